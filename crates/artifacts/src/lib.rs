@@ -1,0 +1,1 @@
+//! The artifacts that stages exchange: one type, one reader and one writer each.

@@ -1,0 +1,1 @@
+//! Text queries, evaluation protocols and the report.

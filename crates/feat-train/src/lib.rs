@@ -1,0 +1,1 @@
+//! Stage 2b: contextual feature propagation and mask-aware contrastive learning.

@@ -1,0 +1,1 @@
+//! Stage 2a: anchors, neighbours, nearest anchors and mask footprints.

@@ -1,0 +1,1 @@
+//! Files of the pipeline: one-line errors, atomic writes, content hashes, npy, safetensors artifacts.

@@ -1,0 +1,1 @@
+//! Differentiable rasteriser of 3D Gaussians on the CPU.

@@ -1,0 +1,1 @@
+//! Gaussians, cameras, datasets, images and 3DGS PLY files.

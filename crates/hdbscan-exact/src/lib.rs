@@ -1,0 +1,1 @@
+//! Exact HDBSCAN: kd-tree core distances, Boruvka spanning tree, condensed tree, selection.

@@ -1,0 +1,1 @@
+//! Stage 0: SAM masks and CLIP features of photographs through ONNX.

@@ -1,0 +1,1 @@
+//! What makes a program a stage: arguments, logging, progress, provenance, exit codes.
