@@ -1,1 +1,13 @@
-//! Gaussians, cameras, datasets, images and 3DGS PLY files.
+//! The scene: [`Gaussians`], [`Camera`]s, [`dataset`]s, images and 3DGS PLY files.
+//!
+//! Conventions, once for the whole workspace:
+//! * World and camera coordinates are right-handed; cameras look along +z with x right and y down (OpenCV, COLMAP).
+//! * A pixel's centre lies at +0.5: pixel (0, 0) covers [0, 1) x [0, 1) and `cx, cy` are in that frame.
+//! * Quaternions are stored w x y z and need not be normalised; scales are stored as logarithms, opacities as logits.
+//! * Transforms are named `target_from_source`: `camera_from_world * p_world = p_camera`.
+
+mod camera;
+mod gaussians;
+
+pub use camera::Camera;
+pub use gaussians::{Gaussians, SH_C0, sh_coefficients};

@@ -1,0 +1,247 @@
+//! Artifacts: safetensors files that say what they are and what they were made from.
+//!
+//! All metadata is one JSON string under the single key `cags` of safetensors' `__metadata__`, because safetensors
+//! writes several keys in an order that changes from run to run. It holds format, version, the program and its version,
+//! the parameters that shaped the data, and the content hash of each input. Nothing in it depends on the time, the
+//! machine, a path or the number of threads: same inputs, same parameters, same bytes.
+
+use crate::{Error, IoContext, Result, hash_bytes, write_bytes};
+use safetensors::tensor::{Dtype, SafeTensors, TensorView};
+use serde::{Deserialize, Serialize};
+use std::collections::{BTreeMap, HashMap};
+use std::fs::File;
+use std::path::{Path, PathBuf};
+
+const KEY: &str = "cags";
+
+/// What an artifact says of itself.
+#[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
+pub struct Provenance {
+    /// Kind of artifact, such as `footprints`.
+    pub format: String,
+    /// Version of that format; a reader refuses another one.
+    pub version: u32,
+    /// Program and version that wrote it, such as `graph-precompute 0.1.0`.
+    pub program: String,
+    /// Every parameter that shaped the data.
+    pub parameters: serde_json::Value,
+    /// Content hash of each input, by role (`geometry`, `masks`, …). Inputs of inputs are included, so that two
+    /// artifacts of one scene can be recognised as such.
+    pub inputs: BTreeMap<String, String>,
+    /// Whatever else belongs to the format: names of views, scale of a scene.
+    #[serde(default, skip_serializing_if = "serde_json::Value::is_null")]
+    pub extra: serde_json::Value,
+}
+
+/// Collects tensors, then writes them atomically.
+pub struct ArtifactWriter {
+    provenance: Provenance,
+    tensors: BTreeMap<String, (Dtype, Vec<usize>, Vec<u8>)>,
+}
+
+/// Element types that artifacts hold.
+pub trait Element: bytemuck::Pod {
+    /// The safetensors dtype.
+    const DTYPE: Dtype;
+}
+macro_rules! element {
+    ($($t:ty => $d:ident),*) => { $(impl Element for $t { const DTYPE: Dtype = Dtype::$d; })* };
+}
+element!(f32 => F32, f64 => F64, u8 => U8, u16 => U16, u32 => U32, u64 => U64, i32 => I32, i64 => I64);
+
+impl ArtifactWriter {
+    /// An artifact without tensors yet.
+    pub fn new(provenance: Provenance) -> Self {
+        Self { provenance, tensors: BTreeMap::new() }
+    }
+
+    /// Adds a tensor; `shape` must fit `data`.
+    ///
+    /// # Panics
+    /// When the product of `shape` is not the number of values: a programming error.
+    #[must_use]
+    pub fn tensor<T: Element>(mut self, name: &str, shape: &[usize], data: &[T]) -> Self {
+        assert_eq!(shape.iter().product::<usize>(), data.len(), "shape of {name}");
+        self.tensors.insert(name.into(), (T::DTYPE, shape.to_vec(), bytemuck::cast_slice(data).to_vec()));
+        self
+    }
+
+    /// Writes the file through a temporary name. The same content gives the same bytes.
+    ///
+    /// # Errors
+    /// When the file cannot be written.
+    pub fn write(self, path: impl AsRef<Path>) -> Result<()> {
+        let path = path.as_ref();
+        let fail = |e: &dyn std::fmt::Display| Error::new(format!("cannot serialise: {e}")).file(path);
+        let json = serde_json::to_string(&self.provenance).map_err(|e| fail(&e))?;
+        let mut views = Vec::with_capacity(self.tensors.len());
+        for (name, (dtype, shape, bytes)) in &self.tensors {
+            views.push((name, TensorView::new(*dtype, shape.clone(), bytes).map_err(|e| fail(&e))?));
+        }
+        let bytes =
+            safetensors::serialize(views, Some(HashMap::from([(KEY.to_string(), json)]))).map_err(|e| fail(&e))?;
+        write_bytes(path, &bytes)
+    }
+}
+
+/// An artifact opened for reading, memory-mapped.
+pub struct Artifact {
+    path: PathBuf,
+    map: memmap2::Mmap,
+    provenance: Provenance,
+    hash: String,
+}
+
+impl Artifact {
+    /// Opens `path` and checks that it is an artifact of this `format` and `version`.
+    ///
+    /// # Errors
+    /// When the file is missing, damaged, of another format or version.
+    pub fn open(path: impl AsRef<Path>, format: &str, version: u32) -> Result<Self> {
+        let path = path.as_ref();
+        let file = File::open(path).at("open", path)?;
+        if file.metadata().at("read", path)?.len() == 0 {
+            return Err(Error::new("the file is empty").file(path).hint("run the stage that makes it again"));
+        }
+        // SAFETY: the map is read-only and artifacts are never modified in place: writers rename a finished file over
+        // the name, which leaves this inode as it was. A foreign program that truncates the file under us is outside
+        // what any reader of mapped files can defend against.
+        let map = unsafe { memmap2::Mmap::map(&file) }.at("map", path)?;
+        let damaged = |e: &dyn std::fmt::Display| {
+            Error::new(format!("not a safetensors artifact: {e}")).file(path).hint("run the stage that makes it again")
+        };
+        let (_, metadata) = SafeTensors::read_metadata(&map).map_err(|e| damaged(&e))?;
+        SafeTensors::deserialize(&map).map_err(|e| damaged(&e))?;
+        let json = metadata.metadata().as_ref().and_then(|m| m.get(KEY)).ok_or_else(|| {
+            Error::new("no provenance: not written by this program").file(path).field(format!("__metadata__.{KEY}"))
+        })?;
+        let provenance: Provenance = serde_json::from_str(json).map_err(|e| damaged(&e))?;
+        if provenance.format != format || provenance.version != version {
+            return Err(Error::new("another kind of artifact")
+                .file(path)
+                .field("format")
+                .found(format!("{} version {}", provenance.format, provenance.version))
+                .expected(format!("{format} version {version}"))
+                .hint("check the order of the arguments, or run the stage that makes it again"));
+        }
+        let hash = hash_bytes(&map);
+        Ok(Self { path: path.to_path_buf(), map, provenance, hash })
+    }
+
+    /// What the artifact says of itself.
+    pub fn provenance(&self) -> &Provenance {
+        &self.provenance
+    }
+
+    /// Content hash of the file.
+    pub fn hash(&self) -> &str {
+        &self.hash
+    }
+
+    /// Where it was read from.
+    pub fn path(&self) -> &Path {
+        &self.path
+    }
+
+    /// The tensor `name`, without a copy. `shape` gives the expected extents, `None` where any will do.
+    ///
+    /// # Errors
+    /// When the tensor is missing, of another type or shape.
+    pub fn tensor<T: Element>(&self, name: &str, shape: &[Option<usize>]) -> Result<&[T]> {
+        let fail = |what: &str| Error::new(what).file(&self.path).field(name).hint("run the stage that makes it again");
+        let tensors = SafeTensors::deserialize(&self.map).map_err(|e| fail(&e.to_string()))?;
+        let view = tensors.tensor(name).map_err(|_| fail("missing tensor"))?;
+        let fits =
+            view.shape().len() == shape.len() && view.shape().iter().zip(shape).all(|(&s, e)| e.is_none_or(|e| e == s));
+        if view.dtype() != T::DTYPE || !fits {
+            let want: Vec<String> = shape.iter().map(|e| e.map_or("any".into(), |e| e.to_string())).collect();
+            return Err(fail("another tensor than expected")
+                .found(format!("{:?} {:?}", view.dtype(), view.shape()))
+                .expected(format!("{:?} [{}]", T::DTYPE, want.join(", "))));
+        }
+        // `view` borrows the map only through a local header; take the same bytes from the map itself.
+        let data = view.data();
+        let start = data.as_ptr() as usize - self.map.as_ptr() as usize;
+        bytemuck::try_cast_slice(&self.map[start..start + data.len()])
+            .map_err(|_| fail("the tensor's data is not aligned"))
+    }
+
+    /// The shape of tensor `name`, if there is one.
+    pub fn shape(&self, name: &str) -> Option<Vec<usize>> {
+        SafeTensors::deserialize(&self.map).ok()?.tensor(name).ok().map(|v| v.shape().to_vec())
+    }
+
+    /// Checks that this artifact was made from the input of the given role with this hash.
+    ///
+    /// # Errors
+    /// Says which artifact comes from another parent.
+    pub fn expect_input(&self, role: &str, hash: &str) -> Result<()> {
+        match self.provenance.inputs.get(role) {
+            Some(h) if h == hash => Ok(()),
+            other => Err(Error::new(format!("made from another {role} than the one given"))
+                .file(&self.path)
+                .field(format!("inputs.{role}"))
+                .found(other.map_or("none", |h| short(h)))
+                .expected(short(hash))
+                .hint("artifacts of different scenes or runs do not mix: give those of one run, or run make again")),
+        }
+    }
+}
+
+fn short(hash: &str) -> &str {
+    hash.get(..12).unwrap_or(hash)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use proptest::prelude::*;
+
+    fn sample() -> ArtifactWriter {
+        let provenance = Provenance {
+            format: "sample".into(),
+            version: 1,
+            program: "test 0".into(),
+            parameters: serde_json::json!({"k": 16}),
+            inputs: BTreeMap::from([("geometry".into(), "ab".repeat(32)), ("masks".into(), "cd".repeat(32))]),
+            extra: serde_json::Value::Null,
+        };
+        ArtifactWriter::new(provenance).tensor("a", &[2, 2], &[1f32, 2.0, 3.0, 4.0]).tensor("b", &[3], &[1u8, 2, 3])
+    }
+
+    #[test]
+    fn same_content_same_bytes_and_reads_back() {
+        let dir = tempfile::tempdir().unwrap();
+        let p = dir.path().join("a.safetensors");
+        sample().write(&p).unwrap();
+        let first = std::fs::read(&p).unwrap();
+        sample().write(&p).unwrap();
+        assert_eq!(first, std::fs::read(&p).unwrap());
+        let a = Artifact::open(&p, "sample", 1).unwrap();
+        assert_eq!(a.tensor::<f32>("a", &[Some(2), None]).unwrap(), [1.0, 2.0, 3.0, 4.0]);
+        assert_eq!(a.tensor::<u8>("b", &[None]).unwrap(), [1, 2, 3]);
+        assert!(a.expect_input("geometry", &"ab".repeat(32)).is_ok());
+        let e = a.expect_input("geometry", &"00".repeat(32)).unwrap_err().to_string();
+        assert!(e.contains("made from another geometry") && e.contains("abababababab"), "{e}");
+        let e = a.tensor::<u32>("a", &[None]).unwrap_err().to_string();
+        assert!(e.contains("found F32 [2, 2], expected U32 [any]"), "{e}");
+        assert!(Artifact::open(&p, "graph", 1).is_err());
+    }
+
+    proptest! {
+        #[test]
+        fn damaged_artifacts_are_errors_not_panics(cut in 0usize..400, flip in 0usize..400, bit in 0u8..8) {
+            let dir = tempfile::tempdir().unwrap();
+            let p = dir.path().join("a.safetensors");
+            sample().write(&p).unwrap();
+            let mut bytes = std::fs::read(&p).unwrap();
+            let at = flip % bytes.len();
+            bytes[at] ^= 1 << bit;
+            bytes.truncate(bytes.len().saturating_sub(cut));
+            std::fs::write(&p, &bytes).unwrap();
+            let opened = Artifact::open(&p, "sample", 1);
+            if cut > 0 { prop_assert!(opened.is_err()); }
+            if let Ok(a) = opened { let _ = a.tensor::<f32>("a", &[None, None]); }
+        }
+    }
+}

@@ -1,0 +1,87 @@
+//! Outputs that appear whole or not at all.
+
+use crate::{IoContext, Result};
+use std::fs;
+use std::io::{BufWriter, Write};
+use std::path::Path;
+
+/// Creates a folder and its parents.
+///
+/// # Errors
+/// When the folder cannot be made (read-only file system, a file in the way).
+pub fn create_dir(dir: impl AsRef<Path>) -> Result<()> {
+    fs::create_dir_all(&dir).at("create the folder", &dir)
+}
+
+/// Writes `path` through `fill`: to a temporary name in the same folder, flushed to the disk, then renamed. A crash, a
+/// full disk or an error from `fill` leaves whatever stood at `path` untouched.
+///
+/// # Errors
+/// When the folder cannot be written, when `fill` fails, or when flushing or renaming fails.
+pub fn write_atomic(path: impl AsRef<Path>, fill: impl FnOnce(&mut dyn Write) -> Result<()>) -> Result<()> {
+    let path = path.as_ref();
+    let folder = match path.parent() {
+        Some(p) if !p.as_os_str().is_empty() => p,
+        _ => Path::new("."),
+    };
+    create_dir(folder)?;
+    let stem = path.file_name().unwrap_or_default().to_string_lossy();
+    let mut builder = tempfile::Builder::new();
+    let prefix = format!(".{stem}.");
+    builder.prefix(&prefix).suffix(".partial");
+    #[cfg(unix)]
+    {
+        // tempfile's default is 0600; an artifact is an ordinary file, subject to the umask.
+        use std::os::unix::fs::PermissionsExt;
+        builder.permissions(fs::Permissions::from_mode(0o666));
+    }
+    let file = builder.tempfile_in(folder).at("create a file beside", path)?;
+    let mut out = BufWriter::with_capacity(1 << 20, file);
+    fill(&mut out)?;
+    let file = out.into_inner().map_err(std::io::IntoInnerError::into_error).at("write", path)?;
+    file.as_file().sync_all().at("flush", path)?;
+    file.persist(path).map_err(|e| e.error).at("rename into place", path)?;
+    // The rename itself lives in the folder: without this a power cut could undo it.
+    if let Ok(dir) = fs::File::open(folder) {
+        let _ = dir.sync_all();
+    }
+    Ok(())
+}
+
+/// Writes `bytes` to `path` as [`write_atomic`] does.
+///
+/// # Errors
+/// As [`write_atomic`].
+pub fn write_bytes(path: impl AsRef<Path>, bytes: &[u8]) -> Result<()> {
+    let path = path.as_ref();
+    write_atomic(path, |w| w.write_all(bytes).at("write", path))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::Error;
+
+    #[test]
+    fn a_failed_write_leaves_the_old_file_and_no_litter() {
+        let dir = tempfile::tempdir().unwrap();
+        let path = dir.path().join("a.bin");
+        write_bytes(&path, b"good").unwrap();
+        let e = write_atomic(&path, |w| {
+            w.write_all(b"half").at("write", &path)?;
+            Err(Error::new("no more"))
+        });
+        assert!(e.is_err());
+        assert_eq!(fs::read(&path).unwrap(), b"good");
+        assert_eq!(fs::read_dir(dir.path()).unwrap().count(), 1);
+    }
+
+    #[test]
+    fn a_file_in_the_way_of_a_folder_is_named() {
+        let dir = tempfile::tempdir().unwrap();
+        let blocker = dir.path().join("f");
+        fs::write(&blocker, "x").unwrap();
+        let e = write_bytes(blocker.join("a.bin"), b"1").unwrap_err().to_string();
+        assert!(e.contains("cannot create the folder"), "{e}");
+    }
+}

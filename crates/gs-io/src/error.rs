@@ -1,0 +1,148 @@
+//! The one error type of the workspace.
+
+use std::fmt;
+use std::path::{Path, PathBuf};
+
+/// Result with the workspace's [`Error`].
+pub type Result<T, E = Error> = std::result::Result<T, E>;
+
+/// Why something could not be done, for the person who has to mend it: one line that names the file, the field, what
+/// was found, what was expected and what to do.
+///
+/// ```
+/// use gs_io::Error;
+/// let e = Error::new("truncated file")
+///     .file("scene/sparse/0/cameras.bin")
+///     .field("camera count")
+///     .found("18446744073709551615")
+///     .expected("at most 12, by the file's length")
+///     .hint("export the COLMAP model again");
+/// assert_eq!(
+///     e.to_string(),
+///     "scene/sparse/0/cameras.bin: camera count: truncated file; found 18446744073709551615, \
+///      expected at most 12, by the file's length; export the COLMAP model again"
+/// );
+/// ```
+#[derive(Debug, Clone, Default, PartialEq, Eq)]
+pub struct Error(Box<Parts>);
+
+#[derive(Debug, Clone, Default, PartialEq, Eq)]
+struct Parts {
+    what: String,
+    file: Option<PathBuf>,
+    field: Option<String>,
+    found: Option<String>,
+    expected: Option<String>,
+    hint: Option<String>,
+}
+
+impl Error {
+    /// An error that says `what` is wrong.
+    pub fn new(what: impl Into<String>) -> Self {
+        Self(Box::new(Parts { what: what.into(), ..Parts::default() }))
+    }
+
+    /// Names the file (or folder) at fault. The first file named stays: inner layers know best.
+    #[must_use]
+    pub fn file(mut self, file: impl AsRef<Path>) -> Self {
+        self.0.file.get_or_insert_with(|| file.as_ref().to_path_buf());
+        self
+    }
+
+    /// Names the field, tensor, property or option at fault. The first field named stays.
+    #[must_use]
+    pub fn field(mut self, field: impl Into<String>) -> Self {
+        self.0.field.get_or_insert_with(|| field.into());
+        self
+    }
+
+    /// What was found there.
+    #[must_use]
+    pub fn found(mut self, found: impl fmt::Display) -> Self {
+        self.0.found = Some(found.to_string());
+        self
+    }
+
+    /// What was expected instead.
+    #[must_use]
+    pub fn expected(mut self, expected: impl fmt::Display) -> Self {
+        self.0.expected = Some(expected.to_string());
+        self
+    }
+
+    /// What the person can do about it.
+    #[must_use]
+    pub fn hint(mut self, hint: impl Into<String>) -> Self {
+        self.0.hint.get_or_insert_with(|| hint.into());
+        self
+    }
+}
+
+impl fmt::Display for Error {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let p = &self.0;
+        let mut line = String::new();
+        if let Some(file) = &p.file {
+            line += &format!("{}: ", file.display());
+        }
+        if let Some(field) = &p.field {
+            line += &format!("{field}: ");
+        }
+        line += &p.what;
+        match (&p.found, &p.expected) {
+            (Some(found), Some(expected)) => line += &format!("; found {found}, expected {expected}"),
+            (Some(found), None) => line += &format!("; found {found}"),
+            (None, Some(expected)) => line += &format!("; expected {expected}"),
+            (None, None) => {}
+        }
+        if let Some(hint) = &p.hint {
+            line += &format!("; {hint}");
+        }
+        // Names inside hostile files may hold line breaks; an error stays one line.
+        f.write_str(&line.replace(['\n', '\r'], " "))
+    }
+}
+
+impl std::error::Error for Error {}
+
+/// Gives an [`std::io::Result`] the path it was about.
+pub trait IoContext<T> {
+    /// Turns an I/O error into an [`Error`] that says which `file` could not be handled, and how (`action`: "read",
+    /// "create", …).
+    fn at(self, action: &str, file: impl AsRef<Path>) -> Result<T>;
+}
+
+impl<T> IoContext<T> for std::io::Result<T> {
+    fn at(self, action: &str, file: impl AsRef<Path>) -> Result<T> {
+        self.map_err(|e| {
+            let hint = match e.kind() {
+                std::io::ErrorKind::NotFound => "check the path",
+                std::io::ErrorKind::PermissionDenied | std::io::ErrorKind::ReadOnlyFilesystem => {
+                    "check the permissions, or choose another output folder"
+                }
+                std::io::ErrorKind::StorageFull => "free some disk space",
+                std::io::ErrorKind::UnexpectedEof => "the file is cut short: make or copy it again",
+                _ => "check the file and its folder",
+            };
+            Error::new(format!("cannot {action}: {e}")).file(file).hint(hint)
+        })
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn stays_one_line_and_keeps_the_innermost_file() {
+        let e = Error::new("bad\nname").file("inner").file("outer").field("a").field("b");
+        assert_eq!(e.to_string(), "inner: a: bad name");
+    }
+
+    #[test]
+    fn io_errors_carry_their_path() {
+        let e = std::fs::read("/no/such/file").at("read", "/no/such/file").unwrap_err();
+        assert!(e.to_string().starts_with("/no/such/file: cannot read: "), "{e}");
+        assert!(e.to_string().ends_with("check the path"), "{e}");
+    }
+}

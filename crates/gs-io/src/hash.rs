@@ -1,0 +1,35 @@
+//! Content hashes, by which artifacts name their parents.
+
+use crate::{IoContext, Result};
+use std::fs::File;
+use std::path::Path;
+
+/// Content hash of `bytes`: BLAKE3, 64 hexadecimal digits.
+pub fn hash_bytes(bytes: &[u8]) -> String {
+    blake3::hash(bytes).to_hex().to_string()
+}
+
+/// Content hash of a file, read in pieces.
+///
+/// # Errors
+/// When the file cannot be read.
+pub fn hash_file(path: impl AsRef<Path>) -> Result<String> {
+    let path = path.as_ref();
+    let file = File::open(path).at("open", path)?;
+    let mut h = blake3::Hasher::new();
+    h.update_reader(file).at("read", path)?;
+    Ok(h.finalize().to_hex().to_string())
+}
+
+/// One hash for several files: of their names (as given, not the path to them) and contents, in the order given.
+///
+/// # Errors
+/// When a file cannot be read.
+pub fn hash_files<N: AsRef<str>, P: AsRef<Path>>(files: impl IntoIterator<Item = (N, P)>) -> Result<String> {
+    let mut h = blake3::Hasher::new();
+    for (name, path) in files {
+        let name = name.as_ref().as_bytes();
+        h.update(&(name.len() as u64).to_le_bytes()).update(name).update(hash_file(path)?.as_bytes());
+    }
+    Ok(h.finalize().to_hex().to_string())
+}

@@ -1,0 +1,200 @@
+//! NumPy `.npy` arrays (format versions 1 to 3, C order), little-endian.
+
+use crate::{Error, IoContext, Result, write_atomic};
+use std::fs;
+use std::path::Path;
+
+/// An array as read: shape and values in C order.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Npy<T> {
+    /// Extent of each axis.
+    pub shape: Vec<usize>,
+    /// Values in C order; as many as the product of the shape.
+    pub data: Vec<T>,
+}
+
+const MAGIC: &[u8] = b"\x93NUMPY";
+
+/// Reads an array of any real dtype (`f2 f4 f8 i1 i2 i4 i8 u1 u2 u4 u8 b1`) as f32.
+///
+/// # Errors
+/// Names file and field when the file is not an npy, is cut short or longer than its header says, is in Fortran order,
+/// big-endian, or of another dtype.
+pub fn read_f32(path: impl AsRef<Path>) -> Result<Npy<f32>> {
+    let path = path.as_ref();
+    let bytes = fs::read(path).at("read", path)?;
+    parse(&bytes).map_err(|e| e.file(path))
+}
+
+/// Parses an npy from memory; see [`read_f32`].
+///
+/// # Errors
+/// As [`read_f32`], without the file's name.
+pub fn parse(bytes: &[u8]) -> Result<Npy<f32>> {
+    let bad = |what: &str| Error::new(what).hint("write it again with numpy.save");
+    if bytes.len() < 10 || &bytes[..6] != MAGIC {
+        return Err(bad("not an npy file").field("magic"));
+    }
+    let (start, header_len) = match bytes[6] {
+        1 => (10usize, usize::from(u16::from_le_bytes([bytes[8], bytes[9]]))),
+        2 | 3 if bytes.len() >= 12 => (12, u32::from_le_bytes([bytes[8], bytes[9], bytes[10], bytes[11]]) as usize),
+        v => return Err(bad("unknown npy version").field("version").found(v).expected("1, 2 or 3")),
+    };
+    let end = start.checked_add(header_len).filter(|&e| e <= bytes.len());
+    let Some(end) = end else {
+        return Err(bad("the header runs past the end of the file").field("header length").found(header_len));
+    };
+    let header = std::str::from_utf8(&bytes[start..end]).map_err(|_| bad("the header is not text").field("header"))?;
+    let value = |key: &str| -> Result<&str> {
+        let at = header.find(&format!("'{key}'")).ok_or_else(|| bad("missing from the header").field(key))?;
+        let rest = &header[at + key.len() + 2..];
+        Ok(rest.trim_start().trim_start_matches(':').trim_start())
+    };
+    if !value("fortran_order")?.starts_with("False") {
+        return Err(Error::new("Fortran order is not supported")
+            .field("fortran_order")
+            .found("True")
+            .expected("False")
+            .hint("save numpy.ascontiguousarray(array)"));
+    }
+    let descr = value("descr")?;
+    let descr = descr.strip_prefix('\'').and_then(|d| d.split('\'').next()).unwrap_or(descr);
+    let shape_text = value("shape")?;
+    let inner = shape_text.strip_prefix('(').and_then(|s| s.split(')').next());
+    let Some(inner) = inner else { return Err(bad("not a tuple").field("shape").found(shape_text.trim())) };
+    let mut shape = Vec::new();
+    for part in inner.split(',').map(str::trim).filter(|p| !p.is_empty()) {
+        shape.push(part.parse::<usize>().map_err(|_| bad("not a whole number").field("shape").found(part))?);
+    }
+    let count = shape.iter().try_fold(1usize, |a, &b| a.checked_mul(b));
+    let body = &bytes[end..];
+    let (order, kind) = descr.split_at(descr.len().min(1));
+    let size: usize = kind.get(1..).and_then(|s| s.parse().ok()).unwrap_or(0);
+    if order == ">" {
+        return Err(bad("big-endian arrays are not supported").field("descr").found(descr).expected("little-endian"));
+    }
+    let expected_bytes = count.and_then(|c| c.checked_mul(size));
+    if expected_bytes != Some(body.len()) {
+        return Err(Error::new("the file's length does not fit its shape")
+            .field("shape")
+            .found(format!("{} bytes of data", body.len()))
+            .expected(format!("{descr} x {shape:?}"))
+            .hint("the file is cut short or was overwritten: make it again"));
+    }
+    macro_rules! read {
+        ($t:ty) => {
+            body.chunks_exact(size_of::<$t>()).map(|c| <$t>::from_le_bytes(c.try_into().unwrap()) as f32).collect()
+        };
+    }
+    let data: Vec<f32> = match kind {
+        "f4" => read!(f32),
+        "f8" => read!(f64),
+        "f2" => body.chunks_exact(2).map(|c| half_to_f32(u16::from_le_bytes([c[0], c[1]]))).collect(),
+        "i1" => read!(i8),
+        "i2" => read!(i16),
+        "i4" => read!(i32),
+        "i8" => read!(i64),
+        "u1" | "b1" => read!(u8),
+        "u2" => read!(u16),
+        "u4" => read!(u32),
+        "u8" => read!(u64),
+        _ => return Err(bad("unsupported dtype").field("descr").found(descr).expected("a real number type")),
+    };
+    Ok(Npy { shape, data })
+}
+
+/// IEEE binary16 to binary32, exact.
+pub fn half_to_f32(h: u16) -> f32 {
+    let sign = u32::from(h >> 15) << 31;
+    let exponent = u32::from(h >> 10) & 31;
+    let mantissa = u32::from(h) & 1023;
+    match (exponent, mantissa) {
+        (0, m) => f32::from_bits(sign | (m as f32 * 2f32.powi(-24)).to_bits()),
+        (31, m) => f32::from_bits(sign | 0x7f80_0000 | (m << 13)),
+        (e, m) => f32::from_bits(sign | ((e + 112) << 23) | (m << 13)),
+    }
+}
+
+fn write(path: &Path, descr: &str, shape: &[usize], body: &[u8]) -> Result<()> {
+    let dims: String = shape.iter().map(|d| format!("{d}, ")).collect();
+    let dims = if shape.len() == 1 { format!("{},", shape[0]) } else { dims.trim_end_matches(", ").to_string() };
+    let mut header = format!("{{'descr': '{descr}', 'fortran_order': False, 'shape': ({dims}), }}");
+    let pad = (64 - (10 + header.len() + 1) % 64) % 64;
+    header += &" ".repeat(pad);
+    header.push('\n');
+    write_atomic(path, |w| {
+        w.write_all(MAGIC).at("write", path)?;
+        w.write_all(&[1, 0]).at("write", path)?;
+        w.write_all(&(header.len() as u16).to_le_bytes()).at("write", path)?;
+        w.write_all(header.as_bytes()).at("write", path)?;
+        w.write_all(body).at("write", path)
+    })
+}
+
+/// Writes an f32 array. The product of `shape` must be the number of values.
+///
+/// # Errors
+/// When the file cannot be written.
+///
+/// # Panics
+/// When `shape` does not fit `data`.
+pub fn write_f32(path: impl AsRef<Path>, shape: &[usize], data: &[f32]) -> Result<()> {
+    assert_eq!(shape.iter().product::<usize>(), data.len());
+    write(path.as_ref(), "<f4", shape, bytemuck::cast_slice(data))
+}
+
+/// Writes an i32 array. The product of `shape` must be the number of values.
+///
+/// # Errors
+/// When the file cannot be written.
+///
+/// # Panics
+/// When `shape` does not fit `data`.
+pub fn write_i32(path: impl AsRef<Path>, shape: &[usize], data: &[i32]) -> Result<()> {
+    assert_eq!(shape.iter().product::<usize>(), data.len());
+    write(path.as_ref(), "<i4", shape, bytemuck::cast_slice(data))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use proptest::prelude::*;
+
+    #[test]
+    fn round_trip() {
+        let dir = tempfile::tempdir().unwrap();
+        let p = dir.path().join("a.npy");
+        for shape in [vec![6], vec![2, 3], vec![1, 2, 3], vec![0, 4]] {
+            let data: Vec<f32> = (0..shape.iter().product::<usize>()).map(|i| i as f32 - 1.5).collect();
+            write_f32(&p, &shape, &data).unwrap();
+            assert_eq!(read_f32(&p).unwrap(), Npy { shape: shape.clone(), data });
+            assert_eq!(fs::read(&p).unwrap().iter().position(|&b| b == b'\n').unwrap() % 64, 63);
+        }
+        write_i32(&p, &[3], &[-1, 0, 7]).unwrap();
+        assert_eq!(read_f32(&p).unwrap().data, [-1.0, 0.0, 7.0]);
+    }
+
+    #[test]
+    fn halves() {
+        for (h, f) in
+            [(0x3c00, 1.0), (0xc000, -2.0), (0x0001, 5.960_464_5e-8), (0x7c00, f32::INFINITY), (0x3555, 0.333_251_95)]
+        {
+            assert_eq!(half_to_f32(h), f);
+        }
+    }
+
+    proptest! {
+        #[test]
+        fn damaged_files_are_errors_not_panics(cut in 0usize..200, flip in 0usize..200, bit in 0u8..8) {
+            let dir = tempfile::tempdir().unwrap();
+            let p = dir.path().join("a.npy");
+            write_f32(&p, &[4, 4], &[1.0; 16]).unwrap();
+            let mut bytes = fs::read(&p).unwrap();
+            let at = flip % bytes.len();
+            bytes[at] ^= 1 << bit;
+            bytes.truncate(bytes.len().saturating_sub(cut));
+            let _ = parse(&bytes);
+            if cut > 0 { prop_assert!(parse(&bytes).is_err()); }
+        }
+    }
+}

@@ -1,0 +1,102 @@
+//! The Gaussians of a scene, as a structure of arrays.
+
+use gs_io::{Error, Result};
+
+/// Zeroth real spherical harmonic, 1 / (2 sqrt(pi)): colour = 0.5 + `SH_C0` * dc for degree 0.
+pub const SH_C0: f32 = 0.282_094_8;
+
+/// Number of spherical-harmonics coefficients per colour channel up to `degree`: (degree + 1)^2.
+pub const fn sh_coefficients(degree: u8) -> usize {
+    (degree as usize + 1) * (degree as usize + 1)
+}
+
+/// N Gaussians in the parametrisation that 3DGS stores and optimises.
+#[derive(Debug, Clone, Default, PartialEq)]
+pub struct Gaussians {
+    /// Centres in the world, N.
+    pub means: Vec<[f32; 3]>,
+    /// Natural logarithms of the standard deviations along the Gaussian's own axes, N.
+    pub log_scales: Vec<[f32; 3]>,
+    /// Rotations as quaternions w x y z, not necessarily normalised, N.
+    pub rotations: Vec<[f32; 4]>,
+    /// Opacities before the sigmoid, N.
+    pub opacity_logits: Vec<f32>,
+    /// Spherical-harmonics coefficients, `[N][coefficients][rgb]` flattened, the constant term first.
+    pub sh: Vec<f32>,
+    /// Degree of the spherical harmonics, 0 to 3.
+    pub sh_degree: u8,
+}
+
+impl Gaussians {
+    /// Number of Gaussians.
+    pub fn len(&self) -> usize {
+        self.means.len()
+    }
+
+    /// Whether there are none.
+    pub fn is_empty(&self) -> bool {
+        self.means.is_empty()
+    }
+
+    /// Floats in [`Self::sh`] per Gaussian: 3, 12, 27 or 48.
+    pub fn sh_stride(&self) -> usize {
+        3 * sh_coefficients(self.sh_degree)
+    }
+
+    /// The spherical-harmonics coefficients of Gaussian `i`, `[coefficients][rgb]`.
+    pub fn sh_of(&self, i: usize) -> &[f32] {
+        let s = self.sh_stride();
+        &self.sh[i * s..(i + 1) * s]
+    }
+
+    /// Opacity of Gaussian `i`, in (0, 1).
+    pub fn opacity(&self, i: usize) -> f32 {
+        1.0 / (1.0 + (-self.opacity_logits[i]).exp())
+    }
+
+    /// View-independent colour of Gaussian `i` from its constant term, not clamped.
+    pub fn base_color(&self, i: usize) -> [f32; 3] {
+        let sh = self.sh_of(i);
+        [0, 1, 2].map(|c| 0.5 + SH_C0 * sh[c])
+    }
+
+    /// The Gaussians at `indices`, in that order.
+    ///
+    /// # Panics
+    /// When an index is out of range.
+    #[must_use]
+    pub fn select(&self, indices: &[u32]) -> Self {
+        let at = || indices.iter().map(|&i| i as usize);
+        Self {
+            means: at().map(|i| self.means[i]).collect(),
+            log_scales: at().map(|i| self.log_scales[i]).collect(),
+            rotations: at().map(|i| self.rotations[i]).collect(),
+            opacity_logits: at().map(|i| self.opacity_logits[i]).collect(),
+            sh: at().flat_map(|i| self.sh_of(i).iter().copied()).collect(),
+            sh_degree: self.sh_degree,
+        }
+    }
+
+    /// Checks that the arrays fit together.
+    ///
+    /// # Errors
+    /// Names the array of another length.
+    pub fn check(&self) -> Result<()> {
+        let n = self.len();
+        let lengths = [
+            ("log_scales", self.log_scales.len(), n),
+            ("rotations", self.rotations.len(), n),
+            ("opacity_logits", self.opacity_logits.len(), n),
+            ("sh", self.sh.len(), n * self.sh_stride()),
+        ];
+        for (field, found, expected) in lengths {
+            if found != expected {
+                return Err(Error::new("arrays of different lengths").field(field).found(found).expected(expected));
+            }
+        }
+        if self.sh_degree > 3 {
+            return Err(Error::new("unsupported degree").field("sh_degree").found(self.sh_degree).expected("0 to 3"));
+        }
+        Ok(())
+    }
+}
