@@ -1,1 +1,70 @@
-//! What makes a program a stage: arguments, logging, progress, provenance, exit codes.
+//! What makes a program a stage: arguments that mean the same everywhere, logging, progress, a record of the run, and
+//! exit codes.
+//!
+//! A stage's `main.rs` is one line: `fn main() -> ExitCode { stage::main::<Args>() }` for a clap parser `Args` that
+//! implements [`Program`]. Exit codes: 0 done; 2 an error, said in one line on standard error; 130 interrupted.
+
+mod log;
+mod progress;
+mod record;
+
+pub use log::Stage;
+pub use progress::Progress;
+pub use record::{RunRecord, peak_rss_bytes};
+
+use gs_io::Result;
+use std::process::ExitCode;
+
+/// Arguments that every stage has, with one meaning.
+#[derive(Debug, Clone, Default, clap::Args)]
+#[command(next_help_heading = "Common options")]
+pub struct CommonArgs {
+    /// Worker threads; 0 means one per core. The results do not depend on it
+    #[arg(long, global = true, default_value_t = 0, value_name = "COUNT")]
+    pub threads: usize,
+    /// Seed of every random choice: the same seed gives the same bytes
+    #[arg(long, global = true, default_value_t = 0, value_name = "NUMBER")]
+    pub seed: u64,
+    /// Say nothing but warnings and errors
+    #[arg(long, global = true)]
+    pub quiet: bool,
+    /// Write events as JSON lines to standard output instead of text to standard error
+    #[arg(long, global = true)]
+    pub json: bool,
+}
+
+/// A stage program: its arguments, and what it does with them.
+pub trait Program: clap::Parser {
+    /// The program's name, such as `gs-geom`.
+    const NAME: &'static str;
+
+    /// The common arguments within.
+    fn common(&self) -> &CommonArgs;
+
+    /// Does the work.
+    ///
+    /// # Errors
+    /// Whatever the person who started the program has to mend.
+    fn run(self, stage: &Stage) -> Result<()>;
+}
+
+/// Parses the arguments, sets up threads and logging, runs the program and turns its result into an exit code.
+pub fn main<P: Program>() -> ExitCode {
+    let program = P::parse();
+    let stage = Stage::new(P::NAME, program.common());
+    let threads = program.common().threads;
+    if let Err(e) = rayon::ThreadPoolBuilder::new().num_threads(threads).build_global() {
+        stage.warn(&format!("cannot start {threads} threads ({e}); using the default"));
+    }
+    match program.run(&stage) {
+        Ok(()) => ExitCode::SUCCESS,
+        Err(_) if stage.interrupted() => {
+            stage.warn("interrupted");
+            ExitCode::from(130)
+        }
+        Err(e) => {
+            stage.error(&e);
+            ExitCode::from(2)
+        }
+    }
+}

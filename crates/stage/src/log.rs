@@ -1,0 +1,159 @@
+//! What a stage says, and the facts of its run.
+
+use crate::{CommonArgs, Progress, RunRecord};
+use gs_io::{Error, Provenance, Result};
+use serde_json::{Value, json};
+use std::collections::BTreeMap;
+use std::io::Write;
+use std::path::Path;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::{Arc, Mutex, OnceLock};
+use std::time::Instant;
+
+/// A running stage: its voice, its clock, its seed and the record of its run.
+pub struct Stage {
+    name: &'static str,
+    common: CommonArgs,
+    started: Instant,
+    skipped: Mutex<Vec<String>>,
+    interrupted: OnceLock<Arc<AtomicBool>>,
+}
+
+impl Stage {
+    /// A stage that starts now. [`crate::main`] makes one; tests of stage libraries may too.
+    pub fn new(name: &'static str, common: &CommonArgs) -> Self {
+        Self {
+            name,
+            common: common.clone(),
+            started: Instant::now(),
+            skipped: Mutex::default(),
+            interrupted: OnceLock::new(),
+        }
+    }
+
+    /// A stage that says nothing, for tests of stage libraries.
+    pub fn silent(name: &'static str) -> Self {
+        Self::new(name, &CommonArgs { quiet: true, ..CommonArgs::default() })
+    }
+
+    /// The program's name.
+    pub fn name(&self) -> &'static str {
+        self.name
+    }
+
+    /// The seed of every random choice.
+    pub fn seed(&self) -> u64 {
+        self.common.seed
+    }
+
+    /// Says what is going on.
+    pub fn info(&self, message: &str) {
+        if self.common.json {
+            self.event("info", &[("message", json!(message))]);
+        } else if !self.common.quiet {
+            self.line(message);
+        }
+    }
+
+    /// Says what is odd but not fatal. Not silenced by `--quiet`.
+    pub fn warn(&self, message: &str) {
+        if self.common.json {
+            self.event("warning", &[("message", json!(message))]);
+        } else {
+            self.line(&format!("warning: {message}"));
+        }
+    }
+
+    /// Says what was skipped because the scene does not need it, such as "212 of 1,004 Gaussians: never seen". It is
+    /// also kept in the record of the run.
+    pub fn skipped(&self, what: &str) {
+        self.info(&format!("skipped {what}"));
+        self.skipped.lock().expect("no panic holds this lock").push(what.to_string());
+    }
+
+    /// Says why the stage failed.
+    pub fn error(&self, error: &Error) {
+        if self.common.json {
+            self.event("error", &[("message", json!(error.to_string()))]);
+        }
+        self.line(&format!("error: {error}"));
+    }
+
+    /// A progress line or bar over `total` steps.
+    pub fn progress(&self, label: &'static str, total: u64) -> Progress<'_> {
+        Progress::new(self, label, total, self.common.quiet, self.common.json)
+    }
+
+    /// Whether Ctrl-C or a termination signal has come. The first call begins to catch them, so a stage that never
+    /// asks dies at once, as any program does; a second signal ends the process whatever it does.
+    pub fn interrupted(&self) -> bool {
+        let flag = self.interrupted.get_or_init(|| {
+            let flag = Arc::new(AtomicBool::new(false));
+            let seen = Arc::clone(&flag);
+            // A handler that is already set belongs to an earlier stage of the same test process.
+            let _ = ctrlc::set_handler(move || {
+                if seen.swap(true, Ordering::SeqCst) {
+                    std::process::exit(130);
+                }
+            });
+            flag
+        });
+        flag.load(Ordering::SeqCst)
+    }
+
+    /// The provenance of an artifact of this stage.
+    pub fn provenance(
+        &self,
+        format: &str,
+        version: u32,
+        parameters: Value,
+        inputs: BTreeMap<String, String>,
+    ) -> Provenance {
+        Provenance {
+            format: format.into(),
+            version,
+            program: format!("{} {}", self.name, env!("CARGO_PKG_VERSION")),
+            parameters,
+            inputs,
+            extra: Value::Null,
+        }
+    }
+
+    /// Writes `<output>.run.json`: parameters, input hashes, wall seconds, peak memory and a summary of the result.
+    /// Call it last; it is not an artifact, its content differs from run to run.
+    ///
+    /// # Errors
+    /// When the file cannot be written.
+    pub fn record(
+        &self,
+        output: impl AsRef<Path>,
+        parameters: Value,
+        inputs: BTreeMap<String, String>,
+        summary: Value,
+    ) -> Result<()> {
+        let record = RunRecord {
+            program: self.name.into(),
+            version: env!("CARGO_PKG_VERSION").into(),
+            parameters,
+            inputs,
+            seed: self.common.seed,
+            threads: rayon::current_num_threads(),
+            wall_seconds: self.started.elapsed().as_secs_f64(),
+            peak_rss_bytes: crate::peak_rss_bytes(),
+            skipped: self.skipped.lock().expect("no panic holds this lock").clone(),
+            summary,
+        };
+        record.write(output)
+    }
+
+    pub(crate) fn event(&self, kind: &str, fields: &[(&str, Value)]) {
+        let mut o = serde_json::Map::from_iter([("event".into(), json!(kind)), ("stage".into(), json!(self.name))]);
+        o.extend(fields.iter().map(|(k, v)| ((*k).to_string(), v.clone())));
+        // A closed pipe is the reader's choice, not an error of the stage.
+        let _ = writeln!(std::io::stdout().lock(), "{}", Value::Object(o));
+    }
+
+    pub(crate) fn line(&self, message: &str) {
+        let _ = writeln!(std::io::stderr().lock(), "{}: {message}", self.name);
+    }
+}
