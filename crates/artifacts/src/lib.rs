@@ -1,1 +1,39 @@
-//! The artifacts that stages exchange: one type, one reader and one writer each.
+//! The artifacts that stages exchange: one type, one reader and one writer each, so that what two stages share on disk
+//! is said in one place. docs/artifacts.md is the same for readers in other languages.
+//!
+//! Indices: N counts the Gaussians of `geometry.ply`; *kept* are the Gaussians that some view sees, as ascending
+//! original indices, n of them. Graph, footprints and features speak of kept Gaussians by their position in that list.
+
+mod features;
+mod footprints;
+mod graph;
+mod instances;
+mod masks;
+mod palette;
+mod truth;
+
+pub use features::Features;
+pub use footprints::{Footprints, FootprintsBuilder, Row};
+pub use graph::Graph;
+pub use instances::{Instances, Match, TreeEdge};
+pub use masks::{LEVELS, Level, MaskFeatures, MaskMaps, features_path, hash_folder, maps_path, stems};
+pub use palette::{NOISE_COLOR, instance_color};
+pub use truth::{MaskTruth, TrueObject, TruePart, TruePoints, TrueScene};
+
+/// Roles under which artifacts record the hashes of their inputs.
+pub mod role {
+    /// `geometry.ply`.
+    pub const GEOMETRY: &str = "geometry";
+    /// The dataset: names, cameras and photographs.
+    pub const DATASET: &str = "dataset";
+    /// All id maps (`*_s.npy`) of a masks folder.
+    pub const MASKS: &str = "masks";
+    /// All mask features (`*_f.npy`) of a masks folder.
+    pub const MASK_FEATURES: &str = "mask-features";
+    /// `graph.safetensors`.
+    pub const GRAPH: &str = "graph";
+    /// `footprints.safetensors`.
+    pub const FOOTPRINTS: &str = "footprints";
+    /// `features.safetensors`.
+    pub const FEATURES: &str = "features";
+}

@@ -85,6 +85,7 @@ impl ArtifactWriter {
 }
 
 /// An artifact opened for reading, memory-mapped.
+#[derive(Debug)]
 pub struct Artifact {
     path: PathBuf,
     map: memmap2::Mmap,

@@ -1,0 +1,122 @@
+//! `graph.safetensors`: anchors and neighbours.
+
+use crate::role;
+use gs_io::{Artifact, ArtifactWriter, Error, Provenance, Result};
+use std::path::Path;
+
+/// The anchor graph of the paper's "Local Graph Sampling", and which Gaussians take part.
+#[derive(Debug, Clone, Default, PartialEq)]
+pub struct Graph {
+    /// Original indices of the kept Gaussians, ascending; n.
+    pub kept: Vec<u32>,
+    /// Anchors as positions in `kept`; M.
+    pub anchors: Vec<u32>,
+    /// Neighbours per anchor, k.
+    pub k: usize,
+    /// Nearest kept Gaussians of each anchor, itself excluded, nearest first, ties by index; `[M][k]`, positions in
+    /// `kept`. Rows are padded with the anchor's own position where a scene has too few Gaussians.
+    pub knn: Vec<u32>,
+    /// Nearest anchors of each anchor, itself excluded; `[M][k]`, indices into `anchors`, padded likewise.
+    pub anchor_knn: Vec<u32>,
+    /// Nearest anchor of each kept Gaussian; n, indices into `anchors`.
+    pub nearest_anchor: Vec<u32>,
+    /// Spatial neighbours per kept Gaussian.
+    pub gaussian_k: usize,
+    /// Nearest kept Gaussians of each kept Gaussian, itself excluded; `[n][gaussian_k]`, padded with itself.
+    pub gaussian_knn: Vec<u32>,
+    /// In how many views each Gaussian contributes; N.
+    pub seen_views: Vec<u32>,
+    /// Sum of blending weights over all pixels of all views; N.
+    pub seen_weight: Vec<f32>,
+}
+
+impl Graph {
+    /// Format name in the file.
+    pub const FORMAT: &str = "graph";
+    const VERSION: u32 = 1;
+
+    /// Writes the artifact.
+    ///
+    /// # Errors
+    /// When the file cannot be written.
+    pub fn write(&self, path: impl AsRef<Path>, mut provenance: Provenance) -> Result<()> {
+        provenance.format = Self::FORMAT.into();
+        provenance.version = Self::VERSION;
+        let (n, m) = (self.kept.len(), self.anchors.len());
+        ArtifactWriter::new(provenance)
+            .tensor("kept", &[n], &self.kept)
+            .tensor("anchors", &[m], &self.anchors)
+            .tensor("knn", &[m, self.k], &self.knn)
+            .tensor("anchor_knn", &[m, self.k], &self.anchor_knn)
+            .tensor("nearest_anchor", &[n], &self.nearest_anchor)
+            .tensor("gaussian_knn", &[n, self.gaussian_k], &self.gaussian_knn)
+            .tensor("seen_views", &[self.seen_views.len()], &self.seen_views)
+            .tensor("seen_weight", &[self.seen_weight.len()], &self.seen_weight)
+            .write(path)
+    }
+
+    /// Reads and checks the artifact.
+    ///
+    /// # Errors
+    /// When the file is damaged, tensors do not fit together, or an index is out of range.
+    pub fn read(path: impl AsRef<Path>) -> Result<(Self, Artifact)> {
+        let a = Artifact::open(path, Self::FORMAT, Self::VERSION)?;
+        let kept = a.tensor::<u32>("kept", &[None])?.to_vec();
+        let anchors = a.tensor::<u32>("anchors", &[None])?.to_vec();
+        let (n, m) = (kept.len(), anchors.len());
+        let width = |name: &str| a.shape(name).and_then(|s| s.get(1).copied()).unwrap_or(0);
+        let (k, gaussian_k) = (width("knn"), width("gaussian_knn"));
+        let seen_views = a.tensor::<u32>("seen_views", &[None])?.to_vec();
+        let total = seen_views.len();
+        let graph = Self {
+            knn: a.tensor("knn", &[Some(m), Some(k)])?.to_vec(),
+            anchor_knn: a.tensor("anchor_knn", &[Some(m), Some(k)])?.to_vec(),
+            nearest_anchor: a.tensor("nearest_anchor", &[Some(n)])?.to_vec(),
+            gaussian_knn: a.tensor("gaussian_knn", &[Some(n), Some(gaussian_k)])?.to_vec(),
+            seen_weight: a.tensor("seen_weight", &[Some(total)])?.to_vec(),
+            kept,
+            anchors,
+            k,
+            gaussian_k,
+            seen_views,
+        };
+        check_kept(&a, &graph.kept, total)?;
+        below(&a, "anchors", &graph.anchors, n)?;
+        below(&a, "knn", &graph.knn, n)?;
+        below(&a, "anchor_knn", &graph.anchor_knn, m)?;
+        below(&a, "nearest_anchor", &graph.nearest_anchor, m)?;
+        below(&a, "gaussian_knn", &graph.gaussian_knn, n)?;
+        Ok((graph, a))
+    }
+
+    /// The hash of the geometry this graph belongs to.
+    pub fn geometry_hash(artifact: &Artifact) -> &str {
+        artifact.provenance().inputs.get(role::GEOMETRY).map_or("", String::as_str)
+    }
+}
+
+/// Checks that every index of tensor `name` is below `limit`.
+pub(crate) fn below(a: &Artifact, name: &str, indices: &[u32], limit: usize) -> Result<()> {
+    match indices.iter().position(|&i| i as usize >= limit) {
+        None => Ok(()),
+        Some(at) => Err(Error::new("index out of range")
+            .file(a.path())
+            .field(format!("{name}[{at}]"))
+            .found(indices[at])
+            .expected(format!("below {limit}"))
+            .hint("run the stage that makes it again")),
+    }
+}
+
+/// Checks that `kept` ascends and stays below `total` (where known: `usize::MAX` otherwise).
+pub(crate) fn check_kept(a: &Artifact, kept: &[u32], total: usize) -> Result<()> {
+    below(a, "kept", kept, total)?;
+    match kept.windows(2).position(|w| w[0] >= w[1]) {
+        None => Ok(()),
+        Some(at) => Err(Error::new("indices do not ascend")
+            .file(a.path())
+            .field(format!("kept[{}]", at + 1))
+            .found(kept[at + 1])
+            .expected(format!("more than {}", kept[at]))),
+    }
+}

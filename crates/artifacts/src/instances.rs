@@ -1,0 +1,208 @@
+//! `instances.safetensors`: the 3D instances with what language and geometry know of them.
+
+use crate::graph::below;
+use gs_io::{Artifact, ArtifactWriter, Error, Provenance, Result};
+use serde_json::json;
+use std::path::Path;
+
+/// An instance matched with a mask of a view.
+#[derive(Debug, Clone, Copy, Default, PartialEq)]
+pub struct Match {
+    /// Index of the instance.
+    pub instance: u32,
+    /// Index of the view in [`Instances::views`].
+    pub view: u32,
+    /// Id of the mask in the view's `*_s.npy`.
+    pub mask: u32,
+    /// Association score, IoU x similarity of mean features (paper, S_kj), 0 to 1.
+    pub score: f32,
+}
+
+/// An edge of the condensed tree of the clustering.
+#[derive(Debug, Clone, Copy, Default, PartialEq)]
+pub struct TreeEdge {
+    /// The parent cluster; the root is the number of clustered points, as in scikit-learn.
+    pub parent: u32,
+    /// The child cluster.
+    pub child: u32,
+    /// 1 / distance at which the child leaves its parent.
+    pub lambda: f32,
+    /// Gaussians in the child.
+    pub size: u32,
+    /// Index of the instance that was selected at the child, or -1.
+    pub instance: i32,
+}
+
+/// All instances of a scene; K of them.
+#[derive(Debug, Clone, Default, PartialEq)]
+pub struct Instances {
+    /// Instance of every Gaussian, -1 for noise; N.
+    pub label: Vec<i32>,
+    /// Numbers per descriptor; 0 when the scene has no language features.
+    pub dim: usize,
+    /// Language descriptors, of unit length or zero; `[K][dim]`.
+    pub descriptor: Vec<f32>,
+    /// Views in which the instance was matched with a mask; K.
+    pub support: Vec<u32>,
+    /// Mean association score of its matches; K.
+    pub score: Vec<f32>,
+    /// Number of Gaussians; K.
+    pub count: Vec<u32>,
+    /// Mean of their centres; K.
+    pub centroid: Vec<[f32; 3]>,
+    /// Lower corner of the axis-aligned box around their centres; K.
+    pub bbox_min: Vec<[f32; 3]>,
+    /// Upper corner of that box; K.
+    pub bbox_max: Vec<[f32; 3]>,
+    /// Names of the views (file stems) that matches speak of.
+    pub views: Vec<String>,
+    /// All matches, ordered by instance, view.
+    pub matches: Vec<Match>,
+    /// Condensed tree of the clustering (cluster-to-cluster edges only), so that a query can choose the granularity.
+    pub tree: Vec<TreeEdge>,
+}
+
+impl Instances {
+    /// Format name in the file.
+    pub const FORMAT: &str = "instances";
+    const VERSION: u32 = 1;
+
+    /// Number of instances.
+    pub fn len(&self) -> usize {
+        self.count.len()
+    }
+
+    /// Whether there are none.
+    pub fn is_empty(&self) -> bool {
+        self.count.is_empty()
+    }
+
+    /// Descriptor of an instance.
+    pub fn descriptor_of(&self, instance: usize) -> &[f32] {
+        &self.descriptor[instance * self.dim..(instance + 1) * self.dim]
+    }
+
+    /// Writes the artifact.
+    ///
+    /// # Errors
+    /// When the file cannot be written.
+    pub fn write(&self, path: impl AsRef<Path>, mut provenance: Provenance) -> Result<()> {
+        provenance.format = Self::FORMAT.into();
+        provenance.version = Self::VERSION;
+        provenance.extra = json!({ "views": self.views });
+        let (k, m, t) = (self.len(), self.matches.len(), self.tree.len());
+        fn column<S, T>(all: &[S], f: impl Fn(&S) -> T) -> Vec<T> {
+            all.iter().map(f).collect()
+        }
+        ArtifactWriter::new(provenance)
+            .tensor("label", &[self.label.len()], &self.label)
+            .tensor("descriptor", &[k, self.dim], &self.descriptor)
+            .tensor("support", &[k], &self.support)
+            .tensor("score", &[k], &self.score)
+            .tensor("count", &[k], &self.count)
+            .tensor("centroid", &[k, 3], self.centroid.as_flattened())
+            .tensor("bbox_min", &[k, 3], self.bbox_min.as_flattened())
+            .tensor("bbox_max", &[k, 3], self.bbox_max.as_flattened())
+            .tensor("match_instance", &[m], &column(&self.matches, |x| x.instance))
+            .tensor("match_view", &[m], &column(&self.matches, |x| x.view))
+            .tensor("match_mask", &[m], &column(&self.matches, |x| x.mask))
+            .tensor("match_score", &[m], &column(&self.matches, |x| x.score))
+            .tensor("tree_parent", &[t], &column(&self.tree, |x| x.parent))
+            .tensor("tree_child", &[t], &column(&self.tree, |x| x.child))
+            .tensor("tree_lambda", &[t], &column(&self.tree, |x| x.lambda))
+            .tensor("tree_size", &[t], &column(&self.tree, |x| x.size))
+            .tensor("tree_instance", &[t], &column(&self.tree, |x| x.instance))
+            .write(path)
+    }
+
+    /// Reads and checks the artifact.
+    ///
+    /// # Errors
+    /// When the file is damaged, tensors do not fit together, or an index is out of range.
+    pub fn read(path: impl AsRef<Path>) -> Result<(Self, Artifact)> {
+        let a = Artifact::open(path, Self::FORMAT, Self::VERSION)?;
+        let count = a.tensor::<u32>("count", &[None])?.to_vec();
+        let k = count.len();
+        let dim = a.shape("descriptor").and_then(|s| s.get(1).copied()).unwrap_or(0);
+        let views: Vec<String> = serde_json::from_value(a.provenance().extra["views"].clone())
+            .map_err(|e| Error::new(format!("no list of view names: {e}")).file(a.path()).field("views"))?;
+        let triples = |name: &str| -> Result<Vec<[f32; 3]>> {
+            Ok(a.tensor::<f32>(name, &[Some(k), Some(3)])?.chunks_exact(3).map(|c| [c[0], c[1], c[2]]).collect())
+        };
+        let instance = a.tensor::<u32>("match_instance", &[None])?;
+        let m = instance.len();
+        let (view, mask) = (a.tensor::<u32>("match_view", &[Some(m)])?, a.tensor::<u32>("match_mask", &[Some(m)])?);
+        let score = a.tensor::<f32>("match_score", &[Some(m)])?;
+        below(&a, "match_instance", instance, k)?;
+        below(&a, "match_view", view, views.len())?;
+        let parent = a.tensor::<u32>("tree_parent", &[None])?;
+        let t = parent.len();
+        let (child, size) = (a.tensor::<u32>("tree_child", &[Some(t)])?, a.tensor::<u32>("tree_size", &[Some(t)])?);
+        let lambda = a.tensor::<f32>("tree_lambda", &[Some(t)])?;
+        let selected = a.tensor::<i32>("tree_instance", &[Some(t)])?;
+        let label = a.tensor::<i32>("label", &[None])?.to_vec();
+        for (name, values) in [("label", &label[..]), ("tree_instance", selected)] {
+            if let Some(at) = values.iter().position(|&l| l < -1 || l >= k as i32) {
+                return Err(Error::new("index out of range")
+                    .file(a.path())
+                    .field(format!("{name}[{at}]"))
+                    .found(values[at])
+                    .expected(format!("-1 to {}", k as i64 - 1)));
+            }
+        }
+        let instances = Self {
+            label,
+            dim,
+            descriptor: a.tensor("descriptor", &[Some(k), Some(dim)])?.to_vec(),
+            support: a.tensor("support", &[Some(k)])?.to_vec(),
+            score: a.tensor("score", &[Some(k)])?.to_vec(),
+            centroid: triples("centroid")?,
+            bbox_min: triples("bbox_min")?,
+            bbox_max: triples("bbox_max")?,
+            count,
+            matches: (0..m)
+                .map(|i| Match { instance: instance[i], view: view[i], mask: mask[i], score: score[i] })
+                .collect(),
+            tree: (0..t)
+                .map(|i| TreeEdge {
+                    parent: parent[i],
+                    child: child[i],
+                    lambda: lambda[i],
+                    size: size[i],
+                    instance: selected[i],
+                })
+                .collect(),
+            views,
+        };
+        Ok((instances, a))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn reads_back_with_and_without_language() {
+        let dir = tempfile::tempdir().unwrap();
+        let p = dir.path().join("i.safetensors");
+        for dim in [0usize, 4] {
+            let i = Instances {
+                label: vec![0, -1, 1, 1],
+                dim,
+                descriptor: vec![0.5; 2 * dim],
+                support: vec![3, 0],
+                score: vec![0.5, 0.0],
+                count: vec![1, 2],
+                centroid: vec![[0.0; 3], [1.0; 3]],
+                bbox_min: vec![[0.0; 3]; 2],
+                bbox_max: vec![[1.0; 3]; 2],
+                views: vec!["a".into()],
+                matches: vec![Match { instance: 0, view: 0, mask: 7, score: 0.5 }],
+                tree: vec![TreeEdge { parent: 4, child: 5, lambda: 2.0, size: 2, instance: 1 }],
+            };
+            i.write(&p, Provenance::default()).unwrap();
+            assert_eq!(Instances::read(&p).unwrap().0, i);
+        }
+    }
+}

@@ -1,0 +1,227 @@
+//! Id maps and mask features in LangSplat's layout: `<stem>_s.npy` and `<stem>_f.npy` in one folder.
+
+use gs_io::{Error, IoContext, Result, hash_files, npy};
+use std::path::{Path, PathBuf};
+
+/// Levels of an id map file.
+pub const LEVELS: usize = 4;
+
+/// A granularity level of SAM's masks, in the order of the files.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
+pub enum Level {
+    /// SAM's default masks.
+    Default = 0,
+    /// Subparts.
+    Small = 1,
+    /// Parts.
+    Medium = 2,
+    /// Whole things.
+    Large = 3,
+}
+
+impl Level {
+    /// All levels in the order of the files.
+    pub const ALL: [Self; LEVELS] = [Self::Default, Self::Small, Self::Medium, Self::Large];
+}
+
+impl std::str::FromStr for Level {
+    type Err = Error;
+
+    fn from_str(s: &str) -> Result<Self> {
+        match s {
+            "default" | "0" => Ok(Self::Default),
+            "small" | "1" => Ok(Self::Small),
+            "medium" | "2" => Ok(Self::Medium),
+            "large" | "3" => Ok(Self::Large),
+            _ => Err(Error::new("unknown level").found(s).expected("default, small, medium or large (or 0 to 3)")),
+        }
+    }
+}
+
+impl std::fmt::Display for Level {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        f.write_str(["default", "small", "medium", "large"][*self as usize])
+    }
+}
+
+/// Where the id maps of a view lie: `<folder>/<stem>_s.npy`.
+pub fn maps_path(folder: impl AsRef<Path>, stem: &str) -> PathBuf {
+    folder.as_ref().join(format!("{stem}_s.npy"))
+}
+
+/// Where the mask features of a view lie: `<folder>/<stem>_f.npy`.
+pub fn features_path(folder: impl AsRef<Path>, stem: &str) -> PathBuf {
+    folder.as_ref().join(format!("{stem}_f.npy"))
+}
+
+/// Stems of all views that have id maps in `folder`, sorted.
+///
+/// # Errors
+/// When the folder cannot be read.
+pub fn stems(folder: impl AsRef<Path>) -> Result<Vec<String>> {
+    with_suffix(folder.as_ref(), "_s.npy")
+}
+
+fn with_suffix(folder: &Path, suffix: &str) -> Result<Vec<String>> {
+    let mut found = Vec::new();
+    for entry in std::fs::read_dir(folder).at("list", folder)? {
+        let name = entry.at("list", folder)?.file_name();
+        if let Some(stem) = name.to_string_lossy().strip_suffix(suffix) {
+            found.push(stem.to_string());
+        }
+    }
+    found.sort();
+    Ok(found)
+}
+
+/// One hash for all files of a masks folder that end in `suffix` (`_s.npy` or `_f.npy`): of names and contents.
+///
+/// # Errors
+/// When the folder or a file cannot be read.
+pub fn hash_folder(folder: impl AsRef<Path>, suffix: &str) -> Result<String> {
+    let folder = folder.as_ref();
+    let names = with_suffix(folder, suffix)?.into_iter().map(|s| s + suffix);
+    hash_files(names.map(|n| (n.clone(), folder.join(n))))
+}
+
+/// The id maps of one view.
+#[derive(Debug, Clone, PartialEq)]
+pub struct MaskMaps {
+    /// Width in pixels; the photograph may have another size.
+    pub width: usize,
+    /// Height in pixels.
+    pub height: usize,
+    /// Mask id per pixel, -1 for none; `[4][height][width]`. Ids count on from level to level, so that an id is the row
+    /// of the mask in `*_f.npy`; ids without pixels exist.
+    pub ids: Vec<i32>,
+}
+
+impl MaskMaps {
+    /// Largest id a file may name: as many as f32 counts exactly.
+    const MAX_ID: f32 = 16_777_216.0;
+
+    /// Reads `*_s.npy`: any real dtype, `[4, H, W]` (or `[1, H, W]` and `[H, W]`: one level for all four).
+    ///
+    /// # Errors
+    /// When the file is damaged, has another shape, or an id is not a whole number of at least -1.
+    pub fn read(path: impl AsRef<Path>) -> Result<Self> {
+        let path = path.as_ref();
+        let a = npy::read_f32(path)?;
+        let (levels, height, width) = match a.shape[..] {
+            [levels @ (1 | LEVELS), h, w] => (levels, h, w),
+            [h, w] => (1, h, w),
+            _ => (0, 0, 0),
+        };
+        if levels * height * width == 0 {
+            return Err(Error::new("not an id map")
+                .file(path)
+                .field("shape")
+                .found(format!("{:?}", a.shape))
+                .expected("[4, height, width]"));
+        }
+        if let Some(at) = a.data.iter().position(|&v| v.fract() != 0.0 || !(-1.0..Self::MAX_ID).contains(&v)) {
+            let (x, y, l) = (at % width, at / width % height, at / (width * height));
+            return Err(Error::new("not a mask id")
+                .file(path)
+                .field(format!("level {l}, row {y}, column {x}"))
+                .found(a.data[at])
+                .expected("-1 or a whole number from 0")
+                .hint("id maps must not be interpolated or blended"));
+        }
+        let mut ids: Vec<i32> = a.data.iter().map(|&v| v as i32).collect();
+        if levels == 1 {
+            ids = ids.repeat(LEVELS);
+        }
+        Ok(Self { width, height, ids })
+    }
+
+    /// Writes `*_s.npy` as LangSplat does: f32 `[4, H, W]`.
+    ///
+    /// # Errors
+    /// When the file cannot be written.
+    pub fn write(&self, path: impl AsRef<Path>) -> Result<()> {
+        let data: Vec<f32> = self.ids.iter().map(|&i| i as f32).collect();
+        npy::write_f32(path, &[LEVELS, self.height, self.width], &data)
+    }
+
+    /// The map of one level, `[height][width]`.
+    pub fn level(&self, level: Level) -> &[i32] {
+        let n = self.width * self.height;
+        &self.ids[level as usize * n..(level as usize + 1) * n]
+    }
+
+    /// Number of ids: the largest id of any level and one.
+    pub fn id_count(&self) -> usize {
+        self.ids.iter().max().map_or(0, |&m| (m + 1) as usize)
+    }
+}
+
+/// The language features of the masks of one view.
+#[derive(Debug, Clone, PartialEq)]
+pub struct MaskFeatures {
+    /// Number of masks over all levels.
+    pub count: usize,
+    /// Numbers per feature.
+    pub dim: usize,
+    /// `[count][dim]`, unit length, or zero for a mask without pixels.
+    pub values: Vec<f32>,
+}
+
+impl MaskFeatures {
+    /// Reads `*_f.npy`: `[masks, dim]`, any real dtype.
+    ///
+    /// # Errors
+    /// When the file is damaged, has another shape, or holds a number that is not finite.
+    pub fn read(path: impl AsRef<Path>) -> Result<Self> {
+        let path = path.as_ref();
+        let a = npy::read_f32(path)?;
+        let &[count, dim] = &a.shape[..] else {
+            return Err(Error::new("not mask features")
+                .file(path)
+                .field("shape")
+                .found(format!("{:?}", a.shape))
+                .expected("[masks, dimension]"));
+        };
+        if let Some(at) = a.data.iter().position(|v| !v.is_finite()) {
+            let field = format!("row {}, column {}", at / dim, at % dim);
+            return Err(Error::new("not a finite number").file(path).field(field).found(a.data[at]));
+        }
+        Ok(Self { count, dim, values: a.data })
+    }
+
+    /// Writes `*_f.npy`: f32 `[masks, dim]`.
+    ///
+    /// # Errors
+    /// When the file cannot be written.
+    pub fn write(&self, path: impl AsRef<Path>) -> Result<()> {
+        npy::write_f32(path, &[self.count, self.dim], &self.values)
+    }
+
+    /// Feature of mask `id`, if there is one.
+    pub fn row(&self, id: usize) -> Option<&[f32]> {
+        self.values.get(id * self.dim..(id + 1) * self.dim)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn id_maps_read_back_and_refuse_blended_ids() {
+        let dir = tempfile::tempdir().unwrap();
+        let p = maps_path(dir.path(), "frame_00001");
+        let m = MaskMaps { width: 3, height: 2, ids: (0..24).map(|i| i % 7 - 1).collect() };
+        m.write(&p).unwrap();
+        assert_eq!(MaskMaps::read(&p).unwrap(), m);
+        assert_eq!(m.level(Level::Large), &m.ids[18..]);
+        assert_eq!(stems(dir.path()).unwrap(), ["frame_00001"]);
+        npy::write_f32(&p, &[2, 3], &[0.0, 0.5, 0.0, 0.0, 0.0, 0.0]).unwrap();
+        let e = MaskMaps::read(&p).unwrap_err().to_string();
+        assert!(e.contains("level 0, row 0, column 1") && e.contains("found 0.5"), "{e}");
+        npy::write_f32(&p, &[2, 3], &[-1.0, 0.0, 1.0, 2.0, 3.0, 4.0]).unwrap();
+        assert_eq!(MaskMaps::read(&p).unwrap().level(Level::Medium), [-1, 0, 1, 2, 3, 4]);
+        npy::write_f32(&p, &[0, 3], &[]).unwrap();
+        assert!(MaskMaps::read(&p).is_err());
+    }
+}
