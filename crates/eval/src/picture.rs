@@ -1,0 +1,158 @@
+//! Pictures for people: overlays, id maps in colours, and their encoding.
+
+use crate::Mask;
+use gs_io::{Error, Result};
+use image::{DynamicImage, RgbImage};
+
+/// Colour by which a selection is marked, sRGB in 0 to 1.
+pub const HIGHLIGHT: [f32; 3] = [1.0, 0.35, 0.0];
+
+/// An sRGB picture, values 0 to 1.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Picture {
+    /// Width in pixels.
+    pub width: usize,
+    /// Height in pixels.
+    pub height: usize,
+    /// `[height][width]` colours.
+    pub pixels: Vec<[f32; 3]>,
+}
+
+impl Picture {
+    /// From flat rgb values (`[height][width][3]`), clamped to 0 to 1.
+    ///
+    /// # Panics
+    /// When `rgb` has another length.
+    pub fn new(width: usize, height: usize, rgb: &[f32]) -> Self {
+        assert_eq!(rgb.len(), width * height * 3);
+        let pixels = rgb.chunks_exact(3).map(|c| [c[0], c[1], c[2]].map(|v| v.clamp(0.0, 1.0))).collect();
+        Self { width, height, pixels }
+    }
+
+    /// Brings out a mask: the rest is dimmed and greyed, the mask lightly tinted and outlined with `color`.
+    ///
+    /// # Panics
+    /// When the mask has another size.
+    #[must_use]
+    pub fn highlighted(&self, mask: &Mask, color: [f32; 3]) -> Self {
+        assert_eq!((self.width, self.height), (mask.width, mask.height));
+        let outline = mask.outline((self.width.max(self.height) / 400).max(1));
+        let pixels = (0..self.pixels.len()).map(|i| {
+            let c = self.pixels[i];
+            if outline.bits[i] {
+                color
+            } else if mask.bits[i] {
+                blend(c, color, 0.25)
+            } else {
+                let grey = 0.299 * c[0] + 0.587 * c[1] + 0.114 * c[2];
+                blend(c, [grey; 3], 0.6).map(|v| 0.15 + 0.45 * v)
+            }
+        });
+        Self { pixels: pixels.collect(), ..*self }
+    }
+
+    /// Lays colours over the picture: `opacity` of `overlay` where there is one.
+    ///
+    /// # Panics
+    /// When `overlay` does not hold a value per pixel.
+    #[must_use]
+    pub fn overlaid(&self, overlay: &[Option<[f32; 3]>], opacity: f32) -> Self {
+        assert_eq!(overlay.len(), self.pixels.len());
+        let pixels = self.pixels.iter().zip(overlay).map(|(&c, o)| o.map_or(c, |o| blend(c, o, opacity))).collect();
+        Self { pixels, ..*self }
+    }
+
+    fn rgb8(&self) -> RgbImage {
+        let byte = |v: &f32| (v.clamp(0.0, 1.0) * 255.0).round() as u8;
+        let bytes: Vec<u8> = self.pixels.iter().flatten().map(byte).collect();
+        RgbImage::from_raw(self.width as u32, self.height as u32, bytes).expect("sizes agree")
+    }
+
+    /// The picture as a PNG file.
+    ///
+    /// # Errors
+    /// When encoding fails.
+    pub fn png(&self) -> Result<Vec<u8>> {
+        encode(&DynamicImage::ImageRgb8(self.rgb8()), image::ImageFormat::Png)
+    }
+
+    /// The picture as a JPEG file of the given quality (1 to 100), shrunk to at most `max_width`.
+    ///
+    /// # Errors
+    /// When encoding fails.
+    pub fn jpeg(&self, max_width: usize, quality: u8) -> Result<Vec<u8>> {
+        let mut full = self.rgb8();
+        if self.width > max_width {
+            let height = (self.height * max_width).div_ceil(self.width).max(1);
+            full =
+                image::imageops::resize(&full, max_width as u32, height as u32, image::imageops::FilterType::Triangle);
+        }
+        let mut out = Vec::new();
+        image::codecs::jpeg::JpegEncoder::new_with_quality(&mut out, quality)
+            .encode_image(&full)
+            .map_err(|e| Error::new(format!("cannot encode a JPEG: {e}")))?;
+        Ok(out)
+    }
+}
+
+/// A mask as a PNG file: 255 inside, 0 outside.
+///
+/// # Errors
+/// When encoding fails.
+pub fn mask_png(mask: &Mask) -> Result<Vec<u8>> {
+    let bytes = mask.bits.iter().map(|&b| 255 * u8::from(b)).collect();
+    let grey = image::GrayImage::from_raw(mask.width as u32, mask.height as u32, bytes).expect("sizes agree");
+    encode(&DynamicImage::ImageLuma8(grey), image::ImageFormat::Png)
+}
+
+fn encode(picture: &DynamicImage, format: image::ImageFormat) -> Result<Vec<u8>> {
+    let mut out = std::io::Cursor::new(Vec::new());
+    picture.write_to(&mut out, format).map_err(|e| Error::new(format!("cannot encode a picture: {e}")))?;
+    Ok(out.into_inner())
+}
+
+/// `(1 - t) a + t b`.
+fn blend(a: [f32; 3], b: [f32; 3], t: f32) -> [f32; 3] {
+    [0, 1, 2].map(|k| a[k] + t * (b[k] - a[k]))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn picture() -> Picture {
+        Picture::new(8, 6, &[0.5; 8 * 6 * 3])
+    }
+
+    #[test]
+    fn a_highlight_marks_outline_inside_and_outside() {
+        let mut mask = Mask::new(8, 6);
+        mask.bits[2 * 8 + 3] = true;
+        let h = picture().highlighted(&mask, [1.0, 0.0, 0.0]);
+        assert_eq!(h.pixels[2 * 8 + 3], [0.625, 0.375, 0.375]);
+        assert_eq!(h.pixels[2 * 8 + 4], [1.0, 0.0, 0.0]);
+        assert!((h.pixels[0][0] - 0.375).abs() < 1e-6);
+    }
+
+    #[test]
+    fn files_decode_to_what_was_drawn() {
+        let mut p = picture();
+        p.pixels[0] = [1.0, 0.0, 0.2];
+        let png = image::load_from_memory(&p.png().unwrap()).unwrap().to_rgb8();
+        assert_eq!((png.dimensions(), png[(0, 0)].0, png[(1, 0)].0), ((8, 6), [255, 0, 51], [128; 3]));
+        let jpeg = image::load_from_memory(&p.jpeg(4, 80).unwrap()).unwrap();
+        assert_eq!((jpeg.width(), jpeg.height()), (4, 3));
+        let mut mask = Mask::new(8, 6);
+        mask.bits[9] = true;
+        let m = image::load_from_memory(&mask_png(&mask).unwrap()).unwrap().to_luma8();
+        assert_eq!((m[(1, 1)].0, m[(0, 0)].0), ([255], [0]));
+    }
+
+    #[test]
+    fn overlays_leave_the_rest_alone() {
+        let mut o = vec![None; 48];
+        o[5] = Some([1.0, 1.0, 1.0]);
+        let p = picture().overlaid(&o, 0.5);
+        assert_eq!((p.pixels[5], p.pixels[6]), ([0.75; 3], [0.5; 3]));
+    }
+}
