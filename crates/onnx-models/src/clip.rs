@@ -1,0 +1,315 @@
+//! The two halves of a CLIP-shaped dual encoder.
+//!
+//! A model is a folder with `image.onnx` (pixels f32 `[n, 3, S, S]` -> `[n, d]`), `text.onnx` (token ids `[n, 77]` ->
+//! `[n, d]`) and, unless OpenAI's constants are right, `clip.json` ([`ClipConfig`]). Where a graph has several outputs,
+//! the one whose name ends in `_embeds` is taken, else the first. What comes out is scaled to unit length here.
+
+use crate::{EngineOptions, Kind, Model, Outputs, Tensor, Tokenizer, open, parallel_map};
+use gs_io::{Error, IoContext, Result, hash_files};
+use serde::{Deserialize, Serialize};
+use std::path::{Path, PathBuf};
+
+/// Pictures or texts per run of a model whose batch is free. Fixed, so that results do not depend on anything else.
+const BATCH: usize = 16;
+/// Longest side of a picture that a model may ask for; larger is a damaged configuration.
+const MAX_SIZE: usize = 4096;
+
+/// `clip.json`: what has to be known beside the two graphs. Every field may be left out.
+///
+/// ```json
+/// {
+///   "name": "ViT-B-16 laion2b_s34b_b88k",
+///   "dimension": 512,
+///   "image_size": 224,
+///   "mean": [0.48145466, 0.4578275, 0.40821073],
+///   "std": [0.26862954, 0.26130258, 0.27577711],
+///   "context_length": 77,
+///   "pad_id": 0
+/// }
+/// ```
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct ClipConfig {
+    /// Which model this is: image and text features of different models cannot be compared.
+    pub name: String,
+    /// Numbers per feature; checked against what the graphs give. 0 when not said.
+    pub dimension: usize,
+    /// Side S of the pictures in pixels. When not said (0): what `image.onnx` declares, else 224.
+    pub image_size: usize,
+    /// Subtracted from each channel of the picture, scaled to 0..1.
+    pub mean: [f32; 3],
+    /// Divides each channel afterwards.
+    pub std: [f32; 3],
+    /// Ids per text. When not said (0): what `text.onnx` declares, else 77.
+    pub context_length: usize,
+    /// Id that fills short texts.
+    pub pad_id: i32,
+}
+
+impl Default for ClipConfig {
+    fn default() -> Self {
+        Self {
+            name: String::new(),
+            dimension: 0,
+            image_size: 0,
+            mean: [0.481_454_66, 0.457_827_5, 0.408_210_73],
+            std: [0.268_629_55, 0.261_302_6, 0.275_777_1],
+            context_length: 0,
+            pad_id: 0,
+        }
+    }
+}
+
+impl ClipConfig {
+    /// Reads `clip.json` of a model folder; the defaults when there is none.
+    ///
+    /// # Errors
+    /// When the file cannot be read, is not such JSON, or a number makes no sense.
+    pub fn read(folder: impl AsRef<Path>) -> Result<Self> {
+        let path = folder.as_ref().join("clip.json");
+        if !path.exists() {
+            return Ok(Self::default());
+        }
+        let bytes = std::fs::read(&path).at("read", &path)?;
+        let config: Self = serde_json::from_slice(&bytes)
+            .map_err(|e| Error::new(format!("not a CLIP configuration: {e}")).file(&path))?;
+        let bad = |field: &str, found: String, expected: &str| {
+            Err(Error::new("not a usable value").file(&path).field(field).found(found).expected(expected))
+        };
+        if config.std.iter().any(|s| !s.is_finite() || *s <= 0.0) {
+            return bad("std", format!("{:?}", config.std), "three positive numbers");
+        }
+        if config.mean.iter().any(|m| !m.is_finite()) {
+            return bad("mean", format!("{:?}", config.mean), "three finite numbers");
+        }
+        if config.image_size > MAX_SIZE {
+            return bad("image_size", config.image_size.to_string(), "at most 4096");
+        }
+        if config.context_length != 0 && !(3..=MAX_SIZE).contains(&config.context_length) {
+            return bad("context_length", config.context_length.to_string(), "3 to 4096");
+        }
+        Ok(config)
+    }
+}
+
+/// One graph of the pair: `[n, …]` in, `[n, d]` out.
+struct Encoder {
+    model: Box<dyn Model>,
+    input: String,
+    output: usize,
+    dimension: usize,
+    /// The batch that the graph insists on, if it does.
+    fixed_batch: Option<usize>,
+    hash: String,
+}
+
+impl Encoder {
+    fn open(path: &Path, rank: usize, kind: Kind, options: &EngineOptions) -> Result<Self> {
+        let model = open(path, Outputs::Declared, options)?;
+        let wrong = |what: &str| Error::new(what).file(path).hint("export the model with scripts/export_clip.py");
+        let [input] = model.inputs() else {
+            let names: Vec<&str> = model.inputs().iter().map(|i| i.name.as_str()).collect();
+            return Err(wrong("another number of inputs").found(names.join(", ")).expected("one"));
+        };
+        if input.kind.is_some_and(|k| k != kind) || input.shape.as_ref().is_some_and(|s| s.len() != rank) {
+            return Err(wrong("the input is of another kind")
+                .field(&input.name)
+                .found(format!("{} of rank {}", input.kind.unwrap_or(kind), input.shape.as_ref().map_or(0, Vec::len)))
+                .expected(format!("{kind} of rank {rank}")));
+        }
+        let output = model.outputs().iter().position(|o| o.name.ends_with("_embeds")).unwrap_or(0);
+        let (name, fixed_batch) = (input.name.clone(), input.fixed(0).filter(|&b| b > 0));
+        let hash = hash_files([("", path)])?;
+        Ok(Self { input: name, output, dimension: 0, fixed_batch, hash, model })
+    }
+
+    /// Features of `count` items, each unit length or zero. `fill` makes the input of items `range`, padded to `batch`.
+    fn encode<'t>(
+        &self,
+        count: usize,
+        fill: impl Fn(std::ops::Range<usize>, usize) -> Tensor<'t> + Sync,
+    ) -> Result<Vec<f32>> {
+        let batch = self.fixed_batch.unwrap_or(BATCH);
+        let parts = parallel_map(count.div_ceil(batch), |b| {
+            let range = b * batch..((b + 1) * batch).min(count);
+            let size = self.fixed_batch.unwrap_or(range.len());
+            let given = fill(range.clone(), size);
+            let out = self.model.run(&[(&self.input, given)])?;
+            let tensor = &out[self.output];
+            let wrong = |what: &str| {
+                Error::new(what)
+                    .file(self.model.path())
+                    .field(format!("output {}", self.model.outputs()[self.output].name))
+                    .hint("export the model with scripts/export_clip.py")
+            };
+            let (&[n, d], Some(values)) = (&tensor.shape[..], tensor.as_f32()) else {
+                return Err(wrong("not a feature per item")
+                    .found(format!("{:?}", tensor.shape))
+                    .expected("floats [n, dimension]"));
+            };
+            if n != size || d == 0 || (self.dimension != 0 && d != self.dimension) {
+                let d = if self.dimension == 0 { "dimension".into() } else { self.dimension.to_string() };
+                return Err(wrong("not a feature per item")
+                    .found(format!("{:?}", tensor.shape))
+                    .expected(format!("[{size}, {d}]")));
+            }
+            if values.iter().any(|v| !v.is_finite()) {
+                return Err(wrong("the model gives numbers that are not finite"));
+            }
+            let mut rows = values[..range.len() * d].to_vec();
+            for row in rows.chunks_exact_mut(d) {
+                let norm = row.iter().map(|&v| f64::from(v) * f64::from(v)).sum::<f64>().sqrt();
+                if norm > 0.0 {
+                    for v in row {
+                        *v = (f64::from(*v) / norm) as f32;
+                    }
+                }
+            }
+            Ok(rows)
+        })?;
+        Ok(parts.concat())
+    }
+}
+
+/// Where a graph lies: in a folder under its usual name, or the file itself.
+fn locate(path: &Path, name: &str) -> Result<(PathBuf, PathBuf)> {
+    let (folder, file) = if path.is_dir() {
+        (path.to_path_buf(), path.join(name))
+    } else {
+        (path.parent().unwrap_or(Path::new("")).to_path_buf(), path.to_path_buf())
+    };
+    if !file.exists() {
+        return Err(Error::new("no such model").file(file).hint(
+            "export one with scripts/export_clip.py where a model hub can be reached, or use the one in testdata/clip-tiny",
+        ));
+    }
+    Ok((folder, file))
+}
+
+/// CLIP's image encoder.
+pub struct ClipImage {
+    encoder: Encoder,
+    config: ClipConfig,
+    size: usize,
+}
+
+impl ClipImage {
+    /// Opens `image.onnx` and `clip.json` of a folder, or a file and the `clip.json` beside it. The model runs once, on
+    /// black, which checks it and tells its dimension.
+    ///
+    /// # Errors
+    /// When a file is missing or damaged, or the graph is not `[n, 3, S, S]` -> `[n, d]`.
+    pub fn open(path: impl AsRef<Path>, options: &EngineOptions) -> Result<Self> {
+        let (folder, file) = locate(path.as_ref(), "image.onnx")?;
+        let config = ClipConfig::read(folder)?;
+        let options = EngineOptions { threads_per_run: 1, ..options.clone() };
+        let encoder = Encoder::open(&file, 4, Kind::Float, &options)?;
+        let declared = encoder.model.inputs()[0].fixed(2).filter(|&s| s > 0);
+        let size = if config.image_size > 0 { config.image_size } else { declared.unwrap_or(224).min(MAX_SIZE) };
+        let mut this = Self { encoder, config, size };
+        this.encoder.dimension = this.config.dimension;
+        this.encoder.dimension = this.encode(&vec![0; 3 * size * size])?.len();
+        Ok(this)
+    }
+
+    /// What is known of the model.
+    pub fn config(&self) -> &ClipConfig {
+        &self.config
+    }
+
+    /// Side S of the pictures in pixels.
+    pub fn size(&self) -> usize {
+        self.size
+    }
+
+    /// Numbers per feature.
+    pub fn dimension(&self) -> usize {
+        self.encoder.dimension
+    }
+
+    /// Content hash of the graph.
+    pub fn hash(&self) -> &str {
+        &self.encoder.hash
+    }
+
+    /// Features `[n][d]`, each of unit length, of `n` pictures `[n][3][S][S]` as [`crate::crop_mask`] gives them.
+    ///
+    /// # Errors
+    /// When the engine fails, or the model gives something other than `[n, d]` finite floats.
+    ///
+    /// # Panics
+    /// When `crops` is not a whole number of pictures: a programming error.
+    pub fn encode(&self, crops: &[u8]) -> Result<Vec<f32>> {
+        let plane = self.size * self.size;
+        assert_eq!(crops.len() % (3 * plane), 0, "whole pictures");
+        self.encoder.encode(crops.len() / (3 * plane), |range, batch| {
+            let mut pixels = Vec::with_capacity(batch * 3 * plane);
+            for (c, values) in crops[range.start * 3 * plane..range.end * 3 * plane].chunks_exact(plane).enumerate() {
+                let (mean, std) = (self.config.mean[c % 3], self.config.std[c % 3]);
+                pixels.extend(values.iter().map(|&v| (f32::from(v) / 255.0 - mean) / std));
+            }
+            pixels.resize(batch * 3 * plane, 0.0);
+            Tensor::f32(&[batch, 3, self.size, self.size], pixels)
+        })
+    }
+}
+
+/// CLIP's text encoder with its tokenizer.
+pub struct ClipText {
+    encoder: Encoder,
+    config: ClipConfig,
+    length: usize,
+    tokenizer: Tokenizer,
+}
+
+impl ClipText {
+    /// Opens `text.onnx` and `clip.json` of a folder, or a file and the `clip.json` beside it. The model runs once, on
+    /// an empty text, which checks it and tells its dimension.
+    ///
+    /// # Errors
+    /// When a file is missing or damaged, or the graph is not `[n, 77]` -> `[n, d]`.
+    pub fn open(path: impl AsRef<Path>, options: &EngineOptions) -> Result<Self> {
+        let (folder, file) = locate(path.as_ref(), "text.onnx")?;
+        let config = ClipConfig::read(folder)?;
+        let options = EngineOptions { threads_per_run: 1, ..options.clone() };
+        let encoder = Encoder::open(&file, 2, Kind::Integer, &options)?;
+        let declared = encoder.model.inputs()[0].fixed(1).filter(|&l| (3..=MAX_SIZE).contains(&l));
+        let length = if config.context_length > 0 { config.context_length } else { declared.unwrap_or(77) };
+        let mut this = Self { encoder, config, length, tokenizer: Tokenizer::new() };
+        this.encoder.dimension = this.config.dimension;
+        this.encoder.dimension = this.encode(&[""])?.len();
+        Ok(this)
+    }
+
+    /// What is known of the model.
+    pub fn config(&self) -> &ClipConfig {
+        &self.config
+    }
+
+    /// Numbers per feature.
+    pub fn dimension(&self) -> usize {
+        self.encoder.dimension
+    }
+
+    /// Content hash of the graph.
+    pub fn hash(&self) -> &str {
+        &self.encoder.hash
+    }
+
+    /// Features `[n][d]`, each of unit length, of `n` texts.
+    ///
+    /// # Errors
+    /// When the engine fails, or the model gives something other than `[n, d]` finite floats.
+    pub fn encode(&self, texts: &[impl AsRef<str> + Sync]) -> Result<Vec<f32>> {
+        self.encoder.encode(texts.len(), |range, batch| {
+            let mut ids = Vec::with_capacity(batch * self.length);
+            for text in &texts[range] {
+                ids.extend(self.tokenizer.encode(text.as_ref(), self.length, self.config.pad_id));
+            }
+            while ids.len() < batch * self.length {
+                ids.extend(self.tokenizer.encode("", self.length, self.config.pad_id));
+            }
+            Tensor::i32(&[batch, self.length], ids)
+        })
+    }
+}

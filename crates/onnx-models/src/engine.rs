@@ -1,0 +1,215 @@
+//! What every engine offers: open a model, ask for its inputs and outputs, run it.
+
+use crate::{Graph, Tensor, ort_engine, rten_engine};
+use gs_io::{Error, IoContext, Result};
+use std::path::{Path, PathBuf};
+use std::sync::Mutex;
+use std::sync::atomic::{AtomicUsize, Ordering};
+
+/// Which engine runs the models, and on how many threads.
+#[derive(Debug, Clone, Default)]
+pub struct EngineOptions {
+    /// Path of ONNX Runtime's shared library (`libonnxruntime.so`, version 1.20 or later); rten runs the model when
+    /// there is none.
+    ///
+    /// ONNX Runtime 1.29 and later send usage data unless the environment holds `ORT_DISABLE_TELEMETRY=1`, and no call
+    /// comes early enough to stop them; so the library is not loaded without that variable.
+    pub onnx_runtime: Option<PathBuf>,
+    /// Threads of one [`Model::run`] with rten: 1 for models that [`parallel_map`] runs several at a time, 0 for one
+    /// per thread of the program. ONNX Runtime always uses all, one run after another.
+    pub threads_per_run: usize,
+}
+
+/// Which values of the graph a model gives.
+#[derive(Debug, Clone, Copy, Default)]
+pub enum Outputs<'a> {
+    /// Those that the file declares as outputs.
+    #[default]
+    Declared,
+    /// These, in this order; any value of the graph will do, and nothing that they do not need is computed.
+    Values(&'a [&'a str]),
+}
+
+/// Kind of numbers in a tensor. Engines differ in integer width (rten has 32 bits only), so widths are converted.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Kind {
+    /// 32-bit floats.
+    Float,
+    /// Integers of 32 or 64 bits.
+    Integer,
+    /// Anything else.
+    Other,
+}
+
+impl std::fmt::Display for Kind {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        f.write_str(match self {
+            Self::Float => "floats",
+            Self::Integer => "integers",
+            Self::Other => "another type",
+        })
+    }
+}
+
+/// What a model says of an input or output.
+#[derive(Debug, Clone, PartialEq)]
+pub struct ValueInfo {
+    /// Its name.
+    pub name: String,
+    /// Extents; `None` where they are free. `None` altogether when the model does not say.
+    pub shape: Option<Vec<Option<usize>>>,
+    /// Kind of its numbers, if the model says.
+    pub kind: Option<Kind>,
+}
+
+impl ValueInfo {
+    /// The extent of `axis` where the model fixes it.
+    pub fn fixed(&self, axis: usize) -> Option<usize> {
+        *self.shape.as_ref()?.get(axis)?
+    }
+
+    fn shape_text(&self) -> String {
+        let dims = self.shape.iter().flatten().map(|d| d.map_or("any".into(), |d| d.to_string()));
+        format!("[{}]", dims.collect::<Vec<String>>().join(", "))
+    }
+}
+
+/// An opened model. Runs may be started from several threads at once.
+pub trait Model: Send + Sync {
+    /// Where it was read from.
+    fn path(&self) -> &Path;
+
+    /// Its inputs.
+    fn inputs(&self) -> &[ValueInfo];
+
+    /// Its outputs, in the order in which [`Model::run`] gives them.
+    fn outputs(&self) -> &[ValueInfo];
+
+    /// Runs inputs that [`Model::run`] has checked.
+    ///
+    /// # Errors
+    /// When the engine fails.
+    fn run_checked(&self, inputs: &[(&str, Tensor)]) -> Result<Vec<Tensor<'static>>>;
+
+    /// Runs the model on named inputs.
+    ///
+    /// # Errors
+    /// When an input is missing, unknown, of another type or shape than the model declares, or when the engine fails.
+    fn run(&self, inputs: &[(&str, Tensor)]) -> Result<Vec<Tensor<'static>>> {
+        check_inputs(self.path(), self.inputs(), inputs)?;
+        self.run_checked(inputs)
+    }
+}
+
+fn check_inputs(path: &Path, declared: &[ValueInfo], given: &[(&str, Tensor)]) -> Result<()> {
+    let names = || declared.iter().map(|d| d.name.as_str()).collect::<Vec<_>>().join(", ");
+    let wrong = |what: &str| Error::new(what).file(path).hint("this is not the kind of model asked for");
+    for (name, tensor) in given {
+        let field = || format!("input {name}");
+        let Some(d) = declared.iter().find(|d| d.name == *name) else {
+            return Err(wrong("the model has no such input").field(field()).expected(format!("one of {}", names())));
+        };
+        if tensor.shape.iter().product::<usize>() != tensor.len() {
+            return Err(Error::new("the number of values does not fit the shape")
+                .file(path)
+                .field(field())
+                .found(format!("{} values", tensor.len()))
+                .expected(format!("{:?}", tensor.shape)));
+        }
+        if let Some(kind) = d.kind
+            && kind != tensor.kind()
+        {
+            return Err(wrong("the input is of another type").field(field()).found(kind).expected(tensor.kind()));
+        }
+        let fits = d.shape.as_ref().is_none_or(|s| {
+            s.len() == tensor.shape.len() && s.iter().zip(&tensor.shape).all(|(d, &n)| d.is_none_or(|d| d == n))
+        });
+        if !fits {
+            let found = format!("{} in the model", d.shape_text());
+            return Err(wrong("the input has another shape")
+                .field(field())
+                .found(found)
+                .expected(format!("{:?}", tensor.shape)));
+        }
+    }
+    match declared.iter().find(|d| given.iter().all(|(name, _)| *name != d.name)) {
+        Some(d) => Err(wrong("the model wants an input that is not known here").field(format!("input {}", d.name))),
+        None => Ok(()),
+    }
+}
+
+/// Opens an ONNX file with the engine that `options` choose.
+///
+/// # Errors
+/// When the file is missing or not an ONNX model, a wanted output does not exist, the engine does not know an operator,
+/// or ONNX Runtime cannot be loaded.
+pub fn open(path: impl AsRef<Path>, outputs: Outputs, options: &EngineOptions) -> Result<Box<dyn Model>> {
+    let path = path.as_ref();
+    let bytes = std::fs::read(path).at("read", path)?;
+    let graph = Graph::parse(&bytes).map_err(|e| e.file(path))?;
+    let (bytes, names) = match outputs {
+        Outputs::Declared => (bytes, graph.outputs.clone()),
+        Outputs::Values(names) => {
+            let rewritten = graph.with_outputs(&bytes, names).map_err(|e| e.file(path))?;
+            (rewritten, names.iter().map(ToString::to_string).collect())
+        }
+    };
+    // Weights in a separate file are found by the engine beside the model: only then does it have to read it itself.
+    let external = matches!(outputs, Outputs::Declared) && graph.external_data;
+    match &options.onnx_runtime {
+        Some(library) => ort_engine::open(path, bytes, external, names, library),
+        None => rten_engine::open(path, bytes, external, names, options.threads_per_run),
+    }
+}
+
+/// Calls `f(0..count)` on as many threads as rayon has and returns the results in order, for work that runs models:
+/// inside rayon's own pool a thread that waits for an engine would begin other work and keep it from finishing.
+///
+/// # Errors
+/// The error of the lowest index that fails.
+pub fn parallel_map<R: Send>(count: usize, f: impl Fn(usize) -> Result<R> + Sync) -> Result<Vec<R>> {
+    let threads = rayon::current_num_threads().min(count);
+    if threads <= 1 {
+        return (0..count).map(f).collect();
+    }
+    let next = AtomicUsize::new(0);
+    let results: Mutex<Vec<Option<Result<R>>>> = Mutex::new((0..count).map(|_| None).collect());
+    std::thread::scope(|scope| {
+        for _ in 0..threads {
+            scope.spawn(|| {
+                loop {
+                    let i = next.fetch_add(1, Ordering::Relaxed);
+                    if i >= count {
+                        break;
+                    }
+                    let r = f(i);
+                    if r.is_err() {
+                        // Work not yet begun has higher indices, whose errors would not be the one reported.
+                        next.store(count, Ordering::Relaxed);
+                    }
+                    results.lock().expect("no panic holds this lock")[i] = Some(r);
+                }
+            });
+        }
+    });
+    let results = results.into_inner().expect("no panic holds this lock");
+    let mut done = Vec::with_capacity(count);
+    for r in results.into_iter().flatten() {
+        done.push(r?);
+    }
+    Ok(done)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn results_come_in_order_and_the_lowest_error_wins() {
+        let squares = parallel_map(1000, |i| Ok(i * i)).unwrap();
+        assert!(squares.iter().enumerate().all(|(i, &s)| s == i * i));
+        let e = parallel_map(100, |i| if i >= 3 { Err(Error::new(format!("at {i}"))) } else { Ok(()) }).unwrap_err();
+        assert_eq!(e.to_string(), "at 3");
+        assert!(parallel_map(0, |_| Ok(0u8)).unwrap().is_empty());
+    }
+}

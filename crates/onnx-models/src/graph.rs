@@ -1,0 +1,207 @@
+//! The little of the ONNX file format that is needed to give a model other outputs.
+//!
+//! An ONNX file is a protobuf message ModelProto whose field 7 is the GraphProto; its field 1 repeats nodes, field 12
+//! outputs. A value inside the graph becomes an output by being named there, which every engine understands, and what
+//! no output needs any longer is not computed.
+
+use gs_io::{Error, Result};
+use std::collections::BTreeMap;
+use std::ops::Range;
+
+const MODEL_GRAPH: u64 = 7;
+const GRAPH_NODE: u64 = 1;
+const GRAPH_INITIALIZER: u64 = 5;
+const GRAPH_OUTPUT: u64 = 12;
+const NODE_INPUT: u64 = 1;
+const NODE_OUTPUT: u64 = 2;
+const NODE_OP_TYPE: u64 = 4;
+const VALUE_NAME: u64 = 1;
+/// TensorProto.data_location, 1 for a separate file.
+const TENSOR_LOCATION: u64 = 14;
+
+/// One operator of the graph.
+#[derive(Debug, Clone, Default, PartialEq)]
+pub struct Node {
+    /// Operator, such as `Gather`.
+    pub op: String,
+    /// Names of the values it reads.
+    pub inputs: Vec<String>,
+    /// Names of the values it makes.
+    pub outputs: Vec<String>,
+}
+
+/// The nodes and outputs of an ONNX file.
+#[derive(Debug, Clone, Default, PartialEq)]
+pub struct Graph {
+    /// Operators by the name of a value they make.
+    pub producers: BTreeMap<String, Node>,
+    /// Names of the declared outputs.
+    pub outputs: Vec<String>,
+    /// Whether weights lie in a separate file.
+    pub external_data: bool,
+}
+
+/// A field of a protobuf message: number, what it holds, and the bytes of the whole field.
+struct Field {
+    number: u64,
+    value: Value,
+    whole: Range<usize>,
+}
+
+enum Value {
+    Varint(u64),
+    Bytes(Range<usize>),
+    Other,
+}
+
+fn damaged() -> Error {
+    Error::new("not an ONNX model").hint("give an .onnx file; a text file of a few lines is a Git LFS pointer")
+}
+
+fn varint(bytes: &[u8], at: &mut usize) -> Result<u64> {
+    let mut value = 0u64;
+    for shift in (0..64).step_by(7) {
+        let &b = bytes.get(*at).ok_or_else(damaged)?;
+        *at += 1;
+        value |= u64::from(b & 127) << shift;
+        if b < 128 {
+            return Ok(value);
+        }
+    }
+    Err(damaged())
+}
+
+fn fields(bytes: &[u8], range: Range<usize>) -> Result<Vec<Field>> {
+    let message = bytes.get(..range.end).ok_or_else(damaged)?;
+    let mut at = range.start;
+    let mut found = Vec::new();
+    while at < range.end {
+        let start = at;
+        let tag = varint(message, &mut at)?;
+        let value = match tag & 7 {
+            0 => Value::Varint(varint(message, &mut at)?),
+            2 => {
+                let len = usize::try_from(varint(message, &mut at)?).map_err(|_| damaged())?;
+                let begin = at;
+                at = begin.checked_add(len).filter(|&e| e <= range.end).ok_or_else(damaged)?;
+                Value::Bytes(begin..at)
+            }
+            size @ (1 | 5) => {
+                at += if size == 1 { 8 } else { 4 };
+                Value::Other
+            }
+            _ => return Err(damaged()),
+        };
+        if at > range.end {
+            return Err(damaged());
+        }
+        found.push(Field { number: tag >> 3, value, whole: start..at });
+    }
+    Ok(found)
+}
+
+fn text(bytes: &[u8], range: &Range<usize>) -> Result<String> {
+    std::str::from_utf8(&bytes[range.clone()]).map(ToString::to_string).map_err(|_| damaged())
+}
+
+fn graph_range(bytes: &[u8]) -> Result<(Range<usize>, Range<usize>)> {
+    let model = fields(bytes, 0..bytes.len())?;
+    let mut graphs = model.into_iter().filter(|f| f.number == MODEL_GRAPH);
+    match (graphs.next(), graphs.next()) {
+        (Some(Field { value: Value::Bytes(inner), whole, .. }), None) => Ok((inner, whole)),
+        _ => Err(damaged()),
+    }
+}
+
+fn push_varint(out: &mut Vec<u8>, mut v: u64) {
+    while v >= 128 {
+        out.push(v as u8 | 128);
+        v >>= 7;
+    }
+    out.push(v as u8);
+}
+
+fn push_bytes(out: &mut Vec<u8>, number: u64, bytes: &[u8]) {
+    push_varint(out, number << 3 | 2);
+    push_varint(out, bytes.len() as u64);
+    out.extend_from_slice(bytes);
+}
+
+impl Graph {
+    /// Reads nodes and outputs from the bytes of an ONNX file.
+    ///
+    /// # Errors
+    /// When the bytes are not an ONNX model.
+    pub fn parse(bytes: &[u8]) -> Result<Self> {
+        let (range, _) = graph_range(bytes)?;
+        let mut graph = Self::default();
+        for field in fields(bytes, range)? {
+            let Value::Bytes(inner) = field.value else { continue };
+            match field.number {
+                GRAPH_NODE => {
+                    let mut node = Node::default();
+                    for f in fields(bytes, inner)? {
+                        match (f.number, &f.value) {
+                            (NODE_INPUT, Value::Bytes(r)) => node.inputs.push(text(bytes, r)?),
+                            (NODE_OUTPUT, Value::Bytes(r)) => node.outputs.push(text(bytes, r)?),
+                            (NODE_OP_TYPE, Value::Bytes(r)) => node.op = text(bytes, r)?,
+                            _ => {}
+                        }
+                    }
+                    for output in &node.outputs {
+                        graph.producers.insert(output.clone(), node.clone());
+                    }
+                }
+                GRAPH_OUTPUT => {
+                    for f in fields(bytes, inner)? {
+                        if let (VALUE_NAME, Value::Bytes(r)) = (f.number, &f.value) {
+                            graph.outputs.push(text(bytes, r)?);
+                        }
+                    }
+                }
+                GRAPH_INITIALIZER => {
+                    let external = |f: &Field| f.number == TENSOR_LOCATION && matches!(f.value, Value::Varint(1));
+                    graph.external_data |= fields(bytes, inner)?.iter().any(external);
+                }
+                _ => {}
+            }
+        }
+        if graph.outputs.is_empty() {
+            return Err(damaged());
+        }
+        Ok(graph)
+    }
+
+    /// The same model with the values `names` as its only outputs.
+    ///
+    /// # Errors
+    /// When no node makes such a value.
+    pub fn with_outputs(&self, bytes: &[u8], names: &[&str]) -> Result<Vec<u8>> {
+        if let Some(name) = names.iter().find(|n| !self.producers.contains_key(**n)) {
+            return Err(Error::new("the model has no such value")
+                .field(*name)
+                .expected(format!("an output such as {}", self.outputs.join(", "))));
+        }
+        let (range, whole) = graph_range(bytes)?;
+        let mut graph = Vec::with_capacity(range.len());
+        for field in fields(bytes, range)? {
+            if field.number != GRAPH_OUTPUT {
+                graph.extend_from_slice(&bytes[field.whole]);
+            }
+        }
+        for name in names {
+            let mut value = Vec::new();
+            push_bytes(&mut value, VALUE_NAME, name.as_bytes());
+            push_bytes(&mut graph, GRAPH_OUTPUT, &value);
+        }
+        let mut model = bytes[..whole.start].to_vec();
+        push_bytes(&mut model, MODEL_GRAPH, &graph);
+        model.extend_from_slice(&bytes[whole.end..]);
+        Ok(model)
+    }
+
+    /// The operator that makes the value `name`.
+    pub fn producer(&self, name: &str) -> Option<&Node> {
+        self.producers.get(name)
+    }
+}
