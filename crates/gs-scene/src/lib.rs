@@ -7,7 +7,16 @@
 //! * Transforms are named `target_from_source`: `camera_from_world * p_world = p_camera`.
 
 mod camera;
+pub mod colmap;
+pub mod dataset;
+mod distortion;
 mod gaussians;
+mod image;
+pub mod ply;
+mod points;
 
 pub use camera::Camera;
+pub use distortion::Distortion;
 pub use gaussians::{Gaussians, SH_C0, sh_coefficients};
+pub use image::Image;
+pub use points::PointCloud;

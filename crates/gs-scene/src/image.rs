@@ -1,0 +1,191 @@
+//! Photographs and other pictures, as f32 RGB.
+
+use gs_io::{Error, IoContext, Result, write_atomic};
+use image::{DynamicImage, ImageReader};
+use rayon::prelude::*;
+use std::io::Cursor;
+use std::path::Path;
+
+/// Pixels that a picture may have at most: a guard against headers that lie.
+const MAX_PIXELS: u64 = 1 << 28;
+
+/// A picture: sRGB values as stored, not linearised.
+#[derive(Debug, Clone, Default, PartialEq)]
+pub struct Image {
+    /// Width in pixels.
+    pub width: u32,
+    /// Height in pixels.
+    pub height: u32,
+    /// `[height][width][rgb]`, 0 to 1.
+    pub rgb: Vec<f32>,
+    /// `[height][width]`, 0 to 1, where the file has an alpha channel.
+    pub alpha: Option<Vec<f32>>,
+}
+
+/// Width and height of a picture file, from its header.
+///
+/// # Errors
+/// When the file cannot be read or is no picture.
+pub fn size_of(path: impl AsRef<Path>) -> Result<(u32, u32)> {
+    let path = path.as_ref();
+    let reader = ImageReader::open(path).at("open", path)?.with_guessed_format().at("read", path)?;
+    reader.into_dimensions().map_err(|e| unreadable(path, &e))
+}
+
+fn unreadable(path: &Path, e: &dyn std::fmt::Display) -> Error {
+    Error::new(format!("not a readable picture: {e}"))
+        .file(path)
+        .expected("a PNG or JPEG")
+        .hint("convert or copy it again")
+}
+
+impl Image {
+    /// An image of `width` x `height` pixels from 8-bit RGB.
+    ///
+    /// # Panics
+    /// When `data` is not `3 * width * height` long.
+    pub fn from_rgb8(width: u32, height: u32, data: &[u8]) -> Self {
+        assert_eq!(data.len(), 3 * width as usize * height as usize);
+        Self { width, height, rgb: data.iter().map(|&v| f32::from(v) / 255.0).collect(), alpha: None }
+    }
+
+    /// The image as 8-bit RGB, rounded.
+    pub fn to_rgb8(&self) -> Vec<u8> {
+        self.rgb.iter().map(|&v| (v.clamp(0.0, 1.0) * 255.0 + 0.5) as u8).collect()
+    }
+
+    /// Reads a PNG or JPEG; EXIF orientation is ignored, as COLMAP does.
+    ///
+    /// # Errors
+    /// When the file cannot be read, is no picture, or is too large.
+    pub fn read(path: impl AsRef<Path>) -> Result<Self> {
+        let path = path.as_ref();
+        let (w, h) = size_of(path)?;
+        if u64::from(w) * u64::from(h) > MAX_PIXELS {
+            return Err(Error::new("the picture is too large")
+                .file(path)
+                .found(format!("{w}x{h}"))
+                .expected(format!("at most {MAX_PIXELS} pixels")));
+        }
+        let reader = ImageReader::open(path).at("open", path)?.with_guessed_format().at("read", path)?;
+        let decoded = reader.decode().map_err(|e| unreadable(path, &e))?;
+        if !decoded.color().has_alpha() {
+            return Ok(Self::from_rgb8(w, h, decoded.to_rgb8().as_raw()));
+        }
+        let rgba = decoded.to_rgba8();
+        let unit = |v: u8| f32::from(v) / 255.0;
+        Ok(Self {
+            width: w,
+            height: h,
+            rgb: rgba.pixels().flat_map(|p| [unit(p[0]), unit(p[1]), unit(p[2])]).collect(),
+            alpha: Some(rgba.pixels().map(|p| unit(p[3])).collect()),
+        })
+    }
+
+    /// The image as a PNG in memory, 8 bits a channel, without alpha.
+    pub fn to_png(&self) -> Vec<u8> {
+        let buffer = image::RgbImage::from_raw(self.width, self.height, self.to_rgb8()).expect("the sizes fit");
+        let mut png = Cursor::new(Vec::new());
+        DynamicImage::from(buffer).write_to(&mut png, image::ImageFormat::Png).expect("writing to memory");
+        png.into_inner()
+    }
+
+    /// Writes a PNG, 8 bits a channel, without alpha.
+    ///
+    /// # Errors
+    /// When the file cannot be written.
+    pub fn write_png(&self, path: impl AsRef<Path>) -> Result<()> {
+        let path = path.as_ref();
+        let png = self.to_png();
+        write_atomic(path, |w| w.write_all(&png).at("write", path))
+    }
+
+    /// The image at another size; each new pixel is the mean of the area it covers (bilinear where the image grows).
+    #[must_use]
+    pub fn resize_area(&self, width: u32, height: u32) -> Self {
+        if (width, height) == (self.width, self.height) {
+            return self.clone();
+        }
+        let size = (self.width as usize, self.height as usize);
+        let to = (width as usize, height as usize);
+        Self {
+            width,
+            height,
+            rgb: resize_planes(&self.rgb, 3, size, to),
+            alpha: self.alpha.as_ref().map(|a| resize_planes(a, 1, size, to)),
+        }
+    }
+
+    /// Bilinear value of channel values at pixel coordinates (centres at +0.5), the border repeated.
+    pub fn sample(&self, x: f64, y: f64) -> [f32; 3] {
+        let (w, h) = (self.width as usize, self.height as usize);
+        let mut out = [0.0; 3];
+        for (at, weight) in corners(x, y, w, h) {
+            for c in 0..3 {
+                out[c] += weight * self.rgb[3 * at + c];
+            }
+        }
+        out
+    }
+
+    /// Bilinear alpha at pixel coordinates; 1 without an alpha channel.
+    pub fn sample_alpha(&self, x: f64, y: f64) -> f32 {
+        let (w, h) = (self.width as usize, self.height as usize);
+        self.alpha.as_ref().map_or(1.0, |a| corners(x, y, w, h).iter().map(|&(at, weight)| weight * a[at]).sum())
+    }
+}
+
+/// The four pixels around a point and their bilinear weights.
+fn corners(x: f64, y: f64, w: usize, h: usize) -> [(usize, f32); 4] {
+    let (x, y) = ((x - 0.5).clamp(0.0, (w - 1) as f64), (y - 0.5).clamp(0.0, (h - 1) as f64));
+    let (x0, y0) = (x.floor() as usize, y.floor() as usize);
+    let (fx, fy) = ((x - x0 as f64) as f32, (y - y0 as f64) as f32);
+    let (x1, y1) = ((x0 + 1).min(w - 1), (y0 + 1).min(h - 1));
+    [
+        (y0 * w + x0, (1.0 - fx) * (1.0 - fy)),
+        (y0 * w + x1, fx * (1.0 - fy)),
+        (y1 * w + x0, (1.0 - fx) * fy),
+        (y1 * w + x1, fx * fy),
+    ]
+}
+
+/// Weights of source pixels per target pixel along one axis.
+fn axis_weights(from: usize, to: usize) -> Vec<Vec<(usize, f32)>> {
+    let scale = from as f64 / to as f64;
+    (0..to)
+        .map(|t| {
+            if scale <= 1.0 {
+                let x = ((t as f64 + 0.5) * scale - 0.5).clamp(0.0, (from - 1) as f64);
+                let i = x.floor() as usize;
+                let f = (x - i as f64) as f32;
+                return vec![(i, 1.0 - f), ((i + 1).min(from - 1), f)];
+            }
+            let (a, b) = (t as f64 * scale, (t + 1) as f64 * scale);
+            let last = (b.ceil() as usize).min(from);
+            (a.floor() as usize..last)
+                .map(|i| (i, ((b.min((i + 1) as f64) - a.max(i as f64)) / scale) as f32))
+                .collect()
+        })
+        .collect()
+}
+
+fn resize_planes(data: &[f32], channels: usize, (w, h): (usize, usize), (to_w, to_h): (usize, usize)) -> Vec<f32> {
+    let (wx, wy) = (axis_weights(w, to_w), axis_weights(h, to_h));
+    let mut out = vec![0.0; to_w * to_h * channels];
+    out.par_chunks_mut(to_w * channels).zip(&wy).for_each(|(row, rows)| {
+        let mut line = vec![0.0f32; w * channels];
+        for &(y, weight) in rows {
+            for (l, s) in line.iter_mut().zip(&data[y * w * channels..(y + 1) * w * channels]) {
+                *l += weight * s;
+            }
+        }
+        for (x, cols) in wx.iter().enumerate() {
+            for &(i, weight) in cols {
+                for c in 0..channels {
+                    row[x * channels + c] += weight * line[i * channels + c];
+                }
+            }
+        }
+    });
+    out
+}
