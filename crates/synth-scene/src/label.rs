@@ -1,0 +1,48 @@
+//! Polygon labels of a view in LERF-OVS's form (ISAT JSON).
+
+use crate::polygon;
+use crate::render::Frame;
+use crate::scene::Scene;
+use gs_io::{Error, Result, write_bytes};
+use serde_json::json;
+use std::path::Path;
+
+/// An object of which a view shows fewer pixels is not labelled in it.
+pub const SMALLEST: usize = 40;
+/// A separate piece of an object with fewer pixels is not labelled.
+const SMALLEST_PIECE: usize = 6;
+
+/// Writes polygons around what `frame` shows of each object; background is not labelled.
+///
+/// # Errors
+/// When the file cannot be written.
+pub fn write(path: &Path, image: &str, scene: &Scene, frame: &Frame) -> Result<()> {
+    let mut objects = Vec::new();
+    for (t, thing) in scene.things.iter().enumerate().filter(|(_, t)| !t.background) {
+        let inside: Vec<bool> = frame.thing.iter().map(|&i| i == t as i32).collect();
+        if inside.iter().filter(|&&i| i).count() < SMALLEST {
+            continue;
+        }
+        for line in polygon::trace(&inside, frame.width, frame.height, SMALLEST_PIECE) {
+            let range = |axis: usize| {
+                line.iter().map(|p| p[axis]).fold((i32::MAX, i32::MIN), |(low, high), v| (low.min(v), high.max(v)))
+            };
+            let ((x0, x1), (y0, y1)) = (range(0), range(1));
+            objects.push(json!({
+                "category": thing.name,
+                "group": t,
+                "segmentation": line,
+                "bbox": [x0, y0, x1, y1],
+                "layer": objects.len() as f64 + 1.0,
+                "iscrowd": false,
+                "note": "",
+            }));
+        }
+    }
+    let info = json!({
+        "description": "ISAT", "name": image, "width": frame.width, "height": frame.height, "depth": 3, "note": "",
+    });
+    let json = serde_json::to_vec(&json!({ "info": info, "objects": objects }))
+        .map_err(|e| Error::new(e.to_string()).file(path))?;
+    write_bytes(path, &json)
+}

@@ -1,0 +1,321 @@
+//! Where things stand: a room, tables, and things that do not touch each other on tables, floor and walls.
+
+use crate::catalogue::{self, CLASSES, Class, Naming, Place};
+use crate::material::{PAINTS, albedo};
+use crate::model::Model;
+use crate::scene::{Scene, SceneBuilder, Thing};
+use glam::{DVec2, DVec3};
+use rand::Rng;
+use rand::seq::SliceRandom;
+use rand_chacha::ChaCha8Rng;
+use std::f64::consts::{FRAC_PI_2, TAU};
+
+/// Height of the table tops in metres.
+pub const TABLE_HEIGHT: f64 = 0.72;
+const TABLE: [f64; 2] = [1.30, 0.95];
+/// Distance of the centres of neighbouring tables.
+const TABLE_SPACING: [f64; 2] = [2.8, 2.5];
+/// From the centres of the outer tables to the walls.
+const MARGIN: f64 = 2.45;
+const WALL_HEIGHT: f64 = 2.7;
+const PAINTING_HEIGHT: f64 = 1.12;
+/// Free space between two things, in metres.
+const GAP: f64 = 0.012;
+const TRIES: usize = 600;
+/// A table is planned for this many things.
+const PER_TABLE: usize = 10;
+/// One painting per ten things, up to this many.
+const MOST_PAINTINGS: usize = 4;
+
+const ORDINALS: [&str; 9] = ["second", "third", "fourth", "fifth", "sixth", "seventh", "eighth", "ninth", "tenth"];
+const WALLS: [(&str, [f64; 3]); 4] = [
+    ("white", [0.87, 0.86, 0.83]),
+    ("green", [0.70, 0.78, 0.68]),
+    ("yellow", [0.88, 0.82, 0.66]),
+    ("blue", [0.66, 0.75, 0.82]),
+];
+
+/// A rectangle on the ground, turned.
+#[derive(Debug, Clone, Copy)]
+struct Footprint {
+    centre: DVec2,
+    half: DVec2,
+    yaw: f64,
+}
+
+impl Footprint {
+    fn axes(&self) -> [DVec2; 2] {
+        let x = DVec2::from_angle(self.yaw);
+        [x, x.perp()]
+    }
+
+    fn corners(&self) -> [DVec2; 4] {
+        let [x, y] = self.axes();
+        let (x, y) = (x * self.half.x, y * self.half.y);
+        [self.centre + x + y, self.centre + x - y, self.centre - x + y, self.centre - x - y]
+    }
+
+    /// Whether the two come closer than `gap`, by separating axes.
+    fn touches(&self, other: &Self, gap: f64) -> bool {
+        let span = |corners: [DVec2; 4], axis: DVec2| {
+            corners
+                .iter()
+                .map(|c| c.dot(axis))
+                .fold((f64::INFINITY, f64::NEG_INFINITY), |(l, h), v| (l.min(v), h.max(v)))
+        };
+        self.axes().into_iter().chain(other.axes()).all(|axis| {
+            let (a, b) = (span(self.corners(), axis), span(other.corners(), axis));
+            a.0 < b.1 + gap && b.0 < a.1 + gap
+        })
+    }
+
+    fn within(&self, centre: DVec2, half: DVec2) -> bool {
+        self.corners().iter().all(|&c| (c - centre).abs().cmple(half).all())
+    }
+}
+
+/// A thing that has been chosen but not placed.
+struct Chosen {
+    class: &'static Class,
+    paint: usize,
+    model: Model,
+    at: Option<(DVec3, f64)>,
+}
+
+/// A scene with `objects` things besides floor, walls and tables.
+pub fn plan(objects: usize, rng: &mut ChaCha8Rng) -> Scene {
+    let mut chosen = choose(objects, rng);
+    let on_tables = chosen.iter().filter(|c| c.class.place == Place::Table).count();
+    let mut tables = on_tables.div_ceil(PER_TABLE).max(1);
+    // A table may turn out too small for its things; another table always helps.
+    let (centres, room) = loop {
+        let (centres, room) = floor_plan(tables);
+        if arrange(&mut chosen, &centres, room, rng) {
+            break (centres, room);
+        }
+        tables += 1;
+    };
+    let mut scene = SceneBuilder::default();
+    background(&mut scene, &centres, room, rng);
+    let mut repeated = vec![0usize; CLASSES.len()];
+    let class_index = |c: &Class| CLASSES.iter().position(|d| d.name == c.name).unwrap_or(0);
+    for c in &chosen {
+        repeated[class_index(c.class)] += 1;
+    }
+    for c in &chosen {
+        let Some((position, yaw)) = c.at else { continue };
+        let (x, y, height) = c.model.extent();
+        let color = PAINTS[c.paint].name;
+        let thing = Thing {
+            name: name_of(c.class, color, repeated[class_index(c.class)] > 1),
+            class: c.class.name,
+            color,
+            background: false,
+            parts: 0..0,
+            position,
+            yaw,
+            footprint: DVec2::new(x, y),
+            height,
+        };
+        scene.place(&c.model, thing);
+    }
+    scene.build(room, centres.iter().map(|c| c.extend(TABLE_HEIGHT)).collect())
+}
+
+fn name_of(class: &Class, color: &str, repeated: bool) -> String {
+    match class.naming {
+        Naming::Plain if !repeated => class.name.to_string(),
+        Naming::Of(before, after) => format!("{before} {color} {after}"),
+        Naming::Plain | Naming::Colored => format!("{color} {}", class.name),
+    }
+}
+
+/// Classes and colours: no pair twice, classes and colours as evenly used as can be.
+fn choose(objects: usize, rng: &mut ChaCha8Rng) -> Vec<Chosen> {
+    let on_walls = (objects / 10).min(MOST_PAINTINGS);
+    let on_floor = (objects / 8).max(1).min(objects - on_walls);
+    let mut used = Vec::new();
+    let mut paint_uses = [0usize; PAINTS.len()];
+    let mut all = Vec::new();
+    for (place, count) in
+        [(Place::Table, objects - on_floor - on_walls), (Place::Floor, on_floor), (Place::Wall, on_walls)]
+    {
+        let mut order: Vec<&'static Class> = CLASSES.iter().filter(|c| c.place == place).collect();
+        order.shuffle(rng);
+        let wanted = all.len() + count;
+        for class in order.into_iter().cycle() {
+            if all.len() == wanted {
+                break;
+            }
+            // A class whose colours are all taken is passed over; there are more pairs than things in any scene offered.
+            let free = |p: &&usize| !used.contains(&(class.name, **p));
+            let fewest = class.paints.iter().filter(free).map(|&p| paint_uses[p]).min();
+            let pick: Vec<usize> =
+                class.paints.iter().filter(free).copied().filter(|&p| Some(paint_uses[p]) == fewest).collect();
+            let Some(&paint) = pick.get(rng.random_range(0..pick.len().max(1))) else { continue };
+            used.push((class.name, paint));
+            paint_uses[paint] += 1;
+            all.push(Chosen { class, paint, model: (class.build)(&PAINTS[paint], rng), at: None });
+        }
+    }
+    all
+}
+
+/// Centres of the tables and half extents of the room around them.
+fn floor_plan(tables: usize) -> (Vec<DVec2>, DVec2) {
+    let columns = (tables as f64).sqrt().ceil() as usize;
+    let rows = tables.div_ceil(columns);
+    let spread = DVec2::new((columns - 1) as f64, (rows - 1) as f64) * DVec2::from_array(TABLE_SPACING) * 0.5;
+    let centres = (0..tables)
+        .map(|k| {
+            let (row, column) = (k / columns, k % columns);
+            // Every other row runs backwards, so that a walk from table to table is short.
+            let column = if row % 2 == 0 { column } else { columns - 1 - column };
+            DVec2::new(column as f64, row as f64) * DVec2::from_array(TABLE_SPACING) - spread
+        })
+        .collect();
+    (centres, spread + MARGIN)
+}
+
+/// Finds a place for everything; false when something does not fit.
+fn arrange(chosen: &mut [Chosen], tables: &[DVec2], room: DVec2, rng: &mut ChaCha8Rng) -> bool {
+    let table_half = 0.5 * DVec2::from_array(TABLE);
+    let mut on_table: Vec<Vec<Footprint>> = vec![Vec::new(); tables.len()];
+    let mut on_floor: Vec<Footprint> =
+        tables.iter().map(|&centre| Footprint { centre, half: table_half, yaw: 0.0 }).collect();
+    let mut on_wall: Vec<(usize, f64)> = Vec::new();
+    // The largest first: they find the fewest places.
+    let mut order: Vec<usize> = (0..chosen.len()).collect();
+    let area = |c: &Chosen| {
+        let (x, y, _) = c.model.extent();
+        x * y
+    };
+    order.sort_by(|&a, &b| area(&chosen[b]).total_cmp(&area(&chosen[a])).then(a.cmp(&b)));
+    for i in order {
+        let (x, y, _) = chosen[i].model.extent();
+        let half = DVec2::new(x, y);
+        let random = |rng: &mut ChaCha8Rng, half: DVec2| {
+            DVec2::new(rng.random::<f64>() * 2.0 - 1.0, rng.random::<f64>() * 2.0 - 1.0) * half
+        };
+        chosen[i].at = (0..TRIES).find_map(|_| match chosen[i].class.place {
+            Place::Table => {
+                // Fill the emptiest table, so that tables are alike.
+                let t = (0..tables.len()).min_by_key(|&t| (on_table[t].len(), t))?;
+                let yaw = rng.random::<f64>() * TAU;
+                let f = Footprint { centre: tables[t] + random(rng, table_half), half, yaw };
+                let fits = f.within(tables[t], table_half - 0.02) && !on_table[t].iter().any(|o| o.touches(&f, GAP));
+                fits.then(|| {
+                    on_table[t].push(f);
+                    (f.centre.extend(TABLE_HEIGHT), yaw)
+                })
+            }
+            Place::Floor => {
+                let yaw = FRAC_PI_2 * f64::from(rng.random_range(0..4)) + 0.5 * (rng.random::<f64>() - 0.5);
+                let f = Footprint { centre: random(rng, room), half, yaw };
+                let fits = f.within(DVec2::ZERO, room - 0.06) && !on_floor.iter().any(|o| o.touches(&f, 0.06));
+                fits.then(|| {
+                    on_floor.push(f);
+                    (f.centre.extend(0.0), yaw)
+                })
+            }
+            Place::Wall => {
+                let wall = rng.random_range(0..4usize);
+                let (length, distance) = if wall % 2 == 0 { (room.x, room.y) } else { (room.y, room.x) };
+                let along = (rng.random::<f64>() * 2.0 - 1.0) * (length - half.x - 0.3).min(tables.len() as f64 * 1.2);
+                let fits = !on_wall.iter().any(|&(w, a)| w == wall && (a - along).abs() < 2.0 * half.x + 0.1);
+                fits.then(|| {
+                    on_wall.push((wall, along));
+                    let yaw = FRAC_PI_2 * wall as f64;
+                    let at = DVec2::from_angle(yaw).rotate(DVec2::new(along, distance));
+                    (at.extend(PAINTING_HEIGHT), yaw)
+                })
+            }
+        });
+        if chosen[i].at.is_none() {
+            return false;
+        }
+    }
+    true
+}
+
+fn background(scene: &mut SceneBuilder, tables: &[DVec2], room: DVec2, rng: &mut ChaCha8Rng) {
+    let thing = |name: String, class, color, position, yaw, model: &Model| {
+        let (x, y, height) = model.extent();
+        Thing { name, class, color, background: true, parts: 0..0, position, yaw, footprint: DVec2::new(x, y), height }
+    };
+    let floor = catalogue::floor(room.to_array());
+    scene.place(&floor, thing("floor".into(), "floor", "brown", DVec3::ZERO, 0.0, &floor));
+    for (k, (color, srgb)) in WALLS.into_iter().enumerate() {
+        let (length, distance) = if k % 2 == 0 { (room.x, room.y) } else { (room.y, room.x) };
+        let yaw = FRAC_PI_2 * k as f64;
+        let at = DVec2::from_angle(yaw).rotate(DVec2::new(0.0, distance)).extend(0.0);
+        // A little longer than the room, so that walls meet behind its corners.
+        let wall = catalogue::wall(2.0 * length + 0.1, WALL_HEIGHT, albedo(srgb));
+        scene.place(&wall, thing(format!("{color} wall"), "wall", color, at, yaw, &wall));
+    }
+    for (k, &centre) in tables.iter().enumerate() {
+        let table = catalogue::table(TABLE, TABLE_HEIGHT, 0.85 + 0.3 * rng.random::<f64>());
+        let name = match k {
+            0 => "table".to_string(),
+            1..=9 => format!("{} table", ORDINALS[k - 1]),
+            _ => format!("table {}", k + 1),
+        };
+        scene.place(&table, thing(name, "table", "brown", centre.extend(0.0), 0.0, &table));
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::shape::ChartPoint;
+    use rand::SeedableRng;
+
+    #[test]
+    fn names_are_unique_and_counts_are_as_asked() {
+        for (objects, seed) in [(1, 0), (8, 1), (10, 2), (25, 3), (60, 4)] {
+            let scene = plan(objects, &mut ChaCha8Rng::seed_from_u64(seed));
+            assert_eq!(scene.things.iter().filter(|t| !t.background).count(), objects);
+            let mut names: Vec<&str> = scene.things.iter().map(|t| t.name.as_str()).collect();
+            names.sort_unstable();
+            let n = names.len();
+            names.dedup();
+            assert_eq!(names.len(), n, "{names:?}");
+            assert_eq!(scene.parts.len(), scene.things.iter().map(|t| t.parts.len()).sum::<usize>());
+        }
+    }
+
+    /// Points of every thing's surfaces must stay in its own column above its footprint, and columns must not meet.
+    #[test]
+    fn things_do_not_interpenetrate() {
+        for seed in 0..8 {
+            let scene = plan(20, &mut ChaCha8Rng::seed_from_u64(seed));
+            let column = |t: &Thing| Footprint { centre: t.position.truncate(), half: t.footprint, yaw: t.yaw };
+            for p in &scene.primitives {
+                let t = &scene.things[p.thing as usize];
+                if t.background {
+                    continue;
+                }
+                for face in 0..p.shape.faces() {
+                    for k in 0..100 {
+                        let at = ChartPoint { face, u: f64::from(k % 10) / 9.0, v: f64::from(k / 10) / 9.0 };
+                        let q = p.to_world(p.shape.surface(at).0) - t.position;
+                        let local = DVec2::from_angle(-t.yaw).rotate(q.truncate());
+                        assert!((local.abs() - t.footprint).max_element() < 1e-6, "{} leaves its footprint", t.name);
+                        assert!(q.z < t.height + 1e-6 && (t.class == "painting" || q.z > -2e-3), "{}: {}", t.name, q.z);
+                    }
+                }
+            }
+            let things: Vec<&Thing> = scene.things.iter().filter(|t| !t.background && t.class != "painting").collect();
+            for (i, a) in things.iter().enumerate() {
+                for b in &things[..i] {
+                    assert!(
+                        a.position.z != b.position.z || !column(a).touches(&column(b), 0.01),
+                        "{} and {}",
+                        a.name,
+                        b.name
+                    );
+                }
+            }
+        }
+    }
+}

@@ -1,0 +1,7 @@
+//! The `synth-scene` program.
+
+use std::process::ExitCode;
+
+fn main() -> ExitCode {
+    stage::main::<synth_scene::cli::Args>()
+}

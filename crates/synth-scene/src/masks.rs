@@ -1,0 +1,399 @@
+//! Id maps as a segmentation model would give them: masks of things at four levels, with the faults of real ones.
+//!
+//! Without faults, levels `default` and `large` show every thing whole, `medium` shows parts with same-named parts of
+//! a thing together ("cookies"), and `small` shows every part by itself. Three faults, each with its own knob:
+//! * granularity: with probability p a thing is shown otherwise in a view and level. On `default` and `large` it is
+//!   then, with equal chance, split into its parts or merged with its nearest free neighbour on the same ground; on
+//!   `small` and `medium` it is shown whole, or two of its parts become one. A thing without such a choice (one part,
+//!   no neighbour) stays as it is, and background is never merged;
+//! * boundaries: each mask shrinks or grows by up to so many pixels; masks painted later win;
+//! * missing masks.
+
+use crate::render::Frame;
+use crate::scene::Scene;
+use artifacts::{LEVELS, Level, MaskMaps, MaskTruth};
+use rand::Rng;
+use rand_chacha::ChaCha8Rng;
+use std::collections::BTreeMap;
+
+/// The knobs of the faults.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Faults {
+    /// Probability that a thing is shown at another granularity than the level's, 0 to 1.
+    pub granularity: f64,
+    /// Largest growth or shrinkage of a mask in pixels.
+    pub boundary: u32,
+    /// Probability that a mask is missing, 0 to 1.
+    pub missing: f64,
+}
+
+/// Masks of fewer pixels are not given, as segmentation models drop them.
+pub const SMALLEST: usize = 16;
+/// How far a neighbour to merge with may stand away, in metres between footprints' bounding circles.
+const NEIGHBOUR: f64 = 0.45;
+
+/// A mask before it is painted.
+struct Candidate {
+    /// Parts shown; their pixels make the mask.
+    parts: Vec<u32>,
+    truth: MaskTruth,
+}
+
+/// Id maps of one view and what each id shows, in the order of ids. Every id owns pixels.
+pub fn segment(scene: &Scene, frame: &Frame, faults: &Faults, rng: &mut ChaCha8Rng) -> (MaskMaps, Vec<MaskTruth>) {
+    let mut maps = MaskMaps { width: frame.width, height: frame.height, ids: Vec::new() };
+    let mut truth = Vec::new();
+    let mut visible = vec![0usize; scene.parts.len()];
+    for &p in frame.part.iter().filter(|&&p| p >= 0) {
+        visible[p as usize] += 1;
+    }
+    for level in Level::ALL {
+        let mut candidates = Vec::new();
+        for (parts, kind) in shown(scene, &visible, level, faults.granularity, rng) {
+            let pixels: usize = parts.iter().map(|&p| visible[p as usize]).sum();
+            // Draw for every mask, so that one mask's fate does not change the others'.
+            let lost = rng.random::<f64>() < faults.missing;
+            if pixels >= SMALLEST {
+                candidates.push((Candidate { truth: describe(scene, &parts, level, kind), parts }, lost, pixels));
+            }
+        }
+        // A level of a real file is never empty: the largest mask stays.
+        let largest = (0..candidates.len()).max_by_key(|&i| (candidates[i].2, i));
+        let kept: Vec<Candidate> = candidates
+            .into_iter()
+            .enumerate()
+            .filter(|(i, (_, lost, _))| !lost || Some(*i) == largest)
+            .map(|(_, (c, _, _))| c)
+            .collect();
+        let painted = paint(frame, &kept, scene.parts.len(), faults.boundary, rng);
+        let owned = compact(&painted, kept.len(), truth.len() as i32, &mut maps.ids);
+        truth.extend(kept.into_iter().zip(owned).filter(|(_, owned)| *owned).map(|(c, _)| c.truth));
+    }
+    debug_assert_eq!(maps.ids.len(), LEVELS * frame.width * frame.height);
+    (maps, truth)
+}
+
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum Kind {
+    Whole,
+    Part,
+    Merged,
+}
+
+/// The masks of a level as sets of parts. Only visible parts count.
+fn shown(scene: &Scene, visible: &[usize], level: Level, p: f64, rng: &mut ChaCha8Rng) -> Vec<(Vec<u32>, Kind)> {
+    let parts_of =
+        |t: usize| -> Vec<u32> { scene.things[t].parts.clone().filter(|&p| visible[p as usize] > 0).collect() };
+    let coarse = matches!(level, Level::Default | Level::Large);
+    // Draw for every thing of the scene, seen or not: what a thing shows does not depend on the others.
+    let draws: Vec<(bool, bool, f64)> =
+        scene.things.iter().map(|_| (rng.random::<f64>() < p, rng.random::<bool>(), rng.random())).collect();
+    let mut taken: Vec<bool> = (0..scene.things.len()).map(|t| parts_of(t).is_empty()).collect();
+    let mut out = Vec::new();
+    if coarse {
+        for t in 0..scene.things.len() {
+            if taken[t] || !draws[t].0 || !draws[t].1 {
+                continue;
+            }
+            if let Some(other) = nearest(scene, t, &taken) {
+                (taken[t], taken[other]) = (true, true);
+                let (a, b) = (t.min(other), t.max(other));
+                out.push(([parts_of(a), parts_of(b)].concat(), Kind::Merged));
+            }
+        }
+    }
+    for t in (0..scene.things.len()).filter(|&t| !taken[t]) {
+        let (odd, first_way, which) = draws[t];
+        let parts = parts_of(t);
+        let split = |group: bool| -> Vec<(Vec<u32>, Kind)> {
+            let mut groups: BTreeMap<(&str, u32), Vec<u32>> = BTreeMap::new();
+            for &part in &parts {
+                let key = if group { 0 } else { part };
+                groups.entry((scene.parts[part as usize].name, key)).or_default().push(part);
+            }
+            let mut masks: Vec<Vec<u32>> = groups.into_values().collect();
+            masks.sort();
+            let kind = if masks.len() == 1 { Kind::Whole } else { Kind::Part };
+            masks.into_iter().map(|m| (m, kind)).collect()
+        };
+        let whole = || vec![(parts.clone(), Kind::Whole)];
+        let masks = match (coarse, odd, first_way) {
+            (true, true, false) => split(false),
+            (true, _, _) | (false, true, true) => whole(),
+            (false, false, _) => split(level == Level::Medium),
+            (false, true, false) => {
+                let mut masks = split(level == Level::Medium);
+                if masks.len() > 2 {
+                    let at = (which * (masks.len() - 1) as f64) as usize;
+                    let (joined, _) = masks.remove(at + 1);
+                    masks[at].0.extend(joined);
+                    masks
+                } else {
+                    whole()
+                }
+            }
+        };
+        out.extend(masks);
+    }
+    out
+}
+
+/// The nearest free object on the same ground, if one is near.
+fn nearest(scene: &Scene, t: usize, taken: &[bool]) -> Option<usize> {
+    let a = &scene.things[t];
+    if a.background {
+        return None;
+    }
+    let gap = |b: &crate::scene::Thing| {
+        (a.position - b.position).truncate().length() - a.footprint.max_element() - b.footprint.max_element()
+    };
+    (0..scene.things.len())
+        .filter(|&o| o != t && !taken[o] && !scene.things[o].background)
+        .map(|o| (gap(&scene.things[o]), o))
+        .filter(|&(g, o)| g < NEIGHBOUR && (scene.things[o].position.z - a.position.z).abs() < 1e-9)
+        .min_by(|x, y| x.0.total_cmp(&y.0).then(x.1.cmp(&y.1)))
+        .map(|(_, o)| o)
+}
+
+fn describe(scene: &Scene, parts: &[u32], level: Level, kind: Kind) -> MaskTruth {
+    let mut instances: Vec<u32> = parts.iter().map(|&p| scene.parts[p as usize].thing).collect();
+    instances.sort_unstable();
+    instances.dedup();
+    let name = |t: &u32| scene.things[*t as usize].name.clone();
+    let caption = match kind {
+        Kind::Whole | Kind::Merged => instances.iter().map(name).collect::<Vec<_>>().join(" and "),
+        Kind::Part => {
+            let mut names: Vec<String> = Vec::new();
+            for &p in parts {
+                let part = scene.parts[p as usize].name;
+                let count = parts.iter().filter(|&&q| scene.parts[q as usize].name == part).count();
+                // "cookies", not "cookie and cookie"; names such as "legs" are plural already.
+                let word = if count > 1 { format!("{part}s") } else { part.to_string() };
+                if !names.contains(&word) {
+                    names.push(word);
+                }
+            }
+            format!("{} of the {}", names.join(" and "), name(&instances[0]))
+        }
+    };
+    MaskTruth {
+        level: level as u32,
+        part: (kind == Kind::Part && parts.len() == 1).then(|| parts[0]),
+        instances,
+        kind: match kind {
+            Kind::Whole => "whole",
+            Kind::Part => "part",
+            Kind::Merged => "merged",
+        }
+        .into(),
+        caption,
+    }
+}
+
+/// Paints the masks in their order, each grown or shrunk; returns positions in `masks`, -1 for none.
+fn paint(frame: &Frame, masks: &[Candidate], parts: usize, boundary: u32, rng: &mut ChaCha8Rng) -> Vec<i32> {
+    let mut owner = vec![-1i32; parts];
+    for (i, m) in masks.iter().enumerate() {
+        for &p in &m.parts {
+            owner[p as usize] = i as i32;
+        }
+    }
+    let exact: Vec<i32> = frame.part.iter().map(|&p| if p < 0 { -1 } else { owner[p as usize] }).collect();
+    if boundary == 0 {
+        return exact;
+    }
+    let mut out = vec![-1; exact.len()];
+    let mut pixels: Vec<Vec<usize>> = vec![Vec::new(); masks.len()];
+    for (at, &id) in exact.iter().enumerate().filter(|(_, id)| **id >= 0) {
+        pixels[id as usize].push(at);
+    }
+    for (id, mut mask) in pixels.into_iter().enumerate() {
+        let change = rng.random_range(-(boundary as i64)..=boundary as i64);
+        if change < 0 {
+            let whole = mask.clone();
+            for _ in 0..-change {
+                mask = eroded(&mask, frame.width, frame.height);
+            }
+            // What is only a few pixels wide does not vanish.
+            if mask.len() < SMALLEST {
+                mask = whole;
+            }
+        }
+        for _ in 0..change {
+            mask = dilated(&mask, frame.width, frame.height);
+        }
+        for at in mask {
+            out[at] = id as i32;
+        }
+    }
+    out
+}
+
+fn neighbours(at: usize, width: usize, height: usize) -> impl Iterator<Item = usize> {
+    let (x, y) = (at % width, at / width);
+    [
+        (x > 0).then(|| at - 1),
+        (x + 1 < width).then(|| at + 1),
+        (y > 0).then(|| at - width),
+        (y + 1 < height).then(|| at + width),
+    ]
+    .into_iter()
+    .flatten()
+}
+
+/// Pixels all of whose four neighbours are in the mask too; beyond the image counts as within. `mask` ascends.
+fn eroded(mask: &[usize], width: usize, height: usize) -> Vec<usize> {
+    mask.iter().copied().filter(|&at| neighbours(at, width, height).all(|n| mask.binary_search(&n).is_ok())).collect()
+}
+
+/// The mask with all four neighbours of its pixels, ascending.
+fn dilated(mask: &[usize], width: usize, height: usize) -> Vec<usize> {
+    let mut all: Vec<usize> = mask.iter().flat_map(|&at| neighbours(at, width, height).chain([at])).collect();
+    all.sort_unstable();
+    all.dedup();
+    all
+}
+
+/// Appends a level with ids from `first` on, skipping masks that own no pixel; says which own some.
+fn compact(painted: &[i32], masks: usize, first: i32, ids: &mut Vec<i32>) -> Vec<bool> {
+    let mut owned = vec![false; masks];
+    for &m in painted.iter().filter(|&&m| m >= 0) {
+        owned[m as usize] = true;
+    }
+    let mut next = first;
+    let new: Vec<i32> = owned
+        .iter()
+        .map(|&o| {
+            next += i32::from(o);
+            next - 1
+        })
+        .collect();
+    ids.extend(painted.iter().map(|&m| if m < 0 { -1 } else { new[m as usize] }));
+    owned
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::cameras::{self, Path};
+    use crate::light::LightMap;
+    use crate::{layout, render};
+    use rand::SeedableRng;
+    use std::sync::OnceLock;
+
+    const EXACT: Faults = Faults { granularity: 0.0, boundary: 0, missing: 0.0 };
+
+    fn example() -> &'static (Scene, Frame) {
+        static ONCE: OnceLock<(Scene, Frame)> = OnceLock::new();
+        ONCE.get_or_init(|| {
+            let mut rng = ChaCha8Rng::seed_from_u64(5);
+            let scene = layout::plan(10, &mut rng);
+            let light = LightMap::bake(&scene);
+            let cameras = cameras::place(&scene, Path::Ring, 4, 240, 180, &mut rng);
+            let frame = render::render(&scene, &light, &cameras[1]);
+            (scene, frame)
+        })
+    }
+
+    fn rng() -> ChaCha8Rng {
+        ChaCha8Rng::seed_from_u64(11)
+    }
+
+    /// Ids count on from level to level, each owns pixels and has its truth at its position.
+    fn check_ids(maps: &MaskMaps, truth: &[MaskTruth]) {
+        assert_eq!(maps.id_count(), truth.len());
+        for level in Level::ALL {
+            let map = maps.level(level);
+            for (id, t) in truth.iter().enumerate() {
+                assert_eq!(map.contains(&(id as i32)), t.level == level as u32, "{id} {t:?}");
+            }
+            assert!(map.iter().any(|&id| id >= 0), "a level is never empty");
+        }
+    }
+
+    #[test]
+    fn without_faults_large_masks_are_things_and_small_masks_are_parts() {
+        let (scene, frame) = example();
+        let (maps, truth) = segment(scene, frame, &EXACT, &mut rng());
+        check_ids(&maps, &truth);
+        for (at, &thing) in frame.thing.iter().enumerate() {
+            for level in [Level::Default, Level::Large] {
+                let id = maps.level(level)[at];
+                if id >= 0 {
+                    assert_eq!(truth[id as usize].instances, [thing as u32]);
+                    assert_eq!(truth[id as usize].caption, scene.things[thing as usize].name);
+                } else {
+                    assert!(frame.thing.iter().filter(|&&t| t == thing).count() < SMALLEST);
+                }
+            }
+            let id = maps.level(Level::Small)[at];
+            if id >= 0 {
+                let t = &truth[id as usize];
+                assert!(t.kind == "whole" || t.part == Some(frame.part[at] as u32));
+            }
+        }
+    }
+
+    #[test]
+    fn granularity_alone_changes_what_masks_show_but_no_boundary_of_parts() {
+        let (scene, frame) = example();
+        let (maps, truth) = segment(scene, frame, &Faults { granularity: 1.0, ..EXACT }, &mut rng());
+        check_ids(&maps, &truth);
+        let large: Vec<&MaskTruth> = truth.iter().filter(|t| t.level == 3).collect();
+        assert!(large.iter().any(|t| t.kind == "merged" && t.instances.len() == 2 && t.caption.contains(" and ")));
+        assert!(large.iter().any(|t| t.kind == "part" && t.caption.contains(" of the ")));
+        assert!(truth.iter().any(|t| t.level == 1 && t.kind == "whole"));
+        // A part is never cut: its pixels all have one id.
+        for level in Level::ALL {
+            let mut id_of = BTreeMap::new();
+            for (at, &part) in frame.part.iter().enumerate() {
+                let id = maps.level(level)[at];
+                assert_eq!(*id_of.entry(part).or_insert(id), id);
+            }
+        }
+    }
+
+    #[test]
+    fn boundary_alone_moves_edges_by_a_few_pixels() {
+        let (scene, frame) = example();
+        let (exact, _) = segment(scene, frame, &EXACT, &mut rng());
+        let (moved, truth) = segment(scene, frame, &Faults { boundary: 2, ..EXACT }, &mut rng());
+        check_ids(&moved, &truth);
+        let changed = exact.ids.iter().zip(&moved.ids).filter(|(a, b)| a != b).count();
+        assert!(changed > 100 && changed < exact.ids.len() / 5, "{changed} of {}", exact.ids.len());
+        for (at, &id) in moved.level(Level::Large).iter().enumerate().filter(|(_, id)| **id >= 0) {
+            let thing = truth[id as usize].instances[0] as i32;
+            let (x, y) = ((at % frame.width) as i64, (at / frame.width) as i64);
+            let near = (-2..=2i64).any(|dy| {
+                (-2..=2i64).any(|dx| {
+                    let (x, y) = (x + dx, y + dy);
+                    (0..frame.width as i64).contains(&x)
+                        && (0..frame.height as i64).contains(&y)
+                        && frame.thing[y as usize * frame.width + x as usize] == thing
+                })
+            });
+            assert!(near, "no further than two pixels");
+        }
+    }
+
+    #[test]
+    fn missing_alone_drops_whole_masks() {
+        let (scene, frame) = example();
+        let (_, all) = segment(scene, frame, &EXACT, &mut rng());
+        let (maps, half) = segment(scene, frame, &Faults { missing: 0.5, ..EXACT }, &mut rng());
+        check_ids(&maps, &half);
+        assert!(half.len() > all.len() / 4 && half.len() < 3 * all.len() / 4, "{} of {}", half.len(), all.len());
+        assert!(half.iter().all(|t| all.contains(t)));
+        let (maps, none) = segment(scene, frame, &Faults { missing: 1.0, ..EXACT }, &mut rng());
+        check_ids(&maps, &none);
+        assert_eq!(none.len(), 4, "the largest of each level stays");
+    }
+
+    #[test]
+    fn growing_and_shrinking() {
+        let square: Vec<usize> = vec![11, 12, 13, 21, 22, 23, 31, 32, 33];
+        assert_eq!(eroded(&square, 10, 10), [22]);
+        assert_eq!(dilated(&[22], 10, 10), [12, 21, 22, 23, 32]);
+        assert_eq!(dilated(&[0], 10, 10), [0, 1, 10]);
+    }
+}

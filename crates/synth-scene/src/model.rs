@@ -1,0 +1,156 @@
+//! A thing in its own frame: named parts made of primitives. z is up, the origin is where it stands.
+
+use crate::material::Material;
+use crate::shape::Shape;
+use glam::{DMat3, DVec3};
+
+/// A primitive of a model.
+#[derive(Debug, Clone)]
+pub struct Piece {
+    /// Part it belongs to.
+    pub part: usize,
+    /// Its surface.
+    pub shape: Shape,
+    /// `model_from_piece`.
+    pub rotation: DMat3,
+    /// Where its origin lies in the model.
+    pub offset: DVec3,
+    /// What it is made of.
+    pub material: Material,
+}
+
+/// A thing made of parts, not yet placed.
+#[derive(Debug, Clone, Default)]
+pub struct Model {
+    /// Names of its parts; several may share a name, such as "cookie".
+    pub parts: Vec<&'static str>,
+    /// Its primitives.
+    pub pieces: Vec<Piece>,
+}
+
+impl Model {
+    /// Adds a part; returns its number.
+    pub fn part(&mut self, name: &'static str) -> usize {
+        self.parts.push(name);
+        self.parts.len() - 1
+    }
+
+    /// Adds an upright primitive.
+    pub fn add(&mut self, part: usize, shape: Shape, offset: [f64; 3], material: Material) {
+        self.add_turned(part, shape, offset, DMat3::IDENTITY, material);
+    }
+
+    /// Adds a rotated primitive.
+    pub fn add_turned(&mut self, part: usize, shape: Shape, offset: [f64; 3], rotation: DMat3, material: Material) {
+        self.pieces.push(Piece { part, shape, rotation, offset: DVec3::from_array(offset), material });
+    }
+
+    /// Adds a solid of revolution about the vertical through `offset`.
+    pub fn turn(&mut self, part: usize, profile: &[(f64, f64)], offset: [f64; 3], material: Material) {
+        for shape in Shape::turned(profile) {
+            self.add(part, shape, offset, material);
+        }
+    }
+
+    /// Adds a solid of revolution about a rotated axis.
+    pub fn turn_rotated(
+        &mut self,
+        part: usize,
+        profile: &[(f64, f64)],
+        offset: [f64; 3],
+        rotation: DMat3,
+        material: Material,
+    ) {
+        for shape in Shape::turned(profile) {
+            self.add_turned(part, shape, offset, rotation, material);
+        }
+    }
+
+    /// Adds a block with its lower side's centre at `foot`.
+    pub fn block(&mut self, part: usize, size: [f64; 3], round: f64, foot: [f64; 3], material: Material) {
+        let half = 0.5 * DVec3::from_array(size);
+        let shape = Shape::Block { half, round };
+        self.add(part, shape, [foot[0], foot[1], foot[2] + half.z], material);
+    }
+
+    /// Adds a round rod from `a` to `b`.
+    pub fn rod(&mut self, part: usize, a: [f64; 3], b: [f64; 3], radius: f64, material: Material) {
+        let (a, b) = (DVec3::from_array(a), DVec3::from_array(b));
+        let shape = Shape::Capsule { half: 0.5 * (b - a).length(), radius };
+        self.add_turned(part, shape, (0.5 * (a + b)).to_array(), z_towards(b - a), material);
+    }
+
+    /// The same model `factor` times as large.
+    #[must_use]
+    pub fn scaled(mut self, factor: f64) -> Self {
+        for piece in &mut self.pieces {
+            piece.offset *= factor;
+            piece.shape = piece.shape.scaled(factor);
+        }
+        self
+    }
+
+    /// Corners of the boxes around all pieces, in the model's frame.
+    fn corners(&self) -> impl Iterator<Item = DVec3> {
+        self.pieces.iter().flat_map(|piece| {
+            let (half, centre) = piece.shape.bounds();
+            (0..8).map(move |k| {
+                let sign = DVec3::new(f64::from(k & 1), f64::from(k >> 1 & 1), f64::from(k >> 2 & 1)) * 2.0 - 1.0;
+                piece.rotation * (centre + half * sign) + piece.offset
+            })
+        })
+    }
+
+    /// Half extents in x and y of an upright box around the origin that holds the model, and its height.
+    pub fn extent(&self) -> (f64, f64, f64) {
+        self.corners().fold((0.0, 0.0, 0.0), |(x, y, z), c| (c.x.abs().max(x), c.y.abs().max(y), c.z.max(z)))
+    }
+}
+
+impl Shape {
+    fn scaled(&self, k: f64) -> Self {
+        match *self {
+            Self::Block { half, round } => Self::Block { half: half * k, round: round * k },
+            Self::Ellipsoid { radii } => Self::Ellipsoid { radii: radii * k },
+            Self::Turned { from, to, from_normal, to_normal } => {
+                Self::Turned { from: from * k, to: to * k, from_normal, to_normal }
+            }
+            Self::Ring { major, minor, arc } => Self::Ring { major: major * k, minor: minor * k, arc },
+            Self::Capsule { half, radius } => Self::Capsule { half: half * k, radius: radius * k },
+        }
+    }
+}
+
+/// A rotation that takes z to `direction`.
+pub fn z_towards(direction: DVec3) -> DMat3 {
+    let z = direction.normalize_or(DVec3::Z);
+    let helper = if z.z.abs() < 0.9 { DVec3::Z } else { DVec3::X };
+    let x = helper.cross(z).normalize_or(DVec3::X);
+    DMat3::from_cols(x, z.cross(x), z)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_rod_joins_its_ends() {
+        let mut m = Model::default();
+        let p = m.part("rod");
+        m.rod(p, [0.1, 0.2, 0.3], [0.4, 0.0, 0.9], 0.01, Material::matt(DVec3::ONE));
+        let piece = &m.pieces[0];
+        let Shape::Capsule { half, .. } = piece.shape else { panic!("a capsule") };
+        let end = piece.rotation * DVec3::new(0.0, 0.0, half) + piece.offset;
+        assert!((end - DVec3::new(0.4, 0.0, 0.9)).length() < 1e-12);
+        assert!((z_towards(DVec3::new(0.3, -0.2, 0.1)).determinant() - 1.0).abs() < 1e-12);
+    }
+
+    #[test]
+    fn scaling_scales_the_extent() {
+        let mut m = Model::default();
+        let p = m.part("box");
+        m.block(p, [0.2, 0.4, 0.6], 0.01, [0.0; 3], Material::matt(DVec3::ONE));
+        let (x, y, z) = m.scaled(2.0).extent();
+        assert!((x - 0.2).abs() < 1e-12 && (y - 0.4).abs() < 1e-12 && (z - 1.2).abs() < 1e-12);
+    }
+}

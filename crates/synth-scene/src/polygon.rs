@@ -1,0 +1,233 @@
+//! Polygons around the pixels of a mask, as people draw labels: one closed line per connected piece.
+//!
+//! The line runs through the centres of border pixels, as OpenCV's contours do, so that OpenCV's `fillPoly` (which
+//! paints the line itself) gives back the very pixels. A hole is cut out by running to it, around it and back along
+//! the same way.
+
+/// A closed line through pixel centres, given as whole pixel coordinates.
+pub type Polygon = Vec<[i32; 2]>;
+
+/// The eight neighbours of a pixel, clockwise in the image from the right.
+const AROUND: [[i32; 2]; 8] = [[1, 0], [1, 1], [0, 1], [-1, 1], [-1, 0], [-1, -1], [0, -1], [1, -1]];
+
+/// Polygons around the pixels where `inside`, one per 8-connected piece of at least `smallest` pixels, from the top.
+pub fn trace(inside: &[bool], width: usize, height: usize, smallest: usize) -> Vec<Polygon> {
+    // A frame of empty pixels around the image saves all bounds checks.
+    let (w, h) = (width + 2, height + 2);
+    let mut piece = vec![0u32; w * h];
+    let filled = |x: i32, y: i32| {
+        (0..width as i32).contains(&x) && (0..height as i32).contains(&y) && inside[y as usize * width + x as usize]
+    };
+    let at = |p: [i32; 2]| (p[1] + 1) as usize * w + (p[0] + 1) as usize;
+    let mut count = 0;
+    let mut polygons = Vec::new();
+    for y in 0..height as i32 {
+        for x in 0..width as i32 {
+            if !filled(x, y) || piece[at([x, y])] != 0 {
+                continue;
+            }
+            count += 1;
+            let mut pixels = vec![[x, y]];
+            piece[at([x, y])] = count;
+            let mut next = 0;
+            while let Some(&[px, py]) = pixels.get(next) {
+                next += 1;
+                for [dx, dy] in AROUND {
+                    let q = [px + dx, py + dy];
+                    if filled(q[0], q[1]) && piece[at(q)] == 0 {
+                        piece[at(q)] = count;
+                        pixels.push(q);
+                    }
+                }
+            }
+            if pixels.len() >= smallest {
+                let own = |p: [i32; 2]| piece[at(p)] == count;
+                polygons.push(outline(&pixels, own));
+            }
+        }
+    }
+    polygons
+}
+
+/// The line around one connected piece, holes cut out.
+fn outline(pixels: &[[i32; 2]], own: impl Fn([i32; 2]) -> bool + Copy) -> Polygon {
+    let Some(&start) = pixels.iter().min_by_key(|p| (p[1], p[0])) else { return Vec::new() };
+    let mut line = border(start, [start[0] - 1, start[1]], own);
+    for (hole_left, y) in holes(pixels, own) {
+        // The pixel left of the hole's leftmost column lies on the hole's border. Going left from it meets the border
+        // of what is already drawn: the outer line, or a hole that begins further left.
+        let first = [hole_left - 1, y];
+        let mut last = first;
+        while own([last[0] - 1, y]) {
+            last[0] -= 1;
+        }
+        let Some(joint) = line.iter().position(|&p| p == last) else { continue };
+        let around = border(first, [hole_left, y], own);
+        let way: Vec<[i32; 2]> = (last[0]..=first[0]).map(|x| [x, y]).collect();
+        let detour = way.iter().copied().chain(around).chain([first]).chain(way.iter().rev().copied());
+        line.splice(joint + 1..joint + 1, detour.collect::<Vec<_>>());
+    }
+    straightened(&line)
+}
+
+/// Holes of a piece: the leftmost column and a row of it, ordered from the left.
+fn holes(pixels: &[[i32; 2]], own: impl Fn([i32; 2]) -> bool) -> Vec<(i32, i32)> {
+    let min = |i: usize| pixels.iter().map(|p| p[i]).min().unwrap_or(0) - 1;
+    let max = |i: usize| pixels.iter().map(|p| p[i]).max().unwrap_or(0) + 1;
+    let (x0, y0, x1, y1) = (min(0), min(1), max(0), max(1));
+    let w = (x1 - x0 + 1) as usize;
+    let at = |x: i32, y: i32| (y - y0) as usize * w + (x - x0) as usize;
+    let mut seen = vec![false; w * (y1 - y0 + 1) as usize];
+    let mut found = Vec::new();
+    // The first region met is the outside. Empty pixels connect by their sides, filled ones by corners too.
+    for y in y0..=y1 {
+        for x in x0..=x1 {
+            if own([x, y]) || seen[at(x, y)] {
+                continue;
+            }
+            let outside = x == x0 && y == y0;
+            let mut left = (x, y);
+            let mut stack = vec![[x, y]];
+            seen[at(x, y)] = true;
+            while let Some([px, py]) = stack.pop() {
+                left = left.min((px, py));
+                for [dx, dy] in [[1, 0], [-1, 0], [0, 1], [0, -1]] {
+                    let (qx, qy) = (px + dx, py + dy);
+                    if (x0..=x1).contains(&qx) && (y0..=y1).contains(&qy) && !own([qx, qy]) && !seen[at(qx, qy)] {
+                        seen[at(qx, qy)] = true;
+                        stack.push([qx, qy]);
+                    }
+                }
+            }
+            if !outside {
+                found.push(left);
+            }
+        }
+    }
+    found.sort_unstable();
+    found
+}
+
+/// Follows the border from pixel `start`, whose neighbour `empty` is not filled, until it comes round: Moore
+/// neighbour tracing, stopped when start is left the same way again.
+fn border(start: [i32; 2], empty: [i32; 2], own: impl Fn([i32; 2]) -> bool) -> Polygon {
+    let direction =
+        |from: [i32; 2], to: [i32; 2]| AROUND.iter().position(|d| [from[0] + d[0], from[1] + d[1]] == to).unwrap_or(0);
+    let step = |p: [i32; 2], from: usize| {
+        (1..=8).map(|k| (from + k) % 8).find(|&k| own([p[0] + AROUND[k][0], p[1] + AROUND[k][1]]))
+    };
+    let mut line = vec![start];
+    let Some(first) = step(start, direction(start, empty)) else { return line };
+    let (mut here, mut way) = (start, first);
+    loop {
+        here = [here[0] + AROUND[way][0], here[1] + AROUND[way][1]];
+        // Search on from the empty neighbour that the last search passed just before it found this pixel.
+        let Some(next) = step(here, (way + if way.is_multiple_of(2) { 5 } else { 4 }) % 8) else { return line };
+        if here == start && next == first {
+            return line;
+        }
+        line.push(here);
+        way = next;
+    }
+}
+
+/// The line without points in the middle of straight runs.
+fn straightened(line: &[[i32; 2]]) -> Polygon {
+    let n = line.len();
+    let toward = |a: [i32; 2], b: [i32; 2]| [(b[0] - a[0]).signum(), (b[1] - a[1]).signum()];
+    let bends = |i: usize| {
+        let (before, here, after) = (line[(i + n - 1) % n], line[i], line[(i + 1) % n]);
+        before != here && toward(before, here) != toward(here, after)
+    };
+    let kept: Polygon = (0..n).filter(|&i| bends(i)).map(|i| line[i]).collect();
+    if kept.is_empty() { line[..1].to_vec() } else { kept }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use rand::{Rng, SeedableRng};
+
+    /// What OpenCV's fillPoly does with whole coordinates: even-odd inside, and the line itself.
+    fn fill(polygon: &Polygon, width: usize, height: usize) -> Vec<bool> {
+        let mut out = vec![false; width * height];
+        let n = polygon.len();
+        for y in 0..height as i32 {
+            let mut crossings: Vec<f64> = (0..n)
+                .filter_map(|i| {
+                    let (a, b) = (polygon[i], polygon[(i + 1) % n]);
+                    let (low, high) = (a[1].min(b[1]), a[1].max(b[1]));
+                    (y >= low && y < high).then(|| {
+                        f64::from(a[0]) + f64::from(b[0] - a[0]) * f64::from(y - a[1]) / f64::from(b[1] - a[1])
+                    })
+                })
+                .collect();
+            crossings.sort_by(f64::total_cmp);
+            for pair in crossings.chunks_exact(2) {
+                for x in pair[0].ceil() as i32..=pair[1].floor() as i32 {
+                    out[y as usize * width + x as usize] = true;
+                }
+            }
+        }
+        for i in 0..n {
+            let (mut a, b) = (polygon[i], polygon[(i + 1) % n]);
+            let (dx, dy) = (b[0] - a[0], b[1] - a[1]);
+            assert!(dx == 0 || dy == 0 || dx.abs() == dy.abs(), "lines run in eight directions");
+            out[a[1] as usize * width + a[0] as usize] = true;
+            while a != b {
+                a = [a[0] + dx.signum(), a[1] + dy.signum()];
+                out[a[1] as usize * width + a[0] as usize] = true;
+            }
+        }
+        out
+    }
+
+    fn back(inside: &[bool], width: usize, height: usize) -> Vec<bool> {
+        let mut all = vec![false; width * height];
+        for p in trace(inside, width, height, 1) {
+            for (a, b) in all.iter_mut().zip(fill(&p, width, height)) {
+                *a |= b;
+            }
+        }
+        all
+    }
+
+    fn picture(rows: &[&str]) -> (Vec<bool>, usize, usize) {
+        (rows.iter().flat_map(|r| r.bytes().map(|b| b == b'#')).collect(), rows[0].len(), rows.len())
+    }
+
+    #[test]
+    fn pictures_come_back_exactly() {
+        let pictures: [&[&str]; 6] = [
+            &["#"],
+            &["####", "####"],
+            &["..#..", ".###.", "#####"],
+            &["######", "#....#", "#.##.#", "#....#", "######"],
+            &["########", "#.##.###", "########", "##.#..##", "########"],
+            &["#..##.", ".#..##", "..#...", "......", "######"],
+        ];
+        for p in pictures {
+            let (inside, w, h) = picture(p);
+            assert_eq!(back(&inside, w, h), inside, "{p:?}");
+        }
+    }
+
+    #[test]
+    fn random_blobs_come_back_exactly() {
+        let mut rng = rand_chacha::ChaCha8Rng::seed_from_u64(1);
+        for density in [0.3, 0.5, 0.7, 0.9] {
+            for _ in 0..200 {
+                let (w, h) = (rng.random_range(1..20), rng.random_range(1..20));
+                let inside: Vec<bool> = (0..w * h).map(|_| rng.random::<f64>() < density).collect();
+                assert_eq!(back(&inside, w, h), inside, "{w} x {h}: {inside:?}");
+            }
+        }
+    }
+
+    #[test]
+    fn small_pieces_are_left_out() {
+        let (inside, w, h) = picture(&["###...#", "###....", "###...."]);
+        let polygons = trace(&inside, w, h, 4);
+        assert_eq!(polygons, [vec![[0, 0], [2, 0], [2, 2], [0, 2]]]);
+    }
+}

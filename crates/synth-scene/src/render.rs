@@ -1,0 +1,107 @@
+//! Photographs by ray tracing, with what each pixel shows.
+
+use crate::light::LightMap;
+use crate::scene::{Hit, Scene};
+use glam::DVec3;
+use gs_scene::Camera;
+use rayon::prelude::*;
+
+/// What a camera sees.
+pub struct Frame {
+    /// Width in pixels.
+    pub width: usize,
+    /// Height in pixels.
+    pub height: usize,
+    /// The photograph, sRGB, `[height][width][3]`.
+    pub rgb: Vec<u8>,
+    /// Thing at each pixel's centre, -1 for none, `[height][width]`.
+    pub thing: Vec<i32>,
+    /// Part at each pixel's centre, -1 for none, `[height][width]`.
+    pub part: Vec<i32>,
+    /// Distance of the surface at each pixel's centre along the ray, infinite for none, `[height][width]`.
+    pub distance: Vec<f64>,
+}
+
+/// The four samples around a pixel's centre: a rotated grid, so that near-horizontal and near-vertical edges are
+/// smooth.
+const SAMPLES: [[f64; 2]; 4] = [[0.375, 0.125], [0.875, 0.375], [0.625, 0.875], [0.125, 0.625]];
+/// Brightness of the print.
+const EXPOSURE: f64 = 1.12;
+/// Sharpness of highlights.
+const GLOSS: f64 = 60.0;
+
+/// Renders the scene; the same bytes for any number of threads.
+pub fn render(scene: &Scene, light: &LightMap, camera: &Camera) -> Frame {
+    let (w, h) = (camera.width as usize, camera.height as usize);
+    struct Row {
+        rgb: Vec<u8>,
+        thing: Vec<i32>,
+        part: Vec<i32>,
+        distance: Vec<f64>,
+    }
+    let eye = camera.position();
+    let rows: Vec<Row> = (0..h)
+        .into_par_iter()
+        .map(|y| {
+            let mut row = Row {
+                rgb: Vec::with_capacity(3 * w),
+                thing: vec![-1; w],
+                part: vec![-1; w],
+                distance: vec![f64::INFINITY; w],
+            };
+            for x in 0..w {
+                let centre = scene.trace(eye, ray(camera, x as f64 + 0.5, y as f64 + 0.5), 0.0);
+                if let Some(hit) = centre {
+                    let p = &scene.primitives[hit.primitive];
+                    (row.thing[x], row.part[x], row.distance[x]) = (p.thing as i32, p.part as i32, hit.t);
+                }
+                let mut sum = DVec3::ZERO;
+                for [sx, sy] in SAMPLES {
+                    let direction = ray(camera, x as f64 + sx, y as f64 + sy);
+                    if let Some(hit) = scene.trace(eye, direction, 0.0) {
+                        // Each sample is clipped by itself, or bright ones would eat the edges around them.
+                        sum += (EXPOSURE * shade(scene, light, direction, &hit)).min(DVec3::ONE);
+                    }
+                }
+                row.rgb.extend((sum / SAMPLES.len() as f64).to_array().map(to_srgb8));
+            }
+            row
+        })
+        .collect();
+    let mut frame =
+        Frame { width: w, height: h, rgb: Vec::new(), thing: Vec::new(), part: Vec::new(), distance: Vec::new() };
+    for row in rows {
+        frame.rgb.extend(row.rgb);
+        frame.thing.extend(row.thing);
+        frame.part.extend(row.part);
+        frame.distance.extend(row.distance);
+    }
+    frame
+}
+
+/// Unit direction of the ray through (x, y) in pixels from the image's corner.
+pub fn ray(camera: &Camera, x: f64, y: f64) -> DVec3 {
+    let d = DVec3::new((x - camera.cx) / camera.fx, (y - camera.cy) / camera.fy, 1.0);
+    (camera.rotation.transpose() * d).normalize_or_zero()
+}
+
+/// Radiance towards the eye, linear.
+fn shade(scene: &Scene, light: &LightMap, direction: DVec3, hit: &Hit) -> DVec3 {
+    let p = &scene.primitives[hit.primitive];
+    let m = &p.material;
+    let here = light.at(scene, hit.primitive, hit.local);
+    let mut out = m.color(hit.local) * (here.diffuse + m.glow);
+    if m.specular > 0.0 && here.key > 0.0 {
+        let normal = p.rotation * p.shape.normal(hit.local);
+        let to_lamp = (light.key_lamp() - p.to_world(hit.local)).normalize_or_zero();
+        let half = (to_lamp - direction).normalize_or_zero();
+        out += DVec3::splat(m.specular * here.key * normal.dot(half).max(0.0).powf(GLOSS) * 3.0);
+    }
+    out
+}
+
+fn to_srgb8(linear: f64) -> u8 {
+    let c = linear.clamp(0.0, 1.0);
+    let s = if c <= 0.003_130_8 { 12.92 * c } else { 1.055 * c.powf(1.0 / 2.4) - 0.055 };
+    (255.0 * s + 0.5) as u8
+}

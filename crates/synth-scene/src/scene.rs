@@ -1,0 +1,183 @@
+//! A placed scene: things, their parts and the primitives they are made of, with ray queries.
+
+use crate::bvh::{Aabb, Bvh};
+use crate::material::Material;
+use crate::model::Model;
+use crate::shape::Shape;
+use glam::{DMat3, DVec2, DVec3};
+
+/// A thing of the scene: an object or background.
+#[derive(Debug, Clone)]
+pub struct Thing {
+    /// What it is called; unique in the scene.
+    pub name: String,
+    /// Its class.
+    pub class: &'static str,
+    /// Its main colour's name.
+    pub color: &'static str,
+    /// Whether it is floor, wall or table.
+    pub background: bool,
+    /// Its parts, as positions in [`Scene::parts`].
+    pub parts: std::ops::Range<u32>,
+    /// Where it stands.
+    pub position: DVec3,
+    /// Turn about z in radians.
+    pub yaw: f64,
+    /// Half extents of its footprint before the turn.
+    pub footprint: DVec2,
+    /// Height above its position.
+    pub height: f64,
+}
+
+/// A part of a thing.
+#[derive(Debug, Clone)]
+pub struct Part {
+    /// Its name, such as "handle".
+    pub name: &'static str,
+    /// The thing it belongs to.
+    pub thing: u32,
+}
+
+/// A surface placed in the world.
+#[derive(Debug, Clone)]
+pub struct Primitive {
+    /// The surface in its own frame.
+    pub shape: Shape,
+    /// `world_from_primitive`.
+    pub rotation: DMat3,
+    /// Origin of its frame in the world.
+    pub origin: DVec3,
+    /// What it is made of.
+    pub material: Material,
+    /// Part it belongs to, a position in [`Scene::parts`].
+    pub part: u32,
+    /// Thing it belongs to, a position in [`Scene::things`].
+    pub thing: u32,
+}
+
+impl Primitive {
+    /// A point of the world in the primitive's frame.
+    pub fn to_local(&self, world: DVec3) -> DVec3 {
+        self.rotation.transpose() * (world - self.origin)
+    }
+
+    /// A point of the primitive's frame in the world.
+    pub fn to_world(&self, local: DVec3) -> DVec3 {
+        self.rotation * local + self.origin
+    }
+
+    fn bounds(&self) -> Aabb {
+        let (half, centre) = self.shape.bounds();
+        let c = self.to_world(centre);
+        let r =
+            DMat3::from_cols(self.rotation.x_axis.abs(), self.rotation.y_axis.abs(), self.rotation.z_axis.abs()) * half;
+        // A little more than the shape, so that rounding loses no grazing ray.
+        Aabb { min: c - r - 1e-9, max: c + r + 1e-9 }
+    }
+}
+
+/// Where a ray meets the scene.
+#[derive(Debug, Clone, Copy)]
+pub struct Hit {
+    /// Distance along the ray.
+    pub t: f64,
+    /// The primitive met.
+    pub primitive: usize,
+    /// The point in the primitive's frame.
+    pub local: DVec3,
+}
+
+/// All that stands in a room.
+pub struct Scene {
+    /// Things, background first.
+    pub things: Vec<Thing>,
+    /// Parts, in the order of their things.
+    pub parts: Vec<Part>,
+    /// Primitives, in the order of their parts' things.
+    pub primitives: Vec<Primitive>,
+    /// Half extents of the room in x and y.
+    pub room: DVec2,
+    /// Centres of the table tops.
+    pub tables: Vec<DVec3>,
+    bvh: Bvh,
+}
+
+/// Collects placed things.
+#[derive(Default)]
+pub struct SceneBuilder {
+    things: Vec<Thing>,
+    parts: Vec<Part>,
+    primitives: Vec<Primitive>,
+}
+
+impl SceneBuilder {
+    /// Adds `model` turned by `yaw` at `position`. The parts of `thing` are filled in.
+    pub fn place(&mut self, model: &Model, mut thing: Thing) {
+        let (index, first) = (self.things.len() as u32, self.parts.len() as u32);
+        self.parts.extend(model.parts.iter().map(|&name| Part { name, thing: index }));
+        thing.parts = first..self.parts.len() as u32;
+        let turn = DMat3::from_rotation_z(thing.yaw);
+        self.primitives.extend(model.pieces.iter().map(|piece| Primitive {
+            shape: piece.shape.clone(),
+            rotation: turn * piece.rotation,
+            origin: turn * piece.offset + thing.position,
+            material: piece.material,
+            part: first + piece.part as u32,
+            thing: index,
+        }));
+        self.things.push(thing);
+    }
+
+    /// The scene, ready for rays.
+    pub fn build(self, room: DVec2, tables: Vec<DVec3>) -> Scene {
+        let boxes: Vec<Aabb> = self.primitives.iter().map(Primitive::bounds).collect();
+        let Self { things, parts, primitives } = self;
+        Scene { things, parts, primitives, room, tables, bvh: Bvh::new(&boxes) }
+    }
+}
+
+impl Scene {
+    /// The first surface that the ray meets after `near`, if any. `direction` has unit length.
+    pub fn trace(&self, origin: DVec3, direction: DVec3, near: f64) -> Option<Hit> {
+        let mut best = None;
+        self.bvh.visit(origin, direction, f64::INFINITY, |i, far| {
+            let p = &self.primitives[i];
+            let o = p.to_local(origin);
+            let d = p.rotation.transpose() * direction;
+            match p.shape.intersect(o, d, near, far) {
+                Some(t) => {
+                    best = Some(Hit { t, primitive: i, local: o + d * t });
+                    t
+                }
+                None => far,
+            }
+        });
+        best
+    }
+
+    /// Whether something lies between `near` and `far` along the ray.
+    pub fn blocked(&self, origin: DVec3, direction: DVec3, near: f64, far: f64) -> bool {
+        let mut found = false;
+        self.bvh.visit(origin, direction, far, |i, far| {
+            let p = &self.primitives[i];
+            let hit = p.shape.intersect(p.to_local(origin), p.rotation.transpose() * direction, near, far);
+            found = hit.is_some();
+            if found { -1.0 } else { far }
+        });
+        found
+    }
+
+    /// Names of the classes present, sorted; class ids are positions in this list.
+    pub fn classes(&self) -> Vec<&'static str> {
+        let mut all: Vec<&str> = self.things.iter().map(|t| t.class).collect();
+        all.sort_unstable();
+        all.dedup();
+        all
+    }
+
+    /// The caption of a part: "handle of the red mug".
+    pub fn part_caption(&self, part: u32) -> String {
+        let p = &self.parts[part as usize];
+        format!("{} of the {}", p.name, self.things[p.thing as usize].name)
+    }
+}

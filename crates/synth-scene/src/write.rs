@@ -1,0 +1,214 @@
+//! Makes a scene and writes all of it.
+
+use crate::cameras::{self, Path as CameraPath};
+use crate::light::LightMap;
+use crate::masks::{self, Faults};
+use crate::points::Collector;
+use crate::render::{self, Frame};
+use crate::scene::Scene;
+use crate::{label, layout};
+use artifacts::{MaskTruth, TrueObject, TruePart, TruePoints, TrueScene, maps_path};
+use gs_io::{Error, IoContext, Result, create_dir, npy};
+use gs_scene::{Camera, Image, colmap};
+use rand::SeedableRng;
+use rand_chacha::ChaCha8Rng;
+use serde_json::{Value, json};
+use stage::Stage;
+use std::collections::BTreeMap;
+use std::path::Path;
+
+/// What shapes a scene.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Options {
+    /// Seed of every random choice.
+    pub seed: u64,
+    /// Things besides floor, walls and tables; 1 to 60.
+    pub objects: usize,
+    /// Number of photographs, at least 1.
+    pub views: usize,
+    /// Their width in pixels.
+    pub width: u32,
+    /// Their height in pixels.
+    pub height: u32,
+    /// Points of the sparse cloud; fewer where the views show fewer.
+    pub points: usize,
+    /// The camera's path; by default a ring around one table, a walk between several.
+    pub cameras: Option<CameraPath>,
+    /// Faults of the id maps.
+    pub faults: Faults,
+    /// Every how many views get polygon labels; 0 for none.
+    pub label_every: usize,
+}
+
+/// Standard deviation of the sparse cloud's points in metres.
+const POINT_NOISE: f64 = 0.003;
+/// Folders of a scene, all of which this program owns.
+const FOLDERS: [&str; 5] = ["images", "sparse", "language_features", "label", "truth"];
+/// Streams of the random generator, so that more views do not move the furniture.
+const LAYOUT: u64 = 0;
+const CAMERAS: u64 = 1;
+const POINTS: u64 = 2;
+const FIRST_VIEW: u64 = 16;
+
+impl Options {
+    /// A generator of one of the streams.
+    fn rng(&self, stream: u64) -> ChaCha8Rng {
+        let mut rng = ChaCha8Rng::seed_from_u64(self.seed);
+        rng.set_stream(stream);
+        rng
+    }
+
+    /// The furnished room.
+    pub fn scene(&self) -> Scene {
+        layout::plan(self.objects, &mut self.rng(LAYOUT))
+    }
+
+    fn path(&self, scene: &Scene) -> CameraPath {
+        self.cameras.unwrap_or(if scene.tables.len() > 1 { CameraPath::Walk } else { CameraPath::Ring })
+    }
+
+    /// The cameras in that room.
+    pub fn cameras(&self, scene: &Scene) -> Vec<Camera> {
+        let rng = &mut self.rng(CAMERAS);
+        cameras::place(scene, self.path(scene), self.views, self.width, self.height, rng)
+    }
+
+    fn parameters(&self, scene: &Scene) -> Value {
+        let path = match self.path(scene) {
+            CameraPath::Ring => "ring",
+            CameraPath::Walk => "walk",
+        };
+        json!({
+            "seed": self.seed, "objects": self.objects, "views": self.views, "width": self.width,
+            "height": self.height, "points": self.points, "cameras": path, "granularity_p": self.faults.granularity,
+            "boundary_noise": self.faults.boundary, "missing": self.faults.missing, "label_every": self.label_every,
+        })
+    }
+}
+
+/// The stem of a view's files: `frame_00001` for the first.
+pub fn stem(view: usize) -> String {
+    format!("frame_{:05}", view + 1)
+}
+
+/// Makes the scene and writes it to `out`; `truth/scene.json` comes last.
+///
+/// # Errors
+/// When a file cannot be written, when `out` holds another dataset, or when the stage is interrupted.
+pub fn run(stage: &Stage, out: &Path, options: &Options) -> Result<()> {
+    prepare(out)?;
+    let scene = options.scene();
+    let parameters = options.parameters(&scene);
+    let cameras = options.cameras(&scene);
+    stage.info(&format!(
+        "{} things of {} parts and {} surfaces",
+        scene.things.len(),
+        scene.parts.len(),
+        scene.primitives.len()
+    ));
+    let light = LightMap::bake(&scene);
+    let mut progress = stage.progress("views", cameras.len() as u64);
+    let mut points = Collector::default();
+    let mut masks = BTreeMap::new();
+    let mut labelled = 0;
+    for (v, camera) in cameras.iter().enumerate() {
+        if stage.interrupted() {
+            return Err(Error::new("interrupted").file(out));
+        }
+        let frame = render::render(&scene, &light, camera);
+        points.add(&scene, camera, &frame);
+        let shown = write_view(out, v, &scene, &frame, options)?;
+        masks.insert(stem(v), shown);
+        if options.label_every > 0 && v % options.label_every == 0 {
+            let path = out.join("label").join(stem(v) + ".json");
+            label::write(&path, &format!("{}.png", stem(v)), &scene, &frame)?;
+            labelled += 1;
+        }
+        progress.step();
+    }
+    progress.finish(&[]);
+
+    let sparse = points.sparse(&scene, options.points, POINT_NOISE, &mut options.rng(POINTS));
+    let views: Vec<(String, Camera)> =
+        cameras.into_iter().enumerate().map(|(v, c)| (format!("{}.png", stem(v)), c)).collect();
+    colmap::write_model(&out.join("sparse/0"), &views, &sparse)?;
+    let truth = points.truth(&scene);
+    let mut provenance = stage.provenance(TruePoints::FORMAT, 1, parameters.clone(), BTreeMap::new());
+    provenance.extra = json!({ "classes": scene.classes() });
+    truth.write(out.join("truth/points.safetensors"), provenance)?;
+    MaskTruth::write_all(out.join("truth/masks.json"), &masks)?;
+    let summary = json!({
+        "objects": options.objects, "parts": scene.parts.len(), "views": views.len(), "labelled_views": labelled,
+        "masks": masks.values().map(Vec::len).sum::<usize>(), "points": sparse.len(),
+        "truth_points": truth.position.len(),
+    });
+    // The record before the marker: a rule that finds the marker finds everything.
+    let marker = out.join("truth/scene.json");
+    stage.record(&marker, parameters.clone(), BTreeMap::new(), summary)?;
+    true_scene(&scene, parameters).write(&marker)?;
+    stage.info(&format!("{} photographs, {} points, {}", views.len(), sparse.len(), marker.display()));
+    Ok(())
+}
+
+/// Makes the folders, empty. What an earlier run left is removed, the marker first; `truth` stands from the beginning,
+/// so that an unfinished scene is recognised as one.
+fn prepare(out: &Path) -> Result<()> {
+    let truth = out.join("truth");
+    if !truth.is_dir() {
+        if let Some(other) = FOLDERS.iter().map(|f| out.join(f)).find(|f| f.exists()) {
+            return Err(Error::new("the folder holds something that is not a synthetic scene")
+                .file(out)
+                .found(other.display())
+                .expected("an empty folder, or an earlier synthetic scene")
+                .hint("choose another --out"));
+        }
+        return FOLDERS.iter().rev().try_for_each(|f| create_dir(out.join(f)));
+    }
+    let marker = truth.join("scene.json");
+    if marker.exists() {
+        std::fs::remove_file(&marker).at("replace", &marker)?;
+    }
+    for folder in FOLDERS.iter().map(|f| out.join(f)) {
+        for name in entries(&folder)? {
+            let gone = if name.is_dir() { std::fs::remove_dir_all(&name) } else { std::fs::remove_file(&name) };
+            gone.at("replace", &name)?;
+        }
+        create_dir(&folder)?;
+    }
+    Ok(())
+}
+
+fn entries(folder: &Path) -> Result<Vec<std::path::PathBuf>> {
+    if !folder.exists() {
+        return Ok(Vec::new());
+    }
+    let list = std::fs::read_dir(folder).at("list", folder)?;
+    list.map(|e| e.map(|e| e.path()).at("list", folder)).collect()
+}
+
+/// Writes a view's photograph, id maps and truth; returns what its masks show.
+fn write_view(out: &Path, v: usize, scene: &Scene, frame: &Frame, options: &Options) -> Result<Vec<MaskTruth>> {
+    let stem = stem(v);
+    let (w, h) = (frame.width, frame.height);
+    Image::from_rgb8(w as u32, h as u32, &frame.rgb).write_png(out.join("images").join(format!("{stem}.png")))?;
+    npy::write_i32(out.join("truth/views").join(format!("{stem}.npy")), &[h, w], &frame.thing)?;
+    npy::write_i32(out.join("truth/parts").join(format!("{stem}.npy")), &[h, w], &frame.part)?;
+    let (maps, shown) = masks::segment(scene, frame, &options.faults, &mut options.rng(FIRST_VIEW + v as u64));
+    maps.write(maps_path(out.join("language_features"), &stem))?;
+    Ok(shown)
+}
+
+fn true_scene(scene: &Scene, parameters: Value) -> TrueScene {
+    let parts = |range: std::ops::Range<u32>| {
+        range.map(|id| TruePart { id, name: scene.parts[id as usize].name.into() }).collect()
+    };
+    let objects = scene.things.iter().enumerate().map(|(id, t)| TrueObject {
+        id: id as u32,
+        name: t.name.clone(),
+        class: t.class.into(),
+        color: t.color.into(),
+        background: t.background,
+        parts: parts(t.parts.clone()),
+    });
+    TrueScene { objects: objects.collect(), parameters }
+}
