@@ -1,0 +1,25 @@
+# `make demo`: a synthetic scene with inconsistent granularity, every stage, and answers to text queries. About eight
+# minutes on two cores, most of them stage 1.
+
+OUT ?= out/demo
+SCENE := $(OUT)/scene
+SCENE_FILES := $(SCENE)/truth/scene.json
+MASKS := $(SCENE)/language_features
+MASKS_DONE := $(SCENE_FILES)
+CLIP ?= testdata/clip-tiny
+
+SEED ?= 0
+SYNTH_ARGS ?= --seed $(SEED) --objects 10 --views 30 --width 480 --height 360 --granularity-p 0.5
+GEOM_ARGS ?= --iterations 3000
+GRAPH_ARGS ?=
+FEAT_ARGS ?=
+CLUSTER_ARGS ?=
+SCORE_ARGS ?=
+QUERIES ?= red_mug plate_of_cookies
+REPORT_ARGS ?= --title Demo
+
+include pipelines/stages.mk
+
+synth_OPTIONS := $(SYNTH_ARGS)
+$(SCENE_FILES): $(OPTIONS)/synth | $(BIN)/synth-scene
+	$(BIN)/synth-scene --out $(SCENE) $(SYNTH_ARGS) $(COMMON)
