@@ -20,7 +20,7 @@ pub enum Path {
 /// Horizontal field of view in radians.
 const FIELD: f64 = 0.90;
 /// Heights of the ring's two levels.
-const HEIGHTS: [f64; 2] = [1.28, 1.92];
+const HEIGHTS: [f64; 2] = [1.40, 1.98];
 /// From the wall to the ring.
 const WALL_DISTANCE: f64 = 0.68;
 /// Least free space around a camera.

@@ -881,9 +881,9 @@ fn painting(paint: &Paint, rng: &mut ChaCha8Rng) -> Model {
 /// A table of the given top: background, but with parts.
 pub fn table(size: [f64; 2], height: f64, tone: f64) -> Model {
     let mut m = Model::default();
-    let top = m.part("table top");
+    let top = m.part("top");
     m.block(top, [size[0], size[1], 0.035], 0.006, [0.0, 0.0, height - 0.035], wood(tone));
-    let legs = m.part("table legs");
+    let legs = m.part("legs");
     for (x, y) in [(-1.0, -1.0), (1.0, -1.0), (-1.0, 1.0), (1.0, 1.0)] {
         let at = [x * (0.5 * size[0] - 0.06), y * (0.5 * size[1] - 0.06), 0.0];
         m.block(legs, [0.06, 0.06, height - 0.035], 0.006, at, wood(0.8 * tone));

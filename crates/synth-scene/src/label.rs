@@ -46,3 +46,43 @@ pub fn write(path: &Path, image: &str, scene: &Scene, frame: &Frame) -> Result<(
         .map_err(|e| Error::new(e.to_string()).file(path))?;
     write_bytes(path, &json)
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::polygon::Polygon;
+    use crate::testing::{example, fill};
+
+    #[test]
+    fn filled_polygons_give_back_the_instance_map() {
+        let (scene, frame) = example();
+        let dir = tempfile::tempdir().unwrap();
+        let path = dir.path().join("frame_00001.json");
+        write(&path, "frame_00001.png", scene, frame).unwrap();
+        let json: serde_json::Value = serde_json::from_slice(&std::fs::read(&path).unwrap()).unwrap();
+        assert_eq!(json["info"]["width"], frame.width);
+        let objects = json["objects"].as_array().unwrap();
+        let mut labelled = 0;
+        for (t, thing) in scene.things.iter().enumerate() {
+            let mine: Vec<&serde_json::Value> =
+                objects.iter().filter(|o| o["category"] == thing.name.as_str()).collect();
+            let pixels = frame.thing.iter().filter(|&&i| i == t as i32).count();
+            assert_eq!(!mine.is_empty(), !thing.background && pixels >= SMALLEST, "{}", thing.name);
+            if mine.is_empty() {
+                continue;
+            }
+            labelled += 1;
+            let mut mask = vec![false; frame.thing.len()];
+            for object in mine {
+                let line: Polygon = serde_json::from_value(object["segmentation"].clone()).unwrap();
+                for (m, f) in mask.iter_mut().zip(fill(&line, frame.width, frame.height)) {
+                    *m |= f;
+                }
+            }
+            let both = mask.iter().zip(&frame.thing).filter(|(m, i)| **m && **i == t as i32).count();
+            let either = mask.iter().zip(&frame.thing).filter(|(m, i)| **m || **i == t as i32).count();
+            assert!(both as f64 > 0.97 * either as f64, "{}: {both} of {either}", thing.name);
+        }
+        assert!(labelled >= 6, "{labelled}");
+    }
+}

@@ -24,7 +24,7 @@ const GAP: f64 = 0.012;
 const TRIES: usize = 600;
 /// A table is planned for this many things.
 const PER_TABLE: usize = 10;
-/// One painting per ten things, up to this many.
+/// One painting per twelve things, up to this many.
 const MOST_PAINTINGS: usize = 4;
 
 const ORDINALS: [&str; 9] = ["second", "third", "fourth", "fifth", "sixth", "seventh", "eighth", "ninth", "tenth"];
@@ -125,14 +125,18 @@ pub fn plan(objects: usize, rng: &mut ChaCha8Rng) -> Scene {
 fn name_of(class: &Class, color: &str, repeated: bool) -> String {
     match class.naming {
         Naming::Plain if !repeated => class.name.to_string(),
-        Naming::Of(before, after) => format!("{before} {color} {after}"),
+        Naming::Of(before, after) => {
+            // "in a" becomes "in an" before a vowel.
+            let n = if before.ends_with(" a") && color.starts_with(['a', 'e', 'i', 'o', 'u']) { "n" } else { "" };
+            format!("{before}{n} {color} {after}")
+        }
         Naming::Plain | Naming::Colored => format!("{color} {}", class.name),
     }
 }
 
 /// Classes and colours: no pair twice, classes and colours as evenly used as can be.
 fn choose(objects: usize, rng: &mut ChaCha8Rng) -> Vec<Chosen> {
-    let on_walls = (objects / 10).min(MOST_PAINTINGS);
+    let on_walls = (objects / 12).min(MOST_PAINTINGS);
     let on_floor = (objects / 8).max(1).min(objects - on_walls);
     let mut used = Vec::new();
     let mut paint_uses = [0usize; PAINTS.len()];

@@ -20,4 +20,6 @@ pub mod polygon;
 pub mod render;
 pub mod scene;
 pub mod shape;
+#[cfg(test)]
+mod testing;
 pub mod write;

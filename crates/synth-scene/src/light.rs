@@ -63,8 +63,9 @@ fn sky(direction: DVec3) -> DVec3 {
 }
 
 impl LightMap {
-    /// Computes the light of a scene.
-    pub fn bake(scene: &Scene) -> Self {
+    /// Computes the light of a scene. `coarseness` of at least 1 multiplies the sides of texels: small pictures need
+    /// no fine shadows.
+    pub fn bake(scene: &Scene, coarseness: f64) -> Self {
         let reach = scene.room.max_element();
         let lamp = |x: f64, y: f64, size: f64, power: [f64; 3]| {
             let half = size * reach / 2.45;
@@ -76,7 +77,7 @@ impl LightMap {
         let mut count = 0;
         for (primitive, p) in scene.primitives.iter().enumerate() {
             map.first.push(map.grids.len());
-            let size = texel_size(scene, p.thing);
+            let size = texel_size(scene, p.thing) * coarseness;
             for face in 0..p.shape.faces() {
                 let (du, dv) = p.shape.face_size(face);
                 let wraps = p.shape.wraps();
@@ -142,6 +143,9 @@ impl LightMap {
 
     fn direct(&self, scene: &Scene, grid: &Grid, k: usize, index: usize) -> [f32; 4] {
         let (point, normal) = grid.place(scene, k);
+        if outside(scene, point) {
+            return [0.0; 4];
+        }
         let mut sum = DVec3::ZERO;
         let mut key = 0.0;
         for (l, lamp) in self.lamps.iter().enumerate() {
@@ -176,6 +180,9 @@ impl LightMap {
     /// from behind.
     fn indirect(&self, scene: &Scene, grid: &Grid, k: usize, index: usize) -> [f32; 4] {
         let (point, normal) = grid.place(scene, k);
+        if outside(scene, point) {
+            return [0.0; 4];
+        }
         let frame = frame(normal);
         let [jx, jy] = jitter(index);
         let mut sum = DVec3::ZERO;
@@ -192,6 +199,9 @@ impl LightMap {
                     let p = &scene.primitives[hit.primitive];
                     if (p.rotation * p.shape.normal(hit.local)).dot(direction) > 0.0 {
                         behind += 1;
+                        if 2 * behind > SKY_RAYS {
+                            return [0.0; 4];
+                        }
                         continue;
                     }
                     let at = p.shape.chart(hit.local);
@@ -204,7 +214,7 @@ impl LightMap {
             }
         }
         sum /= SKY_RAYS as f64;
-        [sum.x as f32, sum.y as f32, sum.z as f32, if 2 * behind > SKY_RAYS { 0.0 } else { 1.0 }]
+        [sum.x as f32, sum.y as f32, sum.z as f32, 1.0]
     }
 
     /// Gives texels that are not `open` their neighbours' light, then smooths what sampling left rough.
@@ -281,6 +291,11 @@ fn texel_size(scene: &Scene, thing: u32) -> f64 {
         "chair" | "armchair" | "cabinet" | "stool" | "waste bin" => 0.018,
         _ => 0.008,
     }
+}
+
+/// Whether a point lies behind the walls or under the floor, where no camera goes.
+fn outside(scene: &Scene, point: DVec3) -> bool {
+    point.z < -1e-3 || (point.truncate().abs() - scene.room).max_element() > 1e-3
 }
 
 /// A right-handed frame whose z is `normal`.

@@ -173,7 +173,12 @@ fn describe(scene: &Scene, parts: &[u32], level: Level, kind: Kind) -> MaskTruth
                     names.push(word);
                 }
             }
-            format!("{} of the {}", names.join(" and "), name(&instances[0]))
+            let thing = &scene.things[instances[0] as usize];
+            match &names[..] {
+                // Not "wall of the white wall".
+                [only] if only == thing.class => thing.name.clone(),
+                _ => format!("{} of the {}", names.join(" and "), thing.name),
+            }
         }
     };
     MaskTruth {
@@ -275,25 +280,10 @@ fn compact(painted: &[i32], masks: usize, first: i32, ids: &mut Vec<i32>) -> Vec
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::cameras::{self, Path};
-    use crate::light::LightMap;
-    use crate::{layout, render};
+    use crate::testing::example;
     use rand::SeedableRng;
-    use std::sync::OnceLock;
 
     const EXACT: Faults = Faults { granularity: 0.0, boundary: 0, missing: 0.0 };
-
-    fn example() -> &'static (Scene, Frame) {
-        static ONCE: OnceLock<(Scene, Frame)> = OnceLock::new();
-        ONCE.get_or_init(|| {
-            let mut rng = ChaCha8Rng::seed_from_u64(5);
-            let scene = layout::plan(10, &mut rng);
-            let light = LightMap::bake(&scene);
-            let cameras = cameras::place(&scene, Path::Ring, 4, 240, 180, &mut rng);
-            let frame = render::render(&scene, &light, &cameras[1]);
-            (scene, frame)
-        })
-    }
 
     fn rng() -> ChaCha8Rng {
         ChaCha8Rng::seed_from_u64(11)

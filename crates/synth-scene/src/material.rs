@@ -147,9 +147,9 @@ impl Material {
                 self.albedo * (1.0 + 0.22 * tone + 0.10 * grain) * seam
             }
             Pattern::Keys { other, half, above } => {
-                let wave = (p.x * TAU / 0.045).cos().max((p.y * TAU / 0.035).cos()) * -1.0;
+                let gap = (p.x * TAU / 0.045).cos().max((p.y * TAU / 0.035).cos());
                 let key = p.z > above && p.x.abs() < half[0] && p.y.abs() < half[1];
-                if key { other.lerp(self.albedo, 0.7 * soft(-wave - 0.75, 0.2)) } else { self.albedo }
+                if key { other.lerp(self.albedo, 0.7 * soft(gap - 0.75, 0.2)) } else { self.albedo }
             }
             Pattern::Pages { other, inner } => {
                 if p.z.abs() < inner.z && (p.x > inner.x || p.y.abs() > inner.y) {

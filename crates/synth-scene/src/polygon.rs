@@ -146,41 +146,8 @@ fn straightened(line: &[[i32; 2]]) -> Polygon {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::testing::fill;
     use rand::{Rng, SeedableRng};
-
-    /// What OpenCV's fillPoly does with whole coordinates: even-odd inside, and the line itself.
-    fn fill(polygon: &Polygon, width: usize, height: usize) -> Vec<bool> {
-        let mut out = vec![false; width * height];
-        let n = polygon.len();
-        for y in 0..height as i32 {
-            let mut crossings: Vec<f64> = (0..n)
-                .filter_map(|i| {
-                    let (a, b) = (polygon[i], polygon[(i + 1) % n]);
-                    let (low, high) = (a[1].min(b[1]), a[1].max(b[1]));
-                    (y >= low && y < high).then(|| {
-                        f64::from(a[0]) + f64::from(b[0] - a[0]) * f64::from(y - a[1]) / f64::from(b[1] - a[1])
-                    })
-                })
-                .collect();
-            crossings.sort_by(f64::total_cmp);
-            for pair in crossings.chunks_exact(2) {
-                for x in pair[0].ceil() as i32..=pair[1].floor() as i32 {
-                    out[y as usize * width + x as usize] = true;
-                }
-            }
-        }
-        for i in 0..n {
-            let (mut a, b) = (polygon[i], polygon[(i + 1) % n]);
-            let (dx, dy) = (b[0] - a[0], b[1] - a[1]);
-            assert!(dx == 0 || dy == 0 || dx.abs() == dy.abs(), "lines run in eight directions");
-            out[a[1] as usize * width + a[0] as usize] = true;
-            while a != b {
-                a = [a[0] + dx.signum(), a[1] + dy.signum()];
-                out[a[1] as usize * width + a[0] as usize] = true;
-            }
-        }
-        out
-    }
 
     fn back(inside: &[bool], width: usize, height: usize) -> Vec<bool> {
         let mut all = vec![false; width * height];

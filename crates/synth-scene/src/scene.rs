@@ -174,10 +174,4 @@ impl Scene {
         all.dedup();
         all
     }
-
-    /// The caption of a part: "handle of the red mug".
-    pub fn part_caption(&self, part: u32) -> String {
-        let p = &self.parts[part as usize];
-        format!("{} of the {}", p.name, self.things[p.thing as usize].name)
-    }
 }

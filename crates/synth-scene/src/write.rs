@@ -42,6 +42,8 @@ pub struct Options {
 
 /// Standard deviation of the sparse cloud's points in metres.
 const POINT_NOISE: f64 = 0.003;
+/// Photographs of at least this many rows show the finest shadows.
+const FINE_HEIGHT: f64 = 360.0;
 /// Folders of a scene, all of which this program owns.
 const FOLDERS: [&str; 5] = ["images", "sparse", "language_features", "label", "truth"];
 /// Streams of the random generator, so that more views do not move the furniture.
@@ -61,6 +63,11 @@ impl Options {
     /// The furnished room.
     pub fn scene(&self) -> Scene {
         layout::plan(self.objects, &mut self.rng(LAYOUT))
+    }
+
+    /// The light in that room, as fine as the photographs show.
+    pub fn light(&self, scene: &Scene) -> LightMap {
+        LightMap::bake(scene, (FINE_HEIGHT / f64::from(self.height)).clamp(1.0, 3.0))
     }
 
     fn path(&self, scene: &Scene) -> CameraPath {
@@ -106,7 +113,7 @@ pub fn run(stage: &Stage, out: &Path, options: &Options) -> Result<()> {
         scene.parts.len(),
         scene.primitives.len()
     ));
-    let light = LightMap::bake(&scene);
+    let light = options.light(&scene);
     let mut progress = stage.progress("views", cameras.len() as u64);
     let mut points = Collector::default();
     let mut masks = BTreeMap::new();

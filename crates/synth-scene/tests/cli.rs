@@ -1,0 +1,234 @@
+//! The program and its files, as people and later stages meet them.
+
+use artifacts::{Level, MaskMaps, MaskTruth, TruePoints, TrueScene, maps_path};
+use glam::DVec3;
+use gs_io::npy;
+use gs_scene::dataset::{self, LoadOptions, Split};
+use std::collections::{BTreeMap, BTreeSet};
+use std::path::{Path, PathBuf};
+use std::process::{Command, Output};
+use std::sync::OnceLock;
+use synth_scene::masks::Faults;
+use synth_scene::write::{Options, stem};
+
+fn synth_scene(out: &Path, arguments: &[&str]) -> Output {
+    let program = env!("CARGO_BIN_EXE_synth-scene");
+    Command::new(program).arg("--out").arg(out).args(["--size", "tiny", "--quiet"]).args(arguments).output().unwrap()
+}
+
+fn make(out: &Path, arguments: &[&str]) {
+    let o = synth_scene(out, arguments);
+    assert!(o.status.success(), "{}", String::from_utf8_lossy(&o.stderr));
+}
+
+/// All files below a folder with their contents, without the records of runs.
+fn contents(root: &Path) -> BTreeMap<PathBuf, Vec<u8>> {
+    let mut all = BTreeMap::new();
+    let mut folders = vec![root.to_path_buf()];
+    while let Some(folder) = folders.pop() {
+        for entry in std::fs::read_dir(&folder).unwrap() {
+            let path = entry.unwrap().path();
+            if path.is_dir() {
+                folders.push(path);
+            } else if !path.to_string_lossy().ends_with(".run.json") {
+                all.insert(path.strip_prefix(root).unwrap().to_path_buf(), std::fs::read(&path).unwrap());
+            }
+        }
+    }
+    all
+}
+
+/// A tiny scene without faults, made once.
+fn exact() -> &'static Path {
+    static ONCE: OnceLock<tempfile::TempDir> = OnceLock::new();
+    ONCE.get_or_init(|| {
+        let dir = tempfile::tempdir().unwrap();
+        make(dir.path(), &["--seed", "3", "--granularity-p", "0", "--boundary-noise", "0", "--missing", "0"]);
+        dir
+    })
+    .path()
+}
+
+fn exact_options() -> Options {
+    Options {
+        seed: 3,
+        objects: 8,
+        views: 8,
+        width: 160,
+        height: 120,
+        points: 1500,
+        cameras: None,
+        faults: Faults { granularity: 0.0, boundary: 0, missing: 0.0 },
+        label_every: 4,
+    }
+}
+
+#[test]
+fn the_same_seed_gives_the_same_bytes_for_any_number_of_threads() {
+    let dir = tempfile::tempdir().unwrap();
+    let (a, b, c) = (dir.path().join("a"), dir.path().join("b"), dir.path().join("c"));
+    make(&a, &["--threads", "1", "--views", "4"]);
+    make(&b, &["--threads", "2", "--views", "4"]);
+    make(&c, &["--seed", "1", "--views", "4"]);
+    let (of_a, of_b, of_c) = (contents(&a), contents(&b), contents(&c));
+    assert_eq!(of_a.keys().collect::<Vec<_>>(), of_b.keys().collect::<Vec<_>>());
+    for (path, bytes) in &of_a {
+        assert!(*bytes == of_b[path], "{}", path.display());
+    }
+    let differ = |name: &str| of_a[Path::new(name)] != of_c[Path::new(name)];
+    assert!(differ("images/frame_00001.png") && differ("sparse/0/points3D.bin") && differ("truth/scene.json"));
+}
+
+#[test]
+fn an_unfinished_or_older_scene_is_replaced_whole() {
+    let dir = tempfile::tempdir().unwrap();
+    let (a, b) = (dir.path().join("a"), dir.path().join("b"));
+    make(&a, &["--views", "5"]);
+    // As left by a run that was killed: no marker, and files that the next run does not make.
+    std::fs::remove_file(a.join("truth/scene.json")).unwrap();
+    std::fs::write(a.join("language_features/frame_00001_f.npy"), "of masks that are gone").unwrap();
+    make(&a, &["--views", "3"]);
+    make(&b, &["--views", "3"]);
+    assert!(contents(&a) == contents(&b));
+}
+
+#[test]
+fn a_dataset_of_another_origin_is_left_alone() {
+    let dir = tempfile::tempdir().unwrap();
+    std::fs::create_dir(dir.path().join("images")).unwrap();
+    std::fs::write(dir.path().join("images/holiday.jpg"), "dear").unwrap();
+    let o = synth_scene(dir.path(), &[]);
+    let said = String::from_utf8_lossy(&o.stderr);
+    assert_eq!(o.status.code(), Some(2));
+    assert!(said.contains("not a synthetic scene") && said.lines().count() == 1, "{said}");
+    assert_eq!(std::fs::read(dir.path().join("images/holiday.jpg")).unwrap(), b"dear");
+}
+
+#[test]
+fn bad_options_are_errors_of_one_line() {
+    let dir = tempfile::tempdir().unwrap();
+    let out = dir.path().join("scene");
+    for (arguments, part) in [
+        (["--objects", "0"], "--objects: out of range; found 0, expected 1 to 60"),
+        (["--views", "0"], "--views"),
+        (["--width", "8"], "--width"),
+        (["--height", "99999"], "--height"),
+        (["--points", "0"], "--points"),
+        (["--granularity-p", "1.5"], "--granularity-p: out of range; found 1.5, expected 0 to 1"),
+        (["--granularity-p", "NaN"], "--granularity-p"),
+        (["--missing", "2"], "--missing"),
+        (["--boundary-noise", "99"], "--boundary-noise"),
+    ] {
+        let o = synth_scene(&out, &arguments);
+        let said = String::from_utf8_lossy(&o.stderr);
+        assert_eq!(o.status.code(), Some(2), "{arguments:?}");
+        assert!(said.contains(part) && said.lines().count() == 1, "{said}");
+        assert!(!out.exists(), "nothing is begun");
+    }
+}
+
+#[test]
+fn an_output_that_cannot_be_written_is_an_error_of_one_line() {
+    let dir = tempfile::tempdir().unwrap();
+    let file = dir.path().join("file");
+    std::fs::write(&file, "in the way").unwrap();
+    let o = synth_scene(&file.join("scene"), &[]);
+    let said = String::from_utf8_lossy(&o.stderr);
+    assert_eq!(o.status.code(), Some(2));
+    assert!(said.contains("cannot create the folder") && said.lines().count() == 1, "{said}");
+    assert_eq!(std::fs::read(&file).unwrap(), b"in the way");
+}
+
+#[test]
+fn the_scene_reads_back_as_a_colmap_dataset() {
+    let data = dataset::load(exact(), &LoadOptions::default()).unwrap();
+    assert_eq!(data.views.len(), 8);
+    assert_eq!(data.points.positions.len(), 1500);
+    assert!(data.warnings.is_empty(), "{:?}", data.warnings);
+    assert_eq!(data.views_of(Split::Test).count(), 1);
+    let options = exact_options();
+    let made = options.cameras(&options.scene());
+    for (view, camera) in data.views.iter().zip(&made) {
+        assert!((view.camera.position() - camera.position()).length() < 1e-9);
+        let p = DVec3::new(0.1, -0.2, 0.8);
+        let ((u, v, _), (s, t, _)) = (view.camera.project(p), camera.project(p));
+        assert!((u - s).abs() < 1e-6 && (v - t).abs() < 1e-6);
+        let image = view.load_image().unwrap();
+        assert_eq!((image.width, image.height), (160, 120));
+        let mean = image.rgb.iter().sum::<f32>() / image.rgb.len() as f32;
+        assert!((0.2..0.8).contains(&mean), "neither dark nor blown out: {mean}");
+    }
+}
+
+#[test]
+fn true_points_show_where_the_instance_maps_say() {
+    let root = exact();
+    let options = exact_options();
+    let scene = options.scene();
+    let points = TruePoints::read(root.join("truth/points.safetensors")).unwrap();
+    let data = dataset::load(root, &LoadOptions::default()).unwrap();
+    let classes = scene.classes();
+    let maps: Vec<Vec<f32>> = data
+        .views
+        .iter()
+        .map(|v| npy::read_f32(root.join("truth/views").join(format!("{}.npy", v.stem()))).unwrap().data)
+        .collect();
+    let (mut right, mut seen) = (0, 0);
+    for i in (0..points.position.len()).step_by(7) {
+        let p = DVec3::from_array(points.position[i].map(f64::from));
+        let thing = scene.parts[points.part[i] as usize].thing;
+        assert_eq!(thing as i32, points.instance[i]);
+        assert_eq!(classes[points.class[i] as usize], scene.things[thing as usize].class);
+        let mut views = 0;
+        for (view, map) in data.views.iter().zip(&maps) {
+            let (u, v, z) = view.camera.project(p);
+            if z <= 0.0 || !(0.0..160.0).contains(&u) || !(0.0..120.0).contains(&v) {
+                continue;
+            }
+            let eye = view.camera.position();
+            let hit = scene.trace(eye, (p - eye).normalize(), 0.0).unwrap();
+            if (hit.t - (p - eye).length()).abs() < 1e-4 {
+                views += 1;
+                right += usize::from(map[v as usize * 160 + u as usize] == points.instance[i] as f32);
+            }
+        }
+        assert!(views > 0, "point {i} is seen by no view");
+        seen += views;
+    }
+    // A point may fall into a pixel whose centre shows its neighbour.
+    assert!(seen > 1000 && right as f64 > 0.97 * seen as f64, "{right} of {seen}");
+}
+
+#[test]
+fn without_faults_large_masks_are_the_true_instances() {
+    let root = exact();
+    let truth = TrueScene::read(root.join("truth/scene.json")).unwrap();
+    let masks = MaskTruth::read_all(root.join("truth/masks.json")).unwrap();
+    assert_eq!(truth.objects.iter().filter(|o| !o.background).count(), 8);
+    assert_eq!(masks.len(), 8);
+    for v in 0..8 {
+        let maps = MaskMaps::read(maps_path(root.join("language_features"), &stem(v))).unwrap();
+        let shown = &masks[&stem(v)];
+        assert_eq!(maps.id_count(), shown.len());
+        let view = npy::read_f32(root.join("truth/views").join(format!("{}.npy", stem(v)))).unwrap();
+        assert_eq!(view.shape, [120, 160]);
+        let mut pairs = BTreeSet::new();
+        for (&id, &instance) in maps.level(Level::Large).iter().zip(&view.data) {
+            assert!(instance >= 0.0, "rooms are closed");
+            if id >= 0 {
+                pairs.insert((id, instance as u32));
+                assert_eq!(shown[id as usize].caption, truth.objects[instance as usize].name);
+            }
+        }
+        let ids: BTreeSet<i32> = pairs.iter().map(|p| p.0).collect();
+        assert_eq!(ids.len(), pairs.len(), "a mask shows one thing");
+    }
+}
+
+#[test]
+fn labels_are_given_for_training_and_held_out_views() {
+    let root = exact();
+    for (v, labelled) in [(0, true), (1, false), (4, true), (7, false)] {
+        assert_eq!(root.join("label").join(format!("{}.json", stem(v))).exists(), labelled);
+    }
+}
