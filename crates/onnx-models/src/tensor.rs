@@ -39,6 +39,16 @@ impl<'a> Tensor<'a> {
         Self { shape: shape.to_vec(), data: Data::I64(data.into()) }
     }
 
+    /// The same tensor, borrowed.
+    pub fn view(&self) -> Tensor<'_> {
+        let data = match &self.data {
+            Data::F32(v) => Data::F32(Cow::Borrowed(v)),
+            Data::I32(v) => Data::I32(Cow::Borrowed(v)),
+            Data::I64(v) => Data::I64(Cow::Borrowed(v)),
+        };
+        Tensor { shape: self.shape.clone(), data }
+    }
+
     /// Number of values.
     pub fn len(&self) -> usize {
         match &self.data {

@@ -1,0 +1,295 @@
+//! Masks of everything in a photograph: SAM asked at a grid of points.
+//!
+//! The points of the grid are asked from coarse to fine. A point that lies within a small-level mask of high score found
+//! in an earlier round is not asked again: the answer would be much the same three masks. The rounds are fixed by the
+//! grid, so that the result does not depend on the number of threads.
+
+use crate::nms::{MaskNms, Pixels, box_nms, mask_nms, nesting_levels};
+use crate::sam::{Candidates, Embedded, Sam};
+use artifacts::LEVELS;
+use gs_io::Result;
+use onnx_models::parallel_map;
+
+/// Distance of the two thresholds of the stability score from 0, as in SAM.
+const STABILITY_OFFSET: f32 = 1.0;
+
+/// How masks are asked for and chosen.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Choice {
+    /// Points of the grid along the longer side of the photograph; along the shorter as many as fit the same distance.
+    pub points_per_side: usize,
+    /// Least predicted IoU.
+    pub predicted_iou: f32,
+    /// Least stability: IoU of the mask cut 1 above and 1 below its threshold.
+    pub stability: f32,
+    /// IoU of boxes above which the better mask stays.
+    pub box_nms: f64,
+    /// LangSplat's rule within a level.
+    pub mask_nms: MaskNms,
+    /// Points within a small-level mask of at least this score (predicted IoU x stability) are not asked again; above 1
+    /// every point is asked.
+    pub skip_score: f32,
+    /// Whether a level takes masks of the other levels where it has none: see [`fill`].
+    pub fill: bool,
+}
+
+/// One mask of one prompt, good enough to be considered.
+#[derive(Debug, Clone)]
+pub struct Proposal {
+    /// Level by SAM's own order: 1 small, 2 medium, 3 large; 0 for a decoder that gives one mask only.
+    pub level: usize,
+    /// Predicted IoU.
+    pub quality: f32,
+    /// Predicted IoU x stability.
+    pub score: f32,
+    /// Its pixels in the decoder's resolution, [`Grid::width`] x [`Grid::height`].
+    pub pixels: Pixels,
+    /// Logits of the same pixels.
+    pub logits: Vec<f32>,
+}
+
+/// The part of the decoder's square that shows the photograph.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Grid {
+    /// Columns.
+    pub width: usize,
+    /// Rows.
+    pub height: usize,
+    /// Width and height of the photograph in these pixels; up to a pixel less.
+    pub extent: [f64; 2],
+}
+
+impl Grid {
+    fn of(embedded: &Embedded) -> Self {
+        let [w, h] = embedded.extent.map(|e| (e.ceil() as usize).clamp(1, Sam::MASK_SIDE));
+        Self { width: w, height: h, extent: embedded.extent }
+    }
+
+    fn index(&self, [x, y]: [f64; 2]) -> usize {
+        let column = ((x * self.extent[0]) as usize).min(self.width - 1);
+        let row = ((y * self.extent[1]) as usize).min(self.height - 1);
+        row * self.width + column
+    }
+}
+
+/// Considered masks of a photograph.
+pub struct Proposals {
+    /// Pixels that they are given in.
+    pub grid: Grid,
+    /// In the order of the prompts.
+    pub masks: Vec<Proposal>,
+    /// Points asked.
+    pub asked: usize,
+    /// Points of the grid.
+    pub points: usize,
+}
+
+/// The grid's points in the order of rounds: every fourth of a row of every fourth row, every second of every second,
+/// then between them. Coordinates in 0..1 of width and height.
+pub fn rounds(points_per_side: usize, aspect: f64) -> [Vec<[f64; 2]>; 5] {
+    let n = points_per_side.max(1);
+    let short = |ratio: f64| ((n as f64 * ratio).round() as usize).max(1);
+    let (nx, ny) = if aspect >= 1.0 { (n, short(1.0 / aspect)) } else { (short(aspect), n) };
+    let mut rounds: [Vec<[f64; 2]>; 5] = Default::default();
+    for j in 0..ny {
+        for i in 0..nx {
+            let round = match (i % 4, j % 4) {
+                (1, 1) => 0,
+                (1 | 3, 1 | 3) => 1,
+                (0 | 2, 0 | 2) => 2,
+                (0 | 2, _) => 3,
+                _ => 4,
+            };
+            rounds[round].push([(i as f64 + 0.5) / nx as f64, (j as f64 + 0.5) / ny as f64]);
+        }
+    }
+    rounds
+}
+
+/// Asks SAM at the points of the grid and keeps what passes the filters.
+///
+/// # Errors
+/// When the decoder fails.
+pub fn propose(sam: &Sam, embedded: &Embedded, choice: &Choice) -> Result<Proposals> {
+    let grid = Grid::of(embedded);
+    let mut masks: Vec<Proposal> = Vec::new();
+    let (mut asked, mut points) = (0, 0);
+    for round in rounds(choice.points_per_side, embedded.frame[0] as f64 / embedded.frame[1] as f64) {
+        points += round.len();
+        let known: Vec<&Pixels> =
+            masks.iter().filter(|m| m.level == 1 && m.score >= choice.skip_score).map(|m| &m.pixels).collect();
+        let ask: Vec<[f64; 2]> =
+            round.into_iter().filter(|&p| !known.iter().any(|k| k.contains(grid.index(p)))).collect();
+        asked += ask.len();
+        let found = parallel_map(ask.len(), |i| Ok(consider(&sam.decode(embedded, ask[i])?, &grid, choice)))?;
+        masks.extend(found.into_iter().flatten());
+    }
+    Ok(Proposals { grid, masks, asked, points })
+}
+
+/// Masks of one answer that pass the filters.
+fn consider(answer: &Candidates, grid: &Grid, choice: &Choice) -> Vec<Proposal> {
+    let count = answer.quality.len();
+    let mut good = Vec::new();
+    for (m, &quality) in answer.quality.iter().enumerate() {
+        // A quality that is not a number is not good.
+        if quality.is_nan() || quality < choice.predicted_iou {
+            continue;
+        }
+        let square = answer.mask(m);
+        let rows = (0..grid.height).flat_map(|y| &square[y * Sam::MASK_SIDE..y * Sam::MASK_SIDE + grid.width]);
+        let logits: Vec<f32> = rows.copied().collect();
+        let above = |t: f32| logits.iter().filter(|&&l| l > t).count();
+        let stability = above(STABILITY_OFFSET) as f32 / above(-STABILITY_OFFSET).max(1) as f32;
+        let pixels = Pixels::new(grid.width, logits.iter().map(|&l| l > 0.0));
+        if stability < choice.stability || pixels.area == 0 {
+            continue;
+        }
+        let level = if count == 1 { 0 } else { (m + 1).min(LEVELS - 1) };
+        good.push(Proposal { level, quality, score: quality * stability, pixels, logits });
+    }
+    good
+}
+
+/// The masks of each level (default, small, medium, large) as indices into `masks`: box suppression, then LangSplat's.
+///
+/// Levels are SAM's own three masks per prompt; default is all of them together. A decoder that gives one mask per
+/// prompt leaves the levels to nesting ([`nesting_levels`]). Then, if so chosen, [`fill`].
+pub fn levels(masks: &[Proposal], choice: &Choice) -> [Vec<usize>; LEVELS] {
+    let by_boxes = |c: Vec<usize>| -> Vec<usize> {
+        let (pixels, quality): (Vec<&Pixels>, Vec<f32>) =
+            c.iter().map(|&i| (&masks[i].pixels, masks[i].quality)).unzip();
+        box_nms(&pixels, &quality, choice.box_nms).into_iter().map(|k| c[k]).collect()
+    };
+    let by_masks = |c: Vec<usize>| -> Vec<usize> {
+        let (pixels, score): (Vec<&Pixels>, Vec<f32>) = c.iter().map(|&i| (&masks[i].pixels, masks[i].score)).unzip();
+        mask_nms(&pixels, &score, choice.mask_nms).into_iter().map(|k| c[k]).collect()
+    };
+    let all = by_boxes((0..masks.len()).collect());
+    let mut chosen: [Vec<usize>; LEVELS] = Default::default();
+    if masks.iter().any(|m| m.level > 0) {
+        for (level, slot) in chosen.iter_mut().enumerate().skip(1) {
+            *slot = by_masks(by_boxes((0..masks.len()).filter(|&i| masks[i].level == level).collect()));
+        }
+    } else {
+        let good: Vec<usize> = all.iter().copied().filter(|&i| masks[i].score > choice.mask_nms.score).collect();
+        let pixels: Vec<&Pixels> = good.iter().map(|&i| &masks[i].pixels).collect();
+        let nested = nesting_levels(&pixels);
+        for (level, slot) in chosen.iter_mut().enumerate().skip(1) {
+            let at_level = good.iter().zip(&nested).filter(|(_, n)| n[level - 1]).map(|(&i, _)| i);
+            *slot = by_masks(at_level.collect());
+        }
+    }
+    chosen[0] = by_masks(all);
+    if choice.fill { fill(masks, &chosen) } else { chosen }
+}
+
+/// Part of a mask that a level must not cover yet for the level to take it.
+const FILL_FREE: f64 = 0.7;
+
+/// Levels small, medium and large with masks of the other two added where they have none: what has no larger whole is
+/// itself whole, what has no parts is its own part. From the best score down, a mask is taken when the level covers at
+/// most 30% of it. Without this a thing for which SAM finds no good mask at a level is absent from it, as most small
+/// things are from level large.
+pub fn fill(masks: &[Proposal], chosen: &[Vec<usize>; LEVELS]) -> [Vec<usize>; LEVELS] {
+    let mut filled = chosen.clone();
+    for (level, slot) in filled.iter_mut().enumerate().skip(1) {
+        let mut others: Vec<usize> =
+            (1..LEVELS).filter(|&l| l != level).flat_map(|l| chosen[l].iter().copied()).collect();
+        others.sort_by(|&a, &b| masks[b].score.total_cmp(&masks[a].score).then(a.cmp(&b)));
+        let mut covered = slot.iter().fold(None::<Pixels>, |all, &i| Some(union(all, &masks[i].pixels)));
+        for i in others {
+            let mask = &masks[i].pixels;
+            let taken = covered.as_ref().map_or(0, |c| c.overlap(mask));
+            if (mask.area - taken) as f64 >= FILL_FREE * mask.area as f64 {
+                covered = Some(union(covered, mask));
+                slot.push(i);
+            }
+        }
+    }
+    filled
+}
+
+fn union(all: Option<Pixels>, mask: &Pixels) -> Pixels {
+    all.map_or_else(|| mask.clone(), |a| a.union(mask))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use proptest::prelude::*;
+
+    proptest! {
+        #[test]
+        fn rounds_are_the_whole_grid(n in 1usize..40, aspect in 0.2f64..5.0) {
+            let all: Vec<[f64; 2]> = rounds(n, aspect).concat();
+            let long = if aspect >= 1.0 { 0 } else { 1 };
+            let distinct = |axis: usize| {
+                let mut v: Vec<u64> = all.iter().map(|p| p[axis].to_bits()).collect();
+                v.sort_unstable();
+                v.dedup();
+                v.len()
+            };
+            prop_assert_eq!(distinct(long), n);
+            prop_assert_eq!(all.len(), n * distinct(1 - long));
+            prop_assert!(all.iter().flatten().all(|&c| c > 0.0 && c < 1.0));
+        }
+    }
+
+    const CHOICE: Choice = Choice {
+        points_per_side: 4,
+        predicted_iou: 0.7,
+        stability: 0.7,
+        box_nms: 0.7,
+        mask_nms: MaskNms { iou: 0.8, score: 0.5, inner: 0.5 },
+        skip_score: 0.8,
+        fill: false,
+    };
+
+    #[test]
+    fn filters_see_quality_and_stability_of_the_photograph_part_only() {
+        let side = Sam::MASK_SIDE;
+        let grid = Grid { width: side, height: 2, extent: [side as f64, 2.0] };
+        // Row 0 is inside by a wide margin; row 1 is undecided in masks 1 and 2; below the photograph all is inside.
+        let mask = |row1: f32| (0..side * side).map(move |i| if i / side == 1 { row1 } else { 9.0 });
+        let logits: Vec<f32> = mask(-9.0).chain(mask(0.5)).chain(mask(-0.5)).collect();
+        let answer = Candidates { quality: vec![0.9, 0.9, 0.6], logits };
+        let good = consider(&answer, &grid, &CHOICE);
+        // Mask 0: stability 1; mask 1: 1/2, not stable; mask 2: low quality.
+        assert_eq!(good.iter().map(|p| (p.level, p.pixels.area)).collect::<Vec<_>>(), [(1, side)]);
+        assert!((good[0].score - 0.9).abs() < 1e-6);
+        let nan = Candidates { quality: vec![f32::NAN], logits: vec![9.0; side * side] };
+        assert!(consider(&nan, &grid, &CHOICE).is_empty());
+    }
+
+    #[test]
+    fn one_mask_per_prompt_gets_its_levels_from_nesting() {
+        let rect = |x0: usize, x1: usize, level: usize| Proposal {
+            level,
+            quality: 0.9,
+            score: 0.85,
+            pixels: Pixels::new(20, (0..200).map(|i| (x0..x1).contains(&(i % 20)))),
+            logits: Vec::new(),
+        };
+        // A thing of two parts, and a thing alone.
+        let single = [rect(0, 10, 0), rect(0, 6, 0), rect(6, 10, 0), rect(12, 20, 0)];
+        let l = levels(&single, &CHOICE);
+        let sorted = |v: &[usize]| {
+            let mut v = v.to_vec();
+            v.sort_unstable();
+            v
+        };
+        assert_eq!(sorted(&l[1]), [1, 2, 3]);
+        assert_eq!(sorted(&l[2]), [1, 2, 3]);
+        assert_eq!(sorted(&l[3]), [0, 3]);
+        // The same masks with SAM's levels.
+        let own = [rect(0, 10, 3), rect(0, 6, 1), rect(6, 10, 2), rect(12, 20, 3)];
+        let l = levels(&own, &CHOICE);
+        assert_eq!((sorted(&l[1]), sorted(&l[2]), sorted(&l[3])), (vec![1], vec![2], vec![0, 3]));
+        assert!(levels(&[], &CHOICE).iter().all(Vec::is_empty));
+        // Filled: the part that lies in no whole of level small is taken there, the whole is not; the lone thing is
+        // taken everywhere.
+        let l = levels(&own, &Choice { fill: true, ..CHOICE });
+        assert_eq!((sorted(&l[1]), sorted(&l[2]), sorted(&l[3])), (vec![1, 2, 3], vec![1, 2, 3], vec![0, 3]));
+    }
+}

@@ -1,0 +1,214 @@
+//! `mask-embed embed`: CLIP features of the masks of existing id maps; `mask-embed crops`: the pictures that CLIP sees.
+
+use crate::args::{CropsArgs, EmbedArgs};
+use crate::{finished, photographs};
+use artifacts::{Level, MaskFeatures, MaskMaps, features_path, hash_folder, maps_path, role};
+use gs_io::{ArtifactWriter, Error, Result, create_dir, hash_file};
+use gs_scene::dataset::View;
+use onnx_models::{ClipImage, LabelMap, RgbImage, crop_mask, mask_bounds};
+use serde::{Deserialize, Serialize};
+use serde_json::json;
+use stage::Stage;
+use std::collections::{BTreeMap, HashMap};
+use std::path::Path;
+
+/// Format name of the file of crops.
+pub const CROPS_FORMAT: &str = "crops";
+
+/// Facts of a view's features.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+struct Facts {
+    /// Rows of the file.
+    masks: usize,
+    /// Rows whose masks have pixels.
+    features: usize,
+    /// Distinct pictures among them, which is what CLIP is shown.
+    pictures: usize,
+}
+
+/// Crops of the masks that own pixels: `(id, crop)`, ids ascending. An id that occurs at several levels is taken from
+/// the first.
+pub fn crops(image: &RgbImage, maps: &MaskMaps, size: usize) -> Vec<(usize, Vec<u8>)> {
+    let count = maps.id_count();
+    let mut found: Vec<Option<(Level, onnx_models::Bounds)>> = vec![None; count];
+    let label_map = |level: Level| LabelMap { width: maps.width, height: maps.height, ids: maps.level(level) };
+    for level in Level::ALL {
+        for (slot, bounds) in found.iter_mut().zip(mask_bounds(&label_map(level), count)) {
+            *slot = slot.or(bounds.map(|b| (level, b)));
+        }
+    }
+    let owners: Vec<(usize, Level, onnx_models::Bounds)> =
+        found.into_iter().enumerate().filter_map(|(id, f)| f.map(|(l, b)| (id, l, b))).collect();
+    use rayon::prelude::*;
+    owners
+        .into_par_iter()
+        .map(|(id, level, bounds)| (id, crop_mask(image, &label_map(level), id as i32, bounds, size)))
+        .collect()
+}
+
+/// Reads the id maps of a view; `None` with a warning when there are none.
+fn read_maps(folder: &Path, view: &View, stage: &Stage) -> Result<Option<MaskMaps>> {
+    let path = maps_path(folder, view.stem());
+    if !path.exists() {
+        stage.warn(&format!("{}: no id maps of this view; it is left out", path.display()));
+        return Ok(None);
+    }
+    MaskMaps::read(&path).map(Some)
+}
+
+fn no_maps(folder: &Path) -> Error {
+    Error::new("no id maps of any view of the scene")
+        .file(folder)
+        .expected("<view>_s.npy, named after the photographs")
+        .hint("run mask-embed masks or mask-embed import first")
+}
+
+/// Makes the features of every view's masks that do not stand already, then the manifest.
+///
+/// # Errors
+/// When scene, id maps or model cannot be read, or the output cannot be written.
+pub fn run(args: &EmbedArgs, stage: &Stage) -> Result<()> {
+    let scene = photographs::open(&args.scene, stage)?;
+    let clip = ClipImage::open(&args.clip, &args.engine.options())?;
+    let out = args.out.as_ref().unwrap_or(&args.masks);
+    create_dir(out)?;
+    let manifest = out.join("features.json");
+    let engine = if args.engine.onnx_runtime.is_some() { "onnxruntime" } else { "rten" };
+    let parameters = json!({
+        "model": clip.config(), "image_size": clip.size(), "dimension": clip.dimension(),
+        "resolution": args.scene.resolution.to_string(), "engine": engine,
+    });
+    let dataset_hash = scene.hash()?;
+    finished::remove_manifest(&manifest)?;
+
+    let mut views = BTreeMap::new();
+    let mut progress = stage.progress("views", scene.views.len() as u64);
+    let (mut kept, mut masks, mut pictures) = (0, 0, 0);
+    for view in &scene.views {
+        if stage.interrupted() {
+            return Err(Error::new("interrupted; start again to go on with the next view"));
+        }
+        let Some(maps) = read_maps(&args.masks, view, stage)? else { continue };
+        let (image, image_hash) = photographs::read(view)?;
+        let maps_hash = hash_file(maps_path(&args.masks, view.stem()))?;
+        let key = finished::made_from(&[&parameters.to_string(), clip.hash(), &image_hash, &maps_hash]);
+        let output = features_path(out, view.stem());
+        let note = if let Some(note) = finished::find::<Facts>(&output, &key) {
+            kept += 1;
+            note
+        } else {
+            let (features, pictures) = embed(&clip, &image, &maps)?;
+            let shown = features.values.chunks(features.dim).filter(|r| r.iter().any(|&v| v != 0.0)).count();
+            let facts = Facts { masks: features.count, features: shown, pictures };
+            features.write(&output)?;
+            finished::write(&output, &key, facts)?
+        };
+        masks += note.facts.features;
+        pictures += note.facts.pictures;
+        views.insert(view.stem().to_string(), json!({ "hash": note.hash, "facts": note.facts }));
+        progress.step();
+    }
+    progress.finish(&[]);
+    if views.is_empty() {
+        return Err(no_maps(&args.masks));
+    }
+    if kept > 0 {
+        stage.skipped(&format!("{kept} of {} views: their features stand already", views.len()));
+    }
+    if pictures < masks {
+        stage.skipped(&format!("{} of {masks} masks: the same pictures as masks of other levels", masks - pictures));
+    }
+    let inputs = BTreeMap::from([
+        (role::DATASET.to_string(), dataset_hash),
+        (role::MASKS.to_string(), hash_folder(&args.masks, "_s.npy")?),
+        ("clip".to_string(), clip.hash().to_string()),
+    ]);
+    let mut provenance = stage.provenance("mask-features", 1, parameters.clone(), inputs.clone());
+    provenance.extra = json!({ "views": views });
+    finished::write_json(&manifest, &provenance)?;
+    stage.record(&manifest, parameters, inputs, json!({ "views": views.len(), "masks": masks, "pictures": pictures }))
+}
+
+/// Features of all masks, and how many different pictures they come from. Levels often hold the very same mask, which is
+/// then encoded once.
+fn embed(clip: &ClipImage, image: &RgbImage, maps: &MaskMaps) -> Result<(MaskFeatures, usize)> {
+    let dim = clip.dimension();
+    let mut values = vec![0f32; maps.id_count() * dim];
+    let all = crops(image, maps, clip.size());
+    let mut first: HashMap<&[u8], usize> = HashMap::new();
+    let mut pictures: Vec<u8> = Vec::new();
+    let picture_of: Vec<usize> = all
+        .iter()
+        .map(|(_, crop)| {
+            let next = first.len();
+            *first.entry(crop).or_insert_with(|| {
+                pictures.extend_from_slice(crop);
+                next
+            })
+        })
+        .collect();
+    let encoded = clip.encode(&pictures)?;
+    for ((id, _), picture) in all.iter().zip(picture_of) {
+        values[id * dim..(id + 1) * dim].copy_from_slice(&encoded[picture * dim..(picture + 1) * dim]);
+    }
+    Ok((MaskFeatures { count: maps.id_count(), dim, values }, first.len()))
+}
+
+/// Writes the crops of all masks of a scene into one file.
+///
+/// # Errors
+/// When scene or id maps cannot be read, or the output cannot be written.
+pub fn write_crops(args: &CropsArgs, stage: &Stage) -> Result<()> {
+    let scene = photographs::open(&args.scene, stage)?;
+    let size = usize::from(args.size);
+    let (mut pixels, mut view_of, mut mask_of, mut names) = (Vec::new(), Vec::new(), Vec::new(), Vec::new());
+    let mut progress = stage.progress("views", scene.views.len() as u64);
+    for view in &scene.views {
+        let Some(maps) = read_maps(&args.masks, view, stage)? else { continue };
+        let (image, _) = photographs::read(view)?;
+        for (id, crop) in crops(&image, &maps, size) {
+            pixels.extend(crop);
+            view_of.push(names.len() as u32);
+            mask_of.push(id as u32);
+        }
+        names.push(view.stem().to_string());
+        progress.step();
+    }
+    progress.finish(&[]);
+    if names.is_empty() {
+        return Err(no_maps(&args.masks));
+    }
+    let parameters = json!({ "size": size, "resolution": args.scene.resolution.to_string() });
+    let inputs = BTreeMap::from([
+        (role::DATASET.to_string(), scene.hash()?),
+        (role::MASKS.to_string(), hash_folder(&args.masks, "_s.npy")?),
+    ]);
+    let mut provenance = stage.provenance(CROPS_FORMAT, 1, parameters.clone(), inputs.clone());
+    provenance.extra = json!({ "views": names });
+    ArtifactWriter::new(provenance)
+        .tensor("pixels", &[mask_of.len(), 3, size, size], &pixels)
+        .tensor("view", &[mask_of.len()], &view_of)
+        .tensor("mask", &[mask_of.len()], &mask_of)
+        .write(&args.out)?;
+    stage.record(&args.out, parameters, inputs, json!({ "views": names.len(), "crops": mask_of.len() }))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn every_mask_with_pixels_has_a_crop_whatever_its_level() {
+        // 2 x 1 map: default has mask 0 on the left; small none; medium mask 2 on both; large masks 2 (again) and 3.
+        let maps = MaskMaps { width: 2, height: 1, ids: vec![0, -1, -1, -1, 2, 2, 2, 3] };
+        let image = RgbImage { width: 2, height: 1, pixels: vec![10, 10, 10, 200, 200, 200] };
+        let all = crops(&image, &maps, 2);
+        assert_eq!(all.iter().map(|(id, _)| *id).collect::<Vec<_>>(), [0, 2, 3]);
+        assert_eq!(all[0].1, [10; 12]);
+        // Two pixels beside each other, black below (the odd row of padding).
+        assert_eq!(all[1].1[..4], [10, 200, 0, 0]);
+        assert_eq!(all[2].1, [200; 12]);
+        let none = MaskMaps { width: 2, height: 1, ids: vec![-1; 8] };
+        assert!(crops(&image, &none, 2).is_empty());
+    }
+}

@@ -1,0 +1,144 @@
+//! `mask-embed masks`: id maps from photographs with SAM.
+
+use crate::args::MasksArgs;
+use crate::automatic::{levels, propose};
+use crate::paint::{paint, preview};
+use crate::sam::Sam;
+use crate::{finished, photographs};
+use artifacts::{LEVELS, Level, MaskMaps, maps_path, role};
+use gs_io::{Error, Result, create_dir};
+use gs_scene::Image;
+use gs_scene::dataset::View;
+use onnx_models::RgbImage;
+use serde::{Deserialize, Serialize};
+use serde_json::json;
+use stage::Stage;
+use std::collections::{BTreeMap, BTreeSet};
+use std::path::Path;
+
+/// Facts of a view's id maps.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+struct Facts {
+    /// Width and height of the maps.
+    size: [usize; 2],
+    /// Masks of each level.
+    masks: [usize; LEVELS],
+    /// Points of the grid, and how many of them were asked.
+    points: usize,
+    asked: usize,
+}
+
+/// Masks of each level of a map.
+pub(crate) fn count_masks(maps: &MaskMaps) -> [usize; LEVELS] {
+    Level::ALL.map(|l| maps.level(l).iter().filter(|&&id| id >= 0).collect::<BTreeSet<_>>().len())
+}
+
+/// Makes the id maps of every view of a scene that do not stand already, then the manifest.
+///
+/// # Errors
+/// When scene or models cannot be read, a photograph cannot be decoded, or the output cannot be written.
+pub fn run(args: &MasksArgs, stage: &Stage) -> Result<()> {
+    let scene = photographs::open(&args.scene, stage)?;
+    let sam = Sam::open(&args.sam, &args.engine.options())?;
+    create_dir(&args.out)?;
+    let manifest = args.out.join("masks.json");
+    let choice = args.choice.choice();
+    let engine = if args.engine.onnx_runtime.is_some() { "onnxruntime" } else { "rten" };
+    let parameters = json!({
+        "choice": args.choice.json(), "map_size": args.map_size, "min_area": args.min_area,
+        "resolution": args.scene.resolution.to_string(), "engine": engine,
+    });
+    let dataset_hash = scene.hash()?;
+    finished::remove_manifest(&manifest)?;
+    warn_of_strangers(&args.out, scene.views.iter().map(View::stem), stage)?;
+
+    let mut views = BTreeMap::new();
+    let mut progress = stage.progress("views", scene.views.len() as u64);
+    let (mut kept, mut asked, mut points) = (0, 0, 0);
+    for view in &scene.views {
+        if stage.interrupted() {
+            return Err(Error::new("interrupted; start again to go on with the next view"));
+        }
+        let output = maps_path(&args.out, view.stem());
+        let (image, image_hash) = photographs::read(view)?;
+        let key = finished::made_from(&[&parameters.to_string(), sam.hash(), &image_hash]);
+        let note = if let Some(note) = finished::find::<Facts>(&output, &key) {
+            kept += 1;
+            note
+        } else {
+            let embedded = sam.encode(&image)?;
+            let proposals = propose(&sam, &embedded, &choice)?;
+            let chosen = levels(&proposals.masks, &choice);
+            let [width, height] = map_size(&image, args.map_size);
+            let scale = (width * height) as f64 / (image.width * image.height) as f64;
+            let maps = paint(&proposals, &chosen, width, height, (args.min_area as f64 * scale).ceil() as usize);
+            let facts = Facts {
+                size: [width, height],
+                masks: count_masks(&maps),
+                points: proposals.points,
+                asked: proposals.asked,
+            };
+            maps.write(&output)?;
+            finished::write(&output, &key, facts)?
+        };
+        if let Some(folder) = &args.preview {
+            let picture = preview(&image, &MaskMaps::read(&output)?);
+            Image::from_rgb8(picture.width as u32, picture.height as u32, &picture.pixels)
+                .write_png(folder.join(format!("{}.png", view.stem())))?;
+        }
+        asked += note.facts.asked;
+        points += note.facts.points;
+        views.insert(view.stem().to_string(), json!({ "hash": note.hash, "facts": note.facts }));
+        progress.step();
+    }
+    progress.finish(&[]);
+    if kept > 0 {
+        stage.skipped(&format!("{kept} of {} views: their id maps stand already", scene.views.len()));
+    }
+    if asked < points {
+        stage.skipped(&format!("{} of {points} points: within masks already found", points - asked));
+    }
+    let mut inputs = BTreeMap::from([(role::DATASET.to_string(), dataset_hash)]);
+    inputs.insert("sam".into(), sam.hash().to_string());
+    let mut provenance = stage.provenance("masks", 1, parameters.clone(), inputs.clone());
+    provenance.extra = json!({ "views": views });
+    finished::write_json(&manifest, &provenance)?;
+    let masks: usize = views.values().filter_map(|v| v["facts"]["masks"][3].as_u64()).sum::<u64>() as usize;
+    stage.record(&manifest, parameters, inputs, json!({ "views": views.len(), "masks_large": masks }))
+}
+
+/// Size of the map: longest side `longest`, but not larger than the photograph; 0 for its own size.
+fn map_size(image: &RgbImage, longest: usize) -> [usize; 2] {
+    let side = image.width.max(image.height);
+    let scale = if longest == 0 { 1.0 } else { (longest as f64 / side as f64).min(1.0) };
+    [image.width, image.height].map(|n| ((n as f64 * scale).round() as usize).max(1))
+}
+
+/// Id maps of views that the scene does not have would be taken for its own by whoever reads the folder.
+fn warn_of_strangers<'a>(folder: &Path, stems: impl Iterator<Item = &'a str>, stage: &Stage) -> Result<()> {
+    let own: BTreeSet<&str> = stems.collect();
+    let strangers: Vec<String> = artifacts::stems(folder)?.into_iter().filter(|s| !own.contains(s.as_str())).collect();
+    if let Some(first) = strangers.first() {
+        stage.warn(&format!(
+            "{}: {} id maps of views that are not in the scene, such as {first}; delete them if they are old",
+            folder.display(),
+            strangers.len()
+        ));
+    }
+    Ok(())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn maps_keep_the_shape_and_never_grow() {
+        let image = |width, height| RgbImage { width, height, pixels: Vec::new() };
+        assert_eq!(map_size(&image(1600, 898), 800), [800, 449]);
+        assert_eq!(map_size(&image(600, 900), 300), [200, 300]);
+        assert_eq!(map_size(&image(320, 200), 800), [320, 200]);
+        assert_eq!(map_size(&image(320, 200), 0), [320, 200]);
+        assert_eq!(map_size(&image(5000, 2), 800), [800, 1]);
+    }
+}

@@ -1,0 +1,199 @@
+//! Which of many overlapping masks stay: SAM's suppression by boxes and LangSplat's by masks.
+
+/// A set of pixels of a small picture, one bit each.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Pixels {
+    words: Vec<u64>,
+    /// Number of pixels in the set.
+    pub area: usize,
+    /// First column and row, one past the last column and row; zeros for the empty set.
+    pub bounds: [usize; 4],
+}
+
+impl Pixels {
+    /// The pixels of a `width`-wide picture where `inside` is true.
+    pub fn new(width: usize, inside: impl ExactSizeIterator<Item = bool>) -> Self {
+        let mut words = vec![0u64; inside.len().div_ceil(64)];
+        let (mut area, mut bounds) = (0, [usize::MAX, usize::MAX, 0, 0]);
+        for (i, _) in inside.enumerate().filter(|(_, inside)| *inside) {
+            words[i / 64] |= 1 << (i % 64);
+            area += 1;
+            let (x, y) = (i % width, i / width);
+            bounds = [bounds[0].min(x), bounds[1].min(y), bounds[2].max(x + 1), bounds[3].max(y + 1)];
+        }
+        Self { words, area, bounds: if area == 0 { [0; 4] } else { bounds } }
+    }
+
+    /// Number of pixels in both sets.
+    pub fn overlap(&self, other: &Self) -> usize {
+        self.words.iter().zip(&other.words).map(|(a, b)| (a & b).count_ones() as usize).sum()
+    }
+
+    /// Pixels of either set; both of the same picture.
+    #[must_use]
+    pub fn union(&self, other: &Self) -> Self {
+        let words: Vec<u64> = self.words.iter().zip(&other.words).map(|(a, b)| a | b).collect();
+        let area = words.iter().map(|w| w.count_ones() as usize).sum();
+        let (a, b) = (self.bounds, other.bounds);
+        let bounds = match (self.area, other.area) {
+            (0, _) => b,
+            (_, 0) => a,
+            _ => [a[0].min(b[0]), a[1].min(b[1]), a[2].max(b[2]), a[3].max(b[3])],
+        };
+        Self { words, area, bounds }
+    }
+
+    /// Whether pixel `index` is in the set.
+    pub fn contains(&self, index: usize) -> bool {
+        self.words.get(index / 64).is_some_and(|w| w >> (index % 64) & 1 == 1)
+    }
+
+    fn box_iou(&self, other: &Self) -> f64 {
+        let ([ax0, ay0, ax1, ay1], [bx0, by0, bx1, by1]) = (self.bounds, other.bounds);
+        let area = |x0: usize, y0: usize, x1: usize, y1: usize| x1.saturating_sub(x0) * y1.saturating_sub(y0);
+        let both = area(ax0.max(bx0), ay0.max(by0), ax1.min(bx1), ay1.min(by1));
+        let either = area(ax0, ay0, ax1, ay1) + area(bx0, by0, bx1, by1) - both;
+        both as f64 / either.max(1) as f64
+    }
+}
+
+/// Indices by descending score; equal scores keep their order, so that the result depends on nothing else.
+fn by_score(scores: &[f32]) -> Vec<usize> {
+    let mut order: Vec<usize> = (0..scores.len()).collect();
+    order.sort_by(|&a, &b| scores[b].total_cmp(&scores[a]).then(a.cmp(&b)));
+    order
+}
+
+/// Suppression by boxes: of masks whose boxes overlap by more than `threshold` (IoU) the one of best score stays.
+/// Gives the indices that stay, best first.
+pub fn box_nms(masks: &[&Pixels], scores: &[f32], threshold: f64) -> Vec<usize> {
+    let mut kept: Vec<usize> = Vec::new();
+    for i in by_score(scores) {
+        if kept.iter().all(|&k| masks[k].box_iou(masks[i]) <= threshold) {
+            kept.push(i);
+        }
+    }
+    kept
+}
+
+/// Thresholds of [`mask_nms`].
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct MaskNms {
+    /// A mask that overlaps a better one by more than this (IoU) goes.
+    pub iou: f64,
+    /// A mask with a lower score than this goes.
+    pub score: f32,
+    /// A mask of which this much or less is shared with a larger one around it goes: see [`mask_nms`].
+    pub inner: f64,
+}
+
+/// LangSplat's suppression by masks within a level. A mask goes when its score is low; when it overlaps a better one too
+/// much; or when it is a fragment: with a = the part of it that lies in another mask and b = the part of the other that
+/// lies in it, a >= 0.85, b < 0.5 and a b < `inner`. Unlike there, a mask of low score goes first and so removes nothing
+/// itself. Gives the indices that stay, best first.
+pub fn mask_nms(masks: &[&Pixels], scores: &[f32], rule: MaskNms) -> Vec<usize> {
+    let mut order = by_score(scores);
+    order.retain(|&i| masks[i].area > 0 && scores[i] > rule.score);
+    let mut keep = vec![true; order.len()];
+    for (p, &i) in order.iter().enumerate() {
+        for (q, &j) in order.iter().enumerate().skip(p + 1) {
+            let both = masks[i].overlap(masks[j]) as f64;
+            if both == 0.0 {
+                continue;
+            }
+            let (ai, aj) = (masks[i].area as f64, masks[j].area as f64);
+            if both / (ai + aj - both) > rule.iou {
+                keep[q] = false;
+            }
+            let (of_i, of_j) = (both / ai, both / aj);
+            if of_i * of_j < rule.inner {
+                if of_i < 0.5 && of_j >= 0.85 {
+                    keep[q] = false;
+                }
+                if of_i >= 0.85 && of_j < 0.5 {
+                    keep[p] = false;
+                }
+            }
+        }
+    }
+    order.into_iter().zip(keep).filter_map(|(i, k)| k.then_some(i)).collect()
+}
+
+/// Levels of masks that come without them, from nesting. A mask lies in another when 85% of it does and the other is
+/// larger. Small are the masks that contain none, large those that lie in none, medium those that lie in exactly one
+/// and, so that no level has holes, those that are both small and large. Gives the levels 1, 2, 3 of each mask.
+pub fn nesting_levels(masks: &[&Pixels]) -> Vec<[bool; 3]> {
+    let inside = |a: &Pixels, b: &Pixels| a.area < b.area && a.overlap(b) as f64 >= 0.85 * a.area as f64;
+    let n = masks.len();
+    (0..n)
+        .map(|i| {
+            let parents = (0..n).filter(|&j| inside(masks[i], masks[j])).count();
+            let children = (0..n).filter(|&j| inside(masks[j], masks[i])).count();
+            let (small, large) = (children == 0, parents == 0);
+            [small, parents == 1 || (small && large), large]
+        })
+        .collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Rectangle x0..x1, y0..y1 of a 20 x 10 picture.
+    fn rect(x0: usize, y0: usize, x1: usize, y1: usize) -> Pixels {
+        Pixels::new(20, (0..200).map(|i| (x0..x1).contains(&(i % 20)) && (y0..y1).contains(&(i / 20))))
+    }
+
+    const RULE: MaskNms = MaskNms { iou: 0.8, score: 0.7, inner: 0.5 };
+
+    #[test]
+    fn pixels_count_and_overlap() {
+        let a = rect(2, 3, 12, 8);
+        assert_eq!((a.area, a.bounds), (50, [2, 3, 12, 8]));
+        assert_eq!(a.overlap(&rect(10, 0, 20, 5)), 4);
+        assert_eq!(
+            a.union(&rect(10, 0, 20, 5)),
+            Pixels::new(20, (0..200).map(|i| a.contains(i) || (i < 100 && i % 20 >= 10)))
+        );
+        assert_eq!(a.union(&rect(0, 0, 0, 0)), a);
+        assert!(a.contains(3 * 20 + 2) && !a.contains(3 * 20 + 1) && !a.contains(100_000));
+        assert!((a.box_iou(&rect(2, 3, 12, 4)) - 0.2).abs() < 1e-12);
+        assert_eq!((rect(5, 5, 5, 9).bounds, rect(5, 5, 5, 9).box_iou(&a)), ([0; 4], 0.0));
+    }
+
+    #[test]
+    fn boxes_that_overlap_leave_the_best() {
+        let m = [rect(0, 0, 10, 10), rect(1, 0, 10, 10), rect(10, 0, 20, 10)];
+        let r: Vec<&Pixels> = m.iter().collect();
+        assert_eq!(box_nms(&r, &[0.8, 0.9, 0.7], 0.7), [1, 2]);
+        assert_eq!(box_nms(&r, &[0.8, 0.9, 0.7], 0.95), [1, 0, 2]);
+        // Equal scores: the first stays.
+        assert_eq!(box_nms(&r, &[0.9, 0.9, 0.9], 0.7), [0, 2]);
+    }
+
+    #[test]
+    fn masks_that_overlap_score_low_or_are_fragments_go() {
+        let (whole, same, part, other) = (rect(0, 0, 10, 10), rect(0, 0, 10, 9), rect(0, 0, 4, 4), rect(12, 0, 20, 10));
+        let r = [&whole, &same, &part, &other];
+        // `same` overlaps `whole` by 0.9; `part` is a fragment of both, whatever its score.
+        assert_eq!(mask_nms(&r, &[0.95, 0.9, 0.8, 0.75], RULE), [0, 3]);
+        assert_eq!(mask_nms(&r, &[0.8, 0.75, 0.99, 0.9], RULE), [3, 0]);
+        assert_eq!(mask_nms(&r, &[0.95, 0.9, 0.8, 0.65], RULE), [0]);
+        // More than half of the larger is no fragment; nor is a mask that lies half outside.
+        let (big_part, half_out) = (rect(0, 0, 10, 6), rect(8, 0, 12, 4));
+        assert_eq!(mask_nms(&[&whole, &big_part, &half_out], &[0.9, 0.85, 0.8], RULE), [0, 1, 2]);
+        assert!(mask_nms(&[&rect(3, 3, 3, 3)], &[0.9], RULE).is_empty());
+        assert!(mask_nms(&[], &[], RULE).is_empty());
+    }
+
+    #[test]
+    fn levels_follow_nesting() {
+        // A thing with a part with a subpart, and a thing alone.
+        let (thing, part, subpart, alone) =
+            (rect(0, 0, 10, 10), rect(0, 0, 6, 6), rect(1, 1, 3, 3), rect(12, 2, 18, 8));
+        assert_eq!(
+            nesting_levels(&[&thing, &part, &subpart, &alone]),
+            [[false, false, true], [false, true, false], [true, false, false], [true, true, true]]
+        );
+    }
+}

@@ -1,0 +1,184 @@
+//! From chosen masks to an id map, and id maps as pictures.
+
+use crate::automatic::{Grid, Proposals};
+use crate::regions::clean;
+use artifacts::{LEVELS, MaskMaps, instance_color};
+use onnx_models::RgbImage;
+
+/// Paints the chosen masks of each level into an id map of `width` x `height`.
+///
+/// A mask is cut where its logits, linearly interpolated, pass 0; islands and holes of fewer than `min_area` pixels of
+/// the map are cleaned. Within a level the masks are painted from large to small, ids ascending: a later mask owns the
+/// pixels that it shares with an earlier one. A mask left with fewer than `min_area` pixels is not painted at all. Ids
+/// count on from level to level, and every id owns pixels, so that LangSplat's readers, which take the highest id of a
+/// level for its number of masks, agree.
+pub fn paint(
+    proposals: &Proposals,
+    chosen: &[Vec<usize>; LEVELS],
+    width: usize,
+    height: usize,
+    min_area: usize,
+) -> MaskMaps {
+    let min_area = min_area.max(1);
+    let mut ids = vec![-1i32; LEVELS * width * height];
+    let mut first = 0;
+    for (level, indices) in chosen.iter().enumerate() {
+        let mut masks: Vec<(usize, usize, Vec<bool>)> = Vec::new();
+        for &i in indices {
+            let mut mask = enlarge(&proposals.masks[i].logits, &proposals.grid, width, height);
+            clean(&mut mask, width, min_area);
+            let area = mask.iter().filter(|&&m| m).count();
+            masks.push((area, i, mask));
+        }
+        // From large to small; equal areas by order of prompts.
+        masks.sort_by(|a, b| b.0.cmp(&a.0).then(a.1.cmp(&b.1)));
+        let map = &mut ids[level * width * height..(level + 1) * width * height];
+        loop {
+            map.fill(-1);
+            for (id, (_, _, mask)) in masks.iter().enumerate() {
+                for (pixel, _) in map.iter_mut().zip(mask).filter(|(_, m)| **m) {
+                    *pixel = id as i32;
+                }
+            }
+            let mut owned = vec![0usize; masks.len()];
+            for id in map.iter().filter_map(|&id| usize::try_from(id).ok()) {
+                owned[id] += 1;
+            }
+            let before = masks.len();
+            let mut owned = owned.into_iter();
+            masks.retain(|_| owned.next().is_some_and(|n| n >= min_area));
+            if masks.len() == before {
+                break;
+            }
+        }
+        for id in map.iter_mut().filter(|id| **id >= 0) {
+            *id += first;
+        }
+        first += masks.len() as i32;
+    }
+    MaskMaps { width, height, ids }
+}
+
+/// The mask at another resolution: pixels where the interpolated logits are positive.
+fn enlarge(logits: &[f32], grid: &Grid, width: usize, height: usize) -> Vec<bool> {
+    // Two neighbours and the weight of the second, for each pixel of the result.
+    let taps = |n: usize, extent: f64, last: usize| -> Vec<(usize, usize, f32)> {
+        (0..n)
+            .map(|i| {
+                let at = ((i as f64 + 0.5) / n as f64 * extent - 0.5).clamp(0.0, (last - 1) as f64);
+                let low = at.floor() as usize;
+                (low, (low + 1).min(last - 1), (at - low as f64) as f32)
+            })
+            .collect()
+    };
+    let columns = taps(width, grid.extent[0], grid.width);
+    let rows = taps(height, grid.extent[1], grid.height);
+    let mut mask = Vec::with_capacity(width * height);
+    for &(y0, y1, fy) in &rows {
+        let (top, bottom) = (&logits[y0 * grid.width..][..grid.width], &logits[y1 * grid.width..][..grid.width]);
+        mask.extend(columns.iter().map(|&(x0, x1, fx)| {
+            let a = top[x0] + (top[x1] - top[x0]) * fx;
+            let b = bottom[x0] + (bottom[x1] - bottom[x0]) * fx;
+            a + (b - a) * fy > 0.0
+        }));
+    }
+    mask
+}
+
+/// Id maps as a picture: the four levels in two rows, each mask in a colour of its own over the photograph, outlined.
+/// `image` is resized to the map.
+pub fn preview(image: &RgbImage, maps: &MaskMaps) -> RgbImage {
+    let (w, h) = (maps.width, maps.height);
+    let small = onnx_models::resize_rgb(image, w, h);
+    let mut out = RgbImage { width: 2 * w, height: 2 * h, pixels: vec![0; 4 * w * h * 3] };
+    for level in 0..LEVELS {
+        let map = &maps.ids[level * w * h..(level + 1) * w * h];
+        let first = map.iter().copied().filter(|&i| i >= 0).min().unwrap_or(0);
+        for y in 0..h {
+            for x in 0..w {
+                let id = map[y * w + x];
+                let edge = (x + 1 < w && map[y * w + x + 1] != id) || (y + 1 < h && map[(y + 1) * w + x] != id);
+                let photo = &small.pixels[(y * w + x) * 3..][..3];
+                let at = ((level / 2 * h + y) * 2 * w + level % 2 * w + x) * 3;
+                for c in 0..3 {
+                    out.pixels[at + c] = match id {
+                        _ if edge => 255,
+                        // No mask: the photograph, darkened.
+                        -1 => photo[c] / 3,
+                        id => (u16::from(photo[c]) * 2 / 5 + u16::from(color(id - first)[c]) * 3 / 5) as u8,
+                    };
+                }
+            }
+        }
+    }
+    out
+}
+
+fn color(id: i32) -> [u8; 3] {
+    instance_color(id as u32).map(|c| (c * 255.0).round() as u8)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::automatic::Proposal;
+    use crate::nms::Pixels;
+
+    /// Proposals on a 20 x 10 grid, each a rectangle x0..x1, y0..y1.
+    fn proposals(rects: &[[usize; 4]]) -> Proposals {
+        let mask = |r: &[usize; 4]| {
+            let inside = |i: usize| (r[0]..r[2]).contains(&(i % 20)) && (r[1]..r[3]).contains(&(i / 20));
+            Proposal {
+                level: 1,
+                quality: 1.0,
+                score: 1.0,
+                pixels: Pixels::new(20, (0..200).map(inside)),
+                logits: (0..200).map(|i| if inside(i) { 5.0 } else { -5.0 }).collect(),
+            }
+        };
+        let grid = Grid { width: 20, height: 10, extent: [20.0, 10.0] };
+        Proposals { grid, masks: rects.iter().map(mask).collect(), asked: 0, points: 0 }
+    }
+
+    #[test]
+    fn ids_count_on_and_small_masks_lie_on_top() {
+        let p = proposals(&[[2, 2, 5, 5], [0, 0, 10, 10], [12, 0, 20, 10]]);
+        let m = paint(&p, &[vec![0, 1, 2], vec![0], vec![], vec![1, 2]], 20, 10, 1);
+        let at = |level: usize, x: usize, y: usize| m.ids[level * 200 + y * 20 + x];
+        // By area: 1 (100), 2 (80), 0 (9).
+        assert_eq!((at(0, 0, 0), at(0, 13, 5), at(0, 3, 3), at(0, 11, 5)), (0, 1, 2, -1));
+        assert_eq!((at(1, 3, 3), at(1, 0, 0)), (3, -1));
+        assert!(m.ids[400..600].iter().all(|&i| i == -1));
+        assert_eq!((at(3, 3, 3), at(3, 13, 3)), (4, 5));
+        assert_eq!(m.id_count(), 6);
+        // The same at twice the size: the straight edges fall half way between logits of equal size.
+        let big = paint(&p, &[vec![0, 1, 2], vec![], vec![], vec![]], 40, 20, 1);
+        for y in 0..20 {
+            for x in 0..40 {
+                assert_eq!(big.ids[y * 40 + x], at(0, x / 2, y / 2), "at {x}, {y}");
+            }
+        }
+    }
+
+    #[test]
+    fn masks_that_others_cover_are_left_out_and_every_id_owns_pixels() {
+        // The large mask is covered up to a strip of 10 pixels; the small one has 4.
+        let p = proposals(&[[0, 0, 10, 10], [0, 0, 5, 10], [5, 0, 9, 10], [15, 5, 17, 7]]);
+        let chosen = [vec![0, 1, 2, 3], vec![], vec![], vec![]];
+        let count = |min: usize| paint(&p, &chosen, 20, 10, min).id_count();
+        assert_eq!((count(1), count(5), count(11)), (4, 3, 2));
+        let m = paint(&p, &chosen, 20, 10, 11);
+        let mut owned = vec![0; 2];
+        m.ids.iter().filter(|&&i| i >= 0).for_each(|&i| owned[i as usize] += 1);
+        assert_eq!(owned, [50, 40]);
+    }
+
+    #[test]
+    fn previews_show_four_levels() {
+        let m = MaskMaps { width: 4, height: 2, ids: vec![-1; 32] };
+        let photo = RgbImage { width: 8, height: 4, pixels: vec![90; 96] };
+        let p = preview(&photo, &m);
+        assert_eq!((p.width, p.height), (8, 4));
+        assert!(p.pixels.iter().all(|&v| v == 30));
+    }
+}
