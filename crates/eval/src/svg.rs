@@ -80,7 +80,7 @@ fn thin(points: &[(f64, f64)]) -> Vec<(f64, f64)> {
 
 /// About `count` round numbers that cover `low` to `high`: steps of 1, 2 or 5 times a power of ten.
 pub fn nice_ticks(low: f64, high: f64, count: usize) -> Vec<f64> {
-    if !(high > low) {
+    if high.is_nan() || low.is_nan() || high <= low {
         return vec![low];
     }
     let raw = (high - low) / count.max(1) as f64;

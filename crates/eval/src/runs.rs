@@ -1,0 +1,167 @@
+//! The records of all stages that made a run.
+
+use gs_io::Result;
+use serde_json::Value;
+use stage::RunRecord;
+use std::collections::BTreeMap;
+use std::path::{Path, PathBuf};
+
+/// Stages in the order in which they run.
+const ORDER: [&str; 7] =
+    ["synth-scene", "gs-geom", "mask-embed", "graph-precompute", "feat-train", "cluster-match", "eval"];
+/// Suffix of a record's file name.
+const SUFFIX: &str = ".run.json";
+
+/// A stage's record and the output it lies beside.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Run {
+    /// File name of the output.
+    pub output: String,
+    /// What the stage wrote of itself.
+    pub record: RunRecord,
+}
+
+impl Run {
+    /// The stage's name, with its command where it has several: `gs-geom train`.
+    pub fn name(&self) -> String {
+        match self.record.parameters.get("command").and_then(Value::as_str) {
+            Some(command) => format!("{} {command}", self.record.program),
+            None => self.record.program.clone(),
+        }
+    }
+
+    /// The figures of its summary, as text.
+    pub fn figures(&self) -> String {
+        let Value::Object(summary) = &self.record.summary else { return String::new() };
+        let figure = |(key, value): (&String, &Value)| {
+            let text = match value {
+                Value::Number(n) if n.is_f64() => crate::svg::number(n.as_f64()?),
+                Value::Number(n) => grouped(&n.to_string()),
+                Value::String(s) => s.clone(),
+                Value::Bool(b) => b.to_string(),
+                _ => return None,
+            };
+            Some(format!("{} {text}", key.replace('_', " ")))
+        };
+        summary.iter().filter_map(figure).collect::<Vec<_>>().join(", ")
+    }
+}
+
+/// All records in these folders and their sub-folders (three deep), in the order of the pipeline; each file once, and
+/// not the record of `except`.
+///
+/// # Errors
+/// When a record is damaged. Folders that do not exist hold no records.
+pub fn read_all(folders: &[&Path], except: &Path) -> Result<Vec<Run>> {
+    let mut paths: BTreeMap<PathBuf, PathBuf> = BTreeMap::new();
+    for folder in folders {
+        walk(folder, 3, &mut paths);
+    }
+    let except = RunRecord::path(except);
+    if let Ok(except) = except.canonicalize() {
+        paths.remove(&except);
+    }
+    let mut runs = Vec::with_capacity(paths.len());
+    for path in paths.into_values() {
+        let name = path.to_string_lossy().into_owned();
+        let output = PathBuf::from(name.strip_suffix(SUFFIX).unwrap_or(&name));
+        let record = RunRecord::read(&output)?;
+        runs.push(Run { output: output.file_name().unwrap_or_default().to_string_lossy().into_owned(), record });
+    }
+    let place = |r: &Run| ORDER.iter().position(|&s| s == r.record.program).unwrap_or(ORDER.len());
+    runs.sort_by(|a, b| (place(a), a.name(), &a.output).cmp(&(place(b), b.name(), &b.output)));
+    // gs-geom eval comes after gs-geom train, whatever the alphabet says.
+    runs.sort_by_key(|r| (place(r), r.name().ends_with(" eval")));
+    Ok(runs)
+}
+
+fn walk(folder: &Path, depth: usize, paths: &mut BTreeMap<PathBuf, PathBuf>) {
+    let Ok(entries) = std::fs::read_dir(folder) else { return };
+    for entry in entries.flatten() {
+        let path = entry.path();
+        if path.is_dir() {
+            if depth > 0 {
+                walk(&path, depth - 1, paths);
+            }
+        } else if path.to_string_lossy().ends_with(SUFFIX) {
+            // Folders may lie in one another: the same file counts once.
+            paths.insert(path.canonicalize().unwrap_or_else(|_| path.clone()), path);
+        }
+    }
+}
+
+/// Seconds by stage. Records that one process wrote beside several outputs (same parameters and inputs) count once.
+pub fn seconds(runs: &[Run]) -> BTreeMap<String, f64> {
+    let mut all: BTreeMap<String, Vec<(&RunRecord, f64)>> = BTreeMap::new();
+    for run in runs {
+        let of_stage = all.entry(run.name()).or_default();
+        let r = &run.record;
+        match of_stage.iter_mut().find(|(o, _)| o.parameters == r.parameters && o.inputs == r.inputs) {
+            Some(same) => same.1 = same.1.max(r.wall_seconds),
+            None => of_stage.push((r, r.wall_seconds)),
+        }
+    }
+    all.into_iter().map(|(name, records)| (name, records.iter().map(|r| r.1).sum())).collect()
+}
+
+/// A whole number with a comma between every three digits.
+pub fn grouped(digits: &str) -> String {
+    let (sign, digits) = digits.strip_prefix('-').map_or(("", digits), |d| ("-", d));
+    let mut out = String::from(sign);
+    for (i, c) in digits.chars().enumerate() {
+        if i > 0 && (digits.len() - i).is_multiple_of(3) {
+            out.push(',');
+        }
+        out.push(c);
+    }
+    out
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use serde_json::json;
+    use stage::Stage;
+
+    #[test]
+    fn records_are_found_once_in_pipeline_order() {
+        let dir = tempfile::tempdir().unwrap();
+        let sub = dir.path().join("query");
+        let none = BTreeMap::new();
+        for (stage, command, output) in [
+            ("eval", "query", sub.join("query.json")),
+            ("eval", "report", dir.path().join("report.html")),
+            ("gs-geom", "train", dir.path().join("geometry.ply")),
+            ("gs-geom", "eval", dir.path().join("geom_metrics.json")),
+            ("graph-precompute", "", dir.path().join("graph.safetensors")),
+            ("graph-precompute", "", dir.path().join("footprints.safetensors")),
+        ] {
+            let p = if command.is_empty() { json!({"k": 16}) } else { json!({"command": command}) };
+            let summary = json!({"gaussians": 12345, "psnr": 26.54321, "list": [1]});
+            Stage::silent(stage).record(output, p, none.clone(), summary).unwrap();
+        }
+        let runs = read_all(&[dir.path(), &sub, Path::new("/no/such")], &dir.path().join("report.html")).unwrap();
+        let names: Vec<String> = runs.iter().map(|r| format!("{}: {}", r.name(), r.output)).collect();
+        assert_eq!(
+            names,
+            [
+                "gs-geom train: geometry.ply",
+                "gs-geom eval: geom_metrics.json",
+                "graph-precompute: footprints.safetensors",
+                "graph-precompute: graph.safetensors",
+                "eval query: query.json"
+            ]
+        );
+        assert_eq!(runs[0].figures(), "gaussians 12,345, psnr 26.54");
+        assert_eq!(seconds(&runs).len(), 4);
+        let graph = runs[2].record.wall_seconds.max(runs[3].record.wall_seconds);
+        assert_eq!(seconds(&runs)["graph-precompute"], graph);
+    }
+
+    #[test]
+    fn digits_are_grouped() {
+        for (d, g) in [("7", "7"), ("1234", "1,234"), ("-123456", "-123,456"), ("1000000", "1,000,000")] {
+            assert_eq!(grouped(d), g);
+        }
+    }
+}

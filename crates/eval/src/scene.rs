@@ -1,0 +1,93 @@
+//! What every command loads: instances with their geometry, and the views of the scene.
+
+use artifacts::{Instances, role};
+use gs_io::{Error, Result, hash_file};
+use gs_scene::Gaussians;
+use gs_scene::dataset::{Dataset, View};
+use std::collections::BTreeMap;
+use std::path::{Path, PathBuf};
+
+/// Instances with the Gaussians they label.
+pub struct LabelledScene {
+    /// All Gaussians of the geometry; N.
+    pub gaussians: Gaussians,
+    /// The instances; labels are as many as Gaussians.
+    pub instances: Instances,
+    /// Where the instances were read from.
+    pub path: PathBuf,
+    /// Content hashes, by role.
+    pub inputs: BTreeMap<String, String>,
+}
+
+impl LabelledScene {
+    /// Reads `instances.safetensors` and the geometry it was made from.
+    ///
+    /// # Errors
+    /// When a file is missing or damaged, or the instances belong to another geometry.
+    pub fn read(instances: &Path, geometry: &Path) -> Result<Self> {
+        let (labelled, artifact) = Instances::read(instances)?;
+        let geometry_hash = hash_file(geometry)?;
+        artifact.expect_input(role::GEOMETRY, &geometry_hash)?;
+        let gaussians = gs_scene::ply::read_gaussians(geometry)?;
+        if labelled.label.len() != gaussians.len() {
+            return Err(Error::new("not a label per Gaussian")
+                .file(instances)
+                .field("label")
+                .found(labelled.label.len())
+                .expected(format!("{} ({})", gaussians.len(), geometry.display()))
+                .hint("run cluster-match again"));
+        }
+        let inputs =
+            BTreeMap::from([(role::GEOMETRY.into(), geometry_hash), ("instances".into(), artifact.hash().into())]);
+        Ok(Self { gaussians, instances: labelled, path: instances.into(), inputs })
+    }
+}
+
+/// The view of this name: a file name, with or without its extension.
+///
+/// # Errors
+/// When there is none; the message names a few that exist.
+pub fn find_view<'a>(dataset: &'a Dataset, name: &str) -> Result<&'a View> {
+    dataset.views.iter().find(|v| v.name == name || v.stem() == name).ok_or_else(|| {
+        let some: Vec<&str> = dataset.views.iter().take(4).map(View::stem).collect();
+        Error::new("no such view").file(&dataset.root).field("--views").found(name).expected(format!(
+            "one of {} names such as {}",
+            dataset.views.len(),
+            some.join(", ")
+        ))
+    })
+}
+
+/// At most `count` of `all`, evenly spread, in order.
+pub fn spread<T: Copy>(all: &[T], count: usize) -> Vec<T> {
+    let n = all.len();
+    let k = count.min(n);
+    (0..k).map(|i| all[(2 * i + 1) * n / (2 * k)]).collect()
+}
+
+/// A text as part of a file name: small letters and digits, everything else a hyphen.
+pub fn slug(text: &str) -> String {
+    let words: String = text.to_lowercase().chars().map(|c| if c.is_alphanumeric() { c } else { ' ' }).collect();
+    let joined = words.split_whitespace().collect::<Vec<_>>().join("-");
+    if joined.is_empty() { "query".into() } else { joined.chars().take(80).collect() }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn spreading_keeps_order_and_ends_apart() {
+        assert_eq!(spread(&[0, 1, 2, 3, 4, 5, 6, 7, 8], 3), [1, 4, 7]);
+        assert_eq!(spread(&[5, 6], 3), [5, 6]);
+        assert_eq!(spread(&[5], 1), [5]);
+        assert!(spread::<u8>(&[], 3).is_empty());
+    }
+
+    #[test]
+    fn slugs_are_file_names() {
+        assert_eq!(slug("Rubik's  cube/..\\x"), "rubik-s-cube-x");
+        assert_eq!(slug("../"), "query");
+        assert_eq!(slug(&"é".repeat(200)).chars().count(), 80);
+    }
+}

@@ -1,0 +1,122 @@
+//! Silhouettes of selected Gaussians in a view.
+
+use crate::Mask;
+use gs_raster::RasterOptions;
+use gs_scene::{Camera, Gaussians};
+
+/// How a selection becomes a mask. The two give different scores: say which was used (methods.md 4.1, trap 3).
+#[derive(Debug, Clone, Copy, PartialEq, Eq, clap::ValueEnum)]
+pub enum Silhouette {
+    /// Render the selected Gaussians alone; what stands before them does not hide them (OpenGaussian, CAGS).
+    Selected,
+    /// Render all Gaussians, count the share of the selected: what is hidden is not shown (AG2aussian, LaGa).
+    Visible,
+}
+
+impl Silhouette {
+    /// The value above which a pixel belongs, where none is given: 0.7 of accumulated alpha, or half of the pixel.
+    pub fn default_threshold(self) -> f32 {
+        match self {
+            Self::Selected => 0.7,
+            Self::Visible => 0.5,
+        }
+    }
+
+    /// Masks of several selections (ascending indices of Gaussians) in one view, in order.
+    pub fn masks(self, gaussians: &Gaussians, selections: &[&[u32]], camera: &Camera, threshold: f32) -> Vec<Mask> {
+        match self {
+            Self::Selected => selections.iter().map(|s| alone(gaussians, s, camera, threshold)).collect(),
+            Self::Visible => visible(gaussians, selections, camera, threshold),
+        }
+    }
+}
+
+/// Colours do not matter for a silhouette, so neither does the view-dependent part of them.
+fn options() -> RasterOptions {
+    RasterOptions { sh_degree: 0, ..RasterOptions::default() }
+}
+
+fn alone(gaussians: &Gaussians, selection: &[u32], camera: &Camera, threshold: f32) -> Mask {
+    let (w, h) = (camera.width as usize, camera.height as usize);
+    if selection.is_empty() {
+        return Mask::new(w, h);
+    }
+    Mask::above(w, h, &gs_raster::render(&gaussians.select(selection), camera, &options()).alpha, threshold)
+}
+
+/// Selections rendered at once; more are done in turns, which bounds the memory.
+const CHANNELS: usize = 16;
+
+fn visible(gaussians: &Gaussians, selections: &[&[u32]], camera: &Camera, threshold: f32) -> Vec<Mask> {
+    let (w, h) = (camera.width as usize, camera.height as usize);
+    let mut masks = Vec::with_capacity(selections.len());
+    for some in selections.chunks(CHANNELS) {
+        let d = some.len();
+        let mut member = vec![0.0f32; gaussians.len() * d];
+        for (k, selection) in some.iter().enumerate() {
+            for &i in *selection {
+                member[i as usize * d + k] = 1.0;
+            }
+        }
+        let share = gs_raster::render_features(gaussians, &member, d, camera, &options());
+        for k in 0..d {
+            let channel: Vec<f32> = share.iter().skip(k).step_by(d).copied().collect();
+            masks.push(Mask::above(w, h, &channel, threshold));
+        }
+    }
+    masks
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use glam::DVec3;
+
+    /// Two opaque balls on the axis of the camera: a small near one before a large far one.
+    fn balls() -> (Gaussians, Camera) {
+        let mut g = Gaussians::default();
+        for (z, scale) in [(2.0, 0.1f32), (4.0, 0.5)] {
+            g.means.push([0.0, 0.0, z]);
+            g.log_scales.push([scale.ln(); 3]);
+            g.rotations.push([1.0, 0.0, 0.0, 0.0]);
+            g.opacity_logits.push(6.0);
+            g.sh.extend([0.0; 3]);
+        }
+        (g, Camera::look_at(DVec3::ZERO, DVec3::Z, -DVec3::Y, 64, 48, 1.0))
+    }
+
+    #[test]
+    fn a_hidden_part_counts_only_when_rendered_alone() {
+        let (g, camera) = balls();
+        let far: &[u32] = &[1];
+        let alone = &Silhouette::Selected.masks(&g, &[far], &camera, 0.7)[0];
+        let seen = &Silhouette::Visible.masks(&g, &[far, &[0, 1]], &camera, 0.5);
+        let centre = 24 * 64 + 32;
+        assert!(alone.bits[centre] && !seen[0].bits[centre] && seen[1].bits[centre]);
+        assert!(seen[0].count() > 20, "its rim is seen");
+        // alpha = 0.99753 exp(-r^2 / (2 s^2)) > 0.7 within r = s sqrt(2 ln(0.99753 / 0.7)); s^2 = (f 0.5 / 4)^2 + 0.3.
+        let f = 32.0 / 0.5f64.tan();
+        let s2 = (f * 0.125).powi(2) + 0.3;
+        let area = std::f64::consts::PI * s2 * 2.0 * (0.99753f64 / 0.7).ln();
+        assert!((alone.count() as f64 - area).abs() < 0.06 * area + 4.0, "{} {area}", alone.count());
+    }
+
+    #[test]
+    fn nothing_selected_covers_nothing() {
+        let (g, camera) = balls();
+        for s in [Silhouette::Selected, Silhouette::Visible] {
+            assert_eq!(s.masks(&g, &[&[]], &camera, s.default_threshold())[0].count(), 0);
+        }
+    }
+
+    #[test]
+    fn many_selections_are_rendered_in_turns() {
+        let (g, camera) = balls();
+        let selections: Vec<&[u32]> =
+            (0..CHANNELS + 3).map(|i| if i % 2 == 0 { &[0u32][..] } else { &[1][..] }).collect();
+        let masks = Silhouette::Visible.masks(&g, &selections, &camera, 0.5);
+        assert_eq!(masks.len(), CHANNELS + 3);
+        assert_eq!(masks[CHANNELS], masks[0]);
+        assert_eq!(masks[CHANNELS + 1], masks[1]);
+    }
+}

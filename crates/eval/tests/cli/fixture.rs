@@ -1,0 +1,256 @@
+//! A scene of two balls above a floor, small enough to know everything about it: photographs rendered from the
+//! Gaussians themselves, truth and labels in closed form.
+
+use artifacts::{Features, Instances, MaskMaps, Match, TrueObject, TruePart, TruePoints, TrueScene, maps_path, role};
+use glam::DVec3;
+use gs_io::{Provenance, hash_file};
+use gs_raster::RasterOptions;
+use gs_scene::{Camera, Gaussians, Image};
+use serde_json::json;
+use std::collections::BTreeMap;
+use std::f64::consts::TAU;
+use std::path::{Path, PathBuf};
+use std::process::{Command, Output};
+
+pub const WIDTH: u32 = 96;
+pub const HEIGHT: u32 = 72;
+pub const VIEWS: usize = 9;
+/// Centres of the red and the blue ball.
+pub const CENTRES: [[f64; 3]; 2] = [[-0.6, 0.0, 0.5], [0.6, 0.0, 0.5]];
+const SIGMA: f64 = 0.3;
+
+pub struct Fixture {
+    dir: tempfile::TempDir,
+}
+
+impl Fixture {
+    /// Everything a finished run has; `language` is the dimension of the descriptors, 2 or 0.
+    pub fn new(language: usize) -> Self {
+        let f = Self { dir: tempfile::tempdir().unwrap() };
+        let (scene, run) = (f.scene(), f.run());
+        std::fs::create_dir_all(scene.join("images")).unwrap();
+        std::fs::create_dir_all(scene.join("label")).unwrap();
+        std::fs::create_dir_all(scene.join("truth")).unwrap();
+        std::fs::create_dir_all(&run).unwrap();
+        let g = gaussians();
+        gs_scene::ply::write_gaussians(f.geometry(), &g, &[]).unwrap();
+        let mut frames = Vec::new();
+        for (i, camera) in cameras().iter().enumerate() {
+            let name = stem(i);
+            let out = gs_raster::render(&g, camera, &RasterOptions::default());
+            let image = Image { width: WIDTH, height: HEIGHT, rgb: out.rgb, alpha: None };
+            image.write_png(scene.join(format!("images/{name}.png"))).unwrap();
+            frames.push(json!({"file_path": format!("images/{name}.png"), "transform_matrix": opengl_pose(camera)}));
+            f.write_masks(i, camera);
+        }
+        let c = &cameras()[0];
+        let transforms =
+            json!({"w": WIDTH, "h": HEIGHT, "fl_x": c.fx, "fl_y": c.fy, "cx": c.cx, "cy": c.cy, "frames": frames});
+        std::fs::write(scene.join("transforms.json"), transforms.to_string()).unwrap();
+        for i in [1, 4] {
+            f.write_label(i, &[("red ball", 0), ("blue ball", 1)], (WIDTH, HEIGHT));
+        }
+        f.write_truth();
+        f.write_instances(language, |i| if i < 2 { i as i32 } else { 2 });
+        f.write_features(&g);
+        std::fs::write(f.table(), r#"{"red ball": [1, 0], "blue ball": [0, 2], "thing": [0.7, 0.7]}"#).unwrap();
+        f
+    }
+
+    pub fn path(&self) -> &Path {
+        self.dir.path()
+    }
+    pub fn scene(&self) -> PathBuf {
+        self.path().join("balls")
+    }
+    pub fn run(&self) -> PathBuf {
+        self.path().join("run")
+    }
+    pub fn geometry(&self) -> PathBuf {
+        self.run().join("geometry.ply")
+    }
+    pub fn instances(&self) -> PathBuf {
+        self.run().join("instances.safetensors")
+    }
+    pub fn table(&self) -> PathBuf {
+        self.path().join("text.json")
+    }
+
+    fn provenance(&self) -> Provenance {
+        let inputs = BTreeMap::from([(role::GEOMETRY.to_string(), hash_file(self.geometry()).unwrap())]);
+        Provenance { inputs, ..Provenance::default() }
+    }
+
+    /// Instances with `label(group)` for the Gaussians of group 0 (red), 1 (blue), 2 (floor).
+    pub fn write_instances(&self, dim: usize, label: impl Fn(usize) -> i32) {
+        let all = [vec![1.0, 0.0], vec![0.0, 1.0], vec![-0.6, -0.8]];
+        let k = 3;
+        let instances = Instances {
+            label: groups().into_iter().map(label).collect(),
+            dim,
+            descriptor: all.iter().flat_map(|d| d[..dim].to_vec()).collect(),
+            support: vec![5, 4, 3],
+            score: vec![0.8; k],
+            count: vec![1, 1, 81],
+            centroid: vec![[0.0; 3]; k],
+            bbox_min: vec![[-1.0; 3]; k],
+            bbox_max: vec![[1.0; 3]; k],
+            views: (0..VIEWS).map(stem).collect(),
+            matches: vec![
+                Match { instance: 0, view: 1, mask: 0, score: 0.9 },
+                Match { instance: 0, view: 5, mask: 0, score: 0.8 },
+                Match { instance: 0, view: 7, mask: 0, score: 0.2 },
+            ],
+            tree: Vec::new(),
+        };
+        instances.write(self.instances(), self.provenance()).unwrap();
+    }
+
+    fn write_features(&self, g: &Gaussians) {
+        let kept: Vec<u32> = (0..g.len() as u32).collect();
+        let values = groups().iter().flat_map(|&i| [i as f32, (i * i) as f32, 1.0]).collect();
+        Features { kept, dim: 3, values }.write(self.run().join("features.safetensors"), self.provenance()).unwrap();
+    }
+
+    fn write_masks(&self, i: usize, camera: &Camera) {
+        let n = (WIDTH * HEIGHT) as usize;
+        let mut ids = vec![-1; 4 * n];
+        for (k, centre) in CENTRES.iter().enumerate() {
+            let (cx, cy, r) = disc(camera, centre);
+            for p in 0..n {
+                let (x, y) = ((p % WIDTH as usize) as f64 + 0.5, (p / WIDTH as usize) as f64 + 0.5);
+                if (x - cx).hypot(y - cy) < r {
+                    (0..4).for_each(|l| ids[l * n + p] = (2 * l + k) as i32);
+                }
+            }
+        }
+        let maps = MaskMaps { width: WIDTH as usize, height: HEIGHT as usize, ids };
+        maps.write(maps_path(self.scene().join("language_features"), &stem(i))).unwrap();
+    }
+
+    /// Labels of view `i`: discs around the balls, in an image of `size`.
+    pub fn write_label(&self, i: usize, categories: &[(&str, usize)], size: (u32, u32)) {
+        let camera = cameras()[i].resized(size.0, size.1);
+        let objects: Vec<_> = categories
+            .iter()
+            .map(|&(category, ball)| {
+                let (cx, cy, r) = disc(&camera, &CENTRES[ball]);
+                let polygon: Vec<[f64; 2]> =
+                    (0..64).map(|k| f64::from(k) / 64.0 * TAU).map(|a| [cx + r * a.cos(), cy + r * a.sin()]).collect();
+                json!({"category": category, "group": 1, "segmentation": polygon, "bbox": [0, 0, 1, 1]})
+            })
+            .collect();
+        let label = json!({"info": {"name": stem(i), "width": size.0, "height": size.1}, "objects": objects});
+        std::fs::write(self.scene().join(format!("label/{}.json", stem(i))), label.to_string()).unwrap();
+    }
+
+    fn write_truth(&self) {
+        let mut t = TruePoints::default();
+        let mut add = |p: [f64; 3], id: i32| {
+            t.position.push(p.map(|v| v as f32));
+            t.instance.push(id);
+            t.part.push(id);
+            t.class.push(id);
+        };
+        for (id, c) in CENTRES.iter().enumerate() {
+            for k in 0..50 {
+                let a = f64::from(k) * 2.4;
+                add([c[0] + SIGMA * a.cos(), c[1] + SIGMA * a.sin(), c[2]], id as i32);
+            }
+        }
+        (0..100).for_each(|k| add([f64::from(k % 10) * 0.4 - 1.8, f64::from(k / 10) * 0.4 - 1.8, -0.2], 2));
+        t.write(self.scene().join("truth/points.safetensors"), Provenance::default()).unwrap();
+        let thing = |id: u32, name: &str| TrueObject {
+            id,
+            name: name.into(),
+            class: "ball".into(),
+            color: "red".into(),
+            background: id == 2,
+            parts: vec![TruePart { id, name: name.into() }],
+        };
+        let objects = vec![thing(0, "red ball"), thing(1, "blue ball"), thing(2, "floor")];
+        TrueScene { objects, parameters: json!({}) }.write(self.scene().join("truth/scene.json")).unwrap();
+    }
+
+    /// Runs `eval` with these arguments after the scene's; `{}` stands for the fixture's folder.
+    pub fn eval(&self, command: &str, arguments: &str) -> Output {
+        let place = self.path().display().to_string();
+        let mut c = Command::new(env!("CARGO_BIN_EXE_eval"));
+        c.arg(command);
+        if command != "report" {
+            let (i, g, s) = (self.instances(), self.geometry(), self.scene());
+            c.arg("--instances").arg(i).arg("--geometry").arg(g).arg("--scene").arg(s);
+        }
+        c.args(arguments.split('|').map(|a| a.trim().replace("{}", &place)).filter(|a| !a.is_empty()));
+        c.output().unwrap()
+    }
+
+    /// Runs `eval`, expects success, and gives what it printed.
+    pub fn good(&self, command: &str, arguments: &str) -> String {
+        let o = self.eval(command, arguments);
+        assert!(o.status.success(), "{}", String::from_utf8_lossy(&o.stderr));
+        String::from_utf8(o.stdout).unwrap()
+    }
+
+    /// Runs `eval`, expects exit code 2 and one line of error, and gives that line.
+    pub fn bad(&self, command: &str, arguments: &str) -> String {
+        let o = self.eval(command, arguments);
+        let error = String::from_utf8(o.stderr).unwrap();
+        assert_eq!(o.status.code(), Some(2), "{error}");
+        let lines: Vec<&str> = error.lines().filter(|l| l.contains("error: ")).collect();
+        assert!(lines.len() == 1 && !error.contains("panicked"), "{error}");
+        lines[0].to_string()
+    }
+
+    pub fn json(&self, path: &str) -> serde_json::Value {
+        serde_json::from_slice(&std::fs::read(self.path().join(path)).unwrap()).unwrap()
+    }
+}
+
+pub fn stem(i: usize) -> String {
+    format!("frame_{i:05}")
+}
+
+pub fn cameras() -> Vec<Camera> {
+    let eye = |i: usize| {
+        // A half circle in front: neither ball ever hides the other.
+        let a = (i as f64 / (VIEWS - 1) as f64 - 0.5) * 1.2 - TAU / 4.0;
+        DVec3::new(4.0 * a.cos(), 4.0 * a.sin(), 1.5)
+    };
+    (0..VIEWS).map(|i| Camera::look_at(eye(i), DVec3::new(0.0, 0.0, 0.3), DVec3::Z, WIDTH, HEIGHT, 0.8)).collect()
+}
+
+fn opengl_pose(c: &Camera) -> [[f64; 4]; 4] {
+    let (m, p) = (c.rotation.transpose(), c.position());
+    let row = |r: usize| [m.x_axis[r], -m.y_axis[r], -m.z_axis[r], p[r]];
+    [row(0), row(1), row(2), [0.0, 0.0, 0.0, 1.0]]
+}
+
+fn groups() -> Vec<usize> {
+    [vec![0, 1], vec![2; 81]].concat()
+}
+
+fn gaussians() -> Gaussians {
+    let mut g = Gaussians::default();
+    let mut add = |p: [f64; 3], sigma: f64, color: [f32; 3]| {
+        g.means.push(p.map(|v| v as f32));
+        g.log_scales.push([sigma.ln() as f32; 3]);
+        g.rotations.push([1.0, 0.0, 0.0, 0.0]);
+        g.opacity_logits.push(6.0);
+        g.sh.extend(color.map(|c| (c - 0.5) / gs_scene::SH_C0));
+    };
+    add(CENTRES[0], SIGMA, [0.9, 0.1, 0.1]);
+    add(CENTRES[1], SIGMA, [0.1, 0.2, 0.9]);
+    for k in 0..81 {
+        add([f64::from(k % 9) * 0.5 - 2.0, f64::from(k / 9) * 0.5 - 2.0, -0.2], 0.2, [0.6, 0.6, 0.55]);
+    }
+    g
+}
+
+/// Where a ball's accumulated alpha is above 0.7 in the image: centre and radius in pixels.
+fn disc(camera: &Camera, centre: &[f64; 3]) -> (f64, f64, f64) {
+    let (x, y, z) = camera.project(DVec3::from_array(*centre));
+    let s = ((camera.fx * SIGMA / z).powi(2) + 0.3).sqrt();
+    let opacity = 1.0 / (1.0 + (-6.0f64).exp());
+    (x, y, s * (2.0 * (opacity.min(0.99) / 0.7).ln()).sqrt())
+}
