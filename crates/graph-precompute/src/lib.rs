@@ -1,1 +1,11 @@
-//! Stage 2a: anchors, neighbours, nearest anchors and mask footprints.
+//! Stage 2a: what is computed once because geometry is frozen.
+//!
+//! [`footprint`] rasterises each view once and keeps which Gaussians make up which mask; [`graph`] samples anchors among
+//! the Gaussians that were seen and finds neighbours. `docs/method.md` has the equations.
+
+pub mod fps;
+pub mod graph;
+pub mod kdtree;
+pub mod positions;
+#[cfg(test)]
+mod testing;

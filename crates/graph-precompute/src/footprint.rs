@@ -1,0 +1,182 @@
+//! Which Gaussians make up which mask: sums of blending weights over the pixels of each mask.
+//!
+//! A view is rasterised tile by tile. Within a tile, pixels that belong to the same masks at all levels form a cell;
+//! weights are summed per cell, and a cell's sum goes to each of its masks. Tiles are added up in their order, so the sums
+//! do not depend on the number of threads.
+
+use artifacts::{LEVELS, MaskMaps, Row};
+use gs_raster::{RasterOptions, TILE, TileWeights};
+use gs_scene::{Camera, Gaussians};
+use rayon::prelude::*;
+
+/// No mask, or a mask too small to count.
+const NONE: u32 = u32::MAX;
+
+/// The footprints of the masks of one view.
+#[derive(Debug, Clone, Default, PartialEq)]
+pub struct ViewFootprints {
+    /// Masks by level and id; their `view` is 0.
+    pub rows: Vec<Row>,
+    /// Per mask: Gaussians, ascending, and their weights summed over the mask's gated pixels, in f64 and then rounded.
+    pub entries: Vec<Vec<(u32, f32)>>,
+    /// Gaussians that contribute to the view, ascending, and their weights summed over all pixels.
+    pub seen: Vec<(u32, f64)>,
+    /// Masks left out for having fewer pixels than asked for.
+    pub small_masks: usize,
+}
+
+/// Computes the footprints of one view.
+///
+/// `camera` must have the size of `maps`. A pixel counts for the weights where its accumulated alpha exceeds `gate`.
+/// Masks with fewer than `min_pixels` pixels are left out.
+pub fn view_footprints(
+    gaussians: &Gaussians,
+    camera: &Camera,
+    maps: &MaskMaps,
+    gate: f32,
+    min_pixels: usize,
+) -> ViewFootprints {
+    let (mut rows, row_of, small_masks) = mask_rows(maps, min_pixels);
+    // Colour plays no part.
+    let options = RasterOptions { sh_degree: 0, ..RasterOptions::default() };
+    let tiles = gs_raster::tile_weights(gaussians, camera, &options, true, |tile| tile_sums(tile, maps, &row_of, gate));
+    let mut alpha = vec![0.0f64; rows.len()];
+    for fact in tiles.iter().flat_map(|t| &t.facts) {
+        rows[fact.row as usize].gated += fact.gated;
+        alpha[fact.row as usize] += fact.alpha;
+    }
+    for (row, alpha) in rows.iter_mut().zip(alpha) {
+        row.alpha = (alpha / f64::from(row.pixels)) as f32;
+    }
+    let entries = add_up(rows.len(), tiles.iter().flat_map(|t| &t.entries).copied());
+    let mut seen = add_up(1, tiles.iter().flat_map(|t| &t.seen).map(|&(g, w)| (0, g, w)));
+    ViewFootprints {
+        rows,
+        entries: entries.into_iter().map(|e| e.into_iter().map(|(g, w)| (g, w as f32)).collect()).collect(),
+        seen: seen.pop().unwrap_or_default(),
+        small_masks,
+    }
+}
+
+/// The masks that own enough pixels, by level and id; per level, the row of each id (`NONE` where it has none); how many
+/// masks were too small.
+fn mask_rows(maps: &MaskMaps, min_pixels: usize) -> (Vec<Row>, [Vec<u32>; LEVELS], usize) {
+    let mut rows = Vec::new();
+    let mut small = 0;
+    let size = maps.width * maps.height;
+    let row_of = std::array::from_fn(|level| {
+        let mut pixels = vec![0u32; maps.id_count()];
+        for &id in &maps.ids[level * size..(level + 1) * size] {
+            if id >= 0 {
+                pixels[id as usize] += 1;
+            }
+        }
+        let mut row_of = vec![NONE; pixels.len()];
+        for (id, &pixels) in pixels.iter().enumerate().filter(|(_, p)| **p > 0) {
+            if (pixels as usize) < min_pixels {
+                small += 1;
+                continue;
+            }
+            row_of[id] = rows.len() as u32;
+            rows.push(Row { level: level as u32, mask: id as u32, pixels, ..Row::default() });
+        }
+        row_of
+    });
+    (rows, row_of, small)
+}
+
+/// What one tile adds.
+struct TileSums {
+    /// (row, Gaussian, weight), Gaussians in the tile's order.
+    entries: Vec<(u32, u32, f32)>,
+    /// (Gaussian, weight over all pixels of the tile).
+    seen: Vec<(u32, f32)>,
+    facts: Vec<Fact>,
+}
+
+/// What one tile says of a mask.
+struct Fact {
+    row: u32,
+    gated: u32,
+    alpha: f64,
+}
+
+fn tile_sums(tile: &TileWeights, maps: &MaskMaps, row_of: &[Vec<u32>; LEVELS], gate: f32) -> TileSums {
+    let size = maps.width * maps.height;
+    let mut out = TileSums { entries: Vec::new(), seen: Vec::with_capacity(tile.gaussians.len()), facts: Vec::new() };
+    // Cell 0 holds the pixels that count for no mask.
+    let mut cells: Vec<[u32; LEVELS]> = vec![[NONE; LEVELS]];
+    let mut cell_of = [0u8; TILE * TILE];
+    for y in 0..tile.height as usize {
+        for x in 0..tile.width as usize {
+            let pixel = (tile.y0 as usize + y) * maps.width + tile.x0 as usize + x;
+            let masks: [u32; LEVELS] = std::array::from_fn(|level| match maps.ids[level * size + pixel] {
+                id if id >= 0 => row_of[level][id as usize],
+                _ => NONE,
+            });
+            let at = y * TILE + x;
+            let passes = tile.alpha[at] > gate;
+            for &row in masks.iter().filter(|r| **r != NONE) {
+                let fact = match out.facts.iter().position(|f| f.row == row) {
+                    Some(i) => &mut out.facts[i],
+                    None => {
+                        out.facts.push(Fact { row, gated: 0, alpha: 0.0 });
+                        out.facts.last_mut().expect("just pushed")
+                    }
+                };
+                fact.gated += u32::from(passes);
+                fact.alpha += f64::from(tile.alpha[at]);
+            }
+            if passes {
+                let cell = cells.iter().position(|c| *c == masks).unwrap_or_else(|| {
+                    cells.push(masks);
+                    cells.len() - 1
+                });
+                // At most 256 pixels, each in at most one cell beside cell 0; the last of 257 would be a tile without
+                // cell 0, where its place is free.
+                cell_of[at] = (cell % 256) as u8;
+            }
+        }
+    }
+    let mut sums = [0.0f32; 256];
+    for (&gaussian, weights) in tile.gaussians.iter().zip(tile.weights.chunks_exact(TILE * TILE)) {
+        sums[..cells.len().min(256)].fill(0.0);
+        for (&w, &cell) in weights.iter().zip(&cell_of) {
+            sums[cell as usize] += w;
+        }
+        let total: f32 = sums[..cells.len().min(256)].iter().sum();
+        if total > 0.0 {
+            out.seen.push((gaussian, total));
+        }
+        for (cell, masks) in cells.iter().enumerate().skip(1) {
+            let sum = sums[cell % 256];
+            if sum > 0.0 {
+                out.entries.extend(masks.iter().filter(|r| **r != NONE).map(|&row| (row, gaussian, sum)));
+            }
+        }
+    }
+    out
+}
+
+/// Sums (row, Gaussian, weight) triples per row and Gaussian, in the order given; Gaussians ascend.
+fn add_up(rows: usize, triples: impl Iterator<Item = (u32, u32, f32)>) -> Vec<Vec<(u32, f64)>> {
+    let mut by_row: Vec<Vec<(u32, f32)>> = vec![Vec::new(); rows];
+    for (row, gaussian, weight) in triples {
+        by_row[row as usize].push((gaussian, weight));
+    }
+    by_row
+        .into_par_iter()
+        .map(|mut parts| {
+            // Stable: the parts of one Gaussian stay in the order of tiles.
+            parts.sort_by_key(|p| p.0);
+            let mut sums: Vec<(u32, f64)> = Vec::new();
+            for (gaussian, weight) in parts {
+                match sums.last_mut() {
+                    Some(last) if last.0 == gaussian => last.1 += f64::from(weight),
+                    _ => sums.push((gaussian, f64::from(weight))),
+                }
+            }
+            sums
+        })
+        .collect()
+}
