@@ -66,10 +66,11 @@ impl LightMap {
     /// Computes the light of a scene. `coarseness` of at least 1 multiplies the sides of texels: small pictures need
     /// no fine shadows.
     pub fn bake(scene: &Scene, coarseness: f64) -> Self {
-        let reach = scene.room.max_element();
+        // Larger rooms have larger lamps, a little less than in proportion: they also have more walls near them.
+        let area = scene.room.x * scene.room.y / (2.45 * 2.45);
         let lamp = |x: f64, y: f64, size: f64, power: [f64; 3]| {
-            let half = size * reach / 2.45;
-            let radiance = DVec3::from_array(power) / (4.0 * half * half) * (reach / 2.45).powi(2);
+            let half = size * area.sqrt();
+            let radiance = DVec3::from_array(power) * area.powf(0.6) / (4.0 * half * half);
             Lamp { centre: DVec3::new(x * scene.room.x, y * scene.room.y, 2.65), half: [half, half], radiance }
         };
         let lamps = [lamp(0.42, -0.34, 0.30, [14.5, 13.4, 11.8]), lamp(-0.50, 0.45, 0.45, [3.4, 3.6, 4.0])];
