@@ -42,6 +42,11 @@ impl Page {
         let _ = write!(self.body, r#"<h2 id="{}">{}</h2>"#, escape(id), escape(title));
     }
 
+    /// A heading within a section, with a remark beside it.
+    pub fn heading(&mut self, title: &str, remark: &str) {
+        let _ = write!(self.body, "<h3>{} <span>{}</span></h3>", escape(title), escape(remark));
+    }
+
     /// A paragraph of plain text.
     pub fn paragraph(&mut self, text: &str) {
         let _ = write!(self.body, "<p>{}</p>", escape(text));
@@ -54,6 +59,9 @@ impl Page {
 
     /// Pictures in rows of `columns` beside each other.
     pub fn figures(&mut self, columns: usize, figures: &[Figure]) {
+        if figures.is_empty() {
+            return;
+        }
         let _ = write!(self.body, r#"<div class="figures" style="--columns:{columns}">"#);
         for f in figures {
             let data = base64::engine::general_purpose::STANDARD.encode(&f.jpeg);

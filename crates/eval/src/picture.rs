@@ -5,7 +5,7 @@ use gs_io::{Error, Result};
 use image::{DynamicImage, RgbImage};
 
 /// Colour by which a selection is marked, sRGB in 0 to 1.
-pub const HIGHLIGHT: [f32; 3] = [1.0, 0.35, 0.0];
+pub const HIGHLIGHT: [f32; 3] = [0.78, 1.0, 0.05];
 
 /// An sRGB picture, values 0 to 1.
 #[derive(Debug, Clone, PartialEq)]
@@ -42,7 +42,7 @@ impl Picture {
             if outline.bits[i] {
                 color
             } else if mask.bits[i] {
-                blend(c, color, 0.25)
+                blend(c, color, 0.125)
             } else {
                 let grey = 0.299 * c[0] + 0.587 * c[1] + 0.114 * c[2];
                 blend(c, [grey; 3], 0.6).map(|v| 0.15 + 0.45 * v)
@@ -129,7 +129,7 @@ mod tests {
         let mut mask = Mask::new(8, 6);
         mask.bits[2 * 8 + 3] = true;
         let h = picture().highlighted(&mask, [1.0, 0.0, 0.0]);
-        assert_eq!(h.pixels[2 * 8 + 3], [0.625, 0.375, 0.375]);
+        assert_eq!(h.pixels[2 * 8 + 3], [0.5625, 0.4375, 0.4375]);
         assert_eq!(h.pixels[2 * 8 + 4], [1.0, 0.0, 0.0]);
         assert!((h.pixels[0][0] - 0.375).abs() < 1e-6);
     }

@@ -451,7 +451,7 @@ fn queries(m: &Material, page: &mut Page, metrics: &mut Metrics) -> Result<()> {
     ));
     let scored = |text: &str| m.scores.as_ref().and_then(|s| s.queries.iter().find(|q| q.text == text));
     for q in &results.queries {
-        let mut facts = vec![format!("\u{201c}{}\u{201d}", q.text)];
+        let mut facts = Vec::new();
         match q.selected.len() {
             0 => facts.push("nothing selected".into()),
             1 => facts.push(format!("instance {}", q.selected[0])),
@@ -464,13 +464,10 @@ fn queries(m: &Material, page: &mut Page, metrics: &mut Metrics) -> Result<()> {
             let path = folder.join(&v.overlay);
             let picture = gs_scene::Image::read(&path)?;
             let picture = Picture::new(picture.width as usize, picture.height as usize, &picture.rgb);
-            figures.push(figure(&picture, 3, format!("{} ({})", facts.join(", "), v.view))?);
+            figures.push(figure(&picture, 3, v.view.clone())?);
         }
-        if figures.is_empty() {
-            page.paragraph(&facts.join(", "));
-        } else {
-            page.figures(figures.len().clamp(2, 3), &figures);
-        }
+        page.heading(&format!("\u{201c}{}\u{201d}", q.text), &facts.join(", "));
+        page.figures(3, &figures);
     }
     Ok(())
 }
