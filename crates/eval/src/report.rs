@@ -48,6 +48,8 @@ pub struct Metrics {
     pub object_miou: Option<f64>,
     /// Mean IoU of text queries over (frame, category) pairs.
     pub query_miou: Option<f64>,
+    /// The same when only what a view shows of a selection counts (occlusion-aware).
+    pub query_miou_visible: Option<f64>,
     /// Fraction of those pairs above IoU 0.25.
     pub query_macc25: Option<f64>,
     /// Number of different queries that were scored.
@@ -251,7 +253,8 @@ fn geometry_figures(m: &Material, metrics: &mut Metrics) -> Result<()> {
     }
     if let Some(s) = &m.scores {
         (metrics.instance_miou, metrics.object_miou) = (s.instance_miou, s.object_miou);
-        (metrics.query_miou, metrics.query_macc25) = (s.query_miou, s.query_macc25);
+        (metrics.query_miou, metrics.query_miou_visible) = (s.query_miou, s.query_miou_visible);
+        metrics.query_macc25 = s.query_macc25;
         metrics.query_count = s.queries.len();
         let figure = |q: &crate::score::QueryScore| QueryFigure { text: q.text.clone(), iou: q.iou, score: q.score };
         metrics.queries = s.queries.iter().map(figure).collect();
@@ -498,11 +501,13 @@ fn score_tables(m: &Material, page: &mut Page) {
         let how = s.silhouette.as_ref().map_or(String::new(), |(name, t)| format!(" Silhouettes: {name}, above {t}."));
         page.paragraph(&format!(
             "IoU of the selection with labelled polygons over {} pairs of frame and category: mIoU {:.3}, {:.0}% above \
-             0.25, {:.0}% above 0.5.{how}",
+             0.25, {:.0}% above 0.5.{how} Where other things hide part of an object, its label ends there: with the \
+             selection cut likewise, mIoU is {}.",
             s.query_pairs,
             s.query_miou.unwrap_or_default(),
             100.0 * s.query_macc25.unwrap_or_default(),
             100.0 * s.query_macc50.unwrap_or_default(),
+            s.query_miou_visible.map_or("–".into(), |v| format!("{v:.3}")),
         ));
         let row = |q: &crate::score::QueryScore| {
             let cosine = q.score.map_or("–".into(), |c| format!("{c:.3}"));
@@ -601,6 +606,7 @@ pub fn table(metrics: &Metrics) -> String {
     line("ssim_heldout", number(metrics.ssim_heldout));
     line("instance_miou", number(metrics.instance_miou));
     line("query_miou", number(metrics.query_miou));
+    line("  visible only", number(metrics.query_miou_visible));
     line("queries", Some(metrics.query_count.to_string()));
     line("gaussians", Some(metrics.gaussians.to_string()));
     line("instances", metrics.instances.map(|n| n.to_string()));

@@ -1,5 +1,6 @@
 //! `eval score`: instances and text queries against the truth of a scene.
 
+use crate::Mask;
 use crate::labels::{self, FrameLabels};
 use crate::metrics::{self, InstanceScore};
 use crate::ranking::{self, Selection};
@@ -43,6 +44,9 @@ pub struct Scores {
     pub query_macc25: Option<f64>,
     /// Fraction of pairs with IoU above 0.5.
     pub query_macc50: Option<f64>,
+    /// Mean IoU over all pairs when only what the view shows of the selection counts (occlusion-aware, share above 0.5),
+    /// whatever `silhouette` says. Labels outline what is seen, so hidden objects cost `query_miou` but not this.
+    pub query_miou_visible: Option<f64>,
     /// Number of (frame, category) pairs.
     pub query_pairs: usize,
     /// Each query with its mean IoU.
@@ -186,16 +190,18 @@ pub fn score_queries(
         answers.insert(text.as_str(), (members, selected, score));
     }
     let mut frame_ious: BTreeMap<&str, Vec<(String, f64)>> = BTreeMap::new();
+    let mut visible = Vec::new();
     for frame in &frames {
-        let ious = score_frame(scene, dataset, frame, &answers, silhouette, threshold, folder, warn)?;
-        for (text, iou) in ious {
-            frame_ious.entry(text).or_default().push((frame.frame.clone(), iou));
+        for pair in score_frame(scene, dataset, frame, &answers, silhouette, threshold, folder, warn)? {
+            frame_ious.entry(pair.category).or_default().push((frame.frame.clone(), pair.iou));
+            visible.push(pair.visible_iou);
         }
     }
     let all: Vec<f64> = frame_ious.values().flatten().map(|f| f.1).collect();
     scores.query_miou = Some(metrics::mean(&all));
     scores.query_macc25 = Some(metrics::fraction_above(&all, 0.25));
     scores.query_macc50 = Some(metrics::fraction_above(&all, 0.5));
+    scores.query_miou_visible = Some(metrics::mean(&visible));
     scores.query_pairs = all.len();
     let name = match silhouette {
         Silhouette::Selected => "selected",
@@ -217,6 +223,13 @@ pub fn score_queries(
 
 type Answer = (Vec<u32>, Vec<u32>, Option<f32>);
 
+/// A category in one frame.
+struct Pair<'f> {
+    category: &'f str,
+    iou: f64,
+    visible_iou: f64,
+}
+
 /// IoU of every category of one frame.
 fn score_frame<'f>(
     scene: &LabelledScene,
@@ -227,11 +240,11 @@ fn score_frame<'f>(
     threshold: f32,
     folder: &Path,
     warn: &mut dyn FnMut(&str),
-) -> Result<Vec<(&'f str, f64)>> {
+) -> Result<Vec<Pair<'f>>> {
     let categories = || frame.categories.iter().map(|(c, m)| (c.as_str(), m));
     let Some(view) = dataset.views.iter().find(|v| v.stem() == frame.frame) else {
         warn(&format!("the labelled frame {} is no view of the scene: its objects count as IoU 0", frame.frame));
-        return Ok(categories().map(|(c, _)| (c, 0.0)).collect());
+        return Ok(categories().map(|(category, _)| Pair { category, iou: 0.0, visible_iou: 0.0 }).collect());
     };
     let (w, h) = (frame.width, frame.height);
     let aspect = |w: u32, h: u32| f64::from(w) / f64::from(h);
@@ -248,7 +261,14 @@ fn score_frame<'f>(
     let none: &[u32] = &[];
     let selections: Vec<&[u32]> = categories().map(|(c, _)| answers.get(c).map_or(none, |a| &a.0)).collect();
     let masks = silhouette.masks(&scene.gaussians, &selections, &camera, threshold);
-    Ok(categories().zip(&masks).map(|((c, truth), mask)| (c, truth.iou(mask))).collect())
+    let visible = Silhouette::Visible;
+    let seen = visible.masks(&scene.gaussians, &selections, &camera, visible.default_threshold());
+    let pair = |((category, truth), (mask, seen)): ((&'f str, &Mask), (&Mask, &Mask))| Pair {
+        category,
+        iou: truth.iou(mask),
+        visible_iou: truth.iou(seen),
+    };
+    Ok(categories().zip(masks.iter().zip(&seen)).map(pair).collect())
 }
 
 /// The scores of each thing and of each (frame, category) as CSV: two tables.
@@ -292,6 +312,7 @@ pub fn table(scores: &Scores) -> String {
     line("fragmented", scores.fragmented.map(|n| format!("{n} of {} things", scores.things.len())));
     line("merging", scores.merging.map(|n| format!("{n} instances")));
     line("query_miou", number(scores.query_miou));
+    line("  visible only", number(scores.query_miou_visible));
     line("query_macc25", number(scores.query_macc25));
     line("query_macc50", number(scores.query_macc50));
     line("queries", scores.query_miou.map(|_| format!("{} in {} pairs", scores.queries.len(), scores.query_pairs)));

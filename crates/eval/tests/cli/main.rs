@@ -126,7 +126,9 @@ fn a_perfect_run_scores_high_and_the_csv_agrees() {
     let things = fs::read_to_string(f.path().join("s/score.things.csv")).unwrap();
     assert!(things.contains("2,\"floor\",true,100,1.000000,2,1"), "{things}");
     f.good("score", "--text-features|{}/text.json|--silhouette|visible|--out|{}/s/visible.json");
-    assert_eq!(f.json("s/visible.json")["silhouette"][0], "visible");
+    let v = f.json("s/visible.json");
+    assert_eq!(v["silhouette"][0], "visible");
+    assert_eq!(v["query_miou"], s["query_miou_visible"]);
 }
 
 #[test]
