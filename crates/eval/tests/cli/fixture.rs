@@ -83,12 +83,17 @@ impl Fixture {
 
     /// Instances with `label(group)` for the Gaussians of group 0 (red), 1 (blue), 2 (floor).
     pub fn write_instances(&self, dim: usize, label: impl Fn(usize) -> i32) {
-        let all = [vec![1.0, 0.0], vec![0.0, 1.0], vec![-0.6, -0.8]];
+        let all = [[1.0, 0.0], [0.0, 1.0], [-0.6, -0.8]];
+        self.write_described(&all.map(|d| d[..dim].to_vec()), label);
+    }
+
+    /// The same with descriptors of one's own.
+    pub fn write_described(&self, descriptors: &[Vec<f32>; 3], label: impl Fn(usize) -> i32) {
         let k = 3;
         let instances = Instances {
             label: groups().into_iter().map(label).collect(),
-            dim,
-            descriptor: all.iter().flat_map(|d| d[..dim].to_vec()).collect(),
+            dim: descriptors[0].len(),
+            descriptor: descriptors.concat(),
             support: vec![5, 4, 3],
             score: vec![0.8; k],
             count: vec![1, 1, 81],

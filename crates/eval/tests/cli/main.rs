@@ -61,6 +61,28 @@ fn top_k_and_threshold_select() {
 }
 
 #[test]
+fn a_text_encoder_takes_any_words() {
+    let f = Fixture::new(2);
+    let clip = concat!(env!("CARGO_MANIFEST_DIR"), "/../onnx-models/testdata/clip");
+    let encoder = onnx_models::ClipText::open(clip, &onnx_models::EngineOptions::default()).unwrap();
+    let words = "a round thing, nowhere in a table";
+    let feature = encoder.encode(&[words]).unwrap();
+    let opposite: Vec<f32> = feature.iter().map(|v| -v).collect();
+    f.write_described(&[opposite, feature, vec![0.0; 4]], |g| g as i32);
+    f.good("query", &format!("--clip|{clip}|--text|{words}|--views|frame_00002|--out|{{}}/out"));
+    let q = f.json("out/query.json");
+    assert_eq!(q["text_source"], "CLIP text encoder test-clip");
+    assert_eq!(q["queries"][0]["selected"], serde_json::json!([1]));
+    assert!((q["queries"][0]["score"].as_f64().unwrap() - 1.0).abs() < 1e-6);
+    assert_eq!(q["queries"][0]["ranking"].as_array().unwrap().len(), 2, "a zero descriptor has no cosine");
+    f.good("score", &format!("--clip|{clip}|--out|{{}}/score.json"));
+    assert_eq!(f.json("score.json")["query_pairs"], 4);
+    f.write_instances(2, |g| g as i32);
+    let e = f.bad("query", &format!("--clip|{clip}|--text|{words}|--out|{{}}/other"));
+    assert!(e.contains("found dimension 2, expected 4 (CLIP text encoder test-clip)"), "{e}");
+}
+
+#[test]
 fn bad_queries_are_one_line_and_leave_no_output() {
     let f = Fixture::new(2);
     let with = |rest: &str| f.bad("query", &format!("{rest}|--out|{{}}/out"));
