@@ -74,6 +74,9 @@ pub struct ChoiceArgs {
     /// edges are softer
     #[arg(long, default_value_t = 0.7, value_name = "0..1", value_parser = unit)]
     stability: f64,
+    /// Largest part of the photograph that a mask may cover
+    #[arg(long, default_value_t = 0.6, value_name = "0..1", value_parser = unit)]
+    max_area: f64,
     /// Of masks whose boxes overlap by more than this (IoU) the best stays
     #[arg(long, default_value_t = 0.7, value_name = "0..1", value_parser = unit)]
     box_nms: f64,
@@ -86,7 +89,7 @@ pub struct ChoiceArgs {
     /// Within a level, fragments of a larger mask go; lower keeps more of them, 0 all
     #[arg(long, default_value_t = 0.5, value_name = "0..1", value_parser = unit)]
     nms_inner: f64,
-    /// Points within a small mask already found with at least this score are not asked; 2 asks all
+    /// Points within a small mask already found with at least this score need not be asked; 2 asks all
     #[arg(long, default_value_t = 0.8, value_name = "0..2", value_parser = up_to_two)]
     skip_score: f64,
     /// Leave a level empty where SAM finds nothing good at it, instead of taking masks of the other levels there
@@ -101,6 +104,7 @@ impl ChoiceArgs {
             points_per_side: usize::from(self.points_per_side),
             predicted_iou: self.pred_iou as f32,
             stability: self.stability as f32,
+            max_area: self.max_area,
             box_nms: self.box_nms,
             mask_nms: MaskNms { iou: self.nms_iou, score: self.nms_score as f32, inner: self.nms_inner },
             skip_score: self.skip_score as f32,
@@ -112,6 +116,7 @@ impl ChoiceArgs {
     pub fn json(&self) -> serde_json::Value {
         serde_json::json!({
             "points_per_side": self.points_per_side, "pred_iou": self.pred_iou, "stability": self.stability,
+            "max_area": self.max_area,
             "box_nms": self.box_nms, "nms_iou": self.nms_iou, "nms_score": self.nms_score,
             "nms_inner": self.nms_inner, "skip_score": self.skip_score, "fill": !self.no_fill,
         })

@@ -1,10 +1,11 @@
 //! Masks of everything in a photograph: SAM asked at a grid of points.
 //!
-//! The points of the grid are asked from coarse to fine. A point that lies within a small-level mask of high score found
-//! in an earlier round is not asked again: the answer would be much the same three masks. The rounds are fixed by the
-//! grid, so that the result does not depend on the number of threads.
+//! The points of the grid are asked from coarse to fine. A point is not asked when it lies within a small-level mask of
+//! high score found in an earlier round, because the answer would be much the same three masks; unless no whole thing
+//! (level large) has been found there yet and the small mask has not been asked often. The rounds are fixed by the grid,
+//! so that the result does not depend on the number of threads.
 
-use crate::nms::{MaskNms, Pixels, box_nms, mask_nms, nesting_levels};
+use crate::nms::{MaskNms, Pixels, box_nms, mask_nms, merges_things, nesting_levels};
 use crate::sam::{Candidates, Embedded, Sam};
 use artifacts::LEVELS;
 use gs_io::Result;
@@ -12,6 +13,8 @@ use onnx_models::parallel_map;
 
 /// Distance of the two thresholds of the stability score from 0, as in SAM.
 const STABILITY_OFFSET: f32 = 1.0;
+/// How often a small mask is asked in the hope of the whole thing that it is part of.
+const ASK_UNTIL_WHOLE: usize = 5;
 
 /// How masks are asked for and chosen.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -22,12 +25,14 @@ pub struct Choice {
     pub predicted_iou: f32,
     /// Least stability: IoU of the mask cut 1 above and 1 below its threshold.
     pub stability: f32,
+    /// Largest part of the photograph that a mask may cover: what is larger is no thing but most of the room.
+    pub max_area: f64,
     /// IoU of boxes above which the better mask stays.
     pub box_nms: f64,
     /// LangSplat's rule within a level.
     pub mask_nms: MaskNms,
-    /// Points within a small-level mask of at least this score (predicted IoU x stability) are not asked again; above 1
-    /// every point is asked.
+    /// Points within a small-level mask of at least this score (predicted IoU x stability) need not be asked again; above
+    /// 1 every point is asked.
     pub skip_score: f32,
     /// Whether a level takes masks of the other levels where it has none: see [`fill`].
     pub fill: bool,
@@ -113,18 +118,28 @@ pub fn rounds(points_per_side: usize, aspect: f64) -> [Vec<[f64; 2]>; 5] {
 pub fn propose(sam: &Sam, embedded: &Embedded, choice: &Choice) -> Result<Proposals> {
     let grid = Grid::of(embedded);
     let mut masks: Vec<Proposal> = Vec::new();
-    let (mut asked, mut points) = (0, 0);
+    let mut asked: Vec<[f64; 2]> = Vec::new();
+    let mut points = 0;
     for round in rounds(choice.points_per_side, embedded.frame[0] as f64 / embedded.frame[1] as f64) {
         points += round.len();
-        let known: Vec<&Pixels> =
-            masks.iter().filter(|m| m.level == 1 && m.score >= choice.skip_score).map(|m| &m.pixels).collect();
-        let ask: Vec<[f64; 2]> =
-            round.into_iter().filter(|&p| !known.iter().any(|k| k.contains(grid.index(p)))).collect();
-        asked += ask.len();
+        let at_level = |l: usize| masks.iter().filter(move |m| m.level == l).map(|m| (m.score, &m.pixels));
+        let small: Vec<(&Pixels, usize)> = at_level(1)
+            .filter(|(score, _)| *score >= choice.skip_score)
+            .map(|(_, p)| (p, asked.iter().filter(|&&a| p.contains(grid.index(a))).count()))
+            .collect();
+        let whole: Vec<&Pixels> =
+            at_level(LEVELS - 1).filter(|(score, _)| *score > choice.mask_nms.score).map(|(_, p)| p).collect();
+        let known = |point: [f64; 2]| {
+            let i = grid.index(point);
+            let is_whole = whole.iter().any(|w| w.contains(i));
+            small.iter().any(|(s, times)| s.contains(i) && (is_whole || *times >= ASK_UNTIL_WHOLE))
+        };
+        let ask: Vec<[f64; 2]> = round.into_iter().filter(|&p| !known(p)).collect();
         let found = parallel_map(ask.len(), |i| Ok(consider(&sam.decode(embedded, ask[i])?, &grid, choice)))?;
         masks.extend(found.into_iter().flatten());
+        asked.extend(ask);
     }
-    Ok(Proposals { grid, masks, asked, points })
+    Ok(Proposals { grid, masks, asked: asked.len(), points })
 }
 
 /// Masks of one answer that pass the filters.
@@ -142,7 +157,8 @@ fn consider(answer: &Candidates, grid: &Grid, choice: &Choice) -> Vec<Proposal> 
         let above = |t: f32| logits.iter().filter(|&&l| l > t).count();
         let stability = above(STABILITY_OFFSET) as f32 / above(-STABILITY_OFFSET).max(1) as f32;
         let pixels = Pixels::new(grid.width, logits.iter().map(|&l| l > 0.0));
-        if stability < choice.stability || pixels.area == 0 {
+        let most = (choice.max_area * grid.extent[0] * grid.extent[1]) as usize;
+        if stability < choice.stability || pixels.area == 0 || pixels.area > most {
             continue;
         }
         let level = if count == 1 { 0 } else { (m + 1).min(LEVELS - 1) };
@@ -151,7 +167,8 @@ fn consider(answer: &Candidates, grid: &Grid, choice: &Choice) -> Vec<Proposal> 
     good
 }
 
-/// The masks of each level (default, small, medium, large) as indices into `masks`: box suppression, then LangSplat's.
+/// The masks of each level (default, small, medium, large) as indices into `masks`: those that merge several
+/// things go ([`merges_things`]), then box suppression, then LangSplat's.
 ///
 /// Levels are SAM's own three masks per prompt; default is all of them together. A decoder that gives one mask per
 /// prompt leaves the levels to nesting ([`nesting_levels`]). Then, if so chosen, [`fill`].
@@ -165,11 +182,16 @@ pub fn levels(masks: &[Proposal], choice: &Choice) -> [Vec<usize>; LEVELS] {
         let (pixels, score): (Vec<&Pixels>, Vec<f32>) = c.iter().map(|&i| (&masks[i].pixels, masks[i].score)).unzip();
         mask_nms(&pixels, &score, choice.mask_nms).into_iter().map(|k| c[k]).collect()
     };
-    let all = by_boxes((0..masks.len()).collect());
+    // Masks of level large are whole things; a mask around several of them is none itself.
+    let things: Vec<(&Pixels, f32)> =
+        masks.iter().filter(|m| m.level == LEVELS - 1).map(|m| (&m.pixels, m.score)).collect();
+    let single: Vec<usize> =
+        (0..masks.len()).filter(|&i| !merges_things(&masks[i].pixels, masks[i].score, &things)).collect();
+    let all = by_boxes(single.clone());
     let mut chosen: [Vec<usize>; LEVELS] = Default::default();
     if masks.iter().any(|m| m.level > 0) {
         for (level, slot) in chosen.iter_mut().enumerate().skip(1) {
-            *slot = by_masks(by_boxes((0..masks.len()).filter(|&i| masks[i].level == level).collect()));
+            *slot = by_masks(by_boxes(single.iter().copied().filter(|&i| masks[i].level == level).collect()));
         }
     } else {
         let good: Vec<usize> = all.iter().copied().filter(|&i| masks[i].score > choice.mask_nms.score).collect();
@@ -240,6 +262,7 @@ mod tests {
         points_per_side: 4,
         predicted_iou: 0.7,
         stability: 0.7,
+        max_area: 1.0,
         box_nms: 0.7,
         mask_nms: MaskNms { iou: 0.8, score: 0.5, inner: 0.5 },
         skip_score: 0.8,
@@ -258,6 +281,7 @@ mod tests {
         // Mask 0: stability 1; mask 1: 1/2, not stable; mask 2: low quality.
         assert_eq!(good.iter().map(|p| (p.level, p.pixels.area)).collect::<Vec<_>>(), [(1, side)]);
         assert!((good[0].score - 0.9).abs() < 1e-6);
+        assert!(consider(&answer, &grid, &Choice { max_area: 0.4, ..CHOICE }).is_empty());
         let nan = Candidates { quality: vec![f32::NAN], logits: vec![9.0; side * side] };
         assert!(consider(&nan, &grid, &CHOICE).is_empty());
     }

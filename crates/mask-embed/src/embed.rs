@@ -79,7 +79,6 @@ pub fn run(args: &EmbedArgs, stage: &Stage) -> Result<()> {
         "resolution": args.scene.resolution.to_string(), "engine": engine,
     });
     let dataset_hash = scene.hash()?;
-    finished::remove_manifest(&manifest)?;
 
     let mut views = BTreeMap::new();
     let mut progress = stage.progress("views", scene.views.len() as u64);
@@ -100,6 +99,7 @@ pub fn run(args: &EmbedArgs, stage: &Stage) -> Result<()> {
             let (features, pictures) = embed(&clip, &image, &maps)?;
             let shown = features.values.chunks(features.dim).filter(|r| r.iter().any(|&v| v != 0.0)).count();
             let facts = Facts { masks: features.count, features: shown, pictures };
+            finished::remove_manifest(&manifest)?;
             features.write(&output)?;
             finished::write(&output, &key, facts)?
         };

@@ -47,7 +47,7 @@ pub(crate) fn write_json(path: &Path, value: &impl Serialize) -> Result<()> {
     write_bytes(path, &bytes)
 }
 
-/// Removes a manifest that will not be true while outputs change; it is written again last of all.
+/// Removes the manifest before an output that it describes changes; it is written again last of all.
 pub(crate) fn remove_manifest(path: &Path) -> Result<()> {
     match std::fs::remove_file(path) {
         Err(e) if e.kind() != std::io::ErrorKind::NotFound => Err(e).at("replace", path),

@@ -88,35 +88,43 @@ fn find(folder: &Path) -> Result<BTreeMap<String, Vec<PathBuf>>> {
     Ok(views)
 }
 
-/// Turns label pictures into id maps, then writes the manifest.
+/// The id maps of one view.
+fn load(paths: &[PathBuf]) -> Result<MaskMaps> {
+    let labels = paths.iter().map(|p| read(p)).collect::<Result<Vec<Labels>>>()?;
+    for (l, path) in labels.iter().zip(paths) {
+        if (l.width, l.height) != (labels[0].width, labels[0].height) {
+            return Err(Error::new("the levels of a view differ in size")
+                .file(path)
+                .found(format!("{} x {}", l.width, l.height))
+                .expected(format!("{} x {}, as the first", labels[0].width, labels[0].height)));
+        }
+    }
+    let of = |level: usize| labels.get(level).unwrap_or(&labels[0]);
+    Ok(number([of(0), of(1), of(2), of(3)]))
+}
+
+/// Turns label pictures into id maps, then writes the manifest. Nothing is written before all pictures have been read
+/// once.
 ///
 /// # Errors
 /// When a picture cannot be read or is not grey, the levels of a view differ in size, or the output cannot be written.
 pub fn run(args: &ImportArgs, stage: &Stage) -> Result<()> {
     let found = find(&args.labels)?;
-    create_dir(&args.out)?;
-    let manifest = args.out.join("masks.json");
-    finished::remove_manifest(&manifest)?;
     let mut views = BTreeMap::new();
-    let mut progress = stage.progress("views", found.len() as u64);
     for (view, paths) in &found {
-        let labels = paths.iter().map(|p| read(p)).collect::<Result<Vec<Labels>>>()?;
-        for (l, path) in labels.iter().zip(paths) {
-            if (l.width, l.height) != (labels[0].width, labels[0].height) {
-                return Err(Error::new("the levels of a view differ in size")
-                    .file(path)
-                    .found(format!("{} x {}", l.width, l.height))
-                    .expected(format!("{} x {}, as the first", labels[0].width, labels[0].height)));
-            }
-        }
-        let of = |level: usize| labels.get(level).unwrap_or(&labels[0]);
-        let maps = number([of(0), of(1), of(2), of(3)]);
+        let maps = load(paths)?;
         let masks = count_masks(&maps);
         if masks.iter().all(|&n| n == 0) {
             stage.warn(&format!("{}: no label but 0", paths[0].display()));
         }
-        maps.write(maps_path(&args.out, view))?;
         views.insert(view.clone(), json!({ "size": [maps.width, maps.height], "masks": masks }));
+    }
+    create_dir(&args.out)?;
+    let manifest = args.out.join("masks.json");
+    finished::remove_manifest(&manifest)?;
+    let mut progress = stage.progress("views", found.len() as u64);
+    for (view, paths) in &found {
+        load(paths)?.write(maps_path(&args.out, view))?;
         progress.step();
     }
     progress.finish(&[]);

@@ -49,7 +49,6 @@ pub fn run(args: &MasksArgs, stage: &Stage) -> Result<()> {
         "resolution": args.scene.resolution.to_string(), "engine": engine,
     });
     let dataset_hash = scene.hash()?;
-    finished::remove_manifest(&manifest)?;
     warn_of_strangers(&args.out, scene.views.iter().map(View::stem), stage)?;
 
     let mut views = BTreeMap::new();
@@ -78,6 +77,7 @@ pub fn run(args: &MasksArgs, stage: &Stage) -> Result<()> {
                 points: proposals.points,
                 asked: proposals.asked,
             };
+            finished::remove_manifest(&manifest)?;
             maps.write(&output)?;
             finished::write(&output, &key, facts)?
         };

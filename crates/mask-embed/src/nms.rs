@@ -119,6 +119,22 @@ pub fn mask_nms(masks: &[&Pixels], scores: &[f32], rule: MaskNms) -> Vec<usize> 
     order.into_iter().zip(keep).filter_map(|(i, k)| k.then_some(i)).collect()
 }
 
+/// Whether a mask merges several things: at least three of the `things`, apart from each other, lie in it (85% of each)
+/// and have a score that is no more than 0.1 below its own. SAM's largest masks are now and then half the room, which
+/// [`mask_nms`] would keep and drop everything in it.
+pub fn merges_things(mask: &Pixels, score: f32, things: &[(&Pixels, f32)]) -> bool {
+    let mut apart: Vec<&Pixels> = Vec::new();
+    for k in by_score(&things.iter().map(|t| t.1).collect::<Vec<f32>>()) {
+        let (thing, good) = (things[k].0, things[k].1 > score - 0.1);
+        let most_of = |part: usize, whole: &Pixels| part as f64 >= 0.85 * whole.area as f64;
+        let inside = good && thing.area < mask.area && most_of(thing.overlap(mask), thing);
+        if inside && apart.iter().all(|a| (a.overlap(thing) as f64) < 0.15 * a.area.min(thing.area) as f64) {
+            apart.push(thing);
+        }
+    }
+    apart.len() >= 3
+}
+
 /// Levels of masks that come without them, from nesting. A mask lies in another when 85% of it does and the other is
 /// larger. Small are the masks that contain none, large those that lie in none, medium those that lie in exactly one
 /// and, so that no level has holes, those that are both small and large. Gives the levels 1, 2, 3 of each mask.
@@ -184,6 +200,20 @@ mod tests {
         assert_eq!(mask_nms(&[&whole, &big_part, &half_out], &[0.9, 0.85, 0.8], RULE), [0, 1, 2]);
         assert!(mask_nms(&[&rect(3, 3, 3, 3)], &[0.9], RULE).is_empty());
         assert!(mask_nms(&[], &[], RULE).is_empty());
+    }
+
+    #[test]
+    fn a_mask_around_three_good_things_merges_them() {
+        let room = rect(0, 0, 20, 10);
+        let (a, b, c) = (rect(0, 0, 4, 4), rect(6, 0, 10, 4), rect(12, 0, 18, 9));
+        let things = |scores: [f32; 3]| [(&a, scores[0]), (&b, scores[1]), (&c, scores[2])];
+        assert!(merges_things(&room, 0.6, &things([0.7, 0.9, 0.8])));
+        assert!(!merges_things(&room, 0.85, &things([0.7, 0.9, 0.8])));
+        assert!(!merges_things(&rect(0, 0, 11, 10), 0.6, &things([0.7, 0.9, 0.8])));
+        // Three masks of one thing are one thing.
+        let same = rect(6, 0, 10, 3);
+        assert!(!merges_things(&room, 0.6, &[(&a, 0.9), (&b, 0.9), (&same, 0.8)]));
+        assert!(!merges_things(&room, 0.6, &[]));
     }
 
     #[test]

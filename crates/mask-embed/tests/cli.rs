@@ -293,6 +293,7 @@ fn label_pictures_become_id_maps() {
     std::fs::create_dir(&labels).unwrap();
     assert!(import().contains("labels: no label pictures"));
     assert_eq!(MaskMaps::read(maps_path(&out, "c")).unwrap(), c, "a good output was overwritten");
+    assert!(out.join("masks.json").exists());
 }
 
 #[test]
