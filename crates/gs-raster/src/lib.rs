@@ -1,1 +1,25 @@
-//! Differentiable rasteriser of 3D Gaussians on the CPU.
+//! Differentiable rasteriser of 3D Gaussians on the CPU: projection, tiles, forward, backward, per-pixel weights. It knows
+//! nothing of training.
+//!
+//! Conventions (those of gsplat and the original 3DGS): pixel centres at +0.5; 0.3 added to the 2D covariance's diagonal;
+//! alpha = min(0.99, opacity exp(-sigma)), skipped below 1/255; compositing stops before the Gaussian that would bring the
+//! transmittance to 1e-4; depth order by camera z, ties by index; colour = max(SH + 0.5, 0). Gaussians whose parameters are
+//! not finite, whose quaternion is zero, or that lie behind the near plane are not drawn.
+//!
+//! The same inputs give the same bits for any number of threads: tiles are independent, and a Gaussian's gradients are
+//! summed over its tiles in tile order.
+
+mod backward;
+mod forward;
+mod kernels;
+mod project;
+mod sh;
+mod tiles;
+mod types;
+mod weights;
+
+pub use backward::backward;
+pub use forward::{Forward, forward, render};
+pub use tiles::TILE;
+pub use types::{Gradients, PixelGradients, RasterOptions, Rendered};
+pub use weights::{TileWeights, render_features, tile_weights};

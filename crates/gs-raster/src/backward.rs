@@ -1,0 +1,133 @@
+//! The backward pass.
+
+use crate::forward::Forward;
+use crate::kernels::{TileGradients, backward_tile};
+use crate::project::{SplatGradient, project_backward};
+use crate::tiles::{PIXELS, TILE};
+use crate::types::{Gradients, PixelGradients, RasterOptions};
+use gs_scene::{Camera, Gaussians};
+use rayon::prelude::*;
+
+/// d loss / d every parameter, given d loss / d every pixel of the view that `forward` rendered with the same arguments.
+///
+/// # Panics
+/// When a gradient image has another size than the rendered view.
+pub fn backward(
+    g: &Gaussians,
+    camera: &Camera,
+    options: &RasterOptions,
+    forward: &Forward,
+    d: PixelGradients<'_>,
+) -> Gradients {
+    let tiles = &forward.tiles;
+    let w = camera.width as usize;
+    let pixels = w * camera.height as usize;
+    assert_eq!(d.rgb.len(), 3 * pixels);
+    assert!(d.alpha.is_none_or(|a| a.len() == pixels) && d.depth.is_none_or(|z| z.len() == pixels));
+
+    // One gradient per tile and Gaussian, each tile writing its own slice.
+    let mut pairs = vec![SplatGradient::default(); tiles.entries.len()];
+    let mut slices = Vec::with_capacity(tiles.count());
+    let mut rest = &mut pairs[..];
+    for t in 0..tiles.count() {
+        let (head, tail) = rest.split_at_mut(tiles.list(t).len());
+        slices.push(head);
+        rest = tail;
+    }
+    slices.into_par_iter().enumerate().for_each(|(t, out)| {
+        if !out.is_empty() {
+            let (x0, y0, _, th) = tiles.rectangle(t);
+            let tile = pixel_gradients(forward, options, d, w, tiles.rectangle(t));
+            backward_tile(&tiles.splats, tiles.list(t), x0, y0, th, &tile, out);
+        }
+    });
+
+    // The pairs of each splat, in tile order.
+    let n = tiles.splats.len();
+    let mut start = vec![0usize; n + 1];
+    for &e in &tiles.entries {
+        start[e as usize + 1] += 1;
+    }
+    for i in 0..n {
+        start[i + 1] += start[i];
+    }
+    let mut next = start.clone();
+    let mut of_splat = vec![0u32; tiles.entries.len()];
+    for (pair, &e) in tiles.entries.iter().enumerate() {
+        of_splat[next[e as usize]] = pair as u32;
+        next[e as usize] += 1;
+    }
+
+    let stride = g.sh_stride();
+    let per_splat: Vec<_> = (0..n)
+        .into_par_iter()
+        .with_min_len(64)
+        .map(|i| {
+            let mut sum = SplatGradient::default();
+            for &pair in &of_splat[start[i]..start[i + 1]] {
+                sum.add(&pairs[pair as usize]);
+            }
+            let mut d_sh = [0.0f32; 48];
+            let i_original = tiles.index[i] as usize;
+            let p = project_backward(g, i_original, &tiles.lens, options, &tiles.splats[i], &sum, &mut d_sh[..stride]);
+            (p, d_sh, sum.mean, sum.mean_abs)
+        })
+        .collect();
+
+    let all = g.len();
+    let mut out = Gradients {
+        means: vec![[0.0; 3]; all],
+        log_scales: vec![[0.0; 3]; all],
+        rotations: vec![[0.0; 4]; all],
+        opacity_logits: vec![0.0; all],
+        sh: vec![0.0; all * stride],
+        mean2d: vec![[0.0; 2]; all],
+        mean2d_abs: vec![[0.0; 2]; all],
+    };
+    for (&i, (p, d_sh, mean, mean_abs)) in tiles.index.iter().zip(per_splat) {
+        let i = i as usize;
+        let Some(p) = p else { continue };
+        out.means[i] = p.mean;
+        out.log_scales[i] = p.log_scale;
+        out.rotations[i] = p.rotation;
+        out.opacity_logits[i] = p.opacity_logit;
+        out.sh[i * stride..(i + 1) * stride].copy_from_slice(&d_sh[..stride]);
+        out.mean2d[i] = mean;
+        out.mean2d_abs[i] = mean_abs;
+    }
+    out
+}
+
+fn pixel_gradients(
+    forward: &Forward,
+    options: &RasterOptions,
+    d: PixelGradients<'_>,
+    w: usize,
+    (x0, y0, tw, th): (usize, usize, usize, usize),
+) -> Box<TileGradients> {
+    let mut tile = Box::new(TileGradients {
+        rgb: [[0.0; PIXELS]; 3],
+        depth: [0.0; PIXELS],
+        alpha: [0.0; PIXELS],
+        total: [0.0; PIXELS],
+    });
+    let r = &forward.rendered;
+    for y in 0..th {
+        for x in 0..tw {
+            let (from, to) = ((y0 + y) * w + x0 + x, y * TILE + x);
+            let mut d_alpha = d.alpha.map_or(0.0, |a| a[from]);
+            let d_depth = d.depth.map_or(0.0, |z| z[from]);
+            let mut total = d_depth * r.depth[from];
+            for c in 0..3 {
+                let g = d.rgb[3 * from + c];
+                tile.rgb[c][to] = g;
+                d_alpha -= options.background[c] * g;
+                total += g * (r.rgb[3 * from + c] - (1.0 - r.alpha[from]) * options.background[c]);
+            }
+            tile.depth[to] = d_depth;
+            tile.alpha[to] = d_alpha;
+            tile.total[to] = total + d_alpha * r.alpha[from];
+        }
+    }
+    tile
+}

@@ -1,0 +1,75 @@
+//! The forward pass.
+
+use crate::kernels::forward_tile;
+use crate::tiles::{TILE, Tiles};
+use crate::types::{RasterOptions, Rendered};
+use gs_scene::{Camera, Gaussians};
+use rayon::prelude::*;
+
+/// A rendered view with what the backward pass needs.
+pub struct Forward {
+    /// The picture.
+    pub rendered: Rendered,
+    pub(crate) tiles: Tiles,
+}
+
+impl Forward {
+    /// Original indices of the Gaussians that were drawn, front to back.
+    pub fn visible(&self) -> &[u32] {
+        &self.tiles.index
+    }
+
+    /// Half extents, in pixels, of the drawn Gaussians' visible ellipses, in the order of [`Self::visible`]: the larger of
+    /// the two axes' extents.
+    pub fn radii(&self) -> Vec<f32> {
+        self.tiles.splats.iter().map(|s| s.extent[0].max(s.extent[1])).collect()
+    }
+
+    /// Pixel-Gaussian pairs in the tiles' lists, an upper bound of what the kernels evaluate.
+    pub fn pairs(&self) -> usize {
+        self.tiles.entries.len() * TILE * TILE
+    }
+}
+
+/// Renders a view and keeps what [`crate::backward`] needs.
+pub fn forward(g: &Gaussians, camera: &Camera, options: &RasterOptions) -> Forward {
+    let tiles = Tiles::new(g, camera, options);
+    let (w, h) = (camera.width as usize, camera.height as usize);
+    let mut rendered = Rendered {
+        width: camera.width,
+        height: camera.height,
+        rgb: vec![0.0; w * h * 3],
+        alpha: vec![0.0; w * h],
+        depth: vec![0.0; w * h],
+    };
+    // A band of tiles owns whole image rows, so bands can be written side by side.
+    let bands = rendered
+        .rgb
+        .par_chunks_mut(w * TILE * 3)
+        .zip(rendered.alpha.par_chunks_mut(w * TILE))
+        .zip(rendered.depth.par_chunks_mut(w * TILE));
+    bands.enumerate().for_each(|(band, ((rgb, alpha), depth))| {
+        for column in 0..tiles.columns {
+            let t = band * tiles.columns + column;
+            let (x0, y0, tw, th) = tiles.rectangle(t);
+            let p = forward_tile(&tiles.splats, tiles.list(t), x0, y0, th);
+            for y in 0..th {
+                for x in 0..tw {
+                    let (from, to) = (y * TILE + x, y * w + x0 + x);
+                    let left = p.transmittance[from];
+                    for c in 0..3 {
+                        rgb[3 * to + c] = p.rgb[c][from] + left * options.background[c];
+                    }
+                    alpha[to] = 1.0 - left;
+                    depth[to] = p.depth[from];
+                }
+            }
+        }
+    });
+    Forward { rendered, tiles }
+}
+
+/// Renders a view: colour, accumulated alpha, alpha-weighted depth.
+pub fn render(g: &Gaussians, camera: &Camera, options: &RasterOptions) -> Rendered {
+    forward(g, camera, options).rendered
+}

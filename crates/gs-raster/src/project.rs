@@ -1,0 +1,287 @@
+//! From Gaussians in the world to ellipses in the image (EWA splatting), and back.
+//!
+//! Follows gsplat's conventions: 0.3 is added to the diagonal of the 2D covariance; in the Jacobian x/z and y/z are clamped to
+//! the image's edges plus 0.15 of its size.
+
+use crate::sh;
+use crate::types::RasterOptions;
+use glam::{DVec3, Mat3, Quat, Vec2, Vec3};
+use gs_scene::{Camera, Gaussians};
+
+/// Added to the diagonal of the projected covariance, in square pixels.
+pub(crate) const LOW_PASS: f32 = 0.3;
+/// Contributions below this are skipped.
+pub(crate) const ALPHA_MIN: f32 = 1.0 / 255.0;
+
+/// A Gaussian as the tiles see it.
+#[derive(Debug, Clone, Copy, Default)]
+pub(crate) struct Splat {
+    pub mean: [f32; 2],
+    /// Inverse of the 2D covariance: xx, xy, yy.
+    pub conic: [f32; 3],
+    /// Half extents of the region where alpha >= 1/255, in pixels.
+    pub extent: [f32; 2],
+    /// sigma at which alpha falls below 1/255: ln(255 opacity).
+    pub sigma_max: f32,
+    pub opacity: f32,
+    pub depth: f32,
+    pub color: [f32; 3],
+    /// Which colour channels were cut at zero: they pass no gradient.
+    pub clamped: [bool; 3],
+}
+
+/// A camera in single precision, ready for many Gaussians.
+pub(crate) struct Lens {
+    rotation: Mat3,
+    position: DVec3,
+    rotation64: glam::DMat3,
+    focal: Vec2,
+    center: Vec2,
+    /// Bounds of x/z and y/z in the Jacobian.
+    low: Vec2,
+    high: Vec2,
+    pub width: u32,
+    pub height: u32,
+}
+
+impl Lens {
+    pub fn new(c: &Camera) -> Self {
+        let focal = Vec2::new(c.fx as f32, c.fy as f32);
+        let size = Vec2::new(c.width as f32, c.height as f32);
+        let center = Vec2::new(c.cx as f32, c.cy as f32);
+        let margin = 0.15 * size / focal;
+        Self {
+            rotation: c.rotation.as_mat3(),
+            rotation64: c.rotation,
+            position: c.position(),
+            focal,
+            center,
+            low: -(center / focal) - margin,
+            high: (size - center) / focal + margin,
+            width: c.width,
+            height: c.height,
+        }
+    }
+
+    /// Camera coordinates; the difference is taken in f64 so that far-away origins do not cost digits.
+    fn to_camera(&self, mean: [f32; 3]) -> Vec3 {
+        (self.rotation64 * (Vec3::from(mean).as_dvec3() - self.position)).as_vec3()
+    }
+
+    /// View direction (from the camera to the Gaussian), not normalised.
+    fn direction(&self, mean: [f32; 3]) -> Vec3 {
+        (Vec3::from(mean).as_dvec3() - self.position).as_vec3()
+    }
+}
+
+/// Intermediate values that the backward pass needs again.
+struct Ellipse {
+    t: Vec3,
+    clamped: Vec2,
+    inside: [bool; 2],
+    /// Rows of J * W.
+    jw: [Vec3; 2],
+    /// Rotation times scale.
+    m: Mat3,
+    quat: Quat,
+    quat_norm: f32,
+    scale: Vec3,
+    cov: [f32; 3],
+}
+
+fn ellipse(g: &Gaussians, i: usize, lens: &Lens, near: f32) -> Option<Ellipse> {
+    let t = lens.to_camera(g.means[i]);
+    if !(t.is_finite() && t.z > near) {
+        return None;
+    }
+    let [w, x, y, z] = g.rotations[i];
+    let raw = Quat::from_xyzw(x, y, z, w);
+    let quat_norm = raw.length();
+    if !(quat_norm.is_finite() && quat_norm > 1e-12) {
+        return None;
+    }
+    let quat = raw * (1.0 / quat_norm);
+    let scale = Vec3::from(g.log_scales[i].map(f32::exp));
+    let m = Mat3::from_quat(quat) * Mat3::from_diagonal(scale);
+    let rz = 1.0 / t.z;
+    let (u, v) = (t.x * rz, t.y * rz);
+    let inside = [(lens.low.x..=lens.high.x).contains(&u), (lens.low.y..=lens.high.y).contains(&v)];
+    let clamped = Vec2::new(u.clamp(lens.low.x, lens.high.x), v.clamp(lens.low.y, lens.high.y)) * t.z;
+    let j0 = Vec3::new(lens.focal.x * rz, 0.0, -lens.focal.x * clamped.x * rz * rz);
+    let j1 = Vec3::new(0.0, lens.focal.y * rz, -lens.focal.y * clamped.y * rz * rz);
+    let wt = lens.rotation.transpose();
+    let jw = [wt * j0, wt * j1];
+    let mt = m.transpose();
+    let (a, b) = (mt * jw[0], mt * jw[1]);
+    let cov = [a.dot(a) + LOW_PASS, a.dot(b), b.dot(b) + LOW_PASS];
+    cov.iter().all(|c| c.is_finite()).then_some(Ellipse { t, clamped, inside, jw, m, quat, quat_norm, scale, cov })
+}
+
+/// Projects Gaussian `i`; `None` when it cannot touch the image.
+pub(crate) fn project(g: &Gaussians, i: usize, lens: &Lens, options: &RasterOptions) -> Option<Splat> {
+    let opacity = g.opacity(i);
+    if opacity.is_nan() || opacity < ALPHA_MIN {
+        return None;
+    }
+    let e = ellipse(g, i, lens, options.near)?;
+    let [xx, xy, yy] = e.cov;
+    let det = xx * yy - xy * xy;
+    if !(det.is_finite() && det > 0.0) {
+        return None;
+    }
+    let inv = 1.0 / det;
+    let conic = [yy * inv, -xy * inv, xx * inv];
+    let mean = [lens.focal.x * e.t.x / e.t.z + lens.center.x, lens.focal.y * e.t.y / e.t.z + lens.center.y];
+    let sigma_max = (255.0 * opacity).ln();
+    let extent = [(2.0 * sigma_max * xx).sqrt(), (2.0 * sigma_max * yy).sqrt()];
+    let (w, h) = (lens.width as f32, lens.height as f32);
+    let touches =
+        mean[0] + extent[0] > 0.0 && mean[0] - extent[0] < w && mean[1] + extent[1] > 0.0 && mean[1] - extent[1] < h;
+    if !(touches && conic.iter().chain(&mean).all(|v| v.is_finite())) {
+        return None;
+    }
+    let raw = sh::color(g.sh_of(i), g.sh_degree.min(options.sh_degree), lens.direction(g.means[i]));
+    if raw.iter().any(|c| !c.is_finite()) {
+        return None;
+    }
+    Some(Splat {
+        mean,
+        conic,
+        extent,
+        sigma_max,
+        opacity,
+        depth: e.t.z,
+        color: raw.map(|c| c.max(0.0)),
+        clamped: raw.map(|c| c < 0.0),
+    })
+}
+
+/// d loss / d splat, summed over pixels.
+#[derive(Debug, Clone, Copy, Default, PartialEq)]
+pub(crate) struct SplatGradient {
+    pub mean: [f32; 2],
+    pub mean_abs: [f32; 2],
+    pub conic: [f32; 3],
+    pub opacity: f32,
+    pub depth: f32,
+    pub color: [f32; 3],
+}
+
+impl SplatGradient {
+    pub fn add(&mut self, o: &Self) {
+        for c in 0..2 {
+            self.mean[c] += o.mean[c];
+            self.mean_abs[c] += o.mean_abs[c];
+        }
+        for c in 0..3 {
+            self.conic[c] += o.conic[c];
+            self.color[c] += o.color[c];
+        }
+        self.opacity += o.opacity;
+        self.depth += o.depth;
+    }
+}
+
+/// d loss / d parameters of one Gaussian.
+pub(crate) struct ParameterGradient {
+    pub mean: [f32; 3],
+    pub log_scale: [f32; 3],
+    pub rotation: [f32; 4],
+    pub opacity_logit: f32,
+}
+
+/// The chain rule through [`project`]; the gradient of the spherical harmonics is written to `d_sh`.
+pub(crate) fn project_backward(
+    g: &Gaussians,
+    i: usize,
+    lens: &Lens,
+    options: &RasterOptions,
+    splat: &Splat,
+    d: &SplatGradient,
+    d_sh: &mut [f32],
+) -> Option<ParameterGradient> {
+    let e = ellipse(g, i, lens, options.near)?;
+    let mut d_color = d.color;
+    for c in 0..3 {
+        if splat.clamped[c] {
+            d_color[c] = 0.0;
+        }
+    }
+    let degree = g.sh_degree.min(options.sh_degree);
+    let mut d_mean = sh::color_backward(g.sh_of(i), degree, lens.direction(g.means[i]), d_color, d_sh);
+
+    // conic = cov^-1:  d cov = -conic^T (d conic) conic, with the off-diagonal counted once in d.conic[1].
+    let [a, b, c] = splat.conic;
+    let (da, db, dc) = (d.conic[0], 0.5 * d.conic[1], d.conic[2]);
+    let (p00, p01) = (a * da + b * db, a * db + b * dc);
+    let (p10, p11) = (b * da + c * db, b * db + c * dc);
+    let d_cov = [-(p00 * a + p01 * b), -(p00 * b + p01 * c), -(p10 * b + p11 * c)];
+
+    // cov2d = (JW) Sigma (JW)^T, Sigma = M M^T.
+    let mt = e.m.transpose();
+    let (ma, mb) = (mt * e.jw[0], mt * e.jw[1]);
+    let (d_ma, d_mb) = (2.0 * d_cov[0] * ma + 2.0 * d_cov[1] * mb, 2.0 * d_cov[1] * ma + 2.0 * d_cov[2] * mb);
+    // ma = M^T jw0: d jw0 = M d_ma; d M = jw0 d_ma^T + jw1 d_mb^T.
+    let (d_jw0, d_jw1) = (e.m * d_ma, e.m * d_mb);
+    let outer = |u: Vec3, v: Vec3| Mat3::from_cols(u * v.x, u * v.y, u * v.z);
+    let d_m = outer(e.jw[0], d_ma) + outer(e.jw[1], d_mb);
+
+    // jw = W^T j: d j = W d_jw.
+    let (d_j0, d_j1) = (lens.rotation * d_jw0, lens.rotation * d_jw1);
+    let rz = 1.0 / e.t.z;
+    let (rz2, rz3) = (rz * rz, rz * rz * rz);
+    let (fx, fy) = (lens.focal.x, lens.focal.y);
+    let mut d_t = Vec3::ZERO;
+    d_t.z += -fx * rz2 * d_j0.x - fy * rz2 * d_j1.y;
+    d_t.z += 2.0 * fx * e.clamped.x * rz3 * d_j0.z + 2.0 * fy * e.clamped.y * rz3 * d_j1.z;
+    if e.inside[0] {
+        d_t.x -= fx * rz2 * d_j0.z;
+    } else {
+        d_t.z -= fx * e.clamped.x * rz3 * d_j0.z;
+    }
+    if e.inside[1] {
+        d_t.y -= fy * rz2 * d_j1.z;
+    } else {
+        d_t.z -= fy * e.clamped.y * rz3 * d_j1.z;
+    }
+    // mean2d and depth.
+    d_t.x += fx * rz * d.mean[0];
+    d_t.y += fy * rz * d.mean[1];
+    d_t.z += -rz2 * (fx * e.t.x * d.mean[0] + fy * e.t.y * d.mean[1]) + d.depth;
+    d_mean += lens.rotation.transpose() * d_t;
+
+    // M = R S.
+    let r = Mat3::from_quat(e.quat);
+    let d_scale = Vec3::new(r.x_axis.dot(d_m.x_axis), r.y_axis.dot(d_m.y_axis), r.z_axis.dot(d_m.z_axis));
+    let d_r = Mat3::from_cols(d_m.x_axis * e.scale.x, d_m.y_axis * e.scale.y, d_m.z_axis * e.scale.z);
+    let d_quat = quat_backward(e.quat, &d_r);
+    // q / |q|: the part along q drops out.
+    let q = [e.quat.w, e.quat.x, e.quat.y, e.quat.z];
+    let along: f32 = q.iter().zip(&d_quat).map(|(a, b)| a * b).sum();
+    let rotation = [0, 1, 2, 3].map(|k| (d_quat[k] - along * q[k]) / e.quat_norm);
+    let log_scale = d_scale * e.scale;
+    Some(ParameterGradient {
+        mean: d_mean.into(),
+        log_scale: log_scale.into(),
+        rotation,
+        opacity_logit: d.opacity * splat.opacity * (1.0 - splat.opacity),
+    })
+}
+
+/// d loss / d (w, x, y, z) of a unit quaternion from d loss / d its rotation matrix.
+fn quat_backward(q: Quat, d: &Mat3) -> [f32; 4] {
+    let (w, x, y, z) = (q.w, q.x, q.y, q.z);
+    // d.col(c)[r] is the gradient of R[r][c].
+    let g = |r: usize, c: usize| d.col(c)[r];
+    [
+        2.0 * (-z * g(0, 1) + y * g(0, 2) + z * g(1, 0) - x * g(1, 2) - y * g(2, 0) + x * g(2, 1)),
+        2.0 * (y * g(0, 1) + z * g(0, 2) + y * g(1, 0) - 2.0 * x * g(1, 1) - w * g(1, 2) + z * g(2, 0) + w * g(2, 1)
+            - 2.0 * x * g(2, 2)),
+        2.0 * (-2.0 * y * g(0, 0) + x * g(0, 1) + w * g(0, 2) + x * g(1, 0) + z * g(1, 2) - w * g(2, 0) + z * g(2, 1)
+            - 2.0 * y * g(2, 2)),
+        2.0 * (-2.0 * z * g(0, 0) - w * g(0, 1) + x * g(0, 2) + w * g(1, 0) - 2.0 * z * g(1, 1)
+            + y * g(1, 2)
+            + x * g(2, 0)
+            + y * g(2, 1)),
+    ]
+}
