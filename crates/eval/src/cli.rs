@@ -209,8 +209,9 @@ fn run_query(a: &QueryArgs, stage: &Stage) -> Result<String> {
     };
     let scene = LabelledScene::read(&a.scene.instances, &a.scene.geometry)?;
     let source = a.language.source()?;
-    source.check_dim(scene.instances.dim, &scene.path)?;
+    source.check_dim(scene.instances.dim, scene.path())?;
     let dataset = load(&a.scene.scene, &LoadOptions { resolution: a.resolution, ..LoadOptions::default() }, stage)?;
+    scene.check_dataset(&dataset)?;
     let results = query::run(&scene, &dataset, &source, &options, &a.out)?;
     for q in results.queries.iter().filter(|q| q.selected.is_empty()) {
         stage.warn(&format!("no instance passes for {:?}: nothing is selected", q.text));
@@ -230,6 +231,7 @@ fn run_score(a: &ScoreArgs, stage: &Stage) -> Result<String> {
     let scene = LabelledScene::read(&a.scene.instances, &a.scene.geometry)?;
     let mut scores = Scores::default();
     let dataset = load(&a.scene.scene, &LoadOptions::default(), stage)?;
+    scene.check_dataset(&dataset)?;
     score::score_instances(&scene, &dataset.root, &mut scores)?;
     let labels = a.labels.clone().unwrap_or_else(|| dataset.root.join("label"));
     let no_source = a.language.clip.is_none() && a.language.text_features.is_none();

@@ -194,7 +194,7 @@ fn slug_of_view(view: &View) -> String {
 /// # Errors
 /// When dimensions differ or a text has no feature.
 fn encode_all(scene: &LabelledScene, source: &TextSource, texts: &[String]) -> Result<Vec<Vec<f32>>> {
-    source.check_dim(scene.instances.dim, &scene.path)?;
+    source.check_dim(scene.instances.dim, scene.path())?;
     let encoded = source.encode(texts)?;
     encoded.into_iter().zip(texts).map(|(f, t)| f.ok_or_else(|| source.unknown(t))).collect()
 }

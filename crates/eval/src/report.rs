@@ -11,7 +11,7 @@ use crate::runs::{self, Run, grouped};
 use crate::scene::{LabelledScene, find_view, spread};
 use crate::score::Scores;
 use crate::{curves, svg};
-use artifacts::{Features, Level, MaskMaps, NOISE_COLOR, instance_color, maps_path, role};
+use artifacts::{Features, Level, MaskMaps, NOISE_COLOR, hash_folder, instance_color, maps_path, role};
 use gs_io::{Error, IoContext, Result, hash_file, write_bytes};
 use gs_raster::RasterOptions;
 use gs_scene::Gaussians;
@@ -175,6 +175,7 @@ impl<'a> Material<'a> {
         let path = options.run_dir.join("instances.safetensors");
         let labelled = if path.exists() {
             let labelled = LabelledScene::read(&path, &geometry)?;
+            labelled.check_dataset(dataset)?;
             inputs.extend(labelled.inputs.clone());
             Some(labelled)
         } else {
@@ -318,6 +319,11 @@ fn id_maps(m: &Material, page: &mut Page, metrics: &mut Metrics) -> Result<()> {
         metrics.skipped.push("id maps: no folder of masks was given".into());
         return Ok(());
     };
+    if let Some(a) =
+        m.labelled.as_ref().map(|l| &l.artifact).filter(|a| a.provenance().inputs.contains_key(role::MASKS))
+    {
+        a.expect_input(role::MASKS, &hash_folder(folder, "_s.npy")?)?;
+    }
     let mut figures = Vec::new();
     for s in &m.shown {
         let path = maps_path(folder, s.view.stem());

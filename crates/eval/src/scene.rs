@@ -1,11 +1,11 @@
 //! What every command loads: instances with their geometry, and the views of the scene.
 
 use artifacts::{Instances, role};
-use gs_io::{Error, Result, hash_file};
+use gs_io::{Artifact, Error, Result, hash_file};
 use gs_scene::Gaussians;
 use gs_scene::dataset::{Dataset, View};
 use std::collections::BTreeMap;
-use std::path::{Path, PathBuf};
+use std::path::Path;
 
 /// Instances with the Gaussians they label.
 pub struct LabelledScene {
@@ -13,8 +13,8 @@ pub struct LabelledScene {
     pub gaussians: Gaussians,
     /// The instances; labels are as many as Gaussians.
     pub instances: Instances,
-    /// Where the instances were read from.
-    pub path: PathBuf,
+    /// The file of the instances.
+    pub artifact: Artifact,
     /// Content hashes, by role.
     pub inputs: BTreeMap<String, String>,
 }
@@ -39,7 +39,30 @@ impl LabelledScene {
         }
         let inputs =
             BTreeMap::from([(role::GEOMETRY.into(), geometry_hash), ("instances".into(), artifact.hash().into())]);
-        Ok(Self { gaussians, instances: labelled, path: instances.into(), inputs })
+        Ok(Self { gaussians, instances: labelled, artifact, inputs })
+    }
+
+    /// Where the instances were read from.
+    pub fn path(&self) -> &Path {
+        self.artifact.path()
+    }
+
+    /// Checks that the dataset can be the one the instances were made from: it has views that they name.
+    ///
+    /// # Errors
+    /// When it has none of them.
+    pub fn check_dataset(&self, dataset: &Dataset) -> Result<()> {
+        let named = &self.instances.views;
+        let has = |name: &String| dataset.views.iter().any(|v| v.stem() == name);
+        match named.first() {
+            Some(first) if !named.iter().any(has) => Err(Error::new("the instances are of another scene")
+                .file(self.path())
+                .field("views")
+                .found(format!("{first} and {} more", named.len() - 1))
+                .expected(format!("views of {}", dataset.root.display()))
+                .hint("give the scene that the instances were made from")),
+            _ => Ok(()),
+        }
     }
 }
 

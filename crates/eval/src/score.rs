@@ -176,7 +176,7 @@ pub fn score_queries(
         scores.skipped.push(format!("query scores: {} holds no labelled object", folder.display()));
         return Ok(());
     }
-    source.check_dim(scene.instances.dim, &scene.path)?;
+    source.check_dim(scene.instances.dim, scene.path())?;
     let mut answers = BTreeMap::new();
     for (text, feature) in texts.iter().zip(source.encode(&texts)?) {
         let Some(feature) = feature else {

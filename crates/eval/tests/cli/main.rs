@@ -121,6 +121,16 @@ fn artifacts_of_another_scene_are_refused() {
         let e = f.bad(command, rest);
         assert!(e.contains("instances.safetensors: inputs.geometry: made from another geometry"), "{e}");
     }
+    let f = Fixture::new(2);
+    let transforms = f.scene().join("transforms.json");
+    for i in 0..fixture::VIEWS {
+        let other = format!("images/other_{i}.png");
+        fs::rename(f.scene().join(format!("images/{}.png", stem(i))), f.scene().join(&other)).unwrap();
+        let text = fs::read_to_string(&transforms).unwrap();
+        fs::write(&transforms, text.replace(&format!("images/{}.png", stem(i)), &other)).unwrap();
+    }
+    let e = f.bad("score", "--out|{}/out");
+    assert!(e.contains("another scene; found frame_00000 and 8 more"), "{e}");
     fs::remove_file(f.geometry()).unwrap();
     assert!(f.bad("score", "--out|{}/out").contains("geometry.ply: cannot open"));
     fs::write(f.instances(), b"short").unwrap();
