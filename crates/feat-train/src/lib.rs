@@ -1,1 +1,15 @@
-//! Stage 2b: contextual feature propagation and mask-aware contrastive learning.
+//! Stage 2b: one feature vector per Gaussian.
+//!
+//! Two methods. [`train`] is the paper's: contextual propagation on the anchor graph and a contrastive loss on the
+//! centroids of masks, which are a sparse matrix times the features once geometry is frozen. [`spectral`] is a closed
+//! form: the leading singular vectors of the matrix of Gaussians and masks. `docs/method.md` has the equations.
+
+pub mod adam;
+pub mod loss;
+pub mod model;
+pub mod network;
+pub mod normalize;
+pub mod real;
+pub mod scene;
+#[cfg(test)]
+mod testing;

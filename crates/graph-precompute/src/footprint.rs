@@ -106,10 +106,10 @@ fn tile_sums(tile: &TileWeights, maps: &MaskMaps, row_of: &[Vec<u32>; LEVELS], g
     let mut out = TileSums { entries: Vec::new(), seen: Vec::with_capacity(tile.gaussians.len()), facts: Vec::new() };
     // Cell 0 holds the pixels that count for no mask.
     let mut cells: Vec<[u32; LEVELS]> = vec![[NONE; LEVELS]];
-    let mut cell_of = [0u8; TILE * TILE];
-    for y in 0..tile.height as usize {
-        for x in 0..tile.width as usize {
-            let pixel = (tile.y0 as usize + y) * maps.width + tile.x0 as usize + x;
+    let mut cell_of = [0u16; TILE * TILE];
+    for y in 0..tile.height {
+        for x in 0..tile.width {
+            let pixel = (tile.y0 + y) * maps.width + tile.x0 + x;
             let masks: [u32; LEVELS] = std::array::from_fn(|level| match maps.ids[level * size + pixel] {
                 id if id >= 0 => row_of[level][id as usize],
                 _ => NONE,
@@ -132,24 +132,21 @@ fn tile_sums(tile: &TileWeights, maps: &MaskMaps, row_of: &[Vec<u32>; LEVELS], g
                     cells.push(masks);
                     cells.len() - 1
                 });
-                // At most 256 pixels, each in at most one cell beside cell 0; the last of 257 would be a tile without
-                // cell 0, where its place is free.
-                cell_of[at] = (cell % 256) as u8;
+                cell_of[at] = cell as u16;
             }
         }
     }
-    let mut sums = [0.0f32; 256];
+    let mut sums = vec![0.0f32; cells.len()];
     for (&gaussian, weights) in tile.gaussians.iter().zip(tile.weights.chunks_exact(TILE * TILE)) {
-        sums[..cells.len().min(256)].fill(0.0);
+        sums.fill(0.0);
         for (&w, &cell) in weights.iter().zip(&cell_of) {
             sums[cell as usize] += w;
         }
-        let total: f32 = sums[..cells.len().min(256)].iter().sum();
+        let total: f32 = sums.iter().sum();
         if total > 0.0 {
             out.seen.push((gaussian, total));
         }
-        for (cell, masks) in cells.iter().enumerate().skip(1) {
-            let sum = sums[cell % 256];
+        for (&sum, masks) in sums.iter().zip(&cells).skip(1) {
             if sum > 0.0 {
                 out.entries.extend(masks.iter().filter(|r| **r != NONE).map(|&row| (row, gaussian, sum)));
             }

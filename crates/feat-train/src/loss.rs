@@ -1,0 +1,169 @@
+//! Losses on the centroids of the masks of one view (paper, "Mask-Aware Contrastive Learning"), in f64: there are few
+//! masks.
+
+/// What a mask is pulled to and pushed from.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, clap::ValueEnum)]
+pub enum Loss {
+    /// As the paper prints it: the positive is the mask itself, a constant; only the other masks push.
+    Printed,
+    /// The same with the mask itself in the denominator too: bounded below.
+    #[value(name = "self")]
+    WithSelf,
+    /// The positive is the centroid of a random half of the mask's Gaussians, in numerator and denominator.
+    HalfMask,
+    /// Per Gaussian instead of per mask: each Gaussian against the centroids of all masks, its own masks being positive
+    /// in proportion to their weight.
+    Gaussian,
+}
+
+/// Centroids shorter than this have no direction and take no part.
+pub const SHORTEST: f64 = 1e-12;
+
+/// Loss, its gradients, and how far apart the centroids are.
+#[derive(Debug, Clone, Default, PartialEq)]
+pub struct Evaluated {
+    /// Mean over masks.
+    pub loss: f64,
+    /// Gradient of the centroids `[K][d]`.
+    pub centroids: Vec<f64>,
+    /// Gradient of the positives `[K][d]`; empty unless they are separate.
+    pub positives: Vec<f64>,
+    /// 1 - mean cosine of different masks.
+    pub separation: f64,
+}
+
+/// Unit vectors and lengths of `rows` `[K][d]`.
+pub fn directions(rows: &[f64], d: usize) -> (Vec<f64>, Vec<f64>) {
+    let mut unit = rows.to_vec();
+    let lengths = unit
+        .chunks_exact_mut(d)
+        .map(|row| {
+            let length = row.iter().map(|v| v * v).sum::<f64>().sqrt();
+            row.iter_mut().for_each(|v| *v = if length > SHORTEST { *v / length } else { 0.0 });
+            length
+        })
+        .collect();
+    (unit, lengths)
+}
+
+/// Scalar product.
+pub fn dot(a: &[f64], b: &[f64]) -> f64 {
+    a.iter().zip(b).map(|(a, b)| a * b).sum()
+}
+
+/// Adds to `gradient` that of a vector of this `unit` direction and `length`, given the gradient `g` of its direction.
+pub fn add_direction_gradient(gradient: &mut [f64], unit: &[f64], length: f64, g: &[f64]) {
+    if length > SHORTEST {
+        let along = dot(unit, g);
+        for ((o, &g), &u) in gradient.iter_mut().zip(g).zip(unit) {
+            *o += (g - along * u) / length;
+        }
+    }
+}
+
+/// log Σ exp without overflow: the maximum taken out. Turns `logits` into their softmax.
+pub fn log_sum_exp(logits: &mut [f64]) -> f64 {
+    let max = logits.iter().copied().fold(f64::NEG_INFINITY, f64::max);
+    let mut sum = 0.0;
+    for v in logits.iter_mut() {
+        *v = (*v - max).exp();
+        sum += *v;
+    }
+    logits.iter_mut().for_each(|v| *v /= sum);
+    max + sum.ln()
+}
+
+/// The loss per mask, averaged over the masks that take part. `positives` are needed for [`Loss::HalfMask`] and only
+/// there; [`Loss::Gaussian`] is none of masks: its loss is 0 here and only the separation is of interest.
+pub fn evaluate(loss: Loss, centroids: &[f64], positives: Option<&[f64]>, d: usize, tau: f64) -> Evaluated {
+    let masks = centroids.len() / d;
+    let (unit, length) = directions(centroids, d);
+    let (pos_unit, pos_length) = positives.map_or_else(Default::default, |p| directions(p, d));
+    let alive: Vec<usize> =
+        (0..masks).filter(|&k| length[k] > SHORTEST && (positives.is_none() || pos_length[k] > SHORTEST)).collect();
+    let mut out = Evaluated {
+        centroids: vec![0.0; centroids.len()],
+        positives: vec![0.0; pos_unit.len()],
+        ..Evaluated::default()
+    };
+    if alive.len() < 2 {
+        return out; // nothing to push from: an empty sum
+    }
+    let of = |rows: &[f64], k: usize| -> Vec<f64> { rows[k * d..(k + 1) * d].to_vec() };
+    let mut unit_gradient = vec![0.0; centroids.len()];
+    let mut pos_gradient = vec![0.0; pos_unit.len()];
+    let mut cosines = 0.0;
+    let share = 1.0 / alive.len() as f64;
+    for &k in &alive {
+        let u = of(&unit, k);
+        let others: Vec<usize> = alive.iter().copied().filter(|&j| j != k).collect();
+        let mut logits: Vec<f64> = others.iter().map(|&j| dot(&u, &unit[j * d..(j + 1) * d]) / tau).collect();
+        cosines += logits.iter().sum::<f64>() * tau;
+        let own = match loss {
+            Loss::Gaussian => continue,
+            Loss::Printed | Loss::WithSelf => 1.0 / tau,
+            Loss::HalfMask => dot(&u, &of(&pos_unit, k)) / tau,
+        };
+        if loss != Loss::Printed {
+            logits.push(own);
+        }
+        out.loss += share * (log_sum_exp(&mut logits) - own);
+        let softmax = logits;
+        let add = |gradient: &mut [f64], k: usize, scale: f64, v: &[f64]| {
+            gradient[k * d..(k + 1) * d].iter_mut().zip(v).for_each(|(g, v)| *g += scale * v);
+        };
+        for (&j, &p) in others.iter().zip(&softmax) {
+            let v = of(&unit, j);
+            add(&mut unit_gradient, k, share * p / tau, &v);
+            add(&mut unit_gradient, j, share * p / tau, &u);
+        }
+        if loss == Loss::HalfMask {
+            let scale = share * (softmax[others.len()] - 1.0) / tau;
+            let v = of(&pos_unit, k);
+            add(&mut unit_gradient, k, scale, &v);
+            add(&mut pos_gradient, k, scale, &u);
+        }
+    }
+    out.separation = 1.0 - cosines * share / (alive.len() - 1) as f64;
+    for k in alive {
+        let range = k * d..(k + 1) * d;
+        let (g, u) = (&unit_gradient[range.clone()], &unit[range.clone()]);
+        add_direction_gradient(&mut out.centroids[range.clone()], u, length[k], g);
+        if positives.is_some() {
+            let (g, u) = (&pos_gradient[range.clone()], &pos_unit[range.clone()]);
+            add_direction_gradient(&mut out.positives[range], u, pos_length[k], g);
+        }
+    }
+    out
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_printed_loss_is_the_formula() {
+        let c = [1.0, 0.0, 0.0, 2.0, 1.0, 1.0];
+        let e = evaluate(Loss::Printed, &c, None, 2, 0.1);
+        let r = 0.5f64.sqrt();
+        let l = |a: f64, b: f64| -10.0 + ((10.0 * a).exp() + (10.0 * b).exp()).ln();
+        let want = (l(0.0, r) + l(0.0, r) + l(r, r)) / 3.0;
+        assert!((e.loss - want).abs() < 1e-12, "{} {want}", e.loss);
+        assert!((e.separation - (1.0 - 2.0 * r / 3.0)).abs() < 1e-12);
+        assert!(evaluate(Loss::WithSelf, &c, None, 2, 0.1).loss >= 0.0);
+    }
+
+    #[test]
+    fn small_temperatures_do_not_overflow_and_empty_sums_and_zero_centroids_are_left_out() {
+        let c = [1.0, 0.0, 0.99, 0.01, 0.0, 1.0];
+        for loss in [Loss::Printed, Loss::WithSelf] {
+            let e = evaluate(loss, &c, None, 2, 1e-4);
+            assert!(e.loss.is_finite() && e.centroids.iter().all(|g| g.is_finite()), "{e:?}");
+        }
+        assert_eq!(evaluate(Loss::Printed, &[1.0, 0.0], None, 2, 0.1).loss, 0.0);
+        let with_zero = evaluate(Loss::Printed, &[1.0, 0.0, 0.0, 0.0, 0.0, 1.0], None, 2, 0.1);
+        let without = evaluate(Loss::Printed, &[1.0, 0.0, 0.0, 1.0], None, 2, 0.1);
+        assert_eq!(with_zero.loss, without.loss);
+        assert_eq!(with_zero.centroids[2..4], [0.0, 0.0]);
+    }
+}

@@ -1,0 +1,585 @@
+//! The model of the paper's stage 2: per-Gaussian features, the graph network that adds context, the loss on one view's
+//! masks, and their gradients. Written once for f32 and f64.
+
+use crate::loss::{self, Loss, SHORTEST, add_direction_gradient, directions, dot, log_sum_exp};
+use crate::network::{self, Activations, Layer};
+use crate::normalize::{Axis, Moments, channel_moments, row_moments};
+use crate::real::Real;
+use crate::scene::{Context, MaskSet, NONE, Neighbours};
+use rand::Rng;
+use rayon::prelude::*;
+
+/// Channels between layers (paper: "an intermediate channel size of 16").
+const HIDDEN: usize = 16;
+/// Channels of a colour.
+const COLOR: usize = 3;
+/// Anchors worked on at a time.
+const CHUNK: usize = 512;
+
+/// How features start.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, clap::ValueEnum)]
+pub enum Init {
+    /// Uniform in [0, 1), as OpenGaussian's.
+    Uniform,
+    /// Normal with deviation 0.01.
+    NormalSmall,
+}
+
+/// What shapes the model.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Settings {
+    /// Numbers per feature, d.
+    pub dim: usize,
+    /// Layers of the graph network, 0 to 4; 0 trains features alone.
+    pub layers: usize,
+    /// What is standardised together.
+    pub norm_axis: Axis,
+    /// The loss.
+    pub loss: Loss,
+    /// Temperature, more than 0.
+    pub tau: f64,
+    /// Weight of the cohesion term (pulls Gaussians to the centroids of their masks); the paper has none.
+    pub cohesion: f64,
+    /// How features start.
+    pub init: Init,
+}
+
+/// Parameters.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Model<T> {
+    /// What shapes it.
+    pub settings: Settings,
+    /// Features, `[n][d]`, in the training order.
+    pub features: Vec<T>,
+    /// The graph network.
+    pub layers: Vec<Layer<T>>,
+}
+
+/// What the graph network makes of the features.
+#[derive(Debug, Clone, Default)]
+pub struct Propagated<T> {
+    /// Standardised output of each anchor `[M][d]`; empty without layers.
+    pub hat: Vec<T>,
+    activations: Activations<T>,
+    /// Of each channel, or of each anchor.
+    moments: Vec<Moments>,
+}
+
+/// Loss and gradients of one view.
+#[derive(Debug, Clone, Default, PartialEq)]
+pub struct Step<T> {
+    /// The loss.
+    pub loss: f64,
+    /// 1 - mean cosine of the centroids of different masks.
+    pub separation: f64,
+    /// Gradient of the features of the view's columns `[v][d]`.
+    pub features: Vec<T>,
+    /// Gradient of each layer's weights.
+    pub layers: Vec<Vec<T>>,
+}
+
+impl<T: Real> Model<T> {
+    /// A model before training. `rng` draws features in the order of kept Gaussians, whatever the training order.
+    pub fn new(settings: Settings, context: &Context, rng: &mut impl Rng) -> Self {
+        let (n, d) = (context.order.len(), settings.dim);
+        let drawn: Vec<T> = (0..n * d)
+            .map(|_| {
+                T::of(match settings.init {
+                    Init::Uniform => rng.random_range(0.0..1.0),
+                    Init::NormalSmall => 0.01 * normal(rng),
+                })
+            })
+            .collect();
+        let features =
+            context.order.iter().flat_map(|&i| drawn[i as usize * d..(i as usize + 1) * d].to_vec()).collect();
+        let layers = network::random_layers(settings.layers, d + COLOR, HIDDEN, d, context.kind, rng);
+        Self { settings, features, layers }
+    }
+
+    /// Runs the graph network on the (detached) features.
+    pub fn propagate(&self, context: &Context) -> Propagated<T> {
+        if self.layers.is_empty() {
+            return Propagated::default();
+        }
+        let d = self.settings.dim;
+        let (h, sums) = self.inputs(context);
+        let activations = network::forward(&self.layers, context, h, sums);
+        let output = activations.features.last().expect("there are layers");
+        let moments: Vec<Moments> = match self.settings.norm_axis {
+            Axis::Channel => channel_moments(output, d, Some(&context.served)),
+            Axis::Gaussian => output
+                .chunks_exact(d)
+                .map(|row| row_moments(&row.iter().map(|v| v.get()).collect::<Vec<_>>()))
+                .collect(),
+        };
+        let hat = output.iter().enumerate().map(|(i, v)| T::of(self.moment(&moments, i).apply(v.get()))).collect();
+        Propagated { hat, activations, moments }
+    }
+
+    /// The moments that standardise entry `i` of an `[M][d]` array.
+    fn moment<'a>(&self, moments: &'a [Moments], i: usize) -> &'a Moments {
+        match self.settings.norm_axis {
+            Axis::Channel => &moments[i % self.settings.dim],
+            Axis::Gaussian => &moments[i / self.settings.dim],
+        }
+    }
+
+    /// Standardised inputs h of the anchors, and their sums over neighbours: `[M][d + 3]` each.
+    fn inputs(&self, context: &Context) -> (Vec<T>, Vec<T>) {
+        let d = self.settings.dim;
+        let channels = d + COLOR;
+        let moments: Vec<Moments> = match self.settings.norm_axis {
+            Axis::Channel => {
+                let colors: Vec<f32> = context.colors.iter().flatten().copied().collect();
+                let mut moments = channel_moments(&self.features, d, None);
+                moments.extend(channel_moments(&colors, COLOR, None));
+                moments
+            }
+            Axis::Gaussian => Vec::new(),
+        };
+        let add = |place: usize, row: &mut [f64]| {
+            let mut h = [0.0; 64 + COLOR];
+            let h = &mut h[..channels];
+            let f = &self.features[place * d..(place + 1) * d];
+            h.iter_mut().zip(f).for_each(|(h, f)| *h = f.get());
+            h[d..].iter_mut().zip(context.colors[place]).for_each(|(h, c)| *h = f64::from(c));
+            match self.settings.norm_axis {
+                Axis::Channel => row.iter_mut().zip(h).zip(&moments).for_each(|((r, h), m)| *r += m.apply(*h)),
+                Axis::Gaussian => {
+                    let m = row_moments(h);
+                    row.iter_mut().zip(h).for_each(|(r, h)| *r += m.apply(*h));
+                }
+            }
+        };
+        let anchors = context.anchors.len();
+        let gather = |places: &(dyn Fn(usize, &mut dyn FnMut(usize)) + Sync)| -> Vec<T> {
+            let mut out = vec![T::default(); anchors * channels];
+            out.par_chunks_mut(CHUNK * channels).enumerate().for_each(|(chunk, rows)| {
+                let mut sum = vec![0.0; channels];
+                for (i, row) in rows.chunks_exact_mut(channels).enumerate() {
+                    sum.fill(0.0);
+                    places(chunk * CHUNK + i, &mut |place| add(place, &mut sum));
+                    row.iter_mut().zip(&sum).for_each(|(r, &s)| *r = T::of(s));
+                }
+            });
+            out
+        };
+        let h = gather(&|a, visit| visit(context.anchors[a] as usize));
+        let sums = match context.kind {
+            Neighbours::Gaussians => {
+                gather(&|a, visit| context.neighbours_of(a).iter().for_each(|&p| visit(p as usize)))
+            }
+            Neighbours::Anchors => network::neighbour_sums(context, &h, channels),
+        };
+        (h, sums)
+    }
+
+    /// f_final of the Gaussian at `place`: its own feature and what it receives.
+    #[inline]
+    fn final_feature(&self, context: &Context, propagated: &Propagated<T>, place: usize, out: &mut [f64]) {
+        let d = out.len();
+        let own = &self.features[place * d..(place + 1) * d];
+        out.iter_mut().zip(own).for_each(|(o, f)| *o = f.get());
+        let source = context.source[place];
+        if source != NONE && !propagated.hat.is_empty() {
+            let hat = &propagated.hat[source as usize * d..(source as usize + 1) * d];
+            out.iter_mut().zip(hat).for_each(|(o, h)| *o += h.get());
+        }
+    }
+
+    /// f_final of all Gaussians `[n][d]`, in the order of `kept`.
+    pub fn final_features(&self, context: &Context, propagated: &Propagated<T>) -> Vec<f32> {
+        let d = self.settings.dim;
+        let mut out = vec![0.0f32; self.features.len()];
+        let mut row = vec![0.0; d];
+        for (place, &i) in context.order.iter().enumerate() {
+            self.final_feature(context, propagated, place, &mut row);
+            let to = &mut out[i as usize * d..(i as usize + 1) * d];
+            to.iter_mut().zip(&row).for_each(|(o, &v)| *o = v as f32);
+        }
+        out
+    }
+
+    /// Sums over pieces of columns, in order: `visit(column, feature, sums)` adds to `sums`.
+    fn sum_columns(
+        &self,
+        context: &Context,
+        propagated: &Propagated<T>,
+        set: &MaskSet<T>,
+        length: usize,
+        visit: impl Fn(usize, &[f64], &mut [f64]) + Sync,
+    ) -> Vec<f64> {
+        let parts: Vec<Vec<f64>> = set
+            .pieces
+            .par_windows(2)
+            .map(|bounds| {
+                let mut sums = vec![0.0; length];
+                let mut f = vec![0.0; self.settings.dim];
+                for c in bounds[0]..bounds[1] {
+                    self.final_feature(context, propagated, set.columns[c as usize] as usize, &mut f);
+                    visit(c as usize, &f, &mut sums);
+                }
+                sums
+            })
+            .collect();
+        let mut total = vec![0.0; length];
+        for part in parts {
+            total.iter_mut().zip(part).for_each(|(t, p)| *t += p);
+        }
+        total
+    }
+
+    /// Centroids A f of all masks `[K][d]`.
+    pub fn centroids(&self, context: &Context, propagated: &Propagated<T>, set: &MaskSet<T>) -> Vec<f64> {
+        let d = self.settings.dim;
+        self.sum_columns(context, propagated, set, set.len() * d, |c, f, sums| {
+            let (masks, weights) = set.entries(c);
+            for (&k, w) in masks.iter().zip(weights) {
+                let to = &mut sums[k as usize * d..(k as usize + 1) * d];
+                to.iter_mut().zip(f).for_each(|(s, f)| *s += w.get() * f);
+            }
+        })
+    }
+
+    /// Mean over masks of the weighted mean cosine between a mask's Gaussians and its centroid.
+    pub fn alignment(&self, context: &Context, propagated: &Propagated<T>, set: &MaskSet<T>) -> f64 {
+        let (d, masks) = (self.settings.dim, set.len());
+        let (unit, _) = directions(&self.centroids(context, propagated, set), d);
+        let sums = self.sum_columns(context, propagated, set, 2 * masks, |c, f, sums| {
+            let (u, _) = directions(f, d);
+            for (&k, w) in set.entries(c).0.iter().zip(set.entries(c).1) {
+                sums[k as usize] += w.get() * dot(&u, &unit[k as usize * d..(k as usize + 1) * d]);
+                sums[masks + k as usize] += w.get();
+            }
+        });
+        (0..masks).map(|k| sums[k] / sums[masks + k]).sum::<f64>() / masks.max(1) as f64
+    }
+
+    /// Loss and gradients on the masks of one view. `noise` seeds the halves of [`Loss::HalfMask`].
+    pub fn step(&self, context: &Context, propagated: &Propagated<T>, set: &MaskSet<T>, noise: u64) -> Step<T> {
+        let (d, s) = (self.settings.dim, &self.settings);
+        let centroids = self.centroids(context, propagated, set);
+        let half = |entry: usize| splitmix(noise ^ entry as u64) & 1 == 1;
+        let positives = (s.loss == Loss::HalfMask).then(|| {
+            self.sum_columns(context, propagated, set, set.len() * d, |c, f, sums| {
+                for e in set.start[c] as usize..set.start[c + 1] as usize {
+                    if half(e) {
+                        let (k, w) = (set.mask[e] as usize, set.weight[e].get());
+                        sums[k * d..(k + 1) * d].iter_mut().zip(f).for_each(|(s, f)| *s += w * f);
+                    }
+                }
+            })
+        });
+        let mut evaluated = loss::evaluate(s.loss, &centroids, positives.as_deref(), d, s.tau);
+        let columns = ColumnTerms::new(s, set, &centroids);
+        if columns.any() {
+            // The column terms move the centroids too: sum their gradients over columns first.
+            let sums = self.sum_columns(context, propagated, set, centroids.len() + 1, |c, f, sums| {
+                let (gradient, value) = sums.split_at_mut(centroids.len());
+                value[0] += columns.add(c, f, Some(gradient), None);
+            });
+            evaluated.loss += sums[centroids.len()];
+            evaluated.centroids.iter_mut().zip(&sums).for_each(|(g, s)| *g += s);
+        }
+        // Back to the columns, piece by piece; the Gaussians of an anchor lie in one piece.
+        let parts: Vec<(Vec<T>, Vec<(u32, Vec<f64>)>)> = set
+            .pieces
+            .par_windows(2)
+            .map(|bounds| {
+                let mut rows = Vec::with_capacity((bounds[1] - bounds[0]) as usize * d);
+                let mut to_anchors: Vec<(u32, Vec<f64>)> = Vec::new();
+                let (mut f, mut g) = (vec![0.0; d], vec![0.0; d]);
+                for c in bounds[0] as usize..bounds[1] as usize {
+                    g.fill(0.0);
+                    for e in set.start[c] as usize..set.start[c + 1] as usize {
+                        let (k, w) = (set.mask[e] as usize * d, set.weight[e].get());
+                        g.iter_mut().zip(&evaluated.centroids[k..k + d]).for_each(|(g, v)| *g += w * v);
+                        if positives.is_some() && half(e) {
+                            g.iter_mut().zip(&evaluated.positives[k..k + d]).for_each(|(g, v)| *g += w * v);
+                        }
+                    }
+                    let place = set.columns[c] as usize;
+                    if columns.any() {
+                        self.final_feature(context, propagated, place, &mut f);
+                        columns.add(c, &f, None, Some(&mut g));
+                    }
+                    rows.extend(g.iter().map(|&v| T::of(v)));
+                    let source = context.source[place];
+                    if source != NONE && !propagated.hat.is_empty() {
+                        match to_anchors.last_mut() {
+                            Some((a, sum)) if *a == source => sum.iter_mut().zip(&g).for_each(|(s, g)| *s += g),
+                            _ => to_anchors.push((source, g.clone())),
+                        }
+                    }
+                }
+                (rows, to_anchors)
+            })
+            .collect();
+        let mut step = Step {
+            loss: evaluated.loss,
+            separation: evaluated.separation,
+            features: Vec::with_capacity(set.columns.len() * d),
+            layers: Vec::new(),
+        };
+        let mut hat_gradient = vec![0.0f64; propagated.hat.len()];
+        for (rows, to_anchors) in parts {
+            step.features.extend(rows);
+            for (a, sum) in to_anchors {
+                hat_gradient[a as usize * d..(a as usize + 1) * d].copy_from_slice(&sum);
+            }
+        }
+        if !self.layers.is_empty() {
+            let gradient = self.unstandardised(context, propagated, &hat_gradient);
+            step.layers = network::backward(&self.layers, context, &propagated.activations, gradient);
+        }
+        step
+    }
+
+    /// Gradient of the network's output `[M][d]` from that of its standardised output.
+    fn unstandardised(&self, context: &Context, propagated: &Propagated<T>, g: &[f64]) -> Vec<T> {
+        let d = self.settings.dim;
+        let groups = propagated.moments.len();
+        let group = |i: usize| match self.settings.norm_axis {
+            Axis::Channel => i % d,
+            Axis::Gaussian => i / d,
+        };
+        let (mut sum_g, mut sum_gy) = (vec![0.0; groups], vec![0.0; groups]);
+        for (i, (&g, y)) in g.iter().zip(&propagated.hat).enumerate() {
+            sum_g[group(i)] += g;
+            sum_gy[group(i)] += g * y.get();
+        }
+        let weight = |i: usize| match self.settings.norm_axis {
+            Axis::Channel => f64::from(context.served[i / d]),
+            Axis::Gaussian => 1.0,
+        };
+        g.par_iter()
+            .zip(&propagated.hat)
+            .enumerate()
+            .with_min_len(CHUNK)
+            .map(|(i, (&g, y))| {
+                let c = group(i);
+                T::of(propagated.moments[c].backward(weight(i), g, y.get(), sum_g[c], sum_gy[c]))
+            })
+            .collect()
+    }
+}
+
+/// Terms of the loss that look at single Gaussians.
+struct ColumnTerms<'a, T> {
+    settings: &'a Settings,
+    set: &'a MaskSet<T>,
+    centroids: &'a [f64],
+    unit: Vec<f64>,
+    length: Vec<f64>,
+    /// Blending weight of all entries, in pixels.
+    total: f64,
+}
+
+impl<'a, T: Real> ColumnTerms<'a, T> {
+    fn new(settings: &'a Settings, set: &'a MaskSet<T>, centroids: &'a [f64]) -> Self {
+        let (unit, length) = directions(centroids, settings.dim);
+        let total = set.mask.iter().zip(&set.weight).map(|(&k, w)| w.get() * set.pixels[k as usize]).sum();
+        Self { settings, set, centroids, unit, length, total }
+    }
+
+    fn any(&self) -> bool {
+        self.settings.loss == Loss::Gaussian || self.settings.cohesion > 0.0
+    }
+
+    /// The terms of column `c` with feature `f`; adds their gradients of the centroids and of the feature where asked for.
+    fn add(&self, c: usize, f: &[f64], mut centroids: Option<&mut [f64]>, mut feature: Option<&mut [f64]>) -> f64 {
+        let d = f.len();
+        let (masks, weights) = self.set.entries(c);
+        let mut value = 0.0;
+        if self.settings.cohesion > 0.0 {
+            for (&k, w) in masks.iter().zip(weights) {
+                let range = k as usize * d..(k as usize + 1) * d;
+                let difference: Vec<f64> = f.iter().zip(&self.centroids[range.clone()]).map(|(f, c)| f - c).collect();
+                let distance = dot(&difference, &difference).sqrt();
+                let scale = self.settings.cohesion * w.get() / self.set.len() as f64;
+                value += scale * distance;
+                if distance > SHORTEST {
+                    let g = |v: &f64| scale * v / distance;
+                    if let Some(to) = centroids.as_deref_mut() {
+                        to[range].iter_mut().zip(&difference).for_each(|(t, v)| *t -= g(v));
+                    }
+                    if let Some(to) = feature.as_deref_mut() {
+                        to.iter_mut().zip(&difference).for_each(|(t, v)| *t += g(v));
+                    }
+                }
+            }
+        }
+        if self.settings.loss == Loss::Gaussian {
+            value += self.contrast(c, f, centroids, feature);
+        }
+        value
+    }
+
+    /// Cross-entropy of the Gaussian's softmax over all masks against its shares in them.
+    fn contrast(&self, c: usize, f: &[f64], centroids: Option<&mut [f64]>, feature: Option<&mut [f64]>) -> f64 {
+        let (d, tau) = (f.len(), self.settings.tau);
+        let (u, f_length) = directions(f, d);
+        let alive: Vec<usize> = (0..self.set.len()).filter(|&k| self.length[k] > SHORTEST).collect();
+        if f_length[0] <= SHORTEST || alive.len() < 2 {
+            return 0.0;
+        }
+        let (masks, weights) = self.set.entries(c);
+        let mut share = vec![0.0; self.set.len()];
+        for (&k, w) in masks.iter().zip(weights).filter(|(k, _)| self.length[**k as usize] > SHORTEST) {
+            share[k as usize] += w.get() * self.set.pixels[k as usize] / self.total;
+        }
+        let mine: f64 = share.iter().sum();
+        let mut softmax: Vec<f64> = alive.iter().map(|&k| dot(&u, &self.unit[k * d..(k + 1) * d]) / tau).collect();
+        let positive: f64 = alive.iter().zip(&softmax).map(|(&k, l)| share[k] * l).sum();
+        let value = mine * log_sum_exp(&mut softmax) - positive;
+        // Gradient of each cosine.
+        let g: Vec<f64> = alive.iter().zip(&softmax).map(|(&k, p)| (mine * p - share[k]) / tau).collect();
+        if let Some(to) = centroids {
+            for (&k, g) in alive.iter().zip(&g) {
+                let scaled: Vec<f64> = u.iter().map(|u| g * u).collect();
+                let range = k * d..(k + 1) * d;
+                add_direction_gradient(&mut to[range.clone()], &self.unit[range], self.length[k], &scaled);
+            }
+        }
+        if let Some(to) = feature {
+            let mut sum = vec![0.0; d];
+            for (&k, g) in alive.iter().zip(&g) {
+                sum.iter_mut().zip(&self.unit[k * d..(k + 1) * d]).for_each(|(s, u)| *s += g * u);
+            }
+            add_direction_gradient(to, &u, f_length[0], &sum);
+        }
+        value
+    }
+}
+
+/// A well-mixed number from a counter (splitmix64).
+pub fn splitmix(counter: u64) -> u64 {
+    let mut z = counter.wrapping_add(0x9E37_79B9_7F4A_7C15);
+    z = (z ^ (z >> 30)).wrapping_mul(0xBF58_476D_1CE4_E5B9);
+    z = (z ^ (z >> 27)).wrapping_mul(0x94D0_49BB_1331_11EB);
+    z ^ (z >> 31)
+}
+
+/// A standard normal number (Box-Muller).
+pub fn normal(rng: &mut impl Rng) -> f64 {
+    let (a, b): (f64, f64) = (1.0 - rng.random_range(0.0..1.0), rng.random_range(0.0..1.0));
+    (-2.0 * a.ln()).sqrt() * (std::f64::consts::TAU * b).cos()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::testing::{context, mask_set};
+    use rand::SeedableRng;
+    use rand_chacha::ChaCha8Rng;
+
+    fn settings() -> Settings {
+        Settings {
+            dim: 4,
+            layers: 2,
+            norm_axis: Axis::Channel,
+            loss: Loss::Printed,
+            tau: 0.1,
+            cohesion: 0.0,
+            init: Init::Uniform,
+        }
+    }
+
+    /// Compares every gradient with central differences.
+    fn check(settings: Settings, kind: Neighbours, propagate: bool) {
+        let name = format!("{settings:?} {kind:?} {propagate}");
+        let context = context(50, kind, propagate);
+        let set = mask_set::<f64>(&context, 5, 3);
+        let mut rng = ChaCha8Rng::seed_from_u64(1);
+        let mut model = Model::<f64>::new(settings, &context, &mut rng);
+        let propagated = model.propagate(&context);
+        let step = model.step(&context, &propagated, &set, 77);
+        let close = |analytic: f64, plus: f64, minus: f64, h: f64, what: &str| {
+            let numeric = (plus - minus) / (2.0 * h);
+            assert!(
+                (analytic - numeric).abs() <= 1e-6 * (1.0 + analytic.abs().max(numeric.abs())),
+                "{name}: {what}: {analytic} {numeric}"
+            );
+        };
+        let (d, h) = (model.settings.dim, 1e-6);
+        // Inputs of the network are detached: what anchors give stays as it is.
+        for (c, &place) in set.columns.iter().enumerate() {
+            for j in 0..d {
+                let at = place as usize * d + j;
+                let was = model.features[at];
+                let mut loss = |v: f64| {
+                    model.features[at] = v;
+                    model.step(&context, &propagated, &set, 77).loss
+                };
+                let (plus, minus) = (loss(was + h), loss(was - h));
+                model.features[at] = was;
+                close(step.features[c * d + j], plus, minus, h, "feature");
+            }
+        }
+        assert!(step.features.iter().any(|g| g.abs() > 1e-4), "{name}: all gradients vanish");
+        for l in 0..model.layers.len() {
+            for i in 0..model.layers[l].weights.len() {
+                let was = model.layers[l].weights[i];
+                let mut loss = |v: f64| {
+                    model.layers[l].weights[i] = v;
+                    let p = model.propagate(&context);
+                    model.step(&context, &p, &set, 77).loss
+                };
+                let (plus, minus) = (loss(was + h), loss(was - h));
+                model.layers[l].weights[i] = was;
+                close(step.layers[l][i], plus, minus, h, "weight");
+            }
+        }
+        let moved = step.layers.iter().flatten().any(|g| g.abs() > 1e-5);
+        assert_eq!(moved, model.settings.layers > 0, "{name}: gradients of weights");
+    }
+
+    #[test]
+    fn gradients_are_those_of_finite_differences() {
+        use Neighbours::{Anchors, Gaussians};
+        for layers in 0..=4 {
+            check(Settings { layers, ..settings() }, Gaussians, true);
+        }
+        for layers in [1, 3] {
+            check(Settings { layers, ..settings() }, Anchors, true);
+        }
+        check(settings(), Gaussians, false);
+        for loss in [Loss::WithSelf, Loss::HalfMask, Loss::Gaussian] {
+            for norm_axis in [Axis::Channel, Axis::Gaussian] {
+                check(Settings { loss, norm_axis, ..settings() }, Anchors, true);
+            }
+        }
+        check(Settings { cohesion: 0.3, tau: 0.5, init: Init::NormalSmall, ..settings() }, Gaussians, true);
+    }
+
+    #[test]
+    fn threads_do_not_change_a_bit() {
+        let context = context(20_000, Neighbours::Anchors, true);
+        let set = mask_set::<f32>(&context, 30, 3);
+        assert!(set.pieces.len() > 4);
+        let with = |threads| {
+            let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
+            pool.install(|| {
+                let model = Model::<f32>::new(settings(), &context, &mut ChaCha8Rng::seed_from_u64(1));
+                let propagated = model.propagate(&context);
+                (
+                    model.step(&context, &propagated, &set, 7),
+                    propagated.hat,
+                    model.alignment(&context, &Propagated::default(), &set),
+                )
+            })
+        };
+        assert!(with(1) == with(3));
+    }
+
+    #[test]
+    fn a_scene_of_one_color_has_no_noise() {
+        let mut context = context(64, Neighbours::Gaussians, true);
+        context.colors.fill([0.1, 0.7, 0.3]);
+        let mut model = Model::<f32>::new(settings(), &context, &mut ChaCha8Rng::seed_from_u64(1));
+        model.features.fill(0.1);
+        let (h, sums) = model.inputs(&context);
+        assert!(h.iter().chain(&sums).all(|v| *v == 0.0));
+        assert!(model.propagate(&context).hat.iter().all(|v| *v == 0.0));
+    }
+}

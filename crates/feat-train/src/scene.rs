@@ -1,0 +1,243 @@
+//! What training reads of a scene: the frozen context graph, and the footprints of the masks of each view.
+//!
+//! Gaussians are put in the order of their nearest anchor, so that everything an anchor serves lies together: sums over
+//! an anchor's Gaussians are sums over a range, and no two threads ever add to the same place.
+
+use crate::real::Real;
+use artifacts::{Footprints, Graph, Level};
+
+/// No anchor.
+pub const NONE: u32 = u32::MAX;
+/// Columns in a piece of work, about.
+const PIECE: usize = 2048;
+
+/// Which neighbours an anchor aggregates.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, clap::ValueEnum)]
+pub enum Neighbours {
+    /// Its nearest Gaussians, whose inputs do not change from layer to layer (the paper's formula).
+    Gaussians,
+    /// Its nearest anchors, with their features of the layer before (the paper's text: "distance between anchors").
+    Anchors,
+}
+
+/// The frozen graph, with Gaussians in the order of training.
+#[derive(Debug, Clone)]
+pub struct Context {
+    /// Position in `kept` of the Gaussian at each place of the training order; n.
+    pub order: Vec<u32>,
+    /// Colour of each Gaussian, training order; n.
+    pub colors: Vec<[f32; 3]>,
+    /// Place of each anchor's Gaussian in the training order; M.
+    pub anchors: Vec<u32>,
+    /// The anchor whose output each Gaussian receives, or [`NONE`]; n, ascending where every Gaussian has one.
+    pub source: Vec<u32>,
+    /// How many Gaussians receive each anchor's output; M.
+    pub served: Vec<u32>,
+    /// Where the neighbours of each anchor begin in `neighbours`; M + 1. Padding is left out.
+    pub neighbour_start: Vec<u32>,
+    /// Places in the training order, or anchors, as asked for.
+    pub neighbours: Vec<u32>,
+    /// Of which kind they are.
+    pub kind: Neighbours,
+    /// The graph of anchors backwards, for gradients: where the anchors begin that have anchor a as a neighbour.
+    pub reverse_start: Vec<u32>,
+    /// Those anchors.
+    pub reverse: Vec<u32>,
+}
+
+impl Context {
+    /// Prepares the graph; `colors` are those of the kept Gaussians. Without `propagate` an anchor's output goes to the
+    /// anchor's own Gaussian alone.
+    pub fn new(graph: &Graph, colors: &[[f32; 3]], kind: Neighbours, propagate: bool) -> Self {
+        let (n, m, k) = (graph.kept.len(), graph.anchors.len(), graph.k);
+        let mut order: Vec<u32> = (0..n as u32).collect();
+        order.sort_by_key(|&i| graph.nearest_anchor[i as usize]);
+        let mut place = vec![0u32; n];
+        for (p, &i) in order.iter().enumerate() {
+            place[i as usize] = p as u32;
+        }
+        let anchors: Vec<u32> = graph.anchors.iter().map(|&a| place[a as usize]).collect();
+        let mut source = vec![NONE; n];
+        if propagate {
+            for (s, &i) in source.iter_mut().zip(&order) {
+                *s = graph.nearest_anchor[i as usize];
+            }
+        } else {
+            for (a, &p) in anchors.iter().enumerate() {
+                source[p as usize] = a as u32;
+            }
+        }
+        let mut served = vec![0u32; m];
+        for &s in source.iter().filter(|s| **s != NONE) {
+            served[s as usize] += 1;
+        }
+        let (mut neighbour_start, mut neighbours) = (vec![0u32], Vec::with_capacity(m * k));
+        for a in 0..m {
+            let row = a * k..(a + 1) * k;
+            match kind {
+                // Rows are padded with the anchor itself, which is not its own neighbour.
+                Neighbours::Gaussians => neighbours
+                    .extend(graph.knn[row].iter().filter(|&&i| i != graph.anchors[a]).map(|&i| place[i as usize])),
+                Neighbours::Anchors => {
+                    neighbours.extend(graph.anchor_knn[row].iter().copied().filter(|&b| b as usize != a));
+                }
+            }
+            neighbour_start.push(neighbours.len() as u32);
+        }
+        let (reverse_start, reverse) = match kind {
+            Neighbours::Anchors => transpose(&neighbour_start, &neighbours, m),
+            Neighbours::Gaussians => (vec![0; m + 1], Vec::new()),
+        };
+        let colors = order.iter().map(|&i| colors[i as usize]).collect();
+        Self { order, colors, anchors, source, served, neighbour_start, neighbours, kind, reverse_start, reverse }
+    }
+
+    /// Neighbours of anchor `a`.
+    #[inline]
+    pub fn neighbours_of(&self, a: usize) -> &[u32] {
+        &self.neighbours[self.neighbour_start[a] as usize..self.neighbour_start[a + 1] as usize]
+    }
+
+    /// Anchors that have anchor `a` as a neighbour.
+    #[inline]
+    pub fn reverse_of(&self, a: usize) -> &[u32] {
+        &self.reverse[self.reverse_start[a] as usize..self.reverse_start[a + 1] as usize]
+    }
+}
+
+/// Adjacency lists the other way round; sources ascend.
+fn transpose(start: &[u32], targets: &[u32], m: usize) -> (Vec<u32>, Vec<u32>) {
+    let mut out_start = vec![0u32; m + 1];
+    for &t in targets {
+        out_start[t as usize + 1] += 1;
+    }
+    for i in 0..m {
+        out_start[i + 1] += out_start[i];
+    }
+    let mut next = out_start.clone();
+    let mut out = vec![0u32; targets.len()];
+    for a in 0..m {
+        for &t in &targets[start[a] as usize..start[a + 1] as usize] {
+            out[next[t as usize] as usize] = a as u32;
+            next[t as usize] += 1;
+        }
+    }
+    (out_start, out)
+}
+
+/// The masks of one view at one level: the matrix A of docs/method.md, by columns (Gaussians).
+#[derive(Debug, Clone, Default)]
+pub struct MaskSet<T> {
+    /// Rows of the footprints artifact; K.
+    pub rows: Vec<u32>,
+    /// Gated pixels of each mask; K.
+    pub pixels: Vec<f64>,
+    /// Places in the training order, ascending; v.
+    pub columns: Vec<u32>,
+    /// Where the entries of each column begin; v + 1.
+    pub start: Vec<u32>,
+    /// Mask of each entry, below K, ascending within a column.
+    pub mask: Vec<u32>,
+    /// A[mask, column]: summed blending weight over gated pixels.
+    pub weight: Vec<T>,
+    /// Bounds of the pieces in which columns are worked on; the Gaussians of an anchor are never parted.
+    pub pieces: Vec<u32>,
+}
+
+impl<T: Real> MaskSet<T> {
+    /// Entries of the column at position `c`: masks and weights.
+    #[inline]
+    pub fn entries(&self, c: usize) -> (&[u32], &[T]) {
+        let range = self.start[c] as usize..self.start[c + 1] as usize;
+        (&self.mask[range.clone()], &self.weight[range])
+    }
+
+    /// Number of masks.
+    pub fn len(&self) -> usize {
+        self.rows.len()
+    }
+
+    /// Whether there is no mask.
+    pub fn is_empty(&self) -> bool {
+        self.rows.is_empty()
+    }
+}
+
+/// The mask sets of all views at the given levels, those with at least `least` masks that have a footprint.
+pub fn mask_sets<T: Real>(
+    footprints: &Footprints,
+    context: &Context,
+    levels: &[Level],
+    least: usize,
+) -> Vec<MaskSet<T>> {
+    let mut place = vec![0u32; context.order.len()];
+    for (p, &i) in context.order.iter().enumerate() {
+        place[i as usize] = p as u32;
+    }
+    let mut sets = Vec::new();
+    let mut from = 0;
+    while from < footprints.rows.len() {
+        let first = footprints.rows[from];
+        let same = |r: &artifacts::Row| (r.view, r.level) == (first.view, first.level);
+        let to = from + footprints.rows[from..].iter().take_while(|r| same(r)).count();
+        let rows: Vec<u32> = (from..to)
+            .filter(|&r| footprints.rows[r].gated > 0 && !footprints.entries(r).0.is_empty())
+            .map(|r| r as u32)
+            .collect();
+        if levels.iter().any(|&l| l as u32 == first.level) && rows.len() >= least {
+            sets.push(mask_set(footprints, &rows, &place, &context.source_group()));
+        }
+        from = to;
+    }
+    sets
+}
+
+impl Context {
+    /// Whether the Gaussian at a place begins another anchor's run.
+    fn source_group(&self) -> impl Fn(u32, u32) -> bool + '_ {
+        |a, b| self.source[a as usize] != self.source[b as usize] || self.source[a as usize] == NONE
+    }
+}
+
+fn mask_set<T: Real>(
+    footprints: &Footprints,
+    rows: &[u32],
+    place: &[u32],
+    parted: &impl Fn(u32, u32) -> bool,
+) -> MaskSet<T> {
+    let mut triples: Vec<(u32, u32, f32)> = Vec::new();
+    for (k, &r) in rows.iter().enumerate() {
+        let (col, weight) = footprints.entries(r as usize);
+        let gated = footprints.rows[r as usize].gated as f32;
+        triples.extend(col.iter().zip(weight).map(|(&c, &w)| (place[c as usize], k as u32, w / gated)));
+    }
+    triples.sort_by_key(|t| (t.0, t.1));
+    let mut set = MaskSet {
+        rows: rows.to_vec(),
+        pixels: rows.iter().map(|&r| f64::from(footprints.rows[r as usize].gated)).collect(),
+        mask: triples.iter().map(|t| t.1).collect(),
+        weight: triples.iter().map(|t| T::of(f64::from(t.2))).collect(),
+        ..MaskSet::default()
+    };
+    for (e, t) in triples.iter().enumerate() {
+        if set.columns.last() != Some(&t.0) {
+            set.columns.push(t.0);
+            set.start.push(e as u32);
+        }
+    }
+    set.start.push(triples.len() as u32);
+    set.pieces = pieces(&set.columns, parted);
+    set
+}
+
+/// Cuts columns into pieces of about [`PIECE`], only where `parted(before, after)` allows.
+pub fn pieces(columns: &[u32], parted: &impl Fn(u32, u32) -> bool) -> Vec<u32> {
+    let mut cuts = vec![0u32];
+    for c in 1..columns.len() {
+        if c - *cuts.last().expect("begins with 0") as usize >= PIECE && parted(columns[c - 1], columns[c]) {
+            cuts.push(c as u32);
+        }
+    }
+    cuts.push(columns.len() as u32);
+    cuts
+}

@@ -1,0 +1,75 @@
+//! A small random scene in memory.
+
+use crate::real::Real;
+use crate::scene::{Context, MaskSet, Neighbours, pieces};
+use artifacts::Graph;
+use rand::{Rng, SeedableRng};
+use rand_chacha::ChaCha8Rng;
+
+/// A graph of `n` Gaussians on a line, every fourth an anchor.
+pub fn graph(n: usize, k: usize) -> Graph {
+    let anchors: Vec<u32> = (0..n as u32).step_by(4).collect();
+    let m = anchors.len();
+    let near = |i: usize, of: &[u32], pad: u32, skip: usize| -> Vec<u32> {
+        let mut all: Vec<u32> = (0..of.len() as u32).filter(|&j| j as usize != skip).collect();
+        all.sort_by_key(|&j| ((of[j as usize] as i64 - i as i64).abs(), j));
+        all.resize(all.len().max(k), pad);
+        all.truncate(k);
+        all
+    };
+    let everyone: Vec<u32> = (0..n as u32).collect();
+    Graph {
+        kept: everyone.clone(),
+        knn: anchors.iter().flat_map(|&a| near(a as usize, &everyone, a, a as usize)).collect(),
+        anchor_knn: (0..m).flat_map(|a| near(anchors[a] as usize, &anchors, a as u32, a)).collect(),
+        nearest_anchor: (0..n).map(|i| (((i + 1) / 4) as u32).min(m as u32 - 1)).collect(),
+        gaussian_knn: (0..n).flat_map(|i| near(i, &everyone, i as u32, i)).collect(),
+        k,
+        gaussian_k: k,
+        seen_views: vec![1; n],
+        seen_weight: vec![1.0; n],
+        anchors,
+    }
+}
+
+/// Random colours.
+pub fn colors(n: usize) -> Vec<[f32; 3]> {
+    let mut rng = ChaCha8Rng::seed_from_u64(9);
+    (0..n).map(|_| std::array::from_fn(|_| rng.random_range(0.0..1.0))).collect()
+}
+
+/// The context of [`graph`].
+pub fn context(n: usize, kind: Neighbours, propagate: bool) -> Context {
+    Context::new(&graph(n, 3), &colors(n), kind, propagate)
+}
+
+/// `masks` masks over most of the Gaussians, some of which lie in two.
+pub fn mask_set<T: Real>(context: &Context, masks: usize, seed: u64) -> MaskSet<T> {
+    let mut rng = ChaCha8Rng::seed_from_u64(seed);
+    let n = context.order.len();
+    let mut set = MaskSet {
+        rows: (0..masks as u32).collect(),
+        pixels: (0..masks).map(|k| 10.0 + k as f64).collect(),
+        start: vec![0],
+        ..MaskSet::default()
+    };
+    for place in 0..n as u32 {
+        if rng.random_range(0.0..1.0) < 0.2 {
+            continue;
+        }
+        let first = rng.random_range(0..masks as u32);
+        let second = rng.random_range(0..masks as u32);
+        let mut mine = vec![first];
+        if second > first {
+            mine.push(second);
+        }
+        set.columns.push(place);
+        for k in mine {
+            set.mask.push(k);
+            set.weight.push(T::of(rng.random_range(0.01..0.1)));
+        }
+        set.start.push(set.mask.len() as u32);
+    }
+    set.pieces = pieces(&set.columns, &|a, b| context.source[a as usize] != context.source[b as usize]);
+    set
+}

@@ -1,0 +1,7 @@
+//! The `graph-precompute` program.
+
+use std::process::ExitCode;
+
+fn main() -> ExitCode {
+    stage::main::<graph_precompute::cli::Args>()
+}

@@ -1,0 +1,208 @@
+//! The whole stage: footprints of all views, then the graph over the Gaussians that were seen.
+
+use crate::footprint::view_footprints;
+use crate::graph::{GraphOptions, anchor_graph};
+use crate::positions::shifted;
+use artifacts::{FootprintsBuilder, Graph, MaskMaps, maps_path};
+use gs_io::{Error, Result};
+use gs_scene::dataset::View;
+use gs_scene::{Camera, Gaussians};
+use stage::Stage;
+use std::path::Path;
+
+/// Pixels of the images on which mask sizes are usually stated (LERF's 986 x 728).
+const REFERENCE_PIXELS: f64 = 986.0 * 728.0;
+
+/// How the stage works.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Options {
+    /// Anchors and neighbours.
+    pub graph: GraphOptions,
+    /// Accumulated alpha above which a pixel counts.
+    pub gate: f32,
+    /// Smallest mask, in pixels of an image of 986 x 728; scaled by the area of the id map.
+    pub min_mask_pixels: f64,
+    /// Entries whose share of their mask's gated pixels is below this are dropped; 0 keeps all.
+    pub cut: f64,
+    /// Keep Gaussians that no view sees.
+    pub keep_unseen: bool,
+}
+
+impl Default for Options {
+    fn default() -> Self {
+        Self { graph: GraphOptions::default(), gate: 0.7, min_mask_pixels: 50.0, cut: 0.0, keep_unseen: false }
+    }
+}
+
+/// Figures of the result.
+#[derive(Debug, Clone, Default, PartialEq, serde::Serialize)]
+pub struct Summary {
+    /// Gaussians of the geometry.
+    pub gaussians: usize,
+    /// Of these, Gaussians that take part.
+    pub kept: usize,
+    /// Anchors.
+    pub anchors: usize,
+    /// Views with masks.
+    pub views: usize,
+    /// Masks that own enough pixels, over all views and levels.
+    pub masks: usize,
+    /// Masks left out for being too small.
+    pub small_masks: usize,
+    /// Entries of the footprints.
+    pub entries: usize,
+    /// Largest share of a mask's weight that the cut dropped: a centroid moves by at most this times the largest feature.
+    pub largest_cut: f64,
+}
+
+/// The camera for an id map of `width` x `height`; the map may be smaller than the photograph but not of another shape.
+///
+/// # Errors
+/// When the aspect ratios differ by more than 2 % and two pixels.
+fn camera_for(view: &View, maps: &MaskMaps, file: &Path) -> Result<Camera> {
+    let c = &view.camera;
+    let (w, h) = (maps.width as f64, maps.height as f64);
+    let expected = w * f64::from(c.height) / f64::from(c.width);
+    if (expected - h).abs() > (0.02 * h).max(2.0) {
+        return Err(Error::new("the id map has another shape than the photograph")
+            .file(file)
+            .field("shape")
+            .found(format!("{w}x{h}"))
+            .expected(format!("{}x{}, or that scaled", c.width, c.height))
+            .hint("make the masks from the photographs of this scene"));
+    }
+    Ok(c.resized(maps.width as u32, maps.height as u32))
+}
+
+/// Computes footprints and graph of `gaussians` from the `views` that have id maps in the folder `masks`.
+///
+/// # Errors
+/// When an id map is damaged or of another shape, no view has masks, or no Gaussian is left.
+pub fn precompute(
+    gaussians: &Gaussians,
+    views: &[&View],
+    masks: &Path,
+    options: &Options,
+    stage: &Stage,
+) -> Result<(FootprintsBuilder, Graph, Summary)> {
+    let n = gaussians.len();
+    let with_masks: Vec<&View> = views.iter().copied().filter(|v| maps_path(masks, v.stem()).is_file()).collect();
+    if with_masks.is_empty() {
+        return Err(Error::new("no view has an id map")
+            .file(masks)
+            .found("no matching file")
+            .expected(format!(
+                "{}_s.npy and so on, for {} views",
+                views.first().map_or("frame", |v| v.stem()),
+                views.len()
+            ))
+            .hint("run mask-embed, or give the folder with the *_s.npy files of this scene"));
+    }
+    if with_masks.len() < views.len() {
+        stage.skipped(&format!("{} of {} views: no id map", views.len() - with_masks.len(), views.len()));
+    }
+    let usable = shifted(&gaussians.means).usable;
+    if usable.len() < n {
+        stage.warn(&format!("{} of {n} Gaussians have no usable position and are left out", n - usable.len()));
+    }
+    let mut out = FootprintsBuilder { row_ptr: vec![0], ..FootprintsBuilder::default() };
+    let mut summary = Summary { gaussians: n, views: with_masks.len(), ..Summary::default() };
+    let mut seen_views = vec![0u32; n];
+    let mut seen_weight = vec![0f64; n];
+    let mut progress = stage.progress("views", with_masks.len() as u64);
+    for (index, view) in with_masks.iter().enumerate() {
+        if stage.interrupted() {
+            return Err(Error::new("interrupted"));
+        }
+        let file = maps_path(masks, view.stem());
+        let maps = MaskMaps::read(&file)?;
+        let camera = camera_for(view, &maps, &file)?;
+        let scale = (maps.width * maps.height) as f64 / REFERENCE_PIXELS;
+        let min_pixels = (options.min_mask_pixels * scale.min(1.0)).ceil() as usize;
+        let footprints = view_footprints(gaussians, &camera, &maps, options.gate, min_pixels);
+        summary.small_masks += footprints.small_masks;
+        for (gaussian, weight) in footprints.seen {
+            seen_views[gaussian as usize] += 1;
+            seen_weight[gaussian as usize] += weight;
+        }
+        for (mut row, entries) in footprints.rows.into_iter().zip(footprints.entries) {
+            let least = (options.cut * f64::from(row.gated)) as f32;
+            let mut dropped = 0.0;
+            for (gaussian, weight) in entries {
+                if weight < least {
+                    dropped += f64::from(weight);
+                } else {
+                    out.col.push(gaussian);
+                    out.weight.push(weight);
+                }
+            }
+            summary.largest_cut = summary.largest_cut.max(dropped / f64::from(row.gated.max(1)));
+            row.view = index as u32;
+            out.rows.push(row);
+            out.row_ptr.push(out.col.len() as u64);
+        }
+        out.views.push(view.stem().to_string());
+        progress.step();
+    }
+    if out.rows.is_empty() {
+        return Err(Error::new("no view has a mask of enough pixels")
+            .file(masks)
+            .found(format!("{} masks, all too small", summary.small_masks))
+            .expected(format!("at least {} pixels in an image of 986 x 728", options.min_mask_pixels))
+            .hint("lower --min-mask-pixels, or check the id maps"));
+    }
+    let kept: Vec<u32> = usable.into_iter().filter(|&i| options.keep_unseen || seen_weight[i as usize] > 0.0).collect();
+    progress.finish(&[("masks", out.rows.len() as f64), ("entries", out.col.len() as f64)]);
+    if kept.is_empty() {
+        return Err(Error::new("no Gaussian is seen by any view with masks")
+            .field("geometry")
+            .found(format!("{n} Gaussians, {} views", with_masks.len()))
+            .hint("geometry and dataset must be of the same scene, in the same coordinates"));
+    }
+    if kept.len() < n && !options.keep_unseen {
+        stage.skipped(&format!("{} of {n} Gaussians: never seen", n - kept.len()));
+    }
+    renumber(&mut out.col, &kept, n);
+    let graph = graph_of(gaussians, &kept, seen_views, &seen_weight, options);
+    summary.kept = kept.len();
+    summary.anchors = graph.anchors.len();
+    summary.masks = out.rows.len();
+    summary.entries = out.col.len();
+    out.kept = kept;
+    Ok((out, graph, summary))
+}
+
+/// Original indices to positions in `kept`. Every Gaussian with a footprint was seen, so it is kept.
+fn renumber(col: &mut [u32], kept: &[u32], n: usize) {
+    let mut position = vec![u32::MAX; n];
+    for (p, &i) in kept.iter().enumerate() {
+        position[i as usize] = p as u32;
+    }
+    for c in col {
+        *c = position[*c as usize];
+    }
+}
+
+fn graph_of(
+    gaussians: &Gaussians,
+    kept: &[u32],
+    seen_views: Vec<u32>,
+    seen_weight: &[f64],
+    options: &Options,
+) -> Graph {
+    let means: Vec<[f32; 3]> = kept.iter().map(|&i| gaussians.means[i as usize]).collect();
+    let points = shifted(&means).points;
+    let g = anchor_graph(&points, &options.graph);
+    Graph {
+        kept: kept.to_vec(),
+        anchors: g.anchors,
+        k: options.graph.k,
+        knn: g.knn,
+        anchor_knn: g.anchor_knn,
+        nearest_anchor: g.nearest_anchor,
+        gaussian_k: options.graph.gaussian_k,
+        gaussian_knn: g.gaussian_knn,
+        seen_views,
+        seen_weight: seen_weight.iter().map(|&w| w as f32).collect(),
+    }
+}
