@@ -45,7 +45,7 @@ impl Picture {
                 blend(c, color, 0.125)
             } else {
                 let grey = 0.299 * c[0] + 0.587 * c[1] + 0.114 * c[2];
-                blend(c, [grey; 3], 0.6).map(|v| 0.15 + 0.45 * v)
+                blend(c, [grey; 3], 0.6).map(|v| 0.12 + 0.55 * v)
             }
         });
         Self { pixels: pixels.collect(), ..*self }
@@ -131,7 +131,7 @@ mod tests {
         let h = picture().highlighted(&mask, [1.0, 0.0, 0.0]);
         assert_eq!(h.pixels[2 * 8 + 3], [0.5625, 0.4375, 0.4375]);
         assert_eq!(h.pixels[2 * 8 + 4], [1.0, 0.0, 0.0]);
-        assert!((h.pixels[0][0] - 0.375).abs() < 1e-6);
+        assert!((h.pixels[0][0] - 0.395).abs() < 1e-6);
     }
 
     #[test]
