@@ -177,3 +177,75 @@ fn add_up(rows: usize, triples: impl Iterator<Item = (u32, u32, f32)>) -> Vec<Ve
         })
         .collect()
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::testing::{camera, cloud};
+    use artifacts::Level;
+
+    const W: usize = 70;
+    const H: usize = 45;
+
+    /// Stripes at one level, blocks at another, a mask of three pixels, and pixels without a mask.
+    fn maps() -> MaskMaps {
+        let mut ids = vec![-1; LEVELS * W * H];
+        for y in 0..H {
+            for x in 0..W {
+                let at = |level: Level| level as usize * W * H + y * W + x;
+                ids[at(Level::Default)] = if x < 60 { (x / 13) as i32 } else { -1 };
+                ids[at(Level::Large)] = 10 + (y / 20) as i32 * 2 + (x / 50) as i32;
+                if y == 30 && x < 3 {
+                    ids[at(Level::Small)] = 9;
+                }
+            }
+        }
+        MaskMaps { width: W, height: H, ids }
+    }
+
+    #[test]
+    fn a_footprint_times_features_is_the_mean_of_rendered_features() {
+        let (g, camera) = (cloud(400), camera(W as u32, H as u32));
+        let maps = maps();
+        let d = 3;
+        let features: Vec<f32> = (0..g.len() * d).map(|i| ((i * 37) % 101) as f32 / 50.0 - 1.0).collect();
+        let image = gs_raster::render_features(&g, &features, d, &camera, &RasterOptions::default());
+        let alpha = gs_raster::render(&g, &camera, &RasterOptions::default()).alpha;
+        let result = view_footprints(&g, &camera, &maps, 0.7, 5);
+        assert_eq!(result.small_masks, 1);
+        assert_eq!(result.rows.len(), 5 + 6);
+        let mut gated_all = 0;
+        for (row, entries) in result.rows.iter().zip(&result.entries) {
+            let map = &maps.ids[row.level as usize * W * H..][..W * H];
+            let mine: Vec<usize> = (0..W * H).filter(|&p| map[p] == row.mask as i32).collect();
+            let gated: Vec<usize> = mine.iter().copied().filter(|&p| alpha[p] > 0.7).collect();
+            assert_eq!((row.pixels as usize, row.gated as usize), (mine.len(), gated.len()));
+            let mean_alpha = mine.iter().map(|&p| f64::from(alpha[p])).sum::<f64>() / mine.len() as f64;
+            assert!((f64::from(row.alpha) - mean_alpha).abs() < 1e-6);
+            assert!(entries.windows(2).all(|e| e[0].0 < e[1].0));
+            for c in 0..d {
+                let dense = gated.iter().map(|&p| f64::from(image[p * d + c])).sum::<f64>() / gated.len().max(1) as f64;
+                let sparse =
+                    entries.iter().map(|&(i, w)| f64::from(w) * f64::from(features[i as usize * d + c])).sum::<f64>()
+                        / gated.len().max(1) as f64;
+                assert!((dense - sparse).abs() < 1e-5, "{row:?} channel {c}: {dense} {sparse}");
+            }
+            gated_all += gated.len();
+        }
+        assert!(gated_all > 2000, "the cloud covers most of the view: {gated_all}");
+        // All weights of a view add up to all of its alpha.
+        let weight: f64 = result.seen.iter().map(|s| s.1).sum();
+        let covered: f64 = alpha.iter().map(|&a| f64::from(a)).sum();
+        assert!((weight - covered).abs() < 1e-3 * covered);
+    }
+
+    #[test]
+    fn threads_do_not_change_a_footprint() {
+        let (g, camera, maps) = (cloud(2000), camera(W as u32, H as u32), maps());
+        let with = |threads| {
+            let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
+            pool.install(|| view_footprints(&g, &camera, &maps, 0.7, 1))
+        };
+        assert_eq!(with(1), with(3));
+    }
+}

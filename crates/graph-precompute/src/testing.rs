@@ -1,6 +1,10 @@
-//! Point sets that trees find hard.
+//! Point sets that trees find hard, and a small scene.
 
-use proptest::prelude::*;
+use glam::DVec3;
+use gs_scene::{Camera, Gaussians};
+use proptest::prelude::{Strategy, prop};
+use rand::{Rng, SeedableRng};
+use rand_chacha::ChaCha8Rng;
 use std::ops::Range;
 
 /// Random, planar, gridded, duplicated, collinear and far-flung point sets.
@@ -20,4 +24,24 @@ pub fn points(size: Range<usize>) -> impl Strategy<Value = Vec<[f32; 3]>> {
         }
         points
     })
+}
+
+/// Gaussians in a thick slab around the origin.
+pub fn cloud(n: usize) -> Gaussians {
+    let mut rng = ChaCha8Rng::seed_from_u64(4);
+    let mut draw = |lo: f32, hi: f32| rng.random_range(lo..hi);
+    let mut g = Gaussians { sh_degree: 0, ..Gaussians::default() };
+    for _ in 0..n {
+        g.means.push([draw(-1.5, 1.5), draw(-1.0, 1.0), draw(-0.5, 0.5)]);
+        g.log_scales.push([draw(-2.5, -1.5), draw(-2.5, -1.5), draw(-2.5, -1.5)]);
+        g.rotations.push([1.0, draw(-1.0, 1.0), draw(-1.0, 1.0), draw(-1.0, 1.0)]);
+        g.opacity_logits.push(draw(-1.0, 3.0));
+        g.sh.extend([draw(-1.0, 1.0), draw(-1.0, 1.0), draw(-1.0, 1.0)]);
+    }
+    g
+}
+
+/// A camera that sees the slab.
+pub fn camera(width: u32, height: u32) -> Camera {
+    Camera::look_at(DVec3::new(0.2, -0.1, -2.0), DVec3::ZERO, DVec3::NEG_Y, width, height, 1.2)
 }

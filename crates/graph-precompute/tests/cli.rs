@@ -1,0 +1,176 @@
+//! The program on a small scene on disk: the artifacts, the same bytes for any thread count, and bad input.
+
+use artifacts::{Footprints, Graph, MaskMaps};
+use glam::DVec3;
+use gs_scene::{Camera, Gaussians, Image, ply};
+use std::path::{Path, PathBuf};
+use std::process::{Command, Output};
+
+const SIZE: u32 = 48;
+const VIEWS: usize = 5;
+
+/// A transforms.json scene of two clusters of Gaussians, one mask each and one for both.
+fn scene(dir: &Path) {
+    let mut frames = Vec::new();
+    std::fs::create_dir_all(dir.join("masks")).unwrap();
+    for v in 0..VIEWS {
+        let eye = DVec3::new(v as f64 * 0.1 - 0.2, -0.2, -3.0);
+        let c = Camera::look_at(eye, DVec3::ZERO, DVec3::NEG_Y, SIZE, SIZE, 0.9);
+        let (r, t) = (c.rotation.transpose(), c.position());
+        // OpenGL axes: y and z turned round.
+        let row = |i: usize| [r.col(0)[i], -r.col(1)[i], -r.col(2)[i], t[i]];
+        frames.push(serde_json::json!({
+            "file_path": format!("images/v{v}.png"),
+            "transform_matrix": [row(0), row(1), row(2), [0.0, 0.0, 0.0, 1.0]],
+        }));
+        let n = (SIZE * SIZE) as usize;
+        Image { width: SIZE, height: SIZE, rgb: vec![0.5; 3 * n], alpha: None }
+            .write_png(dir.join(format!("images/v{v}.png")))
+            .unwrap();
+        let half: Vec<i32> = (0..n).map(|p| i32::from(p % SIZE as usize >= SIZE as usize / 2)).collect();
+        let mut ids = half.clone();
+        ids.extend(half.iter().map(|i| i + 2));
+        ids.extend(half.iter().map(|i| i + 4));
+        ids.extend(vec![6; n]);
+        MaskMaps { width: SIZE as usize, height: SIZE as usize, ids }
+            .write(dir.join(format!("masks/v{v}_s.npy")))
+            .unwrap();
+    }
+    let f = 0.5 * f64::from(SIZE) / 0.45f64.tan();
+    let transforms = serde_json::json!({ "w": SIZE, "h": SIZE, "fl_x": f, "fl_y": f, "frames": frames });
+    std::fs::write(dir.join("transforms.json"), transforms.to_string()).unwrap();
+    ply::write_gaussians(dir.join("geometry.ply"), &gaussians(), &[]).unwrap();
+}
+
+fn gaussians() -> Gaussians {
+    let mut g = Gaussians::default();
+    for i in 0..60 {
+        let side = if i % 2 == 0 { -0.7 } else { 0.7 };
+        g.means.push([side + (i % 7) as f32 * 0.05, (i % 11) as f32 * 0.1 - 0.5, (i % 5) as f32 * 0.05]);
+    }
+    g.means.push([0.0, 0.0, -50.0]); // behind every camera
+    let n = g.means.len();
+    g.log_scales = vec![[-1.5; 3]; n];
+    g.rotations = vec![[1.0, 0.0, 0.0, 0.0]; n];
+    g.opacity_logits = vec![3.0; n];
+    g.sh = vec![0.3; 3 * n];
+    g
+}
+
+fn run(dir: &Path, out: &Path, extra: &[&str]) -> Output {
+    Command::new(env!("CARGO_BIN_EXE_graph-precompute"))
+        .args(["--scene".as_ref(), dir.as_os_str(), "--geometry".as_ref(), dir.join("geometry.ply").as_os_str()])
+        .args(["--masks".as_ref(), dir.join("masks").as_os_str()])
+        .args(["--footprints".as_ref(), out.join("footprints.safetensors").as_os_str()])
+        .args(["--graph".as_ref(), out.join("graph.safetensors").as_os_str()])
+        .args(extra)
+        .output()
+        .unwrap()
+}
+
+fn setup() -> (tempfile::TempDir, PathBuf, PathBuf) {
+    let dir = tempfile::tempdir().unwrap();
+    let (s, o) = (dir.path().join("scene"), dir.path().join("out"));
+    std::fs::create_dir_all(s.join("images")).unwrap();
+    std::fs::create_dir_all(&o).unwrap();
+    scene(&s);
+    (dir, s, o)
+}
+
+fn succeed(output: &Output) -> String {
+    let said = String::from_utf8_lossy(&output.stderr).into_owned();
+    assert!(output.status.success(), "{said}");
+    said
+}
+
+#[test]
+fn artifacts_are_right_and_the_same_for_any_number_of_threads() {
+    let (_dir, s, o) = setup();
+    let said = succeed(&run(&s, &o, &["--threads", "1"]));
+    assert!(said.contains("skipped 1 of 61 Gaussians: never seen"), "{said}");
+    let read = || ["graph.safetensors", "footprints.safetensors"].map(|f| std::fs::read(o.join(f)).unwrap());
+    let first = read();
+    succeed(&run(&s, &o, &["--threads", "2"]));
+    assert!(first == read(), "the number of threads changes the artifacts");
+    let (graph, a) = Graph::read(o.join("graph.safetensors")).unwrap();
+    assert_eq!((graph.kept.len(), graph.anchors.len(), graph.k, graph.gaussian_k), (60, 6, 16, 16));
+    assert_eq!(graph.seen_views[60], 0);
+    let f = Footprints::read(o.join("footprints.safetensors")).unwrap();
+    assert_eq!(f.artifact().provenance().inputs, a.provenance().inputs);
+    assert_eq!(f.kept, graph.kept);
+    // Every 8th view is held out: the first.
+    assert_eq!(f.views, ["v1", "v2", "v3", "v4"]);
+    assert_eq!(f.rows.len(), 4 * 7);
+    // The whole's footprint is the sum of the halves'.
+    let sum = |r: usize| f.entries(r).1.iter().map(|&w| f64::from(w)).sum::<f64>();
+    assert!((sum(0) + sum(1) - sum(6)).abs() < 1e-3 * sum(6) && sum(6) > 100.0);
+
+    let said = succeed(&run(&s, &o, &["--no-skip", "--views", "all", "--cut", "0.01", "--min-mask-pixels", "0"]));
+    assert!(said.contains("the cut dropped at most"), "{said}");
+    assert_eq!(Graph::read(o.join("graph.safetensors")).unwrap().0.kept.len(), 61);
+    let cut = Footprints::read(o.join("footprints.safetensors")).unwrap();
+    assert_eq!(cut.views.len(), 5);
+    assert!(cut.csr().1.len() * 4 < f.csr().1.len() * 5);
+}
+
+#[test]
+fn bad_input_is_one_line_and_leaves_outputs_alone() {
+    let (_dir, s, o) = setup();
+    for f in ["graph.safetensors", "footprints.safetensors"] {
+        std::fs::write(o.join(f), "good").unwrap();
+    }
+    let fail = |extra: &[&str], needles: &[&str]| {
+        let out = run(&s, &o, extra);
+        let said = String::from_utf8_lossy(&out.stderr).into_owned();
+        assert_eq!(out.status.code(), Some(2), "{said}");
+        for needle in needles {
+            assert!(said.contains(needle), "{needle:?} is not in {said:?}");
+        }
+        assert!(!said.contains("panicked"), "{said}");
+        assert_eq!(std::fs::read(o.join("graph.safetensors")).unwrap(), b"good");
+        assert_eq!(std::fs::read(o.join("footprints.safetensors")).unwrap(), b"good");
+    };
+    fail(&["--k", "0"], &["--k", "found 0"]);
+    fail(&["--anchor-ratio", "NaN"], &["--anchor-ratio"]);
+    fail(&["--gate", "1.5"], &["--gate", "found 1.5"]);
+    fail(&["--min-mask-pixels", "1000000"], &["masks", "too small", "--min-mask-pixels"]);
+    let masks = s.join("masks/v2_s.npy");
+    let good = std::fs::read(&masks).unwrap();
+    std::fs::write(&masks, &good[..good.len() / 2]).unwrap();
+    fail(&[], &["v2_s.npy"]);
+    MaskMaps { width: 20, height: 48, ids: vec![0; 4 * 20 * 48] }.write(&masks).unwrap();
+    fail(&[], &["v2_s.npy", "found 20x48", "expected 48x48"]);
+    MaskMaps { width: 48, height: 48, ids: vec![-1; 4 * 48 * 48] }.write(&masks).unwrap();
+    for v in [1, 3, 4] {
+        std::fs::remove_file(s.join(format!("masks/v{v}_s.npy"))).unwrap();
+    }
+    fail(&[], &["masks", "no view has a mask"]);
+    std::fs::remove_file(&masks).unwrap();
+    fail(&[], &["masks", "no view has an id map", "mask-embed"]);
+    let mut g = gaussians();
+    g.means.iter_mut().for_each(|p| p[2] = -80.0);
+    ply::write_gaussians(s.join("geometry.ply"), &g, &[]).unwrap();
+    std::fs::write(&masks, &good).unwrap();
+    fail(&[], &["no Gaussian is seen"]);
+    g.means[3][1] = f32::NAN;
+    ply::write_gaussians(s.join("geometry.ply"), &g, &[]).unwrap();
+    fail(&[], &["geometry.ply", "not finite"]);
+    std::fs::remove_file(s.join("geometry.ply")).unwrap();
+    fail(&[], &["geometry.ply", "cannot read"]);
+}
+
+#[test]
+fn one_gaussian_and_one_view_are_enough() {
+    let (_dir, s, o) = setup();
+    let one = gaussians().select(&[0]);
+    let mut one = Gaussians { log_scales: vec![[0.5; 3]], ..one };
+    one.means[0] = [0.0; 3];
+    ply::write_gaussians(s.join("geometry.ply"), &one, &[]).unwrap();
+    for v in 1..4 {
+        std::fs::remove_file(s.join(format!("masks/v{v}_s.npy"))).unwrap();
+    }
+    succeed(&run(&s, &o, &[]));
+    let (graph, _) = Graph::read(o.join("graph.safetensors")).unwrap();
+    assert_eq!((&graph.anchors[..], &graph.nearest_anchor[..]), (&[0u32][..], &[0u32][..]));
+    assert!(graph.knn.iter().chain(&graph.anchor_knn).chain(&graph.gaussian_knn).all(|&i| i == 0));
+}
