@@ -5,11 +5,17 @@
 //! form: the leading singular vectors of the matrix of Gaussians and masks. `docs/method.md` has the equations.
 
 pub mod adam;
+pub mod checkpoint;
+pub mod cli;
+pub mod evidence;
+pub mod linalg;
 pub mod loss;
 pub mod model;
 pub mod network;
 pub mod normalize;
 pub mod real;
 pub mod scene;
+pub mod spectral;
 #[cfg(test)]
 mod testing;
+pub mod train;

@@ -1,0 +1,358 @@
+//! The command line of `feat-train`.
+
+use crate::checkpoint;
+use crate::evidence::{Evidence, Matrix};
+use crate::loss::Loss;
+use crate::model::{Init, Settings};
+use crate::normalize::Axis;
+use crate::scene::{Context, Neighbours, mask_sets};
+use crate::spectral::{SpectralOptions, spectral};
+use crate::train::{CurvePoint, TrainOptions, train};
+use artifacts::{Features, Footprints, Graph, Level, role};
+use clap::ValueEnum;
+use gs_io::{Error, Result, hash_file, write_bytes};
+use gs_scene::{SH_C0, ply};
+use serde_json::{Value, json};
+use stage::{CommonArgs, Program, Stage};
+use std::collections::BTreeMap;
+use std::path::{Path, PathBuf};
+
+/// A feature vector for every Gaussian, from the masks of all views
+#[derive(Debug, clap::Parser)]
+#[command(name = "feat-train", version)]
+pub struct Args {
+    /// Gaussians, as a 3DGS PLY
+    #[arg(long, value_name = "FILE")]
+    geometry: PathBuf,
+    /// graph.safetensors of graph-precompute
+    #[arg(long, value_name = "FILE")]
+    graph: PathBuf,
+    /// footprints.safetensors of graph-precompute
+    #[arg(long, value_name = "FILE")]
+    footprints: PathBuf,
+    /// Where to write the features; the curve goes to <FILE>.curve.jsonl
+    #[arg(long, value_name = "FILE")]
+    out: PathBuf,
+    /// How features come about
+    #[arg(long, value_enum, default_value_t = Method::Spectral)]
+    method: Method,
+    /// Levels of masks to use: default, small, medium, large
+    #[arg(long, value_name = "LEVELS", value_delimiter = ',', default_value = "large")]
+    levels: Vec<Level>,
+    /// Numbers per feature [default: 6 for contrastive; for spectral as many as matter, at most 64]
+    #[arg(long, value_name = "COUNT")]
+    dim: Option<usize>,
+    #[command(flatten)]
+    contrastive: Contrastive,
+    #[command(flatten)]
+    spectral: Spectral,
+    #[command(flatten)]
+    common: CommonArgs,
+}
+
+/// How features come about.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
+pub enum Method {
+    /// The paper's: contextual propagation and mask-aware contrastive learning.
+    Contrastive,
+    /// Closed form: leading singular vectors of the matrix of Gaussians and masks.
+    Spectral,
+}
+
+/// A set of defaults.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
+pub enum Preset {
+    /// The paper read literally.
+    Paper,
+}
+
+/// Options of `--method contrastive`.
+#[derive(Debug, clap::Args)]
+#[command(next_help_heading = "Contrastive learning")]
+struct Contrastive {
+    /// The paper read literally: --method contrastive with the defaults below, which other options may still change
+    #[arg(long, value_enum)]
+    preset: Option<Preset>,
+    /// Iterations, one random view each
+    #[arg(long, value_name = "COUNT", default_value_t = 10_000)]
+    iterations: u64,
+    /// Layers of the graph network, 0 to 4
+    #[arg(long, value_name = "COUNT", default_value_t = 2)]
+    layers: usize,
+    /// Whom an anchor aggregates
+    #[arg(long, value_enum, default_value_t = Neighbours::Gaussians)]
+    neighbours: Neighbours,
+    /// What is standardised together
+    #[arg(long, value_enum, default_value_t = Axis::Channel)]
+    norm_axis: Axis,
+    /// Loss on the masks of a view
+    #[arg(long, value_enum, default_value_t = Loss::Printed)]
+    loss: Loss,
+    /// How features start
+    #[arg(long, value_enum, default_value_t = Init::Uniform)]
+    init: Init,
+    /// Temperature of the loss
+    #[arg(long, value_name = "TAU", default_value_t = 0.1)]
+    tau: f64,
+    /// Learning rate of features
+    #[arg(long, value_name = "RATE", default_value_t = 1e-3)]
+    lr: f64,
+    /// Learning rate of the graph network
+    #[arg(long, value_name = "RATE", default_value_t = 1e-3)]
+    weight_lr: f64,
+    /// Weight of a term that pulls Gaussians to the centroids of their masks (the paper found that it hurts)
+    #[arg(long, value_name = "WEIGHT", default_value_t = 0.0)]
+    cohesion: f64,
+    /// Give what anchors aggregate to the anchors alone
+    #[arg(long)]
+    no_propagation: bool,
+    /// Iterations between checkpoints; 0 for none
+    #[arg(long, value_name = "COUNT", default_value_t = 1000)]
+    checkpoint_every: u64,
+    /// Iterations between points of the curve
+    #[arg(long, value_name = "COUNT", default_value_t = 50)]
+    curve_every: u64,
+}
+
+/// Options of `--method spectral`.
+#[derive(Debug, clap::Args)]
+#[command(next_help_heading = "Closed form")]
+struct Spectral {
+    /// Power of the singular values: low shows parts, high shows whole things
+    #[arg(long, value_name = "POWER", default_value_t = 16.0)]
+    power: f64,
+    /// What a mask says about a Gaussian
+    #[arg(long, value_enum, default_value_t = Evidence::Weight)]
+    evidence: Evidence,
+    /// Do not spread evidence over spatial neighbours
+    #[arg(long)]
+    no_smoothing: bool,
+}
+
+fn name_of(value: &impl ValueEnum) -> String {
+    value.to_possible_value().map_or_else(String::new, |v| v.get_name().to_string())
+}
+
+impl Args {
+    fn method(&self) -> Method {
+        if self.contrastive.preset.is_some() { Method::Contrastive } else { self.method }
+    }
+
+    fn check(&self) -> Result<()> {
+        let c = &self.contrastive;
+        let dims = match self.method() {
+            Method::Contrastive => 2..=64,
+            Method::Spectral => 1..=512,
+        };
+        let positive = |v: f64| v > 0.0 && v.is_finite();
+        let checks = [
+            ("--dim", self.dim.is_none_or(|d| dims.contains(&d)), format!("{:?}", self.dim), format!("{dims:?}")),
+            ("--layers", c.layers <= 4, c.layers.to_string(), "0 to 4".into()),
+            ("--tau", (1e-6..=1e6).contains(&c.tau), c.tau.to_string(), "1e-6 to 1e6".into()),
+            ("--lr", positive(c.lr), c.lr.to_string(), "more than 0".into()),
+            ("--weight-lr", positive(c.weight_lr), c.weight_lr.to_string(), "more than 0".into()),
+            ("--cohesion", c.cohesion >= 0.0 && c.cohesion.is_finite(), c.cohesion.to_string(), "0 or more".into()),
+            ("--curve-every", c.curve_every > 0, "0".into(), "at least 1".into()),
+            (
+                "--power",
+                (0.0..=1000.0).contains(&self.spectral.power),
+                self.spectral.power.to_string(),
+                "0 to 1000".into(),
+            ),
+        ];
+        match checks.into_iter().find(|c| !c.1) {
+            Some((field, _, found, expected)) => {
+                Err(Error::new("out of range").field(field).found(found).expected(expected))
+            }
+            None => Ok(()),
+        }
+    }
+
+    /// Everything that shapes the features but the number of iterations.
+    fn parameters(&self) -> serde_json::Map<String, Value> {
+        let levels: Vec<String> = self.levels.iter().map(ToString::to_string).collect();
+        let mut p = serde_json::Map::from_iter([
+            ("method".to_string(), json!(name_of(&self.method()))),
+            ("levels".to_string(), json!(levels)),
+            ("seed".to_string(), json!(self.common.seed)),
+        ]);
+        let c = &self.contrastive;
+        let more = match self.method() {
+            Method::Contrastive => json!({
+                "dim": self.dim.unwrap_or(6),
+                "layers": c.layers,
+                "neighbours": name_of(&c.neighbours),
+                "norm_axis": name_of(&c.norm_axis),
+                "loss": name_of(&c.loss),
+                "init": name_of(&c.init),
+                "tau": c.tau,
+                "lr": c.lr,
+                "weight_lr": c.weight_lr,
+                "cohesion": c.cohesion,
+                "propagation": !c.no_propagation,
+                "curve_every": c.curve_every,
+            }),
+            Method::Spectral => json!({
+                "dim": self.dim.map_or(json!("auto"), |d| json!(d)),
+                "power": self.spectral.power,
+                "evidence": name_of(&self.spectral.evidence),
+                "smoothing": !self.spectral.no_smoothing,
+            }),
+        };
+        p.extend(more.as_object().into_iter().flatten().map(|(k, v)| (k.clone(), v.clone())));
+        p
+    }
+}
+
+/// The inputs, read and checked against each other.
+struct Inputs {
+    graph: Graph,
+    footprints: Footprints,
+    hashes: BTreeMap<String, String>,
+}
+
+impl Args {
+    fn read_inputs(&self) -> Result<Inputs> {
+        let geometry = hash_file(&self.geometry)?;
+        let (graph, graph_file) = Graph::read(&self.graph)?;
+        graph_file.expect_input(role::GEOMETRY, &geometry)?;
+        let footprints = Footprints::read(&self.footprints)?;
+        // Made in one run: same parents, same parameters, same kept Gaussians.
+        let mut hashes = graph_file.provenance().inputs.clone();
+        for (role, hash) in &hashes {
+            footprints.artifact().expect_input(role, hash)?;
+        }
+        if footprints.kept != graph.kept {
+            return Err(Error::new("of other Gaussians than the graph")
+                .file(&self.footprints)
+                .field("kept")
+                .found(format!("{} Gaussians", footprints.kept.len()))
+                .expected(format!("the {} of the graph", graph.kept.len()))
+                .hint("give graph and footprints of one run of graph-precompute"));
+        }
+        hashes.insert(role::GRAPH.into(), graph_file.hash().into());
+        hashes.insert(role::FOOTPRINTS.into(), footprints.artifact().hash().into());
+        Ok(Inputs { graph, footprints, hashes })
+    }
+
+    fn contrastive(&self, inputs: &Inputs, stage: &Stage) -> Result<(usize, Vec<f32>, Value)> {
+        let c = &self.contrastive;
+        let gaussians = ply::read_gaussians(&self.geometry)?;
+        if let Some(&last) = inputs.graph.kept.last().filter(|l| **l as usize >= gaussians.len()) {
+            return Err(Error::new("the graph speaks of Gaussians that the geometry lacks")
+                .file(&self.graph)
+                .field("kept")
+                .found(last)
+                .expected(format!("below {}", gaussians.len())));
+        }
+        let colors: Vec<[f32; 3]> = inputs
+            .graph
+            .kept
+            .iter()
+            .map(|&i| [0, 1, 2].map(|ch| 0.5 + SH_C0 * gaussians.sh_of(i as usize)[ch]))
+            .collect();
+        drop(gaussians);
+        let context = Context::new(&inputs.graph, &colors, c.neighbours, !c.no_propagation);
+        let sets = mask_sets::<f32>(&inputs.footprints, &context, &self.levels, 2);
+        let units = inputs.footprints.views.len() * self.levels.len();
+        if sets.len() < units {
+            stage.skipped(&format!("{} of {units} views and levels: fewer than two masks", units - sets.len()));
+        }
+        if sets.is_empty() {
+            return Err(Error::new("no view has two masks to tell apart")
+                .file(&self.footprints)
+                .field(format!("levels {:?}", self.levels))
+                .hint("choose other --levels, or make masks with more than one segment a view"));
+        }
+        let options = TrainOptions {
+            settings: Settings {
+                dim: self.dim.unwrap_or(6),
+                layers: c.layers,
+                norm_axis: c.norm_axis,
+                loss: c.loss,
+                tau: c.tau,
+                cohesion: c.cohesion,
+                init: c.init,
+            },
+            iterations: c.iterations,
+            rate: c.lr,
+            weight_rate: c.weight_lr,
+            seed: self.common.seed,
+            checkpoint_every: c.checkpoint_every,
+            curve_every: c.curve_every,
+        };
+        // A checkpoint serves runs of any number of iterations, as long as everything else is equal.
+        let provenance = stage.provenance("", 0, Value::Object(self.parameters()), inputs.hashes.clone());
+        let path = checkpoint::path(&self.out);
+        let on_curve = |curve: &[CurvePoint]| write_curve(&self.out, curve.iter().map(|p| json!(p)));
+        let trained = train(&context, &sets, &options, Some((&path, &provenance)), stage, on_curve)?;
+        let last = trained.curve.last().copied().unwrap_or_default();
+        let summary = json!({ "views": sets.len(), "last": last, "resumed_at": trained.resumed_at });
+        Ok((options.settings.dim, trained.features, summary))
+    }
+
+    fn spectral(&self, inputs: &Inputs, stage: &Stage) -> Result<(usize, Vec<f32>, Value)> {
+        let s = &self.spectral;
+        let matrix = Matrix::new(&inputs.footprints, &inputs.graph, &self.levels, s.evidence, !s.no_smoothing);
+        if matrix.masks.is_empty() {
+            return Err(Error::new("no mask has a footprint")
+                .file(&self.footprints)
+                .field(format!("levels {:?}", self.levels))
+                .hint("choose other --levels, or check that masks and geometry are of one scene"));
+        }
+        let options = SpectralOptions {
+            most: self.dim.unwrap_or(64),
+            auto: self.dim.is_none(),
+            power: s.power,
+            seed: self.common.seed,
+        };
+        let found = spectral(&matrix, &options, stage)?;
+        let without = found.features.chunks_exact(found.dim).filter(|f| f.iter().all(|v| *v == 0.0)).count();
+        if without > 0 {
+            stage.info(&format!("{without} of {} Gaussians lie in no mask: their features are zero", matrix.gaussians));
+        }
+        let values = found.singular_values.iter().enumerate();
+        write_curve(&self.out, values.map(|(i, v)| json!({ "iteration": i + 1, "singular_value": v })))?;
+        let summary = json!({
+            "masks": matrix.masks.len(), "dim": found.dim, "passes": found.passes, "without_mask": without,
+            "singular_values": found.singular_values,
+        });
+        Ok((found.dim, found.features, summary))
+    }
+}
+
+/// Writes `<out>.curve.jsonl`.
+fn write_curve(out: &Path, lines: impl Iterator<Item = Value>) -> Result<()> {
+    let mut name = out.as_os_str().to_owned();
+    name.push(".curve.jsonl");
+    let text: String = lines.map(|l| format!("{l}\n")).collect();
+    write_bytes(PathBuf::from(name), text.as_bytes())
+}
+
+impl Program for Args {
+    const NAME: &'static str = "feat-train";
+
+    fn common(&self) -> &CommonArgs {
+        &self.common
+    }
+
+    fn run(self, stage: &Stage) -> Result<()> {
+        self.check()?;
+        let inputs = self.read_inputs()?;
+        let (dim, values, summary) = match self.method() {
+            Method::Contrastive => self.contrastive(&inputs, stage)?,
+            Method::Spectral => self.spectral(&inputs, stage)?,
+        };
+        let mut parameters = self.parameters();
+        if self.method() == Method::Contrastive {
+            parameters.insert("iterations".into(), json!(self.contrastive.iterations));
+        }
+        let parameters = Value::Object(parameters);
+        let features = Features { kept: inputs.graph.kept, dim, values };
+        features.write(&self.out, stage.provenance("", 0, parameters.clone(), inputs.hashes.clone()))?;
+        // The run is done: what is left of it must not be mistaken for an unfinished one.
+        let _ = std::fs::remove_file(checkpoint::path(&self.out));
+        stage.info(&format!("features of {} Gaussians, {dim} numbers each", features.kept.len()));
+        stage.record(&self.out, parameters, inputs.hashes, summary)
+    }
+}

@@ -1,0 +1,125 @@
+//! Small dense linear algebra in f64, on columns.
+
+/// A matrix as columns of equal length.
+pub type Columns = Vec<Vec<f64>>;
+
+/// Columns shorter than this share of their length before orthogonalisation depend on those before them.
+const DEPENDENT: f64 = 1e-10;
+
+fn dot(a: &[f64], b: &[f64]) -> f64 {
+    a.iter().zip(b).map(|(a, b)| a * b).sum()
+}
+
+/// Makes the columns orthonormal by Gram-Schmidt, twice each; columns that depend on earlier ones are dropped.
+pub fn orthonormalise(columns: &mut Columns) {
+    let mut done: Columns = Vec::with_capacity(columns.len());
+    for mut column in columns.drain(..) {
+        let before = dot(&column, &column).sqrt();
+        for _ in 0..2 {
+            for q in &done {
+                let along = dot(q, &column);
+                column.iter_mut().zip(q).for_each(|(c, q)| *c -= along * q);
+            }
+        }
+        let length = dot(&column, &column).sqrt();
+        if length > DEPENDENT * before && length > f64::MIN_POSITIVE {
+            column.iter_mut().for_each(|c| *c /= length);
+            done.push(column);
+        }
+    }
+    *columns = done;
+}
+
+/// Aᵀ B.
+pub fn cross(a: &Columns, b: &Columns) -> Columns {
+    b.iter().map(|b| a.iter().map(|a| dot(a, b)).collect()).collect()
+}
+
+/// A M.
+pub fn multiply(a: &Columns, m: &Columns) -> Columns {
+    let rows = a.first().map_or(0, Vec::len);
+    m.iter()
+        .map(|weights| {
+            let mut out = vec![0.0; rows];
+            for (a, &w) in a.iter().zip(weights) {
+                out.iter_mut().zip(a).for_each(|(o, a)| *o += w * a);
+            }
+            out
+        })
+        .collect()
+}
+
+/// Eigenvalues, descending, and eigenvectors of a symmetric matrix, by Jacobi rotations.
+pub fn symmetric_eigen(matrix: &Columns) -> (Vec<f64>, Columns) {
+    let n = matrix.len();
+    let mut a: Columns = (0..n).map(|i| (0..n).map(|j| 0.5 * (matrix[i][j] + matrix[j][i])).collect()).collect();
+    let mut v: Columns = (0..n).map(|i| (0..n).map(|j| f64::from(u8::from(i == j))).collect()).collect();
+    for _sweep in 0..60 {
+        let off: f64 = (0..n).flat_map(|i| (0..i).map(move |j| (i, j))).map(|(i, j)| a[i][j] * a[i][j]).sum();
+        let all: f64 = a.iter().flatten().map(|x| x * x).sum();
+        if off <= 1e-30 * all {
+            break;
+        }
+        for p in 0..n {
+            for q in p + 1..n {
+                if a[p][q].abs() < f64::MIN_POSITIVE {
+                    continue;
+                }
+                let theta = (a[q][q] - a[p][p]) / (2.0 * a[p][q]);
+                let t = theta.signum() / (theta.abs() + theta.hypot(1.0));
+                let c = 1.0 / t.hypot(1.0);
+                let s = t * c;
+                for k in 0..n {
+                    let (x, y) = (a[k][p], a[k][q]);
+                    (a[k][p], a[k][q]) = (c * x - s * y, s * x + c * y);
+                }
+                for k in 0..n {
+                    let (x, y) = (a[p][k], a[q][k]);
+                    (a[p][k], a[q][k]) = (c * x - s * y, s * x + c * y);
+                }
+                let (left, right) = v.split_at_mut(q);
+                for (x, y) in left[p].iter_mut().zip(right[0].iter_mut()) {
+                    (*x, *y) = (c * *x - s * *y, s * *x + c * *y);
+                }
+            }
+        }
+    }
+    let mut order: Vec<usize> = (0..n).collect();
+    order.sort_by(|&i, &j| a[j][j].total_cmp(&a[i][i]).then(i.cmp(&j)));
+    (order.iter().map(|&i| a[i][i]).collect(), order.iter().map(|&i| v[i].clone()).collect())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use proptest::prelude::*;
+
+    proptest! {
+        #![proptest_config(ProptestConfig::with_cases(40))]
+        #[test]
+        fn eigenvectors_rebuild_the_matrix(values in prop::collection::vec(-2f64..2.0, 36), repeat in any::<bool>()) {
+            let n = 6;
+            let mut m: Columns = (0..n).map(|i| (0..n).map(|j| values[i * n + j] + values[j * n + i]).collect()).collect();
+            if repeat {
+                m = cross(&vec![m[0].clone(), m[0].clone(), m[1].clone()], &vec![m[0].clone(), m[0].clone(), m[1].clone()]);
+            }
+            let (values, vectors) = symmetric_eigen(&m);
+            prop_assert!(values.windows(2).all(|w| w[0] >= w[1]));
+            for i in 0..m.len() {
+                for j in 0..m.len() {
+                    let rebuilt: f64 = (0..m.len()).map(|k| vectors[k][i] * values[k] * vectors[k][j]).sum();
+                    prop_assert!((rebuilt - m[i][j]).abs() < 1e-9 * (1.0 + m[i][j].abs()));
+                }
+            }
+        }
+    }
+
+    #[test]
+    fn dependent_columns_are_dropped() {
+        let mut c = vec![vec![1.0, 1.0, 0.0], vec![2.0, 2.0, 0.0], vec![0.0, 0.0, 0.0], vec![1.0, 0.0, 1.0]];
+        orthonormalise(&mut c);
+        assert_eq!(c.len(), 2);
+        let g = cross(&c, &c);
+        assert!((g[0][0] - 1.0).abs() < 1e-12 && g[0][1].abs() < 1e-12 && (g[1][1] - 1.0).abs() < 1e-12);
+    }
+}

@@ -1,0 +1,7 @@
+//! The `feat-train` program.
+
+use std::process::ExitCode;
+
+fn main() -> ExitCode {
+    stage::main::<feat_train::cli::Args>()
+}
