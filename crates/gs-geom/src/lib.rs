@@ -1,1 +1,10 @@
-//! Stage 1: optimisation of 3D Gaussians from posed photographs.
+//! Stage 1: optimisation of 3D Gaussians from posed photographs, on the CPU (Kerbl et al. 2023).
+//!
+//! [`train`] is the loop; what it is made of is pure and in a module each: [`loss`], [`optimiser`], [`densify`],
+//! [`schedule`], [`init`]. [`checkpoint`] makes a killed run go on to the bytes of an undisturbed one.
+
+pub mod densify;
+pub mod init;
+pub mod loss;
+pub mod optimiser;
+pub mod schedule;

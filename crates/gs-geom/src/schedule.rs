@@ -1,0 +1,223 @@
+//! What changes with the iteration: learning rates, degree of the spherical harmonics, picture size, densification, and
+//! the order of the views. Iterations count from 1.
+
+use crate::optimiser::Rates;
+use rand::seq::SliceRandom;
+use rand_chacha::ChaCha8Rng;
+use rand_chacha::rand_core::SeedableRng;
+use serde::Serialize;
+
+/// Learning rates as 3DGS has them. The rates of the centres are per unit of the scene's extent.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize)]
+pub struct LearningRates {
+    /// Of the centres, at the start.
+    pub position: f64,
+    /// Of the centres, at the end; exponential between.
+    pub position_end: f64,
+    /// Of the constant colour term; a twentieth of it of the other spherical harmonics.
+    pub feature: f64,
+    /// Of the opacity logits.
+    pub opacity: f64,
+    /// Of the logarithms of the scales.
+    pub scaling: f64,
+    /// Of the quaternions.
+    pub rotation: f64,
+}
+
+impl Default for LearningRates {
+    fn default() -> Self {
+        Self { position: 1.6e-4, position_end: 1.6e-6, feature: 0.0025, opacity: 0.05, scaling: 0.005, rotation: 0.001 }
+    }
+}
+
+/// When what happens.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct Schedule {
+    /// Length of the optimisation.
+    pub iterations: u32,
+    /// The degree of the spherical harmonics grows by one every so many iterations.
+    pub sh_every: u32,
+    /// Densification begins after this iteration.
+    pub densify_from: u32,
+    /// Densification and opacity resets end before this iteration.
+    pub densify_until: u32,
+    /// Iterations between densifications.
+    pub densify_every: u32,
+    /// Iterations between opacity resets; too large Gaussians are removed only after the first.
+    pub opacity_reset_every: u32,
+    /// Picture sizes: (last iteration, divisor of the training size), in order; afterwards the full training size.
+    pub coarse: Vec<(u32, u32)>,
+}
+
+impl Schedule {
+    /// The schedule of 3DGS at 30,000 iterations and more. Shorter runs begin to densify and grow the degree earlier, in
+    /// proportion, and densify for a larger share, because they have fewer rounds; opacity resets keep their period, for
+    /// a short run has no time to recover from one.
+    pub fn for_iterations(iterations: u32) -> Self {
+        let share = |numerator: u32, denominator: u32| {
+            u32::try_from(u64::from(iterations) * u64::from(numerator) / u64::from(denominator)).unwrap_or(u32::MAX)
+        };
+        Self {
+            iterations,
+            sh_every: share(1, 10).clamp(1, 1000),
+            densify_from: share(1, 20).min(500),
+            densify_until: if iterations < 15_000 { share(7, 10).min(7500) } else { share(1, 2) },
+            densify_every: share(1, 60).clamp(10, 100),
+            opacity_reset_every: 3000,
+            coarse: Vec::new(),
+        }
+    }
+
+    /// Learning rates at an iteration, for a scene of this extent (see [`crate::init::extent`]).
+    pub fn rates(&self, base: &LearningRates, iteration: u32, extent: f64) -> Rates {
+        let t = (f64::from(iteration) / f64::from(self.iterations.max(1))).clamp(0.0, 1.0);
+        let position = if base.position > 0.0 && base.position_end > 0.0 {
+            (base.position.ln() * (1.0 - t) + base.position_end.ln() * t).exp()
+        } else {
+            0.0
+        };
+        Rates {
+            means: (position * extent) as f32,
+            log_scales: base.scaling as f32,
+            rotations: base.rotation as f32,
+            opacity_logits: base.opacity as f32,
+            sh_constant: base.feature as f32,
+            sh_rest: (base.feature / 20.0) as f32,
+        }
+    }
+
+    /// Degree of the spherical harmonics in use at an iteration.
+    pub fn sh_degree(&self, iteration: u32, most: u8) -> u8 {
+        u8::try_from(iteration / self.sh_every.max(1)).unwrap_or(u8::MAX).min(most)
+    }
+
+    /// Divisor of the training size at an iteration.
+    pub fn divisor(&self, iteration: u32) -> u32 {
+        self.coarse.iter().find(|(last, _)| iteration <= *last).map_or(1, |&(_, divisor)| divisor)
+    }
+
+    /// Whether views are to be counted for densification at this iteration.
+    pub fn observes(&self, iteration: u32) -> bool {
+        iteration < self.densify_until
+    }
+
+    /// Whether to densify after this iteration.
+    pub fn densifies(&self, iteration: u32) -> bool {
+        iteration > self.densify_from
+            && iteration < self.densify_until
+            && iteration.is_multiple_of(self.densify_every.max(1))
+    }
+
+    /// Whether to reset the opacities after this iteration.
+    pub fn resets_opacity(&self, iteration: u32) -> bool {
+        iteration < self.densify_until && iteration.is_multiple_of(self.opacity_reset_every.max(1))
+    }
+}
+
+/// A generator for one purpose at one iteration: nothing of it need be kept to go on after an interruption.
+pub fn generator(seed: u64, purpose: Purpose, iteration: u64) -> ChaCha8Rng {
+    let mut rng = ChaCha8Rng::seed_from_u64(seed);
+    rng.set_stream((purpose as u64) << 48 | iteration);
+    rng
+}
+
+/// What random numbers are for.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Purpose {
+    /// Where Gaussians start.
+    Start = 1,
+    /// The order of the views.
+    Order = 2,
+    /// Where the halves of a split Gaussian go.
+    Split = 3,
+}
+
+/// The order of the views: each once per round, shuffled anew every round.
+#[derive(Debug, Clone)]
+pub struct ViewOrder {
+    seed: u64,
+    round: Option<u64>,
+    order: Vec<usize>,
+}
+
+impl ViewOrder {
+    /// An order of `views` views.
+    pub fn new(seed: u64, views: usize) -> Self {
+        Self { seed, round: None, order: (0..views).collect() }
+    }
+
+    /// The view of an iteration.
+    ///
+    /// # Panics
+    /// When there are no views.
+    pub fn at(&mut self, iteration: u32) -> usize {
+        let (n, i) = (self.order.len() as u64, u64::from(iteration.saturating_sub(1)));
+        if self.round != Some(i / n) {
+            self.round = Some(i / n);
+            self.order.sort_unstable();
+            self.order.shuffle(&mut generator(self.seed, Purpose::Order, i / n));
+        }
+        self.order[(i % n) as usize]
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_full_schedule_is_that_of_3dgs() {
+        let s = Schedule::for_iterations(30_000);
+        let wanted = Schedule {
+            iterations: 30_000,
+            sh_every: 1000,
+            densify_from: 500,
+            densify_until: 15_000,
+            densify_every: 100,
+            opacity_reset_every: 3000,
+            coarse: vec![],
+        };
+        assert_eq!(s, wanted);
+        let base = LearningRates::default();
+        let close = |a: f32, b: f64| (f64::from(a) / b - 1.0).abs() < 1e-3;
+        assert!(close(s.rates(&base, 0, 2.0).means, 3.2e-4));
+        assert!(close(s.rates(&base, 15_000, 1.0).means, 1.6e-5));
+        assert!(close(s.rates(&base, 30_000, 1.0).means, 1.6e-6));
+        assert!(close(s.rates(&base, 7, 1.0).sh_rest, 0.0025 / 20.0));
+        assert_eq!([0, 999, 1000, 2000, 3000, 30_000].map(|i| s.sh_degree(i, 3)), [0, 0, 1, 2, 3, 3]);
+        assert!(!s.densifies(500) && s.densifies(600) && !s.densifies(650) && !s.densifies(15_000));
+        assert!(s.resets_opacity(12_000) && !s.resets_opacity(15_000));
+    }
+
+    #[test]
+    fn short_runs_densify_too() {
+        for iterations in [1, 60, 300, 1000, 3000, 7000] {
+            let s = Schedule::for_iterations(iterations);
+            let rounds = (1..=iterations).filter(|&i| s.densifies(i)).count();
+            assert!(rounds >= if iterations < 100 { 0 } else { 9 }, "{iterations}: {rounds}");
+            assert!(s.densify_until <= iterations && s.sh_every >= 1);
+        }
+    }
+
+    #[test]
+    fn picture_sizes_follow_each_other() {
+        let s = Schedule { coarse: vec![(10, 4), (20, 2)], ..Schedule::for_iterations(100) };
+        assert_eq!([1, 10, 11, 20, 21, 100].map(|i| s.divisor(i)), [4, 4, 2, 2, 1, 1]);
+    }
+
+    #[test]
+    fn every_round_shows_every_view_and_rounds_can_be_entered_anywhere() {
+        let mut order = ViewOrder::new(3, 7);
+        let all: Vec<usize> = (1..=70).map(|i| order.at(i)).collect();
+        for round in all.chunks(7) {
+            let mut sorted = round.to_vec();
+            sorted.sort_unstable();
+            assert_eq!(sorted, [0, 1, 2, 3, 4, 5, 6]);
+        }
+        assert_ne!(all[..7], all[7..14], "shuffled anew");
+        let mut late = ViewOrder::new(3, 7);
+        assert_eq!((40..=70).map(|i| late.at(i)).collect::<Vec<_>>(), all[39..]);
+        let mut other = ViewOrder::new(4, 7);
+        assert_ne!((1..=70).map(|i| other.at(i)).collect::<Vec<_>>(), all);
+    }
+}
