@@ -1,0 +1,317 @@
+//! The vertices of a PLY file as rows of bytes with named columns.
+
+use gs_io::{Error, Result};
+use std::borrow::Cow;
+
+pub(super) const AGAIN: &str = "export the PLY again";
+
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum Encoding {
+    Ascii,
+    Little,
+    Big,
+}
+
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum Scalar {
+    I8,
+    U8,
+    I16,
+    U16,
+    I32,
+    U32,
+    F32,
+    F64,
+}
+
+impl Scalar {
+    fn parse(name: &str) -> Option<Self> {
+        Some(match name {
+            "char" | "int8" => Self::I8,
+            "uchar" | "uint8" => Self::U8,
+            "short" | "int16" => Self::I16,
+            "ushort" | "uint16" => Self::U16,
+            "int" | "int32" => Self::I32,
+            "uint" | "uint32" => Self::U32,
+            "float" | "float32" => Self::F32,
+            "double" | "float64" => Self::F64,
+            _ => return None,
+        })
+    }
+
+    fn size(self) -> usize {
+        match self {
+            Self::I8 | Self::U8 => 1,
+            Self::I16 | Self::U16 => 2,
+            Self::I32 | Self::U32 | Self::F32 => 4,
+            Self::F64 => 8,
+        }
+    }
+
+    #[inline]
+    fn value(self, bytes: &[u8], big: bool) -> f64 {
+        macro_rules! get {
+            ($t:ty) => {{
+                let mut b = [0u8; size_of::<$t>()];
+                b.copy_from_slice(&bytes[..size_of::<$t>()]);
+                f64::from(if big { <$t>::from_be_bytes(b) } else { <$t>::from_le_bytes(b) })
+            }};
+        }
+        match self {
+            Self::I8 => get!(i8),
+            Self::U8 => get!(u8),
+            Self::I16 => get!(i16),
+            Self::U16 => get!(u16),
+            Self::I32 => get!(i32),
+            Self::U32 => get!(u32),
+            Self::F32 => get!(f32),
+            Self::F64 => get!(f64),
+        }
+    }
+}
+
+#[derive(Debug, Clone)]
+enum Property {
+    Scalar(String, Scalar),
+    List(Scalar, Scalar),
+}
+
+#[derive(Debug, Clone)]
+struct Element {
+    name: String,
+    count: usize,
+    properties: Vec<Property>,
+}
+
+struct Header<'a> {
+    encoding: Encoding,
+    elements: Vec<Element>,
+    body: &'a [u8],
+}
+
+fn parse_header(bytes: &[u8]) -> Result<Header<'_>> {
+    let fail = |what: &str| Error::new(what).field("header").hint(AGAIN);
+    let mut rest = bytes;
+    let mut next_line = || -> Result<&str> {
+        let end = rest.iter().take(65_536).position(|&b| b == b'\n').ok_or_else(|| fail("the header does not end"))?;
+        let line = std::str::from_utf8(&rest[..end]).map_err(|_| fail("the header is not text"))?;
+        rest = &rest[end + 1..];
+        Ok(line.trim_end_matches('\r').trim())
+    };
+    if next_line()? != "ply" {
+        return Err(fail("not a PLY file"));
+    }
+    let mut encoding = None;
+    let mut elements: Vec<Element> = Vec::new();
+    loop {
+        let line = next_line()?;
+        let words: Vec<&str> = line.split_ascii_whitespace().collect();
+        match words[..] {
+            ["end_header"] => break,
+            [] | ["comment" | "obj_info", ..] => {}
+            ["format", kind, _] => {
+                encoding = Some(match kind {
+                    "ascii" => Encoding::Ascii,
+                    "binary_little_endian" => Encoding::Little,
+                    "binary_big_endian" => Encoding::Big,
+                    _ => return Err(fail("unknown format").found(kind)),
+                });
+            }
+            ["element", name, count] => {
+                let count = count
+                    .parse()
+                    .map_err(|_| Error::new("not a count").field(format!("element {name}")).found(count).hint(AGAIN))?;
+                elements.push(Element { name: name.into(), count, properties: Vec::new() });
+            }
+            ["property", "list", count, item, _] => {
+                let (Some(count), Some(item)) = (Scalar::parse(count), Scalar::parse(item)) else {
+                    return Err(fail("unknown type").found(line));
+                };
+                let e = elements.last_mut().ok_or_else(|| fail("a property before any element"))?;
+                e.properties.push(Property::List(count, item));
+            }
+            ["property", kind, name] => {
+                let kind = Scalar::parse(kind).ok_or_else(|| fail("unknown type").found(line))?;
+                let e = elements.last_mut().ok_or_else(|| fail("a property before any element"))?;
+                if e.properties.iter().any(|p| matches!(p, Property::Scalar(n, _) if n == name)) {
+                    return Err(fail("a property is named twice").found(name));
+                }
+                e.properties.push(Property::Scalar(name.into(), kind));
+            }
+            _ => return Err(fail("not understood").found(line)),
+        }
+    }
+    let encoding = encoding.ok_or_else(|| fail("no format line"))?;
+    Ok(Header { encoding, elements, body: rest })
+}
+
+fn cut_short(element: &str, rows: usize, count: usize) -> Error {
+    Error::new("the file is cut short or its count lies")
+        .field(format!("element {element}"))
+        .found(format!("{rows} rows"))
+        .expected(format!("{count} rows, as its header says"))
+        .hint(AGAIN)
+}
+
+/// A scalar property of the vertices.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Column {
+    at: usize,
+    scalar: Scalar,
+    big: bool,
+}
+
+impl Column {
+    /// The value in a row; a double becomes the nearest float.
+    #[inline]
+    pub(super) fn get(self, row: &[u8]) -> f32 {
+        let bytes = &row[self.at..];
+        // Nearly every 3DGS file holds little-endian floats only.
+        if let (Scalar::F32, false, Some(&b)) = (self.scalar, self.big, bytes.first_chunk()) {
+            return f32::from_le_bytes(b);
+        }
+        self.scalar.value(bytes, self.big) as f32
+    }
+
+    /// Whether the file stores it as a float or double.
+    pub(super) fn is_float(self) -> bool {
+        matches!(self.scalar, Scalar::F32 | Scalar::F64)
+    }
+}
+
+/// The rows of element `vertex`. Binary rows without lists stay where they lie in the file; all others are rewritten
+/// as little-endian floats, without their lists.
+pub(super) struct Table<'a> {
+    pub(super) count: usize,
+    stride: usize,
+    columns: Vec<(String, Column)>,
+    rows: Cow<'a, [u8]>,
+}
+
+impl Table<'_> {
+    /// The column of a property.
+    pub(super) fn column(&self, name: &str) -> Result<Column> {
+        self.find(name).ok_or_else(|| {
+            Error::new("the vertices lack a property")
+                .field(name)
+                .hint("give another kind of PLY: 3DGS Gaussians have f_dc_*, opacity, scale_* and rot_*")
+        })
+    }
+
+    /// The column of a property, where there is one.
+    pub(super) fn find(&self, name: &str) -> Option<Column> {
+        self.columns.iter().find(|(n, _)| n == name).map(|(_, c)| *c)
+    }
+
+    /// The vertices.
+    pub(super) fn rows(&self) -> impl Iterator<Item = &[u8]> {
+        self.rows.chunks_exact(self.stride.max(1))
+    }
+}
+
+/// Takes numbers off the front of an element's data, one encoding like another.
+struct Numbers<'a> {
+    rest: &'a [u8],
+    encoding: Encoding,
+    /// The current line's words, in ascii.
+    words: std::str::SplitAsciiWhitespace<'a>,
+}
+
+impl<'a> Numbers<'a> {
+    fn start_row(&mut self) -> Result<()> {
+        if self.encoding == Encoding::Ascii {
+            let end = self.rest.iter().position(|&b| b == b'\n').unwrap_or(self.rest.len());
+            let line: &'a [u8] = &self.rest[..end];
+            self.rest = &self.rest[(end + 1).min(self.rest.len())..];
+            self.words = std::str::from_utf8(line).map_err(|_| Error::new("not text"))?.split_ascii_whitespace();
+        }
+        Ok(())
+    }
+
+    /// The next number of the row; none where the data end.
+    fn next(&mut self, scalar: Scalar) -> Result<Option<f64>> {
+        if self.encoding == Encoding::Ascii {
+            let parse = |w: &str| w.parse().map_err(|_| Error::new("not a number").found(w));
+            return self.words.next().map(parse).transpose();
+        }
+        let Some((head, rest)) = self.rest.split_at_checked(scalar.size()) else { return Ok(None) };
+        self.rest = rest;
+        Ok(Some(scalar.value(head, self.encoding == Encoding::Big)))
+    }
+}
+
+/// Reads an element row by row: the scalars as little-endian floats, the lists skipped. Returns what lies behind it.
+fn read_rows<'a>(element: &Element, encoding: Encoding, body: &'a [u8], rows: &mut Vec<u8>) -> Result<&'a [u8]> {
+    let mut numbers = Numbers { rest: body, encoding, words: "".split_ascii_whitespace() };
+    for row in 0..element.count {
+        let at = |e: Error| e.field(format!("{} {row}", element.name)).hint(AGAIN);
+        let short = || cut_short(&element.name, row, element.count);
+        numbers.start_row().map_err(at)?;
+        for p in &element.properties {
+            match p {
+                Property::Scalar(_, s) => {
+                    let v = numbers.next(*s).map_err(at)?.ok_or_else(short)?;
+                    rows.extend((v as f32).to_le_bytes());
+                }
+                Property::List(count, item) => {
+                    let n = numbers.next(*count).map_err(at)?.ok_or_else(short)?;
+                    // A count that lies meets the data's end.
+                    for _ in 0..n as u64 {
+                        numbers.next(*item).map_err(at)?.ok_or_else(short)?;
+                    }
+                }
+            }
+        }
+    }
+    Ok(numbers.rest)
+}
+
+/// Reads the vertices of a PLY file and skips the elements before them.
+pub(super) fn read(bytes: &[u8]) -> Result<Table<'_>> {
+    let header = parse_header(bytes)?;
+    let mut body = header.body;
+    for element in &header.elements {
+        let wanted = element.name == "vertex";
+        // The smallest row that the encoding allows bounds how many the file can hold.
+        let smallest = |p: &Property| match (header.encoding, p) {
+            (Encoding::Ascii, _) => 2,
+            (_, Property::Scalar(_, s) | Property::List(s, _)) => s.size(),
+        };
+        let least = element.properties.iter().map(smallest).sum::<usize>().max(1);
+        // The last line of a text may lack its end.
+        if element.count > (body.len() + 1) / least {
+            return Err(cut_short(&element.name, body.len() / least, element.count));
+        }
+        let fixed = element.properties.iter().all(|p| matches!(p, Property::Scalar(..)));
+        let as_is = fixed && header.encoding != Encoding::Ascii;
+        let rows = if as_is {
+            let stride: usize = element.properties.iter().map(smallest).sum();
+            let total = stride.checked_mul(element.count);
+            let split = total.and_then(|t| body.split_at_checked(t));
+            let Some((head, rest)) = split else {
+                return Err(cut_short(&element.name, body.len() / least, element.count));
+            };
+            body = rest;
+            Cow::Borrowed(head)
+        } else {
+            let mut owned = Vec::new();
+            body = read_rows(element, header.encoding, body, &mut owned)?;
+            Cow::Owned(owned)
+        };
+        if wanted {
+            let mut stride = 0;
+            let mut columns = Vec::new();
+            for p in &element.properties {
+                let Property::Scalar(name, s) = p else { continue };
+                let scalar = if as_is { *s } else { Scalar::F32 };
+                columns.push((
+                    name.clone(),
+                    Column { at: stride, scalar, big: as_is && header.encoding == Encoding::Big },
+                ));
+                stride += scalar.size();
+            }
+            return Ok(Table { count: element.count, stride, columns, rows });
+        }
+    }
+    Err(Error::new("the file has no vertices").field("element vertex").hint(AGAIN))
+}
