@@ -3,8 +3,13 @@
 //! [`train`] is the loop; what it is made of is pure and in a module each: [`loss`], [`optimiser`], [`densify`],
 //! [`schedule`], [`init`]. [`checkpoint`] makes a killed run go on to the bytes of an undisturbed one.
 
+pub mod checkpoint;
+pub mod cli;
 pub mod densify;
 pub mod init;
 pub mod loss;
+pub mod metrics;
 pub mod optimiser;
+pub mod photographs;
 pub mod schedule;
+pub mod train;

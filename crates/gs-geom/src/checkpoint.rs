@@ -1,0 +1,179 @@
+//! Checkpoints: everything a run needs to go on to the bytes of an undisturbed one.
+
+use crate::densify::Pull;
+use crate::optimiser::Adam;
+use gs_io::{Artifact, ArtifactWriter, Error, Provenance, Result};
+use gs_scene::{Gaussians, sh_coefficients};
+use serde::{Deserialize, Serialize};
+use std::path::{Path, PathBuf};
+
+/// Format name of the artifact.
+pub const FORMAT: &str = "gs-geom-checkpoint";
+/// Version of the format.
+pub const VERSION: u32 = 1;
+
+/// State of an optimisation after some iterations. Random numbers are drawn from the seed and the iteration (see
+/// [`crate::schedule::generator`]), so no generator is part of it.
+#[derive(Debug, Clone, PartialEq)]
+pub struct State {
+    /// The parameters.
+    pub gaussians: Gaussians,
+    /// The optimiser's moments.
+    pub adam: Adam,
+    /// What densification has seen.
+    pub pull: Pull,
+    /// The rest.
+    pub progress: ProgressState,
+}
+
+/// Counters and the training curve.
+#[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
+pub struct ProgressState {
+    /// Iterations done.
+    pub iteration: u32,
+    /// Gradients of Gaussians that were not finite and so not used.
+    pub dropped: u64,
+    /// Gaussians cloned, split and removed so far.
+    pub densified: [u64; 3],
+    /// Sums of loss, L1 and SSIM, and their number, since the last line of the curve.
+    pub window: ([f64; 3], u32),
+    /// Lines of the training curve.
+    pub curve: Vec<String>,
+}
+
+#[derive(Serialize, Deserialize)]
+struct Extra {
+    steps: u64,
+    sh_degree: u8,
+    progress: ProgressState,
+}
+
+/// Where the checkpoint of an output lies: `<output>.checkpoint`.
+pub fn path_of(output: &Path) -> PathBuf {
+    let mut name = output.as_os_str().to_owned();
+    name.push(".checkpoint");
+    name.into()
+}
+
+/// A fresh run's state.
+pub fn start(gaussians: Gaussians) -> State {
+    let (adam, pull) = (Adam::new(&gaussians), Pull::new(gaussians.len()));
+    State { gaussians, adam, pull, progress: ProgressState::default() }
+}
+
+/// Writes a checkpoint; `provenance` tells by which run.
+///
+/// # Errors
+/// When the file cannot be written.
+pub fn write(path: &Path, state: &State, provenance: Provenance) -> Result<()> {
+    let extra =
+        Extra { steps: state.adam.steps, sh_degree: state.gaussians.sh_degree, progress: state.progress.clone() };
+    let extra = serde_json::to_value(&extra).map_err(|e| Error::new(e.to_string()).file(path))?;
+    let n = state.gaussians.len();
+    let mut writer = ArtifactWriter::new(Provenance { extra, ..provenance })
+        .tensor("pull_sum", &[n], &state.pull.sum)
+        .tensor("pull_views", &[n], &state.pull.views);
+    for (prefix, g) in [("", &state.gaussians), ("first_", &state.adam.first), ("second_", &state.adam.second)] {
+        writer = writer
+            .tensor(&format!("{prefix}means"), &[n, 3], g.means.as_flattened())
+            .tensor(&format!("{prefix}log_scales"), &[n, 3], g.log_scales.as_flattened())
+            .tensor(&format!("{prefix}rotations"), &[n, 4], g.rotations.as_flattened())
+            .tensor(&format!("{prefix}opacity_logits"), &[n], &g.opacity_logits)
+            .tensor(&format!("{prefix}sh"), &[n, g.sh_stride()], &g.sh);
+    }
+    writer.write(path)
+}
+
+/// Reads the checkpoint at `path`, if there is one of the same run: same program, parameters and inputs.
+///
+/// # Errors
+/// Says why the checkpoint cannot be used: damaged, or of another run.
+pub fn read(path: &Path, run: &Provenance) -> Result<Option<State>> {
+    if !path.exists() {
+        return Ok(None);
+    }
+    let a = Artifact::open(path, FORMAT, VERSION)?;
+    let p = a.provenance();
+    let same = [
+        ("program", p.program == run.program),
+        ("parameters", p.parameters == run.parameters),
+        ("inputs", p.inputs == run.inputs),
+    ];
+    if let Some((field, _)) = same.iter().find(|(_, same)| !same) {
+        return Err(Error::new("the checkpoint is of another run").file(path).field(*field));
+    }
+    let extra: Extra = serde_json::from_value(p.extra.clone())
+        .map_err(|e| Error::new(format!("damaged checkpoint: {e}")).file(path).field("extra"))?;
+    if extra.sh_degree > 3 {
+        return Err(Error::new("damaged checkpoint").file(path).field("sh_degree").found(extra.sh_degree));
+    }
+    let n = a.tensor::<u32>("pull_views", &[None])?.len();
+    let group = |prefix: &str| -> Result<Gaussians> {
+        let flat = |name: &str, width: usize| a.tensor::<f32>(&format!("{prefix}{name}"), &[Some(n), Some(width)]);
+        Ok(Gaussians {
+            means: flat("means", 3)?.as_chunks().0.to_vec(),
+            log_scales: flat("log_scales", 3)?.as_chunks().0.to_vec(),
+            rotations: flat("rotations", 4)?.as_chunks().0.to_vec(),
+            opacity_logits: a.tensor::<f32>(&format!("{prefix}opacity_logits"), &[Some(n)])?.to_vec(),
+            sh: flat("sh", 3 * sh_coefficients(extra.sh_degree))?.to_vec(),
+            sh_degree: extra.sh_degree,
+        })
+    };
+    Ok(Some(State {
+        gaussians: group("")?,
+        adam: Adam { first: group("first_")?, second: group("second_")?, steps: extra.steps },
+        pull: Pull {
+            sum: a.tensor::<f32>("pull_sum", &[Some(n)])?.to_vec(),
+            views: a.tensor::<u32>("pull_views", &[Some(n)])?.to_vec(),
+        },
+        progress: extra.progress,
+    }))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::optimiser::zeros;
+    use std::collections::BTreeMap;
+
+    fn provenance(seed: u64) -> Provenance {
+        Provenance {
+            format: FORMAT.into(),
+            version: VERSION,
+            program: "gs-geom 1".into(),
+            parameters: serde_json::json!({"seed": seed, "rate": 0.2f32}),
+            inputs: BTreeMap::from([("dataset".into(), "ab".into())]),
+            extra: serde_json::Value::Null,
+        }
+    }
+
+    #[test]
+    fn a_checkpoint_reads_back_bit_for_bit_and_only_for_its_run() {
+        let dir = tempfile::tempdir().unwrap();
+        let path = path_of(&dir.path().join("g.ply"));
+        assert_eq!(read(&path, &provenance(1)).unwrap(), None);
+        let mut g = zeros(5, 2);
+        let fill = |v: &mut [f32], at: f32| v.iter_mut().enumerate().for_each(|(i, v)| *v = at + (i as f32).sin());
+        fill(g.means.as_flattened_mut(), 1.0);
+        fill(&mut g.sh, 2.0);
+        let mut state = start(g);
+        fill(&mut state.adam.first.sh, 3.0);
+        fill(state.adam.second.rotations.as_flattened_mut(), 4.0);
+        fill(&mut state.pull.sum, 5.0);
+        state.adam.steps = 12;
+        state.progress = ProgressState {
+            iteration: 12,
+            dropped: 3,
+            densified: [1, 2, 3],
+            window: ([0.1, 1.0 / 3.0, f64::MIN_POSITIVE], 7),
+            curve: vec!["{\"iteration\":10}".into()],
+        };
+        write(&path, &state, provenance(1)).unwrap();
+        assert_eq!(read(&path, &provenance(1)).unwrap().unwrap(), state);
+        let e = read(&path, &provenance(2)).unwrap_err().to_string();
+        assert!(e.contains("parameters: the checkpoint is of another run"), "{e}");
+        let bytes = std::fs::read(&path).unwrap();
+        std::fs::write(&path, &bytes[..bytes.len() - 9]).unwrap();
+        assert!(read(&path, &provenance(1)).is_err());
+    }
+}

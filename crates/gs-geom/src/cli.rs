@@ -1,0 +1,126 @@
+//! The command line of `gs-geom`.
+
+mod eval;
+mod render;
+mod train;
+
+use clap::{Parser, Subcommand, ValueEnum};
+use gs_io::{Error, Result, create_dir, write_bytes};
+use gs_scene::Gaussians;
+use gs_scene::dataset::{self, Dataset, LoadOptions, Resolution};
+use gs_scene::ply;
+use stage::{CommonArgs, Program, Stage};
+use std::path::{Path, PathBuf};
+
+/// Optimise 3D Gaussians from posed photographs, render them, measure them
+#[derive(Debug, Parser)]
+#[command(name = "gs-geom", version)]
+pub struct Args {
+    #[command(subcommand)]
+    command: Command,
+    #[command(flatten)]
+    common: CommonArgs,
+}
+
+#[derive(Debug, Subcommand)]
+enum Command {
+    /// Optimise Gaussians until they look like the photographs
+    Train(Box<train::TrainArgs>),
+    /// Render views of a dataset as PNG, and as EXR with alpha and depth on request
+    Render(render::RenderArgs),
+    /// PSNR and SSIM on held-out views
+    Eval(eval::EvalArgs),
+}
+
+impl Program for Args {
+    const NAME: &'static str = "gs-geom";
+
+    fn common(&self) -> &CommonArgs {
+        &self.common
+    }
+
+    fn run(self, stage: &Stage) -> Result<()> {
+        match self.command {
+            Command::Train(args) => args.run(stage),
+            Command::Render(args) => args.run(stage),
+            Command::Eval(args) => args.run(stage),
+        }
+    }
+}
+
+/// Which photographs, and at which size.
+#[derive(Debug, clap::Args)]
+struct SceneArgs {
+    /// Dataset folder (COLMAP, transforms.json or ScanNet)
+    #[arg(long, value_name = "DIR")]
+    scene: PathBuf,
+    /// Divisor of the photographs' size, or auto: at most 1600 pixels wide
+    #[arg(long, value_name = "auto|DIVISOR", default_value = "auto")]
+    resolution: Resolution,
+    /// Hold out every n-th view, from the first; 0 holds none out
+    #[arg(long, value_name = "N", default_value_t = 8)]
+    holdout: usize,
+    /// Colour behind the scene, and behind transparent pixels of the photographs
+    #[arg(long, value_enum, default_value_t = Background::Black)]
+    background: Background,
+}
+
+#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
+enum Background {
+    Black,
+    White,
+}
+
+impl Background {
+    fn color(self) -> [f32; 3] {
+        match self {
+            Self::Black => [0.0; 3],
+            Self::White => [1.0; 3],
+        }
+    }
+}
+
+/// Warnings of a dataset that are said one by one.
+const WARNINGS_SAID: usize = 5;
+
+impl SceneArgs {
+    fn load(&self, stage: &Stage) -> Result<Dataset> {
+        let options = LoadOptions { resolution: self.resolution, holdout: self.holdout };
+        let dataset = dataset::load(&self.scene, &options)?;
+        for warning in dataset.warnings.iter().take(WARNINGS_SAID) {
+            stage.warn(warning);
+        }
+        if dataset.warnings.len() > WARNINGS_SAID {
+            stage.warn(&format!("{} more warnings about the dataset", dataset.warnings.len() - WARNINGS_SAID));
+        }
+        Ok(dataset)
+    }
+}
+
+fn read_geometry(path: &Path) -> Result<Gaussians> {
+    let gaussians = ply::read_gaussians(path)?;
+    if gaussians.is_empty() {
+        return Err(Error::new("no Gaussians").file(path).field("element vertex").hint("train the geometry again"));
+    }
+    Ok(gaussians)
+}
+
+/// Finds out before the work, not after it, that an output cannot be written.
+fn check_writable(output: &Path) -> Result<()> {
+    if output.is_dir() {
+        return Err(Error::new("a folder is in the way").file(output).expected("the name of a file"));
+    }
+    let folder = output.parent().filter(|p| !p.as_os_str().is_empty()).unwrap_or(Path::new("."));
+    create_dir(folder)?;
+    let probe = beside(output, ".probe");
+    write_bytes(&probe, b"")?;
+    let _ = std::fs::remove_file(probe);
+    Ok(())
+}
+
+/// `<output><suffix>`.
+fn beside(output: &Path, suffix: &str) -> PathBuf {
+    let mut name = output.as_os_str().to_owned();
+    name.push(suffix);
+    name.into()
+}

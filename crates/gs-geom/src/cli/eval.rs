@@ -1,0 +1,83 @@
+//! `gs-geom eval`.
+
+use super::{SceneArgs, check_writable, read_geometry};
+use crate::metrics::{ViewMetrics, mean, measure};
+use artifacts::role;
+use gs_io::{Error, Result, hash_file, write_bytes};
+use gs_raster::RasterOptions;
+use gs_scene::dataset::{Split, View};
+use serde_json::json;
+use stage::Stage;
+use std::collections::BTreeMap;
+use std::path::PathBuf;
+
+/// Arguments of `gs-geom eval`.
+#[derive(Debug, clap::Args)]
+pub(super) struct EvalArgs {
+    #[command(flatten)]
+    scene: SceneArgs,
+    /// Gaussians, as a 3DGS PLY
+    #[arg(long, value_name = "FILE")]
+    geometry: PathBuf,
+    /// Where to write the figures, as JSON
+    #[arg(long, value_name = "FILE")]
+    out: PathBuf,
+}
+
+impl EvalArgs {
+    pub(super) fn run(&self, stage: &Stage) -> Result<()> {
+        let dataset = self.scene.load(stage)?;
+        let gaussians = read_geometry(&self.geometry)?;
+        check_writable(&self.out)?;
+        let mut split = Split::Test;
+        let mut views: Vec<&View> = dataset.views_of(split).collect();
+        if views.is_empty() {
+            stage.warn("no view is held out: measuring on the training views, which says little of other views");
+            split = Split::Train;
+            views = dataset.views_of(split).collect();
+        }
+        let options = RasterOptions { background: self.scene.background.color(), ..RasterOptions::default() };
+        let mut progress = stage.progress("view", views.len() as u64);
+        let mut figures: Vec<ViewMetrics> = Vec::new();
+        for view in &views {
+            if stage.interrupted() {
+                return Err(Error::new("interrupted"));
+            }
+            figures.push(measure(&gaussians, view, &options)?);
+            progress.step();
+        }
+        let psnr = mean(figures.iter().map(|f| f.psnr));
+        let ssim = mean(figures.iter().map(|f| f.ssim));
+        progress.finish(&[("psnr", psnr.unwrap_or(0.0)), ("ssim", ssim.unwrap_or(0.0))]);
+        let heldout = split == Split::Test;
+        let if_heldout = |v: Option<f64>| v.filter(|_| heldout);
+        let metrics = json!({
+            "split": if heldout { "test" } else { "train" },
+            "psnr_heldout": if_heldout(psnr),
+            "ssim_heldout": if_heldout(ssim),
+            "psnr_train": psnr.filter(|_| !heldout),
+            "ssim_train": ssim.filter(|_| !heldout),
+            "gaussians": gaussians.len(),
+            "views": figures,
+        });
+        let text = serde_json::to_vec_pretty(&metrics).map_err(|e| Error::new(e.to_string()).file(&self.out))?;
+        write_bytes(&self.out, &text)?;
+        let parameters = json!({
+            "resolution": self.scene.resolution.to_string(),
+            "holdout": self.scene.holdout,
+            "background": self.scene.background.color(),
+        });
+        let inputs = BTreeMap::from([
+            (role::DATASET.to_string(), dataset.hash()?),
+            (role::GEOMETRY.to_string(), hash_file(&self.geometry)?),
+        ]);
+        let summary = json!({
+            "split": metrics["split"],
+            "psnr": psnr,
+            "ssim": ssim,
+            "views": figures.len(),
+            "gaussians": gaussians.len(),
+        });
+        stage.record(&self.out, parameters, inputs, summary)
+    }
+}

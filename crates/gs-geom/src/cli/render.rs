@@ -1,0 +1,111 @@
+//! `gs-geom render`.
+
+use super::{SceneArgs, read_geometry};
+use gs_io::{Error, Result, create_dir, write_bytes};
+use gs_raster::{RasterOptions, Rendered, render};
+use gs_scene::Image;
+use gs_scene::dataset::{Dataset, Split, View};
+use stage::Stage;
+use std::collections::BTreeSet;
+use std::io::Cursor;
+use std::path::PathBuf;
+
+/// Arguments of `gs-geom render`.
+#[derive(Debug, clap::Args)]
+pub(super) struct RenderArgs {
+    #[command(flatten)]
+    scene: SceneArgs,
+    /// Gaussians, as a 3DGS PLY
+    #[arg(long, value_name = "FILE")]
+    geometry: PathBuf,
+    /// Folder for the pictures, named after the photographs
+    #[arg(long, value_name = "DIR")]
+    out: PathBuf,
+    /// test (held-out), train, all, or names of photographs separated by commas
+    #[arg(long, value_name = "VIEWS", default_value = "test")]
+    views: String,
+    /// Also write <name>.exr: R, G, B, A (accumulated alpha) and Z (mean depth along the optical axis) as 32-bit floats
+    #[arg(long)]
+    exr: bool,
+}
+
+impl RenderArgs {
+    pub(super) fn run(&self, stage: &Stage) -> Result<()> {
+        let dataset = self.scene.load(stage)?;
+        let gaussians = read_geometry(&self.geometry)?;
+        let views = choose(&dataset, &self.views)?;
+        create_dir(&self.out)?;
+        let options = RasterOptions { background: self.scene.background.color(), ..RasterOptions::default() };
+        let mut progress = stage.progress("view", views.len() as u64);
+        for view in &views {
+            if stage.interrupted() {
+                return Err(Error::new("interrupted"));
+            }
+            let r = render(&gaussians, &view.camera, &options);
+            if self.exr {
+                write_bytes(self.out.join(format!("{}.exr", view.stem())), &exr_bytes(&r)?)?;
+            }
+            let picture = Image { width: r.width, height: r.height, rgb: r.rgb, alpha: None };
+            picture.write_png(self.out.join(format!("{}.png", view.stem())))?;
+            progress.step();
+        }
+        progress.finish(&[]);
+        stage.info(&format!("{} views in {}", views.len(), self.out.display()));
+        Ok(())
+    }
+}
+
+/// The views that `wanted` names, in the dataset's order.
+fn choose<'a>(dataset: &'a Dataset, wanted: &str) -> Result<Vec<&'a View>> {
+    let views: Vec<&View> = match wanted {
+        "all" => dataset.views.iter().collect(),
+        "test" => dataset.views_of(Split::Test).collect(),
+        "train" => dataset.views_of(Split::Train).collect(),
+        names => {
+            let names: BTreeSet<&str> = names.split(',').map(str::trim).filter(|n| !n.is_empty()).collect();
+            let known = |n: &&&str| dataset.views.iter().any(|v| v.stem() == **n || v.name == **n);
+            if let Some(unknown) = names.iter().find(|n| !known(n)) {
+                return Err(Error::new("no such view").file(&dataset.root).field("--views").found(unknown).expected(
+                    format!("a photograph's name such as {}", dataset.views.first().map_or("", |v| v.stem())),
+                ));
+            }
+            dataset.views.iter().filter(|v| names.contains(v.stem()) || names.contains(v.name.as_str())).collect()
+        }
+    };
+    if views.is_empty() {
+        return Err(Error::new("no views to render")
+            .file(&dataset.root)
+            .field("--views")
+            .found(wanted)
+            .hint("give --views all, or --holdout 8"));
+    }
+    let mut stems = BTreeSet::new();
+    if let Some(twice) = views.iter().find(|v| !stems.insert(v.stem())) {
+        return Err(Error::new("two views would have the same file name").file(&dataset.root).field(&twice.name));
+    }
+    Ok(views)
+}
+
+/// R, G, B, A and Z of a render as an OpenEXR file. Z is the mean depth of what is seen, 0 where nothing is.
+fn exr_bytes(r: &Rendered) -> Result<Vec<u8>> {
+    use exr::prelude::{AnyChannel, AnyChannels, FlatSamples, Image, WritableImage};
+    let channel = |name: &str, values: Vec<f32>| AnyChannel::<FlatSamples>::new(name, FlatSamples::F32(values));
+    let color = |c: usize| r.rgb.iter().skip(c).step_by(3).copied().collect();
+    let depth = r.depth.iter().zip(&r.alpha).map(|(z, a)| if *a > 0.0 { z / a } else { 0.0 }).collect();
+    let all = [
+        channel("R", color(0)),
+        channel("G", color(1)),
+        channel("B", color(2)),
+        channel("A", r.alpha.clone()),
+        channel("Z", depth),
+    ];
+    let image =
+        Image::from_channels((r.width as usize, r.height as usize), AnyChannels::sort(all.into_iter().collect()));
+    let mut bytes = Cursor::new(Vec::new());
+    image
+        .write()
+        .non_parallel()
+        .to_buffered(&mut bytes)
+        .map_err(|e| Error::new(format!("cannot encode as OpenEXR: {e}")))?;
+    Ok(bytes.into_inner())
+}

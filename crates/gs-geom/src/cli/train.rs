@@ -1,0 +1,393 @@
+//! `gs-geom train`.
+
+use super::{SceneArgs, beside, check_writable, read_geometry};
+use crate::checkpoint::{self, State};
+use crate::densify::{DensifyOptions, remove_invisible};
+use crate::init;
+use crate::photographs::Photographs;
+use crate::schedule::{LearningRates, Schedule};
+use crate::train::{Timings, TrainOptions, Trainer};
+use artifacts::role;
+use gs_io::{Error, Provenance, Result, hash_file, write_bytes};
+use gs_scene::dataset::{Dataset, Split, View};
+use gs_scene::{Camera, Gaussians, PointCloud, ply};
+use serde_json::{Value, json};
+use stage::Stage;
+use std::collections::BTreeMap;
+use std::path::{Path, PathBuf};
+use std::str::FromStr;
+use std::time::{Duration, Instant};
+
+/// Arguments of `gs-geom train`.
+#[derive(Debug, clap::Args)]
+pub(super) struct TrainArgs {
+    #[command(flatten)]
+    scene: SceneArgs,
+    /// Where to write the Gaussians, as a 3DGS PLY; checkpoint, training curve and record of the run lie beside it
+    #[arg(long, value_name = "FILE")]
+    out: PathBuf,
+    /// Steps of the optimiser, one view each
+    #[arg(long, value_name = "COUNT", default_value_t = 30_000)]
+    iterations: u32,
+    /// Degree of the spherical harmonics, 0 to 3
+    #[arg(long, value_name = "DEGREE", default_value_t = 3, value_parser = clap::value_parser!(u8).range(0..=3))]
+    sh_degree: u8,
+    /// Start from these Gaussians instead of the dataset's points
+    #[arg(long, value_name = "FILE")]
+    init: Option<PathBuf>,
+    /// Random points to start from where the dataset has none
+    #[arg(long, value_name = "COUNT", default_value_t = 20_000)]
+    init_points: usize,
+    /// Keep number, order and positions of the points: Gaussian i is point i (ScanNet protocol)
+    #[arg(long)]
+    fixed_points: bool,
+    /// Most Gaussians there may be
+    #[arg(long, value_name = "COUNT", default_value_t = DensifyOptions::default().max_gaussians)]
+    max_gaussians: usize,
+    /// Weight of 1 - SSIM in the loss, 0 to 1
+    #[arg(long, value_name = "WEIGHT", default_value_t = 0.2)]
+    dssim: f32,
+    /// Clone or split Gaussians whose projection is pulled harder than this, on average
+    #[arg(long, value_name = "GRADIENT", default_value_t = DensifyOptions::default().gradient)]
+    densify_gradient: f32,
+    /// Densify after this iteration [a twentieth of the iterations, at most 500]
+    #[arg(long, value_name = "ITERATION")]
+    densify_from: Option<u32>,
+    /// Densify and reset opacities before this iteration [half the iterations; more in runs below 15,000]
+    #[arg(long, value_name = "ITERATION")]
+    densify_until: Option<u32>,
+    /// Iterations between densifications [a sixtieth of the iterations, 10 to 100]
+    #[arg(long, value_name = "COUNT")]
+    densify_every: Option<u32>,
+    /// Iterations between opacity resets [3000]
+    #[arg(long, value_name = "COUNT")]
+    opacity_reset_every: Option<u32>,
+    /// Iterations after which the spherical harmonics gain a degree [a tenth of the iterations, at most 1000]
+    #[arg(long, value_name = "COUNT")]
+    sh_every: Option<u32>,
+    /// Learning rate of the opacities; 3DGS had 0.05 first and 0.025 later
+    #[arg(long, value_name = "RATE", default_value_t = LearningRates::default().opacity)]
+    opacity_rate: f64,
+    /// Learning rate of the positions at the start, per unit of the scene's extent; a hundredth of it at the end
+    #[arg(long, value_name = "RATE", default_value_t = LearningRates::default().position)]
+    position_rate: f64,
+    /// Begin with small pictures: a quarter of the size, then half
+    #[arg(long)]
+    coarse: bool,
+    /// Memory for decoded photographs; the rest is decoded anew each time
+    #[arg(long, value_name = "MEGABYTES", default_value_t = 2048)]
+    cache: usize,
+    /// Write a checkpoint every so many iterations (500) or seconds (60s); a run that finds one goes on from it
+    #[arg(long, value_name = "COUNT|SECONDS", default_value = "60s")]
+    checkpoint_every: Every,
+    /// Ignore a checkpoint and begin anew
+    #[arg(long)]
+    no_resume: bool,
+    /// Stop after this iteration with a checkpoint and <out>.partial.ply, as an interruption would
+    #[arg(long, value_name = "ITERATION")]
+    stop_after: Option<u32>,
+}
+
+/// How often to write a checkpoint.
+#[derive(Debug, Clone, Copy, PartialEq)]
+enum Every {
+    Iterations(u32),
+    Seconds(f64),
+}
+
+impl FromStr for Every {
+    type Err = Error;
+
+    fn from_str(s: &str) -> Result<Self> {
+        let wrong = || Error::new("not a period").found(s).expected("iterations such as 500, or seconds such as 60s");
+        match s.strip_suffix('s') {
+            Some(t) => t.parse().ok().filter(|t: &f64| *t >= 0.0).map(Self::Seconds).ok_or_else(wrong),
+            None => s.parse().ok().filter(|n: &u32| *n > 0).map(Self::Iterations).ok_or_else(wrong),
+        }
+    }
+}
+
+impl TrainArgs {
+    fn options(&self, seed: u64) -> Result<TrainOptions> {
+        let positive = |field: &str, value: f64, most: f64| {
+            if value > 0.0 && value <= most {
+                return Ok(());
+            }
+            Err(Error::new("out of range").field(field).found(value).expected(format!("more than 0, at most {most}")))
+        };
+        positive("--iterations", f64::from(self.iterations), 1e8)?;
+        positive("--densify-gradient", f64::from(self.densify_gradient), 1e9)?;
+        positive("--opacity-rate", self.opacity_rate, 10.0)?;
+        positive("--position-rate", self.position_rate, 10.0)?;
+        positive("--max-gaussians", self.max_gaussians as f64, 1e9)?;
+        if !(0.0..=1.0).contains(&self.dssim) {
+            return Err(Error::new("out of range").field("--dssim").found(self.dssim).expected("0 to 1"));
+        }
+        let mut schedule = Schedule::for_iterations(self.iterations);
+        let set = |to: &mut u32, from: Option<u32>, least: u32| *to = from.map_or(*to, |v| v.max(least));
+        set(&mut schedule.densify_from, self.densify_from, 0);
+        set(&mut schedule.densify_until, self.densify_until, 0);
+        set(&mut schedule.densify_every, self.densify_every, 1);
+        set(&mut schedule.opacity_reset_every, self.opacity_reset_every, 1);
+        set(&mut schedule.sh_every, self.sh_every, 1);
+        if self.coarse {
+            schedule.coarse = vec![(self.iterations / 6, 4), (self.iterations / 3, 2)];
+        }
+        Ok(TrainOptions {
+            seed,
+            schedule,
+            rates: LearningRates {
+                opacity: self.opacity_rate,
+                position: self.position_rate,
+                position_end: self.position_rate / 100.0,
+                ..LearningRates::default()
+            },
+            densify: DensifyOptions {
+                gradient: self.densify_gradient,
+                max_gaussians: self.max_gaussians,
+                ..DensifyOptions::default()
+            },
+            dssim_weight: self.dssim,
+            background: self.scene.background.color(),
+            fixed_points: self.fixed_points,
+        })
+    }
+
+    pub(super) fn run(&self, stage: &Stage) -> Result<()> {
+        // From here on a signal ends the run with a checkpoint.
+        stage.interrupted();
+        let options = self.options(stage.seed())?;
+        let dataset = self.scene.load(stage)?;
+        let of = |split: Split| dataset.views_of(split).collect::<Vec<&View>>();
+        let (train, heldout) = (of(Split::Train), of(Split::Test));
+        if train.is_empty() {
+            return Err(Error::new("every view is held out")
+                .file(&self.scene.scene)
+                .found(format!("{} views", dataset.views.len()))
+                .expected("at least one view to learn from")
+                .hint("give --holdout 0, or more photographs"));
+        }
+        check_writable(&self.out)?;
+
+        let mut inputs = BTreeMap::from([(role::DATASET.to_string(), dataset.hash()?)]);
+        if let Some(init) = &self.init {
+            inputs.insert("init".into(), hash_file(init)?);
+        }
+        let parameters = json!({
+            "resolution": self.scene.resolution.to_string(),
+            "holdout": self.scene.holdout,
+            "sh_degree": self.sh_degree,
+            "init_points": self.init_points,
+            "options": options,
+        });
+        let run = stage.provenance(checkpoint::FORMAT, checkpoint::VERSION, parameters.clone(), inputs.clone());
+
+        let cameras: Vec<&Camera> = train.iter().map(|v| &v.camera).collect();
+        let extent = init::extent(&cameras, &dataset.points.positions);
+        let saved = self.saved(&run, stage);
+        let state = match saved {
+            Some(state) => state,
+            None => checkpoint::start(self.start(&dataset, &cameras, extent, stage)?),
+        };
+        stage.info(&format!(
+            "{} training views and {} held out, {}x{} pixels; {} Gaussians; extent {extent:.3}",
+            train.len(),
+            heldout.len(),
+            cameras[0].width,
+            cameras[0].height,
+            state.gaussians.len()
+        ));
+        let budget = self.cache.saturating_mul(1 << 20);
+        let background = options.background;
+        let load = |views, divisor| Photographs::load(views, background, budget, divisor);
+        let photographs = load(train, options.schedule.divisor(state.progress.iteration + 1))?;
+        let mut trainer = Trainer::resume(options, extent, photographs, load(heldout, 1)?, state);
+        if self.optimise(&mut trainer, &run, stage)? { self.finish(trainer, parameters, inputs, stage) } else { Ok(()) }
+    }
+
+    /// The state of an interrupted run of the same parameters and inputs.
+    fn saved(&self, run: &Provenance, stage: &Stage) -> Option<State> {
+        let path = checkpoint::path_of(&self.out);
+        if self.no_resume {
+            return None;
+        }
+        match checkpoint::read(&path, run) {
+            Ok(state) => {
+                if let Some(state) = &state {
+                    stage.info(&format!("going on after iteration {}", state.progress.iteration));
+                }
+                state
+            }
+            Err(e) => {
+                stage.warn(&format!("beginning anew: {e}"));
+                None
+            }
+        }
+    }
+
+    /// The Gaussians before the first iteration.
+    fn start(&self, dataset: &Dataset, cameras: &[&Camera], extent: f64, stage: &Stage) -> Result<Gaussians> {
+        if let Some(path) = &self.init {
+            return Ok(init::with_degree(read_geometry(path)?, self.sh_degree));
+        }
+        let random: PointCloud;
+        let points = if !dataset.points.is_empty() {
+            &dataset.points
+        } else if self.fixed_points {
+            return Err(Error::new("no points to keep")
+                .file(&self.scene.scene)
+                .field("points")
+                .hint("--fixed-points needs a dataset with points, such as ScanNet's vertices"));
+        } else {
+            stage.info(&format!("the dataset has no points: starting from {} random ones", self.init_points));
+            random = init::random_points(cameras, self.init_points, stage.seed());
+            &random
+        };
+        init::from_points(points, self.sh_degree, extent).map_err(|e| e.file(&self.scene.scene))
+    }
+
+    /// Runs the iterations; whether all are done.
+    fn optimise(&self, trainer: &mut Trainer<'_>, run: &Provenance, stage: &Stage) -> Result<bool> {
+        let first = trainer.state().progress.iteration;
+        let mut progress = stage.progress("iteration", self.iterations.into()).resumed_at(first.into());
+        let mut saved = Instant::now();
+        let mut smooth: Option<f64> = None;
+        while !trainer.is_done() {
+            let iteration = trainer.state().progress.iteration;
+            let stop = self.stop_after.is_some_and(|last| iteration >= last);
+            if stop || stage.interrupted() {
+                self.save(trainer, run)?;
+                let partial = beside(&self.out, ".partial.ply");
+                let note = format!("unfinished: {iteration} of {} iterations", self.iterations);
+                ply::write_gaussians(&partial, &trainer.state().gaussians, &[note])?;
+                stage.info(&format!(
+                    "stopped after iteration {iteration}; the same command goes on from here. The Gaussians so far: {}",
+                    partial.display()
+                ));
+                return if stop { Ok(false) } else { Err(Error::new("interrupted")) };
+            }
+            trainer.step()?;
+            let iteration = iteration + 1;
+            let loss = trainer.last_loss().total;
+            let s = smooth.get_or_insert(loss);
+            *s += 0.02 * (loss - *s);
+            progress.set(iteration.into(), &[("loss", *s), ("Gaussians", trainer.state().gaussians.len() as f64)]);
+            let due = match self.checkpoint_every {
+                Every::Iterations(n) => iteration.is_multiple_of(n),
+                Every::Seconds(s) => saved.elapsed().as_secs_f64() >= s,
+            };
+            if due && !trainer.is_done() {
+                self.save(trainer, run)?;
+                saved = Instant::now();
+            }
+        }
+        progress.finish(&[("loss", smooth.unwrap_or(0.0))]);
+        Ok(true)
+    }
+
+    fn save(&self, trainer: &Trainer<'_>, run: &Provenance) -> Result<()> {
+        checkpoint::write(&checkpoint::path_of(&self.out), trainer.state(), run.clone())
+    }
+
+    /// Writes everything a finished run leaves.
+    fn finish(
+        &self,
+        trainer: Trainer<'_>,
+        parameters: Value,
+        inputs: BTreeMap<String, String>,
+        stage: &Stage,
+    ) -> Result<()> {
+        let psnr = trainer.heldout_psnr()?;
+        let timings = trainer.timings();
+        let State { mut gaussians, progress, .. } = trainer.into_state();
+        if !self.fixed_points {
+            let removed = remove_invisible(&mut gaussians);
+            if removed > 0 {
+                stage.skipped(&format!("{removed} Gaussians: too faint to be drawn"));
+            }
+        }
+        if progress.dropped > 0 {
+            stage.warn(&format!("{} gradients of Gaussians were not finite and were not used", progress.dropped));
+        }
+        let curve: String = progress.curve.iter().map(|line| format!("{line}\n")).collect();
+        write_bytes(beside(&self.out, ".curve.jsonl"), curve.as_bytes())?;
+        ply::write_gaussians(&self.out, &gaussians, &comments(&parameters, &inputs))?;
+        let [cloned, split, removed] = progress.densified;
+        let heldout = psnr.map_or(String::new(), |p| format!(", {p:.2} dB on held-out views"));
+        stage.info(&format!(
+            "{} Gaussians ({cloned} cloned, {split} split, {removed} removed){heldout}; {}",
+            gaussians.len(),
+            shares(timings)
+        ));
+        let summary = json!({
+            "gaussians": gaussians.len(),
+            "psnr_heldout": psnr,
+            "iterations": progress.iteration,
+            "dropped_gradients": progress.dropped,
+            "seconds": seconds(timings),
+        });
+        stage.record(&self.out, parameters, inputs, summary)?;
+        for leftover in [checkpoint::path_of(&self.out), beside(&self.out, ".partial.ply")] {
+            remove_if_there(&leftover);
+        }
+        Ok(())
+    }
+}
+
+fn remove_if_there(path: &Path) {
+    // What cannot be removed does no harm.
+    let _ = std::fs::remove_file(path);
+}
+
+fn parts(t: Timings) -> [(&'static str, Duration); 5] {
+    [("forward", t.forward), ("loss", t.loss), ("backward", t.backward), ("Adam", t.adam), ("rest", t.rest)]
+}
+
+fn seconds(t: Timings) -> Value {
+    Value::Object(parts(t).into_iter().map(|(name, d)| (name.into(), json!(d.as_secs_f64()))).collect())
+}
+
+fn shares(t: Timings) -> String {
+    let total = parts(t).iter().map(|(_, d)| d.as_secs_f64()).sum::<f64>().max(1e-9);
+    let all: Vec<String> =
+        parts(t).iter().map(|(name, d)| format!("{name} {:.0}%", 100.0 * d.as_secs_f64() / total)).collect();
+    format!("{total:.1} s: {}", all.join(", "))
+}
+
+/// Provenance as comment lines of the PLY: program, inputs, parameters.
+fn comments(parameters: &Value, inputs: &BTreeMap<String, String>) -> Vec<String> {
+    let mut lines = vec![format!("made by gs-geom {}", env!("CARGO_PKG_VERSION"))];
+    lines.extend(inputs.iter().map(|(role, hash)| format!("{role} {hash}")));
+    let mut add = |prefix: &str, value: &Value| {
+        if let Value::Object(map) = value {
+            lines.extend(map.iter().filter(|(_, v)| !v.is_object()).map(|(k, v)| format!("{prefix}{k} {v}")));
+        }
+    };
+    add("", parameters);
+    add("", &parameters["options"]);
+    for group in ["schedule", "rates", "densify"] {
+        add(&format!("{group}."), &parameters["options"][group]);
+    }
+    lines
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn periods_are_read() {
+        assert_eq!("40".parse::<Every>().unwrap(), Every::Iterations(40));
+        assert_eq!("2.5s".parse::<Every>().unwrap(), Every::Seconds(2.5));
+        for wrong in ["0", "-1", "s", "x", "-3s", ""] {
+            assert!(wrong.parse::<Every>().is_err(), "{wrong}");
+        }
+    }
+
+    #[test]
+    fn comments_name_every_parameter_once() {
+        let parameters = json!({"resolution": "auto", "options": {"seed": 1, "rates": {"opacity": 0.05}}});
+        let lines = comments(&parameters, &BTreeMap::from([("dataset".into(), "ab".into())]));
+        assert_eq!(lines[1..], ["dataset ab", "resolution \"auto\"", "seed 1", "rates.opacity 0.05"]);
+    }
+}
