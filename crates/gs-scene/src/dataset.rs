@@ -1,14 +1,17 @@
 //! Posed photographs: [`load`] recognises the layout of a folder and gives its views.
 
 mod scannet;
+mod sparse;
 mod transforms;
+mod view;
 
-use crate::distortion::Distortion;
-use crate::{Camera, Image, PointCloud, colmap, image};
-use glam::{DMat3, DVec3};
+use crate::{PointCloud, colmap};
+use glam::{DMat3, DMat4, DQuat, DVec3};
 use gs_io::{Error, IoContext, Result, hash_bytes, hash_file};
 use rayon::prelude::*;
-use std::path::{Path, PathBuf};
+use std::path::{Component, Path, PathBuf};
+pub use view::View;
+use view::{Lens, stems};
 
 /// Which layout a folder has.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -19,6 +22,16 @@ pub enum Format {
     Transforms,
     /// ScanNet: `color/`, `pose/`, `intrinsic/`.
     ScanNet,
+}
+
+impl std::fmt::Display for Format {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        f.write_str(match self {
+            Self::Colmap => "COLMAP",
+            Self::Transforms => "transforms.json",
+            Self::ScanNet => "ScanNet",
+        })
+    }
 }
 
 /// What a view is for.
@@ -78,7 +91,7 @@ pub struct LoadOptions {
     /// How much photographs are shrunk.
     pub resolution: Resolution,
     /// Every n-th view by sorted name is held out, from the first; 0 holds none out. A dataset that names its own
-    /// held-out views (`transforms_test.json`) keeps to them.
+    /// held-out views (in `transforms_test.json` or nerfstudio's `test_filenames`) keeps to them.
     pub holdout: usize,
 }
 
@@ -88,28 +101,6 @@ impl Default for LoadOptions {
     }
 }
 
-/// A posed photograph.
-#[derive(Debug, Clone, PartialEq)]
-pub struct View {
-    /// File name relative to the images folder, or as the dataset gives it.
-    pub name: String,
-    /// Where the photograph lies.
-    pub image_path: PathBuf,
-    /// The undistorted camera at the requested resolution.
-    pub camera: Camera,
-    /// What the view is for.
-    pub split: Split,
-    /// The camera as it took the photograph: width, height, fx, fy, cx, cy, and its lens.
-    source: Source,
-}
-
-#[derive(Debug, Clone, Copy, PartialEq)]
-struct Source {
-    size: (u32, u32),
-    focal_center: [f64; 4],
-    distortion: Distortion,
-}
-
 /// Posed photographs and sparse points.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Dataset {
@@ -117,7 +108,7 @@ pub struct Dataset {
     pub root: PathBuf,
     /// Its layout.
     pub format: Format,
-    /// All views, sorted by name.
+    /// All views, sorted by name (ScanNet's by number).
     pub views: Vec<View>,
     /// Sparse points; may be empty.
     pub points: PointCloud,
@@ -129,7 +120,7 @@ pub struct Dataset {
 struct RawView {
     name: String,
     image_path: PathBuf,
-    source: Source,
+    lens: Lens,
     rotation: DMat3,
     translation: DVec3,
     split: Option<Split>,
@@ -154,7 +145,7 @@ pub fn load(path: &Path, options: &LoadOptions) -> Result<Dataset> {
             .file(path)
             .hint("give the folder of a COLMAP, transforms.json or ScanNet scene"));
     } else if let Some(model) = colmap::find_model(path) {
-        load_colmap(path, &model)?
+        sparse::load(path, &model)?
     } else if let Some(files) = transforms::find(path) {
         transforms::load(path, &files)?
     } else if scannet::is_scannet(path) {
@@ -169,127 +160,30 @@ pub fn load(path: &Path, options: &LoadOptions) -> Result<Dataset> {
 }
 
 fn finish(root: &Path, mut raw: RawDataset, options: &LoadOptions) -> Result<Dataset> {
-    raw.views.sort_by(|a, b| a.name.cmp(&b.name));
-    if let Some(w) = raw.views.windows(2).find(|w| w[0].name == w[1].name) {
-        return Err(Error::new("two views have the same name").file(root).field(&w[0].name));
+    if raw.format != Format::ScanNet {
+        raw.views.sort_by(|a, b| a.name.cmp(&b.name));
     }
     if raw.views.is_empty() {
         return Err(Error::new("no view is left")
             .file(root)
-            .found(raw.warnings.first().map_or("no images", String::as_str))
+            .found(raw.warnings.first().map_or("no image", String::as_str))
             .expected("at least one posed photograph")
-            .hint("check that the images lie where the dataset says"));
+            .hint("check that the photographs lie where the dataset says"));
     }
-    let views = raw
-        .views
-        .into_iter()
-        .enumerate()
-        .map(|(i, v)| {
-            let (w, h) = v.source.size;
-            let [fx, fy, cx, cy] = v.source.focal_center;
-            let full = Camera { width: w, height: h, fx, fy, cx, cy, rotation: v.rotation, translation: v.translation };
-            let (width, height) = options.resolution.apply(w, h);
-            let held_out = options.holdout > 0 && i % options.holdout == 0;
-            View {
-                camera: full.resized(width, height),
-                split: v.split.unwrap_or(if held_out { Split::Test } else { Split::Train }),
-                name: v.name,
-                image_path: v.image_path,
-                source: v.source,
-            }
-        })
-        .collect();
-    Ok(Dataset { root: root.to_path_buf(), format: raw.format, views, points: raw.points, warnings: raw.warnings })
-}
-
-fn load_colmap(root: &Path, folder: &Path) -> Result<RawDataset> {
-    let model = colmap::read_model(folder)?;
-    let images = ["images", "input", "."].iter().map(|d| root.join(d)).find(|d| d.is_dir()).unwrap_or_default();
-    let mut warnings = Vec::new();
-    let mut views = Vec::new();
-    for image in model.images {
-        let relative = Path::new(&image.name);
-        // A name inside a file must not lead out of the dataset.
-        if relative.components().any(|c| !matches!(c, std::path::Component::Normal(_) | std::path::Component::CurDir)) {
-            return Err(Error::new("the image's name leads out of the folder")
-                .file(folder)
-                .field("images")
-                .found(&image.name));
-        }
-        let image_path = images.join(relative);
-        if !image_path.is_file() {
-            warnings.push(format!("{}: no such photograph, view skipped", image_path.display()));
-            continue;
-        }
-        let c = &model.cameras[&image.camera];
-        views.push(RawView {
-            name: image.name,
-            image_path,
-            source: Source { size: (c.width, c.height), focal_center: c.focal_center, distortion: c.distortion },
-            rotation: image.rotation,
-            translation: image.translation,
-            split: None,
-        });
-    }
-    Ok(RawDataset { format: Format::Colmap, views, points: model.points, warnings })
-}
-
-impl View {
-    /// The file name without folder and last extension, by which masks are found.
-    pub fn stem(&self) -> &str {
-        Path::new(&self.name).file_stem().and_then(|s| s.to_str()).unwrap_or(&self.name)
-    }
-
-    /// Decodes the photograph, undistorts it and brings it to the camera's size.
-    ///
-    /// # Errors
-    /// When the file cannot be read or its shape is not the camera's.
-    pub fn load_image(&self) -> Result<Image> {
-        let photo = Image::read(&self.image_path)?;
-        let (w, h) = self.source.size;
-        // Photographs may have been shrunk after COLMAP ran, but not cropped or turned.
-        let ratio = f64::from(photo.width) / f64::from(photo.height) / (f64::from(w) / f64::from(h));
-        if !(0.99..1.01).contains(&ratio) {
-            return Err(Error::new("the photograph has another shape than its camera")
-                .file(&self.image_path)
-                .field("size")
-                .found(format!("{}x{}", photo.width, photo.height))
-                .expected(format!("{w}x{h}"))
-                .hint("use the photographs that the poses were made from"));
-        }
-        let flat = if self.source.distortion.is_none() { photo } else { self.undistort(&photo) };
-        Ok(flat.resize_area(self.camera.width, self.camera.height))
-    }
-
-    /// Resamples the photograph as a pinhole camera of the same focal lengths would have seen it.
-    fn undistort(&self, photo: &Image) -> Image {
-        let (w, h) = (photo.width as usize, photo.height as usize);
-        let (sx, sy) = (w as f64 / f64::from(self.source.size.0), h as f64 / f64::from(self.source.size.1));
-        let [fx, fy, cx, cy] = self.source.focal_center;
-        let source_of = |x: usize, y: usize| {
-            let (u, v) = (((x as f64 + 0.5) / sx - cx) / fx, ((y as f64 + 0.5) / sy - cy) / fy);
-            let (du, dv) = self.source.distortion.distort(u, v);
-            ((du * fx + cx) * sx, (dv * fy + cy) * sy)
+    let names: Vec<&str> = raw.views.iter().map(|v| v.name.as_str()).collect();
+    let stems = stems(&names).map_err(|e| e.file(root))?;
+    raw.views.par_iter().map(|v| v.lens.check_size(&v.image_path)).collect::<Result<Vec<()>>>()?;
+    let names_its_own = raw.views.iter().any(|v| v.split == Some(Split::Test));
+    let views = raw.views.into_iter().zip(stems).enumerate().map(|(i, (v, stem))| {
+        let split = match v.split.filter(|_| names_its_own) {
+            Some(split) => split,
+            None if options.holdout > 0 && i % options.holdout == 0 => Split::Test,
+            None => Split::Train,
         };
-        let mut out = Image { rgb: vec![0.0; w * h * 3], alpha: None, ..*photo };
-        out.rgb.par_chunks_mut(3 * w).enumerate().for_each(|(y, row)| {
-            for (x, pixel) in row.chunks_exact_mut(3).enumerate() {
-                let (sx, sy) = source_of(x, y);
-                pixel.copy_from_slice(&photo.sample(sx, sy));
-            }
-        });
-        if photo.alpha.is_some() {
-            out.alpha = Some(
-                (0..w * h)
-                    .map(|i| {
-                        let (x, y) = source_of(i % w, i / w);
-                        photo.sample_alpha(x, y)
-                    })
-                    .collect(),
-            );
-        }
-        out
-    }
+        View::new(v, stem, split, options.resolution)
+    });
+    let views = views.collect::<Result<Vec<_>>>()?;
+    Ok(Dataset { root: root.to_path_buf(), format: raw.format, views, points: raw.points, warnings: raw.warnings })
 }
 
 impl Dataset {
@@ -306,7 +200,7 @@ impl Dataset {
         let mut text = String::new();
         let files: Result<Vec<String>> = self.views.par_iter().map(|v| hash_file(&v.image_path)).collect();
         for (v, file) in self.views.iter().zip(files?) {
-            text += &format!("{}\n{:?}\n{:?}\n{:?}\n{file}\n", v.name, v.camera, v.split, v.source);
+            text += &format!("{}\n{:?}\n{:?}\n{:?}\n{file}\n", v.name, v.camera, v.split, v.lens());
         }
         let mut bytes = text.into_bytes();
         bytes.extend(self.points.positions.iter().flatten().flat_map(|v| v.to_le_bytes()));
@@ -315,12 +209,44 @@ impl Dataset {
     }
 }
 
-/// Size of a picture, for layouts whose files do not say.
-fn picture_size(path: &Path) -> Result<(u32, u32)> {
-    image::size_of(path)
+/// Refuses a name inside a file that leads out of the dataset's folder.
+fn check_inside(name: &str, field: &str) -> Result<()> {
+    let inside = |c: Component| matches!(c, Component::Normal(_) | Component::CurDir);
+    if !name.is_empty() && Path::new(name).components().all(inside) {
+        return Ok(());
+    }
+    Err(Error::new("the photograph's name leads out of the dataset")
+        .field(field)
+        .found(name)
+        .expected("a path below the dataset's folder")
+        .hint("move the photographs there and name them relative to it"))
+}
+
+/// Camera-from-world rotation and translation of a world-from-camera matrix (OpenCV axes); none where a number is not
+/// finite, by which datasets mark lost poses.
+///
+/// A uniform scale, which Blender's objects may carry, is taken out.
+fn invert_pose(world_from_camera: DMat4, field: &str) -> Result<Option<(DMat3, DVec3)>> {
+    if !world_from_camera.is_finite() {
+        return Ok(None);
+    }
+    let m = DMat3::from_mat4(world_from_camera);
+    let scale = m.determinant().cbrt();
+    let rotation = m * scale.recip();
+    let off = rotation.transpose() * rotation - DMat3::IDENTITY;
+    // A scale of zero or less leads to NaN or to a reflection.
+    if !(scale > 0.0 && off.to_cols_array().iter().all(|v| v.abs() < 1e-2)) {
+        return Err(Error::new("the pose is not a rotation and a translation")
+            .field(field)
+            .found(m.transpose())
+            .expected("three orthogonal axes of equal length, right-handed")
+            .hint("export the poses again"));
+    }
+    let inverse = DMat3::from_quat(DQuat::from_mat3(&rotation).normalize()).transpose();
+    Ok(Some((inverse, -(inverse * world_from_camera.w_axis.truncate()))))
 }
 
 fn read_text(path: &Path) -> Result<String> {
     let bytes = std::fs::read(path).at("read", path)?;
-    String::from_utf8(bytes).map_err(|_| Error::new("not a text file").file(path))
+    String::from_utf8(bytes).map_err(|_| Error::new("not a text file").file(path).hint("copy or export it again"))
 }

@@ -6,8 +6,10 @@ use rayon::prelude::*;
 use std::io::Cursor;
 use std::path::Path;
 
-/// Pixels that a picture may have at most: a guard against headers that lie.
+/// Pixels that a picture may have at most.
 const MAX_PIXELS: u64 = 1 << 28;
+/// Pixels per byte of file beyond which a header lies: a one-bit PNG of one colour has about 8,300.
+const MAX_PIXELS_PER_BYTE: u64 = 10_000;
 
 /// A picture: sRGB values as stored, not linearised.
 #[derive(Debug, Clone, Default, PartialEq)]
@@ -61,11 +63,15 @@ impl Image {
     pub fn read(path: impl AsRef<Path>) -> Result<Self> {
         let path = path.as_ref();
         let (w, h) = size_of(path)?;
-        if u64::from(w) * u64::from(h) > MAX_PIXELS {
-            return Err(Error::new("the picture is too large")
+        let bytes = std::fs::metadata(path).at("read", path)?.len();
+        let most = MAX_PIXELS.min(bytes.saturating_mul(MAX_PIXELS_PER_BYTE));
+        if u64::from(w) * u64::from(h) > most {
+            return Err(Error::new("the picture is too large, or its header lies")
                 .file(path)
-                .found(format!("{w}x{h}"))
-                .expected(format!("at most {MAX_PIXELS} pixels")));
+                .field("size")
+                .found(format!("{w}x{h} in {bytes} bytes"))
+                .expected(format!("at most {most} pixels"))
+                .hint("shrink it, or copy it again"));
         }
         let reader = ImageReader::open(path).at("open", path)?.with_guessed_format().at("read", path)?;
         let decoded = reader.decode().map_err(|e| unreadable(path, &e))?;
@@ -137,7 +143,8 @@ impl Image {
 
 /// The four pixels around a point and their bilinear weights.
 fn corners(x: f64, y: f64, w: usize, h: usize) -> [(usize, f32); 4] {
-    let (x, y) = ((x - 0.5).clamp(0.0, (w - 1) as f64), (y - 0.5).clamp(0.0, (h - 1) as f64));
+    // max comes first: it turns NaN into 0.
+    let (x, y) = ((x - 0.5).max(0.0).min((w - 1) as f64), (y - 0.5).max(0.0).min((h - 1) as f64));
     let (x0, y0) = (x.floor() as usize, y.floor() as usize);
     let (fx, fy) = ((x - x0 as f64) as f32, (y - y0 as f64) as f32);
     let (x1, y1) = ((x0 + 1).min(w - 1), (y0 + 1).min(h - 1));

@@ -1,75 +1,94 @@
 //! ScanNet as its tools extract it: `color/<id>.jpg`, `pose/<id>.txt`, `intrinsic/intrinsic_color.txt`, and the scan's
 //! vertices in `*_vh_clean_2.ply`.
 
-use super::{Format, RawDataset, RawView, Source, picture_size, read_text};
+use super::{Format, Lens, RawDataset, RawView, invert_pose, read_text};
 use crate::distortion::Distortion;
-use crate::{PointCloud, ply};
+use crate::{PointCloud, image, ply};
 use glam::DMat4;
 use gs_io::{Error, IoContext, Result};
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
+/// Whether a folder has the layout.
 pub(super) fn is_scannet(root: &Path) -> bool {
     ["color", "pose", "intrinsic"].iter().all(|d| root.join(d).is_dir())
 }
 
+/// Loads the views in the order of their numbers; files whose names are no numbers are no frames.
 pub(super) fn load(root: &Path) -> Result<RawDataset> {
-    let k = matrix(&root.join("intrinsic/intrinsic_color.txt"))?;
+    let intrinsic = root.join("intrinsic/intrinsic_color.txt");
+    let k = matrix(&intrinsic)?;
+    let mut frames: Vec<(u64, PathBuf)> = list(&root.join("color"))?
+        .into_iter()
+        .filter_map(|path| Some((path.file_stem()?.to_str()?.parse().ok()?, path)))
+        .collect();
+    frames.sort();
     let mut warnings = Vec::new();
     let mut views = Vec::new();
-    let color = root.join("color");
-    for entry in std::fs::read_dir(&color).at("list", &color)? {
-        let image_path = entry.at("list", &color)?.path();
-        let Some(stem) = image_path.file_stem().and_then(|s| s.to_str()) else { continue };
-        let Ok(id) = stem.parse::<u64>() else { continue };
-        let pose_path = root.join("pose").join(format!("{stem}.txt"));
+    for (_, image_path) in frames {
+        let pose_path = root.join("pose").join(image_path.with_extension("txt").file_name().unwrap_or_default());
         if !pose_path.is_file() {
             warnings.push(format!("{}: no such pose, view skipped", pose_path.display()));
             continue;
         }
-        let camera_from_world = matrix(&pose_path)?.inverse();
-        if !camera_from_world.is_finite() {
+        let pose = invert_pose(matrix(&pose_path)?, "pose").map_err(|e| e.file(&pose_path))?;
+        let Some((rotation, translation)) = pose else {
             warnings.push(format!("{}: the pose is not finite, view skipped", pose_path.display()));
             continue;
-        }
-        let size = picture_size(&image_path)?;
-        views.push((
-            id,
-            RawView {
-                name: image_path.file_name().unwrap_or_default().to_string_lossy().into_owned(),
-                source: Source {
-                    size,
-                    focal_center: [k.x_axis.x, k.y_axis.y, k.z_axis.x, k.z_axis.y],
-                    distortion: Distortion::default(),
-                },
-                image_path,
-                rotation: glam::DMat3::from_mat4(camera_from_world),
-                translation: camera_from_world.w_axis.truncate(),
-                split: None,
-            },
-        ));
+        };
+        let size = image::size_of(&image_path)?;
+        let lens = Lens {
+            size,
+            focal_center: [k.x_axis.x, k.y_axis.y, k.z_axis.x, k.z_axis.y],
+            distortion: Distortion::default(),
+        };
+        check_intrinsics(&lens).map_err(|e| e.file(&intrinsic))?;
+        let name = image_path.file_name().unwrap_or_default().to_string_lossy().into_owned();
+        views.push(RawView { name, image_path, lens, rotation, translation, split: None });
     }
-    views.sort_by_key(|(id, _)| *id);
-    warnings.sort();
-    let mut scans: Vec<_> = std::fs::read_dir(root)
-        .at("list", root)?
-        .filter_map(|e| Some(e.ok()?.path()))
-        .filter(|p| p.to_string_lossy().ends_with("_vh_clean_2.ply"))
-        .collect();
-    scans.sort();
-    let points = scans.first().map_or_else(|| Ok(PointCloud::default()), ply::read_points)?;
-    Ok(RawDataset { format: Format::ScanNet, views: views.into_iter().map(|(_, v)| v).collect(), points, warnings })
+    let scan = list(root)?.into_iter().find(|p| p.to_string_lossy().ends_with("_vh_clean_2.ply"));
+    let points = scan.map_or_else(|| Ok(PointCloud::default()), ply::read_points)?;
+    Ok(RawDataset { format: Format::ScanNet, views, points, warnings })
 }
 
-/// A 4x4 (or 3x3) matrix of whitespace-separated numbers; `-inf` marks a lost pose.
+/// Paths in a folder, sorted.
+fn list(folder: &Path) -> Result<Vec<PathBuf>> {
+    let entries = std::fs::read_dir(folder).at("list", folder)?;
+    let mut paths = entries.map(|e| Ok(e.at("list", folder)?.path())).collect::<Result<Vec<_>>>()?;
+    paths.sort();
+    Ok(paths)
+}
+
+/// The file does not say for which image size it holds, and frames are often extracted smaller than they were taken:
+/// the principal point, which lies near the middle, tells.
+fn check_intrinsics(lens: &Lens) -> Result<()> {
+    let [fx, fy, cx, cy] = lens.focal_center;
+    let (w, h) = (f64::from(lens.size.0), f64::from(lens.size.1));
+    let sane = |f: f64| (1e-3..1e9).contains(&f);
+    let central = |c: f64, size: f64| (0.25..0.75).contains(&(c / size));
+    if sane(fx) && sane(fy) && central(cx, w) && central(cy, h) {
+        return Ok(());
+    }
+    Err(Error::new("the intrinsics do not fit the frames")
+        .field("fx fy cx cy")
+        .found(format!("{fx} {fy} {cx} {cy}"))
+        .expected(format!("a principal point near the middle of {w}x{h} pixels"))
+        .hint("extract the frames at full size, or scale the intrinsics with them"))
+}
+
+/// A 4x4 matrix of numbers in rows; `-inf` marks a lost pose.
 fn matrix(path: &Path) -> Result<DMat4> {
     let text = read_text(path)?;
-    let numbers: Result<Vec<f64>> = text
-        .split_ascii_whitespace()
-        .map(|w| w.parse().map_err(|_| Error::new("not a number").file(path).found(w)))
-        .collect();
-    let numbers = numbers?;
-    if numbers.len() != 16 {
-        return Err(Error::new("not a 4x4 matrix").file(path).found(format!("{} numbers", numbers.len())).expected(16));
-    }
-    Ok(DMat4::from_cols_slice(&numbers).transpose())
+    let number = |w: &str| {
+        let wrong = |_| Error::new("not a number").file(path).found(w).hint("extract the scene again");
+        w.parse::<f64>().map_err(wrong)
+    };
+    let numbers = text.split_ascii_whitespace().map(number).collect::<Result<Vec<_>>>()?;
+    let m: &[f64; 16] = numbers.as_slice().try_into().map_err(|_| {
+        Error::new("not a 4x4 matrix")
+            .file(path)
+            .found(format!("{} numbers", numbers.len()))
+            .expected("16 numbers")
+            .hint("extract the scene again")
+    })?;
+    Ok(DMat4::from_cols_array(m).transpose())
 }

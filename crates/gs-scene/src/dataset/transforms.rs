@@ -1,12 +1,15 @@
 //! `transforms.json` of nerfstudio, instant-ngp and Blender; OpenGaussian's conversion of ScanNet is one of these.
 
-use super::{Format, RawDataset, RawView, Source, Split, picture_size, read_text};
+use super::{Format, Lens, RawDataset, RawView, Split, check_inside, invert_pose, read_text};
 use crate::distortion::Distortion;
-use crate::{PointCloud, ply};
+use crate::{PointCloud, image, ply};
 use glam::{DMat4, DVec4};
 use gs_io::{Error, Result};
 use serde_json::Value;
+use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
+
+const AGAIN: &str = "export the transforms again";
 
 /// The transforms files of a folder, if it has any.
 pub(super) fn find(root: &Path) -> Option<Vec<PathBuf>> {
@@ -22,7 +25,8 @@ pub(super) fn find(root: &Path) -> Option<Vec<PathBuf>> {
     (!parts.is_empty()).then_some(parts)
 }
 
-/// Reads views from the files; the split comes from the name `transforms_test.json`.
+/// Reads views from the files; the split comes from the names `transforms_train.json` and `transforms_test.json`, or
+/// from nerfstudio's lists.
 pub(super) fn load(root: &Path, files: &[PathBuf]) -> Result<RawDataset> {
     let mut out = RawDataset {
         format: Format::Transforms,
@@ -30,78 +34,111 @@ pub(super) fn load(root: &Path, files: &[PathBuf]) -> Result<RawDataset> {
         points: PointCloud::default(),
         warnings: Vec::new(),
     };
+    let mut clouds = ["points3d.ply", "points3D.ply", "sparse_pc.ply"].map(PathBuf::from).to_vec();
     for file in files {
         let split = match file.file_name().and_then(|n| n.to_str()) {
             Some("transforms_train.json") => Some(Split::Train),
             Some("transforms_test.json") => Some(Split::Test),
             _ => None,
         };
-        read_file(root, file, split, &mut out).map_err(|e| e.file(file))?;
+        let json: Value = serde_json::from_slice(&without_infinities(read_text(file)?))
+            .map_err(|e| Error::new(format!("not JSON: {e}")).file(file).hint(AGAIN))?;
+        read_frames(root, &json, split, &mut out).map_err(|e| e.file(file))?;
+        if let Some(name) = json["ply_file_path"].as_str() {
+            check_inside(name, "ply_file_path").map_err(|e| e.file(file))?;
+            clouds.insert(0, name.into());
+        }
     }
     // OpenGaussian lists every frame of ScanNet in both files; a frame to learn from is not held out.
-    let train: std::collections::BTreeSet<String> =
+    let train: BTreeSet<String> =
         out.views.iter().filter(|v| v.split == Some(Split::Train)).map(|v| v.name.clone()).collect();
     out.views.retain(|v| v.split != Some(Split::Test) || !train.contains(&v.name));
-    let named = ["points3d.ply", "points3D.ply", "sparse_pc.ply"].iter().map(|n| root.join(n)).find(|p| p.is_file());
-    if let Some(path) = named {
+    if let Some(path) = clouds.iter().map(|n| root.join(n)).find(|p| p.is_file()) {
         out.points = ply::read_points(path)?;
     }
     Ok(out)
 }
 
-fn read_file(root: &Path, file: &Path, split: Option<Split>, out: &mut RawDataset) -> Result<()> {
-    let json: Value = serde_json::from_str(&read_text(file)?)
-        .map_err(|e| Error::new(format!("not JSON: {e}")).hint("export the transforms again"))?;
-    let frames = json["frames"].as_array().ok_or_else(|| Error::new("no list of frames").field("frames"))?;
+/// Python writes lost poses as `-Infinity` and `NaN`, which JSON does not know: makes them empty strings.
+fn without_infinities(text: String) -> Vec<u8> {
+    let mut bytes = text.into_bytes();
+    let (mut at, mut in_string) = (0, false);
+    while at < bytes.len() {
+        match bytes[at] {
+            b'"' => in_string = !in_string,
+            b'\\' if in_string => at += 1,
+            _ if !in_string => {
+                if let Some(word) =
+                    ["-Infinity", "Infinity", "NaN"].iter().find(|w| bytes[at..].starts_with(w.as_bytes()))
+                {
+                    // In place; an empty string reads as well as null and fits where NaN stood.
+                    bytes[at..at + word.len()].fill(b' ');
+                    bytes[at..at + 2].fill(b'"');
+                    at += word.len() - 1;
+                }
+            }
+            _ => {}
+        }
+        at += 1;
+    }
+    bytes
+}
+
+fn read_frames(root: &Path, json: &Value, split: Option<Split>, out: &mut RawDataset) -> Result<()> {
+    let frames = json["frames"]
+        .as_array()
+        .ok_or_else(|| Error::new("the file has no list of frames").field("frames").hint(AGAIN))?;
     for (i, frame) in frames.iter().enumerate() {
         let field = format!("frames[{i}]");
-        let name = frame["file_path"]
-            .as_str()
-            .ok_or_else(|| Error::new("no file name").field(format!("{field}.file_path")))?
-            .trim_start_matches("./");
-        let leads_out = Path::new(name).components().any(|c| !matches!(c, std::path::Component::Normal(_)));
-        if leads_out {
-            return Err(Error::new("the name leads out of the folder").field(format!("{field}.file_path")).found(name));
-        }
-        let found = ["", ".png", ".jpg", ".jpeg", ".JPG", ".PNG"]
+        let path = frame["file_path"].as_str().ok_or_else(|| {
+            let field = format!("{field}.file_path");
+            Error::new("the frame names no photograph").field(field).found(&frame["file_path"]).hint(AGAIN)
+        })?;
+        check_inside(path, &format!("{field}.file_path"))?;
+        let given = path.trim_start_matches("./");
+        // Blender leaves the extension out.
+        let found = ["", ".png", ".jpg", ".jpeg", ".PNG", ".JPG", ".JPEG"]
             .iter()
-            .map(|e| format!("{name}{e}"))
+            .map(|e| format!("{given}{e}"))
             .find(|n| root.join(n).is_file());
         let Some(name) = found else {
-            out.warnings.push(format!("{}: no such photograph, view skipped", root.join(name).display()));
+            out.warnings.push(format!("{}: no such photograph, view skipped", root.join(given).display()));
+            continue;
+        };
+        // OpenGL cameras look along -z with y up; ours along +z with y down.
+        let flip = DMat4::from_diagonal(DVec4::new(1.0, -1.0, -1.0, 1.0));
+        let field = format!("{field}.transform_matrix");
+        let Some((rotation, translation)) = invert_pose(matrix(&frame["transform_matrix"], &field)? * flip, &field)?
+        else {
+            out.warnings.push(format!("{name}: the pose is not finite, view skipped"));
             continue;
         };
         let image_path = root.join(&name);
-        let world_from_camera = matrix(&frame["transform_matrix"], &field)?;
-        // OpenGL cameras look along -z with y up; ours along +z with y down.
-        let flip = DMat4::from_diagonal(DVec4::new(1.0, -1.0, -1.0, 1.0));
-        let camera_from_world = (world_from_camera * flip).inverse();
-        if !camera_from_world.is_finite() {
-            out.warnings.push(format!("{name}: the pose is not finite, view skipped"));
-            continue;
-        }
-        let source = source(&json, frame, &image_path, &field)?;
-        let short = name.strip_prefix("images/").or(name.strip_prefix("color/")).unwrap_or(&name).to_string();
-        out.views.push(RawView {
-            name: short,
-            image_path,
-            source,
-            rotation: glam::DMat3::from_mat4(camera_from_world),
-            translation: camera_from_world.w_axis.truncate(),
-            split,
+        let lens = lens(json, frame, &image_path, &format!("frames[{i}]"))?;
+        let listed = |key: &str| {
+            json[key]
+                .as_array()
+                .is_some_and(|l| l.iter().any(|n| n.as_str().is_some_and(|n| n.trim_start_matches("./") == given)))
+        };
+        let split = split.or(match (listed("test_filenames"), listed("train_filenames")) {
+            (true, false) => Some(Split::Test),
+            (_, true) => Some(Split::Train),
+            (false, false) => None,
         });
+        let short = ["images/", "color/"].iter().find_map(|folder| name.strip_prefix(folder));
+        let name = short.unwrap_or(&name).to_string();
+        out.views.push(RawView { name, image_path, lens, rotation, translation, split });
     }
     Ok(())
 }
 
-/// A 4x4 matrix; numbers that JSON cannot write (infinite poses come as null or strings) become NaN.
+/// A 4x4 matrix, or its first three rows; numbers that JSON cannot write (lost poses come as null or words) become NaN.
 fn matrix(value: &Value, field: &str) -> Result<DMat4> {
-    let rows = value.as_array().filter(|r| (3..=4).contains(&r.len()));
-    let mut m = [0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0];
-    let rows = rows.ok_or_else(|| Error::new("not a 4x4 matrix").field(format!("{field}.transform_matrix")))?;
+    let wrong = || Error::new("not a 4x4 matrix").field(field).found(value).expected("four rows of four").hint(AGAIN);
+    let mut m = DMat4::IDENTITY.to_cols_array();
+    let rows = value.as_array().filter(|r| (3..=4).contains(&r.len())).ok_or_else(wrong)?;
     for (r, row) in rows.iter().enumerate() {
-        let row = row.as_array().filter(|r| r.len() == 4);
-        let row = row.ok_or_else(|| Error::new("not a 4x4 matrix").field(format!("{field}.transform_matrix[{r}]")))?;
+        let row = row.as_array().filter(|r| r.len() == 4).ok_or_else(wrong)?;
         for (c, v) in row.iter().enumerate() {
             m[4 * r + c] = v.as_f64().unwrap_or(f64::NAN);
         }
@@ -109,33 +146,57 @@ fn matrix(value: &Value, field: &str) -> Result<DMat4> {
     Ok(DMat4::from_cols_array(&m).transpose())
 }
 
-/// Intrinsics: of the frame where it has them, else of the file.
-fn source(file: &Value, frame: &Value, image: &Path, field: &str) -> Result<Source> {
-    let get = |key: &str| frame[key].as_f64().or_else(|| file[key].as_f64());
-    let (w, h) = match (get("w"), get("h")) {
-        (Some(w), Some(h)) if (1.0..1e6).contains(&w) && (1.0..1e6).contains(&h) => (w as u32, h as u32),
-        _ => picture_size(image)?,
+/// The camera: of the frame where it has one, else of the file.
+fn lens(file: &Value, frame: &Value, image: &Path, field: &str) -> Result<Lens> {
+    let value = |key: &str| if frame[key].is_null() { &file[key] } else { &frame[key] };
+    let get = |key: &str| match value(key) {
+        Value::Null => Ok(None),
+        v => v
+            .as_f64()
+            .map(Some)
+            .ok_or_else(|| Error::new("not a number").field(format!("{field}, {key}")).found(v).hint(AGAIN)),
     };
-    let focal = |length: &str, angle: &str, size: u32| {
-        get(length).or_else(|| get(angle).map(|a| 0.5 * f64::from(size) / (0.5 * a).tan()))
-    };
-    let fx = focal("fl_x", "camera_angle_x", w);
-    let fy = focal("fl_y", "camera_angle_y", h).or(fx);
-    let (Some(fx), Some(fy)) = (fx.or(fy), fy) else {
-        return Err(Error::new("no focal length").field(field).expected("fl_x or camera_angle_x"));
-    };
-    let center = [get("cx").unwrap_or(0.5 * f64::from(w)), get("cy").unwrap_or(0.5 * f64::from(h))];
-    let zero = |key: &str| get(key).unwrap_or(0.0);
-    let distortion =
-        Distortion { k: [zero("k1"), zero("k2"), zero("k3")], p: [zero("p1"), zero("p2")], ..Distortion::default() };
-    if !(fx.is_finite() && fy.is_finite() && fx > 0.0 && fy > 0.0) {
-        return Err(Error::new("impossible focal length").field(field).found(format!("{fx} {fy}")));
-    }
-    if file["camera_model"].as_str().is_some_and(|m| m.contains("FISHEYE")) {
+    let model = value("camera_model").as_str().unwrap_or("OPENCV");
+    let fisheye = value("is_fisheye").as_bool().unwrap_or(false);
+    let known = ["OPENCV", "FULL_OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "PERSPECTIVE"];
+    if fisheye || !known.contains(&model) {
         return Err(Error::new("unsupported camera model")
-            .field("camera_model")
-            .found("FISHEYE")
-            .expected("a perspective camera"));
+            .field(format!("{field}, camera_model"))
+            .found(if fisheye { "is_fisheye" } else { model })
+            .expected(known.join(", "))
+            .hint("undistort the photographs first"));
     }
-    Ok(Source { size: (w, h), focal_center: [fx, fy, center[0], center[1]], distortion })
+    let (w, h) = match (get("w")?, get("h")?) {
+        (Some(w), Some(h)) => {
+            if ![w, h].iter().all(|v| (1.0..=1_048_576.0).contains(v)) {
+                return Err(Error::new("impossible image size")
+                    .field(format!("{field}, w and h"))
+                    .found(format!("{w}x{h}"))
+                    .expected("1 to 1048576 pixels each")
+                    .hint(AGAIN));
+            }
+            (w as u32, h as u32)
+        }
+        _ => image::size_of(image)?,
+    };
+    let of_angle = |angle: Option<f64>, size: u32| angle.map(|a| 0.5 * f64::from(size) / (0.5 * a).tan());
+    let fx = get("fl_x")?.or(of_angle(get("camera_angle_x")?, w));
+    let fy = get("fl_y")?.or(of_angle(get("camera_angle_y")?, h));
+    let focal = fx.or(fy).zip(fy.or(fx)).filter(|(x, y)| [x, y].iter().all(|f| (1e-3..1e9).contains(*f)));
+    let Some((fx, fy)) = focal else {
+        return Err(Error::new("no usable focal length")
+            .field(format!("{field}, fl_x or camera_angle_x"))
+            .found(format!("{fx:?} pixels"))
+            .expected("a number of pixels, or an angle of less than a half-turn in radians")
+            .hint(AGAIN));
+    };
+    let cx = get("cx")?.unwrap_or(0.5 * f64::from(w));
+    let cy = get("cy")?.unwrap_or(0.5 * f64::from(h));
+    let coefficient = |key: &str| get(key).map(Option::unwrap_or_default);
+    let k = [coefficient("k1")?, coefficient("k2")?, coefficient("k3")?];
+    let p = [coefficient("p1")?, coefficient("p2")?];
+    // FULL_OPENCV divides by a second polynomial; other models leave k4 to k6 out or at zero.
+    let denominator = [coefficient("k4")?, coefficient("k5")?, coefficient("k6")?];
+    let distortion = Distortion { k, denominator, p };
+    Ok(Lens { size: (w, h), focal_center: [fx, fy, cx, cy], distortion })
 }

@@ -1,0 +1,172 @@
+//! One view: a photograph, the camera that took it, and the pinhole camera that stands for it.
+
+use super::{RawView, Resolution, Split};
+use crate::distortion::Distortion;
+use crate::{Camera, Image, image};
+use gs_io::{Error, Result};
+use rayon::prelude::*;
+use std::collections::BTreeSet;
+use std::path::{Path, PathBuf};
+
+/// A posed photograph.
+#[derive(Debug, Clone, PartialEq)]
+pub struct View {
+    /// File name relative to the images folder, or as the dataset gives it.
+    pub name: String,
+    /// Where the photograph lies.
+    pub image_path: PathBuf,
+    /// The undistorted camera at the requested resolution.
+    pub camera: Camera,
+    /// What the view is for.
+    pub split: Split,
+    stem: String,
+    lens: Lens,
+}
+
+/// The camera as it took the photograph.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(super) struct Lens {
+    /// Width and height of the photograph.
+    pub(super) size: (u32, u32),
+    /// fx, fy, cx, cy in pixels of the photograph.
+    pub(super) focal_center: [f64; 4],
+    pub(super) distortion: Distortion,
+}
+
+impl Lens {
+    /// Refuses a photograph of another size.
+    pub(super) fn check_size(&self, path: &Path) -> Result<()> {
+        self.expect_size(image::size_of(path)?, path)
+    }
+
+    fn expect_size(&self, (w, h): (u32, u32), path: &Path) -> Result<()> {
+        if (w, h) == self.size {
+            return Ok(());
+        }
+        Err(Error::new("the photograph has another size than its camera")
+            .file(path)
+            .field("size")
+            .found(format!("{w}x{h}"))
+            .expected(format!("{}x{}", self.size.0, self.size.1))
+            .hint("use the photographs that the poses were made from"))
+    }
+
+    /// Where in the photograph the pinhole camera's point (x, y) is seen; the pinhole camera has the same principal
+    /// point and `zoom` times the focal lengths.
+    fn locate(&self, zoom: f64, x: f64, y: f64) -> (f64, f64) {
+        let [fx, fy, cx, cy] = self.focal_center;
+        let (u, v) = self.distortion.distort((x - cx) / (fx * zoom), (y - cy) / (fy * zoom));
+        (u * fx + cx, v * fy + cy)
+    }
+
+    /// The smallest zoom, at least 1, at which the photograph fills the whole pinhole image: a lens that pulls the
+    /// corners outwards leaves nothing to show there. None where there is no such zoom up to 4.
+    fn zoom(&self) -> Option<f64> {
+        if self.distortion.is_none() {
+            return Some(1.0);
+        }
+        (0..=600).map(|i| 1.0 + 0.005 * f64::from(i)).find(|&zoom| self.fills(zoom))
+    }
+
+    /// Whether the pinhole image's border lies within the photograph, by half a pixel, and the lens does not fold: the
+    /// way from the principal point to the border only ever leads outwards.
+    fn fills(&self, zoom: f64) -> bool {
+        const STEPS: i32 = 64;
+        let (w, h) = (f64::from(self.size.0), f64::from(self.size.1));
+        let [_, _, cx, cy] = self.focal_center;
+        let border = (0..=STEPS).map(|i| f64::from(i) / f64::from(STEPS));
+        let mut border = border.flat_map(|t| [(t * w, 0.0), (t * w, h), (0.0, t * h), (w, t * h)]);
+        border.all(|(x, y)| {
+            let mut before = 0.0;
+            (1..=8).all(|i| {
+                let t = f64::from(i) / 8.0;
+                let (u, v) = self.locate(zoom, cx + t * (x - cx), cy + t * (y - cy));
+                let distance = (u - cx).hypot(v - cy);
+                let outwards = distance > before;
+                before = distance;
+                outwards && (-0.5..=w + 0.5).contains(&u) && (-0.5..=h + 0.5).contains(&v)
+            })
+        })
+    }
+}
+
+impl View {
+    pub(super) fn new(raw: RawView, stem: String, split: Split, resolution: Resolution) -> Result<Self> {
+        let RawView { name, image_path, lens, rotation, translation, .. } = raw;
+        let Some(zoom) = lens.zoom() else {
+            return Err(Error::new("the lens distortion is too strong to take out")
+                .file(image_path)
+                .field("camera")
+                .found(format!("{:?}", lens.distortion))
+                .hint("check the coefficients, or run COLMAP's image_undistorter"));
+        };
+        let [fx, fy, cx, cy] = lens.focal_center;
+        let (width, height) = lens.size;
+        let full = Camera { width, height, fx: fx * zoom, fy: fy * zoom, cx, cy, rotation, translation };
+        let (width, height) = resolution.apply(width, height);
+        Ok(Self { name, image_path, camera: full.resized(width, height), split, stem, lens })
+    }
+
+    /// By what masks and other files of this view are found: the file name without folder and last extension. Where
+    /// two views of the dataset share that, the folders before it too, joined by `_`.
+    pub fn stem(&self) -> &str {
+        &self.stem
+    }
+
+    pub(super) fn lens(&self) -> &Lens {
+        &self.lens
+    }
+
+    /// Decodes the photograph, undistorts it and brings it to the camera's size.
+    ///
+    /// # Errors
+    /// When the file cannot be read or its size is not the camera's.
+    pub fn load_image(&self) -> Result<Image> {
+        let photo = Image::read(&self.image_path)?;
+        self.lens.expect_size((photo.width, photo.height), &self.image_path)?;
+        let flat = if self.lens.distortion.is_none() { photo } else { self.undistort(&photo) };
+        Ok(flat.resize_area(self.camera.width, self.camera.height))
+    }
+
+    /// Resamples the photograph as the pinhole camera would have seen it.
+    fn undistort(&self, photo: &Image) -> Image {
+        let w = photo.width as usize;
+        let full = self.camera.resized(photo.width, photo.height);
+        let zoom = full.fx / self.lens.focal_center[0];
+        let locate = |x: usize, y: usize| self.lens.locate(zoom, x as f64 + 0.5, y as f64 + 0.5);
+        let mut out = photo.clone();
+        out.rgb.par_chunks_mut(3 * w).enumerate().for_each(|(y, row)| {
+            for (x, pixel) in row.chunks_exact_mut(3).enumerate() {
+                let (u, v) = locate(x, y);
+                pixel.copy_from_slice(&photo.sample(u, v));
+            }
+        });
+        if let Some(alpha) = &mut out.alpha {
+            alpha.par_chunks_mut(w).enumerate().for_each(|(y, row)| {
+                for (x, pixel) in row.iter_mut().enumerate() {
+                    let (u, v) = locate(x, y);
+                    *pixel = photo.sample_alpha(u, v);
+                }
+            });
+        }
+        out
+    }
+}
+
+/// Each view's stem; see [`View::stem`].
+pub(super) fn stems(names: &[&str]) -> Result<Vec<String>> {
+    let short = |name: &&str| Path::new(name).file_stem().unwrap_or_default().to_string_lossy().into_owned();
+    let long = |name: &&str| Path::new(name).with_extension("").to_string_lossy().replace(['/', '\\'], "_");
+    let stems: Vec<String> = names.iter().map(short).collect();
+    if stems.iter().collect::<BTreeSet<_>>().len() == stems.len() {
+        return Ok(stems);
+    }
+    let stems: Vec<String> = names.iter().map(long).collect();
+    let mut seen = BTreeSet::new();
+    match stems.iter().position(|s| !seen.insert(s)) {
+        None => Ok(stems),
+        Some(i) => Err(Error::new("two views have the same name")
+            .field(names[i])
+            .hint("rename the photographs: masks are found by name without extension")),
+    }
+}
