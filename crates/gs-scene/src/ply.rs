@@ -23,7 +23,7 @@ impl Table<'_> {
     /// The vertices' positions.
     fn positions(&self) -> Result<Vec<[f32; 3]>> {
         let xyz = self.columns(["x", "y", "z"])?;
-        let positions: Vec<[f32; 3]> = self.rows().map(|row| xyz.map(|c| c.get(row))).collect();
+        let positions = self.arrays(xyz);
         let bad = |p: &[f32; 3]| p.iter().any(|v| !v.is_finite());
         if let Some(first) = positions.iter().position(bad) {
             let all = positions.iter().filter(|p| bad(p)).count();
@@ -75,24 +75,23 @@ fn parse_gaussians(bytes: &[u8]) -> Result<Gaussians> {
     let n = table.count;
     let mut g = Gaussians {
         means,
-        log_scales: Vec::with_capacity(n),
-        rotations: Vec::with_capacity(n),
-        opacity_logits: Vec::with_capacity(n),
-        sh: Vec::with_capacity(n * 3 * k),
+        log_scales: table.arrays(scale),
+        rotations: table.arrays(rotation),
+        opacity_logits: table.gather(&[opacity]),
+        sh: table.gather(&sh_columns),
         sh_degree,
     };
-    for row in table.rows() {
-        g.log_scales.push(scale.map(|c| c.get(row)));
-        g.rotations.push(rotation.map(|c| c.get(row)));
-        g.opacity_logits.push(opacity.get(row).clamp(-50.0, 50.0));
-        g.sh.extend(sh_columns.iter().map(|c| c.get(row)));
-    }
-    let finite = |name: &str, values: &[f32]| match values.iter().position(|v| !v.is_finite()) {
-        None => Ok(()),
-        Some(at) => Err(Error::new("a parameter is not finite")
-            .field(format!("vertex {}, {name}", at / (values.len() / n)))
-            .found(format!("{}, and {} in all", values[at], values.iter().filter(|v| !v.is_finite()).count()))
-            .hint("remove these vertices, or export the PLY again")),
+    g.opacity_logits.iter_mut().for_each(|o| *o = o.clamp(-50.0, 50.0));
+    let finite = |name: &str, values: &[f32]| {
+        // Without leaving early, so that it runs at the memory's speed.
+        if values.iter().fold(true, |all, v| all & v.is_finite()) {
+            return Ok(());
+        }
+        let bad: Vec<usize> = (0..values.len()).filter(|&i| !values[i].is_finite()).collect();
+        Err(Error::new("a parameter is not finite")
+            .field(format!("vertex {}, {name}", bad[0] / (values.len() / n)))
+            .found(format!("{}, and {} such numbers in all", values[bad[0]], bad.len()))
+            .hint("remove these vertices, or export the PLY again"))
     };
     finite("scale_*", g.log_scales.as_flattened())?;
     finite("rot_*", g.rotations.as_flattened())?;
@@ -155,13 +154,13 @@ pub fn read_points(path: impl AsRef<Path>) -> Result<PointCloud> {
 fn parse_points(bytes: &[u8]) -> Result<PointCloud> {
     let table = table::read(bytes)?;
     let positions = table.positions()?;
-    let rgb = ["red", "green", "blue"].map(|name| table.find(name));
-    let byte = |column: Option<Column>, row: &[u8]| match column {
-        None => 255,
-        Some(c) if c.is_float() => (255.0 * c.get(row)).round() as u8,
-        Some(c) => c.get(row) as u8,
+    let channel = |name| match table.find(name) {
+        None => vec![255; table.count],
+        Some(c) if c.is_float() => table.gather(&[c]).into_iter().map(|v| (255.0 * v).round() as u8).collect(),
+        Some(c) => table.gather(&[c]).into_iter().map(|v| v as u8).collect::<Vec<u8>>(),
     };
-    let colors = table.rows().map(|row| rgb.map(|c| byte(c, row))).collect();
+    let (r, g, b) = (channel("red"), channel("green"), channel("blue"));
+    let colors = (0..table.count).map(|i| [r[i], g[i], b[i]]).collect();
     Ok(PointCloud { positions, colors })
 }
 

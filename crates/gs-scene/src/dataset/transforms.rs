@@ -92,7 +92,7 @@ fn read_frames(root: &Path, json: &Value, split: Option<Split>, out: &mut RawDat
         let field = format!("frames[{i}]");
         let path = frame["file_path"].as_str().ok_or_else(|| {
             let field = format!("{field}.file_path");
-            Error::new("the frame names no photograph").field(field).found(&frame["file_path"]).hint(AGAIN)
+            Error::new("the frame names no photograph").field(field).found(brief(&frame["file_path"])).hint(AGAIN)
         })?;
         check_inside(path, &format!("{field}.file_path"))?;
         let given = path.trim_start_matches("./");
@@ -132,9 +132,15 @@ fn read_frames(root: &Path, json: &Value, split: Option<Split>, out: &mut RawDat
     Ok(())
 }
 
+/// A value's first characters, to show what was found.
+fn brief(value: &Value) -> String {
+    value.to_string().chars().take(80).collect()
+}
+
 /// A 4x4 matrix, or its first three rows; numbers that JSON cannot write (lost poses come as null or words) become NaN.
 fn matrix(value: &Value, field: &str) -> Result<DMat4> {
-    let wrong = || Error::new("not a 4x4 matrix").field(field).found(value).expected("four rows of four").hint(AGAIN);
+    let wrong =
+        || Error::new("not a 4x4 matrix").field(field).found(brief(value)).expected("four rows of four").hint(AGAIN);
     let mut m = DMat4::IDENTITY.to_cols_array();
     let rows = value.as_array().filter(|r| (3..=4).contains(&r.len())).ok_or_else(wrong)?;
     for (r, row) in rows.iter().enumerate() {
@@ -154,7 +160,7 @@ fn lens(file: &Value, frame: &Value, image: &Path, field: &str) -> Result<Lens> 
         v => v
             .as_f64()
             .map(Some)
-            .ok_or_else(|| Error::new("not a number").field(format!("{field}, {key}")).found(v).hint(AGAIN)),
+            .ok_or_else(|| Error::new("not a number").field(format!("{field}, {key}")).found(brief(v)).hint(AGAIN)),
     };
     let model = value("camera_model").as_str().unwrap_or("OPENCV");
     let fisheye = value("is_fisheye").as_bool().unwrap_or(false);

@@ -1,6 +1,7 @@
 //! The vertices of a PLY file as rows of bytes with named columns.
 
 use gs_io::{Error, Result};
+use rayon::prelude::*;
 use std::borrow::Cow;
 
 pub(super) const AGAIN: &str = "export the PLY again";
@@ -153,6 +154,9 @@ fn cut_short(element: &str, rows: usize, count: usize) -> Error {
         .hint(AGAIN)
 }
 
+/// Rows a thread takes at a time.
+const ROWS: usize = 4096;
+
 /// A scalar property of the vertices.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Column {
@@ -162,17 +166,6 @@ pub(super) struct Column {
 }
 
 impl Column {
-    /// The value in a row; a double becomes the nearest float.
-    #[inline]
-    pub(super) fn get(self, row: &[u8]) -> f32 {
-        let bytes = &row[self.at..];
-        // Nearly every 3DGS file holds little-endian floats only.
-        if let (Scalar::F32, false, Some(&b)) = (self.scalar, self.big, bytes.first_chunk()) {
-            return f32::from_le_bytes(b);
-        }
-        self.scalar.value(bytes, self.big) as f32
-    }
-
     /// Whether the file stores it as a float or double.
     pub(super) fn is_float(self) -> bool {
         matches!(self.scalar, Scalar::F32 | Scalar::F64)
@@ -203,9 +196,36 @@ impl Table<'_> {
         self.columns.iter().find(|(n, _)| n == name).map(|(_, c)| *c)
     }
 
-    /// The vertices.
-    pub(super) fn rows(&self) -> impl Iterator<Item = &[u8]> {
-        self.rows.chunks_exact(self.stride.max(1))
+    /// The values of some columns, `[count][columns]`.
+    pub(super) fn gather(&self, columns: &[Column]) -> Vec<f32> {
+        let mut out = vec![0.0; self.count * columns.len()];
+        if out.is_empty() {
+            return out;
+        }
+        // Nearly every 3DGS file holds little-endian floats only: then a row is an array of words.
+        let floats = self.columns.iter().all(|(_, c)| c.scalar == Scalar::F32 && !c.big);
+        let words: Vec<usize> = columns.iter().map(|c| c.at / 4).collect();
+        let rows = self.rows.par_chunks(ROWS * self.stride);
+        out.par_chunks_mut(ROWS * columns.len()).zip(rows).for_each(|(out, rows)| {
+            for (values, row) in out.chunks_exact_mut(columns.len()).zip(rows.chunks_exact(self.stride)) {
+                if floats {
+                    let (row, _) = row.as_chunks::<4>();
+                    for (value, &word) in values.iter_mut().zip(&words) {
+                        *value = f32::from_le_bytes(row[word]);
+                    }
+                } else {
+                    for (value, column) in values.iter_mut().zip(columns) {
+                        *value = column.scalar.value(&row[column.at..], column.big) as f32;
+                    }
+                }
+            }
+        });
+        out
+    }
+
+    /// The values of a few columns, one array a vertex.
+    pub(super) fn arrays<const N: usize>(&self, columns: [Column; N]) -> Vec<[f32; N]> {
+        self.gather(&columns).as_chunks().0.to_vec()
     }
 }
 
@@ -269,6 +289,10 @@ fn read_rows<'a>(element: &Element, encoding: Encoding, body: &'a [u8], rows: &m
 /// Reads the vertices of a PLY file and skips the elements before them.
 pub(super) fn read(bytes: &[u8]) -> Result<Table<'_>> {
     let header = parse_header(bytes)?;
+    let missing = || Error::new("the file has no vertices").field("element vertex").hint(AGAIN);
+    if !header.elements.iter().any(|e| e.name == "vertex") {
+        return Err(missing());
+    }
     let mut body = header.body;
     for element in &header.elements {
         let wanted = element.name == "vertex";
@@ -313,5 +337,5 @@ pub(super) fn read(bytes: &[u8]) -> Result<Table<'_>> {
             return Ok(Table { count: element.count, stride, columns, rows });
         }
     }
-    Err(Error::new("the file has no vertices").field("element vertex").hint(AGAIN))
+    Err(missing())
 }
