@@ -1,0 +1,600 @@
+//! Datasets in every layout, made on the spot.
+
+use glam::{DMat3, DVec3};
+use gs_scene::dataset::{self, Dataset, Format, LoadOptions, Resolution, Split};
+use gs_scene::{Camera, Image, PointCloud, colmap, ply};
+use std::fs;
+use std::path::Path;
+
+const FULL: LoadOptions = LoadOptions { resolution: Resolution::Divisor(1.0), holdout: 8 };
+
+/// Cameras around the origin, none of whose axes lies along another's.
+fn cameras(n: usize, width: u32, height: u32) -> Vec<Camera> {
+    (0..n)
+        .map(|i| {
+            let a = 0.3 + 0.7 * i as f64;
+            let eye = DVec3::new(3.0 * a.cos(), 3.0 * a.sin(), 1.0 + 0.1 * i as f64);
+            let c = Camera::look_at(eye, DVec3::new(0.1, -0.2, 0.3), DVec3::Z, width, height, 1.0);
+            Camera { fx: c.fx * 1.01, cx: c.cx + 1.5, cy: c.cy - 0.75, ..c }
+        })
+        .collect()
+}
+
+/// A smooth picture of two variables, -1 to 1 over a 90-degree field of view.
+fn picture(u: f64, v: f64) -> [f32; 3] {
+    [0.5 + 0.4 * (2.0 * u).sin(), 0.5 + 0.4 * (3.0 * v).cos(), 0.5 + 0.3 * (u * v)].map(|x| x as f32)
+}
+
+/// What a camera with these intrinsics and OpenCV distortion k1 k2 p1 p2 sees of [`picture`], a closed form but for the
+/// inversion of the distortion, which is Newton's.
+fn photograph(w: u32, h: u32, [fx, fy, cx, cy]: [f64; 4], [k1, k2, p1, p2]: [f64; 4]) -> Image {
+    let distort = |u: f64, v: f64| {
+        let r2 = u * u + v * v;
+        let radial = 1.0 + k1 * r2 + k2 * r2 * r2;
+        (
+            u * radial + 2.0 * p1 * u * v + p2 * (r2 + 2.0 * u * u),
+            v * radial + p1 * (r2 + 2.0 * v * v) + 2.0 * p2 * u * v,
+        )
+    };
+    let mut rgb = Vec::new();
+    for i in 0..w * h {
+        let x = (f64::from(i % w) + 0.5 - cx) / fx;
+        let y = (f64::from(i / w) + 0.5 - cy) / fy;
+        let (mut u, mut v) = (x, y);
+        for _ in 0..20 {
+            let (e, (a, b)) = (1e-6, distort(u, v));
+            let ((au, bu), (av, bv)) = (distort(u + e, v), distort(u, v + e));
+            let (j00, j01, j10, j11) = ((au - a) / e, (av - a) / e, (bu - b) / e, (bv - b) / e);
+            let det = j00 * j11 - j01 * j10;
+            u -= (j11 * (a - x) - j01 * (b - y)) / det;
+            v -= (j00 * (b - y) - j10 * (a - x)) / det;
+        }
+        rgb.extend(picture(u, v));
+    }
+    Image { width: w, height: h, rgb, alpha: None }
+}
+
+fn plain(w: u32, h: u32) -> Image {
+    photograph(w, h, [f64::from(w), f64::from(w), 0.5 * f64::from(w), 0.5 * f64::from(h)], [0.0; 4])
+}
+
+fn points() -> PointCloud {
+    PointCloud { positions: vec![[0.5, -0.25, 1.0], [1.0, 2.0, 3.0]], colors: vec![[1, 2, 3], [250, 251, 252]] }
+}
+
+/// A COLMAP scene in `root` with a photograph a camera.
+fn colmap_scene(root: &Path, cameras: &[Camera]) -> Vec<(String, Camera)> {
+    let views: Vec<_> = cameras.iter().enumerate().map(|(i, c)| (format!("frame_{i:05}.png"), c.clone())).collect();
+    colmap::write_model(&root.join("sparse/0"), &views, &points()).unwrap();
+    for (name, c) in &views {
+        plain(c.width, c.height).write_png(root.join("images").join(name)).unwrap();
+    }
+    views
+}
+
+fn write(path: &Path, text: &str) {
+    fs::create_dir_all(path.parent().unwrap()).unwrap();
+    fs::write(path, text).unwrap();
+}
+
+fn quaternion(c: &Camera) -> [f64; 4] {
+    let q = glam::DQuat::from_mat3(&c.rotation);
+    [q.w, q.x, q.y, q.z]
+}
+
+/// The same model as text, with `model` and its parameters.
+fn text_model(folder: &Path, views: &[(String, Camera)], model: &str, parameters: &[f64]) {
+    let words = |v: &[f64]| v.iter().map(f64::to_string).collect::<Vec<_>>().join(" ");
+    let c = &views[0].1;
+    let size = format!("{} {}", c.width, c.height);
+    write(&folder.join("cameras.txt"), &format!("# Camera list\n7 {model} {size} {}\n", words(parameters)));
+    let mut images = String::from("# Image list\n# two lines an image\n");
+    for (i, (name, c)) in views.iter().enumerate() {
+        let pose = words(&[&quaternion(c)[..], &c.translation.to_array()].concat());
+        // Half of the images see nothing: an empty line.
+        let seen = if i % 2 == 0 { "1.5 2.5 -1 3.0 4.0 12" } else { "" };
+        images += &format!("{} {pose} 7 {name}\n{seen}\n", i + 1);
+    }
+    write(&folder.join("images.txt"), &images);
+    let points = "# Points\n1 0.5 -0.25 1 1 2 3 0.7 1 0 2 5\n2 1 2 3 250 251 252 0.1\n";
+    write(&folder.join("points3D.txt"), points);
+}
+
+fn assert_same_cameras(a: &Dataset, b: &Dataset, tolerance: f64) {
+    assert_eq!(a.views.len(), b.views.len());
+    for (a, b) in a.views.iter().zip(&b.views) {
+        assert_eq!((a.camera.width, a.camera.height), (b.camera.width, b.camera.height));
+        let numbers = |c: &Camera| {
+            let mut v = vec![c.fx, c.fy, c.cx, c.cy];
+            v.extend(c.rotation.to_cols_array());
+            v.extend(c.translation.to_array());
+            v
+        };
+        for (x, y) in numbers(&a.camera).into_iter().zip(numbers(&b.camera)) {
+            assert!((x - y).abs() < tolerance, "{}: {x} {y}", a.name);
+        }
+    }
+}
+
+/// Rows of the world-from-camera matrix with OpenGL's axes.
+fn opengl(c: &Camera) -> [[f64; 4]; 4] {
+    let r = c.rotation.transpose() * DMat3::from_diagonal(DVec3::new(1.0, -1.0, -1.0));
+    let p = c.position();
+    let row = |i: usize| [r.x_axis[i], r.y_axis[i], r.z_axis[i], p[i]];
+    [row(0), row(1), row(2), [0.0, 0.0, 0.0, 1.0]]
+}
+
+#[test]
+fn a_binary_model_round_trips() {
+    let dir = tempfile::tempdir().unwrap();
+    let cameras = cameras(9, 40, 30);
+    let views = colmap_scene(dir.path(), &cameras);
+    let d = dataset::load(dir.path(), &FULL).unwrap();
+    assert_eq!((d.format, d.points, d.warnings.len()), (Format::Colmap, points(), 0));
+    assert_eq!(d.views.len(), 9);
+    for (v, (name, c)) in d.views.iter().zip(&views) {
+        assert_eq!(&v.name, name);
+        assert_eq!(v.stem(), name.trim_end_matches(".png"));
+        assert_eq!([v.camera.fx, v.camera.fy, v.camera.cx, v.camera.cy], [c.fx, c.fy, c.cx, c.cy]);
+        assert!(v.camera.position().distance(c.position()) < 1e-12);
+        assert!((v.camera.rotation - c.rotation).to_cols_array().iter().all(|e| e.abs() < 1e-14));
+    }
+    // Equal cameras are written once.
+    assert_eq!(fs::read(dir.path().join("sparse/0/cameras.bin")).unwrap().len(), 8 + 24 + 4 * 8);
+    assert_eq!(d.views[3].load_image().unwrap().rgb.len(), 3 * 40 * 30);
+}
+
+#[test]
+fn text_and_binary_models_are_the_same() {
+    let dir = tempfile::tempdir().unwrap();
+    let (a, b) = (dir.path().join("a"), dir.path().join("b"));
+    let views = colmap_scene(&a, &cameras(5, 40, 30));
+    colmap_scene(&b, &cameras(5, 40, 30));
+    fs::remove_dir_all(b.join("sparse")).unwrap();
+    let c = &views[0].1;
+    text_model(&b.join("sparse"), &views, "PINHOLE", &[c.fx, c.fy, c.cx, c.cy]);
+    let (a, b) = (dataset::load(&a, &FULL).unwrap(), dataset::load(&b, &FULL).unwrap());
+    assert_same_cameras(&a, &b, 1e-12);
+    assert_eq!(a.points, b.points);
+}
+
+#[test]
+fn names_may_hold_blanks_and_folders_and_stems_stay_apart() {
+    let dir = tempfile::tempdir().unwrap();
+    let mut views = colmap_scene(dir.path(), &cameras(3, 16, 12));
+    fs::remove_dir_all(dir.path().join("sparse")).unwrap();
+    let images = dir.path().join("images");
+    for (i, name) in ["left/my photo.png", "right/my photo.png", "c.png"].into_iter().enumerate() {
+        fs::create_dir_all(images.join(name).parent().unwrap()).unwrap();
+        fs::rename(images.join(&views[i].0), images.join(name)).unwrap();
+        views[i].0 = name.into();
+    }
+    text_model(&dir.path().join("sparse/0"), &views, "SIMPLE_PINHOLE", &[20.0, 8.0, 6.0]);
+    let d = dataset::load(dir.path(), &FULL).unwrap();
+    let stems: Vec<&str> = d.views.iter().map(dataset::View::stem).collect();
+    assert_eq!(stems, ["c", "left_my photo", "right_my photo"]);
+    assert_eq!(d.views[0].camera.fy, 20.0);
+}
+
+#[test]
+fn holding_out_and_shrinking() {
+    let dir = tempfile::tempdir().unwrap();
+    colmap_scene(dir.path(), &cameras(9, 41, 30));
+    let held = |holdout| {
+        let d = dataset::load(dir.path(), &LoadOptions { holdout, ..FULL }).unwrap();
+        (0..9).filter(|&i| d.views[i].split == Split::Test).collect::<Vec<_>>()
+    };
+    assert_eq!(held(8), [0, 8]);
+    assert_eq!(held(3), [0, 3, 6]);
+    assert!(held(0).is_empty());
+    let resolution = "2".parse().unwrap();
+    let d = dataset::load(dir.path(), &LoadOptions { resolution, holdout: 8 }).unwrap();
+    let full = dataset::load(dir.path(), &LoadOptions::default()).unwrap();
+    let (small, large) = (&d.views[0].camera, &full.views[0].camera);
+    assert_eq!((small.width, small.height, large.width), (21, 15, 41));
+    // The same ray falls on the same fraction of the image.
+    let p = DVec3::new(0.2, 0.1, 0.4);
+    let ((u, v, _), (lu, lv, _)) = (small.project(p), large.project(p));
+    assert!((u / 21.0 - lu / 41.0).abs() < 1e-12 && (v / 15.0 - lv / 30.0).abs() < 1e-12);
+    let image = d.views[0].load_image().unwrap();
+    assert_eq!((image.width, image.height, image.rgb.len()), (21, 15, 21 * 15 * 3));
+    for bad in ["0", "0.5", "-3", "NaN", "inf", "big", ""] {
+        let e = bad.parse::<Resolution>().unwrap_err().to_string();
+        assert!(e.contains("not a resolution") && e.contains("auto"), "{e}");
+    }
+    assert_eq!("auto".parse::<Resolution>().unwrap(), Resolution::Auto);
+}
+
+#[test]
+fn the_hash_is_of_contents_not_of_places() {
+    let dir = tempfile::tempdir().unwrap();
+    let (a, b) = (dir.path().join("a"), dir.path().join("elsewhere/b"));
+    colmap_scene(&a, &cameras(4, 20, 16));
+    colmap_scene(&b, &cameras(4, 20, 16));
+    let hash = |p: &Path, o: &LoadOptions| dataset::load(p, o).unwrap().hash().unwrap();
+    let first = hash(&a, &FULL);
+    assert_eq!(first, hash(&b, &FULL));
+    assert_eq!(first.len(), 64);
+    assert_ne!(first, hash(&a, &LoadOptions { holdout: 2, ..FULL }));
+    assert_ne!(first, hash(&a, &LoadOptions { resolution: Resolution::Divisor(2.0), ..FULL }));
+    let mut other = plain(20, 16);
+    other.rgb[5] = 0.0;
+    other.write_png(b.join("images/frame_00002.png")).unwrap();
+    assert_ne!(first, hash(&b, &FULL));
+    let mut moved = cameras(4, 20, 16);
+    moved[1].translation.x += 1e-9;
+    colmap_scene(&b, &moved);
+    assert_ne!(first, hash(&b, &FULL));
+}
+
+/// Loads a scene of one view whose camera has `model` and compares the undistorted photograph to the closed form.
+fn check_undistortion(model: &str, parameters: &[f64], intrinsics: [f64; 4], distortion: [f64; 4]) -> Camera {
+    let dir = tempfile::tempdir().unwrap();
+    let (w, h) = (160, 120);
+    let c = Camera { width: w, height: h, ..cameras(1, w, h)[0].clone() };
+    let photo = photograph(w, h, intrinsics, distortion);
+    photo.write_png(dir.path().join("images/a.png")).unwrap();
+    text_model(&dir.path().join("sparse/0"), &[("a.png".into(), c)], model, parameters);
+    let d = dataset::load(dir.path(), &FULL).unwrap();
+    let (view, image) = (&d.views[0], d.views[0].load_image().unwrap());
+    let k = &view.camera;
+    assert_eq!((k.width, k.height, image.width, image.height), (w, h, w, h));
+    let mut worst = 0.0f32;
+    for y in 0..h {
+        for x in 0..w {
+            let (u, v) = ((f64::from(x) + 0.5 - k.cx) / k.fx, (f64::from(y) + 0.5 - k.cy) / k.fy);
+            let at = 3 * (y * w + x) as usize;
+            let found = &image.rgb[at..at + 3];
+            worst = found.iter().zip(picture(u, v)).fold(worst, |m, (a, b)| m.max((a - b).abs()));
+        }
+    }
+    // 8 bits and bilinear interpolation on 160 pixels leave less than this; a shift of one pixel is 0.015.
+    assert!(worst < 0.006, "{model}: {worst}");
+    if distortion != [0.0; 4] {
+        let off = photo.rgb.iter().zip(&image.rgb).fold(0.0f32, |m, (a, b)| m.max((a - b).abs()));
+        assert!(off > 0.02, "{model}: the distortion does something");
+    }
+    k.clone()
+}
+
+#[test]
+fn undistortion_matches_the_closed_form() {
+    let (f, fx, fy, cx, cy) = (100.0, 101.0, 103.0, 82.0, 57.0);
+    let square = [f, f, cx, cy];
+    let k = check_undistortion("SIMPLE_PINHOLE", &[f, cx, cy], square, [0.0; 4]);
+    assert_eq!([k.fx, k.fy, k.cx, k.cy], square);
+    // A barrel leaves no corner empty, and the focal length stays.
+    let k = check_undistortion("SIMPLE_RADIAL", &[f, cx, cy, -0.08], square, [-0.08, 0.0, 0.0, 0.0]);
+    assert_eq!([k.fx, k.fy, k.cx, k.cy], square);
+    // A pincushion does, and the camera zooms in.
+    let k = check_undistortion("SIMPLE_RADIAL", &[f, cx, cy, 0.06], square, [0.06, 0.0, 0.0, 0.0]);
+    assert!(k.fx > 1.02 * f && k.fx < 1.1 * f && k.fx == k.fy, "{}", k.fx);
+    check_undistortion("RADIAL", &[f, cx, cy, -0.1, 0.02], square, [-0.1, 0.02, 0.0, 0.0]);
+    let d = [-0.09, 0.015, 0.002, -0.003];
+    let opencv = [fx, fy, cx, cy, d[0], d[1], d[2], d[3]];
+    check_undistortion("OPENCV", &opencv, [fx, fy, cx, cy], d);
+    check_undistortion("FULL_OPENCV", &[&opencv[..], &[0.0; 4]].concat(), [fx, fy, cx, cy], d);
+}
+
+#[test]
+fn the_rational_model_divides() {
+    // (1 + a r2) / (1 + a r2) is no distortion at all.
+    let parameters = [100.0, 100.0, 80.0, 60.0, 0.2, 0.1, 0.0, 0.0, 0.05, 0.2, 0.1, 0.05];
+    check_undistortion("FULL_OPENCV", &parameters, [100.0, 100.0, 80.0, 60.0], [0.0; 4]);
+}
+
+#[test]
+fn impossible_lenses_are_refused() {
+    let dir = tempfile::tempdir().unwrap();
+    let views = colmap_scene(dir.path(), &cameras(1, 40, 30));
+    fs::remove_dir_all(dir.path().join("sparse")).unwrap();
+    let load = |model: &str, parameters: &[f64]| {
+        text_model(&dir.path().join("sparse/0"), &views, model, parameters);
+        dataset::load(dir.path(), &FULL).unwrap_err().to_string()
+    };
+    let e = load("SIMPLE_RADIAL", &[20.0, 20.0, 15.0, -1e6]);
+    assert!(e.contains("frame_00000.png: camera: the lens distortion is too strong"), "{e}");
+    let e = load("SIMPLE_RADIAL", &[20.0, 20.0, 15.0]);
+    assert!(e.contains("cameras.txt: line 2: unsupported camera model; found SIMPLE_RADIAL with 3 parameters"), "{e}");
+    let e = load("OPENCV_FISHEYE", &[20.0, 20.0, 20.0, 15.0, 0.0, 0.0, 0.0, 0.0]);
+    assert!(e.contains("unsupported camera model") && e.contains("image_undistorter"), "{e}");
+    let e = load("PINHOLE", &[20.0, f64::NAN, 20.0, 15.0]);
+    assert!(e.contains("impossible camera parameters"), "{e}");
+    let e = load("PINHOLE", &[20.0, 0.0, 20.0, 15.0]);
+    assert!(e.contains("impossible camera parameters"), "{e}");
+}
+
+#[test]
+fn transforms_give_the_poses_of_colmap() {
+    let dir = tempfile::tempdir().unwrap();
+    let (a, b) = (dir.path().join("a"), dir.path().join("b"));
+    let cameras = cameras(4, 40, 30);
+    let views = colmap_scene(&a, &cameras);
+    colmap_scene(&b, &cameras);
+    fs::remove_dir_all(b.join("sparse")).unwrap();
+    ply::write_points(b.join("sparse_pc.ply"), &points(), &[]).unwrap();
+    let frames: Vec<_> = views
+        .iter()
+        .map(|(name, c)| serde_json::json!({"file_path": format!("./images/{name}"), "transform_matrix": opengl(c)}))
+        .collect();
+    let c = &cameras[0];
+    let json = serde_json::json!({"camera_model": "OPENCV", "w": 40, "h": 30, "fl_x": c.fx, "fl_y": c.fy, "cx": c.cx,
+        "cy": c.cy, "k1": 0.0, "k2": 0, "p1": 0.0, "p2": 0.0, "ply_file_path": "sparse_pc.ply", "frames": frames});
+    write(&b.join("transforms.json"), &json.to_string());
+    let (a, b) = (dataset::load(&a, &FULL).unwrap(), dataset::load(&b, &FULL).unwrap());
+    assert_eq!(b.format, Format::Transforms);
+    assert_same_cameras(&a, &b, 1e-12);
+    assert_eq!(a.points, b.points);
+    assert_eq!(b.views[1].name, "frame_00001.png");
+    // The file itself may be named as well as its folder.
+    let by_file = dataset::load(&b.root.join("transforms.json"), &FULL).unwrap();
+    assert_eq!(by_file.views, b.views);
+}
+
+#[test]
+fn blender_leaves_extension_and_size_out_and_keeps_alpha() {
+    let dir = tempfile::tempdir().unwrap();
+    let c = &cameras(1, 20, 16)[0];
+    let mut rgba = Vec::new();
+    for i in 0..320u32 {
+        rgba.extend([200, 100, 50, (i % 256) as u8]);
+    }
+    for name in ["train/r_0.png", "test/r_0.png"] {
+        let path = dir.path().join(name);
+        fs::create_dir_all(path.parent().unwrap()).unwrap();
+        image::save_buffer(&path, &rgba, 20, 16, image::ColorType::Rgba8).unwrap();
+    }
+    for part in ["train", "test"] {
+        let frames =
+            [serde_json::json!({"file_path": format!("./{part}/r_0"), "rotation": 0.1, "transform_matrix": opengl(c)})];
+        let json = serde_json::json!({"camera_angle_x": 0.8, "frames": frames});
+        write(&dir.path().join(format!("transforms_{part}.json")), &json.to_string());
+    }
+    let d = dataset::load(dir.path(), &FULL).unwrap();
+    let splits: Vec<_> = d.views.iter().map(|v| (v.stem(), v.split)).collect();
+    assert_eq!(splits, [("test_r_0", Split::Test), ("train_r_0", Split::Train)]);
+    let k = &d.views[0].camera;
+    assert!((k.fx - 10.0 / 0.4f64.tan()).abs() < 1e-12 && k.fy == k.fx && (k.cx, k.cy) == (10.0, 8.0));
+    let alpha = d.views[1].load_image().unwrap().alpha.unwrap();
+    assert!((alpha[7] - 7.0 / 255.0).abs() < 1e-6);
+}
+
+#[test]
+fn frames_have_their_own_cameras_and_missing_files_are_listed() {
+    let dir = tempfile::tempdir().unwrap();
+    let c = cameras(4, 20, 16);
+    plain(20, 16).write_png(dir.path().join("images/a.png")).unwrap();
+    plain(30, 24).write_png(dir.path().join("images/b.png")).unwrap();
+    plain(20, 16).write_png(dir.path().join("images/c.png")).unwrap();
+    let m: Vec<_> = c.iter().map(opengl).collect();
+    let json = serde_json::json!({"fl_x": 20.0, "w": 20, "h": 16, "test_filenames": ["images/a.png"],
+        "train_filenames": ["images/b.png"], "frames": [
+        {"file_path": "images/a.png", "transform_matrix": m[0]},
+        {"file_path": "images/b.png", "transform_matrix": m[1], "fl_x": 33.0, "fl_y": 34.0, "cx": 14.0, "cy": 13.0, "w": 30,
+         "h": 24, "k1": -0.05},
+        {"file_path": "images/c.png", "transform_matrix": [[0, 0, 0, 1], "LOST", [0, 0, 0, 0], [0, 0, 0, 0]]},
+        {"file_path": "images/gone.png", "transform_matrix": m[3]}]});
+    // Python writes infinities as words that are no JSON.
+    let text = json.to_string().replace("\"LOST\"", "[NaN, -Infinity, 0, Infinity]");
+    write(&dir.path().join("transforms.json"), &text);
+    let d = dataset::load(dir.path(), &FULL).unwrap();
+    let found: Vec<_> = d.views.iter().map(|v| (v.name.as_str(), v.split)).collect();
+    assert_eq!(found, [("a.png", Split::Test), ("b.png", Split::Train)]);
+    let k = &d.views[1].camera;
+    assert_eq!([k.fx, k.fy, k.cx, k.cy, f64::from(k.width)], [33.0, 34.0, 14.0, 13.0, 30.0]);
+    assert_eq!(d.warnings.len(), 2);
+    assert!(d.warnings[0].contains("c.png: the pose is not finite, view skipped"), "{:?}", d.warnings);
+    assert!(d.warnings[1].contains("gone.png: no such photograph, view skipped"), "{:?}", d.warnings);
+}
+
+/// ScanNet's pose file.
+fn pose_text(c: &Camera) -> String {
+    let r = c.rotation.transpose();
+    let p = c.position();
+    let row = |i: usize| format!("{} {} {} {}\n", r.x_axis[i], r.y_axis[i], r.z_axis[i], p[i]);
+    row(0) + &row(1) + &row(2) + "0 0 0 1\n"
+}
+
+#[test]
+fn both_layouts_of_scannet_agree() {
+    let dir = tempfile::tempdir().unwrap();
+    let (raw, converted) = (dir.path().join("raw"), dir.path().join("converted"));
+    let cameras = cameras(5, 40, 30);
+    let ids = [0, 20, 100, 40, 60];
+    let mut frames = Vec::new();
+    for (c, id) in cameras.iter().zip(ids) {
+        let jpeg = image::RgbImage::from_raw(40, 30, plain(40, 30).to_rgb8()).unwrap();
+        for root in [&raw, &converted] {
+            fs::create_dir_all(root.join("color")).unwrap();
+            jpeg.save(root.join(format!("color/{id}.jpg"))).unwrap();
+        }
+        let lost = "-inf -inf -inf -inf\n".repeat(4);
+        write(&raw.join(format!("pose/{id}.txt")), &if id == 60 { lost } else { pose_text(c) });
+        frames.push(serde_json::json!({"file_path": format!("color/{id}"), "transform_matrix": opengl(c)}));
+    }
+    write(&raw.join("color/notes.txt"), "not a frame");
+    let c = &cameras[0];
+    write(
+        &raw.join("intrinsic/intrinsic_color.txt"),
+        &format!("{} 0 {} 0\n0 {} {} 0\n0 0 1 0\n0 0 0 1\n", c.fx, c.cx, c.fy, c.cy),
+    );
+    ply::write_points(raw.join("scene0000_00_vh_clean_2.ply"), &points(), &[]).unwrap();
+    ply::write_points(converted.join("points3d.ply"), &points(), &[]).unwrap();
+    frames.pop();
+    let json =
+        serde_json::json!({"w": 40, "h": 30, "fl_x": c.fx, "fl_y": c.fy, "cx": c.cx, "cy": c.cy, "frames": frames});
+    // OpenGaussian writes all frames into both files.
+    write(&converted.join("transforms_train.json"), &json.to_string());
+    write(&converted.join("transforms_test.json"), &json.to_string());
+    let mut a = dataset::load(&raw, &FULL).unwrap();
+    let b = dataset::load(&converted, &FULL).unwrap();
+    let names = |d: &Dataset| d.views.iter().map(|v| v.name.clone()).collect::<Vec<_>>();
+    assert_eq!(
+        (a.format, names(&a)),
+        (Format::ScanNet, ["0.jpg", "20.jpg", "40.jpg", "100.jpg"].map(String::from).to_vec())
+    );
+    assert_eq!(
+        (b.format, names(&b)),
+        (Format::Transforms, ["0.jpg", "100.jpg", "20.jpg", "40.jpg"].map(String::from).to_vec())
+    );
+    assert!(a.warnings.len() == 1 && a.warnings[0].contains("60.txt: the pose is not finite"), "{:?}", a.warnings);
+    a.views.sort_by(|a, b| a.name.cmp(&b.name));
+    assert_same_cameras(&a, &b, 1e-12);
+    assert_eq!((&a.points, &b.points), (&points(), &points()));
+    assert_eq!(b.views_of(Split::Test).count(), 1, "no file names held-out views, so every eighth is");
+    // Frames extracted at half size under full-size intrinsics.
+    image::RgbImage::new(20, 15).save(raw.join("color/20.jpg")).unwrap();
+    let e = dataset::load(&raw, &FULL).unwrap_err().to_string();
+    assert!(e.contains("intrinsic_color.txt: fx fy cx cy: the intrinsics do not fit the frames"), "{e}");
+}
+
+#[test]
+fn errors_name_file_field_found_and_expected() {
+    let fresh = || {
+        let dir = tempfile::tempdir().unwrap();
+        colmap_scene(dir.path(), &cameras(2, 20, 16));
+        dir
+    };
+    type Spoil = fn(&Path);
+    fn edit(p: &Path, name: &str, at: usize, bytes: &[u8]) {
+        let path = p.join("sparse/0").join(name);
+        let mut b = fs::read(&path).unwrap();
+        b[at..at + bytes.len()].copy_from_slice(bytes);
+        fs::write(path, b).unwrap();
+    }
+    fn shorten(p: &Path, name: &str, by: usize) {
+        let path = p.join("sparse/0").join(name);
+        let b = fs::read(&path).unwrap();
+        fs::write(path, &b[..b.len() - by]).unwrap();
+    }
+    let cases: [(Spoil, &str); 18] = [
+        (
+            |p| edit(p, "cameras.bin", 0, &u64::MAX.to_le_bytes()),
+            "cameras.bin: camera count: the count does not fit the file's length; found 18446744073709551615, expected at most 1",
+        ),
+        (|p| edit(p, "cameras.bin", 0, &0u64.to_le_bytes()), "cameras.bin: camera count: the count does not fit"),
+        (
+            |p| fs::write(p.join("sparse/0/cameras.bin"), [0; 8]).unwrap(),
+            "cameras.bin: camera count: the model has no camera",
+        ),
+        (
+            |p| fs::write(p.join("sparse/0/images.bin"), [0; 8]).unwrap(),
+            "images.bin: image count: the model has no image",
+        ),
+        (
+            |p| edit(p, "cameras.bin", 12, &99u32.to_le_bytes()),
+            "cameras.bin: camera 0: unknown camera model; found model 99",
+        ),
+        (|p| edit(p, "cameras.bin", 12, &5u32.to_le_bytes()), "cameras.bin: camera 0: the file is cut short"),
+        (
+            |p| edit(p, "cameras.bin", 16, &0u64.to_le_bytes()),
+            "cameras.bin: camera 0: impossible image size; found 0x16",
+        ),
+        (
+            |p| edit(p, "cameras.bin", 8, &42u32.to_le_bytes()),
+            "frame_00000.png: the image's camera is unknown; found camera 1",
+        ),
+        (
+            |p| edit(p, "images.bin", 12, &f64::NAN.to_le_bytes()),
+            "images.bin: image 0: impossible pose; found quaternion [NaN",
+        ),
+        (|p| edit(p, "images.bin", 44, &f64::INFINITY.to_le_bytes()), "images.bin: image 0: impossible pose"),
+        (
+            |p| edit(p, "images.bin", 0, &1u64.to_le_bytes()),
+            "images.bin: image count: the count does not fit the file's length; found 1, and",
+        ),
+        (|p| shorten(p, "images.bin", 9), "images.bin: image 1: the image's name does not end"),
+        (|p| shorten(p, "points3D.bin", 1), "points3D.bin: "),
+        (|p| edit(p, "points3D.bin", 16, &f64::NAN.to_le_bytes()), "points3D.bin: point 0: the position is not finite"),
+        (|p| edit(p, "points3D.bin", 0, &u64::MAX.to_le_bytes()), "points3D.bin: point count: the count does not fit"),
+        (|p| fs::remove_file(p.join("sparse/0/images.bin")).unwrap(), "images.txt: cannot read"),
+        (
+            |p| plain(16, 20).write_png(p.join("images/frame_00001.png")).unwrap(),
+            "frame_00001.png: size: the photograph has another size than its camera; found 16x20, expected 20x16",
+        ),
+        (
+            |p| fs::write(p.join("images/frame_00001.png"), "not a picture").unwrap(),
+            "frame_00001.png: not a readable picture",
+        ),
+    ];
+    for (spoil, expected) in cases {
+        let dir = fresh();
+        spoil(dir.path());
+        let e = dataset::load(dir.path(), &FULL).unwrap_err().to_string();
+        assert!(e.contains(expected) && !e.contains('\n'), "{e}\nlacks {expected}");
+    }
+}
+
+#[test]
+fn missing_photographs_are_skipped_until_none_is_left() {
+    let dir = tempfile::tempdir().unwrap();
+    colmap_scene(dir.path(), &cameras(3, 20, 16));
+    fs::remove_file(dir.path().join("images/frame_00001.png")).unwrap();
+    let d = dataset::load(dir.path(), &FULL).unwrap();
+    assert_eq!((d.views.len(), d.warnings.len()), (2, 1));
+    assert!(d.warnings[0].contains("frame_00001.png: no such photograph"), "{:?}", d.warnings);
+    fs::remove_dir_all(dir.path().join("images")).unwrap();
+    let e = dataset::load(dir.path(), &FULL).unwrap_err().to_string();
+    assert!(e.contains("no view is left; found ") && e.contains("frame_00000.png: no such photograph"), "{e}");
+}
+
+#[test]
+fn folders_that_are_no_dataset_say_what_one_is() {
+    let dir = tempfile::tempdir().unwrap();
+    let e = dataset::load(dir.path(), &FULL).unwrap_err().to_string();
+    assert!(e.contains("no dataset recognised") && e.contains("COLMAP") && e.contains("transforms.json"), "{e}");
+    let e = dataset::load(&dir.path().join("nowhere"), &FULL).unwrap_err().to_string();
+    assert!(e.contains("nowhere: no such folder"), "{e}");
+}
+
+#[test]
+fn bad_transforms_are_refused() {
+    let dir = tempfile::tempdir().unwrap();
+    plain(20, 16).write_png(dir.path().join("a.png")).unwrap();
+    let good = opengl(&cameras(1, 20, 16)[0]);
+    let load = |json: &serde_json::Value| {
+        write(&dir.path().join("transforms.json"), &json.to_string());
+        dataset::load(dir.path(), &FULL).map_err(|e| e.to_string())
+    };
+    let with = |key: &str, value: serde_json::Value| {
+        let mut json = serde_json::json!({"fl_x": 20.0, "frames": [{"file_path": "a.png", "transform_matrix": good}]});
+        let owner = if key.starts_with("frame.") { &mut json["frames"][0] } else { &mut json };
+        owner[key.trim_start_matches("frame.")] = value;
+        load(&json)
+    };
+    use serde_json::json;
+    assert!(with("extra", json!(1)).is_ok());
+    let mirrored = json!([[-1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]);
+    let cases = [
+        ("frames", json!(3), "frames: the file has no list of frames"),
+        ("frames", json!([]), "no view is left"),
+        ("frame.file_path", json!(null), "frames[0].file_path: the frame names no photograph; found null"),
+        (
+            "frame.file_path",
+            json!("../../secret.png"),
+            "frames[0].file_path: the photograph's name leads out of the dataset",
+        ),
+        ("frame.file_path", json!("/etc/a.png"), "leads out of the dataset"),
+        ("frame.transform_matrix", json!([[1, 2], [3, 4]]), "frames[0].transform_matrix: not a 4x4 matrix"),
+        ("frame.transform_matrix", mirrored, "frames[0].transform_matrix: the pose is not a rotation"),
+        ("frame.transform_matrix", json!([[0, 0, 0, 0], [0, 0, 0, 0], [0, 0, 0, 0]]), "the pose is not a rotation"),
+        ("fl_x", json!(null), "no usable focal length"),
+        ("fl_x", json!(-4), "no usable focal length"),
+        ("fl_x", json!("long"), "frames[0], fl_x: not a number; found \"long\""),
+        ("camera_model", json!("OPENCV_FISHEYE"), "unsupported camera model; found OPENCV_FISHEYE"),
+        ("is_fisheye", json!(true), "unsupported camera model"),
+        ("ply_file_path", json!("/etc/points.ply"), "ply_file_path: the photograph's name leads out"),
+    ];
+    for (key, value, expected) in cases {
+        let e = with(key, value).unwrap_err();
+        assert!(e.contains(expected) && !e.contains('\n'), "{e}\nlacks {expected}");
+    }
+    let two_sizes =
+        json!({"fl_x": 20.0, "w": 21, "h": 16, "frames": [{"file_path": "a.png", "transform_matrix": good}]});
+    assert!(load(&two_sizes).unwrap_err().contains("found 20x16, expected 21x16"));
+    let twice = json!({"fl_x": 20.0, "frames": [{"file_path": "a.png", "transform_matrix": good},
+        {"file_path": "a", "transform_matrix": good}]});
+    assert!(load(&twice).unwrap_err().contains("two views have the same name"));
+    write(&dir.path().join("transforms.json"), "{\"frames\": [");
+    assert!(dataset::load(dir.path(), &FULL).unwrap_err().to_string().contains("transforms.json: not JSON"));
+}
