@@ -1,1 +1,10 @@
-//! Stage 3: instances from features, instance-to-mask matching, a descriptor per instance.
+//! Stage 3: 3D instances from features, the masks they were seen as, and a language descriptor for each.
+//!
+//! [`group`] clusters Gaussians, [`extend`] gives noise and unseen Gaussians to their neighbours, [`associate`] matches
+//! instances with the masks of each view, [`describe`] gathers what is known of each instance.
+
+pub mod associate;
+pub mod cli;
+pub mod describe;
+pub mod extend;
+pub mod group;

@@ -1,1 +1,86 @@
-//! Exact HDBSCAN: kd-tree core distances, Boruvka spanning tree, condensed tree, selection.
+//! HDBSCAN (Campello, Moulavi, Sander 2013; McInnes and Healy 2017), exact and deterministic.
+//!
+//! Core distances come from a kd-tree, the minimum spanning tree of mutual reachability distances from Boruvka's algorithm
+//! on the same tree; edges have one total order (weight, smaller index, larger index), so the result does not depend on
+//! the number of threads. Points of equal coordinates are collapsed into one with a weight. The same hierarchy can be
+//! built from the edges of a given graph ([`cluster_graph`]).
+//!
+//! `min_samples` counts the point itself, as scikit-learn does (Python's `hdbscan` does not: its 9 is 10 here).
+
+mod boruvka;
+mod condense;
+mod kdtree;
+mod linkage;
+mod select;
+
+pub use boruvka::spanning_tree;
+pub use condense::{CondensedEdge, CondensedTree};
+pub use kdtree::core_distances;
+pub use linkage::{Edge, spanning_forest};
+pub use select::Selection;
+
+/// Parameters of a clustering.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Options {
+    /// Fewest points of a cluster, at least 2.
+    pub min_cluster_size: usize,
+    /// Neighbours, the point itself included, whose distance is the core distance; at least 1.
+    pub min_samples: usize,
+    /// Clusters that are born below this distance are joined with their parents; 0 for none.
+    pub epsilon: f64,
+    /// How clusters are chosen from the hierarchy.
+    pub selection: Selection,
+    /// Whether all points may be one cluster.
+    pub allow_single_cluster: bool,
+}
+
+impl Default for Options {
+    fn default() -> Self {
+        Self {
+            min_cluster_size: 5,
+            min_samples: 5,
+            epsilon: 0.0,
+            selection: Selection::ExcessOfMass,
+            allow_single_cluster: false,
+        }
+    }
+}
+
+/// The result of a clustering.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Clustering {
+    /// Cluster of every point, from 0; -1 for noise.
+    pub labels: Vec<i32>,
+    /// How firmly a point belongs to its cluster, 0 to 1; 0 for noise.
+    pub probabilities: Vec<f32>,
+    /// The condensed tree.
+    pub tree: CondensedTree,
+    /// The node of the tree that was selected for each cluster, by label.
+    pub selected: Vec<u32>,
+}
+
+/// Clusters `points`, `[n][dim]` flattened.
+///
+/// # Panics
+/// When `dim` is 0, does not divide the number of values, or a value is not finite.
+pub fn cluster(points: &[f32], dim: usize, options: &Options) -> Clustering {
+    assert!(dim > 0 && points.len().is_multiple_of(dim), "points are [n][dim]");
+    assert!(points.iter().all(|v| v.is_finite()), "points are finite");
+    let unique = kdtree::Unique::new(points, dim);
+    let core = kdtree::core_distances_of(&unique, dim, options.min_samples);
+    let edges = boruvka::spanning_tree_of(&unique.points, dim, &core);
+    let tree = condense::condense(&edges, &unique.weights, &core, options.min_cluster_size);
+    select::label(tree, &unique.of_point, options)
+}
+
+/// Clusters `n` points by the edges of a graph, weights being distances; parts of the graph that are not connected are
+/// joined at infinite distance.
+///
+/// # Panics
+/// When an edge names a point beyond `n` or has a weight that is NaN or negative.
+pub fn cluster_graph(n: usize, edges: &[Edge], options: &Options) -> Clustering {
+    let forest = spanning_forest(n, edges);
+    let tree = condense::condense(&forest, &vec![1; n], &vec![0.0; n], options.min_cluster_size);
+    let identity: Vec<u32> = (0..n as u32).collect();
+    select::label(tree, &identity, options)
+}

@@ -101,6 +101,14 @@ impl Stage {
         flag.load(Ordering::SeqCst)
     }
 
+    /// Marks the stage as interrupted, as a signal would: whatever error ends it now, the exit code is 130.
+    pub fn stop(&self) {
+        self.interrupted();
+        if let Some(flag) = self.interrupted.get() {
+            flag.store(true, Ordering::SeqCst);
+        }
+    }
+
     /// The provenance of an artifact of this stage.
     pub fn provenance(
         &self,

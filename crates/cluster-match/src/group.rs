@@ -1,0 +1,196 @@
+//! Clustering of Gaussians by their features.
+
+use artifacts::{Features, Graph, TreeEdge};
+use hdbscan_exact::{Clustering, Edge, Options, cluster, cluster_graph};
+use rayon::prelude::*;
+
+/// Gaussians that one task handles.
+const CHUNK: usize = 4096;
+
+/// Which pairs of Gaussians the hierarchy may join.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, clap::ValueEnum)]
+pub enum Space {
+    /// Any two: HDBSCAN of standardised features as free points (the paper).
+    Free,
+    /// Spatial neighbours only: HDBSCAN on the neighbour graph, cosine distances of features.
+    Graph,
+}
+
+/// Features standardised per channel over all Gaussians, (f - mean) / deviation (paper, "Instance Clustering"); a channel
+/// without deviation becomes zeros. Sums in f64.
+pub fn standardise(values: &[f32], dim: usize) -> Vec<f32> {
+    let n = (values.len() / dim.max(1)).max(1) as f64;
+    let sums = |f: &(dyn Fn(usize, f64) -> f64 + Sync)| -> Vec<f64> {
+        let parts: Vec<Vec<f64>> = values
+            .par_chunks(CHUNK * dim)
+            .map(|rows| {
+                let mut s = vec![0.0; dim];
+                for row in rows.chunks_exact(dim) {
+                    for (c, v) in row.iter().enumerate() {
+                        s[c] += f(c, f64::from(*v));
+                    }
+                }
+                s
+            })
+            .collect();
+        let mut total = vec![0.0; dim];
+        for part in parts {
+            total.iter_mut().zip(part).for_each(|(t, p)| *t += p);
+        }
+        total
+    };
+    let mean: Vec<f64> = sums(&|_, v| v).iter().map(|s| s / n).collect();
+    let deviation: Vec<f64> = sums(&|c, v| (v - mean[c]).powi(2)).iter().map(|s| (s / n).sqrt()).collect();
+    // A deviation that is rounding noise of the mean is no deviation.
+    let scale: Vec<f64> =
+        mean.iter().zip(&deviation).map(|(m, d)| if *d > 1e-6 * m.abs().max(1e-30) { 1.0 / d } else { 0.0 }).collect();
+    let mut out = vec![0.0; values.len()];
+    out.par_chunks_mut(dim).zip(values.par_chunks(dim)).with_min_len(CHUNK).for_each(|(o, v)| {
+        for c in 0..dim {
+            o[c] = ((f64::from(v[c]) - mean[c]) * scale[c]) as f32;
+        }
+    });
+    out
+}
+
+/// Features averaged over each Gaussian and its spatial neighbours, `rounds` times.
+pub fn smooth(values: &[f32], dim: usize, neighbours: &[u32], k: usize, rounds: usize) -> Vec<f32> {
+    let mut now = values.to_vec();
+    for _ in 0..rounds {
+        let mut next = vec![0.0; now.len()];
+        next.par_chunks_mut(dim).enumerate().with_min_len(CHUNK).for_each(|(i, out)| {
+            out.copy_from_slice(&now[i * dim..(i + 1) * dim]);
+            for &j in &neighbours[i * k..(i + 1) * k] {
+                for (o, v) in out.iter_mut().zip(&now[j as usize * dim..(j as usize + 1) * dim]) {
+                    *o += v;
+                }
+            }
+            out.iter_mut().for_each(|o| *o /= (k + 1) as f32);
+        });
+        now = next;
+    }
+    now
+}
+
+/// Clusters the kept Gaussians.
+pub fn group(features: &Features, graph: &Graph, space: Space, smoothing: usize, options: &Options) -> Clustering {
+    let dim = features.dim.max(1);
+    let k = graph.gaussian_k;
+    let values = smooth(&features.values, dim, &graph.gaussian_knn, k, smoothing);
+    match space {
+        Space::Free => cluster(&standardise(&values, dim), dim, options),
+        Space::Graph => cluster_graph(features.kept.len(), &neighbour_edges(&values, dim, graph, options), options),
+    }
+}
+
+/// Edges between spatial neighbours with the mutual reachability of cosine distances: a Gaussian's core distance is the
+/// distance to the (`min_samples` - 1)-th nearest in features among its spatial neighbours.
+fn neighbour_edges(values: &[f32], dim: usize, graph: &Graph, options: &Options) -> Vec<Edge> {
+    let (n, k) = (graph.kept.len(), graph.gaussian_k);
+    let unit: Vec<f32> = values
+        .chunks_exact(dim)
+        .flat_map(|row| {
+            let norm = row.iter().map(|v| f64::from(*v).powi(2)).sum::<f64>().sqrt();
+            let scale = if norm > 1e-30 { 1.0 / norm } else { 0.0 };
+            row.iter().map(move |v| (f64::from(*v) * scale) as f32).collect::<Vec<_>>()
+        })
+        .collect();
+    let distance = |a: usize, b: usize| -> f64 {
+        let dot: f64 = (0..dim).map(|c| f64::from(unit[a * dim + c]) * f64::from(unit[b * dim + c])).sum();
+        (1.0 - dot).max(0.0)
+    };
+    let core: Vec<f64> = (0..n)
+        .into_par_iter()
+        .with_min_len(CHUNK)
+        .map(|i| {
+            let row = &graph.gaussian_knn[i * k..(i + 1) * k];
+            let mut d: Vec<f64> = row.iter().filter(|&&j| j as usize != i).map(|&j| distance(i, j as usize)).collect();
+            d.sort_by(f64::total_cmp);
+            match options.min_samples.saturating_sub(1).min(d.len()) {
+                0 => 0.0,
+                at => d[at - 1],
+            }
+        })
+        .collect();
+    let mut edges: Vec<Edge> = (0..n)
+        .into_par_iter()
+        .with_min_len(CHUNK)
+        .flat_map_iter(|i| {
+            let row = &graph.gaussian_knn[i * k..(i + 1) * k];
+            let (core, distance) = (&core, &distance);
+            row.iter().filter(move |&&j| j as usize != i).map(move |&j| {
+                let j = j as usize;
+                Edge::new(i as u32, j as u32, distance(i, j).max(core[i]).max(core[j]))
+            })
+        })
+        .collect();
+    // Two Gaussians that are each other's neighbours give the same edge twice.
+    edges.par_sort_unstable_by(Edge::order);
+    edges.dedup_by(|a, b| a.order(b).is_eq());
+    edges
+}
+
+/// The cluster-to-cluster edges of the condensed tree, with the instance selected at each child.
+pub fn tree(clustering: &Clustering) -> Vec<TreeEdge> {
+    let points = clustering.tree.points;
+    clustering
+        .tree
+        .edges
+        .iter()
+        .filter(|e| e.child >= points)
+        .map(|e| TreeEdge {
+            parent: e.parent,
+            child: e.child,
+            lambda: e.lambda.min(f64::from(f32::MAX)) as f32,
+            size: e.size,
+            instance: clustering.selected.iter().position(|&s| s == e.child).map_or(-1, |p| p as i32),
+        })
+        .collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn standardised_channels_have_mean_0_and_deviation_1_and_constants_vanish() {
+        let values: Vec<f32> = (0..1000).flat_map(|i| [i as f32 * 0.5 + 1e4, 0.1, -(i as f32)]).collect();
+        let s = standardise(&values, 3);
+        for c in [0, 2] {
+            let mean = s.iter().skip(c).step_by(3).map(|v| f64::from(*v)).sum::<f64>() / 1000.0;
+            let square = s.iter().skip(c).step_by(3).map(|v| f64::from(*v).powi(2)).sum::<f64>() / 1000.0;
+            assert!(mean.abs() < 1e-5 && (square - 1.0).abs() < 1e-4, "{mean} {square}");
+        }
+        assert!(s.iter().skip(1).step_by(3).all(|&v| v == 0.0));
+    }
+
+    /// Two rods along x with features along two axes; their ends touch neither in space nor in features.
+    fn two_rods() -> (Features, Graph) {
+        let n = 60usize;
+        let values =
+            (0..n).flat_map(|i| if i < 30 { [1.0, 0.01 * (i % 7) as f32] } else { [0.01 * (i % 5) as f32, 1.0] });
+        let neighbours = (0..n as i32).flat_map(|i| {
+            let (low, high) = if i < 30 { (0, 29) } else { (30, 59) };
+            [i - 2, i - 1, i + 1, i + 2].map(|j| j.clamp(low, high) as u32)
+        });
+        let features = Features { kept: (0..n as u32).collect(), dim: 2, values: values.collect() };
+        let graph = Graph {
+            kept: features.kept.clone(),
+            gaussian_k: 4,
+            gaussian_knn: neighbours.collect(),
+            ..Graph::default()
+        };
+        (features, graph)
+    }
+
+    #[test]
+    fn both_spaces_find_two_rods() {
+        let (f, g) = two_rods();
+        let o = Options { min_cluster_size: 10, min_samples: 3, ..Options::default() };
+        for space in [Space::Free, Space::Graph] {
+            let c = group(&f, &g, space, 0, &o);
+            assert_eq!(c.selected.len(), 2, "{space:?}");
+            assert!(c.labels[5] != c.labels[45] && c.labels[5] >= 0 && c.labels[45] >= 0, "{space:?}");
+        }
+    }
+}

@@ -1,0 +1,7 @@
+//! The `cluster-match` program.
+
+use std::process::ExitCode;
+
+fn main() -> ExitCode {
+    stage::main::<cluster_match::cli::Args>()
+}
