@@ -118,7 +118,11 @@ struct Contrastive {
 #[derive(Debug, clap::Args)]
 #[command(next_help_heading = "Closed form")]
 struct Spectral {
-    /// Power of the singular values: low shows parts, high shows whole things
+    /// Singular value below which vectors fade out: low shows parts, high shows whole things. A vector separates what it
+    /// does the better the nearer its singular value is to 1
+    #[arg(long, value_name = "VALUE", default_value_t = 0.7)]
+    cutoff: f64,
+    /// How steeply they fade out there
     #[arg(long, value_name = "POWER", default_value_t = 16.0)]
     power: f64,
     /// What a mask says about a Gaussian
@@ -152,6 +156,7 @@ impl Args {
             ("--lr", positive(c.lr), c.lr.to_string(), "more than 0".into()),
             ("--weight-lr", positive(c.weight_lr), c.weight_lr.to_string(), "more than 0".into()),
             ("--cohesion", c.cohesion >= 0.0 && c.cohesion.is_finite(), c.cohesion.to_string(), "0 or more".into()),
+            ("--cutoff", positive(self.spectral.cutoff), self.spectral.cutoff.to_string(), "more than 0".into()),
             ("--curve-every", c.curve_every > 0, "0".into(), "at least 1".into()),
             (
                 "--power",
@@ -194,6 +199,7 @@ impl Args {
             }),
             Method::Spectral => json!({
                 "dim": self.dim.map_or(json!("auto"), |d| json!(d)),
+                "cutoff": self.spectral.cutoff,
                 "power": self.spectral.power,
                 "evidence": name_of(&self.spectral.evidence),
                 "smoothing": !self.spectral.no_smoothing,
@@ -303,6 +309,7 @@ impl Args {
         let options = SpectralOptions {
             most: self.dim.unwrap_or(64),
             auto: self.dim.is_none(),
+            cutoff: s.cutoff,
             power: s.power,
             seed: self.common.seed,
         };

@@ -125,7 +125,7 @@ impl<T: Real> Model<T> {
     }
 
     /// Standardised inputs h of the anchors, and their sums over neighbours: `[M][d + 3]` each.
-    fn inputs(&self, context: &Context) -> (Vec<T>, Vec<T>) {
+    fn inputs<'a>(&self, context: &'a Context) -> (Vec<T>, Vec<T>) {
         let d = self.settings.dim;
         let channels = d + COLOR;
         let moments: Vec<Moments> = match self.settings.norm_axis {
@@ -152,23 +152,22 @@ impl<T: Real> Model<T> {
             }
         };
         let anchors = context.anchors.len();
-        let gather = |places: &(dyn Fn(usize, &mut dyn FnMut(usize)) + Sync)| -> Vec<T> {
+        // Sums h over the places that `places_of(anchor)` names.
+        let gather = |places_of: &(dyn Fn(usize) -> &'a [u32] + Sync)| -> Vec<T> {
             let mut out = vec![T::default(); anchors * channels];
             out.par_chunks_mut(CHUNK * channels).enumerate().for_each(|(chunk, rows)| {
                 let mut sum = vec![0.0; channels];
                 for (i, row) in rows.chunks_exact_mut(channels).enumerate() {
                     sum.fill(0.0);
-                    places(chunk * CHUNK + i, &mut |place| add(place, &mut sum));
+                    places_of(chunk * CHUNK + i).iter().for_each(|&place| add(place as usize, &mut sum));
                     row.iter_mut().zip(&sum).for_each(|(r, &s)| *r = T::of(s));
                 }
             });
             out
         };
-        let h = gather(&|a, visit| visit(context.anchors[a] as usize));
+        let h = gather(&|a| &context.anchors[a..=a]);
         let sums = match context.kind {
-            Neighbours::Gaussians => {
-                gather(&|a, visit| context.neighbours_of(a).iter().for_each(|&p| visit(p as usize)))
-            }
+            Neighbours::Gaussians => gather(&|a| context.neighbours_of(a)),
             Neighbours::Anchors => network::neighbour_sums(context, &h, channels),
         };
         (h, sums)
@@ -282,7 +281,7 @@ impl<T: Real> Model<T> {
             evaluated.centroids.iter_mut().zip(&sums).for_each(|(g, s)| *g += s);
         }
         // Back to the columns, piece by piece; the Gaussians of an anchor lie in one piece.
-        let parts: Vec<(Vec<T>, Vec<(u32, Vec<f64>)>)> = set
+        let parts: Vec<PieceGradients<T>> = set
             .pieces
             .par_windows(2)
             .map(|bounds| {
@@ -363,6 +362,9 @@ impl<T: Real> Model<T> {
             .collect()
     }
 }
+
+/// Gradients from one piece of columns: of the columns' features, and, per anchor, of what its Gaussians receive.
+type PieceGradients<T> = (Vec<T>, Vec<(u32, Vec<f64>)>);
 
 /// Terms of the loss that look at single Gaussians.
 struct ColumnTerms<'a, T> {

@@ -1,8 +1,11 @@
 //! Features in closed form: leading singular vectors of the matrix of Gaussians and masks ([`crate::evidence`]).
 //!
 //! Gaussians that share masks over many views get similar rows of the left singular vectors: it is what a spectral
-//! contrastive loss converges to. As in a diffusion map, vectors are scaled by a power of their singular values, which
-//! fades out what only few views separate: a low power shows parts, a high one whole things.
+//! contrastive loss converges to. A vector's squared singular value says how well what it separates holds together: how
+//! much of a random walk from a Gaussian to a mask that shows it, and back, stays there. Vectors are scaled by a smooth
+//! step in their singular values, σ^p / (σ^p + c^p): what holds together counts fully, what only few views separate fades
+//! out. The cutoff c is a knob of granularity: low shows parts, high whole things. (A plain power of σ, as in a diffusion
+//! map, fades the second vector already, and everything comes to lie near the first, which tells nothing apart.)
 //!
 //! The vectors come from block subspace iteration with Rayleigh-Ritz on the side of the masks, of which there are few.
 
@@ -17,8 +20,8 @@ use stage::Stage;
 
 /// Vectors carried beyond those asked for: they speed up convergence.
 const EXTRA: usize = 16;
-/// The iteration ends when no wanted vector's scale (singular value over the largest, to the power) changes by more than
-/// this: vectors that are faded out need not converge.
+/// The iteration ends when no wanted vector's scale changes by more than this share of the first one's: vectors that are
+/// faded out need not converge.
 const TOLERANCE: f64 = 1e-6;
 /// Or after this many products with the matrix and its transpose.
 const MOST_PASSES: usize = 200;
@@ -32,10 +35,19 @@ pub struct SpectralOptions {
     pub most: usize,
     /// Drop those among them whose scale does not matter.
     pub auto: bool,
-    /// Power of the singular values.
+    /// Singular value c at which a vector's scale is a half.
+    pub cutoff: f64,
+    /// Steepness p of the step.
     pub power: f64,
     /// Seed of the starting vectors.
     pub seed: u64,
+}
+
+impl SpectralOptions {
+    /// Scale of a vector of this singular value.
+    fn scale(&self, value: f64) -> f64 {
+        if value > 0.0 { 1.0 / (1.0 + (self.cutoff / value).powf(self.power)) } else { 0.0 }
+    }
 }
 
 /// Features of all Gaussians.
@@ -57,11 +69,10 @@ pub struct Spectral {
 /// When there is no evidence, or the stage was interrupted.
 pub fn spectral(matrix: &Matrix, options: &SpectralOptions, stage: &Stage) -> Result<Spectral> {
     let (vectors, values, passes) = right_singular_vectors(matrix, options, stage)?;
-    let largest = values[0];
-    let scale = |j: usize| (values[j] / largest).powf(options.power);
+    let scale = |j: usize| options.scale(values[j]);
     let mut dim = options.most.min(values.len());
     if options.auto {
-        dim = (0..dim).take_while(|&j| scale(j) >= LEAST_SCALE).count();
+        dim = (0..dim).take_while(|&j| scale(j) >= LEAST_SCALE * scale(0)).count();
     }
     // C v = sigma u; the row's own scale cancels when rows are normalised.
     let scaled: Columns = (0..dim)
@@ -99,14 +110,11 @@ fn right_singular_vectors(
         let (ritz, rotation) = symmetric_eigen(&cross(&v, &w));
         let found: Vec<f64> = ritz.iter().map(|r| r.max(0.0).sqrt()).collect();
         let wanted = options.most.min(found.len());
-        let scale = |values: &[f64], j: usize| match values.get(j) {
-            Some(v) if values[0] > 0.0 => (v / values[0]).powf(options.power),
-            _ => 0.0,
-        };
+        let scale = |values: &[f64], j: usize| values.get(j).map_or(0.0, |v| options.scale(*v));
         let change = (0..wanted).map(|j| (scale(&found, j) - scale(&values, j)).abs()).fold(0.0, f64::max);
         values = found;
         progress.set(pass as u64, &[("change", change)]);
-        if change <= TOLERANCE || p == masks.min(matrix.gaussians) && pass > 1 {
+        if change <= TOLERANCE * scale(&values, 0) || p == masks.min(matrix.gaussians) && pass > 1 {
             progress.finish(&[("change", change)]);
             let mut vectors = multiply(&v, &rotation);
             vectors.iter_mut().for_each(|c| make_positive(c));
@@ -151,7 +159,7 @@ mod tests {
     use crate::evidence::tests::{dense, random};
 
     fn options() -> SpectralOptions {
-        SpectralOptions { most: 6, auto: false, power: 1.0, seed: 3 }
+        SpectralOptions { most: 6, auto: false, cutoff: 1e6, power: 1.0, seed: 3 }
     }
 
     #[test]
@@ -180,7 +188,7 @@ mod tests {
     #[test]
     fn more_vectors_than_masks_and_equal_results_on_any_threads() {
         let m = random(60, 5, true);
-        let wide = SpectralOptions { most: 64, auto: true, ..options() };
+        let wide = SpectralOptions { most: 64, auto: true, cutoff: 0.5, power: 16.0, ..options() };
         let s = spectral(&m, &wide, &Stage::silent("test")).unwrap();
         assert!(s.dim <= 5 && s.dim >= 1);
         let big = random(9000, 30, true);

@@ -97,7 +97,7 @@ pub fn train(
                 .hint("lower --lr, or raise --tau"));
         }
         let alignment_due =
-            (state.iteration + 1) % options.curve_every == 0 || state.iteration + 1 == options.iterations;
+            (state.iteration + 1).is_multiple_of(options.curve_every) || state.iteration + 1 == options.iterations;
         if alignment_due {
             let alignment = state.model.alignment(context, &propagated, set);
             state.window.add(step.loss, step.separation);
@@ -107,7 +107,7 @@ pub fn train(
             state.window.add(step.loss, step.separation);
         }
         state.update(set, &step.features, &step.layers, &mut dense, d, options);
-        let due = options.checkpoint_every > 0 && state.iteration % options.checkpoint_every == 0;
+        let due = options.checkpoint_every > 0 && state.iteration.is_multiple_of(options.checkpoint_every);
         let interrupted = stage.interrupted();
         if let Some((path, provenance)) = checkpoint
             && state.iteration < options.iterations

@@ -15,7 +15,7 @@ pub fn points(size: Range<usize>) -> impl Strategy<Value = Vec<[f32; 3]>> {
             match kind {
                 1 => p[2] = 0.5,
                 2 => *p = p.map(|v| (v * 2.0).round()),
-                3 => *p = p.map(|v| v.round()),
+                3 => *p = p.map(f32::round),
                 4 => *p = [p[0], 2.0 * p[0], -p[0]],
                 5 if i % 7 == 0 => *p = p.map(|v| v * 1e15),
                 5 => *p = p.map(|v| v * 1e-12),

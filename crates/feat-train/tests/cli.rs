@@ -1,0 +1,218 @@
+//! The program on artifacts on disk: both methods, the same bytes for any thread count and after a kill, bad input.
+
+use artifacts::{Features, FootprintsBuilder, Graph, Row, role};
+use gs_io::{Provenance, hash_file};
+use gs_scene::{Gaussians, ply};
+use std::collections::BTreeMap;
+use std::path::{Path, PathBuf};
+use std::process::{Command, Output, Stdio};
+use std::time::{Duration, Instant};
+
+/// Gaussians on a line: three things of 40 each; every view shows three masks, the middle thing sometimes in halves.
+const N: usize = 120;
+const VIEWS: usize = 6;
+
+fn inputs(dir: &Path) {
+    let g = Gaussians {
+        means: (0..N).map(|i| [i as f32, 0.0, 0.0]).collect(),
+        log_scales: vec![[0.0; 3]; N],
+        rotations: vec![[1.0, 0.0, 0.0, 0.0]; N],
+        opacity_logits: vec![2.0; N],
+        sh: (0..3 * N).map(|i| ((i * 7) % 5) as f32 * 0.2).collect(),
+        sh_degree: 0,
+    };
+    let geometry = dir.join("geometry.ply");
+    ply::write_gaussians(&geometry, &g, &[]).unwrap();
+    let inputs = BTreeMap::from([
+        (role::GEOMETRY.to_string(), hash_file(&geometry).unwrap()),
+        (role::MASKS.to_string(), "ab".repeat(32)),
+    ]);
+    let provenance = || Provenance { inputs: inputs.clone(), ..Provenance::default() };
+    graph().write(dir.join("graph.safetensors"), provenance()).unwrap();
+    footprints().write(dir.join("footprints.safetensors"), provenance()).unwrap();
+}
+
+fn graph() -> Graph {
+    let near = |i: usize, of: &[usize]| -> Vec<u32> {
+        let mut all: Vec<usize> = (0..of.len()).filter(|&j| of[j] != i).collect();
+        all.sort_by_key(|&j| (of[j].abs_diff(i), j));
+        all[..4].iter().map(|&j| j as u32).collect()
+    };
+    let everyone: Vec<usize> = (0..N).collect();
+    let anchors: Vec<usize> = (0..N).step_by(8).collect();
+    Graph {
+        kept: (0..N as u32).collect(),
+        anchors: anchors.iter().map(|&a| a as u32).collect(),
+        k: 4,
+        knn: anchors.iter().flat_map(|&a| near(a, &everyone)).collect(),
+        anchor_knn: anchors.iter().flat_map(|&a| near(a, &anchors)).collect(),
+        nearest_anchor: (0..N).map(|i| (((i + 3) / 8) as u32).min(anchors.len() as u32 - 1)).collect(),
+        gaussian_k: 4,
+        gaussian_knn: (0..N).flat_map(|i| near(i, &everyone)).collect(),
+        seen_views: vec![1; N],
+        seen_weight: vec![1.0; N],
+    }
+}
+
+fn footprints() -> FootprintsBuilder {
+    let mut f = FootprintsBuilder { kept: (0..N as u32).collect(), row_ptr: vec![0], ..FootprintsBuilder::default() };
+    for v in 0..VIEWS {
+        f.views.push(format!("v{v}"));
+        let cuts: &[u32] = if v % 3 == 0 { &[0, 40, 60, 80, 120] } else { &[0, 40, 80, 120] };
+        for (k, w) in cuts.windows(2).enumerate() {
+            f.col.extend(w[0]..w[1]);
+            f.weight.extend((w[0]..w[1]).map(|i| 1.0 + (i % 3) as f32));
+            f.row_ptr.push(f.col.len() as u64);
+            let row = Row { view: v as u32, level: 3, mask: k as u32, pixels: 100, gated: 90, alpha: 0.9 };
+            f.rows.push(row);
+        }
+    }
+    f
+}
+
+fn command(dir: &Path, out: &Path, extra: &[&str]) -> Command {
+    let mut c = Command::new(env!("CARGO_BIN_EXE_feat-train"));
+    for name in ["geometry.ply", "graph.safetensors", "footprints.safetensors"] {
+        let option = format!("--{}", name.split('.').next().unwrap());
+        c.arg(option).arg(dir.join(name));
+    }
+    c.arg("--out").arg(out).args(extra);
+    c
+}
+
+fn run(dir: &Path, out: &Path, extra: &[&str]) -> Output {
+    command(dir, out, extra).output().unwrap()
+}
+
+fn succeed(dir: &Path, out: &Path, extra: &[&str]) -> Vec<u8> {
+    let output = run(dir, out, extra);
+    assert!(output.status.success(), "{extra:?}: {}", String::from_utf8_lossy(&output.stderr));
+    std::fs::read(out).unwrap()
+}
+
+fn beside(out: &Path, suffix: &str) -> PathBuf {
+    PathBuf::from(format!("{}{suffix}", out.display()))
+}
+
+fn setup() -> (tempfile::TempDir, PathBuf) {
+    let dir = tempfile::tempdir().unwrap();
+    inputs(dir.path());
+    let out = dir.path().join("features.safetensors");
+    (dir, out)
+}
+
+#[test]
+fn the_closed_form_tells_things_apart_and_not_their_halves() {
+    let (dir, out) = setup();
+    let first = succeed(dir.path(), &out, &["--method", "spectral", "--threads", "1"]);
+    assert!(first == succeed(dir.path(), &out, &["--method", "spectral", "--threads", "2"]));
+    let (f, _) = Features::read(&out).unwrap();
+    let cosine = |a: usize, b: usize| f.row(a).iter().zip(f.row(b)).map(|(a, b)| a * b).sum::<f32>();
+    assert!(cosine(5, 35) > 0.95 && cosine(85, 115) > 0.95, "{} {}", cosine(5, 35), cosine(85, 115));
+    assert!(cosine(45, 75) > 0.8, "the halves of a thing stay together: {}", cosine(45, 75));
+    assert!(cosine(5, 60) < 0.3 && cosine(60, 115) < 0.3 && cosine(5, 115) < 0.3);
+    let curve = std::fs::read_to_string(beside(&out, ".curve.jsonl")).unwrap();
+    assert!(curve.starts_with("{\"iteration\":1,\"singular_value\":"), "{curve}");
+}
+
+#[test]
+fn training_separates_masks_and_does_not_depend_on_threads() {
+    let (dir, out) = setup();
+    for variant in [
+        &["--preset", "paper"][..],
+        &["--method", "contrastive", "--neighbours", "anchors", "--loss", "half-mask", "--norm-axis", "gaussian"],
+        &["--method", "contrastive", "--loss", "gaussian", "--layers", "0", "--init", "normal-small"],
+    ] {
+        let with = |threads| {
+            let args =
+                [variant, &["--iterations", "300", "--lr", "0.01", "--seed", "4", "--threads", threads]].concat();
+            succeed(dir.path(), &out, &args)
+        };
+        assert!(with("1") == with("2"), "{variant:?}");
+        let curve = std::fs::read_to_string(beside(&out, ".curve.jsonl")).unwrap();
+        let points: Vec<serde_json::Value> = curve.lines().map(|l| serde_json::from_str(l).unwrap()).collect();
+        assert_eq!(points.len(), 6);
+        let of = |i: usize, key: &str| points[i][key].as_f64().unwrap();
+        assert!(of(5, "loss") < of(0, "loss"), "{variant:?} {curve}");
+        assert!(of(5, "separation") > of(0, "separation"), "{variant:?} {curve}");
+        assert!(!beside(&out, ".checkpoint").exists());
+    }
+}
+
+#[test]
+fn a_killed_run_continues_to_the_same_bytes() {
+    let (dir, out) = setup();
+    let args = ["--preset", "paper", "--iterations", "6000", "--checkpoint-every", "100"];
+    let whole = succeed(dir.path(), &out, &args);
+    let curve = std::fs::read(beside(&out, ".curve.jsonl")).unwrap();
+    std::fs::remove_file(&out).unwrap();
+    let checkpoint = beside(&out, ".checkpoint");
+    let mut child = command(dir.path(), &out, &args).stderr(Stdio::null()).spawn().unwrap();
+    let started = Instant::now();
+    while !checkpoint.exists() {
+        assert!(started.elapsed() < Duration::from_secs(60), "no checkpoint comes");
+        std::thread::sleep(Duration::from_millis(2));
+    }
+    child.kill().unwrap();
+    child.wait().unwrap();
+    assert!(!out.exists(), "the run ended before it could be killed");
+    let output = run(dir.path(), &out, &args);
+    assert!(String::from_utf8_lossy(&output.stderr).contains("continuing from iteration"));
+    assert!(whole == std::fs::read(&out).unwrap());
+    assert!(curve == std::fs::read(beside(&out, ".curve.jsonl")).unwrap());
+    // A checkpoint of other parameters is not used, nor is a damaged one.
+    std::fs::write(&checkpoint, "no checkpoint").unwrap();
+    let output = run(dir.path(), &out, &args);
+    assert!(String::from_utf8_lossy(&output.stderr).contains("starting anew"));
+    assert!(whole == std::fs::read(&out).unwrap());
+}
+
+#[test]
+fn an_interrupted_run_leaves_a_checkpoint() {
+    let (dir, out) = setup();
+    let args = ["--preset", "paper", "--iterations", "100000000", "--checkpoint-every", "0"];
+    let mut child = command(dir.path(), &out, &args).stderr(Stdio::null()).spawn().unwrap();
+    std::thread::sleep(Duration::from_millis(400));
+    let kill = Command::new("kill").args(["-INT", &child.id().to_string()]).status().unwrap();
+    assert!(kill.success());
+    assert_eq!(child.wait().unwrap().code(), Some(130));
+    assert!(beside(&out, ".checkpoint").exists() && !out.exists());
+}
+
+#[test]
+fn bad_input_is_one_line_and_leaves_the_output_alone() {
+    let (dir, out) = setup();
+    std::fs::write(&out, "good").unwrap();
+    let fail = |extra: &[&str], needles: &[&str]| {
+        let output = run(dir.path(), &out, extra);
+        let said = String::from_utf8_lossy(&output.stderr).into_owned();
+        assert_eq!(output.status.code(), Some(2), "{said}");
+        for needle in needles {
+            assert!(said.contains(needle), "{needle:?} is not in {said:?}");
+        }
+        assert!(!said.contains("panicked"), "{said}");
+        assert_eq!(std::fs::read(&out).unwrap(), b"good");
+    };
+    fail(&["--preset", "paper", "--layers", "5"], &["--layers", "found 5", "0 to 4"]);
+    fail(&["--tau", "0"], &["--tau"]);
+    fail(&["--preset", "paper", "--dim", "65"], &["--dim", "65"]);
+    fail(&["--method", "spectral", "--levels", "small"], &["footprints.safetensors", "no mask has a footprint"]);
+    fail(&["--preset", "paper", "--levels", "small"], &["footprints.safetensors", "two masks"]);
+    // Footprints of another run: one Gaussian less.
+    let (_, graph_file) = Graph::read(dir.path().join("graph.safetensors")).unwrap();
+    let provenance = || Provenance { inputs: graph_file.provenance().inputs.clone(), ..Provenance::default() };
+    let mut other = footprints();
+    other.kept.push(N as u32);
+    let path = dir.path().join("footprints.safetensors");
+    other.write(&path, provenance()).unwrap();
+    fail(&[], &["footprints.safetensors", "kept", "found 121 Gaussians"]);
+    let mut foreign = provenance();
+    foreign.inputs.insert(role::MASKS.into(), "cd".repeat(32));
+    footprints().write(&path, foreign).unwrap();
+    fail(&[], &["footprints.safetensors", "another masks"]);
+    let bytes = std::fs::read(&path).unwrap();
+    std::fs::write(&path, &bytes[..bytes.len() - 9]).unwrap();
+    fail(&[], &["footprints.safetensors"]);
+    std::fs::write(dir.path().join("geometry.ply"), "ply\n").unwrap();
+    fail(&[], &["graph.safetensors", "another geometry"]);
+}
