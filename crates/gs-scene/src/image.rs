@@ -196,3 +196,94 @@ fn resize_planes(data: &[f32], channels: usize, (w, h): (usize, usize), (to_w, t
     });
     out
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use proptest::prelude::*;
+
+    fn ramp(width: u32, height: u32) -> Image {
+        let n = (width * height * 3) as usize;
+        let value = |i: usize| ((i * 37) % 256) as f32 / 255.0;
+        Image { width, height, rgb: (0..n).map(value).collect(), alpha: None }
+    }
+
+    #[test]
+    fn halving_averages_two_by_two() {
+        let image = ramp(6, 4);
+        let half = image.resize_area(3, 2);
+        for (x, y, c) in (0..3).flat_map(|x| (0..2).flat_map(move |y| (0..3).map(move |c| (x, y, c)))) {
+            let at = |x: usize, y: usize| image.rgb[3 * (y * 6 + x) + c];
+            let mean =
+                (at(2 * x, 2 * y) + at(2 * x + 1, 2 * y) + at(2 * x, 2 * y + 1) + at(2 * x + 1, 2 * y + 1)) / 4.0;
+            assert!((half.rgb[3 * (y * 3 + x) + c] - mean).abs() < 1e-6);
+        }
+    }
+
+    #[test]
+    fn five_pixels_to_two_share_the_middle_one() {
+        let gray = [0.1f32, 0.2, 0.4, 0.8, 1.0];
+        let image =
+            Image { width: 5, height: 1, rgb: gray.iter().flat_map(|&v| [v; 3]).collect(), alpha: Some(gray.into()) };
+        let small = image.resize_area(2, 1);
+        let expected = [(0.1 + 0.2 + 0.2) / 2.5, (0.2 + 0.8 + 1.0) / 2.5];
+        let alpha = small.alpha.unwrap();
+        for i in 0..2 {
+            assert!((small.rgb[3 * i] - expected[i]).abs() < 1e-6 && (alpha[i] - expected[i]).abs() < 1e-6);
+        }
+    }
+
+    #[test]
+    fn sampling_is_bilinear_and_repeats_the_border() {
+        let image = ramp(3, 2);
+        let pixel = |x: usize, y: usize| image.rgb[3 * (3 * y + x)];
+        assert_eq!(image.sample(1.5, 0.5)[0], pixel(1, 0));
+        assert!(
+            (image.sample(2.0, 1.0)[0] - (pixel(1, 0) + pixel(2, 0) + pixel(1, 1) + pixel(2, 1)) / 4.0).abs() < 1e-6
+        );
+        assert_eq!(image.sample(-50.0, 1e300)[0], pixel(0, 1));
+        assert!(image.sample(f64::NAN, f64::INFINITY).iter().all(|v| v.is_finite()));
+    }
+
+    #[test]
+    fn files_round_trip_and_keep_alpha() {
+        let dir = tempfile::tempdir().unwrap();
+        let path = dir.path().join("a.png");
+        let image = ramp(7, 5);
+        image.write_png(&path).unwrap();
+        assert_eq!(Image::read(&path).unwrap(), image);
+        assert_eq!(size_of(&path).unwrap(), (7, 5));
+        let gray = image::GrayAlphaImage::from_raw(2, 1, vec![51, 102, 255, 0]).unwrap();
+        gray.save(&path).unwrap();
+        let back = Image::read(&path).unwrap();
+        assert_eq!(back.rgb, [0.2, 0.2, 0.2, 1.0, 1.0, 1.0]);
+        assert_eq!(back.alpha.unwrap(), [0.4, 0.0]);
+    }
+
+    #[test]
+    fn the_content_not_the_name_says_what_a_file_is() {
+        let dir = tempfile::tempdir().unwrap();
+        let path = dir.path().join("a.jpg");
+        ramp(4, 4).write_png(&path).unwrap();
+        assert_eq!(Image::read(&path).unwrap(), ramp(4, 4));
+    }
+
+    proptest! {
+        #[test]
+        fn shrinking_keeps_the_mean(w in 1u32..40, h in 1u32..40, to_w in 1u32..40, to_h in 1u32..40) {
+            let (to_w, to_h) = (to_w.min(w), to_h.min(h));
+            let image = ramp(w, h);
+            let small = image.resize_area(to_w, to_h);
+            prop_assert_eq!(small.rgb.len(), (3 * to_w * to_h) as usize);
+            let mean = |v: &[f32]| v.iter().map(|&v| f64::from(v)).sum::<f64>() / v.len() as f64;
+            prop_assert!((mean(&image.rgb) - mean(&small.rgb)).abs() < 1e-5);
+        }
+
+        #[test]
+        fn a_plain_image_stays_plain_at_any_size(w in 1u32..30, h in 1u32..30, to_w in 1u32..60, to_h in 1u32..60) {
+            let image = Image { width: w, height: h, rgb: vec![0.7; (3 * w * h) as usize], alpha: None };
+            let other = image.resize_area(to_w, to_h);
+            prop_assert!(other.rgb.iter().all(|v| (v - 0.7).abs() < 1e-5));
+        }
+    }
+}
