@@ -34,7 +34,7 @@ pub struct DensifyOptions {
 
 impl Default for DensifyOptions {
     fn default() -> Self {
-        Self { gradient: 2e-4, min_opacity: 0.005, clone_scale: 0.01, max_scale: 0.1, max_gaussians: 5_000_000 }
+        Self { gradient: 2e-4, min_opacity: 0.005, clone_scale: 0.01, max_scale: 0.1, max_gaussians: 1_000_000 }
     }
 }
 

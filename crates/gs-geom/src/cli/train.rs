@@ -56,7 +56,7 @@ pub(super) struct TrainArgs {
     /// Densify and reset opacities before this iteration [half the iterations; more in runs below 15,000]
     #[arg(long, value_name = "ITERATION")]
     densify_until: Option<u32>,
-    /// Iterations between densifications [a sixtieth of the iterations, 10 to 100]
+    /// Iterations between densifications [a thirtieth of the iterations, 50 to 100]
     #[arg(long, value_name = "COUNT")]
     densify_every: Option<u32>,
     /// Iterations between opacity resets [3000]

@@ -1,0 +1,413 @@
+//! The program and its files, as people and later stages meet them.
+
+use glam::{DQuat, DVec3};
+use gs_raster::{RasterOptions, render};
+use gs_scene::{Camera, Gaussians, Image, PointCloud, SH_C0, ply};
+use rand::Rng;
+use rand_chacha::ChaCha8Rng;
+use rand_chacha::rand_core::SeedableRng;
+use serde_json::Value;
+use std::fmt::Write as _;
+use std::fs;
+use std::path::{Path, PathBuf};
+use std::process::{Command, Output};
+use std::sync::OnceLock;
+use std::time::Duration;
+
+const SIZE: (u32, u32) = (72, 56);
+
+fn program(arguments: &[&str]) -> Command {
+    let mut c = Command::new(env!("CARGO_BIN_EXE_gs-geom"));
+    c.args(arguments).arg("--quiet");
+    c
+}
+
+fn run(arguments: &[&str]) -> Output {
+    program(arguments).output().unwrap()
+}
+
+fn succeeds(arguments: &[&str]) {
+    let o = run(arguments);
+    assert!(o.status.success(), "{arguments:?}: {}", String::from_utf8_lossy(&o.stderr));
+}
+
+/// Runs to exit code 2 and gives the one line it says.
+fn refused(arguments: &[&str]) -> String {
+    let o = run(arguments);
+    let said = String::from_utf8_lossy(&o.stderr).into_owned();
+    assert_eq!(o.status.code(), Some(2), "{arguments:?}: {said}");
+    let errors: Vec<&str> = said.lines().filter(|l| l.contains("error: ")).collect();
+    assert_eq!(errors.len(), 1, "{said}");
+    assert!(!said.contains("panicked"), "{said}");
+    errors[0].to_string()
+}
+
+/// Balls of different colours, and cameras in a ring around them.
+fn world() -> (Gaussians, Vec<Camera>) {
+    let mut rng = ChaCha8Rng::seed_from_u64(5);
+    let n = 60;
+    let mut unit = || rng.random_range(-1.0f32..1.0);
+    let mut g = Gaussians { sh_degree: 0, ..Gaussians::default() };
+    for _ in 0..n {
+        g.means.push([unit(), unit(), 0.6 * unit()]);
+        g.log_scales.push([unit(), unit(), unit()].map(|v| -2.0 + 0.4 * v));
+        g.rotations.push([1.0, unit(), unit(), unit()]);
+        g.opacity_logits.push(2.0);
+        g.sh.extend([unit(), unit(), unit()].map(|v| 0.45 * v / SH_C0));
+    }
+    let cameras = (0..10).map(|i| {
+        let a = f64::from(i) / 10.0 * std::f64::consts::TAU;
+        let eye = DVec3::new(3.2 * a.cos(), 3.2 * a.sin(), 0.8 + 0.5 * (3.0 * a).sin());
+        Camera::look_at(eye, DVec3::ZERO, DVec3::Z, SIZE.0, SIZE.1, 0.9)
+    });
+    (g, cameras.collect())
+}
+
+/// Writes a COLMAP text model with photographs of the world by its first `views` cameras.
+fn write_scene(root: &Path, views: usize, points: &PointCloud) {
+    let (g, cameras) = world();
+    fs::create_dir_all(root.join("sparse/0")).unwrap();
+    let c = &cameras[0];
+    let camera = format!("1 PINHOLE {} {} {} {} {} {}\n", SIZE.0, SIZE.1, c.fx, c.fy, c.cx, c.cy);
+    fs::write(root.join("sparse/0/cameras.txt"), camera).unwrap();
+    let mut images = String::new();
+    for (i, c) in cameras.iter().take(views).enumerate() {
+        let r = render(&g, c, &RasterOptions::default());
+        let picture = Image { width: r.width, height: r.height, rgb: r.rgb, alpha: None };
+        picture.write_png(root.join(format!("images/{i:02}.png"))).unwrap();
+        let (q, t) = (DQuat::from_mat3(&c.rotation), c.translation);
+        let pose = [q.w, q.x, q.y, q.z, t.x, t.y, t.z].map(|v| v.to_string()).join(" ");
+        writeln!(images, "{} {pose} 1 {i:02}.png\n", i + 1).unwrap();
+    }
+    fs::write(root.join("sparse/0/images.txt"), images).unwrap();
+    let mut text = String::new();
+    for (i, (p, c)) in points.positions.iter().zip(&points.colors).enumerate() {
+        writeln!(text, "{} {} {} {} {} {} {} 0.5", i + 1, p[0], p[1], p[2], c[0], c[1], c[2]).unwrap();
+    }
+    fs::write(root.join("sparse/0/points3D.txt"), text).unwrap();
+}
+
+/// Points near the balls, as structure from motion would give them.
+fn points() -> PointCloud {
+    let (g, _) = world();
+    let mut rng = ChaCha8Rng::seed_from_u64(6);
+    let mut cloud = PointCloud::default();
+    for i in 0..g.len() {
+        for _ in 0..3 {
+            cloud.positions.push(g.means[i].map(|v| v + rng.random_range(-0.05f32..0.05)));
+            cloud.colors.push(g.base_color(i).map(|v| (v.clamp(0.0, 1.0) * 255.0) as u8));
+        }
+    }
+    cloud
+}
+
+/// The world with points and ten views, written once.
+fn scene() -> &'static str {
+    static ONCE: OnceLock<(tempfile::TempDir, String)> = OnceLock::new();
+    &ONCE
+        .get_or_init(|| {
+            let dir = tempfile::tempdir().unwrap();
+            write_scene(dir.path(), 10, &points());
+            let path = dir.path().to_string_lossy().into_owned();
+            (dir, path)
+        })
+        .1
+}
+
+struct Folder(tempfile::TempDir);
+
+impl Folder {
+    fn new() -> Self {
+        Self(tempfile::tempdir().unwrap())
+    }
+
+    fn path(&self, name: &str) -> String {
+        self.0.path().join(name).to_string_lossy().into_owned()
+    }
+
+    fn names(&self) -> Vec<String> {
+        let mut names: Vec<String> = fs::read_dir(self.0.path())
+            .unwrap()
+            .map(|e| e.unwrap().file_name().to_string_lossy().into_owned())
+            .collect();
+        names.sort();
+        names
+    }
+}
+
+/// Arguments of a short training that densifies.
+fn training<'a>(out: &'a str, more: &[&'a str]) -> Vec<&'a str> {
+    let mut all = vec!["train", "--scene", scene(), "--out", out, "--iterations", "160"];
+    all.extend(["--densify-every", "20", "--seed", "7"]);
+    all.extend(more);
+    all
+}
+
+/// Geometry and curve of an undisturbed training.
+fn undisturbed() -> &'static (Vec<u8>, Vec<u8>) {
+    static ONCE: OnceLock<(Vec<u8>, Vec<u8>)> = OnceLock::new();
+    ONCE.get_or_init(|| {
+        let dir = Folder::new();
+        let out = dir.path("g.ply");
+        succeeds(&training(&out, &["--threads", "2"]));
+        (fs::read(&out).unwrap(), fs::read(format!("{out}.curve.jsonl")).unwrap())
+    })
+}
+
+#[test]
+fn a_small_world_is_learnt_well() {
+    let dir = Folder::new();
+    let (out, metrics) = (dir.path("new/g.ply"), dir.path("m.json"));
+    let start = ply::read_gaussians(&{
+        let o = dir.path("start.ply");
+        succeeds(&["train", "--scene", scene(), "--out", &o, "--iterations", "1"]);
+        o
+    })
+    .unwrap();
+    succeeds(&["train", "--scene", scene(), "--out", &out, "--iterations", "400", "--max-gaussians", "1500"]);
+    succeeds(&["eval", "--scene", scene(), "--geometry", &out, "--out", &metrics]);
+    let m: Value = serde_json::from_slice(&fs::read(&metrics).unwrap()).unwrap();
+    assert_eq!(m["split"], "test");
+    assert_eq!(m["views"].as_array().unwrap().len(), 2);
+    // Eight views, 36 degrees apart, of overlapping balls.
+    assert!(m["psnr_heldout"].as_f64().unwrap() > 25.0 && m["ssim_heldout"].as_f64().unwrap() > 0.85, "{m}");
+    let g = ply::read_gaussians(&out).unwrap();
+    assert_eq!(g.sh_degree, 3);
+    assert!(g.len() > start.len(), "it densified");
+    // The header says how it was made, not where or when.
+    let bytes = fs::read(&out).unwrap();
+    let header = String::from_utf8_lossy(&bytes[..2000]).into_owned();
+    assert!(
+        header.contains("comment made by gs-geom") && header.contains("comment schedule.iterations 400"),
+        "{header}"
+    );
+    assert!(!header.contains(scene()) && !header.contains(&dir.path("")));
+    // The curve falls; finished runs leave no checkpoint.
+    let curve = fs::read_to_string(format!("{out}.curve.jsonl")).unwrap();
+    let losses: Vec<f64> =
+        curve.lines().map(|l| serde_json::from_str::<Value>(l).unwrap()["loss"].as_f64().unwrap()).collect();
+    assert_eq!(losses.len(), 100);
+    assert!(losses[99] < 0.3 * losses[0], "{losses:?}");
+    assert!(curve.lines().last().unwrap().contains("psnr_heldout"));
+    assert!(!PathBuf::from(format!("{out}.checkpoint")).exists());
+    let record: Value = serde_json::from_slice(&fs::read(format!("{out}.run.json")).unwrap()).unwrap();
+    assert_eq!(record["summary"]["gaussians"], g.len());
+}
+
+#[test]
+fn thread_counts_do_not_matter_and_seeds_do() {
+    let dir = Folder::new();
+    let out = dir.path("g.ply");
+    succeeds(&training(&out, &["--threads", "1"]));
+    assert_eq!(fs::read(&out).unwrap(), undisturbed().0);
+    assert_eq!(fs::read(format!("{out}.curve.jsonl")).unwrap(), undisturbed().1);
+    let other = dir.path("h.ply");
+    succeeds(&["train", "--scene", scene(), "--out", &other, "--iterations", "20", "--seed", "1"]);
+    succeeds(&["train", "--scene", scene(), "--out", &out, "--iterations", "20", "--seed", "2"]);
+    assert_ne!(fs::read(&out).unwrap(), fs::read(&other).unwrap());
+}
+
+#[test]
+fn a_stopped_run_goes_on_to_the_same_bytes() {
+    let dir = Folder::new();
+    let out = dir.path("g.ply");
+    // Within a round of views, between densifications, after growth of the degree.
+    for last in ["33", "34", "95"] {
+        succeeds(&training(&out, &["--stop-after", last]));
+        assert_eq!(dir.names(), ["g.ply.checkpoint", "g.ply.partial.ply"]);
+        assert!(!ply::read_gaussians(dir.path("g.ply.partial.ply")).unwrap().is_empty());
+    }
+    succeeds(&training(&out, &[]));
+    assert_eq!(fs::read(&out).unwrap(), undisturbed().0);
+    assert_eq!(fs::read(format!("{out}.curve.jsonl")).unwrap(), undisturbed().1);
+    assert_eq!(dir.names(), ["g.ply", "g.ply.curve.jsonl", "g.ply.run.json"]);
+}
+
+#[test]
+fn a_killed_run_goes_on_to_the_same_bytes() {
+    let dir = Folder::new();
+    let out = dir.path("g.ply");
+    let checkpoint = PathBuf::from(format!("{out}.checkpoint"));
+    let mut child = program(&training(&out, &["--checkpoint-every", "3"])).spawn().unwrap();
+    for _ in 0..1000 {
+        if checkpoint.exists() {
+            break;
+        }
+        std::thread::sleep(Duration::from_millis(5));
+    }
+    child.kill().unwrap();
+    child.wait().unwrap();
+    succeeds(&training(&out, &["--checkpoint-every", "0.01s"]));
+    assert_eq!(fs::read(&out).unwrap(), undisturbed().0);
+}
+
+#[test]
+#[cfg(unix)]
+fn a_signal_ends_with_a_checkpoint_and_usable_gaussians() {
+    let dir = Folder::new();
+    let out = dir.path("g.ply");
+    let mut arguments = training(&out, &["--checkpoint-every", "1"]);
+    arguments[6] = "100000";
+    let child = program(&arguments).spawn().unwrap();
+    for _ in 0..1000 {
+        if PathBuf::from(format!("{out}.checkpoint")).exists() {
+            break;
+        }
+        std::thread::sleep(Duration::from_millis(5));
+    }
+    assert!(Command::new("kill").args(["-TERM", &child.id().to_string()]).status().unwrap().success());
+    let o = child.wait_with_output().unwrap();
+    assert_eq!(o.status.code(), Some(130));
+    assert!(!PathBuf::from(&out).exists());
+    assert!(!ply::read_gaussians(format!("{out}.partial.ply")).unwrap().is_empty());
+}
+
+#[test]
+fn a_checkpoint_of_other_parameters_is_not_used() {
+    let dir = Folder::new();
+    let out = dir.path("g.ply");
+    succeeds(&training(&out, &["--stop-after", "20", "--dssim", "0"]));
+    let o = run(&training(&out, &[]));
+    let said = String::from_utf8_lossy(&o.stderr);
+    assert!(o.status.success() && said.contains("beginning anew") && said.contains("another run"), "{said}");
+    assert_eq!(fs::read(&out).unwrap(), undisturbed().0);
+}
+
+#[test]
+fn fixed_points_keep_number_order_and_place() {
+    let dir = Folder::new();
+    let out = dir.path("g.ply");
+    succeeds(&training(&out, &["--fixed-points"]));
+    let (g, cloud) = (ply::read_gaussians(&out).unwrap(), points());
+    assert_eq!(g.means.len(), cloud.len());
+    for (a, b) in g.means.iter().zip(&cloud.positions) {
+        assert!(a.iter().zip(b).all(|(a, b)| (a - b).abs() < 1e-6), "{a:?} {b:?}");
+    }
+    let first = g.opacity_logits[0];
+    assert!(g.opacity_logits.iter().any(|&o| o != first), "the rest is learnt");
+}
+
+#[test]
+fn a_scene_without_points_starts_at_random_and_a_ply_can_be_refined() {
+    let dir = Folder::new();
+    let bare = dir.path("bare");
+    write_scene(Path::new(&bare), 10, &PointCloud::default());
+    let out = dir.path("g.ply");
+    succeeds(&["train", "--scene", &bare, "--out", &out, "--iterations", "200", "--init-points", "500"]);
+    let curve = fs::read_to_string(format!("{out}.curve.jsonl")).unwrap();
+    let psnr = |curve: &str| {
+        serde_json::from_str::<Value>(curve.lines().last().unwrap()).unwrap()["psnr_heldout"].as_f64().unwrap()
+    };
+    assert!(psnr(&curve) > 18.0, "{curve}");
+    let refined = dir.path("h.ply");
+    let arguments = ["train", "--scene", &bare, "--out", &refined, "--init", &out, "--iterations", "60"];
+    succeeds(&[&arguments[..], &["--sh-degree", "1", "--densify-until", "0"]].concat());
+    let g = ply::read_gaussians(&refined).unwrap();
+    assert_eq!(g.sh_degree, 1);
+    assert!(psnr(&fs::read_to_string(format!("{refined}.curve.jsonl")).unwrap()) > psnr(&curve));
+    assert!(refused(&["train", "--scene", &bare, "--out", &out, "--fixed-points"]).contains("no points to keep"));
+}
+
+#[test]
+fn views_are_rendered_and_measured() {
+    let dir = Folder::new();
+    let (g, _) = world();
+    let geometry = dir.path("g.ply");
+    ply::write_gaussians(&geometry, &g, &[]).unwrap();
+    let base = ["--scene", scene(), "--geometry", &geometry];
+    let out = dir.path("views");
+    succeeds(&[&["render"], &base[..], &["--out", &out, "--exr"]].concat());
+    for name in ["00", "08"] {
+        let picture = Image::read(format!("{out}/{name}.png")).unwrap();
+        let photo = Image::read(format!("{}/images/{name}.png", scene())).unwrap();
+        assert_eq!(picture.to_rgb8(), photo.to_rgb8(), "the same Gaussians, the same picture");
+        let exr = exr::prelude::read_all_flat_layers_from_file(format!("{out}/{name}.exr")).unwrap();
+        let channels = &exr.layer_data[0].channel_data.list;
+        let names: Vec<String> = channels.iter().map(|c| c.name.to_string()).collect();
+        assert_eq!(names, ["A", "B", "G", "R", "Z"]);
+        let values = |i: usize| channels[i].sample_data.values_as_f32().collect::<Vec<f32>>();
+        let (alpha, depth) = (values(0), values(4));
+        assert_eq!(alpha.len(), (SIZE.0 * SIZE.1) as usize);
+        let seen: Vec<f32> = alpha.iter().zip(&depth).filter(|(a, _)| **a > 0.5).map(|(_, z)| *z).collect();
+        assert!(!seen.is_empty() && seen.iter().all(|z| (1.0..6.0).contains(z)));
+    }
+    assert_eq!(fs::read_dir(&out).unwrap().count(), 4);
+    let some = dir.path("some");
+    succeeds(&[&["render"], &base[..], &["--out", &some, "--views", "03,05.png", "--resolution", "2"]].concat());
+    assert_eq!(fs::read_dir(&some).unwrap().count(), 2);
+    assert_eq!(Image::read(format!("{some}/05.png")).unwrap().width, SIZE.0 / 2);
+
+    let metrics = dir.path("m.json");
+    succeeds(&[&["eval"], &base[..], &["--out", &metrics]].concat());
+    let m: Value = serde_json::from_slice(&fs::read(&metrics).unwrap()).unwrap();
+    assert!(m["psnr_heldout"].as_f64().unwrap() > 55.0, "8-bit photographs of the same Gaussians: {m}");
+    let o = run(&[&["eval"], &base[..], &["--out", &metrics, "--holdout", "0"]].concat());
+    assert!(o.status.success() && String::from_utf8_lossy(&o.stderr).contains("no view is held out"));
+    let m: Value = serde_json::from_slice(&fs::read(&metrics).unwrap()).unwrap();
+    assert_eq!((&m["split"], &m["psnr_heldout"]), (&Value::from("train"), &Value::Null));
+    assert!(m["psnr_train"].as_f64().unwrap() > 55.0 && m["views"].as_array().unwrap().len() == 10);
+
+    assert!(refused(&[&["render"], &base[..], &["--out", &some, "--views", "99"]].concat()).contains("no such view"));
+    let e = refused(&[&["render"], &base[..], &["--out", &some, "--holdout", "0"]].concat());
+    assert!(e.contains("no views to render"), "{e}");
+}
+
+#[test]
+fn one_gaussian_and_one_view_are_enough() {
+    let dir = Folder::new();
+    let root = dir.path("one");
+    let cloud = PointCloud { positions: vec![[0.1, 0.0, 0.0]], colors: vec![[200, 100, 50]] };
+    write_scene(Path::new(&root), 1, &cloud);
+    let out = dir.path("g.ply");
+    let e = refused(&["train", "--scene", &root, "--out", &out]);
+    assert!(e.contains("every view is held out") && e.contains("--holdout 0"), "{e}");
+    succeeds(&["train", "--scene", &root, "--out", &out, "--holdout", "0", "--iterations", "40"]);
+    let g = ply::read_gaussians(&out).unwrap();
+    assert!(!g.is_empty() && g.means.iter().flatten().all(|v| v.is_finite()));
+}
+
+#[test]
+fn bad_input_is_refused_in_one_line() {
+    let dir = Folder::new();
+    let out = dir.path("g.ply");
+    fs::write(&out, "a good geometry").unwrap();
+    let train = |scene: &str, more: &[&str]| {
+        refused(&[&["train", "--scene", scene, "--out", &out, "--iterations", "5"], more].concat())
+    };
+    let missing = dir.path("missing");
+    assert!(train(&missing, &[]).contains("no such folder"));
+
+    let shape = dir.path("shape");
+    write_scene(Path::new(&shape), 10, &points());
+    let other = Image { width: 30, height: 80, rgb: vec![0.5; 30 * 80 * 3], alpha: None };
+    other.write_png(format!("{shape}/images/03.png")).unwrap();
+    let e = train(&shape, &[]);
+    assert!(e.contains("03.png") && e.contains("found 30x80, expected 72x56"), "{e}");
+    fs::write(format!("{shape}/images/03.png"), b"\x89PNG\r\n\x1a\n").unwrap();
+    assert!(train(&shape, &[]).contains("03.png"));
+
+    let nan = dir.path("nan");
+    let mut cloud = points();
+    cloud.positions[4][1] = f32::NAN;
+    write_scene(Path::new(&nan), 10, &cloud);
+    let e = train(&nan, &[]);
+    assert!(e.contains("finite") && e.contains("points3D"), "{e}");
+
+    let cut = dir.path("cut.ply");
+    let whole = dir.path("whole.ply");
+    ply::write_gaussians(&whole, &world().0, &[]).unwrap();
+    let bytes = fs::read(&whole).unwrap();
+    fs::write(&cut, &bytes[..bytes.len() - 5]).unwrap();
+    assert!(train(scene(), &["--init", &cut]).contains("cut.ply"));
+    assert!(refused(&["eval", "--scene", scene(), "--geometry", &cut, "--out", &out]).contains("cut.ply"));
+    assert!(refused(&["render", "--scene", scene(), "--geometry", &missing, "--out", &out]).contains("missing"));
+
+    for (option, value) in [("--dssim", "1.5"), ("--densify-gradient", "NaN"), ("--max-gaussians", "0")] {
+        let e = train(scene(), &[option, value]);
+        assert!(e.contains(option) && e.contains("out of range"), "{e}");
+    }
+    assert_eq!(fs::read_to_string(&out).unwrap(), "a good geometry");
+    let blocked = format!("{out}/g.ply");
+    assert!(refused(&["train", "--scene", scene(), "--out", &blocked]).contains("cannot create the folder"));
+    assert!(refused(&["train", "--scene", scene(), "--out", &shape]).contains("a folder is in the way"));
+}
