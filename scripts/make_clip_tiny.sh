@@ -4,7 +4,7 @@
 set -euo pipefail
 cd "$(dirname "$0")/.."
 python=${PYTHON:-python3}
-scenes=${SCENES:-60}
+scenes=${SCENES:-40}
 out=${OUT:-out/clip-tiny}
 "$python" -c 'import numpy, jax, onnx' 2>/dev/null || {
   echo "make clip-tiny needs Python with numpy, jax and onnx: $python -m pip install numpy jax onnx" >&2
@@ -15,7 +15,7 @@ for ((s = 0; s < scenes; s++)); do
   dir=$out/$(printf 'scene_%03d' "$s")
   [ -f "$dir/crops.safetensors" ] && continue
   p=$(awk "BEGIN { print ($s % 3) * 0.25 }")
-  "$bin/synth-scene" --out "$dir/scene" --seed $((1000 + s)) --objects 14 --views 12 --width 480 --height 360 --granularity-p "$p" --quiet
+  "$bin/synth-scene" --out "$dir/scene" --seed $((1000 + s)) --objects 11 --views 8 --width 480 --height 360 --granularity-p "$p" --quiet
   "$bin/mask-embed" crops --scene "$dir/scene" --masks "$dir/scene/language_features" --out "$dir/crops.safetensors" --size 64 --quiet
 done
 "$bin/mask-embed" tokenize --truth "$out" --out "$out/tokens.json" --quiet
