@@ -81,7 +81,7 @@ fn parse_gaussians(bytes: &[u8]) -> Result<Gaussians> {
         sh: table.gather(&sh_columns),
         sh_degree,
     };
-    g.opacity_logits.iter_mut().for_each(|o| *o = o.clamp(-50.0, 50.0));
+    g.opacity_logits.iter_mut().filter(|o| o.is_infinite()).for_each(|o| *o = o.clamp(-50.0, 50.0));
     let finite = |name: &str, values: &[f32]| {
         // Without leaving early, so that it runs at the memory's speed.
         if values.iter().fold(true, |all, v| all & v.is_finite()) {
