@@ -8,8 +8,8 @@ use std::path::Path;
 
 /// Pixels that a picture may have at most.
 const MAX_PIXELS: u64 = 1 << 28;
-/// Pixels per byte of file beyond which a header lies: a one-bit PNG of one colour has about 8,300.
-const MAX_PIXELS_PER_BYTE: u64 = 10_000;
+/// Pixels per byte of file beyond which a header lies: a gray PNG of one colour has about 1,030, a JPEG about 500.
+const MAX_PIXELS_PER_BYTE: u64 = 2_000;
 
 /// A picture: sRGB values as stored, not linearised.
 #[derive(Debug, Clone, Default, PartialEq)]

@@ -44,8 +44,8 @@ unsafe impl GlobalAlloc for Watched {
 #[global_allocator]
 static WATCHED: Watched = Watched;
 
-/// All files here are a few kilobytes; decoders keep tables and buffers of their own.
-const MOST: usize = 8 << 20;
+/// All files here are of a kilobyte or two; a picture may claim 2,000 pixels of 12 bytes for each byte of its file.
+const MOST: usize = 48 << 20;
 
 const FULL: LoadOptions = LoadOptions { resolution: Resolution::Divisor(1.0), holdout: 8 };
 
