@@ -1,46 +1,112 @@
 #!/usr/bin/env python3
-"""Writes crates/hdbscan-exact/testdata/golden.txt: small point sets with the labels that scikit-learn's HDBSCAN gives.
-Three lines a case: name, dimension, min_cluster_size, min_samples, epsilon, eom|leaf, allow_single_cluster, least ARI;
-coordinates; labels.  Needs numpy and scikit-learn.  usage: make_hdbscan_golden.py OUT"""
+"""Writes what scikit-learn makes of small point sets, for the tests of crates/hdbscan-exact.
+
+Every edge of the mutual reachability graph that is dominated by one core distance ties with others, so the minimum spanning
+tree is not unique, and which points stand at a cluster's rim depends on which one was taken. Hence two lists of labels a case:
+those of sklearn.cluster.HDBSCAN as it comes (to be met closely), and those that scikit-learn's own dendrogram and tree code
+gives for THE minimum spanning tree of one total order of edges: weight, smaller index, larger index, with points numbered
+lexicographically by coordinates (to be met exactly, probabilities included).
+
+usage: make_hdbscan_golden.py OUT.txt [CLUSTERABLE.npy OUT2.txt]    (needs numpy, scikit-learn 1.9)
+A case is five lines: name, dimension, min_cluster_size, min_samples, epsilon, eom|leaf, allow_single_cluster; coordinates;
+labels; labels of the one tree; probabilities of the one tree. The second file holds the same for the points of
+CLUSTERABLE.npy, without the coordinates.
+"""
 import sys
+
 import numpy as np
 from sklearn.cluster import HDBSCAN
+from sklearn.cluster._hdbscan._linkage import MST_edge_dtype, make_single_linkage
+from sklearn.cluster._hdbscan._tree import tree_to_labels
 from sklearn.datasets import make_blobs, make_moons
+from sklearn.metrics import adjusted_rand_score
 
-rng = np.random.default_rng(5)
+
+def one_tree(x, size, samples, eps, method, single):
+    """Labels and probabilities from the spanning tree of the one total order."""
+    n = len(x)
+    lexicographic = np.lexsort(x.T[::-1])
+    p = x[lexicographic].astype(np.float64)
+    d2 = np.zeros((n, n))
+    for k in range(p.shape[1]):  # the order of additions fixes the last bit
+        d2 += (p[:, None, k] - p[None, :, k]) ** 2
+    core = np.sqrt(np.sort(d2, axis=1)[:, min(samples, n) - 1])
+    w = np.maximum(np.sqrt(d2), np.maximum(core[:, None], core[None, :]))
+    # Coincident points are one point with a weight.
+    w[d2 == 0] = 0.0
+    assert (d2 == 0).sum(axis=1).max() < size, "a heap of coincident points that is a cluster by itself"
+    a, b = np.triu_indices(n, 1)
+    parent = list(range(n))
+
+    def find(i):
+        while parent[i] != i:
+            parent[i] = parent[parent[i]]
+            i = parent[i]
+        return i
+
+    edges = []
+    for e in np.lexsort((b, a, w[a, b])):
+        ra, rb = find(a[e]), find(b[e])
+        if ra != rb:
+            parent[max(ra, rb)] = min(ra, rb)
+            edges.append((a[e], b[e], w[a[e], b[e]]))
+            if len(edges) == n - 1:
+                break
+    dendrogram = make_single_linkage(np.array(edges, dtype=MST_edge_dtype))
+    labels, probabilities = tree_to_labels(dendrogram, size, method, single, eps)
+    back = np.argsort(lexicographic)
+    return labels[back], probabilities[back]
+
+
+def write_case(out, name, x, size, samples, eps, method, single, coordinates):
+    x = (np.round(x, 4) if coordinates else x).astype(np.float32)  # rounded: a smaller file
+    h = HDBSCAN(min_cluster_size=size, min_samples=samples, cluster_selection_epsilon=eps, cluster_selection_method=method,
+                allow_single_cluster=bool(single), algorithm="brute", copy=True)
+    labels = h.fit_predict(x.astype(np.float64))
+    one, probabilities = one_tree(x, size, samples, eps, method, bool(single))
+    print(name, x.shape[1], size, samples, eps, method, single, file=out)
+    if coordinates:
+        print(*(f"{v:.7g}" for v in x.ravel()), file=out)
+    print(*labels, file=out)
+    print(*one, file=out)
+    print(*(f"{v:.5g}" for v in probabilities), file=out)
+    print(f"{name}: {x.shape}, {one.max() + 1} clusters, {(one < 0).sum()} noise; ARI between the two lists "
+          f"{adjusted_rand_score(labels, one):.4f}")
 
 
 def blobs(n, d, k, std, seed):
     return make_blobs(n, d, centers=k, cluster_std=std, random_state=seed)[0]
 
 
+rng = np.random.default_rng(5)
 sphere = rng.normal(size=(400, 4)) * 0.15 + np.eye(4)[rng.integers(0, 4, 400)]
 sphere /= np.linalg.norm(sphere, axis=1, keepdims=True)
 nested = np.concatenate([blobs(200, 2, [[0, 0]], 0.1, 1), blobs(200, 2, [[1, 0]], 0.1, 2), blobs(300, 2, [[12, 3]], 1.0, 3)])
-# name, points, min_cluster_size, min_samples, epsilon, method, single, least ARI: below 1 because edges dominated by one core
-# distance tie, so that the spanning tree, and with it the rim of a cluster, is not unique
+line = np.concatenate([rng.normal(c, 0.3, 60) for c in (0, 4, 9)])[:, None] * np.array([[1.0, -2.0]])
+# name, points, min_cluster_size, min_samples, epsilon, method, single
 CASES = [
-    ("blobs2", blobs(500, 2, 5, 0.6, 0), 10, 10, 0.0, "eom", 0, 0.99),
-    ("blobs6", blobs(600, 6, 6, 1.0, 1), 15, 5, 0.0, "eom", 0, 0.99),
-    ("blobs6-leaf", blobs(400, 6, 6, 1.0, 2), 10, 5, 0.0, "leaf", 0, 0.99),
-    ("moons", make_moons(500, noise=0.06, random_state=3)[0], 15, 5, 0.0, "eom", 0, 0.99),
-    ("uniform", rng.uniform(size=(500, 3)), 8, 4, 0.0, "eom", 0, 0.95),
-    ("uniform-leaf", rng.uniform(size=(500, 2)), 8, 4, 0.0, "leaf", 0, 0.95),
-    ("sphere", sphere, 12, 6, 0.0, "eom", 0, 0.99),
-    ("nested", nested, 20, 10, 0.0, "eom", 0, 0.99),
-    ("blobs8", blobs(500, 2, 8, 0.8, 7), 8, 5, 0.0, "leaf", 0, 0.95),
-    # On a grid and among duplicates distances tie by the hundred: the spanning tree is not unique.
-    ("grid", np.round(blobs(500, 2, 4, 0.7, 4) * 4) / 4, 10, 6, 0.0, "eom", 0, 0.9),
-    ("duplicates", np.repeat(blobs(150, 3, 4, 0.8, 6), 3, axis=0), 12, 6, 0.0, "eom", 0, 0.99),
-    ("single", blobs(300, 2, 1, 0.5, 8), 20, 10, 0.0, "eom", 1, 0.99),
+    ("blobs2", blobs(500, 2, 5, 0.6, 0), 10, 10, 0.0, "eom", 0),
+    ("blobs6", blobs(500, 6, 6, 1.0, 1), 15, 5, 0.0, "eom", 0),
+    ("blobs6-leaf", blobs(400, 6, 6, 1.0, 2), 10, 5, 0.0, "leaf", 0),
+    ("moons", make_moons(500, noise=0.06, random_state=3)[0], 15, 5, 0.0, "eom", 0),
+    ("uniform", rng.uniform(size=(400, 3)), 8, 4, 0.0, "eom", 0),
+    ("uniform-leaf", rng.uniform(size=(500, 2)), 8, 4, 0.0, "leaf", 0),
+    ("sphere", sphere, 12, 6, 0.0, "eom", 0),
+    ("nested", nested, 20, 10, 0.0, "eom", 0),
+    ("nested-epsilon", nested, 20, 10, 0.5, "eom", 0),
+    ("blobs8", blobs(500, 2, 8, 0.8, 7), 8, 5, 0.0, "leaf", 0),
+    ("blobs8-epsilon", blobs(500, 2, 8, 0.8, 7), 8, 5, 0.6, "leaf", 0),
+    ("uniform-epsilon", rng.uniform(size=(400, 2)), 5, 3, 0.04, "eom", 0),
+    ("collinear", line, 10, 5, 0.0, "eom", 0),
+    ("grid", np.round(blobs(500, 2, 4, 0.7, 4) * 4) / 4, 12, 6, 0.0, "eom", 0),
+    ("duplicates", np.repeat(blobs(150, 3, 4, 0.8, 6), 3, axis=0), 12, 6, 0.0, "eom", 0),
+    ("single", blobs(300, 2, 1, 0.5, 8), 20, 10, 0.0, "eom", 1),
+    ("single-epsilon", blobs(300, 2, 1, 0.5, 8), 20, 10, 0.25, "eom", 1),
+    ("single-leaf", blobs(300, 2, 3, 0.5, 9), 20, 10, 0.3, "leaf", 1),
 ]
 with open(sys.argv[1], "w") as out:
-    for name, x, size, samples, eps, method, single, least in CASES:
-        x = x.astype(np.float32)
-        h = HDBSCAN(min_cluster_size=size, min_samples=samples, cluster_selection_epsilon=eps, cluster_selection_method=method,
-                    allow_single_cluster=bool(single), algorithm="brute", copy=True)
-        labels = h.fit_predict(x.astype(np.float64))
-        print(name, x.shape[1], size, samples, eps, method, single, least, file=out)
-        print(*(f"{v:.9g}" for v in x.ravel()), file=out)
-        print(*labels, file=out)
-        print(name, x.shape, "clusters", labels.max() + 1, "noise", (labels < 0).sum())
+    for case in CASES:
+        write_case(out, *case, coordinates=True)
+if len(sys.argv) > 3:
+    with open(sys.argv[3], "w") as out:
+        write_case(out, "clusterable", np.load(sys.argv[2]), 15, 15, 0.0, "eom", 0, coordinates=False)

@@ -71,24 +71,16 @@ pub(crate) fn condense(edges: &[Edge], weights: &[u32], core: &[f64], min_cluste
         let lambda = lambda_of(merge.distance);
         let sizes = merge.children.map(|c| size_of(c, weights, &merges));
         let large = sizes.map(|s| s as usize >= min_cluster_size);
-        match large {
-            [true, true] => {
-                for (child, size) in merge.children.into_iter().zip(sizes) {
-                    let new = m as u32 + tree.clusters;
-                    tree.clusters += 1;
-                    tree.edges.push(CondensedEdge { parent: cluster, child: new, lambda, size });
-                    open.push((child, new));
-                }
-            }
-            _ => {
-                for ((child, size), large) in merge.children.into_iter().zip(sizes).zip(large) {
-                    if large {
-                        open.push((child, cluster));
-                    } else {
-                        let _ = size;
-                        drop_all(child, cluster, lambda, m, weights, &merges, &mut tree.edges);
-                    }
-                }
+        for ((child, size), is_large) in merge.children.into_iter().zip(sizes).zip(large) {
+            if large == [true, true] {
+                let new = m as u32 + tree.clusters;
+                tree.clusters += 1;
+                tree.edges.push(CondensedEdge { parent: cluster, child: new, lambda, size });
+                open.push((child, new));
+            } else if is_large {
+                open.push((child, cluster));
+            } else {
+                drop_all(child, cluster, lambda, weights, &merges, &mut tree.edges);
             }
         }
     }
@@ -102,15 +94,8 @@ fn size_of(node: u32, weights: &[u32], merges: &[Merge]) -> u32 {
 }
 
 /// All points below a node leave the cluster at once.
-fn drop_all(
-    node: u32,
-    cluster: u32,
-    lambda: f64,
-    m: usize,
-    weights: &[u32],
-    merges: &[Merge],
-    out: &mut Vec<CondensedEdge>,
-) {
+fn drop_all(node: u32, cluster: u32, lambda: f64, weights: &[u32], merges: &[Merge], out: &mut Vec<CondensedEdge>) {
+    let m = weights.len();
     let mut open = vec![node];
     while let Some(node) = open.pop() {
         if (node as usize) < m {

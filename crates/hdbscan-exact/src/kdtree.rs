@@ -1,12 +1,15 @@
 //! A kd-tree, and core distances from it.
 
 use rayon::prelude::*;
+use std::cmp::Ordering;
 
+/// Points of a leaf.
 const LEAF: usize = 16;
 
-/// Points without duplicates.
+/// Points without duplicates, numbered in the lexicographic order of their coordinates: where edges of equal weight are
+/// ordered by these numbers, the result does not depend on the order in which the caller names the points.
 pub(crate) struct Unique {
-    /// Coordinates of the distinct points, `[m][dim]`, in lexicographic order.
+    /// Coordinates of the distinct points, `[m][dim]`.
     pub points: Vec<f32>,
     /// How many points each stands for.
     pub weights: Vec<u32>,
@@ -18,35 +21,22 @@ impl Unique {
     pub fn new(points: &[f32], dim: usize) -> Self {
         let n = points.len() / dim;
         let row = |i: u32| &points[i as usize * dim..(i as usize + 1) * dim];
-        let mut order: Vec<u32> = (0..n as u32).collect();
         // Adding zero turns -0 into 0, which are the same place.
-        let compare = |a: &u32, b: &u32| {
-            let by_value = row(*a).iter().zip(row(*b)).map(|(x, y)| (x + 0.0).total_cmp(&(y + 0.0)));
-            by_value.fold(std::cmp::Ordering::Equal, std::cmp::Ordering::then)
+        let compare = |a: u32, b: u32| {
+            let by_value = row(a).iter().zip(row(b)).map(|(x, y)| (x + 0.0).total_cmp(&(y + 0.0)));
+            by_value.fold(Ordering::Equal, Ordering::then)
         };
-        order.par_sort_unstable_by(|a, b| compare(a, b).then(a.cmp(b)));
+        let mut order: Vec<u32> = (0..n as u32).collect();
+        order.par_sort_unstable_by(|&a, &b| compare(a, b).then(a.cmp(&b)));
         let mut out = Self { points: Vec::new(), weights: Vec::new(), of_point: vec![0; n] };
-        // Distinct points are numbered by their first original index, so that ties are broken by the caller's order.
-        let mut firsts: Vec<u32> = Vec::new();
-        let mut group = vec![0u32; n];
         for (at, &i) in order.iter().enumerate() {
-            if at == 0 || compare(&order[at - 1], &i).is_ne() {
-                firsts.push(i);
+            if at == 0 || compare(order[at - 1], i).is_ne() {
+                out.points.extend(row(i));
+                out.weights.push(0);
             }
-            group[i as usize] = firsts.len() as u32 - 1;
-        }
-        let mut rank: Vec<u32> = (0..firsts.len() as u32).collect();
-        rank.sort_unstable_by_key(|&g| firsts[g as usize]);
-        let mut of_group = vec![0u32; firsts.len()];
-        for (new, &g) in rank.iter().enumerate() {
-            of_group[g as usize] = new as u32;
-            out.points.extend(row(firsts[g as usize]));
-        }
-        out.weights = vec![0; firsts.len()];
-        for i in 0..n {
-            let u = of_group[group[i] as usize];
-            out.of_point[i] = u;
-            out.weights[u as usize] += 1;
+            let last = out.weights.len() - 1;
+            out.weights[last] += 1;
+            out.of_point[i as usize] = last as u32;
         }
         out
     }
@@ -119,18 +109,19 @@ impl KdTree {
         self.build(points, right, start + middle);
     }
 
-    /// Squared distance from a point to a node's box.
+    /// Squared distance from a point to a node's box. Never more than [`squared`] of a point inside gives: every step
+    /// (difference, square, sum in the same order) is rounded from a smaller or equal value, and rounding is monotone.
     #[inline]
     pub fn distance_to(&self, node: usize, p: &[f32]) -> f64 {
         let b = &self.boxes[node * 2 * self.dim..(node + 1) * 2 * self.dim];
         let (low, high) = b.split_at(self.dim);
         let mut sum = 0.0f64;
         for k in 0..self.dim {
-            let d = f64::from((low[k] - p[k]).max(p[k] - high[k]).max(0.0));
+            let v = f64::from(p[k]);
+            let d = (f64::from(low[k]) - v).max(v - f64::from(high[k])).max(0.0);
             sum += d * d;
         }
-        // The subtraction above rounds in f32; stay on the safe side of the true distance.
-        sum * (1.0 - 1e-6)
+        sum
     }
 
     #[inline]

@@ -68,7 +68,7 @@ pub fn cluster(points: &[f32], dim: usize, options: &Options) -> Clustering {
     assert!(points.iter().all(|v| v.is_finite()), "points are finite");
     let unique = kdtree::Unique::new(points, dim);
     let core = kdtree::core_distances_of(&unique, dim, options.min_samples);
-    let edges = boruvka::spanning_tree_of(&unique.points, dim, &core);
+    let edges = spanning_tree(&unique.points, dim, &core);
     let tree = condense::condense(&edges, &unique.weights, &core, options.min_cluster_size);
     select::label(tree, &unique.of_point, options)
 }

@@ -12,150 +12,151 @@ pub enum Selection {
     Leaf,
 }
 
+/// What an infinite lambda (coincident points) counts in a stability: more than any finite one, but still a number that
+/// can be added and compared.
+const LAMBDA_CAP: f64 = 1e30;
+
+/// The clusters of a condensed tree, numbered from 0 (the root). Parents have smaller numbers than their children.
+struct Clusters {
+    /// Lambda at which each was born; 0 for the root.
+    birth: Vec<f64>,
+    parent: Vec<Option<usize>>,
+    children: Vec<Vec<usize>>,
+    /// Sum over what leaves the cluster of (lambda - birth) * size.
+    stability: Vec<f64>,
+    /// Largest finite lambda at which something leaves the cluster.
+    death: Vec<f64>,
+}
+
+impl Clusters {
+    fn new(tree: &CondensedTree) -> Self {
+        let (m, k) = (tree.points as usize, tree.clusters as usize);
+        let mut out = Self {
+            birth: vec![0.0; k],
+            parent: vec![None; k],
+            children: vec![Vec::new(); k],
+            stability: vec![0.0; k],
+            death: vec![0.0; k],
+        };
+        for e in tree.edges.iter().filter(|e| e.child as usize >= m) {
+            let (p, c) = (e.parent as usize - m, e.child as usize - m);
+            out.birth[c] = e.lambda;
+            out.parent[c] = Some(p);
+            out.children[p].push(c);
+        }
+        for e in &tree.edges {
+            let p = e.parent as usize - m;
+            // Equal infinities differ by nothing.
+            let excess = if e.lambda == out.birth[p] { 0.0 } else { (e.lambda - out.birth[p]).min(LAMBDA_CAP) };
+            out.stability[p] += excess * f64::from(e.size);
+            if e.lambda.is_finite() {
+                out.death[p] = out.death[p].max(e.lambda);
+            }
+        }
+        out
+    }
+
+    fn len(&self) -> usize {
+        self.birth.len()
+    }
+
+    /// Distance at which a cluster was born; infinite for the root.
+    fn distance(&self, c: usize) -> f64 {
+        if self.birth[c] > 0.0 { 1.0 / self.birth[c] } else { f64::INFINITY }
+    }
+
+    fn excess_of_mass(&self, allow_root: bool) -> Vec<bool> {
+        let mut chosen = vec![false; self.len()];
+        let mut best = self.stability.clone();
+        for c in (0..self.len()).rev() {
+            if c == 0 && !allow_root {
+                continue;
+            }
+            let below: f64 = self.children[c].iter().map(|&x| best[x]).sum();
+            if below > best[c] {
+                best[c] = below;
+            } else {
+                chosen[c] = true;
+            }
+        }
+        self.keep_topmost(&mut chosen);
+        chosen
+    }
+
+    fn leaves(&self, allow_root: bool) -> Vec<bool> {
+        (0..self.len()).map(|c| self.children[c].is_empty() && (c > 0 || allow_root)).collect()
+    }
+
+    /// Of chosen clusters that lie within one another only the outermost stay.
+    fn keep_topmost(&self, chosen: &mut [bool]) {
+        let mut covered = vec![false; self.len()];
+        for c in 0..self.len() {
+            covered[c] = self.parent[c].is_some_and(|p| covered[p] || chosen[p]);
+            chosen[c] &= !covered[c];
+        }
+    }
+
+    /// Chosen clusters that were born below the distance `epsilon` give way to their first ancestor that was born above it
+    /// (Malzer and Baum 2020).
+    fn join_below(&self, epsilon: f64, allow_root: bool, chosen: &mut [bool]) {
+        // Where a cluster ends that climbs.
+        let mut end: Vec<usize> = (0..self.len()).collect();
+        for c in 0..self.len() {
+            end[c] = match self.parent[c] {
+                Some(0) if !allow_root => c,
+                Some(p) if self.distance(p) > epsilon => p,
+                Some(p) => end[p],
+                None => c,
+            };
+        }
+        let before = chosen.to_vec();
+        chosen.fill(false);
+        for c in (0..self.len()).filter(|&c| before[c]) {
+            chosen[if self.distance(c) < epsilon { end[c] } else { c }] = true;
+        }
+        self.keep_topmost(chosen);
+    }
+}
+
 /// Selects clusters and labels points; `of_point` gives the distinct point of each original one.
 pub(crate) fn label(tree: CondensedTree, of_point: &[u32], options: &Options) -> Clustering {
-    let (m, k) = (tree.points as usize, tree.clusters as usize);
-    let cluster = |node: u32| node as usize - m;
-    let mut birth = vec![0.0f64; k];
-    let mut parent: Vec<Option<usize>> = vec![None; k];
-    let mut children: Vec<Vec<usize>> = vec![Vec::new(); k];
-    for e in tree.edges.iter().filter(|e| e.child as usize >= m) {
-        let (p, c) = (cluster(e.parent), cluster(e.child));
-        birth[c] = e.lambda;
-        parent[c] = Some(p);
-        children[p].push(c);
-    }
-    // Stability: sum over what leaves of (lambda - birth) * size. Equal infinities count as nothing.
-    let mut stability = vec![0.0f64; k];
-    for e in &tree.edges {
-        let p = cluster(e.parent);
-        let excess = if e.lambda == birth[p] { 0.0 } else { (e.lambda - birth[p]).min(1e30) };
-        stability[p] += excess * f64::from(e.size);
-    }
-
-    let mut chosen = vec![false; k];
-    match options.selection {
-        Selection::Leaf => {
-            for c in 0..k {
-                chosen[c] = children[c].is_empty() && (c > 0 || options.allow_single_cluster);
-            }
-        }
-        Selection::ExcessOfMass => {
-            let mut best = stability.clone();
-            // Children have larger numbers than their parents.
-            for c in (0..k).rev() {
-                if c == 0 && !options.allow_single_cluster {
-                    continue;
-                }
-                let below: f64 = children[c].iter().map(|&x| best[x]).sum();
-                if children[c].is_empty() || stability[c] >= below {
-                    chosen[c] = true;
-                } else {
-                    best[c] = below;
-                }
-            }
-            // Only the topmost of those chosen count.
-            for c in 0..k {
-                let mut up = parent[c];
-                while let Some(p) = up {
-                    if chosen[p] {
-                        chosen[c] = false;
-                        break;
-                    }
-                    up = parent[p];
-                }
-            }
-        }
-    }
+    let m = tree.points as usize;
+    let clusters = Clusters::new(&tree);
+    let mut chosen = match options.selection {
+        Selection::Leaf => clusters.leaves(options.allow_single_cluster),
+        Selection::ExcessOfMass => clusters.excess_of_mass(options.allow_single_cluster),
+    };
     if options.epsilon > 0.0 {
-        join_below_epsilon(&mut chosen, &birth, &parent, options);
+        clusters.join_below(options.epsilon, options.allow_single_cluster, &mut chosen);
     }
-
-    let selected: Vec<u32> = (0..k).filter(|&c| chosen[c]).map(|c| (c + m) as u32).collect();
-    let mut label_of = vec![-1i32; k];
-    // Each cluster belongs to the nearest chosen one at or above it.
-    let mut next = 0;
-    for c in 0..k {
-        if chosen[c] {
-            label_of[c] = next;
-            next += 1;
-        } else if let Some(p) = parent[c] {
-            label_of[c] = label_of[p];
-        }
+    let selected: Vec<usize> = (0..clusters.len()).filter(|&c| chosen[c]).collect();
+    // Each cluster belongs to the chosen one at or above it.
+    let mut label_of: Vec<Option<usize>> = vec![None; clusters.len()];
+    for c in 0..clusters.len() {
+        label_of[c] = selected.binary_search(&c).ok().or(clusters.parent[c].and_then(|p| label_of[p]));
     }
-    // Lambda at which each distinct point leaves the tree, and the largest in each cluster.
-    let mut point_label = vec![-1i32; m];
-    let mut point_lambda = vec![0.0f64; m];
-    let mut largest = vec![0.0f64; selected.len()];
-    let root_chosen = k > 0 && chosen[0];
-    // With the root as the one cluster, points that leave it before its last split are noise, as in the reference.
-    let root_limit = if options.epsilon > 0.0 {
-        1.0 / options.epsilon
-    } else {
-        tree.edges.iter().filter(|e| cluster_is_root(e.parent, m)).map(|e| e.lambda).fold(0.0, f64::max)
-    };
+    // Where the root is a cluster, points that leave it early are noise, as in scikit-learn: all cut off above epsilon, or,
+    // without epsilon, before the last.
+    let root_edges = tree.edges.iter().filter(|e| e.parent as usize == m);
+    let least_in_root =
+        if options.epsilon > 0.0 { 1.0 / options.epsilon } else { root_edges.map(|e| e.lambda).fold(0.0, f64::max) };
+    let mut labels = vec![-1i32; m];
+    let mut probabilities = vec![0.0f32; m];
     for e in tree.edges.iter().filter(|e| (e.child as usize) < m) {
-        let c = cluster(e.parent);
-        let l = label_of[c];
-        let stays = !(root_chosen && c == 0) || e.lambda >= root_limit;
-        if l >= 0 && stays {
-            point_label[e.child as usize] = l;
-            point_lambda[e.child as usize] = e.lambda;
-            if e.lambda.is_finite() {
-                largest[l as usize] = largest[l as usize].max(e.lambda);
-            }
-        }
-    }
-    let probability = |u: usize| {
-        let l = point_label[u];
-        if l < 0 {
-            return 0.0;
-        }
-        let most = largest[l as usize];
-        if most == 0.0 || !point_lambda[u].is_finite() { 1.0 } else { (point_lambda[u] / most).min(1.0) as f32 }
-    };
-    Clustering {
-        labels: of_point.iter().map(|&u| point_label[u as usize]).collect(),
-        probabilities: of_point.iter().map(|&u| probability(u as usize)).collect(),
-        tree,
-        selected,
-    }
-}
-
-fn cluster_is_root(node: u32, m: usize) -> bool {
-    node as usize == m
-}
-
-/// Chosen clusters that were born below the distance epsilon give way to their first ancestor that was not.
-fn join_below_epsilon(chosen: &mut [bool], birth: &[f64], parent: &[Option<usize>], options: &Options) {
-    let distance = |c: usize| if birth[c] > 0.0 { 1.0 / birth[c] } else { f64::INFINITY };
-    let k = chosen.len();
-    let before = chosen.to_vec();
-    chosen.fill(false);
-    for c in 0..k {
-        if !before[c] {
+        let c = e.parent as usize - m;
+        let Some(label) = label_of[c] else { continue };
+        if selected[label] == 0 && e.lambda < least_in_root {
             continue;
         }
-        let mut at = c;
-        while distance(at) < options.epsilon {
-            match parent[at] {
-                // The root was born at infinite distance; it is a cluster only where that is allowed.
-                Some(0) if !options.allow_single_cluster => break,
-                Some(p) => at = p,
-                None => break,
-            }
-        }
-        chosen[at] = true;
+        let death = clusters.death[selected[label]];
+        labels[e.child as usize] = label as i32;
+        probabilities[e.child as usize] =
+            if death == 0.0 || e.lambda >= death { 1.0 } else { (e.lambda / death) as f32 };
     }
-    // Of clusters above one another only the topmost stays.
-    for c in 0..k {
-        let mut up = parent[c];
-        while let Some(p) = up {
-            if chosen[p] {
-                chosen[c] = false;
-                break;
-            }
-            up = parent[p];
-        }
+    Clustering {
+        labels: of_point.iter().map(|&u| labels[u as usize]).collect(),
+        probabilities: of_point.iter().map(|&u| probabilities[u as usize]).collect(),
+        tree,
+        selected: selected.iter().map(|&c| (c + m) as u32).collect(),
     }
 }
