@@ -2,26 +2,29 @@
 //!
 //! One rasterisation of a view serves all instances. The silhouette of an instance is where the instance rendered alone
 //! has alpha > 0.8: per pixel, 1 - prod(1 - alpha_i) over its own Gaussians, hidden ones included (OpenGaussian's rule); or,
-//! occlusion-aware, where its Gaussians have more than half of the blending weight.
+//! occlusion-aware, where its Gaussians have more than half of the blending weight. Its mean feature is that of its own
+//! Gaussians as rendered over the silhouette; a mask's is that of all Gaussians as rendered over the mask. Rendering is
+//! linear, so both are sums over Gaussians of feature times summed weight, and no feature image is made.
 
-use artifacts::{Level, MaskMaps, Match};
-use gs_raster::{RasterOptions, TILE, tile_weights};
+use artifacts::{Features, Level, MaskMaps, Match};
+use gs_raster::{RasterOptions, TILE, TileWeights, tile_weights};
 use gs_scene::{Camera, Gaussians};
 use std::collections::BTreeMap;
 
 /// What counts as an instance's silhouette.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, clap::ValueEnum)]
 pub enum Silhouette {
-    /// The instance rendered alone, alpha > 0.8.
+    /// The instance rendered alone, alpha > 0.8
     Selected,
-    /// Where it is seen: more than half of the blending weight.
+    /// Where it is seen: more than half of the blending weight
     Visible,
 }
 
 const SELECTED_ALPHA: f32 = 0.8;
 const VISIBLE_WEIGHT: f32 = 0.5;
+const PIXELS: usize = TILE * TILE;
 
-/// Pixels of something in a view and the sum of rendered features over them.
+/// Pixels of an instance or a mask in a view, and the sum of rendered features over them.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct Region {
     /// Pixels.
@@ -31,12 +34,8 @@ pub struct Region {
 }
 
 impl Region {
-    fn add(&mut self, area: u32, features: &[f64]) {
-        self.area += area;
-        if self.features.is_empty() {
-            self.features = vec![0.0; features.len()];
-        }
-        self.features.iter_mut().zip(features).for_each(|(s, f)| *s += f);
+    fn empty(dim: usize) -> Self {
+        Self { area: 0, features: vec![0.0; dim] }
     }
 }
 
@@ -51,99 +50,192 @@ pub struct Overlaps {
     pub common: BTreeMap<(u32, u32), u32>,
 }
 
-/// Measures a view. `labels` are instances of all Gaussians (-1 for none), `features` `[N][dim]`, `camera` has the size of the
-/// id maps.
+impl Overlaps {
+    fn add(&mut self, tile: Self) {
+        let add_all = |to: &mut BTreeMap<u32, Region>, from: BTreeMap<u32, Region>| {
+            for (key, region) in from {
+                let sum = to.entry(key).or_insert_with(|| Region::empty(region.features.len()));
+                sum.area += region.area;
+                sum.features.iter_mut().zip(&region.features).for_each(|(s, f)| *s += f);
+            }
+        };
+        add_all(&mut self.instances, tile.instances);
+        add_all(&mut self.masks, tile.masks);
+        for (key, pixels) in tile.common {
+            *self.common.entry(key).or_default() += pixels;
+        }
+    }
+}
+
+/// Features by Gaussian.
+pub struct FeatureTable<'a> {
+    features: &'a Features,
+    /// Position in `features` of each Gaussian, if it has one.
+    position: Vec<Option<u32>>,
+}
+
+impl<'a> FeatureTable<'a> {
+    /// The table for a scene of `gaussians` Gaussians.
+    ///
+    /// # Panics
+    /// When `features` speak of other Gaussians than these.
+    pub fn new(features: &'a Features, gaussians: usize) -> Self {
+        let mut position = vec![None; gaussians];
+        for (at, &i) in features.kept.iter().enumerate() {
+            position[i as usize] = Some(at as u32);
+        }
+        Self { features, position }
+    }
+
+    /// Adds `weight` times the feature of a Gaussian. One without a feature is seen by no view and has nothing to add.
+    fn add_to(&self, sum: &mut [f64], gaussian: u32, weight: f32) {
+        if let (Some(at), true) = (self.position[gaussian as usize], weight > 0.0) {
+            for (s, f) in sum.iter_mut().zip(self.features.row(at as usize)) {
+                *s += f64::from(weight) * f64::from(*f);
+            }
+        }
+    }
+}
+
+/// Coordinates of a tile's pixels within the tile.
+fn pixels(t: &TileWeights<'_>) -> impl Iterator<Item = (usize, usize)> + use<> {
+    let (width, height) = (t.width, t.height);
+    (0..height).flat_map(move |y| (0..width).map(move |x| (x, y)))
+}
+
+/// The masks in a tile, and of each level which of them every pixel belongs to (index into `ids`).
+struct TileMasks {
+    ids: Vec<u32>,
+    at: Vec<[Option<u16>; PIXELS]>,
+}
+
+impl TileMasks {
+    fn new(t: &TileWeights<'_>, maps: &MaskMaps, levels: &[Level]) -> Self {
+        let mut out = Self { ids: Vec::new(), at: Vec::new() };
+        for &level in levels {
+            let map = maps.level(level);
+            let mut at = [None; PIXELS];
+            for (x, y) in pixels(t) {
+                let Ok(id) = u32::try_from(map[(t.y0 + y) * maps.width + t.x0 + x]) else { continue };
+                let known = out.ids.iter().position(|&k| k == id).unwrap_or_else(|| {
+                    out.ids.push(id);
+                    out.ids.len() - 1
+                });
+                at[y * TILE + x] = Some(known as u16);
+            }
+            out.at.push(at);
+        }
+        out
+    }
+}
+
+/// Where each instance has its silhouette in a tile.
+fn silhouettes(t: &TileWeights<'_>, labels: &[i32], silhouette: Silhouette) -> BTreeMap<u32, [bool; PIXELS]> {
+    // Transmittance (selected) or weight (visible) of each instance at each pixel.
+    let mut coverage: BTreeMap<u32, [f32; PIXELS]> = BTreeMap::new();
+    for (g, &i) in t.gaussians.iter().enumerate() {
+        let Ok(label) = u32::try_from(labels[i as usize]) else { continue };
+        let own = g * PIXELS..(g + 1) * PIXELS;
+        match silhouette {
+            Silhouette::Selected => {
+                let left = coverage.entry(label).or_insert([1.0; PIXELS]);
+                left.iter_mut().zip(&t.alphas[own]).for_each(|(l, a)| *l *= 1.0 - a);
+            }
+            Silhouette::Visible => {
+                let sum = coverage.entry(label).or_insert([0.0; PIXELS]);
+                sum.iter_mut().zip(&t.weights[own]).for_each(|(s, w)| *s += w);
+            }
+        }
+    }
+    let inside = |value: f32| match silhouette {
+        Silhouette::Selected => 1.0 - value > SELECTED_ALPHA,
+        Silhouette::Visible => value > VISIBLE_WEIGHT,
+    };
+    coverage
+        .into_iter()
+        .map(|(label, values)| (label, values.map(inside)))
+        .filter(|(_, at)| at.iter().any(|&a| a))
+        .collect()
+}
+
+fn tile_overlaps(
+    t: &TileWeights<'_>,
+    labels: &[i32],
+    table: &FeatureTable<'_>,
+    masks: &TileMasks,
+    silhouette: Silhouette,
+) -> Overlaps {
+    let dim = table.features.dim;
+    let inside = silhouettes(t, labels, silhouette);
+    let mut out = Overlaps::default();
+    // Areas.
+    let mut of_mask = vec![Region::empty(dim); masks.ids.len()];
+    for at in masks.at.iter().flatten().flatten() {
+        of_mask[*at as usize].area += 1;
+    }
+    for (&label, pixels) in &inside {
+        let area = pixels.iter().filter(|&&p| p).count() as u32;
+        out.instances.insert(label, Region { area, features: vec![0.0; dim] });
+        for at in &masks.at {
+            for mask in at.iter().zip(pixels).filter(|(_, inside)| **inside).filter_map(|(mask, _)| *mask) {
+                *out.common.entry((label, masks.ids[mask as usize])).or_default() += 1;
+            }
+        }
+    }
+    // Features: of each Gaussian its weights summed over masks and over the silhouette of its instance.
+    let mut left: BTreeMap<u32, [f32; PIXELS]> = inside.keys().map(|&label| (label, [1.0; PIXELS])).collect();
+    let mut sums = vec![0.0f32; masks.ids.len()];
+    for (g, &i) in t.gaussians.iter().enumerate() {
+        let (alphas, weights) = (&t.alphas[g * PIXELS..(g + 1) * PIXELS], &t.weights[g * PIXELS..(g + 1) * PIXELS]);
+        sums.fill(0.0);
+        for at in &masks.at {
+            for (mask, w) in at.iter().zip(weights) {
+                if let Some(mask) = mask {
+                    sums[*mask as usize] += w;
+                }
+            }
+        }
+        for (region, &sum) in of_mask.iter_mut().zip(&sums) {
+            table.add_to(&mut region.features, i, sum);
+        }
+        let Ok(label) = u32::try_from(labels[i as usize]) else { continue };
+        let (Some(pixels), Some(left), Some(region)) =
+            (inside.get(&label), left.get_mut(&label), out.instances.get_mut(&label))
+        else {
+            continue;
+        };
+        let mut sum = 0.0f32;
+        for p in 0..PIXELS {
+            let weight = match silhouette {
+                Silhouette::Selected => left[p] * alphas[p],
+                Silhouette::Visible => weights[p],
+            };
+            left[p] *= 1.0 - alphas[p];
+            sum += if pixels[p] { weight } else { 0.0 };
+        }
+        table.add_to(&mut region.features, i, sum);
+    }
+    out.masks = masks.ids.iter().copied().zip(of_mask).collect();
+    out
+}
+
+/// Measures a view. `labels` are instances of all Gaussians (-1 for none); `camera` has the size of the id maps; masks are
+/// those of `levels`.
 pub fn overlaps(
     gaussians: &Gaussians,
     labels: &[i32],
-    features: &[f32],
-    dim: usize,
+    table: &FeatureTable<'_>,
     camera: &Camera,
     maps: &MaskMaps,
-    level: Level,
+    levels: &[Level],
     silhouette: Silhouette,
 ) -> Overlaps {
-    let ids = maps.level(level);
     let early_stop = silhouette == Silhouette::Visible;
     let tiles = tile_weights(gaussians, camera, &RasterOptions::default(), early_stop, |t| {
-        let pixels = TILE * TILE;
-        let mut rendered = vec![0.0f32; pixels * dim];
-        // Transmittance (selected) or weight (visible) of each instance at each pixel.
-        let mut coverage: BTreeMap<u32, Vec<f32>> = BTreeMap::new();
-        for (g, &i) in t.gaussians.iter().enumerate() {
-            let weights = &t.weights[g * pixels..(g + 1) * pixels];
-            let feature = &features[i as usize * dim..(i as usize + 1) * dim];
-            for (p, &w) in weights.iter().enumerate() {
-                if w > 0.0 {
-                    for (r, f) in rendered[p * dim..(p + 1) * dim].iter_mut().zip(feature) {
-                        *r += w * f;
-                    }
-                }
-            }
-            let Ok(label) = u32::try_from(labels[i as usize]) else { continue };
-            match silhouette {
-                Silhouette::Selected => {
-                    let left = coverage.entry(label).or_insert_with(|| vec![1.0; pixels]);
-                    for (l, a) in left.iter_mut().zip(&t.alphas[g * pixels..(g + 1) * pixels]) {
-                        *l *= 1.0 - a;
-                    }
-                }
-                Silhouette::Visible => {
-                    let sum = coverage.entry(label).or_insert_with(|| vec![0.0; pixels]);
-                    sum.iter_mut().zip(weights).for_each(|(s, w)| *s += w);
-                }
-            }
-        }
-        let inside = |value: f32| match silhouette {
-            Silhouette::Selected => 1.0 - value > SELECTED_ALPHA,
-            Silhouette::Visible => value > VISIBLE_WEIGHT,
-        };
-        let mut out = Overlaps::default();
-        let mut feature = vec![0.0f64; dim];
-        let mut id_at = vec![-1i32; pixels];
-        for y in 0..t.height {
-            for x in 0..t.width {
-                let (p, id) = (y * TILE + x, ids[(t.y0 + y) * maps.width + t.x0 + x]);
-                id_at[p] = id;
-                if let Ok(id) = u32::try_from(id) {
-                    feature.iter_mut().zip(&rendered[p * dim..]).for_each(|(f, r)| *f = f64::from(*r));
-                    out.masks.entry(id).or_default().add(1, &feature);
-                }
-            }
-        }
-        for (instance, values) in coverage {
-            let mut region = Region::default();
-            for y in 0..t.height {
-                for x in 0..t.width {
-                    let p = y * TILE + x;
-                    if !inside(values[p]) {
-                        continue;
-                    }
-                    feature.iter_mut().zip(&rendered[p * dim..]).for_each(|(f, r)| *f = f64::from(*r));
-                    region.add(1, &feature);
-                    if let Ok(id) = u32::try_from(id_at[p]) {
-                        *out.common.entry((instance, id)).or_default() += 1;
-                    }
-                }
-            }
-            if region.area > 0 {
-                out.instances.insert(instance, region);
-            }
-        }
-        out
+        tile_overlaps(t, labels, table, &TileMasks::new(t, maps, levels), silhouette)
     });
     let mut all = Overlaps::default();
-    for tile in tiles {
-        for (k, r) in tile.instances {
-            all.instances.entry(k).or_default().add(r.area, &r.features);
-        }
-        for (k, r) in tile.masks {
-            all.masks.entry(k).or_default().add(r.area, &r.features);
-        }
-        for (k, n) in tile.common {
-            *all.common.entry(k).or_default() += n;
-        }
-    }
+    tiles.into_iter().for_each(|tile| all.add(tile));
     all
 }
 
@@ -176,6 +268,9 @@ mod tests {
     use super::*;
     use glam::DVec3;
 
+    const W: usize = 64;
+    const H: usize = 48;
+
     /// Two opaque blobs side by side, and a third behind the first.
     fn scene() -> (Gaussians, Camera) {
         let g = Gaussians {
@@ -186,20 +281,30 @@ mod tests {
             sh: vec![0.0; 9],
             sh_degree: 0,
         };
-        (g, Camera::look_at(DVec3::new(0.0, 0.0, -6.0), DVec3::ZERO, -DVec3::Y, 64, 48, 0.8))
+        (g, Camera::look_at(DVec3::new(0.0, 0.0, -6.0), DVec3::ZERO, -DVec3::Y, W as u32, H as u32, 0.8))
+    }
+
+    /// Halves of the image on one level, the whole of it on another.
+    fn maps() -> MaskMaps {
+        let half = |p: usize| i32::from(p % W >= W / 2);
+        let level = |f: &dyn Fn(usize) -> i32| (0..W * H).map(f).collect::<Vec<_>>();
+        MaskMaps {
+            width: W,
+            height: H,
+            ids: [level(&half), level(&|_| 2), level(&|_| -1), level(&|p| 3 + half(p))].concat(),
+        }
     }
 
     #[test]
     fn instances_match_the_masks_they_are_seen_as() {
         let (g, camera) = scene();
-        let ids: Vec<i32> = (0..48 * 64).map(|p| i32::from(p % 64 >= 32)).collect();
-        let maps = MaskMaps { width: 64, height: 48, ids: ids.repeat(4) };
-        let features = [1.0, 0.0, 0.0, 1.0, 1.0, 0.0];
+        let features = Features { kept: vec![0, 1, 2], dim: 2, values: vec![1.0, 0.0, 0.0, 1.0, -1.0, 0.2] };
+        let table = FeatureTable::new(&features, 3);
         for silhouette in [Silhouette::Selected, Silhouette::Visible] {
-            let o = overlaps(&g, &[0, 1, 2], &features, 2, &camera, &maps, Level::Large, silhouette);
-            assert_eq!(o.masks[&0].area + o.masks[&1].area, 64 * 48);
-            assert!(o.common.contains_key(&(0, 0)) && o.common.contains_key(&(1, 1)));
-            assert!(!o.common.contains_key(&(0, 1)) && !o.common.contains_key(&(1, 0)));
+            let o = overlaps(&g, &[0, 1, 2], &table, &camera, &maps(), &[Level::Large], silhouette);
+            assert_eq!(o.masks[&3].area + o.masks[&4].area, (W * H) as u32);
+            assert!(o.common.contains_key(&(0, 3)) && o.common.contains_key(&(1, 4)));
+            assert!(!o.common.contains_key(&(0, 4)) && !o.common.contains_key(&(1, 3)));
             // The hidden blob has a silhouette of its own when rendered alone, and none (or a rim) when only the visible counts.
             let hidden = o.instances.get(&2).map_or(0, |r| r.area);
             match silhouette {
@@ -207,8 +312,55 @@ mod tests {
                 Silhouette::Visible => assert!(hidden * 4 < o.instances[&0].area),
             }
             let m = matches(&o, 5, 0.0);
-            assert_eq!((m[0].mask, m[0].view, m[1].mask), (0, 5, 1));
+            assert_eq!((m[0].mask, m[0].view, m[1].mask), (3, 5, 4));
+            // It covers the mask of what hides it, but its features are its own and tell it from that.
+            assert!(m.iter().all(|m| m.instance != 2), "{m:?}");
             assert!(matches(&o, 5, 0.99).is_empty());
         }
+    }
+
+    #[test]
+    fn areas_and_features_are_those_of_rendered_images() {
+        let (mut g, camera) = scene();
+        // Half transparent, so that silhouettes have shades.
+        g.opacity_logits = vec![2.5, 2.0, 1.5];
+        let features = Features { kept: vec![0, 2], dim: 3, values: vec![1.0, 2.0, 0.5, -1.0, 3.0, 0.25] };
+        let all = [1.0, 2.0, 0.5, 0.0, 0.0, 0.0, -1.0, 3.0, 0.25];
+        let (labels, maps, levels) = ([0, -1, 0], maps(), [Level::Default, Level::Small]);
+        let o = overlaps(&g, &labels, &FeatureTable::new(&features, 3), &camera, &maps, &levels, Silhouette::Selected);
+        let options = RasterOptions::default();
+        let image = gs_raster::render_features(&g, &all, 3, &camera, &options);
+        let alone = g.select(&[0, 2]);
+        let own = gs_raster::render_features(&alone, &features.values, 3, &camera, &options);
+        let alpha = gs_raster::render(&alone, &camera, &options).alpha;
+        let sum = |image: &[f32], inside: &dyn Fn(usize) -> bool| -> (u32, [f64; 3]) {
+            let mut out = (0, [0.0; 3]);
+            for p in (0..W * H).filter(|&p| inside(p)) {
+                out.0 += 1;
+                (0..3).for_each(|c| out.1[c] += f64::from(image[p * 3 + c]));
+            }
+            out
+        };
+        let check = |region: &Region, (area, features): (u32, [f64; 3])| {
+            assert_eq!(region.area, area);
+            for (a, b) in region.features.iter().zip(features) {
+                assert!((a - b).abs() < 1e-3 * b.abs().max(1.0), "{region:?}, expected {features:?}");
+            }
+        };
+        for (id, level) in [(0, Level::Default), (1, Level::Default), (2, Level::Small)] {
+            check(&o.masks[&id], sum(&image, &|p| maps.level(level)[p] == id as i32));
+        }
+        let inside = |p: usize| alpha[p] > SELECTED_ALPHA;
+        check(&o.instances[&0], sum(&own, &inside));
+        let common = |mask: i32| sum(&own, &|p| inside(p) && maps.level(Level::Default)[p] == mask).0;
+        assert_eq!(o.common[&(0, 0)], common(0));
+        assert_eq!(o.common.get(&(0, 1)).copied().unwrap_or(0), common(1));
+        assert_eq!(o.common[&(0, 2)], o.instances[&0].area);
+        // IoU of areas, and the cosine of the sums.
+        let (i, m) = (&o.instances[&0], &o.masks[&0]);
+        let best = matches(&o, 0, 0.0)[0];
+        let iou = f64::from(common(0)) / f64::from(i.area + m.area - common(0));
+        assert_eq!(best.mask, 0);
+        assert!((f64::from(best.score) - iou * cosine(&i.features, &m.features)).abs() < 1e-6);
     }
 }

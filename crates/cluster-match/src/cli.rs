@@ -1,16 +1,16 @@
 //! The command line of `cluster-match`.
 
-use crate::associate::{Silhouette, matches, overlaps};
+use crate::associate::{FeatureTable, Silhouette, matches, overlaps};
 use crate::describe::{Aggregate, describe};
 use crate::extend::from_nearest;
-use crate::group::{Space, group, tree};
+use crate::group::{Distance, Space, group, tree};
 use artifacts::{
     Features, Footprints, Graph, Instances, Level, MaskFeatures, MaskMaps, Match, NOISE_COLOR, features_path,
     instance_color, maps_path, role,
 };
 use clap::Parser;
-use gs_io::{Error, Result, hash_file, write_bytes};
-use gs_scene::dataset::{self, LoadOptions, Resolution};
+use gs_io::{Error, IoContext, Result, hash_file, write_bytes};
+use gs_scene::dataset::{self, LoadOptions, Resolution, View};
 use gs_scene::{Gaussians, SH_C0, ply};
 use hdbscan_exact::{Options, Selection};
 use serde_json::{Value, json};
@@ -40,7 +40,8 @@ pub struct Args {
     /// Folder of id maps (*_s.npy) and, for language, mask features (*_f.npy)
     #[arg(long, value_name = "DIR")]
     masks: PathBuf,
-    /// Output; beside it go <name>.ply (instances in colours), <name>.labels.npy and <name>.json
+    /// Output; beside it go <name>.ply (the Gaussians in the colours of their instances), <name>.labels.npy (an i32 for
+    /// every Gaussian, -1 for none) and <name>.json (the same to read)
     #[arg(long, value_name = "FILE")]
     out: PathBuf,
     /// Also write one PLY per instance into this folder
@@ -60,12 +61,18 @@ struct ClusteringArgs {
     /// Cluster free points in feature space (the paper), or on the graph of spatial neighbours
     #[arg(long, value_enum, default_value_t = Space::Graph)]
     cluster: Space,
+    /// Distance of features on the graph; free points have Euclidean distances of standardised features
+    #[arg(long, value_enum, default_value_t = Distance::Cosine)]
+    distance: Distance,
     /// Average features over each Gaussian's spatial neighbours this many times first
     #[arg(long, default_value_t = 0, value_name = "ROUNDS")]
     smooth: usize,
     /// Fewest Gaussians of an instance
     #[arg(long, default_value_t = 30, value_name = "COUNT")]
     min_cluster_size: usize,
+    /// Fewest Gaussians of an instance as a share of those that are seen, if that is more
+    #[arg(long, default_value_t = 0.0, value_name = "SHARE")]
+    min_cluster_share: f64,
     /// Neighbours, itself included, whose distance is a Gaussian's core distance [default: 30, or 5 on the graph]
     #[arg(long, value_name = "COUNT")]
     min_samples: Option<usize>,
@@ -75,17 +82,29 @@ struct ClusteringArgs {
     /// Choose the finest clusters instead of the most stable ones
     #[arg(long)]
     leaf: bool,
-    /// Leave noise without an instance instead of giving it the nearest one's
+    /// Let all Gaussians be one instance where nothing divides them
     #[arg(long)]
-    keep_noise: bool,
+    allow_single_cluster: bool,
+    /// Gaussians in no cluster get the instance of the nearest one in space that has one, or none
+    #[arg(long, value_enum, default_value_t = Noise::Nearest)]
+    noise: Noise,
+}
+
+/// What becomes of Gaussians that the clustering calls noise.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, clap::ValueEnum)]
+enum Noise {
+    /// The instance of the nearest Gaussian in space that has one
+    Nearest,
+    /// No instance
+    Keep,
 }
 
 #[derive(Debug, clap::Args)]
 #[command(next_help_heading = "Matching")]
 struct MatchingArgs {
-    /// Level of the masks: default, small, medium or large
-    #[arg(long, default_value = "large")]
-    level: Level,
+    /// Level of the masks: default, small, medium or large; several with commas between
+    #[arg(long, default_value = "large", value_delimiter = ',', value_name = "LEVELS")]
+    level: Vec<Level>,
     /// Silhouettes of instances rendered alone, or as far as visible
     #[arg(long, value_enum, default_value_t = Silhouette::Selected)]
     silhouette: Silhouette,
@@ -114,11 +133,12 @@ struct Inputs {
     gaussians: Gaussians,
     graph: Graph,
     features: Features,
-    views: Vec<String>,
+    /// The views whose masks the footprints hold.
+    views: Vec<View>,
     hashes: BTreeMap<String, String>,
 }
 
-fn read_inputs(a: &Args) -> Result<Inputs> {
+fn read_inputs(a: &Args, stage: &Stage) -> Result<Inputs> {
     let gaussians = ply::read_gaussians(&a.geometry)?;
     let geometry = hash_file(&a.geometry)?;
     let (graph, graph_file) = Graph::read(&a.graph)?;
@@ -128,6 +148,13 @@ fn read_inputs(a: &Args) -> Result<Inputs> {
     graph_file.expect_input(role::GEOMETRY, &geometry)?;
     footprints.artifact().expect_input(role::GEOMETRY, &geometry)?;
     footprints.artifact().expect_input(role::MASKS, &masks)?;
+    // The hold-out is part of what the dataset was: it is read as the graph's stage read it.
+    let holdout = graph_file.provenance().parameters["holdout"].as_u64().unwrap_or(0) as usize;
+    let dataset = dataset::load(&a.scene, &LoadOptions { resolution: Resolution::Divisor(1.0), holdout })?;
+    dataset.warnings.iter().for_each(|w| stage.warn(w));
+    let dataset_hash = dataset.hash()?;
+    graph_file.expect_input(role::DATASET, &dataset_hash)?;
+    footprints.artifact().expect_input(role::DATASET, &dataset_hash)?;
     features_file.expect_input(role::GRAPH, graph_file.hash())?;
     features_file.expect_input(role::FOOTPRINTS, footprints.artifact().hash())?;
     if graph.seen_views.len() != gaussians.len() || graph.kept != features.kept {
@@ -144,49 +171,96 @@ fn read_inputs(a: &Args) -> Result<Inputs> {
             .field("features")
             .hint("run feat-train again"));
     }
+    let without: Vec<&str> =
+        dataset.views.iter().map(View::stem).filter(|s| !footprints.views.iter().any(|v| v == s)).collect();
+    if !without.is_empty() {
+        stage.skipped(&format!(
+            "{} of {} views in matching: held out, or without masks ({})",
+            without.len(),
+            dataset.views.len(),
+            some_of(&without)
+        ));
+    }
+    let views = footprints.views.iter().map(|stem| {
+        dataset.views.iter().find(|v| v.stem() == stem).cloned().ok_or_else(|| {
+            Error::new("a view of the footprints is not in the dataset")
+                .file(&a.scene)
+                .field("views")
+                .found(stem)
+                .hint("give the dataset that graph-precompute was given")
+        })
+    });
+    let views = views.collect::<Result<_>>()?;
     let hashes = BTreeMap::from([
         (role::GEOMETRY.into(), geometry),
+        (role::DATASET.into(), dataset_hash),
         (role::GRAPH.into(), graph_file.hash().into()),
         (role::FOOTPRINTS.into(), footprints.artifact().hash().into()),
         (role::FEATURES.into(), features_file.hash().into()),
         (role::MASKS.into(), masks),
         (role::MASK_FEATURES.into(), artifacts::hash_folder(&a.masks, "_f.npy")?),
     ]);
-    Ok(Inputs { gaussians, graph, features, views: footprints.views, hashes })
+    Ok(Inputs { gaussians, graph, features, views, hashes })
 }
 
-fn options(c: &ClusteringArgs) -> Result<Options> {
+/// The first few of many names.
+fn some_of(names: &[&str]) -> String {
+    const SHOWN: usize = 5;
+    let shown = names[..names.len().min(SHOWN)].join(", ");
+    if names.len() > SHOWN { format!("{shown}, ...") } else { shown }
+}
+
+/// The clustering's options for `n` Gaussians.
+fn options(c: &ClusteringArgs, n: usize) -> Result<Options> {
     let (min_samples, epsilon) = match c.cluster {
         Space::Free => (c.min_samples.unwrap_or(30), c.epsilon.unwrap_or(0.1)),
         Space::Graph => (c.min_samples.unwrap_or(5), c.epsilon.unwrap_or(0.0)),
     };
-    if c.min_cluster_size < 2 || min_samples < 1 || !(0.0..f64::INFINITY).contains(&epsilon) {
-        return Err(Error::new("impossible option")
-            .field("--min-cluster-size, --min-samples, --epsilon")
-            .found(format!("{}, {min_samples}, {epsilon}", c.min_cluster_size))
-            .expected("at least 2, at least 1, at least 0"));
-    }
+    let share = c.min_cluster_share;
+    let check = |good: bool, field: &str, found: &dyn std::fmt::Display, expected: &str| match good {
+        true => Ok(()),
+        false => Err(Error::new("impossible option").field(field).found(found).expected(expected)),
+    };
+    check(c.min_cluster_size >= 2, "--min-cluster-size", &c.min_cluster_size, "at least 2")?;
+    check((0.0..=1.0).contains(&share), "--min-cluster-share", &share, "0 to 1")?;
+    check(min_samples >= 1, "--min-samples", &min_samples, "at least 1")?;
+    check((0.0..f64::INFINITY).contains(&epsilon), "--epsilon", &epsilon, "at least 0")?;
     Ok(Options {
-        min_cluster_size: c.min_cluster_size,
+        min_cluster_size: c.min_cluster_size.max((share * n as f64).ceil() as usize),
         min_samples,
         epsilon,
         selection: if c.leaf { Selection::Leaf } else { Selection::ExcessOfMass },
-        allow_single_cluster: false,
+        allow_single_cluster: c.allow_single_cluster,
     })
 }
 
 fn run(a: &Args, stage: &Stage) -> Result<()> {
-    let options = options(&a.clustering)?;
-    let inputs = read_inputs(a)?;
+    let (c, m) = (&a.clustering, &a.matching);
+    // Options that no scene can mend are refused before anything is read.
+    options(c, 0)?;
+    if !(0.0..=1.0).contains(&m.threshold) {
+        return Err(Error::new("impossible option").field("--threshold").found(m.threshold).expected("0 to 1"));
+    }
+    if let Some(taken) = SIDE_FILES.iter().find(|e| a.out.with_extension(e) == a.out) {
+        return Err(Error::new("another output has this name")
+            .file(&a.out)
+            .field("--out")
+            .found(format!(".{taken}"))
+            .expected("a name such as instances.safetensors"));
+    }
+    let inputs = read_inputs(a, stage)?;
     let (n_all, n) = (inputs.gaussians.len(), inputs.graph.kept.len());
-    let c = &a.clustering;
+    let options = options(c, n)?;
 
-    let clustering = group(&inputs.features, &inputs.graph, c.cluster, c.smooth, &options);
+    let clustering = group(&inputs.features, &inputs.graph, c.cluster, c.distance, c.smooth, &options);
     let instances = clustering.selected.len();
     let noise = clustering.labels.iter().filter(|&&l| l < 0).count();
     stage.info(&format!("{instances} instances among {n} Gaussians, {noise} noise"));
     if instances == 0 {
-        stage.warn("everything is noise: no instance was found; try a smaller --min-cluster-size");
+        stage.warn(
+            "everything is noise: no instance was found; give a smaller --min-cluster-size, or --allow-single-cluster \
+             where the scene is one thing",
+        );
     }
     let mut labels = vec![-1i32; n_all];
     let mut kept = vec![false; n_all];
@@ -194,7 +268,7 @@ fn run(a: &Args, stage: &Stage) -> Result<()> {
         labels[i as usize] = l;
         kept[i as usize] = true;
     }
-    if !c.keep_noise {
+    if c.noise == Noise::Nearest {
         let noisy: Vec<bool> = labels.iter().zip(&kept).map(|(&l, &k)| k && l < 0).collect();
         from_nearest(&inputs.gaussians.means, &mut labels, |i| noisy[i])?;
     }
@@ -210,18 +284,11 @@ fn run(a: &Args, stage: &Stage) -> Result<()> {
     if features.is_empty() {
         stage.skipped("language descriptors: the masks have no features (*_f.npy; mask-embed embed makes them)");
     }
-    let m = &a.matching;
-    let instances = describe(
-        &inputs.gaussians.means,
-        labels,
-        instances,
-        matches,
-        inputs.views.clone(),
-        &features,
-        m.aggregate,
-        tree(&clustering),
-    );
-    write_outputs(a, stage, &inputs, &instances, &options)
+    let views = inputs.views.iter().map(|v| v.stem().to_string()).collect();
+    let tree = tree(&clustering);
+    let means = &inputs.gaussians.means;
+    let instances = describe(means, labels, instances, matches, views, &features, m.aggregate, tree);
+    write_outputs(a, stage, &inputs, &instances, &options, noise)
 }
 
 /// Matches instances with the masks of every view that has id maps.
@@ -231,30 +298,16 @@ fn associate(
     inputs: &Inputs,
     labels: &[i32],
 ) -> Result<(Vec<Match>, BTreeMap<u32, MaskFeatures>)> {
-    let load = LoadOptions { resolution: Resolution::Divisor(1.0), holdout: 0 };
-    let dataset = dataset::load(&a.scene, &load)?;
-    dataset.warnings.iter().for_each(|w| stage.warn(w));
-    // Features of all Gaussians: those that no view sees have no weight, so zeros do.
-    let dim = inputs.features.dim;
-    let mut all = vec![0.0f32; inputs.gaussians.len() * dim];
-    for (position, &i) in inputs.features.kept.iter().enumerate() {
-        all[i as usize * dim..(i as usize + 1) * dim].copy_from_slice(inputs.features.row(position));
-    }
+    let table = FeatureTable::new(&inputs.features, inputs.gaussians.len());
     let mut found = Vec::new();
     let mut features: BTreeMap<u32, MaskFeatures> = BTreeMap::new();
     let mut progress = stage.progress("matching views", inputs.views.len() as u64);
-    for (index, stem) in inputs.views.iter().enumerate() {
-        let Some(view) = dataset.views.iter().find(|v| v.stem() == stem) else {
-            return Err(Error::new("a view of the footprints is not in the dataset")
-                .file(&a.scene)
-                .field("views")
-                .found(stem)
-                .hint("give the dataset that graph-precompute was given"));
-        };
+    for (index, view) in inputs.views.iter().enumerate() {
+        let stem = view.stem();
         let maps = MaskMaps::read(maps_path(&a.masks, stem))?;
         let camera = view.camera.resized(maps.width as u32, maps.height as u32);
         let m = &a.matching;
-        let o = overlaps(&inputs.gaussians, labels, &all, dim, &camera, &maps, m.level, m.silhouette);
+        let o = overlaps(&inputs.gaussians, labels, &table, &camera, &maps, &m.level, m.silhouette);
         found.extend(matches(&o, index as u32, m.threshold));
         let path = features_path(&a.masks, stem);
         if path.is_file() {
@@ -292,62 +345,104 @@ fn associate(
 
 /// The geometry in the colours of its instances, as a plain 3DGS PLY that any viewer shows.
 fn colored(g: &Gaussians, labels: &[i32]) -> Gaussians {
-    let sh = labels
-        .iter()
-        .flat_map(|&l| u32::try_from(l).map_or(NOISE_COLOR, instance_color).map(|v| (v - 0.5) / SH_C0))
+    let color = |&l: &i32| u32::try_from(l).map_or(NOISE_COLOR, instance_color).map(|v| (v - 0.5) / SH_C0);
+    Gaussians {
+        means: g.means.clone(),
+        log_scales: g.log_scales.clone(),
+        rotations: g.rotations.clone(),
+        opacity_logits: g.opacity_logits.clone(),
+        sh: labels.iter().flat_map(color).collect(),
+        sh_degree: 0,
+    }
+}
+
+/// The instances to read: where they are, how large, and as which masks they were seen.
+fn readable(instances: &Instances, parameters: &Value) -> Value {
+    let list: Vec<Value> = (0..instances.len())
+        .map(|k| {
+            let own = instances.matches.iter().filter(|m| m.instance as usize == k);
+            let matches: Vec<Value> = own
+                .map(|m| json!({"view": instances.views[m.view as usize], "mask": m.mask, "score": m.score}))
+                .collect();
+            json!({
+                "instance": k, "gaussians": instances.count[k], "support": instances.support[k],
+                "score": instances.score[k], "centroid": instances.centroid[k],
+                "bbox_min": instances.bbox_min[k], "bbox_max": instances.bbox_max[k],
+                "color": instance_color(k as u32), "matches": matches,
+            })
+        })
         .collect();
-    Gaussians { sh, sh_degree: 0, ..g.clone() }
+    let unlabelled = instances.label.iter().filter(|&&l| l < 0).count();
+    json!({
+        "gaussians": instances.label.len(), "without_instance": unlabelled, "descriptor_dim": instances.dim,
+        "parameters": parameters, "instances": list,
+    })
 }
 
-fn beside(out: &Path, extension: &str) -> PathBuf {
-    out.with_extension(extension)
+/// One PLY per instance, `instance_0000.ply` on. Those of an earlier run with more instances would be taken for this one's,
+/// so they are removed.
+fn write_instance_plys(folder: &Path, g: &Gaussians, instances: &Instances, comments: &[String]) -> Result<()> {
+    let mut members = vec![Vec::new(); instances.len()];
+    for (i, &label) in instances.label.iter().enumerate() {
+        if let Ok(k) = usize::try_from(label) {
+            members[k].push(i as u32);
+        }
+    }
+    let path = |k: usize| folder.join(format!("instance_{k:04}.ply"));
+    for (k, own) in members.iter().enumerate() {
+        ply::write_gaussians(path(k), &g.select(own), comments)?;
+    }
+    for stale in (members.len()..).map(path).take_while(|p| p.is_file()) {
+        std::fs::remove_file(&stale).at("remove", &stale)?;
+    }
+    Ok(())
 }
 
-fn write_outputs(a: &Args, stage: &Stage, inputs: &Inputs, instances: &Instances, options: &Options) -> Result<()> {
+/// What is written beside the output, by extension: coloured Gaussians, labels, and the instances to read.
+const SIDE_FILES: [&str; 3] = ["ply", "labels.npy", "json"];
+
+fn write_outputs(
+    a: &Args,
+    stage: &Stage,
+    inputs: &Inputs,
+    instances: &Instances,
+    options: &Options,
+    noise: usize,
+) -> Result<()> {
     let (c, m) = (&a.clustering, &a.matching);
+    let lower = |v: &dyn std::fmt::Debug| format!("{v:?}").to_lowercase();
+    let levels: Vec<String> = m.level.iter().map(ToString::to_string).collect();
     let parameters = json!({
-        "cluster": format!("{:?}", c.cluster).to_lowercase(),
+        "cluster": lower(&c.cluster),
+        "distance": lower(&c.distance),
         "smooth": c.smooth,
         "min_cluster_size": options.min_cluster_size,
         "min_samples": options.min_samples,
         "epsilon": options.epsilon,
         "leaf": c.leaf,
-        "keep_noise": c.keep_noise,
-        "level": m.level.to_string(),
-        "silhouette": format!("{:?}", m.silhouette).to_lowercase(),
+        "allow_single_cluster": options.allow_single_cluster,
+        "noise": lower(&c.noise),
+        "level": levels.join(","),
+        "silhouette": lower(&m.silhouette),
         "threshold": m.threshold,
-        "aggregate": format!("{:?}", m.aggregate).to_lowercase(),
+        "aggregate": lower(&m.aggregate),
     });
     let comments = [format!("made by cluster-match {}", env!("CARGO_PKG_VERSION")), format!("parameters {parameters}")];
-    ply::write_gaussians(beside(&a.out, "ply"), &colored(&inputs.gaussians, &instances.label), &comments)?;
-    gs_io::npy::write_i32(beside(&a.out, "labels.npy"), &[instances.label.len()], &instances.label)?;
-    let list: Vec<Value> = (0..instances.len())
-        .map(|k| {
-            json!({
-                "instance": k, "gaussians": instances.count[k], "support": instances.support[k],
-                "score": instances.score[k], "centroid": instances.centroid[k],
-                "bbox_min": instances.bbox_min[k], "bbox_max": instances.bbox_max[k],
-            })
-        })
-        .collect();
-    let text = serde_json::to_vec_pretty(&json!({ "instances": list })).map_err(|e| Error::new(e.to_string()))?;
-    write_bytes(beside(&a.out, "json"), &text)?;
+    let [colors, list, table] = SIDE_FILES.map(|extension| a.out.with_extension(extension));
+    ply::write_gaussians(colors, &colored(&inputs.gaussians, &instances.label), &comments)?;
+    gs_io::npy::write_i32(list, &[instances.label.len()], &instances.label)?;
+    let text = serde_json::to_vec_pretty(&readable(instances, &parameters)).map_err(|e| Error::new(e.to_string()))?;
+    write_bytes(table, &text)?;
     if let Some(folder) = &a.per_instance_plys {
-        for k in 0..instances.len() {
-            let own: Vec<u32> =
-                (0..instances.label.len() as u32).filter(|&i| instances.label[i as usize] == k as i32).collect();
-            ply::write_gaussians(
-                folder.join(format!("instance_{k:04}.ply")),
-                &inputs.gaussians.select(&own),
-                &comments,
-            )?;
-        }
+        write_instance_plys(folder, &inputs.gaussians, instances, &comments)?;
     }
     let matched = instances.support.iter().filter(|&&s| s > 0).count();
-    let summary = json!({"instances": instances.len(), "matched": matched, "matches": instances.matches.len()});
+    let summary = json!({
+        "instances": instances.len(), "noise": noise, "matched": matched, "matches": instances.matches.len(),
+    });
     stage.record(&a.out, parameters.clone(), inputs.hashes.clone(), summary)?;
-    let provenance = stage.provenance(Instances::FORMAT, 1, parameters, inputs.hashes.clone());
-    instances.write(&a.out, provenance)?;
+    // The artifact comes last: where it is new, so is everything beside it.
+    instances.write(&a.out, stage.provenance(Instances::FORMAT, 1, parameters, inputs.hashes.clone()))?;
     stage.info(&format!("wrote {}: {} instances, {matched} matched with masks", a.out.display(), instances.len()));
     Ok(())
 }

@@ -10,10 +10,21 @@ const CHUNK: usize = 4096;
 /// Which pairs of Gaussians the hierarchy may join.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, clap::ValueEnum)]
 pub enum Space {
-    /// Any two: HDBSCAN of standardised features as free points (the paper).
+    /// Any two: HDBSCAN of standardised features as free points (the paper)
     Free,
-    /// Spatial neighbours only: HDBSCAN on the neighbour graph, cosine distances of features.
+    /// Spatial neighbours only: HDBSCAN on the graph of neighbours
     Graph,
+}
+
+/// How far apart the features of two spatial neighbours are.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, clap::ValueEnum)]
+pub enum Distance {
+    /// 1 - cosine
+    Cosine,
+    /// Length of the difference of the features at unit length, sqrt(2 - 2 cosine)
+    Chord,
+    /// Length of the difference of the standardised features
+    Euclidean,
 }
 
 /// Features standardised per channel over all Gaussians, (f - mean) / deviation (paper, "Instance Clustering"); a channel
@@ -72,41 +83,79 @@ pub fn smooth(values: &[f32], dim: usize, neighbours: &[u32], k: usize, rounds: 
     now
 }
 
-/// Clusters the kept Gaussians.
-pub fn group(features: &Features, graph: &Graph, space: Space, smoothing: usize, options: &Options) -> Clustering {
+/// Clusters the kept Gaussians. `distance` counts on the graph only.
+pub fn group(
+    features: &Features,
+    graph: &Graph,
+    space: Space,
+    distance: Distance,
+    smoothing: usize,
+    options: &Options,
+) -> Clustering {
     let dim = features.dim.max(1);
-    let k = graph.gaussian_k;
-    let values = smooth(&features.values, dim, &graph.gaussian_knn, k, smoothing);
+    let values = smooth(&features.values, dim, &graph.gaussian_knn, graph.gaussian_k, smoothing);
     match space {
         Space::Free => cluster(&standardise(&values, dim), dim, options),
-        Space::Graph => cluster_graph(features.kept.len(), &neighbour_edges(&values, dim, graph, options), options),
+        Space::Graph => {
+            let between = FeatureDistance::new(&values, dim, distance);
+            let edges = neighbour_edges(graph, &|a, b| between.get(a, b), options.min_samples);
+            cluster_graph(features.kept.len(), &edges, options)
+        }
     }
 }
 
-/// Edges between spatial neighbours with the mutual reachability of cosine distances: a Gaussian's core distance is the
-/// distance to the (`min_samples` - 1)-th nearest in features among its spatial neighbours.
-fn neighbour_edges(values: &[f32], dim: usize, graph: &Graph, options: &Options) -> Vec<Edge> {
+/// Distances of features, [`Distance`].
+struct FeatureDistance {
+    /// Features at unit length (zeros where there is no direction) or standardised.
+    values: Vec<f32>,
+    dim: usize,
+    distance: Distance,
+}
+
+impl FeatureDistance {
+    fn new(values: &[f32], dim: usize, distance: Distance) -> Self {
+        let values = match distance {
+            Distance::Euclidean => standardise(values, dim),
+            Distance::Cosine | Distance::Chord => values.chunks_exact(dim).flat_map(unit).collect(),
+        };
+        Self { values, dim, distance }
+    }
+
+    fn get(&self, a: usize, b: usize) -> f64 {
+        let row = |i: usize| &self.values[i * self.dim..(i + 1) * self.dim];
+        let (a, b) = (row(a), row(b));
+        // Differences keep the digits that 1 - dot product would lose between near-equal features.
+        let mut square: f64 = a.iter().zip(b).map(|(x, y)| (f64::from(*x) - f64::from(*y)).powi(2)).sum();
+        let nowhere = |row: &[f32]| row.iter().all(|&v| v == 0.0);
+        if self.distance != Distance::Euclidean && (nowhere(a) || nowhere(b)) {
+            // A feature without a direction has a cosine of 0 with any other.
+            square = 2.0;
+        }
+        if self.distance == Distance::Cosine { 0.5 * square } else { square.sqrt() }
+    }
+}
+
+/// A feature at unit length; zeros where it has none.
+fn unit(row: &[f32]) -> impl Iterator<Item = f32> {
+    let norm = row.iter().map(|v| f64::from(*v).powi(2)).sum::<f64>().sqrt();
+    let scale = if norm > 1e-30 { 1.0 / norm } else { 0.0 };
+    row.iter().map(move |v| (f64::from(*v) * scale) as f32)
+}
+
+/// Edges between spatial neighbours with mutual reachability: a Gaussian's core distance is the distance to the
+/// (`min_samples` - 1)-th nearest in features among its spatial neighbours, or to the last where there are fewer.
+fn neighbour_edges(graph: &Graph, distance: &(dyn Fn(usize, usize) -> f64 + Sync), min_samples: usize) -> Vec<Edge> {
     let (n, k) = (graph.kept.len(), graph.gaussian_k);
-    let unit: Vec<f32> = values
-        .chunks_exact(dim)
-        .flat_map(|row| {
-            let norm = row.iter().map(|v| f64::from(*v).powi(2)).sum::<f64>().sqrt();
-            let scale = if norm > 1e-30 { 1.0 / norm } else { 0.0 };
-            row.iter().map(move |v| (f64::from(*v) * scale) as f32).collect::<Vec<_>>()
-        })
-        .collect();
-    let distance = |a: usize, b: usize| -> f64 {
-        let dot: f64 = (0..dim).map(|c| f64::from(unit[a * dim + c]) * f64::from(unit[b * dim + c])).sum();
-        (1.0 - dot).max(0.0)
-    };
+    // Rows are padded with the Gaussian itself.
+    let neighbours =
+        |i: usize| graph.gaussian_knn[i * k..(i + 1) * k].iter().map(|&j| j as usize).filter(move |&j| j != i);
     let core: Vec<f64> = (0..n)
         .into_par_iter()
         .with_min_len(CHUNK)
         .map(|i| {
-            let row = &graph.gaussian_knn[i * k..(i + 1) * k];
-            let mut d: Vec<f64> = row.iter().filter(|&&j| j as usize != i).map(|&j| distance(i, j as usize)).collect();
+            let mut d: Vec<f64> = neighbours(i).map(|j| distance(i, j)).collect();
             d.sort_by(f64::total_cmp);
-            match options.min_samples.saturating_sub(1).min(d.len()) {
+            match min_samples.saturating_sub(1).min(d.len()) {
                 0 => 0.0,
                 at => d[at - 1],
             }
@@ -116,12 +165,8 @@ fn neighbour_edges(values: &[f32], dim: usize, graph: &Graph, options: &Options)
         .into_par_iter()
         .with_min_len(CHUNK)
         .flat_map_iter(|i| {
-            let row = &graph.gaussian_knn[i * k..(i + 1) * k];
-            let (core, distance) = (&core, &distance);
-            row.iter().filter(move |&&j| j as usize != i).map(move |&j| {
-                let j = j as usize;
-                Edge::new(i as u32, j as u32, distance(i, j).max(core[i]).max(core[j]))
-            })
+            let core = &core;
+            neighbours(i).map(move |j| Edge::new(i as u32, j as u32, distance(i, j).max(core[i]).max(core[j])))
         })
         .collect();
     // Two Gaussians that are each other's neighbours give the same edge twice.
@@ -143,7 +188,7 @@ pub fn tree(clustering: &Clustering) -> Vec<TreeEdge> {
             child: e.child,
             lambda: e.lambda.min(f64::from(f32::MAX)) as f32,
             size: e.size,
-            instance: clustering.selected.iter().position(|&s| s == e.child).map_or(-1, |p| p as i32),
+            instance: clustering.selected.binary_search(&e.child).map_or(-1, |label| label as i32),
         })
         .collect()
 }
@@ -188,9 +233,44 @@ mod tests {
         let (f, g) = two_rods();
         let o = Options { min_cluster_size: 10, min_samples: 3, ..Options::default() };
         for space in [Space::Free, Space::Graph] {
-            let c = group(&f, &g, space, 0, &o);
-            assert_eq!(c.selected.len(), 2, "{space:?}");
-            assert!(c.labels[5] != c.labels[45] && c.labels[5] >= 0 && c.labels[45] >= 0, "{space:?}");
+            for distance in [Distance::Cosine, Distance::Chord, Distance::Euclidean] {
+                let c = group(&f, &g, space, distance, 0, &o);
+                assert_eq!(c.selected.len(), 2, "{space:?} {distance:?}");
+                assert!(c.labels[5] != c.labels[45] && c.labels[5] >= 0 && c.labels[45] >= 0, "{space:?} {distance:?}");
+                let tree = tree(&c);
+                assert_eq!(tree.iter().filter(|e| e.instance >= 0).count(), 2);
+            }
         }
+    }
+
+    #[test]
+    fn rods_of_one_feature_are_one_thing_in_features_and_two_in_space() {
+        let (mut f, g) = two_rods();
+        f.values = (0..60).flat_map(|i| [1.0, 0.001 * (i % 7) as f32]).collect();
+        let o = Options { min_cluster_size: 10, min_samples: 3, epsilon: 0.1, ..Options::default() };
+        let c = group(&f, &g, Space::Graph, Distance::Chord, 0, &o);
+        assert_eq!(c.selected.len(), 2);
+        assert_ne!(c.labels[5], c.labels[45]);
+    }
+
+    #[test]
+    fn distances_are_those_of_the_angle() {
+        let values = [2.0, 0.0, 0.0, 3.0, 0.0, 0.0, 5.0, 5.0, 4.0, 0.0];
+        let (cosine, chord) =
+            (FeatureDistance::new(&values, 2, Distance::Cosine), FeatureDistance::new(&values, 2, Distance::Chord));
+        let root = 0.5f64.sqrt();
+        for (a, b, expected) in [(0, 1, 1.0), (0, 3, 1.0 - root), (0, 4, 0.0), (0, 2, 1.0), (2, 2, 1.0)] {
+            assert!((cosine.get(a, b) - expected).abs() < 1e-7, "{a} {b}");
+            assert!((chord.get(a, b) - (2.0 * expected).sqrt()).abs() < 1e-7, "{a} {b}");
+        }
+        let euclidean = FeatureDistance::new(&[0.0, 7.0, 2.0, 7.0, 0.0, 7.0, 2.0, 7.0], 2, Distance::Euclidean);
+        assert!((euclidean.get(0, 1) - 2.0).abs() < 1e-6 && euclidean.get(0, 2) == 0.0);
+    }
+
+    #[test]
+    fn smoothing_averages_over_neighbours() {
+        let s = smooth(&[0.0, 3.0, 6.0], 1, &[1, 2, 0, 2, 1, 0], 2, 1);
+        assert_eq!(s, [3.0, 3.0, 3.0]);
+        assert_eq!(smooth(&[0.0, 3.0, 6.0], 1, &[1, 2, 0, 2, 1, 0], 2, 0), [0.0, 3.0, 6.0]);
     }
 }

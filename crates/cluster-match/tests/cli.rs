@@ -1,0 +1,443 @@
+//! The program on a small scene on disk: instances and descriptors, the same bytes for any thread count, and bad input.
+
+use artifacts::{Features, FootprintsBuilder, Graph, Instances, MaskFeatures, MaskMaps, hash_folder, role};
+use glam::DVec3;
+use gs_io::{Artifact, Provenance, hash_file};
+use gs_scene::dataset::{self, LoadOptions, Resolution};
+use gs_scene::{Camera, Gaussians, Image, ply};
+use serde_json::{Value, json};
+use std::collections::BTreeMap;
+use std::path::{Path, PathBuf};
+use std::process::{Command, Output};
+
+const SIZE: usize = 48;
+const VIEWS: usize = 4;
+/// Gaussians of each of the two things; one more lies behind every camera.
+const EACH: usize = 40;
+
+fn gaussians() -> Gaussians {
+    let mut g = Gaussians::default();
+    for i in 0..2 * EACH {
+        let side = if i < EACH { -0.6 } else { 0.6 };
+        let (a, b) = ((i % 5) as f32, (i % EACH / 5) as f32);
+        g.means.push([side + a * 0.08 - 0.16, b * 0.1 - 0.35, (i % 3) as f32 * 0.05]);
+    }
+    g.means.push([-0.5, 0.0, -50.0]);
+    let n = g.means.len();
+    g.log_scales = vec![[-2.3; 3]; n];
+    g.rotations = vec![[1.0, 0.0, 0.0, 0.0]; n];
+    g.opacity_logits = vec![4.0; n];
+    g.sh = (0..3 * n).map(|i| (i % 7) as f32 * 0.1).collect();
+    g
+}
+
+/// A scene with all that cluster-match reads, and where it writes.
+struct Scene {
+    _dir: tempfile::TempDir,
+    root: PathBuf,
+}
+
+impl Scene {
+    fn new() -> Self {
+        let dir = tempfile::tempdir().unwrap();
+        let s = Self { root: dir.path().to_path_buf(), _dir: dir };
+        for folder in ["images", "masks", "out"] {
+            std::fs::create_dir_all(s.path(folder)).unwrap();
+        }
+        let mut frames = Vec::new();
+        for v in 0..VIEWS {
+            let eye = DVec3::new(v as f64 * 0.1 - 0.15, -0.1, -3.0);
+            let c = Camera::look_at(eye, DVec3::ZERO, DVec3::NEG_Y, SIZE as u32, SIZE as u32, 0.9);
+            let (r, t) = (c.rotation.transpose(), c.position());
+            // OpenGL axes: y and z turned round.
+            let row = |i: usize| [r.col(0)[i], -r.col(1)[i], -r.col(2)[i], t[i]];
+            frames.push(json!({
+                "file_path": format!("images/v{v}.png"),
+                "transform_matrix": [row(0), row(1), row(2), [0.0, 0.0, 0.0, 1.0]],
+            }));
+            let (w, n) = (SIZE as u32, SIZE * SIZE);
+            Image { width: w, height: w, rgb: vec![0.5; 3 * n], alpha: None }
+                .write_png(s.path(&format!("images/v{v}.png")))
+                .unwrap();
+        }
+        let f = 0.5 * SIZE as f64 / 0.45f64.tan();
+        let transforms = json!({ "w": SIZE, "h": SIZE, "fl_x": f, "fl_y": f, "frames": frames });
+        std::fs::write(s.path("transforms.json"), transforms.to_string()).unwrap();
+        ply::write_gaussians(s.path("geometry.ply"), &gaussians(), &[]).unwrap();
+        for v in 0..VIEWS {
+            s.masks(v, &s.seen(v));
+        }
+        s.artifacts(|_| {});
+        s
+    }
+
+    fn path(&self, name: &str) -> PathBuf {
+        self.root.join(name)
+    }
+
+    /// Which thing each pixel of a view shows: 0, 1, or -1.
+    fn seen(&self, view: usize) -> Vec<i32> {
+        let camera = &self.dataset().views[view].camera;
+        let things =
+            [&(0..EACH as u32).collect::<Vec<_>>()[..], &(EACH as u32..2 * EACH as u32).collect::<Vec<_>>()[..]].map(
+                |own| gs_raster::render(&gaussians().select(own), camera, &gs_raster::RasterOptions::default()).alpha,
+            );
+        (0..SIZE * SIZE)
+            .map(|p| {
+                if things[0][p] > 0.5 {
+                    0
+                } else if things[1][p] > 0.5 {
+                    1
+                } else {
+                    -1
+                }
+            })
+            .collect()
+    }
+
+    /// Id maps of a view: the two things on the large level (ids 3 and 4), both as one on the others (ids 0 to 2).
+    fn masks(&self, view: usize, seen: &[i32]) {
+        let both = |id: i32| seen.iter().map(move |&s| if s < 0 { -1 } else { id });
+        let large = seen.iter().map(|&s| if s < 0 { -1 } else { 3 + s });
+        let ids = both(0).chain(both(1)).chain(both(2)).chain(large).collect();
+        MaskMaps { width: SIZE, height: SIZE, ids }.write(self.path(&format!("masks/v{view}_s.npy"))).unwrap();
+    }
+
+    /// Language features: things at right angles to each other, slightly different in each view.
+    fn language(&self, views: std::ops::Range<usize>) {
+        for v in views {
+            let values =
+                [[0.6, 0.6, 0.5]; 3].concat().into_iter().chain([1.0, 0.0, 0.1 * v as f32, 0.0, 2.0, 0.0]).collect();
+            let f = MaskFeatures { count: 5, dim: 3, values };
+            f.write(self.path(&format!("masks/v{v}_f.npy"))).unwrap();
+        }
+    }
+
+    fn dataset(&self) -> dataset::Dataset {
+        dataset::load(&self.root, &LoadOptions { resolution: Resolution::Divisor(1.0), holdout: 0 }).unwrap()
+    }
+
+    /// Writes graph, footprints and features; `change` may change the features first.
+    fn artifacts(&self, change: impl Fn(&mut Features)) {
+        let n = 2 * EACH;
+        let provenance = |inputs: &[(&str, String)]| Provenance {
+            parameters: json!({"holdout": 0}),
+            inputs: inputs.iter().map(|(role, hash)| ((*role).to_string(), hash.clone())).collect(),
+            ..Provenance::default()
+        };
+        let origin = [
+            (role::GEOMETRY, hash_file(self.path("geometry.ply")).unwrap()),
+            (role::DATASET, self.dataset().hash().unwrap()),
+            (role::MASKS, hash_folder(self.path("masks"), "_s.npy").unwrap()),
+        ];
+        let means = gaussians().means;
+        let near = |i: usize| -> Vec<u32> {
+            let square = |j: usize| (0..3).map(|k| (means[i][k] - means[j][k]).powi(2)).sum::<f32>();
+            let mut others: Vec<usize> = (0..n).filter(|&j| j != i).collect();
+            others.sort_by(|&a, &b| square(a).total_cmp(&square(b)).then(a.cmp(&b)));
+            others[..8].iter().map(|&j| j as u32).collect()
+        };
+        let mut seen_views = vec![VIEWS as u32; n + 1];
+        seen_views[n] = 0;
+        let graph = Graph {
+            kept: (0..n as u32).collect(),
+            anchors: vec![0],
+            nearest_anchor: vec![0; n],
+            gaussian_k: 8,
+            gaussian_knn: (0..n).flat_map(near).collect(),
+            seen_weight: seen_views.iter().map(|&v| v as f32).collect(),
+            seen_views,
+            ..Graph::default()
+        };
+        graph.write(self.path("graph.safetensors"), provenance(&origin)).unwrap();
+        let footprints = FootprintsBuilder {
+            views: (0..VIEWS).map(|v| format!("v{v}")).collect(),
+            kept: graph.kept.clone(),
+            row_ptr: vec![0],
+            ..FootprintsBuilder::default()
+        };
+        footprints.write(self.path("footprints.safetensors"), provenance(&origin)).unwrap();
+        let hash = |name: &str, format: &str| Artifact::open(self.path(name), format, 1).unwrap().hash().to_string();
+        let value = |i: usize| {
+            let noise = |k: usize| ((i * 31 + k * 17) % 23) as f32 * 0.004;
+            if i < EACH { [1.0, noise(1), noise(2)] } else { [noise(3), 1.0, noise(4)] }
+        };
+        let mut features = Features { kept: graph.kept, dim: 3, values: (0..n).flat_map(value).collect() };
+        change(&mut features);
+        let inputs = [
+            (role::GRAPH, hash("graph.safetensors", Graph::FORMAT)),
+            (role::FOOTPRINTS, hash("footprints.safetensors", "footprints")),
+        ];
+        features.write(self.path("features.safetensors"), provenance(&inputs)).unwrap();
+    }
+
+    fn run(&self, extra: &[&str]) -> Output {
+        let mut command = Command::new(env!("CARGO_BIN_EXE_cluster-match"));
+        command.arg("--scene").arg(&self.root);
+        if !extra.contains(&"--out") {
+            command.arg("--out").arg(self.path("out/instances.safetensors"));
+        }
+        for (option, file) in [
+            ("--geometry", "geometry.ply"),
+            ("--graph", "graph.safetensors"),
+            ("--footprints", "footprints.safetensors"),
+            ("--features", "features.safetensors"),
+            ("--masks", "masks"),
+        ] {
+            command.arg(option).arg(self.path(file));
+        }
+        if !extra.contains(&"--min-cluster-size") {
+            command.args(["--min-cluster-size", "8"]);
+        }
+        command.args(extra).output().unwrap()
+    }
+
+    fn succeed(&self, extra: &[&str]) -> (Instances, String) {
+        let out = self.run(extra);
+        let said = String::from_utf8_lossy(&out.stderr).into_owned();
+        assert!(out.status.success(), "{said}");
+        (Instances::read(self.path("out/instances.safetensors")).unwrap().0, said)
+    }
+
+    /// Runs, and expects exit code 2, one line with all `needles`, and old outputs as they were.
+    fn fail(&self, extra: &[&str], needles: &[&str]) {
+        let out = self.path("out/instances.safetensors");
+        std::fs::write(&out, "good").unwrap();
+        let o = self.run(extra);
+        let said = String::from_utf8_lossy(&o.stderr).into_owned();
+        assert_eq!(o.status.code(), Some(2), "{said}");
+        for needle in needles {
+            assert!(said.contains(needle), "{needle:?} is not in {said:?}");
+        }
+        let errors: Vec<&str> = said.lines().filter(|l| l.starts_with("cluster-match: error: ")).collect();
+        assert_eq!((errors.len(), said.contains("panicked")), (1, false), "{said}");
+        assert_eq!(std::fs::read(&out).unwrap(), b"good");
+    }
+}
+
+/// The two things' instances, by label.
+fn things(i: &Instances) -> (usize, usize) {
+    let (a, b) = (i.label[0], i.label[EACH]);
+    assert!(a >= 0 && b >= 0 && a != b, "{:?}", i.label);
+    assert!(
+        i.label[..EACH].iter().all(|&l| l == a) && i.label[EACH..2 * EACH].iter().all(|&l| l == b),
+        "{:?}",
+        i.label
+    );
+    (a as usize, b as usize)
+}
+
+#[test]
+fn instances_are_found_matched_and_described_the_same_for_any_number_of_threads() {
+    let s = Scene::new();
+    s.language(0..VIEWS);
+    let (i, said) = s.succeed(&["--threads", "1"]);
+    assert!(said.contains("2 instances among 80 Gaussians") && said.contains("skipped 1 of 81 Gaussians"), "{said}");
+    let (a, b) = things(&i);
+    // The one that no view sees has the label of what is nearest.
+    assert_eq!((i.len(), i.label[2 * EACH]), (2, a as i32));
+    assert_eq!((i.support[a], i.support[b], i.dim), (VIEWS as u32, VIEWS as u32, 3));
+    assert!(i.score[a] > 0.5 && i.score[b] > 0.5);
+    assert!(i.matches.iter().all(|m| m.mask == if m.instance as usize == a { 3 } else { 4 }), "{:?}", i.matches);
+    assert_eq!(i.count[a] + i.count[b], 81);
+    assert!(i.centroid[b][0] > 0.4 && i.bbox_min[b][0] > 0.3 && i.bbox_max[b][0] < 0.9);
+    // Mean of unit features (1, 0, 0.1 v), made a unit again; the other is (0, 1, 0) in every view.
+    let mut mean = [0.0f64; 3];
+    for v in 0..VIEWS {
+        let length = (1.0 + (0.1 * v as f64).powi(2)).sqrt();
+        (mean[0], mean[2]) = (mean[0] + 1.0 / length, mean[2] + 0.1 * v as f64 / length);
+    }
+    let length = mean.iter().map(|v| v * v).sum::<f64>().sqrt();
+    for (found, expected) in i.descriptor_of(a).iter().zip(mean) {
+        assert!((f64::from(*found) - expected / length).abs() < 1e-6);
+    }
+    assert_eq!(i.descriptor_of(b), [0.0, 1.0, 0.0]);
+    assert_eq!(i.tree.iter().filter(|e| e.instance >= 0).count(), 2);
+
+    // Beside it: the Gaussians in their instances' colours, labels, and a text.
+    let colored = ply::read_gaussians(s.path("out/instances.ply")).unwrap();
+    let g = gaussians();
+    assert_eq!((&colored.means, &colored.opacity_logits, colored.sh_degree), (&g.means, &g.opacity_logits, 0));
+    assert_eq!(colored.sh_of(0), colored.sh_of(1));
+    assert_ne!(colored.sh_of(0), colored.sh_of(EACH));
+    let labels = gs_io::npy::read_f32(s.path("out/instances.labels.npy")).unwrap();
+    assert!(labels.data.iter().zip(&i.label).all(|(a, b)| *a == *b as f32) && labels.shape == [81]);
+    let text: Value = serde_json::from_slice(&std::fs::read(s.path("out/instances.json")).unwrap()).unwrap();
+    assert_eq!(text["instances"].as_array().unwrap().len(), 2);
+    assert_eq!(text["instances"][b]["matches"][1]["view"], "v1");
+
+    let outputs = || {
+        ["safetensors", "ply", "labels.npy", "json"]
+            .map(|e| std::fs::read(s.path(&format!("out/instances.{e}"))).unwrap())
+    };
+    let first = outputs();
+    s.succeed(&["--threads", "2"]);
+    assert!(first == outputs(), "the number of threads changes the outputs");
+}
+
+#[test]
+fn options_do_what_they_say() {
+    let s = Scene::new();
+    for extra in [
+        &["--cluster", "free", "--min-samples", "5"][..],
+        &["--distance", "chord", "--epsilon", "0.3", "--smooth", "1"],
+        &["--distance", "euclidean", "--epsilon", "0.5"],
+        &["--silhouette", "visible", "--min-cluster-share", "0.4"],
+    ] {
+        let (i, said) = s.succeed(extra);
+        things(&i);
+        assert_eq!(i.support, [VIEWS as u32; 2], "{extra:?}");
+        // Without language the rest is there, and it is said.
+        assert!(i.dim == 0 && i.descriptor.is_empty() && said.contains("skipped language descriptors"), "{said}");
+    }
+    // Another level: one mask for both things, which each covers half of, or the best of two levels.
+    let (i, _) = s.succeed(&["--level", "medium", "--aggregate", "median"]);
+    assert!(i.matches.iter().all(|m| m.mask == 2 && m.score < 0.7) && !i.matches.is_empty());
+    let (i, _) = s.succeed(&["--level", "medium,large"]);
+    assert!(i.matches.len() == 2 * VIEWS && i.matches.iter().all(|m| m.mask >= 3));
+    assert!(s.succeed(&["--threshold", "1"]).0.matches.is_empty());
+
+    // One PLY per instance, none left from an earlier run.
+    let folder = s.path("plys");
+    std::fs::create_dir(&folder).unwrap();
+    std::fs::write(folder.join("instance_0002.ply"), "of an earlier run").unwrap();
+    std::fs::write(folder.join("mine.ply"), "mine").unwrap();
+    let (i, _) = s.succeed(&["--per-instance-plys", folder.to_str().unwrap()]);
+    for k in 0..2 {
+        let own = ply::read_gaussians(folder.join(format!("instance_{k:04}.ply"))).unwrap();
+        assert_eq!(own.len(), i.count[k] as usize);
+    }
+    assert!(!folder.join("instance_0002.ply").exists() && folder.join("mine.ply").exists());
+
+    // Noise: a Gaussian that is like neither thing.
+    s.artifacts(|f| f.values[..3].copy_from_slice(&[-4.0, -4.0, 0.0]));
+    let free = ["--cluster", "free", "--min-samples", "5"];
+    assert_eq!(s.succeed(&[&free[..], &["--noise", "keep"]].concat()).0.label[0], -1);
+    things(&s.succeed(&free).0);
+}
+
+#[test]
+fn scenes_without_anything_are_results_not_errors() {
+    // All noise.
+    let s = Scene::new();
+    let (i, said) = s.succeed(&["--min-cluster-size", "60"]);
+    assert!(i.is_empty() && i.matches.is_empty() && i.label.iter().all(|&l| l == -1));
+    assert!(said.contains("everything is noise") && said.contains("--allow-single-cluster"), "{said}");
+    assert_eq!(ply::read_gaussians(s.path("out/instances.ply")).unwrap().len(), 81);
+    // One thing.
+    s.artifacts(|f| f.values.chunks_exact_mut(3).for_each(|row| row.copy_from_slice(&[0.0, 1.0, 0.0])));
+    let (i, _) = s.succeed(&["--cluster", "free", "--allow-single-cluster"]);
+    assert!(i.len() == 1 && i.label.iter().all(|&l| l == 0));
+    // Id maps without masks.
+    for v in 0..VIEWS {
+        s.masks(v, &[-1; SIZE * SIZE]);
+    }
+    s.artifacts(|_| {});
+    let (i, _) = s.succeed(&[]);
+    things(&i);
+    assert!(i.matches.is_empty() && i.support == [0, 0]);
+    // One Gaussian.
+    ply::write_gaussians(s.path("geometry.ply"), &gaussians().select(&[0]), &[]).unwrap();
+    let provenance = |inputs: [(&str, String); 3]| Provenance {
+        parameters: json!({"holdout": 0}),
+        inputs: inputs.map(|(role, hash)| (role.to_string(), hash)).into_iter().collect::<BTreeMap<_, _>>(),
+        ..Provenance::default()
+    };
+    let origin = || {
+        provenance([
+            (role::GEOMETRY, hash_file(s.path("geometry.ply")).unwrap()),
+            (role::DATASET, s.dataset().hash().unwrap()),
+            (role::MASKS, hash_folder(s.path("masks"), "_s.npy").unwrap()),
+        ])
+    };
+    let graph = Graph {
+        kept: vec![0],
+        anchors: vec![0],
+        nearest_anchor: vec![0],
+        seen_views: vec![4],
+        seen_weight: vec![1.0],
+        ..Graph::default()
+    };
+    graph.write(s.path("graph.safetensors"), origin()).unwrap();
+    let footprints =
+        FootprintsBuilder { views: vec!["v0".into()], kept: vec![0], row_ptr: vec![0], ..Default::default() };
+    footprints.write(s.path("footprints.safetensors"), origin()).unwrap();
+    let hash = |name: &str, format: &str| Artifact::open(s.path(name), format, 1).unwrap().hash().to_string();
+    let features = Features { kept: vec![0], dim: 2, values: vec![1.0, 0.0] };
+    let inputs = [
+        (role::GRAPH, hash("graph.safetensors", Graph::FORMAT)),
+        (role::FOOTPRINTS, hash("footprints.safetensors", "footprints")),
+        (role::GEOMETRY, String::new()),
+    ];
+    features.write(s.path("features.safetensors"), provenance(inputs)).unwrap();
+    let (i, said) = s.succeed(&[]);
+    assert_eq!(i.label, [-1]);
+    assert!(said.contains("skipped 3 of 4 views in matching") && said.contains("v1, v2, v3"), "{said}");
+}
+
+#[test]
+fn bad_input_is_one_line_and_leaves_outputs_alone() {
+    let s = Scene::new();
+    s.fail(&["--min-cluster-size", "1"], &["--min-cluster-size", "found 1", "at least 2"]);
+    s.fail(&["--min-cluster-share", "2"], &["--min-cluster-share"]);
+    s.fail(&["--min-samples", "0"], &["--min-samples", "found 0"]);
+    s.fail(&["--epsilon", "NaN"], &["--epsilon", "found NaN"]);
+    s.fail(&["--threshold", "1.5"], &["--threshold", "found 1.5"]);
+    assert_eq!(s.run(&["--level", "huge"]).status.code(), Some(2));
+    let out = s.run(&["--out", s.path("out/x.json").to_str().unwrap()]);
+    assert_eq!(out.status.code(), Some(2));
+
+    // Language features that do not fit the masks.
+    s.language(0..VIEWS);
+    let one = s.path("masks/v2_f.npy");
+    MaskFeatures { count: 2, dim: 3, values: vec![0.5; 6] }.write(&one).unwrap();
+    s.fail(&[], &["v2_f.npy", "fewer features than masks", "found 2", "at least 5"]);
+    MaskFeatures { count: 5, dim: 2, values: vec![0.5; 10] }.write(&one).unwrap();
+    s.fail(&[], &["v2_f.npy", "different models", "found 2", "expected 3"]);
+    std::fs::write(&one, "no array").unwrap();
+    s.fail(&[], &["v2_f.npy"]);
+    std::fs::remove_file(&one).unwrap();
+    let (i, said) = s.succeed(&[]);
+    assert!(said.contains("1 of 4 views have no mask features") && i.dim == 3, "{said}");
+
+    // Artifacts of another scene.
+    s.masks(1, &[0; SIZE * SIZE]);
+    s.fail(&[], &["footprints.safetensors", "another masks", "run make again"]);
+    s.masks(1, &s.seen(1));
+    let features = std::fs::read(s.path("features.safetensors")).unwrap();
+    s.artifacts(|_| {});
+    let graph = std::fs::read(s.path("graph.safetensors")).unwrap();
+    let image = Image { width: SIZE as u32, height: SIZE as u32, rgb: vec![0.25; 3 * SIZE * SIZE], alpha: None };
+    let old = std::fs::read(s.path("images/v3.png")).unwrap();
+    image.write_png(s.path("images/v3.png")).unwrap();
+    s.fail(&[], &["graph.safetensors", "another dataset"]);
+    std::fs::write(s.path("images/v3.png"), old).unwrap();
+    let mut other = gaussians();
+    other.means[3][0] += 0.01;
+    ply::write_gaussians(s.path("geometry.ply"), &other, &[]).unwrap();
+    s.fail(&[], &["graph.safetensors", "another geometry"]);
+    ply::write_gaussians(s.path("geometry.ply"), &gaussians(), &[]).unwrap();
+    s.artifacts(|f| f.values[7] = f32::NAN);
+    s.fail(&[], &["features.safetensors", "features[2][1]", "not a finite number"]);
+    s.artifacts(|f| (f.dim, f.values) = (0, Vec::new()));
+    s.fail(&[], &["features.safetensors", "no channels"]);
+    std::fs::write(s.path("features.safetensors"), &features[..features.len() - 9]).unwrap();
+    s.fail(&[], &["features.safetensors"]);
+    std::fs::write(s.path("features.safetensors"), &features).unwrap();
+    s.succeed(&[]);
+    std::fs::write(s.path("graph.safetensors"), &graph[..50]).unwrap();
+    s.fail(&[], &["graph.safetensors"]);
+    std::fs::remove_file(s.path("graph.safetensors")).unwrap();
+    s.fail(&[], &["graph.safetensors"]);
+}
+
+#[test]
+fn an_output_that_cannot_be_written_is_an_error() {
+    let s = Scene::new();
+    let blocked = s.path("blocked");
+    std::fs::write(&blocked, "a file").unwrap();
+    let out = s.run(&["--out", blocked.join("instances.safetensors").to_str().unwrap()]);
+    let said = String::from_utf8_lossy(&out.stderr).into_owned();
+    assert!(out.status.code() == Some(2) && said.contains("blocked") && !said.contains("panicked"), "{said}");
+    assert!(Path::new(&blocked).is_file());
+}
