@@ -1,11 +1,10 @@
 //! The photographs of a scene as 8-bit pictures.
 
 use crate::args::SceneArgs;
-use gs_io::{Error, Result, hash_bytes};
+use gs_io::{Result, hash_bytes};
 use gs_scene::dataset::{self, Dataset, LoadOptions, View};
 use onnx_models::RgbImage;
 use stage::Stage;
-use std::collections::BTreeMap;
 
 /// Opens the scene; what is odd about it is said.
 pub(crate) fn open(args: &SceneArgs, stage: &Stage) -> Result<Dataset> {
@@ -13,16 +12,6 @@ pub(crate) fn open(args: &SceneArgs, stage: &Stage) -> Result<Dataset> {
     let scene = dataset::load(&args.scene, &options)?;
     for warning in &scene.warnings {
         stage.warn(warning);
-    }
-    // Masks are found by the stem of the photograph's name, as in LangSplat.
-    let mut names = BTreeMap::new();
-    for view in &scene.views {
-        if let Some(other) = names.insert(view.stem(), &view.name) {
-            return Err(Error::new("two photographs whose names differ in folder or extension only")
-                .file(&args.scene)
-                .found(format!("{other} and {}", view.name))
-                .hint("give them different names: files of masks are named after them"));
-        }
     }
     Ok(scene)
 }
