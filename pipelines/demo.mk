@@ -12,10 +12,10 @@ SEED ?= 0
 SYNTH_ARGS ?= --seed $(SEED) --objects 10 --views 30 --width 480 --height 360 --granularity-p 0.5
 GEOM_ARGS ?= --iterations 3000
 GRAPH_ARGS ?=
-FEAT_ARGS ?= --dim 16
-CLUSTER_ARGS ?= --cluster free --min-cluster-size 60 --min-samples 10
+FEAT_ARGS ?=
+CLUSTER_ARGS ?=
 SCORE_ARGS ?=
-QUERIES ?= red_mug plate_of_cookies
+QUERIES ?= green_kettle pink_coffee_set black_laptop yellow_toy_car
 REPORT_ARGS ?= --title Demo
 
 include pipelines/stages.mk

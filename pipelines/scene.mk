@@ -19,7 +19,7 @@ SCENE_FILES := $(wildcard $(addprefix $(SCENE)/,sparse/0/* sparse/* images/* tra
 RESOLUTION ?= auto
 ITERATIONS ?= 30000
 CLIP ?= $(patsubst %/,%,$(dir $(wildcard models/clip/text.onnx)))
-SAM ?= models/sam
+SAM ?= models
 
 ifeq ($(MASKS),)
 MASKS := $(OUT)/masks

@@ -196,7 +196,7 @@ def export(p, s, table, out):
         k = weights[f"w{i}"].shape[-1]
         before = (k - 2) // 2  # "SAME" with stride 2 on an even size pads k - 2 in all, the smaller half first
         pads = [before, before, k - 2 - before, k - 2 - before]
-        nodes.append(helper.make_node("Conv", [x, f"w{i}", f"b{i}"], [f"c{i}"], strides=[2, 2], pads=pads))
+        nodes.append(helper.make_node("Conv", [x, f"w{i}", f"b{i}"], [f"c{i}"], strides=[2, 2], pads=pads, dilations=[1, 1]))
         nodes.append(helper.make_node("Relu", [f"c{i}"], [f"r{i}"]))
         x = f"r{i}"
     nodes += [
@@ -223,7 +223,7 @@ def export(p, s, table, out):
         helper.make_node("Gather", ["word", "rows"], ["e"], axis=0),
         helper.make_node("ReduceSum", ["e", "axis"], ["sum"], keepdims=0),
         helper.make_node("Transpose", ["e"], ["et"], perm=[0, 2, 1]),
-        helper.make_node("Conv", ["et", "pair", "pair_bias"], ["pairs"], pads=[1, 1]),
+        helper.make_node("Conv", ["et", "pair", "pair_bias"], ["pairs"], pads=[1, 1], strides=[1], dilations=[1]),
         helper.make_node("Relu", ["pairs"], ["active"]),
         helper.make_node("ReduceMax", ["active"], ["top"], axes=[2], keepdims=0),
         helper.make_node("Concat", ["sum", "top"], ["pooled"], axis=1),
