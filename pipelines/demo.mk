@@ -10,7 +10,7 @@ CLIP ?= testdata/clip-tiny
 
 SEED ?= 0
 SYNTH_ARGS ?= --seed $(SEED) --objects 10 --views 30 --width 480 --height 360 --granularity-p 0.5
-GEOM_ARGS ?= --iterations 3000
+GEOM_ARGS ?= --iterations 1500
 GRAPH_ARGS ?=
 FEAT_ARGS ?=
 CLUSTER_ARGS ?=
