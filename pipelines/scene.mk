@@ -3,8 +3,8 @@
 #:  MASKS=folder        use these id maps (*_s.npy) instead of running SAM
 #:  CLIP=folder         image.onnx and text.onnx of a CLIP model [models/clip, if there]; without it no text queries
 #:  QUERIES="red_mug …" texts to ask for, with underscores for spaces
-#:  RESOLUTION=4        divisor of the photographs' size for stage 1 [auto: at most 1600 wide]
-#:  ITERATIONS=30000    steps of stage 1
+#:  RESOLUTION=640px    size of the photographs for stage 1: a width that wider ones are shrunk to, or a divisor
+#:  ITERATIONS=5000     steps of stage 1
 #:  THREADS=0           threads of every stage, 0 for one per core
 #: and GEOM_ARGS, MASK_ARGS, GRAPH_ARGS, FEAT_ARGS, CLUSTER_ARGS, REPORT_ARGS: more options of a stage
 
@@ -16,8 +16,8 @@ $(error say where to write: make scene SCENE=folder OUT=folder)
 endif
 
 SCENE_FILES := $(wildcard $(addprefix $(SCENE)/,sparse/0/* sparse/* images/* transforms*.json color/* pose/* *.ply))
-RESOLUTION ?= auto
-ITERATIONS ?= 30000
+RESOLUTION ?= 640px
+ITERATIONS ?= 5000
 CLIP ?= $(patsubst %/,%,$(dir $(wildcard models/clip/text.onnx)))
 SAM ?= models
 

@@ -108,7 +108,7 @@ struct QueryArgs {
     /// A pixel belongs to the mask above this [default: 0.7 for selected, 0.5 for visible]
     #[arg(long, value_name = "VALUE")]
     alpha: Option<f32>,
-    /// Size of the pictures: auto, or a divisor of the photographs' size
+    /// Size of the pictures: a divisor of the photographs', a width such as 640px, or auto for 1600px
     #[arg(long, default_value = "auto")]
     resolution: Resolution,
     /// Output folder
@@ -153,7 +153,7 @@ struct ReportArgs {
     /// Views to show, by name, with commas between [default: three held-out ones]
     #[arg(long, value_delimiter = ',', value_name = "NAMES")]
     views: Vec<String>,
-    /// Size of renders: auto, or a divisor of the photographs' size
+    /// Size of renders: a divisor of the photographs', a width such as 640px, or auto for 1600px
     #[arg(long, default_value = "auto")]
     resolution: Resolution,
     /// Every which view is held out; 0 for none

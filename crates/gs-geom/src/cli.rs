@@ -54,8 +54,8 @@ struct SceneArgs {
     /// Dataset folder (COLMAP, transforms.json or ScanNet)
     #[arg(long, value_name = "DIR")]
     scene: PathBuf,
-    /// Divisor of the photographs' size, or auto: at most 1600 pixels wide
-    #[arg(long, value_name = "auto|DIVISOR", default_value = "auto")]
+    /// Size of the photographs: a divisor, a width that wider ones are shrunk to such as 640px, or auto for 1600px
+    #[arg(long, value_name = "auto|WIDTHpx|DIVISOR", default_value = "auto")]
     resolution: Resolution,
     /// Hold out every n-th view, from the first; 0 holds none out
     #[arg(long, value_name = "N", default_value_t = 8)]

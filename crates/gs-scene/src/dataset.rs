@@ -48,6 +48,8 @@ pub enum Split {
 pub enum Resolution {
     /// To 1600 pixels wide where they are wider.
     Auto,
+    /// To this many pixels wide where they are wider; written `640px`.
+    Width(u32),
     /// By this factor, at least 1.
     Divisor(f64),
 }
@@ -56,12 +58,18 @@ impl std::str::FromStr for Resolution {
     type Err = Error;
 
     fn from_str(s: &str) -> Result<Self> {
-        match s {
-            "auto" | "-1" => Ok(Self::Auto),
-            _ => s.parse().ok().filter(|d: &f64| (1.0..=1024.0).contains(d)).map(Self::Divisor).ok_or_else(|| {
-                Error::new("not a resolution").found(s).expected("auto, or a factor from 1 (full size) such as 2, 4, 8")
-            }),
-        }
+        let width = |w: &str| w.parse().ok().filter(|w| *w >= 1).map(Self::Width);
+        let divisor = || s.parse().ok().filter(|d| (1.0..=1024.0).contains(d)).map(Self::Divisor);
+        let resolution = match (s, s.strip_suffix("px")) {
+            ("auto" | "-1", _) => Some(Self::Auto),
+            (_, Some(pixels)) => width(pixels),
+            _ => divisor(),
+        };
+        resolution.ok_or_else(|| {
+            Error::new("not a resolution")
+                .found(s)
+                .expected("auto, a width such as 640px, or a factor from 1 (full size) such as 2, 4, 8")
+        })
     }
 }
 
@@ -69,6 +77,7 @@ impl std::fmt::Display for Resolution {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
         match self {
             Self::Auto => f.write_str("auto"),
+            Self::Width(w) => write!(f, "{w}px"),
             Self::Divisor(d) => write!(f, "{d}"),
         }
     }
@@ -77,7 +86,8 @@ impl std::fmt::Display for Resolution {
 impl Resolution {
     fn apply(self, width: u32, height: u32) -> (u32, u32) {
         let divisor = match self {
-            Self::Auto => (f64::from(width) / 1600.0).max(1.0),
+            Self::Auto => return Self::Width(1600).apply(width, height),
+            Self::Width(w) => (f64::from(width) / f64::from(w)).max(1.0),
             Self::Divisor(d) => d,
         };
         let shrink = |v: u32| ((f64::from(v) / divisor).round() as u32).max(1);

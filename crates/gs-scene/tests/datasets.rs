@@ -198,7 +198,14 @@ fn holding_out_and_shrinking() {
     assert!((u / 21.0 - lu / 41.0).abs() < 1e-12 && (v / 15.0 - lv / 30.0).abs() < 1e-12);
     let image = d.views[0].load_image().unwrap();
     assert_eq!((image.width, image.height, image.rgb.len()), (21, 15, 21 * 15 * 3));
-    for bad in ["0", "0.5", "-3", "NaN", "inf", "big", ""] {
+    let wide = |text: &str| {
+        let d = LoadOptions { resolution: text.parse().unwrap(), holdout: 8 };
+        let c = dataset::load(dir.path(), &d).unwrap().views[0].camera.clone();
+        (c.width, c.height, d.resolution.to_string())
+    };
+    assert_eq!(wide("20px"), (20, 15, "20px".to_string()));
+    assert_eq!(wide("800px"), (41, 30, "800px".to_string()), "photographs are never enlarged");
+    for bad in ["0", "0.5", "-3", "NaN", "inf", "big", "", "px", "0px", "-20px", "2.5px"] {
         let e = bad.parse::<Resolution>().unwrap_err().to_string();
         assert!(e.contains("not a resolution") && e.contains("auto"), "{e}");
     }

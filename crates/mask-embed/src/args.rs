@@ -13,8 +13,8 @@ pub struct SceneArgs {
     /// Scene: COLMAP, transforms.json or ScanNet
     #[arg(long, value_name = "FOLDER")]
     pub scene: PathBuf,
-    /// Photographs are shrunk by this: auto (to 1600 pixels wide if wider) or a number from 1
-    #[arg(long, default_value = "auto", value_name = "auto|NUMBER")]
+    /// Size of the photographs: a divisor, a width that wider ones are shrunk to such as 640px, or auto for 1600px
+    #[arg(long, default_value = "auto", value_name = "auto|WIDTHpx|DIVISOR")]
     pub resolution: Resolution,
 }
 
