@@ -1,7 +1,7 @@
 #!/usr/bin/env bash
 # The pipeline as people run it: make, on a tiny synthetic scene. Shows that a second make runs nothing, that a changed
-# option runs what depends on it and nothing else, that thread counts and kills do not change a byte, and that artifacts
-# of different scenes do not mix. Needs the programs in target/release (make build); takes a minute or two.
+# option runs what depends on it and nothing else, that thread counts and kills do not change a byte, that artifacts of
+# different scenes do not mix, and that every stage refuses every damaged input. Takes a minute or two after the build.
 set -euo pipefail
 cd "$(dirname "$0")/.."
 cargo build --release --workspace --bins
@@ -66,6 +66,70 @@ target/release/feat-train --geometry "$work/c/geometry.ply" --graph "$work/b/gra
 [ "$(grep -c 'error:' "$work/mixed.log")" = 1 ] || fail "mixed artifacts: not one line of error"
 [ "$before" = "$(sha256sum < "$work/b/features.safetensors")" ] || fail "mixed artifacts: an output was overwritten"
 pass "artifacts of another scene are refused: $(grep 'error:' "$work/mixed.log")"
+
+say "== damaged inputs"
+# Every stage, every file it reads, every kind of damage: exit code 2, one line that names the file, no output touched.
+a=$work/a
+scene=$a/scene
+masks=$scene/language_features
+geometry=(--scene "$scene" --geometry "$a/geometry.ply")
+made=(--graph "$a/graph.safetensors" --footprints "$a/footprints.safetensors")
+outputs=$work/outputs
+refusals=0
+refused() { # refused WORD COMMAND...: WORD must be in the one line of error
+  local word=$1 code=0
+  shift
+  (cd "$outputs" && find . -type f -print0 | sort -z | xargs -0 sha256sum) > "$work/before"
+  "$@" --quiet > /dev/null 2> "$work/error" || code=$?
+  (cd "$outputs" && find . -type f -print0 | sort -z | xargs -0 sha256sum) > "$work/after"
+  [ "$code" = 2 ] && [ "$(grep -c 'error: ' "$work/error")" = 1 ] && grep -q -- "$word" "$work/error" \
+    && ! grep -q panicked "$work/error" && cmp -s "$work/before" "$work/after" \
+    || { cat "$work/error"; fail "exit code $code, expected one line about $word and untouched outputs: $*"; }
+  refusals=$((refusals + 1))
+}
+damage() { # damage FILE WORD COMMAND...: the command must refuse FILE cut short, empty, of noise, and missing
+  local file=$1 word=$2 size
+  shift 2
+  size=$(stat -c %s "$file")
+  cp "$file" "$work/good"
+  head -c $((size / 2)) "$work/good" > "$file" && refused "$word" "$@"
+  : > "$file" && refused "$word" "$@"
+  { head -c 64 "$work/good" && head -c "$size" /dev/zero | tr '\0' '\377'; } > "$file" && refused "$word" "$@"
+  # A scene without points is a scene: training starts at random ones, with a warning.
+  case $file in *points3D*) ;; *) rm "$file" && refused "$word" "$@" ;; esac
+  cp "$work/good" "$file"
+}
+fill() { mkdir -p "$outputs" && for f in "$@"; do echo good > "$outputs/$f"; done; }
+bin=$PWD/target/release
+fill geometry.ply graph.safetensors footprints.safetensors features.safetensors instances.safetensors score.json
+train=("$bin/gs-geom" train --scene "$scene" --iterations 3 --out "$outputs/geometry.ply")
+for f in cameras images points3D; do damage "$scene/sparse/0/$f.bin" "$f" "${train[@]}"; done
+cp "$scene/images/frame_00002.png" "$work/photo"
+head -c 1000 "$work/photo" > "$scene/images/frame_00002.png" && refused frame_00002 "${train[@]}"
+cp "$work/photo" "$scene/images/frame_00002.png"
+precompute=("$bin/graph-precompute" "${geometry[@]}" --masks "$masks" --min-mask-pixels 10
+  --graph "$outputs/graph.safetensors" --footprints "$outputs/footprints.safetensors")
+damage "$a/geometry.ply" geometry.ply "${precompute[@]}"
+for kind in cut noise; do
+  cp "$masks/frame_00002_s.npy" "$work/good"
+  if [ $kind = cut ]; then head -c 3000 "$work/good"; else tr '\0' '\377' < "$work/good"; fi > "$masks/frame_00002_s.npy"
+  refused frame_00002_s.npy "${precompute[@]}"
+  cp "$work/good" "$masks/frame_00002_s.npy"
+done
+features=("$bin/feat-train" --geometry "$a/geometry.ply" "${made[@]}" --out "$outputs/features.safetensors")
+damage "$a/geometry.ply" geometry "${features[@]}"
+damage "$a/graph.safetensors" graph "${features[@]}"
+damage "$a/footprints.safetensors" footprints "${features[@]}"
+cluster=("$bin/cluster-match" "${geometry[@]}" "${made[@]}" --features "$a/features.safetensors" --masks "$masks"
+  --out "$outputs/instances.safetensors")
+damage "$a/geometry.ply" geometry "${cluster[@]}"
+damage "$a/graph.safetensors" graph "${cluster[@]}"
+damage "$a/footprints.safetensors" footprints "${cluster[@]}"
+damage "$a/features.safetensors" features "${cluster[@]}"
+score=("$bin/eval" score "${geometry[@]}" --instances "$a/instances.safetensors" --out "$outputs/score.json")
+damage "$a/geometry.ply" geometry "${score[@]}"
+damage "$a/instances.safetensors" instances "${score[@]}"
+pass "$refusals damaged inputs were refused in one line each, and no output was touched"
 
 say "== kills"
 # Kill the whole run at growing moments, then let make finish: the bytes of an undisturbed run.

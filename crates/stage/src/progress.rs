@@ -107,11 +107,11 @@ impl<'a> Progress<'a> {
         let eta = self.eta().map_or(String::new(), |s| format!(", eta {s:.0} s"));
         let sep = if fields.is_empty() { "" } else { ", " };
         self.stage.line(&format!(
-            "{} {}/{} ({:.1}/s{eta}){sep}{}",
+            "{} {}/{} ({}{eta}){sep}{}",
             self.label,
             self.done,
             self.total,
-            self.rate(),
+            pace(self.rate()),
             text(fields)
         ));
     }
@@ -130,10 +130,28 @@ impl<'a> Progress<'a> {
     }
 }
 
+/// Steps per second, or seconds per step where those are more than one.
+fn pace(rate: f64) -> String {
+    if rate > 0.0 && rate < 1.0 { format!("{:.1} s each", 1.0 / rate) } else { format!("{rate:.1}/s") }
+}
+
 fn text(fields: &[(&str, f64)]) -> String {
     let parts: Vec<String> = fields
         .iter()
         .map(|(k, v)| if v.fract() == 0.0 && v.abs() < 1e12 { format!("{k} {v:.0}") } else { format!("{k} {v:.4}") })
         .collect();
     parts.join(", ")
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn slow_work_is_told_in_seconds_each() {
+        assert_eq!(
+            (pace(0.0), pace(0.05), pace(1.0), pace(12.34)),
+            ("0.0/s".into(), "20.0 s each".into(), "1.0/s".into(), "12.3/s".into())
+        );
+    }
 }
