@@ -12,7 +12,7 @@ fn data(name: &str) -> Option<PathBuf> {
     if path.exists() {
         return Some(path);
     }
-    eeprintln!("skipped: {} is not present", path.display());
+    eprintln!("skipped: {} is not present", path.display());
     None
 }
 
