@@ -1,6 +1,6 @@
 //! The command line of `graph-precompute`.
 
-use crate::graph::GraphOptions;
+use crate::graph::{GraphOptions, Space};
 use crate::precompute::{Options, precompute};
 use artifacts::role;
 use gs_io::{Error, Result, hash_file};
@@ -39,6 +39,10 @@ pub struct Args {
     /// Share of the Gaussians that become anchors; at least one does
     #[arg(long, value_name = "SHARE", default_value_t = 0.1)]
     anchor_ratio: f64,
+    /// In which space anchors are spread evenly. Far background Gaussians take most anchors of a scene that has them,
+    /// unless the space is contracted
+    #[arg(long, value_enum, default_value_t = Space::World)]
+    sample_space: Space,
     /// Neighbours per anchor
     #[arg(long, value_name = "COUNT", default_value_t = 16)]
     k: usize,
@@ -57,6 +61,9 @@ pub struct Args {
     /// Keep Gaussians that no view sees
     #[arg(long)]
     no_skip: bool,
+    /// The paper read literally: anchors sampled in the world among all Gaussians, seen or not
+    #[arg(long, value_enum)]
+    preset: Option<Preset>,
     #[command(flatten)]
     common: CommonArgs,
 }
@@ -70,7 +77,22 @@ pub enum Views {
     All,
 }
 
+/// Options that go together.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, clap::ValueEnum)]
+pub enum Preset {
+    /// The paper read literally.
+    Paper,
+}
+
 impl Args {
+    fn keep_unseen(&self) -> bool {
+        self.no_skip || self.preset == Some(Preset::Paper)
+    }
+
+    fn space(&self) -> Space {
+        if self.preset == Some(Preset::Paper) { Space::World } else { self.sample_space }
+    }
+
     fn options(&self) -> Result<Options> {
         let bad = |field: &str, found: String, expected: &str| {
             Err(Error::new("out of range").field(field).found(found).expected(expected))
@@ -97,12 +119,13 @@ impl Args {
                 anchor_ratio: self.anchor_ratio,
                 k: self.k,
                 gaussian_k: self.gaussian_k,
+                space: self.space(),
                 seed: self.common.seed,
             },
             gate: self.gate,
             min_mask_pixels: self.min_mask_pixels,
             cut: self.cut,
-            keep_unseen: self.no_skip,
+            keep_unseen: self.keep_unseen(),
         })
     }
 
@@ -116,7 +139,8 @@ impl Args {
             "gate": self.gate,
             "min_mask_pixels": self.min_mask_pixels,
             "cut": self.cut,
-            "no_skip": self.no_skip,
+            "no_skip": self.keep_unseen(),
+            "sample_space": if self.space() == Space::World { "world" } else { "contracted" },
             "seed": self.common.seed,
         })
     }
@@ -159,6 +183,11 @@ impl Program for Args {
         stage.info(&format!(
             "{} anchors among {} Gaussians; {} masks in {} views, {} footprint entries",
             summary.anchors, summary.kept, summary.masks, summary.views, summary.entries
+        ));
+        let d = summary.anchor_distance;
+        stage.info(&format!(
+            "distance to the anchor: median {:.4}, 90% within {:.4}, 99% within {:.4}, largest {:.4}",
+            d.median, d.p90, d.p99, d.largest
         ));
         if self.cut > 0.0 {
             stage.info(&format!("the cut dropped at most {:.3e} of a mask", summary.largest_cut));

@@ -1,9 +1,19 @@
 //! The anchor graph over the kept Gaussians (paper, "Local Graph Sampling").
 
+use crate::contract::contracted;
 use crate::fps::farthest_points;
-use crate::kdtree::KdTree;
+use crate::kdtree::{KdTree, distance};
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
+
+/// In which space anchors are spread evenly.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, clap::ValueEnum)]
+pub enum Space {
+    /// The scene's own
+    World,
+    /// The far background drawn together to a shell twice as wide as the scene's middle
+    Contracted,
+}
 
 /// How the graph is made.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -14,13 +24,15 @@ pub struct GraphOptions {
     pub k: usize,
     /// Spatial neighbours per Gaussian.
     pub gaussian_k: usize,
+    /// Where distances are taken for the sampling; neighbours and nearest anchors are always those of the world.
+    pub space: Space,
     /// Seed of the first anchor.
     pub seed: u64,
 }
 
 impl Default for GraphOptions {
     fn default() -> Self {
-        Self { anchor_ratio: 0.1, k: 16, gaussian_k: 16, seed: 0 }
+        Self { anchor_ratio: 0.1, k: 16, gaussian_k: 16, space: Space::World, seed: 0 }
     }
 }
 
@@ -45,18 +57,61 @@ pub fn anchor_graph(points: &[[f32; 3]], options: &GraphOptions) -> AnchorGraph 
     if n == 0 {
         return AnchorGraph::default();
     }
-    let tree = KdTree::new(points);
     let count = ((n as f64 * options.anchor_ratio) as usize).clamp(1, n);
     let start = ChaCha8Rng::seed_from_u64(options.seed).random_range(0..n as u32);
-    let sample = farthest_points(&tree, count, start);
-    let anchor_points: Vec<[f32; 3]> = sample.anchors.iter().map(|&a| points[a as usize]).collect();
-    let queries: Vec<_> = sample.anchors.iter().map(|&a| (points[a as usize], Some(a))).collect();
+    let tree = KdTree::new(points);
+    // Sampling is one long chain of choices for one core; neighbours keep the others busy meanwhile.
+    let (gaussian_knn, sample) = rayon::join(
+        || tree.all_nearest(options.gaussian_k),
+        || match options.space {
+            Space::World => farthest_points(&tree, count, start),
+            Space::Contracted => farthest_points(&KdTree::new(&contracted(points)), count, start),
+        },
+    );
+    let anchors = sample.anchors;
+    let anchor_points: Vec<[f32; 3]> = anchors.iter().map(|&a| points[a as usize]).collect();
+    let anchor_tree = KdTree::new(&anchor_points);
+    let nearest_anchor = match options.space {
+        Space::World => sample.nearest,
+        Space::Contracted => {
+            let queries: Vec<_> = points.iter().map(|&p| (p, None)).collect();
+            anchor_tree.nearest_many(&queries, 1, |_| 0)
+        }
+    };
+    let queries: Vec<_> = anchors.iter().map(|&a| (points[a as usize], Some(a))).collect();
     AnchorGraph {
-        knn: tree.nearest_many(&queries, options.k, |m| sample.anchors[m]),
-        anchor_knn: KdTree::new(&anchor_points).all_nearest(options.k),
-        gaussian_knn: tree.all_nearest(options.gaussian_k),
-        nearest_anchor: sample.nearest,
-        anchors: sample.anchors,
+        knn: tree.nearest_many(&queries, options.k, |m| anchors[m]),
+        anchor_knn: anchor_tree.all_nearest(options.k),
+        gaussian_knn,
+        nearest_anchor,
+        anchors,
+    }
+}
+
+/// How far Gaussians are from their anchors, in world units: the p-th largest of all distances.
+#[derive(Debug, Clone, Copy, Default, PartialEq, serde::Serialize)]
+pub struct AnchorDistances {
+    /// Half are nearer.
+    pub median: f64,
+    /// Nine of ten are nearer.
+    pub p90: f64,
+    /// 99 of 100 are nearer.
+    pub p99: f64,
+    /// None is farther.
+    pub largest: f64,
+}
+
+impl AnchorGraph {
+    /// Distribution of the distances of `points` (those that the graph was made of) to their nearest anchors.
+    pub fn distances(&self, points: &[[f32; 3]]) -> AnchorDistances {
+        let to_anchor = |(p, &a): (&[f32; 3], &u32)| distance(points[self.anchors[a as usize] as usize], *p);
+        let mut all: Vec<f32> = points.iter().zip(&self.nearest_anchor).map(to_anchor).collect();
+        all.sort_unstable_by(f32::total_cmp);
+        let at = |share: f64| {
+            let rank = (share * all.len() as f64).ceil() as usize;
+            all.get(rank.max(1) - 1).map_or(0.0, |d| f64::from(*d).sqrt())
+        };
+        AnchorDistances { median: at(0.5), p90: at(0.9), p99: at(0.99), largest: at(1.0) }
     }
 }
 
@@ -71,8 +126,14 @@ mod tests {
     proptest! {
         #![proptest_config(ProptestConfig::with_cases(60))]
         #[test]
-        fn the_graph_is_what_it_says(p in points(1..250), ratio in 0.01f64..1.0, seed in 0u64..9) {
-            let options = GraphOptions { anchor_ratio: ratio, k: 5, gaussian_k: 3, seed };
+        fn the_graph_is_what_it_says(
+            p in points(1..250),
+            ratio in 0.01f64..1.0,
+            seed in 0u64..9,
+            contract in proptest::bool::ANY,
+        ) {
+            let space = if contract { Space::Contracted } else { Space::World };
+            let options = GraphOptions { anchor_ratio: ratio, k: 5, gaussian_k: 3, space, seed };
             let g = anchor_graph(&p, &options);
             let m = g.anchors.len();
             prop_assert_eq!(m, ((p.len() as f64 * ratio) as usize).max(1));
@@ -96,6 +157,33 @@ mod tests {
             let padded_with_self = p.len() > 5 || g.knn.chunks_exact(5).zip(&g.anchors).all(|(row, a)| row[4] == *a);
             prop_assert!(padded_with_self);
         }
+    }
+
+    #[test]
+    fn distances_to_anchors_are_summed_up() {
+        // Ten points in a row, the anchor first: distances 0 to 9.
+        let points: Vec<[f32; 3]> = (0..10).map(|i| [i as f32, 0.0, 0.0]).collect();
+        let g = AnchorGraph { anchors: vec![0], nearest_anchor: vec![0; 10], ..AnchorGraph::default() };
+        assert_eq!(g.distances(&points), AnchorDistances { median: 4.0, p90: 8.0, p99: 9.0, largest: 9.0 });
+        assert_eq!(AnchorGraph::default().distances(&[]), AnchorDistances::default());
+    }
+
+    #[test]
+    fn a_far_background_takes_most_anchors_unless_it_is_contracted() {
+        let mut rng = ChaCha8Rng::seed_from_u64(6);
+        // 9 of 10 points in a room of 2 units, the rest up to 200 units away.
+        let p: Vec<[f32; 3]> = (0..10_000)
+            .map(|i| {
+                let r = if i % 10 == 0 { 200.0 } else { 1.0 };
+                std::array::from_fn(|_| rng.random_range(-r..r))
+            })
+            .collect();
+        let room = |space| {
+            let g = anchor_graph(&p, &GraphOptions { space, ..GraphOptions::default() });
+            g.anchors.iter().filter(|&&a| !a.is_multiple_of(10)).count()
+        };
+        let (world, contracted) = (room(Space::World), room(Space::Contracted));
+        assert!(world < 100 && contracted > 500, "{world} {contracted} of 1000");
     }
 
     #[test]

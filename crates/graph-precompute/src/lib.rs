@@ -4,6 +4,7 @@
 //! the Gaussians that were seen and finds neighbours. `docs/method.md` has the equations.
 
 pub mod cli;
+pub mod contract;
 pub mod footprint;
 pub mod fps;
 pub mod graph;

@@ -1,7 +1,7 @@
 //! The whole stage: footprints of all views, then the graph over the Gaussians that were seen.
 
 use crate::footprint::view_footprints;
-use crate::graph::{GraphOptions, anchor_graph};
+use crate::graph::{AnchorDistances, GraphOptions, anchor_graph};
 use crate::positions::shifted;
 use artifacts::{FootprintsBuilder, Graph, MaskMaps, maps_path};
 use gs_io::{Error, Result};
@@ -39,10 +39,14 @@ impl Default for Options {
 pub struct Summary {
     /// Gaussians of the geometry.
     pub gaussians: usize,
-    /// Of these, Gaussians that take part.
+    /// Of these, Gaussians without a usable position (not finite, or beyond 1e18).
+    pub unusable: usize,
+    /// Gaussians that take part.
     pub kept: usize,
     /// Anchors.
     pub anchors: usize,
+    /// How far the Gaussians that take part are from their anchors.
+    pub anchor_distance: AnchorDistances,
     /// Views with masks.
     pub views: usize,
     /// Masks that own enough pixels, over all views and levels.
@@ -106,7 +110,8 @@ pub fn precompute(
         stage.warn(&format!("{} of {n} Gaussians have no usable position and are left out", n - usable.len()));
     }
     let mut out = FootprintsBuilder { row_ptr: vec![0], ..FootprintsBuilder::default() };
-    let mut summary = Summary { gaussians: n, views: with_masks.len(), ..Summary::default() };
+    let mut summary =
+        Summary { gaussians: n, unusable: n - usable.len(), views: with_masks.len(), ..Summary::default() };
     let mut seen_views = vec![0u32; n];
     let mut seen_weight = vec![0f64; n];
     let mut progress = stage.progress("views", with_masks.len() as u64);
@@ -163,7 +168,8 @@ pub fn precompute(
         stage.skipped(&format!("{} of {n} Gaussians: never seen", n - kept.len()));
     }
     renumber(&mut out.col, &kept, n);
-    let graph = graph_of(gaussians, &kept, seen_views, &seen_weight, options);
+    let (graph, anchor_distance) = graph_of(gaussians, &kept, seen_views, &seen_weight, options);
+    summary.anchor_distance = anchor_distance;
     summary.kept = kept.len();
     summary.anchors = graph.anchors.len();
     summary.masks = out.rows.len();
@@ -189,11 +195,12 @@ fn graph_of(
     seen_views: Vec<u32>,
     seen_weight: &[f64],
     options: &Options,
-) -> Graph {
+) -> (Graph, AnchorDistances) {
     let means: Vec<[f32; 3]> = kept.iter().map(|&i| gaussians.means[i as usize]).collect();
     let points = shifted(&means).points;
     let g = anchor_graph(&points, &options.graph);
-    Graph {
+    let distances = g.distances(&points);
+    let graph = Graph {
         kept: kept.to_vec(),
         anchors: g.anchors,
         k: options.graph.k,
@@ -204,5 +211,6 @@ fn graph_of(
         gaussian_knn: g.gaussian_knn,
         seen_views,
         seen_weight: seen_weight.iter().map(|&w| w as f32).collect(),
-    }
+    };
+    (graph, distances)
 }

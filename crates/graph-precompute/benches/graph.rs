@@ -1,0 +1,59 @@
+//! Times the anchor graph on a file of positions: `cargo bench -p graph-precompute --bench graph -- POSITIONS.npy [RUNS]`.
+//! Prints one JSON object; scripts/bench_graph.py puts another library's figures beside it.
+
+use graph_precompute::fps::farthest_points;
+use graph_precompute::kdtree::KdTree;
+use graph_precompute::positions::shifted;
+use serde_json::json;
+use std::time::Instant;
+
+fn main() {
+    let mut arguments = std::env::args().skip(1).filter(|a| a != "--bench");
+    let Some(file) = arguments.next() else {
+        // `cargo test --benches` comes without a file: nothing to measure.
+        return;
+    };
+    let runs: usize = arguments.next().map_or(3, |r| r.parse().expect("a number of runs"));
+    let array = gs_io::npy::read_f32(&file).expect("positions, f32 [n, 3]");
+    let means: Vec<[f32; 3]> = array.data.chunks_exact(3).map(|p| [p[0], p[1], p[2]]).collect();
+    drop(array);
+    let k = 16;
+    let mut seconds = Vec::new();
+    let mut digest = String::new();
+    for _ in 0..runs.max(1) {
+        let clock = Instant::now();
+        let points = shifted(&means).points;
+        let tree = KdTree::new(&points);
+        let build = clock.elapsed().as_secs_f64();
+        let clock = Instant::now();
+        let sample = farthest_points(&tree, (points.len() / 10).max(1), 0);
+        let fps = clock.elapsed().as_secs_f64();
+        let clock = Instant::now();
+        let anchors: Vec<[f32; 3]> = sample.anchors.iter().map(|&a| points[a as usize]).collect();
+        let queries: Vec<_> = sample.anchors.iter().map(|&a| (points[a as usize], Some(a))).collect();
+        let among_all = tree.nearest_many(&queries, k, |m| sample.anchors[m]);
+        let among_anchors = KdTree::new(&anchors).all_nearest(k);
+        let knn = clock.elapsed().as_secs_f64();
+        seconds.push(json!({"tree": build, "fps": fps, "knn": knn, "nearest": 0.0, "total": build + fps + knn}));
+        let bytes = |v: &[u32]| gs_io::hash_bytes(&v.iter().flat_map(|i| i.to_le_bytes()).collect::<Vec<u8>>());
+        digest = [&sample.anchors[..], &sample.nearest, &among_all, &among_anchors].map(bytes).join(" ");
+        if let Ok(folder) = std::env::var("GRAPH_OUT") {
+            let write = |name: &str, v: &[u32], width: usize| {
+                let v: Vec<i32> = v.iter().map(|&i| i as i32).collect();
+                let path = format!("{folder}/{name}.npy");
+                gs_io::npy::write_i32(path, &[v.len() / width, width], &v).expect("a folder to write to");
+            };
+            write("anchors", &sample.anchors, 1);
+            write("nearest", &sample.nearest, 1);
+            write("knn", &among_all, k);
+            write("anchor_knn", &among_anchors, k);
+        }
+    }
+    let peak = stage::peak_rss_bytes();
+    eprintln!("digest {digest}");
+    let out = json!({"n": means.len(), "anchors": means.len() / 10, "k": k, "runs": seconds, "peak_rss_bytes": peak});
+    #[allow(clippy::print_stdout, reason = "the result of the program")]
+    {
+        println!("{out}");
+    }
+}
