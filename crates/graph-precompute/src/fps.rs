@@ -4,7 +4,9 @@
 //! change nodes whose box is nearer to it than that; all others are passed over. The point with the largest distance at
 //! the root is the next anchor, and when the sampling ends every point knows its nearest anchor.
 
-use crate::kdtree::{KdTree, distance};
+use crate::kdtree::{KdTree, LANES, distance};
+use multiversion::multiversion;
+use std::ops::Range;
 
 /// Anchors and whom they serve.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -33,11 +35,12 @@ pub fn farthest_points(tree: &KdTree, count: usize, start: u32) -> Sample {
         nearest: vec![0; n],
         farthest: vec![(f32::INFINITY, u32::MAX); tree.nodes.len()],
     };
+    let (mut stack, mut entered) = (Vec::new(), Vec::new());
     let mut anchors = Vec::with_capacity(count);
     let mut next = start;
     for anchor in 0..count as u32 {
         anchors.push(next);
-        state.add(anchor, slot_of[next as usize]);
+        add(&mut state, anchor, slot_of[next as usize], &mut stack, &mut entered);
         next = state.farthest[0].1;
     }
     let mut nearest = vec![0; n];
@@ -57,42 +60,71 @@ struct State<'a> {
     farthest: Vec<(f32, u32)>,
 }
 
-impl State<'_> {
-    fn add(&mut self, anchor: u32, slot: u32) {
-        self.visit(0, anchor, slot, self.tree.at(slot as usize));
+/// Takes the point in `slot` as `anchor`: updates what is nearer to it than to any anchor before, and the farthest points
+/// of the nodes on the way. `stack` and `entered` are scratch.
+#[multiversion(targets("x86_64+avx2+fma", "aarch64+neon"))]
+fn add(state: &mut State<'_>, anchor: u32, slot: u32, stack: &mut Vec<u32>, entered: &mut Vec<u32>) {
+    let q = state.tree.at(slot as usize);
+    // A point that coincides with an earlier anchor stays with that.
+    if state.nearest_distance[slot as usize] > 0.0 {
+        state.nearest[slot as usize] = anchor;
     }
-
-    fn visit(&mut self, id: usize, anchor: u32, slot: u32, q: [f32; 3]) {
-        let node = self.tree.nodes[id];
+    state.nearest_distance[slot as usize] = -1.0;
+    stack.clear();
+    entered.clear();
+    stack.push(0);
+    while let Some(id) = stack.pop() {
+        let node = &state.tree.nodes[id as usize];
         let holds_anchor = (node.start..node.end).contains(&slot);
-        if !holds_anchor && node.distance(q) >= self.farthest[id].0 {
-            return;
+        if !holds_anchor && node.distance(q) >= state.farthest[id as usize].0 {
+            continue;
         }
         if node.right == 0 {
-            self.farthest[id] = self.update_leaf(node.start as usize..node.end as usize, anchor, slot, q);
+            let slots = node.start as usize..node.end as usize;
+            state.farthest[id as usize] = update_leaf(state, slots, anchor, q);
         } else {
-            let (left, right) = (id + 1, node.right as usize);
-            self.visit(left, anchor, slot, q);
-            self.visit(right, anchor, slot, q);
-            self.farthest[id] = farther(self.farthest[left], self.farthest[right]);
+            entered.push(id);
+            stack.push(node.right);
+            stack.push(id + 1);
         }
     }
+    // Children were entered after their parents.
+    for &id in entered.iter().rev() {
+        let (left, right) = (id as usize + 1, state.tree.nodes[id as usize].right as usize);
+        state.farthest[id as usize] = farther(state.farthest[left], state.farthest[right]);
+    }
+}
 
-    fn update_leaf(&mut self, slots: std::ops::Range<usize>, anchor: u32, slot: u32, q: [f32; 3]) -> (f32, u32) {
-        let mut best = (f32::NEG_INFINITY, u32::MAX);
-        for s in slots {
-            let d = distance(q, self.tree.at(s));
-            if d < self.nearest_distance[s] {
-                self.nearest_distance[s] = d;
-                self.nearest[s] = anchor;
-            }
-            if s == slot as usize {
-                self.nearest_distance[s] = -1.0;
-            }
-            best = farther(best, (self.nearest_distance[s], self.tree.index[s]));
+/// Updates the points of a leaf, whose indices ascend; returns the farthest of them.
+#[inline(always)]
+fn update_leaf(state: &mut State<'_>, slots: Range<usize>, anchor: u32, q: [f32; 3]) -> (f32, u32) {
+    let [x, y, z] = [0, 1, 2].map(|a| &state.tree.axes[a][slots.clone()]);
+    let distances = &mut state.nearest_distance[slots.clone()];
+    let nearest = &mut state.nearest[slots.clone()];
+    let n = distances.len();
+    assert!(x.len() == n && y.len() == n && z.len() == n && nearest.len() == n);
+    // Lane by lane, so that the compiler may use vectors.
+    let mut most = [f32::NEG_INFINITY; LANES];
+    let mut one = |i: usize, most: &mut f32| {
+        let d = distance(q, [x[i], y[i], z[i]]);
+        let nearer = d < distances[i];
+        distances[i] = if nearer { d } else { distances[i] };
+        nearest[i] = if nearer { anchor } else { nearest[i] };
+        *most = if distances[i] > *most { distances[i] } else { *most };
+    };
+    let whole = n - n % LANES;
+    for i in (0..whole).step_by(LANES) {
+        for (l, most) in most.iter_mut().enumerate() {
+            one(i + l, most);
         }
-        best
     }
+    for i in whole..n {
+        one(i, &mut most[i - whole]);
+    }
+    let most = most.into_iter().fold(f32::NEG_INFINITY, f32::max);
+    // Indices ascend within a leaf: the first is the lowest among equals.
+    let first = distances.iter().position(|&d| d == most).unwrap_or(0);
+    (most, state.tree.index[slots.start + first])
 }
 
 /// The farther of two points, the lower index among equals.

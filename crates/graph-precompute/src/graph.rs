@@ -78,9 +78,8 @@ pub fn anchor_graph(points: &[[f32; 3]], options: &GraphOptions) -> AnchorGraph 
             anchor_tree.nearest_many(&queries, 1, |_| 0)
         }
     };
-    let queries: Vec<_> = anchors.iter().map(|&a| (points[a as usize], Some(a))).collect();
     AnchorGraph {
-        knn: tree.nearest_many(&queries, options.k, |m| anchors[m]),
+        knn: tree.nearest_to(&anchors, options.k),
         anchor_knn: anchor_tree.all_nearest(options.k),
         gaussian_knn,
         nearest_anchor,

@@ -5,10 +5,13 @@
 //! bit for bit what brute force gives. Every node knows its smallest index, which keeps thousands of coinciding points
 //! from being compared with each other.
 
+use multiversion::multiversion;
 use rayon::prelude::*;
 
+/// Points that are worked on side by side; leaves hold multiples of it, but for the last.
+pub(crate) const LANES: usize = 8;
 /// Points in a leaf, at most.
-const LEAF: usize = 24;
+const LEAF: usize = 32;
 /// Queries answered together.
 const CHUNK: usize = 1024;
 /// Subtrees smaller than this are built by one thread.
@@ -39,7 +42,7 @@ pub(crate) struct Node {
 
 impl Node {
     /// Squared distance from `q` to the box; 0 inside.
-    #[inline]
+    #[inline(always)]
     pub(crate) fn distance(&self, q: [f32; 3]) -> f32 {
         let d = |a: usize| (self.lo[a] - q[a]).max(q[a] - self.hi[a]).max(0.0);
         let [x, y, z] = [d(0), d(1), d(2)];
@@ -48,27 +51,33 @@ impl Node {
 }
 
 /// Squared distance as this crate computes it everywhere.
-#[inline]
+#[inline(always)]
 pub fn distance(a: [f32; 3], b: [f32; 3]) -> f32 {
     let [x, y, z] = [b[0] - a[0], b[1] - a[1], b[2] - a[2]];
     x * x + y * y + z * z
 }
 
+/// Points of the left child of a node of `n` points: half, rounded to whole lanes.
+fn left_count(n: usize) -> usize {
+    (n / 2).next_multiple_of(LANES)
+}
+
 /// Nodes of a tree over `n` points.
 fn node_count(n: usize) -> usize {
-    if n <= LEAF { 1 } else { 1 + node_count(n / 2) + node_count(n - n / 2) }
+    if n <= LEAF { 1 } else { 1 + node_count(left_count(n)) + node_count(n - left_count(n)) }
 }
 
 impl KdTree {
     /// Builds the tree over finite `points`; their indices are their positions in the slice.
     pub fn new(points: &[[f32; 3]]) -> Self {
-        let mut index: Vec<u32> = (0..points.len() as u32).collect();
+        // Points and indices side by side: the build moves them together and never jumps in memory.
+        let mut items: Vec<Item> = points.iter().enumerate().map(|(i, &p)| Item { p, index: i as u32 }).collect();
         let mut nodes = vec![Node::default(); if points.is_empty() { 0 } else { node_count(points.len()) }];
         if !points.is_empty() {
-            build(points, &mut index, &mut nodes, 0, 0);
+            build(&mut items, &mut nodes, 0, 0);
         }
-        let axes = [0, 1, 2].map(|a| index.iter().map(|&i| points[i as usize][a]).collect());
-        Self { nodes, index, axes }
+        let axes = [0, 1, 2].map(|a| items.iter().map(|item| item.p[a]).collect());
+        Self { nodes, index: items.iter().map(|item| item.index).collect(), axes }
     }
 
     /// The point in a slot.
@@ -81,58 +90,8 @@ impl KdTree {
     /// result: (squared distance, index).
     pub fn nearest(&self, q: [f32; 3], k: usize, except: Option<u32>, found: &mut Vec<(f32, u32)>) {
         found.clear();
-        if k == 0 || self.nodes.is_empty() {
-            return;
-        }
-        // Preorder of a balanced tree: the stack holds one node per level.
-        let mut stack = [(0.0f32, 0u32); 64];
-        let mut depth = 1;
-        while depth > 0 {
-            depth -= 1;
-            let (box_distance, mut id) = stack[depth];
-            let beaten = |d: f32, min_index: u32, found: &[(f32, u32)]| {
-                found.len() == k && found.last().is_some_and(|&(fd, fi)| (d, min_index) > (fd, fi))
-            };
-            if beaten(box_distance, self.nodes[id as usize].min_index, found) {
-                continue;
-            }
-            loop {
-                let node = &self.nodes[id as usize];
-                if node.right == 0 {
-                    self.scan(node, q, k, except, found);
-                    break;
-                }
-                let (left, right) = (id + 1, node.right);
-                let (l, r) = (&self.nodes[left as usize], &self.nodes[right as usize]);
-                let (dl, dr) = (l.distance(q), r.distance(q));
-                let left_first = (dl, l.min_index) < (dr, r.min_index);
-                let (near, far, d_far) = if left_first { (left, right, dr) } else { (right, left, dl) };
-                if !beaten(d_far, self.nodes[far as usize].min_index, found) {
-                    stack[depth] = (d_far, far);
-                    depth += 1;
-                }
-                id = near;
-            }
-        }
-    }
-
-    fn scan(&self, node: &Node, q: [f32; 3], k: usize, except: Option<u32>, found: &mut Vec<(f32, u32)>) {
-        let (start, end) = (node.start as usize, node.end as usize);
-        let mut distances = [0.0f32; LEAF];
-        let [x, y, z] = [0, 1, 2].map(|a| &self.axes[a][start..end]);
-        for (i, d) in distances[..end - start].iter_mut().enumerate() {
-            *d = distance(q, [x[i], y[i], z[i]]);
-        }
-        for (&d, &i) in distances.iter().zip(&self.index[start..end]) {
-            let full = found.len() == k;
-            if Some(i) == except || (full && (d, i) > found[k - 1]) {
-                continue;
-            }
-            if full {
-                found.pop();
-            }
-            let at = found.partition_point(|&f| f < (d, i));
-            found.insert(at, (d, i));
+        if k > 0 && !self.nodes.is_empty() {
+            search(self, q, k, except, found);
         }
     }
 
@@ -160,9 +119,25 @@ impl KdTree {
         out
     }
 
+    /// The `k` nearest other points of the points `of`, `[of][k]` by index; filled up with the point itself.
+    pub fn nearest_to(&self, of: &[u32], k: usize) -> Vec<u32> {
+        // In slot order, so that one query's leaves are still in the cache for the next.
+        let mut slot_of = vec![0u32; self.index.len()];
+        self.index.iter().enumerate().for_each(|(slot, &i)| slot_of[i as usize] = slot as u32);
+        let mut order: Vec<u32> = (0..of.len() as u32).collect();
+        order.sort_unstable_by_key(|&o| slot_of[of[o as usize] as usize]);
+        let queries: Vec<_> =
+            order.iter().map(|&o| (self.at(slot_of[of[o as usize] as usize] as usize), Some(of[o as usize]))).collect();
+        let sorted = self.nearest_many(&queries, k, |q| of[order[q] as usize]);
+        let mut out = vec![0u32; sorted.len()];
+        for (row, &o) in sorted.chunks_exact(k.max(1)).zip(&order) {
+            out[o as usize * k..(o as usize + 1) * k].copy_from_slice(row);
+        }
+        out
+    }
+
     /// The `k` nearest other points of every point, `[points][k]` by index; filled up with the point itself.
     pub fn all_nearest(&self, k: usize) -> Vec<u32> {
-        // In slot order, so that one query's leaves are still in the cache for the next.
         let queries: Vec<_> = (0..self.index.len()).map(|s| (self.at(s), Some(self.index[s]))).collect();
         let by_slot = self.nearest_many(&queries, k, |s| self.index[s]);
         let mut out = vec![0u32; by_slot.len()];
@@ -173,34 +148,110 @@ impl KdTree {
     }
 }
 
-/// Builds the subtree over `index` into `nodes`; `first_slot` and `first_node` are where the two begin in the tree.
-fn build(points: &[[f32; 3]], index: &mut [u32], nodes: &mut [Node], first_slot: usize, first_node: usize) {
-    let (mut lo, mut hi) = ([f32::INFINITY; 3], [f32::NEG_INFINITY; 3]);
-    for &i in index.iter() {
-        for a in 0..3 {
-            lo[a] = lo[a].min(points[i as usize][a]);
-            hi[a] = hi[a].max(points[i as usize][a]);
+/// [`KdTree::nearest`] in a tree that is not empty, for k > 0.
+#[multiversion(targets("x86_64+avx2+fma", "aarch64+neon"))]
+fn search(tree: &KdTree, q: [f32; 3], k: usize, except: Option<u32>, found: &mut Vec<(f32, u32)>) {
+    // Preorder of a balanced tree: the stack holds one node per level.
+    let mut stack = [(0.0f32, 0u32); 64];
+    let mut depth = 1;
+    let mut worst = (f32::INFINITY, u32::MAX);
+    while depth > 0 {
+        depth -= 1;
+        let (box_distance, mut id) = stack[depth];
+        if (box_distance, tree.nodes[id as usize].min_index) > worst {
+            continue;
+        }
+        loop {
+            let node = &tree.nodes[id as usize];
+            if node.right == 0 {
+                scan(tree, node, q, k, except, found, &mut worst);
+                break;
+            }
+            let (left, right) = (id + 1, node.right);
+            let (l, r) = (&tree.nodes[left as usize], &tree.nodes[right as usize]);
+            let (dl, dr) = (l.distance(q), r.distance(q));
+            let left_first = (dl, l.min_index) < (dr, r.min_index);
+            let (near, far, d_far) = if left_first { (left, right, dr) } else { (right, left, dl) };
+            if (d_far, tree.nodes[far as usize].min_index) <= worst {
+                stack[depth] = (d_far, far);
+                depth += 1;
+            }
+            id = near;
         }
     }
-    let n = index.len();
-    let min_index = index.iter().copied().min().unwrap_or(0);
+}
+
+/// Takes a leaf's points into `found`. `worst` is the last that a better one may push out, or infinity while there is room.
+#[inline(always)]
+fn scan(
+    tree: &KdTree,
+    node: &Node,
+    q: [f32; 3],
+    k: usize,
+    except: Option<u32>,
+    found: &mut Vec<(f32, u32)>,
+    worst: &mut (f32, u32),
+) {
+    let (start, end) = (node.start as usize, node.end as usize);
+    let mut distances = [0.0f32; LEAF];
+    let distances = &mut distances[..end - start];
+    let [x, y, z] = [0, 1, 2].map(|a| &tree.axes[a][start..end]);
+    for (((d, &x), &y), &z) in distances.iter_mut().zip(x).zip(y).zip(z) {
+        *d = distance(q, [x, y, z]);
+    }
+    for (&d, &i) in distances.iter().zip(&tree.index[start..end]) {
+        if d > worst.0 || (d, i) > *worst || Some(i) == except {
+            continue;
+        }
+        if found.len() == k {
+            found.pop();
+        }
+        // From the end: most that come in do so near it.
+        let mut at = found.len();
+        while at > 0 && found[at - 1] > (d, i) {
+            at -= 1;
+        }
+        found.insert(at, (d, i));
+        if found.len() == k {
+            *worst = found[k - 1];
+        }
+    }
+}
+
+#[derive(Debug, Clone, Copy)]
+struct Item {
+    p: [f32; 3],
+    index: u32,
+}
+
+/// Builds the subtree over `items` into `nodes`; `first_slot` and `first_node` are where the two begin in the tree.
+fn build(items: &mut [Item], nodes: &mut [Node], first_slot: usize, first_node: usize) {
+    let (mut lo, mut hi, mut min_index) = ([f32::INFINITY; 3], [f32::NEG_INFINITY; 3], u32::MAX);
+    for item in items.iter() {
+        for a in 0..3 {
+            lo[a] = if item.p[a] < lo[a] { item.p[a] } else { lo[a] };
+            hi[a] = if item.p[a] > hi[a] { item.p[a] } else { hi[a] };
+        }
+        min_index = min_index.min(item.index);
+    }
+    let n = items.len();
     let mut node = Node { lo, hi, start: first_slot as u32, end: (first_slot + n) as u32, min_index, right: 0 };
     if n <= LEAF {
-        index.sort_unstable();
+        items.sort_unstable_by_key(|item| item.index);
         nodes[0] = node;
         return;
     }
     let axis = (0..3).fold(0, |best, a| if hi[a] - lo[a] > hi[best] - lo[best] { a } else { best });
-    let key = |i: &u32| points[*i as usize][axis];
     // The index breaks ties, so the tree is one and the same however often it is built.
-    index.select_nth_unstable_by(n / 2, |a, b| key(a).total_cmp(&key(b)).then(a.cmp(b)));
-    let left_nodes = node_count(n / 2);
+    let middle = left_count(n);
+    items.select_nth_unstable_by(middle, |a, b| a.p[axis].total_cmp(&b.p[axis]).then(a.index.cmp(&b.index)));
+    let left_nodes = node_count(middle);
     node.right = (first_node + 1 + left_nodes) as u32;
     nodes[0] = node;
-    let (left, right) = index.split_at_mut(n / 2);
+    let (left, right) = items.split_at_mut(middle);
     let (left_tree, right_tree) = nodes[1..].split_at_mut(left_nodes);
-    let mut build_left = || build(points, left, left_tree, first_slot, first_node + 1);
-    let mut build_right = || build(points, right, right_tree, first_slot + n / 2, first_node + 1 + left_nodes);
+    let mut build_left = || build(left, left_tree, first_slot, first_node + 1);
+    let mut build_right = || build(right, right_tree, first_slot + middle, first_node + 1 + left_nodes);
     if n >= PARALLEL_BUILD {
         rayon::join(build_left, build_right);
     } else {
