@@ -2,10 +2,13 @@
 //!
 //! In each round every component needs its cheapest edge to another one. A point remembers the cheapest edge it found; it
 //! stays the cheapest as long as its other end is in another component. It also remembers a floor that no later edge of it
-//! can be below, because components only grow. So most points are not searched again in most rounds.
+//! can be below, because components only grow. So most points are not searched again in most rounds. The neighbours that the
+//! core distances were found with are candidates: they tell at once how cheap an edge a component has at least, and an edge
+//! that is no heavier than the point's own core distance cannot be beaten.
 
-use crate::kdtree::{KdTree, squared};
+use crate::kdtree::{KdTree, NONE, Neighbours, neighbours, squared, surely};
 use crate::linkage::{Edge, UnionFind};
+use multiversion::multiversion;
 use rayon::prelude::*;
 use std::sync::atomic::{AtomicU64, Ordering::Relaxed};
 
@@ -39,7 +42,7 @@ impl Caps {
 struct Search<'a> {
     tree: &'a KdTree,
     /// Core distance of each point, and the least of each node.
-    core: Vec<f64>,
+    core: &'a [f64],
     least_core: Vec<f64>,
     /// Component of each point, and of each node ([`MIXED`] where there are several).
     component: Vec<u32>,
@@ -49,57 +52,114 @@ struct Search<'a> {
 /// An edge of a point, and its other end in tree order.
 type Found = Option<(Edge, u32)>;
 
+/// What a point knows.
+#[derive(Debug, Clone, Copy)]
+struct Known {
+    /// Its cheapest edge to another component.
+    best: Found,
+    /// No edge of it to another component is below this weight.
+    floor: f64,
+    /// The next of its candidates that may be in another component.
+    next: u32,
+}
+
+/// Neighbours of a point in the order of their edges.
+struct Candidates<'a> {
+    of: &'a Neighbours,
+    /// Places in the tree, `[n][kept]`.
+    places: Vec<u32>,
+}
+
+impl<'a> Candidates<'a> {
+    fn new(search: &Search<'_>, of: &'a Neighbours) -> Self {
+        let mut places = of.near.clone();
+        places.par_chunks_mut(of.kept).enumerate().with_min_len(256).for_each(|(i, row)| {
+            let count = row.iter().position(|&q| q == NONE).unwrap_or(row.len());
+            let mut edges: Vec<(Edge, u32)> = row[..count].iter().map(|&q| (search.edge(i, q as usize), q)).collect();
+            edges.sort_unstable_by(|a, b| a.0.order(&b.0));
+            row.iter_mut().zip(edges).for_each(|(r, (_, q))| *r = q);
+        });
+        Self { of, places }
+    }
+
+    /// The first candidate of point `i` from `next` on that is in another component.
+    fn first(&self, search: &Search<'_>, i: usize, next: &mut u32) -> Found {
+        let row = &self.places[i * self.of.kept..(i + 1) * self.of.kept];
+        while let Some(&q) = row.get(*next as usize).filter(|q| **q != NONE) {
+            if search.component[q as usize] != search.component[i] {
+                return Some((search.edge(i, q as usize), q));
+            }
+            *next += 1;
+        }
+        None
+    }
+}
+
 /// The spanning tree of points `[n][dim]` under mutual reachability max(core a, core b, distance), n - 1 edges in ascending
-/// order. It is the minimum one of the total order of [`Edge::order`], which is unique.
+/// order, and the core distances it is made with. It is the minimum one of the total order of [`Edge::order`], which is
+/// unique. `weights` are how many points each stands for; see [`crate::Options::min_samples`].
 ///
 /// # Panics
-/// When `core` does not hold a number for every point.
-pub fn spanning_tree(points: &[f32], dim: usize, core: &[f64]) -> Vec<Edge> {
-    assert_eq!(points.len(), core.len() * dim, "one core distance a point");
-    let n = core.len();
-    if n < 2 {
-        return Vec::new();
-    }
+/// When there is not a weight for every point.
+pub fn spanning_tree(points: &[f32], dim: usize, weights: &[u32], min_samples: usize) -> (Vec<Edge>, Vec<f64>) {
+    let n = weights.len();
+    assert_eq!(points.len(), n * dim, "a weight for every point");
     let tree = KdTree::new(points, dim);
-    let mut search = Search::new(&tree, core);
+    let near = neighbours(&tree, weights, min_samples);
+    let mut core = vec![0.0; n];
+    for (&i, &c) in tree.order.iter().zip(&near.core) {
+        core[i as usize] = c;
+    }
+    if n < 2 {
+        return (Vec::new(), core);
+    }
+    let mut search = Search::new(&tree, &near.core);
+    let candidates = Candidates::new(&search, &near);
     let mut sets = UnionFind::new(n);
-    let mut best: Vec<Found> = vec![None; n];
-    let mut floor = search.core.clone();
+    let mut known: Vec<Known> = near.core.iter().map(|&floor| Known { best: None, floor, next: 0 }).collect();
     let mut caps = Caps::new(n);
     let mut out: Vec<Edge> = Vec::with_capacity(n - 1);
     while out.len() < n - 1 {
-        // What components know already.
+        // What points know already, for sure or as candidates.
         caps.reset();
-        for (i, known) in best.iter_mut().enumerate() {
-            match known {
-                Some((edge, q)) if search.component[*q as usize] != search.component[i] => {
-                    caps.lower(search.component[i], edge.weight);
+        known.par_iter_mut().enumerate().with_min_len(1024).for_each(|(i, k)| {
+            let own = search.component[i];
+            if !k.best.is_some_and(|(_, q)| search.component[q as usize] != own) {
+                // A candidate is the cheapest for sure when it costs no more than any edge of this point must, and no
+                // other point as near was left out of the candidates.
+                let first = candidates.first(&search, i, &mut k.next);
+                let certain = |(e, _): &(Edge, u32)| e.weight == near.core[i] && near.complete[i];
+                k.best = first.filter(certain);
+                if let Some((edge, _)) = first {
+                    caps.lower(own, edge.weight);
                 }
-                _ => *known = None,
             }
-        }
+            if let Some((edge, _)) = k.best {
+                caps.lower(own, edge.weight);
+            }
+        });
         // Points that may know something cheaper look for it.
-        best.par_iter_mut().zip(&mut floor).enumerate().with_min_len(256).for_each_init(
-            Vec::new,
-            |stack, (i, (known, floor))| {
-                if known.is_none() && *floor <= caps.get(search.component[i]) {
-                    let (found, least) = search.cheapest_edge(i, &caps, stack);
-                    (*known, *floor) = (found, floor.max(least));
+        known.par_iter_mut().enumerate().with_min_len(256).for_each_init(
+            || (Vec::new(), Vec::new()),
+            |(stack, padded), (i, k)| {
+                if k.best.is_none() && k.floor <= caps.get(search.component[i]) {
+                    let (found, least) = cheapest_edge(&search, i, &caps, stack, padded);
+                    (k.best, k.floor) = (found, k.floor.max(least));
                 }
             },
         );
         // Every component's cheapest edge joins; in one total order these edges close no cycle.
         let mut cheapest: Vec<Option<Edge>> = vec![None; n];
-        for (i, known) in best.iter().enumerate() {
-            if let Some((edge, _)) = known {
-                keep_less(&mut cheapest[search.component[i] as usize], *edge);
+        for (i, k) in known.iter().enumerate() {
+            if let Some((edge, _)) = k.best {
+                keep_less(&mut cheapest[search.component[i] as usize], edge);
             }
         }
         out.extend(cheapest.into_iter().flatten().filter(|e| sets.join(e.a, e.b)));
-        search.update(&mut sets);
+        search.update(&sets);
     }
-    out.sort_unstable_by(Edge::order);
-    out
+    out.par_sort_unstable_by(Edge::order);
+    (out, core)
 }
 
 fn keep_less(slot: &mut Option<Edge>, edge: Edge) {
@@ -109,23 +169,28 @@ fn keep_less(slot: &mut Option<Edge>, edge: Edge) {
 }
 
 impl<'a> Search<'a> {
-    fn new(tree: &'a KdTree, core: &[f64]) -> Self {
-        let core: Vec<f64> = tree.order.iter().map(|&i| core[i as usize]).collect();
+    fn new(tree: &'a KdTree, core: &'a [f64]) -> Self {
         let least = |points: &[f64]| points.iter().copied().fold(f64::INFINITY, f64::min);
         Self {
             least_core: tree.nodes.iter().map(|n| least(&core[n.start as usize..n.end as usize])).collect(),
-            component: (0..core.len() as u32).collect(),
+            component: tree.order.clone(),
             of_node: vec![MIXED; tree.nodes.len()],
             core,
             tree,
         }
     }
 
+    /// The edge between two places.
+    #[inline(always)]
+    fn edge(&self, i: usize, q: usize) -> Edge {
+        let distance = squared(self.tree.point(i), self.tree.point(q)).sqrt();
+        let weight = distance.max(self.core[i]).max(self.core[q]);
+        Edge::new(self.tree.order[i], self.tree.order[q], weight)
+    }
+
     /// Takes over the components of `sets`.
-    fn update(&mut self, sets: &mut UnionFind) {
-        for (c, &i) in self.component.iter_mut().zip(&self.tree.order) {
-            *c = sets.find(i);
-        }
+    fn update(&mut self, sets: &UnionFind) {
+        self.component.par_iter_mut().zip(&self.tree.order).with_min_len(4096).for_each(|(c, &i)| *c = sets.root(i));
         // Children come after their parents.
         for (at, node) in self.tree.nodes.iter().enumerate().rev() {
             self.of_node[at] = if node.right == 0 {
@@ -137,54 +202,63 @@ impl<'a> Search<'a> {
             };
         }
     }
+}
 
-    /// The cheapest edge from point `i` to another component, if its component knows none of less weight; and a weight that
-    /// no edge from `i` to another component is below.
-    fn cheapest_edge(&self, i: usize, caps: &Caps, stack: &mut Vec<(f64, u32)>) -> (Found, f64) {
-        let (p, own) = (self.tree.point(i), self.component[i]);
-        let mut found: Found = None;
-        let mut cap = caps.get(own);
-        // A lower bound of mutual reachability into a node.
-        let reach = |node: u32| {
-            let distance = self.tree.distance_to(node as usize, p).sqrt();
-            distance.max(self.core[i]).max(self.least_core[node as usize])
-        };
-        stack.clear();
-        stack.push((0.0, 0));
-        while let Some((low, node)) = stack.pop() {
-            // Edges of equal weight still matter: the order of indices decides among them.
-            if low > cap || self.of_node[node as usize] == own {
-                continue;
-            }
-            let n = self.tree.nodes[node as usize];
-            if n.right == 0 {
-                cap = cap.min(caps.get(own));
-                for q in n.start as usize..n.end as usize {
-                    if self.component[q] == own {
-                        continue;
-                    }
-                    let weight = squared(p, self.tree.point(q)).sqrt().max(self.core[i]).max(self.core[q]);
-                    if weight > cap {
-                        continue;
-                    }
-                    let edge = Edge::new(self.tree.order[i], self.tree.order[q], weight);
-                    if found.is_none_or(|(f, _)| edge.order(&f).is_lt()) {
-                        found = Some((edge, q as u32));
-                        cap = weight;
-                        caps.lower(own, weight);
-                    }
+/// The cheapest edge from point `i` to another component, if its component knows none of less weight; and a weight that no
+/// edge from `i` to another component is below. `stack` and `padded` are scratch.
+#[multiversion(targets("x86_64+avx2+fma", "aarch64+neon"))]
+fn cheapest_edge(
+    search: &Search<'_>,
+    i: usize,
+    caps: &Caps,
+    stack: &mut Vec<(f64, u32)>,
+    padded: &mut Vec<f32>,
+) -> (Found, f64) {
+    let tree = search.tree;
+    let (p, own) = (tree.point(i), search.component[i]);
+    tree.pad(i, padded);
+    let mut found: Found = None;
+    let mut cap = caps.get(own);
+    // Squared, and a little more than the rounding of root and square can take away.
+    let mut limit = cap * cap * (1.0 + 1e-12);
+    stack.clear();
+    stack.push((0.0, 0));
+    while let Some((bound, node)) = stack.pop() {
+        // Edges of equal weight still matter: the order of indices decides among them.
+        if bound > limit || search.least_core[node as usize] > cap || search.of_node[node as usize] == own {
+            continue;
+        }
+        let n = &tree.nodes[node as usize];
+        if n.right == 0 {
+            cap = cap.min(caps.get(own));
+            limit = cap * cap * (1.0 + 1e-12);
+            let roughly = tree.to_leaf(n, p);
+            for (q, &rough) in (n.start as usize..n.end as usize).zip(&roughly) {
+                if surely(rough) > limit || search.component[q] == own || search.core[q] > cap {
+                    continue;
                 }
-            } else {
-                // The nearer child is looked at first.
-                let (left, right) = (node + 1, n.right);
-                let (l, r) = (reach(left), reach(right));
-                let (near, far) = if l <= r { ((l, left), (r, right)) } else { ((r, right), (l, left)) };
-                stack.extend([far, near]);
+                let edge = search.edge(i, q);
+                if edge.weight <= cap && found.is_none_or(|(f, _)| edge.order(&f).is_lt()) {
+                    found = Some((edge, q as u32));
+                    cap = edge.weight;
+                    limit = cap * cap * (1.0 + 1e-12);
+                    caps.lower(own, cap);
+                }
+            }
+        } else {
+            // The nearer child is looked at first.
+            let (left, right) = (node + 1, n.right);
+            let (l, r) = (tree.to_box(left, padded), tree.to_box(right, padded));
+            let (near, far) = if l <= r { ((l, left), (r, right)) } else { ((r, right), (l, left)) };
+            for (d, child) in [far, near] {
+                if surely(d) <= limit {
+                    stack.push((surely(d), child));
+                }
             }
         }
-        // An edge above the cap need not be the point's cheapest: cheaper ones may have been passed over.
-        (found.filter(|(f, _)| f.weight <= cap), cap)
     }
+    // An edge above the cap need not be the point's cheapest: cheaper ones may have been passed over.
+    (found.filter(|(f, _)| f.weight <= cap), cap)
 }
 
 #[cfg(test)]
@@ -233,11 +307,14 @@ mod tests {
     #[test]
     fn a_line_is_spanned_by_its_gaps() {
         let points = [7.0f32, 0.0, 1.0, 3.5];
-        let edges = spanning_tree(&points, 1, &[0.0; 4]);
+        let (edges, core) = spanning_tree(&points, 1, &[1; 4], 1);
         assert_eq!(edges, [Edge::new(1, 2, 1.0), Edge::new(2, 3, 2.5), Edge::new(0, 3, 3.5)]);
-        // A core distance lifts every edge of its point.
-        assert_eq!(weights(&spanning_tree(&points, 1, &[0.0, 0.0, 3.0, 0.0])), [3.0, 3.0, 3.5]);
-        assert!(spanning_tree(&[1.0, 2.0], 2, &[0.0]).is_empty());
+        assert_eq!(core, [0.0; 4]);
+        // Core distances lift the edges of their points; a point that stands for three is its own neighbour.
+        let (edges, core) = spanning_tree(&points, 1, &[1, 1, 3, 1], 3);
+        assert_eq!(core, [6.0, 1.0, 0.0, 2.5]);
+        assert_eq!(weights(&edges), [1.0, 2.5, 6.0]);
+        assert!(spanning_tree(&[1.0, 2.0], 2, &[1], 4).0.is_empty());
     }
 
     #[test]
@@ -253,12 +330,13 @@ mod tests {
             .map(|v| ((v * 64.0).round() / 64.0) as f32)
             .collect();
         let unique = Unique::new(&points, 3);
-        let core = core_distances(&unique.points, 3, 8);
-        let expected = kruskal(&unique.points, 3, &core);
-        for threads in [1, 4] {
+        let spanned = |threads| {
             let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
-            assert_eq!(pool.install(|| spanning_tree(&unique.points, 3, &core)), expected, "{threads} threads");
-        }
+            pool.install(|| spanning_tree(&unique.points, 3, &unique.weights, 8))
+        };
+        let (edges, core) = spanned(1);
+        assert_eq!(edges, kruskal(&unique.points, 3, &core));
+        assert_eq!((edges, core), spanned(4));
     }
 
     proptest! {
@@ -290,7 +368,8 @@ mod tests {
             for (c, &u) in all_core.iter().zip(&unique.of_point) {
                 core[u as usize] = *c;
             }
-            let ours = spanning_tree(&unique.points, dim, &core);
+            let (ours, own_core) = spanning_tree(&unique.points, dim, &unique.weights, min_samples);
+            prop_assert_eq!(&own_core, &core);
             prop_assert_eq!(weights(&ours), prim(&unique.points, dim, &core));
             prop_assert_eq!(ours, kruskal(&unique.points, dim, &core));
         }

@@ -67,8 +67,7 @@ pub fn cluster(points: &[f32], dim: usize, options: &Options) -> Clustering {
     assert!(dim > 0 && points.len().is_multiple_of(dim), "points are [n][dim]");
     assert!(points.iter().all(|v| v.is_finite()), "points are finite");
     let unique = kdtree::Unique::new(points, dim);
-    let core = kdtree::core_distances_of(&unique, dim, options.min_samples);
-    let edges = spanning_tree(&unique.points, dim, &core);
+    let (edges, core) = spanning_tree(&unique.points, dim, &unique.weights, options.min_samples);
     let tree = condense::condense(&edges, &unique.weights, &core, options.min_cluster_size);
     select::label(tree, &unique.of_point, options)
 }

@@ -45,6 +45,14 @@ impl UnionFind {
         i
     }
 
+    /// The root of a set, for many readers at a time.
+    pub fn root(&self, mut i: u32) -> u32 {
+        while self.parent[i as usize] != i {
+            i = self.parent[i as usize];
+        }
+        i
+    }
+
     /// Joins two sets under the smaller root; false when they are one already.
     pub fn join(&mut self, a: u32, b: u32) -> bool {
         let (a, b) = (self.find(a), self.find(b));
