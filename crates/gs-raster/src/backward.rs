@@ -2,8 +2,8 @@
 
 use crate::forward::Forward;
 use crate::kernels::{TileGradients, backward_tile};
-use crate::project::{SplatGradient, project_backward};
-use crate::tiles::{PIXELS, TILE};
+use crate::single::project::{Parameters, SplatGradient, project_backward};
+use crate::tiles::{PIXELS, TILE, Tiles};
 use crate::types::{Gradients, PixelGradients, RasterOptions};
 use gs_scene::{Camera, Gaussians};
 use rayon::prelude::*;
@@ -42,7 +42,12 @@ pub fn backward(
         }
     });
 
-    // The pairs of each splat, in tile order.
+    gather(g, options, tiles, &pairs)
+}
+
+/// Sums the gradients of each splat over its tiles, in tile order, and takes them to the Gaussians' parameters. `pairs` is in
+/// the order of the tiles' entries.
+pub(crate) fn gather(g: &Gaussians, options: &RasterOptions, tiles: &Tiles, pairs: &[SplatGradient]) -> Gradients {
     let n = tiles.splats.len();
     let mut start = vec![0usize; n + 1];
     for &e in &tiles.entries {
@@ -69,7 +74,14 @@ pub fn backward(
             }
             let mut d_sh = [0.0f32; 48];
             let i_original = tiles.index[i] as usize;
-            let p = project_backward(g, i_original, &tiles.lens, options, &tiles.splats[i], &sum, &mut d_sh[..stride]);
+            let p = project_backward(
+                &Parameters::of(g, i_original),
+                &tiles.lens,
+                options,
+                &tiles.splats[i],
+                &sum,
+                &mut d_sh[..stride],
+            );
             (p, d_sh, sum.mean, sum.mean_abs)
         })
         .collect();

@@ -1,11 +1,11 @@
 //! The inner loops: one tile, all its Gaussians front to back, sixteen pixels (a row) at a time.
 
-use crate::project::{ALPHA_MIN, Splat, SplatGradient};
+use crate::single::project::{ALPHA_MIN, Splat, SplatGradient};
 use crate::tiles::{PIXELS, TILE};
 use multiversion::multiversion;
 
 /// Largest alpha of a Gaussian at a pixel.
-const ALPHA_MAX: f32 = 0.99;
+pub(crate) const ALPHA_MAX: f32 = 0.99;
 /// Compositing stops before the Gaussian that would bring the transmittance to this or less.
 const TRANSMITTANCE_MIN: f32 = 1e-4;
 

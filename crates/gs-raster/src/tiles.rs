@@ -1,6 +1,6 @@
 //! Which Gaussians touch which tile, front to back.
 
-use crate::project::{Lens, Splat, project};
+use crate::single::project::{Lens, Parameters, Splat, project};
 use crate::types::RasterOptions;
 use gs_scene::{Camera, Gaussians};
 use rayon::prelude::*;
@@ -35,7 +35,7 @@ impl Tiles {
                 let range = c * CHUNK..((c + 1) * CHUNK).min(g.len());
                 range
                     .filter_map(|i| {
-                        let s = project(g, i, &lens, options)?;
+                        let s = project(&Parameters::of(g, i), &lens, options).ok()?;
                         // Positive floats sort as their bits do; the index below breaks ties.
                         Some(((u64::from(s.depth.to_bits()) << 32) | i as u64, s))
                     })
