@@ -98,6 +98,7 @@ pub(crate) fn gather(g: &Gaussians, options: &RasterOptions, tiles: &Tiles, pair
     };
     for (&i, (p, d_sh, mean, mean_abs)) in tiles.index.iter().zip(per_splat) {
         let i = i as usize;
+        // Not held by single precision: no gradient rather than NaN in an optimiser's state.
         let Some(p) = p else { continue };
         out.means[i] = p.mean;
         out.log_scales[i] = p.log_scale;

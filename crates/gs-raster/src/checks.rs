@@ -203,7 +203,7 @@ fn gradients_are_the_central_differences() {
         for (name, range) in groups(degree) {
             let exact = relative(&columns(&analytic, &range), &columns(&numeric, &range));
             let single = relative(&columns(&ours, &range), &columns(&numeric, &range));
-            println!("degree {degree}, {name}: f64 {exact:e}, f32 {single:e}");
+            eprintln!("degree {degree}, {name}: f64 {exact:e}, f32 {single:e}");
             assert!(exact <= 1e-6, "degree {degree}, {name}: f64 chain rule is off by {exact:e}");
             assert!(single <= 1e-3, "degree {degree}, {name}: f32 gradient is off by {single:e}");
         }

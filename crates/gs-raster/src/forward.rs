@@ -2,7 +2,7 @@
 
 use crate::kernels::forward_tile;
 use crate::tiles::{TILE, Tiles};
-use crate::types::{RasterOptions, Rendered};
+use crate::types::{Dropped, RasterOptions, Rendered};
 use gs_scene::{Camera, Gaussians};
 use rayon::prelude::*;
 
@@ -17,6 +17,11 @@ impl Forward {
     /// Original indices of the Gaussians that were drawn, front to back.
     pub fn visible(&self) -> &[u32] {
         &self.tiles.index
+    }
+
+    /// How many Gaussians were not drawn, and why.
+    pub fn dropped(&self) -> Dropped {
+        self.tiles.dropped
     }
 
     /// Half extents, in pixels, of the drawn Gaussians' visible ellipses, in the order of [`Self::visible`]: the larger of
@@ -45,9 +50,9 @@ pub fn forward(g: &Gaussians, camera: &Camera, options: &RasterOptions) -> Forwa
     // A band of tiles owns whole image rows, so bands can be written side by side.
     let bands = rendered
         .rgb
-        .par_chunks_mut(w * TILE * 3)
-        .zip(rendered.alpha.par_chunks_mut(w * TILE))
-        .zip(rendered.depth.par_chunks_mut(w * TILE));
+        .par_chunks_mut((w * TILE * 3).max(1))
+        .zip(rendered.alpha.par_chunks_mut((w * TILE).max(1)))
+        .zip(rendered.depth.par_chunks_mut((w * TILE).max(1)));
     bands.enumerate().for_each(|(band, ((rgb, alpha), depth))| {
         for column in 0..tiles.columns {
             let t = band * tiles.columns + column;

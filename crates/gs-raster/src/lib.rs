@@ -32,5 +32,5 @@ pub use backward::backward;
 pub use features::{FeatureGradients, features_backward, render_features};
 pub use forward::{Forward, forward, render};
 pub use tiles::TILE;
-pub use types::{Gradients, PixelGradients, RasterOptions, Rendered};
+pub use types::{Dropped, Gradients, PixelGradients, RasterOptions, Rendered};
 pub use weights::{TileWeights, tile_weights};

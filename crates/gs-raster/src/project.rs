@@ -141,7 +141,8 @@ fn ellipse(p: &Parameters<'_>, lens: &Lens, near: f32) -> Result<Ellipse, Unseen
     let rz = 1.0 / t.z;
     let (u, v) = (t.x * rz, t.y * rz);
     let inside = [(lens.low.x..=lens.high.x).contains(&u), (lens.low.y..=lens.high.y).contains(&v)];
-    let clamped = Vec2::new(u.clamp(lens.low.x, lens.high.x), v.clamp(lens.low.y, lens.high.y)) * t.z;
+    // Not clamp(), which panics over a camera that is not finite.
+    let clamped = Vec2::new(u.max(lens.low.x).min(lens.high.x), v.max(lens.low.y).min(lens.high.y)) * t.z;
     let j0 = Vec3::new(lens.focal.x * rz, 0.0, -lens.focal.x * clamped.x * rz * rz);
     let j1 = Vec3::new(0.0, lens.focal.y * rz, -lens.focal.y * clamped.y * rz * rz);
     let wt = lens.rotation.transpose();
@@ -235,7 +236,8 @@ pub(crate) struct ParameterGradient {
     pub opacity_logit: Real,
 }
 
-/// The chain rule through [`project`]; the gradient of the spherical harmonics is written to `d_sh`.
+/// The chain rule through [`project`]; the gradient of the spherical harmonics is written to `d_sh`. `None` when single
+/// precision does not hold the result: such a Gaussian passes no gradient.
 pub(crate) fn project_backward(
     p: &Parameters<'_>,
     lens: &Lens,
@@ -304,12 +306,16 @@ pub(crate) fn project_backward(
     let along: Real = q.iter().zip(&d_quat).map(|(a, b)| a * b).sum();
     let rotation = [0, 1, 2, 3].map(|k| (d_quat[k] - along * q[k]) / e.quat_norm);
     let log_scale = d_scale * e.scale;
-    Some(ParameterGradient {
+    let gradient = ParameterGradient {
         mean: d_mean.into(),
         log_scale: log_scale.into(),
         rotation,
         opacity_logit: d.opacity * splat.opacity * (1.0 - splat.opacity),
-    })
+    };
+    let ParameterGradient { mean, log_scale, rotation, opacity_logit } = &gradient;
+    let groups = [&mean[..], log_scale, rotation, &[*opacity_logit], d_sh, &d.mean, &d.mean_abs];
+    let finite = groups.iter().all(|group| group.iter().all(|v| v.is_finite()));
+    finite.then_some(gradient)
 }
 
 /// d loss / d (w, x, y, z) of a unit quaternion from d loss / d its rotation matrix.

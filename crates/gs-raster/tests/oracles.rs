@@ -65,7 +65,7 @@ fn matches_gsplat_on_the_gpu() {
         let r = render(&g, &camera, &RasterOptions::default());
         let ours: Vec<f32> = r.rgb.chunks_exact(3).zip(&r.alpha).flat_map(|(c, a)| [c[0], c[1], c[2], *a]).collect();
         let error = worst(&ours, &get("out_img"));
-        println!("{name}: largest difference {error:e}");
+        eprintln!("{name}: largest difference {error:e}");
         assert!(error <= 1e-4, "{name}: {error}");
     }
 }
@@ -111,7 +111,7 @@ fn matches_the_f64_oracle_forward_and_backward() {
         let r = &f.rendered;
         let (rgb, alpha) = (worst(&r.rgb, get("out_rgb")), worst(&r.alpha, get("out_alpha")));
         let depth = relative(&r.depth, get("out_depth"));
-        println!("{name}: rgb {rgb:e} alpha {alpha:e} depth {depth:e}");
+        eprintln!("{name}: rgb {rgb:e} alpha {alpha:e} depth {depth:e}");
         assert!(rgb <= 1e-4 && alpha <= 1e-4 && depth <= 1e-3, "{name}: {rgb} {alpha} {depth}");
 
         // The oracle's loss: mean |rgb - target| + 0.1 mean (alpha - 0.5)^2 + 0.05 mean (depth - target)^2.
@@ -136,7 +136,7 @@ fn matches_the_f64_oracle_forward_and_backward() {
         ];
         for (group, ours, theirs) in groups {
             let error = relative(ours, theirs);
-            println!("{name}: gradient of {group}: relative difference {error:e}");
+            eprintln!("{name}: gradient of {group}: relative difference {error:e}");
             assert!(error <= 1e-3, "{name}: {group}: {error}");
         }
     }
