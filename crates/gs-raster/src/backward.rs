@@ -19,12 +19,16 @@ pub fn backward(
     forward: &Forward,
     d: PixelGradients<'_>,
 ) -> Gradients {
-    let tiles = &forward.tiles;
-    let w = camera.width as usize;
-    let pixels = w * camera.height as usize;
+    let pixels = camera.width as usize * camera.height as usize;
     assert_eq!(d.rgb.len(), 3 * pixels);
     assert!(d.alpha.is_none_or(|a| a.len() == pixels) && d.depth.is_none_or(|z| z.len() == pixels));
+    gather(g, options, &forward.tiles, &pair_gradients(forward, options, d))
+}
 
+/// d loss / d splat for every splat of every tile, in the order of the tiles' entries.
+pub(crate) fn pair_gradients(forward: &Forward, options: &RasterOptions, d: PixelGradients<'_>) -> Vec<SplatGradient> {
+    let tiles = &forward.tiles;
+    let w = tiles.lens.width as usize;
     // One gradient per tile and Gaussian, each tile writing its own slice.
     let mut pairs = vec![SplatGradient::default(); tiles.entries.len()];
     let mut slices = Vec::with_capacity(tiles.count());
@@ -36,13 +40,13 @@ pub fn backward(
     }
     slices.into_par_iter().enumerate().for_each(|(t, out)| {
         if !out.is_empty() {
-            let (x0, y0, _, th) = tiles.rectangle(t);
-            let tile = pixel_gradients(forward, options, d, w, tiles.rectangle(t));
-            backward_tile(&tiles.splats, tiles.list(t), x0, y0, th, &tile, out);
+            let rectangle = tiles.rectangle(t);
+            let mut tile = pixel_gradients(forward, options, d, w, rectangle);
+            backward_tile(&tiles.splats, tiles.list(t), rectangle, &mut tile, out);
         }
     });
 
-    gather(g, options, tiles, &pairs)
+    pairs
 }
 
 /// Sums the gradients of each splat over its tiles, in tile order, and takes them to the Gaussians' parameters. `pairs` is in
@@ -122,7 +126,7 @@ fn pixel_gradients(
         rgb: [[0.0; PIXELS]; 3],
         depth: [0.0; PIXELS],
         alpha: [0.0; PIXELS],
-        total: [0.0; PIXELS],
+        behind: [0.0; PIXELS],
     });
     let r = &forward.rendered;
     for y in 0..th {
@@ -130,16 +134,16 @@ fn pixel_gradients(
             let (from, to) = ((y0 + y) * w + x0 + x, y * TILE + x);
             let mut d_alpha = d.alpha.map_or(0.0, |a| a[from]);
             let d_depth = d.depth.map_or(0.0, |z| z[from]);
-            let mut total = d_depth * r.depth[from];
+            let mut behind = d_depth * r.depth[from];
             for c in 0..3 {
                 let g = d.rgb[3 * from + c];
                 tile.rgb[c][to] = g;
                 d_alpha -= options.background[c] * g;
-                total += g * (r.rgb[3 * from + c] - (1.0 - r.alpha[from]) * options.background[c]);
+                behind += g * (r.rgb[3 * from + c] - (1.0 - r.alpha[from]) * options.background[c]);
             }
             tile.depth[to] = d_depth;
             tile.alpha[to] = d_alpha;
-            tile.total[to] = total + d_alpha * r.alpha[from];
+            tile.behind[to] = behind + d_alpha * r.alpha[from];
         }
     }
     tile

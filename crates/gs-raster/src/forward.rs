@@ -39,10 +39,16 @@ impl Forward {
 /// Renders a view and keeps what [`crate::backward`] needs.
 pub fn forward(g: &Gaussians, camera: &Camera, options: &RasterOptions) -> Forward {
     let tiles = Tiles::new(g, camera, options);
-    let (w, h) = (camera.width as usize, camera.height as usize);
+    let (rendered, _) = composite(&tiles, options);
+    Forward { rendered, tiles }
+}
+
+/// Composites all tiles. Also returns how many pixel-Gaussian pairs the kernels evaluated.
+pub(crate) fn composite(tiles: &Tiles, options: &RasterOptions) -> (Rendered, usize) {
+    let (w, h) = (tiles.lens.width as usize, tiles.lens.height as usize);
     let mut rendered = Rendered {
-        width: camera.width,
-        height: camera.height,
+        width: tiles.lens.width,
+        height: tiles.lens.height,
         rgb: vec![0.0; w * h * 3],
         alpha: vec![0.0; w * h],
         depth: vec![0.0; w * h],
@@ -53,11 +59,13 @@ pub fn forward(g: &Gaussians, camera: &Camera, options: &RasterOptions) -> Forwa
         .par_chunks_mut((w * TILE * 3).max(1))
         .zip(rendered.alpha.par_chunks_mut((w * TILE).max(1)))
         .zip(rendered.depth.par_chunks_mut((w * TILE).max(1)));
-    bands.enumerate().for_each(|(band, ((rgb, alpha), depth))| {
+    let evaluated = bands.enumerate().map(|(band, ((rgb, alpha), depth))| {
+        let mut evaluated = 0;
         for column in 0..tiles.columns {
             let t = band * tiles.columns + column;
             let (x0, y0, tw, th) = tiles.rectangle(t);
-            let p = forward_tile(&tiles.splats, tiles.list(t), x0, y0, th);
+            let p = forward_tile(&tiles.splats, tiles.list(t), (x0, y0, tw, th));
+            evaluated += p.evaluated;
             for y in 0..th {
                 for x in 0..tw {
                     let (from, to) = (y * TILE + x, y * w + x0 + x);
@@ -70,8 +78,10 @@ pub fn forward(g: &Gaussians, camera: &Camera, options: &RasterOptions) -> Forwa
                 }
             }
         }
+        evaluated
     });
-    Forward { rendered, tiles }
+    let evaluated = evaluated.sum();
+    (rendered, evaluated)
 }
 
 /// Renders a view: colour, accumulated alpha, alpha-weighted depth.

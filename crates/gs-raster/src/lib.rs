@@ -21,6 +21,7 @@ mod double;
 mod features;
 mod forward;
 mod kernels;
+mod measure;
 #[cfg(test)]
 mod reference;
 mod single;
@@ -31,6 +32,7 @@ mod weights;
 pub use backward::backward;
 pub use features::{FeatureGradients, features_backward, render_features};
 pub use forward::{Forward, forward, render};
+pub use measure::{Measured, measure};
 pub use tiles::TILE;
 pub use types::{Dropped, Gradients, PixelGradients, RasterOptions, Rendered};
 pub use weights::{TileWeights, tile_weights};

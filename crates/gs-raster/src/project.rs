@@ -24,11 +24,16 @@ pub(crate) struct Splat {
     pub mean: [Real; 2],
     /// Inverse of the 2D covariance: xx, xy, yy.
     pub conic: [Real; 3],
+    /// Determinant of the conic.
+    pub conic_det: Real,
     /// Half extents of the region where alpha >= 1/255, in pixels.
     pub extent: [Real; 2],
+    /// Its lowest point lies this times `extent[1]` to the right of the centre, its highest as far to the left.
+    pub tilt: Real,
     /// sigma at which alpha falls below 1/255: ln(255 opacity).
     pub sigma_max: Real,
     pub opacity: Real,
+    pub log2_opacity: Real,
     pub depth: Real,
     pub color: [Real; 3],
     /// Which colour channels were cut at zero: they pass no gradient.
@@ -118,6 +123,7 @@ struct Ellipse {
     variance: [Real; 2],
     /// Inverse of the projected covariance: xx, xy, yy.
     conic: [Real; 3],
+    conic_det: Real,
 }
 
 fn ellipse(p: &Parameters<'_>, lens: &Lens, near: f32) -> Result<Ellipse, Unseen> {
@@ -160,7 +166,7 @@ fn ellipse(p: &Parameters<'_>, lens: &Lens, near: f32) -> Result<Ellipse, Unseen
     if !(whole && conic[0] > 0.0 && conic[2] > 0.0) {
         return Err(Unseen::Degenerate);
     }
-    Ok(Ellipse { t, clamped, inside, jw, m, quat, quat_norm, scale, variance, conic })
+    Ok(Ellipse { t, clamped, inside, jw, m, quat, quat_norm, scale, variance, conic, conic_det: (1.0 / det) as Real })
 }
 
 /// Projects a Gaussian; the error says why it cannot touch the image.
@@ -193,9 +199,12 @@ pub(crate) fn project(p: &Parameters<'_>, lens: &Lens, options: &RasterOptions) 
     Ok(Splat {
         mean,
         conic: e.conic,
+        conic_det: e.conic_det,
         extent,
+        tilt: -e.conic[1] / e.conic[0],
         sigma_max,
         opacity,
+        log2_opacity: opacity.log2(),
         depth: e.t.z,
         color: raw.map(|c| c.max(0.0)),
         clamped: raw.map(|c| c < 0.0),

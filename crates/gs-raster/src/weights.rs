@@ -1,7 +1,7 @@
 //! Per-pixel weights, for footprints, silhouettes and features.
 
 use crate::kernels::weights_tile;
-use crate::tiles::{PIXELS, TILE, Tiles};
+use crate::tiles::{PIXELS, Tiles};
 use crate::types::RasterOptions;
 use gs_scene::{Camera, Gaussians};
 use rayon::prelude::*;
@@ -12,9 +12,9 @@ pub struct TileWeights<'a> {
     pub x0: usize,
     /// Top edge in pixels.
     pub y0: usize,
-    /// Width within the image, at most [`TILE`].
+    /// Width within the image, at most [`crate::TILE`].
     pub width: usize,
-    /// Height within the image, at most [`TILE`].
+    /// Height within the image, at most [`crate::TILE`].
     pub height: usize,
     /// Original indices of the Gaussians that touch the tile, front to back; G of them.
     pub gaussians: &'a [u32],
@@ -52,16 +52,7 @@ pub(crate) fn with_weights<R>(tiles: &Tiles, t: usize, early_stop: bool, f: impl
     let gaussians: Vec<u32> = list.iter().map(|&e| tiles.index[e as usize]).collect();
     let mut alphas = vec![0.0; list.len() * PIXELS];
     let mut weights = vec![0.0; list.len() * PIXELS];
-    let mut alpha = weights_tile(&tiles.splats, list, x0, y0, height, early_stop, &mut alphas, &mut weights);
-    // Columns beyond the image's right edge are nobody's pixels.
-    if width < TILE {
-        let clear = |values: &mut [f32]| {
-            values.chunks_exact_mut(TILE).for_each(|row| row[width..].fill(0.0));
-        };
-        clear(&mut alphas);
-        clear(&mut weights);
-        clear(&mut alpha);
-    }
+    let alpha = weights_tile(&tiles.splats, list, (x0, y0, width, height), early_stop, &mut alphas, &mut weights);
     let tile =
         TileWeights { x0, y0, width, height, gaussians: &gaussians, alphas: &alphas, weights: &weights, alpha: &alpha };
     f(&tile)
