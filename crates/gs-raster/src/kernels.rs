@@ -17,7 +17,17 @@ const LOG2_ALPHA_MIN: f32 = -7.994_353_4;
 /// Compositing stops before the Gaussian that would bring the transmittance to this or less.
 const TRANSMITTANCE_MIN: f32 = 1e-4;
 /// After this many Gaussians a tile looks again which of its rows still go on.
-const LOOK_EVERY: usize = 8;
+const LOOK_EVERY: usize = 16;
+/// Bits of a tile's rows, as floats.
+const POWERS: Row = {
+    let mut powers = [1.0; TILE];
+    let mut r = 1;
+    while r < TILE {
+        powers[r] = 2.0 * powers[r - 1];
+        r += 1;
+    }
+    powers
+};
 
 /// Left, top, width, height of a tile within the image.
 type Rectangle = (usize, usize, usize, usize);
@@ -41,55 +51,96 @@ fn exp2<S: Simd>(simd: S, q: S::f32s) -> S::f32s {
     simd.transmute_f32s_u32s(simd.add_u32s(simd.transmute_u32s_f32s(p), exponent))
 }
 
-/// Rows of the tile, as bits, in which the ellipse alpha = 1/255 reaches pixels with centres from `u0` to `u1` to the right of
-/// the splat's centre; `v0` is how far the first row's centres lie below it.
-#[inline(always)]
-fn rows_of(s: &Splat, u0: f32, u1: f32, v0: f32, height: usize) -> u32 {
-    // Margins for the rounding of this test against that of the pixels' own; both passes take the same rows.
-    let [_, b, c] = s.conic;
-    let [ex, ey] = s.extent;
-    let sigma = s.sigma_max * 1.0001 + 1e-5;
-    let (margin_x, margin_y) = (1e-3 + 1e-4 * ex, 1e-3 + 1e-4 * ey);
-    let (low, high) = (u0.max(-ex - margin_x), u1.min(ex + margin_x));
-    if low > high {
-        return 0;
-    }
-    // At x, the ellipse spans y = (-b x -+ sqrt(2 sigma c - x^2 det)) / c; both bounds are extreme where the tilt says, or as
-    // near to it as the columns go.
-    let inv_c = 1.0 / c;
-    let half = |x: f32| (2.0 * sigma * c - x * x * s.conic_det).max(0.0).sqrt();
-    let lowest = (s.tilt * ey).max(low).min(high);
-    let highest = (-s.tilt * ey).max(low).min(high);
-    let bottom = (half(lowest) - b * lowest) * inv_c + margin_y - v0;
-    let top = (-half(highest) - b * highest) * inv_c - margin_y - v0;
-    let end = (bottom.floor() + 1.0).clamp(0.0, height as f32) as u32;
-    let begin = top.ceil().clamp(0.0, height as f32) as u32;
-    if begin < end { (1 << end) - (1 << begin) } else { 0 }
+/// A tile's pixel centres: x by column, y by row.
+struct Grid {
+    x: Row,
+    y: Row,
+    /// Rows within the image, as bits.
+    inside: u32,
 }
 
-/// log2(alpha) of a splat over the image, negated quadratic form included.
-struct Falloff {
-    xx: f32,
-    xy: f32,
-    yy: f32,
-    peak: f32,
-}
-
-impl Falloff {
+impl Grid {
     #[inline(always)]
-    fn new(s: &Splat) -> Self {
+    fn new((x0, y0, _, height): Rectangle) -> Self {
+        let centers = |first: usize| std::array::from_fn(|l| (first + l) as f32 + 0.5);
+        Self { x: centers(x0), y: centers(y0), inside: (1 << height) - 1 }
+    }
+}
+
+/// A splat's alpha over a tile, as the exponent of 2: q = peak + (xx dx + xy dy) dx + yy dy^2 at offset (dx, dy) from its
+/// centre.
+struct Falloff<S: Simd> {
+    mean_x: S::f32s,
+    xx: S::f32s,
+    peak: S::f32s,
+    /// By row: dy, xy dy, peak + yy dy^2.
+    dy: Row,
+    linear: Row,
+    constant: Row,
+    /// By vector of columns: rows, as bits, that the ellipse alpha = 1/255 reaches.
+    rows: [u32; TILE],
+}
+
+impl<S: Simd> Falloff<S> {
+    #[inline(always)]
+    fn new(simd: S, s: &Splat, grid: &Grid) -> Self {
         use std::f32::consts::LOG2_E;
         let [a, b, c] = s.conic;
-        Self { xx: -0.5 * LOG2_E * a, xy: -LOG2_E * b, yy: -0.5 * LOG2_E * c, peak: s.log2_opacity }
+        let splat = |v| simd.splat_f32s(v);
+        let (mean_x, peak) = (splat(s.mean[0]), splat(s.log2_opacity));
+        let mut out = Self {
+            mean_x,
+            xx: splat(-0.5 * LOG2_E * a),
+            peak,
+            dy: [0.0; TILE],
+            linear: [0.0; TILE],
+            constant: [0.0; TILE],
+            rows: [0; TILE],
+        };
+        let (x, y) = (vectors::<S>(&grid.x), vectors::<S>(&grid.y));
+        let (dy, linear, constant) =
+            (vectors_mut::<S>(&mut out.dy), vectors_mut::<S>(&mut out.linear), vectors_mut::<S>(&mut out.constant));
+        // In row y, the ellipse spans x = (-b y -+ sqrt(2 sigma a - y^2 det)) / a. Margins for the rounding of this against
+        // that of the pixels' own; both passes take the same rows.
+        let sigma = s.sigma_max * 1.0001 + 1e-5;
+        let square = splat(2.0 * sigma * a);
+        let inverse = splat(1.0 / a);
+        let margin = 1e-3 + 1e-4 * s.extent[0];
+        let mut bits = [splat(0.0); TILE];
+        for k in 0..y.len() {
+            let v = simd.sub_f32s(y[k], splat(s.mean[1]));
+            dy[k] = v;
+            linear[k] = simd.mul_f32s(splat(-LOG2_E * b), v);
+            constant[k] = simd.mul_add_e_f32s(simd.mul_f32s(splat(-0.5 * LOG2_E * c), v), v, peak);
+            // Not a number, and so in no column, above and below the ellipse.
+            let discriminant = simd.negate_mul_add_e_f32s(simd.mul_f32s(v, v), splat(s.conic_det), square);
+            let half = simd.mul_add_e_f32s(simd.sqrt_f32s(discriminant), inverse, splat(margin));
+            let middle = simd.negate_mul_add_e_f32s(simd.mul_f32s(splat(b), v), inverse, mean_x);
+            let (low, high) = (simd.sub_f32s(middle, half), simd.add_f32s(middle, half));
+            let place = vectors::<S>(&POWERS)[k];
+            for (block, bits) in bits[..x.len()].iter_mut().enumerate() {
+                let (first, last) = (grid.x[block * S::F32_LANES], grid.x[(block + 1) * S::F32_LANES - 1]);
+                let left = simd.less_than_or_equal_f32s(low, splat(last));
+                let right = simd.greater_than_or_equal_f32s(high, splat(first));
+                let zero = splat(0.0);
+                let place = simd.select_f32s(left, simd.select_f32s(right, place, zero), zero);
+                *bits = simd.add_f32s(*bits, place);
+            }
+        }
+        for block in 0..x.len() {
+            // Sums of different powers of two below 2^16 are exact.
+            out.rows[block] = simd.reduce_sum_f32s(bits[block]) as u32 & grid.inside;
+        }
+        out
     }
 
-    /// Opacity times the exponential at offset (dx, dy) from the centre, and alpha: capped, and 0 where it is skipped.
+    /// Opacity times the exponential in row `r`, and alpha: capped, and 0 where it is skipped.
     #[inline(always)]
-    fn alpha<S: Simd>(&self, simd: S, dx: S::f32s, dy: f32) -> (S::f32s, S::f32s) {
-        let linear = simd.mul_add_e_f32s(simd.splat_f32s(self.xx), dx, simd.splat_f32s(self.xy * dy));
-        let q = simd.mul_add_e_f32s(linear, dx, simd.splat_f32s(self.peak + self.yy * dy * dy));
+    fn alpha(&self, simd: S, dx: S::f32s, r: usize) -> (S::f32s, S::f32s) {
+        let linear = simd.mul_add_e_f32s(self.xx, dx, simd.splat_f32s(self.linear[r]));
+        let q = simd.mul_add_e_f32s(linear, dx, simd.splat_f32s(self.constant[r]));
         // Needle-like forms may round to above their peak.
-        let q = simd.min_f32s(q, simd.splat_f32s(self.peak));
+        let q = simd.min_f32s(q, self.peak);
         let raw = exp2(simd, q);
         let keep = simd.greater_than_or_equal_f32s(q, simd.splat_f32s(LOG2_ALPHA_MIN));
         let capped = simd.min_f32s(raw, simd.splat_f32s(ALPHA_MAX));
@@ -117,16 +168,11 @@ fn fresh(width: usize) -> [f32; PIXELS] {
     t
 }
 
-/// Rows, as bits, in which some pixel of `lanes` columns from the first goes on.
+/// Rows, as bits, in which some pixel of vector `b` of `blocks` goes on.
 #[inline(always)]
-fn live_rows(t: &[f32; PIXELS], first: usize, lanes: usize, height: usize) -> u32 {
-    let mut live = 0;
-    for r in 0..height {
-        let row = &t[r * TILE + first..r * TILE + first + lanes];
-        let any = row.iter().fold(false, |any, t| any | (*t > 0.0));
-        live |= u32::from(any) << r;
-    }
-    live
+fn live_rows<S: Simd>(simd: S, t: &[S::f32s], b: usize, blocks: usize) -> u32 {
+    let live = |r: usize| u32::from(simd.reduce_max_f32s(t[r * blocks + b]) > 0.0) << r;
+    (0..TILE).map(live).sum()
 }
 
 #[inline(always)]
@@ -137,12 +183,6 @@ fn vectors<S: Simd>(values: &[f32]) -> &[S::f32s] {
 #[inline(always)]
 fn vectors_mut<S: Simd>(values: &mut [f32]) -> &mut [S::f32s] {
     S::as_mut_simd_f32s(values).0
-}
-
-/// x of the tile's pixel centres, less the splat's.
-#[inline(always)]
-fn offsets(s: &Splat, x0: usize) -> Row {
-    std::array::from_fn(|l| (x0 + l) as f32 + 0.5 - s.mean[0])
 }
 
 /// What a tile's pixels have gathered.
@@ -170,7 +210,7 @@ impl WithSimd for ForwardTile<'_> {
 
     #[inline(always)]
     fn with_simd<S: Simd>(self, simd: S) -> Box<TilePixels> {
-        let (x0, y0, width, height) = self.rectangle;
+        let (_, _, width, _) = self.rectangle;
         let lanes = S::F32_LANES.min(TILE);
         let blocks = TILE / lanes;
         let mut out = Box::new(TilePixels {
@@ -182,11 +222,13 @@ impl WithSimd for ForwardTile<'_> {
         let TilePixels { rgb: [red, green, blue], depth, transmittance, evaluated } = &mut *out;
         let [red, green, blue] = [red, green, blue].map(|v| vectors_mut::<S>(v));
         let depth = vectors_mut::<S>(depth);
-        let mut live = [(1u32 << height) - 1; TILE];
+        let grid = Grid::new(self.rectangle);
+        let mut live = [grid.inside; TILE];
         for (n, &entry) in self.list.iter().enumerate() {
             if n % LOOK_EVERY == LOOK_EVERY - 1 {
+                let t = vectors::<S>(transmittance);
                 for b in 0..blocks {
-                    live[b] = live_rows(transmittance, b * lanes, lanes, height);
+                    live[b] = live_rows(simd, t, b, blocks) & grid.inside;
                 }
                 if live[..blocks].iter().all(|rows| *rows == 0) {
                     break;
@@ -194,19 +236,18 @@ impl WithSimd for ForwardTile<'_> {
             }
             let s = &self.splats[entry as usize];
             let t = vectors_mut::<S>(transmittance);
-            let (dx, v0) = (offsets(s, x0), y0 as f32 + 0.5 - s.mean[1]);
-            let falloff = Falloff::new(s);
+            let falloff = Falloff::new(simd, s, &grid);
             let color = s.color.map(|c| simd.splat_f32s(c));
             let z = simd.splat_f32s(s.depth);
             for b in 0..blocks {
-                let mut rows = rows_of(s, dx[b * lanes], dx[(b + 1) * lanes - 1], v0, height) & live[b];
+                let mut rows = falloff.rows[b] & live[b];
                 *evaluated += rows.count_ones() as usize * lanes;
-                let dx = vectors::<S>(&dx)[b];
+                let dx = simd.sub_f32s(vectors::<S>(&grid.x)[b], falloff.mean_x);
                 while rows != 0 {
                     let r = rows.trailing_zeros() as usize % TILE;
                     rows &= rows - 1;
                     let at = r * blocks + b;
-                    let (_, alpha) = falloff.alpha(simd, dx, v0 + r as f32);
+                    let (_, alpha) = falloff.alpha(simd, dx, r);
                     let before = t[at];
                     let (takes, after) = advance(simd, before, alpha);
                     t[at] = after;
@@ -265,7 +306,7 @@ impl WithSimd for BackwardTile<'_> {
 
     #[inline(always)]
     fn with_simd<S: Simd>(self, simd: S) {
-        let (x0, y0, width, height) = self.rectangle;
+        let (_, _, width, _) = self.rectangle;
         let lanes = S::F32_LANES.min(TILE);
         let blocks = TILE / lanes;
         let TileGradients { rgb: [d_red, d_green, d_blue], depth, alpha, behind } = self.d;
@@ -273,11 +314,13 @@ impl WithSimd for BackwardTile<'_> {
             [d_red, d_green, d_blue, depth, alpha].map(|v| vectors::<S>(v));
         let behind = vectors_mut::<S>(behind);
         let mut transmittance = fresh(width);
-        let mut live = [(1u32 << height) - 1; TILE];
+        let grid = Grid::new(self.rectangle);
+        let mut live = [grid.inside; TILE];
         for (n, (&entry, out)) in self.list.iter().zip(self.out).enumerate() {
             if n % LOOK_EVERY == LOOK_EVERY - 1 {
+                let t = vectors::<S>(&transmittance);
                 for b in 0..blocks {
-                    live[b] = live_rows(&transmittance, b * lanes, lanes, height);
+                    live[b] = live_rows(simd, t, b, blocks) & grid.inside;
                 }
                 if live[..blocks].iter().all(|rows| *rows == 0) {
                     break;
@@ -285,26 +328,25 @@ impl WithSimd for BackwardTile<'_> {
             }
             let s = &self.splats[entry as usize];
             let t = vectors_mut::<S>(&mut transmittance);
-            let (dx, v0) = (offsets(s, x0), y0 as f32 + 0.5 - s.mean[1]);
-            let falloff = Falloff::new(s);
+            let falloff = Falloff::new(simd, s, &grid);
             let color = s.color.map(|c| simd.splat_f32s(c));
             let z = simd.splat_f32s(s.depth);
             let [xx, xy, yy] = s.conic;
             let mut sums = [[0.0f32; TILE]; 9];
             for b in 0..blocks {
-                let mut rows = rows_of(s, dx[b * lanes], dx[(b + 1) * lanes - 1], v0, height) & live[b];
+                let mut rows = falloff.rows[b] & live[b];
                 if rows == 0 {
                     continue;
                 }
-                let dx = vectors::<S>(&dx)[b];
+                let dx = simd.sub_f32s(vectors::<S>(&grid.x)[b], falloff.mean_x);
                 let (xx_dx, xy_dx) = (simd.mul_f32s(simd.splat_f32s(xx), dx), simd.mul_f32s(simd.splat_f32s(xy), dx));
                 let mut sum = [simd.splat_f32s(0.0); 9];
                 while rows != 0 {
                     let r = rows.trailing_zeros() as usize % TILE;
                     rows &= rows - 1;
                     let at = r * blocks + b;
-                    let dy = v0 + r as f32;
-                    let (raw, alpha) = falloff.alpha(simd, dx, dy);
+                    let dy = falloff.dy[r];
+                    let (raw, alpha) = falloff.alpha(simd, dx, r);
                     let before = t[at];
                     let (takes, after) = advance(simd, before, alpha);
                     t[at] = after;
@@ -340,7 +382,7 @@ impl WithSimd for BackwardTile<'_> {
                     vectors_mut::<S>(sums)[b] = sum;
                 }
             }
-            *out = splat_gradient(s, &dx, &sums);
+            *out = splat_gradient(s, &grid.x, &sums);
         }
     }
 }
@@ -348,14 +390,15 @@ impl WithSimd for BackwardTile<'_> {
 /// From the kernel's sums per column (g, g dy, g dy^2, absolute gradients of the centre, colour, depth, with
 /// g = - d loss / d sigma) to the splat.
 #[inline(always)]
-fn splat_gradient(s: &Splat, dx: &Row, sums: &[Row; 9]) -> SplatGradient {
+fn splat_gradient(s: &Splat, x: &Row, sums: &[Row; 9]) -> SplatGradient {
     // g dx, g dx^2 and g dx dy follow from the columns' sums.
     let mut all = [[0.0f32; TILE]; 12];
     all[..9].copy_from_slice(sums);
     for l in 0..TILE {
-        all[9][l] = sums[0][l] * dx[l];
-        all[10][l] = all[9][l] * dx[l];
-        all[11][l] = sums[1][l] * dx[l];
+        let dx = x[l] - s.mean[0];
+        all[9][l] = sums[0][l] * dx;
+        all[10][l] = all[9][l] * dx;
+        all[11][l] = sums[1][l] * dx;
     }
     for half in [8, 4, 2, 1] {
         for row in &mut all {
@@ -404,11 +447,12 @@ impl WithSimd for WeightsTile<'_> {
 
     #[inline(always)]
     fn with_simd<S: Simd>(self, simd: S) -> [f32; PIXELS] {
-        let (x0, y0, width, height) = self.rectangle;
+        let (_, _, width, _) = self.rectangle;
         let lanes = S::F32_LANES.min(TILE);
         let blocks = TILE / lanes;
         let mut transmittance = fresh(if self.early_stop { width } else { TILE });
         let mut accumulated = [0.0f32; PIXELS];
+        let grid = Grid::new(self.rectangle);
         // Columns beyond the image's right edge are nobody's pixels, though without a stop they have a transmittance.
         let inside: Row = std::array::from_fn(|l| if l < width { 1.0 } else { 0.0 });
         let layers = self.alphas.chunks_exact_mut(PIXELS).zip(self.weights.chunks_exact_mut(PIXELS));
@@ -416,16 +460,15 @@ impl WithSimd for WeightsTile<'_> {
             let s = &self.splats[entry as usize];
             let [t, accumulated] = [&mut transmittance, &mut accumulated].map(|v| vectors_mut::<S>(v));
             let (alphas, weights) = (vectors_mut::<S>(alphas), vectors_mut::<S>(weights));
-            let (dx, v0) = (offsets(s, x0), y0 as f32 + 0.5 - s.mean[1]);
-            let falloff = Falloff::new(s);
+            let falloff = Falloff::new(simd, s, &grid);
             for b in 0..blocks {
-                let mut rows = rows_of(s, dx[b * lanes], dx[(b + 1) * lanes - 1], v0, height);
-                let dx = vectors::<S>(&dx)[b];
+                let mut rows = falloff.rows[b];
+                let dx = simd.sub_f32s(vectors::<S>(&grid.x)[b], falloff.mean_x);
                 while rows != 0 {
                     let r = rows.trailing_zeros() as usize % TILE;
                     rows &= rows - 1;
                     let at = r * blocks + b;
-                    let (_, alpha) = falloff.alpha(simd, dx, v0 + r as f32);
+                    let (_, alpha) = falloff.alpha(simd, dx, r);
                     let before = t[at];
                     let (alpha, w) = if self.early_stop {
                         let (takes, after) = advance(simd, before, alpha);

@@ -28,8 +28,6 @@ pub(crate) struct Splat {
     pub conic_det: Real,
     /// Half extents of the region where alpha >= 1/255, in pixels.
     pub extent: [Real; 2],
-    /// Its lowest point lies this times `extent[1]` to the right of the centre, its highest as far to the left.
-    pub tilt: Real,
     /// sigma at which alpha falls below 1/255: ln(255 opacity).
     pub sigma_max: Real,
     pub opacity: Real,
@@ -201,7 +199,6 @@ pub(crate) fn project(p: &Parameters<'_>, lens: &Lens, options: &RasterOptions) 
         conic: e.conic,
         conic_det: e.conic_det,
         extent,
-        tilt: -e.conic[1] / e.conic[0],
         sigma_max,
         opacity,
         log2_opacity: opacity.log2(),
