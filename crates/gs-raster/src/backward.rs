@@ -8,6 +8,9 @@ use crate::types::{Gradients, PixelGradients, RasterOptions};
 use gs_scene::{Camera, Gaussians};
 use rayon::prelude::*;
 
+/// Gaussians whose parameters' gradients one task computes.
+const CHUNK: usize = 512;
+
 /// d loss / d every parameter, given d loss / d every pixel of the view that `forward` rendered with the same arguments.
 ///
 /// # Panics
@@ -67,30 +70,13 @@ pub(crate) fn gather(g: &Gaussians, options: &RasterOptions, tiles: &Tiles, pair
         next[e as usize] += 1;
     }
 
-    let stride = g.sh_stride();
-    let per_splat: Vec<_> = (0..n)
-        .into_par_iter()
-        .with_min_len(64)
-        .map(|i| {
-            let mut sum = SplatGradient::default();
-            for &pair in &of_splat[start[i]..start[i + 1]] {
-                sum.add(&pairs[pair as usize]);
-            }
-            let mut d_sh = [0.0f32; 48];
-            let i_original = tiles.index[i] as usize;
-            let p = project_backward(
-                &Parameters::of(g, i_original),
-                &tiles.lens,
-                options,
-                &tiles.splats[i],
-                &sum,
-                &mut d_sh[..stride],
-            );
-            (p, d_sh, sum.mean, sum.mean_abs)
-        })
-        .collect();
+    let mut place = vec![u32::MAX; g.len()];
+    for (i, &original) in tiles.index.iter().enumerate() {
+        place[original as usize] = i as u32;
+    }
 
     let all = g.len();
+    let stride = g.sh_stride();
     let mut out = Gradients {
         means: vec![[0.0; 3]; all],
         log_scales: vec![[0.0; 3]; all],
@@ -100,18 +86,37 @@ pub(crate) fn gather(g: &Gaussians, options: &RasterOptions, tiles: &Tiles, pair
         mean2d: vec![[0.0; 2]; all],
         mean2d_abs: vec![[0.0; 2]; all],
     };
-    for (&i, (p, d_sh, mean, mean_abs)) in tiles.index.iter().zip(per_splat) {
-        let i = i as usize;
-        // Not held by single precision: no gradient rather than NaN in an optimiser's state.
-        let Some(p) = p else { continue };
-        out.means[i] = p.mean;
-        out.log_scales[i] = p.log_scale;
-        out.rotations[i] = p.rotation;
-        out.opacity_logits[i] = p.opacity_logit;
-        out.sh[i * stride..(i + 1) * stride].copy_from_slice(&d_sh[..stride]);
-        out.mean2d[i] = mean;
-        out.mean2d_abs[i] = mean_abs;
-    }
+    let geometry = out.means.par_chunks_mut(CHUNK).zip(out.log_scales.par_chunks_mut(CHUNK));
+    let geometry = geometry.zip(out.rotations.par_chunks_mut(CHUNK));
+    let rest = out.opacity_logits.par_chunks_mut(CHUNK).zip(out.sh.par_chunks_mut(CHUNK * stride));
+    let centers = out.mean2d.par_chunks_mut(CHUNK).zip(out.mean2d_abs.par_chunks_mut(CHUNK));
+    geometry.zip(rest).zip(centers).enumerate().for_each(|(chunk, (of_parameters, (mean2d, mean2d_abs)))| {
+        let (((means, log_scales), rotations), (opacity_logits, sh)) = of_parameters;
+        for k in 0..means.len() {
+            let original = chunk * CHUNK + k;
+            let i = place[original] as usize;
+            if i == u32::MAX as usize {
+                continue;
+            }
+            let mut sum = SplatGradient::default();
+            for &pair in &of_splat[start[i]..start[i + 1]] {
+                sum.add(&pairs[pair as usize]);
+            }
+            let d_sh = &mut sh[k * stride..(k + 1) * stride];
+            let parameters = Parameters::of(g, original);
+            let Some(p) = project_backward(&parameters, &tiles.lens, options, &tiles.splats[i], &sum, d_sh) else {
+                // Not held by single precision: no gradient rather than NaN in an optimiser's state.
+                d_sh.fill(0.0);
+                continue;
+            };
+            means[k] = p.mean;
+            log_scales[k] = p.log_scale;
+            rotations[k] = p.rotation;
+            opacity_logits[k] = p.opacity_logit;
+            mean2d[k] = sum.mean;
+            mean2d_abs[k] = sum.mean_abs;
+        }
+    });
     out
 }
 

@@ -16,8 +16,9 @@ pub(crate) const ALPHA_MAX: f32 = 0.99;
 const LOG2_ALPHA_MIN: f32 = -7.994_353_4;
 /// Compositing stops before the Gaussian that would bring the transmittance to this or less.
 const TRANSMITTANCE_MIN: f32 = 1e-4;
-/// After this many Gaussians a tile looks again which of its rows still go on.
-const LOOK_EVERY: usize = 16;
+/// Gaussians that a tile takes at a time: before each batch it looks which of its rows still go on, and brings the batch's
+/// splats near, so that their cache misses overlap.
+const BATCH: usize = 16;
 /// Bits of a tile's rows, as floats.
 const POWERS: Row = {
     let mut powers = [1.0; TILE];
@@ -224,9 +225,10 @@ impl WithSimd for ForwardTile<'_> {
         let depth = vectors_mut::<S>(depth);
         let grid = Grid::new(self.rectangle);
         let mut live = [grid.inside; TILE];
-        for (n, &entry) in self.list.iter().enumerate() {
-            if n % LOOK_EVERY == LOOK_EVERY - 1 {
-                let t = vectors::<S>(transmittance);
+        let mut near = [Splat::default(); BATCH];
+        for (n, list) in self.list.chunks(BATCH).enumerate() {
+            let t = vectors_mut::<S>(transmittance);
+            if n > 0 {
                 for b in 0..blocks {
                     live[b] = live_rows(simd, t, b, blocks) & grid.inside;
                 }
@@ -234,28 +236,31 @@ impl WithSimd for ForwardTile<'_> {
                     break;
                 }
             }
-            let s = &self.splats[entry as usize];
-            let t = vectors_mut::<S>(transmittance);
-            let falloff = Falloff::new(simd, s, &grid);
-            let color = s.color.map(|c| simd.splat_f32s(c));
-            let z = simd.splat_f32s(s.depth);
-            for b in 0..blocks {
-                let mut rows = falloff.rows[b] & live[b];
-                *evaluated += rows.count_ones() as usize * lanes;
-                let dx = simd.sub_f32s(vectors::<S>(&grid.x)[b], falloff.mean_x);
-                while rows != 0 {
-                    let r = rows.trailing_zeros() as usize % TILE;
-                    rows &= rows - 1;
-                    let at = r * blocks + b;
-                    let (_, alpha) = falloff.alpha(simd, dx, r);
-                    let before = t[at];
-                    let (takes, after) = advance(simd, before, alpha);
-                    t[at] = after;
-                    let w = simd.select_f32s(takes, simd.mul_f32s(before, alpha), simd.splat_f32s(0.0));
-                    red[at] = simd.mul_add_e_f32s(w, color[0], red[at]);
-                    green[at] = simd.mul_add_e_f32s(w, color[1], green[at]);
-                    blue[at] = simd.mul_add_e_f32s(w, color[2], blue[at]);
-                    depth[at] = simd.mul_add_e_f32s(w, z, depth[at]);
+            for (near, &entry) in near.iter_mut().zip(list) {
+                *near = self.splats[entry as usize];
+            }
+            for s in &near[..list.len()] {
+                let falloff = Falloff::new(simd, s, &grid);
+                let color = s.color.map(|c| simd.splat_f32s(c));
+                let z = simd.splat_f32s(s.depth);
+                for b in 0..blocks {
+                    let mut rows = falloff.rows[b] & live[b];
+                    *evaluated += rows.count_ones() as usize * lanes;
+                    let dx = simd.sub_f32s(vectors::<S>(&grid.x)[b], falloff.mean_x);
+                    while rows != 0 {
+                        let r = rows.trailing_zeros() as usize % TILE;
+                        rows &= rows - 1;
+                        let at = r * blocks + b;
+                        let (_, alpha) = falloff.alpha(simd, dx, r);
+                        let before = t[at];
+                        let (takes, after) = advance(simd, before, alpha);
+                        t[at] = after;
+                        let w = simd.select_f32s(takes, simd.mul_f32s(before, alpha), simd.splat_f32s(0.0));
+                        red[at] = simd.mul_add_e_f32s(w, color[0], red[at]);
+                        green[at] = simd.mul_add_e_f32s(w, color[1], green[at]);
+                        blue[at] = simd.mul_add_e_f32s(w, color[2], blue[at]);
+                        depth[at] = simd.mul_add_e_f32s(w, z, depth[at]);
+                    }
                 }
             }
         }
@@ -316,9 +321,10 @@ impl WithSimd for BackwardTile<'_> {
         let mut transmittance = fresh(width);
         let grid = Grid::new(self.rectangle);
         let mut live = [grid.inside; TILE];
-        for (n, (&entry, out)) in self.list.iter().zip(self.out).enumerate() {
-            if n % LOOK_EVERY == LOOK_EVERY - 1 {
-                let t = vectors::<S>(&transmittance);
+        let mut near = [Splat::default(); BATCH];
+        for (n, (list, out)) in self.list.chunks(BATCH).zip(self.out.chunks_mut(BATCH)).enumerate() {
+            let t = vectors_mut::<S>(&mut transmittance);
+            if n > 0 {
                 for b in 0..blocks {
                     live[b] = live_rows(simd, t, b, blocks) & grid.inside;
                 }
@@ -326,63 +332,67 @@ impl WithSimd for BackwardTile<'_> {
                     break;
                 }
             }
-            let s = &self.splats[entry as usize];
-            let t = vectors_mut::<S>(&mut transmittance);
-            let falloff = Falloff::new(simd, s, &grid);
-            let color = s.color.map(|c| simd.splat_f32s(c));
-            let z = simd.splat_f32s(s.depth);
-            let [xx, xy, yy] = s.conic;
-            let mut sums = [[0.0f32; TILE]; 9];
-            for b in 0..blocks {
-                let mut rows = falloff.rows[b] & live[b];
-                if rows == 0 {
-                    continue;
-                }
-                let dx = simd.sub_f32s(vectors::<S>(&grid.x)[b], falloff.mean_x);
-                let (xx_dx, xy_dx) = (simd.mul_f32s(simd.splat_f32s(xx), dx), simd.mul_f32s(simd.splat_f32s(xy), dx));
-                let mut sum = [simd.splat_f32s(0.0); 9];
-                while rows != 0 {
-                    let r = rows.trailing_zeros() as usize % TILE;
-                    rows &= rows - 1;
-                    let at = r * blocks + b;
-                    let dy = falloff.dy[r];
-                    let (raw, alpha) = falloff.alpha(simd, dx, r);
-                    let before = t[at];
-                    let (takes, after) = advance(simd, before, alpha);
-                    t[at] = after;
-                    let zero = simd.splat_f32s(0.0);
-                    let alpha = simd.select_f32s(takes, alpha, zero);
-                    let w = simd.mul_f32s(before, alpha);
-                    let value = simd.mul_add_e_f32s(color[0], d_red[at], d_alpha[at]);
-                    let value = simd.mul_add_e_f32s(color[1], d_green[at], value);
-                    let value = simd.mul_add_e_f32s(color[2], d_blue[at], value);
-                    let value = simd.mul_add_e_f32s(z, d_depth[at], value);
-                    let own = simd.mul_f32s(w, value);
-                    let rest = simd.sub_f32s(behind[at], own);
-                    behind[at] = rest;
-                    // alpha d loss / d alpha = - d loss / d sigma, none where alpha is capped.
-                    let odds = simd.div_f32s(alpha, simd.sub_f32s(simd.splat_f32s(1.0), alpha));
-                    let g = simd.negate_mul_add_e_f32s(odds, rest, own);
-                    let free = simd.less_than_f32s(raw, simd.splat_f32s(ALPHA_MAX));
-                    let g = simd.select_f32s(free, g, zero);
-                    let size = simd.abs_f32s(g);
-                    let gx = simd.abs_f32s(simd.add_f32s(xx_dx, simd.splat_f32s(xy * dy)));
-                    let gy = simd.abs_f32s(simd.add_f32s(xy_dx, simd.splat_f32s(yy * dy)));
-                    sum[0] = simd.add_f32s(g, sum[0]);
-                    sum[1] = simd.mul_add_e_f32s(g, simd.splat_f32s(dy), sum[1]);
-                    sum[2] = simd.mul_add_e_f32s(g, simd.splat_f32s(dy * dy), sum[2]);
-                    sum[3] = simd.mul_add_e_f32s(gx, size, sum[3]);
-                    sum[4] = simd.mul_add_e_f32s(gy, size, sum[4]);
-                    sum[5] = simd.mul_add_e_f32s(w, d_red[at], sum[5]);
-                    sum[6] = simd.mul_add_e_f32s(w, d_green[at], sum[6]);
-                    sum[7] = simd.mul_add_e_f32s(w, d_blue[at], sum[7]);
-                    sum[8] = simd.mul_add_e_f32s(w, d_depth[at], sum[8]);
-                }
-                for (sums, sum) in sums.iter_mut().zip(sum) {
-                    vectors_mut::<S>(sums)[b] = sum;
-                }
+            for (near, &entry) in near.iter_mut().zip(list) {
+                *near = self.splats[entry as usize];
             }
-            *out = splat_gradient(s, &grid.x, &sums);
+            for (s, out) in near.iter().zip(out) {
+                let falloff = Falloff::new(simd, s, &grid);
+                let color = s.color.map(|c| simd.splat_f32s(c));
+                let z = simd.splat_f32s(s.depth);
+                let [xx, xy, yy] = s.conic;
+                let mut sums = [[0.0f32; TILE]; 9];
+                for b in 0..blocks {
+                    let mut rows = falloff.rows[b] & live[b];
+                    if rows == 0 {
+                        continue;
+                    }
+                    let dx = simd.sub_f32s(vectors::<S>(&grid.x)[b], falloff.mean_x);
+                    let (xx_dx, xy_dx) =
+                        (simd.mul_f32s(simd.splat_f32s(xx), dx), simd.mul_f32s(simd.splat_f32s(xy), dx));
+                    let mut sum = [simd.splat_f32s(0.0); 9];
+                    while rows != 0 {
+                        let r = rows.trailing_zeros() as usize % TILE;
+                        rows &= rows - 1;
+                        let at = r * blocks + b;
+                        let dy = falloff.dy[r];
+                        let (raw, alpha) = falloff.alpha(simd, dx, r);
+                        let before = t[at];
+                        let (takes, after) = advance(simd, before, alpha);
+                        t[at] = after;
+                        let zero = simd.splat_f32s(0.0);
+                        let alpha = simd.select_f32s(takes, alpha, zero);
+                        let w = simd.mul_f32s(before, alpha);
+                        let value = simd.mul_add_e_f32s(color[0], d_red[at], d_alpha[at]);
+                        let value = simd.mul_add_e_f32s(color[1], d_green[at], value);
+                        let value = simd.mul_add_e_f32s(color[2], d_blue[at], value);
+                        let value = simd.mul_add_e_f32s(z, d_depth[at], value);
+                        let own = simd.mul_f32s(w, value);
+                        let rest = simd.sub_f32s(behind[at], own);
+                        behind[at] = rest;
+                        // alpha d loss / d alpha = - d loss / d sigma, none where alpha is capped.
+                        let odds = simd.div_f32s(alpha, simd.sub_f32s(simd.splat_f32s(1.0), alpha));
+                        let g = simd.negate_mul_add_e_f32s(odds, rest, own);
+                        let free = simd.less_than_f32s(raw, simd.splat_f32s(ALPHA_MAX));
+                        let g = simd.select_f32s(free, g, zero);
+                        let size = simd.abs_f32s(g);
+                        let gx = simd.abs_f32s(simd.add_f32s(xx_dx, simd.splat_f32s(xy * dy)));
+                        let gy = simd.abs_f32s(simd.add_f32s(xy_dx, simd.splat_f32s(yy * dy)));
+                        sum[0] = simd.add_f32s(g, sum[0]);
+                        sum[1] = simd.mul_add_e_f32s(g, simd.splat_f32s(dy), sum[1]);
+                        sum[2] = simd.mul_add_e_f32s(g, simd.splat_f32s(dy * dy), sum[2]);
+                        sum[3] = simd.mul_add_e_f32s(gx, size, sum[3]);
+                        sum[4] = simd.mul_add_e_f32s(gy, size, sum[4]);
+                        sum[5] = simd.mul_add_e_f32s(w, d_red[at], sum[5]);
+                        sum[6] = simd.mul_add_e_f32s(w, d_green[at], sum[6]);
+                        sum[7] = simd.mul_add_e_f32s(w, d_blue[at], sum[7]);
+                        sum[8] = simd.mul_add_e_f32s(w, d_depth[at], sum[8]);
+                    }
+                    for (sums, sum) in sums.iter_mut().zip(sum) {
+                        vectors_mut::<S>(sums)[b] = sum;
+                    }
+                }
+                *out = splat_gradient(s, &grid.x, &sums);
+            }
         }
     }
 }

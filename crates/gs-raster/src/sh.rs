@@ -26,6 +26,7 @@ const C3: [Real; 7] = [
 ];
 
 /// Values of the basis at a unit direction; only the first (degree + 1)^2 are set.
+#[inline(always)]
 fn basis(degree: u8, d: Vec3) -> [Real; 16] {
     let mut b = [0.0; 16];
     b[0] = C0;
@@ -56,6 +57,7 @@ fn basis(degree: u8, d: Vec3) -> [Real; 16] {
 }
 
 /// Gradients of the basis functions as functions of x, y, z.
+#[inline(always)]
 fn basis_gradient(degree: u8, d: Vec3) -> [Vec3; 16] {
     let mut b = [Vec3::ZERO; 16];
     let (x, y, z) = (d.x, d.y, d.z);
@@ -99,21 +101,34 @@ pub(crate) fn color(sh: &[Real], degree: u8, direction: Vec3) -> [Real; 3] {
 
 /// Adds d loss / d coefficients to `d_sh` and returns d loss / d direction (not normalised).
 pub(crate) fn color_backward(sh: &[Real], degree: u8, direction: Vec3, d_color: [Real; 3], d_sh: &mut [Real]) -> Vec3 {
+    // Loops of constant length for each degree.
+    match degree {
+        0 => color_backward_of::<0>(sh, direction, d_color, d_sh),
+        1 => color_backward_of::<1>(sh, direction, d_color, d_sh),
+        2 => color_backward_of::<2>(sh, direction, d_color, d_sh),
+        _ => color_backward_of::<3>(sh, direction, d_color, d_sh),
+    }
+}
+
+#[inline(always)]
+fn color_backward_of<const DEGREE: u8>(sh: &[Real], direction: Vec3, d_color: [Real; 3], d_sh: &mut [Real]) -> Vec3 {
+    let count = const { sh_coefficients(DEGREE) };
+    let (sh, d_sh) = (&sh[..3 * count], &mut d_sh[..3 * count]);
     let length = direction.length();
     let d = direction.normalize_or_zero();
-    let b = basis(degree, d);
-    for k in 0..sh_coefficients(degree) {
+    let b = basis(DEGREE, d);
+    for k in 0..count {
         for c in 0..3 {
             d_sh[3 * k + c] += b[k] * d_color[c];
         }
     }
-    if degree == 0 || length == 0.0 {
+    if DEGREE == 0 || length == 0.0 {
         return Vec3::ZERO;
     }
-    let gradient = basis_gradient(degree, d);
+    let gradient = basis_gradient(DEGREE, d);
     let mut d_unit = Vec3::ZERO;
-    for k in 1..sh_coefficients(degree) {
-        let s: Real = (0..3).map(|c| sh[3 * k + c] * d_color[c]).sum();
+    for k in 1..count {
+        let s = sh[3 * k] * d_color[0] + sh[3 * k + 1] * d_color[1] + sh[3 * k + 2] * d_color[2];
         d_unit += s * gradient[k];
     }
     (d_unit - d * d.dot(d_unit)) / length
