@@ -7,7 +7,7 @@ CARGO ?= cargo
 THREADS ?= 0
 export THREADS
 
-.PHONY: help build demo scene test lint models clip-tiny bench-graph clean
+.PHONY: help build demo scene test lint models clip-tiny bench-raster bench-graph clean
 
 help: ## Say what can be made
 	@echo "Targets:"
@@ -28,6 +28,12 @@ scene: build ## The same on your own photographs: make scene SCENE=folder OUT=fo
 test: ## Run all tests
 	$(CARGO) test --release --workspace
 	scripts/test_pipeline.sh
+
+# PLYs to measure besides the synthetic scenes.
+SPLATS ?=
+
+bench-raster: ## Time the rasteriser per pixel-Gaussian pair on one core: out/bench/raster.json
+	$(CARGO) bench -p gs-raster --bench raster -- $(abspath $(SPLATS)) $(CURDIR)/out/bench/raster.json
 
 lint: ## Check formatting and lints
 	$(CARGO) fmt --all --check

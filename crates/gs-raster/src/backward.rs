@@ -2,11 +2,14 @@
 
 use crate::forward::Forward;
 use crate::kernels::{TileGradients, backward_tile};
-use crate::project::{SplatGradient, project_backward};
-use crate::tiles::{PIXELS, TILE};
+use crate::single::project::{Parameters, SplatGradient, project_backward};
+use crate::tiles::{PIXELS, TILE, Tiles};
 use crate::types::{Gradients, PixelGradients, RasterOptions};
 use gs_scene::{Camera, Gaussians};
 use rayon::prelude::*;
+
+/// Gaussians whose parameters' gradients one task computes.
+const CHUNK: usize = 512;
 
 /// d loss / d every parameter, given d loss / d every pixel of the view that `forward` rendered with the same arguments.
 ///
@@ -19,12 +22,16 @@ pub fn backward(
     forward: &Forward,
     d: PixelGradients<'_>,
 ) -> Gradients {
-    let tiles = &forward.tiles;
-    let w = camera.width as usize;
-    let pixels = w * camera.height as usize;
+    let pixels = camera.width as usize * camera.height as usize;
     assert_eq!(d.rgb.len(), 3 * pixels);
     assert!(d.alpha.is_none_or(|a| a.len() == pixels) && d.depth.is_none_or(|z| z.len() == pixels));
+    gather(g, options, &forward.tiles, &pair_gradients(forward, options, d))
+}
 
+/// d loss / d splat for every splat of every tile, in the order of the tiles' entries.
+pub(crate) fn pair_gradients(forward: &Forward, options: &RasterOptions, d: PixelGradients<'_>) -> Vec<SplatGradient> {
+    let tiles = &forward.tiles;
+    let w = tiles.lens.width as usize;
     // One gradient per tile and Gaussian, each tile writing its own slice.
     let mut pairs = vec![SplatGradient::default(); tiles.entries.len()];
     let mut slices = Vec::with_capacity(tiles.count());
@@ -36,13 +43,18 @@ pub fn backward(
     }
     slices.into_par_iter().enumerate().for_each(|(t, out)| {
         if !out.is_empty() {
-            let (x0, y0, _, th) = tiles.rectangle(t);
-            let tile = pixel_gradients(forward, options, d, w, tiles.rectangle(t));
-            backward_tile(&tiles.splats, tiles.list(t), x0, y0, th, &tile, out);
+            let rectangle = tiles.rectangle(t);
+            let mut tile = pixel_gradients(forward, options, d, w, rectangle);
+            backward_tile(&tiles.splats, tiles.list(t), rectangle, &mut tile, out);
         }
     });
 
-    // The pairs of each splat, in tile order.
+    pairs
+}
+
+/// Sums the gradients of each splat over its tiles, in tile order, and takes them to the Gaussians' parameters. `pairs` is in
+/// the order of the tiles' entries.
+pub(crate) fn gather(g: &Gaussians, options: &RasterOptions, tiles: &Tiles, pairs: &[SplatGradient]) -> Gradients {
     let n = tiles.splats.len();
     let mut start = vec![0usize; n + 1];
     for &e in &tiles.entries {
@@ -58,23 +70,13 @@ pub fn backward(
         next[e as usize] += 1;
     }
 
-    let stride = g.sh_stride();
-    let per_splat: Vec<_> = (0..n)
-        .into_par_iter()
-        .with_min_len(64)
-        .map(|i| {
-            let mut sum = SplatGradient::default();
-            for &pair in &of_splat[start[i]..start[i + 1]] {
-                sum.add(&pairs[pair as usize]);
-            }
-            let mut d_sh = [0.0f32; 48];
-            let i_original = tiles.index[i] as usize;
-            let p = project_backward(g, i_original, &tiles.lens, options, &tiles.splats[i], &sum, &mut d_sh[..stride]);
-            (p, d_sh, sum.mean, sum.mean_abs)
-        })
-        .collect();
+    let mut place = vec![u32::MAX; g.len()];
+    for (i, &original) in tiles.index.iter().enumerate() {
+        place[original as usize] = i as u32;
+    }
 
     let all = g.len();
+    let stride = g.sh_stride();
     let mut out = Gradients {
         means: vec![[0.0; 3]; all],
         log_scales: vec![[0.0; 3]; all],
@@ -84,17 +86,37 @@ pub fn backward(
         mean2d: vec![[0.0; 2]; all],
         mean2d_abs: vec![[0.0; 2]; all],
     };
-    for (&i, (p, d_sh, mean, mean_abs)) in tiles.index.iter().zip(per_splat) {
-        let i = i as usize;
-        let Some(p) = p else { continue };
-        out.means[i] = p.mean;
-        out.log_scales[i] = p.log_scale;
-        out.rotations[i] = p.rotation;
-        out.opacity_logits[i] = p.opacity_logit;
-        out.sh[i * stride..(i + 1) * stride].copy_from_slice(&d_sh[..stride]);
-        out.mean2d[i] = mean;
-        out.mean2d_abs[i] = mean_abs;
-    }
+    let geometry = out.means.par_chunks_mut(CHUNK).zip(out.log_scales.par_chunks_mut(CHUNK));
+    let geometry = geometry.zip(out.rotations.par_chunks_mut(CHUNK));
+    let rest = out.opacity_logits.par_chunks_mut(CHUNK).zip(out.sh.par_chunks_mut(CHUNK * stride));
+    let centers = out.mean2d.par_chunks_mut(CHUNK).zip(out.mean2d_abs.par_chunks_mut(CHUNK));
+    geometry.zip(rest).zip(centers).enumerate().for_each(|(chunk, (of_parameters, (mean2d, mean2d_abs)))| {
+        let (((means, log_scales), rotations), (opacity_logits, sh)) = of_parameters;
+        for k in 0..means.len() {
+            let original = chunk * CHUNK + k;
+            let i = place[original] as usize;
+            if i == u32::MAX as usize {
+                continue;
+            }
+            let mut sum = SplatGradient::default();
+            for &pair in &of_splat[start[i]..start[i + 1]] {
+                sum.add(&pairs[pair as usize]);
+            }
+            let d_sh = &mut sh[k * stride..(k + 1) * stride];
+            let parameters = Parameters::of(g, original);
+            let Some(p) = project_backward(&parameters, &tiles.lens, options, &tiles.splats[i], &sum, d_sh) else {
+                // Not held by single precision: no gradient rather than NaN in an optimiser's state.
+                d_sh.fill(0.0);
+                continue;
+            };
+            means[k] = p.mean;
+            log_scales[k] = p.log_scale;
+            rotations[k] = p.rotation;
+            opacity_logits[k] = p.opacity_logit;
+            mean2d[k] = sum.mean;
+            mean2d_abs[k] = sum.mean_abs;
+        }
+    });
     out
 }
 
@@ -109,7 +131,7 @@ fn pixel_gradients(
         rgb: [[0.0; PIXELS]; 3],
         depth: [0.0; PIXELS],
         alpha: [0.0; PIXELS],
-        total: [0.0; PIXELS],
+        behind: [0.0; PIXELS],
     });
     let r = &forward.rendered;
     for y in 0..th {
@@ -117,16 +139,16 @@ fn pixel_gradients(
             let (from, to) = ((y0 + y) * w + x0 + x, y * TILE + x);
             let mut d_alpha = d.alpha.map_or(0.0, |a| a[from]);
             let d_depth = d.depth.map_or(0.0, |z| z[from]);
-            let mut total = d_depth * r.depth[from];
+            let mut behind = d_depth * r.depth[from];
             for c in 0..3 {
                 let g = d.rgb[3 * from + c];
                 tile.rgb[c][to] = g;
                 d_alpha -= options.background[c] * g;
-                total += g * (r.rgb[3 * from + c] - (1.0 - r.alpha[from]) * options.background[c]);
+                behind += g * (r.rgb[3 * from + c] - (1.0 - r.alpha[from]) * options.background[c]);
             }
             tile.depth[to] = d_depth;
             tile.alpha[to] = d_alpha;
-            tile.total[to] = total + d_alpha * r.alpha[from];
+            tile.behind[to] = behind + d_alpha * r.alpha[from];
         }
     }
     tile

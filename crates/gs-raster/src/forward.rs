@@ -2,7 +2,7 @@
 
 use crate::kernels::forward_tile;
 use crate::tiles::{TILE, Tiles};
-use crate::types::{RasterOptions, Rendered};
+use crate::types::{Dropped, RasterOptions, Rendered};
 use gs_scene::{Camera, Gaussians};
 use rayon::prelude::*;
 
@@ -17,6 +17,11 @@ impl Forward {
     /// Original indices of the Gaussians that were drawn, front to back.
     pub fn visible(&self) -> &[u32] {
         &self.tiles.index
+    }
+
+    /// How many Gaussians were not drawn, and why.
+    pub fn dropped(&self) -> Dropped {
+        self.tiles.dropped
     }
 
     /// Half extents, in pixels, of the drawn Gaussians' visible ellipses, in the order of [`Self::visible`]: the larger of
@@ -34,10 +39,16 @@ impl Forward {
 /// Renders a view and keeps what [`crate::backward`] needs.
 pub fn forward(g: &Gaussians, camera: &Camera, options: &RasterOptions) -> Forward {
     let tiles = Tiles::new(g, camera, options);
-    let (w, h) = (camera.width as usize, camera.height as usize);
+    let (rendered, _) = composite(&tiles, options);
+    Forward { rendered, tiles }
+}
+
+/// Composites all tiles. Also returns how many pixel-Gaussian pairs the kernels evaluated.
+pub(crate) fn composite(tiles: &Tiles, options: &RasterOptions) -> (Rendered, usize) {
+    let (w, h) = (tiles.lens.width as usize, tiles.lens.height as usize);
     let mut rendered = Rendered {
-        width: camera.width,
-        height: camera.height,
+        width: tiles.lens.width,
+        height: tiles.lens.height,
         rgb: vec![0.0; w * h * 3],
         alpha: vec![0.0; w * h],
         depth: vec![0.0; w * h],
@@ -45,14 +56,16 @@ pub fn forward(g: &Gaussians, camera: &Camera, options: &RasterOptions) -> Forwa
     // A band of tiles owns whole image rows, so bands can be written side by side.
     let bands = rendered
         .rgb
-        .par_chunks_mut(w * TILE * 3)
-        .zip(rendered.alpha.par_chunks_mut(w * TILE))
-        .zip(rendered.depth.par_chunks_mut(w * TILE));
-    bands.enumerate().for_each(|(band, ((rgb, alpha), depth))| {
+        .par_chunks_mut((w * TILE * 3).max(1))
+        .zip(rendered.alpha.par_chunks_mut((w * TILE).max(1)))
+        .zip(rendered.depth.par_chunks_mut((w * TILE).max(1)));
+    let evaluated = bands.enumerate().map(|(band, ((rgb, alpha), depth))| {
+        let mut evaluated = 0;
         for column in 0..tiles.columns {
             let t = band * tiles.columns + column;
             let (x0, y0, tw, th) = tiles.rectangle(t);
-            let p = forward_tile(&tiles.splats, tiles.list(t), x0, y0, th);
+            let p = forward_tile(&tiles.splats, tiles.list(t), (x0, y0, tw, th));
+            evaluated += p.evaluated;
             for y in 0..th {
                 for x in 0..tw {
                     let (from, to) = (y * TILE + x, y * w + x0 + x);
@@ -65,8 +78,10 @@ pub fn forward(g: &Gaussians, camera: &Camera, options: &RasterOptions) -> Forwa
                 }
             }
         }
+        evaluated
     });
-    Forward { rendered, tiles }
+    let evaluated = evaluated.sum();
+    (rendered, evaluated)
 }
 
 /// Renders a view: colour, accumulated alpha, alpha-weighted depth.

@@ -2,35 +2,66 @@
 //!
 //! Follows gsplat's conventions: 0.3 is added to the diagonal of the 2D covariance; in the Jacobian x/z and y/z are clamped to
 //! the image's edges plus 0.15 of its size.
+//!
+//! Compiled in single precision for the renderer and in double for its tests; [`Real`] is whichever it is.
 
-use crate::sh;
+use super::real::{Mat3, Quat, Real, Vec2, Vec3, narrow, narrow_matrix, widen};
+use super::sh;
 use crate::types::RasterOptions;
-use glam::{DVec3, Mat3, Quat, Vec2, Vec3};
-use gs_scene::{Camera, Gaussians};
+use glam::DVec3;
+use gs_scene::Camera;
 
 /// Added to the diagonal of the projected covariance, in square pixels.
-pub(crate) const LOW_PASS: f32 = 0.3;
+const LOW_PASS: f32 = 0.3;
 /// Contributions below this are skipped.
-pub(crate) const ALPHA_MIN: f32 = 1.0 / 255.0;
+pub(crate) const ALPHA_MIN: Real = 1.0 / 255.0;
+/// Centres further out than this, in pixels, are not drawn: the square of such a distance nears the end of single precision.
+const MEAN_MAX: Real = 1e15;
 
 /// A Gaussian as the tiles see it.
 #[derive(Debug, Clone, Copy, Default)]
 pub(crate) struct Splat {
-    pub mean: [f32; 2],
+    pub mean: [Real; 2],
     /// Inverse of the 2D covariance: xx, xy, yy.
-    pub conic: [f32; 3],
+    pub conic: [Real; 3],
+    /// Determinant of the conic.
+    pub conic_det: Real,
     /// Half extents of the region where alpha >= 1/255, in pixels.
-    pub extent: [f32; 2],
+    pub extent: [Real; 2],
     /// sigma at which alpha falls below 1/255: ln(255 opacity).
-    pub sigma_max: f32,
-    pub opacity: f32,
-    pub depth: f32,
-    pub color: [f32; 3],
+    pub sigma_max: Real,
+    pub opacity: Real,
+    pub log2_opacity: Real,
+    pub depth: Real,
+    pub color: [Real; 3],
     /// Which colour channels were cut at zero: they pass no gradient.
     pub clamped: [bool; 3],
 }
 
-/// A camera in single precision, ready for many Gaussians.
+/// The parameters of one Gaussian, as stored.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct Parameters<'a> {
+    pub mean: [Real; 3],
+    pub log_scale: [Real; 3],
+    /// w x y z, any length.
+    pub rotation: [Real; 4],
+    pub opacity_logit: Real,
+    /// `[coefficients][rgb]`.
+    pub sh: &'a [Real],
+    pub sh_degree: u8,
+}
+
+/// Why a Gaussian is not drawn.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) enum Unseen {
+    NotFinite,
+    Behind,
+    Degenerate,
+    Transparent,
+    Outside,
+}
+
+/// A camera ready for many Gaussians.
 pub(crate) struct Lens {
     rotation: Mat3,
     position: DVec3,
@@ -46,12 +77,12 @@ pub(crate) struct Lens {
 
 impl Lens {
     pub fn new(c: &Camera) -> Self {
-        let focal = Vec2::new(c.fx as f32, c.fy as f32);
-        let size = Vec2::new(c.width as f32, c.height as f32);
-        let center = Vec2::new(c.cx as f32, c.cy as f32);
+        let focal = Vec2::new(c.fx as Real, c.fy as Real);
+        let size = Vec2::new(c.width as Real, c.height as Real);
+        let center = Vec2::new(c.cx as Real, c.cy as Real);
         let margin = 0.15 * size / focal;
         Self {
-            rotation: c.rotation.as_mat3(),
+            rotation: narrow_matrix(c.rotation),
             rotation64: c.rotation,
             position: c.position(),
             focal,
@@ -64,13 +95,13 @@ impl Lens {
     }
 
     /// Camera coordinates; the difference is taken in f64 so that far-away origins do not cost digits.
-    fn to_camera(&self, mean: [f32; 3]) -> Vec3 {
-        (self.rotation64 * (Vec3::from(mean).as_dvec3() - self.position)).as_vec3()
+    fn to_camera(&self, mean: [Real; 3]) -> Vec3 {
+        narrow(self.rotation64 * (widen(Vec3::from(mean)) - self.position))
     }
 
     /// View direction (from the camera to the Gaussian), not normalised.
-    fn direction(&self, mean: [f32; 3]) -> Vec3 {
-        (Vec3::from(mean).as_dvec3() - self.position).as_vec3()
+    fn direction(&self, mean: [Real; 3]) -> Vec3 {
+        narrow(widen(Vec3::from(mean)) - self.position)
     }
 }
 
@@ -84,72 +115,93 @@ struct Ellipse {
     /// Rotation times scale.
     m: Mat3,
     quat: Quat,
-    quat_norm: f32,
+    quat_norm: Real,
     scale: Vec3,
-    cov: [f32; 3],
+    /// Of the projection along x and y, the low-pass included.
+    variance: [Real; 2],
+    /// Inverse of the projected covariance: xx, xy, yy.
+    conic: [Real; 3],
+    conic_det: Real,
 }
 
-fn ellipse(g: &Gaussians, i: usize, lens: &Lens, near: f32) -> Option<Ellipse> {
-    let t = lens.to_camera(g.means[i]);
-    if !(t.is_finite() && t.z > near) {
-        return None;
+fn ellipse(p: &Parameters<'_>, lens: &Lens, near: f32) -> Result<Ellipse, Unseen> {
+    let t = lens.to_camera(p.mean);
+    let finite = p.log_scale.iter().chain(&p.rotation).all(|v| v.is_finite());
+    if !(t.is_finite() && finite) {
+        return Err(Unseen::NotFinite);
     }
-    let [w, x, y, z] = g.rotations[i];
+    if t.z <= near as Real {
+        return Err(Unseen::Behind);
+    }
+    let [w, x, y, z] = p.rotation;
     let raw = Quat::from_xyzw(x, y, z, w);
     let quat_norm = raw.length();
     if !(quat_norm.is_finite() && quat_norm > 1e-12) {
-        return None;
+        return Err(Unseen::Degenerate);
     }
     let quat = raw * (1.0 / quat_norm);
-    let scale = Vec3::from(g.log_scales[i].map(f32::exp));
+    let scale = Vec3::from(p.log_scale.map(Real::exp));
     let m = Mat3::from_quat(quat) * Mat3::from_diagonal(scale);
     let rz = 1.0 / t.z;
     let (u, v) = (t.x * rz, t.y * rz);
     let inside = [(lens.low.x..=lens.high.x).contains(&u), (lens.low.y..=lens.high.y).contains(&v)];
-    let clamped = Vec2::new(u.clamp(lens.low.x, lens.high.x), v.clamp(lens.low.y, lens.high.y)) * t.z;
+    // Not clamp(), which panics over a camera that is not finite.
+    let clamped = Vec2::new(u.max(lens.low.x).min(lens.high.x), v.max(lens.low.y).min(lens.high.y)) * t.z;
     let j0 = Vec3::new(lens.focal.x * rz, 0.0, -lens.focal.x * clamped.x * rz * rz);
     let j1 = Vec3::new(0.0, lens.focal.y * rz, -lens.focal.y * clamped.y * rz * rz);
     let wt = lens.rotation.transpose();
     let jw = [wt * j0, wt * j1];
     let mt = m.transpose();
     let (a, b) = (mt * jw[0], mt * jw[1]);
-    let cov = [a.dot(a) + LOW_PASS, a.dot(b), b.dot(b) + LOW_PASS];
-    cov.iter().all(|c| c.is_finite()).then_some(Ellipse { t, clamped, inside, jw, m, quat, quat_norm, scale, cov })
+    // In f64, and |a x b|^2 for the determinant without the low-pass: xx yy - xy^2 would cancel for needles, and the square
+    // of a large covariance overflow.
+    let (a64, b64) = (widen(a), widen(b));
+    let (low_pass, aa, bb) = (f64::from(LOW_PASS), a64.length_squared(), b64.length_squared());
+    let det = a64.cross(b64).length_squared() + low_pass * (aa + bb + low_pass);
+    let conic = [(bb + low_pass) / det, -a64.dot(b64) / det, (aa + low_pass) / det].map(|v| v as Real);
+    let variance = [aa + low_pass, bb + low_pass].map(|v| v as Real);
+    let whole = det.is_finite() && conic.iter().chain(&variance).all(|v| v.is_finite());
+    if !(whole && conic[0] > 0.0 && conic[2] > 0.0) {
+        return Err(Unseen::Degenerate);
+    }
+    Ok(Ellipse { t, clamped, inside, jw, m, quat, quat_norm, scale, variance, conic, conic_det: (1.0 / det) as Real })
 }
 
-/// Projects Gaussian `i`; `None` when it cannot touch the image.
-pub(crate) fn project(g: &Gaussians, i: usize, lens: &Lens, options: &RasterOptions) -> Option<Splat> {
-    let opacity = g.opacity(i);
-    if opacity.is_nan() || opacity < ALPHA_MIN {
-        return None;
+/// Projects a Gaussian; the error says why it cannot touch the image.
+pub(crate) fn project(p: &Parameters<'_>, lens: &Lens, options: &RasterOptions) -> Result<Splat, Unseen> {
+    // Infinite logits are opacities of 0 and 1.
+    let opacity = 1.0 / (1.0 + (-p.opacity_logit).exp());
+    if opacity.is_nan() {
+        return Err(Unseen::NotFinite);
     }
-    let e = ellipse(g, i, lens, options.near)?;
-    let [xx, xy, yy] = e.cov;
-    let det = xx * yy - xy * xy;
-    if !(det.is_finite() && det > 0.0) {
-        return None;
+    let e = ellipse(p, lens, options.near)?;
+    if opacity < ALPHA_MIN {
+        return Err(Unseen::Transparent);
     }
-    let inv = 1.0 / det;
-    let conic = [yy * inv, -xy * inv, xx * inv];
     let mean = [lens.focal.x * e.t.x / e.t.z + lens.center.x, lens.focal.y * e.t.y / e.t.z + lens.center.y];
+    if mean.iter().any(|m| m.abs().is_nan() || m.abs() > MEAN_MAX) {
+        return Err(Unseen::Outside);
+    }
     let sigma_max = (255.0 * opacity).ln();
-    let extent = [(2.0 * sigma_max * xx).sqrt(), (2.0 * sigma_max * yy).sqrt()];
-    let (w, h) = (lens.width as f32, lens.height as f32);
+    let extent = e.variance.map(|v| (2.0 * sigma_max * v).sqrt());
+    let (w, h) = (lens.width as Real, lens.height as Real);
     let touches =
         mean[0] + extent[0] > 0.0 && mean[0] - extent[0] < w && mean[1] + extent[1] > 0.0 && mean[1] - extent[1] < h;
-    if !(touches && conic.iter().chain(&mean).all(|v| v.is_finite())) {
-        return None;
+    if !touches {
+        return Err(Unseen::Outside);
     }
-    let raw = sh::color(g.sh_of(i), g.sh_degree.min(options.sh_degree), lens.direction(g.means[i]));
+    let raw = sh::color(p.sh, p.sh_degree.min(options.sh_degree), lens.direction(p.mean));
     if raw.iter().any(|c| !c.is_finite()) {
-        return None;
+        return Err(Unseen::NotFinite);
     }
-    Some(Splat {
+    Ok(Splat {
         mean,
-        conic,
+        conic: e.conic,
+        conic_det: e.conic_det,
         extent,
         sigma_max,
         opacity,
+        log2_opacity: opacity.log2(),
         depth: e.t.z,
         color: raw.map(|c| c.max(0.0)),
         clamped: raw.map(|c| c < 0.0),
@@ -159,12 +211,12 @@ pub(crate) fn project(g: &Gaussians, i: usize, lens: &Lens, options: &RasterOpti
 /// d loss / d splat, summed over pixels.
 #[derive(Debug, Clone, Copy, Default, PartialEq)]
 pub(crate) struct SplatGradient {
-    pub mean: [f32; 2],
-    pub mean_abs: [f32; 2],
-    pub conic: [f32; 3],
-    pub opacity: f32,
-    pub depth: f32,
-    pub color: [f32; 3],
+    pub mean: [Real; 2],
+    pub mean_abs: [Real; 2],
+    pub conic: [Real; 3],
+    pub opacity: Real,
+    pub depth: Real,
+    pub color: [Real; 3],
 }
 
 impl SplatGradient {
@@ -184,31 +236,31 @@ impl SplatGradient {
 
 /// d loss / d parameters of one Gaussian.
 pub(crate) struct ParameterGradient {
-    pub mean: [f32; 3],
-    pub log_scale: [f32; 3],
-    pub rotation: [f32; 4],
-    pub opacity_logit: f32,
+    pub mean: [Real; 3],
+    pub log_scale: [Real; 3],
+    pub rotation: [Real; 4],
+    pub opacity_logit: Real,
 }
 
-/// The chain rule through [`project`]; the gradient of the spherical harmonics is written to `d_sh`.
+/// The chain rule through [`project`]; the gradient of the spherical harmonics is written to `d_sh`. `None` when single
+/// precision does not hold the result: such a Gaussian passes no gradient.
 pub(crate) fn project_backward(
-    g: &Gaussians,
-    i: usize,
+    p: &Parameters<'_>,
     lens: &Lens,
     options: &RasterOptions,
     splat: &Splat,
     d: &SplatGradient,
-    d_sh: &mut [f32],
+    d_sh: &mut [Real],
 ) -> Option<ParameterGradient> {
-    let e = ellipse(g, i, lens, options.near)?;
+    let e = ellipse(p, lens, options.near).ok()?;
     let mut d_color = d.color;
     for c in 0..3 {
         if splat.clamped[c] {
             d_color[c] = 0.0;
         }
     }
-    let degree = g.sh_degree.min(options.sh_degree);
-    let mut d_mean = sh::color_backward(g.sh_of(i), degree, lens.direction(g.means[i]), d_color, d_sh);
+    let degree = p.sh_degree.min(options.sh_degree);
+    let mut d_mean = sh::color_backward(p.sh, degree, lens.direction(p.mean), d_color, d_sh);
 
     // conic = cov^-1:  d cov = -conic^T (d conic) conic, with the off-diagonal counted once in d.conic[1].
     let [a, b, c] = splat.conic;
@@ -257,19 +309,23 @@ pub(crate) fn project_backward(
     let d_quat = quat_backward(e.quat, &d_r);
     // q / |q|: the part along q drops out.
     let q = [e.quat.w, e.quat.x, e.quat.y, e.quat.z];
-    let along: f32 = q.iter().zip(&d_quat).map(|(a, b)| a * b).sum();
+    let along: Real = q.iter().zip(&d_quat).map(|(a, b)| a * b).sum();
     let rotation = [0, 1, 2, 3].map(|k| (d_quat[k] - along * q[k]) / e.quat_norm);
     let log_scale = d_scale * e.scale;
-    Some(ParameterGradient {
+    let gradient = ParameterGradient {
         mean: d_mean.into(),
         log_scale: log_scale.into(),
         rotation,
         opacity_logit: d.opacity * splat.opacity * (1.0 - splat.opacity),
-    })
+    };
+    let ParameterGradient { mean, log_scale, rotation, opacity_logit } = &gradient;
+    let groups = [&mean[..], log_scale, rotation, &[*opacity_logit], d_sh, &d.mean, &d.mean_abs];
+    let finite = groups.iter().all(|group| group.iter().all(|v| v.is_finite()));
+    finite.then_some(gradient)
 }
 
 /// d loss / d (w, x, y, z) of a unit quaternion from d loss / d its rotation matrix.
-fn quat_backward(q: Quat, d: &Mat3) -> [f32; 4] {
+fn quat_backward(q: Quat, d: &Mat3) -> [Real; 4] {
     let (w, x, y, z) = (q.w, q.x, q.y, q.z);
     // d.col(c)[r] is the gradient of R[r][c].
     let g = |r: usize, c: usize| d.col(c)[r];

@@ -1,16 +1,35 @@
 //! Real spherical harmonics up to degree 3, in 3DGS's order and signs.
 
-use glam::Vec3;
-use gs_scene::{SH_C0, sh_coefficients};
+// Digits for double precision, which the tests compile this file in.
+#![allow(clippy::excessive_precision)]
 
-const C1: f32 = 0.488_602_52;
-const C2: [f32; 5] = [1.092_548_5, -1.092_548_5, 0.315_391_57, -1.092_548_5, 0.546_274_24];
-const C3: [f32; 7] = [-0.590_043_6, 2.890_611_4, -0.457_045_8, 0.373_176_33, -0.457_045_8, 1.445_305_7, -0.590_043_6];
+use super::real::{Real, Vec3};
+use gs_scene::sh_coefficients;
+
+const C0: Real = 0.282_094_791_773_878_14;
+const C1: Real = 0.488_602_511_902_919_92;
+const C2: [Real; 5] = [
+    1.092_548_430_592_079_2,
+    -1.092_548_430_592_079_2,
+    0.315_391_565_252_520_05,
+    -1.092_548_430_592_079_2,
+    0.546_274_215_296_039_59,
+];
+const C3: [Real; 7] = [
+    -0.590_043_589_926_643_52,
+    2.890_611_442_640_554_4,
+    -0.457_045_799_464_465_74,
+    0.373_176_332_590_115_4,
+    -0.457_045_799_464_465_74,
+    1.445_305_721_320_277_2,
+    -0.590_043_589_926_643_52,
+];
 
 /// Values of the basis at a unit direction; only the first (degree + 1)^2 are set.
-fn basis(degree: u8, d: Vec3) -> [f32; 16] {
+#[inline(always)]
+fn basis(degree: u8, d: Vec3) -> [Real; 16] {
     let mut b = [0.0; 16];
-    b[0] = SH_C0;
+    b[0] = C0;
     let (x, y, z) = (d.x, d.y, d.z);
     if degree >= 1 {
         b[1] = -C1 * y;
@@ -38,6 +57,7 @@ fn basis(degree: u8, d: Vec3) -> [f32; 16] {
 }
 
 /// Gradients of the basis functions as functions of x, y, z.
+#[inline(always)]
 fn basis_gradient(degree: u8, d: Vec3) -> [Vec3; 16] {
     let mut b = [Vec3::ZERO; 16];
     let (x, y, z) = (d.x, d.y, d.z);
@@ -68,7 +88,7 @@ fn basis_gradient(degree: u8, d: Vec3) -> [Vec3; 16] {
 }
 
 /// Colour seen along `direction` (any length), before it is cut at zero: 0.5 + sum of coefficients times basis.
-pub(crate) fn color(sh: &[f32], degree: u8, direction: Vec3) -> [f32; 3] {
+pub(crate) fn color(sh: &[Real], degree: u8, direction: Vec3) -> [Real; 3] {
     let b = basis(degree, direction.normalize_or_zero());
     let mut out = [0.5; 3];
     for k in 0..sh_coefficients(degree) {
@@ -80,22 +100,35 @@ pub(crate) fn color(sh: &[f32], degree: u8, direction: Vec3) -> [f32; 3] {
 }
 
 /// Adds d loss / d coefficients to `d_sh` and returns d loss / d direction (not normalised).
-pub(crate) fn color_backward(sh: &[f32], degree: u8, direction: Vec3, d_color: [f32; 3], d_sh: &mut [f32]) -> Vec3 {
+pub(crate) fn color_backward(sh: &[Real], degree: u8, direction: Vec3, d_color: [Real; 3], d_sh: &mut [Real]) -> Vec3 {
+    // Loops of constant length for each degree.
+    match degree {
+        0 => color_backward_of::<0>(sh, direction, d_color, d_sh),
+        1 => color_backward_of::<1>(sh, direction, d_color, d_sh),
+        2 => color_backward_of::<2>(sh, direction, d_color, d_sh),
+        _ => color_backward_of::<3>(sh, direction, d_color, d_sh),
+    }
+}
+
+#[inline(always)]
+fn color_backward_of<const DEGREE: u8>(sh: &[Real], direction: Vec3, d_color: [Real; 3], d_sh: &mut [Real]) -> Vec3 {
+    let count = const { sh_coefficients(DEGREE) };
+    let (sh, d_sh) = (&sh[..3 * count], &mut d_sh[..3 * count]);
     let length = direction.length();
     let d = direction.normalize_or_zero();
-    let b = basis(degree, d);
-    for k in 0..sh_coefficients(degree) {
+    let b = basis(DEGREE, d);
+    for k in 0..count {
         for c in 0..3 {
             d_sh[3 * k + c] += b[k] * d_color[c];
         }
     }
-    if degree == 0 || length == 0.0 {
+    if DEGREE == 0 || length == 0.0 {
         return Vec3::ZERO;
     }
-    let gradient = basis_gradient(degree, d);
+    let gradient = basis_gradient(DEGREE, d);
     let mut d_unit = Vec3::ZERO;
-    for k in 1..sh_coefficients(degree) {
-        let s: f32 = (0..3).map(|c| sh[3 * k + c] * d_color[c]).sum();
+    for k in 1..count {
+        let s = sh[3 * k] * d_color[0] + sh[3 * k + 1] * d_color[1] + sh[3 * k + 2] * d_color[2];
         d_unit += s * gradient[k];
     }
     (d_unit - d * d.dot(d_unit)) / length

@@ -1,7 +1,7 @@
 //! Which Gaussians touch which tile, front to back.
 
-use crate::project::{Lens, Splat, project};
-use crate::types::RasterOptions;
+use crate::single::project::{Lens, Parameters, Splat, project};
+use crate::types::{Dropped, RasterOptions};
 use gs_scene::{Camera, Gaussians};
 use rayon::prelude::*;
 
@@ -24,25 +24,32 @@ pub(crate) struct Tiles {
     /// Positions in `splats`, tile after tile, front to back within each.
     pub entries: Vec<u32>,
     pub columns: usize,
+    pub dropped: Dropped,
 }
 
 impl Tiles {
     pub fn new(g: &Gaussians, camera: &Camera, options: &RasterOptions) -> Self {
         let lens = Lens::new(camera);
-        let chunks: Vec<Vec<(u64, Splat)>> = (0..g.len().div_ceil(CHUNK))
+        let chunks: Vec<(Vec<(u64, Splat)>, Dropped)> = (0..g.len().div_ceil(CHUNK))
             .into_par_iter()
             .map(|c| {
-                let range = c * CHUNK..((c + 1) * CHUNK).min(g.len());
-                range
-                    .filter_map(|i| {
-                        let s = project(g, i, &lens, options)?;
+                let (mut seen, mut dropped) = (Vec::new(), Dropped::default());
+                for i in c * CHUNK..((c + 1) * CHUNK).min(g.len()) {
+                    match project(&Parameters::of(g, i), &lens, options) {
                         // Positive floats sort as their bits do; the index below breaks ties.
-                        Some(((u64::from(s.depth.to_bits()) << 32) | i as u64, s))
-                    })
-                    .collect()
+                        Ok(s) => seen.push(((u64::from(s.depth.to_bits()) << 32) | i as u64, s)),
+                        Err(reason) => dropped.count(reason),
+                    }
+                }
+                (seen, dropped)
             })
             .collect();
-        let mut visible: Vec<(u64, Splat)> = chunks.into_iter().flatten().collect();
+        let mut dropped = Dropped::default();
+        let mut visible = Vec::new();
+        for (seen, own) in chunks {
+            visible.extend(seen);
+            dropped.add(&own);
+        }
         visible.par_sort_unstable_by_key(|(key, _)| *key);
         let index: Vec<u32> = visible.iter().map(|(key, _)| *key as u32).collect();
         let splats: Vec<Splat> = visible.into_iter().map(|(_, s)| s).collect();
@@ -65,7 +72,7 @@ impl Tiles {
                 next[t as usize] += 1;
             }
         }
-        Self { lens, index, splats, offsets, entries, columns }
+        Self { lens, index, splats, offsets, entries, columns, dropped }
     }
 
     pub fn count(&self) -> usize {

@@ -1,7 +1,7 @@
-//! Per-pixel weights, for footprints, silhouettes and features of any dimension.
+//! Per-pixel weights, for footprints, silhouettes and features.
 
 use crate::kernels::weights_tile;
-use crate::tiles::{PIXELS, TILE, Tiles};
+use crate::tiles::{PIXELS, Tiles};
 use crate::types::RasterOptions;
 use gs_scene::{Camera, Gaussians};
 use rayon::prelude::*;
@@ -12,9 +12,9 @@ pub struct TileWeights<'a> {
     pub x0: usize,
     /// Top edge in pixels.
     pub y0: usize,
-    /// Width within the image, at most [`TILE`].
+    /// Width within the image, at most [`crate::TILE`].
     pub width: usize,
-    /// Height within the image, at most [`TILE`].
+    /// Height within the image, at most [`crate::TILE`].
     pub height: usize,
     /// Original indices of the Gaussians that touch the tile, front to back; G of them.
     pub gaussians: &'a [u32],
@@ -36,78 +36,24 @@ pub fn tile_weights<R: Send>(
     early_stop: bool,
     f: impl Fn(&TileWeights<'_>) -> R + Sync,
 ) -> Vec<R> {
-    // Colours are not asked for: skip the harmonics.
-    let tiles = Tiles::new(g, camera, &RasterOptions { sh_degree: 0, ..options.clone() });
-    (0..tiles.count())
-        .into_par_iter()
-        .map(|t| {
-            let (x0, y0, width, height) = tiles.rectangle(t);
-            let list = tiles.list(t);
-            let gaussians: Vec<u32> = list.iter().map(|&e| tiles.index[e as usize]).collect();
-            let mut alphas = vec![0.0; list.len() * PIXELS];
-            let mut weights = vec![0.0; list.len() * PIXELS];
-            let mut alpha = weights_tile(&tiles.splats, list, x0, y0, height, early_stop, &mut alphas, &mut weights);
-            // Columns beyond the image's right edge are nobody's pixels.
-            if width < TILE {
-                let clear = |values: &mut [f32]| {
-                    values.chunks_exact_mut(TILE).for_each(|row| row[width..].fill(0.0));
-                };
-                clear(&mut alphas);
-                clear(&mut weights);
-                clear(&mut alpha);
-            }
-            let tile = TileWeights {
-                x0,
-                y0,
-                width,
-                height,
-                gaussians: &gaussians,
-                alphas: &alphas,
-                weights: &weights,
-                alpha: &alpha,
-            };
-            f(&tile)
-        })
-        .collect()
+    let tiles = tiles_without_color(g, camera, options);
+    (0..tiles.count()).into_par_iter().map(|t| with_weights(&tiles, t, early_stop, &f)).collect()
 }
 
-/// Renders features: sum of blending weight times feature, `[height][width][dim]`, over a zero background.
-///
-/// # Panics
-/// When `features` is not `[N][dim]`.
-pub fn render_features(
-    g: &Gaussians,
-    features: &[f32],
-    dim: usize,
-    camera: &Camera,
-    options: &RasterOptions,
-) -> Vec<f32> {
-    assert_eq!(features.len(), g.len() * dim);
-    let (w, h) = (camera.width as usize, camera.height as usize);
-    let tiles = tile_weights(g, camera, options, true, |t| {
-        let mut out = vec![0.0f32; t.width * t.height * dim];
-        for (&i, weights) in t.gaussians.iter().zip(t.weights.chunks_exact(PIXELS)) {
-            let feature = &features[i as usize * dim..(i as usize + 1) * dim];
-            for y in 0..t.height {
-                for x in 0..t.width {
-                    let weight = weights[y * TILE + x];
-                    if weight > 0.0 {
-                        let at = (y * t.width + x) * dim;
-                        for (o, f) in out[at..at + dim].iter_mut().zip(feature) {
-                            *o += weight * f;
-                        }
-                    }
-                }
-            }
-        }
-        (t.x0, t.y0, t.width, out)
-    });
-    let mut image = vec![0.0; w * h * dim];
-    for (x0, y0, width, values) in tiles {
-        for (y, row) in values.chunks_exact(width * dim).enumerate() {
-            let at = ((y0 + y) * w + x0) * dim;
-            image[at..at + width * dim].copy_from_slice(row);
-        }
-    }
-    image
+/// Tiles for callers that do not ask for colours: the harmonics are skipped.
+pub(crate) fn tiles_without_color(g: &Gaussians, camera: &Camera, options: &RasterOptions) -> Tiles {
+    Tiles::new(g, camera, &RasterOptions { sh_degree: 0, ..options.clone() })
+}
+
+/// Calls `f` with the weights of tile `t`.
+pub(crate) fn with_weights<R>(tiles: &Tiles, t: usize, early_stop: bool, f: impl FnOnce(&TileWeights<'_>) -> R) -> R {
+    let (x0, y0, width, height) = tiles.rectangle(t);
+    let list = tiles.list(t);
+    let gaussians: Vec<u32> = list.iter().map(|&e| tiles.index[e as usize]).collect();
+    let mut alphas = vec![0.0; list.len() * PIXELS];
+    let mut weights = vec![0.0; list.len() * PIXELS];
+    let alpha = weights_tile(&tiles.splats, list, (x0, y0, width, height), early_stop, &mut alphas, &mut weights);
+    let tile =
+        TileWeights { x0, y0, width, height, gaussians: &gaussians, alphas: &alphas, weights: &weights, alpha: &alpha };
+    f(&tile)
 }

@@ -124,7 +124,7 @@ pub fn spanning_tree(points: &[f32], dim: usize, weights: &[u32], min_samples: u
         caps.reset();
         known.par_iter_mut().enumerate().with_min_len(1024).for_each(|(i, k)| {
             let own = search.component[i];
-            if !k.best.is_some_and(|(_, q)| search.component[q as usize] != own) {
+            if k.best.is_none_or(|(_, q)| search.component[q as usize] == own) {
                 // A candidate is the cheapest for sure when it costs no more than any edge of this point must, and no
                 // other point as near was left out of the candidates.
                 let first = candidates.first(&search, i, &mut k.next);

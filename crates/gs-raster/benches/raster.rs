@@ -1,0 +1,172 @@
+//! Time per pixel-Gaussian pair on one core, for `make bench-raster`. The last argument names the JSON file to write; further
+//! arguments before it name PLYs to measure besides the synthetic scenes.
+
+use glam::{DMat3, DVec3};
+use gs_raster::{RasterOptions, measure, tile_weights};
+use gs_scene::{Camera, Gaussians};
+use rand_chacha::ChaCha8Rng;
+use rand_chacha::rand_core::{RngCore, SeedableRng};
+use serde_json::{Value, json};
+
+const REPETITIONS: usize = 15;
+
+/// Gaussians of a trained scene's statistics: log-normal footprints of about `radius` pixels, flat, most of them either faint
+/// or nearly opaque, on surfaces at several depths.
+fn synthetic(n: usize, radius: f32, camera: &Camera) -> Gaussians {
+    let mut rng = ChaCha8Rng::seed_from_u64(1);
+    let mut roll = || (rng.next_u32() >> 8) as f32 / 16_777_216.0;
+    let mut g = Gaussians { sh_degree: 3, ..Gaussians::default() };
+    for _ in 0..n {
+        let z = 2.0 + 6.0 * (roll() * 6.0).floor() / 6.0 + 0.2 * roll();
+        let pixel = z / camera.fx as f32;
+        let x = (roll() * 1.1 - 0.05) * camera.width as f32 - camera.cx as f32;
+        let y = (roll() * 1.1 - 0.05) * camera.height as f32 - camera.cy as f32;
+        g.means.push([x * pixel, y * pixel, z]);
+        let mut normal = || roll() + roll() + roll() + roll() + roll() + roll() - 3.0;
+        let size = (radius * pixel).ln() + normal();
+        g.log_scales.push([size, size + normal() * 0.7, size - 2.0]);
+        g.rotations.push([normal(), normal(), normal(), normal()]);
+        g.opacity_logits.push(3.0 * normal());
+        g.sh.extend((0..48).map(|k| if k < 3 { normal() } else { 0.1 * normal() }));
+    }
+    g
+}
+
+fn front_camera(width: u32, height: u32) -> Camera {
+    Camera {
+        width,
+        height,
+        fx: f64::from(width),
+        fy: f64::from(width),
+        cx: f64::from(width) / 2.0,
+        cy: f64::from(height) / 2.0,
+        rotation: DMat3::IDENTITY,
+        translation: DVec3::ZERO,
+    }
+}
+
+/// Looks at the middle half of the Gaussians from outside.
+fn outside_camera(g: &Gaussians) -> Camera {
+    let quartile = |axis: usize, q: usize| {
+        let mut v: Vec<f32> = g.means.iter().map(|m| m[axis]).filter(|v| v.is_finite()).collect();
+        v.sort_by(f32::total_cmp);
+        f64::from(v[v.len() * q / 4])
+    };
+    let low = DVec3::new(quartile(0, 1), quartile(1, 1), quartile(2, 1));
+    let high = DVec3::new(quartile(0, 3), quartile(1, 3), quartile(2, 3));
+    let middle = (low + high) / 2.0;
+    Camera::look_at(middle + DVec3::new(0.5, 0.3, 1.0) * (high - low).length(), middle, DVec3::Y, 640, 480, 0.9)
+}
+
+/// Median, and half the distance between the quartiles relative to it.
+fn summary(mut values: Vec<f64>) -> (f64, f64) {
+    values.sort_by(f64::total_cmp);
+    let median = values[values.len() / 2];
+    (median, (values[values.len() * 3 / 4] - values[values.len() / 4]) / 2.0 / median)
+}
+
+fn bench(name: &str, g: &Gaussians, camera: &Camera) -> Value {
+    let options = RasterOptions::default();
+    let pixels = camera.width as usize * camera.height as usize;
+    let d: Vec<f32> = (0..3 * pixels).map(|i| ((i * 7919) % 1000) as f32 * 2e-3 - 1.0).collect();
+    let counts = tile_weights(g, camera, &options, true, |t| t.weights.iter().filter(|w| **w > 0.0).count());
+    let contributing: usize = counts.iter().sum();
+    let runs: Vec<_> = (0..=REPETITIONS).map(|_| measure(g, camera, &options, &d)).skip(1).collect();
+    let evaluated = runs[0].pairs_evaluated;
+    let pairs = evaluated as f64;
+    let (forward, forward_spread) = summary(runs.iter().map(|r| r.forward_s * 1e9 / pairs).collect());
+    let (backward, backward_spread) = summary(runs.iter().map(|r| r.backward_s * 1e9 / pairs).collect());
+    let (project, _) = summary(runs.iter().map(|r| r.project_s * 1e3).collect());
+    let (gather, _) = summary(runs.iter().map(|r| r.gather_s * 1e3).collect());
+    let least = |f: fn(&gs_raster::Measured) -> f64| runs.iter().map(f).fold(f64::INFINITY, f64::min);
+    eprintln!(
+        "{name}: {} Gaussians, {}x{}: forward {forward:.3} ns/pair (+-{:.1} %), backward {backward:.3} ns/pair (+-{:.1} %), \
+         {:.1} M pairs evaluated, {:.1} M contributing; ms: project {project:.1}, forward {:.1} (least {:.1}), backward {:.1} \
+         (least {:.1}), gather {gather:.1}",
+        g.len(),
+        camera.width,
+        camera.height,
+        forward_spread * 100.0,
+        backward_spread * 100.0,
+        pairs / 1e6,
+        contributing as f64 / 1e6,
+        forward * pairs / 1e6,
+        least(|r| r.forward_s) * 1e3,
+        backward * pairs / 1e6,
+        least(|r| r.backward_s) * 1e3,
+    );
+    json!({
+        "scene": name,
+        "gaussians": g.len(),
+        "width": camera.width,
+        "height": camera.height,
+        "forward_ns_per_pair": forward,
+        "forward_spread": forward_spread,
+        "backward_ns_per_pair": backward,
+        "backward_spread": backward_spread,
+        "forward_ns_per_contributing_pair": forward * pairs / contributing.max(1) as f64,
+        "backward_ns_per_contributing_pair": backward * pairs / contributing.max(1) as f64,
+        "pairs_evaluated": evaluated,
+        "pairs_contributing": contributing,
+        "project_ms": project,
+        "forward_ms": forward * pairs / 1e6,
+        "backward_ms": backward * pairs / 1e6,
+        "gather_ms": gather,
+    })
+}
+
+fn features() -> Vec<&'static str> {
+    #[cfg(target_arch = "x86_64")]
+    {
+        let all = [
+            ("avx2", std::is_x86_feature_detected!("avx2")),
+            ("fma", std::is_x86_feature_detected!("fma")),
+            ("avx512f", std::is_x86_feature_detected!("avx512f")),
+        ];
+        all.iter().filter(|(_, there)| *there).map(|(name, _)| *name).collect()
+    }
+    #[cfg(not(target_arch = "x86_64"))]
+    vec![std::env::consts::ARCH]
+}
+
+fn main() {
+    // cargo itself passes --bench.
+    let mut paths: Vec<String> = std::env::args().skip(1).filter(|a| !a.starts_with("--")).collect();
+    let out = paths.pop();
+    let pool = rayon::ThreadPoolBuilder::new().num_threads(1).build().expect("a thread");
+    let scenes = pool.install(|| {
+        let camera = front_camera(640, 480);
+        let mut scenes = vec![
+            bench("trained-like", &synthetic(60_000, 3.0, &camera), &camera),
+            bench("large footprints", &synthetic(6_000, 15.0, &camera), &camera),
+            bench("small footprints", &synthetic(120_000, 0.7, &camera), &camera),
+        ];
+        for path in &paths {
+            match gs_scene::ply::read_gaussians(path) {
+                Ok(g) => scenes.push(bench(path.rsplit('/').next().unwrap_or(path), &g, &outside_camera(&g))),
+                Err(e) => eprintln!("skipped: {e}"),
+            }
+        }
+        scenes
+    });
+    let main = &scenes[0];
+    let report = json!({
+        "forward_ns_per_pair": main["forward_ns_per_pair"],
+        "backward_ns_per_pair": main["backward_ns_per_pair"],
+        "pairs_evaluated": main["pairs_evaluated"],
+        "pairs_contributing": main["pairs_contributing"],
+        "repetitions": REPETITIONS,
+        "threads": 1,
+        "cpu_features": features(),
+        "spread": "half the distance between the quartiles, relative to the median",
+        "scenes": scenes,
+    });
+    if let Some(out) = out {
+        let text = serde_json::to_string_pretty(&report).expect("a report") + "\n";
+        let made = std::path::Path::new(&out).parent().map_or(Ok(()), std::fs::create_dir_all);
+        if let Err(e) = made.and_then(|()| std::fs::write(&out, text)) {
+            eprintln!("cannot write {out}: {e}");
+            std::process::exit(2);
+        }
+    }
+}

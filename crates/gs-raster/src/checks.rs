@@ -1,0 +1,285 @@
+//! The renderer against the f64 reference on random scenes.
+
+use crate::reference::{Cuts, Gaussian, Pixel, backward as reference_backward, render as reference_render, widen};
+use crate::{PixelGradients, RasterOptions, backward, features_backward, forward, render_features};
+use glam::DVec3;
+use gs_scene::{Camera, Gaussians};
+use proptest::prelude::*;
+use proptest::test_runner::RngSeed;
+use rand_chacha::ChaCha8Rng;
+use rand_chacha::rand_core::{RngCore, SeedableRng};
+
+/// Features per Gaussian in these tests.
+const DIM: usize = 5;
+
+struct Dice(ChaCha8Rng);
+
+impl Dice {
+    fn new(seed: u64) -> Self {
+        Self(ChaCha8Rng::seed_from_u64(seed))
+    }
+
+    /// Uniform in low..high.
+    fn between(&mut self, low: f32, high: f32) -> f32 {
+        low + (high - low) * (self.0.next_u32() >> 8) as f32 / 16_777_216.0
+    }
+
+    fn many<const K: usize>(&mut self, low: f32, high: f32) -> [f32; K] {
+        std::array::from_fn(|_| self.between(low, high))
+    }
+
+    /// A camera of random place, lens and size, looking roughly at the origin.
+    fn camera(&mut self) -> Camera {
+        let eye = DVec3::from(self.many::<3>(-1.0, 1.0).map(f64::from)).normalize_or(DVec3::X);
+        let target = DVec3::from(self.many::<3>(-0.5, 0.5).map(f64::from));
+        let eye = eye * f64::from(self.between(0.5, 6.0));
+        let size: [u32; 2] = self.many(1.0, 70.0).map(|v| v as u32);
+        let fov = f64::from(self.between(0.4, 2.2));
+        let up = DVec3::from(self.many::<3>(-1.0, 1.0).map(f64::from));
+        let mut c = Camera::look_at(eye, target, up, size[0], size[1], fov);
+        c.fy *= f64::from(self.between(0.8, 1.25));
+        c.cx += f64::from(self.between(-5.0, 5.0));
+        c
+    }
+
+    /// `n` Gaussians around the origin, some elongated, some opaque, some faint, and the features of each.
+    fn gaussians(&mut self, n: usize, degree: u8) -> (Gaussians, Vec<f32>) {
+        let mut g = Gaussians { sh_degree: degree, ..Gaussians::default() };
+        for _ in 0..n {
+            g.means.push(self.many(-1.5, 1.5));
+            let size = self.between(-4.5, -0.5);
+            g.log_scales.push(self.many::<3>(-1.5, 1.0).map(|s| s + size));
+            g.rotations.push(self.many(-1.0, 1.0));
+            g.opacity_logits.push(self.between(-6.0, 7.0));
+            g.sh.extend(self.many::<3>(-2.0, 2.0));
+            for _ in 3..3 * (usize::from(degree) + 1).pow(2) {
+                g.sh.push(self.between(-0.4, 0.4));
+            }
+        }
+        let features = (0..n * DIM).map(|_| self.between(-1.0, 1.0)).collect();
+        (g, features)
+    }
+
+    /// Gradients for every pixel; none where `quiet`.
+    fn pixels(&mut self, quiet: &[bool]) -> Vec<Pixel> {
+        let one = |quiet: &bool| {
+            let mut roll = || if *quiet { 0.0 } else { f64::from(self.between(-1.0, 1.0)) };
+            let rgb = [roll(), roll(), roll()];
+            let (alpha, depth) = (roll(), roll());
+            Pixel { rgb, alpha, depth, features: (0..DIM).map(|_| roll()).collect(), doubt: 0.0 }
+        };
+        quiet.iter().map(one).collect()
+    }
+}
+
+/// Deterministic: a test that fails fails for everyone.
+fn config(cases: u32, seed: u64) -> ProptestConfig {
+    ProptestConfig { cases, rng_seed: RngSeed::Fixed(seed), failure_persistence: None, ..ProptestConfig::default() }
+}
+
+/// |a - b| / |b| in the Euclidean norm; the floor keeps groups without gradient comparable.
+fn relative(a: &[f64], b: &[f64]) -> f64 {
+    assert_eq!(a.len(), b.len());
+    let difference = a.iter().zip(b).map(|(x, y)| (x - y).powi(2)).sum::<f64>().sqrt();
+    difference / b.iter().map(|y| y * y).sum::<f64>().sqrt().max(1e-9)
+}
+
+proptest! {
+    #![proptest_config(config(150, 1))]
+
+    #[test]
+    fn forward_agrees(seed in 0u64..u64::MAX, n in 0usize..60, degree in 0u8..=3, active in 0u8..=3) {
+        let mut dice = Dice::new(seed);
+        let (g, features) = dice.gaussians(n, degree);
+        let camera = dice.camera();
+        let options = RasterOptions { background: dice.many(0.0, 1.0), sh_degree: active, ..RasterOptions::default() };
+        let ours = forward(&g, &camera, &options).rendered;
+        let our_features = render_features(&g, &features, DIM, &camera, &options);
+        let scene = widen(&g, &features, DIM);
+        let truth = reference_render(&scene, &camera, &options, Cuts::Hard);
+        prop_assert_eq!(truth.len(), ours.alpha.len());
+        // Colours are at most 0.5 + the sum of the coefficients times the largest basis value, depths at most this.
+        let brightest = g.sh.chunks(3 * 16).map(|s| s.iter().map(|v| v.abs()).sum::<f32>()).fold(1.0, f32::max) as f64;
+        let deepest = g.means.iter().map(|m| camera.to_camera(DVec3::from(m.map(f64::from))).z).fold(0.0, f64::max);
+        let mut doubtful = 0;
+        for (p, t) in truth.iter().enumerate() {
+            // Where rounding may turn a decision, that one decision's effect is allowed, nothing more.
+            doubtful += usize::from(t.doubt > 0.0);
+            let alpha = (f64::from(ours.alpha[p]) - t.alpha).abs();
+            prop_assert!(alpha <= 1e-4 + t.doubt, "alpha of pixel {}: {:e}", p, alpha);
+            for c in 0..3 {
+                let error = (f64::from(ours.rgb[3 * p + c]) - t.rgb[c]).abs();
+                prop_assert!(error <= 1e-4 + t.doubt * brightest, "colour of pixel {}: {:e}", p, error);
+            }
+            let depth = (f64::from(ours.depth[p]) - t.depth).abs();
+            prop_assert!(depth <= 1e-3 * t.depth + t.doubt * deepest, "depth of pixel {}: {:e}", p, depth);
+            for k in 0..DIM {
+                let error = (f64::from(our_features[DIM * p + k]) - t.features[k]).abs();
+                prop_assert!(error <= 1e-4 + t.doubt, "feature of pixel {}: {:e}", p, error);
+            }
+        }
+        prop_assert!(doubtful * 20 <= truth.len() + 40, "{doubtful} of {} pixels in doubt", truth.len());
+    }
+}
+
+/// Names and places of the parameter groups in the order of [`Gaussian::parameters`].
+fn groups(degree: u8) -> Vec<(&'static str, std::ops::Range<usize>)> {
+    let bands = 11 + 3 * (usize::from(degree) + 1).pow(2);
+    vec![
+        ("means", 0..3),
+        ("log scales", 3..6),
+        ("rotations", 6..10),
+        ("opacity logits", 10..11),
+        ("harmonics", 11..bands),
+        ("features", bands..bands + DIM),
+    ]
+}
+
+fn loss(scene: &[Gaussian], camera: &Camera, options: &RasterOptions, cuts: Cuts, d: &[Pixel]) -> f64 {
+    let rendered = reference_render(scene, camera, options, cuts);
+    let dot = |a: &[f64], b: &[f64]| a.iter().zip(b).map(|(x, y)| x * y).sum::<f64>();
+    rendered
+        .iter()
+        .zip(d)
+        .map(|(r, d)| dot(&r.rgb, &d.rgb) + r.alpha * d.alpha + r.depth * d.depth + dot(&r.features, &d.features))
+        .sum()
+}
+
+/// A scene that every pixel sees without any cut: faint, wide Gaussians in front of the camera, colours away from zero.
+fn smooth_scene(dice: &mut Dice, degree: u8) -> (Gaussians, Vec<f32>, Camera) {
+    let (mut g, features) = dice.gaussians(6, degree);
+    let c = Camera::look_at(DVec3::new(0.3, -0.2, -4.0), DVec3::ZERO, -DVec3::Y, 19, 13, 0.6);
+    for i in 0..g.len() {
+        g.log_scales[i] = dice.many(-0.1, 0.8);
+        g.opacity_logits[i] = dice.between(-2.0, -0.5);
+        g.means[i] = dice.many(-0.5, 0.5);
+    }
+    for (k, v) in g.sh.iter_mut().enumerate() {
+        // The constant term outweighs the rest: no colour reaches zero.
+        *v = if k % (3 * (usize::from(degree) + 1).pow(2)) < 3 { v.abs() + 2.0 } else { 0.2 * *v };
+    }
+    // One centre beside the image, where the Jacobian is clamped.
+    g.means[0] = [2.6, 0.1, 0.2];
+    g.log_scales[0] = [1.2, 1.0, 0.9];
+    (g, features, c)
+}
+
+fn columns(all: &[(Vec<f64>, [f64; 4])], range: &std::ops::Range<usize>) -> Vec<f64> {
+    all.iter().flat_map(|(v, _)| v[range.clone()].iter().copied()).collect()
+}
+
+#[test]
+fn gradients_are_the_central_differences() {
+    for degree in 0..=3 {
+        let mut dice = Dice::new(70 + u64::from(degree));
+        let (g, features, camera) = smooth_scene(&mut dice, degree);
+        let options = RasterOptions { background: [0.2, 0.5, 0.9], ..RasterOptions::default() };
+        let mut scene = widen(&g, &features, DIM);
+        let d = dice.pixels(&vec![false; (camera.width * camera.height) as usize]);
+        let analytic = reference_backward(&scene, &camera, &options, Cuts::None, &d);
+        let mut numeric = Vec::new();
+        for i in 0..scene.len() {
+            let mut row = Vec::new();
+            for k in 0..scene[i].parameters().len() {
+                let mut shifted = |step: f64| {
+                    let before = *scene[i].parameters()[k];
+                    *scene[i].parameters()[k] = before + step;
+                    let value = loss(&scene, &camera, &options, Cuts::None, &d);
+                    *scene[i].parameters()[k] = before;
+                    value
+                };
+                // Fourth order: steps large enough that rounding stays below 1e-10.
+                let h = 1e-3;
+                let (near, far) = (shifted(h) - shifted(-h), shifted(2.0 * h) - shifted(-2.0 * h));
+                row.push((8.0 * near - far) / (12.0 * h));
+            }
+            numeric.push((row, [0.0; 4]));
+        }
+        // The renderer itself, on the same scene: no pixel of it is cut.
+        let plain = reference_render(&scene, &camera, &options, Cuts::None);
+        let cut = reference_render(&scene, &camera, &options, Cuts::Hard);
+        assert!(plain.iter().zip(&cut).all(|(a, b)| a.alpha == b.alpha && b.doubt == 0.0), "the scene is smooth");
+        let ours = our_gradients(&g, &features, &camera, &options, &d);
+        for (name, range) in groups(degree) {
+            let exact = relative(&columns(&analytic, &range), &columns(&numeric, &range));
+            let single = relative(&columns(&ours, &range), &columns(&numeric, &range));
+            eprintln!("degree {degree}, {name}: f64 {exact:e}, f32 {single:e}");
+            assert!(exact <= 1e-6, "degree {degree}, {name}: f64 chain rule is off by {exact:e}");
+            assert!(single <= 1e-3, "degree {degree}, {name}: f32 gradient is off by {single:e}");
+        }
+    }
+}
+
+proptest! {
+    #![proptest_config(config(100, 2))]
+
+    /// On scenes with every cut active; a pixel where rounding may turn a decision passes no gradient.
+    #[test]
+    fn backward_agrees(seed in 0u64..u64::MAX, n in 1usize..40, degree in 0u8..=3, part in 0..3) {
+        let mut dice = Dice::new(seed);
+        let (g, features) = dice.gaussians(n, degree);
+        let camera = dice.camera();
+        let options = RasterOptions { background: dice.many(0.0, 1.0), ..RasterOptions::default() };
+        let scene = widen(&g, &features, DIM);
+        let truth = reference_render(&scene, &camera, &options, Cuts::Hard);
+        let quiet: Vec<bool> = truth.iter().map(|t| t.doubt > 0.0).collect();
+        let mut d = dice.pixels(&quiet);
+        // Everything at once, or the colours or the features alone: absolute sums do not add.
+        for p in &mut d {
+            if part == 1 {
+                p.features.fill(0.0);
+            } else if part == 2 {
+                (p.rgb, p.alpha, p.depth) = ([0.0; 3], 0.0, 0.0);
+            }
+        }
+        let theirs = reference_backward(&scene, &camera, &options, Cuts::Hard, &d);
+        let ours = our_gradients(&g, &features, &camera, &options, &d);
+        for (name, range) in groups(degree) {
+            let error = relative(&columns(&ours, &range), &columns(&theirs, &range));
+            prop_assert!(error <= 1e-3, "{}: {:e}", name, error);
+        }
+        let means = |all: &[(Vec<f64>, [f64; 4])], r: std::ops::Range<usize>| -> Vec<f64> {
+            all.iter().flat_map(|(_, m)| m[r.clone()].to_vec()).collect()
+        };
+        let error = relative(&means(&ours, 0..2), &means(&theirs, 0..2));
+        prop_assert!(error <= 1e-3, "projected centres: {:e}", error);
+        if part > 0 {
+            let error = relative(&means(&ours, 2..4), &means(&theirs, 2..4));
+            prop_assert!(error <= 1e-3, "absolute sums of projected centres: {:e}", error);
+        }
+    }
+}
+
+/// The renderer's gradients, in the layout of the reference's.
+fn our_gradients(
+    g: &Gaussians,
+    features: &[f32],
+    camera: &Camera,
+    options: &RasterOptions,
+    d: &[Pixel],
+) -> Vec<(Vec<f64>, [f64; 4])> {
+    let rgb: Vec<f32> = d.iter().flat_map(|p| p.rgb.map(|v| v as f32)).collect();
+    let alpha: Vec<f32> = d.iter().map(|p| p.alpha as f32).collect();
+    let depth: Vec<f32> = d.iter().map(|p| p.depth as f32).collect();
+    let f = forward(g, camera, options);
+    let pixels = PixelGradients { rgb: &rgb, alpha: Some(&alpha), depth: Some(&depth) };
+    let p = backward(g, camera, options, &f, pixels);
+    let d_features: Vec<f32> = d.iter().flat_map(|p| p.features.iter().map(|&v| v as f32)).collect();
+    let f = features_backward(g, features, DIM, camera, options, &d_features);
+    let stride = g.sh_stride();
+    let one = |i: usize| {
+        let mut row = vec![0.0; 11];
+        let mut mean = [0.0; 4];
+        for p in [&p, &f.parameters] {
+            let [m, s, q] = [&p.means[i][..], &p.log_scales[i], &p.rotations[i]];
+            let own = m.iter().chain(s).chain(q).chain(&p.opacity_logits[i..=i]);
+            row.iter_mut().zip(own).for_each(|(sum, v)| *sum += f64::from(*v));
+            let [[x, y], [ax, ay]] = [p.mean2d[i], p.mean2d_abs[i]];
+            mean.iter_mut().zip([x, y, ax, ay]).for_each(|(sum, v)| *sum += f64::from(v));
+        }
+        let linear = p.sh[i * stride..(i + 1) * stride].iter().chain(&f.features[i * DIM..(i + 1) * DIM]);
+        row.extend(linear.map(|&v| f64::from(v)));
+        (row, mean)
+    };
+    (0..g.len()).map(one).collect()
+}

@@ -1,0 +1,44 @@
+//! Where the time of a pass goes.
+
+use crate::backward::{gather, pair_gradients};
+use crate::forward::{Forward, composite};
+use crate::tiles::Tiles;
+use crate::types::{PixelGradients, RasterOptions};
+use gs_scene::{Camera, Gaussians};
+use std::time::Instant;
+
+/// Seconds of one forward and backward pass, stage by stage, and the pairs it went through.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Measured {
+    /// Projection, harmonics, sorting, lists of tiles.
+    pub project_s: f64,
+    /// Compositing.
+    pub forward_s: f64,
+    /// Gradients of every splat in every tile.
+    pub backward_s: f64,
+    /// Summing these over tiles and taking them to the parameters.
+    pub gather_s: f64,
+    /// Pixel-Gaussian pairs that the kernels looked at, each way.
+    pub pairs_evaluated: usize,
+}
+
+/// Runs [`crate::forward`] and [`crate::backward`], on the current rayon pool, with a clock between their stages. `d_rgb` is
+/// d loss / d colour, `[height][width][rgb]`.
+pub fn measure(g: &Gaussians, camera: &Camera, options: &RasterOptions, d_rgb: &[f32]) -> Measured {
+    let mut last = Instant::now();
+    let mut lap = || {
+        let now = Instant::now();
+        let seconds = (now - last).as_secs_f64();
+        last = now;
+        seconds
+    };
+    let tiles = Tiles::new(g, camera, options);
+    let project_s = lap();
+    let (rendered, pairs_evaluated) = composite(&tiles, options);
+    let forward_s = lap();
+    let forward = Forward { rendered, tiles };
+    let pairs = pair_gradients(&forward, options, PixelGradients { rgb: d_rgb, alpha: None, depth: None });
+    let backward_s = lap();
+    std::hint::black_box(gather(g, options, &forward.tiles, &pairs));
+    Measured { project_s, forward_s, backward_s, gather_s: lap(), pairs_evaluated }
+}

@@ -1,0 +1,310 @@
+//! The renderer once more, as plainly as it can be said: f64, pixel by pixel, all Gaussians, no tiles. The tests' oracle.
+//!
+//! It shares no code with the renderer except the types of its inputs; [`backward`] alone goes through the renderer's chain
+//! rule, compiled in f64, which the tests hold against central differences of [`render`].
+
+use crate::RasterOptions;
+use crate::double::project::{Lens, Parameters, SplatGradient, project, project_backward};
+use glam::{DMat3, DQuat, DVec2, DVec3};
+use gs_scene::{Camera, Gaussians};
+
+/// Gaussians in f64, each with its features.
+#[derive(Debug, Clone)]
+pub(crate) struct Gaussian {
+    pub mean: [f64; 3],
+    pub log_scale: [f64; 3],
+    pub rotation: [f64; 4],
+    pub opacity_logit: f64,
+    pub sh: Vec<f64>,
+    pub features: Vec<f64>,
+}
+
+impl Gaussian {
+    /// Every parameter in a fixed order: centre, scales, rotation, opacity, harmonics, features.
+    pub fn parameters(&mut self) -> Vec<&mut f64> {
+        let Self { mean, log_scale, rotation, opacity_logit, sh, features } = self;
+        let fixed = mean.iter_mut().chain(log_scale).chain(rotation).chain(std::iter::once(opacity_logit));
+        fixed.chain(sh).chain(features).collect()
+    }
+
+    fn view(&self) -> Parameters<'_> {
+        Parameters {
+            mean: self.mean,
+            log_scale: self.log_scale,
+            rotation: self.rotation,
+            opacity_logit: self.opacity_logit,
+            sh: &self.sh,
+            sh_degree: (self.sh.len() as f64 / 3.0).sqrt() as u8 - 1,
+        }
+    }
+}
+
+pub(crate) fn widen(g: &Gaussians, features: &[f32], dim: usize) -> Vec<Gaussian> {
+    (0..g.len())
+        .map(|i| Gaussian {
+            mean: g.means[i].map(f64::from),
+            log_scale: g.log_scales[i].map(f64::from),
+            rotation: g.rotations[i].map(f64::from),
+            opacity_logit: f64::from(g.opacity_logits[i]),
+            sh: g.sh_of(i).iter().map(|&v| f64::from(v)).collect(),
+            features: features[i * dim..(i + 1) * dim].iter().map(|&v| f64::from(v)).collect(),
+        })
+        .collect()
+}
+
+/// Whether the 1/255 skip and the early stop apply; without them the picture is a smooth function of the parameters (as long
+/// as no alpha reaches 0.99 and no colour zero).
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(crate) enum Cuts {
+    Hard,
+    None,
+}
+
+#[derive(Debug, Clone, Default)]
+pub(crate) struct Pixel {
+    pub rgb: [f64; 3],
+    pub alpha: f64,
+    pub depth: f64,
+    pub features: Vec<f64>,
+    /// Largest change of alpha if every decision that rounding may turn at this pixel (an alpha beside 1/255 or 0.99, a
+    /// transmittance beside 1e-4) went the other way; 0 where there is none.
+    pub doubt: f64,
+}
+
+/// A Gaussian's ellipse in the image.
+struct Ellipse {
+    id: usize,
+    mean: DVec2,
+    /// Inverse of the covariance: xx, xy, yy.
+    conic: [f64; 3],
+    opacity: f64,
+    z: f64,
+    color: [f64; 3],
+}
+
+/// Relative distance to a cut below which single precision may decide differently.
+const DOUBT: f64 = 1e-4;
+
+fn ellipses(scene: &[Gaussian], camera: &Camera, options: &RasterOptions) -> Vec<Ellipse> {
+    let mut out = Vec::new();
+    for (id, g) in scene.iter().enumerate() {
+        let p = camera.to_camera(DVec3::from(g.mean));
+        if p.z <= f64::from(options.near) {
+            continue;
+        }
+        let [w, x, y, z] = g.rotation;
+        let axes = DMat3::from_quat(DQuat::from_xyzw(x, y, z, w).normalize());
+        let spread = DMat3::from_diagonal(DVec3::from(g.log_scale.map(|s| (2.0 * s).exp())));
+        let covariance = camera.rotation * axes * spread * axes.transpose() * camera.rotation.transpose();
+
+        // Projection linearised at the centre, which is moved to within 15 % of the image's size around it.
+        let (width, height) = (f64::from(camera.width), f64::from(camera.height));
+        let u = (camera.fx * p.x / p.z).clamp(-camera.cx - 0.15 * width, width - camera.cx + 0.15 * width);
+        let v = (camera.fy * p.y / p.z).clamp(-camera.cy - 0.15 * height, height - camera.cy + 0.15 * height);
+        let row_x = DVec3::new(camera.fx, 0.0, -u) / p.z;
+        let row_y = DVec3::new(0.0, camera.fy, -v) / p.z;
+        let low_pass = f64::from(0.3f32);
+        let xx = row_x.dot(covariance * row_x) + low_pass;
+        let xy = row_x.dot(covariance * row_y);
+        let yy = row_y.dot(covariance * row_y) + low_pass;
+        let det = xx * yy - xy * xy;
+        let (mx, my, z) = camera.project(DVec3::from(g.mean));
+        out.push(Ellipse {
+            id,
+            mean: DVec2::new(mx, my),
+            conic: [yy / det, -xy / det, xx / det],
+            opacity: 1.0 / (1.0 + (-g.opacity_logit).exp()),
+            z,
+            color: color(&g.sh, DVec3::from(g.mean) - camera.position(), options.sh_degree).map(|c| c.max(0.0)),
+        });
+    }
+    out.sort_by(|a, b| a.z.total_cmp(&b.z).then(a.id.cmp(&b.id)));
+    out
+}
+
+/// Harmonics from their definition by associated Legendre functions: band l, order m, with the Condon-Shortley sign, 3DGS's
+/// order m = -l..=l.
+fn color(sh: &[f64], direction: DVec3, degree: u8) -> [f64; 3] {
+    let d = direction.normalize();
+    let (sin_theta, phi) = (d.x.hypot(d.y), d.y.atan2(d.x));
+    let legendre = |l: usize, m: usize| {
+        let c = d.z;
+        let s = sin_theta;
+        match (l, m) {
+            (0, 0) => 1.0,
+            (1, 0) => c,
+            (1, 1) => -s,
+            (2, 0) => 0.5 * (3.0 * c * c - 1.0),
+            (2, 1) => -3.0 * c * s,
+            (2, 2) => 3.0 * s * s,
+            (3, 0) => 0.5 * (5.0 * c * c * c - 3.0 * c),
+            (3, 1) => -1.5 * (5.0 * c * c - 1.0) * s,
+            (3, 2) => 15.0 * c * s * s,
+            (3, 3) => -15.0 * s * s * s,
+            _ => unreachable!(),
+        }
+    };
+    let factorial = |n: usize| (1..=n).product::<usize>() as f64;
+    let mut out = [0.5; 3];
+    let mut k = 0;
+    for l in 0..=usize::from(degree) {
+        for order in -(l as i32)..=l as i32 {
+            if 3 * k >= sh.len() {
+                return out;
+            }
+            let m = order.unsigned_abs() as usize;
+            let norm = ((2 * l + 1) as f64 / (4.0 * std::f64::consts::PI) * factorial(l - m) / factorial(l + m)).sqrt();
+            let angle = m as f64 * phi;
+            let azimuth = match order {
+                0 => 1.0,
+                o if o > 0 => std::f64::consts::SQRT_2 * angle.cos(),
+                _ => std::f64::consts::SQRT_2 * angle.sin(),
+            };
+            let value = norm * legendre(l, m) * azimuth;
+            for c in 0..3 {
+                out[c] += value * sh[3 * k + c];
+            }
+            k += 1;
+        }
+    }
+    out
+}
+
+/// One Gaussian's part in a pixel.
+struct Layer<'a> {
+    ellipse: &'a Ellipse,
+    offset: DVec2,
+    /// Opacity times the exponential, before the cap at 0.99.
+    raw: f64,
+    alpha: f64,
+    transmittance: f64,
+}
+
+fn layers(ellipses: &[Ellipse], x: usize, y: usize, cuts: Cuts) -> (Vec<Layer<'_>>, f64) {
+    let (mut transmittance, mut doubt) = (1.0, 0.0);
+    let mut out = Vec::new();
+    let near = |value: f64, cut: f64| (value / cut - 1.0).abs() < DOUBT;
+    for e in ellipses {
+        let offset = DVec2::new(x as f64 + 0.5, y as f64 + 0.5) - e.mean;
+        let [a, b, c] = e.conic;
+        let sigma = 0.5 * (a * offset.x * offset.x + c * offset.y * offset.y) + b * offset.x * offset.y;
+        let raw = e.opacity * (-sigma).exp();
+        let alpha = raw.min(0.99);
+        if cuts == Cuts::Hard {
+            if near(raw, 1.0 / 255.0) {
+                doubt += transmittance * alpha;
+            }
+            if near(raw, 0.99) {
+                doubt += 0.99 * DOUBT * transmittance;
+            }
+            if raw < 1.0 / 255.0 {
+                continue;
+            }
+            if near(transmittance * (1.0 - alpha), 1e-4) {
+                doubt += transmittance;
+            }
+            if transmittance * (1.0 - alpha) <= 1e-4 {
+                break;
+            }
+        }
+        out.push(Layer { ellipse: e, offset, raw, alpha, transmittance });
+        transmittance *= 1.0 - alpha;
+    }
+    (out, doubt)
+}
+
+/// `[height][width]` pixels.
+pub(crate) fn render(scene: &[Gaussian], camera: &Camera, options: &RasterOptions, cuts: Cuts) -> Vec<Pixel> {
+    let ellipses = ellipses(scene, camera, options);
+    let dim = scene.first().map_or(0, |g| g.features.len());
+    let mut out = Vec::new();
+    for y in 0..camera.height as usize {
+        for x in 0..camera.width as usize {
+            let (layers, doubt) = layers(&ellipses, x, y, cuts);
+            let mut p = Pixel { features: vec![0.0; dim], doubt, ..Pixel::default() };
+            for l in &layers {
+                let weight = l.transmittance * l.alpha;
+                p.alpha += weight;
+                p.depth += weight * l.ellipse.z;
+                for c in 0..3 {
+                    p.rgb[c] += weight * l.ellipse.color[c];
+                }
+                for (sum, f) in p.features.iter_mut().zip(&scene[l.ellipse.id].features) {
+                    *sum += weight * f;
+                }
+            }
+            for c in 0..3 {
+                p.rgb[c] += (1.0 - p.alpha) * f64::from(options.background[c]);
+            }
+            out.push(p);
+        }
+    }
+    out
+}
+
+/// d loss / d parameters, given d loss / d pixels (whose `doubt` is not read): for each Gaussian, in the order of
+/// [`Gaussian::parameters`], and the gradient of its projected centre (sum, and sum of absolute values over pixels).
+pub(crate) fn backward(
+    scene: &[Gaussian],
+    camera: &Camera,
+    options: &RasterOptions,
+    cuts: Cuts,
+    d: &[Pixel],
+) -> Vec<(Vec<f64>, [f64; 4])> {
+    let ellipses = ellipses(scene, camera, options);
+    let mut splats = vec![SplatGradient::default(); scene.len()];
+    let mut features: Vec<Vec<f64>> = scene.iter().map(|g| vec![0.0; g.features.len()]).collect();
+    for (at, d) in d.iter().enumerate() {
+        let (x, y) = (at % camera.width as usize, at / camera.width as usize);
+        let (layers, _) = layers(&ellipses, x, y, cuts);
+        // d loss / d transmittance behind the layer at hand, going back to front.
+        let mut d_behind: f64 = (0..3).map(|c| d.rgb[c] * f64::from(options.background[c])).sum();
+        for l in layers.iter().rev() {
+            let (e, out) = (l.ellipse, &mut splats[l.ellipse.id]);
+            let weight = l.transmittance * l.alpha;
+            let mut value = d.alpha + d.depth * e.z;
+            for c in 0..3 {
+                value += d.rgb[c] * e.color[c];
+                out.color[c] += weight * d.rgb[c];
+            }
+            for (k, d) in d.features.iter().enumerate() {
+                value += d * scene[e.id].features[k];
+                features[e.id][k] += weight * d;
+            }
+            out.depth += weight * d.depth;
+            let d_alpha = l.transmittance * (value - d_behind);
+            d_behind = l.alpha * value + (1.0 - l.alpha) * d_behind;
+            if l.raw > 0.99 {
+                continue;
+            }
+            // raw = opacity exp(-sigma).
+            out.opacity += d_alpha * l.raw / e.opacity;
+            let d_sigma = -d_alpha * l.raw;
+            let [a, b, c] = e.conic;
+            let DVec2 { x, y } = l.offset;
+            out.conic[0] += d_sigma * 0.5 * x * x;
+            out.conic[1] += d_sigma * x * y;
+            out.conic[2] += d_sigma * 0.5 * y * y;
+            let d_mean = [-d_sigma * (a * x + b * y), -d_sigma * (b * x + c * y)];
+            for k in 0..2 {
+                out.mean[k] += d_mean[k];
+                out.mean_abs[k] += d_mean[k].abs();
+            }
+        }
+    }
+    let lens = Lens::new(camera);
+    let mut out = Vec::new();
+    for (i, g) in scene.iter().enumerate() {
+        let d = &splats[i];
+        let mut all = vec![0.0; 11];
+        let mut d_sh = vec![0.0; g.sh.len()];
+        if let Ok(splat) = project(&g.view(), &lens, options) {
+            let p = project_backward(&g.view(), &lens, options, &splat, d, &mut d_sh).unwrap();
+            all = [&p.mean[..], &p.log_scale, &p.rotation, &[p.opacity_logit]].concat();
+        }
+        all.extend(d_sh);
+        all.extend(&features[i]);
+        out.push((all, [d.mean[0], d.mean[1], d.mean_abs[0], d.mean_abs[1]]));
+    }
+    out
+}

@@ -1,0 +1,191 @@
+//! Numerically hostile scenes: no panic, nothing but finite numbers, and what is dropped is counted.
+
+mod common;
+
+use common::{camera, random};
+use gs_raster::{
+    Dropped, PixelGradients, RasterOptions, backward, features_backward, forward, render_features, tile_weights,
+};
+use gs_scene::{Camera, Gaussians};
+
+/// Renders and differentiates by every way there is; all numbers must be finite, alphas within 0 and 1.
+fn survives(g: &Gaussians, camera: &Camera, what: &str) -> (Dropped, f64) {
+    let options = RasterOptions { background: [0.3, 0.2, 0.1], ..RasterOptions::default() };
+    let f = forward(g, camera, &options);
+    let r = &f.rendered;
+    let pixels = camera.width as usize * camera.height as usize;
+    let finite = |values: &[f32], name: &str| {
+        assert!(values.iter().all(|v| v.is_finite()), "{what}: {name} is not finite");
+    };
+    assert_eq!((r.rgb.len(), r.alpha.len(), r.depth.len()), (3 * pixels, pixels, pixels), "{what}");
+    finite(&r.rgb, "colour");
+    finite(&r.depth, "depth");
+    assert!(r.alpha.iter().all(|a| (0.0..=1.0).contains(a)), "{what}: alpha");
+    assert_eq!(f.visible().len() + f.dropped().total(), g.len(), "{what}: {:?}", f.dropped());
+    let d: Vec<f32> = (0..3 * pixels).map(|i| (i as f32 * 0.7).sin()).collect();
+    let of_pixels = PixelGradients { rgb: &d, alpha: Some(&d[..pixels]), depth: Some(&d[pixels..2 * pixels]) };
+    let gradients = [
+        backward(g, camera, &options, &f, of_pixels),
+        features_backward(g, &vec![0.5; 3 * g.len()], 3, camera, &options, &d).parameters,
+    ];
+    for p in &gradients {
+        finite(p.means.as_flattened(), "gradient of the centres");
+        finite(p.log_scales.as_flattened(), "gradient of the scales");
+        finite(p.rotations.as_flattened(), "gradient of the rotations");
+        finite(&p.opacity_logits, "gradient of the opacities");
+        finite(&p.sh, "gradient of the harmonics");
+        finite(p.mean2d.as_flattened(), "gradient of the projected centres");
+        finite(p.mean2d_abs.as_flattened(), "absolute gradient of the projected centres");
+    }
+    finite(&render_features(g, &vec![1.0; 2 * g.len()], 2, camera, &options), "features");
+    for early_stop in [true, false] {
+        tile_weights(g, camera, &options, early_stop, |t| {
+            finite(t.weights, "weights");
+            assert!(t.alphas.iter().chain(t.alpha).all(|a| (0.0..=1.00001).contains(a)), "{what}: tile's alpha");
+        });
+    }
+    let covered = r.alpha.iter().map(|a| f64::from(*a)).sum::<f64>() / pixels.max(1) as f64;
+    eprintln!("{what}: mean alpha {covered:.4}, drawn {}, {:?}", f.visible().len(), f.dropped());
+    (f.dropped(), covered)
+}
+
+#[test]
+fn needles_specks_and_sheets() {
+    let view = camera(70, 50);
+    let mut g = random(300, 1);
+    for s in &mut g.log_scales {
+        *s = [1e3f32.ln(), 1e-3f32.ln(), 1e-3f32.ln()];
+    }
+    let (dropped, covered) = survives(&g, &view, "needles of aspect 1e6");
+    assert!(dropped.degenerate == 0 && dropped.not_finite == 0 && covered > 0.0);
+    for (scale, least) in [(1e-8f32, 0.01), (1e4, 0.9)] {
+        g.log_scales.fill([scale.ln(); 3]);
+        let (dropped, covered) = survives(&g, &view, &format!("scales of {scale:e}"));
+        assert!(dropped.degenerate == 0 && dropped.not_finite == 0 && covered > least, "{covered}");
+    }
+    // One axis of each: sheets, and beyond what any scene holds.
+    for s in [[1e4f32.ln(), 1e-8f32.ln(), 0.0], [60.0, -60.0, 0.0], [80.0; 3], [-80.0; 3]] {
+        g.log_scales.fill(s);
+        survives(&g, &view, &format!("log-scales {s:?}"));
+    }
+    g.log_scales.fill([90.0; 3]);
+    assert_eq!(survives(&g, &view, "scales beyond single precision").0.degenerate, g.len());
+}
+
+#[test]
+fn opacities_of_zero_and_one() {
+    let mut g = random(300, 2);
+    for logit in [f32::NEG_INFINITY, -1e30, -100.0] {
+        g.opacity_logits.fill(logit);
+        let (dropped, covered) = survives(&g, &camera(40, 40), &format!("opacity logit {logit}"));
+        assert!(dropped.total() == g.len() && dropped.transparent > 250 && covered == 0.0);
+    }
+    for logit in [f32::INFINITY, 1e30, 100.0] {
+        g.opacity_logits.fill(logit);
+        let (dropped, covered) = survives(&g, &camera(40, 40), &format!("opacity logit {logit}"));
+        assert!(dropped.transparent == 0 && dropped.not_finite == 0 && covered > 0.2);
+    }
+}
+
+#[test]
+fn centres_on_the_camera_plane_and_far_away() {
+    let view = camera(64, 48);
+    let mut g = random(400, 3);
+    let (eye, forward) = (view.position().as_vec3(), view.rotation.row(2).as_vec3());
+    for (i, m) in g.means.iter_mut().enumerate() {
+        // Around the plane z = 0 of the camera, from exactly on it to a few near planes away.
+        let p = glam::Vec3::from(*m);
+        let on_plane = p - forward * (p - eye).dot(forward);
+        *m = (on_plane + forward * (i as f32 - 200.0) * 1e-4).into();
+    }
+    let (dropped, _) = survives(&g, &view, "centres on the camera plane");
+    assert!(dropped.behind > 150);
+    g.means.fill(eye.into());
+    assert_eq!(survives(&g, &view, "centres at the camera").0.behind, g.len());
+
+    // A scene moved by 1e6 with its camera: f32 centres have steps of 1/16 there, so only the count must be alike.
+    let mut g = random(400, 3);
+    let near = survives(&g, &view, "scene at the origin").0;
+    let shift = glam::DVec3::new(1e6, -1e6, 1e6);
+    for m in &mut g.means {
+        *m = (glam::Vec3::from(*m).as_dvec3() + shift).as_vec3().into();
+    }
+    let moved = Camera { translation: -(view.rotation * (view.position() + shift)), ..view.clone() };
+    let far = survives(&g, &moved, "scene at 1e6 from the origin").0;
+    assert!(far.total().abs_diff(near.total()) <= 20);
+    survives(&g, &view, "centres 1e6 from the camera");
+}
+
+#[test]
+fn thousands_of_coincident_gaussians() {
+    let mut g = random(5000, 4);
+    let (mean, scale, rotation) = (g.means[0], [-1.5; 3], g.rotations[0]);
+    g.means.fill(mean);
+    g.log_scales.fill(scale);
+    g.rotations.fill(rotation);
+    for logit in [-4.5, 0.0, 20.0] {
+        g.opacity_logits.fill(logit);
+        let (dropped, covered) = survives(&g, &camera(60, 45), &format!("5000 coincident, logit {logit}"));
+        assert!(dropped.total() == 0 && covered > 0.01);
+    }
+}
+
+#[test]
+fn every_field_not_finite_and_zero_quaternions() {
+    let view = camera(33, 31);
+    for bad in [f32::NAN, f32::INFINITY, f32::NEG_INFINITY] {
+        for field in 0..5 {
+            let mut g = random(200, 6);
+            // Half of them; the rest must be drawn as if alone.
+            for i in (0..g.len()).step_by(2) {
+                match field {
+                    0 => g.means[i][i % 3] = bad,
+                    1 => g.log_scales[i][i % 3] = bad,
+                    2 => g.rotations[i][i % 4] = bad,
+                    3 => g.opacity_logits[i] = bad,
+                    _ => g.sh[i * 48 + i % 48] = bad,
+                }
+            }
+            let (dropped, _) = survives(&g, &view, &format!("{bad} in field {field}"));
+            if field == 3 && bad.is_infinite() {
+                assert_eq!(dropped.not_finite, 0, "infinite logits are opacities of 0 and 1");
+                continue;
+            }
+            assert!(dropped.not_finite > 50, "{bad} in field {field}: {dropped:?}");
+            if field < 4 {
+                let odd: Vec<u32> = (1..200).step_by(2).collect();
+                let options = RasterOptions::default();
+                let (all, alone) = (forward(&g, &view, &options), forward(&g.select(&odd), &view, &options));
+                assert!(all.rendered == alone.rendered, "{bad} in field {field}");
+            }
+        }
+    }
+    let mut g = random(100, 7);
+    g.rotations.fill([0.0; 4]);
+    let (dropped, covered) = survives(&g, &view, "zero quaternions");
+    assert!(dropped.degenerate + dropped.transparent + dropped.outside == 100 && covered == 0.0);
+    g.rotations.fill([1e-5, 1e-5, 0.0, 0.0]);
+    assert!(survives(&g, &view, "short quaternions").1 > 0.0);
+}
+
+#[test]
+fn focal_lengths_and_sizes_of_image() {
+    let g = random(300, 8);
+    for focal in [1.0, 10.0, 1e3, 1e5] {
+        let wide = Camera { fx: focal, fy: focal, ..camera(50, 40) };
+        survives(&g, &wide, &format!("focal length {focal}"));
+    }
+    for (w, h) in [(1, 1), (1, 100), (100, 1), (16, 16), (17, 15), (0, 0), (0, 5)] {
+        let view = camera(w, h);
+        survives(&g, &Camera { fx: 50.0, fy: 50.0, ..view }, &format!("image of {w}x{h}"));
+    }
+    let none = Gaussians { sh_degree: 3, ..Gaussians::default() };
+    let (dropped, covered) = survives(&none, &camera(30, 20), "empty scene");
+    assert!(dropped == Dropped::default() && covered == 0.0);
+    // Cameras that are not.
+    for bad in [0.0, f64::NAN, f64::INFINITY] {
+        survives(&g, &Camera { fx: bad, ..camera(20, 20) }, &format!("focal length {bad}"));
+        survives(&g, &Camera { cx: bad, ..camera(20, 20) }, &format!("principal point {bad}"));
+        survives(&g, &Camera { translation: glam::DVec3::splat(bad), ..camera(20, 20) }, &format!("pose {bad}"));
+    }
+}
