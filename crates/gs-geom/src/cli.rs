@@ -69,12 +69,14 @@ struct SceneArgs {
 enum Background {
     Black,
     White,
+    /// Training only: another colour in every iteration; renders are over black
+    Random,
 }
 
 impl Background {
     fn color(self) -> [f32; 3] {
         match self {
-            Self::Black => [0.0; 3],
+            Self::Black | Self::Random => [0.0; 3],
             Self::White => [1.0; 3],
         }
     }

@@ -128,8 +128,10 @@ pub enum Purpose {
     Start = 1,
     /// The order of the views.
     Order = 2,
-    /// Where the halves of a split Gaussian go.
+    /// Where the halves of a split Gaussian go, and which Gaussians are given company.
     Split = 3,
+    /// The colour behind the scene.
+    Background = 4,
 }
 
 /// The order of the views: each once per round, shuffled anew every round.

@@ -223,6 +223,35 @@ fn a_stopped_run_goes_on_to_the_same_bytes() {
     assert_eq!(dir.names(), ["g.ply", "g.ply.curve.jsonl", "g.ply.run.json"]);
 }
 
+/// Every way to densify, to choose picture sizes, backgrounds and what Adam moves.
+const WAYS: [&[&str]; 4] = [
+    &["--densify", "mcmc", "--schedule", "content", "--max-gaussians", "190"],
+    &["--densify", "absgrad", "--schedule", "coarse", "--adam", "dense", "--max-gaussians", "300"],
+    &["--densify", "adaptive", "--schedule", "full", "--background", "random", "--max-gaussians", "150"],
+    &["--densify", "mcmc", "--adam", "dense", "--schedule", "full", "--sh-degree", "1"],
+];
+
+#[test]
+fn every_way_is_the_same_for_any_threads_and_after_a_stop_and_keeps_the_budget() {
+    for way in WAYS {
+        let dir = Folder::new();
+        let (whole, parts) = (dir.path("a.ply"), dir.path("b.ply"));
+        succeeds(&[&training(&whole, way)[..], &["--threads", "1"]].concat());
+        // Photographs that are kept and photographs decoded anew are the same.
+        for last in ["37", "61", "1000"] {
+            let more = ["--threads", "3", "--stop-after", last, "--cache", "0"];
+            succeeds(&[&training(&parts, way)[..], &more].concat());
+        }
+        assert_eq!(fs::read(&whole).unwrap(), fs::read(&parts).unwrap(), "{way:?}");
+        let n = ply::read_gaussians(&whole).unwrap().len();
+        let most = way.iter().skip_while(|w| **w != "--max-gaussians").nth(1);
+        assert!(most.is_none_or(|most| n <= most.parse().unwrap()), "{way:?}: {n}");
+        let record: Value = serde_json::from_slice(&fs::read(format!("{whole}.run.json")).unwrap()).unwrap();
+        assert!(record["summary"]["psnr_heldout"].as_f64().unwrap() > 17.0, "{way:?}: {}", record["summary"]);
+        assert!(record["summary"]["ssim_heldout"].as_f64().unwrap() > 0.4, "{way:?}: {}", record["summary"]);
+    }
+}
+
 #[test]
 fn a_killed_run_goes_on_to_the_same_bytes() {
     let dir = Folder::new();

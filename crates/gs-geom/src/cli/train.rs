@@ -1,13 +1,16 @@
 //! `gs-geom train`.
 
-use super::{SceneArgs, beside, check_writable, read_geometry};
+use super::{Background, SceneArgs, beside, check_writable, read_geometry};
 use crate::checkpoint::{self, State};
-use crate::densify::{DensifyOptions, remove_invisible};
+use crate::content;
+use crate::densify::{DensifyOptions, Strategy, remove_invisible};
 use crate::init;
+use crate::mcmc::McmcOptions;
 use crate::photographs::Photographs;
 use crate::schedule::{LearningRates, Schedule};
 use crate::train::{Timings, TrainOptions, Trainer};
 use artifacts::role;
+use clap::ValueEnum;
 use gs_io::{Error, Provenance, Result, hash_file, write_bytes};
 use gs_scene::dataset::{Dataset, Split, View};
 use gs_scene::{Camera, Gaussians, PointCloud, ply};
@@ -41,19 +44,22 @@ pub(super) struct TrainArgs {
     /// Keep number, order and positions of the points: Gaussian i is point i (ScanNet protocol)
     #[arg(long)]
     fixed_points: bool,
-    /// Most Gaussians there may be
+    /// How the number of Gaussians grows
+    #[arg(long, value_enum, default_value_t = Strategy::Adaptive)]
+    densify: Strategy,
+    /// Most Gaussians there may be; with --densify mcmc how many there will be, if the iterations suffice
     #[arg(long, value_name = "COUNT", default_value_t = DensifyOptions::default().max_gaussians)]
     max_gaussians: usize,
     /// Weight of 1 - SSIM in the loss, 0 to 1
     #[arg(long, value_name = "WEIGHT", default_value_t = 0.2)]
     dssim: f32,
-    /// Clone or split Gaussians whose projection is pulled harder than this, on average
-    #[arg(long, value_name = "GRADIENT", default_value_t = DensifyOptions::default().gradient)]
-    densify_gradient: f32,
+    /// Clone or split Gaussians whose projection is pulled harder than this, on average [0.0002; absgrad 0.0004]
+    #[arg(long, value_name = "GRADIENT")]
+    densify_gradient: Option<f32>,
     /// Densify after this iteration [a twentieth of the iterations, at most 500]
     #[arg(long, value_name = "ITERATION")]
     densify_from: Option<u32>,
-    /// Densify and reset opacities before this iteration [half the iterations; more in runs below 15,000]
+    /// Densify and reset opacities before this iteration [half the iterations; more in runs below 15,000; mcmc 5/6]
     #[arg(long, value_name = "ITERATION")]
     densify_until: Option<u32>,
     /// Iterations between densifications [a thirtieth of the iterations, 50 to 100]
@@ -71,9 +77,12 @@ pub(super) struct TrainArgs {
     /// Learning rate of the positions at the start, per unit of the scene's extent; a hundredth of it at the end
     #[arg(long, value_name = "RATE", default_value_t = LearningRates::default().position)]
     position_rate: f64,
-    /// Begin with small pictures: a quarter of the size, then half
-    #[arg(long)]
-    coarse: bool,
+    /// Picture sizes to begin with
+    #[arg(long, value_enum, default_value_t = Sizes::Full)]
+    schedule: Sizes,
+    /// Which Gaussians a step moves
+    #[arg(long, value_enum, default_value_t = Moves::Sparse)]
+    adam: Moves,
     /// Memory for decoded photographs; the rest is decoded anew each time
     #[arg(long, value_name = "MEGABYTES", default_value_t = 2048)]
     cache: usize,
@@ -86,6 +95,26 @@ pub(super) struct TrainArgs {
     /// Stop after this iteration with a checkpoint and <out>.partial.ply, as an interruption would
     #[arg(long, value_name = "ITERATION")]
     stop_after: Option<u32>,
+}
+
+/// Picture sizes in the course of a run.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
+enum Sizes {
+    /// From an eighth up, each for as long as the photographs' content allows (DashGaussian)
+    Content,
+    /// A quarter, from a sixth of the iterations half, from a third full
+    Coarse,
+    /// Full from the start
+    Full,
+}
+
+/// Which Gaussians a step of Adam moves.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
+enum Moves {
+    /// Those that the view draws
+    Sparse,
+    /// All
+    Dense,
 }
 
 /// How often to write a checkpoint.
@@ -116,7 +145,8 @@ impl TrainArgs {
             Err(Error::new("out of range").field(field).found(value).expected(format!("more than 0, at most {most}")))
         };
         positive("--iterations", f64::from(self.iterations), 1e8)?;
-        positive("--densify-gradient", f64::from(self.densify_gradient), 1e9)?;
+        let gradient = self.densify_gradient.unwrap_or(self.densify.gradient());
+        positive("--densify-gradient", f64::from(gradient), 1e9)?;
         positive("--opacity-rate", self.opacity_rate, 10.0)?;
         positive("--position-rate", self.position_rate, 10.0)?;
         positive("--max-gaussians", self.max_gaussians as f64, 1e9)?;
@@ -124,15 +154,16 @@ impl TrainArgs {
             return Err(Error::new("out of range").field("--dssim").found(self.dssim).expected("0 to 1"));
         }
         let mut schedule = Schedule::for_iterations(self.iterations);
+        if self.densify == Strategy::Mcmc {
+            // It moves Gaussians where they are of use, to which there is no harm late.
+            schedule.densify_until = self.iterations - self.iterations / 6;
+        }
         let set = |to: &mut u32, from: Option<u32>, least: u32| *to = from.map_or(*to, |v| v.max(least));
         set(&mut schedule.densify_from, self.densify_from, 0);
         set(&mut schedule.densify_until, self.densify_until, 0);
         set(&mut schedule.densify_every, self.densify_every, 1);
         set(&mut schedule.opacity_reset_every, self.opacity_reset_every, 1);
         set(&mut schedule.sh_every, self.sh_every, 1);
-        if self.coarse {
-            schedule.coarse = vec![(self.iterations / 6, 4), (self.iterations / 3, 2)];
-        }
         Ok(TrainOptions {
             seed,
             schedule,
@@ -143,12 +174,16 @@ impl TrainArgs {
                 ..LearningRates::default()
             },
             densify: DensifyOptions {
-                gradient: self.densify_gradient,
+                strategy: self.densify,
+                gradient,
                 max_gaussians: self.max_gaussians,
                 ..DensifyOptions::default()
             },
+            mcmc: McmcOptions::default(),
+            sparse_adam: self.adam == Moves::Sparse,
             dssim_weight: self.dssim,
             background: self.scene.background.color(),
+            random_background: self.scene.background == Background::Random,
             fixed_points: self.fixed_points,
         })
     }
@@ -156,7 +191,7 @@ impl TrainArgs {
     pub(super) fn run(&self, stage: &Stage) -> Result<()> {
         // From here on a signal ends the run with a checkpoint.
         stage.interrupted();
-        let options = self.options(stage.seed())?;
+        let mut options = self.options(stage.seed())?;
         let dataset = self.scene.load(stage)?;
         let of = |split: Split| dataset.views_of(split).collect::<Vec<&View>>();
         let (train, heldout) = (of(Split::Train), of(Split::Test));
@@ -168,6 +203,13 @@ impl TrainArgs {
                 .hint("give --holdout 0, or more photographs"));
         }
         check_writable(&self.out)?;
+        let budget = self.cache.saturating_mul(1 << 20);
+        let photographs = Photographs::load(train.clone(), budget)?;
+        options.schedule.coarse = match self.schedule {
+            Sizes::Content => content::stages(&content::measure(&photographs)?, self.iterations),
+            Sizes::Coarse => vec![(self.iterations / 6, 4), (self.iterations / 3, 2)],
+            Sizes::Full => Vec::new(),
+        };
 
         let mut inputs = BTreeMap::from([(role::DATASET.to_string(), dataset.hash()?)]);
         if let Some(init) = &self.init {
@@ -197,11 +239,11 @@ impl TrainArgs {
             cameras[0].height,
             state.gaussians.len()
         ));
-        let budget = self.cache.saturating_mul(1 << 20);
-        let background = options.background;
-        let load = |views, divisor| Photographs::load(views, background, budget, divisor);
-        let photographs = load(train, options.schedule.divisor(state.progress.iteration + 1))?;
-        let mut trainer = Trainer::resume(options, extent, photographs, load(heldout, 1)?, state);
+        if !options.schedule.coarse.is_empty() {
+            let sizes = options.schedule.coarse.iter().map(|(last, divisor)| format!("1/{divisor} until {last}"));
+            stage.info(&format!("picture sizes: {}, then full", sizes.collect::<Vec<_>>().join(", ")));
+        }
+        let mut trainer = Trainer::resume(options, extent, photographs, Photographs::load(heldout, budget)?, state);
         if self.optimise(&mut trainer, &run, stage)? { self.finish(trainer, parameters, inputs, stage) } else { Ok(()) }
     }
 
@@ -228,7 +270,14 @@ impl TrainArgs {
     /// The Gaussians before the first iteration.
     fn start(&self, dataset: &Dataset, cameras: &[&Camera], extent: f64, stage: &Stage) -> Result<Gaussians> {
         if let Some(path) = &self.init {
-            return Ok(init::with_degree(read_geometry(path)?, self.sh_degree));
+            let g = init::with_degree(read_geometry(path)?, self.sh_degree);
+            if g.len() > self.max_gaussians && !self.fixed_points {
+                return Err(Error::new("more Gaussians than --max-gaussians")
+                    .file(path)
+                    .found(g.len())
+                    .expected(format!("at most {}", self.max_gaussians)));
+            }
+            return Ok(g);
         }
         let random: PointCloud;
         let points = if !dataset.points.is_empty() {
@@ -243,6 +292,15 @@ impl TrainArgs {
             random = init::random_points(cameras, self.init_points, stage.seed());
             &random
         };
+        if points.len() > self.max_gaussians && !self.fixed_points {
+            stage.info(&format!(
+                "starting from {} of {} points, for --max-gaussians",
+                self.max_gaussians,
+                points.len()
+            ));
+            let some = init::some_points(points, self.max_gaussians, stage.seed());
+            return init::from_points(&some, self.sh_degree, extent).map_err(|e| e.file(&self.scene.scene));
+        }
         init::from_points(points, self.sh_degree, extent).map_err(|e| e.file(&self.scene.scene))
     }
 
@@ -297,7 +355,7 @@ impl TrainArgs {
         inputs: BTreeMap<String, String>,
         stage: &Stage,
     ) -> Result<()> {
-        let psnr = trainer.heldout_psnr()?;
+        let (psnr, ssim) = trainer.heldout()?.unzip();
         let timings = trainer.timings();
         let State { mut gaussians, progress, .. } = trainer.into_state();
         if !self.fixed_points {
@@ -312,16 +370,17 @@ impl TrainArgs {
         let curve: String = progress.curve.iter().map(|line| format!("{line}\n")).collect();
         write_bytes(beside(&self.out, ".curve.jsonl"), curve.as_bytes())?;
         ply::write_gaussians(&self.out, &gaussians, &comments(&parameters, &inputs))?;
-        let [cloned, split, removed] = progress.densified;
+        let [cloned, split, removed, relocated] = progress.densified;
         let heldout = psnr.map_or(String::new(), |p| format!(", {p:.2} dB on held-out views"));
         stage.info(&format!(
-            "{} Gaussians ({cloned} cloned, {split} split, {removed} removed){heldout}; {}",
+            "{} Gaussians ({cloned} cloned, {split} split, {removed} removed, {relocated} relocated){heldout}; {}",
             gaussians.len(),
             shares(timings)
         ));
         let summary = json!({
             "gaussians": gaussians.len(),
             "psnr_heldout": psnr,
+            "ssim_heldout": ssim,
             "iterations": progress.iteration,
             "dropped_gradients": progress.dropped,
             "seconds": seconds(timings),
@@ -365,7 +424,7 @@ fn comments(parameters: &Value, inputs: &BTreeMap<String, String>) -> Vec<String
     };
     add("", parameters);
     add("", &parameters["options"]);
-    for group in ["schedule", "rates", "densify"] {
+    for group in ["schedule", "rates", "densify", "mcmc"] {
         add(&format!("{group}."), &parameters["options"][group]);
     }
     lines
