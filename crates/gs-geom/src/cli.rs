@@ -1,5 +1,6 @@
 //! The command line of `gs-geom`.
 
+mod budget;
 mod eval;
 mod render;
 mod train;
@@ -49,7 +50,7 @@ impl Program for Args {
 }
 
 /// Which photographs, and at which size.
-#[derive(Debug, clap::Args)]
+#[derive(Debug, Clone, clap::Args)]
 struct SceneArgs {
     /// Dataset folder (COLMAP, transforms.json or ScanNet)
     #[arg(long, value_name = "DIR")]

@@ -13,5 +13,6 @@ pub mod mcmc;
 pub mod metrics;
 pub mod optimiser;
 pub mod photographs;
+pub mod plan;
 pub mod schedule;
 pub mod train;

@@ -65,6 +65,11 @@ impl<'a> Photographs<'a> {
         Ok(Self { views, budget, divisor: 1, cameras, full, small: Vec::new() })
     }
 
+    /// No photographs, such as held-out ones where there are none.
+    pub fn none() -> Self {
+        Self { views: vec![], budget: 0, divisor: 1, cameras: vec![], full: vec![], small: vec![] }
+    }
+
     /// Number of photographs.
     pub fn len(&self) -> usize {
         self.views.len()

@@ -5,7 +5,7 @@ use crate::densify::{DensifyOptions, Pull, Strategy, densify, reset_opacities};
 use crate::loss::{Loss, Pair, l1_dssim};
 use crate::mcmc::{self, McmcOptions};
 use crate::metrics;
-use crate::optimiser::drop_bad_gradients;
+use crate::optimiser::{Adam, drop_bad_gradients};
 use crate::photographs::Photographs;
 use crate::schedule::{LearningRates, Purpose, Schedule, ViewOrder, generator};
 use gs_io::Result;
@@ -124,6 +124,11 @@ impl<'a> Trainer<'a> {
     /// The state, at the end.
     pub fn into_state(self) -> State {
         self.state
+    }
+
+    /// Changes the Gaussians, with moments and pulls to follow them.
+    pub fn change(&mut self, change: impl FnOnce(&mut Gaussians, &mut Adam, &mut Pull)) {
+        change(&mut self.state.gaussians, &mut self.state.adam, &mut self.state.pull);
     }
 
     /// Loss of the last iteration's view.

@@ -253,6 +253,28 @@ fn every_way_is_the_same_for_any_threads_and_after_a_stop_and_keeps_the_budget()
 }
 
 #[test]
+fn a_time_budget_is_a_plan_that_can_be_run_without_it() {
+    let dir = Folder::new();
+    let (out, again) = (dir.path("g.ply"), dir.path("h.ply"));
+    let given = ["train", "--scene", scene(), "--densify", "mcmc", "--max-gaussians", "400", "--out"];
+    let budget = ["--time-budget", "1.5s", "--iterations", "300"];
+    // A run that was stopped keeps to its plan, however fast the machine is by then.
+    succeeds(&[&given[..], &[&out], &budget, &["--stop-after", "1"]].concat());
+    let kept = fs::read(format!("{out}.plan.json")).unwrap();
+    succeeds(&[&given[..], &[&out], &budget].concat());
+    let record: Value = serde_json::from_slice(&fs::read(format!("{out}.run.json")).unwrap()).unwrap();
+    let plan = &record["summary"]["plan"];
+    assert_eq!(plan["made"], serde_json::from_slice::<Value>(&kept).unwrap());
+    assert!(plan["made"]["plan"]["iterations"].as_u64().unwrap() <= 300, "{plan}");
+    let options: Vec<&str> = plan["options"].as_str().unwrap().split(' ').collect();
+    succeeds(&[&given[..5], &["--out", &again], &options].concat());
+    assert_eq!(fs::read(&out).unwrap(), fs::read(&again).unwrap(), "{plan}");
+    assert_eq!(dir.names().len(), 6);
+    let e = refused(&["train", "--scene", scene(), "--out", &out, "--time-budget", "1s", "--init", "none.ply"]);
+    assert!(e.contains("none.ply"), "{e}");
+}
+
+#[test]
 fn a_killed_run_goes_on_to_the_same_bytes() {
     let dir = Folder::new();
     let out = dir.path("g.ply");

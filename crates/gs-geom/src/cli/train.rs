@@ -1,8 +1,9 @@
 //! `gs-geom train`.
 
+use super::budget::plan_path;
 use super::{Background, SceneArgs, beside, check_writable, read_geometry};
 use crate::checkpoint::{self, State};
-use crate::content;
+use crate::content::{self, Gain};
 use crate::densify::{DensifyOptions, Strategy, remove_invisible};
 use crate::init;
 use crate::mcmc::McmcOptions;
@@ -22,16 +23,20 @@ use std::str::FromStr;
 use std::time::{Duration, Instant};
 
 /// Arguments of `gs-geom train`.
-#[derive(Debug, clap::Args)]
+#[derive(Debug, Clone, clap::Args)]
 pub(super) struct TrainArgs {
     #[command(flatten)]
-    scene: SceneArgs,
+    pub(super) scene: SceneArgs,
     /// Where to write the Gaussians, as a 3DGS PLY; checkpoint, training curve and record of the run lie beside it
     #[arg(long, value_name = "FILE")]
-    out: PathBuf,
-    /// Steps of the optimiser, one view each
+    pub(super) out: PathBuf,
+    /// Steps of the optimiser, one view each; with --time-budget at most
     #[arg(long, value_name = "COUNT", default_value_t = 30_000)]
-    iterations: u32,
+    pub(super) iterations: u32,
+    /// Plan iterations, picture size and --max-gaussians so as to end within this time, such as 90s, 10m or 1h. The plan
+    /// depends on the machine's speed; it is said as options that give the same bytes anywhere
+    #[arg(long, value_name = "TIME", value_parser = super::budget::seconds)]
+    pub(super) time_budget: Option<f64>,
     /// Degree of the spherical harmonics, 0 to 3
     #[arg(long, value_name = "DEGREE", default_value_t = 3, value_parser = clap::value_parser!(u8).range(0..=3))]
     sh_degree: u8,
@@ -43,13 +48,13 @@ pub(super) struct TrainArgs {
     init_points: usize,
     /// Keep number, order and positions of the points: Gaussian i is point i (ScanNet protocol)
     #[arg(long)]
-    fixed_points: bool,
+    pub(super) fixed_points: bool,
     /// How the number of Gaussians grows
     #[arg(long, value_enum, default_value_t = Strategy::Adaptive)]
     densify: Strategy,
     /// Most Gaussians there may be; with --densify mcmc how many there will be, if the iterations suffice
     #[arg(long, value_name = "COUNT", default_value_t = DensifyOptions::default().max_gaussians)]
-    max_gaussians: usize,
+    pub(super) max_gaussians: usize,
     /// Weight of 1 - SSIM in the loss, 0 to 1
     #[arg(long, value_name = "WEIGHT", default_value_t = 0.2)]
     dssim: f32,
@@ -91,7 +96,7 @@ pub(super) struct TrainArgs {
     checkpoint_every: Every,
     /// Ignore a checkpoint and begin anew
     #[arg(long)]
-    no_resume: bool,
+    pub(super) no_resume: bool,
     /// Stop after this iteration with a checkpoint and <out>.partial.ply, as an interruption would
     #[arg(long, value_name = "ITERATION")]
     stop_after: Option<u32>,
@@ -137,7 +142,7 @@ impl FromStr for Every {
 }
 
 impl TrainArgs {
-    fn options(&self, seed: u64) -> Result<TrainOptions> {
+    pub(super) fn options(&self, seed: u64) -> Result<TrainOptions> {
         let positive = |field: &str, value: f64, most: f64| {
             if value > 0.0 && value <= most {
                 return Ok(());
@@ -191,6 +196,35 @@ impl TrainArgs {
     pub(super) fn run(&self, stage: &Stage) -> Result<()> {
         // From here on a signal ends the run with a checkpoint.
         stage.interrupted();
+        match self.time_budget {
+            Some(seconds) => {
+                let (planned, plan) = self.plan(seconds, stage)?;
+                planned.train(plan, stage)
+            }
+            None => self.train(Value::Null, stage),
+        }
+    }
+
+    pub(super) fn cache_bytes(&self) -> usize {
+        self.cache.saturating_mul(1 << 20)
+    }
+
+    /// Where the picture sizes come from for [`Self::coarse`].
+    pub(super) fn gains(&self, photographs: &Photographs<'_>) -> Result<Vec<Gain>> {
+        if self.schedule == Sizes::Content { content::measure(photographs) } else { Ok(Vec::new()) }
+    }
+
+    /// Picture sizes before the full one.
+    pub(super) fn coarse(&self, gains: &[Gain], iterations: u32) -> Vec<(u32, u32)> {
+        match self.schedule {
+            Sizes::Content => content::stages(gains, iterations),
+            Sizes::Coarse => vec![(iterations / 6, 4), (iterations / 3, 2)],
+            Sizes::Full => Vec::new(),
+        }
+    }
+
+    /// The run itself; `plan` is how its options came about, for the record.
+    fn train(&self, plan: Value, stage: &Stage) -> Result<()> {
         let mut options = self.options(stage.seed())?;
         let dataset = self.scene.load(stage)?;
         let of = |split: Split| dataset.views_of(split).collect::<Vec<&View>>();
@@ -203,13 +237,8 @@ impl TrainArgs {
                 .hint("give --holdout 0, or more photographs"));
         }
         check_writable(&self.out)?;
-        let budget = self.cache.saturating_mul(1 << 20);
-        let photographs = Photographs::load(train.clone(), budget)?;
-        options.schedule.coarse = match self.schedule {
-            Sizes::Content => content::stages(&content::measure(&photographs)?, self.iterations),
-            Sizes::Coarse => vec![(self.iterations / 6, 4), (self.iterations / 3, 2)],
-            Sizes::Full => Vec::new(),
-        };
+        let photographs = Photographs::load(train.clone(), self.cache_bytes())?;
+        options.schedule.coarse = self.coarse(&self.gains(&photographs)?, self.iterations);
 
         let mut inputs = BTreeMap::from([(role::DATASET.to_string(), dataset.hash()?)]);
         if let Some(init) = &self.init {
@@ -243,8 +272,13 @@ impl TrainArgs {
             let sizes = options.schedule.coarse.iter().map(|(last, divisor)| format!("1/{divisor} until {last}"));
             stage.info(&format!("picture sizes: {}, then full", sizes.collect::<Vec<_>>().join(", ")));
         }
-        let mut trainer = Trainer::resume(options, extent, photographs, Photographs::load(heldout, budget)?, state);
-        if self.optimise(&mut trainer, &run, stage)? { self.finish(trainer, parameters, inputs, stage) } else { Ok(()) }
+        let mut trainer =
+            Trainer::resume(options, extent, photographs, Photographs::load(heldout, self.cache_bytes())?, state);
+        if self.optimise(&mut trainer, &run, stage)? {
+            self.finish(trainer, parameters, inputs, plan, stage)
+        } else {
+            Ok(())
+        }
     }
 
     /// The state of an interrupted run of the same parameters and inputs.
@@ -268,7 +302,13 @@ impl TrainArgs {
     }
 
     /// The Gaussians before the first iteration.
-    fn start(&self, dataset: &Dataset, cameras: &[&Camera], extent: f64, stage: &Stage) -> Result<Gaussians> {
+    pub(super) fn start(
+        &self,
+        dataset: &Dataset,
+        cameras: &[&Camera],
+        extent: f64,
+        stage: &Stage,
+    ) -> Result<Gaussians> {
         if let Some(path) = &self.init {
             let g = init::with_degree(read_geometry(path)?, self.sh_degree);
             if g.len() > self.max_gaussians && !self.fixed_points {
@@ -353,6 +393,7 @@ impl TrainArgs {
         trainer: Trainer<'_>,
         parameters: Value,
         inputs: BTreeMap<String, String>,
+        plan: Value,
         stage: &Stage,
     ) -> Result<()> {
         let (psnr, ssim) = trainer.heldout()?.unzip();
@@ -384,16 +425,17 @@ impl TrainArgs {
             "iterations": progress.iteration,
             "dropped_gradients": progress.dropped,
             "seconds": seconds(timings),
+            "plan": plan,
         });
         stage.record(&self.out, parameters, inputs, summary)?;
-        for leftover in [checkpoint::path_of(&self.out), beside(&self.out, ".partial.ply")] {
+        for leftover in [checkpoint::path_of(&self.out), beside(&self.out, ".partial.ply"), plan_path(&self.out)] {
             remove_if_there(&leftover);
         }
         Ok(())
     }
 }
 
-fn remove_if_there(path: &Path) {
+pub(super) fn remove_if_there(path: &Path) {
     // What cannot be removed does no harm.
     let _ = std::fs::remove_file(path);
 }
