@@ -7,11 +7,11 @@ cd "$(dirname "$0")/.."
 CARGO=${CARGO:-cargo}
 DESK=${DESK:-../shared/data/desk}
 RESOLUTION=${RESOLUTION:-320px}
-OUT=out/bench
+OUT=$PWD/out/bench
 mkdir -p "$OUT"
 if [ ! -e "$OUT/scene/truth/scene.json" ]; then
     $CARGO run --release -p synth-scene -- --out "$OUT/scene" --seed 0 --objects 10 --views 30 --width 480 --height 360
 fi
-$CARGO bench -p gs-geom --bench geom -- --out "$OUT/geom.json" --plot docs/images/geometry.svg --table "$OUT/geom.md" \
-    --scene "synthetic=$PWD/$OUT/scene@$RESOLUTION" --scene "desk=$(realpath -m "$DESK")@$RESOLUTION" \
+$CARGO bench -p gs-geom --bench geom -- --out "$OUT/geom.json" --plot "$PWD/docs/images/geometry.svg" --table "$OUT/geom.md" \
+    --scene "synthetic=$OUT/scene@$RESOLUTION" --scene "desk=$(realpath -m "$DESK")@$RESOLUTION" \
     --iterations "${ITERATIONS:-250,700}" --seeds "${SEEDS:-3}" --jobs "${JOBS:-1}" --max-gaussians "${MAX_GAUSSIANS:-15000}"

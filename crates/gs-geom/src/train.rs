@@ -2,7 +2,7 @@
 
 use crate::checkpoint::{State, start};
 use crate::densify::{DensifyOptions, Pull, Strategy, densify, reset_opacities};
-use crate::loss::{Loss, Pair, l1_dssim};
+use crate::loss::{Derivatives, Loss, Pair, l1_dssim};
 use crate::mcmc::{self, McmcOptions};
 use crate::metrics;
 use crate::optimiser::{Adam, drop_bad_gradients};
@@ -84,6 +84,7 @@ pub struct Trainer<'a> {
     order: ViewOrder,
     state: State,
     gradient: Vec<f32>,
+    derivatives: Derivatives,
     /// Which Gaussians the last view drew.
     drawn: Vec<bool>,
     last: Loss,
@@ -112,8 +113,9 @@ impl<'a> Trainer<'a> {
     ) -> Self {
         let order = ViewOrder::new(options.seed, train.len());
         let last = Loss { l1: 0.0, ssim: 0.0, total: 0.0 };
-        let (gradient, drawn, timings) = (Vec::new(), Vec::new(), Timings::default());
-        Self { options, extent, train, heldout, order, state, gradient, drawn, last, timings }
+        let (gradient, derivatives, drawn) = (Vec::new(), Derivatives::default(), Vec::new());
+        let timings = Timings::default();
+        Self { options, extent, train, heldout, order, state, gradient, derivatives, drawn, last, timings }
     }
 
     /// The state, for a checkpoint.
@@ -175,7 +177,7 @@ impl<'a> Trainer<'a> {
         let rendered = forward(gaussians, camera, &raster);
         lap(&mut self.timings.forward);
         let pair = Pair { render: &rendered.rendered.rgb, target: &target, width: camera.width as usize };
-        let loss = l1_dssim(pair, self.options.dssim_weight, &mut self.gradient);
+        let loss = l1_dssim(pair, self.options.dssim_weight, &mut self.gradient, &mut self.derivatives);
         lap(&mut self.timings.loss);
         let pixels = PixelGradients { rgb: &self.gradient, alpha: None, depth: None };
         let mut gradients = backward(gaussians, camera, &raster, &rendered, pixels);
