@@ -4,7 +4,7 @@
 //! `cargo bench -p gs-geom --bench geom -- --out geom.json --plot plot.svg --table table.md --scene name=folder@160px
 //! [--scene ...] [--iterations 300,1000] [--seeds 3] [--jobs 2] [--max-gaussians 15000]`
 //!
-//! Each run is a process of its own on one thread. Wall-clock time says little on a machine that does other things too,
+//! Runs that the JSON file holds already are not run again: delete it after a change of the programs. Each run is a process of its own on one thread. Wall-clock time says little on a machine that does other things too,
 //! so the plot is over the processor time of the process. Scenes whose folder is missing are skipped.
 
 #![expect(clippy::print_stderr, reason = "a program for people to run")]
@@ -18,16 +18,17 @@ use std::sync::Mutex;
 use std::sync::atomic::{AtomicUsize, Ordering};
 
 /// The alternatives: a name and the options that make it.
-const SETTINGS: [(&str, &[&str]); 7] = [
+const SETTINGS: [(&str, &[&str]); 8] = [
     ("3DGS", &["--densify", "adaptive", "--schedule", "full", "--adam", "dense"]),
     ("sparse Adam", &["--densify", "adaptive", "--schedule", "full", "--adam", "sparse"]),
     ("coarse", &["--densify", "adaptive", "--schedule", "coarse", "--adam", "dense"]),
     ("content", &["--densify", "adaptive", "--schedule", "content", "--adam", "dense"]),
+    ("absgrad, coarse", &["--densify", "absgrad", "--schedule", "coarse", "--adam", "dense"]),
     ("absgrad, content", &["--densify", "absgrad", "--schedule", "content", "--adam", "dense"]),
     ("mcmc", &["--densify", "mcmc", "--schedule", "full", "--adam", "dense"]),
     ("mcmc, content", &["--densify", "mcmc", "--schedule", "content", "--adam", "dense"]),
 ];
-const COLORS: [&str; 7] = ["#444444", "#999999", "#1f77b4", "#d62728", "#ff7f0e", "#2ca02c", "#9467bd"];
+const COLORS: [&str; 8] = ["#444444", "#999999", "#1f77b4", "#d62728", "#17becf", "#ff7f0e", "#2ca02c", "#9467bd"];
 /// The figures of a run, and what they are called in the record of a run.
 const FIGURES: [&str; 7] =
     ["psnr_heldout", "ssim_heldout", "gaussians", "cpu_seconds", "it_per_cpu_s", "it_per_s", "peak_rss_bytes"];
@@ -123,7 +124,7 @@ fn run(o: &Options, job: &Job) -> Result<Value, String> {
     let per = |seconds: &Value| seconds.as_f64().map(|t| f64::from(job.iterations) / t.max(1e-9));
     Ok(json!({
         "scene": scene.name, "resolution": scene.resolution, "setting": name, "options": flags.join(" "),
-        "iterations": job.iterations, "seed": job.seed,
+        "iterations": job.iterations, "seed": job.seed, "max_gaussians": o.max_gaussians,
         "psnr_heldout": s["psnr_heldout"], "ssim_heldout": s["ssim_heldout"], "gaussians": s["gaussians"],
         "cpu_seconds": s["cpu_seconds"], "it_per_cpu_s": per(&s["cpu_seconds"]),
         "it_per_s": per(&record["wall_seconds"]), "peak_rss_bytes": record["peak_rss_bytes"],
@@ -157,8 +158,21 @@ fn summary(runs: &[Value]) -> Vec<Value> {
     all
 }
 
+/// Whether a run is that of a job.
+fn is_of(o: &Options, job: &Job, run: &Value) -> bool {
+    let (scene, flags) = (&o.scenes[job.scene], SETTINGS[job.setting].1.join(" "));
+    run["scene"] == *scene.name
+        && run["resolution"] == *scene.resolution
+        && run["options"] == *flags
+        && run["iterations"] == job.iterations
+        && run["seed"] == job.seed
+        && run["max_gaussians"] == *o.max_gaussians
+}
+
 fn main() -> Result<(), String> {
     let o = options()?;
+    let before = std::fs::read(&o.out).ok().and_then(|b| serde_json::from_slice::<Value>(&b).ok());
+    let mut before = before.and_then(|v| v["runs"].as_array().cloned()).unwrap_or_default();
     let mut jobs = Vec::new();
     // The seeds last: what is there when one loses patience is then complete for fewer seeds.
     for seed in 0..o.seeds {
@@ -168,7 +182,10 @@ fn main() -> Result<(), String> {
             }
         }
     }
-    let (next, runs) = (AtomicUsize::new(0), Mutex::new(Vec::<Value>::new()));
+    before.retain(|run| jobs.iter().any(|job| is_of(&o, job, run)));
+    jobs.retain(|job| !before.iter().any(|run| is_of(&o, job, run)));
+    write_all(&o, &before)?;
+    let (next, runs) = (AtomicUsize::new(0), Mutex::new(before));
     let work = || {
         while let Some(job) = jobs.get(next.fetch_add(1, Ordering::Relaxed)) {
             let result = run(&o, job)?;

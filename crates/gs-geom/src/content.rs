@@ -19,7 +19,7 @@ const SAMPLES: usize = 1 << 16;
 /// Smaller pictures, in pixels of the shorter side, are not used: the window of SSIM would be mostly border.
 const LEAST_SIDE: u32 = 24;
 /// Share of the iterations before the pictures are full.
-const COARSE_SHARE: f64 = 0.6;
+const COARSE_SHARE: f64 = 0.4;
 /// Gain over pictures of one colour, in dB, for which the pictures have to be full.
 const FULL_GAIN: f64 = 24.0;
 
@@ -137,9 +137,9 @@ mod tests {
     fn more_content_ends_the_small_pictures_earlier() {
         let gain = |divisor, decibels| Gain { divisor, decibels };
         let smooth = stages(&[gain(8, 12.0), gain(4, 18.0), gain(2, 40.0)], 1000);
-        assert_eq!(smooth, [(300, 8), (450, 4), (600, 2)]);
+        assert_eq!(smooth, [(200, 8), (300, 4), (400, 2)]);
         let fine = stages(&[gain(8, 0.0), gain(4, 6.0), gain(2, 12.0)], 1000);
-        assert_eq!(fine, [(150, 4), (300, 2)]);
+        assert_eq!(fine, [(100, 4), (200, 2)]);
         assert_eq!(stages(&[gain(4, -3.0)], 1000), []);
         assert_eq!(stages(&[gain(2, 9.0)], 1), []);
     }
