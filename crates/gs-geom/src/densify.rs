@@ -18,12 +18,13 @@ const RESET_OPACITY: f32 = 0.01;
 const LEAST_ALPHA: f32 = 1.0 / 255.0;
 
 /// How the number of Gaussians grows.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, ValueEnum)]
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, ValueEnum)]
 #[serde(rename_all = "kebab-case")]
 pub enum Strategy {
     /// Clone and split what is pulled hard on average, as 3DGS does
     Adaptive,
     /// The same with pulls that cannot cancel within a Gaussian, so that large blurred ones are split (AbsGS)
+    #[default]
     Absgrad,
     /// Move dead Gaussians to opaque ones, grow by 5% a round up to --max-gaussians, explore by noise (3DGS-MCMC)
     Mcmc,
@@ -58,9 +59,9 @@ pub struct DensifyOptions {
     pub max_gaussians: usize,
 }
 
-impl Default for DensifyOptions {
-    fn default() -> Self {
-        let strategy = Strategy::Adaptive;
+impl DensifyOptions {
+    /// The usual thresholds of a strategy.
+    pub fn of(strategy: Strategy) -> Self {
         Self {
             strategy,
             gradient: strategy.gradient(),
@@ -69,6 +70,12 @@ impl Default for DensifyOptions {
             max_scale: 0.1,
             max_gaussians: 1_000_000,
         }
+    }
+}
+
+impl Default for DensifyOptions {
+    fn default() -> Self {
+        Self::of(Strategy::default())
     }
 }
 
@@ -245,7 +252,8 @@ mod tests {
         let mut g = row(&[small, small, 0.5f32.ln(), small, 2.0f32.ln(), 0.5f32.ln()]);
         g.opacity_logits[3] = -9.0;
         let before = g.clone();
-        let (adam, report) = run(&mut g, &[1e-3, 0.0, 1e-3, 1e-3, 0.0, 1e-4], &DensifyOptions::default(), true);
+        let (adam, report) =
+            run(&mut g, &[1e-3, 0.0, 1e-3, 1e-3, 0.0, 1e-4], &DensifyOptions::of(super::Strategy::Adaptive), true);
         // 0 and 3 are cloned, but 3 is faint: it and its twin go, as does 4, which is huge. 2 is split.
         assert_eq!(report, Report { cloned: 2, split: 1, removed: 3, relocated: 0 });
         let xs: Vec<f32> = g.means.iter().map(|m| m[0]).collect();
@@ -256,7 +264,10 @@ mod tests {
             assert!((g.means[half][0] - 2.0).abs() < 2.5, "within five standard deviations");
         }
         assert_ne!(g.means[4], g.means[5]);
-        assert_eq!(run(&mut before.clone(), &[0.0; 6], &DensifyOptions::default(), false).1.removed, 1);
+        assert_eq!(
+            run(&mut before.clone(), &[0.0; 6], &DensifyOptions::of(super::Strategy::Adaptive), false).1.removed,
+            1
+        );
     }
 
     #[test]
@@ -301,7 +312,7 @@ mod tests {
             let n = pulls.len();
             let log_scales: Vec<f32> = (0..n).map(|i| ((seed as usize + 7 * i) % 5) as f32 - 4.0).collect();
             let mut g = row(&log_scales);
-            let options = DensifyOptions { max_gaussians: cap, ..DensifyOptions::default() };
+            let options = DensifyOptions { max_gaussians: cap, ..DensifyOptions::of(super::Strategy::Adaptive) };
             let (_, report) = run(&mut g, &pulls, &options, false);
             prop_assert_eq!(g.len(), n + report.cloned + report.split - report.removed);
             prop_assert!(g.len() <= n.max(cap));

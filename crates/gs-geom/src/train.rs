@@ -51,7 +51,7 @@ impl TrainOptions {
             rates: LearningRates::default(),
             densify: DensifyOptions::default(),
             mcmc: McmcOptions::default(),
-            sparse_adam: true,
+            sparse_adam: false,
             dssim_weight: 0.2,
             background: [0.0; 3],
             random_background: false,

@@ -50,7 +50,7 @@ pub(super) struct TrainArgs {
     #[arg(long)]
     pub(super) fixed_points: bool,
     /// How the number of Gaussians grows
-    #[arg(long, value_enum, default_value_t = Strategy::Adaptive)]
+    #[arg(long, value_enum, default_value_t = Strategy::default())]
     densify: Strategy,
     /// Most Gaussians there may be; with --densify mcmc how many there will be, if the iterations suffice
     #[arg(long, value_name = "COUNT", default_value_t = DensifyOptions::default().max_gaussians)]
@@ -58,7 +58,7 @@ pub(super) struct TrainArgs {
     /// Weight of 1 - SSIM in the loss, 0 to 1
     #[arg(long, value_name = "WEIGHT", default_value_t = 0.2)]
     dssim: f32,
-    /// Clone or split Gaussians whose projection is pulled harder than this, on average [0.0002; absgrad 0.0004]
+    /// Clone or split Gaussians whose projection is pulled harder than this, on average [0.0004; adaptive 0.0002]
     #[arg(long, value_name = "GRADIENT")]
     densify_gradient: Option<f32>,
     /// Densify after this iteration [a twentieth of the iterations, at most 500]
@@ -83,10 +83,10 @@ pub(super) struct TrainArgs {
     #[arg(long, value_name = "RATE", default_value_t = LearningRates::default().position)]
     position_rate: f64,
     /// Picture sizes to begin with
-    #[arg(long, value_enum, default_value_t = Sizes::Full)]
+    #[arg(long, value_enum, default_value_t = Sizes::Content)]
     schedule: Sizes,
     /// Which Gaussians a step moves
-    #[arg(long, value_enum, default_value_t = Moves::Sparse)]
+    #[arg(long, value_enum, default_value_t = Moves::Dense)]
     adam: Moves,
     /// Memory for decoded photographs; the rest is decoded anew each time
     #[arg(long, value_name = "MEGABYTES", default_value_t = 2048)]
@@ -178,12 +178,7 @@ impl TrainArgs {
                 position_end: self.position_rate / 100.0,
                 ..LearningRates::default()
             },
-            densify: DensifyOptions {
-                strategy: self.densify,
-                gradient,
-                max_gaussians: self.max_gaussians,
-                ..DensifyOptions::default()
-            },
+            densify: DensifyOptions { gradient, max_gaussians: self.max_gaussians, ..DensifyOptions::of(self.densify) },
             mcmc: McmcOptions::default(),
             sparse_adam: self.adam == Moves::Sparse,
             dssim_weight: self.dssim,
