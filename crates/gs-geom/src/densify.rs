@@ -22,9 +22,9 @@ const LEAST_ALPHA: f32 = 1.0 / 255.0;
 #[serde(rename_all = "kebab-case")]
 pub enum Strategy {
     /// Clone and split what is pulled hard on average, as 3DGS does
+    #[default]
     Adaptive,
     /// The same with pulls that cannot cancel within a Gaussian, so that large blurred ones are split (AbsGS)
-    #[default]
     Absgrad,
     /// Move dead Gaussians to opaque ones, grow by 5% a round up to --max-gaussians, explore by noise (3DGS-MCMC)
     Mcmc,

@@ -58,7 +58,7 @@ pub(super) struct TrainArgs {
     /// Weight of 1 - SSIM in the loss, 0 to 1
     #[arg(long, value_name = "WEIGHT", default_value_t = 0.2)]
     dssim: f32,
-    /// Clone or split Gaussians whose projection is pulled harder than this, on average [0.0004; adaptive 0.0002]
+    /// Clone or split Gaussians whose projection is pulled harder than this, on average [0.0002; absgrad 0.0004]
     #[arg(long, value_name = "GRADIENT")]
     densify_gradient: Option<f32>,
     /// Densify after this iteration [a twentieth of the iterations, at most 500]
@@ -83,7 +83,7 @@ pub(super) struct TrainArgs {
     #[arg(long, value_name = "RATE", default_value_t = LearningRates::default().position)]
     position_rate: f64,
     /// Picture sizes to begin with
-    #[arg(long, value_enum, default_value_t = Sizes::Content)]
+    #[arg(long, value_enum, default_value_t = Sizes::Coarse)]
     schedule: Sizes,
     /// Which Gaussians a step moves
     #[arg(long, value_enum, default_value_t = Moves::Dense)]
