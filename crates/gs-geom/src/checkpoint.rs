@@ -10,7 +10,7 @@ use std::path::{Path, PathBuf};
 /// Format name of the artifact.
 pub const FORMAT: &str = "gs-geom-checkpoint";
 /// Version of the format.
-pub const VERSION: u32 = 1;
+pub const VERSION: u32 = 2;
 
 /// State of an optimisation after some iterations. Random numbers are drawn from the seed and the iteration (see
 /// [`crate::schedule::generator`]), so no generator is part of it.
@@ -33,8 +33,8 @@ pub struct ProgressState {
     pub iteration: u32,
     /// Gradients of Gaussians that were not finite and so not used.
     pub dropped: u64,
-    /// Gaussians cloned, split and removed so far.
-    pub densified: [u64; 3],
+    /// Gaussians cloned, split, removed and relocated so far.
+    pub densified: [u64; 4],
     /// Sums of loss, L1 and SSIM, and their number, since the last line of the curve.
     pub window: ([f64; 3], u32),
     /// Lines of the training curve.
@@ -164,7 +164,7 @@ mod tests {
         state.progress = ProgressState {
             iteration: 12,
             dropped: 3,
-            densified: [1, 2, 3],
+            densified: [1, 2, 3, 4],
             window: ([0.1, 1.0 / 3.0, f64::MIN_POSITIVE], 7),
             curve: vec!["{\"iteration\":10}".into()],
         };

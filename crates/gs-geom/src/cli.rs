@@ -1,5 +1,6 @@
 //! The command line of `gs-geom`.
 
+mod budget;
 mod eval;
 mod render;
 mod train;
@@ -49,7 +50,7 @@ impl Program for Args {
 }
 
 /// Which photographs, and at which size.
-#[derive(Debug, clap::Args)]
+#[derive(Debug, Clone, clap::Args)]
 struct SceneArgs {
     /// Dataset folder (COLMAP, transforms.json or ScanNet)
     #[arg(long, value_name = "DIR")]
@@ -69,12 +70,14 @@ struct SceneArgs {
 enum Background {
     Black,
     White,
+    /// Training only: another colour in every iteration; renders are over black
+    Random,
 }
 
 impl Background {
     fn color(self) -> [f32; 3] {
         match self {
-            Self::Black => [0.0; 3],
+            Self::Black | Self::Random => [0.0; 3],
             Self::White => [1.0; 3],
         }
     }

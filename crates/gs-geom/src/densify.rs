@@ -1,9 +1,10 @@
 //! Adaptive density control: Gaussians whose projection is pulled hard are cloned (small ones) or split (large ones);
-//! faint and huge ones are removed (Kerbl et al. 2023, section 5.2).
+//! faint and huge ones are removed (Kerbl et al. 2023, section 5.2). How hard is measured as there, or without letting
+//! the pulls of a Gaussian's pixels cancel (AbsGS, Ye et al. 2024). The other way to densify is in [`crate::mcmc`].
 
 use crate::optimiser::Adam;
+use clap::ValueEnum;
 use glam::{Quat, Vec3};
-use gs_raster::Gradients;
 use gs_scene::Gaussians;
 use rand::Rng;
 use rand_chacha::ChaCha8Rng;
@@ -16,9 +17,35 @@ const RESET_OPACITY: f32 = 0.01;
 /// Fainter Gaussians are never drawn.
 const LEAST_ALPHA: f32 = 1.0 / 255.0;
 
+/// How the number of Gaussians grows.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, ValueEnum)]
+#[serde(rename_all = "kebab-case")]
+pub enum Strategy {
+    /// Clone and split what is pulled hard on average, as 3DGS does
+    #[default]
+    Adaptive,
+    /// The same with pulls that cannot cancel within a Gaussian, so that large blurred ones are split (AbsGS)
+    Absgrad,
+    /// Move dead Gaussians to opaque ones, grow by 5% a round up to --max-gaussians, explore by noise (3DGS-MCMC)
+    Mcmc,
+}
+
+impl Strategy {
+    /// The usual threshold on the pull.
+    pub fn gradient(self) -> f32 {
+        match self {
+            Self::Adaptive | Self::Mcmc => 2e-4,
+            // AbsGS, section 4.1.
+            Self::Absgrad => 4e-4,
+        }
+    }
+}
+
 /// Thresholds of densification and pruning.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize)]
 pub struct DensifyOptions {
+    /// How.
+    pub strategy: Strategy,
     /// Mean length of d loss / d projected centre, in units of half the picture's width and height, above which a
     /// Gaussian is cloned or split.
     pub gradient: f32,
@@ -32,9 +59,23 @@ pub struct DensifyOptions {
     pub max_gaussians: usize,
 }
 
+impl DensifyOptions {
+    /// The usual thresholds of a strategy.
+    pub fn of(strategy: Strategy) -> Self {
+        Self {
+            strategy,
+            gradient: strategy.gradient(),
+            min_opacity: 0.005,
+            clone_scale: 0.01,
+            max_scale: 0.1,
+            max_gaussians: 1_000_000,
+        }
+    }
+}
+
 impl Default for DensifyOptions {
     fn default() -> Self {
-        Self { gradient: 2e-4, min_opacity: 0.005, clone_scale: 0.01, max_scale: 0.1, max_gaussians: 1_000_000 }
+        Self::of(Strategy::default())
     }
 }
 
@@ -54,12 +95,13 @@ impl Pull {
     }
 
     /// Counts a view that drew the Gaussians `visible` at `width` x `height` pixels.
-    pub fn observe(&mut self, visible: &[u32], d: &Gradients, width: u32, height: u32) {
+    /// `mean2d` is the gradient of the projected centres: [`gs_raster::Gradients::mean2d`] or its `mean2d_abs`.
+    pub fn observe(&mut self, visible: &[u32], mean2d: &[[f32; 2]], width: u32, height: u32) {
         // Pixels to half widths and half heights: the loss's slope by x / (width / 2).
         let (x, y) = (0.5 * width as f32, 0.5 * height as f32);
         for &i in visible {
             let i = i as usize;
-            let [gx, gy] = d.mean2d[i];
+            let [gx, gy] = mean2d[i];
             self.sum[i] += (gx * x).hypot(gy * y);
             self.views[i] += 1;
         }
@@ -79,6 +121,8 @@ pub struct Report {
     pub split: usize,
     /// Gaussians removed.
     pub removed: usize,
+    /// Dead Gaussians moved elsewhere.
+    pub relocated: usize,
 }
 
 /// Clones, splits and removes; afterwards `pull` starts from nothing. New Gaussians follow the old ones and have no
@@ -118,7 +162,7 @@ pub fn densify(
     let kept = |g: &Gaussians, i: usize| g.opacity(i) >= options.min_opacity && !huge(g, i);
     let removed = keep(g, adam, kept);
     *pull = Pull::new(g.len());
-    Report { cloned: clone.len(), split: split.len(), removed }
+    Report { cloned: clone.len(), split: split.len(), removed, relocated: 0 }
 }
 
 /// Removes the Gaussians that `kept` refuses, unless none would be left; gives their number.
@@ -208,9 +252,10 @@ mod tests {
         let mut g = row(&[small, small, 0.5f32.ln(), small, 2.0f32.ln(), 0.5f32.ln()]);
         g.opacity_logits[3] = -9.0;
         let before = g.clone();
-        let (adam, report) = run(&mut g, &[1e-3, 0.0, 1e-3, 1e-3, 0.0, 1e-4], &DensifyOptions::default(), true);
+        let (adam, report) =
+            run(&mut g, &[1e-3, 0.0, 1e-3, 1e-3, 0.0, 1e-4], &DensifyOptions::of(super::Strategy::Adaptive), true);
         // 0 and 3 are cloned, but 3 is faint: it and its twin go, as does 4, which is huge. 2 is split.
-        assert_eq!(report, Report { cloned: 2, split: 1, removed: 3 });
+        assert_eq!(report, Report { cloned: 2, split: 1, removed: 3, relocated: 0 });
         let xs: Vec<f32> = g.means.iter().map(|m| m[0]).collect();
         assert_eq!(xs[..4], [0.0, 1.0, 5.0, 0.0]);
         assert_eq!(adam.first.means.iter().map(|m| m[0]).collect::<Vec<_>>(), [1.0, 2.0, 6.0, 0.0, 0.0, 0.0]);
@@ -219,7 +264,10 @@ mod tests {
             assert!((g.means[half][0] - 2.0).abs() < 2.5, "within five standard deviations");
         }
         assert_ne!(g.means[4], g.means[5]);
-        assert_eq!(run(&mut before.clone(), &[0.0; 6], &DensifyOptions::default(), false).1.removed, 1);
+        assert_eq!(
+            run(&mut before.clone(), &[0.0; 6], &DensifyOptions::of(super::Strategy::Adaptive), false).1.removed,
+            1
+        );
     }
 
     #[test]
@@ -264,7 +312,7 @@ mod tests {
             let n = pulls.len();
             let log_scales: Vec<f32> = (0..n).map(|i| ((seed as usize + 7 * i) % 5) as f32 - 4.0).collect();
             let mut g = row(&log_scales);
-            let options = DensifyOptions { max_gaussians: cap, ..DensifyOptions::default() };
+            let options = DensifyOptions { max_gaussians: cap, ..DensifyOptions::of(super::Strategy::Adaptive) };
             let (_, report) = run(&mut g, &pulls, &options, false);
             prop_assert_eq!(g.len(), n + report.cloned + report.split - report.removed);
             prop_assert!(g.len() <= n.max(cap));

@@ -7,6 +7,7 @@ use gs_io::{Error, Result};
 use gs_scene::{Camera, Gaussians, PointCloud, SH_C0, sh_coefficients};
 use kiddo::{ImmutableKdTree, SquaredEuclidean};
 use rand::Rng;
+use rand::seq::index::sample;
 use rayon::prelude::*;
 use std::num::NonZero;
 
@@ -61,6 +62,17 @@ pub fn from_points(points: &PointCloud, sh_degree: u8, extent: f64) -> Result<Ga
         }
     }
     Ok(g)
+}
+
+/// `count` of the points, drawn at random, in their order; all where there are no more.
+pub fn some_points(points: &PointCloud, count: usize, seed: u64) -> PointCloud {
+    let n = points.len();
+    let mut chosen = sample(&mut generator(seed, Purpose::Start, 1), n, count.min(n)).into_vec();
+    chosen.sort_unstable();
+    PointCloud {
+        positions: chosen.iter().map(|&i| points.positions[i]).collect(),
+        colors: chosen.iter().map(|&i| points.colors[i]).collect(),
+    }
 }
 
 /// Root mean squared distance of each position to its three nearest other places; `alone` where there is no other.
@@ -171,6 +183,16 @@ mod tests {
         assert!((g.opacity(0) - 0.1).abs() < 1e-6);
         assert!(g.base_color(0).iter().zip([1.0, 0.0, 0.2]).all(|(a, b)| (a - b).abs() < 1e-6));
         assert!(g.check().is_ok());
+    }
+
+    #[test]
+    fn some_of_the_points_are_different_points() {
+        let all = cloud((0..100).map(|i| [i as f32, 0.0, 0.0]).collect());
+        let some = some_points(&all, 30, 1);
+        assert!(some.len() == 30 && some.positions.is_sorted() && some.colors.len() == 30);
+        assert!(some.positions.windows(2).all(|w| w[0] != w[1]));
+        assert_ne!(some, some_points(&all, 30, 2));
+        assert_eq!(some_points(&all, 200, 1), all);
     }
 
     #[test]

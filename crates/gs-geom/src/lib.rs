@@ -1,15 +1,18 @@
 //! Stage 1: optimisation of 3D Gaussians from posed photographs, on the CPU (Kerbl et al. 2023).
 //!
-//! [`train`] is the loop; what it is made of is pure and in a module each: [`loss`], [`optimiser`], [`densify`],
+//! [`train`] is the loop; what it is made of is pure and in a module each: [`loss`], [`optimiser`], [`densify`], [`mcmc`],
 //! [`schedule`], [`init`]. [`checkpoint`] makes a killed run go on to the bytes of an undisturbed one.
 
 pub mod checkpoint;
 pub mod cli;
+pub mod content;
 pub mod densify;
 pub mod init;
 pub mod loss;
+pub mod mcmc;
 pub mod metrics;
 pub mod optimiser;
 pub mod photographs;
+pub mod plan;
 pub mod schedule;
 pub mod train;

@@ -42,23 +42,27 @@ pub struct Pair<'a> {
     pub width: usize,
 }
 
-/// Derivatives of the SSIM map by the three blurred maps that depend on the rendered picture.
-struct Derivatives {
+/// Derivatives of the SSIM map by the three blurred maps that depend on the rendered picture. Kept between iterations, so
+/// that large pictures do not ask the system for fresh memory each time.
+#[derive(Debug, Default)]
+pub struct Derivatives {
     mean: Vec<f32>,
     square: Vec<f32>,
     product: Vec<f32>,
 }
 
-/// Loss of `pair.render` against `pair.target`, and d loss / d render into `gradient` (resized to fit).
+/// Loss of `pair.render` against `pair.target`, and d loss / d render into `gradient` (resized to fit); `d` is room to work
+/// in, whatever it held before.
 ///
 /// # Panics
 /// When the pictures have different sizes or are not whole rows of RGB.
-pub fn l1_dssim(pair: Pair<'_>, dssim_weight: f32, gradient: &mut Vec<f32>) -> Loss {
+pub fn l1_dssim(pair: Pair<'_>, dssim_weight: f32, gradient: &mut Vec<f32>, d: &mut Derivatives) -> Loss {
     let (n, row) = pair.check();
     let with_ssim = dssim_weight > 0.0;
-    let maps = || vec![0.0; if with_ssim { n } else { 0 }];
-    let mut d = Derivatives { mean: maps(), square: maps(), product: maps() };
-    let ssim = if with_ssim { ssim_map(pair, Some(&mut d)) / n as f64 } else { 0.0 };
+    for map in [&mut d.mean, &mut d.square, &mut d.product] {
+        map.resize(if with_ssim { n } else { 0 }, 0.0);
+    }
+    let ssim = if with_ssim { ssim_map(pair, Some(d)) / n as f64 } else { 0.0 };
     let (l1_scale, ssim_scale) = ((1.0 - dssim_weight) / n as f32, -dssim_weight / n as f32);
     gradient.resize(n, 0.0);
     let l1: Vec<f64> = gradient
@@ -371,7 +375,8 @@ mod tests {
         let (x, y) = (noise(3 * w * h, 1), noise(3 * w * h, 2));
         for weight in [0.2, 0.0] {
             let mut gradient = Vec::new();
-            let loss = l1_dssim(Pair { render: &x, target: &y, width: w }, weight, &mut gradient);
+            let mut d = Derivatives { mean: vec![7.0; 5], square: vec![f32::NAN; 4 * w * h], product: vec![] };
+            let loss = l1_dssim(Pair { render: &x, target: &y, width: w }, weight, &mut gradient, &mut d);
             let weight = f64::from(weight);
             let (ssim_true, total) = oracle(&wide(&x), &wide(&y), w, weight);
             assert!((loss.total - total).abs() < 1e-6, "{loss:?} {total}");
@@ -395,7 +400,7 @@ mod tests {
         fn equal_pictures_have_no_loss(w in 1usize..40, h in 1usize..70, seed in 0u64..99) {
             let x = noise(3 * w * h, seed);
             let mut gradient = Vec::new();
-            let loss = l1_dssim(Pair { render: &x, target: &x, width: w }, 0.2, &mut gradient);
+            let loss = l1_dssim(Pair { render: &x, target: &x, width: w }, 0.2, &mut gradient, &mut Derivatives::default());
             prop_assert!(loss.total.abs() < 1e-5 && (loss.ssim - 1.0).abs() < 1e-5, "{:?}", loss);
             // A maximum of SSIM has no slope; what is left is rounding.
             prop_assert!(gradient.iter().all(|g| g.abs() < 1e-4 / (w * h) as f32));

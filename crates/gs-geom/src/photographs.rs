@@ -5,27 +5,69 @@ use gs_scene::dataset::View;
 use gs_scene::{Camera, Image};
 use rayon::prelude::*;
 
-/// Photographs over a background, as 8-bit RGB.
+/// Photographs as 8-bit RGB, with alpha where they have it.
 pub struct Photographs<'a> {
     views: Vec<&'a View>,
-    background: [f32; 3],
     budget: usize,
     divisor: u32,
     cameras: Vec<Camera>,
-    /// Decoded pictures; none where the budget ran out: those are decoded whenever they are wanted.
-    pixels: Vec<Option<Vec<u8>>>,
+    /// At the views' own size; none where the budget ran out: those are decoded whenever they are wanted.
+    full: Vec<Option<Picture>>,
+    /// At the picture size in use, where that is smaller and the budget allows.
+    small: Vec<Option<Picture>>,
+}
+
+/// A photograph in memory.
+struct Picture {
+    /// `[height][width][rgb]`, over black where there is alpha.
+    rgb: Vec<u8>,
+    /// `[height][width]`, where the file has an alpha channel.
+    alpha: Option<Vec<u8>>,
+}
+
+impl Picture {
+    fn new(image: &Image) -> Self {
+        let alpha = image.alpha.as_ref().map(|a| a.iter().map(|v| (v * 255.0).round() as u8).collect());
+        Self { rgb: image.to_rgb8(), alpha }
+    }
+
+    fn image(&self, camera: &Camera) -> Image {
+        let image = Image::from_rgb8(camera.width, camera.height, &self.rgb);
+        Image { alpha: self.alpha.as_ref().map(|a| a.iter().map(|&v| unit(v)).collect()), ..image }
+    }
+
+    fn over(&self, background: [f32; 3]) -> Vec<f32> {
+        let mut rgb: Vec<f32> = self.rgb.iter().map(|&v| unit(v)).collect();
+        for (pixel, &a) in rgb.as_chunks_mut::<3>().0.iter_mut().zip(self.alpha.iter().flatten()) {
+            for (v, b) in pixel.iter_mut().zip(background) {
+                *v += (1.0 - unit(a)) * b;
+            }
+        }
+        rgb
+    }
+}
+
+fn unit(v: u8) -> f32 {
+    f32::from(v) * (1.0 / 255.0)
 }
 
 impl<'a> Photographs<'a> {
-    /// Decodes the photographs of `views`, with `background` behind transparent ones, and keeps up to `budget` bytes of
-    /// them.
+    /// Decodes the photographs of `views` and keeps up to `budget` bytes of them.
     ///
     /// # Errors
     /// When a photograph cannot be read or has another shape than its camera.
-    pub fn load(views: Vec<&'a View>, background: [f32; 3], budget: usize, divisor: u32) -> Result<Self> {
-        let mut all = Self { views, background, budget, divisor, cameras: Vec::new(), pixels: Vec::new() };
-        all.reload()?;
-        Ok(all)
+    pub fn load(views: Vec<&'a View>, budget: usize) -> Result<Self> {
+        let cameras: Vec<Camera> = views.iter().map(|v| v.camera.clone()).collect();
+        // A part is for the smaller pictures of a coarse start, at most half as wide and high.
+        let fits = fitting(&cameras, budget / 5 * 4);
+        let decode = |(view, fits): (&&View, bool)| fits.then(|| decode(view).map(|i| Picture::new(&i))).transpose();
+        let full = views.par_iter().zip(fits).map(decode).collect::<Result<_>>()?;
+        Ok(Self { views, budget, divisor: 1, cameras, full, small: Vec::new() })
+    }
+
+    /// No photographs, such as held-out ones where there are none.
+    pub fn none() -> Self {
+        Self { views: vec![], budget: 0, divisor: 1, cameras: vec![], full: vec![], small: vec![] }
     }
 
     /// Number of photographs.
@@ -43,42 +85,36 @@ impl<'a> Photographs<'a> {
     /// # Errors
     /// As [`Self::load`].
     pub fn set_divisor(&mut self, divisor: u32) -> Result<()> {
-        if divisor != self.divisor {
-            self.divisor = divisor;
-            self.reload()?;
+        if divisor == self.divisor {
+            return Ok(());
+        }
+        self.divisor = divisor;
+        self.small = Vec::new();
+        self.cameras = self.views.iter().map(|v| shrunk(&v.camera, divisor)).collect();
+        if divisor > 1 {
+            let fits = fitting(&self.cameras, self.budget / 5);
+            let shrink = |(i, fits): (usize, bool)| fits.then(|| self.shrink(i)).transpose();
+            self.small = fits.into_par_iter().enumerate().map(shrink).collect::<Result<_>>()?;
         }
         Ok(())
     }
 
-    fn reload(&mut self) -> Result<()> {
-        let divisor = self.divisor.max(1);
-        let shrink = |v: u32| ((f64::from(v) / f64::from(divisor)).round() as u32).max(1);
-        self.cameras =
-            self.views.iter().map(|v| v.camera.resized(shrink(v.camera.width), shrink(v.camera.height))).collect();
-        // The old pictures go first: the budget holds for old and new together.
-        self.pixels = Vec::new();
-        let mut left = self.budget;
-        let fits: Vec<bool> = self
-            .cameras
-            .iter()
-            .map(|c| {
-                let bytes = 3 * c.width as usize * c.height as usize;
-                let fits = bytes <= left;
-                left -= if fits { bytes } else { 0 };
-                fits
-            })
-            .collect();
-        self.pixels = fits
-            .into_par_iter()
-            .enumerate()
-            .map(|(i, fits)| if fits { self.decode(i).map(Some) } else { Ok(None) })
-            .collect::<Result<_>>()?;
-        Ok(())
+    /// Photograph `i` at its own size, over black where it has alpha. It is the same 8-bit picture whether it was kept or
+    /// not.
+    ///
+    /// # Errors
+    /// When it has to be decoded again and cannot be.
+    pub fn image(&self, i: usize) -> Result<Image> {
+        let camera = &self.views[i].camera;
+        match &self.full[i] {
+            Some(picture) => Ok(picture.image(camera)),
+            None => Ok(Picture::new(&decode(self.views[i])?).image(camera)),
+        }
     }
 
-    fn decode(&self, i: usize) -> Result<Vec<u8>> {
+    fn shrink(&self, i: usize) -> Result<Picture> {
         let c = &self.cameras[i];
-        Ok(over_background(self.views[i].load_image()?, self.background).resize_area(c.width, c.height).to_rgb8())
+        Ok(Picture::new(&self.image(i)?.resize_area(c.width, c.height)))
     }
 
     /// The camera of photograph `i` at the picture size in use.
@@ -86,21 +122,47 @@ impl<'a> Photographs<'a> {
         &self.cameras[i]
     }
 
-    /// Photograph `i` as `[height][width][rgb]`, 0 to 1.
+    /// Photograph `i` as `[height][width][rgb]`, 0 to 1, with `background` behind its transparent pixels.
     ///
     /// # Errors
     /// When it has to be decoded again and cannot be.
-    pub fn target(&self, i: usize) -> Result<Vec<f32>> {
-        let decoded;
-        let bytes = match &self.pixels[i] {
-            Some(bytes) => bytes,
-            None => {
-                decoded = self.decode(i)?;
-                &decoded
-            }
-        };
-        Ok(bytes.iter().map(|&v| f32::from(v) * (1.0 / 255.0)).collect())
+    pub fn target(&self, i: usize, background: [f32; 3]) -> Result<Vec<f32>> {
+        let kept = if self.divisor > 1 { &self.small } else { &self.full };
+        match kept.get(i).and_then(Option::as_ref) {
+            Some(picture) => Ok(picture.over(background)),
+            None if self.divisor > 1 => Ok(self.shrink(i)?.over(background)),
+            None => Ok(Picture::new(&decode(self.views[i])?).over(background)),
+        }
     }
+}
+
+/// The camera at a fraction of its size, at least one pixel.
+pub fn shrunk(camera: &Camera, divisor: u32) -> Camera {
+    let shrink = |v: u32| ((f64::from(v) / f64::from(divisor.max(1))).round() as u32).max(1);
+    camera.resized(shrink(camera.width), shrink(camera.height))
+}
+
+/// Which cameras' photographs fit in `budget` bytes, in order.
+fn fitting(cameras: &[Camera], budget: usize) -> Vec<bool> {
+    let mut left = budget;
+    let fits = |c: &Camera| {
+        let bytes = 3 * c.width as usize * c.height as usize;
+        let fits = bytes <= left;
+        left -= if fits { bytes } else { 0 };
+        fits
+    };
+    cameras.iter().map(fits).collect()
+}
+
+/// A view's photograph, multiplied by its alpha: pictures can then be shrunk before a background is put behind them.
+fn decode(view: &View) -> Result<Image> {
+    let mut image = view.load_image()?;
+    if let Some(alpha) = &image.alpha {
+        for (pixel, a) in image.rgb.chunks_exact_mut(3).zip(alpha) {
+            pixel.iter_mut().for_each(|v| *v *= a);
+        }
+    }
+    Ok(image)
 }
 
 /// The picture with a colour behind its transparent pixels.
@@ -123,8 +185,13 @@ mod tests {
     fn transparent_pixels_show_the_background() {
         let image =
             Image { width: 2, height: 1, rgb: vec![1.0, 0.5, 0.0, 1.0, 0.5, 0.0], alpha: Some(vec![1.0, 0.25]) };
-        let flat = over_background(image, [0.0, 0.5, 1.0]);
+        let background = [0.0, 0.5, 1.0];
+        let mut black = image.clone();
+        black.rgb[3..].iter_mut().for_each(|v| *v *= 0.25);
+        let kept = Picture::new(&black).over(background);
+        let flat = over_background(image, background);
         assert_eq!(flat.rgb, [1.0, 0.5, 0.0, 0.25, 0.5, 0.75]);
         assert!(flat.alpha.is_none());
+        assert!(kept.iter().zip(&flat.rgb).all(|(a, b)| (a - b).abs() < 0.004), "{kept:?}");
     }
 }

@@ -1,15 +1,17 @@
 //! The optimisation loop.
 
 use crate::checkpoint::{State, start};
-use crate::densify::{DensifyOptions, densify, reset_opacities};
-use crate::loss::{Loss, Pair, l1_dssim};
+use crate::densify::{DensifyOptions, Pull, Strategy, densify, reset_opacities};
+use crate::loss::{Derivatives, Loss, Pair, l1_dssim};
+use crate::mcmc::{self, McmcOptions};
 use crate::metrics;
-use crate::optimiser::drop_bad_gradients;
+use crate::optimiser::{Adam, drop_bad_gradients};
 use crate::photographs::Photographs;
 use crate::schedule::{LearningRates, Purpose, Schedule, ViewOrder, generator};
 use gs_io::Result;
 use gs_raster::{PixelGradients, RasterOptions, backward, forward};
 use gs_scene::Gaussians;
+use rand::Rng;
 use serde::Serialize;
 use serde_json::json;
 use std::time::{Duration, Instant};
@@ -25,10 +27,17 @@ pub struct TrainOptions {
     pub rates: LearningRates,
     /// Thresholds of densification.
     pub densify: DensifyOptions,
+    /// Parameters of densification as sampling; of use only with [`Strategy::Mcmc`].
+    pub mcmc: McmcOptions,
+    /// Leave alone, in each step, the Gaussians that its view does not draw.
+    pub sparse_adam: bool,
     /// Weight of 1 - SSIM in the loss, 0 to 1.
     pub dssim_weight: f32,
     /// Colour behind the scene.
     pub background: [f32; 3],
+    /// Learn with another colour behind the scene in every iteration, so that what is transparent must be so;
+    /// `background` is then for held-out views alone.
+    pub random_background: bool,
     /// Keep number, order and positions of the Gaussians: Gaussian i is point i (ScanNet protocol).
     pub fixed_points: bool,
 }
@@ -41,8 +50,11 @@ impl TrainOptions {
             schedule: Schedule::for_iterations(iterations),
             rates: LearningRates::default(),
             densify: DensifyOptions::default(),
+            mcmc: McmcOptions::default(),
+            sparse_adam: false,
             dssim_weight: 0.2,
             background: [0.0; 3],
+            random_background: false,
             fixed_points: false,
         }
     }
@@ -72,6 +84,9 @@ pub struct Trainer<'a> {
     order: ViewOrder,
     state: State,
     gradient: Vec<f32>,
+    derivatives: Derivatives,
+    /// Which Gaussians the last view drew.
+    drawn: Vec<bool>,
     last: Loss,
     timings: Timings,
 }
@@ -98,7 +113,9 @@ impl<'a> Trainer<'a> {
     ) -> Self {
         let order = ViewOrder::new(options.seed, train.len());
         let last = Loss { l1: 0.0, ssim: 0.0, total: 0.0 };
-        Self { options, extent, train, heldout, order, state, gradient: Vec::new(), last, timings: Timings::default() }
+        let (gradient, derivatives, drawn) = (Vec::new(), Derivatives::default(), Vec::new());
+        let timings = Timings::default();
+        Self { options, extent, train, heldout, order, state, gradient, derivatives, drawn, last, timings }
     }
 
     /// The state, for a checkpoint.
@@ -109,6 +126,11 @@ impl<'a> Trainer<'a> {
     /// The state, at the end.
     pub fn into_state(self) -> State {
         self.state
+    }
+
+    /// Changes the Gaussians, with moments and pulls to follow them.
+    pub fn change(&mut self, change: impl FnOnce(&mut Gaussians, &mut Adam, &mut Pull)) {
+        change(&mut self.state.gaussians, &mut self.state.adam, &mut self.state.pull);
     }
 
     /// Loss of the last iteration's view.
@@ -141,44 +163,70 @@ impl<'a> Trainer<'a> {
         let iteration = self.state.progress.iteration + 1;
         self.train.set_divisor(schedule.divisor(iteration))?;
         let view = self.order.at(iteration);
-        let target = self.train.target(view)?;
+        let background = match self.options.random_background {
+            true => generator(self.options.seed, Purpose::Background, u64::from(iteration)).random(),
+            false => self.options.background,
+        };
+        let target = self.train.target(view, background)?;
         let camera = self.train.camera(view);
         lap(&mut self.timings.rest);
 
         let State { gaussians, adam, pull, progress } = &mut self.state;
         let degree = schedule.sh_degree(iteration, gaussians.sh_degree);
-        let raster =
-            RasterOptions { background: self.options.background, sh_degree: degree, ..RasterOptions::default() };
+        let raster = RasterOptions { background, sh_degree: degree, ..RasterOptions::default() };
         let rendered = forward(gaussians, camera, &raster);
         lap(&mut self.timings.forward);
         let pair = Pair { render: &rendered.rendered.rgb, target: &target, width: camera.width as usize };
-        let loss = l1_dssim(pair, self.options.dssim_weight, &mut self.gradient);
+        let loss = l1_dssim(pair, self.options.dssim_weight, &mut self.gradient, &mut self.derivatives);
         lap(&mut self.timings.loss);
         let pixels = PixelGradients { rgb: &self.gradient, alpha: None, depth: None };
         let mut gradients = backward(gaussians, camera, &raster, &rendered, pixels);
-        progress.dropped += drop_bad_gradients(&mut gradients);
         lap(&mut self.timings.backward);
         let mut rates = schedule.rates(&self.options.rates, iteration, self.extent);
         if self.options.fixed_points {
             rates.means = 0.0;
         }
-        adam.step(gaussians, &gradients, &rates, degree);
+        let drawn = self.options.sparse_adam.then(|| {
+            self.drawn.clear();
+            self.drawn.resize(gaussians.len(), false);
+            rendered.visible().iter().for_each(|&i| self.drawn[i as usize] = true);
+            &self.drawn[..]
+        });
+        let sampling = self.options.densify.strategy == Strategy::Mcmc && !self.options.fixed_points;
+        if sampling {
+            mcmc::regularise(gaussians, &mut gradients, &self.options.mcmc, drawn);
+        }
+        progress.dropped += drop_bad_gradients(&mut gradients);
+        adam.step(gaussians, &gradients, &rates, degree, drawn);
+        if sampling {
+            mcmc::explore(gaussians, &self.options.mcmc, rates.means, self.options.seed, iteration);
+        }
         lap(&mut self.timings.adam);
 
         if !self.options.fixed_points {
-            if schedule.observes(iteration) {
-                pull.observe(rendered.visible(), &gradients, camera.width, camera.height);
+            let options = &self.options.densify;
+            let pulls = match options.strategy {
+                Strategy::Adaptive => Some(&gradients.mean2d),
+                Strategy::Absgrad => Some(&gradients.mean2d_abs),
+                Strategy::Mcmc => None,
+            };
+            if let Some(pulls) = pulls.filter(|_| schedule.observes(iteration)) {
+                pull.observe(rendered.visible(), pulls, camera.width, camera.height);
             }
-            if schedule.densifies(iteration) {
+            if schedule.densifies(iteration) && (sampling || schedule.observes(iteration)) {
                 let mut rng = generator(self.options.seed, Purpose::Split, u64::from(iteration));
-                let remove_huge = iteration > schedule.opacity_reset_every;
-                let options = &self.options.densify;
-                let report = densify(gaussians, adam, pull, options, self.extent as f32, remove_huge, &mut rng);
-                for (sum, n) in progress.densified.iter_mut().zip([report.cloned, report.split, report.removed]) {
-                    *sum += n as u64;
-                }
+                let report = if sampling {
+                    let report = mcmc::round(gaussians, adam, &self.options.mcmc, options.max_gaussians, &mut rng);
+                    *pull = Pull::new(gaussians.len());
+                    report
+                } else {
+                    let remove_huge = iteration > schedule.opacity_reset_every;
+                    densify(gaussians, adam, pull, options, self.extent as f32, remove_huge, &mut rng)
+                };
+                let counts = [report.cloned, report.split, report.removed, report.relocated];
+                progress.densified.iter_mut().zip(counts).for_each(|(sum, n)| *sum += n as u64);
             }
-            if schedule.resets_opacity(iteration) {
+            if schedule.resets_opacity(iteration) && !sampling {
                 reset_opacities(gaussians, adam);
             }
         }
@@ -208,7 +256,7 @@ impl<'a> Trainer<'a> {
         let gaussians = self.state.gaussians.len();
         let mut line = json!({"iteration": iteration, "loss": loss, "l1": l1, "ssim": ssim, "gaussians": gaussians});
         if (iteration.is_multiple_of(heldout_every) || iteration == total)
-            && let Some(psnr) = self.heldout_psnr()?
+            && let Some((psnr, _)) = self.heldout()?
         {
             line["psnr_heldout"] = json!(psnr);
         }
@@ -216,17 +264,20 @@ impl<'a> Trainer<'a> {
         Ok(())
     }
 
-    /// Mean PSNR over the held-out views with the spherical harmonics in use; none without such views.
+    /// Mean PSNR and SSIM over the held-out views with all spherical harmonics; none without such views.
     ///
     /// # Errors
     /// When a photograph has to be decoded and cannot be.
-    pub fn heldout_psnr(&self) -> Result<Option<f64>> {
+    pub fn heldout(&self) -> Result<Option<(f64, f64)>> {
         let g = &self.state.gaussians;
-        let options = RasterOptions { background: self.options.background, ..RasterOptions::default() };
-        let mut all = Vec::new();
-        for i in 0..self.heldout.len() {
-            all.push(metrics::compare(g, self.heldout.camera(i), &options, &self.heldout.target(i)?).0);
-        }
-        Ok(metrics::mean(all.into_iter()))
+        let background = self.options.background;
+        let options = RasterOptions { background, ..RasterOptions::default() };
+        let compare = |i: usize| {
+            let target = self.heldout.target(i, background)?;
+            Ok(metrics::compare(g, self.heldout.camera(i), &options, &target))
+        };
+        let all = (0..self.heldout.len()).map(compare).collect::<Result<Vec<(f64, f64)>>>()?;
+        let psnr = metrics::mean(all.iter().map(|v| v.0));
+        Ok(psnr.zip(metrics::mean(all.iter().map(|v| v.1))))
     }
 }

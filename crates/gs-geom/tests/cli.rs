@@ -223,6 +223,57 @@ fn a_stopped_run_goes_on_to_the_same_bytes() {
     assert_eq!(dir.names(), ["g.ply", "g.ply.curve.jsonl", "g.ply.run.json"]);
 }
 
+/// Every way to densify, to choose picture sizes, backgrounds and what Adam moves.
+const WAYS: [&[&str]; 4] = [
+    &["--densify", "mcmc", "--schedule", "content", "--max-gaussians", "190"],
+    &["--densify", "absgrad", "--schedule", "coarse", "--adam", "dense", "--max-gaussians", "300"],
+    &["--densify", "adaptive", "--schedule", "full", "--background", "random", "--max-gaussians", "150"],
+    &["--densify", "mcmc", "--adam", "dense", "--schedule", "full", "--sh-degree", "1"],
+];
+
+#[test]
+fn every_way_is_the_same_for_any_threads_and_after_a_stop_and_keeps_the_budget() {
+    for way in WAYS {
+        let dir = Folder::new();
+        let (whole, parts) = (dir.path("a.ply"), dir.path("b.ply"));
+        succeeds(&[&training(&whole, way)[..], &["--threads", "1"]].concat());
+        // Photographs that are kept and photographs decoded anew are the same.
+        for last in ["37", "61", "1000"] {
+            let more = ["--threads", "3", "--stop-after", last, "--cache", "0"];
+            succeeds(&[&training(&parts, way)[..], &more].concat());
+        }
+        assert_eq!(fs::read(&whole).unwrap(), fs::read(&parts).unwrap(), "{way:?}");
+        let n = ply::read_gaussians(&whole).unwrap().len();
+        let most = way.iter().skip_while(|w| **w != "--max-gaussians").nth(1);
+        assert!(most.is_none_or(|most| n <= most.parse().unwrap()), "{way:?}: {n}");
+        let record: Value = serde_json::from_slice(&fs::read(format!("{whole}.run.json")).unwrap()).unwrap();
+        assert!(record["summary"]["psnr_heldout"].as_f64().unwrap() > 17.0, "{way:?}: {}", record["summary"]);
+        assert!(record["summary"]["ssim_heldout"].as_f64().unwrap() > 0.4, "{way:?}: {}", record["summary"]);
+    }
+}
+
+#[test]
+fn a_time_budget_is_a_plan_that_can_be_run_without_it() {
+    let dir = Folder::new();
+    let (out, again) = (dir.path("g.ply"), dir.path("h.ply"));
+    let given = ["train", "--scene", scene(), "--densify", "mcmc", "--max-gaussians", "400", "--out"];
+    let budget = ["--time-budget", "1.5s", "--iterations", "300"];
+    // A run that was stopped keeps to its plan, however fast the machine is by then.
+    succeeds(&[&given[..], &[&out], &budget, &["--stop-after", "1"]].concat());
+    let kept = fs::read(format!("{out}.plan.json")).unwrap();
+    succeeds(&[&given[..], &[&out], &budget].concat());
+    let record: Value = serde_json::from_slice(&fs::read(format!("{out}.run.json")).unwrap()).unwrap();
+    let plan = &record["summary"]["plan"];
+    assert_eq!(plan["made"], serde_json::from_slice::<Value>(&kept).unwrap());
+    assert!(plan["made"]["plan"]["iterations"].as_u64().unwrap() <= 300, "{plan}");
+    let options: Vec<&str> = plan["options"].as_str().unwrap().split(' ').collect();
+    succeeds(&[&given[..5], &["--out", &again], &options].concat());
+    assert_eq!(fs::read(&out).unwrap(), fs::read(&again).unwrap(), "{plan}");
+    assert_eq!(dir.names().len(), 6);
+    let e = refused(&["train", "--scene", scene(), "--out", &out, "--time-budget", "1s", "--init", "none.ply"]);
+    assert!(e.contains("none.ply"), "{e}");
+}
+
 #[test]
 fn a_killed_run_goes_on_to_the_same_bytes() {
     let dir = Folder::new();

@@ -1,13 +1,17 @@
 //! `gs-geom train`.
 
-use super::{SceneArgs, beside, check_writable, read_geometry};
+use super::budget::plan_path;
+use super::{Background, SceneArgs, beside, check_writable, read_geometry};
 use crate::checkpoint::{self, State};
-use crate::densify::{DensifyOptions, remove_invisible};
+use crate::content::{self, Gain};
+use crate::densify::{DensifyOptions, Strategy, remove_invisible};
 use crate::init;
+use crate::mcmc::McmcOptions;
 use crate::photographs::Photographs;
 use crate::schedule::{LearningRates, Schedule};
 use crate::train::{Timings, TrainOptions, Trainer};
 use artifacts::role;
+use clap::ValueEnum;
 use gs_io::{Error, Provenance, Result, hash_file, write_bytes};
 use gs_scene::dataset::{Dataset, Split, View};
 use gs_scene::{Camera, Gaussians, PointCloud, ply};
@@ -19,16 +23,20 @@ use std::str::FromStr;
 use std::time::{Duration, Instant};
 
 /// Arguments of `gs-geom train`.
-#[derive(Debug, clap::Args)]
+#[derive(Debug, Clone, clap::Args)]
 pub(super) struct TrainArgs {
     #[command(flatten)]
-    scene: SceneArgs,
+    pub(super) scene: SceneArgs,
     /// Where to write the Gaussians, as a 3DGS PLY; checkpoint, training curve and record of the run lie beside it
     #[arg(long, value_name = "FILE")]
-    out: PathBuf,
-    /// Steps of the optimiser, one view each
+    pub(super) out: PathBuf,
+    /// Steps of the optimiser, one view each; with --time-budget at most
     #[arg(long, value_name = "COUNT", default_value_t = 30_000)]
-    iterations: u32,
+    pub(super) iterations: u32,
+    /// Plan iterations, picture size and --max-gaussians so as to end within this time, such as 90s, 10m or 1h. The plan
+    /// depends on the machine's speed; it is said as options that give the same bytes anywhere
+    #[arg(long, value_name = "TIME", value_parser = super::budget::seconds)]
+    pub(super) time_budget: Option<f64>,
     /// Degree of the spherical harmonics, 0 to 3
     #[arg(long, value_name = "DEGREE", default_value_t = 3, value_parser = clap::value_parser!(u8).range(0..=3))]
     sh_degree: u8,
@@ -40,20 +48,23 @@ pub(super) struct TrainArgs {
     init_points: usize,
     /// Keep number, order and positions of the points: Gaussian i is point i (ScanNet protocol)
     #[arg(long)]
-    fixed_points: bool,
-    /// Most Gaussians there may be
+    pub(super) fixed_points: bool,
+    /// How the number of Gaussians grows
+    #[arg(long, value_enum, default_value_t = Strategy::default())]
+    densify: Strategy,
+    /// Most Gaussians there may be; with --densify mcmc how many there will be, if the iterations suffice
     #[arg(long, value_name = "COUNT", default_value_t = DensifyOptions::default().max_gaussians)]
-    max_gaussians: usize,
+    pub(super) max_gaussians: usize,
     /// Weight of 1 - SSIM in the loss, 0 to 1
     #[arg(long, value_name = "WEIGHT", default_value_t = 0.2)]
     dssim: f32,
-    /// Clone or split Gaussians whose projection is pulled harder than this, on average
-    #[arg(long, value_name = "GRADIENT", default_value_t = DensifyOptions::default().gradient)]
-    densify_gradient: f32,
+    /// Clone or split Gaussians whose projection is pulled harder than this, on average [0.0002; absgrad 0.0004]
+    #[arg(long, value_name = "GRADIENT")]
+    densify_gradient: Option<f32>,
     /// Densify after this iteration [a twentieth of the iterations, at most 500]
     #[arg(long, value_name = "ITERATION")]
     densify_from: Option<u32>,
-    /// Densify and reset opacities before this iteration [half the iterations; more in runs below 15,000]
+    /// Densify and reset opacities before this iteration [half the iterations; more in runs below 15,000; mcmc 5/6]
     #[arg(long, value_name = "ITERATION")]
     densify_until: Option<u32>,
     /// Iterations between densifications [a thirtieth of the iterations, 50 to 100]
@@ -71,9 +82,12 @@ pub(super) struct TrainArgs {
     /// Learning rate of the positions at the start, per unit of the scene's extent; a hundredth of it at the end
     #[arg(long, value_name = "RATE", default_value_t = LearningRates::default().position)]
     position_rate: f64,
-    /// Begin with small pictures: a quarter of the size, then half
-    #[arg(long)]
-    coarse: bool,
+    /// Picture sizes to begin with
+    #[arg(long, value_enum, default_value_t = Sizes::Coarse)]
+    schedule: Sizes,
+    /// Which Gaussians a step moves
+    #[arg(long, value_enum, default_value_t = Moves::Dense)]
+    adam: Moves,
     /// Memory for decoded photographs; the rest is decoded anew each time
     #[arg(long, value_name = "MEGABYTES", default_value_t = 2048)]
     cache: usize,
@@ -82,10 +96,30 @@ pub(super) struct TrainArgs {
     checkpoint_every: Every,
     /// Ignore a checkpoint and begin anew
     #[arg(long)]
-    no_resume: bool,
+    pub(super) no_resume: bool,
     /// Stop after this iteration with a checkpoint and <out>.partial.ply, as an interruption would
     #[arg(long, value_name = "ITERATION")]
     stop_after: Option<u32>,
+}
+
+/// Picture sizes in the course of a run.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
+enum Sizes {
+    /// From an eighth up, each for as long as the photographs' content allows (DashGaussian)
+    Content,
+    /// A quarter, from a sixth of the iterations half, from a third full
+    Coarse,
+    /// Full from the start
+    Full,
+}
+
+/// Which Gaussians a step of Adam moves.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
+enum Moves {
+    /// Those that the view draws
+    Sparse,
+    /// All
+    Dense,
 }
 
 /// How often to write a checkpoint.
@@ -108,7 +142,7 @@ impl FromStr for Every {
 }
 
 impl TrainArgs {
-    fn options(&self, seed: u64) -> Result<TrainOptions> {
+    pub(super) fn options(&self, seed: u64) -> Result<TrainOptions> {
         let positive = |field: &str, value: f64, most: f64| {
             if value > 0.0 && value <= most {
                 return Ok(());
@@ -116,7 +150,8 @@ impl TrainArgs {
             Err(Error::new("out of range").field(field).found(value).expected(format!("more than 0, at most {most}")))
         };
         positive("--iterations", f64::from(self.iterations), 1e8)?;
-        positive("--densify-gradient", f64::from(self.densify_gradient), 1e9)?;
+        let gradient = self.densify_gradient.unwrap_or(self.densify.gradient());
+        positive("--densify-gradient", f64::from(gradient), 1e9)?;
         positive("--opacity-rate", self.opacity_rate, 10.0)?;
         positive("--position-rate", self.position_rate, 10.0)?;
         positive("--max-gaussians", self.max_gaussians as f64, 1e9)?;
@@ -124,15 +159,16 @@ impl TrainArgs {
             return Err(Error::new("out of range").field("--dssim").found(self.dssim).expected("0 to 1"));
         }
         let mut schedule = Schedule::for_iterations(self.iterations);
+        if self.densify == Strategy::Mcmc {
+            // It moves Gaussians where they are of use, to which there is no harm late.
+            schedule.densify_until = self.iterations - self.iterations / 6;
+        }
         let set = |to: &mut u32, from: Option<u32>, least: u32| *to = from.map_or(*to, |v| v.max(least));
         set(&mut schedule.densify_from, self.densify_from, 0);
         set(&mut schedule.densify_until, self.densify_until, 0);
         set(&mut schedule.densify_every, self.densify_every, 1);
         set(&mut schedule.opacity_reset_every, self.opacity_reset_every, 1);
         set(&mut schedule.sh_every, self.sh_every, 1);
-        if self.coarse {
-            schedule.coarse = vec![(self.iterations / 6, 4), (self.iterations / 3, 2)];
-        }
         Ok(TrainOptions {
             seed,
             schedule,
@@ -142,13 +178,12 @@ impl TrainArgs {
                 position_end: self.position_rate / 100.0,
                 ..LearningRates::default()
             },
-            densify: DensifyOptions {
-                gradient: self.densify_gradient,
-                max_gaussians: self.max_gaussians,
-                ..DensifyOptions::default()
-            },
+            densify: DensifyOptions { gradient, max_gaussians: self.max_gaussians, ..DensifyOptions::of(self.densify) },
+            mcmc: McmcOptions::default(),
+            sparse_adam: self.adam == Moves::Sparse,
             dssim_weight: self.dssim,
             background: self.scene.background.color(),
+            random_background: self.scene.background == Background::Random,
             fixed_points: self.fixed_points,
         })
     }
@@ -156,7 +191,36 @@ impl TrainArgs {
     pub(super) fn run(&self, stage: &Stage) -> Result<()> {
         // From here on a signal ends the run with a checkpoint.
         stage.interrupted();
-        let options = self.options(stage.seed())?;
+        match self.time_budget {
+            Some(seconds) => {
+                let (planned, plan) = self.plan(seconds, stage)?;
+                planned.train(plan, stage)
+            }
+            None => self.train(Value::Null, stage),
+        }
+    }
+
+    pub(super) fn cache_bytes(&self) -> usize {
+        self.cache.saturating_mul(1 << 20)
+    }
+
+    /// Where the picture sizes come from for [`Self::coarse`].
+    pub(super) fn gains(&self, photographs: &Photographs<'_>) -> Result<Vec<Gain>> {
+        if self.schedule == Sizes::Content { content::measure(photographs) } else { Ok(Vec::new()) }
+    }
+
+    /// Picture sizes before the full one.
+    pub(super) fn coarse(&self, gains: &[Gain], iterations: u32) -> Vec<(u32, u32)> {
+        match self.schedule {
+            Sizes::Content => content::stages(gains, iterations),
+            Sizes::Coarse => vec![(iterations / 6, 4), (iterations / 3, 2)],
+            Sizes::Full => Vec::new(),
+        }
+    }
+
+    /// The run itself; `plan` is how its options came about, for the record.
+    fn train(&self, plan: Value, stage: &Stage) -> Result<()> {
+        let mut options = self.options(stage.seed())?;
         let dataset = self.scene.load(stage)?;
         let of = |split: Split| dataset.views_of(split).collect::<Vec<&View>>();
         let (train, heldout) = (of(Split::Train), of(Split::Test));
@@ -168,6 +232,8 @@ impl TrainArgs {
                 .hint("give --holdout 0, or more photographs"));
         }
         check_writable(&self.out)?;
+        let photographs = Photographs::load(train.clone(), self.cache_bytes())?;
+        options.schedule.coarse = self.coarse(&self.gains(&photographs)?, self.iterations);
 
         let mut inputs = BTreeMap::from([(role::DATASET.to_string(), dataset.hash()?)]);
         if let Some(init) = &self.init {
@@ -197,12 +263,17 @@ impl TrainArgs {
             cameras[0].height,
             state.gaussians.len()
         ));
-        let budget = self.cache.saturating_mul(1 << 20);
-        let background = options.background;
-        let load = |views, divisor| Photographs::load(views, background, budget, divisor);
-        let photographs = load(train, options.schedule.divisor(state.progress.iteration + 1))?;
-        let mut trainer = Trainer::resume(options, extent, photographs, load(heldout, 1)?, state);
-        if self.optimise(&mut trainer, &run, stage)? { self.finish(trainer, parameters, inputs, stage) } else { Ok(()) }
+        if !options.schedule.coarse.is_empty() {
+            let sizes = options.schedule.coarse.iter().map(|(last, divisor)| format!("1/{divisor} until {last}"));
+            stage.info(&format!("picture sizes: {}, then full", sizes.collect::<Vec<_>>().join(", ")));
+        }
+        let mut trainer =
+            Trainer::resume(options, extent, photographs, Photographs::load(heldout, self.cache_bytes())?, state);
+        if self.optimise(&mut trainer, &run, stage)? {
+            self.finish(trainer, parameters, inputs, plan, stage)
+        } else {
+            Ok(())
+        }
     }
 
     /// The state of an interrupted run of the same parameters and inputs.
@@ -226,9 +297,22 @@ impl TrainArgs {
     }
 
     /// The Gaussians before the first iteration.
-    fn start(&self, dataset: &Dataset, cameras: &[&Camera], extent: f64, stage: &Stage) -> Result<Gaussians> {
+    pub(super) fn start(
+        &self,
+        dataset: &Dataset,
+        cameras: &[&Camera],
+        extent: f64,
+        stage: &Stage,
+    ) -> Result<Gaussians> {
         if let Some(path) = &self.init {
-            return Ok(init::with_degree(read_geometry(path)?, self.sh_degree));
+            let g = init::with_degree(read_geometry(path)?, self.sh_degree);
+            if g.len() > self.max_gaussians && !self.fixed_points {
+                return Err(Error::new("more Gaussians than --max-gaussians")
+                    .file(path)
+                    .found(g.len())
+                    .expected(format!("at most {}", self.max_gaussians)));
+            }
+            return Ok(g);
         }
         let random: PointCloud;
         let points = if !dataset.points.is_empty() {
@@ -243,6 +327,15 @@ impl TrainArgs {
             random = init::random_points(cameras, self.init_points, stage.seed());
             &random
         };
+        if points.len() > self.max_gaussians && !self.fixed_points {
+            stage.info(&format!(
+                "starting from {} of {} points, for --max-gaussians",
+                self.max_gaussians,
+                points.len()
+            ));
+            let some = init::some_points(points, self.max_gaussians, stage.seed());
+            return init::from_points(&some, self.sh_degree, extent).map_err(|e| e.file(&self.scene.scene));
+        }
         init::from_points(points, self.sh_degree, extent).map_err(|e| e.file(&self.scene.scene))
     }
 
@@ -295,9 +388,10 @@ impl TrainArgs {
         trainer: Trainer<'_>,
         parameters: Value,
         inputs: BTreeMap<String, String>,
+        plan: Value,
         stage: &Stage,
     ) -> Result<()> {
-        let psnr = trainer.heldout_psnr()?;
+        let (psnr, ssim) = trainer.heldout()?.unzip();
         let timings = trainer.timings();
         let State { mut gaussians, progress, .. } = trainer.into_state();
         if !self.fixed_points {
@@ -312,31 +406,42 @@ impl TrainArgs {
         let curve: String = progress.curve.iter().map(|line| format!("{line}\n")).collect();
         write_bytes(beside(&self.out, ".curve.jsonl"), curve.as_bytes())?;
         ply::write_gaussians(&self.out, &gaussians, &comments(&parameters, &inputs))?;
-        let [cloned, split, removed] = progress.densified;
+        let [cloned, split, removed, relocated] = progress.densified;
         let heldout = psnr.map_or(String::new(), |p| format!(", {p:.2} dB on held-out views"));
         stage.info(&format!(
-            "{} Gaussians ({cloned} cloned, {split} split, {removed} removed){heldout}; {}",
+            "{} Gaussians ({cloned} cloned, {split} split, {removed} removed, {relocated} relocated){heldout}; {}",
             gaussians.len(),
             shares(timings)
         ));
         let summary = json!({
             "gaussians": gaussians.len(),
             "psnr_heldout": psnr,
+            "ssim_heldout": ssim,
             "iterations": progress.iteration,
             "dropped_gradients": progress.dropped,
             "seconds": seconds(timings),
+            "cpu_seconds": cpu_seconds(),
+            "plan": plan,
         });
         stage.record(&self.out, parameters, inputs, summary)?;
-        for leftover in [checkpoint::path_of(&self.out), beside(&self.out, ".partial.ply")] {
+        for leftover in [checkpoint::path_of(&self.out), beside(&self.out, ".partial.ply"), plan_path(&self.out)] {
             remove_if_there(&leftover);
         }
         Ok(())
     }
 }
 
-fn remove_if_there(path: &Path) {
+pub(super) fn remove_if_there(path: &Path) {
     // What cannot be removed does no harm.
     let _ = std::fs::remove_file(path);
+}
+
+/// Processor time of this process so far in seconds, where the system tells (Linux, with its 100 ticks a second).
+fn cpu_seconds() -> Option<f64> {
+    let stat = std::fs::read_to_string("/proc/self/stat").ok()?;
+    // After the name in parentheses, which may hold anything, user and system time are fields 12 and 13.
+    let fields: Vec<f64> = stat.rsplit(')').next()?.split_whitespace().map(|f| f.parse().unwrap_or(0.0)).collect();
+    Some((fields.get(11)? + fields.get(12)?) / 100.0)
 }
 
 fn parts(t: Timings) -> [(&'static str, Duration); 5] {
@@ -365,7 +470,7 @@ fn comments(parameters: &Value, inputs: &BTreeMap<String, String>) -> Vec<String
     };
     add("", parameters);
     add("", &parameters["options"]);
-    for group in ["schedule", "rates", "densify"] {
+    for group in ["schedule", "rates", "densify", "mcmc"] {
         add(&format!("{group}."), &parameters["options"][group]);
     }
     lines
@@ -374,6 +479,16 @@ fn comments(parameters: &Value, inputs: &BTreeMap<String, String>) -> Vec<String
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn processor_time_passes() {
+        if let Some(before) = cpu_seconds() {
+            let begun = Instant::now();
+            while cpu_seconds().is_some_and(|t| t <= before) {
+                assert!(begun.elapsed().as_secs() < 60);
+            }
+        }
+    }
 
     #[test]
     fn periods_are_read() {
