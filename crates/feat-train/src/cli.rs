@@ -257,9 +257,10 @@ impl Args {
             .iter()
             .map(|&i| [0, 1, 2].map(|ch| 0.5 + SH_C0 * gaussians.sh_of(i as usize)[ch]))
             .collect();
+        let positions: Vec<[f32; 3]> = inputs.graph.kept.iter().map(|&i| gaussians.means[i as usize]).collect();
         drop(gaussians);
-        let context = Context::new(&inputs.graph, &colors, c.neighbours, !c.no_propagation);
-        let sets = mask_sets::<f32>(&inputs.footprints, &context, &self.levels, 2);
+        let context = Context::new(&inputs.graph, &colors, &positions, c.neighbours, !c.no_propagation);
+        let sets = mask_sets::<f32>(&inputs.footprints, &context, &self.levels, 2)?;
         let units = inputs.footprints.views.len() * self.levels.len();
         if sets.len() < units {
             stage.skipped(&format!("{} of {units} views and levels: fewer than two masks", units - sets.len()));

@@ -167,7 +167,7 @@ impl<T: Real> Model<T> {
         };
         let h = gather(&|a| &context.anchors[a..=a]);
         let sums = match context.kind {
-            Neighbours::Gaussians => gather(&|a| context.neighbours_of(a)),
+            Neighbours::Gaussians | Neighbours::AnchorInputs => gather(&|a| context.neighbours_of(a)),
             Neighbours::Anchors => network::neighbour_sums(context, &h, channels),
         };
         (h, sums)

@@ -57,7 +57,7 @@ pub fn random_layers<T: Real>(
     (0..count)
         .map(|l| {
             let own = if l == 0 { input } else { hidden };
-            let neighbour = if kind == Neighbours::Gaussians { input } else { own };
+            let neighbour = if kind == Neighbours::Anchors { own } else { input };
             Layer::random(own, neighbour, if l + 1 == count { output } else { hidden }, rng)
         })
         .collect()
