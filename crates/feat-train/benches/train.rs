@@ -4,7 +4,8 @@
 mod scene;
 
 use clap::Parser;
-use feat_train::adam::Adam;
+use feat_train::adam::{Adam, Rates};
+use feat_train::fast::{Engine, Shortcuts};
 use feat_train::loss::Loss;
 use feat_train::model::{Init, Model, Settings};
 use feat_train::normalize::Axis;
@@ -84,6 +85,32 @@ fn reference(context: &Context, sets: &[MaskSet<f32>], iterations: usize) -> Val
     json!({ "seconds": each.iter().sum::<f64>(), "propagate": each[0], "step": each[1], "adam": each[2] })
 }
 
+/// Iterations of the engine, from a fresh model.
+fn fast(context: &Context, sets: &[MaskSet<f32>], layers: usize, shortcuts: Shortcuts, iterations: usize) -> Value {
+    let mut model = Model::<f32>::new(settings(layers), context, &mut ChaCha8Rng::seed_from_u64(0));
+    let mut engine = Engine::new(context, &model, shortcuts);
+    let mut adam = Adam::new(model.features.len());
+    let mut weights: Vec<Adam<f32>> = model.layers.iter().map(|l| Adam::new(l.weights.len())).collect();
+    let start = Instant::now();
+    for i in 0..iterations as u64 {
+        let set = &sets[i as usize * 7 % sets.len()];
+        engine.propagate(&model, i);
+        let evaluated = engine.evaluate(&model, set, i);
+        let rates = Rates::at(1e-3, i + 1);
+        let gradients = engine.backward(&mut model, &mut adam, set, &evaluated, i, &rates, i);
+        for ((layer, adam), gradient) in model.layers.iter_mut().zip(&mut weights).zip(&gradients) {
+            adam.update(&mut layer.weights, gradient, 1e-3, i + 1);
+        }
+    }
+    let each = |d: std::time::Duration| d.as_secs_f64() / iterations as f64;
+    let t = engine.timings;
+    json!({
+        "seconds": each(start.elapsed()),
+        "propagate": each(t.propagate), "centroids": each(t.centroids), "loss": each(t.loss),
+        "features": each(t.features), "backward": each(t.backward),
+    })
+}
+
 fn main() {
     let args = Args::parse();
     rayon::ThreadPoolBuilder::new().num_threads(args.threads).build_global().expect("the first pool");
@@ -94,7 +121,11 @@ fn main() {
     let columns: usize = sets.iter().map(|s| s.columns.len()).sum();
     eprintln!("{} Gaussians, {columns} columns, {entries} entries", context.order.len());
     let found = reference(&context, &sets, args.iterations);
+    let context = s.context(Neighbours::Gaussians, true);
+    let sets = s.views(&context);
+    let quick = fast(&context, &sets, 2, Shortcuts::default(), args.iterations);
     let report = json!({
+        "fast": quick,
         "gaussians": context.order.len(), "anchors": context.anchors.len(), "views": sets.len(),
         "reference": found, "peak_rss_bytes": stage::peak_rss_bytes(),
     });

@@ -8,6 +8,7 @@ pub mod adam;
 pub mod checkpoint;
 pub mod cli;
 pub mod evidence;
+pub mod fast;
 pub mod linalg;
 pub mod loss;
 pub mod model;

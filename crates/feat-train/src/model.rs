@@ -12,7 +12,7 @@ use rayon::prelude::*;
 /// Channels between layers (paper: "an intermediate channel size of 16").
 const HIDDEN: usize = 16;
 /// Channels of a colour.
-const COLOR: usize = 3;
+pub(crate) const COLOR: usize = 3;
 /// Anchors worked on at a time.
 const CHUNK: usize = 512;
 

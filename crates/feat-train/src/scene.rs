@@ -118,6 +118,11 @@ impl Context {
     }
 }
 
+/// Whether the neighbours of this kind are places in the training order.
+pub fn inputs_are_of_gaussians(kind: Neighbours) -> bool {
+    kind != Neighbours::Anchors
+}
+
 /// The order of points along a Morton curve over their bounding box; ties by index.
 fn along_curve(points: &[[f32; 3]]) -> Vec<u32> {
     const BITS: u32 = 21;
