@@ -120,7 +120,7 @@ fn main() {
     let entries: usize = sets.iter().map(|s| s.mask.len()).sum();
     let columns: usize = sets.iter().map(|s| s.columns.len()).sum();
     eprintln!("{} Gaussians, {columns} columns, {entries} entries", context.order.len());
-    let found = reference(&context, &sets, args.iterations);
+    let found = if std::env::var("FAST").is_ok() { json!(0) } else { reference(&context, &sets, args.iterations) };
     let context = s.context(Neighbours::Gaussians, true);
     let sets = s.views(&context);
     let quick = fast(&context, &sets, 2, Shortcuts::default(), args.iterations);

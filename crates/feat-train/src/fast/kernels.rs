@@ -2,23 +2,25 @@
 //! processor gives the same bits.
 //!
 //! `D` is the number of channels of a feature where it is known at compile time, or 0: the same loop, its length read
-//! from the argument `d`. `O` is a row's width, a multiple of [`LANES`].
+//! from the argument `d`. The network works on blocks of anchors, a [`Lanes`] per channel.
 
 use crate::adam::Rates;
 use multiversion::multiversion;
 
-/// Rows that are computed with are padded to multiples of this.
-pub const LANES: usize = 8;
-/// Anchors that share a pass over the weights.
-const BLOCK: usize = 4;
+/// Anchors of a block.
+pub const BLOCK: usize = 256;
+/// One channel of a block of anchors.
+pub type Lanes = [f32; BLOCK];
+/// Partial sums of a scalar product.
+const PARTIAL: usize = 16;
 /// Rows whose sums are kept apart: together they fill vectors whatever the number of channels.
 const APART: usize = 16;
 /// Sums go from f32 to f64 after so many terms.
 const TERMS: usize = 32;
 
-/// Calls a kernel with the number of channels as a constant where there is a version for it, else what is said.
+/// Calls a kernel with the number of channels as a constant where there is a version for it.
 macro_rules! for_width {
-    ($d:expr, $kernel:ident ( $($argument:expr),* $(,)? ), else $other:expr) => {
+    ($d:expr, $kernel:ident ( $($argument:expr),* $(,)? )) => {
         match $d {
             2 => $kernel::<2>($($argument),*),
             3 => $kernel::<3>($($argument),*),
@@ -35,31 +37,11 @@ macro_rules! for_width {
             14 => $kernel::<14>($($argument),*),
             15 => $kernel::<15>($($argument),*),
             16 => $kernel::<16>($($argument),*),
-            _ => $other,
+            _ => $kernel::<0>($($argument),*),
         }
-    };
-    ($d:expr, $kernel:ident ( $($argument:expr),* $(,)? )) => {
-        for_width!($d, $kernel($($argument),*), else $kernel::<0>($($argument),*))
     };
 }
 pub(super) use for_width;
-
-/// Calls a kernel with a row's width as a constant; widths are at most 64.
-macro_rules! for_pitch {
-    ($o:expr, $kernel:ident ( $($argument:expr),* $(,)? )) => {
-        match $o {
-            8 => $kernel::<8>($($argument),*),
-            16 => $kernel::<16>($($argument),*),
-            24 => $kernel::<24>($($argument),*),
-            32 => $kernel::<32>($($argument),*),
-            40 => $kernel::<40>($($argument),*),
-            48 => $kernel::<48>($($argument),*),
-            56 => $kernel::<56>($($argument),*),
-            _ => $kernel::<64>($($argument),*),
-        }
-    };
-}
-pub(super) use for_pitch;
 
 /// Whether an entry belongs to the half of its mask that is the positive.
 pub type Half<'a> = &'a (dyn Fn(usize) -> bool + Sync);
@@ -74,24 +56,25 @@ fn row<T>(values: &[T], i: usize, width: usize) -> &[T] {
     &values[i * width..(i + 1) * width]
 }
 
-/// Adds (f - mean) of the features at `places` to the first channels of `out`, then scales them.
+/// Sum of (f - mean) over the features at `places`, scaled, into lane `a` of the first `d` channels.
 #[inline(always)]
-fn add_standardised(features: &[f32], places: &[u32], mean: &[f32], inverse: &[f32], d: usize, out: &mut [f32]) {
-    let out = &mut out[..d];
+fn standardised(features: &[f32], places: &[u32], mean: &[f32], inverse: &[f32], d: usize, a: usize, to: &mut [Lanes]) {
+    let mut sum = [0.0f32; 64];
+    let sum = &mut sum[..d];
     let (mean, inverse) = (&mean[..d], &inverse[..d]);
     for &place in places {
         let f = row(features, place as usize, d);
         for c in 0..d {
-            out[c] += f[c] - mean[c];
+            sum[c] += f[c] - mean[c];
         }
     }
     for c in 0..d {
-        out[c] *= inverse[c];
+        to[c][a] = sum[c] * inverse[c];
     }
 }
 
-/// Standardised inputs of some anchors: rows of `h` and `sums`, `pitch` wide, whose first `d` channels are zero and
-/// the others, of colour, done.
+/// Standardised features of a block's anchors, at the places `own`, into the first `d` channels of `h`, and their sums
+/// over neighbours into those of `sums`, unless that is empty.
 #[multiversion(targets("x86_64+avx512f+avx512vl", "x86_64+avx2"))]
 pub fn inputs<const D: usize>(
     d: usize,
@@ -101,97 +84,110 @@ pub fn inputs<const D: usize>(
     start: &[u32],
     mean: &[f32],
     inverse: &[f32],
-    pitch: usize,
-    h: &mut [f32],
-    sums: &mut [f32],
+    h: &mut [Lanes],
+    sums: &mut [Lanes],
 ) {
     let d = width::<D>(d);
-    for (a, h) in h.chunks_exact_mut(pitch).enumerate() {
-        h[..d].fill(0.0);
-        add_standardised(features, &own[a..=a], mean, inverse, d, h);
-    }
-    for (sum, bounds) in sums.chunks_exact_mut(pitch).zip(start.windows(2)) {
-        sum[..d].fill(0.0);
-        let places = &neighbours[bounds[0] as usize..bounds[1] as usize];
-        add_standardised(features, places, mean, inverse, d, sum);
+    for a in 0..own.len() {
+        standardised(features, &own[a..=a], mean, inverse, d, a, h);
+        if !sums.is_empty() {
+            let places = &neighbours[start[a] as usize..start[a + 1] as usize];
+            standardised(features, places, mean, inverse, d, a, sums);
+        }
     }
 }
 
-/// Sums of rows `O` wide over lists of them: `start[i]..start[i + 1]` of `list` for the i-th row of `sums`.
+/// Sums of rows over lists of them, one for each anchor of a block: `start[a]..start[a + 1]` of `list`.
 #[multiversion(targets("x86_64+avx512f+avx512vl", "x86_64+avx2"))]
-pub fn sum_rows<const O: usize>(rows: &[f32], list: &[u32], start: &[u32], sums: &mut [f32]) {
-    for (sum, bounds) in sums.as_chunks_mut::<O>().0.iter_mut().zip(start.windows(2)) {
-        let mut total = [0.0f32; O];
+pub fn sum_rows(rows: &[f32], list: &[u32], start: &[u32], sums: &mut [Lanes]) {
+    let width = sums.len();
+    let mut total = vec![0.0f32; width];
+    for (a, bounds) in start.windows(2).enumerate() {
+        total.fill(0.0);
         for &n in &list[bounds[0] as usize..bounds[1] as usize] {
-            let x = row(rows, n as usize, O);
-            for c in 0..O {
-                total[c] += x[c];
+            for (t, x) in total.iter_mut().zip(row(rows, n as usize, width)) {
+                *t += x;
             }
         }
-        *sum = total;
+        for (sum, t) in sums.iter_mut().zip(&total) {
+            sum[a] = *t;
+        }
     }
 }
 
-/// `y = bias + x W1 + s W2` for some anchors, with rows of `y`, of both matrices and of the bias `O` wide. `x` and `s`
-/// have rows of their own pitch; as many channels of them are used as their matrix has rows.
+/// y += x W for a block, with W `[channels of x][channels of y]`.
 #[multiversion(targets("x86_64+avx512f+avx512vl", "x86_64+avx2"))]
-pub fn dense<const O: usize>(
-    (x, x_pitch, w1): (&[f32], usize, &[f32]),
-    (s, s_pitch, w2): (&[f32], usize, &[f32]),
-    bias: &[f32],
-    relu: bool,
-    y: &mut [f32],
-) {
-    let bias: [f32; O] = std::array::from_fn(|o| bias[o]);
-    let (w1, w2) = (w1.as_chunks::<O>().0, w2.as_chunks::<O>().0);
-    for (block, y) in y.chunks_mut(BLOCK * O).enumerate() {
-        let first = block * BLOCK;
-        let mut sums = [bias; BLOCK];
-        // The last block repeats its last anchor.
-        let last = y.len() / O - 1;
-        let anchors: [usize; BLOCK] = std::array::from_fn(|j| first + j.min(last));
-        for (from, pitch, w) in [(x, x_pitch, w1), (s, s_pitch, w2)] {
-            let rows = anchors.map(|a| if w.is_empty() { from } else { &from[a * pitch..a * pitch + w.len()] });
-            for (i, w) in w.iter().enumerate() {
-                for j in 0..BLOCK {
-                    let v = rows[j][i];
-                    for o in 0..O {
-                        sums[j][o] += v * w[o];
-                    }
+pub fn dense(x: &[Lanes], w: &[f32], y: &mut [Lanes]) {
+    let width = y.len();
+    let (fours, rest) = x.as_chunks::<4>();
+    for (o, y) in y.iter_mut().enumerate() {
+        for (i, [x0, x1, x2, x3]) in fours.iter().enumerate() {
+            let [w0, w1, w2, w3]: [f32; 4] = std::array::from_fn(|j| w[(4 * i + j) * width + o]);
+            for a in 0..BLOCK {
+                y[a] += (w0 * x0[a] + w1 * x1[a]) + (w2 * x2[a] + w3 * x3[a]);
+            }
+        }
+        for (i, x) in rest.iter().enumerate() {
+            let w = w[(4 * fours.len() + i) * width + o];
+            for a in 0..BLOCK {
+                y[a] += w * x[a];
+            }
+        }
+    }
+}
+
+/// Negative values become zero.
+#[multiversion(targets("x86_64+avx512f+avx512vl", "x86_64+avx2"))]
+pub fn relu(y: &mut [Lanes]) {
+    for v in y.as_flattened_mut() {
+        *v = if *v > 0.0 { *v } else { 0.0 };
+    }
+}
+
+/// What did not pass [`relu`] takes no gradient.
+#[multiversion(targets("x86_64+avx512f+avx512vl", "x86_64+avx2"))]
+pub fn relu_backward(y: &[Lanes], g: &mut [Lanes]) {
+    for (g, &y) in g.as_flattened_mut().iter_mut().zip(y.as_flattened()) {
+        *g = if y > 0.0 { *g } else { 0.0 };
+    }
+}
+
+/// total `[channels of x][channels of g]` += xᵀ g over a block.
+#[multiversion(targets("x86_64+avx512f+avx512vl", "x86_64+avx2"))]
+pub fn outer(x: &[Lanes], g: &[Lanes], total: &mut [f32]) {
+    for (x, total) in x.iter().zip(total.chunks_exact_mut(g.len())) {
+        for (g, total) in g.iter().zip(total) {
+            let mut sums = [0.0f32; PARTIAL];
+            for (x, g) in x.as_chunks::<PARTIAL>().0.iter().zip(g.as_chunks::<PARTIAL>().0) {
+                for j in 0..PARTIAL {
+                    sums[j] += x[j] * g[j];
                 }
             }
-        }
-        for (y, sum) in y.as_chunks_mut::<O>().0.iter_mut().zip(&sums) {
-            for o in 0..O {
-                y[o] = if relu && sum[o] < 0.0 { 0.0 } else { sum[o] };
-            }
+            *total += added(&sums);
         }
     }
 }
 
-/// Adds xᵀ g over some anchors to `total` `[channels][O]`.
+/// total `[channels]` += the sum of g over a block.
 #[multiversion(targets("x86_64+avx512f+avx512vl", "x86_64+avx2"))]
-pub fn outer<const O: usize>(x: &[f32], pitch: usize, channels: usize, g: &[f32], total: &mut [f32]) {
-    let g = g.as_chunks::<O>().0;
-    let total = &mut total.as_chunks_mut::<O>().0[..channels];
-    let (blocks, rest) = g.as_chunks::<BLOCK>();
-    for (b, g) in blocks.iter().enumerate() {
-        let rows: [&[f32]; BLOCK] =
-            std::array::from_fn(|j| &x[(b * BLOCK + j) * pitch..(b * BLOCK + j) * pitch + channels]);
-        for (i, total) in total.iter_mut().enumerate() {
-            for o in 0..O {
-                let pair = rows[0][i] * g[0][o] + rows[1][i] * g[1][o];
-                total[o] += pair + (rows[2][i] * g[2][o] + rows[3][i] * g[3][o]);
+pub fn sum_lanes(g: &[Lanes], total: &mut [f32]) {
+    for (g, total) in g.iter().zip(total) {
+        let mut sums = [0.0f32; PARTIAL];
+        for g in g.as_chunks::<PARTIAL>().0 {
+            for j in 0..PARTIAL {
+                sums[j] += g[j];
             }
         }
+        *total += added(&sums);
     }
-    for (g, x) in rest.iter().zip(x[blocks.len() * BLOCK * pitch..].chunks(pitch)) {
-        for (i, total) in total.iter_mut().enumerate() {
-            for o in 0..O {
-                total[o] += x[i] * g[o];
-            }
-        }
-    }
+}
+
+/// The sum, halves first.
+#[inline(always)]
+fn added(sums: &[f32; PARTIAL]) -> f32 {
+    let eight: [f32; 8] = std::array::from_fn(|j| sums[j] + sums[j + 8]);
+    let four: [f32; 4] = std::array::from_fn(|j| eight[j] + eight[j + 4]);
+    (four[0] + four[2]) + (four[1] + four[3])
 }
 
 /// What the columns of a view are read from and what a piece of them is.
@@ -360,37 +356,26 @@ pub fn adam_rows<const D: usize>(
 
 /// Per channel, the sums of (x - pivot) and of its square over rows, the pivot being the first row.
 #[multiversion(targets("x86_64+avx512f+avx512vl", "x86_64+avx2"))]
-pub fn channel_sums<const D: usize>(rows: &[f32], s1: &mut [f64], s2: &mut [f64]) {
-    let rows = rows.as_chunks::<D>().0;
-    let Some(&pivot) = rows.first() else { return };
-    for some in rows.chunks(APART * TERMS) {
-        let (mut a1, mut a2) = ([[0.0f32; D]; APART], [[0.0f32; D]; APART]);
-        let (blocks, rest) = some.as_chunks::<APART>();
-        for block in blocks.iter().map(<[[f32; D]; APART]>::as_slice).chain([rest]) {
-            for ((row, a1), a2) in block.iter().zip(&mut a1).zip(&mut a2) {
-                for c in 0..D {
-                    let x = row[c] - pivot[c];
-                    a1[c] += x;
-                    a2[c] += x * x;
-                }
+pub fn channel_sums(d: usize, rows: &[f32], s1: &mut [f64], s2: &mut [f64]) {
+    // Some rows side by side are a row of independent sums: a loop without a thought for channels.
+    let width = APART * d;
+    let pivots: Vec<f32> = rows.iter().take(d).copied().cycle().take(width).collect();
+    let (mut a1, mut a2) = (vec![0.0f32; width], vec![0.0f32; width]);
+    for some in rows.chunks(width * TERMS) {
+        a1.fill(0.0);
+        a2.fill(0.0);
+        for block in some.chunks(width) {
+            for (((x, p), a1), a2) in block.iter().zip(&pivots).zip(&mut a1).zip(&mut a2) {
+                let x = x - p;
+                *a1 += x;
+                *a2 += x * x;
             }
         }
-        for (a1, a2) in a1.iter().zip(&a2) {
-            for c in 0..D {
+        for (a1, a2) in a1.chunks_exact(d).zip(a2.chunks_exact(d)) {
+            for c in 0..d {
                 s1[c] += f64::from(a1[c]);
                 s2[c] += f64::from(a2[c]);
             }
-        }
-    }
-}
-
-/// [`channel_sums`] of rows of any width.
-pub fn channel_sums_of_wide(d: usize, rows: &[f32], s1: &mut [f64], s2: &mut [f64]) {
-    for row in rows.chunks_exact(d) {
-        for c in 0..d {
-            let x = f64::from(row[c] - rows[c]);
-            s1[c] += x;
-            s2[c] += x * x;
         }
     }
 }

@@ -13,19 +13,15 @@ mod tests;
 use crate::adam::{Adam, Rates};
 use crate::loss::{self, Evaluated, Loss, directions};
 use crate::model::{COLOR, Model, Settings, splitmix};
-use crate::network::Layer;
 use crate::normalize::{Axis, Moments, channel_moments};
 use crate::scene::{Context, MaskSet, NONE, Neighbours, inputs_are_of_gaussians};
-use kernels::{
-    Half, LANES, Piece, adam_rows, centroids, channel_sums, channel_sums_of_wide, columns_backward, dense, for_pitch,
-    for_width, inputs, outer, sum_rows,
-};
+use kernels::{BLOCK, Half, Lanes, Piece, adam_rows, centroids, columns_backward, for_width, inputs};
 use rayon::prelude::*;
 use std::ops::Range;
 use std::time::{Duration, Instant};
 
-/// Anchors worked on at a time.
-const ANCHORS: usize = 512;
+/// Rows of anchors are padded to multiples of this.
+const PAD: usize = 8;
 /// Gaussians worked on at a time, about.
 const GAUSSIANS: usize = 4096;
 
@@ -81,8 +77,7 @@ impl Sums {
             sums.clear();
             sums.resize(d, 0.0);
         }
-        let (s1, s2) = (&mut self.first[..], &mut self.second[..]);
-        for_width!(d, channel_sums(rows, s1, s2), else channel_sums_of_wide(d, rows, s1, s2));
+        kernels::channel_sums(d, rows, &mut self.first, &mut self.second);
         self.count = (rows.len() / d) as f64;
         self.pivot.clear();
         self.pivot.extend(rows.iter().take(d).map(|&v| f64::from(v)));
@@ -93,44 +88,10 @@ impl Sums {
     }
 }
 
-/// A layer with rows padded to multiples of [`LANES`].
-#[derive(Debug, Default)]
-struct Padded {
-    w1: Vec<f32>,
-    w2: Vec<f32>,
-    bias: Vec<f32>,
-    /// Transposed, for gradients of the layer's input.
-    w1_back: Vec<f32>,
-    w2_back: Vec<f32>,
-}
-
-fn padded(width: usize) -> usize {
-    width.next_multiple_of(LANES)
-}
-
-impl Padded {
-    fn new(layer: &Layer<f32>) -> Self {
-        let (w1, w2, bias) = layer.split();
-        let pad = |w: &[f32], rows: usize| -> Vec<f32> {
-            let (from, to) = (w.len() / rows.max(1), padded(w.len() / rows.max(1)));
-            let mut out = vec![0.0; rows * to];
-            for (out, w) in out.chunks_exact_mut(to).zip(w.chunks_exact(from)) {
-                out[..from].copy_from_slice(w);
-            }
-            out
-        };
-        let transpose = |w: &[f32], rows: usize| -> Vec<f32> {
-            let columns = w.len() / rows;
-            (0..w.len()).map(|i| w[i % rows * columns + i / rows]).collect()
-        };
-        Self {
-            w1: pad(w1, layer.input),
-            w2: pad(w2, layer.neighbour),
-            bias: pad(bias, 1),
-            w1_back: pad(&transpose(w1, layer.input), layer.output),
-            w2_back: pad(&transpose(w2, layer.neighbour), layer.output),
-        }
-    }
+/// `[rows][columns]` to `[columns][rows]`.
+fn transposed(w: &[f32], rows: usize) -> Vec<f32> {
+    let columns = w.len() / rows;
+    (0..w.len()).map(|i| w[i % rows * columns + i / rows]).collect()
 }
 
 /// Everything an iteration needs beside the parameters, allocated once.
@@ -145,21 +106,20 @@ pub struct Engine<'a> {
     chunks: Vec<Chunk>,
     sums: Vec<Sums>,
     moments: Vec<Moments>,
-    /// Inputs of the anchors `[M][d + 3]`; the colours never change.
-    own: Vec<f32>,
-    /// Their sums over neighbours.
-    around: Vec<f32>,
-    layers: Vec<Padded>,
-    /// Outputs of the layers, padded.
-    outputs: Vec<Vec<f32>>,
-    /// With anchors as neighbours, the sums of the neighbours' features from layer 1 on, padded.
-    later: Vec<Vec<f32>>,
+    /// Input of each layer, block by block; the colours of the first never change.
+    inputs: Vec<Vec<Lanes>>,
+    /// Its sums over neighbours; with Gaussians as neighbours those of the first layer serve all.
+    around: Vec<Vec<Lanes>>,
+    /// Output of the last layer.
+    output: Vec<Lanes>,
+    /// With anchors as neighbours, rows of what is summed over lists of anchors.
+    rows: Vec<f32>,
     /// Standardised output, padded.
     hat: Vec<f32>,
     hat_moments: Vec<Moments>,
     hat_gradient: Vec<f32>,
-    /// Gradients of two layers' outputs, padded.
-    gradients: [Vec<f32>; 2],
+    /// Gradients of the outputs of two layers, and sums of one over anchors that have it as a neighbour.
+    gradients: [Vec<Lanes>; 3],
     /// Where the time went.
     pub timings: Timings,
 }
@@ -189,15 +149,18 @@ impl<'a> Engine<'a> {
     pub fn new(context: &'a Context, model: &Model<f32>, shortcuts: Shortcuts) -> Self {
         assert!(Self::serves(&model.settings), "settings of the readable model only");
         let d = model.settings.dim;
-        let (pitch, m) = (padded(d), if model.layers.is_empty() { 0 } else { context.anchors.len() });
+        let m = if model.layers.is_empty() { 0 } else { context.anchors.len() };
+        let (pitch, blocks) = (d.next_multiple_of(PAD), m.div_ceil(BLOCK));
+        let lanes = |channels: usize| vec![[0.0f32; BLOCK]; blocks * channels];
+        let anchors = context.kind == Neighbours::Anchors;
+        let mut layer_inputs: Vec<_> = model.layers.iter().map(|l| lanes(l.input)).collect();
+        let summed = if anchors { &model.layers[..] } else { &model.layers[..model.layers.len().min(1)] };
+        let mut around: Vec<_> = summed.iter().map(|l| lanes(l.neighbour)).collect();
+        if m > 0 {
+            color_inputs(context, d, &mut layer_inputs[0], &mut around[0]);
+        }
+        let widest = model.layers.iter().map(|l| l.input.max(l.output)).max().unwrap_or(0);
         let chunks = chunks(context);
-        let (own, around) = if m == 0 { Default::default() } else { color_inputs(context, d) };
-        let outputs: Vec<Vec<f32>> = model.layers.iter().map(|l| vec![0.0; m * padded(l.output)]).collect();
-        let later = match context.kind {
-            Neighbours::Anchors => outputs[..outputs.len().max(1) - 1].to_vec(),
-            _ => Vec::new(),
-        };
-        let widest = outputs.iter().map(Vec::len).max().unwrap_or(0);
         let mut engine = Self {
             context,
             settings: model.settings.clone(),
@@ -207,15 +170,14 @@ impl<'a> Engine<'a> {
             sums: vec![Sums::default(); chunks.len()],
             chunks,
             moments: Vec::new(),
-            own,
+            inputs: layer_inputs,
             around,
-            layers: Vec::new(),
-            outputs,
-            later,
+            output: if m > 0 { lanes(d) } else { Vec::new() },
+            rows: vec![0.0; if anchors { m * widest } else { 0 }],
             hat: vec![0.0; m * pitch],
             hat_moments: Vec::new(),
             hat_gradient: vec![0.0; m * pitch],
-            gradients: [vec![0.0; widest], vec![0.0; widest]],
+            gradients: [lanes(widest), lanes(widest), if anchors { lanes(widest) } else { Vec::new() }],
             timings: Timings::default(),
         };
         engine.sum_features(model);
@@ -224,9 +186,10 @@ impl<'a> Engine<'a> {
 
     /// Bytes of the graph network's activations and gradients.
     pub fn network_bytes(&self) -> usize {
-        let vectors = self.outputs.iter().chain(&self.later).chain(&self.gradients);
-        let rows = vectors.chain([&self.own, &self.around, &self.hat, &self.hat_gradient]);
-        rows.map(|v| v.len() * size_of::<f32>()).sum()
+        let blocks = self.inputs.iter().chain(&self.around).chain(&self.gradients).chain([&self.output]);
+        let rows = [&self.hat, &self.hat_gradient, &self.rows];
+        blocks.map(|v| v.len() * size_of::<Lanes>()).sum::<usize>()
+            + rows.map(|v| v.len() * size_of::<f32>()).iter().sum::<usize>()
     }
 
     /// The statistics in use, for a checkpoint: with `stats_every` they are older than the features.
@@ -270,88 +233,62 @@ impl<'a> Engine<'a> {
         if due {
             self.moments = (0..d).map(|c| Moments::from_parts(self.sums.iter().map(|s| s.part(c)))).collect();
         }
-        self.layers = model.layers.iter().map(Padded::new).collect();
         self.take_inputs(model);
         for l in 0..model.layers.len() {
             self.run_layer(model, l);
         }
-        let last = self.outputs.last().expect("there are layers");
         if due || self.hat_moments.is_empty() {
-            self.hat_moments = output_moments(last, pitch, d, &context.served);
+            self.hat_moments = output_moments(&self.output, d, &context.served);
         }
         let (mean, inverse) = floats(&self.hat_moments);
-        self.hat.par_chunks_mut(ANCHORS * pitch).zip(last.par_chunks(ANCHORS * pitch)).for_each(|(hat, y)| {
-            for (hat, y) in hat.chunks_exact_mut(pitch).zip(y.chunks_exact(pitch)) {
+        self.hat.par_chunks_mut(BLOCK * pitch).zip(self.output.par_chunks(d)).for_each(|(hat, y)| {
+            for (a, hat) in hat.chunks_exact_mut(pitch).enumerate() {
                 for c in 0..d {
-                    hat[c] = (y[c] - mean[c]) * inverse[c];
+                    hat[c] = (y[c][a] - mean[c]) * inverse[c];
                 }
             }
         });
         self.timings.propagate += start.elapsed();
     }
 
-    /// Standardised features of the anchors and their sums over neighbours.
+    /// Standardised features of the anchors, and, with Gaussians as neighbours, their sums.
     fn take_inputs(&mut self, model: &Model<f32>) {
         let (d, channels, context) = (self.d, self.d + COLOR, self.context);
         let (mean, inverse) = floats(&self.moments);
         let of_gaussians = inputs_are_of_gaussians(context.kind);
-        let rows = self.own.par_chunks_mut(ANCHORS * channels).zip(self.around.par_chunks_mut(ANCHORS * channels));
-        rows.enumerate().for_each(|(chunk, (own, around))| {
-            let first = chunk * ANCHORS;
-            let count = own.len() / channels;
-            let anchors = &context.anchors[first..first + count];
-            // Neighbouring anchors' inputs are those of their Gaussians.
+        let blocks = self.inputs[0].par_chunks_mut(channels).zip(self.around[0].par_chunks_mut(channels));
+        blocks.enumerate().for_each(|(block, (own, around))| {
+            let anchors = block * BLOCK..((block + 1) * BLOCK).min(context.anchors.len());
+            let start = &context.neighbour_start[anchors.start..=anchors.end];
             let around = if of_gaussians { around } else { &mut [] };
-            let start = &context.neighbour_start[first..=first + count];
             let (features, list) = (&model.features[..], &context.neighbours[..]);
-            for_width!(d, inputs(d, features, anchors, list, start, &mean, &inverse, channels, own, around));
+            let places = &context.anchors[anchors];
+            for_width!(d, inputs(d, features, places, list, start, &mean, &inverse, own, around));
         });
-        if !of_gaussians {
-            let own = &self.own;
-            self.around.par_chunks_mut(ANCHORS * channels).enumerate().for_each(|(chunk, rows)| {
-                for (i, row) in rows.chunks_exact_mut(channels).enumerate() {
-                    let mut sum = [0.0f32; 64];
-                    let sum = &mut sum[..d];
-                    for &n in context.neighbours_of(chunk * ANCHORS + i) {
-                        let x = &own[n as usize * channels..n as usize * channels + d];
-                        sum.iter_mut().zip(x).for_each(|(s, x)| *s += x);
-                    }
-                    row[..d].copy_from_slice(sum);
-                }
-            });
-        }
     }
 
-    /// Inputs of layer `l` and their pitch: of the anchors, and of their neighbours summed.
-    fn inputs_of(&self, l: usize) -> [(&[f32], usize); 2] {
-        let channels = self.d + COLOR;
-        let pitch = |rows: &[f32]| rows.len() / self.context.anchors.len().max(1);
-        let own = if l == 0 { (&self.own[..], channels) } else { (&self.outputs[l - 1][..], pitch(&self.outputs[l - 1])) };
-        let around = match self.context.kind {
-            Neighbours::Anchors if l > 0 => (&self.later[l - 1][..], pitch(&self.later[l - 1])),
-            _ => (&self.around[..], channels),
-        };
-        [own, around]
+    /// The sums over neighbours that layer `l` reads.
+    fn around(&self, l: usize) -> &[Lanes] {
+        &self.around[l.min(self.around.len() - 1)]
     }
 
     fn run_layer(&mut self, model: &Model<f32>, l: usize) {
-        let context = self.context;
-        if l > 0 && context.kind == Neighbours::Anchors {
-            let rows = &self.outputs[l - 1];
-            let o = padded(model.layers[l].input);
-            self.later[l - 1].resize(context.anchors.len() * o, 0.0);
-            sum_lists(rows, o, &context.neighbours, &context.neighbour_start, &mut self.later[l - 1]);
+        let (context, layer) = (self.context, &model.layers[l]);
+        if context.kind == Neighbours::Anchors {
+            let (list, start) = (&context.neighbours, &context.neighbour_start);
+            sum_over_lists(&self.inputs[l], layer.input, &mut self.rows, list, start, &mut self.around[l]);
         }
-        let mut output = std::mem::take(&mut self.outputs[l]);
-        let o = padded(model.layers[l].output);
-        let [(x, xp), (s, sp)] = self.inputs_of(l);
-        let w = &self.layers[l];
-        output.par_chunks_mut(ANCHORS * o).enumerate().for_each(|(chunk, y)| {
-            let from = chunk * ANCHORS;
-            let (x, s) = ((&x[from * xp..], xp, &w.w1[..]), (&s[from * sp..], sp, &w.w2[..]));
-            for_pitch!(o, dense(x, s, &w.bias, true, y));
+        let mut output =
+            std::mem::take(if l + 1 < model.layers.len() { &mut self.inputs[l + 1] } else { &mut self.output });
+        let (w1, w2, bias) = layer.split();
+        let inputs = self.inputs[l].par_chunks(layer.input).zip(self.around(l).par_chunks(layer.neighbour));
+        output.par_chunks_mut(layer.output).zip(inputs).for_each(|(y, (x, s))| {
+            y.iter_mut().zip(bias).for_each(|(y, &b)| y.fill(b));
+            kernels::dense(x, w1, y);
+            kernels::dense(s, w2, y);
+            kernels::relu(y);
         });
-        self.outputs[l] = output;
+        *(if l + 1 < model.layers.len() { &mut self.inputs[l + 1] } else { &mut self.output }) = output;
     }
 
     /// Centroids of the masks `[K][d]`, and of their halves where asked for.
@@ -458,7 +395,10 @@ impl<'a> Engine<'a> {
             .into_iter()
             .zip(split(&mut adam.mean, places()))
             .zip(split(&mut adam.square, places()))
-            .zip(split(&mut hat_gradient, self.chunks.iter().map(|c| if with_network { c.anchors.end * pitch } else { 0 })))
+            .zip(split(
+                &mut hat_gradient,
+                self.chunks.iter().map(|c| if with_network { c.anchors.end * pitch } else { 0 }),
+            ))
             .zip(&mut sums)
             .zip(&self.chunks)
             .collect();
@@ -516,92 +456,93 @@ impl<'a> Engine<'a> {
     }
 
     fn network_gradients(&mut self, model: &Model<f32>, totals: &[[f64; 2]]) -> Vec<Vec<f32>> {
-        let (d, pitch, context) = (self.d, self.pitch, self.context);
-        let m = context.anchors.len();
-        // Gradient of the last output, from that of its standardised values: see Moments::backward.
-        let mut scale = [[0.0f32; 3]; 64];
-        for (c, (scale, moments)) in scale.iter_mut().zip(&self.hat_moments).enumerate() {
-            if moments.inverse != 0.0 {
-                let [g, gy] = totals[c];
-                let mean = moments.inverse * g / moments.count;
-                let slope = gy / ((moments.count - 1.0) * moments.deviation);
-                *scale = [moments.inverse as f32, mean as f32, slope as f32];
-            }
-        }
+        let context = self.context;
         let mut out = vec![Vec::new(); model.layers.len()];
-        let [mut gradient, mut above] = std::mem::take(&mut self.gradients);
+        let [mut gradient, mut above, mut around] = std::mem::take(&mut self.gradients);
+        let blocks = self.output.len() / self.d;
+        self.output_gradient(totals, &mut gradient);
         for (l, layer) in model.layers.iter().enumerate().rev() {
-            let o = padded(layer.output);
-            let last = l + 1 == model.layers.len();
-            let around = if !last && context.kind == Neighbours::Anchors {
-                let above_width = padded(model.layers[l + 1].output);
-                let mut sums = std::mem::take(&mut self.later[l]);
-                sums.resize(m * above_width, 0.0);
-                sum_lists(&above[..m * above_width], above_width, &context.reverse, &context.reverse_start, &mut sums);
-                sums
-            } else {
-                Vec::new()
-            };
-            let output = &self.outputs[l];
-            let [(x, xp), (s, sp)] = self.inputs_of(l);
-            let parts: Vec<Vec<f32>> = gradient[..m * o]
-                .par_chunks_mut(ANCHORS * o)
-                .zip(output.par_chunks(ANCHORS * o))
-                .enumerate()
-                .map(|(chunk, (g, y))| {
-                    let first = chunk * ANCHORS;
-                    let count = y.len() / o;
-                    if last {
-                        let hat = &self.hat[first * pitch..];
-                        let hat_gradient = &self.hat_gradient[first * pitch..];
-                        for a in 0..count {
-                            let served = context.served[first + a] as f32;
-                            for c in 0..d {
-                                let [inverse, mean, slope] = scale[c];
-                                let (i, y) = (a * pitch + c, hat[a * pitch + c]);
-                                g[i] = inverse * hat_gradient[i] - served * (mean + slope * y);
-                            }
-                            g[a * pitch + d..(a + 1) * pitch].fill(0.0);
-                        }
-                    } else {
-                        let up = padded(model.layers[l + 1].output);
-                        let w = &self.layers[l + 1];
-                        let direct = (&above[first * up..], up, &w.w1_back[..]);
-                        let sums = if around.is_empty() {
-                            (&around[..], 0, &[][..])
-                        } else {
-                            (&around[first * up..], up, &w.w2_back[..])
-                        };
-                        let zero = [0.0f32; 64];
-                        for_pitch!(o, dense(direct, sums, &zero, false, g));
+            if let Some(next) = model.layers.get(l + 1) {
+                let (w1, w2, _) = next.split();
+                let (w1, w2) = (transposed(w1, next.input), transposed(w2, next.neighbour));
+                let above = &above[..blocks * next.output];
+                let around = if context.kind == Neighbours::Anchors {
+                    let around = &mut around[..blocks * next.output];
+                    sum_over_lists(
+                        above,
+                        next.output,
+                        &mut self.rows,
+                        &context.reverse,
+                        &context.reverse_start,
+                        around,
+                    );
+                    around
+                } else {
+                    &mut []
+                };
+                let to = gradient[..blocks * layer.output].par_chunks_mut(layer.output);
+                to.zip(above.par_chunks(next.output)).enumerate().for_each(|(block, (to, g))| {
+                    to.as_flattened_mut().fill(0.0);
+                    kernels::dense(g, &w1, to);
+                    if !around.is_empty() {
+                        kernels::dense(&around[block * next.output..(block + 1) * next.output], &w2, to);
                     }
-                    // ReLU: what did not pass takes no gradient.
-                    for (g, &y) in g.iter_mut().zip(y) {
-                        *g = if y > 0.0 { *g } else { 0.0 };
-                    }
-                    let mut sums = vec![0.0f32; (layer.input + layer.neighbour + 1) * o];
-                    let (w1, rest) = sums.split_at_mut(layer.input * o);
-                    let (w2, bias) = rest.split_at_mut(layer.neighbour * o);
-                    for_pitch!(o, outer(&x[first * xp..], xp, layer.input, g, w1));
-                    for_pitch!(o, outer(&s[first * sp..], sp, layer.neighbour, g, w2));
-                    for_pitch!(o, outer(&[1.0; ANCHORS], 1, 1, g, bias));
+                });
+            }
+            let output = self.inputs.get(l + 1).unwrap_or(&self.output);
+            let inputs = self.inputs[l].par_chunks(layer.input).zip(self.around(l).par_chunks(layer.neighbour));
+            let parts: Vec<Vec<f32>> = gradient[..blocks * layer.output]
+                .par_chunks_mut(layer.output)
+                .zip(output.par_chunks(layer.output))
+                .zip(inputs)
+                .map(|((g, y), (x, s))| {
+                    kernels::relu_backward(y, g);
+                    let mut sums = vec![0.0f32; layer.weights.len()];
+                    let (w1, rest) = sums.split_at_mut(layer.input * layer.output);
+                    let (w2, bias) = rest.split_at_mut(layer.neighbour * layer.output);
+                    kernels::outer(x, g, w1);
+                    kernels::outer(s, g, w2);
+                    kernels::sum_lanes(g, bias);
                     sums
                 })
                 .collect();
             let mut total = vec![0.0f64; layer.weights.len()];
             for part in &parts {
-                for (total, part) in total.chunks_exact_mut(layer.output).zip(part.chunks_exact(o)) {
-                    total.iter_mut().zip(part).for_each(|(t, p)| *t += f64::from(*p));
-                }
+                total.iter_mut().zip(part).for_each(|(t, p)| *t += f64::from(*p));
             }
             out[l] = total.into_iter().map(|v| v as f32).collect();
-            if !around.is_empty() {
-                self.later[l] = around;
-            }
             std::mem::swap(&mut gradient, &mut above);
         }
-        self.gradients = [gradient, above];
+        self.gradients = [gradient, above, around];
         out
+    }
+
+    /// Gradient of the last output, from that of its standardised values: see [`Moments::backward`].
+    fn output_gradient(&self, totals: &[[f64; 2]], to: &mut [Lanes]) {
+        let (d, pitch) = (self.d, self.pitch);
+        let scale: Vec<[f32; 3]> = self
+            .hat_moments
+            .iter()
+            .zip(totals)
+            .map(|(m, [g, gy])| {
+                if m.inverse == 0.0 {
+                    return [0.0; 3];
+                }
+                [m.inverse, m.inverse * g / m.count, gy / ((m.count - 1.0) * m.deviation)].map(|v| v as f32)
+            })
+            .collect();
+        let rows = self.hat.par_chunks(BLOCK * pitch).zip(self.hat_gradient.par_chunks(BLOCK * pitch));
+        let served = self.context.served.par_chunks(BLOCK);
+        to.par_chunks_mut(d).zip(rows.zip(served)).for_each(|(to, ((hat, gradient), served))| {
+            // Lanes beyond the last anchor take no gradient.
+            to.as_flattened_mut().fill(0.0);
+            for (a, &served) in served.iter().enumerate() {
+                for (c, [inverse, mean, slope]) in scale.iter().enumerate() {
+                    let (g, y) = (gradient[a * pitch + c], hat[a * pitch + c]);
+                    to[c][a] = inverse * g - served as f32 * (mean + slope * y);
+                }
+            }
+        });
     }
 
     /// f_final of the Gaussian at `place`, into `out`.
@@ -690,24 +631,22 @@ fn chunks(context: &Context) -> Vec<Chunk> {
     out
 }
 
-/// Inputs of anchors and sums over their neighbours `[M][d + 3]` with the standardised colours, which never change.
-fn color_inputs(context: &Context, d: usize) -> (Vec<f32>, Vec<f32>) {
+/// Puts the standardised colours, which never change, into the inputs of anchors and sums over their neighbours, after
+/// `d` channels of features.
+fn color_inputs(context: &Context, d: usize, own: &mut [Lanes], around: &mut [Lanes]) {
     let moments = channel_moments(context.colors.as_flattened(), COLOR, None);
-    let color = |place: usize, c: usize| moments[c].apply(f64::from(context.colors[place][c]));
-    let channels = d + COLOR;
-    let m = context.anchors.len();
-    let (mut own, mut around) = (vec![0.0f32; m * channels], vec![0.0f32; m * channels]);
-    let rows = own.chunks_exact_mut(channels).zip(around.chunks_exact_mut(channels));
-    for (a, (own, around)) in rows.enumerate() {
+    let color = |place: u32, c: usize| moments[c].apply(f64::from(context.colors[place as usize][c]));
+    let of_gaussians = inputs_are_of_gaussians(context.kind);
+    for (a, &place) in context.anchors.iter().enumerate() {
         for c in 0..COLOR {
-            own[d + c] = color(context.anchors[a] as usize, c) as f32;
-            let place = |&n: &u32| {
-                if inputs_are_of_gaussians(context.kind) { n as usize } else { context.anchors[n as usize] as usize }
-            };
-            around[d + c] = context.neighbours_of(a).iter().map(|n| color(place(n), c)).sum::<f64>() as f32;
+            let (channel, lane) = (a / BLOCK * (d + COLOR) + d + c, a % BLOCK);
+            own[channel][lane] = color(place, c) as f32;
+            if of_gaussians {
+                let sum: f64 = context.neighbours_of(a).iter().map(|&n| color(n, c)).sum();
+                around[channel][lane] = sum as f32;
+            }
         }
     }
-    (own, around)
 }
 
 /// Means and inverse deviations in f32.
@@ -715,22 +654,24 @@ fn floats(moments: &[Moments]) -> (Vec<f32>, Vec<f32>) {
     moments.iter().map(|m| (m.mean as f32, m.inverse as f32)).unzip()
 }
 
-/// Moments of the first `d` channels of padded rows, each row counting `served` times.
-fn output_moments(rows: &[f32], pitch: usize, d: usize, served: &[u32]) -> Vec<Moments> {
-    let parts: Vec<Sums> = rows
-        .par_chunks(ANCHORS * pitch)
-        .zip(served.par_chunks(ANCHORS))
-        .map(|(rows, served)| {
-            let pivot: Vec<f64> = rows[..d].iter().map(|&v| f64::from(v)).collect();
-            let mut sums = Sums { first: vec![0.0; d], second: vec![0.0; d], pivot, count: 0.0 };
-            for (row, &w) in rows.chunks_exact(pitch).zip(served) {
-                let w = f64::from(w);
-                sums.count += w;
-                for c in 0..d {
-                    let x = f64::from(row[c]) - sums.pivot[c];
-                    sums.first[c] += w * x;
-                    sums.second[c] += w * x * x;
+/// Moments of each channel of a network's output, each anchor counting `served` times.
+fn output_moments(output: &[Lanes], d: usize, served: &[u32]) -> Vec<Moments> {
+    let parts: Vec<Sums> = output
+        .par_chunks(d)
+        .zip(served.par_chunks(BLOCK))
+        .map(|(y, served)| {
+            let mut sums = Sums { count: served.iter().map(|&s| f64::from(s)).sum(), ..Sums::default() };
+            for y in y {
+                let pivot = y[0];
+                let (mut s1, mut s2) = (0.0, 0.0);
+                for (&y, &w) in y.iter().zip(served) {
+                    let (x, w) = (f64::from(y - pivot), f64::from(w));
+                    s1 += w * x;
+                    s2 += w * x * x;
                 }
+                sums.first.push(s1);
+                sums.second.push(s2);
+                sums.pivot.push(f64::from(pivot));
             }
             sums
         })
@@ -738,12 +679,18 @@ fn output_moments(rows: &[f32], pitch: usize, d: usize, served: &[u32]) -> Vec<M
     (0..d).map(|c| Moments::from_parts(parts.iter().map(|s| s.part(c)))).collect()
 }
 
-/// Sums of padded rows over lists of them.
-fn sum_lists(rows: &[f32], o: usize, list: &[u32], start: &[u32], sums: &mut [f32]) {
-    sums.par_chunks_mut(ANCHORS * o).enumerate().for_each(|(chunk, sums)| {
-        let first = chunk * ANCHORS;
-        let start = &start[first..=first + sums.len() / o];
-        for_pitch!(o, sum_rows(rows, list, start, sums));
+/// Sums over lists of anchors of their `channels`; `rows` is room for them row by row.
+fn sum_over_lists(from: &[Lanes], channels: usize, rows: &mut [f32], list: &[u32], start: &[u32], sums: &mut [Lanes]) {
+    let m = start.len() - 1;
+    let rows = &mut rows[..m * channels];
+    rows.par_chunks_mut(BLOCK * channels).zip(from.par_chunks(channels)).for_each(|(rows, block)| {
+        for (a, row) in rows.chunks_exact_mut(channels).enumerate() {
+            row.iter_mut().zip(block).for_each(|(r, lanes)| *r = lanes[a]);
+        }
+    });
+    sums.par_chunks_mut(channels).enumerate().for_each(|(block, sums)| {
+        let end = ((block + 1) * BLOCK).min(m);
+        kernels::sum_rows(rows, list, &start[block * BLOCK..=end], sums);
     });
 }
 

@@ -2,6 +2,7 @@
 
 use super::*;
 use crate::model::Init;
+use crate::network::Layer;
 use crate::testing::{context, mask_set};
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
