@@ -2,6 +2,7 @@
 
 use crate::checkpoint;
 use crate::evidence::{Evidence, Matrix};
+use crate::fast::{Engine, Shortcuts};
 use crate::loss::Loss;
 use crate::model::{Init, Settings};
 use crate::normalize::Axis;
@@ -109,6 +110,12 @@ struct Contrastive {
     /// Iterations between checkpoints; 0 for none
     #[arg(long, value_name = "COUNT", default_value_t = 1000)]
     checkpoint_every: u64,
+    /// Take means and deviations anew only every so many iterations: an approximation
+    #[arg(long, value_name = "COUNT", default_value_t = 1)]
+    stats_every: u64,
+    /// Leave Gaussians that the view does not see, and their momentum, as they are: an approximation
+    #[arg(long)]
+    lazy_adam: bool,
     /// Iterations between points of the curve
     #[arg(long, value_name = "COUNT", default_value_t = 50)]
     curve_every: u64,
@@ -157,6 +164,7 @@ impl Args {
             ("--weight-lr", positive(c.weight_lr), c.weight_lr.to_string(), "more than 0".into()),
             ("--cohesion", c.cohesion >= 0.0 && c.cohesion.is_finite(), c.cohesion.to_string(), "0 or more".into()),
             ("--cutoff", positive(self.spectral.cutoff), self.spectral.cutoff.to_string(), "more than 0".into()),
+            ("--stats-every", c.stats_every > 0, "0".into(), "at least 1".into()),
             ("--curve-every", c.curve_every > 0, "0".into(), "at least 1".into()),
             (
                 "--power",
@@ -196,6 +204,8 @@ impl Args {
                 "cohesion": c.cohesion,
                 "propagation": !c.no_propagation,
                 "curve_every": c.curve_every,
+                "stats_every": c.stats_every,
+                "lazy_adam": c.lazy_adam,
             }),
             Method::Spectral => json!({
                 "dim": self.dim.map_or(json!("auto"), |d| json!(d)),
@@ -287,7 +297,15 @@ impl Args {
             seed: self.common.seed,
             checkpoint_every: c.checkpoint_every,
             curve_every: c.curve_every,
+            shortcuts: Shortcuts { stats_every: c.stats_every, lazy_adam: c.lazy_adam },
         };
+        if !Engine::serves(&options.settings) && options.shortcuts != Shortcuts::default() {
+            return Err(Error::new("not with this loss, --cohesion or --norm-axis").field(if c.lazy_adam {
+                "--lazy-adam"
+            } else {
+                "--stats-every"
+            }));
+        }
         // A checkpoint serves runs of any number of iterations, as long as everything else is equal.
         let provenance = stage.provenance("", 0, Value::Object(self.parameters()), inputs.hashes.clone());
         let path = checkpoint::path(&self.out);

@@ -182,8 +182,8 @@ pub fn sum_lanes(g: &[Lanes], total: &mut [f32]) {
     }
 }
 
-/// The sum, halves first.
-#[inline(always)]
+/// The sum, halves first. Not inlined: its tree would have the compiler keep the partial sums in pairs.
+#[inline(never)]
 fn added(sums: &[f32; PARTIAL]) -> f32 {
     let eight: [f32; 8] = std::array::from_fn(|j| sums[j] + sums[j + 8]);
     let four: [f32; 4] = std::array::from_fn(|j| eight[j] + eight[j + 4]);

@@ -125,7 +125,7 @@ pub struct Engine<'a> {
 }
 
 /// The parts of `values` that end at `ends`.
-fn split<'a, T>(mut values: &'a mut [T], ends: impl Iterator<Item = usize>) -> Vec<&'a mut [T]> {
+fn split<T>(mut values: &mut [T], ends: impl Iterator<Item = usize>) -> Vec<&mut [T]> {
     let mut from = 0;
     ends.map(|end| {
         let (part, rest) = std::mem::take(&mut values).split_at_mut(end - from);
@@ -311,16 +311,17 @@ impl<'a> Engine<'a> {
                 Some((sums, halves))
             })
             .collect();
-        let total = |of: fn(&(Vec<f32>, Vec<f32>)) -> &Vec<f32>| {
+        let (all, halves): (Vec<_>, Vec<_>) = parts.into_iter().unzip();
+        let total = |parts: Vec<Vec<f32>>| {
             let mut total = vec![0.0f64; set.len() * d];
-            for part in parts.iter().map(of).filter(|p| !p.is_empty()) {
+            for part in parts {
                 for (total, part) in total.chunks_exact_mut(d).zip(part.chunks_exact(pitch)) {
                     total.iter_mut().zip(part).for_each(|(t, p)| *t += f64::from(*p));
                 }
             }
             total
         };
-        (total(|p| &p.0), if half.is_some() { total(|p| &p.1) } else { Vec::new() })
+        (total(all), if half.is_some() { total(halves) } else { Vec::new() })
     }
 
     fn piece<'b>(&'b self, set: &'b MaskSet<f32>, columns: Range<usize>) -> Piece<'b> {

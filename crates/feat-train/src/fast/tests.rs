@@ -97,3 +97,112 @@ fn agrees_with_the_readable_model() {
         check(settings(6, 3, Loss::Printed), kind, false);
     }
 }
+
+/// Trains the engine or the readable model for `iterations` on two views in turn.
+fn trained<T: crate::real::Real>(
+    model: &mut Model<T>,
+    iterations: u64,
+    mut step: impl FnMut(&mut Model<T>, u64) -> Vec<Vec<T>>,
+) -> Vec<f64> {
+    let mut weights: Vec<Adam<T>> = model.layers.iter().map(|l| Adam::new(l.weights.len())).collect();
+    for i in 0..iterations {
+        let gradients = step(model, i);
+        for ((layer, adam), gradient) in model.layers.iter_mut().zip(&mut weights).zip(&gradients) {
+            adam.update(&mut layer.weights, gradient, 1e-3, i + 1);
+        }
+    }
+    model.features.iter().map(|v| v.get()).collect()
+}
+
+fn by_readable<T: crate::real::Real>(context: &Context, sets: &[MaskSet<T>], model: &mut Model<T>, n: u64) -> Vec<f64> {
+    let mut adam = Adam::<T>::new(model.features.len());
+    let d = model.settings.dim;
+    trained(model, n, |model, i| {
+        let set = &sets[i as usize % sets.len()];
+        let propagated = model.propagate(context);
+        let step = model.step(context, &propagated, set, i);
+        let mut dense = vec![T::default(); model.features.len()];
+        for (row, &place) in step.features.chunks_exact(d).zip(&set.columns) {
+            dense[place as usize * d..(place as usize + 1) * d].copy_from_slice(row);
+        }
+        adam.update(&mut model.features, &dense, 1e-3, i + 1);
+        step.layers
+    })
+}
+
+fn by_engine(
+    context: &Context,
+    sets: &[MaskSet<f32>],
+    model: &mut Model<f32>,
+    shortcuts: Shortcuts,
+    n: u64,
+) -> Vec<f64> {
+    let mut engine = Engine::new(context, model, shortcuts);
+    let mut adam = Adam::new(model.features.len());
+    trained(model, n, |model, i| {
+        let set = &sets[i as usize % sets.len()];
+        engine.propagate(model, i);
+        let evaluated = engine.evaluate(model, set, i);
+        engine.backward(model, &mut adam, set, &evaluated, i, &Rates::at(1e-3, i + 1), i)
+    })
+}
+
+#[test]
+fn stays_with_the_readable_model_in_f64_for_1000_iterations() {
+    let context = context(400, Neighbours::Gaussians, true);
+    let sets = [mask_set::<f32>(&context, 9, 3), mask_set::<f32>(&context, 12, 4)];
+    let mut model = Model::<f32>::new(settings(6, 2, Loss::Printed), &context, &mut ChaCha8Rng::seed_from_u64(5));
+    let start: Vec<f64> = model.features.iter().map(|v| f64::from(*v)).collect();
+    let wide: Vec<MaskSet<f64>> = sets.iter().map(wide_set).collect();
+    let oracle = by_readable(&context, &wide, &mut widened(&model), 1000);
+    let readable = by_readable(&context, &sets, &mut model.clone(), 1000);
+    let found = by_engine(&context, &sets, &mut model, Shortcuts::default(), 1000);
+    let apart = |a: &[f64], b: &[f64]| {
+        let squares: f64 = a.iter().zip(b).map(|(a, b)| (a - b) * (a - b)).sum();
+        (squares / a.len() as f64).sqrt()
+    };
+    // Adam takes a step of full size for the sign of a gradient, however small: rounding is amplified in any f32.
+    let (moved, off, usual) = (apart(&oracle, &start), apart(&oracle, &found), apart(&oracle, &readable));
+    eprintln!(
+        "after 1000 iterations features moved by {moved:.1e} (root mean square); off f64 by {off:.1e} (the engine), \
+         {usual:.1e} (the readable model in f32)"
+    );
+    assert!(moved > 0.05, "{moved}");
+    assert!(off < 0.03 * moved && off < 4.0 * usual, "{off:e} of {moved:e}; {usual:e}");
+}
+
+#[test]
+fn threads_do_not_change_a_bit() {
+    let context = context(20_000, Neighbours::Anchors, true);
+    let sets = [mask_set::<f32>(&context, 30, 3), mask_set::<f32>(&context, 20, 4)];
+    let with = |threads| {
+        let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
+        pool.install(|| {
+            let mut rng = ChaCha8Rng::seed_from_u64(1);
+            let mut model = Model::<f32>::new(settings(6, 3, Loss::HalfMask), &context, &mut rng);
+            let features = by_engine(&context, &sets, &mut model, Shortcuts::default(), 5);
+            let mut engine = Engine::new(&context, &model, Shortcuts::default());
+            engine.propagate(&model, 5);
+            let alignment = engine.alignment(&model, &sets[0]);
+            (features, model, alignment)
+        })
+    };
+    assert!(with(1) == with(3));
+}
+
+#[test]
+fn shortcuts_change_little() {
+    let context = context(2000, Neighbours::Gaussians, true);
+    let sets = [mask_set::<f32>(&context, 9, 3), mask_set::<f32>(&context, 12, 4)];
+    let run = |shortcuts| {
+        let mut rng = ChaCha8Rng::seed_from_u64(1);
+        let mut model = Model::<f32>::new(settings(6, 2, Loss::Printed), &context, &mut rng);
+        by_engine(&context, &sets, &mut model, shortcuts, 60)
+    };
+    let exact = run(Shortcuts::default());
+    for shortcuts in [Shortcuts { stats_every: 5, lazy_adam: false }, Shortcuts { stats_every: 1, lazy_adam: true }] {
+        let found = run(shortcuts);
+        let off = found.iter().zip(&exact).map(|(f, e)| (f - e).abs()).fold(0.0, f64::max);
+        assert!(off > 0.0 && off < 0.06, "{shortcuts:?}: {off}");
+    }
+}
