@@ -15,15 +15,6 @@ use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use rayon::prelude::*;
 
-/// How large the scene is.
-#[derive(Debug, Clone, Copy)]
-pub struct Size {
-    /// Gaussians along a side of the surface; a multiple of ten.
-    pub side: usize,
-    /// Views.
-    pub views: usize,
-}
-
 /// Neighbours of an anchor.
 const K: usize = 16;
 /// Gaussians of an anchor: a block so high and so wide.
@@ -41,12 +32,12 @@ pub struct Scene {
     pub positions: Vec<[f32; 3]>,
     /// Index of the Gaussian at each place of the surface, row by row.
     index: Vec<u32>,
-    size: Size,
+    side: usize,
 }
 
-/// Makes the surface and its graph.
-pub fn scene(size: Size) -> Scene {
-    let (side, mut rng) = (size.side, ChaCha8Rng::seed_from_u64(1));
+/// Makes the surface and its graph, of `side` x `side` Gaussians; `side` is a multiple of ten.
+pub fn scene(side: usize) -> Scene {
+    let mut rng = ChaCha8Rng::seed_from_u64(1);
     let n = side * side;
     let shuffled = |count: usize, rng: &mut ChaCha8Rng| {
         let mut order: Vec<u32> = (0..count as u32).collect();
@@ -114,7 +105,7 @@ pub fn scene(size: Size) -> Scene {
         seen_views: Vec::new(),
         seen_weight: Vec::new(),
     };
-    Scene { graph, colors, positions, index, size }
+    Scene { graph, colors, positions, index, side }
 }
 
 impl Scene {
@@ -130,19 +121,19 @@ impl Scene {
         Context::new(&self.graph, &self.colors, positions, kind, true)
     }
 
-    /// The masks of all views.
-    pub fn views(&self, context: &Context) -> Vec<MaskSet<f32>> {
+    /// The masks of `count` views.
+    pub fn views(&self, context: &Context, count: usize) -> Vec<MaskSet<f32>> {
         let mut place = vec![0u32; context.order.len()];
         for (p, &i) in context.order.iter().enumerate() {
             place[i as usize] = p as u32;
         }
-        (0..self.size.views).map(|v| self.view(context, &place, v as u64)).collect()
+        (0..count).map(|v| self.view(context, &place, v as u64)).collect()
     }
 
     fn view(&self, context: &Context, place: &[u32], v: u64) -> MaskSet<f32> {
         let mut rng = ChaCha8Rng::seed_from_u64(2);
         rng.set_stream(v);
-        let side = self.size.side;
+        let side = self.side;
         let width = (side as f64 * 0.2f64.sqrt()) as usize;
         let corner = (rng.random_range(0..=side - width), rng.random_range(0..=side - width));
         let masks = rng.random_range(60..=100usize);

@@ -291,8 +291,13 @@ impl<'a> Engine<'a> {
         *(if l + 1 < model.layers.len() { &mut self.inputs[l + 1] } else { &mut self.output }) = output;
     }
 
+    /// Centroids A f of all masks `[K][d]`, after [`Engine::propagate`].
+    pub fn centroids(&self, model: &Model<f32>, set: &MaskSet<f32>) -> Vec<f64> {
+        self.mask_means(model, set, None).0
+    }
+
     /// Centroids of the masks `[K][d]`, and of their halves where asked for.
-    fn centroids(&self, model: &Model<f32>, set: &MaskSet<f32>, half: Option<Half<'_>>) -> (Vec<f64>, Vec<f64>) {
+    fn mask_means(&self, model: &Model<f32>, set: &MaskSet<f32>, half: Option<Half<'_>>) -> (Vec<f64>, Vec<f64>) {
         let (d, pitch) = (self.d, self.pitch);
         let length = set.len() * pitch;
         let parts: Vec<(Vec<f32>, Vec<f32>)> = self
@@ -340,7 +345,7 @@ impl<'a> Engine<'a> {
         let s = &self.settings;
         let half = move |entry: usize| in_half(noise, entry);
         let with_halves = s.loss == Loss::HalfMask;
-        let (means, positives) = self.centroids(model, set, with_halves.then_some(&half));
+        let (means, positives) = self.mask_means(model, set, with_halves.then_some(&half));
         let taken = start.elapsed();
         let positives = with_halves.then_some(&positives[..]);
         let evaluated = loss::evaluate(s.loss, &means, positives, self.d, s.tau);
@@ -569,7 +574,7 @@ impl<'a> Engine<'a> {
     /// Mean over masks of the weighted mean cosine between a mask's Gaussians and its centroid.
     pub fn alignment(&self, model: &Model<f32>, set: &MaskSet<f32>) -> f64 {
         let (d, masks) = (self.d, set.len());
-        let (unit, _) = directions(&self.centroids(model, set, None).0, d);
+        let (unit, _) = directions(&self.centroids(model, set), d);
         let parts: Vec<Vec<f64>> = set
             .pieces
             .par_windows(2)
