@@ -7,6 +7,7 @@
 pub mod adam;
 pub mod checkpoint;
 pub mod cli;
+pub mod cross_view;
 pub mod evidence;
 pub mod fast;
 pub mod linalg;

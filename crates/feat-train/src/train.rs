@@ -2,8 +2,9 @@
 
 use crate::adam::{Adam, Rates};
 use crate::checkpoint::{self, Checkpoint};
+use crate::cross_view;
 use crate::fast::{Engine, Shortcuts};
-use crate::loss::Evaluated;
+use crate::loss::{Evaluated, Loss};
 use crate::model::{Model, Propagated, Settings, Step, splitmix};
 use crate::network::Layer;
 use crate::scene::{Context, MaskSet};
@@ -95,7 +96,8 @@ pub fn train(
         }
         let set = &sets[order[(state.iteration % sets.len() as u64) as usize] as usize];
         let noise = splitmix(options.seed ^ splitmix(state.iteration));
-        let [loss, separation] = way.forward(&state.model, set, noise, state.iteration);
+        let beside = beside(sets, set, noise, &options.settings);
+        let [loss, separation] = way.forward(&state.model, set, beside, noise, state.iteration);
         if !loss.is_finite() {
             return Err(Error::new("the loss is not finite")
                 .field(format!("iteration {}", state.iteration + 1))
@@ -131,6 +133,17 @@ pub fn train(
     Ok(Trained { features, curve: state.curve, resumed_at })
 }
 
+/// Another view to take positives from, for the loss that asks for them.
+fn beside<'a>(
+    sets: &'a [MaskSet<f32>],
+    set: &MaskSet<f32>,
+    noise: u64,
+    settings: &Settings,
+) -> Option<&'a MaskSet<f32>> {
+    let other = &sets[(splitmix(noise) % sets.len() as u64) as usize];
+    (settings.loss == Loss::CrossView && !std::ptr::eq(other, set)).then_some(other)
+}
+
 /// By what an iteration is computed.
 enum Way<'a> {
     /// The engine, for the settings that it serves, and what it found of the iteration under way.
@@ -163,16 +176,27 @@ impl<'a> Way<'a> {
     }
 
     /// Loss and separation.
-    fn forward(&mut self, model: &Model<f32>, set: &MaskSet<f32>, noise: u64, iteration: u64) -> [f64; 2] {
+    fn forward(
+        &mut self,
+        model: &Model<f32>,
+        set: &MaskSet<f32>,
+        beside: Option<&MaskSet<f32>>,
+        noise: u64,
+        iteration: u64,
+    ) -> [f64; 2] {
+        let d = model.settings.dim;
         match self {
             Self::Fast(engine, evaluated) => {
                 engine.propagate(model, iteration);
-                *evaluated = engine.evaluate(model, set, noise);
+                let positives = beside.map(|b| cross_view::positives(set, b, &engine.centroids(model, b), d));
+                *evaluated = engine.evaluate_beside(model, set, noise, positives.as_deref());
                 [evaluated.loss, evaluated.separation]
             }
             Self::Plain { context, propagated, step, .. } => {
                 *propagated = model.propagate(context);
-                *step = model.step(context, propagated, set, noise);
+                let centroids = |b| model.centroids(context, propagated, b);
+                let positives = beside.map(|b| cross_view::positives(set, b, &centroids(b), d));
+                *step = model.step_beside(context, propagated, set, noise, positives.as_deref());
                 [step.loss, step.separation]
             }
         }

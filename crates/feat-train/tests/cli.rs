@@ -121,6 +121,7 @@ fn training_separates_masks_and_does_not_depend_on_threads() {
     for variant in [
         &["--preset", "paper"][..],
         &["--method", "contrastive", "--neighbours", "anchors", "--loss", "half-mask", "--norm-axis", "gaussian"],
+        &["--method", "contrastive", "--neighbours", "anchor-inputs", "--loss", "cross-view", "--lazy-adam"],
         &["--method", "contrastive", "--loss", "gaussian", "--layers", "0", "--init", "normal-small"],
     ] {
         let with = |threads| {

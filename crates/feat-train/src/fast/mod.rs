@@ -341,13 +341,24 @@ impl<'a> Engine<'a> {
 
     /// The loss on one view and its gradients of the centroids. `noise` seeds the halves of [`Loss::HalfMask`].
     pub fn evaluate(&mut self, model: &Model<f32>, set: &MaskSet<f32>, noise: u64) -> Evaluated {
+        self.evaluate_beside(model, set, noise, None)
+    }
+
+    /// [`Engine::evaluate`], with positives from another view `[K][d]` for [`Loss::CrossView`].
+    pub fn evaluate_beside(
+        &mut self,
+        model: &Model<f32>,
+        set: &MaskSet<f32>,
+        noise: u64,
+        beside: Option<&[f64]>,
+    ) -> Evaluated {
         let start = Instant::now();
         let s = &self.settings;
         let half = move |entry: usize| in_half(noise, entry);
         let with_halves = s.loss == Loss::HalfMask;
         let (means, positives) = self.mask_means(model, set, with_halves.then_some(&half));
         let taken = start.elapsed();
-        let positives = with_halves.then_some(&positives[..]);
+        let positives = with_halves.then_some(&positives[..]).or(beside);
         let evaluated = loss::evaluate(s.loss, &means, positives, self.d, s.tau);
         self.timings.centroids += taken;
         self.timings.loss += start.elapsed() - taken;

@@ -51,11 +51,14 @@ fn check(settings: Settings, kind: Neighbours, propagate: bool) {
     let mut model = Model::<f32>::new(settings, &context, &mut ChaCha8Rng::seed_from_u64(5));
     let exact = widened(&model);
     let propagated = exact.propagate(&context);
-    let step = exact.step(&context, &propagated, &wide_set(&set), 77);
+    let beside: Vec<f64> =
+        (0..23 * exact.settings.dim).map(|i| if i < 40 { (i * i % 7) as f64 - 2.0 } else { 0.0 }).collect();
+    let beside = (exact.settings.loss == Loss::CrossView).then_some(&beside[..]);
+    let step = exact.step_beside(&context, &propagated, &wide_set(&set), 77, beside);
 
     let mut engine = Engine::new(&context, &model, Shortcuts::default());
     engine.propagate(&model, 0);
-    let evaluated = engine.evaluate(&model, &set, 77);
+    let evaluated = engine.evaluate_beside(&model, &set, 77, beside);
     assert!((evaluated.loss - step.loss).abs() <= 1e-5 * step.loss.abs(), "{name}: {} {}", evaluated.loss, step.loss);
     assert!((evaluated.separation - step.separation).abs() <= 1e-5);
     let d = model.settings.dim;
@@ -93,6 +96,7 @@ fn agrees_with_the_readable_model() {
         check(settings(d, 2, Loss::WithSelf), Anchors, true);
     }
     check(settings(6, 2, Loss::HalfMask), Gaussians, true);
+    check(settings(6, 2, Loss::CrossView), Gaussians, true);
     for kind in [Gaussians, Anchors] {
         check(settings(6, 3, Loss::Printed), kind, false);
     }
@@ -205,4 +209,68 @@ fn shortcuts_change_little() {
         let off = found.iter().zip(&exact).map(|(f, e)| (f - e).abs()).fold(0.0, f64::max);
         assert!(off > 0.0 && off < 0.06, "{shortcuts:?}: {off}");
     }
+}
+
+/// A mask set of given masks over ranges of places, with one that has no entry at all.
+fn set_of(context: &Context, masks: &[Range<u32>]) -> MaskSet<f32> {
+    let entries =
+        masks.iter().enumerate().flat_map(|(k, r)| r.clone().map(move |p| (p, k as u16, 0.01))).collect::<Vec<_>>();
+    MaskSet::from_entries((0..masks.len() as u32).collect(), vec![100.0; masks.len()], entries, context)
+}
+
+/// Trains for `n` iterations on one thread and says what came of it.
+fn run_on(context: &Context, set: &MaskSet<f32>, model: &mut Model<f32>, n: u64) -> Vec<f64> {
+    let pool = rayon::ThreadPoolBuilder::new().num_threads(1).build().unwrap();
+    let sets = [set.clone()];
+    pool.install(|| by_engine(context, &sets, model, Shortcuts::default(), n))
+}
+
+#[test]
+fn constant_features_and_colors_give_zeros_not_noise() {
+    let mut context = context(640, Neighbours::Gaussians, true);
+    context.colors.fill([0.1, 0.7, 0.3]);
+    let mut model = Model::<f32>::new(settings(6, 2, Loss::Printed), &context, &mut ChaCha8Rng::seed_from_u64(1));
+    model.features.fill(0.1);
+    let mut engine = Engine::new(&context, &model, Shortcuts::default());
+    engine.propagate(&model, 0);
+    assert!(engine.inputs[0].as_flattened().iter().all(|v| *v == 0.0));
+    assert!(engine.around[0].as_flattened().iter().all(|v| *v == 0.0));
+    assert!(engine.hat.iter().all(|v| *v == 0.0));
+    // Training goes on from there without a number that is none.
+    let set = mask_set::<f32>(&context, 9, 3);
+    assert!(run_on(&context, &set, &mut model, 50).iter().all(|v| v.is_finite()));
+}
+
+#[test]
+fn one_mask_or_masks_without_entries_or_direction_move_nothing_wrongly() {
+    let context = context(64, Neighbours::Gaussians, true);
+    let fresh =
+        |layers| Model::<f32>::new(settings(6, layers, Loss::Printed), &context, &mut ChaCha8Rng::seed_from_u64(1));
+    // One mask: nothing to tell apart.
+    let mut model = fresh(2);
+    let start: Vec<f64> = model.features.iter().map(|v| f64::from(*v)).collect();
+    assert_eq!(run_on(&context, &set_of(&context, &[0..30]), &mut model, 5), start);
+    // A mask without entries takes no part.
+    let with = run_on(&context, &set_of(&context, &[0..20, 5..5, 30..60]), &mut fresh(2), 5);
+    let without = run_on(&context, &set_of(&context, &[0..20, 30..60]), &mut fresh(2), 5);
+    assert_eq!(with, without);
+    assert_ne!(with, start);
+    // A centroid of zero length has no direction.
+    let mut model = fresh(0);
+    model.features[..120].fill(0.0);
+    let features = run_on(&context, &set_of(&context, &[0..20, 30..45, 45..60]), &mut model, 5);
+    assert!(features[..120].iter().all(|v| *v == 0.0) && features.iter().all(|v| v.is_finite()));
+}
+
+#[test]
+fn a_hundred_thousand_iterations_at_a_low_temperature_stay_finite() {
+    let context = context(40, Neighbours::Gaussians, true);
+    let set = mask_set::<f32>(&context, 4, 3);
+    let cold = Settings { tau: 1e-3, ..settings(6, 2, Loss::Printed) };
+    let mut model = Model::<f32>::new(cold, &context, &mut ChaCha8Rng::seed_from_u64(1));
+    let features = run_on(&context, &set, &mut model, 100_000);
+    let weights = model.layers.iter().flat_map(|l| &l.weights);
+    assert!(features.iter().all(|v| v.is_finite()) && weights.clone().all(|w| w.is_finite()));
+    let largest = features.iter().fold(0.0f64, |a, b| a.max(b.abs()));
+    assert!(largest < 100.0, "features drift: {largest}");
 }
