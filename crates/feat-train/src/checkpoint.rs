@@ -15,6 +15,8 @@ pub struct Checkpoint {
     pub iteration: u64,
     /// Sums since the last point of the curve: loss, separation, count.
     pub window: [f64; 3],
+    /// Lowest loss of held-out views, and looks since.
+    pub settled: [f64; 2],
     /// The curve so far.
     pub curve: Vec<CurvePoint>,
     /// Means and deviations in use, which may be older than the parameters; see `Engine::statistics`.
@@ -41,6 +43,7 @@ pub fn write(path: &Path, provenance: &Provenance, checkpoint: &Checkpoint) -> R
     let mut writer = ArtifactWriter::new(provenance)
         .tensor("iteration", &[1], &[checkpoint.iteration])
         .tensor("window", &[3], &checkpoint.window)
+        .tensor("settled", &[2], &checkpoint.settled)
         .tensor("curve", &[checkpoint.curve.len(), 5], &curve)
         .tensor("statistics", &[checkpoint.statistics.len()], &checkpoint.statistics);
     for (name, values) in NAMES.iter().zip(&checkpoint.parameters) {
@@ -60,6 +63,7 @@ pub fn read(path: &Path, provenance: &Provenance, lengths: [usize; 6]) -> Result
         return Err(Error::new("of other parameters or inputs").file(path));
     }
     let curve = a.tensor::<f64>("curve", &[None, Some(5)])?;
+    let settled = a.tensor::<f64>("settled", &[Some(2)])?;
     let window = a.tensor::<f64>("window", &[Some(3)])?;
     let mut parameters: [Vec<f32>; 6] = Default::default();
     for ((to, name), length) in parameters.iter_mut().zip(NAMES).zip(lengths) {
@@ -71,6 +75,7 @@ pub fn read(path: &Path, provenance: &Provenance, lengths: [usize; 6]) -> Result
     Ok(Checkpoint {
         iteration: a.tensor::<u64>("iteration", &[Some(1)])?[0],
         window: [window[0], window[1], window[2]],
+        settled: [settled[0], settled[1]],
         curve: curve
             .chunks_exact(5)
             .map(|p| CurvePoint { iteration: p[0] as u64, loss: p[1], alignment: p[2], separation: p[3], rate: p[4] })

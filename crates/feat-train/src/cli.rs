@@ -116,6 +116,9 @@ struct Contrastive {
     /// Leave Gaussians that the view does not see, and their momentum, as they are: an approximation
     #[arg(long)]
     lazy_adam: bool,
+    /// Hold out every tenth view from training, and stop when their loss has settled
+    #[arg(long)]
+    early_stop: bool,
     /// Iterations between points of the curve
     #[arg(long, value_name = "COUNT", default_value_t = 50)]
     curve_every: u64,
@@ -206,6 +209,7 @@ impl Args {
                 "curve_every": c.curve_every,
                 "stats_every": c.stats_every,
                 "lazy_adam": c.lazy_adam,
+                "early_stop": c.early_stop,
             }),
             Method::Spectral => json!({
                 "dim": self.dim.map_or(json!("auto"), |d| json!(d)),
@@ -298,6 +302,7 @@ impl Args {
             checkpoint_every: c.checkpoint_every,
             curve_every: c.curve_every,
             shortcuts: Shortcuts { stats_every: c.stats_every, lazy_adam: c.lazy_adam },
+            early_stop: c.early_stop,
         };
         if !Engine::serves(&options.settings) && options.shortcuts != Shortcuts::default() {
             return Err(Error::new("not with this loss, --cohesion or --norm-axis").field(if c.lazy_adam {
@@ -312,7 +317,8 @@ impl Args {
         let on_curve = |curve: &[CurvePoint]| write_curve(&self.out, curve.iter().map(|p| json!(p)));
         let trained = train(&context, &sets, &options, Some((&path, &provenance)), stage, on_curve)?;
         let last = trained.curve.last().copied().unwrap_or_default();
-        let summary = json!({ "views": sets.len(), "last": last, "resumed_at": trained.resumed_at });
+        let summary = json!({ "views": sets.len(), "last": last, "resumed_at": trained.resumed_at,
+            "iterations": trained.iterations });
         Ok((options.settings.dim, trained.features, summary))
     }
 

@@ -34,6 +34,38 @@ pub struct TrainOptions {
     pub curve_every: u64,
     /// What to do less often than the method asks for.
     pub shortcuts: Shortcuts,
+    /// Hold out every tenth view and stop when their loss has settled.
+    pub early_stop: bool,
+}
+
+/// Of so many mask sets one is held out for [`TrainOptions::early_stop`].
+const HELD_OUT: usize = 10;
+/// Of those held out, at most so many are looked at.
+const MOST_HELD_OUT: usize = 16;
+/// Iterations between looks at them.
+const LOOK_EVERY: u64 = 250;
+/// Training ends after so many looks without a better loss ...
+const PATIENCE: f64 = 4.0;
+/// ... better meaning lower by this, in nats.
+const BETTER: f64 = 1e-3;
+
+/// Lowest loss of the held-out views, and how many looks ago it was.
+#[derive(Debug, Clone, Copy, PartialEq)]
+struct Settled {
+    lowest: f64,
+    looks: f64,
+}
+
+impl Settled {
+    /// Whether the loss has settled, given that of a look.
+    fn look(&mut self, loss: f64) -> bool {
+        if loss < self.lowest - BETTER {
+            *self = Self { lowest: loss, looks: 0.0 };
+        } else {
+            self.looks += 1.0;
+        }
+        self.looks >= PATIENCE
+    }
 }
 
 /// A point of the training curve.
@@ -60,6 +92,8 @@ pub struct Trained {
     pub curve: Vec<CurvePoint>,
     /// Iteration of the checkpoint it continued from.
     pub resumed_at: u64,
+    /// Iterations done: fewer than asked for when it stopped early.
+    pub iterations: u64,
 }
 
 /// Trains on `sets`, each with at least two masks. `checkpoint`: where checkpoints lie, and what one of this very run
@@ -85,6 +119,13 @@ pub fn train(
     let mut way = Way::new(context, &state.model, options);
     way.restore(&statistics);
     let resumed_at = state.iteration;
+    let (held_out, seen): (Vec<_>, Vec<_>) =
+        sets.iter().enumerate().partition(|(i, _)| options.early_stop && i % HELD_OUT == HELD_OUT - 1);
+    let held_out: Vec<&MaskSet<f32>> = held_out.into_iter().map(|(_, set)| set).take(MOST_HELD_OUT).collect();
+    let sets: Vec<&MaskSet<f32>> = seen.into_iter().map(|(_, set)| set).collect();
+    if options.early_stop && held_out.is_empty() {
+        stage.warn(&format!("--early-stop needs {HELD_OUT} views with masks: training to the end"));
+    }
     let mut order: Vec<u32> = Vec::new();
     let mut epoch = u64::MAX;
     let mut progress = stage.progress("iterations", options.iterations).resumed_at(resumed_at);
@@ -94,9 +135,9 @@ pub fn train(
             epoch = now;
             order = shuffled(sets.len(), options.seed, epoch);
         }
-        let set = &sets[order[(state.iteration % sets.len() as u64) as usize] as usize];
+        let set = sets[order[(state.iteration % sets.len() as u64) as usize] as usize];
         let noise = splitmix(options.seed ^ splitmix(state.iteration));
-        let beside = beside(sets, set, noise, &options.settings);
+        let beside = beside(&sets, set, noise, &options.settings);
         let [loss, separation] = way.forward(&state.model, set, beside, noise, state.iteration);
         if !loss.is_finite() {
             return Err(Error::new("the loss is not finite")
@@ -111,6 +152,9 @@ pub fn train(
             state.curve.push(point);
         }
         way.update(&mut state, set, noise, options);
+        let settled = state.iteration.is_multiple_of(LOOK_EVERY)
+            && !held_out.is_empty()
+            && state.settled.look(way.mean_loss(&state.model, &held_out, state.iteration));
         let due = options.checkpoint_every > 0 && state.iteration.is_multiple_of(options.checkpoint_every);
         let interrupted = stage.interrupted();
         if let Some((path, provenance)) = checkpoint
@@ -125,22 +169,29 @@ pub fn train(
         }
         let loss = state.curve.last().map_or(loss, |p| p.loss);
         progress.set(state.iteration, &[("loss", loss)]);
+        if settled {
+            stage.info(&format!(
+                "stopped after {} of {} iterations: the loss of held-out views has settled at {:.4}",
+                state.iteration, options.iterations, state.settled.lowest
+            ));
+            break;
+        }
     }
     let last = state.curve.last().copied().unwrap_or_default();
     progress.finish(&[("loss", last.loss), ("alignment", last.alignment), ("separation", last.separation)]);
     on_curve(&state.curve)?;
     let features = way.final_features(&state.model, state.iteration);
-    Ok(Trained { features, curve: state.curve, resumed_at })
+    Ok(Trained { features, curve: state.curve, resumed_at, iterations: state.iteration })
 }
 
 /// Another view to take positives from, for the loss that asks for them.
 fn beside<'a>(
-    sets: &'a [MaskSet<f32>],
+    sets: &[&'a MaskSet<f32>],
     set: &MaskSet<f32>,
     noise: u64,
     settings: &Settings,
 ) -> Option<&'a MaskSet<f32>> {
-    let other = &sets[(splitmix(noise) % sets.len() as u64) as usize];
+    let other = sets[(splitmix(noise) % sets.len() as u64) as usize];
     (settings.loss == Loss::CrossView && !std::ptr::eq(other, set)).then_some(other)
 }
 
@@ -200,6 +251,12 @@ impl<'a> Way<'a> {
                 [step.loss, step.separation]
             }
         }
+    }
+
+    /// Mean loss of views, which nothing is learnt from.
+    fn mean_loss(&mut self, model: &Model<f32>, sets: &[&MaskSet<f32>], iteration: u64) -> f64 {
+        let losses: f64 = sets.iter().map(|set| self.forward(model, set, None, 0, iteration)[0]).sum();
+        losses / sets.len() as f64
     }
 
     fn alignment(&self, model: &Model<f32>, set: &MaskSet<f32>) -> f64 {
@@ -286,6 +343,7 @@ struct State {
     iteration: u64,
     window: Window,
     curve: Vec<CurvePoint>,
+    settled: Settled,
 }
 
 impl State {
@@ -297,6 +355,7 @@ impl State {
             iteration: 0,
             window: Window::default(),
             curve: Vec::new(),
+            settled: Settled { lowest: f64::MAX, looks: 0.0 },
         }
     }
 
@@ -308,6 +367,7 @@ impl State {
             &Checkpoint {
                 iteration: self.iteration,
                 window: [self.window.loss, self.window.separation, self.window.count],
+                settled: [self.settled.lowest, self.settled.looks],
                 curve: self.curve.clone(),
                 statistics,
                 parameters: [
@@ -344,6 +404,7 @@ impl State {
                     adam.square.copy_from_slice(&layer_square[range]);
                 }
                 self.window = Window { loss: c.window[0], separation: c.window[1], count: c.window[2] };
+                self.settled = Settled { lowest: c.settled[0], looks: c.settled[1] };
                 self.curve = c.curve;
                 self.iteration = c.iteration;
                 stage.info(&format!("continuing from iteration {}", self.iteration));

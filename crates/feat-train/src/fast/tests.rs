@@ -46,7 +46,7 @@ fn difference(found: &[f32], exact: &[f64]) -> f64 {
 
 fn check(settings: Settings, kind: Neighbours, propagate: bool) {
     let name = format!("{settings:?} {kind:?} {propagate}");
-    let context = context(6001, kind, propagate);
+    let context = context(4501, kind, propagate);
     let set = mask_set::<f32>(&context, 23, 3);
     let mut model = Model::<f32>::new(settings, &context, &mut ChaCha8Rng::seed_from_u64(5));
     let exact = widened(&model);
@@ -92,7 +92,7 @@ fn agrees_with_the_readable_model() {
             check(settings(6, layers, Loss::Printed), kind, true);
         }
     }
-    for d in [2, 3, 5, 8, 16, 17, 64] {
+    for d in [2, 5, 16, 64] {
         check(settings(d, 2, Loss::WithSelf), Anchors, true);
     }
     check(settings(6, 2, Loss::HalfMask), Gaussians, true);
@@ -249,7 +249,7 @@ fn one_mask_or_masks_without_entries_or_direction_move_nothing_wrongly() {
     // One mask: nothing to tell apart.
     let mut model = fresh(2);
     let start: Vec<f64> = model.features.iter().map(|v| f64::from(*v)).collect();
-    assert_eq!(run_on(&context, &set_of(&context, &[0..30]), &mut model, 5), start);
+    assert_eq!(run_on(&context, &set_of(&context, std::slice::from_ref(&(0..30))), &mut model, 5), start);
     // A mask without entries takes no part.
     let with = run_on(&context, &set_of(&context, &[0..20, 5..5, 30..60]), &mut fresh(2), 5);
     let without = run_on(&context, &set_of(&context, &[0..20, 30..60]), &mut fresh(2), 5);
