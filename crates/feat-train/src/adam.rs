@@ -11,8 +11,56 @@ const BETA2: f64 = 0.999;
 const EPSILON: f64 = 1e-15;
 /// Means below this are nothing: without gradient they would decay into denormal numbers, which are slow.
 const TINY: f64 = 1e-30;
+/// So are mean squares below this.
+const TINY_SQUARE: f64 = 1e-37;
 /// Parameters updated at a time.
 const CHUNK: usize = 16_384;
+
+/// The rate with the first moment's bias taken out, and the root of that of the second; `step` counts from 1.
+fn corrected(rate: f64, step: u64) -> (f64, f64) {
+    let power = |beta: f64| 1.0 - beta.powi(step.min(1 << 30) as i32);
+    (rate / power(BETA1), power(BETA2).sqrt())
+}
+
+/// One step's constants in f32: m' = b1 m + c1 g, v' = b2 v + c2 g², p' = p - rate m' / (root √v' + epsilon).
+#[derive(Debug, Clone, Copy, PartialEq)]
+#[allow(missing_docs, reason = "the letters are those of the formula")]
+pub struct Rates {
+    pub b1: f32,
+    pub c1: f32,
+    pub b2: f32,
+    pub c2: f32,
+    pub rate: f32,
+    pub root: f32,
+    pub epsilon: f32,
+    /// Means below this are set to zero.
+    pub tiny: f32,
+    /// Mean squares below this are set to zero.
+    pub tiny_square: f32,
+}
+
+impl Rates {
+    /// Of step `step`, which counts from 1.
+    pub fn at(rate: f64, step: u64) -> Self {
+        let (rate, root) = corrected(rate, step);
+        Self {
+            b1: BETA1 as f32,
+            c1: (1.0 - BETA1) as f32,
+            b2: BETA2 as f32,
+            c2: (1.0 - BETA2) as f32,
+            rate: rate as f32,
+            root: (1.0 / root) as f32,
+            epsilon: EPSILON as f32,
+            tiny: TINY as f32,
+            tiny_square: TINY_SQUARE as f32,
+        }
+    }
+
+    /// A step that moves nothing and leaves the gradient in the place of its mean.
+    pub fn none() -> Self {
+        Self { b1: 0.0, c1: 1.0, b2: 0.0, c2: 0.0, rate: 0.0, tiny: 0.0, ..Self::at(0.0, 1) }
+    }
+}
 
 /// State of the optimiser for one array of parameters.
 #[derive(Debug, Clone, Default, PartialEq)]
@@ -31,8 +79,7 @@ impl<T: Real> Adam<T> {
 
     /// One update; `step` counts from 1.
     pub fn update(&mut self, parameters: &mut [T], gradient: &[T], rate: f64, step: u64) {
-        let power = |beta: f64| 1.0 - beta.powi(step.min(1 << 30) as i32);
-        let (rate, root) = (rate / power(BETA1), power(BETA2).sqrt());
+        let (rate, root) = corrected(rate, step);
         let (b1, b2) = (T::of(BETA1), T::of(BETA2));
         let (c1, c2) = (T::of(1.0 - BETA1), T::of(1.0 - BETA2));
         parameters
@@ -44,6 +91,9 @@ impl<T: Real> Adam<T> {
                 for i in 0..p.len() {
                     m[i] = b1 * m[i] + c1 * g[i];
                     v[i] = b2 * v[i] + c2 * g[i] * g[i];
+                    if v[i].get() < TINY_SQUARE {
+                        v[i] = T::default();
+                    }
                     let mean = m[i].get();
                     if mean.abs() < TINY {
                         m[i] = T::default();

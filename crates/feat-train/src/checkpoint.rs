@@ -5,7 +5,7 @@ use gs_io::{Artifact, ArtifactWriter, Error, Provenance, Result};
 use std::path::{Path, PathBuf};
 
 const FORMAT: &str = "feat-train-checkpoint";
-const VERSION: u32 = 1;
+const VERSION: u32 = 2;
 const NAMES: [&str; 6] = ["features", "weights", "mean", "square", "weights_mean", "weights_square"];
 
 /// All that training needs to go on as if it had never stopped.
@@ -15,8 +15,12 @@ pub struct Checkpoint {
     pub iteration: u64,
     /// Sums since the last point of the curve: loss, separation, count.
     pub window: [f64; 3],
+    /// Lowest loss of held-out views, and looks since.
+    pub settled: [f64; 2],
     /// The curve so far.
     pub curve: Vec<CurvePoint>,
+    /// Means and deviations in use, which may be older than the parameters; see `Engine::statistics`.
+    pub statistics: Vec<f64>,
     /// Features, network weights, and the optimiser's means and squares of the features and of the weights.
     pub parameters: [Vec<f32>; 6],
 }
@@ -34,12 +38,14 @@ pub fn path(output: &Path) -> PathBuf {
 /// When the file cannot be written.
 pub fn write(path: &Path, provenance: &Provenance, checkpoint: &Checkpoint) -> Result<()> {
     let curve: Vec<f64> =
-        checkpoint.curve.iter().flat_map(|p| [p.iteration as f64, p.loss, p.alignment, p.separation]).collect();
+        checkpoint.curve.iter().flat_map(|p| [p.iteration as f64, p.loss, p.alignment, p.separation, p.rate]).collect();
     let provenance = Provenance { format: FORMAT.into(), version: VERSION, ..provenance.clone() };
     let mut writer = ArtifactWriter::new(provenance)
         .tensor("iteration", &[1], &[checkpoint.iteration])
         .tensor("window", &[3], &checkpoint.window)
-        .tensor("curve", &[checkpoint.curve.len(), 4], &curve);
+        .tensor("settled", &[2], &checkpoint.settled)
+        .tensor("curve", &[checkpoint.curve.len(), 5], &curve)
+        .tensor("statistics", &[checkpoint.statistics.len()], &checkpoint.statistics);
     for (name, values) in NAMES.iter().zip(&checkpoint.parameters) {
         writer = writer.tensor(name, &[values.len()], values);
     }
@@ -56,7 +62,8 @@ pub fn read(path: &Path, provenance: &Provenance, lengths: [usize; 6]) -> Result
     if (&p.parameters, &p.inputs, &p.program) != (&provenance.parameters, &provenance.inputs, &provenance.program) {
         return Err(Error::new("of other parameters or inputs").file(path));
     }
-    let curve = a.tensor::<f64>("curve", &[None, Some(4)])?;
+    let curve = a.tensor::<f64>("curve", &[None, Some(5)])?;
+    let settled = a.tensor::<f64>("settled", &[Some(2)])?;
     let window = a.tensor::<f64>("window", &[Some(3)])?;
     let mut parameters: [Vec<f32>; 6] = Default::default();
     for ((to, name), length) in parameters.iter_mut().zip(NAMES).zip(lengths) {
@@ -68,10 +75,12 @@ pub fn read(path: &Path, provenance: &Provenance, lengths: [usize; 6]) -> Result
     Ok(Checkpoint {
         iteration: a.tensor::<u64>("iteration", &[Some(1)])?[0],
         window: [window[0], window[1], window[2]],
+        settled: [settled[0], settled[1]],
         curve: curve
-            .chunks_exact(4)
-            .map(|p| CurvePoint { iteration: p[0] as u64, loss: p[1], alignment: p[2], separation: p[3] })
+            .chunks_exact(5)
+            .map(|p| CurvePoint { iteration: p[0] as u64, loss: p[1], alignment: p[2], separation: p[3], rate: p[4] })
             .collect(),
+        statistics: a.tensor::<f64>("statistics", &[None])?.to_vec(),
         parameters,
     })
 }

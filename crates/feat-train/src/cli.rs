@@ -2,6 +2,7 @@
 
 use crate::checkpoint;
 use crate::evidence::{Evidence, Matrix};
+use crate::fast::{Engine, Shortcuts};
 use crate::loss::Loss;
 use crate::model::{Init, Settings};
 use crate::normalize::Axis;
@@ -109,6 +110,15 @@ struct Contrastive {
     /// Iterations between checkpoints; 0 for none
     #[arg(long, value_name = "COUNT", default_value_t = 1000)]
     checkpoint_every: u64,
+    /// Take means and deviations anew only every so many iterations: an approximation
+    #[arg(long, value_name = "COUNT", default_value_t = 1)]
+    stats_every: u64,
+    /// Leave Gaussians that the view does not see, and their momentum, as they are: an approximation
+    #[arg(long)]
+    lazy_adam: bool,
+    /// Hold out every tenth view from training, and stop when their loss has settled
+    #[arg(long)]
+    early_stop: bool,
     /// Iterations between points of the curve
     #[arg(long, value_name = "COUNT", default_value_t = 50)]
     curve_every: u64,
@@ -157,6 +167,7 @@ impl Args {
             ("--weight-lr", positive(c.weight_lr), c.weight_lr.to_string(), "more than 0".into()),
             ("--cohesion", c.cohesion >= 0.0 && c.cohesion.is_finite(), c.cohesion.to_string(), "0 or more".into()),
             ("--cutoff", positive(self.spectral.cutoff), self.spectral.cutoff.to_string(), "more than 0".into()),
+            ("--stats-every", c.stats_every > 0, "0".into(), "at least 1".into()),
             ("--curve-every", c.curve_every > 0, "0".into(), "at least 1".into()),
             (
                 "--power",
@@ -196,6 +207,9 @@ impl Args {
                 "cohesion": c.cohesion,
                 "propagation": !c.no_propagation,
                 "curve_every": c.curve_every,
+                "stats_every": c.stats_every,
+                "lazy_adam": c.lazy_adam,
+                "early_stop": c.early_stop,
             }),
             Method::Spectral => json!({
                 "dim": self.dim.map_or(json!("auto"), |d| json!(d)),
@@ -257,9 +271,10 @@ impl Args {
             .iter()
             .map(|&i| [0, 1, 2].map(|ch| 0.5 + SH_C0 * gaussians.sh_of(i as usize)[ch]))
             .collect();
+        let positions: Vec<[f32; 3]> = inputs.graph.kept.iter().map(|&i| gaussians.means[i as usize]).collect();
         drop(gaussians);
-        let context = Context::new(&inputs.graph, &colors, c.neighbours, !c.no_propagation);
-        let sets = mask_sets::<f32>(&inputs.footprints, &context, &self.levels, 2);
+        let context = Context::new(&inputs.graph, &colors, &positions, c.neighbours, !c.no_propagation);
+        let sets = mask_sets::<f32>(&inputs.footprints, &context, &self.levels, 2)?;
         let units = inputs.footprints.views.len() * self.levels.len();
         if sets.len() < units {
             stage.skipped(&format!("{} of {units} views and levels: fewer than two masks", units - sets.len()));
@@ -286,14 +301,24 @@ impl Args {
             seed: self.common.seed,
             checkpoint_every: c.checkpoint_every,
             curve_every: c.curve_every,
+            shortcuts: Shortcuts { stats_every: c.stats_every, lazy_adam: c.lazy_adam },
+            early_stop: c.early_stop,
         };
+        if !Engine::serves(&options.settings) && options.shortcuts != Shortcuts::default() {
+            return Err(Error::new("not with this loss, --cohesion or --norm-axis").field(if c.lazy_adam {
+                "--lazy-adam"
+            } else {
+                "--stats-every"
+            }));
+        }
         // A checkpoint serves runs of any number of iterations, as long as everything else is equal.
         let provenance = stage.provenance("", 0, Value::Object(self.parameters()), inputs.hashes.clone());
         let path = checkpoint::path(&self.out);
         let on_curve = |curve: &[CurvePoint]| write_curve(&self.out, curve.iter().map(|p| json!(p)));
         let trained = train(&context, &sets, &options, Some((&path, &provenance)), stage, on_curve)?;
         let last = trained.curve.last().copied().unwrap_or_default();
-        let summary = json!({ "views": sets.len(), "last": last, "resumed_at": trained.resumed_at });
+        let summary = json!({ "views": sets.len(), "last": last, "resumed_at": trained.resumed_at,
+            "iterations": trained.iterations });
         Ok((options.settings.dim, trained.features, summary))
     }
 

@@ -7,7 +7,9 @@
 pub mod adam;
 pub mod checkpoint;
 pub mod cli;
+pub mod cross_view;
 pub mod evidence;
+pub mod fast;
 pub mod linalg;
 pub mod loss;
 pub mod model;

@@ -11,6 +11,9 @@ pub enum Loss {
     WithSelf,
     /// The positive is the centroid of a random half of the mask's Gaussians, in numerator and denominator.
     HalfMask,
+    /// The positive is the centroid of the same thing's mask in another view, in numerator and denominator; a mask
+    /// without counterpart is its own positive. See [`crate::cross_view`].
+    CrossView,
     /// Per Gaussian instead of per mask: each Gaussian against the centroids of all masks, its own masks being positive
     /// in proportion to their weight.
     Gaussian,
@@ -73,17 +76,18 @@ pub fn log_sum_exp(logits: &mut [f64]) -> f64 {
     max + sum.ln()
 }
 
-/// The loss per mask, averaged over the masks that take part. `positives` are needed for [`Loss::HalfMask`] and only
-/// there; [`Loss::Gaussian`] is none of masks: its loss is 0 here and only the separation is of interest.
+/// The loss per mask, averaged over the masks that take part. `positives` are needed for [`Loss::HalfMask`], which gives
+/// their gradient too, and for [`Loss::CrossView`], where they are constant and zeros stand for none; [`Loss::Gaussian`] is none of masks: its loss is 0 here and only the separation is of interest.
 pub fn evaluate(loss: Loss, centroids: &[f64], positives: Option<&[f64]>, d: usize, tau: f64) -> Evaluated {
     let masks = centroids.len() / d;
     let (unit, length) = directions(centroids, d);
     let (pos_unit, pos_length) = positives.map_or_else(Default::default, |p| directions(p, d));
-    let alive: Vec<usize> =
-        (0..masks).filter(|&k| length[k] > SHORTEST && (positives.is_none() || pos_length[k] > SHORTEST)).collect();
+    let separate = loss == Loss::HalfMask;
+    let has_positive = |k: usize| pos_length.get(k).is_some_and(|l| *l > SHORTEST);
+    let alive: Vec<usize> = (0..masks).filter(|&k| length[k] > SHORTEST && (!separate || has_positive(k))).collect();
     let mut out = Evaluated {
         centroids: vec![0.0; centroids.len()],
-        positives: vec![0.0; pos_unit.len()],
+        positives: vec![0.0; if separate { pos_unit.len() } else { 0 }],
         ..Evaluated::default()
     };
     if alive.len() < 2 {
@@ -102,7 +106,8 @@ pub fn evaluate(loss: Loss, centroids: &[f64], positives: Option<&[f64]>, d: usi
         let own = match loss {
             Loss::Gaussian => continue,
             Loss::Printed | Loss::WithSelf => 1.0 / tau,
-            Loss::HalfMask => dot(&u, &of(&pos_unit, k)) / tau,
+            Loss::CrossView if !has_positive(k) => 1.0 / tau,
+            Loss::HalfMask | Loss::CrossView => dot(&u, &of(&pos_unit, k)) / tau,
         };
         if loss != Loss::Printed {
             logits.push(own);
@@ -117,7 +122,7 @@ pub fn evaluate(loss: Loss, centroids: &[f64], positives: Option<&[f64]>, d: usi
             add(&mut unit_gradient, k, share * p / tau, &v);
             add(&mut unit_gradient, j, share * p / tau, &u);
         }
-        if loss == Loss::HalfMask {
+        if matches!(loss, Loss::HalfMask | Loss::CrossView) && has_positive(k) {
             let scale = share * (softmax[others.len()] - 1.0) / tau;
             let v = of(&pos_unit, k);
             add(&mut unit_gradient, k, scale, &v);
@@ -129,7 +134,7 @@ pub fn evaluate(loss: Loss, centroids: &[f64], positives: Option<&[f64]>, d: usi
         let range = k * d..(k + 1) * d;
         let (g, u) = (&unit_gradient[range.clone()], &unit[range.clone()]);
         add_direction_gradient(&mut out.centroids[range.clone()], u, length[k], g);
-        if positives.is_some() {
+        if separate {
             let (g, u) = (&pos_gradient[range.clone()], &pos_unit[range.clone()]);
             add_direction_gradient(&mut out.positives[range], u, pos_length[k], g);
         }

@@ -12,7 +12,7 @@ use rayon::prelude::*;
 /// Channels between layers (paper: "an intermediate channel size of 16").
 const HIDDEN: usize = 16;
 /// Channels of a colour.
-const COLOR: usize = 3;
+pub(crate) const COLOR: usize = 3;
 /// Anchors worked on at a time.
 const CHUNK: usize = 512;
 
@@ -167,7 +167,7 @@ impl<T: Real> Model<T> {
         };
         let h = gather(&|a| &context.anchors[a..=a]);
         let sums = match context.kind {
-            Neighbours::Gaussians => gather(&|a| context.neighbours_of(a)),
+            Neighbours::Gaussians | Neighbours::AnchorInputs => gather(&|a| context.neighbours_of(a)),
             Neighbours::Anchors => network::neighbour_sums(context, &h, channels),
         };
         (h, sums)
@@ -256,6 +256,18 @@ impl<T: Real> Model<T> {
 
     /// Loss and gradients on the masks of one view. `noise` seeds the halves of [`Loss::HalfMask`].
     pub fn step(&self, context: &Context, propagated: &Propagated<T>, set: &MaskSet<T>, noise: u64) -> Step<T> {
+        self.step_beside(context, propagated, set, noise, None)
+    }
+
+    /// [`Model::step`], with positives from another view `[K][d]` for [`Loss::CrossView`].
+    pub fn step_beside(
+        &self,
+        context: &Context,
+        propagated: &Propagated<T>,
+        set: &MaskSet<T>,
+        noise: u64,
+        beside: Option<&[f64]>,
+    ) -> Step<T> {
         let (d, s) = (self.settings.dim, &self.settings);
         let centroids = self.centroids(context, propagated, set);
         let half = |entry: usize| splitmix(noise ^ entry as u64) & 1 == 1;
@@ -269,7 +281,7 @@ impl<T: Real> Model<T> {
                 }
             })
         });
-        let mut evaluated = loss::evaluate(s.loss, &centroids, positives.as_deref(), d, s.tau);
+        let mut evaluated = loss::evaluate(s.loss, &centroids, positives.as_deref().or(beside), d, s.tau);
         let columns = ColumnTerms::new(s, set, &centroids);
         if columns.any() {
             // The column terms move the centroids too: sum their gradients over columns first.
@@ -495,7 +507,10 @@ mod tests {
         let mut rng = ChaCha8Rng::seed_from_u64(1);
         let mut model = Model::<f64>::new(settings, &context, &mut rng);
         let propagated = model.propagate(&context);
-        let step = model.step(&context, &propagated, &set, 77);
+        // Positives for three masks of five.
+        let beside: Vec<f64> = (0..20).map(|i| if i < 12 { f64::from(i * i % 7) - 2.0 } else { 0.0 }).collect();
+        let beside = (model.settings.loss == Loss::CrossView).then_some(&beside[..]);
+        let step = model.step_beside(&context, &propagated, &set, 77, beside);
         let close = |analytic: f64, plus: f64, minus: f64, h: f64, what: &str| {
             let numeric = (plus - minus) / (2.0 * h);
             assert!(
@@ -511,7 +526,7 @@ mod tests {
                 let was = model.features[at];
                 let mut loss = |v: f64| {
                     model.features[at] = v;
-                    model.step(&context, &propagated, &set, 77).loss
+                    model.step_beside(&context, &propagated, &set, 77, beside).loss
                 };
                 let (plus, minus) = (loss(was + h), loss(was - h));
                 model.features[at] = was;
@@ -525,7 +540,7 @@ mod tests {
                 let mut loss = |v: f64| {
                     model.layers[l].weights[i] = v;
                     let p = model.propagate(&context);
-                    model.step(&context, &p, &set, 77).loss
+                    model.step_beside(&context, &p, &set, 77, beside).loss
                 };
                 let (plus, minus) = (loss(was + h), loss(was - h));
                 model.layers[l].weights[i] = was;
@@ -546,7 +561,8 @@ mod tests {
             check(Settings { layers, ..settings() }, Anchors, true);
         }
         check(settings(), Gaussians, false);
-        for loss in [Loss::WithSelf, Loss::HalfMask, Loss::Gaussian] {
+        check(settings(), Neighbours::AnchorInputs, true);
+        for loss in [Loss::WithSelf, Loss::HalfMask, Loss::CrossView, Loss::Gaussian] {
             for norm_axis in [Axis::Channel, Axis::Gaussian] {
                 check(Settings { loss, norm_axis, ..settings() }, Anchors, true);
             }

@@ -38,7 +38,8 @@ impl<T: Real> Layer<T> {
         Self { input, neighbour, output, weights }
     }
 
-    fn split(&self) -> (&[T], &[T], &[T]) {
+    /// W1, W2 and the bias.
+    pub fn split(&self) -> (&[T], &[T], &[T]) {
         let (w1, rest) = self.weights.split_at(self.input * self.output);
         let (w2, bias) = rest.split_at(self.neighbour * self.output);
         (w1, w2, bias)
@@ -57,7 +58,7 @@ pub fn random_layers<T: Real>(
     (0..count)
         .map(|l| {
             let own = if l == 0 { input } else { hidden };
-            let neighbour = if kind == Neighbours::Gaussians { input } else { own };
+            let neighbour = if kind == Neighbours::Anchors { own } else { input };
             Layer::random(own, neighbour, if l + 1 == count { output } else { hidden }, rng)
         })
         .collect()

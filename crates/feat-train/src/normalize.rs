@@ -37,7 +37,7 @@ pub struct Moments {
 
 impl Moments {
     /// From the sums of (x - pivot) and of its square.
-    fn from_sums(pivot: f64, s1: f64, s2: f64, count: f64) -> Self {
+    pub fn from_sums(pivot: f64, s1: f64, s2: f64, count: f64) -> Self {
         if count < 2.0 {
             return Self { mean: pivot + s1, deviation: 0.0, inverse: 0.0, count };
         }
@@ -45,6 +45,19 @@ impl Moments {
         let deviation = ((s2 - s1 * s1 / count).max(0.0) / (count - 1.0)).sqrt();
         let noise = deviation <= NOISE * mean.abs() || deviation <= EPSILON;
         Self { mean, deviation, inverse: if noise { 0.0 } else { 1.0 / (deviation + EPSILON) }, count }
+    }
+
+    /// From parts: each the sums of (x - pivot) and of its square, the pivot and how many values, added up in order.
+    pub fn from_parts(parts: impl Iterator<Item = [f64; 4]> + Clone) -> Self {
+        let Some([_, _, pivot, _]) = parts.clone().find(|p| p[3] > 0.0) else { return Self::default() };
+        let (mut s1, mut s2, mut count) = (0.0, 0.0, 0.0);
+        for [a, b, from, n] in parts.filter(|p| p[3] > 0.0) {
+            let shift = from - pivot;
+            s1 += a + n * shift;
+            s2 += b + 2.0 * shift * a + n * shift * shift;
+            count += n;
+        }
+        Self::from_sums(pivot, s1, s2, count)
     }
 
     /// Standardises a value.

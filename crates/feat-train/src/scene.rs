@@ -1,13 +1,17 @@
 //! What training reads of a scene: the frozen context graph, and the footprints of the masks of each view.
 //!
-//! Gaussians are put in the order of their nearest anchor, so that everything an anchor serves lies together: sums over
-//! an anchor's Gaussians are sums over a range, and no two threads ever add to the same place.
+//! Anchors are put along a space-filling curve and Gaussians in the order of their nearest anchor, so that everything an
+//! anchor serves lies together: sums over an anchor's Gaussians are sums over a range, no two threads ever add to the same
+//! place, and what a view sees, or an anchor aggregates, is mostly near in memory too.
 
 use crate::real::Real;
 use artifacts::{Footprints, Graph, Level};
+use gs_io::{Error, Result};
 
 /// No anchor.
 pub const NONE: u32 = u32::MAX;
+/// Masks of a view at a level, at most: what 16 bits can number.
+const MOST_MASKS: usize = 1 << 16;
 /// Columns in a piece of work, about.
 const PIECE: usize = 2048;
 
@@ -18,6 +22,8 @@ pub enum Neighbours {
     Gaussians,
     /// Its nearest anchors, with their features of the layer before (the paper's text: "distance between anchors").
     Anchors,
+    /// Its nearest anchors, with their inputs at every layer: the formula's shared input over the text's neighbours.
+    AnchorInputs,
 }
 
 /// The frozen graph, with Gaussians in the order of training.
@@ -27,9 +33,9 @@ pub struct Context {
     pub order: Vec<u32>,
     /// Colour of each Gaussian, training order; n.
     pub colors: Vec<[f32; 3]>,
-    /// Place of each anchor's Gaussian in the training order; M.
+    /// Place of each anchor's Gaussian in the training order; M, in the order of the curve.
     pub anchors: Vec<u32>,
-    /// The anchor whose output each Gaussian receives, or [`NONE`]; n, ascending where every Gaussian has one.
+    /// The anchor whose output each Gaussian receives, or [`NONE`]; n, ascending but for those.
     pub source: Vec<u32>,
     /// How many Gaussians receive each anchor's output; M.
     pub served: Vec<u32>,
@@ -46,21 +52,27 @@ pub struct Context {
 }
 
 impl Context {
-    /// Prepares the graph; `colors` are those of the kept Gaussians. Without `propagate` an anchor's output goes to the
-    /// anchor's own Gaussian alone.
-    pub fn new(graph: &Graph, colors: &[[f32; 3]], kind: Neighbours, propagate: bool) -> Self {
+    /// Prepares the graph; `colors` and `positions` are those of the kept Gaussians. Without `propagate` an anchor's output
+    /// goes to the anchor's own Gaussian alone.
+    pub fn new(graph: &Graph, colors: &[[f32; 3]], positions: &[[f32; 3]], kind: Neighbours, propagate: bool) -> Self {
         let (n, m, k) = (graph.kept.len(), graph.anchors.len(), graph.k);
-        let mut order: Vec<u32> = (0..n as u32).collect();
-        order.sort_by_key(|&i| graph.nearest_anchor[i as usize]);
-        let mut place = vec![0u32; n];
-        for (p, &i) in order.iter().enumerate() {
-            place[i as usize] = p as u32;
+        // Anchors of the graph in the order of the curve, and the other way round.
+        let at: Vec<[f32; 3]> = graph.anchors.iter().map(|&a| positions[a as usize]).collect();
+        let curve = along_curve(&at);
+        let rank = inverse(&curve);
+        let mut group: Vec<u32> = graph.nearest_anchor.iter().map(|&a| rank[a as usize]).collect();
+        for (&a, &rank) in graph.anchors.iter().zip(&rank) {
+            // Its own nearest, but for another anchor at the same position.
+            group[a as usize] = if propagate { group[a as usize] } else { rank };
         }
-        let anchors: Vec<u32> = graph.anchors.iter().map(|&a| place[a as usize]).collect();
+        let mut order: Vec<u32> = (0..n as u32).collect();
+        order.sort_by_key(|&i| group[i as usize]);
+        let place = inverse(&order);
+        let anchors: Vec<u32> = curve.iter().map(|&a| place[graph.anchors[a as usize] as usize]).collect();
         let mut source = vec![NONE; n];
         if propagate {
             for (s, &i) in source.iter_mut().zip(&order) {
-                *s = graph.nearest_anchor[i as usize];
+                *s = group[i as usize];
             }
         } else {
             for (a, &p) in anchors.iter().enumerate() {
@@ -72,21 +84,22 @@ impl Context {
             served[s as usize] += 1;
         }
         let (mut neighbour_start, mut neighbours) = (vec![0u32], Vec::with_capacity(m * k));
-        for a in 0..m {
+        for &a in &curve {
+            let a = a as usize;
             let row = a * k..(a + 1) * k;
+            // Rows are padded with the anchor itself, which is not its own neighbour.
+            let others = graph.anchor_knn[row.clone()].iter().map(|&b| b as usize).filter(|&b| b != a);
             match kind {
-                // Rows are padded with the anchor itself, which is not its own neighbour.
                 Neighbours::Gaussians => neighbours
                     .extend(graph.knn[row].iter().filter(|&&i| i != graph.anchors[a]).map(|&i| place[i as usize])),
-                Neighbours::Anchors => {
-                    neighbours.extend(graph.anchor_knn[row].iter().copied().filter(|&b| b as usize != a));
-                }
+                Neighbours::AnchorInputs => neighbours.extend(others.map(|b| place[graph.anchors[b] as usize])),
+                Neighbours::Anchors => neighbours.extend(others.map(|b| rank[b])),
             }
             neighbour_start.push(neighbours.len() as u32);
         }
         let (reverse_start, reverse) = match kind {
             Neighbours::Anchors => transpose(&neighbour_start, &neighbours, m),
-            Neighbours::Gaussians => (vec![0; m + 1], Vec::new()),
+            Neighbours::Gaussians | Neighbours::AnchorInputs => (vec![0; m + 1], Vec::new()),
         };
         let colors = order.iter().map(|&i| colors[i as usize]).collect();
         Self { order, colors, anchors, source, served, neighbour_start, neighbours, kind, reverse_start, reverse }
@@ -103,6 +116,40 @@ impl Context {
     pub fn reverse_of(&self, a: usize) -> &[u32] {
         &self.reverse[self.reverse_start[a] as usize..self.reverse_start[a + 1] as usize]
     }
+}
+
+/// Whether the neighbours of this kind are places in the training order.
+pub fn inputs_are_of_gaussians(kind: Neighbours) -> bool {
+    kind != Neighbours::Anchors
+}
+
+/// The order of points along a Morton curve over their bounding box; ties by index.
+fn along_curve(points: &[[f32; 3]]) -> Vec<u32> {
+    const BITS: u32 = 21;
+    let mut order: Vec<u32> = (0..points.len() as u32).collect();
+    let Some(first) = points.first() else { return order };
+    let bound = |c: usize, best: fn(f32, f32) -> f32| points.iter().map(|p| p[c]).fold(first[c], best);
+    let low: [f32; 3] = std::array::from_fn(|c| bound(c, f32::min));
+    let extent = (0..3).map(|c| f64::from(bound(c, f32::max)) - f64::from(low[c])).fold(0.0, f64::max);
+    let scale = if extent > 0.0 { f64::from((1u32 << BITS) - 1) / extent } else { 0.0 };
+    let code = |p: &[f32; 3]| {
+        let cell: [u64; 3] = std::array::from_fn(|c| ((f64::from(p[c]) - f64::from(low[c])) * scale) as u64);
+        (0..BITS).fold(0u64, |code, bit| {
+            code | (0..3).fold(0, |bits, c| bits | ((cell[c] >> bit) & 1) << (3 * bit + c as u32))
+        })
+    };
+    let codes: Vec<u64> = points.iter().map(code).collect();
+    order.sort_by_key(|&i| codes[i as usize]);
+    order
+}
+
+/// The inverse of a permutation.
+fn inverse(permutation: &[u32]) -> Vec<u32> {
+    let mut out = vec![0u32; permutation.len()];
+    for (to, &from) in permutation.iter().enumerate() {
+        out[from as usize] = to as u32;
+    }
+    out
 }
 
 /// Adjacency lists the other way round; sources ascend.
@@ -137,7 +184,7 @@ pub struct MaskSet<T> {
     /// Where the entries of each column begin; v + 1.
     pub start: Vec<u32>,
     /// Mask of each entry, below K, ascending within a column.
-    pub mask: Vec<u32>,
+    pub mask: Vec<u16>,
     /// A[mask, column]: summed blending weight over gated pixels.
     pub weight: Vec<T>,
     /// Bounds of the pieces in which columns are worked on; the Gaussians of an anchor are never parted.
@@ -147,7 +194,7 @@ pub struct MaskSet<T> {
 impl<T: Real> MaskSet<T> {
     /// Entries of the column at position `c`: masks and weights.
     #[inline]
-    pub fn entries(&self, c: usize) -> (&[u32], &[T]) {
+    pub fn entries(&self, c: usize) -> (&[u16], &[T]) {
         let range = self.start[c] as usize..self.start[c + 1] as usize;
         (&self.mask[range.clone()], &self.weight[range])
     }
@@ -164,16 +211,16 @@ impl<T: Real> MaskSet<T> {
 }
 
 /// The mask sets of all views at the given levels, those with at least `least` masks that have a footprint.
+///
+/// # Errors
+/// When a view has more masks than 16 bits can number.
 pub fn mask_sets<T: Real>(
     footprints: &Footprints,
     context: &Context,
     levels: &[Level],
     least: usize,
-) -> Vec<MaskSet<T>> {
-    let mut place = vec![0u32; context.order.len()];
-    for (p, &i) in context.order.iter().enumerate() {
-        place[i as usize] = p as u32;
-    }
+) -> Result<Vec<MaskSet<T>>> {
+    let place = inverse(&context.order);
     let mut sets = Vec::new();
     let mut from = 0;
     while from < footprints.rows.len() {
@@ -185,11 +232,18 @@ pub fn mask_sets<T: Real>(
             .map(|r| r as u32)
             .collect();
         if levels.iter().any(|&l| l as u32 == first.level) && rows.len() >= least {
-            sets.push(mask_set(footprints, &rows, &place, &context.source_group()));
+            if rows.len() > MOST_MASKS {
+                return Err(Error::new("more masks than can be numbered")
+                    .file(footprints.artifact().path())
+                    .field(format!("view {:?}", footprints.views[first.view as usize]))
+                    .found(rows.len())
+                    .expected(format!("at most {MOST_MASKS}")));
+            }
+            sets.push(mask_set(footprints, &rows, &place, context));
         }
         from = to;
     }
-    sets
+    Ok(sets)
 }
 
 impl Context {
@@ -199,35 +253,47 @@ impl Context {
     }
 }
 
-fn mask_set<T: Real>(
-    footprints: &Footprints,
-    rows: &[u32],
-    place: &[u32],
-    parted: &impl Fn(u32, u32) -> bool,
-) -> MaskSet<T> {
-    let mut triples: Vec<(u32, u32, f32)> = Vec::new();
+fn mask_set<T: Real>(footprints: &Footprints, rows: &[u32], place: &[u32], context: &Context) -> MaskSet<T> {
+    let count = rows.iter().map(|&r| footprints.entries(r as usize).0.len()).sum();
+    let mut entries: Vec<(u32, u16, f32)> = Vec::with_capacity(count);
     for (k, &r) in rows.iter().enumerate() {
         let (col, weight) = footprints.entries(r as usize);
         let gated = footprints.rows[r as usize].gated as f32;
-        triples.extend(col.iter().zip(weight).map(|(&c, &w)| (place[c as usize], k as u32, w / gated)));
+        entries.extend(col.iter().zip(weight).map(|(&c, &w)| (place[c as usize], k as u16, w / gated)));
     }
-    triples.sort_by_key(|t| (t.0, t.1));
-    let mut set = MaskSet {
-        rows: rows.to_vec(),
-        pixels: rows.iter().map(|&r| f64::from(footprints.rows[r as usize].gated)).collect(),
-        mask: triples.iter().map(|t| t.1).collect(),
-        weight: triples.iter().map(|t| T::of(f64::from(t.2))).collect(),
-        ..MaskSet::default()
-    };
-    for (e, t) in triples.iter().enumerate() {
-        if set.columns.last() != Some(&t.0) {
-            set.columns.push(t.0);
-            set.start.push(e as u32);
+    let pixels = rows.iter().map(|&r| f64::from(footprints.rows[r as usize].gated)).collect();
+    MaskSet::from_entries(rows.to_vec(), pixels, entries, context)
+}
+
+impl<T: Real> MaskSet<T> {
+    /// From entries (place in the training order, mask, weight), in any order.
+    pub fn from_entries(
+        rows: Vec<u32>,
+        pixels: Vec<f64>,
+        mut entries: Vec<(u32, u16, f32)>,
+        context: &Context,
+    ) -> Self {
+        entries.sort_unstable_by_key(|t| (t.0, t.1));
+        let mut set = Self {
+            rows,
+            pixels,
+            mask: entries.iter().map(|t| t.1).collect(),
+            weight: entries.iter().map(|t| T::of(f64::from(t.2))).collect(),
+            ..Self::default()
+        };
+        let columns = 1 + entries.windows(2).filter(|w| w[0].0 != w[1].0).count();
+        set.columns.reserve_exact(columns);
+        set.start.reserve_exact(columns + 1);
+        for (e, t) in entries.iter().enumerate() {
+            if set.columns.last() != Some(&t.0) {
+                set.columns.push(t.0);
+                set.start.push(e as u32);
+            }
         }
+        set.start.push(entries.len() as u32);
+        set.pieces = pieces(&set.columns, &context.source_group());
+        set
     }
-    set.start.push(triples.len() as u32);
-    set.pieces = pieces(&set.columns, parted);
-    set
 }
 
 /// Cuts columns into pieces of about [`PIECE`], only where `parted(before, after)` allows.

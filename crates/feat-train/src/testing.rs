@@ -40,7 +40,8 @@ pub fn colors(n: usize) -> Vec<[f32; 3]> {
 
 /// The context of [`graph`].
 pub fn context(n: usize, kind: Neighbours, propagate: bool) -> Context {
-    Context::new(&graph(n, 3), &colors(n), kind, propagate)
+    let positions: Vec<[f32; 3]> = (0..n).map(|i| [i as f32, 0.0, 0.0]).collect();
+    Context::new(&graph(n, 3), &colors(n), &positions, kind, propagate)
 }
 
 /// `masks` masks over most of the Gaussians, some of which lie in two.
@@ -65,7 +66,7 @@ pub fn mask_set<T: Real>(context: &Context, masks: usize, seed: u64) -> MaskSet<
         }
         set.columns.push(place);
         for k in mine {
-            set.mask.push(k);
+            set.mask.push(k as u16);
             set.weight.push(T::of(rng.random_range(0.01..0.1)));
         }
         set.start.push(set.mask.len() as u32);

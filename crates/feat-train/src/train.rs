@@ -1,8 +1,11 @@
 //! The training loop of the paper's stage 2, with checkpoints.
 
-use crate::adam::Adam;
+use crate::adam::{Adam, Rates};
 use crate::checkpoint::{self, Checkpoint};
-use crate::model::{Model, Settings, splitmix};
+use crate::cross_view;
+use crate::fast::{Engine, Shortcuts};
+use crate::loss::{Evaluated, Loss};
+use crate::model::{Model, Propagated, Settings, Step, splitmix};
 use crate::network::Layer;
 use crate::scene::{Context, MaskSet};
 use gs_io::{Error, Provenance, Result};
@@ -29,6 +32,40 @@ pub struct TrainOptions {
     pub checkpoint_every: u64,
     /// Iterations between points of the curve.
     pub curve_every: u64,
+    /// What to do less often than the method asks for.
+    pub shortcuts: Shortcuts,
+    /// Hold out every tenth view and stop when their loss has settled.
+    pub early_stop: bool,
+}
+
+/// Of so many mask sets one is held out for [`TrainOptions::early_stop`].
+const HELD_OUT: usize = 10;
+/// Of those held out, at most so many are looked at.
+const MOST_HELD_OUT: usize = 16;
+/// Iterations between looks at them.
+const LOOK_EVERY: u64 = 250;
+/// Training ends after so many looks without a better loss ...
+const PATIENCE: f64 = 4.0;
+/// ... better meaning lower by this, in nats.
+const BETTER: f64 = 1e-3;
+
+/// Lowest loss of the held-out views, and how many looks ago it was.
+#[derive(Debug, Clone, Copy, PartialEq)]
+struct Settled {
+    lowest: f64,
+    looks: f64,
+}
+
+impl Settled {
+    /// Whether the loss has settled, given that of a look.
+    fn look(&mut self, loss: f64) -> bool {
+        if loss < self.lowest - BETTER {
+            *self = Self { lowest: loss, looks: 0.0 };
+        } else {
+            self.looks += 1.0;
+        }
+        self.looks >= PATIENCE
+    }
 }
 
 /// A point of the training curve.
@@ -42,6 +79,8 @@ pub struct CurvePoint {
     pub alignment: f64,
     /// 1 - mean cosine of the centroids of different masks, mean since the point before.
     pub separation: f64,
+    /// Learning rate of features.
+    pub rate: f64,
 }
 
 /// What training gives.
@@ -53,6 +92,8 @@ pub struct Trained {
     pub curve: Vec<CurvePoint>,
     /// Iteration of the checkpoint it continued from.
     pub resumed_at: u64,
+    /// Iterations done: fewer than asked for when it stopped early.
+    pub iterations: u64,
 }
 
 /// Trains on `sets`, each with at least two masks. `checkpoint`: where checkpoints lie, and what one of this very run
@@ -71,12 +112,20 @@ pub fn train(
     let mut rng = ChaCha8Rng::seed_from_u64(options.seed);
     let model = Model::<f32>::new(options.settings.clone(), context, &mut rng);
     let mut state = State::new(model);
+    let mut statistics = Vec::new();
     if let Some((path, provenance)) = checkpoint {
-        state.restore(path, provenance, options.iterations, stage);
+        statistics = state.restore(path, provenance, options.iterations, stage);
     }
+    let mut way = Way::new(context, &state.model, options);
+    way.restore(&statistics);
     let resumed_at = state.iteration;
-    let d = options.settings.dim;
-    let mut dense = vec![0.0f32; state.model.features.len()];
+    let (held_out, seen): (Vec<_>, Vec<_>) =
+        sets.iter().enumerate().partition(|(i, _)| options.early_stop && i % HELD_OUT == HELD_OUT - 1);
+    let held_out: Vec<&MaskSet<f32>> = held_out.into_iter().map(|(_, set)| set).take(MOST_HELD_OUT).collect();
+    let sets: Vec<&MaskSet<f32>> = seen.into_iter().map(|(_, set)| set).collect();
+    if options.early_stop && held_out.is_empty() {
+        stage.warn(&format!("--early-stop needs {HELD_OUT} views with masks: training to the end"));
+    }
     let mut order: Vec<u32> = Vec::new();
     let mut epoch = u64::MAX;
     let mut progress = stage.progress("iterations", options.iterations).resumed_at(resumed_at);
@@ -86,47 +135,173 @@ pub fn train(
             epoch = now;
             order = shuffled(sets.len(), options.seed, epoch);
         }
-        let set = &sets[order[(state.iteration % sets.len() as u64) as usize] as usize];
-        let propagated = state.model.propagate(context);
+        let set = sets[order[(state.iteration % sets.len() as u64) as usize] as usize];
         let noise = splitmix(options.seed ^ splitmix(state.iteration));
-        let step = state.model.step(context, &propagated, set, noise);
-        if !step.loss.is_finite() {
+        let beside = beside(&sets, set, noise, &options.settings);
+        let [loss, separation] = way.forward(&state.model, set, beside, noise, state.iteration);
+        if !loss.is_finite() {
             return Err(Error::new("the loss is not finite")
                 .field(format!("iteration {}", state.iteration + 1))
-                .found(step.loss)
+                .found(loss)
                 .hint("lower --lr, or raise --tau"));
         }
-        let alignment_due =
-            (state.iteration + 1).is_multiple_of(options.curve_every) || state.iteration + 1 == options.iterations;
-        if alignment_due {
-            let alignment = state.model.alignment(context, &propagated, set);
-            state.window.add(step.loss, step.separation);
-            let point = state.window.take(state.iteration + 1, alignment);
+        state.window.add(loss, separation);
+        if (state.iteration + 1).is_multiple_of(options.curve_every) || state.iteration + 1 == options.iterations {
+            let alignment = way.alignment(&state.model, set);
+            let point = state.window.take(state.iteration + 1, alignment, options.rate);
             state.curve.push(point);
-        } else {
-            state.window.add(step.loss, step.separation);
         }
-        state.update(set, &step.features, &step.layers, &mut dense, d, options);
+        way.update(&mut state, set, noise, options);
+        let settled = state.iteration.is_multiple_of(LOOK_EVERY)
+            && !held_out.is_empty()
+            && state.settled.look(way.mean_loss(&state.model, &held_out, state.iteration));
         let due = options.checkpoint_every > 0 && state.iteration.is_multiple_of(options.checkpoint_every);
         let interrupted = stage.interrupted();
         if let Some((path, provenance)) = checkpoint
             && state.iteration < options.iterations
             && (due || interrupted)
         {
-            state.save(path, provenance)?;
+            state.save(path, provenance, way.statistics())?;
             on_curve(&state.curve)?;
         }
         if interrupted && state.iteration < options.iterations {
             return Err(Error::new("interrupted"));
         }
-        let loss = state.curve.last().map_or(step.loss, |p| p.loss);
+        let loss = state.curve.last().map_or(loss, |p| p.loss);
         progress.set(state.iteration, &[("loss", loss)]);
+        if settled {
+            stage.info(&format!(
+                "stopped after {} of {} iterations: the loss of held-out views has settled at {:.4}",
+                state.iteration, options.iterations, state.settled.lowest
+            ));
+            break;
+        }
     }
     let last = state.curve.last().copied().unwrap_or_default();
     progress.finish(&[("loss", last.loss), ("alignment", last.alignment), ("separation", last.separation)]);
     on_curve(&state.curve)?;
-    let propagated = state.model.propagate(context);
-    Ok(Trained { features: state.model.final_features(context, &propagated), curve: state.curve, resumed_at })
+    let features = way.final_features(&state.model, state.iteration);
+    Ok(Trained { features, curve: state.curve, resumed_at, iterations: state.iteration })
+}
+
+/// Another view to take positives from, for the loss that asks for them.
+fn beside<'a>(
+    sets: &[&'a MaskSet<f32>],
+    set: &MaskSet<f32>,
+    noise: u64,
+    settings: &Settings,
+) -> Option<&'a MaskSet<f32>> {
+    let other = sets[(splitmix(noise) % sets.len() as u64) as usize];
+    (settings.loss == Loss::CrossView && !std::ptr::eq(other, set)).then_some(other)
+}
+
+/// By what an iteration is computed.
+enum Way<'a> {
+    /// The engine, for the settings that it serves, and what it found of the iteration under way.
+    Fast(Box<Engine<'a>>, Evaluated),
+    /// The readable model.
+    Plain { context: &'a Context, propagated: Propagated<f32>, step: Step<f32>, dense: Vec<f32> },
+}
+
+impl<'a> Way<'a> {
+    fn new(context: &'a Context, model: &Model<f32>, options: &TrainOptions) -> Self {
+        if Engine::serves(&model.settings) {
+            Self::Fast(Box::new(Engine::new(context, model, options.shortcuts)), Evaluated::default())
+        } else {
+            let dense = vec![0.0; model.features.len()];
+            Self::Plain { context, propagated: Propagated::default(), step: Step::default(), dense }
+        }
+    }
+
+    fn statistics(&self) -> Vec<f64> {
+        match self {
+            Self::Fast(engine, _) => engine.statistics(),
+            Self::Plain { .. } => Vec::new(),
+        }
+    }
+
+    fn restore(&mut self, statistics: &[f64]) {
+        if let Self::Fast(engine, _) = self {
+            engine.restore(statistics);
+        }
+    }
+
+    /// Loss and separation.
+    fn forward(
+        &mut self,
+        model: &Model<f32>,
+        set: &MaskSet<f32>,
+        beside: Option<&MaskSet<f32>>,
+        noise: u64,
+        iteration: u64,
+    ) -> [f64; 2] {
+        let d = model.settings.dim;
+        match self {
+            Self::Fast(engine, evaluated) => {
+                engine.propagate(model, iteration);
+                let positives = beside.map(|b| cross_view::positives(set, b, &engine.centroids(model, b), d));
+                *evaluated = engine.evaluate_beside(model, set, noise, positives.as_deref());
+                [evaluated.loss, evaluated.separation]
+            }
+            Self::Plain { context, propagated, step, .. } => {
+                *propagated = model.propagate(context);
+                let centroids = |b| model.centroids(context, propagated, b);
+                let positives = beside.map(|b| cross_view::positives(set, b, &centroids(b), d));
+                *step = model.step_beside(context, propagated, set, noise, positives.as_deref());
+                [step.loss, step.separation]
+            }
+        }
+    }
+
+    /// Mean loss of views, which nothing is learnt from.
+    fn mean_loss(&mut self, model: &Model<f32>, sets: &[&MaskSet<f32>], iteration: u64) -> f64 {
+        let losses: f64 = sets.iter().map(|set| self.forward(model, set, None, 0, iteration)[0]).sum();
+        losses / sets.len() as f64
+    }
+
+    fn alignment(&self, model: &Model<f32>, set: &MaskSet<f32>) -> f64 {
+        match self {
+            Self::Fast(engine, _) => engine.alignment(model, set),
+            Self::Plain { context, propagated, .. } => model.alignment(context, propagated, set),
+        }
+    }
+
+    /// Moves all parameters by what [`Way::forward`] found.
+    fn update(&mut self, state: &mut State, set: &MaskSet<f32>, noise: u64, options: &TrainOptions) {
+        let done = state.iteration;
+        state.iteration += 1;
+        let State { model, features, layers, iteration, .. } = state;
+        let gradients = match self {
+            Self::Fast(engine, evaluated) => {
+                let rates = Rates::at(options.rate, *iteration);
+                engine.backward(model, features, set, evaluated, noise, &rates, done)
+            }
+            Self::Plain { step, dense, .. } => {
+                let d = model.settings.dim;
+                for (row, &place) in step.features.chunks_exact(d).zip(&set.columns) {
+                    dense[place as usize * d..(place as usize + 1) * d].copy_from_slice(row);
+                }
+                features.update(&mut model.features, dense, options.rate, *iteration);
+                for &place in &set.columns {
+                    dense[place as usize * d..(place as usize + 1) * d].fill(0.0);
+                }
+                std::mem::take(&mut step.layers)
+            }
+        };
+        for ((layer, adam), gradient) in model.layers.iter_mut().zip(layers).zip(&gradients) {
+            adam.update(&mut layer.weights, gradient, options.weight_rate, *iteration);
+        }
+    }
+
+    fn final_features(&mut self, model: &Model<f32>, iteration: u64) -> Vec<f32> {
+        match self {
+            Self::Fast(engine, _) => {
+                engine.propagate(model, iteration);
+                engine.final_features(model)
+            }
+            Self::Plain { context, .. } => model.final_features(context, &model.propagate(context)),
+        }
+    }
 }
 
 /// The order of views in an epoch: every view once.
@@ -154,9 +329,9 @@ impl Window {
         self.count += 1.0;
     }
 
-    fn take(&mut self, iteration: u64, alignment: f64) -> CurvePoint {
+    fn take(&mut self, iteration: u64, alignment: f64, rate: f64) -> CurvePoint {
         let w = std::mem::take(self);
-        CurvePoint { iteration, loss: w.loss / w.count, alignment, separation: w.separation / w.count }
+        CurvePoint { iteration, loss: w.loss / w.count, alignment, separation: w.separation / w.count, rate }
     }
 }
 
@@ -168,6 +343,7 @@ struct State {
     iteration: u64,
     window: Window,
     curve: Vec<CurvePoint>,
+    settled: Settled,
 }
 
 impl State {
@@ -179,32 +355,11 @@ impl State {
             iteration: 0,
             window: Window::default(),
             curve: Vec::new(),
+            settled: Settled { lowest: f64::MAX, looks: 0.0 },
         }
     }
 
-    fn update(
-        &mut self,
-        set: &MaskSet<f32>,
-        features: &[f32],
-        layers: &[Vec<f32>],
-        dense: &mut [f32],
-        d: usize,
-        options: &TrainOptions,
-    ) {
-        self.iteration += 1;
-        for (row, &place) in features.chunks_exact(d).zip(&set.columns) {
-            dense[place as usize * d..(place as usize + 1) * d].copy_from_slice(row);
-        }
-        self.features.update(&mut self.model.features, dense, options.rate, self.iteration);
-        for &place in &set.columns {
-            dense[place as usize * d..(place as usize + 1) * d].fill(0.0);
-        }
-        for ((layer, adam), gradient) in self.model.layers.iter_mut().zip(&mut self.layers).zip(layers) {
-            adam.update(&mut layer.weights, gradient, options.weight_rate, self.iteration);
-        }
-    }
-
-    fn save(&self, path: &Path, provenance: &Provenance) -> Result<()> {
+    fn save(&self, path: &Path, provenance: &Provenance, statistics: Vec<f64>) -> Result<()> {
         let flat = |of: &dyn Fn(usize) -> Vec<f32>| (0..self.layers.len()).flat_map(of).collect::<Vec<f32>>();
         checkpoint::write(
             path,
@@ -212,7 +367,9 @@ impl State {
             &Checkpoint {
                 iteration: self.iteration,
                 window: [self.window.loss, self.window.separation, self.window.count],
+                settled: [self.settled.lowest, self.settled.looks],
                 curve: self.curve.clone(),
+                statistics,
                 parameters: [
                     &self.model.features[..],
                     &flat(&|l| self.model.layers[l].weights.clone()),
@@ -226,10 +383,10 @@ impl State {
         )
     }
 
-    /// Continues from the checkpoint at `path` if it is of this very run and not past its end.
-    fn restore(&mut self, path: &Path, provenance: &Provenance, iterations: u64, stage: &Stage) {
+    /// Continues from the checkpoint at `path` if it is of this very run and not past its end; gives its statistics.
+    fn restore(&mut self, path: &Path, provenance: &Provenance, iterations: u64, stage: &Stage) -> Vec<f64> {
         if !path.exists() {
-            return;
+            return Vec::new();
         }
         let weights: usize = self.model.layers.iter().map(|l: &Layer<f32>| l.weights.len()).sum();
         let n = self.model.features.len();
@@ -247,12 +404,15 @@ impl State {
                     adam.square.copy_from_slice(&layer_square[range]);
                 }
                 self.window = Window { loss: c.window[0], separation: c.window[1], count: c.window[2] };
+                self.settled = Settled { lowest: c.settled[0], looks: c.settled[1] };
                 self.curve = c.curve;
                 self.iteration = c.iteration;
                 stage.info(&format!("continuing from iteration {}", self.iteration));
+                return c.statistics;
             }
             Ok(c) => stage.info(&format!("the checkpoint is past the end (iteration {}): starting anew", c.iteration)),
             Err(e) => stage.info(&format!("the checkpoint is not of this run, starting anew ({e})")),
         }
+        Vec::new()
     }
 }

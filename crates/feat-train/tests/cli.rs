@@ -10,7 +10,7 @@ use std::time::{Duration, Instant};
 
 /// Gaussians on a line: three things of 40 each; every view shows three masks, the middle thing sometimes in halves.
 const N: usize = 120;
-const VIEWS: usize = 6;
+const VIEWS: usize = 12;
 
 fn inputs(dir: &Path) {
     let g = Gaussians {
@@ -121,6 +121,7 @@ fn training_separates_masks_and_does_not_depend_on_threads() {
     for variant in [
         &["--preset", "paper"][..],
         &["--method", "contrastive", "--neighbours", "anchors", "--loss", "half-mask", "--norm-axis", "gaussian"],
+        &["--method", "contrastive", "--neighbours", "anchor-inputs", "--loss", "cross-view", "--lazy-adam"],
         &["--method", "contrastive", "--loss", "gaussian", "--layers", "0", "--init", "normal-small"],
     ] {
         let with = |threads| {
@@ -165,6 +166,22 @@ fn a_killed_run_continues_to_the_same_bytes() {
     let output = run(dir.path(), &out, &args);
     assert!(String::from_utf8_lossy(&output.stderr).contains("starting anew"));
     assert!(whole == std::fs::read(&out).unwrap());
+}
+
+#[test]
+fn training_stops_early_when_held_out_views_have_settled() {
+    let (dir, out) = setup();
+    let args = ["--preset", "paper", "--lr", "0.01", "--loss", "self", "--iterations", "50000", "--early-stop"];
+    succeed(dir.path(), &out, &args);
+    let record = std::fs::read_to_string(beside(&out, ".run.json")).unwrap();
+    let record: serde_json::Value = serde_json::from_str(&record).unwrap();
+    let done = record["summary"]["iterations"].as_u64().unwrap();
+    assert!((1000..50_000).contains(&done) && done.is_multiple_of(250), "{done}");
+    // What it learnt is what that many iterations learn.
+    let early = Features::read(&out).unwrap().0.values;
+    let done = done.to_string();
+    succeed(dir.path(), &out, &[&args[..6], &["--iterations", &done, "--early-stop"]].concat());
+    assert!(early == Features::read(&out).unwrap().0.values);
 }
 
 #[test]

@@ -1,0 +1,40 @@
+//! The iteration on footprints gives what rendering and averaging give.
+
+#[path = "../benches/rendering.rs"]
+mod rendering;
+#[path = "../benches/scene.rs"]
+mod scene;
+
+use feat_train::loss::Loss;
+use feat_train::model::{Init, Model, Settings};
+use feat_train::normalize::Axis;
+use feat_train::scene::Neighbours;
+use rand::SeedableRng;
+use rand_chacha::ChaCha8Rng;
+
+#[test]
+fn footprints_give_what_rendering_and_averaging_give() {
+    let s = scene::scene(60);
+    let context = s.context(Neighbours::Gaussians, true);
+    let settings = Settings {
+        dim: 6,
+        layers: 2,
+        norm_axis: Axis::Channel,
+        loss: Loss::Printed,
+        tau: 0.1,
+        cohesion: 0.0,
+        init: Init::Uniform,
+    };
+    let mut model = Model::<f32>::new(settings, &context, &mut ChaCha8Rng::seed_from_u64(0));
+    // Away from the start, where all centroids are nearly parallel and gradients nearly cancel.
+    for (i, f) in model.features.iter_mut().enumerate() {
+        *f = 3.0 * *f - 1.5 + (i / 600 % 7) as f32 * 0.3;
+    }
+    let found = rendering::View::new(&s.positions, 60.0, 160, 120).compare(&context, &model, 1);
+    eprintln!("{found:?}");
+    assert!(found.centroids <= 1e-5 && found.loss <= 1e-5 && found.gradients <= 1e-5, "{found:?}");
+    assert!(found.engine > 0.0 && found.rendering > found.engine, "{found:?}");
+    // The synthetic views of the benchmark are of the size that they promise.
+    let views = s.views(&context, 1);
+    assert!((60..=100).contains(&views[0].len()) && views[0].columns.len() > 60 * 60 / 6);
+}
