@@ -104,6 +104,8 @@ fn bench(name: &str, g: &Gaussians, camera: &Camera) -> Value {
         "forward_spread": forward_spread,
         "backward_ns_per_pair": backward,
         "backward_spread": backward_spread,
+        "forward_ns_per_pair_least": least(|r| r.forward_s) * 1e9 / pairs,
+        "backward_ns_per_pair_least": least(|r| r.backward_s) * 1e9 / pairs,
         "forward_ns_per_contributing_pair": forward * pairs / contributing.max(1) as f64,
         "backward_ns_per_contributing_pair": backward * pairs / contributing.max(1) as f64,
         "pairs_evaluated": evaluated,

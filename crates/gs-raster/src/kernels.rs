@@ -38,7 +38,7 @@ type Row = [f32; TILE];
 /// through 1 at 0 and Chebyshev nodes of [-1/2, 1/2].
 #[inline(always)]
 fn exp2<S: Simd>(simd: S, q: S::f32s) -> S::f32s {
-    const COEFFICIENTS: [f32; 5] = [0.693_147_2, 0.240_223_5, 0.055_503_81, 0.009_666_368, 0.001_338_130_2];
+    const COEFFICIENTS: [f32; 5] = [std::f32::consts::LN_2, 0.240_223_5, 0.055_503_81, 0.009_666_368, 0.001_338_130_2];
     // Adding this leaves the nearest whole number in the lowest bits.
     let round = simd.splat_f32s(12_582_912.0);
     let shifted = simd.add_f32s(q, round);
@@ -536,5 +536,89 @@ mod tests {
             assert!((f64::from(exp2(pulp::Scalar, q)) / exact - 1.0).abs() < 5e-7);
         }
         assert_eq!(exp2(pulp::Scalar, 0.0), 1.0);
+    }
+
+    /// Splats over the first tile: of all sizes and shapes, some too faint to see, some that stop it early.
+    fn splats(n: usize) -> Vec<Splat> {
+        let mut state = 1u32;
+        let mut roll = move |low: f32, high: f32| {
+            state = state.wrapping_mul(1_664_525).wrapping_add(1_013_904_223);
+            low + (high - low) * (state >> 8) as f32 / 16_777_216.0
+        };
+        let one = |_| {
+            let (sx, sy, rho) = (roll(0.6, 9.0), roll(0.6, 9.0), roll(-0.95, 0.95));
+            let conic_det = 1.0 / (sx * sx * sy * sy * (1.0 - rho * rho));
+            let opacity = roll(0.01, 1.0);
+            let sigma_max = (255.0 * opacity).ln();
+            let color = [roll(0.0, 1.0), roll(0.0, 1.0), roll(0.0, 1.0)];
+            Splat {
+                mean: [roll(-6.0, 22.0), roll(-6.0, 22.0)],
+                conic: [sy * sy * conic_det, -rho * sx * sy * conic_det, sx * sx * conic_det],
+                conic_det,
+                extent: [sx, sy].map(|s| s * (2.0 * sigma_max).sqrt()),
+                sigma_max,
+                opacity,
+                log2_opacity: opacity.log2(),
+                depth: roll(1.0, 5.0),
+                color,
+                clamped: [false; 3],
+            }
+        };
+        (0..n).map(one).collect()
+    }
+
+    /// All that the kernels put out for a tile.
+    fn everything<S: Simd>(simd: S, splats: &[Splat], rectangle: Rectangle) -> Vec<f32> {
+        let list: Vec<u32> = (0..splats.len() as u32).collect();
+        let p = ForwardTile { splats, list: &list, rectangle }.with_simd(simd);
+        let mut all = [p.rgb.as_flattened(), &p.depth, &p.transmittance].concat();
+        let wave = |k: usize| std::array::from_fn(|i| ((k * PIXELS + i) as f32 * 0.3).sin());
+        let mut d =
+            TileGradients { rgb: [wave(0), wave(1), wave(2)], depth: wave(3), alpha: wave(4), behind: [0.0; PIXELS] };
+        let mut out = vec![SplatGradient::default(); splats.len()];
+        BackwardTile { splats, list: &list, rectangle, d: &mut d, out: &mut out }.with_simd(simd);
+        for o in &out {
+            all.extend([&o.mean[..], &o.mean_abs, &o.conic, &[o.opacity, o.depth], &o.color].concat());
+        }
+        for early_stop in [true, false] {
+            let (mut alphas, mut weights) = (vec![0.0; PIXELS * splats.len()], vec![0.0; PIXELS * splats.len()]);
+            let tile =
+                WeightsTile { splats, list: &list, rectangle, early_stop, alphas: &mut alphas, weights: &mut weights };
+            all.extend(tile.with_simd(simd));
+            all.extend(alphas);
+            all.extend(weights);
+        }
+        all
+    }
+
+    struct Everything<'a>(&'a [Splat], Rectangle);
+
+    impl WithSimd for Everything<'_> {
+        type Output = Vec<f32>;
+
+        #[inline(always)]
+        fn with_simd<S: Simd>(self, simd: S) -> Vec<f32> {
+            everything(simd, self.0, self.1)
+        }
+    }
+
+    #[test]
+    fn the_width_of_vectors_does_not_show() {
+        let splats = splats(150);
+        for rectangle in [(0, 0, 16, 16), (0, 0, 11, 16), (0, 0, 16, 5), (0, 0, 1, 1)] {
+            // These fuse multiplications and additions in software.
+            let four = everything(pulp::Scalar128b, &splats, rectangle);
+            assert!(four == everything(pulp::Scalar256b, &splats, rectangle));
+            assert!(four == everything(pulp::Scalar512b, &splats, rectangle));
+            let here = Arch::new().dispatch(Everything(&splats, rectangle));
+            if !matches!(Arch::new(), Arch::Scalar) {
+                assert!(four == here, "this processor's vectors");
+            }
+            // One float at a time, not fused: the last bits may differ.
+            let norm = |v: &[f32]| v.iter().map(|v| f64::from(*v).powi(2)).sum::<f64>().sqrt();
+            let one = everything(pulp::Scalar, &splats, rectangle);
+            let difference: Vec<f32> = one.iter().zip(&four).map(|(a, b)| a - b).collect();
+            assert!(norm(&difference) < 1e-5 * norm(&four), "{:e}", norm(&difference) / norm(&four));
+        }
     }
 }
