@@ -1,6 +1,8 @@
 //! The command line of `gs-geom`.
 
+mod convert;
 mod eval;
+mod inspect;
 mod render;
 mod train;
 
@@ -30,6 +32,10 @@ enum Command {
     Render(render::RenderArgs),
     /// PSNR and SSIM on held-out views
     Eval(eval::EvalArgs),
+    /// Tell what is in a file of Gaussians: counts, bounds, histograms, faults
+    Inspect(inspect::InspectArgs),
+    /// Drop, crop, trim and re-order the Gaussians of a file
+    Convert(convert::ConvertArgs),
 }
 
 impl Program for Args {
@@ -44,6 +50,8 @@ impl Program for Args {
             Command::Train(args) => args.run(stage),
             Command::Render(args) => args.run(stage),
             Command::Eval(args) => args.run(stage),
+            Command::Inspect(args) => args.run(self.common.json),
+            Command::Convert(args) => args.run(stage),
         }
     }
 }

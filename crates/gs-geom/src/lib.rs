@@ -5,8 +5,10 @@
 
 pub mod checkpoint;
 pub mod cli;
+pub mod convert;
 pub mod densify;
 pub mod init;
+pub mod inspect;
 pub mod loss;
 pub mod metrics;
 pub mod optimiser;
