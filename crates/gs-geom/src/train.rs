@@ -11,7 +11,7 @@ use gs_io::Result;
 use gs_raster::{PixelGradients, RasterOptions, backward, forward};
 use gs_scene::Gaussians;
 use serde::Serialize;
-use serde_json::json;
+use serde_json::{Value, json};
 use std::time::{Duration, Instant};
 
 /// Every parameter that shapes the result.
@@ -73,6 +73,7 @@ pub struct Trainer<'a> {
     state: State,
     gradient: Vec<f32>,
     last: Loss,
+    last_heldout: Option<f64>,
     timings: Timings,
 }
 
@@ -98,7 +99,9 @@ impl<'a> Trainer<'a> {
     ) -> Self {
         let order = ViewOrder::new(options.seed, train.len());
         let last = Loss { l1: 0.0, ssim: 0.0, total: 0.0 };
-        Self { options, extent, train, heldout, order, state, gradient: Vec::new(), last, timings: Timings::default() }
+        let (gradient, timings) = (Vec::new(), Timings::default());
+        let last_heldout = state.progress.curve.iter().rev().find_map(|line| heldout_of(line));
+        Self { options, extent, train, heldout, order, state, gradient, last, last_heldout, timings }
     }
 
     /// The state, for a checkpoint.
@@ -116,6 +119,11 @@ impl<'a> Trainer<'a> {
         self.last
     }
 
+    /// PSNR of the last held-out check, dB.
+    pub fn last_heldout(&self) -> Option<f64> {
+        self.last_heldout
+    }
+
     /// Where the time went.
     pub fn timings(&self) -> Timings {
         self.timings
@@ -129,8 +137,9 @@ impl<'a> Trainer<'a> {
     /// One iteration: render a view, compare, step, and whatever the schedule says.
     ///
     /// # Errors
-    /// When a photograph has to be decoded and cannot be.
+    /// When a photograph has to be decoded and cannot be; the state is then good for a checkpoint.
     pub fn step(&mut self) -> Result<()> {
+        self.complete_curve()?;
         let mut clock = Instant::now();
         let mut lap = |spent: &mut Duration| {
             let now = Instant::now();
@@ -192,7 +201,7 @@ impl<'a> Trainer<'a> {
     /// Adds to the training curve.
     fn note(&mut self, loss: Loss) -> Result<()> {
         let total = self.options.schedule.iterations;
-        let (line_every, heldout_every) = (total.div_ceil(100), total.div_ceil(10));
+        let line_every = total.div_ceil(100);
         let progress = &mut self.state.progress;
         if loss.total.is_finite() {
             let (sums, count) = &mut progress.window;
@@ -206,13 +215,30 @@ impl<'a> Trainer<'a> {
         let (sums, count) = std::mem::take(&mut progress.window);
         let [loss, l1, ssim] = sums.map(|s| s / f64::from(count.max(1)));
         let gaussians = self.state.gaussians.len();
-        let mut line = json!({"iteration": iteration, "loss": loss, "l1": l1, "ssim": ssim, "gaussians": gaussians});
-        if (iteration.is_multiple_of(heldout_every) || iteration == total)
-            && let Some(psnr) = self.heldout_psnr()?
-        {
-            line["psnr_heldout"] = json!(psnr);
-        }
+        let line = json!({"iteration": iteration, "loss": loss, "l1": l1, "ssim": ssim, "gaussians": gaussians});
         self.state.progress.curve.push(line.to_string());
+        self.complete_curve()
+    }
+
+    /// Measures the held-out views where that is due and the curve's last line lacks it. A run that failed in it, because a
+    /// photograph could not be read, makes up for it when it goes on.
+    ///
+    /// # Errors
+    /// When a photograph has to be decoded and cannot be.
+    pub fn complete_curve(&mut self) -> Result<()> {
+        let (total, iteration) = (self.options.schedule.iterations, self.state.progress.iteration);
+        let due = iteration.is_multiple_of(total.div_ceil(10).max(1)) || iteration == total;
+        let Some(last) = self.state.progress.curve.last().filter(|_| due) else { return Ok(()) };
+        let Ok(mut line) = serde_json::from_str::<Value>(last) else { return Ok(()) };
+        if line["iteration"] != iteration || line.get("psnr_heldout").is_some() {
+            return Ok(());
+        }
+        if let Some(psnr) = self.heldout_psnr()? {
+            self.last_heldout = Some(psnr);
+            line["psnr_heldout"] = json!(psnr);
+            self.state.progress.curve.pop();
+            self.state.progress.curve.push(line.to_string());
+        }
         Ok(())
     }
 
@@ -229,4 +255,9 @@ impl<'a> Trainer<'a> {
         }
         Ok(metrics::mean(all.into_iter()))
     }
+}
+
+/// The held-out PSNR that a line of the curve tells.
+fn heldout_of(line: &str) -> Option<f64> {
+    serde_json::from_str::<Value>(line).ok()?["psnr_heldout"].as_f64()
 }

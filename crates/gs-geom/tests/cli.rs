@@ -220,7 +220,7 @@ fn a_stopped_run_goes_on_to_the_same_bytes() {
     succeeds(&training(&out, &[]));
     assert_eq!(fs::read(&out).unwrap(), undisturbed().0);
     assert_eq!(fs::read(format!("{out}.curve.jsonl")).unwrap(), undisturbed().1);
-    assert_eq!(dir.names(), ["g.ply", "g.ply.curve.jsonl", "g.ply.run.json"]);
+    assert_eq!(dir.names(), ["g.ply", "g.ply.curve.jsonl", "g.ply.curve.svg", "g.ply.run.json"]);
 }
 
 #[test]

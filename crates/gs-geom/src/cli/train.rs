@@ -2,15 +2,17 @@
 
 use super::{SceneArgs, beside, check_writable, read_geometry};
 use crate::checkpoint::{self, State};
+use crate::curve;
 use crate::densify::{DensifyOptions, remove_invisible};
 use crate::init;
+use crate::memory::{Bytes, Forecast};
 use crate::photographs::Photographs;
 use crate::schedule::{LearningRates, Schedule};
 use crate::train::{Timings, TrainOptions, Trainer};
 use artifacts::role;
 use gs_io::{Error, Provenance, Result, hash_file, write_bytes};
 use gs_scene::dataset::{Dataset, Split, View};
-use gs_scene::{Camera, Gaussians, PointCloud, ply};
+use gs_scene::{Camera, Gaussians, PointCloud, image_size, ply};
 use serde_json::{Value, json};
 use stage::Stage;
 use std::collections::BTreeMap;
@@ -74,12 +76,16 @@ pub(super) struct TrainArgs {
     /// Begin with small pictures: a quarter of the size, then half
     #[arg(long)]
     coarse: bool,
-    /// Memory for decoded photographs; the rest is decoded anew each time
-    #[arg(long, value_name = "MEGABYTES", default_value_t = 2048)]
-    cache: usize,
+    /// Memory for decoded photographs, such as 512M or 2G; the rest is decoded anew each time. 0 keeps none
+    #[arg(long, value_name = "BYTES", default_value_t = Bytes(2 << 30))]
+    image_cache: Bytes,
     /// Write a checkpoint every so many iterations (500) or seconds (60s); a run that finds one goes on from it
     #[arg(long, value_name = "COUNT|SECONDS", default_value = "60s")]
     checkpoint_every: Every,
+    /// Keep the checkpoint at the end, so that the same command with more --iterations can go on from it: what was done
+    /// stays, and from there on the longer run's schedule holds (rates, densification, degree)
+    #[arg(long)]
+    keep_state: bool,
     /// Ignore a checkpoint and begin anew
     #[arg(long)]
     no_resume: bool,
@@ -180,7 +186,7 @@ impl TrainArgs {
             "init_points": self.init_points,
             "options": options,
         });
-        let run = stage.provenance(checkpoint::FORMAT, checkpoint::VERSION, parameters.clone(), inputs.clone());
+        let run = stage.provenance(checkpoint::FORMAT, checkpoint::VERSION, parameters, inputs);
 
         let cameras: Vec<&Camera> = train.iter().map(|v| &v.camera).collect();
         let extent = init::extent(&cameras, &dataset.points.positions);
@@ -197,12 +203,56 @@ impl TrainArgs {
             cameras[0].height,
             state.gaussians.len()
         ));
-        let budget = self.cache.saturating_mul(1 << 20);
+        let most =
+            if self.fixed_points { state.gaussians.len() } else { self.max_gaussians.max(state.gaussians.len()) };
+        let forecast = self.forecast(&dataset, state.gaussians.len(), most, stage)?;
         let background = options.background;
-        let load = |views, divisor| Photographs::load(views, background, budget, divisor);
-        let photographs = load(train, options.schedule.divisor(state.progress.iteration + 1))?;
-        let mut trainer = Trainer::resume(options, extent, photographs, load(heldout, 1)?, state);
-        if self.optimise(&mut trainer, &run, stage)? { self.finish(trainer, parameters, inputs, stage) } else { Ok(()) }
+        let load = |views, budget, divisor| Photographs::load(views, background, budget, divisor);
+        let bytes = |c: &&Camera| 3 * u64::from(c.width) * u64::from(c.height);
+        let cache = self.image_cache.0;
+        let left = cache.saturating_sub(cameras.iter().map(bytes).sum());
+        let photographs = load(train, cache as usize, options.schedule.divisor(state.progress.iteration + 1))?;
+        let mut trainer = Trainer::resume(options, extent, photographs, load(heldout, left as usize, 1)?, state);
+        let done = self.optimise(&mut trainer, &run, stage).and_then(|done| match done {
+            true => self.finish(&trainer, &run, &forecast, stage),
+            false => Ok(()),
+        });
+        done.inspect_err(|_| self.rescue(&trainer, &run, stage))
+    }
+
+    /// Says how much memory the run will take, with the Gaussians there are and with the most there may be.
+    fn forecast(&self, dataset: &Dataset, now: usize, most: usize, stage: &Stage) -> Result<Forecast> {
+        let mut file_pixels = 0;
+        for view in &dataset.views {
+            let (w, h) = image_size(&view.image_path)?;
+            file_pixels = file_pixels.max(u64::from(w) * u64::from(h));
+        }
+        let cameras = dataset.views.iter().map(|v| &v.camera);
+        let forecast =
+            Forecast::new(cameras, file_pixels, self.image_cache, rayon::current_num_threads(), self.sh_degree);
+        stage.info(&format!(
+            "memory: about {} with {now} Gaussians, at most {} with {most} (photographs {}, pictures {}, {} bytes a Gaussian)",
+            forecast.peak(now),
+            forecast.peak(most),
+            Bytes(forecast.photographs),
+            Bytes(forecast.pictures),
+            forecast.per_gaussian
+        ));
+        Ok(forecast)
+    }
+
+    /// Saves what a failing run has done. An interrupted one has done so already.
+    fn rescue(&self, trainer: &Trainer<'_>, run: &Provenance, stage: &Stage) {
+        let iteration = trainer.state().progress.iteration;
+        if stage.interrupted() {
+            return;
+        }
+        match self.save(trainer, run) {
+            Ok(()) => stage.warn(&format!(
+                "saved a checkpoint after iteration {iteration}; mend the error below, and the same command goes on from it"
+            )),
+            Err(e) => stage.warn(&format!("no checkpoint after iteration {iteration} could be saved: {e}")),
+        }
     }
 
     /// The state of an interrupted run of the same parameters and inputs.
@@ -214,7 +264,11 @@ impl TrainArgs {
         match checkpoint::read(&path, run) {
             Ok(state) => {
                 if let Some(state) = &state {
-                    stage.info(&format!("going on after iteration {}", state.progress.iteration));
+                    let from = state.progress.iteration;
+                    stage.info(&format!("going on after iteration {from}"));
+                    if state.progress.extended.last() == Some(&from) {
+                        stage.info(&format!("from here on with the schedule of {} iterations", self.iterations));
+                    }
                 }
                 state
             }
@@ -228,7 +282,12 @@ impl TrainArgs {
     /// The Gaussians before the first iteration.
     fn start(&self, dataset: &Dataset, cameras: &[&Camera], extent: f64, stage: &Stage) -> Result<Gaussians> {
         if let Some(path) = &self.init {
-            return Ok(init::with_degree(read_geometry(path)?, self.sh_degree));
+            let g = init::with_degree(read_geometry(path)?, self.sh_degree);
+            let zero = g.rotations.iter().filter(|q| q.iter().all(|v| v.abs() < 1e-12)).count();
+            if zero > 0 {
+                stage.warn(&format!("{zero} Gaussians of --init have a quaternion of length 0 and are never drawn"));
+            }
+            return Ok(g);
         }
         let random: PointCloud;
         let points = if !dataset.points.is_empty() {
@@ -252,6 +311,7 @@ impl TrainArgs {
         let mut progress = stage.progress("iteration", self.iterations.into()).resumed_at(first.into());
         let mut saved = Instant::now();
         let mut smooth: Option<f64> = None;
+        trainer.complete_curve()?;
         while !trainer.is_done() {
             let iteration = trainer.state().progress.iteration;
             let stop = self.stop_after.is_some_and(|last| iteration >= last);
@@ -271,7 +331,10 @@ impl TrainArgs {
             let loss = trainer.last_loss().total;
             let s = smooth.get_or_insert(loss);
             *s += 0.02 * (loss - *s);
-            progress.set(iteration.into(), &[("loss", *s), ("Gaussians", trainer.state().gaussians.len() as f64)]);
+            let gaussians = trainer.state().gaussians.len() as f64;
+            let fields = [("loss", *s), ("Gaussians", gaussians), ("psnr", trainer.last_heldout().unwrap_or(0.0))];
+            let fields = if trainer.last_heldout().is_some() { &fields[..] } else { &fields[..2] };
+            progress.set(iteration.into(), fields);
             let due = match self.checkpoint_every {
                 Every::Iterations(n) => iteration.is_multiple_of(n),
                 Every::Seconds(s) => saved.elapsed().as_secs_f64() >= s,
@@ -290,16 +353,13 @@ impl TrainArgs {
     }
 
     /// Writes everything a finished run leaves.
-    fn finish(
-        &self,
-        trainer: Trainer<'_>,
-        parameters: Value,
-        inputs: BTreeMap<String, String>,
-        stage: &Stage,
-    ) -> Result<()> {
+    fn finish(&self, trainer: &Trainer<'_>, run: &Provenance, forecast: &Forecast, stage: &Stage) -> Result<()> {
         let psnr = trainer.heldout_psnr()?;
         let timings = trainer.timings();
-        let State { mut gaussians, progress, .. } = trainer.into_state();
+        let (parameters, inputs) = (&run.parameters, &run.inputs);
+        let State { gaussians, progress, .. } = trainer.state();
+        let predicted = forecast.peak(gaussians.len());
+        let mut gaussians = gaussians.clone();
         if !self.fixed_points {
             let removed = remove_invisible(&mut gaussians);
             if removed > 0 {
@@ -311,7 +371,10 @@ impl TrainArgs {
         }
         let curve: String = progress.curve.iter().map(|line| format!("{line}\n")).collect();
         write_bytes(beside(&self.out, ".curve.jsonl"), curve.as_bytes())?;
-        ply::write_gaussians(&self.out, &gaussians, &comments(&parameters, &inputs))?;
+        write_bytes(beside(&self.out, ".curve.svg"), curve::svg(&progress.curve).as_bytes())?;
+        let mut comments = comments(parameters, inputs);
+        comments.extend(progress.extended.iter().map(|i| format!("extended after iteration {i}")));
+        ply::write_gaussians(&self.out, &gaussians, &comments)?;
         let [cloned, split, removed] = progress.densified;
         let heldout = psnr.map_or(String::new(), |p| format!(", {p:.2} dB on held-out views"));
         stage.info(&format!(
@@ -324,12 +387,16 @@ impl TrainArgs {
             "psnr_heldout": psnr,
             "iterations": progress.iteration,
             "dropped_gradients": progress.dropped,
+            "memory_predicted_bytes": predicted,
+            "extended_after": progress.extended,
             "seconds": seconds(timings),
         });
-        stage.record(&self.out, parameters, inputs, summary)?;
-        for leftover in [checkpoint::path_of(&self.out), beside(&self.out, ".partial.ply")] {
-            remove_if_there(&leftover);
+        stage.record(&self.out, parameters.clone(), inputs.clone(), summary)?;
+        remove_if_there(&beside(&self.out, ".partial.ply"));
+        if self.keep_state {
+            return self.save(trainer, run);
         }
+        remove_if_there(&checkpoint::path_of(&self.out));
         Ok(())
     }
 }
