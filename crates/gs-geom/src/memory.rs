@@ -10,11 +10,15 @@ use std::fmt;
 use std::str::FromStr;
 
 /// The program itself, its threads' stacks and the allocator's slack.
-const BASE: u64 = 16 << 20;
+const BASE: u64 = 10 << 20;
 /// Per pixel in training: render with alpha and depth 20, target 12, gradient 12, three maps of SSIM 36.
 const PER_PIXEL: u64 = 80;
-/// Per pixel of a photograph's file while it is decoded: 8-bit and f32 RGB, and the horizontally shrunk one.
+/// Per pixel of a photograph's file while it is decoded: 8-bit and f32 RGB.
 const PER_DECODED_PIXEL: u64 = 15;
+/// Per pixel while it is shrunk: f32 RGB, once for the pixels of new width and old height, twice for the result.
+const PER_SHRUNK_PIXEL: u64 = 12;
+/// Per tile that a drawn Gaussian touches: its entry in the tile's list and in the Gaussian's, and its gradient.
+const PER_TILE: u64 = 56;
 /// Per pixel of a cached photograph: 8-bit RGB.
 const PER_CACHED_PIXEL: u64 = 3;
 /// Numbers of a Gaussian besides its spherical harmonics: centre, scales, quaternion, opacity.
@@ -72,15 +76,19 @@ pub struct Forecast {
     pub decoding: u64,
     /// Pictures of one iteration.
     pub pictures: u64,
+    /// Lists of the tiles' Gaussians and their gradients, of the views tried.
+    pub tiles: u64,
     /// Per Gaussian.
     pub per_gaussian: u64,
 }
 
 impl Forecast {
-    /// For photographs taken by `cameras`, whose largest file has `file_pixels`, decoded by `threads` at once.
+    /// For photographs taken by `cameras`, whose largest file has `file_size` (width and height in pixels), decoded by
+    /// `threads` at once; `tile_entries` is how many tiles the Gaussians of a view touch, all told.
     pub fn new<'a>(
         cameras: impl Iterator<Item = &'a Camera> + Clone,
-        file_pixels: u64,
+        file_size: (u32, u32),
+        tile_entries: u64,
         cache: Bytes,
         threads: usize,
         sh_degree: u8,
@@ -91,18 +99,22 @@ impl Forecast {
         // Parameters and two moments; beside them, while a checkpoint is written, its tensors and then its bytes. A step
         // takes no more: gradients, drawn Gaussians and their tiles.
         let state = 3 * 4 * numbers + 8;
+        let (most, widest) = cameras.fold((0, 0), |(m, w), c| (pixels(c).max(m), u64::from(c.width).max(w)));
+        let (w, h) = (u64::from(file_size.0), u64::from(file_size.1));
         Self {
             photographs: all.min(cache.0),
-            decoding: threads as u64 * PER_DECODED_PIXEL * file_pixels,
-            pictures: PER_PIXEL * cameras.map(pixels).max().unwrap_or(0),
+            decoding: threads as u64 * (PER_DECODED_PIXEL * w * h + PER_SHRUNK_PIXEL * (widest * h + 2 * most)),
+            pictures: PER_PIXEL * most,
+            tiles: PER_TILE * tile_entries,
             per_gaussian: 3 * state,
         }
     }
 
     /// Peak memory with so many Gaussians, bytes.
     pub fn peak(&self, gaussians: usize) -> Bytes {
-        let training = self.pictures.saturating_add(self.per_gaussian.saturating_mul(gaussians as u64));
-        Bytes(BASE + self.photographs + training.max(self.decoding))
+        // The allocator keeps what decoding took, and the pictures and tiles of training fit into it.
+        let scratch = self.decoding.max(self.pictures + self.tiles);
+        Bytes((BASE + self.photographs + scratch).saturating_add(self.per_gaussian.saturating_mul(gaussians as u64)))
     }
 }
 
@@ -129,11 +141,13 @@ mod tests {
     #[test]
     fn the_cache_bounds_the_photographs_and_gaussians_count() {
         let camera = Camera::look_at(DVec3::X, DVec3::ZERO, DVec3::Z, 1000, 500, 1.0);
-        let of = |cache| Forecast::new([&camera; 4].into_iter(), 2_000_000, Bytes(cache), 2, 3);
-        assert_eq!((of(u64::MAX).photographs, of(100).photographs), (6_000_000, 100));
-        assert_eq!(of(0).decoding, 60_000_000);
-        // Few Gaussians: decoding is the peak; many: they are.
-        assert_eq!(of(0).peak(10), Bytes(BASE + 60_000_000));
-        assert_eq!(of(0).peak(1_000_000), Bytes(BASE + 40_000_000 + 1_000_000 * 3 * (12 * 59 + 8)));
+        let of = |cache, tiles| Forecast::new([&camera; 4].into_iter(), (2000, 1000), tiles, Bytes(cache), 2, 3);
+        assert_eq!((of(u64::MAX, 0).photographs, of(100, 0).photographs), (6_000_000, 100));
+        let decoding = 2 * (15 * 2_000_000 + 12 * (1_000_000 + 2 * 500_000));
+        assert_eq!(of(0, 0).decoding, decoding);
+        // Few tiles: decoding needs more at once; many: training does.
+        let gaussians = 1000 * 3 * (12 * 59 + 8);
+        assert_eq!(of(0, 0).peak(1000), Bytes(BASE + decoding + gaussians));
+        assert_eq!(of(0, 5_000_000).peak(1000), Bytes(BASE + 40_000_000 + 56 * 5_000_000 + gaussians));
     }
 }

@@ -11,6 +11,7 @@ use crate::schedule::{LearningRates, Schedule};
 use crate::train::{Timings, TrainOptions, Trainer};
 use artifacts::role;
 use gs_io::{Error, Provenance, Result, hash_file, write_bytes};
+use gs_raster::{RasterOptions, TILE, forward};
 use gs_scene::dataset::{Dataset, Split, View};
 use gs_scene::{Camera, Gaussians, PointCloud, image_size, ply};
 use serde_json::{Value, json};
@@ -93,6 +94,9 @@ pub(super) struct TrainArgs {
     #[arg(long, value_name = "ITERATION")]
     stop_after: Option<u32>,
 }
+
+/// Views on which the tiles' share of the memory is tried.
+const FORECAST_VIEWS: usize = 4;
 
 /// How often to write a checkpoint.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -203,9 +207,7 @@ impl TrainArgs {
             cameras[0].height,
             state.gaussians.len()
         ));
-        let most =
-            if self.fixed_points { state.gaussians.len() } else { self.max_gaussians.max(state.gaussians.len()) };
-        let forecast = self.forecast(&dataset, state.gaussians.len(), most, stage)?;
+        let forecast = self.forecast(&dataset, &state.gaussians, stage)?;
         let background = options.background;
         let load = |views, budget, divisor| Photographs::load(views, background, budget, divisor);
         let bytes = |c: &&Camera| 3 * u64::from(c.width) * u64::from(c.height);
@@ -221,21 +223,27 @@ impl TrainArgs {
     }
 
     /// Says how much memory the run will take, with the Gaussians there are and with the most there may be.
-    fn forecast(&self, dataset: &Dataset, now: usize, most: usize, stage: &Stage) -> Result<Forecast> {
-        let mut file_pixels = 0;
+    fn forecast(&self, dataset: &Dataset, gaussians: &Gaussians, stage: &Stage) -> Result<Forecast> {
+        let now = gaussians.len();
+        let most = if self.fixed_points { now } else { self.max_gaussians.max(now) };
+        let mut size = (0, 0);
         for view in &dataset.views {
             let (w, h) = image_size(&view.image_path)?;
-            file_pixels = file_pixels.max(u64::from(w) * u64::from(h));
+            size = (w.max(size.0), h.max(size.1));
         }
         let cameras = dataset.views.iter().map(|v| &v.camera);
-        let forecast =
-            Forecast::new(cameras, file_pixels, self.image_cache, rayon::current_num_threads(), self.sh_degree);
+        let apart = dataset.views.len().div_ceil(FORECAST_VIEWS).max(1);
+        let options = RasterOptions { sh_degree: 0, ..RasterOptions::default() };
+        let entries = |c: &Camera| forward(gaussians, c, &options).pairs() / (TILE * TILE);
+        let entries = cameras.clone().step_by(apart).map(entries).max().unwrap_or(0) as u64;
+        let threads = rayon::current_num_threads();
+        let forecast = Forecast::new(cameras, size, entries, self.image_cache, threads, self.sh_degree);
         stage.info(&format!(
             "memory: about {} with {now} Gaussians, at most {} with {most} (photographs {}, pictures {}, {} bytes a Gaussian)",
             forecast.peak(now),
             forecast.peak(most),
             Bytes(forecast.photographs),
-            Bytes(forecast.pictures),
+            Bytes(forecast.decoding.max(forecast.pictures + forecast.tiles)),
             forecast.per_gaussian
         ));
         Ok(forecast)
