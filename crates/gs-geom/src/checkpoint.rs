@@ -5,6 +5,7 @@ use crate::optimiser::Adam;
 use gs_io::{Artifact, ArtifactWriter, Error, Provenance, Result};
 use gs_scene::{Gaussians, sh_coefficients};
 use serde::{Deserialize, Serialize};
+use serde_json::Value;
 use std::path::{Path, PathBuf};
 
 /// Format name of the artifact.
@@ -39,6 +40,9 @@ pub struct ProgressState {
     pub window: ([f64; 3], u32),
     /// Lines of the training curve.
     pub curve: Vec<String>,
+    /// Iterations after which the run was given more of them; see [`read`].
+    #[serde(default)]
+    pub extended: Vec<u32>,
 }
 
 #[derive(Serialize, Deserialize)]
@@ -84,7 +88,9 @@ pub fn write(path: &Path, state: &State, provenance: Provenance) -> Result<()> {
     writer.write(path)
 }
 
-/// Reads the checkpoint at `path`, if there is one of the same run: same program, parameters and inputs.
+/// Reads the checkpoint at `path`, if there is one of the same run: same program, parameters and inputs. A run may have
+/// more iterations than the checkpoint's; what was done stays as it is, and from there on the longer run's schedule
+/// holds, as if the iterations before had been its own.
 ///
 /// # Errors
 /// Says why the checkpoint cannot be used: damaged, or of another run.
@@ -96,16 +102,19 @@ pub fn read(path: &Path, run: &Provenance) -> Result<Option<State>> {
     let p = a.provenance();
     let same = [
         ("program", p.program == run.program),
-        ("parameters", p.parameters == run.parameters),
+        ("parameters", p.parameters == run.parameters || extends(&p.parameters, &run.parameters)),
         ("inputs", p.inputs == run.inputs),
     ];
     if let Some((field, _)) = same.iter().find(|(_, same)| !same) {
         return Err(Error::new("the checkpoint is of another run").file(path).field(*field));
     }
-    let extra: Extra = serde_json::from_value(p.extra.clone())
+    let mut extra: Extra = serde_json::from_value(p.extra.clone())
         .map_err(|e| Error::new(format!("damaged checkpoint: {e}")).file(path).field("extra"))?;
     if extra.sh_degree > 3 {
         return Err(Error::new("damaged checkpoint").file(path).field("sh_degree").found(extra.sh_degree));
+    }
+    if p.parameters != run.parameters {
+        extra.progress.extended.push(extra.progress.iteration);
     }
     let n = a.tensor::<u32>("pull_views", &[None])?.len();
     let group = |prefix: &str| -> Result<Gaussians> {
@@ -130,6 +139,19 @@ pub fn read(path: &Path, run: &Provenance) -> Result<Option<State>> {
     }))
 }
 
+/// Whether the parameters differ only in that the new run has more iterations, and in the schedule, which follows from
+/// their number.
+fn extends(old: &Value, new: &Value) -> bool {
+    let iterations = |p: &Value| p["options"]["schedule"]["iterations"].as_u64();
+    let (Some(before), Some(now)) = (iterations(old), iterations(new)) else { return false };
+    let rest = |p: &Value| {
+        let mut p = p.clone();
+        p["options"]["schedule"] = Value::Null;
+        p
+    };
+    before < now && rest(old) == rest(new)
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -143,7 +165,7 @@ mod tests {
             program: "gs-geom 1".into(),
             parameters: serde_json::json!({"seed": seed, "rate": 0.2f32}),
             inputs: BTreeMap::from([("dataset".into(), "ab".into())]),
-            extra: serde_json::Value::Null,
+            extra: Value::Null,
         }
     }
 
@@ -167,6 +189,7 @@ mod tests {
             densified: [1, 2, 3, 4],
             window: ([0.1, 1.0 / 3.0, f64::MIN_POSITIVE], 7),
             curve: vec!["{\"iteration\":10}".into()],
+            extended: vec![4],
         };
         write(&path, &state, provenance(1)).unwrap();
         assert_eq!(read(&path, &provenance(1)).unwrap().unwrap(), state);
@@ -175,5 +198,23 @@ mod tests {
         let bytes = std::fs::read(&path).unwrap();
         std::fs::write(&path, &bytes[..bytes.len() - 9]).unwrap();
         assert!(read(&path, &provenance(1)).is_err());
+    }
+
+    #[test]
+    fn a_run_may_be_given_more_iterations_but_nothing_else() {
+        let parameters = |iterations: u32, rate: f32| serde_json::json!({"options": {"rate": rate, "schedule": {"iterations": iterations, "densify_until": iterations / 2}}});
+        let run = |parameters| Provenance { parameters, ..provenance(1) };
+        let dir = tempfile::tempdir().unwrap();
+        let path = dir.path().join("c");
+        let mut state = start(zeros(1, 0));
+        state.progress.iteration = 70;
+        write(&path, &state, run(parameters(100, 0.5))).unwrap();
+        assert_eq!(read(&path, &run(parameters(100, 0.5))).unwrap().unwrap().progress.extended, Vec::<u32>::new());
+        assert_eq!(read(&path, &run(parameters(200, 0.5))).unwrap().unwrap().progress.extended, [70]);
+        assert!(read(&path, &run(parameters(99, 0.5))).is_err());
+        assert!(read(&path, &run(parameters(200, 0.25))).is_err());
+        for hostile in [serde_json::json!("x"), serde_json::json!({"options": 3}), Value::Null] {
+            assert!(!extends(&hostile, &parameters(2, 0.5)));
+        }
     }
 }

@@ -1,7 +1,9 @@
 //! The command line of `gs-geom`.
 
 mod budget;
+mod convert;
 mod eval;
+mod inspect;
 mod render;
 mod train;
 
@@ -31,6 +33,10 @@ enum Command {
     Render(render::RenderArgs),
     /// PSNR and SSIM on held-out views
     Eval(eval::EvalArgs),
+    /// Tell what is in a file of Gaussians: counts, bounds, histograms, faults
+    Inspect(inspect::InspectArgs),
+    /// Drop, crop, trim and re-order the Gaussians of a file
+    Convert(convert::ConvertArgs),
 }
 
 impl Program for Args {
@@ -45,6 +51,8 @@ impl Program for Args {
             Command::Train(args) => args.run(stage),
             Command::Render(args) => args.run(stage),
             Command::Eval(args) => args.run(stage),
+            Command::Inspect(args) => args.run(self.common.json),
+            Command::Convert(args) => args.run(stage),
         }
     }
 }

@@ -6,10 +6,14 @@
 pub mod checkpoint;
 pub mod cli;
 pub mod content;
+pub mod convert;
+pub mod curve;
 pub mod densify;
 pub mod init;
+pub mod inspect;
 pub mod loss;
 pub mod mcmc;
+pub mod memory;
 pub mod metrics;
 pub mod optimiser;
 pub mod photographs;

@@ -13,7 +13,7 @@ use gs_raster::{PixelGradients, RasterOptions, backward, forward};
 use gs_scene::Gaussians;
 use rand::Rng;
 use serde::Serialize;
-use serde_json::json;
+use serde_json::{Value, json};
 use std::time::{Duration, Instant};
 
 /// Every parameter that shapes the result.
@@ -88,6 +88,7 @@ pub struct Trainer<'a> {
     /// Which Gaussians the last view drew.
     drawn: Vec<bool>,
     last: Loss,
+    last_heldout: Option<f64>,
     timings: Timings,
 }
 
@@ -115,7 +116,21 @@ impl<'a> Trainer<'a> {
         let last = Loss { l1: 0.0, ssim: 0.0, total: 0.0 };
         let (gradient, derivatives, drawn) = (Vec::new(), Derivatives::default(), Vec::new());
         let timings = Timings::default();
-        Self { options, extent, train, heldout, order, state, gradient, derivatives, drawn, last, timings }
+        let last_heldout = state.progress.curve.iter().rev().find_map(|line| heldout_of(line));
+        Self {
+            options,
+            extent,
+            train,
+            heldout,
+            order,
+            state,
+            gradient,
+            derivatives,
+            drawn,
+            last,
+            last_heldout,
+            timings,
+        }
     }
 
     /// The state, for a checkpoint.
@@ -138,6 +153,11 @@ impl<'a> Trainer<'a> {
         self.last
     }
 
+    /// PSNR of the last held-out check, dB.
+    pub fn last_heldout(&self) -> Option<f64> {
+        self.last_heldout
+    }
+
     /// Where the time went.
     pub fn timings(&self) -> Timings {
         self.timings
@@ -151,8 +171,9 @@ impl<'a> Trainer<'a> {
     /// One iteration: render a view, compare, step, and whatever the schedule says.
     ///
     /// # Errors
-    /// When a photograph has to be decoded and cannot be.
+    /// When a photograph has to be decoded and cannot be; the state is then good for a checkpoint.
     pub fn step(&mut self) -> Result<()> {
+        self.complete_curve()?;
         let mut clock = Instant::now();
         let mut lap = |spent: &mut Duration| {
             let now = Instant::now();
@@ -240,7 +261,7 @@ impl<'a> Trainer<'a> {
     /// Adds to the training curve.
     fn note(&mut self, loss: Loss) -> Result<()> {
         let total = self.options.schedule.iterations;
-        let (line_every, heldout_every) = (total.div_ceil(100), total.div_ceil(10));
+        let line_every = total.div_ceil(100);
         let progress = &mut self.state.progress;
         if loss.total.is_finite() {
             let (sums, count) = &mut progress.window;
@@ -254,13 +275,30 @@ impl<'a> Trainer<'a> {
         let (sums, count) = std::mem::take(&mut progress.window);
         let [loss, l1, ssim] = sums.map(|s| s / f64::from(count.max(1)));
         let gaussians = self.state.gaussians.len();
-        let mut line = json!({"iteration": iteration, "loss": loss, "l1": l1, "ssim": ssim, "gaussians": gaussians});
-        if (iteration.is_multiple_of(heldout_every) || iteration == total)
-            && let Some((psnr, _)) = self.heldout()?
-        {
-            line["psnr_heldout"] = json!(psnr);
-        }
+        let line = json!({"iteration": iteration, "loss": loss, "l1": l1, "ssim": ssim, "gaussians": gaussians});
         self.state.progress.curve.push(line.to_string());
+        self.complete_curve()
+    }
+
+    /// Measures the held-out views where that is due and the curve's last line lacks it. A run that failed in it, because a
+    /// photograph could not be read, makes up for it when it goes on.
+    ///
+    /// # Errors
+    /// When a photograph has to be decoded and cannot be.
+    pub fn complete_curve(&mut self) -> Result<()> {
+        let (total, iteration) = (self.options.schedule.iterations, self.state.progress.iteration);
+        let due = iteration.is_multiple_of(total.div_ceil(10).max(1)) || iteration == total;
+        let Some(last) = self.state.progress.curve.last().filter(|_| due) else { return Ok(()) };
+        let Ok(mut line) = serde_json::from_str::<Value>(last) else { return Ok(()) };
+        if line["iteration"] != iteration || line.get("psnr_heldout").is_some() {
+            return Ok(());
+        }
+        if let Some((psnr, _)) = self.heldout()? {
+            self.last_heldout = Some(psnr);
+            line["psnr_heldout"] = json!(psnr);
+            self.state.progress.curve.pop();
+            self.state.progress.curve.push(line.to_string());
+        }
         Ok(())
     }
 
@@ -280,4 +318,9 @@ impl<'a> Trainer<'a> {
         let psnr = metrics::mean(all.iter().map(|v| v.0));
         Ok(psnr.zip(metrics::mean(all.iter().map(|v| v.1))))
     }
+}
+
+/// The held-out PSNR that a line of the curve tells.
+fn heldout_of(line: &str) -> Option<f64> {
+    serde_json::from_str::<Value>(line).ok()?["psnr_heldout"].as_f64()
 }

@@ -220,7 +220,7 @@ fn a_stopped_run_goes_on_to_the_same_bytes() {
     succeeds(&training(&out, &[]));
     assert_eq!(fs::read(&out).unwrap(), undisturbed().0);
     assert_eq!(fs::read(format!("{out}.curve.jsonl")).unwrap(), undisturbed().1);
-    assert_eq!(dir.names(), ["g.ply", "g.ply.curve.jsonl", "g.ply.run.json"]);
+    assert_eq!(dir.names(), ["g.ply", "g.ply.curve.jsonl", "g.ply.curve.svg", "g.ply.run.json"]);
 }
 
 /// Every way to densify, to choose picture sizes, backgrounds and what Adam moves.
@@ -239,7 +239,7 @@ fn every_way_is_the_same_for_any_threads_and_after_a_stop_and_keeps_the_budget()
         succeeds(&[&training(&whole, way)[..], &["--threads", "1"]].concat());
         // Photographs that are kept and photographs decoded anew are the same.
         for last in ["37", "61", "1000"] {
-            let more = ["--threads", "3", "--stop-after", last, "--cache", "0"];
+            let more = ["--threads", "3", "--stop-after", last, "--image-cache", "0"];
             succeeds(&[&training(&parts, way)[..], &more].concat());
         }
         assert_eq!(fs::read(&whole).unwrap(), fs::read(&parts).unwrap(), "{way:?}");
@@ -269,7 +269,7 @@ fn a_time_budget_is_a_plan_that_can_be_run_without_it() {
     let options: Vec<&str> = plan["options"].as_str().unwrap().split(' ').collect();
     succeeds(&[&given[..5], &["--out", &again], &options].concat());
     assert_eq!(fs::read(&out).unwrap(), fs::read(&again).unwrap(), "{plan}");
-    assert_eq!(dir.names().len(), 6);
+    assert_eq!(dir.names().len(), 8);
     let e = refused(&["train", "--scene", scene(), "--out", &out, "--time-budget", "1s", "--init", "none.ply"]);
     assert!(e.contains("none.ply"), "{e}");
 }

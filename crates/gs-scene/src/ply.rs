@@ -20,10 +20,9 @@ impl Table<'_> {
         Ok(found.map(|f| f.expect("each was found")))
     }
 
-    /// The vertices' positions.
+    /// The vertices' positions, which must be finite.
     fn positions(&self) -> Result<Vec<[f32; 3]>> {
-        let xyz = self.columns(["x", "y", "z"])?;
-        let positions = self.arrays(xyz);
+        let positions = self.positions_as_they_are()?;
         let bad = |p: &[f32; 3]| p.iter().any(|v| !v.is_finite());
         if let Some(first) = positions.iter().position(bad) {
             let all = positions.iter().filter(|p| bad(p)).count();
@@ -34,6 +33,10 @@ impl Table<'_> {
                 .hint("remove these vertices, or export the PLY again"));
         }
         Ok(positions)
+    }
+
+    fn positions_as_they_are(&self) -> Result<Vec<[f32; 3]>> {
+        Ok(self.arrays(self.columns(["x", "y", "z"])?))
     }
 }
 
@@ -48,9 +51,45 @@ pub fn read_gaussians(path: impl AsRef<Path>) -> Result<Gaussians> {
     parse_gaussians(&bytes).map_err(|e| e.file(path))
 }
 
+/// Reads the Gaussians of a 3DGS PLY as [`read_gaussians`] does, but takes every number as it stands, finite or not: for
+/// looking at damaged files and mending them.
+///
+/// # Errors
+/// When the file is damaged or is no 3DGS PLY.
+pub fn read_gaussians_as_they_are(path: impl AsRef<Path>) -> Result<Gaussians> {
+    let path = path.as_ref();
+    let bytes = std::fs::read(path).at("read", path)?;
+    let parse = || gaussians_of(&table::read(&bytes)?);
+    parse().map_err(|e| e.file(path))
+}
+
 fn parse_gaussians(bytes: &[u8]) -> Result<Gaussians> {
     let table = table::read(bytes)?;
-    let means = table.positions()?;
+    // The positions once more than needed, to name a bad one before any other fault.
+    table.positions()?;
+    let mut g = gaussians_of(&table)?;
+    let n = g.len();
+    g.opacity_logits.iter_mut().filter(|o| o.is_infinite()).for_each(|o| *o = o.clamp(-50.0, 50.0));
+    let finite = |name: &str, values: &[f32]| {
+        // Without leaving early, so that it runs at the memory's speed.
+        if values.iter().fold(true, |all, v| all & v.is_finite()) {
+            return Ok(());
+        }
+        let bad: Vec<usize> = (0..values.len()).filter(|&i| !values[i].is_finite()).collect();
+        Err(Error::new("a parameter is not finite")
+            .field(format!("vertex {}, {name}", bad[0] / (values.len() / n)))
+            .found(format!("{}, and {} such numbers in all", values[bad[0]], bad.len()))
+            .hint("remove these vertices, or export the PLY again"))
+    };
+    finite("scale_*", g.log_scales.as_flattened())?;
+    finite("rot_*", g.rotations.as_flattened())?;
+    finite("opacity", &g.opacity_logits)?;
+    finite("f_dc_* or f_rest_*", &g.sh)?;
+    Ok(g)
+}
+
+fn gaussians_of(table: &Table<'_>) -> Result<Gaussians> {
+    let means = table.positions_as_they_are()?;
     let scale = table.columns(["scale_0", "scale_1", "scale_2"])?;
     let rotation = table.columns(["rot_0", "rot_1", "rot_2", "rot_3"])?;
     let [opacity] = table.columns(["opacity"])?;
@@ -72,32 +111,14 @@ fn parse_gaussians(bytes: &[u8]) -> Result<Gaussians> {
     // The file holds them channel by channel, memory coefficient by coefficient.
     let k = sh_coefficients(sh_degree);
     sh_columns.extend((0..k - 1).flat_map(|c| [rest[c], rest[k - 1 + c], rest[2 * (k - 1) + c]]));
-    let n = table.count;
-    let mut g = Gaussians {
+    Ok(Gaussians {
         means,
         log_scales: table.arrays(scale),
         rotations: table.arrays(rotation),
         opacity_logits: table.gather(&[opacity]),
         sh: table.gather(&sh_columns),
         sh_degree,
-    };
-    g.opacity_logits.iter_mut().filter(|o| o.is_infinite()).for_each(|o| *o = o.clamp(-50.0, 50.0));
-    let finite = |name: &str, values: &[f32]| {
-        // Without leaving early, so that it runs at the memory's speed.
-        if values.iter().fold(true, |all, v| all & v.is_finite()) {
-            return Ok(());
-        }
-        let bad: Vec<usize> = (0..values.len()).filter(|&i| !values[i].is_finite()).collect();
-        Err(Error::new("a parameter is not finite")
-            .field(format!("vertex {}, {name}", bad[0] / (values.len() / n)))
-            .found(format!("{}, and {} such numbers in all", values[bad[0]], bad.len()))
-            .hint("remove these vertices, or export the PLY again"))
-    };
-    finite("scale_*", g.log_scales.as_flattened())?;
-    finite("rot_*", g.rotations.as_flattened())?;
-    finite("opacity", &g.opacity_logits)?;
-    finite("f_dc_* or f_rest_*", &g.sh)?;
-    Ok(g)
+    })
 }
 
 fn header(count: usize, comments: &[String], properties: &[(&str, String)]) -> String {

@@ -4,17 +4,20 @@ use super::budget::plan_path;
 use super::{Background, SceneArgs, beside, check_writable, read_geometry};
 use crate::checkpoint::{self, State};
 use crate::content::{self, Gain};
+use crate::curve;
 use crate::densify::{DensifyOptions, Strategy, remove_invisible};
 use crate::init;
 use crate::mcmc::McmcOptions;
+use crate::memory::{Bytes, Forecast};
 use crate::photographs::Photographs;
 use crate::schedule::{LearningRates, Schedule};
 use crate::train::{Timings, TrainOptions, Trainer};
 use artifacts::role;
 use clap::ValueEnum;
 use gs_io::{Error, Provenance, Result, hash_file, write_bytes};
+use gs_raster::{RasterOptions, TILE, forward};
 use gs_scene::dataset::{Dataset, Split, View};
-use gs_scene::{Camera, Gaussians, PointCloud, ply};
+use gs_scene::{Camera, Gaussians, PointCloud, image_size, ply};
 use serde_json::{Value, json};
 use stage::Stage;
 use std::collections::BTreeMap;
@@ -88,12 +91,16 @@ pub(super) struct TrainArgs {
     /// Which Gaussians a step moves
     #[arg(long, value_enum, default_value_t = Moves::Dense)]
     adam: Moves,
-    /// Memory for decoded photographs; the rest is decoded anew each time
-    #[arg(long, value_name = "MEGABYTES", default_value_t = 2048)]
-    cache: usize,
+    /// Memory for decoded photographs, such as 512M or 2G; the rest is decoded anew each time. 0 keeps none
+    #[arg(long, value_name = "BYTES", default_value_t = Bytes(2 << 30))]
+    image_cache: Bytes,
     /// Write a checkpoint every so many iterations (500) or seconds (60s); a run that finds one goes on from it
     #[arg(long, value_name = "COUNT|SECONDS", default_value = "60s")]
     checkpoint_every: Every,
+    /// Keep the checkpoint at the end, so that the same command with more --iterations can go on from it: what was done
+    /// stays, and from there on the longer run's schedule holds (rates, densification, degree)
+    #[arg(long)]
+    keep_state: bool,
     /// Ignore a checkpoint and begin anew
     #[arg(long)]
     pub(super) no_resume: bool,
@@ -121,6 +128,8 @@ enum Moves {
     /// All
     Dense,
 }
+/// Views on which the tiles' share of the memory is tried.
+const FORECAST_VIEWS: usize = 4;
 
 /// How often to write a checkpoint.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -201,7 +210,7 @@ impl TrainArgs {
     }
 
     pub(super) fn cache_bytes(&self) -> usize {
-        self.cache.saturating_mul(1 << 20)
+        usize::try_from(self.image_cache.0).unwrap_or(usize::MAX)
     }
 
     /// Where the picture sizes come from for [`Self::coarse`].
@@ -246,7 +255,7 @@ impl TrainArgs {
             "init_points": self.init_points,
             "options": options,
         });
-        let run = stage.provenance(checkpoint::FORMAT, checkpoint::VERSION, parameters.clone(), inputs.clone());
+        let run = stage.provenance(checkpoint::FORMAT, checkpoint::VERSION, parameters, inputs);
 
         let cameras: Vec<&Camera> = train.iter().map(|v| &v.camera).collect();
         let extent = init::extent(&cameras, &dataset.points.positions);
@@ -267,12 +276,56 @@ impl TrainArgs {
             let sizes = options.schedule.coarse.iter().map(|(last, divisor)| format!("1/{divisor} until {last}"));
             stage.info(&format!("picture sizes: {}, then full", sizes.collect::<Vec<_>>().join(", ")));
         }
-        let mut trainer =
-            Trainer::resume(options, extent, photographs, Photographs::load(heldout, self.cache_bytes())?, state);
-        if self.optimise(&mut trainer, &run, stage)? {
-            self.finish(trainer, parameters, inputs, plan, stage)
-        } else {
-            Ok(())
+        let forecast = self.forecast(&dataset, &state.gaussians, stage)?;
+        let bytes = |c: &&Camera| 3 * u64::from(c.width) * u64::from(c.height);
+        let left = self.image_cache.0.saturating_sub(cameras.iter().map(bytes).sum());
+        let heldout = Photographs::load(heldout, left as usize)?;
+        let mut trainer = Trainer::resume(options, extent, photographs, heldout, state);
+        let done = self.optimise(&mut trainer, &run, stage).and_then(|done| match done {
+            true => self.finish(&trainer, &run, &forecast, plan, stage),
+            false => Ok(()),
+        });
+        done.inspect_err(|_| self.rescue(&trainer, &run, stage))
+    }
+
+    /// Says how much memory the run will take, with the Gaussians there are and with the most there may be.
+    fn forecast(&self, dataset: &Dataset, gaussians: &Gaussians, stage: &Stage) -> Result<Forecast> {
+        let now = gaussians.len();
+        let most = if self.fixed_points { now } else { self.max_gaussians.max(now) };
+        let mut size = (0, 0);
+        for view in &dataset.views {
+            let (w, h) = image_size(&view.image_path)?;
+            size = (w.max(size.0), h.max(size.1));
+        }
+        let cameras = dataset.views.iter().map(|v| &v.camera);
+        let apart = dataset.views.len().div_ceil(FORECAST_VIEWS).max(1);
+        let options = RasterOptions { sh_degree: 0, ..RasterOptions::default() };
+        let entries = |c: &Camera| forward(gaussians, c, &options).pairs() / (TILE * TILE);
+        let entries = cameras.clone().step_by(apart).map(entries).max().unwrap_or(0) as u64;
+        let threads = rayon::current_num_threads();
+        let forecast = Forecast::new(cameras, size, entries, self.image_cache, threads, self.sh_degree);
+        stage.info(&format!(
+            "memory: about {} with {now} Gaussians, at most {} with {most} (photographs {}, pictures {}, {} bytes a Gaussian)",
+            forecast.peak(now),
+            forecast.peak(most),
+            Bytes(forecast.photographs),
+            Bytes(forecast.decoding.max(forecast.pictures + forecast.tiles)),
+            forecast.per_gaussian
+        ));
+        Ok(forecast)
+    }
+
+    /// Saves what a failing run has done. An interrupted one has done so already.
+    fn rescue(&self, trainer: &Trainer<'_>, run: &Provenance, stage: &Stage) {
+        let iteration = trainer.state().progress.iteration;
+        if stage.interrupted() {
+            return;
+        }
+        match self.save(trainer, run) {
+            Ok(()) => stage.warn(&format!(
+                "saved a checkpoint after iteration {iteration}; mend the error below, and the same command goes on from it"
+            )),
+            Err(e) => stage.warn(&format!("no checkpoint after iteration {iteration} could be saved: {e}")),
         }
     }
 
@@ -285,7 +338,11 @@ impl TrainArgs {
         match checkpoint::read(&path, run) {
             Ok(state) => {
                 if let Some(state) = &state {
-                    stage.info(&format!("going on after iteration {}", state.progress.iteration));
+                    let from = state.progress.iteration;
+                    stage.info(&format!("going on after iteration {from}"));
+                    if state.progress.extended.last() == Some(&from) {
+                        stage.info(&format!("from here on with the schedule of {} iterations", self.iterations));
+                    }
                 }
                 state
             }
@@ -311,6 +368,10 @@ impl TrainArgs {
                     .file(path)
                     .found(g.len())
                     .expected(format!("at most {}", self.max_gaussians)));
+            }
+            let zero = g.rotations.iter().filter(|q| q.iter().all(|v| v.abs() < 1e-12)).count();
+            if zero > 0 {
+                stage.warn(&format!("{zero} Gaussians of --init have a quaternion of length 0 and are never drawn"));
             }
             return Ok(g);
         }
@@ -345,6 +406,7 @@ impl TrainArgs {
         let mut progress = stage.progress("iteration", self.iterations.into()).resumed_at(first.into());
         let mut saved = Instant::now();
         let mut smooth: Option<f64> = None;
+        trainer.complete_curve()?;
         while !trainer.is_done() {
             let iteration = trainer.state().progress.iteration;
             let stop = self.stop_after.is_some_and(|last| iteration >= last);
@@ -364,7 +426,10 @@ impl TrainArgs {
             let loss = trainer.last_loss().total;
             let s = smooth.get_or_insert(loss);
             *s += 0.02 * (loss - *s);
-            progress.set(iteration.into(), &[("loss", *s), ("Gaussians", trainer.state().gaussians.len() as f64)]);
+            let gaussians = trainer.state().gaussians.len() as f64;
+            let fields = [("loss", *s), ("Gaussians", gaussians), ("psnr", trainer.last_heldout().unwrap_or(0.0))];
+            let fields = if trainer.last_heldout().is_some() { &fields[..] } else { &fields[..2] };
+            progress.set(iteration.into(), fields);
             let due = match self.checkpoint_every {
                 Every::Iterations(n) => iteration.is_multiple_of(n),
                 Every::Seconds(s) => saved.elapsed().as_secs_f64() >= s,
@@ -385,15 +450,18 @@ impl TrainArgs {
     /// Writes everything a finished run leaves.
     fn finish(
         &self,
-        trainer: Trainer<'_>,
-        parameters: Value,
-        inputs: BTreeMap<String, String>,
+        trainer: &Trainer<'_>,
+        run: &Provenance,
+        forecast: &Forecast,
         plan: Value,
         stage: &Stage,
     ) -> Result<()> {
         let (psnr, ssim) = trainer.heldout()?.unzip();
         let timings = trainer.timings();
-        let State { mut gaussians, progress, .. } = trainer.into_state();
+        let (parameters, inputs) = (&run.parameters, &run.inputs);
+        let State { gaussians, progress, .. } = trainer.state();
+        let predicted = forecast.peak(gaussians.len());
+        let mut gaussians = gaussians.clone();
         if !self.fixed_points {
             let removed = remove_invisible(&mut gaussians);
             if removed > 0 {
@@ -405,7 +473,10 @@ impl TrainArgs {
         }
         let curve: String = progress.curve.iter().map(|line| format!("{line}\n")).collect();
         write_bytes(beside(&self.out, ".curve.jsonl"), curve.as_bytes())?;
-        ply::write_gaussians(&self.out, &gaussians, &comments(&parameters, &inputs))?;
+        write_bytes(beside(&self.out, ".curve.svg"), curve::svg(&progress.curve).as_bytes())?;
+        let mut comments = comments(parameters, inputs);
+        comments.extend(progress.extended.iter().map(|i| format!("extended after iteration {i}")));
+        ply::write_gaussians(&self.out, &gaussians, &comments)?;
         let [cloned, split, removed, relocated] = progress.densified;
         let heldout = psnr.map_or(String::new(), |p| format!(", {p:.2} dB on held-out views"));
         stage.info(&format!(
@@ -419,14 +490,20 @@ impl TrainArgs {
             "ssim_heldout": ssim,
             "iterations": progress.iteration,
             "dropped_gradients": progress.dropped,
+            "memory_predicted_bytes": predicted,
+            "extended_after": progress.extended,
             "seconds": seconds(timings),
             "cpu_seconds": cpu_seconds(),
             "plan": plan,
         });
-        stage.record(&self.out, parameters, inputs, summary)?;
-        for leftover in [checkpoint::path_of(&self.out), beside(&self.out, ".partial.ply"), plan_path(&self.out)] {
+        stage.record(&self.out, parameters.clone(), inputs.clone(), summary)?;
+        for leftover in [beside(&self.out, ".partial.ply"), plan_path(&self.out)] {
             remove_if_there(&leftover);
         }
+        if self.keep_state {
+            return self.save(trainer, run);
+        }
+        remove_if_there(&checkpoint::path_of(&self.out));
         Ok(())
     }
 }

@@ -1,0 +1,82 @@
+//! `gs-geom inspect`.
+
+use crate::inspect::{Bin, Bounds, Report, inspect};
+use gs_io::{Error, IoContext, Result};
+use gs_scene::ply;
+use std::fmt::Write as _;
+use std::io::Write as _;
+use std::path::PathBuf;
+
+/// Arguments of `gs-geom inspect`.
+#[derive(Debug, clap::Args)]
+pub(super) struct InspectArgs {
+    /// Gaussians, as a 3DGS PLY of any property order and encoding
+    #[arg(value_name = "FILE")]
+    file: PathBuf,
+}
+
+impl InspectArgs {
+    /// Tells on standard output: text, or one JSON object.
+    pub(super) fn run(&self, json: bool) -> Result<()> {
+        let file_bytes = std::fs::metadata(&self.file).at("read", &self.file)?.len();
+        let report = inspect(&ply::read_gaussians_as_they_are(&self.file)?);
+        let told = if json {
+            let failed = |e: serde_json::Error| Error::new(e.to_string()).file(&self.file);
+            let mut object = serde_json::to_value(&report).map_err(failed)?;
+            object["file_bytes"] = file_bytes.into();
+            format!("{object}\n")
+        } else {
+            text(&report, file_bytes)
+        };
+        // A closed pipe is the reader's choice, not an error.
+        let _ = std::io::stdout().lock().write_all(told.as_bytes());
+        Ok(())
+    }
+}
+
+fn text(r: &Report, file_bytes: u64) -> String {
+    let mut t = String::new();
+    let mut line = |name: &str, value: String| {
+        let _ = writeln!(t, "{name:<20}{value}");
+    };
+    line("Gaussians", r.gaussians.to_string());
+    line("SH degree", r.sh_degree.to_string());
+    let mib = |bytes: f64| format!("{:.1} MiB", bytes / f64::from(1 << 20));
+    line("memory", format!("{} of parameters, {} on disk", mib(r.memory_bytes as f64), mib(file_bytes as f64)));
+    line("bounds", corners(r.bounds));
+    line("1% to 99%", corners(r.robust_bounds));
+    if let Some([least, median, most, max]) = r.aspect {
+        line("aspect", format!("least {least:.3}, median {median:.3}, 99% {most:.3}, greatest {max:.3}"));
+    }
+    line("below 1/255 opacity", format!("{} (never drawn)", r.invisible));
+    let f = &r.non_finite;
+    let parts = [
+        ("means", f.means),
+        ("scales", f.log_scales),
+        ("rotations", f.rotations),
+        ("opacity", f.opacity_logits),
+        ("SH", f.sh),
+    ];
+    let parts: Vec<String> = parts.iter().filter(|p| p.1 > 0).map(|(name, n)| format!("{name} {n}")).collect();
+    let parts = if parts.is_empty() { String::new() } else { format!(" ({})", parts.join(", ")) };
+    line("not finite", format!("{}{parts}", f.gaussians));
+    line("infinite opacity", format!("{} (read as opaque or transparent)", f.infinite_opacity_logits));
+    line("quaternions", format!("{} not of length 1, {} of length 0", r.rotations_not_normalised, r.rotations_zero));
+    bars(&mut t, "opacity", &r.opacity, |v| format!("{v:.1}"));
+    bars(&mut t, "scale (standard deviation along each axis, world units)", &r.scale, |v| format!("{v:.0e}"));
+    t
+}
+
+fn corners(b: Option<Bounds>) -> String {
+    let point = |p: [f32; 3]| format!("({:.4}, {:.4}, {:.4})", p[0], p[1], p[2]);
+    b.map_or("none: no centre is finite".into(), |b| format!("{} to {}", point(b.low), point(b.high)))
+}
+
+fn bars(t: &mut String, title: &str, bins: &[Bin], edge: impl Fn(f64) -> String) {
+    let most = bins.iter().map(|b| b.count).max().unwrap_or(0).max(1);
+    let _ = writeln!(t, "{title}");
+    for b in bins {
+        let bar = "#".repeat((40 * b.count).div_ceil(most));
+        let _ = writeln!(t, "  {:>6} to {:<6}{:>9}  {bar}", edge(b.from), edge(b.to), b.count);
+    }
+}

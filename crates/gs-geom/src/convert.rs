@@ -1,0 +1,145 @@
+//! Choosing, ordering and trimming Gaussians.
+
+use crate::inspect::{Bounds, bounds, is_usable};
+use gs_scene::Gaussians;
+use serde::Serialize;
+
+/// Bits of a coordinate in a Morton code.
+const MORTON_BITS: u32 = 21;
+
+/// In which order Gaussians are written.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, clap::ValueEnum)]
+#[serde(rename_all = "lowercase")]
+pub enum Order {
+    /// As in the input
+    None,
+    /// Along a Morton curve: neighbours in space lie near each other in the file
+    Morton,
+    /// The most opaque first
+    Opacity,
+}
+
+/// Which Gaussians to keep.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize)]
+pub struct Choice {
+    /// Least opacity, 0 to 1.
+    pub min_opacity: f32,
+    /// Box around the centres to keep, its faces included.
+    pub crop: Option<Bounds>,
+}
+
+/// The Gaussians chosen, and how many were not, by the first reason that applied.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Chosen {
+    /// Indices, rising.
+    pub kept: Vec<u32>,
+    /// A number was not finite.
+    pub not_finite: usize,
+    /// Outside the box.
+    pub cropped: usize,
+    /// Too faint.
+    pub faint: usize,
+}
+
+/// Picks the Gaussians that can be used, lie inside the box, and are opaque enough.
+pub fn choose(g: &Gaussians, choice: &Choice) -> Chosen {
+    let mut chosen = Chosen { kept: Vec::new(), not_finite: 0, cropped: 0, faint: 0 };
+    let inside = |p: &[f32; 3], b: &Bounds| (0..3).all(|c| (b.low[c]..=b.high[c]).contains(&p[c]));
+    for i in 0..g.len() {
+        if !is_usable(g, i) {
+            chosen.not_finite += 1;
+        } else if choice.crop.is_some_and(|b| !inside(&g.means[i], &b)) {
+            chosen.cropped += 1;
+        } else if g.opacity(i) < choice.min_opacity {
+            chosen.faint += 1;
+        } else {
+            chosen.kept.push(i as u32);
+        }
+    }
+    chosen
+}
+
+/// Puts indices in order; equal ones stay as they were.
+pub fn arrange(g: &Gaussians, kept: &mut [u32], order: Order) {
+    match order {
+        Order::None => {}
+        Order::Opacity => {
+            let logit = |i: u32| g.opacity_logits[i as usize];
+            kept.sort_by(|&a, &b| logit(b).total_cmp(&logit(a)));
+        }
+        Order::Morton => {
+            let chosen = g.select(kept);
+            // Percentiles, or one stray Gaussian would leave the scene a handful of cells.
+            let Some(b) = bounds(&chosen, 0.001) else { return };
+            kept.sort_by_cached_key(|&i| morton(g.means[i as usize], &b));
+        }
+    }
+}
+
+/// The bits of the three coordinates, taken in turn, of a cell of a grid over the box.
+fn morton(p: [f32; 3], b: &Bounds) -> u64 {
+    let cells = f64::from((1u32 << MORTON_BITS) - 1);
+    let mut code = 0;
+    for c in 0..3 {
+        let (low, high) = (f64::from(b.low[c]), f64::from(b.high[c]));
+        let share = if high > low { (f64::from(p[c]) - low) / (high - low) } else { 0.0 };
+        let cell = (share.clamp(0.0, 1.0) * cells) as u64;
+        for bit in 0..MORTON_BITS {
+            code |= (cell >> bit & 1) << (3 * bit + c as u32);
+        }
+    }
+    code
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::optimiser::zeros;
+    use proptest::prelude::*;
+
+    #[test]
+    fn each_reason_is_counted_once() {
+        let mut g = zeros(5, 0);
+        g.means = vec![[0.0; 3], [2.0, 0.0, 0.0], [f32::NAN; 3], [1.0, 1.0, 1.0], [0.5; 3]];
+        g.opacity_logits = vec![0.0, -9.0, -9.0, f32::INFINITY, -9.0];
+        let crop = Some(Bounds { low: [0.0; 3], high: [1.0; 3] });
+        let c = choose(&g, &Choice { min_opacity: 0.1, crop });
+        assert_eq!(c, Chosen { kept: vec![0, 3], not_finite: 1, cropped: 1, faint: 1 });
+        assert_eq!(choose(&g, &Choice { min_opacity: 0.0, crop: None }).kept, [0, 1, 3, 4]);
+    }
+
+    #[test]
+    fn orders_are_stable() {
+        let mut g = zeros(4, 0);
+        g.means = vec![[1.0, 1.0, 1.0], [0.0; 3], [1.0, 0.0, 0.0], [0.0; 3]];
+        g.opacity_logits = vec![0.0, 2.0, 1.0, 2.0];
+        let run = |order| {
+            let mut all = vec![0, 1, 2, 3];
+            arrange(&g, &mut all, order);
+            all
+        };
+        assert_eq!(run(Order::None), [0, 1, 2, 3]);
+        assert_eq!(run(Order::Opacity), [1, 3, 2, 0]);
+        assert_eq!(run(Order::Morton), [1, 3, 2, 0]);
+    }
+
+    proptest! {
+        #[test]
+        fn a_morton_order_permutes_and_brings_neighbours_together(seed in 0u64..20) {
+            use rand::{Rng, SeedableRng};
+            let mut rng = rand_chacha::ChaCha8Rng::seed_from_u64(seed);
+            let mut g = zeros(400, 0);
+            g.means.iter_mut().flatten().for_each(|v| *v = rng.random_range(-3.0..5.0));
+            let mut order: Vec<u32> = (0..400).collect();
+            let path = |order: &[u32]| -> f32 {
+                let at = |i: u32| glam::Vec3::from(g.means[i as usize]);
+                order.windows(2).map(|w| at(w[0]).distance(at(w[1]))).sum()
+            };
+            let before = path(&order);
+            arrange(&g, &mut order, Order::Morton);
+            prop_assert!(path(&order) < 0.5 * before);
+            order.sort_unstable();
+            prop_assert!(order.iter().enumerate().all(|(i, &o)| i as u32 == o));
+        }
+    }
+}

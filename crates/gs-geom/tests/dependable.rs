@@ -1,0 +1,307 @@
+//! Runs that fail, are extended, or are fed what breaks arithmetic.
+
+use glam::{DQuat, DVec3};
+use gs_raster::{RasterOptions, render};
+use gs_scene::{Camera, Gaussians, Image, ply};
+use serde_json::Value;
+use std::fmt::Write as _;
+use std::fs;
+use std::path::{Path, PathBuf};
+use std::process::{Command, Output};
+use std::time::Duration;
+
+const SIZE: (u32, u32) = (64, 48);
+
+fn program(arguments: &[&str]) -> Command {
+    let mut c = Command::new(env!("CARGO_BIN_EXE_gs-geom"));
+    c.args(arguments);
+    c
+}
+
+fn succeeds(arguments: &[&str]) -> String {
+    let o = program(arguments).output().unwrap();
+    let said = String::from_utf8_lossy(&o.stderr).into_owned();
+    assert!(o.status.success(), "{arguments:?}: {said}");
+    said
+}
+
+/// `n` Gaussians on a spiral around the origin.
+fn spiral(n: usize) -> Gaussians {
+    let t = |i: usize| i as f32 / n as f32;
+    Gaussians {
+        means: (0..n).map(|i| [(9.0 * t(i)).cos() * t(i), (9.0 * t(i)).sin() * t(i), t(i) - 0.5]).collect(),
+        log_scales: vec![[-2.2, -2.5, -2.0]; n],
+        rotations: vec![[1.0, 0.2, -0.1, 0.3]; n],
+        opacity_logits: vec![1.0; n],
+        sh: (0..3 * n).map(|i| (i as f32 * 1.7).sin()).collect(),
+        sh_degree: 0,
+    }
+}
+
+/// A COLMAP scene with `views` photographs `picture` of cameras around the origin, whose focal length is `focal` times
+/// the width.
+fn write_scene(root: &Path, views: usize, focal: f64, picture: impl Fn(&Camera) -> Vec<f32>) {
+    let (w, h) = SIZE;
+    let f = focal * f64::from(w);
+    let camera = format!("1 PINHOLE {w} {h} {f} {f} {} {}\n", f64::from(w) / 2.0, f64::from(h) / 2.0);
+    fs::create_dir_all(root.join("sparse/0")).unwrap();
+    fs::write(root.join("sparse/0/cameras.txt"), camera).unwrap();
+    let (mut images, mut points) = (String::new(), String::new());
+    for i in 0..views {
+        let a = i as f64 / views as f64 * std::f64::consts::TAU;
+        let eye = DVec3::new(3.0 * a.cos(), 3.0 * a.sin(), 0.5);
+        let mut c = Camera::look_at(eye, DVec3::ZERO, DVec3::Z, w, h, 1.0);
+        (c.fx, c.fy) = (f, f);
+        let picture = Image { width: w, height: h, rgb: picture(&c), alpha: None };
+        picture.write_png(root.join(format!("images/{i:02}.png"))).unwrap();
+        let (q, t) = (DQuat::from_mat3(&c.rotation), c.translation);
+        let pose = [q.w, q.x, q.y, q.z, t.x, t.y, t.z].map(|v| v.to_string()).join(" ");
+        writeln!(images, "{} {pose} 1 {i:02}.png\n", i + 1).unwrap();
+    }
+    for (i, p) in spiral(60).means.iter().enumerate() {
+        writeln!(points, "{} {} {} {} 200 100 50 0.5", i + 1, p[0], p[1], p[2]).unwrap();
+    }
+    fs::write(root.join("sparse/0/images.txt"), images).unwrap();
+    fs::write(root.join("sparse/0/points3D.txt"), points).unwrap();
+}
+
+fn spiral_seen_by(c: &Camera) -> Vec<f32> {
+    render(&spiral(60), c, &RasterOptions::default()).rgb
+}
+
+struct Folder(tempfile::TempDir);
+
+impl Folder {
+    /// A folder with a scene in it.
+    fn new() -> Self {
+        let folder = Self(tempfile::tempdir().unwrap());
+        write_scene(Path::new(&folder.path("scene")), 9, 1.0, spiral_seen_by);
+        folder
+    }
+
+    fn path(&self, name: &str) -> String {
+        self.0.path().join(name).to_string_lossy().into_owned()
+    }
+}
+
+fn training<'a>(scene: &'a str, out: &'a str, iterations: &'a str, more: &[&'a str]) -> Vec<&'a str> {
+    let all = ["train", "--scene", scene, "--out", out, "--iterations", iterations, "--densify-every", "20"];
+    [&all, more].concat()
+}
+
+/// Starts a training, waits until it is well under way, does something to its files, and gives how it ended.
+fn disturbed(arguments: &[&str], out: &str, disturb: impl FnOnce()) -> Output {
+    let child = program(arguments).stderr(std::process::Stdio::piped()).spawn().unwrap();
+    for _ in 0..2000 {
+        if PathBuf::from(format!("{out}.checkpoint")).exists() {
+            break;
+        }
+        std::thread::sleep(Duration::from_millis(2));
+    }
+    disturb();
+    child.wait_with_output().unwrap()
+}
+
+#[test]
+fn a_run_whose_photographs_vanish_saves_a_checkpoint_and_goes_on_to_the_same_bytes() {
+    let dir = Folder::new();
+    let (scene, whole, out) = (dir.path("scene"), dir.path("whole.ply"), dir.path("g.ply"));
+    succeeds(&training(&scene, &whole, "400", &[]));
+    let photographs = format!("{scene}/images");
+    let away = dir.path("away");
+    let arguments = training(&scene, &out, "400", &["--image-cache", "0", "--checkpoint-every", "10"]);
+    let o = disturbed(&arguments, &out, || fs::rename(&photographs, &away).unwrap());
+    let said = String::from_utf8_lossy(&o.stderr);
+    assert_eq!(o.status.code(), Some(2), "{said}");
+    assert!(said.contains("saved a checkpoint after iteration") && said.contains("cannot open"), "{said}");
+    fs::rename(&away, &photographs).unwrap();
+    let said = succeeds(&training(&scene, &out, "400", &[]));
+    assert!(said.contains("going on after iteration"), "{said}");
+    assert_eq!(fs::read(&out).unwrap(), fs::read(&whole).unwrap());
+    let curve = |p: &str| fs::read(format!("{p}.curve.jsonl")).unwrap();
+    assert_eq!(curve(&out), curve(&whole));
+    assert!(fs::read_to_string(format!("{out}.curve.svg")).unwrap().contains("held-out"));
+}
+
+#[test]
+fn a_run_that_cannot_write_its_result_saves_a_checkpoint() {
+    let dir = Folder::new();
+    let (scene, out) = (dir.path("scene"), dir.path("g.ply"));
+    let arguments = training(&scene, &out, "300", &["--checkpoint-every", "10"]);
+    // A folder where the result should go: the last step, like any that fails there, loses nothing.
+    let o = disturbed(&arguments, &out, || fs::create_dir(&out).unwrap());
+    let said = String::from_utf8_lossy(&o.stderr);
+    assert_eq!(o.status.code(), Some(2), "{said}");
+    assert!(said.contains("saved a checkpoint after iteration 300"), "{said}");
+    fs::remove_dir(&out).unwrap();
+    succeeds(&arguments);
+    let whole = dir.path("whole.ply");
+    succeeds(&training(&scene, &whole, "300", &[]));
+    assert_eq!(fs::read(&out).unwrap(), fs::read(&whole).unwrap());
+}
+
+#[test]
+fn a_finished_run_can_be_given_more_iterations() {
+    let dir = Folder::new();
+    let (scene, out) = (dir.path("scene"), dir.path("g.ply"));
+    let state = PathBuf::from(format!("{out}.checkpoint"));
+    succeeds(&training(&scene, &out, "100", &["--keep-state"]));
+    assert!(state.exists());
+    let kept = fs::read(&out).unwrap();
+    // Again as it was: nothing is left to do, and the same comes out.
+    succeeds(&training(&scene, &out, "100", &["--keep-state"]));
+    assert_eq!(fs::read(&out).unwrap(), kept);
+    let copy = fs::read(&state).unwrap();
+    let said = succeeds(&training(&scene, &out, "150", &[]));
+    assert!(said.contains("going on after iteration 100") && said.contains("schedule of 150 iterations"), "{said}");
+    assert!(!state.exists());
+    let extended = fs::read(&out).unwrap();
+    let header = String::from_utf8_lossy(&extended[..4000]).into_owned();
+    assert!(header.contains("comment extended after iteration 100"));
+    let curve = fs::read_to_string(format!("{out}.curve.jsonl")).unwrap();
+    assert!(curve.contains("\"iteration\":100,") && curve.contains("\"iteration\":150,"));
+    // The same extension in two parts, with other threads, gives the same bytes.
+    fs::write(&state, copy).unwrap();
+    succeeds(&training(&scene, &out, "150", &["--stop-after", "120", "--threads", "1"]));
+    succeeds(&training(&scene, &out, "150", &[]));
+    assert_eq!(fs::read(&out).unwrap(), extended);
+}
+
+#[test]
+fn memory_is_foretold_and_recorded() {
+    let dir = Folder::new();
+    let (scene, out) = (dir.path("scene"), dir.path("g.ply"));
+    let said = succeeds(&training(&scene, &out, "20", &["--max-gaussians", "1000"]));
+    assert!(said.contains("memory: about") && said.contains("with 1000"), "{said}");
+    let record: Value = serde_json::from_slice(&fs::read(format!("{out}.run.json")).unwrap()).unwrap();
+    assert!(record["summary"]["memory_predicted_bytes"].as_u64().unwrap() > 10 << 20);
+    let wrong = program(&training(&scene, &out, "20", &["--image-cache", "512"])).output().unwrap();
+    assert_eq!(wrong.status.code(), Some(2));
+    assert!(String::from_utf8_lossy(&wrong.stderr).contains("512M or 2G"));
+}
+
+/// Trains on from `g` and gives the result, all finite, with what the program said.
+fn stressed(scene: &str, dir: &Folder, g: &Gaussians) -> (Gaussians, String) {
+    let (init, out) = (dir.path("init.ply"), dir.path("stress.ply"));
+    ply::write_gaussians(&init, g, &[]).unwrap();
+    let more = ["--init", &init, "--sh-degree", "1", "--sh-every", "5", "--holdout", "0", "--no-resume"];
+    let said = succeeds(&training(scene, &out, "45", &[&more[..], &["--opacity-reset-every", "25"]].concat()));
+    let result = ply::read_gaussians_as_they_are(&out).unwrap();
+    for (name, values) in [
+        ("means", result.means.as_flattened()),
+        ("scales", result.log_scales.as_flattened()),
+        ("rotations", result.rotations.as_flattened()),
+        ("opacities", &result.opacity_logits),
+        ("SH", &result.sh),
+    ] {
+        assert!(values.iter().all(|v| v.is_finite()), "{name}");
+    }
+    let curve = fs::read_to_string(format!("{out}.curve.jsonl")).unwrap();
+    for line in curve.lines() {
+        let v: Value = serde_json::from_str(line).unwrap();
+        assert!(v["loss"].as_f64().is_some_and(f64::is_finite), "{line}");
+    }
+    (result, said)
+}
+
+#[test]
+fn gaussians_that_break_arithmetic_leave_every_parameter_finite() {
+    let dir = Folder::new();
+    let scene = dir.path("scene");
+    let (tiny, huge) = (1e-8f32.ln(), 1e4f32.ln());
+    let eye = [3.0f32, 0.0, 0.5];
+    type Change = Box<dyn Fn(&mut Gaussians, usize)>;
+    let cases: Vec<(&str, Change)> = vec![
+        ("needles", Box::new(|g, i| g.log_scales[i] = [0.0, 1e-6f32.ln(), 1e-6f32.ln()])),
+        ("specks", Box::new(move |g, i| g.log_scales[i] = [tiny; 3])),
+        ("giants", Box::new(move |g, i| g.log_scales[i] = [huge; 3])),
+        ("giant needles", Box::new(move |g, i| g.log_scales[i] = [huge, tiny, tiny])),
+        ("transparent", Box::new(|g, i| g.opacity_logits[i] = -50.0)),
+        ("opaque", Box::new(|g, i| g.opacity_logits[i] = f32::INFINITY)),
+        // The plane through the first camera, across its axis, and the near plane.
+        (
+            "on the camera plane",
+            Box::new(move |g, i| g.means[i] = [eye[0] + 0.01 * (i % 3) as f32, i as f32 * 0.1, eye[2]]),
+        ),
+        ("in the camera", Box::new(move |g, i| g.means[i] = eye)),
+        ("far away", Box::new(|g, i| g.means[i] = [1e6, -1e6, 1e6 + i as f32])),
+        ("zero quaternions", Box::new(|g, i| g.rotations[i] = [0.0; 4])),
+        ("large quaternions", Box::new(|g, i| g.rotations[i] = [1e18, -1e18, 1e18, 0.0])),
+        ("small quaternions", Box::new(|g, i| g.rotations[i] = [1e-20, 0.0, 1e-20, 0.0])),
+        ("glaring", Box::new(|g, i| g.sh[3 * i..3 * i + 3].fill(1e30))),
+        ("black", Box::new(|g, i| g.sh[3 * i..3 * i + 3].fill(-1e30))),
+    ];
+    for (name, change) in cases {
+        let mut g = spiral(60);
+        (0..60).step_by(2).for_each(|i| change(&mut g, i));
+        let (result, said) = stressed(&scene, &dir, &g);
+        assert!(!result.is_empty(), "{name}");
+        if name == "zero quaternions" {
+            assert!(said.contains("30 Gaussians of --init have a quaternion of length 0"), "{said}");
+        }
+        eprintln!("{name}: {} Gaussians left", result.len());
+    }
+}
+
+#[test]
+fn thousands_of_coincident_gaussians_stay_finite() {
+    let dir = Folder::new();
+    let mut g = spiral(3000);
+    g.means.fill([0.1, 0.0, 0.0]);
+    let (result, _) = stressed(&dir.path("scene"), &dir, &g);
+    assert!(result.len() >= 1000);
+}
+
+#[test]
+fn a_scene_far_from_the_origin_is_learnt() {
+    // 1e6 from the origin a float has steps of 0.06: the poses are moved, the scene with them.
+    let dir = Folder::new();
+    let far = [1e6f32, 0.0, 0.0];
+    let mut g = spiral(60);
+    g.means.iter_mut().for_each(|m| m[0] += far[0]);
+    let root = dir.path("far");
+    write_scene(Path::new(&root), 4, 1.0, spiral_seen_by);
+    let file = format!("{root}/sparse/0/images.txt");
+    let moved: String = fs::read_to_string(&file)
+        .unwrap()
+        .lines()
+        .map(|line| {
+            let mut words: Vec<String> = line.split(' ').map(String::from).collect();
+            if words.len() > 8 {
+                let v: Vec<f64> = words[1..8].iter().map(|w| w.parse().unwrap()).collect();
+                let q = DQuat::from_xyzw(v[1], v[2], v[3], v[0]);
+                let t = DVec3::new(v[4], v[5], v[6]) - q * DVec3::from(far.map(f64::from));
+                for c in 0..3 {
+                    words[5 + c] = t[c].to_string();
+                }
+            }
+            words.join(" ") + "\n"
+        })
+        .collect();
+    fs::write(&file, moved).unwrap();
+    stressed(&root, &dir, &g);
+}
+
+#[test]
+fn pictures_of_one_colour_one_view_and_any_focal_length_stay_finite() {
+    let dir = Folder::new();
+    let flat = |_: &Camera| vec![0.5; (3 * SIZE.0 * SIZE.1) as usize];
+    for (name, views, focal) in [
+        ("flat", 4, 1.0),
+        ("one", 1, 1.0),
+        ("wide", 3, 1.0 / 64.0),
+        ("tele", 3, 1e5 / 64.0),
+        ("tele1e3", 2, 1e3 / 64.0),
+    ] {
+        let root = dir.path(name);
+        write_scene(Path::new(&root), views, focal, flat);
+        stressed(&root, &dir, &spiral(60));
+        // From its own points, too.
+        let out = dir.path("own.ply");
+        succeeds(&training(&root, &out, "40", &["--holdout", "0", "--no-resume"]));
+        ply::read_gaussians(&out).unwrap();
+    }
+    let root = dir.path("black");
+    write_scene(Path::new(&root), 2, 1.0, |_| vec![0.0; (3 * SIZE.0 * SIZE.1) as usize]);
+    stressed(&root, &dir, &spiral(60));
+}

@@ -1,0 +1,149 @@
+//! `gs-geom inspect` and `gs-geom convert` through the program.
+
+use gs_scene::{Gaussians, ply};
+use serde_json::Value;
+use std::fs;
+use std::path::PathBuf;
+use std::process::{Command, Output};
+
+fn run(arguments: &[&str]) -> Output {
+    Command::new(env!("CARGO_BIN_EXE_gs-geom")).args(arguments).output().unwrap()
+}
+
+fn succeeds(arguments: &[&str]) -> String {
+    let o = run(arguments);
+    assert!(o.status.success(), "{arguments:?}: {}", String::from_utf8_lossy(&o.stderr));
+    String::from_utf8_lossy(&o.stdout).into_owned()
+}
+
+fn refused(arguments: &[&str]) -> String {
+    let o = run(arguments);
+    let said = String::from_utf8_lossy(&o.stderr).into_owned();
+    assert!(o.status.code() == Some(2) && !said.contains("panicked"), "{arguments:?}: {said}");
+    said
+}
+
+/// Gaussians on a line, the later the fainter; one is not a number, one of infinite opacity.
+fn gaussians() -> Gaussians {
+    let n = 40;
+    let mut g = Gaussians {
+        means: (0..n).map(|i| [i as f32 * 0.25, 1.0, -2.0]).collect(),
+        log_scales: vec![[-3.0, -4.0, -3.0]; n],
+        rotations: vec![[1.0, 0.0, 0.0, 0.0]; n],
+        opacity_logits: (0..n).map(|i| 3.0 - 0.2 * i as f32).collect(),
+        sh: (0..n * 48).map(|i| (i as f32).sin()).collect(),
+        sh_degree: 3,
+    };
+    g.means[7][1] = f32::NAN;
+    g.opacity_logits[0] = f32::INFINITY;
+    g
+}
+
+fn written(dir: &tempfile::TempDir) -> String {
+    let path = dir.path().join("in.ply").to_string_lossy().into_owned();
+    ply::write_gaussians(&path, &gaussians(), &[]).unwrap();
+    path
+}
+
+#[test]
+fn a_file_is_inspected_in_text_and_json() {
+    let dir = tempfile::tempdir().unwrap();
+    let file = written(&dir);
+    let text = succeeds(&["inspect", &file]);
+    for wanted in ["Gaussians           40", "SH degree           3", "not finite          1 (means 1)"] {
+        assert!(text.contains(wanted), "{text}");
+    }
+    let json = succeeds(&["inspect", &file, "--json"]);
+    assert_eq!(json.lines().count(), 1);
+    let v: Value = serde_json::from_str(&json).unwrap();
+    assert_eq!((&v["gaussians"], &v["non_finite"]["means"]), (&40.into(), &1.into()));
+    assert_eq!(v["bounds"]["high"][0], 9.75);
+    assert_eq!(v["file_bytes"], fs::metadata(&file).unwrap().len());
+    assert!(refused(&["inspect", "no/such.ply"]).contains("no/such.ply"));
+    fs::write(&file, "ply\nformat ascii 1.0\nelement vertex 9\nend_header\n").unwrap();
+    assert!(refused(&["inspect", &file]).contains("in.ply"));
+}
+
+#[test]
+fn a_file_is_trimmed_cropped_pruned_and_ordered() {
+    let dir = tempfile::tempdir().unwrap();
+    let file = written(&dir);
+    let path = |name: &str| dir.path().join(name).to_string_lossy().into_owned();
+    let (out, map) = (path("new/out.ply"), path("map.npy"));
+    let crop = ["--crop", "-1,0,-2,5,2,-2", "--keep-map", &map, "--order", "opacity"];
+    succeeds(&[&["convert", &file, &out, "--sh-degree", "1", "--min-opacity", "0.5"], &crop[..]].concat());
+    let (g, all) = (ply::read_gaussians(&out).unwrap(), gaussians());
+    // 0 to 20 lie inside, 0 to 15 are opaque enough (0.2 * 15 = 3), 7 is broken; they are in order already.
+    let wanted: Vec<usize> = (0..16).filter(|&i| i != 7).collect();
+    let kept: Vec<usize> = gs_io::npy::read_f32(&map).unwrap().data.iter().map(|&v| v as usize).collect();
+    assert_eq!(kept, wanted);
+    assert_eq!((g.len(), g.sh_degree, g.opacity_logits[0]), (15, 1, 50.0));
+    for (i, &from) in kept.iter().enumerate() {
+        assert_eq!((g.means[i], g.sh_of(i)), (all.means[from], &all.sh_of(from)[..12]));
+    }
+    let record: Value = serde_json::from_slice(&fs::read(format!("{out}.run.json")).unwrap()).unwrap();
+    assert_eq!((&record["summary"]["not_finite"], &record["summary"]["of"]), (&1.into(), &40.into()));
+    assert_eq!(record["skipped"].as_array().unwrap().len(), 3);
+
+    // Back to degree 3: the 62 properties of the original code.
+    let full = path("full.ply");
+    succeeds(&["convert", &out, &full, "--sh-degree", "3", "--order", "morton", "--quiet"]);
+    let header = String::from_utf8_lossy(&fs::read(&full).unwrap()[..3000]).into_owned();
+    assert_eq!(header.matches("property float").count(), 62);
+    assert!(!header.contains(&*dir.path().to_string_lossy()));
+    assert_eq!(ply::read_gaussians(&full).unwrap().len(), 15);
+}
+
+#[test]
+fn the_input_is_never_overwritten() {
+    let dir = tempfile::tempdir().unwrap();
+    let file = written(&dir);
+    let before = fs::read(&file).unwrap();
+    let path = |name: &str| dir.path().join(name).to_string_lossy().into_owned();
+    let roundabout = format!("{}/./in.ply", dir.path().display());
+    let mut names = vec![file.clone(), roundabout];
+    #[cfg(unix)]
+    {
+        std::os::unix::fs::symlink(&file, path("link.ply")).unwrap();
+        fs::hard_link(&file, path("hard.ply")).unwrap();
+        names.extend([path("link.ply"), path("hard.ply")]);
+    }
+    let out = path("out.ply");
+    for name in &names {
+        assert!(refused(&["convert", &file, name]).contains("would be overwritten"), "{name}");
+        let map = refused(&["convert", &file, &out, "--keep-map", name]);
+        assert!(map.contains("would be overwritten"), "{name}");
+    }
+    assert!(refused(&["convert", &file, &out, "--keep-map", &out]).contains("two outputs"));
+    assert!(refused(&["convert", &file, &out, "--min-opacity", "2"]).contains("--min-opacity"));
+    assert!(refused(&["convert", &file, &out, "--crop", "90,90,90,91,91,91"]).contains("no Gaussian is left"));
+    assert!(refused(&["convert", &file, &out, "--crop", "1,2"]).contains("not a box"));
+    assert!(refused(&["convert", &path("none.ply"), &out]).contains("none.ply"));
+    assert_eq!(fs::read(&file).unwrap(), before);
+    assert!(!PathBuf::from(out).exists());
+}
+
+#[test]
+fn real_files_are_inspected_and_converted() {
+    let splats = PathBuf::from(env!("CARGO_MANIFEST_DIR")).join("../../../shared/data/splats");
+    if !splats.exists() {
+        eprintln!("skipped: {} is not present", splats.display());
+        return;
+    }
+    let dir = tempfile::tempdir().unwrap();
+    for (name, n, degree) in
+        [("guitar.ply", 90_854, 0), ("inria_layout_9k.ply", 9_080, 3), ("inria_train_1000.ply", 1_000, 3)]
+    {
+        let file = splats.join(name).to_string_lossy().into_owned();
+        let v: Value = serde_json::from_str(&succeeds(&["inspect", &file, "--json"])).unwrap();
+        assert_eq!((&v["gaussians"], &v["sh_degree"]), (&n.into(), &degree.into()), "{name}");
+        assert_eq!(v["non_finite"]["gaussians"], 0);
+        let sum: u64 = v["opacity"].as_array().unwrap().iter().map(|b| b["count"].as_u64().unwrap()).sum();
+        assert_eq!(sum, n);
+        let out = dir.path().join(name).to_string_lossy().into_owned();
+        succeeds(&["convert", &file, &out, "--order", "morton", "--sh-degree", "3"]);
+        let (a, b) = (ply::read_gaussians(&file).unwrap(), ply::read_gaussians(&out).unwrap());
+        let sum = |g: &Gaussians| g.opacity_logits.iter().map(|&v| f64::from(v)).sum::<f64>();
+        assert!(a.len() == b.len() && b.sh_degree == 3 && (sum(&a) - sum(&b)).abs() < 1e-6 * sum(&a).abs());
+    }
+}
