@@ -58,6 +58,12 @@ fn outside_camera(g: &Gaussians) -> Camera {
     Camera::look_at(middle + DVec3::new(0.5, 0.3, 1.0) * (high - low).length(), middle, DVec3::Y, 640, 480, 0.9)
 }
 
+/// CPU time of this thread.
+fn cpu_seconds() -> f64 {
+    let t = rustix::time::clock_gettime(rustix::time::ClockId::ThreadCPUTime);
+    t.tv_sec as f64 + t.tv_nsec as f64 * 1e-9
+}
+
 /// Median, and half the distance between the quartiles relative to it.
 fn summary(mut values: Vec<f64>) -> (f64, f64) {
     values.sort_by(f64::total_cmp);
@@ -71,7 +77,7 @@ fn bench(name: &str, g: &Gaussians, camera: &Camera) -> Value {
     let d: Vec<f32> = (0..3 * pixels).map(|i| ((i * 7919) % 1000) as f32 * 2e-3 - 1.0).collect();
     let counts = tile_weights(g, camera, &options, true, |t| t.weights.iter().filter(|w| **w > 0.0).count());
     let contributing: usize = counts.iter().sum();
-    let runs: Vec<_> = (0..=REPETITIONS).map(|_| measure(g, camera, &options, &d)).skip(1).collect();
+    let runs: Vec<_> = (0..=REPETITIONS).map(|_| measure(g, camera, &options, &d, cpu_seconds)).skip(1).collect();
     let evaluated = runs[0].pairs_evaluated;
     let pairs = evaluated as f64;
     let (forward, forward_spread) = summary(runs.iter().map(|r| r.forward_s * 1e9 / pairs).collect());
@@ -159,6 +165,7 @@ fn main() {
         "pairs_contributing": main["pairs_contributing"],
         "repetitions": REPETITIONS,
         "threads": 1,
+        "clock": "CPU time of the thread",
         "cpu_features": features(),
         "spread": "half the distance between the quartiles, relative to the median",
         "scenes": scenes,
