@@ -7,7 +7,7 @@ CARGO ?= cargo
 THREADS ?= 0
 export THREADS
 
-.PHONY: help build demo scene test lint models clip-tiny bench-raster bench-graph bench-geom bench-train clean
+.PHONY: help build demo scene test lint models clip-tiny bench-raster bench-graph bench-geom bench-train bench-cluster clean
 
 help: ## Say what can be made
 	@echo "Targets:"
@@ -56,6 +56,13 @@ bench-graph: ## Time anchors and neighbours beside fpsample and pykdtree (needs 
 	@test -x out/bench/python/bin/python || { python3 -m venv out/bench/python \
 	  && out/bench/python/bin/pip install -q numpy scipy fpsample pykdtree; }
 	out/bench/python/bin/python scripts/bench_graph.py $(POSITIONS) out/bench/graph.json
+
+POINTS ?= 1000000x6
+bench-cluster: ## Time HDBSCAN beside hdbscan-rs and fast_hdbscan (needs Python; POINTS=1000000x6 or file.npy)
+	$(CARGO) build --release -p hdbscan-exact --benches
+	@test -x out/bench/python-cluster/bin/python || { python3 -m venv out/bench/python-cluster \
+	  && out/bench/python-cluster/bin/pip install -q numpy scikit-learn hdbscan-rs fast_hdbscan; }
+	out/bench/python-cluster/bin/python scripts/bench_cluster.py $(POINTS) out/bench/cluster.json
 
 clean: ## Delete out/ and what cargo built
 	rm -rf out
