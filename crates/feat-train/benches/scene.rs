@@ -9,6 +9,7 @@
 //! A mask's weights sum to about 0.9, the mean alpha of its pixels; the 750,000 pixels of a view are shared out by area.
 
 use artifacts::Graph;
+use feat_train::real::Weight;
 use feat_train::scene::{Context, MaskSet, Neighbours};
 use rand::seq::SliceRandom;
 use rand::{Rng, SeedableRng};
@@ -121,16 +122,23 @@ impl Scene {
         Context::new(&self.graph, &self.colors, positions, kind, true)
     }
 
-    /// The masks of `count` views.
-    pub fn views(&self, context: &Context, count: usize) -> Vec<MaskSet<f32>> {
+    /// The masks of `count` views, without entries below `cut`, and the largest share of a mask that this drops.
+    pub fn cut_views<W: Weight>(&self, context: &Context, count: usize, cut: f32) -> (Vec<MaskSet<W>>, f64) {
         let mut place = vec![0u32; context.order.len()];
         for (p, &i) in context.order.iter().enumerate() {
             place[i as usize] = p as u32;
         }
-        (0..count).map(|v| self.view(context, &place, v as u64)).collect()
+        let views = (0..count).map(|v| self.view(context, &place, v as u64, cut));
+        let (sets, dropped): (Vec<_>, Vec<f64>) = views.unzip();
+        (sets, dropped.into_iter().fold(0.0, f64::max))
     }
 
-    fn view(&self, context: &Context, place: &[u32], v: u64) -> MaskSet<f32> {
+    /// The masks of `count` views.
+    pub fn views(&self, context: &Context, count: usize) -> Vec<MaskSet> {
+        self.cut_views(context, count, 0.0).0
+    }
+
+    fn view<W: Weight>(&self, context: &Context, place: &[u32], v: u64, cut: f32) -> (MaskSet<W>, f64) {
         let mut rng = ChaCha8Rng::seed_from_u64(2);
         rng.set_stream(v);
         let side = self.side;
@@ -177,6 +185,10 @@ impl Scene {
         entries.iter_mut().for_each(|e| e.2 = (0.9 * f64::from(e.2) / sum[e.1 as usize]) as f32);
         let total: f64 = sum.iter().sum();
         let pixels = sum.iter().map(|s| (PIXELS * s / total).round()).collect();
-        MaskSet::from_entries((0..masks as u32).collect(), pixels, entries, context)
+        let mut dropped = vec![0.0; masks];
+        entries.iter().filter(|e| e.2 < cut).for_each(|e| dropped[e.1 as usize] += f64::from(e.2));
+        entries.retain(|e| e.2 >= cut);
+        let set = MaskSet::from_entries((0..masks as u32).collect(), pixels, entries, context);
+        (set, dropped.into_iter().fold(0.0, f64::max))
     }
 }
