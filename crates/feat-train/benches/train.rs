@@ -402,7 +402,6 @@ fn main() {
         },
         "approximations": approximations(&s, &context, &sets, &runs[0], args.iterations),
         "early_stop": early_stop(),
-        "closed_form": closed_form(&s, &context, &sets, folder),
         "by_layers": layers(&context, &sets, (args.iterations / 4).max(1)),
         "rendering": against_rendering(),
     });
