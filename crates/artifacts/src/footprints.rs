@@ -1,9 +1,11 @@
 //! `footprints.safetensors`: which Gaussians make up which mask.
 
 use crate::graph::{below, check_kept};
-use gs_io::{Artifact, ArtifactWriter, Error, Provenance, Result};
+use gs_io::{Artifact, ArtifactWriter, Error, IoContext, Provenance, Result};
 use serde_json::json;
-use std::path::Path;
+use std::fs::File;
+use std::io::{BufWriter, Read, Seek, SeekFrom, Write};
+use std::path::{Path, PathBuf};
 
 /// Facts of one mask of one view at one level.
 #[derive(Debug, Clone, Copy, Default, PartialEq)]
@@ -32,8 +34,71 @@ pub struct Footprints {
     pub kept: Vec<u32>,
     /// Facts of each mask, ordered by view, level, mask; R.
     pub rows: Vec<Row>,
+    /// Single pixels of the masks, where they were asked for.
+    pub pixels: PixelSamples,
     row_ptr: Vec<u64>,
     artifact: Artifact,
+}
+
+/// Single pixels of masks: a sparse matrix, pixels x kept Gaussians, of blending weights.
+#[derive(Debug, Clone, Default, PartialEq)]
+pub struct PixelSamples {
+    /// Mask of each pixel, as a row of the footprints, ascending; P.
+    pub row: Vec<u32>,
+    /// Where the entries of each pixel begin; P + 1, or empty without pixels.
+    pub ptr: Vec<u64>,
+    /// Positions in `kept`, ascending within a pixel.
+    pub col: Vec<u32>,
+    /// Blending weights.
+    pub weight: Vec<f32>,
+}
+
+impl PixelSamples {
+    fn read(a: &Artifact, rows: usize, kept: usize) -> Result<Self> {
+        if !a.has("pixel_row") {
+            return Ok(Self::default());
+        }
+        let row = a.tensor::<u32>("pixel_row", &[None])?.to_vec();
+        let ptr = a.tensor::<u64>("pixel_ptr", &[Some(row.len() + 1)])?.to_vec();
+        let col = a.tensor::<u32>("pixel_col", &[None])?.to_vec();
+        let weight = a.tensor::<f32>("pixel_weight", &[Some(col.len())])?.to_vec();
+        below(a, "pixel_row", &row, rows)?;
+        below(a, "pixel_col", &col, kept)?;
+        check_pointers(a, "pixel_ptr", &ptr, col.len())?;
+        check_weights(a, "pixel_weight", &weight)?;
+        if row.windows(2).any(|w| w[0] > w[1]) {
+            return Err(Error::new("does not ascend").file(a.path()).field("pixel_row"));
+        }
+        Ok(Self { row, ptr, col, weight })
+    }
+
+    /// Number of pixels.
+    pub fn len(&self) -> usize {
+        self.row.len()
+    }
+
+    /// Whether there is none.
+    pub fn is_empty(&self) -> bool {
+        self.row.is_empty()
+    }
+}
+
+fn check_pointers(a: &Artifact, name: &str, ptr: &[u64], entries: usize) -> Result<()> {
+    let monotone = ptr.windows(2).all(|w| w[0] <= w[1]);
+    if ptr[0] != 0 || !monotone || ptr[ptr.len() - 1] != entries as u64 {
+        return Err(Error::new("row pointers do not ascend from 0 to the number of entries")
+            .file(a.path())
+            .field(name)
+            .hint("run graph-precompute again"));
+    }
+    Ok(())
+}
+
+fn check_weights(a: &Artifact, name: &str, weight: &[f32]) -> Result<()> {
+    match weight.iter().position(|w| !w.is_finite() || *w < 0.0) {
+        Some(at) => Err(Error::new("not a weight").file(a.path()).field(format!("{name}[{at}]")).found(weight[at])),
+        None => Ok(()),
+    }
 }
 
 /// Footprints while they are computed.
@@ -51,6 +116,8 @@ pub struct FootprintsBuilder {
     pub col: Vec<u32>,
     /// Blending weight summed over the mask's gated pixels.
     pub weight: Vec<f32>,
+    /// Single pixels, if any; their columns are positions in `kept` too.
+    pub pixels: PixelSamples,
 }
 
 impl FootprintsBuilder {
@@ -58,14 +125,44 @@ impl FootprintsBuilder {
     ///
     /// # Errors
     /// When the file cannot be written.
-    pub fn write(&self, path: impl AsRef<Path>, mut provenance: Provenance) -> Result<()> {
+    pub fn write(&self, path: impl AsRef<Path>, provenance: Provenance) -> Result<()> {
+        self.writer(provenance)
+            .tensor("col", &[self.col.len()], &self.col)
+            .tensor("weight", &[self.weight.len()], &self.weight)
+            .write(path)
+    }
+
+    /// [`FootprintsBuilder::write`] with the entries of all rows from scratch files; `col` and `weight` are not looked at.
+    ///
+    /// # Errors
+    /// When a file cannot be read or written.
+    pub fn write_with(&self, entries: ScratchEntries, path: impl AsRef<Path>, provenance: Provenance) -> Result<()> {
+        let count = entries.count as usize;
+        let (col, weight) = entries.finish()?;
+        self.writer(provenance)
+            .tensor_from_file::<u32>("col", &[count], col)
+            .tensor_from_file::<f32>("weight", &[count], weight)
+            .write(path)
+    }
+
+    /// All but the entries.
+    fn writer(&self, mut provenance: Provenance) -> ArtifactWriter {
         provenance.format = Footprints::FORMAT.into();
         provenance.version = Footprints::VERSION;
         provenance.extra = json!({ "views": self.views });
         let r = self.rows.len();
         let column = |f: fn(&Row) -> u32| self.rows.iter().map(f).collect::<Vec<u32>>();
         let alpha: Vec<f32> = self.rows.iter().map(|r| r.alpha).collect();
-        ArtifactWriter::new(provenance)
+        let mut writer = ArtifactWriter::new(provenance);
+        if !self.pixels.is_empty() {
+            let p = &self.pixels;
+            writer = writer
+                .tensor("pixel_row", &[p.row.len()], &p.row)
+                .tensor("pixel_ptr", &[p.ptr.len()], &p.ptr)
+                .tensor("pixel_col", &[p.col.len()], &p.col)
+                .tensor("pixel_weight", &[p.weight.len()], &p.weight);
+        }
+        writer
             .tensor("kept", &[self.kept.len()], &self.kept)
             .tensor("row_view", &[r], &column(|r| r.view))
             .tensor("row_level", &[r], &column(|r| r.level))
@@ -74,9 +171,80 @@ impl FootprintsBuilder {
             .tensor("row_gated", &[r], &column(|r| r.gated))
             .tensor("row_alpha", &[r], &alpha)
             .tensor("row_ptr", &[r + 1], &self.row_ptr)
-            .tensor("col", &[self.col.len()], &self.col)
-            .tensor("weight", &[self.weight.len()], &self.weight)
-            .write(path)
+    }
+}
+
+/// Entries of footprints in scratch files without a name, so that no more than one view's are in memory while they are
+/// computed. The files go with the process.
+#[derive(Debug)]
+pub struct ScratchEntries {
+    col: BufWriter<File>,
+    weight: BufWriter<File>,
+    /// Entries so far.
+    pub count: u64,
+    folder: PathBuf,
+}
+
+impl ScratchEntries {
+    /// Bytes worked on at a time when columns are numbered anew.
+    const CHUNK: usize = 1 << 20;
+
+    /// Scratch files in the folder in which `output` will lie.
+    ///
+    /// # Errors
+    /// When they cannot be made there.
+    pub fn beside(output: &Path) -> Result<Self> {
+        let folder = match output.parent() {
+            Some(p) if !p.as_os_str().is_empty() => p.to_path_buf(),
+            _ => PathBuf::from("."),
+        };
+        gs_io::create_dir(&folder)?;
+        let file = || tempfile::tempfile_in(&folder).at("create a scratch file in", &folder).map(BufWriter::new);
+        Ok(Self { col: file()?, weight: file()?, count: 0, folder })
+    }
+
+    /// Adds an entry.
+    ///
+    /// # Errors
+    /// When the disk is full.
+    pub fn push(&mut self, col: u32, weight: f32) -> Result<()> {
+        self.count += 1;
+        self.col.write_all(&col.to_ne_bytes()).at("write a scratch file in", &self.folder)?;
+        self.weight.write_all(&weight.to_ne_bytes()).at("write a scratch file in", &self.folder)
+    }
+
+    /// Replaces every column `c` by `position[c]`.
+    ///
+    /// # Errors
+    /// When a scratch file cannot be read or written.
+    pub fn renumber(&mut self, position: &[u32]) -> Result<()> {
+        let folder = &self.folder;
+        self.col.flush().at("write a scratch file in", folder)?;
+        let file = self.col.get_mut();
+        let (mut at, end) = (0, 4 * self.count);
+        let mut bytes = vec![0u8; Self::CHUNK];
+        while at < end {
+            let some = &mut bytes[..Self::CHUNK.min((end - at) as usize)];
+            file.seek(SeekFrom::Start(at)).at("read a scratch file in", folder)?;
+            file.read_exact(some).at("read a scratch file in", folder)?;
+            for c in some.chunks_exact_mut(4) {
+                let old = u32::from_ne_bytes([c[0], c[1], c[2], c[3]]);
+                c.copy_from_slice(&position[old as usize].to_ne_bytes());
+            }
+            file.seek(SeekFrom::Start(at)).at("write a scratch file in", folder)?;
+            file.write_all(some).at("write a scratch file in", folder)?;
+            at += some.len() as u64;
+        }
+        Ok(())
+    }
+
+    /// The files of columns and of weights.
+    fn finish(self) -> Result<(File, File)> {
+        let folder = self.folder;
+        let done = |w: BufWriter<File>| {
+            w.into_inner().map_err(std::io::IntoInnerError::into_error).at("write a scratch file in", &folder)
+        };
+        Ok((done(self.col)?, done(self.weight)?))
     }
 }
 
@@ -116,18 +284,11 @@ impl Footprints {
         let row_ptr = a.tensor::<u64>("row_ptr", &[Some(r + 1)])?.to_vec();
         let col = a.tensor::<u32>("col", &[None])?;
         let weight = a.tensor::<f32>("weight", &[Some(col.len())])?;
-        let monotone = row_ptr.windows(2).all(|w| w[0] <= w[1]);
-        if row_ptr[0] != 0 || !monotone || row_ptr[r] != col.len() as u64 {
-            return Err(Error::new("row pointers do not ascend from 0 to the number of entries")
-                .file(a.path())
-                .field("row_ptr")
-                .hint("run graph-precompute again"));
-        }
+        check_pointers(&a, "row_ptr", &row_ptr, col.len())?;
         below(&a, "col", col, kept.len())?;
-        if let Some(at) = weight.iter().position(|w| !w.is_finite() || *w < 0.0) {
-            return Err(Error::new("not a weight").file(a.path()).field(format!("weight[{at}]")).found(weight[at]));
-        }
-        Ok(Self { views, kept, rows, row_ptr, artifact: a })
+        check_weights(&a, "weight", weight)?;
+        let pixels = PixelSamples::read(&a, r, kept.len())?;
+        Ok(Self { views, kept, rows, pixels, row_ptr, artifact: a })
     }
 
     /// Entries of row `r`: positions in `kept` (ascending) and summed weights.
@@ -168,12 +329,38 @@ mod tests {
             row_ptr: vec![0, 2, 3],
             col: vec![0, 2, 1],
             weight: vec![1.0, 2.0, 3.0],
+            ..FootprintsBuilder::default()
         };
         b.write(&p, Provenance::default()).unwrap();
         let f = Footprints::read(&p).unwrap();
         assert_eq!(f.rows, b.rows);
         assert_eq!(f.entries(0), (&[0u32, 2][..], &[1.0f32, 2.0][..]));
         assert_eq!(f.entries(1), (&[1u32][..], &[3.0f32][..]));
+        assert!(f.pixels.is_empty());
+        // From scratch files, under other numbers at first: the same bytes.
+        let mut scratch = ScratchEntries::beside(&p).unwrap();
+        for (c, w) in b.col.iter().zip(&b.weight) {
+            scratch.push(c + 2, *w).unwrap();
+        }
+        scratch.renumber(&[9, 9, 0, 1, 2]).unwrap();
+        let without = FootprintsBuilder { col: Vec::new(), weight: Vec::new(), ..b.clone() };
+        let other = dir.path().join("other.safetensors");
+        without.write_with(scratch, &other, Provenance::default()).unwrap();
+        assert_eq!(std::fs::read(&other).unwrap(), std::fs::read(&p).unwrap());
+        b.pixels = PixelSamples { row: vec![0, 0, 1], ptr: vec![0, 1, 1, 3], col: vec![2, 0, 1], weight: vec![0.5; 3] };
+        b.write(&p, Provenance::default()).unwrap();
+        assert_eq!(Footprints::read(&p).unwrap().pixels, b.pixels);
+        for (bad, said) in [
+            (PixelSamples { row: vec![0, 0, 2], ..b.pixels.clone() }, "pixel_row"),
+            (PixelSamples { row: vec![1, 0, 1], ..b.pixels.clone() }, "pixel_row"),
+            (PixelSamples { ptr: vec![0, 2, 1, 3], ..b.pixels.clone() }, "pixel_ptr"),
+            (PixelSamples { col: vec![2, 0, 9], ..b.pixels.clone() }, "pixel_col"),
+            (PixelSamples { weight: vec![0.5, f32::NAN, 0.5], ..b.pixels.clone() }, "pixel_weight"),
+        ] {
+            FootprintsBuilder { pixels: bad, ..b.clone() }.write(&p, Provenance::default()).unwrap();
+            let e = Footprints::read(&p).unwrap_err().to_string();
+            assert!(e.contains(said), "{e}");
+        }
         b.col[1] = 3;
         b.write(&p, Provenance::default()).unwrap();
         let e = Footprints::read(&p).unwrap_err().to_string();

@@ -13,7 +13,7 @@ mod palette;
 mod truth;
 
 pub use features::Features;
-pub use footprints::{Footprints, FootprintsBuilder, Row};
+pub use footprints::{Footprints, FootprintsBuilder, PixelSamples, Row, ScratchEntries};
 pub use graph::Graph;
 pub use instances::{Instances, Match, TreeEdge};
 pub use masks::{LEVELS, Level, MaskFeatures, MaskMaps, features_path, hash_folder, maps_path, stems};

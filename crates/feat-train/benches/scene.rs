@@ -9,6 +9,7 @@
 //! A mask's weights sum to about 0.9, the mean alpha of its pixels; the 750,000 pixels of a view are shared out by area.
 
 use artifacts::Graph;
+use feat_train::real::Weight;
 use feat_train::scene::{Context, MaskSet, Neighbours};
 use rand::seq::SliceRandom;
 use rand::{Rng, SeedableRng};
@@ -66,10 +67,8 @@ pub fn scene(side: usize) -> Scene {
             }
         }
     }
-    // The K nearest steps on a grid of the given spacing, from each place of a grid of `height` x `width`.
-    let near = |spacing: (usize, usize), y: usize, x: usize, height: usize, width: usize| -> Vec<usize> {
-        let mut steps: Vec<(i64, i64)> = (-9..=9).flat_map(|dy| (-9..=9).map(move |dx| (dy, dx))).collect();
-        steps.sort_by_key(|(dy, dx)| (dy * spacing.0 as i64).pow(2) + (dx * spacing.1 as i64).pow(2));
+    // The K nearest of the given steps from each place of a grid of `height` x `width`.
+    let near = |steps: &[(i64, i64)], y: usize, x: usize, height: usize, width: usize| -> Vec<usize> {
         let inside = |(dy, dx): &(i64, i64)| {
             let (y, x) = (y as i64 + dy, x as i64 + dx);
             ((0..height as i64).contains(&y) && (0..width as i64).contains(&x))
@@ -77,13 +76,14 @@ pub fn scene(side: usize) -> Scene {
         };
         steps[1..].iter().filter_map(inside).take(K).collect()
     };
+    let (one, block) = (steps((1, 1)), steps(BLOCK));
     let (mut knn, mut anchor_knn) = (vec![0u32; m * K], vec![0u32; m * K]);
     let lists: Vec<(Vec<usize>, Vec<usize>)> = (0..m)
         .into_par_iter()
         .map(|b| {
             let (y, x) = (b / columns, b % columns);
             let at = (y * BLOCK.0, x * BLOCK.1 + BLOCK.1 / 2);
-            (near((1, 1), at.0, at.1, side, side), near(BLOCK, y, x, rows, columns))
+            (near(&one, at.0, at.1, side, side), near(&block, y, x, rows, columns))
         })
         .collect();
     for (b, (gaussians, blocks)) in lists.iter().enumerate() {
@@ -93,19 +93,33 @@ pub fn scene(side: usize) -> Scene {
             anchor_knn[row + j] = anchor_id[blocks[j]];
         }
     }
+    let mut gaussian_knn = vec![0u32; n * K];
+    for place in 0..n {
+        let row = index[place] as usize * K;
+        for (j, other) in near(&one, place / side, place % side, side, side).into_iter().enumerate() {
+            gaussian_knn[row + j] = index[other];
+        }
+    }
     let graph = Graph {
         kept: (0..n as u32).collect(),
         anchors,
         knn,
         anchor_knn,
         nearest_anchor,
-        gaussian_knn: Vec::new(),
+        gaussian_knn,
         k: K,
-        gaussian_k: 0,
+        gaussian_k: K,
         seen_views: Vec::new(),
         seen_weight: Vec::new(),
     };
     Scene { graph, colors, positions, index, side }
+}
+
+/// Steps on a grid of the given spacing, nearest first.
+fn steps(spacing: (usize, usize)) -> Vec<(i64, i64)> {
+    let mut steps: Vec<(i64, i64)> = (-9..=9).flat_map(|dy| (-9..=9).map(move |dx| (dy, dx))).collect();
+    steps.sort_by_key(|(dy, dx)| (dy * spacing.0 as i64).pow(2) + (dx * spacing.1 as i64).pow(2));
+    steps
 }
 
 impl Scene {
@@ -121,16 +135,23 @@ impl Scene {
         Context::new(&self.graph, &self.colors, positions, kind, true)
     }
 
-    /// The masks of `count` views.
-    pub fn views(&self, context: &Context, count: usize) -> Vec<MaskSet<f32>> {
+    /// The masks of `count` views, without entries below `cut`, and the largest share of a mask that this drops.
+    pub fn cut_views<W: Weight>(&self, context: &Context, count: usize, cut: f32) -> (Vec<MaskSet<W>>, f64) {
         let mut place = vec![0u32; context.order.len()];
         for (p, &i) in context.order.iter().enumerate() {
             place[i as usize] = p as u32;
         }
-        (0..count).map(|v| self.view(context, &place, v as u64)).collect()
+        let views = (0..count).map(|v| self.view(context, &place, v as u64, cut));
+        let (sets, dropped): (Vec<_>, Vec<f64>) = views.unzip();
+        (sets, dropped.into_iter().fold(0.0, f64::max))
     }
 
-    fn view(&self, context: &Context, place: &[u32], v: u64) -> MaskSet<f32> {
+    /// The masks of `count` views.
+    pub fn views(&self, context: &Context, count: usize) -> Vec<MaskSet> {
+        self.cut_views(context, count, 0.0).0
+    }
+
+    fn view<W: Weight>(&self, context: &Context, place: &[u32], v: u64, cut: f32) -> (MaskSet<W>, f64) {
         let mut rng = ChaCha8Rng::seed_from_u64(2);
         rng.set_stream(v);
         let side = self.side;
@@ -177,6 +198,10 @@ impl Scene {
         entries.iter_mut().for_each(|e| e.2 = (0.9 * f64::from(e.2) / sum[e.1 as usize]) as f32);
         let total: f64 = sum.iter().sum();
         let pixels = sum.iter().map(|s| (PIXELS * s / total).round()).collect();
-        MaskSet::from_entries((0..masks as u32).collect(), pixels, entries, context)
+        let mut dropped = vec![0.0; masks];
+        entries.iter().filter(|e| e.2 < cut).for_each(|e| dropped[e.1 as usize] += f64::from(e.2));
+        entries.retain(|e| e.2 >= cut);
+        let set = MaskSet::from_entries((0..masks as u32).collect(), pixels, entries, context);
+        (set, dropped.into_iter().fold(0.0, f64::max))
     }
 }

@@ -4,19 +4,25 @@
 mod rendering;
 mod scene;
 
+use artifacts::{Footprints, FootprintsBuilder, Level, Row, ScratchEntries};
 use clap::Parser;
 use feat_train::adam::{Adam, Rates};
+use feat_train::evidence::{Evidence, Matrix};
 use feat_train::fast::{Engine, Shortcuts, Timings};
-use feat_train::loss::Loss;
-use feat_train::model::{Init, Model, Settings};
+use feat_train::loss::{self, Loss};
+use feat_train::model::{CohesionOf, Init, Model, Settings};
 use feat_train::normalize::Axis;
+use feat_train::real::{Half, Weight};
 use feat_train::scene::{Context, MaskSet, Neighbours};
+use feat_train::spectral::{SpectralOptions, spectral};
+use feat_train::train::{TrainOptions, train};
+use gs_io::Provenance;
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
 use rendering::View;
-use scene::scene;
+use scene::{Scene, scene};
 use serde_json::{Value, json};
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
 
 /// Iterations of a training.
@@ -42,6 +48,9 @@ struct Args {
     /// Where the report goes
     #[arg(long, default_value = "out/bench/train.json")]
     out: PathBuf,
+    /// Measure the closed form alone
+    #[arg(long)]
+    closed_form: bool,
     /// Given by cargo
     #[arg(long, hide = true)]
     bench: bool,
@@ -55,6 +64,7 @@ fn settings(layers: usize) -> Settings {
         loss: Loss::Printed,
         tau: 0.1,
         cohesion: 0.0,
+        cohesion_of: CohesionOf::Gaussians,
         init: Init::Uniform,
     }
 }
@@ -71,12 +81,18 @@ struct Run {
 }
 
 /// The views in an order that jumps about.
-fn view(sets: &[MaskSet<f32>], i: u64) -> &MaskSet<f32> {
+fn view<W>(sets: &[MaskSet<W>], i: u64) -> &MaskSet<W> {
     &sets[i as usize * 7 % sets.len()]
 }
 
 /// Iterations of the engine, from a fresh model.
-fn engine(context: &Context, sets: &[MaskSet<f32>], layers: usize, shortcuts: Shortcuts, iterations: u64) -> Run {
+fn engine<W: Weight>(
+    context: &Context,
+    sets: &[MaskSet<W>],
+    layers: usize,
+    shortcuts: Shortcuts,
+    iterations: u64,
+) -> Run {
     let mut model = Model::<f32>::new(settings(layers), context, &mut ChaCha8Rng::seed_from_u64(0));
     let mut engine = Engine::new(context, &model, shortcuts);
     let mut adam = Adam::new(model.features.len());
@@ -107,7 +123,7 @@ fn engine(context: &Context, sets: &[MaskSet<f32>], layers: usize, shortcuts: Sh
 
 /// Iterations of the readable model with the dense optimiser, as training was before the engine: seconds and, of all
 /// threads, CPU seconds of one.
-fn readable(context: &Context, sets: &[MaskSet<f32>], iterations: u64) -> [f64; 2] {
+fn readable(context: &Context, sets: &[MaskSet], iterations: u64) -> [f64; 2] {
     let mut model = Model::<f32>::new(settings(2), context, &mut ChaCha8Rng::seed_from_u64(0));
     let mut adam = Adam::new(model.features.len());
     let mut layers: Vec<Adam<f32>> = model.layers.iter().map(|l| Adam::new(l.weights.len())).collect();
@@ -169,29 +185,151 @@ fn breakdown(runs: &[Run], iterations: u64) -> Value {
     })
 }
 
-/// What the shortcuts save and cost, against the exact run of as many iterations.
-fn shortcuts(context: &Context, sets: &[MaskSet<f32>], exact: &Run, iterations: u64) -> Value {
+/// Entries of footprints below this are dropped in the row of `graph-precompute --cut`.
+const CUT: f32 = 1e-4;
+/// Refresh of statistics in its row.
+const EVERY: u64 = 10;
+
+/// Bytes of the footprints.
+fn footprint_bytes<W>(sets: &[MaskSet<W>]) -> usize {
+    let of = |s: &MaskSet<W>| 4 * (s.columns.len() + s.start.len()) + (2 + size_of::<W>()) * s.mask.len();
+    sets.iter().map(of).sum()
+}
+
+/// What changes the numbers: its time and its error, against the exact run of as many iterations.
+fn approximations(s: &Scene, context: &Context, sets: &[MaskSet], exact: &Run, iterations: u64) -> Value {
     let start = Model::<f32>::new(settings(2), context, &mut ChaCha8Rng::seed_from_u64(0)).features;
     let moved = apart(&exact.features, &start);
-    let exactly = Shortcuts::default();
-    let all = [
-        ("none", exactly),
-        ("--stats-every 10", Shortcuts { stats_every: 10, ..exactly }),
-        ("--lazy-adam", Shortcuts { lazy_adam: true, ..exactly }),
-        ("both", Shortcuts { stats_every: 10, lazy_adam: true }),
-    ];
-    let row = |(name, shortcuts): &(&str, Shortcuts)| {
-        let run = engine(context, sets, 2, *shortcuts, iterations);
+    let row = |name: &str, bytes: usize, run: Run| {
         json!({
             "option": name, "seconds_per_iteration": run.seconds, "cpu_seconds_per_iteration": run.cpu_seconds,
-            "features_off": apart(&run.features, &exact.features) / moved, "loss_off": (run.loss - exact.loss).abs(),
+            "footprint_bytes": bytes, "features_off": apart(&run.features, &exact.features) / moved,
+            "loss_off": (run.loss - exact.loss).abs(),
         })
     };
-    all.iter().map(row).collect()
+    let none = Shortcuts::default();
+    let (refreshed, lazy) = (Shortcuts { stats_every: EVERY, ..none }, Shortcuts { lazy_adam: true, ..none });
+    let bytes = footprint_bytes(sets);
+    let mut rows = Vec::new();
+    for (name, shortcuts) in [
+        ("none".to_string(), none),
+        (format!("--stats-every {EVERY}"), refreshed),
+        ("--lazy-adam".to_string(), lazy),
+        (format!("--stats-every {EVERY} --lazy-adam"), Shortcuts { stats_every: EVERY, lazy_adam: true }),
+    ] {
+        rows.push(row(&name, bytes, engine(context, sets, 2, shortcuts, iterations)));
+    }
+    let half = s.cut_views::<Half>(context, sets.len(), 0.0).0;
+    rows.push(row("--half-weights", footprint_bytes(&half), engine(context, &half, 2, none, iterations)));
+    drop(half);
+    let (cut, dropped) = s.cut_views::<f32>(context, sets.len(), CUT);
+    let mut cut_row = row(
+        &format!("graph-precompute --cut {CUT}"),
+        footprint_bytes(&cut),
+        engine(context, &cut, 2, none, iterations),
+    );
+    let entries = |sets: &[MaskSet]| sets.iter().map(|s| s.mask.len()).sum::<usize>() as f64;
+    cut_row["entries_dropped"] = json!(1.0 - entries(&cut) / entries(sets));
+    cut_row["largest_change_of_a_centroid"] = json!(dropped);
+    rows.push(cut_row);
+    rows.into()
+}
+
+/// Mean loss of views by features `[n][d]` in the order of kept Gaussians.
+fn mean_loss(context: &Context, sets: &[&MaskSet], features: &[f32]) -> f64 {
+    let d = settings(2).dim;
+    let of = |set: &MaskSet| {
+        let mut centroids = vec![0.0; set.len() * d];
+        for (c, &place) in set.columns.iter().enumerate() {
+            let i = context.order[place as usize] as usize;
+            let (mask, weight) = set.entries(c);
+            for (&k, w) in mask.iter().zip(weight) {
+                let to = &mut centroids[k as usize * d..(k as usize + 1) * d];
+                to.iter_mut().zip(&features[i * d..]).for_each(|(t, f)| *t += f64::from(*w) * f64::from(*f));
+            }
+        }
+        loss::evaluate(Loss::Printed, &centroids, None, d, settings(2).tau).loss
+    };
+    sets.iter().map(|set| of(set)).sum::<f64>() / sets.len() as f64
+}
+
+/// Whole trainings on a small scene, to the end and with `--early-stop`: what stopping saves, and what it costs in the
+/// loss of the views that neither learns from.
+fn early_stop() -> Value {
+    let (side, views) = (100, 60);
+    let s = scene(side);
+    let context = s.context(Neighbours::Gaussians, true);
+    let sets = s.views(&context, views);
+    let (held_out, seen): (Vec<_>, Vec<_>) = sets.iter().enumerate().partition(|(i, _)| i % 10 == 9);
+    let held_out: Vec<&MaskSet> = held_out.into_iter().map(|(_, set)| set).collect();
+    let seen: Vec<MaskSet> = seen.into_iter().map(|(_, set)| set.clone()).collect();
+    let run = |sets: &[MaskSet], early_stop: bool| {
+        let options = TrainOptions {
+            settings: settings(2),
+            iterations: ITERATIONS,
+            rate: 1e-3,
+            weight_rate: 1e-3,
+            seed: 0,
+            checkpoint_every: 0,
+            curve_every: 1000,
+            shortcuts: Shortcuts::default(),
+            early_stop,
+        };
+        let clock = cpu_seconds();
+        let silent = stage::Stage::silent("bench");
+        let trained = train(&context, sets, &options, None, &silent, |_| Ok(())).expect("training works");
+        (cpu_seconds() - clock, trained)
+    };
+    let (all_cpu, all) = run(&seen, false);
+    let (early_cpu, early) = run(&sets, true);
+    let row = |cpu: f64, t: &feat_train::train::Trained| json!({ "iterations": t.iterations, "cpu_seconds": cpu, "held_out_loss": mean_loss(&context, &held_out, &t.features) });
+    json!({
+        "gaussians": side * side, "views": views, "held_out": held_out.len(),
+        "to_the_end": row(all_cpu, &all), "early_stop": row(early_cpu, &early),
+    })
+}
+
+/// The closed form on the same graph and footprints, written as graph-precompute writes them, into `folder` for a while.
+fn closed_form(s: &Scene, context: &Context, sets: &[MaskSet], folder: &Path) -> Value {
+    let path = folder.join("train-footprints.safetensors");
+    let mut builder =
+        FootprintsBuilder { kept: s.graph.kept.clone(), row_ptr: vec![0], ..FootprintsBuilder::default() };
+    let mut entries = ScratchEntries::beside(&path).expect("room for footprints");
+    for (v, set) in sets.iter().enumerate() {
+        let mut rows: Vec<Vec<(u32, f32)>> = vec![Vec::new(); set.len()];
+        for (c, &place) in set.columns.iter().enumerate() {
+            let (mask, weight) = set.entries(c);
+            for (&k, &w) in mask.iter().zip(weight) {
+                rows[k as usize].push((context.order[place as usize], w * set.pixels[k as usize] as f32));
+            }
+        }
+        builder.views.push(v.to_string());
+        for (k, mut row) in rows.into_iter().enumerate() {
+            row.sort_unstable_by_key(|e| e.0);
+            row.iter().for_each(|&(i, w)| entries.push(i, w).expect("room for footprints"));
+            builder.row_ptr.push(entries.count);
+            let pixels = set.pixels[k] as u32;
+            builder.rows.push(Row { view: v as u32, level: 3, mask: k as u32, pixels, gated: pixels, alpha: 0.9 });
+        }
+    }
+    builder.write_with(entries, &path, Provenance::default()).expect("room for footprints");
+    let (clock, cpu) = (Instant::now(), cpu_seconds());
+    let footprints = Footprints::read(&path).expect("just written");
+    let matrix = Matrix::new(&footprints, &s.graph, &[Level::Large], Evidence::Weight, true);
+    let read = clock.elapsed().as_secs_f64();
+    let options = SpectralOptions { most: 64, auto: true, cutoff: 0.75, power: 16.0, seed: 0 };
+    let found = spectral(&matrix, &options, &stage::Stage::silent("bench")).expect("features");
+    let out = json!({
+        "masks": matrix.masks.len(), "seconds": clock.elapsed().as_secs_f64(), "cpu_seconds": cpu_seconds() - cpu,
+        "reading_seconds": read, "passes": found.passes, "dim": found.dim,
+        "singular_values": [found.singular_values[0], found.singular_values[found.dim - 1]],
+    });
+    std::fs::remove_file(&path).expect("just written");
+    out
 }
 
 /// Time and memory of each number of layers.
-fn layers(context: &Context, sets: &[MaskSet<f32>], iterations: u64) -> Value {
+fn layers(context: &Context, sets: &[MaskSet], iterations: u64) -> Value {
     let row = |layers: usize| {
         let run = engine(context, sets, layers, Shortcuts::default(), iterations);
         json!({
@@ -226,6 +364,12 @@ fn main() {
     let s = scene(args.side);
     let context = s.context(Neighbours::Gaussians, true);
     let sets = s.views(&context, args.views);
+    let folder = args.out.parent().expect("a file in a folder");
+    std::fs::create_dir_all(folder).expect("the folder can be made");
+    if args.closed_form {
+        eprintln!("{}", closed_form(&s, &context, &sets, folder));
+        return;
+    }
     let entries: usize = sets.iter().map(|s| s.mask.len()).sum();
     let columns: usize = sets.iter().map(|s| s.columns.len()).sum();
     let first = engine(&context, &sets, 2, Shortcuts::default(), args.iterations);
@@ -256,13 +400,12 @@ fn main() {
             "cpu_seconds_per_iteration": before.iter().map(|b| b[1]).sum::<f64>() / before.len() as f64,
             "ratio": before_each / each,
         },
-        "shortcuts": shortcuts(&context, &sets, &runs[0], args.iterations),
+        "approximations": approximations(&s, &context, &sets, &runs[0], args.iterations),
+        "early_stop": early_stop(),
         "by_layers": layers(&context, &sets, (args.iterations / 4).max(1)),
         "rendering": against_rendering(),
     });
     let text = serde_json::to_string_pretty(&report).expect("a report is JSON") + "\n";
     eprint!("{text}");
-    let folder = args.out.parent().expect("a file in a folder");
-    std::fs::create_dir_all(folder).expect("the folder can be made");
     std::fs::write(&args.out, text).expect("the report can be written");
 }

@@ -4,8 +4,9 @@ use crate::checkpoint;
 use crate::evidence::{Evidence, Matrix};
 use crate::fast::{Engine, Shortcuts};
 use crate::loss::Loss;
-use crate::model::{Init, Settings};
+use crate::model::{CohesionOf, Init, Settings};
 use crate::normalize::Axis;
+use crate::real::{Half, Weight};
 use crate::scene::{Context, Neighbours, mask_sets};
 use crate::spectral::{SpectralOptions, spectral};
 use crate::train::{CurvePoint, TrainOptions, train};
@@ -14,6 +15,7 @@ use clap::ValueEnum;
 use gs_io::{Error, Result, hash_file, write_bytes};
 use gs_scene::{SH_C0, ply};
 use serde_json::{Value, json};
+use stage::curve::{self, Panel};
 use stage::{CommonArgs, Program, Stage};
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
@@ -31,7 +33,7 @@ pub struct Args {
     /// footprints.safetensors of graph-precompute
     #[arg(long, value_name = "FILE")]
     footprints: PathBuf,
-    /// Where to write the features; the curve goes to <FILE>.curve.jsonl
+    /// Where to write the features; the curve goes to <FILE>.curve.jsonl, as a picture to <FILE>.curve.svg
     #[arg(long, value_name = "FILE")]
     out: PathBuf,
     /// How features come about
@@ -104,6 +106,9 @@ struct Contrastive {
     /// Weight of a term that pulls Gaussians to the centroids of their masks (the paper found that it hurts)
     #[arg(long, value_name = "WEIGHT", default_value_t = 0.0)]
     cohesion: f64,
+    /// Of what this is the distance to the centroid
+    #[arg(long, value_enum, default_value_t = CohesionOf::Gaussians)]
+    cohesion_of: CohesionOf,
     /// Give what anchors aggregate to the anchors alone
     #[arg(long)]
     no_propagation: bool,
@@ -116,6 +121,9 @@ struct Contrastive {
     /// Leave Gaussians that the view does not see, and their momentum, as they are: an approximation
     #[arg(long)]
     lazy_adam: bool,
+    /// Keep footprint weights in 16 bits, each within 0.02% of what it was: an approximation
+    #[arg(long)]
+    half_weights: bool,
     /// Hold out every tenth view from training, and stop when their loss has settled
     #[arg(long)]
     early_stop: bool,
@@ -205,10 +213,12 @@ impl Args {
                 "lr": c.lr,
                 "weight_lr": c.weight_lr,
                 "cohesion": c.cohesion,
+                "cohesion_of": name_of(&c.cohesion_of),
                 "propagation": !c.no_propagation,
                 "curve_every": c.curve_every,
                 "stats_every": c.stats_every,
                 "lazy_adam": c.lazy_adam,
+                "half_weights": c.half_weights,
                 "early_stop": c.early_stop,
             }),
             Method::Spectral => json!({
@@ -255,9 +265,10 @@ impl Args {
         Ok(Inputs { graph, footprints, hashes })
     }
 
-    fn contrastive(&self, inputs: &Inputs, stage: &Stage) -> Result<(usize, Vec<f32>, Value)> {
+    fn contrastive<W: Weight>(&self, inputs: &Inputs, stage: &Stage) -> Result<(usize, Vec<f32>, Value)> {
         let c = &self.contrastive;
-        let gaussians = ply::read_gaussians(&self.geometry)?;
+        // Damaged Gaussians are no kept ones: graph-precompute leaves them out.
+        let gaussians = ply::read_gaussians_as_they_are(&self.geometry)?;
         if let Some(&last) = inputs.graph.kept.last().filter(|l| **l as usize >= gaussians.len()) {
             return Err(Error::new("the graph speaks of Gaussians that the geometry lacks")
                 .file(&self.graph)
@@ -271,10 +282,16 @@ impl Args {
             .iter()
             .map(|&i| [0, 1, 2].map(|ch| 0.5 + SH_C0 * gaussians.sh_of(i as usize)[ch]))
             .collect();
+        if let Some(bad) = colors.iter().position(|c| c.iter().any(|v| !v.is_finite())) {
+            return Err(Error::new("a colour is not finite")
+                .file(&self.geometry)
+                .field(format!("vertex {}, f_dc_*", inputs.graph.kept[bad]))
+                .hint("mend the PLY, as with gs-geom convert"));
+        }
         let positions: Vec<[f32; 3]> = inputs.graph.kept.iter().map(|&i| gaussians.means[i as usize]).collect();
         drop(gaussians);
         let context = Context::new(&inputs.graph, &colors, &positions, c.neighbours, !c.no_propagation);
-        let sets = mask_sets::<f32>(&inputs.footprints, &context, &self.levels, 2)?;
+        let sets = mask_sets::<W>(&inputs.footprints, &context, &self.levels, 2)?;
         let units = inputs.footprints.views.len() * self.levels.len();
         if sets.len() < units {
             stage.skipped(&format!("{} of {units} views and levels: fewer than two masks", units - sets.len()));
@@ -293,6 +310,7 @@ impl Args {
                 loss: c.loss,
                 tau: c.tau,
                 cohesion: c.cohesion,
+                cohesion_of: c.cohesion_of,
                 init: c.init,
             },
             iterations: c.iterations,
@@ -304,6 +322,12 @@ impl Args {
             shortcuts: Shortcuts { stats_every: c.stats_every, lazy_adam: c.lazy_adam },
             early_stop: c.early_stop,
         };
+        if options.settings.needs_pixels() && sets.iter().all(|s| s.sampled.is_empty()) {
+            return Err(Error::new("no sampled pixels, which this loss looks at")
+                .file(&self.footprints)
+                .field("pixel_row")
+                .hint("run graph-precompute with --pixel-samples 16"));
+        }
         if !Engine::serves(&options.settings) && options.shortcuts != Shortcuts::default() {
             return Err(Error::new("not with this loss, --cohesion or --norm-axis").field(if c.lazy_adam {
                 "--lazy-adam"
@@ -314,7 +338,7 @@ impl Args {
         // A checkpoint serves runs of any number of iterations, as long as everything else is equal.
         let provenance = stage.provenance("", 0, Value::Object(self.parameters()), inputs.hashes.clone());
         let path = checkpoint::path(&self.out);
-        let on_curve = |curve: &[CurvePoint]| write_curve(&self.out, curve.iter().map(|p| json!(p)));
+        let on_curve = |curve: &[CurvePoint]| write_curve(&self.out, curve.iter().map(|p| json!(p)), &TRAINING);
         let trained = train(&context, &sets, &options, Some((&path, &provenance)), stage, on_curve)?;
         let last = trained.curve.last().copied().unwrap_or_default();
         let summary = json!({ "views": sets.len(), "last": last, "resumed_at": trained.resumed_at,
@@ -344,7 +368,7 @@ impl Args {
             stage.info(&format!("{without} of {} Gaussians lie in no mask: their features are zero", matrix.gaussians));
         }
         let values = found.singular_values.iter().enumerate();
-        write_curve(&self.out, values.map(|(i, v)| json!({ "iteration": i + 1, "singular_value": v })))?;
+        write_curve(&self.out, values.map(|(i, v)| json!({ "iteration": i + 1, "singular_value": v })), &SPECTRUM)?;
         let summary = json!({
             "masks": matrix.masks.len(), "dim": found.dim, "passes": found.passes, "without_mask": without,
             "singular_values": found.singular_values,
@@ -353,12 +377,27 @@ impl Args {
     }
 }
 
-/// Writes `<out>.curve.jsonl`.
-fn write_curve(out: &Path, lines: impl Iterator<Item = Value>) -> Result<()> {
-    let mut name = out.as_os_str().to_owned();
-    name.push(".curve.jsonl");
-    let text: String = lines.map(|l| format!("{l}\n")).collect();
-    write_bytes(PathBuf::from(name), text.as_bytes())
+/// Panels of the picture of training.
+const TRAINING: [Panel; 4] = [
+    ("loss", "loss", "#1f77b4"),
+    ("alignment", "alignment: mean cosine of a mask's Gaussians with its centroid", "#2ca02c"),
+    ("separation", "separation: 1 - mean cosine of different masks", "#d62728"),
+    ("rate", "learning rate of features", "#7f7f7f"),
+];
+/// Panel of the picture of a closed form.
+const SPECTRUM: [Panel; 1] = [("singular_value", "singular values", "#1f77b4")];
+
+/// Writes `<out>.curve.jsonl` and its picture, `<out>.curve.svg`.
+fn write_curve(out: &Path, points: impl Iterator<Item = Value>, panels: &[Panel]) -> Result<()> {
+    let beside = |suffix: &str| {
+        let mut name = out.as_os_str().to_owned();
+        name.push(suffix);
+        PathBuf::from(name)
+    };
+    let lines: Vec<String> = points.map(|p| p.to_string()).collect();
+    let text: String = lines.iter().map(|l| format!("{l}\n")).collect();
+    write_bytes(beside(".curve.jsonl"), text.as_bytes())?;
+    write_bytes(beside(".curve.svg"), curve::svg(&lines, panels).as_bytes())
 }
 
 impl Program for Args {
@@ -372,7 +411,8 @@ impl Program for Args {
         self.check()?;
         let inputs = self.read_inputs()?;
         let (dim, values, summary) = match self.method() {
-            Method::Contrastive => self.contrastive(&inputs, stage)?,
+            Method::Contrastive if self.contrastive.half_weights => self.contrastive::<Half>(&inputs, stage)?,
+            Method::Contrastive => self.contrastive::<f32>(&inputs, stage)?,
             Method::Spectral => self.spectral(&inputs, stage)?,
         };
         let mut parameters = self.parameters();

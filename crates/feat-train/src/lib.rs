@@ -15,6 +15,7 @@ pub mod loss;
 pub mod model;
 pub mod network;
 pub mod normalize;
+pub mod pixels;
 pub mod real;
 pub mod scene;
 pub mod spectral;

@@ -17,6 +17,9 @@ pub enum Loss {
     /// Per Gaussian instead of per mask: each Gaussian against the centroids of all masks, its own masks being positive
     /// in proportion to their weight.
     Gaussian,
+    /// Per pixel: the rendered feature of each sampled pixel against the centroids of all masks, that of its own mask being
+    /// the positive. See [`crate::pixels`].
+    Pixel,
 }
 
 /// Centroids shorter than this have no direction and take no part.
@@ -76,8 +79,88 @@ pub fn log_sum_exp(logits: &mut [f64]) -> f64 {
     max + sum.ln()
 }
 
+/// The centroids of a view's masks, as what single features are told apart by.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Prototypes {
+    d: usize,
+    tau: f64,
+    unit: Vec<f64>,
+    length: Vec<f64>,
+    /// Those that have a direction.
+    alive: Vec<usize>,
+}
+
+impl Prototypes {
+    /// Of `centroids` `[K][d]`, at the temperature `tau`.
+    pub fn new(centroids: &[f64], d: usize, tau: f64) -> Self {
+        let (unit, length) = directions(centroids, d);
+        let alive = (0..length.len()).filter(|&k| length[k] > SHORTEST).collect();
+        Self { d, tau, unit, length, alive }
+    }
+
+    /// Cross-entropy of the softmax over all masks of the cosines with `f`, against its `share` in each mask `[K]`. Adds
+    /// the gradients of the centroids `[K][d]` and of `f` where asked for.
+    pub fn cross_entropy(
+        &self,
+        f: &[f64],
+        share: &[f64],
+        centroids: Option<&mut [f64]>,
+        feature: Option<&mut [f64]>,
+    ) -> f64 {
+        let (d, tau) = (self.d, self.tau);
+        let (u, f_length) = directions(f, d);
+        if f_length[0] <= SHORTEST || self.alive.len() < 2 {
+            return 0.0;
+        }
+        let mine: f64 = self.alive.iter().map(|&k| share[k]).sum();
+        let mut softmax: Vec<f64> = self.alive.iter().map(|&k| dot(&u, &self.unit[k * d..(k + 1) * d]) / tau).collect();
+        let positive: f64 = self.alive.iter().zip(&softmax).map(|(&k, l)| share[k] * l).sum();
+        let value = mine * log_sum_exp(&mut softmax) - positive;
+        // Gradient of each cosine.
+        let g: Vec<f64> = self.alive.iter().zip(&softmax).map(|(&k, p)| (mine * p - share[k]) / tau).collect();
+        if let Some(to) = centroids {
+            for (&k, g) in self.alive.iter().zip(&g) {
+                let scaled: Vec<f64> = u.iter().map(|u| g * u).collect();
+                let range = k * d..(k + 1) * d;
+                add_direction_gradient(&mut to[range.clone()], &self.unit[range], self.length[k], &scaled);
+            }
+        }
+        if let Some(to) = feature {
+            let mut sum = vec![0.0; d];
+            for (&k, g) in self.alive.iter().zip(&g) {
+                sum.iter_mut().zip(&self.unit[k * d..(k + 1) * d]).for_each(|(s, u)| *s += g * u);
+            }
+            add_direction_gradient(to, &u, f_length[0], &sum);
+        }
+        value
+    }
+}
+
+/// Distance of `f` from `centroid` times `scale`; adds the gradients of both where asked for.
+pub fn cohesion(
+    f: &[f64],
+    centroid: &[f64],
+    scale: f64,
+    to_centroid: Option<&mut [f64]>,
+    to_feature: Option<&mut [f64]>,
+) -> f64 {
+    let difference: Vec<f64> = f.iter().zip(centroid).map(|(f, c)| f - c).collect();
+    let distance = dot(&difference, &difference).sqrt();
+    if distance > SHORTEST {
+        let g = |v: &f64| scale * v / distance;
+        if let Some(to) = to_centroid {
+            to.iter_mut().zip(&difference).for_each(|(t, v)| *t -= g(v));
+        }
+        if let Some(to) = to_feature {
+            to.iter_mut().zip(&difference).for_each(|(t, v)| *t += g(v));
+        }
+    }
+    scale * distance
+}
+
 /// The loss per mask, averaged over the masks that take part. `positives` are needed for [`Loss::HalfMask`], which gives
-/// their gradient too, and for [`Loss::CrossView`], where they are constant and zeros stand for none; [`Loss::Gaussian`] is none of masks: its loss is 0 here and only the separation is of interest.
+/// their gradient too, and for [`Loss::CrossView`], where they are constant and zeros stand for none; [`Loss::Gaussian`] and
+/// [`Loss::Pixel`] are none of masks: their loss is 0 here and only the separation is of interest.
 pub fn evaluate(loss: Loss, centroids: &[f64], positives: Option<&[f64]>, d: usize, tau: f64) -> Evaluated {
     let masks = centroids.len() / d;
     let (unit, length) = directions(centroids, d);
@@ -104,7 +187,7 @@ pub fn evaluate(loss: Loss, centroids: &[f64], positives: Option<&[f64]>, d: usi
         let mut logits: Vec<f64> = others.iter().map(|&j| dot(&u, &unit[j * d..(j + 1) * d]) / tau).collect();
         cosines += logits.iter().sum::<f64>() * tau;
         let own = match loss {
-            Loss::Gaussian => continue,
+            Loss::Gaussian | Loss::Pixel => continue,
             Loss::Printed | Loss::WithSelf => 1.0 / tau,
             Loss::CrossView if !has_positive(k) => 1.0 / tau,
             Loss::HalfMask | Loss::CrossView => dot(&u, &of(&pos_unit, k)) / tau,

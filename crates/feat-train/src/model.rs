@@ -1,10 +1,11 @@
 //! The model of the paper's stage 2: per-Gaussian features, the graph network that adds context, the loss on one view's
 //! masks, and their gradients. Written once for f32 and f64.
 
-use crate::loss::{self, Loss, SHORTEST, add_direction_gradient, directions, dot, log_sum_exp};
+use crate::loss::{self, Loss, Prototypes, directions, dot};
 use crate::network::{self, Activations, Layer};
 use crate::normalize::{Axis, Moments, channel_moments, row_moments};
-use crate::real::Real;
+use crate::pixels;
+use crate::real::{Real, Weight};
 use crate::scene::{Context, MaskSet, NONE, Neighbours};
 use rand::Rng;
 use rayon::prelude::*;
@@ -25,6 +26,15 @@ pub enum Init {
     NormalSmall,
 }
 
+/// Of what cohesion is the distance to a mask's centroid.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, clap::ValueEnum)]
+pub enum CohesionOf {
+    /// The mask's Gaussians, by their weight in it.
+    Gaussians,
+    /// The rendered features of its sampled pixels, as OpenGaussian has it.
+    Pixels,
+}
+
 /// What shapes the model.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Settings {
@@ -40,8 +50,17 @@ pub struct Settings {
     pub tau: f64,
     /// Weight of the cohesion term (pulls Gaussians to the centroids of their masks); the paper has none.
     pub cohesion: f64,
+    /// Of what.
+    pub cohesion_of: CohesionOf,
     /// How features start.
     pub init: Init,
+}
+
+impl Settings {
+    /// Whether the loss looks at sampled pixels.
+    pub fn needs_pixels(&self) -> bool {
+        self.loss == Loss::Pixel || self.cohesion > 0.0 && self.cohesion_of == CohesionOf::Pixels
+    }
 }
 
 /// Parameters.
@@ -200,11 +219,11 @@ impl<T: Real> Model<T> {
     }
 
     /// Sums over pieces of columns, in order: `visit(column, feature, sums)` adds to `sums`.
-    fn sum_columns(
+    fn sum_columns<W: Weight>(
         &self,
         context: &Context,
         propagated: &Propagated<T>,
-        set: &MaskSet<T>,
+        set: &MaskSet<W>,
         length: usize,
         visit: impl Fn(usize, &[f64], &mut [f64]) + Sync,
     ) -> Vec<f64> {
@@ -229,42 +248,49 @@ impl<T: Real> Model<T> {
     }
 
     /// Centroids A f of all masks `[K][d]`.
-    pub fn centroids(&self, context: &Context, propagated: &Propagated<T>, set: &MaskSet<T>) -> Vec<f64> {
+    pub fn centroids<W: Weight>(&self, context: &Context, propagated: &Propagated<T>, set: &MaskSet<W>) -> Vec<f64> {
         let d = self.settings.dim;
         self.sum_columns(context, propagated, set, set.len() * d, |c, f, sums| {
             let (masks, weights) = set.entries(c);
             for (&k, w) in masks.iter().zip(weights) {
                 let to = &mut sums[k as usize * d..(k as usize + 1) * d];
-                to.iter_mut().zip(f).for_each(|(s, f)| *s += w.get() * f);
+                to.iter_mut().zip(f).for_each(|(s, f)| *s += f64::from(w.get()) * f);
             }
         })
     }
 
     /// Mean over masks of the weighted mean cosine between a mask's Gaussians and its centroid.
-    pub fn alignment(&self, context: &Context, propagated: &Propagated<T>, set: &MaskSet<T>) -> f64 {
+    pub fn alignment<W: Weight>(&self, context: &Context, propagated: &Propagated<T>, set: &MaskSet<W>) -> f64 {
         let (d, masks) = (self.settings.dim, set.len());
         let (unit, _) = directions(&self.centroids(context, propagated, set), d);
         let sums = self.sum_columns(context, propagated, set, 2 * masks, |c, f, sums| {
             let (u, _) = directions(f, d);
             for (&k, w) in set.entries(c).0.iter().zip(set.entries(c).1) {
-                sums[k as usize] += w.get() * dot(&u, &unit[k as usize * d..(k as usize + 1) * d]);
-                sums[masks + k as usize] += w.get();
+                let w = f64::from(w.get());
+                sums[k as usize] += w * dot(&u, &unit[k as usize * d..(k as usize + 1) * d]);
+                sums[masks + k as usize] += w;
             }
         });
         (0..masks).map(|k| sums[k] / sums[masks + k]).sum::<f64>() / masks.max(1) as f64
     }
 
     /// Loss and gradients on the masks of one view. `noise` seeds the halves of [`Loss::HalfMask`].
-    pub fn step(&self, context: &Context, propagated: &Propagated<T>, set: &MaskSet<T>, noise: u64) -> Step<T> {
+    pub fn step<W: Weight>(
+        &self,
+        context: &Context,
+        propagated: &Propagated<T>,
+        set: &MaskSet<W>,
+        noise: u64,
+    ) -> Step<T> {
         self.step_beside(context, propagated, set, noise, None)
     }
 
     /// [`Model::step`], with positives from another view `[K][d]` for [`Loss::CrossView`].
-    pub fn step_beside(
+    pub fn step_beside<W: Weight>(
         &self,
         context: &Context,
         propagated: &Propagated<T>,
-        set: &MaskSet<T>,
+        set: &MaskSet<W>,
         noise: u64,
         beside: Option<&[f64]>,
     ) -> Step<T> {
@@ -275,7 +301,7 @@ impl<T: Real> Model<T> {
             self.sum_columns(context, propagated, set, set.len() * d, |c, f, sums| {
                 for e in set.start[c] as usize..set.start[c + 1] as usize {
                     if half(e) {
-                        let (k, w) = (set.mask[e] as usize, set.weight[e].get());
+                        let (k, w) = (set.mask[e] as usize, f64::from(set.weight[e].get()));
                         sums[k * d..(k + 1) * d].iter_mut().zip(f).for_each(|(s, f)| *s += w * f);
                     }
                 }
@@ -292,6 +318,17 @@ impl<T: Real> Model<T> {
             evaluated.loss += sums[centroids.len()];
             evaluated.centroids.iter_mut().zip(&sums).for_each(|(g, s)| *g += s);
         }
+        // So do sampled pixels; what they give the columns is added below.
+        let of_pixels = s.needs_pixels().then(|| {
+            let terms = pixels::Terms::new(s, set, &centroids);
+            let feature = |c: usize, f: &mut [f64]| {
+                self.final_feature(context, propagated, set.columns[c] as usize, f);
+            };
+            let (value, to_columns) =
+                terms.gradients(&set.sampled, set.columns.len(), feature, &mut evaluated.centroids);
+            evaluated.loss += value;
+            to_columns
+        });
         // Back to the columns, piece by piece; the Gaussians of an anchor lie in one piece.
         let parts: Vec<PieceGradients<T>> = set
             .pieces
@@ -303,7 +340,7 @@ impl<T: Real> Model<T> {
                 for c in bounds[0] as usize..bounds[1] as usize {
                     g.fill(0.0);
                     for e in set.start[c] as usize..set.start[c + 1] as usize {
-                        let (k, w) = (set.mask[e] as usize * d, set.weight[e].get());
+                        let (k, w) = (set.mask[e] as usize * d, f64::from(set.weight[e].get()));
                         g.iter_mut().zip(&evaluated.centroids[k..k + d]).for_each(|(g, v)| *g += w * v);
                         if positives.is_some() && half(e) {
                             g.iter_mut().zip(&evaluated.positives[k..k + d]).for_each(|(g, v)| *g += w * v);
@@ -313,6 +350,9 @@ impl<T: Real> Model<T> {
                     if columns.any() {
                         self.final_feature(context, propagated, place, &mut f);
                         columns.add(c, &f, None, Some(&mut g));
+                    }
+                    if let Some(rows) = &of_pixels {
+                        g.iter_mut().zip(&rows[c * d..(c + 1) * d]).for_each(|(g, v)| *g += v);
                     }
                     rows.extend(g.iter().map(|&v| T::of(v)));
                     let source = context.source[place];
@@ -379,25 +419,29 @@ impl<T: Real> Model<T> {
 type PieceGradients<T> = (Vec<T>, Vec<(u32, Vec<f64>)>);
 
 /// Terms of the loss that look at single Gaussians.
-struct ColumnTerms<'a, T> {
+struct ColumnTerms<'a, W> {
     settings: &'a Settings,
-    set: &'a MaskSet<T>,
+    set: &'a MaskSet<W>,
     centroids: &'a [f64],
-    unit: Vec<f64>,
-    length: Vec<f64>,
+    prototypes: Prototypes,
     /// Blending weight of all entries, in pixels.
     total: f64,
 }
 
-impl<'a, T: Real> ColumnTerms<'a, T> {
-    fn new(settings: &'a Settings, set: &'a MaskSet<T>, centroids: &'a [f64]) -> Self {
-        let (unit, length) = directions(centroids, settings.dim);
-        let total = set.mask.iter().zip(&set.weight).map(|(&k, w)| w.get() * set.pixels[k as usize]).sum();
-        Self { settings, set, centroids, unit, length, total }
+impl<'a, W: Weight> ColumnTerms<'a, W> {
+    fn new(settings: &'a Settings, set: &'a MaskSet<W>, centroids: &'a [f64]) -> Self {
+        let prototypes = Prototypes::new(centroids, settings.dim, settings.tau);
+        let pixels = |(&k, w): (&u16, &W)| f64::from(w.get()) * set.pixels[k as usize];
+        let total = set.mask.iter().zip(&set.weight).map(pixels).sum();
+        Self { settings, set, centroids, prototypes, total }
+    }
+
+    fn coheres(&self) -> bool {
+        self.settings.cohesion > 0.0 && self.settings.cohesion_of == CohesionOf::Gaussians
     }
 
     fn any(&self) -> bool {
-        self.settings.loss == Loss::Gaussian || self.settings.cohesion > 0.0
+        self.settings.loss == Loss::Gaussian || self.coheres()
     }
 
     /// The terms of column `c` with feature `f`; adds their gradients of the centroids and of the feature where asked for.
@@ -405,62 +449,20 @@ impl<'a, T: Real> ColumnTerms<'a, T> {
         let d = f.len();
         let (masks, weights) = self.set.entries(c);
         let mut value = 0.0;
-        if self.settings.cohesion > 0.0 {
+        if self.coheres() {
             for (&k, w) in masks.iter().zip(weights) {
                 let range = k as usize * d..(k as usize + 1) * d;
-                let difference: Vec<f64> = f.iter().zip(&self.centroids[range.clone()]).map(|(f, c)| f - c).collect();
-                let distance = dot(&difference, &difference).sqrt();
-                let scale = self.settings.cohesion * w.get() / self.set.len() as f64;
-                value += scale * distance;
-                if distance > SHORTEST {
-                    let g = |v: &f64| scale * v / distance;
-                    if let Some(to) = centroids.as_deref_mut() {
-                        to[range].iter_mut().zip(&difference).for_each(|(t, v)| *t -= g(v));
-                    }
-                    if let Some(to) = feature.as_deref_mut() {
-                        to.iter_mut().zip(&difference).for_each(|(t, v)| *t += g(v));
-                    }
-                }
+                let scale = self.settings.cohesion * f64::from(w.get()) / self.set.len() as f64;
+                let to_centroid = centroids.as_deref_mut().map(|to| &mut to[range.clone()]);
+                value += loss::cohesion(f, &self.centroids[range], scale, to_centroid, feature.as_deref_mut());
             }
         }
         if self.settings.loss == Loss::Gaussian {
-            value += self.contrast(c, f, centroids, feature);
-        }
-        value
-    }
-
-    /// Cross-entropy of the Gaussian's softmax over all masks against its shares in them.
-    fn contrast(&self, c: usize, f: &[f64], centroids: Option<&mut [f64]>, feature: Option<&mut [f64]>) -> f64 {
-        let (d, tau) = (f.len(), self.settings.tau);
-        let (u, f_length) = directions(f, d);
-        let alive: Vec<usize> = (0..self.set.len()).filter(|&k| self.length[k] > SHORTEST).collect();
-        if f_length[0] <= SHORTEST || alive.len() < 2 {
-            return 0.0;
-        }
-        let (masks, weights) = self.set.entries(c);
-        let mut share = vec![0.0; self.set.len()];
-        for (&k, w) in masks.iter().zip(weights).filter(|(k, _)| self.length[**k as usize] > SHORTEST) {
-            share[k as usize] += w.get() * self.set.pixels[k as usize] / self.total;
-        }
-        let mine: f64 = share.iter().sum();
-        let mut softmax: Vec<f64> = alive.iter().map(|&k| dot(&u, &self.unit[k * d..(k + 1) * d]) / tau).collect();
-        let positive: f64 = alive.iter().zip(&softmax).map(|(&k, l)| share[k] * l).sum();
-        let value = mine * log_sum_exp(&mut softmax) - positive;
-        // Gradient of each cosine.
-        let g: Vec<f64> = alive.iter().zip(&softmax).map(|(&k, p)| (mine * p - share[k]) / tau).collect();
-        if let Some(to) = centroids {
-            for (&k, g) in alive.iter().zip(&g) {
-                let scaled: Vec<f64> = u.iter().map(|u| g * u).collect();
-                let range = k * d..(k + 1) * d;
-                add_direction_gradient(&mut to[range.clone()], &self.unit[range], self.length[k], &scaled);
+            let mut share = vec![0.0; self.set.len()];
+            for (&k, w) in masks.iter().zip(weights) {
+                share[k as usize] += f64::from(w.get()) * self.set.pixels[k as usize] / self.total;
             }
-        }
-        if let Some(to) = feature {
-            let mut sum = vec![0.0; d];
-            for (&k, g) in alive.iter().zip(&g) {
-                sum.iter_mut().zip(&self.unit[k * d..(k + 1) * d]).for_each(|(s, u)| *s += g * u);
-            }
-            add_direction_gradient(to, &u, f_length[0], &sum);
+            value += self.prototypes.cross_entropy(f, &share, centroids, feature);
         }
         value
     }
@@ -495,6 +497,7 @@ mod tests {
             loss: Loss::Printed,
             tau: 0.1,
             cohesion: 0.0,
+            cohesion_of: CohesionOf::Gaussians,
             init: Init::Uniform,
         }
     }
@@ -503,7 +506,7 @@ mod tests {
     fn check(settings: Settings, kind: Neighbours, propagate: bool) {
         let name = format!("{settings:?} {kind:?} {propagate}");
         let context = context(50, kind, propagate);
-        let set = mask_set::<f64>(&context, 5, 3);
+        let set = mask_set(&context, 5, 3);
         let mut rng = ChaCha8Rng::seed_from_u64(1);
         let mut model = Model::<f64>::new(settings, &context, &mut rng);
         let propagated = model.propagate(&context);
@@ -562,18 +565,23 @@ mod tests {
         }
         check(settings(), Gaussians, false);
         check(settings(), Neighbours::AnchorInputs, true);
-        for loss in [Loss::WithSelf, Loss::HalfMask, Loss::CrossView, Loss::Gaussian] {
+        for loss in [Loss::WithSelf, Loss::HalfMask, Loss::CrossView, Loss::Gaussian, Loss::Pixel] {
             for norm_axis in [Axis::Channel, Axis::Gaussian] {
                 check(Settings { loss, norm_axis, ..settings() }, Anchors, true);
             }
         }
-        check(Settings { cohesion: 0.3, tau: 0.5, init: Init::NormalSmall, ..settings() }, Gaussians, true);
+        for cohesion_of in [CohesionOf::Gaussians, CohesionOf::Pixels] {
+            let cohesive = Settings { cohesion: 0.3, cohesion_of, tau: 0.5, init: Init::NormalSmall, ..settings() };
+            check(cohesive.clone(), Gaussians, true);
+            check(Settings { loss: Loss::Pixel, layers: 0, ..cohesive.clone() }, Gaussians, true);
+            check(Settings { loss: Loss::Pixel, ..cohesive }, Anchors, true);
+        }
     }
 
     #[test]
     fn threads_do_not_change_a_bit() {
         let context = context(20_000, Neighbours::Anchors, true);
-        let set = mask_set::<f32>(&context, 30, 3);
+        let set = mask_set(&context, 30, 3);
         assert!(set.pieces.len() > 4);
         let with = |threads| {
             let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();

@@ -4,7 +4,8 @@
 //! anchor serves lies together: sums over an anchor's Gaussians are sums over a range, no two threads ever add to the same
 //! place, and what a view sees, or an anchor aggregates, is mostly near in memory too.
 
-use crate::real::Real;
+use crate::pixels::Pixels;
+use crate::real::Weight;
 use artifacts::{Footprints, Graph, Level};
 use gs_io::{Error, Result};
 
@@ -173,8 +174,8 @@ fn transpose(start: &[u32], targets: &[u32], m: usize) -> (Vec<u32>, Vec<u32>) {
 }
 
 /// The masks of one view at one level: the matrix A of docs/method.md, by columns (Gaussians).
-#[derive(Debug, Clone, Default)]
-pub struct MaskSet<T> {
+#[derive(Debug, Clone)]
+pub struct MaskSet<W = f32> {
     /// Rows of the footprints artifact; K.
     pub rows: Vec<u32>,
     /// Gated pixels of each mask; K.
@@ -186,15 +187,32 @@ pub struct MaskSet<T> {
     /// Mask of each entry, below K, ascending within a column.
     pub mask: Vec<u16>,
     /// A[mask, column]: summed blending weight over gated pixels.
-    pub weight: Vec<T>,
+    pub weight: Vec<W>,
     /// Bounds of the pieces in which columns are worked on; the Gaussians of an anchor are never parted.
     pub pieces: Vec<u32>,
+    /// Single pixels of the masks; empty where the footprints have none.
+    pub sampled: Pixels,
 }
 
-impl<T: Real> MaskSet<T> {
+impl<W> Default for MaskSet<W> {
+    fn default() -> Self {
+        Self {
+            rows: Vec::new(),
+            pixels: Vec::new(),
+            columns: Vec::new(),
+            start: Vec::new(),
+            mask: Vec::new(),
+            weight: Vec::new(),
+            pieces: Vec::new(),
+            sampled: Pixels::default(),
+        }
+    }
+}
+
+impl<W: Weight> MaskSet<W> {
     /// Entries of the column at position `c`: masks and weights.
     #[inline]
-    pub fn entries(&self, c: usize) -> (&[u16], &[T]) {
+    pub fn entries(&self, c: usize) -> (&[u16], &[W]) {
         let range = self.start[c] as usize..self.start[c + 1] as usize;
         (&self.mask[range.clone()], &self.weight[range])
     }
@@ -214,12 +232,12 @@ impl<T: Real> MaskSet<T> {
 ///
 /// # Errors
 /// When a view has more masks than 16 bits can number.
-pub fn mask_sets<T: Real>(
+pub fn mask_sets<W: Weight>(
     footprints: &Footprints,
     context: &Context,
     levels: &[Level],
     least: usize,
-) -> Result<Vec<MaskSet<T>>> {
+) -> Result<Vec<MaskSet<W>>> {
     let place = inverse(&context.order);
     let mut sets = Vec::new();
     let mut from = 0;
@@ -253,7 +271,7 @@ impl Context {
     }
 }
 
-fn mask_set<T: Real>(footprints: &Footprints, rows: &[u32], place: &[u32], context: &Context) -> MaskSet<T> {
+fn mask_set<W: Weight>(footprints: &Footprints, rows: &[u32], place: &[u32], context: &Context) -> MaskSet<W> {
     let count = rows.iter().map(|&r| footprints.entries(r as usize).0.len()).sum();
     let mut entries: Vec<(u32, u16, f32)> = Vec::with_capacity(count);
     for (k, &r) in rows.iter().enumerate() {
@@ -262,10 +280,14 @@ fn mask_set<T: Real>(footprints: &Footprints, rows: &[u32], place: &[u32], conte
         entries.extend(col.iter().zip(weight).map(|(&c, &w)| (place[c as usize], k as u16, w / gated)));
     }
     let pixels = rows.iter().map(|&r| f64::from(footprints.rows[r as usize].gated)).collect();
-    MaskSet::from_entries(rows.to_vec(), pixels, entries, context)
+    let mut set = MaskSet::from_entries(rows.to_vec(), pixels, entries, context);
+    set.sampled = Pixels::of_masks(&footprints.pixels, rows, |col| {
+        set.columns.binary_search(&place[col as usize]).ok().map(|c| c as u32)
+    });
+    set
 }
 
-impl<T: Real> MaskSet<T> {
+impl<W: Weight> MaskSet<W> {
     /// From entries (place in the training order, mask, weight), in any order.
     pub fn from_entries(
         rows: Vec<u32>,
@@ -278,7 +300,7 @@ impl<T: Real> MaskSet<T> {
             rows,
             pixels,
             mask: entries.iter().map(|t| t.1).collect(),
-            weight: entries.iter().map(|t| T::of(f64::from(t.2))).collect(),
+            weight: entries.iter().map(|t| W::of(t.2)).collect(),
             ..Self::default()
         };
         let columns = 1 + entries.windows(2).filter(|w| w[0].0 != w[1].0).count();

@@ -1,6 +1,6 @@
 //! A small random scene in memory.
 
-use crate::real::Real;
+use crate::pixels::Pixels;
 use crate::scene::{Context, MaskSet, Neighbours, pieces};
 use artifacts::Graph;
 use rand::{Rng, SeedableRng};
@@ -45,7 +45,7 @@ pub fn context(n: usize, kind: Neighbours, propagate: bool) -> Context {
 }
 
 /// `masks` masks over most of the Gaussians, some of which lie in two.
-pub fn mask_set<T: Real>(context: &Context, masks: usize, seed: u64) -> MaskSet<T> {
+pub fn mask_set(context: &Context, masks: usize, seed: u64) -> MaskSet {
     let mut rng = ChaCha8Rng::seed_from_u64(seed);
     let n = context.order.len();
     let mut set = MaskSet {
@@ -67,10 +67,29 @@ pub fn mask_set<T: Real>(context: &Context, masks: usize, seed: u64) -> MaskSet<
         set.columns.push(place);
         for k in mine {
             set.mask.push(k as u16);
-            set.weight.push(T::of(rng.random_range(0.01..0.1)));
+            set.weight.push(rng.random_range(0.01..0.1));
         }
         set.start.push(set.mask.len() as u32);
     }
+    set.sampled = sampled(&set, &mut rng);
     set.pieces = pieces(&set.columns, &|a, b| context.source[a as usize] != context.source[b as usize]);
     set
+}
+
+/// Three pixels of every mask, each of a few of its Gaussians; the second mask has none.
+fn sampled(set: &MaskSet, rng: &mut ChaCha8Rng) -> Pixels {
+    let mut pixels = Pixels { start: vec![0], ..Pixels::default() };
+    for k in (0..set.len() as u16).filter(|&k| k != 1) {
+        let mine: Vec<u32> =
+            (0..set.columns.len() as u32).filter(|&c| set.entries(c as usize).0.contains(&k)).collect();
+        for _ in 0..if mine.is_empty() { 0 } else { 3 } {
+            let first = rng.random_range(0..mine.len());
+            let few = &mine[first..(first + 4).min(mine.len())];
+            pixels.mask.push(k);
+            pixels.column.extend(few);
+            pixels.weight.extend(few.iter().map(|_| rng.random_range(0.05f32..0.3)));
+            pixels.start.push(pixels.column.len() as u32);
+        }
+    }
+    pixels
 }

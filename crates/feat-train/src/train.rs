@@ -7,6 +7,7 @@ use crate::fast::{Engine, Shortcuts};
 use crate::loss::{Evaluated, Loss};
 use crate::model::{Model, Propagated, Settings, Step, splitmix};
 use crate::network::Layer;
+use crate::real::Weight;
 use crate::scene::{Context, MaskSet};
 use gs_io::{Error, Provenance, Result};
 use rand::SeedableRng;
@@ -101,9 +102,9 @@ pub struct Trained {
 ///
 /// # Errors
 /// When the loss is not finite, a checkpoint cannot be written, or the stage was interrupted (after a last checkpoint).
-pub fn train(
+pub fn train<W: Weight>(
     context: &Context,
-    sets: &[MaskSet<f32>],
+    sets: &[MaskSet<W>],
     options: &TrainOptions,
     checkpoint: Option<(&Path, &Provenance)>,
     stage: &Stage,
@@ -121,8 +122,8 @@ pub fn train(
     let resumed_at = state.iteration;
     let (held_out, seen): (Vec<_>, Vec<_>) =
         sets.iter().enumerate().partition(|(i, _)| options.early_stop && i % HELD_OUT == HELD_OUT - 1);
-    let held_out: Vec<&MaskSet<f32>> = held_out.into_iter().map(|(_, set)| set).take(MOST_HELD_OUT).collect();
-    let sets: Vec<&MaskSet<f32>> = seen.into_iter().map(|(_, set)| set).collect();
+    let held_out: Vec<&MaskSet<W>> = held_out.into_iter().map(|(_, set)| set).take(MOST_HELD_OUT).collect();
+    let sets: Vec<&MaskSet<W>> = seen.into_iter().map(|(_, set)| set).collect();
     if options.early_stop && held_out.is_empty() {
         stage.warn(&format!("--early-stop needs {HELD_OUT} views with masks: training to the end"));
     }
@@ -185,12 +186,12 @@ pub fn train(
 }
 
 /// Another view to take positives from, for the loss that asks for them.
-fn beside<'a>(
-    sets: &[&'a MaskSet<f32>],
-    set: &MaskSet<f32>,
+fn beside<'a, W: Weight>(
+    sets: &[&'a MaskSet<W>],
+    set: &MaskSet<W>,
     noise: u64,
     settings: &Settings,
-) -> Option<&'a MaskSet<f32>> {
+) -> Option<&'a MaskSet<W>> {
     let other = sets[(splitmix(noise) % sets.len() as u64) as usize];
     (settings.loss == Loss::CrossView && !std::ptr::eq(other, set)).then_some(other)
 }
@@ -227,11 +228,11 @@ impl<'a> Way<'a> {
     }
 
     /// Loss and separation.
-    fn forward(
+    fn forward<W: Weight>(
         &mut self,
         model: &Model<f32>,
-        set: &MaskSet<f32>,
-        beside: Option<&MaskSet<f32>>,
+        set: &MaskSet<W>,
+        beside: Option<&MaskSet<W>>,
         noise: u64,
         iteration: u64,
     ) -> [f64; 2] {
@@ -245,7 +246,7 @@ impl<'a> Way<'a> {
             }
             Self::Plain { context, propagated, step, .. } => {
                 *propagated = model.propagate(context);
-                let centroids = |b| model.centroids(context, propagated, b);
+                let centroids = |b: &MaskSet<W>| model.centroids(context, propagated, b);
                 let positives = beside.map(|b| cross_view::positives(set, b, &centroids(b), d));
                 *step = model.step_beside(context, propagated, set, noise, positives.as_deref());
                 [step.loss, step.separation]
@@ -254,12 +255,12 @@ impl<'a> Way<'a> {
     }
 
     /// Mean loss of views, which nothing is learnt from.
-    fn mean_loss(&mut self, model: &Model<f32>, sets: &[&MaskSet<f32>], iteration: u64) -> f64 {
+    fn mean_loss<W: Weight>(&mut self, model: &Model<f32>, sets: &[&MaskSet<W>], iteration: u64) -> f64 {
         let losses: f64 = sets.iter().map(|set| self.forward(model, set, None, 0, iteration)[0]).sum();
         losses / sets.len() as f64
     }
 
-    fn alignment(&self, model: &Model<f32>, set: &MaskSet<f32>) -> f64 {
+    fn alignment<W: Weight>(&self, model: &Model<f32>, set: &MaskSet<W>) -> f64 {
         match self {
             Self::Fast(engine, _) => engine.alignment(model, set),
             Self::Plain { context, propagated, .. } => model.alignment(context, propagated, set),
@@ -267,7 +268,7 @@ impl<'a> Way<'a> {
     }
 
     /// Moves all parameters by what [`Way::forward`] found.
-    fn update(&mut self, state: &mut State, set: &MaskSet<f32>, noise: u64, options: &TrainOptions) {
+    fn update<W: Weight>(&mut self, state: &mut State, set: &MaskSet<W>, noise: u64, options: &TrainOptions) {
         let done = state.iteration;
         state.iteration += 1;
         let State { model, features, layers, iteration, .. } = state;

@@ -1,9 +1,9 @@
 //! The program on artifacts on disk: both methods, the same bytes for any thread count and after a kill, bad input.
 
-use artifacts::{Features, FootprintsBuilder, Graph, Row, role};
+use artifacts::{Features, FootprintsBuilder, Graph, PixelSamples, Row, role};
 use gs_io::{Provenance, hash_file};
 use gs_scene::{Gaussians, ply};
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
 use std::process::{Command, Output, Stdio};
 use std::time::{Duration, Instant};
@@ -55,7 +55,9 @@ fn graph() -> Graph {
 }
 
 fn footprints() -> FootprintsBuilder {
-    let mut f = FootprintsBuilder { kept: (0..N as u32).collect(), row_ptr: vec![0], ..FootprintsBuilder::default() };
+    let pixels = PixelSamples { ptr: vec![0], ..PixelSamples::default() };
+    let mut f =
+        FootprintsBuilder { kept: (0..N as u32).collect(), row_ptr: vec![0], pixels, ..FootprintsBuilder::default() };
     for v in 0..VIEWS {
         f.views.push(format!("v{v}"));
         let cuts: &[u32] = if v % 3 == 0 { &[0, 40, 60, 80, 120] } else { &[0, 40, 80, 120] };
@@ -64,6 +66,13 @@ fn footprints() -> FootprintsBuilder {
             f.weight.extend((w[0]..w[1]).map(|i| 1.0 + (i % 3) as f32));
             f.row_ptr.push(f.col.len() as u64);
             let row = Row { view: v as u32, level: 3, mask: k as u32, pixels: 100, gated: 90, alpha: 0.9 };
+            // Four pixels of each mask, each showing three Gaussians.
+            for first in (w[0]..w[1] - 3).step_by(((w[1] - w[0]) / 4) as usize).take(4) {
+                f.pixels.row.push(f.rows.len() as u32);
+                f.pixels.col.extend(first..first + 3);
+                f.pixels.weight.extend([0.5, 0.2, 0.1]);
+                f.pixels.ptr.push(f.pixels.col.len() as u64);
+            }
             f.rows.push(row);
         }
     }
@@ -123,6 +132,8 @@ fn training_separates_masks_and_does_not_depend_on_threads() {
         &["--method", "contrastive", "--neighbours", "anchors", "--loss", "half-mask", "--norm-axis", "gaussian"],
         &["--method", "contrastive", "--neighbours", "anchor-inputs", "--loss", "cross-view", "--lazy-adam"],
         &["--method", "contrastive", "--loss", "gaussian", "--layers", "0", "--init", "normal-small"],
+        &["--method", "contrastive", "--loss", "pixel", "--cohesion", "0.1", "--cohesion-of", "pixels"],
+        &["--method", "contrastive", "--half-weights"],
     ] {
         let with = |threads| {
             let args =
@@ -137,7 +148,36 @@ fn training_separates_masks_and_does_not_depend_on_threads() {
         assert!(of(5, "loss") < of(0, "loss"), "{variant:?} {curve}");
         assert!(of(5, "separation") > of(0, "separation"), "{variant:?} {curve}");
         assert!(!beside(&out, ".checkpoint").exists());
+        let picture = std::fs::read_to_string(beside(&out, ".curve.svg")).unwrap();
+        assert_eq!(picture.matches("<polyline").count(), 4, "loss, alignment, separation, rate: {picture}");
     }
+}
+
+/// docs/method.md says which command line makes each row of the paper's ablation tables: all of them train.
+#[test]
+fn every_row_of_the_ablation_tables_trains() {
+    let (dir, out) = setup();
+    let docs = std::fs::read_to_string(Path::new(env!("CARGO_MANIFEST_DIR")).join("../../docs/method.md")).unwrap();
+    let section = docs.split("## The paper's ablation tables").nth(1).unwrap().split("\n## ").next().unwrap();
+    let rows: Vec<&str> = section.lines().filter_map(|l| l.split("`--").nth(1)).collect();
+    assert_eq!(rows.len(), 5 + 4 + 5, "{section}");
+    let mut outputs = BTreeMap::new();
+    for row in rows {
+        let line = format!("--{}", row.split('`').next().unwrap());
+        let args: Vec<&str> = line.split(' ').chain(["--iterations", "200", "--lr", "0.01"]).collect();
+        succeed(dir.path(), &out, &args);
+        let curve = std::fs::read_to_string(beside(&out, ".curve.jsonl")).unwrap();
+        let losses: Vec<f64> = curve
+            .lines()
+            .map(|l| serde_json::from_str::<serde_json::Value>(l).unwrap()["loss"].as_f64().unwrap())
+            .collect();
+        assert!(losses[losses.len() - 1] < losses[0], "{line}: {losses:?}");
+        let values: Vec<u32> = Features::read(&out).unwrap().0.values.iter().map(|v| v.to_bits()).collect();
+        outputs.insert(line, values);
+    }
+    // The full method has three names and its features alone two; all else differs.
+    let distinct: BTreeSet<_> = outputs.values().collect();
+    assert_eq!((outputs.len(), distinct.len()), (14, 14 - 2 - 1));
 }
 
 #[test]
@@ -213,14 +253,18 @@ fn bad_input_is_one_line_and_leaves_the_output_alone() {
     fail(&["--preset", "paper", "--layers", "5"], &["--layers", "found 5", "0 to 4"]);
     fail(&["--tau", "0"], &["--tau"]);
     fail(&["--preset", "paper", "--dim", "65"], &["--dim", "65"]);
+    fail(&["--preset", "paper", "--loss", "pixel", "--lazy-adam"], &["--lazy-adam", "not with this loss"]);
     fail(&["--method", "spectral", "--levels", "small"], &["footprints.safetensors", "no mask has a footprint"]);
     fail(&["--preset", "paper", "--levels", "small"], &["footprints.safetensors", "two masks"]);
     // Footprints of another run: one Gaussian less.
     let (_, graph_file) = Graph::read(dir.path().join("graph.safetensors")).unwrap();
     let provenance = || Provenance { inputs: graph_file.provenance().inputs.clone(), ..Provenance::default() };
+    let path = dir.path().join("footprints.safetensors");
+    let without = FootprintsBuilder { pixels: PixelSamples::default(), ..footprints() };
+    without.write(&path, provenance()).unwrap();
+    fail(&["--preset", "paper", "--loss", "pixel"], &["footprints.safetensors", "pixel_row", "--pixel-samples"]);
     let mut other = footprints();
     other.kept.push(N as u32);
-    let path = dir.path().join("footprints.safetensors");
     other.write(&path, provenance()).unwrap();
     fail(&[], &["footprints.safetensors", "kept", "found 121 Gaussians"]);
     let mut foreign = provenance();

@@ -6,7 +6,7 @@ mod rendering;
 mod scene;
 
 use feat_train::loss::Loss;
-use feat_train::model::{Init, Model, Settings};
+use feat_train::model::{CohesionOf, Init, Model, Settings};
 use feat_train::normalize::Axis;
 use feat_train::scene::Neighbours;
 use rand::SeedableRng;
@@ -23,6 +23,7 @@ fn footprints_give_what_rendering_and_averaging_give() {
         loss: Loss::Printed,
         tau: 0.1,
         cohesion: 0.0,
+        cohesion_of: CohesionOf::Gaussians,
         init: Init::Uniform,
     };
     let mut model = Model::<f32>::new(settings, &context, &mut ChaCha8Rng::seed_from_u64(0));

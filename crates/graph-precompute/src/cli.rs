@@ -2,7 +2,7 @@
 
 use crate::graph::{GraphOptions, Space};
 use crate::precompute::{Options, precompute};
-use artifacts::role;
+use artifacts::{ScratchEntries, role};
 use gs_io::{Error, Result, hash_file};
 use gs_scene::dataset::{self, LoadOptions, Resolution, Split, View};
 use gs_scene::ply;
@@ -58,6 +58,9 @@ pub struct Args {
     /// Drop footprint entries below this share of their mask; 0 keeps all. The largest change is reported
     #[arg(long, value_name = "SHARE", default_value_t = 0.0)]
     cut: f64,
+    /// Keep so many random pixels of each mask too, for the losses of feat-train that look at single pixels
+    #[arg(long, value_name = "COUNT", default_value_t = 0)]
+    pixel_samples: usize,
     /// Keep Gaussians that no view sees
     #[arg(long)]
     no_skip: bool,
@@ -114,6 +117,9 @@ impl Args {
         if !(0.0..1.0).contains(&self.cut) {
             return bad("--cut", self.cut.to_string(), "at least 0, below 1");
         }
+        if self.pixel_samples > 4096 {
+            return bad("--pixel-samples", self.pixel_samples.to_string(), "0 to 4096");
+        }
         Ok(Options {
             graph: GraphOptions {
                 anchor_ratio: self.anchor_ratio,
@@ -126,6 +132,7 @@ impl Args {
             min_mask_pixels: self.min_mask_pixels,
             cut: self.cut,
             keep_unseen: self.keep_unseen(),
+            pixel_samples: self.pixel_samples,
         })
     }
 
@@ -139,6 +146,7 @@ impl Args {
             "gate": self.gate,
             "min_mask_pixels": self.min_mask_pixels,
             "cut": self.cut,
+            "pixel_samples": self.pixel_samples,
             "no_skip": self.keep_unseen(),
             "sample_space": if self.space() == Space::World { "world" } else { "contracted" },
             "seed": self.common.seed,
@@ -163,7 +171,9 @@ impl Program for Args {
         }
         let views: Vec<&View> =
             dataset.views.iter().filter(|v| self.views == Views::All || v.split == Split::Train).collect();
-        let gaussians = ply::read_gaussians(&self.geometry)?;
+        // Damaged Gaussians are left out and said to be, not refused: the rest of the scene is none the worse.
+        let mut gaussians = ply::read_gaussians_as_they_are(&self.geometry)?;
+        gaussians.opacity_logits.iter_mut().filter(|o| o.is_infinite()).for_each(|o| *o = o.clamp(-50.0, 50.0));
         if gaussians.is_empty() {
             return Err(Error::new("no Gaussians").file(&self.geometry).hint("train the geometry first"));
         }
@@ -172,13 +182,14 @@ impl Program for Args {
             (role::DATASET.to_string(), dataset.hash()?),
             (role::MASKS.to_string(), artifacts::hash_folder(&self.masks, "_s.npy")?),
         ]);
-        let (footprints, graph, summary) =
-            precompute(&gaussians, &views, &self.masks, &options, stage).map_err(|e| match views.is_empty() {
-                true => Error::new("all views are held out").file(&self.scene).hint("give --views all or --holdout 0"),
-                false => e,
-            })?;
+        let mut entries = ScratchEntries::beside(&self.footprints)?;
+        let (footprints, graph, summary) = precompute(&gaussians, &views, &self.masks, &options, stage, &mut entries)
+            .map_err(|e| match views.is_empty() {
+            true => Error::new("all views are held out").file(&self.scene).hint("give --views all or --holdout 0"),
+            false => e,
+        })?;
         let provenance = || stage.provenance("", 0, self.parameters(), inputs.clone());
-        footprints.write(&self.footprints, provenance())?;
+        footprints.write_with(entries, &self.footprints, provenance())?;
         graph.write(&self.graph, provenance())?;
         stage.info(&format!(
             "{} anchors among {} Gaussians; {} masks in {} views, {} footprint entries",
@@ -189,8 +200,16 @@ impl Program for Args {
             "distance to the anchor: median {:.4}, 90% within {:.4}, 99% within {:.4}, largest {:.4}",
             d.median, d.p90, d.p99, d.largest
         ));
+        let m = summary.middle;
+        stage.info(&format!(
+            "the half of the Gaussians nearest to the middle has {:.1}% of the anchors; distance median {:.4}, 99% within {:.4}",
+            100.0 * m.share, m.distance.median, m.distance.p99
+        ));
         if self.cut > 0.0 {
-            stage.info(&format!("the cut dropped at most {:.3e} of a mask", summary.largest_cut));
+            stage.info(&format!(
+                "the cut dropped at most {:.3e} of a mask: no centroid moves by more than that times the longest feature",
+                summary.largest_cut
+            ));
         }
         let summary = json!(summary);
         for output in [&self.footprints, &self.graph] {

@@ -23,23 +23,54 @@ pub struct ViewFootprints {
     pub seen: Vec<(u32, f64)>,
     /// Masks left out for having fewer pixels than asked for.
     pub small_masks: usize,
+    /// Single pixels of the masks, in the order of `rows`.
+    pub pixels: Vec<Pixel>,
+}
+
+/// What a view is looked at for.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct FootprintOptions {
+    /// Accumulated alpha above which a pixel counts for the weights.
+    pub gate: f32,
+    /// Masks with fewer pixels are left out.
+    pub min_pixels: usize,
+    /// Single pixels kept of each mask, at most.
+    pub samples: usize,
+    /// Seed of their choice.
+    pub seed: u64,
+}
+
+/// A pixel of a mask and the Gaussians that it shows.
+#[derive(Debug, Clone, Default, PartialEq)]
+pub struct Pixel {
+    /// The mask, as a position in [`ViewFootprints::rows`].
+    pub row: u32,
+    /// The lowest keys of a mask are kept; well-mixed, so that they are a random choice.
+    key: u64,
+    /// Gaussians, ascending, and their blending weights.
+    pub entries: Vec<(u32, f32)>,
 }
 
 /// Computes the footprints of one view.
 ///
-/// `camera` must have the size of `maps`. A pixel counts for the weights where its accumulated alpha exceeds `gate`.
-/// Masks with fewer than `min_pixels` pixels are left out.
+/// `camera` must have the size of `maps`.
 pub fn view_footprints(
     gaussians: &Gaussians,
     camera: &Camera,
     maps: &MaskMaps,
-    gate: f32,
-    min_pixels: usize,
+    options: &FootprintOptions,
 ) -> ViewFootprints {
-    let (mut rows, row_of, small_masks) = mask_rows(maps, min_pixels);
+    let (mut rows, row_of, small_masks) = mask_rows(maps, options.min_pixels);
     // Colour plays no part.
-    let options = RasterOptions { sh_degree: 0, ..RasterOptions::default() };
-    let tiles = gs_raster::tile_weights(gaussians, camera, &options, true, |tile| tile_sums(tile, maps, &row_of, gate));
+    let raster = RasterOptions { sh_degree: 0, ..RasterOptions::default() };
+    let below: Vec<u64> = rows.iter().map(|r| candidates_below(options.samples, r.pixels)).collect();
+    let mut tiles = gs_raster::tile_weights(gaussians, camera, &raster, true, |tile| {
+        let mut sums = tile_sums(tile, maps, &row_of, options.gate);
+        if options.samples > 0 {
+            sums.pixels = tile_pixels(tile, maps, &row_of, options, &below);
+        }
+        sums
+    });
     let mut alpha = vec![0.0f64; rows.len()];
     for fact in tiles.iter().flat_map(|t| &t.facts) {
         rows[fact.row as usize].gated += fact.gated;
@@ -55,7 +86,66 @@ pub fn view_footprints(
         entries: entries.into_iter().map(|e| e.into_iter().map(|(g, w)| (g, w as f32)).collect()).collect(),
         seen: seen.pop().unwrap_or_default(),
         small_masks,
+        pixels: lowest_keys(tiles.iter_mut().flat_map(|t| std::mem::take(&mut t.pixels)).collect(), options.samples),
     }
+}
+
+/// The key below which a pixel of a mask of `pixels` is worth keeping for a while: four times as many as `samples` are,
+/// so that enough pass the gate.
+fn candidates_below(samples: usize, pixels: u32) -> u64 {
+    let share = 4.0 * samples as f64 / f64::from(pixels.max(1));
+    if share >= 1.0 { u64::MAX } else { (share * u64::MAX as f64) as u64 }
+}
+
+/// Per mask the `count` pixels of the lowest keys; masks ascend.
+fn lowest_keys(mut pixels: Vec<Pixel>, count: usize) -> Vec<Pixel> {
+    pixels.sort_by_key(|p| (p.row, p.key));
+    let (mut row, mut kept) = (NONE, 0);
+    pixels.retain(|p| {
+        kept = if p.row == row { kept + 1 } else { 1 };
+        row = p.row;
+        kept <= count
+    });
+    pixels
+}
+
+/// A well-mixed number (splitmix64).
+fn mixed(counter: u64) -> u64 {
+    let mut z = counter.wrapping_add(0x9E37_79B9_7F4A_7C15);
+    z = (z ^ (z >> 30)).wrapping_mul(0xBF58_476D_1CE4_E5B9);
+    z = (z ^ (z >> 27)).wrapping_mul(0x94D0_49BB_1331_11EB);
+    z ^ (z >> 31)
+}
+
+/// Gated pixels of a tile whose keys are low, and what they show.
+fn tile_pixels(
+    tile: &TileWeights,
+    maps: &MaskMaps,
+    row_of: &[Vec<u32>; LEVELS],
+    options: &FootprintOptions,
+    below: &[u64],
+) -> Vec<Pixel> {
+    let size = maps.width * maps.height;
+    let mut out = Vec::new();
+    for y in 0..tile.height {
+        for x in 0..tile.width {
+            let (at, pixel) = (y * TILE + x, (tile.y0 + y) * maps.width + tile.x0 + x);
+            for level in 0..LEVELS {
+                let id = maps.ids[level * size + pixel];
+                let row = if id < 0 { NONE } else { row_of[level][id as usize] };
+                let key = mixed(options.seed ^ mixed((pixel * LEVELS + level) as u64));
+                if row == NONE || tile.alpha[at] <= options.gate || key > below[row as usize] {
+                    continue;
+                }
+                let weights = tile.weights.chunks_exact(TILE * TILE).map(|w| w[at]);
+                let mut entries: Vec<(u32, f32)> =
+                    tile.gaussians.iter().copied().zip(weights).filter(|(_, w)| *w > 0.0).collect();
+                entries.sort_unstable_by_key(|e| e.0);
+                out.push(Pixel { row, key, entries });
+            }
+        }
+    }
+    out
 }
 
 /// The masks that own enough pixels, by level and id; per level, the row of each id (`NONE` where it has none); how many
@@ -92,6 +182,7 @@ struct TileSums {
     /// (Gaussian, weight over all pixels of the tile).
     seen: Vec<(u32, f32)>,
     facts: Vec<Fact>,
+    pixels: Vec<Pixel>,
 }
 
 /// What one tile says of a mask.
@@ -103,7 +194,8 @@ struct Fact {
 
 fn tile_sums(tile: &TileWeights, maps: &MaskMaps, row_of: &[Vec<u32>; LEVELS], gate: f32) -> TileSums {
     let size = maps.width * maps.height;
-    let mut out = TileSums { entries: Vec::new(), seen: Vec::with_capacity(tile.gaussians.len()), facts: Vec::new() };
+    let seen = Vec::with_capacity(tile.gaussians.len());
+    let mut out = TileSums { entries: Vec::new(), seen, facts: Vec::new(), pixels: Vec::new() };
     // Cell 0 holds the pixels that count for no mask.
     let mut cells: Vec<[u32; LEVELS]> = vec![[NONE; LEVELS]];
     let mut cell_of = [0u16; TILE * TILE];
@@ -203,6 +295,38 @@ mod tests {
         MaskMaps { width: W, height: H, ids }
     }
 
+    fn options(min_pixels: usize, samples: usize) -> FootprintOptions {
+        FootprintOptions { gate: 0.7, min_pixels, samples, seed: 3 }
+    }
+
+    #[test]
+    fn pixels_times_features_are_rendered_features_and_no_mask_has_more_than_asked_for() {
+        let (g, camera, maps) = (cloud(400), camera(W as u32, H as u32), maps());
+        let d = 2;
+        let features: Vec<f32> = (0..g.len() * d).map(|i| ((i * 37) % 101) as f32 / 50.0 - 1.0).collect();
+        let image = gs_raster::render_features(&g, &features, d, &camera, &RasterOptions::default());
+        let alpha = gs_raster::render(&g, &camera, &RasterOptions::default()).alpha;
+        let result = view_footprints(&g, &camera, &maps, &options(5, 6));
+        assert!(result.pixels.windows(2).all(|p| (p[0].row, p[0].key) < (p[1].row, p[1].key)));
+        for (k, row) in result.rows.iter().enumerate() {
+            let mine: Vec<&Pixel> = result.pixels.iter().filter(|p| p.row as usize == k).collect();
+            assert!(mine.len() <= 6 && (mine.len() == 6 || row.gated < 30), "{row:?}: {}", mine.len());
+            let map = &maps.ids[row.level as usize * W * H..][..W * H];
+            for pixel in mine {
+                let rendered: Vec<f32> = (0..d)
+                    .map(|c| pixel.entries.iter().map(|&(i, w)| w * features[i as usize * d + c]).sum())
+                    .collect();
+                let close = |p: usize| (0..d).all(|c| (image[p * d + c] - rendered[c]).abs() < 1e-5);
+                let found = (0..W * H).any(|p| map[p] == row.mask as i32 && alpha[p] > 0.7 && close(p));
+                assert!(found, "no pixel of mask {k} looks like it");
+            }
+        }
+        assert!(result.pixels.len() > 40, "{}", result.pixels.len());
+        let other = view_footprints(&g, &camera, &maps, &FootprintOptions { seed: 4, ..options(5, 6) });
+        assert_ne!(result.pixels, other.pixels);
+        assert_eq!(result.entries, other.entries);
+    }
+
     #[test]
     fn a_footprint_times_features_is_the_mean_of_rendered_features() {
         let (g, camera) = (cloud(400), camera(W as u32, H as u32));
@@ -211,7 +335,8 @@ mod tests {
         let features: Vec<f32> = (0..g.len() * d).map(|i| ((i * 37) % 101) as f32 / 50.0 - 1.0).collect();
         let image = gs_raster::render_features(&g, &features, d, &camera, &RasterOptions::default());
         let alpha = gs_raster::render(&g, &camera, &RasterOptions::default()).alpha;
-        let result = view_footprints(&g, &camera, &maps, 0.7, 5);
+        let result = view_footprints(&g, &camera, &maps, &options(5, 0));
+        assert!(result.pixels.is_empty());
         assert_eq!(result.small_masks, 1);
         assert_eq!(result.rows.len(), 5 + 6);
         let mut gated_all = 0;
@@ -244,7 +369,7 @@ mod tests {
         let (g, camera, maps) = (cloud(2000), camera(W as u32, H as u32), maps());
         let with = |threads| {
             let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
-            pool.install(|| view_footprints(&g, &camera, &maps, 0.7, 1))
+            pool.install(|| view_footprints(&g, &camera, &maps, &options(1, 5)))
         };
         assert_eq!(with(1), with(3));
     }

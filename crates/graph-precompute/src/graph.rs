@@ -104,13 +104,45 @@ impl AnchorGraph {
     /// Distribution of the distances of `points` (those that the graph was made of) to their nearest anchors.
     pub fn distances(&self, points: &[[f32; 3]]) -> AnchorDistances {
         let to_anchor = |(p, &a): (&[f32; 3], &u32)| distance(points[self.anchors[a as usize] as usize], *p);
-        let mut all: Vec<f32> = points.iter().zip(&self.nearest_anchor).map(to_anchor).collect();
+        AnchorDistances::of(points.iter().zip(&self.nearest_anchor).map(to_anchor).collect())
+    }
+}
+
+impl AnchorDistances {
+    /// Of squared distances.
+    fn of(mut all: Vec<f32>) -> Self {
         all.sort_unstable_by(f32::total_cmp);
         let at = |share: f64| {
             let rank = (share * all.len() as f64).ceil() as usize;
             all.get(rank.max(1) - 1).map_or(0.0, |d| f64::from(*d).sqrt())
         };
-        AnchorDistances { median: at(0.5), p90: at(0.9), p99: at(0.99), largest: at(1.0) }
+        Self { median: at(0.5), p90: at(0.9), p99: at(0.99), largest: at(1.0) }
+    }
+}
+
+/// How anchors are shared out between the middle of a scene, where its things are, and the rest.
+#[derive(Debug, Clone, Copy, Default, PartialEq, serde::Serialize)]
+pub struct MiddleAnchors {
+    /// Share of the anchors that lie among the half of the Gaussians nearest to the scene's middle; a half would be even.
+    pub share: f64,
+    /// How far the Gaussians of that half are from their anchors.
+    pub distance: AnchorDistances,
+}
+
+impl AnchorGraph {
+    /// Looks at the half of `points` (those that the graph was made of, around their middle) that is nearest to the origin.
+    pub fn middle(&self, points: &[[f32; 3]]) -> MiddleAnchors {
+        let mut radii: Vec<f32> = points.iter().map(|&p| distance([0.0; 3], p)).collect();
+        if radii.is_empty() {
+            return MiddleAnchors::default();
+        }
+        let half = (radii.len() - 1) / 2;
+        let radius = *radii.select_nth_unstable_by(half, f32::total_cmp).1;
+        let inside = |p: &[f32; 3]| distance([0.0; 3], *p) <= radius;
+        let among = self.anchors.iter().filter(|&&a| inside(&points[a as usize])).count();
+        let served = points.iter().zip(&self.nearest_anchor).filter(|(p, _)| inside(p));
+        let all = served.map(|(p, &a)| distance(points[self.anchors[a as usize] as usize], *p)).collect();
+        MiddleAnchors { share: among as f64 / self.anchors.len() as f64, distance: AnchorDistances::of(all) }
     }
 }
 
@@ -165,6 +197,11 @@ mod tests {
         let g = AnchorGraph { anchors: vec![0], nearest_anchor: vec![0; 10], ..AnchorGraph::default() };
         assert_eq!(g.distances(&points), AnchorDistances { median: 4.0, p90: 8.0, p99: 9.0, largest: 9.0 });
         assert_eq!(AnchorGraph::default().distances(&[]), AnchorDistances::default());
+        // The nearer half of these to the origin are the first five, which hold the anchor.
+        let middle = g.middle(&points);
+        let distance = AnchorDistances { median: 2.0, p90: 4.0, p99: 4.0, largest: 4.0 };
+        assert_eq!(middle, MiddleAnchors { share: 1.0, distance });
+        assert_eq!(AnchorGraph::default().middle(&[]), MiddleAnchors::default());
     }
 
     #[test]

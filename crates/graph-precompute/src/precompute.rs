@@ -1,9 +1,9 @@
 //! The whole stage: footprints of all views, then the graph over the Gaussians that were seen.
 
-use crate::footprint::view_footprints;
-use crate::graph::{AnchorDistances, GraphOptions, anchor_graph};
+use crate::footprint::{FootprintOptions, view_footprints};
+use crate::graph::{AnchorDistances, GraphOptions, MiddleAnchors, anchor_graph};
 use crate::positions::shifted;
-use artifacts::{FootprintsBuilder, Graph, MaskMaps, maps_path};
+use artifacts::{FootprintsBuilder, Graph, MaskMaps, PixelSamples, ScratchEntries, maps_path};
 use gs_io::{Error, Result};
 use gs_scene::dataset::View;
 use gs_scene::{Camera, Gaussians};
@@ -26,11 +26,14 @@ pub struct Options {
     pub cut: f64,
     /// Keep Gaussians that no view sees.
     pub keep_unseen: bool,
+    /// Single pixels kept of each mask, at most.
+    pub pixel_samples: usize,
 }
 
 impl Default for Options {
     fn default() -> Self {
-        Self { graph: GraphOptions::default(), gate: 0.7, min_mask_pixels: 50.0, cut: 0.0, keep_unseen: false }
+        let graph = GraphOptions::default();
+        Self { graph, gate: 0.7, min_mask_pixels: 50.0, cut: 0.0, keep_unseen: false, pixel_samples: 0 }
     }
 }
 
@@ -47,6 +50,8 @@ pub struct Summary {
     pub anchors: usize,
     /// How far the Gaussians that take part are from their anchors.
     pub anchor_distance: AnchorDistances,
+    /// What the middle of the scene has of the anchors.
+    pub middle: MiddleAnchors,
     /// Views with masks.
     pub views: usize,
     /// Masks that own enough pixels, over all views and levels.
@@ -55,6 +60,8 @@ pub struct Summary {
     pub small_masks: usize,
     /// Entries of the footprints.
     pub entries: usize,
+    /// Single pixels kept.
+    pub pixels: usize,
     /// Largest share of a mask's weight that the cut dropped: a centroid moves by at most this times the largest feature.
     pub largest_cut: f64,
 }
@@ -78,16 +85,18 @@ fn camera_for(view: &View, maps: &MaskMaps, file: &Path) -> Result<Camera> {
     Ok(c.resized(maps.width as u32, maps.height as u32))
 }
 
-/// Computes footprints and graph of `gaussians` from the `views` that have id maps in the folder `masks`.
+/// Computes footprints and graph of `gaussians` from the `views` that have id maps in the folder `masks`. The entries of the
+/// footprints go into `entries`, view by view; the builder that comes back has none.
 ///
 /// # Errors
-/// When an id map is damaged or of another shape, no view has masks, or no Gaussian is left.
+/// When the disk is full, an id map is damaged or of another shape, no view has masks, or no Gaussian is left.
 pub fn precompute(
     gaussians: &Gaussians,
     views: &[&View],
     masks: &Path,
     options: &Options,
     stage: &Stage,
+    entries: &mut ScratchEntries,
 ) -> Result<(FootprintsBuilder, Graph, Summary)> {
     let n = gaussians.len();
     let with_masks: Vec<&View> = views.iter().copied().filter(|v| maps_path(masks, v.stem()).is_file()).collect();
@@ -109,7 +118,8 @@ pub fn precompute(
     if usable.len() < n {
         stage.warn(&format!("{} of {n} Gaussians have no usable position and are left out", n - usable.len()));
     }
-    let mut out = FootprintsBuilder { row_ptr: vec![0], ..FootprintsBuilder::default() };
+    let pixels = PixelSamples { ptr: vec![0], ..PixelSamples::default() };
+    let mut out = FootprintsBuilder { row_ptr: vec![0], pixels, ..FootprintsBuilder::default() };
     let mut summary =
         Summary { gaussians: n, unusable: n - usable.len(), views: with_masks.len(), ..Summary::default() };
     let mut seen_views = vec![0u32; n];
@@ -124,27 +134,38 @@ pub fn precompute(
         let camera = camera_for(view, &maps, &file)?;
         let scale = (maps.width * maps.height) as f64 / REFERENCE_PIXELS;
         let min_pixels = (options.min_mask_pixels * scale.min(1.0)).ceil() as usize;
-        let footprints = view_footprints(gaussians, &camera, &maps, options.gate, min_pixels);
+        let look = FootprintOptions {
+            gate: options.gate,
+            min_pixels,
+            samples: options.pixel_samples,
+            seed: options.graph.seed ^ ((index as u64) << 32),
+        };
+        let footprints = view_footprints(gaussians, &camera, &maps, &look);
+        for pixel in footprints.pixels {
+            out.pixels.row.push(out.rows.len() as u32 + pixel.row);
+            out.pixels.col.extend(pixel.entries.iter().map(|e| e.0));
+            out.pixels.weight.extend(pixel.entries.iter().map(|e| e.1));
+            out.pixels.ptr.push(out.pixels.col.len() as u64);
+        }
         summary.small_masks += footprints.small_masks;
         for (gaussian, weight) in footprints.seen {
             seen_views[gaussian as usize] += 1;
             seen_weight[gaussian as usize] += weight;
         }
-        for (mut row, entries) in footprints.rows.into_iter().zip(footprints.entries) {
+        for (mut row, of_row) in footprints.rows.into_iter().zip(footprints.entries) {
             let least = (options.cut * f64::from(row.gated)) as f32;
             let mut dropped = 0.0;
-            for (gaussian, weight) in entries {
+            for (gaussian, weight) in of_row {
                 if weight < least {
                     dropped += f64::from(weight);
                 } else {
-                    out.col.push(gaussian);
-                    out.weight.push(weight);
+                    entries.push(gaussian, weight)?;
                 }
             }
             summary.largest_cut = summary.largest_cut.max(dropped / f64::from(row.gated.max(1)));
             row.view = index as u32;
             out.rows.push(row);
-            out.row_ptr.push(out.col.len() as u64);
+            out.row_ptr.push(entries.count);
         }
         out.views.push(view.stem().to_string());
         progress.step();
@@ -157,7 +178,7 @@ pub fn precompute(
             .hint("lower --min-mask-pixels, or check the id maps"));
     }
     let kept: Vec<u32> = usable.into_iter().filter(|&i| options.keep_unseen || seen_weight[i as usize] > 0.0).collect();
-    progress.finish(&[("masks", out.rows.len() as f64), ("entries", out.col.len() as f64)]);
+    progress.finish(&[("masks", out.rows.len() as f64), ("entries", entries.count as f64)]);
     if kept.is_empty() {
         return Err(Error::new("no Gaussian is seen by any view with masks")
             .field("geometry")
@@ -167,26 +188,23 @@ pub fn precompute(
     if kept.len() < n && !options.keep_unseen {
         stage.skipped(&format!("{} of {n} Gaussians: never seen", n - kept.len()));
     }
-    renumber(&mut out.col, &kept, n);
-    let (graph, anchor_distance) = graph_of(gaussians, &kept, seen_views, &seen_weight, options);
-    summary.anchor_distance = anchor_distance;
-    summary.kept = kept.len();
-    summary.anchors = graph.anchors.len();
-    summary.masks = out.rows.len();
-    summary.entries = out.col.len();
-    out.kept = kept;
-    Ok((out, graph, summary))
-}
-
-/// Original indices to positions in `kept`. Every Gaussian with a footprint was seen, so it is kept.
-fn renumber(col: &mut [u32], kept: &[u32], n: usize) {
+    // Original indices to positions in `kept`. Every Gaussian with a footprint was seen, so it is kept.
     let mut position = vec![u32::MAX; n];
     for (p, &i) in kept.iter().enumerate() {
         position[i as usize] = p as u32;
     }
-    for c in col {
-        *c = position[*c as usize];
-    }
+    entries.renumber(&position)?;
+    out.pixels.col.iter_mut().for_each(|c| *c = position[*c as usize]);
+    let (graph, anchor_distance, middle) = graph_of(gaussians, &kept, seen_views, &seen_weight, options);
+    summary.anchor_distance = anchor_distance;
+    summary.middle = middle;
+    summary.kept = kept.len();
+    summary.anchors = graph.anchors.len();
+    summary.masks = out.rows.len();
+    summary.entries = entries.count as usize;
+    summary.pixels = out.pixels.len();
+    out.kept = kept;
+    Ok((out, graph, summary))
 }
 
 fn graph_of(
@@ -195,11 +213,11 @@ fn graph_of(
     seen_views: Vec<u32>,
     seen_weight: &[f64],
     options: &Options,
-) -> (Graph, AnchorDistances) {
+) -> (Graph, AnchorDistances, MiddleAnchors) {
     let means: Vec<[f32; 3]> = kept.iter().map(|&i| gaussians.means[i as usize]).collect();
     let points = shifted(&means).points;
     let g = anchor_graph(&points, &options.graph);
-    let distances = g.distances(&points);
+    let (distances, middle) = (g.distances(&points), g.middle(&points));
     let graph = Graph {
         kept: kept.to_vec(),
         anchors: g.anchors,
@@ -212,5 +230,5 @@ fn graph_of(
         seen_views,
         seen_weight: seen_weight.iter().map(|&w| w as f32).collect(),
     };
-    (graph, distances)
+    (graph, distances, middle)
 }

@@ -133,6 +133,7 @@ fn bad_input_is_one_line_and_leaves_outputs_alone() {
     fail(&["--k", "0"], &["--k", "found 0"]);
     fail(&["--anchor-ratio", "NaN"], &["--anchor-ratio"]);
     fail(&["--gate", "1.5"], &["--gate", "found 1.5"]);
+    fail(&["--pixel-samples", "5000"], &["--pixel-samples", "found 5000"]);
     fail(&["--min-mask-pixels", "1000000"], &["masks", "too small", "--min-mask-pixels"]);
     let masks = s.join("masks/v2_s.npy");
     let good = std::fs::read(&masks).unwrap();
@@ -152,11 +153,54 @@ fn bad_input_is_one_line_and_leaves_outputs_alone() {
     ply::write_gaussians(s.join("geometry.ply"), &g, &[]).unwrap();
     std::fs::write(&masks, &good).unwrap();
     fail(&[], &["no Gaussian is seen"]);
-    g.means[3][1] = f32::NAN;
-    ply::write_gaussians(s.join("geometry.ply"), &g, &[]).unwrap();
-    fail(&[], &["geometry.ply", "not finite"]);
     std::fs::remove_file(s.join("geometry.ply")).unwrap();
     fail(&[], &["geometry.ply", "cannot read"]);
+}
+
+/// `kept` is the mapping from what takes part to the PLY.
+#[test]
+fn damaged_gaussians_are_left_out_and_said_to_be() {
+    let (_dir, s, o) = setup();
+    let mut g = gaussians();
+    g.means[3][1] = f32::NAN;
+    g.means[7][0] = f32::INFINITY;
+    g.means[9][2] = 1e30;
+    g.log_scales[5][0] = f32::NAN;
+    g.opacity_logits[6] = f32::INFINITY;
+    ply::write_gaussians(s.join("geometry.ply"), &g, &[]).unwrap();
+    let said = succeed(&run(&s, &o, &[]));
+    assert!(said.contains("3 of 61 Gaussians have no usable position"), "{said}");
+    let (graph, _) = Graph::read(o.join("graph.safetensors")).unwrap();
+    let left_out: Vec<u32> = (0..61).filter(|i| !graph.kept.contains(i)).collect();
+    assert_eq!(left_out, [3, 5, 7, 9, 60]);
+    let record = std::fs::read_to_string(o.join("graph.safetensors.run.json")).unwrap();
+    assert!(record.contains("\"unusable\": 3") || record.contains("\"unusable\":3"), "{record}");
+    // The paper's preset keeps what no view sees, but nothing without a place.
+    succeed(&run(&s, &o, &["--preset", "paper"]));
+    assert_eq!(Graph::read(o.join("graph.safetensors")).unwrap().0.kept.len(), 58);
+}
+
+#[test]
+fn pixels_are_kept_where_asked_for_and_change_nothing_else() {
+    let (_dir, s, o) = setup();
+    let footprints = || Footprints::read(o.join("footprints.safetensors")).unwrap();
+    succeed(&run(&s, &o, &[]));
+    let without = footprints();
+    assert!(without.pixels.is_empty());
+    succeed(&run(&s, &o, &["--pixel-samples", "8", "--threads", "1"]));
+    let with = footprints();
+    assert_eq!(with.csr(), without.csr());
+    assert!(with.pixels.len() > 4 * 7 * 4 && with.pixels.len() <= 4 * 7 * 8, "{}", with.pixels.len());
+    let hash = with.artifact().hash().to_string();
+    succeed(&run(&s, &o, &["--pixel-samples", "8", "--threads", "2"]));
+    assert_eq!(hash, footprints().artifact().hash());
+    // Its Gaussians are among those of its mask.
+    let p = with.pixels;
+    for (i, &row) in p.row.iter().enumerate() {
+        let mask = without.entries(row as usize).0;
+        let mine = &p.col[p.ptr[i] as usize..p.ptr[i + 1] as usize];
+        assert!(!mine.is_empty() && mine.iter().all(|c| mask.contains(c)));
+    }
 }
 
 #[test]

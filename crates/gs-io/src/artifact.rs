@@ -5,11 +5,12 @@
 //! the parameters that shaped the data, and the content hash of each input. Nothing in it depends on the time, the
 //! machine, a path or the number of threads: same inputs, same parameters, same bytes.
 
-use crate::{Error, IoContext, Result, hash_bytes, write_bytes};
-use safetensors::tensor::{Dtype, SafeTensors, TensorView};
+use crate::{Error, IoContext, Result, hash_bytes, write_atomic};
+use safetensors::tensor::{Dtype, Metadata, SafeTensors, TensorInfo};
 use serde::{Deserialize, Serialize};
 use std::collections::{BTreeMap, HashMap};
 use std::fs::File;
+use std::io::{Seek, SeekFrom};
 use std::path::{Path, PathBuf};
 
 const KEY: &str = "cags";
@@ -36,7 +37,13 @@ pub struct Provenance {
 /// Collects tensors, then writes them atomically.
 pub struct ArtifactWriter {
     provenance: Provenance,
-    tensors: BTreeMap<String, (Dtype, Vec<usize>, Vec<u8>)>,
+    tensors: BTreeMap<String, (Dtype, Vec<usize>, Source)>,
+}
+
+/// Where a tensor's bytes are until they are written.
+enum Source {
+    Memory(Vec<u8>),
+    File(File),
 }
 
 /// Element types that artifacts hold.
@@ -62,7 +69,16 @@ impl ArtifactWriter {
     #[must_use]
     pub fn tensor<T: Element>(mut self, name: &str, shape: &[usize], data: &[T]) -> Self {
         assert_eq!(shape.iter().product::<usize>(), data.len(), "shape of {name}");
-        self.tensors.insert(name.into(), (T::DTYPE, shape.to_vec(), bytemuck::cast_slice(data).to_vec()));
+        let bytes = Source::Memory(bytemuck::cast_slice(data).to_vec());
+        self.tensors.insert(name.into(), (T::DTYPE, shape.to_vec(), bytes));
+        self
+    }
+
+    /// Adds a tensor whose elements lie in `file`, from its beginning on, in the machine's byte order: for tensors that
+    /// should not be held in memory.
+    #[must_use]
+    pub fn tensor_from_file<T: Element>(mut self, name: &str, shape: &[usize], file: File) -> Self {
+        self.tensors.insert(name.into(), (T::DTYPE, shape.to_vec(), Source::File(file)));
         self
     }
 
@@ -74,13 +90,41 @@ impl ArtifactWriter {
         let path = path.as_ref();
         let fail = |e: &dyn std::fmt::Display| Error::new(format!("cannot serialise: {e}")).file(path);
         let json = serde_json::to_string(&self.provenance).map_err(|e| fail(&e))?;
-        let mut views = Vec::with_capacity(self.tensors.len());
-        for (name, (dtype, shape, bytes)) in &self.tensors {
-            views.push((name, TensorView::new(*dtype, shape.clone(), bytes).map_err(|e| fail(&e))?));
+        // The format's order: larger elements first, so that all are aligned; then by name.
+        let mut tensors: Vec<_> = self.tensors.into_iter().collect();
+        tensors.sort_by(|(a, (x, ..)), (b, (y, ..))| y.cmp(x).then_with(|| a.cmp(b)));
+        let (mut infos, mut offset) = (Vec::with_capacity(tensors.len()), 0);
+        for (name, (dtype, shape, source)) in &tensors {
+            let count: usize = shape.iter().product();
+            let bytes = count * dtype.bitsize() / 8;
+            let there = match source {
+                Source::Memory(v) => v.len() as u64,
+                Source::File(f) => f.metadata().at("read the scratch file of", path)?.len(),
+            };
+            if there != bytes as u64 {
+                return Err(fail(&format!("{name} has {there} bytes, not {bytes}")));
+            }
+            let info = TensorInfo { dtype: *dtype, shape: shape.clone(), data_offsets: (offset, offset + bytes) };
+            infos.push((name.clone(), info));
+            offset += bytes;
         }
-        let bytes =
-            safetensors::serialize(views, Some(HashMap::from([(KEY.to_string(), json)]))).map_err(|e| fail(&e))?;
-        write_bytes(path, &bytes)
+        let metadata = Metadata::new(Some(HashMap::from([(KEY.to_string(), json)])), infos).map_err(|e| fail(&e))?;
+        let mut header = serde_json::to_vec(&metadata).map_err(|e| fail(&e))?;
+        header.resize(header.len().next_multiple_of(8), b' ');
+        write_atomic(path, |out| {
+            out.write_all(&(header.len() as u64).to_le_bytes()).at("write", path)?;
+            out.write_all(&header).at("write", path)?;
+            for (_, (_, _, source)) in tensors {
+                match source {
+                    Source::Memory(bytes) => out.write_all(&bytes).at("write", path)?,
+                    Source::File(mut file) => {
+                        file.seek(SeekFrom::Start(0)).at("read the scratch file of", path)?;
+                        std::io::copy(&mut file, &mut *out).at("write", path)?;
+                    }
+                }
+            }
+            Ok(())
+        })
     }
 }
 
@@ -142,6 +186,11 @@ impl Artifact {
     /// Where it was read from.
     pub fn path(&self) -> &Path {
         &self.path
+    }
+
+    /// Whether there is a tensor `name`.
+    pub fn has(&self, name: &str) -> bool {
+        SafeTensors::deserialize(&self.map).is_ok_and(|t| t.tensor(name).is_ok())
     }
 
     /// The tensor `name`, without a copy. `shape` gives the expected extents, `None` where any will do.
@@ -227,6 +276,28 @@ mod tests {
         let e = a.tensor::<u32>("a", &[None]).unwrap_err().to_string();
         assert!(e.contains("found F32 [2, 2], expected U32 [any]"), "{e}");
         assert!(Artifact::open(&p, "graph", 1).is_err());
+    }
+
+    #[test]
+    fn files_are_those_of_safetensors_itself_and_tensors_may_come_from_files() {
+        let dir = tempfile::tempdir().unwrap();
+        let p = dir.path().join("a.safetensors");
+        let values = [0.5f64, 2.0, -1.0];
+        let scratch = |bytes: &[u8]| {
+            let path = dir.path().join("scratch");
+            std::fs::write(&path, bytes).unwrap();
+            File::open(path).unwrap()
+        };
+        sample().tensor_from_file::<f64>("c", &[3], scratch(bytemuck::cast_slice(&values))).write(&p).unwrap();
+        let found = std::fs::read(&p).unwrap();
+        let (_, metadata) = SafeTensors::read_metadata(&found).unwrap();
+        let views: Vec<_> = SafeTensors::deserialize(&found).unwrap().tensors();
+        assert_eq!(views.len(), 3);
+        assert!(found == safetensors::serialize(views, metadata.metadata().clone()).unwrap());
+        assert_eq!(Artifact::open(&p, "sample", 1).unwrap().tensor::<f64>("c", &[Some(3)]).unwrap(), values);
+        let short = sample().tensor_from_file::<f64>("c", &[3], scratch(&[0; 23])).write(&p).unwrap_err().to_string();
+        assert!(short.contains("c has 23 bytes, not 24"), "{short}");
+        assert!(found == std::fs::read(&p).unwrap());
     }
 
     proptest! {

@@ -4,6 +4,7 @@
 //! A stage's `main.rs` is one line: `fn main() -> ExitCode { stage::main::<Args>() }` for a clap parser `Args` that
 //! implements [`Program`]. Exit codes: 0 done; 2 an error, said in one line on standard error; 130 interrupted.
 
+pub mod curve;
 mod log;
 mod progress;
 mod record;

@@ -14,6 +14,7 @@ use crate::adam::{Adam, Rates};
 use crate::loss::{self, Evaluated, Loss, directions};
 use crate::model::{COLOR, Model, Settings, splitmix};
 use crate::normalize::{Axis, Moments, channel_moments};
+use crate::real::Weight;
 use crate::scene::{Context, MaskSet, NONE, Neighbours, inputs_are_of_gaussians};
 use kernels::{BLOCK, Half, Lanes, Piece, adam_rows, centroids, columns_backward, for_width, inputs};
 use rayon::prelude::*;
@@ -139,7 +140,8 @@ fn split<T>(mut values: &mut [T], ends: impl Iterator<Item = usize>) -> Vec<&mut
 impl<'a> Engine<'a> {
     /// Whether the engine can train with these settings; the readable model can with all.
     pub fn serves(settings: &Settings) -> bool {
-        settings.norm_axis == Axis::Channel && settings.cohesion == 0.0 && settings.loss != Loss::Gaussian
+        let of_masks = !matches!(settings.loss, Loss::Gaussian | Loss::Pixel);
+        settings.norm_axis == Axis::Channel && settings.cohesion == 0.0 && of_masks
     }
 
     /// For training `model` on `context`.
@@ -292,12 +294,17 @@ impl<'a> Engine<'a> {
     }
 
     /// Centroids A f of all masks `[K][d]`, after [`Engine::propagate`].
-    pub fn centroids(&self, model: &Model<f32>, set: &MaskSet<f32>) -> Vec<f64> {
+    pub fn centroids<W: Weight>(&self, model: &Model<f32>, set: &MaskSet<W>) -> Vec<f64> {
         self.mask_means(model, set, None).0
     }
 
     /// Centroids of the masks `[K][d]`, and of their halves where asked for.
-    fn mask_means(&self, model: &Model<f32>, set: &MaskSet<f32>, half: Option<Half<'_>>) -> (Vec<f64>, Vec<f64>) {
+    fn mask_means<W: Weight>(
+        &self,
+        model: &Model<f32>,
+        set: &MaskSet<W>,
+        half: Option<Half<'_>>,
+    ) -> (Vec<f64>, Vec<f64>) {
         let (d, pitch) = (self.d, self.pitch);
         let length = set.len() * pitch;
         let parts: Vec<(Vec<f32>, Vec<f32>)> = self
@@ -312,7 +319,7 @@ impl<'a> Engine<'a> {
                 let mut halves = vec![0.0; if half.is_some() { length } else { 0 }];
                 let both = half.map(|half| (&mut halves[..], half));
                 let piece = self.piece(set, columns);
-                for_width!(d, centroids(d, pitch, piece, &model.features, &self.hat, &mut sums, both));
+                for_width!(d, centroids[W](d, pitch, piece, &model.features, &self.hat, &mut sums, both));
                 Some((sums, halves))
             })
             .collect();
@@ -329,7 +336,7 @@ impl<'a> Engine<'a> {
         (total(all), if half.is_some() { total(halves) } else { Vec::new() })
     }
 
-    fn piece<'b>(&'b self, set: &'b MaskSet<f32>, columns: Range<usize>) -> Piece<'b> {
+    fn piece<'b, W: Weight>(&'b self, set: &'b MaskSet<W>, columns: Range<usize>) -> Piece<'b, W> {
         Piece {
             columns: &set.columns[columns.clone()],
             start: &set.start[columns.start..=columns.end],
@@ -340,15 +347,15 @@ impl<'a> Engine<'a> {
     }
 
     /// The loss on one view and its gradients of the centroids. `noise` seeds the halves of [`Loss::HalfMask`].
-    pub fn evaluate(&mut self, model: &Model<f32>, set: &MaskSet<f32>, noise: u64) -> Evaluated {
+    pub fn evaluate<W: Weight>(&mut self, model: &Model<f32>, set: &MaskSet<W>, noise: u64) -> Evaluated {
         self.evaluate_beside(model, set, noise, None)
     }
 
     /// [`Engine::evaluate`], with positives from another view `[K][d]` for [`Loss::CrossView`].
-    pub fn evaluate_beside(
+    pub fn evaluate_beside<W: Weight>(
         &mut self,
         model: &Model<f32>,
-        set: &MaskSet<f32>,
+        set: &MaskSet<W>,
         noise: u64,
         beside: Option<&[f64]>,
     ) -> Evaluated {
@@ -367,11 +374,11 @@ impl<'a> Engine<'a> {
 
     /// Takes the gradients of the centroids back, and moves the features by one step of Adam. Gives the gradients of the
     /// network's weights. `iteration` counts from 0; `noise` is that of [`Engine::evaluate`].
-    pub fn backward(
+    pub fn backward<W: Weight>(
         &mut self,
         model: &mut Model<f32>,
         adam: &mut Adam<f32>,
-        set: &MaskSet<f32>,
+        set: &MaskSet<W>,
         evaluated: &Evaluated,
         noise: u64,
         rates: &Rates,
@@ -388,11 +395,11 @@ impl<'a> Engine<'a> {
 
     /// The pass over all features. Gives, per channel, the sums of g and of g y over anchors, y being the standardised
     /// output and g its gradient.
-    fn move_features(
+    fn move_features<W: Weight>(
         &mut self,
         model: &mut Model<f32>,
         adam: &mut Adam<f32>,
-        set: &MaskSet<f32>,
+        set: &MaskSet<W>,
         evaluated: &Evaluated,
         noise: u64,
         rates: &Rates,
@@ -436,7 +443,7 @@ impl<'a> Engine<'a> {
                     let both = (!halves.is_empty()).then_some((&halves[..], &half as Half<'_>));
                     let to = (chunk.places.start, &mut rows[..]);
                     let to_anchors = (chunk.anchors.start, &mut anchors[..]);
-                    for_width!(d, columns_backward(d, pitch, piece, &masks, both, to, to_anchors));
+                    for_width!(d, columns_backward[W](d, pitch, piece, &masks, both, to, to_anchors));
                     if lazy {
                         for_width!(d, adam_rows(d, piece.columns, chunk.places.start, p, m, v, rows, rates));
                     } else {
@@ -583,7 +590,7 @@ impl<'a> Engine<'a> {
     }
 
     /// Mean over masks of the weighted mean cosine between a mask's Gaussians and its centroid.
-    pub fn alignment(&self, model: &Model<f32>, set: &MaskSet<f32>) -> f64 {
+    pub fn alignment<W: Weight>(&self, model: &Model<f32>, set: &MaskSet<W>) -> f64 {
         let (d, masks) = (self.d, set.len());
         let (unit, _) = directions(&self.centroids(model, set), d);
         let parts: Vec<Vec<f64>> = set
@@ -600,8 +607,8 @@ impl<'a> Engine<'a> {
                     for (&k, &w) in mask.iter().zip(weight) {
                         let k = k as usize;
                         let along: f64 = unit[k * d..(k + 1) * d].iter().zip(&f).map(|(u, f)| u * f64::from(*f)).sum();
-                        sums[k] += f64::from(w) * along * inverse;
-                        sums[masks + k] += f64::from(w);
+                        sums[k] += f64::from(w.get()) * along * inverse;
+                        sums[masks + k] += f64::from(w.get());
                     }
                 }
                 sums
@@ -622,7 +629,7 @@ fn in_half(noise: u64, entry: usize) -> bool {
 }
 
 /// Positions of the columns of `set` whose places lie in the chunk.
-fn columns_in(set: &MaskSet<f32>, chunk: &Chunk) -> Range<usize> {
+fn columns_in<W: Weight>(set: &MaskSet<W>, chunk: &Chunk) -> Range<usize> {
     let before = |place: usize| set.columns.partition_point(|&c| (c as usize) < place);
     before(chunk.places.start)..before(chunk.places.end)
 }

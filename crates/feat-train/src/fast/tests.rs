@@ -1,14 +1,23 @@
 //! The engine against the readable model.
 
 use super::*;
-use crate::model::Init;
+use crate::model::{CohesionOf, Init};
 use crate::network::Layer;
 use crate::testing::{context, mask_set};
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
 
 fn settings(dim: usize, layers: usize, loss: Loss) -> Settings {
-    Settings { dim, layers, norm_axis: Axis::Channel, loss, tau: 0.1, cohesion: 0.0, init: Init::Uniform }
+    Settings {
+        dim,
+        layers,
+        norm_axis: Axis::Channel,
+        loss,
+        tau: 0.1,
+        cohesion: 0.0,
+        cohesion_of: CohesionOf::Gaussians,
+        init: Init::Uniform,
+    }
 }
 
 /// The same model in f64.
@@ -25,18 +34,6 @@ fn widened(model: &Model<f32>) -> Model<f64> {
     }
 }
 
-fn wide_set(set: &MaskSet<f32>) -> MaskSet<f64> {
-    MaskSet {
-        rows: set.rows.clone(),
-        pixels: set.pixels.clone(),
-        columns: set.columns.clone(),
-        start: set.start.clone(),
-        mask: set.mask.clone(),
-        weight: set.weight.iter().map(|&w| f64::from(w)).collect(),
-        pieces: set.pieces.clone(),
-    }
-}
-
 /// Largest difference as a share of the largest value.
 fn difference(found: &[f32], exact: &[f64]) -> f64 {
     assert_eq!(found.len(), exact.len());
@@ -47,14 +44,14 @@ fn difference(found: &[f32], exact: &[f64]) -> f64 {
 fn check(settings: Settings, kind: Neighbours, propagate: bool) {
     let name = format!("{settings:?} {kind:?} {propagate}");
     let context = context(4501, kind, propagate);
-    let set = mask_set::<f32>(&context, 23, 3);
+    let set = mask_set(&context, 23, 3);
     let mut model = Model::<f32>::new(settings, &context, &mut ChaCha8Rng::seed_from_u64(5));
     let exact = widened(&model);
     let propagated = exact.propagate(&context);
     let beside: Vec<f64> =
         (0..23 * exact.settings.dim).map(|i| if i < 40 { (i * i % 7) as f64 - 2.0 } else { 0.0 }).collect();
     let beside = (exact.settings.loss == Loss::CrossView).then_some(&beside[..]);
-    let step = exact.step_beside(&context, &propagated, &wide_set(&set), 77, beside);
+    let step = exact.step_beside(&context, &propagated, &set, 77, beside);
 
     let mut engine = Engine::new(&context, &model, Shortcuts::default());
     engine.propagate(&model, 0);
@@ -62,7 +59,7 @@ fn check(settings: Settings, kind: Neighbours, propagate: bool) {
     assert!((evaluated.loss - step.loss).abs() <= 1e-5 * step.loss.abs(), "{name}: {} {}", evaluated.loss, step.loss);
     assert!((evaluated.separation - step.separation).abs() <= 1e-5);
     let d = model.settings.dim;
-    let alignment = exact.alignment(&context, &propagated, &wide_set(&set));
+    let alignment = exact.alignment(&context, &propagated, &set);
     assert!((engine.alignment(&model, &set) - alignment).abs() <= 1e-5, "{name}: alignment");
     let finals: Vec<f64> = exact.final_features(&context, &propagated).iter().map(|v| f64::from(*v)).collect();
     assert!(difference(&engine.final_features(&model), &finals) <= 1e-5, "{name}: features");
@@ -118,7 +115,7 @@ fn trained<T: crate::real::Real>(
     model.features.iter().map(|v| v.get()).collect()
 }
 
-fn by_readable<T: crate::real::Real>(context: &Context, sets: &[MaskSet<T>], model: &mut Model<T>, n: u64) -> Vec<f64> {
+fn by_readable<T: crate::real::Real>(context: &Context, sets: &[MaskSet], model: &mut Model<T>, n: u64) -> Vec<f64> {
     let mut adam = Adam::<T>::new(model.features.len());
     let d = model.settings.dim;
     trained(model, n, |model, i| {
@@ -134,13 +131,7 @@ fn by_readable<T: crate::real::Real>(context: &Context, sets: &[MaskSet<T>], mod
     })
 }
 
-fn by_engine(
-    context: &Context,
-    sets: &[MaskSet<f32>],
-    model: &mut Model<f32>,
-    shortcuts: Shortcuts,
-    n: u64,
-) -> Vec<f64> {
+fn by_engine(context: &Context, sets: &[MaskSet], model: &mut Model<f32>, shortcuts: Shortcuts, n: u64) -> Vec<f64> {
     let mut engine = Engine::new(context, model, shortcuts);
     let mut adam = Adam::new(model.features.len());
     trained(model, n, |model, i| {
@@ -154,11 +145,10 @@ fn by_engine(
 #[test]
 fn stays_with_the_readable_model_in_f64_for_1000_iterations() {
     let context = context(400, Neighbours::Gaussians, true);
-    let sets = [mask_set::<f32>(&context, 9, 3), mask_set::<f32>(&context, 12, 4)];
+    let sets = [mask_set(&context, 9, 3), mask_set(&context, 12, 4)];
     let mut model = Model::<f32>::new(settings(6, 2, Loss::Printed), &context, &mut ChaCha8Rng::seed_from_u64(5));
     let start: Vec<f64> = model.features.iter().map(|v| f64::from(*v)).collect();
-    let wide: Vec<MaskSet<f64>> = sets.iter().map(wide_set).collect();
-    let oracle = by_readable(&context, &wide, &mut widened(&model), 1000);
+    let oracle = by_readable(&context, &sets, &mut widened(&model), 1000);
     let readable = by_readable(&context, &sets, &mut model.clone(), 1000);
     let found = by_engine(&context, &sets, &mut model, Shortcuts::default(), 1000);
     let apart = |a: &[f64], b: &[f64]| {
@@ -178,7 +168,7 @@ fn stays_with_the_readable_model_in_f64_for_1000_iterations() {
 #[test]
 fn threads_do_not_change_a_bit() {
     let context = context(20_000, Neighbours::Anchors, true);
-    let sets = [mask_set::<f32>(&context, 30, 3), mask_set::<f32>(&context, 20, 4)];
+    let sets = [mask_set(&context, 30, 3), mask_set(&context, 20, 4)];
     let with = |threads| {
         let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
         pool.install(|| {
@@ -197,7 +187,7 @@ fn threads_do_not_change_a_bit() {
 #[test]
 fn shortcuts_change_little() {
     let context = context(2000, Neighbours::Gaussians, true);
-    let sets = [mask_set::<f32>(&context, 9, 3), mask_set::<f32>(&context, 12, 4)];
+    let sets = [mask_set(&context, 9, 3), mask_set(&context, 12, 4)];
     let run = |shortcuts| {
         let mut rng = ChaCha8Rng::seed_from_u64(1);
         let mut model = Model::<f32>::new(settings(6, 2, Loss::Printed), &context, &mut rng);
@@ -212,14 +202,14 @@ fn shortcuts_change_little() {
 }
 
 /// A mask set of given masks over ranges of places, with one that has no entry at all.
-fn set_of(context: &Context, masks: &[Range<u32>]) -> MaskSet<f32> {
+fn set_of(context: &Context, masks: &[Range<u32>]) -> MaskSet {
     let entries =
         masks.iter().enumerate().flat_map(|(k, r)| r.clone().map(move |p| (p, k as u16, 0.01))).collect::<Vec<_>>();
     MaskSet::from_entries((0..masks.len() as u32).collect(), vec![100.0; masks.len()], entries, context)
 }
 
 /// Trains for `n` iterations on one thread and says what came of it.
-fn run_on(context: &Context, set: &MaskSet<f32>, model: &mut Model<f32>, n: u64) -> Vec<f64> {
+fn run_on(context: &Context, set: &MaskSet, model: &mut Model<f32>, n: u64) -> Vec<f64> {
     let pool = rayon::ThreadPoolBuilder::new().num_threads(1).build().unwrap();
     let sets = [set.clone()];
     pool.install(|| by_engine(context, &sets, model, Shortcuts::default(), n))
@@ -237,7 +227,7 @@ fn constant_features_and_colors_give_zeros_not_noise() {
     assert!(engine.around[0].as_flattened().iter().all(|v| *v == 0.0));
     assert!(engine.hat.iter().all(|v| *v == 0.0));
     // Training goes on from there without a number that is none.
-    let set = mask_set::<f32>(&context, 9, 3);
+    let set = mask_set(&context, 9, 3);
     assert!(run_on(&context, &set, &mut model, 50).iter().all(|v| v.is_finite()));
 }
 
@@ -265,7 +255,7 @@ fn one_mask_or_masks_without_entries_or_direction_move_nothing_wrongly() {
 #[test]
 fn a_hundred_thousand_iterations_at_a_low_temperature_stay_finite() {
     let context = context(40, Neighbours::Gaussians, true);
-    let set = mask_set::<f32>(&context, 4, 3);
+    let set = mask_set(&context, 4, 3);
     let cold = Settings { tau: 1e-3, ..settings(6, 2, Loss::Printed) };
     let mut model = Model::<f32>::new(cold, &context, &mut ChaCha8Rng::seed_from_u64(1));
     let features = run_on(&context, &set, &mut model, 100_000);
