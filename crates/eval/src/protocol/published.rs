@@ -164,8 +164,10 @@ mod tests {
     fn means_are_those_of_their_scenes() {
         for row in LERF.iter().filter(|r| r.miou[0].is_some()) {
             for values in [row.miou, row.macc25] {
+                // The paper prints 69.62 as its own mean accuracy; its four scenes make 69.675.
+                let slack = if row.method == "CAGS" { 0.06 } else { 0.011 };
                 let mean = values[..4].iter().flatten().sum::<f64>() / 4.0;
-                assert!((mean - values[4].unwrap()).abs() < 0.011, "{} {mean}", row.method);
+                assert!((mean - values[4].unwrap()).abs() < slack, "{} {mean}", row.method);
             }
         }
     }
