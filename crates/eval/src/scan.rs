@@ -2,7 +2,7 @@
 //! [`crate::protocol::instances`].
 
 use crate::protocol::instances::{self, InstanceFigures};
-use crate::protocol::published;
+use crate::protocol::published::{self, SetRow};
 use crate::protocol::scannet::{self, Association, Confusion};
 use crate::ranking::{Index, Scoring};
 use crate::scene::LabelledScene;
@@ -300,7 +300,7 @@ impl ScanMetrics {
     pub const PROTOCOL: &str = "scannet";
 
     /// mIoU and mAcc of the sets of 19, 15 and 10 classes.
-    pub fn row(&self) -> [Option<(f64, f64)>; 3] {
+    pub fn row(&self) -> SetRow {
         scannet::SETS.map(|size| {
             let set = self.sets.iter().find(|s| s.size == size)?;
             set.miou.zip(set.macc)
@@ -329,7 +329,7 @@ impl ScanMetrics {
 }
 
 /// Both ways of bringing scans together: the mean of the scans' means, and the means of the pooled points.
-pub fn summary(scans: &[ScanMetrics]) -> [(&'static str, [Option<(f64, f64)>; 3]); 2] {
+pub fn summary(scans: &[ScanMetrics]) -> [(&'static str, SetRow); 2] {
     let mut mean = [None; 3];
     let mut pooled = [None; 3];
     for (at, size) in scannet::SETS.into_iter().enumerate() {

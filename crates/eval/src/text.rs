@@ -167,7 +167,7 @@ impl TextSource {
         }
         let filled: Vec<String> = texts.iter().flat_map(|t| templates.iter().map(|p| p.replace("{}", t))).collect();
         let features = self.encode(&filled)?;
-        Ok(features.chunks_exact(templates.len()).map(|of_text| mean_direction(of_text)).collect())
+        Ok(features.chunks_exact(templates.len()).map(mean_direction).collect())
     }
 
     /// All names, where the source is a table.

@@ -5,6 +5,7 @@ use crate::labels;
 use crate::lerf::{self, Answers, LerfMetrics, Rendering};
 use crate::protocol::lerf::Averaging;
 use crate::protocol::lerf_scenes::LerfScene;
+use crate::protocol::published::SetRow;
 use crate::protocol::scannet::{self, Association};
 use crate::scan::{self, ScanFiles, ScanMetrics, ScanOptions, Undescribed};
 use crate::scene::LabelledScene;
@@ -381,7 +382,7 @@ pub(super) fn run_table(a: &TableArgs, stage: &Stage) -> Result<String> {
         (lerf::table(&lerfs), json!({"protocol": "lerf-ovs dataset", "figures": dataset, "scenes": scenes}))
     } else {
         let [mean, pooled] = scan::summary(&scans).map(|(_, row)| row);
-        let sized = |row: [Option<(f64, f64)>; 3]| -> Value {
+        let sized = |row: SetRow| -> Value {
             let cells = scannet::SETS
                 .iter()
                 .zip(row)

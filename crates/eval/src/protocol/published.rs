@@ -106,8 +106,11 @@ pub fn lerf_table(scenes: &[(String, Figures)], notes: &[String]) -> String {
     out + &noted(notes)
 }
 
+/// mIoU and mAcc of the sets of 19, 15 and 10 classes; none where a set was not scored.
+pub type SetRow = [Option<(f64, f64)>; 3];
+
 /// mIoU and mAcc in percent of a method on ScanNet (frozen points, 10 scenes): 19, 15 and 10 classes.
-const SCANNET: [(&str, [Option<(f64, f64)>; 3], &str); 8] = [
+const SCANNET: [(&str, SetRow, &str); 8] = [
     ("LangSplat", [Some((2.0, 9.2)), Some((4.9, 14.6)), Some((8.0, 23.9))], "CAGS paper"),
     ("LEGaussians", [Some((1.6, 7.9)), Some((4.6, 16.1)), Some((7.7, 24.9))], "CAGS paper"),
     ("OpenGaussian", [Some((24.73, 41.54)), Some((30.13, 48.25)), Some((38.29, 55.19))], "its paper"),
@@ -120,11 +123,11 @@ const SCANNET: [(&str, [Option<(f64, f64)>; 3], &str); 8] = [
 
 /// The paper's ScanNet table as Markdown: published rows, then ours (mIoU and mAcc as fractions, for 19, 15 and 10
 /// classes; none where a set was not scored), each under its name.
-pub fn scannet_table(ours: &[(String, [Option<(f64, f64)>; 3])], scenes: usize, notes: &[String]) -> String {
+pub fn scannet_table(ours: &[(String, SetRow)], scenes: usize, notes: &[String]) -> String {
     let header =
         ["Methods", "19 mIoU", "19 mAcc", "15 mIoU", "15 mAcc", "10 mIoU", "10 mAcc", "source"].map(String::from);
     let mut out = line(&header) + &line(&["---"; 8].map(String::from));
-    let mut row = |name: &str, values: [Option<(f64, f64)>; 3], source: &str| {
+    let mut row = |name: &str, values: SetRow, source: &str| {
         let mut cells = vec![name.to_string()];
         cells.extend(values.iter().flat_map(|v| [percent(v.map(|v| v.0)), percent(v.map(|v| v.1))]));
         cells.push(source.into());
