@@ -1,12 +1,17 @@
 //! The command line of `eval`.
 
-use crate::query::{self, QueryOptions};
-use crate::ranking::Selection;
+mod protocols;
+mod query;
+
+use crate::ask::Asker;
+use crate::lerf::Rendering;
+use crate::ranking::{Index, Join, Scoring, Selection};
 use crate::report::{self, ReportOptions};
 use crate::scene::LabelledScene;
 use crate::score::{self, Scores};
 use crate::silhouette::Silhouette;
 use crate::text::TextSource;
+use artifacts::{Features, role};
 use clap::{Parser, Subcommand};
 use gs_io::{Error, Result, write_bytes};
 use gs_scene::dataset::{self, Dataset, LoadOptions, Resolution};
@@ -29,7 +34,13 @@ pub struct Args {
 #[derive(Debug, Subcommand)]
 enum Command {
     /// Find what a text means: ranked instances, a PLY of the selection, pictures, JSON
-    Query(QueryArgs),
+    Query(query::QueryArgs),
+    /// Score a scene of LERF-OVS: objects selected in 3D by their names
+    Lerf(protocols::LerfArgs),
+    /// Score a ScanNet scan: classes of its vertices, class-agnostic instances
+    Scannet(protocols::ScannetArgs),
+    /// Bring the metrics of several scenes together in the paper's table
+    Table(protocols::TableArgs),
     /// Score instances and text queries against the truth of the scene
     Score(ScoreArgs),
     /// Make one self-contained HTML page of a run, and metrics.json beside it
@@ -56,7 +67,7 @@ struct LanguageArgs {
     /// CLIP folder with text.onnx: the other half of the model that encoded the masks
     #[arg(long, value_name = "DIR")]
     clip: Option<PathBuf>,
-    /// JSON table of name -> text feature, instead of --clip
+    /// Table of name -> text feature, JSON or npz, instead of --clip
     #[arg(long, value_name = "FILE", conflicts_with = "clip")]
     text_features: Option<PathBuf>,
     /// Run ONNX models with this ONNX Runtime library instead of the built-in engine
@@ -65,12 +76,24 @@ struct LanguageArgs {
     /// Select at most this many instances, best first [default: 1, or all with --threshold]
     #[arg(long, value_name = "COUNT")]
     top_k: Option<usize>,
-    /// Select only instances whose cosine with the text is at least this
-    #[arg(long, value_name = "COSINE", allow_negative_numbers = true)]
+    /// Select only instances whose score is at least this: the cosine, or with --negatives the relevancy
+    #[arg(long, value_name = "SCORE", allow_negative_numbers = true)]
     threshold: Option<f32>,
-    /// Select only instances that were matched with masks in at least this many views
-    #[arg(long, value_name = "VIEWS", default_value_t = 1)]
-    min_support: u32,
+    /// Select only instances that were matched with masks in at least this many views [default: 1; scannet: 2]
+    #[arg(long, value_name = "VIEWS")]
+    min_support: Option<u32>,
+    /// Score by LERF's relevancy against these texts, with commas between, such as object,things,stuff,texture
+    #[arg(long, value_delimiter = ',', value_name = "TEXTS")]
+    negatives: Vec<String>,
+    /// Put every text into this template, such as "a photo of a {}"; several are averaged
+    #[arg(long, value_name = "TEMPLATE")]
+    template: Vec<String>,
+    /// Select look-alikes too: of the ten best those whose mean feature is within this of the best's (OpenGaussian: 0.9)
+    #[arg(long, value_name = "DISTANCE", requires = "features")]
+    join: Option<f32>,
+    /// features.safetensors that the instances were clustered from, for --join
+    #[arg(long, value_name = "FILE")]
+    features: Option<PathBuf>,
 }
 
 impl LanguageArgs {
@@ -79,41 +102,88 @@ impl LanguageArgs {
             return Err(Error::new("selects nothing").field("--top-k").found(0).expected("at least 1"));
         }
         if self.threshold.is_some_and(|t| !t.is_finite()) {
-            return Err(Error::new("not a cosine").field("--threshold").expected("a number from -1 to 1"));
+            return Err(Error::new("not a score").field("--threshold").expected("a number from -1 to 1"));
         }
-        Ok(Selection::new(self.top_k, self.threshold, self.min_support))
+        if self.join.is_some_and(|d| !(d.is_finite() && d > 0.0)) {
+            return Err(Error::new("not a distance").field("--join").expected("a number above 0, such as 0.9"));
+        }
+        if let Some(t) = self.template.iter().find(|t| !t.contains("{}")) {
+            return Err(Error::new("no place for the text").field("--template").found(t).expected("{} in it"));
+        }
+        Ok(Selection::new(self.top_k, self.threshold, self.min_support.unwrap_or(1)))
+    }
+
+    /// Whether nothing but the source and the support is chosen.
+    fn is_plain(&self) -> bool {
+        let selects = self.top_k.is_some() || self.threshold.is_some() || self.join.is_some();
+        !selects && self.negatives.is_empty() && self.template.is_empty()
+    }
+
+    fn engine(&self) -> EngineOptions {
+        EngineOptions { onnx_runtime: self.onnx_runtime.clone(), ..EngineOptions::default() }
     }
 
     fn source(&self) -> Result<TextSource> {
-        let engine = EngineOptions { onnx_runtime: self.onnx_runtime.clone(), ..EngineOptions::default() };
-        TextSource::open(self.clip.as_deref(), self.text_features.as_deref(), &engine)
+        TextSource::open(self.clip.as_deref(), self.text_features.as_deref(), &self.engine())
     }
-}
 
-#[derive(Debug, clap::Args)]
-struct QueryArgs {
-    #[command(flatten)]
-    scene: SceneArgs,
-    #[command(flatten)]
-    language: LanguageArgs,
-    /// What to look for, in words; may be given several times
-    #[arg(long, required = true, value_name = "WORDS")]
-    text: Vec<String>,
-    /// Views for the pictures, by name, with commas between [default: three in which the selection is seen well]
-    #[arg(long, value_delimiter = ',', value_name = "NAMES")]
-    views: Vec<String>,
-    /// Show the selection as far as it is visible, or rendered alone
-    #[arg(long, value_enum, default_value = "visible")]
-    silhouette: Silhouette,
-    /// A pixel belongs to the mask above this [default: 0.7 for selected, 0.5 for visible]
-    #[arg(long, value_name = "VALUE")]
-    alpha: Option<f32>,
-    /// Size of the pictures: a divisor of the photographs', a width such as 640px, or auto for 1600px
-    #[arg(long, default_value = "auto")]
-    resolution: Resolution,
-    /// Output folder
-    #[arg(long, value_name = "DIR")]
-    out: PathBuf,
+    /// What answers queries about a scene.
+    fn asker<'a>(&self, scene: &'a LabelledScene, source: Option<TextSource>) -> Result<Asker<'a>> {
+        let selection = self.selection()?;
+        let join = match (&self.features, self.join) {
+            (Some(path), Some(distance)) => {
+                let (features, artifact) = Features::read(path)?;
+                let geometry = scene.inputs.get(role::GEOMETRY).map_or("", |h| h);
+                artifact.expect_input(role::GEOMETRY, geometry)?;
+                if features.kept.last().is_some_and(|&last| last as usize >= scene.instances.label.len()) {
+                    return Err(Error::new("the features are of other Gaussians").file(path).field("kept"));
+                }
+                Some(Join::new(&scene.instances, &features, distance))
+            }
+            _ => None,
+        };
+        let negatives = match &source {
+            Some(source) => {
+                let known =
+                    |(f, n): (Option<Vec<f32>>, &String)| f.ok_or_else(|| source.unknown(n).field("--negatives"));
+                source.encode(&self.negatives)?.into_iter().zip(&self.negatives).map(known).collect::<Result<_>>()?
+            }
+            None => Vec::new(),
+        };
+        let (index, templates) = (Index::new(&scene.instances), self.template.clone());
+        Ok(Asker { index, source, templates, scoring: Scoring { negatives }, selection, join })
+    }
+
+    fn parameters(&self) -> Value {
+        json!({
+            "top_k": self.top_k, "threshold": self.threshold, "min_support": self.min_support.unwrap_or(1),
+            "negatives": self.negatives, "templates": self.template, "join": self.join,
+        })
+    }
+
+    /// What deviates from "the instance of the best cosine", in words, for the rule of a score.
+    fn describe(&self) -> String {
+        let mut s = String::new();
+        if let Some(k) = self.top_k {
+            s += &format!("; top {k}");
+        }
+        if let Some(t) = self.threshold {
+            s += &format!("; score at least {t}");
+        }
+        if let Some(n) = self.min_support {
+            s += &format!("; matched in at least {n} views");
+        }
+        if !self.negatives.is_empty() {
+            s += &format!("; relevancy against {}", self.negatives.join(", "));
+        }
+        if !self.template.is_empty() {
+            s += &format!("; templates {}", self.template.join(", "));
+        }
+        if let Some(d) = self.join {
+            s += &format!("; look-alikes within {d} joined");
+        }
+        s
+    }
 }
 
 #[derive(Debug, clap::Args)]
@@ -173,7 +243,10 @@ impl Program for Args {
 
     fn run(self, stage: &Stage) -> Result<()> {
         let text = match &self.command {
-            Command::Query(a) => run_query(a, stage)?,
+            Command::Query(a) => query::run(a, stage, self.common.json)?,
+            Command::Lerf(a) => protocols::run_lerf(a, stage)?,
+            Command::Scannet(a) => protocols::run_scannet(a, stage)?,
+            Command::Table(a) => protocols::run_table(a, stage)?,
             Command::Score(a) => run_score(a, stage)?,
             Command::Report(a) => run_report(a, stage)?,
         };
@@ -199,34 +272,8 @@ fn mask_threshold(alpha: Option<f32>, silhouette: Silhouette) -> Result<f32> {
     Err(Error::new("not an opacity").field("--alpha").found(value).expected("0 to below 1"))
 }
 
-fn run_query(a: &QueryArgs, stage: &Stage) -> Result<String> {
-    let options = QueryOptions {
-        texts: a.text.clone(),
-        selection: a.language.selection()?,
-        views: a.views.clone(),
-        silhouette: a.silhouette,
-        threshold: mask_threshold(a.alpha, a.silhouette)?,
-    };
-    let scene = LabelledScene::read(&a.scene.instances, &a.scene.geometry)?;
-    let source = a.language.source()?;
-    source.check_dim(scene.instances.dim, scene.path())?;
-    let dataset = load(&a.scene.scene, &LoadOptions { resolution: a.resolution, ..LoadOptions::default() }, stage)?;
-    scene.check_dataset(&dataset)?;
-    let results = query::run(&scene, &dataset, &source, &options, &a.out)?;
-    for q in results.queries.iter().filter(|q| q.selected.is_empty()) {
-        stage.warn(&format!("no instance passes for {:?}: nothing is selected", q.text));
-    }
-    let parameters = json!({
-        "command": "query", "texts": a.text, "top_k": a.language.top_k, "threshold": a.language.threshold,
-        "min_support": a.language.min_support, "alpha": options.threshold,
-    });
-    let summary = json!({"texts": results.queries.len(), "instances": results.instances});
-    stage.record(a.out.join("query.json"), parameters, scene.inputs.clone(), summary)?;
-    Ok(query::table(&results, 5))
-}
-
 fn run_score(a: &ScoreArgs, stage: &Stage) -> Result<String> {
-    let selection = a.language.selection()?;
+    a.language.selection()?;
     let threshold = mask_threshold(a.alpha, a.silhouette)?;
     let scene = LabelledScene::read(&a.scene.instances, &a.scene.geometry)?;
     let mut scores = Scores::default();
@@ -248,18 +295,10 @@ fn run_score(a: &ScoreArgs, stage: &Stage) -> Result<String> {
         scores.skipped.push("query scores: neither --clip nor --text-features was given".into());
     } else {
         let source = a.language.source()?;
-        let (silhouette, mut warn) = (a.silhouette, |w: &str| stage.warn(w));
-        score::score_queries(
-            &scene,
-            &dataset,
-            &labels,
-            &source,
-            &selection,
-            silhouette,
-            threshold,
-            &mut scores,
-            &mut warn,
-        )?;
+        source.check_dim(scene.instances.dim, scene.path())?;
+        let asker = a.language.asker(&scene, Some(source))?;
+        let rendering = Rendering { silhouette: a.silhouette, threshold };
+        score::score_queries(&scene, &dataset, &labels, &asker, rendering, &mut scores, &mut |w| stage.warn(w))?;
     }
     scores.skipped.iter().for_each(|s| stage.skipped(s));
     let json = serde_json::to_vec_pretty(&scores).map_err(|e| Error::new(e.to_string()).file(&a.out))?;
@@ -268,10 +307,9 @@ fn run_score(a: &ScoreArgs, stage: &Stage) -> Result<String> {
     write_bytes(beside("things.csv"), things.as_bytes())?;
     write_bytes(beside("queries.csv"), queries.as_bytes())?;
     write_bytes(&a.out, &json)?;
-    let parameters = json!({
-        "command": "score", "top_k": a.language.top_k, "threshold": a.language.threshold,
-        "min_support": a.language.min_support, "alpha": threshold,
-    });
+    let mut parameters = a.language.parameters();
+    parameters["command"] = json!("score");
+    parameters["alpha"] = json!(threshold);
     let figure = |v: Option<f64>| v.map_or(Value::Null, Value::from);
     let summary = json!({
         "instance_miou": figure(scores.instance_miou), "query_miou": figure(scores.query_miou),

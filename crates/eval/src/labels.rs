@@ -1,4 +1,5 @@
-//! LERF-OVS labels: one ISAT JSON file per labelled frame, with polygons by category.
+//! LERF-OVS labels: one ISAT JSON file per labelled frame, with polygons by category; or the pictures that the published
+//! scorers made of them.
 
 use crate::{Mask, polygon};
 use gs_io::{Error, IoContext, Result};
@@ -20,6 +21,8 @@ pub struct FrameLabels {
     pub height: u32,
     /// Pixels of each category; several polygons of one category are joined.
     pub categories: BTreeMap<String, Mask>,
+    /// Boxes of each category, x1 y1 x2 y2 in pixels: one per polygon as the file gives it, or else around the polygon.
+    pub boxes: BTreeMap<String, Vec<[f64; 4]>>,
 }
 
 #[derive(Deserialize)]
@@ -38,6 +41,16 @@ struct Info {
 struct Object {
     category: String,
     segmentation: Vec<[f64; 2]>,
+    #[serde(default)]
+    bbox: Option<Vec<f64>>,
+}
+
+/// The box around some points; none for none.
+fn box_around(points: impl Iterator<Item = [f64; 2]>) -> Option<[f64; 4]> {
+    points.fold(None, |b: Option<[f64; 4]>, [x, y]| {
+        let [x1, y1, x2, y2] = b.unwrap_or([x, y, x, y]);
+        Some([x1.min(x), y1.min(y), x2.max(x), y2.max(y)])
+    })
 }
 
 /// Reads all `*.json` of a label folder, by name.
@@ -78,7 +91,11 @@ pub fn read(path: impl AsRef<Path>) -> Result<FrameLabels> {
     }
     let (width, height) = (isat.info.width as u32, isat.info.height as u32);
     let mut categories = BTreeMap::new();
+    let mut boxes = BTreeMap::<String, Vec<[f64; 4]>>::new();
     for object in &isat.objects {
+        let given = object.bbox.as_deref().and_then(|b| <[f64; 4]>::try_from(b).ok());
+        let around = given.or_else(|| box_around(object.segmentation.iter().copied()));
+        boxes.entry(object.category.clone()).or_default().extend(around);
         // JSON has no infinities or NaN; the cast truncates toward zero and saturates.
         let vertices: Vec<[i64; 2]> = object.segmentation.iter().map(|&[x, y]| [x as i64, y as i64]).collect();
         let mask =
@@ -86,7 +103,67 @@ pub fn read(path: impl AsRef<Path>) -> Result<FrameLabels> {
         polygon::fill_polygon(mask, &vertices);
     }
     let frame = path.file_stem().unwrap_or_default().to_string_lossy().into_owned();
-    Ok(FrameLabels { frame, width, height, categories })
+    Ok(FrameLabels { frame, width, height, categories, boxes })
+}
+
+/// Grey level above which a pixel of a truth or prediction picture belongs to the object, strictly. Truth pictures are
+/// JPEG, whose ringing lights up dark pixels beside the object: a scorer that tests "above 0" has larger objects.
+pub const GREY: u8 = 10;
+
+/// The pixels of a picture above [`GREY`], in its grey levels.
+///
+/// # Errors
+/// When the file cannot be read as a picture.
+pub fn read_mask(path: &Path) -> Result<Mask> {
+    let bytes = std::fs::read(path).at("read", path)?;
+    let grey =
+        image::load_from_memory(&bytes).map_err(|e| Error::new(format!("not a picture: {e}")).file(path))?.to_luma8();
+    let (width, height) = (grey.width() as usize, grey.height() as usize);
+    Ok(Mask { width, height, bits: grey.into_raw().into_iter().map(|v| v > GREY).collect() })
+}
+
+/// Reads the pictures that LangSplat's scorer made of the labels, `<folder>/<frame>/<category>.jpg` (or png), with pixels
+/// above [`GREY`]. Boxes are those around the pixels.
+///
+/// # Errors
+/// When the folder cannot be read, a file is no picture, or pictures of one frame differ in size.
+pub fn read_pictures(folder: impl AsRef<Path>) -> Result<Vec<FrameLabels>> {
+    let folder = folder.as_ref();
+    let list = |folder: &Path| -> Result<Vec<std::path::PathBuf>> {
+        let entries = std::fs::read_dir(folder).at("list", folder)?;
+        let mut paths = entries.map(|e| Ok(e.at("list", folder)?.path())).collect::<Result<Vec<_>>>()?;
+        paths.sort();
+        Ok(paths)
+    };
+    let mut frames = Vec::new();
+    for place in list(folder)?.into_iter().filter(|p| p.is_dir()) {
+        let frame = place.file_name().unwrap_or_default().to_string_lossy().into_owned();
+        let mut labels =
+            FrameLabels { frame, width: 0, height: 0, categories: BTreeMap::new(), boxes: BTreeMap::new() };
+        for path in list(&place)? {
+            if !path.extension().is_some_and(|e| ["jpg", "jpeg", "png"].iter().any(|k| e == *k)) {
+                continue;
+            }
+            let mask = read_mask(&path)?;
+            if labels.categories.is_empty() {
+                (labels.width, labels.height) = (mask.width as u32, mask.height as u32);
+            } else if (mask.width, mask.height) != (labels.width as usize, labels.height as usize) {
+                return Err(Error::new("pictures of one frame differ in size")
+                    .file(&path)
+                    .found(format!("{}x{}", mask.width, mask.height))
+                    .expected(format!("{}x{}", labels.width, labels.height)));
+            }
+            let category = path.file_stem().unwrap_or_default().to_string_lossy().into_owned();
+            let lit = (0..mask.bits.len()).filter(|&i| mask.bits[i]);
+            let around = box_around(lit.map(|i| [(i % mask.width) as f64, (i / mask.width) as f64]));
+            labels.boxes.insert(category.clone(), around.into_iter().collect());
+            labels.categories.insert(category, mask);
+        }
+        if !labels.categories.is_empty() {
+            frames.push(labels);
+        }
+    }
+    Ok(frames)
 }
 
 #[cfg(test)]
@@ -112,7 +189,28 @@ mod tests {
         assert_eq!((labels.frame.as_str(), labels.width, labels.height), ("frame_00007", 20, 10));
         assert_eq!(labels.categories["cup"].count(), 4 * 3 + 4, "truncated corners, borders included");
         assert_eq!(labels.categories["lid"].count(), 0);
+        assert_eq!(labels.boxes["cup"], [[1.0, 1.0, 4.0, 3.0], [10.0, 1.0, 11.0, 2.0]], "given, or around the polygon");
+        assert_eq!(labels.boxes["lid"].len(), 0);
         assert_eq!(read_folder(dir.path()).unwrap(), [labels]);
+    }
+
+    #[test]
+    fn pictures_are_read_above_their_ringing() {
+        let dir = tempfile::tempdir().unwrap();
+        let place = dir.path().join("frame_00007");
+        std::fs::create_dir(&place).unwrap();
+        let grey = |levels: Vec<u8>| image::GrayImage::from_raw(4, 2, levels).unwrap();
+        grey(vec![0, 10, 11, 255, 0, 0, 12, 3]).save(place.join("red cup.png")).unwrap();
+        std::fs::write(place.join("notes.txt"), "x").unwrap();
+        let labels = read_pictures(dir.path()).unwrap();
+        assert_eq!((labels.len(), labels[0].frame.as_str(), labels[0].width), (1, "frame_00007", 4));
+        let cup = &labels[0].categories["red cup"];
+        assert_eq!(cup.bits, [false, false, true, true, false, false, true, false], "10 is still ringing");
+        assert_eq!(labels[0].boxes["red cup"], [[2.0, 0.0, 3.0, 1.0]]);
+        image::GrayImage::new(3, 2).save(place.join("spoon.png")).unwrap();
+        assert!(read_pictures(dir.path()).unwrap_err().to_string().contains("differ in size; found 3x2, expected 4x2"));
+        std::fs::write(place.join("spoon.png"), "no").unwrap();
+        assert!(read_pictures(dir.path()).unwrap_err().to_string().contains("spoon.png: not a picture"));
     }
 
     #[test]

@@ -1,20 +1,26 @@
 //! The last stage: text queries, evaluation protocols and the report.
 
+pub mod ask;
 pub mod cli;
 pub mod curves;
 pub mod html;
 pub mod labels;
+pub mod lerf;
 mod mask;
 pub mod metrics;
 pub mod pca;
 pub mod picture;
+pub mod place;
 pub mod polygon;
+pub mod protocol;
 pub mod query;
 pub mod ranking;
 pub mod report;
 pub mod runs;
+pub mod scan;
 pub mod scene;
 pub mod score;
+pub mod segment;
 pub mod silhouette;
 pub mod svg;
 pub mod text;

@@ -1,11 +1,15 @@
-//! `eval query`: from a text to the Gaussians it means.
+//! `eval query`: what was asked for, shown: PLYs, masks, overlays, `query.json`.
 
+use crate::ask::Answered;
+use crate::lerf::Rendering;
 use crate::picture::{HIGHLIGHT, Picture, mask_png};
-use crate::ranking::{self, Ranked, Selection};
+use crate::place::Place;
+use crate::ranking::Ranked;
 use crate::scene::{LabelledScene, find_view, slug, spread};
-use crate::silhouette::Silhouette;
-use crate::text::TextSource;
+use crate::segment::{self, Segment, Segmentation};
+use artifacts::instance_color;
 use gs_io::{Error, Result, write_bytes};
+use gs_raster::RasterOptions;
 use gs_scene::dataset::{Dataset, View};
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeSet;
@@ -17,18 +21,34 @@ const KEPT_RANKS: usize = 20;
 /// Views that show a query where none are named.
 const DEFAULT_VIEWS: usize = 3;
 
-/// How to answer queries.
-pub struct QueryOptions {
-    /// The texts.
-    pub texts: Vec<String>,
-    /// Which instances of the ranking are selected.
-    pub selection: Selection,
+/// What is asked for.
+pub struct Asked {
+    /// What it is called in `query.json` and in names of files: the text, a picture's name, a place.
+    pub name: String,
+    /// `text`, `image`, `pixel` or `point`.
+    pub kind: &'static str,
+    /// The answer.
+    pub answer: Answered,
+    /// Where, for a pixel or a point.
+    pub place: Option<Place>,
+}
+
+/// How to show answers.
+pub struct ShowOptions {
     /// Names of the views for pictures; empty: those in which the selected instances were matched best.
     pub views: Vec<String>,
-    /// How a selection becomes a mask.
-    pub silhouette: Silhouette,
-    /// The value above which a pixel belongs to the mask.
-    pub threshold: f32,
+    /// How a selection becomes a mask, and above which value a pixel belongs.
+    pub rendering: Rendering,
+}
+
+/// A division of the cloud among texts, to be written.
+pub struct Divided {
+    /// The texts.
+    pub texts: Vec<String>,
+    /// Index of the text per Gaussian, -1 for none.
+    pub labels: Vec<i32>,
+    /// Instances of each text.
+    pub instances: Vec<Vec<u32>>,
 }
 
 /// `query.json`.
@@ -40,24 +60,33 @@ pub struct QueryResults {
     pub dimension: usize,
     /// Instances in the scene.
     pub instances: usize,
-    /// The answer to each text, in the order given.
+    /// The answer to each query, in the order given.
     pub queries: Vec<QueryResult>,
+    /// The cloud divided among the texts, where that was asked for.
+    #[serde(default)]
+    pub segmentation: Option<Segmentation>,
 }
 
 /// The answer to one text.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct QueryResult {
-    /// The text.
+    /// The text, or what else was asked for.
     pub text: String,
+    /// `text`, `image`, `pixel` or `point`.
+    #[serde(default)]
+    pub kind: String,
+    /// Where, for a pixel or a point.
+    #[serde(default)]
+    pub place: Option<Place>,
     /// Selected instances, best first.
     pub selected: Vec<u32>,
-    /// Cosine of the best selected instance.
+    /// Score of the best selected instance: cosine, relevancy, or share of a pixel.
     pub score: Option<f32>,
     /// Gaussians selected.
     pub gaussians: usize,
     /// File of the selected Gaussians, beside `query.json`; none when nothing is selected.
     pub ply: Option<String>,
-    /// The best instances by cosine, selected or not.
+    /// The best instances, selected or not.
     pub ranking: Vec<RankedInstance>,
     /// Pictures.
     pub views: Vec<QueryView>,
@@ -68,7 +97,7 @@ pub struct QueryResult {
 pub struct RankedInstance {
     /// Index of the instance.
     pub instance: u32,
-    /// Cosine with the text.
+    /// Cosine with the text; relevancy with negatives; share of a pixel.
     pub score: f32,
     /// Views that support its descriptor.
     pub support: u32,
@@ -89,53 +118,57 @@ pub struct QueryView {
     pub pixels: usize,
 }
 
-/// Answers the queries and writes PLYs, pictures and `query.json` into `out`.
+/// Writes the answers' PLYs, pictures and `query.json` into `out`.
 ///
 /// # Errors
-/// When the text features do not fit the instances, a text or view is unknown, or a file cannot be read or written.
-pub fn run(
+/// When a view is unknown, or a file cannot be read or written.
+pub fn write(
     scene: &LabelledScene,
     dataset: &Dataset,
-    source: &TextSource,
-    options: &QueryOptions,
+    source: String,
+    asked: Vec<Asked>,
+    divided: Option<Divided>,
+    options: &ShowOptions,
     out: &Path,
 ) -> Result<QueryResults> {
-    let features = encode_all(scene, source, &options.texts)?;
     let named: Vec<&View> = options.views.iter().map(|v| find_view(dataset, v)).collect::<Result<_>>()?;
     let mut names = BTreeSet::new();
-    let mut answers = Vec::new();
-    for (text, feature) in options.texts.iter().zip(&features) {
-        let ranking = ranking::rank(&scene.instances, feature);
-        let selected = options.selection.choose(&ranking);
-        let members = ranking::members(&scene.instances, &selected);
-        let base = slug(text);
-        let file =
-            (1..).map(|i| if i == 1 { base.clone() } else { format!("{base}-{i}") }).find(|n| names.insert(n.clone()));
-        let file = file.unwrap_or(base);
-        let views = if named.is_empty() { best_views(scene, dataset, &selected) } else { named.clone() };
-        answers.push(Answer { text, ranking, selected, members, file, views });
+    let mut shown = Vec::new();
+    for asked in asked {
+        let base = slug(&asked.name);
+        let numbered = |i: usize| if i == 1 { base.clone() } else { format!("{base}-{i}") };
+        let file = (1..).map(numbered).find(|n| names.insert(n.clone())).unwrap_or_else(|| base.clone());
+        let own = asked.place.as_ref().and_then(|p| p.view.as_deref()).and_then(|v| find_view(dataset, v).ok());
+        let mut views =
+            if named.is_empty() { best_views(scene, dataset, &asked.answer.selected) } else { named.clone() };
+        if let Some(own) = own.filter(|o| !views.iter().any(|v| v.name == o.name)) {
+            views.insert(0, own);
+        }
+        shown.push(Shown { asked, file, views });
     }
     gs_io::create_dir(out)?;
-    for a in answers.iter().filter(|a| !a.members.is_empty()) {
-        let ids: Vec<String> = a.selected.iter().map(u32::to_string).collect();
-        let text: String = a.text.chars().map(|c| if c.is_control() { ' ' } else { c }).collect();
+    for Shown { asked, file, .. } in shown.iter().filter(|s| !s.asked.answer.gaussians.is_empty()) {
+        let ids: Vec<String> = asked.answer.selected.iter().map(u32::to_string).collect();
+        let text: String = asked.name.chars().map(|c| if c.is_control() { ' ' } else { c }).collect();
         let comments = [format!("cags query: {text}"), format!("cags instances: {}", ids.join(" "))];
-        let path = out.join(format!("{}.ply", a.file));
-        gs_scene::ply::write_gaussians(&path, &scene.gaussians.select(&a.members), &comments)?;
+        let path = out.join(format!("{file}.ply"));
+        gs_scene::ply::write_gaussians(&path, &scene.gaussians.select(&asked.answer.gaussians), &comments)?;
     }
-    let mut pictures: Vec<Vec<QueryView>> = vec![Vec::new(); answers.len()];
+    let segmentation = divided.map(|d| write_segmentation(scene, dataset, &named, d, out)).transpose()?;
+    let mut pictures: Vec<Vec<QueryView>> = vec![Vec::new(); shown.len()];
     for view in &dataset.views {
         let here: Vec<usize> =
-            (0..answers.len()).filter(|&q| answers[q].views.iter().any(|v| v.name == view.name)).collect();
+            (0..shown.len()).filter(|&q| shown[q].views.iter().any(|v| v.name == view.name)).collect();
         if here.is_empty() {
             continue;
         }
         let photo = view.load_image()?;
         let photo = Picture::new(photo.width as usize, photo.height as usize, &photo.rgb);
-        let selections: Vec<&[u32]> = here.iter().map(|&q| &answers[q].members[..]).collect();
-        let masks = options.silhouette.masks(&scene.gaussians, &selections, &view.camera, options.threshold);
+        let selections: Vec<&[u32]> = here.iter().map(|&q| &shown[q].asked.answer.gaussians[..]).collect();
+        let Rendering { silhouette, threshold } = options.rendering;
+        let masks = silhouette.masks(&scene.gaussians, &selections, &view.camera, threshold);
         for (&q, mask) in here.iter().zip(&masks) {
-            let stem = format!("{}.{}", answers[q].file, slug_of_view(view));
+            let stem = format!("{}.{}", shown[q].file, slug_of_view(view));
             let (overlay, mask_file) = (format!("{stem}.overlay.png"), format!("{stem}.mask.png"));
             write_bytes(out.join(&overlay), &photo.highlighted(mask, HIGHLIGHT).png()?)?;
             write_bytes(out.join(&mask_file), &mask_png(mask)?)?;
@@ -143,10 +176,11 @@ pub fn run(
         }
     }
     let results = QueryResults {
-        text_source: source.describe(),
+        text_source: source,
         dimension: scene.instances.dim,
         instances: scene.instances.len(),
-        queries: answers.into_iter().zip(pictures).map(|(a, views)| a.result(views)).collect(),
+        queries: shown.into_iter().zip(pictures).map(|(s, views)| s.result(views)).collect(),
+        segmentation,
     };
     let path = out.join("query.json");
     let json = serde_json::to_vec_pretty(&results).map_err(|e| Error::new(e.to_string()).file(&path))?;
@@ -154,49 +188,86 @@ pub fn run(
     Ok(results)
 }
 
-struct Answer<'a> {
-    text: &'a str,
-    ranking: Vec<Ranked>,
-    selected: Vec<u32>,
-    members: Vec<u32>,
+/// Writes `labels.npy`, `segmentation.ply` and renders of it.
+fn write_segmentation(
+    scene: &LabelledScene,
+    dataset: &Dataset,
+    named: &[&View],
+    divided: Divided,
+    out: &Path,
+) -> Result<Segmentation> {
+    let Divided { texts, labels, instances } = divided;
+    let coloured = segment::coloured(&scene.gaussians, &labels);
+    let (npy, ply) = ("labels.npy", "segmentation.ply");
+    gs_io::npy::write_i32(out.join(npy), &[labels.len()], &labels)?;
+    let comments: Vec<String> = texts.iter().enumerate().map(|(t, text)| format!("cags label {t}: {text}")).collect();
+    gs_scene::ply::write_gaussians(out.join(ply), &coloured, &comments)?;
+    let all: Vec<&View> = dataset.views.iter().collect();
+    for view in if named.is_empty() { spread(&all, DEFAULT_VIEWS) } else { named.to_vec() } {
+        let image = gs_raster::render(&coloured, &view.camera, &RasterOptions::default());
+        let picture = Picture::new(image.width as usize, image.height as usize, &image.rgb);
+        write_bytes(out.join(format!("segmentation.{}.png", slug_of_view(view))), &picture.png()?)?;
+    }
+    let segments = texts.into_iter().zip(instances).enumerate().map(|(t, (text, instances))| Segment {
+        gaussians: labels.iter().filter(|&&l| l == t as i32).count(),
+        color: instance_color(t as u32),
+        text,
+        instances,
+    });
+    let segments = segments.collect();
+    let unlabelled = labels.iter().filter(|&&l| l < 0).count();
+    Ok(Segmentation { segments, unlabelled, labels: npy.into(), ply: ply.into() })
+}
+
+struct Shown<'a> {
+    asked: Asked,
     file: String,
     views: Vec<&'a View>,
 }
 
-impl Answer<'_> {
+impl Shown<'_> {
     fn result(self, views: Vec<QueryView>) -> QueryResult {
-        let ranked = |r: &Ranked| RankedInstance {
-            instance: r.instance,
-            score: r.score,
-            support: r.support,
-            gaussians: r.gaussians,
-        };
-        let best = self.selected.first();
-        QueryResult {
-            score: self.ranking.iter().find(|r| Some(&r.instance) == best).map(|r| r.score),
-            gaussians: self.members.len(),
-            ply: (!self.members.is_empty()).then(|| format!("{}.ply", self.file)),
-            ranking: self.ranking.iter().take(KEPT_RANKS).map(ranked).collect(),
-            text: self.text.into(),
-            selected: self.selected,
-            views,
-        }
+        let Asked { name, kind, answer, place } = self.asked;
+        let ply = (!answer.gaussians.is_empty()).then(|| format!("{}.ply", self.file));
+        result(name, kind, place, &answer, ply, views)
     }
+}
+
+fn result(
+    name: String,
+    kind: &str,
+    place: Option<Place>,
+    answer: &Answered,
+    ply: Option<String>,
+    views: Vec<QueryView>,
+) -> QueryResult {
+    let ranked = |r: &Ranked| RankedInstance {
+        instance: r.instance,
+        score: r.score,
+        support: r.support,
+        gaussians: r.gaussians,
+    };
+    QueryResult {
+        text: name,
+        kind: kind.into(),
+        place,
+        score: answer.score,
+        gaussians: answer.gaussians.len(),
+        ply,
+        ranking: answer.ranking.iter().take(KEPT_RANKS).map(ranked).collect(),
+        selected: answer.selected.clone(),
+        views,
+    }
+}
+
+/// The answer to a text as [`QueryResults`] holds it, without files: for queries that are only printed.
+pub fn unwritten(text: &str, answer: &Answered) -> QueryResult {
+    result(text.into(), "text", None, answer, None, Vec::new())
 }
 
 /// A view's stem as part of a file name (names of views may hold folders).
 fn slug_of_view(view: &View) -> String {
     view.stem().chars().map(|c| if c.is_alphanumeric() || "_-.".contains(c) { c } else { '-' }).collect()
-}
-
-/// Text features of all texts, checked against the instances.
-///
-/// # Errors
-/// When dimensions differ or a text has no feature.
-fn encode_all(scene: &LabelledScene, source: &TextSource, texts: &[String]) -> Result<Vec<Vec<f32>>> {
-    source.check_dim(scene.instances.dim, scene.path())?;
-    let encoded = source.encode(texts)?;
-    encoded.into_iter().zip(texts).map(|(f, t)| f.ok_or_else(|| source.unknown(t))).collect()
 }
 
 /// Views to show a selection in: of those in which its instances were matched with at least half of the best score, a
@@ -213,25 +284,43 @@ fn best_views<'a>(scene: &LabelledScene, dataset: &'a Dataset, selected: &[u32])
 
 /// The rankings as a table for the terminal.
 pub fn table(results: &QueryResults, rows: usize) -> String {
-    let mut s = String::new();
-    for q in &results.queries {
-        let _ = writeln!(s, "{:?} ({} Gaussians selected)", q.text, q.gaussians);
-        let _ = writeln!(s, "  {:>4} {:>9} {:>8} {:>6} {:>10}", "rank", "instance", "cosine", "views", "Gaussians");
-        for (i, r) in q.ranking.iter().take(rows).enumerate() {
-            let mark = if q.selected.contains(&r.instance) { "  selected" } else { "" };
+    let mut s: String = results.queries.iter().map(|q| answer_table(q, rows)).collect();
+    if let Some(d) = &results.segmentation {
+        let _ = writeln!(s, "segmentation ({} Gaussians without a text)", d.unlabelled);
+        for segment in &d.segments {
             let _ = writeln!(
                 s,
-                "  {:>4} {:>9} {:>8.4} {:>6} {:>10}{mark}",
-                i + 1,
-                r.instance,
-                r.score,
-                r.support,
-                r.gaussians
+                "  {:>10} Gaussians {:>4} instances  {}",
+                segment.gaussians,
+                segment.instances.len(),
+                segment.text
             );
         }
-        if q.ranking.is_empty() {
-            let _ = writeln!(s, "  no instance has a descriptor");
+    }
+    s
+}
+
+/// One ranking as a table for the terminal.
+pub fn answer_table(q: &QueryResult, rows: usize) -> String {
+    let mut s = String::new();
+    let _ = writeln!(s, "{:?} ({} Gaussians selected)", q.text, q.gaussians);
+    if let Some(place) = &q.place {
+        if let Some([x, y, z]) = place.position {
+            let _ = writeln!(s, "  at {x:.4} {y:.4} {z:.4}");
         }
+        for (name, score) in &place.names {
+            let _ = writeln!(s, "  {score:>8.4} {name}");
+        }
+    }
+    let _ = writeln!(s, "  {:>4} {:>9} {:>8} {:>6} {:>10}", "rank", "instance", "score", "views", "Gaussians");
+    for (i, r) in q.ranking.iter().take(rows).enumerate() {
+        let mark = if q.selected.contains(&r.instance) { "  selected" } else { "" };
+        let _ =
+            writeln!(s, "  {:>4} {:>9} {:>8.4} {:>6} {:>10}{mark}", i + 1, r.instance, r.score, r.support, r.gaussians);
+    }
+    if q.ranking.is_empty() {
+        let _ =
+            writeln!(s, "  {}", if q.place.is_some() { "nothing is there" } else { "no instance has a descriptor" });
     }
     s
 }

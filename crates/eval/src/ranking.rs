@@ -1,6 +1,6 @@
-//! Text queries: instances ranked by the cosine of their descriptors with a text feature, and the choice among them.
+//! Instances ranked by how well their descriptors fit a feature, and the choice among them.
 
-use artifacts::Instances;
+use artifacts::{Features, Instances};
 use serde::Serialize;
 
 /// An instance in a ranking.
@@ -8,7 +8,7 @@ use serde::Serialize;
 pub struct Ranked {
     /// Index of the instance.
     pub instance: u32,
-    /// Cosine of descriptor and text, -1 to 1; plain, without negatives (methods.md section 6, row 32).
+    /// Cosine of descriptor and feature, -1 to 1; with negatives the relevancy, 0 to 1 ([`Scoring`]).
     pub score: f32,
     /// Views in which the instance was matched with a mask.
     pub support: u32,
@@ -16,12 +16,21 @@ pub struct Ranked {
     pub gaussians: u32,
 }
 
+/// How a descriptor is compared with a feature.
+#[derive(Debug, Clone, Default, PartialEq)]
+pub struct Scoring {
+    /// Features of texts that mean nothing in particular ("object", "things", "stuff", "texture"). Without any the score
+    /// is the plain cosine (methods.md section 6, row 32). With them it is LERF's relevancy: over the negatives n the
+    /// smallest exp(10 p) / (exp(10 p) + exp(10 n)) of the cosines p and n with the feature and the negative.
+    pub negatives: Vec<Vec<f32>>,
+}
+
 /// Which instances of a ranking answer a query.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize)]
 pub struct Selection {
     /// At most this many, best first.
     pub top_k: usize,
-    /// Only those with at least this cosine.
+    /// Only those with at least this score.
     pub threshold: Option<f32>,
     /// Only those matched in at least this many views.
     pub min_support: u32,
@@ -46,40 +55,150 @@ impl Selection {
     }
 }
 
-/// All instances that have a descriptor, by falling cosine with `text`, ties by index. An instance that no view matched
-/// has a zero descriptor: it has no cosine and is left out.
-///
-/// # Panics
-/// When `text` has another length than the descriptors.
-pub fn rank(instances: &Instances, text: &[f32]) -> Vec<Ranked> {
-    assert_eq!(text.len(), instances.dim);
-    let norm = |v: &[f32]| v.iter().map(|&x| f64::from(x).powi(2)).sum::<f64>().sqrt();
-    let text_norm = norm(text);
-    let mut ranking: Vec<Ranked> = (0..instances.len())
-        .filter_map(|k| {
-            let d = instances.descriptor_of(k);
-            let norms = norm(d) * text_norm;
-            let dot: f64 = d.iter().zip(text).map(|(&a, &b)| f64::from(a) * f64::from(b)).sum();
-            (norms > 0.0).then(|| Ranked {
-                instance: k as u32,
-                score: (dot / norms) as f32,
-                support: instances.support[k],
-                gaussians: instances.count[k],
-            })
-        })
-        .collect();
-    ranking.sort_by(|a, b| b.score.total_cmp(&a.score).then(a.instance.cmp(&b.instance)));
-    ranking
+/// Instances laid out for many queries: descriptors with their lengths, and the Gaussians of each instance together.
+pub struct Index<'a> {
+    instances: &'a Instances,
+    norms: Vec<f64>,
+    /// Gaussians by instance, ascending within each.
+    members: Vec<u32>,
+    /// Where each instance's Gaussians begin in `members`; K + 1.
+    starts: Vec<usize>,
 }
 
-/// The Gaussians of the chosen instances, ascending.
-pub fn members(instances: &Instances, chosen: &[u32]) -> Vec<u32> {
-    let mut is_chosen = vec![false; instances.len()];
-    for &c in chosen {
-        is_chosen[c as usize] = true;
+fn norm(v: &[f32]) -> f64 {
+    dot(v, v).sqrt()
+}
+
+/// In f64 and in eight sums that the compiler can keep apart.
+fn dot(a: &[f32], b: &[f32]) -> f64 {
+    let mut sums = [0.0f64; 8];
+    let (a8, a_rest) = a.as_chunks::<8>();
+    let (b8, b_rest) = b.as_chunks::<8>();
+    for (x, y) in a8.iter().zip(b8) {
+        for k in 0..8 {
+            sums[k] += f64::from(x[k]) * f64::from(y[k]);
+        }
     }
-    let of = |&i: &u32| usize::try_from(instances.label[i as usize]).is_ok_and(|l| is_chosen[l]);
-    (0..instances.label.len() as u32).filter(of).collect()
+    sums.iter().sum::<f64>() + a_rest.iter().zip(b_rest).map(|(&x, &y)| f64::from(x) * f64::from(y)).sum::<f64>()
+}
+
+impl<'a> Index<'a> {
+    /// Lays out the instances.
+    pub fn new(instances: &'a Instances) -> Self {
+        let k = instances.len();
+        let mut starts = vec![0usize; k + 1];
+        let labels = || instances.label.iter().enumerate().filter_map(|(i, &l)| Some((i, usize::try_from(l).ok()?)));
+        labels().for_each(|(_, l)| starts[l + 1] += 1);
+        (0..k).for_each(|l| starts[l + 1] += starts[l]);
+        let mut next = starts.clone();
+        let mut members = vec![0u32; starts[k]];
+        for (i, l) in labels() {
+            members[next[l]] = i as u32;
+            next[l] += 1;
+        }
+        let norms = (0..k).map(|i| norm(instances.descriptor_of(i))).collect();
+        Self { instances, norms, members, starts }
+    }
+
+    /// Score of every instance; none for one without a descriptor (no view matched it) or when the feature is zero.
+    ///
+    /// # Panics
+    /// When a feature has another length than the descriptors.
+    pub fn scores(&self, feature: &[f32], scoring: &Scoring) -> Vec<Option<f32>> {
+        let dim = self.instances.dim;
+        assert!(feature.len() == dim && scoring.negatives.iter().all(|n| n.len() == dim));
+        let feature_norm = norm(feature);
+        let negative_norms: Vec<f64> = scoring.negatives.iter().map(|n| norm(n)).collect();
+        let one = |k: usize| {
+            let (d, length) = (self.instances.descriptor_of(k), self.norms[k]);
+            let cosine = |v: &[f32], n: f64| if n > 0.0 { dot(d, v) / (length * n) } else { 0.0 };
+            (length * feature_norm > 0.0).then(|| {
+                let p = cosine(feature, feature_norm);
+                let worst = scoring.negatives.iter().zip(&negative_norms).map(|(v, &n)| cosine(v, n));
+                match worst.fold(None, |m: Option<f64>, n| Some(m.map_or(n, |m| m.max(n)))) {
+                    None => p as f32,
+                    Some(n) => (1.0 / (1.0 + (10.0 * (n - p)).exp())) as f32,
+                }
+            })
+        };
+        (0..self.instances.len()).map(one).collect()
+    }
+
+    /// All instances that have a score, best first, ties by index.
+    ///
+    /// # Panics
+    /// As [`Self::scores`].
+    pub fn rank(&self, feature: &[f32], scoring: &Scoring) -> Vec<Ranked> {
+        let ranked = |(k, score): (usize, Option<f32>)| {
+            let (support, gaussians) = (self.instances.support[k], self.gaussians_of(k).len() as u32);
+            Some(Ranked { instance: k as u32, score: score?, support, gaussians })
+        };
+        let mut ranking: Vec<Ranked> =
+            self.scores(feature, scoring).into_iter().enumerate().filter_map(ranked).collect();
+        ranking.sort_by(|a, b| b.score.total_cmp(&a.score).then(a.instance.cmp(&b.instance)));
+        ranking
+    }
+
+    /// The Gaussians of an instance, ascending.
+    pub fn gaussians_of(&self, instance: usize) -> &[u32] {
+        &self.members[self.starts[instance]..self.starts[instance + 1]]
+    }
+
+    /// The Gaussians of the chosen instances, ascending.
+    pub fn members(&self, chosen: &[u32]) -> Vec<u32> {
+        let mut chosen = chosen.to_vec();
+        chosen.sort_unstable();
+        chosen.dedup();
+        let mut all: Vec<u32> = chosen.iter().flat_map(|&c| self.gaussians_of(c as usize)).copied().collect();
+        all.sort_unstable();
+        all
+    }
+}
+
+/// Candidates for joining, as in OpenGaussian.
+const JOIN_AMONG: usize = 10;
+
+/// Joins instances that look alike in instance-feature space, as OpenGaussian's query does: of the 10 best of the ranking,
+/// those whose mean feature lies within a distance of the best one's. Its further test, that both belong to one coarse
+/// cluster, has no counterpart here.
+pub struct Join {
+    distance: f64,
+    /// Mean of the unit features of each instance's Gaussians; none without any.
+    means: Vec<Option<Vec<f64>>>,
+}
+
+impl Join {
+    /// Prepares joining within `distance` (OpenGaussian: 0.9), by the features that the instances were clustered from.
+    pub fn new(instances: &Instances, features: &Features, distance: f32) -> Self {
+        let mut sums: Vec<(Vec<f64>, usize)> = vec![(vec![0.0; features.dim], 0); instances.len()];
+        for (at, &gaussian) in features.kept.iter().enumerate() {
+            let Ok(label) = usize::try_from(instances.label[gaussian as usize]) else { continue };
+            let row = features.row(at);
+            let length = norm(row);
+            if length > 0.0 {
+                let (sum, count) = &mut sums[label];
+                sum.iter_mut().zip(row).for_each(|(s, &v)| *s += f64::from(v) / length);
+                *count += 1;
+            }
+        }
+        let mean =
+            |(sum, count): (Vec<f64>, usize)| (count > 0).then(|| sum.into_iter().map(|v| v / count as f64).collect());
+        Self { distance: f64::from(distance), means: sums.into_iter().map(mean).collect() }
+    }
+
+    /// `selected` and what joins its first, in the order of the ranking.
+    pub fn extend(&self, ranking: &[Ranked], min_support: u32, selected: &[u32]) -> Vec<u32> {
+        let mut all = selected.to_vec();
+        let Some(best) = selected.first().and_then(|&b| self.means[b as usize].as_ref()) else { return all };
+        for r in ranking.iter().filter(|r| r.support >= min_support).take(JOIN_AMONG) {
+            let Some(mean) = &self.means[r.instance as usize] else { continue };
+            let squared: f64 = mean.iter().zip(best).map(|(a, b)| (a - b).powi(2)).sum();
+            if squared.sqrt() < self.distance && !all.contains(&r.instance) {
+                all.push(r.instance);
+            }
+        }
+        all
+    }
 }
 
 #[cfg(test)]
@@ -102,23 +221,64 @@ mod tests {
         }
     }
 
+    fn rank(feature: &[f32]) -> Vec<Ranked> {
+        Index::new(&instances()).rank(feature, &Scoring::default())
+    }
+
     #[test]
     fn ranks_by_cosine_whatever_the_length_of_the_text() {
-        let r = rank(&instances(), &[0.0, 5.0]);
+        let r = rank(&[0.0, 5.0]);
         assert_eq!(r.iter().map(|r| r.instance).collect::<Vec<_>>(), [1, 0, 3], "ties by index, zero left out");
         assert!((r[0].score - 0.8).abs() < 1e-6);
-        assert!(rank(&instances(), &[0.0, 0.0]).is_empty());
+        assert_eq!(r[0].gaussians, 2);
+        assert!(rank(&[0.0, 0.0]).is_empty());
     }
 
     #[test]
     fn selection_rules() {
-        let r = rank(&instances(), &[1.0, 0.0]);
+        let r = rank(&[1.0, 0.0]);
         assert_eq!(Selection::new(None, None, 0).choose(&r), [0]);
         assert_eq!(Selection::new(Some(2), None, 0).choose(&r), [0, 1]);
         assert_eq!(Selection::new(None, Some(0.5), 0).choose(&r), [0, 1]);
         assert_eq!(Selection::new(Some(1), Some(0.5), 0).choose(&r), [0]);
         assert_eq!(Selection::new(None, None, 6).choose(&r), [3]);
         assert!(Selection::new(None, Some(2.0), 0).choose(&r).is_empty());
-        assert_eq!(members(&instances(), &[1, 2]), [0, 3, 5]);
+        let i = instances();
+        assert_eq!(Index::new(&i).members(&[2, 1, 1]), [0, 3, 5]);
+        assert!(Index::new(&i).members(&[]).is_empty());
+    }
+
+    #[test]
+    fn relevancy_is_the_worst_softmax_against_the_negatives() {
+        let i = instances();
+        let scoring = Scoring { negatives: vec![vec![0.0, 3.0], vec![-1.0, 0.0]] };
+        let s = Index::new(&i).scores(&[2.0, 0.0], &scoring);
+        let softmax = |p: f64, n: f64| (10.0 * p).exp() / ((10.0 * p).exp() + (10.0 * n).exp());
+        assert!((f64::from(s[0].unwrap()) - softmax(1.0, 0.0)).abs() < 1e-6);
+        assert!((f64::from(s[1].unwrap()) - softmax(0.6, 0.8)).abs() < 1e-6);
+        assert_eq!(s[2], None);
+        assert!((f64::from(s[3].unwrap()) - softmax(-1.0, 1.0)).abs() < 1e-6);
+    }
+
+    #[test]
+    fn long_descriptors_have_the_same_cosine() {
+        let a: Vec<f32> = (0..83).map(|k| (k as f32 * 0.37).sin()).collect();
+        let b: Vec<f32> = (0..83).map(|k| (k as f32 * 0.11).cos()).collect();
+        let plain: f64 = a.iter().zip(&b).map(|(&x, &y)| f64::from(x) * f64::from(y)).sum();
+        assert!((dot(&a, &b) - plain).abs() < 1e-12);
+    }
+
+    #[test]
+    fn joining_takes_near_instances_of_the_best_ten() {
+        let mut i = instances();
+        i.label = vec![0, 1, 3, 3, -1];
+        let values = vec![1.0, 0.0, 0.9, 0.3, -2.0, 0.1, -1.0, 0.0, 0.0, 0.0];
+        let f = Features { kept: vec![0, 1, 2, 3, 4], dim: 2, values };
+        let ranking = rank(&[1.0, 0.0]);
+        assert_eq!(Join::new(&i, &f, 0.9).extend(&ranking, 0, &[0]), [0, 1]);
+        assert_eq!(Join::new(&i, &f, 0.1).extend(&ranking, 0, &[0]), [0]);
+        assert_eq!(Join::new(&i, &f, 3.0).extend(&ranking, 0, &[0]), [0, 1, 3]);
+        assert_eq!(Join::new(&i, &f, 3.0).extend(&ranking, 5, &[0]), [0, 3], "support counts here too");
+        assert!(Join::new(&i, &f, 3.0).extend(&ranking, 0, &[]).is_empty());
     }
 }

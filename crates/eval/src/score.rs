@@ -1,25 +1,22 @@
 //! `eval score`: instances and text queries against the truth of a scene.
 
-use crate::Mask;
-use crate::labels::{self, FrameLabels};
+use crate::ask::Asker;
+use crate::labels;
+use crate::lerf::{self, Answer, Rendering};
 use crate::metrics::{self, InstanceScore};
-use crate::ranking::{self, Selection};
+use crate::protocol::lerf::{Averaging, object_figures, scene_figures};
+use crate::protocol::scannet;
 use crate::scene::LabelledScene;
 use crate::silhouette::Silhouette;
-use crate::text::TextSource;
 use artifacts::{TruePoints, TrueScene};
-use gs_io::{Error, Result};
+use gs_io::Result;
 use gs_scene::dataset::Dataset;
-use kiddo::{ImmutableKdTree, SquaredEuclidean};
-use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
-use std::collections::{BTreeMap, BTreeSet};
+use std::collections::BTreeSet;
 use std::path::Path;
 
 /// Gaussians fainter than this do not speak for a surface (methods.md 4.2).
 const MIN_OPACITY: f32 = 0.1;
-/// How far width / height of a labelled image and of its photograph may differ, relatively.
-const ASPECT_TOLERANCE: f64 = 0.02;
 
 /// `score.json`. Fields are null where the scene has no truth for them; `skipped` says why.
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
@@ -138,34 +135,23 @@ pub fn score_instances(scene: &LabelledScene, root: &Path, scores: &mut Scores) 
 /// Label of the nearest labelled Gaussian of sufficient opacity for each point; -1 when there is none at all.
 fn nearest_labels(scene: &LabelledScene, points: &[[f32; 3]]) -> Vec<i32> {
     let (g, label) = (&scene.gaussians, &scene.instances.label);
-    let speakers: Vec<usize> = (0..g.len()).filter(|&i| label[i] >= 0 && g.opacity(i) >= MIN_OPACITY).collect();
-    let positions: Vec<[f32; 3]> = speakers.iter().map(|&i| g.means[i]).collect();
-    let Some(tree) =
-        (!positions.is_empty()).then(|| ImmutableKdTree::<f32, 3>::new_from_slice(&positions).ok()).flatten()
-    else {
-        return vec![-1; points.len()];
-    };
-    let nearest = |p: &[f32; 3]| {
-        let found = tree.query(p).nearest_one::<SquaredEuclidean<f32>>().execute();
-        label[speakers[found.item as usize]]
-    };
-    points.par_iter().map(nearest).collect()
+    let speaks = |&i: &u32| label[i as usize] >= 0 && g.opacity(i as usize) >= MIN_OPACITY;
+    let speakers: Vec<u32> = (0..g.len() as u32).filter(speaks).collect();
+    let nearest = scannet::nearest(g, &speakers, points);
+    nearest.into_iter().map(|i| i.map_or(-1, |i| label[i as usize])).collect()
 }
 
-/// Scores text queries against `label/*.json` of the scene, by the protocol of methods.md 4.1: one IoU per (frame,
-/// category), zero where a prediction is missing; the mean over all of them. `silhouette` and `threshold` say how a
-/// selection becomes a mask. Masks are rendered in the size of the labelled image.
+/// Scores text queries against `label/*.json` of the scene, by the protocol of [`crate::protocol::lerf`] with every
+/// category of the labels asked for. `rendering` says how a selection becomes a mask.
 ///
 /// # Errors
-/// When labels are damaged or of another size, or text features do not fit the instances.
+/// When labels are damaged or of another size, or the text encoder fails.
 pub fn score_queries(
     scene: &LabelledScene,
     dataset: &Dataset,
     folder: &Path,
-    source: &TextSource,
-    selection: &Selection,
-    silhouette: Silhouette,
-    threshold: f32,
+    asker: &Asker<'_>,
+    rendering: Rendering,
     scores: &mut Scores,
     warn: &mut dyn FnMut(&str),
 ) -> Result<()> {
@@ -176,111 +162,61 @@ pub fn score_queries(
         scores.skipped.push(format!("query scores: {} holds no labelled object", folder.display()));
         return Ok(());
     }
-    source.check_dim(scene.instances.dim, scene.path())?;
-    let mut answers = BTreeMap::new();
-    for (text, feature) in texts.iter().zip(source.encode(&texts)?) {
-        let Some(feature) = feature else {
-            warn(&format!("no text feature of the category {text:?}: it counts as IoU 0"));
-            continue;
-        };
-        let ranking = ranking::rank(&scene.instances, &feature);
-        let selected = selection.choose(&ranking);
-        let score = ranking.iter().find(|r| selected.first() == Some(&r.instance)).map(|r| r.score);
-        let members = ranking::members(&scene.instances, &selected);
-        answers.insert(text.as_str(), (members, selected, score));
+    let answers = lerf::ask(asker, &texts, false)?;
+    for (text, _) in answers.iter().filter(|(_, a)| matches!(a, Answer::Unasked(_))) {
+        warn(&format!("no text feature of the category {text:?}: it counts as IoU 0"));
     }
-    let mut frame_ious: BTreeMap<&str, Vec<(String, f64)>> = BTreeMap::new();
-    let mut visible = Vec::new();
+    let seen = Rendering { silhouette: Silhouette::Visible, threshold: Silhouette::Visible.default_threshold() };
+    let (mut pairs, mut visible) = (Vec::new(), Vec::new());
     for frame in &frames {
-        for pair in score_frame(scene, dataset, frame, &answers, silhouette, threshold, folder, warn)? {
-            frame_ious.entry(pair.category).or_default().push((frame.frame.clone(), pair.iou));
-            visible.push(pair.visible_iou);
+        if !dataset.views.iter().any(|v| v.stem() == frame.frame) {
+            let name = &frame.frame;
+            warn(&format!("the labelled frame {name} is no view of the scene: its objects count as IoU 0"));
+        }
+        for (rendering, all) in [(rendering, &mut pairs), (seen, &mut visible)] {
+            let predictions = lerf::predict(scene, dataset, frame, &answers, rendering, false, folder)?;
+            all.extend(lerf::pairs(frame, &predictions));
         }
     }
-    let all: Vec<f64> = frame_ious.values().flatten().map(|f| f.1).collect();
-    scores.query_miou = Some(metrics::mean(&all));
-    scores.query_macc25 = Some(metrics::fraction_above(&all, 0.25));
-    scores.query_macc50 = Some(metrics::fraction_above(&all, 0.5));
-    scores.query_miou_visible = Some(metrics::mean(&visible));
-    scores.query_pairs = all.len();
-    let name = match silhouette {
-        Silhouette::Selected => "selected",
-        Silhouette::Visible => "visible",
-    };
-    scores.silhouette = Some((name.into(), threshold));
-    scores.queries = frame_ious
+    let figures = scene_figures(&pairs, Averaging::Objects);
+    (scores.query_miou, scores.query_pairs) = (Some(figures.miou), figures.pairs);
+    (scores.query_macc25, scores.query_macc50) = (Some(figures.macc25), Some(figures.macc50));
+    scores.query_miou_visible = Some(scene_figures(&visible, Averaging::Objects).miou);
+    scores.silhouette = Some((rendering.silhouette.name().into(), rendering.threshold));
+    scores.queries = object_figures(&pairs)
         .into_iter()
-        .map(|(text, frames)| QueryScore {
-            iou: metrics::mean(&frames.iter().map(|f| f.1).collect::<Vec<_>>()),
-            selected: answers.get(text).map_or_else(Vec::new, |a| a.1.clone()),
-            score: answers.get(text).and_then(|a| a.2),
-            text: text.into(),
-            frames,
+        .map(|(text, figures)| {
+            let (selected, score) = match answers.get(&text) {
+                Some(Answer::Selected { instances, score, .. }) => (instances.clone(), *score),
+                _ => (Vec::new(), None),
+            };
+            let mine = pairs.iter().filter(|p| p.category == text);
+            QueryScore {
+                frames: mine.map(|p| (p.frame.clone(), p.iou)).collect(),
+                iou: figures.miou,
+                selected,
+                score,
+                text,
+            }
         })
         .collect();
     Ok(())
 }
 
-type Answer = (Vec<u32>, Vec<u32>, Option<f32>);
-
-/// A category in one frame.
-struct Pair<'f> {
-    category: &'f str,
-    iou: f64,
-    visible_iou: f64,
-}
-
-/// IoU of every category of one frame.
-fn score_frame<'f>(
-    scene: &LabelledScene,
-    dataset: &Dataset,
-    frame: &'f FrameLabels,
-    answers: &BTreeMap<&str, Answer>,
-    silhouette: Silhouette,
-    threshold: f32,
-    folder: &Path,
-    warn: &mut dyn FnMut(&str),
-) -> Result<Vec<Pair<'f>>> {
-    let categories = || frame.categories.iter().map(|(c, m)| (c.as_str(), m));
-    let Some(view) = dataset.views.iter().find(|v| v.stem() == frame.frame) else {
-        warn(&format!("the labelled frame {} is no view of the scene: its objects count as IoU 0", frame.frame));
-        return Ok(categories().map(|(category, _)| Pair { category, iou: 0.0, visible_iou: 0.0 }).collect());
-    };
-    let (w, h) = (frame.width, frame.height);
-    let aspect = |w: u32, h: u32| f64::from(w) / f64::from(h);
-    let ratio = aspect(w, h) / aspect(view.camera.width, view.camera.height);
-    if (ratio - 1.0).abs() > ASPECT_TOLERANCE {
-        return Err(Error::new("the labelled image has another shape than the photograph")
-            .file(folder.join(format!("{}.json", frame.frame)))
-            .field("info")
-            .found(format!("{w}x{h}"))
-            .expected(format!("{}x{} or a multiple", view.camera.width, view.camera.height))
-            .hint("use the labels of this scene"));
-    }
-    let camera = view.camera.resized(w, h);
-    let none: &[u32] = &[];
-    let selections: Vec<&[u32]> = categories().map(|(c, _)| answers.get(c).map_or(none, |a| &a.0)).collect();
-    let masks = silhouette.masks(&scene.gaussians, &selections, &camera, threshold);
-    let visible = Silhouette::Visible;
-    let seen = visible.masks(&scene.gaussians, &selections, &camera, visible.default_threshold());
-    let pair = |((category, truth), (mask, seen)): ((&'f str, &Mask), (&Mask, &Mask))| Pair {
-        category,
-        iou: truth.iou(mask),
-        visible_iou: truth.iou(seen),
-    };
-    Ok(categories().zip(masks.iter().zip(&seen)).map(pair).collect())
+/// A text as a field of a CSV file.
+pub(crate) fn quoted(s: &str) -> String {
+    format!("\"{}\"", s.replace('"', "\"\""))
 }
 
 /// The scores of each thing and of each (frame, category) as CSV: two tables.
 pub fn csv(scores: &Scores) -> (String, String) {
-    let quote = |s: &str| format!("\"{}\"", s.replace('"', "\"\""));
     let mut things = String::from("id,name,background,points,iou,instance,fragments\n");
     for t in &scores.things {
         let instance = t.instance.map_or(String::new(), |i| i.to_string());
         things += &format!(
             "{},{},{},{},{:.6},{instance},{}\n",
             t.id,
-            quote(&t.name),
+            quoted(&t.name),
             t.background,
             t.points,
             t.iou,
@@ -290,7 +226,7 @@ pub fn csv(scores: &Scores) -> (String, String) {
     let mut queries = String::from("frame,category,iou\n");
     for q in &scores.queries {
         for (frame, iou) in &q.frames {
-            queries += &format!("{},{},{iou:.6}\n", quote(frame), quote(&q.text));
+            queries += &format!("{},{},{iou:.6}\n", quoted(frame), quoted(&q.text));
         }
     }
     (things, queries)

@@ -22,6 +22,14 @@ impl Silhouette {
         }
     }
 
+    /// The name it has on the command line.
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::Selected => "selected",
+            Self::Visible => "visible",
+        }
+    }
+
     /// Masks of several selections (ascending indices of Gaussians) in one view, in order.
     pub fn masks(self, gaussians: &Gaussians, selections: &[&[u32]], camera: &Camera, threshold: f32) -> Vec<Mask> {
         match self {
@@ -49,22 +57,48 @@ const CHANNELS: usize = 16;
 
 fn visible(gaussians: &Gaussians, selections: &[&[u32]], camera: &Camera, threshold: f32) -> Vec<Mask> {
     let (w, h) = (camera.width as usize, camera.height as usize);
-    let mut masks = Vec::with_capacity(selections.len());
-    for some in selections.chunks(CHANNELS) {
-        let d = some.len();
-        let mut member = vec![0.0f32; gaussians.len() * d];
-        for (k, selection) in some.iter().enumerate() {
-            for &i in *selection {
-                member[i as usize * d + k] = 1.0;
+    let shares = blended(gaussians, selections.len(), camera, |member, k, d| {
+        for &i in selections[k] {
+            member[i as usize * d] = 1.0;
+        }
+    });
+    shares.iter().map(|share| Mask::above(w, h, share, threshold)).collect()
+}
+
+/// Rendered relevancy, `[height][width]` for each of `relevancies` (a value per instance): every Gaussian has its
+/// instance's value, one of no instance 0, and so has what lies behind the Gaussians.
+///
+/// # Panics
+/// When `label` is not a label per Gaussian or exceeds the instances.
+pub fn relevancy_maps(gaussians: &Gaussians, label: &[i32], relevancies: &[&[f32]], camera: &Camera) -> Vec<Vec<f32>> {
+    assert_eq!(label.len(), gaussians.len());
+    blended(gaussians, relevancies.len(), camera, |values, k, d| {
+        for (i, &l) in label.iter().enumerate() {
+            if l >= 0 {
+                values[i * d] = relevancies[k][l as usize];
             }
         }
-        let share = gs_raster::render_features(gaussians, &member, d, camera, &options());
-        for k in 0..d {
-            let channel: Vec<f32> = share.iter().skip(k).step_by(d).copied().collect();
-            masks.push(Mask::above(w, h, &channel, threshold));
+    })
+}
+
+/// Blends `count` values per Gaussian. `fill(values, k, d)` writes value k of Gaussian i to `values[i * d]`.
+fn blended(
+    gaussians: &Gaussians,
+    count: usize,
+    camera: &Camera,
+    fill: impl Fn(&mut [f32], usize, usize),
+) -> Vec<Vec<f32>> {
+    let mut maps = Vec::with_capacity(count);
+    for first in (0..count).step_by(CHANNELS) {
+        let d = CHANNELS.min(count - first);
+        let mut values = vec![0.0f32; gaussians.len() * d];
+        if !gaussians.is_empty() {
+            (0..d).for_each(|k| fill(&mut values[k..], first + k, d));
         }
+        let image = gs_raster::render_features(gaussians, &values, d, camera, &options());
+        maps.extend((0..d).map(|k| image.iter().skip(k).step_by(d).copied().collect::<Vec<f32>>()));
     }
-    masks
+    maps
 }
 
 #[cfg(test)]
@@ -99,6 +133,15 @@ mod tests {
         let s2 = (f * 0.125).powi(2) + 0.3;
         let area = std::f64::consts::PI * s2 * 2.0 * (0.99753f64 / 0.7).ln();
         assert!((alone.count() as f64 - area).abs() < 0.06 * area + 4.0, "{} {area}", alone.count());
+    }
+
+    #[test]
+    fn relevancy_is_that_of_what_is_seen() {
+        let (g, camera) = balls();
+        let maps = relevancy_maps(&g, &[1, 0], &[&[0.25, 1.0], &[0.5, 0.0]], &camera);
+        let centre = 24 * 64 + 32;
+        assert!(maps[0][centre] > 0.95 && maps[1][centre] < 0.03, "the near ball");
+        assert_eq!(relevancy_maps(&g, &[-1, -1], &[&[]], &camera)[0], vec![0.0; 64 * 48]);
     }
 
     #[test]

@@ -3,6 +3,7 @@
 use gs_io::{Error, IoContext, Result};
 use onnx_models::{ClipText, EngineOptions};
 use std::collections::BTreeMap;
+use std::io::Read;
 use std::path::{Path, PathBuf};
 
 /// A source of text features.
@@ -22,18 +23,27 @@ pub struct TextTable {
 }
 
 impl TextTable {
-    /// Reads a JSON object of name -> list of numbers, all of one length.
+    /// Reads a table: a JSON object of name -> list of numbers, as OpenGaussian's text_features.json, or a NumPy `.npz`
+    /// with an array per name, of shape `[d]` or `[1, d]`. All vectors have one length.
     ///
     /// # Errors
-    /// When the file is missing or not such a table, is empty, or its vectors differ in length.
+    /// When the file is missing or not such a table, is empty, its vectors differ in length, or a number is not finite.
     pub fn read(path: impl AsRef<Path>) -> Result<Self> {
         let path = path.as_ref();
         let bytes = std::fs::read(path).at("read", path)?;
-        let features: BTreeMap<String, Vec<f32>> = serde_json::from_slice(&bytes).map_err(|e| {
-            Error::new(format!("not a table of text features: {e}"))
-                .file(path)
-                .expected("a JSON object of name -> list of numbers")
-        })?;
+        let features = if bytes.starts_with(b"PK") {
+            read_npz(&bytes).map_err(|e| e.file(path))?
+        } else {
+            serde_json::from_slice(&bytes).map_err(|e| {
+                Error::new(format!("not a table of text features: {e}"))
+                    .file(path)
+                    .expected("a JSON object of name -> list of numbers, or an npz of name -> vector")
+            })?
+        };
+        Self::new(path.to_path_buf(), features)
+    }
+
+    fn new(path: PathBuf, features: BTreeMap<String, Vec<f32>>) -> Result<Self> {
         let dim = features.values().next().map_or(0, Vec::len);
         if dim == 0 {
             return Err(Error::new("no text features").file(path).hint("give a table with at least one name"));
@@ -43,9 +53,40 @@ impl TextTable {
                 let e = Error::new("a vector of another length").file(path).field(name);
                 return Err(e.found(v.len()).expected(dim));
             }
+            if let Some(bad) = v.iter().find(|x| !x.is_finite()) {
+                return Err(Error::new("a number is not finite").file(path).field(name).found(bad));
+            }
         }
-        Ok(Self { path: path.to_path_buf(), dim, features })
+        Ok(Self { path, dim, features })
     }
+}
+
+/// Largest array of an npz that is believed, in bytes: a vector of text features has a few thousand.
+const LARGEST_ARRAY: u64 = 1 << 24;
+
+fn read_npz(bytes: &[u8]) -> Result<BTreeMap<String, Vec<f32>>> {
+    let broken =
+        |e: zip::result::ZipError| Error::new(format!("not an npz file: {e}")).hint("write it with numpy.savez");
+    let mut archive = zip::ZipArchive::new(std::io::Cursor::new(bytes)).map_err(broken)?;
+    let mut features = BTreeMap::new();
+    for i in 0..archive.len() {
+        let mut entry = archive.by_index(i).map_err(broken)?;
+        let name = entry.name().trim_end_matches(".npy").to_string();
+        let mut data = Vec::new();
+        // Not the size that the file claims, but what comes out.
+        let read = (&mut entry).take(LARGEST_ARRAY + 1).read_to_end(&mut data);
+        read.map_err(|e| Error::new(format!("not an npz file: {e}")).field(&name).hint("write it with numpy.savez"))?;
+        if data.len() as u64 > LARGEST_ARRAY {
+            return Err(Error::new("too large for a text feature").field(&name).expected("a vector per name"));
+        }
+        let array = gs_io::npy::parse(&data).map_err(|e| e.field(&name))?;
+        if !matches!(array.shape[..], [_] | [1, _]) {
+            let e = Error::new("not a vector").field(&name).found(format!("{:?}", array.shape));
+            return Err(e.expected("[d] or [1, d]"));
+        }
+        features.insert(name, array.data);
+    }
+    Ok(features)
 }
 
 impl TextSource {
@@ -115,6 +156,39 @@ impl TextSource {
         }
     }
 
+    /// Features of `texts` where each is put into the place of `{}` in every template, such as "a photo of a {}", and the
+    /// unit features of what comes out are averaged and scaled to unit length. Without templates: [`Self::encode`].
+    ///
+    /// # Errors
+    /// As [`Self::encode`].
+    pub fn encode_in(&self, templates: &[String], texts: &[String]) -> Result<Vec<Option<Vec<f32>>>> {
+        if templates.is_empty() {
+            return self.encode(texts);
+        }
+        let filled: Vec<String> = texts.iter().flat_map(|t| templates.iter().map(|p| p.replace("{}", t))).collect();
+        let features = self.encode(&filled)?;
+        Ok(features.chunks_exact(templates.len()).map(mean_direction).collect())
+    }
+
+    /// All names, where the source is a table.
+    pub fn names(&self) -> Vec<String> {
+        match self {
+            Self::Clip(_) => Vec::new(),
+            Self::Table(table) => table.features.keys().cloned().collect(),
+        }
+    }
+
+    /// Which features exactly: the content hash of the encoder's graph or of the table, for reports.
+    ///
+    /// # Errors
+    /// When the table cannot be read again.
+    pub fn hash(&self) -> Result<String> {
+        match self {
+            Self::Clip(clip) => Ok(clip.hash().into()),
+            Self::Table(table) => gs_io::hash_file(&table.path),
+        }
+    }
+
     /// The error for a text that [`Self::encode`] knows no feature of; it names a few that it knows.
     pub fn unknown(&self, text: &str) -> Error {
         let mut e = Error::new("no such text in the table").field("--text").found(format!("{text:?}"));
@@ -125,6 +199,22 @@ impl TextSource {
         }
         e.hint("a CLIP text encoder (--clip) takes any words")
     }
+}
+
+/// The unit mean of unit features; none when one is missing.
+fn mean_direction(features: &[Option<Vec<f32>>]) -> Option<Vec<f32>> {
+    let unit = |v: &mut Vec<f64>| {
+        let norm = v.iter().map(|x| x * x).sum::<f64>().sqrt();
+        v.iter_mut().for_each(|x| *x /= if norm > 0.0 { norm } else { 1.0 });
+    };
+    let mut sum = vec![0.0; features.first()?.as_ref()?.len()];
+    for feature in features {
+        let mut one: Vec<f64> = feature.as_ref()?.iter().map(|&x| f64::from(x)).collect();
+        unit(&mut one);
+        sum.iter_mut().zip(&one).for_each(|(s, x)| *s += x);
+    }
+    unit(&mut sum);
+    Some(sum.into_iter().map(|x| x as f32).collect())
 }
 
 /// The five names that share most letters with `text`, by Dice's coefficient of letter pairs.
@@ -167,6 +257,43 @@ mod tests {
         assert!(e.contains("found dimension 512, expected 2"), "{e}");
         let e = t.check_dim(0, Path::new("i")).unwrap_err().to_string();
         assert!(e.contains("no language features") && e.contains("mask-embed"), "{e}");
+    }
+
+    fn npz(entries: &[(&str, &[usize], &[f32])]) -> Result<TextSource> {
+        let dir = tempfile::tempdir().unwrap();
+        let path = dir.path().join("text.npz");
+        let mut archive = zip::ZipWriter::new(std::fs::File::create(&path).unwrap());
+        for (name, shape, data) in entries {
+            let array = dir.path().join("a.npy");
+            gs_io::npy::write_f32(&array, shape, data).unwrap();
+            archive.start_file(format!("{name}.npy"), zip::write::SimpleFileOptions::default()).unwrap();
+            std::io::Write::write_all(&mut archive, &std::fs::read(&array).unwrap()).unwrap();
+        }
+        archive.finish().unwrap();
+        TextSource::open(None, Some(&path), &EngineOptions::default())
+    }
+
+    #[test]
+    fn an_npz_is_a_table_too() {
+        let t = npz(&[("coffee mug", &[2], &[1.0, 0.0]), ("sheep", &[1, 2], &[0.6, 0.8])]).unwrap();
+        assert_eq!(t.encode(&["sheep".into()]).unwrap(), [Some(vec![0.6, 0.8])]);
+        assert_eq!((t.dim(), t.names()), (2, vec!["coffee mug".to_string(), "sheep".into()]));
+        let e = npz(&[("a", &[2, 2], &[0.0; 4])]).err().unwrap().to_string();
+        assert!(e.contains("text.npz: a: not a vector; found [2, 2], expected [d] or [1, d]"), "{e}");
+        let e = npz(&[("a", &[1], &[f32::NAN])]).err().unwrap().to_string();
+        assert!(e.contains("a: a number is not finite"), "{e}");
+        assert!(npz(&[]).err().unwrap().to_string().contains("no text features"));
+        assert!(table("PK\u{3}\u{4}cut").err().unwrap().to_string().contains("not an npz file"));
+    }
+
+    #[test]
+    fn templates_are_averaged_as_directions() {
+        let t = table(r#"{"a cup": [3, 0], "the cup": [0, 1], "cup": [1, 1]}"#).unwrap();
+        let templates = ["a {}".to_string(), "the {}".into()];
+        let found = t.encode_in(&templates, &["cup".into(), "pot".into()]).unwrap();
+        let half = std::f32::consts::FRAC_1_SQRT_2;
+        assert_eq!(found, [Some(vec![half, half]), None], "each template counts alike, whatever its length");
+        assert_eq!(t.encode_in(&[], &["cup".into()]).unwrap(), [Some(vec![1.0, 1.0])]);
     }
 
     #[test]

@@ -172,6 +172,34 @@ pub fn read_points(path: impl AsRef<Path>) -> Result<PointCloud> {
     parse_points(&bytes).map_err(|e| e.file(path))
 }
 
+/// Reads the positions of a PLY's vertices and a whole-number property of each, such as `label` of ScanNet's
+/// `*.labels.ply`.
+///
+/// # Errors
+/// When the file is damaged, lacks the property, a position is not finite, or a value is not a whole number from 0 to
+/// 16,777,216.
+pub fn read_labels(path: impl AsRef<Path>, property: &str) -> Result<(Vec<[f32; 3]>, Vec<u32>)> {
+    let path = path.as_ref();
+    let bytes = std::fs::read(path).at("read", path)?;
+    parse_labels(&bytes, property).map_err(|e| e.file(path))
+}
+
+fn parse_labels(bytes: &[u8], property: &str) -> Result<(Vec<[f32; 3]>, Vec<u32>)> {
+    let table = table::read(bytes)?;
+    let positions = table.positions()?;
+    let column = table.find(property).ok_or_else(|| {
+        Error::new("the vertices lack a property").field(property).hint("give the *.labels.ply of the scan")
+    })?;
+    let whole = |(i, v): (usize, f32)| {
+        if v.fract() == 0.0 && (0.0..=16_777_216.0).contains(&v) {
+            return Ok(v as u32);
+        }
+        Err(Error::new("not a label").field(format!("vertex {i}, {property}")).found(v))
+    };
+    let labels = table.gather(&[column]).into_iter().enumerate().map(whole).collect::<Result<Vec<u32>>>()?;
+    Ok((positions, labels))
+}
+
 fn parse_points(bytes: &[u8]) -> Result<PointCloud> {
     let table = table::read(bytes)?;
     let positions = table.positions()?;
@@ -208,4 +236,21 @@ pub fn write_points(path: impl AsRef<Path>, points: &PointCloud, comments: &[Str
         }
         Ok(())
     })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn labels_are_read_beside_positions() {
+        let text = "ply\nformat ascii 1.0\nelement vertex 2\nproperty float x\nproperty float y\nproperty float z\n\
+                    property ushort label\nelement face 1\nproperty list uchar int vertex_indices\nend_header\n\
+                    1 2 3 0\n4 5 6 65535\n3 0 1 1\n";
+        let read = |text: &str, property| parse_labels(text.as_bytes(), property);
+        assert_eq!(read(text, "label").unwrap(), (vec![[1.0, 2.0, 3.0], [4.0, 5.0, 6.0]], vec![0, 65535]));
+        assert!(read(text, "class").unwrap_err().to_string().contains("class: the vertices lack a property"));
+        let e = read(&text.replace("ushort", "float").replace("65535", "-1"), "label").unwrap_err().to_string();
+        assert!(e.contains("vertex 1, label: not a label; found -1"), "{e}");
+    }
 }

@@ -177,7 +177,7 @@ impl Fixture {
         TrueScene { objects, parameters: json!({}) }.write(self.scene().join("truth/scene.json")).unwrap();
     }
 
-    /// Runs `eval` with these arguments after the scene's; `{}` stands for the fixture's folder.
+    /// Runs `eval` with these arguments after the scene's; `{}` stands for the fixture's folder, `<>` for `{}`.
     pub fn eval(&self, command: &str, arguments: &str) -> Output {
         let place = self.path().display().to_string();
         let mut c = Command::new(env!("CARGO_BIN_EXE_eval"));
@@ -186,7 +186,9 @@ impl Fixture {
             let (i, g, s) = (self.instances(), self.geometry(), self.scene());
             c.arg("--instances").arg(i).arg("--geometry").arg(g).arg("--scene").arg(s);
         }
-        c.args(arguments.split('|').map(|a| a.trim().replace("{}", &place)).filter(|a| !a.is_empty()));
+        c.args(
+            arguments.split('|').map(|a| a.trim().replace("{}", &place).replace("<>", "{}")).filter(|a| !a.is_empty()),
+        );
         c.output().unwrap()
     }
 

@@ -1,6 +1,7 @@
 //! `eval` as people run it.
 
 mod fixture;
+mod protocols;
 
 use fixture::{Fixture, stem};
 use std::fs;
@@ -312,4 +313,184 @@ fn an_unwritable_output_is_named() {
         let e = f.bad(command, rest);
         assert!(e.contains("cannot create the folder") && e.contains("/file"), "{e}");
     }
+}
+
+#[test]
+fn places_say_what_is_there() {
+    let f = Fixture::new(2);
+    let (x, y, _) = fixture::cameras()[2].project(glam::DVec3::from_array(fixture::CENTRES[1]));
+    let pixel = format!("frame_00002:{},{}", x as u32, y as u32);
+    let printed =
+        f.good("query", &format!("{TABLE}|--pixel|{pixel}|--point|-0.6,0.1,0.5|--pixel|frame_00002.png:48,1"));
+    assert!(printed.contains("blue ball") && printed.contains("nothing is there"), "{printed}");
+    let q = f.json("out/query.json");
+    let blue = &q["queries"][0];
+    assert_eq!((&blue["kind"], &blue["selected"]), (&serde_json::json!("pixel"), &serde_json::json!([1])));
+    assert_eq!(blue["place"]["names"][0][0], "blue ball");
+    assert!(blue["score"].as_f64().unwrap() > 0.9 && blue["place"]["alpha_or_distance"].as_f64().unwrap() > 0.9);
+    let shown = blue["views"].as_array().unwrap();
+    assert!(shown.iter().any(|v| v["view"] == "frame_00002"), "the view that was asked about is shown");
+    let sky = &q["queries"][1];
+    assert!(sky["selected"].as_array().unwrap().is_empty() && sky["ply"].is_null(), "{sky}");
+    let red = &q["queries"][2];
+    assert_eq!((&red["kind"], &red["selected"]), (&serde_json::json!("point"), &serde_json::json!([0])));
+    assert!((red["place"]["alpha_or_distance"].as_f64().unwrap() - 0.1).abs() < 1e-6);
+    // Without language nothing has a name, but it is still there.
+    let f = Fixture::new(0);
+    f.good("query", &format!("--out|{{}}/out|--pixel|{pixel}"));
+    assert_eq!(f.json("out/query.json")["queries"][0]["selected"], serde_json::json!([1]));
+    let e = f.bad("query", "--out|{}/out|--pixel|frame_00002:96,1");
+    assert!(e.contains("--pixel: the pixel lies outside the view; found 96,1"), "{e}");
+    assert!(f.bad("query", "--out|{}/out|--pixel|frame_00002").contains("--pixel: not understood"));
+    assert!(f.bad("query", "--out|{}/out|--point|1,2,inf").contains("--point: not a point"));
+    assert!(f.bad("query", "--out|{}/out").contains("nothing is asked for"));
+}
+
+#[test]
+fn several_texts_divide_the_cloud() {
+    let f = Fixture::new(2);
+    let at = "--text|blue ball|--text|red ball|--segment|--views|frame_00002";
+    let printed = f.good("query", &format!("{TABLE}|{at}|--threshold|0"));
+    assert!(printed.contains("segmentation (81 Gaussians without a text)"), "{printed}");
+    let labels = gs_io::npy::read_f32(f.path().join("out/labels.npy")).unwrap();
+    assert_eq!((labels.shape, &labels.data[..4]), (vec![83], &[1.0, 0.0, -1.0, -1.0][..]));
+    let s = &f.json("out/query.json")["segmentation"];
+    assert_eq!((&s["segments"][0]["text"], &s["segments"][0]["gaussians"]), (&"blue ball".into(), &1.into()));
+    let g = gs_scene::ply::read_gaussians(f.path().join("out/segmentation.ply")).unwrap();
+    assert_eq!(g.len(), 83);
+    assert!(g.base_color(0) != g.base_color(1) && g.base_color(2) == g.base_color(3));
+    assert!(f.path().join("out/segmentation.frame_00002.png").exists());
+    let e = f.bad("query", &format!("{TABLE}|--text|red ball|--segment"));
+    assert!(e.contains("--segment: nothing to choose between"), "{e}");
+}
+
+#[test]
+fn a_picture_is_a_query() {
+    let f = Fixture::new(2);
+    let clip = concat!(env!("CARGO_MANIFEST_DIR"), "/../onnx-models/testdata/clip");
+    let picture = f.scene().join("images/frame_00002.png");
+    let encoder = onnx_models::ClipImage::open(clip, &onnx_models::EngineOptions::default()).unwrap();
+    let image = gs_scene::Image::read(&picture).unwrap();
+    let (width, height) = (image.width as usize, image.height as usize);
+    let whole = onnx_models::RgbImage { width, height, pixels: image.to_rgb8() };
+    let map = onnx_models::LabelMap { width, height, ids: &vec![0; width * height] };
+    let bounds = onnx_models::Bounds { x0: 8, y0: 4, x1: 40, y1: 36 };
+    let feature = encoder.encode(&onnx_models::crop_mask(&whole, &map, 0, bounds, encoder.size())).unwrap();
+    let opposite: Vec<f32> = feature.iter().map(|v| -v).collect();
+    f.write_described(&[opposite, feature, vec![0.0; 4]], |g| g as i32);
+    let ask =
+        |rest: &str| format!("--clip|{clip}|--image|{}|{rest}|--views|frame_00002|--out|{{}}/out", picture.display());
+    f.good("query", &ask("--crop|8,4,40,36"));
+    let q = &f.json("out/query.json")["queries"][0];
+    assert_eq!(
+        (&q["kind"], &q["text"], &q["selected"]),
+        (&"image".into(), &"frame_00002".into(), &serde_json::json!([1]))
+    );
+    assert!((q["score"].as_f64().unwrap() - 1.0).abs() < 1e-6);
+    assert!(f.bad("query", &ask("--crop|8,4,8,36")).contains("--crop: not a part of the picture"));
+    assert!(f.bad("query", &ask("--crop|8,4")).contains("--crop: not understood"));
+    let e = f.bad("query", &format!("{TABLE}|--image|{}", picture.display()));
+    assert!(e.contains("pictures need an image encoder"), "{e}");
+    f.write_instances(2, |g| g as i32);
+    assert!(f.bad("query", &ask("")).contains("found dimension 2, expected 4"));
+}
+
+#[test]
+fn negatives_templates_and_joining_change_the_answer() {
+    let f = Fixture::new(2);
+    let first = |rest: &str| {
+        f.good("query", &format!("{TABLE}|--views|frame_00002|{rest}"));
+        f.json("out/query.json")["queries"][0].clone()
+    };
+    let q = first("--text|red ball|--negatives|blue ball,thing");
+    // cos(red, thing) = 0.707: 1 / (1 + exp(10 (0.7071 - 1))).
+    assert!((q["score"].as_f64().unwrap() - 1.0 / (1.0 + (-2.928_932_f64).exp())).abs() < 1e-5, "{q}");
+    fs::write(f.table(), r#"{"ball": [0, 1], "a ball": [1, 0], "the ball": [1, 0.2]}"#).unwrap();
+    assert_eq!(first("--text|ball")["selected"], serde_json::json!([1]));
+    assert_eq!(first("--text|ball|--template|a <>|--template|the <>")["selected"], serde_json::json!([0]));
+    // Features (0 0 1), (1 1 1), (2 4 1): angles between red and blue 54.7 degrees, so unit distance 0.919.
+    let join = |d: &str| first(&format!("--text|ball|--join|{d}|--features|{{}}/run/features.safetensors"));
+    assert_eq!(join("0.9")["selected"].as_array().unwrap()[0], 1);
+    assert!(!join("0.9")["selected"].to_string().contains('0'), "{}", join("0.9")["selected"]);
+    assert!(join("0.93")["selected"].to_string().contains('0'));
+    let bad = |rest: &str| f.bad("query", &format!("{TABLE}|--text|ball|{rest}"));
+    assert!(bad("--negatives|stuff").contains("no such text in the table"));
+    assert!(bad("--template|a photo").contains("--template: no place for the text"));
+    assert!(bad("--join|0|--features|{}/run/features.safetensors").contains("--join: not a distance"));
+    assert!(bad("--join|1|--features|{}/run/none").contains("none"));
+}
+
+#[test]
+fn an_interactive_query_reads_texts_from_a_pipe() {
+    use std::io::Write;
+    let f = Fixture::new(2);
+    let ask = |rest: &[&str], input: &str| {
+        let mut c = std::process::Command::new(env!("CARGO_BIN_EXE_eval"));
+        c.arg("query").arg("--instances").arg(f.instances()).arg("--geometry").arg(f.geometry());
+        c.arg("--scene").arg(f.scene()).arg("--text-features").arg(f.table()).arg("--interactive").args(rest);
+        c.stdin(std::process::Stdio::piped()).stdout(std::process::Stdio::piped()).stderr(std::process::Stdio::piped());
+        let mut child = c.spawn().unwrap();
+        child.stdin.take().unwrap().write_all(input.as_bytes()).unwrap();
+        child.wait_with_output().unwrap()
+    };
+    let o = ask(&[], "red ball\n\nreed ball\nblue ball\n:quit\nthing\n");
+    assert!(o.status.success());
+    let (said, printed) = (String::from_utf8_lossy(&o.stderr), String::from_utf8_lossy(&o.stdout));
+    assert!(said.contains("no such text in the table") && said.contains("\"reed ball\""), "{said}");
+    assert!(printed.contains("\"red ball\" (1 Gaussians") && printed.contains("\"blue ball\""), "{printed}");
+    assert!(!printed.contains("\"thing\"") && printed.contains("ms query"), "nothing after :quit: {printed}");
+    let out = f.path().join("live");
+    let o = ask(&["--json", "--out", out.to_str().unwrap(), "--views", "frame_00002"], "red ball\nblue ball");
+    let lines: Vec<serde_json::Value> = String::from_utf8_lossy(&o.stdout)
+        .lines()
+        .filter_map(|l| serde_json::from_str(l).ok())
+        .filter(|v: &serde_json::Value| v["ranking"].is_array())
+        .collect();
+    assert_eq!(lines.len(), 2);
+    assert_eq!(lines[1]["selected"], serde_json::json!([1]));
+    assert!(out.join("red-ball/red-ball.ply").exists() && out.join("blue-ball/query.json").exists());
+}
+
+#[test]
+fn odd_instances_are_answered_with_a_line() {
+    let f = Fixture::new(2);
+    let warned = |command: &str, rest: &str| {
+        let o = f.eval(command, rest);
+        let said = String::from_utf8_lossy(&o.stderr).into_owned();
+        assert!(o.status.success(), "{said}");
+        said
+    };
+    let query = format!("{TABLE}|--text|red ball|--views|frame_00002");
+    let lerf = "--text-features|{}/text.json|--out|{}/lerf";
+    // The instance of the best descriptor holds no Gaussian.
+    f.write_instances(2, |g| if g == 0 { 1 } else { g as i32 });
+    assert!(warned("query", &query).contains("hold no Gaussian: nothing to show"));
+    assert!(warned("lerf", lerf).contains("score 0 because no Gaussian is selected"));
+    // All noise.
+    f.write_instances(2, |_| -1);
+    assert!(warned("query", &query).contains("all Gaussians are noise"));
+    assert!(warned("lerf", lerf).contains("all Gaussians are noise"));
+    assert_eq!(f.json("lerf/metrics.json")["figures"]["miou"], 0.0);
+    // One instance: it answers everything.
+    f.write_instances(2, |_| 0);
+    warned("query", &query);
+    assert_eq!(f.json("out/query.json")["queries"][0]["gaussians"], 83);
+    // Nothing reaches the threshold.
+    assert!(warned("query", &format!("{query}|--threshold|2")).contains("nothing is selected"));
+    // A view that no label names, an unknown category, labels of another shape.
+    f.write_instances(2, |g| g as i32);
+    f.write_label(4, &[("red ball", 0), ("green ball", 1)], (fixture::WIDTH, fixture::HEIGHT));
+    fs::rename(f.scene().join("label/frame_00001.json"), f.scene().join("label/frame_09999.json")).unwrap();
+    let said = warned("lerf", lerf);
+    assert!(said.contains("it has no text feature: green ball in frame_00004"), "{said}");
+    assert!(said.contains("2 of 4 pairs score 0 because the frame is no view of the scene"), "{said}");
+    let table = fs::read_to_string(f.path().join("lerf/table.md")).unwrap();
+    assert!(table.contains("green ball in frame_00004") && table.contains("selected rendering above 0.7"), "{table}");
+    f.write_label(4, &[("red ball", 0)], (100, 100));
+    assert!(f.bad("lerf", lerf).contains("another shape than the photograph; found 100x100"));
+    fs::remove_dir_all(f.scene().join("label")).unwrap();
+    assert!(f.bad("lerf", lerf).contains("the scene has no labels"));
+    f.write_instances(0, |g| g as i32);
+    fs::create_dir(f.scene().join("label")).unwrap();
+    assert!(f.bad("lerf", lerf).contains("no language features"));
 }

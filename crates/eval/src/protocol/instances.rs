@@ -1,0 +1,256 @@
+//! Class-agnostic instances of a ScanNet scan: truth from segs and aggregation, mIoU and average precision
+//! (methods.md 4.3).
+
+use crate::metrics;
+use gs_io::{Error, IoContext, Result};
+use serde::{Deserialize, Serialize};
+use std::collections::{BTreeMap, BTreeSet};
+use std::path::Path;
+
+/// True instances with fewer points, and predicted ones, take no part in average precision, as in ScanNet's benchmark.
+pub const MIN_POINTS: usize = 100;
+
+#[derive(Deserialize)]
+#[serde(rename_all = "camelCase")]
+struct Segs {
+    seg_indices: Vec<i64>,
+}
+
+#[derive(Deserialize)]
+#[serde(rename_all = "camelCase")]
+struct Aggregation {
+    seg_groups: Vec<Group>,
+}
+
+#[derive(Deserialize)]
+#[serde(rename_all = "camelCase")]
+struct Group {
+    object_id: i32,
+    #[serde(default)]
+    label: String,
+    segments: Vec<i64>,
+}
+
+/// The true instance of every vertex: `<scan>_vh_clean_2.0.010000.segs.json` gives each vertex a segment
+/// (`segIndices`), `<scan>.aggregation.json` gives each object its segments (`segGroups[].objectId, segments, label`).
+/// -1 for vertices of no object, and of objects whose label is in `without`.
+///
+/// # Errors
+/// When a file is missing or not such a file, when there is not a segment for each of `vertices` vertices, or two objects
+/// claim one segment.
+pub fn read_truth(segs: &Path, aggregation: &Path, vertices: usize, without: &[String]) -> Result<Vec<i32>> {
+    let read = |path: &Path| std::fs::read(path).at("read", path);
+    let bad = |path: &Path, what: &str, e: serde_json::Error| Error::new(format!("{what}: {e}")).file(path);
+    let s: Segs = serde_json::from_slice(&read(segs)?).map_err(|e| bad(segs, "not a file of segments", e))?;
+    if s.seg_indices.len() != vertices {
+        return Err(Error::new("not a segment per vertex")
+            .file(segs)
+            .field("segIndices")
+            .found(s.seg_indices.len())
+            .expected(format!("{vertices}, as many as labels"))
+            .hint("use the segs.json of the same mesh as the labels, *_vh_clean_2.0.010000.segs.json"));
+    }
+    let a: Aggregation =
+        serde_json::from_slice(&read(aggregation)?).map_err(|e| bad(aggregation, "not an aggregation file", e))?;
+    let mut object = BTreeMap::new();
+    for (i, group) in a.seg_groups.iter().enumerate() {
+        for &segment in &group.segments {
+            if let Some(other) = object.insert(segment, group).filter(|g| g.object_id != group.object_id) {
+                return Err(Error::new("two objects claim one segment")
+                    .file(aggregation)
+                    .field(format!("segGroups[{i}].segments"))
+                    .found(format!("segment {segment} of objects {} and {}", other.object_id, group.object_id)));
+            }
+        }
+    }
+    let id = |segment: &i64| match object.get(segment) {
+        Some(group) if group.object_id >= 0 && !without.contains(&group.label) => group.object_id,
+        _ => -1,
+    };
+    Ok(s.seg_indices.iter().map(id).collect())
+}
+
+/// Class-agnostic scores of a scan.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct InstanceFigures {
+    /// Mean over true instances of the best IoU with any predicted one (InstanceGaussian).
+    pub miou: f64,
+    /// Fraction of true instances with best IoU above 0.25.
+    pub acc25: f64,
+    /// Fraction of true instances with best IoU above 0.5.
+    pub acc50: f64,
+    /// Average precision at IoU 0.25 (ScanNet's matching); none without a true instance of [`MIN_POINTS`] points.
+    pub ap25: Option<f64>,
+    /// The same at IoU 0.5.
+    pub ap50: Option<f64>,
+    /// True instances.
+    pub truth: usize,
+    /// Predicted instances that own points of the scan.
+    pub predicted: usize,
+}
+
+/// Scores the predicted instance of every point (negative: none) against the true one (negative: no object, which counts
+/// neither for nor against), with the `confidence` of each predicted instance.
+///
+/// # Panics
+/// When lengths differ or a predicted id has no confidence.
+pub fn score(truth: &[i32], predicted: &[i32], confidence: &[f32], min_points: usize) -> InstanceFigures {
+    let best = metrics::score_instances(truth, predicted);
+    let ids: BTreeSet<i32> = predicted.iter().copied().filter(|&p| p >= 0).collect();
+    let ap = |threshold| average_precision(truth, predicted, confidence, min_points, threshold);
+    InstanceFigures {
+        miou: best.miou,
+        acc25: best.macc25,
+        acc50: best.macc50,
+        ap25: ap(0.25),
+        ap50: ap(0.5),
+        truth: best.objects.len(),
+        predicted: ids.len(),
+    }
+}
+
+/// Average precision by ScanNet's matching. Only true and predicted instances of at least `min_points` points take part;
+/// IoU counts all points, also those without a true object. True instances are taken by rising id; each takes the
+/// predictions (by rising id) whose IoU with it exceeds `threshold` and that were not the first match of an earlier one:
+/// the most confident is its hit, every other a false alarm. A prediction that exceeds the threshold with no true instance
+/// is a false alarm too, unless more than `threshold` of its points belong to no true instance that takes part. For every
+/// distinct confidence, precision p_i and recall r_i of what is at least that confident; after them (1, 0); the result is
+/// the sum over i of p_i (r_(i-1) - r_(i+1)) / 2, with r repeated before the first and 0 after the last. None without a
+/// true instance that takes part.
+///
+/// # Panics
+/// As [`score`].
+pub fn average_precision(
+    truth: &[i32],
+    predicted: &[i32],
+    confidence: &[f32],
+    min_points: usize,
+    threshold: f64,
+) -> Option<f64> {
+    assert_eq!(truth.len(), predicted.len());
+    let mut truth_points = BTreeMap::<i32, usize>::new();
+    let mut predicted_points = BTreeMap::<i32, usize>::new();
+    let mut common = BTreeMap::<(i32, i32), usize>::new();
+    for (&t, &p) in truth.iter().zip(predicted) {
+        *truth_points.entry(t).or_default() += 1;
+        *predicted_points.entry(p).or_default() += 1;
+        *common.entry((t, p)).or_default() += 1;
+    }
+    truth_points.retain(|&id, n| id >= 0 && *n >= min_points);
+    predicted_points.retain(|&id, n| id >= 0 && *n >= min_points);
+    if truth_points.is_empty() {
+        return None;
+    }
+    let overlaps = |t: i32, p: i32| {
+        let both = common.get(&(t, p)).copied().unwrap_or(0);
+        both as f64 / (truth_points[&t] + predicted_points[&p] - both) as f64 > threshold
+    };
+    // Outcomes: confidence and whether it is a hit. What no prediction reaches is missed at every confidence.
+    let mut outcomes: Vec<(f32, bool)> = Vec::new();
+    let mut taken = BTreeSet::new();
+    let mut missed = 0usize;
+    for &t in truth_points.keys() {
+        let mut best: Option<f32> = None;
+        for &p in predicted_points.keys().filter(|&&p| overlaps(t, p)) {
+            if taken.contains(&p) {
+                continue;
+            }
+            let c = confidence[p as usize];
+            match best {
+                None => {
+                    taken.insert(p);
+                    best = Some(c);
+                }
+                Some(b) => {
+                    outcomes.push((b.min(c), false));
+                    best = Some(b.max(c));
+                }
+            }
+        }
+        match best {
+            Some(b) => outcomes.push((b, true)),
+            None => missed += 1,
+        }
+    }
+    for (&p, &points) in &predicted_points {
+        if truth_points.keys().any(|&t| overlaps(t, p)) {
+            continue;
+        }
+        let counted: usize = truth_points.keys().filter_map(|&t| common.get(&(t, p))).sum();
+        if (points - counted) as f64 / points as f64 <= threshold {
+            outcomes.push((confidence[p as usize], false));
+        }
+    }
+    // From the least confident cut to the most.
+    outcomes.sort_by(|a, b| a.0.total_cmp(&b.0));
+    let all_hits = outcomes.iter().filter(|o| o.1).count();
+    let (mut curve, mut dropped_hits, mut at) = (Vec::new(), 0usize, 0usize);
+    for group in outcomes.chunk_by(|a, b| a.0 == b.0) {
+        let (hits, shown) = (all_hits - dropped_hits, outcomes.len() - at);
+        curve.push((hits as f64 / shown as f64, hits as f64 / (all_hits + missed) as f64));
+        dropped_hits += group.iter().filter(|o| o.1).count();
+        at += group.len();
+    }
+    curve.push((1.0, 0.0));
+    let recall = |i: usize| curve.get(i).map_or(0.0, |c: &(f64, f64)| c.1);
+    Some((0..curve.len()).map(|i| curve[i].0 * (recall(i.saturating_sub(1)) - recall(i + 1)) / 2.0).sum())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn ap(truth: &[i32], predicted: &[i32], confidence: &[f32]) -> f64 {
+        average_precision(truth, predicted, confidence, 1, 0.5).unwrap()
+    }
+
+    #[test]
+    fn average_precision_by_hand() {
+        let truth = [0, 0, 0, 0, 1, 1, 1, 1];
+        assert_eq!(ap(&truth, &[0, 0, 0, 0, 1, 1, 1, 1], &[0.9, 0.8]), 1.0);
+        // One of two found: cuts 0.8 (p 1, r 1/2), then (1, 0): 1 * (1/2 - 0) / 2 + 1 * (1/2 - 0) / 2.
+        assert_eq!(ap(&truth, &[0, 0, 0, 0, -1, -1, -1, -1], &[0.8]), 0.5);
+        // A false alarm below the hit halves precision at the lower cut only.
+        let low = ap(&truth, &[0, 0, 0, 0, 1, -1, -1, -1], &[0.8, 0.1]);
+        let high = ap(&truth, &[0, 0, 0, 0, 1, -1, -1, -1], &[0.1, 0.8]);
+        assert!(high < low && low <= 0.5, "{high} {low}");
+        assert_eq!(ap(&truth, &[-1; 8], &[]), 0.0);
+    }
+
+    #[test]
+    fn points_without_an_object_excuse_a_prediction() {
+        let truth = [vec![0; 4], vec![-1; 4]].concat();
+        let on_void = [vec![0; 4], vec![1; 4]].concat();
+        assert_eq!(ap(&truth, &on_void, &[0.5, 0.9]), 1.0, "a prediction on nothing labelled is no false alarm");
+        assert_eq!(average_precision(&[-1; 4], &[0; 4], &[1.0], 1, 0.5), None);
+    }
+
+    #[test]
+    fn small_instances_take_no_part() {
+        let truth = [vec![0; 10], vec![1; 3]].concat();
+        let predicted = [vec![0; 10], vec![-1; 3]].concat();
+        assert_eq!(average_precision(&truth, &predicted, &[1.0], 5, 0.5), Some(1.0));
+        let s = score(&truth, &predicted, &[1.0], 5);
+        assert_eq!((s.miou, s.acc25, s.truth, s.predicted), (0.5, 0.5, 2, 1), "but they count in mIoU");
+        assert_eq!(score(&truth, &[-1; 13], &[], 5).ap25, Some(0.0), "all noise");
+    }
+
+    #[test]
+    fn segs_and_aggregation_make_instances() {
+        let dir = tempfile::tempdir().unwrap();
+        let (s, a) = (dir.path().join("s.segs.json"), dir.path().join("a.aggregation.json"));
+        std::fs::write(&s, r#"{"params":{},"sceneId":"x","segIndices":[5,5,7,9,11]}"#).unwrap();
+        let groups = r#"{"segGroups":[{"id":0,"objectId":0,"segments":[5],"label":"wall"},
+                         {"id":1,"objectId":1,"segments":[7,9],"label":"chair"}]}"#;
+        std::fs::write(&a, groups).unwrap();
+        assert_eq!(read_truth(&s, &a, 5, &[]).unwrap(), [0, 0, 1, 1, -1]);
+        assert_eq!(read_truth(&s, &a, 5, &["wall".into()]).unwrap(), [-1, -1, 1, 1, -1]);
+        let e = read_truth(&s, &a, 6, &[]).unwrap_err().to_string();
+        assert!(e.contains("segIndices: not a segment per vertex; found 5, expected 6"), "{e}");
+        std::fs::write(&a, groups.replace("[7,9]", "[5,9]")).unwrap();
+        let e = read_truth(&s, &a, 5, &[]).unwrap_err().to_string();
+        assert!(e.contains("segment 5 of objects 0 and 1"), "{e}");
+        std::fs::write(&a, "{}").unwrap();
+        assert!(read_truth(&s, &a, 5, &[]).unwrap_err().to_string().contains("not an aggregation file"));
+    }
+}
