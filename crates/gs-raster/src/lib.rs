@@ -28,6 +28,7 @@ mod single;
 mod tiles;
 mod types;
 mod weights;
+mod workspace;
 
 pub use backward::backward;
 pub use features::{FeatureGradients, features_backward, render_features};
@@ -36,3 +37,4 @@ pub use measure::{Measured, measure};
 pub use tiles::TILE;
 pub use types::{Dropped, Gradients, PixelGradients, RasterOptions, Rendered};
 pub use weights::{TileWeights, tile_weights};
+pub use workspace::Workspace;

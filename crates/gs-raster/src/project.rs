@@ -63,6 +63,7 @@ pub(crate) enum Unseen {
 }
 
 /// A camera ready for many Gaussians.
+#[derive(Default)]
 pub(crate) struct Lens {
     rotation: Mat3,
     position: DVec3,

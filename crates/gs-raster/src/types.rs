@@ -105,4 +105,6 @@ pub struct Gradients {
     pub mean2d: Vec<[f32; 2]>,
     /// Sum over pixels of the absolute values of that gradient (AbsGS).
     pub mean2d_abs: Vec<[f32; 2]>,
+    /// How many of the Gaussians drawn have a gradient that single precision does not hold: theirs are zero here.
+    pub overflowed: usize,
 }
