@@ -2,7 +2,8 @@
 
 use crate::forward::Forward;
 use crate::kernels::{TileGradients, backward_tile};
-use crate::single::project::{Parameters, SplatGradient, project_backward};
+use crate::lanes::{Backward, LANES};
+use crate::project::SplatGradient;
 use crate::tiles::{PIXELS, TILE, Tiles};
 use crate::types::{Gradients, PixelGradients, RasterOptions};
 use gs_scene::{Camera, Gaussians};
@@ -71,6 +72,7 @@ pub(crate) fn gather(
     out: &mut Gradients,
 ) {
     let (all, stride) = (g.len(), g.sh_stride());
+    let degree = g.sh_degree.min(options.sh_degree);
     out.means.resize(all, [0.0; 3]);
     out.log_scales.resize(all, [0.0; 3]);
     out.rotations.resize(all, [0.0; 4]);
@@ -93,34 +95,40 @@ pub(crate) fn gather(
             mean2d_abs.fill([0.0; 2]);
             let begin = chunk * CHUNK;
             let from = tiles.index.partition_point(|&i| (i as usize) < begin);
+            let to = from + tiles.index[from..].partition_point(|&i| (i as usize) < begin + means.len());
             let (mut done, mut overflowed) = (0, 0);
-            for (i, &original) in tiles.index.iter().enumerate().skip(from) {
-                let original = original as usize;
-                if original >= begin + means.len() {
-                    break;
+            let mut lanes = Box::<Backward>::default();
+            let mut sums = [SplatGradient::default(); LANES];
+            for first in (from..to).step_by(LANES) {
+                let own = first..to.min(first + LANES);
+                for (l, i) in own.clone().enumerate() {
+                    let mut sum = SplatGradient::default();
+                    for &pair in &tiles.places[tiles.first[i] as usize..tiles.first[i + 1] as usize] {
+                        sum.add(&pairs[pair as usize]);
+                    }
+                    lanes.set(l, g, tiles.index[i] as usize, degree, &tiles.splats[i], &sum);
+                    sums[l] = sum;
                 }
-                let k = original - begin;
-                let mut sum = SplatGradient::default();
-                for &pair in &tiles.places[tiles.first[i] as usize..tiles.first[i + 1] as usize] {
-                    sum.add(&pairs[pair as usize]);
+                lanes.run(&tiles.lens, options, degree);
+                for (l, i) in own.enumerate() {
+                    let k = tiles.index[i] as usize - begin;
+                    sh[done * stride..k * stride].fill(0.0);
+                    done = k + 1;
+                    let d_sh = &mut sh[k * stride..(k + 1) * stride];
+                    let of_centers = sums[l].mean.iter().chain(&sums[l].mean_abs).all(|v| v.is_finite());
+                    let Some(p) = lanes.get(l, degree, d_sh).filter(|_| of_centers) else {
+                        // Not held by single precision: no gradient rather than NaN in an optimiser's state.
+                        d_sh.fill(0.0);
+                        overflowed += 1;
+                        continue;
+                    };
+                    means[k] = p.mean;
+                    log_scales[k] = p.log_scale;
+                    rotations[k] = p.rotation;
+                    opacity_logits[k] = p.opacity_logit;
+                    mean2d[k] = sums[l].mean;
+                    mean2d_abs[k] = sums[l].mean_abs;
                 }
-                // Of Gaussians that are not drawn, too; this leaves the rows' memory in the cache for what follows.
-                sh[done * stride..(k + 1) * stride].fill(0.0);
-                done = k + 1;
-                let d_sh = &mut sh[k * stride..(k + 1) * stride];
-                let parameters = Parameters::of(g, original);
-                let Some(p) = project_backward(&parameters, &tiles.lens, options, &tiles.splats[i], &sum, d_sh) else {
-                    // Not held by single precision: no gradient rather than NaN in an optimiser's state.
-                    d_sh.fill(0.0);
-                    overflowed += 1;
-                    continue;
-                };
-                means[k] = p.mean;
-                log_scales[k] = p.log_scale;
-                rotations[k] = p.rotation;
-                opacity_logits[k] = p.opacity_logit;
-                mean2d[k] = sum.mean;
-                mean2d_abs[k] = sum.mean_abs;
             }
             sh[done * stride..].fill(0.0);
             overflowed

@@ -2,7 +2,7 @@
 
 use crate::backward::gather;
 use crate::kernels::ALPHA_MAX;
-use crate::single::project::{Splat, SplatGradient};
+use crate::project::{Splat, SplatGradient};
 use crate::tiles::{PIXELS, TILE};
 use crate::types::{Gradients, RasterOptions};
 use crate::weights::{TileWeights, tile_weights, tiles_without_color, with_weights};

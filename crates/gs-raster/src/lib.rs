@@ -9,22 +9,18 @@
 //! The same inputs give the same bits for any number of threads: tiles are independent, and a Gaussian's gradients are
 //! summed over its tiles in tile order.
 
-// `single` and `double` hold the same two files, compiled in two precisions.
-#![cfg_attr(test, allow(clippy::duplicate_mod))]
-
 mod backward;
 #[cfg(test)]
 mod checks;
-#[cfg(test)]
-#[allow(dead_code, reason = "the tests need part of it")]
-mod double;
 mod features;
 mod forward;
 mod kernels;
+mod lanes;
 mod measure;
+mod project;
 #[cfg(test)]
 mod reference;
-mod single;
+mod sh;
 mod tiles;
 mod types;
 mod weights;

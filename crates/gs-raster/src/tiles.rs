@@ -1,6 +1,7 @@
 //! Which Gaussians touch which tile, front to back.
 
-use crate::single::project::{Lens, Parameters, Splat, project};
+use crate::lanes::project_range;
+use crate::project::{Lens, Splat};
 use crate::types::{Dropped, RasterOptions};
 use gs_scene::{Camera, Gaussians};
 use rayon::prelude::*;
@@ -55,18 +56,15 @@ impl Chunk {
         touched.clear();
         counts.clear();
         *dropped = Dropped::default();
-        for i in chunk * CHUNK..((chunk + 1) * CHUNK).min(g.len()) {
-            match project(&Parameters::of(g, i), lens, options) {
-                Ok(s) => {
-                    let before = touched.len();
-                    push_tiles(&s, grid, touched);
-                    counts.push((touched.len() - before) as u32);
-                    index.push(i as u32);
-                    splats.push(s);
-                }
-                Err(reason) => dropped.count(reason),
-            }
-        }
+        let range = chunk * CHUNK..((chunk + 1) * CHUNK).min(g.len());
+        let seen = |i: usize, s: Splat| {
+            let before = touched.len();
+            push_tiles(&s, grid, touched);
+            counts.push((touched.len() - before) as u32);
+            index.push(i as u32);
+            splats.push(s);
+        };
+        project_range(g, range, lens, options, seen, |reason| dropped.count(reason));
     }
 }
 

@@ -1,6 +1,6 @@
 //! What goes in and what comes out.
 
-use crate::single::project::Unseen;
+use crate::project::Unseen;
 
 /// How to rasterise.
 #[derive(Debug, Clone, PartialEq)]

@@ -2,7 +2,7 @@
 
 use crate::backward::{gather, pair_gradients};
 use crate::forward::Forward;
-use crate::single::project::SplatGradient;
+use crate::project::SplatGradient;
 use crate::types::{Gradients, PixelGradients, RasterOptions};
 use gs_scene::{Camera, Gaussians};
 
