@@ -1,7 +1,7 @@
 //! The renderer once more, as plainly as it can be said: f64, pixel by pixel, all Gaussians, no tiles. The tests' oracle.
 //!
 //! It shares no code with the renderer except the types of its inputs; [`backward`] alone goes through the renderer's chain
-//! rule, compiled in f64, which the tests hold against central differences of [`render`].
+//! rule, which is in f64, and which the tests hold against central differences of [`render`].
 
 use crate::RasterOptions;
 use crate::project::{Lens, Parameters, SplatGradient, project, project_backward};
