@@ -1,5 +1,5 @@
-//! Projection and harmonics of many Gaussians side by side, as loops that the compiler turns into vectors of the processor at
-//! hand. They use what IEEE rounds one way only, so that all processors give the same bits.
+//! Projection and harmonics of many Gaussians side by side, as loops that the compiler may turn into vectors of the processor
+//! at hand. They use what IEEE rounds one way only, so that all processors give the same bits.
 
 use crate::project::{
     ParameterGradient, Parameters, Projected, Splat, SplatGradient, Unseen, project, project_backward,
