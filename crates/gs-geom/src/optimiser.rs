@@ -272,6 +272,7 @@ mod tests {
             sh: (0..n * stride).map(|i| value(i / stride)).collect(),
             mean2d: vec![[0.0; 2]; n],
             mean2d_abs: vec![[0.0; 2]; n],
+            overflowed: 0,
         }
     }
 

@@ -9,7 +9,7 @@ use crate::optimiser::{Adam, drop_bad_gradients};
 use crate::photographs::Photographs;
 use crate::schedule::{LearningRates, Purpose, Schedule, ViewOrder, generator};
 use gs_io::Result;
-use gs_raster::{PixelGradients, RasterOptions, backward, forward};
+use gs_raster::{PixelGradients, RasterOptions, Workspace};
 use gs_scene::Gaussians;
 use rand::Rng;
 use serde::Serialize;
@@ -83,6 +83,7 @@ pub struct Trainer<'a> {
     heldout: Photographs<'a>,
     order: ViewOrder,
     state: State,
+    workspace: Workspace,
     gradient: Vec<f32>,
     derivatives: Derivatives,
     /// Which Gaussians the last view drew.
@@ -124,6 +125,7 @@ impl<'a> Trainer<'a> {
             heldout,
             order,
             state,
+            workspace: Workspace::default(),
             gradient,
             derivatives,
             drawn,
@@ -195,13 +197,14 @@ impl<'a> Trainer<'a> {
         let State { gaussians, adam, pull, progress } = &mut self.state;
         let degree = schedule.sh_degree(iteration, gaussians.sh_degree);
         let raster = RasterOptions { background, sh_degree: degree, ..RasterOptions::default() };
-        let rendered = forward(gaussians, camera, &raster);
+        let rendered = &self.workspace.forward(gaussians, camera, &raster).rendered;
         lap(&mut self.timings.forward);
-        let pair = Pair { render: &rendered.rendered.rgb, target: &target, width: camera.width as usize };
+        let pair = Pair { render: &rendered.rgb, target: &target, width: camera.width as usize };
         let loss = l1_dssim(pair, self.options.dssim_weight, &mut self.gradient, &mut self.derivatives);
         lap(&mut self.timings.loss);
         let pixels = PixelGradients { rgb: &self.gradient, alpha: None, depth: None };
-        let mut gradients = backward(gaussians, camera, &raster, &rendered, pixels);
+        self.workspace.backward(gaussians, camera, &raster, pixels);
+        let Workspace { forward: rendered, gradients, .. } = &mut self.workspace;
         lap(&mut self.timings.backward);
         let mut rates = schedule.rates(&self.options.rates, iteration, self.extent);
         if self.options.fixed_points {
@@ -215,10 +218,10 @@ impl<'a> Trainer<'a> {
         });
         let sampling = self.options.densify.strategy == Strategy::Mcmc && !self.options.fixed_points;
         if sampling {
-            mcmc::regularise(gaussians, &mut gradients, &self.options.mcmc, drawn);
+            mcmc::regularise(gaussians, gradients, &self.options.mcmc, drawn);
         }
-        progress.dropped += drop_bad_gradients(&mut gradients);
-        adam.step(gaussians, &gradients, &rates, degree, drawn);
+        progress.dropped += gradients.overflowed as u64 + drop_bad_gradients(gradients);
+        adam.step(gaussians, gradients, &rates, degree, drawn);
         if sampling {
             mcmc::explore(gaussians, &self.options.mcmc, rates.means, self.options.seed, iteration);
         }

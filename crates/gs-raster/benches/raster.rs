@@ -2,7 +2,7 @@
 //! arguments before it name PLYs to measure besides the synthetic scenes.
 
 use glam::{DMat3, DVec3};
-use gs_raster::{RasterOptions, measure, tile_weights};
+use gs_raster::{RasterOptions, Workspace, measure, tile_weights};
 use gs_scene::{Camera, Gaussians};
 use rand_chacha::ChaCha8Rng;
 use rand_chacha::rand_core::{RngCore, SeedableRng};
@@ -77,7 +77,9 @@ fn bench(name: &str, g: &Gaussians, camera: &Camera) -> Value {
     let d: Vec<f32> = (0..3 * pixels).map(|i| ((i * 7919) % 1000) as f32 * 2e-3 - 1.0).collect();
     let counts = tile_weights(g, camera, &options, true, |t| t.weights.iter().filter(|w| **w > 0.0).count());
     let contributing: usize = counts.iter().sum();
-    let runs: Vec<_> = (0..=REPETITIONS).map(|_| measure(g, camera, &options, &d, cpu_seconds)).skip(1).collect();
+    let mut workspace = Workspace::default();
+    let runs: Vec<_> =
+        (0..=REPETITIONS).map(|_| measure(&mut workspace, g, camera, &options, &d, cpu_seconds)).skip(1).collect();
     let evaluated = runs[0].pairs_evaluated;
     let pairs = evaluated as f64;
     let (forward, forward_spread) = summary(runs.iter().map(|r| r.forward_s * 1e9 / pairs).collect());
@@ -144,10 +146,12 @@ fn main() {
     let pool = rayon::ThreadPoolBuilder::new().num_threads(1).build().expect("a thread");
     let scenes = pool.install(|| {
         let camera = front_camera(640, 480);
+        let small = front_camera(129, 235);
         let mut scenes = vec![
             bench("trained-like", &synthetic(60_000, 3.0, &camera), &camera),
             bench("large footprints", &synthetic(6_000, 15.0, &camera), &camera),
             bench("small footprints", &synthetic(120_000, 0.7, &camera), &camera),
+            bench("small image", &synthetic(16_000, 2.0, &small), &small),
         ];
         for path in &paths {
             match gs_scene::ply::read_gaussians(path) {

@@ -2,7 +2,8 @@
 
 use crate::forward::Forward;
 use crate::kernels::{TileGradients, backward_tile};
-use crate::single::project::{Parameters, SplatGradient, project_backward};
+use crate::lanes::{Backward, LANES};
+use crate::project::SplatGradient;
 use crate::tiles::{PIXELS, TILE, Tiles};
 use crate::types::{Gradients, PixelGradients, RasterOptions};
 use gs_scene::{Camera, Gaussians};
@@ -22,18 +23,27 @@ pub fn backward(
     forward: &Forward,
     d: PixelGradients<'_>,
 ) -> Gradients {
-    let pixels = camera.width as usize * camera.height as usize;
-    assert_eq!(d.rgb.len(), 3 * pixels);
-    assert!(d.alpha.is_none_or(|a| a.len() == pixels) && d.depth.is_none_or(|z| z.len() == pixels));
-    gather(g, options, &forward.tiles, &pair_gradients(forward, options, d))
+    let (mut pairs, mut gradients) = (Vec::new(), Gradients::default());
+    pair_gradients(forward, camera, options, d, &mut pairs);
+    gather(g, options, &forward.tiles, &pairs, &mut gradients);
+    gradients
 }
 
 /// d loss / d splat for every splat of every tile, in the order of the tiles' entries.
-pub(crate) fn pair_gradients(forward: &Forward, options: &RasterOptions, d: PixelGradients<'_>) -> Vec<SplatGradient> {
+pub(crate) fn pair_gradients(
+    forward: &Forward,
+    camera: &Camera,
+    options: &RasterOptions,
+    d: PixelGradients<'_>,
+    pairs: &mut Vec<SplatGradient>,
+) {
+    let pixels = camera.width as usize * camera.height as usize;
+    assert_eq!(d.rgb.len(), 3 * pixels);
+    assert!(d.alpha.is_none_or(|a| a.len() == pixels) && d.depth.is_none_or(|z| z.len() == pixels));
     let tiles = &forward.tiles;
     let w = tiles.lens.width as usize;
     // One gradient per tile and Gaussian, each tile writing its own slice.
-    let mut pairs = vec![SplatGradient::default(); tiles.entries.len()];
+    pairs.resize(tiles.entries.len(), SplatGradient::default());
     let mut slices = Vec::with_capacity(tiles.count());
     let mut rest = &mut pairs[..];
     for t in 0..tiles.count() {
@@ -45,79 +55,85 @@ pub(crate) fn pair_gradients(forward: &Forward, options: &RasterOptions, d: Pixe
         if !out.is_empty() {
             let rectangle = tiles.rectangle(t);
             let mut tile = pixel_gradients(forward, options, d, w, rectangle);
+            // The kernel does not come to those behind where all pixels have stopped.
+            out.fill(SplatGradient::default());
             backward_tile(&tiles.splats, tiles.list(t), rectangle, &mut tile, out);
         }
     });
-
-    pairs
 }
 
 /// Sums the gradients of each splat over its tiles, in tile order, and takes them to the Gaussians' parameters. `pairs` is in
-/// the order of the tiles' entries.
-pub(crate) fn gather(g: &Gaussians, options: &RasterOptions, tiles: &Tiles, pairs: &[SplatGradient]) -> Gradients {
-    let n = tiles.splats.len();
-    let mut start = vec![0usize; n + 1];
-    for &e in &tiles.entries {
-        start[e as usize + 1] += 1;
-    }
-    for i in 0..n {
-        start[i + 1] += start[i];
-    }
-    let mut next = start.clone();
-    let mut of_splat = vec![0u32; tiles.entries.len()];
-    for (pair, &e) in tiles.entries.iter().enumerate() {
-        of_splat[next[e as usize]] = pair as u32;
-        next[e as usize] += 1;
-    }
-
-    let mut place = vec![u32::MAX; g.len()];
-    for (i, &original) in tiles.index.iter().enumerate() {
-        place[original as usize] = i as u32;
-    }
-
-    let all = g.len();
-    let stride = g.sh_stride();
-    let mut out = Gradients {
-        means: vec![[0.0; 3]; all],
-        log_scales: vec![[0.0; 3]; all],
-        rotations: vec![[0.0; 4]; all],
-        opacity_logits: vec![0.0; all],
-        sh: vec![0.0; all * stride],
-        mean2d: vec![[0.0; 2]; all],
-        mean2d_abs: vec![[0.0; 2]; all],
-    };
+/// the order of the tiles' entries; every value of `out` is written.
+pub(crate) fn gather(
+    g: &Gaussians,
+    options: &RasterOptions,
+    tiles: &Tiles,
+    pairs: &[SplatGradient],
+    out: &mut Gradients,
+) {
+    let (all, stride) = (g.len(), g.sh_stride());
+    let degree = g.sh_degree.min(options.sh_degree);
+    out.means.resize(all, [0.0; 3]);
+    out.log_scales.resize(all, [0.0; 3]);
+    out.rotations.resize(all, [0.0; 4]);
+    out.opacity_logits.resize(all, 0.0);
+    out.sh.resize(all * stride, 0.0);
+    out.mean2d.resize(all, [0.0; 2]);
+    out.mean2d_abs.resize(all, [0.0; 2]);
     let geometry = out.means.par_chunks_mut(CHUNK).zip(out.log_scales.par_chunks_mut(CHUNK));
     let geometry = geometry.zip(out.rotations.par_chunks_mut(CHUNK));
     let rest = out.opacity_logits.par_chunks_mut(CHUNK).zip(out.sh.par_chunks_mut(CHUNK * stride));
     let centers = out.mean2d.par_chunks_mut(CHUNK).zip(out.mean2d_abs.par_chunks_mut(CHUNK));
-    geometry.zip(rest).zip(centers).enumerate().for_each(|(chunk, (of_parameters, (mean2d, mean2d_abs)))| {
-        let (((means, log_scales), rotations), (opacity_logits, sh)) = of_parameters;
-        for k in 0..means.len() {
-            let original = chunk * CHUNK + k;
-            let i = place[original] as usize;
-            if i == u32::MAX as usize {
-                continue;
+    let overflowed =
+        geometry.zip(rest).zip(centers).enumerate().map(|(chunk, (of_parameters, (mean2d, mean2d_abs)))| {
+            let (((means, log_scales), rotations), (opacity_logits, sh)) = of_parameters;
+            means.fill([0.0; 3]);
+            log_scales.fill([0.0; 3]);
+            rotations.fill([0.0; 4]);
+            opacity_logits.fill(0.0);
+            mean2d.fill([0.0; 2]);
+            mean2d_abs.fill([0.0; 2]);
+            let begin = chunk * CHUNK;
+            let from = tiles.index.partition_point(|&i| (i as usize) < begin);
+            let to = from + tiles.index[from..].partition_point(|&i| (i as usize) < begin + means.len());
+            let (mut done, mut overflowed) = (0, 0);
+            let mut lanes = Box::<Backward>::default();
+            let mut sums = [SplatGradient::default(); LANES];
+            for first in (from..to).step_by(LANES) {
+                let own = first..to.min(first + LANES);
+                for (l, i) in own.clone().enumerate() {
+                    let mut sum = SplatGradient::default();
+                    for &pair in &tiles.places[tiles.first[i] as usize..tiles.first[i + 1] as usize] {
+                        sum.add(&pairs[pair as usize]);
+                    }
+                    lanes.set(l, g, tiles.index[i] as usize, degree, &tiles.splats[i], &sum);
+                    sums[l] = sum;
+                }
+                lanes.run(&tiles.lens, options, degree);
+                for (l, i) in own.enumerate() {
+                    let k = tiles.index[i] as usize - begin;
+                    sh[done * stride..k * stride].fill(0.0);
+                    done = k + 1;
+                    let d_sh = &mut sh[k * stride..(k + 1) * stride];
+                    let of_centers = sums[l].mean.iter().chain(&sums[l].mean_abs).all(|v| v.is_finite());
+                    let Some(p) = lanes.get(l, degree, d_sh).filter(|_| of_centers) else {
+                        // Not held by single precision: no gradient rather than NaN in an optimiser's state.
+                        d_sh.fill(0.0);
+                        overflowed += 1;
+                        continue;
+                    };
+                    means[k] = p.mean;
+                    log_scales[k] = p.log_scale;
+                    rotations[k] = p.rotation;
+                    opacity_logits[k] = p.opacity_logit;
+                    mean2d[k] = sums[l].mean;
+                    mean2d_abs[k] = sums[l].mean_abs;
+                }
             }
-            let mut sum = SplatGradient::default();
-            for &pair in &of_splat[start[i]..start[i + 1]] {
-                sum.add(&pairs[pair as usize]);
-            }
-            let d_sh = &mut sh[k * stride..(k + 1) * stride];
-            let parameters = Parameters::of(g, original);
-            let Some(p) = project_backward(&parameters, &tiles.lens, options, &tiles.splats[i], &sum, d_sh) else {
-                // Not held by single precision: no gradient rather than NaN in an optimiser's state.
-                d_sh.fill(0.0);
-                continue;
-            };
-            means[k] = p.mean;
-            log_scales[k] = p.log_scale;
-            rotations[k] = p.rotation;
-            opacity_logits[k] = p.opacity_logit;
-            mean2d[k] = sum.mean;
-            mean2d_abs[k] = sum.mean_abs;
-        }
-    });
-    out
+            sh[done * stride..].fill(0.0);
+            overflowed
+        });
+    out.overflowed = overflowed.sum();
 }
 
 fn pixel_gradients(

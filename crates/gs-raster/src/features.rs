@@ -2,7 +2,7 @@
 
 use crate::backward::gather;
 use crate::kernels::ALPHA_MAX;
-use crate::single::project::{Splat, SplatGradient};
+use crate::project::{Splat, SplatGradient};
 use crate::tiles::{PIXELS, TILE};
 use crate::types::{Gradients, RasterOptions};
 use crate::weights::{TileWeights, tile_weights, tiles_without_color, with_weights};
@@ -94,7 +94,9 @@ pub fn features_backward(
         }
         pairs.extend(of_splats);
     }
-    FeatureGradients { features: d_features, parameters: gather(g, options, &tiles, &pairs) }
+    let mut parameters = Gradients::default();
+    gather(g, options, &tiles, &pairs, &mut parameters);
+    FeatureGradients { features: d_features, parameters }
 }
 
 /// Gradients of the splats of a tile and of their features, in the order of its list.

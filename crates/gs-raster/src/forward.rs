@@ -7,6 +7,7 @@ use gs_scene::{Camera, Gaussians};
 use rayon::prelude::*;
 
 /// A rendered view with what the backward pass needs.
+#[derive(Default)]
 pub struct Forward {
     /// The picture.
     pub rendered: Rendered,
@@ -14,7 +15,7 @@ pub struct Forward {
 }
 
 impl Forward {
-    /// Original indices of the Gaussians that were drawn, front to back.
+    /// Original indices of the Gaussians that were drawn, ascending.
     pub fn visible(&self) -> &[u32] {
         &self.tiles.index
     }
@@ -38,21 +39,27 @@ impl Forward {
 
 /// Renders a view and keeps what [`crate::backward`] needs.
 pub fn forward(g: &Gaussians, camera: &Camera, options: &RasterOptions) -> Forward {
-    let tiles = Tiles::new(g, camera, options);
-    let (rendered, _) = composite(&tiles, options);
-    Forward { rendered, tiles }
+    let mut forward = Forward::default();
+    forward.again(g, camera, options);
+    forward
 }
 
-/// Composites all tiles. Also returns how many pixel-Gaussian pairs the kernels evaluated.
-pub(crate) fn composite(tiles: &Tiles, options: &RasterOptions) -> (Rendered, usize) {
+impl Forward {
+    /// Renders another view, in the memory of the last.
+    pub(crate) fn again(&mut self, g: &Gaussians, camera: &Camera, options: &RasterOptions) {
+        self.tiles.build(g, camera, options);
+        composite(&self.tiles, options, &mut self.rendered);
+    }
+}
+
+/// Composites all tiles and returns how many pixel-Gaussian pairs the kernels evaluated.
+pub(crate) fn composite(tiles: &Tiles, options: &RasterOptions, rendered: &mut Rendered) -> usize {
     let (w, h) = (tiles.lens.width as usize, tiles.lens.height as usize);
-    let mut rendered = Rendered {
-        width: tiles.lens.width,
-        height: tiles.lens.height,
-        rgb: vec![0.0; w * h * 3],
-        alpha: vec![0.0; w * h],
-        depth: vec![0.0; w * h],
-    };
+    (rendered.width, rendered.height) = (tiles.lens.width, tiles.lens.height);
+    // Every pixel is written below.
+    rendered.rgb.resize(w * h * 3, 0.0);
+    rendered.alpha.resize(w * h, 0.0);
+    rendered.depth.resize(w * h, 0.0);
     // A band of tiles owns whole image rows, so bands can be written side by side.
     let bands = rendered
         .rgb
@@ -80,8 +87,7 @@ pub(crate) fn composite(tiles: &Tiles, options: &RasterOptions) -> (Rendered, us
         }
         evaluated
     });
-    let evaluated = evaluated.sum();
-    (rendered, evaluated)
+    evaluated.sum()
 }
 
 /// Renders a view: colour, accumulated alpha, alpha-weighted depth.

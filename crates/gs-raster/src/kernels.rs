@@ -6,7 +6,7 @@
 //!
 //! A transmittance is kept with its sign set once its pixel has stopped: such a pixel fails the test for going on by itself.
 
-use crate::single::project::{Splat, SplatGradient};
+use crate::project::{Splat, SplatGradient};
 use crate::tiles::{PIXELS, TILE};
 use pulp::{Arch, Simd, WithSimd};
 

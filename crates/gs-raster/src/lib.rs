@@ -9,25 +9,22 @@
 //! The same inputs give the same bits for any number of threads: tiles are independent, and a Gaussian's gradients are
 //! summed over its tiles in tile order.
 
-// `single` and `double` hold the same two files, compiled in two precisions.
-#![cfg_attr(test, allow(clippy::duplicate_mod))]
-
 mod backward;
 #[cfg(test)]
 mod checks;
-#[cfg(test)]
-#[allow(dead_code, reason = "the tests need part of it")]
-mod double;
 mod features;
 mod forward;
 mod kernels;
+mod lanes;
 mod measure;
+mod project;
 #[cfg(test)]
 mod reference;
-mod single;
+mod sh;
 mod tiles;
 mod types;
 mod weights;
+mod workspace;
 
 pub use backward::backward;
 pub use features::{FeatureGradients, features_backward, render_features};
@@ -36,3 +33,4 @@ pub use measure::{Measured, measure};
 pub use tiles::TILE;
 pub use types::{Dropped, Gradients, PixelGradients, RasterOptions, Rendered};
 pub use weights::{TileWeights, tile_weights};
+pub use workspace::Workspace;

@@ -1,8 +1,8 @@
 //! Where the time of a pass goes.
 
+use crate::Workspace;
 use crate::backward::{gather, pair_gradients};
-use crate::forward::{Forward, composite};
-use crate::tiles::Tiles;
+use crate::forward::composite;
 use crate::types::{PixelGradients, RasterOptions};
 use gs_scene::{Camera, Gaussians};
 
@@ -21,10 +21,11 @@ pub struct Measured {
     pub pairs_evaluated: usize,
 }
 
-/// Runs [`crate::forward`] and [`crate::backward`], on the current rayon pool, with a clock between their stages. `d_rgb` is
+/// Runs [`Workspace::forward`] and [`Workspace::backward`], on the current rayon pool, with a clock between their stages. `d_rgb` is
 /// d loss / d colour, `[height][width][rgb]`; `clock` returns seconds: on a pool of one thread its CPU time serves best, which
 /// other loads on the machine do not stretch.
 pub fn measure(
+    workspace: &mut Workspace,
     g: &Gaussians,
     camera: &Camera,
     options: &RasterOptions,
@@ -38,13 +39,13 @@ pub fn measure(
         last = now;
         seconds
     };
-    let tiles = Tiles::new(g, camera, options);
+    let Workspace { forward, gradients, pairs } = workspace;
+    forward.tiles.build(g, camera, options);
     let project_s = lap();
-    let (rendered, pairs_evaluated) = composite(&tiles, options);
+    let pairs_evaluated = composite(&forward.tiles, options, &mut forward.rendered);
     let forward_s = lap();
-    let forward = Forward { rendered, tiles };
-    let pairs = pair_gradients(&forward, options, PixelGradients { rgb: d_rgb, alpha: None, depth: None });
+    pair_gradients(forward, camera, options, PixelGradients { rgb: d_rgb, alpha: None, depth: None }, pairs);
     let backward_s = lap();
-    std::hint::black_box(gather(g, options, &forward.tiles, &pairs));
+    gather(g, options, &forward.tiles, pairs, gradients);
     Measured { project_s, forward_s, backward_s, gather_s: lap(), pairs_evaluated }
 }

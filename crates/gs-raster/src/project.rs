@@ -3,52 +3,48 @@
 //! Follows gsplat's conventions: 0.3 is added to the diagonal of the 2D covariance; in the Jacobian x/z and y/z are clamped to
 //! the image's edges plus 0.15 of its size.
 //!
-//! Compiled in single precision for the renderer and in double for its tests; [`Real`] is whichever it is.
+//! All in double precision, between parameters and results in single: far-away origins cost no digits, needles do not cancel
+//! and sheets do not overflow. Nothing here branches or calls a library, so that loops over many Gaussians become vectors.
 
-use super::real::{Mat3, Quat, Real, Vec2, Vec3, narrow, narrow_matrix, widen};
-use super::sh;
 use crate::types::RasterOptions;
-use glam::DVec3;
 use gs_scene::Camera;
 
 /// Added to the diagonal of the projected covariance, in square pixels.
-const LOW_PASS: f32 = 0.3;
+const LOW_PASS: f64 = 0.3f32 as f64;
 /// Contributions below this are skipped.
-pub(crate) const ALPHA_MIN: Real = 1.0 / 255.0;
+const ALPHA_MIN: f64 = 1.0 / 255.0;
 /// Centres further out than this, in pixels, are not drawn: the square of such a distance nears the end of single precision.
-const MEAN_MAX: Real = 1e15;
+const MEAN_MAX: f64 = 1e15;
 
 /// A Gaussian as the tiles see it.
 #[derive(Debug, Clone, Copy, Default)]
 pub(crate) struct Splat {
-    pub mean: [Real; 2],
+    pub mean: [f32; 2],
     /// Inverse of the 2D covariance: xx, xy, yy.
-    pub conic: [Real; 3],
+    pub conic: [f32; 3],
     /// Determinant of the conic.
-    pub conic_det: Real,
+    pub conic_det: f32,
     /// Half extents of the region where alpha >= 1/255, in pixels.
-    pub extent: [Real; 2],
+    pub extent: [f32; 2],
     /// sigma at which alpha falls below 1/255: ln(255 opacity).
-    pub sigma_max: Real,
-    pub opacity: Real,
-    pub log2_opacity: Real,
-    pub depth: Real,
-    pub color: [Real; 3],
+    pub sigma_max: f32,
+    /// The antialiasing's compensation included.
+    pub opacity: f32,
+    pub log2_opacity: f32,
+    pub depth: f32,
+    pub color: [f32; 3],
     /// Which colour channels were cut at zero: they pass no gradient.
     pub clamped: [bool; 3],
 }
 
-/// The parameters of one Gaussian, as stored.
+/// The parameters of one Gaussian but for its harmonics.
 #[derive(Debug, Clone, Copy)]
-pub(crate) struct Parameters<'a> {
-    pub mean: [Real; 3],
-    pub log_scale: [Real; 3],
+pub(crate) struct Parameters {
+    pub mean: [f64; 3],
+    pub log_scale: [f64; 3],
     /// w x y z, any length.
-    pub rotation: [Real; 4],
-    pub opacity_logit: Real,
-    /// `[coefficients][rgb]`.
-    pub sh: &'a [Real],
-    pub sh_degree: u8,
+    pub rotation: [f64; 4],
+    pub opacity_logit: f64,
 }
 
 /// Why a Gaussian is not drawn.
@@ -61,162 +57,280 @@ pub(crate) enum Unseen {
     Outside,
 }
 
+impl Unseen {
+    /// From [`Projected::unseen`]; none for what is drawn.
+    pub fn of(code: f64) -> Option<Self> {
+        [Self::NotFinite, Self::Behind, Self::Degenerate, Self::Transparent, Self::Outside]
+            .get((code as usize).wrapping_sub(1))
+            .copied()
+    }
+}
+
+type V3 = [f64; 3];
+
+#[inline(always)]
+fn dot(a: V3, b: V3) -> f64 {
+    a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+}
+
+#[inline(always)]
+fn scaled(a: V3, s: f64) -> V3 {
+    [a[0] * s, a[1] * s, a[2] * s]
+}
+
+#[inline(always)]
+fn sum(a: V3, b: V3) -> V3 {
+    [a[0] + b[0], a[1] + b[1], a[2] + b[2]]
+}
+
+#[inline(always)]
+fn cross(a: V3, b: V3) -> V3 {
+    [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]]
+}
+
+/// Rows times a column.
+#[inline(always)]
+fn times(m: &[V3; 3], v: V3) -> V3 {
+    [dot(m[0], v), dot(m[1], v), dot(m[2], v)]
+}
+
+/// Columns times a column.
+#[inline(always)]
+fn transposed_times(m: &[V3; 3], v: V3) -> V3 {
+    sum(sum(scaled(m[0], v[0]), scaled(m[1], v[1])), scaled(m[2], v[2]))
+}
+
+/// e^x for -700 <= x <= 700 (nearer ones beyond), with a relative error below 1e-13: 2^n by the exponent's bits, the rest by
+/// Taylor's polynomial on [-ln 2 / 2, ln 2 / 2].
+#[inline(always)]
+pub(crate) fn exp(x: f64) -> f64 {
+    const INVERSE_FACTORIALS: [f64; 12] = {
+        let mut f = [1.0; 12];
+        let mut k = 1;
+        while k < 12 {
+            f[k] = f[k - 1] / k as f64;
+            k += 1;
+        }
+        f
+    };
+    // Adding this leaves the nearest whole number in the lowest bits.
+    const ROUND: f64 = 6_755_399_441_055_744.0;
+    let x = if x > -700.0 { x } else { -700.0 };
+    let x = if x < 700.0 { x } else { 700.0 };
+    let shifted = x * std::f64::consts::LOG2_E + ROUND;
+    let n = shifted - ROUND;
+    // ln 2 in two parts, the first short enough for exact products.
+    let r = (x - n * 0.693_147_180_369_123_8) - n * 1.908_214_929_270_587_7e-10;
+    let mut p = INVERSE_FACTORIALS[11];
+    let mut k = 11;
+    while k > 0 {
+        k -= 1;
+        p = p * r + INVERSE_FACTORIALS[k];
+    }
+    f64::from_bits(p.to_bits().wrapping_add(shifted.to_bits() << 52))
+}
+
+/// ln x for normal positive x, with an absolute error below 1e-12: the exponent's bits, and the area tangent's series.
+#[inline(always)]
+pub(crate) fn ln(x: f64) -> f64 {
+    const EXPONENT_AS_INTEGER: f64 = 4_503_599_627_370_496.0;
+    let bits = x.to_bits();
+    let exponent = f64::from_bits((bits >> 52) | EXPONENT_AS_INTEGER.to_bits()) - EXPONENT_AS_INTEGER - 1023.0;
+    let mantissa = f64::from_bits((bits & ((1 << 52) - 1)) | 1f64.to_bits());
+    let high = mantissa > std::f64::consts::SQRT_2;
+    let mantissa = if high { 0.5 * mantissa } else { mantissa };
+    let exponent = if high { exponent + 1.0 } else { exponent };
+    let s = (mantissa - 1.0) / (mantissa + 1.0);
+    let z = s * s;
+    let mut p = 1.0 / 15.0;
+    let mut k = 13.0;
+    while k > 0.0 {
+        p = p * z + 1.0 / k;
+        k -= 2.0;
+    }
+    exponent * std::f64::consts::LN_2 + 2.0 * s * p
+}
+
 /// A camera ready for many Gaussians.
+#[derive(Default)]
 pub(crate) struct Lens {
-    rotation: Mat3,
-    position: DVec3,
-    rotation64: glam::DMat3,
-    focal: Vec2,
-    center: Vec2,
+    rotation: [V3; 3],
+    position: V3,
+    focal: [f64; 2],
+    center: [f64; 2],
     /// Bounds of x/z and y/z in the Jacobian.
-    low: Vec2,
-    high: Vec2,
+    low: [f64; 2],
+    high: [f64; 2],
     pub width: u32,
     pub height: u32,
 }
 
 impl Lens {
     pub fn new(c: &Camera) -> Self {
-        let focal = Vec2::new(c.fx as Real, c.fy as Real);
-        let size = Vec2::new(c.width as Real, c.height as Real);
-        let center = Vec2::new(c.cx as Real, c.cy as Real);
-        let margin = 0.15 * size / focal;
+        let (focal, center) = ([c.fx, c.fy], [c.cx, c.cy]);
+        let size = [f64::from(c.width), f64::from(c.height)];
+        let margin = [0, 1].map(|k| 0.15 * size[k] / focal[k]);
         Self {
-            rotation: narrow_matrix(c.rotation),
-            rotation64: c.rotation,
-            position: c.position(),
+            rotation: [0, 1, 2].map(|r| c.rotation.row(r).into()),
+            position: c.position().into(),
             focal,
             center,
-            low: -(center / focal) - margin,
-            high: (size - center) / focal + margin,
+            low: [0, 1].map(|k| -center[k] / focal[k] - margin[k]),
+            high: [0, 1].map(|k| (size[k] - center[k]) / focal[k] + margin[k]),
             width: c.width,
             height: c.height,
         }
     }
 
-    /// Camera coordinates; the difference is taken in f64 so that far-away origins do not cost digits.
-    fn to_camera(&self, mean: [Real; 3]) -> Vec3 {
-        narrow(self.rotation64 * (widen(Vec3::from(mean)) - self.position))
-    }
-
     /// View direction (from the camera to the Gaussian), not normalised.
-    fn direction(&self, mean: [Real; 3]) -> Vec3 {
-        narrow(widen(Vec3::from(mean)) - self.position)
+    #[inline(always)]
+    pub fn direction(&self, mean: V3) -> V3 {
+        [mean[0] - self.position[0], mean[1] - self.position[1], mean[2] - self.position[2]]
     }
 }
 
 /// Intermediate values that the backward pass needs again.
 struct Ellipse {
-    t: Vec3,
-    clamped: Vec2,
+    t: V3,
+    clamped: [f64; 2],
     inside: [bool; 2],
     /// Rows of J * W.
-    jw: [Vec3; 2],
-    /// Rotation times scale.
-    m: Mat3,
-    quat: Quat,
-    quat_norm: Real,
-    scale: Vec3,
+    jw: [V3; 2],
+    rotation: [V3; 3],
+    quat: [f64; 4],
+    quat_norm: f64,
+    scale: V3,
+    /// Scale times rotation, transposed, times the rows of J * W.
+    a: V3,
+    b: V3,
     /// Of the projection along x and y, the low-pass included.
-    variance: [Real; 2],
+    variance: [f64; 2],
     /// Inverse of the projected covariance: xx, xy, yy.
-    conic: [Real; 3],
-    conic_det: Real,
+    conic: V3,
+    conic_det: f64,
+    own_opacity: f64,
+    /// By how much antialiasing lowers the opacity.
+    compensation: f64,
 }
 
-fn ellipse(p: &Parameters<'_>, lens: &Lens, near: f32) -> Result<Ellipse, Unseen> {
-    let t = lens.to_camera(p.mean);
-    let finite = p.log_scale.iter().chain(&p.rotation).all(|v| v.is_finite());
-    if !(t.is_finite() && finite) {
-        return Err(Unseen::NotFinite);
-    }
-    if t.z <= near as Real {
-        return Err(Unseen::Behind);
-    }
+#[inline(always)]
+fn ellipse(p: &Parameters, lens: &Lens, antialias: bool) -> Ellipse {
+    let t = times(&lens.rotation, lens.direction(p.mean));
     let [w, x, y, z] = p.rotation;
-    let raw = Quat::from_xyzw(x, y, z, w);
-    let quat_norm = raw.length();
-    if !(quat_norm.is_finite() && quat_norm > 1e-12) {
-        return Err(Unseen::Degenerate);
+    let quat_norm = (w * w + x * x + y * y + z * z).sqrt();
+    let inverse = 1.0 / quat_norm;
+    let quat = [w * inverse, x * inverse, y * inverse, z * inverse];
+    let [w, x, y, z] = quat;
+    let rotation = [
+        [1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y - w * z), 2.0 * (x * z + w * y)],
+        [2.0 * (x * y + w * z), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z - w * x)],
+        [2.0 * (x * z - w * y), 2.0 * (y * z + w * x), 1.0 - 2.0 * (x * x + y * y)],
+    ];
+    let scale = [exp(p.log_scale[0]), exp(p.log_scale[1]), exp(p.log_scale[2])];
+    let rz = 1.0 / t[2];
+    let (u, v) = (t[0] * rz, t[1] * rz);
+    let inside = [lens.low[0] <= u && u <= lens.high[0], lens.low[1] <= v && v <= lens.high[1]];
+    let clamp = |v: f64, low: f64, high: f64| {
+        let v = if v > low { v } else { low };
+        if v < high { v } else { high }
+    };
+    let clamped = [clamp(u, lens.low[0], lens.high[0]), clamp(v, lens.low[1], lens.high[1])];
+    let [fx, fy] = lens.focal;
+    let jw = [
+        transposed_times(&lens.rotation, [fx * rz, 0.0, -fx * clamped[0] * rz]),
+        transposed_times(&lens.rotation, [0.0, fy * rz, -fy * clamped[1] * rz]),
+    ];
+    let own = |row: V3| {
+        let v = transposed_times(&rotation, row);
+        [v[0] * scale[0], v[1] * scale[1], v[2] * scale[2]]
+    };
+    let (a, b) = (own(jw[0]), own(jw[1]));
+    // |a x b|^2 for the determinant without the low-pass: xx yy - xy^2 would cancel for needles.
+    let (aa, ab, bb, normal) = (dot(a, a), dot(a, b), dot(b, b), cross(a, b));
+    let own_det = dot(normal, normal);
+    let conic_det = 1.0 / (own_det + LOW_PASS * (aa + bb + LOW_PASS));
+    Ellipse {
+        t,
+        clamped,
+        inside,
+        jw,
+        rotation,
+        quat,
+        quat_norm,
+        scale,
+        a,
+        b,
+        variance: [aa + LOW_PASS, bb + LOW_PASS],
+        conic: [(bb + LOW_PASS) * conic_det, -ab * conic_det, (aa + LOW_PASS) * conic_det],
+        conic_det,
+        own_opacity: 1.0 / (1.0 + exp(-p.opacity_logit)),
+        compensation: if antialias { (own_det * conic_det).sqrt() } else { 1.0 },
     }
-    let quat = raw * (1.0 / quat_norm);
-    let scale = Vec3::from(p.log_scale.map(Real::exp));
-    let m = Mat3::from_quat(quat) * Mat3::from_diagonal(scale);
-    let rz = 1.0 / t.z;
-    let (u, v) = (t.x * rz, t.y * rz);
-    let inside = [(lens.low.x..=lens.high.x).contains(&u), (lens.low.y..=lens.high.y).contains(&v)];
-    // Not clamp(), which panics over a camera that is not finite.
-    let clamped = Vec2::new(u.max(lens.low.x).min(lens.high.x), v.max(lens.low.y).min(lens.high.y)) * t.z;
-    let j0 = Vec3::new(lens.focal.x * rz, 0.0, -lens.focal.x * clamped.x * rz * rz);
-    let j1 = Vec3::new(0.0, lens.focal.y * rz, -lens.focal.y * clamped.y * rz * rz);
-    let wt = lens.rotation.transpose();
-    let jw = [wt * j0, wt * j1];
-    let mt = m.transpose();
-    let (a, b) = (mt * jw[0], mt * jw[1]);
-    // In f64, and |a x b|^2 for the determinant without the low-pass: xx yy - xy^2 would cancel for needles, and the square
-    // of a large covariance overflow.
-    let (a64, b64) = (widen(a), widen(b));
-    let (low_pass, aa, bb) = (f64::from(LOW_PASS), a64.length_squared(), b64.length_squared());
-    let det = a64.cross(b64).length_squared() + low_pass * (aa + bb + low_pass);
-    let conic = [(bb + low_pass) / det, -a64.dot(b64) / det, (aa + low_pass) / det].map(|v| v as Real);
-    let variance = [aa + low_pass, bb + low_pass].map(|v| v as Real);
-    let whole = det.is_finite() && conic.iter().chain(&variance).all(|v| v.is_finite());
-    if !(whole && conic[0] > 0.0 && conic[2] > 0.0) {
-        return Err(Unseen::Degenerate);
-    }
-    Ok(Ellipse { t, clamped, inside, jw, m, quat, quat_norm, scale, variance, conic, conic_det: (1.0 / det) as Real })
 }
 
-/// Projects a Gaussian; the error says why it cannot touch the image.
-pub(crate) fn project(p: &Parameters<'_>, lens: &Lens, options: &RasterOptions) -> Result<Splat, Unseen> {
+/// A Gaussian in the image, but for its colour.
+#[derive(Default)]
+pub(crate) struct Projected {
+    /// 0 for what is drawn, else the position of the reason in [`Unseen`], from 1.
+    pub unseen: f64,
+    pub mean: [f64; 2],
+    pub conic: V3,
+    pub conic_det: f64,
+    pub extent: [f64; 2],
+    pub sigma_max: f64,
+    pub opacity: f64,
+    pub log2_opacity: f64,
+    pub depth: f64,
+}
+
+/// Whether single precision holds a value.
+#[inline(always)]
+fn held(v: f64) -> bool {
+    v.abs() < 3.4e38
+}
+
+/// Projects a Gaussian.
+#[inline(always)]
+pub(crate) fn project(p: &Parameters, lens: &Lens, options: &RasterOptions) -> Projected {
+    let e = ellipse(p, lens, options.antialias);
+    let opacity = e.own_opacity * e.compensation;
+    let rz = 1.0 / e.t[2];
+    let mean = [lens.focal[0] * e.t[0] * rz + lens.center[0], lens.focal[1] * e.t[1] * rz + lens.center[1]];
+    let log = ln(opacity);
+    let sigma_max = log - ln(ALPHA_MIN);
+    let reach = |variance: f64| (2.0 * sigma_max * variance).sqrt();
+    let extent = [reach(e.variance[0]), reach(e.variance[1])];
+    let (w, h) = (f64::from(lens.width), f64::from(lens.height));
+
+    let [s, r] = [p.log_scale, [p.rotation[1], p.rotation[2], p.rotation[3]]];
+    let finite = held(e.t[0]) & held(e.t[1]) & held(e.t[2]) & held(s[0]) & held(s[1]) & held(s[2]);
     // Infinite logits are opacities of 0 and 1.
-    let opacity = 1.0 / (1.0 + (-p.opacity_logit).exp());
-    if opacity.is_nan() {
-        return Err(Unseen::NotFinite);
-    }
-    let e = ellipse(p, lens, options.near)?;
-    if opacity < ALPHA_MIN {
-        return Err(Unseen::Transparent);
-    }
-    let mean = [lens.focal.x * e.t.x / e.t.z + lens.center.x, lens.focal.y * e.t.y / e.t.z + lens.center.y];
-    if mean.iter().any(|m| m.abs().is_nan() || m.abs() > MEAN_MAX) {
-        return Err(Unseen::Outside);
-    }
-    let sigma_max = (255.0 * opacity).ln();
-    let extent = e.variance.map(|v| (2.0 * sigma_max * v).sqrt());
-    let (w, h) = (lens.width as Real, lens.height as Real);
-    let touches =
-        mean[0] + extent[0] > 0.0 && mean[0] - extent[0] < w && mean[1] + extent[1] > 0.0 && mean[1] - extent[1] < h;
-    if !touches {
-        return Err(Unseen::Outside);
-    }
-    let raw = sh::color(p.sh, p.sh_degree.min(options.sh_degree), lens.direction(p.mean));
-    if raw.iter().any(|c| !c.is_finite()) {
-        return Err(Unseen::NotFinite);
-    }
-    Ok(Splat {
-        mean,
-        conic: e.conic,
-        conic_det: e.conic_det,
-        extent,
-        sigma_max,
-        opacity,
-        log2_opacity: opacity.log2(),
-        depth: e.t.z,
-        color: raw.map(|c| c.max(0.0)),
-        clamped: raw.map(|c| c < 0.0),
-    })
+    let finite = finite & held(r[0]) & held(r[1]) & held(r[2]) & held(p.rotation[0]) & !p.opacity_logit.is_nan();
+    let whole = (e.quat_norm > 1e-12) & held(e.variance[0]) & held(e.variance[1]) & held(e.conic[1]);
+    let whole = whole & (e.conic[0] > 1e-38) & (e.conic[2] > 1e-38) & held(e.conic[0]) & held(e.conic[2]);
+    let near = (mean[0].abs() <= MEAN_MAX) & (mean[1].abs() <= MEAN_MAX);
+    let touches = (mean[0] + extent[0] > 0.0) & (mean[0] - extent[0] < w);
+    let touches = touches & (mean[1] + extent[1] > 0.0) & (mean[1] - extent[1] < h);
+    // The first reason that holds.
+    let unseen = if near & touches { 0.0 } else { 5.0 };
+    let unseen = if opacity >= ALPHA_MIN { unseen } else { 4.0 };
+    let unseen = if whole { unseen } else { 3.0 };
+    let unseen = if e.t[2] > f64::from(options.near) { unseen } else { 2.0 };
+    let unseen = if finite { unseen } else { 1.0 };
+    let log2_opacity = log * std::f64::consts::LOG2_E;
+    let (conic, conic_det, depth) = (e.conic, e.conic_det, e.t[2]);
+    Projected { unseen, mean, conic, conic_det, extent, sigma_max, opacity, log2_opacity, depth }
 }
 
 /// d loss / d splat, summed over pixels.
 #[derive(Debug, Clone, Copy, Default, PartialEq)]
-pub(crate) struct SplatGradient {
-    pub mean: [Real; 2],
-    pub mean_abs: [Real; 2],
-    pub conic: [Real; 3],
-    pub opacity: Real,
-    pub depth: Real,
-    pub color: [Real; 3],
+pub(crate) struct SplatGradient<T = f32> {
+    pub mean: [T; 2],
+    pub mean_abs: [T; 2],
+    pub conic: [T; 3],
+    pub opacity: T,
+    pub depth: T,
+    pub color: [T; 3],
 }
 
 impl SplatGradient {
@@ -234,101 +348,84 @@ impl SplatGradient {
     }
 }
 
-/// d loss / d parameters of one Gaussian.
+/// d loss / d parameters of one Gaussian, but for its harmonics.
 pub(crate) struct ParameterGradient {
-    pub mean: [Real; 3],
-    pub log_scale: [Real; 3],
-    pub rotation: [Real; 4],
-    pub opacity_logit: Real,
+    pub mean: V3,
+    pub log_scale: V3,
+    pub rotation: [f64; 4],
+    pub opacity_logit: f64,
 }
 
-/// The chain rule through [`project`]; the gradient of the spherical harmonics is written to `d_sh`. `None` when single
-/// precision does not hold the result: such a Gaussian passes no gradient.
+/// The chain rule through [`project`], for a Gaussian that is drawn; what reaches the centre through the view direction is not
+/// in it, nor is the colour looked at.
+#[inline(always)]
 pub(crate) fn project_backward(
-    p: &Parameters<'_>,
+    p: &Parameters,
     lens: &Lens,
     options: &RasterOptions,
-    splat: &Splat,
-    d: &SplatGradient,
-    d_sh: &mut [Real],
-) -> Option<ParameterGradient> {
-    let e = ellipse(p, lens, options.near).ok()?;
-    let mut d_color = d.color;
-    for c in 0..3 {
-        if splat.clamped[c] {
-            d_color[c] = 0.0;
-        }
-    }
-    let degree = p.sh_degree.min(options.sh_degree);
-    let mut d_mean = sh::color_backward(p.sh, degree, lens.direction(p.mean), d_color, d_sh);
-
+    d: &SplatGradient<f64>,
+) -> ParameterGradient {
+    let e = ellipse(p, lens, options.antialias);
     // conic = cov^-1:  d cov = -conic^T (d conic) conic, with the off-diagonal counted once in d.conic[1].
-    let [a, b, c] = splat.conic;
+    let [a, b, c] = e.conic;
     let (da, db, dc) = (d.conic[0], 0.5 * d.conic[1], d.conic[2]);
     let (p00, p01) = (a * da + b * db, a * db + b * dc);
     let (p10, p11) = (b * da + c * db, b * db + c * dc);
-    let d_cov = [-(p00 * a + p01 * b), -(p00 * b + p01 * c), -(p10 * b + p11 * c)];
+    let mut d_cov = [-(p00 * a + p01 * b), -(p00 * b + p01 * c), -(p10 * b + p11 * c)];
+    if options.antialias {
+        // c^2 = det(C) / det(C + k I): by Cayley and Hamilton, the derivative of c by C is k / (2 c det(C + k I)) times the
+        // product of adj(C) and (C + k I)^-1, which cancels nothing.
+        let by = d.opacity * e.own_opacity * 0.5 * LOW_PASS / e.compensation * e.conic_det;
+        let adj = [e.variance[1] - LOW_PASS, -dot(e.a, e.b), e.variance[0] - LOW_PASS];
+        d_cov[0] += by * (adj[0] * a + adj[1] * b);
+        d_cov[1] += by * (adj[0] * b + adj[1] * c);
+        d_cov[2] += by * (adj[1] * b + adj[2] * c);
+    }
 
-    // cov2d = (JW) Sigma (JW)^T, Sigma = M M^T.
-    let mt = e.m.transpose();
-    let (ma, mb) = (mt * e.jw[0], mt * e.jw[1]);
-    let (d_ma, d_mb) = (2.0 * d_cov[0] * ma + 2.0 * d_cov[1] * mb, 2.0 * d_cov[1] * ma + 2.0 * d_cov[2] * mb);
-    // ma = M^T jw0: d jw0 = M d_ma; d M = jw0 d_ma^T + jw1 d_mb^T.
-    let (d_jw0, d_jw1) = (e.m * d_ma, e.m * d_mb);
-    let outer = |u: Vec3, v: Vec3| Mat3::from_cols(u * v.x, u * v.y, u * v.z);
-    let d_m = outer(e.jw[0], d_ma) + outer(e.jw[1], d_mb);
+    // cov2d = (JW) Sigma (JW)^T, Sigma = M M^T, M = R S.
+    let d_ma = sum(scaled(e.a, 2.0 * d_cov[0]), scaled(e.b, 2.0 * d_cov[1]));
+    let d_mb = sum(scaled(e.a, 2.0 * d_cov[1]), scaled(e.b, 2.0 * d_cov[2]));
+    // ma = S R^T jw0: d jw0 = R S d_ma; d M = jw0 d_ma^T + jw1 d_mb^T.
+    let stretched = |v: V3| [v[0] * e.scale[0], v[1] * e.scale[1], v[2] * e.scale[2]];
+    let (d_ma_s, d_mb_s) = (stretched(d_ma), stretched(d_mb));
+    let (d_jw0, d_jw1) = (times(&e.rotation, d_ma_s), times(&e.rotation, d_mb_s));
 
     // jw = W^T j: d j = W d_jw.
-    let (d_j0, d_j1) = (lens.rotation * d_jw0, lens.rotation * d_jw1);
-    let rz = 1.0 / e.t.z;
-    let (rz2, rz3) = (rz * rz, rz * rz * rz);
-    let (fx, fy) = (lens.focal.x, lens.focal.y);
-    let mut d_t = Vec3::ZERO;
-    d_t.z += -fx * rz2 * d_j0.x - fy * rz2 * d_j1.y;
-    d_t.z += 2.0 * fx * e.clamped.x * rz3 * d_j0.z + 2.0 * fy * e.clamped.y * rz3 * d_j1.z;
-    if e.inside[0] {
-        d_t.x -= fx * rz2 * d_j0.z;
-    } else {
-        d_t.z -= fx * e.clamped.x * rz3 * d_j0.z;
-    }
-    if e.inside[1] {
-        d_t.y -= fy * rz2 * d_j1.z;
-    } else {
-        d_t.z -= fy * e.clamped.y * rz3 * d_j1.z;
-    }
+    let (d_j0, d_j1) = (times(&lens.rotation, d_jw0), times(&lens.rotation, d_jw1));
+    let rz = 1.0 / e.t[2];
+    let rz2 = rz * rz;
+    let [fx, fy] = lens.focal;
+    let (jx, jy) = (fx * rz2 * d_j0[2], fy * rz2 * d_j1[2]);
+    let (cx, cy) = (e.clamped[0] * jx, e.clamped[1] * jy);
+    let mut d_t = [if e.inside[0] { -jx } else { 0.0 }, if e.inside[1] { -jy } else { 0.0 }, 0.0];
+    d_t[2] += -fx * rz2 * d_j0[0] - fy * rz2 * d_j1[1];
+    d_t[2] += if e.inside[0] { 2.0 * cx } else { cx };
+    d_t[2] += if e.inside[1] { 2.0 * cy } else { cy };
     // mean2d and depth.
-    d_t.x += fx * rz * d.mean[0];
-    d_t.y += fy * rz * d.mean[1];
-    d_t.z += -rz2 * (fx * e.t.x * d.mean[0] + fy * e.t.y * d.mean[1]) + d.depth;
-    d_mean += lens.rotation.transpose() * d_t;
+    d_t[0] += fx * rz * d.mean[0];
+    d_t[1] += fy * rz * d.mean[1];
+    d_t[2] += -rz2 * (fx * e.t[0] * d.mean[0] + fy * e.t[1] * d.mean[1]) + d.depth;
 
-    // M = R S.
-    let r = Mat3::from_quat(e.quat);
-    let d_scale = Vec3::new(r.x_axis.dot(d_m.x_axis), r.y_axis.dot(d_m.y_axis), r.z_axis.dot(d_m.z_axis));
-    let d_r = Mat3::from_cols(d_m.x_axis * e.scale.x, d_m.y_axis * e.scale.y, d_m.z_axis * e.scale.z);
-    let d_quat = quat_backward(e.quat, &d_r);
+    // ma = S (R^T jw0): d S is d_ma times what it stretches, which is ma / S; and d S S the gradient of log S.
+    let log_scale = [0, 1, 2].map(|k| d_ma[k] * e.a[k] + d_mb[k] * e.b[k]);
+    // d R = jw0 (S d_ma)^T + jw1 (S d_mb)^T.
+    let row = |r: usize| sum(scaled(d_ma_s, e.jw[0][r]), scaled(d_mb_s, e.jw[1][r]));
+    let d_quat = quat_backward(e.quat, &[row(0), row(1), row(2)]);
     // q / |q|: the part along q drops out.
-    let q = [e.quat.w, e.quat.x, e.quat.y, e.quat.z];
-    let along: Real = q.iter().zip(&d_quat).map(|(a, b)| a * b).sum();
-    let rotation = [0, 1, 2, 3].map(|k| (d_quat[k] - along * q[k]) / e.quat_norm);
-    let log_scale = d_scale * e.scale;
-    let gradient = ParameterGradient {
-        mean: d_mean.into(),
-        log_scale: log_scale.into(),
-        rotation,
-        opacity_logit: d.opacity * splat.opacity * (1.0 - splat.opacity),
-    };
-    let ParameterGradient { mean, log_scale, rotation, opacity_logit } = &gradient;
-    let groups = [&mean[..], log_scale, rotation, &[*opacity_logit], d_sh, &d.mean, &d.mean_abs];
-    let finite = groups.iter().all(|group| group.iter().all(|v| v.is_finite()));
-    finite.then_some(gradient)
+    let q = e.quat;
+    let along = q[0] * d_quat[0] + q[1] * d_quat[1] + q[2] * d_quat[2] + q[3] * d_quat[3];
+    ParameterGradient {
+        mean: transposed_times(&lens.rotation, d_t),
+        log_scale,
+        rotation: [0, 1, 2, 3].map(|k| (d_quat[k] - along * q[k]) / e.quat_norm),
+        opacity_logit: d.opacity * e.own_opacity * e.compensation * (1.0 - e.own_opacity),
+    }
 }
 
-/// d loss / d (w, x, y, z) of a unit quaternion from d loss / d its rotation matrix.
-fn quat_backward(q: Quat, d: &Mat3) -> [Real; 4] {
-    let (w, x, y, z) = (q.w, q.x, q.y, q.z);
-    // d.col(c)[r] is the gradient of R[r][c].
-    let g = |r: usize, c: usize| d.col(c)[r];
+/// d loss / d (w, x, y, z) of a unit quaternion from d loss / d its rotation matrix, by rows.
+#[inline(always)]
+fn quat_backward([w, x, y, z]: [f64; 4], d: &[V3; 3]) -> [f64; 4] {
+    let g = |r: usize, c: usize| d[r][c];
     [
         2.0 * (-z * g(0, 1) + y * g(0, 2) + z * g(1, 0) - x * g(1, 2) - y * g(2, 0) + x * g(2, 1)),
         2.0 * (y * g(0, 1) + z * g(0, 2) + y * g(1, 0) - 2.0 * x * g(1, 1) - w * g(1, 2) + z * g(2, 0) + w * g(2, 1)
@@ -340,4 +437,24 @@ fn quat_backward(q: Quat, d: &Mat3) -> [Real; 4] {
             + x * g(2, 0)
             + y * g(2, 1)),
     ]
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn exponential_and_logarithm_keep_their_bounds() {
+        let (mut of_exp, mut of_ln) = (0f64, 0f64);
+        for i in -699_999..=699_999 {
+            let x = f64::from(i) * 1e-3;
+            let (own, true_value) = (exp(x), x.exp());
+            of_exp = of_exp.max((own / true_value - 1.0).abs());
+            of_ln = of_ln.max((ln(true_value) - x).abs() / x.abs().max(1.0));
+        }
+        eprintln!("largest errors: exp {of_exp:e}, ln {of_ln:e}");
+        assert!(of_exp < 1e-13 && of_ln < 1e-12);
+        assert_eq!((exp(0.0), ln(1.0)), (1.0, 0.0));
+        assert!(exp(f64::NEG_INFINITY) < 1e-300 && exp(f64::INFINITY) > 1e300);
+    }
 }

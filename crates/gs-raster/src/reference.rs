@@ -1,10 +1,11 @@
 //! The renderer once more, as plainly as it can be said: f64, pixel by pixel, all Gaussians, no tiles. The tests' oracle.
 //!
 //! It shares no code with the renderer except the types of its inputs; [`backward`] alone goes through the renderer's chain
-//! rule, compiled in f64, which the tests hold against central differences of [`render`].
+//! rule, which is in f64, and which the tests hold against central differences of [`render`].
 
 use crate::RasterOptions;
-use crate::double::project::{Lens, Parameters, SplatGradient, project, project_backward};
+use crate::project::{Lens, Parameters, SplatGradient, project, project_backward};
+use crate::sh;
 use glam::{DMat3, DQuat, DVec2, DVec3};
 use gs_scene::{Camera, Gaussians};
 
@@ -27,14 +28,12 @@ impl Gaussian {
         fixed.chain(sh).chain(features).collect()
     }
 
-    fn view(&self) -> Parameters<'_> {
+    fn view(&self) -> Parameters {
         Parameters {
             mean: self.mean,
             log_scale: self.log_scale,
             rotation: self.rotation,
             opacity_logit: self.opacity_logit,
-            sh: &self.sh,
-            sh_degree: (self.sh.len() as f64 / 3.0).sqrt() as u8 - 1,
         }
     }
 }
@@ -108,12 +107,14 @@ fn ellipses(scene: &[Gaussian], camera: &Camera, options: &RasterOptions) -> Vec
         let xy = row_x.dot(covariance * row_y);
         let yy = row_y.dot(covariance * row_y) + low_pass;
         let det = xx * yy - xy * xy;
+        let own = (xx - low_pass) * (yy - low_pass) - xy * xy;
+        let compensation = if options.antialias { (own.max(0.0) / det).sqrt() } else { 1.0 };
         let (mx, my, z) = camera.project(DVec3::from(g.mean));
         out.push(Ellipse {
             id,
             mean: DVec2::new(mx, my),
             conic: [yy / det, -xy / det, xx / det],
-            opacity: 1.0 / (1.0 + (-g.opacity_logit).exp()),
+            opacity: compensation / (1.0 + (-g.opacity_logit).exp()),
             z,
             color: color(&g.sh, DVec3::from(g.mean) - camera.position(), options.sh_degree).map(|c| c.max(0.0)),
         });
@@ -252,7 +253,7 @@ pub(crate) fn backward(
     d: &[Pixel],
 ) -> Vec<(Vec<f64>, [f64; 4])> {
     let ellipses = ellipses(scene, camera, options);
-    let mut splats = vec![SplatGradient::default(); scene.len()];
+    let mut splats = vec![SplatGradient::<f64>::default(); scene.len()];
     let mut features: Vec<Vec<f64>> = scene.iter().map(|g| vec![0.0; g.features.len()]).collect();
     for (at, d) in d.iter().enumerate() {
         let (x, y) = (at % camera.width as usize, at / camera.width as usize);
@@ -298,8 +299,22 @@ pub(crate) fn backward(
         let d = &splats[i];
         let mut all = vec![0.0; 11];
         let mut d_sh = vec![0.0; g.sh.len()];
-        if let Ok(splat) = project(&g.view(), &lens, options) {
-            let p = project_backward(&g.view(), &lens, options, &splat, d, &mut d_sh).unwrap();
+        if project(&g.view(), &lens, options).unseen == 0.0 {
+            let mut p = project_backward(&g.view(), &lens, options, d);
+            let stored = (g.sh.len() as f64 / 3.0).sqrt() as u8 - 1;
+            let (degree, direction) = (stored.min(options.sh_degree), lens.direction(g.mean));
+            let seen = color(&g.sh, direction.into(), degree);
+            let d_color = [0, 1, 2].map(|c| if seen[c] < 0.0 { 0.0 } else { d.color[c] });
+            let basis = sh::basis(degree, sh::unit(direction).0);
+            let mut weights = [0.0; 16];
+            for (k, (d_sh, sh)) in d_sh.chunks_exact_mut(3).zip(g.sh.chunks_exact(3)).enumerate() {
+                for c in 0..3 {
+                    d_sh[c] = basis[k] * d_color[c];
+                    weights[k] += sh[c] * d_color[c];
+                }
+            }
+            let through_direction = sh::direction_gradient(degree, direction, &weights);
+            p.mean.iter_mut().zip(through_direction).for_each(|(sum, v)| *sum += v);
             all = [&p.mean[..], &p.log_scale, &p.rotation, &[p.opacity_logit]].concat();
         }
         all.extend(d_sh);

@@ -1,6 +1,7 @@
 //! Which Gaussians touch which tile, front to back.
 
-use crate::single::project::{Lens, Parameters, Splat, project};
+use crate::lanes::project_range;
+use crate::project::{Lens, Splat};
 use crate::types::{Dropped, RasterOptions};
 use gs_scene::{Camera, Gaussians};
 use rayon::prelude::*;
@@ -10,69 +11,118 @@ pub const TILE: usize = 16;
 /// Pixels of a tile.
 pub(crate) const PIXELS: usize = TILE * TILE;
 /// Gaussians that one task projects: fixed, so that results do not depend on the number of threads.
-const CHUNK: usize = 4096;
+const CHUNK: usize = 1024;
+/// Bits that one pass of the sort looks at.
+const DIGIT: usize = 11;
 
-/// The Gaussians that a view sees, and the lists of its tiles.
+/// The Gaussians that a view sees, and the lists of its tiles. Building it again for another view reuses its memory.
+#[derive(Default)]
 pub(crate) struct Tiles {
     pub lens: Lens,
-    /// Original indices of the splats, in depth order (ties by index).
+    /// Original indices of the splats, ascending.
     pub index: Vec<u32>,
-    /// Projected Gaussians in depth order.
+    /// Projected Gaussians, in the order of `index`.
     pub splats: Vec<Splat>,
     /// Where each tile's list begins in `entries`; tiles + 1.
-    pub offsets: Vec<usize>,
-    /// Positions in `splats`, tile after tile, front to back within each.
+    pub offsets: Vec<u32>,
+    /// Positions in `splats`, tile after tile, front to back (ties by index) within each.
     pub entries: Vec<u32>,
+    /// Where each splat's places begin in `places`; splats + 1.
+    pub first: Vec<u32>,
+    /// Where in `entries` each splat is, splat after splat, in tile order within each.
+    pub places: Vec<u32>,
     pub columns: usize,
     pub dropped: Dropped,
+    chunks: Vec<Chunk>,
+    sort: Sort,
+}
+
+/// What one task projects.
+#[derive(Default)]
+struct Chunk {
+    index: Vec<u32>,
+    splats: Vec<Splat>,
+    /// Tiles of each splat, ascending, one splat after the other, and how many each has.
+    touched: Vec<u32>,
+    counts: Vec<u32>,
+    dropped: Dropped,
+}
+
+impl Chunk {
+    fn fill(&mut self, g: &Gaussians, chunk: usize, lens: &Lens, options: &RasterOptions, grid: [usize; 2]) {
+        let Self { index, splats, touched, counts, dropped } = self;
+        index.clear();
+        splats.clear();
+        touched.clear();
+        counts.clear();
+        *dropped = Dropped::default();
+        let range = chunk * CHUNK..((chunk + 1) * CHUNK).min(g.len());
+        let seen = |i: usize, s: Splat| {
+            let before = touched.len();
+            push_tiles(&s, grid, touched);
+            counts.push((touched.len() - before) as u32);
+            index.push(i as u32);
+            splats.push(s);
+        };
+        project_range(g, range, lens, options, seen, |reason| dropped.count(reason));
+    }
 }
 
 impl Tiles {
     pub fn new(g: &Gaussians, camera: &Camera, options: &RasterOptions) -> Self {
-        let lens = Lens::new(camera);
-        let chunks: Vec<(Vec<(u64, Splat)>, Dropped)> = (0..g.len().div_ceil(CHUNK))
-            .into_par_iter()
-            .map(|c| {
-                let (mut seen, mut dropped) = (Vec::new(), Dropped::default());
-                for i in c * CHUNK..((c + 1) * CHUNK).min(g.len()) {
-                    match project(&Parameters::of(g, i), &lens, options) {
-                        // Positive floats sort as their bits do; the index below breaks ties.
-                        Ok(s) => seen.push(((u64::from(s.depth.to_bits()) << 32) | i as u64, s)),
-                        Err(reason) => dropped.count(reason),
-                    }
-                }
-                (seen, dropped)
-            })
-            .collect();
-        let mut dropped = Dropped::default();
-        let mut visible = Vec::new();
-        for (seen, own) in chunks {
-            visible.extend(seen);
-            dropped.add(&own);
-        }
-        visible.par_sort_unstable_by_key(|(key, _)| *key);
-        let index: Vec<u32> = visible.iter().map(|(key, _)| *key as u32).collect();
-        let splats: Vec<Splat> = visible.into_iter().map(|(_, s)| s).collect();
+        let mut tiles = Self::default();
+        tiles.build(g, camera, options);
+        tiles
+    }
 
+    pub fn build(&mut self, g: &Gaussians, camera: &Camera, options: &RasterOptions) {
+        let lens = Lens::new(camera);
         let columns = (lens.width as usize).div_ceil(TILE);
         let rows = (lens.height as usize).div_ceil(TILE);
-        let touched: Vec<Vec<u32>> = splats.par_iter().with_min_len(256).map(|s| tiles_of(s, columns, rows)).collect();
-        let mut offsets = vec![0usize; columns * rows + 1];
-        for t in touched.iter().flatten() {
-            offsets[*t as usize + 1] += 1;
+        self.chunks.resize_with(g.len().div_ceil(CHUNK), Chunk::default);
+        let chunks = self.chunks.par_iter_mut().enumerate();
+        chunks.for_each(|(c, chunk)| chunk.fill(g, c, &lens, options, [columns, rows]));
+
+        self.dropped = Dropped::default();
+        self.index.clear();
+        self.splats.clear();
+        self.places.clear();
+        self.first.clear();
+        self.first.push(0);
+        let mut end = 0;
+        for chunk in &self.chunks {
+            self.index.extend_from_slice(&chunk.index);
+            self.splats.extend_from_slice(&chunk.splats);
+            self.places.extend_from_slice(&chunk.touched);
+            self.first.extend(chunk.counts.iter().map(|n| {
+                end += n;
+                end
+            }));
+            self.dropped.add(&chunk.dropped);
+        }
+
+        self.offsets.clear();
+        self.offsets.resize(columns * rows + 1, 0);
+        for &t in &self.places {
+            self.offsets[t as usize + 1] += 1;
         }
         for t in 0..columns * rows {
-            offsets[t + 1] += offsets[t];
+            self.offsets[t + 1] += self.offsets[t];
         }
-        let mut next = offsets.clone();
-        let mut entries = vec![0u32; offsets[columns * rows]];
-        for (i, tiles) in touched.iter().enumerate() {
-            for &t in tiles {
-                entries[next[t as usize]] = i as u32;
-                next[t as usize] += 1;
+        self.entries.resize(self.places.len(), 0);
+        // Tiles become places in their lists; each list's end moves through it, and is the next one's beginning at the end.
+        for &i in self.sort.by_depth(&self.splats) {
+            for place in &mut self.places[self.first[i as usize] as usize..self.first[i as usize + 1] as usize] {
+                let next = &mut self.offsets[*place as usize];
+                *place = *next;
+                self.entries[*next as usize] = i;
+                *next += 1;
             }
         }
-        Self { lens, index, splats, offsets, entries, columns, dropped }
+        self.offsets.rotate_right(1);
+        self.offsets[0] = 0;
+        self.lens = lens;
+        self.columns = columns;
     }
 
     pub fn count(&self) -> usize {
@@ -81,7 +131,7 @@ impl Tiles {
 
     /// Positions in `splats` of the Gaussians that touch tile `t`.
     pub fn list(&self, t: usize) -> &[u32] {
-        &self.entries[self.offsets[t]..self.offsets[t + 1]]
+        &self.entries[self.offsets[t] as usize..self.offsets[t + 1] as usize]
     }
 
     /// Left, top, width, height of tile `t` within the image.
@@ -91,42 +141,90 @@ impl Tiles {
     }
 }
 
-/// Tiles in which some pixel may get alpha >= 1/255: those that the ellipse sigma = ln(255 opacity) reaches.
-fn tiles_of(s: &Splat, columns: usize, rows: usize) -> Vec<u32> {
-    let range = |center: f32, extent: f32, count: usize| {
-        let low = ((center - extent) / TILE as f32).floor().max(0.0) as usize;
-        let high = ((center + extent) / TILE as f32).floor().max(-1.0) + 1.0;
-        low..(high as usize).min(count)
-    };
-    let mut out = Vec::new();
-    // A margin for the rounding of this test against the rounding of the pixels' own.
-    let limit = s.sigma_max * (1.0 + 1e-5) + 1e-5;
-    for ty in range(s.mean[1], s.extent[1], rows) {
-        for tx in range(s.mean[0], s.extent[0], columns) {
-            let (x0, y0) = ((tx * TILE) as f32 - s.mean[0], (ty * TILE) as f32 - s.mean[1]);
-            if least_sigma(s.conic, x0, y0, x0 + TILE as f32, y0 + TILE as f32) <= limit {
-                out.push((ty * columns + tx) as u32);
-            }
-        }
-    }
-    out
+/// Radix sort of 32-bit keys, lowest digit first; equal depths stay in the order of their index.
+#[derive(Default)]
+struct Sort {
+    pairs: Vec<(u32, u32)>,
+    other: Vec<(u32, u32)>,
+    order: Vec<u32>,
 }
 
-/// Smallest value of (a x^2 + 2 b x y + c y^2) / 2 over a rectangle around or beside the origin.
-fn least_sigma([a, b, c]: [f32; 3], x0: f32, y0: f32, x1: f32, y1: f32) -> f32 {
-    if x0 <= 0.0 && 0.0 <= x1 && y0 <= 0.0 && 0.0 <= y1 {
-        return 0.0;
+impl Sort {
+    /// Positions in `splats`, front to back.
+    fn by_depth(&mut self, splats: &[Splat]) -> &[u32] {
+        self.pairs.clear();
+        // Positive floats sort as their bits do.
+        self.pairs.extend(splats.iter().zip(0..).map(|(s, i)| (s.depth.to_bits(), i)));
+        self.other.resize(splats.len(), (0, 0));
+        let digit = |key: u32, pass: usize| (key >> (pass * DIGIT)) as usize & ((1 << DIGIT) - 1);
+        let mut counts = [[0u32; 1 << DIGIT]; 32usize.div_ceil(DIGIT)];
+        for (key, _) in &self.pairs {
+            for (pass, counts) in counts.iter_mut().enumerate() {
+                counts[digit(*key, pass)] += 1;
+            }
+        }
+        for (pass, counts) in counts.iter_mut().enumerate() {
+            if counts.iter().any(|&n| n as usize == splats.len()) {
+                continue;
+            }
+            let mut begin = 0;
+            for n in counts.iter_mut() {
+                (*n, begin) = (begin, begin + *n);
+            }
+            for &pair in &self.pairs {
+                let next = &mut counts[digit(pair.0, pass)];
+                self.other[*next as usize] = pair;
+                *next += 1;
+            }
+            std::mem::swap(&mut self.pairs, &mut self.other);
+        }
+        self.order.clear();
+        self.order.extend(self.pairs.iter().map(|(_, i)| i));
+        &self.order
     }
-    let sigma = |x: f32, y: f32| 0.5 * (a * x * x + c * y * y) + b * x * y;
-    // The form is convex: its least value on the rectangle lies on an edge that faces the origin.
-    let mut least = f32::INFINITY;
-    if x0 > 0.0 || x1 < 0.0 {
-        let x = if x0 > 0.0 { x0 } else { x1 };
-        least = least.min(sigma(x, (-b * x / c).clamp(y0, y1)));
+}
+
+/// Appends the tiles, of `columns` times `rows`, in which some pixel may get alpha >= 1/255: in every row of tiles those
+/// between the leftmost and the rightmost point there of the ellipse sigma = ln(255 opacity). Some beside it may be among them.
+fn push_tiles(s: &Splat, [columns, rows]: [usize; 2], out: &mut Vec<u32>) {
+    const SIDE: f32 = TILE as f32;
+    let range = |low: f32, high: f32, count: usize| {
+        let low = (low / SIDE).floor().max(0.0) as usize;
+        let high = (high / SIDE).floor().max(-1.0) + 1.0;
+        low..(high as usize).min(count)
+    };
+    let [x, y] = s.mean;
+    let [width, height] = s.extent;
+    let all = range(x - width, x + width, columns);
+    let down = range(y - height, y + height, rows);
+    let [a, b, c] = s.conic;
+    // Margins for the rounding of this against that of the kernels' own, which are half as large.
+    let sigma = s.sigma_max * 1.0002 + 2e-5;
+    let margin = 2e-3 + 2e-4 * width;
+    // Height of the rightmost point over the centre's; the leftmost one lies opposite.
+    let rightmost = -b * width / c;
+    // Leftmost and rightmost point at a height; nothing (left beyond right) above and below.
+    let at = |v: f32| {
+        let half = (2.0 * sigma * a - v * v * s.conic_det).max(0.0).sqrt() / a;
+        let middle = -b * v / a;
+        if v.abs() <= height { [middle - half, middle + half] } else { [f32::INFINITY, f32::NEG_INFINITY] }
+    };
+    let narrow = all.len() <= 1 || down.len() <= 1 || !(rightmost.is_finite() && (sigma * a).is_finite());
+    let mut upper = at((down.start * TILE) as f32 - y);
+    for ty in down {
+        let (top, bottom) = ((ty * TILE) as f32 - y, ((ty + 1) * TILE) as f32 - y);
+        let lower = at(bottom);
+        let [mut left, mut right] = [upper[0].min(lower[0]), upper[1].max(lower[1])];
+        upper = lower;
+        let within = |v: f32| top <= v + margin && v - margin <= bottom;
+        if within(rightmost) {
+            right = width;
+        }
+        if within(-rightmost) {
+            left = -width;
+        }
+        let own = range(x + left - margin, x + right + margin, columns);
+        let own = if narrow { all.clone() } else { own.start.max(all.start)..own.end.min(all.end) };
+        out.extend(own.map(|tx| (ty * columns + tx) as u32));
     }
-    if y0 > 0.0 || y1 < 0.0 {
-        let y = if y0 > 0.0 { y0 } else { y1 };
-        least = least.min(sigma((-b * y / a).clamp(x0, x1), y));
-    }
-    least
 }
