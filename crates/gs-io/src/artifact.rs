@@ -5,8 +5,8 @@
 //! the parameters that shaped the data, and the content hash of each input. Nothing in it depends on the time, the
 //! machine, a path or the number of threads: same inputs, same parameters, same bytes.
 
-use crate::{Error, IoContext, Result, hash_bytes, write_bytes};
-use safetensors::tensor::{Dtype, SafeTensors, TensorView};
+use crate::{Error, IoContext, Result, hash_bytes, write_atomic};
+use safetensors::tensor::{Dtype, Metadata, SafeTensors, TensorInfo};
 use serde::{Deserialize, Serialize};
 use std::collections::{BTreeMap, HashMap};
 use std::fs::File;
@@ -33,10 +33,10 @@ pub struct Provenance {
     pub extra: serde_json::Value,
 }
 
-/// Collects tensors, then writes them atomically.
-pub struct ArtifactWriter {
+/// Collects tensors, then writes them atomically, without a copy of them.
+pub struct ArtifactWriter<'a> {
     provenance: Provenance,
-    tensors: BTreeMap<String, (Dtype, Vec<usize>, Vec<u8>)>,
+    tensors: BTreeMap<String, (Dtype, Vec<usize>, &'a [u8])>,
 }
 
 /// Element types that artifacts hold.
@@ -49,7 +49,7 @@ macro_rules! element {
 }
 element!(f32 => F32, f64 => F64, u8 => U8, u16 => U16, u32 => U32, u64 => U64, i32 => I32, i64 => I64);
 
-impl ArtifactWriter {
+impl<'a> ArtifactWriter<'a> {
     /// An artifact without tensors yet.
     pub fn new(provenance: Provenance) -> Self {
         Self { provenance, tensors: BTreeMap::new() }
@@ -60,9 +60,9 @@ impl ArtifactWriter {
     /// # Panics
     /// When the product of `shape` is not the number of values: a programming error.
     #[must_use]
-    pub fn tensor<T: Element>(mut self, name: &str, shape: &[usize], data: &[T]) -> Self {
+    pub fn tensor<T: Element>(mut self, name: &str, shape: &[usize], data: &'a [T]) -> Self {
         assert_eq!(shape.iter().product::<usize>(), data.len(), "shape of {name}");
-        self.tensors.insert(name.into(), (T::DTYPE, shape.to_vec(), bytemuck::cast_slice(data).to_vec()));
+        self.tensors.insert(name.into(), (T::DTYPE, shape.to_vec(), bytemuck::cast_slice(data)));
         self
     }
 
@@ -74,13 +74,25 @@ impl ArtifactWriter {
         let path = path.as_ref();
         let fail = |e: &dyn std::fmt::Display| Error::new(format!("cannot serialise: {e}")).file(path);
         let json = serde_json::to_string(&self.provenance).map_err(|e| fail(&e))?;
-        let mut views = Vec::with_capacity(self.tensors.len());
-        for (name, (dtype, shape, bytes)) in &self.tensors {
-            views.push((name, TensorView::new(*dtype, shape.clone(), bytes).map_err(|e| fail(&e))?));
+        // The order that the format wants: the widest type first, so that every tensor is aligned; then by name.
+        let mut tensors: Vec<_> = self.tensors.into_iter().collect();
+        tensors.sort_by_key(|(_, (dtype, ..))| std::cmp::Reverse(*dtype));
+        let mut offset = 0;
+        let mut infos = Vec::with_capacity(tensors.len());
+        for (name, (dtype, shape, bytes)) in &tensors {
+            let data_offsets = (offset, offset + bytes.len());
+            offset = data_offsets.1;
+            infos.push((name.clone(), TensorInfo { dtype: *dtype, shape: shape.clone(), data_offsets }));
         }
-        let bytes =
-            safetensors::serialize(views, Some(HashMap::from([(KEY.to_string(), json)]))).map_err(|e| fail(&e))?;
-        write_bytes(path, &bytes)
+        let metadata =
+            Metadata::new(Some(HashMap::from([(KEY.to_string(), json)])), infos).map_err(|e| fail(&e))?;
+        let mut header = serde_json::to_vec(&metadata).map_err(|e| fail(&e))?;
+        header.resize(header.len().next_multiple_of(8), b' ');
+        write_atomic(path, |w| {
+            w.write_all(&(header.len() as u64).to_le_bytes()).at("write", path)?;
+            w.write_all(&header).at("write", path)?;
+            tensors.iter().try_for_each(|(_, (_, _, bytes))| w.write_all(bytes)).at("write", path)
+        })
     }
 }
 
@@ -198,7 +210,7 @@ mod tests {
     use super::*;
     use proptest::prelude::*;
 
-    fn sample() -> ArtifactWriter {
+    fn sample() -> ArtifactWriter<'static> {
         let provenance = Provenance {
             format: "sample".into(),
             version: 1,
@@ -227,6 +239,19 @@ mod tests {
         let e = a.tensor::<u32>("a", &[None]).unwrap_err().to_string();
         assert!(e.contains("found F32 [2, 2], expected U32 [any]"), "{e}");
         assert!(Artifact::open(&p, "graph", 1).is_err());
+    }
+
+    #[test]
+    fn the_bytes_are_those_of_safetensors() {
+        let dir = tempfile::tempdir().unwrap();
+        let p = dir.path().join("a.safetensors");
+        let wide = [1.5f64, -2.0];
+        sample().tensor("z", &[2], &wide).tensor("empty", &[0, 4], &[0f32; 0]).write(&p).unwrap();
+        let written = std::fs::read(&p).unwrap();
+        let views = SafeTensors::deserialize(&written).unwrap();
+        let (_, metadata) = SafeTensors::read_metadata(&written).unwrap();
+        let again = safetensors::serialize(views.tensors(), metadata.metadata().clone()).unwrap();
+        assert_eq!(written, again);
     }
 
     proptest! {

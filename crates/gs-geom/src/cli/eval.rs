@@ -1,6 +1,6 @@
 //! `gs-geom eval`.
 
-use super::{SceneArgs, check_writable, read_geometry};
+use super::{MaskArgs, SceneArgs, check_writable, read_geometry};
 use crate::metrics::{ViewMetrics, mean, measure};
 use artifacts::role;
 use gs_io::{Error, Result, hash_file, write_bytes};
@@ -16,6 +16,8 @@ use std::path::PathBuf;
 pub(super) struct EvalArgs {
     #[command(flatten)]
     scene: SceneArgs,
+    #[command(flatten)]
+    masks: MaskArgs,
     /// Gaussians, as a 3DGS PLY
     #[arg(long, value_name = "FILE")]
     geometry: PathBuf,
@@ -28,6 +30,7 @@ impl EvalArgs {
     pub(super) fn run(&self, stage: &Stage) -> Result<()> {
         let dataset = self.scene.load(stage)?;
         let gaussians = read_geometry(&self.geometry)?;
+        let (alpha, masks) = (self.masks.alpha(), self.masks.load(&dataset, stage)?);
         check_writable(&self.out)?;
         let mut split = Split::Test;
         let mut views: Vec<&View> = dataset.views_of(split).collect();
@@ -43,7 +46,7 @@ impl EvalArgs {
             if stage.interrupted() {
                 return Err(Error::new("interrupted"));
             }
-            figures.push(measure(&gaussians, view, &options)?);
+            figures.push(measure(&gaussians, view, &options, alpha, &masks)?);
             progress.step();
         }
         let psnr = mean(figures.iter().map(|f| f.psnr));
@@ -66,11 +69,15 @@ impl EvalArgs {
             "resolution": self.scene.resolution.to_string(),
             "holdout": self.scene.holdout,
             "background": self.scene.background.color(),
+            "alpha": alpha,
         });
-        let inputs = BTreeMap::from([
+        let mut inputs = BTreeMap::from([
             (role::DATASET.to_string(), dataset.hash()?),
             (role::GEOMETRY.to_string(), hash_file(&self.geometry)?),
         ]);
+        if let Some(hash) = masks.hash()? {
+            inputs.insert("photograph_masks".into(), hash);
+        }
         let summary = json!({
             "split": metrics["split"],
             "psnr": psnr,
