@@ -37,6 +37,9 @@ pub struct ProgressState {
     pub iteration: u32,
     /// Gradients of Gaussians that were not finite and so not used.
     pub dropped: u64,
+    /// Most Gaussians in an iteration that could not be drawn: not finite; degenerate (see [`gs_raster::Dropped`]).
+    #[serde(default)]
+    pub undrawn: [u64; 2],
     /// Gaussians cloned, split, removed and relocated so far.
     pub densified: [u64; 4],
     /// Sums of loss, L1 and SSIM, and their number, since the last line of the curve.
@@ -207,6 +210,7 @@ mod tests {
         state.progress = ProgressState {
             iteration: 12,
             dropped: 3,
+            undrawn: [5, 6],
             densified: [1, 2, 3, 4],
             window: ([0.1, 1.0 / 3.0, f64::MIN_POSITIVE], 7),
             curve: vec!["{\"iteration\":10}".into()],

@@ -99,6 +99,8 @@ pub struct Sizes {
     pub threads: usize,
     /// Degree of the spherical harmonics.
     pub sh_degree: u8,
+    /// Whether the number of Gaussians may change.
+    pub densifies: bool,
 }
 
 impl Forecast {
@@ -106,8 +108,9 @@ impl Forecast {
     pub fn new(sizes: &Sizes) -> Self {
         let numbers = 4 * (PLAIN_NUMBERS + 3 * sh_coefficients(sizes.sh_degree) as u64);
         // Parameters, two moments and pulls. Beside them in a step: the gradient with that of the projected centre, and
-        // the drawn Gaussians. Densification and the end copy one such set at a time, which takes less.
-        let (state, step) = (3 * numbers + 8, numbers + 16 + PER_DRAWN);
+        // the drawn Gaussians. Densification, at the end of a step, copies the parameters and each moment in turn.
+        let copy = if sizes.densifies { numbers } else { 0 };
+        let (state, step) = (3 * numbers + 8, numbers + 16 + PER_DRAWN + copy);
         let (w, h) = (u64::from(sizes.file.0), u64::from(sizes.file.1));
         let shrunk = PER_SHRUNK_PIXEL * (sizes.width * h + 2 * sizes.pixels);
         Self {
@@ -156,6 +159,7 @@ mod tests {
             tile_entries: 0,
             threads: 2,
             sh_degree: 3,
+            densifies: false,
         };
         let decoding = 2 * (15 * 2_000_000 + 12 * (1_000_000 + 2 * 500_000));
         assert_eq!(Forecast::new(&sizes).decoding, decoding);
@@ -163,6 +167,8 @@ mod tests {
         let gaussians = 1000 * (3 * 236 + 8 + 236 + 16 + PER_DRAWN);
         assert_eq!(Forecast::new(&sizes).peak(1000), Bytes(BASE + 6_000_000 + decoding + gaussians));
         let many = Sizes { tile_entries: 5_000_000, ..sizes };
+        let densifying = Sizes { densifies: true, ..sizes };
+        assert_eq!(Forecast::new(&densifying).per_gaussian, Forecast::new(&sizes).per_gaussian + 236);
         let training = 40_000_000 + 56 * 5_000_000;
         assert_eq!(Forecast::new(&many).peak(1000), Bytes(BASE + 6_000_000 + training + gaussians));
     }
@@ -184,8 +190,16 @@ mod tests {
             let pull = size_of_val(&state.pull.sum[..]) + size_of_val(&state.pull.views[..]);
             // Parameters, moments, pulls, and the gradient of a step.
             let known = bytes(&state.gaussians) * 2 + bytes(&state.adam.first) + bytes(&state.adam.second) + pull;
-            let sizes =
-                Sizes { photographs: 0, pixels: 0, width: 0, file: (0, 0), tile_entries: 0, threads: 1, sh_degree };
+            let sizes = Sizes {
+                photographs: 0,
+                pixels: 0,
+                width: 0,
+                file: (0, 0),
+                tile_entries: 0,
+                threads: 1,
+                sh_degree,
+                densifies: false,
+            };
             let told = Forecast::new(&sizes).per_gaussian * n as u64;
             assert!(told >= known as u64 && told < 2 * known as u64, "degree {sh_degree}: {told} of {known}");
         }

@@ -40,7 +40,13 @@ pub fn psnr(a: &[f32], b: &[f32]) -> f64 {
 ///
 /// # Errors
 /// When the photograph or its mask cannot be read.
-pub fn measure(g: &Gaussians, view: &View, options: &RasterOptions, alpha: Alpha, masks: &Masks) -> Result<ViewMetrics> {
+pub fn measure(
+    g: &Gaussians,
+    view: &View,
+    options: &RasterOptions,
+    alpha: Alpha,
+    masks: &Masks,
+) -> Result<ViewMetrics> {
     let target = exact_target(view, masks, behind(alpha, options.background))?;
     let (psnr, ssim) = compare(g, &view.camera, options, &target, alpha);
     let split = if view.split == Split::Test { "test" } else { "train" };

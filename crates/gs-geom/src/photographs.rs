@@ -82,7 +82,16 @@ impl<'a> Photographs<'a> {
     /// No photographs, such as held-out ones where there are none.
     pub fn none() -> Self {
         let masks = Masks::default();
-        Self { views: vec![], masks, budget: 0, bytes: vec![], divisor: 1, cameras: vec![], full: vec![], small: vec![] }
+        Self {
+            views: vec![],
+            masks,
+            budget: 0,
+            bytes: vec![],
+            divisor: 1,
+            cameras: vec![],
+            full: vec![],
+            small: vec![],
+        }
     }
 
     /// Bytes of the photographs that are kept at their own size.

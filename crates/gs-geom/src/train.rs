@@ -223,6 +223,10 @@ impl<'a> Trainer<'a> {
         let degree = schedule.sh_degree(iteration, gaussians.sh_degree);
         let raster = RasterOptions { background, sh_degree: degree, ..RasterOptions::default() };
         let rendered = forward(gaussians, camera, &raster);
+        let undrawn = rendered.dropped();
+        for (most, now) in progress.undrawn.iter_mut().zip([undrawn.not_finite, undrawn.degenerate]) {
+            *most = (*most).max(now as u64);
+        }
         lap(&mut self.timings.forward);
         // What the photograph would show, and which of its pixels count.
         let rgb = &rendered.rendered.rgb;
@@ -306,6 +310,8 @@ impl<'a> Trainer<'a> {
         }
         progress.iteration = iteration;
         self.last = loss;
+        // Room for the held-out views.
+        drop((rendered, target, gradients));
         self.note(loss)?;
         lap(&mut self.timings.rest);
         Ok(())

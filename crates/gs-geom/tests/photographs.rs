@@ -143,8 +143,8 @@ fn exposures_that_differ_are_compensated() {
 fn alpha_error(file: &str) -> f64 {
     let g = ply::read_gaussians(file).unwrap();
     let alpha = |g: &Gaussians, c: &Camera| render(g, c, &RasterOptions::default()).alpha;
-    let errors = cameras().iter().map(|c| {
-        let (a, b) = (alpha(&g, c), alpha(&balls(), c));
+    let errors = cameras().into_iter().map(|c| {
+        let (a, b) = (alpha(&g, &c), alpha(&balls(), &c));
         a.iter().zip(&b).map(|(a, b)| f64::from((a - b).abs())).sum::<f64>() / a.len() as f64
     });
     errors.sum::<f64>() / VIEWS as f64
@@ -222,7 +222,8 @@ fn a_run_starts_from_what_it_is_told_to() {
         (&cloud, 7, "starting from the 7 points"),
         (&gaussians, 40, "40 Gaussians"),
     ] {
-        let all = ["train", "--scene", &scene, "--out", &out, "--iterations", "2", "--init-points", "55", "--init", init];
+        let all =
+            ["train", "--scene", &scene, "--out", &out, "--iterations", "2", "--init-points", "55", "--init", init];
         let said = succeeds(&all);
         assert!(said.contains(says), "{init}: {said}");
         assert_eq!(ply::read_gaussians(&out).unwrap().len(), count, "{init}");

@@ -84,8 +84,7 @@ impl<'a> ArtifactWriter<'a> {
             offset = data_offsets.1;
             infos.push((name.clone(), TensorInfo { dtype: *dtype, shape: shape.clone(), data_offsets }));
         }
-        let metadata =
-            Metadata::new(Some(HashMap::from([(KEY.to_string(), json)])), infos).map_err(|e| fail(&e))?;
+        let metadata = Metadata::new(Some(HashMap::from([(KEY.to_string(), json)])), infos).map_err(|e| fail(&e))?;
         let mut header = serde_json::to_vec(&metadata).map_err(|e| fail(&e))?;
         header.resize(header.len().next_multiple_of(8), b' ');
         write_atomic(path, |w| {

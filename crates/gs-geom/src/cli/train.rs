@@ -318,7 +318,7 @@ impl TrainArgs {
             let sizes = options.schedule.coarse.iter().map(|(last, divisor)| format!("1/{divisor} until {last}"));
             stage.info(&format!("picture sizes: {}, then full", sizes.collect::<Vec<_>>().join(", ")));
         }
-        let forecast = self.forecast(&dataset, &masks, &state.gaussians, stage)?;
+        let forecast = self.forecast(&dataset, &masks, &state.gaussians, &options.schedule, stage)?;
         // The training views' smaller pictures are not there yet.
         let left = full_share(self.cache_bytes()).saturating_sub(photographs.kept_bytes());
         let heldout = Photographs::load(heldout, masks, left)?;
@@ -332,7 +332,14 @@ impl TrainArgs {
     }
 
     /// Says how much memory the run will take, with the Gaussians there are and with the most there may be.
-    fn forecast(&self, dataset: &Dataset, masks: &Masks, gaussians: &Gaussians, stage: &Stage) -> Result<Forecast> {
+    fn forecast(
+        &self,
+        dataset: &Dataset,
+        masks: &Masks,
+        gaussians: &Gaussians,
+        schedule: &Schedule,
+        stage: &Stage,
+    ) -> Result<Forecast> {
         let now = gaussians.len();
         let most = if self.fixed_points { now } else { self.max_gaussians.max(now) };
         let mut size = (0, 0);
@@ -352,6 +359,7 @@ impl TrainArgs {
         };
         let train = kept(Split::Train, self.cache_bytes())?;
         let heldout = kept(Split::Test, full_share(self.cache_bytes()).saturating_sub(train))?;
+        let last = schedule.densify_until.min(schedule.iterations);
         let forecast = Forecast::new(&memory::Sizes {
             photographs: (train + heldout) as u64,
             pixels: dataset.views.iter().map(pixels).max().unwrap_or(0),
@@ -360,6 +368,7 @@ impl TrainArgs {
             tile_entries: entries,
             threads: rayon::current_num_threads(),
             sh_degree: self.sh_degree,
+            densifies: !self.fixed_points && (1..=last).any(|i| schedule.densifies(i)),
         });
         stage.info(&format!(
             "memory: about {} with {now} Gaussians, at most {} with {most} (photographs {}, pictures {}, {} bytes a Gaussian)",
@@ -434,10 +443,9 @@ impl TrainArgs {
             return self.start_points(&dataset.points, extent, stage).map_err(|e| e.file(&self.scene.scene));
         }
         if self.fixed_points {
-            return Err(Error::new("no points to keep")
-                .file(&self.scene.scene)
-                .field("points")
-                .hint("--fixed-points needs a dataset with points, such as ScanNet's vertices, or --init with a file"));
+            return Err(Error::new("no points to keep").file(&self.scene.scene).field("points").hint(
+                "--fixed-points needs a dataset with points, such as ScanNet's vertices, or --init with a file",
+            ));
         }
         let why = if self.init == Init::Points { "the dataset has no points: " } else { "" };
         stage.info(&format!("{why}starting from {} random points", self.init_points));
@@ -541,6 +549,12 @@ impl TrainArgs {
         if progress.dropped > 0 {
             stage.warn(&format!("{} gradients of Gaussians were not finite and were not used", progress.dropped));
         }
+        let [not_finite, degenerate] = progress.undrawn;
+        if not_finite + degenerate > 0 {
+            stage.warn(&format!(
+                "Gaussians that could not be drawn, in the worst iteration: {not_finite} not finite, {degenerate} of a shape beyond single precision or with a quaternion of length 0"
+            ));
+        }
         let curve: String = progress.curve.iter().map(|line| format!("{line}\n")).collect();
         write_bytes(beside(&self.out, ".curve.jsonl"), curve.as_bytes())?;
         write_bytes(beside(&self.out, ".curve.svg"), curve::svg(&progress.curve).as_bytes())?;
@@ -569,6 +583,7 @@ impl TrainArgs {
             "ssim_heldout": ssim,
             "iterations": progress.iteration,
             "dropped_gradients": progress.dropped,
+            "most_undrawn": {"not_finite": progress.undrawn[0], "degenerate": progress.undrawn[1]},
             "memory_predicted_bytes": predicted,
             "extended_after": progress.extended,
             "seconds": seconds(timings),
