@@ -30,6 +30,7 @@ pub(crate) struct Splat {
     pub extent: [Real; 2],
     /// sigma at which alpha falls below 1/255: ln(255 opacity).
     pub sigma_max: Real,
+    /// The antialiasing's compensation included.
     pub opacity: Real,
     pub log2_opacity: Real,
     pub depth: Real,
@@ -122,15 +123,18 @@ struct Ellipse {
     /// Inverse of the projected covariance: xx, xy, yy.
     conic: [Real; 3],
     conic_det: Real,
+    /// By how much antialiasing lowers the opacity, and its derivative by the projected covariance: xx, xy (once), yy.
+    compensation: Real,
+    d_compensation: [Real; 3],
 }
 
-fn ellipse(p: &Parameters<'_>, lens: &Lens, near: f32) -> Result<Ellipse, Unseen> {
+fn ellipse(p: &Parameters<'_>, lens: &Lens, options: &RasterOptions) -> Result<Ellipse, Unseen> {
     let t = lens.to_camera(p.mean);
     let finite = p.log_scale.iter().chain(&p.rotation).all(|v| v.is_finite());
     if !(t.is_finite() && finite) {
         return Err(Unseen::NotFinite);
     }
-    if t.z <= near as Real {
+    if t.z <= options.near as Real {
         return Err(Unseen::Behind);
     }
     let [w, x, y, z] = p.rotation;
@@ -157,24 +161,57 @@ fn ellipse(p: &Parameters<'_>, lens: &Lens, near: f32) -> Result<Ellipse, Unseen
     // of a large covariance overflow.
     let (a64, b64) = (widen(a), widen(b));
     let (low_pass, aa, bb) = (f64::from(LOW_PASS), a64.length_squared(), b64.length_squared());
-    let det = a64.cross(b64).length_squared() + low_pass * (aa + bb + low_pass);
+    let own_det = a64.cross(b64).length_squared();
+    let det = own_det + low_pass * (aa + bb + low_pass);
     let conic = [(bb + low_pass) / det, -a64.dot(b64) / det, (aa + low_pass) / det].map(|v| v as Real);
     let variance = [aa + low_pass, bb + low_pass].map(|v| v as Real);
     let whole = det.is_finite() && conic.iter().chain(&variance).all(|v| v.is_finite());
     if !(whole && conic[0] > 0.0 && conic[2] > 0.0) {
         return Err(Unseen::Degenerate);
     }
-    Ok(Ellipse { t, clamped, inside, jw, m, quat, quat_norm, scale, variance, conic, conic_det: (1.0 / det) as Real })
+    // c^2 = det(C) / det(C + k I): by Cayley and Hamilton, the derivative of c by C is k / (2 c det(C + k I)) times the
+    // product of adj(C) and (C + k I)^-1, which cancels nothing.
+    let (mut compensation, mut d_compensation) = (1.0, [0.0; 3]);
+    if options.antialias {
+        let c = (own_det / det).sqrt();
+        let (xx, xy, yy) = ((bb + low_pass) / det, -a64.dot(b64) / det, (aa + low_pass) / det);
+        let (adj_xx, adj_xy, adj_yy) = (bb, -a64.dot(b64), aa);
+        let k = 0.5 * low_pass / (c * det);
+        compensation = c as Real;
+        d_compensation =
+            [k * (adj_xx * xx + adj_xy * xy), k * (adj_xx * xy + adj_xy * yy), k * (adj_xy * xy + adj_yy * yy)]
+                .map(|v| v as Real);
+    }
+    let conic_det = (1.0 / det) as Real;
+    Ok(Ellipse {
+        t,
+        clamped,
+        inside,
+        jw,
+        m,
+        quat,
+        quat_norm,
+        scale,
+        variance,
+        conic,
+        conic_det,
+        compensation,
+        d_compensation,
+    })
+}
+
+fn sigmoid(logit: Real) -> Real {
+    1.0 / (1.0 + (-logit).exp())
 }
 
 /// Projects a Gaussian; the error says why it cannot touch the image.
 pub(crate) fn project(p: &Parameters<'_>, lens: &Lens, options: &RasterOptions) -> Result<Splat, Unseen> {
     // Infinite logits are opacities of 0 and 1.
-    let opacity = 1.0 / (1.0 + (-p.opacity_logit).exp());
-    if opacity.is_nan() {
+    if p.opacity_logit.is_nan() {
         return Err(Unseen::NotFinite);
     }
-    let e = ellipse(p, lens, options.near)?;
+    let e = ellipse(p, lens, options)?;
+    let opacity = sigmoid(p.opacity_logit) * e.compensation;
     if opacity < ALPHA_MIN {
         return Err(Unseen::Transparent);
     }
@@ -252,7 +289,7 @@ pub(crate) fn project_backward(
     d: &SplatGradient,
     d_sh: &mut [Real],
 ) -> Option<ParameterGradient> {
-    let e = ellipse(p, lens, options.near).ok()?;
+    let e = ellipse(p, lens, options).ok()?;
     let mut d_color = d.color;
     for c in 0..3 {
         if splat.clamped[c] {
@@ -267,7 +304,11 @@ pub(crate) fn project_backward(
     let (da, db, dc) = (d.conic[0], 0.5 * d.conic[1], d.conic[2]);
     let (p00, p01) = (a * da + b * db, a * db + b * dc);
     let (p10, p11) = (b * da + c * db, b * db + c * dc);
-    let d_cov = [-(p00 * a + p01 * b), -(p00 * b + p01 * c), -(p10 * b + p11 * c)];
+    let mut d_cov = [-(p00 * a + p01 * b), -(p00 * b + p01 * c), -(p10 * b + p11 * c)];
+    let own_opacity = sigmoid(p.opacity_logit);
+    for (d_cov, by) in d_cov.iter_mut().zip(e.d_compensation) {
+        *d_cov += d.opacity * own_opacity * by;
+    }
 
     // cov2d = (JW) Sigma (JW)^T, Sigma = M M^T.
     let mt = e.m.transpose();
@@ -316,7 +357,7 @@ pub(crate) fn project_backward(
         mean: d_mean.into(),
         log_scale: log_scale.into(),
         rotation,
-        opacity_logit: d.opacity * splat.opacity * (1.0 - splat.opacity),
+        opacity_logit: d.opacity * splat.opacity * (1.0 - own_opacity),
     };
     let ParameterGradient { mean, log_scale, rotation, opacity_logit } = &gradient;
     let groups = [&mean[..], log_scale, rotation, &[*opacity_logit], d_sh, &d.mean, &d.mean_abs];

@@ -108,12 +108,14 @@ fn ellipses(scene: &[Gaussian], camera: &Camera, options: &RasterOptions) -> Vec
         let xy = row_x.dot(covariance * row_y);
         let yy = row_y.dot(covariance * row_y) + low_pass;
         let det = xx * yy - xy * xy;
+        let own = (xx - low_pass) * (yy - low_pass) - xy * xy;
+        let compensation = if options.antialias { (own.max(0.0) / det).sqrt() } else { 1.0 };
         let (mx, my, z) = camera.project(DVec3::from(g.mean));
         out.push(Ellipse {
             id,
             mean: DVec2::new(mx, my),
             conic: [yy / det, -xy / det, xx / det],
-            opacity: 1.0 / (1.0 + (-g.opacity_logit).exp()),
+            opacity: compensation / (1.0 + (-g.opacity_logit).exp()),
             z,
             color: color(&g.sh, DVec3::from(g.mean) - camera.position(), options.sh_degree).map(|c| c.max(0.0)),
         });

@@ -11,11 +11,14 @@ pub struct RasterOptions {
     pub sh_degree: u8,
     /// Gaussians nearer than this (camera z, world units) are not drawn.
     pub near: f32,
+    /// Multiply opacities by sqrt(det(covariance) / det(covariance + 0.3 I)), so that a Gaussian smaller than a pixel keeps
+    /// its weight when the low-pass widens it (the 2D filter of Mip-Splatting, Yu et al. 2024, as gsplat's "antialiased").
+    pub antialias: bool,
 }
 
 impl Default for RasterOptions {
     fn default() -> Self {
-        Self { background: [0.0; 3], sh_degree: 3, near: 0.01 }
+        Self { background: [0.0; 3], sh_degree: 3, near: 0.01, antialias: false }
     }
 }
 
