@@ -148,12 +148,12 @@ mod tests {
         let rgb = pixels(200, 0.37);
         let mut exposures = Exposures::new(3);
         let mut out = Vec::new();
-        for step in 0..600 {
+        for step in 0..1500 {
             let view = step % 3;
             apply(&exposures.maps[view], &rgb, &mut out);
             let mut gradient: Vec<f32> = out.iter().zip(&rgb).map(|(o, p)| o - gains[view] * p).collect();
             let of_map = backward(&exposures.maps[view], &rgb, &mut gradient);
-            exposures.step(view, &of_map, step as f64 / 600.0);
+            exposures.step(view, &of_map, step as f64 / 1500.0);
         }
         for (view, gain) in gains.iter().enumerate() {
             apply(&exposures.maps[view], &rgb, &mut out);

@@ -46,6 +46,8 @@ pub struct TrainOptions {
     pub random_background: bool,
     /// What transparent pixels of the photographs mean.
     pub alpha: Alpha,
+    /// Keep the light of Gaussians smaller than a pixel (the 2D filter of Mip-Splatting, Yu et al. 2024).
+    pub antialias: bool,
     /// Learn an affine map of colours for each training photograph.
     pub exposure: bool,
     /// Keep number, order and positions of the Gaussians: Gaussian i is point i (ScanNet protocol).
@@ -66,6 +68,7 @@ impl TrainOptions {
             background: [0.0; 3],
             random_background: false,
             alpha: Alpha::default(),
+            antialias: false,
             exposure: false,
             fixed_points: false,
         }
@@ -221,7 +224,12 @@ impl<'a> Trainer<'a> {
 
         let State { gaussians, adam, pull, exposures, progress } = &mut self.state;
         let degree = schedule.sh_degree(iteration, gaussians.sh_degree);
-        let raster = RasterOptions { background, sh_degree: degree, ..RasterOptions::default() };
+        let raster = RasterOptions {
+            background,
+            sh_degree: degree,
+            antialias: self.options.antialias,
+            ..RasterOptions::default()
+        };
         let rendered = forward(gaussians, camera, &raster);
         let undrawn = rendered.dropped();
         for (most, now) in progress.undrawn.iter_mut().zip([undrawn.not_finite, undrawn.degenerate]) {
@@ -369,7 +377,7 @@ impl<'a> Trainer<'a> {
     pub fn heldout(&self) -> Result<Option<(f64, f64)>> {
         let g = &self.state.gaussians;
         let background = self.options.background;
-        let options = RasterOptions { background, ..RasterOptions::default() };
+        let options = RasterOptions { background, antialias: self.options.antialias, ..RasterOptions::default() };
         let compare = |i: usize| {
             let target = self.heldout.target(i, metrics::behind(self.options.alpha, background))?;
             Ok(metrics::compare(g, self.heldout.camera(i), &options, &target, self.options.alpha))

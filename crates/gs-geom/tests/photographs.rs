@@ -10,7 +10,8 @@ use std::path::Path;
 use std::process::{Command, Output};
 
 const SIZE: (u32, u32) = (64, 48);
-const VIEWS: usize = 12;
+const VIEWS: usize = 24;
+const ITERATIONS: &str = "1000";
 
 fn run(arguments: &[&str]) -> Output {
     Command::new(env!("CARGO_BIN_EXE_gs-geom")).args(arguments).output().unwrap()
@@ -96,7 +97,7 @@ impl Folder {
     /// Trains; the run's summary.
     fn train(&self, out: &str, more: &[&str]) -> Value {
         let (scene, out) = (self.path("scene"), self.path(out));
-        let all = ["train", "--scene", &scene, "--out", &out, "--iterations", "330", "--holdout", "6"];
+        let all = ["train", "--scene", &scene, "--out", &out, "--iterations", ITERATIONS, "--holdout", "6"];
         let all = [&all[..], &["--sh-degree", "0", "--max-gaussians", "400", "--schedule", "full"], more].concat();
         succeeds(&all);
         let record: Value = serde_json::from_slice(&fs::read(format!("{out}.run.json")).unwrap()).unwrap();
@@ -110,8 +111,9 @@ fn psnr(summary: &Value) -> f64 {
 
 #[test]
 fn exposures_that_differ_are_compensated() {
-    // Views 0 and 6 are held out and as the scene is; the others' gains have a mean of 1.
-    let gain = |i: usize| 1.0 + 0.3 * ((i % 6) as f32 - 3.0) / 2.0;
+    // From one side all is bright, from the other dark. Every sixth view is held out and as the scene is; the others' gains
+    // have a mean of 1.
+    let gain = |i: usize| 1.0 + 0.3 * (i as f32 / VIEWS as f32 * std::f32::consts::TAU).sin();
     let dir = Folder::new(false, |i, pixels| {
         if i % 6 != 0 {
             pixels.iter_mut().for_each(|p| p[..3].iter_mut().for_each(|v| *v *= gain(i)));
@@ -121,13 +123,17 @@ fn exposures_that_differ_are_compensated() {
     let with = dir.train("b.ply", &["--exposure", "--threads", "1"]);
     assert!(psnr(&with) > psnr(&without) + 2.0, "{} {}", psnr(&with), psnr(&without));
     let maps: Value = serde_json::from_slice(&fs::read(dir.path("b.ply.exposures.json")).unwrap()).unwrap();
-    assert_eq!(maps.as_object().unwrap().len(), VIEWS - 2);
-    let (dark, bright) = (maps["01.png"][1][1].as_f64().unwrap(), maps["11.png"][1][1].as_f64().unwrap());
-    assert!(dark < 0.85 && bright > 1.15, "{maps}");
+    assert_eq!(maps.as_object().unwrap().len(), VIEWS - 4);
+    // What a grey becomes: maps may mix the channels as well.
+    let green = |name: &str| (0..3).map(|c| maps[name][1][c].as_f64().unwrap()).sum::<f64>();
+    for i in [5, 19] {
+        let found = green(&format!("{i:02}.png"));
+        assert!((found - f64::from(gain(i))).abs() < 0.06, "{i}: {found} {}", gain(i));
+    }
     // In parts, on other threads: the maps and their moments are part of the checkpoint.
-    for last in ["7", "101"] {
+    for last in ["7", "301"] {
         let (scene, out) = (dir.path("scene"), dir.path("c.ply"));
-        let all = ["train", "--scene", &scene, "--out", &out, "--iterations", "330", "--holdout", "6"];
+        let all = ["train", "--scene", &scene, "--out", &out, "--iterations", ITERATIONS, "--holdout", "6"];
         let all = [&all[..], &["--sh-degree", "0", "--max-gaussians", "400", "--schedule", "full"]].concat();
         succeeds(&[&all[..], &["--exposure", "--stop-after", last]].concat());
     }
@@ -152,20 +158,27 @@ fn alpha_error(file: &str) -> f64 {
 
 #[test]
 fn alpha_is_learnt_from_transparent_photographs() {
-    let dir = Folder::new(true, |_, _| ());
     // Over black, dark things may be transparent or opaque; over any colour, or where alpha is compared, they may not.
+    let dir = Folder::new(true, |_, pixels| {
+        pixels.iter_mut().for_each(|p| p[..3].iter_mut().for_each(|v| *v *= 0.1));
+    });
     let background = dir.train("a.ply", &[]);
     dir.train("b.ply", &["--alpha", "match"]);
     dir.train("c.ply", &["--background", "random"]);
     let [plain, matched, random] = ["a.ply", "b.ply", "c.ply"].map(|f| alpha_error(&dir.path(f)));
-    assert!(matched < 0.8 * plain && random < plain, "{plain} {matched} {random}");
-    assert!(psnr(&background) > 22.0, "{background}");
-    // What is rendered over white is what is measured over white.
-    let (scene, geometry, out) = (dir.path("scene"), dir.path("b.ply"), dir.path("m.json"));
-    let eval = ["eval", "--scene", &scene, "--geometry", &geometry, "--holdout", "6", "--background", "white"];
-    succeeds(&[&eval[..], &["--out", &out]].concat());
-    let m: Value = serde_json::from_slice(&fs::read(&out).unwrap()).unwrap();
-    assert!(psnr(&m) > 18.0, "{m}");
+    assert!(matched < 0.6 * plain && random < 0.8 * plain, "{plain} {matched} {random}");
+    assert!(psnr(&background) > 30.0, "{background}");
+    // What should be opaque hides a background of another colour.
+    let (scene, out) = (dir.path("scene"), dir.path("m.json"));
+    let over_white = |geometry: &str| {
+        let geometry = dir.path(geometry);
+        let all = ["eval", "--scene", &scene, "--geometry", &geometry, "--holdout", "6", "--background", "white"];
+        succeeds(&[&all[..], &["--out", &out]].concat());
+        let m: Value = serde_json::from_slice(&fs::read(&out).unwrap()).unwrap();
+        psnr(&m)
+    };
+    let (plain, matched) = (over_white("a.ply"), over_white("b.ply"));
+    assert!(matched > plain + 2.0, "{plain} {matched}");
 }
 
 #[test]
@@ -197,16 +210,44 @@ fn masked_pixels_do_not_count() {
         psnr(&m)
     };
     let (without, with) = (eval("a.ply"), eval("b.ply"));
-    assert!(with > without + 2.0 && (with - psnr(&masked)).abs() < 0.2, "{without} {with} {masked}");
+    assert!(with > without + 1.0 && (with - psnr(&masked)).abs() < 0.2, "{without} {with} {masked}");
     // Without a mask for some, and for all.
     fs::remove_file(Path::new(&masks).join("01.png")).unwrap();
     let out = dir.path("c.ply");
     let train = ["train", "--scene", &scene, "--out", &out, "--iterations", "3", "--masks"];
-    assert!(succeeds(&[&train[..], &[&masks]].concat()).contains("1 of 12 photographs have no mask"));
+    assert!(succeeds(&[&train[..], &[&masks]].concat()).contains("1 of 24 photographs have no mask"));
     fs::create_dir(dir.path("none")).unwrap();
     let o = run(&[&train[..], &[&dir.path("none")]].concat());
     let said = String::from_utf8_lossy(&o.stderr);
     assert!(o.status.code() == Some(2) && said.contains("no masks in this folder"), "{said}");
+}
+
+#[test]
+fn antialiased_gaussians_say_so_and_are_rendered_so() {
+    let dir = Folder::new(false, |_, _| ());
+    let (scene, out) = (dir.path("scene"), dir.path("m.json"));
+    dir.train("a.ply", &[]);
+    let learnt = psnr(&dir.train("b.ply", &["--antialias"]));
+    let eval = |geometry: &str, resolution: &str| {
+        let all = ["eval", "--scene", &scene, "--geometry", geometry, "--holdout", "6", "--resolution", resolution];
+        succeeds(&[&all[..], &["--out", &out]].concat());
+        let m: Value = serde_json::from_slice(&fs::read(&out).unwrap()).unwrap();
+        psnr(&m)
+    };
+    let (plain, filtered) = (dir.path("a.ply"), dir.path("b.ply"));
+    assert!((eval(&filtered, "1") - learnt).abs() < 0.2);
+    // Far away, where Gaussians are smaller than pixels, those learnt without the filter are too thick.
+    let (coarse, coarse_filtered) = (eval(&plain, "8"), eval(&filtered, "8"));
+    assert!(coarse_filtered > coarse, "{coarse} {coarse_filtered}");
+    // What says so is the comment; convert hands it on.
+    let converted = dir.path("c.ply");
+    succeeds(&["convert", &filtered, &converted]);
+    assert!(ply::is_antialiased(&converted).unwrap() && !ply::is_antialiased(&plain).unwrap());
+    let mut bytes = fs::read(&filtered).unwrap();
+    let at = bytes.windows(14).position(|w| w == b"antialias true").unwrap();
+    bytes[at..at + 14].copy_from_slice(b"antialias none");
+    fs::write(&filtered, bytes).unwrap();
+    assert!((eval(&filtered, "8") - coarse_filtered).abs() > 0.01);
 }
 
 #[test]

@@ -6,6 +6,7 @@ use artifacts::role;
 use gs_io::{Error, Result, hash_file, write_bytes};
 use gs_raster::RasterOptions;
 use gs_scene::dataset::{Split, View};
+use gs_scene::ply;
 use serde_json::json;
 use stage::Stage;
 use std::collections::BTreeMap;
@@ -39,7 +40,11 @@ impl EvalArgs {
             split = Split::Train;
             views = dataset.views_of(split).collect();
         }
-        let options = RasterOptions { background: self.scene.background.color(), ..RasterOptions::default() };
+        let options = RasterOptions {
+            background: self.scene.background.color(),
+            antialias: ply::is_antialiased(&self.geometry)?,
+            ..RasterOptions::default()
+        };
         let mut progress = stage.progress("view", views.len() as u64);
         let mut figures: Vec<ViewMetrics> = Vec::new();
         for view in &views {
@@ -70,6 +75,7 @@ impl EvalArgs {
             "holdout": self.scene.holdout,
             "background": self.scene.background.color(),
             "alpha": alpha,
+            "antialias": options.antialias,
         });
         let mut inputs = BTreeMap::from([
             (role::DATASET.to_string(), dataset.hash()?),

@@ -62,6 +62,10 @@ pub(super) struct TrainArgs {
     /// Most Gaussians there may be; with --densify mcmc how many there will be, if the iterations suffice
     #[arg(long, value_name = "COUNT", default_value_t = DensifyOptions::default().max_gaussians)]
     pub(super) max_gaussians: usize,
+    /// Keep the light of Gaussians smaller than a pixel (the 2D filter of Mip-Splatting), so that renders at other sizes
+    /// than the photographs' are neither thick nor dark. The PLY says so, and render and eval do as it says
+    #[arg(long)]
+    antialias: bool,
     /// Learn an affine map of colours for each training photograph, for cameras that chose exposure or white balance by
     /// themselves; held-out views are rendered at the photographs' mean
     #[arg(long)]
@@ -222,6 +226,7 @@ impl TrainArgs {
             background: self.scene.background.color(),
             random_background: self.scene.background == Background::Random,
             alpha: self.masks.alpha(),
+            antialias: self.antialias,
             exposure: self.exposure,
             fixed_points: self.fixed_points,
         })
@@ -349,7 +354,7 @@ impl TrainArgs {
         }
         let pixels = |v: &View| u64::from(v.camera.width) * u64::from(v.camera.height);
         let apart = dataset.views.len().div_ceil(FORECAST_VIEWS).max(1);
-        let options = RasterOptions { sh_degree: 0, ..RasterOptions::default() };
+        let options = RasterOptions { sh_degree: 0, antialias: self.antialias, ..RasterOptions::default() };
         let entries = |v: &View| forward(gaussians, &v.camera, &options).pairs() / (TILE * TILE);
         let entries = dataset.views.iter().step_by(apart).map(entries).max().unwrap_or(0) as u64;
         // As they are loaded: those to learn from first, then those held out in what is left.
@@ -375,7 +380,7 @@ impl TrainArgs {
             forecast.peak(now),
             forecast.peak(most),
             Bytes(forecast.photographs),
-            Bytes(forecast.decoding.max(forecast.pictures + forecast.tiles)),
+            Bytes(forecast.scratch()),
             forecast.per_gaussian
         ));
         Ok(forecast)
