@@ -7,7 +7,7 @@ CARGO ?= cargo
 THREADS ?= 0
 export THREADS
 
-.PHONY: help build demo scene test lint models clip-tiny bench-raster bench-graph bench-geom bench-train bench-cluster bench-query clean
+.PHONY: help build demo scene test lint models clip-tiny bench-raster bench-graph bench-geom bench-growth bench-memory bench-train bench-cluster bench-query clean
 
 help: ## Say what can be made
 	@echo "Targets:"
@@ -41,6 +41,13 @@ lint: ## Check formatting and lints
 
 bench-geom: ## Measure gs-geom's quality for the time: out/bench/geom.json, docs/images/geometry.svg
 	scripts/bench_geom.sh
+
+bench-growth: ## Measure gs-geom's cost against Gaussians, pixels and threads: out/bench/growth.json
+	scripts/bench_growth.sh
+
+bench-memory: ## Hold gs-geom's memory forecast against measured peaks: out/bench/memory.md
+	scripts/bench_memory.sh
+
 bench-train: ## Time feat-train at a million Gaussians: out/bench/train.json
 	$(CARGO) bench -p feat-train --bench train -- --out $(CURDIR)/out/bench/train.json
 

@@ -126,7 +126,8 @@ impl FootprintsBuilder {
     /// # Errors
     /// When the file cannot be written.
     pub fn write(&self, path: impl AsRef<Path>, provenance: Provenance) -> Result<()> {
-        self.writer(provenance)
+        let rows = Columns::of(&self.rows);
+        self.writer(&rows, provenance)
             .tensor("col", &[self.col.len()], &self.col)
             .tensor("weight", &[self.weight.len()], &self.weight)
             .write(path)
@@ -139,20 +140,19 @@ impl FootprintsBuilder {
     pub fn write_with(&self, entries: ScratchEntries, path: impl AsRef<Path>, provenance: Provenance) -> Result<()> {
         let count = entries.count as usize;
         let (col, weight) = entries.finish()?;
-        self.writer(provenance)
+        let rows = Columns::of(&self.rows);
+        self.writer(&rows, provenance)
             .tensor_from_file::<u32>("col", &[count], col)
             .tensor_from_file::<f32>("weight", &[count], weight)
             .write(path)
     }
 
     /// All but the entries.
-    fn writer(&self, mut provenance: Provenance) -> ArtifactWriter {
+    fn writer<'a>(&'a self, rows: &'a Columns, mut provenance: Provenance) -> ArtifactWriter<'a> {
         provenance.format = Footprints::FORMAT.into();
         provenance.version = Footprints::VERSION;
         provenance.extra = json!({ "views": self.views });
         let r = self.rows.len();
-        let column = |f: fn(&Row) -> u32| self.rows.iter().map(f).collect::<Vec<u32>>();
-        let alpha: Vec<f32> = self.rows.iter().map(|r| r.alpha).collect();
         let mut writer = ArtifactWriter::new(provenance);
         if !self.pixels.is_empty() {
             let p = &self.pixels;
@@ -164,13 +164,36 @@ impl FootprintsBuilder {
         }
         writer
             .tensor("kept", &[self.kept.len()], &self.kept)
-            .tensor("row_view", &[r], &column(|r| r.view))
-            .tensor("row_level", &[r], &column(|r| r.level))
-            .tensor("row_mask", &[r], &column(|r| r.mask))
-            .tensor("row_pixels", &[r], &column(|r| r.pixels))
-            .tensor("row_gated", &[r], &column(|r| r.gated))
-            .tensor("row_alpha", &[r], &alpha)
+            .tensor("row_view", &[r], &rows.view)
+            .tensor("row_level", &[r], &rows.level)
+            .tensor("row_mask", &[r], &rows.mask)
+            .tensor("row_pixels", &[r], &rows.pixels)
+            .tensor("row_gated", &[r], &rows.gated)
+            .tensor("row_alpha", &[r], &rows.alpha)
             .tensor("row_ptr", &[r + 1], &self.row_ptr)
+    }
+}
+
+/// The rows, a field at a time.
+struct Columns {
+    view: Vec<u32>,
+    level: Vec<u32>,
+    mask: Vec<u32>,
+    pixels: Vec<u32>,
+    gated: Vec<u32>,
+    alpha: Vec<f32>,
+}
+
+impl Columns {
+    fn of(rows: &[Row]) -> Self {
+        Self {
+            view: rows.iter().map(|r| r.view).collect(),
+            level: rows.iter().map(|r| r.level).collect(),
+            mask: rows.iter().map(|r| r.mask).collect(),
+            pixels: rows.iter().map(|r| r.pixels).collect(),
+            gated: rows.iter().map(|r| r.gated).collect(),
+            alpha: rows.iter().map(|r| r.alpha).collect(),
+        }
     }
 }
 

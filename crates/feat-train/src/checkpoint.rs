@@ -40,8 +40,9 @@ pub fn write(path: &Path, provenance: &Provenance, checkpoint: &Checkpoint) -> R
     let curve: Vec<f64> =
         checkpoint.curve.iter().flat_map(|p| [p.iteration as f64, p.loss, p.alignment, p.separation, p.rate]).collect();
     let provenance = Provenance { format: FORMAT.into(), version: VERSION, ..provenance.clone() };
+    let iteration = [checkpoint.iteration];
     let mut writer = ArtifactWriter::new(provenance)
-        .tensor("iteration", &[1], &[checkpoint.iteration])
+        .tensor("iteration", &[1], &iteration)
         .tensor("window", &[3], &checkpoint.window)
         .tensor("settled", &[2], &checkpoint.settled)
         .tensor("curve", &[checkpoint.curve.len(), 5], &curve)

@@ -18,7 +18,7 @@ use std::sync::Mutex;
 use std::sync::atomic::{AtomicUsize, Ordering};
 
 /// The alternatives: a name and the options that make it.
-const SETTINGS: [(&str, &[&str]); 8] = [
+const SETTINGS: [(&str, &[&str]); 9] = [
     ("3DGS", &["--densify", "adaptive", "--schedule", "full", "--adam", "dense"]),
     ("sparse Adam", &["--densify", "adaptive", "--schedule", "full", "--adam", "sparse"]),
     ("coarse", &["--densify", "adaptive", "--schedule", "coarse", "--adam", "dense"]),
@@ -27,8 +27,10 @@ const SETTINGS: [(&str, &[&str]); 8] = [
     ("absgrad, content", &["--densify", "absgrad", "--schedule", "content", "--adam", "dense"]),
     ("mcmc", &["--densify", "mcmc", "--schedule", "full", "--adam", "dense"]),
     ("mcmc, content", &["--densify", "mcmc", "--schedule", "content", "--adam", "dense"]),
+    ("antialias", &["--densify", "adaptive", "--schedule", "coarse", "--adam", "dense", "--antialias"]),
 ];
-const COLORS: [&str; 8] = ["#444444", "#999999", "#1f77b4", "#d62728", "#17becf", "#ff7f0e", "#2ca02c", "#9467bd"];
+const COLORS: [&str; 9] =
+    ["#444444", "#999999", "#1f77b4", "#d62728", "#17becf", "#ff7f0e", "#2ca02c", "#9467bd", "#8c564b"];
 /// The figures of a run, and what they are called in the record of a run.
 const FIGURES: [&str; 7] =
     ["psnr_heldout", "ssim_heldout", "gaussians", "cpu_seconds", "it_per_cpu_s", "it_per_s", "peak_rss_bytes"];
@@ -58,6 +60,8 @@ struct Options {
     seeds: u32,
     jobs: usize,
     max_gaussians: String,
+    /// Names of the settings to run; all where it is empty.
+    settings: Vec<String>,
 }
 
 fn options() -> Result<Options, String> {
@@ -80,6 +84,14 @@ fn options() -> Result<Options, String> {
             "--seeds" => o.seeds = number()?,
             "--jobs" => o.jobs = number()?.max(1) as usize,
             "--max-gaussians" => o.max_gaussians = value,
+            "--settings" => {
+                // Names have commas in them.
+                o.settings = value.split('/').map(|s| s.trim().to_string()).filter(|s| !s.is_empty()).collect();
+                let known = |s: &&String| SETTINGS.iter().any(|(name, _)| *name == s.as_str());
+                if let Some(unknown) = o.settings.iter().find(|s| !known(s)) {
+                    return Err(format!("--settings: no setting is called {unknown}"));
+                }
+            }
             "--iterations" => {
                 o.iterations = value
                     .split(',')
@@ -109,7 +121,7 @@ fn run(o: &Options, job: &Job) -> Result<Value, String> {
     let folder = o.out.with_extension("runs");
     std::fs::create_dir_all(&folder).map_err(|e| e.to_string())?;
     let out = folder.join(format!("{}-{}-{}-{}.ply", scene.name, job.setting, job.iterations, job.seed));
-    let mut command = Command::new(env!("CARGO_BIN_EXE_gs-geom"));
+    let mut command = Command::new(std::env::var_os("GS_GEOM").unwrap_or(env!("CARGO_BIN_EXE_gs-geom").into()));
     command.args(["train", "--quiet", "--no-resume", "--threads", "1", "--max-gaussians", &o.max_gaussians]);
     command.args(["--resolution", &scene.resolution, "--checkpoint-every", "100000000"]).args(flags);
     command.args(["--iterations", &job.iterations.to_string(), "--seed", &job.seed.to_string()]);
@@ -178,7 +190,9 @@ fn main() -> Result<(), String> {
     for seed in 0..o.seeds {
         for &iterations in &o.iterations {
             for scene in 0..o.scenes.len() {
-                jobs.extend((0..SETTINGS.len()).map(|setting| Job { scene, setting, iterations, seed }));
+                let wanted = |s: &usize| o.settings.is_empty() || o.settings.iter().any(|w| w == SETTINGS[*s].0);
+                let settings = (0..SETTINGS.len()).filter(wanted);
+                jobs.extend(settings.map(|setting| Job { scene, setting, iterations, seed }));
             }
         }
     }

@@ -1,6 +1,7 @@
 //! Checkpoints: everything a run needs to go on to the bytes of an undisturbed one.
 
 use crate::densify::Pull;
+use crate::exposure::{Exposures, NUMBERS};
 use crate::optimiser::Adam;
 use gs_io::{Artifact, ArtifactWriter, Error, Provenance, Result};
 use gs_scene::{Gaussians, sh_coefficients};
@@ -11,7 +12,7 @@ use std::path::{Path, PathBuf};
 /// Format name of the artifact.
 pub const FORMAT: &str = "gs-geom-checkpoint";
 /// Version of the format.
-pub const VERSION: u32 = 2;
+pub const VERSION: u32 = 3;
 
 /// State of an optimisation after some iterations. Random numbers are drawn from the seed and the iteration (see
 /// [`crate::schedule::generator`]), so no generator is part of it.
@@ -23,6 +24,8 @@ pub struct State {
     pub adam: Adam,
     /// What densification has seen.
     pub pull: Pull,
+    /// The photographs' exposures.
+    pub exposures: Exposures,
     /// The rest.
     pub progress: ProgressState,
 }
@@ -34,6 +37,9 @@ pub struct ProgressState {
     pub iteration: u32,
     /// Gradients of Gaussians that were not finite and so not used.
     pub dropped: u64,
+    /// Most Gaussians in an iteration that could not be drawn: not finite; degenerate (see [`gs_raster::Dropped`]).
+    #[serde(default)]
+    pub undrawn: [u64; 2],
     /// Gaussians cloned, split, removed and relocated so far.
     pub densified: [u64; 4],
     /// Sums of loss, L1 and SSIM, and their number, since the last line of the curve.
@@ -59,10 +65,10 @@ pub fn path_of(output: &Path) -> PathBuf {
     name.into()
 }
 
-/// A fresh run's state.
-pub fn start(gaussians: Gaussians) -> State {
+/// A fresh run's state, with the exposures of so many views (see [`Exposures::new`]).
+pub fn start(gaussians: Gaussians, exposures: usize) -> State {
     let (adam, pull) = (Adam::new(&gaussians), Pull::new(gaussians.len()));
-    State { gaussians, adam, pull, progress: ProgressState::default() }
+    State { gaussians, adam, pull, exposures: Exposures::new(exposures), progress: ProgressState::default() }
 }
 
 /// Writes a checkpoint; `provenance` tells by which run.
@@ -73,10 +79,15 @@ pub fn write(path: &Path, state: &State, provenance: Provenance) -> Result<()> {
     let extra =
         Extra { steps: state.adam.steps, sh_degree: state.gaussians.sh_degree, progress: state.progress.clone() };
     let extra = serde_json::to_value(&extra).map_err(|e| Error::new(e.to_string()).file(path))?;
-    let n = state.gaussians.len();
+    let (n, e) = (state.gaussians.len(), &state.exposures);
+    let exposures = [e.maps.len(), NUMBERS];
     let mut writer = ArtifactWriter::new(Provenance { extra, ..provenance })
         .tensor("pull_sum", &[n], &state.pull.sum)
-        .tensor("pull_views", &[n], &state.pull.views);
+        .tensor("pull_views", &[n], &state.pull.views)
+        .tensor("exposure_maps", &exposures, e.maps.as_flattened())
+        .tensor("exposure_first", &exposures, e.first.as_flattened())
+        .tensor("exposure_second", &exposures, e.second.as_flattened())
+        .tensor("exposure_steps", &exposures[..1], &e.steps);
     for (prefix, g) in [("", &state.gaussians), ("first_", &state.adam.first), ("second_", &state.adam.second)] {
         writer = writer
             .tensor(&format!("{prefix}means"), &[n, 3], g.means.as_flattened())
@@ -128,7 +139,17 @@ pub fn read(path: &Path, run: &Provenance) -> Result<Option<State>> {
             sh_degree: extra.sh_degree,
         })
     };
+    let steps = a.tensor::<u32>("exposure_steps", &[None])?.to_vec();
+    let exposure = |name: &str| -> Result<Vec<[f32; NUMBERS]>> {
+        Ok(a.tensor::<f32>(name, &[Some(steps.len()), Some(NUMBERS)])?.as_chunks().0.to_vec())
+    };
     Ok(Some(State {
+        exposures: Exposures {
+            maps: exposure("exposure_maps")?,
+            first: exposure("exposure_first")?,
+            second: exposure("exposure_second")?,
+            steps: steps.clone(),
+        },
         gaussians: group("")?,
         adam: Adam { first: group("first_")?, second: group("second_")?, steps: extra.steps },
         pull: Pull {
@@ -178,14 +199,18 @@ mod tests {
         let fill = |v: &mut [f32], at: f32| v.iter_mut().enumerate().for_each(|(i, v)| *v = at + (i as f32).sin());
         fill(g.means.as_flattened_mut(), 1.0);
         fill(&mut g.sh, 2.0);
-        let mut state = start(g);
+        let mut state = start(g, 3);
         fill(&mut state.adam.first.sh, 3.0);
         fill(state.adam.second.rotations.as_flattened_mut(), 4.0);
         fill(&mut state.pull.sum, 5.0);
+        fill(state.exposures.maps.as_flattened_mut(), 6.0);
+        fill(state.exposures.second.as_flattened_mut(), 7.0);
+        state.exposures.steps = vec![3, 1, 4];
         state.adam.steps = 12;
         state.progress = ProgressState {
             iteration: 12,
             dropped: 3,
+            undrawn: [5, 6],
             densified: [1, 2, 3, 4],
             window: ([0.1, 1.0 / 3.0, f64::MIN_POSITIVE], 7),
             curve: vec!["{\"iteration\":10}".into()],
@@ -206,7 +231,7 @@ mod tests {
         let run = |parameters| Provenance { parameters, ..provenance(1) };
         let dir = tempfile::tempdir().unwrap();
         let path = dir.path().join("c");
-        let mut state = start(zeros(1, 0));
+        let mut state = start(zeros(1, 0), 0);
         state.progress.iteration = 70;
         write(&path, &state, run(parameters(100, 0.5))).unwrap();
         assert_eq!(read(&path, &run(parameters(100, 0.5))).unwrap().unwrap().progress.extended, Vec::<u32>::new());

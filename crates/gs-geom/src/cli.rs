@@ -7,6 +7,7 @@ mod inspect;
 mod render;
 mod train;
 
+use crate::masks::{Alpha, Masks};
 use clap::{Parser, Subcommand, ValueEnum};
 use gs_io::{Error, Result, create_dir, write_bytes};
 use gs_scene::Gaussians;
@@ -72,6 +73,34 @@ struct SceneArgs {
     /// Colour behind the scene, and behind transparent pixels of the photographs
     #[arg(long, value_enum, default_value_t = Background::Black)]
     background: Background,
+}
+
+/// Which pixels of the photographs count.
+#[derive(Debug, Clone, clap::Args)]
+struct MaskArgs {
+    /// What transparent pixels of the photographs (alpha below 1) mean [background; with --masks ignore]
+    #[arg(long, value_enum)]
+    alpha: Option<Alpha>,
+    /// Folder of masks, called as the photographs: what is black there is transparent
+    #[arg(long, value_name = "DIR")]
+    masks: Option<PathBuf>,
+}
+
+impl MaskArgs {
+    fn alpha(&self) -> Alpha {
+        let default = if self.masks.is_some() { Alpha::Ignore } else { Alpha::default() };
+        self.alpha.unwrap_or(default)
+    }
+
+    fn load(&self, dataset: &Dataset, stage: &Stage) -> Result<Masks> {
+        let Some(folder) = &self.masks else { return Ok(Masks::default()) };
+        let masks = Masks::find(folder, &dataset.views)?;
+        let views = dataset.views.len();
+        if masks.len() < views {
+            stage.warn(&format!("{} of {views} photographs have no mask and count wholly", views - masks.len()));
+        }
+        Ok(masks)
+    }
 }
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]

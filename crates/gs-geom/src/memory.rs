@@ -4,7 +4,7 @@
 //! against measured peaks.
 
 use gs_io::Error;
-use gs_scene::{Camera, sh_coefficients};
+use gs_scene::sh_coefficients;
 use serde::Serialize;
 use std::fmt;
 use std::str::FromStr;
@@ -19,8 +19,8 @@ const PER_DECODED_PIXEL: u64 = 15;
 const PER_SHRUNK_PIXEL: u64 = 12;
 /// Per tile that a drawn Gaussian touches: its entry in the tile's list and in the Gaussian's, and its gradient.
 const PER_TILE: u64 = 56;
-/// Per pixel of a cached photograph: 8-bit RGB.
-const PER_CACHED_PIXEL: u64 = 3;
+/// Per Gaussian in a step, besides its gradient: what the renderer keeps of those it draws, and their lists.
+const PER_DRAWN: u64 = 200;
 /// Numbers of a Gaussian besides its spherical harmonics: centre, scales, quaternion, opacity.
 const PLAIN_NUMBERS: u64 = 11;
 
@@ -82,46 +82,66 @@ pub struct Forecast {
     pub per_gaussian: u64,
 }
 
+/// What is known before a run of how large it will be.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Sizes {
+    /// Photographs that are kept decoded, bytes.
+    pub photographs: u64,
+    /// Pixels of the largest view.
+    pub pixels: u64,
+    /// Width of the widest view.
+    pub width: u64,
+    /// Width and height of the largest photograph's file.
+    pub file: (u32, u32),
+    /// How many tiles the Gaussians of a view touch, all told.
+    pub tile_entries: u64,
+    /// Photographs decoded at once.
+    pub threads: usize,
+    /// Degree of the spherical harmonics.
+    pub sh_degree: u8,
+    /// Whether the number of Gaussians may change.
+    pub densifies: bool,
+}
+
 impl Forecast {
-    /// For photographs taken by `cameras`, whose largest file has `file_size` (width and height in pixels), decoded by
-    /// `threads` at once; `tile_entries` is how many tiles the Gaussians of a view touch, all told.
-    pub fn new<'a>(
-        cameras: impl Iterator<Item = &'a Camera> + Clone,
-        file_size: (u32, u32),
-        tile_entries: u64,
-        cache: Bytes,
-        threads: usize,
-        sh_degree: u8,
-    ) -> Self {
-        let pixels = |c: &Camera| u64::from(c.width) * u64::from(c.height);
-        let all: u64 = cameras.clone().map(|c| PER_CACHED_PIXEL * pixels(c)).sum();
-        let numbers = PLAIN_NUMBERS + 3 * sh_coefficients(sh_degree) as u64;
-        // Parameters and two moments; beside them, while a checkpoint is written, its tensors and then its bytes. A step
-        // takes no more: gradients, drawn Gaussians and their tiles.
-        let state = 3 * 4 * numbers + 8;
-        let (most, widest) = cameras.fold((0, 0), |(m, w), c| (pixels(c).max(m), u64::from(c.width).max(w)));
-        let (w, h) = (u64::from(file_size.0), u64::from(file_size.1));
+    /// For a run of these sizes.
+    pub fn new(sizes: &Sizes) -> Self {
+        let numbers = 4 * (PLAIN_NUMBERS + 3 * sh_coefficients(sizes.sh_degree) as u64);
+        // Parameters, two moments and pulls. Beside them in a step: the gradient with that of the projected centre, and
+        // the drawn Gaussians. Densification, at the end of a step, copies the parameters and each moment in turn, and the
+        // allocator does not give all of it back: half as much again was measured.
+        let copy = if sizes.densifies { numbers * 3 / 2 } else { 0 };
+        let (state, step) = (3 * numbers + 8, numbers + 16 + PER_DRAWN + copy);
+        let (w, h) = (u64::from(sizes.file.0), u64::from(sizes.file.1));
+        let shrunk = PER_SHRUNK_PIXEL * (sizes.width * h + 2 * sizes.pixels);
         Self {
-            photographs: all.min(cache.0),
-            decoding: threads as u64 * (PER_DECODED_PIXEL * w * h + PER_SHRUNK_PIXEL * (widest * h + 2 * most)),
-            pictures: PER_PIXEL * most,
-            tiles: PER_TILE * tile_entries,
-            per_gaussian: 3 * state,
+            photographs: sizes.photographs,
+            decoding: sizes.threads as u64 * (PER_DECODED_PIXEL * w * h + shrunk),
+            pictures: PER_PIXEL * sizes.pixels,
+            tiles: PER_TILE * sizes.tile_entries,
+            per_gaussian: state + step,
         }
+    }
+
+    /// What comes and goes. The allocator keeps what decoding took, in pieces into which the pictures and tiles of training
+    /// fit only in part: half of the lesser comes on top, as measured.
+    pub fn scratch(&self) -> u64 {
+        let training = self.pictures + self.tiles;
+        self.decoding.max(training) + self.decoding.min(training) / 2
     }
 
     /// Peak memory with so many Gaussians, bytes.
     pub fn peak(&self, gaussians: usize) -> Bytes {
-        // The allocator keeps what decoding took, and the pictures and tiles of training fit into it.
-        let scratch = self.decoding.max(self.pictures + self.tiles);
-        Bytes((BASE + self.photographs + scratch).saturating_add(self.per_gaussian.saturating_mul(gaussians as u64)))
+        Bytes(
+            (BASE + self.photographs + self.scratch())
+                .saturating_add(self.per_gaussian.saturating_mul(gaussians as u64)),
+        )
     }
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
-    use glam::DVec3;
 
     #[test]
     fn amounts_are_read_and_written() {
@@ -139,15 +159,58 @@ mod tests {
     }
 
     #[test]
-    fn the_cache_bounds_the_photographs_and_gaussians_count() {
-        let camera = Camera::look_at(DVec3::X, DVec3::ZERO, DVec3::Z, 1000, 500, 1.0);
-        let of = |cache, tiles| Forecast::new([&camera; 4].into_iter(), (2000, 1000), tiles, Bytes(cache), 2, 3);
-        assert_eq!((of(u64::MAX, 0).photographs, of(100, 0).photographs), (6_000_000, 100));
+    fn the_terms_are_those_of_the_arrays() {
+        let sizes = Sizes {
+            photographs: 6_000_000,
+            pixels: 500_000,
+            width: 1000,
+            file: (2000, 1000),
+            tile_entries: 0,
+            threads: 2,
+            sh_degree: 3,
+            densifies: false,
+        };
         let decoding = 2 * (15 * 2_000_000 + 12 * (1_000_000 + 2 * 500_000));
-        assert_eq!(of(0, 0).decoding, decoding);
-        // Few tiles: decoding needs more at once; many: training does.
-        let gaussians = 1000 * 3 * (12 * 59 + 8);
-        assert_eq!(of(0, 0).peak(1000), Bytes(BASE + decoding + gaussians));
-        assert_eq!(of(0, 5_000_000).peak(1000), Bytes(BASE + 40_000_000 + 56 * 5_000_000 + gaussians));
+        assert_eq!(Forecast::new(&sizes).decoding, decoding);
+        // Few tiles: decoding needs more at once; many: training does. Of the lesser, half counts.
+        let gaussians = 1000 * (3 * 236 + 8 + 236 + 16 + PER_DRAWN);
+        assert_eq!(Forecast::new(&sizes).peak(1000), Bytes(BASE + 6_000_000 + decoding + 20_000_000 + gaussians));
+        let many = Sizes { tile_entries: 5_000_000, ..sizes };
+        let densifying = Sizes { densifies: true, ..sizes };
+        assert_eq!(Forecast::new(&densifying).per_gaussian, Forecast::new(&sizes).per_gaussian + 354);
+        let training = 40_000_000 + 56 * 5_000_000;
+        assert_eq!(Forecast::new(&many).peak(1000), Bytes(BASE + 6_000_000 + training + decoding / 2 + gaussians));
+    }
+
+    #[test]
+    fn a_gaussian_costs_at_least_its_arrays() {
+        use crate::checkpoint::start;
+        use crate::optimiser::zeros;
+        for sh_degree in 0..=3 {
+            let n = 1000;
+            let state = start(zeros(n, sh_degree), 0);
+            let bytes = |g: &gs_scene::Gaussians| {
+                size_of_val(&g.means[..])
+                    + size_of_val(&g.log_scales[..])
+                    + size_of_val(&g.rotations[..])
+                    + size_of_val(&g.opacity_logits[..])
+                    + size_of_val(&g.sh[..])
+            };
+            let pull = size_of_val(&state.pull.sum[..]) + size_of_val(&state.pull.views[..]);
+            // Parameters, moments, pulls, and the gradient of a step.
+            let known = bytes(&state.gaussians) * 2 + bytes(&state.adam.first) + bytes(&state.adam.second) + pull;
+            let sizes = Sizes {
+                photographs: 0,
+                pixels: 0,
+                width: 0,
+                file: (0, 0),
+                tile_entries: 0,
+                threads: 1,
+                sh_degree,
+                densifies: false,
+            };
+            let told = Forecast::new(&sizes).per_gaussian * n as u64;
+            assert!(told >= known as u64 && told < 2 * known as u64, "degree {sh_degree}: {told} of {known}");
+        }
     }
 }

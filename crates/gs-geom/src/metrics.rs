@@ -1,11 +1,12 @@
 //! PSNR and SSIM of renders against photographs.
 
 use crate::loss::{Pair, ssim};
-use crate::photographs::over_background;
+use crate::masks::{Alpha, Masks, multiply};
+use crate::photographs::{Target, exact_target};
 use gs_io::Result;
 use gs_raster::{RasterOptions, render};
-use gs_scene::Gaussians;
 use gs_scene::dataset::{Split, View};
+use gs_scene::{Camera, Gaussians};
 use serde::Serialize;
 
 /// PSNR of equal pictures, dB: the mean squared error counts as at least 1e-10.
@@ -38,19 +39,39 @@ pub fn psnr(a: &[f32], b: &[f32]) -> f64 {
 /// Renders a view and compares it with its photograph. The render is clamped to 0 to 1 but not rounded to 8 bits.
 ///
 /// # Errors
-/// When the photograph cannot be read.
-pub fn measure(g: &Gaussians, view: &View, options: &RasterOptions) -> Result<ViewMetrics> {
-    let target = over_background(view.load_image()?, options.background).rgb;
-    let (psnr, ssim) = compare(g, &view.camera, options, &target);
+/// When the photograph or its mask cannot be read.
+pub fn measure(
+    g: &Gaussians,
+    view: &View,
+    options: &RasterOptions,
+    alpha: Alpha,
+    masks: &Masks,
+) -> Result<ViewMetrics> {
+    let target = exact_target(view, masks, behind(alpha, options.background))?;
+    let (psnr, ssim) = compare(g, &view.camera, options, &target, alpha);
     let split = if view.split == Split::Test { "test" } else { "train" };
     Ok(ViewMetrics { name: view.name.clone(), split, psnr, ssim })
 }
 
-/// PSNR and SSIM of a render against `target`, `[height][width][rgb]`.
-pub fn compare(g: &Gaussians, camera: &gs_scene::Camera, options: &RasterOptions, target: &[f32]) -> (f64, f64) {
+/// What is to lie behind a photograph's transparent pixels, where `background` is behind the scene: pixels that do not
+/// count are black in both pictures.
+pub fn behind(alpha: Alpha, background: [f32; 3]) -> [f32; 3] {
+    if alpha == Alpha::Ignore { [0.0; 3] } else { background }
+}
+
+/// PSNR and SSIM of a render against `target`, which lies over [`behind`]. With [`Alpha::Ignore`] the PSNR is that of the
+/// pixels that count, each weighed by the square of its alpha; in the SSIM the others are black in both pictures.
+pub fn compare(g: &Gaussians, camera: &Camera, options: &RasterOptions, target: &Target, alpha: Alpha) -> (f64, f64) {
     let mut rgb = render(g, camera, options).rgb;
     rgb.iter_mut().for_each(|v| *v = v.clamp(0.0, 1.0));
-    (psnr(&rgb, target), ssim(Pair { render: &rgb, target, width: camera.width as usize }))
+    let mut psnr_gain = 0.0;
+    if let Some(weights) = target.alpha.as_ref().filter(|_| alpha == Alpha::Ignore) {
+        multiply(&mut rgb, weights);
+        let count: f64 = weights.iter().map(|a| f64::from(*a).powi(2)).sum();
+        psnr_gain = 10.0 * (count.max(1e-9) / weights.len().max(1) as f64).log10();
+    }
+    let psnr = (psnr(&rgb, &target.rgb) + psnr_gain).min(MOST_PSNR);
+    (psnr, ssim(Pair { render: &rgb, target: &target.rgb, width: camera.width as usize }))
 }
 
 /// Mean of some figure over views; `None` of none.

@@ -1,14 +1,18 @@
 //! The photographs to learn from, decoded once where memory allows, at the picture size in use.
 
+use crate::masks::Masks;
 use gs_io::Result;
 use gs_scene::dataset::View;
-use gs_scene::{Camera, Image};
+use gs_scene::{Camera, Image, image_has_alpha};
 use rayon::prelude::*;
 
 /// Photographs as 8-bit RGB, with alpha where they have it.
 pub struct Photographs<'a> {
     views: Vec<&'a View>,
+    masks: Masks,
     budget: usize,
+    /// Bytes per pixel of each photograph: 3, and 1 for alpha.
+    bytes: Vec<usize>,
     divisor: u32,
     cameras: Vec<Camera>,
     /// At the views' own size; none where the budget ran out: those are decoded whenever they are wanted.
@@ -36,15 +40,24 @@ impl Picture {
         Image { alpha: self.alpha.as_ref().map(|a| a.iter().map(|&v| unit(v)).collect()), ..image }
     }
 
-    fn over(&self, background: [f32; 3]) -> Vec<f32> {
+    fn over(&self, background: [f32; 3]) -> Target {
         let mut rgb: Vec<f32> = self.rgb.iter().map(|&v| unit(v)).collect();
         for (pixel, &a) in rgb.as_chunks_mut::<3>().0.iter_mut().zip(self.alpha.iter().flatten()) {
             for (v, b) in pixel.iter_mut().zip(background) {
                 *v += (1.0 - unit(a)) * b;
             }
         }
-        rgb
+        Target { rgb, alpha: self.alpha.as_ref().map(|a| a.iter().map(|&v| unit(v)).collect()) }
     }
+}
+
+/// What a render is compared with.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Target {
+    /// `[height][width][rgb]`, 0 to 1, over some background.
+    pub rgb: Vec<f32>,
+    /// `[height][width]`, 0 to 1, where the photograph has an alpha channel or a mask.
+    pub alpha: Option<Vec<f32>>,
 }
 
 fn unit(v: u8) -> f32 {
@@ -56,18 +69,40 @@ impl<'a> Photographs<'a> {
     ///
     /// # Errors
     /// When a photograph cannot be read or has another shape than its camera.
-    pub fn load(views: Vec<&'a View>, budget: usize) -> Result<Self> {
+    pub fn load(views: Vec<&'a View>, masks: Masks, budget: usize) -> Result<Self> {
         let cameras: Vec<Camera> = views.iter().map(|v| v.camera.clone()).collect();
-        // A part is for the smaller pictures of a coarse start, at most half as wide and high.
-        let fits = fitting(&cameras, budget / 5 * 4);
-        let decode = |(view, fits): (&&View, bool)| fits.then(|| decode(view).map(|i| Picture::new(&i))).transpose();
+        let bytes = views.par_iter().map(|v| bytes_per_pixel(v, &masks)).collect::<Result<Vec<usize>>>()?;
+        let fits = fitting(&cameras, &bytes, full_share(budget));
+        let decode =
+            |(view, fits): (&&View, bool)| fits.then(|| decode(view, &masks).map(|i| Picture::new(&i))).transpose();
         let full = views.par_iter().zip(fits).map(decode).collect::<Result<_>>()?;
-        Ok(Self { views, budget, divisor: 1, cameras, full, small: Vec::new() })
+        Ok(Self { views, masks, budget, bytes, divisor: 1, cameras, full, small: Vec::new() })
     }
 
     /// No photographs, such as held-out ones where there are none.
     pub fn none() -> Self {
-        Self { views: vec![], budget: 0, divisor: 1, cameras: vec![], full: vec![], small: vec![] }
+        let masks = Masks::default();
+        Self {
+            views: vec![],
+            masks,
+            budget: 0,
+            bytes: vec![],
+            divisor: 1,
+            cameras: vec![],
+            full: vec![],
+            small: vec![],
+        }
+    }
+
+    /// Bytes of the photographs that are kept at their own size.
+    pub fn kept_bytes(&self) -> usize {
+        let size = |p: &Picture| p.rgb.len() + p.alpha.as_ref().map_or(0, Vec::len);
+        self.full.iter().flatten().map(size).sum()
+    }
+
+    /// Names of the photographs.
+    pub fn names(&self) -> impl Iterator<Item = &str> {
+        self.views.iter().map(|v| v.name.as_str())
     }
 
     /// Number of photographs.
@@ -92,7 +127,7 @@ impl<'a> Photographs<'a> {
         self.small = Vec::new();
         self.cameras = self.views.iter().map(|v| shrunk(&v.camera, divisor)).collect();
         if divisor > 1 {
-            let fits = fitting(&self.cameras, self.budget / 5);
+            let fits = fitting(&self.cameras, &self.bytes, self.budget - full_share(self.budget));
             let shrink = |(i, fits): (usize, bool)| fits.then(|| self.shrink(i)).transpose();
             self.small = fits.into_par_iter().enumerate().map(shrink).collect::<Result<_>>()?;
         }
@@ -108,7 +143,7 @@ impl<'a> Photographs<'a> {
         let camera = &self.views[i].camera;
         match &self.full[i] {
             Some(picture) => Ok(picture.image(camera)),
-            None => Ok(Picture::new(&decode(self.views[i])?).image(camera)),
+            None => Ok(Picture::new(&decode(self.views[i], &self.masks)?).image(camera)),
         }
     }
 
@@ -122,16 +157,16 @@ impl<'a> Photographs<'a> {
         &self.cameras[i]
     }
 
-    /// Photograph `i` as `[height][width][rgb]`, 0 to 1, with `background` behind its transparent pixels.
+    /// Photograph `i` with `background` behind its transparent pixels; over black it is multiplied by its alpha.
     ///
     /// # Errors
     /// When it has to be decoded again and cannot be.
-    pub fn target(&self, i: usize, background: [f32; 3]) -> Result<Vec<f32>> {
+    pub fn target(&self, i: usize, background: [f32; 3]) -> Result<Target> {
         let kept = if self.divisor > 1 { &self.small } else { &self.full };
         match kept.get(i).and_then(Option::as_ref) {
             Some(picture) => Ok(picture.over(background)),
             None if self.divisor > 1 => Ok(self.shrink(i)?.over(background)),
-            None => Ok(Picture::new(&decode(self.views[i])?).over(background)),
+            None => Ok(Picture::new(&decode(self.views[i], &self.masks)?).over(background)),
         }
     }
 }
@@ -142,21 +177,43 @@ pub fn shrunk(camera: &Camera, divisor: u32) -> Camera {
     camera.resized(shrink(camera.width), shrink(camera.height))
 }
 
-/// Which cameras' photographs fit in `budget` bytes, in order.
-fn fitting(cameras: &[Camera], budget: usize) -> Vec<bool> {
+/// The part of a budget that is for photographs at their own size; the rest is for the smaller pictures of a coarse start,
+/// at most half as wide and high.
+pub fn full_share(budget: usize) -> usize {
+    budget / 5 * 4
+}
+
+/// Bytes of a kept photograph's pixel.
+///
+/// # Errors
+/// When the file's header cannot be read.
+pub fn bytes_per_pixel(view: &View, masks: &Masks) -> Result<usize> {
+    Ok(if masks.of(view).is_some() || image_has_alpha(&view.image_path)? { 4 } else { 3 })
+}
+
+/// Which photographs, of `bytes` a pixel, fit in `budget` bytes, in order.
+fn fitting(cameras: &[Camera], bytes: &[usize], budget: usize) -> Vec<bool> {
     let mut left = budget;
-    let fits = |c: &Camera| {
-        let bytes = 3 * c.width as usize * c.height as usize;
+    let fits = |(c, bytes): (&Camera, &usize)| {
+        let bytes = bytes * c.width as usize * c.height as usize;
         let fits = bytes <= left;
         left -= if fits { bytes } else { 0 };
         fits
     };
-    cameras.iter().map(fits).collect()
+    cameras.iter().zip(bytes).map(fits).collect()
 }
 
-/// A view's photograph, multiplied by its alpha: pictures can then be shrunk before a background is put behind them.
-fn decode(view: &View) -> Result<Image> {
+/// A view's photograph, multiplied by its alpha and its mask: pictures can then be shrunk before a background is put behind
+/// them.
+fn decode(view: &View, masks: &Masks) -> Result<Image> {
     let mut image = view.load_image()?;
+    if let Some(mask) = masks.of(view) {
+        let mask = view.load_mask(mask)?;
+        match &mut image.alpha {
+            Some(alpha) => alpha.iter_mut().zip(&mask).for_each(|(a, m)| *a *= m),
+            None => image.alpha = Some(mask),
+        }
+    }
     if let Some(alpha) = &image.alpha {
         for (pixel, a) in image.rgb.chunks_exact_mut(3).zip(alpha) {
             pixel.iter_mut().for_each(|v| *v *= a);
@@ -165,16 +222,18 @@ fn decode(view: &View) -> Result<Image> {
     Ok(image)
 }
 
-/// The picture with a colour behind its transparent pixels.
-pub fn over_background(mut image: Image, background: [f32; 3]) -> Image {
-    if let Some(alpha) = image.alpha.take() {
-        for (pixel, a) in image.rgb.chunks_exact_mut(3).zip(alpha) {
-            for (v, b) in pixel.iter_mut().zip(background) {
-                *v = a * *v + (1.0 - a) * b;
-            }
+/// A view's photograph at full precision, with a colour behind its transparent pixels.
+///
+/// # Errors
+/// When a file cannot be read or has another size than the camera.
+pub fn exact_target(view: &View, masks: &Masks, background: [f32; 3]) -> Result<Target> {
+    let Image { mut rgb, alpha, .. } = decode(view, masks)?;
+    for (pixel, a) in rgb.as_chunks_mut::<3>().0.iter_mut().zip(alpha.iter().flatten()) {
+        for (v, b) in pixel.iter_mut().zip(background) {
+            *v += (1.0 - a) * b;
         }
     }
-    image
+    Ok(Target { rgb, alpha })
 }
 
 #[cfg(test)]
@@ -183,15 +242,21 @@ mod tests {
 
     #[test]
     fn transparent_pixels_show_the_background() {
+        // Multiplied by their alpha.
         let image =
-            Image { width: 2, height: 1, rgb: vec![1.0, 0.5, 0.0, 1.0, 0.5, 0.0], alpha: Some(vec![1.0, 0.25]) };
-        let background = [0.0, 0.5, 1.0];
-        let mut black = image.clone();
-        black.rgb[3..].iter_mut().for_each(|v| *v *= 0.25);
-        let kept = Picture::new(&black).over(background);
-        let flat = over_background(image, background);
-        assert_eq!(flat.rgb, [1.0, 0.5, 0.0, 0.25, 0.5, 0.75]);
-        assert!(flat.alpha.is_none());
-        assert!(kept.iter().zip(&flat.rgb).all(|(a, b)| (a - b).abs() < 0.004), "{kept:?}");
+            Image { width: 2, height: 1, rgb: vec![1.0, 0.5, 0.0, 0.25, 0.125, 0.0], alpha: Some(vec![1.0, 0.25]) };
+        let kept = Picture::new(&image).over([0.0, 0.5, 1.0]);
+        let wanted = [1.0, 0.5, 0.0, 0.25, 0.5, 0.75];
+        assert!(kept.rgb.iter().zip(wanted).all(|(a, b)| (a - b).abs() < 0.004), "{kept:?}");
+        assert!(kept.alpha.unwrap().iter().zip([1.0, 0.25]).all(|(a, b)| (a - b).abs() < 0.002));
+    }
+
+    #[test]
+    fn photographs_fit_by_their_bytes() {
+        let camera = Camera::look_at(glam::DVec3::X, glam::DVec3::ZERO, glam::DVec3::Z, 10, 10, 1.0);
+        let cameras = vec![camera; 3];
+        assert_eq!(fitting(&cameras, &[3, 4, 3], 699), [true, false, true]);
+        assert_eq!(fitting(&cameras, &[3, 4, 3], 700), [true, true, false]);
+        assert_eq!((full_share(0), full_share(1000)), (0, 800));
     }
 }

@@ -2,7 +2,9 @@
 
 use crate::checkpoint::{State, start};
 use crate::densify::{DensifyOptions, Pull, Strategy, densify, reset_opacities};
+use crate::exposure;
 use crate::loss::{Derivatives, Loss, Pair, l1_dssim};
+use crate::masks::{Alpha, alpha_loss, multiply};
 use crate::mcmc::{self, McmcOptions};
 use crate::metrics;
 use crate::optimiser::{Adam, drop_bad_gradients};
@@ -14,7 +16,11 @@ use gs_scene::Gaussians;
 use rand::Rng;
 use serde::Serialize;
 use serde_json::{Value, json};
+use std::borrow::Cow;
 use std::time::{Duration, Instant};
+
+/// Weight of the difference of alpha in the loss, for [`Alpha::Match`].
+const ALPHA_WEIGHT: f32 = 0.1;
 
 /// Every parameter that shapes the result.
 #[derive(Debug, Clone, PartialEq, Serialize)]
@@ -38,6 +44,12 @@ pub struct TrainOptions {
     /// Learn with another colour behind the scene in every iteration, so that what is transparent must be so;
     /// `background` is then for held-out views alone.
     pub random_background: bool,
+    /// What transparent pixels of the photographs mean.
+    pub alpha: Alpha,
+    /// Keep the light of Gaussians smaller than a pixel (the 2D filter of Mip-Splatting, Yu et al. 2024).
+    pub antialias: bool,
+    /// Learn an affine map of colours for each training photograph.
+    pub exposure: bool,
     /// Keep number, order and positions of the Gaussians: Gaussian i is point i (ScanNet protocol).
     pub fixed_points: bool,
 }
@@ -55,6 +67,9 @@ impl TrainOptions {
             dssim_weight: 0.2,
             background: [0.0; 3],
             random_background: false,
+            alpha: Alpha::default(),
+            antialias: false,
+            exposure: false,
             fixed_points: false,
         }
     }
@@ -85,6 +100,9 @@ pub struct Trainer<'a> {
     state: State,
     workspace: Workspace,
     gradient: Vec<f32>,
+    alpha_gradient: Vec<f32>,
+    /// The render through its view's exposure.
+    exposed: Vec<f32>,
     derivatives: Derivatives,
     /// Which Gaussians the last view drew.
     drawn: Vec<bool>,
@@ -102,10 +120,14 @@ impl<'a> Trainer<'a> {
         heldout: Photographs<'a>,
         gaussians: Gaussians,
     ) -> Self {
-        Self::resume(options, extent, train, heldout, start(gaussians))
+        let exposures = if options.exposure { train.len() } else { 0 };
+        Self::resume(options, extent, train, heldout, start(gaussians, exposures))
     }
 
     /// Goes on from a checkpoint.
+    ///
+    /// # Panics
+    /// When the state has exposures of another number of views.
     pub fn resume(
         options: TrainOptions,
         extent: f64,
@@ -114,6 +136,7 @@ impl<'a> Trainer<'a> {
         state: State,
     ) -> Self {
         let order = ViewOrder::new(options.seed, train.len());
+        assert_eq!(state.exposures.maps.len(), if options.exposure { train.len() } else { 0 });
         let last = Loss { l1: 0.0, ssim: 0.0, total: 0.0 };
         let (gradient, derivatives, drawn) = (Vec::new(), Derivatives::default(), Vec::new());
         let timings = Timings::default();
@@ -127,12 +150,19 @@ impl<'a> Trainer<'a> {
             state,
             workspace: Workspace::default(),
             gradient,
+            alpha_gradient: Vec::new(),
+            exposed: Vec::new(),
             derivatives,
             drawn,
             last,
             last_heldout,
             timings,
         }
+    }
+
+    /// Names of the training photographs, in the order of the exposures.
+    pub fn train_names(&self) -> impl Iterator<Item = &str> {
+        self.train.names()
     }
 
     /// The state, for a checkpoint.
@@ -190,19 +220,54 @@ impl<'a> Trainer<'a> {
             true => generator(self.options.seed, Purpose::Background, u64::from(iteration)).random(),
             false => self.options.background,
         };
-        let target = self.train.target(view, background)?;
+        let target = self.train.target(view, metrics::behind(self.options.alpha, background))?;
         let camera = self.train.camera(view);
         lap(&mut self.timings.rest);
 
-        let State { gaussians, adam, pull, progress } = &mut self.state;
+        let State { gaussians, adam, pull, exposures, progress } = &mut self.state;
         let degree = schedule.sh_degree(iteration, gaussians.sh_degree);
-        let raster = RasterOptions { background, sh_degree: degree, ..RasterOptions::default() };
-        let rendered = &self.workspace.forward(gaussians, camera, &raster).rendered;
+        let raster = RasterOptions {
+            background,
+            sh_degree: degree,
+            antialias: self.options.antialias,
+            ..RasterOptions::default()
+        };
+        let rendered = self.workspace.forward(gaussians, camera, &raster);
+        let undrawn = rendered.dropped();
+        for (most, now) in progress.undrawn.iter_mut().zip([undrawn.not_finite, undrawn.degenerate]) {
+            *most = (*most).max(now as u64);
+        }
         lap(&mut self.timings.forward);
-        let pair = Pair { render: &rendered.rgb, target: &target, width: camera.width as usize };
-        let loss = l1_dssim(pair, self.options.dssim_weight, &mut self.gradient, &mut self.derivatives);
+        // What the photograph would show, and which of its pixels count.
+        let rgb = &rendered.rendered.rgb;
+        let map = exposures.maps.get(view).copied();
+        let mut shown = match &map {
+            Some(map) => {
+                exposure::apply(map, rgb, &mut self.exposed);
+                Cow::Borrowed(&self.exposed[..])
+            }
+            None => Cow::Borrowed(&rgb[..]),
+        };
+        let counts = target.alpha.as_ref().filter(|_| self.options.alpha == Alpha::Ignore);
+        if let Some(alpha) = counts {
+            multiply(shown.to_mut(), alpha);
+        }
+        let pair = Pair { render: &shown, target: &target.rgb, width: camera.width as usize };
+        let mut loss = l1_dssim(pair, self.options.dssim_weight, &mut self.gradient, &mut self.derivatives);
+        drop(shown);
+        if let Some(alpha) = counts {
+            multiply(&mut self.gradient, alpha);
+        }
+        if let Some(map) = &map {
+            let gradient = exposure::backward(map, rgb, &mut self.gradient);
+            exposures.step(view, &gradient, f64::from(iteration) / f64::from(schedule.iterations.max(1)));
+        }
+        let mut pixels = PixelGradients { rgb: &self.gradient, alpha: None, depth: None };
+        if let Some(alpha) = target.alpha.as_ref().filter(|_| self.options.alpha == Alpha::Match) {
+            loss.total += alpha_loss(&rendered.rendered.alpha, alpha, ALPHA_WEIGHT, &mut self.alpha_gradient);
+            pixels.alpha = Some(&self.alpha_gradient);
+        }
         lap(&mut self.timings.loss);
-        let pixels = PixelGradients { rgb: &self.gradient, alpha: None, depth: None };
         self.workspace.backward(gaussians, camera, &raster, pixels);
         let Workspace { forward: rendered, gradients, .. } = &mut self.workspace;
         lap(&mut self.timings.backward);
@@ -256,6 +321,8 @@ impl<'a> Trainer<'a> {
         }
         progress.iteration = iteration;
         self.last = loss;
+        // Room for the held-out views.
+        drop(target);
         self.note(loss)?;
         lap(&mut self.timings.rest);
         Ok(())
@@ -305,17 +372,18 @@ impl<'a> Trainer<'a> {
         Ok(())
     }
 
-    /// Mean PSNR and SSIM over the held-out views with all spherical harmonics; none without such views.
+    /// Mean PSNR and SSIM over the held-out views with all spherical harmonics, at the scene's own exposure; none without
+    /// such views.
     ///
     /// # Errors
     /// When a photograph has to be decoded and cannot be.
     pub fn heldout(&self) -> Result<Option<(f64, f64)>> {
         let g = &self.state.gaussians;
         let background = self.options.background;
-        let options = RasterOptions { background, ..RasterOptions::default() };
+        let options = RasterOptions { background, antialias: self.options.antialias, ..RasterOptions::default() };
         let compare = |i: usize| {
-            let target = self.heldout.target(i, background)?;
-            Ok(metrics::compare(g, self.heldout.camera(i), &options, &target))
+            let target = self.heldout.target(i, metrics::behind(self.options.alpha, background))?;
+            Ok(metrics::compare(g, self.heldout.camera(i), &options, &target, self.options.alpha))
         };
         let all = (0..self.heldout.len()).map(compare).collect::<Result<Vec<(f64, f64)>>>()?;
         let psnr = metrics::mean(all.iter().map(|v| v.0));

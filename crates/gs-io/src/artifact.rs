@@ -34,15 +34,15 @@ pub struct Provenance {
     pub extra: serde_json::Value,
 }
 
-/// Collects tensors, then writes them atomically.
-pub struct ArtifactWriter {
+/// Collects tensors, then writes them atomically, without a copy of them.
+pub struct ArtifactWriter<'a> {
     provenance: Provenance,
-    tensors: BTreeMap<String, (Dtype, Vec<usize>, Source)>,
+    tensors: BTreeMap<String, (Dtype, Vec<usize>, Source<'a>)>,
 }
 
 /// Where a tensor's bytes are until they are written.
-enum Source {
-    Memory(Vec<u8>),
+enum Source<'a> {
+    Memory(&'a [u8]),
     File(File),
 }
 
@@ -56,7 +56,7 @@ macro_rules! element {
 }
 element!(f32 => F32, f64 => F64, u8 => U8, u16 => U16, u32 => U32, u64 => U64, i32 => I32, i64 => I64);
 
-impl ArtifactWriter {
+impl<'a> ArtifactWriter<'a> {
     /// An artifact without tensors yet.
     pub fn new(provenance: Provenance) -> Self {
         Self { provenance, tensors: BTreeMap::new() }
@@ -67,9 +67,9 @@ impl ArtifactWriter {
     /// # Panics
     /// When the product of `shape` is not the number of values: a programming error.
     #[must_use]
-    pub fn tensor<T: Element>(mut self, name: &str, shape: &[usize], data: &[T]) -> Self {
+    pub fn tensor<T: Element>(mut self, name: &str, shape: &[usize], data: &'a [T]) -> Self {
         assert_eq!(shape.iter().product::<usize>(), data.len(), "shape of {name}");
-        let bytes = Source::Memory(bytemuck::cast_slice(data).to_vec());
+        let bytes = Source::Memory(bytemuck::cast_slice(data));
         self.tensors.insert(name.into(), (T::DTYPE, shape.to_vec(), bytes));
         self
     }
@@ -116,7 +116,7 @@ impl ArtifactWriter {
             out.write_all(&header).at("write", path)?;
             for (_, (_, _, source)) in tensors {
                 match source {
-                    Source::Memory(bytes) => out.write_all(&bytes).at("write", path)?,
+                    Source::Memory(bytes) => out.write_all(bytes).at("write", path)?,
                     Source::File(mut file) => {
                         file.seek(SeekFrom::Start(0)).at("read the scratch file of", path)?;
                         std::io::copy(&mut file, &mut *out).at("write", path)?;
@@ -247,7 +247,7 @@ mod tests {
     use super::*;
     use proptest::prelude::*;
 
-    fn sample() -> ArtifactWriter {
+    fn sample() -> ArtifactWriter<'static> {
         let provenance = Provenance {
             format: "sample".into(),
             version: 1,

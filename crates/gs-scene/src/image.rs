@@ -34,6 +34,17 @@ pub fn size_of(path: impl AsRef<Path>) -> Result<(u32, u32)> {
     reader.into_dimensions().map_err(|e| unreadable(path, &e))
 }
 
+/// Whether a picture file has an alpha channel, from its header.
+///
+/// # Errors
+/// As [`size_of`].
+pub fn has_alpha(path: impl AsRef<Path>) -> Result<bool> {
+    let path = path.as_ref();
+    let reader = ImageReader::open(path).at("open", path)?.with_guessed_format().at("read", path)?;
+    let decoder = reader.into_decoder().map_err(|e| unreadable(path, &e))?;
+    Ok(image::ImageDecoder::color_type(&decoder).has_alpha())
+}
+
 fn unreadable(path: &Path, e: &dyn std::fmt::Display) -> Error {
     Error::new(format!("not a readable picture: {e}"))
         .file(path)
@@ -253,11 +264,13 @@ mod tests {
         image.write_png(&path).unwrap();
         assert_eq!(Image::read(&path).unwrap(), image);
         assert_eq!(size_of(&path).unwrap(), (7, 5));
+        assert!(!has_alpha(&path).unwrap());
         let gray = image::GrayAlphaImage::from_raw(2, 1, vec![51, 102, 255, 0]).unwrap();
         gray.save(&path).unwrap();
         let back = Image::read(&path).unwrap();
         assert_eq!(back.rgb, [0.2, 0.2, 0.2, 1.0, 1.0, 1.0]);
         assert_eq!(back.alpha.unwrap(), [0.4, 0.0]);
+        assert!(has_alpha(&path).unwrap());
     }
 
     #[test]

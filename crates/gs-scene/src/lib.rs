@@ -18,5 +18,5 @@ mod points;
 pub use camera::Camera;
 pub use distortion::Distortion;
 pub use gaussians::{Gaussians, SH_C0, sh_coefficients};
-pub use image::{Image, size_of as image_size};
+pub use image::{Image, has_alpha as image_has_alpha, size_of as image_size};
 pub use points::PointCloud;

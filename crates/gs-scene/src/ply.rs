@@ -8,6 +8,7 @@ mod table;
 
 use crate::{Gaussians, PointCloud, sh_coefficients};
 use gs_io::{Error, IoContext, Result, write_atomic};
+use std::io::Read;
 use std::path::Path;
 use table::{AGAIN, Column, Table};
 
@@ -38,6 +39,42 @@ impl Table<'_> {
     fn positions_as_they_are(&self) -> Result<Vec<[f32; 3]>> {
         Ok(self.arrays(self.columns(["x", "y", "z"])?))
     }
+}
+
+/// Longest header that is read on its own, bytes.
+const MAX_HEADER: u64 = 1 << 20;
+
+fn read_header(path: &Path) -> Result<(Vec<String>, bool)> {
+    let mut bytes = Vec::new();
+    let file = std::fs::File::open(path).at("open", path)?;
+    file.take(MAX_HEADER).read_to_end(&mut bytes).at("read", path)?;
+    let (comments, there) = table::read_header(&bytes, "opacity").map_err(|e| e.file(path))?;
+    Ok((comments.into_iter().map(String::from).collect(), there))
+}
+
+/// The comment lines of a PLY's header, without the word `comment`.
+///
+/// # Errors
+/// When the file cannot be read or has no PLY header.
+pub fn read_comments(path: impl AsRef<Path>) -> Result<Vec<String>> {
+    Ok(read_header(path.as_ref())?.0)
+}
+
+/// Whether a PLY's comments say that its Gaussians were learnt with the 2D filter of Mip-Splatting (`antialias true`), and so
+/// are to be rendered with it.
+///
+/// # Errors
+/// As [`read_comments`].
+pub fn is_antialiased(path: impl AsRef<Path>) -> Result<bool> {
+    Ok(read_comments(path)?.iter().any(|c| c == "antialias true"))
+}
+
+/// Whether a PLY's vertices are Gaussians rather than points: whether they have an opacity.
+///
+/// # Errors
+/// As [`read_comments`].
+pub fn holds_gaussians(path: impl AsRef<Path>) -> Result<bool> {
+    Ok(read_header(path.as_ref())?.1)
 }
 
 /// Reads the Gaussians of a 3DGS PLY. Without `f_rest_*` the spherical harmonics have degree 0; normals are ignored.

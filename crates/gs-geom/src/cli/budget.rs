@@ -98,7 +98,7 @@ impl TrainArgs {
         let start = self.start(&dataset, &cameras, extent, stage)?;
         let some = train.len().min(VIEWS);
         let views: Vec<&View> = (0..some).map(|i| train[i * train.len() / some]).collect();
-        let photographs = Photographs::load(views, self.cache_bytes())?;
+        let photographs = Photographs::load(views, self.masks.load(&dataset, stage)?, self.cache_bytes())?;
         let gains = self.gains(&photographs)?;
         let count = start.len();
         let speed = probe(options.clone(), extent, photographs, start)?;

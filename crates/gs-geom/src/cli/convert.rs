@@ -107,6 +107,9 @@ impl ConvertArgs {
         let mut comments = vec![format!("made by gs-geom {} convert", env!("CARGO_PKG_VERSION"))];
         comments.extend(inputs.iter().map(|(role, hash)| format!("{role} {hash}")));
         comments.push(format!("parameters {parameters}"));
+        if ply::is_antialiased(&self.input)? {
+            comments.push("antialias true".into());
+        }
         if let Some(map) = &self.keep_map {
             let indices: Vec<i32> = chosen.kept.iter().map(|&i| i as i32).collect();
             npy::write_i32(map, &[indices.len()], &indices)?;

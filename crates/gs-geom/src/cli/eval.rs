@@ -1,11 +1,12 @@
 //! `gs-geom eval`.
 
-use super::{SceneArgs, check_writable, read_geometry};
+use super::{MaskArgs, SceneArgs, check_writable, read_geometry};
 use crate::metrics::{ViewMetrics, mean, measure};
 use artifacts::role;
 use gs_io::{Error, Result, hash_file, write_bytes};
 use gs_raster::RasterOptions;
 use gs_scene::dataset::{Split, View};
+use gs_scene::ply;
 use serde_json::json;
 use stage::Stage;
 use std::collections::BTreeMap;
@@ -16,6 +17,8 @@ use std::path::PathBuf;
 pub(super) struct EvalArgs {
     #[command(flatten)]
     scene: SceneArgs,
+    #[command(flatten)]
+    masks: MaskArgs,
     /// Gaussians, as a 3DGS PLY
     #[arg(long, value_name = "FILE")]
     geometry: PathBuf,
@@ -28,6 +31,7 @@ impl EvalArgs {
     pub(super) fn run(&self, stage: &Stage) -> Result<()> {
         let dataset = self.scene.load(stage)?;
         let gaussians = read_geometry(&self.geometry)?;
+        let (alpha, masks) = (self.masks.alpha(), self.masks.load(&dataset, stage)?);
         check_writable(&self.out)?;
         let mut split = Split::Test;
         let mut views: Vec<&View> = dataset.views_of(split).collect();
@@ -36,14 +40,18 @@ impl EvalArgs {
             split = Split::Train;
             views = dataset.views_of(split).collect();
         }
-        let options = RasterOptions { background: self.scene.background.color(), ..RasterOptions::default() };
+        let options = RasterOptions {
+            background: self.scene.background.color(),
+            antialias: ply::is_antialiased(&self.geometry)?,
+            ..RasterOptions::default()
+        };
         let mut progress = stage.progress("view", views.len() as u64);
         let mut figures: Vec<ViewMetrics> = Vec::new();
         for view in &views {
             if stage.interrupted() {
                 return Err(Error::new("interrupted"));
             }
-            figures.push(measure(&gaussians, view, &options)?);
+            figures.push(measure(&gaussians, view, &options, alpha, &masks)?);
             progress.step();
         }
         let psnr = mean(figures.iter().map(|f| f.psnr));
@@ -66,11 +74,16 @@ impl EvalArgs {
             "resolution": self.scene.resolution.to_string(),
             "holdout": self.scene.holdout,
             "background": self.scene.background.color(),
+            "alpha": alpha,
+            "antialias": options.antialias,
         });
-        let inputs = BTreeMap::from([
+        let mut inputs = BTreeMap::from([
             (role::DATASET.to_string(), dataset.hash()?),
             (role::GEOMETRY.to_string(), hash_file(&self.geometry)?),
         ]);
+        if let Some(hash) = masks.hash()? {
+            inputs.insert("photograph_masks".into(), hash);
+        }
         let summary = json!({
             "split": metrics["split"],
             "psnr": psnr,

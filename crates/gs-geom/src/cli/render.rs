@@ -3,8 +3,8 @@
 use super::{SceneArgs, read_geometry};
 use gs_io::{Error, Result, create_dir, write_bytes};
 use gs_raster::{RasterOptions, Rendered, render};
-use gs_scene::Image;
 use gs_scene::dataset::{Dataset, Split, View};
+use gs_scene::{Image, ply};
 use stage::Stage;
 use std::collections::BTreeSet;
 use std::io::Cursor;
@@ -35,7 +35,11 @@ impl RenderArgs {
         let gaussians = read_geometry(&self.geometry)?;
         let views = choose(&dataset, &self.views)?;
         create_dir(&self.out)?;
-        let options = RasterOptions { background: self.scene.background.color(), ..RasterOptions::default() };
+        let options = RasterOptions {
+            background: self.scene.background.color(),
+            antialias: ply::is_antialiased(&self.geometry)?,
+            ..RasterOptions::default()
+        };
         let mut progress = stage.progress("view", views.len() as u64);
         for view in &views {
             if stage.interrupted() {

@@ -1,15 +1,16 @@
 //! `gs-geom train`.
 
 use super::budget::plan_path;
-use super::{Background, SceneArgs, beside, check_writable, read_geometry};
+use super::{Background, MaskArgs, SceneArgs, beside, check_writable, read_geometry};
 use crate::checkpoint::{self, State};
 use crate::content::{self, Gain};
 use crate::curve;
 use crate::densify::{DensifyOptions, Strategy, remove_invisible};
 use crate::init;
+use crate::masks::Masks;
 use crate::mcmc::McmcOptions;
-use crate::memory::{Bytes, Forecast};
-use crate::photographs::Photographs;
+use crate::memory::{self, Bytes, Forecast};
+use crate::photographs::{Photographs, bytes_per_pixel, full_share};
 use crate::schedule::{LearningRates, Schedule};
 use crate::train::{Timings, TrainOptions, Trainer};
 use artifacts::role;
@@ -30,6 +31,8 @@ use std::time::{Duration, Instant};
 pub(super) struct TrainArgs {
     #[command(flatten)]
     pub(super) scene: SceneArgs,
+    #[command(flatten)]
+    pub(super) masks: MaskArgs,
     /// Where to write the Gaussians, as a 3DGS PLY; checkpoint, training curve and record of the run lie beside it
     #[arg(long, value_name = "FILE")]
     pub(super) out: PathBuf,
@@ -43,10 +46,11 @@ pub(super) struct TrainArgs {
     /// Degree of the spherical harmonics, 0 to 3
     #[arg(long, value_name = "DEGREE", default_value_t = 3, value_parser = clap::value_parser!(u8).range(0..=3))]
     sh_degree: u8,
-    /// Start from these Gaussians instead of the dataset's points
-    #[arg(long, value_name = "FILE")]
-    init: Option<PathBuf>,
-    /// Random points to start from where the dataset has none
+    /// What to start from: the dataset's points (random ones where it has none), random points in front of the cameras, or
+    /// a PLY of Gaussians or of points
+    #[arg(long, value_name = "points|random|FILE.ply", default_value = "points")]
+    init: Init,
+    /// How many random points to start from
     #[arg(long, value_name = "COUNT", default_value_t = 20_000)]
     init_points: usize,
     /// Keep number, order and positions of the points: Gaussian i is point i (ScanNet protocol)
@@ -58,6 +62,14 @@ pub(super) struct TrainArgs {
     /// Most Gaussians there may be; with --densify mcmc how many there will be, if the iterations suffice
     #[arg(long, value_name = "COUNT", default_value_t = DensifyOptions::default().max_gaussians)]
     pub(super) max_gaussians: usize,
+    /// Keep the light of Gaussians smaller than a pixel (the 2D filter of Mip-Splatting), so that renders at other sizes
+    /// than the photographs' are neither thick nor dark. The PLY says so, and render and eval do as it says
+    #[arg(long)]
+    antialias: bool,
+    /// Learn an affine map of colours for each training photograph, for cameras that chose exposure or white balance by
+    /// themselves; held-out views are rendered at the photographs' mean
+    #[arg(long)]
+    exposure: bool,
     /// Weight of 1 - SSIM in the loss, 0 to 1
     #[arg(long, value_name = "WEIGHT", default_value_t = 0.2)]
     dssim: f32,
@@ -107,6 +119,26 @@ pub(super) struct TrainArgs {
     /// Stop after this iteration with a checkpoint and <out>.partial.ply, as an interruption would
     #[arg(long, value_name = "ITERATION")]
     stop_after: Option<u32>,
+}
+
+/// What to start from.
+#[derive(Debug, Clone, PartialEq, Eq)]
+enum Init {
+    Points,
+    Random,
+    File(PathBuf),
+}
+
+impl FromStr for Init {
+    type Err = std::convert::Infallible;
+
+    fn from_str(s: &str) -> std::result::Result<Self, Self::Err> {
+        Ok(match s {
+            "points" => Self::Points,
+            "random" => Self::Random,
+            file => Self::File(file.into()),
+        })
+    }
 }
 
 /// Picture sizes in the course of a run.
@@ -193,6 +225,9 @@ impl TrainArgs {
             dssim_weight: self.dssim,
             background: self.scene.background.color(),
             random_background: self.scene.background == Background::Random,
+            alpha: self.masks.alpha(),
+            antialias: self.antialias,
+            exposure: self.exposure,
             fixed_points: self.fixed_points,
         })
     }
@@ -241,17 +276,26 @@ impl TrainArgs {
                 .hint("give --holdout 0, or more photographs"));
         }
         check_writable(&self.out)?;
-        let photographs = Photographs::load(train.clone(), self.cache_bytes())?;
+        let masks = self.masks.load(&dataset, stage)?;
+        let photographs = Photographs::load(train.clone(), masks.clone(), self.cache_bytes())?;
         options.schedule.coarse = self.coarse(&self.gains(&photographs)?, self.iterations);
 
         let mut inputs = BTreeMap::from([(role::DATASET.to_string(), dataset.hash()?)]);
-        if let Some(init) = &self.init {
+        if let Init::File(init) = &self.init {
             inputs.insert("init".into(), hash_file(init)?);
+        }
+        if let Some(hash) = masks.hash()? {
+            inputs.insert("photograph_masks".into(), hash);
         }
         let parameters = json!({
             "resolution": self.scene.resolution.to_string(),
             "holdout": self.scene.holdout,
             "sh_degree": self.sh_degree,
+            "init": match &self.init {
+                Init::Points => "points",
+                Init::Random => "random",
+                Init::File(_) => "file",
+            },
             "init_points": self.init_points,
             "options": options,
         });
@@ -262,7 +306,10 @@ impl TrainArgs {
         let saved = self.saved(&run, stage);
         let state = match saved {
             Some(state) => state,
-            None => checkpoint::start(self.start(&dataset, &cameras, extent, stage)?),
+            None => {
+                let exposures = if self.exposure { train.len() } else { 0 };
+                checkpoint::start(self.start(&dataset, &cameras, extent, stage)?, exposures)
+            }
         };
         stage.info(&format!(
             "{} training views and {} held out, {}x{} pixels; {} Gaussians; extent {extent:.3}",
@@ -276,20 +323,28 @@ impl TrainArgs {
             let sizes = options.schedule.coarse.iter().map(|(last, divisor)| format!("1/{divisor} until {last}"));
             stage.info(&format!("picture sizes: {}, then full", sizes.collect::<Vec<_>>().join(", ")));
         }
-        let forecast = self.forecast(&dataset, &state.gaussians, stage)?;
-        let bytes = |c: &&Camera| 3 * u64::from(c.width) * u64::from(c.height);
-        let left = self.image_cache.0.saturating_sub(cameras.iter().map(bytes).sum());
-        let heldout = Photographs::load(heldout, left as usize)?;
+        let forecast = self.forecast(&dataset, &masks, &state.gaussians, &options.schedule, stage)?;
+        // The training views' smaller pictures are not there yet.
+        let left = full_share(self.cache_bytes()).saturating_sub(photographs.kept_bytes());
+        let heldout = Photographs::load(heldout, masks, left)?;
         let mut trainer = Trainer::resume(options, extent, photographs, heldout, state);
+        let before = cpu_seconds();
         let done = self.optimise(&mut trainer, &run, stage).and_then(|done| match done {
-            true => self.finish(&trainer, &run, &forecast, plan, stage),
+            true => self.finish(&trainer, &run, &forecast, (plan, spent_since(before)), stage),
             false => Ok(()),
         });
         done.inspect_err(|_| self.rescue(&trainer, &run, stage))
     }
 
     /// Says how much memory the run will take, with the Gaussians there are and with the most there may be.
-    fn forecast(&self, dataset: &Dataset, gaussians: &Gaussians, stage: &Stage) -> Result<Forecast> {
+    fn forecast(
+        &self,
+        dataset: &Dataset,
+        masks: &Masks,
+        gaussians: &Gaussians,
+        schedule: &Schedule,
+        stage: &Stage,
+    ) -> Result<Forecast> {
         let now = gaussians.len();
         let most = if self.fixed_points { now } else { self.max_gaussians.max(now) };
         let mut size = (0, 0);
@@ -297,19 +352,35 @@ impl TrainArgs {
             let (w, h) = image_size(&view.image_path)?;
             size = (w.max(size.0), h.max(size.1));
         }
-        let cameras = dataset.views.iter().map(|v| &v.camera);
+        let pixels = |v: &View| u64::from(v.camera.width) * u64::from(v.camera.height);
         let apart = dataset.views.len().div_ceil(FORECAST_VIEWS).max(1);
-        let options = RasterOptions { sh_degree: 0, ..RasterOptions::default() };
-        let entries = |c: &Camera| forward(gaussians, c, &options).pairs() / (TILE * TILE);
-        let entries = cameras.clone().step_by(apart).map(entries).max().unwrap_or(0) as u64;
-        let threads = rayon::current_num_threads();
-        let forecast = Forecast::new(cameras, size, entries, self.image_cache, threads, self.sh_degree);
+        let options = RasterOptions { sh_degree: 0, antialias: self.antialias, ..RasterOptions::default() };
+        let entries = |v: &View| forward(gaussians, &v.camera, &options).pairs() / (TILE * TILE);
+        let entries = dataset.views.iter().step_by(apart).map(entries).max().unwrap_or(0) as u64;
+        // As they are loaded: those to learn from first, then those held out in what is left.
+        let kept = |split: Split, budget: usize| -> Result<usize> {
+            let each = dataset.views_of(split).map(|v| Ok(bytes_per_pixel(v, masks)? * pixels(v) as usize));
+            Ok(each.sum::<Result<usize>>()?.min(full_share(budget)))
+        };
+        let train = kept(Split::Train, self.cache_bytes())?;
+        let heldout = kept(Split::Test, full_share(self.cache_bytes()).saturating_sub(train))?;
+        let last = schedule.densify_until.min(schedule.iterations);
+        let forecast = Forecast::new(&memory::Sizes {
+            photographs: (train + heldout) as u64,
+            pixels: dataset.views.iter().map(pixels).max().unwrap_or(0),
+            width: dataset.views.iter().map(|v| u64::from(v.camera.width)).max().unwrap_or(0),
+            file: size,
+            tile_entries: entries,
+            threads: rayon::current_num_threads(),
+            sh_degree: self.sh_degree,
+            densifies: !self.fixed_points && (1..=last).any(|i| schedule.densifies(i)),
+        });
         stage.info(&format!(
             "memory: about {} with {now} Gaussians, at most {} with {most} (photographs {}, pictures {}, {} bytes a Gaussian)",
             forecast.peak(now),
             forecast.peak(most),
             Bytes(forecast.photographs),
-            Bytes(forecast.decoding.max(forecast.pictures + forecast.tiles)),
+            Bytes(forecast.scratch()),
             forecast.per_gaussian
         ));
         Ok(forecast)
@@ -361,43 +432,55 @@ impl TrainArgs {
         extent: f64,
         stage: &Stage,
     ) -> Result<Gaussians> {
-        if let Some(path) = &self.init {
-            let g = init::with_degree(read_geometry(path)?, self.sh_degree);
-            if g.len() > self.max_gaussians && !self.fixed_points {
-                return Err(Error::new("more Gaussians than --max-gaussians")
-                    .file(path)
-                    .found(g.len())
-                    .expected(format!("at most {}", self.max_gaussians)));
+        let read: PointCloud;
+        if let Init::File(path) = &self.init {
+            if ply::holds_gaussians(path)? {
+                return self.start_gaussians(path, stage);
             }
-            let zero = g.rotations.iter().filter(|q| q.iter().all(|v| v.abs() < 1e-12)).count();
-            if zero > 0 {
-                stage.warn(&format!("{zero} Gaussians of --init have a quaternion of length 0 and are never drawn"));
+            read = ply::read_points(path)?;
+            if read.is_empty() {
+                return Err(Error::new("no points to start from").file(path).field("--init"));
             }
-            return Ok(g);
+            stage.info(&format!("starting from the {} points of {}", read.len(), path.display()));
+            return self.start_points(&read, extent, stage).map_err(|e| e.file(path));
         }
-        let random: PointCloud;
-        let points = if !dataset.points.is_empty() {
-            &dataset.points
-        } else if self.fixed_points {
-            return Err(Error::new("no points to keep")
-                .file(&self.scene.scene)
-                .field("points")
-                .hint("--fixed-points needs a dataset with points, such as ScanNet's vertices"));
-        } else {
-            stage.info(&format!("the dataset has no points: starting from {} random ones", self.init_points));
-            random = init::random_points(cameras, self.init_points, stage.seed());
-            &random
-        };
-        if points.len() > self.max_gaussians && !self.fixed_points {
-            stage.info(&format!(
-                "starting from {} of {} points, for --max-gaussians",
-                self.max_gaussians,
-                points.len()
+        if self.init == Init::Points && !dataset.points.is_empty() {
+            return self.start_points(&dataset.points, extent, stage).map_err(|e| e.file(&self.scene.scene));
+        }
+        if self.fixed_points {
+            return Err(Error::new("no points to keep").file(&self.scene.scene).field("points").hint(
+                "--fixed-points needs a dataset with points, such as ScanNet's vertices, or --init with a file",
             ));
-            let some = init::some_points(points, self.max_gaussians, stage.seed());
-            return init::from_points(&some, self.sh_degree, extent).map_err(|e| e.file(&self.scene.scene));
         }
-        init::from_points(points, self.sh_degree, extent).map_err(|e| e.file(&self.scene.scene))
+        let why = if self.init == Init::Points { "the dataset has no points: " } else { "" };
+        stage.info(&format!("{why}starting from {} random points", self.init_points));
+        let random = init::random_points(cameras, self.init_points, stage.seed());
+        self.start_points(&random, extent, stage).map_err(|e| e.file(&self.scene.scene))
+    }
+
+    /// One Gaussian for each point, or for as many as may be.
+    fn start_points(&self, points: &PointCloud, extent: f64, stage: &Stage) -> Result<Gaussians> {
+        if points.len() <= self.max_gaussians || self.fixed_points {
+            return init::from_points(points, self.sh_degree, extent);
+        }
+        stage.info(&format!("starting from {} of {} points, for --max-gaussians", self.max_gaussians, points.len()));
+        init::from_points(&init::some_points(points, self.max_gaussians, stage.seed()), self.sh_degree, extent)
+    }
+
+    /// The Gaussians of a file.
+    fn start_gaussians(&self, path: &Path, stage: &Stage) -> Result<Gaussians> {
+        let g = init::with_degree(read_geometry(path)?, self.sh_degree);
+        if g.len() > self.max_gaussians && !self.fixed_points {
+            return Err(Error::new("more Gaussians than --max-gaussians")
+                .file(path)
+                .found(g.len())
+                .expected(format!("at most {}", self.max_gaussians)));
+        }
+        let zero = g.rotations.iter().filter(|q| q.iter().all(|v| v.abs() < 1e-12)).count();
+        if zero > 0 {
+            stage.warn(&format!("{zero} Gaussians of --init have a quaternion of length 0 and are never drawn"));
+        }
+        Ok(g)
     }
 
     /// Runs the iterations; whether all are done.
@@ -453,7 +536,7 @@ impl TrainArgs {
         trainer: &Trainer<'_>,
         run: &Provenance,
         forecast: &Forecast,
-        plan: Value,
+        (plan, iteration_cpu_seconds): (Value, Option<f64>),
         stage: &Stage,
     ) -> Result<()> {
         let (psnr, ssim) = trainer.heldout()?.unzip();
@@ -471,9 +554,24 @@ impl TrainArgs {
         if progress.dropped > 0 {
             stage.warn(&format!("{} gradients of Gaussians were not finite and were not used", progress.dropped));
         }
+        let [not_finite, degenerate] = progress.undrawn;
+        if not_finite + degenerate > 0 {
+            stage.warn(&format!(
+                "Gaussians that could not be drawn, in the worst iteration: {not_finite} not finite, {degenerate} of a shape beyond single precision or with a quaternion of length 0"
+            ));
+        }
         let curve: String = progress.curve.iter().map(|line| format!("{line}\n")).collect();
         write_bytes(beside(&self.out, ".curve.jsonl"), curve.as_bytes())?;
         write_bytes(beside(&self.out, ".curve.svg"), curve::svg(&progress.curve).as_bytes())?;
+        if !trainer.state().exposures.is_off() {
+            let names = trainer.train_names();
+            let maps: serde_json::Map<String, Value> = names
+                .zip(&trainer.state().exposures.maps)
+                .map(|(name, map)| (name.to_string(), json!(map.chunks(4).collect::<Vec<_>>())))
+                .collect();
+            let text = serde_json::to_vec_pretty(&maps).map_err(|e| Error::new(e.to_string()))?;
+            write_bytes(beside(&self.out, ".exposures.json"), &text)?;
+        }
         let mut comments = comments(parameters, inputs);
         comments.extend(progress.extended.iter().map(|i| format!("extended after iteration {i}")));
         ply::write_gaussians(&self.out, &gaussians, &comments)?;
@@ -490,10 +588,12 @@ impl TrainArgs {
             "ssim_heldout": ssim,
             "iterations": progress.iteration,
             "dropped_gradients": progress.dropped,
+            "most_undrawn": {"not_finite": progress.undrawn[0], "degenerate": progress.undrawn[1]},
             "memory_predicted_bytes": predicted,
             "extended_after": progress.extended,
             "seconds": seconds(timings),
             "cpu_seconds": cpu_seconds(),
+            "iteration_cpu_seconds": iteration_cpu_seconds,
             "plan": plan,
         });
         stage.record(&self.out, parameters.clone(), inputs.clone(), summary)?;
@@ -519,6 +619,11 @@ fn cpu_seconds() -> Option<f64> {
     // After the name in parentheses, which may hold anything, user and system time are fields 12 and 13.
     let fields: Vec<f64> = stat.rsplit(')').next()?.split_whitespace().map(|f| f.parse().unwrap_or(0.0)).collect();
     Some((fields.get(11)? + fields.get(12)?) / 100.0)
+}
+
+/// Processor time since a moment at which it was `before`.
+fn spent_since(before: Option<f64>) -> Option<f64> {
+    Some(cpu_seconds()? - before?)
 }
 
 fn parts(t: Timings) -> [(&'static str, Duration); 5] {

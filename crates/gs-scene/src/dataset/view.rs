@@ -122,8 +122,22 @@ impl View {
     /// # Errors
     /// When the file cannot be read or its size is not the camera's.
     pub fn load_image(&self) -> Result<Image> {
-        let photo = Image::read(&self.image_path)?;
-        self.lens.expect_size((photo.width, photo.height), &self.image_path)?;
+        self.load(&self.image_path)
+    }
+
+    /// Decodes a mask of the photograph, a picture of the same size, as `[height][width]`, 0 (black) to 1 (white), at the
+    /// camera's size.
+    ///
+    /// # Errors
+    /// As [`Self::load_image`].
+    pub fn load_mask(&self, path: &Path) -> Result<Vec<f32>> {
+        let mask = self.load(path)?;
+        Ok(mask.rgb.as_chunks::<3>().0.iter().map(|p| p.iter().sum::<f32>() / 3.0).collect())
+    }
+
+    fn load(&self, path: &Path) -> Result<Image> {
+        let photo = Image::read(path)?;
+        self.lens.expect_size((photo.width, photo.height), path)?;
         let flat = if self.lens.distortion.is_none() { photo } else { self.undistort(&photo) };
         Ok(flat.resize_area(self.camera.width, self.camera.height))
     }

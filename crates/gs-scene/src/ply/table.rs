@@ -87,13 +87,23 @@ struct Element {
 struct Header<'a> {
     encoding: Encoding,
     elements: Vec<Element>,
+    comments: Vec<&'a str>,
     body: &'a [u8],
+}
+
+/// The comment lines of a file's header, and whether its vertices have the property `name`.
+pub(super) fn read_header<'a>(bytes: &'a [u8], name: &str) -> Result<(Vec<&'a str>, bool)> {
+    let header = parse_header(bytes)?;
+    let vertices = header.elements.iter().filter(|e| e.name == "vertex");
+    let mut properties = vertices.flat_map(|e| &e.properties);
+    let there = properties.any(|p| matches!(p, Property::Scalar(n, _) if n == name));
+    Ok((header.comments, there))
 }
 
 fn parse_header(bytes: &[u8]) -> Result<Header<'_>> {
     let fail = |what: &str| Error::new(what).field("header").hint(AGAIN);
     let mut rest = bytes;
-    let mut next_line = || -> Result<&str> {
+    let mut next_line = || -> Result<&'_ str> {
         let end = rest.iter().take(65_536).position(|&b| b == b'\n').ok_or_else(|| fail("the header does not end"))?;
         let line = std::str::from_utf8(&rest[..end]).map_err(|_| fail("the header is not text"))?;
         rest = &rest[end + 1..];
@@ -104,12 +114,14 @@ fn parse_header(bytes: &[u8]) -> Result<Header<'_>> {
     }
     let mut encoding = None;
     let mut elements: Vec<Element> = Vec::new();
+    let mut comments = Vec::new();
     loop {
         let line = next_line()?;
         let words: Vec<&str> = line.split_ascii_whitespace().collect();
         match words[..] {
             ["end_header"] => break,
-            [] | ["comment" | "obj_info", ..] => {}
+            ["comment", ..] => comments.push(line["comment".len()..].trim_start()),
+            [] | ["obj_info", ..] => {}
             ["format", kind, _] => {
                 encoding = Some(match kind {
                     "ascii" => Encoding::Ascii,
@@ -143,7 +155,7 @@ fn parse_header(bytes: &[u8]) -> Result<Header<'_>> {
         }
     }
     let encoding = encoding.ok_or_else(|| fail("no format line"))?;
-    Ok(Header { encoding, elements, body: rest })
+    Ok(Header { encoding, elements, comments, body: rest })
 }
 
 fn cut_short(element: &str, rows: usize, count: usize) -> Error {

@@ -1,0 +1,114 @@
+//! Which pixels of a photograph count, and how: alpha channels and mask files.
+
+use clap::ValueEnum;
+use gs_io::{Error, Result, hash_bytes, hash_file};
+use gs_scene::dataset::View;
+use serde::Serialize;
+use std::collections::BTreeMap;
+use std::path::{Path, PathBuf};
+
+/// What transparent pixels of the photographs mean.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, ValueEnum)]
+#[serde(rename_all = "kebab-case")]
+pub enum Alpha {
+    /// Nothing is there: the photograph lies over --background
+    #[default]
+    Background,
+    /// The same, and what is rendered must be as opaque as the photograph
+    Match,
+    /// Nothing is known of them: they do not count
+    Ignore,
+}
+
+/// Mask files by the names of the views they belong to.
+#[derive(Debug, Clone, Default, PartialEq)]
+pub struct Masks(BTreeMap<String, PathBuf>);
+
+impl Masks {
+    /// The masks in a folder: a PNG or JPEG a view, called as the photograph with (as COLMAP has it) or without the
+    /// photograph's own extension. A view without a file has no mask.
+    ///
+    /// # Errors
+    /// When no view has a mask there.
+    pub fn find(folder: &Path, views: &[View]) -> Result<Self> {
+        let mut all = BTreeMap::new();
+        for view in views {
+            let bare = Path::new(&view.name).with_extension("").to_string_lossy().into_owned();
+            let names = [view.name.clone(), format!("{}.png", view.name), format!("{bare}.png"), format!("{bare}.jpg")];
+            let named = names.iter().map(|n| folder.join(n)).chain([folder.join(format!("{}.png", view.stem()))]);
+            if let Some(path) = named.into_iter().find(|p| p.is_file()) {
+                all.insert(view.name.clone(), path);
+            }
+        }
+        if all.is_empty() {
+            return Err(Error::new("no masks in this folder")
+                .file(folder)
+                .field("--masks")
+                .expected(views.first().map_or_else(String::new, |v| format!("pictures such as {}.png", v.stem()))));
+        }
+        Ok(Self(all))
+    }
+
+    /// The mask of a view.
+    pub fn of(&self, view: &View) -> Option<&Path> {
+        self.0.get(&view.name).map(PathBuf::as_path)
+    }
+
+    /// Number of masks.
+    pub fn len(&self) -> usize {
+        self.0.len()
+    }
+
+    /// Whether there are none.
+    pub fn is_empty(&self) -> bool {
+        self.0.is_empty()
+    }
+
+    /// Content hash of names and files; none without masks.
+    ///
+    /// # Errors
+    /// When a file cannot be read.
+    pub fn hash(&self) -> Result<Option<String>> {
+        let mut text = String::new();
+        for (name, path) in &self.0 {
+            text += &format!("{name}\n{}\n", hash_file(path)?);
+        }
+        Ok((!self.is_empty()).then(|| hash_bytes(text.as_bytes())))
+    }
+}
+
+/// Multiplies `[pixels][rgb]` by `[pixels]`.
+pub fn multiply(rgb: &mut [f32], alpha: &[f32]) {
+    for (pixel, a) in rgb.as_chunks_mut::<3>().0.iter_mut().zip(alpha) {
+        pixel.iter_mut().for_each(|v| *v *= a);
+    }
+}
+
+/// `weight` times the mean absolute difference of what was rendered from what it should be, `[pixels]` both, and its
+/// derivative into `gradient` (resized to fit).
+pub fn alpha_loss(rendered: &[f32], wanted: &[f32], weight: f32, gradient: &mut Vec<f32>) -> f64 {
+    let scale = weight / wanted.len().max(1) as f32;
+    gradient.clear();
+    gradient.extend(rendered.iter().zip(wanted).map(|(r, w)| match r - w {
+        0.0 => 0.0,
+        d => d.signum() * scale,
+    }));
+    let sum: f64 = rendered.iter().zip(wanted).map(|(r, w)| f64::from((r - w).abs())).sum();
+    f64::from(weight) * sum / wanted.len().max(1) as f64
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_loss_of_alpha_and_its_gradient() {
+        let mut gradient = vec![9.0; 7];
+        let loss = alpha_loss(&[0.5, 0.25, 1.0, 0.0], &[1.0, 0.0, 1.0, 0.0], 2.0, &mut gradient);
+        assert!((loss - 2.0 * 0.75 / 4.0).abs() < 1e-12);
+        assert_eq!(gradient, [-0.5, 0.5, 0.0, 0.0]);
+        let mut rgb = vec![1.0; 6];
+        multiply(&mut rgb, &[0.5, 0.0]);
+        assert_eq!(rgb, [0.5, 0.5, 0.5, 0.0, 0.0, 0.0]);
+    }
+}

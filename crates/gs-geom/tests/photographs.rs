@@ -1,0 +1,274 @@
+//! Photographs of different exposures, with alpha or masks; and what a run starts from.
+
+use glam::{DQuat, DVec3};
+use gs_raster::{RasterOptions, render};
+use gs_scene::{Camera, Gaussians, PointCloud, ply};
+use serde_json::Value;
+use std::fmt::Write as _;
+use std::fs;
+use std::path::Path;
+use std::process::{Command, Output};
+
+const SIZE: (u32, u32) = (64, 48);
+const VIEWS: usize = 24;
+const ITERATIONS: &str = "1000";
+
+fn run(arguments: &[&str]) -> Output {
+    Command::new(env!("CARGO_BIN_EXE_gs-geom")).args(arguments).output().unwrap()
+}
+
+fn succeeds(arguments: &[&str]) -> String {
+    let o = run(arguments);
+    let said = String::from_utf8_lossy(&o.stderr).into_owned();
+    assert!(o.status.success(), "{arguments:?}: {said}");
+    said
+}
+
+/// Opaque balls of different colours.
+fn balls() -> Gaussians {
+    let n = 40;
+    let t = |i: usize| i as f32 / n as f32;
+    Gaussians {
+        means: (0..n).map(|i| [(11.0 * t(i)).cos() * t(i), (11.0 * t(i)).sin() * t(i), t(i) - 0.5]).collect(),
+        log_scales: vec![[-1.9, -2.1, -1.8]; n],
+        rotations: vec![[1.0, 0.2, -0.1, 0.3]; n],
+        opacity_logits: vec![3.0; n],
+        sh: (0..3 * n).map(|i| (i as f32 * 1.7).sin()).collect(),
+        sh_degree: 0,
+    }
+}
+
+fn cameras() -> Vec<Camera> {
+    let at = |i: usize| {
+        let a = i as f64 / VIEWS as f64 * std::f64::consts::TAU;
+        let eye = DVec3::new(3.0 * a.cos(), 3.0 * a.sin(), 0.5);
+        Camera::look_at(eye, DVec3::ZERO, DVec3::Z, SIZE.0, SIZE.1, 0.8)
+    };
+    (0..VIEWS).map(at).collect()
+}
+
+/// A folder with a COLMAP scene of the balls; `change` may change the photographs, `[height][width][rgba]`.
+struct Folder(tempfile::TempDir);
+
+impl Folder {
+    fn new(rgba: bool, change: impl Fn(usize, &mut [[f32; 4]])) -> Self {
+        let folder = Self(tempfile::tempdir().unwrap());
+        let root = folder.0.path().join("scene");
+        fs::create_dir_all(root.join("sparse/0")).unwrap();
+        fs::create_dir_all(root.join("images")).unwrap();
+        let (mut images, mut points) = (String::new(), String::new());
+        for (i, c) in cameras().iter().enumerate() {
+            let r = render(&balls(), c, &RasterOptions::default());
+            // As files have them: not multiplied by alpha.
+            let pixel = |(p, &a): (&[f32], &f32)| {
+                let straight = |v: f32| if rgba { v / a.max(1e-6) } else { v };
+                [straight(p[0]), straight(p[1]), straight(p[2]), a]
+            };
+            let mut pixels: Vec<[f32; 4]> = r.rgb.chunks(3).zip(&r.alpha).map(pixel).collect();
+            change(i, &mut pixels);
+            let bytes: Vec<u8> = pixels
+                .iter()
+                .flat_map(|p| p[..if rgba { 4 } else { 3 }].iter())
+                .map(|v| (v.clamp(0.0, 1.0) * 255.0).round() as u8)
+                .collect();
+            let kind = if rgba { image::ColorType::Rgba8 } else { image::ColorType::Rgb8 };
+            image::save_buffer(root.join(format!("images/{i:02}.png")), &bytes, SIZE.0, SIZE.1, kind).unwrap();
+            let (q, t) = (DQuat::from_mat3(&c.rotation), c.translation);
+            let pose = [q.w, q.x, q.y, q.z, t.x, t.y, t.z].map(|v| v.to_string()).join(" ");
+            writeln!(images, "{} {pose} 1 {i:02}.png\n", i + 1).unwrap();
+            if i == 0 {
+                let line = format!("1 PINHOLE {} {} {} {} {} {}\n", SIZE.0, SIZE.1, c.fx, c.fy, c.cx, c.cy);
+                fs::write(root.join("sparse/0/cameras.txt"), line).unwrap();
+            }
+        }
+        for (i, p) in balls().means.iter().enumerate() {
+            let c = balls().base_color(i).map(|v| (v.clamp(0.0, 1.0) * 255.0) as u8);
+            writeln!(points, "{} {} {} {} {} {} {} 0.5", i + 1, p[0], p[1], p[2], c[0], c[1], c[2]).unwrap();
+        }
+        fs::write(root.join("sparse/0/images.txt"), images).unwrap();
+        fs::write(root.join("sparse/0/points3D.txt"), points).unwrap();
+        folder
+    }
+
+    fn path(&self, name: &str) -> String {
+        self.0.path().join(name).to_string_lossy().into_owned()
+    }
+
+    /// Trains; the run's summary.
+    fn train(&self, out: &str, more: &[&str]) -> Value {
+        let (scene, out) = (self.path("scene"), self.path(out));
+        let all = ["train", "--scene", &scene, "--out", &out, "--iterations", ITERATIONS, "--holdout", "6"];
+        let all = [&all[..], &["--sh-degree", "0", "--max-gaussians", "400", "--schedule", "full"], more].concat();
+        succeeds(&all);
+        let record: Value = serde_json::from_slice(&fs::read(format!("{out}.run.json")).unwrap()).unwrap();
+        record["summary"].clone()
+    }
+}
+
+fn psnr(summary: &Value) -> f64 {
+    summary["psnr_heldout"].as_f64().unwrap()
+}
+
+#[test]
+fn exposures_that_differ_are_compensated() {
+    // From one side all is bright, from the other dark. Every sixth view is held out and as the scene is; the others' gains
+    // have a mean of 1.
+    let gain = |i: usize| 1.0 + 0.3 * (i as f32 / VIEWS as f32 * std::f32::consts::TAU).sin();
+    let dir = Folder::new(false, |i, pixels| {
+        if i % 6 != 0 {
+            pixels.iter_mut().for_each(|p| p[..3].iter_mut().for_each(|v| *v *= gain(i)));
+        }
+    });
+    let without = dir.train("a.ply", &[]);
+    let with = dir.train("b.ply", &["--exposure", "--threads", "1"]);
+    assert!(psnr(&with) > psnr(&without) + 2.0, "{} {}", psnr(&with), psnr(&without));
+    let maps: Value = serde_json::from_slice(&fs::read(dir.path("b.ply.exposures.json")).unwrap()).unwrap();
+    assert_eq!(maps.as_object().unwrap().len(), VIEWS - 4);
+    // What a grey becomes: maps may mix the channels as well.
+    let green = |name: &str| (0..3).map(|c| maps[name][1][c].as_f64().unwrap()).sum::<f64>();
+    for i in [5, 19] {
+        let found = green(&format!("{i:02}.png"));
+        assert!((found - f64::from(gain(i))).abs() < 0.06, "{i}: {found} {}", gain(i));
+    }
+    // In parts, on other threads: the maps and their moments are part of the checkpoint.
+    for last in ["7", "301"] {
+        let (scene, out) = (dir.path("scene"), dir.path("c.ply"));
+        let all = ["train", "--scene", &scene, "--out", &out, "--iterations", ITERATIONS, "--holdout", "6"];
+        let all = [&all[..], &["--sh-degree", "0", "--max-gaussians", "400", "--schedule", "full"]].concat();
+        succeeds(&[&all[..], &["--exposure", "--stop-after", last]].concat());
+    }
+    dir.train("c.ply", &["--exposure", "--threads", "2"]);
+    assert_eq!(fs::read(dir.path("b.ply")).unwrap(), fs::read(dir.path("c.ply")).unwrap());
+    assert_eq!(
+        fs::read(dir.path("b.ply.exposures.json")).unwrap(),
+        fs::read(dir.path("c.ply.exposures.json")).unwrap()
+    );
+}
+
+/// Mean absolute difference of the alpha that a file's Gaussians have from that of the balls.
+fn alpha_error(file: &str) -> f64 {
+    let g = ply::read_gaussians(file).unwrap();
+    let alpha = |g: &Gaussians, c: &Camera| render(g, c, &RasterOptions::default()).alpha;
+    let errors = cameras().into_iter().map(|c| {
+        let (a, b) = (alpha(&g, &c), alpha(&balls(), &c));
+        a.iter().zip(&b).map(|(a, b)| f64::from((a - b).abs())).sum::<f64>() / a.len() as f64
+    });
+    errors.sum::<f64>() / VIEWS as f64
+}
+
+#[test]
+fn alpha_is_learnt_from_transparent_photographs() {
+    // Over black, dark things may be transparent or opaque; over any colour, or where alpha is compared, they may not.
+    let dir = Folder::new(true, |_, pixels| {
+        pixels.iter_mut().for_each(|p| p[..3].iter_mut().for_each(|v| *v *= 0.1));
+    });
+    let background = dir.train("a.ply", &[]);
+    dir.train("b.ply", &["--alpha", "match"]);
+    dir.train("c.ply", &["--background", "random"]);
+    let [plain, matched, random] = ["a.ply", "b.ply", "c.ply"].map(|f| alpha_error(&dir.path(f)));
+    assert!(matched < 0.6 * plain && random < 0.8 * plain, "{plain} {matched} {random}");
+    assert!(psnr(&background) > 30.0, "{background}");
+    // What should be opaque hides a background of another colour.
+    let (scene, out) = (dir.path("scene"), dir.path("m.json"));
+    let over_white = |geometry: &str| {
+        let geometry = dir.path(geometry);
+        let all = ["eval", "--scene", &scene, "--geometry", &geometry, "--holdout", "6", "--background", "white"];
+        succeeds(&[&all[..], &["--out", &out]].concat());
+        let m: Value = serde_json::from_slice(&fs::read(&out).unwrap()).unwrap();
+        psnr(&m)
+    };
+    let (plain, matched) = (over_white("a.ply"), over_white("b.ply"));
+    assert!(matched > plain + 2.0, "{plain} {matched}");
+}
+
+#[test]
+fn masked_pixels_do_not_count() {
+    // Something passes through the photographs, held-out ones as well; the masks are black there.
+    let at = |i: usize| {
+        let (x, y) = ((7 * i) % 40 + 6, (5 * i) % 24 + 4);
+        (0..14).flat_map(move |dy| (0..14).map(move |dx| (y + dy) * SIZE.0 as usize + x + dx))
+    };
+    let dir = Folder::new(false, |i, pixels| at(i).for_each(|p| pixels[p] = [0.9, 0.9, (i % 2) as f32, 1.0]));
+    let masks = dir.path("masks");
+    fs::create_dir(&masks).unwrap();
+    for i in 0..VIEWS {
+        let mut mask = vec![255u8; (SIZE.0 * SIZE.1) as usize];
+        at(i).for_each(|p| mask[p] = 0);
+        // As COLMAP calls masks, and without the photograph's own extension.
+        let name = if i % 2 == 0 { format!("{i:02}.png.png") } else { format!("{i:02}.png") };
+        image::save_buffer(Path::new(&masks).join(name), &mask, SIZE.0, SIZE.1, image::ColorType::L8).unwrap();
+    }
+    let whole = dir.train("a.ply", &[]);
+    let masked = dir.train("b.ply", &["--masks", &masks]);
+    assert!(psnr(&masked) > 22.0 && psnr(&whole) < 18.0, "{masked} {whole}");
+    let (scene, out) = (dir.path("scene"), dir.path("m.json"));
+    let eval = |geometry: &str| {
+        let geometry = dir.path(geometry);
+        let all = ["eval", "--scene", &scene, "--geometry", &geometry, "--holdout", "6", "--masks", &masks];
+        succeeds(&[&all[..], &["--out", &out]].concat());
+        let m: Value = serde_json::from_slice(&fs::read(&out).unwrap()).unwrap();
+        psnr(&m)
+    };
+    let (without, with) = (eval("a.ply"), eval("b.ply"));
+    assert!(with > without + 1.0 && (with - psnr(&masked)).abs() < 0.2, "{without} {with} {masked}");
+    // Without a mask for some, and for all.
+    fs::remove_file(Path::new(&masks).join("01.png")).unwrap();
+    let out = dir.path("c.ply");
+    let train = ["train", "--scene", &scene, "--out", &out, "--iterations", "3", "--masks"];
+    assert!(succeeds(&[&train[..], &[&masks]].concat()).contains("1 of 24 photographs have no mask"));
+    fs::create_dir(dir.path("none")).unwrap();
+    let o = run(&[&train[..], &[&dir.path("none")]].concat());
+    let said = String::from_utf8_lossy(&o.stderr);
+    assert!(o.status.code() == Some(2) && said.contains("no masks in this folder"), "{said}");
+}
+
+#[test]
+fn antialiased_gaussians_say_so_and_are_rendered_so() {
+    let dir = Folder::new(false, |_, _| ());
+    let (scene, out) = (dir.path("scene"), dir.path("m.json"));
+    dir.train("a.ply", &[]);
+    let learnt = psnr(&dir.train("b.ply", &["--antialias"]));
+    let eval = |geometry: &str, resolution: &str| {
+        let all = ["eval", "--scene", &scene, "--geometry", geometry, "--holdout", "6", "--resolution", resolution];
+        succeeds(&[&all[..], &["--out", &out]].concat());
+        let m: Value = serde_json::from_slice(&fs::read(&out).unwrap()).unwrap();
+        psnr(&m)
+    };
+    let (plain, filtered) = (dir.path("a.ply"), dir.path("b.ply"));
+    assert!((eval(&filtered, "1") - learnt).abs() < 0.2);
+    // Far away, where Gaussians are smaller than pixels, those learnt without the filter are too thick.
+    let (coarse, coarse_filtered) = (eval(&plain, "8"), eval(&filtered, "8"));
+    assert!(coarse_filtered > coarse, "{coarse} {coarse_filtered}");
+    // What says so is the comment; convert hands it on.
+    let converted = dir.path("c.ply");
+    succeeds(&["convert", &filtered, &converted]);
+    assert!(ply::is_antialiased(&converted).unwrap() && !ply::is_antialiased(&plain).unwrap());
+    let mut bytes = fs::read(&filtered).unwrap();
+    let at = bytes.windows(14).position(|w| w == b"antialias true").unwrap();
+    bytes[at..at + 14].copy_from_slice(b"antialias none");
+    fs::write(&filtered, bytes).unwrap();
+    assert!((eval(&filtered, "8") - coarse_filtered).abs() > 0.01);
+}
+
+#[test]
+fn a_run_starts_from_what_it_is_told_to() {
+    let dir = Folder::new(false, |_, _| ());
+    let (scene, out, cloud, gaussians) = (dir.path("scene"), dir.path("g.ply"), dir.path("p.ply"), dir.path("i.ply"));
+    let points = PointCloud { positions: balls().means[..7].to_vec(), colors: vec![[10, 20, 30]; 7] };
+    ply::write_points(&cloud, &points, &[]).unwrap();
+    ply::write_gaussians(&gaussians, &balls(), &[]).unwrap();
+    for (init, count, says) in [
+        ("points", 40, "40 Gaussians"),
+        ("random", 55, "starting from 55 random points"),
+        (&cloud, 7, "starting from the 7 points"),
+        (&gaussians, 40, "40 Gaussians"),
+    ] {
+        let all =
+            ["train", "--scene", &scene, "--out", &out, "--iterations", "2", "--init-points", "55", "--init", init];
+        let said = succeeds(&all);
+        assert!(said.contains(says), "{init}: {said}");
+        assert_eq!(ply::read_gaussians(&out).unwrap().len(), count, "{init}");
+    }
+    let o = run(&["train", "--scene", &scene, "--out", &out, "--init", &format!("{scene}/images/00.png")]);
+    assert_eq!(o.status.code(), Some(2));
+}
