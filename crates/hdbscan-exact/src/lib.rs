@@ -11,12 +11,13 @@ mod boruvka;
 mod condense;
 mod kdtree;
 mod linkage;
+mod neighbours;
 mod select;
 
 pub use boruvka::spanning_tree;
 pub use condense::{CondensedEdge, CondensedTree};
-pub use kdtree::core_distances;
 pub use linkage::{Edge, spanning_forest};
+pub use neighbours::core_distances;
 pub use select::Selection;
 
 /// Parameters of a clustering.
