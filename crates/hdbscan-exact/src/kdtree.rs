@@ -243,11 +243,13 @@ fn build(points: &[f32], dim: usize, core: &[f64], part: Part<'_>) {
     }
 }
 
-/// Up to [`LEAF`] points that walk over a tree together.
+/// Up to [`LEAF`] points that walk over a tree together, theirs or another of the same dimension.
 #[derive(Default)]
 pub(crate) struct Group {
-    /// Their places in the tree.
+    /// Their places in the tree that they were gathered from.
     pub places: Vec<u32>,
+    /// Their coordinates, `[places][dim]`.
+    points: Vec<f32>,
     /// Their coordinates, `[dim][LEAF]`; lanes without a point repeat the first one.
     lanes: Vec<f32>,
     /// Lower and upper corner of the box around them, padded as those of nodes.
@@ -275,6 +277,10 @@ impl Group {
     pub fn gather(&mut self, tree: &KdTree, places: impl Iterator<Item = u32>) {
         self.places.clear();
         self.places.extend(places);
+        self.points.clear();
+        for &at in &self.places {
+            self.points.extend(tree.point(at as usize));
+        }
         self.lanes.resize(tree.dim * LEAF, 0.0);
         self.low.clear();
         self.low.extend(tree.point(self.places[0] as usize));
@@ -283,8 +289,8 @@ impl Group {
         for k in 0..tree.dim {
             let row = &mut self.lanes[k * LEAF..(k + 1) * LEAF];
             row.fill(self.low[k]);
-            for (r, &at) in row.iter_mut().zip(&self.places) {
-                *r = tree.coords[at as usize * tree.dim + k];
+            for (r, point) in row.iter_mut().zip(self.points.chunks_exact(tree.dim)) {
+                *r = point[k];
             }
             for &v in row.iter() {
                 self.low[k] = if v < self.low[k] { v } else { self.low[k] };
@@ -293,6 +299,12 @@ impl Group {
         }
         self.low.resize(tree.padded, 0.0);
         self.high.resize(tree.padded, 0.0);
+    }
+
+    /// The coordinates of one of the points.
+    #[inline(always)]
+    pub fn point(&self, lane: usize, dim: usize) -> &[f32] {
+        &self.points[lane * dim..(lane + 1) * dim]
     }
 
     /// Squared distance in f32 between the box around the points and that of a node.

@@ -147,14 +147,7 @@ fn search_leaf(tree: &KdTree, weights: &[u32], leaf: u32, root: u32, min_samples
     let node = &tree.nodes[leaf as usize];
     let mut group = std::mem::take(&mut search.group);
     group.gather(tree, node.start..node.end);
-    search.count = group.places.len();
-    search.found.resize_with(LEAF, Vec::new);
-    search.found.iter_mut().for_each(Vec::clear);
-    search.held = [0; LEAF];
-    (search.limit, search.gone) = ([f64::INFINITY; LEAF], [f64::INFINITY; LEAF]);
-    // Lanes without a point reach nothing.
-    search.rough = [-1.0; LEAF];
-    search.rough[..search.count].fill(f32::INFINITY);
+    search.start(group.places.len());
     let wanted = min_samples as u64;
     let mut nearest = Nearest { tree, weights, wanted, own: NONE, of: search, reach: f32::INFINITY };
     // The own leaf first: it holds the nearest points, more often than not.
@@ -162,6 +155,53 @@ fn search_leaf(tree: &KdTree, weights: &[u32], leaf: u32, root: u32, min_samples
     nearest.own = leaf;
     group.walk(tree, root, &mut nearest);
     search.group = group;
+}
+
+/// Finds the nearest points in `tree` of each point of a leaf of another tree.
+#[multiversion(targets("x86_64+avx2+fma", "aarch64+neon"))]
+fn search_elsewhere(tree: &KdTree, weights: &[u32], from: &KdTree, leaf: u32, wanted: u64, search: &mut Search) {
+    let node = &from.nodes[leaf as usize];
+    let mut group = std::mem::take(&mut search.group);
+    group.gather(from, node.start..node.end);
+    search.start(group.places.len());
+    let mut nearest = Nearest { tree, weights, wanted, own: NONE, of: search, reach: f32::INFINITY };
+    group.walk(tree, 0, &mut nearest);
+    search.group = group;
+}
+
+/// For every one of `queries` `[m][dim]`, that need not be in the tree, the nearest distinct points that stand for at least
+/// `wanted` points, or all there are: (distance, place in the tree), ascending.
+pub(crate) fn nearest(tree: &KdTree, weights: &[u32], queries: &[f32], wanted: usize) -> Vec<Vec<(f64, u32)>> {
+    let weights = in_tree_order(tree, weights);
+    // Queries that are near each other walk together.
+    let from = KdTree::new(queries, tree.dim);
+    let leaves: Vec<u32> = from.leaves(0).collect();
+    let rows: Vec<Vec<Vec<(f64, u32)>>> = leaves
+        .par_iter()
+        .map_init(Search::default, |search, &leaf| {
+            search_elsewhere(tree, &weights, &from, leaf, wanted as u64, search);
+            let rows = search.found[..search.count].iter();
+            rows.map(|row| row.iter().map(|&(d, q)| (d.sqrt(), q)).collect()).collect()
+        })
+        .collect();
+    let mut out = vec![Vec::new(); from.order.len()];
+    for (&i, row) in from.order.iter().zip(rows.into_iter().flatten()) {
+        out[i as usize] = row;
+    }
+    out
+}
+
+impl Search {
+    fn start(&mut self, count: usize) {
+        self.count = count;
+        self.found.resize_with(LEAF, Vec::new);
+        self.found.iter_mut().for_each(Vec::clear);
+        self.held = [0; LEAF];
+        (self.limit, self.gone) = ([f64::INFINITY; LEAF], [f64::INFINITY; LEAF]);
+        // Lanes without a point reach nothing.
+        self.rough = [-1.0; LEAF];
+        self.rough[..count].fill(f32::INFINITY);
+    }
 }
 
 impl Visitor for Nearest<'_> {
@@ -185,11 +225,11 @@ impl Visitor for Nearest<'_> {
         let n = &self.tree.nodes[node as usize];
         let to_box = group.each_to_node(self.tree, node);
         let mut closer = false;
-        for (lane, &at) in group.places.iter().enumerate() {
+        for lane in 0..group.places.len() {
             if to_box[lane] > self.of.rough[lane] {
                 continue;
             }
-            let p = self.tree.point(at as usize);
+            let p = group.point(lane, self.tree.dim);
             let roughly = self.tree.to_leaf(n, p);
             for (q, &rough) in (n.start..n.end).zip(&roughly) {
                 if rough <= self.of.rough[lane] {
