@@ -62,6 +62,9 @@ fn in_tree_order(tree: &KdTree, weights: &[u32]) -> Vec<u32> {
     tree.order.iter().map(|&i| weights[i as usize]).collect()
 }
 
+/// Of each point of a leaf its core distance and whether its neighbours are complete; and their rows of neighbours.
+type OfLeaf = (Vec<(f64, bool)>, Vec<u32>);
+
 /// Core distances and nearest neighbours of the tree's points; `weights` are how many points each stands for.
 pub(crate) fn neighbours(tree: &KdTree, weights: &[u32], min_samples: usize) -> Neighbours {
     let n = tree.order.len();
@@ -69,7 +72,7 @@ pub(crate) fn neighbours(tree: &KdTree, weights: &[u32], min_samples: usize) -> 
     let weights = in_tree_order(tree, weights);
     let leaves: Vec<u32> = tree.leaves(0).collect();
     // Leaves are in tree order; so are their points, one after the other.
-    let found: Vec<(Vec<(f64, bool)>, Vec<u32>)> = leaves
+    let found: Vec<OfLeaf> = leaves
         .par_iter()
         .with_min_len(8)
         .map_init(Search::default, |search, &leaf| {
