@@ -2,18 +2,19 @@
 """Writes what scikit-learn makes of small point sets, for the tests of crates/hdbscan-exact.
 
 Every edge of the mutual reachability graph that is dominated by one core distance ties with others, so the minimum spanning
-tree is not unique, and which points stand at a cluster's rim depends on which one was taken. Hence two lists of labels a case:
-those of sklearn.cluster.HDBSCAN as it comes (to be met closely), and those that scikit-learn's own dendrogram and tree code
+tree is not unique, and which points stand at a cluster's rim depends on which one was taken. Hence several lists of labels a case:
+those of sklearn.cluster.HDBSCAN as it comes, beside those of Python's hdbscan with its exact spanning tree (to be met closely), and those that scikit-learn's own dendrogram and tree code
 gives for THE minimum spanning tree of one total order of edges: weight, smaller index, larger index, with points numbered
 lexicographically by coordinates (to be met exactly, probabilities included).
 
-usage: make_hdbscan_golden.py OUT.txt [CLUSTERABLE.npy OUT2.txt]    (needs numpy, scikit-learn 1.9)
-A case is five lines: name, dimension, min_cluster_size, min_samples, epsilon, eom|leaf, allow_single_cluster; coordinates;
-labels; labels of the one tree; probabilities of the one tree. The second file holds the same for the points of
+usage: make_hdbscan_golden.py OUT.txt [CLUSTERABLE.npy OUT2.txt]    (needs numpy, scikit-learn 1.9, hdbscan 0.8)
+A case is seven lines: name, dimension, min_cluster_size, min_samples, epsilon, eom|leaf, allow_single_cluster; coordinates;
+labels; labels of the one tree; probabilities of the one tree; labels of hdbscan; outlier scores of hdbscan. The second file holds the same for the points of
 CLUSTERABLE.npy, without the coordinates.
 """
 import sys
 
+import hdbscan
 import numpy as np
 from sklearn.cluster import HDBSCAN
 from sklearn.cluster._hdbscan._linkage import MST_edge_dtype, make_single_linkage
@@ -64,14 +65,20 @@ def write_case(out, name, x, size, samples, eps, method, single, coordinates):
                 allow_single_cluster=bool(single), algorithm="brute", copy=True)
     labels = h.fit_predict(x.astype(np.float64))
     one, probabilities = one_tree(x, size, samples, eps, method, bool(single))
+    # It does not count the point itself in min_samples.
+    python = hdbscan.HDBSCAN(min_cluster_size=size, min_samples=samples - 1, cluster_selection_epsilon=eps,
+                             cluster_selection_method=method, allow_single_cluster=bool(single),
+                             algorithm="prims_kdtree", approx_min_span_tree=False).fit(x.astype(np.float64))
     print(name, x.shape[1], size, samples, eps, method, single, file=out)
     if coordinates:
         print(*(f"{v:.7g}" for v in x.ravel()), file=out)
     print(*labels, file=out)
     print(*one, file=out)
     print(*(f"{v:.5g}" for v in probabilities), file=out)
+    print(*python.labels_, file=out)
+    print(*(f"{v:.5g}" for v in python.outlier_scores_), file=out)
     print(f"{name}: {x.shape}, {one.max() + 1} clusters, {(one < 0).sum()} noise; ARI between the two lists "
-          f"{adjusted_rand_score(labels, one):.4f}")
+          f"{adjusted_rand_score(labels, one):.4f}, of hdbscan with the second {adjusted_rand_score(python.labels_, one):.4f}")
 
 
 def blobs(n, d, k, std, seed):

@@ -33,6 +33,17 @@ pub struct TreeEdge {
     pub instance: i32,
 }
 
+/// A box around an instance along its principal axes.
+#[derive(Debug, Clone, Copy, Default, PartialEq)]
+pub struct OrientedBox {
+    /// Middle of the box.
+    pub center: [f32; 3],
+    /// Unit axes, right-handed, the longest side first.
+    pub axes: [[f32; 3]; 3],
+    /// Half the sides, along the axes.
+    pub half_size: [f32; 3],
+}
+
 /// All instances of a scene; K of them.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct Instances {
@@ -54,6 +65,8 @@ pub struct Instances {
     pub bbox_min: Vec<[f32; 3]>,
     /// Upper corner of that box; K.
     pub bbox_max: Vec<[f32; 3]>,
+    /// Box around their centres along their principal axes; K, or none at all in files of before there were such boxes.
+    pub oriented: Vec<OrientedBox>,
     /// Names of the views (file stems) that matches speak of.
     pub views: Vec<String>,
     /// All matches, ordered by instance, view.
@@ -82,6 +95,13 @@ impl Instances {
         &self.descriptor[instance * self.dim..(instance + 1) * self.dim]
     }
 
+    /// The cluster of the tree that an instance split off, and the clusters that it falls into below (its parts); `None` for
+    /// an instance that is all there is (the root), or not in the tree.
+    pub fn family(&self, instance: usize) -> Option<(u32, Vec<u32>)> {
+        let own = self.tree.iter().find(|e| e.instance == instance as i32)?;
+        Some((own.parent, self.tree.iter().filter(|e| e.parent == own.child).map(|e| e.child).collect()))
+    }
+
     /// Writes the artifact.
     ///
     /// # Errors
@@ -94,7 +114,19 @@ impl Instances {
         fn column<S, T>(all: &[S], f: impl Fn(&S) -> T) -> Vec<T> {
             all.iter().map(f).collect()
         }
-        ArtifactWriter::new(provenance)
+        let mut writer = ArtifactWriter::new(provenance);
+        if self.oriented.len() == k {
+            let (center, axes, half): (Vec<_>, Vec<_>, Vec<_>) = (
+                column(&self.oriented, |b| b.center),
+                column(&self.oriented, |b| b.axes),
+                column(&self.oriented, |b| b.half_size),
+            );
+            writer = writer
+                .tensor("obb_center", &[k, 3], center.as_flattened())
+                .tensor("obb_axes", &[k, 3, 3], axes.as_flattened().as_flattened())
+                .tensor("obb_half_size", &[k, 3], half.as_flattened());
+        }
+        writer
             .tensor("label", &[self.label.len()], &self.label)
             .tensor("descriptor", &[k, self.dim], &self.descriptor)
             .tensor("support", &[k], &self.support)
@@ -150,7 +182,14 @@ impl Instances {
                     .expected(format!("-1 to {}", k as i64 - 1)));
             }
         }
+        let mut oriented = Vec::new();
+        if a.shape("obb_center").is_some() {
+            let (center, half) = (triples("obb_center")?, triples("obb_half_size")?);
+            let axes = a.tensor::<f32>("obb_axes", &[Some(k), Some(3), Some(3)])?.as_chunks::<3>().0.as_chunks::<3>().0;
+            oriented = (0..k).map(|i| OrientedBox { center: center[i], axes: axes[i], half_size: half[i] }).collect();
+        }
         let instances = Self {
+            oriented,
             label,
             dim,
             descriptor: a.tensor("descriptor", &[Some(k), Some(dim)])?.to_vec(),
@@ -197,12 +236,18 @@ mod tests {
                 centroid: vec![[0.0; 3], [1.0; 3]],
                 bbox_min: vec![[0.0; 3]; 2],
                 bbox_max: vec![[1.0; 3]; 2],
+                // Files without oriented boxes are read, too.
+                oriented: match dim {
+                    0 => Vec::new(),
+                    _ => vec![OrientedBox { half_size: [3.0, 2.0, 1.0], axes: [[0.5; 3]; 3], ..Default::default() }; 2],
+                },
                 views: vec!["a".into()],
                 matches: vec![Match { instance: 0, view: 0, mask: 7, score: 0.5 }],
                 tree: vec![TreeEdge { parent: 4, child: 5, lambda: 2.0, size: 2, instance: 1 }],
             };
             i.write(&p, Provenance::default()).unwrap();
             assert_eq!(Instances::read(&p).unwrap().0, i);
+            assert_eq!((i.family(1), i.family(0)), (Some((4, vec![])), None));
         }
     }
 }

@@ -3,7 +3,7 @@
 use crate::associate::{FeatureTable, Silhouette, matches, overlaps};
 use crate::describe::{Aggregate, describe};
 use crate::extend::from_nearest;
-use crate::group::{Distance, Space, group, tree};
+use crate::group::{Distance, Space, group, group_sample, tree};
 use artifacts::{
     Features, Footprints, Graph, Instances, Level, MaskFeatures, MaskMaps, Match, NOISE_COLOR, features_path,
     instance_color, maps_path, role,
@@ -67,6 +67,9 @@ struct ClusteringArgs {
     /// Average features over each Gaussian's spatial neighbours this many times first
     #[arg(long, default_value_t = 0, value_name = "ROUNDS")]
     smooth: usize,
+    /// Cluster this many free points, chosen by --seed, and give the others the clusters they fall into
+    #[arg(long, value_name = "COUNT")]
+    sample: Option<usize>,
     /// Fewest Gaussians of an instance
     #[arg(long, default_value_t = 30, value_name = "COUNT")]
     min_cluster_size: usize,
@@ -230,6 +233,15 @@ fn options(c: &ClusteringArgs, n: usize) -> Result<Options> {
     check(c.min_cluster_size >= 2, "--min-cluster-size", &c.min_cluster_size, "at least 2")?;
     check((0.0..=1.0).contains(&share), "--min-cluster-share", &share, "0 to 1")?;
     check(min_samples >= 1, "--min-samples", &min_samples, "at least 1")?;
+    if let Some(sample) = c.sample {
+        check(sample >= 2, "--sample", &sample, "at least 2")?;
+        check(
+            c.cluster == Space::Free,
+            "--sample",
+            &sample,
+            "--cluster free: a graph without most of its nodes falls apart",
+        )?;
+    }
     check((0.0..f64::INFINITY).contains(&epsilon), "--epsilon", &epsilon, "at least 0")?;
     Ok(Options {
         min_cluster_size: c.min_cluster_size.max((share * n as f64).ceil() as usize),
@@ -258,7 +270,15 @@ fn run(a: &Args, stage: &Stage) -> Result<()> {
     let (n_all, n) = (inputs.gaussians.len(), inputs.graph.kept.len());
     let options = options(c, n)?;
 
-    let clustering = group(&inputs.features, &inputs.graph, c.cluster, c.distance, c.smooth, &options);
+    let clustering = match c.sample {
+        Some(sample) => {
+            if sample < n {
+                stage.skipped(&format!("{} of {n} Gaussians in clustering: not in the sample; predicted", n - sample));
+            }
+            group_sample(&inputs.features, &inputs.graph, c.smooth, sample, a.common.seed, &options)
+        }
+        None => group(&inputs.features, &inputs.graph, c.cluster, c.distance, c.smooth, &options),
+    };
     let instances = clustering.selected.len();
     let noise = clustering.labels.iter().filter(|&&l| l < 0).count();
     stage.info(&format!("{instances} instances among {n} Gaussians, {noise} noise"));
@@ -370,7 +390,13 @@ fn readable(instances: &Instances, parameters: &Value) -> Value {
             let matches: Vec<Value> = own
                 .map(|m| json!({"view": instances.views[m.view as usize], "mask": m.mask, "score": m.score}))
                 .collect();
+            let (parent, parts) = instances.family(k).map_or((None, Vec::new()), |(p, parts)| (Some(p), parts));
+            let oriented = instances
+                .oriented
+                .get(k)
+                .map(|b| json!({"center": b.center, "axes": b.axes, "half_size": b.half_size}));
             json!({
+                "oriented_box": oriented, "tree_parent": parent, "tree_parts": parts,
                 "instance": k, "gaussians": instances.count[k], "support": instances.support[k],
                 "score": instances.score[k], "centroid": instances.centroid[k],
                 "bbox_min": instances.bbox_min[k], "bbox_max": instances.bbox_max[k],
@@ -422,6 +448,7 @@ fn write_outputs(
         "cluster": lower(&c.cluster),
         "distance": lower(&c.distance),
         "smooth": c.smooth,
+        "sample": c.sample,
         "min_cluster_size": options.min_cluster_size,
         "min_samples": options.min_samples,
         "epsilon": options.epsilon,

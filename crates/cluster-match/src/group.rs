@@ -1,7 +1,10 @@
 //! Clustering of Gaussians by their features.
 
 use artifacts::{Features, Graph, TreeEdge};
-use hdbscan_exact::{Clustering, Edge, Options, cluster, cluster_graph};
+use hdbscan_exact::{Clustering, Edge, Options, approximate_predict, cluster, cluster_graph};
+use rand::seq::index;
+use rand_chacha::ChaCha8Rng;
+use rand_chacha::rand_core::SeedableRng;
 use rayon::prelude::*;
 
 /// Gaussians that one task handles.
@@ -102,6 +105,46 @@ pub fn group(
             cluster_graph(features.kept.len(), &edges, options)
         }
     }
+}
+
+/// Clusters a random `sample` of the kept Gaussians as free points, and gives the others the clusters that they would fall
+/// into. `min_cluster_size` shrinks with the sample, to 2 at least. The tree speaks of the sample alone.
+pub fn group_sample(
+    features: &Features,
+    graph: &Graph,
+    smoothing: usize,
+    sample: usize,
+    seed: u64,
+    options: &Options,
+) -> Clustering {
+    let dim = features.dim.max(1);
+    let n = features.kept.len();
+    let values = standardise(&smooth(&features.values, dim, &graph.gaussian_knn, graph.gaussian_k, smoothing), dim);
+    if sample >= n {
+        return cluster(&values, dim, options);
+    }
+    let mut chosen = index::sample(&mut ChaCha8Rng::seed_from_u64(seed), n, sample).into_vec();
+    chosen.sort_unstable();
+    let mut is_chosen = vec![false; n];
+    chosen.iter().for_each(|&i| is_chosen[i] = true);
+    let rest: Vec<usize> = (0..n).filter(|&i| !is_chosen[i]).collect();
+    let rows =
+        |of: &[usize]| -> Vec<f32> { of.iter().flat_map(|&i| &values[i * dim..(i + 1) * dim]).copied().collect() };
+    let least = (options.min_cluster_size as f64 * sample as f64 / n as f64).ceil() as usize;
+    let options = Options { min_cluster_size: least.max(2), ..*options };
+    let points = rows(&chosen);
+    let mut out = cluster(&points, dim, &options);
+    let others = approximate_predict(&points, dim, &out, &options, &rows(&rest));
+    let mut labels = vec![-1; n];
+    chosen.iter().zip(&out.labels).chain(rest.iter().zip(&others.labels)).for_each(|(&i, &l)| labels[i] = l);
+    let mut probabilities = vec![0.0; n];
+    let all = chosen.iter().zip(&out.probabilities).chain(rest.iter().zip(&others.probabilities));
+    all.for_each(|(&i, &p)| probabilities[i] = p);
+    // Outlier scores are of clustered points only.
+    let mut outlier_scores = vec![0.0; n];
+    chosen.iter().zip(&out.outlier_scores).for_each(|(&i, &s)| outlier_scores[i] = s);
+    (out.labels, out.probabilities, out.outlier_scores) = (labels, probabilities, outlier_scores);
+    out
 }
 
 /// Distances of features, [`Distance`].
@@ -241,6 +284,21 @@ mod tests {
                 assert_eq!(tree.iter().filter(|e| e.instance >= 0).count(), 2);
             }
         }
+    }
+
+    #[test]
+    fn a_sample_finds_the_same_two_rods() {
+        let (f, g) = two_rods();
+        let o = Options { min_cluster_size: 20, min_samples: 3, ..Options::default() };
+        let all = group(&f, &g, Space::Free, Distance::Chord, 0, &o);
+        assert_eq!(group_sample(&f, &g, 0, 60, 1, &o), all);
+        let c = group_sample(&f, &g, 0, 30, 1, &o);
+        assert_eq!((c.selected.len(), c.labels.len(), c.tree.points <= 30), (2, 60, true));
+        for rod in [&c.labels[..30], &c.labels[30..]] {
+            let known: Vec<i32> = rod.iter().copied().filter(|&l| l >= 0).collect();
+            assert!(known.len() > 20 && known.iter().all(|&l| l == known[0]), "{rod:?}");
+        }
+        assert_eq!(c, group_sample(&f, &g, 0, 30, 1, &o));
     }
 
     #[test]

@@ -280,6 +280,7 @@ fn options_do_what_they_say() {
     let s = Scene::new();
     for extra in [
         &["--cluster", "free", "--min-samples", "5"][..],
+        &["--cluster", "free", "--min-samples", "5", "--sample", "60", "--aggregate", "geometric-median"],
         &["--distance", "chord", "--epsilon", "0.3", "--smooth", "1"],
         &["--distance", "euclidean", "--epsilon", "0.5"],
         &["--silhouette", "visible", "--min-cluster-share", "0.4"],

@@ -6,8 +6,9 @@
 //! core distances were found with are candidates: they tell at once how cheap an edge a component has at least, and an edge
 //! that is no heavier than the point's own core distance cannot be beaten.
 
-use crate::kdtree::{KdTree, NONE, Neighbours, neighbours, squared, surely};
+use crate::kdtree::{Group, KdTree, LEAF, Visitor, rough_limit, squared};
 use crate::linkage::{Edge, UnionFind};
+use crate::neighbours::{NONE, Neighbours, density_tree, neighbours};
 use multiversion::multiversion;
 use rayon::prelude::*;
 use std::sync::atomic::{AtomicU64, Ordering::Relaxed};
@@ -104,7 +105,7 @@ impl<'a> Candidates<'a> {
 pub fn spanning_tree(points: &[f32], dim: usize, weights: &[u32], min_samples: usize) -> (Vec<Edge>, Vec<f64>) {
     let n = weights.len();
     assert_eq!(points.len(), n * dim, "a weight for every point");
-    let tree = KdTree::new(points, dim);
+    let tree = density_tree(points, dim, weights, min_samples);
     let near = neighbours(&tree, weights, min_samples);
     let mut core = vec![0.0; n];
     for (&i, &c) in tree.order.iter().zip(&near.core) {
@@ -118,6 +119,7 @@ pub fn spanning_tree(points: &[f32], dim: usize, weights: &[u32], min_samples: u
     let mut sets = UnionFind::new(n);
     let mut known: Vec<Known> = near.core.iter().map(|&floor| Known { best: None, floor, next: 0 }).collect();
     let mut caps = Caps::new(n);
+    let leaves: Vec<u32> = tree.leaves(0).collect();
     let mut out: Vec<Edge> = Vec::with_capacity(n - 1);
     while out.len() < n - 1 {
         // What points know already, for sure or as candidates.
@@ -139,12 +141,33 @@ pub fn spanning_tree(points: &[f32], dim: usize, weights: &[u32], min_samples: u
             }
         });
         // Points that may know something cheaper look for it.
-        known.par_iter_mut().enumerate().with_min_len(256).for_each_init(
-            || (Vec::new(), Vec::new()),
-            |(stack, padded), (i, k)| {
-                if k.best.is_none() && k.floor <= caps.get(search.component[i]) {
-                    let (found, least) = cheapest_edge(&search, i, &caps, stack, padded);
-                    (k.best, k.floor) = (found, k.floor.max(least));
+        let mut rest = &mut known[..];
+        let mut of_leaf: Vec<&mut [Known]> = Vec::with_capacity(leaves.len());
+        for &leaf in &leaves {
+            let node = &tree.nodes[leaf as usize];
+            let (own, others) = rest.split_at_mut((node.end - node.start) as usize);
+            of_leaf.push(own);
+            rest = others;
+        }
+        of_leaf.into_par_iter().zip(&leaves).with_min_len(8).for_each_init(
+            || (Group::default(), Vec::new()),
+            |(group, asking), (known, &leaf)| {
+                let start = tree.nodes[leaf as usize].start;
+                asking.clear();
+                for (lane, k) in known.iter().enumerate() {
+                    let own = search.component[start as usize + lane];
+                    if k.best.is_none() && k.floor <= caps.get(own) {
+                        asking.push((own, start + lane as u32));
+                    }
+                }
+                // Points of one component ask together.
+                asking.sort_unstable();
+                for points in asking.chunk_by(|a, b| a.0 == b.0) {
+                    let (found, least) = cheapest_edges(&search, points, &caps, group);
+                    for (&(_, at), found) in points.iter().zip(found) {
+                        let k = &mut known[(at - start) as usize];
+                        (k.best, k.floor) = (found, k.floor.max(least));
+                    }
                 }
             },
         );
@@ -204,61 +227,84 @@ impl<'a> Search<'a> {
     }
 }
 
-/// The cheapest edge from point `i` to another component, if its component knows none of less weight; and a weight that no
-/// edge from `i` to another component is below. `stack` and `padded` are scratch.
-#[multiversion(targets("x86_64+avx2+fma", "aarch64+neon"))]
-fn cheapest_edge(
-    search: &Search<'_>,
-    i: usize,
-    caps: &Caps,
-    stack: &mut Vec<(f64, u32)>,
-    padded: &mut Vec<f32>,
-) -> (Found, f64) {
-    let tree = search.tree;
-    let (p, own) = (tree.point(i), search.component[i]);
-    tree.pad(i, padded);
-    let mut found: Found = None;
-    let mut cap = caps.get(own);
-    // Squared, and a little more than the rounding of root and square can take away.
-    let mut limit = cap * cap * (1.0 + 1e-12);
-    stack.clear();
-    stack.push((0.0, 0));
-    while let Some((bound, node)) = stack.pop() {
-        // Edges of equal weight still matter: the order of indices decides among them.
-        if bound > limit || search.least_core[node as usize] > cap || search.of_node[node as usize] == own {
-            continue;
+/// A search for the cheapest edges of points of one component.
+struct Cheapest<'a> {
+    search: &'a Search<'a>,
+    caps: &'a Caps,
+    own: u32,
+    /// No edge of greater weight matters; and its square in f32, with more than the rounding of root and square can take away.
+    cap: f64,
+    reach: f32,
+    found: [Found; LEAF],
+}
+
+impl Cheapest<'_> {
+    #[inline(always)]
+    fn lower(&mut self, cap: f64) {
+        if cap < self.cap {
+            self.cap = cap;
+            self.reach = rough_limit(cap * cap * (1.0 + 1e-12));
         }
-        let n = &tree.nodes[node as usize];
-        if n.right == 0 {
-            cap = cap.min(caps.get(own));
-            limit = cap * cap * (1.0 + 1e-12);
-            let roughly = tree.to_leaf(n, p);
+    }
+}
+
+impl Visitor for Cheapest<'_> {
+    #[inline(always)]
+    fn wants(&self, node: u32) -> bool {
+        // Edges of equal weight still matter: the order of indices decides among them.
+        self.search.of_node[node as usize] != self.own && self.search.least_core[node as usize] <= self.cap
+    }
+
+    #[inline(always)]
+    fn reach(&self) -> f32 {
+        self.reach
+    }
+
+    #[inline(always)]
+    fn reaches(&self, distances: &[f32; LEAF]) -> bool {
+        distances.iter().map(|&d| u32::from(d <= self.reach)).sum::<u32>() > 0
+    }
+
+    #[inline(always)]
+    fn leaf(&mut self, group: &Group, node: u32) {
+        let s = self.search;
+        let n = &s.tree.nodes[node as usize];
+        self.lower(self.caps.get(self.own));
+        let to_box = group.each_to_node(s.tree, node);
+        for (lane, &at) in group.places.iter().enumerate() {
+            if to_box[lane] > self.reach {
+                continue;
+            }
+            let roughly = s.tree.to_leaf(n, s.tree.point(at as usize));
             for (q, &rough) in (n.start as usize..n.end as usize).zip(&roughly) {
-                if surely(rough) > limit || search.component[q] == own || search.core[q] > cap {
+                if rough > self.reach || s.component[q] == self.own || s.core[q] > self.cap {
                     continue;
                 }
-                let edge = search.edge(i, q);
-                if edge.weight <= cap && found.is_none_or(|(f, _)| edge.order(&f).is_lt()) {
-                    found = Some((edge, q as u32));
-                    cap = edge.weight;
-                    limit = cap * cap * (1.0 + 1e-12);
-                    caps.lower(own, cap);
-                }
-            }
-        } else {
-            // The nearer child is looked at first.
-            let (left, right) = (node + 1, n.right);
-            let (l, r) = (tree.to_box(left, padded), tree.to_box(right, padded));
-            let (near, far) = if l <= r { ((l, left), (r, right)) } else { ((r, right), (l, left)) };
-            for (d, child) in [far, near] {
-                if surely(d) <= limit {
-                    stack.push((surely(d), child));
+                let edge = s.edge(at as usize, q);
+                if edge.weight <= self.cap && self.found[lane].is_none_or(|(f, _)| edge.order(&f).is_lt()) {
+                    self.found[lane] = Some((edge, q as u32));
+                    self.lower(edge.weight);
+                    self.caps.lower(self.own, edge.weight);
+                    // It is an edge of the other component, too.
+                    self.caps.lower(s.component[q], edge.weight);
                 }
             }
         }
     }
+}
+
+/// The cheapest edges from points of one component, (component, place) each, to others, where the component knows none of less
+/// weight; and a weight that no other edge from them to another component is below.
+#[multiversion(targets("x86_64+avx2+fma", "aarch64+neon"))]
+fn cheapest_edges(search: &Search<'_>, points: &[(u32, u32)], caps: &Caps, group: &mut Group) -> ([Found; LEAF], f64) {
+    let own = points[0].0;
+    group.gather(search.tree, points.iter().map(|p| p.1));
+    let mut walk = Cheapest { search, caps, own, cap: f64::INFINITY, reach: f32::INFINITY, found: [None; LEAF] };
+    walk.lower(caps.get(own));
+    group.walk(search.tree, 0, &mut walk);
     // An edge above the cap need not be the point's cheapest: cheaper ones may have been passed over.
-    (found.filter(|(f, _)| f.weight <= cap), cap)
+    let cap = walk.cap;
+    (walk.found.map(|f| f.filter(|(f, _)| f.weight <= cap)), cap)
 }
 
 #[cfg(test)]

@@ -1,9 +1,8 @@
-//! A kd-tree, and core distances from it.
+//! A kd-tree, and walks over it for a group of points at a time.
 //!
 //! What decides is computed in f64. What only tells whether something need be looked at is computed in f32, many points at
-//! a time, and lowered by more than f32 can be wrong ([`surely`]): nothing that matters is ever passed over.
+//! a time, against limits raised by more than f32 can be wrong ([`rough_limit`]): nothing that matters is ever passed over.
 
-use multiversion::multiversion;
 use rayon::prelude::*;
 use std::cmp::Ordering;
 
@@ -11,12 +10,10 @@ use std::cmp::Ordering;
 pub(crate) const LEAF: usize = 16;
 /// Coordinates of boxes are padded to a multiple of this.
 const LANES: usize = 8;
+/// Core distances count this many times what coordinates do when it is decided what to split by (measured).
+const CORE_AXIS: f64 = 1.0;
 /// Subtrees smaller than this are built by one thread.
 const PARALLEL_BUILD: usize = 8192;
-/// Most neighbours that are remembered of a point.
-const MOST_NEIGHBOURS: usize = 32;
-/// No neighbour.
-pub(crate) const NONE: u32 = u32::MAX;
 
 /// Points without duplicates, numbered in the lexicographic order of their coordinates: where edges of equal weight are
 /// ordered by these numbers, the result does not depend on the order in which the caller names the points.
@@ -60,12 +57,12 @@ pub(crate) fn squared(a: &[f32], b: &[f32]) -> f64 {
     a.iter().zip(b).map(|(x, y)| (f64::from(*x) - f64::from(*y)).powi(2)).sum()
 }
 
-/// A squared distance that the one computed in f32 cannot be below. A sum of up to 64 squares of differences, in any order,
-/// is off by less than 70 roundings of 6e-8 each; below the normal numbers by less than 1e-37. What overflowed tells
-/// nothing.
+/// Squared distances in f32 beyond this are surely beyond `limit` in truth. A sum of up to 64 squares of differences, in any
+/// order, is off by less than 70 roundings of 6e-8 each; below the normal numbers by less than 1e-37. One that overflowed is
+/// beyond every limit that does not overflow with it.
 #[inline(always)]
-pub(crate) fn surely(distance: f32) -> f64 {
-    if distance < f32::INFINITY { f64::from(distance) * (1.0 - 1e-5) - 1e-37 } else { 0.0 }
+pub(crate) fn rough_limit(limit: f64) -> f32 {
+    ((limit + 1e-37) * (1.0 + 2e-5)) as f32
 }
 
 #[derive(Debug, Clone, Copy, Default)]
@@ -114,6 +111,13 @@ struct Part<'a> {
 
 impl KdTree {
     pub fn new(points: &[f32], dim: usize) -> Self {
+        Self::by_density(points, dim, &[])
+    }
+
+    /// A tree that parts dense and scattered points, too: where `core` (one for each point) tells how far apart they are, it
+    /// is split by like another coordinate. Then few scattered points do not make the boxes of many dense ones wide, and
+    /// nodes are alike in core distance and in component.
+    pub fn by_density(points: &[f32], dim: usize, core: &[f64]) -> Self {
         let n = points.len() / dim;
         let padded = dim.next_multiple_of(LANES);
         let (nodes, leaves) = if n == 0 { (0, 0) } else { counts(n) };
@@ -129,7 +133,7 @@ impl KdTree {
         };
         if n > 0 {
             let part = Part { order: &mut order, nodes: &mut tree.nodes, boxes: &mut tree.boxes, first: [0, 0, 0] };
-            build(points, dim, part);
+            build(points, dim, core, part);
         }
         tree.coords = order.iter().flat_map(|&i| &points[i as usize * dim..(i as usize + 1) * dim]).copied().collect();
         for node in tree.nodes.iter().filter(|n| n.right == 0) {
@@ -149,28 +153,19 @@ impl KdTree {
         &self.coords[at * self.dim..(at + 1) * self.dim]
     }
 
-    /// The point at a place with zeros up to whole lanes, as [`Self::to_box`] wants it.
-    #[inline(always)]
-    pub fn pad(&self, at: usize, into: &mut Vec<f32>) {
-        into.clear();
-        into.extend(self.point(at));
-        into.resize(self.padded, 0.0);
+    /// The leaves below a node, in tree order.
+    pub fn leaves(&self, root: u32) -> impl Iterator<Item = u32> + use<'_> {
+        // A subtree's nodes follow its root, as its points follow each other.
+        let end = self.nodes.get(root as usize).map_or(0, |n| n.end);
+        (root..self.nodes.len() as u32)
+            .take_while(move |&i| self.nodes[i as usize].start < end)
+            .filter(|&i| self.nodes[i as usize].right == 0)
     }
 
-    /// Squared distance in f32 from a padded point to a node's box.
+    /// Lower and upper corner of a node's box, padded.
     #[inline(always)]
-    pub fn to_box(&self, node: u32, p: &[f32]) -> f32 {
-        let (low, high) = self.boxes[node as usize * 2 * self.padded..][..2 * self.padded].split_at(self.padded);
-        let mut sums = [0.0f32; LANES];
-        for ((p, low), high) in p.chunks_exact(LANES).zip(low.chunks_exact(LANES)).zip(high.chunks_exact(LANES)) {
-            for l in 0..LANES {
-                let (below, above) = (low[l] - p[l], p[l] - high[l]);
-                let d = if below > above { below } else { above };
-                let d = if d > 0.0 { d } else { 0.0 };
-                sums[l] += d * d;
-            }
-        }
-        ((sums[0] + sums[4]) + (sums[1] + sums[5])) + ((sums[2] + sums[6]) + (sums[3] + sums[7]))
+    fn box_of(&self, node: u32) -> (&[f32], &[f32]) {
+        self.boxes[node as usize * 2 * self.padded..][..2 * self.padded].split_at(self.padded)
     }
 
     /// Squared distances in f32 from a point to those of a leaf; infinite beyond them.
@@ -187,7 +182,17 @@ impl KdTree {
     }
 }
 
-fn build(points: &[f32], dim: usize, part: Part<'_>) {
+/// How far apart the core distances of points are; 0 where none are known.
+fn core_range(core: &[f64], order: &[u32]) -> f64 {
+    if core.is_empty() {
+        return 0.0;
+    }
+    let (low, high) =
+        order.iter().map(|&i| core[i as usize]).fold((f64::INFINITY, 0.0f64), |(l, h), c| (l.min(c), h.max(c)));
+    high - low
+}
+
+fn build(points: &[f32], dim: usize, core: &[f64], part: Part<'_>) {
     let Part { order, nodes, boxes, first: [first_slot, first_node, first_leaf] } = part;
     let padded = dim.next_multiple_of(LANES);
     let (own_box, rest_boxes) = boxes.split_at_mut(2 * padded);
@@ -210,8 +215,13 @@ fn build(points: &[f32], dim: usize, part: Part<'_>) {
     }
     let axis = (0..dim).max_by(|&a, &b| (high[a] - low[a]).total_cmp(&(high[b] - low[b])).then(b.cmp(&a))).unwrap_or(0);
     let middle = n / 2;
-    let key = |i: u32| points[i as usize * dim + axis];
-    order.select_nth_unstable_by(middle, |&a, &b| key(a).total_cmp(&key(b)).then(a.cmp(&b)));
+    let extent = f64::from(high[axis]) - f64::from(low[axis]);
+    if core_range(core, order) * CORE_AXIS > extent {
+        order.select_nth_unstable_by(middle, |&a, &b| core[a as usize].total_cmp(&core[b as usize]).then(a.cmp(&b)));
+    } else {
+        let key = |i: u32| points[i as usize * dim + axis];
+        order.select_nth_unstable_by(middle, |&a, &b| key(a).total_cmp(&key(b)).then(a.cmp(&b)));
+    }
     let (left_nodes, left_leaves) = counts(middle);
     nodes[0].right = (first_node + 1 + left_nodes) as u32;
     let (left, right) = order.split_at_mut(middle);
@@ -226,129 +236,140 @@ fn build(points: &[f32], dim: usize, part: Part<'_>) {
         first: [first_slot + middle, first_node + 1 + left_nodes, first_leaf + left_leaves],
     };
     if n >= PARALLEL_BUILD {
-        rayon::join(|| build(points, dim, left), || build(points, dim, right));
+        rayon::join(|| build(points, dim, core, left), || build(points, dim, core, right));
     } else {
-        build(points, dim, left);
-        build(points, dim, right);
+        build(points, dim, core, left);
+        build(points, dim, core, right);
     }
 }
 
-/// What the search for core distances finds, in tree order.
-pub(crate) struct Neighbours {
-    /// Core distance of each point: the distance within which `min_samples` points lie, itself and its duplicates counted.
-    /// The distance to the farthest point where there are fewer.
-    pub core: Vec<f64>,
-    /// Points within the core distance, as places in the tree, `[n][kept]`; [`NONE`] where there are fewer.
-    pub near: Vec<u32>,
-    /// Places of a row in `near`.
-    pub kept: usize,
-    /// Whether `near` names every other point within the core distance.
-    pub complete: Vec<bool>,
-}
-
-/// Core distances and nearest neighbours of the tree's points; `weights` are how many points each stands for.
-pub(crate) fn neighbours(tree: &KdTree, weights: &[u32], min_samples: usize) -> Neighbours {
-    let n = tree.order.len();
-    let kept = min_samples.saturating_sub(1).clamp(1, MOST_NEIGHBOURS);
-    let weights: Vec<u32> = tree.order.iter().map(|&i| weights[i as usize]).collect();
-    let mut near = vec![NONE; n * kept];
-    // Queries in tree order touch the same nodes one after the other.
-    let found: Vec<(f64, bool)> = near
-        .par_chunks_mut(kept)
-        .enumerate()
-        .with_min_len(128)
-        .map_init(Scratch::default, |scratch, (at, row)| {
-            let (core, all) = search(tree, &weights, at, min_samples, scratch);
-            let others = scratch.best.iter().filter(|b| b.1 != at as u32);
-            let fits = scratch.best.len() <= kept + 1;
-            row.iter_mut().zip(others).for_each(|(r, b)| *r = b.1);
-            (core.sqrt(), all && fits)
-        })
-        .collect();
-    let (core, complete) = found.into_iter().unzip();
-    Neighbours { core, near, kept, complete }
-}
-
-/// Core distances of points `[n][dim]`; see [`crate::Options::min_samples`].
-pub fn core_distances(points: &[f32], dim: usize, min_samples: usize) -> Vec<f64> {
-    let unique = Unique::new(points, dim);
-    let tree = KdTree::new(&unique.points, dim);
-    let found = neighbours(&tree, &unique.weights, min_samples);
-    let mut core = vec![0.0; unique.weights.len()];
-    for (&i, c) in tree.order.iter().zip(found.core) {
-        core[i as usize] = c;
-    }
-    unique.of_point.iter().map(|&u| core[u as usize]).collect()
-}
-
+/// Up to [`LEAF`] points that walk over a tree together, theirs or another of the same dimension.
 #[derive(Default)]
-struct Scratch {
-    /// Squared distances with places, ascending, just enough of them to hold min_samples points.
-    best: Vec<(f64, u32)>,
-    stack: Vec<(f64, u32)>,
-    padded: Vec<f32>,
+pub(crate) struct Group {
+    /// Their places in the tree that they were gathered from.
+    pub places: Vec<u32>,
+    /// Their coordinates, `[places][dim]`.
+    points: Vec<f32>,
+    /// Their coordinates, `[dim][LEAF]`; lanes without a point repeat the first one.
+    lanes: Vec<f32>,
+    /// Lower and upper corner of the box around them, padded as those of nodes.
+    low: Vec<f32>,
+    high: Vec<f32>,
+    /// Nodes to be looked at, with their squared distances in f32.
+    stack: Vec<(f32, u32)>,
 }
 
-/// The squared core distance of the point at a place, and whether `best` holds all points within it.
-#[multiversion(targets("x86_64+avx2+fma", "aarch64+neon"))]
-fn search(tree: &KdTree, weights: &[u32], at: usize, min_samples: usize, scratch: &mut Scratch) -> (f64, bool) {
-    let Scratch { best, stack, padded } = scratch;
-    let p = tree.point(at);
-    tree.pad(at, padded);
-    let wanted = min_samples as u64;
-    best.clear();
-    let mut held = 0u64;
-    // The distance that a point must not exceed to matter, and the least of those that had to go.
-    let (mut limit, mut gone) = (f64::INFINITY, f64::INFINITY);
-    stack.clear();
-    stack.push((0.0, 0));
-    while let Some((bound, node)) = stack.pop() {
-        if bound > limit {
-            continue;
+/// What a walk is for.
+pub(crate) trait Visitor {
+    /// Whether a node may hold something of interest at all.
+    fn wants(&self, node: u32) -> bool;
+    /// The squared distance in f32 beyond which nothing is of interest to any point of the group.
+    fn reach(&self) -> f32;
+    /// Whether any point reaches as far as its squared distance, `[LEAF]`.
+    fn reaches(&self, distances: &[f32; LEAF]) -> bool;
+    /// Looks at a leaf.
+    fn leaf(&mut self, group: &Group, node: u32);
+}
+
+impl Group {
+    /// Takes other points. `places` has at least one and at most [`LEAF`].
+    #[inline(always)]
+    pub fn gather(&mut self, tree: &KdTree, places: impl Iterator<Item = u32>) {
+        self.places.clear();
+        self.places.extend(places);
+        self.points.clear();
+        for &at in &self.places {
+            self.points.extend(tree.point(at as usize));
         }
-        let n = &tree.nodes[node as usize];
-        if n.right == 0 {
-            let roughly = tree.to_leaf(n, p);
-            for (q, &rough) in (n.start..n.end).zip(&roughly) {
-                if surely(rough) > limit {
-                    continue;
-                }
-                let d = squared(p, tree.point(q as usize));
-                if d >= limit {
-                    gone = gone.min(d);
-                    continue;
-                }
-                let mut to = best.len();
-                while to > 0 && best[to - 1].0 > d {
-                    to -= 1;
-                }
-                best.insert(to, (d, q));
-                held += u64::from(weights[q as usize]);
-                while let Some(&(d, last)) = best.last() {
-                    let w = u64::from(weights[last as usize]);
-                    if held - w < wanted {
-                        break;
-                    }
-                    held -= w;
-                    gone = gone.min(d);
-                    best.pop();
-                }
-                if held >= wanted {
-                    limit = best.last().map_or(f64::INFINITY, |b| b.0);
-                }
+        self.lanes.resize(tree.dim * LEAF, 0.0);
+        self.low.clear();
+        self.low.extend(tree.point(self.places[0] as usize));
+        self.high.clear();
+        self.high.extend_from_slice(&self.low);
+        for k in 0..tree.dim {
+            let row = &mut self.lanes[k * LEAF..(k + 1) * LEAF];
+            row.fill(self.low[k]);
+            for (r, point) in row.iter_mut().zip(self.points.chunks_exact(tree.dim)) {
+                *r = point[k];
             }
-        } else {
-            let (left, right) = (node + 1, n.right);
-            let (l, r) = (tree.to_box(left, padded), tree.to_box(right, padded));
-            // The nearer child is looked at first.
-            let (near, far) = if l <= r { ((l, left), (r, right)) } else { ((r, right), (l, left)) };
-            for (d, child) in [far, near] {
-                if surely(d) <= limit {
-                    stack.push((surely(d), child));
-                }
+            for &v in row.iter() {
+                self.low[k] = if v < self.low[k] { v } else { self.low[k] };
+                self.high[k] = if v > self.high[k] { v } else { self.high[k] };
             }
         }
+        self.low.resize(tree.padded, 0.0);
+        self.high.resize(tree.padded, 0.0);
     }
-    let core = best.last().map_or(0.0, |b| b.0);
-    (core, gone > core)
+
+    /// The coordinates of one of the points.
+    #[inline(always)]
+    pub fn point(&self, lane: usize, dim: usize) -> &[f32] {
+        &self.points[lane * dim..(lane + 1) * dim]
+    }
+
+    /// Squared distance in f32 between the box around the points and that of a node.
+    #[inline(always)]
+    fn to_node(&self, tree: &KdTree, node: u32) -> f32 {
+        let (low, high) = tree.box_of(node);
+        let mut sums = [0.0f32; LANES];
+        for (at, (low, high)) in low.chunks_exact(LANES).zip(high.chunks_exact(LANES)).enumerate() {
+            let own = at * LANES..(at + 1) * LANES;
+            let (own_low, own_high) = (&self.low[own.clone()], &self.high[own]);
+            for l in 0..LANES {
+                let (below, above) = (low[l] - own_high[l], own_low[l] - high[l]);
+                let d = if below > above { below } else { above };
+                let d = if d > 0.0 { d } else { 0.0 };
+                sums[l] += d * d;
+            }
+        }
+        ((sums[0] + sums[4]) + (sums[1] + sums[5])) + ((sums[2] + sums[6]) + (sums[3] + sums[7]))
+    }
+
+    /// Squared distances in f32 of the points to the box of a node, [`LEAF`] of them.
+    #[inline(always)]
+    pub fn each_to_node(&self, tree: &KdTree, node: u32) -> [f32; LEAF] {
+        let (low, high) = tree.box_of(node);
+        let mut out = [0.0f32; LEAF];
+        for ((row, &low), &high) in self.lanes.chunks_exact(LEAF).zip(low).zip(high) {
+            for (o, &v) in out.iter_mut().zip(row) {
+                let (below, above) = (low - v, v - high);
+                let d = if below > above { below } else { above };
+                let d = if d > 0.0 { d } else { 0.0 };
+                *o += d * d;
+            }
+        }
+        out
+    }
+
+    /// Shows the visitor all leaves below `root` that are within reach of the group, near ones first.
+    #[inline(always)]
+    pub fn walk(&mut self, tree: &KdTree, root: u32, visitor: &mut impl Visitor) {
+        let mut stack = std::mem::take(&mut self.stack);
+        stack.clear();
+        stack.push((0.0, root));
+        while let Some((bound, node)) = stack.pop() {
+            if bound > visitor.reach() || !visitor.wants(node) {
+                continue;
+            }
+            let n = &tree.nodes[node as usize];
+            if n.right == 0 {
+                visitor.leaf(self, node);
+                continue;
+            }
+            // The box around the points may be near although none of them is.
+            if !visitor.reaches(&self.each_to_node(tree, node)) {
+                continue;
+            }
+            // The nearer child is looked at first.
+            let (left, right) = ((self.to_node(tree, node + 1), node + 1), (self.to_node(tree, n.right), n.right));
+            let (near, far) = if left.0 <= right.0 { (left, right) } else { (right, left) };
+            let reach = visitor.reach();
+            for child in [far, near] {
+                if child.0 <= reach {
+                    stack.push(child);
+                }
+            }
+        }
+        self.stack = stack;
+    }
 }

@@ -11,12 +11,15 @@ mod boruvka;
 mod condense;
 mod kdtree;
 mod linkage;
+mod neighbours;
+mod predict;
 mod select;
 
 pub use boruvka::spanning_tree;
 pub use condense::{CondensedEdge, CondensedTree};
-pub use kdtree::core_distances;
 pub use linkage::{Edge, spanning_forest};
+pub use neighbours::core_distances;
+pub use predict::{Prediction, approximate_predict};
 pub use select::Selection;
 
 /// Parameters of a clustering.
@@ -53,6 +56,10 @@ pub struct Clustering {
     pub labels: Vec<i32>,
     /// How firmly a point belongs to its cluster, 0 to 1; 0 for noise.
     pub probabilities: Vec<f32>,
+    /// How far a point is an outlier of the densest it could belong to, 0 to 1: (last - lambda) / last, where it leaves its
+    /// cluster of the tree at lambda and `last` is the largest finite lambda in that cluster and below (GLOSH, Campello,
+    /// Moulavi, Zimek and Sander 2015).
+    pub outlier_scores: Vec<f32>,
     /// The condensed tree.
     pub tree: CondensedTree,
     /// The node of the tree that was selected for each cluster, by label.

@@ -17,10 +17,10 @@ pub enum Selection {
 const LAMBDA_CAP: f64 = 1e30;
 
 /// The clusters of a condensed tree, numbered from 0 (the root). Parents have smaller numbers than their children.
-struct Clusters {
+pub(crate) struct Clusters {
     /// Lambda at which each was born; 0 for the root.
-    birth: Vec<f64>,
-    parent: Vec<Option<usize>>,
+    pub birth: Vec<f64>,
+    pub parent: Vec<Option<usize>>,
     children: Vec<Vec<usize>>,
     /// Sum over what leaves the cluster of (lambda - birth) * size.
     stability: Vec<f64>,
@@ -29,7 +29,7 @@ struct Clusters {
 }
 
 impl Clusters {
-    fn new(tree: &CondensedTree) -> Self {
+    pub fn new(tree: &CondensedTree) -> Self {
         let (m, k) = (tree.points as usize, tree.clusters as usize);
         let mut out = Self {
             birth: vec![0.0; k],
@@ -63,6 +63,41 @@ impl Clusters {
     /// Distance at which a cluster was born; infinite for the root.
     fn distance(&self, c: usize) -> f64 {
         if self.birth[c] > 0.0 { 1.0 / self.birth[c] } else { f64::INFINITY }
+    }
+
+    /// The chosen cluster, as an index into `selected` (ascending), at or above each cluster.
+    pub fn labels(&self, selected: &[usize]) -> Vec<Option<usize>> {
+        let mut out: Vec<Option<usize>> = vec![None; self.len()];
+        for c in 0..self.len() {
+            out[c] = selected.binary_search(&c).ok().or(self.parent[c].and_then(|p| out[p]));
+        }
+        out
+    }
+
+    /// Where the root is a cluster, points that leave it before this lambda are noise, as in scikit-learn: all cut off above
+    /// epsilon, or, without epsilon, before the last.
+    pub fn least_in_root(&self, tree: &CondensedTree, epsilon: f64) -> f64 {
+        if epsilon > 0.0 {
+            return 1.0 / epsilon;
+        }
+        tree.edges.iter().filter(|e| e.parent == tree.points).map(|e| e.lambda).fold(0.0, f64::max)
+    }
+
+    /// How firmly what leaves at `lambda` belongs to a cluster, 0 to 1.
+    pub fn probability(&self, cluster: usize, lambda: f64) -> f32 {
+        let death = self.death[cluster];
+        if death == 0.0 || lambda >= death { 1.0 } else { (lambda / death) as f32 }
+    }
+
+    /// Largest finite lambda at which something leaves each cluster or one below it.
+    fn last_deaths(&self) -> Vec<f64> {
+        let mut out = self.death.clone();
+        for c in (1..self.len()).rev() {
+            if let Some(p) = self.parent[c] {
+                out[p] = out[p].max(out[c]);
+            }
+        }
+        out
     }
 
     fn excess_of_mass(&self, allow_root: bool) -> Vec<bool> {
@@ -130,32 +165,28 @@ pub(crate) fn label(tree: CondensedTree, of_point: &[u32], options: &Options) ->
         clusters.join_below(options.epsilon, options.allow_single_cluster, &mut chosen);
     }
     let selected: Vec<usize> = (0..clusters.len()).filter(|&c| chosen[c]).collect();
-    // Each cluster belongs to the chosen one at or above it.
-    let mut label_of: Vec<Option<usize>> = vec![None; clusters.len()];
-    for c in 0..clusters.len() {
-        label_of[c] = selected.binary_search(&c).ok().or(clusters.parent[c].and_then(|p| label_of[p]));
-    }
-    // Where the root is a cluster, points that leave it early are noise, as in scikit-learn: all cut off above epsilon, or,
-    // without epsilon, before the last.
-    let root_edges = tree.edges.iter().filter(|e| e.parent as usize == m);
-    let least_in_root =
-        if options.epsilon > 0.0 { 1.0 / options.epsilon } else { root_edges.map(|e| e.lambda).fold(0.0, f64::max) };
+    let label_of = clusters.labels(&selected);
+    let least_in_root = clusters.least_in_root(&tree, options.epsilon);
+    let last = clusters.last_deaths();
+    let mut outlier_scores = vec![0.0f32; m];
     let mut labels = vec![-1i32; m];
     let mut probabilities = vec![0.0f32; m];
     for e in tree.edges.iter().filter(|e| (e.child as usize) < m) {
         let c = e.parent as usize - m;
+        if last[c] > 0.0 && e.lambda < last[c] {
+            outlier_scores[e.child as usize] = ((last[c] - e.lambda) / last[c]) as f32;
+        }
         let Some(label) = label_of[c] else { continue };
         if selected[label] == 0 && e.lambda < least_in_root {
             continue;
         }
-        let death = clusters.death[selected[label]];
         labels[e.child as usize] = label as i32;
-        probabilities[e.child as usize] =
-            if death == 0.0 || e.lambda >= death { 1.0 } else { (e.lambda / death) as f32 };
+        probabilities[e.child as usize] = clusters.probability(selected[label], e.lambda);
     }
     Clustering {
         labels: of_point.iter().map(|&u| labels[u as usize]).collect(),
         probabilities: of_point.iter().map(|&u| probabilities[u as usize]).collect(),
+        outlier_scores: of_point.iter().map(|&u| outlier_scores[u as usize]).collect(),
         tree,
         selected: selected.iter().map(|&c| (c + m) as u32).collect(),
     }

@@ -1,6 +1,8 @@
-//! Labels of scikit-learn on small sets, made by scripts/make_hdbscan_golden.py, and properties of clusterings.
+//! Labels of scikit-learn and Python's hdbscan on small sets, made by scripts/make_hdbscan_golden.py, and properties of clusterings.
 
-use hdbscan_exact::{Clustering, Edge, Options, Selection, cluster, cluster_graph, core_distances};
+use hdbscan_exact::{
+    Clustering, Edge, Options, Selection, approximate_predict, cluster, cluster_graph, core_distances,
+};
 use proptest::prelude::*;
 use std::collections::BTreeMap;
 use std::path::PathBuf;
@@ -35,6 +37,9 @@ struct Case {
     /// What scikit-learn's tree code makes of the one spanning tree.
     one_tree: Vec<i32>,
     probabilities: Vec<f32>,
+    /// What Python's `hdbscan` says with an exact spanning tree.
+    python: Vec<i32>,
+    python_outliers: Vec<f32>,
 }
 
 fn numbers<T: FromStr>(line: Option<&str>) -> Vec<T> {
@@ -63,6 +68,8 @@ fn read(file: &str, coordinates: Option<Vec<f32>>) -> Vec<Case> {
             labels: numbers(lines.next()),
             one_tree: numbers(lines.next()),
             probabilities: numbers(lines.next()),
+            python: numbers(lines.next()),
+            python_outliers: numbers(lines.next()),
         });
     }
     out
@@ -86,6 +93,11 @@ fn check(c: &Case, least: f64) {
     let own = ari(&ours.labels, &c.labels);
     eprintln!("{}: ARI {own:.4} with scikit-learn's own tree", c.name);
     assert!(own >= least, "{}: ARI {own} with scikit-learn's own tree", c.name);
+    let own = ari(&ours.labels, &c.python);
+    let apart = ours.outlier_scores.iter().zip(&c.python_outliers).filter(|(a, b)| (*a - *b).abs() > 1e-3).count();
+    let share = apart as f64 / c.python.len() as f64;
+    eprintln!("{}: ARI {own:.4} with hdbscan, {share:.3} of the outlier scores differ", c.name);
+    assert!(own >= least, "{}: ARI {own} with hdbscan", c.name);
 }
 
 #[test]
@@ -116,9 +128,9 @@ fn the_documentations_own_set() {
 fn permuted(points: &[f32], dim: usize, order: &[usize], options: &Options) -> Clustering {
     let shuffled: Vec<f32> = order.iter().flat_map(|&i| points[i * dim..(i + 1) * dim].iter().copied()).collect();
     let mut r = cluster(&shuffled, dim, options);
-    let (labels, probabilities) = (r.labels.clone(), r.probabilities.clone());
+    let (labels, probabilities, scores) = (r.labels.clone(), r.probabilities.clone(), r.outlier_scores.clone());
     for (to, &i) in order.iter().enumerate() {
-        (r.labels[i], r.probabilities[i]) = (labels[to], probabilities[to]);
+        (r.labels[i], r.probabilities[i], r.outlier_scores[i]) = (labels[to], probabilities[to], scores[to]);
     }
     r
 }
@@ -293,4 +305,49 @@ fn parts_of_a_graph_are_apart_however_near_they_are() {
     }
     assert!(cluster_graph(0, &[], &o).labels.is_empty());
     assert_eq!(cluster_graph(3, &[], &o).labels, [-1; 3]);
+}
+
+#[test]
+fn outlier_scores_are_those_of_paper_and_pencil() {
+    // Gaps 1, 1, 2 and 6 within a heap, then a pair far off: the core distances (2 samples) are the gaps to the nearest.
+    let o = Options { min_cluster_size: 2, min_samples: 2, ..Options::default() };
+    let r = cluster(&[0.0, 1.0, 2.0, 4.0, 10.0, 100.0, 101.0], 1, &o);
+    // 0, 1, 2 leave at distance 1, 4 at 2, 10 at 6; the pair at 1.
+    let expected = [0.0, 0.0, 0.0, 0.5, 1.0 - 1.0 / 6.0, 0.0, 0.0];
+    assert!(
+        r.outlier_scores.iter().zip(expected).all(|(a, b): (&f32, f32)| (a - b).abs() < 1e-6),
+        "{:?}",
+        r.outlier_scores
+    );
+    assert_eq!(cluster(&[1.0; 5], 1, &o).outlier_scores, [0.0; 5]);
+}
+
+#[test]
+fn predictions_fall_into_the_cluster_around_them() {
+    let points: Vec<f32> = [0.0, 50.0].into_iter().flat_map(|c| heap(c, 30)).collect();
+    let o = Options { min_cluster_size: 5, min_samples: 3, ..Options::default() };
+    let c = cluster(&points, 1, &o);
+    let (a, b) = (c.labels[15], c.labels[45]);
+    assert!(a >= 0 && b >= 0 && a != b);
+    let p = approximate_predict(&points, 1, &c, &o, &[0.001, 50.001, 25.0, -1e6, 0.3]);
+    assert_eq!(p.labels[..2], [a, b]);
+    assert_eq!(p.labels[4], a);
+    // Halfway is nearer to one than they are to each other; what is farther off than that belongs to neither.
+    assert!(p.labels[2] >= 0 && p.probabilities[2] < 1e-3);
+    assert_eq!((p.labels[3], p.probabilities[3]), (-1, 0.0));
+    assert!(p.probabilities[0] > p.probabilities[4] && p.probabilities[4] > 0.0);
+    assert!(approximate_predict(&points, 1, &c, &o, &[]).labels.is_empty());
+    let none = cluster(&[], 1, &o);
+    assert_eq!(approximate_predict(&[], 1, &none, &o, &[1.0]).labels, [-1]);
+}
+
+#[test]
+fn points_asked_about_again_mostly_keep_their_clusters() {
+    for c in cases().iter().filter(|c| c.name.starts_with("blobs") || c.name == "moons") {
+        let clustering = cluster(&c.points, c.dim, &c.options);
+        let again = approximate_predict(&c.points, c.dim, &clustering, &c.options, &c.points);
+        let own = ari(&again.labels, &clustering.labels);
+        // A query adds to the density, which moves the rims of small clusters.
+        assert!(own > if c.options.selection == Selection::Leaf { 0.8 } else { 0.95 }, "{}: ARI {own}", c.name);
+    }
 }

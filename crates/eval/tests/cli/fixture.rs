@@ -106,7 +106,7 @@ impl Fixture {
                 Match { instance: 0, view: 5, mask: 0, score: 0.8 },
                 Match { instance: 0, view: 7, mask: 0, score: 0.2 },
             ],
-            tree: Vec::new(),
+            ..Instances::default()
         };
         instances.write(self.instances(), self.provenance()).unwrap();
     }
