@@ -114,13 +114,11 @@ impl Instances {
         fn column<S, T>(all: &[S], f: impl Fn(&S) -> T) -> Vec<T> {
             all.iter().map(f).collect()
         }
+        let center = column(&self.oriented, |b| b.center);
+        let axes = column(&self.oriented, |b| b.axes);
+        let half = column(&self.oriented, |b| b.half_size);
         let mut writer = ArtifactWriter::new(provenance);
         if self.oriented.len() == k {
-            let (center, axes, half): (Vec<_>, Vec<_>, Vec<_>) = (
-                column(&self.oriented, |b| b.center),
-                column(&self.oriented, |b| b.axes),
-                column(&self.oriented, |b| b.half_size),
-            );
             writer = writer
                 .tensor("obb_center", &[k, 3], center.as_flattened())
                 .tensor("obb_axes", &[k, 3, 3], axes.as_flattened().as_flattened())
