@@ -65,11 +65,13 @@ bench-graph: ## Time anchors and neighbours beside fpsample and pykdtree (needs 
 	out/bench/python/bin/python scripts/bench_graph.py $(POSITIONS) out/bench/graph.json
 
 POINTS ?= 1000000x6
-bench-cluster: ## Time HDBSCAN beside hdbscan-rs and fast_hdbscan (needs Python; POINTS=1000000x6 or file.npy)
+RUNS ?= 3
+TRUTH ?=
+bench-cluster: ## Time HDBSCAN beside hdbscan-rs and fast_hdbscan (needs Python; POINTS=1000000x6 or file.npy, TRUTH=file.npy, RUNS)
 	$(CARGO) build --release -p hdbscan-exact --benches
 	@test -x out/bench/python-cluster/bin/python || { python3 -m venv out/bench/python-cluster \
 	  && out/bench/python-cluster/bin/pip install -q numpy scikit-learn hdbscan-rs fast_hdbscan; }
-	out/bench/python-cluster/bin/python scripts/bench_cluster.py $(POINTS) out/bench/cluster.json
+	out/bench/python-cluster/bin/python scripts/bench_cluster.py $(POINTS) out/bench/cluster.json $(RUNS) $(TRUTH)
 
 bench-query: ## Time a query over a million Gaussians and 500 instances: out/bench/query.json
 	$(CARGO) bench -p eval --bench query -- --out $(CURDIR)/out/bench/query.json

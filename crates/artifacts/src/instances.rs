@@ -16,6 +16,8 @@ pub struct Match {
     pub mask: u32,
     /// Association score, IoU x similarity of mean features (paper, S_kj), 0 to 1.
     pub score: f32,
+    /// How much of the silhouette is seen: blending weight of the instance's Gaussians summed over it, in pixels.
+    pub visible: f32,
 }
 
 /// An edge of the condensed tree of the clustering.
@@ -137,6 +139,7 @@ impl Instances {
             .tensor("match_view", &[m], &column(&self.matches, |x| x.view))
             .tensor("match_mask", &[m], &column(&self.matches, |x| x.mask))
             .tensor("match_score", &[m], &column(&self.matches, |x| x.score))
+            .tensor("match_visible", &[m], &column(&self.matches, |x| x.visible))
             .tensor("tree_parent", &[t], &column(&self.tree, |x| x.parent))
             .tensor("tree_child", &[t], &column(&self.tree, |x| x.child))
             .tensor("tree_lambda", &[t], &column(&self.tree, |x| x.lambda))
@@ -163,6 +166,10 @@ impl Instances {
         let m = instance.len();
         let (view, mask) = (a.tensor::<u32>("match_view", &[Some(m)])?, a.tensor::<u32>("match_mask", &[Some(m)])?);
         let score = a.tensor::<f32>("match_score", &[Some(m)])?;
+        let visible = match a.has("match_visible") {
+            true => a.tensor::<f32>("match_visible", &[Some(m)])?.to_vec(),
+            false => vec![0.0; m],
+        };
         below(&a, "match_instance", instance, k)?;
         below(&a, "match_view", view, views.len())?;
         let parent = a.tensor::<u32>("tree_parent", &[None])?;
@@ -198,7 +205,13 @@ impl Instances {
             bbox_max: triples("bbox_max")?,
             count,
             matches: (0..m)
-                .map(|i| Match { instance: instance[i], view: view[i], mask: mask[i], score: score[i] })
+                .map(|i| Match {
+                    instance: instance[i],
+                    view: view[i],
+                    mask: mask[i],
+                    score: score[i],
+                    visible: visible[i],
+                })
                 .collect(),
             tree: (0..t)
                 .map(|i| TreeEdge {
@@ -240,7 +253,7 @@ mod tests {
                     _ => vec![OrientedBox { half_size: [3.0, 2.0, 1.0], axes: [[0.5; 3]; 3], ..Default::default() }; 2],
                 },
                 views: vec!["a".into()],
-                matches: vec![Match { instance: 0, view: 0, mask: 7, score: 0.5 }],
+                matches: vec![Match { instance: 0, view: 0, mask: 7, score: 0.5, visible: 12.5 }],
                 tree: vec![TreeEdge { parent: 4, child: 5, lambda: 2.0, size: 2, instance: 1 }],
             };
             i.write(&p, Provenance::default()).unwrap();

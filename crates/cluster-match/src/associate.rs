@@ -31,11 +31,13 @@ pub struct Region {
     pub area: u32,
     /// Sum of rendered features over the pixels, `[dim]`.
     pub features: Vec<f64>,
+    /// Of an instance, the blending weight of its Gaussians over the pixels: how many of them show it.
+    pub visible: f64,
 }
 
 impl Region {
     fn empty(dim: usize) -> Self {
-        Self { area: 0, features: vec![0.0; dim] }
+        Self { area: 0, visible: 0.0, features: vec![0.0; dim] }
     }
 }
 
@@ -56,6 +58,7 @@ impl Overlaps {
             for (key, region) in from {
                 let sum = to.entry(key).or_insert_with(|| Region::empty(region.features.len()));
                 sum.area += region.area;
+                sum.visible += region.visible;
                 sum.features.iter_mut().zip(&region.features).for_each(|(s, f)| *s += f);
             }
         };
@@ -175,7 +178,7 @@ fn tile_overlaps(
     }
     for (&label, pixels) in &inside {
         let area = pixels.iter().filter(|&&p| p).count() as u32;
-        out.instances.insert(label, Region { area, features: vec![0.0; dim] });
+        out.instances.insert(label, Region { area, ..Region::empty(dim) });
         for at in &masks.at {
             for mask in at.iter().zip(pixels).filter(|(_, inside)| **inside).filter_map(|(mask, _)| *mask) {
                 *out.common.entry((label, masks.ids[mask as usize])).or_default() += 1;
@@ -204,8 +207,9 @@ fn tile_overlaps(
         else {
             continue;
         };
-        let mut sum = 0.0f32;
+        let (mut sum, mut visible) = (0.0f32, 0.0f32);
         for p in 0..PIXELS {
+            visible += if pixels[p] { weights[p] } else { 0.0 };
             let weight = match silhouette {
                 Silhouette::Selected => left[p] * alphas[p],
                 Silhouette::Visible => weights[p],
@@ -214,6 +218,7 @@ fn tile_overlaps(
             sum += if pixels[p] { weight } else { 0.0 };
         }
         table.add_to(&mut region.features, i, sum);
+        region.visible += f64::from(visible);
     }
     out.masks = masks.ids.iter().copied().zip(of_mask).collect();
     out
@@ -257,7 +262,7 @@ pub fn matches(overlaps: &Overlaps, view: u32, threshold: f32) -> Vec<Match> {
         let score = (iou * cosine(&i.features, &m.features).max(0.0)) as f32;
         let better = best.get(&instance).is_none_or(|b| score > b.score);
         if score > threshold && better {
-            best.insert(instance, Match { instance, view, mask, score });
+            best.insert(instance, Match { instance, view, mask, score, visible: i.visible as f32 });
         }
     }
     best.into_values().collect()

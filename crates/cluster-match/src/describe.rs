@@ -11,6 +11,8 @@ pub enum Aggregate {
     Mean,
     /// Mean weighted by association scores.
     Weighted,
+    /// Mean weighted by how many pixels of its silhouette show the instance in the view.
+    Visible,
     /// Median of each channel.
     Median,
     /// Geometric median: the direction of least summed distance to all (VALA).
@@ -67,8 +69,9 @@ pub fn describe(
     for (k, own) in of_instance.iter().enumerate() {
         out.support[k] = own.len() as u32;
         out.score[k] = own.iter().map(|m| m.score).sum::<f32>() / own.len().max(1) as f32;
+        let weight = |m: &Match| if aggregate == Aggregate::Visible { m.visible } else { m.score };
         let rows: Vec<(f32, Vec<f32>)> =
-            own.iter().filter_map(|m| Some((m.score, unit(features.get(&m.view)?.row(m.mask as usize)?)?))).collect();
+            own.iter().filter_map(|m| Some((weight(m), unit(features.get(&m.view)?.row(m.mask as usize)?)?))).collect();
         if let Some(d) = descriptor(&rows, dim, aggregate) {
             out.descriptor[k * dim..(k + 1) * dim].copy_from_slice(&d);
         }
@@ -152,11 +155,11 @@ fn descriptor(rows: &[(f32, Vec<f32>)], dim: usize, aggregate: Aggregate) -> Opt
     match aggregate {
         Aggregate::GeometricMedian => return unit(&geometric_median(&all, mean(&all))),
         Aggregate::Inliers => return unit(&mean(&inliers(&all, &unit(&mean(&all))?))),
-        Aggregate::Mean | Aggregate::Weighted | Aggregate::Median => {}
+        Aggregate::Mean | Aggregate::Weighted | Aggregate::Visible | Aggregate::Median => {}
     }
     let values = (0..dim).map(|c| match aggregate {
         Aggregate::Mean => rows.iter().map(|(_, r)| f64::from(r[c])).sum::<f64>() as f32,
-        Aggregate::Weighted => rows.iter().map(|(w, r)| f64::from(*w) * f64::from(r[c])).sum::<f64>() as f32,
+        Aggregate::Weighted | Aggregate::Visible => rows.iter().map(|(w, r)| f64::from(*w) * f64::from(r[c])).sum::<f64>() as f32,
         Aggregate::Median => {
             let mut column: Vec<f32> = rows.iter().map(|(_, r)| r[c]).collect();
             column.sort_by(f32::total_cmp);
@@ -209,8 +212,13 @@ mod tests {
         let means = [[0.0, 0.0, 0.0], [2.0, 1.0, 0.0], [9.0; 3]];
         let f = MaskFeatures { count: 2, dim: 2, values: vec![3.0, 0.0, 0.0, 1.0] };
         let features = BTreeMap::from([(0, f.clone()), (1, f)]);
-        let m = |view, mask, score| Match { instance: 0, view, mask, score };
-        for (aggregate, x) in [(Aggregate::Mean, 0.5f32.sqrt()), (Aggregate::Weighted, 0.8 / 0.68f32.sqrt())] {
+        let m = |view, mask, score| Match { instance: 0, view, mask, score, visible: 1.0 - score };
+        let cases = [
+            (Aggregate::Mean, 0.5f32.sqrt()),
+            (Aggregate::Weighted, 0.8 / 0.68f32.sqrt()),
+            (Aggregate::Visible, 0.2 / 0.68f32.sqrt()),
+        ];
+        for (aggregate, x) in cases {
             let i = describe(
                 &means,
                 vec![0, 0, -1],

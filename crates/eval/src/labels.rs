@@ -70,7 +70,7 @@ pub fn read_folder(folder: impl AsRef<Path>) -> Result<Vec<FrameLabels>> {
     paths.iter().map(read).collect()
 }
 
-/// Reads one label file and fills its polygons: vertices are truncated toward zero, borders included (methods.md 4.1).
+/// Reads one label file and fills its polygons: vertices are truncated toward zero, borders included (docs/protocols.md).
 ///
 /// # Errors
 /// As [`read_folder`].

@@ -31,7 +31,7 @@ impl Mask {
         self.bits.iter().filter(|&&b| b).count()
     }
 
-    /// Intersection over union; 0 when both sets are empty (methods.md 4.1).
+    /// Intersection over union; 0 when both sets are empty (docs/protocols.md).
     ///
     /// # Panics
     /// When the masks differ in size.

@@ -1,4 +1,4 @@
-//! Scores: class-agnostic 3D instances (methods.md 4.3) and object selection (methods.md 4.1).
+//! Scores: class-agnostic 3D instances (docs/protocols.md) and object selection (the same).
 
 use serde::Serialize;
 

@@ -2,7 +2,7 @@
 //!
 //! The LERF-OVS truth is polygons, and its published scores were computed on masks that `cv2.fillPoly` drew: even-odd
 //! inside *and* the 8-connected lines of the border. A scan line through pixel centres gives slightly smaller masks
-//! (methods.md 4.1, trap 2). The rules below are those of OpenCV 4.8 to 4.10, from the years of the published numbers;
+//! (docs/protocols.md). The rules below are those of OpenCV 4.8 to 4.10, from the years of the published numbers;
 //! earlier and later versions differ from them by single pixels on some borders. The masks in
 //! `testdata/fillpoly.json` were made by 4.10 (4.8.1 gives the same).
 

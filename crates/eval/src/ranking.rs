@@ -20,7 +20,7 @@ pub struct Ranked {
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct Scoring {
     /// Features of texts that mean nothing in particular ("object", "things", "stuff", "texture"). Without any the score
-    /// is the plain cosine (methods.md section 6, row 32). With them it is LERF's relevancy: over the negatives n the
+    /// is the plain cosine (docs/protocols.md). With them it is LERF's relevancy: over the negatives n the
     /// smallest exp(10 p) / (exp(10 p) + exp(10 n)) of the cosines p and n with the feature and the negative.
     pub negatives: Vec<Vec<f32>>,
 }

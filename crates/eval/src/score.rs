@@ -15,7 +15,7 @@ use serde::{Deserialize, Serialize};
 use std::collections::BTreeSet;
 use std::path::Path;
 
-/// Gaussians fainter than this do not speak for a surface (methods.md 4.2).
+/// Gaussians fainter than this do not speak for a surface (docs/protocols.md).
 const MIN_OPACITY: f32 = 0.1;
 
 /// `score.json`. Fields are null where the scene has no truth for them; `skipped` says why.

@@ -4,7 +4,7 @@ use crate::Mask;
 use gs_raster::RasterOptions;
 use gs_scene::{Camera, Gaussians};
 
-/// How a selection becomes a mask. The two give different scores: say which was used (methods.md 4.1, trap 3).
+/// How a selection becomes a mask. The two give different scores: say which was used (docs/protocols.md).
 #[derive(Debug, Clone, Copy, PartialEq, Eq, clap::ValueEnum)]
 pub enum Silhouette {
     /// Render the selected Gaussians alone; what stands before them does not hide them (OpenGaussian, CAGS).

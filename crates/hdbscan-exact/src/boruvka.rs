@@ -391,7 +391,7 @@ mod tests {
         /// On scattered points, grids, lines and heaps of equal points.
         #[test]
         fn the_tree_is_the_minimum_one(
-            dim in 1usize..6,
+            dim in prop_oneof![4 => 1usize..6, 1 => 6usize..33],
             grid in prop::sample::select(vec![0.0f32, 0.25, 1.0, 10.0]),
             collinear in any::<bool>(),
             values in prop::collection::vec(-3.0f32..3.0, 12..1200),

@@ -1,5 +1,5 @@
 //! Class-agnostic instances of a ScanNet scan: truth from segs and aggregation, mIoU and average precision
-//! (methods.md 4.3).
+//! (docs/protocols.md).
 
 use crate::metrics;
 use gs_io::{Error, IoContext, Result};

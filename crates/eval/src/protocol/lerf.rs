@@ -1,4 +1,4 @@
-//! LERF-OVS: selection of objects in 3D, scored in 2D (methods.md 4.1).
+//! LERF-OVS: selection of objects in 3D, scored in 2D (docs/protocols.md).
 
 use crate::Mask;
 use crate::metrics::{fraction_above, mean};
@@ -120,7 +120,7 @@ pub fn object_figures(pairs: &[Pair]) -> BTreeMap<String, Figures> {
     by_category.into_iter().map(|(c, pairs)| (c.into(), scene_figures(&pairs, Averaging::Objects))).collect()
 }
 
-/// The dataset's figures: the unweighted mean over scenes, whatever their number of pairs (methods.md 4.1). Localisation
+/// The dataset's figures: the unweighted mean over scenes, whatever their number of pairs (docs/protocols.md). Localisation
 /// over the scenes that have it.
 pub fn dataset_figures(scenes: &[Figures]) -> Figures {
     let over = |f: &dyn Fn(&Figures) -> f64| mean(&scenes.iter().map(f).collect::<Vec<_>>());

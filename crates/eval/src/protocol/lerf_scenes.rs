@@ -1,4 +1,4 @@
-//! The four scenes of LERF-OVS: which frames are scored, and which texts are asked (methods.md 4.1).
+//! The four scenes of LERF-OVS: which frames are scored, and which texts are asked (docs/protocols.md).
 
 /// A scene of the benchmark.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]

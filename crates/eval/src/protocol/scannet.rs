@@ -1,4 +1,4 @@
-//! ScanNet: semantic classes of the scan's vertices (methods.md 4.2).
+//! ScanNet: semantic classes of the scan's vertices (docs/protocols.md).
 
 use gs_scene::Gaussians;
 use kiddo::{ImmutableKdTree, SquaredEuclidean};

@@ -102,9 +102,9 @@ impl Fixture {
             bbox_max: vec![[1.0; 3]; k],
             views: (0..VIEWS).map(stem).collect(),
             matches: vec![
-                Match { instance: 0, view: 1, mask: 0, score: 0.9 },
-                Match { instance: 0, view: 5, mask: 0, score: 0.8 },
-                Match { instance: 0, view: 7, mask: 0, score: 0.2 },
+                Match { instance: 0, view: 1, mask: 0, score: 0.9, ..Match::default() },
+                Match { instance: 0, view: 5, mask: 0, score: 0.8, ..Match::default() },
+                Match { instance: 0, view: 7, mask: 0, score: 0.2, ..Match::default() },
             ],
             ..Instances::default()
         };

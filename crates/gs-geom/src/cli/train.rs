@@ -146,7 +146,7 @@ impl FromStr for Init {
 enum Sizes {
     /// From an eighth up, each for as long as the photographs' content allows (DashGaussian)
     Content,
-    /// A quarter, from a sixth of the iterations half, from a third full
+    /// A quarter, from a sixth of the iterations half, from a third full; at the latest from the 500th and the 1,000th
     Coarse,
     /// Full from the start
     Full,
@@ -257,7 +257,7 @@ impl TrainArgs {
     pub(super) fn coarse(&self, gains: &[Gain], iterations: u32) -> Vec<(u32, u32)> {
         match self.schedule {
             Sizes::Content => content::stages(gains, iterations),
-            Sizes::Coarse => vec![(iterations / 6, 4), (iterations / 3, 2)],
+            Sizes::Coarse => vec![((iterations / 6).min(500), 4), ((iterations / 3).min(1000), 2)],
             Sizes::Full => Vec::new(),
         }
     }
