@@ -17,6 +17,7 @@ use serde_json::{Value, json};
 use stage::{CommonArgs, Program, Stage};
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
+use std::time::Instant;
 
 /// Stage 3: 3D instances, the masks they are seen as, and a language descriptor for each
 #[derive(Debug, Parser)]
@@ -270,6 +271,7 @@ fn run(a: &Args, stage: &Stage) -> Result<()> {
     let (n_all, n) = (inputs.gaussians.len(), inputs.graph.kept.len());
     let options = options(c, n)?;
 
+    let start = Instant::now();
     let clustering = match c.sample {
         Some(sample) => {
             if sample < n {
@@ -279,6 +281,7 @@ fn run(a: &Args, stage: &Stage) -> Result<()> {
         }
         None => group(&inputs.features, &inputs.graph, c.cluster, c.distance, c.smooth, &options),
     };
+    let clustering_seconds = start.elapsed().as_secs_f64();
     let instances = clustering.selected.len();
     let noise = clustering.labels.iter().filter(|&&l| l < 0).count();
     stage.info(&format!("{instances} instances among {n} Gaussians, {noise} noise"));
@@ -314,7 +317,7 @@ fn run(a: &Args, stage: &Stage) -> Result<()> {
     let tree = tree(&clustering);
     let means = &inputs.gaussians.means;
     let instances = describe(means, labels, instances, matches, views, &features, m.aggregate, tree);
-    write_outputs(a, stage, &inputs, &instances, &options, noise)
+    write_outputs(a, stage, &inputs, &instances, &options, (noise, clustering_seconds))
 }
 
 /// Matches instances with the masks of every view that has id maps.
@@ -439,7 +442,7 @@ fn write_outputs(
     inputs: &Inputs,
     instances: &Instances,
     options: &Options,
-    noise: usize,
+    (noise, clustering_seconds): (usize, f64),
 ) -> Result<()> {
     let (c, m) = (&a.clustering, &a.matching);
     let lower = |v: &dyn std::fmt::Debug| format!("{v:?}").to_lowercase();
@@ -472,6 +475,7 @@ fn write_outputs(
     let matched = instances.support.iter().filter(|&&s| s > 0).count();
     let summary = json!({
         "instances": instances.len(), "noise": noise, "matched": matched, "matches": instances.matches.len(),
+        "clustering_seconds": clustering_seconds,
     });
     stage.record(&a.out, parameters.clone(), inputs.hashes.clone(), summary)?;
     // The artifact comes last: where it is new, so is everything beside it.

@@ -159,7 +159,9 @@ fn descriptor(rows: &[(f32, Vec<f32>)], dim: usize, aggregate: Aggregate) -> Opt
     }
     let values = (0..dim).map(|c| match aggregate {
         Aggregate::Mean => rows.iter().map(|(_, r)| f64::from(r[c])).sum::<f64>() as f32,
-        Aggregate::Weighted | Aggregate::Visible => rows.iter().map(|(w, r)| f64::from(*w) * f64::from(r[c])).sum::<f64>() as f32,
+        Aggregate::Weighted | Aggregate::Visible => {
+            rows.iter().map(|(w, r)| f64::from(*w) * f64::from(r[c])).sum::<f64>() as f32
+        }
         Aggregate::Median => {
             let mut column: Vec<f32> = rows.iter().map(|(_, r)| r[c]).collect();
             column.sort_by(f32::total_cmp);
