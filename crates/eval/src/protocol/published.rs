@@ -116,7 +116,7 @@ const SCANNET: [(&str, SetRow, &str); 8] = [
     ("OpenGaussian", [Some((24.73, 41.54)), Some((30.13, 48.25)), Some((38.29, 55.19))], "its paper"),
     ("OpenGaussian", [Some((30.1, 46.5)), Some((38.1, 56.8)), Some((49.7, 71.4))], "CAGS paper"),
     ("Dr. Splat", [Some((28.0, 44.6)), Some((38.2, 60.4)), Some((47.2, 68.9))], "CAGS paper"),
-    ("THGS", [Some((34.39, 50.74)), Some((39.61, 57.07)), Some((46.38, 64.74))], "its paper"),
+    ("THGS", [Some((34.39, 50.74)), Some((39.61, 57.07)), Some((46.38, 64.74))], "source not recorded"),
     ("NormLift", [Some((35.77, 54.02)), Some((39.62, 59.26)), Some((48.93, 68.83))], "arXiv 2609.18898"),
     ("CAGS", [Some((32.6, 48.9)), Some((41.1, 62.0)), Some((54.8, 75.9))], "its paper"),
 ];
