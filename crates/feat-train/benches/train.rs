@@ -10,8 +10,7 @@ use feat_train::adam::{Adam, Rates};
 use feat_train::evidence::{Evidence, Matrix};
 use feat_train::fast::{Engine, Shortcuts, Timings};
 use feat_train::loss::{self, Loss};
-use feat_train::model::{CohesionOf, Init, Model, Settings};
-use feat_train::normalize::Axis;
+use feat_train::model::{Model, Settings};
 use feat_train::real::{Half, Weight};
 use feat_train::scene::{Context, MaskSet, Neighbours};
 use feat_train::spectral::{SpectralOptions, spectral};
@@ -56,19 +55,6 @@ struct Args {
     bench: bool,
 }
 
-fn settings(layers: usize) -> Settings {
-    Settings {
-        dim: 6,
-        layers,
-        norm_axis: Axis::Channel,
-        loss: Loss::Printed,
-        tau: 0.1,
-        cohesion: 0.0,
-        cohesion_of: CohesionOf::Gaussians,
-        init: Init::Uniform,
-    }
-}
-
 /// What a run of the engine gave.
 struct Run {
     seconds: f64,
@@ -93,7 +79,7 @@ fn engine<W: Weight>(
     shortcuts: Shortcuts,
     iterations: u64,
 ) -> Run {
-    let mut model = Model::<f32>::new(settings(layers), context, &mut ChaCha8Rng::seed_from_u64(0));
+    let mut model = Model::<f32>::new(Settings::printed(6, layers), context, &mut ChaCha8Rng::seed_from_u64(0));
     let mut engine = Engine::new(context, &model, shortcuts);
     let mut adam = Adam::new(model.features.len());
     let mut weights: Vec<Adam<f32>> = model.layers.iter().map(|l| Adam::new(l.weights.len())).collect();
@@ -124,7 +110,7 @@ fn engine<W: Weight>(
 /// Iterations of the readable model with the dense optimiser, as training was before the engine: seconds and, of all
 /// threads, CPU seconds of one.
 fn readable(context: &Context, sets: &[MaskSet], iterations: u64) -> [f64; 2] {
-    let mut model = Model::<f32>::new(settings(2), context, &mut ChaCha8Rng::seed_from_u64(0));
+    let mut model = Model::<f32>::new(Settings::printed(6, 2), context, &mut ChaCha8Rng::seed_from_u64(0));
     let mut adam = Adam::new(model.features.len());
     let mut layers: Vec<Adam<f32>> = model.layers.iter().map(|l| Adam::new(l.weights.len())).collect();
     let d = model.settings.dim;
@@ -148,13 +134,9 @@ fn readable(context: &Context, sets: &[MaskSet], iterations: u64) -> [f64; 2] {
     [start.elapsed().as_secs_f64(), cpu_seconds() - cpu].map(|s| s / iterations as f64)
 }
 
-/// User and system time of this process, in all; 0 where it is not told.
+/// Processor time of this process; 0 where it is not told.
 fn cpu_seconds() -> f64 {
-    const TICKS_PER_SECOND: f64 = 100.0;
-    let stat = std::fs::read_to_string("/proc/self/stat").unwrap_or_default();
-    // After the name, which is in parentheses: state is field 0, user and system ticks 11 and 12.
-    let fields = stat.rsplit(')').next().unwrap_or_default().split_whitespace().skip(11).take(2);
-    fields.filter_map(|f| f.parse::<f64>().ok()).sum::<f64>() / TICKS_PER_SECOND
+    stage::cpu_seconds().unwrap_or(0.0)
 }
 
 fn median(mut values: Vec<f64>) -> f64 {
@@ -198,7 +180,7 @@ fn footprint_bytes<W>(sets: &[MaskSet<W>]) -> usize {
 
 /// What changes the numbers: its time and its error, against the exact run of as many iterations.
 fn approximations(s: &Scene, context: &Context, sets: &[MaskSet], exact: &Run, iterations: u64) -> Value {
-    let start = Model::<f32>::new(settings(2), context, &mut ChaCha8Rng::seed_from_u64(0)).features;
+    let start = Model::<f32>::new(Settings::printed(6, 2), context, &mut ChaCha8Rng::seed_from_u64(0)).features;
     let moved = apart(&exact.features, &start);
     let row = |name: &str, bytes: usize, run: Run| {
         json!({
@@ -237,7 +219,7 @@ fn approximations(s: &Scene, context: &Context, sets: &[MaskSet], exact: &Run, i
 
 /// Mean loss of views by features `[n][d]` in the order of kept Gaussians.
 fn mean_loss(context: &Context, sets: &[&MaskSet], features: &[f32]) -> f64 {
-    let d = settings(2).dim;
+    let d = Settings::printed(6, 2).dim;
     let of = |set: &MaskSet| {
         let mut centroids = vec![0.0; set.len() * d];
         for (c, &place) in set.columns.iter().enumerate() {
@@ -248,7 +230,7 @@ fn mean_loss(context: &Context, sets: &[&MaskSet], features: &[f32]) -> f64 {
                 to.iter_mut().zip(&features[i * d..]).for_each(|(t, f)| *t += f64::from(*w) * f64::from(*f));
             }
         }
-        loss::evaluate(Loss::Printed, &centroids, None, d, settings(2).tau).loss
+        loss::evaluate(Loss::Printed, &centroids, None, d, Settings::printed(6, 2).tau).loss
     };
     sets.iter().map(|set| of(set)).sum::<f64>() / sets.len() as f64
 }
@@ -265,7 +247,7 @@ fn early_stop() -> Value {
     let seen: Vec<MaskSet> = seen.into_iter().map(|(_, set)| set.clone()).collect();
     let run = |sets: &[MaskSet], early_stop: bool| {
         let options = TrainOptions {
-            settings: settings(2),
+            settings: Settings::printed(6, 2),
             iterations: ITERATIONS,
             rate: 1e-3,
             weight_rate: 1e-3,
@@ -345,7 +327,7 @@ fn against_rendering() -> Value {
     let side = 320;
     let s = scene(side);
     let context = s.context(Neighbours::Gaussians, true);
-    let mut model = Model::<f32>::new(settings(2), &context, &mut ChaCha8Rng::seed_from_u64(0));
+    let mut model = Model::<f32>::new(Settings::printed(6, 2), &context, &mut ChaCha8Rng::seed_from_u64(0));
     // As after some training: centroids of different directions.
     for (i, f) in model.features.iter_mut().enumerate() {
         *f = 3.0 * *f - 1.5 + (i / 6000 % 7) as f32 * 0.3;

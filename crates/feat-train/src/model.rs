@@ -57,6 +57,21 @@ pub struct Settings {
 }
 
 impl Settings {
+    /// The loss as the paper prints it, without cohesion, at temperature 0.1, channels standardised over anchors, features that
+    /// start uniform.
+    pub fn printed(dim: usize, layers: usize) -> Self {
+        Self {
+            dim,
+            layers,
+            norm_axis: Axis::Channel,
+            loss: Loss::Printed,
+            tau: 0.1,
+            cohesion: 0.0,
+            cohesion_of: CohesionOf::Gaussians,
+            init: Init::Uniform,
+        }
+    }
+
     /// Whether the loss looks at sampled pixels.
     pub fn needs_pixels(&self) -> bool {
         self.loss == Loss::Pixel || self.cohesion > 0.0 && self.cohesion_of == CohesionOf::Pixels
@@ -490,16 +505,7 @@ mod tests {
     use rand_chacha::ChaCha8Rng;
 
     fn settings() -> Settings {
-        Settings {
-            dim: 4,
-            layers: 2,
-            norm_axis: Axis::Channel,
-            loss: Loss::Printed,
-            tau: 0.1,
-            cohesion: 0.0,
-            cohesion_of: CohesionOf::Gaussians,
-            init: Init::Uniform,
-        }
+        Settings::printed(4, 2)
     }
 
     /// Compares every gradient with central differences.

@@ -5,9 +5,7 @@ mod rendering;
 #[path = "../benches/scene.rs"]
 mod scene;
 
-use feat_train::loss::Loss;
-use feat_train::model::{CohesionOf, Init, Model, Settings};
-use feat_train::normalize::Axis;
+use feat_train::model::{Model, Settings};
 use feat_train::scene::Neighbours;
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
@@ -16,16 +14,7 @@ use rand_chacha::ChaCha8Rng;
 fn footprints_give_what_rendering_and_averaging_give() {
     let s = scene::scene(60);
     let context = s.context(Neighbours::Gaussians, true);
-    let settings = Settings {
-        dim: 6,
-        layers: 2,
-        norm_axis: Axis::Channel,
-        loss: Loss::Printed,
-        tau: 0.1,
-        cohesion: 0.0,
-        cohesion_of: CohesionOf::Gaussians,
-        init: Init::Uniform,
-    };
+    let settings = Settings::printed(6, 2);
     let mut model = Model::<f32>::new(settings, &context, &mut ChaCha8Rng::seed_from_u64(0));
     // Away from the start, where all centroids are nearly parallel and gradients nearly cancel.
     for (i, f) in model.features.iter_mut().enumerate() {

@@ -1,5 +1,6 @@
 //! ScanNet: semantic classes of the scan's vertices (docs/protocols.md).
 
+use glam::{DMat3, DQuat, DVec3, DVec4, Vec3};
 use gs_scene::Gaussians;
 use kiddo::{ImmutableKdTree, SquaredEuclidean};
 use rayon::prelude::*;
@@ -142,14 +143,8 @@ pub fn score_vertices(
     counts: &[bool],
     classes: usize,
 ) -> Confusion {
-    assert!(truth.len() == predicted.len() && truth.len() == counts.len());
-    let mut confusion = Confusion::new(classes);
-    for ((t, &p), _) in truth.iter().zip(predicted).zip(counts).filter(|(_, c)| **c) {
-        if let Some(t) = *t {
-            confusion.add(t, p, 1.0);
-        }
-    }
-    confusion
+    let truth: Vec<(Option<usize>, f64)> = truth.iter().map(|&t| (t, 1.0)).collect();
+    score_volumes(&truth, predicted, counts, classes)
 }
 
 /// Index of the nearest Gaussian among `speakers` (ascending indices) for each vertex; none when there are none.
@@ -191,12 +186,14 @@ pub fn volume_truth(
         }
         let mean = gaussians.means[i];
         let near = tree.query(&mean).nearest_n::<SquaredEuclidean<f32>>(most).within(reach * reach).execute();
-        let axes = rotation(gaussians.rotations[i]);
+        let [w, x, y, z] = gaussians.rotations[i].map(f64::from);
+        let unit = DVec4::new(x, y, z, w).try_normalize().unwrap_or(DVec4::W);
+        let to_own = DMat3::from_quat(DQuat::from_vec4(unit)).transpose();
         let mut votes = vec![0.0f64; classes];
         for found in near {
             let v = labelled[found.item as usize];
-            let d = [0, 1, 2].map(|k| f64::from(vertices[v][k]) - f64::from(mean[k]));
-            let m: f64 = (0..3).map(|k| ((0..3).map(|r| axes[r][k] * d[r]).sum::<f64>() / scales[k]).powi(2)).sum();
+            let d = Vec3::from(vertices[v]).as_dvec3() - Vec3::from(mean).as_dvec3();
+            let m = (to_own * d / DVec3::from(scales)).length_squared();
             votes[truth[v].expect("labelled")] += (-0.5 * m).exp();
         }
         let best = (0..classes).filter(|&c| votes[c] > 0.0).fold(None, |best: Option<usize>, c| match best {
@@ -206,18 +203,6 @@ pub fn volume_truth(
         (best, weight)
     };
     (0..gaussians.len()).into_par_iter().map(one).collect()
-}
-
-/// Rotation matrix (rows) of a quaternion w x y z, of any length; the axes of the Gaussian are its columns.
-fn rotation(q: [f32; 4]) -> [[f64; 3]; 3] {
-    let q = q.map(f64::from);
-    let norm = q.iter().map(|v| v * v).sum::<f64>().sqrt();
-    let [w, x, y, z] = if norm > 0.0 { q.map(|v| v / norm) } else { [1.0, 0.0, 0.0, 0.0] };
-    [
-        [1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y - w * z), 2.0 * (x * z + w * y)],
-        [2.0 * (x * y + w * z), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z - w * x)],
-        [2.0 * (x * z - w * y), 2.0 * (y * z + w * x), 1.0 - 2.0 * (x * x + y * y)],
-    ]
 }
 
 /// Scores Gaussians against [`volume_truth`]: every Gaussian that has a true class counts with its weight.

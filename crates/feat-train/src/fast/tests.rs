@@ -1,23 +1,13 @@
 //! The engine against the readable model.
 
 use super::*;
-use crate::model::{CohesionOf, Init};
 use crate::network::Layer;
 use crate::testing::{context, mask_set};
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
 
 fn settings(dim: usize, layers: usize, loss: Loss) -> Settings {
-    Settings {
-        dim,
-        layers,
-        norm_axis: Axis::Channel,
-        loss,
-        tau: 0.1,
-        cohesion: 0.0,
-        cohesion_of: CohesionOf::Gaussians,
-        init: Init::Uniform,
-    }
+    Settings { loss, ..Settings::printed(dim, layers) }
 }
 
 /// The same model in f64.

@@ -328,7 +328,7 @@ impl TrainArgs {
         let left = full_share(self.cache_bytes()).saturating_sub(photographs.kept_bytes());
         let heldout = Photographs::load(heldout, masks, left)?;
         let mut trainer = Trainer::resume(options, extent, photographs, heldout, state);
-        let before = cpu_seconds();
+        let before = stage::cpu_seconds();
         let done = self.optimise(&mut trainer, &run, stage).and_then(|done| match done {
             true => self.finish(&trainer, &run, &forecast, (plan, spent_since(before)), stage),
             false => Ok(()),
@@ -592,7 +592,7 @@ impl TrainArgs {
             "memory_predicted_bytes": predicted,
             "extended_after": progress.extended,
             "seconds": seconds(timings),
-            "cpu_seconds": cpu_seconds(),
+            "cpu_seconds": stage::cpu_seconds(),
             "iteration_cpu_seconds": iteration_cpu_seconds,
             "plan": plan,
         });
@@ -613,17 +613,9 @@ pub(super) fn remove_if_there(path: &Path) {
     let _ = std::fs::remove_file(path);
 }
 
-/// Processor time of this process so far in seconds, where the system tells (Linux, with its 100 ticks a second).
-fn cpu_seconds() -> Option<f64> {
-    let stat = std::fs::read_to_string("/proc/self/stat").ok()?;
-    // After the name in parentheses, which may hold anything, user and system time are fields 12 and 13.
-    let fields: Vec<f64> = stat.rsplit(')').next()?.split_whitespace().map(|f| f.parse().unwrap_or(0.0)).collect();
-    Some((fields.get(11)? + fields.get(12)?) / 100.0)
-}
-
 /// Processor time since a moment at which it was `before`.
 fn spent_since(before: Option<f64>) -> Option<f64> {
-    Some(cpu_seconds()? - before?)
+    Some(stage::cpu_seconds()? - before?)
 }
 
 fn parts(t: Timings) -> [(&'static str, Duration); 5] {
@@ -664,9 +656,9 @@ mod tests {
 
     #[test]
     fn processor_time_passes() {
-        if let Some(before) = cpu_seconds() {
+        if let Some(before) = stage::cpu_seconds() {
             let begun = Instant::now();
-            while cpu_seconds().is_some_and(|t| t <= before) {
+            while stage::cpu_seconds().is_some_and(|t| t <= before) {
                 assert!(begun.elapsed().as_secs() < 60);
             }
         }
