@@ -8,6 +8,7 @@ use crate::pixels::Pixels;
 use crate::real::Weight;
 use artifacts::{Footprints, Graph, Level};
 use gs_io::{Error, Result};
+use gs_scene::morton_order;
 
 /// No anchor.
 pub const NONE: u32 = u32::MAX;
@@ -59,7 +60,7 @@ impl Context {
         let (n, m, k) = (graph.kept.len(), graph.anchors.len(), graph.k);
         // Anchors of the graph in the order of the curve, and the other way round.
         let at: Vec<[f32; 3]> = graph.anchors.iter().map(|&a| positions[a as usize]).collect();
-        let curve = along_curve(&at);
+        let curve = morton_order(&at);
         let rank = inverse(&curve);
         let mut group: Vec<u32> = graph.nearest_anchor.iter().map(|&a| rank[a as usize]).collect();
         for (&a, &rank) in graph.anchors.iter().zip(&rank) {
@@ -122,26 +123,6 @@ impl Context {
 /// Whether the neighbours of this kind are places in the training order.
 pub fn inputs_are_of_gaussians(kind: Neighbours) -> bool {
     kind != Neighbours::Anchors
-}
-
-/// The order of points along a Morton curve over their bounding box; ties by index.
-fn along_curve(points: &[[f32; 3]]) -> Vec<u32> {
-    const BITS: u32 = 21;
-    let mut order: Vec<u32> = (0..points.len() as u32).collect();
-    let Some(first) = points.first() else { return order };
-    let bound = |c: usize, best: fn(f32, f32) -> f32| points.iter().map(|p| p[c]).fold(first[c], best);
-    let low: [f32; 3] = std::array::from_fn(|c| bound(c, f32::min));
-    let extent = (0..3).map(|c| f64::from(bound(c, f32::max)) - f64::from(low[c])).fold(0.0, f64::max);
-    let scale = if extent > 0.0 { f64::from((1u32 << BITS) - 1) / extent } else { 0.0 };
-    let code = |p: &[f32; 3]| {
-        let cell: [u64; 3] = std::array::from_fn(|c| ((f64::from(p[c]) - f64::from(low[c])) * scale) as u64);
-        (0..BITS).fold(0u64, |code, bit| {
-            code | (0..3).fold(0, |bits, c| bits | ((cell[c] >> bit) & 1) << (3 * bit + c as u32))
-        })
-    };
-    let codes: Vec<u64> = points.iter().map(code).collect();
-    order.sort_by_key(|&i| codes[i as usize]);
-    order
 }
 
 /// The inverse of a permutation.

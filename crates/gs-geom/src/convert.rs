@@ -1,11 +1,8 @@
 //! Choosing, ordering and trimming Gaussians.
 
-use crate::inspect::{Bounds, bounds, is_usable};
-use gs_scene::Gaussians;
+use crate::inspect::{Bounds, is_usable};
+use gs_scene::{Gaussians, morton_order};
 use serde::Serialize;
-
-/// Bits of a coordinate in a Morton code.
-const MORTON_BITS: u32 = 21;
 
 /// In which order Gaussians are written.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, clap::ValueEnum)]
@@ -68,34 +65,17 @@ pub fn arrange(g: &Gaussians, kept: &mut [u32], order: Order) {
             kept.sort_by(|&a, &b| logit(b).total_cmp(&logit(a)));
         }
         Order::Morton => {
-            let chosen = g.select(kept);
-            // Percentiles, or one stray Gaussian would leave the scene a handful of cells.
-            let Some(b) = bounds(&chosen, 0.001) else { return };
-            kept.sort_by_cached_key(|&i| morton(g.means[i as usize], &b));
+            let centres: Vec<[f32; 3]> = kept.iter().map(|&i| g.means[i as usize]).collect();
+            let ordered: Vec<u32> = morton_order(&centres).into_iter().map(|k| kept[k as usize]).collect();
+            kept.copy_from_slice(&ordered);
         }
     }
-}
-
-/// The bits of the three coordinates, taken in turn, of a cell of a grid over the box.
-fn morton(p: [f32; 3], b: &Bounds) -> u64 {
-    let cells = f64::from((1u32 << MORTON_BITS) - 1);
-    let mut code = 0;
-    for c in 0..3 {
-        let (low, high) = (f64::from(b.low[c]), f64::from(b.high[c]));
-        let share = if high > low { (f64::from(p[c]) - low) / (high - low) } else { 0.0 };
-        let cell = (share.clamp(0.0, 1.0) * cells) as u64;
-        for bit in 0..MORTON_BITS {
-            code |= (cell >> bit & 1) << (3 * bit + c as u32);
-        }
-    }
-    code
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
     use crate::optimiser::zeros;
-    use proptest::prelude::*;
 
     #[test]
     fn each_reason_is_counted_once() {
@@ -121,25 +101,5 @@ mod tests {
         assert_eq!(run(Order::None), [0, 1, 2, 3]);
         assert_eq!(run(Order::Opacity), [1, 3, 2, 0]);
         assert_eq!(run(Order::Morton), [1, 3, 2, 0]);
-    }
-
-    proptest! {
-        #[test]
-        fn a_morton_order_permutes_and_brings_neighbours_together(seed in 0u64..20) {
-            use rand::{Rng, SeedableRng};
-            let mut rng = rand_chacha::ChaCha8Rng::seed_from_u64(seed);
-            let mut g = zeros(400, 0);
-            g.means.iter_mut().flatten().for_each(|v| *v = rng.random_range(-3.0..5.0));
-            let mut order: Vec<u32> = (0..400).collect();
-            let path = |order: &[u32]| -> f32 {
-                let at = |i: u32| glam::Vec3::from(g.means[i as usize]);
-                order.windows(2).map(|w| at(w[0]).distance(at(w[1]))).sum()
-            };
-            let before = path(&order);
-            arrange(&g, &mut order, Order::Morton);
-            prop_assert!(path(&order) < 0.5 * before);
-            order.sort_unstable();
-            prop_assert!(order.iter().enumerate().all(|(i, &o)| i as u32 == o));
-        }
     }
 }

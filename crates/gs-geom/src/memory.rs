@@ -11,8 +11,8 @@ use std::str::FromStr;
 
 /// The program itself, its threads' stacks and the allocator's slack.
 const BASE: u64 = 10 << 20;
-/// Per pixel in training: render with alpha and depth 20, target 12, gradient 12, three maps of SSIM 36.
-const PER_PIXEL: u64 = 80;
+/// Per pixel in training: render with alpha 16, target 12, gradient 12, three maps of SSIM 36.
+const PER_PIXEL: u64 = 76;
 /// Per pixel of a photograph's file while it is decoded: 8-bit and f32 RGB.
 const PER_DECODED_PIXEL: u64 = 15;
 /// Per pixel while it is shrunk: f32 RGB, once for the pixels of new width and old height, twice for the result.

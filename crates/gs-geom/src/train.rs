@@ -12,7 +12,7 @@ use crate::photographs::Photographs;
 use crate::schedule::{LearningRates, Purpose, Schedule, ViewOrder, generator};
 use gs_io::Result;
 use gs_raster::{PixelGradients, RasterOptions, Workspace};
-use gs_scene::Gaussians;
+use gs_scene::{Gaussians, morton_order};
 use rand::Rng;
 use serde::Serialize;
 use serde_json::{Value, json};
@@ -225,11 +225,18 @@ impl<'a> Trainer<'a> {
         lap(&mut self.timings.rest);
 
         let State { gaussians, adam, pull, exposures, progress } = &mut self.state;
+        let sampling = self.options.densify.strategy == Strategy::Mcmc && !self.options.fixed_points;
+        // Not at the end of the last step, so that held-out views are measured before.
+        if schedule.resets_opacity(iteration - 1) && iteration > 1 && !sampling && !self.options.fixed_points {
+            reset_opacities(gaussians, adam);
+        }
         let degree = schedule.sh_degree(iteration, gaussians.sh_degree);
         let raster = RasterOptions {
             background,
             sh_degree: degree,
             antialias: self.options.antialias,
+            depth: false,
+            absolute_pulls: self.options.densify.strategy == Strategy::Absgrad,
             ..RasterOptions::default()
         };
         let rendered = self.workspace.forward(gaussians, camera, &raster);
@@ -281,7 +288,6 @@ impl<'a> Trainer<'a> {
             rendered.visible().iter().for_each(|&i| self.drawn[i as usize] = true);
             &self.drawn[..]
         });
-        let sampling = self.options.densify.strategy == Strategy::Mcmc && !self.options.fixed_points;
         if sampling {
             mcmc::regularise(gaussians, gradients, &self.options.mcmc, drawn);
         }
@@ -314,9 +320,10 @@ impl<'a> Trainer<'a> {
                 };
                 let counts = [report.cloned, report.split, report.removed, report.relocated];
                 progress.densified.iter_mut().zip(counts).for_each(|(sum, n)| *sum += n as u64);
-            }
-            if schedule.resets_opacity(iteration) && !sampling {
-                reset_opacities(gaussians, adam);
+                // What lies together is drawn together.
+                let order = morton_order(&gaussians.means);
+                *gaussians = gaussians.select(&order);
+                adam.select(&order, order.len());
             }
         }
         progress.iteration = iteration;
@@ -380,7 +387,8 @@ impl<'a> Trainer<'a> {
     pub fn heldout(&self) -> Result<Option<(f64, f64)>> {
         let g = &self.state.gaussians;
         let background = self.options.background;
-        let options = RasterOptions { background, antialias: self.options.antialias, ..RasterOptions::default() };
+        let antialias = self.options.antialias;
+        let options = RasterOptions { background, antialias, depth: false, ..RasterOptions::default() };
         let compare = |i: usize| {
             let target = self.heldout.target(i, metrics::behind(self.options.alpha, background))?;
             Ok(metrics::compare(g, self.heldout.camera(i), &options, &target, self.options.alpha))

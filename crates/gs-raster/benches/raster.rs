@@ -71,8 +71,9 @@ fn summary(mut values: Vec<f64>) -> (f64, f64) {
     (median, (values[values.len() * 3 / 4] - values[values.len() / 4]) / 2.0 / median)
 }
 
-fn bench(name: &str, g: &Gaussians, camera: &Camera) -> Value {
-    let options = RasterOptions::default();
+/// Measures what an optimisation asks for; with `everything`, depth and the pulls that do not cancel as well.
+fn bench(name: &str, g: &Gaussians, camera: &Camera, everything: bool) -> Value {
+    let options = RasterOptions { depth: everything, absolute_pulls: everything, ..RasterOptions::default() };
     let pixels = camera.width as usize * camera.height as usize;
     let d: Vec<f32> = (0..3 * pixels).map(|i| ((i * 7919) % 1000) as f32 * 2e-3 - 1.0).collect();
     let counts = tile_weights(g, camera, &options, true, |t| t.weights.iter().filter(|w| **w > 0.0).count());
@@ -148,14 +149,15 @@ fn main() {
         let camera = front_camera(640, 480);
         let small = front_camera(129, 235);
         let mut scenes = vec![
-            bench("trained-like", &synthetic(60_000, 3.0, &camera), &camera),
-            bench("large footprints", &synthetic(6_000, 15.0, &camera), &camera),
-            bench("small footprints", &synthetic(120_000, 0.7, &camera), &camera),
-            bench("small image", &synthetic(16_000, 2.0, &small), &small),
+            bench("trained-like", &synthetic(60_000, 3.0, &camera), &camera, false),
+            bench("trained-like, everything", &synthetic(60_000, 3.0, &camera), &camera, true),
+            bench("large footprints", &synthetic(6_000, 15.0, &camera), &camera, false),
+            bench("small footprints", &synthetic(120_000, 0.7, &camera), &camera, false),
+            bench("small image", &synthetic(16_000, 2.0, &small), &small, false),
         ];
         for path in &paths {
             match gs_scene::ply::read_gaussians(path) {
-                Ok(g) => scenes.push(bench(path.rsplit('/').next().unwrap_or(path), &g, &outside_camera(&g))),
+                Ok(g) => scenes.push(bench(path.rsplit('/').next().unwrap_or(path), &g, &outside_camera(&g), false)),
                 Err(e) => eprintln!("skipped: {e}"),
             }
         }

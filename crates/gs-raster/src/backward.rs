@@ -15,7 +15,7 @@ const CHUNK: usize = 512;
 /// d loss / d every parameter, given d loss / d every pixel of the view that `forward` rendered with the same arguments.
 ///
 /// # Panics
-/// When a gradient image has another size than the rendered view.
+/// When a gradient image has another size than the rendered view, or is that of a depth that was not rendered.
 pub fn backward(
     g: &Gaussians,
     camera: &Camera,
@@ -39,6 +39,7 @@ pub(crate) fn pair_gradients(
 ) {
     let pixels = camera.width as usize * camera.height as usize;
     assert_eq!(d.rgb.len(), 3 * pixels);
+    assert!(d.depth.is_none() || options.depth, "the gradient of a depth that was not rendered");
     assert!(d.alpha.is_none_or(|a| a.len() == pixels) && d.depth.is_none_or(|z| z.len() == pixels));
     let tiles = &forward.tiles;
     let w = tiles.lens.width as usize;
@@ -57,7 +58,8 @@ pub(crate) fn pair_gradients(
             let mut tile = pixel_gradients(forward, options, d, w, rectangle);
             // The kernel does not come to those behind where all pixels have stopped.
             out.fill(SplatGradient::default());
-            backward_tile(&tiles.splats, tiles.list(t), rectangle, &mut tile, out);
+            let wanted = (d.depth.is_some(), options.absolute_pulls);
+            backward_tile(&tiles.splats, tiles.list(t), rectangle, wanted, &mut tile, out);
         }
     });
 }
@@ -155,7 +157,7 @@ fn pixel_gradients(
             let (from, to) = ((y0 + y) * w + x0 + x, y * TILE + x);
             let mut d_alpha = d.alpha.map_or(0.0, |a| a[from]);
             let d_depth = d.depth.map_or(0.0, |z| z[from]);
-            let mut behind = d_depth * r.depth[from];
+            let mut behind = if d.depth.is_some() { d_depth * r.depth[from] } else { 0.0 };
             for c in 0..3 {
                 let g = d.rgb[3 * from + c];
                 tile.rgb[c][to] = g;

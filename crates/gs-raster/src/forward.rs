@@ -59,19 +59,21 @@ pub(crate) fn composite(tiles: &Tiles, options: &RasterOptions, rendered: &mut R
     // Every pixel is written below.
     rendered.rgb.resize(w * h * 3, 0.0);
     rendered.alpha.resize(w * h, 0.0);
-    rendered.depth.resize(w * h, 0.0);
+    rendered.depth.resize(if options.depth { w * h } else { 0 }, 0.0);
     // A band of tiles owns whole image rows, so bands can be written side by side.
     let bands = rendered
         .rgb
         .par_chunks_mut((w * TILE * 3).max(1))
         .zip(rendered.alpha.par_chunks_mut((w * TILE).max(1)))
-        .zip(rendered.depth.par_chunks_mut((w * TILE).max(1)));
-    let evaluated = bands.enumerate().map(|(band, ((rgb, alpha), depth))| {
+        .enumerate();
+    let mut depths: Vec<&mut [f32]> = rendered.depth.chunks_mut((w * TILE).max(1)).collect();
+    depths.resize_with(h.div_ceil(TILE), Default::default);
+    let evaluated = bands.zip(depths).map(|((band, (rgb, alpha)), depth)| {
         let mut evaluated = 0;
         for column in 0..tiles.columns {
             let t = band * tiles.columns + column;
             let (x0, y0, tw, th) = tiles.rectangle(t);
-            let p = forward_tile(&tiles.splats, tiles.list(t), (x0, y0, tw, th));
+            let p = forward_tile(&tiles.splats, tiles.list(t), (x0, y0, tw, th), options.depth);
             evaluated += p.evaluated;
             for y in 0..th {
                 for x in 0..tw {
@@ -81,7 +83,9 @@ pub(crate) fn composite(tiles: &Tiles, options: &RasterOptions, rendered: &mut R
                         rgb[3 * to + c] = p.rgb[c][from] + left * options.background[c];
                     }
                     alpha[to] = 1.0 - left;
-                    depth[to] = p.depth[from];
+                    if options.depth {
+                        depth[to] = p.depth[from];
+                    }
                 }
             }
         }

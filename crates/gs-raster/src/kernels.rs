@@ -195,18 +195,21 @@ pub(crate) struct TilePixels {
     pub evaluated: usize,
 }
 
-/// Composites a tile. `list` holds positions in `splats`.
-pub(crate) fn forward_tile(splats: &[Splat], list: &[u32], rectangle: Rectangle) -> Box<TilePixels> {
-    Arch::new().dispatch(ForwardTile { splats, list, rectangle })
+/// Composites a tile. `list` holds positions in `splats`; without `depth` that stays zero.
+pub(crate) fn forward_tile(splats: &[Splat], list: &[u32], rectangle: Rectangle, depth: bool) -> Box<TilePixels> {
+    match depth {
+        true => Arch::new().dispatch(ForwardTile::<true> { splats, list, rectangle }),
+        false => Arch::new().dispatch(ForwardTile::<false> { splats, list, rectangle }),
+    }
 }
 
-struct ForwardTile<'a> {
+struct ForwardTile<'a, const DEPTH: bool> {
     splats: &'a [Splat],
     list: &'a [u32],
     rectangle: Rectangle,
 }
 
-impl WithSimd for ForwardTile<'_> {
+impl<const DEPTH: bool> WithSimd for ForwardTile<'_, DEPTH> {
     type Output = Box<TilePixels>;
 
     #[inline(always)]
@@ -259,7 +262,9 @@ impl WithSimd for ForwardTile<'_> {
                         red[at] = simd.mul_add_e_f32s(w, color[0], red[at]);
                         green[at] = simd.mul_add_e_f32s(w, color[1], green[at]);
                         blue[at] = simd.mul_add_e_f32s(w, color[2], blue[at]);
-                        depth[at] = simd.mul_add_e_f32s(w, z, depth[at]);
+                        if DEPTH {
+                            depth[at] = simd.mul_add_e_f32s(w, z, depth[at]);
+                        }
                     }
                 }
             }
@@ -288,17 +293,27 @@ pub(crate) struct TileGradients {
 ///
 /// Goes front to back like the forward pass: with s_i = c_i . d rgb + z_i d depth + d alpha, the gradient of alpha_i is
 /// T_i s_i - (sum of w_j s_j behind i) / (1 - alpha_i), and the sum behind is the total less what came before.
+///
+/// `depth` and `absolute` say whether the gradients of depth, and those that do not cancel, are wanted; else they stay zero.
+/// What is not wanted leaves registers to the rest.
 pub(crate) fn backward_tile(
     splats: &[Splat],
     list: &[u32],
     rectangle: Rectangle,
+    (depth, absolute): (bool, bool),
     d: &mut TileGradients,
     out: &mut [SplatGradient],
 ) {
-    Arch::new().dispatch(BackwardTile { splats, list, rectangle, d, out });
+    let arch = Arch::new();
+    match (depth, absolute) {
+        (false, false) => arch.dispatch(BackwardTile::<false, false> { splats, list, rectangle, d, out }),
+        (false, true) => arch.dispatch(BackwardTile::<false, true> { splats, list, rectangle, d, out }),
+        (true, false) => arch.dispatch(BackwardTile::<true, false> { splats, list, rectangle, d, out }),
+        (true, true) => arch.dispatch(BackwardTile::<true, true> { splats, list, rectangle, d, out }),
+    }
 }
 
-struct BackwardTile<'a> {
+struct BackwardTile<'a, const DEPTH: bool, const ABSOLUTE: bool> {
     splats: &'a [Splat],
     list: &'a [u32],
     rectangle: Rectangle,
@@ -306,7 +321,7 @@ struct BackwardTile<'a> {
     out: &'a mut [SplatGradient],
 }
 
-impl WithSimd for BackwardTile<'_> {
+impl<const DEPTH: bool, const ABSOLUTE: bool> WithSimd for BackwardTile<'_, DEPTH, ABSOLUTE> {
     type Output = ();
 
     #[inline(always)]
@@ -365,7 +380,7 @@ impl WithSimd for BackwardTile<'_> {
                         let value = simd.mul_add_e_f32s(color[0], d_red[at], d_alpha[at]);
                         let value = simd.mul_add_e_f32s(color[1], d_green[at], value);
                         let value = simd.mul_add_e_f32s(color[2], d_blue[at], value);
-                        let value = simd.mul_add_e_f32s(z, d_depth[at], value);
+                        let value = if DEPTH { simd.mul_add_e_f32s(z, d_depth[at], value) } else { value };
                         let own = simd.mul_f32s(w, value);
                         let rest = simd.sub_f32s(behind[at], own);
                         behind[at] = rest;
@@ -374,59 +389,68 @@ impl WithSimd for BackwardTile<'_> {
                         let g = simd.negate_mul_add_e_f32s(odds, rest, own);
                         let free = simd.less_than_f32s(raw, simd.splat_f32s(ALPHA_MAX));
                         let g = simd.select_f32s(free, g, zero);
-                        let size = simd.abs_f32s(g);
-                        let gx = simd.abs_f32s(simd.add_f32s(xx_dx, simd.splat_f32s(xy * dy)));
-                        let gy = simd.abs_f32s(simd.add_f32s(xy_dx, simd.splat_f32s(yy * dy)));
                         sum[0] = simd.add_f32s(g, sum[0]);
                         sum[1] = simd.mul_add_e_f32s(g, simd.splat_f32s(dy), sum[1]);
                         sum[2] = simd.mul_add_e_f32s(g, simd.splat_f32s(dy * dy), sum[2]);
-                        sum[3] = simd.mul_add_e_f32s(gx, size, sum[3]);
-                        sum[4] = simd.mul_add_e_f32s(gy, size, sum[4]);
-                        sum[5] = simd.mul_add_e_f32s(w, d_red[at], sum[5]);
-                        sum[6] = simd.mul_add_e_f32s(w, d_green[at], sum[6]);
-                        sum[7] = simd.mul_add_e_f32s(w, d_blue[at], sum[7]);
-                        sum[8] = simd.mul_add_e_f32s(w, d_depth[at], sum[8]);
+                        sum[3] = simd.mul_add_e_f32s(w, d_red[at], sum[3]);
+                        sum[4] = simd.mul_add_e_f32s(w, d_green[at], sum[4]);
+                        sum[5] = simd.mul_add_e_f32s(w, d_blue[at], sum[5]);
+                        if ABSOLUTE {
+                            let size = simd.abs_f32s(g);
+                            let gx = simd.abs_f32s(simd.add_f32s(xx_dx, simd.splat_f32s(xy * dy)));
+                            let gy = simd.abs_f32s(simd.add_f32s(xy_dx, simd.splat_f32s(yy * dy)));
+                            sum[6] = simd.mul_add_e_f32s(gx, size, sum[6]);
+                            sum[7] = simd.mul_add_e_f32s(gy, size, sum[7]);
+                        }
+                        if DEPTH {
+                            sum[8] = simd.mul_add_e_f32s(w, d_depth[at], sum[8]);
+                        }
                     }
                     for (sums, sum) in sums.iter_mut().zip(sum) {
                         vectors_mut::<S>(sums)[b] = sum;
                     }
                 }
-                *out = splat_gradient(s, &grid.x, &sums);
+                *out = splat_gradient::<DEPTH, ABSOLUTE>(s, &grid.x, &sums);
             }
         }
     }
 }
 
-/// From the kernel's sums per column (g, g dy, g dy^2, absolute gradients of the centre, colour, depth, with
+/// From the kernel's sums per column (g, g dy, g dy^2, colour, absolute gradients of the centre, depth, with
 /// g = - d loss / d sigma) to the splat.
 #[inline(always)]
-fn splat_gradient(s: &Splat, x: &Row, sums: &[Row; 9]) -> SplatGradient {
+fn splat_gradient<const DEPTH: bool, const ABSOLUTE: bool>(s: &Splat, x: &Row, sums: &[Row; 9]) -> SplatGradient {
     // g dx, g dx^2 and g dx dy follow from the columns' sums.
-    let mut all = [[0.0f32; TILE]; 12];
-    all[..9].copy_from_slice(sums);
+    let mut moments = [[0.0f32; TILE]; 3];
     for l in 0..TILE {
         let dx = x[l] - s.mean[0];
-        all[9][l] = sums[0][l] * dx;
-        all[10][l] = all[9][l] * dx;
-        all[11][l] = sums[1][l] * dx;
+        moments[0][l] = sums[0][l] * dx;
+        moments[1][l] = moments[0][l] * dx;
+        moments[2][l] = sums[1][l] * dx;
     }
-    for half in [8, 4, 2, 1] {
-        for row in &mut all {
-            for l in 0..half {
-                row[l] += row[l + half];
-            }
-        }
-    }
-    let [g, g_y, g_yy, abs_x, abs_y, red, green, blue, depth, g_x, g_xx, g_xy] = all.map(|row| row[0]);
+    let [g, g_y, g_yy, red, green, blue] = [0, 1, 2, 3, 4, 5].map(|k| folded(&sums[k]));
+    let [g_x, g_xx, g_xy] = moments.map(|row| folded(&row));
     let [xx, xy, yy] = s.conic;
     SplatGradient {
         mean: [xx * g_x + xy * g_y, xy * g_x + yy * g_y],
-        mean_abs: [abs_x, abs_y],
+        mean_abs: if ABSOLUTE { [folded(&sums[6]), folded(&sums[7])] } else { [0.0; 2] },
         conic: [-0.5 * g_xx, -g_xy, -0.5 * g_yy],
         opacity: g / s.opacity,
-        depth,
+        depth: if DEPTH { folded(&sums[8]) } else { 0.0 },
         color: [red, green, blue],
     }
+}
+
+/// The sum of a row's columns, halves added to halves: the same order for any width of vectors.
+#[inline(always)]
+fn folded(row: &Row) -> f32 {
+    let mut row = *row;
+    for half in [8, 4, 2, 1] {
+        for l in 0..half {
+            row[l] += row[l + half];
+        }
+    }
+    row[0]
 }
 
 /// Alphas and blending weights of every Gaussian at every pixel of a tile, `[list][TILE * TILE]`, both zero on entry. With
@@ -570,13 +594,13 @@ mod tests {
     /// All that the kernels put out for a tile.
     fn everything<S: Simd>(simd: S, splats: &[Splat], rectangle: Rectangle) -> Vec<f32> {
         let list: Vec<u32> = (0..splats.len() as u32).collect();
-        let p = ForwardTile { splats, list: &list, rectangle }.with_simd(simd);
+        let p = ForwardTile::<true> { splats, list: &list, rectangle }.with_simd(simd);
         let mut all = [p.rgb.as_flattened(), &p.depth, &p.transmittance].concat();
         let wave = |k: usize| std::array::from_fn(|i| ((k * PIXELS + i) as f32 * 0.3).sin());
         let mut d =
             TileGradients { rgb: [wave(0), wave(1), wave(2)], depth: wave(3), alpha: wave(4), behind: [0.0; PIXELS] };
         let mut out = vec![SplatGradient::default(); splats.len()];
-        BackwardTile { splats, list: &list, rectangle, d: &mut d, out: &mut out }.with_simd(simd);
+        BackwardTile::<true, true> { splats, list: &list, rectangle, d: &mut d, out: &mut out }.with_simd(simd);
         for o in &out {
             all.extend([&o.mean[..], &o.mean_abs, &o.conic, &[o.opacity, o.depth], &o.color].concat());
         }

@@ -14,11 +14,15 @@ pub struct RasterOptions {
     /// Multiply opacities by sqrt(det(covariance) / det(covariance + 0.3 I)), so that a Gaussian smaller than a pixel keeps
     /// its weight when the low-pass widens it (the 2D filter of Mip-Splatting, Yu et al. 2024, as gsplat's "antialiased").
     pub antialias: bool,
+    /// Render depth; else [`Rendered::depth`] is empty. What is not asked for is not computed.
+    pub depth: bool,
+    /// Compute [`Gradients::mean2d_abs`]; else it is zero.
+    pub absolute_pulls: bool,
 }
 
 impl Default for RasterOptions {
     fn default() -> Self {
-        Self { background: [0.0; 3], sh_degree: 3, near: 0.01, antialias: false }
+        Self { background: [0.0; 3], sh_degree: 3, near: 0.01, antialias: false, depth: true, absolute_pulls: true }
     }
 }
 
@@ -33,7 +37,8 @@ pub struct Rendered {
     pub rgb: Vec<f32>,
     /// Accumulated alpha, `[height][width]`, 0 to 1.
     pub alpha: Vec<f32>,
-    /// Sum of blending weight times camera z, `[height][width]`; divide by alpha for a depth.
+    /// Sum of blending weight times camera z, `[height][width]`; divide by alpha for a depth. Empty where
+    /// [`RasterOptions::depth`] is off.
     pub depth: Vec<f32>,
 }
 
@@ -103,7 +108,7 @@ pub struct Gradients {
     pub sh: Vec<f32>,
     /// Of the projected centres, in pixels; zero for Gaussians that are not drawn.
     pub mean2d: Vec<[f32; 2]>,
-    /// Sum over pixels of the absolute values of that gradient (AbsGS).
+    /// Sum over pixels of the absolute values of that gradient (AbsGS); zero where [`RasterOptions::absolute_pulls`] is off.
     pub mean2d_abs: Vec<[f32; 2]>,
     /// How many of the Gaussians drawn have a gradient that single precision does not hold: theirs are zero here.
     pub overflowed: usize,

@@ -28,7 +28,7 @@ impl Workspace {
     /// arguments.
     ///
     /// # Panics
-    /// When a gradient image has another size than the rendered view.
+    /// When a gradient image has another size than the rendered view, or is that of a depth that was not rendered.
     pub fn backward(
         &mut self,
         g: &Gaussians,

@@ -53,3 +53,22 @@ fn one_two_three_and_seven_threads_give_the_same_bits() {
         assert!(on(threads) == one, "{threads} threads");
     }
 }
+
+#[test]
+fn what_is_not_asked_for_changes_nothing_else() {
+    let g = common::random(3000, 6);
+    let camera = common::camera(203, 117);
+    let all = RasterOptions { background: [0.1, 0.2, 0.3], ..RasterOptions::default() };
+    let d: Vec<f32> = (0..3 * 203 * 117).map(|i| (i as f32 * 0.37).sin()).collect();
+    let run = |options: &RasterOptions| {
+        let f = forward(&g, &camera, options);
+        let d = PixelGradients { rgb: &d, alpha: Some(&d[..203 * 117]), depth: None };
+        (backward(&g, &camera, options, &f, d), f.rendered)
+    };
+    let (gradients, rendered) = run(&all);
+    assert!(gradients.mean2d_abs.as_flattened().iter().any(|v| *v > 0.0) && rendered.depth.iter().any(|z| *z > 0.0));
+    let (few, picture) = run(&RasterOptions { depth: false, absolute_pulls: false, ..all });
+    assert!(few.mean2d_abs.as_flattened().iter().all(|v| *v == 0.0) && picture.depth.is_empty());
+    assert!(few == Gradients { mean2d_abs: few.mean2d_abs.clone(), ..gradients });
+    assert!(picture == Rendered { depth: Vec::new(), ..rendered });
+}

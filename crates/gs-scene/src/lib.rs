@@ -12,6 +12,7 @@ pub mod dataset;
 mod distortion;
 mod gaussians;
 mod image;
+mod order;
 pub mod ply;
 mod points;
 
@@ -19,4 +20,5 @@ pub use camera::Camera;
 pub use distortion::Distortion;
 pub use gaussians::{Gaussians, SH_C0, sh_coefficients};
 pub use image::{Image, has_alpha as image_has_alpha, size_of as image_size};
+pub use order::morton_order;
 pub use points::PointCloud;
