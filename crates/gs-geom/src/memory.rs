@@ -174,11 +174,11 @@ mod tests {
         assert_eq!(Forecast::new(&sizes).decoding, decoding);
         // Few tiles: decoding needs more at once; many: training does. Of the lesser, half counts.
         let gaussians = 1000 * (3 * 236 + 8 + 236 + 16 + PER_DRAWN);
-        assert_eq!(Forecast::new(&sizes).peak(1000), Bytes(BASE + 6_000_000 + decoding + 20_000_000 + gaussians));
+        assert_eq!(Forecast::new(&sizes).peak(1000), Bytes(BASE + 6_000_000 + decoding + 19_000_000 + gaussians));
         let many = Sizes { tile_entries: 5_000_000, ..sizes };
         let densifying = Sizes { densifies: true, ..sizes };
         assert_eq!(Forecast::new(&densifying).per_gaussian, Forecast::new(&sizes).per_gaussian + 354);
-        let training = 40_000_000 + 56 * 5_000_000;
+        let training = 38_000_000 + 56 * 5_000_000;
         assert_eq!(Forecast::new(&many).peak(1000), Bytes(BASE + 6_000_000 + training + decoding / 2 + gaussians));
     }
 

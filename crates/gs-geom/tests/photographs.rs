@@ -210,7 +210,7 @@ fn masked_pixels_do_not_count() {
         psnr(&m)
     };
     let (without, with) = (eval("a.ply"), eval("b.ply"));
-    assert!(with > without + 1.0 && (with - psnr(&masked)).abs() < 0.2, "{without} {with} {masked}");
+    assert!(with > without + 0.5 && (with - psnr(&masked)).abs() < 0.2, "{without} {with} {masked}");
     // Without a mask for some, and for all.
     fs::remove_file(Path::new(&masks).join("01.png")).unwrap();
     let out = dir.path("c.ply");
