@@ -1,6 +1,7 @@
 //! The command line of `synth-scene`.
 
 use crate::cameras::Path as CameraPath;
+use crate::families::Family;
 use crate::language::Speech;
 use crate::masks::Faults;
 use crate::write::{self, Options};
@@ -25,10 +26,13 @@ pub struct Args {
     /// photographs and geometry serve masks with many faults, which never move a thing or a camera
     #[arg(long, value_name = "DIR", conflicts_with = "out")]
     masks_to: Option<PathBuf>,
+    /// What kind of scene
+    #[arg(long, value_enum, default_value_t = Family::Studio)]
+    family: Family,
     /// Sizes that the options below default to
     #[arg(long, value_enum, default_value_t = Size::Demo)]
     size: Size,
-    /// Things besides floor, walls and tables, 1 to 60 [tiny 8, demo 10, large 40]
+    /// Things besides floor, walls, tables and counters, 1 to 60 (studio) or 250 (others) [tiny 8, demo 10, large 40]
     #[arg(long, value_name = "COUNT")]
     objects: Option<usize>,
     /// Photographs, 1 to 2000 [tiny 8, demo 30, large 120]
@@ -43,7 +47,7 @@ pub struct Args {
     /// Points of the sparse cloud, 1 to 10000000 [tiny 1500, demo 9000, large 40000]
     #[arg(long, value_name = "COUNT")]
     points: Option<usize>,
-    /// Where the camera goes [a ring for one table, a walk for several]
+    /// Where the camera goes [a ring for one table, a walk for several, kitchens and rooms]
     #[arg(long, value_enum)]
     cameras: Option<CameraPath>,
     /// What the faults below default to
@@ -122,6 +126,10 @@ impl Corruption {
     }
 }
 
+/// Most things of a studio, which names them by class and colour, and of other families.
+const MOST_STUDIO: usize = 60;
+const MOST: usize = 250;
+
 impl Args {
     fn options(&self, seed: u64) -> Result<Options> {
         let (objects, views, width, height, points) = match self.size {
@@ -129,6 +137,7 @@ impl Args {
             Size::Demo => (10, 30, 480, 360, 9_000),
             Size::Large => (40, 120, 640, 480, 40_000),
         };
+        let most = if self.family == Family::Studio { MOST_STUDIO } else { MOST };
         let Knobs { faults, speech, pose_noise } = self.corruption.knobs();
         let share = |option: &str, given: Option<f64>, preset: f64| within(option, given.unwrap_or(preset), 0.0, 1.0);
         let speech = Speech {
@@ -137,7 +146,8 @@ impl Args {
         };
         Ok(Options {
             seed,
-            objects: within("--objects", self.objects.unwrap_or(objects), 1, 60)?,
+            family: self.family,
+            objects: within("--objects", self.objects.unwrap_or(objects), 1, most)?,
             views: within("--views", self.views.unwrap_or(views), 1, 2000)?,
             width: within("--width", self.width.unwrap_or(width), 32, 4096)?,
             height: within("--height", self.height.unwrap_or(height), 32, 4096)?,

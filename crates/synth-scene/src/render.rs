@@ -29,6 +29,8 @@ const SAMPLES: [[f64; 2]; 4] = [[0.375, 0.125], [0.875, 0.375], [0.625, 0.875], 
 const EXPOSURE: f64 = 1.12;
 /// Sharpness of highlights.
 const GLOSS: f64 = 60.0;
+/// A mirror does not see what is nearer than this, in metres: itself.
+const MIRROR_NEAR: f64 = 1e-4;
 
 /// What each pixel shows, without a photograph: [`Frame::rgb`] is empty, everything else as [`render`] gives it.
 pub fn identify(scene: &Scene, camera: &Camera) -> Frame {
@@ -83,7 +85,7 @@ pub fn render(scene: &Scene, light: &LightMap, camera: &Camera) -> Frame {
                     let direction = ray(camera, x as f64 + sx, y as f64 + sy);
                     if let Some(hit) = scene.trace(eye, direction, 0.0) {
                         // Each sample is clipped by itself, or bright ones would eat the edges around them.
-                        sum += (EXPOSURE * shade(scene, light, direction, &hit)).min(DVec3::ONE);
+                        sum += (EXPOSURE * shade_with_mirror(scene, light, direction, &hit)).min(DVec3::ONE);
                     }
                 }
                 row.rgb.extend((sum / SAMPLES.len() as f64).to_array().map(to_srgb8));
@@ -121,6 +123,22 @@ fn shade(scene: &Scene, light: &LightMap, direction: DVec3, hit: &Hit) -> DVec3 
         out += DVec3::splat(m.specular * here.key * normal.dot(half).max(0.0).powf(GLOSS) * 3.0);
     }
     out
+}
+
+/// Radiance towards the eye with one mirror image.
+fn shade_with_mirror(scene: &Scene, light: &LightMap, direction: DVec3, hit: &Hit) -> DVec3 {
+    let own = shade(scene, light, direction, hit);
+    let p = &scene.primitives[hit.primitive];
+    if p.material.mirror == 0.0 {
+        return own;
+    }
+    let normal = p.rotation * p.shape.normal(hit.local);
+    let reflected = direction - normal * (2.0 * direction.dot(normal));
+    let Some(seen) = scene.trace(p.to_world(hit.local), reflected, MIRROR_NEAR) else { return own };
+    // Schlick's approximation with its fifth power tamed, as for lacquer that is not quite smooth.
+    let share =
+        p.material.mirror + (1.0 - p.material.mirror) * 0.5 * (1.0 + direction.dot(normal)).clamp(0.0, 1.0).powi(4);
+    own.lerp(shade(scene, light, reflected, &seen), share)
 }
 
 fn to_srgb8(linear: f64) -> u8 {

@@ -1,14 +1,16 @@
 //! Makes a scene and writes all of it.
 
 use crate::cameras::{self, Path as CameraPath};
+use crate::families::{self, Family};
+use crate::label;
 use crate::language::{Language, Speech};
 use crate::light::LightMap;
 use crate::masks::{self, Faults};
 use crate::points::Collector;
 use crate::render::{self, Frame};
 use crate::scene::Scene;
-use crate::{label, layout};
 use artifacts::{MaskTruth, TrueObject, TruePart, TruePoints, TrueScene, features_path, maps_path};
+use clap::ValueEnum;
 use gs_io::{Error, IoContext, Result, create_dir, npy, write_bytes};
 use gs_scene::{Camera, Image, PointCloud, colmap};
 use rand::SeedableRng;
@@ -23,7 +25,9 @@ use std::path::Path;
 pub struct Options {
     /// Seed of every random choice.
     pub seed: u64,
-    /// Things besides floor, walls and tables; 1 to 60.
+    /// What kind of scene.
+    pub family: Family,
+    /// Things besides floor, walls, tables and counters; 1 to 60 in the studio, to 250 elsewhere.
     pub objects: usize,
     /// Number of photographs, at least 1.
     pub views: usize,
@@ -65,6 +69,7 @@ impl Default for Options {
     fn default() -> Self {
         Self {
             seed: 0,
+            family: Family::Studio,
             objects: 10,
             views: 30,
             width: 480,
@@ -89,7 +94,7 @@ impl Options {
 
     /// The furnished room.
     pub fn scene(&self) -> Scene {
-        layout::plan(self.objects, &mut self.rng(LAYOUT))
+        families::plan(self.family, self.objects, &mut self.rng(LAYOUT))
     }
 
     /// The light in that room, as fine as the photographs show.
@@ -98,7 +103,12 @@ impl Options {
     }
 
     fn path(&self, scene: &Scene) -> CameraPath {
-        self.cameras.unwrap_or(if scene.tables.len() > 1 { CameraPath::Walk } else { CameraPath::Ring })
+        let ring = match self.family {
+            Family::Studio => scene.tables.len() == 1,
+            Family::Table => true,
+            Family::Kitchen | Family::Room => false,
+        };
+        self.cameras.unwrap_or(if ring { CameraPath::Ring } else { CameraPath::Walk })
     }
 
     /// The cameras in that room.
@@ -118,6 +128,9 @@ impl Options {
             "boundary_noise": self.faults.boundary, "missing": self.faults.missing, "label_every": self.label_every,
         });
         // What is not used is not named: older scenes of the same bytes lack it too.
+        if self.family != Family::Studio {
+            all["family"] = json!(self.family.to_possible_value().map(|v| v.get_name().to_string()));
+        }
         let mut used = |name: &str, value: f64| {
             if value != 0.0 {
                 all[name] = json!(value);
