@@ -194,7 +194,7 @@ mod tests {
                 let rng = &mut ChaCha8Rng::seed_from_u64(objects as u64);
                 let scene = crate::families::plan(family, objects, rng);
                 let mut seen = vec![0usize; scene.things.len()];
-                for camera in place(&scene, path, 24, 64, 48, rng) {
+                for camera in place(&scene, path, 24, 96, 72, rng) {
                     let frame = crate::render::identify(&scene, &camera);
                     let near = frame.distance.iter().copied().fold(f64::INFINITY, f64::min);
                     assert!(near > 0.12, "{family:?} {path:?}: {near} m from something");
@@ -205,8 +205,8 @@ mod tests {
                     seen.iter_mut().zip(here).for_each(|(s, n)| *s += usize::from(n >= 4));
                 }
                 let objects = scene.things.iter().zip(&seen).filter(|(t, _)| !t.background);
-                let often = objects.clone().filter(|(_, n)| **n >= 3).count();
-                assert!(5 * often >= 3 * objects.count(), "{family:?} {path:?}: {often} are seen in three views");
+                let often = objects.clone().filter(|(_, n)| **n >= 2).count();
+                assert!(5 * often >= 3 * objects.count(), "{family:?} {path:?}: {often} are seen in two views");
             }
         }
     }

@@ -8,6 +8,7 @@ use crate::light::LightMap;
 use crate::masks::{self, Faults};
 use crate::points::Collector;
 use crate::render::{self, Frame};
+use crate::scannet;
 use crate::scene::Scene;
 use artifacts::{MaskTruth, TrueObject, TruePart, TruePoints, TrueScene, features_path, maps_path};
 use clap::ValueEnum;
@@ -55,6 +56,8 @@ const POINT_NOISE: f64 = 0.003;
 const FINE_HEIGHT: f64 = 360.0;
 /// Folders of a scene, all of which this program owns.
 const FOLDERS: [&str; 5] = ["images", "sparse", "language_features", "label", "truth"];
+/// Folder of the scan, which only furnished rooms have.
+const SCAN: &str = "scan";
 /// Streams of the random generator, so that more views do not move the furniture.
 const LAYOUT: u64 = 0;
 const CAMERAS: u64 = 1;
@@ -229,6 +232,9 @@ pub fn run(stage: &Stage, out: &Path, options: &Options) -> Result<()> {
     let mut provenance = stage.provenance(TruePoints::FORMAT, 1, parameters.clone(), BTreeMap::new());
     provenance.extra = json!({ "classes": scene.classes() });
     truth.write(out.join("truth/points.safetensors"), provenance)?;
+    if options.family == Family::Room {
+        scannet::write(&out.join(SCAN), &scene, &truth, points.colors())?;
+    }
     MaskTruth::write_all(out.join("truth/masks.json"), &masks)?;
     let summary = json!({
         "objects": options.objects, "parts": scene.parts.len(), "views": views.len(), "labelled_views": labelled,
@@ -310,7 +316,7 @@ fn write_table(folder: &Path, language: &Language) -> Result<()> {
 fn prepare(out: &Path) -> Result<()> {
     let truth = out.join("truth");
     if !truth.is_dir() {
-        if let Some(other) = FOLDERS.iter().map(|f| out.join(f)).find(|f| f.exists()) {
+        if let Some(other) = FOLDERS.iter().chain([&SCAN]).map(|f| out.join(f)).find(|f| f.exists()) {
             return Err(Error::new("the folder holds something that is not a synthetic scene")
                 .file(out)
                 .found(other.display())
@@ -322,6 +328,10 @@ fn prepare(out: &Path) -> Result<()> {
     let marker = truth.join("scene.json");
     if marker.exists() {
         std::fs::remove_file(&marker).at("replace", &marker)?;
+    }
+    let scan = out.join(SCAN);
+    if scan.is_dir() {
+        std::fs::remove_dir_all(&scan).at("replace", &scan)?;
     }
     for folder in FOLDERS.iter().map(|f| out.join(f)) {
         for name in entries(&folder)? {

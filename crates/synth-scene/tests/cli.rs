@@ -315,6 +315,29 @@ fn each_fault_changes_its_own_files_and_nothing_else() {
 }
 
 #[test]
+fn families_are_written_whole_and_rooms_as_scans_too() {
+    let dir = tempfile::tempdir().unwrap();
+    for family in ["table", "kitchen", "room"] {
+        let out = dir.path().join("scene");
+        make(&out, &[&["--family", family], &SMALL[..]].concat());
+        let truth = TrueScene::read(out.join("truth/scene.json")).unwrap();
+        assert_eq!(truth.parameters["family"], family);
+        assert_eq!(truth.objects.iter().filter(|o| !o.background).count(), 4);
+        let data = dataset::load(&out, &LoadOptions::default()).unwrap();
+        assert!(data.warnings.is_empty() && data.views.len() == 2, "{:?}", data.warnings);
+        // The scan of an earlier room does not outlive it.
+        assert_eq!(out.join("scan").exists(), family == "room");
+    }
+    let scan = dir.path().join("scene/scan/scene0000_00_vh_clean_2.labels.ply");
+    let (at, _) = gs_scene::ply::read_labels(&scan, "label").unwrap();
+    assert_eq!(at, TruePoints::read(dir.path().join("scene/truth/points.safetensors")).unwrap().position);
+    make(&dir.path().join("scene"), &SMALL);
+    assert!(!dir.path().join("scene/scan").exists());
+    let o = synth_scene(&dir.path().join("many"), &["--family", "table", "--objects", "251"]);
+    assert!(String::from_utf8_lossy(&o.stderr).contains("expected 1 to 250"));
+}
+
+#[test]
 fn labels_are_given_for_training_and_held_out_views() {
     let root = exact();
     for (v, labelled) in [(0, true), (1, false), (4, true), (7, false)] {
