@@ -1,5 +1,6 @@
 //! The command line of `eval`.
 
+mod masks;
 mod protocols;
 mod query;
 
@@ -43,6 +44,8 @@ enum Command {
     Table(protocols::TableArgs),
     /// Score instances and text queries against the truth of the scene
     Score(ScoreArgs),
+    /// Measure id maps: how many, how large, and how often one view splits or merges what another shows
+    Masks(masks::MasksArgs),
     /// Make one self-contained HTML page of a run, and metrics.json beside it
     Report(ReportArgs),
 }
@@ -248,6 +251,7 @@ impl Program for Args {
             Command::Scannet(a) => protocols::run_scannet(a, stage)?,
             Command::Table(a) => protocols::run_table(a, stage)?,
             Command::Score(a) => run_score(a, stage)?,
+            Command::Masks(a) => masks::run(a, stage)?,
             Command::Report(a) => run_report(a, stage)?,
         };
         if !self.common.quiet && !self.common.json {
@@ -286,7 +290,12 @@ fn run_score(a: &ScoreArgs, stage: &Stage) -> Result<String> {
         if a.labels.is_some() {
             return Err(Error::new("no such folder").file(&labels).field("--labels").hint("check the path"));
         }
-        scores.skipped.push(format!("query scores: the scene has no {}", labels.display()));
+        scores.skipped.push(format!("label and query scores: the scene has no {}", labels.display()));
+    } else {
+        score::score_labels(&scene, &dataset, &labels, &mut scores)?;
+    }
+    if !labels.is_dir() {
+        // Said above.
     } else if scene.instances.dim == 0 {
         let why = "query scores: the instances have no language features, because the masks were not encoded with a \
                    CLIP model (mask-embed --clip)";
@@ -312,7 +321,7 @@ fn run_score(a: &ScoreArgs, stage: &Stage) -> Result<String> {
     parameters["alpha"] = json!(threshold);
     let figure = |v: Option<f64>| v.map_or(Value::Null, Value::from);
     let summary = json!({
-        "instance_miou": figure(scores.instance_miou), "query_miou": figure(scores.query_miou),
+        "instance_miou": figure(scores.instance_miou), "label_miou": figure(scores.label_miou), "query_miou": figure(scores.query_miou),
         "query_pairs": scores.query_pairs,
     });
     stage.record(&a.out, parameters, scene.inputs.clone(), summary)?;

@@ -1,6 +1,7 @@
 //! `eval score`: instances and text queries against the truth of a scene.
 
 use crate::ask::Asker;
+use crate::label_iou::{self, LabelScore};
 use crate::labels;
 use crate::lerf::{self, Answer, Rendering};
 use crate::metrics::{self, InstanceScore};
@@ -35,6 +36,18 @@ pub struct Scores {
     pub merging: Option<usize>,
     /// Each true thing.
     pub things: Vec<ThingScore>,
+    /// Mean over all labelled objects of all labelled views of the best IoU with any instance's visible pixels.
+    #[serde(default)]
+    pub label_miou: Option<f64>,
+    /// Fraction of them with best IoU above 0.25.
+    #[serde(default)]
+    pub label_macc25: Option<f64>,
+    /// Fraction of them with best IoU above 0.5.
+    #[serde(default)]
+    pub label_macc50: Option<f64>,
+    /// Each labelled object of each labelled view.
+    #[serde(default)]
+    pub labels: Vec<LabelScore>,
     /// Mean IoU over all (frame, category) pairs.
     pub query_miou: Option<f64>,
     /// Fraction of pairs with IoU above 0.25.
@@ -129,6 +142,23 @@ pub fn score_instances(scene: &LabelledScene, root: &Path, scores: &mut Scores) 
     scores.object_miou = (!object_ious.is_empty()).then(|| metrics::mean(&object_ious));
     (scores.instance_miou, scores.instance_macc25, scores.instance_macc50) = (Some(miou), Some(macc25), Some(macc50));
     (scores.fragmented, scores.merging) = (Some(fragmented), Some(merging));
+    Ok(())
+}
+
+/// Scores the instances against the polygons of `folder`, without asking for anything: [`label_iou::score`].
+///
+/// # Errors
+/// When labels are damaged.
+pub fn score_labels(scene: &LabelledScene, dataset: &Dataset, folder: &Path, scores: &mut Scores) -> Result<()> {
+    scores.labels = label_iou::score(scene, dataset, &labels::read_folder(folder)?);
+    let ious: Vec<f64> = scores.labels.iter().map(|l| l.iou).collect();
+    if ious.is_empty() {
+        scores.skipped.push(format!("label scores: {} labels no object of a view", folder.display()));
+        return Ok(());
+    }
+    let above = |t: f64| Some(ious.iter().filter(|&&i| i > t).count() as f64 / ious.len() as f64);
+    scores.label_miou = Some(metrics::mean(&ious));
+    (scores.label_macc25, scores.label_macc50) = (above(0.25), above(0.5));
     Ok(())
 }
 
@@ -247,6 +277,10 @@ pub fn table(scores: &Scores) -> String {
     line("instance_macc50", number(scores.instance_macc50));
     line("fragmented", scores.fragmented.map(|n| format!("{n} of {} things", scores.things.len())));
     line("merging", scores.merging.map(|n| format!("{n} instances")));
+    line("label_miou", number(scores.label_miou));
+    line("label_macc25", number(scores.label_macc25));
+    line("label_macc50", number(scores.label_macc50));
+    line("labels", scores.label_miou.map(|_| format!("{} objects in views", scores.labels.len())));
     line("query_miou", number(scores.query_miou));
     line("  visible only", number(scores.query_miou_visible));
     line("query_macc25", number(scores.query_macc25));

@@ -1,12 +1,14 @@
 //! Where the photographs are taken from.
 
+use crate::families::Family;
 use crate::layout::TABLE_HEIGHT;
+use crate::points::normal;
 use crate::scene::Scene;
-use glam::{DVec2, DVec3};
+use glam::{DMat3, DVec2, DVec3, EulerRot};
 use gs_scene::Camera;
 use rand::Rng;
 use rand_chacha::ChaCha8Rng;
-use std::f64::consts::TAU;
+use std::f64::consts::{PI, TAU};
 
 /// How the photographer moves.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, clap::ValueEnum)]
@@ -21,6 +23,10 @@ pub enum Path {
 const FIELD: f64 = 0.90;
 /// Heights of the ring's two levels.
 const HEIGHTS: [f64; 2] = [1.40, 1.98];
+/// The same in furnished rooms, where walls are near.
+const WIDE_FIELD: f64 = 1.15;
+/// From the walls of a furnished room to the way through it.
+const ROOM_AWAY: f64 = 1.22;
 /// From the wall to the ring.
 const WALL_DISTANCE: f64 = 0.68;
 /// Least free space around a camera.
@@ -30,15 +36,39 @@ const CLEARANCE: f64 = 0.35;
 pub fn place(scene: &Scene, path: Path, views: usize, width: u32, height: u32, rng: &mut ChaCha8Rng) -> Vec<Camera> {
     (0..views)
         .map(|i| {
-            let (mut eye, mut target) = match path {
-                Path::Ring => ring(scene, i, views),
-                Path::Walk => walk(scene, i, views),
+            let (mut eye, mut target) = match (scene.family, path) {
+                (Family::Studio, Path::Ring) => ring(scene, i, views),
+                (Family::Studio, Path::Walk) => walk(scene, i, views),
+                (Family::Table, _) => table(scene, path, i, views),
+                (Family::Kitchen, _) => kitchen(scene, path, i, views),
+                (Family::Room, _) => room(scene, path, i, views),
             };
             let mut shake = |size: f64| DVec3::new(rng.random(), rng.random(), rng.random()) * 2.0 * size - size;
             eye += shake(0.05);
             target += shake(0.06);
-            clear(scene, &mut eye);
-            Camera::look_at(eye, target, DVec3::Z, width, height, FIELD)
+            if scene.family == Family::Studio {
+                clear(scene, &mut eye);
+            }
+            let field = if scene.family == Family::Room { WIDE_FIELD } else { FIELD };
+            Camera::look_at(eye, target, DVec3::Z, width, height, field)
+        })
+        .collect()
+}
+
+/// The same cameras as structure from motion would have found them: turned about each axis by Gaussian noise of standard
+/// deviation `noise` degrees, and moved along each by as many centimetres.
+pub fn perturbed(cameras: &[Camera], noise: f64, rng: &mut ChaCha8Rng) -> Vec<Camera> {
+    if noise == 0.0 {
+        return cameras.to_vec();
+    }
+    cameras
+        .iter()
+        .map(|camera| {
+            let mut draw = || DVec3::new(normal(rng), normal(rng), normal(rng)) * noise;
+            let (turn, shift) = (draw() * PI / 180.0, draw() * 0.01);
+            let rotation = DMat3::from_euler(EulerRot::XYZ, turn.x, turn.y, turn.z) * camera.rotation;
+            let eye = camera.position() + shift;
+            Camera { rotation, translation: -(rotation * eye), ..camera.clone() }
         })
         .collect()
 }
@@ -63,6 +93,84 @@ fn walk(scene: &Scene, i: usize, views: usize) -> (DVec3, DVec3) {
     ((centre.truncate() + around).extend(height), centre + DVec3::new(0.0, 0.0, 0.04))
 }
 
+/// A point of a rectangle's border and the direction in which it runs, `along` from 0 to 1, counter-clockwise.
+fn border(half: DVec2, along: f64) -> (DVec2, DVec2) {
+    let corners = [DVec2::new(-half.x, -half.y), DVec2::new(half.x, -half.y), half, DVec2::new(-half.x, half.y)];
+    let length = 4.0 * (half.x + half.y);
+    let mut left = along.rem_euclid(1.0) * length;
+    for k in 0..4 {
+        let side = corners[(k + 1) % 4] - corners[k];
+        if left <= side.length() || k == 3 {
+            let direction = side.normalize_or_zero();
+            return (corners[k] + direction * left, direction);
+        }
+        left -= side.length();
+    }
+    (corners[0], DVec2::X)
+}
+
+/// Half extents of the first table or counter.
+fn top_half(scene: &Scene) -> DVec2 {
+    let is_top = |t: &&crate::scene::Thing| t.class == "table" || t.class == "counter";
+    scene.things.iter().find(is_top).map_or(DVec2::ONE, |t| t.footprint)
+}
+
+/// A ring: three rounds, from beside the table to above it. A walk: around the edge, close to what stands there.
+fn table(scene: &Scene, path: Path, i: usize, views: usize) -> (DVec3, DVec3) {
+    let (top, half) = (scene.tables[0], top_half(scene));
+    match path {
+        Path::Ring => {
+            let angle = TAU * (i as f64 + 0.25) / views as f64;
+            let around = DVec2::from_angle(angle);
+            let (out, up) = [(0.75, 0.45), (0.50, 0.80), (0.20, 1.10)][i % 3];
+            let eye = around * (half + out);
+            (top + eye.extend(up), top + (around * half * 0.25).extend(0.03))
+        }
+        Path::Walk => {
+            let (at, _) = border(half + 0.42, 2.0 * (i as f64 + 0.5) / views as f64);
+            let up = if 2 * i < views { 0.45 } else { 0.80 };
+            (top + at.extend(up), top + (at * 0.35).extend(0.03))
+        }
+    }
+}
+
+/// A ring: an arc in front of the counter. A walk: along the counter and back, at two heights and distances.
+fn kitchen(scene: &Scene, path: Path, i: usize, views: usize) -> (DVec3, DVec3) {
+    let (top, half) = (scene.tables[0], top_half(scene));
+    let t = (i as f64 + 0.5) / views as f64;
+    let up = [1.40, 1.75][i % 2];
+    match path {
+        Path::Ring => {
+            let angle = PI * (1.08 + 0.84 * t);
+            let eye = DVec2::new(half.x * angle.cos(), top.y - 0.55 + 1.45 * angle.sin());
+            (eye.extend(up), DVec3::new(0.55 * eye.x, top.y, top.z + 0.15))
+        }
+        Path::Walk => {
+            let (x, away) = if t < 0.5 { (4.0 * t - 1.0, 1.15) } else { (3.0 - 4.0 * t, 1.45) };
+            let x = x * (half.x - 0.25);
+            let sway = 0.45 * (TAU * 6.0 * t).sin();
+            (DVec3::new(x, top.y - away, up), DVec3::new(x + sway, top.y, top.z + 0.18))
+        }
+    }
+}
+
+/// A round through the room between what stands at the walls and in the middle. A ring looks inwards, a walk ahead and to
+/// both sides.
+fn room(scene: &Scene, path: Path, i: usize, views: usize) -> (DVec3, DVec3) {
+    let t = (i as f64 + 0.5) / views as f64;
+    let (at, ahead) = border(scene.room - ROOM_AWAY, t);
+    let eye = at.extend(1.52 + 0.12 * (TAU * 7.0 * t).sin());
+    match path {
+        Path::Ring => (eye, (at * 0.15).extend(0.65)),
+        Path::Walk => {
+            // Left is inwards; what is right is too near to be seen whole.
+            let turn = 0.55 + 1.15 * (TAU * 5.0 * t).sin();
+            let look = DVec2::from_angle(turn).rotate(ahead);
+            (eye, eye + look.extend(-0.38))
+        }
+    }
+}
+
 /// Lifts the camera over things that it would come too close to.
 fn clear(scene: &Scene, eye: &mut DVec3) {
     for t in scene.things.iter().filter(|t| t.class != "wall" && t.class != "floor") {
@@ -71,5 +179,55 @@ fn clear(scene: &Scene, eye: &mut DVec3) {
         if away < CLEARANCE && eye.z < top + CLEARANCE {
             eye.z = top + CLEARANCE;
         }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use rand::SeedableRng;
+
+    #[test]
+    fn cameras_see_things_and_stand_in_none() {
+        for (family, objects) in [(Family::Table, 40), (Family::Kitchen, 50), (Family::Room, 70), (Family::Room, 30)] {
+            for path in [Path::Ring, Path::Walk] {
+                let rng = &mut ChaCha8Rng::seed_from_u64(objects as u64);
+                let scene = crate::families::plan(family, objects, rng);
+                let mut seen = vec![0usize; scene.things.len()];
+                for camera in place(&scene, path, 24, 96, 72, rng) {
+                    let frame = crate::render::identify(&scene, &camera);
+                    let near = frame.distance.iter().copied().fold(f64::INFINITY, f64::min);
+                    assert!(near > 0.12, "{family:?} {path:?}: {near} m from something");
+                    assert!(frame.thing.iter().all(|&t| t >= 0), "{family:?} {path:?}: outside the room");
+                    let mut here = vec![0usize; scene.things.len()];
+                    frame.thing.iter().for_each(|&t| here[t as usize] += 1);
+                    assert!(here.iter().filter(|&&n| n > 0).count() >= 3, "{family:?} {path:?}: sees nothing");
+                    seen.iter_mut().zip(here).for_each(|(s, n)| *s += usize::from(n >= 4));
+                }
+                let objects = scene.things.iter().zip(&seen).filter(|(t, _)| !t.background);
+                let often = objects.clone().filter(|(_, n)| **n >= 2).count();
+                assert!(5 * often >= 3 * objects.count(), "{family:?} {path:?}: {often} are seen in two views");
+            }
+        }
+    }
+
+    #[test]
+    fn pose_noise_has_the_size_asked_for_and_keeps_the_lens() {
+        let camera = Camera::look_at(DVec3::new(1.0, 2.0, 1.5), DVec3::ZERO, DVec3::Z, 64, 48, FIELD);
+        let cameras = vec![camera.clone(); 2000];
+        let rng = &mut ChaCha8Rng::seed_from_u64(4);
+        let (mut turns, mut shifts) = (0.0, 0.0);
+        for c in perturbed(&cameras, 0.5, rng) {
+            assert_eq!((c.fx, c.fy, c.cx, c.cy, c.width), (camera.fx, camera.fy, camera.cx, camera.cy, camera.width));
+            assert!((c.rotation * c.rotation.transpose() - DMat3::IDENTITY).abs_diff_eq(DMat3::ZERO, 1e-12));
+            let relative = c.rotation * camera.rotation.transpose();
+            let cosine: f64 = 0.5 * (relative.x_axis.x + relative.y_axis.y + relative.z_axis.z - 1.0);
+            turns += cosine.clamp(-1.0, 1.0).acos().to_degrees().powi(2);
+            shifts += (100.0 * (c.position() - camera.position())).length_squared();
+        }
+        // Three axes, each with the variance 0.25.
+        assert!((turns / 2000.0 - 0.75).abs() < 0.06, "{turns}");
+        assert!((shifts / 2000.0 - 0.75).abs() < 0.06, "{shifts}");
+        assert_eq!(perturbed(&cameras[..1], 0.0, rng), cameras[..1]);
     }
 }

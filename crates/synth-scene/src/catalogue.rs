@@ -162,24 +162,24 @@ fn brown() -> DVec3 {
     albedo([0.46, 0.30, 0.18])
 }
 
-fn wood(tone: f64) -> Material {
+pub(crate) fn wood(tone: f64) -> Material {
     Material::matt(albedo([0.72, 0.52, 0.33]) * tone).with(Pattern::Wood { board: 0.11 })
 }
 
-fn metal() -> Material {
+pub(crate) fn metal() -> Material {
     Material { specular: 0.2, ..Material::matt(albedo([0.70, 0.70, 0.72])) }
 }
 
-fn ivory() -> DVec3 {
+pub(crate) fn ivory() -> DVec3 {
     albedo([0.93, 0.90, 0.82])
 }
 
 /// About x by `degrees`: tips +y up.
-fn tip(degrees: f64) -> DMat3 {
+pub(crate) fn tip(degrees: f64) -> DMat3 {
     DMat3::from_rotation_x(degrees.to_radians())
 }
 
-fn vary(rng: &mut ChaCha8Rng, amount: f64) -> f64 {
+pub(crate) fn vary(rng: &mut ChaCha8Rng, amount: f64) -> f64 {
     1.0 + amount * (2.0 * rng.random::<f64>() - 1.0)
 }
 
@@ -444,6 +444,7 @@ fn books(paint: &Paint, rng: &mut ChaCha8Rng) -> Model {
         );
         z += size[2] + 0.0005;
     }
+    m.top([0.0, 0.0], [0.08, 0.05], z);
     m
 }
 
@@ -802,6 +803,7 @@ fn cabinet(paint: &Paint, rng: &mut ChaCha8Rng) -> Model {
     let lacquer = Material::matt(paint.albedo());
     m.block(body, [w, d, h], 0.008, [0.0; 3], lacquer);
     m.block(body, [w + 0.03, d + 0.03, 0.025], 0.006, [0.0, 0.0, h], wood(1.0));
+    m.top([0.0, 0.0], [0.5 * w, 0.5 * d], h + 0.0255);
     for k in 0..2 {
         let drawer = m.part("drawer");
         let z = 0.05 + 0.31 * f64::from(k);
@@ -924,11 +926,17 @@ pub fn wall(length: f64, height: f64, color: DVec3) -> Model {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::furniture::{ALONG_WALLS, ON_WALLS, SHELF, SINK, STOVE, WALL_CABINET};
     use rand::SeedableRng;
+
+    fn all() -> impl Iterator<Item = &'static Class> {
+        let hung = ON_WALLS.iter().map(|c| &c.0).chain([&SHELF.0, &WALL_CABINET.0, &SINK, &STOVE]);
+        CLASSES.iter().chain(crate::props::PROPS).chain(ALONG_WALLS).chain(hung)
+    }
 
     #[test]
     fn every_class_builds_in_every_colour_with_parts_that_own_pieces() {
-        for class in CLASSES {
+        for class in all() {
             for &paint in class.paints {
                 for seed in 0..5 {
                     let m = (class.build)(&PAINTS[paint], &mut ChaCha8Rng::seed_from_u64(seed));
@@ -947,7 +955,7 @@ mod tests {
 
     #[test]
     fn things_stand_on_their_ground() {
-        for class in CLASSES.iter().filter(|c| c.place != Place::Wall) {
+        for class in all().filter(|c| c.place != Place::Wall) {
             let m = (class.build)(&PAINTS[class.paints[0]], &mut ChaCha8Rng::seed_from_u64(1));
             let mut low = f64::INFINITY;
             for piece in &m.pieces {

@@ -17,7 +17,7 @@ const TABLE: [f64; 2] = [1.36, 1.00];
 const TABLE_SPACING: [f64; 2] = [2.8, 2.5];
 /// From the centres of the outer tables to the walls.
 const MARGIN: f64 = 2.45;
-const WALL_HEIGHT: f64 = 2.7;
+pub(crate) const WALL_HEIGHT: f64 = 2.7;
 const PAINTING_HEIGHT: f64 = 1.12;
 /// Free space between two things, in metres.
 const GAP: f64 = 0.012;
@@ -30,7 +30,7 @@ const PER_TABLE: usize = 10;
 const MOST_PAINTINGS: usize = 4;
 
 const ORDINALS: [&str; 9] = ["second", "third", "fourth", "fifth", "sixth", "seventh", "eighth", "ninth", "tenth"];
-const WALLS: [(&str, [f64; 3]); 4] = [
+pub(crate) const WALLS: [(&str, [f64; 3]); 4] = [
     ("white", [0.87, 0.86, 0.83]),
     ("green", [0.70, 0.78, 0.68]),
     ("yellow", [0.88, 0.82, 0.66]),
@@ -39,14 +39,14 @@ const WALLS: [(&str, [f64; 3]); 4] = [
 
 /// A rectangle on the ground, turned.
 #[derive(Debug, Clone, Copy)]
-struct Footprint {
-    centre: DVec2,
-    half: DVec2,
-    yaw: f64,
+pub(crate) struct Footprint {
+    pub centre: DVec2,
+    pub half: DVec2,
+    pub yaw: f64,
 }
 
 impl Footprint {
-    fn axes(&self) -> [DVec2; 2] {
+    pub fn axes(&self) -> [DVec2; 2] {
         let x = DVec2::from_angle(self.yaw);
         [x, x.perp()]
     }
@@ -58,7 +58,7 @@ impl Footprint {
     }
 
     /// Whether the two come closer than `gap`, by separating axes.
-    fn touches(&self, other: &Self, gap: f64) -> bool {
+    pub fn touches(&self, other: &Self, gap: f64) -> bool {
         let span = |corners: [DVec2; 4], axis: DVec2| {
             corners
                 .iter()
@@ -69,6 +69,32 @@ impl Footprint {
             let (a, b) = (span(self.corners(), axis), span(other.corners(), axis));
             a.0 < b.1 + gap && b.0 < a.1 + gap
         })
+    }
+
+    /// Whether it lies within another one.
+    pub fn inside(&self, other: &Self) -> bool {
+        let [x, y] = other.axes();
+        self.corners().iter().all(|&c| {
+            let d = c - other.centre;
+            d.dot(x).abs() <= other.half.x && d.dot(y).abs() <= other.half.y
+        })
+    }
+
+    /// A footprint of half extents `half` beside this one, `gap` away from it. `turn` (0 to 1) chooses the side and the
+    /// turn, `shift` (-1 to 1) how far the middles are apart along the side.
+    pub fn beside(&self, half: DVec2, gap: f64, turn: f64, shift: f64) -> Self {
+        let side = (turn * 16.0) as usize;
+        let turned = side / 4 % 2 == 1;
+        let size = if turned { DVec2::new(half.y, half.x) } else { half };
+        let [x, y] = self.axes();
+        let sign = if side % 2 == 0 { 1.0 } else { -1.0 };
+        let slide = 0.6 * shift * (self.half + size);
+        let offset = match side / 2 % 2 {
+            0 => x * (sign * (self.half.x + size.x + gap)) + y * slide.y,
+            _ => y * (sign * (self.half.y + size.y + gap)) + x * slide.x,
+        };
+        let half_turns = FRAC_PI_2 * (f64::from(turned) + 2.0 * (side / 8) as f64);
+        Self { centre: self.centre + offset, half, yaw: self.yaw + half_turns }
     }
 
     fn within(&self, centre: DVec2, half: DVec2) -> bool {
@@ -124,7 +150,7 @@ pub fn plan(objects: usize, rng: &mut ChaCha8Rng) -> Scene {
     scene.build(room, centres.iter().map(|c| c.extend(TABLE_HEIGHT)).collect())
 }
 
-fn name_of(class: &Class, color: &str, repeated: bool) -> String {
+pub(crate) fn name_of(class: &Class, color: &str, repeated: bool) -> String {
     match class.naming {
         Naming::Plain if !repeated => class.name.to_string(),
         Naming::Of(before, after) => {

@@ -100,6 +100,8 @@ pub struct Material {
     pub pattern: Pattern,
     /// Strength of the highlight, 0 to about 0.3.
     pub specular: f64,
+    /// Share of the mirror image at a right angle, 0 to about 0.3; it grows towards grazing angles.
+    pub mirror: f64,
     /// Light given off, as a multiple of the albedo: lampshades and flames.
     pub glow: f64,
 }
@@ -107,7 +109,7 @@ pub struct Material {
 impl Material {
     /// A matt surface with faint clouds.
     pub fn matt(albedo: DVec3) -> Self {
-        Self { albedo, pattern: Pattern::Clouds { size: 0.06, amount: 0.10 }, specular: 0.0, glow: 0.0 }
+        Self { albedo, pattern: Pattern::Clouds { size: 0.06, amount: 0.10 }, specular: 0.0, mirror: 0.0, glow: 0.0 }
     }
 
     /// A glazed or polished surface.

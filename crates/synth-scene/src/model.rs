@@ -26,6 +26,21 @@ pub struct Model {
     pub parts: Vec<&'static str>,
     /// Its primitives.
     pub pieces: Vec<Piece>,
+    /// Flat tops that other things may stand on.
+    pub tops: Vec<Top>,
+}
+
+/// A flat rectangle of a model that other things may stand on.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Top {
+    /// Its centre in x and y.
+    pub centre: [f64; 2],
+    /// Its half extents in x and y.
+    pub half: [f64; 2],
+    /// Its height.
+    pub height: f64,
+    /// Height of what fits between it and what is above it; none for the open air.
+    pub room: Option<f64>,
 }
 
 impl Model {
@@ -80,12 +95,28 @@ impl Model {
         self.add_turned(part, shape, (0.5 * (a + b)).to_array(), z_towards(b - a), material);
     }
 
+    /// Adds a flat top under the open air.
+    pub fn top(&mut self, centre: [f64; 2], half: [f64; 2], height: f64) {
+        self.tops.push(Top { centre, half, height, room: None });
+    }
+
+    /// Adds a flat top with something `room` above it.
+    pub fn top_under(&mut self, centre: [f64; 2], half: [f64; 2], height: f64, room: f64) {
+        self.tops.push(Top { centre, half, height, room: Some(room) });
+    }
+
     /// The same model `factor` times as large.
     #[must_use]
     pub fn scaled(mut self, factor: f64) -> Self {
         for piece in &mut self.pieces {
             piece.offset *= factor;
             piece.shape = piece.shape.scaled(factor);
+        }
+        for top in &mut self.tops {
+            top.centre = top.centre.map(|c| c * factor);
+            top.half = top.half.map(|h| h * factor);
+            top.height *= factor;
+            top.room = top.room.map(|r| r * factor);
         }
         self
     }

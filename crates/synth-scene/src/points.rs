@@ -60,6 +60,11 @@ impl Collector {
         }
     }
 
+    /// Colours of the points of [`Self::truth`], in its order.
+    pub fn colors(&self) -> &[[u8; 3]] {
+        &self.colors
+    }
+
     /// At most `count` of the points, half of them on objects, with noise of standard deviation `noise` metres.
     pub fn sparse(&self, scene: &Scene, count: usize, noise: f64, rng: &mut ChaCha8Rng) -> PointCloud {
         let (objects, background): (Vec<usize>, Vec<usize>) =
@@ -93,7 +98,7 @@ fn ground(scene: &Scene, part: u32) -> usize {
 }
 
 /// A standard normal number (Box and Muller).
-fn normal(rng: &mut ChaCha8Rng) -> f64 {
+pub(crate) fn normal(rng: &mut ChaCha8Rng) -> f64 {
     let (a, b): (f64, f64) = (rng.random(), rng.random());
     (-2.0 * (1.0 - a).ln()).sqrt() * (TAU * b).cos()
 }

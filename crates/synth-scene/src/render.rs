@@ -29,6 +29,35 @@ const SAMPLES: [[f64; 2]; 4] = [[0.375, 0.125], [0.875, 0.375], [0.625, 0.875], 
 const EXPOSURE: f64 = 1.12;
 /// Sharpness of highlights.
 const GLOSS: f64 = 60.0;
+/// A mirror does not see what is nearer than this, in metres: itself.
+const MIRROR_NEAR: f64 = 1e-4;
+
+/// What each pixel shows, without a photograph: [`Frame::rgb`] is empty, everything else as [`render`] gives it.
+pub fn identify(scene: &Scene, camera: &Camera) -> Frame {
+    let (w, h) = (camera.width as usize, camera.height as usize);
+    let eye = camera.position();
+    let pixels: Vec<(i32, i32, f64)> =
+        (0..w * h).into_par_iter().with_min_len(w).map(|at| shown(scene, camera, eye, at % w, at / w)).collect();
+    Frame {
+        width: w,
+        height: h,
+        rgb: Vec::new(),
+        thing: pixels.iter().map(|p| p.0).collect(),
+        part: pixels.iter().map(|p| p.1).collect(),
+        distance: pixels.iter().map(|p| p.2).collect(),
+    }
+}
+
+/// Thing, part and distance at a pixel's centre.
+fn shown(scene: &Scene, camera: &Camera, eye: DVec3, x: usize, y: usize) -> (i32, i32, f64) {
+    match scene.trace(eye, ray(camera, x as f64 + 0.5, y as f64 + 0.5), 0.0) {
+        Some(hit) => {
+            let p = &scene.primitives[hit.primitive];
+            (p.thing as i32, p.part as i32, hit.t)
+        }
+        None => (-1, -1, f64::INFINITY),
+    }
+}
 
 /// Renders the scene; the same bytes for any number of threads.
 pub fn render(scene: &Scene, light: &LightMap, camera: &Camera) -> Frame {
@@ -50,17 +79,13 @@ pub fn render(scene: &Scene, light: &LightMap, camera: &Camera) -> Frame {
                 distance: vec![f64::INFINITY; w],
             };
             for x in 0..w {
-                let centre = scene.trace(eye, ray(camera, x as f64 + 0.5, y as f64 + 0.5), 0.0);
-                if let Some(hit) = centre {
-                    let p = &scene.primitives[hit.primitive];
-                    (row.thing[x], row.part[x], row.distance[x]) = (p.thing as i32, p.part as i32, hit.t);
-                }
+                (row.thing[x], row.part[x], row.distance[x]) = shown(scene, camera, eye, x, y);
                 let mut sum = DVec3::ZERO;
                 for [sx, sy] in SAMPLES {
                     let direction = ray(camera, x as f64 + sx, y as f64 + sy);
                     if let Some(hit) = scene.trace(eye, direction, 0.0) {
                         // Each sample is clipped by itself, or bright ones would eat the edges around them.
-                        sum += (EXPOSURE * shade(scene, light, direction, &hit)).min(DVec3::ONE);
+                        sum += (EXPOSURE * shade_with_mirror(scene, light, direction, &hit)).min(DVec3::ONE);
                     }
                 }
                 row.rgb.extend((sum / SAMPLES.len() as f64).to_array().map(to_srgb8));
@@ -98,6 +123,22 @@ fn shade(scene: &Scene, light: &LightMap, direction: DVec3, hit: &Hit) -> DVec3 
         out += DVec3::splat(m.specular * here.key * normal.dot(half).max(0.0).powf(GLOSS) * 3.0);
     }
     out
+}
+
+/// Radiance towards the eye with one mirror image.
+fn shade_with_mirror(scene: &Scene, light: &LightMap, direction: DVec3, hit: &Hit) -> DVec3 {
+    let own = shade(scene, light, direction, hit);
+    let p = &scene.primitives[hit.primitive];
+    if p.material.mirror == 0.0 {
+        return own;
+    }
+    let normal = p.rotation * p.shape.normal(hit.local);
+    let reflected = direction - normal * (2.0 * direction.dot(normal));
+    let Some(seen) = scene.trace(p.to_world(hit.local), reflected, MIRROR_NEAR) else { return own };
+    // Schlick's approximation with its fifth power tamed, as for lacquer that is not quite smooth.
+    let share =
+        p.material.mirror + (1.0 - p.material.mirror) * 0.5 * (1.0 + direction.dot(normal)).clamp(0.0, 1.0).powi(4);
+    own.lerp(shade(scene, light, reflected, &seen), share)
 }
 
 fn to_srgb8(linear: f64) -> u8 {

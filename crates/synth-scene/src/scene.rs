@@ -1,6 +1,7 @@
 //! A placed scene: things, their parts and the primitives they are made of, with ray queries.
 
 use crate::bvh::{Aabb, Bvh};
+use crate::families::Family;
 use crate::material::Material;
 use crate::model::Model;
 use crate::shape::Shape;
@@ -99,6 +100,8 @@ pub struct Scene {
     pub room: DVec2,
     /// Centres of the table tops.
     pub tables: Vec<DVec3>,
+    /// The family it is of, which says where cameras go.
+    pub family: Family,
     bvh: Bvh,
 }
 
@@ -132,7 +135,7 @@ impl SceneBuilder {
     pub fn build(self, room: DVec2, tables: Vec<DVec3>) -> Scene {
         let boxes: Vec<Aabb> = self.primitives.iter().map(Primitive::bounds).collect();
         let Self { things, parts, primitives } = self;
-        Scene { things, parts, primitives, room, tables, bvh: Bvh::new(&boxes) }
+        Scene { things, parts, primitives, room, tables, family: Family::Studio, bvh: Bvh::new(&boxes) }
     }
 }
 

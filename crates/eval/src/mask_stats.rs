@@ -1,0 +1,308 @@
+//! `eval masks`: how id maps look (how many, how large) and how consistent they are from view to view, by one instrument
+//! for real and synthetic masks.
+//!
+//! Sizes come from the maps alone. Consistency needs to know which pixels of two views show the same surface: the
+//! Gaussians of the mask's footprint say so. Each view is compared with the view that shares most of its Gaussians. A
+//! mask takes part when at least half of its weight lies on Gaussians that the other view's masks of that level own. It
+//! is *split* when at least two of the other view's masks hold a quarter of that weight each, and *merged* when the mask
+//! that holds most of it is itself split, with this mask among the pieces.
+
+use artifacts::{Footprints, Level, MaskMaps, maps_path};
+use gs_io::{Error, Result};
+use serde::{Deserialize, Serialize};
+use std::collections::BTreeMap;
+use std::path::Path;
+
+/// Share of a mask's weight that another view must see for the two to be compared.
+const SEEN: f64 = 0.5;
+/// Share of a mask that makes a piece of it.
+const PIECE: f64 = 0.25;
+/// Quantiles of the masks' areas.
+const QUANTILES: [f64; 5] = [0.1, 0.25, 0.5, 0.75, 0.9];
+
+/// Statistics of one level.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct LevelStats {
+    /// Name of the level.
+    pub level: String,
+    /// Masks per view: mean, and standard deviation over views.
+    pub masks: [f64; 2],
+    /// Areas as shares of the image, at 10, 25, 50, 75 and 90 percent of the masks.
+    pub area: [f64; 5],
+    /// Share of all pixels that a mask owns.
+    pub covered: f64,
+    /// Masks that could be compared with another view's.
+    pub compared: usize,
+    /// Share of them that are split in the other view; none without footprints.
+    pub split: Option<f64>,
+    /// Share of them that are merged with others in the other view.
+    pub merged: Option<f64>,
+    /// Share of them that are neither.
+    pub stable: Option<f64>,
+}
+
+/// Statistics of a folder of masks.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct MaskStats {
+    /// Views.
+    pub views: usize,
+    /// Each level.
+    pub levels: Vec<LevelStats>,
+}
+
+/// Measures the id maps of a folder, with footprints of these very masks also their consistency.
+///
+/// # Errors
+/// When the folder holds no id maps, a file is damaged, or the footprints are of other views.
+pub fn measure(folder: &Path, footprints: Option<&Footprints>) -> Result<MaskStats> {
+    let stems = artifacts::stems(folder)?;
+    if stems.is_empty() {
+        return Err(Error::new("no id maps").file(folder).expected("*_s.npy").hint("run mask-embed or synth-scene"));
+    }
+    if let Some(f) = footprints
+        && let Some(other) = f.views.iter().find(|v| !stems.contains(v))
+    {
+        return Err(Error::new("the footprints are of other masks")
+            .file(f.artifact().path())
+            .field("views")
+            .found(other)
+            .hint("run graph-precompute on these masks"));
+    }
+    let mut counts: Vec<Vec<f64>> = vec![Vec::new(); Level::ALL.len()];
+    let mut areas: Vec<Vec<f64>> = vec![Vec::new(); Level::ALL.len()];
+    let mut covered: Vec<Vec<f64>> = vec![Vec::new(); Level::ALL.len()];
+    for stem in &stems {
+        let maps = MaskMaps::read(maps_path(folder, stem))?;
+        let image = (maps.width * maps.height) as f64;
+        for level in Level::ALL {
+            let mut pixels = BTreeMap::<i32, usize>::new();
+            maps.level(level).iter().filter(|&&id| id >= 0).for_each(|&id| *pixels.entry(id).or_default() += 1);
+            let l = level as usize;
+            counts[l].push(pixels.len() as f64);
+            covered[l].push(pixels.values().sum::<usize>() as f64 / image);
+            areas[l].extend(pixels.values().map(|&n| n as f64 / image));
+        }
+    }
+    let pairs = footprints.map(closest_views);
+    let levels = Level::ALL
+        .into_iter()
+        .map(|level| {
+            let l = level as usize;
+            let fate = footprints.zip(pairs.as_ref()).map(|(f, pairs)| compare(f, level as u32, pairs));
+            let share = |of: fn(&Fate) -> usize| {
+                fate.as_ref().filter(|f| f.compared > 0).map(|f| of(f) as f64 / f.compared as f64)
+            };
+            LevelStats {
+                level: level.to_string(),
+                masks: mean_and_spread(&counts[l]),
+                area: quantiles(&mut areas[l]),
+                covered: mean_and_spread(&covered[l])[0],
+                compared: fate.as_ref().map_or(0, |f| f.compared),
+                split: share(|f| f.split),
+                merged: share(|f| f.merged),
+                stable: share(|f| f.stable),
+            }
+        })
+        .collect();
+    Ok(MaskStats { views: stems.len(), levels })
+}
+
+fn mean_and_spread(values: &[f64]) -> [f64; 2] {
+    let n = values.len().max(1) as f64;
+    let mean = values.iter().sum::<f64>() / n;
+    let square = values.iter().map(|v| (v - mean).powi(2)).sum::<f64>();
+    [mean, (square / (n - 1.0).max(1.0)).sqrt()]
+}
+
+fn quantiles(values: &mut [f64]) -> [f64; 5] {
+    values.sort_by(f64::total_cmp);
+    QUANTILES.map(|q| match values.len() {
+        0 => 0.0,
+        n => values[(q * (n - 1) as f64).round() as usize],
+    })
+}
+
+/// For each view the other one that shares the largest part of its Gaussians; none for a view without any.
+fn closest_views(f: &Footprints) -> Vec<Option<usize>> {
+    let words = f.kept.len().div_ceil(64);
+    let mut seen = vec![vec![0u64; words]; f.views.len()];
+    for (r, row) in f.rows.iter().enumerate().filter(|(_, row)| row.level == 0) {
+        for &c in f.entries(r).0 {
+            seen[row.view as usize][c as usize / 64] |= 1 << (c % 64);
+        }
+    }
+    let shared = |a: usize, b: usize| -> u32 { seen[a].iter().zip(&seen[b]).map(|(x, y)| (x & y).count_ones()).sum() };
+    (0..f.views.len())
+        .map(|a| {
+            let others = (0..f.views.len()).filter(|&b| b != a).map(|b| (shared(a, b), b)).filter(|s| s.0 > 0);
+            others.max_by_key(|&(n, b)| (n, std::cmp::Reverse(b))).map(|s| s.1)
+        })
+        .collect()
+}
+
+#[derive(Default)]
+struct Fate {
+    compared: usize,
+    split: usize,
+    merged: usize,
+    stable: usize,
+}
+
+/// Weight of each mask of view `from` by the masks of view `to` that own its Gaussians: row -> (row, weight), with the
+/// weight of the whole mask.
+fn shares(f: &Footprints, rows: &[usize], owner: &[u32]) -> BTreeMap<usize, (f64, BTreeMap<usize, f64>)> {
+    let one = |&r: &usize| {
+        let (col, weight) = f.entries(r);
+        let mut by = BTreeMap::<usize, f64>::new();
+        let mut all = 0.0;
+        for (&c, &w) in col.iter().zip(weight) {
+            all += f64::from(w);
+            if owner[c as usize] != u32::MAX {
+                *by.entry(owner[c as usize] as usize).or_default() += f64::from(w);
+            }
+        }
+        (r, (all, by))
+    };
+    rows.iter().map(one).collect()
+}
+
+/// The mask of each Gaussian with the largest weight; `u32::MAX` for none.
+fn owners(f: &Footprints, rows: &[usize]) -> Vec<u32> {
+    let mut best = vec![(0.0f32, u32::MAX); f.kept.len()];
+    for &r in rows {
+        let (col, weight) = f.entries(r);
+        for (&c, &w) in col.iter().zip(weight) {
+            if w > best[c as usize].0 {
+                best[c as usize] = (w, r as u32);
+            }
+        }
+    }
+    best.into_iter().map(|b| b.1).collect()
+}
+
+/// The masks that hold a piece each of what is seen of a mask.
+fn pieces(by: &BTreeMap<usize, f64>) -> Vec<usize> {
+    let seen: f64 = by.values().sum();
+    by.iter().filter(|(_, w)| **w >= PIECE * seen).map(|(r, _)| *r).collect()
+}
+
+fn compare(f: &Footprints, level: u32, pairs: &[Option<usize>]) -> Fate {
+    let mut rows: Vec<Vec<usize>> = vec![Vec::new(); f.views.len()];
+    for (r, row) in f.rows.iter().enumerate().filter(|(_, row)| row.level == level) {
+        rows[row.view as usize].push(r);
+    }
+    let mut fate = Fate::default();
+    for (a, b) in pairs.iter().enumerate().filter_map(|(a, b)| Some((a, (*b)?))) {
+        let there = shares(f, &rows[a], &owners(f, &rows[b]));
+        let back = shares(f, &rows[b], &owners(f, &rows[a]));
+        for (r, (all, by)) in &there {
+            let seen: f64 = by.values().sum();
+            if seen < SEEN * all || *all <= 0.0 {
+                continue;
+            }
+            fate.compared += 1;
+            let split = pieces(by).len() > 1;
+            let most = by.iter().max_by(|x, y| x.1.total_cmp(y.1)).map(|m| m.0);
+            let merged = most.and_then(|m| back.get(m)).is_some_and(|(_, by)| {
+                let pieces = pieces(by);
+                pieces.len() > 1 && pieces.contains(r)
+            });
+            fate.split += usize::from(split);
+            fate.merged += usize::from(merged);
+            fate.stable += usize::from(!split && !merged);
+        }
+    }
+    fate
+}
+
+/// The statistics as a Markdown table.
+pub fn table(stats: &MaskStats) -> String {
+    let mut s = String::from(
+        "| Level | Masks per view | Area at 10 / 50 / 90 % of masks, % of the image | Covered | Split | Merged | Neither |\n\
+         | --- | --- | --- | --- | --- | --- | --- |\n",
+    );
+    let percent = |v: Option<f64>| v.map_or("–".to_string(), |v| format!("{:.0} %", 100.0 * v));
+    for l in &stats.levels {
+        s += &format!(
+            "| {} | {:.1} ± {:.1} | {:.2} / {:.2} / {:.2} | {} | {} | {} | {} |\n",
+            l.level,
+            l.masks[0],
+            l.masks[1],
+            100.0 * l.area[0],
+            100.0 * l.area[2],
+            100.0 * l.area[4],
+            percent(Some(l.covered)),
+            percent(l.split),
+            percent(l.merged),
+            percent(l.stable),
+        );
+    }
+    s
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use artifacts::{FootprintsBuilder, Row};
+    use gs_io::Provenance;
+
+    /// Two views of eight Gaussians at one level; each mask is a list of Gaussians.
+    fn footprints(views: [&[&[u32]]; 2]) -> (tempfile::TempDir, Footprints) {
+        let mut b = FootprintsBuilder {
+            views: vec!["a".into(), "b".into()],
+            kept: (0..8).collect(),
+            row_ptr: vec![0],
+            ..FootprintsBuilder::default()
+        };
+        for (v, masks) in views.into_iter().enumerate() {
+            for (m, mask) in masks.iter().enumerate() {
+                b.rows.push(Row { view: v as u32, level: 0, mask: m as u32, pixels: 9, gated: 9, alpha: 1.0 });
+                b.col.extend(*mask);
+                b.weight.extend(mask.iter().map(|_| 1.0));
+                b.row_ptr.push(b.col.len() as u64);
+            }
+        }
+        let dir = tempfile::tempdir().unwrap();
+        let path = dir.path().join("footprints.safetensors");
+        b.write(&path, Provenance::default()).unwrap();
+        let f = Footprints::read(&path).unwrap();
+        (dir, f)
+    }
+
+    fn fate(views: [&[&[u32]]; 2]) -> [usize; 4] {
+        let (_dir, f) = footprints(views);
+        let fate = compare(&f, 0, &closest_views(&f));
+        [fate.compared, fate.split, fate.merged, fate.stable]
+    }
+
+    #[test]
+    fn a_thing_that_another_view_cuts_is_split_and_its_pieces_are_merged() {
+        assert_eq!(fate([&[&[0, 1, 2, 3], &[4, 5, 6, 7]], &[&[0, 1, 2, 3], &[4, 5, 6, 7]]]), [4, 0, 0, 4]);
+        assert_eq!(fate([&[&[0, 1, 2, 3], &[4, 5, 6, 7]], &[&[0, 1], &[2, 3], &[4, 5, 6, 7]]]), [5, 1, 2, 2]);
+        // An eighth is no piece.
+        assert_eq!(fate([&[&[0, 1, 2, 3, 4, 5, 6, 7]], &[&[0, 1, 2, 3, 4, 5, 6], &[7]]])[..2], [3, 0]);
+        // What the other view hardly sees is not compared.
+        assert_eq!(fate([&[&[0, 1, 2, 3], &[4, 5, 6, 7]], &[&[0, 1, 2, 3], &[4]]]), [3, 0, 0, 3]);
+    }
+
+    #[test]
+    fn counts_areas_and_cover_are_those_of_the_maps() {
+        let dir = tempfile::tempdir().unwrap();
+        let mut ids = vec![0; 50];
+        ids.extend(vec![1; 30]);
+        ids.extend(vec![-1; 20]);
+        let maps = MaskMaps { width: 10, height: 10, ids: ids.repeat(4) };
+        maps.write(maps_path(dir.path(), "v")).unwrap();
+        let stats = measure(dir.path(), None).unwrap();
+        let l = &stats.levels[0];
+        assert_eq!((stats.views, l.masks, l.covered), (1, [2.0, 0.0], 0.8));
+        assert_eq!((l.area[0], l.area[4], l.split), (0.3, 0.5, None));
+        assert!(
+            table(&stats).contains("| large | 2.0 ± 0.0 | 30.00 / 50.00 / 50.00 | 80 % | – | – | – |"),
+            "{}",
+            table(&stats)
+        );
+        let empty = tempfile::tempdir().unwrap();
+        assert!(measure(empty.path(), None).unwrap_err().to_string().contains("no id maps"));
+    }
+}

@@ -1,0 +1,72 @@
+//! What makes things hard to tell apart and parts hard to keep together: patterns within one thing, mirrors, sizes.
+
+use crate::material::{Paint, Pattern};
+use crate::model::Model;
+use glam::DVec3;
+use rand::Rng;
+use rand_chacha::ChaCha8Rng;
+
+/// Probabilities of a small and of a large thing, of a patterned and of a shiny one.
+const SMALL: f64 = 0.2;
+const LARGE: f64 = 0.15;
+const PATTERNED: f64 = 0.35;
+const SHINY: f64 = 0.3;
+/// Sizes of small and large things.
+const SIZES: [f64; 2] = [0.75, 1.25];
+/// Highlight and mirror of shiny things.
+const GLEAM: [f64; 2] = [0.35, 0.25];
+/// Cosine between the colours of a surface and the thing's paint above which it is painted.
+const PAINTED: f64 = 0.97;
+
+/// Changes size, pattern and shine of a model at random; gives the words that tell it from its like, such as
+/// "small shiny striped". Furniture is not `sized`: it keeps its size and is no mirror.
+pub fn dress(
+    model: Model,
+    paint: &Paint,
+    other: &Paint,
+    sized: bool,
+    rng: &mut ChaCha8Rng,
+) -> (Model, Vec<&'static str>) {
+    let draws: [f64; 4] = rng.random();
+    let mut words = Vec::new();
+    let mut model = match draws[0] {
+        d if sized && d < SMALL => {
+            words.push("small");
+            model.scaled(SIZES[0])
+        }
+        d if sized && d < SMALL + LARGE => {
+            words.push("large");
+            model.scaled(SIZES[1])
+        }
+        _ => model,
+    };
+    let painted = |albedo: DVec3| albedo.normalize_or_zero().dot(paint.albedo().normalize_or_zero()) > PAINTED;
+    let plain = |p: Pattern| matches!(p, Pattern::Clouds { .. });
+    let surfaces: Vec<usize> = (0..model.pieces.len())
+        .filter(|&i| {
+            let m = &model.pieces[i].material;
+            painted(m.albedo) && plain(m.pattern) && m.glow == 0.0
+        })
+        .collect();
+    if surfaces.is_empty() {
+        return (model, words);
+    }
+    if sized && draws[1] < SHINY {
+        words.push("shiny");
+        for &i in &surfaces {
+            (model.pieces[i].material.specular, model.pieces[i].material.mirror) = (GLEAM[0], GLEAM[1]);
+        }
+    }
+    if draws[2] < PATTERNED {
+        let (striped, other) = (draws[3] < 0.6, other.albedo() * 0.8 + 0.1);
+        words.push(if striped { "striped" } else { "chequered" });
+        let pattern = match striped {
+            true => Pattern::Stripes { other, across: DVec3::new(6.0, 4.0, 16.0) },
+            false => Pattern::Checks { other, size: 0.035 },
+        };
+        for &i in &surfaces {
+            model.pieces[i].material.pattern = pattern;
+        }
+    }
+    (model, words)
+}
