@@ -1,7 +1,7 @@
 //! The command line of `feat-train`.
 
 use crate::checkpoint;
-use crate::evidence::{Evidence, Matrix};
+use crate::evidence::{Evidence, collect};
 use crate::fast::{Engine, Shortcuts};
 use crate::loss::Loss;
 use crate::model::{CohesionOf, Init, Settings};
@@ -348,7 +348,7 @@ impl Args {
 
     fn spectral(&self, inputs: &Inputs, stage: &Stage) -> Result<(usize, Vec<f32>, Value)> {
         let s = &self.spectral;
-        let matrix = Matrix::new(&inputs.footprints, &inputs.graph, &self.levels, s.evidence, !s.no_smoothing);
+        let matrix = collect(&inputs.footprints, &inputs.graph, &self.levels, s.evidence, !s.no_smoothing);
         if matrix.masks.is_empty() {
             return Err(Error::new("no mask has a footprint")
                 .file(&self.footprints)
@@ -370,7 +370,8 @@ impl Args {
         let values = found.singular_values.iter().enumerate();
         write_curve(&self.out, values.map(|(i, v)| json!({ "iteration": i + 1, "singular_value": v })), &SPECTRUM)?;
         let summary = json!({
-            "masks": matrix.masks.len(), "dim": found.dim, "passes": found.passes, "without_mask": without,
+            "masks": matrix.masks.len(), "dim": found.dim, "passes": found.passes, "residual": found.residual,
+            "without_mask": without, "entries": matrix.entries(), "gram_entries": found.gram_entries,
             "singular_values": found.singular_values,
         });
         Ok((found.dim, found.features, summary))
