@@ -20,7 +20,8 @@ pub fn measure(scene: &Scene, views: usize, threads: usize, folder: &Path) -> Va
 
 fn run(scene: &Scene, things: Option<&Things>, views: usize, threads: usize, folder: &Path) -> Value {
     let file = |name: &str| folder.join(format!("closed-form-{name}"));
-    let (geometry, graph, footprints) = (file("geometry.ply"), file("graph.safetensors"), file("footprints.safetensors"));
+    let (geometry, graph, footprints) =
+        (file("geometry.ply"), file("graph.safetensors"), file("footprints.safetensors"));
     let n = scene.positions.len();
     let gaussians = Gaussians {
         means: scene.positions.clone(),
@@ -57,8 +58,9 @@ fn run(scene: &Scene, things: Option<&Things>, views: usize, threads: usize, fol
     let values: Vec<f64> = serde_json::from_value(summary["singular_values"].clone()).expect("numbers");
     let dim = summary["dim"].as_u64().expect("a number") as usize;
     json!({
-        "masks": masks, "entries": entries, "seconds": record["wall_seconds"], "cpu_seconds": record["cpu_seconds"],
+        "masks": masks, "entries": entries, "seconds": record["wall_seconds"], "cpu_seconds": summary["cpu_seconds"],
         "peak_rss_bytes": record["peak_rss_bytes"],
+        "evidence_seconds": summary["evidence_seconds"], "vectors_seconds": summary["vectors_seconds"],
         "passes": summary["passes"], "residual": summary["residual"], "dim": dim, "smoothed_entries": summary["entries"],
         "gram_entries": summary["gram_entries"], "singular_values": [values[0], values[dim - 1], values[values.len() - 1]],
     })

@@ -276,7 +276,6 @@ fn matrix(masks: Vec<u32>, rows: Vec<Rows>, neighbours: &Neighbours<'_>, smooth:
 #[cfg(test)]
 pub(crate) mod tests {
     use super::*;
-    use crate::testing::graph;
     use rand::{Rng, SeedableRng};
     use rand_chacha::ChaCha8Rng;
 
@@ -292,12 +291,18 @@ pub(crate) mod tests {
             .collect()
     }
 
+    /// Every Gaussian's neighbours on a line: before, behind, and two behind.
+    fn line(n: usize) -> Vec<u32> {
+        let inside = |i: i64, j: i64| if (0..n as i64).contains(&j) { j as u32 } else { i as u32 };
+        (0..n as i64).flat_map(|i| [i - 1, i + 1, i + 2].map(|j| inside(i, j))).collect()
+    }
+
     /// A random matrix of `n` Gaussians and `masks` masks, smoothed or not.
     pub fn random(n: usize, masks: usize, smooth: bool) -> Matrix {
         let columns = columns(n, masks);
         let slices: Vec<(&[u32], &[f32])> = columns.iter().map(|(g, w)| (&g[..], &w[..])).collect();
-        let graph = graph(n, 3);
-        let neighbours = Neighbours { k: graph.gaussian_k, items: &graph.gaussian_knn };
+        let items = line(n);
+        let neighbours = Neighbours { k: 3, items: &items };
         matrix((0..masks as u32).collect(), by_gaussian(n, &slices), &neighbours, smooth)
     }
 
@@ -306,15 +311,19 @@ pub(crate) mod tests {
         // More Gaussians than a block and than a chunk.
         let (n, masks) = (CHUNK + 3000, 9);
         let columns = columns(n, masks);
-        let g = graph(n, 3);
+        let near = line(n);
         for smooth in [false, true] {
             let mut spread = vec![vec![0.0f64; n]; masks];
             for (k, (gaussians, weights)) in columns.iter().enumerate() {
                 let mut plain = vec![0.0f64; n];
                 gaussians.iter().zip(weights).for_each(|(&i, &w)| plain[i as usize] = f64::from(w));
                 for i in 0..n {
-                    let near = g.gaussian_knn[i * 3..(i + 1) * 3].iter().map(|&j| plain[j as usize]);
-                    spread[k][i] = if smooth { 0.25 * (plain[i] + near.sum::<f64>()) } else { plain[i] };
+                    let around: Vec<f64> = near[i * 3..(i + 1) * 3]
+                        .iter()
+                        .filter(|&&j| smooth && j as usize != i)
+                        .map(|&j| plain[j as usize])
+                        .collect();
+                    spread[k][i] = (plain[i] + around.iter().sum::<f64>()) / (1 + around.len()) as f64;
                 }
             }
             let m = random(n, masks, smooth);
@@ -332,8 +341,8 @@ pub(crate) mod tests {
     #[test]
     fn patches_hold_everyone_once_and_neighbours_together() {
         let n = 3 * BLOCK + 77;
-        let g = graph(n, 3);
-        let neighbours = Neighbours { k: 3, items: &g.gaussian_knn };
+        let items = line(n);
+        let neighbours = Neighbours { k: 3, items: &items };
         let parts = patches(n, &neighbours);
         assert_eq!(parts.len(), 4);
         let mut all: Vec<u32> = parts.concat();

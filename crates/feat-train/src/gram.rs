@@ -112,11 +112,8 @@ impl Gram {
                 touched.drain(..).map(|k| (k, std::mem::take(&mut sum[k as usize]) as f32)).collect();
             row
         };
-        let rows: Vec<Vec<(u32, f32)>> = known
-            .par_iter()
-            .with_min_len(256)
-            .map_init(|| (vec![0.0; r], Vec::new()), add_up)
-            .collect();
+        let rows: Vec<Vec<(u32, f32)>> =
+            known.par_iter().with_min_len(256).map_init(|| (vec![0.0; r], Vec::new()), add_up).collect();
         drop(uppers);
         Some(Self::from_upper(&rows))
     }

@@ -141,12 +141,7 @@ struct Found {
     residual: f64,
 }
 
-fn singular_vectors(
-    product: &Product<'_>,
-    matrix: &Matrix,
-    options: &SpectralOptions,
-    stage: &Stage,
-) -> Result<Found> {
+fn singular_vectors(product: &Product<'_>, matrix: &Matrix, options: &SpectralOptions, stage: &Stage) -> Result<Found> {
     let masks = matrix.masks.len();
     let all = masks.min(matrix.gaussians);
     // Whole panels: columns that fill one up cost nothing.
@@ -255,7 +250,10 @@ fn panels(columns: &Columns) -> Vec<Panel> {
 
 /// The first `count` columns of panels.
 fn from_panels(panels: &[Panel], count: usize) -> Columns {
-    (0..count).into_par_iter().map(|j| panels[j / WIDTH].iter().map(|row| f64::from(row[j % WIDTH])).collect()).collect()
+    (0..count)
+        .into_par_iter()
+        .map(|j| panels[j / WIDTH].iter().map(|row| f64::from(row[j % WIDTH])).collect())
+        .collect()
 }
 
 /// Columns to `[rows][columns]`.
