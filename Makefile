@@ -7,7 +7,7 @@ CARGO ?= cargo
 THREADS ?= 0
 export THREADS
 
-.PHONY: help build demo scene test lint models clip-tiny bench-raster bench-graph bench-geom bench-growth bench-memory bench-train bench-cluster bench-query clean
+.PHONY: help build demo scene test lint models clip-tiny bench-raster bench-graph bench-geom bench-growth bench-memory bench-train bench-cluster bench-cluster-graph bench-query clean
 
 help: ## Say what can be made
 	@echo "Targets:"
@@ -72,6 +72,9 @@ bench-cluster: ## Time HDBSCAN beside hdbscan-rs and fast_hdbscan (needs Python;
 	@test -x out/bench/python-cluster/bin/python || { python3 -m venv out/bench/python-cluster \
 	  && out/bench/python-cluster/bin/pip install -q numpy scikit-learn hdbscan-rs fast_hdbscan; }
 	out/bench/python-cluster/bin/python scripts/bench_cluster.py $(POINTS) out/bench/cluster.json $(RUNS) $(TRUTH)
+
+bench-cluster-graph: ## Time cluster-match --cluster graph at a million Gaussians: out/bench/cluster-graph.json
+	$(CARGO) bench -p cluster-match --bench graph -- --out $(CURDIR)/out/bench/cluster-graph.json
 
 bench-query: ## Time a query over a million Gaussians and 500 instances: out/bench/query.json
 	$(CARGO) bench -p eval --bench query -- --out $(CURDIR)/out/bench/query.json

@@ -4,8 +4,10 @@ use crate::associate::{FeatureTable, Silhouette, matches, overlaps};
 use crate::describe::{Aggregate, describe};
 use crate::extend::from_nearest;
 use crate::group::{Distance, Space, group, group_sample, tree};
+use crate::join::by_masks;
+use crate::vote::by_votes;
 use artifacts::{
-    Features, Footprints, Graph, Instances, Level, MaskFeatures, MaskMaps, Match, NOISE_COLOR, features_path,
+    Features, Footprints, Graph, Instances, Level, MaskFeatures, MaskMaps, Match, NOISE_COLOR, TreeEdge, features_path,
     instance_color, maps_path, role,
 };
 use clap::Parser;
@@ -93,7 +95,33 @@ struct ClusteringArgs {
     /// Gaussians in no cluster get the instance of the nearest one in space that has one, or none
     #[arg(long, value_enum, default_value_t = Noise::Nearest)]
     noise: Noise,
+    /// Join instances that the masks show as one with at least this probability, more than 0.5; 0 joins none [default:
+    /// 0.6 on the graph, 0 for free points]
+    #[arg(long, value_name = "PROBABILITY")]
+    join: Option<f64>,
+    /// Rounds in which Gaussians move to the instance around them whose masks show them [default: 3 on the graph, 0 for
+    /// free points]
+    #[arg(long, value_name = "ROUNDS")]
+    votes: Option<usize>,
 }
+
+impl ClusteringArgs {
+    /// Probability from which instances are joined, if they are.
+    fn join(&self) -> Option<f64> {
+        let default = if self.cluster == Space::Graph { JOIN } else { 0.0 };
+        Some(self.join.unwrap_or(default)).filter(|j| *j > 0.0)
+    }
+
+    /// Rounds of votes.
+    fn votes(&self) -> usize {
+        self.votes.unwrap_or(if self.cluster == Space::Graph { VOTES } else { 0 })
+    }
+}
+
+/// From this probability on instances on the graph are joined.
+const JOIN: f64 = 0.6;
+/// Rounds of votes on the graph.
+const VOTES: usize = 3;
 
 /// What becomes of Gaussians that the clustering calls noise.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, clap::ValueEnum)]
@@ -137,6 +165,7 @@ impl Program for Args {
 struct Inputs {
     gaussians: Gaussians,
     graph: Graph,
+    footprints: Footprints,
     features: Features,
     /// The views whose masks the footprints hold.
     views: Vec<View>,
@@ -205,7 +234,7 @@ fn read_inputs(a: &Args, stage: &Stage) -> Result<Inputs> {
         (role::MASKS.into(), masks),
         (role::MASK_FEATURES.into(), artifacts::hash_folder(&a.masks, "_f.npy")?),
     ]);
-    Ok(Inputs { gaussians, graph, features, views, hashes })
+    Ok(Inputs { gaussians, graph, footprints, features, views, hashes })
 }
 
 /// The first few of many names.
@@ -244,6 +273,9 @@ fn options(c: &ClusteringArgs, n: usize) -> Result<Options> {
         )?;
     }
     check((0.0..f64::INFINITY).contains(&epsilon), "--epsilon", &epsilon, "at least 0")?;
+    if let Some(join) = c.join {
+        check(join == 0.0 || join > 0.5 && join <= 1.0, "--join", &join, "0, or more than 0.5 and at most 1")?;
+    }
     Ok(Options {
         min_cluster_size: c.min_cluster_size.max((share * n as f64).ceil() as usize),
         min_samples,
@@ -282,7 +314,7 @@ fn run(a: &Args, stage: &Stage) -> Result<()> {
         None => group(&inputs.features, &inputs.graph, c.cluster, c.distance, c.smooth, &options),
     };
     let clustering_seconds = start.elapsed().as_secs_f64();
-    let instances = clustering.selected.len();
+    let mut instances = clustering.selected.len();
     let noise = clustering.labels.iter().filter(|&&l| l < 0).count();
     stage.info(&format!("{instances} instances among {n} Gaussians, {noise} noise"));
     if instances == 0 {
@@ -301,6 +333,8 @@ fn run(a: &Args, stage: &Stage) -> Result<()> {
         let noisy: Vec<bool> = labels.iter().zip(&kept).map(|(&l, &k)| k && l < 0).collect();
         from_nearest(&inputs.gaussians.means, &mut labels, |i| noisy[i])?;
     }
+    let mut tree = tree(&clustering);
+    instances = revise(a, stage, &inputs, instances, &mut labels, &mut tree);
     if n < n_all {
         stage.skipped(&format!(
             "{} of {n_all} Gaussians in clustering: never seen; labelled from their nearest neighbour",
@@ -314,10 +348,39 @@ fn run(a: &Args, stage: &Stage) -> Result<()> {
         stage.skipped("language descriptors: the masks have no features (*_f.npy; mask-embed embed makes them)");
     }
     let views = inputs.views.iter().map(|v| v.stem().to_string()).collect();
-    let tree = tree(&clustering);
     let means = &inputs.gaussians.means;
     let instances = describe(means, labels, instances, matches, views, &features, m.aggregate, tree);
     write_outputs(a, stage, &inputs, &instances, &options, (noise, clustering_seconds))
+}
+
+/// Moves Gaussians between instances and joins instances as the masks say. Returns how many instances there are then.
+fn revise(
+    a: &Args,
+    stage: &Stage,
+    inputs: &Inputs,
+    mut instances: usize,
+    labels: &mut [i32],
+    tree: &mut [TreeEdge],
+) -> usize {
+    let (c, levels) = (&a.clustering, &a.matching.level);
+    let mut of_kept: Vec<i32> = inputs.graph.kept.iter().map(|&i| labels[i as usize]).collect();
+    if c.votes() > 0 {
+        let moved = by_votes(&mut of_kept, instances, &inputs.footprints, &inputs.graph, levels, c.votes());
+        stage.info(&format!("{moved} moves of Gaussians to the instance that their masks show"));
+    }
+    if let Some(least) = c.join() {
+        let number = by_masks(&of_kept, instances, &inputs.footprints, levels, least);
+        let left = number.iter().max().map_or(0, |&n| n as usize + 1);
+        if left < instances {
+            stage.info(&format!("{left} instances after joining pieces that the masks show as one"));
+        }
+        instances = left;
+        let renumber = |l: &mut i32| *l = usize::try_from(*l).map_or(*l, |k| number[k] as i32);
+        of_kept.iter_mut().for_each(renumber);
+        tree.iter_mut().for_each(|e| renumber(&mut e.instance));
+    }
+    inputs.graph.kept.iter().zip(of_kept).for_each(|(&i, l)| labels[i as usize] = l);
+    instances
 }
 
 /// Matches instances with the masks of every view that has id maps.
@@ -458,6 +521,8 @@ fn write_outputs(
         "leaf": c.leaf,
         "allow_single_cluster": options.allow_single_cluster,
         "noise": lower(&c.noise),
+        "join": c.join(),
+        "votes": c.votes(),
         "level": levels.join(","),
         "silhouette": lower(&m.silhouette),
         "threshold": m.threshold,

@@ -100,9 +100,10 @@ pub fn group(
     match space {
         Space::Free => cluster(&standardise(&values, dim), dim, options),
         Space::Graph => {
-            let between = FeatureDistance::new(&values, dim, distance);
-            let edges = neighbour_edges(graph, &|a, b| between.get(a, b), options.min_samples);
-            cluster_graph(features.kept.len(), &edges, options)
+            let between = FeatureDistance::new(values, dim, distance);
+            let edges = neighbour_edges(graph, &between, options.min_samples);
+            drop(between);
+            cluster_graph(features.kept.len(), edges, options)
         }
     }
 }
@@ -151,71 +152,90 @@ pub fn group_sample(
 struct FeatureDistance {
     /// Features at unit length (zeros where there is no direction) or standardised.
     values: Vec<f32>,
+    /// Which of them have no direction.
+    nowhere: Vec<bool>,
     dim: usize,
     distance: Distance,
 }
 
 impl FeatureDistance {
-    fn new(values: &[f32], dim: usize, distance: Distance) -> Self {
-        let values = match distance {
-            Distance::Euclidean => standardise(values, dim),
-            Distance::Cosine | Distance::Chord => values.chunks_exact(dim).flat_map(unit).collect(),
-        };
-        Self { values, dim, distance }
+    fn new(values: Vec<f32>, dim: usize, distance: Distance) -> Self {
+        let mut values = if distance == Distance::Euclidean { standardise(&values, dim) } else { values };
+        if distance != Distance::Euclidean {
+            values.par_chunks_mut(dim).with_min_len(CHUNK).for_each(unit);
+        }
+        let nowhere = values.par_chunks(dim).with_min_len(CHUNK).map(|row| row.iter().all(|&v| v == 0.0)).collect();
+        Self { values, nowhere, dim, distance }
     }
 
     fn get(&self, a: usize, b: usize) -> f64 {
         let row = |i: usize| &self.values[i * self.dim..(i + 1) * self.dim];
-        let (a, b) = (row(a), row(b));
         // Differences keep the digits that 1 - dot product would lose between near-equal features.
-        let mut square: f64 = a.iter().zip(b).map(|(x, y)| (f64::from(*x) - f64::from(*y)).powi(2)).sum();
-        let nowhere = |row: &[f32]| row.iter().all(|&v| v == 0.0);
-        if self.distance != Distance::Euclidean && (nowhere(a) || nowhere(b)) {
+        let square = match self.distance {
             // A feature without a direction has a cosine of 0 with any other.
-            square = 2.0;
-        }
+            Distance::Cosine | Distance::Chord if self.nowhere[a] || self.nowhere[b] => 2.0,
+            _ => square_of_difference(row(a), row(b)),
+        };
         if self.distance == Distance::Cosine { 0.5 * square } else { square.sqrt() }
     }
 }
 
-/// A feature at unit length; zeros where it has none.
-fn unit(row: &[f32]) -> impl Iterator<Item = f32> {
-    let norm = row.iter().map(|v| f64::from(*v).powi(2)).sum::<f64>().sqrt();
-    let scale = if norm > 1e-30 { 1.0 / norm } else { 0.0 };
-    row.iter().map(move |v| (f64::from(*v) * scale) as f32)
+/// |a - b|², in f64.
+fn square_of_difference(a: &[f32], b: &[f32]) -> f64 {
+    const PARTIAL: usize = 8;
+    let square = |a: f32, b: f32| (f64::from(a) - f64::from(b)).powi(2);
+    let mut sums = [0.0; PARTIAL];
+    let (mut a, mut b) = (a.chunks_exact(PARTIAL), b.chunks_exact(PARTIAL));
+    for (a, b) in a.by_ref().zip(b.by_ref()) {
+        for c in 0..PARTIAL {
+            sums[c] += square(a[c], b[c]);
+        }
+    }
+    let rest: f64 = a.remainder().iter().zip(b.remainder()).map(|(&a, &b)| square(a, b)).sum();
+    sums.iter().sum::<f64>() + rest
 }
 
-/// Edges between spatial neighbours with mutual reachability: a Gaussian's core distance is the distance to the
+/// Brings a feature to unit length, or to zeros where it has no direction.
+fn unit(row: &mut [f32]) {
+    let norm = row.iter().map(|v| f64::from(*v).powi(2)).sum::<f64>().sqrt();
+    let scale = if norm > 1e-30 { 1.0 / norm } else { 0.0 };
+    row.iter_mut().for_each(|v| *v = (f64::from(*v) * scale) as f32);
+}
+
+/// Edges between spatial neighbours with mutual reachability, each once: a Gaussian's core distance is the distance to the
 /// (`min_samples` - 1)-th nearest in features among its spatial neighbours, or to the last where there are fewer.
-fn neighbour_edges(graph: &Graph, distance: &(dyn Fn(usize, usize) -> f64 + Sync), min_samples: usize) -> Vec<Edge> {
+fn neighbour_edges(graph: &Graph, between: &FeatureDistance, min_samples: usize) -> Vec<Edge> {
     let (n, k) = (graph.kept.len(), graph.gaussian_k);
-    // Rows are padded with the Gaussian itself.
-    let neighbours =
-        |i: usize| graph.gaussian_knn[i * k..(i + 1) * k].iter().map(|&j| j as usize).filter(move |&j| j != i);
-    let core: Vec<f64> = (0..n)
-        .into_par_iter()
+    let list = |i: usize| &graph.gaussian_knn[i * k..(i + 1) * k];
+    // To all neighbours; rows are padded with the Gaussian itself, which does not count.
+    let mut distances = vec![0.0f64; n * k];
+    let core: Vec<f64> = distances
+        .par_chunks_mut(k.max(1))
+        .enumerate()
         .with_min_len(CHUNK)
-        .map(|i| {
-            let mut d: Vec<f64> = neighbours(i).map(|j| distance(i, j)).collect();
-            d.sort_by(f64::total_cmp);
-            match min_samples.saturating_sub(1).min(d.len()) {
+        .map_init(Vec::new, |sorted, (i, own)| {
+            own.iter_mut().zip(list(i)).for_each(|(d, &j)| *d = between.get(i, j as usize));
+            sorted.clear();
+            sorted.extend(own.iter().zip(list(i)).filter(|(_, j)| **j as usize != i).map(|(d, _)| *d));
+            sorted.sort_unstable_by(f64::total_cmp);
+            match min_samples.saturating_sub(1).min(sorted.len()) {
                 0 => 0.0,
-                at => d[at - 1],
+                at => sorted[at - 1],
             }
         })
         .collect();
-    let mut edges: Vec<Edge> = (0..n)
+    // Of two Gaussians that are each other's neighbours the first has the edge.
+    let mine = |i: usize, j: usize| i < j || j < i && !list(j).contains(&(i as u32));
+    (0..core.len())
         .into_par_iter()
         .with_min_len(CHUNK)
         .flat_map_iter(|i| {
             let core = &core;
-            neighbours(i).map(move |j| Edge::new(i as u32, j as u32, distance(i, j).max(core[i]).max(core[j])))
+            let neighbours = list(i).iter().map(|&j| j as usize).zip(&distances[i * k..(i + 1) * k]);
+            let own = neighbours.filter(move |(j, _)| mine(i, *j));
+            own.map(move |(j, &d)| Edge::new(i as u32, j as u32, d.max(core[i]).max(core[j])))
         })
-        .collect();
-    // Two Gaussians that are each other's neighbours give the same edge twice.
-    edges.par_sort_unstable_by(Edge::order);
-    edges.dedup_by(|a, b| a.order(b).is_eq());
-    edges
+        .collect()
 }
 
 /// The cluster-to-cluster edges of the condensed tree, with the instance selected at each child.
@@ -315,14 +335,36 @@ mod tests {
     fn distances_are_those_of_the_angle() {
         let values = [2.0, 0.0, 0.0, 3.0, 0.0, 0.0, 5.0, 5.0, 4.0, 0.0];
         let (cosine, chord) =
-            (FeatureDistance::new(&values, 2, Distance::Cosine), FeatureDistance::new(&values, 2, Distance::Chord));
+            [Distance::Cosine, Distance::Chord].map(|d| FeatureDistance::new(values.to_vec(), 2, d)).into();
         let root = 0.5f64.sqrt();
         for (a, b, expected) in [(0, 1, 1.0), (0, 3, 1.0 - root), (0, 4, 0.0), (0, 2, 1.0), (2, 2, 1.0)] {
             assert!((cosine.get(a, b) - expected).abs() < 1e-7, "{a} {b}");
             assert!((chord.get(a, b) - (2.0 * expected).sqrt()).abs() < 1e-7, "{a} {b}");
         }
-        let euclidean = FeatureDistance::new(&[0.0, 7.0, 2.0, 7.0, 0.0, 7.0, 2.0, 7.0], 2, Distance::Euclidean);
+        let euclidean = FeatureDistance::new(vec![0.0, 7.0, 2.0, 7.0, 0.0, 7.0, 2.0, 7.0], 2, Distance::Euclidean);
         assert!((euclidean.get(0, 1) - 2.0).abs() < 1e-6 && euclidean.get(0, 2) == 0.0);
+    }
+
+    #[test]
+    fn every_pair_of_neighbours_has_one_edge_whoever_names_whom() {
+        // 0 and 1 name each other, 2 names 0 only, 3 is alone: padded with itself.
+        let graph = Graph {
+            kept: (0..4).collect(),
+            gaussian_k: 2,
+            gaussian_knn: vec![1, 0, 0, 1, 0, 2, 3, 3],
+            ..Graph::default()
+        };
+        let between = FeatureDistance::new(vec![0.0, 1.0, 3.0, 9.0], 1, Distance::Euclidean);
+        let pairs = |samples| -> Vec<(u32, u32, f64)> {
+            neighbour_edges(&graph, &between, samples).into_iter().map(|e| (e.a, e.b, e.weight)).collect()
+        };
+        let [near, far] = [between.get(0, 1), between.get(0, 2)];
+        assert_eq!(pairs(1), [(0, 1, near), (0, 2, far)]);
+        // Core distances of the second nearest, itself included, change nothing here; a larger edge stays.
+        assert_eq!(pairs(2), [(0, 1, near), (0, 2, far)]);
+        // Nine channels: whole partial sums and a rest.
+        let (a, b): (Vec<f32>, Vec<f32>) = (0..9).map(|c| (c as f32, 2.0 * c as f32)).unzip();
+        assert_eq!(square_of_difference(&a, &b), 204.0);
     }
 
     #[test]

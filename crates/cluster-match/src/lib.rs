@@ -1,6 +1,6 @@
 //! Stage 3: 3D instances from features, the masks they were seen as, and a language descriptor for each.
 //!
-//! [`group`] clusters Gaussians, [`extend`] gives noise and unseen Gaussians to their neighbours, [`associate`] matches
+//! [`group`] clusters Gaussians, [`extend`] gives noise and unseen Gaussians to their neighbours, [`join`] joins pieces of one thing, [`vote`] mends their rims, [`associate`] matches
 //! instances with the masks of each view, [`describe`] gathers what is known of each instance.
 
 pub mod associate;
@@ -8,3 +8,5 @@ pub mod cli;
 pub mod describe;
 pub mod extend;
 pub mod group;
+pub mod join;
+pub mod vote;

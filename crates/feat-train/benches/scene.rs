@@ -7,6 +7,9 @@
 //! view, as masks of inconsistent granularity are. A Gaussian belongs to the mask it lies in, and within two Gaussians of
 //! a border, where its splat reaches over, to the masks of both sides (three or four at a corner): 1.2 entries a Gaussian.
 //! A mask's weights sum to about 0.9, the mean alpha of its pixels; the 750,000 pixels of a view are shared out by area.
+//!
+//! Those masks follow no things. With [`Things`] they do: a fifth of the scene's 240 things of one to four parts are in
+//! a window, and each is shown by a view whole, or, with probability 0.5, in its parts or merged with a neighbour.
 
 use artifacts::Graph;
 use feat_train::real::Weight;
@@ -109,8 +112,8 @@ pub fn scene(side: usize) -> Scene {
         gaussian_knn,
         k: K,
         gaussian_k: K,
-        seen_views: Vec::new(),
-        seen_weight: Vec::new(),
+        seen_views: vec![1; n],
+        seen_weight: vec![1.0; n],
     };
     Scene { graph, colors, positions, index, side }
 }
@@ -152,31 +155,34 @@ impl Scene {
     }
 
     fn view<W: Weight>(&self, context: &Context, place: &[u32], v: u64, cut: f32) -> (MaskSet<W>, f64) {
+        let (mut entries, pixels) = self.entries(v, None);
+        let mut dropped = vec![0.0; pixels.len()];
+        entries.iter().filter(|e| e.2 < cut).for_each(|e| dropped[e.1 as usize] += f64::from(e.2));
+        entries.retain(|e| e.2 >= cut);
+        entries.iter_mut().for_each(|e| e.0 = place[e.0 as usize]);
+        let set = MaskSet::from_entries((0..pixels.len() as u32).collect(), pixels, entries, context);
+        (set, dropped.into_iter().fold(0.0, f64::max))
+    }
+
+    /// Gaussian, mask and weight, as a share of the mask, of all entries of a view, and the pixels of its masks. Without
+    /// things, masks are cells of a grid.
+    pub fn entries(&self, v: u64, things: Option<&Things>) -> (Vec<(u32, u16, f32)>, Vec<f64>) {
         let mut rng = ChaCha8Rng::seed_from_u64(2);
         rng.set_stream(v);
         let side = self.side;
         let width = (side as f64 * 0.2f64.sqrt()) as usize;
         let corner = (rng.random_range(0..=side - width), rng.random_range(0..=side - width));
-        let masks = rng.random_range(60..=100usize);
-        let rows = (masks as f64).sqrt() as usize;
-        // Each row of cells has as many as make up the number of masks.
-        let mut cuts = |parts: usize| -> Vec<usize> {
-            let step = width as f64 / parts as f64;
-            let inner = (1..parts).map(|p| ((p as f64 + rng.random_range(-0.3..0.3)) * step) as usize);
-            std::iter::once(0).chain(inner.collect::<Vec<_>>()).chain([width]).collect()
+        let (masks, cells) = match things {
+            None => grid(width, &mut rng),
+            Some(things) => things.shown(side, width, corner, &mut rng),
         };
-        let row_cuts = cuts(rows);
-        let cells: Vec<Vec<usize>> = (0..rows).map(|r| cuts((r + 1) * masks / rows - r * masks / rows)).collect();
-        let cell_of = |y: usize, x: usize| -> u16 {
-            let r = row_cuts.partition_point(|&c| c <= y) - 1;
-            (r * masks / rows + cells[r].partition_point(|&c| c <= x) - 1) as u16
-        };
+        let cell_of = |y: usize, x: usize| cells[y * width + x];
         let mut entries: Vec<(u32, u16, f32)> = Vec::with_capacity(width * width * 5 / 4);
         let mut sum = vec![0.0f64; masks];
         let last = width - 1;
         for y in 0..width {
             for x in 0..width {
-                let at = place[self.index[(y + corner.0) * side + x + corner.1] as usize];
+                let at = self.index[(y + corner.0) * side + x + corner.1];
                 let own = cell_of(y, x);
                 let reach = |dy: i64, dx: i64| {
                     let clamp = |a: usize, d: i64| (a as i64 + d).clamp(0, last as i64) as usize;
@@ -197,11 +203,93 @@ impl Scene {
         }
         entries.iter_mut().for_each(|e| e.2 = (0.9 * f64::from(e.2) / sum[e.1 as usize]) as f32);
         let total: f64 = sum.iter().sum();
-        let pixels = sum.iter().map(|s| (PIXELS * s / total).round()).collect();
-        let mut dropped = vec![0.0; masks];
-        entries.iter().filter(|e| e.2 < cut).for_each(|e| dropped[e.1 as usize] += f64::from(e.2));
-        entries.retain(|e| e.2 >= cut);
-        let set = MaskSet::from_entries((0..masks as u32).collect(), pixels, entries, context);
-        (set, dropped.into_iter().fold(0.0, f64::max))
+        (entries, sum.iter().map(|s| (PIXELS * s / total).round()).collect())
+    }
+}
+
+/// 60 to 100 cells with jittered borders: their number, and the cell of each place of a window.
+fn grid(width: usize, rng: &mut ChaCha8Rng) -> (usize, Vec<u16>) {
+    let masks = rng.random_range(60..=100usize);
+    let rows = (masks as f64).sqrt() as usize;
+    // Each row of cells has as many as make up the number of masks.
+    let mut cuts = |parts: usize| -> Vec<usize> {
+        let step = width as f64 / parts as f64;
+        let inner = (1..parts).map(|p| ((p as f64 + rng.random_range(-0.3..0.3)) * step) as usize);
+        std::iter::once(0).chain(inner.collect::<Vec<_>>()).chain([width]).collect()
+    };
+    let row_cuts = cuts(rows);
+    let cells: Vec<Vec<usize>> = (0..rows).map(|r| cuts((r + 1) * masks / rows - r * masks / rows)).collect();
+    let cell_of = |y: usize, x: usize| -> u16 {
+        let r = row_cuts.partition_point(|&c| c <= y) - 1;
+        (r * masks / rows + cells[r].partition_point(|&c| c <= x) - 1) as u16
+    };
+    (masks, (0..width * width).map(|i| cell_of(i / width, i % width)).collect())
+}
+
+/// Things that the surface is made of.
+pub struct Things {
+    /// Thing of each place of the surface, and which of its parts.
+    at: Vec<(u16, u8)>,
+    /// Number of parts of each thing.
+    parts: Vec<u8>,
+    /// Things along a side.
+    across: usize,
+}
+
+impl Things {
+    /// 15 x 16 things around jittered centres, each cut into one to four parts by angle.
+    pub fn new(side: usize) -> Self {
+        let mut rng = ChaCha8Rng::seed_from_u64(3);
+        let (down, across) = (15usize, 16usize);
+        let (high, wide) = (side as f32 / down as f32, side as f32 / across as f32);
+        let centres: Vec<[f32; 2]> = (0..down * across)
+            .map(|t| {
+                let mut jitter = || rng.random_range(0.2f32..0.8);
+                [((t / across) as f32 + jitter()) * high, ((t % across) as f32 + jitter()) * wide]
+            })
+            .collect();
+        let parts: Vec<u8> = centres.iter().map(|_| rng.random_range(1..=4)).collect();
+        let nearest = |i: usize| {
+            let (y, x) = ((i / side) as f32, (i % side) as f32);
+            let (cy, cx) = ((y / high) as usize, (x / wide) as usize);
+            let around = (cy.saturating_sub(2)..(cy + 3).min(down))
+                .flat_map(|r| (cx.saturating_sub(2)..(cx + 3).min(across)).map(move |c| r * across + c));
+            let off = |t: usize| [y - centres[t][0], x - centres[t][1]];
+            let square = |t: &usize| off(*t).iter().map(|d| d * d).sum::<f32>();
+            let t = around.min_by(|a, b| square(a).total_cmp(&square(b))).expect("its own cell");
+            let [dy, dx] = off(t);
+            let turn = dy.atan2(dx) / std::f32::consts::TAU + 0.5;
+            (t as u16, ((turn * f32::from(parts[t])) as u8).min(parts[t] - 1))
+        };
+        let at = (0..side * side).into_par_iter().map(nearest).collect();
+        Self { at, parts, across }
+    }
+
+    /// How a view shows the things of its window: the number of masks, and the mask of each place.
+    fn shown(&self, side: usize, width: usize, corner: (usize, usize), rng: &mut ChaCha8Rng) -> (usize, Vec<u16>) {
+        let things = self.parts.len();
+        // The mask of each part of each thing, by a first numbering.
+        let mut mask: Vec<[usize; 4]> = (0..things).map(|t| [4 * t; 4]).collect();
+        for t in 0..things {
+            match rng.random_range(0..4) {
+                0 => mask[t] = std::array::from_fn(|part| 4 * t + part),
+                1 if t % self.across > 0 => mask[t] = mask[t - 1],
+                _ => {}
+            }
+        }
+        let window = (0..width * width).map(|i| {
+            let (t, part) = self.at[(i / width + corner.0) * side + i % width + corner.1];
+            mask[t as usize][part as usize]
+        });
+        let window: Vec<usize> = window.collect();
+        let mut number = vec![u16::MAX; 4 * things];
+        let mut masks = 0;
+        for &m in &window {
+            if number[m] == u16::MAX {
+                number[m] = masks;
+                masks += 1;
+            }
+        }
+        (masks as usize, window.into_iter().map(|m| number[m]).collect())
     }
 }

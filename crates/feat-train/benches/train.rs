@@ -1,27 +1,24 @@
 //! `make bench-train`: what an iteration of training costs at a million Gaussians, 100,000 anchors and 300 views.
 //! [`scene`] says how the scene is made. Writes out/bench/train.json.
 
+mod closed_form;
 mod rendering;
 mod scene;
 
-use artifacts::{Footprints, FootprintsBuilder, Level, Row, ScratchEntries};
 use clap::Parser;
 use feat_train::adam::{Adam, Rates};
-use feat_train::evidence::{Evidence, Matrix};
 use feat_train::fast::{Engine, Shortcuts, Timings};
 use feat_train::loss::{self, Loss};
 use feat_train::model::{Model, Settings};
 use feat_train::real::{Half, Weight};
 use feat_train::scene::{Context, MaskSet, Neighbours};
-use feat_train::spectral::{SpectralOptions, spectral};
 use feat_train::train::{TrainOptions, train};
-use gs_io::Provenance;
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
 use rendering::View;
 use scene::{Scene, scene};
 use serde_json::{Value, json};
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 use std::time::{Duration, Instant};
 
 /// Iterations of a training.
@@ -271,45 +268,6 @@ fn early_stop() -> Value {
     })
 }
 
-/// The closed form on the same graph and footprints, written as graph-precompute writes them, into `folder` for a while.
-fn closed_form(s: &Scene, context: &Context, sets: &[MaskSet], folder: &Path) -> Value {
-    let path = folder.join("train-footprints.safetensors");
-    let mut builder =
-        FootprintsBuilder { kept: s.graph.kept.clone(), row_ptr: vec![0], ..FootprintsBuilder::default() };
-    let mut entries = ScratchEntries::beside(&path).expect("room for footprints");
-    for (v, set) in sets.iter().enumerate() {
-        let mut rows: Vec<Vec<(u32, f32)>> = vec![Vec::new(); set.len()];
-        for (c, &place) in set.columns.iter().enumerate() {
-            let (mask, weight) = set.entries(c);
-            for (&k, &w) in mask.iter().zip(weight) {
-                rows[k as usize].push((context.order[place as usize], w * set.pixels[k as usize] as f32));
-            }
-        }
-        builder.views.push(v.to_string());
-        for (k, mut row) in rows.into_iter().enumerate() {
-            row.sort_unstable_by_key(|e| e.0);
-            row.iter().for_each(|&(i, w)| entries.push(i, w).expect("room for footprints"));
-            builder.row_ptr.push(entries.count);
-            let pixels = set.pixels[k] as u32;
-            builder.rows.push(Row { view: v as u32, level: 3, mask: k as u32, pixels, gated: pixels, alpha: 0.9 });
-        }
-    }
-    builder.write_with(entries, &path, Provenance::default()).expect("room for footprints");
-    let (clock, cpu) = (Instant::now(), cpu_seconds());
-    let footprints = Footprints::read(&path).expect("just written");
-    let matrix = Matrix::new(&footprints, &s.graph, &[Level::Large], Evidence::Weight, true);
-    let read = clock.elapsed().as_secs_f64();
-    let options = SpectralOptions { most: 64, auto: true, cutoff: 0.75, power: 16.0, seed: 0 };
-    let found = spectral(&matrix, &options, &stage::Stage::silent("bench")).expect("features");
-    let out = json!({
-        "masks": matrix.masks.len(), "seconds": clock.elapsed().as_secs_f64(), "cpu_seconds": cpu_seconds() - cpu,
-        "reading_seconds": read, "passes": found.passes, "dim": found.dim,
-        "singular_values": [found.singular_values[0], found.singular_values[found.dim - 1]],
-    });
-    std::fs::remove_file(&path).expect("just written");
-    out
-}
-
 /// Time and memory of each number of layers.
 fn layers(context: &Context, sets: &[MaskSet], iterations: u64) -> Value {
     let row = |layers: usize| {
@@ -344,14 +302,15 @@ fn main() {
     let args = Args::parse();
     rayon::ThreadPoolBuilder::new().num_threads(args.threads).build_global().expect("the first pool");
     let s = scene(args.side);
-    let context = s.context(Neighbours::Gaussians, true);
-    let sets = s.views(&context, args.views);
     let folder = args.out.parent().expect("a file in a folder");
     std::fs::create_dir_all(folder).expect("the folder can be made");
+    let closed_form = closed_form::measure(&s, args.views, args.threads, folder);
     if args.closed_form {
-        eprintln!("{}", closed_form(&s, &context, &sets, folder));
+        eprintln!("{closed_form:#}");
         return;
     }
+    let context = s.context(Neighbours::Gaussians, true);
+    let sets = s.views(&context, args.views);
     let entries: usize = sets.iter().map(|s| s.mask.len()).sum();
     let columns: usize = sets.iter().map(|s| s.columns.len()).sum();
     let first = engine(&context, &sets, 2, Shortcuts::default(), args.iterations);
@@ -386,6 +345,7 @@ fn main() {
         "early_stop": early_stop(),
         "by_layers": layers(&context, &sets, (args.iterations / 4).max(1)),
         "rendering": against_rendering(),
+        "closed_form": closed_form,
     });
     let text = serde_json::to_string_pretty(&report).expect("a report is JSON") + "\n";
     eprint!("{text}");

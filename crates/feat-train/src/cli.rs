@@ -1,7 +1,7 @@
 //! The command line of `feat-train`.
 
 use crate::checkpoint;
-use crate::evidence::{Evidence, Matrix};
+use crate::evidence::{Evidence, collect};
 use crate::fast::{Engine, Shortcuts};
 use crate::loss::Loss;
 use crate::model::{CohesionOf, Init, Settings};
@@ -19,6 +19,7 @@ use stage::curve::{self, Panel};
 use stage::{CommonArgs, Program, Stage};
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
+use std::time::Instant;
 
 /// A feature vector for every Gaussian, from the masks of all views
 #[derive(Debug, clap::Parser)]
@@ -348,13 +349,15 @@ impl Args {
 
     fn spectral(&self, inputs: &Inputs, stage: &Stage) -> Result<(usize, Vec<f32>, Value)> {
         let s = &self.spectral;
-        let matrix = Matrix::new(&inputs.footprints, &inputs.graph, &self.levels, s.evidence, !s.no_smoothing);
+        let clock = Instant::now();
+        let matrix = collect(&inputs.footprints, &inputs.graph, &self.levels, s.evidence, !s.no_smoothing);
         if matrix.masks.is_empty() {
             return Err(Error::new("no mask has a footprint")
                 .file(&self.footprints)
                 .field(format!("levels {:?}", self.levels))
                 .hint("choose other --levels, or check that masks and geometry are of one scene"));
         }
+        let evidence_seconds = clock.elapsed().as_secs_f64();
         let options = SpectralOptions {
             most: self.dim.unwrap_or(64),
             auto: self.dim.is_none(),
@@ -363,6 +366,7 @@ impl Args {
             seed: self.common.seed,
         };
         let found = spectral(&matrix, &options, stage)?;
+        let vectors_seconds = clock.elapsed().as_secs_f64() - evidence_seconds;
         let without = found.features.chunks_exact(found.dim).filter(|f| f.iter().all(|v| *v == 0.0)).count();
         if without > 0 {
             stage.info(&format!("{without} of {} Gaussians lie in no mask: their features are zero", matrix.gaussians));
@@ -370,7 +374,9 @@ impl Args {
         let values = found.singular_values.iter().enumerate();
         write_curve(&self.out, values.map(|(i, v)| json!({ "iteration": i + 1, "singular_value": v })), &SPECTRUM)?;
         let summary = json!({
-            "masks": matrix.masks.len(), "dim": found.dim, "passes": found.passes, "without_mask": without,
+            "masks": matrix.masks.len(), "dim": found.dim, "passes": found.passes, "residual": found.residual,
+            "evidence_seconds": evidence_seconds, "vectors_seconds": vectors_seconds, "cpu_seconds": stage::cpu_seconds(),
+            "without_mask": without, "entries": matrix.entries(), "gram_entries": found.gram_entries,
             "singular_values": found.singular_values,
         });
         Ok((found.dim, found.features, summary))

@@ -1,13 +1,18 @@
 //! The matrix of Gaussians and masks: how much each mask says about each Gaussian, spread over neighbours.
 //!
 //! C = D_r^-1/2 S B D_c^-1/2, with B the evidence (Gaussians x masks), S the average over a Gaussian and its spatial
-//! neighbours, and D the sums of rows and columns of S B. It is never formed: only its products with a few vectors are.
+//! neighbours, and D the sums of rows and columns of S B. It is formed in [`Block`]s of Gaussians that lie together and so
+//! know the same few hundred masks: what is summed over a block's masks stays in cache.
 
+use crate::sparse::{Block, Matrix};
 use artifacts::{Footprints, Graph, Level};
 use rayon::prelude::*;
+use std::collections::VecDeque;
 
-/// Gaussians worked on at a time.
+/// Gaussians of a block.
 const BLOCK: usize = 2048;
+/// Gaussians whose evidence is collected by one task.
+const CHUNK: usize = 16384;
 
 /// What an entry of the evidence is.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, clap::ValueEnum)]
@@ -20,270 +25,341 @@ pub enum Evidence {
     Share,
 }
 
-/// The matrix C.
-pub struct Matrix {
-    /// Gaussians, n.
-    pub gaussians: usize,
-    /// Row of the footprints artifact of each mask; R.
-    pub masks: Vec<u32>,
-    /// Evidence by mask: where its entries begin, Gaussians (ascending), values.
-    start: Vec<usize>,
-    gaussian: Vec<u32>,
-    value: Vec<f32>,
-    /// Neighbours of each Gaussian, without padding; empty lists without smoothing.
-    neighbour_start: Vec<u32>,
-    neighbours: Vec<u32>,
-    /// The same, the other way round.
-    reverse_start: Vec<u32>,
-    reverse: Vec<u32>,
-    /// D_r^-1/2, 0 for Gaussians without evidence; n.
-    row_scale: Vec<f32>,
-    /// D_c^-1/2; R.
-    column_scale: Vec<f32>,
-}
-
-impl Matrix {
-    /// Collects the evidence of all masks at `levels`; with `smooth`, spread over spatial neighbours.
-    pub fn new(footprints: &Footprints, graph: &Graph, levels: &[Level], evidence: Evidence, smooth: bool) -> Self {
-        let n = graph.kept.len();
-        let chosen: Vec<u32> = (0..footprints.rows.len() as u32)
-            .filter(|&r| levels.iter().any(|&l| l as u32 == footprints.rows[r as usize].level))
-            .filter(|&r| !footprints.entries(r as usize).0.is_empty())
-            .collect();
-        let entries = chosen.iter().map(|&r| {
-            let (gaussians, weights) = footprints.entries(r as usize);
-            (gaussians.to_vec(), weights.to_vec())
-        });
-        let mut rows: Vec<(Vec<u32>, Vec<f32>)> = entries.collect();
-        let view_of = |i: usize| {
-            let row = footprints.rows[chosen[i] as usize];
-            (row.view, row.level)
-        };
-        match evidence {
-            Evidence::Weight => {}
-            Evidence::Root => rows.iter_mut().flat_map(|r| &mut r.1).for_each(|w| *w = w.sqrt()),
-            Evidence::Share => shares(&mut rows, n, view_of),
-        }
-        let (neighbour_start, neighbours) = if smooth { neighbour_lists(graph) } else { (vec![0; n + 1], Vec::new()) };
-        Self::from_parts(n, chosen, &rows, neighbour_start, neighbours)
-    }
-
-    fn from_parts(
-        n: usize,
-        masks: Vec<u32>,
-        rows: &[(Vec<u32>, Vec<f32>)],
-        neighbour_start: Vec<u32>,
-        neighbours: Vec<u32>,
-    ) -> Self {
-        let mut start = vec![0];
-        for row in rows {
-            start.push(start[start.len() - 1] + row.0.len());
-        }
-        let (reverse_start, reverse) = transpose(&neighbour_start, &neighbours);
-        let mut matrix = Self {
-            gaussians: n,
-            gaussian: rows.iter().flat_map(|r| r.0.iter().copied()).collect(),
-            value: rows.iter().flat_map(|r| r.1.iter().copied()).collect(),
-            start,
-            neighbour_start,
-            neighbours,
-            reverse_start,
-            reverse,
-            row_scale: vec![1.0; n],
-            column_scale: vec![1.0; masks.len()],
-            masks,
-        };
-        // With the scales still 1, products with ones are the sums of rows and columns.
-        let inverse_root = |v: f32| if v > 0.0 { 1.0 / v.sqrt() } else { 0.0 };
-        let rows: Vec<f32> = matrix.apply(&vec![1.0; matrix.masks.len()], 1).into_iter().map(inverse_root).collect();
-        let columns = matrix.apply_transposed(vec![1.0; n], 1);
-        matrix.column_scale = columns.into_iter().map(|v| inverse_root(v as f32)).collect();
-        matrix.row_scale = rows;
-        matrix
-    }
-
-    /// C X for X `[R][p]`: `[n][p]`.
-    pub fn apply(&self, x: &[f32], p: usize) -> Vec<f32> {
-        let scaled: Vec<f32> =
-            x.chunks_exact(p).zip(&self.column_scale).flat_map(|(row, s)| row.iter().map(move |v| v * s)).collect();
-        let mut plain = vec![0.0f32; self.gaussians * p];
-        plain.par_chunks_mut(BLOCK * p).enumerate().for_each(|(block, out)| {
-            let first = (block * BLOCK) as u32;
-            let last = first + (out.len() / p) as u32;
-            for r in 0..self.masks.len() {
-                let mine = &self.gaussian[self.start[r]..self.start[r + 1]];
-                let from = mine.partition_point(|&g| g < first);
-                let to = from + mine[from..].partition_point(|&g| g < last);
-                let values = &self.value[self.start[r] + from..self.start[r] + to];
-                let x = &scaled[r * p..(r + 1) * p];
-                for (&g, &v) in mine[from..to].iter().zip(values) {
-                    let at = (g - first) as usize * p;
-                    out[at..at + p].iter_mut().zip(x).for_each(|(o, x)| *o += v * x);
-                }
-            }
-        });
-        let mut out = if self.neighbours.is_empty() { plain } else { self.smoothed(&plain, p) };
-        out.par_chunks_mut(p).zip(&self.row_scale).with_min_len(BLOCK).for_each(|(row, s)| {
-            row.iter_mut().for_each(|v| *v *= s);
-        });
-        out
-    }
-
-    /// S Y.
-    fn smoothed(&self, y: &[f32], p: usize) -> Vec<f32> {
-        let mut out = vec![0.0f32; y.len()];
-        out.par_chunks_mut(p).enumerate().with_min_len(BLOCK).for_each(|(i, row)| {
-            row.copy_from_slice(&y[i * p..(i + 1) * p]);
-            let mine = list(&self.neighbour_start, &self.neighbours, i);
-            for &j in mine {
-                let other = &y[j as usize * p..(j as usize + 1) * p];
-                row.iter_mut().zip(other).for_each(|(r, o)| *r += o);
-            }
-            let share = 1.0 / (1 + mine.len()) as f32;
-            row.iter_mut().for_each(|r| *r *= share);
-        });
-        out
-    }
-
-    /// Sᵀ Y.
-    fn smoothed_transposed(&self, y: &[f32], p: usize) -> Vec<f32> {
-        let share = |i: usize| 1.0 / (1 + list(&self.neighbour_start, &self.neighbours, i).len()) as f32;
-        let mut out = vec![0.0f32; y.len()];
-        out.par_chunks_mut(p).enumerate().with_min_len(BLOCK).for_each(|(i, row)| {
-            let mut add = |j: usize| {
-                let s = share(j);
-                row.iter_mut().zip(&y[j * p..(j + 1) * p]).for_each(|(r, o)| *r += s * o);
+/// Collects the evidence of all masks at `levels`; with `smooth`, spread over spatial neighbours.
+pub fn collect(footprints: &Footprints, graph: &Graph, levels: &[Level], evidence: Evidence, smooth: bool) -> Matrix {
+    let (start, gaussians, weights) = footprints.csr();
+    let range = |r: usize| start[r] as usize..start[r + 1] as usize;
+    let masks: Vec<u32> = (0..footprints.rows.len() as u32)
+        .filter(|&r| levels.iter().any(|&l| l as u32 == footprints.rows[r as usize].level))
+        .filter(|&r| !range(r as usize).is_empty())
+        .collect();
+    let columns: Vec<(&[u32], &[f32])> =
+        masks.iter().map(|&r| (&gaussians[range(r as usize)], &weights[range(r as usize)])).collect();
+    let mut rows = by_gaussian(graph.kept.len(), &columns);
+    match evidence {
+        Evidence::Weight => {}
+        Evidence::Root => rows.par_iter_mut().flat_map(|r| &mut r.value).for_each(|w| *w = w.sqrt()),
+        Evidence::Share => {
+            let unit_of = |mask: u32| {
+                let row = footprints.rows[masks[mask as usize] as usize];
+                (row.view, row.level)
             };
-            add(i);
-            list(&self.reverse_start, &self.reverse, i).iter().for_each(|&j| add(j as usize));
-        });
-        out
+            rows.par_iter_mut().for_each(|r| shares(r, unit_of));
+        }
     }
+    matrix(masks, rows, &Neighbours { k: graph.gaussian_k, items: &graph.gaussian_knn }, smooth)
+}
 
-    /// Cᵀ Y for Y `[n][p]`: `[R][p]`, summed in f64.
-    pub fn apply_transposed(&self, mut y: Vec<f32>, p: usize) -> Vec<f64> {
-        y.par_chunks_mut(p).zip(&self.row_scale).with_min_len(BLOCK).for_each(|(row, s)| {
-            row.iter_mut().for_each(|v| *v *= s);
-        });
-        let y = if self.neighbours.is_empty() { y } else { self.smoothed_transposed(&y, p) };
-        let mut out = vec![0.0f64; self.masks.len() * p];
-        out.par_chunks_mut(p).enumerate().for_each(|(r, sums)| {
-            let range = self.start[r]..self.start[r + 1];
-            for (&g, &v) in self.gaussian[range.clone()].iter().zip(&self.value[range]) {
-                let row = &y[g as usize * p..(g as usize + 1) * p];
-                sums.iter_mut().zip(row).for_each(|(s, y)| *s += f64::from(v * y));
+/// Spatial neighbours of every Gaussian, padded with itself.
+struct Neighbours<'a> {
+    k: usize,
+    items: &'a [u32],
+}
+
+impl Neighbours<'_> {
+    fn of(&self, i: usize) -> impl Iterator<Item = usize> + '_ {
+        self.items[i * self.k..(i + 1) * self.k].iter().map(|&j| j as usize).filter(move |&j| j != i)
+    }
+}
+
+/// Evidence of [`CHUNK`] consecutive Gaussians, a row each; masks ascend within a row.
+#[derive(Debug, Default)]
+struct Rows {
+    start: Vec<u32>,
+    mask: Vec<u32>,
+    value: Vec<f32>,
+}
+
+impl Rows {
+    fn row(&self, i: usize) -> (&[u32], &[f32]) {
+        let range = self.start[i] as usize..self.start[i + 1] as usize;
+        (&self.mask[range.clone()], &self.value[range])
+    }
+}
+
+fn row_of(rows: &[Rows], i: usize) -> (&[u32], &[f32]) {
+    rows[i / CHUNK].row(i % CHUNK)
+}
+
+/// The same entries by Gaussian that `columns` has by mask, with Gaussians ascending.
+fn by_gaussian(n: usize, columns: &[(&[u32], &[f32])]) -> Vec<Rows> {
+    let chunk = |c: usize| {
+        let (first, last) = ((c * CHUNK) as u32, ((c + 1) * CHUNK).min(n) as u32);
+        let ranges: Vec<(usize, usize)> = columns
+            .iter()
+            .map(|(g, _)| {
+                let from = g.partition_point(|&g| g < first);
+                (from, from + g[from..].partition_point(|&g| g < last))
+            })
+            .collect();
+        let mut start = vec![0u32; (last - first) as usize + 1];
+        for ((g, _), &(from, to)) in columns.iter().zip(&ranges) {
+            g[from..to].iter().for_each(|&g| start[(g - first) as usize + 1] += 1);
+        }
+        (1..start.len()).for_each(|i| start[i] += start[i - 1]);
+        let mut next = start.clone();
+        let count = start[start.len() - 1] as usize;
+        let (mut mask, mut value) = (vec![0u32; count], vec![0.0f32; count]);
+        for (k, ((g, w), &(from, to))) in columns.iter().zip(&ranges).enumerate() {
+            for (&g, &w) in g[from..to].iter().zip(&w[from..to]) {
+                let at = &mut next[(g - first) as usize];
+                mask[*at as usize] = k as u32;
+                value[*at as usize] = w;
+                *at += 1;
             }
-            let scale = f64::from(self.column_scale[r]);
-            sums.iter_mut().for_each(|s| *s *= scale);
-        });
-        out
-    }
-}
-
-fn list<'a>(start: &[u32], items: &'a [u32], i: usize) -> &'a [u32] {
-    &items[start[i] as usize..start[i + 1] as usize]
-}
-
-/// Divides the entries of each view and level by the Gaussian's sum over them.
-fn shares(rows: &mut [(Vec<u32>, Vec<f32>)], n: usize, view_of: impl Fn(usize) -> (u32, u32)) {
-    let mut sums = vec![0.0f32; n];
-    let mut from = 0;
-    while from < rows.len() {
-        let to = from + (from..rows.len()).take_while(|&r| view_of(r) == view_of(from)).count();
-        let view = &mut rows[from..to];
-        view.iter().for_each(|(g, w)| g.iter().zip(w).for_each(|(&g, w)| sums[g as usize] += w));
-        for (g, w) in view.iter_mut() {
-            g.iter().zip(w).for_each(|(&g, w)| *w /= sums[g as usize].max(f32::MIN_POSITIVE));
         }
-        view.iter().for_each(|(g, _)| g.iter().for_each(|&g| sums[g as usize] = 0.0));
-        from = to;
-    }
+        Rows { start, mask, value }
+    };
+    (0..n.div_ceil(CHUNK)).into_par_iter().map(chunk).collect()
 }
 
-/// Spatial neighbours without the padding.
-fn neighbour_lists(graph: &Graph) -> (Vec<u32>, Vec<u32>) {
-    let (mut start, mut items) = (vec![0u32], Vec::with_capacity(graph.gaussian_knn.len()));
-    for i in 0..graph.kept.len() {
-        let row = &graph.gaussian_knn[i * graph.gaussian_k..(i + 1) * graph.gaussian_k];
-        items.extend(row.iter().copied().filter(|&j| j as usize != i));
-        start.push(items.len() as u32);
-    }
-    (start, items)
-}
-
-fn transpose(start: &[u32], items: &[u32]) -> (Vec<u32>, Vec<u32>) {
-    let n = start.len() - 1;
-    let mut out_start = vec![0u32; n + 1];
-    items.iter().for_each(|&t| out_start[t as usize + 1] += 1);
-    (0..n).for_each(|i| out_start[i + 1] += out_start[i]);
-    let mut next = out_start.clone();
-    let mut out = vec![0u32; items.len()];
-    for i in 0..n {
-        for &t in list(start, items, i) {
-            out[next[t as usize] as usize] = i as u32;
-            next[t as usize] += 1;
+/// Divides each Gaussian's entries of a view and level by their sum.
+fn shares(rows: &mut Rows, unit_of: impl Fn(u32) -> (u32, u32)) {
+    for i in 0..rows.start.len() - 1 {
+        let range = rows.start[i] as usize..rows.start[i + 1] as usize;
+        let (masks, values) = (&rows.mask[range.clone()], &mut rows.value[range]);
+        let mut from = 0;
+        while from < masks.len() {
+            let unit = unit_of(masks[from]);
+            let to = from + masks[from..].iter().take_while(|&&k| unit_of(k) == unit).count();
+            let sum: f32 = values[from..to].iter().sum();
+            values[from..to].iter_mut().for_each(|v| *v /= sum.max(f32::MIN_POSITIVE));
+            from = to;
         }
     }
-    (out_start, out)
+}
+
+/// Parts the Gaussians into patches of [`BLOCK`], each grown over the neighbours of its first, which lies at the rim of
+/// those before.
+fn patches(n: usize, neighbours: &Neighbours<'_>) -> Vec<Vec<u32>> {
+    let mut out = Vec::with_capacity(n.div_ceil(BLOCK));
+    let mut taken = vec![false; n];
+    let (mut rim, mut lowest) = (VecDeque::<u32>::new(), 0);
+    let mut left = n;
+    while left > 0 {
+        let size = BLOCK.min(left);
+        let mut patch: Vec<u32> = Vec::with_capacity(size);
+        let mut at = 0;
+        while patch.len() < size {
+            if at == patch.len() {
+                let seed = loop {
+                    match rim.pop_front() {
+                        Some(i) if taken[i as usize] => {}
+                        Some(i) => break i as usize,
+                        None => {
+                            lowest += taken[lowest..].iter().take_while(|t| **t).count();
+                            break lowest;
+                        }
+                    }
+                };
+                taken[seed] = true;
+                patch.push(seed as u32);
+            } else {
+                for j in neighbours.of(patch[at] as usize) {
+                    if patch.len() < size && !taken[j] {
+                        taken[j] = true;
+                        patch.push(j as u32);
+                    }
+                }
+                at += 1;
+            }
+        }
+        for &i in &patch[at.saturating_sub(1)..] {
+            rim.extend(neighbours.of(i as usize).filter(|&j| !taken[j]).map(|j| j as u32));
+        }
+        left -= size;
+        out.push(patch);
+    }
+    out
+}
+
+/// Room for a task that makes blocks.
+struct Scratch {
+    /// Where each Gaussian's row is in the block's copy.
+    place: Vec<u32>,
+    /// Each mask's number within the block.
+    local: Vec<u32>,
+}
+
+/// S B of the Gaussians of a patch, with its sums over rows, in the patch's order, and over the block's masks.
+fn smoothed(
+    patch: Vec<u32>,
+    rows: &[Rows],
+    neighbours: Option<&Neighbours<'_>>,
+    scratch: &mut Scratch,
+) -> (Block, Vec<f64>, Vec<f64>) {
+    // Whose evidence counts: the patch and what surrounds it.
+    let mut around: Vec<u32> = patch.clone();
+    if let Some(n) = neighbours {
+        around.extend(patch.iter().flat_map(|&i| n.of(i as usize)).map(|j| j as u32));
+        around.sort_unstable();
+        around.dedup();
+    }
+    let mut masks: Vec<u32> = Vec::new();
+    for &i in &around {
+        for &k in row_of(rows, i as usize).0 {
+            if scratch.local[k as usize] == u32::MAX {
+                scratch.local[k as usize] = 0;
+                masks.push(k);
+            }
+        }
+    }
+    masks.sort_unstable();
+    for (at, &k) in masks.iter().enumerate() {
+        scratch.local[k as usize] = at as u32;
+    }
+    // Their rows by the block's numbers.
+    let (mut start, mut mask, mut value) = (vec![0], Vec::<u32>::new(), Vec::<f32>::new());
+    for (at, &i) in around.iter().enumerate() {
+        scratch.place[i as usize] = at as u32;
+        let (k, v) = row_of(rows, i as usize);
+        mask.extend(k.iter().map(|&k| scratch.local[k as usize]));
+        value.extend_from_slice(v);
+        start.push(mask.len());
+    }
+    masks.iter().for_each(|&k| scratch.local[k as usize] = u32::MAX);
+
+    let mut block = Block { start: vec![0], ..Block::default() };
+    let (mut row_sums, mut column_sums) = (Vec::with_capacity(patch.len()), vec![0.0f64; masks.len()]);
+    let mut sum = vec![0.0f32; masks.len()];
+    for &i in &patch {
+        let mut count = 0;
+        let mut add = |j: usize| {
+            let range = start[scratch.place[j] as usize]..start[scratch.place[j] as usize + 1];
+            mask[range.clone()].iter().zip(&value[range]).for_each(|(&k, v)| sum[k as usize] += v);
+            count += 1;
+        };
+        add(i as usize);
+        neighbours.into_iter().flat_map(|n| n.of(i as usize)).for_each(add);
+        let share = 1.0 / count as f32;
+        let mut total = 0.0;
+        for (k, s) in sum.iter_mut().enumerate().filter(|(_, s)| **s > 0.0) {
+            let v = *s * share;
+            *s = 0.0;
+            total += f64::from(v);
+            column_sums[k] += f64::from(v);
+            block.mask.push(k as u32);
+            block.value.push(v);
+        }
+        row_sums.push(total);
+        block.start.push(block.mask.len());
+    }
+    (block.gaussians, block.masks) = (patch, masks);
+    block.mask.shrink_to_fit();
+    block.value.shrink_to_fit();
+    (block, row_sums, column_sums)
+}
+
+/// C from the evidence.
+fn matrix(masks: Vec<u32>, rows: Vec<Rows>, neighbours: &Neighbours<'_>, smooth: bool) -> Matrix {
+    let n = rows.iter().map(|r| r.start.len() - 1).sum();
+    let spread = smooth.then_some(neighbours);
+    let scratch = || Scratch { place: vec![0; n], local: vec![u32::MAX; masks.len()] };
+    let made: Vec<(Block, Vec<f64>, Vec<f64>)> = patches(n, neighbours)
+        .into_par_iter()
+        .with_min_len(16)
+        .map_init(scratch, |scratch, patch| smoothed(patch, &rows, spread, scratch))
+        .collect();
+    drop(rows);
+    let inverse_root = |v: f64| if v > 0.0 { 1.0 / v.sqrt() } else { 0.0 };
+    let (mut row_scale, mut column_sums) = (vec![0.0f32; n], vec![0.0f64; masks.len()]);
+    for (block, sums, columns) in &made {
+        block.gaussians.iter().zip(sums).for_each(|(&i, &s)| row_scale[i as usize] = inverse_root(s) as f32);
+        block.masks.iter().zip(columns).for_each(|(&k, s)| column_sums[k as usize] += s);
+    }
+    let column_scale: Vec<f32> = column_sums.into_iter().map(|s| inverse_root(s) as f32).collect();
+    let mut blocks: Vec<Block> = made.into_iter().map(|(block, ..)| block).collect();
+    blocks.par_iter_mut().for_each(|b| b.scale(&row_scale, &column_scale));
+    Matrix { gaussians: n, masks, blocks, row_scale, column_scale }
 }
 
 #[cfg(test)]
 pub(crate) mod tests {
     use super::*;
-    use crate::testing::graph;
     use rand::{Rng, SeedableRng};
     use rand_chacha::ChaCha8Rng;
 
-    /// A random matrix of `n` Gaussians and `masks` masks, smoothed or not.
-    pub fn random(n: usize, masks: usize, smooth: bool) -> Matrix {
+    /// Evidence of `masks` random masks on `n` Gaussians, by mask.
+    fn columns(n: usize, masks: usize) -> Vec<(Vec<u32>, Vec<f32>)> {
         let mut rng = ChaCha8Rng::seed_from_u64(2);
-        let rows: Vec<(Vec<u32>, Vec<f32>)> = (0..masks)
+        (0..masks)
             .map(|_| {
                 let g: Vec<u32> = (0..n as u32).filter(|_| rng.random_range(0.0..1.0) < 0.3).collect();
                 let w = g.iter().map(|_| rng.random_range(0.1..3.0)).collect();
                 (g, w)
             })
-            .collect();
-        let (start, items) = if smooth { neighbour_lists(&graph(n, 3)) } else { (vec![0; n + 1], Vec::new()) };
-        Matrix::from_parts(n, (0..masks as u32).collect(), &rows, start, items)
-    }
-
-    /// The matrix itself, by columns (masks).
-    pub fn dense(matrix: &Matrix) -> Vec<Vec<f64>> {
-        (0..matrix.masks.len())
-            .map(|r| {
-                let mut unit = vec![0.0; matrix.masks.len()];
-                unit[r] = 1.0;
-                matrix.apply(&unit, 1).into_iter().map(f64::from).collect()
-            })
             .collect()
     }
 
+    /// Every Gaussian's neighbours on a line: before, behind, and two behind.
+    fn line(n: usize) -> Vec<u32> {
+        let inside = |i: i64, j: i64| if (0..n as i64).contains(&j) { j as u32 } else { i as u32 };
+        (0..n as i64).flat_map(|i| [i - 1, i + 1, i + 2].map(|j| inside(i, j))).collect()
+    }
+
+    /// A random matrix of `n` Gaussians and `masks` masks, smoothed or not.
+    pub fn random(n: usize, masks: usize, smooth: bool) -> Matrix {
+        let columns = columns(n, masks);
+        let slices: Vec<(&[u32], &[f32])> = columns.iter().map(|(g, w)| (&g[..], &w[..])).collect();
+        let items = line(n);
+        let neighbours = Neighbours { k: 3, items: &items };
+        matrix((0..masks as u32).collect(), by_gaussian(n, &slices), &neighbours, smooth)
+    }
+
     #[test]
-    fn both_products_are_of_one_matrix_whose_largest_singular_value_is_one() {
+    fn the_matrix_is_evidence_averaged_over_neighbours_and_scaled() {
+        // More Gaussians than a block and than a chunk.
+        let (n, masks) = (CHUNK + 3000, 9);
+        let columns = columns(n, masks);
+        let near = line(n);
         for smooth in [false, true] {
-            let m = random(83, 12, smooth);
-            let c = dense(&m);
-            for i in (0..83).step_by(5) {
-                let mut unit = vec![0.0; 83];
-                unit[i] = 1.0;
-                let row = m.apply_transposed(unit, 1);
-                for r in 0..12 {
-                    assert!((row[r] - c[r][i]).abs() < 1e-6, "{smooth} {i} {r}: {} {}", row[r], c[r][i]);
+            let mut spread = vec![vec![0.0f64; n]; masks];
+            for (k, (gaussians, weights)) in columns.iter().enumerate() {
+                let mut plain = vec![0.0f64; n];
+                gaussians.iter().zip(weights).for_each(|(&i, &w)| plain[i as usize] = f64::from(w));
+                for i in 0..n {
+                    let around: Vec<f64> = near[i * 3..(i + 1) * 3]
+                        .iter()
+                        .filter(|&&j| smooth && j as usize != i)
+                        .map(|&j| plain[j as usize])
+                        .collect();
+                    spread[k][i] = (plain[i] + around.iter().sum::<f64>()) / (1 + around.len()) as f64;
                 }
             }
-            // D^1/2 1 is the leading pair of vectors, with singular value 1.
-            let right: Vec<f32> = m.column_scale.iter().map(|s| if *s > 0.0 { 1.0 / s } else { 0.0 }).collect();
-            for (y, s) in m.apply(&right, 1).iter().zip(&m.row_scale) {
-                assert!((y * s - f32::from(u8::from(*s > 0.0))).abs() < 1e-5, "{y} {s}");
+            let m = random(n, masks, smooth);
+            let row_sums: Vec<f64> = (0..n).map(|i| spread.iter().map(|c| c[i]).sum()).collect();
+            for (k, column) in crate::sparse::tests::dense(&m).iter().enumerate() {
+                let column_sum: f64 = spread[k].iter().sum();
+                for i in (0..n).step_by(7) {
+                    let expected = spread[k][i] / (row_sums[i] * column_sum).sqrt().max(1e-300);
+                    assert!((column[i] - expected).abs() < 1e-6, "{smooth} {k} {i}: {} {expected}", column[i]);
+                }
             }
         }
     }
 
     #[test]
+    fn patches_hold_everyone_once_and_neighbours_together() {
+        let n = 3 * BLOCK + 77;
+        let items = line(n);
+        let neighbours = Neighbours { k: 3, items: &items };
+        let parts = patches(n, &neighbours);
+        assert_eq!(parts.len(), 4);
+        let mut all: Vec<u32> = parts.concat();
+        all.sort_unstable();
+        assert!(all.iter().enumerate().all(|(i, &j)| i as u32 == j));
+        // On a line a patch is a stretch.
+        for part in &parts {
+            let (low, high) = (part.iter().min().unwrap(), part.iter().max().unwrap());
+            assert_eq!((high - low) as usize + 1, part.len());
+        }
+    }
+
+    #[test]
     fn shares_sum_to_one_per_view() {
-        let mut rows = vec![(vec![0, 1], vec![1.0, 2.0]), (vec![1], vec![6.0]), (vec![0, 1], vec![5.0, 5.0])];
-        shares(&mut rows, 2, |r| (u32::from(r == 2), 3));
-        assert_eq!(rows, [(vec![0, 1], vec![1.0, 0.25]), (vec![1], vec![0.75]), (vec![0, 1], vec![1.0, 1.0])]);
+        // Masks 0 and 1 are of one view, 2 of another.
+        let mut rows = Rows { start: vec![0, 2, 5], mask: vec![0, 2, 0, 1, 2], value: vec![1.0, 5.0, 2.0, 6.0, 5.0] };
+        shares(&mut rows, |r| (u32::from(r == 2), 3));
+        assert_eq!(rows.value, [1.0, 1.0, 0.25, 0.75, 1.0]);
     }
 }

@@ -10,6 +10,7 @@ pub mod cli;
 pub mod cross_view;
 pub mod evidence;
 pub mod fast;
+pub mod gram;
 pub mod linalg;
 pub mod loss;
 pub mod model;
@@ -18,6 +19,7 @@ pub mod normalize;
 pub mod pixels;
 pub mod real;
 pub mod scene;
+pub mod sparse;
 pub mod spectral;
 #[cfg(test)]
 mod testing;

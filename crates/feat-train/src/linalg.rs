@@ -1,44 +1,55 @@
-//! Small dense linear algebra in f64, on columns.
+//! Small dense linear algebra in f64, on columns. Work on columns is spread over threads; each sum has one order.
+
+use rayon::prelude::*;
 
 /// A matrix as columns of equal length.
 pub type Columns = Vec<Vec<f64>>;
 
-/// Columns shorter than this share of their length before orthogonalisation depend on those before them.
-const DEPENDENT: f64 = 1e-10;
+/// Combinations of columns of unit length that are shorter than the root of this, relative to the longest, are rounding.
+const DEPENDENT: f64 = 1e-12;
+/// Partial sums of a scalar product.
+const PARTIAL: usize = 8;
 
 fn dot(a: &[f64], b: &[f64]) -> f64 {
-    a.iter().zip(b).map(|(a, b)| a * b).sum()
-}
-
-/// Makes the columns orthonormal by Gram-Schmidt, twice each; columns that depend on earlier ones are dropped.
-pub fn orthonormalise(columns: &mut Columns) {
-    let mut done: Columns = Vec::with_capacity(columns.len());
-    for mut column in columns.drain(..) {
-        let before = dot(&column, &column).sqrt();
-        for _ in 0..2 {
-            for q in &done {
-                let along = dot(q, &column);
-                column.iter_mut().zip(q).for_each(|(c, q)| *c -= along * q);
-            }
-        }
-        let length = dot(&column, &column).sqrt();
-        if length > DEPENDENT * before && length > f64::MIN_POSITIVE {
-            column.iter_mut().for_each(|c| *c /= length);
-            done.push(column);
+    let mut sums = [0.0; PARTIAL];
+    let (mut a, mut b) = (a.chunks_exact(PARTIAL), b.chunks_exact(PARTIAL));
+    for (a, b) in a.by_ref().zip(b.by_ref()) {
+        for c in 0..PARTIAL {
+            sums[c] += a[c] * b[c];
         }
     }
-    *columns = done;
+    let rest: f64 = a.remainder().iter().zip(b.remainder()).map(|(a, b)| a * b).sum();
+    sums.iter().sum::<f64>() + rest
+}
+
+/// Makes the columns orthonormal by the eigenvectors of their scalar products, twice (Stathopoulos and Wu 2002); columns
+/// that depend on others are dropped.
+pub fn orthonormalise(columns: &mut Columns) {
+    for _ in 0..2 {
+        columns.retain_mut(|column| {
+            let length = dot(column, column).sqrt();
+            column.iter_mut().for_each(|c| *c /= length);
+            length > f64::MIN_POSITIVE
+        });
+        let (values, mut vectors) = symmetric_eigen(&cross(columns, columns));
+        let independent = values.iter().take_while(|&&v| v > DEPENDENT * values[0]).count();
+        vectors.truncate(independent);
+        for (vector, value) in vectors.iter_mut().zip(&values) {
+            vector.iter_mut().for_each(|v| *v /= value.sqrt());
+        }
+        *columns = multiply(columns, &vectors);
+    }
 }
 
 /// Aᵀ B.
 pub fn cross(a: &Columns, b: &Columns) -> Columns {
-    b.iter().map(|b| a.iter().map(|a| dot(a, b)).collect()).collect()
+    b.par_iter().map(|b| a.iter().map(|a| dot(a, b)).collect()).collect()
 }
 
 /// A M.
 pub fn multiply(a: &Columns, m: &Columns) -> Columns {
     let rows = a.first().map_or(0, Vec::len);
-    m.iter()
+    m.par_iter()
         .map(|weights| {
             let mut out = vec![0.0; rows];
             for (a, &w) in a.iter().zip(weights) {

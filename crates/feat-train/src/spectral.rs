@@ -7,26 +7,35 @@
 //! out. The cutoff c is a knob of granularity: low shows parts, high whole things. (A plain power of σ, as in a diffusion
 //! map, fades the second vector already, and everything comes to lie near the first, which tells nothing apart.)
 //!
-//! The vectors come from block subspace iteration with Rayleigh-Ritz on the side of the masks, of which there are few.
+//! The vectors are sought on the side of the masks, of which there are few: CᵀC is formed once ([`Gram`]), and its leading
+//! eigenvectors come from block subspace iteration, filtered by Chebyshev polynomials (Zhou, Saad, Tiago and Chelikowsky
+//! 2006), with Rayleigh-Ritz. One product with C itself then gives all Gaussians.
 
-use crate::evidence::Matrix;
+use crate::gram::{Gram, Panel, WIDTH};
 use crate::linalg::{Columns, cross, multiply, orthonormalise, symmetric_eigen};
 use crate::model::normal;
+use crate::sparse::Matrix;
 use gs_io::{Error, Result};
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
 use rayon::prelude::*;
 use stage::Stage;
 
-/// Vectors carried beyond those asked for: they speed up convergence.
+/// Vectors carried beyond those asked for, at least: they speed up convergence.
 const EXTRA: usize = 16;
-/// The iteration ends when no wanted vector's scale changes by more than this share of the first one's: vectors that are
-/// faded out need not converge.
-const TOLERANCE: f64 = 1e-6;
-/// Or after this many products with the matrix and its transpose.
-const MOST_PASSES: usize = 200;
+/// The iteration ends when every vector that matters is one of a matrix this near to CᵀC: its residual |CᵀC v - σ² v| times
+/// its scale is below. Where singular values are closer together than this, which vectors span them is open.
+const TOLERANCE: f64 = 1e-5;
+/// Or after this many products with CᵀC.
+const MOST_PASSES: usize = 400;
 /// `--dim auto` keeps vectors whose scale is at least this share of the first one's.
 const LEAST_SCALE: f64 = 1e-3;
+/// A filter raises the first vector over the last by this factor at most: the digits of f32 must do for both.
+const MOST_GAIN: f64 = 1e4;
+/// Highest degree of a filter.
+const MOST_DEGREE: f64 = 24.0;
+/// CᵀC is formed where that takes at most so many entries for each of C, and so many more; else C is applied twice.
+const GRAM_ENTRIES: (usize, usize) = (4, 1 << 24);
 
 /// How many vectors, and how they are scaled.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -59,8 +68,12 @@ pub struct Spectral {
     pub features: Vec<f32>,
     /// Singular values found, descending; at least `dim`.
     pub singular_values: Vec<f64>,
-    /// Products with the matrix and its transpose that it took.
+    /// Products with CᵀC that it took.
     pub passes: usize,
+    /// Largest scaled residual of a vector ([`SpectralOptions`]' scale times |CᵀC v - σ² v|).
+    pub residual: f64,
+    /// Entries of CᵀC, where it was formed.
+    pub gram_entries: Option<usize>,
 }
 
 /// Computes the features.
@@ -68,71 +81,152 @@ pub struct Spectral {
 /// # Errors
 /// When there is no evidence, or the stage was interrupted.
 pub fn spectral(matrix: &Matrix, options: &SpectralOptions, stage: &Stage) -> Result<Spectral> {
-    let (vectors, values, passes) = right_singular_vectors(matrix, options, stage)?;
-    let scale = |j: usize| options.scale(values[j]);
-    let mut dim = options.most.min(values.len());
+    let gram = Gram::new(matrix, GRAM_ENTRIES.0 * matrix.entries() + GRAM_ENTRIES.1);
+    let product = gram.as_ref().map_or(Product::Factors(matrix), Product::Formed);
+    let found = singular_vectors(&product, matrix, options, stage)?;
+    let gram_entries = gram.as_ref().map(Gram::entries);
+    drop(gram);
+    let scale = |j: usize| options.scale(found.values[j]);
+    let mut dim = options.most.min(found.values.len());
     if options.auto {
         dim = (0..dim).take_while(|&j| scale(j) >= LEAST_SCALE * scale(0)).count();
     }
     // C v = sigma u; the row's own scale cancels when rows are normalised.
-    let scaled: Columns = (0..dim)
-        .map(|j| vectors[j].iter().map(|v| v * scale(j) / values[j].max(f64::MIN_POSITIVE)).collect())
-        .collect();
+    let mut scaled: Columns = found.vectors;
+    scaled.truncate(dim);
+    for (j, vector) in scaled.iter_mut().enumerate() {
+        let by = scale(j) / found.values[j].max(f64::MIN_POSITIVE);
+        vector.iter_mut().for_each(|v| *v *= by);
+    }
     let mut features = matrix.apply(&rows(&scaled), dim);
-    features.par_chunks_mut(dim).for_each(|row| {
+    features.par_chunks_mut(dim).with_min_len(4096).for_each(|row| {
         let length = row.iter().map(|v| f64::from(*v) * f64::from(*v)).sum::<f64>().sqrt();
         let inverse = if length > 0.0 { 1.0 / length } else { 0.0 };
         row.iter_mut().for_each(|v| *v = (f64::from(*v) * inverse) as f32);
     });
-    Ok(Spectral { dim, features, singular_values: values, passes })
+    Ok(Spectral {
+        dim,
+        features,
+        singular_values: found.values,
+        passes: found.passes,
+        residual: found.residual,
+        gram_entries,
+    })
+}
+
+/// CᵀC, to multiply by.
+enum Product<'a> {
+    Formed(&'a Gram),
+    Factors(&'a Matrix),
+}
+
+impl Product<'_> {
+    fn apply(&self, x: &[Panel]) -> Vec<Panel> {
+        let one = |x: &Panel| match self {
+            Self::Formed(gram) => gram.apply(x),
+            Self::Factors(matrix) => {
+                let out = matrix.normal(x.as_flattened(), WIDTH);
+                out.chunks_exact(WIDTH).map(|row| std::array::from_fn(|c| row[c] as f32)).collect()
+            }
+        };
+        x.iter().map(one).collect()
+    }
 }
 
 /// Leading right singular vectors and values, descending; each vector's largest entry is positive.
-fn right_singular_vectors(
-    matrix: &Matrix,
-    options: &SpectralOptions,
-    stage: &Stage,
-) -> Result<(Columns, Vec<f64>, usize)> {
+struct Found {
+    vectors: Columns,
+    values: Vec<f64>,
+    passes: usize,
+    residual: f64,
+}
+
+fn singular_vectors(product: &Product<'_>, matrix: &Matrix, options: &SpectralOptions, stage: &Stage) -> Result<Found> {
     let masks = matrix.masks.len();
-    let width = (options.most + EXTRA).min(masks).min(matrix.gaussians);
+    let all = masks.min(matrix.gaussians);
+    // Whole panels: columns that fill one up cost nothing.
+    let width = (options.most + EXTRA).next_multiple_of(WIDTH).min(all);
     let mut rng = ChaCha8Rng::seed_from_u64(options.seed);
     let mut v: Columns = (0..width).map(|_| (0..masks).map(|_| normal(&mut rng)).collect()).collect();
     orthonormalise(&mut v);
-    let mut values: Vec<f64> = Vec::new();
     let mut progress = stage.progress("passes", MOST_PASSES as u64);
-    for pass in 1..=MOST_PASSES {
+    let mut passes = 0;
+    loop {
         if stage.interrupted() {
             return Err(Error::new("interrupted"));
         }
-        let p = v.len();
-        let w = columns(&matrix.apply_transposed(matrix.apply(&rows(&v), p), p), p);
+        let (x, mut columns) = (panels(&v), v.len());
+        let w = product.apply(&x);
+        passes += 1;
         // Ritz values and vectors of CᵀC in the space of v.
+        let w = from_panels(&w, columns);
         let (ritz, rotation) = symmetric_eigen(&cross(&v, &w));
-        let found: Vec<f64> = ritz.iter().map(|r| r.max(0.0).sqrt()).collect();
-        let wanted = options.most.min(found.len());
-        let scale = |values: &[f64], j: usize| values.get(j).map_or(0.0, |v| options.scale(*v));
-        let change = (0..wanted).map(|j| (scale(&found, j) - scale(&values, j)).abs()).fold(0.0, f64::max);
-        values = found;
-        progress.set(pass as u64, &[("change", change)]);
-        if change <= TOLERANCE * scale(&values, 0) || p == masks.min(matrix.gaussians) && pass > 1 {
-            progress.finish(&[("change", change)]);
-            let mut vectors = multiply(&v, &rotation);
-            vectors.iter_mut().for_each(|c| make_positive(c));
-            if values.first().is_none_or(|v| *v <= 0.0) {
-                break;
+        let (vectors, w) = (multiply(&v, &rotation), multiply(&w, &rotation));
+        let values: Vec<f64> = ritz.iter().map(|r| r.max(0.0).sqrt()).collect();
+        if values.first().is_none_or(|v| *v <= 0.0) {
+            return Err(Error::new("the masks say nothing about any Gaussian")
+                .field("footprints")
+                .hint("check --levels and the masks"));
+        }
+        let wanted = options.most.min(values.len());
+        let residuals: Vec<f64> = (0..wanted)
+            .into_par_iter()
+            .map(|j| {
+                let squares = vectors[j].iter().zip(&w[j]).map(|(v, w)| (w - ritz[j] * v).powi(2));
+                options.scale(values[j]) * squares.sum::<f64>().sqrt()
+            })
+            .collect();
+        let residual = residuals.into_iter().fold(0.0, f64::max);
+        progress.set(passes as u64, &[("residual", residual)]);
+        // Vectors of the whole space are found at once.
+        let done = residual <= TOLERANCE * options.scale(values[0]) * ritz[0] || columns == all;
+        if done || passes >= MOST_PASSES {
+            progress.finish(&[("residual", residual)]);
+            if !done {
+                stage.warn(&format!("singular vectors are only good to {residual:.1e} after {passes} passes"));
             }
-            return Ok((vectors, values, pass));
+            let mut vectors = vectors;
+            vectors.iter_mut().for_each(|c| make_positive(c));
+            return Ok(Found { vectors, values, passes, residual });
         }
-        v = multiply(&w, &rotation);
+        columns = vectors.len();
+        let (filtered, degree) = filter(product, &panels(&vectors), &panels(&w), ritz[0], ritz[columns - 1].max(0.0));
+        passes += degree - 1;
+        v = from_panels(&filtered, columns);
         orthonormalise(&mut v);
-        if pass == MOST_PASSES {
-            stage.warn(&format!("singular values still change by {change:.1e} after {pass} passes"));
-            v.iter_mut().for_each(|c| make_positive(c));
-            values.truncate(v.len());
-            return Ok((v, values, pass));
-        }
     }
-    Err(Error::new("the masks say nothing about any Gaussian").field("footprints").hint("check --levels and the masks"))
+}
+
+/// A Chebyshev polynomial of CᵀC times X, small on the eigenvalues up to `low` and scaled to one at `high`; `w` is CᵀC X.
+/// Also its degree.
+fn filter(product: &Product<'_>, x: &[Panel], w: &[Panel], high: f64, low: f64) -> (Vec<Panel>, usize) {
+    // The unwanted interval, 0 to low, is mapped to -1 to 1.
+    let half = (0.5 * low).max(1e-6 * high);
+    let outside = (high - half) / half;
+    let degree = (MOST_GAIN.acosh() / outside.max(1.0 + 1e-9).acosh()).clamp(1.0, MOST_DEGREE) as usize;
+    let first = half / (high - half);
+    let mut sigma = first;
+    let scaled = |w: &[Panel], x: &[Panel], by: f64, before: Option<(&[Panel], f64)>| -> Vec<Panel> {
+        let (a, b) = ((by / half) as f32, by as f32);
+        let mut out = w.to_vec();
+        for (p, panel) in out.iter_mut().enumerate() {
+            for (r, row) in panel.iter_mut().enumerate() {
+                for c in 0..WIDTH {
+                    let old = before.map_or(0.0, |(y, s)| s as f32 * y[p][r][c]);
+                    row[c] = a * row[c] - b * x[p][r][c] - old;
+                }
+            }
+        }
+        out
+    };
+    let mut before = x.to_vec();
+    let mut now = scaled(w, x, first, None);
+    for _ in 1..degree {
+        let next = 1.0 / (2.0 / first - sigma);
+        let after = scaled(&product.apply(&now), &now, 2.0 * next, Some((&before, sigma * next)));
+        (before, now, sigma) = (now, after, next);
+    }
+    (now, degree)
 }
 
 fn make_positive(column: &mut [f64]) {
@@ -142,21 +236,37 @@ fn make_positive(column: &mut [f64]) {
     }
 }
 
+/// Columns to panels; what is left of the last one is zero.
+fn panels(columns: &Columns) -> Vec<Panel> {
+    let panel = |columns: &[Vec<f64>]| {
+        let mut out = vec![[0.0; WIDTH]; columns[0].len()];
+        for (c, column) in columns.iter().enumerate() {
+            out.iter_mut().zip(column).for_each(|(row, &v)| row[c] = v as f32);
+        }
+        out
+    };
+    columns.par_chunks(WIDTH).map(panel).collect()
+}
+
+/// The first `count` columns of panels.
+fn from_panels(panels: &[Panel], count: usize) -> Columns {
+    (0..count)
+        .into_par_iter()
+        .map(|j| panels[j / WIDTH].iter().map(|row| f64::from(row[j % WIDTH])).collect())
+        .collect()
+}
+
 /// Columns to `[rows][columns]`.
 fn rows(columns: &Columns) -> Vec<f32> {
     let count = columns.first().map_or(0, Vec::len);
     (0..count).flat_map(|i| columns.iter().map(move |c| c[i] as f32)).collect()
 }
 
-/// `[rows][p]` to columns.
-fn columns(rows: &[f64], p: usize) -> Columns {
-    (0..p).map(|j| rows.iter().skip(j).step_by(p).copied().collect()).collect()
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::evidence::tests::{dense, random};
+    use crate::evidence::tests::random;
+    use crate::sparse::tests::dense;
 
     fn options() -> SpectralOptions {
         SpectralOptions { most: 6, auto: false, cutoff: 1e6, power: 1.0, seed: 3 }
@@ -169,6 +279,7 @@ mod tests {
             let c = dense(&m);
             let (squares, right) = symmetric_eigen(&cross(&c, &c));
             let s = spectral(&m, &options(), &Stage::silent("test")).unwrap();
+            assert_eq!(s.gram_entries, Some(1600));
             for j in 0..6 {
                 assert!((s.singular_values[j] - squares[j].sqrt()).abs() < 1e-5, "{j}: {s:?}");
             }
@@ -197,5 +308,25 @@ mod tests {
             pool.install(|| spectral(&big, &wide, &Stage::silent("test")).unwrap())
         };
         assert!(with(1) == with(3));
+    }
+
+    #[test]
+    fn the_formed_product_and_its_factors_find_the_same() {
+        let m = random(3000, 200, true);
+        let o = SpectralOptions { most: 20, auto: false, cutoff: 0.05, power: 16.0, seed: 1 };
+        let silent = Stage::silent("test");
+        let gram = Gram::new(&m, usize::MAX).unwrap();
+        let formed = singular_vectors(&Product::Formed(&gram), &m, &o, &silent).unwrap();
+        let factors = singular_vectors(&Product::Factors(&m), &m, &o, &silent).unwrap();
+        let c = dense(&m);
+        let (squares, right) = symmetric_eigen(&cross(&c, &c));
+        for found in [formed, factors] {
+            assert!(found.vectors.len() < 200 && found.residual <= TOLERANCE && found.passes < 100);
+            for j in 0..20 {
+                assert!((found.values[j] - squares[j].sqrt()).abs() < 1e-5, "{j}");
+                let cosine: f64 = found.vectors[j].iter().zip(&right[j]).map(|(a, b)| a * b).sum();
+                assert!(cosine.abs() > 0.99, "{j}: {cosine}");
+            }
+        }
     }
 }

@@ -321,7 +321,7 @@ mod tests {
         let n = core.len() as u32;
         let weight = |a: u32, b: u32| squared(row(a), row(b)).sqrt().max(core[a as usize]).max(core[b as usize]);
         let pairs = (0..n).flat_map(|a| (a + 1..n).map(move |b| (a, b)));
-        spanning_forest(n as usize, &pairs.map(|(a, b)| Edge::new(a, b, weight(a, b))).collect::<Vec<_>>())
+        spanning_forest(n as usize, pairs.map(|(a, b)| Edge::new(a, b, weight(a, b))).collect::<Vec<_>>())
     }
 
     /// Sorted weights of a minimum spanning tree by Prim's algorithm over all pairs.

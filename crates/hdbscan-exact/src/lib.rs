@@ -84,7 +84,7 @@ pub fn cluster(points: &[f32], dim: usize, options: &Options) -> Clustering {
 ///
 /// # Panics
 /// When an edge names a point beyond `n` or has a weight that is NaN or negative.
-pub fn cluster_graph(n: usize, edges: &[Edge], options: &Options) -> Clustering {
+pub fn cluster_graph(n: usize, edges: impl Into<Vec<Edge>>, options: &Options) -> Clustering {
     let forest = spanning_forest(n, edges);
     let tree = condense::condense(&forest, &vec![1; n], &vec![0.0; n], options.min_cluster_size);
     let identity: Vec<u32> = (0..n as u32).collect();

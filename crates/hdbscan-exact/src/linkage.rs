@@ -69,9 +69,9 @@ impl UnionFind {
 ///
 /// # Panics
 /// When an edge names a point beyond `n` or has a weight that is NaN or negative.
-pub fn spanning_forest(n: usize, edges: &[Edge]) -> Vec<Edge> {
-    assert!(edges.iter().all(|e| (e.b as usize) < n && e.weight >= 0.0), "edges lie within the points");
-    let mut sorted = edges.to_vec();
+pub fn spanning_forest(n: usize, edges: impl Into<Vec<Edge>>) -> Vec<Edge> {
+    let mut sorted: Vec<Edge> = edges.into();
+    assert!(sorted.par_iter().all(|e| (e.b as usize) < n && e.weight >= 0.0), "edges lie within the points");
     sorted.par_sort_unstable_by(Edge::order);
     let mut sets = UnionFind::new(n);
     let mut out = Vec::with_capacity(n.saturating_sub(1));

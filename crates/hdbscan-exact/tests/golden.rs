@@ -280,7 +280,7 @@ fn a_complete_graph_gives_the_clusters_of_the_points() {
                 edges.push(Edge::new(a as u32, b as u32, d.sqrt().max(core[i]).max(core[j])));
             }
         }
-        let graph = cluster_graph(n, &edges, &c.options);
+        let graph = cluster_graph(n, &edges[..], &c.options);
         let points = cluster(&c.points, c.dim, &c.options);
         let expected: Vec<i32> = order.iter().map(|&i| points.labels[i]).collect();
         assert_eq!(graph.labels, expected, "{}", c.name);
@@ -294,7 +294,7 @@ fn parts_of_a_graph_are_apart_however_near_they_are() {
     let edges: Vec<Edge> = chain(0).chain(chain(10)).chain([Edge::new(20, 21, 0.1)]).collect();
     let o = Options { min_cluster_size: 5, ..Options::default() };
     for options in [o, Options { epsilon: 100.0, ..o }, Options { selection: Selection::Leaf, ..o }] {
-        let r = cluster_graph(22, &edges, &options);
+        let r = cluster_graph(22, &edges[..], &options);
         assert_eq!(r.selected.len(), 2);
         assert!(
             r.labels[..10].iter().all(|&l| l == r.labels[0]) && r.labels[10..20].iter().all(|&l| l == r.labels[10])

@@ -1,0 +1,183 @@
+//! Labels by votes of masks.
+//!
+//! The tree of the clustering cuts where features differ most, which at the rim of a thing is a few Gaussians off, and noise
+//! goes to whoever is nearest. Once instances are known, so is how each view cuts them: a Gaussian goes to that of the
+//! instances around it whose masks hold its weight, and its neighbours' weight, most.
+
+use crate::join::{mask_weights, units};
+use artifacts::{Footprints, Graph, Level};
+use rayon::prelude::*;
+
+/// Gaussians that one task handles.
+const CHUNK: usize = 8192;
+/// A Gaussian leaves its instance for another with this much more votes only.
+const LEAD: f32 = 1.02;
+
+/// Moves Gaussians to the instance around them with most votes, `rounds` times or until none moves. `labels` are those of the kept
+/// Gaussians; those in none (-1) stay so. A Gaussian's votes for an instance are its weights, and those of its spatial
+/// neighbours, in all masks, each times the share of the instance that the view shows in this mask. Returns how many moved.
+pub fn by_votes(
+    labels: &mut [i32],
+    instances: usize,
+    footprints: &Footprints,
+    graph: &Graph,
+    levels: &[Level],
+    rounds: usize,
+) -> usize {
+    let mut moved = 0;
+    for _ in 0..rounds {
+        let new = vote(labels, instances, footprints, graph, levels);
+        if new.is_empty() {
+            break;
+        }
+        moved += new.len();
+        new.into_iter().for_each(|(i, label)| labels[i as usize] = label as i32);
+    }
+    moved
+}
+
+/// Who moves, and where to.
+fn vote(labels: &[i32], instances: usize, footprints: &Footprints, graph: &Graph, levels: &[Level]) -> Vec<(u32, u32)> {
+    let k = graph.gaussian_k;
+    let around = |i: usize| {
+        let neighbours = graph.gaussian_knn[i * k..(i + 1) * k].iter().map(|&j| j as usize);
+        std::iter::once(i).chain(neighbours.filter(move |&j| j != i))
+    };
+    // Who has a choice, and which.
+    let choices: Vec<(u32, Vec<u32>)> = (0..labels.len())
+        .into_par_iter()
+        .with_min_len(CHUNK)
+        .filter(|&i| labels[i] >= 0)
+        .filter_map(|i| {
+            let mut choice: Vec<u32> = around(i).filter_map(|j| u32::try_from(labels[j]).ok()).collect();
+            choice.sort_unstable();
+            choice.dedup();
+            (choice.len() > 1).then_some((i as u32, choice))
+        })
+        .collect();
+    // Which votes of which Gaussians they ask for, ascending.
+    let mut asked: Vec<(u32, u32)> = choices
+        .par_iter()
+        .with_min_len(CHUNK)
+        .flat_map_iter(|(i, choice)| {
+            around(*i as usize).flat_map(move |j| choice.iter().map(move |&label| (j as u32, label)))
+        })
+        .collect();
+    asked.par_sort_unstable();
+    asked.dedup();
+    let votes = count(&asked, labels, instances, footprints, levels);
+    let of = |j: usize, label: u32| votes[asked.binary_search(&(j as u32, label)).expect("asked for")];
+    choices
+        .par_iter()
+        .with_min_len(CHUNK)
+        .filter_map(|(i, choice)| {
+            let own = labels[*i as usize] as u32;
+            let sum = |label: u32| around(*i as usize).map(|j| of(j, label)).sum::<f32>();
+            let mut best = (own, LEAD * sum(own));
+            for &label in choice.iter().filter(|&&label| label != own) {
+                let votes = sum(label);
+                if votes > best.1 {
+                    best = (label, votes);
+                }
+            }
+            (best.0 != own).then_some((*i, best.0))
+        })
+        .collect()
+}
+
+/// The votes of each Gaussian for each instance that is asked for.
+fn count(
+    asked: &[(u32, u32)],
+    labels: &[i32],
+    instances: usize,
+    footprints: &Footprints,
+    levels: &[Level],
+) -> Vec<f32> {
+    let unit_of = units(footprints);
+    let weights = mask_weights(labels, footprints, levels);
+    // Share of each instance in each mask, of what the mask's view and level show of it.
+    let mut in_unit = vec![0.0f64; instances];
+    let mut shares: Vec<(u32, Vec<(u32, f32)>)> = Vec::with_capacity(weights.len());
+    for unit in weights.chunk_by(|a, b| unit_of[a.0 as usize] == unit_of[b.0 as usize]) {
+        in_unit.fill(0.0);
+        unit.iter().flat_map(|(_, of)| of).for_each(|(&label, w)| in_unit[label as usize] += w);
+        for (r, of) in unit {
+            let share = |(&label, w): (&u32, &f64)| (label, (w / in_unit[label as usize].max(1e-300)) as f32);
+            shares.push((*r, of.iter().map(share).collect()));
+        }
+    }
+    let chunk = |c: usize| {
+        let (first, last) = ((c * CHUNK) as u32, ((c + 1) * CHUNK) as u32);
+        let own = &asked[asked.partition_point(|a| a.0 < first)..asked.partition_point(|a| a.0 < last)];
+        let mut start = vec![0usize; CHUNK + 1];
+        own.iter().for_each(|a| start[(a.0 - first) as usize + 1] += 1);
+        (0..CHUNK).for_each(|i| start[i + 1] += start[i]);
+        let mut votes = vec![0.0f32; own.len()];
+        let mut share_of = vec![0.0f32; instances];
+        for (r, of) in &shares {
+            let (gaussians, weights) = footprints.entries(*r as usize);
+            let from = gaussians.partition_point(|&i| i < first);
+            let to = from + gaussians[from..].partition_point(|&i| i < last);
+            if from == to {
+                continue;
+            }
+            of.iter().for_each(|&(label, s)| share_of[label as usize] = s);
+            for (&i, &w) in gaussians[from..to].iter().zip(&weights[from..to]) {
+                let range = start[(i - first) as usize]..start[(i - first) as usize + 1];
+                for (v, a) in votes[range.clone()].iter_mut().zip(&own[range]) {
+                    *v += w * share_of[a.1 as usize];
+                }
+            }
+            of.iter().for_each(|&(label, _)| share_of[label as usize] = 0.0);
+        }
+        votes
+    };
+    let parts: Vec<Vec<f32>> = (0..labels.len().div_ceil(CHUNK)).into_par_iter().map(chunk).collect();
+    parts.concat()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use artifacts::{FootprintsBuilder, Row};
+    use gs_io::Provenance;
+
+    #[test]
+    fn a_rim_goes_where_its_masks_are_and_strays_come_home() {
+        // 20 Gaussians in a row; in each of 4 views masks show 0..10 and 10..20. Labels are off by two, and one is astray.
+        let n = 20u32;
+        let mut b = FootprintsBuilder { kept: (0..n).collect(), row_ptr: vec![0], ..FootprintsBuilder::default() };
+        for view in 0..4 {
+            b.views.push(view.to_string());
+            for mask in 0..2 {
+                b.rows.push(Row { view, level: 3, mask, pixels: 10, gated: 10, alpha: 1.0 });
+                b.col.extend(mask * 10..mask * 10 + 10);
+                b.weight.extend([1.0; 10]);
+                b.row_ptr.push(b.col.len() as u64);
+            }
+        }
+        let dir = tempfile::tempdir().unwrap();
+        let path = dir.path().join("f.safetensors");
+        b.write(&path, Provenance::default()).unwrap();
+        let footprints = Footprints::read(&path).unwrap();
+        let near = |i: i64| [i - 1, i + 1].map(|j| if (0..20).contains(&j) { j as u32 } else { i as u32 });
+        let graph = Graph {
+            kept: (0..n).collect(),
+            gaussian_k: 2,
+            gaussian_knn: (0..20).flat_map(near).collect(),
+            ..Graph::default()
+        };
+        let mut labels: Vec<i32> = (0..20).map(|i| i32::from(i >= 12)).collect();
+        labels[4] = 1;
+        labels[17] = -1;
+        let mut expected: Vec<i32> = (0..20).map(|i| i32::from(i >= 10)).collect();
+        expected[17] = -1;
+        let moved = by_votes(&mut labels, 2, &footprints, &graph, &[Level::Large], 5);
+        assert_eq!((moved, &labels), (3, &expected));
+        assert_eq!(by_votes(&mut labels, 2, &footprints, &graph, &[Level::Large], 5), 0);
+        // No masks of this level: nobody votes, nobody moves.
+        let mut off = vec![0; 20];
+        off[3] = 1;
+        assert_eq!(by_votes(&mut off, 2, &footprints, &graph, &[Level::Small], 5), 0);
+    }
+}

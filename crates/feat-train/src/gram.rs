@@ -1,0 +1,224 @@
+//! CᵀC, masks by masks: which masks share Gaussians, and how much.
+//!
+//! It is as sparse as masks are small, and a hundred times smaller than C, so that an iteration on it costs next to nothing.
+//! A block of Gaussians knows a few hundred masks; products of its rows are summed in a dense square that stays in
+//! cache, and the squares of all blocks are then added up mask by mask, in the order of blocks.
+
+use crate::sparse::{Block, Matrix};
+use multiversion::multiversion;
+use rayon::prelude::*;
+
+/// Columns of a panel.
+pub const WIDTH: usize = 32;
+/// Some columns of a matrix with a row per mask, row after row.
+pub type Panel = Vec<[f32; WIDTH]>;
+/// Entries of a square that are summed at a time.
+const SQUARE: usize = 1 << 23;
+/// Terms of a row's product before they go to the outer sum.
+const TERMS: usize = 128;
+/// Blocks worked on at a time.
+const BATCH: usize = 64;
+
+/// CᵀC by rows.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Gram {
+    start: Vec<usize>,
+    mask: Vec<u32>,
+    value: Vec<f32>,
+}
+
+/// Entries on and above the diagonal, by rows.
+#[derive(Debug, Default)]
+struct Upper {
+    start: Vec<usize>,
+    other: Vec<u32>,
+    value: Vec<f32>,
+}
+
+impl Upper {
+    /// Of a block, by its own numbers of masks.
+    fn of(block: &Block) -> Self {
+        let m = block.masks.len();
+        let mut out = Self { start: vec![0], ..Self::default() };
+        let band = (SQUARE / m.max(1)).clamp(1, m.max(1));
+        let mut square = vec![0.0f32; band * m];
+        for first in (0..m).step_by(band) {
+            let last = (first + band).min(m);
+            square.fill(0.0);
+            add_products(block, first as u32..last as u32, &mut square);
+            for a in first..last {
+                let row = &square[(a - first) * m..(a - first + 1) * m];
+                for (b, &v) in row.iter().enumerate().skip(a).filter(|(_, v)| **v != 0.0) {
+                    out.other.push(b as u32);
+                    out.value.push(v);
+                }
+                out.start.push(out.other.len());
+            }
+        }
+        out
+    }
+}
+
+/// Adds the products of each row's entries in `band` with themselves and those behind.
+fn add_products(block: &Block, band: std::ops::Range<u32>, square: &mut [f32]) {
+    let m = block.masks.len();
+    for row in block.start.windows(2) {
+        let (masks, values) = (&block.mask[row[0]..row[1]], &block.value[row[0]..row[1]]);
+        let from = masks.partition_point(|&k| k < band.start);
+        let to = masks.partition_point(|&k| k < band.end);
+        for a in from..to {
+            let v = values[a];
+            let at = (masks[a] - band.start) as usize * m;
+            let sums = &mut square[at..at + m];
+            for (&k, &w) in masks[a..].iter().zip(&values[a..]) {
+                sums[k as usize] += v * w;
+            }
+        }
+    }
+}
+
+impl Gram {
+    /// The product, or nothing where it takes more than `most` entries on the way there.
+    pub fn new(matrix: &Matrix, most: usize) -> Option<Self> {
+        let r = matrix.masks.len();
+        let mut uppers: Vec<Upper> = Vec::with_capacity(matrix.blocks.len());
+        let mut entries = 0;
+        for batch in matrix.blocks.chunks(BATCH) {
+            uppers.par_extend(batch.par_iter().map(Upper::of));
+            entries += uppers[uppers.len() - batch.len()..].iter().map(|u| u.other.len()).sum::<usize>();
+            if entries > most {
+                return None;
+            }
+        }
+        // Which blocks know a mask, and under which number.
+        let mut known: Vec<Vec<(u32, u32)>> = vec![Vec::new(); r];
+        for (b, block) in matrix.blocks.iter().enumerate() {
+            block.masks.iter().enumerate().for_each(|(at, &k)| known[k as usize].push((b as u32, at as u32)));
+        }
+        let add_up = |(sum, touched): &mut (Vec<f64>, Vec<u32>), known: &Vec<(u32, u32)>| {
+            for &(b, at) in known {
+                let (masks, upper) = (&matrix.blocks[b as usize].masks, &uppers[b as usize]);
+                let range = upper.start[at as usize]..upper.start[at as usize + 1];
+                for (&other, &v) in upper.other[range.clone()].iter().zip(&upper.value[range]) {
+                    let other = masks[other as usize];
+                    if sum[other as usize] == 0.0 {
+                        touched.push(other);
+                    }
+                    sum[other as usize] += f64::from(v);
+                }
+            }
+            touched.sort_unstable();
+            let row: Vec<(u32, f32)> =
+                touched.drain(..).map(|k| (k, std::mem::take(&mut sum[k as usize]) as f32)).collect();
+            row
+        };
+        let rows: Vec<Vec<(u32, f32)>> =
+            known.par_iter().with_min_len(256).map_init(|| (vec![0.0; r], Vec::new()), add_up).collect();
+        drop(uppers);
+        Some(Self::from_upper(&rows))
+    }
+
+    /// The whole from what is on and above the diagonal.
+    fn from_upper(rows: &[Vec<(u32, f32)>]) -> Self {
+        let mut start = vec![0usize; rows.len() + 1];
+        for (a, row) in rows.iter().enumerate() {
+            for &(b, _) in row {
+                start[a + 1] += 1;
+                start[b as usize + 1] += usize::from(b as usize != a);
+            }
+        }
+        (1..start.len()).for_each(|i| start[i] += start[i - 1]);
+        let mut next = start.clone();
+        let (mut mask, mut value) = (vec![0; start[rows.len()]], vec![0.0; start[rows.len()]]);
+        let mut put = |row: usize, other: u32, v: f32| {
+            mask[next[row]] = other;
+            value[next[row]] = v;
+            next[row] += 1;
+        };
+        for (a, row) in rows.iter().enumerate() {
+            for &(b, v) in row {
+                put(a, b, v);
+                if b as usize != a {
+                    put(b as usize, a as u32, v);
+                }
+            }
+        }
+        Self { start, mask, value }
+    }
+
+    /// Entries.
+    pub fn entries(&self) -> usize {
+        self.mask.len()
+    }
+
+    /// CᵀC X.
+    pub fn apply(&self, x: &Panel) -> Panel {
+        let row = |r: usize| {
+            let range = self.start[r]..self.start[r + 1];
+            row_times(&self.mask[range.clone()], &self.value[range], x)
+        };
+        (0..x.len()).into_par_iter().with_min_len(64).map(row).collect()
+    }
+}
+
+#[multiversion(targets("x86_64+avx512f+avx512vl", "x86_64+avx2"))]
+fn row_times(masks: &[u32], values: &[f32], x: &[[f32; WIDTH]]) -> [f32; WIDTH] {
+    let mut out = [0.0f32; WIDTH];
+    for (masks, values) in masks.chunks(TERMS).zip(values.chunks(TERMS)) {
+        let mut sum = [0.0f32; WIDTH];
+        for (&k, &v) in masks.iter().zip(values) {
+            let x = &x[k as usize];
+            for c in 0..WIDTH {
+                sum[c] += v * x[c];
+            }
+        }
+        for c in 0..WIDTH {
+            out[c] += sum[c];
+        }
+    }
+    out
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::evidence::tests::random;
+    use crate::linalg::cross;
+    use crate::sparse::tests::dense;
+
+    #[test]
+    fn is_the_product_and_refuses_to_grow() {
+        let m = random(5000, 40, true);
+        let c = dense(&m);
+        let product = cross(&c, &c);
+        let gram = Gram::new(&m, usize::MAX).unwrap();
+        assert_eq!(gram.entries(), 1600);
+        for first in [0usize, 20] {
+            // Columns of the identity give columns of the matrix.
+            let unit: Panel =
+                (0..40).map(|k| std::array::from_fn(|c| f32::from(u8::from(k == first + c && c < 20)))).collect();
+            for (a, row) in gram.apply(&unit).iter().enumerate() {
+                for b in 0..20 {
+                    let expected = product[first + b][a];
+                    assert!((f64::from(row[b]) - expected).abs() < 1e-6, "{a} {b}: {} {expected}", row[b]);
+                }
+            }
+        }
+        assert!(Gram::new(&m, 100).is_none());
+    }
+
+    #[test]
+    fn squares_in_bands_are_the_same() {
+        let m = random(300, 30, true);
+        let block = &m.blocks[0];
+        let k = block.masks.len();
+        let mut whole = vec![0.0; k * k];
+        add_products(block, 0..k as u32, &mut whole);
+        for first in (0..k).step_by(7) {
+            let last = (first + 7).min(k);
+            let mut band = vec![0.0; (last - first) * k];
+            add_products(block, first as u32..last as u32, &mut band);
+            assert_eq!(band, whole[first * k..last * k]);
+        }
+    }
+}
