@@ -172,7 +172,7 @@ struct Matched {
 }
 
 fn matched(scene: &LabelledScene, vertices: &[[f32; 3]], options: &ScanOptions, labels: &Path) -> Result<Matched> {
-    let g = &scene.gaussians;
+    let g = scene.gaussians();
     let faint = |i: usize| options.opacity_rule && g.opacity(i) < FAINT;
     if options.association != Association::OneToOne {
         let speakers: Vec<u32> = (0..g.len() as u32).filter(|&i| !faint(i as usize)).collect();
@@ -217,7 +217,7 @@ pub fn score(
     without: &[String],
 ) -> Result<(Vec<SetFigures>, Option<InstanceFigures>, Vec<String>)> {
     let (vertices, labels) = gs_scene::ply::read_labels(&files.labels, "label")?;
-    let g = &scene.gaussians;
+    let g = scene.gaussians();
     let matched = matched(scene, &vertices, options, &files.labels)?;
     let mut notes = Vec::new();
     let mut sets = Vec::new();
