@@ -350,9 +350,9 @@ mod tests {
             let result =
                 view_footprints(&geometry.gaussians, &read, &camera(W as u32, H as u32), &maps(), &options(5, 0));
             is_the_mean_of_rendered_features(&small, &raster, &result);
-            result.seen.iter().map(|s| s.1).sum::<f64>()
+            result.seen.iter().filter(|s| s.0 % 3 == 0).map(|s| s.1).sum::<f64>()
         });
-        assert!(weight[1] < 0.99 * weight[0], "the filter takes weight from small Gaussians: {weight:?}");
+        assert!(weight[1] < 0.5 * weight[0], "the filter takes weight from small Gaussians: {weight:?}");
     }
 
     fn is_the_mean_of_rendered_features(g: &Gaussians, raster: &RasterOptions, result: &ViewFootprints) {
