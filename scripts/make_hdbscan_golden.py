@@ -7,10 +7,19 @@ those of sklearn.cluster.HDBSCAN as it comes, beside those of Python's hdbscan w
 gives for THE minimum spanning tree of one total order of edges: weight, smaller index, larger index, with points numbered
 lexicographically by coordinates (to be met exactly, probabilities included).
 
-usage: make_hdbscan_golden.py OUT.txt [CLUSTERABLE.npy OUT2.txt]    (needs numpy, scikit-learn 1.9, hdbscan 0.8)
+usage: make_hdbscan_golden.py OUT.txt [CLUSTERABLE.npy OUT2.txt]    (needs numpy below 2.4, scikit-learn 1.9, hdbscan 0.8)
+       make_hdbscan_golden.py --predict OUT.txt
+       make_hdbscan_golden.py --permutations OUT.txt
 A case is seven lines: name, dimension, min_cluster_size, min_samples, epsilon, eom|leaf, allow_single_cluster; coordinates;
 labels; labels of the one tree; probabilities of the one tree; labels of hdbscan; outlier scores of hdbscan. The second file holds the same for the points of
 CLUSTERABLE.npy, without the coordinates.
+
+--predict writes what hdbscan's approximate_predict says: per case four lines, name, queries' coordinates, labels,
+probabilities; the points are those of OUT.txt.
+
+--permutations writes how far each library differs from itself: a line per case with its name, then for scikit-learn and for
+hdbscan the least and the median adjusted Rand index between its labels of the points as they are and in PERMUTATIONS other
+orders. It is 1 where the spanning tree is unique, or its ties are of no consequence.
 """
 import sys
 
@@ -61,14 +70,9 @@ def one_tree(x, size, samples, eps, method, single):
 
 def write_case(out, name, x, size, samples, eps, method, single, coordinates):
     x = (np.round(x, 4) if coordinates else x).astype(np.float32)  # rounded: a smaller file
-    h = HDBSCAN(min_cluster_size=size, min_samples=samples, cluster_selection_epsilon=eps, cluster_selection_method=method,
-                allow_single_cluster=bool(single), algorithm="brute", copy=True)
-    labels = h.fit_predict(x.astype(np.float64))
+    labels = of_sklearn(x, size, samples, eps, method, single).labels_
     one, probabilities = one_tree(x, size, samples, eps, method, bool(single))
-    # It does not count the point itself in min_samples.
-    python = hdbscan.HDBSCAN(min_cluster_size=size, min_samples=samples - 1, cluster_selection_epsilon=eps,
-                             cluster_selection_method=method, allow_single_cluster=bool(single),
-                             algorithm="prims_kdtree", approx_min_span_tree=False).fit(x.astype(np.float64))
+    python = of_hdbscan(x, size, samples, eps, method, single)
     print(name, x.shape[1], size, samples, eps, method, single, file=out)
     if coordinates:
         print(*(f"{v:.7g}" for v in x.ravel()), file=out)
@@ -111,6 +115,68 @@ CASES = [
     ("single-epsilon", blobs(300, 2, 1, 0.5, 8), 20, 10, 0.25, "eom", 1),
     ("single-leaf", blobs(300, 2, 3, 0.5, 9), 20, 10, 0.3, "leaf", 1),
 ]
+PERMUTATIONS = 50
+# None with an epsilon: hdbscan's predictions forget it and speak of other clusters than its labels.
+PREDICTED = ["blobs2", "blobs6", "moons", "sphere", "nested", "collinear", "grid", "duplicates"]
+
+
+def of_hdbscan(x, size, samples, eps, method, single, **more):
+    # It does not count the point itself in min_samples.
+    return hdbscan.HDBSCAN(min_cluster_size=size, min_samples=samples - 1, cluster_selection_epsilon=eps,
+                           cluster_selection_method=method, allow_single_cluster=bool(single), algorithm="prims_kdtree",
+                           approx_min_span_tree=False, **more).fit(x.astype(np.float64))
+
+
+def of_sklearn(x, size, samples, eps, method, single):
+    return HDBSCAN(min_cluster_size=size, min_samples=samples, cluster_selection_epsilon=eps, cluster_selection_method=method,
+                   allow_single_cluster=bool(single), algorithm="brute", copy=True).fit(x.astype(np.float64))
+
+
+def as_stored(x):
+    return np.array([float(f"{v:.7g}") for v in np.round(x, 4).astype(np.float32).ravel()], np.float32).reshape(x.shape)
+
+
+def write_predictions(out):
+    """Half of the queries lie near points, half anywhere in and around their bounding box."""
+    dice = np.random.default_rng(11)
+    for name, x, *rest in CASES:
+        if name not in PREDICTED:
+            continue
+        x = as_stored(x)
+        model = of_hdbscan(x, *rest, prediction_data=True)
+        low, high = x.min(axis=0), x.max(axis=0)
+        near = x[dice.integers(0, len(x), 100)] + dice.normal(size=(100, x.shape[1])) * 0.05 * (high - low)
+        queries = as_stored(np.concatenate([near, dice.uniform(1.1 * low - 0.1 * high, 1.1 * high - 0.1 * low, (100, x.shape[1]))]))
+        labels, probabilities = hdbscan.approximate_predict(model, queries.astype(np.float64))
+        print(name, file=out)
+        print(*(f"{v:.7g}" for v in queries.ravel()), file=out)
+        print(*labels, file=out)
+        print(*(f"{v:.9g}" for v in probabilities), file=out)
+        print(f"{name}: {(labels < 0).sum()} of {len(labels)} queries are noise")
+
+
+def write_permutations(out):
+    dice = np.random.default_rng(12)
+    for name, x, *rest in CASES:
+        x = as_stored(x)
+        line = [name]
+        for fit in (of_sklearn, of_hdbscan):
+            own = fit(x, *rest).labels_
+            scores = []
+            for _ in range(PERMUTATIONS):
+                order = dice.permutation(len(x))
+                labels = np.empty_like(own)
+                labels[order] = fit(x[order], *rest).labels_
+                scores.append(adjusted_rand_score(own, labels))
+            line += [f"{min(scores):.4f}", f"{np.median(scores):.4f}"]
+        print(*line, file=out)
+        print(*line, flush=True)
+
+
+if sys.argv[1] in ("--predict", "--permutations"):
+    with open(sys.argv[2], "w") as out:
+        (write_predictions if sys.argv[1] == "--predict" else write_permutations)(out)
+    sys.exit()
 with open(sys.argv[1], "w") as out:
     for case in CASES:
         write_case(out, *case, coordinates=True)

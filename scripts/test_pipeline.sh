@@ -131,6 +131,33 @@ damage "$a/geometry.ply" geometry "${score[@]}"
 damage "$a/instances.safetensors" instances "${score[@]}"
 pass "$refusals damaged inputs were refused in one line each, and no output was touched"
 
+say "== damaged Gaussians"
+# Two Gaussians of the geometry lose a number: every stage leaves them out, says so, and goes on.
+d=$work/d
+mkdir -p "$d"
+cp "$a/geometry.ply" "$d/geometry.ply"
+start=$(($(grep -abo end_header "$d/geometry.ply" | head -1 | cut -d: -f1) + 11))
+row=$((4 * $(head -c "$start" "$d/geometry.ply" | grep -ac '^property float')))
+for vertex in 3 20; do
+  printf '\000\000\300\177' | dd of="$d/geometry.ply" bs=1 seek=$((start + vertex * row)) conv=notrunc status=none # x = NaN
+done
+says() { # says COMMAND...: it must succeed and name the damage
+  "$@" 2> "$work/said" > /dev/null || { cat "$work/said"; fail "a damaged Gaussian stops $1"; }
+  grep -q 'skipped 2 of .* Gaussians: damaged' "$work/said" || { cat "$work/said"; fail "$1 does not say what it left out"; }
+}
+geometry=(--scene "$scene" --geometry "$d/geometry.ply")
+made=(--graph "$d/graph.safetensors" --footprints "$d/footprints.safetensors")
+says "$bin/graph-precompute" "${geometry[@]}" --masks "$masks" --min-mask-pixels 10 "${made[@]}"
+says "$bin/feat-train" --geometry "$d/geometry.ply" "${made[@]}" --method contrastive --iterations 100 --out "$d/features.safetensors"
+says "$bin/cluster-match" "${geometry[@]}" "${made[@]}" --features "$d/features.safetensors" --masks "$masks" --out "$d/instances.safetensors"
+says "$bin/eval" score "${geometry[@]}" --instances "$d/instances.safetensors" --clip testdata/clip-tiny --out "$d/score.json"
+says "$bin/eval" query "${geometry[@]}" --instances "$d/instances.safetensors" --clip testdata/clip-tiny --text floor --out "$d/query"
+for vertex in 3 20; do
+  label=$(od -An -t d4 -j $((10 + $(od -An -t u2 -j 8 -N 2 "$d/instances.labels.npy") + 4 * vertex)) -N 4 "$d/instances.labels.npy")
+  [ $((label)) = -1 ] || fail "the damaged vertex $vertex has the instance $label"
+done
+pass "graph-precompute, feat-train, cluster-match and eval leave damaged Gaussians out and say so"
+
 say "== kills"
 # Kill the whole run at growing moments, then let make finish: the bytes of an undisturbed run.
 kills=${KILLS:-12}

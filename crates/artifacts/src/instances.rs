@@ -3,6 +3,7 @@
 use crate::graph::below;
 use gs_io::{Artifact, ArtifactWriter, Error, Provenance, Result};
 use serde_json::json;
+use std::collections::{BTreeMap, BTreeSet};
 use std::path::Path;
 
 /// An instance matched with a mask of a view.
@@ -75,6 +76,21 @@ pub struct Instances {
     pub matches: Vec<Match>,
     /// Condensed tree of the clustering (cluster-to-cluster edges only), so that a query can choose the granularity.
     pub tree: Vec<TreeEdge>,
+    /// The smallest cluster of the tree that holds each Gaussian, -1 for one that is in none; N, or none at all in files of
+    /// before it was kept.
+    pub node: Vec<i32>,
+}
+
+/// Where an instance stands in the tree of clusters.
+#[derive(Debug, Clone, Default, PartialEq, Eq)]
+pub struct Family {
+    /// Its own cluster; several where it was joined from pieces.
+    pub own: Vec<u32>,
+    /// The cluster that it and its siblings are parts of. None where that is the whole scene or a heap of things that
+    /// nothing connects.
+    pub parent: Option<u32>,
+    /// The clusters that it falls into when looked at more finely: the pieces it was joined from, or those below its own.
+    pub parts: Vec<u32>,
 }
 
 impl Instances {
@@ -97,11 +113,66 @@ impl Instances {
         &self.descriptor[instance * self.dim..(instance + 1) * self.dim]
     }
 
-    /// The cluster of the tree that an instance split off, and the clusters that it falls into below (its parts); `None` for
-    /// an instance that is all there is (the root), or not in the tree.
-    pub fn family(&self, instance: usize) -> Option<(u32, Vec<u32>)> {
-        let own = self.tree.iter().find(|e| e.instance == instance as i32)?;
-        Some((own.parent, self.tree.iter().filter(|e| e.parent == own.child).map(|e| e.child).collect()))
+    /// Where an instance stands in the tree; `None` for one that is not in it: all there is (the root).
+    pub fn family(&self, instance: usize) -> Option<Family> {
+        let own: Vec<u32> = self.tree.iter().filter(|e| e.instance == instance as i32).map(|e| e.child).collect();
+        let (&first, others) = own.split_first()?;
+        let root = self.tree.iter().map(|e| e.parent).min();
+        let above = |cluster: u32| self.tree.iter().find(|e| e.child == cluster);
+        // The nearest cluster above all of it.
+        let mut edge = above(first)?;
+        let all = |within: BTreeSet<u32>| others.iter().all(|o| within.contains(o));
+        while !all(self.within(edge.parent)) {
+            edge = above(edge.parent)?;
+        }
+        // What was split at lambda 0 is infinitely far apart.
+        let parent = Some(edge.parent).filter(|&p| Some(p) != root && edge.lambda > 0.0);
+        let below = self.tree.iter().filter(|e| e.parent == first).map(|e| e.child);
+        let parts = if others.is_empty() { below.collect() } else { own.clone() };
+        Some(Family { own, parent, parts })
+    }
+
+    /// The cluster `top` and all below it.
+    fn within(&self, top: u32) -> BTreeSet<u32> {
+        let mut within = BTreeSet::from([top]);
+        let mut edges: Vec<&TreeEdge> = self.tree.iter().collect();
+        edges.sort_by_key(|e| e.parent);
+        // Parents have smaller numbers than their children.
+        for e in edges {
+            if within.contains(&e.parent) {
+                within.insert(e.child);
+            }
+        }
+        within
+    }
+
+    /// The Gaussians of a cluster of the tree, ascending; none in files of before [`Self::node`].
+    pub fn gaussians_of_cluster(&self, cluster: u32) -> Vec<u32> {
+        let within = self.within(cluster);
+        let own = |node: i32| u32::try_from(node).is_ok_and(|n| within.contains(&n));
+        (0..self.node.len() as u32).filter(|&i| own(self.node[i as usize])).collect()
+    }
+
+    /// Gaussians of every cluster of the tree, those of the clusters below it among them; what noise and unseen Gaussians
+    /// were given to is in it, so it may be more than [`TreeEdge::size`].
+    pub fn cluster_sizes(&self) -> BTreeMap<u32, u32> {
+        let mut sizes = BTreeMap::new();
+        self.node.iter().filter_map(|&n| u32::try_from(n).ok()).for_each(|n| *sizes.entry(n).or_default() += 1);
+        let mut edges: Vec<&TreeEdge> = self.tree.iter().collect();
+        edges.sort_by_key(|e| std::cmp::Reverse(e.child));
+        for e in edges {
+            *sizes.entry(e.parent).or_default() += sizes.get(&e.child).copied().unwrap_or(0);
+        }
+        sizes
+    }
+
+    /// The instances that were selected at a cluster of the tree or below it, ascending.
+    pub fn instances_of_cluster(&self, cluster: u32) -> Vec<u32> {
+        let within = self.within(cluster);
+        let own = |e: &&TreeEdge| e.instance >= 0 && within.contains(&e.child);
+        let mut instances: Vec<u32> = self.tree.iter().filter(own).map(|e| e.instance as u32).collect();
+        instances.sort_unstable();
+        instances
     }
 
     /// Writes the artifact.
@@ -125,6 +196,9 @@ impl Instances {
                 .tensor("obb_center", &[k, 3], center.as_flattened())
                 .tensor("obb_axes", &[k, 3, 3], axes.as_flattened().as_flattened())
                 .tensor("obb_half_size", &[k, 3], half.as_flattened());
+        }
+        if !self.node.is_empty() {
+            writer = writer.tensor("node", &[self.node.len()], &self.node);
         }
         writer
             .tensor("label", &[self.label.len()], &self.label)
@@ -187,6 +261,15 @@ impl Instances {
                     .expected(format!("-1 to {}", k as i64 - 1)));
             }
         }
+        if let Some(at) = (0..t).find(|&i| child[i] <= parent[i]) {
+            return Err(Error::new("the tree of clusters is damaged")
+                .file(a.path())
+                .field(format!("tree_child[{at}]"))
+                .found(child[at])
+                .expected(format!("more than its parent {}", parent[at]))
+                .hint("run cluster-match again"));
+        }
+        let node = if a.has("node") { a.tensor::<i32>("node", &[Some(label.len())])?.to_vec() } else { Vec::new() };
         let mut oriented = Vec::new();
         if a.shape("obb_center").is_some() {
             let (center, half) = (triples("obb_center")?, triples("obb_half_size")?);
@@ -222,6 +305,7 @@ impl Instances {
                     instance: selected[i],
                 })
                 .collect(),
+            node,
             views,
         };
         Ok((instances, a))
@@ -255,10 +339,58 @@ mod tests {
                 views: vec!["a".into()],
                 matches: vec![Match { instance: 0, view: 0, mask: 7, score: 0.5, visible: 12.5 }],
                 tree: vec![TreeEdge { parent: 4, child: 5, lambda: 2.0, size: 2, instance: 1 }],
+                node: if dim == 0 { Vec::new() } else { vec![4, -1, 5, 5] },
             };
             i.write(&p, Provenance::default()).unwrap();
             assert_eq!(Instances::read(&p).unwrap().0, i);
-            assert_eq!((i.family(1), i.family(0)), (Some((4, vec![])), None));
+            assert_eq!((i.family(1), i.family(0)), (Some(Family { own: vec![5], ..Family::default() }), None));
+        }
+    }
+
+    #[test]
+    fn the_tree_tells_parents_parts_and_who_belongs_to_them() {
+        let edge = |parent, child, instance, lambda| TreeEdge { parent, child, lambda, size: 2, instance };
+        // 7 is everything: 8, a thing 9 (instance 1) apart from all, and below 8 the instances 0, of parts 12 and 13, and 2.
+        let i = Instances {
+            label: vec![0, 0, 0, 2, 2, 1, -1, -1],
+            count: vec![3, 1, 2],
+            tree: vec![
+                edge(7, 8, -1, 0.5),
+                edge(7, 9, 1, 0.0),
+                edge(8, 10, 0, 1.0),
+                edge(8, 11, 2, 1.0),
+                edge(10, 12, -1, 3.0),
+                edge(10, 13, -1, 3.0),
+            ],
+            node: vec![12, 13, 10, 11, 11, 9, 8, -1],
+            ..Instances::default()
+        };
+        assert_eq!(i.family(0), Some(Family { own: vec![10], parent: Some(8), parts: vec![12, 13] }));
+        assert_eq!(i.family(2), Some(Family { own: vec![11], parent: Some(8), parts: vec![] }));
+        assert_eq!(i.family(1), Some(Family { own: vec![9], parent: None, parts: vec![] }));
+        // Joined from pieces: these are its parts, and what is above all of them its parent.
+        let mut joined = i.clone();
+        joined.tree.iter_mut().filter(|e| e.child == 11).for_each(|e| e.instance = 0);
+        assert_eq!(joined.family(0), Some(Family { own: vec![10, 11], parent: Some(8), parts: vec![10, 11] }));
+        joined.tree.iter_mut().filter(|e| e.child == 9).for_each(|e| e.instance = 0);
+        assert_eq!(joined.family(0).unwrap().parent, None);
+        assert_eq!(i.gaussians_of_cluster(10), [0, 1, 2]);
+        assert_eq!(i.gaussians_of_cluster(12), [0]);
+        assert_eq!(i.gaussians_of_cluster(8), [0, 1, 2, 3, 4, 6], "with what belongs to no child");
+        assert_eq!((i.instances_of_cluster(8), i.instances_of_cluster(12)), (vec![0, 2], vec![]));
+        assert!(i.gaussians_of_cluster(99).is_empty());
+        let sizes = i.cluster_sizes();
+        for cluster in 7..=13 {
+            assert_eq!(sizes[&cluster] as usize, i.gaussians_of_cluster(cluster).len(), "{cluster}");
+        }
+        let dir = tempfile::tempdir().unwrap();
+        let p = dir.path().join("i.safetensors");
+        for (parent, child) in [(8, 8), (9, 8)] {
+            let ring = Instances { tree: vec![edge(parent, child, -1, 1.0)], ..Instances::default() };
+            ring.write(&p, Provenance::default()).unwrap();
+            assert!(
+                Instances::read(&p).unwrap_err().to_string().contains("tree_child[0]: the tree of clusters is damaged")
+            );
         }
     }
 }

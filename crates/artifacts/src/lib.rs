@@ -15,7 +15,7 @@ mod truth;
 pub use features::Features;
 pub use footprints::{Footprints, FootprintsBuilder, PixelSamples, Row, ScratchEntries};
 pub use graph::Graph;
-pub use instances::{Instances, Match, OrientedBox, TreeEdge};
+pub use instances::{Family, Instances, Match, OrientedBox, TreeEdge};
 pub use masks::{LEVELS, Level, MaskFeatures, MaskMaps, features_path, hash_folder, maps_path, stems};
 pub use palette::{NOISE_COLOR, instance_color};
 pub use truth::{MaskTruth, TrueObject, TruePart, TruePoints, TrueScene};

@@ -224,23 +224,28 @@ fn tile_overlaps(
     out
 }
 
-/// Measures a view. `labels` are instances of all Gaussians (-1 for none); `camera` has the size of the id maps; masks are
-/// those of `levels`.
+/// Measures a view, once for each of `silhouettes`, in one rasterisation as `raster` says. `labels` are instances of all
+/// Gaussians (-1 for none); `camera` has the size of the id maps; masks are those of `levels`.
 pub fn overlaps(
     gaussians: &Gaussians,
+    raster: &RasterOptions,
     labels: &[i32],
     table: &FeatureTable<'_>,
     camera: &Camera,
     maps: &MaskMaps,
     levels: &[Level],
-    silhouette: Silhouette,
-) -> Overlaps {
-    let early_stop = silhouette == Silhouette::Visible;
-    let tiles = tile_weights(gaussians, camera, &RasterOptions::default(), early_stop, |t| {
-        tile_overlaps(t, labels, table, &TileMasks::new(t, maps, levels), silhouette)
+    silhouettes: &[Silhouette],
+) -> Vec<Overlaps> {
+    let early_stop = !silhouettes.contains(&Silhouette::Selected);
+    let raster = RasterOptions { sh_degree: 0, ..raster.clone() };
+    let tiles = tile_weights(gaussians, camera, &raster, early_stop, |t| {
+        let masks = TileMasks::new(t, maps, levels);
+        silhouettes.iter().map(|&s| tile_overlaps(t, labels, table, &masks, s)).collect::<Vec<_>>()
     });
-    let mut all = Overlaps::default();
-    tiles.into_iter().for_each(|tile| all.add(tile));
+    let mut all = vec![Overlaps::default(); silhouettes.len()];
+    for tile in tiles {
+        all.iter_mut().zip(tile).for_each(|(all, tile)| all.add(tile));
+    }
     all
 }
 
@@ -252,10 +257,10 @@ fn cosine(a: &[f64], b: &[f64]) -> f64 {
 }
 
 /// The best mask of each instance in a view: S = IoU x similarity of mean features (0 where it is negative), kept where it
-/// exceeds `threshold`; ties go to the lower mask id.
-pub fn matches(overlaps: &Overlaps, view: u32, threshold: f32) -> Vec<Match> {
+/// exceeds `threshold`; ties go to the lower mask id. Of several silhouettes each instance has the one that fits better.
+pub fn matches(overlaps: &[Overlaps], view: u32, threshold: f32) -> Vec<Match> {
     let mut best: BTreeMap<u32, Match> = BTreeMap::new();
-    for (&(instance, mask), &common) in &overlaps.common {
+    for (overlaps, (&(instance, mask), &common)) in overlaps.iter().flat_map(|o| o.common.iter().map(move |c| (o, c))) {
         let (Some(i), Some(m)) = (overlaps.instances.get(&instance), overlaps.masks.get(&mask)) else { continue };
         let union = i.area + m.area - common;
         let iou = f64::from(common) / f64::from(union.max(1));
@@ -272,6 +277,7 @@ pub fn matches(overlaps: &Overlaps, view: u32, threshold: f32) -> Vec<Match> {
 mod tests {
     use super::*;
     use glam::DVec3;
+    use gs_scene::Geometry;
 
     const W: usize = 64;
     const H: usize = 48;
@@ -306,7 +312,9 @@ mod tests {
         let features = Features { kept: vec![0, 1, 2], dim: 2, values: vec![1.0, 0.0, 0.0, 1.0, -1.0, 0.2] };
         let table = FeatureTable::new(&features, 3);
         for silhouette in [Silhouette::Selected, Silhouette::Visible] {
-            let o = overlaps(&g, &[0, 1, 2], &table, &camera, &maps(), &[Level::Large], silhouette);
+            let raster = RasterOptions::default();
+            let all = overlaps(&g, &raster, &[0, 1, 2], &table, &camera, &maps(), &[Level::Large], &[silhouette]);
+            let o = &all[0];
             assert_eq!(o.masks[&3].area + o.masks[&4].area, (W * H) as u32);
             assert!(o.common.contains_key(&(0, 3)) && o.common.contains_key(&(1, 4)));
             assert!(!o.common.contains_key(&(0, 4)) && !o.common.contains_key(&(1, 3)));
@@ -316,28 +324,63 @@ mod tests {
                 Silhouette::Selected => assert!(hidden > 4),
                 Silhouette::Visible => assert!(hidden * 4 < o.instances[&0].area),
             }
-            let m = matches(&o, 5, 0.0);
+            let m = matches(&all, 5, 0.0);
             assert_eq!((m[0].mask, m[0].view, m[1].mask), (3, 5, 4));
             // It covers the mask of what hides it, but its features are its own and tell it from that.
             assert!(m.iter().all(|m| m.instance != 2), "{m:?}");
-            assert!(matches(&o, 5, 0.99).is_empty());
+            assert!(matches(&all, 5, 0.99).is_empty());
         }
     }
 
     #[test]
+    fn both_silhouettes_in_one_pass_are_those_of_two_and_the_better_counts() {
+        let (g, camera) = scene();
+        let features = Features { kept: vec![0, 1, 2], dim: 2, values: vec![1.0, 0.0, 0.0, 1.0, 1.0, 0.1] };
+        let table = FeatureTable::new(&features, 3);
+        let with = |s: &[Silhouette]| {
+            overlaps(&g, &RasterOptions::default(), &[0, 1, 2], &table, &camera, &maps(), &[Level::Large], s)
+        };
+        let (selected, visible) = (with(&[Silhouette::Selected]), with(&[Silhouette::Visible]));
+        let both = with(&[Silhouette::Selected, Silhouette::Visible]);
+        assert_eq!(both[0], selected[0]);
+        // Without the early stop weights below 1e-4 are not cut off.
+        assert_eq!(both[1].common, visible[0].common);
+        let best = |o: &[Overlaps]| matches(o, 0, 0.0);
+        let score = |m: &[Match], i: u32| m.iter().find(|m| m.instance == i).map_or(0.0, |m| m.score);
+        for i in 0..3 {
+            let either = score(&best(&selected), i).max(score(&best(&visible), i));
+            assert!((score(&best(&both), i) - either).abs() < 1e-4, "instance {i}");
+        }
+        assert!(score(&best(&selected), 2) > 1.5 * score(&best(&visible), 2), "the hidden one has most of it alone");
+    }
+
+    #[test]
     fn areas_and_features_are_those_of_rendered_images() {
+        // Without and with the 2D filter, as a marked geometry asks for; it shrinks what is smaller than a pixel.
+        let areas = [false, true].map(|antialias| {
+            let geometry = Geometry { antialias, ..Geometry::default() };
+            are_those_of_rendered_images(
+                &RasterOptions::of(&geometry),
+                &RasterOptions { antialias, ..Default::default() },
+            )
+        });
+        assert!(areas[1] < areas[0], "{areas:?}");
+    }
+
+    fn are_those_of_rendered_images(raster: &RasterOptions, options: &RasterOptions) -> u32 {
         let (mut g, camera) = scene();
         // Half transparent, so that silhouettes have shades.
         g.opacity_logits = vec![2.5, 2.0, 1.5];
         let features = Features { kept: vec![0, 2], dim: 3, values: vec![1.0, 2.0, 0.5, -1.0, 3.0, 0.25] };
         let all = [1.0, 2.0, 0.5, 0.0, 0.0, 0.0, -1.0, 3.0, 0.25];
         let (labels, maps, levels) = ([0, -1, 0], maps(), [Level::Default, Level::Small]);
-        let o = overlaps(&g, &labels, &FeatureTable::new(&features, 3), &camera, &maps, &levels, Silhouette::Selected);
-        let options = RasterOptions::default();
-        let image = gs_raster::render_features(&g, &all, 3, &camera, &options);
+        let table = FeatureTable::new(&features, 3);
+        let all_overlaps = overlaps(&g, raster, &labels, &table, &camera, &maps, &levels, &[Silhouette::Selected]);
+        let o = &all_overlaps[0];
+        let image = gs_raster::render_features(&g, &all, 3, &camera, options);
         let alone = g.select(&[0, 2]);
-        let own = gs_raster::render_features(&alone, &features.values, 3, &camera, &options);
-        let alpha = gs_raster::render(&alone, &camera, &options).alpha;
+        let own = gs_raster::render_features(&alone, &features.values, 3, &camera, options);
+        let alpha = gs_raster::render(&alone, &camera, options).alpha;
         let sum = |image: &[f32], inside: &dyn Fn(usize) -> bool| -> (u32, [f64; 3]) {
             let mut out = (0, [0.0; 3]);
             for p in (0..W * H).filter(|&p| inside(p)) {
@@ -363,9 +406,10 @@ mod tests {
         assert_eq!(o.common[&(0, 2)], o.instances[&0].area);
         // IoU of areas, and the cosine of the sums.
         let (i, m) = (&o.instances[&0], &o.masks[&0]);
-        let best = matches(&o, 0, 0.0)[0];
+        let best = matches(&all_overlaps, 0, 0.0)[0];
         let iou = f64::from(common(0)) / f64::from(i.area + m.area - common(0));
         assert_eq!(best.mask, 0);
         assert!((f64::from(best.score) - iou * cosine(&i.features, &m.features)).abs() < 1e-6);
+        i.area
     }
 }

@@ -12,8 +12,9 @@ use artifacts::{
 };
 use clap::Parser;
 use gs_io::{Error, IoContext, Result, hash_file, write_bytes};
+use gs_raster::RasterOptions;
 use gs_scene::dataset::{self, LoadOptions, Resolution, View};
-use gs_scene::{Gaussians, SH_C0, ply};
+use gs_scene::{Gaussians, Geometry, SH_C0, ply};
 use hdbscan_exact::{Options, Selection};
 use serde_json::{Value, json};
 use stage::{CommonArgs, Program, Stage};
@@ -138,9 +139,9 @@ struct MatchingArgs {
     /// Level of the masks: default, small, medium or large; several with commas between
     #[arg(long, default_value = "large", value_delimiter = ',', value_name = "LEVELS")]
     level: Vec<Level>,
-    /// Silhouettes of instances rendered alone, or as far as visible
-    #[arg(long, value_enum, default_value_t = Silhouette::Selected)]
-    silhouette: Silhouette,
+    /// Silhouettes of instances rendered alone, or as far as visible; both with a comma between: in each view the better
+    #[arg(long, value_enum, default_value = "selected", value_delimiter = ',', value_name = "RULES")]
+    silhouette: Vec<Silhouette>,
     /// Least association score of a match, IoU x similarity of features
     #[arg(long, default_value_t = 0.2, value_name = "SCORE")]
     threshold: f32,
@@ -163,7 +164,7 @@ impl Program for Args {
 
 /// The inputs, checked against each other.
 struct Inputs {
-    gaussians: Gaussians,
+    geometry: Geometry,
     graph: Graph,
     footprints: Footprints,
     features: Features,
@@ -173,14 +174,17 @@ struct Inputs {
 }
 
 fn read_inputs(a: &Args, stage: &Stage) -> Result<Inputs> {
-    let gaussians = ply::read_gaussians(&a.geometry)?;
-    let geometry = hash_file(&a.geometry)?;
+    let geometry = Geometry::read(&a.geometry)?;
+    if let Some(damage) = geometry.damage() {
+        stage.skipped(&damage);
+    }
+    let geometry_hash = hash_file(&a.geometry)?;
     let (graph, graph_file) = Graph::read(&a.graph)?;
     let footprints = Footprints::read(&a.footprints)?;
     let (features, features_file) = Features::read(&a.features)?;
     let masks = artifacts::hash_folder(&a.masks, "_s.npy")?;
-    graph_file.expect_input(role::GEOMETRY, &geometry)?;
-    footprints.artifact().expect_input(role::GEOMETRY, &geometry)?;
+    graph_file.expect_input(role::GEOMETRY, &geometry_hash)?;
+    footprints.artifact().expect_input(role::GEOMETRY, &geometry_hash)?;
     footprints.artifact().expect_input(role::MASKS, &masks)?;
     // The hold-out is part of what the dataset was: it is read as the graph's stage read it.
     let holdout = graph_file.provenance().parameters["holdout"].as_u64().unwrap_or(0) as usize;
@@ -191,7 +195,7 @@ fn read_inputs(a: &Args, stage: &Stage) -> Result<Inputs> {
     footprints.artifact().expect_input(role::DATASET, &dataset_hash)?;
     features_file.expect_input(role::GRAPH, graph_file.hash())?;
     features_file.expect_input(role::FOOTPRINTS, footprints.artifact().hash())?;
-    if graph.seen_views.len() != gaussians.len() || graph.kept != features.kept {
+    if graph.seen_views.len() != geometry.gaussians.len() || graph.kept != features.kept {
         return Err(Error::new("another number of Gaussians than in the graph")
             .file(&a.features)
             .field("kept")
@@ -226,7 +230,7 @@ fn read_inputs(a: &Args, stage: &Stage) -> Result<Inputs> {
     });
     let views = views.collect::<Result<_>>()?;
     let hashes = BTreeMap::from([
-        (role::GEOMETRY.into(), geometry),
+        (role::GEOMETRY.into(), geometry_hash),
         (role::DATASET.into(), dataset_hash),
         (role::GRAPH.into(), graph_file.hash().into()),
         (role::FOOTPRINTS.into(), footprints.artifact().hash().into()),
@@ -234,7 +238,7 @@ fn read_inputs(a: &Args, stage: &Stage) -> Result<Inputs> {
         (role::MASKS.into(), masks),
         (role::MASK_FEATURES.into(), artifacts::hash_folder(&a.masks, "_f.npy")?),
     ]);
-    Ok(Inputs { gaussians, graph, footprints, features, views, hashes })
+    Ok(Inputs { geometry, graph, footprints, features, views, hashes })
 }
 
 /// The first few of many names.
@@ -300,7 +304,7 @@ fn run(a: &Args, stage: &Stage) -> Result<()> {
             .expected("a name such as instances.safetensors"));
     }
     let inputs = read_inputs(a, stage)?;
-    let (n_all, n) = (inputs.gaussians.len(), inputs.graph.kept.len());
+    let (n_all, n) = (inputs.geometry.gaussians.len(), inputs.graph.kept.len());
     let options = options(c, n)?;
 
     let start = Instant::now();
@@ -324,23 +328,28 @@ fn run(a: &Args, stage: &Stage) -> Result<()> {
         );
     }
     let mut labels = vec![-1i32; n_all];
+    let mut nodes = vec![-1i32; n_all];
     let mut kept = vec![false; n_all];
-    for (&i, &l) in inputs.graph.kept.iter().zip(&clustering.labels) {
+    for (&i, (&l, &node)) in inputs.graph.kept.iter().zip(clustering.labels.iter().zip(&clustering.nodes)) {
         labels[i as usize] = l;
+        nodes[i as usize] = node as i32;
         kept[i as usize] = true;
     }
+    let means = &inputs.geometry.gaussians.means;
     if c.noise == Noise::Nearest {
         let noisy: Vec<bool> = labels.iter().zip(&kept).map(|(&l, &k)| k && l < 0).collect();
-        from_nearest(&inputs.gaussians.means, &mut labels, |i| noisy[i])?;
+        from_nearest(means, &mut labels, &mut nodes, |i| noisy[i])?;
     }
     let mut tree = tree(&clustering);
-    instances = revise(a, stage, &inputs, instances, &mut labels, &mut tree);
-    if n < n_all {
+    instances = revise(a, stage, &inputs, (instances, &clustering.selected), (&mut labels, &mut nodes), &mut tree);
+    // Damaged Gaussians have no place, so they are nobody's neighbour and stay without an instance.
+    let whole = inputs.geometry.whole();
+    let unseen = (0..n_all).filter(|&i| !kept[i] && whole[i]).count();
+    if unseen > 0 {
         stage.skipped(&format!(
-            "{} of {n_all} Gaussians in clustering: never seen; labelled from their nearest neighbour",
-            n_all - n
+            "{unseen} of {n_all} Gaussians in clustering: never seen; labelled from their nearest neighbour"
         ));
-        from_nearest(&inputs.gaussians.means, &mut labels, |i| !kept[i])?;
+        from_nearest(means, &mut labels, &mut nodes, |i| !kept[i] && whole[i])?;
     }
 
     let (matches, features) = associate(a, stage, &inputs, &labels)?;
@@ -348,18 +357,19 @@ fn run(a: &Args, stage: &Stage) -> Result<()> {
         stage.skipped("language descriptors: the masks have no features (*_f.npy; mask-embed embed makes them)");
     }
     let views = inputs.views.iter().map(|v| v.stem().to_string()).collect();
-    let means = &inputs.gaussians.means;
-    let instances = describe(means, labels, instances, matches, views, &features, m.aggregate, tree);
+    let described = describe(means, labels, instances, matches, views, &features, m.aggregate, tree);
+    let instances = Instances { node: nodes, ..described };
     write_outputs(a, stage, &inputs, &instances, &options, (noise, clustering_seconds))
 }
 
-/// Moves Gaussians between instances and joins instances as the masks say. Returns how many instances there are then.
+/// Moves Gaussians between instances and joins instances as the masks say. Takes the number of instances and their clusters;
+/// returns how many instances there are then. A Gaussian that moves becomes one of its new instance's cluster.
 fn revise(
     a: &Args,
     stage: &Stage,
     inputs: &Inputs,
-    mut instances: usize,
-    labels: &mut [i32],
+    (mut instances, clusters): (usize, &[u32]),
+    (labels, nodes): (&mut [i32], &mut [i32]),
     tree: &mut [TreeEdge],
 ) -> usize {
     let (c, levels) = (&a.clustering, &a.matching.level);
@@ -367,6 +377,13 @@ fn revise(
     if c.votes() > 0 {
         let moved = by_votes(&mut of_kept, instances, &inputs.footprints, &inputs.graph, levels, c.votes());
         stage.info(&format!("{moved} moves of Gaussians to the instance that their masks show"));
+        for (&i, &label) in inputs.graph.kept.iter().zip(&of_kept) {
+            if let Some(&cluster) = usize::try_from(label).ok().and_then(|l| clusters.get(l))
+                && labels[i as usize] != label
+            {
+                nodes[i as usize] = cluster as i32;
+            }
+        }
     }
     if let Some(least) = c.join() {
         let number = by_masks(&of_kept, instances, &inputs.footprints, levels, least);
@@ -390,7 +407,8 @@ fn associate(
     inputs: &Inputs,
     labels: &[i32],
 ) -> Result<(Vec<Match>, BTreeMap<u32, MaskFeatures>)> {
-    let table = FeatureTable::new(&inputs.features, inputs.gaussians.len());
+    let (gaussians, raster) = (&inputs.geometry.gaussians, RasterOptions::of(&inputs.geometry));
+    let table = FeatureTable::new(&inputs.features, gaussians.len());
     let mut found = Vec::new();
     let mut features: BTreeMap<u32, MaskFeatures> = BTreeMap::new();
     let mut progress = stage.progress("matching views", inputs.views.len() as u64);
@@ -399,7 +417,7 @@ fn associate(
         let maps = MaskMaps::read(maps_path(&a.masks, stem))?;
         let camera = view.camera.resized(maps.width as u32, maps.height as u32);
         let m = &a.matching;
-        let o = overlaps(&inputs.gaussians, labels, &table, &camera, &maps, &m.level, m.silhouette);
+        let o = overlaps(gaussians, &raster, labels, &table, &camera, &maps, &m.level, &m.silhouette);
         found.extend(matches(&o, index as u32, m.threshold));
         let path = features_path(&a.masks, stem);
         if path.is_file() {
@@ -450,19 +468,26 @@ fn colored(g: &Gaussians, labels: &[i32]) -> Gaussians {
 
 /// The instances to read: where they are, how large, and as which masks they were seen.
 fn readable(instances: &Instances, parameters: &Value) -> Value {
+    let sizes = instances.cluster_sizes();
     let list: Vec<Value> = (0..instances.len())
         .map(|k| {
             let own = instances.matches.iter().filter(|m| m.instance as usize == k);
             let matches: Vec<Value> = own
                 .map(|m| json!({"view": instances.views[m.view as usize], "mask": m.mask, "score": m.score}))
                 .collect();
-            let (parent, parts) = instances.family(k).map_or((None, Vec::new()), |(p, parts)| (Some(p), parts));
+            let family = instances.family(k);
+            let gaussians = |cluster: u32| sizes.get(&cluster).copied().unwrap_or(0);
+            let parent = family.as_ref().and_then(|f| f.parent).map(
+                |p| json!({"cluster": p, "gaussians": gaussians(p), "instances": instances.instances_of_cluster(p)}),
+            );
+            let part = |&p: &u32| json!({"cluster": p, "gaussians": gaussians(p)});
+            let parts: Vec<Value> = family.iter().flat_map(|f| &f.parts).map(part).collect();
             let oriented = instances
                 .oriented
                 .get(k)
                 .map(|b| json!({"center": b.center, "axes": b.axes, "half_size": b.half_size}));
             json!({
-                "oriented_box": oriented, "tree_parent": parent, "tree_parts": parts,
+                "oriented_box": oriented, "clusters": family.map(|f| f.own), "parent": parent, "parts": parts,
                 "instance": k, "gaussians": instances.count[k], "support": instances.support[k],
                 "score": instances.score[k], "centroid": instances.centroid[k],
                 "bbox_min": instances.bbox_min[k], "bbox_max": instances.bbox_max[k],
@@ -510,6 +535,7 @@ fn write_outputs(
     let (c, m) = (&a.clustering, &a.matching);
     let lower = |v: &dyn std::fmt::Debug| format!("{v:?}").to_lowercase();
     let levels: Vec<String> = m.level.iter().map(ToString::to_string).collect();
+    let silhouettes: Vec<String> = m.silhouette.iter().map(|s| lower(s)).collect();
     let parameters = json!({
         "cluster": lower(&c.cluster),
         "distance": lower(&c.distance),
@@ -524,18 +550,19 @@ fn write_outputs(
         "join": c.join(),
         "votes": c.votes(),
         "level": levels.join(","),
-        "silhouette": lower(&m.silhouette),
+        "silhouette": silhouettes.join(","),
         "threshold": m.threshold,
         "aggregate": lower(&m.aggregate),
     });
-    let comments = [format!("made by cluster-match {}", env!("CARGO_PKG_VERSION")), format!("parameters {parameters}")];
+    let own = vec![format!("made by cluster-match {}", env!("CARGO_PKG_VERSION")), format!("parameters {parameters}")];
+    let (gaussians, comments) = (&inputs.geometry.gaussians, inputs.geometry.comments(own));
     let [colors, list, table] = SIDE_FILES.map(|extension| a.out.with_extension(extension));
-    ply::write_gaussians(colors, &colored(&inputs.gaussians, &instances.label), &comments)?;
+    ply::write_gaussians(colors, &colored(gaussians, &instances.label), &comments)?;
     gs_io::npy::write_i32(list, &[instances.label.len()], &instances.label)?;
     let text = serde_json::to_vec_pretty(&readable(instances, &parameters)).map_err(|e| Error::new(e.to_string()))?;
     write_bytes(table, &text)?;
     if let Some(folder) = &a.per_instance_plys {
-        write_instance_plys(folder, &inputs.gaussians, instances, &comments)?;
+        write_instance_plys(folder, gaussians, instances, &comments)?;
     }
     let matched = instances.support.iter().filter(|&&s| s > 0).count();
     let summary = json!({

@@ -5,12 +5,17 @@ use kiddo::{ImmutableKdTree, SquaredEuclidean};
 use rayon::prelude::*;
 use std::num::NonZero;
 
-/// Gives every Gaussian for which `wanted` holds the label of the nearest Gaussian that has one (label >= 0); ties go to the
-/// lower index. Nothing changes where nobody has a label.
+/// Gives every Gaussian for which `wanted` holds the label and the node of the tree of the nearest Gaussian that has a label
+/// (>= 0); ties go to the lower index. Nothing changes where nobody has a label.
 ///
 /// # Errors
 /// When the tree of labelled centres cannot be built.
-pub fn from_nearest(means: &[[f32; 3]], labels: &mut [i32], wanted: impl Fn(usize) -> bool + Sync) -> Result<usize> {
+pub fn from_nearest(
+    means: &[[f32; 3]],
+    labels: &mut [i32],
+    nodes: &mut [i32],
+    wanted: impl Fn(usize) -> bool + Sync,
+) -> Result<usize> {
     let finite = |p: &[f32; 3]| p.iter().all(|v| v.is_finite());
     // Distinct places only: the tree cannot split heaps of coincident points.
     let mut known: Vec<u32> =
@@ -31,18 +36,18 @@ pub fn from_nearest(means: &[[f32; 3]], labels: &mut [i32], wanted: impl Fn(usiz
     let tree = ImmutableKdTree::<f32, 3>::new_from_slice(&places)
         .map_err(|e| Error::new(format!("cannot index the Gaussians' centres: {e:?}")))?;
     let some = NonZero::new(4.min(places.len())).expect("there is one");
-    let found: Vec<(usize, i32)> = (0..means.len())
+    let found: Vec<(usize, usize)> = (0..means.len())
         .into_par_iter()
         .filter(|&i| wanted(i) && finite(&means[i]))
-        .map(|i| {
+        .filter_map(|i| {
             let near = tree.query(&shift(means[i])).nearest_n::<SquaredEuclidean<f32>>(some).execute();
             let best = near.iter().map(|n| (n.distance, n.item)).min_by(|a, b| a.0.total_cmp(&b.0).then(a.1.cmp(&b.1)));
-            (i, best.map_or(-1, |(_, item)| labels[known[item as usize] as usize]))
+            best.map(|(_, item)| (i, known[item as usize] as usize))
         })
         .collect();
     let count = found.len();
-    for (i, label) in found {
-        labels[i] = label;
+    for (i, near) in found {
+        (labels[i], nodes[i]) = (labels[near], nodes[near]);
     }
     Ok(count)
 }
@@ -54,14 +59,14 @@ mod tests {
     #[test]
     fn the_nearest_labelled_gaussian_decides() {
         let means = [[0.0, 0.0, 0.0], [10.0, 0.0, 0.0], [4.0, 0.0, 0.0], [6.0, 0.0, 0.0], [5.0, 0.0, 0.0]];
-        let mut labels = [0, 1, -1, -1, -1];
-        assert_eq!(from_nearest(&means, &mut labels, |i| (2..4).contains(&i)).unwrap(), 2);
-        assert_eq!(labels, [0, 1, 0, 1, -1]);
+        let (mut labels, mut nodes) = ([0, 1, -1, -1, -1], [8, 9, 7, 7, 7]);
+        assert_eq!(from_nearest(&means, &mut labels, &mut nodes, |i| (2..4).contains(&i)).unwrap(), 2);
+        assert_eq!((labels, nodes), ([0, 1, 0, 1, -1], [8, 9, 8, 9, 7]));
         let mut none = [-1; 5];
-        from_nearest(&means, &mut none, |_| true).unwrap();
+        from_nearest(&means, &mut none, &mut nodes, |_| true).unwrap();
         assert_eq!(none, [-1; 5]);
         let mut heap = [3, 3, -1];
-        from_nearest(&[[1.0; 3]; 3], &mut heap, |i| i == 2).unwrap();
+        from_nearest(&[[1.0; 3]; 3], &mut heap, &mut [5; 3], |i| i == 2).unwrap();
         assert_eq!(heap, [3, 3, 3]);
     }
 }

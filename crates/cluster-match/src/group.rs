@@ -138,13 +138,16 @@ pub fn group_sample(
     let others = approximate_predict(&points, dim, &out, &options, &rows(&rest));
     let mut labels = vec![-1; n];
     chosen.iter().zip(&out.labels).chain(rest.iter().zip(&others.labels)).for_each(|(&i, &l)| labels[i] = l);
+    let mut nodes = vec![0; n];
+    chosen.iter().zip(&out.nodes).chain(rest.iter().zip(&others.nodes)).for_each(|(&i, &node)| nodes[i] = node);
     let mut probabilities = vec![0.0; n];
     let all = chosen.iter().zip(&out.probabilities).chain(rest.iter().zip(&others.probabilities));
     all.for_each(|(&i, &p)| probabilities[i] = p);
     // Outlier scores are of clustered points only.
     let mut outlier_scores = vec![0.0; n];
     chosen.iter().zip(&out.outlier_scores).for_each(|(&i, &s)| outlier_scores[i] = s);
-    (out.labels, out.probabilities, out.outlier_scores) = (labels, probabilities, outlier_scores);
+    (out.labels, out.nodes) = (labels, nodes);
+    (out.probabilities, out.outlier_scores) = (probabilities, outlier_scores);
     out
 }
 
@@ -318,6 +321,8 @@ mod tests {
             let known: Vec<i32> = rod.iter().copied().filter(|&l| l >= 0).collect();
             assert!(known.len() > 20 && known.iter().all(|&l| l == known[0]), "{rod:?}");
         }
+        let in_a_cluster = c.nodes.iter().filter(|n| c.selected.contains(n)).count();
+        assert_eq!(in_a_cluster, c.labels.iter().filter(|&&l| l >= 0).count(), "predicted ones have a node as well");
         assert_eq!(c, group_sample(&f, &g, 0, 30, 1, &o));
     }
 

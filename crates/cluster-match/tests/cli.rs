@@ -265,6 +265,14 @@ fn instances_are_found_matched_and_described_the_same_for_any_number_of_threads(
     let text: Value = serde_json::from_slice(&std::fs::read(s.path("out/instances.json")).unwrap()).unwrap();
     assert_eq!(text["instances"].as_array().unwrap().len(), 2);
     assert_eq!(text["instances"][b]["matches"][1]["view"], "v1");
+    // Where it stands in the tree: its cluster holds its Gaussians, and above it is only the whole scene.
+    for k in [a, b] {
+        let own = i.family(k).unwrap().own;
+        let members: Vec<u32> = (0..81).filter(|&g| i.label[g as usize] == k as i32).collect();
+        assert_eq!((own.len(), i.gaussians_of_cluster(own[0])), (1, members));
+        let listed = &text["instances"][k];
+        assert_eq!((&listed["clusters"], &listed["parent"]), (&json!(own), &Value::Null));
+    }
 
     let outputs = || {
         ["safetensors", "ply", "labels.npy", "json"]
@@ -284,6 +292,7 @@ fn options_do_what_they_say() {
         &["--distance", "chord", "--epsilon", "0.3", "--smooth", "1"],
         &["--distance", "euclidean", "--epsilon", "0.5"],
         &["--silhouette", "visible", "--min-cluster-share", "0.4"],
+        &["--silhouette", "selected,visible"],
     ] {
         let (i, said) = s.succeed(extra);
         things(&i);
@@ -315,6 +324,35 @@ fn options_do_what_they_say() {
     let free = ["--cluster", "free", "--min-samples", "5"];
     assert_eq!(s.succeed(&[&free[..], &["--noise", "keep"]].concat()).0.label[0], -1);
     things(&s.succeed(&free).0);
+}
+
+#[test]
+fn damaged_gaussians_belong_to_nothing_and_harm_nobody() {
+    let s = Scene::new();
+    let mut g = gaussians();
+    g.log_scales[2 * EACH][1] = f32::NAN;
+    ply::write_gaussians(s.path("geometry.ply"), &g, &[]).unwrap();
+    s.artifacts(|_| {});
+    let (i, said) = s.succeed(&[]);
+    assert!(said.contains("skipped 1 of 81 Gaussians: damaged") && said.contains("vertex 80"), "{said}");
+    assert!(!said.contains("never seen"), "{said}");
+    things(&i);
+    assert_eq!((i.label[2 * EACH], i.node[2 * EACH]), (-1, -1));
+    // What is written can be read by anyone.
+    assert_eq!(ply::read_gaussians(s.path("out/instances.ply")).unwrap().means[2 * EACH], g.means[2 * EACH]);
+}
+
+#[test]
+fn a_geometry_learnt_with_the_filter_is_matched_and_written_with_it() {
+    let s = Scene::new();
+    let (plain, _) = s.succeed(&[]);
+    ply::write_gaussians(s.path("geometry.ply"), &gaussians(), &[ply::ANTIALIASED.into()]).unwrap();
+    s.artifacts(|_| {});
+    let (marked, _) = s.succeed(&[]);
+    assert_eq!(plain.label, marked.label);
+    let scores = |i: &Instances| i.matches.iter().map(|m| m.score).collect::<Vec<_>>();
+    assert_ne!(scores(&plain), scores(&marked), "silhouettes of small Gaussians shrink");
+    assert!(ply::is_antialiased(s.path("out/instances.ply")).unwrap());
 }
 
 #[test]

@@ -94,6 +94,9 @@ struct LanguageArgs {
     /// Select look-alikes too: of the ten best those whose mean feature is within this of the best's (OpenGaussian: 0.9)
     #[arg(long, value_name = "DISTANCE", requires = "features")]
     join: Option<f32>,
+    /// Join only instances that lie below one parent in the tree of clusters, as OpenGaussian does below a coarse cluster
+    #[arg(long, requires = "join")]
+    join_siblings: bool,
     /// features.safetensors that the instances were clustered from, for --join
     #[arg(long, value_name = "FILE")]
     features: Option<PathBuf>,
@@ -141,7 +144,7 @@ impl LanguageArgs {
                 if features.kept.last().is_some_and(|&last| last as usize >= scene.instances.label.len()) {
                     return Err(Error::new("the features are of other Gaussians").file(path).field("kept"));
                 }
-                Some(Join::new(&scene.instances, &features, distance))
+                Some(Join::new(&scene.instances, &features, distance, self.join_siblings))
             }
             _ => None,
         };
@@ -160,7 +163,7 @@ impl LanguageArgs {
     fn parameters(&self) -> Value {
         json!({
             "top_k": self.top_k, "threshold": self.threshold, "min_support": self.min_support.unwrap_or(1),
-            "negatives": self.negatives, "templates": self.template, "join": self.join,
+            "negatives": self.negatives, "templates": self.template, "join": self.join, "join_siblings": self.join_siblings,
         })
     }
 
@@ -183,7 +186,10 @@ impl LanguageArgs {
             s += &format!("; templates {}", self.template.join(", "));
         }
         if let Some(d) = self.join {
-            s += &format!("; look-alikes within {d} joined");
+            s += &format!(
+                "; look-alikes within {d} joined{}",
+                if self.join_siblings { " below one parent" } else { "" }
+            );
         }
         s
     }
@@ -268,6 +274,15 @@ fn load(scene: &Path, options: &LoadOptions, stage: &Stage) -> Result<Dataset> {
     Ok(dataset)
 }
 
+/// Reads instances and geometry; damaged Gaussians are said.
+fn read_scene(instances: &Path, geometry: &Path, stage: &Stage) -> Result<LabelledScene> {
+    let scene = LabelledScene::read(instances, geometry)?;
+    if let Some(damage) = scene.geometry.damage() {
+        stage.skipped(&damage);
+    }
+    Ok(scene)
+}
+
 fn mask_threshold(alpha: Option<f32>, silhouette: Silhouette) -> Result<f32> {
     let value = alpha.unwrap_or(silhouette.default_threshold());
     if (0.0..1.0).contains(&value) {
@@ -279,7 +294,10 @@ fn mask_threshold(alpha: Option<f32>, silhouette: Silhouette) -> Result<f32> {
 fn run_score(a: &ScoreArgs, stage: &Stage) -> Result<String> {
     a.language.selection()?;
     let threshold = mask_threshold(a.alpha, a.silhouette)?;
-    let scene = LabelledScene::read(&a.scene.instances, &a.scene.geometry)?;
+    let scene = read_scene(&a.scene.instances, &a.scene.geometry, stage)?;
+    if scene.instances.label.iter().all(|&l| l < 0) {
+        stage.warn("all Gaussians are noise: every score is 0");
+    }
     let mut scores = Scores::default();
     let dataset = load(&a.scene.scene, &LoadOptions::default(), stage)?;
     scene.check_dataset(&dataset)?;

@@ -112,10 +112,11 @@ pub fn predict(
         })
         .collect();
     let selections: Vec<&[u32]> = asked.iter().map(|a| a.1).collect();
-    let masks = rendering.silhouette.masks(&scene.gaussians, &selections, &camera, rendering.threshold);
+    let masks = rendering.silhouette.masks(scene.gaussians(), &scene.raster, &selections, &camera, rendering.threshold);
     let maps: Vec<Option<Vec<f32>>> = if localise {
         let relevancies: Vec<&[f32]> = asked.iter().map(|a| a.2).collect();
-        let maps = silhouette::relevancy_maps(&scene.gaussians, &scene.instances.label, &relevancies, &camera);
+        let maps =
+            silhouette::relevancy_maps(scene.gaussians(), &scene.raster, &scene.instances.label, &relevancies, &camera);
         maps.into_iter().map(Some).collect()
     } else {
         vec![None; asked.len()]

@@ -3,6 +3,7 @@
 pub mod ask;
 pub mod cli;
 pub mod curves;
+pub mod granularity;
 pub mod html;
 pub mod label_iou;
 pub mod labels;

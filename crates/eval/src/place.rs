@@ -48,8 +48,8 @@ pub fn at_pixel(
             .found(format!("{x},{y}"))
             .expected(format!("x below {} and y below {} in {}", camera.width, camera.height, view.stem())));
     }
-    let options = RasterOptions { sh_degree: 0, ..RasterOptions::default() };
-    let here = tile_weights(&scene.gaussians, camera, &options, true, |t| {
+    let options = RasterOptions { sh_degree: 0, ..scene.raster.clone() };
+    let here = tile_weights(scene.gaussians(), camera, &options, true, |t| {
         let inside = (t.x0..t.x0 + t.width).contains(&x) && (t.y0..t.y0 + t.height).contains(&y);
         let at = inside.then(|| (y - t.y0) * TILE + x - t.x0)?;
         let weights = t.gaussians.iter().zip(t.weights.chunks_exact(TILE * TILE));
@@ -61,7 +61,7 @@ pub fn at_pixel(
     let mut position = [0.0f64; 3];
     for &(i, w) in &weights {
         *shares.entry(scene.instances.label[i as usize]).or_default() += w;
-        let mean = scene.gaussians.means[i as usize];
+        let mean = scene.gaussians().means[i as usize];
         (0..3).for_each(|k| position[k] += w / alpha * f64::from(mean[k]));
     }
     let noise = shares.get(&-1).copied().unwrap_or(0.0);
@@ -83,7 +83,7 @@ pub fn at_pixel(
 
 /// What is at a point of the world: the instance of the nearest labelled Gaussian of opacity at least 0.1.
 pub fn at_point(scene: &LabelledScene, index: &Index<'_>, point: [f32; 3]) -> (Place, Vec<Ranked>) {
-    let (g, label) = (&scene.gaussians, &scene.instances.label);
+    let (g, label) = (scene.gaussians(), &scene.instances.label);
     let speaks = |&i: &u32| label[i as usize] >= 0 && g.opacity(i as usize) >= MIN_OPACITY;
     let speakers: Vec<u32> = (0..g.len() as u32).filter(speaks).collect();
     let found = nearest(g, &speakers, &[point])[0];

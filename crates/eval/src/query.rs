@@ -9,7 +9,6 @@ use crate::scene::{LabelledScene, find_view, slug, spread};
 use crate::segment::{self, Segment, Segmentation};
 use artifacts::instance_color;
 use gs_io::{Error, Result, write_bytes};
-use gs_raster::RasterOptions;
 use gs_scene::dataset::{Dataset, View};
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeSet;
@@ -25,7 +24,7 @@ const DEFAULT_VIEWS: usize = 3;
 pub struct Asked {
     /// What it is called in `query.json` and in names of files: the text, a picture's name, a place.
     pub name: String,
-    /// `text`, `image`, `pixel` or `point`.
+    /// `text`, `image`, `pixel`, `point`, or `part` of what was found.
     pub kind: &'static str,
     /// The answer.
     pub answer: Answered,
@@ -72,7 +71,7 @@ pub struct QueryResults {
 pub struct QueryResult {
     /// The text, or what else was asked for.
     pub text: String,
-    /// `text`, `image`, `pixel` or `point`.
+    /// `text`, `image`, `pixel`, `point`, or `part` of what was found.
     #[serde(default)]
     pub kind: String,
     /// Where, for a pixel or a point.
@@ -150,9 +149,10 @@ pub fn write(
     for Shown { asked, file, .. } in shown.iter().filter(|s| !s.asked.answer.gaussians.is_empty()) {
         let ids: Vec<String> = asked.answer.selected.iter().map(u32::to_string).collect();
         let text: String = asked.name.chars().map(|c| if c.is_control() { ' ' } else { c }).collect();
-        let comments = [format!("cags query: {text}"), format!("cags instances: {}", ids.join(" "))];
+        let own = vec![format!("cags query: {text}"), format!("cags instances: {}", ids.join(" "))];
+        let comments = scene.geometry.comments(own);
         let path = out.join(format!("{file}.ply"));
-        gs_scene::ply::write_gaussians(&path, &scene.gaussians.select(&asked.answer.gaussians), &comments)?;
+        gs_scene::ply::write_gaussians(&path, &scene.gaussians().select(&asked.answer.gaussians), &comments)?;
     }
     let segmentation = divided.map(|d| write_segmentation(scene, dataset, &named, d, out)).transpose()?;
     let mut pictures: Vec<Vec<QueryView>> = vec![Vec::new(); shown.len()];
@@ -166,7 +166,7 @@ pub fn write(
         let photo = Picture::new(photo.width as usize, photo.height as usize, &photo.rgb);
         let selections: Vec<&[u32]> = here.iter().map(|&q| &shown[q].asked.answer.gaussians[..]).collect();
         let Rendering { silhouette, threshold } = options.rendering;
-        let masks = silhouette.masks(&scene.gaussians, &selections, &view.camera, threshold);
+        let masks = silhouette.masks(scene.gaussians(), &scene.raster, &selections, &view.camera, threshold);
         for (&q, mask) in here.iter().zip(&masks) {
             let stem = format!("{}.{}", shown[q].file, slug_of_view(view));
             let (overlay, mask_file) = (format!("{stem}.overlay.png"), format!("{stem}.mask.png"));
@@ -197,14 +197,14 @@ fn write_segmentation(
     out: &Path,
 ) -> Result<Segmentation> {
     let Divided { texts, labels, instances } = divided;
-    let coloured = segment::coloured(&scene.gaussians, &labels);
+    let coloured = segment::coloured(scene.gaussians(), &labels);
     let (npy, ply) = ("labels.npy", "segmentation.ply");
     gs_io::npy::write_i32(out.join(npy), &[labels.len()], &labels)?;
     let comments: Vec<String> = texts.iter().enumerate().map(|(t, text)| format!("cags label {t}: {text}")).collect();
-    gs_scene::ply::write_gaussians(out.join(ply), &coloured, &comments)?;
+    gs_scene::ply::write_gaussians(out.join(ply), &coloured, &scene.geometry.comments(comments))?;
     let all: Vec<&View> = dataset.views.iter().collect();
     for view in if named.is_empty() { spread(&all, DEFAULT_VIEWS) } else { named.to_vec() } {
-        let image = gs_raster::render(&coloured, &view.camera, &RasterOptions::default());
+        let image = gs_raster::render(&coloured, &view.camera, &scene.raster);
         let picture = Picture::new(image.width as usize, image.height as usize, &image.rgb);
         write_bytes(out.join(format!("segmentation.{}.png", slug_of_view(view))), &picture.png()?)?;
     }
@@ -260,9 +260,9 @@ fn result(
     }
 }
 
-/// The answer to a text as [`QueryResults`] holds it, without files: for queries that are only printed.
-pub fn unwritten(text: &str, answer: &Answered) -> QueryResult {
-    result(text.into(), "text", None, answer, None, Vec::new())
+/// An answer as [`QueryResults`] holds it, without files: for queries that are only printed.
+pub fn unwritten(asked: &Asked) -> QueryResult {
+    result(asked.name.clone(), asked.kind, None, &asked.answer, None, Vec::new())
 }
 
 /// A view's stem as part of a file name (names of views may hold folders).
@@ -311,6 +311,9 @@ pub fn answer_table(q: &QueryResult, rows: usize) -> String {
         for (name, score) in &place.names {
             let _ = writeln!(s, "  {score:>8.4} {name}");
         }
+    }
+    if q.kind == "part" {
+        return s;
     }
     let _ = writeln!(s, "  {:>4} {:>9} {:>8} {:>6} {:>10}", "rank", "instance", "score", "views", "Gaussians");
     for (i, r) in q.ranking.iter().take(rows).enumerate() {

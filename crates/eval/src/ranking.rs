@@ -159,17 +159,21 @@ impl<'a> Index<'a> {
 const JOIN_AMONG: usize = 10;
 
 /// Joins instances that look alike in instance-feature space, as OpenGaussian's query does: of the 10 best of the ranking,
-/// those whose mean feature lies within a distance of the best one's. Its further test, that both belong to one coarse
-/// cluster, has no counterpart here.
+/// those whose mean feature lies within a distance of the best one's. Its further test, that both are leaves of one coarse
+/// cluster, is here that both lie below one parent in the tree of clusters; by option, for that tree is finer than its 32
+/// to 64 coarse clusters.
 pub struct Join {
     distance: f64,
+    /// Per instance those that share its parent, where that is asked for.
+    siblings: Option<Vec<Vec<u32>>>,
     /// Mean of the unit features of each instance's Gaussians; none without any.
     means: Vec<Option<Vec<f64>>>,
 }
 
 impl Join {
-    /// Prepares joining within `distance` (OpenGaussian: 0.9), by the features that the instances were clustered from.
-    pub fn new(instances: &Instances, features: &Features, distance: f32) -> Self {
+    /// Prepares joining within `distance` (OpenGaussian: 0.9), by the features that the instances were clustered from, among
+    /// all instances or only those that share the best one's parent.
+    pub fn new(instances: &Instances, features: &Features, distance: f32, siblings_only: bool) -> Self {
         let mut sums: Vec<(Vec<f64>, usize)> = vec![(vec![0.0; features.dim], 0); instances.len()];
         for (at, &gaussian) in features.kept.iter().enumerate() {
             let Ok(label) = usize::try_from(instances.label[gaussian as usize]) else { continue };
@@ -183,17 +187,22 @@ impl Join {
         }
         let mean =
             |(sum, count): (Vec<f64>, usize)| (count > 0).then(|| sum.into_iter().map(|v| v / count as f64).collect());
-        Self { distance: f64::from(distance), means: sums.into_iter().map(mean).collect() }
+        let family = |k: usize| instances.family(k).and_then(|f| f.parent);
+        let siblings = |k: usize| family(k).map_or(Vec::new(), |p| instances.instances_of_cluster(p));
+        let siblings = siblings_only.then(|| (0..instances.len()).map(siblings).collect());
+        Self { distance: f64::from(distance), siblings, means: sums.into_iter().map(mean).collect() }
     }
 
     /// `selected` and what joins its first, in the order of the ranking.
     pub fn extend(&self, ranking: &[Ranked], min_support: u32, selected: &[u32]) -> Vec<u32> {
         let mut all = selected.to_vec();
-        let Some(best) = selected.first().and_then(|&b| self.means[b as usize].as_ref()) else { return all };
+        let Some(&first) = selected.first() else { return all };
+        let Some(best) = &self.means[first as usize] else { return all };
+        let near = |i: u32| self.siblings.as_ref().is_none_or(|s| s[first as usize].contains(&i));
         for r in ranking.iter().filter(|r| r.support >= min_support).take(JOIN_AMONG) {
             let Some(mean) = &self.means[r.instance as usize] else { continue };
             let squared: f64 = mean.iter().zip(best).map(|(a, b)| (a - b).powi(2)).sum();
-            if squared.sqrt() < self.distance && !all.contains(&r.instance) {
+            if squared.sqrt() < self.distance && near(r.instance) && !all.contains(&r.instance) {
                 all.push(r.instance);
             }
         }
@@ -204,6 +213,7 @@ impl Join {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use artifacts::TreeEdge;
 
     fn instances() -> Instances {
         let k = 4;
@@ -275,10 +285,15 @@ mod tests {
         let values = vec![1.0, 0.0, 0.9, 0.3, -2.0, 0.1, -1.0, 0.0, 0.0, 0.0];
         let f = Features { kept: vec![0, 1, 2, 3, 4], dim: 2, values };
         let ranking = rank(&[1.0, 0.0]);
-        assert_eq!(Join::new(&i, &f, 0.9).extend(&ranking, 0, &[0]), [0, 1]);
-        assert_eq!(Join::new(&i, &f, 0.1).extend(&ranking, 0, &[0]), [0]);
-        assert_eq!(Join::new(&i, &f, 3.0).extend(&ranking, 0, &[0]), [0, 1, 3]);
-        assert_eq!(Join::new(&i, &f, 3.0).extend(&ranking, 5, &[0]), [0, 3], "support counts here too");
-        assert!(Join::new(&i, &f, 3.0).extend(&ranking, 0, &[]).is_empty());
+        assert_eq!(Join::new(&i, &f, 0.9, false).extend(&ranking, 0, &[0]), [0, 1]);
+        assert_eq!(Join::new(&i, &f, 0.1, false).extend(&ranking, 0, &[0]), [0]);
+        assert_eq!(Join::new(&i, &f, 3.0, false).extend(&ranking, 0, &[0]), [0, 1, 3]);
+        assert_eq!(Join::new(&i, &f, 3.0, false).extend(&ranking, 5, &[0]), [0, 3], "support counts here too");
+        assert!(Join::new(&i, &f, 3.0, false).extend(&ranking, 0, &[]).is_empty());
+        // Only below one parent: 6 holds the instances 0 and 3, and 1 stands alone.
+        let edge = |parent, child, instance| TreeEdge { parent, child, lambda: 1.0, size: 2, instance };
+        i.tree = vec![edge(5, 6, -1), edge(5, 7, 1), edge(6, 8, 0), edge(6, 9, 3)];
+        assert_eq!(Join::new(&i, &f, 3.0, true).extend(&ranking, 0, &[0]), [0, 3]);
+        assert_eq!(Join::new(&i, &f, 3.0, true).extend(&ranking, 0, &[1]), [1]);
     }
 }

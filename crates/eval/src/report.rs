@@ -14,7 +14,7 @@ use crate::{curves, svg};
 use artifacts::{Features, Level, MaskMaps, NOISE_COLOR, hash_folder, instance_color, maps_path, role};
 use gs_io::{Error, IoContext, Result, hash_file, write_bytes};
 use gs_raster::RasterOptions;
-use gs_scene::Gaussians;
+use gs_scene::Geometry;
 use gs_scene::dataset::{Dataset, Split, View};
 use serde::{Deserialize, Serialize};
 use serde_json::Value;
@@ -95,7 +95,8 @@ const BACKDROP: [f32; 3] = [0.08, 0.09, 0.1];
 struct Material<'a> {
     options: &'a ReportOptions,
     dataset: &'a Dataset,
-    gaussians: Gaussians,
+    geometry: Geometry,
+    raster: RasterOptions,
     geometry_hash: String,
     labelled: Option<LabelledScene>,
     scores: Option<Scores>,
@@ -119,7 +120,7 @@ pub fn run(dataset: &Dataset, options: &ReportOptions, inputs: &mut BTreeMap<Str
     let mut metrics = Metrics::default();
     let material = Material::read(dataset, options, &mut metrics, inputs)?;
     let records = run_records(&material)?;
-    metrics.gaussians = material.gaussians.len();
+    metrics.gaussians = material.geometry.gaussians.len();
     metrics.instances = material.labelled.as_ref().map(|l| l.instances.len());
     geometry_figures(&material, &mut metrics)?;
     metrics.seconds = runs::seconds(&records);
@@ -148,7 +149,7 @@ pub fn run(dataset: &Dataset, options: &ReportOptions, inputs: &mut BTreeMap<Str
         dataset.views.iter().filter(|v| v.split == Split::Test).count(),
         dataset.views.first().map_or(0, |v| v.camera.width),
         dataset.views.first().map_or(0, |v| v.camera.height),
-        grouped(&material.gaussians.len().to_string()),
+        grouped(&material.geometry.gaussians.len().to_string()),
     );
     let path = metrics_path(options);
     let json = serde_json::to_vec_pretty(&metrics).map_err(|e| Error::new(e.to_string()).file(&path))?;
@@ -182,10 +183,12 @@ impl<'a> Material<'a> {
             metrics.skipped.push("instances: the run has no instances.safetensors (cluster-match makes it)".into());
             None
         };
-        let gaussians = match &labelled {
-            Some(l) => l.gaussians.clone(),
-            None => gs_scene::ply::read_gaussians(&geometry)?,
+        let geometry = match &labelled {
+            Some(l) => l.geometry.clone(),
+            None => Geometry::read(&geometry)?,
         };
+        metrics.skipped.extend(geometry.damage());
+        let raster = RasterOptions::of(&geometry);
         let scores = optional_json::<Scores>(&options.run_dir.join("score.json"))?;
         match &scores {
             Some(s) => metrics.skipped.extend(s.skipped.iter().cloned()),
@@ -195,12 +198,12 @@ impl<'a> Material<'a> {
         for view in views_to_show(dataset, &options.views)? {
             let photo = view.load_image()?;
             let photo = Picture::new(photo.width as usize, photo.height as usize, &photo.rgb);
-            let rendered = gs_raster::render(&gaussians, &view.camera, &RasterOptions::default());
+            let rendered = gs_raster::render(&geometry.gaussians, &view.camera, &raster);
             let render = Picture::new(rendered.width as usize, rendered.height as usize, &rendered.rgb);
             let psnr = psnr(&photo, &render);
             shown.push(Shown { view, photo, render, psnr });
         }
-        Ok(Self { options, dataset, gaussians, geometry_hash, labelled, scores, shown })
+        Ok(Self { options, dataset, geometry, raster, geometry_hash, labelled, scores, shown })
     }
 
     fn file(&self, name: &str) -> PathBuf {
@@ -370,7 +373,7 @@ fn features(m: &Material, page: &mut Page, metrics: &mut Metrics) -> Result<()> 
     }
     let (features, artifact) = Features::read(&path)?;
     artifact.expect_input(role::GEOMETRY, &m.geometry_hash)?;
-    if features.kept.last().is_some_and(|&i| i as usize >= m.gaussians.len()) {
+    if features.kept.last().is_some_and(|&i| i as usize >= m.geometry.gaussians.len()) {
         return Err(Error::new("index out of range").file(&path).field("kept").hint("run feat-train again"));
     }
     if features.dim == 0 || features.kept.is_empty() {
@@ -380,7 +383,7 @@ fn features(m: &Material, page: &mut Page, metrics: &mut Metrics) -> Result<()> 
     let step = features.kept.len().div_ceil(PCA_ROWS);
     let rows: Vec<f32> = features.values.chunks_exact(features.dim).step_by(step).flatten().copied().collect();
     let p = pca(&rows, features.dim, 3);
-    let mut colors = vec![None; m.gaussians.len()];
+    let mut colors = vec![None; m.geometry.gaussians.len()];
     for (&i, c) in features.kept.iter().zip(p.colors(&features.values)) {
         colors[i as usize] = Some(c);
     }
@@ -392,7 +395,7 @@ fn features(m: &Material, page: &mut Page, metrics: &mut Metrics) -> Result<()> 
     ));
     let mut figures = Vec::new();
     for s in &m.shown {
-        let picture = render_colors(&m.gaussians, &colors, s.view);
+        let picture = render_colors(m, &colors, s.view);
         figures.push(figure(&picture, 3, s.view.stem().to_string())?);
     }
     page.figures(3, &figures);
@@ -400,12 +403,12 @@ fn features(m: &Material, page: &mut Page, metrics: &mut Metrics) -> Result<()> 
 }
 
 /// Renders a colour per Gaussian; Gaussians without one are left out of the mixture.
-fn render_colors(gaussians: &Gaussians, colors: &[Option<[f32; 3]>], view: &View) -> Picture {
+fn render_colors(m: &Material, colors: &[Option<[f32; 3]>], view: &View) -> Picture {
     let width = view.camera.width.min(MAX_RENDER);
     let height = (f64::from(view.camera.height) * f64::from(width) / f64::from(view.camera.width)).round() as u32;
     let camera = view.camera.resized(width, height.max(1));
     let channels: Vec<f32> = colors.iter().flat_map(|c| c.map_or([0.0; 4], |[r, g, b]| [r, g, b, 1.0])).collect();
-    let out = gs_raster::render_features(gaussians, &channels, 4, &camera, &RasterOptions::default());
+    let out = gs_raster::render_features(&m.geometry.gaussians, &channels, 4, &camera, &m.raster);
     let over = |p: &[f32]| [0, 1, 2].map(|k| p[k] + (1.0 - p[3]).max(0.0) * BACKDROP[k]);
     let rgb: Vec<f32> = out.chunks_exact(4).flat_map(over).collect();
     Picture::new(camera.width as usize, camera.height as usize, &rgb)
@@ -431,7 +434,7 @@ fn instances(m: &Material, page: &mut Page, metrics: &mut Metrics) -> Result<()>
     let mut figures = Vec::new();
     for s in &m.shown {
         figures.push(figure(&s.photo, 2, format!("{}: photograph", s.view.stem()))?);
-        let picture = render_colors(&m.gaussians, &colors, s.view);
+        let picture = render_colors(m, &colors, s.view);
         figures.push(figure(&picture, 2, format!("{}: instances", s.view.stem()))?);
     }
     page.figures(2, &figures);

@@ -172,8 +172,9 @@ struct Matched {
 }
 
 fn matched(scene: &LabelledScene, vertices: &[[f32; 3]], options: &ScanOptions, labels: &Path) -> Result<Matched> {
-    let g = &scene.gaussians;
-    let faint = |i: usize| options.opacity_rule && g.opacity(i) < FAINT;
+    let g = scene.gaussians();
+    let whole = scene.geometry.whole();
+    let faint = |i: usize| !whole[i] || options.opacity_rule && g.opacity(i) < FAINT;
     if options.association != Association::OneToOne {
         let speakers: Vec<u32> = (0..g.len() as u32).filter(|&i| !faint(i as usize)).collect();
         let gaussian = scannet::nearest(g, &speakers, vertices);
@@ -188,7 +189,7 @@ fn matched(scene: &LabelledScene, vertices: &[[f32; 3]], options: &ScanOptions, 
             .expected(format!("{}, as many as Gaussians", g.len()))
             .hint(hint));
     }
-    let apart = |i: &usize| (0..3).any(|k| (g.means[*i][k] - vertices[*i][k]).abs() > FROZEN);
+    let apart = |i: &usize| whole[*i] && (0..3).any(|k| (g.means[*i][k] - vertices[*i][k]).abs() > FROZEN);
     if let Some(i) = (0..g.len()).find(apart) {
         return Err(Error::new("the Gaussian of this number lies elsewhere")
             .file(labels)
@@ -217,7 +218,7 @@ pub fn score(
     without: &[String],
 ) -> Result<(Vec<SetFigures>, Option<InstanceFigures>, Vec<String>)> {
     let (vertices, labels) = gs_scene::ply::read_labels(&files.labels, "label")?;
-    let g = &scene.gaussians;
+    let g = scene.gaussians();
     let matched = matched(scene, &vertices, options, &files.labels)?;
     let mut notes = Vec::new();
     let mut sets = Vec::new();
@@ -227,7 +228,10 @@ pub fn score(
     }
     let out = matched.counts.iter().filter(|c| !**c).count();
     if out > 0 {
-        notes.push(format!("{out} of {} vertices leave the evaluation: their Gaussian is faint", vertices.len()));
+        notes.push(format!(
+            "{out} of {} vertices leave the evaluation: their Gaussian is faint or damaged",
+            vertices.len()
+        ));
     }
     if let Some(texts) = texts {
         assert_eq!(texts.len(), scannet::NYU40.len());
@@ -255,7 +259,9 @@ pub fn score(
             let truth = scannet::truth_classes(&labels, &set);
             let (confusion, lost) = if options.association == Association::Volume {
                 let truth = scannet::volume_truth(g, &vertices, &truth, set.len());
-                let counts: Vec<bool> = (0..g.len()).map(|i| !options.opacity_rule || g.opacity(i) >= FAINT).collect();
+                let whole = scene.geometry.whole();
+                let counts = |i: usize| whole[i] && (!options.opacity_rule || g.opacity(i) >= FAINT);
+                let counts: Vec<bool> = (0..g.len()).map(counts).collect();
                 let lost =
                     (0..g.len()).filter(|&i| counts[i] && truth[i].0.is_some() && described[i].is_none()).count();
                 (scannet::score_volumes(&truth, &class, &counts, set.len()), lost)

@@ -2,15 +2,18 @@
 
 use artifacts::{Instances, role};
 use gs_io::{Artifact, Error, Result, hash_file};
-use gs_scene::Gaussians;
+use gs_raster::RasterOptions;
 use gs_scene::dataset::{Dataset, View};
+use gs_scene::{Gaussians, Geometry};
 use std::collections::BTreeMap;
 use std::path::Path;
 
 /// Instances with the Gaussians they label.
 pub struct LabelledScene {
-    /// All Gaussians of the geometry; N.
-    pub gaussians: Gaussians,
+    /// The geometry with all its Gaussians; N.
+    pub geometry: Geometry,
+    /// How to render them.
+    pub raster: RasterOptions,
     /// The instances; labels are as many as Gaussians.
     pub instances: Instances,
     /// The file of the instances.
@@ -28,18 +31,25 @@ impl LabelledScene {
         let (labelled, artifact) = Instances::read(instances)?;
         let geometry_hash = hash_file(geometry)?;
         artifact.expect_input(role::GEOMETRY, &geometry_hash)?;
-        let gaussians = gs_scene::ply::read_gaussians(geometry)?;
-        if labelled.label.len() != gaussians.len() {
+        let path = geometry;
+        let geometry = Geometry::read(path)?;
+        if labelled.label.len() != geometry.gaussians.len() {
             return Err(Error::new("not a label per Gaussian")
                 .file(instances)
                 .field("label")
                 .found(labelled.label.len())
-                .expected(format!("{} ({})", gaussians.len(), geometry.display()))
+                .expected(format!("{} ({})", geometry.gaussians.len(), path.display()))
                 .hint("run cluster-match again"));
         }
         let inputs =
             BTreeMap::from([(role::GEOMETRY.into(), geometry_hash), ("instances".into(), artifact.hash().into())]);
-        Ok(Self { gaussians, instances: labelled, artifact, inputs })
+        let raster = RasterOptions::of(&geometry);
+        Ok(Self { geometry, raster, instances: labelled, artifact, inputs })
+    }
+
+    /// All Gaussians.
+    pub fn gaussians(&self) -> &Gaussians {
+        &self.geometry.gaussians
     }
 
     /// Where the instances were read from.

@@ -164,7 +164,7 @@ pub fn score_labels(scene: &LabelledScene, dataset: &Dataset, folder: &Path, sco
 
 /// Label of the nearest labelled Gaussian of sufficient opacity for each point; -1 when there is none at all.
 fn nearest_labels(scene: &LabelledScene, points: &[[f32; 3]]) -> Vec<i32> {
-    let (g, label) = (&scene.gaussians, &scene.instances.label);
+    let (g, label) = (scene.gaussians(), &scene.instances.label);
     let speaks = |&i: &u32| label[i as usize] >= 0 && g.opacity(i as usize) >= MIN_OPACITY;
     let speakers: Vec<u32> = (0..g.len() as u32).filter(speaks).collect();
     let nearest = scannet::nearest(g, &speakers, points);
@@ -195,6 +195,10 @@ pub fn score_queries(
     let answers = lerf::ask(asker, &texts, false)?;
     for (text, _) in answers.iter().filter(|(_, a)| matches!(a, Answer::Unasked(_))) {
         warn(&format!("no text feature of the category {text:?}: it counts as IoU 0"));
+    }
+    let empty = |a: &Answer| matches!(a, Answer::Selected { gaussians, .. } if gaussians.is_empty());
+    for (text, _) in answers.iter().filter(|(_, a)| empty(a)) {
+        warn(&format!("nothing is selected for {text:?}: it counts as IoU 0"));
     }
     let seen = Rendering { silhouette: Silhouette::Visible, threshold: Silhouette::Visible.default_threshold() };
     let (mut pairs, mut visible) = (Vec::new(), Vec::new());

@@ -30,34 +30,47 @@ impl Silhouette {
         }
     }
 
-    /// Masks of several selections (ascending indices of Gaussians) in one view, in order.
-    pub fn masks(self, gaussians: &Gaussians, selections: &[&[u32]], camera: &Camera, threshold: f32) -> Vec<Mask> {
+    /// Masks of several selections (ascending indices of Gaussians) in one view, in order; rendered as `raster` says.
+    pub fn masks(
+        self,
+        gaussians: &Gaussians,
+        raster: &RasterOptions,
+        selections: &[&[u32]],
+        camera: &Camera,
+        threshold: f32,
+    ) -> Vec<Mask> {
         match self {
-            Self::Selected => selections.iter().map(|s| alone(gaussians, s, camera, threshold)).collect(),
-            Self::Visible => visible(gaussians, selections, camera, threshold),
+            Self::Selected => selections.iter().map(|s| alone(gaussians, raster, s, camera, threshold)).collect(),
+            Self::Visible => visible(gaussians, raster, selections, camera, threshold),
         }
     }
 }
 
 /// Colours do not matter for a silhouette, so neither does the view-dependent part of them.
-fn options() -> RasterOptions {
-    RasterOptions { sh_degree: 0, ..RasterOptions::default() }
+fn colourless(raster: &RasterOptions) -> RasterOptions {
+    RasterOptions { sh_degree: 0, ..raster.clone() }
 }
 
-fn alone(gaussians: &Gaussians, selection: &[u32], camera: &Camera, threshold: f32) -> Mask {
+fn alone(gaussians: &Gaussians, raster: &RasterOptions, selection: &[u32], camera: &Camera, threshold: f32) -> Mask {
     let (w, h) = (camera.width as usize, camera.height as usize);
     if selection.is_empty() {
         return Mask::new(w, h);
     }
-    Mask::above(w, h, &gs_raster::render(&gaussians.select(selection), camera, &options()).alpha, threshold)
+    Mask::above(w, h, &gs_raster::render(&gaussians.select(selection), camera, &colourless(raster)).alpha, threshold)
 }
 
 /// Selections rendered at once; more are done in turns, which bounds the memory.
 const CHANNELS: usize = 16;
 
-fn visible(gaussians: &Gaussians, selections: &[&[u32]], camera: &Camera, threshold: f32) -> Vec<Mask> {
+fn visible(
+    gaussians: &Gaussians,
+    raster: &RasterOptions,
+    selections: &[&[u32]],
+    camera: &Camera,
+    threshold: f32,
+) -> Vec<Mask> {
     let (w, h) = (camera.width as usize, camera.height as usize);
-    let shares = blended(gaussians, selections.len(), camera, |member, k, d| {
+    let shares = blended(gaussians, raster, selections.len(), camera, |member, k, d| {
         for &i in selections[k] {
             member[i as usize * d] = 1.0;
         }
@@ -65,14 +78,20 @@ fn visible(gaussians: &Gaussians, selections: &[&[u32]], camera: &Camera, thresh
     shares.iter().map(|share| Mask::above(w, h, share, threshold)).collect()
 }
 
-/// Rendered relevancy, `[height][width]` for each of `relevancies` (a value per instance): every Gaussian has its
+/// Relevancy rendered as `raster` says, `[height][width]` for each of `relevancies` (a value per instance): every Gaussian has its
 /// instance's value, one of no instance 0, and so has what lies behind the Gaussians.
 ///
 /// # Panics
 /// When `label` is not a label per Gaussian or exceeds the instances.
-pub fn relevancy_maps(gaussians: &Gaussians, label: &[i32], relevancies: &[&[f32]], camera: &Camera) -> Vec<Vec<f32>> {
+pub fn relevancy_maps(
+    gaussians: &Gaussians,
+    raster: &RasterOptions,
+    label: &[i32],
+    relevancies: &[&[f32]],
+    camera: &Camera,
+) -> Vec<Vec<f32>> {
     assert_eq!(label.len(), gaussians.len());
-    blended(gaussians, relevancies.len(), camera, |values, k, d| {
+    blended(gaussians, raster, relevancies.len(), camera, |values, k, d| {
         for (i, &l) in label.iter().enumerate() {
             if l >= 0 {
                 values[i * d] = relevancies[k][l as usize];
@@ -84,6 +103,7 @@ pub fn relevancy_maps(gaussians: &Gaussians, label: &[i32], relevancies: &[&[f32
 /// Blends `count` values per Gaussian. `fill(values, k, d)` writes value k of Gaussian i to `values[i * d]`.
 fn blended(
     gaussians: &Gaussians,
+    raster: &RasterOptions,
     count: usize,
     camera: &Camera,
     fill: impl Fn(&mut [f32], usize, usize),
@@ -95,7 +115,7 @@ fn blended(
         if !gaussians.is_empty() {
             (0..d).for_each(|k| fill(&mut values[k..], first + k, d));
         }
-        let image = gs_raster::render_features(gaussians, &values, d, camera, &options());
+        let image = gs_raster::render_features(gaussians, &values, d, camera, &colourless(raster));
         maps.extend((0..d).map(|k| image.iter().skip(k).step_by(d).copied().collect::<Vec<f32>>()));
     }
     maps
@@ -119,12 +139,39 @@ mod tests {
         (g, Camera::look_at(DVec3::ZERO, DVec3::Z, -DVec3::Y, 64, 48, 1.0))
     }
 
+    fn raster() -> RasterOptions {
+        RasterOptions::default()
+    }
+
+    #[test]
+    fn silhouettes_of_a_marked_geometry_are_those_of_the_filtered_render() {
+        let (mut g, camera) = balls();
+        g.log_scales = vec![[-5.0; 3], [-4.2; 3]];
+        let areas = [false, true].map(|antialias| {
+            let raster = RasterOptions::of(&gs_scene::Geometry { antialias, ..Default::default() });
+            let direct = RasterOptions { antialias, ..RasterOptions::default() };
+            let mut pixels = 0;
+            for (own, threshold) in [(0u32, 0.2), (1, 0.2)] {
+                let alone = &Silhouette::Selected.masks(&g, &raster, &[&[own]], &camera, threshold)[0];
+                let alpha = gs_raster::render(&g.select(&[own]), &camera, &direct).alpha;
+                assert_eq!(*alone, Mask::above(64, 48, &alpha, threshold));
+                let seen = &Silhouette::Visible.masks(&g, &raster, &[&[own]], &camera, threshold)[0];
+                let member: Vec<f32> = (0..2).map(|i| f32::from(u8::from(i == own))).collect();
+                let share = gs_raster::render_features(&g, &member, 1, &camera, &direct);
+                assert_eq!(*seen, Mask::above(64, 48, &share, threshold));
+                pixels += alone.count() + seen.count();
+            }
+            pixels
+        });
+        assert!(areas[1] < areas[0], "the filter thins what is smaller than a pixel: {areas:?}");
+    }
+
     #[test]
     fn a_hidden_part_counts_only_when_rendered_alone() {
         let (g, camera) = balls();
         let far: &[u32] = &[1];
-        let alone = &Silhouette::Selected.masks(&g, &[far], &camera, 0.7)[0];
-        let seen = &Silhouette::Visible.masks(&g, &[far, &[0, 1]], &camera, 0.5);
+        let alone = &Silhouette::Selected.masks(&g, &raster(), &[far], &camera, 0.7)[0];
+        let seen = &Silhouette::Visible.masks(&g, &raster(), &[far, &[0, 1]], &camera, 0.5);
         let centre = 24 * 64 + 32;
         assert!(alone.bits[centre] && !seen[0].bits[centre] && seen[1].bits[centre]);
         assert!(seen[0].count() > 20, "its rim is seen");
@@ -138,17 +185,17 @@ mod tests {
     #[test]
     fn relevancy_is_that_of_what_is_seen() {
         let (g, camera) = balls();
-        let maps = relevancy_maps(&g, &[1, 0], &[&[0.25, 1.0], &[0.5, 0.0]], &camera);
+        let maps = relevancy_maps(&g, &raster(), &[1, 0], &[&[0.25, 1.0], &[0.5, 0.0]], &camera);
         let centre = 24 * 64 + 32;
         assert!(maps[0][centre] > 0.95 && maps[1][centre] < 0.03, "the near ball");
-        assert_eq!(relevancy_maps(&g, &[-1, -1], &[&[]], &camera)[0], vec![0.0; 64 * 48]);
+        assert_eq!(relevancy_maps(&g, &raster(), &[-1, -1], &[&[]], &camera)[0], vec![0.0; 64 * 48]);
     }
 
     #[test]
     fn nothing_selected_covers_nothing() {
         let (g, camera) = balls();
         for s in [Silhouette::Selected, Silhouette::Visible] {
-            assert_eq!(s.masks(&g, &[&[]], &camera, s.default_threshold())[0].count(), 0);
+            assert_eq!(s.masks(&g, &raster(), &[&[]], &camera, s.default_threshold())[0].count(), 0);
         }
     }
 
@@ -157,7 +204,7 @@ mod tests {
         let (g, camera) = balls();
         let selections: Vec<&[u32]> =
             (0..CHANNELS + 3).map(|i| if i % 2 == 0 { &[0u32][..] } else { &[1][..] }).collect();
-        let masks = Silhouette::Visible.masks(&g, &selections, &camera, 0.5);
+        let masks = Silhouette::Visible.masks(&g, &raster(), &selections, &camera, 0.5);
         assert_eq!(masks.len(), CHANNELS + 3);
         assert_eq!(masks[CHANNELS], masks[0]);
         assert_eq!(masks[CHANNELS + 1], masks[1]);

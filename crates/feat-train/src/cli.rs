@@ -13,7 +13,7 @@ use crate::train::{CurvePoint, TrainOptions, train};
 use artifacts::{Features, Footprints, Graph, Level, role};
 use clap::ValueEnum;
 use gs_io::{Error, Result, hash_file, write_bytes};
-use gs_scene::{SH_C0, ply};
+use gs_scene::{Geometry, SH_C0};
 use serde_json::{Value, json};
 use stage::curve::{self, Panel};
 use stage::{CommonArgs, Program, Stage};
@@ -268,8 +268,12 @@ impl Args {
 
     fn contrastive<W: Weight>(&self, inputs: &Inputs, stage: &Stage) -> Result<(usize, Vec<f32>, Value)> {
         let c = &self.contrastive;
-        // Damaged Gaussians are no kept ones: graph-precompute leaves them out.
-        let gaussians = ply::read_gaussians_as_they_are(&self.geometry)?;
+        // Damaged Gaussians are no kept ones: graph-precompute left them out.
+        let geometry = Geometry::read(&self.geometry)?;
+        if let Some(damage) = geometry.damage() {
+            stage.skipped(&damage);
+        }
+        let gaussians = geometry.gaussians;
         if let Some(&last) = inputs.graph.kept.last().filter(|l| **l as usize >= gaussians.len()) {
             return Err(Error::new("the graph speaks of Gaussians that the geometry lacks")
                 .file(&self.graph)
@@ -283,12 +287,6 @@ impl Args {
             .iter()
             .map(|&i| [0, 1, 2].map(|ch| 0.5 + SH_C0 * gaussians.sh_of(i as usize)[ch]))
             .collect();
-        if let Some(bad) = colors.iter().position(|c| c.iter().any(|v| !v.is_finite())) {
-            return Err(Error::new("a colour is not finite")
-                .file(&self.geometry)
-                .field(format!("vertex {}, f_dc_*", inputs.graph.kept[bad]))
-                .hint("mend the PLY, as with gs-geom convert"));
-        }
         let positions: Vec<[f32; 3]> = inputs.graph.kept.iter().map(|&i| gaussians.means[i as usize]).collect();
         drop(gaussians);
         let context = Context::new(&inputs.graph, &colors, &positions, c.neighbours, !c.no_propagation);

@@ -110,6 +110,35 @@ fn setup() -> (tempfile::TempDir, PathBuf) {
     (dir, out)
 }
 
+/// graph-precompute leaves damaged Gaussians out; this stage says so, and what it makes of the others is the same.
+#[test]
+fn damaged_gaussians_change_nothing() {
+    let (dir, out) = setup();
+    let options = ["--method", "contrastive", "--iterations", "100", "--lr", "0.01"];
+    succeed(dir.path(), &out, &options);
+    let values = || Features::read(&out).unwrap().0.values;
+    let before = values();
+    let geometry = dir.path().join("geometry.ply");
+    let mut g = ply::read_gaussians(&geometry).unwrap();
+    let rows: Vec<u32> = (0..N as u32).chain([0, 1]).collect();
+    g = g.select(&rows);
+    (g.sh[3 * N], g.means[N + 1][2]) = (f32::NAN, f32::INFINITY);
+    ply::write_gaussians(&geometry, &g, &[]).unwrap();
+    let inputs = BTreeMap::from([
+        (role::GEOMETRY.to_string(), hash_file(&geometry).unwrap()),
+        (role::MASKS.to_string(), "ab".repeat(32)),
+    ]);
+    let provenance = || Provenance { inputs: inputs.clone(), ..Provenance::default() };
+    let unseen = |values: Vec<f32>| values.into_iter().chain([0.0; 2]).collect();
+    let graph = Graph { seen_views: vec![1; N + 2], seen_weight: unseen(vec![1.0; N]), ..graph() };
+    graph.write(dir.path().join("graph.safetensors"), provenance()).unwrap();
+    footprints().write(dir.path().join("footprints.safetensors"), provenance()).unwrap();
+    let output = run(dir.path(), &out, &options);
+    let said = String::from_utf8_lossy(&output.stderr);
+    assert!(output.status.success() && said.contains("skipped 2 of 122 Gaussians: damaged"), "{said}");
+    assert_eq!(values(), before);
+}
+
 #[test]
 fn the_closed_form_tells_things_apart_and_not_their_halves() {
     let (dir, out) = setup();

@@ -6,8 +6,8 @@ use artifacts::ScratchEntries;
 use graph_precompute::graph::{GraphOptions, Space, anchor_graph};
 use graph_precompute::positions::shifted;
 use graph_precompute::precompute::{Options, precompute};
+use gs_scene::Geometry;
 use gs_scene::dataset::{self, LoadOptions, Resolution, Split, View};
-use gs_scene::{Gaussians, ply};
 use std::path::{Path, PathBuf};
 
 /// Sampling: its name, in which space, and whether unseen Gaussians take part.
@@ -19,15 +19,15 @@ const SAMPLINGS: [(&str, Space, bool); 4] = [
 ];
 
 /// The Gaussians that some view of the scene sees.
-fn seen(gaussians: &Gaussians, scene: &Path, masks: &Path) -> Vec<[f32; 3]> {
+fn seen(geometry: &Geometry, scene: &Path, masks: &Path) -> Vec<[f32; 3]> {
     let load = LoadOptions { resolution: Resolution::Divisor(1.0), holdout: 8 };
     let dataset = dataset::load(scene, &load).expect("a scene");
     let views: Vec<&View> = dataset.views.iter().filter(|v| v.split == Split::Train).collect();
     let stage = stage::Stage::silent("bench");
     let mut entries = ScratchEntries::beside(&std::env::temp_dir().join("footprints")).expect("room for footprints");
     let (_, graph, _) =
-        precompute(gaussians, &views, masks, &Options::default(), &stage, &mut entries).expect("footprints");
-    graph.kept.iter().map(|&i| gaussians.means[i as usize]).collect()
+        precompute(geometry, &views, masks, &Options::default(), &stage, &mut entries).expect("footprints");
+    graph.kept.iter().map(|&i| geometry.gaussians.means[i as usize]).collect()
 }
 
 fn main() {
@@ -40,8 +40,9 @@ fn main() {
     while let [file, after @ ..] = rest {
         let folders = if after.len() >= 2 && after[0].is_dir() { 2 } else { 0 };
         rest = &after[folders..];
-        let gaussians = ply::read_gaussians(file).expect("a 3DGS PLY");
-        let visible = (folders == 2).then(|| seen(&gaussians, &after[0], &after[1]));
+        let geometry = Geometry::read(file).expect("a 3DGS PLY");
+        let gaussians = &geometry.gaussians;
+        let visible = (folders == 2).then(|| seen(&geometry, &after[0], &after[1]));
         for (name, space, everything) in SAMPLINGS {
             let Some(means) = (if everything { Some(&gaussians.means) } else { visible.as_ref() }) else { continue };
             let points = shifted(means).points;

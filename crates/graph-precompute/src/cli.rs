@@ -4,8 +4,8 @@ use crate::graph::{GraphOptions, Space};
 use crate::precompute::{Options, precompute};
 use artifacts::{ScratchEntries, role};
 use gs_io::{Error, Result, hash_file};
+use gs_scene::Geometry;
 use gs_scene::dataset::{self, LoadOptions, Resolution, Split, View};
-use gs_scene::ply;
 use serde_json::{Value, json};
 use stage::{CommonArgs, Program, Stage};
 use std::collections::BTreeMap;
@@ -171,10 +171,8 @@ impl Program for Args {
         }
         let views: Vec<&View> =
             dataset.views.iter().filter(|v| self.views == Views::All || v.split == Split::Train).collect();
-        // Damaged Gaussians are left out and said to be, not refused: the rest of the scene is none the worse.
-        let mut gaussians = ply::read_gaussians_as_they_are(&self.geometry)?;
-        gaussians.opacity_logits.iter_mut().filter(|o| o.is_infinite()).for_each(|o| *o = o.clamp(-50.0, 50.0));
-        if gaussians.is_empty() {
+        let geometry = Geometry::read(&self.geometry)?;
+        if geometry.gaussians.is_empty() {
             return Err(Error::new("no Gaussians").file(&self.geometry).hint("train the geometry first"));
         }
         let inputs = BTreeMap::from([
@@ -183,11 +181,11 @@ impl Program for Args {
             (role::MASKS.to_string(), artifacts::hash_folder(&self.masks, "_s.npy")?),
         ]);
         let mut entries = ScratchEntries::beside(&self.footprints)?;
-        let (footprints, graph, summary) = precompute(&gaussians, &views, &self.masks, &options, stage, &mut entries)
+        let (footprints, graph, summary) = precompute(&geometry, &views, &self.masks, &options, stage, &mut entries)
             .map_err(|e| match views.is_empty() {
-            true => Error::new("all views are held out").file(&self.scene).hint("give --views all or --holdout 0"),
-            false => e,
-        })?;
+                true => Error::new("all views are held out").file(&self.scene).hint("give --views all or --holdout 0"),
+                false => e,
+            })?;
         let provenance = || stage.provenance("", 0, self.parameters(), inputs.clone());
         footprints.write_with(entries, &self.footprints, provenance())?;
         graph.write(&self.graph, provenance())?;

@@ -51,18 +51,18 @@ pub struct Pixel {
     pub entries: Vec<(u32, f32)>,
 }
 
-/// Computes the footprints of one view.
+/// Computes the footprints of one view, rendered as `raster` says; colour plays no part.
 ///
 /// `camera` must have the size of `maps`.
 pub fn view_footprints(
     gaussians: &Gaussians,
+    raster: &RasterOptions,
     camera: &Camera,
     maps: &MaskMaps,
     options: &FootprintOptions,
 ) -> ViewFootprints {
     let (mut rows, row_of, small_masks) = mask_rows(maps, options.min_pixels);
-    // Colour plays no part.
-    let raster = RasterOptions { sh_degree: 0, ..RasterOptions::default() };
+    let raster = RasterOptions { sh_degree: 0, ..raster.clone() };
     let below: Vec<u64> = rows.iter().map(|r| candidates_below(options.samples, r.pixels)).collect();
     let mut tiles = gs_raster::tile_weights(gaussians, camera, &raster, true, |tile| {
         let mut sums = tile_sums(tile, maps, &row_of, options.gate);
@@ -275,6 +275,7 @@ mod tests {
     use super::*;
     use crate::testing::{camera, cloud};
     use artifacts::Level;
+    use gs_scene::Geometry;
 
     const W: usize = 70;
     const H: usize = 45;
@@ -306,7 +307,7 @@ mod tests {
         let features: Vec<f32> = (0..g.len() * d).map(|i| ((i * 37) % 101) as f32 / 50.0 - 1.0).collect();
         let image = gs_raster::render_features(&g, &features, d, &camera, &RasterOptions::default());
         let alpha = gs_raster::render(&g, &camera, &RasterOptions::default()).alpha;
-        let result = view_footprints(&g, &camera, &maps, &options(5, 6));
+        let result = view_footprints(&g, &RasterOptions::default(), &camera, &maps, &options(5, 6));
         assert!(result.pixels.windows(2).all(|p| (p[0].row, p[0].key) < (p[1].row, p[1].key)));
         for (k, row) in result.rows.iter().enumerate() {
             let mine: Vec<&Pixel> = result.pixels.iter().filter(|p| p.row as usize == k).collect();
@@ -322,20 +323,44 @@ mod tests {
             }
         }
         assert!(result.pixels.len() > 40, "{}", result.pixels.len());
-        let other = view_footprints(&g, &camera, &maps, &FootprintOptions { seed: 4, ..options(5, 6) });
+        let other = view_footprints(
+            &g,
+            &RasterOptions::default(),
+            &camera,
+            &maps,
+            &FootprintOptions { seed: 4, ..options(5, 6) },
+        );
         assert_ne!(result.pixels, other.pixels);
         assert_eq!(result.entries, other.entries);
     }
 
     #[test]
     fn a_footprint_times_features_is_the_mean_of_rendered_features() {
-        let (g, camera) = (cloud(400), camera(W as u32, H as u32));
-        let maps = maps();
+        // As the mark of a PLY says: without and with the 2D filter, which matters for Gaussians smaller than a pixel.
+        let dir = tempfile::tempdir().unwrap();
+        let mut small = cloud(400);
+        small.log_scales.iter_mut().step_by(3).for_each(|s| *s = [-5.0; 3]);
+        let weight = [false, true].map(|antialias| {
+            let marked = Geometry { gaussians: small.clone(), antialias, ..Geometry::default() };
+            let path = dir.path().join("g.ply");
+            gs_scene::ply::write_gaussians(&path, &small, &marked.comments(Vec::new())).unwrap();
+            let geometry = Geometry::read(&path).unwrap();
+            let raster = RasterOptions { antialias, ..RasterOptions::default() };
+            let read = RasterOptions::of(&geometry);
+            let result =
+                view_footprints(&geometry.gaussians, &read, &camera(W as u32, H as u32), &maps(), &options(5, 0));
+            is_the_mean_of_rendered_features(&small, &raster, &result);
+            result.seen.iter().filter(|s| s.0 % 3 == 0).map(|s| s.1).sum::<f64>()
+        });
+        assert!(weight[1] < 0.5 * weight[0], "the filter takes weight from small Gaussians: {weight:?}");
+    }
+
+    fn is_the_mean_of_rendered_features(g: &Gaussians, raster: &RasterOptions, result: &ViewFootprints) {
+        let (camera, maps) = (camera(W as u32, H as u32), maps());
         let d = 3;
         let features: Vec<f32> = (0..g.len() * d).map(|i| ((i * 37) % 101) as f32 / 50.0 - 1.0).collect();
-        let image = gs_raster::render_features(&g, &features, d, &camera, &RasterOptions::default());
-        let alpha = gs_raster::render(&g, &camera, &RasterOptions::default()).alpha;
-        let result = view_footprints(&g, &camera, &maps, &options(5, 0));
+        let image = gs_raster::render_features(g, &features, d, &camera, raster);
+        let alpha = gs_raster::render(g, &camera, raster).alpha;
         assert!(result.pixels.is_empty());
         assert_eq!(result.small_masks, 1);
         assert_eq!(result.rows.len(), 5 + 6);
@@ -357,7 +382,7 @@ mod tests {
             }
             gated_all += gated.len();
         }
-        assert!(gated_all > 2000, "the cloud covers most of the view: {gated_all}");
+        assert!(gated_all > 1500, "the cloud covers most of the view: {gated_all}");
         // All weights of a view add up to all of its alpha.
         let weight: f64 = result.seen.iter().map(|s| s.1).sum();
         let covered: f64 = alpha.iter().map(|&a| f64::from(a)).sum();
@@ -369,7 +394,7 @@ mod tests {
         let (g, camera, maps) = (cloud(2000), camera(W as u32, H as u32), maps());
         let with = |threads| {
             let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
-            pool.install(|| view_footprints(&g, &camera, &maps, &options(1, 5)))
+            pool.install(|| view_footprints(&g, &RasterOptions::default(), &camera, &maps, &options(1, 5)))
         };
         assert_eq!(with(1), with(3));
     }

@@ -5,8 +5,9 @@ use crate::graph::{AnchorDistances, GraphOptions, MiddleAnchors, anchor_graph};
 use crate::positions::shifted;
 use artifacts::{FootprintsBuilder, Graph, MaskMaps, PixelSamples, ScratchEntries, maps_path};
 use gs_io::{Error, Result};
+use gs_raster::RasterOptions;
 use gs_scene::dataset::View;
-use gs_scene::{Camera, Gaussians};
+use gs_scene::{Camera, Gaussians, Geometry};
 use stage::Stage;
 use std::path::Path;
 
@@ -42,7 +43,9 @@ impl Default for Options {
 pub struct Summary {
     /// Gaussians of the geometry.
     pub gaussians: usize,
-    /// Of these, Gaussians without a usable position (not finite, or beyond 1e18).
+    /// Of these, Gaussians with a parameter that is not finite.
+    pub damaged: usize,
+    /// Others without a usable position (beyond 1e18).
     pub unusable: usize,
     /// Gaussians that take part.
     pub kept: usize,
@@ -85,19 +88,20 @@ fn camera_for(view: &View, maps: &MaskMaps, file: &Path) -> Result<Camera> {
     Ok(c.resized(maps.width as u32, maps.height as u32))
 }
 
-/// Computes footprints and graph of `gaussians` from the `views` that have id maps in the folder `masks`. The entries of the
+/// Computes footprints and graph of a geometry from the `views` that have id maps in the folder `masks`. The entries of the
 /// footprints go into `entries`, view by view; the builder that comes back has none.
 ///
 /// # Errors
 /// When the disk is full, an id map is damaged or of another shape, no view has masks, or no Gaussian is left.
 pub fn precompute(
-    gaussians: &Gaussians,
+    geometry: &Geometry,
     views: &[&View],
     masks: &Path,
     options: &Options,
     stage: &Stage,
     entries: &mut ScratchEntries,
 ) -> Result<(FootprintsBuilder, Graph, Summary)> {
+    let (gaussians, raster) = (&geometry.gaussians, RasterOptions::of(geometry));
     let n = gaussians.len();
     let with_masks: Vec<&View> = views.iter().copied().filter(|v| maps_path(masks, v.stem()).is_file()).collect();
     if with_masks.is_empty() {
@@ -114,14 +118,19 @@ pub fn precompute(
     if with_masks.len() < views.len() {
         stage.skipped(&format!("{} of {} views: no id map", views.len() - with_masks.len(), views.len()));
     }
-    let usable = shifted(&gaussians.means).usable;
-    if usable.len() < n {
-        stage.warn(&format!("{} of {n} Gaussians have no usable position and are left out", n - usable.len()));
+    if let Some(damage) = geometry.damage() {
+        stage.skipped(&damage);
+    }
+    let (mut usable, whole) = (shifted(&gaussians.means).usable, geometry.whole());
+    usable.retain(|&i| whole[i as usize]);
+    let damaged = geometry.damaged.len();
+    let unusable = n - damaged - usable.len();
+    if unusable > 0 {
+        stage.warn(&format!("{unusable} of {n} Gaussians have no usable position and are left out"));
     }
     let pixels = PixelSamples { ptr: vec![0], ..PixelSamples::default() };
     let mut out = FootprintsBuilder { row_ptr: vec![0], pixels, ..FootprintsBuilder::default() };
-    let mut summary =
-        Summary { gaussians: n, unusable: n - usable.len(), views: with_masks.len(), ..Summary::default() };
+    let mut summary = Summary { gaussians: n, damaged, unusable, views: with_masks.len(), ..Summary::default() };
     let mut seen_views = vec![0u32; n];
     let mut seen_weight = vec![0f64; n];
     let mut progress = stage.progress("views", with_masks.len() as u64);
@@ -140,7 +149,7 @@ pub fn precompute(
             samples: options.pixel_samples,
             seed: options.graph.seed ^ ((index as u64) << 32),
         };
-        let footprints = view_footprints(gaussians, &camera, &maps, &look);
+        let footprints = view_footprints(gaussians, &raster, &camera, &maps, &look);
         for pixel in footprints.pixels {
             out.pixels.row.push(out.rows.len() as u32 + pixel.row);
             out.pixels.col.extend(pixel.entries.iter().map(|e| e.0));
@@ -185,8 +194,9 @@ pub fn precompute(
             .found(format!("{n} Gaussians, {} views", with_masks.len()))
             .hint("geometry and dataset must be of the same scene, in the same coordinates"));
     }
-    if kept.len() < n && !options.keep_unseen {
-        stage.skipped(&format!("{} of {n} Gaussians: never seen", n - kept.len()));
+    let unseen = n - damaged - kept.len();
+    if unseen > 0 && !options.keep_unseen {
+        stage.skipped(&format!("{unseen} of {n} Gaussians: never seen"));
     }
     // Original indices to positions in `kept`. Every Gaussian with a footprint was seen, so it is kept.
     let mut position = vec![u32::MAX; n];

@@ -26,6 +26,13 @@ impl Default for RasterOptions {
     }
 }
 
+impl RasterOptions {
+    /// How a geometry is to be rendered: as it was learnt.
+    pub fn of(geometry: &gs_scene::Geometry) -> Self {
+        Self { antialias: geometry.antialias, ..Self::default() }
+    }
+}
+
 /// A rendered view.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct Rendered {

@@ -168,6 +168,58 @@ fn every_field_not_finite_and_zero_quaternions() {
     assert!(survives(&g, &view, "short quaternions").1 > 0.0);
 }
 
+/// One scene that has every reason for which a Gaussian is not drawn, in known numbers.
+#[test]
+fn every_reason_not_to_draw_is_counted() {
+    let view = camera(60, 40);
+    let ahead = |distance: f32, aside: f32| {
+        let (eye, rotation) = (view.position().as_vec3(), view.rotation);
+        let (right, forward) = (rotation.row(0).as_vec3(), rotation.row(2).as_vec3());
+        (eye + forward * distance + right * aside).into()
+    };
+    let mut g = Gaussians::default();
+    let mut add = |count: usize, mean: [f32; 3], log_scale: f32, quaternion: [f32; 4], logit: f32| {
+        for _ in 0..count {
+            g.means.push(mean);
+            g.log_scales.push([log_scale; 3]);
+            g.rotations.push(quaternion);
+            g.opacity_logits.push(logit);
+            g.sh.extend([0.5; 3]);
+        }
+    };
+    let straight = [1.0, 0.0, 0.0, 0.0];
+    add(7, ahead(3.0, 0.0), -3.0, straight, 1.0);
+    add(1, [f32::NAN; 3], -3.0, straight, 1.0);
+    add(2, ahead(-3.0, 0.0), -3.0, straight, 1.0);
+    add(3, ahead(3.0, 0.0), 90.0, straight, 1.0);
+    add(1, ahead(3.0, 0.0), -3.0, [0.0; 4], 1.0);
+    add(5, ahead(3.0, 0.0), -3.0, straight, -9.0);
+    add(6, ahead(3.0, 500.0), -3.0, straight, 1.0);
+    let (dropped, covered) = survives(&g, &view, "every reason");
+    assert_eq!(dropped, Dropped { not_finite: 1, behind: 2, degenerate: 4, transparent: 5, outside: 6 });
+    assert!(dropped.total() == g.len() - 7 && covered > 0.0);
+}
+
+/// Pixel gradients at the end of single precision: those of which the sums do not fit are counted and are zero, and only
+/// those.
+#[test]
+fn gradients_that_overflow_are_counted() {
+    let (g, view, options) = (random(100, 9), camera(40, 30), RasterOptions::default());
+    let f = forward(&g, &view, &options);
+    let with = |d: f32| {
+        let d = vec![d; 3 * 40 * 30];
+        backward(&g, &view, &options, &f, PixelGradients { rgb: &d, alpha: None, depth: None })
+    };
+    let (usual, huge) = (with(1.0), with(1e38));
+    assert_eq!(usual.overflowed, 0);
+    assert!(huge.overflowed > 0 && huge.overflowed <= f.visible().len(), "{}", huge.overflowed);
+    assert!(huge.means.as_flattened().iter().chain(&huge.sh).chain(&huge.opacity_logits).all(|v| v.is_finite()));
+    let none = |p: &gs_raster::Gradients| {
+        f.visible().iter().filter(|&&i| p.sh[48 * i as usize..48 * (i as usize + 1)].iter().all(|v| *v == 0.0)).count()
+    };
+    assert_eq!(none(&huge) - none(&usual), huge.overflowed, "an overflowed Gaussian has no gradient at all");
+}
+
 #[test]
 fn focal_lengths_and_sizes_of_image() {
     let g = random(300, 8);

@@ -60,13 +60,16 @@ pub fn read_comments(path: impl AsRef<Path>) -> Result<Vec<String>> {
     Ok(read_header(path.as_ref())?.0)
 }
 
-/// Whether a PLY's comments say that its Gaussians were learnt with the 2D filter of Mip-Splatting (`antialias true`), and so
+/// The comment of a PLY whose Gaussians were learnt with the 2D filter of Mip-Splatting.
+pub const ANTIALIASED: &str = "antialias true";
+
+/// Whether a PLY's comments say that its Gaussians were learnt with the 2D filter of Mip-Splatting ([`ANTIALIASED`]), and so
 /// are to be rendered with it.
 ///
 /// # Errors
 /// As [`read_comments`].
 pub fn is_antialiased(path: impl AsRef<Path>) -> Result<bool> {
-    Ok(read_comments(path)?.iter().any(|c| c == "antialias true"))
+    Ok(read_comments(path)?.iter().any(|c| c == ANTIALIASED))
 }
 
 /// Whether a PLY's vertices are Gaussians rather than points: whether they have an opacity.

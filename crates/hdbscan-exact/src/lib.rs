@@ -60,6 +60,8 @@ pub struct Clustering {
     /// cluster of the tree at lambda and `last` is the largest finite lambda in that cluster and below (GLOSH, Campello,
     /// Moulavi, Zimek and Sander 2015).
     pub outlier_scores: Vec<f32>,
+    /// The cluster of the tree that every point leaves it from: the smallest that holds it, whether selected or not.
+    pub nodes: Vec<u32>,
     /// The condensed tree.
     pub tree: CondensedTree,
     /// The node of the tree that was selected for each cluster, by label.

@@ -12,13 +12,19 @@ pub struct Prediction {
     pub labels: Vec<i32>,
     /// How firmly it belongs to it, 0 to 1; 0 for noise.
     pub probabilities: Vec<f32>,
+    /// The cluster of the tree that it falls into: the smallest that holds it, whether selected or not.
+    pub nodes: Vec<u32>,
 }
 
 /// The clusters of `queries`, `[m][dim]`, in `clustering`, which [`crate::cluster`] made of `points`, `[n][dim]`, with the same
-/// `options`. The hierarchy stays as it is: a query joins the cluster of its neighbour by mutual reachability, among its
-/// 2 `min_samples` nearest points, or the ancestor of it that holds at this distance. So does Python's `hdbscan`; but here
-/// clusters below a selected one count as that one. A query at the place of a point need not get that point's label: it
-/// adds to the density there.
+/// `options`. The hierarchy stays as it is: a query joins the cluster of its neighbour by mutual reachability, or the ancestor
+/// of it that holds at this distance.
+///
+/// By the rules of Python's `hdbscan` to the letter. With `m` = `min_samples` - 1, which is what it calls `min_samples`: the
+/// neighbour is one of the 2 `m` nearest points; a point's core distance is here the one to its `m`-th nearest, itself
+/// counted (one less than the tree was made with); that of a query the one to its (`m` + 1)-th nearest. So a query at the place
+/// of a point need not get that point's label. The one difference: where the root is a cluster (`allow_single_cluster`),
+/// queries that would leave it before any of its points stays are noise here, as points are, and members there.
 ///
 /// # Panics
 /// When `dim` is 0 or does not divide the numbers of values, a value is not finite, or `clustering` is not of `points`.
@@ -37,11 +43,12 @@ pub fn approximate_predict(
     let m = unique.weights.len();
     assert_eq!(m, clustering.tree.points as usize, "the clustering is of other points");
     if m == 0 || count == 0 {
-        return Prediction { labels: vec![-1; count], probabilities: vec![0.0; count] };
+        return Prediction { labels: vec![-1; count], probabilities: vec![0.0; count], nodes: vec![m as u32; count] };
     }
     let tree = density_tree(&unique.points, dim, &unique.weights, options.min_samples);
-    let core = neighbours(&tree, &unique.weights, options.min_samples).core;
-    let near = nearest(&tree, &unique.weights, queries, 2 * options.min_samples);
+    let others = options.min_samples.saturating_sub(1).max(1);
+    let core = neighbours(&tree, &unique.weights, others).core;
+    let near = nearest(&tree, &unique.weights, queries, 2 * others);
     let clusters = Clusters::new(&clustering.tree);
     let selected: Vec<usize> = clustering.selected.iter().map(|&c| c as usize - m).collect();
     let label_of = clusters.labels(&selected);
@@ -51,12 +58,11 @@ pub fn approximate_predict(
         leaves[e.child as usize] = (e.parent as usize - m, e.lambda);
     }
     let least_in_root = clusters.least_in_root(&clustering.tree, options.epsilon);
-    let predict = |row: &Vec<(f64, u32)>| -> (i32, f32) {
-        // The query counts itself; the rest of min_samples are its neighbours.
-        let mut held = 1u64;
+    let predict = |row: &Vec<(f64, u32)>| -> (i32, (f32, u32)) {
+        let mut held = 0;
         let mut own_core = 0.0;
         for &(d, q) in row {
-            if held >= options.min_samples as u64 {
+            if held > others as u64 {
                 break;
             }
             held += u64::from(unique.weights[tree.order[q as usize] as usize]);
@@ -67,7 +73,7 @@ pub fn approximate_predict(
         let by = |a: &(f64, f64, u32), b: &(f64, f64, u32)| {
             a.0.total_cmp(&b.0).then(a.1.total_cmp(&b.1)).then(a.2.cmp(&b.2))
         };
-        let Some((distance, _, neighbour)) = closest.min_by(by) else { return (-1, 0.0) };
+        let Some((distance, _, neighbour)) = closest.min_by(by) else { return (-1, (0.0, m as u32)) };
         let lambda = if distance > 0.0 { 1.0 / distance } else { f64::INFINITY };
         let (mut cluster, left) = leaves[neighbour as usize];
         if left > lambda {
@@ -75,13 +81,13 @@ pub fn approximate_predict(
                 cluster = parent;
             }
         }
-        let Some(label) = label_of[cluster] else { return (-1, 0.0) };
-        let lambda = lambda.min(left);
+        let node = (cluster + m) as u32;
+        let Some(label) = label_of[cluster] else { return (-1, (0.0, node)) };
         if selected[label] == 0 && lambda < least_in_root {
-            return (-1, 0.0);
+            return (-1, (0.0, node));
         }
-        (label as i32, clusters.probability(selected[label], lambda))
+        (label as i32, (clusters.probability(selected[label], lambda), node))
     };
-    let (labels, probabilities) = near.iter().map(predict).unzip();
-    Prediction { labels, probabilities }
+    let (labels, (probabilities, nodes)) = near.iter().map(predict).unzip();
+    Prediction { labels, probabilities, nodes }
 }

@@ -170,9 +170,11 @@ pub(crate) fn label(tree: CondensedTree, of_point: &[u32], options: &Options) ->
     let last = clusters.last_deaths();
     let mut outlier_scores = vec![0.0f32; m];
     let mut labels = vec![-1i32; m];
+    let mut nodes = vec![tree.points; m];
     let mut probabilities = vec![0.0f32; m];
     for e in tree.edges.iter().filter(|e| (e.child as usize) < m) {
         let c = e.parent as usize - m;
+        nodes[e.child as usize] = e.parent;
         if last[c] > 0.0 && e.lambda < last[c] {
             outlier_scores[e.child as usize] = ((last[c] - e.lambda) / last[c]) as f32;
         }
@@ -187,6 +189,7 @@ pub(crate) fn label(tree: CondensedTree, of_point: &[u32], options: &Options) ->
         labels: of_point.iter().map(|&u| labels[u as usize]).collect(),
         probabilities: of_point.iter().map(|&u| probabilities[u as usize]).collect(),
         outlier_scores: of_point.iter().map(|&u| outlier_scores[u as usize]).collect(),
+        nodes: of_point.iter().map(|&u| nodes[u as usize]).collect(),
         tree,
         selected: selected.iter().map(|&c| (c + m) as u32).collect(),
     }

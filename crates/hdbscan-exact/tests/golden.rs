@@ -124,13 +124,84 @@ fn the_documentations_own_set() {
     check(&case, 1.0);
 }
 
+/// What Python's `approximate_predict` says of queries to the points of a case.
+struct Predicted {
+    name: String,
+    queries: Vec<f32>,
+    labels: Vec<i32>,
+    probabilities: Vec<f32>,
+}
+
+fn predictions() -> Vec<Predicted> {
+    let path = PathBuf::from(env!("CARGO_MANIFEST_DIR")).join("testdata/predict.txt");
+    let text = std::fs::read_to_string(path).unwrap();
+    let mut lines = text.lines();
+    let mut out = Vec::new();
+    while let Some(name) = lines.next() {
+        out.push(Predicted {
+            name: name.into(),
+            queries: numbers(lines.next()),
+            labels: numbers(lines.next()),
+            probabilities: numbers(lines.next()),
+        });
+    }
+    out
+}
+
+#[test]
+fn predictions_agree_with_python() {
+    let cases = cases();
+    let predictions = predictions();
+    assert_eq!(predictions.len(), 8);
+    for Predicted { name, queries, labels, probabilities } in predictions {
+        let c = cases.iter().find(|c| c.name == name).unwrap();
+        let clustering = cluster(&c.points, c.dim, &c.options);
+        // The libraries may number the same clusters differently.
+        let number: BTreeMap<i32, i32> = c.python.iter().copied().zip(clustering.labels.iter().copied()).collect();
+        let number = |l: &i32| if *l < 0 { -1 } else { number[l] };
+        let expected: Vec<i32> = labels.iter().map(number).collect();
+        let found = approximate_predict(&c.points, c.dim, &clustering, &c.options, &queries);
+        assert_eq!((found.labels.len(), found.labels.iter().filter(|&&l| l >= 0).count() > 50), (200, true), "{name}");
+        let apart = found.labels.iter().zip(&expected).filter(|(a, b)| a != b).count();
+        let error = found.probabilities.iter().zip(&probabilities).map(|(a, b)| (a - b).abs()).fold(0.0, f32::max);
+        eprintln!("{name}: {apart} of 200 predictions differ from hdbscan's, probabilities by at most {error:.1e}");
+        assert_eq!(found.labels, expected, "{name}");
+        // Where edges tie, the trees are two of those that there are, and a point may leave them at another lambda.
+        let ties = ["blobs2", "collinear"].contains(&name.as_str());
+        assert!(error < if ties { 0.2 } else { 1e-6 }, "{name}: probabilities differ by {error}");
+    }
+}
+
+/// Where the spanning tree is not unique, the libraries differ from themselves as soon as the points come in another order
+/// (scripts/make_hdbscan_golden.py --permutations: least ARI with themselves over 50 orders). One labelling for every order
+/// cannot be nearer to them than that on all; it must not be farther either.
+#[test]
+fn no_farther_from_the_libraries_than_they_are_from_themselves() {
+    let path = PathBuf::from(env!("CARGO_MANIFEST_DIR")).join("testdata/permutations.txt");
+    let text = std::fs::read_to_string(path).unwrap();
+    let cases = cases();
+    assert_eq!(text.lines().count(), cases.len());
+    for (line, c) in text.lines().zip(&cases) {
+        let fields: Vec<&str> = line.split_whitespace().collect();
+        assert_eq!(fields[0], c.name);
+        let ours = cluster(&c.points, c.dim, &c.options).labels;
+        for (library, labels, least) in [("scikit-learn", &c.labels, fields[1]), ("hdbscan", &c.python, fields[3])] {
+            let (own, least) = (ari(&ours, labels), least.parse::<f64>().unwrap());
+            eprintln!("{}: ARI {own:.4} with {library}, which has at least {least:.4} with itself", c.name);
+            // The file has four digits.
+            assert!(own + 5e-5 >= least, "{}: {own}, {library} with itself {least}", c.name);
+        }
+    }
+}
+
 /// Clusters the points in another order and puts the result back into the first one.
 fn permuted(points: &[f32], dim: usize, order: &[usize], options: &Options) -> Clustering {
     let shuffled: Vec<f32> = order.iter().flat_map(|&i| points[i * dim..(i + 1) * dim].iter().copied()).collect();
     let mut r = cluster(&shuffled, dim, options);
-    let (labels, probabilities, scores) = (r.labels.clone(), r.probabilities.clone(), r.outlier_scores.clone());
+    let found = r.clone();
     for (to, &i) in order.iter().enumerate() {
-        (r.labels[i], r.probabilities[i], r.outlier_scores[i]) = (labels[to], probabilities[to], scores[to]);
+        (r.labels[i], r.nodes[i]) = (found.labels[to], found.nodes[to]);
+        (r.probabilities[i], r.outlier_scores[i]) = (found.probabilities[to], found.outlier_scores[to]);
     }
     r
 }
@@ -183,6 +254,15 @@ proptest! {
         for e in straight.tree.edges.iter().filter(|e| e.child >= m) {
             let held: u32 = straight.tree.edges.iter().filter(|x| x.parent == e.child).map(|x| x.size).sum();
             prop_assert_eq!(held, e.size);
+            // As many points name a cluster or one below it as smallest as it holds.
+            let below = |node: u32| {
+                let mut at = node;
+                while at > e.child {
+                    at = straight.tree.edges.iter().find(|x| x.child == at).map_or(0, |x| x.parent);
+                }
+                at == e.child
+            };
+            prop_assert_eq!(straight.nodes.iter().filter(|&&n| below(n)).count() as u32, e.size);
         }
     }
 }

@@ -1,6 +1,6 @@
 //! `eval lerf`, `eval scannet` and `eval table` on the command line.
 
-use super::{LanguageArgs, SceneArgs, load, mask_threshold};
+use super::{LanguageArgs, SceneArgs, load, mask_threshold, read_scene};
 use crate::labels;
 use crate::lerf::{self, Answers, LerfMetrics, Rendering};
 use crate::protocol::lerf::Averaging;
@@ -157,7 +157,7 @@ pub(super) fn run_lerf(a: &LerfArgs, stage: &Stage) -> Result<String> {
     let mut rendered = None;
     if a.predictions.is_none() {
         let part = |p: &Option<PathBuf>| p.clone().expect("clap asks for it");
-        let scene = LabelledScene::read(&part(&a.instances), &part(&a.geometry))?;
+        let scene = read_scene(&part(&a.instances), &part(&a.geometry), stage)?;
         let source = a.language.source()?;
         source.check_dim(scene.instances.dim, scene.path())?;
         features.insert("text features".into(), format!("{} ({:.12})", source.describe(), source.hash()?));
@@ -276,7 +276,7 @@ pub(super) fn run_scannet(a: &ScannetArgs, stage: &Stage) -> Result<String> {
         undescribed: a.undescribed,
         min_support: a.language.min_support.unwrap_or(2),
     };
-    let scene = LabelledScene::read(&a.scene.instances, &a.scene.geometry)?;
+    let scene = read_scene(&a.scene.instances, &a.scene.geometry, stage)?;
     let files = ScanFiles::find(&a.scene.scene)?;
     let mut features = BTreeMap::from([("instances".to_string(), format!("{:.12}", scene.artifact.hash()))]);
     if let Some(masks) = scene.artifact.provenance().inputs.get(artifacts::role::MASK_FEATURES) {

@@ -1,7 +1,8 @@
 //! `eval query` on the command line.
 
-use super::{LanguageArgs, SceneArgs, load, mask_threshold};
+use super::{LanguageArgs, SceneArgs, load, mask_threshold, read_scene};
 use crate::ask::Asker;
+use crate::granularity::Granularity;
 use crate::lerf::Rendering;
 use crate::place::{self, Place};
 use crate::query::{self, Asked, Divided, ShowOptions};
@@ -44,6 +45,9 @@ pub(super) struct QueryArgs {
     /// What is at this point of the world? May be given several times
     #[arg(long, value_name = "X,Y,Z", allow_hyphen_values = true)]
     point: Vec<String>,
+    /// Answer texts and pictures with the instance found, what it is a part of, or its parts
+    #[arg(long, value_enum, default_value = "instance")]
+    granularity: Granularity,
     /// Divide all Gaussians among the texts: labels.npy and segmentation.ply
     #[arg(long)]
     segment: bool,
@@ -94,7 +98,7 @@ pub(super) fn run(a: &QueryArgs, stage: &Stage, json_lines: bool) -> Result<Stri
     let rendering = Rendering { silhouette: a.silhouette, threshold: mask_threshold(a.alpha, a.silhouette)? };
     let options = ShowOptions { views: a.views.clone(), rendering };
     a.language.selection()?;
-    let scene = LabelledScene::read(&a.scene.instances, &a.scene.geometry)?;
+    let scene = read_scene(&a.scene.instances, &a.scene.geometry, stage)?;
     let worded = !a.text.is_empty() || a.interactive;
     let given = a.language.clip.is_some() || a.language.text_features.is_some();
     let source = if worded || given { Some(a.language.source()?) } else { None };
@@ -140,6 +144,10 @@ pub(super) fn run(a: &QueryArgs, stage: &Stage, json_lines: bool) -> Result<Stri
         let name = path.file_stem().unwrap_or_default().to_string_lossy().into_owned();
         asked.push(Asked { name, kind: "image", answer: asker.answer(&feature), place: None });
     }
+    let mut asked: Vec<Asked> = asked
+        .into_iter()
+        .flat_map(|one| a.granularity.apply(&scene.instances, one, &mut |why| stage.warn(why)))
+        .collect();
     let namer = Namer::new(&asker, &a.text)?;
     for text in &a.pixel {
         let bad = || Error::new("not understood").field("--pixel").found(text).expected("VIEW:X,Y");
@@ -169,6 +177,7 @@ pub(super) fn run(a: &QueryArgs, stage: &Stage, json_lines: bool) -> Result<Stri
     let mut parameters = a.language.parameters();
     parameters["command"] = json!("query");
     parameters["texts"] = json!(a.text);
+    parameters["granularity"] = json!(a.granularity.name());
     parameters["pixels"] = json!(a.pixel);
     parameters["points"] = json!(a.point);
     parameters["alpha"] = json!(rendering.threshold);
@@ -304,25 +313,26 @@ fn interactive(
         let started = Instant::now();
         let answer = asker.answer(&feature);
         let took = started.elapsed();
+        let asked = Asked { name: text.into(), kind: "text", answer, place: None };
+        let asked = a.granularity.apply(&scene.instances, asked, &mut |why| stage.warn(why));
         let shown = match &a.out {
-            None => query::unwritten(text, &answer),
+            None => asked.iter().map(query::unwritten).collect(),
             Some(out) => {
-                let asked = Asked { name: text.into(), kind: "text", answer, place: None };
-                let folder = out.join(slug(text));
-                query::write(scene, dataset, source.describe(), vec![asked], None, options, &folder)?.queries.remove(0)
+                query::write(scene, dataset, source.describe(), asked, None, options, &out.join(slug(text)))?.queries
             }
         };
-        let printed = if json_lines {
-            serde_json::to_string(&shown).map_err(|e| Error::new(e.to_string()))? + "\n"
-        } else {
+        let mut printed = String::new();
+        for one in &shown {
+            printed += &if json_lines {
+                serde_json::to_string(one).map_err(|e| Error::new(e.to_string()))? + "\n"
+            } else {
+                query::answer_table(one, ROWS)
+            };
+        }
+        if !json_lines {
             let ms = |t: std::time::Duration| t.as_secs_f64() * 1e3;
-            format!(
-                "{}  {:.1} ms encoding, {:.2} ms query\n",
-                query::answer_table(&shown, ROWS),
-                ms(encoding),
-                ms(took)
-            )
-        };
+            printed += &format!("\n  {:.1} ms encoding, {:.2} ms query\n", ms(encoding), ms(took));
+        }
         let mut stdout = std::io::stdout().lock();
         // A closed pipe is the reader's choice.
         if stdout.write_all(printed.as_bytes()).and_then(|()| stdout.flush()).is_err() {

@@ -111,6 +111,13 @@ impl Fixture {
         instances.write(self.instances(), self.provenance()).unwrap();
     }
 
+    /// Changes the instances, or makes them those of a geometry that was changed.
+    pub fn change_instances(&self, change: impl Fn(&mut Instances)) {
+        let (mut instances, _) = Instances::read(self.instances()).unwrap();
+        change(&mut instances);
+        instances.write(self.instances(), self.provenance()).unwrap();
+    }
+
     fn write_features(&self, g: &Gaussians) {
         let kept: Vec<u32> = (0..g.len() as u32).collect();
         let values = groups().iter().flat_map(|&i| [i as f32, (i * i) as f32, 1.0]).collect();

@@ -198,7 +198,10 @@ fn missing_predictions_count_as_zero_and_say_so() {
 fn all_noise_scores_zero() {
     let f = Fixture::new(2);
     f.write_instances(2, |_| -1);
-    f.good("score", "--text-features|{}/text.json|--out|{}/score.json");
+    let o = f.eval("score", "--text-features|{}/text.json|--out|{}/score.json");
+    let said = String::from_utf8_lossy(&o.stderr);
+    assert!(said.contains("all Gaussians are noise: every score is 0"), "{said}");
+    assert!(said.contains("nothing is selected for \"red ball\": it counts as IoU 0"), "{said}");
     let s = f.json("score.json");
     assert_eq!((s["instance_miou"].as_f64(), s["query_miou"].as_f64()), (Some(0.0), Some(0.0)));
 }
@@ -413,6 +416,11 @@ fn negatives_templates_and_joining_change_the_answer() {
     assert_eq!(join("0.9")["selected"].as_array().unwrap()[0], 1);
     assert!(!join("0.9")["selected"].to_string().contains('0'), "{}", join("0.9")["selected"]);
     assert!(join("0.93")["selected"].to_string().contains('0'));
+    assert_eq!(
+        join("0.93|--join-siblings")["selected"],
+        serde_json::json!([1]),
+        "there is no tree, so nobody has siblings"
+    );
     let bad = |rest: &str| f.bad("query", &format!("{TABLE}|--text|ball|{rest}"));
     assert!(bad("--negatives|stuff").contains("no such text in the table"));
     assert!(bad("--template|a photo").contains("--template: no place for the text"));
@@ -493,4 +501,146 @@ fn odd_instances_are_answered_with_a_line() {
     f.write_instances(0, |g| g as i32);
     fs::create_dir(f.scene().join("label")).unwrap();
     assert!(f.bad("lerf", lerf).contains("no language features"));
+}
+
+#[test]
+fn views_without_masks_leave_instances_without_words() {
+    let f = Fixture::new(2);
+    let warned = |command: &str, rest: &str| {
+        let o = f.eval(command, rest);
+        let said = String::from_utf8_lossy(&o.stderr).into_owned();
+        assert!(o.status.success(), "{said}");
+        (said, String::from_utf8_lossy(&o.stdout).into_owned())
+    };
+    let query = format!("{TABLE}|--text|red ball|--views|frame_00002");
+    let (score, lerf) =
+        ("--text-features|{}/text.json|--out|{}/score.json", "--text-features|{}/text.json|--out|{}/lerf");
+    let report = "--run-dir|{}/run|--scene|{}/balls|--out|{}/report.html|--views|frame_00000,frame_00001,frame_00002";
+    // One view has an id map without a mask, another none: the rest speaks for the instances.
+    let masks = f.scene().join("language_features");
+    let n = (fixture::WIDTH * fixture::HEIGHT) as usize;
+    let empty =
+        artifacts::MaskMaps { width: fixture::WIDTH as usize, height: fixture::HEIGHT as usize, ids: vec![-1; 4 * n] };
+    empty.write(artifacts::maps_path(&masks, &stem(0))).unwrap();
+    fs::remove_file(artifacts::maps_path(&masks, &stem(1))).unwrap();
+    f.change_instances(|i| i.matches.retain(|m| m.view > 1));
+    warned("query", &query);
+    assert_eq!(f.json("out/query.json")["queries"][0]["selected"], serde_json::json!([0]));
+    warned("score", score);
+    assert_eq!(f.json("score.json")["query_macc25"], 1.0);
+    warned("lerf", lerf);
+    assert_eq!(f.json("lerf/metrics.json")["figures"]["macc25"], 1.0);
+    warned("report", report);
+    let html = fs::read_to_string(f.path().join("report.html")).unwrap();
+    assert!(html.contains("frame_00000: 0 masks") && html.contains("frame_00002: 2 masks"));
+    assert!(!html.contains("frame_00001: 0 masks"), "a view without an id map is not shown as one without masks");
+    // No view has masks: nothing was matched, so no instance has a descriptor. Zeros, each with a line.
+    for i in 0..fixture::VIEWS {
+        empty.write(artifacts::maps_path(&masks, &stem(i))).unwrap();
+    }
+    f.change_instances(|i| {
+        i.matches.clear();
+        i.support.fill(0);
+        i.descriptor.fill(0.0);
+    });
+    let (said, printed) = warned("query", &query);
+    assert!(said.contains("no instance passes for \"red ball\"") && printed.contains("no instance has a descriptor"));
+    let (said, _) = warned("score", score);
+    assert!(said.contains("nothing is selected for \"blue ball\": it counts as IoU 0"), "{said}");
+    assert_eq!(
+        (&f.json("score.json")["query_miou"], &f.json("score.json")["instance_miou"]),
+        (&0.0.into(), &1.0.into())
+    );
+    let (said, _) = warned("lerf", lerf);
+    assert!(said.contains("4 of 4 pairs score 0 because no Gaussian is selected"), "{said}");
+    warned("report", report);
+}
+
+#[test]
+fn damaged_gaussians_are_left_out_and_said_to_be() {
+    let f = Fixture::new(2);
+    let selected = |extra: &str| {
+        f.good("query", &format!("{TABLE}|--text|red ball|--text|blue ball|--segment|--views|frame_00002{extra}"));
+        fs::read(f.path().join("out/red-ball.frame_00002.mask.png")).unwrap()
+    };
+    let before = selected("");
+    let mut g = gs_scene::ply::read_gaussians(f.geometry()).unwrap();
+    (g.means[50][0], g.log_scales[60][1]) = (f32::NAN, f32::INFINITY);
+    gs_scene::ply::write_gaussians(f.geometry(), &g, &[]).unwrap();
+    // cluster-match gives them no instance.
+    f.change_instances(|i| (i.label[50], i.label[60]) = (-1, -1));
+    assert!(before == selected(""), "the ball looks as before");
+    assert_eq!(gs_scene::ply::read_gaussians(f.path().join("out/segmentation.ply")).unwrap().len(), 83);
+    for (command, rest) in [
+        ("query", "--text-features|{}/text.json|--text|red ball|--out|{}/out"),
+        ("score", "--text-features|{}/text.json|--out|{}/score.json"),
+        ("lerf", "--text-features|{}/text.json|--out|{}/lerf"),
+    ] {
+        let o = f.eval(command, rest);
+        let said = String::from_utf8_lossy(&o.stderr);
+        assert!(o.status.success(), "{said}");
+        assert!(said.contains("skipped 2 of 83 Gaussians: damaged") && said.contains("vertex 50"), "{command}: {said}");
+    }
+    assert_eq!(f.json("score.json")["instance_miou"], 1.0);
+    fs::remove_file(f.run().join("features.safetensors")).unwrap();
+    let printed = f.good("report", "--run-dir|{}/run|--scene|{}/balls|--out|{}/report.html");
+    assert!(printed.contains("2 of 83 Gaussians: damaged"), "{printed}");
+}
+
+#[test]
+fn a_geometry_learnt_with_the_filter_is_shown_with_it() {
+    let f = Fixture::new(2);
+    let mut g = gs_scene::ply::read_gaussians(f.geometry()).unwrap();
+    g.log_scales[0] = [-4.2; 3]; // about a pixel
+    let camera = &fixture::cameras()[2];
+    let mut pixels = Vec::new();
+    for antialias in [false, true] {
+        let geometry = gs_scene::Geometry { gaussians: g.clone(), antialias, ..Default::default() };
+        gs_scene::ply::write_gaussians(f.geometry(), &g, &geometry.comments(Vec::new())).unwrap();
+        f.change_instances(|_| {});
+        f.good("query", &format!("{TABLE}|--text|red ball|--views|frame_00002|--silhouette|selected|--alpha|0.4"));
+        let options = gs_raster::RasterOptions { antialias, ..Default::default() };
+        let alpha = gs_raster::render(&g.select(&[0]), camera, &options).alpha;
+        let expected = alpha.iter().filter(|&&a| a > 0.4).count();
+        assert_eq!(f.json("out/query.json")["queries"][0]["views"][0]["pixels"], expected);
+        assert_eq!(gs_scene::ply::is_antialiased(f.path().join("out/red-ball.ply")).unwrap(), antialias);
+        pixels.push(expected);
+    }
+    assert!(pixels[1] < pixels[0], "{pixels:?}");
+}
+
+#[test]
+fn an_answer_may_be_coarser_or_finer() {
+    let f = Fixture::new(2);
+    let edge = |parent, child, instance| artifacts::TreeEdge { parent, child, lambda: 1.0, size: 2, instance };
+    f.change_instances(|i| {
+        // Both balls are parts of 84; the floor (85) falls into two halves.
+        i.tree = vec![
+            edge(83, 84, -1),
+            edge(83, 85, 2),
+            edge(84, 86, 0),
+            edge(84, 87, 1),
+            edge(85, 88, -1),
+            edge(85, 89, -1),
+        ];
+        i.node = (0..83).map(|g| if g < 2 { 86 + g } else { 88 + g % 2 }).collect();
+    });
+    let ask = |text: &str, granularity: &str| {
+        let o = f.eval("query", &format!("{TABLE}|--text|{text}|--views|frame_00002|--granularity|{granularity}"));
+        assert!(o.status.success());
+        (f.json("out/query.json")["queries"].clone(), String::from_utf8_lossy(&o.stderr).into_owned())
+    };
+    let (q, _) = ask("blue ball", "parent");
+    assert_eq!((&q[0]["selected"], &q[0]["gaussians"]), (&serde_json::json!([1, 0]), &2.into()));
+    assert_eq!(gs_scene::ply::read_gaussians(f.path().join("out/blue-ball.ply")).unwrap().len(), 2);
+    fs::write(f.table(), r#"{"floor": [-0.6, -0.8], "blue ball": [0, 1]}"#).unwrap();
+    let (q, _) = ask("floor", "parts");
+    let sizes: Vec<u64> = q.as_array().unwrap().iter().map(|q| q["gaussians"].as_u64().unwrap()).collect();
+    assert_eq!((sizes, &q[2]["kind"], &q[2]["text"]), (vec![81, 41, 40], &"part".into(), &"floor, part 2 of 2".into()));
+    assert_eq!(gs_scene::ply::read_gaussians(f.path().join("out/floor-part-2-of-2.ply")).unwrap().len(), 40);
+    assert!(f.path().join("out/floor-part-1-of-2.frame_00002.mask.png").exists());
+    let (q, said) = ask("floor", "parent");
+    assert!(q[0]["gaussians"] == 81 && said.contains("no parent but the whole scene"), "{said}");
+    let (q, said) = ask("blue ball", "parts");
+    assert!(q.as_array().unwrap().len() == 1 && said.contains("instance 1 has no parts"), "{said}");
 }

@@ -348,6 +348,25 @@ fn tables_join_scenes_and_refuse_what_does_not_fit() {
 }
 
 #[test]
+fn damaged_gaussians_leave_the_evaluation_of_a_scan() {
+    let s = Scene::new();
+    let mut g = gs_scene::ply::read_gaussians(s.geometry()).unwrap();
+    (g.means[5][1], g.log_scales[6][0]) = (f32::NAN, f32::NAN);
+    gs_scene::ply::write_gaussians(s.geometry(), &g, &[]).unwrap();
+    let (mut i, _) = Instances::read(s.instances()).unwrap();
+    (i.label[5], i.label[6]) = (-1, -1);
+    let inputs = BTreeMap::from([(role::GEOMETRY.to_string(), hash_file(s.geometry()).unwrap())]);
+    i.write(s.instances(), Provenance { inputs, ..Provenance::default() }).unwrap();
+    // By number they leave with their vertices, faint or not; their neighbours speak for the place.
+    let notes = s.metrics("scannet", &["--association", "one-to-one", "--keep-faint"])["notes"].to_string();
+    assert!(notes.contains(&format!("2 of {} vertices leave the evaluation", g.len())), "{notes}");
+    let notes = s.metrics("scannet", &["--association", "nearest", "--keep-faint"])["notes"].to_string();
+    assert!(!notes.contains("leave the evaluation"), "{notes}");
+    let said = String::from_utf8(s.run("scannet", &["--association", "volume"]).stderr).unwrap();
+    assert!(said.contains(&format!("skipped 2 of {} Gaussians: damaged", g.len())), "{said}");
+}
+
+#[test]
 fn scans_that_do_not_fit_are_refused() {
     let s = Scene::new();
     let bad = |rest: &[&str]| {

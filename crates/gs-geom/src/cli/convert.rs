@@ -108,7 +108,7 @@ impl ConvertArgs {
         comments.extend(inputs.iter().map(|(role, hash)| format!("{role} {hash}")));
         comments.push(format!("parameters {parameters}"));
         if ply::is_antialiased(&self.input)? {
-            comments.push("antialias true".into());
+            comments.push(ply::ANTIALIASED.into());
         }
         if let Some(map) = &self.keep_map {
             let indices: Vec<i32> = chosen.kept.iter().map(|&i| i as i32).collect();

@@ -1,0 +1,139 @@
+//! A finished geometry, as every stage after the first reads it.
+
+use crate::{Gaussians, ply};
+use gs_io::{Error, Result};
+use std::path::Path;
+
+/// Opacity logit of a Gaussian that nothing shows.
+const INVISIBLE: f32 = -50.0;
+
+/// The Gaussians of a 3DGS PLY and how to treat them.
+#[derive(Debug, Clone, Default, PartialEq)]
+pub struct Geometry {
+    /// All Gaussians of the file, in its order, every number finite; [`Self::damaged`] ones are invisible stand-ins.
+    pub gaussians: Gaussians,
+    /// Gaussians with a parameter that is not finite in the file, ascending. No view sees them, and no instance has them.
+    pub damaged: Vec<u32>,
+    /// Whether they were learnt with the 2D filter of Mip-Splatting, and so are to be rendered with it.
+    pub antialias: bool,
+}
+
+impl Geometry {
+    /// Reads a PLY. Damaged Gaussians do not condemn the rest: a transparent one takes the place of each, where its centre
+    /// is or, if that is not finite, where the first whole Gaussian is, so that numbers stay and boxes do not grow. Infinite
+    /// opacity logits are no damage: they become +-50, as in [`ply::read_gaussians`].
+    ///
+    /// # Errors
+    /// When the file is damaged as a whole or is no 3DGS PLY, or all of its Gaussians are damaged.
+    pub fn read(path: impl AsRef<Path>) -> Result<Self> {
+        let path = path.as_ref();
+        let mut g = ply::read_gaussians_as_they_are(path)?;
+        g.opacity_logits.iter_mut().filter(|o| o.is_infinite()).for_each(|o| *o = o.clamp(-50.0, 50.0));
+        let stride = g.sh_stride();
+        let whole = |i: usize| {
+            let geometric = g.means[i].iter().chain(&g.log_scales[i]).chain(&g.rotations[i]);
+            geometric.chain(g.sh_of(i)).all(|v| v.is_finite()) && g.opacity_logits[i].is_finite()
+        };
+        let damaged: Vec<u32> = (0..g.len() as u32).filter(|&i| !whole(i as usize)).collect();
+        let Some(first) = (0..g.len()).find(|&i| damaged.get(i) != Some(&(i as u32))) else {
+            if g.is_empty() {
+                return Ok(Self { gaussians: g, damaged, antialias: ply::is_antialiased(path)? });
+            }
+            return Err(Error::new("no Gaussian is whole: every one has a number that is not finite")
+                .file(path)
+                .found(g.len())
+                .hint("train the geometry again"));
+        };
+        let place = g.means[first];
+        for i in damaged.iter().map(|&i| i as usize) {
+            if g.means[i].iter().any(|v| !v.is_finite()) {
+                g.means[i] = place;
+            }
+            g.log_scales[i] = [-10.0; 3];
+            g.rotations[i] = [1.0, 0.0, 0.0, 0.0];
+            g.opacity_logits[i] = INVISIBLE;
+            g.sh[i * stride..(i + 1) * stride].fill(0.0);
+        }
+        Ok(Self { gaussians: g, damaged, antialias: ply::is_antialiased(path)? })
+    }
+
+    /// What is to be said of damaged Gaussians, where there are any.
+    pub fn damage(&self) -> Option<String> {
+        let first = self.damaged.first()?;
+        Some(format!(
+            "{} of {} Gaussians: damaged, a parameter is not finite (the first is vertex {first})",
+            self.damaged.len(),
+            self.gaussians.len()
+        ))
+    }
+
+    /// Whether each Gaussian is whole.
+    pub fn whole(&self) -> Vec<bool> {
+        let mut whole = vec![true; self.gaussians.len()];
+        self.damaged.iter().for_each(|&i| whole[i as usize] = false);
+        whole
+    }
+
+    /// Comments for a PLY of these Gaussians: `own`, and the mark of how they are to be rendered.
+    pub fn comments(&self, mut own: Vec<String>) -> Vec<String> {
+        own.extend(self.antialias.then(|| ply::ANTIALIASED.to_string()));
+        own
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn sample() -> Gaussians {
+        Gaussians {
+            means: (0..7).map(|i| [i as f32, 1.0, 2.0]).collect(),
+            log_scales: vec![[-1.0; 3]; 7],
+            rotations: vec![[1.0, 0.0, 0.0, 0.0]; 7],
+            opacity_logits: vec![2.0; 7],
+            sh: vec![0.25; 7 * 12],
+            sh_degree: 1,
+        }
+    }
+
+    #[test]
+    fn damaged_gaussians_become_invisible_and_the_rest_stays() {
+        let dir = tempfile::tempdir().unwrap();
+        let path = dir.path().join("g.ply");
+        let mut g = sample();
+        g.means[0][1] = f32::NAN;
+        g.log_scales[2][0] = f32::INFINITY;
+        g.rotations[3][3] = f32::NAN;
+        g.opacity_logits[4] = f32::NAN;
+        g.opacity_logits[5] = f32::INFINITY;
+        g.sh[6 * 12 + 11] = f32::NEG_INFINITY;
+        ply::write_gaussians(&path, &g, &[]).unwrap();
+        let read = Geometry::read(&path).unwrap();
+        assert_eq!(read.damaged, [0, 2, 3, 4, 6]);
+        assert_eq!(read.gaussians.select(&[1]), sample().select(&[1]));
+        assert_eq!(read.gaussians.opacity_logits[5], 50.0);
+        assert_eq!(read.gaussians.means[0], [1.0, 1.0, 2.0], "where the first whole one is");
+        assert_eq!(read.gaussians.means[2], [2.0, 1.0, 2.0], "where it was");
+        assert!(read.damaged.iter().all(|&i| read.gaussians.opacity(i as usize) < 1e-20));
+        let said = read.damage().unwrap();
+        assert!(said.contains("5 of 7 Gaussians") && said.contains("vertex 0"), "{said}");
+        assert_eq!(read.whole(), [false, true, false, false, false, true, false]);
+        // Written and read again it is no longer damaged.
+        ply::write_gaussians(&path, &read.gaussians, &read.comments(Vec::new())).unwrap();
+        assert_eq!((Geometry::read(&path).unwrap().damage(), read.antialias), (None, false));
+        g.means.fill([f32::NAN; 3]);
+        ply::write_gaussians(&path, &g, &[]).unwrap();
+        assert!(Geometry::read(&path).unwrap_err().to_string().contains("no Gaussian is whole"));
+    }
+
+    #[test]
+    fn the_mark_of_the_filter_is_read_and_passed_on() {
+        let dir = tempfile::tempdir().unwrap();
+        let path = dir.path().join("g.ply");
+        ply::write_gaussians(&path, &sample(), &["antialias true".into()]).unwrap();
+        let read = Geometry::read(&path).unwrap();
+        assert!(read.antialias && read.damage().is_none());
+        ply::write_gaussians(&path, &read.gaussians, &read.comments(vec!["mine".into()])).unwrap();
+        assert_eq!(ply::read_comments(&path).unwrap(), ["mine", "antialias true"]);
+    }
+}
