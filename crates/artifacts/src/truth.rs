@@ -49,7 +49,7 @@ pub struct MaskTruth {
     pub instances: Vec<u32>,
     /// Part id when it shows a single part of a thing.
     pub part: Option<u32>,
-    /// `whole`, `part` or `merged`.
+    /// `whole`, `part`, `merged`, or `spurious`: a patch that is no thing.
     pub kind: String,
     /// A caption, such as "handle of the red mug".
     pub caption: String,

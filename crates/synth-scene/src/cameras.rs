@@ -1,12 +1,13 @@
 //! Where the photographs are taken from.
 
 use crate::layout::TABLE_HEIGHT;
+use crate::points::normal;
 use crate::scene::Scene;
-use glam::{DVec2, DVec3};
+use glam::{DMat3, DVec2, DVec3, EulerRot};
 use gs_scene::Camera;
 use rand::Rng;
 use rand_chacha::ChaCha8Rng;
-use std::f64::consts::TAU;
+use std::f64::consts::{PI, TAU};
 
 /// How the photographer moves.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, clap::ValueEnum)]
@@ -43,6 +44,24 @@ pub fn place(scene: &Scene, path: Path, views: usize, width: u32, height: u32, r
         .collect()
 }
 
+/// The same cameras as structure from motion would have found them: turned about each axis by Gaussian noise of standard
+/// deviation `noise` degrees, and moved along each by as many centimetres.
+pub fn perturbed(cameras: &[Camera], noise: f64, rng: &mut ChaCha8Rng) -> Vec<Camera> {
+    if noise == 0.0 {
+        return cameras.to_vec();
+    }
+    cameras
+        .iter()
+        .map(|camera| {
+            let mut draw = || DVec3::new(normal(rng), normal(rng), normal(rng)) * noise;
+            let (turn, shift) = (draw() * PI / 180.0, draw() * 0.01);
+            let rotation = DMat3::from_euler(EulerRot::XYZ, turn.x, turn.y, turn.z) * camera.rotation;
+            let eye = camera.position() + shift;
+            Camera { rotation, translation: -(rotation * eye), ..camera.clone() }
+        })
+        .collect()
+}
+
 fn ring(scene: &Scene, i: usize, views: usize) -> (DVec3, DVec3) {
     let angle = TAU * (i as f64 + 0.25) / views as f64;
     let radius = scene.room - WALL_DISTANCE;
@@ -71,5 +90,31 @@ fn clear(scene: &Scene, eye: &mut DVec3) {
         if away < CLEARANCE && eye.z < top + CLEARANCE {
             eye.z = top + CLEARANCE;
         }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use rand::SeedableRng;
+
+    #[test]
+    fn pose_noise_has_the_size_asked_for_and_keeps_the_lens() {
+        let camera = Camera::look_at(DVec3::new(1.0, 2.0, 1.5), DVec3::ZERO, DVec3::Z, 64, 48, FIELD);
+        let cameras = vec![camera.clone(); 2000];
+        let rng = &mut ChaCha8Rng::seed_from_u64(4);
+        let (mut turns, mut shifts) = (0.0, 0.0);
+        for c in perturbed(&cameras, 0.5, rng) {
+            assert_eq!((c.fx, c.fy, c.cx, c.cy, c.width), (camera.fx, camera.fy, camera.cx, camera.cy, camera.width));
+            assert!((c.rotation * c.rotation.transpose() - DMat3::IDENTITY).abs_diff_eq(DMat3::ZERO, 1e-12));
+            let relative = c.rotation * camera.rotation.transpose();
+            let cosine: f64 = 0.5 * (relative.x_axis.x + relative.y_axis.y + relative.z_axis.z - 1.0);
+            turns += cosine.clamp(-1.0, 1.0).acos().to_degrees().powi(2);
+            shifts += (100.0 * (c.position() - camera.position())).length_squared();
+        }
+        // Three axes, each with the variance 0.25.
+        assert!((turns / 2000.0 - 0.75).abs() < 0.06, "{turns}");
+        assert!((shifts / 2000.0 - 0.75).abs() < 0.06, "{shifts}");
+        assert_eq!(perturbed(&cameras[..1], 0.0, rng), cameras[..1]);
     }
 }

@@ -1,6 +1,7 @@
 //! The command line of `synth-scene`.
 
 use crate::cameras::Path as CameraPath;
+use crate::language::Speech;
 use crate::masks::Faults;
 use crate::write::{self, Options};
 use clap::{Parser, ValueEnum};
@@ -17,8 +18,13 @@ use std::path::PathBuf;
 #[command(name = "synth-scene", version)]
 pub struct Args {
     /// Folder to write; an earlier synthetic scene in it is replaced
-    #[arg(long, value_name = "DIR")]
-    out: PathBuf,
+    #[arg(long, value_name = "DIR", required_unless_present = "masks_to")]
+    out: Option<PathBuf>,
+    /// Write only the masks of the scene that the other options describe, without photographs: <view>_s.npy (and
+    /// <view>_f.npy and text_features.json with --features) and masks.json, what each mask shows. So one scene's
+    /// photographs and geometry serve masks with many faults, which never move a thing or a camera
+    #[arg(long, value_name = "DIR", conflicts_with = "out")]
+    masks_to: Option<PathBuf>,
     /// Sizes that the options below default to
     #[arg(long, value_enum, default_value_t = Size::Demo)]
     size: Size,
@@ -40,16 +46,36 @@ pub struct Args {
     /// Where the camera goes [a ring for one table, a walk for several]
     #[arg(long, value_enum)]
     cameras: Option<CameraPath>,
+    /// What the faults below default to
+    #[arg(long, value_enum, default_value_t = Corruption::Mild)]
+    corruption: Corruption,
     /// Probability that a mask level of a view shows a thing at another granularity: split into parts, or merged with
-    /// a neighbour. 0 is perfect; 0.3 resembles automatic masks of cluttered tables
-    #[arg(long, value_name = "PROBABILITY", default_value_t = 0.3)]
-    granularity_p: f64,
-    /// Largest growth or shrinkage of a mask, 0 to 16
-    #[arg(long, value_name = "PIXELS", default_value_t = 1)]
-    boundary_noise: u32,
-    /// Probability that a mask is missing
-    #[arg(long, value_name = "PROBABILITY", default_value_t = 0.05)]
-    missing: f64,
+    /// a neighbour [exact 0, mild 0.3]
+    #[arg(long, value_name = "PROBABILITY")]
+    granularity_p: Option<f64>,
+    /// Largest growth or shrinkage of a mask, 0 to 16 [exact 0, mild 1]
+    #[arg(long, value_name = "PIXELS")]
+    boundary_noise: Option<u32>,
+    /// Probability that a mask is missing [exact 0, mild 0.05]
+    #[arg(long, value_name = "PROBABILITY")]
+    missing: Option<f64>,
+    /// Spurious masks per mask of a level, 0 to 1: patches that are no thing [exact 0, mild 0]
+    #[arg(long, value_name = "SHARE")]
+    spurious: Option<f64>,
+    /// Noise of the poses in sparse/0, 0 to 10: standard deviation in degrees about each axis, and in centimetres along
+    /// it. Photographs and truth keep the exact ones, which truth/sparse then holds [exact 0, mild 0]
+    #[arg(long, value_name = "SIZE")]
+    pose_noise: Option<f64>,
+    /// Give each mask a CLIP-like feature (<view>_f.npy) and write a table of text features for eval --text-features:
+    /// text_features.json in truth, or beside the masks
+    #[arg(long)]
+    features: bool,
+    /// Weight of what lies beside a mask in the crop that its feature means, 0 to 1 [exact 0, mild 0]
+    #[arg(long, value_name = "SHARE", requires = "features")]
+    leaking: Option<f64>,
+    /// Expected length of the noise added to a mask's unit feature, 0 to 10 [exact 0, mild 0]
+    #[arg(long, value_name = "SIZE", requires = "features")]
+    feature_noise: Option<f64>,
     /// Every how many views get polygon labels, from the first; 0 for none. Held-out views are every eighth
     #[arg(long, value_name = "COUNT", default_value_t = 4)]
     label_every: usize,
@@ -68,12 +94,46 @@ pub enum Size {
     Large,
 }
 
+/// Settings of all faults together; docs/granularity.md says where they come from.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
+pub enum Corruption {
+    /// No faults.
+    Exact,
+    /// A few faults of granularity, edges a pixel off, some masks missing.
+    Mild,
+}
+
+/// What a [`Corruption`] sets.
+struct Knobs {
+    faults: Faults,
+    speech: Speech,
+    pose_noise: f64,
+}
+
+impl Corruption {
+    fn knobs(self) -> Knobs {
+        let exact = Knobs { faults: Faults::default(), speech: Speech::default(), pose_noise: 0.0 };
+        match self {
+            Self::Exact => exact,
+            Self::Mild => {
+                Knobs { faults: Faults { granularity: 0.3, boundary: 1, missing: 0.05, spurious: 0.0 }, ..exact }
+            }
+        }
+    }
+}
+
 impl Args {
     fn options(&self, seed: u64) -> Result<Options> {
         let (objects, views, width, height, points) = match self.size {
             Size::Tiny => (8, 8, 160, 120, 1_500),
             Size::Demo => (10, 30, 480, 360, 9_000),
             Size::Large => (40, 120, 640, 480, 40_000),
+        };
+        let Knobs { faults, speech, pose_noise } = self.corruption.knobs();
+        let share = |option: &str, given: Option<f64>, preset: f64| within(option, given.unwrap_or(preset), 0.0, 1.0);
+        let speech = Speech {
+            leaking: share("--leaking", self.leaking, speech.leaking)?,
+            noise: within("--feature-noise", self.feature_noise.unwrap_or(speech.noise), 0.0, 10.0)?,
         };
         Ok(Options {
             seed,
@@ -84,10 +144,13 @@ impl Args {
             points: within("--points", self.points.unwrap_or(points), 1, 10_000_000)?,
             cameras: self.cameras,
             faults: Faults {
-                granularity: within("--granularity-p", self.granularity_p, 0.0, 1.0)?,
-                boundary: within("--boundary-noise", self.boundary_noise, 0, 16)?,
-                missing: within("--missing", self.missing, 0.0, 1.0)?,
+                granularity: share("--granularity-p", self.granularity_p, faults.granularity)?,
+                boundary: within("--boundary-noise", self.boundary_noise.unwrap_or(faults.boundary), 0, 16)?,
+                missing: share("--missing", self.missing, faults.missing)?,
+                spurious: share("--spurious", self.spurious, faults.spurious)?,
             },
+            speech: self.features.then_some(speech),
+            pose_noise: within("--pose-noise", self.pose_noise.unwrap_or(pose_noise), 0.0, 10.0)?,
             label_every: self.label_every,
         })
     }
@@ -110,6 +173,10 @@ impl Program for Args {
 
     fn run(self, stage: &Stage) -> Result<()> {
         let options = self.options(stage.seed())?;
-        write::run(stage, &self.out, &options)
+        match (&self.out, &self.masks_to) {
+            (_, Some(folder)) => write::run_masks(stage, folder, &options),
+            (Some(out), None) => write::run(stage, out, &options),
+            (None, None) => Err(Error::new("nowhere to write").field("--out")),
+        }
     }
 }

@@ -1,23 +1,26 @@
 //! Id maps as a segmentation model would give them: masks of things at four levels, with the faults of real ones.
 //!
 //! Without faults, levels `default` and `large` show every thing whole, `medium` shows parts with same-named parts of
-//! a thing together ("cookies"), and `small` shows every part by itself. Three faults, each with its own knob:
+//! a thing together ("cookies"), and `small` shows every part by itself. Four faults, each with its own knob:
 //! * granularity: with probability p a thing is shown otherwise in a view and level. On `default` and `large` it is
 //!   then, with equal chance, split into its parts or merged with its nearest free neighbour on the same ground; on
 //!   `small` and `medium` it is shown whole, or two of its parts become one. A thing without such a choice (one part,
 //!   no neighbour) stays as it is, and background is never merged;
 //! * boundaries: each mask shrinks or grows by up to so many pixels; masks painted later win;
-//! * missing masks.
+//! * missing masks;
+//! * spurious masks: patches that are no thing, such as a highlight, a shadow or half of a wall.
 
 use crate::render::Frame;
 use crate::scene::Scene;
 use artifacts::{LEVELS, Level, MaskMaps, MaskTruth};
+use glam::DVec2;
 use rand::Rng;
 use rand_chacha::ChaCha8Rng;
 use std::collections::BTreeMap;
+use std::f64::consts::{PI, TAU};
 
 /// The knobs of the faults.
-#[derive(Debug, Clone, Copy, PartialEq)]
+#[derive(Debug, Clone, Copy, Default, PartialEq)]
 pub struct Faults {
     /// Probability that a thing is shown at another granularity than the level's, 0 to 1.
     pub granularity: f64,
@@ -25,12 +28,19 @@ pub struct Faults {
     pub boundary: u32,
     /// Probability that a mask is missing, 0 to 1.
     pub missing: f64,
+    /// Spurious masks per mask of a level, 0 to 1.
+    pub spurious: f64,
 }
 
 /// Masks of fewer pixels are not given, as segmentation models drop them.
 pub const SMALLEST: usize = 16;
 /// How far a neighbour to merge with may stand away, in metres between footprints' bounding circles.
 const NEIGHBOUR: f64 = 0.45;
+
+/// Share of the image that the smallest and the largest spurious mask cover.
+const PATCH: [f64; 2] = [0.0008, 0.02];
+/// A spurious mask is a patch of the things that own at least this share of it.
+const PATCH_OF: f64 = 0.1;
 
 /// A mask before it is painted.
 struct Candidate {
@@ -39,8 +49,15 @@ struct Candidate {
     truth: MaskTruth,
 }
 
-/// Id maps of one view and what each id shows, in the order of ids. Every id owns pixels.
-pub fn segment(scene: &Scene, frame: &Frame, faults: &Faults, rng: &mut ChaCha8Rng) -> (MaskMaps, Vec<MaskTruth>) {
+/// Id maps of one view and what each id shows, in the order of ids. Every id owns pixels. `patches` draws the spurious
+/// masks, so that they do not change the others.
+pub fn segment(
+    scene: &Scene,
+    frame: &Frame,
+    faults: &Faults,
+    rng: &mut ChaCha8Rng,
+    patches: &mut ChaCha8Rng,
+) -> (MaskMaps, Vec<MaskTruth>) {
     let mut maps = MaskMaps { width: frame.width, height: frame.height, ids: Vec::new() };
     let mut truth = Vec::new();
     let mut visible = vec![0usize; scene.parts.len()];
@@ -59,13 +76,23 @@ pub fn segment(scene: &Scene, frame: &Frame, faults: &Faults, rng: &mut ChaCha8R
         }
         // A level of a real file is never empty: the largest mask stays.
         let largest = (0..candidates.len()).max_by_key(|&i| (candidates[i].2, i));
-        let kept: Vec<Candidate> = candidates
+        let mut kept: Vec<Candidate> = candidates
             .into_iter()
             .enumerate()
             .filter(|(i, (_, lost, _))| !lost || Some(*i) == largest)
             .map(|(_, (c, _, _))| c)
             .collect();
-        let painted = paint(frame, &kept, scene.parts.len(), faults.boundary, rng);
+        let mut painted = paint(frame, &kept, scene.parts.len(), faults.boundary, rng);
+        for _ in 0..kept.len() {
+            if patches.random::<f64>() < faults.spurious {
+                let pixels = patch(frame, patches);
+                let things = pixels.iter().map(|&at| frame.thing[at]).filter(|&t| t >= 0);
+                if pixels.len() >= SMALLEST {
+                    kept.push(Candidate { parts: Vec::new(), truth: describe_patch(scene, things, level) });
+                    pixels.into_iter().for_each(|at| painted[at] = kept.len() as i32 - 1);
+                }
+            }
+        }
         let owned = compact(&painted, kept.len(), truth.len() as i32, &mut maps.ids);
         truth.extend(kept.into_iter().zip(owned).filter(|(_, owned)| *owned).map(|(c, _)| c.truth));
     }
@@ -195,6 +222,39 @@ fn describe(scene: &Scene, parts: &[u32], level: Level, kind: Kind) -> MaskTruth
     }
 }
 
+/// Pixels of an ellipse anywhere in the image.
+fn patch(frame: &Frame, rng: &mut ChaCha8Rng) -> Vec<usize> {
+    let (w, h) = (frame.width as f64, frame.height as f64);
+    let centre = DVec2::new(rng.random::<f64>() * w, rng.random::<f64>() * h);
+    // Small patches are the most frequent: the logarithm of the area is uniform.
+    let area = w * h * PATCH[0] * (PATCH[1] / PATCH[0]).powf(rng.random());
+    let aspect = 0.4 + 0.6 * rng.random::<f64>();
+    let axis = DVec2::from_angle(rng.random::<f64>() * TAU);
+    let radius = (area / (PI * aspect)).sqrt();
+    let reach = radius.ceil();
+    let span = |at: f64, size: usize| (at - reach).max(0.0) as usize..((at + reach + 1.0) as usize).min(size);
+    let mut pixels = Vec::new();
+    for y in span(centre.y, frame.height) {
+        for x in span(centre.x, frame.width) {
+            let d = DVec2::new(x as f64 + 0.5, y as f64 + 0.5) - centre;
+            if DVec2::new(d.dot(axis), d.perp_dot(axis) / aspect).length() < radius {
+                pixels.push(y * frame.width + x);
+            }
+        }
+    }
+    pixels
+}
+
+fn describe_patch(scene: &Scene, things: impl Iterator<Item = i32>, level: Level) -> MaskTruth {
+    let mut counts = BTreeMap::<u32, usize>::new();
+    things.for_each(|t| *counts.entry(t as u32).or_default() += 1);
+    let least = PATCH_OF * counts.values().sum::<usize>() as f64;
+    let instances: Vec<u32> = counts.into_iter().filter(|&(_, n)| n as f64 >= least).map(|(t, _)| t).collect();
+    let names: Vec<String> = instances.iter().map(|&t| format!("the {}", scene.things[t as usize].name)).collect();
+    let caption = format!("patch of {}", names.join(" and "));
+    MaskTruth { level: level as u32, instances, part: None, kind: "spurious".into(), caption }
+}
+
 /// Paints the masks in their order, each grown or shrunk; returns positions in `masks`, -1 for none.
 fn paint(frame: &Frame, masks: &[Candidate], parts: usize, boundary: u32, rng: &mut ChaCha8Rng) -> Vec<i32> {
     let mut owner = vec![-1i32; parts];
@@ -283,7 +343,7 @@ mod tests {
     use crate::testing::example;
     use rand::SeedableRng;
 
-    const EXACT: Faults = Faults { granularity: 0.0, boundary: 0, missing: 0.0 };
+    const EXACT: Faults = Faults { granularity: 0.0, boundary: 0, missing: 0.0, spurious: 0.0 };
 
     fn rng() -> ChaCha8Rng {
         ChaCha8Rng::seed_from_u64(11)
@@ -304,7 +364,7 @@ mod tests {
     #[test]
     fn without_faults_large_masks_are_things_and_small_masks_are_parts() {
         let (scene, frame) = example();
-        let (maps, truth) = segment(scene, frame, &EXACT, &mut rng());
+        let (maps, truth) = segment(scene, frame, &EXACT, &mut rng(), &mut rng());
         check_ids(&maps, &truth);
         for (at, &thing) in frame.thing.iter().enumerate() {
             for level in [Level::Default, Level::Large] {
@@ -327,7 +387,7 @@ mod tests {
     #[test]
     fn granularity_alone_changes_what_masks_show_but_no_boundary_of_parts() {
         let (scene, frame) = example();
-        let (maps, truth) = segment(scene, frame, &Faults { granularity: 1.0, ..EXACT }, &mut rng());
+        let (maps, truth) = segment(scene, frame, &Faults { granularity: 1.0, ..EXACT }, &mut rng(), &mut rng());
         check_ids(&maps, &truth);
         let large: Vec<&MaskTruth> = truth.iter().filter(|t| t.level == 3).collect();
         assert!(large.iter().any(|t| t.kind == "merged" && t.instances.len() == 2 && t.caption.contains(" and ")));
@@ -346,8 +406,8 @@ mod tests {
     #[test]
     fn boundary_alone_moves_edges_by_a_few_pixels() {
         let (scene, frame) = example();
-        let (exact, _) = segment(scene, frame, &EXACT, &mut rng());
-        let (moved, truth) = segment(scene, frame, &Faults { boundary: 2, ..EXACT }, &mut rng());
+        let (exact, _) = segment(scene, frame, &EXACT, &mut rng(), &mut rng());
+        let (moved, truth) = segment(scene, frame, &Faults { boundary: 2, ..EXACT }, &mut rng(), &mut rng());
         check_ids(&moved, &truth);
         let changed = exact.ids.iter().zip(&moved.ids).filter(|(a, b)| a != b).count();
         assert!(changed > 100 && changed < exact.ids.len() / 5, "{changed} of {}", exact.ids.len());
@@ -369,14 +429,38 @@ mod tests {
     #[test]
     fn missing_alone_drops_whole_masks() {
         let (scene, frame) = example();
-        let (_, all) = segment(scene, frame, &EXACT, &mut rng());
-        let (maps, half) = segment(scene, frame, &Faults { missing: 0.5, ..EXACT }, &mut rng());
+        let (_, all) = segment(scene, frame, &EXACT, &mut rng(), &mut rng());
+        let (maps, half) = segment(scene, frame, &Faults { missing: 0.5, ..EXACT }, &mut rng(), &mut rng());
         check_ids(&maps, &half);
         assert!(half.len() > all.len() / 4 && half.len() < 3 * all.len() / 4, "{} of {}", half.len(), all.len());
         assert!(half.iter().all(|t| all.contains(t)));
-        let (maps, none) = segment(scene, frame, &Faults { missing: 1.0, ..EXACT }, &mut rng());
+        let (maps, none) = segment(scene, frame, &Faults { missing: 1.0, ..EXACT }, &mut rng(), &mut rng());
         check_ids(&maps, &none);
         assert_eq!(none.len(), 4, "the largest of each level stays");
+    }
+
+    #[test]
+    fn spurious_alone_paints_patches_over_untouched_masks() {
+        let (scene, frame) = example();
+        let with = |spurious| segment(scene, frame, &Faults { spurious, ..EXACT }, &mut rng(), &mut rng());
+        let (exact, all) = with(0.0);
+        for p in [0.3, 1.0] {
+            let (maps, truth) = with(p);
+            check_ids(&maps, &truth);
+            let patches = truth.iter().filter(|t| t.kind == "spurious").count();
+            let share = patches as f64 / all.len() as f64;
+            assert!((share - p).abs() < 0.15, "{share} of {p}");
+            for (at, &id) in maps.ids.iter().enumerate() {
+                let shown = &truth[id.max(0) as usize];
+                if id >= 0 && shown.kind != "spurious" {
+                    assert_eq!(shown, &all[exact.ids[at] as usize], "what is not covered stays");
+                } else if id < 0 {
+                    assert_eq!(exact.ids[at], -1);
+                }
+            }
+            let patch = truth.iter().find(|t| t.kind == "spurious").unwrap();
+            assert!(!patch.instances.is_empty() && patch.caption.starts_with("patch of the "), "{patch:?}");
+        }
     }
 
     #[test]

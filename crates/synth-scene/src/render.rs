@@ -30,6 +30,33 @@ const EXPOSURE: f64 = 1.12;
 /// Sharpness of highlights.
 const GLOSS: f64 = 60.0;
 
+/// What each pixel shows, without a photograph: [`Frame::rgb`] is empty, everything else as [`render`] gives it.
+pub fn identify(scene: &Scene, camera: &Camera) -> Frame {
+    let (w, h) = (camera.width as usize, camera.height as usize);
+    let eye = camera.position();
+    let pixels: Vec<(i32, i32, f64)> =
+        (0..w * h).into_par_iter().with_min_len(w).map(|at| shown(scene, camera, eye, at % w, at / w)).collect();
+    Frame {
+        width: w,
+        height: h,
+        rgb: Vec::new(),
+        thing: pixels.iter().map(|p| p.0).collect(),
+        part: pixels.iter().map(|p| p.1).collect(),
+        distance: pixels.iter().map(|p| p.2).collect(),
+    }
+}
+
+/// Thing, part and distance at a pixel's centre.
+fn shown(scene: &Scene, camera: &Camera, eye: DVec3, x: usize, y: usize) -> (i32, i32, f64) {
+    match scene.trace(eye, ray(camera, x as f64 + 0.5, y as f64 + 0.5), 0.0) {
+        Some(hit) => {
+            let p = &scene.primitives[hit.primitive];
+            (p.thing as i32, p.part as i32, hit.t)
+        }
+        None => (-1, -1, f64::INFINITY),
+    }
+}
+
 /// Renders the scene; the same bytes for any number of threads.
 pub fn render(scene: &Scene, light: &LightMap, camera: &Camera) -> Frame {
     let (w, h) = (camera.width as usize, camera.height as usize);
@@ -50,11 +77,7 @@ pub fn render(scene: &Scene, light: &LightMap, camera: &Camera) -> Frame {
                 distance: vec![f64::INFINITY; w],
             };
             for x in 0..w {
-                let centre = scene.trace(eye, ray(camera, x as f64 + 0.5, y as f64 + 0.5), 0.0);
-                if let Some(hit) = centre {
-                    let p = &scene.primitives[hit.primitive];
-                    (row.thing[x], row.part[x], row.distance[x]) = (p.thing as i32, p.part as i32, hit.t);
-                }
+                (row.thing[x], row.part[x], row.distance[x]) = shown(scene, camera, eye, x, y);
                 let mut sum = DVec3::ZERO;
                 for [sx, sy] in SAMPLES {
                     let direction = ray(camera, x as f64 + sx, y as f64 + sy);

@@ -1,15 +1,16 @@
 //! Makes a scene and writes all of it.
 
 use crate::cameras::{self, Path as CameraPath};
+use crate::language::{Language, Speech};
 use crate::light::LightMap;
 use crate::masks::{self, Faults};
 use crate::points::Collector;
 use crate::render::{self, Frame};
 use crate::scene::Scene;
 use crate::{label, layout};
-use artifacts::{MaskTruth, TrueObject, TruePart, TruePoints, TrueScene, maps_path};
-use gs_io::{Error, IoContext, Result, create_dir, npy};
-use gs_scene::{Camera, Image, colmap};
+use artifacts::{MaskTruth, TrueObject, TruePart, TruePoints, TrueScene, features_path, maps_path};
+use gs_io::{Error, IoContext, Result, create_dir, npy, write_bytes};
+use gs_scene::{Camera, Image, PointCloud, colmap};
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
 use serde_json::{Value, json};
@@ -36,6 +37,10 @@ pub struct Options {
     pub cameras: Option<CameraPath>,
     /// Faults of the id maps.
     pub faults: Faults,
+    /// CLIP-like features of the masks, where asked for.
+    pub speech: Option<Speech>,
+    /// Noise of the poses in `sparse/0`, in degrees about and centimetres along each axis.
+    pub pose_noise: f64,
     /// Every how many views get polygon labels; 0 for none.
     pub label_every: usize,
 }
@@ -50,7 +55,29 @@ const FOLDERS: [&str; 5] = ["images", "sparse", "language_features", "label", "t
 const LAYOUT: u64 = 0;
 const CAMERAS: u64 = 1;
 const POINTS: u64 = 2;
+const POSES: u64 = 3;
 const FIRST_VIEW: u64 = 16;
+const FIRST_SPEECH: u64 = 1 << 32;
+const FIRST_PATCHES: u64 = 2 << 32;
+
+impl Default for Options {
+    /// The demo's scene with perfect masks.
+    fn default() -> Self {
+        Self {
+            seed: 0,
+            objects: 10,
+            views: 30,
+            width: 480,
+            height: 360,
+            points: 9_000,
+            cameras: None,
+            faults: Faults::default(),
+            speech: None,
+            pose_noise: 0.0,
+            label_every: 4,
+        }
+    }
+}
 
 impl Options {
     /// A generator of one of the streams.
@@ -85,11 +112,47 @@ impl Options {
             CameraPath::Ring => "ring",
             CameraPath::Walk => "walk",
         };
-        json!({
+        let mut all = json!({
             "seed": self.seed, "objects": self.objects, "views": self.views, "width": self.width,
             "height": self.height, "points": self.points, "cameras": path, "granularity_p": self.faults.granularity,
             "boundary_noise": self.faults.boundary, "missing": self.faults.missing, "label_every": self.label_every,
-        })
+        });
+        // What is not used is not named: older scenes of the same bytes lack it too.
+        let mut used = |name: &str, value: f64| {
+            if value != 0.0 {
+                all[name] = json!(value);
+            }
+        };
+        used("spurious", self.faults.spurious);
+        used("pose_noise", self.pose_noise);
+        if let Some(speech) = self.speech {
+            all["features"] = json!({ "leaking": speech.leaking, "noise": speech.noise });
+        }
+        all
+    }
+
+    /// Writes a view's id maps, and features where asked for, into a folder; returns what the masks show.
+    fn write_masks(
+        &self,
+        folder: &Path,
+        v: usize,
+        scene: &Scene,
+        frame: &Frame,
+        language: Option<&Language>,
+    ) -> Result<Vec<MaskTruth>> {
+        let (stem, v) = (stem(v), v as u64);
+        let (rng, patches) = (&mut self.rng(FIRST_VIEW + v), &mut self.rng(FIRST_PATCHES + v));
+        let (maps, shown) = masks::segment(scene, frame, &self.faults, rng, patches);
+        maps.write(maps_path(folder, &stem))?;
+        if let (Some(language), Some(speech)) = (language, &self.speech) {
+            let features = language.encode(frame, &maps, speech, &mut self.rng(FIRST_SPEECH + v));
+            features.write(features_path(folder, &stem))?;
+        }
+        Ok(shown)
+    }
+
+    fn language(&self, scene: &Scene) -> Option<Language> {
+        self.speech.map(|_| Language::new(scene))
     }
 }
 
@@ -114,6 +177,7 @@ pub fn run(stage: &Stage, out: &Path, options: &Options) -> Result<()> {
         scene.primitives.len()
     ));
     let light = options.light(&scene);
+    let language = options.language(&scene);
     let mut progress = stage.progress("views", cameras.len() as u64);
     let mut points = Collector::default();
     let mut masks = BTreeMap::new();
@@ -124,7 +188,8 @@ pub fn run(stage: &Stage, out: &Path, options: &Options) -> Result<()> {
         }
         let frame = render::render(&scene, &light, camera);
         points.add(&scene, camera, &frame);
-        let shown = write_view(out, v, &scene, &frame, options)?;
+        write_view(out, v, &frame)?;
+        let shown = options.write_masks(&out.join("language_features"), v, &scene, &frame, language.as_ref())?;
         masks.insert(stem(v), shown);
         if options.label_every > 0 && v % options.label_every == 0 {
             let path = out.join("label").join(stem(v) + ".json");
@@ -136,9 +201,17 @@ pub fn run(stage: &Stage, out: &Path, options: &Options) -> Result<()> {
     progress.finish(&[]);
 
     let sparse = points.sparse(&scene, options.points, POINT_NOISE, &mut options.rng(POINTS));
-    let views: Vec<(String, Camera)> =
-        cameras.into_iter().enumerate().map(|(v, c)| (format!("{}.png", stem(v)), c)).collect();
+    let named = |cameras: Vec<Camera>| -> Vec<(String, Camera)> {
+        cameras.into_iter().enumerate().map(|(v, c)| (format!("{}.png", stem(v)), c)).collect()
+    };
+    if options.pose_noise > 0.0 {
+        colmap::write_model(&out.join("truth/sparse/0"), &named(cameras.clone()), &PointCloud::default())?;
+    }
+    let views = named(cameras::perturbed(&cameras, options.pose_noise, &mut options.rng(POSES)));
     colmap::write_model(&out.join("sparse/0"), &views, &sparse)?;
+    if let Some(language) = &language {
+        write_table(&out.join("truth"), language)?;
+    }
     let truth = points.truth(&scene);
     let mut provenance = stage.provenance(TruePoints::FORMAT, 1, parameters.clone(), BTreeMap::new());
     provenance.extra = json!({ "classes": scene.classes() });
@@ -155,6 +228,68 @@ pub fn run(stage: &Stage, out: &Path, options: &Options) -> Result<()> {
     true_scene(&scene, parameters).write(&marker)?;
     stage.info(&format!("{} photographs, {} points, {}", views.len(), sparse.len(), marker.display()));
     Ok(())
+}
+
+/// Makes only the masks of the scene, without its photographs: id maps (and features and their table of texts, where
+/// asked for) as [`run`] with the same options puts them into `language_features`, and last of all `masks.json`, what each
+/// mask shows.
+///
+/// # Errors
+/// When a file cannot be written, when `folder` holds something else, or when the stage is interrupted.
+pub fn run_masks(stage: &Stage, folder: &Path, options: &Options) -> Result<()> {
+    let marker = folder.join("masks.json");
+    prepare_masks(folder, &marker)?;
+    let scene = options.scene();
+    let cameras = options.cameras(&scene);
+    let language = options.language(&scene);
+    let mut progress = stage.progress("views", cameras.len() as u64);
+    let mut masks = BTreeMap::new();
+    for (v, camera) in cameras.iter().enumerate() {
+        if stage.interrupted() {
+            return Err(Error::new("interrupted").file(folder));
+        }
+        let frame = render::identify(&scene, camera);
+        masks.insert(stem(v), options.write_masks(folder, v, &scene, &frame, language.as_ref())?);
+        progress.step();
+    }
+    progress.finish(&[]);
+    if let Some(language) = &language {
+        write_table(folder, language)?;
+    }
+    let count = masks.values().map(Vec::len).sum::<usize>();
+    let summary = json!({ "views": cameras.len(), "masks": count });
+    stage.record(&marker, options.parameters(&scene), BTreeMap::new(), summary)?;
+    MaskTruth::write_all(&marker, &masks)?;
+    stage.info(&format!("{count} masks in {} views, {}", cameras.len(), marker.display()));
+    Ok(())
+}
+
+/// Makes the folder of masks, without those of an earlier run; `masks.json` says that there is one, and while it is empty
+/// that it is not complete.
+fn prepare_masks(folder: &Path, marker: &Path) -> Result<()> {
+    let here = entries(folder)?;
+    if !here.is_empty() && MaskTruth::read_all(marker).is_err() {
+        return Err(Error::new("the folder holds something that is not synthetic masks")
+            .file(folder)
+            .expected("an empty folder, or earlier synthetic masks")
+            .hint("choose another --masks-to"));
+    }
+    create_dir(folder)?;
+    MaskTruth::write_all(marker, &BTreeMap::new())?;
+    let ours = |p: &&std::path::PathBuf| {
+        let name = p.file_name().unwrap_or_default().to_string_lossy();
+        name.ends_with("_s.npy") || name.ends_with("_f.npy") || name == TABLE
+    };
+    here.iter().filter(ours).try_for_each(|p| std::fs::remove_file(p).at("replace", p))
+}
+
+/// Name of the table of text features.
+const TABLE: &str = "text_features.json";
+
+fn write_table(folder: &Path, language: &Language) -> Result<()> {
+    let path = folder.join(TABLE);
+    let json = serde_json::to_vec(&language.table()).map_err(|e| Error::new(e.to_string()).file(&path))?;
+    write_bytes(&path, &json)
 }
 
 /// Makes the folders, empty. What an earlier run left is removed, the marker first; `truth` stands from the beginning,
@@ -193,16 +328,13 @@ fn entries(folder: &Path) -> Result<Vec<std::path::PathBuf>> {
     list.map(|e| e.map(|e| e.path()).at("list", folder)).collect()
 }
 
-/// Writes a view's photograph, id maps and truth; returns what its masks show.
-fn write_view(out: &Path, v: usize, scene: &Scene, frame: &Frame, options: &Options) -> Result<Vec<MaskTruth>> {
+/// Writes a view's photograph and what each of its pixels shows.
+fn write_view(out: &Path, v: usize, frame: &Frame) -> Result<()> {
     let stem = stem(v);
     let (w, h) = (frame.width, frame.height);
     Image::from_rgb8(w as u32, h as u32, &frame.rgb).write_png(out.join("images").join(format!("{stem}.png")))?;
     npy::write_i32(out.join("truth/views").join(format!("{stem}.npy")), &[h, w], &frame.thing)?;
-    npy::write_i32(out.join("truth/parts").join(format!("{stem}.npy")), &[h, w], &frame.part)?;
-    let (maps, shown) = masks::segment(scene, frame, &options.faults, &mut options.rng(FIRST_VIEW + v as u64));
-    maps.write(maps_path(out.join("language_features"), &stem))?;
-    Ok(shown)
+    npy::write_i32(out.join("truth/parts").join(format!("{stem}.npy")), &[h, w], &frame.part)
 }
 
 fn true_scene(scene: &Scene, parameters: Value) -> TrueScene {

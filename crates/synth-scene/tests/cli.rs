@@ -8,7 +8,6 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
 use std::process::{Command, Output};
 use std::sync::OnceLock;
-use synth_scene::masks::Faults;
 use synth_scene::write::{Options, stem};
 
 fn synth_scene(out: &Path, arguments: &[&str]) -> Output {
@@ -50,17 +49,7 @@ fn exact() -> &'static Path {
 }
 
 fn exact_options() -> Options {
-    Options {
-        seed: 3,
-        objects: 8,
-        views: 8,
-        width: 160,
-        height: 120,
-        points: 1500,
-        cameras: None,
-        faults: Faults { granularity: 0.0, boundary: 0, missing: 0.0 },
-        label_every: 4,
-    }
+    Options { seed: 3, objects: 8, views: 8, width: 160, height: 120, points: 1500, ..Options::default() }
 }
 
 #[test]
@@ -118,6 +107,8 @@ fn bad_options_are_errors_of_one_line() {
         (["--granularity-p", "NaN"], "--granularity-p"),
         (["--missing", "2"], "--missing"),
         (["--boundary-noise", "99"], "--boundary-noise"),
+        (["--spurious", "1.1"], "--spurious: out of range; found 1.1, expected 0 to 1"),
+        (["--pose-noise", "11"], "--pose-noise"),
     ] {
         let o = synth_scene(&out, &arguments);
         let said = String::from_utf8_lossy(&o.stderr);
@@ -222,6 +213,104 @@ fn without_faults_large_masks_are_the_true_instances() {
         }
         let ids: BTreeSet<i32> = pairs.iter().map(|p| p.0).collect();
         assert_eq!(ids.len(), pairs.len(), "a mask shows one thing");
+    }
+}
+
+fn names(all: &BTreeMap<PathBuf, Vec<u8>>, folder: &str) -> BTreeMap<PathBuf, Vec<u8>> {
+    let within = |(p, b): (&PathBuf, &Vec<u8>)| Some((p.strip_prefix(folder).ok()?.to_path_buf(), b.clone()));
+    all.iter().filter_map(within).collect()
+}
+
+const SMALL: [&str; 8] = ["--objects", "4", "--views", "2", "--width", "80", "--height", "60"];
+
+/// Options that set every fault.
+const ALL: [&str; 17] = [
+    "--granularity-p",
+    "0.5",
+    "--boundary-noise",
+    "2",
+    "--missing",
+    "0.1",
+    "--spurious",
+    "0.3",
+    "--features",
+    "--leaking",
+    "0.3",
+    "--feature-noise",
+    "0.4",
+    "--pose-noise",
+    "0.2",
+    "--views",
+    "3",
+];
+
+#[test]
+fn masks_alone_are_those_of_the_full_run() {
+    let dir = tempfile::tempdir().unwrap();
+    let (full, alone) = (dir.path().join("full"), dir.path().join("alone"));
+    make(&full, &ALL);
+    let program = env!("CARGO_BIN_EXE_synth-scene");
+    let masks = |arguments: &[&str]| {
+        let mut c = Command::new(program);
+        c.args(["--size", "tiny", "--quiet"]).arg("--masks-to").arg(&alone).args(arguments).output().unwrap()
+    };
+    // Masks of an earlier run with more views leave nothing behind.
+    assert!(masks(&["--views", "4"]).status.success());
+    assert!(masks(&ALL).status.success());
+    let (full, alone_files) = (contents(&full), contents(&alone));
+    let mut expected = names(&full, "language_features");
+    expected.insert("masks.json".into(), full[Path::new("truth/masks.json")].clone());
+    expected.insert("text_features.json".into(), full[Path::new("truth/text_features.json")].clone());
+    assert_eq!(alone_files.keys().collect::<Vec<_>>(), expected.keys().collect::<Vec<_>>());
+    assert!(alone_files == expected, "the same bytes");
+    // What is not synthetic masks is left alone.
+    std::fs::write(alone.join("masks.json"), r#"{"photographs": 7}"#).unwrap();
+    let o = masks(&ALL);
+    let said = String::from_utf8_lossy(&o.stderr);
+    assert_eq!(o.status.code(), Some(2));
+    assert!(said.contains("not synthetic masks") && said.lines().count() == 1, "{said}");
+}
+
+/// Which folders of a scene each fault may change.
+#[test]
+fn each_fault_changes_its_own_files_and_nothing_else() {
+    let dir = tempfile::tempdir().unwrap();
+    let with = |name: &str, arguments: &[&str]| {
+        let out = dir.path().join(name);
+        let all = [&["--corruption", "exact", "--features"][..], &SMALL[..], arguments].concat();
+        make(&out, &all);
+        contents(&out)
+    };
+    let exact = with("exact", &[]);
+    let maps = ["language_features", "truth/masks.json", "truth/scene.json"];
+    let edges = ["language_features", "truth/scene.json"];
+    let features = ["_f.npy", "truth/scene.json"];
+    let poses = ["sparse/0/images.bin", "truth/scene.json", "truth/sparse"];
+    for (knob, value, may) in [
+        ("--granularity-p", "1", &maps[..]),
+        ("--boundary-noise", "2", &edges),
+        ("--missing", "0.5", &maps),
+        ("--spurious", "0.5", &maps),
+        ("--leaking", "0.5", &features),
+        ("--feature-noise", "0.5", &features),
+        ("--pose-noise", "0.5", &poses),
+    ] {
+        let changed = with(knob, &[knob, value]);
+        let differs: BTreeSet<&PathBuf> =
+            exact.keys().chain(changed.keys()).filter(|&p| exact.get(p) != changed.get(p)).collect();
+        for path in &differs {
+            // Points carry the parameters that made them, no more.
+            let path = path.to_string_lossy();
+            assert!(
+                path == "truth/points.safetensors" || may.iter().any(|m| path.contains(m)),
+                "{knob} changes {path}"
+            );
+        }
+        for m in may {
+            assert!(differs.iter().any(|p| p.to_string_lossy().contains(m)), "{knob} does not change {m}");
+        }
+        let points = |name: &str| TruePoints::read(dir.path().join(name).join("truth/points.safetensors")).unwrap();
+        assert_eq!(points("exact"), points(knob));
     }
 }
 

@@ -24,7 +24,7 @@ impl Scene {
     fn new() -> Self {
         let dir = tempfile::tempdir().unwrap();
         let scene = dir.path().join("scene0000_00");
-        let faults = synth_scene::masks::Faults { granularity: 0.5, boundary: 1, missing: 0.1 };
+        let faults = synth_scene::masks::Faults { granularity: 0.5, boundary: 1, missing: 0.1, spurious: 0.0 };
         let options = synth_scene::write::Options {
             seed: 3,
             objects: 6,
@@ -32,9 +32,9 @@ impl Scene {
             width: 120,
             height: 90,
             points: 50,
-            cameras: None,
             faults,
             label_every: 2,
+            ..synth_scene::write::Options::default()
         };
         synth_scene::write::run(&stage::Stage::silent("synth-scene"), &scene, &options).unwrap();
         let truth = TruePoints::read(scene.join("truth/points.safetensors")).unwrap();
