@@ -150,7 +150,10 @@ mod tests {
         assert_eq!(all(&truth, &[7; 400]), (1.0, 4.0), "one instance for all four");
         let spilled: Vec<i32> = (0..400).map(|i| (i + 5) / 100).collect();
         let (fragments, merged) = all(&truth, &spilled);
-        assert!((fragments - 1.25).abs() < 1e-12 && merged == 1.0, "the last spills 5 of its 100 into one of their own");
+        assert!(
+            (fragments - 1.25).abs() < 1e-12 && merged == 1.0,
+            "the last spills 5 of its 100 into one of their own"
+        );
     }
 
     #[test]

@@ -354,7 +354,8 @@ impl Args {
         let trained = train(&context, &sets, &options, Some((&path, &provenance)), stage, on_curve)?;
         let last = trained.curve.last().copied().unwrap_or_default();
         let summary = json!({ "views": sets.len(), "last": last, "resumed_at": trained.resumed_at,
-            "iterations": trained.iterations });
+            "iterations": trained.iterations, "gaussians": inputs.graph.kept.len(),
+            "network_bytes": trained.network_bytes });
         Ok((options.settings.dim, trained.features, summary))
     }
 
