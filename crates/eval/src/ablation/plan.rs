@@ -156,7 +156,7 @@ impl Plan {
         match keyword {
             "seeds" => {
                 self.seeds =
-                    rest[0].split_whitespace().map(|s| s.parse().map_err(|_| wrong())).collect::<Result<_>>()?
+                    rest[0].split_whitespace().map(|s| s.parse().map_err(|_| wrong())).collect::<Result<_>>()?;
             }
             "table" => {
                 let p: Vec<String> = rest[0].split_whitespace().map(String::from).collect();

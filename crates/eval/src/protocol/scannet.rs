@@ -157,7 +157,7 @@ pub fn nearest(gaussians: &Gaussians, speakers: &[u32], vertices: &[[f32; 3]]) -
 pub fn nearest_of(positions: &[[f32; 3]], points: &[[f32; 3]]) -> Vec<Option<u32>> {
     let tree = (!positions.is_empty()).then(|| ImmutableKdTree::<f32, 3>::new_from_slice(positions).ok()).flatten();
     let Some(tree) = tree else { return vec![None; points.len()] };
-    let one = |p: &[f32; 3]| Some(tree.query(p).nearest_one::<SquaredEuclidean<f32>>().execute().item as u32);
+    let one = |p: &[f32; 3]| Some(tree.query(p).nearest_one::<SquaredEuclidean<f32>>().execute().item);
     points.par_iter().map(one).collect()
 }
 
