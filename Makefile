@@ -7,7 +7,7 @@ CARGO ?= cargo
 THREADS ?= 0
 export THREADS
 
-.PHONY: help build demo scene test lint models clip-tiny bench-raster bench-graph bench-geom bench-growth bench-memory bench-train bench-cluster bench-cluster-graph bench-query clean
+.PHONY: help build demo scene test lint models clip-tiny bench-raster bench-graph bench-geom bench-growth bench-memory bench-train bench-cluster bench-cluster-graph bench-query ablation clean
 
 help: ## Say what can be made
 	@echo "Targets:"
@@ -78,6 +78,11 @@ bench-cluster-graph: ## Time cluster-match --cluster graph at a million Gaussian
 
 bench-query: ## Time a query over a million Gaussians and 500 instances: out/bench/query.json
 	$(CARGO) bench -p eval --bench query -- --out $(CURDIR)/out/bench/query.json
+
+JOBS ?= $(shell nproc)
+ablation: build ## The paper's ablation tables, readings of the paper, our methods: out/ablation/, docs/accuracy.md (an hour)
+	@$(MAKE) --no-print-directory -f pipelines/ablation.mk plan
+	@$(MAKE) --no-print-directory -j $(JOBS) -f pipelines/ablation.mk DOCS=docs/accuracy.md
 
 clean: ## Delete out/ and what cargo built
 	rm -rf out

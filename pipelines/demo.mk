@@ -16,7 +16,8 @@ FEAT_ARGS ?=
 CLUSTER_ARGS ?=
 SCORE_ARGS ?=
 QUERIES ?= green_kettle pink_coffee_set black_laptop yellow_toy_car
-REPORT_ARGS ?= --title Demo
+# The tables of an ablation, where there is one, are a section of the report.
+REPORT_ARGS ?= --title Demo $(if $(wildcard out/ablation/components.json),--ablation out/ablation)
 
 include pipelines/stages.mk
 

@@ -175,4 +175,17 @@ tiny "$work/k" 2 > "$work/k.log" 2>&1 || { cat "$work/k.log"; fail "make after k
 same "$work/a" "$work/k" || fail "kills changed the bytes"
 pass "after $kills kills make ends with the bytes of an undisturbed run"
 
+say "== a small ablation"
+# One tiny scene, one p, four rows, and the ranges that their results must lie in (pipelines/ablation-small.plan).
+ablation() { make --no-print-directory -j 2 -f pipelines/ablation.mk PLAN="${plan:-pipelines/ablation-small.plan}" OUT="$work/ablation"; }
+ablation > "$work/ablation.log" 2>&1 || { tail -3 "$work/ablation.log"; fail "the small ablation"; }
+[ -s "$work/ablation/small.json" ] && grep -q 'instance mIoU' "$work/ablation/small.md" || fail "no tables"
+ablation > "$work/again.log" 2>&1
+[ -z "$(stages_of "$work/again.log")" ] || { cat "$work/again.log"; fail "a second make ran a stage"; }
+sed 's/--method spectral/--method spectral --dim 2/' pipelines/ablation-small.plan > "$work/broken.plan"
+plan=$work/broken.plan ablation > "$work/broken.log" 2>&1 && fail "two numbers per feature are as good as many"
+grep -q 'not what the plan expects' "$work/broken.log" || { cat "$work/broken.log"; fail "no word of what was expected"; }
+[ "$(grep -c 'target/release/feat-train ' "$work/broken.log")" = 1 ] || fail "a changed line ran more than its features"
+pass "the small ablation gives what is expected, and a broken component does not"
+
 say "$passed passed, 0 failed"

@@ -1,5 +1,6 @@
 //! The command line of `eval`.
 
+mod ablation;
 mod masks;
 mod protocols;
 mod query;
@@ -48,6 +49,8 @@ enum Command {
     Masks(masks::MasksArgs),
     /// Make one self-contained HTML page of a run, and metrics.json beside it
     Report(ReportArgs),
+    /// Bring the scores of an ablation together: tables as JSON, Markdown and HTML
+    Ablation(ablation::AblationArgs),
 }
 
 /// The scene and what was found in it.
@@ -238,6 +241,9 @@ struct ReportArgs {
     /// Every which view is held out; 0 for none
     #[arg(long, default_value_t = 8, value_name = "N")]
     holdout: usize,
+    /// Show the tables of an ablation too: the output folder of eval ablation
+    #[arg(long, value_name = "DIR")]
+    ablation: Option<PathBuf>,
     /// The page; metrics.json is written beside it
     #[arg(long, value_name = "FILE")]
     out: PathBuf,
@@ -259,6 +265,7 @@ impl Program for Args {
             Command::Score(a) => run_score(a, stage)?,
             Command::Masks(a) => masks::run(a, stage)?,
             Command::Report(a) => run_report(a, stage)?,
+            Command::Ablation(a) => ablation::run(a, stage)?,
         };
         if !self.common.quiet && !self.common.json {
             // A closed pipe is the reader's choice.
@@ -360,6 +367,7 @@ fn run_report(a: &ReportArgs, stage: &Stage) -> Result<String> {
         title: a.title.clone().unwrap_or_else(name),
         out: a.out.clone(),
         views: a.views.clone(),
+        ablation: a.ablation.clone(),
     };
     let mut inputs = std::collections::BTreeMap::new();
     let metrics = report::run(&dataset, &options, &mut inputs)?;

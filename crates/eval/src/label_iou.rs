@@ -31,7 +31,7 @@ pub fn score(scene: &LabelledScene, dataset: &Dataset, frames: &[FrameLabels]) -
     for frame in frames {
         let Some(view) = dataset.views.iter().find(|v| v.stem() == frame.frame) else { continue };
         let camera = view.camera.resized(frame.width, frame.height);
-        let map = instance_map(&scene.gaussians, &scene.instances.label, &camera);
+        let map = instance_map(scene.gaussians(), &scene.instances.label, &camera, &scene.raster);
         let mut sizes = BTreeMap::<i32, usize>::new();
         map.iter().filter(|&&i| i >= 0).for_each(|&i| *sizes.entry(i).or_default() += 1);
         for (category, mask) in &frame.categories {
@@ -54,13 +54,13 @@ pub fn score(scene: &LabelledScene, dataset: &Dataset, frames: &[FrameLabels]) -
 }
 
 /// Which instance each pixel shows, `[height][width]`; -1 where none has more than half of the weight.
-fn instance_map(gaussians: &Gaussians, label: &[i32], camera: &Camera) -> Vec<i32> {
+fn instance_map(gaussians: &Gaussians, label: &[i32], camera: &Camera, raster: &RasterOptions) -> Vec<i32> {
     let (w, h) = (camera.width as usize, camera.height as usize);
     let mut map = vec![-1; w * h];
     if gaussians.is_empty() {
         return map;
     }
-    let options = RasterOptions { sh_degree: 0, ..RasterOptions::default() };
+    let options = RasterOptions { sh_degree: 0, ..raster.clone() };
     let threshold = Silhouette::Visible.default_threshold();
     let tiles = gs_raster::tile_weights(gaussians, camera, &options, true, |tile| {
         let mut shares = BTreeMap::<i32, Vec<f32>>::new();
@@ -99,8 +99,8 @@ mod tests {
             g.sh.extend([0.0; 3]);
         }
         let camera = Camera::look_at(DVec3::ZERO, DVec3::Z, -DVec3::Y, 75, 50, 1.0);
-        let map = instance_map(&g, &[2, 0, 0, -1], &camera);
-        let masks = Silhouette::Visible.masks(&g, &[&[1, 2], &[], &[0]], &camera, 0.5);
+        let map = instance_map(&g, &[2, 0, 0, -1], &camera, &RasterOptions::default());
+        let masks = Silhouette::Visible.masks(&g, &RasterOptions::default(), &[&[1, 2], &[], &[0]], &camera, 0.5);
         for (at, &i) in map.iter().enumerate() {
             for (k, mask) in masks.iter().enumerate() {
                 assert_eq!(mask.bits[at], i == k as i32, "pixel {at}, instance {k}");

@@ -1,5 +1,6 @@
 //! The last stage: text queries, evaluation protocols and the report.
 
+pub mod ablation;
 pub mod ask;
 pub mod cli;
 pub mod curves;

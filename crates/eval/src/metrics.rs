@@ -30,6 +30,12 @@ pub struct InstanceScore {
     pub fragmented: usize,
     /// Predicted instances that hold at least half of two or more true objects.
     pub merging: usize,
+    /// Fragmentation: predicted instances per true object, in the mean. An instance and an object belong together when they
+    /// share at least [`FRAGMENT`] of the points of either. 1 is perfect; less means that objects have none.
+    pub instances_per_object: f64,
+    /// Merging: true objects per predicted instance that belongs to any, in the mean. 1 is perfect; 0 without such an
+    /// instance.
+    pub objects_per_instance: f64,
     /// Points that count.
     pub points: usize,
     /// Each true object, by id.
@@ -59,6 +65,7 @@ pub fn score_instances(truth: &[i32], predicted: &[i32]) -> InstanceScore {
     let mut objects: Vec<ObjectScore> =
         true_size.iter().map(|(&id, &points)| ObjectScore { id, points, iou: 0.0, best: None, fragments: 0 }).collect();
     let mut held = std::collections::BTreeMap::<i32, usize>::new();
+    let (mut together, mut belonging) = (0usize, std::collections::BTreeSet::new());
     for run in pairs.chunk_by(|a, b| a == b) {
         let ((id, instance), both) = (run[0], run.len());
         if instance < 0 {
@@ -72,6 +79,10 @@ pub fn score_instances(truth: &[i32], predicted: &[i32]) -> InstanceScore {
         }
         let share = both as f64 / object.points as f64;
         object.fragments += usize::from(share >= FRAGMENT);
+        if share.max(both as f64 / predicted_size[&instance] as f64) >= FRAGMENT {
+            together += 1;
+            belonging.insert(instance);
+        }
         if share >= 0.5 {
             *held.entry(instance).or_default() += 1;
         }
@@ -83,6 +94,8 @@ pub fn score_instances(truth: &[i32], predicted: &[i32]) -> InstanceScore {
         macc50: fraction_above(&ious, 0.5),
         fragmented: objects.iter().filter(|o| o.fragments > 1).count(),
         merging: held.values().filter(|&&n| n > 1).count(),
+        instances_per_object: together as f64 / objects.len().max(1) as f64,
+        objects_per_instance: together as f64 / belonging.len().max(1) as f64,
         points: pairs.len(),
         objects,
     }
@@ -121,12 +134,33 @@ mod tests {
         assert_eq!((s.macc25, s.fragmented, s.merging, s.points), (1.0, 1, 1, 20));
         assert_eq!(s.macc50, 1.0 / 3.0, "exactly 0.5 does not pass");
         assert_eq!(s.objects[0].fragments, 2);
+        assert_eq!((s.instances_per_object, s.objects_per_instance), (4.0 / 3.0, 4.0 / 3.0), "0-0, 0-1, 1-2, 2-2");
+    }
+
+    #[test]
+    fn fragmentation_and_merging_count_what_belongs_together() {
+        let all = |truth: &[i32], predicted: &[i32]| {
+            let s = score_instances(truth, predicted);
+            (s.instances_per_object, s.objects_per_instance)
+        };
+        let truth: Vec<i32> = (0..400).map(|i| i / 100).collect();
+        let pieces: Vec<i32> = (0..400).map(|i| i / 5).collect();
+        assert_eq!(all(&truth, &truth), (1.0, 1.0));
+        assert_eq!(all(&truth, &pieces), (20.0, 1.0), "each holds a twentieth of its object, and nothing else");
+        assert_eq!(all(&truth, &[7; 400]), (1.0, 4.0), "one instance for all four");
+        let spilled: Vec<i32> = (0..400).map(|i| (i + 5) / 100).collect();
+        let (fragments, merged) = all(&truth, &spilled);
+        assert!(
+            (fragments - 1.25).abs() < 1e-12 && merged == 1.0,
+            "the last spills 5 of its 100 into one of their own"
+        );
     }
 
     #[test]
     fn all_noise_scores_zero() {
         let s = score_instances(&[0, 1, 1], &[-1, -1, -1]);
         assert_eq!((s.miou, s.macc25, s.fragmented, s.merging), (0.0, 0.0, 0, 0));
+        assert_eq!((s.instances_per_object, s.objects_per_instance), (0.0, 0.0));
         assert_eq!(s.objects[1].best, None);
         assert_eq!(score_instances(&[], &[]).miou, 0.0);
     }

@@ -3,6 +3,7 @@
 //! Only the scene and the geometry have to be there. Whatever else a run did not make leaves its section out, with a
 //! line that says why.
 
+use crate::ablation::{self, Table};
 use crate::html::{Figure, Page};
 use crate::pca::pca;
 use crate::picture::Picture;
@@ -33,6 +34,8 @@ pub struct ReportOptions {
     pub out: PathBuf,
     /// Names of views to show; empty: a few held-out ones.
     pub views: Vec<String>,
+    /// Folder of an ablation's tables, to show them too.
+    pub ablation: Option<PathBuf>,
 }
 
 /// `metrics.json`: the figures of a run in one place. Null where the run has none.
@@ -139,6 +142,9 @@ pub fn run(dataset: &Dataset, options: &ReportOptions, inputs: &mut BTreeMap<Str
     instances(&material, &mut page, &mut metrics)?;
     queries(&material, &mut page, &mut metrics)?;
     score_tables(&material, &mut page);
+    if let Some(folder) = &options.ablation {
+        ablation::sections(&mut page, &Table::read_all(folder)?);
+    }
     training(&material, &mut page, &mut metrics)?;
     stages(&records, &mut page);
     left_out(&records, &mut page, &metrics);

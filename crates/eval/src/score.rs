@@ -5,6 +5,7 @@ use crate::label_iou::{self, LabelScore};
 use crate::labels;
 use crate::lerf::{self, Answer, Rendering};
 use crate::metrics::{self, InstanceScore};
+use crate::protocol::instances::{MIN_POINTS, average_precision};
 use crate::protocol::lerf::{Averaging, object_figures, scene_figures};
 use crate::protocol::scannet;
 use crate::scene::LabelledScene;
@@ -18,6 +19,8 @@ use std::path::Path;
 
 /// Gaussians fainter than this do not speak for a surface (docs/protocols.md).
 const MIN_OPACITY: f32 = 0.1;
+/// True and predicted instances of fewer Gaussians take no part in average precision over Gaussians.
+pub const MIN_GAUSSIANS: usize = 10;
 
 /// `score.json`. Fields are null where the scene has no truth for them; `skipped` says why.
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
@@ -34,6 +37,17 @@ pub struct Scores {
     pub fragmented: Option<usize>,
     /// Instances that hold several true things.
     pub merging: Option<usize>,
+    /// Fragmentation: instances per true thing (see [`InstanceScore`]).
+    pub instances_per_thing: Option<f64>,
+    /// Merging: true things per instance.
+    pub things_per_instance: Option<f64>,
+    /// Average precision at IoU 0.25 over surface points, by ScanNet's matching
+    /// ([`average_precision`]), of instances of at least [`MIN_POINTS`] points.
+    pub ap25: Option<f64>,
+    /// The same at IoU 0.5.
+    pub ap50: Option<f64>,
+    /// The same scores over Gaussians instead of surface points.
+    pub gaussians: Option<GaussianScores>,
     /// Each true thing.
     pub things: Vec<ThingScore>,
     /// Mean over all labelled objects of all labelled views of the best IoU with any instance's visible pixels.
@@ -65,6 +79,19 @@ pub struct Scores {
     pub silhouette: Option<(String, f32)>,
     /// What was left out, and why.
     pub skipped: Vec<String>,
+}
+
+/// Scores over Gaussians of opacity at least 0.1, each belonging to the thing of the nearest surface point.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct GaussianScores {
+    /// Gaussians that count.
+    pub count: usize,
+    /// Mean over true things of the best IoU with any instance.
+    pub instance_miou: f64,
+    /// Average precision at IoU 0.25, of instances of at least [`MIN_GAUSSIANS`] Gaussians.
+    pub ap25: Option<f64>,
+    /// The same at IoU 0.5.
+    pub ap50: Option<f64>,
 }
 
 /// How one true thing was found.
@@ -117,8 +144,17 @@ pub fn score_instances(scene: &LabelledScene, root: &Path, scores: &mut Scores) 
     let names = root.join("truth/scene.json");
     let things = if names.exists() { TrueScene::read(&names)?.objects } else { Vec::new() };
     let predicted = nearest_labels(scene, &truth.position);
-    let InstanceScore { miou, macc25, macc50, fragmented, merging, objects, .. } =
-        metrics::score_instances(&truth.instance, &predicted);
+    let InstanceScore {
+        miou,
+        macc25,
+        macc50,
+        fragmented,
+        merging,
+        objects,
+        instances_per_object,
+        objects_per_instance,
+        ..
+    } = metrics::score_instances(&truth.instance, &predicted);
     if objects.is_empty() {
         scores.skipped.push(format!("instance scores: {} holds no point of a thing", path.display()));
         return Ok(());
@@ -142,6 +178,11 @@ pub fn score_instances(scene: &LabelledScene, root: &Path, scores: &mut Scores) 
     scores.object_miou = (!object_ious.is_empty()).then(|| metrics::mean(&object_ious));
     (scores.instance_miou, scores.instance_macc25, scores.instance_macc50) = (Some(miou), Some(macc25), Some(macc50));
     (scores.fragmented, scores.merging) = (Some(fragmented), Some(merging));
+    (scores.instances_per_thing, scores.things_per_instance) = (Some(instances_per_object), Some(objects_per_instance));
+    let confidence = &scene.instances.score;
+    let ap = |threshold| average_precision(&truth.instance, &predicted, confidence, MIN_POINTS, threshold);
+    (scores.ap25, scores.ap50) = (ap(0.25), ap(0.5));
+    scores.gaussians = Some(score_gaussians(scene, &truth));
     Ok(())
 }
 
@@ -160,6 +201,26 @@ pub fn score_labels(scene: &LabelledScene, dataset: &Dataset, folder: &Path, sco
     scores.label_miou = Some(metrics::mean(&ious));
     (scores.label_macc25, scores.label_macc50) = (above(0.25), above(0.5));
     Ok(())
+}
+
+/// Scores the labels of Gaussians themselves.
+fn score_gaussians(scene: &LabelledScene, points: &TruePoints) -> GaussianScores {
+    let (g, whole) = (scene.gaussians(), scene.geometry.whole());
+    let counted: Vec<usize> = (0..g.len()).filter(|&i| whole[i] && g.opacity(i) >= MIN_OPACITY).collect();
+    let means: Vec<[f32; 3]> = counted.iter().map(|&i| g.means[i]).collect();
+    let truth: Vec<i32> = scannet::nearest_of(&points.position, &means)
+        .into_iter()
+        .map(|p| p.map_or(-1, |p| points.instance[p as usize]))
+        .collect();
+    let predicted: Vec<i32> = counted.iter().map(|&i| scene.instances.label[i]).collect();
+    let confidence = &scene.instances.score;
+    let ap = |threshold| average_precision(&truth, &predicted, confidence, MIN_GAUSSIANS, threshold);
+    GaussianScores {
+        count: counted.len(),
+        instance_miou: metrics::score_instances(&truth, &predicted).miou,
+        ap25: ap(0.25),
+        ap50: ap(0.5),
+    }
 }
 
 /// Label of the nearest labelled Gaussian of sufficient opacity for each point; -1 when there is none at all.
@@ -285,6 +346,13 @@ pub fn table(scores: &Scores) -> String {
     line("label_macc25", number(scores.label_macc25));
     line("label_macc50", number(scores.label_macc50));
     line("labels", scores.label_miou.map(|_| format!("{} objects in views", scores.labels.len())));
+    line("instances/thing", number(scores.instances_per_thing));
+    line("things/instance", number(scores.things_per_instance));
+    line("ap25", number(scores.ap25));
+    line("ap50", number(scores.ap50));
+    line("per Gaussian", number(scores.gaussians.as_ref().map(|g| g.instance_miou)));
+    line("  ap25", number(scores.gaussians.as_ref().and_then(|g| g.ap25)));
+    line("  ap50", number(scores.gaussians.as_ref().and_then(|g| g.ap50)));
     line("query_miou", number(scores.query_miou));
     line("  visible only", number(scores.query_miou_visible));
     line("query_macc25", number(scores.query_macc25));

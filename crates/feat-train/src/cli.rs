@@ -4,7 +4,7 @@ use crate::checkpoint;
 use crate::evidence::{Evidence, collect};
 use crate::fast::{Engine, Shortcuts};
 use crate::loss::Loss;
-use crate::model::{CohesionOf, Init, Settings};
+use crate::model::{AnchorStart, CohesionOf, Init, Settings};
 use crate::normalize::Axis;
 use crate::real::{Half, Weight};
 use crate::scene::{Context, Neighbours, mask_sets};
@@ -86,6 +86,15 @@ struct Contrastive {
     /// Whom an anchor aggregates
     #[arg(long, value_enum, default_value_t = Neighbours::Gaussians)]
     neighbours: Neighbours,
+    /// What an anchor's own feature is before the first layer
+    #[arg(long, value_enum, default_value_t = AnchorStart::Inputs)]
+    anchor_start: AnchorStart,
+    /// Let negative values through the last layer
+    #[arg(long)]
+    no_last_relu: bool,
+    /// Bring the features of each Gaussian to unit length before they are rendered
+    #[arg(long)]
+    unit_length: bool,
     /// What is standardised together
     #[arg(long, value_enum, default_value_t = Axis::Channel)]
     norm_axis: Axis,
@@ -207,6 +216,9 @@ impl Args {
                 "dim": self.dim.unwrap_or(6),
                 "layers": c.layers,
                 "neighbours": name_of(&c.neighbours),
+                "anchor_start": name_of(&c.anchor_start),
+                "last_relu": !c.no_last_relu,
+                "unit_length": c.unit_length,
                 "norm_axis": name_of(&c.norm_axis),
                 "loss": name_of(&c.loss),
                 "init": name_of(&c.init),
@@ -305,6 +317,9 @@ impl Args {
             settings: Settings {
                 dim: self.dim.unwrap_or(6),
                 layers: c.layers,
+                anchor_start: c.anchor_start,
+                last_relu: !c.no_last_relu,
+                unit_length: c.unit_length,
                 norm_axis: c.norm_axis,
                 loss: c.loss,
                 tau: c.tau,
@@ -328,11 +343,8 @@ impl Args {
                 .hint("run graph-precompute with --pixel-samples 16"));
         }
         if !Engine::serves(&options.settings) && options.shortcuts != Shortcuts::default() {
-            return Err(Error::new("not with this loss, --cohesion or --norm-axis").field(if c.lazy_adam {
-                "--lazy-adam"
-            } else {
-                "--stats-every"
-            }));
+            return Err(Error::new("not with this loss, --cohesion, --norm-axis or --unit-length")
+                .field(if c.lazy_adam { "--lazy-adam" } else { "--stats-every" }));
         }
         // A checkpoint serves runs of any number of iterations, as long as everything else is equal.
         let provenance = stage.provenance("", 0, Value::Object(self.parameters()), inputs.hashes.clone());
@@ -341,7 +353,8 @@ impl Args {
         let trained = train(&context, &sets, &options, Some((&path, &provenance)), stage, on_curve)?;
         let last = trained.curve.last().copied().unwrap_or_default();
         let summary = json!({ "views": sets.len(), "last": last, "resumed_at": trained.resumed_at,
-            "iterations": trained.iterations });
+            "iterations": trained.iterations, "gaussians": inputs.graph.kept.len(),
+            "network_bytes": trained.network_bytes });
         Ok((options.settings.dim, trained.features, summary))
     }
 

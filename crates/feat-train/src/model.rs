@@ -1,7 +1,7 @@
 //! The model of the paper's stage 2: per-Gaussian features, the graph network that adds context, the loss on one view's
 //! masks, and their gradients. Written once for f32 and f64.
 
-use crate::loss::{self, Loss, Prototypes, directions, dot};
+use crate::loss::{self, Loss, Prototypes, SHORTEST, directions, dot};
 use crate::network::{self, Activations, Layer};
 use crate::normalize::{Axis, Moments, channel_moments, row_moments};
 use crate::pixels;
@@ -35,6 +35,15 @@ pub enum CohesionOf {
     Pixels,
 }
 
+/// What an anchor's own feature is before the first layer, f_m^(0).
+#[derive(Debug, Clone, Copy, PartialEq, Eq, clap::ValueEnum)]
+pub enum AnchorStart {
+    /// Its input h: feature and colour.
+    Inputs,
+    /// Its feature alone; colours come in through the neighbours.
+    Feature,
+}
+
 /// What shapes the model.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Settings {
@@ -42,6 +51,12 @@ pub struct Settings {
     pub dim: usize,
     /// Layers of the graph network, 0 to 4; 0 trains features alone.
     pub layers: usize,
+    /// What anchors start from.
+    pub anchor_start: AnchorStart,
+    /// Whether what is negative becomes zero after the last layer too.
+    pub last_relu: bool,
+    /// Whether f_final is brought to unit length, per Gaussian, before it is rendered.
+    pub unit_length: bool,
     /// What is standardised together.
     pub norm_axis: Axis,
     /// The loss.
@@ -63,6 +78,9 @@ impl Settings {
         Self {
             dim,
             layers,
+            anchor_start: AnchorStart::Inputs,
+            last_relu: true,
+            unit_length: false,
             norm_axis: Axis::Channel,
             loss: Loss::Printed,
             tau: 0.1,
@@ -126,7 +144,13 @@ impl<T: Real> Model<T> {
             .collect();
         let features =
             context.order.iter().flat_map(|&i| drawn[i as usize * d..(i as usize + 1) * d].to_vec()).collect();
-        let layers = network::random_layers(settings.layers, d + COLOR, HIDDEN, d, context.kind, rng);
+        let mut layers = network::random_layers(settings.layers, d + COLOR, HIDDEN, d, context.kind, rng);
+        if let Some(first) = layers.first_mut().filter(|_| settings.anchor_start == AnchorStart::Feature) {
+            first.read_only(d);
+        }
+        if let Some(last) = layers.last_mut() {
+            last.relu = settings.last_relu;
+        }
         Self { settings, features, layers }
     }
 
@@ -207,9 +231,10 @@ impl<T: Real> Model<T> {
         (h, sums)
     }
 
-    /// f_final of the Gaussian at `place`: its own feature and what it receives.
+    /// f_final of the Gaussian at `place`: its own feature and what it receives. Gives its length before it was brought to
+    /// unit length, where that is asked for; else 1.
     #[inline]
-    fn final_feature(&self, context: &Context, propagated: &Propagated<T>, place: usize, out: &mut [f64]) {
+    fn final_feature(&self, context: &Context, propagated: &Propagated<T>, place: usize, out: &mut [f64]) -> f64 {
         let d = out.len();
         let own = &self.features[place * d..(place + 1) * d];
         out.iter_mut().zip(own).for_each(|(o, f)| *o = f.get());
@@ -218,6 +243,12 @@ impl<T: Real> Model<T> {
             let hat = &propagated.hat[source as usize * d..(source as usize + 1) * d];
             out.iter_mut().zip(hat).for_each(|(o, h)| *o += h.get());
         }
+        if !self.settings.unit_length {
+            return 1.0;
+        }
+        let length = dot(out, out).sqrt();
+        out.iter_mut().for_each(|o| *o = if length > SHORTEST { *o / length } else { 0.0 });
+        length
     }
 
     /// f_final of all Gaussians `[n][d]`, in the order of `kept`.
@@ -362,12 +393,20 @@ impl<T: Real> Model<T> {
                         }
                     }
                     let place = set.columns[c] as usize;
+                    let length = if columns.any() || s.unit_length {
+                        self.final_feature(context, propagated, place, &mut f)
+                    } else {
+                        1.0
+                    };
                     if columns.any() {
-                        self.final_feature(context, propagated, place, &mut f);
                         columns.add(c, &f, None, Some(&mut g));
                     }
                     if let Some(rows) = &of_pixels {
                         g.iter_mut().zip(&rows[c * d..(c + 1) * d]).for_each(|(g, v)| *g += v);
+                    }
+                    if s.unit_length {
+                        let of_direction = std::mem::replace(&mut g, vec![0.0; d]);
+                        loss::add_direction_gradient(&mut g, &f, length, &of_direction);
                     }
                     rows.extend(g.iter().map(|&v| T::of(v)));
                     let source = context.source[place];
@@ -544,7 +583,8 @@ mod tests {
         }
         assert!(step.features.iter().any(|g| g.abs() > 1e-4), "{name}: all gradients vanish");
         for l in 0..model.layers.len() {
-            for i in 0..model.layers[l].weights.len() {
+            let frozen = model.layers[l].frozen.clone();
+            for i in (0..model.layers[l].weights.len()).filter(|i| !frozen.contains(i)) {
                 let was = model.layers[l].weights[i];
                 let mut loss = |v: f64| {
                     model.layers[l].weights[i] = v;
@@ -571,6 +611,14 @@ mod tests {
         }
         check(settings(), Gaussians, false);
         check(settings(), Neighbours::AnchorInputs, true);
+        check(Settings { last_relu: false, ..settings() }, Gaussians, true);
+        for kind in [Gaussians, Anchors] {
+            check(Settings { anchor_start: AnchorStart::Feature, ..settings() }, kind, true);
+            check(Settings { unit_length: true, last_relu: false, ..settings() }, kind, true);
+        }
+        for loss in [Loss::Gaussian, Loss::Pixel] {
+            check(Settings { loss, unit_length: true, ..settings() }, Gaussians, true);
+        }
         for loss in [Loss::WithSelf, Loss::HalfMask, Loss::CrossView, Loss::Gaussian, Loss::Pixel] {
             for norm_axis in [Axis::Channel, Axis::Gaussian] {
                 check(Settings { loss, norm_axis, ..settings() }, Anchors, true);
@@ -582,6 +630,26 @@ mod tests {
             check(Settings { loss: Loss::Pixel, layers: 0, ..cohesive.clone() }, Gaussians, true);
             check(Settings { loss: Loss::Pixel, ..cohesive }, Anchors, true);
         }
+    }
+
+    #[test]
+    fn anchors_that_start_from_their_feature_do_not_read_their_colour() {
+        let mut context = context(50, Neighbours::Gaussians, true);
+        let start = Settings { anchor_start: AnchorStart::Feature, ..settings() };
+        let model = Model::<f64>::new(start, &context, &mut ChaCha8Rng::seed_from_u64(1));
+        assert_eq!(model.layers[0].frozen, 4 * HIDDEN..7 * HIDDEN);
+        assert!(model.layers[0].weights[model.layers[0].frozen.clone()].iter().all(|w| *w == 0.0));
+        // Everybody's neighbours are the first anchor; the last is nobody's.
+        let (first, last) = (context.anchors[0], *context.anchors.last().unwrap());
+        context.neighbours.fill(first);
+        let mut moved_by_colors_of = |a: u32, b: u32| {
+            let before = model.propagate(&context).hat;
+            context.colors.swap(a as usize, b as usize);
+            let after = model.propagate(&context).hat;
+            before.iter().zip(&after).map(|(a, b)| (a - b).abs()).fold(0.0, f64::max)
+        };
+        assert!(moved_by_colors_of(last, last - 1) < 1e-9);
+        assert!(moved_by_colors_of(first, last) > 1e-3);
     }
 
     #[test]

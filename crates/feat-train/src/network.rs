@@ -8,6 +8,7 @@ use crate::real::Real;
 use crate::scene::{Context, Neighbours};
 use rand::Rng;
 use rayon::prelude::*;
+use std::ops::Range;
 
 /// Anchors worked on at a time.
 const CHUNK: usize = 512;
@@ -23,6 +24,10 @@ pub struct Layer<T> {
     pub output: usize,
     /// W1 `[input][output]`, then W2 `[neighbour][output]`, then the bias `[output]`.
     pub weights: Vec<T>,
+    /// Whether what is negative becomes zero.
+    pub relu: bool,
+    /// Which weights are zero and stay so: those of inputs that the layer does not read.
+    pub frozen: Range<usize>,
 }
 
 impl<T: Real> Layer<T> {
@@ -35,7 +40,13 @@ impl<T: Real> Layer<T> {
         let mut weights = draw(input * output, input);
         weights.extend(draw(neighbour * output, neighbour));
         weights.extend(draw(output, neighbour));
-        Self { input, neighbour, output, weights }
+        Self { input, neighbour, output, weights, relu: true, frozen: 0..0 }
+    }
+
+    /// Lets the layer read only the first `inputs` channels of the anchor's own feature.
+    pub fn read_only(&mut self, inputs: usize) {
+        self.frozen = inputs * self.output..self.input * self.output;
+        self.weights[self.frozen.clone()].fill(T::default());
     }
 
     /// W1, W2 and the bias.
@@ -97,10 +108,8 @@ pub fn forward<T: Real>(layers: &[Layer<T>], context: &Context, h: Vec<T>, sums:
                 row.copy_from_slice(bias);
                 multiply_add(&x[a * layer.input..(a + 1) * layer.input], w1, row);
                 multiply_add(&s[a * layer.neighbour..(a + 1) * layer.neighbour], w2, row);
-                for v in row {
-                    if *v < T::default() {
-                        *v = T::default();
-                    }
+                for v in row.iter_mut().filter(|v| layer.relu && **v < T::default()) {
+                    *v = T::default();
                 }
             }
         });
@@ -145,11 +154,12 @@ pub fn backward<T: Real>(
         let output = &activations.features[l + 1];
         // ReLU: what did not pass takes no gradient.
         gradient.par_iter_mut().zip(output).with_min_len(CHUNK).for_each(|(g, &y)| {
-            if y <= T::default() {
+            if layer.relu && y <= T::default() {
                 *g = T::default();
             }
         });
         out[l] = weight_gradients(layer, &activations.features[l], activations.sums_of(l), &gradient);
+        out[l][layer.frozen.clone()].fill(T::default());
         if l > 0 {
             gradient = input_gradients(layer, context, &gradient);
         }

@@ -95,6 +95,8 @@ pub struct Trained {
     pub resumed_at: u64,
     /// Iterations done: fewer than asked for when it stopped early.
     pub iterations: u64,
+    /// Bytes that the graph network took; none where the readable model trained, which keeps no account.
+    pub network_bytes: Option<usize>,
 }
 
 /// Trains on `sets`, each with at least two masks. `checkpoint`: where checkpoints lie, and what one of this very run
@@ -182,7 +184,11 @@ pub fn train<W: Weight>(
     progress.finish(&[("loss", last.loss), ("alignment", last.alignment), ("separation", last.separation)]);
     on_curve(&state.curve)?;
     let features = way.final_features(&state.model, state.iteration);
-    Ok(Trained { features, curve: state.curve, resumed_at, iterations: state.iteration })
+    let network_bytes = match &way {
+        Way::Fast(engine, _) => Some(engine.network_bytes()),
+        Way::Plain { .. } => None,
+    };
+    Ok(Trained { features, curve: state.curve, resumed_at, iterations: state.iteration, network_bytes })
 }
 
 /// Another view to take positives from, for the loss that asks for them.

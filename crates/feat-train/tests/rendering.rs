@@ -3,6 +3,7 @@
 #[path = "../benches/rendering.rs"]
 mod rendering;
 #[path = "../benches/scene.rs"]
+#[allow(dead_code)] // The benchmark has more scenes.
 mod scene;
 
 use feat_train::model::{Model, Settings};

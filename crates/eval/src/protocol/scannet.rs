@@ -150,11 +150,15 @@ pub fn score_vertices(
 /// Index of the nearest Gaussian among `speakers` (ascending indices) for each vertex; none when there are none.
 pub fn nearest(gaussians: &Gaussians, speakers: &[u32], vertices: &[[f32; 3]]) -> Vec<Option<u32>> {
     let positions: Vec<[f32; 3]> = speakers.iter().map(|&i| gaussians.means[i as usize]).collect();
-    let tree = (!positions.is_empty()).then(|| ImmutableKdTree::<f32, 3>::new_from_slice(&positions).ok()).flatten();
-    let Some(tree) = tree else { return vec![None; vertices.len()] };
-    let one =
-        |p: &[f32; 3]| Some(speakers[tree.query(p).nearest_one::<SquaredEuclidean<f32>>().execute().item as usize]);
-    vertices.par_iter().map(one).collect()
+    nearest_of(&positions, vertices).into_iter().map(|n| n.map(|n| speakers[n as usize])).collect()
+}
+
+/// Index of the nearest of `positions` for each point; none when there are none.
+pub fn nearest_of(positions: &[[f32; 3]], points: &[[f32; 3]]) -> Vec<Option<u32>> {
+    let tree = (!positions.is_empty()).then(|| ImmutableKdTree::<f32, 3>::new_from_slice(positions).ok()).flatten();
+    let Some(tree) = tree else { return vec![None; points.len()] };
+    let one = |p: &[f32; 3]| Some(tree.query(p).nearest_one::<SquaredEuclidean<f32>>().execute().item);
+    points.par_iter().map(one).collect()
 }
 
 /// How far labelled vertices speak for a Gaussian, in its largest scales.

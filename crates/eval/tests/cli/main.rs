@@ -1,5 +1,6 @@
 //! `eval` as people run it.
 
+mod ablation;
 mod fixture;
 mod protocols;
 

@@ -141,7 +141,7 @@ impl<'a> Engine<'a> {
     /// Whether the engine can train with these settings; the readable model can with all.
     pub fn serves(settings: &Settings) -> bool {
         let of_masks = !matches!(settings.loss, Loss::Gaussian | Loss::Pixel);
-        settings.norm_axis == Axis::Channel && settings.cohesion == 0.0 && of_masks
+        settings.norm_axis == Axis::Channel && settings.cohesion == 0.0 && of_masks && !settings.unit_length
     }
 
     /// For training `model` on `context`.
@@ -288,7 +288,9 @@ impl<'a> Engine<'a> {
             y.iter_mut().zip(bias).for_each(|(y, &b)| y.fill(b));
             kernels::dense(x, w1, y);
             kernels::dense(s, w2, y);
-            kernels::relu(y);
+            if layer.relu {
+                kernels::relu(y);
+            }
         });
         *(if l + 1 < model.layers.len() { &mut self.inputs[l + 1] } else { &mut self.output }) = output;
     }
@@ -520,7 +522,9 @@ impl<'a> Engine<'a> {
                 .zip(output.par_chunks(layer.output))
                 .zip(inputs)
                 .map(|((g, y), (x, s))| {
-                    kernels::relu_backward(y, g);
+                    if layer.relu {
+                        kernels::relu_backward(y, g);
+                    }
                     let mut sums = vec![0.0f32; layer.weights.len()];
                     let (w1, rest) = sums.split_at_mut(layer.input * layer.output);
                     let (w2, bias) = rest.split_at_mut(layer.neighbour * layer.output);
@@ -535,6 +539,7 @@ impl<'a> Engine<'a> {
                 total.iter_mut().zip(part).for_each(|(t, p)| *t += f64::from(*p));
             }
             out[l] = total.into_iter().map(|v| v as f32).collect();
+            out[l][layer.frozen.clone()].fill(0.0);
             std::mem::swap(&mut gradient, &mut above);
         }
         self.gradients = [gradient, above, around];

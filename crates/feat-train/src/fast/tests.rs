@@ -1,6 +1,7 @@
 //! The engine against the readable model.
 
 use super::*;
+use crate::model::AnchorStart;
 use crate::network::Layer;
 use crate::testing::{context, mask_set};
 use rand::SeedableRng;
@@ -19,7 +20,14 @@ fn widened(model: &Model<f32>) -> Model<f64> {
         layers: model
             .layers
             .iter()
-            .map(|l| Layer { input: l.input, neighbour: l.neighbour, output: l.output, weights: wide(&l.weights) })
+            .map(|l| Layer {
+                input: l.input,
+                neighbour: l.neighbour,
+                output: l.output,
+                weights: wide(&l.weights),
+                relu: l.relu,
+                frozen: l.frozen.clone(),
+            })
             .collect(),
     }
 }
@@ -85,6 +93,9 @@ fn agrees_with_the_readable_model() {
     check(settings(6, 2, Loss::HalfMask), Gaussians, true);
     check(settings(6, 2, Loss::CrossView), Gaussians, true);
     for kind in [Gaussians, Anchors] {
+        let start = Settings { anchor_start: AnchorStart::Feature, ..settings(6, 2, Loss::Printed) };
+        check(start.clone(), kind, true);
+        check(Settings { last_relu: false, ..start }, kind, true);
         check(settings(6, 3, Loss::Printed), kind, false);
     }
 }
