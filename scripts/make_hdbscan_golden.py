@@ -116,7 +116,7 @@ CASES = [
     ("single-leaf", blobs(300, 2, 3, 0.5, 9), 20, 10, 0.3, "leaf", 1),
 ]
 PERMUTATIONS = 50
-# None with an epsilon: hdbscan's predictions forget it and speak of other clusters than its labels.
+# None with an epsilon: of a cluster that it joined of two, hdbscan's predictions know one half only.
 PREDICTED = ["blobs2", "blobs6", "moons", "sphere", "nested", "collinear", "grid", "duplicates"]
 
 
