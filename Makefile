@@ -7,7 +7,7 @@ CARGO ?= cargo
 THREADS ?= 0
 export THREADS
 
-.PHONY: help build demo scene test lint models clip-tiny bench-raster bench-graph bench-geom bench-growth bench-memory bench-train bench-cluster bench-query clean
+.PHONY: help build demo scene test lint models clip-tiny bench-raster bench-graph bench-geom bench-growth bench-memory bench-train bench-cluster bench-query bench-granularity clean
 
 help: ## Say what can be made
 	@echo "Targets:"
@@ -75,6 +75,9 @@ bench-cluster: ## Time HDBSCAN beside hdbscan-rs and fast_hdbscan (needs Python;
 
 bench-query: ## Time a query over a million Gaussians and 500 instances: out/bench/query.json
 	$(CARGO) bench -p eval --bench query -- --out $(CURDIR)/out/bench/query.json
+
+bench-granularity: build ## Measure synthetic masks beside real ones (MASKS=folder FOOTPRINTS=file): out/bench/granularity.md
+	scripts/bench_granularity.sh
 
 clean: ## Delete out/ and what cargo built
 	rm -rf out
