@@ -7,7 +7,7 @@ CARGO ?= cargo
 THREADS ?= 0
 export THREADS
 
-.PHONY: help build demo scene test lint models clip-tiny bench-raster bench-graph bench-geom bench-growth bench-memory bench-train bench-cluster bench-cluster-graph bench-query ablation clean
+.PHONY: help build demo scene test lint models clip-tiny bench-raster bench-graph bench-geom bench-growth bench-memory bench-train bench-cluster bench-cluster-graph bench-query bench-granularity ablation clean
 
 help: ## Say what can be made
 	@echo "Targets:"
@@ -83,6 +83,9 @@ JOBS ?= $(shell nproc)
 ablation: build ## The paper's ablation tables, readings of the paper, our methods: out/ablation/, docs/accuracy.md (an hour)
 	@$(MAKE) --no-print-directory -f pipelines/ablation.mk plan
 	@$(MAKE) --no-print-directory -j $(JOBS) -f pipelines/ablation.mk DOCS=docs/accuracy.md
+
+bench-granularity: build ## Measure synthetic masks beside real ones (MASKS=folder FOOTPRINTS=file): out/bench/granularity.md
+	scripts/bench_granularity.sh
 
 clean: ## Delete out/ and what cargo built
 	rm -rf out

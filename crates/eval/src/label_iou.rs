@@ -1,13 +1,16 @@
 //! Instances against polygon labels, without text: how well any instance fits each labelled object in each view.
 
 use crate::labels::FrameLabels;
+use crate::lerf;
 use crate::scene::LabelledScene;
 use crate::silhouette::Silhouette;
+use gs_io::Result;
 use gs_raster::{RasterOptions, TILE};
 use gs_scene::dataset::Dataset;
 use gs_scene::{Camera, Gaussians};
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
+use std::path::Path;
 
 /// How a labelled object is found in a view.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -24,14 +27,27 @@ pub struct LabelScore {
     pub pixels: usize,
 }
 
-/// The best instance for each labelled object of each frame that is a view of the dataset, as far as it is visible: an
-/// instance owns the pixels of which it gives more than half of the blended weight.
-pub fn score(scene: &LabelledScene, dataset: &Dataset, frames: &[FrameLabels]) -> Vec<LabelScore> {
+/// The best instance for each labelled object of each frame, as far as it is visible: an
+/// instance owns the pixels of which it gives more than half of the blended weight. Objects of a frame that is no view
+/// have IoU 0.
+///
+/// # Errors
+/// When a labelled image has another shape than its photograph; `folder` is that of the labels.
+pub fn score(
+    scene: &LabelledScene,
+    dataset: &Dataset,
+    frames: &[FrameLabels],
+    folder: &Path,
+) -> Result<Vec<LabelScore>> {
     let mut scores = Vec::new();
     for frame in frames {
-        let Some(view) = dataset.views.iter().find(|v| v.stem() == frame.frame) else { continue };
-        let camera = view.camera.resized(frame.width, frame.height);
-        let map = instance_map(scene.gaussians(), &scene.instances.label, &camera, &scene.raster);
+        let map = match dataset.views.iter().find(|v| v.stem() == frame.frame) {
+            None => vec![-1; frame.width as usize * frame.height as usize],
+            Some(view) => {
+                let camera = lerf::labelled_camera(view, frame, folder)?;
+                instance_map(scene.gaussians(), &scene.instances.label, &camera, &scene.raster)
+            }
+        };
         let mut sizes = BTreeMap::<i32, usize>::new();
         map.iter().filter(|&&i| i >= 0).for_each(|&i| *sizes.entry(i).or_default() += 1);
         for (category, mask) in &frame.categories {
@@ -50,7 +66,7 @@ pub fn score(scene: &LabelledScene, dataset: &Dataset, frames: &[FrameLabels]) -
             });
         }
     }
-    scores
+    Ok(scores)
 }
 
 /// Which instance each pixel shows, `[height][width]`; -1 where none has more than half of the weight.

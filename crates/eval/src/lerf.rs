@@ -7,7 +7,8 @@ use crate::protocol::published;
 use crate::scene::LabelledScene;
 use crate::silhouette::{self, Silhouette};
 use gs_io::{Error, Result, write_bytes};
-use gs_scene::dataset::Dataset;
+use gs_scene::Camera;
+use gs_scene::dataset::{Dataset, View};
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
@@ -74,6 +75,25 @@ pub struct Prediction {
     pub relevancy: Option<Vec<f32>>,
 }
 
+/// The camera of a view in the size of its labelled image.
+///
+/// # Errors
+/// When the labelled image has another shape than the photograph; `labels` names the folder.
+pub fn labelled_camera(view: &View, frame: &FrameLabels, labels: &Path) -> Result<Camera> {
+    let (w, h) = (frame.width, frame.height);
+    let aspect = |w: u32, h: u32| f64::from(w) / f64::from(h);
+    let ratio = aspect(w, h) / aspect(view.camera.width, view.camera.height);
+    if (ratio - 1.0).abs() > ASPECT_TOLERANCE {
+        return Err(Error::new("the labelled image has another shape than the photograph")
+            .file(labels.join(format!("{}.json", frame.frame)))
+            .field("info")
+            .found(format!("{w}x{h}"))
+            .expected(format!("{}x{} or a multiple", view.camera.width, view.camera.height))
+            .hint("use the labels of this scene"));
+    }
+    Ok(view.camera.resized(w, h))
+}
+
 /// Renders the answers to every category of a labelled frame, in the size of the labelled image.
 ///
 /// # Errors
@@ -93,18 +113,7 @@ pub fn predict(
         let mask = nothing("the frame is no view of the scene");
         return Ok(categories().map(|category| Prediction { category, mask: mask.clone(), relevancy: None }).collect());
     };
-    let (w, h) = (frame.width, frame.height);
-    let aspect = |w: u32, h: u32| f64::from(w) / f64::from(h);
-    let ratio = aspect(w, h) / aspect(view.camera.width, view.camera.height);
-    if (ratio - 1.0).abs() > ASPECT_TOLERANCE {
-        return Err(Error::new("the labelled image has another shape than the photograph")
-            .file(labels.join(format!("{}.json", frame.frame)))
-            .field("info")
-            .found(format!("{w}x{h}"))
-            .expected(format!("{}x{} or a multiple", view.camera.width, view.camera.height))
-            .hint("use the labels of this scene"));
-    }
-    let camera = view.camera.resized(w, h);
+    let camera = labelled_camera(view, frame, labels)?;
     let asked: Vec<(String, &[u32], &[f32])> = categories()
         .filter_map(|c| match answers.get(&c) {
             Some(Answer::Selected { gaussians, relevancy, .. }) => Some((c, &gaussians[..], &relevancy[..])),

@@ -191,7 +191,7 @@ pub fn score_instances(scene: &LabelledScene, root: &Path, scores: &mut Scores) 
 /// # Errors
 /// When labels are damaged.
 pub fn score_labels(scene: &LabelledScene, dataset: &Dataset, folder: &Path, scores: &mut Scores) -> Result<()> {
-    scores.labels = label_iou::score(scene, dataset, &labels::read_folder(folder)?);
+    scores.labels = label_iou::score(scene, dataset, &labels::read_folder(folder)?, folder)?;
     let ious: Vec<f64> = scores.labels.iter().map(|l| l.iou).collect();
     if ious.is_empty() {
         scores.skipped.push(format!("label scores: {} labels no object of a view", folder.display()));

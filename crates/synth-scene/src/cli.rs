@@ -54,30 +54,30 @@ pub struct Args {
     #[arg(long, value_enum, default_value_t = Corruption::Mild)]
     corruption: Corruption,
     /// Probability that a mask level of a view shows a thing at another granularity: split into parts, or merged with
-    /// a neighbour [exact 0, mild 0.3]
+    /// a neighbour [exact 0, mild 0.3, sam 0.5]
     #[arg(long, value_name = "PROBABILITY")]
     granularity_p: Option<f64>,
-    /// Largest growth or shrinkage of a mask, 0 to 16 [exact 0, mild 1]
+    /// Largest growth or shrinkage of a mask, 0 to 16 [exact 0, mild 1, sam 1]
     #[arg(long, value_name = "PIXELS")]
     boundary_noise: Option<u32>,
-    /// Probability that a mask is missing [exact 0, mild 0.05]
+    /// Probability that a mask is missing [exact 0, mild 0.05, sam 0.05]
     #[arg(long, value_name = "PROBABILITY")]
     missing: Option<f64>,
-    /// Spurious masks per mask of a level, 0 to 1: patches that are no thing [exact 0, mild 0]
+    /// Spurious masks per mask of a level, 0 to 1: patches that are no thing [exact 0, mild 0, sam 0.15]
     #[arg(long, value_name = "SHARE")]
     spurious: Option<f64>,
     /// Noise of the poses in sparse/0, 0 to 10: standard deviation in degrees about each axis, and in centimetres along
-    /// it. Photographs and truth keep the exact ones, which truth/sparse then holds [exact 0, mild 0]
+    /// it. Photographs and truth keep the exact ones, which truth/sparse then holds [0]
     #[arg(long, value_name = "SIZE")]
     pose_noise: Option<f64>,
     /// Give each mask a CLIP-like feature (<view>_f.npy) and write a table of text features for eval --text-features:
     /// text_features.json in truth, or beside the masks
     #[arg(long)]
     features: bool,
-    /// Weight of what lies beside a mask in the crop that its feature means, 0 to 1 [exact 0, mild 0]
+    /// Weight of what lies beside a mask in the crop that its feature means, 0 to 1 [exact 0, mild 0, sam 0.1]
     #[arg(long, value_name = "SHARE", requires = "features")]
     leaking: Option<f64>,
-    /// Expected length of the noise added to a mask's unit feature, 0 to 10 [exact 0, mild 0]
+    /// Expected length of the noise added to a mask's unit feature, 0 to 10 [exact 0, mild 0, sam 0.5]
     #[arg(long, value_name = "SIZE", requires = "features")]
     feature_noise: Option<f64>,
     /// Every how many views get polygon labels, from the first; 0 for none. Held-out views are every eighth
@@ -105,6 +105,8 @@ pub enum Corruption {
     Exact,
     /// A few faults of granularity, edges a pixel off, some masks missing.
     Mild,
+    /// As inconsistent from view to view as SAM's masks of a real desk.
+    Sam,
 }
 
 /// What a [`Corruption`] sets.
@@ -122,6 +124,11 @@ impl Corruption {
             Self::Mild => {
                 Knobs { faults: Faults { granularity: 0.3, boundary: 1, missing: 0.05, spurious: 0.0 }, ..exact }
             }
+            Self::Sam => Knobs {
+                faults: Faults { granularity: 0.5, boundary: 1, missing: 0.05, spurious: 0.15 },
+                speech: Speech { leaking: 0.1, noise: 0.5 },
+                ..exact
+            },
         }
     }
 }

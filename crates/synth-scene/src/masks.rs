@@ -341,6 +341,7 @@ fn compact(painted: &[i32], masks: usize, first: i32, ids: &mut Vec<i32>) -> Vec
 mod tests {
     use super::*;
     use crate::testing::example;
+    use proptest::prelude::*;
     use rand::SeedableRng;
 
     const EXACT: Faults = Faults { granularity: 0.0, boundary: 0, missing: 0.0, spurious: 0.0 };
@@ -460,6 +461,34 @@ mod tests {
             }
             let patch = truth.iter().find(|t| t.kind == "spurious").unwrap();
             assert!(!patch.instances.is_empty() && patch.caption.starts_with("patch of the "), "{patch:?}");
+        }
+    }
+
+    proptest! {
+        #![proptest_config(ProptestConfig::with_cases(24))]
+        /// Whatever the faults, ids are dense, each has pixels and its truth, and what a mask says it shows is in it.
+        #[test]
+        fn any_faults_together_give_sound_maps(
+            granularity in 0.0..=1.0, boundary in 0u32..4, missing in 0.0..=1.0, spurious in 0.0..=1.0, seed: u64,
+        ) {
+            let (scene, frame) = example();
+            let faults = Faults { granularity, boundary, missing, spurious };
+            let (a, b) = (&mut ChaCha8Rng::seed_from_u64(seed), &mut ChaCha8Rng::seed_from_u64(!seed));
+            let (maps, truth) = segment(scene, frame, &faults, a, b);
+            check_ids(&maps, &truth);
+            for t in &truth {
+                prop_assert!(!t.instances.is_empty() && t.instances.iter().all(|&i| (i as usize) < scene.things.len()));
+                prop_assert_eq!(t.kind == "merged", t.kind != "spurious" && t.instances.len() > 1);
+            }
+            // Exact edges: every pixel of a mask that is not spurious shows one of its things.
+            if boundary == 0 {
+                for level in Level::ALL {
+                    for (&id, &thing) in maps.level(level).iter().zip(&frame.thing).filter(|(id, _)| **id >= 0) {
+                        let t = &truth[id as usize];
+                        prop_assert!(t.kind == "spurious" || t.instances.contains(&(thing as u32)));
+                    }
+                }
+            }
         }
     }
 

@@ -315,6 +315,23 @@ fn each_fault_changes_its_own_files_and_nothing_else() {
 }
 
 #[test]
+fn a_corruption_is_its_knobs_and_each_can_be_set_by_itself() {
+    let dir = tempfile::tempdir().unwrap();
+    let parameters = |name: &str, arguments: &[&str]| {
+        let out = dir.path().join(name);
+        make(&out, &[&SMALL[..], arguments].concat());
+        TrueScene::read(out.join("truth/scene.json")).unwrap().parameters
+    };
+    let sam = parameters("sam", &["--corruption", "sam", "--features", "--missing", "0.2"]);
+    for (name, value) in [("granularity_p", 0.5), ("boundary_noise", 1.0), ("missing", 0.2), ("spurious", 0.15)] {
+        assert_eq!(sam[name].as_f64(), Some(value), "{name}");
+    }
+    assert_eq!(sam["features"], serde_json::json!({"leaking": 0.1, "noise": 0.5}));
+    let mild = parameters("mild", &[]);
+    assert_eq!((mild["granularity_p"].as_f64(), mild.get("spurious"), mild.get("features")), (Some(0.3), None, None));
+}
+
+#[test]
 fn families_are_written_whole_and_rooms_as_scans_too() {
     let dir = tempfile::tempdir().unwrap();
     for family in ["table", "kitchen", "room"] {

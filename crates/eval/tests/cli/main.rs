@@ -159,6 +159,15 @@ fn a_perfect_run_scores_high_and_the_csv_agrees() {
     assert!((mean - s["query_miou"].as_f64().unwrap()).abs() < 1e-5);
     let things = fs::read_to_string(f.path().join("s/score.things.csv")).unwrap();
     assert!(things.contains("2,\"floor\",true,100,1.000000,2,1"), "{things}");
+    // The best instance for a label is the one that its text selects.
+    assert_eq!(
+        (s["label_miou"].as_f64(), s["labels"].as_array().unwrap().len()),
+        (s["query_miou_visible"].as_f64(), 4)
+    );
+    assert_eq!(
+        (s["labels"][0]["category"].as_str(), s["labels"][0]["instance"].as_i64()),
+        (Some("blue ball"), Some(1))
+    );
     f.good("score", "--text-features|{}/text.json|--silhouette|visible|--out|{}/s/visible.json");
     let v = f.json("s/visible.json");
     assert_eq!(v["silhouette"][0], "visible");
@@ -196,6 +205,25 @@ fn missing_predictions_count_as_zero_and_say_so() {
 }
 
 #[test]
+fn id_maps_are_measured() {
+    let f = Fixture::new(0);
+    let masks = f.scene().join("language_features");
+    let eval = |masks: &std::path::Path, out: &str| {
+        let mut c = std::process::Command::new(env!("CARGO_BIN_EXE_eval"));
+        c.args(["masks", "--masks"]).arg(masks).arg("--out").arg(f.path().join(out)).output().unwrap()
+    };
+    let o = eval(&masks, "stats.json");
+    let printed = String::from_utf8_lossy(&o.stdout).into_owned();
+    assert!(o.status.success() && printed.contains("| large |"), "{printed}{}", String::from_utf8_lossy(&o.stderr));
+    let stats = f.json("stats.json");
+    assert_eq!(stats["views"], fixture::VIEWS);
+    assert!(stats["levels"][3]["masks"][0].as_f64().unwrap() >= 1.0 && stats["levels"][3]["split"].is_null());
+    let o = eval(&f.scene().join("label"), "none.json");
+    let said = String::from_utf8_lossy(&o.stderr);
+    assert!(o.status.code() == Some(2) && said.contains("no id maps") && said.lines().count() == 1, "{said}");
+}
+
+#[test]
 fn all_noise_scores_zero() {
     let f = Fixture::new(2);
     f.write_instances(2, |_| -1);
@@ -212,6 +240,7 @@ fn what_has_no_truth_is_skipped_with_a_reason() {
     let f = Fixture::new(0);
     fs::remove_dir_all(f.scene().join("truth")).unwrap();
     let printed = f.good("score", "--text-features|{}/text.json|--out|{}/score.json");
+    assert!(f.json("score.json")["label_miou"].as_f64().unwrap() > 0.5, "labels need no language");
     assert!(printed.contains("no language features") && printed.contains("truth/points.safetensors"), "{printed}");
     let s = f.json("score.json");
     assert!(s["instance_miou"].is_null() && s["query_miou"].is_null());
