@@ -57,6 +57,8 @@ pub struct Cell {
     pub values: Vec<Option<f64>>,
     /// Wall-clock seconds of feat-train and cluster-match.
     pub seconds: Option<f64>,
+    /// Mean cosine of a mask's Gaussians with its centroid in the last view trained on; none for closed forms.
+    pub alignment: Option<f64>,
     /// Bytes of the graph network, and of it per Gaussian.
     pub network: Option<(f64, f64)>,
 }
@@ -101,7 +103,9 @@ fn cell(scene: String, folder: &Path, path: &Path, row: &Row) -> Result<Cell> {
     let instances = record(format!("{}.instances.safetensors", row.id()));
     let number = |key: &str| features.as_ref().and_then(|r| r.summary[key].as_f64());
     let network = number("network_bytes").zip(number("gaussians"));
+    let alignment = features.as_ref().and_then(|r| r.summary["last"]["alignment"].as_f64());
     Ok(Cell {
+        alignment,
         scene,
         values: METRICS.iter().map(|m| (m.of)(&scores)).collect(),
         seconds: features.as_ref().zip(instances.as_ref()).map(|(f, i)| f.wall_seconds + i.wall_seconds),

@@ -23,6 +23,8 @@ pub struct RowResult {
     pub differences: BTreeMap<String, BTreeMap<String, Interval>>,
     /// Mean wall-clock seconds of feat-train and cluster-match by p; several ran at a time.
     pub seconds: BTreeMap<String, f64>,
+    /// Mean cosine of a mask's Gaussians with its centroid at the end of training, by p.
+    pub alignment: BTreeMap<String, f64>,
     /// Bytes of the graph network per Gaussian, where there is one.
     pub network_bytes_per_gaussian: Option<f64>,
 }
@@ -110,17 +112,18 @@ fn result(runs: &Runs<'_>, table: &TablePlan) -> Result<(Table, Vec<PathBuf>)> {
         }
         let all = || by_p.values().flatten();
         let mean = |values: &[f64]| Interval::of(values).map(|i| i.mean);
-        let times = by_p.iter().filter_map(|(p, cells)| {
-            let seconds: Vec<f64> = cells.iter().filter_map(|c| c.seconds).collect();
-            Some((p.to_string(), mean(&seconds)?))
-        });
+        let by_p_mean = |of: &dyn Fn(&Cell) -> Option<f64>| -> BTreeMap<String, f64> {
+            let values = |cells: &[Cell]| cells.iter().filter_map(of).collect::<Vec<_>>();
+            by_p.iter().filter_map(|(p, cells)| Some((p.to_string(), mean(&values(cells))?))).collect()
+        };
         let footprints = runs.plan.footprints_of.get(&row.features).map_or("", |f| f);
         rows.push(RowResult {
             options: [("footprints", footprints), ("features", &row.features), ("clustering", &row.clustering)]
                 .map(|(keyword, name)| runs.plan.options_of(keyword, name).to_string()),
             results: intervals(&by_p, |c, m| c.values[m]),
             differences: BTreeMap::new(),
-            seconds: times.collect(),
+            seconds: by_p_mean(&|c| c.seconds),
+            alignment: by_p_mean(&|c| c.alignment),
             network_bytes_per_gaussian: mean(&all().filter_map(|c| Some(c.network?.1)).collect::<Vec<_>>()),
             row: row.clone(),
         });
@@ -234,6 +237,10 @@ pub fn blocks(table: &Table) -> Vec<Block> {
     if table.reference.is_some() {
         head.extend(["gain, instance mIoU".into(), "gain, query mIoU".into()]);
     }
+    let aligned = table.rows.iter().any(|r| !r.alignment.is_empty());
+    if aligned {
+        head.push("alignment".into());
+    }
     head.push("seconds".into());
     if memory {
         head.extend(["network, MB per million Gaussians".into(), "paper, GB".into()]);
@@ -248,6 +255,9 @@ pub fn blocks(table: &Table) -> Vec<Block> {
         if table.reference.is_some() {
             let gains = r.differences.get(p);
             cells.extend(["instance_miou", "query_miou"].map(|m| text(gains.and_then(|g| g.get(m)), true, true)));
+        }
+        if aligned {
+            cells.push(r.alignment.get(p).map_or("–".into(), |a| format!("{a:.2}")));
         }
         cells.push(r.seconds.get(p).map_or("–".into(), |s| format!("{s:.1}")));
         if memory {
