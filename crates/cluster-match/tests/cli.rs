@@ -1,6 +1,6 @@
 //! The program on a small scene on disk: instances and descriptors, the same bytes for any thread count, and bad input.
 
-use artifacts::{Features, FootprintsBuilder, Graph, Instances, MaskFeatures, MaskMaps, hash_folder, role};
+use artifacts::{Features, FootprintsBuilder, Graph, Instances, MaskFeatures, MaskMaps, Row, hash_folder, role};
 use glam::DVec3;
 use gs_io::{Artifact, Provenance, hash_file};
 use gs_scene::dataset::{self, LoadOptions, Resolution};
@@ -150,12 +150,21 @@ impl Scene {
             ..Graph::default()
         };
         graph.write(self.path("graph.safetensors"), provenance(&origin)).unwrap();
-        let footprints = FootprintsBuilder {
+        let mut footprints = FootprintsBuilder {
             views: (0..VIEWS).map(|v| format!("v{v}")).collect(),
             kept: graph.kept.clone(),
             row_ptr: vec![0],
             ..FootprintsBuilder::default()
         };
+        // As the id maps have it: both things in one medium mask, each in its large one.
+        for view in 0..VIEWS as u32 {
+            for (level, mask, own) in [(2, 2, 0..n), (3, 3, 0..EACH), (3, 4, EACH..n)] {
+                footprints.rows.push(Row { view, level, mask, pixels: 50, gated: 50, alpha: 1.0 });
+                footprints.weight.extend(own.clone().map(|_| 1.0));
+                footprints.col.extend(own.map(|i| i as u32));
+                footprints.row_ptr.push(footprints.col.len() as u64);
+            }
+        }
         footprints.write(self.path("footprints.safetensors"), provenance(&origin)).unwrap();
         let hash = |name: &str, format: &str| Artifact::open(self.path(name), format, 1).unwrap().hash().to_string();
         let value = |i: usize| {
@@ -301,8 +310,13 @@ fn options_do_what_they_say() {
         assert!(i.dim == 0 && i.descriptor.is_empty() && said.contains("skipped language descriptors"), "{said}");
     }
     // Another level: one mask for both things, which each covers half of, or the best of two levels.
-    let (i, _) = s.succeed(&["--level", "medium", "--aggregate", "median"]);
+    let (i, _) = s.succeed(&["--level", "medium", "--aggregate", "median", "--join", "0"]);
     assert!(i.matches.iter().all(|m| m.mask == 2 && m.score < 0.7) && !i.matches.is_empty());
+    // What masks show as one is joined.
+    let (i, said) = s.succeed(&["--level", "medium"]);
+    assert!(i.len() == 1 && i.label.iter().all(|&l| l == 0) && said.contains("1 instances after joining"), "{said}");
+    assert!(i.tree.iter().all(|e| e.instance <= 0));
+    assert_eq!(s.succeed(&["--level", "medium", "--cluster", "free", "--min-samples", "5"]).0.len(), 2);
     let (i, _) = s.succeed(&["--level", "medium,large"]);
     assert!(i.matches.len() == 2 * VIEWS && i.matches.iter().all(|m| m.mask >= 3));
     assert!(s.succeed(&["--threshold", "1"]).0.matches.is_empty());
@@ -421,6 +435,7 @@ fn bad_input_is_one_line_and_leaves_outputs_alone() {
     s.fail(&["--min-cluster-share", "2"], &["--min-cluster-share"]);
     s.fail(&["--min-samples", "0"], &["--min-samples", "found 0"]);
     s.fail(&["--epsilon", "NaN"], &["--epsilon", "found NaN"]);
+    s.fail(&["--join", "0.5"], &["--join", "found 0.5", "more than 0.5"]);
     s.fail(&["--threshold", "1.5"], &["--threshold", "found 1.5"]);
     assert_eq!(s.run(&["--level", "huge"]).status.code(), Some(2));
     let out = s.run(&["--out", s.path("out/x.json").to_str().unwrap()]);

@@ -29,3 +29,17 @@ fn footprints_give_what_rendering_and_averaging_give() {
     let views = s.views(&context, 1);
     assert!((60..=100).contains(&views[0].len()) && views[0].columns.len() > 60 * 60 / 6);
 }
+
+#[test]
+fn views_of_the_benchmark_show_things_whole_in_parts_and_merged() {
+    let s = scene::scene(300);
+    let things = scene::Things::new(300);
+    let numbers: Vec<usize> = (0..4).map(|v| s.entries(v, Some(&things)).1.len()).collect();
+    // About a fifth of 240 things, and as many masks more as parts are shown more often than merged.
+    assert!(numbers.iter().all(|n| (40..120).contains(n)) && numbers.iter().any(|n| *n != numbers[0]), "{numbers:?}");
+    let (entries, pixels) = s.entries(0, Some(&things));
+    for k in [0, pixels.len() - 1] {
+        let sum: f64 = entries.iter().filter(|e| usize::from(e.1) == k).map(|e| f64::from(e.2)).sum();
+        assert!((sum - 0.9).abs() < 1e-3, "{k}: {sum}");
+    }
+}
