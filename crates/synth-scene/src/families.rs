@@ -416,7 +416,7 @@ impl<'a> Planner<'a> {
 
     /// Half the length of a wall and its distance from the middle.
     fn wall(&self, wall: usize) -> (f64, f64) {
-        if wall % 2 == 0 { (self.half.x, self.half.y) } else { (self.half.y, self.half.x) }
+        if wall.is_multiple_of(2) { (self.half.x, self.half.y) } else { (self.half.y, self.half.x) }
     }
 
     fn is_free(&self, wall: usize, along: f64, half: f64, up: [f64; 2]) -> bool {

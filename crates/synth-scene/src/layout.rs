@@ -87,7 +87,7 @@ impl Footprint {
         let turned = side / 4 % 2 == 1;
         let size = if turned { DVec2::new(half.y, half.x) } else { half };
         let [x, y] = self.axes();
-        let sign = if side % 2 == 0 { 1.0 } else { -1.0 };
+        let sign = if side.is_multiple_of(2) { 1.0 } else { -1.0 };
         let slide = 0.6 * shift * (self.half + size);
         let offset = match side / 2 % 2 {
             0 => x * (sign * (self.half.x + size.x + gap)) + y * slide.y,
