@@ -108,7 +108,10 @@ impl Clusters {
                 continue;
             }
             let below: f64 = self.children[c].iter().map(|&x| best[x]).sum();
-            if below > best[c] {
+            // A part of a graph that nothing joins to the rest is a root of its own. Born at lambda 0 it would outweigh all that
+            // it divides into, as the root would.
+            let root_of_part = self.birth[c] == 0.0 && !self.children[c].is_empty() && !allow_root;
+            if below > best[c] || root_of_part {
                 best[c] = below;
             } else {
                 chosen[c] = true;

@@ -431,3 +431,18 @@ fn points_asked_about_again_mostly_keep_their_clusters() {
         assert!(own > if c.options.selection == Selection::Leaf { 0.8 } else { 0.95 }, "{}: ARI {own}", c.name);
     }
 }
+
+/// A part of the graph that nothing joins to the rest is a root of its own: it is not the cluster where it divides.
+#[test]
+fn a_part_that_divides_gives_way_to_what_it_divides_into() {
+    let chain = |from: u32, to: u32| (from..to - 1).map(|a| Edge::new(a, a + 1, 1.0));
+    // Two chains with a bridge hardly longer than their links, and an island.
+    let edges: Vec<Edge> =
+        chain(0, 40).chain(chain(40, 80)).chain(chain(80, 90)).chain([Edge::new(39, 40, 1.2)]).collect();
+    let options = Options { min_cluster_size: 5, ..Options::default() };
+    let labels = cluster_graph(90, &edges, &options).labels;
+    assert!(labels.iter().all(|l| *l >= 0), "{labels:?}");
+    let of = |range: std::ops::Range<usize>| labels[range].iter().copied().collect::<std::collections::BTreeSet<_>>();
+    assert!([of(0..40), of(40..80), of(80..90)].iter().all(|l| l.len() == 1), "{labels:?}");
+    assert_eq!(of(0..90).len(), 3, "{labels:?}");
+}
