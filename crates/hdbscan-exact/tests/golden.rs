@@ -303,8 +303,8 @@ fn parts_of_a_graph_are_apart_however_near_they_are() {
         assert_eq!(r.labels[20..], [-1, -1]);
         assert!(r.tree.edges.iter().all(|e| e.child < 22 || e.lambda == 0.0));
     }
-    assert!(cluster_graph(0, &[], &o).labels.is_empty());
-    assert_eq!(cluster_graph(3, &[], &o).labels, [-1; 3]);
+    assert!(cluster_graph(0, [], &o).labels.is_empty());
+    assert_eq!(cluster_graph(3, [], &o).labels, [-1; 3]);
 }
 
 #[test]
