@@ -1,6 +1,7 @@
 //! CᵀC, masks by masks: which masks share Gaussians, and how much.
 //!
-//! It is as sparse as masks are small, and a hundred times smaller than C, so that an iteration on it costs next to nothing.
+//! It is as sparse as masks are small: for a million Gaussians and 300 views it has a twelfth of the entries that a product
+//! with C and its transpose goes through.
 //! A block of Gaussians knows a few hundred masks; products of its rows are summed in a dense square that stays in
 //! cache, and the squares of all blocks are then added up mask by mask, in the order of blocks.
 
