@@ -9,6 +9,7 @@ mod footprints;
 mod graph;
 mod instances;
 mod masks;
+mod nyu40;
 mod palette;
 mod truth;
 
@@ -17,6 +18,7 @@ pub use footprints::{Footprints, FootprintsBuilder, PixelSamples, Row, ScratchEn
 pub use graph::Graph;
 pub use instances::{Family, Instances, Match, OrientedBox, TreeEdge};
 pub use masks::{LEVELS, Level, MaskFeatures, MaskMaps, features_path, hash_folder, maps_path, stems};
+pub use nyu40::NYU40;
 pub use palette::{NOISE_COLOR, instance_color};
 pub use truth::{MaskTruth, TrueObject, TruePart, TruePoints, TrueScene};
 

@@ -202,7 +202,7 @@ fn matched(scene: &LabelledScene, vertices: &[[f32; 3]], options: &ScanOptions, 
     Ok(Matched { gaussian: (0..g.len() as u32).map(Some).collect(), counts })
 }
 
-/// Scores a scan. `texts` are the features of the names of [`scannet::NYU40`], in that order; `sizes` the class sets.
+/// Scores a scan. `texts` are the features of the names of [`artifacts::NYU40`], in that order; `sizes` the class sets.
 ///
 /// # Errors
 /// When the truth is damaged or does not fit the Gaussians.
@@ -234,12 +234,12 @@ pub fn score(
         ));
     }
     if let Some(texts) = texts {
-        assert_eq!(texts.len(), scannet::NYU40.len());
+        assert_eq!(texts.len(), artifacts::NYU40.len());
         let index = Index::new(&scene.instances);
         let by_name: Vec<Vec<Option<f32>>> = texts.iter().map(|t| index.scores(t, &Scoring::default())).collect();
         for &size in sizes {
             let set = scannet::class_set(size).expect("a known size");
-            let names: Vec<usize> = (0..texts.len()).filter(|&n| set.contains(&scannet::NYU40[n])).collect();
+            let names: Vec<usize> = (0..texts.len()).filter(|&n| set.contains(&artifacts::NYU40[n])).collect();
             let of_instance = |k: usize| {
                 let mut best: Option<(usize, f32)> = None;
                 if scene.instances.support[k] >= options.min_support {

@@ -2,7 +2,7 @@
 //! for what the catalogue has.
 
 use crate::scene::Scene;
-use artifacts::TruePoints;
+use artifacts::{NYU40, TruePoints};
 use gs_io::{Error, Result, create_dir, write_bytes};
 use gs_scene::{PointCloud, ply};
 use serde_json::{Value, json};
@@ -11,28 +11,6 @@ use std::path::Path;
 /// Name of the scan within its files.
 const SCAN: &str = "scene0000_00";
 
-/// ScanNet's label ids (NYU40) and names that the open-vocabulary benchmark asks for.
-const BENCHMARK: [(u32, &str); 19] = [
-    (1, "wall"),
-    (2, "floor"),
-    (3, "cabinet"),
-    (4, "bed"),
-    (5, "chair"),
-    (6, "sofa"),
-    (7, "table"),
-    (8, "door"),
-    (9, "window"),
-    (10, "bookshelf"),
-    (11, "picture"),
-    (12, "counter"),
-    (14, "desk"),
-    (16, "curtain"),
-    (24, "refrigerator"),
-    (28, "showercurtain"),
-    (33, "toilet"),
-    (34, "sink"),
-    (36, "bathtub"),
-];
 /// Classes of the catalogue that the benchmark calls otherwise.
 const CALLED: [(&str, &str); 5] = [
     ("armchair", "chair"),
@@ -46,7 +24,7 @@ const OTHER: u32 = 40;
 
 /// The names of all classes that the benchmark asks for.
 pub fn names() -> impl Iterator<Item = &'static str> {
-    BENCHMARK.iter().map(|b| b.1)
+    NYU40.iter().map(|b| b.1)
 }
 
 /// What the benchmark calls a class of the catalogue, if it asks for it.
@@ -58,7 +36,7 @@ pub fn benchmark_name(class: &str) -> Option<&'static str> {
 /// The label id of a class of the catalogue.
 pub fn label(class: &str) -> u32 {
     let name = benchmark_name(class);
-    BENCHMARK.iter().find(|b| Some(b.1) == name).map_or(OTHER, |b| b.0)
+    NYU40.iter().find(|b| Some(b.1) == name).map_or(OTHER, |b| b.0)
 }
 
 /// Writes the scan's files into `folder`: `*_vh_clean_2.ply` (vertices with colours, no faces), `*_vh_clean_2.labels.ply`

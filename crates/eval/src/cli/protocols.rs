@@ -288,7 +288,7 @@ pub(super) fn run_scannet(a: &ScannetArgs, stage: &Stage) -> Result<String> {
         let source = a.language.source()?;
         source.check_dim(scene.instances.dim, scene.path())?;
         features.insert("text features".into(), format!("{} ({:.12})", source.describe(), source.hash()?));
-        let names: Vec<String> = scannet::NYU40.iter().map(|c| c.1.to_string()).collect();
+        let names: Vec<String> = artifacts::NYU40.iter().map(|c| c.1.to_string()).collect();
         let found = source.encode(&names)?;
         let known = |(f, n): (Option<Vec<f32>>, &String)| f.ok_or_else(|| source.unknown(n));
         Some(found.into_iter().zip(&names).map(known).collect::<Result<Vec<_>>>()?)

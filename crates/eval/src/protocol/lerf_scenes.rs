@@ -158,7 +158,7 @@ mod tests {
         for query in SCENES.iter().flat_map(|s| s.queries) {
             assert!(table.contains_key(*query), "{query}");
         }
-        for (_, name) in crate::protocol::scannet::NYU40 {
+        for (_, name) in artifacts::NYU40 {
             assert!(table.contains_key(name), "{name}");
         }
     }

@@ -11,7 +11,7 @@ use std::process::{Command, Output};
 
 /// The ids of the classes that things take in turn; 40 is no class of any set.
 const NYU: [u32; 9] = [1, 2, 7, 5, 11, 33, 40, 3, 34];
-const NAMES: [(u32, &str); 19] = eval::protocol::scannet::NYU40;
+const NAMES: [(u32, &str); 19] = artifacts::NYU40;
 const DIM: usize = 24;
 
 struct Scene {
