@@ -440,7 +440,7 @@ fn a_part_that_divides_gives_way_to_what_it_divides_into() {
     let edges: Vec<Edge> =
         chain(0, 40).chain(chain(40, 80)).chain(chain(80, 90)).chain([Edge::new(39, 40, 1.2)]).collect();
     let options = Options { min_cluster_size: 5, ..Options::default() };
-    let labels = cluster_graph(90, &edges, &options).labels;
+    let labels = cluster_graph(90, &edges[..], &options).labels;
     assert!(labels.iter().all(|l| *l >= 0), "{labels:?}");
     let of = |range: std::ops::Range<usize>| labels[range].iter().copied().collect::<std::collections::BTreeSet<_>>();
     assert!([of(0..40), of(40..80), of(80..90)].iter().all(|l| l.len() == 1), "{labels:?}");
