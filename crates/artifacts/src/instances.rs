@@ -118,12 +118,19 @@ impl Instances {
         let own: Vec<u32> = self.tree.iter().filter(|e| e.instance == instance as i32).map(|e| e.child).collect();
         let (&first, others) = own.split_first()?;
         let root = self.tree.iter().map(|e| e.parent).min();
-        let above = |cluster: u32| self.tree.iter().find(|e| e.child == cluster);
-        // The nearest cluster above all of it.
-        let mut edge = above(first)?;
-        let all = |within: BTreeSet<u32>| others.iter().all(|o| within.contains(o));
-        while !all(self.within(edge.parent)) {
-            edge = above(edge.parent)?;
+        let above: BTreeMap<u32, &TreeEdge> = self.tree.iter().map(|e| (e.child, e)).collect();
+        // The nearest cluster above all of it: parents have smaller numbers than their children.
+        let mut top = above[&first].parent;
+        for &other in others {
+            let mut at = other;
+            while at != top {
+                let lower = if at > top { &mut at } else { &mut top };
+                *lower = above.get(lower)?.parent;
+            }
+        }
+        let mut edge = above[&first];
+        while edge.parent != top {
+            edge = above[&edge.parent];
         }
         // What was split at lambda 0 is infinitely far apart.
         let parent = Some(edge.parent).filter(|&p| Some(p) != root && edge.lambda > 0.0);

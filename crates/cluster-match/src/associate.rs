@@ -237,8 +237,7 @@ pub fn overlaps(
     silhouettes: &[Silhouette],
 ) -> Vec<Overlaps> {
     let early_stop = !silhouettes.contains(&Silhouette::Selected);
-    let raster = RasterOptions { sh_degree: 0, ..raster.clone() };
-    let tiles = tile_weights(gaussians, camera, &raster, early_stop, |t| {
+    let tiles = tile_weights(gaussians, camera, raster, early_stop, |t| {
         let masks = TileMasks::new(t, maps, levels);
         silhouettes.iter().map(|&s| tile_overlaps(t, labels, table, &masks, s)).collect::<Vec<_>>()
     });

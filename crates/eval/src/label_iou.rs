@@ -76,9 +76,8 @@ fn instance_map(gaussians: &Gaussians, label: &[i32], camera: &Camera, raster: &
     if gaussians.is_empty() {
         return map;
     }
-    let options = RasterOptions { sh_degree: 0, ..raster.clone() };
     let threshold = Silhouette::Visible.default_threshold();
-    let tiles = gs_raster::tile_weights(gaussians, camera, &options, true, |tile| {
+    let tiles = gs_raster::tile_weights(gaussians, camera, raster, true, |tile| {
         let mut shares = BTreeMap::<i32, Vec<f32>>::new();
         for (k, &g) in tile.gaussians.iter().enumerate().filter(|(_, g)| label[**g as usize] >= 0) {
             let share = shares.entry(label[g as usize]).or_insert_with(|| vec![0.0; TILE * TILE]);

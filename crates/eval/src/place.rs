@@ -4,7 +4,7 @@ use crate::protocol::scannet::nearest;
 use crate::ranking::{Index, Ranked};
 use crate::scene::LabelledScene;
 use gs_io::{Error, Result};
-use gs_raster::{RasterOptions, TILE, tile_weights};
+use gs_raster::{TILE, tile_weights};
 use gs_scene::dataset::View;
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
@@ -48,8 +48,7 @@ pub fn at_pixel(
             .found(format!("{x},{y}"))
             .expected(format!("x below {} and y below {} in {}", camera.width, camera.height, view.stem())));
     }
-    let options = RasterOptions { sh_degree: 0, ..scene.raster.clone() };
-    let here = tile_weights(scene.gaussians(), camera, &options, true, |t| {
+    let here = tile_weights(scene.gaussians(), camera, &scene.raster, true, |t| {
         let inside = (t.x0..t.x0 + t.width).contains(&x) && (t.y0..t.y0 + t.height).contains(&y);
         let at = inside.then(|| (y - t.y0) * TILE + x - t.x0)?;
         let weights = t.gaussians.iter().zip(t.weights.chunks_exact(TILE * TILE));

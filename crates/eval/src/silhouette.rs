@@ -46,17 +46,14 @@ impl Silhouette {
     }
 }
 
-/// Colours do not matter for a silhouette, so neither does the view-dependent part of them.
-fn colourless(raster: &RasterOptions) -> RasterOptions {
-    RasterOptions { sh_degree: 0, ..raster.clone() }
-}
-
 fn alone(gaussians: &Gaussians, raster: &RasterOptions, selection: &[u32], camera: &Camera, threshold: f32) -> Mask {
     let (w, h) = (camera.width as usize, camera.height as usize);
     if selection.is_empty() {
         return Mask::new(w, h);
     }
-    Mask::above(w, h, &gs_raster::render(&gaussians.select(selection), camera, &colourless(raster)).alpha, threshold)
+    // Of the render only alpha counts.
+    let raster = RasterOptions { sh_degree: 0, depth: false, ..raster.clone() };
+    Mask::above(w, h, &gs_raster::render(&gaussians.select(selection), camera, &raster).alpha, threshold)
 }
 
 /// Selections rendered at once; more are done in turns, which bounds the memory.
@@ -115,7 +112,7 @@ fn blended(
         if !gaussians.is_empty() {
             (0..d).for_each(|k| fill(&mut values[k..], first + k, d));
         }
-        let image = gs_raster::render_features(gaussians, &values, d, camera, &colourless(raster));
+        let image = gs_raster::render_features(gaussians, &values, d, camera, raster);
         maps.extend((0..d).map(|k| image.iter().skip(k).step_by(d).copied().collect::<Vec<f32>>()));
     }
     maps

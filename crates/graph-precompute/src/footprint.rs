@@ -62,9 +62,8 @@ pub fn view_footprints(
     options: &FootprintOptions,
 ) -> ViewFootprints {
     let (mut rows, row_of, small_masks) = mask_rows(maps, options.min_pixels);
-    let raster = RasterOptions { sh_degree: 0, ..raster.clone() };
     let below: Vec<u64> = rows.iter().map(|r| candidates_below(options.samples, r.pixels)).collect();
-    let mut tiles = gs_raster::tile_weights(gaussians, camera, &raster, true, |tile| {
+    let mut tiles = gs_raster::tile_weights(gaussians, camera, raster, true, |tile| {
         let mut sums = tile_sums(tile, maps, &row_of, options.gate);
         if options.samples > 0 {
             sums.pixels = tile_pixels(tile, maps, &row_of, options, &below);

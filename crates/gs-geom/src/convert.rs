@@ -1,6 +1,6 @@
 //! Choosing, ordering and trimming Gaussians.
 
-use crate::inspect::{Bounds, is_usable};
+use crate::inspect::Bounds;
 use gs_scene::{Gaussians, morton_order};
 use serde::Serialize;
 
@@ -43,7 +43,7 @@ pub fn choose(g: &Gaussians, choice: &Choice) -> Chosen {
     let mut chosen = Chosen { kept: Vec::new(), not_finite: 0, cropped: 0, faint: 0 };
     let inside = |p: &[f32; 3], b: &Bounds| (0..3).all(|c| (b.low[c]..=b.high[c]).contains(&p[c]));
     for i in 0..g.len() {
-        if !is_usable(g, i) {
+        if !g.is_whole(i) {
             chosen.not_finite += 1;
         } else if choice.crop.is_some_and(|b| !inside(&g.means[i], &b)) {
             chosen.cropped += 1;

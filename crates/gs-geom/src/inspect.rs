@@ -99,16 +99,6 @@ pub fn inspect(g: &Gaussians) -> Report {
     }
 }
 
-/// Whether every number of Gaussian `i` can be used; an infinite opacity logit can.
-pub fn is_usable(g: &Gaussians, i: usize) -> bool {
-    let finite = |values: &[f32]| values.iter().all(|v| v.is_finite());
-    finite(&g.means[i])
-        && finite(&g.log_scales[i])
-        && finite(&g.rotations[i])
-        && !g.opacity_logits[i].is_nan()
-        && finite(g.sh_of(i))
-}
-
 /// Bounds of the finite centres without the share `cut` of them at either end of each axis.
 pub fn bounds(g: &Gaussians, cut: f64) -> Option<Bounds> {
     let axis = |c: usize| {
@@ -166,7 +156,7 @@ fn non_finite(g: &Gaussians) -> NonFinite {
     let bad = |values: &[f32]| usize::from(values.iter().any(|v| !v.is_finite()));
     let mut n = NonFinite::default();
     for i in 0..g.len() {
-        n.gaussians += usize::from(!is_usable(g, i));
+        n.gaussians += usize::from(!g.is_whole(i));
         n.means += bad(&g.means[i]);
         n.log_scales += bad(&g.log_scales[i]);
         n.rotations += bad(&g.rotations[i]);

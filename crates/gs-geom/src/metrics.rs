@@ -62,7 +62,7 @@ pub fn behind(alpha: Alpha, background: [f32; 3]) -> [f32; 3] {
 /// PSNR and SSIM of a render against `target`, which lies over [`behind`]. With [`Alpha::Ignore`] the PSNR is that of the
 /// pixels that count, each weighed by the square of its alpha; in the SSIM the others are black in both pictures.
 pub fn compare(g: &Gaussians, camera: &Camera, options: &RasterOptions, target: &Target, alpha: Alpha) -> (f64, f64) {
-    let mut rgb = render(g, camera, options).rgb;
+    let mut rgb = render(g, camera, &RasterOptions { depth: false, ..options.clone() }).rgb;
     rgb.iter_mut().for_each(|v| *v = v.clamp(0.0, 1.0));
     let mut psnr_gain = 0.0;
     if let Some(weights) = target.alpha.as_ref().filter(|_| alpha == Alpha::Ignore) {

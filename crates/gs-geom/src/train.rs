@@ -387,8 +387,7 @@ impl<'a> Trainer<'a> {
     pub fn heldout(&self) -> Result<Option<(f64, f64)>> {
         let g = &self.state.gaussians;
         let background = self.options.background;
-        let antialias = self.options.antialias;
-        let options = RasterOptions { background, antialias, depth: false, ..RasterOptions::default() };
+        let options = RasterOptions { background, antialias: self.options.antialias, ..RasterOptions::default() };
         let compare = |i: usize| {
             let target = self.heldout.target(i, metrics::behind(self.options.alpha, background))?;
             Ok(metrics::compare(g, self.heldout.camera(i), &options, &target, self.options.alpha))

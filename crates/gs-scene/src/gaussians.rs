@@ -60,6 +60,17 @@ impl Gaussians {
         [0, 1, 2].map(|c| 0.5 + SH_C0 * sh[c])
     }
 
+    /// Whether every number of Gaussian `i` can be used: all are finite, but that an infinite opacity logit can, too.
+    pub fn is_whole(&self, i: usize) -> bool {
+        let geometric = self.means[i].iter().chain(&self.log_scales[i]).chain(&self.rotations[i]);
+        geometric.chain(self.sh_of(i)).all(|v| v.is_finite()) && !self.opacity_logits[i].is_nan()
+    }
+
+    /// Makes infinite opacity logits +-50, which is as opaque and as transparent as single precision tells.
+    pub fn bound_opacities(&mut self) {
+        self.opacity_logits.iter_mut().filter(|o| o.is_infinite()).for_each(|o| *o = o.clamp(-50.0, 50.0));
+    }
+
     /// The Gaussians at `indices`, in that order.
     ///
     /// # Panics

@@ -28,13 +28,9 @@ impl Geometry {
     pub fn read(path: impl AsRef<Path>) -> Result<Self> {
         let path = path.as_ref();
         let mut g = ply::read_gaussians_as_they_are(path)?;
-        g.opacity_logits.iter_mut().filter(|o| o.is_infinite()).for_each(|o| *o = o.clamp(-50.0, 50.0));
+        g.bound_opacities();
         let stride = g.sh_stride();
-        let whole = |i: usize| {
-            let geometric = g.means[i].iter().chain(&g.log_scales[i]).chain(&g.rotations[i]);
-            geometric.chain(g.sh_of(i)).all(|v| v.is_finite()) && g.opacity_logits[i].is_finite()
-        };
-        let damaged: Vec<u32> = (0..g.len() as u32).filter(|&i| !whole(i as usize)).collect();
+        let damaged: Vec<u32> = (0..g.len() as u32).filter(|&i| !g.is_whole(i as usize)).collect();
         let Some(first) = (0..g.len()).find(|&i| damaged.get(i) != Some(&(i as u32))) else {
             if g.is_empty() {
                 return Ok(Self { gaussians: g, damaged, antialias: ply::is_antialiased(path)? });

@@ -109,7 +109,7 @@ fn parse_gaussians(bytes: &[u8]) -> Result<Gaussians> {
     table.positions()?;
     let mut g = gaussians_of(&table)?;
     let n = g.len();
-    g.opacity_logits.iter_mut().filter(|o| o.is_infinite()).for_each(|o| *o = o.clamp(-50.0, 50.0));
+    g.bound_opacities();
     let finite = |name: &str, values: &[f32]| {
         // Without leaving early, so that it runs at the memory's speed.
         if values.iter().fold(true, |all, v| all & v.is_finite()) {

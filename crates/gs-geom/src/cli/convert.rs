@@ -97,7 +97,7 @@ impl ConvertArgs {
         }
         arrange(&g, &mut chosen.kept, self.order);
         g = g.select(&chosen.kept);
-        g.opacity_logits.iter_mut().filter(|o| o.is_infinite()).for_each(|o| *o = o.clamp(-50.0, 50.0));
+        g.bound_opacities();
         g = match self.sh_degree {
             Some(degree) => init::with_degree(g, degree),
             None => g,
