@@ -74,9 +74,9 @@ struct ClusteringArgs {
     /// Cluster this many free points, chosen by --seed, and give the others the clusters they fall into
     #[arg(long, value_name = "COUNT")]
     sample: Option<usize>,
-    /// Fewest Gaussians of an instance
-    #[arg(long, default_value_t = 30, value_name = "COUNT")]
-    min_cluster_size: usize,
+    /// Fewest Gaussians of an instance [default: 30; on the graph a thousandth of those that are seen, but 10 to 30]
+    #[arg(long, value_name = "COUNT")]
+    min_cluster_size: Option<usize>,
     /// Fewest Gaussians of an instance as a share of those that are seen, if that is more
     #[arg(long, default_value_t = 0.0, value_name = "SHARE")]
     min_cluster_share: f64,
@@ -260,11 +260,16 @@ fn options(c: &ClusteringArgs, n: usize) -> Result<Options> {
     };
     let (min_samples, epsilon) = (c.min_samples.unwrap_or(min_samples), c.epsilon.unwrap_or(epsilon));
     let share = c.min_cluster_share;
+    // Small scenes have small things; measured at 12,000 and 88,000 Gaussians (docs/accuracy.md).
+    let smallest = c.min_cluster_size.unwrap_or(match c.cluster {
+        Space::Free => 30,
+        Space::Graph => n.div_ceil(1000).clamp(10, 30),
+    });
     let check = |good: bool, field: &str, found: &dyn std::fmt::Display, expected: &str| match good {
         true => Ok(()),
         false => Err(Error::new("impossible option").field(field).found(found).expected(expected)),
     };
-    check(c.min_cluster_size >= 2, "--min-cluster-size", &c.min_cluster_size, "at least 2")?;
+    check(smallest >= 2, "--min-cluster-size", &smallest, "at least 2")?;
     check((0.0..=1.0).contains(&share), "--min-cluster-share", &share, "0 to 1")?;
     check(min_samples >= 1, "--min-samples", &min_samples, "at least 1")?;
     if let Some(sample) = c.sample {
@@ -281,7 +286,7 @@ fn options(c: &ClusteringArgs, n: usize) -> Result<Options> {
         check(join == 0.0 || join > 0.5 && join <= 1.0, "--join", &join, "0, or more than 0.5 and at most 1")?;
     }
     Ok(Options {
-        min_cluster_size: c.min_cluster_size.max((share * n as f64).ceil() as usize),
+        min_cluster_size: smallest.max((share * n as f64).ceil() as usize),
         min_samples,
         epsilon,
         selection: if c.leaf { Selection::Leaf } else { Selection::ExcessOfMass },

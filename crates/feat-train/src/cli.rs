@@ -148,7 +148,7 @@ struct Contrastive {
 struct Spectral {
     /// Singular value below which vectors fade out: low shows parts, high shows whole things. A vector separates what it
     /// does the better the nearer its singular value is to 1
-    #[arg(long, value_name = "VALUE", default_value_t = 0.75)]
+    #[arg(long, value_name = "VALUE", default_value_t = 0.6)]
     cutoff: f64,
     /// How steeply they fade out there
     #[arg(long, value_name = "POWER", default_value_t = 16.0)]

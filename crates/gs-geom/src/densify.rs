@@ -53,8 +53,8 @@ pub struct DensifyOptions {
     pub min_opacity: f32,
     /// Gaussians up to this share of the scene's extent are cloned, larger ones split.
     pub clone_scale: f32,
-    /// Gaussians beyond this share of the scene's extent are removed once the opacities have been reset.
-    pub max_scale: f32,
+    /// Gaussians beyond this share of the scene's extent are removed, if there is one.
+    pub max_scale: Option<f32>,
     /// Most Gaussians there may be; those pulled hardest come first.
     pub max_gaussians: usize,
 }
@@ -67,7 +67,7 @@ impl DensifyOptions {
             gradient: strategy.gradient(),
             min_opacity: 0.005,
             clone_scale: 0.01,
-            max_scale: 0.1,
+            max_scale: None,
             max_gaussians: 1_000_000,
         }
     }
@@ -133,7 +133,6 @@ pub fn densify(
     pull: &mut Pull,
     options: &DensifyOptions,
     extent: f32,
-    remove_huge: bool,
     rng: &mut ChaCha8Rng,
 ) -> Report {
     let n = g.len();
@@ -158,7 +157,7 @@ pub fn densify(
     }
     adam.select(&sources, fresh);
 
-    let huge = |g: &Gaussians, i: usize| remove_huge && largest_scale(g, i) > options.max_scale * extent;
+    let huge = |g: &Gaussians, i: usize| options.max_scale.is_some_and(|most| largest_scale(g, i) > most * extent);
     let kept = |g: &Gaussians, i: usize| g.opacity(i) >= options.min_opacity && !huge(g, i);
     let removed = keep(g, adam, kept);
     *pull = Pull::new(g.len());
@@ -236,11 +235,11 @@ mod tests {
         g
     }
 
-    fn run(g: &mut Gaussians, pulls: &[f32], options: &DensifyOptions, remove_huge: bool) -> (Adam, Report) {
+    fn run(g: &mut Gaussians, pulls: &[f32], options: &DensifyOptions) -> (Adam, Report) {
         let mut adam = Adam::new(g);
         adam.first.means.iter_mut().enumerate().for_each(|(i, m)| m[0] = 1.0 + i as f32);
         let mut pull = Pull { sum: pulls.iter().map(|p| 3.0 * p).collect(), views: vec![3; pulls.len()] };
-        let report = densify(g, &mut adam, &mut pull, options, 10.0, remove_huge, &mut generator(0, Purpose::Split, 1));
+        let report = densify(g, &mut adam, &mut pull, options, 10.0, &mut generator(0, Purpose::Split, 1));
         assert_eq!(pull, Pull::new(g.len()));
         assert!(g.check().is_ok() && adam.first.check().is_ok() && adam.first.len() == g.len());
         (adam, report)
@@ -252,8 +251,9 @@ mod tests {
         let mut g = row(&[small, small, 0.5f32.ln(), small, 2.0f32.ln(), 0.5f32.ln()]);
         g.opacity_logits[3] = -9.0;
         let before = g.clone();
-        let (adam, report) =
-            run(&mut g, &[1e-3, 0.0, 1e-3, 1e-3, 0.0, 1e-4], &DensifyOptions::of(super::Strategy::Adaptive), true);
+        let keeping = DensifyOptions::of(super::Strategy::Adaptive);
+        let removing = DensifyOptions { max_scale: Some(0.1), ..keeping };
+        let (adam, report) = run(&mut g, &[1e-3, 0.0, 1e-3, 1e-3, 0.0, 1e-4], &removing);
         // 0 and 3 are cloned, but 3 is faint: it and its twin go, as does 4, which is huge. 2 is split.
         assert_eq!(report, Report { cloned: 2, split: 1, removed: 3, relocated: 0 });
         let xs: Vec<f32> = g.means.iter().map(|m| m[0]).collect();
@@ -264,10 +264,7 @@ mod tests {
             assert!((g.means[half][0] - 2.0).abs() < 2.5, "within five standard deviations");
         }
         assert_ne!(g.means[4], g.means[5]);
-        assert_eq!(
-            run(&mut before.clone(), &[0.0; 6], &DensifyOptions::of(super::Strategy::Adaptive), false).1.removed,
-            1
-        );
+        assert_eq!(run(&mut before.clone(), &[0.0; 6], &keeping).1.removed, 1);
     }
 
     #[test]
@@ -313,7 +310,7 @@ mod tests {
             let log_scales: Vec<f32> = (0..n).map(|i| ((seed as usize + 7 * i) % 5) as f32 - 4.0).collect();
             let mut g = row(&log_scales);
             let options = DensifyOptions { max_gaussians: cap, ..DensifyOptions::of(super::Strategy::Adaptive) };
-            let (_, report) = run(&mut g, &pulls, &options, false);
+            let (_, report) = run(&mut g, &pulls, &options);
             prop_assert_eq!(g.len(), n + report.cloned + report.split - report.removed);
             prop_assert!(g.len() <= n.max(cap));
             let wanted = pulls.iter().filter(|&&p| 3.0 * p / 3.0 >= 2e-4).count();

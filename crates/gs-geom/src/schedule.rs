@@ -46,7 +46,7 @@ pub struct Schedule {
     pub densify_until: u32,
     /// Iterations between densifications.
     pub densify_every: u32,
-    /// Iterations between opacity resets; too large Gaussians are removed only after the first.
+    /// Iterations between opacity resets; 0 for none.
     pub opacity_reset_every: u32,
     /// Picture sizes: (last iteration, divisor of the training size), in order; afterwards the full training size.
     pub coarse: Vec<(u32, u32)>,
@@ -114,7 +114,9 @@ impl Schedule {
 
     /// Whether to reset the opacities after this iteration.
     pub fn resets_opacity(&self, iteration: u32) -> bool {
-        iteration < self.densify_until && iteration.is_multiple_of(self.opacity_reset_every.max(1))
+        self.opacity_reset_every > 0
+            && iteration < self.densify_until
+            && iteration.is_multiple_of(self.opacity_reset_every)
     }
 }
 

@@ -315,8 +315,7 @@ impl<'a> Trainer<'a> {
                     *pull = Pull::new(gaussians.len());
                     report
                 } else {
-                    let remove_huge = iteration > schedule.opacity_reset_every;
-                    densify(gaussians, adam, pull, options, self.extent as f32, remove_huge, &mut rng)
+                    densify(gaussians, adam, pull, options, self.extent as f32, &mut rng)
                 };
                 let counts = [report.cloned, report.split, report.removed, report.relocated];
                 progress.densified.iter_mut().zip(counts).for_each(|(sum, n)| *sum += n as u64);

@@ -64,7 +64,7 @@ impl TrainArgs {
         let Plan { iterations, gaussians, seconds, .. } = kept.plan;
         let mut planned = self.clone();
         planned.iterations = iterations;
-        planned.max_gaussians = gaussians;
+        planned.max_gaussians = Some(gaussians);
         planned.scene.resolution = kept.resolution.parse()?;
         let options = format!("--iterations {iterations} --max-gaussians {gaussians} --resolution {}", kept.resolution);
         stage.info(&format!("planned for {budget} s, to take {seconds:.0} s; the same without a budget:"));
@@ -114,7 +114,7 @@ impl TrainArgs {
             seconds: (SHARE * budget - begun.elapsed().as_secs_f64()).max(0.0),
             iterations: self.iterations,
             start: count,
-            gaussians: if self.fixed_points { count } else { self.max_gaussians },
+            gaussians: if self.fixed_points { count } else { self.most_gaussians(&dataset).max(count) },
             divisor: (f64::from(width) / LEAST_WIDTH).max(1.0),
             heldout: dataset.views_of(Split::Test).count(),
         };
@@ -152,9 +152,10 @@ fn probe(options: TrainOptions, extent: f64, photographs: Photographs<'_>, start
     let small = time(&mut trainer, views)?;
     let full = time(&mut trainer, views)?;
     trainer.change(|g, adam, pull| {
-        let all = DensifyOptions { gradient: 0.0, clone_scale: 0.0, max_gaussians: usize::MAX, ..split };
+        let all =
+            DensifyOptions { gradient: 0.0, clone_scale: 0.0, max_gaussians: usize::MAX, max_scale: None, ..split };
         let mut rng = generator(0, Purpose::Split, 0);
-        densify(g, adam, pull, &all, extent as f32, false, &mut rng);
+        densify(g, adam, pull, &all, extent as f32, &mut rng);
     });
     let doubled = time(&mut trainer, views)?;
     Ok(Speed::fit(count, full, (1.0 / f64::from(SMALL * SMALL), small), doubled))

@@ -59,9 +59,10 @@ pub(super) struct TrainArgs {
     /// How the number of Gaussians grows
     #[arg(long, value_enum, default_value_t = Strategy::default())]
     densify: Strategy,
-    /// Most Gaussians there may be; with --densify mcmc how many there will be, if the iterations suffice
-    #[arg(long, value_name = "COUNT", default_value_t = DensifyOptions::default().max_gaussians)]
-    pub(super) max_gaussians: usize,
+    /// Most Gaussians there may be; with --densify mcmc how many there will be, if the iterations suffice [one for 50
+    /// pixels of the training photographs, but at least 10,000 and twice as many as there are at the start]
+    #[arg(long, value_name = "COUNT")]
+    pub(super) max_gaussians: Option<usize>,
     /// Keep the light of Gaussians smaller than a pixel (the 2D filter of Mip-Splatting), so that renders at other sizes
     /// than the photographs' are neither thick nor dark. The PLY says so, and render and eval do as it says
     #[arg(long)]
@@ -85,9 +86,13 @@ pub(super) struct TrainArgs {
     /// Iterations between densifications [a thirtieth of the iterations, 50 to 100]
     #[arg(long, value_name = "COUNT")]
     densify_every: Option<u32>,
-    /// Iterations between opacity resets [3000]
+    /// Iterations between opacity resets, 0 for none [3000]
     #[arg(long, value_name = "COUNT")]
     opacity_reset_every: Option<u32>,
+    /// Remove Gaussians larger than this share of the scene's extent at each densification; 3DGS has 0.1, which tears holes
+    /// into plain walls and tables [none]
+    #[arg(long, value_name = "SHARE")]
+    max_scale: Option<f32>,
     /// Iterations after which the spherical harmonics gain a degree [a tenth of the iterations, at most 1000]
     #[arg(long, value_name = "COUNT")]
     sh_every: Option<u32>,
@@ -120,6 +125,11 @@ pub(super) struct TrainArgs {
     #[arg(long, value_name = "ITERATION")]
     stop_after: Option<u32>,
 }
+
+/// By default there is at most one Gaussian for so many pixels of the training photographs (docs/geometry.md).
+const PIXELS_PER_GAUSSIAN: usize = 50;
+/// The budget is never less by itself.
+const LEAST_BUDGET: usize = 10_000;
 
 /// What to start from.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -195,7 +205,12 @@ impl TrainArgs {
         positive("--densify-gradient", f64::from(gradient), 1e9)?;
         positive("--opacity-rate", self.opacity_rate, 10.0)?;
         positive("--position-rate", self.position_rate, 10.0)?;
-        positive("--max-gaussians", self.max_gaussians as f64, 1e9)?;
+        if let Some(most) = self.max_gaussians {
+            positive("--max-gaussians", most as f64, 1e9)?;
+        }
+        if let Some(scale) = self.max_scale {
+            positive("--max-scale", f64::from(scale), 1e9)?;
+        }
         if !(0.0..=1.0).contains(&self.dssim) {
             return Err(Error::new("out of range").field("--dssim").found(self.dssim).expected("0 to 1"));
         }
@@ -208,7 +223,7 @@ impl TrainArgs {
         set(&mut schedule.densify_from, self.densify_from, 0);
         set(&mut schedule.densify_until, self.densify_until, 0);
         set(&mut schedule.densify_every, self.densify_every, 1);
-        set(&mut schedule.opacity_reset_every, self.opacity_reset_every, 1);
+        set(&mut schedule.opacity_reset_every, self.opacity_reset_every, 0);
         set(&mut schedule.sh_every, self.sh_every, 1);
         Ok(TrainOptions {
             seed,
@@ -219,7 +234,12 @@ impl TrainArgs {
                 position_end: self.position_rate / 100.0,
                 ..LearningRates::default()
             },
-            densify: DensifyOptions { gradient, max_gaussians: self.max_gaussians, ..DensifyOptions::of(self.densify) },
+            densify: DensifyOptions {
+                gradient,
+                max_gaussians: self.max_gaussians.unwrap_or(usize::MAX),
+                max_scale: self.max_scale,
+                ..DensifyOptions::of(self.densify)
+            },
             mcmc: McmcOptions::default(),
             sparse_adam: self.adam == Moves::Sparse,
             dssim_weight: self.dssim,
@@ -244,6 +264,13 @@ impl TrainArgs {
         }
     }
 
+    /// The budget of Gaussians. A scene of many or large photographs shows more than one of few or small ones.
+    pub(super) fn most_gaussians(&self, dataset: &Dataset) -> usize {
+        let pixels = |v: &View| v.camera.width as usize * v.camera.height as usize;
+        let shown = dataset.views_of(Split::Train).map(pixels).sum::<usize>() / PIXELS_PER_GAUSSIAN;
+        self.max_gaussians.unwrap_or(shown.max(2 * dataset.points.len()).max(LEAST_BUDGET))
+    }
+
     pub(super) fn cache_bytes(&self) -> usize {
         usize::try_from(self.image_cache.0).unwrap_or(usize::MAX)
     }
@@ -266,6 +293,7 @@ impl TrainArgs {
     fn train(&self, plan: Value, stage: &Stage) -> Result<()> {
         let mut options = self.options(stage.seed())?;
         let dataset = self.scene.load(stage)?;
+        options.densify.max_gaussians = self.most_gaussians(&dataset);
         let of = |split: Split| dataset.views_of(split).collect::<Vec<&View>>();
         let (train, heldout) = (of(Split::Train), of(Split::Test));
         if train.is_empty() {
@@ -346,7 +374,7 @@ impl TrainArgs {
         stage: &Stage,
     ) -> Result<Forecast> {
         let now = gaussians.len();
-        let most = if self.fixed_points { now } else { self.max_gaussians.max(now) };
+        let most = if self.fixed_points { now } else { self.most_gaussians(dataset).max(now) };
         let mut size = (0, 0);
         for view in &dataset.views {
             let (w, h) = image_size(&view.image_path)?;
@@ -460,21 +488,21 @@ impl TrainArgs {
 
     /// One Gaussian for each point, or for as many as may be.
     fn start_points(&self, points: &PointCloud, extent: f64, stage: &Stage) -> Result<Gaussians> {
-        if points.len() <= self.max_gaussians || self.fixed_points {
+        let Some(most) = self.max_gaussians.filter(|&most| points.len() > most && !self.fixed_points) else {
             return init::from_points(points, self.sh_degree, extent);
-        }
-        stage.info(&format!("starting from {} of {} points, for --max-gaussians", self.max_gaussians, points.len()));
-        init::from_points(&init::some_points(points, self.max_gaussians, stage.seed()), self.sh_degree, extent)
+        };
+        stage.info(&format!("starting from {most} of {} points, for --max-gaussians", points.len()));
+        init::from_points(&init::some_points(points, most, stage.seed()), self.sh_degree, extent)
     }
 
     /// The Gaussians of a file.
     fn start_gaussians(&self, path: &Path, stage: &Stage) -> Result<Gaussians> {
         let g = init::with_degree(read_geometry(path)?, self.sh_degree);
-        if g.len() > self.max_gaussians && !self.fixed_points {
+        if let Some(most) = self.max_gaussians.filter(|&most| g.len() > most && !self.fixed_points) {
             return Err(Error::new("more Gaussians than --max-gaussians")
                 .file(path)
                 .found(g.len())
-                .expected(format!("at most {}", self.max_gaussians)));
+                .expected(format!("at most {most}")));
         }
         let zero = g.rotations.iter().filter(|q| q.iter().all(|v| v.abs() < 1e-12)).count();
         if zero > 0 {
