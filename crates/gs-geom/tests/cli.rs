@@ -194,6 +194,23 @@ fn a_small_world_is_learnt_well() {
     assert_eq!(record["summary"]["gaussians"], g.len());
 }
 
+/// What resets of the opacities leave behind must come back, plain surfaces that few large Gaussians cover among it.
+#[test]
+fn resets_heal_and_large_gaussians_stay_unless_asked() {
+    let psnr = |more: &[&str]| {
+        let dir = Folder::new();
+        let out = dir.path("g.ply");
+        let all = ["train", "--scene", scene(), "--out", &out, "--iterations", "500", "--densify-until", "300"];
+        succeeds(&[&all[..], more].concat());
+        let record: Value = serde_json::from_slice(&fs::read(format!("{out}.run.json")).unwrap()).unwrap();
+        record["summary"]["psnr_heldout"].as_f64().unwrap()
+    };
+    let (never, reset) = (psnr(&["--opacity-reset-every", "0"]), psnr(&["--opacity-reset-every", "100"]));
+    let removed = psnr(&["--opacity-reset-every", "100", "--max-scale", "0.015"]);
+    assert!(reset > never - 1.5, "{reset} dB with resets, {never} without");
+    assert!(removed < reset - 1.0, "{removed} dB without large Gaussians, {reset} with them");
+}
+
 #[test]
 fn thread_counts_do_not_matter_and_seeds_do() {
     let dir = Folder::new();
@@ -453,7 +470,7 @@ fn bad_input_is_refused_in_one_line() {
     assert!(refused(&["eval", "--scene", scene(), "--geometry", &cut, "--out", &out]).contains("cut.ply"));
     assert!(refused(&["render", "--scene", scene(), "--geometry", &missing, "--out", &out]).contains("missing"));
 
-    for (option, value) in [("--dssim", "1.5"), ("--densify-gradient", "NaN"), ("--max-gaussians", "0")] {
+    for (option, value) in [("--dssim", "1.5"), ("--densify-gradient", "NaN"), ("--max-gaussians", "0"), ("--max-scale", "0")] {
         let e = train(scene(), &[option, value]);
         assert!(e.contains(option) && e.contains("out of range"), "{e}");
     }
