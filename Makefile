@@ -7,7 +7,7 @@ CARGO ?= cargo
 THREADS ?= 0
 export THREADS
 
-.PHONY: help build demo scene test lint models clip-tiny bench-raster bench-graph bench-geom bench-growth bench-memory bench-train bench-cluster bench-cluster-graph bench-query bench-granularity ablation clean
+.PHONY: help build demo scene test lint models clip-tiny bench stress bench-raster bench-graph bench-geom bench-growth bench-memory bench-train bench-cluster bench-cluster-graph bench-query bench-granularity ablation clean
 
 help: ## Say what can be made
 	@echo "Targets:"
@@ -38,6 +38,21 @@ bench-raster: ## Time the rasteriser per pixel-Gaussian pair on one core: out/be
 lint: ## Check formatting and lints
 	$(CARGO) fmt --all --check
 	$(CARGO) clippy --release --workspace --all-targets -- -D warnings
+
+# A revision to compare with, such as HEAD~5.
+BASE ?=
+# Knobs and axes of pipelines/tradeoffs.plan, with commas between; all where it is empty.
+ONLY ?=
+bench: build ## Run time against error of every approximation, and growth: out/bench/report.html (BASE=revision: two builds in turns)
+ifeq ($(BASE),)
+	target/release/bench tradeoff --plan pipelines/tradeoffs.plan --work out/bench/tradeoffs --out out/bench/report.json \
+	  $(if $(ONLY),--only $(ONLY))
+else
+	scripts/bench_base.sh $(BASE)
+endif
+
+stress: build ## Hostile scenes and settings through every stage: out/stress/report.html
+	target/release/bench stress --work out/stress/scenes --out out/stress/report.json
 
 bench-geom: ## Measure gs-geom's quality for the time: out/bench/geom.json, docs/images/geometry.svg
 	scripts/bench_geom.sh

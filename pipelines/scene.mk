@@ -4,7 +4,8 @@
 #:  CLIP=folder         image.onnx and text.onnx of a CLIP model [models/clip, if there]; without it no text queries
 #:  QUERIES="red_mug …" texts to ask for, with underscores for spaces
 #:  RESOLUTION=640px    size of the photographs for stage 1: a width that wider ones are shrunk to, or a divisor
-#:  ITERATIONS=3000     steps of stage 1
+#:  QUALITY=balanced    fast, balanced or exact: pipelines/quality
+#:  ITERATIONS=3000     steps of stage 1; fast 1000, exact 10000
 #:  THREADS=0           threads of every stage, 0 for one per core
 #: and GEOM_ARGS, MASK_ARGS, GRAPH_ARGS, FEAT_ARGS, CLUSTER_ARGS, REPORT_ARGS: more options of a stage
 
@@ -17,7 +18,6 @@ endif
 
 SCENE_FILES := $(wildcard $(addprefix $(SCENE)/,sparse/0/* sparse/* images/* transforms*.json color/* pose/* *.ply))
 RESOLUTION ?= 640px
-ITERATIONS ?= 3000
 CLIP ?= $(patsubst %/,%,$(dir $(wildcard models/clip/text.onnx)))
 SAM ?= models
 
@@ -28,7 +28,8 @@ else
 MASKS_DONE := $(wildcard $(MASKS)/*_s.npy)
 endif
 
-override GEOM_ARGS := --resolution $(RESOLUTION) --iterations $(ITERATIONS) $(GEOM_ARGS)
+GIVEN_GEOM_ARGS := $(GEOM_ARGS)
+override GEOM_ARGS = --resolution $(RESOLUTION) --iterations $(ITERATIONS) $(GIVEN_GEOM_ARGS)
 EVAL_ARGS ?= --resolution $(RESOLUTION)
 REPORT_ARGS ?= --resolution $(RESOLUTION)
 

@@ -16,6 +16,12 @@ BIN ?= target/release
 THREADS ?= 0
 COMMON := --threads $(THREADS)
 
+# Points of the trade-offs of docs/performance.md for all stages: fast, balanced or exact.
+QUALITY ?= balanced
+QUALITY_FILE := $(wildcard pipelines/quality/$(QUALITY).conf)
+$(if $(QUALITY_FILE),,$(error no such quality: $(QUALITY); there are $(basename $(notdir $(wildcard pipelines/quality/*.conf)))))
+include $(QUALITY_FILE)
+
 GEOMETRY ?= $(OUT)/geometry.ply
 GRAPH := $(OUT)/graph.safetensors
 FOOTPRINTS := $(OUT)/footprints.safetensors
@@ -31,9 +37,9 @@ $(OPTIONS)/%: FORCE
 	@mkdir -p $(@D)
 	@printf '%s\n' '$(subst ','\'',$($*_OPTIONS))' | cmp -s - $@ || printf '%s\n' '$(subst ','\'',$($*_OPTIONS))' > $@
 
-geom_OPTIONS := $(GEOM_ARGS)
-graph_OPTIONS := $(GRAPH_ARGS)
-feat_OPTIONS := $(FEAT_ARGS)
+geom_OPTIONS = $(GEOM_QUALITY) $(GEOM_ARGS)
+graph_OPTIONS = $(GRAPH_QUALITY) $(GRAPH_ARGS)
+feat_OPTIONS = $(FEAT_QUALITY) $(FEAT_ARGS)
 cluster_OPTIONS := $(CLUSTER_ARGS)
 embed_OPTIONS := $(CLIP)
 score_OPTIONS := $(CLIP) $(SCORE_ARGS)
@@ -42,7 +48,7 @@ report_OPTIONS := $(REPORT_ARGS)
 
 # Stage 1. Not run when GEOMETRY names a PLY that exists already.
 $(OUT)/geometry.ply: $(SCENE_FILES) $(OPTIONS)/geom | $(BIN)/gs-geom
-	$(BIN)/gs-geom train --scene $(SCENE) --out $@ $(GEOM_ARGS) $(COMMON)
+	$(BIN)/gs-geom train --scene $(SCENE) --out $@ $(geom_OPTIONS) $(COMMON)
 
 $(OUT)/geom_metrics.json: $(GEOMETRY) $(OPTIONS)/geom | $(BIN)/gs-geom
 	$(BIN)/gs-geom eval --scene $(SCENE) --geometry $(GEOMETRY) --out $@ $(EVAL_ARGS) $(COMMON)
@@ -57,7 +63,7 @@ endif
 # Stage 2a writes two files in one run; the second hangs on the first so that `make -j` does not start it twice.
 $(GRAPH): $(GEOMETRY) $(MASKS_DONE) $(OPTIONS)/graph | $(BIN)/graph-precompute
 	$(BIN)/graph-precompute --scene $(SCENE) --geometry $(GEOMETRY) --masks $(MASKS) \
-	  --footprints $(FOOTPRINTS) --graph $(GRAPH) $(GRAPH_ARGS) $(COMMON)
+	  --footprints $(FOOTPRINTS) --graph $(GRAPH) $(graph_OPTIONS) $(COMMON)
 
 $(FOOTPRINTS): $(GRAPH)
 	@test -e $@ || { echo "$@ is gone: delete $(GRAPH) and run make again" >&2; exit 2; }
@@ -65,7 +71,7 @@ $(FOOTPRINTS): $(GRAPH)
 
 # Stage 2b.
 $(FEATURES): $(GEOMETRY) $(GRAPH) $(FOOTPRINTS) $(OPTIONS)/feat | $(BIN)/feat-train
-	$(BIN)/feat-train --geometry $(GEOMETRY) --graph $(GRAPH) --footprints $(FOOTPRINTS) --out $@ $(FEAT_ARGS) $(COMMON)
+	$(BIN)/feat-train --geometry $(GEOMETRY) --graph $(GRAPH) --footprints $(FOOTPRINTS) --out $@ $(feat_OPTIONS) $(COMMON)
 
 # Stage 3.
 $(INSTANCES): $(FEATURES) $(LANGUAGE) $(OPTIONS)/cluster | $(BIN)/cluster-match

@@ -470,7 +470,9 @@ fn bad_input_is_refused_in_one_line() {
     assert!(refused(&["eval", "--scene", scene(), "--geometry", &cut, "--out", &out]).contains("cut.ply"));
     assert!(refused(&["render", "--scene", scene(), "--geometry", &missing, "--out", &out]).contains("missing"));
 
-    for (option, value) in [("--dssim", "1.5"), ("--densify-gradient", "NaN"), ("--max-gaussians", "0"), ("--max-scale", "0")] {
+    for (option, value) in
+        [("--dssim", "1.5"), ("--densify-gradient", "NaN"), ("--max-gaussians", "0"), ("--max-scale", "0")]
+    {
         let e = train(scene(), &[option, value]);
         assert!(e.contains(option) && e.contains("out of range"), "{e}");
     }

@@ -18,7 +18,6 @@ mod kernels;
 mod lanes;
 mod measure;
 mod project;
-#[cfg(test)]
 mod reference;
 mod sh;
 mod tiles;
@@ -30,6 +29,7 @@ pub use backward::backward;
 pub use features::{FeatureGradients, features_backward, render_features};
 pub use forward::{Forward, forward, render};
 pub use measure::{Measured, measure};
+pub use reference::{Pixel, render_gaussians as render_reference};
 pub use tiles::TILE;
 pub use types::{Dropped, Gradients, PixelGradients, RasterOptions, Rendered};
 pub use weights::{TileWeights, tile_weights};

@@ -1,10 +1,13 @@
-//! The renderer once more, as plainly as it can be said: f64, pixel by pixel, all Gaussians, no tiles. The tests' oracle.
+//! The renderer once more, as plainly as it can be said: f64, pixel by pixel, all Gaussians, no tiles. The oracle of the tests
+//! and of `bench stress`.
 //!
 //! It shares no code with the renderer except the types of its inputs; [`backward`] alone goes through the renderer's chain
 //! rule, which is in f64, and which the tests hold against central differences of [`render`].
 
 use crate::RasterOptions;
+#[cfg(test)]
 use crate::project::{Lens, Parameters, SplatGradient, project, project_backward};
+#[cfg(test)]
 use crate::sh;
 use glam::{DMat3, DQuat, DVec2, DVec3};
 use gs_scene::{Camera, Gaussians};
@@ -20,6 +23,7 @@ pub(crate) struct Gaussian {
     pub features: Vec<f64>,
 }
 
+#[cfg(test)]
 impl Gaussian {
     /// Every parameter in a fixed order: centre, scales, rotation, opacity, harmonics, features.
     pub fn parameters(&mut self) -> Vec<&mut f64> {
@@ -56,14 +60,20 @@ pub(crate) fn widen(g: &Gaussians, features: &[f32], dim: usize) -> Vec<Gaussian
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(crate) enum Cuts {
     Hard,
+    #[cfg(test)]
     None,
 }
 
+/// What a pixel shows.
 #[derive(Debug, Clone, Default)]
-pub(crate) struct Pixel {
+pub struct Pixel {
+    /// Colour over the background.
     pub rgb: [f64; 3],
+    /// Accumulated alpha, 0 to 1.
     pub alpha: f64,
+    /// Camera depth, summed with the blending weights.
     pub depth: f64,
+    /// Features, likewise; none from [`render_gaussians`].
     pub features: Vec<f64>,
     /// Largest change of alpha if every decision that rounding may turn at this pixel (an alpha beside 1/255 or 0.99, a
     /// transmittance beside 1e-4) went the other way; 0 where there is none.
@@ -172,6 +182,7 @@ fn color(sh: &[f64], direction: DVec3, degree: u8) -> [f64; 3] {
 }
 
 /// One Gaussian's part in a pixel.
+#[cfg_attr(not(test), expect(dead_code, reason = "some are for the gradients, which only the tests need"))]
 struct Layer<'a> {
     ellipse: &'a Ellipse,
     offset: DVec2,
@@ -214,6 +225,12 @@ fn layers(ellipses: &[Ellipse], x: usize, y: usize, cuts: Cuts) -> (Vec<Layer<'_
     (out, doubt)
 }
 
+/// Renders Gaussians plainly in f64, `[height][width]` pixels: what [`crate::render`] is held against. For N Gaussians and
+/// P pixels it takes N P steps.
+pub fn render_gaussians(gaussians: &Gaussians, camera: &Camera, options: &RasterOptions) -> Vec<Pixel> {
+    render(&widen(gaussians, &[], 0), camera, options, Cuts::Hard)
+}
+
 /// `[height][width]` pixels.
 pub(crate) fn render(scene: &[Gaussian], camera: &Camera, options: &RasterOptions, cuts: Cuts) -> Vec<Pixel> {
     let ellipses = ellipses(scene, camera, options);
@@ -245,6 +262,7 @@ pub(crate) fn render(scene: &[Gaussian], camera: &Camera, options: &RasterOption
 
 /// d loss / d parameters, given d loss / d pixels (whose `doubt` is not read): for each Gaussian, in the order of
 /// [`Gaussian::parameters`], and the gradient of its projected centre (sum, and sum of absolute values over pixels).
+#[cfg(test)]
 pub(crate) fn backward(
     scene: &[Gaussian],
     camera: &Camera,

@@ -11,7 +11,7 @@ mod record;
 
 pub use log::Stage;
 pub use progress::Progress;
-pub use record::{RunRecord, cpu_seconds, peak_rss_bytes};
+pub use record::{RunRecord, children_cpu_seconds, cpu_seconds, peak_rss_bytes};
 
 use gs_io::Result;
 use std::process::ExitCode;

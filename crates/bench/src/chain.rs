@@ -1,0 +1,231 @@
+//! The stages one after another on a scene: what each is given, and what its run took.
+
+use gs_io::{Error, IoContext, Result, create_dir};
+use serde::{Deserialize, Serialize};
+use serde_json::Value;
+use std::collections::BTreeMap;
+use std::path::{Path, PathBuf};
+use std::process::Command;
+use std::str::FromStr;
+use std::time::Instant;
+
+/// A stage of the pipeline, in order.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Stage {
+    /// `gs-geom train`.
+    Geometry,
+    /// `graph-precompute`.
+    Graph,
+    /// `feat-train`.
+    Features,
+    /// `cluster-match`.
+    Instances,
+}
+
+/// All stages, in order.
+pub const STAGES: [Stage; 4] = [Stage::Geometry, Stage::Graph, Stage::Features, Stage::Instances];
+
+impl Stage {
+    /// As plans name it.
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::Geometry => "geometry",
+            Self::Graph => "graph",
+            Self::Features => "features",
+            Self::Instances => "instances",
+        }
+    }
+}
+
+impl FromStr for Stage {
+    type Err = Error;
+
+    fn from_str(text: &str) -> Result<Self> {
+        let names = STAGES.map(Self::name);
+        let found = STAGES.into_iter().find(|s| s.name() == text);
+        found.ok_or_else(|| Error::new("no such stage").found(text).expected(names.join(", ")))
+    }
+}
+
+/// Options of stages.
+#[derive(Debug, Clone, Default, PartialEq, Eq)]
+pub struct Options(BTreeMap<Stage, Vec<String>>);
+
+impl Options {
+    /// Options of one stage, with spaces between.
+    pub fn of(stage: Stage, text: &str) -> Self {
+        Self(BTreeMap::from([(stage, text.split_whitespace().map(String::from).collect())]))
+    }
+
+    /// Reads `stage: options; stage: options`.
+    ///
+    /// # Errors
+    /// When a stage is unknown or a colon is missing.
+    pub fn parse(text: &str) -> Result<Self> {
+        let mut all = Self::default();
+        for part in text.split(';').map(str::trim).filter(|p| !p.is_empty()) {
+            let (stage, options) = part.split_once(':').ok_or_else(|| {
+                Error::new("options of no stage").found(part).expected("stage: options; stage: options")
+            })?;
+            all.0.extend(Self::of(stage.trim().parse()?, options).0);
+        }
+        Ok(all)
+    }
+
+    /// The options of a stage.
+    pub fn get(&self, stage: Stage) -> &[String] {
+        self.0.get(&stage).map_or(&[], Vec::as_slice)
+    }
+
+    /// As [`Self::parse`] reads it.
+    pub fn text(&self) -> String {
+        let parts = self.0.iter().filter(|(_, o)| !o.is_empty());
+        parts.map(|(s, o)| format!("{}: {}", s.name(), o.join(" "))).collect::<Vec<_>>().join("; ")
+    }
+}
+
+/// What a run of a program took.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Serialize, Deserialize)]
+pub struct Cost {
+    /// Wall-clock seconds.
+    pub wall: f64,
+    /// Processor seconds of all its threads.
+    pub cpu: f64,
+    /// Peak memory in bytes, where the record of the run says so.
+    pub peak: u64,
+}
+
+impl std::ops::Add for Cost {
+    type Output = Self;
+
+    fn add(self, other: Self) -> Self {
+        Self { wall: self.wall + other.wall, cpu: self.cpu + other.cpu, peak: self.peak.max(other.peak) }
+    }
+}
+
+/// Where the programs are, and how many threads they get.
+#[derive(Debug, Clone)]
+pub struct Programs {
+    /// Folder of the binaries.
+    pub folder: PathBuf,
+    /// Worker threads of each.
+    pub threads: usize,
+}
+
+impl Programs {
+    /// Runs a program to its end, quietly.
+    ///
+    /// # Errors
+    /// When it cannot be started or fails; the error holds what it said.
+    pub fn run<S: AsRef<std::ffi::OsStr>>(&self, program: &str, arguments: &[S]) -> Result<Cost> {
+        let path = self.folder.join(program);
+        let (begun, before) = (Instant::now(), stage::children_cpu_seconds().unwrap_or(0.0));
+        let output = Command::new(&path)
+            .args(arguments)
+            .args(["--quiet", "--threads", &self.threads.to_string()])
+            .output()
+            .at("run", &path)?;
+        if !output.status.success() {
+            let said = String::from_utf8_lossy(&output.stderr).trim().to_string();
+            return Err(Error::new(format!("{program} failed ({}): {said}", output.status)).file(&path));
+        }
+        let cpu = stage::children_cpu_seconds().unwrap_or(0.0) - before;
+        Ok(Cost { wall: begun.elapsed().as_secs_f64(), cpu, peak: 0 })
+    }
+}
+
+/// The files of a scene and of what the stages make of it.
+#[derive(Debug, Clone)]
+pub struct Files {
+    /// Folder of the photographs.
+    pub scene: PathBuf,
+    /// Folder of the masks.
+    pub masks: PathBuf,
+    /// `geometry.ply`.
+    pub geometry: PathBuf,
+    /// Folder of everything after it.
+    pub out: PathBuf,
+}
+
+impl Files {
+    /// A synthetic scene in `folder`, with what is made of it.
+    pub fn of(folder: &Path) -> Self {
+        let scene = folder.join("scene");
+        let masks = scene.join("language_features");
+        Self { scene, masks, geometry: folder.join("geometry.ply"), out: folder.join("exact") }
+    }
+
+    /// The file that a stage writes; of the graph's two the graph.
+    pub fn output(&self, stage: Stage) -> PathBuf {
+        match stage {
+            Stage::Geometry => self.geometry.clone(),
+            Stage::Graph => self.out.join("graph.safetensors"),
+            Stage::Features => self.out.join("features.safetensors"),
+            Stage::Instances => self.out.join("instances.safetensors"),
+        }
+    }
+
+    /// The footprints beside the graph.
+    pub fn footprints(&self) -> PathBuf {
+        self.out.join("footprints.safetensors")
+    }
+
+    /// The score of the instances.
+    pub fn score(&self) -> PathBuf {
+        self.out.join("score.json")
+    }
+
+    /// Runs a stage.
+    ///
+    /// # Errors
+    /// See [`Programs::run`].
+    pub fn run(&self, programs: &Programs, stage: Stage, options: &Options) -> Result<Cost> {
+        create_dir(&self.out)?;
+        let text = |p: &Path| p.to_string_lossy().into_owned();
+        let file = |name: &str, p: PathBuf| [name.to_string(), text(&p)];
+        let (scene, geometry) = (file("--scene", self.scene.clone()), file("--geometry", self.geometry.clone()));
+        let (graph, masks) = (file("--graph", self.output(Stage::Graph)), file("--masks", self.masks.clone()));
+        let footprints = file("--footprints", self.footprints());
+        let out = file("--out", self.output(stage));
+        let (program, mut arguments) = match stage {
+            Stage::Geometry => ("gs-geom", [&["train".to_string(), "--no-resume".into()][..], &scene, &out].concat()),
+            Stage::Graph => ("graph-precompute", [scene, geometry, masks, footprints, graph].concat()),
+            Stage::Features => ("feat-train", [geometry, graph, footprints, out].concat()),
+            Stage::Instances => {
+                let features = file("--features", self.output(Stage::Features));
+                ("cluster-match", [scene, geometry, graph, footprints, features, masks, out].concat())
+            }
+        };
+        arguments.extend(options.get(stage).iter().cloned());
+        let cost = programs.run(program, &arguments)?;
+        let peak = stage::RunRecord::read(self.output(stage))?.peak_rss_bytes;
+        Ok(Cost { peak: peak.unwrap_or(0), ..cost })
+    }
+
+    /// Scores the instances: the figures of `score.json`.
+    ///
+    /// # Errors
+    /// See [`Programs::run`].
+    pub fn evaluate(&self, programs: &Programs) -> Result<Value> {
+        let (score, texts) = (self.score(), self.scene.join("truth/text_features.json"));
+        let text = |p: &Path| p.to_string_lossy().into_owned();
+        let mut arguments = vec!["score".to_string(), "--scene".into(), text(&self.scene)];
+        arguments.extend(["--geometry".into(), text(&self.geometry), "--out".into(), text(&score)]);
+        arguments.extend(["--instances".into(), text(&self.output(Stage::Instances))]);
+        if texts.exists() {
+            arguments.extend(["--text-features".into(), text(&texts)]);
+        }
+        programs.run("eval", &arguments)?;
+        read_json(&score)
+    }
+}
+
+/// Reads a JSON file.
+///
+/// # Errors
+/// When it is missing or not JSON.
+pub fn read_json(path: &Path) -> Result<Value> {
+    let bytes = std::fs::read(path).at("read", path)?;
+    serde_json::from_slice(&bytes).map_err(|e| Error::new(format!("not JSON: {e}")).file(path))
+}

@@ -1,0 +1,61 @@
+//! Two builds of the programs, in turns on the same scenes.
+
+use crate::chain::{Cost, Files, Options, Programs, STAGES, Stage};
+use crate::plan::Plan;
+use crate::tradeoff::{prepare, spread};
+use gs_io::{Result, hash_file};
+use serde::Serialize;
+use std::path::Path;
+
+/// A stage on a scene, by both builds.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct Compared {
+    /// The scene.
+    pub scene: String,
+    /// The stage.
+    pub stage: Stage,
+    /// Processor seconds of the base: median, least, most.
+    pub base: [f64; 3],
+    /// Of this build.
+    pub own: [f64; 3],
+    /// This build's median over the base's: below 1 is faster.
+    pub ratio: f64,
+    /// Peak memory of this build over the base's.
+    pub memory_ratio: f64,
+    /// Whether both wrote the same bytes.
+    pub same_bytes: bool,
+}
+
+/// Times all stages of `base` and `own` on the plan's scenes, each after the other `plan.repeats` times. Both work on a
+/// scene that `own` made; each on its own artifacts.
+///
+/// # Errors
+/// When a program fails.
+pub fn compare(base: &Programs, own: &Programs, plan: &Plan, folder: &Path) -> Result<Vec<Compared>> {
+    let mut all = Vec::new();
+    for scene in &plan.scenes {
+        let root = prepare(own, scene, &folder.join(&scene.name))?;
+        let options = Options::of(Stage::Geometry, &scene.geometry);
+        let side = |name: &str| {
+            let out = folder.join(&scene.name).join(name);
+            Files { geometry: out.join("geometry.ply"), out, ..root.clone() }
+        };
+        let sides = [(base, side("base")), (own, side("own"))];
+        let mut costs = [vec![Vec::<Cost>::new(); STAGES.len()], vec![Vec::new(); STAGES.len()]];
+        for _ in 0..plan.repeats {
+            for stage in STAGES {
+                for ((programs, files), of) in sides.iter().zip(&mut costs) {
+                    of[stage as usize].push(files.run(programs, stage, &options)?);
+                }
+            }
+        }
+        for stage in STAGES {
+            let [b, o] = [0, 1].map(|s| spread(costs[s][stage as usize].iter().map(|c| c.cpu).collect()));
+            let [mb, mo] = [0, 1].map(|s| spread(costs[s][stage as usize].iter().map(|c| c.peak as f64).collect())[0]);
+            let same_bytes = hash_file(sides[0].1.output(stage))? == hash_file(sides[1].1.output(stage))?;
+            let (scene, ratio, memory_ratio) = (scene.name.clone(), o[0] / b[0].max(1e-9), mo / mb.max(1.0));
+            all.push(Compared { scene, stage, base: b, own: o, ratio, memory_ratio, same_bytes });
+        }
+    }
+    Ok(all)
+}

@@ -1,0 +1,12 @@
+//! Run time against error, growth, and numerical stress. All through the stages' binaries, as people run them.
+
+pub mod agreement;
+pub mod chain;
+pub mod cli;
+pub mod compare;
+pub mod growth;
+pub mod page;
+pub mod plan;
+mod scatter;
+pub mod stress;
+pub mod tradeoff;

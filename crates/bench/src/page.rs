@@ -1,0 +1,159 @@
+//! The measurements as tables and a page.
+
+use crate::compare::Compared;
+use crate::growth::Growth;
+use crate::scatter::scatter;
+use crate::stress::Row;
+use crate::tradeoff::Curve;
+use eval::html::Page;
+use std::fmt::Write;
+
+fn with_spread([median, least, most]: [f64; 3]) -> String {
+    format!("{median:.2} ({least:.2} to {most:.2})")
+}
+
+/// Head and rows of a knob's table.
+fn curve_table(c: &Curve) -> (Vec<&'static str>, Vec<Vec<String>>) {
+    let head = vec![
+        "setting",
+        "options",
+        "CPU s",
+        "wall s",
+        "lost",
+        "agreement",
+        "instance mIoU, %",
+        "query mIoU, %",
+        "PSNR",
+        "",
+    ];
+    let shown =
+        |v: Option<f64>, scale: f64, digits: usize| v.map_or("–".into(), |v| format!("{:.digits$}", v * scale));
+    let rows = c.points.iter().zip(&c.errors).zip(&c.front).map(|((p, error), &front)| {
+        let roles = [(p.exact, "exact"), (p.default, "default"), (front, "front")];
+        let q = &p.quality;
+        vec![
+            p.label.clone(),
+            p.options.clone(),
+            with_spread(p.cpu()),
+            with_spread(p.wall()),
+            format!("{error:.2}"),
+            shown(q.agreement, 1.0, 3),
+            shown(q.instance_miou, 100.0, 1),
+            shown(q.query_miou, 100.0, 1),
+            shown(q.psnr, 1.0, 2),
+            roles.iter().filter(|(is, _)| *is).map(|(_, name)| *name).collect::<Vec<_>>().join(", "),
+        ]
+    });
+    (head, rows.collect())
+}
+
+fn growth_table(all: &[Growth]) -> (Vec<&'static str>, Vec<Vec<String>>) {
+    let head = vec!["along", "stage", "sizes", "Gaussians", "CPU s", "peak MB", "exponent of time", "of memory"];
+    let list = |values: Vec<String>| values.join(" / ");
+    let rows = all.iter().map(|g| {
+        vec![
+            g.title.clone(),
+            g.stage.name().into(),
+            list(g.sizes.iter().map(|s| eval::svg::number(*s)).collect()),
+            list(g.gaussians.iter().map(u64::to_string).collect()),
+            list(g.costs.iter().map(|c| format!("{:.2}", c.cpu)).collect()),
+            list(g.costs.iter().map(|c| format!("{:.0}", c.peak as f64 / 1e6)).collect()),
+            format!("{:.2}", g.time_exponent),
+            format!("{:.2}", g.memory_exponent),
+        ]
+    });
+    (head, rows.collect())
+}
+
+/// Head and rows of a comparison of builds.
+pub fn compare_table(all: &[Compared]) -> (Vec<&'static str>, Vec<Vec<String>>) {
+    let head = vec!["scene", "stage", "base, CPU s", "this, CPU s", "ratio", "memory", "same bytes"];
+    let rows = all.iter().map(|c| {
+        vec![
+            c.scene.clone(),
+            c.stage.name().into(),
+            with_spread(c.base),
+            with_spread(c.own),
+            format!("{:.2}", c.ratio),
+            format!("{:.2}", c.memory_ratio),
+            if c.same_bytes { "yes" } else { "no" }.into(),
+        ]
+    });
+    (head, rows.collect())
+}
+
+/// What is to be said of defaults that another setting beats.
+pub fn warnings(curves: &[Curve]) -> Vec<String> {
+    let beaten = curves.iter().filter_map(|c| Some((c, c.dominated_by.as_ref()?)));
+    beaten.map(|(c, by)| format!("{} on {}: the default is dominated by \"{by}\"", c.title, c.scene)).collect()
+}
+
+/// A table in Markdown.
+pub fn markdown(head: &[&str], rows: &[Vec<String>]) -> String {
+    let line = |cells: &[String]| format!("| {} |\n", cells.join(" | "));
+    let head: Vec<String> = head.iter().map(|h| (*h).to_string()).collect();
+    let mut text = line(&head) + &format!("|{}\n", "---|".repeat(head.len()));
+    rows.iter().for_each(|r| text += &line(r));
+    text
+}
+
+/// The page.
+pub fn html(curves: &[Curve], growth: &[Growth], subtitle: &str) -> String {
+    let mut page = Page::default();
+    page.section("trade-offs", "Run time against error");
+    for warning in warnings(curves) {
+        page.note(&warning);
+    }
+    for c in curves {
+        page.heading(&c.title, &c.scene);
+        page.charts(&[scatter(c)]);
+        let (head, rows) = curve_table(c);
+        page.table(&head, &rows);
+    }
+    if !growth.is_empty() {
+        page.section("growth", "Growth");
+        let (head, rows) = growth_table(growth);
+        page.table(&head, &rows);
+    }
+    page.finish("Benchmarks of the stages", subtitle)
+}
+
+/// The same as Markdown, without pictures.
+pub fn text(curves: &[Curve], growth: &[Growth]) -> String {
+    let mut text = String::from("# Benchmarks of the stages\n\n");
+    for warning in warnings(curves) {
+        let _ = writeln!(text, "* {warning}");
+    }
+    for c in curves {
+        let (head, rows) = curve_table(c);
+        let _ = writeln!(text, "\n## {} ({})\n\nlost: {}\n\n{}", c.title, c.scene, c.measure, markdown(&head, &rows));
+    }
+    if !growth.is_empty() {
+        let (head, rows) = growth_table(growth);
+        let _ = writeln!(text, "\n## Growth\n\n{}", markdown(&head, &rows));
+    }
+    text
+}
+
+/// The matrix of stress as Markdown and as a page.
+pub fn stress(all: &[Row]) -> (String, String) {
+    let head = ["scene", "stage", "error", "tolerance", "finite", "good", "what was asked, what was said"];
+    let figure = |v: Option<f64>| v.map_or("–".into(), |v| if v == 0.0 { "0".into() } else { format!("{v:.1e}") });
+    let yes = |is: bool| if is { "yes" } else { "NO" }.to_string();
+    let rows: Vec<Vec<String>> = all
+        .iter()
+        .map(|r| {
+            let (error, tolerance) = (figure(r.error), figure(r.tolerance));
+            vec![r.scene.clone(), r.stage.clone(), error, tolerance, yes(!r.non_finite), yes(r.good), r.note.clone()]
+        })
+        .collect();
+    let mut page = Page::default();
+    page.section("stress", "Hostile scenes");
+    page.table(&head, &rows);
+    let good = all.iter().filter(|r| r.good).count();
+    let subtitle = format!("{good} of {} cells are good", all.len());
+    (
+        format!("# Numerical stress\n\n{subtitle}\n\n{}", markdown(&head, &rows)),
+        page.finish("Numerical stress", &subtitle),
+    )
+}

@@ -1,0 +1,7 @@
+//! Numerical stress: hostile scenes and settings through every stage, and changes of a scene that must not change the result.
+
+mod hostile;
+mod oracle;
+pub mod world;
+
+pub use hostile::{Row, run};

@@ -1,0 +1,33 @@
+//! What came out, against what should have.
+
+use gs_io::Result;
+use gs_raster::{RasterOptions, render, render_reference};
+use gs_scene::{Camera, Gaussians, ply};
+use std::path::Path;
+
+/// Largest difference of colour and alpha between the renderer and the reference in f64, over all pixels, beyond what
+/// rounding may turn at a cut; and whether a pixel is not finite.
+pub fn render_error(gaussians: &Gaussians, camera: &Camera) -> (f64, bool) {
+    let options = RasterOptions { sh_degree: gaussians.sh_degree, ..RasterOptions::default() };
+    let fast = render(gaussians, camera, &options);
+    let exact = render_reference(gaussians, camera, &options);
+    let mut worst = 0.0f64;
+    let mut finite = true;
+    for (i, e) in exact.iter().enumerate() {
+        finite &= fast.alpha[i].is_finite() && (0..3).all(|c| fast.rgb[3 * i + c].is_finite());
+        // At a cut either decision is right.
+        let colors = (0..3).map(|c| (f64::from(fast.rgb[3 * i + c]) - e.rgb[c]).abs());
+        let error = colors.fold((f64::from(fast.alpha[i]) - e.alpha).abs(), f64::max);
+        worst = worst.max((error - e.doubt).max(0.0));
+    }
+    (worst, !finite)
+}
+
+/// Whether a PLY of Gaussians holds a number that is not finite.
+///
+/// # Errors
+/// When it cannot be read.
+pub fn geometry_is_damaged(path: &Path) -> Result<bool> {
+    let g = ply::read_gaussians_as_they_are(path)?;
+    Ok((0..g.len()).any(|i| !g.is_whole(i)))
+}
