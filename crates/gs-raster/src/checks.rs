@@ -293,3 +293,20 @@ fn our_gradients(
     };
     (0..g.len()).map(one).collect()
 }
+
+/// Bands of harmonics that are zero are left out of later stages' renders, to the same bytes.
+#[test]
+fn zero_bands_are_skipped_without_a_trace() {
+    let mut dice = Dice::new(11);
+    for used in 0..3u8 {
+        let (mut gaussians, _) = dice.gaussians(60, 3);
+        let first = 3 * gs_scene::sh_coefficients(used);
+        (0..gaussians.len()).for_each(|i| gaussians.sh[48 * i + first..48 * (i + 1)].fill(0.0));
+        let geometry = gs_scene::Geometry { gaussians, ..gs_scene::Geometry::default() };
+        let skipping = RasterOptions::of(&geometry);
+        assert_eq!(skipping.sh_degree, used);
+        let camera = dice.camera();
+        let whole = crate::render(&geometry.gaussians, &camera, &RasterOptions::default());
+        assert_eq!(crate::render(&geometry.gaussians, &camera, &skipping), whole);
+    }
+}

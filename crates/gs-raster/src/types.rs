@@ -27,9 +27,9 @@ impl Default for RasterOptions {
 }
 
 impl RasterOptions {
-    /// How a geometry is to be rendered: as it was learnt.
+    /// How a geometry is to be rendered: as it was learnt, without the bands of harmonics that are zero.
     pub fn of(geometry: &gs_scene::Geometry) -> Self {
-        Self { antialias: geometry.antialias, ..Self::default() }
+        Self { antialias: geometry.antialias, sh_degree: geometry.gaussians.used_degree(), ..Self::default() }
     }
 }
 

@@ -49,6 +49,15 @@ impl Gaussians {
         &self.sh[i * s..(i + 1) * s]
     }
 
+    /// The highest degree of the spherical harmonics of which some coefficient is not zero: what renders need.
+    pub fn used_degree(&self) -> u8 {
+        let used = |degree: &u8| {
+            let band = 3 * sh_coefficients(degree - 1)..3 * sh_coefficients(*degree);
+            (0..self.len()).any(|i| self.sh_of(i)[band.clone()].iter().any(|&v| v != 0.0))
+        };
+        (1..=self.sh_degree).rev().find(used).unwrap_or(0)
+    }
+
     /// Opacity of Gaussian `i`, in (0, 1).
     pub fn opacity(&self, i: usize) -> f32 {
         1.0 / (1.0 + (-self.opacity_logits[i]).exp())

@@ -59,8 +59,8 @@ pub(super) struct TrainArgs {
     /// How the number of Gaussians grows
     #[arg(long, value_enum, default_value_t = Strategy::default())]
     densify: Strategy,
-    /// Most Gaussians there may be; with --densify mcmc how many there will be, if the iterations suffice [one for 50
-    /// pixels of the training photographs, but at least 10,000 and twice as many as there are at the start]
+    /// Most Gaussians there may be; with --densify mcmc how many there will be, if the iterations suffice [one for
+    /// 100 pixels of the training photographs, but at least 10,000 and twice as many as there are at the start]
     #[arg(long, value_name = "COUNT")]
     pub(super) max_gaussians: Option<usize>,
     /// Keep the light of Gaussians smaller than a pixel (the 2D filter of Mip-Splatting), so that renders at other sizes
@@ -127,7 +127,7 @@ pub(super) struct TrainArgs {
 }
 
 /// By default there is at most one Gaussian for so many pixels of the training photographs (docs/geometry.md).
-const PIXELS_PER_GAUSSIAN: usize = 50;
+const PIXELS_PER_GAUSSIAN: usize = 100;
 /// The budget is never less by itself.
 const LEAST_BUDGET: usize = 10_000;
 
