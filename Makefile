@@ -7,7 +7,7 @@ CARGO ?= cargo
 THREADS ?= 0
 export THREADS
 
-.PHONY: help build demo scene test lint models clip-tiny bench stress bench-raster bench-graph bench-geom bench-growth bench-memory bench-train bench-cluster bench-cluster-graph bench-query bench-granularity ablation clean
+.PHONY: help build demo scene test lint models clip-tiny bench stress bench-raster bench-graph bench-geom bench-growth bench-memory bench-train bench-cluster bench-cluster-graph bench-query bench-granularity ablation dist clean
 
 help: ## Say what can be made
 	@echo "Targets:"
@@ -101,6 +101,9 @@ ablation: build ## The paper's ablation tables, readings of the paper, our metho
 
 bench-granularity: build ## Measure synthetic masks beside real ones (MASKS=folder FOOTPRINTS=file): out/bench/granularity.md
 	scripts/bench_granularity.sh
+
+dist: ## Pack the programs with manual pages and completions: out/dist
+	scripts/dist.sh
 
 clean: ## Delete out/ and what cargo built
 	rm -rf out

@@ -3,8 +3,11 @@
 //!
 //! A stage's `main.rs` is one line: `fn main() -> ExitCode { stage::main::<Args>() }` for a clap parser `Args` that
 //! implements [`Program`]. Exit codes: 0 done; 2 an error, said in one line on standard error; 130 interrupted.
+//!
+//! `PROGRAM --generate man DIR` writes manual pages, `PROGRAM --generate bash DIR` (zsh, fish, ...) completions.
 
 pub mod curve;
+mod generate;
 mod log;
 mod progress;
 mod record;
@@ -51,6 +54,17 @@ pub trait Program: clap::Parser {
 
 /// Parses the arguments, sets up threads and logging, runs the program and turns its result into an exit code.
 pub fn main<P: Program>() -> ExitCode {
+    let arguments: Vec<String> = std::env::args_os().skip(1).map(|a| a.to_string_lossy().into_owned()).collect();
+    if arguments.first().is_some_and(|a| a == "--generate") {
+        let stage = Stage::new(P::NAME, &CommonArgs::default());
+        return match generate::generate::<P>(P::NAME, &arguments[1..]) {
+            Ok(()) => ExitCode::SUCCESS,
+            Err(e) => {
+                stage.error(&e);
+                ExitCode::from(2)
+            }
+        };
+    }
     let program = P::parse();
     let stage = Stage::new(P::NAME, program.common());
     let threads = program.common().threads;
