@@ -11,7 +11,7 @@ use crate::optimiser::{Adam, drop_bad_gradients};
 use crate::photographs::Photographs;
 use crate::schedule::{LearningRates, Purpose, Schedule, ViewOrder, generator};
 use gs_io::Result;
-use gs_raster::{PixelGradients, RasterOptions, Workspace};
+use gs_raster::{PixelGradients, RasterOptions, Workspace, near_plane};
 use gs_scene::{Gaussians, morton_order};
 use rand::Rng;
 use serde::Serialize;
@@ -235,6 +235,7 @@ impl<'a> Trainer<'a> {
             background,
             sh_degree: degree,
             antialias: self.options.antialias,
+            near: near_plane(self.extent),
             depth: false,
             absolute_pulls: self.options.densify.strategy == Strategy::Absgrad,
             ..RasterOptions::default()
@@ -386,7 +387,8 @@ impl<'a> Trainer<'a> {
     pub fn heldout(&self) -> Result<Option<(f64, f64)>> {
         let g = &self.state.gaussians;
         let background = self.options.background;
-        let options = RasterOptions { background, antialias: self.options.antialias, ..RasterOptions::default() };
+        let (antialias, near) = (self.options.antialias, near_plane(self.extent));
+        let options = RasterOptions { background, antialias, near, ..RasterOptions::default() };
         let compare = |i: usize| {
             let target = self.heldout.target(i, metrics::behind(self.options.alpha, background))?;
             Ok(metrics::compare(g, self.heldout.camera(i), &options, &target, self.options.alpha))

@@ -66,7 +66,7 @@ impl Dice {
             let mut roll = || if *quiet { 0.0 } else { f64::from(self.between(-1.0, 1.0)) };
             let rgb = [roll(), roll(), roll()];
             let (alpha, depth) = (roll(), roll());
-            Pixel { rgb, alpha, depth, features: (0..DIM).map(|_| roll()).collect(), doubt: 0.0 }
+            Pixel { rgb, alpha, depth, features: (0..DIM).map(|_| roll()).collect(), doubt: 0.0, rounding: 0.0 }
         };
         quiet.iter().map(one).collect()
     }

@@ -31,6 +31,6 @@ pub use forward::{Forward, forward, render};
 pub use measure::{Measured, measure};
 pub use reference::{Pixel, render_gaussians as render_reference};
 pub use tiles::TILE;
-pub use types::{Dropped, Gradients, PixelGradients, RasterOptions, Rendered};
+pub use types::{Dropped, Gradients, PixelGradients, RasterOptions, Rendered, near_plane};
 pub use weights::{TileWeights, tile_weights};
 pub use workspace::Workspace;

@@ -78,6 +78,8 @@ pub struct Pixel {
     /// Largest change of alpha if every decision that rounding may turn at this pixel (an alpha beside 1/255 or 0.99, a
     /// transmittance beside 1e-4) went the other way; 0 where there is none.
     pub doubt: f64,
+    /// What rounding of the exponents to single precision may change of alpha besides.
+    pub rounding: f64,
 }
 
 /// A Gaussian's ellipse in the image.
@@ -91,6 +93,8 @@ struct Ellipse {
     color: [f64; 3],
 }
 
+/// Roundings to single precision that reach an exponent, each of half a unit in the last place of its terms.
+const ROUNDINGS: f64 = 8.0;
 /// Relative distance to a cut below which single precision may decide differently.
 const DOUBT: f64 = 1e-4;
 
@@ -102,6 +106,9 @@ fn ellipses(scene: &[Gaussian], camera: &Camera, options: &RasterOptions) -> Vec
             continue;
         }
         let [w, x, y, z] = g.rotation;
+        if [w, x, y, z] == [0.0; 4] {
+            continue;
+        }
         let axes = DMat3::from_quat(DQuat::from_xyzw(x, y, z, w).normalize());
         let spread = DMat3::from_diagonal(DVec3::from(g.log_scale.map(|s| (2.0 * s).exp())));
         let covariance = camera.rotation * axes * spread * axes.transpose() * camera.rotation.transpose();
@@ -192,37 +199,42 @@ struct Layer<'a> {
     transmittance: f64,
 }
 
-fn layers(ellipses: &[Ellipse], x: usize, y: usize, cuts: Cuts) -> (Vec<Layer<'_>>, f64) {
-    let (mut transmittance, mut doubt) = (1.0, 0.0);
+/// The layers of a pixel, front to back; [`Pixel::doubt`] and [`Pixel::rounding`].
+fn layers(ellipses: &[Ellipse], x: usize, y: usize, cuts: Cuts) -> (Vec<Layer<'_>>, [f64; 2]) {
+    let (mut transmittance, mut doubt, mut rounded) = (1.0, 0.0, 0.0);
     let mut out = Vec::new();
-    let near = |value: f64, cut: f64| (value / cut - 1.0).abs() < DOUBT;
+    // Single precision adds terms of sigma that may cancel, those of a long and narrow ellipse by orders of magnitude.
+    let near = |value: f64, cut: f64, doubt: f64| (value / cut - 1.0).abs() < DOUBT + doubt;
     for e in ellipses {
         let offset = DVec2::new(x as f64 + 0.5, y as f64 + 0.5) - e.mean;
         let [a, b, c] = e.conic;
         let sigma = 0.5 * (a * offset.x * offset.x + c * offset.y * offset.y) + b * offset.x * offset.y;
+        let terms = 0.5 * (a * offset.x * offset.x + c * offset.y * offset.y) + (b * offset.x * offset.y).abs();
+        let rounding = ROUNDINGS * f64::from(f32::EPSILON) * terms;
         let raw = e.opacity * (-sigma).exp();
         let alpha = raw.min(0.99);
         if cuts == Cuts::Hard {
-            if near(raw, 1.0 / 255.0) {
+            if near(raw, 1.0 / 255.0, rounding) {
                 doubt += transmittance * alpha;
             }
-            if near(raw, 0.99) {
+            if near(raw, 0.99, 0.0) {
                 doubt += 0.99 * DOUBT * transmittance;
             }
             if raw < 1.0 / 255.0 {
                 continue;
             }
-            if near(transmittance * (1.0 - alpha), 1e-4) {
+            if near(transmittance * (1.0 - alpha), 1e-4, rounded) {
                 doubt += transmittance;
             }
             if transmittance * (1.0 - alpha) <= 1e-4 {
                 break;
             }
         }
+        rounded += transmittance * alpha * rounding;
         out.push(Layer { ellipse: e, offset, raw, alpha, transmittance });
         transmittance *= 1.0 - alpha;
     }
-    (out, doubt)
+    (out, [doubt, rounded])
 }
 
 /// Renders Gaussians plainly in f64, `[height][width]` pixels: what [`crate::render`] is held against. For N Gaussians and
@@ -238,8 +250,8 @@ pub(crate) fn render(scene: &[Gaussian], camera: &Camera, options: &RasterOption
     let mut out = Vec::new();
     for y in 0..camera.height as usize {
         for x in 0..camera.width as usize {
-            let (layers, doubt) = layers(&ellipses, x, y, cuts);
-            let mut p = Pixel { features: vec![0.0; dim], doubt, ..Pixel::default() };
+            let (layers, [doubt, rounding]) = layers(&ellipses, x, y, cuts);
+            let mut p = Pixel { features: vec![0.0; dim], doubt, rounding, ..Pixel::default() };
             for l in &layers {
                 let weight = l.transmittance * l.alpha;
                 p.alpha += weight;

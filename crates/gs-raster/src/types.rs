@@ -27,10 +27,21 @@ impl Default for RasterOptions {
 }
 
 impl RasterOptions {
-    /// How a geometry is to be rendered: as it was learnt, without the bands of harmonics that are zero.
+    /// How a geometry is to be rendered: as it was learnt.
     pub fn of(geometry: &gs_scene::Geometry) -> Self {
-        Self { antialias: geometry.antialias, sh_degree: geometry.gaussians.used_degree(), ..Self::default() }
+        Self { antialias: geometry.antialias, ..Self::fit(&geometry.gaussians) }
     }
+
+    /// The defaults for these Gaussians: without the bands of harmonics that are zero, and a near plane of their scale.
+    pub fn fit(gaussians: &gs_scene::Gaussians) -> Self {
+        Self { sh_degree: gaussians.used_degree(), near: near_plane(gaussians.spread()), ..Self::default() }
+    }
+}
+
+/// The near plane of a scene of this size (world units): 0.01, or a hundredth of a smaller one, so that a scene in kilometres
+/// is drawn as it is in metres.
+pub fn near_plane(size: f64) -> f32 {
+    (0.01 * size.min(1.0)).max(f64::from(f32::MIN_POSITIVE)) as f32
 }
 
 /// A rendered view.

@@ -49,6 +49,22 @@ impl Gaussians {
         &self.sh[i * s..(i + 1) * s]
     }
 
+    /// Size of the scene by its Gaussians, world units: the median distance of the centres from the median centre. 1 for
+    /// none, and where they coincide.
+    pub fn spread(&self) -> f64 {
+        fn median(mut values: Vec<f32>) -> f64 {
+            let middle = values.len() / 2;
+            f64::from(*values.select_nth_unstable_by(middle, f32::total_cmp).1)
+        }
+        if self.is_empty() {
+            return 1.0;
+        }
+        let centre = [0, 1, 2].map(|c| median(self.means.iter().map(|m| m[c]).collect()));
+        let from_centre =
+            |m: &[f32; 3]| (0..3).map(|c| (f64::from(m[c]) - centre[c]).powi(2)).sum::<f64>().sqrt() as f32;
+        Some(median(self.means.iter().map(from_centre).collect())).filter(|s| *s > 0.0 && s.is_finite()).unwrap_or(1.0)
+    }
+
     /// The highest degree of the spherical harmonics of which some coefficient is not zero: what renders need.
     pub fn used_degree(&self) -> u8 {
         let used = |degree: &u8| {
@@ -118,5 +134,33 @@ impl Gaussians {
             return Err(Error::new("unsupported degree").field("sh_degree").found(self.sh_degree).expected("0 to 3"));
         }
         Ok(())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn spread_has_the_scenes_scale_and_ignores_what_is_far() {
+        let at = |scale: f32| {
+            let mut means: Vec<[f32; 3]> = (0..99).map(|i| [i as f32 * scale, 5.0, 0.0]).collect();
+            means.push([1e9, 0.0, 0.0]);
+            Gaussians { means, ..Gaussians::default() }.spread()
+        };
+        assert!((at(1.0) - 25.0).abs() < 1.0, "{}", at(1.0));
+        assert!((at(1e-6) / at(1.0) - 1e-6).abs() < 1e-8);
+        assert_eq!(Gaussians::default().spread(), 1.0);
+        assert_eq!(Gaussians { means: vec![[3.0; 3]; 4], ..Gaussians::default() }.spread(), 1.0);
+    }
+
+    #[test]
+    fn bands_of_zeros_are_not_used() {
+        let mut g = Gaussians { means: vec![[0.0; 3]; 2], sh: vec![0.0; 96], sh_degree: 3, ..Gaussians::default() };
+        assert_eq!(g.used_degree(), 0);
+        g.sh[48 + 12] = 0.5;
+        assert_eq!(g.used_degree(), 2);
+        g.sh[47] = -0.5;
+        assert_eq!(g.used_degree(), 3);
     }
 }

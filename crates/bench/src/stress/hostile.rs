@@ -358,10 +358,10 @@ fn cases(world: &World) -> Vec<Case> {
         ),
         case(
             "metamorphic Gaussians halved",
-            "each Gaussian as two half-opaque ones",
+            "each Gaussian as two half-opaque ones: of faint ones neither reaches 1/255",
             world.clone().with_gaussians_halved(),
             Some((0..n).flat_map(|i| [i, i]).collect()),
-            Tolerances { geometry: Some(0.0), graph: Some(0.01), instances: Some(0.25), ..ROUNDING },
+            Tolerances { geometry: Some(0.0), graph: Some(0.15), instances: Some(0.25), ..ROUNDING },
         ),
     ];
     let hostile = |name, note, world| case(name, note, world, None, SURVIVE);

@@ -43,7 +43,7 @@ impl EvalArgs {
         let options = RasterOptions {
             background: self.scene.background.color(),
             antialias: ply::is_antialiased(&self.geometry)?,
-            ..RasterOptions::default()
+            ..RasterOptions::fit(&gaussians)
         };
         let mut progress = stage.progress("view", views.len() as u64);
         let mut figures: Vec<ViewMetrics> = Vec::new();

@@ -38,7 +38,7 @@ impl RenderArgs {
         let options = RasterOptions {
             background: self.scene.background.color(),
             antialias: ply::is_antialiased(&self.geometry)?,
-            ..RasterOptions::default()
+            ..RasterOptions::fit(&gaussians)
         };
         let mut progress = stage.progress("view", views.len() as u64);
         for view in &views {

@@ -382,7 +382,7 @@ impl TrainArgs {
         }
         let pixels = |v: &View| u64::from(v.camera.width) * u64::from(v.camera.height);
         let apart = dataset.views.len().div_ceil(FORECAST_VIEWS).max(1);
-        let options = RasterOptions { sh_degree: 0, antialias: self.antialias, ..RasterOptions::default() };
+        let options = RasterOptions { sh_degree: 0, antialias: self.antialias, ..RasterOptions::fit(gaussians) };
         let entries = |v: &View| forward(gaussians, &v.camera, &options).pairs() / (TILE * TILE);
         let entries = dataset.views.iter().step_by(apart).map(entries).max().unwrap_or(0) as u64;
         // As they are loaded: those to learn from first, then those held out in what is left.
