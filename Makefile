@@ -6,15 +6,17 @@ CARGO ?= cargo
 # Passed on to every stage; 0 means one thread per core, and the results do not depend on it.
 THREADS ?= 0
 export THREADS
+# Stages at a time, where many scenes are run.
+JOBS ?= $(shell nproc)
 
-.PHONY: help build demo scene test lint models clip-tiny bench stress bench-raster bench-graph bench-geom bench-growth bench-memory bench-train bench-cluster bench-cluster-graph bench-query bench-granularity ablation dist clean
+.PHONY: help build demo scene lerf-ovs scannet granularity check-data reproduce-check batch snakemake test lint models clip-tiny bench stress bench-raster bench-graph bench-geom bench-growth bench-memory bench-train bench-cluster bench-cluster-graph bench-query bench-granularity ablation dist clean
 
 help: ## Say what can be made
 	@echo "Targets:"
 	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/^([a-z-]+):.*## /  \1\t/' | expand -t 14
 	@echo
 	@echo "make scene needs SCENE=folder (COLMAP, transforms.json or ScanNet) and OUT=folder; it takes"
-	@sed -nE 's/^#: ?/  /p' pipelines/scene.mk
+	@sed -nE 's/^#: ?/  /p' pipelines/custom.mk
 
 build: ## Build all programs into target/release
 	$(CARGO) build --release --workspace --bins
@@ -23,11 +25,46 @@ demo: build ## Build, make a synthetic scene, run every stage on it, write out/d
 	@$(MAKE) --no-print-directory -f pipelines/demo.mk all
 
 scene: build ## The same on your own photographs: make scene SCENE=folder OUT=folder
-	@$(MAKE) --no-print-directory -f pipelines/scene.mk all
+	@$(MAKE) --no-print-directory -f pipelines/custom.mk all
+
+# The data sets of the paper, in folder DATA; their parameters are in pipelines/*.conf.
+lerf-ovs: build check-lerf-ovs ## The paper's table of LERF-OVS: make lerf-ovs DATA=folder OUT=folder (docs/reproduce.md)
+	@$(MAKE) --no-print-directory -f pipelines/benchmark.mk SET=lerf-ovs all
+
+scannet: build check-scannet ## The paper's table of ScanNet: make scannet DATA=folder OUT=folder
+	@$(MAKE) --no-print-directory -f pipelines/benchmark.mk SET=scannet all
+
+check-data: check-$(SET) ## Say what of a data set is missing and where it comes from: make check-data DATA=folder SET=lerf-ovs|scannet
+
+.PHONY: check- check-lerf-ovs check-scannet
+check-lerf-ovs check-scannet: check-%:
+	@$(MAKE) --no-print-directory -f pipelines/benchmark.mk SET=$* check
+check-:
+	@echo "say which data set: make check-data DATA=folder SET=lerf-ovs|scannet" >&2; exit 2
+
+granularity: build ## Cost of inconsistent granularity on synthetic scenes, by a plan: make granularity PLAN=file OUT=folder
+	@$(MAKE) --no-print-directory -f pipelines/granularity.mk plan
+	@$(MAKE) --no-print-directory -j $(JOBS) -f pipelines/granularity.mk all
+
+batch: build ## Scenes x variants x seeds from a table, JOBS at a time: make batch TABLE=file OUT=folder (docs/cluster.md)
+	@$(MAKE) --no-print-directory -j $(JOBS) -f pipelines/batch.mk all
+
+# For batches on more than one machine; nothing else here needs it.
+SNAKEMAKE := out/snakemake
+snakemake: $(SNAKEMAKE)/bin/snakemake ## Put Snakemake with its Slurm and Kubernetes executors into out/snakemake (needs Python 3.11)
+$(SNAKEMAKE)/bin/snakemake: pipelines/snakemake.txt
+	python3 -m venv $(SNAKEMAKE)
+	$(SNAKEMAKE)/bin/pip install -q -r $<
+	@touch $@
+
+reproduce-check: build ## Run a finished OUT again into another folder and compare the bytes: make reproduce-check OUT=folder
+	@scripts/reproduce_check.sh $(OUT) $(INTO)
 
 test: ## Run all tests
 	$(CARGO) test --release --workspace
 	scripts/test_pipeline.sh
+	scripts/test_benchmarks.sh
+	scripts/test_snakemake.sh
 
 # PLYs to measure besides the synthetic scenes.
 SPLATS ?=
@@ -94,10 +131,8 @@ bench-cluster-graph: ## Time cluster-match --cluster graph at a million Gaussian
 bench-query: ## Time a query over a million Gaussians and 500 instances: out/bench/query.json
 	$(CARGO) bench -p eval --bench query -- --out $(CURDIR)/out/bench/query.json
 
-JOBS ?= $(shell nproc)
-ablation: build ## The paper's ablation tables, readings of the paper, our methods: out/ablation/, docs/accuracy.md (an hour)
-	@$(MAKE) --no-print-directory -f pipelines/ablation.mk plan
-	@$(MAKE) --no-print-directory -j $(JOBS) -f pipelines/ablation.mk DOCS=docs/accuracy.md
+ablation: ## The same with the tables of docs/accuracy.md filled: out/ablation/ (an hour)
+	@$(MAKE) --no-print-directory granularity DOCS=docs/accuracy.md
 
 bench-granularity: build ## Measure synthetic masks beside real ones (MASKS=folder FOOTPRINTS=file): out/bench/granularity.md
 	scripts/bench_granularity.sh

@@ -19,6 +19,9 @@ QUERIES ?= green_kettle pink_coffee_set black_laptop yellow_toy_car
 # The tables of an ablation, where there is one, are a section of the report.
 REPORT_ARGS ?= --title Demo $(if $(wildcard out/ablation/components.json),--ablation out/ablation)
 
+QUALITY ?= balanced
+SETTINGS := QUALITY SEED CLIP SYNTH_ARGS GEOM_ARGS GRAPH_ARGS FEAT_ARGS CLUSTER_ARGS SCORE_ARGS QUERIES REPORT_ARGS
+include pipelines/settings.mk
 include pipelines/stages.mk
 
 synth_OPTIONS := $(SYNTH_ARGS)

@@ -5,6 +5,7 @@ use crate::labels::{self, FrameLabels};
 use crate::protocol::lerf::{self, Averaging, Figures, Pair, Predicted};
 use crate::protocol::published;
 use crate::scene::LabelledScene;
+use crate::sheet::Sheet;
 use crate::silhouette::{self, Silhouette};
 use gs_io::{Error, Result, write_bytes};
 use gs_scene::Camera;
@@ -294,7 +295,7 @@ impl LerfMetrics {
         let (objects, pairs) = self.csv();
         write_bytes(out.join("objects.csv"), objects.as_bytes())?;
         write_bytes(out.join("pairs.csv"), pairs.as_bytes())?;
-        write_bytes(out.join("table.md"), table(std::slice::from_ref(self)).as_bytes())?;
+        write_bytes(out.join("table.md"), sheet(std::slice::from_ref(self)).markdown().as_bytes())?;
         let path = out.join("metrics.json");
         let json = serde_json::to_vec_pretty(self).map_err(|e| Error::new(e.to_string()).file(&path))?;
         write_bytes(&path, &json)?;
@@ -336,7 +337,7 @@ impl LerfMetrics {
 }
 
 /// The paper's table with the scenes given, and notes that name rule and feature files.
-pub fn table(scenes: &[LerfMetrics]) -> String {
+pub fn sheet(scenes: &[LerfMetrics]) -> Sheet {
     let figures: Vec<(String, Figures)> = scenes.iter().map(|s| (s.scene.clone(), s.figures)).collect();
     let mut notes =
         vec!["Published rows: percent, as printed in the source named; the authors' feature files.".to_string()];
@@ -345,7 +346,7 @@ pub fn table(scenes: &[LerfMetrics]) -> String {
         notes.push(format!("{}: {}. From {}.", s.scene, s.rule, features.join("; ")));
         notes.extend(s.notes.iter().map(|n| format!("{}: {n}.", s.scene)));
     }
-    published::lerf_table(&figures, &notes)
+    published::lerf_sheet(&figures, notes)
 }
 
 #[cfg(test)]

@@ -25,6 +25,7 @@ pub mod scan;
 pub mod scene;
 pub mod score;
 pub mod segment;
+pub mod sheet;
 pub mod silhouette;
 pub mod svg;
 pub mod text;

@@ -3,6 +3,5 @@
 
 pub mod instances;
 pub mod lerf;
-pub mod lerf_scenes;
 pub mod published;
 pub mod scannet;

@@ -6,6 +6,7 @@ use crate::protocol::published::{self, SetRow};
 use crate::protocol::scannet::{self, Association, Confusion};
 use crate::ranking::{Index, Scoring};
 use crate::scene::LabelledScene;
+use crate::sheet::{Row, Sheet, Table};
 use gs_io::{Error, IoContext, Result, write_bytes};
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
@@ -326,7 +327,7 @@ impl ScanMetrics {
             }
         }
         write_bytes(out.join("objects.csv"), csv.as_bytes())?;
-        write_bytes(out.join("table.md"), table(std::slice::from_ref(self)).as_bytes())?;
+        write_bytes(out.join("table.md"), sheet(std::slice::from_ref(self)).markdown().as_bytes())?;
         let path = out.join("metrics.json");
         let json = serde_json::to_vec_pretty(self).map_err(|e| Error::new(e.to_string()).file(&path))?;
         write_bytes(&path, &json)?;
@@ -351,7 +352,7 @@ pub fn summary(scans: &[ScanMetrics]) -> [(&'static str, SetRow); 2] {
 }
 
 /// The paper's table with the scans given, the scans one by one, and notes that name rule and feature files.
-pub fn table(scans: &[ScanMetrics]) -> String {
+pub fn sheet(scans: &[ScanMetrics]) -> Sheet {
     let rows = summary(scans).map(|(name, row)| (name.to_string(), row));
     let mut notes =
         vec!["Published rows: percent, as printed in the source named; the authors' feature files.".to_string()];
@@ -360,28 +361,24 @@ pub fn table(scans: &[ScanMetrics]) -> String {
         notes.push(format!("{}: {}. From {}.", s.scene, s.rule, features.join("; ")));
         notes.extend(s.notes.iter().map(|n| format!("{}: {n}.", s.scene)));
     }
-    let mut out = published::scannet_table(&rows, scans.len(), &notes);
-    let percent = |v: Option<f64>| v.map_or("–".to_string(), |v| format!("{:.2}", 100.0 * v));
-    let header = ["Scan", "19 mIoU", "19 mAcc", "15 mIoU", "15 mAcc", "10 mIoU", "10 mAcc"];
-    let instance = ["instance mIoU", "@25", "@50", "AP25", "AP50"];
-    let header: Vec<String> = header.iter().chain(&instance).map(|s| (*s).to_string()).collect();
-    out += "\n";
-    out += &published::line(&header);
-    out += &published::line(&vec!["---".into(); header.len()]);
-    for s in scans {
-        let mut cells = vec![s.scene.clone()];
-        cells.extend(s.row().iter().flat_map(|r| [percent(r.map(|r| r.0)), percent(r.map(|r| r.1))]));
+    let mut sheet = published::scannet_sheet(&rows, scans.len(), notes);
+    let instance = ["instance mIoU", "@25", "@50", "AP25", "AP50"].map(String::from);
+    let row = |s: &ScanMetrics| {
         let i = s.instances.as_ref();
-        cells.extend([
-            percent(i.map(|i| i.miou)),
-            percent(i.map(|i| i.acc25)),
-            percent(i.map(|i| i.acc50)),
-            percent(i.and_then(|i| i.ap25)),
-            percent(i.and_then(|i| i.ap50)),
-        ]);
-        out += &published::line(&cells);
-    }
-    out
+        let figures =
+            [i.map(|i| i.miou), i.map(|i| i.acc25), i.map(|i| i.acc50), i.and_then(|i| i.ap25), i.and_then(|i| i.ap50)];
+        let mut cells = published::set_cells(s.row());
+        cells.extend(figures.map(|v| v.map(|v| 100.0 * v)));
+        Row::measured(&s.scene, cells)
+    };
+    sheet.more.push(Table {
+        title: "Scans one by one".into(),
+        head: "Scan".into(),
+        columns: published::set_columns().into_iter().chain(instance).collect(),
+        rows: scans.iter().map(row).collect(),
+        sources: false,
+    });
+    sheet
 }
 
 #[cfg(test)]

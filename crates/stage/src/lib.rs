@@ -9,15 +9,21 @@
 pub mod curve;
 mod generate;
 mod log;
+mod machine;
 mod progress;
 mod record;
 
 pub use log::Stage;
+pub use machine::Machine;
 pub use progress::Progress;
 pub use record::{RunRecord, children_cpu_seconds, cpu_seconds, peak_rss_bytes};
 
 use gs_io::Result;
 use std::process::ExitCode;
+
+/// The git revision that the programs were built from: the commit that was checked out, or `CAGS_REVISION` of the build's
+/// environment, or `unknown` where there is neither.
+pub const REVISION: &str = env!("CAGS_REVISION");
 
 /// Arguments that every stage has, with one meaning.
 #[derive(Debug, Clone, Default, clap::Args)]

@@ -1,6 +1,6 @@
 //! What a stage says, and the facts of its run.
 
-use crate::{CommonArgs, Progress, RunRecord};
+use crate::{CommonArgs, Machine, Progress, RunRecord};
 use gs_io::{Error, Provenance, Result};
 use serde_json::{Value, json};
 use std::collections::BTreeMap;
@@ -8,7 +8,7 @@ use std::io::Write;
 use std::path::Path;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Mutex, OnceLock};
-use std::time::Instant;
+use std::time::{Instant, SystemTime, UNIX_EPOCH};
 
 /// A running stage: its voice, its clock, its seed and the record of its run.
 pub struct Stage {
@@ -127,7 +127,8 @@ impl Stage {
         }
     }
 
-    /// Writes `<output>.run.json`: parameters, input hashes, wall seconds, peak memory and a summary of the result.
+    /// Writes `<output>.run.json`, the whole of [`RunRecord`]: what ran on what and where, what it took, and a summary of
+    /// the result.
     /// Call it last; it is not an artifact, its content differs from run to run.
     ///
     /// # Errors
@@ -139,14 +140,22 @@ impl Stage {
         inputs: BTreeMap<String, String>,
         summary: Value,
     ) -> Result<()> {
+        let elapsed = self.started.elapsed();
+        let began = SystemTime::now() - elapsed;
         let record = RunRecord {
             program: self.name.into(),
             version: env!("CARGO_PKG_VERSION").into(),
+            revision: crate::REVISION.into(),
+            program_hash: crate::record::program_hash(),
+            arguments: std::env::args_os().skip(1).map(|a| a.to_string_lossy().into_owned()).collect(),
             parameters,
             inputs,
             seed: self.common.seed,
             threads: rayon::current_num_threads(),
-            wall_seconds: self.started.elapsed().as_secs_f64(),
+            machine: Machine::here(),
+            started: began.duration_since(UNIX_EPOCH).map_or(0, |d| d.as_secs()),
+            wall_seconds: elapsed.as_secs_f64(),
+            cpu_seconds: crate::cpu_seconds(),
             peak_rss_bytes: crate::peak_rss_bytes(),
             skipped: self.skipped.lock().expect("no panic holds this lock").clone(),
             summary,

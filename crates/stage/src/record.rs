@@ -1,10 +1,12 @@
 //! The record of a run, beside its output.
 
-use gs_io::{Error, IoContext, Result, write_bytes};
+use crate::Machine;
+use gs_io::{Error, IoContext, Result, hash_file, write_bytes};
 use serde::{Deserialize, Serialize};
 use serde_json::Value;
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
+use std::sync::OnceLock;
 
 /// What `<output>.run.json` says.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -13,6 +15,15 @@ pub struct RunRecord {
     pub program: String,
     /// The program's version.
     pub version: String,
+    /// The git revision it was built from: the commit that was checked out then, or `unknown`.
+    #[serde(default)]
+    pub revision: String,
+    /// Hash of the program's file: which program it was exactly, whatever had changed since the revision.
+    #[serde(default)]
+    pub program_hash: String,
+    /// The command line, without the program.
+    #[serde(default)]
+    pub arguments: Vec<String>,
     /// Parameters of the run.
     pub parameters: Value,
     /// Content hashes of the inputs, by role.
@@ -21,8 +32,17 @@ pub struct RunRecord {
     pub seed: u64,
     /// Worker threads used.
     pub threads: usize,
+    /// The machine.
+    #[serde(default)]
+    pub machine: Machine,
+    /// When the run began, in seconds since 1970.
+    #[serde(default)]
+    pub started: u64,
     /// Wall-clock seconds from start to record.
     pub wall_seconds: f64,
+    /// Processor time of all threads in seconds, where the system tells.
+    #[serde(default)]
+    pub cpu_seconds: Option<f64>,
     /// Peak resident memory in bytes, where the system tells.
     pub peak_rss_bytes: Option<u64>,
     /// What was skipped because the scene does not need it.
@@ -54,6 +74,12 @@ impl RunRecord {
         let json = serde_json::to_vec_pretty(self).map_err(|e| Error::new(e.to_string()).file(&path))?;
         write_bytes(path, &json)
     }
+}
+
+/// Hash of the running program's file; empty where it cannot be read.
+pub(crate) fn program_hash() -> String {
+    static HASH: OnceLock<String> = OnceLock::new();
+    HASH.get_or_init(|| std::env::current_exe().ok().and_then(|p| hash_file(p).ok()).unwrap_or_default()).clone()
 }
 
 /// Processor time of this process so far in seconds, where the system tells (Linux, with its 100 ticks a second).
@@ -98,5 +124,29 @@ mod tests {
         assert_eq!(r.skipped, ["3 of 10 Gaussians: never seen"]);
         assert!(r.wall_seconds >= 0.0 && r.peak_rss_bytes.is_none_or(|b| b > 1 << 18));
         assert!(RunRecord::read(dir.path().join("b")).is_err());
+    }
+
+    #[test]
+    fn a_record_says_what_ran_where_and_when() {
+        let dir = tempfile::tempdir().unwrap();
+        let out = dir.path().join("a.ply");
+        Stage::silent("gs-geom").record(&out, Value::Null, BTreeMap::new(), Value::Null).unwrap();
+        let r = RunRecord::read(&out).unwrap();
+        assert_eq!((r.revision.as_str(), r.program_hash.len()), (crate::REVISION, 64), "{r:?}");
+        assert!(crate::REVISION == "unknown" || crate::REVISION.len() >= 7);
+        assert!(r.machine == Machine::here() && r.started > 1_700_000_000);
+        assert_eq!(r.arguments, std::env::args().skip(1).collect::<Vec<_>>());
+        assert!(r.cpu_seconds.is_some() || !cfg!(target_os = "linux"));
+    }
+
+    #[test]
+    fn records_of_older_programs_read() {
+        let dir = tempfile::tempdir().unwrap();
+        let out = dir.path().join("a.ply");
+        let old = r#"{"program":"eval","version":"0.1.0","parameters":{},"inputs":{},"seed":3,"threads":2,
+            "wall_seconds":1.5,"peak_rss_bytes":null,"skipped":[],"summary":{}}"#;
+        std::fs::write(RunRecord::path(&out), old).unwrap();
+        let r = RunRecord::read(&out).unwrap();
+        assert_eq!((r.seed, r.revision.as_str(), r.arguments.len()), (3, "", 0));
     }
 }

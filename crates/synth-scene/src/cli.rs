@@ -1,5 +1,6 @@
 //! The command line of `synth-scene`.
 
+use crate::benchmark::{Layout, LayoutName};
 use crate::cameras::Path as CameraPath;
 use crate::families::Family;
 use crate::language::Speech;
@@ -26,6 +27,9 @@ pub struct Args {
     /// photographs and geometry serve masks with many faults, which never move a thing or a camera
     #[arg(long, value_name = "DIR", conflicts_with = "out")]
     masks_to: Option<PathBuf>,
+    /// Where files lie and what they are called: as COLMAP leaves them, or as a miniature of a benchmark
+    #[arg(long, value_enum, default_value = "colmap", conflicts_with = "masks_to")]
+    layout: LayoutName,
     /// What kind of scene
     #[arg(long, value_enum, default_value_t = Family::Studio)]
     family: Family,
@@ -44,7 +48,7 @@ pub struct Args {
     /// Height of the photographs in pixels, 32 to 4096 [tiny 120, demo 360, large 480]
     #[arg(long, value_name = "PIXELS")]
     height: Option<u32>,
-    /// Points of the sparse cloud, 1 to 10000000 [tiny 1500, demo 9000, large 40000]
+    /// Points of the sparse cloud, or vertices of a scan, 1 to 10000000 [tiny 1500, demo 9000, large 40000]
     #[arg(long, value_name = "COUNT")]
     points: Option<usize>,
     /// Where the camera goes [a ring for one table, a walk for several, kitchens and rooms]
@@ -169,6 +173,7 @@ impl Args {
             speech: self.features.then_some(speech),
             pose_noise: within("--pose-noise", self.pose_noise.unwrap_or(pose_noise), 0.0, 10.0)?,
             label_every: self.label_every,
+            layout: self.out.as_deref().map_or(Ok(Layout::Colmap), |out| Layout::new(self.layout, out))?,
         })
     }
 }

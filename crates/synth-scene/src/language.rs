@@ -94,6 +94,15 @@ impl Language {
         Self { things, parts, thing_of, names }
     }
 
+    /// The same with the directions of further texts, as those that a benchmark asks of other scenes.
+    #[must_use]
+    pub fn with(mut self, texts: &[&str]) -> Self {
+        for &text in texts {
+            self.names.entry(text.into()).or_insert_with(|| word(text));
+        }
+        self
+    }
+
     /// Vectors by text: of every thing's name, every class, the classes of ScanNet's benchmark and LERF's negatives.
     pub fn table(&self) -> BTreeMap<&str, Vec<f32>> {
         self.names.iter().map(|(n, v)| (n.as_str(), v.iter().map(|&x| x as f32).collect())).collect()

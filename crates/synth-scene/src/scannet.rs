@@ -8,8 +8,8 @@ use gs_scene::{PointCloud, ply};
 use serde_json::{Value, json};
 use std::path::Path;
 
-/// Name of the scan within its files.
-const SCAN: &str = "scene0000_00";
+/// Name of the scan where the scene has none.
+pub const SCAN: &str = "scene0000_00";
 
 /// Classes of the catalogue that the benchmark calls otherwise.
 const CALLED: [(&str, &str); 5] = [
@@ -39,15 +39,15 @@ pub fn label(class: &str) -> u32 {
     NYU40.iter().find(|b| Some(b.1) == name).map_or(OTHER, |b| b.0)
 }
 
-/// Writes the scan's files into `folder`: `*_vh_clean_2.ply` (vertices with colours, no faces), `*_vh_clean_2.labels.ply`
+/// Writes the files of the scan `name` into `folder`: `*_vh_clean_2.ply` (vertices with colours, no faces), `*_vh_clean_2.labels.ply`
 /// (the same with a label id each), `*_vh_clean_2.0.010000.segs.json` (segments: parts) and `*.aggregation.json` (objects:
 /// things, background included). The vertices are the true surface points.
 ///
 /// # Errors
 /// When a file cannot be written.
-pub fn write(folder: &Path, scene: &Scene, points: &TruePoints, colors: &[[u8; 3]]) -> Result<()> {
+pub fn write(folder: &Path, name: &str, scene: &Scene, points: &TruePoints, colors: &[[u8; 3]]) -> Result<()> {
     create_dir(folder)?;
-    let file = |end: &str| folder.join(format!("{SCAN}{end}"));
+    let file = |end: &str| folder.join(format!("{name}{end}"));
     let cloud = PointCloud { positions: points.position.clone(), colors: colors.to_vec() };
     ply::write_points(file("_vh_clean_2.ply"), &cloud, &[])?;
     let mut labelled = format!(
@@ -65,17 +65,17 @@ pub fn write(folder: &Path, scene: &Scene, points: &TruePoints, colors: &[[u8; 3
     }
     write_bytes(file("_vh_clean_2.labels.ply"), &labelled)?;
     let segs = "_vh_clean_2.0.010000.segs.json";
-    write_json(&file(segs), &json!({ "params": {}, "sceneId": SCAN, "segIndices": points.part }))?;
+    write_json(&file(segs), &json!({ "params": {}, "sceneId": name, "segIndices": points.part }))?;
     let groups: Vec<Value> = scene
         .things
         .iter()
         .enumerate()
         .map(|(id, t)| {
-            let name = benchmark_name(t.class).unwrap_or(t.class);
-            json!({ "id": id, "objectId": id, "segments": t.parts.clone().collect::<Vec<u32>>(), "label": name })
+            let class = benchmark_name(t.class).unwrap_or(t.class);
+            json!({ "id": id, "objectId": id, "segments": t.parts.clone().collect::<Vec<u32>>(), "label": class })
         })
         .collect();
-    let json = json!({ "sceneId": SCAN, "segGroups": groups, "segmentsFile": format!("{SCAN}{segs}") });
+    let json = json!({ "sceneId": name, "segGroups": groups, "segmentsFile": format!("{name}{segs}") });
     write_json(&file(".aggregation.json"), &json)
 }
 
@@ -101,7 +101,7 @@ mod tests {
             part: parts.clone(),
         };
         let dir = tempfile::tempdir().unwrap();
-        write(dir.path(), scene, &points, &vec![[9, 8, 7]; parts.len()]).unwrap();
+        write(dir.path(), SCAN, scene, &points, &vec![[9, 8, 7]; parts.len()]).unwrap();
         let (at, labels) = ply::read_labels(dir.path().join("scene0000_00_vh_clean_2.labels.ply"), "label").unwrap();
         assert_eq!(at, points.position);
         for (&l, &i) in labels.iter().zip(&points.instance) {

@@ -1,5 +1,6 @@
 //! Makes a scene and writes all of it.
 
+use crate::benchmark::{self, Layout};
 use crate::cameras::{self, Path as CameraPath};
 use crate::families::{self, Family};
 use crate::label;
@@ -48,6 +49,8 @@ pub struct Options {
     pub pose_noise: f64,
     /// Every how many views get polygon labels; 0 for none.
     pub label_every: usize,
+    /// Where the files lie, and what they are called.
+    pub layout: Layout,
 }
 
 /// Standard deviation of the sparse cloud's points in metres.
@@ -63,6 +66,7 @@ const LAYOUT: u64 = 0;
 const CAMERAS: u64 = 1;
 const POINTS: u64 = 2;
 const POSES: u64 = 3;
+const VERTICES: u64 = 4;
 const FIRST_VIEW: u64 = 16;
 const FIRST_SPEECH: u64 = 1 << 32;
 const FIRST_PATCHES: u64 = 2 << 32;
@@ -83,6 +87,7 @@ impl Default for Options {
             speech: None,
             pose_noise: 0.0,
             label_every: 4,
+            layout: Layout::Colmap,
         }
     }
 }
@@ -97,7 +102,9 @@ impl Options {
 
     /// The furnished room.
     pub fn scene(&self) -> Scene {
-        families::plan(self.family, self.objects, &mut self.rng(LAYOUT))
+        let mut scene = families::plan(self.family, self.objects, &mut self.rng(LAYOUT));
+        self.layout.rename(&mut scene);
+        scene
     }
 
     /// The light in that room, as fine as the photographs show.
@@ -134,6 +141,12 @@ impl Options {
         if self.family != Family::Studio {
             all["family"] = json!(self.family.to_possible_value().map(|v| v.get_name().to_string()));
         }
+        match &self.layout {
+            Layout::Colmap => {}
+            Layout::LerfOvs(scene) => all["layout"] = json!(format!("lerf-ovs {}", scene.name)),
+            Layout::Scan { name, converted: false } => all["layout"] = json!(format!("scannet {name}")),
+            Layout::Scan { name, converted: true } => all["layout"] = json!(format!("opengaussian {name}")),
+        }
         let mut used = |name: &str, value: f64| {
             if value != 0.0 {
                 all[name] = json!(value);
@@ -151,28 +164,29 @@ impl Options {
     fn write_masks(
         &self,
         folder: &Path,
+        stem: &str,
         v: usize,
         scene: &Scene,
         frame: &Frame,
         language: Option<&Language>,
     ) -> Result<Vec<MaskTruth>> {
-        let (stem, v) = (stem(v), v as u64);
+        let v = v as u64;
         let (rng, patches) = (&mut self.rng(FIRST_VIEW + v), &mut self.rng(FIRST_PATCHES + v));
         let (maps, shown) = masks::segment(scene, frame, &self.faults, rng, patches);
-        maps.write(maps_path(folder, &stem))?;
+        maps.write(maps_path(folder, stem))?;
         if let (Some(language), Some(speech)) = (language, &self.speech) {
             let features = language.encode(frame, &maps, speech, &mut self.rng(FIRST_SPEECH + v));
-            features.write(features_path(folder, &stem))?;
+            features.write(features_path(folder, stem))?;
         }
         Ok(shown)
     }
 
     fn language(&self, scene: &Scene) -> Option<Language> {
-        self.speech.map(|_| Language::new(scene))
+        self.speech.map(|_| Language::new(scene).with(&self.layout.texts()))
     }
 }
 
-/// The stem of a view's files: `frame_00001` for the first.
+/// The stem of a view's files in [`Layout::Colmap`]: `frame_00001` for the first.
 pub fn stem(view: usize) -> String {
     format!("frame_{:05}", view + 1)
 }
@@ -182,7 +196,7 @@ pub fn stem(view: usize) -> String {
 /// # Errors
 /// When a file cannot be written, when `out` holds another dataset, or when the stage is interrupted.
 pub fn run(stage: &Stage, out: &Path, options: &Options) -> Result<()> {
-    prepare(out)?;
+    prepare(out, &options.layout)?;
     let scene = options.scene();
     let parameters = options.parameters(&scene);
     let cameras = options.cameras(&scene);
@@ -194,6 +208,8 @@ pub fn run(stage: &Stage, out: &Path, options: &Options) -> Result<()> {
     ));
     let light = options.light(&scene);
     let language = options.language(&scene);
+    let stems = options.layout.stems(cameras.len());
+    let labels = options.layout.labels(out);
     let mut progress = stage.progress("views", cameras.len() as u64);
     let mut points = Collector::default();
     let mut masks = BTreeMap::new();
@@ -204,12 +220,12 @@ pub fn run(stage: &Stage, out: &Path, options: &Options) -> Result<()> {
         }
         let frame = render::render(&scene, &light, camera);
         points.add(&scene, camera, &frame);
-        write_view(out, v, &frame)?;
-        let shown = options.write_masks(&out.join("language_features"), v, &scene, &frame, language.as_ref())?;
-        masks.insert(stem(v), shown);
-        if options.label_every > 0 && v % options.label_every == 0 {
-            let path = out.join("label").join(stem(v) + ".json");
-            label::write(&path, &format!("{}.png", stem(v)), &scene, &frame)?;
+        let stem = &stems[v];
+        write_view(out, options.layout.images(), stem, &frame)?;
+        let shown = options.write_masks(&out.join("language_features"), stem, v, &scene, &frame, language.as_ref())?;
+        masks.insert(stem.clone(), shown);
+        if options.layout.is_labelled(v, stem, options.label_every) {
+            label::write(&labels.join(format!("{stem}.json")), &format!("{stem}.png"), &scene, &frame)?;
             labelled += 1;
         }
         progress.step();
@@ -218,13 +234,13 @@ pub fn run(stage: &Stage, out: &Path, options: &Options) -> Result<()> {
 
     let sparse = points.sparse(&scene, options.points, POINT_NOISE, &mut options.rng(POINTS));
     let named = |cameras: Vec<Camera>| -> Vec<(String, Camera)> {
-        cameras.into_iter().enumerate().map(|(v, c)| (format!("{}.png", stem(v)), c)).collect()
+        stems.iter().map(|stem| format!("{stem}.png")).zip(cameras).collect()
     };
     if options.pose_noise > 0.0 {
         colmap::write_model(&out.join("truth/sparse/0"), &named(cameras.clone()), &PointCloud::default())?;
     }
     let views = named(cameras::perturbed(&cameras, options.pose_noise, &mut options.rng(POSES)));
-    colmap::write_model(&out.join("sparse/0"), &views, &sparse)?;
+    options.layout.write_cameras(out, &views, &sparse)?;
     if let Some(language) = &language {
         write_table(&out.join("truth"), language)?;
     }
@@ -232,9 +248,11 @@ pub fn run(stage: &Stage, out: &Path, options: &Options) -> Result<()> {
     let mut provenance = stage.provenance(TruePoints::FORMAT, 1, parameters.clone(), BTreeMap::new());
     provenance.extra = json!({ "classes": scene.classes() });
     truth.write(out.join("truth/points.safetensors"), provenance)?;
-    if options.family == Family::Room {
-        scannet::write(&out.join(SCAN), &scene, &truth, points.colors())?;
+    if options.layout == Layout::Colmap && options.family == Family::Room {
+        scannet::write(&out.join(SCAN), scannet::SCAN, &scene, &truth, points.colors())?;
     }
+    let (vertices, colors) = points.vertices(&scene, options.points, &mut options.rng(VERTICES));
+    options.layout.write_scan(out, &scene, &vertices, &colors)?;
     MaskTruth::write_all(out.join("truth/masks.json"), &masks)?;
     let summary = json!({
         "objects": options.objects, "parts": scene.parts.len(), "views": views.len(), "labelled_views": labelled,
@@ -261,6 +279,7 @@ pub fn run_masks(stage: &Stage, folder: &Path, options: &Options) -> Result<()> 
     let scene = options.scene();
     let cameras = options.cameras(&scene);
     let language = options.language(&scene);
+    let stems = options.layout.stems(cameras.len());
     let mut progress = stage.progress("views", cameras.len() as u64);
     let mut masks = BTreeMap::new();
     for (v, camera) in cameras.iter().enumerate() {
@@ -268,7 +287,8 @@ pub fn run_masks(stage: &Stage, folder: &Path, options: &Options) -> Result<()> 
             return Err(Error::new("interrupted").file(folder));
         }
         let frame = render::identify(&scene, camera);
-        masks.insert(stem(v), options.write_masks(folder, v, &scene, &frame, language.as_ref())?);
+        let shown = options.write_masks(folder, &stems[v], v, &scene, &frame, language.as_ref())?;
+        masks.insert(stems[v].clone(), shown);
         progress.step();
     }
     progress.finish(&[]);
@@ -313,34 +333,50 @@ fn write_table(folder: &Path, language: &Language) -> Result<()> {
 
 /// Makes the folders, empty. What an earlier run left is removed, the marker first; `truth` stands from the beginning,
 /// so that an unfinished scene is recognised as one.
-fn prepare(out: &Path) -> Result<()> {
+fn prepare(out: &Path, layout: &Layout) -> Result<()> {
     let truth = out.join("truth");
     if !truth.is_dir() {
-        if let Some(other) = FOLDERS.iter().chain([&SCAN]).map(|f| out.join(f)).find(|f| f.exists()) {
+        if let Some(other) =
+            FOLDERS.iter().chain([&SCAN]).chain(&benchmark::FOLDERS).map(|f| out.join(f)).find(|f| f.exists())
+        {
             return Err(Error::new("the folder holds something that is not a synthetic scene")
                 .file(out)
                 .found(other.display())
                 .expected("an empty folder, or an earlier synthetic scene")
                 .hint("choose another --out"));
         }
-        return FOLDERS.iter().rev().try_for_each(|f| create_dir(out.join(f)));
+        folders(layout).rev().try_for_each(|f| create_dir(out.join(f)))?;
+        return benchmark::prepare(layout, out);
     }
     let marker = truth.join("scene.json");
     if marker.exists() {
         std::fs::remove_file(&marker).at("replace", &marker)?;
     }
-    let scan = out.join(SCAN);
-    if scan.is_dir() {
-        std::fs::remove_dir_all(&scan).at("replace", &scan)?;
+    let unused = |f: &&str| !folders(layout).any(|used| used == *f);
+    let others = FOLDERS.into_iter().filter(|f| unused(&f)).chain([SCAN]).chain(benchmark::FOLDERS);
+    for folder in others.map(|f| out.join(f)).filter(|f| f.is_dir()) {
+        std::fs::remove_dir_all(&folder).at("replace", &folder)?;
     }
-    for folder in FOLDERS.iter().map(|f| out.join(f)) {
+    for folder in folders(layout).map(|f| out.join(f)).chain([layout.labels(out)]) {
         for name in entries(&folder)? {
             let gone = if name.is_dir() { std::fs::remove_dir_all(&name) } else { std::fs::remove_file(&name) };
             gone.at("replace", &name)?;
         }
-        create_dir(&folder)?;
     }
-    Ok(())
+    let ours = |p: &&std::path::PathBuf| benchmark::FILES.iter().any(|end| p.to_string_lossy().ends_with(end));
+    entries(out)?.iter().filter(ours).try_for_each(|p| std::fs::remove_file(p).at("replace", p))?;
+    folders(layout).try_for_each(|f| create_dir(out.join(f)))?;
+    benchmark::prepare(layout, out)
+}
+
+/// Those of the folders of a scene that stand in this layout.
+fn folders(layout: &Layout) -> impl DoubleEndedIterator<Item = &'static str> {
+    let unused: &[&str] = match layout {
+        Layout::Colmap => &[],
+        Layout::LerfOvs(_) => &["label"],
+        Layout::Scan { .. } => &["images", "sparse", "label"],
+    };
+    FOLDERS.into_iter().filter(move |f| !unused.contains(f))
 }
 
 fn entries(folder: &Path) -> Result<Vec<std::path::PathBuf>> {
@@ -352,10 +388,9 @@ fn entries(folder: &Path) -> Result<Vec<std::path::PathBuf>> {
 }
 
 /// Writes a view's photograph and what each of its pixels shows.
-fn write_view(out: &Path, v: usize, frame: &Frame) -> Result<()> {
-    let stem = stem(v);
+fn write_view(out: &Path, images: &str, stem: &str, frame: &Frame) -> Result<()> {
     let (w, h) = (frame.width, frame.height);
-    Image::from_rgb8(w as u32, h as u32, &frame.rgb).write_png(out.join("images").join(format!("{stem}.png")))?;
+    Image::from_rgb8(w as u32, h as u32, &frame.rgb).write_png(out.join(images).join(format!("{stem}.png")))?;
     npy::write_i32(out.join("truth/views").join(format!("{stem}.npy")), &[h, w], &frame.thing)?;
     npy::write_i32(out.join("truth/parts").join(format!("{stem}.npy")), &[h, w], &frame.part)
 }

@@ -361,3 +361,58 @@ fn labels_are_given_for_training_and_held_out_views() {
         assert_eq!(root.join("label").join(format!("{}.json", stem(v))).exists(), labelled);
     }
 }
+
+#[test]
+fn miniatures_of_the_benchmarks_read_as_what_they_are() {
+    let dir = tempfile::tempdir().unwrap();
+    let options = ["--views", "6", "--objects", "6", "--points", "900", "--family", "room", "--features"];
+    let folder = |name: &str, layout: &str| {
+        let out = dir.path().join(layout).join(name);
+        make(&out, &[&options[..], &["--layout", layout]].concat());
+        // Made anew over itself, and over another layout, the same files lie there.
+        let first = contents(&out);
+        make(&out, &options);
+        make(&out, &[&options[..], &["--layout", layout]].concat());
+        assert!(first == contents(&out), "{layout}");
+        out
+    };
+    let lerf = folder("teatime", "lerf-ovs");
+    let data = dataset::load(&lerf, &LoadOptions::default()).unwrap();
+    assert_eq!((data.format, data.views.len()), (dataset::Format::Colmap, 6));
+    let labels: BTreeSet<String> = contents(&dir.path().join("lerf-ovs/label/teatime"))
+        .keys()
+        .map(|p| p.file_stem().unwrap().to_string_lossy().into_owned())
+        .collect();
+    assert_eq!(labels.len(), 6, "teatime has six frames that are scored");
+    assert!(data.views.iter().all(|v| labels.contains(v.stem())) && labels.contains("frame_00140"));
+    let truth = TrueScene::read(lerf.join("truth/scene.json")).unwrap();
+    let names: Vec<&str> = truth.objects.iter().filter(|o| !o.background).map(|o| o.name.as_str()).collect();
+    assert!(names.contains(&"stuffed bear") && names.contains(&"coffee mug"), "{names:?}");
+
+    let table: BTreeMap<String, Vec<f32>> =
+        serde_json::from_slice(&std::fs::read(lerf.join("truth/text_features.json")).unwrap()).unwrap();
+    let queries: BTreeSet<&str> = artifacts::LERF_OVS.iter().flat_map(|s| s.queries).copied().collect();
+    assert!(queries.iter().all(|q| table.contains_key(*q)), "one table serves all scenes");
+
+    let scan = folder("scene0062_00", "scannet");
+    let converted = folder("scene0062_00", "opengaussian");
+    let one = LoadOptions { holdout: 0, ..LoadOptions::default() };
+    let (a, b) = (dataset::load(&scan, &one).unwrap(), dataset::load(&converted, &one).unwrap());
+    assert_eq!((a.format, b.format), (dataset::Format::ScanNet, dataset::Format::Transforms));
+    let (vertices, _) = gs_scene::ply::read_labels(scan.join("scene0062_00_vh_clean_2.labels.ply"), "label").unwrap();
+    assert!(vertices.len() == 900 && a.points.positions == vertices && b.points.positions == vertices);
+    assert!(!converted.join("scene0062_00_vh_clean_2.ply").exists());
+    for (stem, view) in ["0", "20", "40", "60", "80", "100"].iter().zip(&a.views) {
+        let same = b.views.iter().find(|v| v.stem() == *stem).unwrap();
+        assert_eq!((view.stem(), view.split), (*stem, Split::Train));
+        assert!((view.camera.position() - same.camera.position()).length() < 1e-6);
+        let p = DVec3::new(0.1, -0.2, 0.8);
+        assert!((view.camera.to_camera(p) - same.camera.to_camera(p)).length() < 1e-6);
+        let maps = MaskMaps::read(maps_path(scan.join("language_features"), stem)).unwrap();
+        assert!(maps.id_count() > 0);
+    }
+
+    let o = synth_scene(&dir.path().join("kitchen"), &["--layout", "lerf-ovs"]);
+    assert_eq!(o.status.code(), Some(2));
+    assert!(String::from_utf8_lossy(&o.stderr).contains("the folder's name is none of the benchmark's"));
+}

@@ -4,12 +4,12 @@ use super::{LanguageArgs, SceneArgs, load, mask_threshold, read_scene};
 use crate::labels;
 use crate::lerf::{self, Answers, LerfMetrics, Rendering};
 use crate::protocol::lerf::Averaging;
-use crate::protocol::lerf_scenes::LerfScene;
 use crate::protocol::published::SetRow;
 use crate::protocol::scannet::{self, Association};
 use crate::scan::{self, ScanFiles, ScanMetrics, ScanOptions, Undescribed};
 use crate::scene::LabelledScene;
 use crate::silhouette::Silhouette;
+use artifacts::LerfScene;
 use gs_io::{Error, IoContext, Result, write_bytes};
 use gs_scene::dataset::{Dataset, LoadOptions};
 use serde_json::{Value, json};
@@ -232,7 +232,7 @@ pub(super) fn run_lerf(a: &LerfArgs, stage: &Stage) -> Result<String> {
     let summary =
         json!({"figures": metrics.figures, "zeros": metrics.pairs.iter().filter(|p| p.zero.is_some()).count()});
     stage.record(&path, parameters, inputs, summary)?;
-    Ok(lerf::table(&[metrics]))
+    Ok(lerf::sheet(&[metrics]).markdown())
 }
 
 #[derive(Debug, clap::Args)]
@@ -313,7 +313,7 @@ pub(super) fn run_scannet(a: &ScannetArgs, stage: &Stage) -> Result<String> {
     let parameters = json!({"command": "scannet", "rule": metrics.rule, "without": a.without});
     let summary = json!({"rows": metrics.row(), "instances": metrics.instances});
     stage.record(&path, parameters, scene.inputs.clone(), summary)?;
-    Ok(scan::table(&[metrics]))
+    Ok(scan::sheet(&[metrics]).markdown())
 }
 
 #[derive(Debug, clap::Args)]
@@ -321,7 +321,7 @@ pub(super) struct TableArgs {
     /// Folders (or metrics.json files) that eval lerf or eval scannet wrote, one a scene
     #[arg(required = true, value_name = "DIR")]
     scenes: Vec<PathBuf>,
-    /// Output folder: metrics.json and table.md of the dataset
+    /// Output folder: metrics.json, table.md and table.html of the dataset
     #[arg(long, value_name = "DIR")]
     out: PathBuf,
 }
@@ -375,11 +375,11 @@ pub(super) fn run_table(a: &TableArgs, stage: &Stage) -> Result<String> {
     if rules.len() > 1 {
         stage.warn("the scenes were scored by different rules: their mean means little");
     }
-    let (table, json) = if scans.is_empty() {
+    let (sheet, mut json) = if scans.is_empty() {
         let figures: Vec<_> = lerfs.iter().map(|m| m.figures).collect();
         let dataset = crate::protocol::lerf::dataset_figures(&figures);
         let scenes: BTreeMap<&str, _> = lerfs.iter().map(|m| (m.scene.as_str(), m.figures)).collect();
-        (lerf::table(&lerfs), json!({"protocol": "lerf-ovs dataset", "figures": dataset, "scenes": scenes}))
+        (lerf::sheet(&lerfs), json!({"protocol": "lerf-ovs dataset", "figures": dataset, "scenes": scenes}))
     } else {
         let [mean, pooled] = scan::summary(&scans).map(|(_, row)| row);
         let sized = |row: SetRow| -> Value {
@@ -393,13 +393,17 @@ pub(super) fn run_table(a: &TableArgs, stage: &Stage) -> Result<String> {
         let json = json!({
             "protocol": "scannet dataset", "scenes": scenes, "mean_over_scenes": sized(mean), "pooled": sized(pooled),
         });
-        (scan::table(&scans), json)
+        (scan::sheet(&scans), json)
     };
+    let summary = json.clone();
+    json["tables"] = sheet.json();
     gs_io::create_dir(&a.out)?;
+    let table = sheet.markdown();
     write_bytes(a.out.join("table.md"), table.as_bytes())?;
+    write_bytes(a.out.join("table.html"), sheet.html().as_bytes())?;
     let path = a.out.join("metrics.json");
     let bytes = serde_json::to_vec_pretty(&json).map_err(|e| Error::new(e.to_string()).file(&path))?;
     write_bytes(&path, &bytes)?;
-    stage.record(&path, json!({"command": "table"}), BTreeMap::new(), json)?;
+    stage.record(&path, json!({"command": "table"}), BTreeMap::new(), summary)?;
     Ok(table)
 }

@@ -1,4 +1,4 @@
-# `make scene SCENE=folder OUT=folder`: anyone's posed photographs.
+# `make scene SCENE=folder OUT=folder`: anyone's posed photographs. The defaults stand in pipelines/custom.conf.
 #:  GEOMETRY=file.ply   use these trained Gaussians instead of training
 #:  MASKS=folder        use these id maps (*_s.npy) instead of running SAM
 #:  CLIP=folder         image.onnx and text.onnx of a CLIP model [models/clip, if there]; without it no text queries
@@ -6,7 +6,9 @@
 #:  RESOLUTION=640px    size of the photographs for stage 1: a width that wider ones are shrunk to, or a divisor
 #:  QUALITY=balanced    fast, balanced or exact: pipelines/quality
 #:  ITERATIONS=3000     steps of stage 1; fast 1000, exact 10000
+#:  SEED=0              of every stage's random choices
 #:  THREADS=0           threads of every stage, 0 for one per core
+#:  CONF=file           settings from a file, one NAME = value a line
 #: and GEOM_ARGS, MASK_ARGS, GRAPH_ARGS, FEAT_ARGS, CLUSTER_ARGS, REPORT_ARGS: more options of a stage
 
 ifeq ($(SCENE),)
@@ -16,11 +18,16 @@ ifeq ($(OUT),)
 $(error say where to write: make scene SCENE=folder OUT=folder)
 endif
 
-SCENE_FILES := $(wildcard $(addprefix $(SCENE)/,sparse/0/* sparse/* images/* transforms*.json color/* pose/* *.ply))
-RESOLUTION ?= 640px
+include pipelines/custom.conf
+include pipelines/quality.mk
+include $(CONF)
 CLIP ?= $(patsubst %/,%,$(dir $(wildcard models/clip/text.onnx)))
-SAM ?= models
 
+SETTINGS := QUALITY SCENE GEOMETRY MASKS CLIP SAM QUERIES RESOLUTION ITERATIONS SEED \
+  GEOM_ARGS MASK_ARGS GRAPH_ARGS FEAT_ARGS CLUSTER_ARGS SCORE_ARGS REPORT_ARGS
+include pipelines/settings.mk
+
+SCENE_FILES := $(wildcard $(addprefix $(SCENE)/,sparse/0/* sparse/* images/* transforms*.json color/* pose/* *.ply))
 ifeq ($(MASKS),)
 MASKS := $(OUT)/masks
 MASKS_DONE := $(MASKS)/masks.json
@@ -28,14 +35,8 @@ else
 MASKS_DONE := $(wildcard $(MASKS)/*_s.npy)
 endif
 
-GIVEN_GEOM_ARGS := $(GEOM_ARGS)
-override GEOM_ARGS = --resolution $(RESOLUTION) --iterations $(ITERATIONS) $(GIVEN_GEOM_ARGS)
+geom_OPTIONS := --resolution $(RESOLUTION) --iterations $(ITERATIONS) $(GEOM_ARGS)
 EVAL_ARGS ?= --resolution $(RESOLUTION)
-REPORT_ARGS ?= --resolution $(RESOLUTION)
+report_OPTIONS := --resolution $(RESOLUTION) $(REPORT_ARGS)
 
 include pipelines/stages.mk
-
-masks_OPTIONS := $(SAM) $(MASK_ARGS)
-$(OUT)/masks/masks.json: $(SCENE_FILES) $(OPTIONS)/masks | $(BIN)/mask-embed
-	@test -e $(SAM)/encoder.onnx || { echo "no SAM model in $(SAM): run make models, or give MASKS=folder" >&2; exit 2; }
-	$(BIN)/mask-embed masks --scene $(SCENE) --sam $(SAM) --out $(MASKS) $(MASK_ARGS) $(COMMON)

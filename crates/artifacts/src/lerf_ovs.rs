@@ -1,4 +1,5 @@
-//! The four scenes of LERF-OVS: which frames are scored, and which texts are asked (docs/protocols.md).
+//! The four scenes of LERF-OVS: which frames are scored, and which texts are asked (docs/protocols.md). Synthetic scenes
+//! in its layout are named and labelled by it, and scenes are scored by it.
 
 /// A scene of the benchmark.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -15,7 +16,7 @@ pub struct LerfScene {
 }
 
 /// The scenes in the order of the paper's table.
-pub const SCENES: [LerfScene; 4] = [
+pub const LERF_OVS: [LerfScene; 4] = [
     LerfScene {
         name: "waldo_kitchen",
         frames: &[53, 66, 89, 140, 154],
@@ -116,7 +117,7 @@ pub const SCENES: [LerfScene; 4] = [
 impl LerfScene {
     /// The scene of this name.
     pub fn named(name: &str) -> Option<&'static Self> {
-        SCENES.iter().find(|s| s.name == name)
+        LERF_OVS.iter().find(|s| s.name == name)
     }
 
     /// Whether a labelled frame (the stem of its file) is one that is scored.
@@ -133,11 +134,11 @@ mod tests {
     #[test]
     fn the_tables_have_the_published_sizes() {
         let sizes: Vec<(usize, usize, usize)> =
-            SCENES.iter().map(|s| (s.frames.len(), s.queries.len(), s.pairs)).collect();
+            LERF_OVS.iter().map(|s| (s.frames.len(), s.queries.len(), s.pairs)).collect();
         assert_eq!(sizes, [(5, 18, 22), (7, 14, 71), (4, 21, 56), (6, 14, 59)]);
         assert_eq!(sizes.iter().map(|s| s.0).sum::<usize>(), 22);
         assert_eq!(sizes.iter().map(|s| s.2).sum::<usize>(), 208);
-        for s in SCENES {
+        for s in LERF_OVS {
             assert_eq!(s.queries.iter().collect::<BTreeSet<_>>().len(), s.queries.len(), "{}", s.name);
         }
         assert!(LerfScene::named("ramen").unwrap().scores_frame("frame_00006"));
@@ -155,10 +156,10 @@ mod tests {
             return;
         };
         let table: std::collections::BTreeMap<String, serde_json::Value> = serde_json::from_slice(&bytes).unwrap();
-        for query in SCENES.iter().flat_map(|s| s.queries) {
+        for query in LERF_OVS.iter().flat_map(|s| s.queries) {
             assert!(table.contains_key(*query), "{query}");
         }
-        for (_, name) in artifacts::NYU40 {
+        for (_, name) in crate::NYU40 {
             assert!(table.contains_key(name), "{name}");
         }
     }

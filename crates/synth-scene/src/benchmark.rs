@@ -1,0 +1,261 @@
+//! Miniatures of the benchmarks: where the files of a scene lie, and what they are called, in the layout of LERF-OVS, of
+//! ScanNet as its tools extract it, and of ScanNet as OpenGaussian converts it.
+
+use crate::scannet;
+use crate::scene::Scene;
+use artifacts::{LERF_OVS, LerfScene};
+use clap::ValueEnum;
+use gs_io::{Error, Result, create_dir, write_bytes};
+use gs_scene::{Camera, PointCloud, colmap, ply};
+use serde_json::{Value, json};
+use std::collections::BTreeSet;
+use std::path::{Path, PathBuf};
+
+/// The layouts by name.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
+pub enum LayoutName {
+    /// images/ and sparse/0
+    Colmap,
+    /// One of the four scenes, which the folder's name says: its labelled frames and texts, labels in ../label/<scene>
+    LerfOvs,
+    /// A scan by the folder's name: color/, pose/, intrinsic/, and the files of its mesh; frames 0, 20, 40...
+    Scannet,
+    /// The same as OpenGaussian converts it: color/, transforms_train.json, transforms_test.json, points3d.ply
+    Opengaussian,
+}
+
+/// A layout with the scene's name in it.
+#[derive(Debug, Clone, PartialEq)]
+pub enum Layout {
+    /// `images/`, `sparse/0/`, labels in `label/`.
+    Colmap,
+    /// A scene of LERF-OVS: things have the names that are asked for, and the frames that are scored are among the views.
+    LerfOvs(&'static LerfScene),
+    /// A scan of this name, as extracted or converted.
+    Scan {
+        /// Name of the scan, such as `scene0000_00`.
+        name: String,
+        /// Whether it lies there as OpenGaussian converts it.
+        converted: bool,
+    },
+}
+
+/// Every how many frames of a recording one is used.
+const FRAME_STEP: usize = 20;
+
+impl Layout {
+    /// The layout of a scene in the folder `out`.
+    ///
+    /// # Errors
+    /// When the folder's name is none of the benchmark's.
+    pub fn new(name: LayoutName, out: &Path) -> Result<Self> {
+        let folder = out.file_name().unwrap_or_default().to_string_lossy().into_owned();
+        let unnamed = |expected: &str| {
+            Error::new("the folder's name is none of the benchmark's").field("--out").found(&folder).expected(expected)
+        };
+        match name {
+            LayoutName::Colmap => Ok(Self::Colmap),
+            LayoutName::LerfOvs => LerfScene::named(&folder)
+                .map(Self::LerfOvs)
+                .ok_or_else(|| unnamed("figurines, ramen, teatime or waldo_kitchen")),
+            LayoutName::Scannet | LayoutName::Opengaussian => {
+                let digits = folder.strip_prefix("scene").map(|d| d.replacen('_', "", 1)).unwrap_or_default();
+                if digits.len() != 6 || !digits.bytes().all(|b| b.is_ascii_digit()) {
+                    return Err(unnamed("a scan's, such as scene0000_00"));
+                }
+                Ok(Self::Scan { name: folder, converted: name == LayoutName::Opengaussian })
+            }
+        }
+    }
+
+    /// Folder of the photographs.
+    pub fn images(&self) -> &'static str {
+        if matches!(self, Self::Scan { .. }) { "color" } else { "images" }
+    }
+
+    /// Folder of the labels of a scene in `out`.
+    pub fn labels(&self, out: &Path) -> PathBuf {
+        match self {
+            Self::LerfOvs(s) => out.parent().unwrap_or(Path::new("")).join("label").join(s.name),
+            _ => out.join("label"),
+        }
+    }
+
+    /// Stems of the files of `views` views, ascending.
+    pub fn stems(&self, views: usize) -> Vec<String> {
+        match self {
+            Self::Colmap => (1..=views).map(|v| format!("frame_{v:05}")).collect(),
+            Self::LerfOvs(s) => frames(s, views).into_iter().map(|v| format!("frame_{v:05}")).collect(),
+            Self::Scan { .. } => (0..views).map(|v| (FRAME_STEP * v).to_string()).collect(),
+        }
+    }
+
+    /// Whether a view has labels, where every `every`-th has (0: none).
+    pub fn is_labelled(&self, view: usize, stem: &str, every: usize) -> bool {
+        match self {
+            Self::LerfOvs(s) => every > 0 && s.scores_frame(stem),
+            Self::Colmap => every > 0 && view.is_multiple_of(every),
+            Self::Scan { .. } => false,
+        }
+    }
+
+    /// Calls the things of a scene of LERF-OVS what is asked for there, one after the other while there are texts. They are
+    /// classes of their own then, whose features depend on the text alone: one table serves all scenes.
+    pub fn rename(&self, scene: &mut Scene) {
+        if let Self::LerfOvs(s) = self {
+            for (thing, query) in scene.things.iter_mut().filter(|t| !t.background).zip(s.queries) {
+                thing.name = (*query).to_string();
+                thing.class = query;
+            }
+        }
+    }
+
+    /// The texts of the benchmark, which a table of text features should have.
+    pub fn texts(&self) -> Vec<&'static str> {
+        match self {
+            Self::LerfOvs(_) => LERF_OVS.iter().flat_map(|s| s.queries).copied().collect(),
+            Self::Colmap | Self::Scan { .. } => Vec::new(),
+        }
+    }
+
+    /// Writes poses, intrinsics and points. `views` are the file names of the photographs and their cameras.
+    ///
+    /// # Errors
+    /// When a file cannot be written.
+    pub fn write_cameras(&self, out: &Path, views: &[(String, Camera)], sparse: &PointCloud) -> Result<()> {
+        match self {
+            Self::Colmap | Self::LerfOvs(_) => colmap::write_model(&out.join("sparse/0"), views, sparse),
+            Self::Scan { converted: false, .. } => write_poses(out, views),
+            Self::Scan { converted: true, .. } => write_transforms(out, views),
+        }
+    }
+
+    /// Writes the files of the scan's mesh: [`scannet::write`], and for a converted one `points3d.ply` instead of
+    /// `*_vh_clean_2.ply`.
+    ///
+    /// # Errors
+    /// When a file cannot be written.
+    pub fn write_scan(
+        &self,
+        out: &Path,
+        scene: &Scene,
+        points: &artifacts::TruePoints,
+        colors: &[[u8; 3]],
+    ) -> Result<()> {
+        let Self::Scan { name, converted } = self else { return Ok(()) };
+        scannet::write(out, name, scene, points, colors)?;
+        if *converted {
+            let from = out.join(format!("{name}_vh_clean_2.ply"));
+            ply::write_points(out.join("points3d.ply"), &ply::read_points(&from)?, &[])?;
+            std::fs::remove_file(&from).map_err(|e| Error::new(format!("cannot remove: {e}")).file(&from))?;
+        }
+        Ok(())
+    }
+}
+
+/// Numbers of the frames of `views` photographs: those that are scored, as many as there is room for, and others between.
+fn frames(scene: &LerfScene, views: usize) -> BTreeSet<u32> {
+    let mut chosen: BTreeSet<u32> = scene.frames.iter().take(views).copied().collect();
+    let last = scene.frames.last().copied().unwrap_or(0).max(2 * views as u32);
+    let free: Vec<u32> = (1..=last).filter(|f| !scene.frames.contains(f)).collect();
+    let more = views - chosen.len();
+    chosen.extend((0..more).map(|k| free[k * free.len() / more]));
+    chosen
+}
+
+/// The pose of a camera in the world, in rows of 4x4 numbers.
+fn world_from_camera(camera: &Camera) -> [[f64; 4]; 4] {
+    let (r, c) = (camera.rotation.transpose(), camera.position());
+    let row = |k: usize| [r.x_axis[k], r.y_axis[k], r.z_axis[k], c[k]];
+    [row(0), row(1), row(2), [0.0, 0.0, 0.0, 1.0]]
+}
+
+fn text(rows: &[[f64; 4]; 4]) -> String {
+    rows.iter().map(|r| r.map(|v| format!("{v:.9}")).join(" ") + "\n").collect()
+}
+
+fn write_poses(out: &Path, views: &[(String, Camera)]) -> Result<()> {
+    for (name, camera) in views {
+        let path = out.join("pose").join(name).with_extension("txt");
+        write_bytes(&path, text(&world_from_camera(camera)).as_bytes())?;
+    }
+    let Some((_, k)) = views.first() else { return Ok(()) };
+    let intrinsic = [[k.fx, 0.0, k.cx, 0.0], [0.0, k.fy, k.cy, 0.0], [0.0, 0.0, 1.0, 0.0], [0.0, 0.0, 0.0, 1.0]];
+    write_bytes(out.join("intrinsic/intrinsic_color.txt"), text(&intrinsic).as_bytes())
+}
+
+/// OpenGaussian lists all frames in both files, cameras in OpenGL's axes, names without extension.
+fn write_transforms(out: &Path, views: &[(String, Camera)]) -> Result<()> {
+    let Some((_, k)) = views.first() else { return Ok(()) };
+    let frame = |(name, camera): &(String, Camera)| -> Value {
+        let rows = world_from_camera(camera).map(|[x, y, z, w]| [x, -y, -z, w]);
+        json!({ "file_path": format!("color/{}", name.trim_end_matches(".png")), "transform_matrix": rows })
+    };
+    let frames: Vec<Value> = views.iter().map(frame).collect();
+    let all = json!({
+        "w": k.width, "h": k.height, "fl_x": k.fx, "fl_y": k.fy, "cx": k.cx, "cy": k.cy, "frames": frames,
+    });
+    for name in ["transforms_train.json", "transforms_test.json"] {
+        let path = out.join(name);
+        let bytes = serde_json::to_vec(&all).map_err(|e| Error::new(e.to_string()).file(&path))?;
+        write_bytes(&path, &bytes)?;
+    }
+    Ok(())
+}
+
+/// Folders that a scene of some layout may have beside those of [`Layout::Colmap`], and files in its root by their ends.
+pub(crate) const FOLDERS: [&str; 3] = ["color", "pose", "intrinsic"];
+pub(crate) const FILES: [&str; 7] = [
+    "_vh_clean_2.ply",
+    ".labels.ply",
+    ".segs.json",
+    ".aggregation.json",
+    "transforms_train.json",
+    "transforms_test.json",
+    "points3d.ply",
+];
+
+/// Makes the empty folders that a scan must have.
+pub(crate) fn prepare(layout: &Layout, out: &Path) -> Result<()> {
+    match layout {
+        Layout::Scan { converted: false, .. } => FOLDERS.iter().try_for_each(|f| create_dir(out.join(f))),
+        Layout::Scan { converted: true, .. } => create_dir(out.join("color")),
+        Layout::Colmap | Layout::LerfOvs(_) => Ok(()),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn frames_hold_those_that_are_scored() {
+        for scene in &LERF_OVS {
+            for views in [1, 4, 9, 30, 120, 400] {
+                let f = frames(scene, views);
+                assert_eq!(f.len(), views, "{}", scene.name);
+                assert_eq!(scene.frames.iter().filter(|n| f.contains(n)).count(), views.min(scene.frames.len()));
+            }
+        }
+    }
+
+    #[test]
+    fn folders_are_named_as_the_benchmarks_scenes() {
+        let layout = |name, out: &str| Layout::new(name, Path::new(out));
+        assert_eq!(
+            layout(LayoutName::LerfOvs, "a/ramen").unwrap().labels(Path::new("a/ramen")),
+            Path::new("a/label/ramen")
+        );
+        assert!(layout(LayoutName::Scannet, "a/scene0062_00").is_ok());
+        assert!(layout(LayoutName::Colmap, "anything").is_ok());
+        for (name, out) in [
+            (LayoutName::LerfOvs, "a/kitchen"),
+            (LayoutName::Scannet, "scene62_00"),
+            (LayoutName::Scannet, "a/scene"),
+            (LayoutName::Opengaussian, ".."),
+        ] {
+            let e = layout(name, out).unwrap_err().to_string();
+            assert!(e.contains("--out: the folder's name is none of the benchmark's"), "{e}");
+        }
+    }
+}

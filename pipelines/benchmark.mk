@@ -1,0 +1,33 @@
+# `make lerf-ovs DATA=folder OUT=folder`, `make scannet ...`: the scenes of a data set (SET), one after the other or `-j` at a
+# time, then the paper's table with ours: OUT/table.md, table.html, metrics.json. A scene is pipelines/$(SET).mk, its
+# parameters pipelines/$(SET).conf.
+
+ifeq ($(and $(DATA),$(or $(OUT),$(filter check,$(MAKECMDGOALS)))),)
+$(error say where the data set is and where to write: make $(SET) DATA=folder OUT=folder)
+endif
+
+.DELETE_ON_ERROR:
+.SUFFIXES:
+include pipelines/$(SET).conf
+include $(CONF)
+BIN ?= target/release
+METRICS := $(foreach s,$(SCENES),$(OUT)/$s/protocol/metrics.json)
+
+.PHONY: all check FORCE
+check:
+	@SCENES="$(SCENES)" MASKS="$(MASKS)" CLIP="$(CLIP)" TEXTS="$(TEXTS)" SAM="$(SAM)" EVERY="$(EVERY)" \
+	  scripts/check_data.sh $(SET) $(DATA)
+
+.DEFAULT_GOAL := all
+all: $(OUT)/metrics.json
+	@cat $(OUT)/table.md
+
+$(OUT)/%/protocol/metrics.json: FORCE
+	+@$(MAKE) --no-print-directory -f pipelines/$(SET).mk SCENE=$(DATA)/$* OUT=$(OUT)/$*
+
+# Beside it go table.md and table.html; metrics.json is written last.
+$(OUT)/metrics.json: $(METRICS) | $(BIN)/eval
+	$(BIN)/eval table $(patsubst %/metrics.json,%,$(METRICS)) --out $(OUT) --quiet > /dev/null
+
+$(BIN)/%:
+	cargo build --release --workspace --bins

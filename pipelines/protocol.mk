@@ -1,0 +1,27 @@
+# What scenes of the benchmarks share: parameters, masks, texts, and the score by the protocol as the last file. The fragment
+# that includes this has read its parameters (*.conf) and set PROTOCOL, SCENE_FILES and PROTOCOL_FILES.
+
+ifeq ($(and $(SCENE),$(OUT)),)
+$(error say which scene and where to write: SCENE=folder OUT=folder)
+endif
+
+include $(CONF)
+SETTINGS := SCENE GEOMETRY MASKS SAM CLIP TEXTS EVERY SEED GEOM_ARGS MASK_ARGS GRAPH_ARGS FEAT_ARGS CLUSTER_ARGS SCORE_ARGS
+include pipelines/settings.mk
+
+# LangSplat's masks and features where they are there; else SAM's, and CLIP's of them.
+GIVEN := $(or $(MASKS),$(if $(wildcard $(SCENE)/language_features/*_s.npy),$(SCENE)/language_features))
+ifneq ($(GIVEN),)
+MASKS := $(GIVEN)
+MASKS_DONE := $(wildcard $(MASKS)/*_s.npy)
+LANGUAGE := $(wildcard $(MASKS)/*_f.npy)
+else
+MASKS := $(OUT)/masks
+MASKS_DONE := $(MASKS)/masks.json
+endif
+
+include pipelines/stages.mk
+
+.DEFAULT_GOAL := scored
+.PHONY: scored
+scored: $(OUT)/protocol/metrics.json settings

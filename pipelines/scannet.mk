@@ -1,0 +1,21 @@
+# One scan of ScanNet: make -f pipelines/scannet.mk SCENE=scannet/scene0000_00 OUT=out/scene0000_00. All: make scannet.
+#
+# A scan as the tools of ScanNet extract it (color/, pose/, intrinsic/) has all frames of the recording; every EVERY-th of
+# them is linked to a folder of the same name below OUT. One that OpenGaussian converted (transforms_train.json) has only
+# those, and is used as it is.
+
+include pipelines/scannet.conf
+PROTOCOL := scannet
+ifeq ($(wildcard $(SCENE)/transforms_train.json),)
+SOURCE_FILES := $(wildcard $(addprefix $(SCENE)/,color/* pose/* intrinsic/* *.ply *.json))
+PHOTOGRAPHS := $(OUT)/frames/$(notdir $(SCENE))
+SCENE_FILES := $(PHOTOGRAPHS)/frames.txt
+else
+SCENE_FILES := $(wildcard $(addprefix $(SCENE)/,color/* transforms_*.json points3d.ply))
+endif
+PROTOCOL_FILES := $(wildcard $(addprefix $(SCENE)/,*.labels.ply *.segs.json *.aggregation.json))
+include pipelines/protocol.mk
+
+frames_OPTIONS := $(EVERY)
+$(OUT)/frames/%/frames.txt: $(SOURCE_FILES) $(OPTIONS)/frames scripts/scannet_frames.sh
+	scripts/scannet_frames.sh $(SCENE) $(@D) $(EVERY)
