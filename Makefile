@@ -7,7 +7,7 @@ CARGO ?= cargo
 THREADS ?= 0
 export THREADS
 
-.PHONY: help build demo scene test lint models clip-tiny bench-raster bench-graph bench-geom bench-growth bench-memory bench-train bench-cluster bench-cluster-graph bench-query bench-granularity ablation clean
+.PHONY: help build demo scene test lint models clip-tiny bench-raster bench-graph bench-geom bench-growth bench-memory bench-train bench-cluster bench-cluster-graph bench-query bench-granularity ablation fault-test fuzz clean
 
 help: ## Say what can be made
 	@echo "Targets:"
@@ -28,6 +28,15 @@ scene: build ## The same on your own photographs: make scene SCENE=folder OUT=fo
 test: ## Run all tests
 	$(CARGO) test --release --workspace
 	scripts/test_pipeline.sh
+
+SEED ?= 1
+TRIALS ?= 200
+fault-test: build ## Kill, starve, fill up, damage and change under it every stage (docs/faults.md; SEED, TRIALS kills)
+	scripts/fault-test --seed $(SEED) --trials $(TRIALS)
+
+FUZZ_SECONDS ?= 600
+fuzz: ## Fuzz every reader of files for FUZZ_SECONDS each (needs a nightly toolchain and cargo-fuzz; docs/faults.md)
+	scripts/fuzz.sh $(FUZZ_SECONDS)
 
 # PLYs to measure besides the synthetic scenes.
 SPLATS ?=

@@ -29,7 +29,7 @@ all: $(OUT)/report.html
 # $(OPTIONS)/NAME holds the options of stage NAME and is touched only when they change.
 $(OPTIONS)/%: FORCE
 	@mkdir -p $(@D)
-	@printf '%s\n' '$(subst ','\'',$($*_OPTIONS))' | cmp -s - $@ || printf '%s\n' '$(subst ','\'',$($*_OPTIONS))' > $@
+	@printf '%s\n' '$(subst ','\'',$($*_OPTIONS))' | cmp -s - $@ || { printf '%s\n' '$(subst ','\'',$($*_OPTIONS))' > $@.$$$$ && mv $@.$$$$ $@; }
 
 geom_OPTIONS := $(GEOM_ARGS)
 graph_OPTIONS := $(GRAPH_ARGS)

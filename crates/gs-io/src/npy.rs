@@ -66,6 +66,10 @@ pub fn parse(bytes: &[u8]) -> Result<Npy<f32>> {
     for part in inner.split(',').map(str::trim).filter(|p| !p.is_empty()) {
         shape.push(part.parse::<usize>().map_err(|_| bad("not a whole number").field("shape").found(part))?);
     }
+    // An array without elements takes no room whatever its other extents say; nothing real is wider than this.
+    if let Some(&wide) = shape.iter().find(|&&extent| extent > bytes.len().max(1 << 16)) {
+        return Err(bad("an extent is out of proportion to the file").field("shape").found(wide));
+    }
     let count = shape.iter().try_fold(1usize, |a, &b| a.checked_mul(b));
     let body = &bytes[end..];
     let (order, kind) = descr.split_at(descr.len().min(1));
