@@ -72,7 +72,8 @@ pub fn parse(bytes: &[u8]) -> Result<Npy<f32>> {
     }
     let count = shape.iter().try_fold(1usize, |a, &b| a.checked_mul(b));
     let body = &bytes[end..];
-    let (order, kind) = descr.split_at(descr.len().min(1));
+    // A first character that is none of ASCII's is no byte order either.
+    let (order, kind) = descr.split_at_checked(1).unwrap_or((descr, ""));
     let size: usize = kind.get(1..).and_then(|s| s.parse().ok()).unwrap_or(0);
     if order == ">" {
         return Err(bad("big-endian arrays are not supported").field("descr").found(descr).expected("little-endian"));

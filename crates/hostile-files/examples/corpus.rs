@@ -8,7 +8,7 @@ fn main() -> Result<(), Box<dyn Error>> {
     for format in &hostile_files::FORMATS {
         let folder = out.join(format.name);
         std::fs::create_dir_all(&folder)?;
-        for (i, seed) in (format.seeds)().iter().enumerate() {
+        for (i, seed) in hostile_files::seeds(format).iter().enumerate() {
             std::fs::write(folder.join(format!("seed-{i}")), seed)?;
         }
         let found = Path::new(env!("CARGO_MANIFEST_DIR")).join("testdata").join(format.name);

@@ -18,8 +18,8 @@ pub struct Format {
     pub name: &'static str,
     /// Gives the bytes to the readers; panics on a finding.
     pub(crate) check: fn(&[u8]),
-    /// Small good files.
-    pub seeds: fn() -> Vec<Vec<u8>>,
+    /// Makes the small good files.
+    pub(crate) seeds: fn() -> Vec<Vec<u8>>,
     /// Memory that readers may hold whatever the file's length, bytes.
     pub(crate) fixed: usize,
     /// Memory that readers may hold for each byte of the file.
@@ -258,10 +258,10 @@ fn check_scannet(bytes: &[u8]) {
     check_part(&SCANNET.map(String::from), bytes, |path| {
         let [segs, aggregation, labels] = [0, 1, 2].map(|i| folder().join(SCANNET[i]));
         let scan = folder().join("scannet");
-        if let Some((vertices, _)) = sound(ply::read_labels(&labels, "label"), &scan) {
-            if let Some(truth) = sound(read_truth(&segs, &aggregation, vertices.len(), &["wall".into()]), &scan) {
-                assert_eq!(truth.len(), vertices.len());
-            }
+        if let Some((vertices, _)) = sound(ply::read_labels(&labels, "label"), &scan)
+            && let Some(truth) = sound(read_truth(&segs, &aggregation, vertices.len(), &["wall".into()]), &scan)
+        {
+            assert_eq!(truth.len(), vertices.len());
         }
         sound(ply::read_points(&labels), &scan).iter().for_each(sound_points);
         check_scene(&scan);

@@ -12,6 +12,7 @@ mod seeds;
 pub use formats::{FORMATS, Format};
 pub use mutate::mutate;
 
+use std::collections::BTreeMap;
 use std::sync::Mutex;
 
 /// One measurement at a time: the counters are those of the process.
@@ -23,6 +24,15 @@ static TURN: Mutex<()> = Mutex::new(());
 /// When there is none.
 pub fn format(name: &str) -> &'static Format {
     FORMATS.iter().find(|f| f.name == name).expect("a format of that name")
+}
+
+/// Small good files of a format, made once.
+pub fn seeds(format: &Format) -> Vec<Vec<u8>> {
+    static MADE: Mutex<BTreeMap<&str, Vec<Vec<u8>>>> = Mutex::new(BTreeMap::new());
+    // What making them takes is no reader's.
+    let _turn = TURN.lock().unwrap_or_else(std::sync::PoisonError::into_inner);
+    let mut made = MADE.lock().unwrap_or_else(std::sync::PoisonError::into_inner);
+    made.entry(format.name).or_insert_with(format.seeds).clone()
 }
 
 /// Gives a file of these bytes to the readers of a format and returns the most memory they held, in bytes.

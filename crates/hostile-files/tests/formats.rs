@@ -1,12 +1,12 @@
 //! Every format, with good files, damaged ones, and those that once were findings.
 
-use hostile_files::{FORMATS, Format, format, mutate, run};
+use hostile_files::{FORMATS, Format, format, mutate, run, seeds};
 use proptest::prelude::*;
 use std::path::Path;
 
 /// Damages the seeds of a format in one way.
 fn damage(format: &Format, which: usize, other: usize, seed: u64) {
-    let seeds = (format.seeds)();
+    let seeds = seeds(format);
     let bytes = mutate(&seeds[which % seeds.len()], &seeds[other % seeds.len()], seed);
     run(format, &bytes);
 }
@@ -42,7 +42,7 @@ fn findings_stay_mended() {
 #[test]
 fn good_files_take_little_memory() {
     for format in &FORMATS {
-        for seed in (format.seeds)() {
+        for seed in seeds(format) {
             let held = run(format, &seed);
             println!("{}: {held} bytes for {}", format.name, seed.len());
         }
@@ -54,13 +54,13 @@ fn names_that_lead_out_are_refused() {
     let escapes =
         ["../../x.png", "../x.png", "/dev/shm/x.png", "images/../../x.png", "..", ".", "", "images/..", "a/\\..\\x"];
     for name in escapes {
-        let seeds = (format("colmap_bin").seeds)();
-        let at = seeds[1].windows(6).position(|w| w == b"0.png\0").unwrap();
-        let mut bytes = seeds[1].clone();
+        let images = seeds(format("colmap_bin")).swap_remove(1);
+        let at = images.windows(6).position(|w| w == b"0.png\0").unwrap();
+        let mut bytes = images;
         bytes.splice(at..at + 5, name.bytes());
         run(format("colmap_bin"), &bytes);
         for kind in ["colmap_txt", "transforms"] {
-            for seed in (format(kind).seeds)() {
+            for seed in seeds(format(kind)) {
                 let text = String::from_utf8(seed).unwrap();
                 for good in ["0.png", "./images/0", "points.ply"] {
                     run(format(kind), text.replacen(good, name, 1).as_bytes());
