@@ -9,7 +9,7 @@ export THREADS
 # Stages at a time, where many scenes are run.
 JOBS ?= $(shell nproc)
 
-.PHONY: help build demo scene lerf-ovs scannet granularity check-data reproduce-check batch snakemake test lint models clip-tiny bench stress bench-raster bench-graph bench-geom bench-growth bench-memory bench-train bench-cluster bench-cluster-graph bench-query bench-granularity ablation dist clean
+.PHONY: help build demo scene lerf-ovs scannet granularity check-data reproduce-check batch snakemake test lint models clip-tiny bench stress bench-raster bench-graph bench-geom bench-growth bench-memory bench-train bench-cluster bench-cluster-graph bench-query bench-granularity ablation fault-test fuzz dist clean
 
 help: ## Say what can be made
 	@echo "Targets:"
@@ -65,6 +65,15 @@ test: ## Run all tests
 	scripts/test_pipeline.sh
 	scripts/test_benchmarks.sh
 	scripts/test_snakemake.sh
+
+SEED ?= 1
+TRIALS ?= 200
+fault-test: build ## Kill, starve, fill up, damage and change under it every stage (docs/faults.md; SEED, TRIALS kills)
+	scripts/fault-test --seed $(SEED) --trials $(TRIALS)
+
+FUZZ_SECONDS ?= 600
+fuzz: ## Fuzz every reader of files for FUZZ_SECONDS each (needs a nightly toolchain and cargo-fuzz; docs/faults.md)
+	scripts/fuzz.sh $(FUZZ_SECONDS)
 
 # PLYs to measure besides the synthetic scenes.
 SPLATS ?=

@@ -6,7 +6,8 @@ $(error say which scene and where to write: SCENE=folder OUT=folder)
 endif
 
 include $(CONF)
-SETTINGS := SCENE GEOMETRY MASKS SAM CLIP TEXTS EVERY SEED GEOM_ARGS MASK_ARGS GRAPH_ARGS FEAT_ARGS CLUSTER_ARGS SCORE_ARGS
+QUALITY ?= balanced
+SETTINGS := QUALITY SCENE GEOMETRY MASKS SAM CLIP TEXTS EVERY SEED GEOM_ARGS MASK_ARGS GRAPH_ARGS FEAT_ARGS CLUSTER_ARGS SCORE_ARGS
 include pipelines/settings.mk
 
 # LangSplat's masks and features where they are there; else SAM's, and CLIP's of them.

@@ -42,7 +42,7 @@ endif
 # $(OPTIONS)/NAME holds the options of stage NAME and is touched only when they change.
 $(OPTIONS)/%: FORCE
 	@mkdir -p $(@D)
-	@printf '%s\n' '$(subst ','\'',$($*_OPTIONS))' | cmp -s - $@ || printf '%s\n' '$(subst ','\'',$($*_OPTIONS))' > $@
+	@printf '%s\n' '$(subst ','\'',$($*_OPTIONS))' | cmp -s - $@ || { printf '%s\n' '$(subst ','\'',$($*_OPTIONS))' > $@.$$$$ && mv $@.$$$$ $@; }
 
 # The seed counts as an option; 0 is every stage's own.
 SEED_ARGS := $(addprefix --seed ,$(filter-out 0,$(SEED)))

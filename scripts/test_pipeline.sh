@@ -175,6 +175,11 @@ tiny "$work/k" 2 > "$work/k.log" 2>&1 || { cat "$work/k.log"; fail "make after k
 same "$work/a" "$work/k" || fail "kills changed the bytes"
 pass "after $kills kills make ends with the bytes of an undisturbed run"
 
+say "== faults"
+# The short form of make fault-test: kills, Ctrl-C, full disks, two runs at once, damage and changes, too little memory.
+scripts/fault-test --short --seed "$seed" > "$work/faults.log" 2>&1 || { cat "$work/faults.log"; fail "faults"; }
+pass "$(tail -1 "$work/faults.log")"
+
 say "== a small ablation"
 # One tiny scene, one p, four rows, and the ranges that their results must lie in (pipelines/ablation-small.plan).
 ablation() { make --no-print-directory -j 2 -f pipelines/ablation.mk PLAN="${plan:-pipelines/ablation-small.plan}" OUT="$work/ablation"; }

@@ -19,7 +19,7 @@ pub use footprints::{Footprints, FootprintsBuilder, PixelSamples, Row, ScratchEn
 pub use graph::Graph;
 pub use instances::{Family, Instances, Match, OrientedBox, TreeEdge};
 pub use lerf_ovs::{LERF_OVS, LerfScene};
-pub use masks::{LEVELS, Level, MaskFeatures, MaskMaps, features_path, hash_folder, maps_path, stems};
+pub use masks::{LEVELS, Level, MaskFeatures, MaskMaps, features_path, hash_folder, maps_path, stems, watch_folder};
 pub use nyu40::NYU40;
 pub use palette::{NOISE_COLOR, instance_color};
 pub use truth::{MaskTruth, TrueObject, TruePart, TruePoints, TrueScene};

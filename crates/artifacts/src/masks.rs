@@ -1,6 +1,6 @@
 //! Id maps and mask features in LangSplat's layout: `<stem>_s.npy` and `<stem>_f.npy` in one folder.
 
-use gs_io::{Error, IoContext, Result, hash_files, npy};
+use gs_io::{Error, IoContext, Result, Watched, hash_files, npy};
 use std::path::{Path, PathBuf};
 
 /// Levels of an id map file.
@@ -84,6 +84,16 @@ pub fn hash_folder(folder: impl AsRef<Path>, suffix: &str) -> Result<String> {
     hash_files(names.map(|n| (n.clone(), folder.join(n))))
 }
 
+/// Notes how the files that [`hash_folder`] would hash are now, for a stage that hashes them at one time and reads them at
+/// another.
+///
+/// # Errors
+/// When the folder cannot be read.
+pub fn watch_folder(folder: impl AsRef<Path>, suffix: &str) -> Result<Watched> {
+    let folder = folder.as_ref();
+    Ok(Watched::new(with_suffix(folder, suffix)?.into_iter().map(|s| folder.join(s + suffix))))
+}
+
 /// The id maps of one view.
 #[derive(Debug, Clone, PartialEq)]
 pub struct MaskMaps {
@@ -103,7 +113,8 @@ impl MaskMaps {
     /// Reads `*_s.npy`: any real dtype, `[4, H, W]` (or `[1, H, W]` and `[H, W]`: one level for all four).
     ///
     /// # Errors
-    /// When the file is damaged, has another shape, or an id is not a whole number of at least -1.
+    /// When the file is damaged, has another shape, or an id is not a whole number of at least -1 or out of proportion to
+    /// the number of pixels.
     pub fn read(path: impl AsRef<Path>) -> Result<Self> {
         let path = path.as_ref();
         let a = npy::read_f32(path)?;
@@ -119,13 +130,15 @@ impl MaskMaps {
                 .found(format!("{:?}", a.shape))
                 .expected("[4, height, width]"));
         }
-        if let Some(at) = a.data.iter().position(|&v| v.fract() != 0.0 || !(-1.0..Self::MAX_ID).contains(&v)) {
+        // Tables with a row for each id are made from this: ids are dense, so there are no more of them than pixels.
+        let most = Self::MAX_ID.min((levels * height * width).max(1 << 16) as f32);
+        if let Some(at) = a.data.iter().position(|&v| v.fract() != 0.0 || !(-1.0..most).contains(&v)) {
             let (x, y, l) = (at % width, at / width % height, at / (width * height));
             return Err(Error::new("not a mask id")
                 .file(path)
                 .field(format!("level {l}, row {y}, column {x}"))
                 .found(a.data[at])
-                .expected("-1 or a whole number from 0")
+                .expected(format!("-1 or a whole number from 0, below {most}"))
                 .hint("id maps must not be interpolated or blended"));
         }
         let mut ids: Vec<i32> = a.data.iter().map(|&v| v as i32).collect();

@@ -11,7 +11,7 @@ use artifacts::{
     instance_color, maps_path, role,
 };
 use clap::Parser;
-use gs_io::{Error, IoContext, Result, hash_file, write_bytes};
+use gs_io::{Error, IoContext, Lock, Result, Watched, hash_file, write_bytes};
 use gs_raster::RasterOptions;
 use gs_scene::dataset::{self, LoadOptions, Resolution, View};
 use gs_scene::{Gaussians, Geometry, SH_C0, ply};
@@ -308,6 +308,11 @@ fn run(a: &Args, stage: &Stage) -> Result<()> {
             .found(format!(".{taken}"))
             .expected("a name such as instances.safetensors"));
     }
+    let _lock = Lock::take(&a.out)?;
+    let mut watched = Watched::new([&a.geometry]);
+    for suffix in ["_s.npy", "_f.npy"] {
+        watched = watched.and(artifacts::watch_folder(&a.masks, suffix)?);
+    }
     let inputs = read_inputs(a, stage)?;
     let (n_all, n) = (inputs.geometry.gaussians.len(), inputs.graph.kept.len());
     let options = options(c, n)?;
@@ -364,6 +369,7 @@ fn run(a: &Args, stage: &Stage) -> Result<()> {
     let views = inputs.views.iter().map(|v| v.stem().to_string()).collect();
     let described = describe(means, labels, instances, matches, views, &features, m.aggregate, tree);
     let instances = Instances { node: nodes, ..described };
+    watched.check()?;
     write_outputs(a, stage, &inputs, &instances, &options, (noise, clustering_seconds))
 }
 

@@ -9,6 +9,8 @@ use std::path::Path;
 
 /// Largest width or height of a labelled frame that is believed, in pixels.
 const MAX_SIDE: u64 = 1 << 15;
+/// Pixels that the masks of all categories of a frame may have at most: a small file of polygons can ask for any number.
+const MAX_PIXELS: u64 = 1 << 28;
 
 /// The labels of one frame.
 #[derive(Debug, Clone, PartialEq)]
@@ -90,6 +92,16 @@ pub fn read(path: impl AsRef<Path>) -> Result<FrameLabels> {
         }
     }
     let (width, height) = (isat.info.width as u32, isat.info.height as u32);
+    let names: std::collections::BTreeSet<&str> = isat.objects.iter().map(|o| o.category.as_str()).collect();
+    let pixels = isat.info.width * isat.info.height * names.len() as u64;
+    if pixels > MAX_PIXELS {
+        return Err(Error::new("too many pixels in the masks of all categories")
+            .file(path)
+            .field("info.width, info.height")
+            .found(format!("{}x{} for each of {}", isat.info.width, isat.info.height, names.len()))
+            .expected(format!("at most {MAX_PIXELS}"))
+            .hint("check the size, or shrink photographs and labels"));
+    }
     let mut categories = BTreeMap::new();
     let mut boxes = BTreeMap::<String, Vec<[f64; 4]>>::new();
     for object in &isat.objects {
@@ -116,8 +128,7 @@ pub const GREY: u8 = 10;
 /// When the file cannot be read as a picture.
 pub fn read_mask(path: &Path) -> Result<Mask> {
     let bytes = std::fs::read(path).at("read", path)?;
-    let grey =
-        image::load_from_memory(&bytes).map_err(|e| Error::new(format!("not a picture: {e}")).file(path))?.to_luma8();
+    let grey = gs_scene::decode_image(&bytes, path)?.to_luma8();
     let (width, height) = (grey.width() as usize, grey.height() as usize);
     Ok(Mask { width, height, bits: grey.into_raw().into_iter().map(|v| v > GREY).collect() })
 }
@@ -210,7 +221,7 @@ mod tests {
         image::GrayImage::new(3, 2).save(place.join("spoon.png")).unwrap();
         assert!(read_pictures(dir.path()).unwrap_err().to_string().contains("differ in size; found 3x2, expected 4x2"));
         std::fs::write(place.join("spoon.png"), "no").unwrap();
-        assert!(read_pictures(dir.path()).unwrap_err().to_string().contains("spoon.png: not a picture"));
+        assert!(read_pictures(dir.path()).unwrap_err().to_string().contains("spoon.png: not a readable picture"));
     }
 
     #[test]

@@ -1,7 +1,7 @@
 //! What every command loads: instances with their geometry, and the views of the scene.
 
 use artifacts::{Instances, role};
-use gs_io::{Artifact, Error, Result, hash_file};
+use gs_io::{Artifact, Error, Result, Watched, hash_file};
 use gs_raster::RasterOptions;
 use gs_scene::dataset::{Dataset, View};
 use gs_scene::{Gaussians, Geometry};
@@ -29,10 +29,12 @@ impl LabelledScene {
     /// When a file is missing or damaged, or the instances belong to another geometry.
     pub fn read(instances: &Path, geometry: &Path) -> Result<Self> {
         let (labelled, artifact) = Instances::read(instances)?;
+        let watched = Watched::new([geometry]);
         let geometry_hash = hash_file(geometry)?;
         artifact.expect_input(role::GEOMETRY, &geometry_hash)?;
         let path = geometry;
         let geometry = Geometry::read(path)?;
+        watched.check()?;
         if labelled.label.len() != geometry.gaussians.len() {
             return Err(Error::new("not a label per Gaussian")
                 .file(instances)

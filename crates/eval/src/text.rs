@@ -69,16 +69,20 @@ fn read_npz(bytes: &[u8]) -> Result<BTreeMap<String, Vec<f32>>> {
         |e: zip::result::ZipError| Error::new(format!("not an npz file: {e}")).hint("write it with numpy.savez");
     let mut archive = zip::ZipArchive::new(std::io::Cursor::new(bytes)).map_err(broken)?;
     let mut features = BTreeMap::new();
+    // All arrays together: entries may be packed a thousandfold, and several may be the same bytes of the file.
+    let mut left = (64 * bytes.len() as u64).max(LARGEST_ARRAY);
     for i in 0..archive.len() {
         let mut entry = archive.by_index(i).map_err(broken)?;
         let name = entry.name().trim_end_matches(".npy").to_string();
         let mut data = Vec::new();
         // Not the size that the file claims, but what comes out.
-        let read = (&mut entry).take(LARGEST_ARRAY + 1).read_to_end(&mut data);
+        let most = LARGEST_ARRAY.min(left);
+        let read = (&mut entry).take(most + 1).read_to_end(&mut data);
         read.map_err(|e| Error::new(format!("not an npz file: {e}")).field(&name).hint("write it with numpy.savez"))?;
-        if data.len() as u64 > LARGEST_ARRAY {
+        if data.len() as u64 > most {
             return Err(Error::new("too large for a text feature").field(&name).expected("a vector per name"));
         }
+        left -= data.len() as u64;
         let array = gs_io::npy::parse(&data).map_err(|e| e.field(&name))?;
         if !matches!(array.shape[..], [_] | [1, _]) {
             let e = Error::new("not a vector").field(&name).found(format!("{:?}", array.shape));

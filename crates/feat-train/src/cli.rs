@@ -12,7 +12,7 @@ use crate::spectral::{SpectralOptions, spectral};
 use crate::train::{CurvePoint, TrainOptions, train};
 use artifacts::{Features, Footprints, Graph, Level, role};
 use clap::ValueEnum;
-use gs_io::{Error, Result, hash_file, write_bytes};
+use gs_io::{Error, Lock, Result, Watched, hash_file, write_bytes};
 use gs_scene::{Geometry, SH_C0};
 use serde_json::{Value, json};
 use stage::curve::{self, Panel};
@@ -426,6 +426,8 @@ impl Program for Args {
 
     fn run(self, stage: &Stage) -> Result<()> {
         self.check()?;
+        let _lock = Lock::take(&self.out)?;
+        let watched = Watched::new([&self.geometry]);
         let inputs = self.read_inputs()?;
         let (dim, values, summary) = match self.method() {
             Method::Contrastive if self.contrastive.half_weights => self.contrastive::<Half>(&inputs, stage)?,
@@ -438,6 +440,7 @@ impl Program for Args {
         }
         let parameters = Value::Object(parameters);
         let features = Features { kept: inputs.graph.kept, dim, values };
+        watched.check()?;
         features.write(&self.out, stage.provenance("", 0, parameters.clone(), inputs.hashes.clone()))?;
         // The run is done: what is left of it must not be mistaken for an unfinished one.
         let _ = std::fs::remove_file(checkpoint::path(&self.out));

@@ -3,7 +3,7 @@
 use crate::graph::{GraphOptions, Space};
 use crate::precompute::{Options, precompute};
 use artifacts::{ScratchEntries, role};
-use gs_io::{Error, Result, hash_file};
+use gs_io::{Error, Lock, Result, Watched, hash_file};
 use gs_scene::Geometry;
 use gs_scene::dataset::{self, LoadOptions, Resolution, Split, View};
 use serde_json::{Value, json};
@@ -163,6 +163,8 @@ impl Program for Args {
 
     fn run(self, stage: &Stage) -> Result<()> {
         let options = self.options()?;
+        let _locks = [Lock::take(&self.graph)?, Lock::take(&self.footprints)?];
+        let watched = Watched::new([&self.geometry]).and(artifacts::watch_folder(&self.masks, "_s.npy")?);
         // The id maps' own size decides the resolution, so photographs count at full size.
         let load = LoadOptions { resolution: Resolution::Divisor(1.0), holdout: self.holdout };
         let dataset = dataset::load(&self.scene, &load)?;
@@ -186,6 +188,7 @@ impl Program for Args {
                 true => Error::new("all views are held out").file(&self.scene).hint("give --views all or --holdout 0"),
                 false => e,
             })?;
+        watched.check()?;
         let provenance = || stage.provenance("", 0, self.parameters(), inputs.clone());
         footprints.write_with(entries, &self.footprints, provenance())?;
         graph.write(&self.graph, provenance())?;

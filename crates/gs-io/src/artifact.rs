@@ -4,16 +4,31 @@
 //! writes several keys in an order that changes from run to run. It holds format, version, the program and its version,
 //! the parameters that shaped the data, and the content hash of each input. Nothing in it depends on the time, the
 //! machine, a path or the number of threads: same inputs, same parameters, same bytes.
+//!
+//! The first entry of that JSON is a checksum of the whole file, so that a flipped bit anywhere in it is noticed when it is
+//! read, not taken for a feature: the BLAKE3 hash of the file with 64 zeros in the place of the checksum's digits.
 
 use crate::{Error, IoContext, Result, hash_bytes, write_atomic};
 use safetensors::tensor::{Dtype, Metadata, SafeTensors, TensorInfo};
 use serde::{Deserialize, Serialize};
 use std::collections::{BTreeMap, HashMap};
 use std::fs::File;
-use std::io::{Seek, SeekFrom};
+use std::io::{Read, Seek, SeekFrom};
 use std::path::{Path, PathBuf};
 
 const KEY: &str = "cags";
+
+/// What the checksum is made over in its own place: it is the BLAKE3 hash of the file with these 64 zeros.
+const NO_CHECKSUM: &str = "0000000000000000000000000000000000000000000000000000000000000000";
+/// What stands before the checksum's digits in the file's header, where the JSON is a string within JSON.
+const BEFORE_CHECKSUM: &[u8] = br#""{\"checksum\":\""#;
+
+/// Where the checksum's digits lie in a file, if it has one.
+fn checksum_at(header: &[u8]) -> Option<std::ops::Range<usize>> {
+    let start = header.windows(BEFORE_CHECKSUM.len()).position(|w| w == BEFORE_CHECKSUM)? + BEFORE_CHECKSUM.len();
+    let range = start..start + NO_CHECKSUM.len();
+    (range.end <= header.len()).then_some(range)
+}
 
 /// What an artifact says of itself.
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
@@ -90,6 +105,7 @@ impl<'a> ArtifactWriter<'a> {
         let path = path.as_ref();
         let fail = |e: &dyn std::fmt::Display| Error::new(format!("cannot serialise: {e}")).file(path);
         let json = serde_json::to_string(&self.provenance).map_err(|e| fail(&e))?;
+        let json = format!("{{\"checksum\":\"{NO_CHECKSUM}\",{}", &json[1..]);
         // The format's order: larger elements first, so that all are aligned; then by name.
         let mut tensors: Vec<_> = self.tensors.into_iter().collect();
         tensors.sort_by(|(a, (x, ..)), (b, (y, ..))| y.cmp(x).then_with(|| a.cmp(b)));
@@ -111,6 +127,19 @@ impl<'a> ArtifactWriter<'a> {
         let metadata = Metadata::new(Some(HashMap::from([(KEY.to_string(), json)])), infos).map_err(|e| fail(&e))?;
         let mut header = serde_json::to_vec(&metadata).map_err(|e| fail(&e))?;
         header.resize(header.len().next_multiple_of(8), b' ');
+        let mut hasher = blake3::Hasher::new();
+        hasher.update(&(header.len() as u64).to_le_bytes()).update(&header);
+        for (_, (_, _, source)) in &mut tensors {
+            match source {
+                Source::Memory(bytes) => _ = hasher.update(bytes),
+                Source::File(file) => {
+                    file.seek(SeekFrom::Start(0)).at("read the scratch file of", path)?;
+                    hasher.update_reader(file).at("read the scratch file of", path)?;
+                }
+            }
+        }
+        let digits = checksum_at(&header).ok_or_else(|| fail(&"no place for the checksum"))?;
+        header[digits].copy_from_slice(hasher.finalize().to_hex().as_bytes());
         write_atomic(path, |out| {
             out.write_all(&(header.len() as u64).to_le_bytes()).at("write", path)?;
             out.write_all(&header).at("write", path)?;
@@ -128,11 +157,14 @@ impl<'a> ArtifactWriter<'a> {
     }
 }
 
-/// An artifact opened for reading, memory-mapped.
+/// An artifact, read and checked. It is held in memory, not mapped: a program that writes into the file or cuts it short
+/// while a stage works on it would change numbers that were checked, or end the stage by a signal.
 #[derive(Debug)]
 pub struct Artifact {
     path: PathBuf,
-    map: memmap2::Mmap,
+    /// The file, in words so that its tensors are aligned; the last may be longer than the file.
+    words: Vec<u64>,
+    length: usize,
     provenance: Provenance,
     hash: String,
 }
@@ -144,19 +176,26 @@ impl Artifact {
     /// When the file is missing, damaged, of another format or version.
     pub fn open(path: impl AsRef<Path>, format: &str, version: u32) -> Result<Self> {
         let path = path.as_ref();
-        let file = File::open(path).at("open", path)?;
-        if file.metadata().at("read", path)?.len() == 0 {
+        let mut file = File::open(path).at("open", path)?;
+        let length = file.metadata().at("read", path)?.len() as usize;
+        if length == 0 {
             return Err(Error::new("the file is empty").file(path).hint("run the stage that makes it again"));
         }
-        // SAFETY: the map is read-only and artifacts are never modified in place: writers rename a finished file over
-        // the name, which leaves this inode as it was. A foreign program that truncates the file under us is outside
-        // what any reader of mapped files can defend against.
-        let map = unsafe { memmap2::Mmap::map(&file) }.at("map", path)?;
+        let mut words = vec![0u64; length.div_ceil(8)];
+        file.read_exact(&mut bytemuck::cast_slice_mut(&mut words)[..length]).at("read", path)?;
+        let bytes: &[u8] = &bytemuck::cast_slice(&words)[..length];
         let damaged = |e: &dyn std::fmt::Display| {
             Error::new(format!("not a safetensors artifact: {e}")).file(path).hint("run the stage that makes it again")
         };
-        let (_, metadata) = SafeTensors::read_metadata(&map).map_err(|e| damaged(&e))?;
-        SafeTensors::deserialize(&map).map_err(|e| damaged(&e))?;
+        let (header, metadata) = SafeTensors::read_metadata(bytes).map_err(|e| damaged(&e))?;
+        SafeTensors::deserialize(bytes).map_err(|e| damaged(&e))?;
+        // A tensor without elements takes no room whatever its other extents say; nothing real is wider than this.
+        let widest = length.max(1 << 16);
+        for (name, tensor) in metadata.tensors() {
+            if tensor.shape.iter().any(|&extent| extent > widest) {
+                return Err(damaged(&"an extent is out of proportion to the file").field(name));
+            }
+        }
         let json = metadata.metadata().as_ref().and_then(|m| m.get(KEY)).ok_or_else(|| {
             Error::new("no provenance: not written by this program").file(path).field(format!("__metadata__.{KEY}"))
         })?;
@@ -169,8 +208,23 @@ impl Artifact {
                 .expected(format!("{format} version {version}"))
                 .hint("check the order of the arguments, or run the stage that makes it again"));
         }
-        let hash = hash_bytes(&map);
-        Ok(Self { path: path.to_path_buf(), map, provenance, hash })
+        // Artifacts of before there was a checksum have none.
+        if let Some(at) = checksum_at(&bytes[..bytes.len().min(8 + header)]) {
+            let mut hasher = blake3::Hasher::new();
+            hasher.update(&bytes[..at.start]).update(NO_CHECKSUM.as_bytes()).update(&bytes[at.end..]);
+            if hasher.finalize().to_hex().as_bytes() != &bytes[at] {
+                return Err(Error::new("the file is damaged: its content does not have its checksum")
+                    .file(path)
+                    .field("checksum")
+                    .hint("copy it again, or delete it and run the stage that makes it"));
+            }
+        }
+        let hash = hash_bytes(bytes);
+        Ok(Self { path: path.to_path_buf(), words, length, provenance, hash })
+    }
+
+    fn bytes(&self) -> &[u8] {
+        &bytemuck::cast_slice(&self.words)[..self.length]
     }
 
     /// What the artifact says of itself.
@@ -190,7 +244,7 @@ impl Artifact {
 
     /// Whether there is a tensor `name`.
     pub fn has(&self, name: &str) -> bool {
-        SafeTensors::deserialize(&self.map).is_ok_and(|t| t.tensor(name).is_ok())
+        SafeTensors::deserialize(self.bytes()).is_ok_and(|t| t.tensor(name).is_ok())
     }
 
     /// The tensor `name`, without a copy. `shape` gives the expected extents, `None` where any will do.
@@ -199,7 +253,7 @@ impl Artifact {
     /// When the tensor is missing, of another type or shape.
     pub fn tensor<T: Element>(&self, name: &str, shape: &[Option<usize>]) -> Result<&[T]> {
         let fail = |what: &str| Error::new(what).file(&self.path).field(name).hint("run the stage that makes it again");
-        let tensors = SafeTensors::deserialize(&self.map).map_err(|e| fail(&e.to_string()))?;
+        let tensors = SafeTensors::deserialize(self.bytes()).map_err(|e| fail(&e.to_string()))?;
         let view = tensors.tensor(name).map_err(|_| fail("missing tensor"))?;
         let fits =
             view.shape().len() == shape.len() && view.shape().iter().zip(shape).all(|(&s, e)| e.is_none_or(|e| e == s));
@@ -209,16 +263,16 @@ impl Artifact {
                 .found(format!("{:?} {:?}", view.dtype(), view.shape()))
                 .expected(format!("{:?} [{}]", T::DTYPE, want.join(", "))));
         }
-        // `view` borrows the map only through a local header; take the same bytes from the map itself.
+        // `view` borrows the file only through a local header; take the same bytes from the file itself.
         let data = view.data();
-        let start = data.as_ptr() as usize - self.map.as_ptr() as usize;
-        bytemuck::try_cast_slice(&self.map[start..start + data.len()])
+        let start = data.as_ptr() as usize - self.bytes().as_ptr() as usize;
+        bytemuck::try_cast_slice(&self.bytes()[start..start + data.len()])
             .map_err(|_| fail("the tensor's data is not aligned"))
     }
 
     /// The shape of tensor `name`, if there is one.
     pub fn shape(&self, name: &str) -> Option<Vec<usize>> {
-        SafeTensors::deserialize(&self.map).ok()?.tensor(name).ok().map(|v| v.shape().to_vec())
+        SafeTensors::deserialize(self.bytes()).ok()?.tensor(name).ok().map(|v| v.shape().to_vec())
     }
 
     /// Checks that this artifact was made from the input of the given role with this hash.
@@ -279,6 +333,31 @@ mod tests {
     }
 
     #[test]
+    fn files_without_a_checksum_are_read_and_one_that_does_not_fit_is_named() {
+        let dir = tempfile::tempdir().unwrap();
+        let p = dir.path().join("a.safetensors");
+        let metadata = HashMap::from([(KEY.to_string(), serde_json::to_string(&sample().provenance).unwrap())]);
+        let tensors: [(&str, safetensors::tensor::TensorView<'_>); 0] = [];
+        std::fs::write(&p, safetensors::serialize(tensors, Some(metadata)).unwrap()).unwrap();
+        assert!(!Artifact::open(&p, "sample", 1).unwrap().has("a"));
+        sample().write(&p).unwrap();
+        let mut bytes = std::fs::read(&p).unwrap();
+        *bytes.last_mut().unwrap() ^= 1;
+        std::fs::write(&p, bytes).unwrap();
+        let e = Artifact::open(&p, "sample", 1).unwrap_err().to_string();
+        assert!(e.contains("a.safetensors: checksum: the file is damaged"), "{e}");
+    }
+
+    #[test]
+    fn an_empty_tensor_of_an_absurd_width_is_refused() {
+        let dir = tempfile::tempdir().unwrap();
+        let p = dir.path().join("a.safetensors");
+        sample().tensor::<f32>("c", &[0, 1 << 40], &[]).write(&p).unwrap();
+        let e = Artifact::open(&p, "sample", 1).unwrap_err().to_string();
+        assert!(e.contains("c: not a safetensors artifact: an extent"), "{e}");
+    }
+
+    #[test]
     fn files_are_those_of_safetensors_itself_and_tensors_may_come_from_files() {
         let dir = tempfile::tempdir().unwrap();
         let p = dir.path().join("a.safetensors");
@@ -313,7 +392,8 @@ mod tests {
             std::fs::write(&p, &bytes).unwrap();
             let opened = Artifact::open(&p, "sample", 1);
             if cut > 0 { prop_assert!(opened.is_err()); }
-            if let Ok(a) = opened { let _ = a.tensor::<f32>("a", &[None, None]); }
+            // The writer's number in a field that is not read ahead of the checksum: nothing is taken as it is.
+            prop_assert!(opened.is_err(), "a flipped bit at {at} of {} was not noticed", bytes.len());
         }
     }
 }

@@ -2,15 +2,20 @@
 //!
 //! Everything a stage does to the file system goes through this crate, so that the promises hold in one place:
 //! an error is one line that names file, field, what was found, what was expected and what to do ([`Error`]);
-//! an output appears whole or not at all ([`write_atomic`]); an artifact says what it was made from ([`artifact`]).
+//! an output appears whole or not at all ([`write_atomic`]);
+//! one run at a time works on an output ([`Lock`]); inputs that change meanwhile are noticed ([`Watched`]); an artifact says what it was made from ([`artifact`]).
 
 pub mod artifact;
 mod atomic;
 mod error;
 mod hash;
+mod lock;
 pub mod npy;
+mod watch;
 
 pub use artifact::{Artifact, ArtifactWriter, Provenance};
 pub use atomic::{create_dir, write_atomic, write_bytes};
 pub use error::{Error, IoContext, Result};
 pub use hash::{hash_bytes, hash_file, hash_files};
+pub use lock::Lock;
+pub use watch::Watched;

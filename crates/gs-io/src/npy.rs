@@ -66,9 +66,14 @@ pub fn parse(bytes: &[u8]) -> Result<Npy<f32>> {
     for part in inner.split(',').map(str::trim).filter(|p| !p.is_empty()) {
         shape.push(part.parse::<usize>().map_err(|_| bad("not a whole number").field("shape").found(part))?);
     }
+    // An array without elements takes no room whatever its other extents say; nothing real is wider than this.
+    if let Some(&wide) = shape.iter().find(|&&extent| extent > bytes.len().max(1 << 16)) {
+        return Err(bad("an extent is out of proportion to the file").field("shape").found(wide));
+    }
     let count = shape.iter().try_fold(1usize, |a, &b| a.checked_mul(b));
     let body = &bytes[end..];
-    let (order, kind) = descr.split_at(descr.len().min(1));
+    // A first character that is none of ASCII's is no byte order either.
+    let (order, kind) = descr.split_at_checked(1).unwrap_or((descr, ""));
     let size: usize = kind.get(1..).and_then(|s| s.parse().ok()).unwrap_or(0);
     if order == ">" {
         return Err(bad("big-endian arrays are not supported").field("descr").found(descr).expected("little-endian"));

@@ -34,6 +34,25 @@ pub fn size_of(path: impl AsRef<Path>) -> Result<(u32, u32)> {
     reader.into_dimensions().map_err(|e| unreadable(path, &e))
 }
 
+/// Decodes a PNG or JPEG that was read from `path`. EXIF orientation is ignored.
+///
+/// # Errors
+/// When it is no picture, or claims more pixels than so many bytes can hold.
+pub fn decode(bytes: &[u8], path: &Path) -> Result<DynamicImage> {
+    let reader = || ImageReader::new(Cursor::new(bytes)).with_guessed_format().at("read", path);
+    let (w, h) = reader()?.into_dimensions().map_err(|e| unreadable(path, &e))?;
+    let most = MAX_PIXELS.min((bytes.len() as u64).saturating_mul(MAX_PIXELS_PER_BYTE));
+    if u64::from(w) * u64::from(h) > most {
+        return Err(Error::new("the picture is too large, or its header lies")
+            .file(path)
+            .field("size")
+            .found(format!("{w}x{h} in {} bytes", bytes.len()))
+            .expected(format!("at most {most} pixels"))
+            .hint("shrink it, or copy it again"));
+    }
+    reader()?.decode().map_err(|e| unreadable(path, &e))
+}
+
 /// Whether a picture file has an alpha channel, from its header.
 ///
 /// # Errors
@@ -73,19 +92,8 @@ impl Image {
     /// When the file cannot be read, is no picture, or is too large.
     pub fn read(path: impl AsRef<Path>) -> Result<Self> {
         let path = path.as_ref();
-        let (w, h) = size_of(path)?;
-        let bytes = std::fs::metadata(path).at("read", path)?.len();
-        let most = MAX_PIXELS.min(bytes.saturating_mul(MAX_PIXELS_PER_BYTE));
-        if u64::from(w) * u64::from(h) > most {
-            return Err(Error::new("the picture is too large, or its header lies")
-                .file(path)
-                .field("size")
-                .found(format!("{w}x{h} in {bytes} bytes"))
-                .expected(format!("at most {most} pixels"))
-                .hint("shrink it, or copy it again"));
-        }
-        let reader = ImageReader::open(path).at("open", path)?.with_guessed_format().at("read", path)?;
-        let decoded = reader.decode().map_err(|e| unreadable(path, &e))?;
+        let decoded = decode(&std::fs::read(path).at("read", path)?, path)?;
+        let (w, h) = (decoded.width(), decoded.height());
         if !decoded.color().has_alpha() {
             return Ok(Self::from_rgb8(w, h, decoded.to_rgb8().as_raw()));
         }

@@ -3,7 +3,7 @@
 use crate::args::{CropsArgs, EmbedArgs};
 use crate::{finished, photographs};
 use artifacts::{Level, MaskFeatures, MaskMaps, features_path, hash_folder, maps_path, role};
-use gs_io::{ArtifactWriter, Error, Result, create_dir, hash_file};
+use gs_io::{ArtifactWriter, Error, Lock, Result, Watched, create_dir, hash_file};
 use gs_scene::dataset::View;
 use onnx_models::{ClipImage, LabelMap, RgbImage, crop_mask, mask_bounds};
 use serde::{Deserialize, Serialize};
@@ -73,6 +73,9 @@ pub fn run(args: &EmbedArgs, stage: &Stage) -> Result<()> {
     let out = args.out.as_ref().unwrap_or(&args.masks);
     create_dir(out)?;
     let manifest = out.join("features.json");
+    let _lock = Lock::take(&manifest)?;
+    let watched =
+        Watched::new(scene.views.iter().map(|v| &v.image_path)).and(artifacts::watch_folder(&args.masks, "_s.npy")?);
     let engine = if args.engine.onnx_runtime.is_some() { "onnxruntime" } else { "rten" };
     let parameters = json!({
         "model": clip.config(), "image_size": clip.size(), "dimension": clip.dimension(),
@@ -99,6 +102,7 @@ pub fn run(args: &EmbedArgs, stage: &Stage) -> Result<()> {
             let (features, pictures) = embed(&clip, &image, &maps)?;
             let shown = features.values.chunks(features.dim).filter(|r| r.iter().any(|&v| v != 0.0)).count();
             let facts = Facts { masks: features.count, features: shown, pictures };
+            watched.check()?;
             finished::remove_manifest(&manifest)?;
             features.write(&output)?;
             finished::write(&output, &key, facts)?
@@ -118,6 +122,7 @@ pub fn run(args: &EmbedArgs, stage: &Stage) -> Result<()> {
     if pictures < masks {
         stage.skipped(&format!("{} of {masks} masks: the same pictures as masks of other levels", masks - pictures));
     }
+    watched.check()?;
     let inputs = BTreeMap::from([
         (role::DATASET.to_string(), dataset_hash),
         (role::MASKS.to_string(), hash_folder(&args.masks, "_s.npy")?),

@@ -20,8 +20,10 @@ struct Labels {
 
 fn read(path: &Path) -> Result<Labels> {
     let bytes = std::fs::read(path).at("read", path)?;
-    let picture = image::load_from_memory_with_format(&bytes, image::ImageFormat::Png)
-        .map_err(|e| Error::new(format!("not a readable PNG: {e}")).file(path).hint("make or copy it again"))?;
+    if image::guess_format(&bytes).ok() != Some(image::ImageFormat::Png) {
+        return Err(Error::new("not a readable PNG").file(path).hint("make or copy it again"));
+    }
+    let picture = gs_scene::decode_image(&bytes, path)?;
     let (width, height) = (picture.width() as usize, picture.height() as usize);
     let values = match picture {
         DynamicImage::ImageLuma8(p) => p.into_raw().into_iter().map(u16::from).collect(),

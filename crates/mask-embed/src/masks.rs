@@ -6,7 +6,7 @@ use crate::paint::{paint, preview};
 use crate::sam::Sam;
 use crate::{finished, photographs};
 use artifacts::{LEVELS, Level, MaskMaps, maps_path, role};
-use gs_io::{Error, Result, create_dir};
+use gs_io::{Error, Lock, Result, Watched, create_dir};
 use gs_scene::Image;
 use gs_scene::dataset::View;
 use onnx_models::RgbImage;
@@ -42,6 +42,8 @@ pub fn run(args: &MasksArgs, stage: &Stage) -> Result<()> {
     let sam = Sam::open(&args.sam, &args.engine.options())?;
     create_dir(&args.out)?;
     let manifest = args.out.join("masks.json");
+    let _lock = Lock::take(&manifest)?;
+    let watched = Watched::new(scene.views.iter().map(|v| &v.image_path));
     let choice = args.choice.choice();
     let engine = if args.engine.onnx_runtime.is_some() { "onnxruntime" } else { "rten" };
     let parameters = json!({
@@ -98,6 +100,7 @@ pub fn run(args: &MasksArgs, stage: &Stage) -> Result<()> {
     if asked < points {
         stage.skipped(&format!("{} of {points} points: within masks already found", points - asked));
     }
+    watched.check()?;
     let mut inputs = BTreeMap::from([(role::DATASET.to_string(), dataset_hash)]);
     inputs.insert("sam".into(), sam.hash().to_string());
     let mut provenance = stage.provenance("masks", 1, parameters.clone(), inputs.clone());

@@ -13,7 +13,7 @@ use crate::scannet;
 use crate::scene::Scene;
 use artifacts::{MaskTruth, TrueObject, TruePart, TruePoints, TrueScene, features_path, maps_path};
 use clap::ValueEnum;
-use gs_io::{Error, IoContext, Result, create_dir, npy, write_bytes};
+use gs_io::{Error, IoContext, Lock, Result, create_dir, npy, write_bytes};
 use gs_scene::{Camera, Image, PointCloud, colmap};
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
@@ -196,6 +196,7 @@ pub fn stem(view: usize) -> String {
 /// # Errors
 /// When a file cannot be written, when `out` holds another dataset, or when the stage is interrupted.
 pub fn run(stage: &Stage, out: &Path, options: &Options) -> Result<()> {
+    let _lock = Lock::take(out)?;
     prepare(out, &options.layout)?;
     let scene = options.scene();
     let parameters = options.parameters(&scene);
@@ -275,6 +276,7 @@ pub fn run(stage: &Stage, out: &Path, options: &Options) -> Result<()> {
 /// When a file cannot be written, when `folder` holds something else, or when the stage is interrupted.
 pub fn run_masks(stage: &Stage, folder: &Path, options: &Options) -> Result<()> {
     let marker = folder.join("masks.json");
+    let _lock = Lock::take(folder)?;
     prepare_masks(folder, &marker)?;
     let scene = options.scene();
     let cameras = options.cameras(&scene);

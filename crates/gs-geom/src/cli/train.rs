@@ -15,7 +15,7 @@ use crate::schedule::{LearningRates, Schedule};
 use crate::train::{Timings, TrainOptions, Trainer};
 use artifacts::role;
 use clap::ValueEnum;
-use gs_io::{Error, Provenance, Result, hash_file, write_bytes};
+use gs_io::{Error, Lock, Provenance, Result, Watched, hash_file, write_bytes};
 use gs_raster::{RasterOptions, TILE, forward};
 use gs_scene::dataset::{Dataset, Split, View};
 use gs_scene::{Camera, Gaussians, PointCloud, image_size, ply};
@@ -304,6 +304,8 @@ impl TrainArgs {
                 .hint("give --holdout 0, or more photographs"));
         }
         check_writable(&self.out)?;
+        let _lock = Lock::take(&self.out)?;
+        let watched = self.watched(&dataset);
         let masks = self.masks.load(&dataset, stage)?;
         let photographs = Photographs::load(train.clone(), masks.clone(), self.cache_bytes())?;
         options.schedule.coarse = self.coarse(&self.gains(&photographs)?, self.iterations);
@@ -357,11 +359,13 @@ impl TrainArgs {
         let heldout = Photographs::load(heldout, masks, left)?;
         let mut trainer = Trainer::resume(options, extent, photographs, heldout, state);
         let before = stage::cpu_seconds();
-        let done = self.optimise(&mut trainer, &run, stage).and_then(|done| match done {
-            true => self.finish(&trainer, &run, &forecast, (plan, spent_since(before)), stage),
+        let done = self.optimise(&mut trainer, &run, &watched, stage).and_then(|done| match done {
+            true => watched
+                .check()
+                .and_then(|()| self.finish(&trainer, &run, &forecast, (plan, spent_since(before)), stage)),
             false => Ok(()),
         });
-        done.inspect_err(|_| self.rescue(&trainer, &run, stage))
+        done.inspect_err(|_| self.rescue(&trainer, &run, &watched, stage))
     }
 
     /// Says how much memory the run will take, with the Gaussians there are and with the most there may be.
@@ -414,13 +418,22 @@ impl TrainArgs {
         Ok(forecast)
     }
 
+    /// The files that are hashed at one time and read at another.
+    fn watched(&self, dataset: &Dataset) -> Watched {
+        let init = match &self.init {
+            Init::File(path) => Some(path),
+            _ => None,
+        };
+        Watched::new(dataset.views.iter().map(|v| &v.image_path).chain(init))
+    }
+
     /// Saves what a failing run has done. An interrupted one has done so already.
-    fn rescue(&self, trainer: &Trainer<'_>, run: &Provenance, stage: &Stage) {
+    fn rescue(&self, trainer: &Trainer<'_>, run: &Provenance, watched: &Watched, stage: &Stage) {
         let iteration = trainer.state().progress.iteration;
         if stage.interrupted() {
             return;
         }
-        match self.save(trainer, run) {
+        match watched.check().and_then(|()| self.save(trainer, run)) {
             Ok(()) => stage.warn(&format!(
                 "saved a checkpoint after iteration {iteration}; mend the error below, and the same command goes on from it"
             )),
@@ -512,7 +525,7 @@ impl TrainArgs {
     }
 
     /// Runs the iterations; whether all are done.
-    fn optimise(&self, trainer: &mut Trainer<'_>, run: &Provenance, stage: &Stage) -> Result<bool> {
+    fn optimise(&self, trainer: &mut Trainer<'_>, run: &Provenance, watched: &Watched, stage: &Stage) -> Result<bool> {
         let first = trainer.state().progress.iteration;
         let mut progress = stage.progress("iteration", self.iterations.into()).resumed_at(first.into());
         let mut saved = Instant::now();
@@ -522,6 +535,7 @@ impl TrainArgs {
             let iteration = trainer.state().progress.iteration;
             let stop = self.stop_after.is_some_and(|last| iteration >= last);
             if stop || stage.interrupted() {
+                watched.check()?;
                 self.save(trainer, run)?;
                 let partial = beside(&self.out, ".partial.ply");
                 let note = format!("unfinished: {iteration} of {} iterations", self.iterations);
@@ -546,6 +560,8 @@ impl TrainArgs {
                 Every::Seconds(s) => saved.elapsed().as_secs_f64() >= s,
             };
             if due && !trainer.is_done() {
+                // A checkpoint names the photographs as they were: it must not hold what others taught.
+                watched.check()?;
                 self.save(trainer, run)?;
                 saved = Instant::now();
             }

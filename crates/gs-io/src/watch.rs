@@ -1,0 +1,79 @@
+//! Inputs that change while a stage works on them.
+
+use crate::{Error, Result};
+use std::fs::Metadata;
+use std::path::{Path, PathBuf};
+use std::time::SystemTime;
+
+/// Files as they were when a stage began. A stage that reads a file twice (for its hash, then for its content) or late (a
+/// photograph, when its turn comes) asks in the end whether they are still the same: otherwise its output would name parents
+/// that it was not made from.
+#[derive(Debug, Clone, Default)]
+pub struct Watched {
+    files: Vec<(PathBuf, Stamp)>,
+}
+
+/// Length, time of the last change and, where there is one, number of the file: a copy under the same name is another file.
+type Stamp = (u64, Option<SystemTime>, u64);
+
+fn stamp(m: &Metadata) -> Stamp {
+    #[cfg(unix)]
+    let number = std::os::unix::fs::MetadataExt::ino(m);
+    #[cfg(not(unix))]
+    let number = 0;
+    (m.len(), m.modified().ok(), number)
+}
+
+impl Watched {
+    /// Notes how these files are now. Call it before they are read; those that are not there are left out.
+    pub fn new<P: AsRef<Path>>(files: impl IntoIterator<Item = P>) -> Self {
+        let noted = files.into_iter().filter_map(|path| {
+            let path = path.as_ref();
+            Some((path.to_path_buf(), stamp(&std::fs::metadata(path).ok()?)))
+        });
+        Self { files: noted.collect() }
+    }
+
+    /// Adds the files of another.
+    #[must_use]
+    pub fn and(mut self, other: Self) -> Self {
+        self.files.extend(other.files);
+        self
+    }
+
+    /// Checks that no file has become another. One that is gone was read while it was there, or its reader has said so.
+    ///
+    /// # Errors
+    /// Names the first file that changed.
+    pub fn check(&self) -> Result<()> {
+        let changed = |(path, then): &&(PathBuf, Stamp)| std::fs::metadata(path).is_ok_and(|m| stamp(&m) != *then);
+        match self.files.iter().find(changed) {
+            None => Ok(()),
+            Some((path, _)) => Err(Error::new("the file changed while this run was reading it")
+                .file(path)
+                .hint("nothing was written; run the same command again")),
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn changes_are_seen_and_absence_is_not_one() {
+        let dir = tempfile::tempdir().unwrap();
+        let [a, b] = ["a", "b"].map(|n| dir.path().join(n));
+        std::fs::write(&a, "one").unwrap();
+        let w = Watched::new([&a]).and(Watched::new([&b]));
+        w.check().unwrap();
+        std::fs::write(&b, "two").unwrap();
+        std::fs::rename(&b, &a).unwrap();
+        let e = w.check().unwrap_err().to_string();
+        assert!(e.contains("a: the file changed while this run was reading it"), "{e}");
+        std::fs::remove_file(&a).unwrap();
+        w.check().unwrap();
+        std::fs::write(&a, "longer than before").unwrap();
+        assert!(w.check().is_err());
+    }
+}

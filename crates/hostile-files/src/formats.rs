@@ -1,0 +1,289 @@
+//! The formats and what must hold of whatever their readers accept.
+
+use crate::seeds;
+use artifacts::{Features, Footprints, Graph, Instances, MaskFeatures, MaskMaps, TruePoints, TrueScene};
+use clap::Parser;
+use eval::protocol::instances::read_truth;
+use eval::text::{TextSource, TextTable};
+use gs_scene::dataset::{self, LoadOptions, Resolution};
+use gs_scene::{Geometry, Image, PointCloud, ply};
+use stage::{Program, Stage};
+use std::fs;
+use std::path::{Component, Path, PathBuf};
+use std::sync::OnceLock;
+
+/// A kind of file that the stages read.
+pub struct Format {
+    /// Its name, which is also that of its fuzz target and of its folder in `testdata/`.
+    pub name: &'static str,
+    /// Gives the bytes to the readers; panics on a finding.
+    pub(crate) check: fn(&[u8]),
+    /// Makes the small good files.
+    pub(crate) seeds: fn() -> Vec<Vec<u8>>,
+    /// Memory that readers may hold whatever the file's length, bytes.
+    pub(crate) fixed: usize,
+    /// Memory that readers may hold for each byte of the file.
+    pub(crate) factor: usize,
+}
+
+/// Buffers, the names of a dataset, and what libraries set up on first use.
+const FIXED: usize = 1 << 20;
+/// Binary files: their bytes, and their numbers in one or two layouts. An ascii PLY has a float in two bytes.
+const BINARY: usize = 24;
+/// A JSON value takes 32 bytes and may have two characters in the file; an object of one entry takes 600 and has eight.
+const JSON: usize = 200;
+/// A picture may claim 2,000 pixels for each byte: it is decoded, then widened to floats.
+const PICTURE: usize = 2_000 * 24;
+
+/// All formats.
+pub const FORMATS: [Format; 10] = [
+    Format { name: "ply", check: check_ply, seeds: seeds::ply, fixed: FIXED, factor: BINARY },
+    Format { name: "colmap_bin", check: check_colmap_bin, seeds: seeds::colmap_bin, fixed: FIXED, factor: BINARY },
+    Format { name: "colmap_txt", check: check_colmap_txt, seeds: seeds::colmap_txt, fixed: FIXED, factor: BINARY },
+    Format { name: "transforms", check: check_transforms, seeds: seeds::transforms, fixed: FIXED, factor: JSON },
+    Format { name: "npy", check: check_npy, seeds: seeds::npy, fixed: FIXED, factor: BINARY },
+    // One array of 16 MiB is believed, then 64 bytes a byte; of one-byte numbers, as floats.
+    Format { name: "npz", check: check_npz, seeds: seeds::npz, fixed: 7 << 24, factor: JSON + 64 * 5 },
+    Format { name: "artifact", check: check_artifact, seeds: seeds::artifact, fixed: FIXED, factor: JSON },
+    // Polygons stand for pictures of the size that the file names; all of a frame have 2^28 pixels at most.
+    Format { name: "labels", check: check_labels, seeds: seeds::labels, fixed: FIXED + (1 << 28), factor: JSON },
+    Format { name: "scannet", check: check_scannet, seeds: seeds::scannet, fixed: FIXED, factor: JSON },
+    // Writing takes a buffer of a megabyte for each file.
+    Format { name: "id_png", check: check_id_png, seeds: seeds::id_png, fixed: 4 * FIXED, factor: PICTURE },
+];
+
+const FULL: LoadOptions = LoadOptions { resolution: Resolution::Divisor(1.0), holdout: 8 };
+
+/// A folder of this process with the good files that stand beside a damaged one.
+fn folder() -> &'static Path {
+    static MADE: OnceLock<tempfile::TempDir> = OnceLock::new();
+    let dir = MADE.get_or_init(|| {
+        // In memory where the system has such a place.
+        let base = Some(PathBuf::from("/dev/shm")).filter(|p| p.is_dir()).unwrap_or_else(std::env::temp_dir);
+        let dir = tempfile::Builder::new().prefix("hostile-files.").tempdir_in(base).expect("a temporary folder");
+        let at = |name: &str| dir.path().join(name);
+        let put = |name: &str, bytes: &[u8]| {
+            fs::create_dir_all(at(name).parent().expect("a parent")).expect("a folder");
+            fs::write(at(name), bytes).expect("written");
+        };
+        let photo = seeds::photograph().to_png();
+        for scene in ["colmap_bin/images", "colmap_txt/images", "transforms/images", "scannet/color"] {
+            for i in 0..3 {
+                put(&format!("{scene}/{i}.png"), &photo);
+            }
+        }
+        // What a name that leads out of a scene would find.
+        put("x", b"outside");
+        put("x.png", &photo);
+        for (scene, ext, files) in
+            [("colmap_bin", "bin", seeds::colmap_bin()), ("colmap_txt", "txt", seeds::colmap_txt())]
+        {
+            for (name, bytes) in ["cameras", "images", "points3D"].iter().zip(files) {
+                put(&format!("{scene}/sparse/0/{name}.{ext}"), &bytes[1..]);
+            }
+        }
+        put("transforms/points.ply", &seeds::ply()[1]);
+        for (name, bytes) in SCANNET.iter().zip(seeds::scannet()) {
+            put(name, &bytes[1..]);
+        }
+        for i in 0..3 {
+            put(&format!("scannet/pose/{i}.txt"), &seeds::scannet()[4][1..]);
+        }
+        put("labels/one", b"");
+        dir
+    });
+    dir.path()
+}
+
+/// Files of a scan, in the order of their seeds.
+const SCANNET: [&str; 5] = [
+    "scannet/s.segs.json",
+    "scannet/s.aggregation.json",
+    "scannet/s_vh_clean_2.labels.ply",
+    "scannet/intrinsic/intrinsic_color.txt",
+    "scannet/pose/1.txt",
+];
+
+/// Makes what stands beside damaged files, so that it is not counted.
+pub(crate) fn prepare() {
+    folder();
+}
+
+/// Puts the bytes at a place in the folder for as long as `read` runs; the good file comes back afterwards.
+fn with(name: &str, bytes: &[u8], read: impl FnOnce(&Path)) {
+    let path = folder().join(name);
+    let good = fs::read(&path).ok();
+    fs::write(&path, bytes).expect("written");
+    read(&path);
+    if let Some(good) = good {
+        fs::write(&path, good).expect("written");
+    }
+}
+
+/// An error is one line that names the file; a value is passed on.
+fn sound<T>(result: gs_io::Result<T>, inside: &Path) -> Option<T> {
+    result
+        .map_err(|e| {
+            let e = e.to_string();
+            let names = e.starts_with(&inside.display().to_string());
+            assert!(names && !e.contains(['\n', '\r']), "not one line about {}: {e}", inside.display());
+        })
+        .ok()
+}
+
+fn sound_points(p: &PointCloud) {
+    assert_eq!(p.positions.len(), p.colors.len());
+    assert!(p.positions.iter().flatten().all(|v| v.is_finite()));
+}
+
+fn check_ply(bytes: &[u8]) {
+    with("a.ply", bytes, |path| {
+        if let Some(g) = sound(ply::read_gaussians(path), path) {
+            assert!(g.check().is_ok() && g.means.iter().flatten().chain(&g.sh).all(|v| v.is_finite()));
+        }
+        if let Some(g) = sound(Geometry::read(path), path) {
+            assert!(g.gaussians.means.iter().flatten().all(|v| v.is_finite()));
+        }
+        sound(ply::read_points(path), path).iter().for_each(sound_points);
+        if let Some((vertices, labels)) = sound(ply::read_labels(path, "label"), path) {
+            assert_eq!(vertices.len(), labels.len());
+        }
+        sound(ply::read_comments(path), path);
+    });
+}
+
+/// Loads a scene; its views must be sound and lie within it.
+fn check_scene(root: &Path) {
+    let Some(scene) = sound(dataset::load(root, &FULL), root) else { return };
+    sound_points(&scene.points);
+    for view in &scene.views {
+        let c = &view.camera;
+        assert!(c.rotation.is_finite() && c.translation.is_finite() && (c.rotation.determinant() - 1.0).abs() < 1e-6);
+        assert!([c.fx, c.fy, c.cx, c.cy].iter().all(|v| v.is_finite()));
+        let within = view.image_path.strip_prefix(root).expect("a photograph within the scene");
+        assert!(!within.components().any(|c| c == Component::ParentDir), "{} leads out", view.image_path.display());
+        // Stages name their files after it.
+        let stem = Path::new(view.stem()).components().collect::<Vec<_>>();
+        assert!(matches!(stem[..], [Component::Normal(_)]), "{:?} is no file name", view.stem());
+        assert!(!view.stem().contains('/'), "{:?} names a folder", view.stem());
+    }
+}
+
+/// Puts the bytes behind the first, which says which of the files it is.
+fn check_part(files: &[String], bytes: &[u8], read: impl FnOnce(&Path)) {
+    let Some((&which, bytes)) = bytes.split_first() else { return };
+    with(&files[usize::from(which) % files.len()], bytes, read);
+}
+
+fn colmap(scene: &str, ext: &str, bytes: &[u8]) {
+    let files = ["cameras", "images", "points3D"].map(|name| format!("{scene}/sparse/0/{name}.{ext}"));
+    check_part(&files, bytes, |_| check_scene(&folder().join(scene)));
+}
+
+fn check_colmap_bin(bytes: &[u8]) {
+    colmap("colmap_bin", "bin", bytes);
+}
+
+fn check_colmap_txt(bytes: &[u8]) {
+    colmap("colmap_txt", "txt", bytes);
+}
+
+fn check_transforms(bytes: &[u8]) {
+    with("transforms/transforms.json", bytes, |_| check_scene(&folder().join("transforms")));
+}
+
+fn check_npy(bytes: &[u8]) {
+    with("a_s.npy", bytes, |path| {
+        if let Some(a) = sound(gs_io::npy::read_f32(path), path) {
+            assert_eq!(a.shape.iter().product::<usize>(), a.data.len());
+        }
+        if let Some(m) = sound(MaskMaps::read(path), path) {
+            assert_eq!(m.ids.len(), 4 * m.width * m.height);
+            // Tables of so many rows are made from it.
+            assert!(m.ids.iter().all(|&i| i >= -1) && m.id_count() <= (bytes.len() * 4).max(1 << 16));
+        }
+        if let Some(f) = sound(MaskFeatures::read(path), path) {
+            assert_eq!(f.values.len(), f.count * f.dim);
+            // A row of that width is made for each instance.
+            assert!(f.dim <= bytes.len().max(1 << 16));
+        }
+    });
+}
+
+fn check_npz(bytes: &[u8]) {
+    with("a.npz", bytes, |path| {
+        if let Some(table) = sound(TextTable::read(path), path) {
+            assert!(TextSource::Table(table).dim() > 0);
+        }
+    });
+}
+
+fn check_artifact(bytes: &[u8]) {
+    with("a.safetensors", bytes, |path| {
+        sound(Graph::read(path), path);
+        sound(Features::read(path), path);
+        if let Some(f) = sound(Footprints::read(path), path) {
+            (0..f.rows.len()).for_each(|r| _ = f.entries(r));
+        }
+        if let Some((instances, _)) = sound(Instances::read(path), path) {
+            for k in 0..instances.len() {
+                assert_eq!(instances.descriptor_of(k).len(), instances.dim);
+                if let Some(family) = instances.family(k) {
+                    family.own.iter().for_each(|&c| _ = instances.gaussians_of_cluster(c));
+                    family.parts.iter().for_each(|&c| _ = instances.instances_of_cluster(c));
+                }
+            }
+            instances.cluster_sizes();
+        }
+        sound(TruePoints::read(path), path);
+        sound(TrueScene::read(path), path);
+    });
+}
+
+fn check_labels(bytes: &[u8]) {
+    with("labels/frame_00001.json", bytes, |path| {
+        if let Some(frame) = sound(eval::labels::read(path), path) {
+            assert_eq!(frame.frame, "frame_00001");
+            for (name, mask) in &frame.categories {
+                assert_eq!(mask.bits.len(), frame.width as usize * frame.height as usize);
+                // Pictures of queries are named so.
+                let file = eval::scene::slug(name);
+                assert!(!file.is_empty() && !file.contains(['/', '\\', '\0']) && !file.contains(".."), "{file:?}");
+            }
+        }
+    });
+}
+
+fn check_scannet(bytes: &[u8]) {
+    check_part(&SCANNET.map(String::from), bytes, |path| {
+        let [segs, aggregation, labels] = [0, 1, 2].map(|i| folder().join(SCANNET[i]));
+        let scan = folder().join("scannet");
+        if let Some((vertices, _)) = sound(ply::read_labels(&labels, "label"), &scan)
+            && let Some(truth) = sound(read_truth(&segs, &aggregation, vertices.len(), &["wall".into()]), &scan)
+        {
+            assert_eq!(truth.len(), vertices.len());
+        }
+        sound(ply::read_points(&labels), &scan).iter().for_each(sound_points);
+        check_scene(&scan);
+        sound(artifacts::MaskTruth::read_all(path), path);
+    });
+}
+
+fn check_id_png(bytes: &[u8]) {
+    let dir = folder().join("pictures");
+    fs::create_dir_all(&dir).expect("a folder");
+    with("pictures/a.png", bytes, |path| {
+        if let Some(i) = sound(Image::read(path), path) {
+            assert_eq!(i.rgb.len(), 3 * i.width as usize * i.height as usize);
+        }
+        sound(eval::labels::read_mask(path), path);
+        let out = folder().join("maps");
+        let args = ["mask-embed", "import", "--quiet", "--labels"].map(Into::into);
+        let args = args.into_iter().chain([dir.clone().into_os_string(), "--out".into(), out.clone().into()]);
+        let args = mask_embed::Args::try_parse_from(args).expect("sound arguments");
+        if sound(args.run(&Stage::silent("mask-embed")), &dir).is_some() {
+            let maps = MaskMaps::read(artifacts::maps_path(&out, "a")).expect("a map");
+            assert_eq!(maps.ids.len(), 4 * maps.width * maps.height);
+        }
+    });
+}

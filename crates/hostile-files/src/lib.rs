@@ -1,0 +1,50 @@
+//! What every reader of files must withstand: files that are cut short, flipped, spliced, or lie about how much they hold.
+//! No panic, no memory out of proportion to the file, no name inside a file that leads out of its folder.
+//!
+//! Each [`Format`] is one entry point, shared by the property tests of `cargo test` and the fuzz targets in `fuzz/`. The
+//! crate is for tests only: it replaces the allocator by one that counts.
+
+mod formats;
+mod meter;
+mod mutate;
+mod seeds;
+
+pub use formats::{FORMATS, Format};
+pub use mutate::mutate;
+
+use std::collections::BTreeMap;
+use std::sync::Mutex;
+
+/// One measurement at a time: the counters are those of the process.
+static TURN: Mutex<()> = Mutex::new(());
+
+/// The format of this name.
+///
+/// # Panics
+/// When there is none.
+pub fn format(name: &str) -> &'static Format {
+    FORMATS.iter().find(|f| f.name == name).expect("a format of that name")
+}
+
+/// Small good files of a format, made once.
+pub fn seeds(format: &Format) -> Vec<Vec<u8>> {
+    static MADE: Mutex<BTreeMap<&str, Vec<Vec<u8>>>> = Mutex::new(BTreeMap::new());
+    // What making them takes is no reader's.
+    let _turn = TURN.lock().unwrap_or_else(std::sync::PoisonError::into_inner);
+    let mut made = MADE.lock().unwrap_or_else(std::sync::PoisonError::into_inner);
+    made.entry(format.name).or_insert_with(format.seeds).clone()
+}
+
+/// Gives a file of these bytes to the readers of a format and returns the most memory they held, in bytes.
+///
+/// # Panics
+/// When a reader panics, takes more memory than the format allows, or lets a name out of its folder: a finding.
+pub fn run(format: &Format, bytes: &[u8]) -> usize {
+    // A finding of another test, caught by its harness, says nothing of this one.
+    let _turn = TURN.lock().unwrap_or_else(std::sync::PoisonError::into_inner);
+    formats::prepare();
+    let (held, ()) = meter::peak(|| (format.check)(bytes));
+    let most = format.fixed + format.factor * bytes.len();
+    assert!(held <= most, "{}: {held} bytes of memory for a file of {}, at most {most}", format.name, bytes.len());
+    held
+}

@@ -1,0 +1,95 @@
+//! Damage to good files, from a seed.
+
+/// SplitMix64: enough for damage, and the same everywhere.
+struct Dice(u64);
+
+impl Dice {
+    fn next(&mut self) -> u64 {
+        self.0 = self.0.wrapping_add(0x9e37_79b9_7f4a_7c15);
+        let mut z = self.0;
+        z = (z ^ (z >> 30)).wrapping_mul(0xbf58_476d_1ce4_e5b9);
+        z = (z ^ (z >> 27)).wrapping_mul(0x94d0_49bb_1331_11eb);
+        z ^ (z >> 31)
+    }
+
+    fn below(&mut self, n: usize) -> usize {
+        (self.next() % n.max(1) as u64) as usize
+    }
+
+    fn of<'a, T>(&mut self, all: &'a [T]) -> &'a T {
+        &all[self.below(all.len())]
+    }
+}
+
+/// Numbers that lie, as the formats' own integers and floats.
+const WORDS: [u64; 10] = [
+    0,
+    1,
+    0xff,
+    0xffff,
+    1 << 31,
+    1 << 40,
+    u64::MAX,
+    0x7ff8_0000_0000_0000,
+    0x7ff0_0000_0000_0000,
+    0x7fc0_0000_7fc0_0000,
+];
+const TEXT: [&str; 20] = [
+    "-",
+    "9",
+    "99999999999",
+    "18446744073709551615",
+    "nan",
+    "-Infinity",
+    "1e308",
+    " ",
+    "\n",
+    "\r",
+    "\"",
+    "[",
+    "{",
+    "]",
+    "}",
+    "../../x",
+    "/etc/x",
+    "\\",
+    "\0",
+    "é",
+];
+
+/// A damaged copy of `good`: cut, flipped, spliced with itself or `other`, or with a number that lies. Equal seeds do equal
+/// damage.
+pub fn mutate(good: &[u8], other: &[u8], seed: u64) -> Vec<u8> {
+    let mut dice = Dice(seed);
+    let mut bytes = good.to_vec();
+    for _ in 0..1 + dice.below(3) {
+        let n = bytes.len();
+        let at = dice.below(n);
+        match dice.below(9) {
+            0 => bytes.truncate(at),
+            1 | 2 if n > 0 => bytes[at] ^= 1 << dice.below(8),
+            3 if n > 0 => bytes[at] = dice.next() as u8,
+            4 => {
+                let word = dice.of(&WORDS).to_le_bytes();
+                let size = *dice.of(&[4usize, 8]);
+                bytes.iter_mut().skip(at).zip(&word[..size]).for_each(|(b, w)| *b = *w);
+            }
+            5 => {
+                // A number in a text becomes another.
+                let digit = bytes.iter().skip(at).position(u8::is_ascii_digit).map(|p| p + at);
+                let start = digit.unwrap_or(at);
+                let end = start + bytes[start.min(n)..].iter().take_while(|b| b.is_ascii_digit()).count();
+                bytes.splice(start.min(n)..end.min(n), dice.of(&TEXT).bytes());
+            }
+            6 => _ = bytes.splice(at..at, dice.of(&TEXT).bytes()),
+            7 => {
+                let from = if dice.below(2) == 0 { good } else { other };
+                let start = dice.below(from.len());
+                let length = dice.below((from.len() - start).min(4096) + 1);
+                bytes.splice(at..at, from[start..start + length].iter().copied());
+            }
+            _ => _ = bytes.drain(at..(at + dice.below(64)).min(n)),
+        }
+    }
+    bytes
+}

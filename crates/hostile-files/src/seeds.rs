@@ -1,0 +1,221 @@
+//! Small good files of each format, from which damaged ones are made.
+
+use artifacts::{
+    Features, FootprintsBuilder, Graph, Instances, MaskFeatures, MaskMaps, Match, Row, TreeEdge, TruePoints,
+};
+use gs_io::Provenance;
+use gs_scene::{Camera, Gaussians, Image, PointCloud, colmap, ply};
+use std::fs;
+use std::io::Write;
+use std::path::Path;
+
+fn made(name: &str, write: impl FnOnce(&Path)) -> Vec<u8> {
+    let dir = tempfile::tempdir().expect("a temporary folder");
+    let path = dir.path().join(name);
+    write(&path);
+    fs::read(&path).expect("it was just written")
+}
+
+/// A text picture of a scene's photograph.
+pub(crate) fn photograph() -> Image {
+    Image { width: 20, height: 16, rgb: (0..960).map(|i| i as f32 / 960.0).collect(), alpha: None }
+}
+
+fn points() -> PointCloud {
+    PointCloud { positions: vec![[0.0, 1.0, 2.0]; 6], colors: vec![[9, 8, 7]; 6] }
+}
+
+pub(crate) fn ply() -> Vec<Vec<u8>> {
+    let g = Gaussians {
+        means: vec![[1.0, 2.0, 3.0]; 5],
+        log_scales: vec![[-3.0; 3]; 5],
+        rotations: vec![[1.0, 0.0, 0.0, 0.0]; 5],
+        opacity_logits: vec![0.5; 5],
+        sh: vec![0.25; 5 * 12],
+        sh_degree: 1,
+    };
+    let lists = "ply\nformat ascii 1.0\nelement face 2\nproperty list uchar int i\nelement vertex 2\nproperty float x\n\
+                 property list uchar float l\nproperty float y\nproperty float z\nproperty ushort label\nend_header\n\
+                 3 1 2 3\n1 4\n0.5 2 1 2 1 2 5\n1 0 2 3 6\n";
+    let big = [
+        &b"ply\nformat binary_big_endian 1.0\nelement vertex 2\nproperty list uint double l\nproperty double x\n\
+           property short y\nproperty float z\nend_header\n"[..],
+        &[0, 0, 0, 1],
+        &[0; 8 + 8 + 2 + 4],
+        &[0; 4 + 8 + 2 + 4],
+    ];
+    vec![
+        made("a.ply", |p| ply::write_gaussians(p, &g, &["a comment".into()]).expect("written")),
+        made("a.ply", |p| ply::write_points(p, &points(), &[]).expect("written")),
+        lists.into(),
+        big.concat(),
+    ]
+}
+
+/// A file of a COLMAP model behind a byte that says which of the three it is.
+pub(crate) fn colmap_bin() -> Vec<Vec<u8>> {
+    let dir = tempfile::tempdir().expect("a temporary folder");
+    let eye = glam::DVec3::new(3.0, 1.0, 1.0);
+    let camera = Camera::look_at(eye, glam::DVec3::ZERO, glam::DVec3::Z, 20, 16, 1.0);
+    let views: Vec<_> = (0..3).map(|i| (format!("{i}.png"), camera.clone())).collect();
+    colmap::write_model(dir.path(), &views, &points()).expect("written");
+    let part = |i: u8, name: &str| [vec![i], fs::read(dir.path().join(name)).expect("it was just written")].concat();
+    vec![part(0, "cameras.bin"), part(1, "images.bin"), part(2, "points3D.bin")]
+}
+
+pub(crate) fn colmap_txt() -> Vec<Vec<u8>> {
+    let parts = [
+        "# c\n1 OPENCV 20 16 20 20 10 8 0.01 -0.01 0.001 0.001\n2 SIMPLE_RADIAL 20 16 20 10 8 0.01\n",
+        "1 1 0 0 0 0 0 4 1 0.png\n1 2 -1 3 4 7\n2 1 0.1 0 0 0 0 4 1 1.png\n\n3 1 0 0.1 0 0 0 4 1 2.png\n\n",
+        "1 0.5 1 2 9 8 7 0.1 1 2\n2 0.5 1 2 9 8 7 0.1\n",
+    ];
+    parts.iter().zip(0u8..).map(|(text, i)| [&[i][..], text.as_bytes()].concat()).collect()
+}
+
+pub(crate) fn transforms() -> Vec<Vec<u8>> {
+    let pose = "[[0,0,1,2],[1,0,0,3],[0,1,0,4],[0,0,0,1]]";
+    let frames = |ext: &str| -> String {
+        let all: Vec<String> =
+            (0..3).map(|i| format!("{{\"file_path\": \"./images/{i}{ext}\", \"transform_matrix\": {pose}}}")).collect();
+        all.join(", ")
+    };
+    vec![
+        format!("{{\"camera_angle_x\": 0.8, \"k1\": 0.01, \"frames\": [{}]}}", frames("")).into_bytes(),
+        format!(
+            "{{\"fl_x\": 20.0, \"fl_y\": 21.5, \"cx\": 10, \"cy\": 8, \"w\": 20, \"h\": 16, \"camera_model\": \"OPENCV\", \
+             \"ply_file_path\": \"points.ply\", \"test_filenames\": [\"images/1.png\"], \"lost\": [NaN, -Infinity], \
+             \"frames\": [{}]}}",
+            frames(".png")
+        )
+        .into_bytes(),
+    ]
+}
+
+pub(crate) fn npy() -> Vec<Vec<u8>> {
+    let maps = MaskMaps { width: 5, height: 4, ids: (0..80).map(|i| i % 9 - 1).collect() };
+    let features = MaskFeatures { count: 3, dim: 4, values: vec![0.5; 12] };
+    let halves: Vec<u8> = [
+        &b"\x93NUMPY\x01\x00\x36\x00{'descr': '<f2', 'fortran_order': False, 'shape': (4,)}\n"[..],
+        &[0, 0x3c, 1, 0, 0, 0x7c, 0, 0xc0],
+    ]
+    .concat();
+    vec![
+        made("a_s.npy", |p| maps.write(p).expect("written")),
+        made("a_f.npy", |p| features.write(p).expect("written")),
+        made("i.npy", |p| gs_io::npy::write_i32(p, &[2, 3], &[-1, 0, 1, 2, 3, 4]).expect("written")),
+        halves,
+    ]
+}
+
+pub(crate) fn npz() -> Vec<Vec<u8>> {
+    let pack = |method: zip::CompressionMethod| {
+        let mut archive = zip::ZipWriter::new(std::io::Cursor::new(Vec::new()));
+        for (name, shape) in [("coffee mug", vec![4]), ("sheep", vec![1, 4])] {
+            let array = made("a.npy", |p| gs_io::npy::write_f32(p, &shape, &[1.0, 0.0, 0.5, 0.25]).expect("written"));
+            let options = zip::write::SimpleFileOptions::default().compression_method(method);
+            archive.start_file(format!("{name}.npy"), options).expect("begun");
+            archive.write_all(&array).expect("written");
+        }
+        archive.finish().expect("finished").into_inner()
+    };
+    vec![
+        pack(zip::CompressionMethod::Stored),
+        pack(zip::CompressionMethod::Deflated),
+        br#"{"coffee mug": [1.0, 0.0], "sheep": [0.6, 0.8]}"#.to_vec(),
+    ]
+}
+
+/// Without checksums, so that damage reaches what lies behind them.
+pub(crate) fn artifact() -> Vec<Vec<u8>> {
+    let provenance = || Provenance { program: "test 1".into(), ..Provenance::default() };
+    let graph = Graph {
+        kept: vec![0, 2, 3],
+        anchors: vec![1, 0],
+        k: 2,
+        knn: vec![0, 1, 2, 0],
+        anchor_knn: vec![1, 1, 0, 0],
+        nearest_anchor: vec![0, 0, 1],
+        gaussian_k: 1,
+        gaussian_knn: vec![1, 0, 0],
+        seen_views: vec![1, 0, 2, 1],
+        seen_weight: vec![0.5, 0.0, 1.0, 2.0],
+    };
+    let features = Features { kept: vec![0, 2, 3], dim: 2, values: vec![0.5; 6] };
+    let row = Row { view: 0, level: 3, mask: 1, pixels: 9, gated: 8, alpha: 0.9 };
+    let footprints = FootprintsBuilder {
+        views: vec!["a".into()],
+        kept: vec![0, 2, 3],
+        rows: vec![row, Row { mask: 2, ..row }],
+        row_ptr: vec![0, 2, 3],
+        col: vec![0, 2, 1],
+        weight: vec![1.0, 0.5, 2.0],
+        ..FootprintsBuilder::default()
+    };
+    let edge = TreeEdge { parent: 4, child: 5, lambda: 1.0, size: 2, instance: 0 };
+    let instances = Instances {
+        label: vec![0, -1, 0, 1],
+        dim: 2,
+        descriptor: vec![1.0, 0.0, 0.0, 1.0],
+        support: vec![1, 2],
+        score: vec![0.5, 1.0],
+        count: vec![2, 1],
+        centroid: vec![[0.0; 3]; 2],
+        bbox_min: vec![[0.0; 3]; 2],
+        bbox_max: vec![[1.0; 3]; 2],
+        views: vec!["a".into()],
+        matches: vec![Match { instance: 1, view: 0, mask: 3, score: 0.5, visible: 2.0 }],
+        tree: vec![edge, TreeEdge { parent: 5, child: 6, instance: 1, ..edge }],
+        node: vec![5, -1, 5, 6],
+        ..Instances::default()
+    };
+    let truth = TruePoints { position: vec![[0.0; 3]; 2], instance: vec![0, 1], part: vec![0, 0], class: vec![-1, 1] };
+    let all = [
+        made("a", |p| graph.write(p, provenance()).expect("written")),
+        made("a", |p| features.write(p, provenance()).expect("written")),
+        made("a", |p| footprints.write(p, provenance()).expect("written")),
+        made("a", |p| instances.write(p, provenance()).expect("written")),
+        made("a", |p| truth.write(p, provenance()).expect("written")),
+    ];
+    // Under another name the reader does not know it.
+    let blind = |mut bytes: Vec<u8>| {
+        let at = bytes.windows(8).position(|w| w == b"checksum").expect("artifacts have a checksum");
+        bytes[at..at + 8].copy_from_slice(b"nochecks");
+        bytes
+    };
+    all.into_iter().map(blind).collect()
+}
+
+pub(crate) fn labels() -> Vec<Vec<u8>> {
+    vec![
+        br#"{"info":{"description":"ISAT","name":"a.jpg","width":20,"height":10,"depth":3,"note":""},
+"objects":[{"category":"cup","group":1,"segmentation":[[1.9,1.2],[4.7,1.9],[4.2,3.3],[1.1,3.9]],"bbox":[1,1,4,3]},
+{"category":"../../cup","segmentation":[[10,1],[11,1],[30,2],[-10,20]]},{"category":"lid","segmentation":[]}]}"#
+            .to_vec(),
+    ]
+}
+
+/// A file of a ScanNet scan behind a byte that says which.
+pub(crate) fn scannet() -> Vec<Vec<u8>> {
+    let labelled = "ply\nformat ascii 1.0\nelement vertex 4\nproperty float x\nproperty float y\nproperty float z\n\
+                    property uchar red\nproperty uchar green\nproperty uchar blue\nproperty ushort label\nend_header\n\
+                    0 0 0 1 2 3 5\n1 0 0 1 2 3 5\n0 1 0 1 2 3 1\n0 0 1 1 2 3 0\n";
+    let parts: [&[u8]; 5] = [
+        br#"{"params":{},"sceneId":"x","segIndices":[5,5,7,9]}"#,
+        br#"{"segGroups":[{"id":0,"objectId":0,"segments":[5],"label":"wall"},{"id":1,"objectId":1,"segments":[7,9],"label":"chair"}]}"#,
+        labelled.as_bytes(),
+        b"20 0 10 0\n0 20 8 0\n0 0 1 0\n0 0 0 1\n",
+        b"0 0 1 2\n1 0 0 3\n0 1 0 4\n0 0 0 1\n",
+    ];
+    parts.iter().zip(0u8..).map(|(text, i)| [&[i][..], text].concat()).collect()
+}
+
+pub(crate) fn id_png() -> Vec<Vec<u8>> {
+    let narrow = image::GrayImage::from_fn(9, 7, |x, y| image::Luma([(x * y % 5) as u8]));
+    let wide = image::ImageBuffer::<image::Luma<u16>, _>::from_fn(6, 5, |x, y| image::Luma([(300 * x + y) as u16]));
+    let colour = image::RgbImage::from_fn(6, 5, |x, y| image::Rgb([x as u8, y as u8, 9]));
+    vec![
+        made("a.png", |p| narrow.save(p).expect("written")),
+        made("a.png", |p| wide.save(p).expect("written")),
+        made("a.png", |p| colour.save(p).expect("written")),
+    ]
+}

@@ -1,0 +1,71 @@
+//! Every format, with good files, damaged ones, and those that once were findings.
+
+use hostile_files::{FORMATS, Format, format, mutate, run, seeds};
+use proptest::prelude::*;
+use std::path::Path;
+
+/// Damages the seeds of a format in one way.
+fn damage(format: &Format, which: usize, other: usize, seed: u64) {
+    let seeds = seeds(format);
+    let bytes = mutate(&seeds[which % seeds.len()], &seeds[other % seeds.len()], seed);
+    run(format, &bytes);
+}
+
+macro_rules! formats {
+    ($($name:ident),*) => {
+        proptest! {
+            $(
+                #[test]
+                fn $name(which in 0usize..8, other in 0usize..8, seed: u64) {
+                    damage(format(stringify!($name)), which, other, seed);
+                }
+            )*
+        }
+    };
+}
+formats!(ply, colmap_bin, colmap_txt, transforms, npy, npz, artifact, labels, scannet, id_png);
+
+#[test]
+fn findings_stay_mended() {
+    let mut count = 0;
+    for format in &FORMATS {
+        let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("testdata").join(format.name);
+        let Ok(entries) = std::fs::read_dir(folder) else { continue };
+        for entry in entries {
+            run(format, &std::fs::read(entry.unwrap().path()).unwrap());
+            count += 1;
+        }
+    }
+    println!("{count} findings of old");
+}
+
+#[test]
+fn good_files_take_little_memory() {
+    for format in &FORMATS {
+        for seed in seeds(format) {
+            let held = run(format, &seed);
+            println!("{}: {held} bytes for {}", format.name, seed.len());
+        }
+    }
+}
+
+#[test]
+fn names_that_lead_out_are_refused() {
+    let escapes =
+        ["../../x.png", "../x.png", "/dev/shm/x.png", "images/../../x.png", "..", ".", "", "images/..", "a/\\..\\x"];
+    for name in escapes {
+        let images = seeds(format("colmap_bin")).swap_remove(1);
+        let at = images.windows(6).position(|w| w == b"0.png\0").unwrap();
+        let mut bytes = images;
+        bytes.splice(at..at + 5, name.bytes());
+        run(format("colmap_bin"), &bytes);
+        for kind in ["colmap_txt", "transforms"] {
+            for seed in seeds(format(kind)) {
+                let text = String::from_utf8(seed).unwrap();
+                for good in ["0.png", "./images/0", "points.ply"] {
+                    run(format(kind), text.replacen(good, name, 1).as_bytes());
+                }
+            }
+        }
+    }
+}
