@@ -121,7 +121,8 @@ fn tradeoffs(a: &TradeoffArgs, threads: usize, stage: &Stage) -> Result<()> {
     }
     let wanted = |name: &str| a.only.is_empty() || a.only.iter().any(|o| o == name);
     let (mut curves, mut grown) = (Vec::new(), Vec::new());
-    for scene in &plan.scenes {
+    let any = plan.knobs.iter().any(|k| wanted(&k.name));
+    for scene in plan.scenes.iter().filter(|_| any) {
         let folder = c.work.join(&scene.name);
         let base = tradeoff::prepare(&programs, scene, &folder)?;
         for s in STAGES.into_iter().skip(1) {

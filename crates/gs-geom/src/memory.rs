@@ -3,11 +3,9 @@
 //! The terms are counted from the sizes of the arrays that live at the same time; docs/geometry-memory.md holds them
 //! against measured peaks.
 
-use gs_io::Error;
 use gs_scene::sh_coefficients;
 use serde::Serialize;
-use std::fmt;
-use std::str::FromStr;
+use stage::Bytes;
 
 /// The program itself, its threads' stacks and the allocator's slack.
 const BASE: u64 = 10 << 20;
@@ -23,49 +21,6 @@ const PER_TILE: u64 = 56;
 const PER_DRAWN: u64 = 200;
 /// Numbers of a Gaussian besides its spherical harmonics: centre, scales, quaternion, opacity.
 const PLAIN_NUMBERS: u64 = 11;
-
-/// A number of bytes, written and read as `512M`, `2G`, `1.5G`, `64K` or `0` (powers of 1024).
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
-pub struct Bytes(pub u64);
-
-impl FromStr for Bytes {
-    type Err = Error;
-
-    fn from_str(s: &str) -> Result<Self, Error> {
-        let plain = s.strip_suffix("iB").or_else(|| s.strip_suffix('B')).unwrap_or(s);
-        let (digits, unit) = match plain.char_indices().last() {
-            Some((at, 'K' | 'k')) => (&plain[..at], 10),
-            Some((at, 'M' | 'm')) => (&plain[..at], 20),
-            Some((at, 'G' | 'g')) => (&plain[..at], 30),
-            Some((at, 'T' | 't')) => (&plain[..at], 40),
-            _ => (plain, 0),
-        };
-        let value: Option<f64> = digits.parse().ok().filter(|v| (0.0..1e6).contains(v));
-        match value {
-            // A bare number could be taken for megabytes as well as bytes.
-            Some(v) if unit > 0 || v == 0.0 => Ok(Self((v * f64::from(1u32 << (unit - 10).max(0)) * 1024.0) as u64)),
-            _ => Err(Error::new("not an amount of memory")
-                .found(s)
-                .expected("a number with a unit such as 512M or 2G, or 0")),
-        }
-    }
-}
-
-impl fmt::Display for Bytes {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        for (unit, shift) in [("T", 40), ("G", 30), ("M", 20), ("K", 10)] {
-            if self.0 >= 1 << shift {
-                let value = self.0 as f64 / (1u64 << shift) as f64;
-                return if value.fract() == 0.0 || value >= 100.0 {
-                    write!(f, "{value:.0}{unit}")
-                } else {
-                    write!(f, "{value:.1}{unit}")
-                };
-            }
-        }
-        write!(f, "{}", self.0)
-    }
-}
 
 /// What a run's peak memory is made of, bytes.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
@@ -142,21 +97,6 @@ impl Forecast {
 #[cfg(test)]
 mod tests {
     use super::*;
-
-    #[test]
-    fn amounts_are_read_and_written() {
-        for (s, n) in
-            [("2G", 2u64 << 30), ("512M", 512 << 20), ("1.5GiB", 3 << 29), ("64kB", 65_536), ("0", 0), ("1T", 1 << 40)]
-        {
-            assert_eq!(s.parse::<Bytes>().unwrap(), Bytes(n), "{s}");
-        }
-        for wrong in ["", "G", "2048", "-1G", "nanG", "infG", "2X", "1e9G"] {
-            assert!(wrong.parse::<Bytes>().is_err(), "{wrong}");
-        }
-        for (n, s) in [(2u64 << 30, "2G"), (3 << 29, "1.5G"), (700 << 20, "700M"), (12, "12")] {
-            assert_eq!(Bytes(n).to_string(), s);
-        }
-    }
 
     #[test]
     fn the_terms_are_those_of_the_arrays() {

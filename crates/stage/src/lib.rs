@@ -10,11 +10,13 @@ pub mod curve;
 mod generate;
 mod log;
 mod machine;
+mod memory;
 mod progress;
 mod record;
 
 pub use log::Stage;
 pub use machine::Machine;
+pub use memory::Bytes;
 pub use progress::Progress;
 pub use record::{RunRecord, children_cpu_seconds, cpu_seconds, peak_rss_bytes};
 
@@ -41,6 +43,9 @@ pub struct CommonArgs {
     /// Write events as JSON lines to standard output instead of text to standard error
     #[arg(long, global = true)]
     pub json: bool,
+    /// Most memory the run may take, such as 4G: a stage whose forecast is more refuses at the start [no limit]
+    #[arg(long, global = true, value_name = "BYTES")]
+    pub memory_limit: Option<Bytes>,
 }
 
 /// A stage program: its arguments, and what it does with them.

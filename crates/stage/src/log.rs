@@ -16,6 +16,7 @@ pub struct Stage {
     common: CommonArgs,
     started: Instant,
     skipped: Mutex<Vec<String>>,
+    predicted: Mutex<Option<u64>>,
     interrupted: OnceLock<Arc<AtomicBool>>,
 }
 
@@ -27,6 +28,7 @@ impl Stage {
             common: common.clone(),
             started: Instant::now(),
             skipped: Mutex::default(),
+            predicted: Mutex::default(),
             interrupted: OnceLock::new(),
         }
     }
@@ -69,6 +71,14 @@ impl Stage {
     pub fn skipped(&self, what: &str) {
         self.info(&format!("skipped {what}"));
         self.skipped.lock().expect("no panic holds this lock").push(what.to_string());
+    }
+
+    pub(crate) fn memory_limit(&self) -> Option<crate::Bytes> {
+        self.common.memory_limit
+    }
+
+    pub(crate) fn predict(&self, bytes: u64) {
+        *self.predicted.lock().expect("no panic holds this lock") = Some(bytes);
     }
 
     /// Says why the stage failed.
@@ -157,6 +167,7 @@ impl Stage {
             wall_seconds: elapsed.as_secs_f64(),
             cpu_seconds: crate::cpu_seconds(),
             peak_rss_bytes: crate::peak_rss_bytes(),
+            memory_predicted_bytes: *self.predicted.lock().expect("no panic holds this lock"),
             skipped: self.skipped.lock().expect("no panic holds this lock").clone(),
             summary,
         };

@@ -45,6 +45,9 @@ pub struct RunRecord {
     pub cpu_seconds: Option<f64>,
     /// Peak resident memory in bytes, where the system tells.
     pub peak_rss_bytes: Option<u64>,
+    /// What it was forecast to be at the start.
+    #[serde(default)]
+    pub memory_predicted_bytes: Option<u64>,
     /// What was skipped because the scene does not need it.
     pub skipped: Vec<String>,
     /// Figures of the result, such as the number of Gaussians.

@@ -430,10 +430,11 @@ fn cases(world: &World) -> Vec<Case> {
         w
     };
     let one_view = World { shots: world.shots[..1].to_vec(), ..world.clone() };
+    let alone = Options::parse(&SHORT.replace("geometry:", "geometry: --holdout 0")).unwrap_or_default();
     all.extend([
         hostile("black photographs", "every pixel 0", pictures(&|s| s.image.rgb.fill(0.0))),
         hostile("white photographs", "every pixel 1", pictures(&|s| s.image.rgb.fill(1.0))),
-        hostile("one view", "a single photograph", one_view),
+        Case { options: alone, ..hostile("one view", "a single photograph", one_view) },
         hostile("one mask", "the same single mask everywhere", pictures(&|s| s.masks.ids.fill(0))),
         hostile("no masks", "no mask anywhere", pictures(&|s| s.masks.ids.fill(-1))),
         hostile(

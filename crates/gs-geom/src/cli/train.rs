@@ -9,7 +9,7 @@ use crate::densify::{DensifyOptions, Strategy, remove_invisible};
 use crate::init;
 use crate::masks::Masks;
 use crate::mcmc::McmcOptions;
-use crate::memory::{self, Bytes, Forecast};
+use crate::memory::{self, Forecast};
 use crate::photographs::{Photographs, bytes_per_pixel, full_share};
 use crate::schedule::{LearningRates, Schedule};
 use crate::train::{Timings, TrainOptions, Trainer};
@@ -20,7 +20,7 @@ use gs_raster::{RasterOptions, TILE, forward};
 use gs_scene::dataset::{Dataset, Split, View};
 use gs_scene::{Camera, Gaussians, PointCloud, image_size, ply};
 use serde_json::{Value, json};
-use stage::Stage;
+use stage::{Bytes, Stage};
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 use std::str::FromStr;
@@ -415,6 +415,7 @@ impl TrainArgs {
             Bytes(forecast.scratch()),
             forecast.per_gaussian
         ));
+        stage.needs(forecast.peak(most).0, "give fewer --max-gaussians, a smaller --resolution or --image-cache")?;
         Ok(forecast)
     }
 

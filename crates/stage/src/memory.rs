@@ -1,0 +1,104 @@
+//! Amounts of memory, and what a run may take.
+
+use crate::Stage;
+use gs_io::{Error, Result};
+use std::fmt;
+use std::str::FromStr;
+
+/// A number of bytes, written and read as `512M`, `2G`, `1.5G`, `64K` or `0` (powers of 1024).
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, serde::Serialize)]
+pub struct Bytes(pub u64);
+
+impl FromStr for Bytes {
+    type Err = Error;
+
+    fn from_str(s: &str) -> Result<Self> {
+        let plain = s.strip_suffix("iB").or_else(|| s.strip_suffix('B')).unwrap_or(s);
+        let (digits, unit) = match plain.char_indices().last() {
+            Some((at, 'K' | 'k')) => (&plain[..at], 10),
+            Some((at, 'M' | 'm')) => (&plain[..at], 20),
+            Some((at, 'G' | 'g')) => (&plain[..at], 30),
+            Some((at, 'T' | 't')) => (&plain[..at], 40),
+            _ => (plain, 0),
+        };
+        let value: Option<f64> = digits.parse().ok().filter(|v| (0.0..1e6).contains(v));
+        match value {
+            // A bare number could be taken for megabytes as well as bytes.
+            Some(v) if unit > 0 || v == 0.0 => Ok(Self((v * f64::from(1u32 << (unit - 10).max(0)) * 1024.0) as u64)),
+            _ => Err(Error::new("not an amount of memory")
+                .found(s)
+                .expected("a number with a unit such as 512M or 2G, or 0")),
+        }
+    }
+}
+
+impl fmt::Display for Bytes {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        for (unit, shift) in [("T", 40), ("G", 30), ("M", 20), ("K", 10)] {
+            if self.0 >= 1 << shift {
+                let value = self.0 as f64 / (1u64 << shift) as f64;
+                return if value.fract() == 0.0 || value >= 100.0 {
+                    write!(f, "{value:.0}{unit}")
+                } else {
+                    write!(f, "{value:.1}{unit}")
+                };
+            }
+        }
+        write!(f, "{}", self.0)
+    }
+}
+
+impl Stage {
+    /// Notes how much memory the run will take at its peak for the record, and refuses more than `--memory-limit`. `hint` says
+    /// what would take less.
+    ///
+    /// # Errors
+    /// When it is more than the limit.
+    pub fn needs(&self, bytes: u64, hint: &str) -> Result<()> {
+        self.predict(bytes);
+        match self.memory_limit() {
+            Some(limit) if bytes > limit.0 => Err(Error::new("more memory than there may be")
+                .field("--memory-limit")
+                .found(format!("about {} needed", Bytes(bytes)))
+                .expected(format!("at most {limit}"))
+                .hint(hint)),
+            _ => Ok(()),
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::CommonArgs;
+
+    #[test]
+    fn amounts_are_read_and_written() {
+        for (s, n) in
+            [("2G", 2u64 << 30), ("512M", 512 << 20), ("1.5GiB", 3 << 29), ("64kB", 65_536), ("0", 0), ("1T", 1 << 40)]
+        {
+            assert_eq!(s.parse::<Bytes>().unwrap(), Bytes(n), "{s}");
+        }
+        for wrong in ["", "G", "2048", "-1G", "nanG", "infG", "2X", "1e9G"] {
+            assert!(wrong.parse::<Bytes>().is_err(), "{wrong}");
+        }
+        for (n, s) in [(2u64 << 30, "2G"), (3 << 29, "1.5G"), (700 << 20, "700M"), (12, "12")] {
+            assert_eq!(Bytes(n).to_string(), s);
+        }
+    }
+
+    #[test]
+    fn more_than_the_limit_is_refused() {
+        let stage = |limit: Option<&str>| {
+            let memory_limit = limit.map(|l| l.parse().unwrap());
+            Stage::new("gs-geom", &CommonArgs { quiet: true, memory_limit, ..CommonArgs::default() })
+        };
+        assert!(stage(None).needs(u64::MAX, "").is_ok());
+        assert!(stage(Some("2M")).needs(2 << 20, "").is_ok());
+        let e = stage(Some("2M")).needs(3 << 20, "give fewer").unwrap_err().to_string();
+        assert!(
+            e.contains("--memory-limit") && e.contains("3M") && e.contains("2M") && e.contains("give fewer"),
+            "{e}"
+        );
+    }
+}
