@@ -13,7 +13,7 @@ pub use log::Stage;
 pub use progress::Progress;
 pub use record::{RunRecord, cpu_seconds, peak_rss_bytes};
 
-use gs_io::Result;
+use gs_io::{Error, Result};
 use std::process::ExitCode;
 
 /// Arguments that every stage has, with one meaning.
@@ -55,7 +55,14 @@ pub fn main<P: Program>() -> ExitCode {
     let stage = Stage::new(P::NAME, program.common());
     let threads = program.common().threads;
     if let Err(e) = rayon::ThreadPoolBuilder::new().num_threads(threads).build_global() {
-        stage.warn(&format!("cannot start {threads} threads ({e}); using the default"));
+        // rayon has no pool to fall back on: whoever asks for it later would panic.
+        stage.error(
+            &Error::new(format!("cannot start the worker threads: {e}"))
+                .field("--threads")
+                .found(threads)
+                .hint("give fewer threads, or the process more memory"),
+        );
+        return ExitCode::from(2);
     }
     match program.run(&stage) {
         Ok(()) => ExitCode::SUCCESS,
