@@ -6,6 +6,7 @@ mod protocols;
 mod query;
 
 use crate::ask::Asker;
+use crate::labels;
 use crate::lerf::Rendering;
 use crate::ranking::{Index, Join, Scoring, Selection};
 use crate::report::{self, ReportOptions};
@@ -15,7 +16,7 @@ use crate::silhouette::Silhouette;
 use crate::text::TextSource;
 use artifacts::{Features, role};
 use clap::{Parser, Subcommand};
-use gs_io::{Error, Result, write_bytes};
+use gs_io::{Error, Result, Watched, write_bytes};
 use gs_scene::dataset::{self, Dataset, LoadOptions, Resolution};
 use onnx_models::EngineOptions;
 use serde_json::{Value, json};
@@ -310,6 +311,7 @@ fn run_score(a: &ScoreArgs, stage: &Stage) -> Result<String> {
     scene.check_dataset(&dataset)?;
     score::score_instances(&scene, &dataset.root, &mut scores)?;
     let labels = a.labels.clone().unwrap_or_else(|| dataset.root.join("label"));
+    let watched = if labels.is_dir() { labels::watch_folder(&labels)? } else { Watched::default() };
     let no_source = a.language.clip.is_none() && a.language.text_features.is_none();
     if !labels.is_dir() {
         if a.labels.is_some() {
@@ -334,6 +336,7 @@ fn run_score(a: &ScoreArgs, stage: &Stage) -> Result<String> {
         let rendering = Rendering { silhouette: a.silhouette, threshold };
         score::score_queries(&scene, &dataset, &labels, &asker, rendering, &mut scores, &mut |w| stage.warn(w))?;
     }
+    watched.check()?;
     scores.skipped.iter().for_each(|s| stage.skipped(s));
     let json = serde_json::to_vec_pretty(&scores).map_err(|e| Error::new(e.to_string()).file(&a.out))?;
     let (things, queries) = score::csv(&scores);

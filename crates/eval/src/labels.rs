@@ -2,10 +2,10 @@
 //! scorers made of them.
 
 use crate::{Mask, polygon};
-use gs_io::{Error, IoContext, Result};
+use gs_io::{Error, IoContext, Result, Watched};
 use serde::Deserialize;
 use std::collections::BTreeMap;
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
 /// Largest width or height of a labelled frame that is believed, in pixels.
 const MAX_SIDE: u64 = 1 << 15;
@@ -60,7 +60,19 @@ fn box_around(points: impl Iterator<Item = [f64; 2]>) -> Option<[f64; 4]> {
 /// # Errors
 /// When the folder cannot be read, a file is not such a label file, or its image size is absurd.
 pub fn read_folder(folder: impl AsRef<Path>) -> Result<Vec<FrameLabels>> {
-    let folder = folder.as_ref();
+    files(folder.as_ref())?.iter().map(read).collect()
+}
+
+/// Notes how a label folder and its files are now, for a stage that reads them more than once.
+///
+/// # Errors
+/// When the folder cannot be read.
+pub fn watch_folder(folder: &Path) -> Result<Watched> {
+    Ok(Watched::new(files(folder)?).and(Watched::new([folder])))
+}
+
+/// All `*.json` of a folder, by name.
+fn files(folder: &Path) -> Result<Vec<PathBuf>> {
     let mut paths = Vec::new();
     for entry in std::fs::read_dir(folder).at("list", folder)? {
         let path = entry.at("list", folder)?.path();
@@ -69,7 +81,7 @@ pub fn read_folder(folder: impl AsRef<Path>) -> Result<Vec<FrameLabels>> {
         }
     }
     paths.sort();
-    paths.iter().map(read).collect()
+    Ok(paths)
 }
 
 /// Reads one label file and fills its polygons: vertices are truncated toward zero, borders included (docs/protocols.md).
@@ -140,7 +152,7 @@ pub fn read_mask(path: &Path) -> Result<Mask> {
 /// When the folder cannot be read, a file is no picture, or pictures of one frame differ in size.
 pub fn read_pictures(folder: impl AsRef<Path>) -> Result<Vec<FrameLabels>> {
     let folder = folder.as_ref();
-    let list = |folder: &Path| -> Result<Vec<std::path::PathBuf>> {
+    let list = |folder: &Path| -> Result<Vec<PathBuf>> {
         let entries = std::fs::read_dir(folder).at("list", folder)?;
         let mut paths = entries.map(|e| Ok(e.at("list", folder)?.path())).collect::<Result<Vec<_>>>()?;
         paths.sort();

@@ -41,13 +41,25 @@ impl Watched {
         self
     }
 
-    /// Checks that no file has become another. One that is gone was read while it was there, or its reader has said so.
+    /// Checks that all files are still there and the same.
+    ///
+    /// # Errors
+    /// Names the first file that changed or is gone.
+    pub fn check(&self) -> Result<()> {
+        self.first(|path, then| std::fs::metadata(path).map_or(true, |m| stamp(&m) != then))
+    }
+
+    /// Checks that no file has become another, for a stage that cannot go on without one of them: what it has read so far
+    /// was there, and it says itself which it misses.
     ///
     /// # Errors
     /// Names the first file that changed.
-    pub fn check(&self) -> Result<()> {
-        let changed = |(path, then): &&(PathBuf, Stamp)| std::fs::metadata(path).is_ok_and(|m| stamp(&m) != *then);
-        match self.files.iter().find(changed) {
+    pub fn check_those_left(&self) -> Result<()> {
+        self.first(|path, then| std::fs::metadata(path).is_ok_and(|m| stamp(&m) != then))
+    }
+
+    fn first(&self, changed: impl Fn(&Path, Stamp) -> bool) -> Result<()> {
+        match self.files.iter().find(|(path, then)| changed(path, *then)) {
             None => Ok(()),
             Some((path, _)) => Err(Error::new("the file changed while this run was reading it")
                 .file(path)
@@ -61,7 +73,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn changes_are_seen_and_absence_is_not_one() {
+    fn changes_are_seen_and_absence_is_one_where_it_counts() {
         let dir = tempfile::tempdir().unwrap();
         let [a, b] = ["a", "b"].map(|n| dir.path().join(n));
         std::fs::write(&a, "one").unwrap();
@@ -71,9 +83,11 @@ mod tests {
         std::fs::rename(&b, &a).unwrap();
         let e = w.check().unwrap_err().to_string();
         assert!(e.contains("a: the file changed while this run was reading it"), "{e}");
+        assert!(w.check_those_left().is_err());
         std::fs::remove_file(&a).unwrap();
-        w.check().unwrap();
-        std::fs::write(&a, "longer than before").unwrap();
         assert!(w.check().is_err());
+        w.check_those_left().unwrap();
+        std::fs::write(&a, "longer than before").unwrap();
+        assert!(w.check_those_left().is_err());
     }
 }

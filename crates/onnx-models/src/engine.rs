@@ -174,22 +174,25 @@ pub fn parallel_map<R: Send>(count: usize, f: impl Fn(usize) -> Result<R> + Sync
     }
     let next = AtomicUsize::new(0);
     let results: Mutex<Vec<Option<Result<R>>>> = Mutex::new((0..count).map(|_| None).collect());
+    let work = || {
+        loop {
+            let i = next.fetch_add(1, Ordering::Relaxed);
+            if i >= count {
+                break;
+            }
+            let r = f(i);
+            if r.is_err() {
+                // Work not yet begun has higher indices, whose errors would not be the one reported.
+                next.store(count, Ordering::Relaxed);
+            }
+            results.lock().expect("no panic holds this lock")[i] = Some(r);
+        }
+    };
     std::thread::scope(|scope| {
-        for _ in 0..threads {
-            scope.spawn(|| {
-                loop {
-                    let i = next.fetch_add(1, Ordering::Relaxed);
-                    if i >= count {
-                        break;
-                    }
-                    let r = f(i);
-                    if r.is_err() {
-                        // Work not yet begun has higher indices, whose errors would not be the one reported.
-                        next.store(count, Ordering::Relaxed);
-                    }
-                    results.lock().expect("no panic holds this lock")[i] = Some(r);
-                }
-            });
+        let begun = (0..threads).filter(|_| std::thread::Builder::new().spawn_scoped(scope, work).is_ok()).count();
+        // Where the system has no more threads to give, those there are do the work; this one does it where there is none.
+        if begun == 0 {
+            work();
         }
     });
     let results = results.into_inner().expect("no panic holds this lock");

@@ -20,7 +20,7 @@ pub use memory::Bytes;
 pub use progress::Progress;
 pub use record::{RunRecord, children_cpu_seconds, cpu_seconds, peak_rss_bytes};
 
-use gs_io::Result;
+use gs_io::{Error, Result};
 use std::process::ExitCode;
 
 /// The git revision that the programs were built from: the commit that was checked out, or `CAGS_REVISION` of the build's
@@ -80,7 +80,14 @@ pub fn main<P: Program>() -> ExitCode {
     let stage = Stage::new(P::NAME, program.common());
     let threads = program.common().threads;
     if let Err(e) = rayon::ThreadPoolBuilder::new().num_threads(threads).build_global() {
-        stage.warn(&format!("cannot start {threads} threads ({e}); using the default"));
+        // rayon has no pool to fall back on: whoever asks for it later would panic.
+        stage.error(
+            &Error::new(format!("cannot start the worker threads: {e}"))
+                .field("--threads")
+                .found(threads)
+                .hint("give fewer threads, or the process more memory"),
+        );
+        return ExitCode::from(2);
     }
     match program.run(&stage) {
         Ok(()) => ExitCode::SUCCESS,

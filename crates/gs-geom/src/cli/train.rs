@@ -434,7 +434,7 @@ impl TrainArgs {
         if stage.interrupted() {
             return;
         }
-        match watched.check().and_then(|()| self.save(trainer, run)) {
+        match watched.check_those_left().and_then(|()| self.save(trainer, run)) {
             Ok(()) => stage.warn(&format!(
                 "saved a checkpoint after iteration {iteration}; mend the error below, and the same command goes on from it"
             )),
@@ -536,7 +536,7 @@ impl TrainArgs {
             let iteration = trainer.state().progress.iteration;
             let stop = self.stop_after.is_some_and(|last| iteration >= last);
             if stop || stage.interrupted() {
-                watched.check()?;
+                watched.check_those_left()?;
                 self.save(trainer, run)?;
                 let partial = beside(&self.out, ".partial.ply");
                 let note = format!("unfinished: {iteration} of {} iterations", self.iterations);
@@ -562,7 +562,7 @@ impl TrainArgs {
             };
             if due && !trainer.is_done() {
                 // A checkpoint names the photographs as they were: it must not hold what others taught.
-                watched.check()?;
+                watched.check_those_left()?;
                 self.save(trainer, run)?;
                 saved = Instant::now();
             }
