@@ -51,7 +51,7 @@ batch: build ## Scenes x variants x seeds from a table, JOBS at a time: make bat
 
 # For batches on more than one machine; nothing else here needs it.
 SNAKEMAKE := out/snakemake
-snakemake: $(SNAKEMAKE)/bin/snakemake ## Put Snakemake with its Slurm and Kubernetes executors into out/snakemake (needs Python 3.11)
+snakemake: $(SNAKEMAKE)/bin/snakemake ## Put Snakemake with its executors for clusters into out/snakemake (needs Python 3.11)
 $(SNAKEMAKE)/bin/snakemake: pipelines/snakemake.txt
 	python3 -m venv $(SNAKEMAKE)
 	$(SNAKEMAKE)/bin/pip install -q -r $<

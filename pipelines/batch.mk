@@ -1,5 +1,6 @@
 # `make batch TABLE=file OUT=folder`: scenes x variants x seeds from one table (scripts/batch_plan.sh says what it holds), -j
-# runs at a time. Scenes of a benchmark end in the paper's table for each variant and seed, OUT/tables/<variant>-<seed>.
+# runs at a time. Scenes of a benchmark end in the paper's table for each variant and seed, OUT/tables/<variant>-<seed>, and
+# in OUT/summary.md.
 #
 # Each run is a make of its own on pipelines/<pipeline>.mk, so a killed batch goes on where it was, and a changed line of the
 # table runs what depends on it. pipelines/Snakefile is the same for more than one machine.
@@ -16,7 +17,7 @@ endif
 SHELL := /bin/bash
 .DEFAULT_GOAL := all
 
-$(if $(filter 0,$(shell scripts/batch_plan.sh $(TABLE) $(OUT); echo $$?)),,$(error the table cannot be read))
+$(if $(filter 0,$(shell DATA='$(DATA)' scripts/batch_plan.sh $(TABLE) $(OUT); echo $$?)),,$(error the table cannot be read))
 # A run as name|pipeline|scene|seed|base|target.
 LINES := $(shell tr '\t' '|' < $(OUT)/runs.tsv)
 cell = $(word $2,$(subst |, ,$1))
@@ -41,9 +42,15 @@ VARIANTS := $(sort $(notdir $(SCORED)))
 define TABLE_RULES
 $(OUT)/tables/$1/metrics.json: $(foreach r,$(filter %/$1,$(SCORED)),$(OUT)/$r/protocol/metrics.json) | $(BIN)/eval
 	$(BIN)/eval table $(foreach r,$(filter %/$1,$(SCORED)),$(OUT)/$r/protocol) --out $$(@D) --quiet > /dev/null
-all: $(OUT)/tables/$1/metrics.json
 endef
 $(foreach v,$(VARIANTS),$(eval $(call TABLE_RULES,$v)))
+
+# Our rows of all of them below each other.
+ifneq ($(VARIANTS),)
+all: $(OUT)/summary.md
+$(OUT)/summary.md: $(foreach v,$(VARIANTS),$(OUT)/tables/$v/metrics.json) scripts/batch_summary.sh
+	scripts/batch_summary.sh $(OUT)/tables > $@
+endif
 
 $(BIN)/%:
 	cargo build --release --workspace --bins

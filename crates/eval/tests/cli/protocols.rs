@@ -332,6 +332,11 @@ fn tables_join_scenes_and_refuse_what_does_not_fit() {
     let t: Value = serde_json::from_slice(&std::fs::read(s.at("t/metrics.json")).unwrap()).unwrap();
     same(&t["mean_over_scenes"]["19"]["miou"], &first["sets"][0]["miou"], "twice the same scene");
     same(&t["pooled"]["19"]["macc"], &first["sets"][0]["macc"], "pooled with itself");
+    let cags = t["tables"][0]["rows"].as_array().unwrap().iter().find(|r| r["name"] == "CAGS").unwrap();
+    assert_eq!((&cags["percent"]["10 mIoU"], &cags["source"]), (&json!(54.8), &json!("its paper")));
+    assert_eq!(t["tables"][1]["rows"][1]["name"], "scene0062_00");
+    let page = std::fs::read_to_string(s.at("t/table.html")).unwrap();
+    assert!(page.contains("its paper") && page.contains("54.80") && page.contains("scene0062_00"));
     let error = |folders: &[&str]| {
         let o = table(folders);
         assert_eq!(o.status.code(), Some(2));
