@@ -203,6 +203,9 @@ fn read_inputs(a: &Args, stage: &Stage) -> Result<Inputs> {
             .expected(graph.kept.len())
             .hint("run feat-train again"));
     }
+    let (entries, samples) = (footprints.csr().1.len(), footprints.pixels.col.len());
+    let needed = crate::memory::forecast(geometry.gaussians.len(), features.kept.len(), features.dim, entries, samples);
+    stage.forecast(needed, "drop small footprint entries: graph-precompute --cut 0.001")?;
     if features.dim == 0 {
         return Err(Error::new("features have no channels")
             .file(&a.features)

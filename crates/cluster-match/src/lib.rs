@@ -9,4 +9,5 @@ pub mod describe;
 pub mod extend;
 pub mod group;
 pub mod join;
+pub mod memory;
 pub mod vote;

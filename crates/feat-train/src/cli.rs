@@ -4,6 +4,7 @@ use crate::checkpoint;
 use crate::evidence::{Evidence, collect};
 use crate::fast::{Engine, Shortcuts};
 use crate::loss::Loss;
+use crate::memory;
 use crate::model::{AnchorStart, CohesionOf, Init, Settings};
 use crate::normalize::Axis;
 use crate::real::{Half, Weight};
@@ -429,6 +430,17 @@ impl Program for Args {
         let _lock = Lock::take(&self.out)?;
         let watched = Watched::new([&self.geometry]);
         let inputs = self.read_inputs()?;
+        let sizes = memory::Sizes {
+            entries: inputs.footprints.csr().1.len(),
+            samples: inputs.footprints.pixels.col.len(),
+            gaussians: inputs.footprints.kept.len(),
+            masks: inputs.footprints.rows.len(),
+        };
+        let needed = match self.method() {
+            Method::Contrastive => memory::contrastive(sizes, self.dim.unwrap_or(6), self.contrastive.layers),
+            Method::Spectral => memory::spectral(sizes),
+        };
+        stage.forecast(needed, "drop small footprint entries: graph-precompute --cut 0.001")?;
         let (dim, values, summary) = match self.method() {
             Method::Contrastive if self.contrastive.half_weights => self.contrastive::<Half>(&inputs, stage)?,
             Method::Contrastive => self.contrastive::<f32>(&inputs, stage)?,

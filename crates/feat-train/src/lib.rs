@@ -13,6 +13,7 @@ pub mod fast;
 pub mod gram;
 pub mod linalg;
 pub mod loss;
+pub mod memory;
 pub mod model;
 pub mod network;
 pub mod normalize;

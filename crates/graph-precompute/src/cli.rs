@@ -177,6 +177,9 @@ impl Program for Args {
         if geometry.gaussians.is_empty() {
             return Err(Error::new("no Gaussians").file(&self.geometry).hint("train the geometry first"));
         }
+        let pixels = views.iter().map(|v| u64::from(v.camera.width) * u64::from(v.camera.height)).max().unwrap_or(0);
+        let needed = crate::memory::forecast(geometry.gaussians.len(), views.len(), pixels, self.pixel_samples);
+        stage.forecast(needed, "give smaller id maps or fewer --pixel-samples")?;
         let inputs = BTreeMap::from([
             (role::GEOMETRY.to_string(), hash_file(&self.geometry)?),
             (role::DATASET.to_string(), dataset.hash()?),

@@ -9,6 +9,7 @@ pub mod footprint;
 pub mod fps;
 pub mod graph;
 pub mod kdtree;
+pub mod memory;
 pub mod positions;
 pub mod precompute;
 #[cfg(test)]

@@ -238,7 +238,6 @@ impl<'a> Trainer<'a> {
             near: near_plane(self.extent),
             depth: false,
             absolute_pulls: self.options.densify.strategy == Strategy::Absgrad,
-            ..RasterOptions::default()
         };
         let rendered = self.workspace.forward(gaussians, camera, &raster);
         let undrawn = rendered.dropped();

@@ -476,6 +476,8 @@ fn bad_input_is_refused_in_one_line() {
         let e = train(scene(), &[option, value]);
         assert!(e.contains(option) && e.contains("out of range"), "{e}");
     }
+    let e = train(scene(), &["--memory-limit", "1M"]);
+    assert!(e.contains("--memory-limit") && e.contains("--max-gaussians") && e.contains("at most 1M"), "{e}");
     assert_eq!(fs::read_to_string(&out).unwrap(), "a good geometry");
     let blocked = format!("{out}/g.ply");
     assert!(refused(&["train", "--scene", scene(), "--out", &blocked]).contains("cannot create the folder"));

@@ -49,6 +49,15 @@ impl fmt::Display for Bytes {
 }
 
 impl Stage {
+    /// Says how much memory the run will take at its peak, and [`Self::needs`] it.
+    ///
+    /// # Errors
+    /// When it is more than the limit.
+    pub fn forecast(&self, bytes: u64, hint: &str) -> Result<()> {
+        self.info(&format!("memory: about {} at the peak", Bytes(bytes)));
+        self.needs(bytes, hint)
+    }
+
     /// Notes how much memory the run will take at its peak for the record, and refuses more than `--memory-limit`. `hint` says
     /// what would take less.
     ///
