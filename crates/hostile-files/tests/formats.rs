@@ -36,15 +36,15 @@ fn findings_stay_mended() {
             count += 1;
         }
     }
-    println!("{count} findings of old");
+    assert!(count > 0, "no findings in testdata");
 }
 
 #[test]
 fn good_files_take_little_memory() {
     for format in &FORMATS {
         for seed in seeds(format) {
-            let held = run(format, &seed);
-            println!("{}: {held} bytes for {}", format.name, seed.len());
+            // Files of a kilobyte: what is held are buffers for writing, a megabyte each.
+            assert!(run(format, &seed) < 2 << 20, "{}", format.name);
         }
     }
 }
