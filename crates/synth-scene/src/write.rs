@@ -355,7 +355,7 @@ fn prepare(out: &Path, layout: &Layout) -> Result<()> {
         std::fs::remove_file(&marker).at("replace", &marker)?;
     }
     let unused = |f: &&str| !folders(layout).any(|used| used == *f);
-    let others = FOLDERS.into_iter().filter(|f| unused(&f)).chain([SCAN]).chain(benchmark::FOLDERS);
+    let others = FOLDERS.into_iter().filter(|f| unused(f)).chain([SCAN]).chain(benchmark::FOLDERS);
     for folder in others.map(|f| out.join(f)).filter(|f| f.is_dir()) {
         std::fs::remove_dir_all(&folder).at("replace", &folder)?;
     }
