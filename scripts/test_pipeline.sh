@@ -193,4 +193,25 @@ grep -q 'not what the plan expects' "$work/broken.log" || { cat "$work/broken.lo
 [ "$(grep -c 'target/release/feat-train ' "$work/broken.log")" = 1 ] || fail "a changed line ran more than its features"
 pass "the small ablation gives what is expected, and a broken component does not"
 
+say "== benchmarks"
+# The harness of make bench and make stress on a small part of their work.
+cat > "$work/tradeoffs.plan" <<'PLAN'
+scene tiny | --size tiny --views 10 --objects 5 | --iterations 120 --max-gaussians 3000
+repeats | 1
+knob cut | graph | Smallest share
+point cut | 0 | --cut 0 | exact default
+point cut | all but nothing | --cut 0.2 |
+axis views | Photographs | graph
+size views | 6  | --size tiny --views 6  | --iterations 20
+size views | 12 | --size tiny --views 12 | --iterations 20
+PLAN
+bench() { target/release/bench "$@" --quiet > "$work/bench.log" 2>&1 || { cat "$work/bench.log"; fail "bench $1"; }; }
+bench tradeoff --plan "$work/tradeoffs.plan" --work "$work/trade" --out "$work/trade.json"
+grep -q 'all but nothing' "$work/trade.md" && grep -q 'Growth' "$work/trade.md" && [ -s "$work/trade.html" ] || fail "no trade-offs"
+# What keeps a fifth of a mask or nothing must lose something: the harness measures what it says.
+awk -F'|' '/all but nothing/ { found = $6 + 0 > 1 } END { exit !found }' "$work/trade.md" || fail "a coarse cut lost nothing"
+bench stress --only "metamorphic scaled" --work "$work/stress" --out "$work/stress.json"
+grep -q '"good": true' "$work/stress.json" || fail "no stress"
+pass "the harness of make bench and make stress measures what it says"
+
 say "$passed passed, 0 failed"
