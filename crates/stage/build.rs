@@ -1,6 +1,5 @@
 //! Finds the git revision that the programs are built from.
 
-use std::path::Path;
 use std::process::Command;
 
 /// What git says, if this source is in a git repository of its own.
@@ -17,9 +16,7 @@ fn main() {
     // A source archive unpacked within another project has that project's git around it, which does not know this file.
     let ours = || git(&["ls-files", "--error-unmatch", "build.rs"]);
     let revision = given.or_else(|| ours().and_then(|_| git(&["rev-parse", "--short=12", "HEAD"])));
-    // The log of HEAD grows with every commit and checkout.
-    if let Some(log) = git(&["rev-parse", "--git-path", "logs/HEAD"]).filter(|p| Path::new(p).exists()) {
-        println!("cargo::rerun-if-changed={log}");
-    }
+    // Not with every commit, which would compile every program again: a build of a clean checkout has its own commit, one that
+    // goes on has that of the last change to this crate, and the hash of the program tells the rest.
     println!("cargo::rustc-env=CAGS_REVISION={}", revision.as_deref().unwrap_or("unknown"));
 }
