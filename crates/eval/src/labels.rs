@@ -193,7 +193,7 @@ pub fn read_pictures(folder: impl AsRef<Path>) -> Result<Vec<FrameLabels>> {
 mod tests {
     use super::*;
 
-    fn write(json: &str) -> (tempfile::TempDir, std::path::PathBuf) {
+    fn write(json: &str) -> (tempfile::TempDir, PathBuf) {
         let dir = tempfile::tempdir().unwrap();
         let path = dir.path().join("frame_00007.json");
         std::fs::write(&path, json).unwrap();
