@@ -55,7 +55,7 @@ pub struct Cell {
     pub scene: String,
     /// A value for each of [`METRICS`].
     pub values: Vec<Option<f64>>,
-    /// Wall-clock seconds of feat-train and cluster-match.
+    /// Processor seconds of feat-train and cluster-match; of a training whose record lacks them, those of the clock.
     pub seconds: Option<f64>,
     /// Mean cosine of a mask's Gaussians with its centroid in the last view trained on; none for closed forms.
     pub alignment: Option<f64>,
@@ -108,7 +108,10 @@ fn cell(scene: String, folder: &Path, path: &Path, row: &Row) -> Result<Cell> {
         alignment,
         scene,
         values: METRICS.iter().map(|m| (m.of)(&scores)).collect(),
-        seconds: features.as_ref().zip(instances.as_ref()).map(|(f, i)| f.wall_seconds + i.wall_seconds),
+        seconds: features
+            .as_ref()
+            .zip(instances.as_ref())
+            .and_then(|(f, i)| Some(f.cpu_seconds.unwrap_or(f.wall_seconds) + i.cpu_seconds?)),
         network: network.filter(|(_, n)| *n > 0.0).map(|(bytes, n)| (bytes, bytes / n)),
     })
 }

@@ -21,7 +21,7 @@ pub struct RowResult {
     pub results: BTreeMap<String, BTreeMap<String, Interval>>,
     /// By p, then by metric: the same of the difference from the row of reference, cell by cell.
     pub differences: BTreeMap<String, BTreeMap<String, Interval>>,
-    /// Mean wall-clock seconds of feat-train and cluster-match by p; several ran at a time.
+    /// Mean processor seconds of feat-train and cluster-match by p, over the scenes whose records have them.
     pub seconds: BTreeMap<String, f64>,
     /// Mean cosine of a mask's Gaussians with its centroid at the end of training, by p.
     pub alignment: BTreeMap<String, f64>,
