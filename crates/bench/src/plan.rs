@@ -5,7 +5,7 @@
 //! | `scene NAME \| synth-scene \| geometry` | a scene: options of synth-scene, and of gs-geom train |
 //! | `repeats \| COUNT` | how often each point is timed, in turns |
 //! | `knob NAME \| STAGE \| title` | an approximation of a stage: `geometry`, `graph`, `features`, `instances` or `pipeline` |
-//! | `point KNOB \| LABEL \| options \| role` | a setting; role: `exact`, `default`, both or none. With `pipeline`, options are `stage: options; stage: options` |
+//! | `point KNOB \| LABEL \| options \| role` | a setting; role: `exact`, `default`, both or none. Options of other stages than the knob's: `stage: options; stage: options` |
 //! | `axis NAME \| title \| STAGE ...` | a size that stages are timed against |
 //! | `size AXIS \| VALUE \| scene \| geometry` | one size: options of synth-scene and gs-geom train |
 
@@ -139,8 +139,8 @@ impl Plan {
                 let knob = self.knobs.iter_mut().find(|k| k.name == name).ok_or_else(|| unknown("knob"))?;
                 let roles: Vec<&str> = fields.get(3).map(|r| r.split(' ').collect()).unwrap_or_default();
                 let options = match knob.stage {
-                    Some(stage) => Options::of(stage, field(2)?),
-                    None => Options::parse(field(2)?)?,
+                    Some(stage) if !field(2)?.contains(':') => Options::of(stage, field(2)?),
+                    _ => Options::parse(field(2)?)?,
                 };
                 let (exact, default) = (roles.contains(&"exact"), roles.contains(&"default"));
                 knob.points.push(Point { label: field(1)?.into(), options, exact, default });

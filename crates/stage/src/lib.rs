@@ -48,6 +48,9 @@ pub struct CommonArgs {
     pub memory_limit: Option<Bytes>,
 }
 
+/// What `--version` says: the version and the git revision.
+const VERSION: &str = concat!(env!("CARGO_PKG_VERSION"), " (", env!("CAGS_REVISION"), ")");
+
 /// A stage program: its arguments, and what it does with them.
 pub trait Program: clap::Parser {
     /// The program's name, such as `gs-geom`.
@@ -76,7 +79,8 @@ pub fn main<P: Program>() -> ExitCode {
             }
         };
     }
-    let program = P::parse();
+    let mut matches = P::command().version(VERSION).get_matches();
+    let program = P::from_arg_matches_mut(&mut matches).unwrap_or_else(|e| e.exit());
     let stage = Stage::new(P::NAME, program.common());
     let threads = program.common().threads;
     if let Err(e) = rayon::ThreadPoolBuilder::new().num_threads(threads).build_global() {

@@ -1,0 +1,37 @@
+#!/usr/bin/env python3
+"""Asks a finished run for a text and takes the Gaussians of the best instance. Needs numpy only.
+
+    examples/query.py "green kettle" [out/demo] [testdata/clip-tiny]
+"""
+import json
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+
+from read_artifacts import read
+
+ROOT = Path(__file__).resolve().parent.parent
+
+
+def ask(text, run, clip):
+    """The ranked instances of `eval query`, best first."""
+    with tempfile.TemporaryDirectory() as out:
+        command = [ROOT / "target/release/eval", "query", "--instances", run / "instances.safetensors"]
+        command += ["--geometry", run / "geometry.ply", "--clip", clip, "--text", text, "--out", out, "--quiet"]
+        subprocess.run([str(c) for c in command], check=True)
+        return json.loads((Path(out) / "query.json").read_text())
+
+
+def main(text, run="out/demo", clip="testdata/clip-tiny"):
+    answer = ask(text, Path(run), Path(clip))
+    best = answer["queries"][0]["ranking"][0]["instance"]
+    tensors, _ = read(Path(run) / "instances.safetensors")
+    chosen = tensors["label"] == best
+    print(f"{text}: instance {best}, {chosen.sum()} Gaussians around {tensors['centroid'][best]}")
+
+
+if __name__ == "__main__":
+    if len(sys.argv) < 2:
+        sys.exit(__doc__)
+    main(*sys.argv[1:])
