@@ -178,7 +178,12 @@ impl Program for Args {
             return Err(Error::new("no Gaussians").file(&self.geometry).hint("train the geometry first"));
         }
         let pixels = views.iter().map(|v| u64::from(v.camera.width) * u64::from(v.camera.height)).max().unwrap_or(0);
-        let needed = crate::memory::forecast(geometry.gaussians.len(), views.len(), pixels, self.pixel_samples);
+        // The first view's masks speak for all; a damaged file is an error later on.
+        let first =
+            views.iter().filter(|_| self.pixel_samples > 0).map(|v| artifacts::maps_path(&self.masks, v.stem()));
+        let masks = first.filter_map(|p| artifacts::MaskMaps::read(p).ok()).next().map_or(0, |m| m.id_count());
+        let samples = self.pixel_samples * masks;
+        let needed = crate::memory::forecast(geometry.gaussians.len(), views.len(), pixels, samples);
         stage.forecast(needed, "give smaller id maps or fewer --pixel-samples")?;
         let inputs = BTreeMap::from([
             (role::GEOMETRY.to_string(), hash_file(&self.geometry)?),
