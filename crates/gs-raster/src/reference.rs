@@ -78,7 +78,7 @@ pub struct Pixel {
     /// Largest change of alpha if every decision that rounding may turn at this pixel (an alpha beside 1/255 or 0.99, a
     /// transmittance beside 1e-4) went the other way; 0 where there is none.
     pub doubt: f64,
-    /// What rounding of the exponents to single precision may change of alpha besides.
+    /// What rounding of exponents and depths to single precision may change of alpha, and of a colour of 1, besides.
     pub rounding: f64,
 }
 
@@ -231,6 +231,9 @@ fn layers(ellipses: &[Ellipse], x: usize, y: usize, cuts: Cuts) -> (Vec<Layer<'_
             }
         }
         rounded += transmittance * alpha * rounding;
+        // Layers as deep as each other, to single precision, may come in either order.
+        let as_deep = |l: &&Layer<'_>| e.z - l.ellipse.z <= 2.0 * f64::from(f32::EPSILON) * e.z;
+        rounded += out.iter().rev().take_while(as_deep).map(|l| l.transmittance * l.alpha * alpha).sum::<f64>();
         out.push(Layer { ellipse: e, offset, raw, alpha, transmittance });
         transmittance *= 1.0 - alpha;
     }
