@@ -39,6 +39,18 @@ tiny "$work/a" 2 > "$work/a.log" 2>&1 || { cat "$work/a.log"; fail "the pipeline
 for f in "${artifacts[@]}" report.html metrics.json; do [ -s "$work/a/$f" ] || fail "no $f"; done
 pass "the pipeline runs from scene to report"
 
+say "== examples"
+if python3 -c 'import numpy' 2> /dev/null; then
+  examples/read_artifacts.py "$work/a" > "$work/python.log" && grep -q '^instance ' "$work/python.log" || fail "examples/read_artifacts.py"
+  examples/query.py floor "$work/a" > "$work/python.log" && grep -q 'floor: instance' "$work/python.log" || fail "examples/query.py"
+  pass "the Python examples read artifacts and ask"
+else
+  say "skipped: no python3 with numpy"
+fi
+examples/export_instances.sh "$work/a" "$work/viewer" > "$work/export.log" 2>&1 || { cat "$work/export.log"; fail "examples/export_instances.sh"; }
+[ -s "$work/viewer/instance_0000.ply" ] || fail "no instance was exported"
+pass "a shell example exports instances"
+
 say "== a second make"
 tiny "$work/a" 2 > "$work/again.log" 2>&1
 [ -z "$(stages_of "$work/again.log")" ] || { cat "$work/again.log"; fail "a second make ran a stage"; }
