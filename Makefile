@@ -84,6 +84,7 @@ bench-raster: ## Time the rasteriser per pixel-Gaussian pair on one core: out/be
 lint: ## Check formatting and lints
 	$(CARGO) fmt --all --check
 	$(CARGO) clippy --release --workspace --all-targets -- -D warnings
+	scripts/licences.py --check
 
 # A revision to compare with, such as HEAD~5.
 BASE ?=
