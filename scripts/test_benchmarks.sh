@@ -4,7 +4,7 @@
 # conversion), what make check-data says of data that is missing, and make reproduce-check.
 set -euo pipefail
 cd "$(dirname "$0")/.."
-cargo build --release --workspace --bins
+cargo build --release --workspace --bins --tests
 work=$(mktemp -d)
 trap 'rm -rf "$work"' EXIT
 passed=0

@@ -4,7 +4,8 @@
 # different scenes do not mix, and that every stage refuses every damaged input. Takes a minute or two after the build.
 set -euo pipefail
 cd "$(dirname "$0")/.."
-cargo build --release --workspace --bins
+# With the tests, whose dependencies ask more of shared crates: else everything is compiled again after cargo test.
+cargo build --release --workspace --bins --tests
 
 work=$(mktemp -d)
 trap 'rm -rf "$work"' EXIT

@@ -8,7 +8,7 @@ if [ -z "$snakemake" ]; then
   echo "skipped: no snakemake (make snakemake puts it into out/snakemake)"
   skip=1
 fi
-cargo build --release --workspace --bins
+cargo build --release --workspace --bins --tests
 work=$(mktemp -d)
 trap 'rm -rf "$work"' EXIT
 started=$SECONDS

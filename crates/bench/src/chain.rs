@@ -7,7 +7,6 @@ use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 use std::process::Command;
 use std::str::FromStr;
-use std::time::Instant;
 
 /// A stage of the pipeline, in order.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
@@ -73,6 +72,13 @@ impl Options {
         Ok(all)
     }
 
+    /// The same with other options of one stage.
+    #[must_use]
+    pub fn with(mut self, stage: Stage, options: Vec<String>) -> Self {
+        self.0.insert(stage, options);
+        self
+    }
+
     /// The options of a stage.
     pub fn get(&self, stage: Stage) -> &[String] {
         self.0.get(&stage).map_or(&[], Vec::as_slice)
@@ -85,14 +91,14 @@ impl Options {
     }
 }
 
-/// What a run of a program took.
+/// What a run of a stage took, as its record says.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Serialize, Deserialize)]
 pub struct Cost {
     /// Wall-clock seconds.
     pub wall: f64,
     /// Processor seconds of all its threads.
     pub cpu: f64,
-    /// Peak memory in bytes, where the record of the run says so.
+    /// Peak memory in bytes; 0 where the record of the run does not say.
     pub peak: u64,
 }
 
@@ -118,9 +124,8 @@ impl Programs {
     ///
     /// # Errors
     /// When it cannot be started or fails; the error holds what it said.
-    pub fn run<S: AsRef<std::ffi::OsStr>>(&self, program: &str, arguments: &[S]) -> Result<Cost> {
+    pub fn run<S: AsRef<std::ffi::OsStr>>(&self, program: &str, arguments: &[S]) -> Result<()> {
         let path = self.folder.join(program);
-        let (begun, before) = (Instant::now(), stage::children_cpu_seconds().unwrap_or(0.0));
         let output = Command::new(&path)
             .args(arguments)
             .args(["--quiet", "--threads", &self.threads.to_string()])
@@ -130,8 +135,7 @@ impl Programs {
             let said = String::from_utf8_lossy(&output.stderr).trim().to_string();
             return Err(Error::new(format!("{program} failed ({}): {said}", output.status)).file(&path));
         }
-        let cpu = stage::children_cpu_seconds().unwrap_or(0.0) - before;
-        Ok(Cost { wall: begun.elapsed().as_secs_f64(), cpu, peak: 0 })
+        Ok(())
     }
 }
 
@@ -198,9 +202,10 @@ impl Files {
             }
         };
         arguments.extend(options.get(stage).iter().cloned());
-        let cost = programs.run(program, &arguments)?;
-        let peak = stage::RunRecord::read(self.output(stage))?.peak_rss_bytes;
-        Ok(Cost { peak: peak.unwrap_or(0), ..cost })
+        programs.run(program, &arguments)?;
+        let record = stage::RunRecord::read(self.output(stage))?;
+        let (cpu, peak) = (record.cpu_seconds.unwrap_or(f64::NAN), record.peak_rss_bytes.unwrap_or(0));
+        Ok(Cost { wall: record.wall_seconds, cpu, peak })
     }
 
     /// Scores the instances: the figures of `score.json`.

@@ -30,18 +30,16 @@ enum Command {
     Stress(StressArgs),
 }
 
+/// Options of every command.
 #[derive(Debug, clap::Args)]
 struct Common {
-    /// What to measure, such as pipelines/tradeoffs.plan
-    #[arg(long, value_name = "FILE")]
-    plan: PathBuf,
     /// Folder of the stages' programs
     #[arg(long, value_name = "DIR", default_value = "target/release")]
     bin: PathBuf,
-    /// Folder for scenes and what is made of them; what is there is not made again
+    /// Folder for scenes and what is made of them; what tradeoff and compare find there is not made again
     #[arg(long, value_name = "DIR")]
     work: PathBuf,
-    /// Output file, JSON; a .md (and with tradeoff a .html) of the same is written beside it
+    /// Output file, JSON; a .md (and but for compare a .html) of the same is written beside it
     #[arg(long, value_name = "FILE")]
     out: PathBuf,
 }
@@ -50,6 +48,9 @@ struct Common {
 struct TradeoffArgs {
     #[command(flatten)]
     common: Common,
+    /// What to measure, such as pipelines/tradeoffs.plan
+    #[arg(long, value_name = "FILE")]
+    plan: PathBuf,
     /// Only these knobs and axes of the plan [all]
     #[arg(long, value_name = "NAMES", value_delimiter = ',')]
     only: Vec<String>,
@@ -59,6 +60,9 @@ struct TradeoffArgs {
 struct CompareArgs {
     #[command(flatten)]
     common: Common,
+    /// The plan whose scenes are run, such as pipelines/tradeoffs.plan
+    #[arg(long, value_name = "FILE")]
+    plan: PathBuf,
     /// Folder of the programs to compare with
     #[arg(long, value_name = "DIR")]
     base: PathBuf,
@@ -66,15 +70,8 @@ struct CompareArgs {
 
 #[derive(Debug, clap::Args)]
 struct StressArgs {
-    /// Folder of the stages' programs
-    #[arg(long, value_name = "DIR", default_value = "target/release")]
-    bin: PathBuf,
-    /// Folder for the hostile scenes
-    #[arg(long, value_name = "DIR")]
-    work: PathBuf,
-    /// Output file, JSON: a list of scene, stage, error, tolerance, non_finite and note; a .md and a .html beside it
-    #[arg(long, value_name = "FILE")]
-    out: PathBuf,
+    #[command(flatten)]
+    common: Common,
     /// Only scenes whose name contains this
     #[arg(long, value_name = "TEXT", default_value = "")]
     only: String,
@@ -112,7 +109,7 @@ fn write(out: &Path, value: &impl Serialize) -> Result<()> {
 
 fn tradeoffs(a: &TradeoffArgs, threads: usize, stage: &Stage) -> Result<()> {
     let c = &a.common;
-    let plan = Plan::read(&c.plan)?;
+    let plan = Plan::read(&a.plan)?;
     let programs = programs(&c.bin, threads)?;
     create_dir(&c.work)?;
     let names: Vec<&str> = plan.knobs.iter().map(|k| &*k.name).chain(plan.axes.iter().map(|x| &*x.name)).collect();
@@ -148,7 +145,7 @@ fn tradeoffs(a: &TradeoffArgs, threads: usize, stage: &Stage) -> Result<()> {
 
 fn comparison(a: &CompareArgs, threads: usize, stage: &Stage) -> Result<()> {
     let c = &a.common;
-    let plan = Plan::read(&c.plan)?;
+    let plan = Plan::read(&a.plan)?;
     let all = compare::compare(&programs(&a.base, threads)?, &programs(&c.bin, threads)?, &plan, &c.work)?;
     let (head, rows) = page::compare_table(&all);
     let text = page::markdown(&head, &rows);
@@ -158,18 +155,19 @@ fn comparison(a: &CompareArgs, threads: usize, stage: &Stage) -> Result<()> {
 }
 
 fn stress(a: &StressArgs, threads: usize, stage: &Stage) -> Result<()> {
-    create_dir(&a.work)?;
-    let rows = crate::stress::run(&programs(&a.bin, threads)?, &a.work, &a.only, &|name| stage.info(name))?;
-    write(&a.out, &rows)?;
+    let c = &a.common;
+    create_dir(&c.work)?;
+    let rows = crate::stress::run(&programs(&c.bin, threads)?, &c.work, &a.only, &|name| stage.info(name))?;
+    write(&c.out, &rows)?;
     let (text, page) = page::stress(&rows);
-    write_bytes(a.out.with_extension("md"), text.as_bytes())?;
-    write_bytes(a.out.with_extension("html"), page.as_bytes())?;
+    write_bytes(c.out.with_extension("md"), text.as_bytes())?;
+    write_bytes(c.out.with_extension("html"), page.as_bytes())?;
     let bad: Vec<_> = rows.iter().filter(|r| !r.good).collect();
     stage.info(&format!("{} of {} cells are good", rows.len() - bad.len(), rows.len()));
     match bad.first() {
         None => Ok(()),
         Some(first) => Err(Error::new(format!("{} cells are not good", bad.len()))
-            .file(&a.out)
+            .file(&c.out)
             .field(format!("{}, {}", first.scene, first.stage))
             .found(&first.note)),
     }

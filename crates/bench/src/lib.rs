@@ -1,6 +1,5 @@
 //! Run time against error, growth, and numerical stress. All through the stages' binaries, as people run them.
 
-pub mod agreement;
 pub mod chain;
 pub mod cli;
 pub mod compare;

@@ -6,6 +6,7 @@ use crate::scatter::scatter;
 use crate::stress::Row;
 use crate::tradeoff::Curve;
 use eval::html::Page;
+use eval::sheet::line;
 use std::fmt::Write;
 
 fn with_spread([median, least, most]: [f64; 3]) -> String {
@@ -90,11 +91,9 @@ pub fn warnings(curves: &[Curve]) -> Vec<String> {
 
 /// A table in Markdown.
 pub fn markdown(head: &[&str], rows: &[Vec<String>]) -> String {
-    let line = |cells: &[String]| format!("| {} |\n", cells.join(" | "));
     let head: Vec<String> = head.iter().map(|h| (*h).to_string()).collect();
-    let mut text = line(&head) + &format!("|{}\n", "---|".repeat(head.len()));
-    rows.iter().for_each(|r| text += &line(r));
-    text
+    let rule = vec!["---".to_string(); head.len()];
+    [head, rule].iter().chain(rows).map(|cells| line(cells)).collect()
 }
 
 /// The page.

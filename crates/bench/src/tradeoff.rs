@@ -1,10 +1,10 @@
 //! Run time against error: every setting of an approximation, timed in turns, beside the exact one.
 
-use crate::agreement::adjusted_rand;
 use crate::chain::{Cost, Files, Options, Programs, STAGES, Stage, read_json};
 use crate::plan::{Knob, Plan, Scene};
 use artifacts::Instances;
 use gs_io::{Error, Result, create_dir, write_bytes};
+use hdbscan_exact::adjusted_rand;
 use serde::{Deserialize, Serialize};
 use serde_json::Value;
 use std::path::Path;
@@ -233,14 +233,14 @@ fn merged(scene: &Options, setting: &Options) -> Options {
         }
     }
     kept.extend(own.iter().cloned());
-    let others = STAGES.into_iter().filter(|s| *s != Stage::Geometry);
-    let texts = others.map(|s| format!("{}: {}", s.name(), setting.get(s).join(" ")));
-    let text = format!("geometry: {}; {}", kept.join(" "), texts.collect::<Vec<_>>().join("; "));
-    Options::parse(&text).unwrap_or_default()
+    setting.clone().with(Stage::Geometry, kept)
 }
 
 /// Gives `own` what the stages before `first` made in `base`.
-fn inherit(base: &Files, own: &Files, first: Stage) -> Result<()> {
+///
+/// # Errors
+/// When a file cannot be copied.
+pub fn inherit(base: &Files, own: &Files, first: Stage) -> Result<()> {
     create_dir(&own.out)?;
     let copy = |from: &Path, to: &Path| {
         std::fs::copy(from, to).map(|_| ()).map_err(|e| Error::new(format!("cannot copy: {e}")).file(from))

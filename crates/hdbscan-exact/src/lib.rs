@@ -7,6 +7,7 @@
 //!
 //! `min_samples` counts the point itself, as scikit-learn does (Python's `hdbscan` does not: its 9 is 10 here).
 
+mod agreement;
 mod boruvka;
 mod condense;
 mod kdtree;
@@ -15,6 +16,7 @@ mod neighbours;
 mod predict;
 mod select;
 
+pub use agreement::adjusted_rand;
 pub use boruvka::spanning_tree;
 pub use condense::{CondensedEdge, CondensedTree};
 pub use linkage::{Edge, spanning_forest};

@@ -1,31 +1,12 @@
 //! Labels of scikit-learn and Python's hdbscan on small sets, made by scripts/make_hdbscan_golden.py, and properties of clusterings.
 
 use hdbscan_exact::{
-    Clustering, Edge, Options, Selection, approximate_predict, cluster, cluster_graph, core_distances,
+    Clustering, Edge, Options, Selection, adjusted_rand, approximate_predict, cluster, cluster_graph, core_distances,
 };
 use proptest::prelude::*;
 use std::collections::BTreeMap;
 use std::path::PathBuf;
 use std::str::FromStr;
-
-/// Adjusted Rand index; noise (-1) counts as a class of its own.
-fn ari(a: &[i32], b: &[i32]) -> f64 {
-    let mut joint: BTreeMap<(i32, i32), f64> = BTreeMap::new();
-    let (mut rows, mut columns): (BTreeMap<i32, f64>, BTreeMap<i32, f64>) = Default::default();
-    for (&x, &y) in a.iter().zip(b) {
-        *joint.entry((x, y)).or_default() += 1.0;
-        *rows.entry(x).or_default() += 1.0;
-        *columns.entry(y).or_default() += 1.0;
-    }
-    let pairs = |n: &f64| n * (n - 1.0) / 2.0;
-    let (s, r, c) = (
-        joint.values().map(pairs).sum::<f64>(),
-        rows.values().map(pairs).sum::<f64>(),
-        columns.values().map(pairs).sum::<f64>(),
-    );
-    let expected = r * c / pairs(&(a.len() as f64));
-    if (r + c) / 2.0 == expected { 1.0 } else { (s - expected) / ((r + c) / 2.0 - expected) }
-}
 
 struct Case {
     name: String,
@@ -86,14 +67,14 @@ fn cases() -> Vec<Case> {
 fn check(c: &Case, least: f64) {
     let ours = cluster(&c.points, c.dim, &c.options);
     assert_eq!(ours.labels.len(), c.one_tree.len());
-    assert_eq!(ari(&ours.labels, &c.one_tree), 1.0, "{}", c.name);
+    assert_eq!(adjusted_rand(&ours.labels, &c.one_tree), 1.0, "{}", c.name);
     for (i, (p, expected)) in ours.probabilities.iter().zip(&c.probabilities).enumerate() {
         assert!((p - expected).abs() < 2e-5, "{}: probability of point {i} is {p}, expected {expected}", c.name);
     }
-    let own = ari(&ours.labels, &c.labels);
+    let own = adjusted_rand(&ours.labels, &c.labels);
     eprintln!("{}: ARI {own:.4} with scikit-learn's own tree", c.name);
     assert!(own >= least, "{}: ARI {own} with scikit-learn's own tree", c.name);
-    let own = ari(&ours.labels, &c.python);
+    let own = adjusted_rand(&ours.labels, &c.python);
     let apart = ours.outlier_scores.iter().zip(&c.python_outliers).filter(|(a, b)| (*a - *b).abs() > 1e-3).count();
     let share = apart as f64 / c.python.len() as f64;
     eprintln!("{}: ARI {own:.4} with hdbscan, {share:.3} of the outlier scores differ", c.name);
@@ -186,7 +167,7 @@ fn no_farther_from_the_libraries_than_they_are_from_themselves() {
         assert_eq!(fields[0], c.name);
         let ours = cluster(&c.points, c.dim, &c.options).labels;
         for (library, labels, least) in [("scikit-learn", &c.labels, fields[1]), ("hdbscan", &c.python, fields[3])] {
-            let (own, least) = (ari(&ours, labels), least.parse::<f64>().unwrap());
+            let (own, least) = (adjusted_rand(&ours, labels), least.parse::<f64>().unwrap());
             eprintln!("{}: ARI {own:.4} with {library}, which has at least {least:.4} with itself", c.name);
             // The file has four digits.
             assert!(own + 5e-5 >= least, "{}: {own}, {library} with itself {least}", c.name);
@@ -426,7 +407,7 @@ fn points_asked_about_again_mostly_keep_their_clusters() {
     for c in cases().iter().filter(|c| c.name.starts_with("blobs") || c.name == "moons") {
         let clustering = cluster(&c.points, c.dim, &c.options);
         let again = approximate_predict(&c.points, c.dim, &clustering, &c.options, &c.points);
-        let own = ari(&again.labels, &clustering.labels);
+        let own = adjusted_rand(&again.labels, &clustering.labels);
         // A query adds to the density, which moves the rims of small clusters.
         assert!(own > if c.options.selection == Selection::Leaf { 0.8 } else { 0.95 }, "{}: ARI {own}", c.name);
     }

@@ -18,7 +18,7 @@ pub use log::Stage;
 pub use machine::Machine;
 pub use memory::Bytes;
 pub use progress::Progress;
-pub use record::{RunRecord, children_cpu_seconds, cpu_seconds, peak_rss_bytes};
+pub use record::{RunRecord, cpu_seconds, peak_rss_bytes};
 
 use gs_io::{Error, Result};
 use std::process::ExitCode;

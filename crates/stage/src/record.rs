@@ -87,20 +87,10 @@ pub(crate) fn program_hash() -> String {
 
 /// Processor time of this process so far in seconds, where the system tells (Linux, with its 100 ticks a second).
 pub fn cpu_seconds() -> Option<f64> {
-    ticks(11)
-}
-
-/// The same of those that this process started and that have ended.
-pub fn children_cpu_seconds() -> Option<f64> {
-    ticks(13)
-}
-
-/// Seconds of user and system time from two fields of the process's state, counted after its name in parentheses, which may
-/// hold anything.
-fn ticks(user: usize) -> Option<f64> {
     let stat = std::fs::read_to_string("/proc/self/stat").ok()?;
+    // After the name in parentheses, which may hold anything, user and system time are fields 12 and 13.
     let fields: Vec<f64> = stat.rsplit(')').next()?.split_whitespace().map(|f| f.parse().unwrap_or(0.0)).collect();
-    Some((fields.get(user)? + fields.get(user + 1)?) / 100.0)
+    Some((fields.get(11)? + fields.get(12)?) / 100.0)
 }
 
 /// Peak resident memory of this process in bytes, where the system tells (Linux).

@@ -2,12 +2,13 @@
 
 use super::oracle::{geometry_is_damaged, render_error};
 use super::world::World;
-use crate::agreement::adjusted_rand;
 use crate::chain::{Files, Options, Programs, STAGES, Stage};
+use crate::tradeoff::inherit;
 use artifacts::{Features, Footprints, Instances};
 use glam::{DQuat, DVec3};
 use gs_io::Result;
 use gs_scene::Gaussians;
+use hdbscan_exact::adjusted_rand;
 use rand::seq::SliceRandom;
 use rand_chacha::ChaCha8Rng;
 use rand_chacha::rand_core::SeedableRng;
@@ -58,8 +59,39 @@ struct Case {
     origin: Option<Vec<u32>>,
     tolerances: Tolerances,
     options: Options,
-    /// Stages that run; the others' artifacts are those of the undisturbed world.
-    first: Stage,
+    from: From,
+}
+
+/// Where a case begins.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum From {
+    /// Stage 1 learns from the world's points.
+    Points,
+    /// Stage 1 goes on from the world's Gaussians, which are what is hostile.
+    Gaussians,
+    /// Training of features, on what was made of the undisturbed world.
+    Features,
+}
+
+impl Case {
+    fn row(&self, stage: &str, error: Option<f64>, tolerance: Option<f64>, ended: Outcome) -> Row {
+        let (non_finite, note) = match ended {
+            Outcome::Finished { non_finite } => (non_finite, self.note.to_string()),
+            Outcome::Refused(said) => (false, format!("{}; refused: {said}", self.note)),
+            Outcome::Crashed(said) => (true, format!("{}; crashed: {said}", self.note)),
+        };
+        let within = tolerance.is_none_or(|most| error.is_some_and(|e| e <= most));
+        let (scene, stage, good) = (self.name.into(), stage.into(), within && !non_finite);
+        Row { scene, stage, error, tolerance, non_finite, note, good }
+    }
+
+    /// The renderer against its reference, on two views.
+    fn rendered(&self) -> Row {
+        let World { shots, gaussians, .. } = &self.world;
+        let seen = shots.iter().step_by(shots.len().div_ceil(2)).map(|s| render_error(gaussians, &s.camera));
+        let (error, non_finite) = seen.fold((0.0f64, false), |(e, b), (error, bad)| (e.max(error), b | bad));
+        self.row("render", Some(error), self.tolerances.render, Outcome::Finished { non_finite })
+    }
 }
 
 /// Runs the matrix on a tiny synthetic scene in `folder`: the scenes whose name contains `only`.
@@ -89,7 +121,8 @@ const SHORT: &str = "geometry: --iterations 80 --sh-degree 0 --max-gaussians 300
 
 struct Base {
     files: Files,
-    psnr: f64,
+    /// None where nothing is held out.
+    psnr: Option<f64>,
     labels: Vec<i32>,
     footprints: Vec<(u32, f32)>,
 }
@@ -120,95 +153,70 @@ impl Base {
         let trained = Files { geometry: folder.join("trained.ply"), ..files.clone() };
         trained.run(programs, Stage::Geometry, &options)?;
         Ok(Self {
-            psnr: trained_psnr(&trained.geometry)?,
+            psnr: trained_psnr(&trained.geometry),
             labels: Instances::read(files.output(Stage::Instances))?.0.label,
             footprints: weights(&files.footprints())?,
             files,
         })
     }
 
+    /// The cells of a case: its stages until one refuses.
     fn rows(&self, programs: &Programs, case: &Case, folder: &Path) -> Result<Vec<Row>> {
         case.world.write(folder)?;
-        let (mut rows, t) = (Vec::new(), case.tolerances);
-        let mut add = |stage: &str, error: Option<f64>, tolerance: Option<f64>, bad: Outcome| {
-            let (non_finite, note) = match bad {
-                Outcome::Finished { non_finite } => (non_finite, case.note.to_string()),
-                Outcome::Refused(said) => (false, format!("{}; refused: {said}", case.note)),
-                Outcome::Crashed(said) => (true, format!("{}; crashed: {said}", case.note)),
-            };
-            let within = match (error, tolerance) {
-                (Some(e), Some(t)) => e <= t,
-                (None, Some(_)) => false,
-                _ => true,
-            };
-            rows.push(Row {
-                scene: case.name.into(),
-                stage: stage.into(),
-                error,
-                tolerance,
-                non_finite,
-                good: within && !non_finite,
-                note,
-            });
-        };
-        if case.first == Stage::Geometry {
-            let shots = &case.world.shots;
-            let seen =
-                shots.iter().step_by(shots.len().div_ceil(2)).map(|s| render_error(&case.world.gaussians, &s.camera));
-            let (error, non_finite) = seen.fold((0.0f64, false), |(e, b), (error, bad)| (e.max(error), b | bad));
-            add("render", Some(error), t.render, Outcome::Finished { non_finite });
-            let trained = Files { geometry: folder.join("trained.ply"), ..files_of(folder) };
-            let ended = outcome(trained.run(programs, Stage::Geometry, &case.options), || {
-                geometry_is_damaged(&trained.geometry)
-            });
-            let lost = trained_psnr(&trained.geometry).ok().map(|p| (self.psnr - p).max(0.0));
-            add("geometry", t.geometry.and(lost), t.geometry, ended);
-        }
         let own = files_of(folder);
-        if case.first == Stage::Features {
-            gs_io::create_dir(&own.out)?;
-            for (from, to) in [
-                (self.files.output(Stage::Graph), own.output(Stage::Graph)),
-                (self.files.footprints(), own.footprints()),
-            ] {
-                std::fs::copy(&from, to).map_err(|e| gs_io::Error::new(e.to_string()).file(&from))?;
+        if case.from == From::Features {
+            return self.trained_on_the_undisturbed(programs, case, &own).map(|row| vec![row]);
+        }
+        let mut rows = vec![case.rendered(), self.geometry(programs, case, folder)];
+        let t = case.tolerances;
+        for (stage, tolerance) in [(Stage::Graph, t.graph), (Stage::Features, None), (Stage::Instances, t.instances)] {
+            let ended = outcome(own.run(programs, stage, &case.options), || is_damaged(&own, stage));
+            let finished = matches!(ended, Outcome::Finished { .. });
+            let error = match stage {
+                Stage::Graph if finished && tolerance.is_some() => {
+                    Some(self.footprint_change(&own, case.origin.as_deref())?)
+                }
+                Stage::Instances if finished && tolerance.is_some() => self.disagreement(&own, case)?,
+                _ => None,
+            };
+            rows.push(case.row(stage.name(), error, tolerance, ended));
+            if !finished {
+                break;
             }
-            let geometry = Files { geometry: self.files.geometry.clone(), ..own.clone() };
-            let features =
-                outcome(geometry.run(programs, Stage::Features, &case.options), || features_are_damaged(&own));
-            add("features", None, None, features);
-            return Ok(rows);
         }
-        let graph = outcome(own.run(programs, Stage::Graph, &case.options), || {
-            Ok(weights(&own.footprints())?.iter().any(|(_, w)| !w.is_finite()))
-        });
-        let went = matches!(graph, Outcome::Finished { .. });
-        let changed =
-            (went && t.graph.is_some()).then(|| self.footprint_change(&own, case.origin.as_deref())).transpose()?;
-        add("graph", changed, t.graph, graph);
-        if !went {
-            return Ok(rows);
-        }
-        let features = outcome(own.run(programs, Stage::Features, &case.options), || features_are_damaged(&own));
-        let went = matches!(features, Outcome::Finished { .. });
-        add("features", None, None, features);
-        if !went {
-            return Ok(rows);
-        }
-        let instances = outcome(own.run(programs, Stage::Instances, &case.options), || {
-            let i = Instances::read(own.output(Stage::Instances))?.0;
-            Ok(i.score.iter().chain(&i.descriptor).any(|v| !v.is_finite()))
-        });
-        let off = match (&instances, t.instances, &case.origin) {
-            (Outcome::Finished { .. }, Some(_), Some(origin)) => {
-                let labels = Instances::read(own.output(Stage::Instances))?.0.label;
-                let before: Vec<i32> = origin.iter().map(|&o| self.labels[o as usize]).collect();
-                Some(1.0 - adjusted_rand(&labels, &before))
-            }
-            _ => None,
-        };
-        add("instances", off, t.instances, instances);
         Ok(rows)
+    }
+
+    /// Stage 1 on the case's photographs, from its points or its Gaussians.
+    fn geometry(&self, programs: &Programs, case: &Case, folder: &Path) -> Row {
+        let own = files_of(folder);
+        let trained = Files { geometry: folder.join("trained.ply"), ..own.clone() };
+        let mut options = case.options.get(Stage::Geometry).to_vec();
+        if case.from == From::Gaussians {
+            options.extend(["--init".into(), own.geometry.to_string_lossy().into_owned()]);
+        }
+        let options = case.options.clone().with(Stage::Geometry, options);
+        let ended = outcome(trained.run(programs, Stage::Geometry, &options), || is_damaged(&trained, Stage::Geometry));
+        let tolerance = case.tolerances.geometry;
+        let lost = self.psnr.zip(trained_psnr(&trained.geometry)).map(|(before, after)| (before - after).max(0.0));
+        case.row("geometry", tolerance.and(lost), tolerance, ended)
+    }
+
+    /// Hostile settings of training, on the undisturbed graph and footprints.
+    fn trained_on_the_undisturbed(&self, programs: &Programs, case: &Case, own: &Files) -> Result<Row> {
+        inherit(&self.files, own, Stage::Features)?;
+        let files = Files { geometry: self.files.geometry.clone(), ..own.clone() };
+        let ended =
+            outcome(files.run(programs, Stage::Features, &case.options), || is_damaged(&files, Stage::Features));
+        Ok(case.row("features", None, None, ended))
+    }
+
+    /// 1 - adjusted Rand index with the undisturbed instances, where it is known which Gaussian is which.
+    fn disagreement(&self, own: &Files, case: &Case) -> Result<Option<f64>> {
+        let Some(origin) = &case.origin else { return Ok(None) };
+        let labels = Instances::read(own.output(Stage::Instances))?.0.label;
+        let before: Vec<i32> = origin.iter().map(|&o| self.labels[o as usize]).collect();
+        Ok(Some(1.0 - adjusted_rand(&labels, &before)))
     }
 
     /// Sum of absolute changes of the Gaussians' weights over their sum; of each one's share where it was divided.
@@ -257,12 +265,23 @@ fn outcome<T>(run: Result<T>, damaged: impl FnOnce() -> Result<bool>) -> Outcome
     }
 }
 
-fn features_are_damaged(files: &Files) -> Result<bool> {
-    Ok(Features::read(files.output(Stage::Features))?.0.values.iter().any(|v| !v.is_finite()))
+/// Whether what a stage wrote holds a number that is not finite.
+fn is_damaged(files: &Files, stage: Stage) -> Result<bool> {
+    let output = files.output(stage);
+    Ok(match stage {
+        Stage::Geometry => geometry_is_damaged(&output)?,
+        Stage::Graph => weights(&files.footprints())?.iter().any(|(_, w)| !w.is_finite()),
+        Stage::Features => Features::read(output)?.0.values.iter().any(|v| !v.is_finite()),
+        Stage::Instances => {
+            let i = Instances::read(output)?.0;
+            i.score.iter().chain(&i.descriptor).any(|v| !v.is_finite())
+        }
+    })
 }
 
-fn trained_psnr(geometry: &Path) -> Result<f64> {
-    Ok(stage::RunRecord::read(geometry)?.summary["psnr_heldout"].as_f64().unwrap_or(f64::NAN))
+/// PSNR of the held-out views, if the training ended and had some.
+fn trained_psnr(geometry: &Path) -> Option<f64> {
+    stage::RunRecord::read(geometry).ok()?.summary["psnr_heldout"].as_f64()
 }
 
 fn with(world: &World, change: impl FnOnce(&mut Gaussians)) -> World {
@@ -282,7 +301,7 @@ fn cases(world: &World) -> Vec<Case> {
         origin,
         tolerances,
         options: short(),
-        first: Stage::Geometry,
+        from: From::Points,
     };
     let moved = |scale: f64, turn: DQuat, shift: DVec3| world.clone().moved(scale, turn, shift);
     let (still, here) = (DQuat::IDENTITY, DVec3::ZERO);
@@ -366,8 +385,12 @@ fn cases(world: &World) -> Vec<Case> {
     ];
     let hostile = |name, note, world| case(name, note, world, None, SURVIVE);
     let some = |world: &World, f: fn(usize, &mut Gaussians)| with(world, |g| (0..g.len()).for_each(|i| f(i, g)));
+    // Stage 1 goes on from them, all of them.
+    let roomy = Options::parse(&SHORT.replace("--max-gaussians 3000", "--max-gaussians 9000")).unwrap_or_default();
+    let learnt =
+        |name, note, world| Case { from: From::Gaussians, options: roomy.clone(), ..hostile(name, note, world) };
     all.extend([
-        hostile(
+        learnt(
             "needles",
             "every third Gaussian a million times as long as wide",
             some(world, |i, g| {
@@ -376,7 +399,7 @@ fn cases(world: &World) -> Vec<Case> {
                 }
             }),
         ),
-        hostile(
+        learnt(
             "huge and tiny scales",
             "scales from 1e-8 to 1e4",
             some(world, |i, g| {
@@ -385,7 +408,7 @@ fn cases(world: &World) -> Vec<Case> {
                 }
             }),
         ),
-        hostile(
+        learnt(
             "denormals",
             "scales and colours below the smallest normal number",
             some(world, |i, g| {
@@ -395,7 +418,7 @@ fn cases(world: &World) -> Vec<Case> {
                 }
             }),
         ),
-        hostile(
+        learnt(
             "duplicates",
             "every Gaussian where one of ten is",
             with(world, |g| {
@@ -404,17 +427,17 @@ fn cases(world: &World) -> Vec<Case> {
                 }
             }),
         ),
-        hostile("a plane", "all centres in a plane", with(world, |g| g.means.iter_mut().for_each(|m| m[2] = 0.1))),
-        hostile(
+        learnt("a plane", "all centres in a plane", with(world, |g| g.means.iter_mut().for_each(|m| m[2] = 0.1))),
+        learnt(
             "a line",
             "all centres on a line",
             with(world, |g| g.means.iter_mut().for_each(|m| (m[1], m[2]) = (0.0, 0.1))),
         ),
-        hostile("a point", "all centres in a point", with(world, |g| g.means.fill([0.0, 0.0, 0.1]))),
-        hostile("transparent", "all opacities 0", with(world, |g| g.opacity_logits.fill(-50.0))),
-        hostile("opaque", "all opacities 1", with(world, |g| g.opacity_logits.fill(50.0))),
-        hostile("one Gaussian", "nothing but one", with(world, |g| *g = g.select(&[0]))),
-        hostile(
+        learnt("a point", "all centres in a point", with(world, |g| g.means.fill([0.0, 0.0, 0.1]))),
+        learnt("transparent", "all opacities 0", with(world, |g| g.opacity_logits.fill(-50.0))),
+        learnt("opaque", "all opacities 1", with(world, |g| g.opacity_logits.fill(50.0))),
+        learnt("one Gaussian", "nothing but one", with(world, |g| *g = g.select(&[0]))),
+        learnt(
             "zero quaternions",
             "every fifth rotation zero",
             some(world, |i, g| {
@@ -490,7 +513,7 @@ fn cases(world: &World) -> Vec<Case> {
     for (name, note, options) in settings {
         let options = Options::parse(options).unwrap_or_default();
         let (world, tolerances) = (world.clone(), Tolerances::default());
-        all.push(Case { name, note, world, origin: None, tolerances, options, first: Stage::Features });
+        all.push(Case { name, note, world, origin: None, tolerances, options, from: From::Features });
     }
     let fast = "geometry: --iterations 80 --sh-degree 0 --opacity-rate 5 --position-rate 0.016";
     let options = Options::parse(fast).unwrap_or_default();
