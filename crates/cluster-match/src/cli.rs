@@ -359,9 +359,9 @@ fn run(a: &Args, stage: &Stage) -> Result<()> {
     let whole = inputs.geometry.whole();
     let unseen = (0..n_all).filter(|&i| !kept[i] && whole[i]).count();
     if unseen > 0 {
-        stage.skipped(&format!(
-            "{unseen} of {n_all} Gaussians in clustering: never seen; labelled from their nearest neighbour"
-        ));
+        let what =
+            format!("{unseen} of {n_all} Gaussians in clustering: never seen; labelled from their nearest neighbour");
+        stage.skipped_some(&what, unseen, n, clustering_seconds);
         from_nearest(means, &mut labels, &mut nodes, |i| !kept[i] && whole[i])?;
     }
 

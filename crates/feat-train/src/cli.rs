@@ -138,6 +138,9 @@ struct Contrastive {
     /// Hold out every tenth view from training, and stop when their loss has settled
     #[arg(long)]
     early_stop: bool,
+    /// Take turns at views with a single mask too, which teach nothing: it has no other to be told from
+    #[arg(long)]
+    no_skip: bool,
     /// Iterations between points of the curve
     #[arg(long, value_name = "COUNT", default_value_t = 50)]
     curve_every: u64,
@@ -233,6 +236,7 @@ impl Args {
                 "stats_every": c.stats_every,
                 "lazy_adam": c.lazy_adam,
                 "half_weights": c.half_weights,
+                "no_skip": c.no_skip,
                 "early_stop": c.early_stop,
             }),
             Method::Spectral => json!({
@@ -303,10 +307,12 @@ impl Args {
         let positions: Vec<[f32; 3]> = inputs.graph.kept.iter().map(|&i| gaussians.means[i as usize]).collect();
         drop(gaussians);
         let context = Context::new(&inputs.graph, &colors, &positions, c.neighbours, !c.no_propagation);
-        let sets = mask_sets::<W>(&inputs.footprints, &context, &self.levels, 2)?;
+        // A lone mask has none to be told from, but it can be drawn together.
+        let least = if c.no_skip || c.cohesion > 0.0 { 1 } else { 2 };
+        let sets = mask_sets::<W>(&inputs.footprints, &context, &self.levels, least)?;
         let units = inputs.footprints.views.len() * self.levels.len();
         if sets.len() < units {
-            stage.skipped(&format!("{} of {units} views and levels: fewer than two masks", units - sets.len()));
+            stage.skipped(&format!("{} of {units} views and levels: fewer than {least} masks", units - sets.len()));
         }
         if sets.is_empty() {
             return Err(Error::new("no view has two masks to tell apart")

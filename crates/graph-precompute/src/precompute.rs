@@ -10,6 +10,7 @@ use gs_scene::dataset::View;
 use gs_scene::{Camera, Gaussians, Geometry};
 use stage::Stage;
 use std::path::Path;
+use std::time::Instant;
 
 /// Pixels of the images on which mask sizes are usually stated (LERF's 986 x 728).
 const REFERENCE_PIXELS: f64 = 986.0 * 728.0;
@@ -194,10 +195,6 @@ pub fn precompute(
             .found(format!("{n} Gaussians, {} views", with_masks.len()))
             .hint("geometry and dataset must be of the same scene, in the same coordinates"));
     }
-    let unseen = n - damaged - kept.len();
-    if unseen > 0 && !options.keep_unseen {
-        stage.skipped(&format!("{unseen} of {n} Gaussians: never seen"));
-    }
     // Original indices to positions in `kept`. Every Gaussian with a footprint was seen, so it is kept.
     let mut position = vec![u32::MAX; n];
     for (p, &i) in kept.iter().enumerate() {
@@ -205,7 +202,13 @@ pub fn precompute(
     }
     entries.renumber(&position)?;
     out.pixels.col.iter_mut().for_each(|c| *c = position[*c as usize]);
+    let start = Instant::now();
     let (graph, anchor_distance, middle) = graph_of(gaussians, &kept, seen_views, &seen_weight, options);
+    let unseen = n - damaged - kept.len();
+    if unseen > 0 && !options.keep_unseen {
+        let what = format!("{unseen} of {n} Gaussians: never seen");
+        stage.skipped_some(&what, unseen, kept.len(), start.elapsed().as_secs_f64());
+    }
     summary.anchor_distance = anchor_distance;
     summary.middle = middle;
     summary.kept = kept.len();

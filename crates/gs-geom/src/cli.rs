@@ -10,6 +10,7 @@ mod train;
 use crate::masks::{Alpha, Masks};
 use clap::{Parser, Subcommand, ValueEnum};
 use gs_io::{Error, Result, create_dir, write_bytes};
+use gs_raster::RasterOptions;
 use gs_scene::Gaussians;
 use gs_scene::dataset::{self, Dataset, LoadOptions, Resolution};
 use gs_scene::ply;
@@ -143,6 +144,36 @@ fn read_geometry(path: &Path) -> Result<Gaussians> {
         return Err(Error::new("no Gaussians").file(path).field("element vertex").hint("train the geometry again"));
     }
     Ok(gaussians)
+}
+
+/// Gaussians to draw.
+#[derive(Debug, Clone, clap::Args)]
+struct GeometryArgs {
+    /// Gaussians, as a 3DGS PLY
+    #[arg(long, value_name = "FILE")]
+    geometry: PathBuf,
+    /// Evaluate bands of spherical harmonics that are zero too: the same pictures, more slowly
+    #[arg(long)]
+    no_skip: bool,
+}
+
+impl GeometryArgs {
+    /// The Gaussians, and how they are drawn over `background`.
+    fn read(&self, background: Background, stage: &Stage) -> Result<(Gaussians, RasterOptions)> {
+        let gaussians = read_geometry(&self.geometry)?;
+        let fitting = RasterOptions::fit(&gaussians);
+        let (used, degree) = (fitting.sh_degree, gaussians.sh_degree);
+        if used < degree && !self.no_skip {
+            stage.skipped(&format!("spherical harmonics of degrees {} to {degree}: zero in every Gaussian", used + 1));
+        }
+        let options = RasterOptions {
+            sh_degree: if self.no_skip { degree } else { used },
+            background: background.color(),
+            antialias: ply::is_antialiased(&self.geometry)?,
+            ..fitting
+        };
+        Ok((gaussians, options))
+    }
 }
 
 /// Finds out before the work, not after it, that an output cannot be written.

@@ -176,15 +176,11 @@ fn keep(g: &mut Gaussians, adam: &mut Adam, kept: impl Fn(&Gaussians, usize) -> 
     removed
 }
 
-/// Removes Gaussians too faint to be drawn from any view: the renders stay as they are. Gives their number.
-pub fn remove_invisible(g: &mut Gaussians) -> usize {
-    let sources: Vec<u32> = (0..g.len() as u32).filter(|&i| g.opacity(i as usize) >= LEAST_ALPHA).collect();
-    let removed = g.len() - sources.len();
-    if removed == 0 || sources.is_empty() {
-        return 0;
-    }
-    *g = g.select(&sources);
-    removed
+/// The Gaussians that can be drawn: their opacity reaches 1/255 somewhere. All of them, where none can.
+pub fn drawable(g: &Gaussians) -> Vec<u32> {
+    let all = 0..g.len() as u32;
+    let rows: Vec<u32> = all.clone().filter(|&i| g.opacity(i as usize) >= LEAST_ALPHA).collect();
+    if rows.is_empty() { all.collect() } else { rows }
 }
 
 /// Lowers every opacity to at most 0.01, and forgets their moments: what is needed comes back, floaters do not.
@@ -294,9 +290,9 @@ mod tests {
         reset_opacities(&mut g, &mut adam);
         assert!((g.opacity(0) - 0.01).abs() < 1e-6 && g.opacity_logits[1] == -8.0);
         assert_eq!(adam.second.opacity_logits, [0.0; 2]);
-        assert_eq!(remove_invisible(&mut g), 1);
+        assert_eq!(drawable(&g), [0]);
         g.opacity_logits[0] = -9.0;
-        assert_eq!((remove_invisible(&mut g), g.len()), (0, 1), "something is always left");
+        assert_eq!(drawable(&g), [0, 1], "something is always left");
     }
 
     proptest! {

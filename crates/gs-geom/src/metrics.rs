@@ -5,8 +5,8 @@ use crate::masks::{Alpha, Masks, multiply};
 use crate::photographs::{Target, exact_target};
 use gs_io::Result;
 use gs_raster::{RasterOptions, render};
+use gs_scene::Gaussians;
 use gs_scene::dataset::{Split, View};
-use gs_scene::{Camera, Gaussians};
 use serde::Serialize;
 
 /// PSNR of equal pictures, dB: the mean squared error counts as at least 1e-10.
@@ -48,7 +48,8 @@ pub fn measure(
     masks: &Masks,
 ) -> Result<ViewMetrics> {
     let target = exact_target(view, masks, behind(alpha, options.background))?;
-    let (psnr, ssim) = compare(g, &view.camera, options, &target, alpha);
+    let mut rgb = render(g, &view.camera, &RasterOptions { depth: false, ..options.clone() }).rgb;
+    let (psnr, ssim) = compare(&mut rgb, view.camera.width as usize, &target, alpha);
     let split = if view.split == Split::Test { "test" } else { "train" };
     Ok(ViewMetrics { name: view.name.clone(), split, psnr, ssim })
 }
@@ -60,18 +61,18 @@ pub fn behind(alpha: Alpha, background: [f32; 3]) -> [f32; 3] {
 }
 
 /// PSNR and SSIM of a render against `target`, which lies over [`behind`]. With [`Alpha::Ignore`] the PSNR is that of the
-/// pixels that count, each weighed by the square of its alpha; in the SSIM the others are black in both pictures.
-pub fn compare(g: &Gaussians, camera: &Camera, options: &RasterOptions, target: &Target, alpha: Alpha) -> (f64, f64) {
-    let mut rgb = render(g, camera, &RasterOptions { depth: false, ..options.clone() }).rgb;
+/// pixels that count, each weighed by the square of its alpha; in the SSIM the others are black in both pictures. `rgb`
+/// (`[height][width][rgb]`) is clamped and masked in place.
+pub fn compare(rgb: &mut [f32], width: usize, target: &Target, alpha: Alpha) -> (f64, f64) {
     rgb.iter_mut().for_each(|v| *v = v.clamp(0.0, 1.0));
     let mut psnr_gain = 0.0;
     if let Some(weights) = target.alpha.as_ref().filter(|_| alpha == Alpha::Ignore) {
-        multiply(&mut rgb, weights);
+        multiply(rgb, weights);
         let count: f64 = weights.iter().map(|a| f64::from(*a).powi(2)).sum();
         psnr_gain = 10.0 * (count.max(1e-9) / weights.len().max(1) as f64).log10();
     }
-    let psnr = (psnr(&rgb, &target.rgb) + psnr_gain).min(MOST_PSNR);
-    (psnr, ssim(Pair { render: &rgb, target: &target.rgb, width: camera.width as usize }))
+    let psnr = (psnr(rgb, &target.rgb) + psnr_gain).min(MOST_PSNR);
+    (psnr, ssim(Pair { render: rgb, target: &target.rgb, width }))
 }
 
 /// Mean of some figure over views; `None` of none.

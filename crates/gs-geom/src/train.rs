@@ -383,17 +383,19 @@ impl<'a> Trainer<'a> {
     ///
     /// # Errors
     /// When a photograph has to be decoded and cannot be.
-    pub fn heldout(&self) -> Result<Option<(f64, f64)>> {
-        let g = &self.state.gaussians;
-        let background = self.options.background;
+    pub fn heldout(&mut self) -> Result<Option<(f64, f64)>> {
+        let (alpha, background) = (self.options.alpha, self.options.background);
         let (antialias, near) = (self.options.antialias, near_plane(self.extent));
-        let options = RasterOptions { background, antialias, near, ..RasterOptions::default() };
-        let compare = |i: usize| {
-            let target = self.heldout.target(i, metrics::behind(self.options.alpha, background))?;
-            Ok(metrics::compare(g, self.heldout.camera(i), &options, &target, self.options.alpha))
-        };
-        let all = (0..self.heldout.len()).map(compare).collect::<Result<Vec<(f64, f64)>>>()?;
-        let psnr = metrics::mean(all.iter().map(|v| v.0));
+        let options = RasterOptions { background, antialias, near, depth: false, ..RasterOptions::default() };
+        let mut all = Vec::with_capacity(self.heldout.len());
+        for i in 0..self.heldout.len() {
+            let (camera, target) =
+                (self.heldout.camera(i), self.heldout.target(i, metrics::behind(alpha, background))?);
+            self.workspace.forward(&self.state.gaussians, camera, &options);
+            let rgb = &mut self.workspace.forward.rendered.rgb;
+            all.push(metrics::compare(rgb, camera.width as usize, &target, alpha));
+        }
+        let psnr = metrics::mean(all.iter().map(|v: &(f64, f64)| v.0));
         Ok(psnr.zip(metrics::mean(all.iter().map(|v| v.1))))
     }
 }

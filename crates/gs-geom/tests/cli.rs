@@ -262,7 +262,7 @@ fn every_way_is_the_same_for_any_threads_and_after_a_stop_and_keeps_the_budget()
         assert_eq!(fs::read(&whole).unwrap(), fs::read(&parts).unwrap(), "{way:?}");
         let n = ply::read_gaussians(&whole).unwrap().len();
         let most = way.iter().skip_while(|w| **w != "--max-gaussians").nth(1);
-        assert!(most.is_none_or(|most| n <= most.parse().unwrap()), "{way:?}: {n}");
+        assert!(most.is_none_or(|most| n <= most.parse::<usize>().unwrap()), "{way:?}: {n}");
         let record: Value = serde_json::from_slice(&fs::read(format!("{whole}.run.json")).unwrap()).unwrap();
         assert!(record["summary"]["psnr_heldout"].as_f64().unwrap() > 17.0, "{way:?}: {}", record["summary"]);
         assert!(record["summary"]["ssim_heldout"].as_f64().unwrap() > 0.4, "{way:?}: {}", record["summary"]);
@@ -418,6 +418,39 @@ fn views_are_rendered_and_measured() {
     assert!(refused(&[&["render"], &base[..], &["--out", &some, "--views", "99"]].concat()).contains("no such view"));
     let e = refused(&[&["render"], &base[..], &["--out", &some, "--holdout", "0"]].concat());
     assert!(e.contains("no views to render"), "{e}");
+}
+
+#[test]
+fn what_is_skipped_changes_nothing() {
+    let dir = Folder::new();
+    let (mut g, _) = world();
+    g.opacity_logits[10..15].fill(-9.0);
+    let start = dir.path("start.ply");
+    ply::write_gaussians(&start, &g, &[]).unwrap();
+    let (out, all) = (dir.path("g.ply"), dir.path("all.ply"));
+    let refine = ["--init", &start, "--densify-until", "0"];
+    succeeds(&training(&out, &refine));
+    succeeds(&training(&all, &[&refine[..], &["--no-skip"]].concat()));
+    let (drawn, whole) = (ply::read_gaussians(&out).unwrap(), ply::read_gaussians(&all).unwrap());
+    let rows: Vec<u32> = (0..whole.len() as u32).filter(|&i| whole.opacity(i as usize) >= 1.0 / 255.0).collect();
+    assert!(rows.len() < whole.len(), "{} Gaussians, all of them drawn", whole.len());
+    assert_eq!(drawn, whole.select(&rows));
+
+    let g = gs_geom::init::with_degree(world().0, 3);
+    let geometry = dir.path("zeros.ply");
+    ply::write_gaussians(&geometry, &g, &[]).unwrap();
+    let measured = |more: &[&str]| {
+        let metrics = dir.path("m.json");
+        let base = ["eval", "--scene", scene(), "--geometry", &geometry, "--out", &metrics];
+        let mut command = Command::new(env!("CARGO_BIN_EXE_gs-geom"));
+        let said = command.args(base).args(more).output().unwrap();
+        assert!(said.status.success());
+        (fs::read(&metrics).unwrap(), String::from_utf8_lossy(&said.stderr).into_owned())
+    };
+    let ((skipped, said), (full, nothing)) = (measured(&[]), measured(&["--no-skip"]));
+    assert!(said.contains("skipped spherical harmonics of degrees 1 to 3"), "{said}");
+    assert!(!nothing.contains("skipped"), "{nothing}");
+    assert_eq!(skipped, full);
 }
 
 #[test]

@@ -95,9 +95,9 @@ impl Image {
         let decoded = decode(&std::fs::read(path).at("read", path)?, path)?;
         let (w, h) = (decoded.width(), decoded.height());
         if !decoded.color().has_alpha() {
-            return Ok(Self::from_rgb8(w, h, decoded.to_rgb8().as_raw()));
+            return Ok(Self::from_rgb8(w, h, decoded.into_rgb8().as_raw()));
         }
-        let rgba = decoded.to_rgba8();
+        let rgba = decoded.into_rgba8();
         let unit = |v: u8| f32::from(v) / 255.0;
         Ok(Self {
             width: w,

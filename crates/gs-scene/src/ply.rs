@@ -174,7 +174,28 @@ fn header(count: usize, comments: &[String], properties: &[(&str, String)]) -> S
 /// # Errors
 /// When the arrays do not fit together or the file cannot be written.
 pub fn write_gaussians(path: impl AsRef<Path>, gaussians: &Gaussians, comments: &[String]) -> Result<()> {
-    let path = path.as_ref();
+    write_rows(path.as_ref(), gaussians, (gaussians.len(), 0..gaussians.len()), comments)
+}
+
+/// The same for the Gaussians `rows` only, in that order, without a copy of them.
+///
+/// # Errors
+/// As [`write_gaussians`]; positions in `rows` are below the number of Gaussians.
+pub fn write_some_gaussians(
+    path: impl AsRef<Path>,
+    gaussians: &Gaussians,
+    rows: &[u32],
+    comments: &[String],
+) -> Result<()> {
+    write_rows(path.as_ref(), gaussians, (rows.len(), rows.iter().map(|&i| i as usize)), comments)
+}
+
+fn write_rows(
+    path: &Path,
+    gaussians: &Gaussians,
+    (count, rows): (usize, impl Iterator<Item = usize>),
+    comments: &[String],
+) -> Result<()> {
     gaussians.check().map_err(|e| e.file(path))?;
     let k = sh_coefficients(gaussians.sh_degree);
     let mut names: Vec<String> =
@@ -183,9 +204,9 @@ pub fn write_gaussians(path: impl AsRef<Path>, gaussians: &Gaussians, comments: 
     names.extend(["opacity", "scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3"].map(String::from));
     let properties: Vec<(&str, String)> = names.into_iter().map(|n| ("float", n)).collect();
     write_atomic(path, |w| {
-        w.write_all(header(gaussians.len(), comments, &properties).as_bytes()).at("write", path)?;
+        w.write_all(header(count, comments, &properties).as_bytes()).at("write", path)?;
         let mut row: Vec<u8> = Vec::with_capacity(4 * properties.len());
-        for i in 0..gaussians.len() {
+        for i in rows {
             row.clear();
             let mut put = |v: f32| row.extend_from_slice(&v.to_le_bytes());
             gaussians.means[i].into_iter().chain([0.0; 3]).for_each(&mut put);

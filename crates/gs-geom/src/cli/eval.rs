@@ -1,12 +1,10 @@
 //! `gs-geom eval`.
 
-use super::{MaskArgs, SceneArgs, check_writable, read_geometry};
+use super::{GeometryArgs, MaskArgs, SceneArgs, check_writable};
 use crate::metrics::{ViewMetrics, mean, measure};
 use artifacts::role;
 use gs_io::{Error, Result, hash_file, write_bytes};
-use gs_raster::RasterOptions;
 use gs_scene::dataset::{Split, View};
-use gs_scene::ply;
 use serde_json::json;
 use stage::Stage;
 use std::collections::BTreeMap;
@@ -19,9 +17,8 @@ pub(super) struct EvalArgs {
     scene: SceneArgs,
     #[command(flatten)]
     masks: MaskArgs,
-    /// Gaussians, as a 3DGS PLY
-    #[arg(long, value_name = "FILE")]
-    geometry: PathBuf,
+    #[command(flatten)]
+    geometry: GeometryArgs,
     /// Where to write the figures, as JSON
     #[arg(long, value_name = "FILE")]
     out: PathBuf,
@@ -30,7 +27,7 @@ pub(super) struct EvalArgs {
 impl EvalArgs {
     pub(super) fn run(&self, stage: &Stage) -> Result<()> {
         let dataset = self.scene.load(stage)?;
-        let gaussians = read_geometry(&self.geometry)?;
+        let (gaussians, options) = self.geometry.read(self.scene.background, stage)?;
         let (alpha, masks) = (self.masks.alpha(), self.masks.load(&dataset, stage)?);
         check_writable(&self.out)?;
         let mut split = Split::Test;
@@ -40,11 +37,6 @@ impl EvalArgs {
             split = Split::Train;
             views = dataset.views_of(split).collect();
         }
-        let options = RasterOptions {
-            background: self.scene.background.color(),
-            antialias: ply::is_antialiased(&self.geometry)?,
-            ..RasterOptions::fit(&gaussians)
-        };
         let mut progress = stage.progress("view", views.len() as u64);
         let mut figures: Vec<ViewMetrics> = Vec::new();
         for view in &views {
@@ -79,7 +71,7 @@ impl EvalArgs {
         });
         let mut inputs = BTreeMap::from([
             (role::DATASET.to_string(), dataset.hash()?),
-            (role::GEOMETRY.to_string(), hash_file(&self.geometry)?),
+            (role::GEOMETRY.to_string(), hash_file(&self.geometry.geometry)?),
         ]);
         if let Some(hash) = masks.hash()? {
             inputs.insert("photograph_masks".into(), hash);

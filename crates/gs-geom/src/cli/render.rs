@@ -1,10 +1,10 @@
 //! `gs-geom render`.
 
-use super::{SceneArgs, read_geometry};
+use super::{GeometryArgs, SceneArgs};
 use gs_io::{Error, Result, create_dir, write_bytes};
-use gs_raster::{RasterOptions, Rendered, render};
+use gs_raster::{Rendered, render};
+use gs_scene::Image;
 use gs_scene::dataset::{Dataset, Split, View};
-use gs_scene::{Image, ply};
 use stage::Stage;
 use std::collections::BTreeSet;
 use std::io::Cursor;
@@ -15,9 +15,8 @@ use std::path::PathBuf;
 pub(super) struct RenderArgs {
     #[command(flatten)]
     scene: SceneArgs,
-    /// Gaussians, as a 3DGS PLY
-    #[arg(long, value_name = "FILE")]
-    geometry: PathBuf,
+    #[command(flatten)]
+    geometry: GeometryArgs,
     /// Folder for the pictures, named after the photographs
     #[arg(long, value_name = "DIR")]
     out: PathBuf,
@@ -32,14 +31,9 @@ pub(super) struct RenderArgs {
 impl RenderArgs {
     pub(super) fn run(&self, stage: &Stage) -> Result<()> {
         let dataset = self.scene.load(stage)?;
-        let gaussians = read_geometry(&self.geometry)?;
+        let (gaussians, options) = self.geometry.read(self.scene.background, stage)?;
         let views = choose(&dataset, &self.views)?;
         create_dir(&self.out)?;
-        let options = RasterOptions {
-            background: self.scene.background.color(),
-            antialias: ply::is_antialiased(&self.geometry)?,
-            ..RasterOptions::fit(&gaussians)
-        };
         let mut progress = stage.progress("view", views.len() as u64);
         for view in &views {
             if stage.interrupted() {

@@ -5,7 +5,7 @@ use super::{Background, MaskArgs, SceneArgs, beside, check_writable, read_geomet
 use crate::checkpoint::{self, State};
 use crate::content::{self, Gain};
 use crate::curve;
-use crate::densify::{DensifyOptions, Strategy, remove_invisible};
+use crate::densify::{DensifyOptions, Strategy, drawable};
 use crate::init;
 use crate::masks::Masks;
 use crate::mcmc::McmcOptions;
@@ -56,6 +56,9 @@ pub(super) struct TrainArgs {
     /// Keep number, order and positions of the points: Gaussian i is point i (ScanNet protocol)
     #[arg(long)]
     pub(super) fixed_points: bool,
+    /// Keep Gaussians too faint to be drawn from anywhere
+    #[arg(long)]
+    no_skip: bool,
     /// How the number of Gaussians grows
     #[arg(long, value_enum, default_value_t = Strategy::default())]
     densify: Strategy,
@@ -327,6 +330,7 @@ impl TrainArgs {
                 Init::File(_) => "file",
             },
             "init_points": self.init_points,
+            "no_skip": self.no_skip,
             "options": options,
         });
         let run = stage.provenance(checkpoint::FORMAT, checkpoint::VERSION, parameters, inputs);
@@ -362,7 +366,7 @@ impl TrainArgs {
         let done = self.optimise(&mut trainer, &run, &watched, stage).and_then(|done| match done {
             true => watched
                 .check()
-                .and_then(|()| self.finish(&trainer, &run, &forecast, (plan, spent_since(before)), stage)),
+                .and_then(|()| self.finish(&mut trainer, &run, &forecast, (plan, spent_since(before)), stage)),
             false => Ok(()),
         });
         done.inspect_err(|_| self.rescue(&trainer, &run, &watched, stage))
@@ -578,23 +582,23 @@ impl TrainArgs {
     /// Writes everything a finished run leaves.
     fn finish(
         &self,
-        trainer: &Trainer<'_>,
+        trainer: &mut Trainer<'_>,
         run: &Provenance,
         forecast: &Forecast,
         (plan, iteration_cpu_seconds): (Value, Option<f64>),
         stage: &Stage,
     ) -> Result<()> {
         let (psnr, ssim) = trainer.heldout()?.unzip();
+        let trainer = &*trainer;
         let timings = trainer.timings();
         let (parameters, inputs) = (&run.parameters, &run.inputs);
         let State { gaussians, progress, .. } = trainer.state();
         let predicted = forecast.peak(gaussians.len());
-        let mut gaussians = gaussians.clone();
-        if !self.fixed_points {
-            let removed = remove_invisible(&mut gaussians);
-            if removed > 0 {
-                stage.skipped(&format!("{removed} Gaussians: too faint to be drawn"));
-            }
+        // Rows to write and no copy: the moments are still there, for a checkpoint if the disk is full.
+        let keep_all = self.fixed_points || self.no_skip;
+        let rows = if keep_all { (0..gaussians.len() as u32).collect() } else { drawable(gaussians) };
+        if rows.len() < gaussians.len() {
+            stage.skipped(&format!("{} Gaussians: too faint to be drawn", gaussians.len() - rows.len()));
         }
         if progress.dropped > 0 {
             stage.warn(&format!("{} gradients of Gaussians were not finite and were not used", progress.dropped));
@@ -619,16 +623,16 @@ impl TrainArgs {
         }
         let mut comments = comments(parameters, inputs);
         comments.extend(progress.extended.iter().map(|i| format!("extended after iteration {i}")));
-        ply::write_gaussians(&self.out, &gaussians, &comments)?;
+        ply::write_some_gaussians(&self.out, gaussians, &rows, &comments)?;
         let [cloned, split, removed, relocated] = progress.densified;
         let heldout = psnr.map_or(String::new(), |p| format!(", {p:.2} dB on held-out views"));
         stage.info(&format!(
             "{} Gaussians ({cloned} cloned, {split} split, {removed} removed, {relocated} relocated){heldout}; {}",
-            gaussians.len(),
+            rows.len(),
             shares(timings)
         ));
         let summary = json!({
-            "gaussians": gaussians.len(),
+            "gaussians": rows.len(),
             "psnr_heldout": psnr,
             "ssim_heldout": ssim,
             "iterations": progress.iteration,
