@@ -27,8 +27,10 @@ const PLAIN_NUMBERS: u64 = 11;
 pub struct Forecast {
     /// Photographs kept decoded.
     pub photographs: u64,
-    /// Photographs on their way from the file into memory, before training.
+    /// Photographs on their way from the file into memory.
     pub decoding: u64,
+    /// Whether that happens in training too, and not only before it.
+    pub decodes_again: bool,
     /// Pictures of one iteration.
     pub pictures: u64,
     /// Lists of the tiles' Gaussians and their gradients, of the views tried.
@@ -52,6 +54,8 @@ pub struct Sizes {
     pub tile_entries: u64,
     /// Photographs decoded at once.
     pub threads: usize,
+    /// Whether some photographs are not kept and decoded again in training.
+    pub decodes_again: bool,
     /// Degree of the spherical harmonics.
     pub sh_degree: u8,
     /// Whether the number of Gaussians may change.
@@ -72,6 +76,7 @@ impl Forecast {
         Self {
             photographs: sizes.photographs,
             decoding: sizes.threads as u64 * (PER_DECODED_PIXEL * w * h + shrunk),
+            decodes_again: sizes.decodes_again,
             pictures: PER_PIXEL * sizes.pixels,
             tiles: PER_TILE * sizes.tile_entries,
             per_gaussian: state + step,
@@ -82,6 +87,9 @@ impl Forecast {
     /// fit only in part: half of the lesser comes on top, as measured.
     pub fn scratch(&self) -> u64 {
         let training = self.pictures + self.tiles;
+        if self.decodes_again {
+            return self.decoding + training;
+        }
         self.decoding.max(training) + self.decoding.min(training) / 2
     }
 
@@ -107,6 +115,7 @@ mod tests {
             file: (2000, 1000),
             tile_entries: 0,
             threads: 2,
+            decodes_again: false,
             sh_degree: 3,
             densifies: false,
         };
@@ -115,6 +124,8 @@ mod tests {
         // Few tiles: decoding needs more at once; many: training does. Of the lesser, half counts.
         let gaussians = 1000 * (3 * 236 + 8 + 236 + 16 + PER_DRAWN);
         assert_eq!(Forecast::new(&sizes).peak(1000), Bytes(BASE + 6_000_000 + decoding + 19_000_000 + gaussians));
+        let again = Sizes { decodes_again: true, ..sizes };
+        assert_eq!(Forecast::new(&again).scratch(), decoding + 38_000_000);
         let many = Sizes { tile_entries: 5_000_000, ..sizes };
         let densifying = Sizes { densifies: true, ..sizes };
         assert_eq!(Forecast::new(&densifying).per_gaussian, Forecast::new(&sizes).per_gaussian + 354);
@@ -146,6 +157,7 @@ mod tests {
                 file: (0, 0),
                 tile_entries: 0,
                 threads: 1,
+                decodes_again: false,
                 sh_degree,
                 densifies: false,
             };

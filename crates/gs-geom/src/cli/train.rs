@@ -394,12 +394,12 @@ impl TrainArgs {
         let entries = |v: &View| forward(gaussians, &v.camera, &options).pairs() / (TILE * TILE);
         let entries = dataset.views.iter().step_by(apart).map(entries).max().unwrap_or(0) as u64;
         // As they are loaded: those to learn from first, then those held out in what is left.
-        let kept = |split: Split, budget: usize| -> Result<usize> {
-            let each = dataset.views_of(split).map(|v| Ok(bytes_per_pixel(v, masks)? * pixels(v) as usize));
-            Ok(each.sum::<Result<usize>>()?.min(full_share(budget)))
+        let whole = |split: Split| -> Result<usize> {
+            dataset.views_of(split).map(|v| Ok(bytes_per_pixel(v, masks)? * pixels(v) as usize)).sum()
         };
-        let train = kept(Split::Train, self.cache_bytes())?;
-        let heldout = kept(Split::Test, full_share(self.cache_bytes()).saturating_sub(train))?;
+        let whole = (whole(Split::Train)?, whole(Split::Test)?);
+        let train = whole.0.min(full_share(self.cache_bytes()));
+        let heldout = whole.1.min(full_share(full_share(self.cache_bytes()).saturating_sub(train)));
         let last = schedule.densify_until.min(schedule.iterations);
         let forecast = Forecast::new(&memory::Sizes {
             photographs: (train + heldout) as u64,
@@ -408,6 +408,7 @@ impl TrainArgs {
             file: size,
             tile_entries: entries,
             threads: rayon::current_num_threads(),
+            decodes_again: (train, heldout) != whole,
             sh_degree: self.sh_degree,
             densifies: !self.fixed_points && (1..=last).any(|i| schedule.densifies(i)),
         });
