@@ -81,9 +81,10 @@ SPLATS ?=
 bench-raster: ## Time the rasteriser per pixel-Gaussian pair on one core: out/bench/raster.json
 	$(CARGO) bench -p gs-raster --bench raster -- $(abspath $(SPLATS)) $(CURDIR)/out/bench/raster.json
 
-lint: ## Check formatting and lints
+lint: ## Check formatting, lints and documentation
 	$(CARGO) fmt --all --check
 	$(CARGO) clippy --release --workspace --all-targets -- -D warnings
+	RUSTDOCFLAGS="-D warnings" $(CARGO) doc --release --workspace --no-deps --quiet
 	scripts/licences.py --check
 
 # A revision to compare with, such as HEAD~5.

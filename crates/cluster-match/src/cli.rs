@@ -1,5 +1,7 @@
 //! The command line of `cluster-match`.
 
+#![allow(rustdoc::invalid_html_tags, reason = "help texts name files as <view>_s.npy")]
+
 use crate::associate::{FeatureTable, Silhouette, matches, overlaps};
 use crate::describe::{Aggregate, describe};
 use crate::extend::from_nearest;

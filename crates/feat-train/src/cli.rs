@@ -1,5 +1,7 @@
 //! The command line of `feat-train`.
 
+#![allow(rustdoc::invalid_html_tags, reason = "help texts name files as <view>_s.npy")]
+
 use crate::checkpoint;
 use crate::evidence::{Evidence, collect};
 use crate::fast::{Engine, Shortcuts};

@@ -299,7 +299,7 @@ impl<W: Weight> MaskSet<W> {
     }
 }
 
-/// Cuts columns into pieces of about [`PIECE`], only where `parted(before, after)` allows.
+/// Cuts columns into pieces of about `PIECE`, only where `parted(before, after)` allows.
 pub fn pieces(columns: &[u32], parted: &impl Fn(u32, u32) -> bool) -> Vec<u32> {
     let mut cuts = vec![0u32];
     for c in 1..columns.len() {

@@ -1,5 +1,7 @@
 //! The command line of `graph-precompute`.
 
+#![allow(rustdoc::invalid_html_tags, reason = "help texts name files as <view>_s.npy")]
+
 use crate::graph::{GraphOptions, Space};
 use crate::precompute::{Options, precompute};
 use artifacts::{ScratchEntries, role};

@@ -61,7 +61,7 @@ pub fn measure(photographs: &Photographs<'_>) -> Result<Vec<Gain>> {
 }
 
 /// Picture sizes for a run of `iterations`, as [`crate::schedule::Schedule::coarse`] has them: a divisor is in use until
-/// its share of [`FULL_GAIN`] of the coarse part is over.
+/// its share of `FULL_GAIN` of the coarse part is over.
 pub fn stages(gains: &[Gain], iterations: u32) -> Vec<(u32, u32)> {
     let coarse = COARSE_SHARE * f64::from(iterations);
     let mut last = 0;

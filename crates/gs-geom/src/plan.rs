@@ -78,7 +78,7 @@ pub struct Plan {
 
 /// The plan for these limits. `schedule` gives the schedule of a number of iterations.
 ///
-/// Full pictures come first, then as many Gaussians as get [`ITERATIONS_PER_GROWTH`] iterations for each multiple of
+/// Full pictures come first, then as many Gaussians as get `ITERATIONS_PER_GROWTH` iterations for each multiple of
 /// their first number. Where not even the first number gets them, the pictures become smaller; and where that does not
 /// suffice, there are fewer iterations.
 pub fn plan(speed: &Speed, limits: &Limits, schedule: impl Fn(u32) -> Schedule) -> Plan {

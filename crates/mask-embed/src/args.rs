@@ -1,5 +1,7 @@
 //! Arguments of the programs.
 
+#![allow(rustdoc::invalid_html_tags, reason = "help texts name files as <view>_s.npy")]
+
 use crate::automatic::Choice;
 use crate::nms::MaskNms;
 use gs_io::{Error, Result};

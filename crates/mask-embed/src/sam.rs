@@ -3,7 +3,7 @@
 //! The two graphs are those of SAM's own export script: an encoder with a square input of 1024 pixels, and a decoder with
 //! `image_embeddings`, `point_coords`, `point_labels`, `mask_input`, `has_mask_input` and `orig_im_size`. The export
 //! declares the best mask only, but computes four: one for prompts of several points, and whole, part and subpart for a
-//! single one. The four are found in the graph before the choice among them and taken instead ([`all_masks`]); the
+//! single one. The four are found in the graph before the choice among them and taken instead (`all_masks`); the
 //! enlargement to the photograph's size, which is most of the memory and much of the time, is then never computed.
 
 use gs_io::{Error, IoContext, Result, hash_files};

@@ -16,7 +16,7 @@ use std::path::{Path, PathBuf};
 pub enum LayoutName {
     /// images/ and sparse/0
     Colmap,
-    /// One of the four scenes, which the folder's name says: its labelled frames and texts, labels in ../label/<scene>
+    /// One of the four scenes, which the folder's name says: its labelled frames and texts, labels in `../label/<scene>`
     LerfOvs,
     /// A scan by the folder's name: color/, pose/, intrinsic/, and the files of its mesh; frames 0, 20, 40...
     Scannet,

@@ -1,5 +1,7 @@
 //! The command line of `synth-scene`.
 
+#![allow(rustdoc::invalid_html_tags, reason = "help texts name files as <view>_s.npy")]
+
 use crate::benchmark::{Layout, LayoutName};
 use crate::cameras::Path as CameraPath;
 use crate::families::Family;

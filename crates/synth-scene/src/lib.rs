@@ -2,7 +2,7 @@
 //!
 //! [`layout`] and [`families`] furnish a room from the [`catalogue`] of [`model`]s, [`props`] and [`furniture`]; [`light`] computes once how much light reaches every
 //! surface; [`render`] traces the photographs and what each pixel shows; [`masks`] turns that into id maps with the
-//! faults of real ones, [`language`] says what each mask means; [`points`], [`label`] and [`write`] give the rest of what a capture and its truth consist of, [`benchmark`] where it lies.
+//! faults of real ones, [`language`] says what each mask means; [`points`], [`label`] and [`mod@write`] give the rest of what a capture and its truth consist of, [`benchmark`] where it lies.
 //! Lengths are in metres, z is up, the floor is at z = 0.
 
 pub mod benchmark;
