@@ -12,7 +12,6 @@ BIN ?= target/release
 
 .DELETE_ON_ERROR:
 .SUFFIXES:
-.SECONDARY:
 SHELL := /bin/bash
 .DEFAULT_GOAL := all
 
