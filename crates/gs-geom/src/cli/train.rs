@@ -1,30 +1,30 @@
 //! `gs-geom train`.
 
-use super::budget::plan_path;
-use super::{Background, MaskArgs, SceneArgs, beside, check_writable, read_geometry};
+mod finish;
+mod forecast;
+mod start;
+
+use self::finish::spent_since;
+use super::{Background, MaskArgs, SceneArgs, beside, check_writable};
 use crate::checkpoint::{self, State};
 use crate::content::{self, Gain};
-use crate::curve;
-use crate::densify::{DensifyOptions, Strategy, drawable};
+use crate::densify::{DensifyOptions, Strategy};
 use crate::init;
-use crate::masks::Masks;
 use crate::mcmc::McmcOptions;
-use crate::memory::{self, Forecast};
-use crate::photographs::{Photographs, bytes_per_pixel, full_share};
+use crate::photographs::{Photographs, full_share};
 use crate::schedule::{LearningRates, Schedule};
-use crate::train::{Timings, TrainOptions, Trainer};
+use crate::train::{TrainOptions, Trainer};
 use artifacts::role;
 use clap::ValueEnum;
-use gs_io::{Error, Lock, Provenance, Result, Watched, hash_file, write_bytes};
-use gs_raster::{RasterOptions, TILE, forward};
+use gs_io::{Error, Lock, Provenance, Result, Watched, hash_file};
 use gs_scene::dataset::{Dataset, Split, View};
-use gs_scene::{Camera, Gaussians, PointCloud, image_size, ply};
+use gs_scene::{Camera, ply};
 use serde_json::{Value, json};
 use stage::{Bytes, Stage};
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 use std::str::FromStr;
-use std::time::{Duration, Instant};
+use std::time::Instant;
 
 /// Arguments of `gs-geom train`.
 #[derive(Debug, Clone, clap::Args)]
@@ -173,8 +173,6 @@ enum Moves {
     /// All
     Dense,
 }
-/// Views on which the tiles' share of the memory is tried.
-const FORECAST_VIEWS: usize = 4;
 
 /// How often to write a checkpoint.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -372,58 +370,6 @@ impl TrainArgs {
         done.inspect_err(|_| self.rescue(&trainer, &run, &watched, stage))
     }
 
-    /// Says how much memory the run will take, with the Gaussians there are and with the most there may be.
-    fn forecast(
-        &self,
-        dataset: &Dataset,
-        masks: &Masks,
-        gaussians: &Gaussians,
-        schedule: &Schedule,
-        stage: &Stage,
-    ) -> Result<Forecast> {
-        let now = gaussians.len();
-        let most = if self.fixed_points { now } else { self.most_gaussians(dataset).max(now) };
-        let mut size = (0, 0);
-        for view in &dataset.views {
-            let (w, h) = image_size(&view.image_path)?;
-            size = (w.max(size.0), h.max(size.1));
-        }
-        let pixels = |v: &View| u64::from(v.camera.width) * u64::from(v.camera.height);
-        let apart = dataset.views.len().div_ceil(FORECAST_VIEWS).max(1);
-        let options = RasterOptions { sh_degree: 0, antialias: self.antialias, ..RasterOptions::fit(gaussians) };
-        let entries = |v: &View| forward(gaussians, &v.camera, &options).pairs() / (TILE * TILE);
-        let entries = dataset.views.iter().step_by(apart).map(entries).max().unwrap_or(0) as u64;
-        // As they are loaded: those to learn from first, then those held out in what is left.
-        let whole = |split: Split| -> Result<usize> {
-            dataset.views_of(split).map(|v| Ok(bytes_per_pixel(v, masks)? * pixels(v) as usize)).sum()
-        };
-        let whole = (whole(Split::Train)?, whole(Split::Test)?);
-        let train = whole.0.min(full_share(self.cache_bytes()));
-        let heldout = whole.1.min(full_share(full_share(self.cache_bytes()).saturating_sub(train)));
-        let last = schedule.densify_until.min(schedule.iterations);
-        let forecast = Forecast::new(&memory::Sizes {
-            photographs: (train + heldout) as u64,
-            pixels: dataset.views.iter().map(pixels).max().unwrap_or(0),
-            width: dataset.views.iter().map(|v| u64::from(v.camera.width)).max().unwrap_or(0),
-            file: size,
-            tile_entries: entries,
-            threads: rayon::current_num_threads(),
-            decodes_again: (train, heldout) != whole,
-            sh_degree: self.sh_degree,
-            densifies: !self.fixed_points && (1..=last).any(|i| schedule.densifies(i)),
-        });
-        stage.info(&format!(
-            "memory: about {} with {now} Gaussians, at most {} with {most} (photographs {}, pictures {}, {} bytes a Gaussian)",
-            forecast.peak(now),
-            forecast.peak(most),
-            Bytes(forecast.photographs),
-            Bytes(forecast.scratch()),
-            forecast.per_gaussian
-        ));
-        stage.needs(forecast.peak(most).0, "give fewer --max-gaussians, a smaller --resolution or --image-cache")?;
-        Ok(forecast)
-    }
-
     /// The files that are hashed at one time and read at another.
     fn watched(&self, dataset: &Dataset) -> Watched {
         let init = match &self.init {
@@ -469,65 +415,6 @@ impl TrainArgs {
                 None
             }
         }
-    }
-
-    /// The Gaussians before the first iteration.
-    pub(super) fn start(
-        &self,
-        dataset: &Dataset,
-        cameras: &[&Camera],
-        extent: f64,
-        stage: &Stage,
-    ) -> Result<Gaussians> {
-        let read: PointCloud;
-        if let Init::File(path) = &self.init {
-            if ply::holds_gaussians(path)? {
-                return self.start_gaussians(path, stage);
-            }
-            read = ply::read_points(path)?;
-            if read.is_empty() {
-                return Err(Error::new("no points to start from").file(path).field("--init"));
-            }
-            stage.info(&format!("starting from the {} points of {}", read.len(), path.display()));
-            return self.start_points(&read, extent, stage).map_err(|e| e.file(path));
-        }
-        if self.init == Init::Points && !dataset.points.is_empty() {
-            return self.start_points(&dataset.points, extent, stage).map_err(|e| e.file(&self.scene.scene));
-        }
-        if self.fixed_points {
-            return Err(Error::new("no points to keep").file(&self.scene.scene).field("points").hint(
-                "--fixed-points needs a dataset with points, such as ScanNet's vertices, or --init with a file",
-            ));
-        }
-        let why = if self.init == Init::Points { "the dataset has no points: " } else { "" };
-        stage.info(&format!("{why}starting from {} random points", self.init_points));
-        let random = init::random_points(cameras, self.init_points, stage.seed());
-        self.start_points(&random, extent, stage).map_err(|e| e.file(&self.scene.scene))
-    }
-
-    /// One Gaussian for each point, or for as many as may be.
-    fn start_points(&self, points: &PointCloud, extent: f64, stage: &Stage) -> Result<Gaussians> {
-        let Some(most) = self.max_gaussians.filter(|&most| points.len() > most && !self.fixed_points) else {
-            return init::from_points(points, self.sh_degree, extent);
-        };
-        stage.info(&format!("starting from {most} of {} points, for --max-gaussians", points.len()));
-        init::from_points(&init::some_points(points, most, stage.seed()), self.sh_degree, extent)
-    }
-
-    /// The Gaussians of a file.
-    fn start_gaussians(&self, path: &Path, stage: &Stage) -> Result<Gaussians> {
-        let g = init::with_degree(read_geometry(path)?, self.sh_degree);
-        if let Some(most) = self.max_gaussians.filter(|&most| g.len() > most && !self.fixed_points) {
-            return Err(Error::new("more Gaussians than --max-gaussians")
-                .file(path)
-                .found(g.len())
-                .expected(format!("at most {most}")));
-        }
-        let zero = g.rotations.iter().filter(|q| q.iter().all(|v| v.abs() < 1e-12)).count();
-        if zero > 0 {
-            stage.warn(&format!("{zero} Gaussians of --init have a quaternion of length 0 and are never drawn"));
-        }
-        Ok(g)
     }
 
     /// Runs the iterations; whether all are done.
@@ -579,125 +466,11 @@ impl TrainArgs {
     fn save(&self, trainer: &Trainer<'_>, run: &Provenance) -> Result<()> {
         checkpoint::write(&checkpoint::path_of(&self.out), trainer.state(), run.clone())
     }
-
-    /// Writes everything a finished run leaves.
-    fn finish(
-        &self,
-        trainer: &mut Trainer<'_>,
-        run: &Provenance,
-        forecast: &Forecast,
-        (plan, iteration_cpu_seconds): (Value, Option<f64>),
-        stage: &Stage,
-    ) -> Result<()> {
-        let (psnr, ssim) = trainer.heldout()?.unzip();
-        let trainer = &*trainer;
-        let timings = trainer.timings();
-        let (parameters, inputs) = (&run.parameters, &run.inputs);
-        let State { gaussians, progress, .. } = trainer.state();
-        let predicted = forecast.peak(gaussians.len());
-        // Rows to write and no copy: the moments are still there, for a checkpoint if the disk is full.
-        let keep_all = self.fixed_points || self.no_skip;
-        let rows = if keep_all { (0..gaussians.len() as u32).collect() } else { drawable(gaussians) };
-        if rows.len() < gaussians.len() {
-            stage.skipped(&format!("{} Gaussians: too faint to be drawn", gaussians.len() - rows.len()));
-        }
-        if progress.dropped > 0 {
-            stage.warn(&format!("{} gradients of Gaussians were not finite and were not used", progress.dropped));
-        }
-        let [not_finite, degenerate] = progress.undrawn;
-        if not_finite + degenerate > 0 {
-            stage.warn(&format!(
-                "Gaussians that could not be drawn, in the worst iteration: {not_finite} not finite, {degenerate} of a shape beyond single precision or with a quaternion of length 0"
-            ));
-        }
-        let curve: String = progress.curve.iter().map(|line| format!("{line}\n")).collect();
-        write_bytes(beside(&self.out, ".curve.jsonl"), curve.as_bytes())?;
-        write_bytes(beside(&self.out, ".curve.svg"), curve::svg(&progress.curve).as_bytes())?;
-        if !trainer.state().exposures.is_off() {
-            let names = trainer.train_names();
-            let maps: serde_json::Map<String, Value> = names
-                .zip(&trainer.state().exposures.maps)
-                .map(|(name, map)| (name.to_string(), json!(map.chunks(4).collect::<Vec<_>>())))
-                .collect();
-            let text = serde_json::to_vec_pretty(&maps).map_err(|e| Error::new(e.to_string()))?;
-            write_bytes(beside(&self.out, ".exposures.json"), &text)?;
-        }
-        let mut comments = comments(parameters, inputs);
-        comments.extend(progress.extended.iter().map(|i| format!("extended after iteration {i}")));
-        ply::write_some_gaussians(&self.out, gaussians, &rows, &comments)?;
-        let [cloned, split, removed, relocated] = progress.densified;
-        let heldout = psnr.map_or(String::new(), |p| format!(", {p:.2} dB on held-out views"));
-        stage.info(&format!(
-            "{} Gaussians ({cloned} cloned, {split} split, {removed} removed, {relocated} relocated){heldout}; {}",
-            rows.len(),
-            shares(timings)
-        ));
-        let summary = json!({
-            "gaussians": rows.len(),
-            "psnr_heldout": psnr,
-            "ssim_heldout": ssim,
-            "iterations": progress.iteration,
-            "dropped_gradients": progress.dropped,
-            "most_undrawn": {"not_finite": progress.undrawn[0], "degenerate": progress.undrawn[1]},
-            "memory_predicted_bytes": predicted,
-            "extended_after": progress.extended,
-            "seconds": seconds(timings),
-            "cpu_seconds": stage::cpu_seconds(),
-            "iteration_cpu_seconds": iteration_cpu_seconds,
-            "plan": plan,
-        });
-        stage.record(&self.out, parameters.clone(), inputs.clone(), summary)?;
-        for leftover in [beside(&self.out, ".partial.ply"), plan_path(&self.out)] {
-            remove_if_there(&leftover);
-        }
-        if self.keep_state {
-            return self.save(trainer, run);
-        }
-        remove_if_there(&checkpoint::path_of(&self.out));
-        Ok(())
-    }
 }
 
 pub(super) fn remove_if_there(path: &Path) {
     // What cannot be removed does no harm.
     let _ = std::fs::remove_file(path);
-}
-
-/// Processor time since a moment at which it was `before`.
-fn spent_since(before: Option<f64>) -> Option<f64> {
-    Some(stage::cpu_seconds()? - before?)
-}
-
-fn parts(t: Timings) -> [(&'static str, Duration); 5] {
-    [("forward", t.forward), ("loss", t.loss), ("backward", t.backward), ("Adam", t.adam), ("rest", t.rest)]
-}
-
-fn seconds(t: Timings) -> Value {
-    Value::Object(parts(t).into_iter().map(|(name, d)| (name.into(), json!(d.as_secs_f64()))).collect())
-}
-
-fn shares(t: Timings) -> String {
-    let total = parts(t).iter().map(|(_, d)| d.as_secs_f64()).sum::<f64>().max(1e-9);
-    let all: Vec<String> =
-        parts(t).iter().map(|(name, d)| format!("{name} {:.0}%", 100.0 * d.as_secs_f64() / total)).collect();
-    format!("{total:.1} s: {}", all.join(", "))
-}
-
-/// Provenance as comment lines of the PLY: program, inputs, parameters.
-fn comments(parameters: &Value, inputs: &BTreeMap<String, String>) -> Vec<String> {
-    let mut lines = vec![format!("made by gs-geom {}", env!("CARGO_PKG_VERSION"))];
-    lines.extend(inputs.iter().map(|(role, hash)| format!("{role} {hash}")));
-    let mut add = |prefix: &str, value: &Value| {
-        if let Value::Object(map) = value {
-            lines.extend(map.iter().filter(|(_, v)| !v.is_object()).map(|(k, v)| format!("{prefix}{k} {v}")));
-        }
-    };
-    add("", parameters);
-    add("", &parameters["options"]);
-    for group in ["schedule", "rates", "densify", "mcmc"] {
-        add(&format!("{group}."), &parameters["options"][group]);
-    }
-    lines
 }
 
 #[cfg(test)]
@@ -721,12 +494,5 @@ mod tests {
         for wrong in ["0", "-1", "s", "x", "-3s", ""] {
             assert!(wrong.parse::<Every>().is_err(), "{wrong}");
         }
-    }
-
-    #[test]
-    fn comments_name_every_parameter_once() {
-        let parameters = json!({"resolution": "auto", "options": {"seed": 1, "rates": {"opacity": 0.05}}});
-        let lines = comments(&parameters, &BTreeMap::from([("dataset".into(), "ab".into())]));
-        assert_eq!(lines[1..], ["dataset ab", "resolution \"auto\"", "seed 1", "rates.opacity 0.05"]);
     }
 }
