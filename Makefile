@@ -13,7 +13,7 @@ JOBS ?= $(shell nproc)
 
 help: ## Say what can be made
 	@echo "Targets:"
-	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/^([a-z-]+):.*## /  \1\t/' | expand -t 14
+	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/^([a-z-]+):.*## /  \1\t/' | expand -t 24
 	@echo
 	@echo "make scene needs SCENE=folder (COLMAP, transforms.json or ScanNet) and OUT=folder; it takes"
 	@sed -nE 's/^#: ?/  /p' pipelines/custom.mk
@@ -24,14 +24,19 @@ build: ## Build all programs into target/release
 demo: build ## Build, make a synthetic scene, run every stage on it, write out/demo/report.html
 	@$(MAKE) --no-print-directory -f pipelines/demo.mk all
 
-scene: build ## The same on your own photographs: make scene SCENE=folder OUT=folder
+scene: checked-scene build ## The same on your own photographs: make scene SCENE=folder OUT=folder
 	@$(MAKE) --no-print-directory -f pipelines/custom.mk all
 
+# Settings that are missing or wrong are said before anything is built.
+.PHONY: checked-scene
+checked-scene:
+	@$(MAKE) --no-print-directory -f pipelines/custom.mk checked
+
 # The data sets of the paper, in folder DATA; their parameters are in pipelines/*.conf.
-lerf-ovs: build check-lerf-ovs ## The paper's table of LERF-OVS: make lerf-ovs DATA=folder OUT=folder (docs/reproduce.md)
+lerf-ovs: check-lerf-ovs build ## The paper's table of LERF-OVS: make lerf-ovs DATA=folder OUT=folder (docs/reproduce.md)
 	@$(MAKE) --no-print-directory -f pipelines/benchmark.mk SET=lerf-ovs all
 
-scannet: build check-scannet ## The paper's table of ScanNet: make scannet DATA=folder OUT=folder
+scannet: check-scannet build ## The paper's table of ScanNet: make scannet DATA=folder OUT=folder
 	@$(MAKE) --no-print-directory -f pipelines/benchmark.mk SET=scannet all
 
 check-data: check-$(SET) ## Say what of a data set is missing and where it comes from: make check-data DATA=folder SET=lerf-ovs|scannet
@@ -42,7 +47,7 @@ check-lerf-ovs check-scannet: check-%:
 check-:
 	@echo "say which data set: make check-data DATA=folder SET=lerf-ovs|scannet" >&2; exit 2
 
-granularity: build ## Cost of inconsistent granularity on synthetic scenes, by a plan: make granularity PLAN=file OUT=folder
+granularity: build ## Tables 3 to 5 on synthetic scenes of inconsistent granularity, by a plan: make granularity PLAN=file OUT=folder
 	@$(MAKE) --no-print-directory -f pipelines/granularity.mk plan
 	@$(MAKE) --no-print-directory -j $(JOBS) -f pipelines/granularity.mk all
 
@@ -57,8 +62,12 @@ $(SNAKEMAKE)/bin/snakemake: pipelines/snakemake.txt
 	$(SNAKEMAKE)/bin/pip install -q -r $<
 	@touch $@
 
-reproduce-check: build ## Run a finished OUT again into another folder and compare the bytes: make reproduce-check OUT=folder
+reproduce-check: $(if $(OUT),build,checked-out) ## Run a finished OUT again into another folder and compare the bytes: make reproduce-check OUT=folder
 	@scripts/reproduce_check.sh $(OUT) $(INTO)
+
+.PHONY: checked-out
+checked-out:
+	@echo "say which finished run: make reproduce-check OUT=folder" >&2; exit 2
 
 test: ## Run all tests
 	$(CARGO) test --release --workspace
@@ -142,7 +151,7 @@ bench-cluster-graph: ## Time cluster-match --cluster graph at a million Gaussian
 bench-query: ## Time a query over a million Gaussians and 500 instances: out/bench/query.json
 	$(CARGO) bench -p eval --bench query -- --out $(CURDIR)/out/bench/query.json
 
-ablation: ## The same with the tables of docs/accuracy.md filled: out/ablation/ (an hour)
+ablation: ## make granularity with the tables of docs/accuracy.md filled: out/ablation/ (hours)
 	@$(MAKE) --no-print-directory granularity DOCS=docs/accuracy.md
 
 bench-granularity: build ## Measure synthetic masks beside real ones (MASKS=folder FOOTPRINTS=file): out/bench/granularity.md

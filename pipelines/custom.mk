@@ -3,7 +3,7 @@
 #:  MASKS=folder        use these id maps (*_s.npy) instead of running SAM
 #:  CLIP=folder         image.onnx and text.onnx of a CLIP model [models/clip, if there]; without it no text queries
 #:  QUERIES="red_mug …" texts to ask for, with underscores for spaces
-#:  RESOLUTION=640px    size of the photographs for stage 1: a width that wider ones are shrunk to, or a divisor
+#:  RESOLUTION=640px    size of the photographs for stage 1: a width that wider ones are shrunk to, a divisor, or auto
 #:  QUALITY=balanced    fast, balanced or exact: pipelines/quality
 #:  ITERATIONS=3000     steps of stage 1; fast 1000, exact 10000
 #:  SEED=0              of every stage's random choices

@@ -7,7 +7,11 @@ SEED ?= 0
 PIPELINE := $(firstword $(MAKEFILE_LIST))
 settings_LINES := 'PIPELINE = $(PIPELINE)' $(foreach v,$(SETTINGS),'$v = $(subst ','\'',$(subst $$,$$$$,$($v)))')
 
-.PHONY: settings
+.PHONY: settings checked
+# Reading the makefiles has checked what was given.
+checked:
+	@:
+
 settings:
 	@mkdir -p $(OUT)
 	@printf '%s\n' $(settings_LINES) > $(OUT)/settings.conf

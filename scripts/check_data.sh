@@ -20,7 +20,7 @@ check_masks() {
   local photographs=$1 folder=${MASKS:-$2/language_features} maps features
   maps=$(count "$folder" '*_s.npy') features=$(count "$folder" '*_f.npy')
   if [ "$maps" -eq 0 ]; then
-    there "no masks in $folder: SAM makes them"
+    printf '  none     masks in %s: SAM makes them\n' "$folder"
     [ -e "$SAM/encoder.onnx" ] || lack "SAM's encoder.onnx and sam.onnx" "$SAM (make models), or LangSplat's masks to $folder" sam
     [ -n "$CLIP" ] || lack "a CLIP model for the masks' features" "any folder, given as CLIP=folder" clip
   elif [ "$maps" -lt "$photographs" ]; then

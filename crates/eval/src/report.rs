@@ -614,22 +614,22 @@ fn left_out(records: &[Run], page: &mut Page, metrics: &Metrics) {
 pub fn table(metrics: &Metrics) -> String {
     let mut s = String::new();
     let mut line = |name: &str, value: Option<String>| {
-        s += &format!("{name:<14} {}\n", value.unwrap_or_else(|| "–".into()));
+        s += &format!("{name:<16} {}\n", value.unwrap_or_else(|| "–".into()));
     };
     let number = |v: Option<f64>| v.map(|v| format!("{v:.4}"));
-    line("psnr_heldout", metrics.psnr_heldout.map(|v| format!("{v:.2}")));
+    line("psnr_heldout", metrics.psnr_heldout.map(|v| format!("{v:.2} dB")));
     line("ssim_heldout", number(metrics.ssim_heldout));
     line("instance_miou", number(metrics.instance_miou));
     line("query_miou", number(metrics.query_miou));
     line("  visible only", number(metrics.query_miou_visible));
-    line("queries", Some(metrics.query_count.to_string()));
+    line("queries scored", Some(metrics.query_count.to_string()));
     line("gaussians", Some(metrics.gaussians.to_string()));
     line("instances", metrics.instances.map(|n| n.to_string()));
     for (stage, seconds) in &metrics.seconds {
         line(stage, Some(format!("{seconds:.1} s")));
     }
     for reason in &metrics.skipped {
-        s += &format!("left out       {reason}\n");
+        s += &format!("left out         {reason}\n");
     }
     s
 }

@@ -12,10 +12,10 @@ const ORDER: [&str; 7] =
 /// Suffix of a record's file name.
 const SUFFIX: &str = ".run.json";
 
-/// A stage's record and the output it lies beside.
+/// A run of a stage and the outputs it has a record beside.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Run {
-    /// File name of the output.
+    /// File names of the outputs, with commas between.
     pub output: String,
     /// What the stage wrote of itself.
     pub record: RunRecord,
@@ -28,6 +28,14 @@ impl Run {
             Some(command) => format!("{} {command}", self.record.program),
             None => self.record.program.clone(),
         }
+    }
+
+    /// Whether both records are of one run.
+    fn is_of(&self, other: &Self) -> bool {
+        let (a, b) = (&self.record, &other.record);
+        // The start is a difference of two clocks, in seconds.
+        a.started.abs_diff(b.started) <= 1
+            && (&a.program, &a.parameters, &a.inputs) == (&b.program, &b.parameters, &b.inputs)
     }
 
     /// The figures of its summary, as text.
@@ -72,6 +80,14 @@ pub fn read_all(folders: &[&Path], except: &Path) -> Result<Vec<Run>> {
     runs.sort_by(|a, b| (place(a), a.name(), &a.output).cmp(&(place(b), b.name(), &b.output)));
     // gs-geom eval comes after gs-geom train, whatever the alphabet says.
     runs.sort_by_key(|r| (place(r), r.name().ends_with(" eval")));
+    // A run with several outputs left a record beside each.
+    runs.dedup_by(|next, run| {
+        let same = run.is_of(next);
+        if same {
+            run.output += &format!(", {}", next.output);
+        }
+        same
+    });
     Ok(runs)
 }
 
@@ -147,15 +163,13 @@ mod tests {
             [
                 "gs-geom train: geometry.ply",
                 "gs-geom eval: geom_metrics.json",
-                "graph-precompute: footprints.safetensors",
-                "graph-precompute: graph.safetensors",
+                "graph-precompute: footprints.safetensors, graph.safetensors",
                 "eval query: query.json"
             ]
         );
         assert_eq!(runs[0].figures(), "gaussians 12,345, psnr 26.54");
         assert_eq!(seconds(&runs).len(), 4);
-        let graph = runs[2].record.wall_seconds.max(runs[3].record.wall_seconds);
-        assert_eq!(seconds(&runs)["graph-precompute"], graph);
+        assert_eq!(seconds(&runs)["graph-precompute"], runs[2].record.wall_seconds);
     }
 
     #[test]

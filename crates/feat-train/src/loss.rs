@@ -12,13 +12,13 @@ pub enum Loss {
     /// The positive is the centroid of a random half of the mask's Gaussians, in numerator and denominator.
     HalfMask,
     /// The positive is the centroid of the same thing's mask in another view, in numerator and denominator; a mask
-    /// without counterpart is its own positive. See [`crate::cross_view`].
+    /// without counterpart is its own positive.
     CrossView,
     /// Per Gaussian instead of per mask: each Gaussian against the centroids of all masks, its own masks being positive
     /// in proportion to their weight.
     Gaussian,
     /// Per pixel: the rendered feature of each sampled pixel against the centroids of all masks, that of its own mask being
-    /// the positive. See [`crate::pixels`].
+    /// the positive.
     Pixel,
 }
 

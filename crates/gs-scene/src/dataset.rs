@@ -83,6 +83,9 @@ impl std::fmt::Display for Resolution {
     }
 }
 
+/// A side of a photograph in pixels below which its resolution was hardly meant.
+const SMALL: u32 = 24;
+
 impl Resolution {
     fn apply(self, width: u32, height: u32) -> (u32, u32) {
         let divisor = match self {
@@ -193,6 +196,15 @@ fn finish(root: &Path, mut raw: RawDataset, options: &LoadOptions) -> Result<Dat
         View::new(v, stem, split, options.resolution)
     });
     let views = views.collect::<Result<Vec<_>>>()?;
+    let smallest =
+        views.iter().map(|v| (v.camera.width, v.camera.height)).min_by_key(|(w, h)| *w.min(h)).unwrap_or_default();
+    if let Resolution::Divisor(d) = options.resolution
+        && d > 1.0
+        && smallest.0.min(smallest.1) < SMALL
+    {
+        let (w, h) = smallest;
+        raw.warnings.push(format!("photographs of {w}x{h} pixels after division by {d}: for a width, write {d}px"));
+    }
     Ok(Dataset { root: root.to_path_buf(), format: raw.format, views, points: raw.points, warnings: raw.warnings })
 }
 

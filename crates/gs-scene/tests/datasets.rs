@@ -212,6 +212,19 @@ fn holding_out_and_shrinking() {
     assert_eq!("auto".parse::<Resolution>().unwrap(), Resolution::Auto);
 }
 
+/// `240` for `240px` is easily typed.
+#[test]
+fn a_divisor_that_leaves_next_to_nothing_is_warned_of() {
+    let dir = tempfile::tempdir().unwrap();
+    colmap_scene(dir.path(), &cameras(2, 120, 90));
+    let warnings = |d: f64| {
+        dataset::load(dir.path(), &LoadOptions { resolution: Resolution::Divisor(d), ..FULL }).unwrap().warnings
+    };
+    assert_eq!(warnings(2.0), [""; 0]);
+    let said = warnings(40.0).join(" ");
+    assert!(said.contains("3x2 pixels") && said.contains("write 40px"), "{said}");
+}
+
 #[test]
 fn the_hash_is_of_contents_not_of_places() {
     let dir = tempfile::tempdir().unwrap();

@@ -88,7 +88,9 @@ pub fn run(args: &EmbedArgs, stage: &Stage) -> Result<()> {
     let (mut kept, mut masks, mut pictures) = (0, 0, 0);
     for view in &scene.views {
         if stage.interrupted() {
-            return Err(Error::new("interrupted; start again to go on with the next view"));
+            return Err(Error::new(
+                "interrupted; the views that are done stay, and the same command goes on with the next",
+            ));
         }
         let Some(maps) = read_maps(&args.masks, view, stage)? else { continue };
         let (image, image_hash) = photographs::read(view)?;

@@ -58,7 +58,9 @@ pub fn run(args: &MasksArgs, stage: &Stage) -> Result<()> {
     let (mut kept, mut asked, mut points) = (0, 0, 0);
     for view in &scene.views {
         if stage.interrupted() {
-            return Err(Error::new("interrupted; start again to go on with the next view"));
+            return Err(Error::new(
+                "interrupted; the views that are done stay, and the same command goes on with the next",
+            ));
         }
         let output = maps_path(&args.out, view.stem());
         let (image, image_hash) = photographs::read(view)?;

@@ -16,7 +16,9 @@ pub(crate) fn generate<P: CommandFactory>(name: &'static str, arguments: &[Strin
             .field("--generate")
             .expected(format!("man or one of {shells}, then a folder"))
     };
-    let [kind, folder] = arguments else { return Err(usage().found(arguments.join(" "))) };
+    let [kind, folder] = arguments else {
+        return Err(usage().found(if arguments.is_empty() { "nothing".into() } else { arguments.join(" ") }));
+    };
     let folder = Path::new(folder);
     create_dir(folder)?;
     let command = P::command().name(name);

@@ -263,7 +263,7 @@ fn a_full_report_stands_alone() {
     )
     .unwrap();
     let printed = f.good("report", "--run-dir|{}/run|--scene|{}/balls|--out|{}/run/report.html");
-    assert!(printed.contains("psnr_heldout   31.50"), "{printed}");
+    assert!(printed.contains("psnr_heldout     31.50 dB"), "{printed}");
     let html = fs::read_to_string(f.run().join("report.html")).unwrap();
     for id in [
         "photographs",
