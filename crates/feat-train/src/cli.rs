@@ -314,10 +314,12 @@ impl Args {
         let sets = mask_sets::<W>(&inputs.footprints, &context, &self.levels, least)?;
         let units = inputs.footprints.views.len() * self.levels.len();
         if sets.len() < units {
-            stage.skipped(&format!("{} of {units} views and levels: fewer than {least} masks", units - sets.len()));
+            let why = if least == 1 { "no mask" } else { "fewer than two masks" };
+            stage.skipped(&format!("{} of {units} views and levels: {why}", units - sets.len()));
         }
         if sets.is_empty() {
-            return Err(Error::new("no view has two masks to tell apart")
+            let what = if least == 1 { "no view has a mask" } else { "no view has two masks to tell apart" };
+            return Err(Error::new(what)
                 .file(&self.footprints)
                 .field(format!("levels {:?}", self.levels))
                 .hint("choose other --levels, or make masks with more than one segment a view"));
