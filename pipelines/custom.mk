@@ -18,6 +18,10 @@ ifeq ($(OUT),)
 $(error say where to write: make scene SCENE=folder OUT=folder)
 endif
 
+# What is given must be there, before anything is built.
+given = $(if $($1),$(if $(wildcard $($1)),,$(error $1=$($1): no such file or folder)))
+$(foreach name,SCENE GEOMETRY MASKS CLIP CONF,$(call given,$(name)))
+
 include pipelines/custom.conf
 include pipelines/quality.mk
 include $(CONF)

@@ -68,6 +68,11 @@ ran=$(stages_of "$work/changed.log")
 [ "$ran" = 'cluster-match,eval query,eval report,eval score,feat-train,' ] || fail "a changed feat-train option ran: $ran"
 pass "a changed option runs what depends on it and nothing else"
 
+say "== a scene that is not there"
+make --no-print-directory scene SCENE="$work/nowhere" OUT="$work/n" > "$work/nowhere.log" 2>&1 && fail "make scene without a scene"
+grep -q "SCENE=$work/nowhere: no such" "$work/nowhere.log" && ! grep -q cargo "$work/nowhere.log" || { cat "$work/nowhere.log"; fail "a scene that is not there is not said at once"; }
+pass "a scene that is not there is said before anything is built"
+
 say "== artifacts of another scene"
 make --no-print-directory -f pipelines/demo.mk OUT="$work/c" SYNTH_ARGS='--seed 8 --objects 8 --views 6 --width 120 --height 90' \
   GEOM_ARGS='--iterations 30' "$work/c/geometry.ply" > "$work/c.log" 2>&1 || { cat "$work/c.log"; fail "another scene"; }

@@ -8,6 +8,7 @@ mod query;
 use crate::ask::Asker;
 use crate::labels;
 use crate::lerf::Rendering;
+use crate::memory::{self, Sizes};
 use crate::ranking::{Index, Join, Scoring, Selection};
 use crate::report::{self, ReportOptions};
 use crate::scene::LabelledScene;
@@ -17,7 +18,7 @@ use crate::text::TextSource;
 use artifacts::{Features, role};
 use clap::{Parser, Subcommand};
 use gs_io::{Error, Result, Watched, write_bytes};
-use gs_scene::dataset::{self, Dataset, LoadOptions, Resolution};
+use gs_scene::dataset::{self, Dataset, LoadOptions, Resolution, View};
 use onnx_models::EngineOptions;
 use serde_json::{Value, json};
 use stage::{CommonArgs, Program, Stage};
@@ -67,6 +68,21 @@ struct SceneArgs {
     #[arg(long, value_name = "DIR")]
     scene: PathBuf,
 }
+
+impl SceneArgs {
+    /// What is known of the memory that this scene takes, before it is read.
+    fn sizes(&self, language: &LanguageArgs, views: &[View]) -> Sizes {
+        Sizes {
+            geometry: memory::bytes(&self.geometry),
+            language: memory::language(language.clip.as_deref(), language.text_features.as_deref()),
+            pixels: memory::pixels(views),
+            ..Sizes::default()
+        }
+    }
+}
+
+/// What takes less memory.
+const SMALLER: &str = "give a smaller geometry (gs-geom train --max-gaussians) or smaller pictures";
 
 /// Where text features come from, and which instances they select.
 #[derive(Debug, clap::Args)]
@@ -302,15 +318,21 @@ fn mask_threshold(alpha: Option<f32>, silhouette: Silhouette) -> Result<f32> {
 fn run_score(a: &ScoreArgs, stage: &Stage) -> Result<String> {
     a.language.selection()?;
     let threshold = mask_threshold(a.alpha, a.silhouette)?;
+    let dataset = load(&a.scene.scene, &LoadOptions::default(), stage)?;
+    let labels = a.labels.clone().unwrap_or_else(|| dataset.root.join("label"));
+    let sizes = Sizes {
+        truth: memory::bytes(&dataset.root.join("truth/points.safetensors")),
+        labels: labels::pixels(&labels),
+        ..a.scene.sizes(&a.language, &dataset.views)
+    };
+    stage.forecast(memory::of_scores(&sizes), SMALLER)?;
     let scene = read_scene(&a.scene.instances, &a.scene.geometry, stage)?;
     if scene.instances.label.iter().all(|&l| l < 0) {
         stage.warn("all Gaussians are noise: every score is 0");
     }
     let mut scores = Scores::default();
-    let dataset = load(&a.scene.scene, &LoadOptions::default(), stage)?;
     scene.check_dataset(&dataset)?;
     score::score_instances(&scene, &dataset.root, &mut scores)?;
-    let labels = a.labels.clone().unwrap_or_else(|| dataset.root.join("label"));
     let watched = if labels.is_dir() { labels::watch_folder(&labels)? } else { Watched::default() };
     let no_source = a.language.clip.is_none() && a.language.text_features.is_none();
     if !labels.is_dir() {
@@ -372,6 +394,13 @@ fn run_report(a: &ReportArgs, stage: &Stage) -> Result<String> {
         views: a.views.clone(),
         ablation: a.ablation.clone(),
     };
+    let sizes = Sizes {
+        geometry: memory::bytes(&a.run_dir.join("geometry.ply")),
+        features: memory::bytes(&a.run_dir.join("features.safetensors")),
+        pixels: memory::pixels(&dataset.views),
+        ..Sizes::default()
+    };
+    stage.forecast(memory::of_report(&sizes), "give a smaller --resolution")?;
     let mut inputs = std::collections::BTreeMap::new();
     let metrics = report::run(&dataset, &options, &mut inputs)?;
     stage.record(&a.out, json!({"command": "report"}), inputs, json!({"left_out": metrics.skipped.len()}))?;

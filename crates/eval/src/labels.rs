@@ -4,7 +4,7 @@
 use crate::{Mask, polygon};
 use gs_io::{Error, IoContext, Result, Watched};
 use serde::Deserialize;
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
 
 /// Largest width or height of a labelled frame that is believed, in pixels.
@@ -31,6 +31,17 @@ pub struct FrameLabels {
 struct Isat {
     info: Info,
     objects: Vec<Object>,
+}
+
+impl Isat {
+    fn names(&self) -> BTreeSet<&str> {
+        self.objects.iter().map(|o| o.category.as_str()).collect()
+    }
+
+    /// Pixels of the masks of all categories.
+    fn pixels(&self) -> u64 {
+        self.info.width * self.info.height * self.names().len() as u64
+    }
 }
 
 #[derive(Deserialize)]
@@ -84,36 +95,21 @@ fn files(folder: &Path) -> Result<Vec<PathBuf>> {
     Ok(paths)
 }
 
+/// Pixels of the masks of all categories of all frames of a label folder, a byte each in memory; files that cannot be read
+/// count nothing, because [`read_folder`] says so.
+pub fn pixels(folder: &Path) -> u64 {
+    let of = |path: &PathBuf| parse(path).map_or(0, |isat| isat.pixels());
+    files(folder).map_or(0, |paths| paths.iter().map(of).sum())
+}
+
 /// Reads one label file and fills its polygons: vertices are truncated toward zero, borders included (docs/protocols.md).
 ///
 /// # Errors
 /// As [`read_folder`].
 pub fn read(path: impl AsRef<Path>) -> Result<FrameLabels> {
     let path = path.as_ref();
-    let bytes = std::fs::read(path).at("read", path)?;
-    let hint = "label files are ISAT JSON: info {width, height}, objects [{category, segmentation}]";
-    let isat: Isat = serde_json::from_slice(&bytes)
-        .map_err(|e| Error::new(format!("not a label file: {e}")).file(path).hint(hint))?;
-    for (field, side) in [("info.width", isat.info.width), ("info.height", isat.info.height)] {
-        if !(1..=MAX_SIDE).contains(&side) {
-            return Err(Error::new("not an image size")
-                .file(path)
-                .field(field)
-                .found(side)
-                .expected(format!("1 to {MAX_SIDE}")));
-        }
-    }
+    let isat = parse(path)?;
     let (width, height) = (isat.info.width as u32, isat.info.height as u32);
-    let names: std::collections::BTreeSet<&str> = isat.objects.iter().map(|o| o.category.as_str()).collect();
-    let pixels = isat.info.width * isat.info.height * names.len() as u64;
-    if pixels > MAX_PIXELS {
-        return Err(Error::new("too many pixels in the masks of all categories")
-            .file(path)
-            .field("info.width, info.height")
-            .found(format!("{}x{} for each of {}", isat.info.width, isat.info.height, names.len()))
-            .expected(format!("at most {MAX_PIXELS}"))
-            .hint("check the size, or shrink photographs and labels"));
-    }
     let mut categories = BTreeMap::new();
     let mut boxes = BTreeMap::<String, Vec<[f64; 4]>>::new();
     for object in &isat.objects {
@@ -128,6 +124,32 @@ pub fn read(path: impl AsRef<Path>) -> Result<FrameLabels> {
     }
     let frame = path.file_stem().unwrap_or_default().to_string_lossy().into_owned();
     Ok(FrameLabels { frame, width, height, categories, boxes })
+}
+
+/// Reads one label file without filling its polygons.
+fn parse(path: &Path) -> Result<Isat> {
+    let bytes = std::fs::read(path).at("read", path)?;
+    let hint = "label files are ISAT JSON: info {width, height}, objects [{category, segmentation}]";
+    let isat: Isat = serde_json::from_slice(&bytes)
+        .map_err(|e| Error::new(format!("not a label file: {e}")).file(path).hint(hint))?;
+    for (field, side) in [("info.width", isat.info.width), ("info.height", isat.info.height)] {
+        if !(1..=MAX_SIDE).contains(&side) {
+            return Err(Error::new("not an image size")
+                .file(path)
+                .field(field)
+                .found(side)
+                .expected(format!("1 to {MAX_SIDE}")));
+        }
+    }
+    if isat.pixels() > MAX_PIXELS {
+        return Err(Error::new("too many pixels in the masks of all categories")
+            .file(path)
+            .field("info.width, info.height")
+            .found(format!("{}x{} for each of {}", isat.info.width, isat.info.height, isat.names().len()))
+            .expected(format!("at most {MAX_PIXELS}"))
+            .hint("check the size, or shrink photographs and labels"));
+    }
+    Ok(isat)
 }
 
 /// Grey level above which a pixel of a truth or prediction picture belongs to the object, strictly. Truth pictures are

@@ -11,6 +11,7 @@ pub mod labels;
 pub mod lerf;
 mod mask;
 pub mod mask_stats;
+pub mod memory;
 pub mod metrics;
 pub mod pca;
 pub mod picture;

@@ -15,8 +15,8 @@ use crate::{curves, svg};
 use artifacts::{Features, Level, MaskMaps, NOISE_COLOR, hash_folder, instance_color, maps_path, role};
 use gs_io::{Error, IoContext, Result, hash_file, write_bytes};
 use gs_raster::RasterOptions;
-use gs_scene::Geometry;
 use gs_scene::dataset::{Dataset, Split, View};
+use gs_scene::{Gaussians, Geometry};
 use serde::{Deserialize, Serialize};
 use serde_json::Value;
 use std::collections::BTreeMap;
@@ -98,13 +98,27 @@ const BACKDROP: [f32; 3] = [0.08, 0.09, 0.1];
 struct Material<'a> {
     options: &'a ReportOptions,
     dataset: &'a Dataset,
-    geometry: Geometry,
+    scene: Known,
     raster: RasterOptions,
     geometry_hash: String,
-    labelled: Option<LabelledScene>,
     scores: Option<Scores>,
     /// The views shown, with photograph and render.
     shown: Vec<Shown<'a>>,
+}
+
+/// The Gaussians, with their instances where the run has some.
+enum Known {
+    Labelled(Box<LabelledScene>),
+    Geometry(Geometry),
+}
+
+impl Known {
+    fn geometry(&self) -> &Geometry {
+        match self {
+            Self::Labelled(scene) => &scene.geometry,
+            Self::Geometry(geometry) => geometry,
+        }
+    }
 }
 
 struct Shown<'a> {
@@ -123,8 +137,8 @@ pub fn run(dataset: &Dataset, options: &ReportOptions, inputs: &mut BTreeMap<Str
     let mut metrics = Metrics::default();
     let material = Material::read(dataset, options, &mut metrics, inputs)?;
     let records = run_records(&material)?;
-    metrics.gaussians = material.geometry.gaussians.len();
-    metrics.instances = material.labelled.as_ref().map(|l| l.instances.len());
+    metrics.gaussians = material.gaussians().len();
+    metrics.instances = material.labelled().map(|l| l.instances.len());
     geometry_figures(&material, &mut metrics)?;
     metrics.seconds = runs::seconds(&records);
     for r in &records {
@@ -155,7 +169,7 @@ pub fn run(dataset: &Dataset, options: &ReportOptions, inputs: &mut BTreeMap<Str
         dataset.views.iter().filter(|v| v.split == Split::Test).count(),
         dataset.views.first().map_or(0, |v| v.camera.width),
         dataset.views.first().map_or(0, |v| v.camera.height),
-        grouped(&material.geometry.gaussians.len().to_string()),
+        grouped(&material.gaussians().len().to_string()),
     );
     let path = metrics_path(options);
     let json = serde_json::to_vec_pretty(&metrics).map_err(|e| Error::new(e.to_string()).file(&path))?;
@@ -180,21 +194,18 @@ impl<'a> Material<'a> {
         let geometry_hash = hash_file(&geometry)?;
         inputs.insert(role::GEOMETRY.into(), geometry_hash.clone());
         let path = options.run_dir.join("instances.safetensors");
-        let labelled = if path.exists() {
+        let scene = if path.exists() {
             let labelled = LabelledScene::read(&path, &geometry)?;
             labelled.check_dataset(dataset)?;
             inputs.extend(labelled.inputs.clone());
-            Some(labelled)
+            Known::Labelled(Box::new(labelled))
         } else {
             metrics.skipped.push("instances: the run has no instances.safetensors (cluster-match makes it)".into());
-            None
+            Known::Geometry(Geometry::read(&geometry)?)
         };
-        let geometry = match &labelled {
-            Some(l) => l.geometry.clone(),
-            None => Geometry::read(&geometry)?,
-        };
+        let geometry = scene.geometry();
         metrics.skipped.extend(geometry.damage());
-        let raster = RasterOptions::of(&geometry);
+        let raster = RasterOptions::of(geometry);
         let scores = optional_json::<Scores>(&options.run_dir.join("score.json"))?;
         match &scores {
             Some(s) => metrics.skipped.extend(s.skipped.iter().cloned()),
@@ -209,7 +220,18 @@ impl<'a> Material<'a> {
             let psnr = psnr(&photo, &render);
             shown.push(Shown { view, photo, render, psnr });
         }
-        Ok(Self { options, dataset, geometry, raster, geometry_hash, labelled, scores, shown })
+        Ok(Self { options, dataset, scene, raster, geometry_hash, scores, shown })
+    }
+
+    fn gaussians(&self) -> &Gaussians {
+        &self.scene.geometry().gaussians
+    }
+
+    fn labelled(&self) -> Option<&LabelledScene> {
+        match &self.scene {
+            Known::Labelled(scene) => Some(scene),
+            Known::Geometry(_) => None,
+        }
     }
 
     fn file(&self, name: &str) -> PathBuf {
@@ -328,9 +350,7 @@ fn id_maps(m: &Material, page: &mut Page, metrics: &mut Metrics) -> Result<()> {
         metrics.skipped.push("id maps: no folder of masks was given".into());
         return Ok(());
     };
-    if let Some(a) =
-        m.labelled.as_ref().map(|l| &l.artifact).filter(|a| a.provenance().inputs.contains_key(role::MASKS))
-    {
+    if let Some(a) = m.labelled().map(|l| &l.artifact).filter(|a| a.provenance().inputs.contains_key(role::MASKS)) {
         a.expect_input(role::MASKS, &hash_folder(folder, "_s.npy")?)?;
     }
     let mut figures = Vec::new();
@@ -379,7 +399,7 @@ fn features(m: &Material, page: &mut Page, metrics: &mut Metrics) -> Result<()> 
     }
     let (features, artifact) = Features::read(&path)?;
     artifact.expect_input(role::GEOMETRY, &m.geometry_hash)?;
-    if features.kept.last().is_some_and(|&i| i as usize >= m.geometry.gaussians.len()) {
+    if features.kept.last().is_some_and(|&i| i as usize >= m.gaussians().len()) {
         return Err(Error::new("index out of range").file(&path).field("kept").hint("run feat-train again"));
     }
     if features.dim == 0 || features.kept.is_empty() {
@@ -389,7 +409,7 @@ fn features(m: &Material, page: &mut Page, metrics: &mut Metrics) -> Result<()> 
     let step = features.kept.len().div_ceil(PCA_ROWS);
     let rows: Vec<f32> = features.values.chunks_exact(features.dim).step_by(step).flatten().copied().collect();
     let p = pca(&rows, features.dim, 3);
-    let mut colors = vec![None; m.geometry.gaussians.len()];
+    let mut colors = vec![None; m.gaussians().len()];
     for (&i, c) in features.kept.iter().zip(p.colors(&features.values)) {
         colors[i as usize] = Some(c);
     }
@@ -414,14 +434,14 @@ fn render_colors(m: &Material, colors: &[Option<[f32; 3]>], view: &View) -> Pict
     let height = (f64::from(view.camera.height) * f64::from(width) / f64::from(view.camera.width)).round() as u32;
     let camera = view.camera.resized(width, height.max(1));
     let channels: Vec<f32> = colors.iter().flat_map(|c| c.map_or([0.0; 4], |[r, g, b]| [r, g, b, 1.0])).collect();
-    let out = gs_raster::render_features(&m.geometry.gaussians, &channels, 4, &camera, &m.raster);
+    let out = gs_raster::render_features(m.gaussians(), &channels, 4, &camera, &m.raster);
     let over = |p: &[f32]| [0, 1, 2].map(|k| p[k] + (1.0 - p[3]).max(0.0) * BACKDROP[k]);
     let rgb: Vec<f32> = out.chunks_exact(4).flat_map(over).collect();
     Picture::new(camera.width as usize, camera.height as usize, &rgb)
 }
 
 fn instances(m: &Material, page: &mut Page, metrics: &mut Metrics) -> Result<()> {
-    let Some(labelled) = &m.labelled else { return Ok(()) };
+    let Some(labelled) = m.labelled() else { return Ok(()) };
     let inst = &labelled.instances;
     page.section("instances", "Instances");
     if inst.is_empty() {
@@ -451,7 +471,7 @@ fn queries(m: &Material, page: &mut Page, metrics: &mut Metrics) -> Result<()> {
     let folder = m.file("query");
     let results = optional_json::<QueryResults>(&folder.join("query.json"))?;
     let Some(results) = results.filter(|r| !r.queries.is_empty()) else {
-        let without_language = m.labelled.as_ref().is_some_and(|l| l.instances.dim == 0);
+        let without_language = m.labelled().is_some_and(|l| l.instances.dim == 0);
         metrics.skipped.push(if without_language {
             "text queries: the instances have no language features, because the masks were not encoded with a CLIP \
              model (mask-embed --clip)"

@@ -56,6 +56,11 @@ impl Error {
         self
     }
 
+    /// The file at fault, if one is named.
+    pub fn at_fault(&self) -> Option<&Path> {
+        self.0.file.as_deref()
+    }
+
     /// What was found there.
     #[must_use]
     pub fn found(mut self, found: impl fmt::Display) -> Self {

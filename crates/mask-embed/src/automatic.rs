@@ -5,6 +5,7 @@
 //! (level large) has been found there yet and the small mask has not been asked often. The rounds are fixed by the grid,
 //! so that the result does not depend on the number of threads.
 
+use crate::logits::Logits;
 use crate::nms::{MaskNms, Pixels, box_nms, mask_nms, merges_things, nesting_levels};
 use crate::sam::{Candidates, Embedded, Sam};
 use artifacts::LEVELS;
@@ -49,8 +50,8 @@ pub struct Proposal {
     pub score: f32,
     /// Its pixels in the decoder's resolution, [`Grid::width`] x [`Grid::height`].
     pub pixels: Pixels,
-    /// Logits of the same pixels.
-    pub logits: Vec<f32>,
+    /// How sure it is of them.
+    pub logits: Logits,
 }
 
 /// The part of the decoder's square that shows the photograph.
@@ -152,16 +153,17 @@ fn consider(answer: &Candidates, grid: &Grid, choice: &Choice) -> Vec<Proposal> 
             continue;
         }
         let square = answer.mask(m);
-        let rows = (0..grid.height).flat_map(|y| &square[y * Sam::MASK_SIDE..y * Sam::MASK_SIDE + grid.width]);
-        let logits: Vec<f32> = rows.copied().collect();
-        let above = |t: f32| logits.iter().filter(|&&l| l > t).count();
+        let row = |y: usize| &square[y * Sam::MASK_SIDE..y * Sam::MASK_SIDE + grid.width];
+        let above = |t: f32| (0..grid.height).map(|y| row(y).iter().filter(|&&l| l > t).count()).sum::<usize>();
         let stability = above(STABILITY_OFFSET) as f32 / above(-STABILITY_OFFSET).max(1) as f32;
-        let pixels = Pixels::new(grid.width, logits.iter().map(|&l| l > 0.0));
+        let inside: Vec<bool> = (0..grid.height).flat_map(|y| row(y).iter().map(|&l| l > 0.0)).collect();
+        let pixels = Pixels::new(grid.width, inside.into_iter());
         let most = (choice.max_area * grid.extent[0] * grid.extent[1]) as usize;
         if stability < choice.stability || pixels.area == 0 || pixels.area > most {
             continue;
         }
         let level = if count == 1 { 0 } else { (m + 1).min(LEVELS - 1) };
+        let logits = Logits::new(row, grid, pixels.bounds);
         good.push(Proposal { level, quality, score: quality * stability, pixels, logits });
     }
     good
@@ -293,7 +295,7 @@ mod tests {
             quality: 0.9,
             score: 0.85,
             pixels: Pixels::new(20, (0..200).map(|i| (x0..x1).contains(&(i % 20)))),
-            logits: Vec::new(),
+            logits: Logits::new(|_| &[], &Grid { width: 0, height: 0, extent: [0.0; 2] }, [0; 4]),
         };
         // A thing of two parts, and a thing alone.
         let single = [rect(0, 10, 0), rect(0, 6, 0), rect(6, 10, 0), rect(12, 20, 0)];

@@ -1,11 +1,12 @@
 //! `mask-embed embed`: CLIP features of the masks of existing id maps; `mask-embed crops`: the pictures that CLIP sees.
 
 use crate::args::{CropsArgs, EmbedArgs};
-use crate::{finished, photographs};
+use crate::{finished, memory, photographs};
 use artifacts::{Level, MaskFeatures, MaskMaps, features_path, hash_folder, maps_path, role};
-use gs_io::{ArtifactWriter, Error, Lock, Result, Watched, create_dir, hash_file};
+use gs_io::{ArtifactWriter, Error, Lock, Result, Watched, create_dir, hash_bytes, hash_file};
 use gs_scene::dataset::View;
-use onnx_models::{ClipImage, LabelMap, RgbImage, crop_mask, mask_bounds};
+use onnx_models::{Bounds, ClipImage, LabelMap, RgbImage, crop_mask, mask_bounds};
+use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 use serde_json::json;
 use stage::Stage;
@@ -14,6 +15,9 @@ use std::path::Path;
 
 /// Format name of the file of crops.
 pub const CROPS_FORMAT: &str = "crops";
+
+/// Masks whose pictures are made and encoded at a time: a whole number of the encoder's batches.
+const AT_A_TIME: usize = 4 * ClipImage::BATCH;
 
 /// Facts of a view's features.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -26,24 +30,35 @@ struct Facts {
     pictures: usize,
 }
 
-/// Crops of the masks that own pixels: `(id, crop)`, ids ascending. An id that occurs at several levels is taken from
-/// the first.
-pub fn crops(image: &RgbImage, maps: &MaskMaps, size: usize) -> Vec<(usize, Vec<u8>)> {
+/// A mask that owns pixels: its id, the first level that it occurs at, and its box there.
+type Owner = (usize, Level, Bounds);
+
+fn label_map(maps: &MaskMaps, level: Level) -> LabelMap<'_> {
+    LabelMap { width: maps.width, height: maps.height, ids: maps.level(level) }
+}
+
+/// Masks that own pixels, ids ascending.
+fn owners(maps: &MaskMaps) -> Vec<Owner> {
     let count = maps.id_count();
-    let mut found: Vec<Option<(Level, onnx_models::Bounds)>> = vec![None; count];
-    let label_map = |level: Level| LabelMap { width: maps.width, height: maps.height, ids: maps.level(level) };
+    let mut found: Vec<Option<(Level, Bounds)>> = vec![None; count];
     for level in Level::ALL {
-        for (slot, bounds) in found.iter_mut().zip(mask_bounds(&label_map(level), count)) {
+        for (slot, bounds) in found.iter_mut().zip(mask_bounds(&label_map(maps, level), count)) {
             *slot = slot.or(bounds.map(|b| (level, b)));
         }
     }
-    let owners: Vec<(usize, Level, onnx_models::Bounds)> =
-        found.into_iter().enumerate().filter_map(|(id, f)| f.map(|(l, b)| (id, l, b))).collect();
-    use rayon::prelude::*;
-    owners
-        .into_par_iter()
-        .map(|(id, level, bounds)| (id, crop_mask(image, &label_map(level), id as i32, bounds, size)))
-        .collect()
+    found.into_iter().enumerate().filter_map(|(id, f)| f.map(|(l, b)| (id, l, b))).collect()
+}
+
+/// Crops of these masks of a view, in their order: `(id, crop)`.
+fn cut(image: &RgbImage, maps: &MaskMaps, owners: &[Owner], size: usize) -> Vec<(usize, Vec<u8>)> {
+    let crop = |&(id, level, bounds): &Owner| (id, crop_mask(image, &label_map(maps, level), id as i32, bounds, size));
+    owners.par_iter().map(crop).collect()
+}
+
+/// Crops of the masks that own pixels: `(id, crop)`, ids ascending. An id that occurs at several levels is taken from
+/// the first.
+pub fn crops(image: &RgbImage, maps: &MaskMaps, size: usize) -> Vec<(usize, Vec<u8>)> {
+    cut(image, maps, &owners(maps), size)
 }
 
 /// Reads the id maps of a view; `None` with a warning when there are none.
@@ -85,7 +100,7 @@ pub fn run(args: &EmbedArgs, stage: &Stage) -> Result<()> {
 
     let mut views = BTreeMap::new();
     let mut progress = stage.progress("views", scene.views.len() as u64);
-    let (mut kept, mut masks, mut pictures) = (0, 0, 0);
+    let (mut kept, mut masks, mut pictures, mut foretold) = (0, 0, 0, false);
     for view in &scene.views {
         if stage.interrupted() {
             return Err(Error::new(
@@ -101,6 +116,9 @@ pub fn run(args: &EmbedArgs, stage: &Stage) -> Result<()> {
             kept += 1;
             note
         } else {
+            if !std::mem::replace(&mut foretold, true) {
+                foretell(&clip, &scene.views, stage)?;
+            }
             let (features, pictures) = embed(&clip, &image, &maps)?;
             let shown = features.values.chunks(features.dim).filter(|r| r.iter().any(|&v| v != 0.0)).count();
             let facts = Facts { masks: features.count, features: shown, pictures };
@@ -137,28 +155,43 @@ pub fn run(args: &EmbedArgs, stage: &Stage) -> Result<()> {
 }
 
 /// Features of all masks, and how many different pictures they come from. Levels often hold the very same mask, which is
-/// then encoded once.
+/// then encoded once. Pictures are made and encoded [`AT_A_TIME`], so that memory does not grow with the masks.
 fn embed(clip: &ClipImage, image: &RgbImage, maps: &MaskMaps) -> Result<(MaskFeatures, usize)> {
-    let dim = clip.dimension();
-    let mut values = vec![0f32; maps.id_count() * dim];
-    let all = crops(image, maps, clip.size());
-    let mut first: HashMap<&[u8], usize> = HashMap::new();
-    let mut pictures: Vec<u8> = Vec::new();
-    let picture_of: Vec<usize> = all
-        .iter()
-        .map(|(_, crop)| {
+    let (dim, side) = (clip.dimension(), 3 * clip.size() * clip.size());
+    let mut first: HashMap<String, usize> = HashMap::new();
+    let mut picture_of: Vec<(usize, usize)> = Vec::new();
+    let (mut waiting, mut encoded): (Vec<u8>, Vec<f32>) = (Vec::new(), Vec::new());
+    for owners in owners(maps).chunks(AT_A_TIME) {
+        for (id, crop) in cut(image, maps, owners, clip.size()) {
             let next = first.len();
-            *first.entry(crop).or_insert_with(|| {
-                pictures.extend_from_slice(crop);
-                next
-            })
-        })
-        .collect();
-    let encoded = clip.encode(&pictures)?;
-    for ((id, _), picture) in all.iter().zip(picture_of) {
+            picture_of.push((
+                id,
+                *first.entry(hash_bytes(&crop)).or_insert_with(|| {
+                    waiting.extend_from_slice(&crop);
+                    next
+                }),
+            ));
+        }
+        // Whole pieces only: the batches are those that all pictures at once would be encoded in.
+        let ready = waiting.len() / (AT_A_TIME * side) * (AT_A_TIME * side);
+        encoded.extend(clip.encode(&waiting[..ready])?);
+        waiting.drain(..ready);
+    }
+    encoded.extend(clip.encode(&waiting)?);
+    let mut values = vec![0f32; maps.id_count() * dim];
+    for (id, picture) in picture_of {
         values[id * dim..(id + 1) * dim].copy_from_slice(&encoded[picture * dim..(picture + 1) * dim]);
     }
     Ok((MaskFeatures { count: maps.id_count(), dim, values }, first.len()))
+}
+
+/// Says how much memory the photographs will take, and refuses more than there may be.
+fn foretell(clip: &ClipImage, views: &[View], stage: &Stage) -> Result<()> {
+    let size = clip.size();
+    clip.encode(&vec![0; ClipImage::BATCH * rayon::current_num_threads() * 3 * size * size])?;
+    let pixels = memory::largest(views);
+    let needed = memory::of_features(memory::so_far(), AT_A_TIME as u64, size as u64, pixels);
+    stage.forecast(needed, "give fewer --threads, or smaller photographs (--resolution)")
 }
 
 /// Writes the crops of all masks of a scene into one file.

@@ -3,6 +3,7 @@
 use crate::args::ImportArgs;
 use crate::finished;
 use crate::masks::count_masks;
+use crate::memory;
 use artifacts::{LEVELS, Level, MaskMaps, hash_folder, maps_path};
 use gs_io::{Error, IoContext, Result, create_dir, hash_files};
 use image::DynamicImage;
@@ -112,6 +113,11 @@ fn load(paths: &[PathBuf]) -> Result<MaskMaps> {
 /// When a picture cannot be read or is not grey, the levels of a view differ in size, or the output cannot be written.
 pub fn run(args: &ImportArgs, stage: &Stage) -> Result<()> {
     let found = find(&args.labels)?;
+    // A file whose size cannot be told is refused below.
+    let sizes = found.values().flatten().filter_map(|p| image::image_dimensions(p).ok());
+    let pixels = sizes.map(|(w, h)| u64::from(w) * u64::from(h)).max().unwrap_or(0);
+    let levels = found.values().map(Vec::len).max().unwrap_or(0) as u64;
+    stage.forecast(memory::of_import(memory::so_far(), pixels, levels), "give smaller pictures")?;
     let mut views = BTreeMap::new();
     for (view, paths) in &found {
         let maps = load(paths)?;

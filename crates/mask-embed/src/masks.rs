@@ -1,10 +1,10 @@
 //! `mask-embed masks`: id maps from photographs with SAM.
 
 use crate::args::MasksArgs;
-use crate::automatic::{levels, propose};
+use crate::automatic::{Choice, levels, propose};
 use crate::paint::{paint, preview};
 use crate::sam::Sam;
-use crate::{finished, photographs};
+use crate::{finished, memory, photographs};
 use artifacts::{LEVELS, Level, MaskMaps, maps_path, role};
 use gs_io::{Error, Lock, Result, Watched, create_dir};
 use gs_scene::Image;
@@ -55,7 +55,7 @@ pub fn run(args: &MasksArgs, stage: &Stage) -> Result<()> {
 
     let mut views = BTreeMap::new();
     let mut progress = stage.progress("views", scene.views.len() as u64);
-    let (mut kept, mut asked, mut points) = (0, 0, 0);
+    let (mut kept, mut asked, mut points, mut foretold) = (0, 0, 0, false);
     for view in &scene.views {
         if stage.interrupted() {
             return Err(Error::new(
@@ -69,6 +69,9 @@ pub fn run(args: &MasksArgs, stage: &Stage) -> Result<()> {
             kept += 1;
             note
         } else {
+            if !std::mem::replace(&mut foretold, true) {
+                foretell(args, &sam, &scene.views, stage)?;
+            }
             let embedded = sam.encode(&image)?;
             let proposals = propose(&sam, &embedded, &choice)?;
             let chosen = levels(&proposals.masks, &choice);
@@ -110,6 +113,19 @@ pub fn run(args: &MasksArgs, stage: &Stage) -> Result<()> {
     finished::write_json(&manifest, &provenance)?;
     let masks: usize = views.values().filter_map(|v| v["facts"]["masks"][3].as_u64()).sum::<u64>() as usize;
     stage.record(&manifest, parameters, inputs, json!({ "views": views.len(), "masks_large": masks }))
+}
+
+/// Says how much memory the photographs will take, and refuses more than there may be.
+fn foretell(args: &MasksArgs, sam: &Sam, views: &[View], stage: &Stage) -> Result<()> {
+    let nothing = RgbImage { width: 4, height: 3, pixels: vec![0; 36] };
+    // The encoder a second time, on top of what the decoder leaves with each thread.
+    propose(sam, &sam.encode(&nothing)?, &Choice { points_per_side: 4, ..args.choice.choice() })?;
+    sam.encode(&nothing)?;
+    let side = args.choice.choice().points_per_side as u64;
+    let pixels = memory::largest(views);
+    let map = if args.map_size == 0 { pixels } else { pixels.min((args.map_size * args.map_size * 3 / 4) as u64) };
+    let needed = memory::of_masks(memory::so_far(), side * side * 3 / 4, pixels, map);
+    stage.forecast(needed, "give fewer --threads, or smaller photographs (--resolution) and maps (--map-size)")
 }
 
 /// Size of the map: longest side `longest`, but not larger than the photograph; 0 for its own size.

@@ -1,6 +1,6 @@
 //! From chosen masks to an id map, and id maps as pictures.
 
-use crate::automatic::{Grid, Proposals};
+use crate::automatic::Proposals;
 use crate::regions::clean;
 use artifacts::{LEVELS, MaskMaps, instance_color};
 use onnx_models::RgbImage;
@@ -25,7 +25,7 @@ pub fn paint(
     for (level, indices) in chosen.iter().enumerate() {
         let mut masks: Vec<(usize, usize, Vec<bool>)> = Vec::new();
         for &i in indices {
-            let mut mask = enlarge(&proposals.masks[i].logits, &proposals.grid, width, height);
+            let mut mask = proposals.masks[i].logits.enlarge(&proposals.grid, width, height);
             clean(&mut mask, width, min_area);
             let area = mask.iter().filter(|&&m| m).count();
             masks.push((area, i, mask));
@@ -57,32 +57,6 @@ pub fn paint(
         first += masks.len() as i32;
     }
     MaskMaps { width, height, ids }
-}
-
-/// The mask at another resolution: pixels where the interpolated logits are positive.
-fn enlarge(logits: &[f32], grid: &Grid, width: usize, height: usize) -> Vec<bool> {
-    // Two neighbours and the weight of the second, for each pixel of the result.
-    let taps = |n: usize, extent: f64, last: usize| -> Vec<(usize, usize, f32)> {
-        (0..n)
-            .map(|i| {
-                let at = ((i as f64 + 0.5) / n as f64 * extent - 0.5).clamp(0.0, (last - 1) as f64);
-                let low = at.floor() as usize;
-                (low, (low + 1).min(last - 1), (at - low as f64) as f32)
-            })
-            .collect()
-    };
-    let columns = taps(width, grid.extent[0], grid.width);
-    let rows = taps(height, grid.extent[1], grid.height);
-    let mut mask = Vec::with_capacity(width * height);
-    for &(y0, y1, fy) in &rows {
-        let (top, bottom) = (&logits[y0 * grid.width..][..grid.width], &logits[y1 * grid.width..][..grid.width]);
-        mask.extend(columns.iter().map(|&(x0, x1, fx)| {
-            let a = top[x0] + (top[x1] - top[x0]) * fx;
-            let b = bottom[x0] + (bottom[x1] - bottom[x0]) * fx;
-            a + (b - a) * fy > 0.0
-        }));
-    }
-    mask
 }
 
 /// Id maps as a picture: the four levels in two rows, each mask in a colour of its own over the photograph, outlined.
@@ -121,22 +95,20 @@ fn color(id: i32) -> [u8; 3] {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::automatic::Proposal;
+    use crate::automatic::{Grid, Proposal};
+    use crate::logits::Logits;
     use crate::nms::Pixels;
 
     /// Proposals on a 20 x 10 grid, each a rectangle x0..x1, y0..y1.
     fn proposals(rects: &[[usize; 4]]) -> Proposals {
+        let grid = Grid { width: 20, height: 10, extent: [20.0, 10.0] };
         let mask = |r: &[usize; 4]| {
             let inside = |i: usize| (r[0]..r[2]).contains(&(i % 20)) && (r[1]..r[3]).contains(&(i / 20));
-            Proposal {
-                level: 1,
-                quality: 1.0,
-                score: 1.0,
-                pixels: Pixels::new(20, (0..200).map(inside)),
-                logits: (0..200).map(|i| if inside(i) { 5.0 } else { -5.0 }).collect(),
-            }
+            let pixels = Pixels::new(20, (0..200).map(inside));
+            let logits: Vec<f32> = (0..200).map(|i| if inside(i) { 5.0 } else { -5.0 }).collect();
+            let logits = Logits::new(|y| &logits[20 * y..20 * (y + 1)], &grid, pixels.bounds);
+            Proposal { level: 1, quality: 1.0, score: 1.0, pixels, logits }
         };
-        let grid = Grid { width: 20, height: 10, extent: [20.0, 10.0] };
         Proposals { grid, masks: rects.iter().map(mask).collect(), asked: 0, points: 0 }
     }
 

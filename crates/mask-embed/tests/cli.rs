@@ -55,6 +55,28 @@ fn ok(args: &[&str]) -> String {
     text
 }
 
+#[test]
+fn more_memory_than_there_may_be_is_refused_before_the_first_view() {
+    let dir = tempfile::tempdir().unwrap();
+    let (scene, masks) = (dir.path().join("scene"), dir.path().join("masks"));
+    std::fs::create_dir(&scene).unwrap();
+    write_scene(&scene, 1);
+    let (sam, clip) = (fake_sam(), fake_clip());
+    let make = ["masks", "--scene", path(&scene), "--sam", path(&sam), "--out", path(&masks)];
+    let limit = ["--memory-limit", "2M"];
+    let e = error(&[&make[..], &limit[..]].concat());
+    assert!(e.contains("--memory-limit: more memory than there may be") && e.contains("--threads"), "{e}");
+    assert!(!masks.join("masks.json").exists() && !maps_path(&masks, "v0").exists());
+    ok(&make);
+    let embed = ["embed", "--scene", path(&scene), "--masks", path(&masks), "--clip", path(&clip)];
+    let e = error(&[&embed[..], &limit[..]].concat());
+    assert!(e.contains("--memory-limit"), "{e}");
+    assert!(!features_path(&masks, "v0").exists());
+    ok(&embed);
+    // What stands already needs no model to run.
+    ok(&[&embed[..], &limit[..]].concat());
+}
+
 /// The one line of an error, with exit code 2.
 fn error(args: &[&str]) -> String {
     let out = run(args);

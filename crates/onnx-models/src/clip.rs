@@ -194,6 +194,9 @@ pub struct ClipImage {
 }
 
 impl ClipImage {
+    /// Pictures that are encoded in one run of the model, where the graph does not fix another number.
+    pub const BATCH: usize = BATCH;
+
     /// Opens `image.onnx` and `clip.json` of a folder, or a file and the `clip.json` beside it. The model runs once, on
     /// black, which checks it and tells its dimension.
     ///

@@ -5,6 +5,9 @@ use clap_complete::Shell;
 use gs_io::{Error, IoContext, Result, create_dir};
 use std::path::Path;
 
+/// What the help says of it.
+pub(crate) const HELP: &str = "Manual pages and completions: --generate man|bash|zsh|fish|elvish|powershell FOLDER";
+
 /// Writes what `PROGRAM --generate KIND DIR` asks for: `man`, or a shell whose completions are wanted.
 ///
 /// # Errors

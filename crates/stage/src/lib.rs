@@ -21,6 +21,7 @@ pub use progress::Progress;
 pub use record::{RunRecord, cpu_seconds, peak_rss_bytes};
 
 use gs_io::{Error, Result};
+use std::path::Path;
 use std::process::ExitCode;
 
 /// The git revision that the programs were built from: the commit that was checked out, or `CAGS_REVISION` of the build's
@@ -79,7 +80,7 @@ pub fn main<P: Program>() -> ExitCode {
             }
         };
     }
-    let mut matches = P::command().version(VERSION).get_matches();
+    let mut matches = P::command().version(VERSION).after_help(generate::HELP).get_matches();
     let program = P::from_arg_matches_mut(&mut matches).unwrap_or_else(|e| e.exit());
     let stage = Stage::new(P::NAME, program.common());
     let threads = program.common().threads;
@@ -100,8 +101,34 @@ pub fn main<P: Program>() -> ExitCode {
             ExitCode::from(130)
         }
         Err(e) => {
-            stage.error(&e);
+            // As it was typed: the option, then its value.
+            stage.error(&match e.at_fault().and_then(|file| given_by(&arguments, file)) {
+                Some(option) => Error::new(format!("{option} {e}")),
+                None => e,
+            });
             ExitCode::from(2)
         }
+    }
+}
+
+/// The option whose value this very path is: whoever reads an error about it knows then which one to mend.
+fn given_by<'a>(arguments: &'a [String], path: &Path) -> Option<&'a str> {
+    let options = arguments.iter().zip(arguments.iter().skip(1).map(Some).chain([None]));
+    options.filter(|(option, _)| option.starts_with("--")).find_map(|(option, next)| match option.split_once('=') {
+        Some((option, value)) => (Path::new(value) == path).then_some(option),
+        None => next.filter(|value| Path::new(value) == path).map(|_| option.as_str()),
+    })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_path_is_known_by_its_option() {
+        let arguments = ["train", "--quiet", "--scene", "a/b/", "--out=c", "--threads"].map(String::from);
+        let of = |path: &str| given_by(&arguments, Path::new(path));
+        assert_eq!((of("a/b"), of("c")), (Some("--scene"), Some("--out")));
+        assert_eq!((of("a/b/images"), of("train"), of("")), (None, None, None));
     }
 }

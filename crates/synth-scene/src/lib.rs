@@ -19,6 +19,7 @@ pub mod layout;
 pub mod light;
 pub mod masks;
 pub mod material;
+pub mod memory;
 pub mod model;
 pub mod points;
 pub mod polygon;

@@ -74,20 +74,9 @@ impl LightMap {
             Lamp { centre: DVec3::new(x * scene.room.x, y * scene.room.y, 2.65), half: [half, half], radiance }
         };
         let lamps = [lamp(0.42, -0.34, 0.30, [14.5, 13.4, 11.8]), lamp(-0.50, 0.45, 0.45, [3.4, 3.6, 4.0])];
-        let mut map = Self { lamps, first: Vec::new(), grids: Vec::new(), texels: Vec::new() };
-        let mut count = 0;
-        for (primitive, p) in scene.primitives.iter().enumerate() {
-            map.first.push(map.grids.len());
-            let size = texel_size(scene, p.thing) * coarseness;
-            for face in 0..p.shape.faces() {
-                let (du, dv) = p.shape.face_size(face);
-                let wraps = p.shape.wraps();
-                let nu = ((du / size).ceil() as usize).clamp(if wraps { 8 } else { 2 }, MOST);
-                let nv = ((dv / size).ceil() as usize).clamp(2, MOST);
-                map.grids.push(Grid { primitive, face, nu, nv, start: count, wraps });
-                count += nu * nv;
-            }
-        }
+        let (first, grids) = lay_out(scene, coarseness);
+        let count = grids.last().map_or(0, |g| g.start + g.nu * g.nv);
+        let mut map = Self { lamps, first, grids, texels: Vec::new() };
         map.texels = map.for_each_texel(count, |grid, k, index| map.direct(scene, grid, k, index));
         map.tidy(&vec![true; count]);
         let indirect = map.for_each_texel(count, |grid, k, index| map.indirect(scene, grid, k, index));
@@ -100,6 +89,12 @@ impl LightMap {
         let open: Vec<bool> = inside.iter().map(|i| !i).collect();
         map.tidy(&open);
         map
+    }
+
+    /// How many texels [`Self::bake`] computes.
+    pub fn size(scene: &Scene, coarseness: f64) -> usize {
+        let (_, grids) = lay_out(scene, coarseness);
+        grids.last().map_or(0, |g| g.start + g.nu * g.nv)
     }
 
     /// The light at `local`, a point on the surface of a primitive, interpolated.
@@ -280,6 +275,24 @@ impl Grid {
         let normal = p.rotation * normal;
         (p.to_world(point) + normal * LIFT, normal)
     }
+}
+
+/// The first grid of each primitive, and the grids of all faces.
+fn lay_out(scene: &Scene, coarseness: f64) -> (Vec<usize>, Vec<Grid>) {
+    let (mut first, mut grids, mut count) = (Vec::new(), Vec::new(), 0);
+    for (primitive, p) in scene.primitives.iter().enumerate() {
+        first.push(grids.len());
+        let size = texel_size(scene, p.thing) * coarseness;
+        for face in 0..p.shape.faces() {
+            let (du, dv) = p.shape.face_size(face);
+            let wraps = p.shape.wraps();
+            let nu = ((du / size).ceil() as usize).clamp(if wraps { 8 } else { 2 }, MOST);
+            let nv = ((dv / size).ceil() as usize).clamp(2, MOST);
+            grids.push(Grid { primitive, face, nu, nv, start: count, wraps });
+            count += nu * nv;
+        }
+    }
+    (first, grids)
 }
 
 /// Side of a texel in metres.

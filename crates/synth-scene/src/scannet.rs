@@ -5,7 +5,9 @@ use crate::scene::Scene;
 use artifacts::{NYU40, TruePoints};
 use gs_io::{Error, Result, create_dir, write_bytes};
 use gs_scene::{PointCloud, ply};
+use serde::Serialize;
 use serde_json::{Value, json};
+use std::collections::BTreeMap;
 use std::path::Path;
 
 /// Name of the scan where the scene has none.
@@ -65,7 +67,8 @@ pub fn write(folder: &Path, name: &str, scene: &Scene, points: &TruePoints, colo
     }
     write_bytes(file("_vh_clean_2.labels.ply"), &labelled)?;
     let segs = "_vh_clean_2.0.010000.segs.json";
-    write_json(&file(segs), &json!({ "params": {}, "sceneId": name, "segIndices": points.part }))?;
+    let segments = Segments { params: BTreeMap::new(), scene_id: name, seg_indices: &points.part };
+    write_json(&file(segs), &segments)?;
     let groups: Vec<Value> = scene
         .things
         .iter()
@@ -79,7 +82,16 @@ pub fn write(folder: &Path, name: &str, scene: &Scene, points: &TruePoints, colo
     write_json(&file(".aggregation.json"), &json)
 }
 
-fn write_json(path: &Path, value: &Value) -> Result<()> {
+/// The segment of each vertex. A [`Value`] would take many times the memory.
+#[derive(Serialize)]
+#[serde(rename_all = "camelCase")]
+struct Segments<'a> {
+    params: BTreeMap<String, Value>,
+    scene_id: &'a str,
+    seg_indices: &'a [i32],
+}
+
+fn write_json(path: &Path, value: &impl Serialize) -> Result<()> {
     let json = serde_json::to_vec(value).map_err(|e| Error::new(e.to_string()).file(path))?;
     write_bytes(path, &json)
 }

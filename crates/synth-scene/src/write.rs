@@ -7,7 +7,8 @@ use crate::label;
 use crate::language::{Language, Speech};
 use crate::light::LightMap;
 use crate::masks::{self, Faults};
-use crate::points::Collector;
+use crate::memory::{self, Amounts};
+use crate::points::{self, Collector};
 use crate::render::{self, Frame};
 use crate::scannet;
 use crate::scene::Scene;
@@ -57,6 +58,8 @@ pub struct Options {
 const POINT_NOISE: f64 = 0.003;
 /// Photographs of at least this many rows show the finest shadows.
 const FINE_HEIGHT: f64 = 360.0;
+/// What takes less memory.
+const FEWER: &str = "make smaller photographs (--width, --height) or fewer of them";
 /// Folders of a scene, all of which this program owns.
 const FOLDERS: [&str; 5] = ["images", "sparse", "language_features", "label", "truth"];
 /// Folder of the scan, which only furnished rooms have.
@@ -109,7 +112,26 @@ impl Options {
 
     /// The light in that room, as fine as the photographs show.
     pub fn light(&self, scene: &Scene) -> LightMap {
-        LightMap::bake(scene, (FINE_HEIGHT / f64::from(self.height)).clamp(1.0, 3.0))
+        LightMap::bake(scene, self.coarseness())
+    }
+
+    fn coarseness(&self) -> f64 {
+        (FINE_HEIGHT / f64::from(self.height)).clamp(1.0, 3.0)
+    }
+
+    /// What decides about the memory of the whole scene.
+    fn amounts(&self, scene: &Scene, cameras: &[Camera]) -> Amounts {
+        let points = points::expected(scene, cameras);
+        Amounts {
+            pixels: self.width as usize * self.height as usize,
+            texels: LightMap::size(scene, self.coarseness()),
+            points,
+            vertices: match &self.layout {
+                Layout::Colmap if self.family == Family::Room => points,
+                Layout::Scan { .. } => points.min(self.points),
+                _ => 0,
+            },
+        }
     }
 
     fn path(&self, scene: &Scene) -> CameraPath {
@@ -197,7 +219,6 @@ pub fn stem(view: usize) -> String {
 /// When a file cannot be written, when `out` holds another dataset, or when the stage is interrupted.
 pub fn run(stage: &Stage, out: &Path, options: &Options) -> Result<()> {
     let _lock = Lock::take(out)?;
-    prepare(out, &options.layout)?;
     let scene = options.scene();
     let parameters = options.parameters(&scene);
     let cameras = options.cameras(&scene);
@@ -207,6 +228,8 @@ pub fn run(stage: &Stage, out: &Path, options: &Options) -> Result<()> {
         scene.parts.len(),
         scene.primitives.len()
     ));
+    stage.forecast(memory::forecast(&options.amounts(&scene, &cameras)), FEWER)?;
+    prepare(out, &options.layout)?;
     let light = options.light(&scene);
     let language = options.language(&scene);
     let stems = options.layout.stems(cameras.len());
@@ -277,9 +300,11 @@ pub fn run(stage: &Stage, out: &Path, options: &Options) -> Result<()> {
 pub fn run_masks(stage: &Stage, folder: &Path, options: &Options) -> Result<()> {
     let marker = folder.join("masks.json");
     let _lock = Lock::take(folder)?;
-    prepare_masks(folder, &marker)?;
     let scene = options.scene();
     let cameras = options.cameras(&scene);
+    let pixels = options.width as usize * options.height as usize;
+    stage.forecast(memory::forecast(&Amounts { pixels, ..Amounts::default() }), FEWER)?;
+    prepare_masks(folder, &marker)?;
     let language = options.language(&scene);
     let stems = options.layout.stems(cameras.len());
     let mut progress = stage.progress("views", cameras.len() as u64);

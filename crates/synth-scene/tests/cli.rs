@@ -119,6 +119,18 @@ fn bad_options_are_errors_of_one_line() {
 }
 
 #[test]
+fn more_memory_than_there_may_be_is_refused_before_an_earlier_scene_goes() {
+    let dir = tempfile::tempdir().unwrap();
+    make(dir.path(), &["--views", "2"]);
+    let before = contents(dir.path());
+    let o = synth_scene(dir.path(), &["--views", "3", "--memory-limit", "2M"]);
+    let said = String::from_utf8_lossy(&o.stderr);
+    assert_eq!(o.status.code(), Some(2), "{said}");
+    assert!(said.contains("--memory-limit") && said.contains("needed") && said.lines().count() == 1, "{said}");
+    assert_eq!(contents(dir.path()), before);
+}
+
+#[test]
 fn an_output_that_cannot_be_written_is_an_error_of_one_line() {
     let dir = tempfile::tempdir().unwrap();
     let file = dir.path().join("file");

@@ -1,8 +1,9 @@
 //! `eval lerf`, `eval scannet` and `eval table` on the command line.
 
-use super::{LanguageArgs, SceneArgs, load, mask_threshold, read_scene};
+use super::{LanguageArgs, SMALLER, SceneArgs, load, mask_threshold, read_scene};
 use crate::labels;
 use crate::lerf::{self, Answers, LerfMetrics, Rendering};
+use crate::memory::{self, Sizes};
 use crate::protocol::lerf::Averaging;
 use crate::protocol::published::SetRow;
 use crate::protocol::scannet::{self, Association};
@@ -157,7 +158,12 @@ pub(super) fn run_lerf(a: &LerfArgs, stage: &Stage) -> Result<String> {
     let mut rendered = None;
     if a.predictions.is_none() {
         let part = |p: &Option<PathBuf>| p.clone().expect("clap asks for it");
-        let scene = read_scene(&part(&a.instances), &part(&a.geometry), stage)?;
+        let dataset = load(&part(&a.scene), &LoadOptions::default(), stage)?;
+        let files = SceneArgs { instances: part(&a.instances), geometry: part(&a.geometry), scene: part(&a.scene) };
+        let labels = frames.iter().flat_map(|f| f.categories.values()).map(|m| m.bits.len() as u64).sum();
+        let sizes = Sizes { labels, ..files.sizes(&a.language, &dataset.views) };
+        stage.forecast(memory::of_scores(&sizes), SMALLER)?;
+        let scene = read_scene(&files.instances, &files.geometry, stage)?;
         let source = a.language.source()?;
         source.check_dim(scene.instances.dim, scene.path())?;
         features.insert("text features".into(), format!("{} ({:.12})", source.describe(), source.hash()?));
@@ -165,7 +171,6 @@ pub(super) fn run_lerf(a: &LerfArgs, stage: &Stage) -> Result<String> {
         if let Some(masks) = scene.artifact.provenance().inputs.get(artifacts::role::MASK_FEATURES) {
             features.insert("mask features".into(), format!("{masks:.12}"));
         }
-        let dataset = load(&part(&a.scene), &LoadOptions::default(), stage)?;
         scene.check_dataset(&dataset)?;
         if scene.instances.label.iter().all(|&l| l < 0) {
             notes.push("all Gaussians are noise: every query selects nothing".into());
@@ -276,8 +281,11 @@ pub(super) fn run_scannet(a: &ScannetArgs, stage: &Stage) -> Result<String> {
         undescribed: a.undescribed,
         min_support: a.language.min_support.unwrap_or(2),
     };
-    let scene = read_scene(&a.scene.instances, &a.scene.geometry, stage)?;
     let files = ScanFiles::find(&a.scene.scene)?;
+    let parts = files.instances.iter().flat_map(|(segments, objects)| [segments, objects]).chain([&files.labels]);
+    let truth = parts.map(|p| memory::bytes(p)).sum();
+    stage.forecast(memory::of_scan(&Sizes { truth, ..a.scene.sizes(&a.language, &[]) }), SMALLER)?;
+    let scene = read_scene(&a.scene.instances, &a.scene.geometry, stage)?;
     let mut features = BTreeMap::from([("instances".to_string(), format!("{:.12}", scene.artifact.hash()))]);
     if let Some(masks) = scene.artifact.provenance().inputs.get(artifacts::role::MASK_FEATURES) {
         features.insert("mask features".into(), format!("{masks:.12}"));

@@ -1,9 +1,10 @@
 //! `eval query` on the command line.
 
-use super::{LanguageArgs, SceneArgs, load, mask_threshold, read_scene};
+use super::{LanguageArgs, SMALLER, SceneArgs, load, mask_threshold, read_scene};
 use crate::ask::Asker;
 use crate::granularity::Granularity;
 use crate::lerf::Rendering;
+use crate::memory;
 use crate::place::{self, Place};
 use crate::query::{self, Asked, Divided, ShowOptions};
 use crate::ranking::{Index, Ranked, Scoring};
@@ -98,6 +99,8 @@ pub(super) fn run(a: &QueryArgs, stage: &Stage, json_lines: bool) -> Result<Stri
     let rendering = Rendering { silhouette: a.silhouette, threshold: mask_threshold(a.alpha, a.silhouette)? };
     let options = ShowOptions { views: a.views.clone(), rendering };
     a.language.selection()?;
+    let dataset = load(&a.scene.scene, &LoadOptions { resolution: a.resolution, ..LoadOptions::default() }, stage)?;
+    stage.forecast(memory::of_query(&a.scene.sizes(&a.language, &dataset.views)), SMALLER)?;
     let scene = read_scene(&a.scene.instances, &a.scene.geometry, stage)?;
     let worded = !a.text.is_empty() || a.interactive;
     let given = a.language.clip.is_some() || a.language.text_features.is_some();
@@ -106,7 +109,6 @@ pub(super) fn run(a: &QueryArgs, stage: &Stage, json_lines: bool) -> Result<Stri
         source.check_dim(scene.instances.dim, scene.path())?;
     }
     let source = source.filter(|s| s.dim() == scene.instances.dim);
-    let dataset = load(&a.scene.scene, &LoadOptions { resolution: a.resolution, ..LoadOptions::default() }, stage)?;
     scene.check_dataset(&dataset)?;
     for view in &a.views {
         find_view(&dataset, view)?;

@@ -251,6 +251,19 @@ fn what_has_no_truth_is_skipped_with_a_reason() {
 }
 
 #[test]
+fn more_memory_than_there_may_be_is_refused_at_the_start() {
+    let f = Fixture::new(2);
+    for (command, rest) in [
+        ("score", "--text-features|{}/text.json|--out|{}/score.json"),
+        ("query", "--text-features|{}/text.json|--text|red ball|--out|{}/out"),
+    ] {
+        let e = f.bad(command, &format!("{rest}|--memory-limit|2M"));
+        assert!(e.contains("--memory-limit: more memory than there may be"), "{e}");
+    }
+    assert!(!f.path().join("out").exists() && !f.path().join("score.json").exists());
+}
+
+#[test]
 fn a_full_report_stands_alone() {
     let f = Fixture::new(2);
     let at = "--text-features|{}/text.json|--text|red ball|--out|{}/run/query";

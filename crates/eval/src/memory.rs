@@ -1,0 +1,110 @@
+//! How much memory a command will take, told before it reads more than sizes. docs/performance.md holds it against
+//! measured peaks.
+
+use gs_scene::dataset::View;
+use std::path::Path;
+
+/// Sizes of what a command reads.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
+pub struct Sizes {
+    /// Bytes of the geometry.
+    pub geometry: u64,
+    /// Bytes that the text encoder, or the table instead of it, takes.
+    pub language: u64,
+    /// Bytes of true points, or of a scan's files.
+    pub truth: u64,
+    /// Pixels of all masks of the labels: a byte each.
+    pub labels: u64,
+    /// Pixels of the largest view.
+    pub pixels: u64,
+    /// Bytes of the features that a report shows.
+    pub features: u64,
+}
+
+/// What the program takes for itself.
+const PROGRAM: u64 = 8_000_000;
+/// What CLIP's tokenizer takes.
+const TOKENIZER: u64 = 16_000_000;
+
+/// Bytes of a file or, for a folder, of the files in it; 0 where it cannot be read, which whoever reads it will say.
+pub fn bytes(path: &Path) -> u64 {
+    let of = |p: &Path| std::fs::metadata(p).map_or(0, |m| if m.is_file() { m.len() } else { 0 });
+    match std::fs::read_dir(path) {
+        Ok(entries) => entries.flatten().map(|e| of(&e.path())).sum(),
+        Err(_) => of(path),
+    }
+}
+
+/// Bytes that text features take: an encoder's weights and its tokenizer, or a table.
+pub fn language(clip: Option<&Path>, table: Option<&Path>) -> u64 {
+    let encoder = |c: &Path| TOKENIZER + bytes(&if c.is_dir() { c.join("text.onnx") } else { c.into() }) * 5 / 4;
+    clip.map_or(0, encoder) + table.map_or(0, |t| 2 * bytes(t))
+}
+
+/// Pixels of the largest view.
+pub fn pixels<'a>(views: impl IntoIterator<Item = &'a View>) -> u64 {
+    views.into_iter().map(|v| u64::from(v.camera.width) * u64::from(v.camera.height)).max().unwrap_or(0)
+}
+
+/// Peak in bytes of `score` and `lerf`.
+pub fn of_scores(s: &Sizes) -> u64 {
+    // The geometry's file and its Gaussians at the same time; then true points, masks and, where there are some, renders.
+    let renders = if s.labels == 0 { 0 } else { 20 * s.pixels };
+    PROGRAM + s.language + 2 * s.geometry + 9 * s.truth / 5 + s.labels + renders
+}
+
+/// Peak in bytes of `query`.
+pub fn of_query(s: &Sizes) -> u64 {
+    PROGRAM + s.language + 23 * s.geometry / 10 + 34 * s.pixels
+}
+
+/// Peak in bytes of `report`.
+pub fn of_report(s: &Sizes) -> u64 {
+    PROGRAM + 5 * s.geometry / 2 + 4 * s.features + 65 * s.pixels
+}
+
+/// Peak in bytes of `scannet`.
+pub fn of_scan(s: &Sizes) -> u64 {
+    PROGRAM + s.language + 2 * s.geometry + 2 * s.truth
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn they_are_within_a_fifth_of_measured_peaks() {
+        let within = |forecast: u64, peak: u64| {
+            let ratio = forecast as f64 / peak as f64;
+            assert!((0.8..1.2).contains(&ratio), "{forecast} for {peak}: {ratio}");
+        };
+        // The demo, a room of the ablation and the desk of photographs at full and half size.
+        let demo = Sizes {
+            geometry: 17_775_177,
+            language: 16_369_873,
+            truth: 3_976_000,
+            labels: 12_787_200,
+            pixels: 172_800,
+            features: 12_579_384,
+        };
+        let room = Sizes {
+            geometry: 2_978_407,
+            language: 700_000,
+            truth: 10_384_000,
+            labels: 3_542_400,
+            pixels: 43_200,
+            features: 2_639_820,
+        };
+        let desk = Sizes { geometry: 21_903_446, pixels: 1_436_800, features: 20_046_004, ..Sizes::default() };
+        let half = Sizes { pixels: 359_200, ..desk };
+        for (sizes, peak) in [(&demo, 90_415_104), (&room, 32_870_400), (&desk, 55_255_040)] {
+            within(of_scores(sizes), peak);
+        }
+        for (sizes, peak) in [(&demo, 61_284_352), (&room, 16_953_344), (&desk, 117_100_544), (&half, 80_478_208)] {
+            within(of_query(sizes), peak);
+        }
+        for (sizes, peak) in [(&demo, 105_656_320), (&room, 30_158_848), (&desk, 246_337_536), (&half, 176_398_336)] {
+            within(of_report(sizes), peak);
+        }
+    }
+}

@@ -1,0 +1,99 @@
+//! How sure a mask is of each pixel, kept where it matters.
+
+use crate::automatic::Grid;
+
+/// Logits of a mask within the box of its pixels and one pixel around. Further out no logit is positive, nor is any
+/// number interpolated between two of them, so that [`Self::enlarge`] needs no more; most masks are much smaller than
+/// the picture, and there are thousands.
+#[derive(Debug, Clone)]
+pub struct Logits {
+    /// First column and row, one past the last column and row.
+    bounds: [usize; 4],
+    values: Vec<f32>,
+}
+
+impl Logits {
+    /// Keeps what is needed of `row(y)`, the logits of each row of the grid. `bounds` is the box of the positive ones: first
+    /// column and row, one past the last column and row.
+    pub fn new<'a>(row: impl Fn(usize) -> &'a [f32], grid: &Grid, bounds: [usize; 4]) -> Self {
+        let [x0, y0, x1, y1] = bounds;
+        let (left, top) = (x0.saturating_sub(1), y0.saturating_sub(1));
+        let (right, bottom) = ((x1 + 1).min(grid.width), (y1 + 1).min(grid.height));
+        let values = (top..bottom).flat_map(|y| &row(y)[left..right]).copied().collect();
+        Self { bounds: [left, top, right, bottom], values }
+    }
+
+    /// The mask at another resolution: pixels where the linearly interpolated logits are positive.
+    pub fn enlarge(&self, grid: &Grid, width: usize, height: usize) -> Vec<bool> {
+        let [left, top, right, bottom] = self.bounds;
+        let columns = taps(width, grid.extent[0], grid.width);
+        let rows = taps(height, grid.extent[1], grid.height);
+        let mut mask = vec![false; width * height];
+        for (out, &(y0, y1, fy)) in mask.chunks_exact_mut(width).zip(&rows) {
+            if y0 < top || y1 >= bottom {
+                continue;
+            }
+            let row = |y: usize| &self.values[(y - top) * (right - left)..][..right - left];
+            let (above, below) = (row(y0), row(y1));
+            for (inside, &(x0, x1, fx)) in out.iter_mut().zip(&columns).filter(|(_, c)| c.0 >= left && c.1 < right) {
+                let (x0, x1) = (x0 - left, x1 - left);
+                let a = above[x0] + (above[x1] - above[x0]) * fx;
+                let b = below[x0] + (below[x1] - below[x0]) * fx;
+                *inside = a + (b - a) * fy > 0.0;
+            }
+        }
+        mask
+    }
+}
+
+/// Two neighbours and the weight of the second, for each of `n` pixels that `extent` pixels of the grid are enlarged to;
+/// the grid has `last` pixels.
+fn taps(n: usize, extent: f64, last: usize) -> Vec<(usize, usize, f32)> {
+    (0..n)
+        .map(|i| {
+            let at = ((i as f64 + 0.5) / n as f64 * extent - 0.5).clamp(0.0, (last - 1) as f64);
+            let low = at.floor() as usize;
+            (low, (low + 1).min(last - 1), (at - low as f64) as f32)
+        })
+        .collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::nms::Pixels;
+    use proptest::prelude::*;
+
+    /// [`Logits::enlarge`] with all logits at hand.
+    fn enlarge_whole(logits: &[f32], grid: &Grid, width: usize, height: usize) -> Vec<bool> {
+        let columns = taps(width, grid.extent[0], grid.width);
+        let rows = taps(height, grid.extent[1], grid.height);
+        let at = |x: usize, y: usize| logits[y * grid.width + x];
+        let mix = |a: f32, b: f32, f: f32| a + (b - a) * f;
+        rows.iter()
+            .flat_map(|&(y0, y1, fy)| {
+                columns.iter().map(move |&(x0, x1, fx)| {
+                    mix(mix(at(x0, y0), at(x1, y0), fx), mix(at(x0, y1), at(x1, y1), fx), fy) > 0.0
+                })
+            })
+            .collect()
+    }
+
+    proptest! {
+        #[test]
+        fn nothing_is_lost_beyond_the_box(
+            (w, h) in (1usize..12, 1usize..9),
+            (width, height) in (1usize..40, 1usize..30),
+            shift in 0.0f32..3.0,
+            noise in prop::collection::vec(-4.0f32..3.0, 12 * 9),
+            short in 0.0f64..0.9,
+        ) {
+            let grid = Grid { width: w, height: h, extent: [w as f64 - short, h as f64 - short] };
+            let logits: Vec<f32> = noise[..w * h].iter().map(|v| v - shift).collect();
+            let pixels = Pixels::new(w, logits.iter().map(|&l| l > 0.0));
+            let cut = Logits::new(|y| &logits[y * w..(y + 1) * w], &grid, pixels.bounds);
+            prop_assert!(cut.values.len() <= logits.len());
+            prop_assert_eq!(cut.enlarge(&grid, width, height), enlarge_whole(&logits, &grid, width, height));
+        }
+    }
+}
