@@ -3,20 +3,15 @@
 //! Only the scene and the geometry have to be there. Whatever else a run did not make leaves its section out, with a
 //! line that says why.
 
+mod material;
+mod sections;
+
+use self::material::{Material, optional_json};
 use crate::ablation::{self, Table};
-use crate::html::{Figure, Page};
-use crate::pca::pca;
-use crate::picture::Picture;
-use crate::query::QueryResults;
+use crate::html::Page;
 use crate::runs::{self, Run, grouped};
-use crate::scene::{LabelledScene, find_view, spread};
-use crate::score::Scores;
-use crate::{curves, svg};
-use artifacts::{Features, Level, MaskMaps, NOISE_COLOR, hash_folder, instance_color, maps_path, role};
-use gs_io::{Error, IoContext, Result, hash_file, write_bytes};
-use gs_raster::RasterOptions;
-use gs_scene::dataset::{Dataset, Split, View};
-use gs_scene::{Gaussians, Geometry};
+use gs_io::{Error, Result, write_bytes};
+use gs_scene::dataset::{Dataset, Split};
 use serde::{Deserialize, Serialize};
 use serde_json::Value;
 use std::collections::BTreeMap;
@@ -82,52 +77,6 @@ pub struct QueryFigure {
     pub score: Option<f32>,
 }
 
-/// Views shown from the scene.
-const VIEWS: usize = 3;
-/// Width of pictures on the page, two or three beside each other.
-const WIDTH_OF: [usize; 4] = [900, 900, 640, 440];
-const QUALITY: u8 = 86;
-/// Rows of features that principal components are computed from; more change no colour that one would see.
-const PCA_ROWS: usize = 100_000;
-/// Pictures of features and instances are rendered at most this wide: the page shows them smaller.
-const MAX_RENDER: u32 = 960;
-/// What is behind Gaussians in rendered pictures.
-const BACKDROP: [f32; 3] = [0.08, 0.09, 0.1];
-
-/// Everything the sections draw from.
-struct Material<'a> {
-    options: &'a ReportOptions,
-    dataset: &'a Dataset,
-    scene: Known,
-    raster: RasterOptions,
-    geometry_hash: String,
-    scores: Option<Scores>,
-    /// The views shown, with photograph and render.
-    shown: Vec<Shown<'a>>,
-}
-
-/// The Gaussians, with their instances where the run has some.
-enum Known {
-    Labelled(Box<LabelledScene>),
-    Geometry(Geometry),
-}
-
-impl Known {
-    fn geometry(&self) -> &Geometry {
-        match self {
-            Self::Labelled(scene) => &scene.geometry,
-            Self::Geometry(geometry) => geometry,
-        }
-    }
-}
-
-struct Shown<'a> {
-    view: &'a View,
-    photo: Picture,
-    render: Picture,
-    psnr: f64,
-}
-
 /// Makes the page and `metrics.json` beside it.
 ///
 /// # Errors
@@ -149,19 +98,19 @@ pub fn run(dataset: &Dataset, options: &ReportOptions, inputs: &mut BTreeMap<Str
     }
 
     let mut page = Page::default();
-    page.tiles(&tiles(&metrics, dataset));
-    photographs(&material, &mut page)?;
-    id_maps(&material, &mut page, &mut metrics)?;
-    features(&material, &mut page, &mut metrics)?;
-    instances(&material, &mut page, &mut metrics)?;
-    queries(&material, &mut page, &mut metrics)?;
-    score_tables(&material, &mut page);
+    page.tiles(&sections::tiles(&metrics, dataset));
+    sections::photographs(&material, &mut page)?;
+    sections::id_maps(&material, &mut page, &mut metrics)?;
+    sections::features(&material, &mut page, &mut metrics)?;
+    sections::instances(&material, &mut page, &mut metrics)?;
+    sections::queries(&material, &mut page, &mut metrics)?;
+    sections::score_tables(&material, &mut page);
     if let Some(folder) = &options.ablation {
         ablation::sections(&mut page, &Table::read_all(folder)?);
     }
-    training(&material, &mut page, &mut metrics)?;
-    stages(&records, &mut page);
-    left_out(&records, &mut page, &metrics);
+    sections::training(&material, &mut page, &mut metrics)?;
+    sections::stages(&records, &mut page);
+    sections::left_out(&records, &mut page, &metrics);
 
     let subtitle = format!(
         "{} photographs ({} held out) of {}x{} pixels, {} Gaussians",
@@ -181,90 +130,6 @@ pub fn run(dataset: &Dataset, options: &ReportOptions, inputs: &mut BTreeMap<Str
 /// `metrics.json` beside the page.
 pub fn metrics_path(options: &ReportOptions) -> PathBuf {
     options.out.with_file_name("metrics.json")
-}
-
-impl<'a> Material<'a> {
-    fn read(
-        dataset: &'a Dataset,
-        options: &'a ReportOptions,
-        metrics: &mut Metrics,
-        inputs: &mut BTreeMap<String, String>,
-    ) -> Result<Self> {
-        let geometry = options.run_dir.join("geometry.ply");
-        let geometry_hash = hash_file(&geometry)?;
-        inputs.insert(role::GEOMETRY.into(), geometry_hash.clone());
-        let path = options.run_dir.join("instances.safetensors");
-        let scene = if path.exists() {
-            let labelled = LabelledScene::read(&path, &geometry)?;
-            labelled.check_dataset(dataset)?;
-            inputs.extend(labelled.inputs.clone());
-            Known::Labelled(Box::new(labelled))
-        } else {
-            metrics.skipped.push("instances: the run has no instances.safetensors (cluster-match makes it)".into());
-            Known::Geometry(Geometry::read(&geometry)?)
-        };
-        let geometry = scene.geometry();
-        metrics.skipped.extend(geometry.damage());
-        let raster = RasterOptions::of(geometry);
-        let scores = optional_json::<Scores>(&options.run_dir.join("score.json"))?;
-        match &scores {
-            Some(s) => metrics.skipped.extend(s.skipped.iter().cloned()),
-            None => metrics.skipped.push("scores: the run has no score.json (eval score makes it)".into()),
-        }
-        let mut shown = Vec::new();
-        for view in views_to_show(dataset, &options.views)? {
-            let photo = view.load_image()?;
-            let photo = Picture::new(photo.width as usize, photo.height as usize, &photo.rgb);
-            let rendered = gs_raster::render(&geometry.gaussians, &view.camera, &raster);
-            let render = Picture::new(rendered.width as usize, rendered.height as usize, &rendered.rgb);
-            let psnr = psnr(&photo, &render);
-            shown.push(Shown { view, photo, render, psnr });
-        }
-        Ok(Self { options, dataset, scene, raster, geometry_hash, scores, shown })
-    }
-
-    fn gaussians(&self) -> &Gaussians {
-        &self.scene.geometry().gaussians
-    }
-
-    fn labelled(&self) -> Option<&LabelledScene> {
-        match &self.scene {
-            Known::Labelled(scene) => Some(scene),
-            Known::Geometry(_) => None,
-        }
-    }
-
-    fn file(&self, name: &str) -> PathBuf {
-        self.options.run_dir.join(name)
-    }
-}
-
-/// The views named, or a few held-out ones, or a few of all.
-fn views_to_show<'a>(dataset: &'a Dataset, names: &[String]) -> Result<Vec<&'a View>> {
-    if !names.is_empty() {
-        return names.iter().map(|n| find_view(dataset, n)).collect();
-    }
-    let held_out: Vec<&View> = dataset.views.iter().filter(|v| v.split == Split::Test).collect();
-    let all: Vec<&View> = dataset.views.iter().collect();
-    Ok(spread(if held_out.is_empty() { &all } else { &held_out }, VIEWS))
-}
-
-fn psnr(a: &Picture, b: &Picture) -> f64 {
-    let squares =
-        a.pixels.iter().zip(&b.pixels).flat_map(|(x, y)| x.iter().zip(y)).map(|(x, y)| f64::from(x - y).powi(2));
-    let mse = squares.sum::<f64>() / (3 * a.pixels.len()).max(1) as f64;
-    -10.0 * mse.max(1e-20).log10()
-}
-
-/// Reads a JSON file that need not exist.
-fn optional_json<T: serde::de::DeserializeOwned>(path: &Path) -> Result<Option<T>> {
-    if !path.exists() {
-        return Ok(None);
-    }
-    let bytes = std::fs::read(path).at("read", path)?;
-    serde_json::from_slice(&bytes).map(Some).map_err(|e| {
-        Error::new(format!("not the JSON expected: {e}")).file(path).hint("run the stage that makes it again")
-    })
 }
 
 fn run_records(m: &Material) -> Result<Vec<Run>> {
@@ -294,342 +159,6 @@ fn geometry_figures(m: &Material, metrics: &mut Metrics) -> Result<()> {
     Ok(())
 }
 
-fn tiles(metrics: &Metrics, dataset: &Dataset) -> Vec<(String, String)> {
-    let mut tiles = Vec::new();
-    let mut tile = |name: &str, value: Option<String>| {
-        if let Some(value) = value {
-            tiles.push((name.to_string(), value));
-        }
-    };
-    tile("PSNR, held-out views", metrics.psnr_heldout.map(|v| format!("{v:.2} dB")));
-    tile("SSIM, held-out views", metrics.ssim_heldout.map(|v| format!("{v:.3}")));
-    tile("instance mIoU", metrics.instance_miou.map(|v| format!("{v:.3}")));
-    tile("query mIoU", metrics.query_miou.map(|v| format!("{v:.3}")));
-    tile("photographs", Some(dataset.views.len().to_string()));
-    tile("Gaussians", Some(grouped(&metrics.gaussians.to_string())));
-    tile("instances", metrics.instances.map(|n| n.to_string()));
-    let total: f64 = metrics.seconds.values().sum();
-    tile("all stages", (total > 0.0).then(|| duration(total)));
-    tiles
-}
-
-/// Seconds for people.
-fn duration(seconds: f64) -> String {
-    if seconds < 60.0 {
-        format!("{seconds:.1} s")
-    } else {
-        let whole = seconds.round() as u64;
-        format!("{} min {:02} s", whole / 60, whole % 60)
-    }
-}
-
-fn figure(picture: &Picture, columns: usize, caption: String) -> Result<Figure> {
-    Ok(Figure { jpeg: picture.jpeg(WIDTH_OF[columns.min(3)], QUALITY)?, caption })
-}
-
-fn photographs(m: &Material, page: &mut Page) -> Result<()> {
-    page.section("photographs", "Photographs and renders");
-    let held_out = m.shown.iter().all(|s| s.view.split == Split::Test);
-    page.paragraph(if held_out {
-        "Left the photograph, right the 3D Gaussians rendered from the same place. These views were held out: training \
-         never saw them."
-    } else {
-        "Left the photograph, right the 3D Gaussians rendered from the same place. Training saw these views."
-    });
-    let mut figures = Vec::new();
-    for s in &m.shown {
-        figures.push(figure(&s.photo, 2, format!("{}: photograph", s.view.stem()))?);
-        figures.push(figure(&s.render, 2, format!("{}: render, {:.2} dB", s.view.stem(), s.psnr))?);
-    }
-    page.figures(2, &figures);
-    Ok(())
-}
-
-fn id_maps(m: &Material, page: &mut Page, metrics: &mut Metrics) -> Result<()> {
-    let Some(folder) = m.options.masks.as_deref().filter(|f| f.is_dir()) else {
-        metrics.skipped.push("id maps: no folder of masks was given".into());
-        return Ok(());
-    };
-    if let Some(a) = m.labelled().map(|l| &l.artifact).filter(|a| a.provenance().inputs.contains_key(role::MASKS)) {
-        a.expect_input(role::MASKS, &hash_folder(folder, "_s.npy")?)?;
-    }
-    let mut figures = Vec::new();
-    for s in &m.shown {
-        let path = maps_path(folder, s.view.stem());
-        if !path.exists() {
-            continue;
-        }
-        let maps = MaskMaps::read(&path)?;
-        let level = maps.level(Level::Large);
-        let mut distinct: Vec<i32> = level.iter().copied().filter(|&id| id >= 0).collect();
-        distinct.sort_unstable();
-        distinct.dedup();
-        let (w, h) = (s.photo.width, s.photo.height);
-        let overlay: Vec<Option<[f32; 3]>> = (0..w * h)
-            .map(|i| {
-                let (x, y) = (i % w * maps.width / w, i / w * maps.height / h);
-                // Ids of the large level begin after those of the others; only their differences matter for colours.
-                Some(match u32::try_from(level[y * maps.width + x]) {
-                    Ok(id) => instance_color(id),
-                    Err(_) => NOISE_COLOR,
-                })
-            })
-            .collect();
-        let caption = format!("{}: {} masks", s.view.stem(), distinct.len());
-        figures.push(figure(&s.photo.overlaid(&overlay, 0.6), 3, caption)?);
-    }
-    if figures.is_empty() {
-        metrics.skipped.push(format!("id maps: none of the views shown has one in {}", folder.display()));
-        return Ok(());
-    }
-    page.section("id-maps", "Masks");
-    page.paragraph(
-        "The 2D masks of the level \u{201c}large\u{201d}, a colour per mask, grey where there is none. Every view is \
-         segmented on its own: colours do not correspond between views, and neither need the extents of masks.",
-    );
-    page.figures(3, &figures);
-    Ok(())
-}
-
-fn features(m: &Material, page: &mut Page, metrics: &mut Metrics) -> Result<()> {
-    let path = m.file("features.safetensors");
-    if !path.exists() {
-        metrics.skipped.push("features: the run has no features.safetensors (feat-train makes it)".into());
-        return Ok(());
-    }
-    let (features, artifact) = Features::read(&path)?;
-    artifact.expect_input(role::GEOMETRY, &m.geometry_hash)?;
-    if features.kept.last().is_some_and(|&i| i as usize >= m.gaussians().len()) {
-        return Err(Error::new("index out of range").file(&path).field("kept").hint("run feat-train again"));
-    }
-    if features.dim == 0 || features.kept.is_empty() {
-        metrics.skipped.push("features: no Gaussian has one".into());
-        return Ok(());
-    }
-    let step = features.kept.len().div_ceil(PCA_ROWS);
-    let rows: Vec<f32> = features.values.chunks_exact(features.dim).step_by(step).flatten().copied().collect();
-    let p = pca(&rows, features.dim, 3);
-    let mut colors = vec![None; m.gaussians().len()];
-    for (&i, c) in features.kept.iter().zip(p.colors(&features.values)) {
-        colors[i as usize] = Some(c);
-    }
-    page.section("features", "Features");
-    page.paragraph(&format!(
-        "The {} numbers that every Gaussian carries, as colours: the three leading principal components are red, green \
-         and blue. Gaussians of one colour are one thing to the clustering.",
-        features.dim
-    ));
-    let mut figures = Vec::new();
-    for s in &m.shown {
-        let picture = render_colors(m, &colors, s.view);
-        figures.push(figure(&picture, 3, s.view.stem().to_string())?);
-    }
-    page.figures(3, &figures);
-    Ok(())
-}
-
-/// Renders a colour per Gaussian; Gaussians without one are left out of the mixture.
-fn render_colors(m: &Material, colors: &[Option<[f32; 3]>], view: &View) -> Picture {
-    let width = view.camera.width.min(MAX_RENDER);
-    let height = (f64::from(view.camera.height) * f64::from(width) / f64::from(view.camera.width)).round() as u32;
-    let camera = view.camera.resized(width, height.max(1));
-    let channels: Vec<f32> = colors.iter().flat_map(|c| c.map_or([0.0; 4], |[r, g, b]| [r, g, b, 1.0])).collect();
-    let out = gs_raster::render_features(m.gaussians(), &channels, 4, &camera, &m.raster);
-    let over = |p: &[f32]| [0, 1, 2].map(|k| p[k] + (1.0 - p[3]).max(0.0) * BACKDROP[k]);
-    let rgb: Vec<f32> = out.chunks_exact(4).flat_map(over).collect();
-    Picture::new(camera.width as usize, camera.height as usize, &rgb)
-}
-
-fn instances(m: &Material, page: &mut Page, metrics: &mut Metrics) -> Result<()> {
-    let Some(labelled) = m.labelled() else { return Ok(()) };
-    let inst = &labelled.instances;
-    page.section("instances", "Instances");
-    if inst.is_empty() {
-        page.note("The clustering found no instance: all Gaussians are noise.");
-        metrics.skipped.push("instance pictures: there is no instance".into());
-        return Ok(());
-    }
-    let noise = inst.label.iter().filter(|&&l| l < 0).count();
-    page.paragraph(&format!(
-        "{} instances, a colour each, the same in every view and in the coloured PLY; {} Gaussians belong to none (grey).",
-        inst.len(),
-        grouped(&noise.to_string())
-    ));
-    let color = |&l: &i32| Some(u32::try_from(l).map_or(NOISE_COLOR, instance_color));
-    let colors: Vec<Option<[f32; 3]>> = inst.label.iter().map(color).collect();
-    let mut figures = Vec::new();
-    for s in &m.shown {
-        figures.push(figure(&s.photo, 2, format!("{}: photograph", s.view.stem()))?);
-        let picture = render_colors(m, &colors, s.view);
-        figures.push(figure(&picture, 2, format!("{}: instances", s.view.stem()))?);
-    }
-    page.figures(2, &figures);
-    Ok(())
-}
-
-fn queries(m: &Material, page: &mut Page, metrics: &mut Metrics) -> Result<()> {
-    let folder = m.file("query");
-    let results = optional_json::<QueryResults>(&folder.join("query.json"))?;
-    let Some(results) = results.filter(|r| !r.queries.is_empty()) else {
-        let without_language = m.labelled().is_some_and(|l| l.instances.dim == 0);
-        metrics.skipped.push(if without_language {
-            "text queries: the instances have no language features, because the masks were not encoded with a CLIP \
-             model (mask-embed --clip)"
-                .into()
-        } else {
-            "text queries: the run has no query/query.json (eval query makes it)".into()
-        });
-        return Ok(());
-    };
-    page.section("queries", "Text queries");
-    page.paragraph(&format!(
-        "Answers by cosine similarity between a text and the instances\u{2019} descriptors ({}). The photographs show the \
-         selected 3D Gaussians.",
-        results.text_source
-    ));
-    let scored = |text: &str| m.scores.as_ref().and_then(|s| s.queries.iter().find(|q| q.text == text));
-    for q in &results.queries {
-        let mut facts = Vec::new();
-        match q.selected.len() {
-            0 => facts.push("nothing selected".into()),
-            1 => facts.push(format!("instance {}", q.selected[0])),
-            n => facts.push(format!("{n} instances")),
-        }
-        facts.extend(q.score.map(|s| format!("cosine {s:.3}")));
-        facts.extend(scored(&q.text).map(|s| format!("IoU {:.3}", s.iou)));
-        let mut figures = Vec::new();
-        for v in &q.views {
-            let path = folder.join(&v.overlay);
-            let picture = gs_scene::Image::read(&path)?;
-            let picture = Picture::new(picture.width as usize, picture.height as usize, &picture.rgb);
-            figures.push(figure(&picture, 3, v.view.clone())?);
-        }
-        page.heading(&format!("\u{201c}{}\u{201d}", q.text), &facts.join(", "));
-        page.figures(3, &figures);
-    }
-    Ok(())
-}
-
-fn score_tables(m: &Material, page: &mut Page) {
-    let Some(s) = &m.scores else { return };
-    if !s.things.is_empty() {
-        page.section("instance-scores", "Instances against the truth");
-        page.paragraph(&format!(
-            "Each surface point takes the instance of the nearest Gaussian. mIoU {:.3}, over objects without background \
-             {}; {} of {} things fell into several instances, {} instances hold several things.",
-            s.instance_miou.unwrap_or_default(),
-            s.object_miou.map_or("–".into(), |v| format!("{v:.3}")),
-            s.fragmented.unwrap_or_default(),
-            s.things.len(),
-            s.merging.unwrap_or_default(),
-        ));
-        let row = |t: &crate::score::ThingScore| {
-            let instance = t.instance.map_or("–".into(), |i| i.to_string());
-            let name = if t.background { format!("{} (background)", t.name) } else { t.name.clone() };
-            vec![name, grouped(&t.points.to_string()), format!("{:.3}", t.iou), instance, t.fragments.to_string()]
-        };
-        let rows: Vec<Vec<String>> = s.things.iter().map(row).collect();
-        page.table(&["thing", "points", "best IoU", "instance", "fragments"], &rows);
-    }
-    if !s.queries.is_empty() {
-        page.section("query-scores", "Queries against the labels");
-        let how = s.silhouette.as_ref().map_or(String::new(), |(name, t)| format!(" Silhouettes: {name}, above {t}."));
-        page.paragraph(&format!(
-            "IoU of the selection with labelled polygons over {} pairs of frame and category: mIoU {:.3}, {:.0}% above \
-             0.25, {:.0}% above 0.5.{how} Where other things hide part of an object, its label ends there: with the \
-             selection cut likewise, mIoU is {}.",
-            s.query_pairs,
-            s.query_miou.unwrap_or_default(),
-            100.0 * s.query_macc25.unwrap_or_default(),
-            100.0 * s.query_macc50.unwrap_or_default(),
-            s.query_miou_visible.map_or("–".into(), |v| format!("{v:.3}")),
-        ));
-        let row = |q: &crate::score::QueryScore| {
-            let cosine = q.score.map_or("–".into(), |c| format!("{c:.3}"));
-            let ids = q.selected.iter().map(u32::to_string).collect::<Vec<_>>().join(" ");
-            let ids = if ids.is_empty() { "–".into() } else { ids };
-            vec![q.text.clone(), format!("{:.3}", q.iou), cosine, ids, q.frames.len().to_string()]
-        };
-        let rows: Vec<Vec<String>> = s.queries.iter().map(row).collect();
-        page.table(&["text", "mean IoU", "cosine", "instances", "frames"], &rows);
-    }
-}
-
-fn training(m: &Material, page: &mut Page, metrics: &mut Metrics) -> Result<()> {
-    let mut paths: Vec<PathBuf> = std::fs::read_dir(&m.options.run_dir)
-        .at("list", &m.options.run_dir)?
-        .flatten()
-        .map(|e| e.path())
-        .filter(|p| p.to_string_lossy().ends_with(".curve.jsonl"))
-        .collect();
-    paths.sort();
-    let mut charts = Vec::new();
-    for path in paths {
-        let file = path.file_name().unwrap_or_default().to_string_lossy().into_owned();
-        let stage = file.trim_end_matches(".curve.jsonl");
-        let stage = stage.trim_end_matches(".ply").trim_end_matches(".safetensors");
-        for mut series in curves::read(&path)? {
-            series.name = format!("{stage}: {}", series.name.replace('_', " "));
-            charts.push(svg::chart(&series));
-        }
-    }
-    charts.retain(|c| !c.is_empty());
-    if charts.is_empty() {
-        metrics.skipped.push("training curves: the run has no *.curve.jsonl".into());
-        return Ok(());
-    }
-    page.section("training", "Training");
-    page.paragraph("Figures against iterations.");
-    page.charts(&charts);
-    Ok(())
-}
-
-fn stages(records: &[Run], page: &mut Page) {
-    if records.is_empty() {
-        return;
-    }
-    page.section("stages", "Stages");
-    let row = |r: &Run| {
-        vec![
-            r.name(),
-            r.output.clone(),
-            format!("{:.1}", r.record.wall_seconds),
-            r.record.peak_rss_bytes.map_or("–".into(), |b| format!("{:.0}", b as f64 / 1e6)),
-            r.record.threads.to_string(),
-            r.figures(),
-        ]
-    };
-    let mut rows: Vec<Vec<String>> = records.iter().map(row).collect();
-    let total: f64 = runs::seconds(records).values().sum();
-    let peak = records.iter().filter_map(|r| r.record.peak_rss_bytes).max();
-    rows.push(vec![
-        "all".into(),
-        String::new(),
-        format!("{total:.1}"),
-        peak.map_or("–".into(), |b| format!("{:.0}", b as f64 / 1e6)),
-        "–".into(),
-        String::new(),
-    ]);
-    page.table(&["stage", "output", "seconds", "peak MB", "threads", "figures"], &rows);
-}
-
-fn left_out(records: &[Run], page: &mut Page, metrics: &Metrics) {
-    let by_stage: Vec<(String, &String)> =
-        records.iter().flat_map(|r| r.record.skipped.iter().map(|s| (r.name(), s))).collect();
-    if by_stage.is_empty() && metrics.skipped.is_empty() {
-        return;
-    }
-    page.section("skipped", "Left out");
-    for reason in &metrics.skipped {
-        page.note(reason);
-    }
-    if !by_stage.is_empty() {
-        page.paragraph("Work that stages did not need to do:");
-        let rows: Vec<Vec<String>> = by_stage.into_iter().map(|(stage, what)| vec![stage, what.clone()]).collect();
-        page.table(&["stage", "skipped"], &rows);
-    }
-}
-
 /// The figures as a table for the terminal.
 pub fn table(metrics: &Metrics) -> String {
     let mut s = String::new();
@@ -652,23 +181,4 @@ pub fn table(metrics: &Metrics) -> String {
         s += &format!("left out         {reason}\n");
     }
     s
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn psnr_of_a_known_error() {
-        let a = Picture::new(2, 1, &[0.5; 6]);
-        let b = Picture::new(2, 1, &[0.6; 6]);
-        assert!((psnr(&a, &b) - 20.0).abs() < 1e-4);
-        assert_eq!(psnr(&a, &a), 200.0);
-    }
-
-    #[test]
-    fn durations_for_people() {
-        assert_eq!(duration(5.25), "5.2 s");
-        assert_eq!(duration(119.7), "2 min 00 s");
-    }
 }

@@ -1,0 +1,147 @@
+//! What the sections of a report draw from.
+
+use super::{Metrics, ReportOptions};
+use crate::picture::Picture;
+use crate::scene::{LabelledScene, find_view, spread};
+use crate::score::Scores;
+use artifacts::role;
+use gs_io::{Error, IoContext, Result, hash_file};
+use gs_raster::RasterOptions;
+use gs_scene::dataset::{Dataset, Split, View};
+use gs_scene::{Gaussians, Geometry};
+use std::collections::BTreeMap;
+use std::path::{Path, PathBuf};
+
+/// Views shown from the scene.
+const VIEWS: usize = 3;
+/// Everything the sections draw from.
+pub(super) struct Material<'a> {
+    pub(super) options: &'a ReportOptions,
+    pub(super) dataset: &'a Dataset,
+    scene: Known,
+    pub(super) raster: RasterOptions,
+    pub(super) geometry_hash: String,
+    pub(super) scores: Option<Scores>,
+    /// The views shown, with photograph and render.
+    pub(super) shown: Vec<Shown<'a>>,
+}
+
+/// The Gaussians, with their instances where the run has some.
+enum Known {
+    Labelled(Box<LabelledScene>),
+    Geometry(Geometry),
+}
+
+impl Known {
+    fn geometry(&self) -> &Geometry {
+        match self {
+            Self::Labelled(scene) => &scene.geometry,
+            Self::Geometry(geometry) => geometry,
+        }
+    }
+}
+
+/// A view with what is shown of it.
+pub(super) struct Shown<'a> {
+    pub(super) view: &'a View,
+    pub(super) photo: Picture,
+    pub(super) render: Picture,
+    pub(super) psnr: f64,
+}
+
+impl<'a> Material<'a> {
+    pub(super) fn read(
+        dataset: &'a Dataset,
+        options: &'a ReportOptions,
+        metrics: &mut Metrics,
+        inputs: &mut BTreeMap<String, String>,
+    ) -> Result<Self> {
+        let geometry = options.run_dir.join("geometry.ply");
+        let geometry_hash = hash_file(&geometry)?;
+        inputs.insert(role::GEOMETRY.into(), geometry_hash.clone());
+        let path = options.run_dir.join("instances.safetensors");
+        let scene = if path.exists() {
+            let labelled = LabelledScene::read(&path, &geometry)?;
+            labelled.check_dataset(dataset)?;
+            inputs.extend(labelled.inputs.clone());
+            Known::Labelled(Box::new(labelled))
+        } else {
+            metrics.skipped.push("instances: the run has no instances.safetensors (cluster-match makes it)".into());
+            Known::Geometry(Geometry::read(&geometry)?)
+        };
+        let geometry = scene.geometry();
+        metrics.skipped.extend(geometry.damage());
+        let raster = RasterOptions::of(geometry);
+        let scores = optional_json::<Scores>(&options.run_dir.join("score.json"))?;
+        match &scores {
+            Some(s) => metrics.skipped.extend(s.skipped.iter().cloned()),
+            None => metrics.skipped.push("scores: the run has no score.json (eval score makes it)".into()),
+        }
+        let mut shown = Vec::new();
+        for view in views_to_show(dataset, &options.views)? {
+            let photo = view.load_image()?;
+            let photo = Picture::new(photo.width as usize, photo.height as usize, &photo.rgb);
+            let rendered = gs_raster::render(&geometry.gaussians, &view.camera, &raster);
+            let render = Picture::new(rendered.width as usize, rendered.height as usize, &rendered.rgb);
+            let psnr = psnr(&photo, &render);
+            shown.push(Shown { view, photo, render, psnr });
+        }
+        Ok(Self { options, dataset, scene, raster, geometry_hash, scores, shown })
+    }
+
+    pub(super) fn gaussians(&self) -> &Gaussians {
+        &self.scene.geometry().gaussians
+    }
+
+    pub(super) fn labelled(&self) -> Option<&LabelledScene> {
+        match &self.scene {
+            Known::Labelled(scene) => Some(scene),
+            Known::Geometry(_) => None,
+        }
+    }
+
+    pub(super) fn file(&self, name: &str) -> PathBuf {
+        self.options.run_dir.join(name)
+    }
+}
+
+/// The views named, or a few held-out ones, or a few of all.
+fn views_to_show<'a>(dataset: &'a Dataset, names: &[String]) -> Result<Vec<&'a View>> {
+    if !names.is_empty() {
+        return names.iter().map(|n| find_view(dataset, n)).collect();
+    }
+    let held_out: Vec<&View> = dataset.views.iter().filter(|v| v.split == Split::Test).collect();
+    let all: Vec<&View> = dataset.views.iter().collect();
+    Ok(spread(if held_out.is_empty() { &all } else { &held_out }, VIEWS))
+}
+
+fn psnr(a: &Picture, b: &Picture) -> f64 {
+    let squares =
+        a.pixels.iter().zip(&b.pixels).flat_map(|(x, y)| x.iter().zip(y)).map(|(x, y)| f64::from(x - y).powi(2));
+    let mse = squares.sum::<f64>() / (3 * a.pixels.len()).max(1) as f64;
+    -10.0 * mse.max(1e-20).log10()
+}
+
+/// Reads a JSON file that need not exist.
+pub(super) fn optional_json<T: serde::de::DeserializeOwned>(path: &Path) -> Result<Option<T>> {
+    if !path.exists() {
+        return Ok(None);
+    }
+    let bytes = std::fs::read(path).at("read", path)?;
+    serde_json::from_slice(&bytes).map(Some).map_err(|e| {
+        Error::new(format!("not the JSON expected: {e}")).file(path).hint("run the stage that makes it again")
+    })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn psnr_of_a_known_error() {
+        let a = Picture::new(2, 1, &[0.5; 6]);
+        let b = Picture::new(2, 1, &[0.6; 6]);
+        assert!((psnr(&a, &b) - 20.0).abs() < 1e-4);
+        assert_eq!(psnr(&a, &a), 200.0);
+    }
+}
