@@ -68,7 +68,7 @@ fn growth_table(all: &[Growth]) -> (Vec<&'static str>, Vec<Vec<String>>) {
 
 /// Head and rows of a comparison of builds.
 pub fn compare_table(all: &[Compared]) -> (Vec<&'static str>, Vec<Vec<String>>) {
-    let head = vec!["scene", "stage", "base, CPU s", "this, CPU s", "ratio", "memory", "same bytes"];
+    let head = vec!["scene", "stage", "base, CPU s", "this, CPU s", "ratio", "memory", "same data"];
     let rows = all.iter().map(|c| {
         vec![
             c.scene.clone(),
@@ -77,7 +77,7 @@ pub fn compare_table(all: &[Compared]) -> (Vec<&'static str>, Vec<Vec<String>>) 
             with_spread(c.own),
             format!("{:.2}", c.ratio),
             format!("{:.2}", c.memory_ratio),
-            if c.same_bytes { "yes" } else { "no" }.into(),
+            if c.same_data { "yes" } else { "no" }.into(),
         ]
     });
     (head, rows.collect())
