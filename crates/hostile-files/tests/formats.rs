@@ -40,6 +40,15 @@ fn findings_stay_mended() {
 }
 
 #[test]
+fn what_fuzzing_kept_is_withstood() {
+    for format in &FORMATS {
+        let files = hostile_files::corpus(format);
+        assert!(files.len() > 100, "{}: {} files", format.name, files.len());
+        files.iter().for_each(|bytes| _ = run(format, bytes));
+    }
+}
+
+#[test]
 fn good_files_take_little_memory() {
     for format in &FORMATS {
         for seed in seeds(format) {
