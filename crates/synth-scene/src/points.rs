@@ -107,9 +107,9 @@ impl Collector {
     }
 }
 
-/// About how many points a [`Collector`] will have of views by these cameras, from views of a [`PREVIEW`]-th of their
-/// size: a square of `PREVIEW` by `PREVIEW` cells that `n` of their pixels fall into is met by `n PREVIEW^2` of the full
-/// ones, each in one of its cells.
+/// About how many points a [`Collector`] will have of views by these cameras, from views of a fourth of their size: a
+/// square of four by four cells that `n` of their pixels fall into is met by `16 n` of the full ones, each in one of its
+/// cells.
 pub fn expected(scene: &Scene, cameras: &[Camera]) -> usize {
     let mut met: HashMap<(u32, [i32; 3]), u32> = HashMap::new();
     for camera in cameras {
