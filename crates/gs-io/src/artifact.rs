@@ -23,6 +23,9 @@ const NO_CHECKSUM: &str = "00000000000000000000000000000000000000000000000000000
 /// What stands before the checksum's digits in the file's header, where the JSON is a string within JSON.
 const BEFORE_CHECKSUM: &[u8] = br#""{\"checksum\":\""#;
 
+/// Names of what an artifact says of itself: the checksum, and the fields of [`Provenance`].
+const ENTRIES: [&str; 7] = ["checksum", "format", "version", "program", "parameters", "inputs", "extra"];
+
 /// Where the checksum's digits lie in a file, if it has one.
 fn checksum_at(header: &[u8]) -> Option<std::ops::Range<usize>> {
     let start = header.windows(BEFORE_CHECKSUM.len()).position(|w| w == BEFORE_CHECKSUM)? + BEFORE_CHECKSUM.len();
@@ -199,7 +202,13 @@ impl Artifact {
         let json = metadata.metadata().as_ref().and_then(|m| m.get(KEY)).ok_or_else(|| {
             Error::new("no provenance: not written by this program").file(path).field(format!("__metadata__.{KEY}"))
         })?;
-        let provenance: Provenance = serde_json::from_str(json).map_err(|e| damaged(&e))?;
+        let entries: serde_json::Map<String, serde_json::Value> =
+            serde_json::from_str(json).map_err(|e| damaged(&e))?;
+        // A flipped bit in the name of the checksum would hide it, and with it every other one.
+        if let Some(unknown) = entries.keys().find(|name| !ENTRIES.contains(&name.as_str())) {
+            return Err(damaged(&"an entry that no artifact has").field(format!("__metadata__.{KEY}.{unknown}")));
+        }
+        let provenance: Provenance = serde_json::from_value(entries.into()).map_err(|e| damaged(&e))?;
         if provenance.format != format || provenance.version != version {
             return Err(Error::new("another kind of artifact")
                 .file(path)
@@ -330,6 +339,21 @@ mod tests {
         let e = a.tensor::<u32>("a", &[None]).unwrap_err().to_string();
         assert!(e.contains("found F32 [2, 2], expected U32 [any]"), "{e}");
         assert!(Artifact::open(&p, "graph", 1).is_err());
+    }
+
+    #[test]
+    fn a_checksum_under_another_name_is_damage() {
+        let dir = tempfile::tempdir().unwrap();
+        let p = dir.path().join("a.safetensors");
+        sample().write(&p).unwrap();
+        let mut bytes = std::fs::read(&p).unwrap();
+        let at = bytes.windows(8).position(|w| w == b"checksum").unwrap();
+        for bit in 0..64 {
+            bytes[at + bit / 8] ^= 1 << (bit % 8);
+            std::fs::write(&p, &bytes).unwrap();
+            assert!(Artifact::open(&p, "sample", 1).is_err(), "bit {bit} of the name");
+            bytes[at + bit / 8] ^= 1 << (bit % 8);
+        }
     }
 
     #[test]
