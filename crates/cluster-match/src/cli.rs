@@ -5,6 +5,7 @@
 use crate::associate::{FeatureTable, Silhouette, matches, overlaps};
 use crate::describe::{Aggregate, describe};
 use crate::extend::from_nearest;
+
 use crate::group::{Distance, Space, group, group_sample, tree};
 use crate::join::by_masks;
 use crate::vote::by_votes;
@@ -138,8 +139,9 @@ enum Noise {
 #[derive(Debug, clap::Args)]
 #[command(next_help_heading = "Matching")]
 struct MatchingArgs {
-    /// Level of the masks: default, small, medium or large; several with commas between
-    #[arg(long, default_value = "large", value_delimiter = ',', value_name = "LEVELS")]
+    /// Levels of the masks that vote, join and match: default, small, medium or large, with commas between [default: all
+    /// on the graph; large for free points, as the paper]
+    #[arg(long, value_delimiter = ',', value_name = "LEVELS")]
     level: Vec<Level>,
     /// Silhouettes of instances rendered alone, or as far as visible; both with a comma between: in each view the better
     #[arg(long, value_enum, default_value = "selected", value_delimiter = ',', value_name = "RULES")]
@@ -150,6 +152,17 @@ struct MatchingArgs {
     /// How the features of an instance's masks become its descriptor
     #[arg(long, value_enum, default_value_t = Aggregate::Mean)]
     aggregate: Aggregate,
+}
+
+impl Args {
+    /// Levels of the masks that vote, join and match.
+    fn levels(&self) -> Vec<Level> {
+        match (&self.matching.level[..], self.clustering.cluster) {
+            ([], Space::Graph) => Level::ALL.to_vec(),
+            ([], Space::Free) => vec![Level::Large],
+            (given, _) => given.to_vec(),
+        }
+    }
 }
 
 impl Program for Args {
@@ -388,7 +401,7 @@ fn revise(
     (labels, nodes): (&mut [i32], &mut [i32]),
     tree: &mut [TreeEdge],
 ) -> usize {
-    let (c, levels) = (&a.clustering, &a.matching.level);
+    let (c, levels) = (&a.clustering, &a.levels());
     let mut of_kept: Vec<i32> = inputs.graph.kept.iter().map(|&i| labels[i as usize]).collect();
     if c.votes() > 0 {
         let moved = by_votes(&mut of_kept, instances, &inputs.footprints, &inputs.graph, levels, c.votes());
@@ -433,7 +446,7 @@ fn associate(
         let maps = MaskMaps::read(maps_path(&a.masks, stem))?;
         let camera = view.camera.resized(maps.width as u32, maps.height as u32);
         let m = &a.matching;
-        let o = overlaps(gaussians, &raster, labels, &table, &camera, &maps, &m.level, &m.silhouette);
+        let o = overlaps(gaussians, &raster, labels, &table, &camera, &maps, &a.levels(), &m.silhouette);
         found.extend(matches(&o, index as u32, m.threshold));
         let path = features_path(&a.masks, stem);
         if path.is_file() {
@@ -550,7 +563,7 @@ fn write_outputs(
 ) -> Result<()> {
     let (c, m) = (&a.clustering, &a.matching);
     let lower = |v: &dyn std::fmt::Debug| format!("{v:?}").to_lowercase();
-    let levels: Vec<String> = m.level.iter().map(ToString::to_string).collect();
+    let levels: Vec<String> = a.levels().iter().map(ToString::to_string).collect();
     let silhouettes: Vec<String> = m.silhouette.iter().map(|s| lower(s)).collect();
     let parameters = json!({
         "cluster": lower(&c.cluster),

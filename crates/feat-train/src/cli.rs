@@ -13,7 +13,7 @@ use crate::real::{Half, Weight};
 use crate::scene::{Context, Neighbours, mask_sets};
 use crate::spectral::{SpectralOptions, spectral};
 use crate::train::{CurvePoint, TrainOptions, train};
-use artifacts::{Features, Footprints, Graph, Level, role};
+use artifacts::{Features, Footprints, Graph, Level, Row, role};
 use clap::ValueEnum;
 use gs_io::{Error, Lock, Result, Watched, hash_file, write_bytes};
 use gs_scene::{Geometry, SH_C0};
@@ -43,10 +43,12 @@ pub struct Args {
     /// How features come about
     #[arg(long, value_enum, default_value_t = Method::Spectral)]
     method: Method,
-    /// Levels of masks to use: default, small, medium, large
-    #[arg(long, value_name = "LEVELS", value_delimiter = ',', default_value = "large")]
+    /// Levels of the masks to learn from: default, small, medium or large, with commas between [default: all for
+    /// spectral; large for contrastive, as the paper]
+    #[arg(long, value_name = "LEVELS", value_delimiter = ',')]
     levels: Vec<Level>,
-    /// Numbers per feature [default: 6 for contrastive; for spectral as many as matter, at most 64]
+    /// Dimension of the features [default: 6 for contrastive; for spectral as many as the cutoff keeps, at most 256, and
+    /// fewer from 262,144 Gaussians on, but at least 64]
     #[arg(long, value_name = "COUNT")]
     dim: Option<usize>,
     #[command(flatten)]
@@ -167,6 +169,12 @@ struct Spectral {
     no_smoothing: bool,
 }
 
+/// Dimension of the closed form where `--dim` is not given: within these bounds as many as features of so many numbers in
+/// all allow (256 MB).
+const MOST_VECTORS: usize = 256;
+const LEAST_VECTORS: usize = 64;
+const MOST_NUMBERS: usize = 1 << 26;
+
 fn name_of(value: &impl ValueEnum) -> String {
     value.to_possible_value().map_or_else(String::new, |v| v.get_name().to_string())
 }
@@ -174,6 +182,19 @@ fn name_of(value: &impl ValueEnum) -> String {
 impl Args {
     fn method(&self) -> Method {
         if self.contrastive.preset.is_some() { Method::Contrastive } else { self.method }
+    }
+
+    fn levels(&self) -> Vec<Level> {
+        match (&self.levels[..], self.method()) {
+            ([], Method::Spectral) => Level::ALL.to_vec(),
+            ([], Method::Contrastive) => vec![Level::Large],
+            (given, _) => given.to_vec(),
+        }
+    }
+
+    /// Vectors of the closed form that are kept at most, where `--dim` is not given.
+    fn most_vectors(&self, gaussians: usize) -> usize {
+        self.dim.unwrap_or((MOST_NUMBERS / gaussians.max(1)).clamp(LEAST_VECTORS, MOST_VECTORS))
     }
 
     fn check(&self) -> Result<()> {
@@ -210,7 +231,7 @@ impl Args {
 
     /// Everything that shapes the features but the number of iterations.
     fn parameters(&self) -> serde_json::Map<String, Value> {
-        let levels: Vec<String> = self.levels.iter().map(ToString::to_string).collect();
+        let levels: Vec<String> = self.levels().iter().map(ToString::to_string).collect();
         let mut p = serde_json::Map::from_iter([
             ("method".to_string(), json!(name_of(&self.method()))),
             ("levels".to_string(), json!(levels)),
@@ -311,8 +332,8 @@ impl Args {
         let context = Context::new(&inputs.graph, &colors, &positions, c.neighbours, !c.no_propagation);
         // A lone mask has none to be told from, but it can be drawn together.
         let least = if c.no_skip || c.cohesion > 0.0 { 1 } else { 2 };
-        let sets = mask_sets::<W>(&inputs.footprints, &context, &self.levels, least)?;
-        let units = inputs.footprints.views.len() * self.levels.len();
+        let sets = mask_sets::<W>(&inputs.footprints, &context, &self.levels(), least)?;
+        let units = inputs.footprints.views.len() * self.levels().len();
         if sets.len() < units {
             let why = if least == 1 { "no mask" } else { "fewer than two masks" };
             stage.skipped(&format!("{} of {units} views and levels: {why}", units - sets.len()));
@@ -321,7 +342,7 @@ impl Args {
             let what = if least == 1 { "no view has a mask" } else { "no view has two masks to tell apart" };
             return Err(Error::new(what)
                 .file(&self.footprints)
-                .field(format!("levels {:?}", self.levels))
+                .field(format!("levels {:?}", self.levels()))
                 .hint("choose other --levels, or make masks with more than one segment a view"));
         }
         let options = TrainOptions {
@@ -372,16 +393,16 @@ impl Args {
     fn spectral(&self, inputs: &Inputs, stage: &Stage) -> Result<(usize, Vec<f32>, Value)> {
         let s = &self.spectral;
         let clock = Instant::now();
-        let matrix = collect(&inputs.footprints, &inputs.graph, &self.levels, s.evidence, !s.no_smoothing);
+        let matrix = collect(&inputs.footprints, &inputs.graph, &self.levels(), s.evidence, !s.no_smoothing);
         if matrix.masks.is_empty() {
             return Err(Error::new("no mask has a footprint")
                 .file(&self.footprints)
-                .field(format!("levels {:?}", self.levels))
+                .field(format!("levels {:?}", self.levels()))
                 .hint("choose other --levels, or check that masks and geometry are of one scene"));
         }
         let evidence_seconds = clock.elapsed().as_secs_f64();
         let options = SpectralOptions {
-            most: self.dim.unwrap_or(64),
+            most: self.most_vectors(matrix.gaussians),
             auto: self.dim.is_none(),
             cutoff: s.cutoff,
             power: s.power,
@@ -389,6 +410,15 @@ impl Args {
         };
         let found = spectral(&matrix, &options, stage)?;
         let vectors_seconds = clock.elapsed().as_secs_f64() - evidence_seconds;
+        let above = found.singular_values.iter().filter(|v| **v > s.cutoff).count();
+        if above > found.dim {
+            let more = if above == found.singular_values.len() { " or more" } else { "" };
+            stage.warn(&format!(
+                "{above}{more} singular values exceed the cutoff of {}, but only the first {} are kept: small things may run \
+                 together; give a larger --dim",
+                s.cutoff, found.dim
+            ));
+        }
         let without = found.features.chunks_exact(found.dim).filter(|f| f.iter().all(|v| *v == 0.0)).count();
         if without > 0 {
             stage.info(&format!("{without} of {} Gaussians lie in no mask: their features are zero", matrix.gaussians));
@@ -444,11 +474,16 @@ impl Program for Args {
             entries: inputs.footprints.csr().1.len(),
             samples: inputs.footprints.pixels.col.len(),
             gaussians: inputs.footprints.kept.len(),
-            masks: inputs.footprints.rows.len(),
         };
+        let levels = self.levels();
+        let start = inputs.footprints.csr().0;
+        let entries = |r: usize| (start[r + 1] - start[r]) as usize;
+        let chosen = |row: &Row| levels.iter().any(|&l| l as u32 == row.level);
+        let rows = inputs.footprints.rows.iter().enumerate().filter(|(_, row)| chosen(row));
+        let (masks, used) = rows.fold((0, 0), |(masks, used), (r, _)| (masks + 1, used + entries(r)));
         let needed = match self.method() {
             Method::Contrastive => memory::contrastive(sizes, self.dim.unwrap_or(6), self.contrastive.layers),
-            Method::Spectral => memory::spectral(sizes),
+            Method::Spectral => memory::spectral(sizes, used, self.most_vectors(sizes.gaussians).min(masks)),
         };
         stage.forecast(needed, "drop small footprint entries: graph-precompute --cut 0.001")?;
         let (dim, values, summary) = match self.method() {
