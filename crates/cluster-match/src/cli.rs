@@ -7,6 +7,7 @@ use crate::describe::{Aggregate, describe};
 use crate::extend::from_nearest;
 
 use crate::group::{Distance, Space, group, group_sample, tree};
+use crate::health::Health;
 use crate::join::by_masks;
 use crate::vote::by_votes;
 use artifacts::{
@@ -594,7 +595,10 @@ fn write_outputs(
         write_instance_plys(folder, gaussians, instances, &comments)?;
     }
     let matched = instances.support.iter().filter(|&&s| s > 0).count();
+    let health = Health::of(instances, &inputs.footprints, &inputs.graph.kept, &a.levels());
+    health.say(stage);
     let summary = json!({
+        "largest_share": health.largest, "mask_purity": health.purity,
         "instances": instances.len(), "noise": noise, "matched": matched, "matches": instances.matches.len(),
         "clustering_seconds": clustering_seconds,
     });
