@@ -9,7 +9,7 @@ export THREADS
 # Stages at a time, where many scenes are run.
 JOBS ?= $(shell nproc)
 
-.PHONY: help build demo scene lerf-ovs scannet granularity check-data reproduce-check batch snakemake test lint models clip-tiny bench stress bench-raster bench-graph bench-geom bench-growth bench-memory bench-train bench-cluster bench-cluster-graph bench-query bench-granularity ablation fault-test fuzz dist clean
+.PHONY: help build demo scene lerf-ovs scannet granularity check-data reproduce-check batch snakemake test lint models clip-tiny bench stress bench-raster bench-graph bench-geom bench-growth bench-memory bench-train bench-cluster bench-cluster-graph bench-query bench-granularity real-masks ablation fault-test fuzz dist clean
 
 help: ## Say what can be made
 	@echo "Targets:"
@@ -156,6 +156,10 @@ ablation: ## make granularity with the tables of docs/accuracy.md filled: out/ab
 
 bench-granularity: build ## Measure synthetic masks beside real ones (MASKS=folder FOOTPRINTS=file): out/bench/granularity.md
 	scripts/bench_granularity.sh
+
+SCENES ?=
+real-masks: build ## Score instances from a real SAM's masks of scenes with exact truth: out/real-masks (hours; SCENES=kitchen-10,room-10)
+	scripts/real_masks.py $(if $(SCENES),--scenes $(SCENES)) $(if $(PHOTOGRAPHS),--photographs $(PHOTOGRAPHS))
 
 dist: ## Pack the programs with manual pages and completions: out/dist
 	scripts/dist.sh
