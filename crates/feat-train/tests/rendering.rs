@@ -24,7 +24,6 @@ fn footprints_give_what_rendering_and_averaging_give() {
     let found = rendering::View::new(&s.positions, 60.0, 160, 120).compare(&context, &model, 1);
     eprintln!("{found:?}");
     assert!(found.centroids <= 1e-5 && found.loss <= 1e-5 && found.gradients <= 1e-5, "{found:?}");
-    assert!(found.engine > 0.0 && found.rendering > found.engine, "{found:?}");
     // The synthetic views of the benchmark are of the size that they promise.
     let views = s.views(&context, 1);
     assert!((60..=100).contains(&views[0].len()) && views[0].columns.len() > 60 * 60 / 6);
