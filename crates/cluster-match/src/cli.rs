@@ -5,7 +5,6 @@
 use crate::associate::{FeatureTable, Silhouette, matches, overlaps};
 use crate::describe::{Aggregate, describe};
 use crate::extend::from_nearest;
-
 use crate::group::{Distance, Space, group, group_sample, tree};
 use crate::health::Health;
 use crate::join::by_masks;
