@@ -26,4 +26,4 @@ include pipelines/stages.mk
 
 synth_OPTIONS := $(SYNTH_ARGS)
 $(SCENE_FILES): $(OPTIONS)/synth | $(BIN)/synth-scene
-	$(BIN)/synth-scene --out $(SCENE) $(SYNTH_ARGS) $(COMMON)
+	$(BIN)/synth-scene --out $(SCENE) --overwrite $(SYNTH_ARGS) $(COMMON)

@@ -19,7 +19,9 @@ pub use footprints::{Footprints, FootprintsBuilder, PixelSamples, Row, ScratchEn
 pub use graph::Graph;
 pub use instances::{Family, Instances, Match, OrientedBox, TreeEdge};
 pub use lerf_ovs::{LERF_OVS, LerfScene};
-pub use masks::{LEVELS, Level, MaskFeatures, MaskMaps, features_path, hash_folder, maps_path, stems, watch_folder};
+pub use masks::{
+    LEVELS, Level, MaskFeatures, MaskMaps, features_path, folder_files, hash_folder, maps_path, stems, watch_folder,
+};
 pub use nyu40::NYU40;
 pub use palette::{NOISE_COLOR, instance_color};
 pub use truth::{MaskTruth, TrueObject, TruePart, TruePoints, TrueScene};
@@ -34,6 +36,10 @@ pub mod role {
     pub const MASKS: &str = "masks";
     /// All mask features (`*_f.npy`) of a masks folder.
     pub const MASK_FEATURES: &str = "mask-features";
+    /// `image.onnx` of the CLIP pair that made the mask features.
+    pub const CLIP: &str = "clip";
+    /// `text.onnx` of the same pair.
+    pub const CLIP_TEXT: &str = "clip-text";
     /// `graph.safetensors`.
     pub const GRAPH: &str = "graph";
     /// `footprints.safetensors`.

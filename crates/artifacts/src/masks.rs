@@ -74,6 +74,15 @@ fn with_suffix(folder: &Path, suffix: &str) -> Result<Vec<String>> {
     Ok(found)
 }
 
+/// The files of a masks folder that end in `suffix` (`_s.npy` or `_f.npy`), sorted by stem.
+///
+/// # Errors
+/// When the folder cannot be read.
+pub fn folder_files(folder: impl AsRef<Path>, suffix: &str) -> Result<Vec<PathBuf>> {
+    let folder = folder.as_ref();
+    Ok(with_suffix(folder, suffix)?.into_iter().map(|stem| folder.join(stem + suffix)).collect())
+}
+
 /// One hash for all files of a masks folder that end in `suffix` (`_s.npy` or `_f.npy`): of names and contents.
 ///
 /// # Errors
@@ -90,8 +99,7 @@ pub fn hash_folder(folder: impl AsRef<Path>, suffix: &str) -> Result<String> {
 /// # Errors
 /// When the folder cannot be read.
 pub fn watch_folder(folder: impl AsRef<Path>, suffix: &str) -> Result<Watched> {
-    let folder = folder.as_ref();
-    Ok(Watched::new(with_suffix(folder, suffix)?.into_iter().map(|s| folder.join(s + suffix))))
+    Ok(Watched::new(folder_files(folder, suffix)?))
 }
 
 /// The id maps of one view.

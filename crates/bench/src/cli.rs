@@ -3,7 +3,7 @@
 use crate::chain::{Programs, STAGES};
 use crate::plan::Plan;
 use crate::{compare, growth, page, tradeoff};
-use gs_io::{Error, Result, create_dir, write_bytes};
+use gs_io::{Claim, Error, Result, create_dir, write_bytes};
 use serde::Serialize;
 use serde_json::json;
 use stage::{CommonArgs, Stage};
@@ -102,6 +102,11 @@ fn programs(folder: &Path, threads: usize) -> Result<Programs> {
     Err(Error::new("no programs here").file(folder).expected("gs-geom and the other stages").hint("run make build"))
 }
 
+/// The right to write the results: JSON, and the same as Markdown and HTML beside it.
+fn claim(out: &Path, stage: &Stage) -> Result<Claim> {
+    stage.outputs(out).file(out).files(["md", "html"].map(|extension| out.with_extension(extension))).claim()
+}
+
 fn write(out: &Path, value: &impl Serialize) -> Result<()> {
     let text = serde_json::to_vec_pretty(value).map_err(|e| Error::new(e.to_string()).file(out))?;
     write_bytes(out, &text)
@@ -111,6 +116,7 @@ fn tradeoffs(a: &TradeoffArgs, threads: usize, stage: &Stage) -> Result<()> {
     let c = &a.common;
     let plan = Plan::read(&a.plan)?;
     let programs = programs(&c.bin, threads)?;
+    let mut claim = claim(&c.out, stage)?;
     create_dir(&c.work)?;
     let names: Vec<&str> = plan.knobs.iter().map(|k| &*k.name).chain(plan.axes.iter().map(|x| &*x.name)).collect();
     if let Some(unknown) = a.only.iter().find(|o| !names.contains(&o.as_str())) {
@@ -140,22 +146,25 @@ fn tradeoffs(a: &TradeoffArgs, threads: usize, stage: &Stage) -> Result<()> {
     let subtitle = format!("{} runs of each, {threads} threads", plan.repeats);
     write_bytes(c.out.with_extension("html"), page::html(&curves, &grown, &subtitle).as_bytes())?;
     let summary = json!({"curves": curves.len(), "dominated": page::warnings(&curves).len()});
-    stage.record(&c.out, json!({"command": "tradeoff"}), BTreeMap::new(), summary)
+    stage.record(&mut claim, json!({"command": "tradeoff"}), BTreeMap::new(), summary)
 }
 
 fn comparison(a: &CompareArgs, threads: usize, stage: &Stage) -> Result<()> {
     let c = &a.common;
     let plan = Plan::read(&a.plan)?;
+    let mut claim = claim(&c.out, stage)?;
     let all = compare::compare(&programs(&a.base, threads)?, &programs(&c.bin, threads)?, &plan, &c.work)?;
     let (head, rows) = page::compare_table(&all);
     let text = page::markdown(&head, &rows);
     text.lines().for_each(|l| stage.info(l));
     write(&c.out, &all)?;
-    write_bytes(c.out.with_extension("md"), text.as_bytes())
+    write_bytes(c.out.with_extension("md"), text.as_bytes())?;
+    stage.record(&mut claim, json!({"command": "compare"}), BTreeMap::new(), json!({}))
 }
 
 fn stress(a: &StressArgs, threads: usize, stage: &Stage) -> Result<()> {
     let c = &a.common;
+    let mut claim = claim(&c.out, stage)?;
     create_dir(&c.work)?;
     let rows = crate::stress::run(&programs(&c.bin, threads)?, &c.work, &a.only, &|name| stage.info(name))?;
     write(&c.out, &rows)?;
@@ -163,6 +172,12 @@ fn stress(a: &StressArgs, threads: usize, stage: &Stage) -> Result<()> {
     write_bytes(c.out.with_extension("md"), text.as_bytes())?;
     write_bytes(c.out.with_extension("html"), page.as_bytes())?;
     let bad: Vec<_> = rows.iter().filter(|r| !r.good).collect();
+    stage.record(
+        &mut claim,
+        json!({"command": "stress"}),
+        BTreeMap::new(),
+        json!({"cells": rows.len(), "bad": bad.len()}),
+    )?;
     stage.info(&format!("{} of {} cells are good", rows.len() - bad.len(), rows.len()));
     match bad.first() {
         None => Ok(()),

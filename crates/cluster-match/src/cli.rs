@@ -14,7 +14,7 @@ use artifacts::{
     instance_color, maps_path, role,
 };
 use clap::Parser;
-use gs_io::{Error, IoContext, Lock, Result, Watched, hash_file, write_bytes};
+use gs_io::{Claim, Error, IoContext, Provenance, Result, Watched, hash_file, write_bytes};
 use gs_raster::RasterOptions;
 use gs_scene::dataset::{self, LoadOptions, Resolution, View};
 use gs_scene::{Gaussians, Geometry, SH_C0, ply};
@@ -201,9 +201,7 @@ fn read_inputs(a: &Args, stage: &Stage) -> Result<Inputs> {
     graph_file.expect_input(role::GEOMETRY, &geometry_hash)?;
     footprints.artifact().expect_input(role::GEOMETRY, &geometry_hash)?;
     footprints.artifact().expect_input(role::MASKS, &masks)?;
-    // The hold-out is part of what the dataset was: it is read as the graph's stage read it.
-    let holdout = graph_file.provenance().parameters["holdout"].as_u64().unwrap_or(0) as usize;
-    let dataset = dataset::load(&a.scene, &LoadOptions { resolution: Resolution::Divisor(1.0), holdout })?;
+    let dataset = dataset::load(&a.scene, &LoadOptions { resolution: Resolution::Divisor(1.0), holdout: 0 })?;
     dataset.warnings.iter().for_each(|w| stage.warn(w));
     let dataset_hash = dataset.hash()?;
     graph_file.expect_input(role::DATASET, &dataset_hash)?;
@@ -247,7 +245,7 @@ fn read_inputs(a: &Args, stage: &Stage) -> Result<Inputs> {
         })
     });
     let views = views.collect::<Result<_>>()?;
-    let hashes = BTreeMap::from([
+    let mut hashes = BTreeMap::from([
         (role::GEOMETRY.into(), geometry_hash),
         (role::DATASET.into(), dataset_hash),
         (role::GRAPH.into(), graph_file.hash().into()),
@@ -256,7 +254,31 @@ fn read_inputs(a: &Args, stage: &Stage) -> Result<Inputs> {
         (role::MASKS.into(), masks),
         (role::MASK_FEATURES.into(), artifacts::hash_folder(&a.masks, "_f.npy")?),
     ]);
+    hashes.extend(model_of_features(&a.masks, &hashes[role::MASKS])?);
     Ok(Inputs { geometry, graph, footprints, features, views, hashes })
+}
+
+/// Which CLIP model made the features of the masks, as far as `features.json` of mask-embed says it.
+///
+/// # Errors
+/// When the features are of other id maps.
+fn model_of_features(folder: &Path, masks: &str) -> Result<BTreeMap<String, String>> {
+    let manifest = folder.join("features.json");
+    // Features that another program made have none.
+    if !manifest.exists() {
+        return Ok(BTreeMap::new());
+    }
+    let bytes = std::fs::read(&manifest).at("read", &manifest)?;
+    let known: Provenance = serde_json::from_slice(&bytes).map_err(|e| {
+        Error::new(format!("not a manifest of mask features: {e}")).file(&manifest).hint("run mask-embed embed again")
+    })?;
+    if known.inputs.get(role::MASKS).is_some_and(|m| m != masks) {
+        return Err(Error::new("the id maps were changed after their features were made")
+            .file(&manifest)
+            .field("inputs.masks")
+            .hint("run mask-embed embed again"));
+    }
+    Ok(known.inputs.into_iter().filter(|(role, _)| [role::CLIP, role::CLIP_TEXT].contains(&role.as_str())).collect())
 }
 
 /// The first few of many names.
@@ -312,13 +334,8 @@ fn options(c: &ClusteringArgs, n: usize) -> Result<Options> {
     })
 }
 
-fn run(a: &Args, stage: &Stage) -> Result<()> {
-    let (c, m) = (&a.clustering, &a.matching);
-    // Options that no scene can mend are refused before anything is read.
-    options(c, 0)?;
-    if !(0.0..=1.0).contains(&m.threshold) {
-        return Err(Error::new("impossible option").field("--threshold").found(m.threshold).expected("0 to 1"));
-    }
+/// The right to write the instances and what lies beside them.
+fn claim(a: &Args, stage: &Stage) -> Result<Claim> {
     if let Some(taken) = SIDE_FILES.iter().find(|e| a.out.with_extension(e) == a.out) {
         return Err(Error::new("another output has this name")
             .file(&a.out)
@@ -326,7 +343,28 @@ fn run(a: &Args, stage: &Stage) -> Result<()> {
             .found(format!(".{taken}"))
             .expected("a name such as instances.safetensors"));
     }
-    let _lock = Lock::take(&a.out)?;
+    let mut maps = Vec::new();
+    for suffix in ["_s.npy", "_f.npy"] {
+        maps.extend(artifacts::folder_files(&a.masks, suffix)?);
+    }
+    let outputs = stage
+        .outputs(&a.out)
+        .artifact(&a.out, Instances::FORMAT)
+        .files(SIDE_FILES.map(|extension| a.out.with_extension(extension)))
+        .reads([&a.geometry, &a.graph, &a.footprints, &a.features])
+        .reads(maps)
+        .drop_stale();
+    a.per_instance_plys.iter().fold(outputs, |outputs, folder| outputs.folder(folder)).claim()
+}
+
+fn run(a: &Args, stage: &Stage) -> Result<()> {
+    let (c, m) = (&a.clustering, &a.matching);
+    // Options that no scene can mend are refused before anything is read.
+    options(c, 0)?;
+    if !(0.0..=1.0).contains(&m.threshold) {
+        return Err(Error::new("impossible option").field("--threshold").found(m.threshold).expected("0 to 1"));
+    }
+    let mut claim = claim(a, stage)?;
     let mut watched = Watched::new([&a.geometry]);
     for suffix in ["_s.npy", "_f.npy"] {
         watched = watched.and(artifacts::watch_folder(&a.masks, suffix)?);
@@ -388,7 +426,7 @@ fn run(a: &Args, stage: &Stage) -> Result<()> {
     let described = describe(means, labels, instances, matches, views, &features, m.aggregate, tree);
     let instances = Instances { node: nodes, ..described };
     watched.check()?;
-    write_outputs(a, stage, &inputs, &instances, &options, (noise, clustering_seconds))
+    write_outputs(a, stage, &inputs, &instances, &options, (noise, clustering_seconds), &mut claim)
 }
 
 /// Moves Gaussians between instances and joins instances as the masks say. Takes the number of instances and their clusters;
@@ -531,8 +569,7 @@ fn readable(instances: &Instances, parameters: &Value) -> Value {
     })
 }
 
-/// One PLY per instance, `instance_0000.ply` on. Those of an earlier run with more instances would be taken for this one's,
-/// so they are removed.
+/// One PLY per instance, `instance_0000.ply` on.
 fn write_instance_plys(folder: &Path, g: &Gaussians, instances: &Instances, comments: &[String]) -> Result<()> {
     let mut members = vec![Vec::new(); instances.len()];
     for (i, &label) in instances.label.iter().enumerate() {
@@ -543,9 +580,6 @@ fn write_instance_plys(folder: &Path, g: &Gaussians, instances: &Instances, comm
     let path = |k: usize| folder.join(format!("instance_{k:04}.ply"));
     for (k, own) in members.iter().enumerate() {
         ply::write_gaussians(path(k), &g.select(own), comments)?;
-    }
-    for stale in (members.len()..).map(path).take_while(|p| p.is_file()) {
-        std::fs::remove_file(&stale).at("remove", &stale)?;
     }
     Ok(())
 }
@@ -560,6 +594,7 @@ fn write_outputs(
     instances: &Instances,
     options: &Options,
     (noise, clustering_seconds): (usize, f64),
+    claim: &mut Claim,
 ) -> Result<()> {
     let (c, m) = (&a.clustering, &a.matching);
     let lower = |v: &dyn std::fmt::Debug| format!("{v:?}").to_lowercase();
@@ -601,7 +636,7 @@ fn write_outputs(
         "instances": instances.len(), "noise": noise, "matched": matched, "matches": instances.matches.len(),
         "clustering_seconds": clustering_seconds,
     });
-    stage.record(&a.out, parameters.clone(), inputs.hashes.clone(), summary)?;
+    stage.record(claim, parameters.clone(), inputs.hashes.clone(), summary)?;
     // The artifact comes last: where it is new, so is everything beside it.
     instances.write(&a.out, stage.provenance(Instances::FORMAT, 1, parameters, inputs.hashes.clone()))?;
     stage.info(&format!("wrote {}: {} instances, {matched} matched with masks", a.out.display(), instances.len()));

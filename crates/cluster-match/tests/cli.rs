@@ -212,7 +212,7 @@ impl Scene {
     fn fail(&self, extra: &[&str], needles: &[&str]) {
         let out = self.path("out/instances.safetensors");
         std::fs::write(&out, "good").unwrap();
-        let o = self.run(extra);
+        let o = self.run(&[extra, &["--overwrite"]].concat());
         let said = String::from_utf8_lossy(&o.stderr).into_owned();
         assert_eq!(o.status.code(), Some(2), "{said}");
         for needle in needles {
@@ -323,15 +323,20 @@ fn options_do_what_they_say() {
 
     // One PLY per instance, none left from an earlier run.
     let folder = s.path("plys");
-    std::fs::create_dir(&folder).unwrap();
-    std::fs::write(folder.join("instance_0002.ply"), "of an earlier run").unwrap();
+    let plys = ["--per-instance-plys", folder.to_str().unwrap()];
+    assert_eq!(s.succeed(&[&plys[..], &["--level", "medium"]].concat()).0.len(), 1);
+    s.succeed(&plys);
+    assert!(folder.join("instance_0001.ply").exists());
+    s.succeed(&[&plys[..], &["--level", "medium"]].concat());
+    assert!(!folder.join("instance_0001.ply").exists());
     std::fs::write(folder.join("mine.ply"), "mine").unwrap();
-    let (i, _) = s.succeed(&["--per-instance-plys", folder.to_str().unwrap()]);
+    assert_eq!(s.run(&plys).status.code(), Some(2));
+    std::fs::remove_file(folder.join("mine.ply")).unwrap();
+    let (i, _) = s.succeed(&plys);
     for k in 0..2 {
         let own = ply::read_gaussians(folder.join(format!("instance_{k:04}.ply"))).unwrap();
         assert_eq!(own.len(), i.count[k] as usize);
     }
-    assert!(!folder.join("instance_0002.ply").exists() && folder.join("mine.ply").exists());
 
     // Noise: a Gaussian that is like neither thing.
     s.artifacts(|f| f.values[..3].copy_from_slice(&[-4.0, -4.0, 0.0]));

@@ -19,7 +19,7 @@ use artifacts::{Features, role};
 use clap::{Parser, Subcommand};
 use gs_io::{Error, Result, Watched, write_bytes};
 use gs_scene::dataset::{self, Dataset, LoadOptions, Resolution, View};
-use onnx_models::EngineOptions;
+use onnx_models::{ClipImage, ClipText, EngineOptions};
 use serde_json::{Value, json};
 use stage::{CommonArgs, Program, Stage};
 use std::io::Write;
@@ -70,6 +70,13 @@ struct SceneArgs {
 }
 
 impl SceneArgs {
+    /// The files that are read of this scene and of a model of texts.
+    fn files(&self, dataset: &Dataset, language: &LanguageArgs) -> impl Iterator<Item = PathBuf> {
+        let own = [self.instances.clone(), self.geometry.clone()];
+        let texts = [&language.text_features, &language.features].into_iter().flatten().cloned().collect::<Vec<_>>();
+        dataset.files().into_iter().chain(own).chain(texts)
+    }
+
     /// What is known of the memory that this scene takes, before it is read.
     fn sizes(&self, language: &LanguageArgs, views: &[View]) -> Sizes {
         Sizes {
@@ -93,6 +100,9 @@ struct LanguageArgs {
     /// Table of name -> text feature, JSON or npz, instead of --clip
     #[arg(long, value_name = "FILE", conflicts_with = "clip")]
     text_features: Option<PathBuf>,
+    /// Take another CLIP model than the one that encoded the masks, if its features have the same dimension
+    #[arg(long, requires = "clip")]
+    any_model: bool,
     /// Run ONNX models with this ONNX Runtime library instead of the built-in engine
     #[arg(long, value_name = "FILE")]
     onnx_runtime: Option<PathBuf>,
@@ -151,6 +161,31 @@ impl LanguageArgs {
 
     fn source(&self) -> Result<TextSource> {
         TextSource::open(self.clip.as_deref(), self.text_features.as_deref(), &self.engine())
+    }
+
+    /// The source, which must fit the descriptors of a scene.
+    fn source_for(&self, scene: &LabelledScene) -> Result<TextSource> {
+        let source = self.source()?;
+        source.check_dim(scene.instances.dim, scene.path())?;
+        self.check_model(scene)?;
+        Ok(source)
+    }
+
+    /// Checks that the CLIP pair is the one whose other half encoded the masks, as far as the instances know it.
+    fn check_model(&self, scene: &LabelledScene) -> Result<()> {
+        let Some(clip) = self.clip.as_deref().filter(|_| !self.any_model) else { return Ok(()) };
+        let made_with = |role: &str| scene.artifact.provenance().inputs.get(role).cloned();
+        let (image, text) = (made_with(role::CLIP), made_with(role::CLIP_TEXT));
+        let same = |known: &Option<String>, here: Option<String>| known.is_some() && *known == here;
+        let unknown = image.is_none() && text.is_none();
+        if unknown || same(&text, ClipText::hash_in(clip)) || same(&image, ClipImage::hash_in(clip)) {
+            return Ok(());
+        }
+        Err(Error::new("another CLIP model than the one that encoded the masks")
+            .file(clip)
+            .field("--clip")
+            .expected(format!("the model that {} was made with", scene.path().display()))
+            .hint("give that model, run mask-embed embed and cluster-match with this one, or take it as it is with --any-model"))
     }
 
     /// What answers queries about a scene.
@@ -320,6 +355,11 @@ fn run_score(a: &ScoreArgs, stage: &Stage) -> Result<String> {
     let threshold = mask_threshold(a.alpha, a.silhouette)?;
     let dataset = load(&a.scene.scene, &LoadOptions::default(), stage)?;
     let labels = a.labels.clone().unwrap_or_else(|| dataset.root.join("label"));
+    let mut claim = stage
+        .outputs(&a.out)
+        .files([a.out.clone(), a.out.with_extension("things.csv"), a.out.with_extension("queries.csv")])
+        .reads(a.scene.files(&dataset, &a.language))
+        .claim()?;
     let sizes = Sizes {
         truth: memory::bytes(&dataset.root.join("truth/points.safetensors")),
         labels: labels::pixels(&labels),
@@ -347,13 +387,12 @@ fn run_score(a: &ScoreArgs, stage: &Stage) -> Result<String> {
         // Said above.
     } else if scene.instances.dim == 0 {
         let why = "query scores: the instances have no language features, because the masks were not encoded with a \
-                   CLIP model (mask-embed --clip)";
+                   CLIP model (mask-embed embed --clip)";
         scores.skipped.push(why.into());
     } else if no_source {
         scores.skipped.push("query scores: neither --clip nor --text-features was given".into());
     } else {
-        let source = a.language.source()?;
-        source.check_dim(scene.instances.dim, scene.path())?;
+        let source = a.language.source_for(&scene)?;
         let asker = a.language.asker(&scene, Some(source))?;
         let rendering = Rendering { silhouette: a.silhouette, threshold };
         score::score_queries(&scene, &dataset, &labels, &asker, rendering, &mut scores, &mut |w| stage.warn(w))?;
@@ -374,7 +413,7 @@ fn run_score(a: &ScoreArgs, stage: &Stage) -> Result<String> {
         "instance_miou": figure(scores.instance_miou), "label_miou": figure(scores.label_miou), "query_miou": figure(scores.query_miou),
         "query_pairs": scores.query_pairs,
     });
-    stage.record(&a.out, parameters, scene.inputs.clone(), summary)?;
+    stage.record(&mut claim, parameters, scene.inputs.clone(), summary)?;
     Ok(score::table(&scores))
 }
 
@@ -401,9 +440,11 @@ fn run_report(a: &ReportArgs, stage: &Stage) -> Result<String> {
         ..Sizes::default()
     };
     stage.forecast(memory::of_report(&sizes), "give a smaller --resolution")?;
+    let outputs = stage.outputs(&a.out).file(&a.out).file(report::metrics_path(&options));
+    let mut claim = outputs.reads(dataset.files()).reads(report::files(&a.run_dir)).claim()?;
     let mut inputs = std::collections::BTreeMap::new();
     let metrics = report::run(&dataset, &options, &mut inputs)?;
-    stage.record(&a.out, json!({"command": "report"}), inputs, json!({"left_out": metrics.skipped.len()}))?;
+    stage.record(&mut claim, json!({"command": "report"}), inputs, json!({"left_out": metrics.skipped.len()}))?;
     stage.info(&format!("wrote {}", a.out.display()));
     Ok(report::table(&metrics))
 }

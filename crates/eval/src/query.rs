@@ -5,7 +5,7 @@ use crate::lerf::Rendering;
 use crate::picture::{HIGHLIGHT, Picture, mask_png};
 use crate::place::Place;
 use crate::ranking::Ranked;
-use crate::scene::{LabelledScene, find_view, slug, spread};
+use crate::scene::{LabelledScene, find_view, numbered, slug, spread};
 use crate::segment::{self, Segment, Segmentation};
 use artifacts::instance_color;
 use gs_io::{Error, Result, write_bytes};
@@ -131,12 +131,9 @@ pub fn write(
     out: &Path,
 ) -> Result<QueryResults> {
     let named: Vec<&View> = options.views.iter().map(|v| find_view(dataset, v)).collect::<Result<_>>()?;
-    let mut names = BTreeSet::new();
     let mut shown = Vec::new();
-    for asked in asked {
-        let base = slug(&asked.name);
-        let numbered = |i: usize| if i == 1 { base.clone() } else { format!("{base}-{i}") };
-        let file = (1..).map(numbered).find(|n| names.insert(n.clone())).unwrap_or_else(|| base.clone());
+    for (number, asked) in (1..).zip(asked) {
+        let file = numbered(number, &asked.name);
         let own = asked.place.as_ref().and_then(|p| p.view.as_deref()).and_then(|v| find_view(dataset, v).ok());
         let mut views =
             if named.is_empty() { best_views(scene, dataset, &asked.answer.selected) } else { named.clone() };
@@ -145,7 +142,6 @@ pub fn write(
         }
         shown.push(Shown { asked, file, views });
     }
-    gs_io::create_dir(out)?;
     for Shown { asked, file, .. } in shown.iter().filter(|s| !s.asked.answer.gaussians.is_empty()) {
         let ids: Vec<String> = asked.answer.selected.iter().map(u32::to_string).collect();
         let text: String = asked.name.chars().map(|c| if c.is_control() { ' ' } else { c }).collect();
@@ -168,7 +164,7 @@ pub fn write(
         let Rendering { silhouette, threshold } = options.rendering;
         let masks = silhouette.masks(scene.gaussians(), &scene.raster, &selections, &view.camera, threshold);
         for (&q, mask) in here.iter().zip(&masks) {
-            let stem = format!("{}.{}", shown[q].file, slug_of_view(view));
+            let stem = format!("{}.{}", shown[q].file, view_name(dataset, view));
             let (overlay, mask_file) = (format!("{stem}.overlay.png"), format!("{stem}.mask.png"));
             write_bytes(out.join(&overlay), &photo.highlighted(mask, HIGHLIGHT).png()?)?;
             write_bytes(out.join(&mask_file), &mask_png(mask)?)?;
@@ -206,7 +202,7 @@ fn write_segmentation(
     for view in if named.is_empty() { spread(&all, DEFAULT_VIEWS) } else { named.to_vec() } {
         let image = gs_raster::render(&coloured, &view.camera, &scene.raster);
         let picture = Picture::new(image.width as usize, image.height as usize, &image.rgb);
-        write_bytes(out.join(format!("segmentation.{}.png", slug_of_view(view))), &picture.png()?)?;
+        write_bytes(out.join(format!("segmentation.{}.png", view_name(dataset, view))), &picture.png()?)?;
     }
     let segments = texts.into_iter().zip(instances).enumerate().map(|(t, (text, instances))| Segment {
         gaussians: labels.iter().filter(|&&l| l == t as i32).count(),
@@ -265,9 +261,13 @@ pub fn unwritten(asked: &Asked) -> QueryResult {
     result(asked.name.clone(), asked.kind, None, &asked.answer, None, Vec::new())
 }
 
-/// A view's stem as part of a file name (names of views may hold folders).
-fn slug_of_view(view: &View) -> String {
-    view.stem().chars().map(|c| if c.is_alphanumeric() || "_-.".contains(c) { c } else { '-' }).collect()
+/// A view's stem as part of a file name (names of views may hold folders), with its number where two would be the same.
+fn view_name(dataset: &Dataset, view: &View) -> String {
+    let name = |v: &View| slug(v.stem(), "_.");
+    let own = name(view);
+    let twins = dataset.views.iter().filter(|v| name(v) == own).count();
+    let number = dataset.views.iter().position(|v| v.name == view.name).unwrap_or(0);
+    if twins > 1 { format!("{number:04}-{own}") } else { own }
 }
 
 /// Views to show a selection in: of those in which its instances were matched with at least half of the best score, a

@@ -127,6 +127,23 @@ pub fn run(dataset: &Dataset, options: &ReportOptions, inputs: &mut BTreeMap<Str
     Ok(metrics)
 }
 
+/// The files of a run that the page tells of.
+pub fn files(run_dir: &Path) -> impl Iterator<Item = PathBuf> {
+    let names = [
+        "geometry.ply",
+        "geom_metrics.json",
+        "geometry.ply.curve.jsonl",
+        "graph.safetensors",
+        "footprints.safetensors",
+        "features.safetensors",
+        "features.safetensors.curve.jsonl",
+        "instances.safetensors",
+        "score.json",
+        "query/query.json",
+    ];
+    names.map(|name| run_dir.join(name)).into_iter()
+}
+
 /// `metrics.json` beside the page.
 pub fn metrics_path(options: &ReportOptions) -> PathBuf {
     options.out.with_file_name("metrics.json")

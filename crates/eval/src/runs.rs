@@ -142,7 +142,7 @@ mod tests {
         let dir = tempfile::tempdir().unwrap();
         let sub = dir.path().join("query");
         let none = BTreeMap::new();
-        for (stage, command, output) in [
+        for (program, command, output) in [
             ("eval", "query", sub.join("query.json")),
             ("eval", "report", dir.path().join("report.html")),
             ("gs-geom", "train", dir.path().join("geometry.ply")),
@@ -152,7 +152,9 @@ mod tests {
         ] {
             let p = if command.is_empty() { json!({"k": 16}) } else { json!({"command": command}) };
             let summary = json!({"gaussians": 12345, "psnr": 26.54321, "list": [1]});
-            Stage::silent(stage).record(output, p, none.clone(), summary).unwrap();
+            let stage = Stage::silent(program);
+            let mut claim = stage.outputs(output).claim().unwrap();
+            stage.record(&mut claim, p, none.clone(), summary).unwrap();
         }
         let runs = read_all(&[dir.path(), &sub, Path::new("/no/such")], &dir.path().join("report.html")).unwrap();
         let names: Vec<String> = runs.iter().map(|r| format!("{}: {}", r.name(), r.output)).collect();

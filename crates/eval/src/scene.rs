@@ -59,22 +59,15 @@ impl LabelledScene {
         self.artifact.path()
     }
 
-    /// Checks that the dataset can be the one the instances were made from: it has views that they name.
+    /// Checks that the dataset is the one that the instances were made from.
     ///
     /// # Errors
-    /// When it has none of them.
+    /// When it has other photographs, cameras or points, or a photograph cannot be read.
     pub fn check_dataset(&self, dataset: &Dataset) -> Result<()> {
-        let named = &self.instances.views;
-        let has = |name: &String| dataset.views.iter().any(|v| v.stem() == name);
-        match named.first() {
-            Some(first) if !named.iter().any(has) => Err(Error::new("the instances are of another scene")
-                .file(self.path())
-                .field("views")
-                .found(format!("{first} and {} more", named.len() - 1))
-                .expected(format!("views of {}", dataset.root.display()))
-                .hint("give the scene that the instances were made from")),
-            _ => Ok(()),
-        }
+        self.artifact.expect_input(role::DATASET, &dataset.hash()?).map_err(|e| {
+            e.expected(format!("the photographs, cameras and points of {}", dataset.root.display()))
+                .hint("give the scene that the instances were made from, or run make again if it was edited")
+        })
     }
 }
 
@@ -100,11 +93,24 @@ pub fn spread<T: Copy>(all: &[T], count: usize) -> Vec<T> {
     (0..k).map(|i| all[(2 * i + 1) * n / (2 * k)]).collect()
 }
 
-/// A text as part of a file name: small letters and digits, everything else a hyphen.
-pub fn slug(text: &str) -> String {
-    let words: String = text.to_lowercase().chars().map(|c| if c.is_alphanumeric() { c } else { ' ' }).collect();
-    let joined = words.split_whitespace().collect::<Vec<_>>().join("-");
-    if joined.is_empty() { "query".into() } else { joined.chars().take(80).collect() }
+/// Most bytes of a name that is made of a text.
+const LONGEST_NAME: usize = 100;
+
+/// A text as part of a file name of at most [`LONGEST_NAME`] bytes: letters, digits and what is in `also`; everything else is
+/// a hyphen.
+pub fn slug(text: &str, also: &str) -> String {
+    let kept = |c: char| if c.is_alphanumeric() || also.contains(c) { c } else { ' ' };
+    let words: String = text.chars().map(kept).collect();
+    let mut joined = words.split_whitespace().collect::<Vec<_>>().join("-");
+    joined.truncate((0..=LONGEST_NAME).rfind(|&n| joined.is_char_boundary(n)).unwrap_or(0));
+    if joined.is_empty() { "query".into() } else { joined }
+}
+
+/// The file name of the answer to a text, number first: no two are the same, and none is a name that means something else.
+pub fn numbered(number: usize, text: &str) -> String {
+    let mut name = format!("{number:02}-{}", slug(&text.to_lowercase(), ""));
+    name.truncate((0..=LONGEST_NAME).rfind(|&n| name.is_char_boundary(n)).unwrap_or(0));
+    name
 }
 
 #[cfg(test)]
@@ -121,8 +127,14 @@ mod tests {
 
     #[test]
     fn slugs_are_file_names() {
-        assert_eq!(slug("Rubik's  cube/..\\x"), "rubik-s-cube-x");
-        assert_eq!(slug("../"), "query");
-        assert_eq!(slug(&"é".repeat(200)).chars().count(), 80);
+        assert_eq!(slug("Rubik's  cube/..\\x", ""), "Rubik-s-cube-x");
+        assert_eq!(slug("cam0/IMG_1.a", "_."), "cam0-IMG_1.a");
+        assert_eq!(slug("../", ""), "query");
+        for text in ["é".repeat(200), "x".repeat(300), "日本".repeat(90)] {
+            let name = numbered(1234, &text);
+            assert!(name.len() <= 100 && name.len() > 96 && name.starts_with("1234-"), "{name}");
+        }
+        assert_eq!(numbered(1, "Coffee mug"), "01-coffee-mug");
+        assert_ne!(numbered(1, "coffee mug"), numbered(2, "Coffee, mug!"));
     }
 }

@@ -136,7 +136,7 @@ impl TextSource {
         let e = |what: &str| Error::new(what).file(instances).field("descriptor").found(format!("dimension {dim}"));
         if dim == 0 {
             return Err(e("the instances have no language features")
-                .hint("run mask-embed with --clip (or add *_f.npy to the masks folder), then cluster-match again"));
+                .hint("run mask-embed embed --clip (or add *_f.npy to the masks folder), then cluster-match again"));
         }
         if dim != self.dim() {
             return Err(e("the text features are of another model than the masks'")

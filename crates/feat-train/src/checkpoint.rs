@@ -4,7 +4,7 @@ use crate::train::CurvePoint;
 use gs_io::{Artifact, ArtifactWriter, Error, Provenance, Result};
 use std::path::{Path, PathBuf};
 
-const FORMAT: &str = "feat-train-checkpoint";
+pub(crate) const FORMAT: &str = "feat-train-checkpoint";
 const VERSION: u32 = 2;
 const NAMES: [&str; 6] = ["features", "weights", "mean", "square", "weights_mean", "weights_square"];
 

@@ -15,7 +15,7 @@ use crate::spectral::{SpectralOptions, spectral};
 use crate::train::{CurvePoint, TrainOptions, train};
 use artifacts::{Features, Footprints, Graph, Level, Row, role};
 use clap::ValueEnum;
-use gs_io::{Error, Lock, Result, Watched, hash_file, write_bytes};
+use gs_io::{Error, Result, Watched, hash_file, write_bytes};
 use gs_scene::{Geometry, SH_C0};
 use serde_json::{Value, json};
 use stage::curve::{self, Panel};
@@ -445,17 +445,23 @@ const TRAINING: [Panel; 4] = [
 /// Panel of the picture of a closed form.
 const SPECTRUM: [Panel; 1] = [("singular_value", "singular values", "#1f77b4")];
 
+/// What lies beside the output: the curve, and its plot.
+const CURVE: &str = ".curve.jsonl";
+const PLOT: &str = ".curve.svg";
+
+/// `<output><suffix>`.
+fn beside(output: &Path, suffix: &str) -> PathBuf {
+    let mut name = output.as_os_str().to_owned();
+    name.push(suffix);
+    name.into()
+}
+
 /// Writes `<out>.curve.jsonl` and its picture, `<out>.curve.svg`.
 fn write_curve(out: &Path, points: impl Iterator<Item = Value>, panels: &[Panel]) -> Result<()> {
-    let beside = |suffix: &str| {
-        let mut name = out.as_os_str().to_owned();
-        name.push(suffix);
-        PathBuf::from(name)
-    };
     let lines: Vec<String> = points.map(|p| p.to_string()).collect();
     let text: String = lines.iter().map(|l| format!("{l}\n")).collect();
-    write_bytes(beside(".curve.jsonl"), text.as_bytes())?;
-    write_bytes(beside(".curve.svg"), curve::svg(&lines, panels).as_bytes())
+    write_bytes(beside(out, CURVE), text.as_bytes())?;
+    write_bytes(beside(out, PLOT), curve::svg(&lines, panels).as_bytes())
 }
 
 impl Program for Args {
@@ -467,7 +473,13 @@ impl Program for Args {
 
     fn run(self, stage: &Stage) -> Result<()> {
         self.check()?;
-        let _lock = Lock::take(&self.out)?;
+        let mut claim = stage
+            .outputs(&self.out)
+            .artifact(&self.out, Features::FORMAT)
+            .artifact(checkpoint::path(&self.out), checkpoint::FORMAT)
+            .files([CURVE, PLOT].map(|suffix| beside(&self.out, suffix)))
+            .reads([&self.geometry, &self.graph, &self.footprints])
+            .claim()?;
         let watched = Watched::new([&self.geometry]);
         let inputs = self.read_inputs()?;
         let sizes = memory::Sizes {
@@ -501,7 +513,7 @@ impl Program for Args {
         features.write(&self.out, stage.provenance("", 0, parameters.clone(), inputs.hashes.clone()))?;
         // The run is done: what is left of it must not be mistaken for an unfinished one.
         let _ = std::fs::remove_file(checkpoint::path(&self.out));
-        stage.info(&format!("features of {} Gaussians, {dim} numbers each", features.kept.len()));
-        stage.record(&self.out, parameters, inputs.hashes, summary)
+        stage.info(&format!("features of {} Gaussians, {dim} dimensions", features.kept.len()));
+        stage.record(&mut claim, parameters, inputs.hashes, summary)
     }
 }

@@ -226,12 +226,15 @@ fn a_killed_run_continues_to_the_same_bytes() {
     child.kill().unwrap();
     child.wait().unwrap();
     assert!(!out.exists(), "the run ended before it could be killed");
+    let mut unfinished = std::fs::read(&checkpoint).unwrap();
     let output = run(dir.path(), &out, &args);
     assert!(String::from_utf8_lossy(&output.stderr).contains("continuing from iteration"));
     assert!(whole == std::fs::read(&out).unwrap());
     assert!(curve == std::fs::read(beside(&out, ".curve.jsonl")).unwrap());
     // A checkpoint of other parameters is not used, nor is a damaged one.
-    std::fs::write(&checkpoint, "no checkpoint").unwrap();
+    let middle = unfinished.len() / 2;
+    unfinished[middle] ^= 1;
+    std::fs::write(&checkpoint, &unfinished).unwrap();
     let output = run(dir.path(), &out, &args);
     assert!(String::from_utf8_lossy(&output.stderr).contains("starting anew"));
     assert!(whole == std::fs::read(&out).unwrap());
@@ -270,7 +273,7 @@ fn bad_input_is_one_line_and_leaves_the_output_alone() {
     let (dir, out) = setup();
     std::fs::write(&out, "good").unwrap();
     let fail = |extra: &[&str], needles: &[&str]| {
-        let output = run(dir.path(), &out, extra);
+        let output = run(dir.path(), &out, &[extra, &["--overwrite"]].concat());
         let said = String::from_utf8_lossy(&output.stderr).into_owned();
         assert_eq!(output.status.code(), Some(2), "{said}");
         for needle in needles {

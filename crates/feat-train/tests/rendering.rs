@@ -1,6 +1,7 @@
 //! The iteration on footprints gives what rendering and averaging give.
 
 #[path = "../benches/rendering.rs"]
+#[allow(dead_code)] // Seconds are the benchmark's.
 mod rendering;
 #[path = "../benches/scene.rs"]
 #[allow(dead_code)] // The benchmark has more scenes.

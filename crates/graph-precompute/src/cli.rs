@@ -4,8 +4,8 @@
 
 use crate::graph::{GraphOptions, Space};
 use crate::precompute::{Options, precompute};
-use artifacts::{ScratchEntries, role};
-use gs_io::{Error, Lock, Result, Watched, hash_file};
+use artifacts::{Footprints, Graph, ScratchEntries, role};
+use gs_io::{Error, Result, Watched, hash_file};
 use gs_scene::Geometry;
 use gs_scene::dataset::{self, LoadOptions, Resolution, Split, View};
 use serde_json::{Value, json};
@@ -165,11 +165,18 @@ impl Program for Args {
 
     fn run(self, stage: &Stage) -> Result<()> {
         let options = self.options()?;
-        let _locks = [Lock::take(&self.graph)?, Lock::take(&self.footprints)?];
-        let watched = Watched::new([&self.geometry]).and(artifacts::watch_folder(&self.masks, "_s.npy")?);
         // The id maps' own size decides the resolution, so photographs count at full size.
         let load = LoadOptions { resolution: Resolution::Divisor(1.0), holdout: self.holdout };
         let dataset = dataset::load(&self.scene, &load)?;
+        let masks = dataset.views.iter().map(|v| artifacts::maps_path(&self.masks, v.stem()));
+        let mut claim = stage
+            .outputs(&self.graph)
+            .main(&self.footprints)
+            .artifact(&self.graph, Graph::FORMAT)
+            .artifact(&self.footprints, Footprints::FORMAT)
+            .reads(dataset.files().into_iter().chain(masks).chain([self.geometry.clone()]))
+            .claim()?;
+        let watched = Watched::new([&self.geometry]).and(artifacts::watch_folder(&self.masks, "_s.npy")?);
         for warning in &dataset.warnings {
             stage.warn(warning);
         }
@@ -222,10 +229,6 @@ impl Program for Args {
                 summary.largest_cut
             ));
         }
-        let summary = json!(summary);
-        for output in [&self.footprints, &self.graph] {
-            stage.record(output, self.parameters(), inputs.clone(), summary.clone())?;
-        }
-        Ok(())
+        stage.record(&mut claim, self.parameters(), inputs, json!(summary))
     }
 }

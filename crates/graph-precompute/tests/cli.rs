@@ -120,7 +120,7 @@ fn bad_input_is_one_line_and_leaves_outputs_alone() {
         std::fs::write(o.join(f), "good").unwrap();
     }
     let fail = |extra: &[&str], needles: &[&str]| {
-        let out = run(&s, &o, extra);
+        let out = run(&s, &o, &[extra, &["--overwrite"]].concat());
         let said = String::from_utf8_lossy(&out.stderr).into_owned();
         assert_eq!(out.status.code(), Some(2), "{said}");
         for needle in needles {

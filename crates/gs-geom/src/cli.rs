@@ -9,7 +9,7 @@ mod train;
 
 use crate::masks::{Alpha, Masks};
 use clap::{Parser, Subcommand, ValueEnum};
-use gs_io::{Error, Result, create_dir, write_bytes};
+use gs_io::{Error, Result};
 use gs_raster::RasterOptions;
 use gs_scene::Gaussians;
 use gs_scene::dataset::{self, Dataset, LoadOptions, Resolution};
@@ -125,9 +125,13 @@ impl Background {
 const WARNINGS_SAID: usize = 5;
 
 impl SceneArgs {
+    /// The dataset without a word about its warnings.
+    fn load_quietly(&self) -> Result<Dataset> {
+        dataset::load(&self.scene, &LoadOptions { resolution: self.resolution, holdout: self.holdout })
+    }
+
     fn load(&self, stage: &Stage) -> Result<Dataset> {
-        let options = LoadOptions { resolution: self.resolution, holdout: self.holdout };
-        let dataset = dataset::load(&self.scene, &options)?;
+        let dataset = self.load_quietly()?;
         for warning in dataset.warnings.iter().take(WARNINGS_SAID) {
             stage.warn(warning);
         }
@@ -174,19 +178,6 @@ impl GeometryArgs {
         };
         Ok((gaussians, options))
     }
-}
-
-/// Finds out before the work, not after it, that an output cannot be written.
-fn check_writable(output: &Path) -> Result<()> {
-    if output.is_dir() {
-        return Err(Error::new("a folder is in the way").file(output).expected("the name of a file"));
-    }
-    let folder = output.parent().filter(|p| !p.as_os_str().is_empty()).unwrap_or(Path::new("."));
-    create_dir(folder)?;
-    let probe = beside(output, ".probe");
-    write_bytes(&probe, b"")?;
-    let _ = std::fs::remove_file(probe);
-    Ok(())
 }
 
 /// `<output><suffix>`.

@@ -59,6 +59,11 @@ impl Masks {
         self.0.len()
     }
 
+    /// The files.
+    pub fn files(&self) -> impl Iterator<Item = PathBuf> {
+        self.0.values().cloned()
+    }
+
     /// Whether there are none.
     pub fn is_empty(&self) -> bool {
         self.0.is_empty()

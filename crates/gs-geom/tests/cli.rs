@@ -231,7 +231,7 @@ fn a_stopped_run_goes_on_to_the_same_bytes() {
     // Within a round of views, between densifications, after growth of the degree.
     for last in ["33", "34", "95"] {
         succeeds(&training(&out, &["--stop-after", last]));
-        assert_eq!(dir.names(), ["g.ply.checkpoint", "g.ply.partial.ply"]);
+        assert_eq!(dir.names(), [".g.ply.lock", "g.ply.checkpoint", "g.ply.partial.ply"]);
         assert!(!ply::read_gaussians(dir.path("g.ply.partial.ply")).unwrap().is_empty());
     }
     succeeds(&training(&out, &[]));
@@ -473,7 +473,7 @@ fn bad_input_is_refused_in_one_line() {
     let out = dir.path("g.ply");
     fs::write(&out, "a good geometry").unwrap();
     let train = |scene: &str, more: &[&str]| {
-        refused(&[&["train", "--scene", scene, "--out", &out, "--iterations", "5"], more].concat())
+        refused(&[&["train", "--scene", scene, "--out", &out, "--iterations", "5", "--overwrite"], more].concat())
     };
     let missing = dir.path("missing");
     assert!(train(&missing, &[]).contains("no such folder"));
@@ -500,7 +500,9 @@ fn bad_input_is_refused_in_one_line() {
     let bytes = fs::read(&whole).unwrap();
     fs::write(&cut, &bytes[..bytes.len() - 5]).unwrap();
     assert!(train(scene(), &["--init", &cut]).contains("cut.ply"));
-    assert!(refused(&["eval", "--scene", scene(), "--geometry", &cut, "--out", &out]).contains("cut.ply"));
+    assert!(
+        refused(&["eval", "--scene", scene(), "--geometry", &cut, "--out", &out, "--overwrite"]).contains("cut.ply")
+    );
     assert!(refused(&["render", "--scene", scene(), "--geometry", &missing, "--out", &out]).contains("missing"));
 
     for (option, value) in

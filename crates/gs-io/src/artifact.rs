@@ -301,6 +301,20 @@ impl Artifact {
     }
 }
 
+/// The format of the artifact at `path`, by its header alone; None where it is not an artifact.
+pub(crate) fn format_of(path: &Path) -> Option<String> {
+    let mut file = File::open(path).ok()?;
+    let mut length = [0; 8];
+    file.read_exact(&mut length).ok()?;
+    let length = u64::from_le_bytes(length);
+    let mut header = Vec::new();
+    // safetensors' own bound.
+    (&mut file).take(length.min(100_000_000)).read_to_end(&mut header).ok()?;
+    let metadata: Metadata = serde_json::from_slice(&header).ok()?;
+    let provenance: Provenance = serde_json::from_str(metadata.metadata().as_ref()?.get(KEY)?).ok()?;
+    Some(provenance.format)
+}
+
 fn short(hash: &str) -> &str {
     hash.get(..12).unwrap_or(hash)
 }

@@ -3,7 +3,7 @@
 use crate::{IoContext, Result};
 use std::fs;
 use std::io::{BufWriter, Write};
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
 /// Creates a folder and its parents.
 ///
@@ -13,13 +13,25 @@ pub fn create_dir(dir: impl AsRef<Path>) -> Result<()> {
     fs::create_dir_all(&dir).at("create the folder", &dir)
 }
 
+/// The file that `path` leads to through symbolic links, there or not.
+pub(crate) fn resolve(path: &Path) -> PathBuf {
+    let mut target = path.to_path_buf();
+    // More links than systems follow are a circle.
+    for _ in 0..40 {
+        let Ok(next) = fs::read_link(&target) else { break };
+        target = target.parent().unwrap_or(Path::new(".")).join(next);
+    }
+    target
+}
+
 /// Writes `path` through `fill`: to a temporary name in the same folder, flushed to the disk, then renamed. A crash, a
-/// full disk or an error from `fill` leaves whatever stood at `path` untouched.
+/// full disk or an error from `fill` leaves whatever stood at `path` untouched. A symbolic link stays, and the file that it
+/// leads to is written; a file keeps its permissions.
 ///
 /// # Errors
 /// When the folder cannot be written, when `fill` fails, or when flushing or renaming fails.
 pub fn write_atomic(path: impl AsRef<Path>, fill: impl FnOnce(&mut dyn Write) -> Result<()>) -> Result<()> {
-    let path = path.as_ref();
+    let path = &resolve(path.as_ref());
     let folder = match path.parent() {
         Some(p) if !p.as_os_str().is_empty() => p,
         _ => Path::new("."),
@@ -39,6 +51,9 @@ pub fn write_atomic(path: impl AsRef<Path>, fill: impl FnOnce(&mut dyn Write) ->
     let mut out = BufWriter::with_capacity(1 << 20, file);
     fill(&mut out)?;
     let file = out.into_inner().map_err(std::io::IntoInnerError::into_error).at("write", path)?;
+    if let Ok(old) = fs::metadata(path) {
+        file.as_file().set_permissions(old.permissions()).at("keep the permissions of", path)?;
+    }
     file.as_file().sync_all().at("flush", path)?;
     file.persist(path).map_err(|e| e.error).at("rename into place", path)?;
     // The rename itself lives in the folder: without this a power cut could undo it.
@@ -74,6 +89,24 @@ mod tests {
         assert!(e.is_err());
         assert_eq!(fs::read(&path).unwrap(), b"good");
         assert_eq!(fs::read_dir(dir.path()).unwrap().count(), 1);
+    }
+
+    #[cfg(unix)]
+    #[test]
+    fn links_and_permissions_stay() {
+        use std::os::unix::fs::{PermissionsExt, symlink};
+        let dir = tempfile::tempdir().unwrap();
+        let [real, link, dangling] = ["real", "link", "dangling"].map(|n| dir.path().join(n));
+        fs::write(&real, "old").unwrap();
+        fs::set_permissions(&real, fs::Permissions::from_mode(0o640)).unwrap();
+        symlink("real", &link).unwrap();
+        symlink("new", &dangling).unwrap();
+        write_bytes(&link, b"one").unwrap();
+        write_bytes(&dangling, b"two").unwrap();
+        assert!(link.is_symlink() && dangling.is_symlink());
+        assert_eq!(fs::read(&real).unwrap(), b"one");
+        assert_eq!(fs::metadata(&real).unwrap().permissions().mode() & 0o777, 0o640);
+        assert_eq!(fs::read(dir.path().join("new")).unwrap(), b"two");
     }
 
     #[test]

@@ -3,7 +3,7 @@
 //! Everything a stage does to the file system goes through this crate, so that the promises hold in one place:
 //! an error is one line that names file, field, what was found, what was expected and what to do ([`Error`]);
 //! an output appears whole or not at all ([`write_atomic`]);
-//! one run at a time works on an output ([`Lock`]); inputs that change meanwhile are noticed ([`Watched`]); an artifact says what it was made from ([`artifact`]).
+//! a run writes only what it claimed, and nothing that somebody else made ([`Outputs`]); one run at a time works on an output ([`Lock`]); inputs that change meanwhile are noticed ([`Watched`]); an artifact says what it was made from ([`artifact`]).
 
 pub mod artifact;
 mod atomic;
@@ -11,6 +11,7 @@ mod error;
 mod hash;
 mod lock;
 pub mod npy;
+mod outputs;
 mod watch;
 
 pub use artifact::{Artifact, ArtifactWriter, Provenance};
@@ -18,4 +19,5 @@ pub use atomic::{create_dir, write_atomic, write_bytes};
 pub use error::{Error, IoContext, Result};
 pub use hash::{hash_bytes, hash_file, hash_files};
 pub use lock::Lock;
+pub use outputs::{Claim, Outputs, Written, record_path};
 pub use watch::Watched;

@@ -1,32 +1,29 @@
 //! One run at a time for each output.
 
+use crate::atomic::resolve;
 use crate::{Error, IoContext, Result, create_dir};
 use std::fs::{File, OpenOptions, TryLockError};
+use std::io::Write;
 use std::path::{Path, PathBuf};
 
 /// The right to write an output, held by one process at a time: `.<name>.lock` beside it, locked by the operating system,
-/// which takes the lock back however the process ends.
+/// which takes the lock back however the process ends. A signed one that is left behind says whose run was cut off.
 #[derive(Debug)]
 pub struct Lock {
     /// None where the file system knows no locks.
     held: Option<(File, PathBuf)>,
+    keep: bool,
 }
 
 impl Lock {
-    /// Takes the right to write `output` (a file or a folder) and whatever is named after it, and removes what killed
-    /// runs left of it: `.<name>.*.partial`.
+    /// Takes the right to write `output` (a file or a folder) and whatever is named after it.
     ///
     /// # Errors
     /// When another process holds it, or the folder cannot be written.
     pub fn take(output: impl AsRef<Path>) -> Result<Self> {
         let output = output.as_ref();
-        let folder = match output.parent() {
-            Some(p) if !p.as_os_str().is_empty() => p,
-            _ => Path::new("."),
-        };
-        create_dir(folder)?;
-        let name = output.file_name().unwrap_or_default().to_string_lossy();
-        let path = folder.join(format!(".{name}.lock"));
+        let path = Self::path(output);
+        create_dir(path.parent().unwrap_or(Path::new(".")))?;
         let open = || OpenOptions::new().write(true).create(true).truncate(false).open(&path);
         let file = loop {
             let file = open().at("create", &path)?;
@@ -39,23 +36,47 @@ impl Lock {
                         .file(output)
                         .hint("wait until it ends, or stop it; then run this again"));
                 }
-                Err(TryLockError::Error(_)) => return Ok(Self { held: None }),
+                Err(TryLockError::Error(_)) => return Ok(Self { held: None, keep: false }),
             }
         };
-        let stale = |n: &str| n.starts_with(&format!(".{name}.")) && n.ends_with(".partial");
-        for entry in std::fs::read_dir(folder).at("list", folder)?.flatten() {
-            if entry.file_name().to_str().is_some_and(stale) {
-                // What cannot be removed does no harm.
-                let _ = std::fs::remove_file(entry.path());
-            }
+        // A run that is refused leaves the signature of the one that was cut off.
+        let keep = file.metadata().is_ok_and(|m| m.len() > 0);
+        Ok(Self { held: Some((file, path)), keep })
+    }
+
+    /// `.<name>.lock` beside what `output` leads to.
+    fn path(output: &Path) -> PathBuf {
+        let output = resolve(output);
+        let name = output.file_name().unwrap_or_default().to_string_lossy().into_owned();
+        output.with_file_name(format!(".{name}.lock"))
+    }
+
+    /// Writes into the lock who holds it.
+    ///
+    /// # Errors
+    /// When there is no room for it.
+    pub(crate) fn sign(&mut self, by: &str) -> Result<()> {
+        if let Some((file, path)) = &self.held {
+            file.set_len(0).and_then(|()| (&mut &*file).write_all(by.as_bytes())).at("write", path)?;
         }
-        Ok(Self { held: Some((file, path)) })
+        self.keep = false;
+        Ok(())
+    }
+
+    /// Who signed the lock that lies beside `output`.
+    pub(crate) fn signature(output: &Path) -> Option<String> {
+        std::fs::read_to_string(Self::path(output)).ok().filter(|by| !by.is_empty())
+    }
+
+    /// Leaves the signed lock behind, open for the next run.
+    pub(crate) fn keep(&mut self) {
+        self.keep = true;
     }
 }
 
 impl Drop for Lock {
     fn drop(&mut self) {
-        if let Some((_, path)) = &self.held {
+        if let Some((_, path)) = self.held.as_ref().filter(|_| !self.keep) {
             // Still locked: whoever opened it meanwhile finds it gone and makes another.
             let _ = std::fs::remove_file(path);
         }
@@ -90,10 +111,16 @@ mod tests {
         assert!(e.contains("a.ply: another run is writing this output"), "{e}");
         Lock::take(dir.path().join("new/b.ply")).unwrap();
         drop(first);
-        std::fs::write(dir.path().join("new/.a.ply.x1Yz.partial"), "left").unwrap();
-        std::fs::write(dir.path().join("new/.b.ply.x1Yz.partial"), "another's").unwrap();
         drop(Lock::take(&out).unwrap());
-        let left: Vec<_> = std::fs::read_dir(dir.path().join("new")).unwrap().map(|e| e.unwrap().file_name()).collect();
-        assert_eq!(left, [".b.ply.x1Yz.partial"]);
+        assert_eq!(std::fs::read_dir(dir.path().join("new")).unwrap().count(), 0);
+        let mut cut_off = Lock::take(&out).unwrap();
+        cut_off.sign("gs-geom train").unwrap();
+        cut_off.keep();
+        drop(cut_off);
+        assert_eq!(Lock::signature(&out).as_deref(), Some("gs-geom train"));
+        let mut next = Lock::take(&out).unwrap();
+        next.sign("gs-geom train").unwrap();
+        drop(next);
+        assert_eq!(Lock::signature(&out), None);
     }
 }

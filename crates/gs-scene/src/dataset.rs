@@ -5,7 +5,7 @@ mod sparse;
 mod transforms;
 mod view;
 
-use crate::{PointCloud, colmap};
+use crate::{Camera, PointCloud, colmap};
 use glam::{DMat3, DMat4, DQuat, DVec3};
 use gs_io::{Error, IoContext, Result, hash_bytes, hash_file};
 use rayon::prelude::*;
@@ -214,7 +214,13 @@ impl Dataset {
         self.views.iter().filter(move |v| v.split == split)
     }
 
-    /// Content hash: names, cameras, splits, sparse points and photographs, independent of where the folder lies.
+    /// The files that it was read from.
+    pub fn files(&self) -> Vec<PathBuf> {
+        self.views.iter().map(|v| v.image_path.clone()).collect()
+    }
+
+    /// Content hash: names, lenses, poses, sparse points and photographs. It depends neither on where the folder lies nor
+    /// on how the dataset was loaded: all stages know a scene by the same hash.
     ///
     /// # Errors
     /// When a photograph cannot be read.
@@ -222,7 +228,8 @@ impl Dataset {
         let mut text = String::new();
         let files: Result<Vec<String>> = self.views.par_iter().map(|v| hash_file(&v.image_path)).collect();
         for (v, file) in self.views.iter().zip(files?) {
-            text += &format!("{}\n{:?}\n{:?}\n{:?}\n{file}\n", v.name, v.camera, v.split, v.lens());
+            let Camera { rotation, translation, .. } = v.camera;
+            text += &format!("{}\n{rotation:?}\n{translation:?}\n{:?}\n{file}\n", v.name, v.lens());
         }
         let mut bytes = text.into_bytes();
         bytes.extend(self.points.positions.iter().flatten().flat_map(|v| v.to_le_bytes()));

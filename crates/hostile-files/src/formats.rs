@@ -247,7 +247,7 @@ fn check_labels(bytes: &[u8]) {
             for (name, mask) in &frame.categories {
                 assert_eq!(mask.bits.len(), frame.width as usize * frame.height as usize);
                 // Pictures of queries are named so.
-                let file = eval::scene::slug(name);
+                let file = eval::scene::numbered(1, name);
                 assert!(!file.is_empty() && !file.contains(['/', '\\', '\0']) && !file.contains(".."), "{file:?}");
             }
         }

@@ -3,15 +3,15 @@
 use crate::args::{CropsArgs, EmbedArgs};
 use crate::{finished, memory, photographs};
 use artifacts::{Level, MaskFeatures, MaskMaps, features_path, hash_folder, maps_path, role};
-use gs_io::{ArtifactWriter, Error, Lock, Result, Watched, create_dir, hash_bytes, hash_file};
+use gs_io::{ArtifactWriter, Error, Result, Watched, hash_bytes, hash_file};
 use gs_scene::dataset::View;
-use onnx_models::{Bounds, ClipImage, LabelMap, RgbImage, crop_mask, mask_bounds};
+use onnx_models::{Bounds, ClipImage, ClipText, LabelMap, RgbImage, crop_mask, mask_bounds};
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 use serde_json::json;
 use stage::Stage;
 use std::collections::{BTreeMap, HashMap};
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
 /// Format name of the file of crops.
 pub const CROPS_FORMAT: &str = "crops";
@@ -84,11 +84,16 @@ fn no_maps(folder: &Path) -> Error {
 /// When scene, id maps or model cannot be read, or the output cannot be written.
 pub fn run(args: &EmbedArgs, stage: &Stage) -> Result<()> {
     let scene = photographs::open(&args.scene, stage)?;
-    let clip = ClipImage::open(&args.clip, &args.engine.options())?;
     let out = args.out.as_ref().unwrap_or(&args.masks);
-    create_dir(out)?;
     let manifest = out.join("features.json");
-    let _lock = Lock::take(&manifest)?;
+    let maps = artifacts::folder_files(&args.masks, "_s.npy")?;
+    let with_maps = scene.views.iter().map(View::stem).filter(|stem| maps_path(&args.masks, stem).exists());
+    let features: Vec<PathBuf> = with_maps.map(|stem| features_path(out, stem)).collect();
+    let notes = features.iter().map(|f| finished::note_path(f));
+    // Features of maps that are gone would be taken for this run's.
+    let outputs = stage.outputs(&manifest).file(&manifest).files(notes).files(&features).drop_stale();
+    let mut claim = outputs.reads(scene.files()).reads(maps).claim()?;
+    let clip = ClipImage::open(&args.clip, &args.engine.options())?;
     let watched =
         Watched::new(scene.views.iter().map(|v| &v.image_path)).and(artifacts::watch_folder(&args.masks, "_s.npy")?);
     let engine = if args.engine.onnx_runtime.is_some() { "onnxruntime" } else { "rten" };
@@ -143,15 +148,16 @@ pub fn run(args: &EmbedArgs, stage: &Stage) -> Result<()> {
         stage.skipped(&format!("{} of {masks} masks: the same pictures as masks of other levels", masks - pictures));
     }
     watched.check()?;
-    let inputs = BTreeMap::from([
+    let mut inputs = BTreeMap::from([
         (role::DATASET.to_string(), dataset_hash),
         (role::MASKS.to_string(), hash_folder(&args.masks, "_s.npy")?),
-        ("clip".to_string(), clip.hash().to_string()),
+        (role::CLIP.to_string(), clip.hash().to_string()),
     ]);
+    inputs.extend(ClipText::hash_in(&args.clip).map(|text| (role::CLIP_TEXT.to_string(), text)));
     let mut provenance = stage.provenance("mask-features", 1, parameters.clone(), inputs.clone());
     provenance.extra = json!({ "views": views });
     finished::write_json(&manifest, &provenance)?;
-    stage.record(&manifest, parameters, inputs, json!({ "views": views.len(), "masks": masks, "pictures": pictures }))
+    stage.record(&mut claim, parameters, inputs, json!({ "views": views.len(), "masks": masks, "pictures": pictures }))
 }
 
 /// Features of all masks, and how many different pictures they come from. Levels often hold the very same mask, which is
@@ -200,6 +206,9 @@ fn foretell(clip: &ClipImage, views: &[View], stage: &Stage) -> Result<()> {
 /// When scene or id maps cannot be read, or the output cannot be written.
 pub fn write_crops(args: &CropsArgs, stage: &Stage) -> Result<()> {
     let scene = photographs::open(&args.scene, stage)?;
+    let maps = artifacts::folder_files(&args.masks, "_s.npy")?;
+    let mut claim =
+        stage.outputs(&args.out).artifact(&args.out, CROPS_FORMAT).reads(scene.files()).reads(maps).claim()?;
     let size = usize::from(args.size);
     let (mut pixels, mut view_of, mut mask_of, mut names) = (Vec::new(), Vec::new(), Vec::new(), Vec::new());
     let mut progress = stage.progress("views", scene.views.len() as u64);
@@ -230,7 +239,7 @@ pub fn write_crops(args: &CropsArgs, stage: &Stage) -> Result<()> {
         .tensor("view", &[mask_of.len()], &view_of)
         .tensor("mask", &[mask_of.len()], &mask_of)
         .write(&args.out)?;
-    stage.record(&args.out, parameters, inputs, json!({ "views": names.len(), "crops": mask_of.len() }))
+    stage.record(&mut claim, parameters, inputs, json!({ "views": names.len(), "crops": mask_of.len() }))
 }
 
 #[cfg(test)]

@@ -22,7 +22,8 @@ pub(crate) fn made_from(parts: &[&str]) -> String {
     hash_bytes(format!("{program}\n{}", parts.join("\n")).as_bytes())
 }
 
-fn note_path(output: &Path) -> PathBuf {
+/// Where the note of an output lies.
+pub(crate) fn note_path(output: &Path) -> PathBuf {
     output.with_extension("json")
 }
 

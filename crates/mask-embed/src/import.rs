@@ -5,7 +5,7 @@ use crate::finished;
 use crate::masks::count_masks;
 use crate::memory;
 use artifacts::{LEVELS, Level, MaskMaps, hash_folder, maps_path};
-use gs_io::{Error, IoContext, Result, create_dir, hash_files};
+use gs_io::{Error, IoContext, Result, hash_files};
 use image::DynamicImage;
 use serde_json::json;
 use stage::Stage;
@@ -113,6 +113,10 @@ fn load(paths: &[PathBuf]) -> Result<MaskMaps> {
 /// When a picture cannot be read or is not grey, the levels of a view differ in size, or the output cannot be written.
 pub fn run(args: &ImportArgs, stage: &Stage) -> Result<()> {
     let found = find(&args.labels)?;
+    let manifest = args.out.join("masks.json");
+    let maps = found.keys().map(|view| maps_path(&args.out, view));
+    let outputs = stage.outputs(&manifest).file(&manifest).files(maps).drop_stale();
+    let mut claim = outputs.reads(found.values().flatten()).claim()?;
     // A file whose size cannot be told is refused below.
     let sizes = found.values().flatten().filter_map(|p| image::image_dimensions(p).ok());
     let pixels = sizes.map(|(w, h)| u64::from(w) * u64::from(h)).max().unwrap_or(0);
@@ -127,8 +131,6 @@ pub fn run(args: &ImportArgs, stage: &Stage) -> Result<()> {
         }
         views.insert(view.clone(), json!({ "size": [maps.width, maps.height], "masks": masks }));
     }
-    create_dir(&args.out)?;
-    let manifest = args.out.join("masks.json");
     finished::remove_manifest(&manifest)?;
     let mut progress = stage.progress("views", found.len() as u64);
     for (view, paths) in &found {
@@ -141,7 +143,7 @@ pub fn run(args: &ImportArgs, stage: &Stage) -> Result<()> {
     let mut provenance = stage.provenance("masks", 1, json!({}), inputs.clone());
     provenance.extra = json!({ "views": views, "hash": hash_folder(&args.out, "_s.npy")? });
     finished::write_json(&manifest, &provenance)?;
-    stage.record(&manifest, json!({}), inputs, json!({ "views": views.len() }))
+    stage.record(&mut claim, json!({}), inputs, json!({ "views": views.len() }))
 }
 
 #[cfg(test)]

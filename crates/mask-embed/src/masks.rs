@@ -6,15 +6,15 @@ use crate::paint::{paint, preview};
 use crate::sam::Sam;
 use crate::{finished, memory, photographs};
 use artifacts::{LEVELS, Level, MaskMaps, maps_path, role};
-use gs_io::{Error, Lock, Result, Watched, create_dir};
+use gs_io::{Claim, Error, Result, Watched};
 use gs_scene::Image;
-use gs_scene::dataset::View;
+use gs_scene::dataset::{Dataset, View};
 use onnx_models::RgbImage;
 use serde::{Deserialize, Serialize};
 use serde_json::json;
 use stage::Stage;
 use std::collections::{BTreeMap, BTreeSet};
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
 /// Facts of a view's id maps.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -39,10 +39,9 @@ pub(crate) fn count_masks(maps: &MaskMaps) -> [usize; LEVELS] {
 /// When scene or models cannot be read, a photograph cannot be decoded, or the output cannot be written.
 pub fn run(args: &MasksArgs, stage: &Stage) -> Result<()> {
     let scene = photographs::open(&args.scene, stage)?;
-    let sam = Sam::open(&args.sam, &args.engine.options())?;
-    create_dir(&args.out)?;
     let manifest = args.out.join("masks.json");
-    let _lock = Lock::take(&manifest)?;
+    let mut claim = claim(args, &scene, &manifest, stage)?;
+    let sam = Sam::open(&args.sam, &args.engine.options())?;
     let watched = Watched::new(scene.views.iter().map(|v| &v.image_path));
     let choice = args.choice.choice();
     let engine = if args.engine.onnx_runtime.is_some() { "onnxruntime" } else { "rten" };
@@ -112,7 +111,16 @@ pub fn run(args: &MasksArgs, stage: &Stage) -> Result<()> {
     provenance.extra = json!({ "views": views });
     finished::write_json(&manifest, &provenance)?;
     let masks: usize = views.values().filter_map(|v| v["facts"]["masks"][3].as_u64()).sum::<u64>() as usize;
-    stage.record(&manifest, parameters, inputs, json!({ "views": views.len(), "masks_large": masks }))
+    stage.record(&mut claim, parameters, inputs, json!({ "views": views.len(), "masks_large": masks }))
+}
+
+/// The right to write id maps, their notes, the manifest and the previews. Maps that this program did not make stay.
+fn claim(args: &MasksArgs, scene: &Dataset, manifest: &Path, stage: &Stage) -> Result<Claim> {
+    let maps: Vec<PathBuf> = scene.views.iter().map(|v| maps_path(&args.out, v.stem())).collect();
+    let notes = maps.iter().map(|m| finished::note_path(m));
+    let outputs = stage.outputs(manifest).file(manifest).files(notes).files(&maps).reads(scene.files()).drop_stale();
+    let pictures = scene.views.iter().map(|v| format!("{}.png", v.stem()));
+    args.preview.iter().fold(outputs, |outputs, folder| outputs.files_in(folder, pictures.clone())).claim()
 }
 
 /// Says how much memory the photographs will take, and refuses more than there may be.

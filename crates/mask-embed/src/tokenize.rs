@@ -6,6 +6,7 @@ use crate::finished::write_json;
 use artifacts::{MaskTruth, TrueScene};
 use gs_io::{Error, IoContext, Result};
 use onnx_models::Tokenizer;
+use serde_json::json;
 use stage::Stage;
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
@@ -35,6 +36,7 @@ fn truths(folder: &Path, found: &mut Vec<PathBuf>) -> Result<()> {
 /// # Errors
 /// When there is no truth, one cannot be read, or the output cannot be written.
 pub fn run(args: &TokenizeArgs, stage: &Stage) -> Result<()> {
+    let mut claim = stage.outputs(&args.out).file(&args.out).claim()?;
     let mut folders = Vec::new();
     truths(&args.truth, &mut folders)?;
     if folders.is_empty() {
@@ -61,5 +63,5 @@ pub fn run(args: &TokenizeArgs, stage: &Stage) -> Result<()> {
         .collect();
     write_json(&args.out, &ids)?;
     stage.info(&format!("{} texts of {} scenes", ids.len(), folders.len()));
-    Ok(())
+    stage.record(&mut claim, json!({}), BTreeMap::new(), json!({ "texts": ids.len() }))
 }

@@ -190,7 +190,10 @@ fn the_result_depends_neither_on_threads_nor_on_interruptions() {
         std::fs::remove_file(other.join(name)).unwrap();
     }
     std::fs::write(other.join("v1_s.npy"), &whole["v1_s.npy"][..1000]).unwrap();
-    scene.make_masks(&other, &[]);
+    // It might as well have been edited by hand.
+    let masks = ["masks", "--scene", path(&scene.folder), "--sam", path(&fake_sam()), "--out", path(&other)];
+    assert!(error(&masks).contains("v1_s.npy: the output exists and would be lost"));
+    scene.make_masks(&other, &["--overwrite"]);
     assert_eq!(whole, contents(&other));
     // Again: nothing is made. With another parameter: everything is.
     let touched = || std::fs::metadata(other.join("v1_s.npy")).unwrap().modified().unwrap();
@@ -393,7 +396,7 @@ fn bad_input_is_one_line_and_exit_code_2() {
     let e = embed(&scene.masks, dir.path());
     assert!(e.contains("image.onnx: no such model"), "{e}");
     let e = embed(&blocked.with_file_name("empty"), &fake_clip());
-    assert!(e.contains("no id maps of any view of the scene"), "{e}");
+    assert!(e.contains("empty: cannot list"), "{e}");
     std::fs::write(maps_path(&scene.masks, "v0"), &good["v0_s.npy"][..500]).unwrap();
     let e = embed(&scene.masks, &fake_clip());
     assert!(e.contains("v0_s.npy: shape: the file's length does not fit its shape"), "{e}");

@@ -171,6 +171,12 @@ impl Encoder {
     }
 }
 
+/// Content hash of one half of a CLIP pair.
+fn hash_in(path: &Path, name: &str) -> Option<String> {
+    let folder = if path.is_dir() { path } else { path.parent()? };
+    hash_files([("", folder.join(name))]).ok()
+}
+
 /// Where a graph lies: in a folder under its usual name, or the file itself.
 fn locate(path: &Path, name: &str) -> Result<(PathBuf, PathBuf)> {
     let (folder, file) = if path.is_dir() {
@@ -235,6 +241,11 @@ impl ClipImage {
         &self.encoder.hash
     }
 
+    /// [`Self::hash`] of the model in a folder, or beside a file, without opening it; None where there is none.
+    pub fn hash_in(path: impl AsRef<Path>) -> Option<String> {
+        hash_in(path.as_ref(), "image.onnx")
+    }
+
     /// Features `[n][d]`, each of unit length, of `n` pictures `[n][3][S][S]` as [`crate::crop_mask`] gives them.
     ///
     /// # Errors
@@ -297,6 +308,11 @@ impl ClipText {
     /// Content hash of the graph.
     pub fn hash(&self) -> &str {
         &self.encoder.hash
+    }
+
+    /// [`Self::hash`] of the model in a folder, or beside a file, without opening it; None where there is none.
+    pub fn hash_in(path: impl AsRef<Path>) -> Option<String> {
+        hash_in(path.as_ref(), "text.onnx")
     }
 
     /// Features `[n][d]`, each of unit length, of `n` texts.

@@ -44,6 +44,9 @@ pub struct CommonArgs {
     /// Write events as JSON lines to standard output instead of text to standard error
     #[arg(long, global = true)]
     pub json: bool,
+    /// Write over files that this command did not write, such as older results or your own; inputs are never written
+    #[arg(long, global = true)]
+    pub overwrite: bool,
     /// Most memory the run may take, such as 4G: a stage whose forecast is more refuses at the start [no limit]
     #[arg(long, global = true, value_name = "BYTES")]
     pub memory_limit: Option<Bytes>,
@@ -81,8 +84,9 @@ pub fn main<P: Program>() -> ExitCode {
         };
     }
     let mut matches = P::command().version(VERSION).after_help(generate::HELP).get_matches();
+    let command = matches.subcommand_name().map(String::from);
     let program = P::from_arg_matches_mut(&mut matches).unwrap_or_else(|e| e.exit());
-    let stage = Stage::new(P::NAME, program.common());
+    let stage = Stage::new(P::NAME, program.common()).with_command(command);
     let threads = program.common().threads;
     if let Err(e) = rayon::ThreadPoolBuilder::new().num_threads(threads).build_global() {
         // rayon has no pool to fall back on: whoever asks for it later would panic.

@@ -1,7 +1,7 @@
 //! What a stage says, and the facts of its run.
 
 use crate::{CommonArgs, Machine, Progress, RunRecord};
-use gs_io::{Error, Provenance, Result};
+use gs_io::{Claim, Error, Outputs, Provenance, Result, Written};
 use serde_json::{Value, json};
 use std::collections::BTreeMap;
 use std::io::Write;
@@ -13,6 +13,7 @@ use std::time::{Instant, SystemTime, UNIX_EPOCH};
 /// A running stage: its voice, its clock, its seed and the record of its run.
 pub struct Stage {
     name: &'static str,
+    command: Option<String>,
     common: CommonArgs,
     started: Instant,
     skipped: Mutex<Vec<String>>,
@@ -25,6 +26,7 @@ impl Stage {
     pub fn new(name: &'static str, common: &CommonArgs) -> Self {
         Self {
             name,
+            command: None,
             common: common.clone(),
             started: Instant::now(),
             skipped: Mutex::default(),
@@ -36,6 +38,12 @@ impl Stage {
     /// A stage that says nothing, for tests of stage libraries.
     pub fn silent(name: &'static str) -> Self {
         Self::new(name, &CommonArgs { quiet: true, ..CommonArgs::default() })
+    }
+
+    /// The same, running this subcommand.
+    #[must_use]
+    pub(crate) fn with_command(self, command: Option<String>) -> Self {
+        Self { command, ..self }
     }
 
     /// The program's name.
@@ -143,22 +151,40 @@ impl Stage {
         }
     }
 
-    /// Writes `<output>.run.json`, the whole of [`RunRecord`]: what ran on what and where, what it took, and a summary of
-    /// the result.
+    /// What this run will write, to be completed and claimed before the work; its record will lie beside `main`.
+    pub fn outputs(&self, main: impl AsRef<Path>) -> Outputs {
+        let by = [Some(self.name), self.command.as_deref()].into_iter().flatten().collect::<Vec<_>>().join(" ");
+        Outputs::new(&by, self.common.overwrite, main)
+    }
+
+    /// Writes `<output>.run.json`, the whole of [`RunRecord`]: what ran on what and where, what it took, a summary of the
+    /// result, and what it wrote.
     /// Call it last; it is not an artifact, its content differs from run to run.
     ///
     /// # Errors
-    /// When the file cannot be written.
+    /// When an output cannot be read or the record cannot be written.
     pub fn record(
         &self,
-        output: impl AsRef<Path>,
+        claim: &mut Claim,
         parameters: Value,
         inputs: BTreeMap<String, String>,
         summary: Value,
     ) -> Result<()> {
+        claim.finish(|main, written| {
+            self.run_record(parameters.clone(), inputs.clone(), summary.clone(), written).write(main)
+        })
+    }
+
+    fn run_record(
+        &self,
+        parameters: Value,
+        inputs: BTreeMap<String, String>,
+        summary: Value,
+        written: Written,
+    ) -> RunRecord {
         let elapsed = self.started.elapsed();
         let began = SystemTime::now() - elapsed;
-        let record = RunRecord {
+        RunRecord {
             program: self.name.into(),
             version: env!("CARGO_PKG_VERSION").into(),
             revision: crate::REVISION.into(),
@@ -176,8 +202,8 @@ impl Stage {
             memory_predicted_bytes: *self.predicted.lock().expect("no panic holds this lock"),
             skipped: self.skipped.lock().expect("no panic holds this lock").clone(),
             summary,
-        };
-        record.write(output)
+            written,
+        }
     }
 
     pub(crate) fn event(&self, kind: &str, fields: &[(&str, Value)]) {

@@ -1,7 +1,7 @@
 //! The record of a run, beside its output.
 
 use crate::Machine;
-use gs_io::{Error, IoContext, Result, hash_file, write_bytes};
+use gs_io::{Error, IoContext, Result, Written, hash_file, record_path, write_bytes};
 use serde::{Deserialize, Serialize};
 use serde_json::Value;
 use std::collections::BTreeMap;
@@ -52,14 +52,15 @@ pub struct RunRecord {
     pub skipped: Vec<String>,
     /// Figures of the result, such as the number of Gaussians.
     pub summary: Value,
+    /// Which files the run wrote: they may be replaced by the same command, and by no other.
+    #[serde(default)]
+    pub written: Written,
 }
 
 impl RunRecord {
     /// Where the record of `output` lies: `<output>.run.json`.
     pub fn path(output: impl AsRef<Path>) -> PathBuf {
-        let mut name = output.as_ref().as_os_str().to_owned();
-        name.push(".run.json");
-        name.into()
+        record_path(output)
     }
 
     /// Reads the record of `output`.
@@ -111,9 +112,13 @@ mod tests {
         let out = dir.path().join("a.ply");
         let stage = Stage::silent("gs-geom");
         stage.skipped("3 of 10 Gaussians: never seen");
-        stage.record(&out, serde_json::json!({"k": 1}), BTreeMap::new(), serde_json::json!({"gaussians": 7})).unwrap();
+        let mut claim = stage.outputs(&out).file(&out).claim().unwrap();
+        write_bytes(&out, b"Gaussians").unwrap();
+        let summary = serde_json::json!({"gaussians": 7});
+        stage.record(&mut claim, serde_json::json!({"k": 1}), BTreeMap::new(), summary).unwrap();
         let r = RunRecord::read(&out).unwrap();
         assert_eq!(r.program, "gs-geom");
+        assert_eq!((r.written.by.as_str(), r.written.files.len()), ("gs-geom", 1));
         assert_eq!(r.skipped, ["3 of 10 Gaussians: never seen"]);
         assert!(r.wall_seconds >= 0.0 && r.peak_rss_bytes.is_none_or(|b| b > 1 << 18));
         assert!(RunRecord::read(dir.path().join("b")).is_err());
@@ -123,7 +128,9 @@ mod tests {
     fn a_record_says_what_ran_where_and_when() {
         let dir = tempfile::tempdir().unwrap();
         let out = dir.path().join("a.ply");
-        Stage::silent("gs-geom").record(&out, Value::Null, BTreeMap::new(), Value::Null).unwrap();
+        let stage = Stage::silent("gs-geom");
+        let mut claim = stage.outputs(&out).claim().unwrap();
+        stage.record(&mut claim, Value::Null, BTreeMap::new(), Value::Null).unwrap();
         let r = RunRecord::read(&out).unwrap();
         assert_eq!((r.revision.as_str(), r.program_hash.len()), (crate::REVISION, 64), "{r:?}");
         assert!(crate::REVISION == "unknown" || crate::REVISION.len() >= 7);

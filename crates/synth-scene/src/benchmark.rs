@@ -130,6 +130,14 @@ impl Layout {
         }
     }
 
+    /// Names of the files that lie beside the folders.
+    pub(crate) fn root_files(&self) -> Vec<String> {
+        const TRANSFORMS: [&str; 3] = ["transforms_train.json", "transforms_test.json", "points3d.ply"];
+        let Self::Scan { name, converted } = self else { return Vec::new() };
+        let more = if *converted { &TRANSFORMS[..] } else { &[] };
+        scannet::files(name).into_iter().chain(more.iter().map(ToString::to_string)).collect()
+    }
+
     /// Writes the files of the scan's mesh: [`scannet::write`], and for a converted one `points3d.ply` instead of
     /// `*_vh_clean_2.ply`.
     ///
@@ -203,25 +211,21 @@ fn write_transforms(out: &Path, views: &[(String, Camera)]) -> Result<()> {
     Ok(())
 }
 
-/// Folders that a scene of some layout may have beside those of [`Layout::Colmap`], and files in its root by their ends.
+/// Folders that a scene of some layout may have beside those of [`Layout::Colmap`].
 pub(crate) const FOLDERS: [&str; 3] = ["color", "pose", "intrinsic"];
-pub(crate) const FILES: [&str; 7] = [
-    "_vh_clean_2.ply",
-    ".labels.ply",
-    ".segs.json",
-    ".aggregation.json",
-    "transforms_train.json",
-    "transforms_test.json",
-    "points3d.ply",
-];
+
+/// Those of [`FOLDERS`] that stand in this layout.
+pub(crate) fn used_folders(layout: &Layout) -> &'static [&'static str] {
+    match layout {
+        Layout::Scan { converted: false, .. } => &FOLDERS,
+        Layout::Scan { converted: true, .. } => &FOLDERS[..1],
+        Layout::Colmap | Layout::LerfOvs(_) => &[],
+    }
+}
 
 /// Makes the empty folders that a scan must have.
 pub(crate) fn prepare(layout: &Layout, out: &Path) -> Result<()> {
-    match layout {
-        Layout::Scan { converted: false, .. } => FOLDERS.iter().try_for_each(|f| create_dir(out.join(f))),
-        Layout::Scan { converted: true, .. } => create_dir(out.join("color")),
-        Layout::Colmap | Layout::LerfOvs(_) => Ok(()),
-    }
+    used_folders(layout).iter().try_for_each(|f| create_dir(out.join(f)))
 }
 
 #[cfg(test)]

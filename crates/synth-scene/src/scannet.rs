@@ -41,6 +41,15 @@ pub fn label(class: &str) -> u32 {
     NYU40.iter().find(|b| Some(b.1) == name).map_or(OTHER, |b| b.0)
 }
 
+/// Ends of the names of a scan's files: vertices, their labels, segments, objects.
+const ENDS: [&str; 4] =
+    ["_vh_clean_2.ply", "_vh_clean_2.labels.ply", "_vh_clean_2.0.010000.segs.json", ".aggregation.json"];
+
+/// Names of the files that [`write`] writes.
+pub(crate) fn files(name: &str) -> [String; 4] {
+    ENDS.map(|end| format!("{name}{end}"))
+}
+
 /// Writes the files of the scan `name` into `folder`: `*_vh_clean_2.ply` (vertices with colours, no faces), `*_vh_clean_2.labels.ply`
 /// (the same with a label id each), `*_vh_clean_2.0.010000.segs.json` (segments: parts) and `*.aggregation.json` (objects:
 /// things, background included). The vertices are the true surface points.
@@ -49,9 +58,9 @@ pub fn label(class: &str) -> u32 {
 /// When a file cannot be written.
 pub fn write(folder: &Path, name: &str, scene: &Scene, points: &TruePoints, colors: &[[u8; 3]]) -> Result<()> {
     create_dir(folder)?;
-    let file = |end: &str| folder.join(format!("{name}{end}"));
+    let [vertices, labels, segs, objects] = files(name);
     let cloud = PointCloud { positions: points.position.clone(), colors: colors.to_vec() };
-    ply::write_points(file("_vh_clean_2.ply"), &cloud, &[])?;
+    ply::write_points(folder.join(vertices), &cloud, &[])?;
     let mut labelled = format!(
         "ply\nformat binary_little_endian 1.0\nelement vertex {}\nproperty float x\nproperty float y\n\
          property float z\nproperty uchar red\nproperty uchar green\nproperty uchar blue\nproperty ushort label\n\
@@ -65,10 +74,9 @@ pub fn write(folder: &Path, name: &str, scene: &Scene, points: &TruePoints, colo
         let id = usize::try_from(instance).ok().and_then(|i| scene.things.get(i)).map_or(0, |t| label(t.class));
         labelled.extend((id as u16).to_le_bytes());
     }
-    write_bytes(file("_vh_clean_2.labels.ply"), &labelled)?;
-    let segs = "_vh_clean_2.0.010000.segs.json";
+    write_bytes(folder.join(labels), &labelled)?;
     let segments = Segments { params: BTreeMap::new(), scene_id: name, seg_indices: &points.part };
-    write_json(&file(segs), &segments)?;
+    write_json(&folder.join(&segs), &segments)?;
     let groups: Vec<Value> = scene
         .things
         .iter()
@@ -78,8 +86,8 @@ pub fn write(folder: &Path, name: &str, scene: &Scene, points: &TruePoints, colo
             json!({ "id": id, "objectId": id, "segments": t.parts.clone().collect::<Vec<u32>>(), "label": class })
         })
         .collect();
-    let json = json!({ "sceneId": name, "segGroups": groups, "segmentsFile": format!("{name}{segs}") });
-    write_json(&file(".aggregation.json"), &json)
+    let json = json!({ "sceneId": name, "segGroups": groups, "segmentsFile": segs });
+    write_json(&folder.join(objects), &json)
 }
 
 /// The segment of each vertex. A [`Value`] would take many times the memory.

@@ -14,7 +14,7 @@ use crate::scannet;
 use crate::scene::Scene;
 use artifacts::{MaskTruth, TrueObject, TruePart, TruePoints, TrueScene, features_path, maps_path};
 use clap::ValueEnum;
-use gs_io::{Error, IoContext, Lock, Result, create_dir, npy, write_bytes};
+use gs_io::{Claim, Error, IoContext, Result, create_dir, npy, write_bytes};
 use gs_scene::{Camera, Image, PointCloud, colmap};
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
@@ -218,7 +218,8 @@ pub fn stem(view: usize) -> String {
 /// # Errors
 /// When a file cannot be written, when `out` holds another dataset, or when the stage is interrupted.
 pub fn run(stage: &Stage, out: &Path, options: &Options) -> Result<()> {
-    let _lock = Lock::take(out)?;
+    let marker = out.join("truth/scene.json");
+    let mut claim = claim(stage, out, &marker, &options.layout)?;
     let scene = options.scene();
     let parameters = options.parameters(&scene);
     let cameras = options.cameras(&scene);
@@ -229,7 +230,7 @@ pub fn run(stage: &Stage, out: &Path, options: &Options) -> Result<()> {
         scene.primitives.len()
     ));
     stage.forecast(memory::forecast(&options.amounts(&scene, &cameras)), FEWER)?;
-    prepare(out, &options.layout)?;
+    prepare(out, &marker, &options.layout)?;
     let light = options.light(&scene);
     let language = options.language(&scene);
     let stems = options.layout.stems(cameras.len());
@@ -284,8 +285,8 @@ pub fn run(stage: &Stage, out: &Path, options: &Options) -> Result<()> {
         "truth_points": truth.position.len(),
     });
     // The record before the marker: a rule that finds the marker finds everything.
-    let marker = out.join("truth/scene.json");
-    stage.record(&marker, parameters.clone(), BTreeMap::new(), summary)?;
+    stage.record(&mut claim, parameters.clone(), BTreeMap::new(), summary)?;
+    remove_unused(out, &options.layout);
     true_scene(&scene, parameters).write(&marker)?;
     stage.info(&format!("{} photographs, {} points, {}", views.len(), sparse.len(), marker.display()));
     Ok(())
@@ -299,14 +300,17 @@ pub fn run(stage: &Stage, out: &Path, options: &Options) -> Result<()> {
 /// When a file cannot be written, when `folder` holds something else, or when the stage is interrupted.
 pub fn run_masks(stage: &Stage, folder: &Path, options: &Options) -> Result<()> {
     let marker = folder.join("masks.json");
-    let _lock = Lock::take(folder)?;
+    let stems = options.layout.stems(options.views);
+    let maps = stems.iter().flat_map(|stem| [maps_path(folder, stem), features_path(folder, stem)]);
+    let outputs = stage.outputs(&marker).files([marker.clone(), folder.join(TABLE)]).files(maps).drop_stale();
+    let mut claim = outputs.claim()?;
     let scene = options.scene();
     let cameras = options.cameras(&scene);
     let pixels = options.width as usize * options.height as usize;
     stage.forecast(memory::forecast(&Amounts { pixels, ..Amounts::default() }), FEWER)?;
-    prepare_masks(folder, &marker)?;
+    // An empty list says that the masks are not complete.
+    MaskTruth::write_all(&marker, &BTreeMap::new())?;
     let language = options.language(&scene);
-    let stems = options.layout.stems(cameras.len());
     let mut progress = stage.progress("views", cameras.len() as u64);
     let mut masks = BTreeMap::new();
     for (v, camera) in cameras.iter().enumerate() {
@@ -324,29 +328,10 @@ pub fn run_masks(stage: &Stage, folder: &Path, options: &Options) -> Result<()> 
     }
     let count = masks.values().map(Vec::len).sum::<usize>();
     let summary = json!({ "views": cameras.len(), "masks": count });
-    stage.record(&marker, options.parameters(&scene), BTreeMap::new(), summary)?;
     MaskTruth::write_all(&marker, &masks)?;
+    stage.record(&mut claim, options.parameters(&scene), BTreeMap::new(), summary)?;
     stage.info(&format!("{count} masks in {} views, {}", cameras.len(), marker.display()));
     Ok(())
-}
-
-/// Makes the folder of masks, without those of an earlier run; `masks.json` says that there is one, and while it is empty
-/// that it is not complete.
-fn prepare_masks(folder: &Path, marker: &Path) -> Result<()> {
-    let here = entries(folder)?;
-    if !here.is_empty() && MaskTruth::read_all(marker).is_err() {
-        return Err(Error::new("the folder holds something that is not synthetic masks")
-            .file(folder)
-            .expected("an empty folder, or earlier synthetic masks")
-            .hint("choose another --masks-to"));
-    }
-    create_dir(folder)?;
-    MaskTruth::write_all(marker, &BTreeMap::new())?;
-    let ours = |p: &&std::path::PathBuf| {
-        let name = p.file_name().unwrap_or_default().to_string_lossy();
-        name.ends_with("_s.npy") || name.ends_with("_f.npy") || name == TABLE
-    };
-    here.iter().filter(ours).try_for_each(|p| std::fs::remove_file(p).at("replace", p))
 }
 
 /// Name of the table of text features.
@@ -358,42 +343,35 @@ fn write_table(folder: &Path, language: &Language) -> Result<()> {
     write_bytes(&path, &json)
 }
 
-/// Makes the folders, empty. What an earlier run left is removed, the marker first; `truth` stands from the beginning,
-/// so that an unfinished scene is recognised as one.
-fn prepare(out: &Path, layout: &Layout) -> Result<()> {
-    let truth = out.join("truth");
-    if !truth.is_dir() {
-        if let Some(other) =
-            FOLDERS.iter().chain([&SCAN]).chain(&benchmark::FOLDERS).map(|f| out.join(f)).find(|f| f.exists())
-        {
-            return Err(Error::new("the folder holds something that is not a synthetic scene")
-                .file(out)
-                .found(other.display())
-                .expected("an empty folder, or an earlier synthetic scene")
-                .hint("choose another --out"));
-        }
-        folders(layout).rev().try_for_each(|f| create_dir(out.join(f)))?;
-        return benchmark::prepare(layout, out);
-    }
-    let marker = truth.join("scene.json");
+/// The right to write a scene. Its folders may hold nothing but an earlier synthetic scene.
+fn claim(stage: &Stage, out: &Path, marker: &Path, layout: &Layout) -> Result<Claim> {
+    let root = layout.root_files().into_iter().map(|name| out.join(name));
+    let folders = all_folders().map(|f| out.join(f)).chain([layout.labels(out)]);
+    let outputs = folders.fold(stage.outputs(marker).file(marker).files(root), |outputs, f| outputs.folder(f));
+    outputs.drop_stale().claim()
+}
+
+/// Makes the folders; an earlier scene there is complete no more.
+fn prepare(out: &Path, marker: &Path, layout: &Layout) -> Result<()> {
     if marker.exists() {
-        std::fs::remove_file(&marker).at("replace", &marker)?;
+        std::fs::remove_file(marker).at("replace", marker)?;
     }
-    let unused = |f: &&str| !folders(layout).any(|used| used == *f);
-    let others = FOLDERS.into_iter().filter(|f| unused(f)).chain([SCAN]).chain(benchmark::FOLDERS);
-    for folder in others.map(|f| out.join(f)).filter(|f| f.is_dir()) {
-        std::fs::remove_dir_all(&folder).at("replace", &folder)?;
-    }
-    for folder in folders(layout).map(|f| out.join(f)).chain([layout.labels(out)]) {
-        for name in entries(&folder)? {
-            let gone = if name.is_dir() { std::fs::remove_dir_all(&name) } else { std::fs::remove_file(&name) };
-            gone.at("replace", &name)?;
-        }
-    }
-    let ours = |p: &&std::path::PathBuf| benchmark::FILES.iter().any(|end| p.to_string_lossy().ends_with(end));
-    entries(out)?.iter().filter(ours).try_for_each(|p| std::fs::remove_file(p).at("replace", p))?;
     folders(layout).try_for_each(|f| create_dir(out.join(f)))?;
     benchmark::prepare(layout, out)
+}
+
+/// Removes the empty folders of an earlier scene of another layout.
+fn remove_unused(out: &Path, layout: &Layout) {
+    let used: Vec<&str> = folders(layout).chain(benchmark::used_folders(layout).iter().copied()).collect();
+    for folder in all_folders().filter(|f| !used.contains(f)) {
+        // One that is not empty, or not there, stays as it is.
+        let _ = std::fs::remove_dir(out.join(folder));
+    }
+}
+
+/// The folders that a scene of any layout may have.
+fn all_folders() -> impl Iterator<Item = &'static str> {
+    FOLDERS.into_iter().rev().chain([SCAN]).chain(benchmark::FOLDERS)
 }
 
 /// Those of the folders of a scene that stand in this layout.
@@ -404,14 +382,6 @@ fn folders(layout: &Layout) -> impl DoubleEndedIterator<Item = &'static str> {
         Layout::Scan { .. } => &["images", "sparse", "label"],
     };
     FOLDERS.into_iter().filter(move |f| !unused.contains(f))
-}
-
-fn entries(folder: &Path) -> Result<Vec<std::path::PathBuf>> {
-    if !folder.exists() {
-        return Ok(Vec::new());
-    }
-    let list = std::fs::read_dir(folder).at("list", folder)?;
-    list.map(|e| e.map(|e| e.path()).at("list", folder)).collect()
 }
 
 /// Writes a view's photograph and what each of its pixels shows.

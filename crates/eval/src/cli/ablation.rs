@@ -2,7 +2,7 @@
 
 use crate::ablation::{self, Plan, Runs, Table};
 use crate::html::Page;
-use gs_io::{Error, IoContext, Result, create_dir, write_bytes};
+use gs_io::{Error, IoContext, Result, write_bytes};
 use serde_json::json;
 use stage::Stage;
 use std::collections::BTreeMap;
@@ -37,7 +37,9 @@ pub(super) fn run(a: &AblationArgs, stage: &Stage) -> Result<String> {
         Ok((path, filled))
     });
     let documents: Vec<_> = documents.collect::<Result<_>>()?;
-    create_dir(&a.out)?;
+    let path = a.out.join("report.html");
+    let names = tables.iter().flat_map(|t| ["json", "md"].map(|extension| format!("{}.{extension}", t.name)));
+    let mut claim = stage.outputs(&path).file(&path).files_in(&a.out, names).reads([&a.plan]).claim()?;
     let mut shown = String::new();
     for table in &tables {
         let path = a.out.join(format!("{}.json", table.name));
@@ -49,13 +51,12 @@ pub(super) fn run(a: &AblationArgs, stage: &Stage) -> Result<String> {
     }
     let mut page = Page::default();
     ablation::sections(&mut page, &tables);
-    let path = a.out.join("report.html");
     write_bytes(&path, page.finish("Ablation", &subtitle(&tables)).as_bytes())?;
     for (path, text) in documents {
         write_bytes(path, text.as_bytes())?;
     }
     let summary = json!({"tables": tables.len(), "missing": missing.len()});
-    stage.record(&path, json!({"command": "ablation"}), BTreeMap::new(), summary)?;
+    stage.record(&mut claim, json!({"command": "ablation"}), BTreeMap::new(), summary)?;
     Ok(shown)
 }
 

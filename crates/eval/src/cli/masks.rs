@@ -23,6 +23,8 @@ pub(super) struct MasksArgs {
 }
 
 pub(super) fn run(a: &MasksArgs, stage: &Stage) -> Result<String> {
+    let maps = artifacts::folder_files(&a.masks, "_s.npy")?;
+    let mut claim = stage.outputs(&a.out).file(&a.out).reads(maps).reads(&a.footprints).claim()?;
     let footprints = a.footprints.as_deref().map(Footprints::read).transpose()?;
     let mut inputs = BTreeMap::new();
     let masks = artifacts::hash_folder(&a.masks, "_s.npy")?;
@@ -34,6 +36,6 @@ pub(super) fn run(a: &MasksArgs, stage: &Stage) -> Result<String> {
     let stats = mask_stats::measure(&a.masks, footprints.as_ref())?;
     let json = serde_json::to_vec_pretty(&stats).map_err(|e| Error::new(e.to_string()).file(&a.out))?;
     write_bytes(&a.out, &json)?;
-    stage.record(&a.out, json!({"command": "masks"}), inputs, json!({"views": stats.views}))?;
+    stage.record(&mut claim, json!({"command": "masks"}), inputs, json!({"views": stats.views}))?;
     Ok(mask_stats::table(&stats))
 }

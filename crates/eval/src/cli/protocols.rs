@@ -11,7 +11,7 @@ use crate::scan::{self, ScanFiles, ScanMetrics, ScanOptions, Undescribed};
 use crate::scene::LabelledScene;
 use crate::silhouette::Silhouette;
 use artifacts::LerfScene;
-use gs_io::{Error, IoContext, Result, write_bytes};
+use gs_io::{Error, IoContext, Outputs, Result, write_bytes};
 use gs_scene::dataset::{Dataset, LoadOptions};
 use serde_json::{Value, json};
 use stage::Stage;
@@ -84,6 +84,12 @@ pub(super) struct LerfArgs {
     out: PathBuf,
 }
 
+/// `metrics.json` of a protocol, whose record lies beside it, and more files in its folder.
+fn protocol_outputs(folder: &Path, more: &[&str], stage: &Stage) -> Outputs {
+    let metrics = folder.join("metrics.json");
+    stage.outputs(&metrics).file(&metrics).files_in(folder, more)
+}
+
 fn folder_name(path: &Path) -> String {
     let full = path.canonicalize().unwrap_or_else(|_| path.to_path_buf());
     full.file_name().map_or("scene".into(), |n| n.to_string_lossy().into_owned())
@@ -117,6 +123,14 @@ pub(super) fn run_lerf(a: &LerfArgs, stage: &Stage) -> Result<String> {
     let folder = labels_folder(a.labels.as_deref(), a.scene.as_deref())?;
     let named = a.scene.as_deref().map(folder_name).or_else(|| a.labels.as_deref().map(folder_name));
     let name = a.name.clone().or(named).unwrap_or_else(|| "scene".into());
+    let scene = a.scene.as_ref().filter(|_| a.predictions.is_none());
+    let mut dataset = scene.map(|scene| load(scene, &LoadOptions::default(), stage)).transpose()?;
+    let outputs = protocol_outputs(&a.out, &["table.md", "objects.csv", "pairs.csv"], stage);
+    let outputs = a.save_predictions.iter().fold(outputs, |outputs, folder| outputs.folder(folder));
+    let mut claim = outputs
+        .reads(dataset.iter().flat_map(Dataset::files))
+        .reads(a.instances.iter().chain(&a.geometry).chain(&a.language.text_features).chain(&a.language.features))
+        .claim()?;
     let benchmark = LerfScene::named(&name);
     let table = match a.queries {
         Queries::Labels => None,
@@ -158,14 +172,13 @@ pub(super) fn run_lerf(a: &LerfArgs, stage: &Stage) -> Result<String> {
     let mut rendered = None;
     if a.predictions.is_none() {
         let part = |p: &Option<PathBuf>| p.clone().expect("clap asks for it");
-        let dataset = load(&part(&a.scene), &LoadOptions::default(), stage)?;
+        let dataset = dataset.take().expect("loaded without --predictions");
         let files = SceneArgs { instances: part(&a.instances), geometry: part(&a.geometry), scene: part(&a.scene) };
         let labels = frames.iter().flat_map(|f| f.categories.values()).map(|m| m.bits.len() as u64).sum();
         let sizes = Sizes { labels, ..files.sizes(&a.language, &dataset.views) };
         stage.forecast(memory::of_scores(&sizes), SMALLER)?;
         let scene = read_scene(&files.instances, &files.geometry, stage)?;
-        let source = a.language.source()?;
-        source.check_dim(scene.instances.dim, scene.path())?;
+        let source = a.language.source_for(&scene)?;
         features.insert("text features".into(), format!("{} ({:.12})", source.describe(), source.hash()?));
         features.insert("instances".into(), format!("{:.12}", scene.artifact.hash()));
         if let Some(masks) = scene.artifact.provenance().inputs.get(artifacts::role::MASK_FEATURES) {
@@ -199,7 +212,6 @@ pub(super) fn run_lerf(a: &LerfArgs, stage: &Stage) -> Result<String> {
             (None, None) => Vec::new(),
         };
         if let Some(save) = &a.save_predictions {
-            gs_io::create_dir(save)?;
             lerf::save_predictions(save, frame, &predictions)?;
         }
         pairs.extend(lerf::pairs(frame, &predictions));
@@ -229,14 +241,13 @@ pub(super) fn run_lerf(a: &LerfArgs, stage: &Stage) -> Result<String> {
     let rule = format!("{how}; {truth}; {averaging}, missing = 0{asked}{}", a.language.describe());
     let metrics = LerfMetrics::new(name, rule, a.averaging, features, pairs, &answers, notes);
     metrics.notes.iter().for_each(|n| stage.warn(n));
-    gs_io::create_dir(&a.out)?;
-    let path = metrics.write(&a.out)?;
+    metrics.write(&a.out)?;
     let mut parameters = a.language.parameters();
     parameters["command"] = json!("lerf");
     parameters["rule"] = json!(metrics.rule);
     let summary =
         json!({"figures": metrics.figures, "zeros": metrics.pairs.iter().filter(|p| p.zero.is_some()).count()});
-    stage.record(&path, parameters, inputs, summary)?;
+    stage.record(&mut claim, parameters, inputs, summary)?;
     Ok(lerf::sheet(&[metrics]).markdown())
 }
 
@@ -282,10 +293,15 @@ pub(super) fn run_scannet(a: &ScannetArgs, stage: &Stage) -> Result<String> {
         min_support: a.language.min_support.unwrap_or(2),
     };
     let files = ScanFiles::find(&a.scene.scene)?;
+    let mut claim = protocol_outputs(&a.out, &["table.md", "objects.csv"], stage)
+        .reads(files.instances.iter().flat_map(|(segments, objects)| [segments, objects]).chain([&files.labels]))
+        .reads([&a.scene.instances, &a.scene.geometry].into_iter().chain(&a.language.text_features))
+        .claim()?;
     let parts = files.instances.iter().flat_map(|(segments, objects)| [segments, objects]).chain([&files.labels]);
     let truth = parts.map(|p| memory::bytes(p)).sum();
     stage.forecast(memory::of_scan(&Sizes { truth, ..a.scene.sizes(&a.language, &[]) }), SMALLER)?;
     let scene = read_scene(&a.scene.instances, &a.scene.geometry, stage)?;
+    scene.check_dataset(&load(&a.scene.scene, &LoadOptions::default(), stage)?)?;
     let mut features = BTreeMap::from([("instances".to_string(), format!("{:.12}", scene.artifact.hash()))]);
     if let Some(masks) = scene.artifact.provenance().inputs.get(artifacts::role::MASK_FEATURES) {
         features.insert("mask features".into(), format!("{masks:.12}"));
@@ -293,8 +309,7 @@ pub(super) fn run_scannet(a: &ScannetArgs, stage: &Stage) -> Result<String> {
     let given = a.language.clip.is_some() || a.language.text_features.is_some();
     let mut notes = Vec::new();
     let texts = if given {
-        let source = a.language.source()?;
-        source.check_dim(scene.instances.dim, scene.path())?;
+        let source = a.language.source_for(&scene)?;
         features.insert("text features".into(), format!("{} ({:.12})", source.describe(), source.hash()?));
         let names: Vec<String> = artifacts::NYU40.iter().map(|c| c.1.to_string()).collect();
         let found = source.encode(&names)?;
@@ -316,11 +331,10 @@ pub(super) fn run_scannet(a: &ScannetArgs, stage: &Stage) -> Result<String> {
         notes,
     };
     metrics.notes.iter().for_each(|n| stage.warn(n));
-    gs_io::create_dir(&a.out)?;
-    let path = metrics.write(&a.out)?;
+    metrics.write(&a.out)?;
     let parameters = json!({"command": "scannet", "rule": metrics.rule, "without": a.without});
     let summary = json!({"rows": metrics.row(), "instances": metrics.instances});
-    stage.record(&path, parameters, scene.inputs.clone(), summary)?;
+    stage.record(&mut claim, parameters, scene.inputs.clone(), summary)?;
     Ok(scan::sheet(&[metrics]).markdown())
 }
 
@@ -335,6 +349,8 @@ pub(super) struct TableArgs {
 }
 
 pub(super) fn run_table(a: &TableArgs, stage: &Stage) -> Result<String> {
+    let metrics = a.scenes.iter().map(|given| if given.is_dir() { given.join("metrics.json") } else { given.clone() });
+    let mut claim = protocol_outputs(&a.out, &["table.md", "table.html"], stage).reads(metrics).claim()?;
     let mut lerfs = Vec::new();
     let mut scans: Vec<ScanMetrics> = Vec::new();
     let mut names = BTreeSet::new();
@@ -405,13 +421,12 @@ pub(super) fn run_table(a: &TableArgs, stage: &Stage) -> Result<String> {
     };
     let summary = json.clone();
     json["tables"] = sheet.json();
-    gs_io::create_dir(&a.out)?;
     let table = sheet.markdown();
     write_bytes(a.out.join("table.md"), table.as_bytes())?;
     write_bytes(a.out.join("table.html"), sheet.html().as_bytes())?;
     let path = a.out.join("metrics.json");
     let bytes = serde_json::to_vec_pretty(&json).map_err(|e| Error::new(e.to_string()).file(&path))?;
     write_bytes(&path, &bytes)?;
-    stage.record(&path, json!({"command": "table"}), BTreeMap::new(), summary)?;
+    stage.record(&mut claim, json!({"command": "table"}), BTreeMap::new(), summary)?;
     Ok(table)
 }

@@ -8,13 +8,13 @@ use crate::memory;
 use crate::place::{self, Place};
 use crate::query::{self, Asked, Divided, ShowOptions};
 use crate::ranking::{Index, Ranked, Scoring};
-use crate::scene::{LabelledScene, find_view, slug};
+use crate::scene::{LabelledScene, find_view, numbered};
 use crate::segment;
 use crate::silhouette::Silhouette;
 use gs_io::{Error, Result};
 use gs_scene::dataset::{Dataset, LoadOptions, Resolution};
 use onnx_models::{Bounds, ClipImage, LabelMap, RgbImage, crop_mask};
-use serde_json::json;
+use serde_json::{Value, json};
 use stage::Stage;
 use std::io::{BufRead, Write};
 use std::path::{Path, PathBuf};
@@ -100,6 +100,11 @@ pub(super) fn run(a: &QueryArgs, stage: &Stage, json_lines: bool) -> Result<Stri
     let options = ShowOptions { views: a.views.clone(), rendering };
     a.language.selection()?;
     let dataset = load(&a.scene.scene, &LoadOptions { resolution: a.resolution, ..LoadOptions::default() }, stage)?;
+    let claim = |out: &PathBuf| {
+        let outputs = stage.outputs(out.join("query.json")).folder(out);
+        outputs.reads(a.scene.files(&dataset, &a.language)).reads(&a.image).claim()
+    };
+    let mut claim = a.out.as_ref().map(claim).transpose()?;
     stage.forecast(memory::of_query(&a.scene.sizes(&a.language, &dataset.views)), SMALLER)?;
     let scene = read_scene(&a.scene.instances, &a.scene.geometry, stage)?;
     let worded = !a.text.is_empty() || a.interactive;
@@ -107,6 +112,7 @@ pub(super) fn run(a: &QueryArgs, stage: &Stage, json_lines: bool) -> Result<Stri
     let source = if worded || given { Some(a.language.source()?) } else { None };
     if let Some(source) = source.as_ref().filter(|_| worded || !a.image.is_empty()) {
         source.check_dim(scene.instances.dim, scene.path())?;
+        a.language.check_model(&scene)?;
     }
     let source = source.filter(|s| s.dim() == scene.instances.dim);
     scene.check_dataset(&dataset)?;
@@ -118,7 +124,11 @@ pub(super) fn run(a: &QueryArgs, stage: &Stage, json_lines: bool) -> Result<Stri
         stage.warn("all Gaussians are noise: every query selects nothing");
     }
     if a.interactive {
-        return interactive(a, &scene, &dataset, &asker, &options, stage, json_lines);
+        interactive(a, &scene, &dataset, &asker, &options, stage, json_lines)?;
+        if let Some(claim) = &mut claim {
+            stage.record(claim, parameters(a, &rendering), scene.inputs.clone(), json!({}))?;
+        }
+        return Ok(String::new());
     }
     let mut asked = Vec::new();
     let mut divided = None;
@@ -176,6 +186,18 @@ pub(super) fn run(a: &QueryArgs, stage: &Stage, json_lines: bool) -> Result<Stri
             stage.warn(&format!("the instances selected for {:?} hold no Gaussian: nothing to show", q.text));
         }
     }
+    let summary = json!({
+        "queries": results.queries.len(), "instances": results.instances,
+        "selected_nothing": results.queries.iter().filter(|q| q.gaussians == 0).count(),
+    });
+    if let Some(claim) = &mut claim {
+        stage.record(claim, parameters(a, &rendering), scene.inputs.clone(), summary)?;
+    }
+    Ok(query::table(&results, ROWS))
+}
+
+/// What shaped the answers, for the record.
+fn parameters(a: &QueryArgs, rendering: &Rendering) -> Value {
     let mut parameters = a.language.parameters();
     parameters["command"] = json!("query");
     parameters["texts"] = json!(a.text);
@@ -183,12 +205,7 @@ pub(super) fn run(a: &QueryArgs, stage: &Stage, json_lines: bool) -> Result<Stri
     parameters["pixels"] = json!(a.pixel);
     parameters["points"] = json!(a.point);
     parameters["alpha"] = json!(rendering.threshold);
-    let summary = json!({
-        "queries": results.queries.len(), "instances": results.instances,
-        "selected_nothing": results.queries.iter().filter(|q| q.gaussians == 0).count(),
-    });
-    stage.record(out.join("query.json"), parameters, scene.inputs.clone(), summary)?;
-    Ok(query::table(&results, ROWS))
+    parameters
 }
 
 /// Features of the pictures: cut to the crop, padded to a square with black, as masks are shown to CLIP.
@@ -293,7 +310,7 @@ fn interactive(
     options: &ShowOptions,
     stage: &Stage,
     json_lines: bool,
-) -> Result<String> {
+) -> Result<()> {
     let source = asker.source.as_ref().expect("opened for texts");
     stage.info(&format!("{} instances, {}; a text a line, :quit to end", scene.instances.len(), source.describe()));
     for line in std::io::stdin().lock().lines() {
@@ -320,7 +337,8 @@ fn interactive(
         let shown = match &a.out {
             None => asked.iter().map(query::unwritten).collect(),
             Some(out) => {
-                query::write(scene, dataset, source.describe(), asked, None, options, &out.join(slug(text)))?.queries
+                let folder = out.join(free_name(out, text));
+                query::write(scene, dataset, source.describe(), asked, None, options, &folder)?.queries
             }
         };
         let mut printed = String::new();
@@ -341,7 +359,18 @@ fn interactive(
             break;
         }
     }
-    Ok(String::new())
+    Ok(())
+}
+
+/// The name of a new folder for a text: earlier answers stay.
+fn free_name(out: &Path, text: &str) -> String {
+    let taken = |number: usize| {
+        let prefix = format!("{number:02}-");
+        let entries = std::fs::read_dir(out).into_iter().flatten().flatten();
+        entries.into_iter().any(|e| e.file_name().to_string_lossy().starts_with(&prefix))
+    };
+    let number = (1..).find(|&n| !taken(n)).unwrap_or(usize::MAX);
+    numbered(number, text)
 }
 
 #[cfg(test)]

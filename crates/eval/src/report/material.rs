@@ -9,6 +9,7 @@ use gs_io::{Error, IoContext, Result, hash_file};
 use gs_raster::RasterOptions;
 use gs_scene::dataset::{Dataset, Split, View};
 use gs_scene::{Gaussians, Geometry};
+use stage::RunRecord;
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
@@ -72,9 +73,13 @@ impl<'a> Material<'a> {
         let geometry = scene.geometry();
         metrics.skipped.extend(geometry.damage());
         let raster = RasterOptions::of(geometry);
-        let scores = optional_json::<Scores>(&options.run_dir.join("score.json"))?;
+        let path = options.run_dir.join("score.json");
+        let scores = if is_of(&path, inputs) { optional_json::<Scores>(&path)? } else { None };
         match &scores {
             Some(s) => metrics.skipped.extend(s.skipped.iter().cloned()),
+            None if path.exists() => {
+                metrics.skipped.push("scores: score.json is of other instances (run eval score)".into())
+            }
             None => metrics.skipped.push("scores: the run has no score.json (eval score makes it)".into()),
         }
         let mut shown = Vec::new();
@@ -120,6 +125,11 @@ fn psnr(a: &Picture, b: &Picture) -> f64 {
         a.pixels.iter().zip(&b.pixels).flat_map(|(x, y)| x.iter().zip(y)).map(|(x, y)| f64::from(x - y).powi(2));
     let mse = squares.sum::<f64>() / (3 * a.pixels.len()).max(1) as f64;
     -10.0 * mse.max(1e-20).log10()
+}
+
+/// Whether the record of an output of eval, if it has one, names the instances of this run.
+pub(super) fn is_of(output: &Path, inputs: &BTreeMap<String, String>) -> bool {
+    RunRecord::read(output).map_or(true, |record| record.inputs.get("instances") == inputs.get("instances"))
 }
 
 /// Reads a JSON file that need not exist.

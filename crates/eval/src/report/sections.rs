@@ -1,7 +1,7 @@
 //! The sections of a report, in their order on the page.
 
 use super::Metrics;
-use super::material::{Material, optional_json};
+use super::material::{Material, is_of, optional_json};
 use crate::html::{Figure, Page};
 use crate::pca::pca;
 use crate::picture::Picture;
@@ -198,13 +198,17 @@ pub(super) fn instances(m: &Material, page: &mut Page, metrics: &mut Metrics) ->
 
 pub(super) fn queries(m: &Material, page: &mut Page, metrics: &mut Metrics) -> Result<()> {
     let folder = m.file("query");
-    let results = optional_json::<QueryResults>(&folder.join("query.json"))?;
+    let path = folder.join("query.json");
+    let current = m.labelled().is_none_or(|l| is_of(&path, &l.inputs));
+    let results = if current { optional_json::<QueryResults>(&path)? } else { None };
     let Some(results) = results.filter(|r| !r.queries.is_empty()) else {
         let without_language = m.labelled().is_some_and(|l| l.instances.dim == 0);
         metrics.skipped.push(if without_language {
             "text queries: the instances have no language features, because the masks were not encoded with a CLIP \
-             model (mask-embed --clip)"
+             model (mask-embed embed --clip)"
                 .into()
+        } else if !current {
+            "text queries: query/query.json is of other instances (run eval query)".into()
         } else {
             "text queries: the run has no query/query.json (eval query makes it)".into()
         });

@@ -5,6 +5,7 @@ use artifacts::{Features, Instances, MaskMaps, Match, TrueObject, TruePart, True
 use glam::DVec3;
 use gs_io::{Provenance, hash_file};
 use gs_raster::RasterOptions;
+use gs_scene::dataset::{self, LoadOptions};
 use gs_scene::{Camera, Gaussians, Image};
 use serde_json::json;
 use std::collections::BTreeMap;
@@ -77,7 +78,11 @@ impl Fixture {
     }
 
     fn provenance(&self) -> Provenance {
-        let inputs = BTreeMap::from([(role::GEOMETRY.to_string(), hash_file(self.geometry()).unwrap())]);
+        let mut inputs = BTreeMap::from([(role::GEOMETRY.to_string(), hash_file(self.geometry()).unwrap())]);
+        // A scan alone is no dataset.
+        if let Ok(dataset) = dataset::load(&self.scene(), &LoadOptions::default()) {
+            inputs.insert(role::DATASET.to_string(), dataset.hash().unwrap());
+        }
         Provenance { inputs, ..Provenance::default() }
     }
 

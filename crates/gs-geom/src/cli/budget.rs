@@ -4,12 +4,13 @@ use super::beside;
 use super::train::TrainArgs;
 use crate::densify::{DensifyOptions, densify};
 use crate::init;
+use crate::masks::Masks;
 use crate::photographs::Photographs;
 use crate::plan::{Limits, Plan, Speed, plan};
 use crate::schedule::{Purpose, Schedule, generator};
 use crate::train::{TrainOptions, Trainer};
 use gs_io::{Error, Result, write_bytes};
-use gs_scene::dataset::{Resolution, Split, View};
+use gs_scene::dataset::{Dataset, Resolution, Split, View};
 use gs_scene::{Camera, Gaussians};
 use serde::{Deserialize, Serialize};
 use serde_json::{Value, json};
@@ -56,10 +57,10 @@ pub(super) fn seconds(text: &str) -> Result<f64> {
 
 impl TrainArgs {
     /// These arguments with a plan for `budget` seconds in place of the budget, and the plan for the record.
-    pub(super) fn plan(&self, budget: f64, stage: &Stage) -> Result<(Self, Value)> {
+    pub(super) fn plan(&self, budget: f64, dataset: &Dataset, masks: &Masks, stage: &Stage) -> Result<(Self, Value)> {
         let kept = match self.kept(budget) {
             Some(kept) => kept,
-            None => self.measured(budget, stage)?,
+            None => self.measured(budget, dataset, masks, stage)?,
         };
         let Plan { iterations, gaussians, seconds, .. } = kept.plan;
         let mut planned = self.clone();
@@ -85,20 +86,19 @@ impl TrainArgs {
     }
 
     /// Measures the speed and plans.
-    fn measured(&self, budget: f64, stage: &Stage) -> Result<Kept> {
+    fn measured(&self, budget: f64, dataset: &Dataset, masks: &Masks, stage: &Stage) -> Result<Kept> {
         let begun = Instant::now();
         let options = self.options(stage.seed())?;
-        let dataset = self.scene.load(stage)?;
         let train: Vec<&View> = dataset.views_of(Split::Train).collect();
         let cameras: Vec<&Camera> = train.iter().map(|v| &v.camera).collect();
         let Some(width) = cameras.iter().map(|c| c.width).max() else {
             return Err(Error::new("every view is held out").file(&self.scene.scene).hint("give --holdout 0"));
         };
         let extent = init::extent(&cameras, &dataset.points.positions);
-        let start = self.start(&dataset, &cameras, extent, stage)?;
+        let start = self.start(dataset, &cameras, extent, stage)?;
         let some = train.len().min(VIEWS);
         let views: Vec<&View> = (0..some).map(|i| train[i * train.len() / some]).collect();
-        let photographs = Photographs::load(views, self.masks.load(&dataset, stage)?, self.cache_bytes())?;
+        let photographs = Photographs::load(views, masks.clone(), self.cache_bytes())?;
         let gains = self.gains(&photographs)?;
         let count = start.len();
         let speed = probe(options.clone(), extent, photographs, start)?;
@@ -114,7 +114,7 @@ impl TrainArgs {
             seconds: (SHARE * budget - begun.elapsed().as_secs_f64()).max(0.0),
             iterations: self.iterations,
             start: count,
-            gaussians: if self.fixed_points { count } else { self.most_gaussians(&dataset).max(count) },
+            gaussians: if self.fixed_points { count } else { self.most_gaussians(dataset).max(count) },
             divisor: (f64::from(width) / LEAST_WIDTH).max(1.0),
             heldout: dataset.views_of(Split::Test).count(),
         };

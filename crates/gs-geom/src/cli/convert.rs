@@ -1,16 +1,15 @@
 //! `gs-geom convert`.
 
-use super::check_writable;
 use crate::convert::{Choice, Order, arrange, choose};
 use crate::init;
 use crate::inspect::Bounds;
 use artifacts::role;
-use gs_io::{Error, IoContext, Result, hash_file, npy};
+use gs_io::{Error, Result, hash_file, npy};
 use gs_scene::ply;
 use serde_json::json;
 use stage::Stage;
 use std::collections::BTreeMap;
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 use std::str::FromStr;
 
 /// Arguments of `gs-geom convert`.
@@ -67,19 +66,8 @@ impl ConvertArgs {
         if !(0.0..=1.0).contains(&self.min_opacity) {
             return Err(Error::new("out of range").field("--min-opacity").found(self.min_opacity).expected("0 to 1"));
         }
-        let another = |what: &str, file: &Path, than: &Path| {
-            let e = || Error::new("the input would be overwritten").file(file).field(what.to_string());
-            if same_file(file, than)? { Err(e().expected("another file")) } else { Ok(()) }
-        };
-        another("OUT", &self.output, &self.input)?;
-        check_writable(&self.output)?;
-        if let Some(map) = &self.keep_map {
-            another("--keep-map", map, &self.input)?;
-            check_writable(map)?;
-            if same_path(map, &self.output) {
-                return Err(Error::new("two outputs in one file").file(map).field("--keep-map"));
-            }
-        }
+        let outputs = stage.outputs(&self.output).file(&self.output).files(&self.keep_map).reads([&self.input]);
+        let mut claim = outputs.claim()?;
         let mut g = ply::read_gaussians_as_they_are(&self.input)?;
         let all = g.len();
         let choice = Choice { min_opacity: self.min_opacity, crop: self.crop.map(|c| c.0) };
@@ -123,31 +111,8 @@ impl ConvertArgs {
             "cropped": chosen.cropped,
             "faint": chosen.faint,
         });
-        stage.record(&self.output, parameters, inputs, summary)
+        stage.record(&mut claim, parameters, inputs, summary)
     }
-}
-
-/// Whether two names lead to one file, through links too.
-fn same_file(file: &Path, input: &Path) -> Result<bool> {
-    let canonical = input.canonicalize().at("read", input)?;
-    let Ok(there) = file.canonicalize() else { return Ok(false) };
-    #[cfg(unix)]
-    {
-        use std::os::unix::fs::MetadataExt;
-        if let (Ok(a), Ok(b)) = (there.metadata(), canonical.metadata()) {
-            return Ok((a.dev(), a.ino()) == (b.dev(), b.ino()));
-        }
-    }
-    Ok(there == canonical)
-}
-
-/// Whether two outputs, which need not be there yet, have one name in one folder.
-fn same_path(a: &Path, b: &Path) -> bool {
-    let folder = |p: &Path| {
-        let folder = p.parent().filter(|f| !f.as_os_str().is_empty()).unwrap_or(Path::new("."));
-        folder.canonicalize().ok()
-    };
-    a.file_name() == b.file_name() && folder(a) == folder(b)
 }
 
 #[cfg(test)]

@@ -1,6 +1,6 @@
 //! `gs-geom eval`.
 
-use super::{GeometryArgs, MaskArgs, SceneArgs, check_writable};
+use super::{GeometryArgs, MaskArgs, SceneArgs};
 use crate::metrics::{ViewMetrics, mean, measure};
 use artifacts::role;
 use gs_io::{Error, Result, hash_file, write_bytes};
@@ -29,7 +29,8 @@ impl EvalArgs {
         let dataset = self.scene.load(stage)?;
         let (gaussians, options) = self.geometry.read(self.scene.background, stage)?;
         let (alpha, masks) = (self.masks.alpha(), self.masks.load(&dataset, stage)?);
-        check_writable(&self.out)?;
+        let reads = dataset.files().into_iter().chain(masks.files()).chain([self.geometry.geometry.clone()]);
+        let mut claim = stage.outputs(&self.out).file(&self.out).reads(reads).claim()?;
         let mut split = Split::Test;
         let mut views: Vec<&View> = dataset.views_of(split).collect();
         if views.is_empty() {
@@ -83,6 +84,6 @@ impl EvalArgs {
             "views": figures.len(),
             "gaussians": gaussians.len(),
         });
-        stage.record(&self.out, parameters, inputs, summary)
+        stage.record(&mut claim, parameters, inputs, summary)
     }
 }

@@ -1,12 +1,14 @@
 //! `gs-geom render`.
 
 use super::{GeometryArgs, SceneArgs};
-use gs_io::{Error, Result, create_dir, write_bytes};
+use artifacts::role;
+use gs_io::{Error, Result, hash_file, write_bytes};
 use gs_raster::{Rendered, render};
 use gs_scene::Image;
 use gs_scene::dataset::{Dataset, Split, View};
+use serde_json::json;
 use stage::Stage;
-use std::collections::BTreeSet;
+use std::collections::{BTreeMap, BTreeSet};
 use std::io::Cursor;
 use std::path::PathBuf;
 
@@ -33,7 +35,10 @@ impl RenderArgs {
         let dataset = self.scene.load(stage)?;
         let (gaussians, options) = self.geometry.read(self.scene.background, stage)?;
         let views = choose(&dataset, &self.views)?;
-        create_dir(&self.out)?;
+        let extensions: &[&str] = if self.exr { &["png", "exr"] } else { &["png"] };
+        let names = views.iter().flat_map(|v| extensions.iter().map(|e| format!("{}.{e}", v.stem())));
+        let reads = dataset.files().into_iter().chain([self.geometry.geometry.clone()]);
+        let mut claim = stage.outputs(&self.out).files_in(&self.out, names).reads(reads).claim()?;
         let mut progress = stage.progress("view", views.len() as u64);
         for view in &views {
             if stage.interrupted() {
@@ -49,7 +54,11 @@ impl RenderArgs {
         }
         progress.finish(&[]);
         stage.info(&format!("{} views in {}", views.len(), self.out.display()));
-        Ok(())
+        let inputs = BTreeMap::from([
+            (role::DATASET.to_string(), dataset.hash()?),
+            (role::GEOMETRY.to_string(), hash_file(&self.geometry.geometry)?),
+        ]);
+        stage.record(&mut claim, json!({"exr": self.exr}), inputs, json!({"views": views.len()}))
     }
 }
 

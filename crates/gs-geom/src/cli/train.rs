@@ -5,18 +5,20 @@ mod forecast;
 mod start;
 
 use self::finish::spent_since;
-use super::{Background, MaskArgs, SceneArgs, beside, check_writable};
+use super::budget::plan_path;
+use super::{Background, MaskArgs, SceneArgs, beside};
 use crate::checkpoint::{self, State};
 use crate::content::{self, Gain};
 use crate::densify::{DensifyOptions, Strategy};
 use crate::init;
+use crate::masks::Masks;
 use crate::mcmc::McmcOptions;
 use crate::photographs::{Photographs, full_share};
 use crate::schedule::{LearningRates, Schedule};
 use crate::train::{TrainOptions, Trainer};
 use artifacts::role;
 use clap::ValueEnum;
-use gs_io::{Error, Lock, Provenance, Result, Watched, hash_file};
+use gs_io::{Claim, Error, Provenance, Result, Watched, hash_file};
 use gs_scene::dataset::{Dataset, Split, View};
 use gs_scene::{Camera, ply};
 use serde_json::{Value, json};
@@ -133,6 +135,13 @@ pub(super) struct TrainArgs {
 const PIXELS_PER_GAUSSIAN: usize = 100;
 /// The budget is never less by itself.
 const LEAST_BUDGET: usize = 10_000;
+
+/// What lies beside the output: the training curve and its plot, the photographs' exposures, and the Gaussians of an
+/// unfinished run.
+const CURVE: &str = ".curve.jsonl";
+const PLOT: &str = ".curve.svg";
+const EXPOSURES: &str = ".exposures.json";
+const PARTIAL: &str = ".partial.ply";
 
 /// What to start from.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -256,12 +265,16 @@ impl TrainArgs {
     pub(super) fn run(&self, stage: &Stage) -> Result<()> {
         // From here on a signal ends the run with a checkpoint.
         stage.interrupted();
+        let dataset = self.scene.load(stage)?;
+        let masks = self.masks.load(&dataset, stage)?;
+        let mut claim = self.claim(&dataset, &masks, stage)?;
         match self.time_budget {
             Some(seconds) => {
-                let (planned, plan) = self.plan(seconds, stage)?;
-                planned.train(plan, stage)
+                let (planned, plan) = self.plan(seconds, &dataset, &masks, stage)?;
+                let dataset = planned.scene.load_quietly()?;
+                planned.train(plan, &dataset, masks, &mut claim, stage)
             }
-            None => self.train(Value::Null, stage),
+            None => self.train(Value::Null, &dataset, masks, &mut claim, stage),
         }
     }
 
@@ -291,10 +304,9 @@ impl TrainArgs {
     }
 
     /// The run itself; `plan` is how its options came about, for the record.
-    fn train(&self, plan: Value, stage: &Stage) -> Result<()> {
+    fn train(&self, plan: Value, dataset: &Dataset, masks: Masks, claim: &mut Claim, stage: &Stage) -> Result<()> {
         let mut options = self.options(stage.seed())?;
-        let dataset = self.scene.load(stage)?;
-        options.densify.max_gaussians = self.most_gaussians(&dataset);
+        options.densify.max_gaussians = self.most_gaussians(dataset);
         let of = |split: Split| dataset.views_of(split).collect::<Vec<&View>>();
         let (train, heldout) = (of(Split::Train), of(Split::Test));
         if train.is_empty() {
@@ -304,10 +316,7 @@ impl TrainArgs {
                 .expected("at least one view to learn from")
                 .hint("give --holdout 0, or more photographs"));
         }
-        check_writable(&self.out)?;
-        let _lock = Lock::take(&self.out)?;
-        let watched = self.watched(&dataset);
-        let masks = self.masks.load(&dataset, stage)?;
+        let watched = self.watched(dataset);
         let photographs = Photographs::load(train.clone(), masks.clone(), self.cache_bytes())?;
         options.schedule.coarse = self.coarse(&self.gains(&photographs)?, self.iterations);
 
@@ -340,7 +349,7 @@ impl TrainArgs {
             Some(state) => state,
             None => {
                 let exposures = if self.exposure { train.len() } else { 0 };
-                checkpoint::start(self.start(&dataset, &cameras, extent, stage)?, exposures)
+                checkpoint::start(self.start(dataset, &cameras, extent, stage)?, exposures)
             }
         };
         stage.info(&format!(
@@ -355,7 +364,7 @@ impl TrainArgs {
             let sizes = options.schedule.coarse.iter().map(|(last, divisor)| format!("1/{divisor} until {last}"));
             stage.info(&format!("picture sizes: {}, then full", sizes.collect::<Vec<_>>().join(", ")));
         }
-        let forecast = self.forecast(&dataset, &masks, &state.gaussians, &options.schedule, stage)?;
+        let forecast = self.forecast(dataset, &masks, &state.gaussians, &options.schedule, stage)?;
         // The training views' smaller pictures are not there yet.
         let left = full_share(self.cache_bytes()).saturating_sub(photographs.kept_bytes());
         let heldout = Photographs::load(heldout, masks, left)?;
@@ -364,10 +373,23 @@ impl TrainArgs {
         let done = self.optimise(&mut trainer, &run, &watched, stage).and_then(|done| match done {
             true => watched
                 .check()
-                .and_then(|()| self.finish(&mut trainer, &run, &forecast, (plan, spent_since(before)), stage)),
+                .and_then(|()| self.finish(&mut trainer, &run, &forecast, (plan, spent_since(before)), claim, stage)),
             false => Ok(()),
         });
         done.inspect_err(|_| self.rescue(&trainer, &run, &watched, stage))
+    }
+
+    /// The right to write everything that a run may leave.
+    fn claim(&self, dataset: &Dataset, masks: &Masks, stage: &Stage) -> Result<Claim> {
+        let exposures = Some(EXPOSURES).filter(|_| self.exposure);
+        let beside = [CURVE, PLOT, PARTIAL].into_iter().chain(exposures).map(|suffix| beside(&self.out, suffix));
+        let outputs = stage.outputs(&self.out).file(&self.out).files(beside).file(plan_path(&self.out));
+        let outputs = outputs.artifact(checkpoint::path_of(&self.out), checkpoint::FORMAT);
+        let init = match &self.init {
+            Init::File(path) => Some(path.clone()),
+            _ => None,
+        };
+        outputs.reads(dataset.files().into_iter().chain(masks.files()).chain(init)).drop_stale().claim()
     }
 
     /// The files that are hashed at one time and read at another.
@@ -430,7 +452,7 @@ impl TrainArgs {
             if stop || stage.interrupted() {
                 watched.check_those_left()?;
                 self.save(trainer, run)?;
-                let partial = beside(&self.out, ".partial.ply");
+                let partial = beside(&self.out, PARTIAL);
                 let note = format!("unfinished: {iteration} of {} iterations", self.iterations);
                 ply::write_gaussians(&partial, &trainer.state().gaussians, &[note])?;
                 stage.info(&format!(

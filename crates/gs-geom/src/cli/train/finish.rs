@@ -1,6 +1,6 @@
 //! What a finished run leaves: Gaussians, curve, exposures and its record.
 
-use super::{TrainArgs, remove_if_there};
+use super::{CURVE, EXPOSURES, PARTIAL, PLOT, TrainArgs, remove_if_there};
 use crate::checkpoint::{self, State};
 use crate::cli::beside;
 use crate::cli::budget::plan_path;
@@ -8,7 +8,7 @@ use crate::curve;
 use crate::densify::drawable;
 use crate::memory::Forecast;
 use crate::train::{Timings, Trainer};
-use gs_io::{Error, Provenance, Result, write_bytes};
+use gs_io::{Claim, Error, Provenance, Result, write_bytes};
 use gs_scene::ply;
 use serde_json::{Value, json};
 use stage::Stage;
@@ -23,6 +23,7 @@ impl TrainArgs {
         run: &Provenance,
         forecast: &Forecast,
         (plan, iteration_cpu_seconds): (Value, Option<f64>),
+        claim: &mut Claim,
         stage: &Stage,
     ) -> Result<()> {
         let (psnr, ssim) = trainer.heldout()?.unzip();
@@ -47,8 +48,8 @@ impl TrainArgs {
             ));
         }
         let curve: String = progress.curve.iter().map(|line| format!("{line}\n")).collect();
-        write_bytes(beside(&self.out, ".curve.jsonl"), curve.as_bytes())?;
-        write_bytes(beside(&self.out, ".curve.svg"), curve::svg(&progress.curve).as_bytes())?;
+        write_bytes(beside(&self.out, CURVE), curve.as_bytes())?;
+        write_bytes(beside(&self.out, PLOT), curve::svg(&progress.curve).as_bytes())?;
         if !trainer.state().exposures.is_off() {
             let names = trainer.train_names();
             let maps: serde_json::Map<String, Value> = names
@@ -56,7 +57,7 @@ impl TrainArgs {
                 .map(|(name, map)| (name.to_string(), json!(map.chunks(4).collect::<Vec<_>>())))
                 .collect();
             let text = serde_json::to_vec_pretty(&maps).map_err(|e| Error::new(e.to_string()))?;
-            write_bytes(beside(&self.out, ".exposures.json"), &text)?;
+            write_bytes(beside(&self.out, EXPOSURES), &text)?;
         }
         let mut comments = comments(parameters, inputs);
         comments.extend(progress.extended.iter().map(|i| format!("extended after iteration {i}")));
@@ -82,14 +83,14 @@ impl TrainArgs {
             "iteration_cpu_seconds": iteration_cpu_seconds,
             "plan": plan,
         });
-        stage.record(&self.out, parameters.clone(), inputs.clone(), summary)?;
-        for leftover in [beside(&self.out, ".partial.ply"), plan_path(&self.out)] {
+        if self.keep_state {
+            self.save(trainer, run)?;
+        }
+        stage.record(claim, parameters.clone(), inputs.clone(), summary)?;
+        let state = Some(checkpoint::path_of(&self.out)).filter(|_| !self.keep_state);
+        for leftover in [beside(&self.out, PARTIAL), plan_path(&self.out)].into_iter().chain(state) {
             remove_if_there(&leftover);
         }
-        if self.keep_state {
-            return self.save(trainer, run);
-        }
-        remove_if_there(&checkpoint::path_of(&self.out));
         Ok(())
     }
 }
