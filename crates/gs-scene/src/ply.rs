@@ -134,7 +134,7 @@ fn gaussians_of(table: &Table<'_>) -> Result<Gaussians> {
     let rotation = table.columns(["rot_0", "rot_1", "rot_2", "rot_3"])?;
     let [opacity] = table.columns(["opacity"])?;
     let mut sh_columns = table.columns(["f_dc_0", "f_dc_1", "f_dc_2"])?.to_vec();
-    let rest: Vec<Column> = (0..).map_while(|i| table.find(&format!("f_rest_{i}"))).collect();
+    let rest = rest_columns(table)?;
     let sh_degree = match rest.len() {
         0 => 0,
         9 => 1,
@@ -159,6 +159,22 @@ fn gaussians_of(table: &Table<'_>) -> Result<Gaussians> {
         sh: table.gather(&sh_columns),
         sh_degree,
     })
+}
+
+/// The columns f_rest_0, f_rest_1 and so on, without a gap.
+fn rest_columns(table: &Table<'_>) -> Result<Vec<Column>> {
+    let count = table.count_of("f_rest_");
+    let find = |i: usize| {
+        let name = format!("f_rest_{i}");
+        table.find(&name).ok_or_else(|| {
+            Error::new("a spherical-harmonics property is missing")
+                .field(name)
+                .found(format!("{count} properties f_rest_* without it"))
+                .expected("0, 9, 24 or 45, numbered from 0 without a gap")
+                .hint(AGAIN)
+        })
+    };
+    (0..count).map(find).collect()
 }
 
 fn header(count: usize, comments: &[String], properties: &[(&str, String)]) -> String {
@@ -223,10 +239,11 @@ fn write_rows(
     })
 }
 
-/// Reads a coloured point cloud; white where the file has no colours. Colours stored as floats lie in 0 to 1.
+/// Reads a coloured point cloud; white where the file has no colours. Colours stored as floats lie in 0 to 1, others in 0 to
+/// 255.
 ///
 /// # Errors
-/// When the file is damaged, has no positions, or one is not finite.
+/// When the file is damaged, has no positions, or one is not finite, or a colour lies outside its range.
 pub fn read_points(path: impl AsRef<Path>) -> Result<PointCloud> {
     let path = path.as_ref();
     let bytes = std::fs::read(path).at("read", path)?;
@@ -264,12 +281,27 @@ fn parse_labels(bytes: &[u8], property: &str) -> Result<(Vec<[f32; 3]>, Vec<u32>
 fn parse_points(bytes: &[u8]) -> Result<PointCloud> {
     let table = table::read(bytes)?;
     let positions = table.positions()?;
-    let channel = |name| match table.find(name) {
-        None => vec![255; table.count],
-        Some(c) if c.is_float() => table.gather(&[c]).into_iter().map(|v| (255.0 * v).round() as u8).collect(),
-        Some(c) => table.gather(&[c]).into_iter().map(|v| v as u8).collect::<Vec<u8>>(),
+    let channel = |name| {
+        let Some(c) = table.find(name) else { return Ok(vec![255; table.count]) };
+        let most = if c.is_float() { 1.0 } else { 255.0 };
+        let byte = |(i, v): (usize, f32)| {
+            // Rounded first: arithmetic on floats ends a little beside 0 and 1.
+            let scaled = (255.0 / most * v).round();
+            if (0.0..=255.0).contains(&scaled) {
+                return Ok(scaled as u8);
+            }
+            Err(Error::new("a colour is out of range")
+                .field(format!("vertex {i}, {name}"))
+                .found(v)
+                .expected(format!(
+                    "0 to {most}, since the property is a {}",
+                    if c.is_float() { "float" } else { "whole number" }
+                ))
+                .hint("store red, green and blue as uchar from 0 to 255"))
+        };
+        table.gather(&[c]).into_iter().enumerate().map(byte).collect::<Result<Vec<u8>>>()
     };
-    let (r, g, b) = (channel("red"), channel("green"), channel("blue"));
+    let (r, g, b) = (channel("red")?, channel("green")?, channel("blue")?);
     let colors = (0..table.count).map(|i| [r[i], g[i], b[i]]).collect();
     Ok(PointCloud { positions, colors })
 }

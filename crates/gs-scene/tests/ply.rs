@@ -96,8 +96,17 @@ fn encode(g: &Gaussians, kind: Kind, list: bool) -> Vec<u8> {
             out.push(b'\n');
         }
     }
+    if kind == Kind::Ascii {
+        out.extend(b"3 0 1 1");
+    } else {
+        out.push(3);
+        [0i32, 1, 1].iter().for_each(|v| scalar(&mut out, &v.to_le_bytes()));
+    }
     out
 }
+
+/// Bytes of the face that ends a binary file of [`encode`].
+const FACE: usize = 13;
 
 fn file(bytes: &[u8]) -> (tempfile::TempDir, PathBuf) {
     let dir = tempfile::tempdir().unwrap();
@@ -217,15 +226,21 @@ fn damage_is_named() {
         let header = std::str::from_utf8(&good[..header_end]).unwrap().replace(from, to);
         [header.as_bytes(), &good[header_end..]].concat()
     };
-    let cases: [(Vec<u8>, &str); 14] = [
+    let cases: [(Vec<u8>, &str); 17] = [
         (Vec::new(), "the header does not end"),
         (b"PNG\n".to_vec(), "not a PLY file"),
         (good[..40].to_vec(), "the header does not end"),
         (
-            good[..good.len() - 1].to_vec(),
+            good[..good.len() - FACE - 1].to_vec(),
             "element vertex: the file is cut short or its count lies; found 3 rows, expected 4 rows",
         ),
         (good[..header_end + 5].to_vec(), "element camera"),
+        (good[..good.len() - 1].to_vec(), "element face: the file is cut short or its count lies; found 0 rows"),
+        ([&good[..], b"\n\0"].concat(), "header: the file goes on after its last element"),
+        (
+            with("element face 1", "element face 0"),
+            "found 13 bytes more, expected the end of the file after element camera 2",
+        ),
         (with("element vertex 4", "element vertex 5"), "element vertex: the file is cut short or its count lies"),
         (with("element vertex 4", "element vertex 18446744073709551615"), "element vertex"),
         (with("element vertex 4", "element vertex 99999999999999999999"), "element vertex: not a count"),
@@ -248,6 +263,61 @@ fn damage_is_named() {
     assert!(refuse(ascii.as_bytes()).contains("element camera: the file is cut short"));
     let word = String::from_utf8_lossy(&encode(&sample(1, 0), Kind::Ascii, false)).replace("7 2 100", "7 2 many");
     assert!(refuse(word.as_bytes()).contains("camera 0: not a number; found many"));
+}
+
+#[test]
+fn a_count_smaller_than_the_data_is_refused() {
+    let dir = tempfile::tempdir().unwrap();
+    let path = dir.path().join("g.ply");
+    ply::write_gaussians(&path, &sample(4, 0), &[]).unwrap();
+    let good = std::fs::read(&path).unwrap();
+    let at = good.windows(16).position(|w| w == b"element vertex 4").unwrap() + 15;
+    let fewer = [&good[..at], b"3", &good[at + 1..]].concat();
+    let e = refuse(&fewer);
+    assert!(
+        e.contains("found 68 bytes more, expected the end of the file after element vertex 3, as the header says"),
+        "{e}"
+    );
+    // Faces are no remains, and an empty line at the end is none either.
+    let spaced = [&encode(&sample(4, 0), Kind::Ascii, false)[..], b"\n\r\n"].concat();
+    assert_eq!(read(&spaced).unwrap(), sample(4, 0));
+    let more = [&spaced[..], b"1 2 3\n"].concat();
+    assert!(refuse(&more).contains("the file goes on after its last element"));
+}
+
+#[test]
+fn spherical_harmonics_are_all_there_or_refused() {
+    let text = |degree, from, to| {
+        let all = String::from_utf8_lossy(&encode(&sample(1, degree), Kind::Ascii, false)).into_owned();
+        assert!(all.contains(from), "{from}");
+        all.replace(from, to).into_bytes()
+    };
+    let e = refuse(&text(3, "float f_rest_9\n", "float other\n"));
+    assert!(e.contains("f_rest_9: a spherical-harmonics property is missing; found 44"), "{e}");
+    let e = refuse(&text(3, "float f_rest_9\n", "float f_rest_45\n"));
+    assert!(e.contains("f_rest_9: a spherical-harmonics property is missing; found 45"), "{e}");
+    let e = refuse(&text(1, "float f_rest_8\n", "float f_rest_9\n"));
+    assert!(e.contains("f_rest_8: a spherical-harmonics property is missing"), "{e}");
+}
+
+#[test]
+fn colours_keep_to_the_range_of_their_type() {
+    let colours = |kind: &str, values: &str| {
+        let properties: String = ["red", "green", "blue"].map(|c| format!("property {kind} {c}\n")).concat();
+        let xyz = "property float x\nproperty float y\nproperty float z\n";
+        let text = format!("ply\nformat ascii 1.0\nelement vertex 2\n{xyz}{properties}end_header\n");
+        let (_dir, path) = file(format!("{text}1 2 3 0 0 0\n1 2 3 {values}\n").as_bytes());
+        ply::read_points(&path).map(|p| p.colors[1]).map_err(|e| e.to_string())
+    };
+    assert_eq!(colours("uchar", "9 128 255").unwrap(), [9, 128, 255]);
+    assert_eq!(colours("int", "0 1 255").unwrap(), [0, 1, 255]);
+    // Floats a little beside their range are arithmetic's.
+    assert_eq!(colours("double", "-0.0000001 0.5 1.000001").unwrap(), [0, 128, 255]);
+    let e = colours("float", "0.5 200 1").unwrap_err();
+    assert!(e.contains("vertex 1, green: a colour is out of range; found 200, expected 0 to 1"), "{e}");
+    assert!(colours("ushort", "0 0 65535").unwrap_err().contains("blue: a colour is out of range; found 65535"));
+    assert!(colours("float", "nan 0 0").unwrap_err().contains("red: a colour is out of range"));
+    assert!(colours("char", "-1 0 0").unwrap_err().contains("expected 0 to 255"));
 }
 
 #[test]

@@ -84,6 +84,13 @@ struct Element {
     properties: Vec<Property>,
 }
 
+impl Element {
+    /// Whether its rows are used as they lie in the file: binary and without lists.
+    fn is_as_it_lies(&self, encoding: Encoding) -> bool {
+        encoding != Encoding::Ascii && self.properties.iter().all(|p| matches!(p, Property::Scalar(..)))
+    }
+}
+
 struct Header<'a> {
     encoding: Encoding,
     elements: Vec<Element>,
@@ -175,12 +182,14 @@ pub(super) struct Column {
     at: usize,
     scalar: Scalar,
     big: bool,
+    /// The type that the header names; `scalar` is that of the rows, which may have been rewritten.
+    named: Scalar,
 }
 
 impl Column {
     /// Whether the file stores it as a float or double.
     pub(super) fn is_float(self) -> bool {
-        matches!(self.scalar, Scalar::F32 | Scalar::F64)
+        matches!(self.named, Scalar::F32 | Scalar::F64)
     }
 }
 
@@ -193,7 +202,20 @@ pub(super) struct Table<'a> {
     rows: Cow<'a, [u8]>,
 }
 
-impl Table<'_> {
+impl<'a> Table<'a> {
+    fn new(element: &Element, encoding: Encoding, rows: Cow<'a, [u8]>) -> Self {
+        let as_is = element.is_as_it_lies(encoding);
+        let (mut stride, mut columns) = (0, Vec::new());
+        for p in &element.properties {
+            let Property::Scalar(name, named) = p else { continue };
+            let scalar = if as_is { *named } else { Scalar::F32 };
+            let big = as_is && encoding == Encoding::Big;
+            columns.push((name.clone(), Column { at: stride, scalar, big, named: *named }));
+            stride += scalar.size();
+        }
+        Self { count: element.count, stride, columns, rows }
+    }
+
     /// The column of a property.
     pub(super) fn column(&self, name: &str) -> Result<Column> {
         self.find(name).ok_or_else(|| {
@@ -206,6 +228,11 @@ impl Table<'_> {
     /// The column of a property, where there is one.
     pub(super) fn find(&self, name: &str) -> Option<Column> {
         self.columns.iter().find(|(n, _)| n == name).map(|(_, c)| *c)
+    }
+
+    /// How many properties have a name that begins so.
+    pub(super) fn count_of(&self, prefix: &str) -> usize {
+        self.columns.iter().filter(|(n, _)| n.starts_with(prefix)).count()
     }
 
     /// The values of some columns, `[count][columns]`.
@@ -298,7 +325,32 @@ fn read_rows<'a>(element: &Element, encoding: Encoding, body: &'a [u8], rows: &m
     Ok(numbers.rest)
 }
 
-/// Reads the vertices of a PLY file and skips the elements before them.
+/// Takes an element's rows off the front of `body`: as they lie there, or rewritten as [`read_rows`] does.
+fn take_rows<'a>(element: &Element, encoding: Encoding, body: &mut &'a [u8]) -> Result<Cow<'a, [u8]>> {
+    // The smallest row that the encoding allows bounds how many the file can hold.
+    let smallest = |p: &Property| match (encoding, p) {
+        (Encoding::Ascii, _) => 2,
+        (_, Property::Scalar(_, s) | Property::List(s, _)) => s.size(),
+    };
+    let stride: usize = element.properties.iter().map(smallest).sum();
+    let least = stride.max(1);
+    let short = || cut_short(&element.name, body.len() / least, element.count);
+    // The last line of a text may lack its end.
+    if element.count > (body.len() + 1) / least {
+        return Err(short());
+    }
+    if element.is_as_it_lies(encoding) {
+        let total = stride.checked_mul(element.count);
+        let (head, rest) = total.and_then(|t| body.split_at_checked(t)).ok_or_else(short)?;
+        *body = rest;
+        return Ok(Cow::Borrowed(head));
+    }
+    let mut owned = Vec::new();
+    *body = read_rows(element, encoding, body, &mut owned)?;
+    Ok(Cow::Owned(owned))
+}
+
+/// Reads the vertices of a PLY file. The other elements are walked through and left out: nothing may follow the last one.
 pub(super) fn read(bytes: &[u8]) -> Result<Table<'_>> {
     let header = parse_header(bytes)?;
     let missing = || Error::new("the file has no vertices").field("element vertex").hint(AGAIN);
@@ -306,48 +358,20 @@ pub(super) fn read(bytes: &[u8]) -> Result<Table<'_>> {
         return Err(missing());
     }
     let mut body = header.body;
+    let mut table = None;
     for element in &header.elements {
-        let wanted = element.name == "vertex";
-        // The smallest row that the encoding allows bounds how many the file can hold.
-        let smallest = |p: &Property| match (header.encoding, p) {
-            (Encoding::Ascii, _) => 2,
-            (_, Property::Scalar(_, s) | Property::List(s, _)) => s.size(),
-        };
-        let least = element.properties.iter().map(smallest).sum::<usize>().max(1);
-        // The last line of a text may lack its end.
-        if element.count > (body.len() + 1) / least {
-            return Err(cut_short(&element.name, body.len() / least, element.count));
-        }
-        let fixed = element.properties.iter().all(|p| matches!(p, Property::Scalar(..)));
-        let as_is = fixed && header.encoding != Encoding::Ascii;
-        let rows = if as_is {
-            let stride: usize = element.properties.iter().map(smallest).sum();
-            let total = stride.checked_mul(element.count);
-            let split = total.and_then(|t| body.split_at_checked(t));
-            let Some((head, rest)) = split else {
-                return Err(cut_short(&element.name, body.len() / least, element.count));
-            };
-            body = rest;
-            Cow::Borrowed(head)
-        } else {
-            let mut owned = Vec::new();
-            body = read_rows(element, header.encoding, body, &mut owned)?;
-            Cow::Owned(owned)
-        };
-        if wanted {
-            let mut stride = 0;
-            let mut columns = Vec::new();
-            for p in &element.properties {
-                let Property::Scalar(name, s) = p else { continue };
-                let scalar = if as_is { *s } else { Scalar::F32 };
-                columns.push((
-                    name.clone(),
-                    Column { at: stride, scalar, big: as_is && header.encoding == Encoding::Big },
-                ));
-                stride += scalar.size();
-            }
-            return Ok(Table { count: element.count, stride, columns, rows });
+        let rows = take_rows(element, header.encoding, &mut body)?;
+        if element.name == "vertex" && table.is_none() {
+            table = Some(Table::new(element, header.encoding, rows));
         }
     }
-    Err(missing())
+    if !body.trim_ascii().is_empty() {
+        let counts: Vec<String> = header.elements.iter().map(|e| format!("element {} {}", e.name, e.count)).collect();
+        return Err(Error::new("the file goes on after its last element, or a count in its header is too small")
+            .field("header")
+            .found(format!("{} bytes more", body.len()))
+            .expected(format!("the end of the file after {}, as the header says", counts.join(", ")))
+            .hint(AGAIN));
+    }
+    table.ok_or_else(missing)
 }
