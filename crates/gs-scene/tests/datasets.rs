@@ -583,7 +583,9 @@ fn bad_transforms_are_refused() {
         load(&json)
     };
     use serde_json::json;
-    assert!(with("extra", json!(1)).is_ok());
+    for (key, value) in [("extra", json!(1)), ("is_fisheye", json!(false)), ("camera_model", json!("PINHOLE"))] {
+        assert!(with(key, value).is_ok(), "{key}");
+    }
     let mirrored = json!([[-1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]);
     let cases = [
         ("frames", json!(3), "frames: the file has no list of frames"),
@@ -602,7 +604,12 @@ fn bad_transforms_are_refused() {
         ("fl_x", json!(-4), "no usable focal length"),
         ("fl_x", json!("long"), "frames[0], fl_x: not a number; found \"long\""),
         ("camera_model", json!("OPENCV_FISHEYE"), "unsupported camera model; found OPENCV_FISHEYE"),
-        ("is_fisheye", json!(true), "unsupported camera model"),
+        ("camera_model", json!(3), "frames[0], camera_model: unsupported camera model; found 3"),
+        ("is_fisheye", json!(true), "frames[0], is_fisheye: unsupported camera model; found true, expected false"),
+        ("is_fisheye", json!(1), "frames[0], is_fisheye: unsupported camera model; found 1"),
+        ("frame.is_fisheye", json!("true"), "frames[0], is_fisheye: unsupported camera model; found true"),
+        ("equirectangular", json!(true), "frames[0], equirectangular: unsupported camera model"),
+        ("ftheta_p1", json!(0.001), "undistort the photographs first"),
         ("ply_file_path", json!("/etc/points.ply"), "ply_file_path: the photograph's name leads out"),
     ];
     for (key, value, expected) in cases {

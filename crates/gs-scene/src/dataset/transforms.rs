@@ -152,6 +152,31 @@ fn matrix(value: &Value, field: &str) -> Result<DMat4> {
     Ok(DMat4::from_cols_array(&m).transpose())
 }
 
+/// Refuses lenses that are not of OpenCV's family: their photographs have to be undistorted by other programs.
+fn check_model<'a>(value: impl Fn(&str) -> &'a Value, field: &str) -> Result<()> {
+    const KNOWN: [&str; 7] =
+        ["OPENCV", "FULL_OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "PERSPECTIVE"];
+    // How instant-ngp marks other lenses.
+    const OTHERS: [&str; 5] = ["is_fisheye", "orthographic", "latlong", "equirectangular", "ftheta_p1"];
+    let unsupported = |key: &str, expected: String| {
+        let v = value(key);
+        Err(Error::new("unsupported camera model")
+            .field(format!("{field}, {key}"))
+            .found(v.as_str().map_or_else(|| brief(v), String::from))
+            .expected(expected)
+            .hint("undistort the photographs first"))
+    };
+    let model = value("camera_model");
+    if !(model.is_null() || model.as_str().is_some_and(|m| KNOWN.contains(&m))) {
+        return unsupported("camera_model", KNOWN.join(", "));
+    }
+    let is_off = |v: &Value| v.is_null() || v.as_bool() == Some(false) || v.as_f64() == Some(0.0);
+    match OTHERS.iter().find(|key| !is_off(value(key))) {
+        Some(key) => unsupported(key, "false, or nothing: a lens of OpenCV's model".into()),
+        None => Ok(()),
+    }
+}
+
 /// The camera: of the frame where it has one, else of the file.
 fn lens(file: &Value, frame: &Value, image: &Path, field: &str) -> Result<Lens> {
     let value = |key: &str| if frame[key].is_null() { &file[key] } else { &frame[key] };
@@ -162,16 +187,7 @@ fn lens(file: &Value, frame: &Value, image: &Path, field: &str) -> Result<Lens> 
             .map(Some)
             .ok_or_else(|| Error::new("not a number").field(format!("{field}, {key}")).found(brief(v)).hint(AGAIN)),
     };
-    let model = value("camera_model").as_str().unwrap_or("OPENCV");
-    let fisheye = value("is_fisheye").as_bool().unwrap_or(false);
-    let known = ["OPENCV", "FULL_OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "PERSPECTIVE"];
-    if fisheye || !known.contains(&model) {
-        return Err(Error::new("unsupported camera model")
-            .field(format!("{field}, camera_model"))
-            .found(if fisheye { "is_fisheye" } else { model })
-            .expected(known.join(", "))
-            .hint("undistort the photographs first"));
-    }
+    check_model(value, field)?;
     let (w, h) = match (get("w")?, get("h")?) {
         (Some(w), Some(h)) => {
             if ![w, h].iter().all(|v| (1.0..=1_048_576.0).contains(v)) {
