@@ -146,6 +146,52 @@ struct RawDataset {
     warnings: Vec<String>,
 }
 
+/// Focal lengths in longer sides of the photograph. A pinhole camera of the least sees 179.9 degrees; lenses stay below 150.
+/// The most is a view of 2 arcseconds; telescopes and satellites' cameras stay below 10,000.
+const FOCAL: std::ops::Range<f64> = 1e-3..1e5;
+/// The principal point's distance from the middle of the photograph, in focal lengths, where it lies outside: 63 degrees. A
+/// part cut out of a larger photograph has it outside, but no part of it is farther from the lens's axis than that.
+const OFF_AXIS: f64 = 2.0;
+/// Distance of a camera from the origin. The Earth is 1e10 mm wide; single precision holds squares up to 1e19.
+const FARTHEST: f64 = 1e12;
+
+impl RawView {
+    /// Refuses numbers that no camera has, whatever the dataset's layout: nothing can be learnt with them.
+    fn check(&self, format: Format) -> Result<()> {
+        let wrong = |field: &str, found: String, expected: String| {
+            let from = match format {
+                Format::Colmap => "COLMAP's model",
+                Format::Transforms => "transforms.json",
+                Format::ScanNet => "intrinsic/ and pose/",
+            };
+            let hint = format!("correct the camera in {from}, or export it again");
+            Err(Error::new("no camera has this")
+                .file(&self.image_path)
+                .field(field)
+                .found(found)
+                .expected(expected)
+                .hint(hint))
+        };
+        let [fx, fy, cx, cy] = self.lens.focal_center;
+        let (w, h) = (f64::from(self.lens.size.0), f64::from(self.lens.size.1));
+        let side = w.max(h);
+        if ![fx, fy].iter().all(|f| FOCAL.contains(&(f / side))) {
+            let expected = format!("{} to {} pixels for {w}x{h} pixels", FOCAL.start * side, FOCAL.end * side);
+            return wrong("focal lengths", format!("{fx:?} {fy:?}"), expected);
+        }
+        let off = |c: f64, size: f64, f: f64| (c - 0.5 * size).abs() <= side.max(OFF_AXIS * f);
+        if !(off(cx, w, fx) && off(cy, h, fy)) {
+            let expected = format!("a point in the photograph of {w}x{h} pixels, or not far from it");
+            return wrong("principal point", format!("{cx:?} {cy:?}"), expected);
+        }
+        if !self.translation.to_array().iter().all(|t| t.abs() <= FARTHEST) {
+            let expected = format!("numbers from -{FARTHEST:e} to {FARTHEST:e}");
+            return wrong("translation", format!("{:?}", self.translation.to_array()), expected);
+        }
+        Ok(())
+    }
+}
+
 /// Loads the dataset in a folder (or the `transforms.json` given), whatever its layout.
 ///
 /// # Errors
@@ -185,7 +231,10 @@ fn finish(root: &Path, mut raw: RawDataset, options: &LoadOptions) -> Result<Dat
     }
     let names: Vec<&str> = raw.views.iter().map(|v| v.name.as_str()).collect();
     let stems = stems(&names).map_err(|e| e.file(root))?;
-    raw.views.par_iter().map(|v| v.lens.check_size(&v.image_path)).collect::<Result<Vec<()>>>()?;
+    raw.views
+        .par_iter()
+        .map(|v| v.lens.check_size(&v.image_path).and_then(|()| v.check(raw.format)))
+        .collect::<Result<Vec<()>>>()?;
     let names_its_own = raw.views.iter().any(|v| v.split == Some(Split::Test));
     let views = raw.views.into_iter().zip(stems).enumerate().map(|(i, (v, stem))| {
         let split = match v.split.filter(|_| names_its_own) {

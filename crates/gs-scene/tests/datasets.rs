@@ -546,6 +546,70 @@ fn errors_name_file_field_found_and_expected() {
 }
 
 #[test]
+fn cameras_that_no_one_has_are_refused_in_every_layout() {
+    let dir = tempfile::tempdir().unwrap();
+    let root = |name: &str| dir.path().join(name);
+    let camera = &cameras(1, 40, 30)[0];
+    let colmap = |c: Camera| {
+        colmap_scene(&root("colmap"), &[c]);
+        dataset::load(&root("colmap"), &FULL).map_err(|e| e.to_string())
+    };
+    let transforms = |c: Camera| {
+        plain(40, 30).write_png(root("json/a.png")).unwrap();
+        let json = serde_json::json!({"fl_x": c.fx, "fl_y": c.fy, "cx": c.cx, "cy": c.cy,
+            "frames": [{"file_path": "a.png", "transform_matrix": opengl(&c)}]});
+        write(&root("json/transforms.json"), &json.to_string());
+        dataset::load(&root("json"), &FULL).map_err(|e| e.to_string())
+    };
+    let scannet = |c: Camera| {
+        for folder in ["color", "pose", "intrinsic"] {
+            fs::create_dir_all(root("scan").join(folder)).unwrap();
+        }
+        plain(40, 30).write_png(root("scan/color/0.png")).unwrap();
+        let k = format!("{} 0 {} 0\n0 {} {} 0\n0 0 1 0\n0 0 0 1\n", c.fx, c.cx, c.fy, c.cy);
+        write(&root("scan/intrinsic/intrinsic_color.txt"), &k);
+        write(&root("scan/pose/0.txt"), &pose_text(&c));
+        dataset::load(&root("scan"), &FULL).map_err(|e| e.to_string())
+    };
+    type Change = fn(&mut Camera);
+    let of = |change: Change| {
+        let mut c = camera.clone();
+        change(&mut c);
+        c
+    };
+    let focal = ": focal lengths: no camera has this; found ";
+    let point = ": principal point: no camera has this; found ";
+    let pose = ": translation: no camera has this; found [";
+    let far: Change = |c| c.translation = DVec3::new(0.0, 1e300, 0.0);
+    let cases: [(Change, &str); 7] = [
+        (|c| c.fx = 9e8, focal),
+        (|c| (c.fx, c.fy) = (0.039, 0.039), focal),
+        (|c| c.fy = 1e7, focal),
+        (|c| c.cx = 1e6, point),
+        (|c| c.cy = -200.0, point),
+        (|c| c.translation.x = 2e12, pose),
+        (far, pose),
+    ];
+    for (change, expected) in cases {
+        for e in [colmap(of(change)), transforms(of(change))].map(Result::unwrap_err) {
+            assert!(e.contains(&format!(".png{expected}")) && e.contains("; correct the camera in "), "{e}");
+        }
+    }
+    assert!(scannet(of(far)).unwrap_err().contains(&format!("0.png{pose}")));
+    // A satellite's camera, one of 170 degrees, a quarter cut out of a photograph, a scene in metres from the Earth's middle.
+    let real: [Change; 4] = [
+        |c| (c.fx, c.fy) = (2e5, 2e5),
+        |c| (c.fx, c.fy) = (1.8, 1.8),
+        |c| (c.cx, c.cy) = (0.0, 30.0),
+        |c| c.translation *= 6.4e6,
+    ];
+    for change in real {
+        colmap(of(change)).unwrap();
+        transforms(of(change)).unwrap();
+    }
+}
+
+#[test]
 fn missing_photographs_are_skipped_until_none_is_left() {
     let dir = tempfile::tempdir().unwrap();
     colmap_scene(dir.path(), &cameras(3, 20, 16));
