@@ -1,6 +1,7 @@
 //! Runs that fail, are extended, or are fed what breaks arithmetic.
 
 use glam::{DQuat, DVec3};
+use gs_geom::checkpoint;
 use gs_raster::{RasterOptions, render};
 use gs_scene::{Camera, Gaussians, Image, ply};
 use serde_json::Value;
@@ -244,6 +245,58 @@ fn gaussians_that_break_arithmetic_leave_every_parameter_finite() {
             said.lines().filter(|l| l.contains("could not be drawn") || l.contains("were not")).collect();
         eprintln!("{name}: {} Gaussians left; {warnings:?}", result.len());
     }
+}
+
+/// Runs to exit code 2; what it said.
+fn refused(arguments: &[&str]) -> String {
+    let o = program(arguments).output().unwrap();
+    let said = String::from_utf8_lossy(&o.stderr).into_owned();
+    assert_eq!(o.status.code(), Some(2), "{arguments:?}: {said}");
+    said
+}
+
+#[test]
+fn gaussians_that_are_not_finite_are_never_written() {
+    let dir = Folder::new();
+    let (scene, out) = (dir.path("scene"), dir.path("g.ply"));
+    let said = succeeds(&training(&scene, &out, "60", &["--stop-after", "30"]));
+    assert!(said.contains("stopped after iteration 30"), "{said}");
+    // The next step goes wrong.
+    let state = PathBuf::from(format!("{out}.checkpoint"));
+    let run = gs_io::Artifact::open(&state, checkpoint::FORMAT, checkpoint::VERSION).unwrap().provenance().clone();
+    let mut wrong = checkpoint::read(&state, &run).unwrap().unwrap();
+    wrong.adam.first.means[3][1] = f32::NAN;
+    checkpoint::write(&state, &wrong, run).unwrap();
+    let said = refused(&training(&scene, &out, "60", &[]));
+    assert!(said.contains("g.ply: iteration 60: Gaussians are not finite; nothing is written; found "), "{said}");
+    assert!(said.contains("lower --position-rate") && !said.contains("saved a checkpoint"), "{said}");
+    assert!(!Path::new(&out).exists());
+}
+
+#[test]
+fn scenes_beyond_the_range_of_numbers_are_refused_before_the_first_step() {
+    let dir = Folder::new();
+    let (scene, out) = (dir.path("scene"), dir.path("g.ply"));
+    let file = format!("{scene}/sparse/0/images.txt");
+    let images = fs::read_to_string(&file).unwrap();
+    let with = |change: &dyn Fn(f64) -> f64| {
+        let line = |line: &str| {
+            let mut words: Vec<String> = line.split(' ').map(String::from).collect();
+            for word in words.iter_mut().skip(5).take(3) {
+                *word = change(word.parse().unwrap()).to_string();
+            }
+            words.join(" ") + "\n"
+        };
+        fs::write(&file, images.lines().map(line).collect::<String>()).unwrap();
+        refused(&training(&scene, &out, "60", &[]))
+    };
+    let said = with(&|t| t * 1e300);
+    assert!(said.contains("translation: no camera has this; found ["), "{said}");
+    let points = format!("{scene}/sparse/0/points3D.txt");
+    fs::write(&points, "1 0 0 0 200 100 50 0.5\n").unwrap();
+    let said = with(&|t| t * 1e-60);
+    assert!(said.contains("iteration 0: Gaussians are not finite") && said.contains("points and poses"), "{said}");
+    assert!(!Path::new(&out).exists());
 }
 
 #[test]

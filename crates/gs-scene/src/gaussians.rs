@@ -91,6 +91,11 @@ impl Gaussians {
         geometric.chain(self.sh_of(i)).all(|v| v.is_finite()) && !self.opacity_logits[i].is_nan()
     }
 
+    /// Whether every number of Gaussian `i` is finite.
+    pub fn is_finite(&self, i: usize) -> bool {
+        self.is_whole(i) && self.opacity_logits[i].is_finite()
+    }
+
     /// Makes infinite opacity logits +-50, which is as opaque and as transparent as single precision tells.
     pub fn bound_opacities(&mut self) {
         self.opacity_logits.iter_mut().filter(|o| o.is_infinite()).for_each(|o| *o = o.clamp(-50.0, 50.0));

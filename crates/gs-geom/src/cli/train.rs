@@ -20,7 +20,7 @@ use artifacts::role;
 use clap::ValueEnum;
 use gs_io::{Claim, Error, Provenance, Result, Watched, hash_file};
 use gs_scene::dataset::{Dataset, Split, View};
-use gs_scene::{Camera, ply};
+use gs_scene::{Camera, Gaussians, ply};
 use serde_json::{Value, json};
 use stage::{Bytes, Stage};
 use std::collections::BTreeMap;
@@ -352,6 +352,7 @@ impl TrainArgs {
                 checkpoint::start(self.start(dataset, &cameras, extent, stage)?, exposures)
             }
         };
+        self.check_finite(&state.gaussians, state.progress.iteration)?;
         stage.info(&format!(
             "{} training views and {} held out, {}x{} pixels; {} Gaussians; extent {extent:.3}",
             train.len(),
@@ -404,7 +405,8 @@ impl TrainArgs {
     /// Saves what a failing run has done. An interrupted one has done so already.
     fn rescue(&self, trainer: &Trainer<'_>, run: &Provenance, watched: &Watched, stage: &Stage) {
         let iteration = trainer.state().progress.iteration;
-        if stage.interrupted() {
+        // What is not finite stays so: there is nothing to save.
+        if stage.interrupted() || self.check_finite(&trainer.state().gaussians, iteration).is_err() {
             return;
         }
         match watched.check_those_left().and_then(|()| self.save(trainer, run)) {
@@ -412,6 +414,20 @@ impl TrainArgs {
                 "saved a checkpoint after iteration {iteration}; mend the error below, and the same command goes on from it"
             )),
             Err(e) => stage.warn(&format!("no checkpoint after iteration {iteration} could be saved: {e}")),
+        }
+    }
+
+    /// Refuses Gaussians that are not finite: no stage can use them, and no later step makes them finite.
+    pub(super) fn check_finite(&self, gaussians: &Gaussians, iteration: u32) -> Result<()> {
+        let bad: Vec<usize> = (0..gaussians.len()).filter(|&i| !gaussians.is_finite(i)).collect();
+        match bad.first() {
+            None => Ok(()),
+            Some(first) => Err(Error::new("Gaussians are not finite; nothing is written")
+                .file(&self.out)
+                .field(format!("iteration {iteration}"))
+                .found(format!("{} of {}, the first is {first}", bad.len(), gaussians.len()))
+                .expected("finite numbers in all")
+                .hint("check the scene's points and poses, or give a lower --position-rate")),
         }
     }
 
@@ -486,6 +502,7 @@ impl TrainArgs {
     }
 
     fn save(&self, trainer: &Trainer<'_>, run: &Provenance) -> Result<()> {
+        self.check_finite(&trainer.state().gaussians, trainer.state().progress.iteration)?;
         checkpoint::write(&checkpoint::path_of(&self.out), trainer.state(), run.clone())
     }
 }

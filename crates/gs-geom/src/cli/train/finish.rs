@@ -26,6 +26,7 @@ impl TrainArgs {
         claim: &mut Claim,
         stage: &Stage,
     ) -> Result<()> {
+        self.check_finite(&trainer.state().gaussians, trainer.state().progress.iteration)?;
         let (psnr, ssim) = trainer.heldout()?.unzip();
         let trainer = &*trainer;
         let timings = trainer.timings();
