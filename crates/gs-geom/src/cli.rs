@@ -11,9 +11,8 @@ use crate::masks::{Alpha, Masks};
 use clap::{Parser, Subcommand, ValueEnum};
 use gs_io::{Error, Result};
 use gs_raster::RasterOptions;
-use gs_scene::Gaussians;
 use gs_scene::dataset::{self, Dataset, LoadOptions, Resolution};
-use gs_scene::ply;
+use gs_scene::{Gaussians, Geometry};
 use stage::{CommonArgs, Program, Stage};
 use std::path::{Path, PathBuf};
 
@@ -142,12 +141,11 @@ impl SceneArgs {
     }
 }
 
-fn read_geometry(path: &Path) -> Result<Gaussians> {
-    let gaussians = ply::read_gaussians(path)?;
+fn check_some(gaussians: &Gaussians, path: &Path) -> Result<()> {
     if gaussians.is_empty() {
         return Err(Error::new("no Gaussians").file(path).field("element vertex").hint("train the geometry again"));
     }
-    Ok(gaussians)
+    Ok(())
 }
 
 /// Gaussians to draw.
@@ -164,8 +162,13 @@ struct GeometryArgs {
 impl GeometryArgs {
     /// The Gaussians, and how they are drawn over `background`.
     fn read(&self, background: Background, stage: &Stage) -> Result<(Gaussians, RasterOptions)> {
-        let gaussians = read_geometry(&self.geometry)?;
-        let fitting = RasterOptions::fit(&gaussians);
+        let geometry = Geometry::read(&self.geometry)?;
+        if let Some(damage) = geometry.damage() {
+            stage.skipped(&damage);
+        }
+        let fitting = RasterOptions::of(&geometry);
+        let gaussians = geometry.gaussians;
+        check_some(&gaussians, &self.geometry)?;
         let (used, degree) = (fitting.sh_degree, gaussians.sh_degree);
         if used < degree && !self.no_skip {
             stage.skipped(&format!("spherical harmonics of degrees {} to {degree}: zero in every Gaussian", used + 1));
@@ -173,7 +176,6 @@ impl GeometryArgs {
         let options = RasterOptions {
             sh_degree: if self.no_skip { degree } else { used },
             background: background.color(),
-            antialias: ply::is_antialiased(&self.geometry)?,
             ..fitting
         };
         Ok((gaussians, options))

@@ -454,6 +454,40 @@ fn what_is_skipped_changes_nothing() {
 }
 
 #[test]
+fn damaged_gaussians_are_skipped_as_in_every_stage() {
+    let dir = Folder::new();
+    let (mut g, _) = world();
+    g.means[7][1] = f32::NAN;
+    let (damaged, without, metrics) = (dir.path("damaged.ply"), dir.path("without.ply"), dir.path("m.json"));
+    ply::write_gaussians(&damaged, &g, &[]).unwrap();
+    let others: Vec<u32> = (0..g.len() as u32).filter(|&i| i != 7).collect();
+    ply::write_gaussians(&without, &g.select(&others), &[]).unwrap();
+    let views = |geometry: &str| {
+        succeeds(&["eval", "--scene", scene(), "--geometry", geometry, "--out", &metrics]);
+        let m: Value = serde_json::from_slice(&fs::read(&metrics).unwrap()).unwrap();
+        (m["views"].clone(), m["gaussians"].clone())
+    };
+    let (seen, count) = views(&damaged);
+    assert_eq!((&seen, count), (&views(&without).0, Value::from(g.len())));
+    let pictures = dir.path("pictures");
+    for arguments in [["eval", "--out", &metrics], ["render", "--out", &pictures]] {
+        let o = Command::new(env!("CARGO_BIN_EXE_gs-geom"))
+            .args([&arguments[..], &["--scene", scene(), "--geometry", &damaged]].concat())
+            .output()
+            .unwrap();
+        let said = String::from_utf8_lossy(&o.stderr);
+        assert!(o.status.success() && said.contains("skipped 1 of 60 Gaussians: damaged"), "{said}");
+    }
+    // What is trained on has to be whole: refused before any work.
+    let out = dir.path("g.ply");
+    assert!(refused(&training(&out, &["--init", &damaged])).contains("vertex 7: a position is not finite"));
+    g.means.fill([f32::NAN; 3]);
+    ply::write_gaussians(&damaged, &g, &[]).unwrap();
+    let e = refused(&["eval", "--scene", scene(), "--geometry", &damaged, "--out", &out]);
+    assert!(e.contains("no Gaussian is whole"), "{e}");
+}
+
+#[test]
 fn one_gaussian_and_one_view_are_enough() {
     let dir = Folder::new();
     let root = dir.path("one");

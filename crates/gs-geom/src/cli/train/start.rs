@@ -1,7 +1,7 @@
 //! The Gaussians that a run starts from.
 
 use super::{Init, TrainArgs};
-use crate::cli::read_geometry;
+use crate::cli::check_some;
 use crate::init;
 use gs_io::{Error, Result};
 use gs_scene::dataset::Dataset;
@@ -53,9 +53,11 @@ impl TrainArgs {
         init::from_points(&init::some_points(points, most, stage.seed()), self.sh_degree, extent)
     }
 
-    /// The Gaussians of a file.
+    /// The Gaussians of a file, all of which must be whole: none can be learnt from, and --fixed-points keeps all.
     fn start_gaussians(&self, path: &Path, stage: &Stage) -> Result<Gaussians> {
-        let g = init::with_degree(read_geometry(path)?, self.sh_degree);
+        let g = ply::read_gaussians(path)?;
+        check_some(&g, path)?;
+        let g = init::with_degree(g, self.sh_degree);
         if let Some(most) = self.max_gaussians.filter(|&most| g.len() > most && !self.fixed_points) {
             return Err(Error::new("more Gaussians than --max-gaussians")
                 .file(path)
