@@ -19,10 +19,10 @@ pub struct ViewMetrics {
     pub name: String,
     /// `train` or `test`.
     pub split: &'static str,
-    /// Peak signal-to-noise ratio, dB.
-    pub psnr: f64,
-    /// Structural similarity, -1 to 1.
-    pub ssim: f64,
+    /// Peak signal-to-noise ratio, dB; none where no pixel counts.
+    pub psnr: Option<f64>,
+    /// Structural similarity, -1 to 1; none where no pixel counts.
+    pub ssim: Option<f64>,
 }
 
 /// PSNR in dB for values from 0 to 1.
@@ -49,7 +49,7 @@ pub fn measure(
 ) -> Result<ViewMetrics> {
     let target = exact_target(view, masks, behind(alpha, options.background))?;
     let mut rgb = render(g, &view.camera, &RasterOptions { depth: false, ..options.clone() }).rgb;
-    let (psnr, ssim) = compare(&mut rgb, view.camera.width as usize, &target, alpha);
+    let (psnr, ssim) = compare(&mut rgb, view.camera.width as usize, &target, alpha).unzip();
     let split = if view.split == Split::Test { "test" } else { "train" };
     Ok(ViewMetrics { name: view.name.clone(), split, psnr, ssim })
 }
@@ -62,21 +62,49 @@ pub fn behind(alpha: Alpha, background: [f32; 3]) -> [f32; 3] {
 
 /// PSNR and SSIM of a render against `target`, which lies over [`behind`]. With [`Alpha::Ignore`] the PSNR is that of the
 /// pixels that count, each weighed by the square of its alpha; in the SSIM the others are black in both pictures. `rgb`
-/// (`[height][width][rgb]`) is clamped and masked in place.
-pub fn compare(rgb: &mut [f32], width: usize, target: &Target, alpha: Alpha) -> (f64, f64) {
+/// (`[height][width][rgb]`) is clamped and masked in place. None where less than one pixel counts, as below a black mask:
+/// both pictures are black then, which says nothing.
+pub fn compare(rgb: &mut [f32], width: usize, target: &Target, alpha: Alpha) -> Option<(f64, f64)> {
     rgb.iter_mut().for_each(|v| *v = v.clamp(0.0, 1.0));
     let mut psnr_gain = 0.0;
     if let Some(weights) = target.alpha.as_ref().filter(|_| alpha == Alpha::Ignore) {
         multiply(rgb, weights);
         let count: f64 = weights.iter().map(|a| f64::from(*a).powi(2)).sum();
-        psnr_gain = 10.0 * (count.max(1e-9) / weights.len().max(1) as f64).log10();
+        if count < 1.0 {
+            return None;
+        }
+        psnr_gain = 10.0 * (count / weights.len() as f64).log10();
     }
     let psnr = (psnr(rgb, &target.rgb) + psnr_gain).min(MOST_PSNR);
-    (psnr, ssim(Pair { render: rgb, target: &target.rgb, width }))
+    Some((psnr, ssim(Pair { render: rgb, target: &target.rgb, width })))
+}
+
+/// Means over views.
+#[derive(Debug, Clone, Default, PartialEq)]
+pub struct Means {
+    /// Of the PSNR, dB; none where no view counts.
+    pub psnr: Option<f64>,
+    /// Of the SSIM.
+    pub ssim: Option<f64>,
+    /// What is to be said of views in which no pixel counts, where there are any.
+    pub uncounted: Option<String>,
+}
+
+impl Means {
+    /// Of each view's name with its PSNR and SSIM.
+    pub fn of<'a>(views: impl Iterator<Item = (&'a str, Option<(f64, f64)>)> + Clone) -> Self {
+        let figures = views.clone().filter_map(|v| v.1);
+        let mut blank = views.filter(|v| v.1.is_none()).map(|v| v.0);
+        let uncounted = blank.next().map(|first| {
+            let count = 1 + blank.count();
+            format!("{count} of the views measured: no pixel counts there (a black mask), in {first} for one")
+        });
+        Self { psnr: mean(figures.clone().map(|f| f.0)), ssim: mean(figures.map(|f| f.1)), uncounted }
+    }
 }
 
 /// Mean of some figure over views; `None` of none.
-pub fn mean(values: impl Iterator<Item = f64>) -> Option<f64> {
+fn mean(values: impl Iterator<Item = f64>) -> Option<f64> {
     let (sum, count) = values.fold((0.0, 0u32), |(s, n), v| (s + v, n + 1));
     (count > 0).then(|| sum / f64::from(count))
 }

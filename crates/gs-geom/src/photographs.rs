@@ -101,7 +101,7 @@ impl<'a> Photographs<'a> {
     }
 
     /// Names of the photographs.
-    pub fn names(&self) -> impl Iterator<Item = &str> {
+    pub fn names(&self) -> impl Iterator<Item = &str> + Clone {
         self.views.iter().map(|v| v.name.as_str())
     }
 

@@ -6,7 +6,7 @@ use crate::exposure;
 use crate::loss::{Derivatives, Loss, Pair, l1_dssim};
 use crate::masks::{Alpha, alpha_loss, multiply};
 use crate::mcmc::{self, McmcOptions};
-use crate::metrics;
+use crate::metrics::{self, Means};
 use crate::optimiser::{Adam, drop_bad_gradients};
 use crate::photographs::Photographs;
 use crate::schedule::{LearningRates, Purpose, Schedule, ViewOrder, generator};
@@ -369,7 +369,7 @@ impl<'a> Trainer<'a> {
         if line["iteration"] != iteration || line.get("psnr_heldout").is_some() {
             return Ok(());
         }
-        if let Some((psnr, _)) = self.heldout()? {
+        if let Some(psnr) = self.heldout()?.psnr {
             self.last_heldout = Some(psnr);
             line["psnr_heldout"] = json!(psnr);
             self.state.progress.curve.pop();
@@ -383,7 +383,7 @@ impl<'a> Trainer<'a> {
     ///
     /// # Errors
     /// When a photograph has to be decoded and cannot be.
-    pub fn heldout(&mut self) -> Result<Option<(f64, f64)>> {
+    pub fn heldout(&mut self) -> Result<Means> {
         let (alpha, background) = (self.options.alpha, self.options.background);
         let (antialias, near) = (self.options.antialias, near_plane(self.extent));
         let options = RasterOptions { background, antialias, near, depth: false, ..RasterOptions::default() };
@@ -395,8 +395,7 @@ impl<'a> Trainer<'a> {
             let rgb = &mut self.workspace.forward.rendered.rgb;
             all.push(metrics::compare(rgb, camera.width as usize, &target, alpha));
         }
-        let psnr = metrics::mean(all.iter().map(|v: &(f64, f64)| v.0));
-        Ok(psnr.zip(metrics::mean(all.iter().map(|v| v.1))))
+        Ok(Means::of(self.heldout.names().zip(all.iter().copied())))
     }
 }
 

@@ -211,6 +211,7 @@ fn masked_pixels_do_not_count() {
     };
     let (without, with) = (eval("a.ply"), eval("b.ply"));
     assert!(with > without + 1.0 && (with - psnr(&masked)).abs() < 0.2, "{without} {with} {masked}");
+    black_masks_do_not_count(&dir, &masks, &eval);
     // Without a mask for some, and for all.
     fs::remove_file(Path::new(&masks).join("01.png")).unwrap();
     let out = dir.path("c.ply");
@@ -220,6 +221,31 @@ fn masked_pixels_do_not_count() {
     let o = run(&[&train[..], &[&dir.path("none")]].concat());
     let said = String::from_utf8_lossy(&o.stderr);
     assert!(o.status.code() == Some(2) && said.contains("no masks in this folder"), "{said}");
+}
+
+/// A held-out view whose mask is black has no figures, and the means are those of the others.
+fn black_masks_do_not_count(dir: &Folder, masks: &str, eval: &dyn Fn(&str) -> f64) {
+    let metrics = || -> Value { serde_json::from_slice(&fs::read(dir.path("m.json")).unwrap()).unwrap() };
+    let figures = |m: &Value| m["views"].as_array().unwrap().iter().map(|v| v["psnr"].as_f64()).collect::<Vec<_>>();
+    let before = figures(&metrics());
+    let blacken = |i: usize| {
+        let (file, mask) = (Path::new(masks).join(format!("{i:02}.png.png")), vec![0u8; (SIZE.0 * SIZE.1) as usize]);
+        image::save_buffer(file, &mask, SIZE.0, SIZE.1, image::ColorType::L8).unwrap();
+    };
+    blacken(6);
+    let mean = eval("b.ply");
+    let m = metrics();
+    assert_eq!(figures(&m), [before[0], None, before[2], before[3]]);
+    assert_eq!(m["views"][1]["ssim"], Value::Null);
+    let others = [0, 2, 3].map(|i| before[i].unwrap()).iter().sum::<f64>() / 3.0;
+    assert!((mean - others).abs() < 1e-9, "{mean} {others}");
+    let record: Value = serde_json::from_slice(&fs::read(dir.path("m.json.run.json")).unwrap()).unwrap();
+    let said = record["skipped"].to_string();
+    assert!(said.contains("1 of the views measured: no pixel counts there (a black mask), in 06.png"), "{said}");
+    // Training measures the same views in the same way.
+    [0, 12, 18].into_iter().for_each(blacken);
+    let summary = dir.train("black.ply", &["--masks", masks]);
+    assert_eq!(summary["psnr_heldout"], Value::Null, "{summary}");
 }
 
 #[test]

@@ -1,7 +1,7 @@
 //! `gs-geom eval`.
 
 use super::{GeometryArgs, MaskArgs, SceneArgs};
-use crate::metrics::{ViewMetrics, mean, measure};
+use crate::metrics::{Means, ViewMetrics, measure};
 use artifacts::role;
 use gs_io::{Error, Result, hash_file, write_bytes};
 use gs_scene::dataset::{Split, View};
@@ -47,8 +47,8 @@ impl EvalArgs {
             figures.push(measure(&gaussians, view, &options, alpha, &masks)?);
             progress.step();
         }
-        let psnr = mean(figures.iter().map(|f| f.psnr));
-        let ssim = mean(figures.iter().map(|f| f.ssim));
+        let Means { psnr, ssim, uncounted } = Means::of(figures.iter().map(|f| (f.name.as_str(), f.psnr.zip(f.ssim))));
+        uncounted.iter().for_each(|why| stage.skipped(why));
         progress.finish(&[("psnr", psnr.unwrap_or(0.0)), ("ssim", ssim.unwrap_or(0.0))]);
         let heldout = split == Split::Test;
         let if_heldout = |v: Option<f64>| v.filter(|_| heldout);

@@ -7,6 +7,7 @@ use crate::cli::budget::plan_path;
 use crate::curve;
 use crate::densify::drawable;
 use crate::memory::Forecast;
+use crate::metrics::Means;
 use crate::train::{Timings, Trainer};
 use gs_io::{Claim, Error, Provenance, Result, write_bytes};
 use gs_scene::ply;
@@ -27,7 +28,8 @@ impl TrainArgs {
         stage: &Stage,
     ) -> Result<()> {
         self.check_finite(&trainer.state().gaussians, trainer.state().progress.iteration)?;
-        let (psnr, ssim) = trainer.heldout()?.unzip();
+        let Means { psnr, ssim, uncounted } = trainer.heldout()?;
+        uncounted.iter().for_each(|why| stage.skipped(why));
         let trainer = &*trainer;
         let timings = trainer.timings();
         let (parameters, inputs) = (&run.parameters, &run.inputs);
