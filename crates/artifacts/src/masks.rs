@@ -171,6 +171,24 @@ impl MaskMaps {
         &self.ids[level as usize * n..(level as usize + 1) * n]
     }
 
+    /// Refuses maps, read from `file`, of another shape than a photograph of `width` x `height`: maps may be of another size.
+    ///
+    /// # Errors
+    /// When the aspect ratios differ by more than 2 % and two pixels.
+    pub fn expect_shape(&self, width: u32, height: u32, file: impl AsRef<Path>) -> Result<()> {
+        let (w, h) = (self.width as f64, self.height as f64);
+        let expected = w * f64::from(height) / f64::from(width);
+        if (expected - h).abs() <= (0.02 * h).max(2.0) {
+            return Ok(());
+        }
+        Err(Error::new("the id map has another shape than the photograph")
+            .file(file)
+            .field("shape")
+            .found(format!("{w}x{h}"))
+            .expected(format!("{width}x{height}, or that scaled"))
+            .hint("make the masks from the photographs of this scene"))
+    }
+
     /// Number of ids: the largest id of any level and one.
     pub fn id_count(&self) -> usize {
         self.ids.iter().max().map_or(0, |&m| (m + 1) as usize)

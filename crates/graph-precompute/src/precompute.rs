@@ -70,23 +70,10 @@ pub struct Summary {
     pub largest_cut: f64,
 }
 
-/// The camera for an id map of `width` x `height`; the map may be smaller than the photograph but not of another shape.
-///
-/// # Errors
-/// When the aspect ratios differ by more than 2 % and two pixels.
+/// The camera for an id map; the map may be smaller than the photograph but not of another shape.
 fn camera_for(view: &View, maps: &MaskMaps, file: &Path) -> Result<Camera> {
-    let c = &view.camera;
-    let (w, h) = (maps.width as f64, maps.height as f64);
-    let expected = w * f64::from(c.height) / f64::from(c.width);
-    if (expected - h).abs() > (0.02 * h).max(2.0) {
-        return Err(Error::new("the id map has another shape than the photograph")
-            .file(file)
-            .field("shape")
-            .found(format!("{w}x{h}"))
-            .expected(format!("{}x{}, or that scaled", c.width, c.height))
-            .hint("make the masks from the photographs of this scene"));
-    }
-    Ok(c.resized(maps.width as u32, maps.height as u32))
+    maps.expect_shape(view.camera.width, view.camera.height, file)?;
+    Ok(view.camera.resized(maps.width as u32, maps.height as u32))
 }
 
 /// Computes footprints and graph of a geometry from the `views` that have id maps in the folder `masks`. The entries of the

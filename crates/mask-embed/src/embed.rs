@@ -68,7 +68,19 @@ fn read_maps(folder: &Path, view: &View, stage: &Stage) -> Result<Option<MaskMap
         stage.warn(&format!("{}: no id maps of this view; it is left out", path.display()));
         return Ok(None);
     }
-    MaskMaps::read(&path).map(Some)
+    let maps = MaskMaps::read(&path)?;
+    maps.expect_shape(view.camera.width, view.camera.height, &path)?;
+    Ok(Some(maps))
+}
+
+/// Reads all id maps once, so that one that is damaged or of other photographs is found before the first is encoded.
+fn check_maps(folder: &Path, views: &[View]) -> Result<()> {
+    let fault = |v: &View| {
+        let path = maps_path(folder, v.stem());
+        let maps = path.exists().then(|| MaskMaps::read(&path))?;
+        maps.and_then(|m| m.expect_shape(v.camera.width, v.camera.height, &path)).err()
+    };
+    views.par_iter().find_map_first(fault).map_or(Ok(()), Err)
 }
 
 fn no_maps(folder: &Path) -> Error {
@@ -84,6 +96,7 @@ fn no_maps(folder: &Path) -> Error {
 /// When scene, id maps or model cannot be read, or the output cannot be written.
 pub fn run(args: &EmbedArgs, stage: &Stage) -> Result<()> {
     let scene = photographs::open(&args.scene, stage)?;
+    check_maps(&args.masks, &scene.views)?;
     let out = args.out.as_ref().unwrap_or(&args.masks);
     let manifest = out.join("features.json");
     let maps = artifacts::folder_files(&args.masks, "_s.npy")?;

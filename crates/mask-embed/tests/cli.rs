@@ -405,6 +405,27 @@ fn bad_input_is_one_line_and_exit_code_2() {
 }
 
 #[test]
+fn id_maps_of_another_shape_are_refused_before_the_first_view() {
+    let scene = Scene::new(2);
+    scene.make_masks(&scene.masks, &[]);
+    let file = maps_path(&scene.masks, "v1");
+    let maps = MaskMaps::read(&file).unwrap();
+    MaskMaps { width: maps.height, height: maps.width, ids: maps.ids }.write(&file).unwrap();
+    let (clip, out) = (fake_clip(), scene.masks.with_file_name("out"));
+    let inputs = ["--scene", path(&scene.folder), "--masks", path(&scene.masks), "--out", path(&out)];
+    for command in [&["embed", "--clip", path(&clip)][..], &["crops"]] {
+        let e = error(&[command, &inputs[..]].concat());
+        let expected =
+            "v1_s.npy: shape: the id map has another shape than the photograph; found 64x128, expected 128x64";
+        assert!(e.contains(expected), "{e}");
+        assert!(!out.exists());
+    }
+    // Smaller maps are whole pictures, too.
+    MaskMaps { width: 64, height: 32, ids: vec![0; 4 * 64 * 32] }.write(&file).unwrap();
+    ok(&[&["embed", "--clip", path(&clip)], &inputs[..]].concat());
+}
+
+#[test]
 fn views_of_the_same_name_are_told_apart_by_folder() {
     let scene = Scene::new(1);
     let inner = scene.folder.join("b");
