@@ -12,6 +12,9 @@ use std::collections::BTreeMap;
 /// Gaussians fainter than this are not taken for the surface nearest a point.
 const MIN_OPACITY: f32 = 0.1;
 
+/// Farther than this from all labelled Gaussians, in sizes of the scene, a point lies outside of it.
+const FAR: f64 = 10.0;
+
 /// A place that was asked about.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Place {
@@ -81,17 +84,28 @@ pub fn at_pixel(
 }
 
 /// What is at a point of the world: the instance of the nearest labelled Gaussian of opacity at least 0.1.
-pub fn at_point(scene: &LabelledScene, index: &Index<'_>, point: [f32; 3]) -> (Place, Vec<Ranked>) {
+///
+/// # Errors
+/// When that Gaussian is so far that it says nothing of the point.
+pub fn at_point(scene: &LabelledScene, index: &Index<'_>, point: [f32; 3]) -> Result<(Place, Vec<Ranked>)> {
     let (g, label) = (scene.gaussians(), &scene.instances.label);
     let speaks = |&i: &u32| label[i as usize] >= 0 && g.opacity(i as usize) >= MIN_OPACITY;
     let speakers: Vec<u32> = (0..g.len() as u32).filter(speaks).collect();
     let found = nearest(g, &speakers, &[point])[0];
     let mean = found.map(|i| g.means[i as usize].map(f64::from));
     let distance = mean.map(|m| (0..3).map(|k| (m[k] - f64::from(point[k])).powi(2)).sum::<f64>().sqrt());
+    let most = FAR * g.spread();
+    if let Some(distance) = distance.filter(|d| *d > most) {
+        return Err(Error::new("the point lies outside the scene")
+            .field("--point")
+            .found(format!("{point:?}, {distance:.4e} from the nearest labelled Gaussian"))
+            .expected(format!("at most {most:.4e} from it, in units of the scene"))
+            .hint("gs-geom inspect tells the bounds of the geometry"));
+    }
     let ranking = found.map(|i| ranked(scene, index, label[i as usize] as usize, 1.0)).into_iter().collect();
     let place =
         Place { view: None, pixel: None, position: mean, alpha_or_distance: distance, noise: 0.0, names: Vec::new() };
-    (place, ranking)
+    Ok((place, ranking))
 }
 
 fn ranked(scene: &LabelledScene, index: &Index<'_>, instance: usize, score: f32) -> Ranked {

@@ -173,7 +173,7 @@ pub(super) fn run(a: &QueryArgs, stage: &Stage, json_lines: bool) -> Result<Stri
         if point.iter().any(|v| !v.is_finite()) {
             return Err(Error::new("not a point").field("--point").found(text).expected("finite numbers"));
         }
-        let (found, ranking) = place::at_point(&scene, &asker.index, point);
+        let (found, ranking) = place::at_point(&scene, &asker.index, point)?;
         asked.push(located(format!("point {text}"), "point", found, ranking, &asker, &namer));
     }
     let describe = asker.source.as_ref().map_or("none".into(), crate::text::TextSource::describe);

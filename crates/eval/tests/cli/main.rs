@@ -393,6 +393,19 @@ fn places_say_what_is_there() {
 }
 
 #[test]
+fn points_outside_the_scene_are_refused() {
+    let f = Fixture::new(2);
+    for (point, found) in [("1e30,0,0", "[1e30, 0.0, 0.0], 1.0000e30 from"), ("0,-60,0", "[0.0, -60.0, 0.0], ")] {
+        let e = f.bad("query", &format!("{TABLE}|--point|0,0,0.5|--point|{point}"));
+        assert!(e.contains("--point: the point lies outside the scene; found ") && e.contains(found), "{e}");
+        assert!(!f.path().join("out").exists());
+    }
+    assert!(f.bad("query", &format!("{TABLE}|--point|1e300,0,0")).contains("--point: not a point"));
+    // Somewhat beside the scene there is still something nearest.
+    f.good("query", &format!("{TABLE}|--point|0,-6,0"));
+}
+
+#[test]
 fn several_texts_divide_the_cloud() {
     let f = Fixture::new(2);
     let at = "--text|blue ball|--text|red ball|--segment|--views|frame_00002";
