@@ -88,6 +88,14 @@ impl SceneArgs {
     }
 }
 
+/// The value of an option that takes a text: CLIP has a feature for no words, too, and it resembles anything.
+fn words(text: &str) -> Result<String> {
+    if text.trim().is_empty() {
+        return Err(Error::new("an empty text").expected("words").hint("leave the option out, or give it words"));
+    }
+    Ok(text.into())
+}
+
 /// What takes less memory.
 const SMALLER: &str = "give a smaller geometry (gs-geom train --max-gaussians) or smaller pictures";
 
@@ -116,7 +124,7 @@ struct LanguageArgs {
     #[arg(long, value_name = "VIEWS")]
     min_support: Option<u32>,
     /// Score by LERF's relevancy against these texts, with commas between, such as object,things,stuff,texture
-    #[arg(long, value_delimiter = ',', value_name = "TEXTS")]
+    #[arg(long, value_delimiter = ',', value_name = "TEXTS", value_parser = words)]
     negatives: Vec<String>,
     /// Put every text into this template, such as "a photo of a {}"; several are averaged
     #[arg(long, value_name = "TEMPLATE")]
@@ -282,7 +290,7 @@ struct ReportArgs {
     #[arg(long, value_name = "DIR")]
     masks: Option<PathBuf>,
     /// Title of the page [default: the scene's folder name]
-    #[arg(long)]
+    #[arg(long, value_parser = words)]
     title: Option<String>,
     /// Views to show, by name, with commas between [default: three held-out ones]
     #[arg(long, value_delimiter = ',', value_name = "NAMES")]

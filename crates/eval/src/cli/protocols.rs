@@ -1,6 +1,6 @@
 //! `eval lerf`, `eval scannet` and `eval table` on the command line.
 
-use super::{LanguageArgs, SMALLER, SceneArgs, load, mask_threshold, read_scene};
+use super::{LanguageArgs, SMALLER, SceneArgs, load, mask_threshold, read_scene, words};
 use crate::labels;
 use crate::lerf::{self, Answers, LerfMetrics, Rendering};
 use crate::memory::{self, Sizes};
@@ -56,7 +56,7 @@ pub(super) struct LerfArgs {
     #[arg(long, value_name = "DIR")]
     labels: Option<PathBuf>,
     /// Name of the scene [default: that of its folder]
-    #[arg(long)]
+    #[arg(long, value_parser = words)]
     name: Option<String>,
     /// Which texts are asked
     #[arg(long, value_enum, default_value = "auto")]
@@ -270,7 +270,7 @@ pub(super) struct ScannetArgs {
     #[arg(long, value_enum, default_value = "first")]
     undescribed: Undescribed,
     /// Labels of true instances that count as no object, with commas between, such as wall,floor,ceiling
-    #[arg(long, value_delimiter = ',', value_name = "LABELS")]
+    #[arg(long, value_delimiter = ',', value_name = "LABELS", value_parser = words)]
     without: Vec<String>,
     /// Output folder: metrics.json, table.md, objects.csv
     #[arg(long, value_name = "DIR")]

@@ -1,6 +1,6 @@
 //! `eval query` on the command line.
 
-use super::{LanguageArgs, SMALLER, SceneArgs, load, mask_threshold, read_scene};
+use super::{LanguageArgs, SMALLER, SceneArgs, load, mask_threshold, read_scene, words};
 use crate::ask::Asker;
 use crate::granularity::Granularity;
 use crate::lerf::Rendering;
@@ -32,7 +32,7 @@ pub(super) struct QueryArgs {
     #[command(flatten)]
     language: LanguageArgs,
     /// What to look for, in words; may be given several times
-    #[arg(long, value_name = "WORDS")]
+    #[arg(long, value_name = "WORDS", value_parser = words)]
     text: Vec<String>,
     /// A picture of what to look for (needs image.onnx in the --clip folder); may be given several times
     #[arg(long, value_name = "FILE")]

@@ -406,6 +406,25 @@ fn points_outside_the_scene_are_refused() {
 }
 
 #[test]
+fn empty_texts_are_refused() {
+    let f = Fixture::new(2);
+    let report = "--run-dir|{}/run|--scene|{}/balls|--out|{}/report.html";
+    for (command, arguments, option) in [
+        ("query", format!("{TABLE}|--text|red ball|--text="), "--text"),
+        ("query", format!("{TABLE}|--text|red ball|--negatives=thing,"), "--negatives"),
+        ("lerf", "--out|{}/out|--name=".into(), "--name"),
+        ("report", format!("{report}|--title="), "--title"),
+    ] {
+        let e = f.bad(command, &arguments);
+        assert!(e.contains(&format!("'{option} <")) && e.contains("': an empty text; expected words"), "{e}");
+    }
+    let e = f.bad("query", &format!("{TABLE}|--text|red ball|--negatives=thing, ,stuff"));
+    assert!(e.contains("invalid value ' ' for '--negatives <TEXTS>': an empty text"), "{e}");
+    assert!(f.bad("query", &format!("{TABLE}|--text|red ball|--template=")).contains("no place for the text"));
+    assert!(!f.path().join("out").exists() && !f.path().join("report.html").exists());
+}
+
+#[test]
 fn several_texts_divide_the_cloud() {
     let f = Fixture::new(2);
     let at = "--text|blue ball|--text|red ball|--segment|--views|frame_00002";
