@@ -11,7 +11,7 @@ use crate::{curves, svg};
 use artifacts::{Features, Level, MaskMaps, NOISE_COLOR, hash_folder, instance_color, maps_path, role};
 use gs_io::{Error, IoContext, Result};
 use gs_scene::dataset::{Dataset, Split, View};
-use std::path::PathBuf;
+use std::path::{Component, Path, PathBuf};
 
 /// Width of pictures on the page, two or three beside each other.
 const WIDTH_OF: [usize; 4] = [900, 900, 640, 440];
@@ -232,7 +232,7 @@ pub(super) fn queries(m: &Material, page: &mut Page, metrics: &mut Metrics) -> R
         facts.extend(scored(&q.text).map(|s| format!("IoU {:.3}", s.iou)));
         let mut figures = Vec::new();
         for v in &q.views {
-            let path = folder.join(&v.overlay);
+            let path = beside(&folder, &v.overlay)?;
             let picture = gs_scene::Image::read(&path)?;
             let picture = Picture::new(picture.width as usize, picture.height as usize, &picture.rgb);
             figures.push(figure(&picture, 3, v.view.clone())?);
@@ -241,6 +241,20 @@ pub(super) fn queries(m: &Material, page: &mut Page, metrics: &mut Metrics) -> R
         page.figures(3, &figures);
     }
     Ok(())
+}
+
+/// The path of a picture that `query.json` names: it lies in that file's folder, and no other file is shown.
+fn beside(folder: &Path, name: &str) -> Result<PathBuf> {
+    let inside = !name.is_empty() && Path::new(name).components().all(|c| matches!(c, Component::Normal(_)));
+    if inside {
+        return Ok(folder.join(name));
+    }
+    Err(Error::new("a picture outside the run")
+        .file(folder.join("query.json"))
+        .field("overlay")
+        .found(name)
+        .expected("the name of a picture in this folder")
+        .hint("run eval query again"))
 }
 
 pub(super) fn score_tables(m: &Material, page: &mut Page) {

@@ -425,6 +425,26 @@ fn empty_texts_are_refused() {
 }
 
 #[test]
+fn a_report_shows_no_picture_from_outside_the_run() {
+    let f = Fixture::new(2);
+    f.good("query", &format!("{TABLE}|--text|red ball|--views|frame_00002"));
+    fs::rename(f.path().join("out"), f.run().join("query")).unwrap();
+    let file = f.run().join("query/query.json");
+    let written = fs::read_to_string(&file).unwrap();
+    let picture = f.scene().join("images/frame_00001.png");
+    let name = "red-ball.frame_00002.overlay.png";
+    assert!(written.contains(name));
+    for outside in ["../../balls/images/frame_00001.png", picture.to_str().unwrap(), "./../../x.png", ""] {
+        fs::write(&file, written.replace(name, outside)).unwrap();
+        let e = f.bad("report", "--run-dir|{}/run|--scene|{}/balls|--out|{}/report.html");
+        assert!(e.contains(&format!("query.json: overlay: a picture outside the run; found {outside}")), "{e}");
+        assert!(!f.path().join("report.html").exists());
+    }
+    fs::write(&file, written).unwrap();
+    f.good("report", "--run-dir|{}/run|--scene|{}/balls|--out|{}/report.html");
+}
+
+#[test]
 fn several_texts_divide_the_cloud() {
     let f = Fixture::new(2);
     let at = "--text|blue ball|--text|red ball|--segment|--views|frame_00002";
