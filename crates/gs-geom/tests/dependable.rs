@@ -125,6 +125,30 @@ fn a_run_whose_photographs_vanish_saves_a_checkpoint_and_goes_on_to_the_same_byt
 }
 
 #[test]
+#[cfg(unix)]
+fn signals_that_were_ignored_at_the_start_stay_ignored() {
+    let dir = Folder::new();
+    let scene = dir.path("scene");
+    // A shell that ignores some of them, as nohup does SIGHUP and a shell in the background SIGINT.
+    for (ignored, sent, ends) in [("", "HUP", 130), ("HUP", "HUP", 0), ("HUP", "TERM", 130), ("INT", "INT", 0)] {
+        let out = dir.path(&format!("{ignored}{sent}.ply"));
+        let arguments = training(&scene, &out, "400", &["--checkpoint-every", "1", "--holdout", "0"]);
+        let mut child = Command::new("sh")
+            .args(["-c", &format!("trap '' {ignored}; exec \"$0\" \"$@\""), env!("CARGO_BIN_EXE_gs-geom")])
+            .args(arguments)
+            .stderr(std::process::Stdio::null())
+            .spawn()
+            .unwrap();
+        while !PathBuf::from(format!("{out}.checkpoint")).exists() && child.try_wait().unwrap().is_none() {
+            std::thread::sleep(Duration::from_millis(1));
+        }
+        assert!(Command::new("kill").args([&format!("-{sent}"), &child.id().to_string()]).status().unwrap().success());
+        assert_eq!(child.wait().unwrap().code(), Some(ends), "{sent} where {ignored} is ignored");
+        assert_eq!(PathBuf::from(&out).exists(), ends == 0);
+    }
+}
+
+#[test]
 fn a_run_that_cannot_write_its_result_saves_a_checkpoint() {
     let dir = Folder::new();
     let (scene, out) = (dir.path("scene"), dir.path("g.ply"));

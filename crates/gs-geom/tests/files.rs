@@ -4,7 +4,7 @@ use gs_scene::{Gaussians, ply};
 use serde_json::Value;
 use std::fs;
 use std::path::PathBuf;
-use std::process::{Command, Output};
+use std::process::{Command, Output, Stdio};
 
 fn run(arguments: &[&str]) -> Output {
     Command::new(env!("CARGO_BIN_EXE_gs-geom")).args(arguments).output().unwrap()
@@ -92,6 +92,33 @@ fn a_file_is_trimmed_cropped_pruned_and_ordered() {
     assert_eq!(header.matches("property float").count(), 62);
     assert!(!header.contains(&*dir.path().to_string_lossy()));
     assert_eq!(ply::read_gaussians(&full).unwrap().len(), 15);
+}
+
+/// Runs what a shell does before the program, such as `ulimit -f 1;`, and then the program.
+#[cfg(unix)]
+fn in_shell(before: &str, arguments: &[&str]) -> Command {
+    let mut c = Command::new("sh");
+    c.args(["-c", &format!("{before} exec \"$0\" \"$@\""), env!("CARGO_BIN_EXE_gs-geom")]).args(arguments);
+    c
+}
+
+/// What is said by a run that ends with exit code 2 and one line.
+#[cfg(unix)]
+fn one_line(command: &mut Command) -> String {
+    let o = command.stderr(Stdio::piped()).spawn().unwrap().wait_with_output().unwrap();
+    let said = String::from_utf8_lossy(&o.stderr).into_owned();
+    assert_eq!((o.status.code(), said.lines().count()), (Some(2), 1), "{said}");
+    said
+}
+
+#[test]
+#[cfg(unix)]
+fn a_limit_on_the_length_of_files_is_an_error() {
+    let dir = tempfile::tempdir().unwrap();
+    let (file, out) = (written(&dir), dir.path().join("out.ply"));
+    let said = one_line(&mut in_shell("ulimit -f 1;", &["convert", &file, &out.to_string_lossy(), "--quiet"]));
+    assert!(said.contains("out.ply: cannot write: File too large") && said.contains("ulimit -f"), "{said}");
+    assert!(!out.exists());
 }
 
 #[test]

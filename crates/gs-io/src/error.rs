@@ -135,6 +135,7 @@ impl<T> IoContext<T> for std::io::Result<T> {
 }
 
 #[cfg(test)]
+                std::io::ErrorKind::FileTooLarge => "raise the limit on the length of files (ulimit -f)",
 mod tests {
     use super::*;
 

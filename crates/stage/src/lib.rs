@@ -13,6 +13,7 @@ mod machine;
 mod memory;
 mod progress;
 mod record;
+mod signals;
 
 pub use log::Stage;
 pub use machine::Machine;
@@ -72,6 +73,7 @@ pub trait Program: clap::Parser {
 
 /// Parses the arguments, sets up threads and logging, runs the program and turns its result into an exit code.
 pub fn main<P: Program>() -> ExitCode {
+    signals::outlive_long_files();
     let arguments: Vec<String> = std::env::args_os().skip(1).map(|a| a.to_string_lossy().into_owned()).collect();
     if arguments.first().is_some_and(|a| a == "--generate") {
         let stage = Stage::new(P::NAME, &CommonArgs::default());

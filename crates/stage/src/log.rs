@@ -1,6 +1,6 @@
 //! What a stage says, and the facts of its run.
 
-use crate::{CommonArgs, Machine, Progress, RunRecord};
+use crate::{CommonArgs, Machine, Progress, RunRecord, signals};
 use gs_io::{Claim, Error, Outputs, Provenance, Result, Written};
 use serde_json::{Value, json};
 use std::collections::BTreeMap;
@@ -109,17 +109,12 @@ impl Stage {
     }
 
     /// Whether Ctrl-C or a termination signal has come. The first call begins to catch them, so a stage that never
-    /// asks dies at once, as any program does; a second signal ends the process whatever it does.
+    /// asks dies at once, as any program does; a second signal ends the process whatever it does. Signals that were ignored
+    /// when the program started stay ignored.
     pub fn interrupted(&self) -> bool {
         let flag = self.interrupted.get_or_init(|| {
             let flag = Arc::new(AtomicBool::new(false));
-            let seen = Arc::clone(&flag);
-            // A handler that is already set belongs to an earlier stage of the same test process.
-            let _ = ctrlc::set_handler(move || {
-                if seen.swap(true, Ordering::SeqCst) {
-                    std::process::exit(130);
-                }
-            });
+            signals::catch(&flag);
             flag
         });
         flag.load(Ordering::SeqCst)
