@@ -22,7 +22,6 @@ use gs_scene::dataset::{self, Dataset, LoadOptions, Resolution, View};
 use onnx_models::{ClipImage, ClipText, EngineOptions};
 use serde_json::{Value, json};
 use stage::{CommonArgs, Program, Stage};
-use std::io::Write;
 use std::path::{Path, PathBuf};
 
 /// Text queries, evaluation protocols and the report
@@ -328,8 +327,7 @@ impl Program for Args {
             Command::Ablation(a) => ablation::run(a, stage)?,
         };
         if !self.common.quiet && !self.common.json {
-            // A closed pipe is the reader's choice.
-            let _ = std::io::stdout().lock().write_all(text.as_bytes());
+            stage.print(&text)?;
         }
         Ok(())
     }

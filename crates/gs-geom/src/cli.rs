@@ -52,7 +52,7 @@ impl Program for Args {
             Command::Train(args) => args.run(stage),
             Command::Render(args) => args.run(stage),
             Command::Eval(args) => args.run(stage),
-            Command::Inspect(args) => args.run(self.common.json),
+            Command::Inspect(args) => args.run(self.common.json, stage),
             Command::Convert(args) => args.run(stage),
         }
     }

@@ -112,6 +112,26 @@ fn one_line(command: &mut Command) -> String {
 }
 
 #[test]
+#[cfg(target_os = "linux")]
+fn a_full_standard_output_is_an_error_and_a_closed_one_is_not() {
+    let dir = tempfile::tempdir().unwrap();
+    let file = written(&dir);
+    for arguments in [&["inspect", &file][..], &["inspect", &file, "--json"], &["--help"], &["--version"]] {
+        let said = one_line(in_shell("", arguments).stdout(fs::File::options().write(true).open("/dev/full").unwrap()));
+        assert!(said.contains("standard output: cannot write: No space left"), "{said}");
+        let mut child = in_shell("", arguments).stdout(Stdio::piped()).spawn().unwrap();
+        drop(child.stdout.take());
+        assert!(child.wait().unwrap().success(), "{arguments:?}");
+    }
+    // What events tell is lost, what is made is not.
+    let out = dir.path().join("out.ply").to_string_lossy().into_owned();
+    let full = fs::File::options().write(true).open("/dev/full").unwrap();
+    let said = one_line(in_shell("", &["convert", &file, &out, "--json"]).stdout(full));
+    assert!(said.contains("standard output: cannot write: No space left"), "{said}");
+    assert_eq!(ply::read_gaussians(&out).unwrap().len(), 39);
+}
+
+#[test]
 #[cfg(unix)]
 fn a_limit_on_the_length_of_files_is_an_error() {
     let dir = tempfile::tempdir().unwrap();
@@ -119,6 +139,9 @@ fn a_limit_on_the_length_of_files_is_an_error() {
     let said = one_line(&mut in_shell("ulimit -f 1;", &["convert", &file, &out.to_string_lossy(), "--quiet"]));
     assert!(said.contains("out.ply: cannot write: File too large") && said.contains("ulimit -f"), "{said}");
     assert!(!out.exists());
+    let told = fs::File::create(dir.path().join("told.txt")).unwrap();
+    let said = one_line(in_shell("ulimit -f 1;", &["inspect", &file]).stdout(told));
+    assert!(said.contains("standard output: cannot write: File too large"), "{said}");
 }
 
 #[test]

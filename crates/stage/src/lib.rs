@@ -22,6 +22,7 @@ pub use progress::Progress;
 pub use record::{RunRecord, cpu_seconds, peak_rss_bytes};
 
 use gs_io::{Error, Result};
+use std::io::Write;
 use std::path::Path;
 use std::process::ExitCode;
 
@@ -75,46 +76,55 @@ pub trait Program: clap::Parser {
 pub fn main<P: Program>() -> ExitCode {
     signals::outlive_long_files();
     let arguments: Vec<String> = std::env::args_os().skip(1).map(|a| a.to_string_lossy().into_owned()).collect();
+    let failed = |stage: &Stage, e: &Error| {
+        stage.error(e);
+        ExitCode::from(2)
+    };
     if arguments.first().is_some_and(|a| a == "--generate") {
         let stage = Stage::new(P::NAME, &CommonArgs::default());
-        return match generate::generate::<P>(P::NAME, &arguments[1..]) {
-            Ok(()) => ExitCode::SUCCESS,
-            Err(e) => {
-                stage.error(&e);
-                ExitCode::from(2)
-            }
-        };
+        let generated = generate::generate::<P>(P::NAME, &arguments[1..]);
+        return generated.map_or_else(|e| failed(&stage, &e), |()| ExitCode::SUCCESS);
     }
-    let mut matches = P::command().version(VERSION).after_help(generate::HELP).get_matches();
-    let command = matches.subcommand_name().map(String::from);
-    let program = P::from_arg_matches_mut(&mut matches).unwrap_or_else(|e| e.exit());
+    let matches = P::command().version(VERSION).after_help(generate::HELP).try_get_matches();
+    let parsed = matches.and_then(|mut m| {
+        let command = m.subcommand_name().map(String::from);
+        P::from_arg_matches_mut(&mut m).map(|program| (program, command))
+    });
+    let (program, command) = match parsed {
+        Ok(parsed) => parsed,
+        Err(e) => {
+            let told = of_the_command_line(e);
+            return told.map_or_else(|e| failed(&Stage::silent(P::NAME), &e), |_| ExitCode::SUCCESS);
+        }
+    };
     let stage = Stage::new(P::NAME, program.common()).with_command(command);
     let threads = program.common().threads;
     if let Err(e) = rayon::ThreadPoolBuilder::new().num_threads(threads).build_global() {
         // rayon has no pool to fall back on: whoever asks for it later would panic.
-        stage.error(
-            &Error::new(format!("cannot start the worker threads: {e}"))
-                .field("--threads")
-                .found(threads)
-                .hint("give fewer threads, or the process more memory"),
-        );
-        return ExitCode::from(2);
+        let e = Error::new(format!("cannot start the worker threads: {e}")).field("--threads").found(threads);
+        return failed(&stage, &e.hint("give fewer threads, or the process more memory"));
     }
     match program.run(&stage) {
-        Ok(()) => ExitCode::SUCCESS,
+        Ok(()) => stage.unwritten().map_or(ExitCode::SUCCESS, |e| failed(&stage, e)),
         Err(_) if stage.interrupted() => {
             stage.warn("interrupted");
             ExitCode::from(130)
         }
-        Err(e) => {
-            // As it was typed: the option, then its value.
-            stage.error(&match e.at_fault().and_then(|file| given_by(&arguments, file)) {
-                Some(option) => Error::new(format!("{option} {e}")),
-                None => e,
-            });
-            ExitCode::from(2)
-        }
+        // As it was typed: the option, then its value.
+        Err(e) => match e.at_fault().and_then(|file| given_by(&arguments, file)) {
+            Some(option) => failed(&stage, &Error::new(format!("{option} {e}"))),
+            None => failed(&stage, &e),
+        },
     }
+}
+
+/// Prints help or version as [`Stage::print`] does; ends the program with exit code 2 and clap's few lines where the command
+/// line is wrong.
+fn of_the_command_line(e: clap::Error) -> Result<bool> {
+    if !e.use_stderr() {
+        return log::told(e.print().and_then(|()| std::io::stdout().flush()));
+    }
+    e.exit()
 }
 
 /// The option whose value this very path is: whoever reads an error about it knows then which one to mend.

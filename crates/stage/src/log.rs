@@ -1,10 +1,10 @@
 //! What a stage says, and the facts of its run.
 
 use crate::{CommonArgs, Machine, Progress, RunRecord, signals};
-use gs_io::{Claim, Error, Outputs, Provenance, Result, Written};
+use gs_io::{Claim, Error, IoContext, Outputs, Provenance, Result, Written};
 use serde_json::{Value, json};
 use std::collections::BTreeMap;
-use std::io::Write;
+use std::io::{ErrorKind, Write};
 use std::path::Path;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Mutex, OnceLock};
@@ -19,6 +19,7 @@ pub struct Stage {
     skipped: Mutex<Vec<String>>,
     predicted: Mutex<Option<u64>>,
     interrupted: OnceLock<Arc<AtomicBool>>,
+    unwritten: OnceLock<Error>,
 }
 
 impl Stage {
@@ -32,6 +33,7 @@ impl Stage {
             skipped: Mutex::default(),
             predicted: Mutex::default(),
             interrupted: OnceLock::new(),
+            unwritten: OnceLock::new(),
         }
     }
 
@@ -204,11 +206,36 @@ impl Stage {
     pub(crate) fn event(&self, kind: &str, fields: &[(&str, Value)]) {
         let mut o = serde_json::Map::from_iter([("event".into(), json!(kind)), ("stage".into(), json!(self.name))]);
         o.extend(fields.iter().map(|(k, v)| ((*k).to_string(), v.clone())));
-        // A closed pipe is the reader's choice, not an error of the stage.
-        let _ = writeln!(std::io::stdout().lock(), "{}", Value::Object(o));
+        // The work goes on without the event; the program says in the end that it is missing.
+        if let Err(e) = self.print(&format!("{}\n", Value::Object(o))) {
+            self.unwritten.get_or_init(|| e);
+        }
+    }
+
+    /// Why an event could not be written, if one could not.
+    pub(crate) fn unwritten(&self) -> Option<&Error> {
+        self.unwritten.get()
+    }
+
+    /// Writes what a command tells to standard output; whether somebody still reads it. A closed pipe is the reader's choice,
+    /// not an error.
+    ///
+    /// # Errors
+    /// When it cannot be written, as on a full disk.
+    pub fn print(&self, text: &str) -> Result<bool> {
+        let mut out = std::io::stdout().lock();
+        told(out.write_all(text.as_bytes()).and_then(|()| out.flush()))
     }
 
     pub(crate) fn line(&self, message: &str) {
-        let _ = writeln!(std::io::stderr().lock(), "{}: {message}", self.name);
+        let _ = writeln!(std::io::stderr().lock(), "{}: {}", self.name, message);
+    }
+}
+
+/// What became of a text on standard output, for [`Stage::print`].
+pub(crate) fn told(written: std::io::Result<()>) -> Result<bool> {
+    match written {
+        Err(e) if e.kind() == ErrorKind::BrokenPipe => Ok(false),
+        written => written.at("write", "standard output").map(|()| true),
     }
 }

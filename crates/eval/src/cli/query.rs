@@ -16,7 +16,7 @@ use gs_scene::dataset::{Dataset, LoadOptions, Resolution};
 use onnx_models::{Bounds, ClipImage, LabelMap, RgbImage, crop_mask};
 use serde_json::{Value, json};
 use stage::Stage;
-use std::io::{BufRead, Write};
+use std::io::BufRead;
 use std::path::{Path, PathBuf};
 use std::time::Instant;
 
@@ -353,9 +353,7 @@ fn interactive(
             let ms = |t: std::time::Duration| t.as_secs_f64() * 1e3;
             printed += &format!("\n  {:.1} ms encoding, {:.2} ms query\n", ms(encoding), ms(took));
         }
-        let mut stdout = std::io::stdout().lock();
-        // A closed pipe is the reader's choice.
-        if stdout.write_all(printed.as_bytes()).and_then(|()| stdout.flush()).is_err() {
+        if !stage.print(&printed)? {
             break;
         }
     }

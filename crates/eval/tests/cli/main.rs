@@ -555,6 +555,26 @@ fn an_interactive_query_reads_texts_from_a_pipe() {
 }
 
 #[test]
+#[cfg(target_os = "linux")]
+fn a_full_standard_output_is_an_error() {
+    let f = Fixture::new(2);
+    let query = |rest: &[&str]| {
+        let mut c = std::process::Command::new(env!("CARGO_BIN_EXE_eval"));
+        c.arg("query").arg("--instances").arg(f.instances()).arg("--geometry").arg(f.geometry());
+        c.arg("--scene").arg(f.scene()).arg("--text-features").arg(f.table()).args(rest);
+        let texts = f.path().join("texts");
+        std::fs::write(&texts, "red ball\n").unwrap();
+        c.stdin(std::fs::File::open(&texts).unwrap());
+        let o = c.stdout(std::fs::File::options().write(true).open("/dev/full").unwrap()).output().unwrap();
+        let said = String::from_utf8_lossy(&o.stderr).into_owned();
+        assert!(o.status.code() == Some(2) && said.contains("standard output: cannot write: No space left"), "{said}");
+    };
+    query(&["--interactive"]);
+    query(&["--interactive", "--json"]);
+    query(&["--text", "red ball", "--out", &f.path().join("full").to_string_lossy()]);
+}
+
+#[test]
 fn odd_instances_are_answered_with_a_line() {
     let f = Fixture::new(2);
     let warned = |command: &str, rest: &str| {

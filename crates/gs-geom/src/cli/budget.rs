@@ -69,7 +69,8 @@ impl TrainArgs {
         planned.scene.resolution = kept.resolution.parse()?;
         let options = format!("--iterations {iterations} --max-gaussians {gaussians} --resolution {}", kept.resolution);
         stage.info(&format!("planned for {budget} s, to take {seconds:.0} s; the same without a budget:"));
-        stage.info(&command(std::env::args().collect(), &options));
+        let typed = std::env::args_os().map(|a| a.to_string_lossy().into_owned()).collect();
+        stage.info(&command(typed, &options));
         let text = serde_json::to_vec_pretty(&kept).map_err(|e| Error::new(e.to_string()))?;
         write_bytes(plan_path(&self.out), &text)?;
         Ok((planned, json!({"options": options, "made": kept})))

@@ -3,8 +3,8 @@
 use crate::inspect::{Bin, Bounds, Report, inspect};
 use gs_io::{Error, IoContext, Result};
 use gs_scene::ply;
+use stage::Stage;
 use std::fmt::Write as _;
-use std::io::Write as _;
 use std::path::PathBuf;
 
 /// Arguments of `gs-geom inspect`.
@@ -17,7 +17,7 @@ pub(super) struct InspectArgs {
 
 impl InspectArgs {
     /// Tells on standard output: text, or one JSON object.
-    pub(super) fn run(&self, json: bool) -> Result<()> {
+    pub(super) fn run(&self, json: bool, stage: &Stage) -> Result<()> {
         let file_bytes = std::fs::metadata(&self.file).at("read", &self.file)?.len();
         let report = inspect(&ply::read_gaussians_as_they_are(&self.file)?);
         let told = if json {
@@ -28,9 +28,7 @@ impl InspectArgs {
         } else {
             text(&report, file_bytes)
         };
-        // A closed pipe is the reader's choice, not an error.
-        let _ = std::io::stdout().lock().write_all(told.as_bytes());
-        Ok(())
+        stage.print(&told).map(drop)
     }
 }
 
