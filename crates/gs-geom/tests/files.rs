@@ -145,6 +145,26 @@ fn a_limit_on_the_length_of_files_is_an_error() {
 }
 
 #[test]
+#[cfg(unix)]
+fn names_with_control_characters_are_escaped() {
+    let dir = tempfile::tempdir().unwrap();
+    let odd = |name: &str| dir.path().join(format!("a\nb\t\x1b[31m{name}")).to_string_lossy().into_owned();
+    let (file, out) = (odd("in.ply"), odd("out.ply"));
+    fs::rename(written(&dir), &file).unwrap();
+    let o = run(&["convert", &file, &out]);
+    let said = String::from_utf8(o.stderr).unwrap();
+    assert!(o.status.success() && said.contains(r"a\nb\t\u{1b}[31mout.ply"), "{said}");
+    assert_eq!(said.lines().count(), 2, "what was skipped and what was written: {said}");
+    let missing = one_line(&mut in_shell("", &["inspect", &odd("none.ply")]));
+    assert!(missing.contains(r"a\nb\t\u{1b}[31mnone.ply: "), "{missing}");
+    // What the command line itself is refused for.
+    for arguments in [&["inspect", "x.ply", &odd("")][..], &["inspect", "x.ply", "--threads", &odd("")]] {
+        let said = refused(arguments);
+        assert!(said.contains(r"a\nb\t\u{1b}[31m") && !said.contains(['\t', '\x1b']), "{said}");
+    }
+}
+
+#[test]
 fn the_input_is_never_overwritten() {
     let dir = tempfile::tempdir().unwrap();
     let file = written(&dir);

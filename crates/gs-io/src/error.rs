@@ -103,9 +103,18 @@ impl fmt::Display for Error {
         if let Some(hint) = &p.hint {
             line += &format!("; {hint}");
         }
-        // Names inside hostile files may hold line breaks; an error stays one line.
-        f.write_str(&line.replace(['\n', '\r'], " "))
+        f.write_str(&escaped(&line))
     }
+}
+
+/// A message as one line that does nothing to a terminal: names of files, and names within them, may hold line breaks and
+/// other control characters, which are written as `\n` or `\u{1b}`.
+pub fn escaped(message: &str) -> String {
+    let mut line = String::with_capacity(message.len());
+    for c in message.chars() {
+        if c.is_control() { line.extend(c.escape_default()) } else { line.push(c) }
+    }
+    line
 }
 
 impl std::error::Error for Error {}
@@ -126,6 +135,7 @@ impl<T> IoContext<T> for std::io::Result<T> {
                     "check the permissions, or choose another output folder"
                 }
                 std::io::ErrorKind::StorageFull => "free some disk space",
+                std::io::ErrorKind::FileTooLarge => "raise the limit on the length of files (ulimit -f)",
                 std::io::ErrorKind::UnexpectedEof => "the file is cut short: make or copy it again",
                 _ => "check the file and its folder",
             };
@@ -135,14 +145,16 @@ impl<T> IoContext<T> for std::io::Result<T> {
 }
 
 #[cfg(test)]
-                std::io::ErrorKind::FileTooLarge => "raise the limit on the length of files (ulimit -f)",
 mod tests {
     use super::*;
 
     #[test]
     fn stays_one_line_and_keeps_the_innermost_file() {
         let e = Error::new("bad\nname").file("inner").file("outer").field("a").field("b");
-        assert_eq!(e.to_string(), "inner: a: bad name");
+        assert_eq!(e.to_string(), "inner: a: bad\\nname");
+        let e = Error::new("no such view").file("été\t\x1b[31m/\u{85}").found("a\r\\").to_string();
+        assert_eq!(e, "été\\t\\u{1b}[31m/\\u{85}: no such view; found a\\r\\");
+        assert_eq!(escaped(&e), e);
     }
 
     #[test]

@@ -21,7 +21,8 @@ pub use memory::Bytes;
 pub use progress::Progress;
 pub use record::{RunRecord, cpu_seconds, peak_rss_bytes};
 
-use gs_io::{Error, Result};
+use clap::error::ContextValue;
+use gs_io::{Error, Result, escaped};
 use std::io::Write;
 use std::path::Path;
 use std::process::ExitCode;
@@ -120,9 +121,17 @@ pub fn main<P: Program>() -> ExitCode {
 
 /// Prints help or version as [`Stage::print`] does; ends the program with exit code 2 and clap's few lines where the command
 /// line is wrong.
-fn of_the_command_line(e: clap::Error) -> Result<bool> {
+fn of_the_command_line(mut e: clap::Error) -> Result<bool> {
     if !e.use_stderr() {
         return log::told(e.print().and_then(|()| std::io::stdout().flush()));
+    }
+    // What was typed may hold control characters, as names of files do.
+    let typed = e.context().filter_map(|(kind, value)| match value {
+        ContextValue::String(s) => Some((kind, ContextValue::String(escaped(s)))),
+        _ => None,
+    });
+    for (kind, value) in typed.collect::<Vec<_>>() {
+        e.insert(kind, value);
     }
     e.exit()
 }

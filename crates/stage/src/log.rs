@@ -1,7 +1,7 @@
 //! What a stage says, and the facts of its run.
 
 use crate::{CommonArgs, Machine, Progress, RunRecord, signals};
-use gs_io::{Claim, Error, IoContext, Outputs, Provenance, Result, Written};
+use gs_io::{Claim, Error, IoContext, Outputs, Provenance, Result, Written, escaped};
 use serde_json::{Value, json};
 use std::collections::BTreeMap;
 use std::io::{ErrorKind, Write};
@@ -228,7 +228,7 @@ impl Stage {
     }
 
     pub(crate) fn line(&self, message: &str) {
-        let _ = writeln!(std::io::stderr().lock(), "{}: {}", self.name, message);
+        let _ = writeln!(std::io::stderr().lock(), "{}: {}", self.name, escaped(message));
     }
 }
 
