@@ -59,6 +59,7 @@ fn a_file_is_inspected_in_text_and_json() {
     assert_eq!((&v["gaussians"], &v["non_finite"]["means"]), (&40.into(), &1.into()));
     assert_eq!(v["bounds"]["high"][0], 9.75);
     assert_eq!(v["file_bytes"], fs::metadata(&file).unwrap().len());
+    assert!(refused(&["inspect", &file, "--threads", "1025"]).contains("1025 is not in 0..=1024"));
     assert!(refused(&["inspect", "no/such.ply"]).contains("no/such.ply"));
     fs::write(&file, "ply\nformat ascii 1.0\nelement vertex 9\nend_header\n").unwrap();
     assert!(refused(&["inspect", &file]).contains("in.ply"));

@@ -21,6 +21,7 @@ pub use memory::Bytes;
 pub use progress::Progress;
 pub use record::{RunRecord, cpu_seconds, peak_rss_bytes};
 
+use clap::builder::RangedU64ValueParser;
 use clap::error::ContextValue;
 use gs_io::{Error, Result, escaped};
 use std::io::Write;
@@ -31,12 +32,15 @@ use std::process::ExitCode;
 /// environment, or `unknown` where there is neither.
 pub const REVISION: &str = env!("CAGS_REVISION");
 
+/// More threads than any machine has cores would only take memory.
+const MOST_THREADS: u64 = 1024;
+
 /// Arguments that every stage has, with one meaning.
 #[derive(Debug, Clone, Default, clap::Args)]
 #[command(next_help_heading = "Common options")]
 pub struct CommonArgs {
-    /// Worker threads; 0 means one per core. The results do not depend on it
-    #[arg(long, global = true, default_value_t = 0, value_name = "COUNT")]
+    /// Worker threads, at most 1024; 0 means one per core. The results do not depend on it
+    #[arg(long, global = true, default_value_t = 0, value_name = "COUNT", value_parser = RangedU64ValueParser::<usize>::new().range(..=MOST_THREADS))]
     pub threads: usize,
     /// Seed of every random choice: the same seed gives the same bytes
     #[arg(long, global = true, default_value_t = 0, value_name = "NUMBER")]
