@@ -84,6 +84,10 @@ impl stage::Program for Args {
         &self.common
     }
 
+    fn forecasts(&self) -> bool {
+        false
+    }
+
     fn run(self, stage: &Stage) -> Result<()> {
         // Timings are of one thread unless more are asked for: fewer other programs get between.
         let threads = self.common.threads.max(1);

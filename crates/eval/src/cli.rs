@@ -315,6 +315,10 @@ impl Program for Args {
         &self.common
     }
 
+    fn forecasts(&self) -> bool {
+        !matches!(self.command, Command::Table(_) | Command::Masks(_) | Command::Ablation(_))
+    }
+
     fn run(self, stage: &Stage) -> Result<()> {
         let text = match &self.command {
             Command::Query(a) => query::run(a, stage, self.common.json)?,

@@ -9,10 +9,10 @@ mod train;
 
 use crate::masks::{Alpha, Masks};
 use clap::{Parser, Subcommand, ValueEnum};
-use gs_io::{Error, Result};
+use gs_io::{Error, IoContext, Result};
 use gs_raster::RasterOptions;
 use gs_scene::dataset::{self, Dataset, LoadOptions, Resolution};
-use gs_scene::{Gaussians, Geometry};
+use gs_scene::{Gaussians, Geometry, image_size};
 use stage::{CommonArgs, Program, Stage};
 use std::path::{Path, PathBuf};
 
@@ -146,6 +146,24 @@ fn check_some(gaussians: &Gaussians, path: &Path) -> Result<()> {
         return Err(Error::new("no Gaussians").file(path).field("element vertex").hint("train the geometry again"));
     }
     Ok(())
+}
+
+/// Pixels of the largest view.
+fn most_pixels(dataset: &Dataset) -> u64 {
+    dataset.views.iter().map(|v| u64::from(v.camera.width) * u64::from(v.camera.height)).max().unwrap_or(0)
+}
+
+/// Width and height of the largest photograph's file.
+fn largest_file(dataset: &Dataset) -> Result<(u32, u32)> {
+    dataset.views.iter().try_fold((0, 0), |(width, height), view| {
+        let (w, h) = image_size(&view.image_path)?;
+        Ok((w.max(width), h.max(height)))
+    })
+}
+
+/// Bytes of a file.
+fn bytes(path: &Path) -> Result<u64> {
+    Ok(std::fs::metadata(path).at("read", path)?.len())
 }
 
 /// Gaussians to draw.

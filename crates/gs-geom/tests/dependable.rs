@@ -205,6 +205,45 @@ fn memory_is_foretold_and_recorded() {
     assert!(String::from_utf8_lossy(&wrong.stderr).contains("512M or 2G"));
 }
 
+#[test]
+fn what_cannot_fit_is_refused_before_it_is_made() {
+    let dir = Folder::new();
+    let (scene, out, geometry) = (dir.path("scene"), dir.path("out"), dir.path("g.ply"));
+    ply::write_gaussians(&geometry, &spiral(60), &[]).unwrap();
+    let refused = |arguments: &[&str]| {
+        let o = program(arguments).output().unwrap();
+        let said = String::from_utf8_lossy(&o.stderr).into_owned();
+        assert_eq!((o.status.code(), said.matches("error: ").count()), (Some(2), 1), "{arguments:?}: {said}");
+        assert!(!Path::new(&out).exists(), "{arguments:?}");
+        said
+    };
+    let random = ["--init", "random", "--init-points"];
+    let start =
+        |count: &str, more: &[&str]| refused(&[&training(&scene, &out, "20", &random)[..], &[count], more].concat());
+    assert!(start("3000000000", &["--memory-limit", "1G"]).contains("--init-points: out of range"));
+    for more in [&["--memory-limit", "1G"][..], &["--memory-limit", "1G", "--time-budget", "9s"]] {
+        let said = start("900000000", more);
+        assert!(said.contains("--memory-limit: more memory than there may be"), "{said}");
+        // Few of the points may be kept, but all are made.
+        let said = start("900000000", &[more, &["--max-gaussians", "60"]].concat());
+        assert!(said.contains("found about 12.6G needed"), "{said}");
+    }
+    assert!(start("900000000", &[]).contains("memory of this machine: more memory than there may be"));
+    // Every command has a forecast.
+    let limit = ["--memory-limit", "1M"];
+    let drawn = ["--scene", &scene, "--geometry", &geometry, "--out", &out];
+    for arguments in [
+        &training(&scene, &out, "20", &["--init", &geometry])[..],
+        &[&["render"], &drawn[..]].concat(),
+        &[&["eval"], &drawn[..]].concat(),
+        &["inspect", &geometry],
+        &["convert", &geometry, &out],
+    ] {
+        assert!(refused(&[arguments, &limit].concat()).contains("--memory-limit: more memory than there may be"));
+    }
+    succeeds(&["inspect", &geometry, "--memory-limit", "1G"]);
+}
+
 /// Trains on from `g` and gives the result, all finite, with what the program said.
 fn stressed(scene: &str, dir: &Folder, g: &Gaussians) -> (Gaussians, String) {
     let (init, out) = (dir.path("init.ply"), dir.path("stress.ply"));

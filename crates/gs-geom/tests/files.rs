@@ -155,7 +155,7 @@ fn names_with_control_characters_are_escaped() {
     let o = run(&["convert", &file, &out]);
     let said = String::from_utf8(o.stderr).unwrap();
     assert!(o.status.success() && said.contains(r"a\nb\t\u{1b}[31mout.ply"), "{said}");
-    assert_eq!(said.lines().count(), 2, "what was skipped and what was written: {said}");
+    assert_eq!(said.lines().count(), 3, "memory, what was skipped, what was written: {said}");
     let missing = one_line(&mut in_shell("", &["inspect", &odd("none.ply")]));
     assert!(missing.contains(r"a\nb\t\u{1b}[31mnone.ply: "), "{missing}");
     // What the command line itself is refused for.

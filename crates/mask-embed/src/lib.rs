@@ -56,6 +56,10 @@ impl stage::Program for Args {
         &self.common
     }
 
+    fn forecasts(&self) -> bool {
+        !matches!(self.task, Task::Crops(_) | Task::Tokenize(_))
+    }
+
     fn run(self, stage: &Stage) -> Result<()> {
         match self.task {
             Task::Masks(args) => masks::run(&args, stage),

@@ -56,6 +56,19 @@ fn ok(args: &[&str]) -> String {
 }
 
 #[test]
+fn a_limit_that_nothing_is_held_against_is_refused() {
+    for args in [
+        &["tokenize", "--truth", "none", "--out", "none"][..],
+        &["crops", "--scene", "x", "--masks", "x", "--out", "x"],
+    ] {
+        let o = run(&[args, &["--memory-limit", "1G"]].concat());
+        let said = String::from_utf8_lossy(&o.stderr);
+        let line = "mask-embed: error: --memory-limit: this command does not forecast its memory; leave it out\n";
+        assert!(o.status.code() == Some(2) && said == line, "{said}");
+    }
+}
+
+#[test]
 fn more_memory_than_there_may_be_is_refused_before_the_first_view() {
     let dir = tempfile::tempdir().unwrap();
     let (scene, masks) = (dir.path().join("scene"), dir.path().join("masks"));

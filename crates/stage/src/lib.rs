@@ -32,7 +32,7 @@ use std::process::ExitCode;
 /// environment, or `unknown` where there is neither.
 pub const REVISION: &str = env!("CAGS_REVISION");
 
-/// More threads than any machine has cores would only take memory.
+/// Most worker threads: more than a machine has cores only take memory.
 const MOST_THREADS: u64 = 1024;
 
 /// Arguments that every stage has, with one meaning.
@@ -54,7 +54,8 @@ pub struct CommonArgs {
     /// Write over files that this command did not write, such as older results or your own; inputs are never written
     #[arg(long, global = true)]
     pub overwrite: bool,
-    /// Most memory the run may take, such as 4G: a stage whose forecast is more refuses at the start [no limit]
+    /// Most memory the run may take, such as 4G: a stage whose forecast is more refuses at the start, and so does a command
+    /// without a forecast [no limit]
     #[arg(long, global = true, value_name = "BYTES")]
     pub memory_limit: Option<Bytes>,
 }
@@ -69,6 +70,11 @@ pub trait Program: clap::Parser {
 
     /// The common arguments within.
     fn common(&self) -> &CommonArgs;
+
+    /// Whether the command forecasts its memory, so that `--memory-limit` means something; where not, it is refused.
+    fn forecasts(&self) -> bool {
+        true
+    }
 
     /// Does the work.
     ///
@@ -103,6 +109,10 @@ pub fn main<P: Program>() -> ExitCode {
         }
     };
     let stage = Stage::new(P::NAME, program.common()).with_command(command);
+    if program.common().memory_limit.is_some() && !program.forecasts() {
+        let e = Error::new("this command does not forecast its memory").field("--memory-limit").hint("leave it out");
+        return failed(&stage, &e);
+    }
     let threads = program.common().threads;
     if let Err(e) = rayon::ThreadPoolBuilder::new().num_threads(threads).build_global() {
         // rayon has no pool to fall back on: whoever asks for it later would panic.

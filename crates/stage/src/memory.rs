@@ -1,6 +1,6 @@
 //! Amounts of memory, and what a run may take.
 
-use crate::Stage;
+use crate::{Machine, Stage};
 use gs_io::{Error, Result};
 use std::fmt;
 use std::str::FromStr;
@@ -66,14 +66,29 @@ impl Stage {
     pub fn needs(&self, bytes: u64, hint: &str) -> Result<()> {
         self.predict(bytes);
         match self.memory_limit() {
-            Some(limit) if bytes > limit.0 => Err(Error::new("more memory than there may be")
-                .field("--memory-limit")
-                .found(format!("about {} needed", Bytes(bytes)))
-                .expected(format!("at most {limit}"))
-                .hint(hint)),
+            Some(limit) if bytes > limit.0 => Err(too_much(bytes, limit, hint).field("--memory-limit")),
             _ => Ok(()),
         }
     }
+
+    /// The same for what the run takes soon after its start, whatever it does later: without `--memory-limit` the machine's
+    /// memory is the limit.
+    ///
+    /// # Errors
+    /// When it is more than the limit.
+    pub fn needs_at_once(&self, bytes: u64, hint: &str) -> Result<()> {
+        match (self.memory_limit(), Machine::here().memory_bytes) {
+            (None, Some(all)) if bytes > all => Err(too_much(bytes, Bytes(all), hint).field("memory of this machine")),
+            _ => self.needs(bytes, hint),
+        }
+    }
+}
+
+fn too_much(bytes: u64, limit: Bytes, hint: &str) -> Error {
+    Error::new("more memory than there may be")
+        .found(format!("about {} needed", Bytes(bytes)))
+        .expected(format!("at most {limit}"))
+        .hint(hint)
 }
 
 #[cfg(test)]

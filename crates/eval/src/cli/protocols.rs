@@ -170,11 +170,13 @@ pub(super) fn run_lerf(a: &LerfArgs, stage: &Stage) -> Result<String> {
     let mut inputs = BTreeMap::new();
     let mut answers = Answers::new();
     let mut rendered = None;
-    if a.predictions.is_none() {
+    let labels = frames.iter().flat_map(|f| f.categories.values()).map(|m| m.bits.len() as u64).sum();
+    if a.predictions.is_some() {
+        stage.forecast(memory::of_scores(&Sizes { labels, ..Sizes::default() }), "give fewer or smaller labels")?;
+    } else {
         let part = |p: &Option<PathBuf>| p.clone().expect("clap asks for it");
         let dataset = dataset.take().expect("loaded without --predictions");
         let files = SceneArgs { instances: part(&a.instances), geometry: part(&a.geometry), scene: part(&a.scene) };
-        let labels = frames.iter().flat_map(|f| f.categories.values()).map(|m| m.bits.len() as u64).sum();
         let sizes = Sizes { labels, ..files.sizes(&a.language, &dataset.views) };
         stage.forecast(memory::of_scores(&sizes), SMALLER)?;
         let scene = read_scene(&files.instances, &files.geometry, stage)?;

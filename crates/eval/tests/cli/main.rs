@@ -555,6 +555,27 @@ fn an_interactive_query_reads_texts_from_a_pipe() {
 }
 
 #[test]
+fn a_limit_that_nothing_is_held_against_is_refused() {
+    let f = Fixture::new(2);
+    let limited = |arguments: &[&str]| {
+        let mut c = std::process::Command::new(env!("CARGO_BIN_EXE_eval"));
+        let o =
+            c.current_dir(f.path()).args(arguments).args(["--memory-limit", "1M", "--out", "out"]).output().unwrap();
+        let said = String::from_utf8_lossy(&o.stderr).into_owned();
+        assert!(o.status.code() == Some(2) && !f.path().join("out").exists(), "{arguments:?}: {said}");
+        said
+    };
+    let labels = f.scene().join("label").to_string_lossy().into_owned();
+    let said = limited(&["lerf", "--predictions", "none", "--labels", &labels]);
+    assert!(said.contains("--memory-limit: more memory than there may be"), "{said}");
+    for arguments in
+        [&["table", "none"][..], &["masks", "--masks", "none"], &["ablation", "--plan", "x", "--runs", "x"]]
+    {
+        assert!(limited(arguments).contains("--memory-limit: this command does not forecast its memory; leave it out"));
+    }
+}
+
+#[test]
 #[cfg(target_os = "linux")]
 fn a_full_standard_output_is_an_error() {
     let f = Fixture::new(2);
@@ -563,9 +584,9 @@ fn a_full_standard_output_is_an_error() {
         c.arg("query").arg("--instances").arg(f.instances()).arg("--geometry").arg(f.geometry());
         c.arg("--scene").arg(f.scene()).arg("--text-features").arg(f.table()).args(rest);
         let texts = f.path().join("texts");
-        std::fs::write(&texts, "red ball\n").unwrap();
-        c.stdin(std::fs::File::open(&texts).unwrap());
-        let o = c.stdout(std::fs::File::options().write(true).open("/dev/full").unwrap()).output().unwrap();
+        fs::write(&texts, "red ball\n").unwrap();
+        c.stdin(fs::File::open(&texts).unwrap());
+        let o = c.stdout(fs::File::options().write(true).open("/dev/full").unwrap()).output().unwrap();
         let said = String::from_utf8_lossy(&o.stderr).into_owned();
         assert!(o.status.code() == Some(2) && said.contains("standard output: cannot write: No space left"), "{said}");
     };

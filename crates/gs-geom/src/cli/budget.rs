@@ -96,6 +96,7 @@ impl TrainArgs {
             return Err(Error::new("every view is held out").file(&self.scene.scene).hint("give --holdout 0"));
         };
         let extent = init::extent(&cameras, &dataset.points.positions);
+        self.forecast_start(dataset, masks, &options.schedule, stage)?;
         let start = self.start(dataset, &cameras, extent, stage)?;
         let some = train.len().min(VIEWS);
         let views: Vec<&View> = (0..some).map(|i| train[i * train.len() / some]).collect();

@@ -1,8 +1,10 @@
 //! `gs-geom convert`.
 
+use super::bytes;
 use crate::convert::{Choice, Order, arrange, choose};
 use crate::init;
 use crate::inspect::Bounds;
+use crate::memory;
 use artifacts::role;
 use gs_io::{Error, Result, hash_file, npy};
 use gs_scene::ply;
@@ -68,6 +70,7 @@ impl ConvertArgs {
         }
         let outputs = stage.outputs(&self.output).file(&self.output).files(&self.keep_map).reads([&self.input]);
         let mut claim = outputs.claim()?;
+        stage.forecast(memory::of_file(bytes(&self.input)?), "give a smaller file")?;
         let mut g = ply::read_gaussians_as_they_are(&self.input)?;
         let all = g.len();
         let choice = Choice { min_opacity: self.min_opacity, crop: self.crop.map(|c| c.0) };
@@ -82,6 +85,9 @@ impl ConvertArgs {
                 .file(&self.input)
                 .found(format!("{all} Gaussians"))
                 .hint("give a lower --min-opacity or a larger --crop"));
+        }
+        if let Some(degree) = self.sh_degree.filter(|&d| d > g.sh_degree) {
+            stage.forecast(memory::of_bands(chosen.kept.len(), g.sh_degree, degree), "give a lower --sh-degree")?;
         }
         arrange(&g, &mut chosen.kept, self.order);
         g = g.select(&chosen.kept);

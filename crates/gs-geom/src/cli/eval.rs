@@ -1,6 +1,7 @@
 //! `gs-geom eval`.
 
-use super::{GeometryArgs, MaskArgs, SceneArgs};
+use super::{GeometryArgs, MaskArgs, SceneArgs, bytes, largest_file, most_pixels};
+use crate::memory;
 use crate::metrics::{Means, ViewMetrics, measure};
 use artifacts::role;
 use gs_io::{Error, Result, hash_file, write_bytes};
@@ -27,6 +28,10 @@ pub(super) struct EvalArgs {
 impl EvalArgs {
     pub(super) fn run(&self, stage: &Stage) -> Result<()> {
         let dataset = self.scene.load(stage)?;
+        let (width, size) = (dataset.views.iter().map(|v| u64::from(v.camera.width)).max(), largest_file(&dataset)?);
+        let geometry = bytes(&self.geometry.geometry)?;
+        let needed = memory::of_figures(geometry, most_pixels(&dataset), width.unwrap_or(0), size);
+        stage.forecast(needed, "give a smaller --geometry or --resolution")?;
         let (gaussians, options) = self.geometry.read(self.scene.background, stage)?;
         let (alpha, masks) = (self.masks.alpha(), self.masks.load(&dataset, stage)?);
         let reads = dataset.files().into_iter().chain(masks.files()).chain([self.geometry.geometry.clone()]);

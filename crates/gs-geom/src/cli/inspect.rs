@@ -1,7 +1,9 @@
 //! `gs-geom inspect`.
 
+use super::bytes;
 use crate::inspect::{Bin, Bounds, Report, inspect};
-use gs_io::{Error, IoContext, Result};
+use crate::memory;
+use gs_io::{Error, Result};
 use gs_scene::ply;
 use stage::Stage;
 use std::fmt::Write as _;
@@ -18,7 +20,8 @@ pub(super) struct InspectArgs {
 impl InspectArgs {
     /// Tells on standard output: text, or one JSON object.
     pub(super) fn run(&self, json: bool, stage: &Stage) -> Result<()> {
-        let file_bytes = std::fs::metadata(&self.file).at("read", &self.file)?.len();
+        let file_bytes = bytes(&self.file)?;
+        stage.needs(memory::of_file(file_bytes), "give a smaller file")?;
         let report = inspect(&ply::read_gaussians_as_they_are(&self.file)?);
         let told = if json {
             let failed = |e: serde_json::Error| Error::new(e.to_string()).file(&self.file);

@@ -1,6 +1,7 @@
 //! `gs-geom render`.
 
-use super::{GeometryArgs, SceneArgs};
+use super::{GeometryArgs, SceneArgs, bytes, most_pixels};
+use crate::memory;
 use artifacts::role;
 use gs_io::{Error, Result, hash_file, write_bytes};
 use gs_raster::{Rendered, render};
@@ -33,6 +34,9 @@ pub(super) struct RenderArgs {
 impl RenderArgs {
     pub(super) fn run(&self, stage: &Stage) -> Result<()> {
         let dataset = self.scene.load(stage)?;
+        let pixels = most_pixels(&dataset);
+        let needed = memory::of_renders(bytes(&self.geometry.geometry)?, pixels, self.exr);
+        stage.forecast(needed, "give a smaller --geometry or --resolution")?;
         let (gaussians, options) = self.geometry.read(self.scene.background, stage)?;
         let views = choose(&dataset, &self.views)?;
         let extensions: &[&str] = if self.exr { &["png", "exr"] } else { &["png"] };

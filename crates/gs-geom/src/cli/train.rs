@@ -52,7 +52,7 @@ pub(super) struct TrainArgs {
     /// a PLY of Gaussians or of points
     #[arg(long, value_name = "points|random|FILE.ply", default_value = "points")]
     init: Init,
-    /// How many random points to start from
+    /// How many random points to start from, at most 1e9
     #[arg(long, value_name = "COUNT", default_value_t = 20_000)]
     init_points: usize,
     /// Keep number, order and positions of the points: Gaussian i is point i (ScanNet protocol)
@@ -215,6 +215,7 @@ impl TrainArgs {
         positive("--densify-gradient", f64::from(gradient), 1e9)?;
         positive("--opacity-rate", self.opacity_rate, 10.0)?;
         positive("--position-rate", self.position_rate, 10.0)?;
+        positive("--init-points", self.init_points as f64, 1e9)?;
         if let Some(most) = self.max_gaussians {
             positive("--max-gaussians", most as f64, 1e9)?;
         }
@@ -317,6 +318,7 @@ impl TrainArgs {
                 .hint("give --holdout 0, or more photographs"));
         }
         let watched = self.watched(dataset);
+        let forecast = self.forecast_start(dataset, &masks, &options.schedule, stage)?;
         let photographs = Photographs::load(train.clone(), masks.clone(), self.cache_bytes())?;
         options.schedule.coarse = self.coarse(&self.gains(&photographs)?, self.iterations);
 
@@ -365,7 +367,7 @@ impl TrainArgs {
             let sizes = options.schedule.coarse.iter().map(|(last, divisor)| format!("1/{divisor} until {last}"));
             stage.info(&format!("picture sizes: {}, then full", sizes.collect::<Vec<_>>().join(", ")));
         }
-        let forecast = self.forecast(dataset, &masks, &state.gaussians, &options.schedule, stage)?;
+        let forecast = self.forecast(forecast, dataset, &state.gaussians, stage)?;
         // The training views' smaller pictures are not there yet.
         let left = full_share(self.cache_bytes()).saturating_sub(photographs.kept_bytes());
         let heldout = Photographs::load(heldout, masks, left)?;
