@@ -172,6 +172,10 @@ impl Program for Args {
         &self.common
     }
 
+    fn check(&self) -> Result<()> {
+        check(self)
+    }
+
     fn run(self, stage: &Stage) -> Result<()> {
         run(&self, stage)
     }
@@ -334,8 +338,13 @@ fn options(c: &ClusteringArgs, n: usize) -> Result<Options> {
     })
 }
 
-/// The right to write the instances and what lies beside them.
-fn claim(a: &Args, stage: &Stage) -> Result<Claim> {
+/// Options that no scene can mend are refused before anything is read.
+fn check(a: &Args) -> Result<()> {
+    options(&a.clustering, 0)?;
+    let threshold = a.matching.threshold;
+    if !(0.0..=1.0).contains(&threshold) {
+        return Err(Error::new("impossible option").field("--threshold").found(threshold).expected("0 to 1"));
+    }
     if let Some(taken) = SIDE_FILES.iter().find(|e| a.out.with_extension(e) == a.out) {
         return Err(Error::new("another output has this name")
             .file(&a.out)
@@ -343,6 +352,11 @@ fn claim(a: &Args, stage: &Stage) -> Result<Claim> {
             .found(format!(".{taken}"))
             .expected("a name such as instances.safetensors"));
     }
+    Ok(())
+}
+
+/// The right to write the instances and what lies beside them.
+fn claim(a: &Args, stage: &Stage) -> Result<Claim> {
     let mut maps = Vec::new();
     for suffix in ["_s.npy", "_f.npy"] {
         maps.extend(artifacts::folder_files(&a.masks, suffix)?);
@@ -359,11 +373,6 @@ fn claim(a: &Args, stage: &Stage) -> Result<Claim> {
 
 fn run(a: &Args, stage: &Stage) -> Result<()> {
     let (c, m) = (&a.clustering, &a.matching);
-    // Options that no scene can mend are refused before anything is read.
-    options(c, 0)?;
-    if !(0.0..=1.0).contains(&m.threshold) {
-        return Err(Error::new("impossible option").field("--threshold").found(m.threshold).expected("0 to 1"));
-    }
     let mut claim = claim(a, stage)?;
     let mut watched = Watched::new([&a.geometry]);
     for suffix in ["_s.npy", "_f.npy"] {

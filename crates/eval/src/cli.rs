@@ -319,6 +319,19 @@ impl Program for Args {
         !matches!(self.command, Command::Table(_) | Command::Masks(_) | Command::Ablation(_))
     }
 
+    fn check(&self) -> Result<()> {
+        match &self.command {
+            Command::Query(a) => query::check(a),
+            Command::Lerf(a) => protocols::check_lerf(a),
+            Command::Scannet(a) => protocols::check_scannet(a),
+            Command::Score(a) => {
+                mask_threshold(a.alpha, a.silhouette)?;
+                a.language.selection().map(drop)
+            }
+            Command::Table(_) | Command::Masks(_) | Command::Report(_) | Command::Ablation(_) => Ok(()),
+        }
+    }
+
     fn run(self, stage: &Stage) -> Result<()> {
         let text = match &self.command {
             Command::Query(a) => query::run(a, stage, self.common.json)?,
@@ -361,7 +374,6 @@ fn mask_threshold(alpha: Option<f32>, silhouette: Silhouette) -> Result<f32> {
 }
 
 fn run_score(a: &ScoreArgs, stage: &Stage) -> Result<String> {
-    a.language.selection()?;
     let threshold = mask_threshold(a.alpha, a.silhouette)?;
     let dataset = load(&a.scene.scene, &LoadOptions::default(), stage)?;
     let labels = a.labels.clone().unwrap_or_else(|| dataset.root.join("label"));

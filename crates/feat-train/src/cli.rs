@@ -197,7 +197,7 @@ impl Args {
         self.dim.unwrap_or((MOST_NUMBERS / gaussians.max(1)).clamp(LEAST_VECTORS, MOST_VECTORS))
     }
 
-    fn check(&self) -> Result<()> {
+    fn check_ranges(&self) -> Result<()> {
         let c = &self.contrastive;
         let dims = match self.method() {
             Method::Contrastive => 2..=64,
@@ -306,6 +306,34 @@ impl Args {
         Ok(Inputs { graph, footprints, hashes })
     }
 
+    /// What contrastive learning is told.
+    fn train_options(&self) -> TrainOptions {
+        let c = &self.contrastive;
+        TrainOptions {
+            settings: Settings {
+                dim: self.dim.unwrap_or(6),
+                layers: c.layers,
+                anchor_start: c.anchor_start,
+                last_relu: !c.no_last_relu,
+                unit_length: c.unit_length,
+                norm_axis: c.norm_axis,
+                loss: c.loss,
+                tau: c.tau,
+                cohesion: c.cohesion,
+                cohesion_of: c.cohesion_of,
+                init: c.init,
+            },
+            iterations: c.iterations,
+            rate: c.lr,
+            weight_rate: c.weight_lr,
+            seed: self.common.seed,
+            checkpoint_every: c.checkpoint_every,
+            curve_every: c.curve_every,
+            shortcuts: Shortcuts { stats_every: c.stats_every, lazy_adam: c.lazy_adam },
+            early_stop: c.early_stop,
+        }
+    }
+
     fn contrastive<W: Weight>(&self, inputs: &Inputs, stage: &Stage) -> Result<(usize, Vec<f32>, Value)> {
         let c = &self.contrastive;
         // Damaged Gaussians are no kept ones: graph-precompute left them out.
@@ -345,38 +373,12 @@ impl Args {
                 .field(format!("levels {:?}", self.levels()))
                 .hint("choose other --levels, or make masks with more than one segment a view"));
         }
-        let options = TrainOptions {
-            settings: Settings {
-                dim: self.dim.unwrap_or(6),
-                layers: c.layers,
-                anchor_start: c.anchor_start,
-                last_relu: !c.no_last_relu,
-                unit_length: c.unit_length,
-                norm_axis: c.norm_axis,
-                loss: c.loss,
-                tau: c.tau,
-                cohesion: c.cohesion,
-                cohesion_of: c.cohesion_of,
-                init: c.init,
-            },
-            iterations: c.iterations,
-            rate: c.lr,
-            weight_rate: c.weight_lr,
-            seed: self.common.seed,
-            checkpoint_every: c.checkpoint_every,
-            curve_every: c.curve_every,
-            shortcuts: Shortcuts { stats_every: c.stats_every, lazy_adam: c.lazy_adam },
-            early_stop: c.early_stop,
-        };
+        let options = self.train_options();
         if options.settings.needs_pixels() && sets.iter().all(|s| s.sampled.is_empty()) {
             return Err(Error::new("no sampled pixels, which this loss looks at")
                 .file(&self.footprints)
                 .field("pixel_row")
                 .hint("run graph-precompute with --pixel-samples 16"));
-        }
-        if !Engine::serves(&options.settings) && options.shortcuts != Shortcuts::default() {
-            return Err(Error::new("not with this loss, --cohesion, --norm-axis or --unit-length")
-                .field(if c.lazy_adam { "--lazy-adam" } else { "--stats-every" }));
         }
         // A checkpoint serves runs of any number of iterations, as long as everything else is equal.
         let provenance = stage.provenance("", 0, Value::Object(self.parameters()), inputs.hashes.clone());
@@ -471,8 +473,17 @@ impl Program for Args {
         &self.common
     }
 
+    fn check(&self) -> Result<()> {
+        self.check_ranges()?;
+        let TrainOptions { settings, shortcuts, .. } = self.train_options();
+        if self.method() == Method::Contrastive && !Engine::serves(&settings) && shortcuts != Shortcuts::default() {
+            return Err(Error::new("not with this loss, --cohesion, --norm-axis or --unit-length")
+                .field(if shortcuts.lazy_adam { "--lazy-adam" } else { "--stats-every" }));
+        }
+        Ok(())
+    }
+
     fn run(self, stage: &Stage) -> Result<()> {
-        self.check()?;
         let mut claim = stage
             .outputs(&self.out)
             .artifact(&self.out, Features::FORMAT)

@@ -286,6 +286,20 @@ fn bad_input_is_one_line_and_leaves_the_output_alone() {
     fail(&["--tau", "0"], &["--tau"]);
     fail(&["--preset", "paper", "--dim", "65"], &["--dim", "65"]);
     fail(&["--preset", "paper", "--loss", "pixel", "--lazy-adam"], &["--lazy-adam", "not with this loss"]);
+    // The same without a file to read.
+    let nowhere = dir.path().join("nowhere");
+    let check = |extra: &[&str]| run(&nowhere, &out, &[extra, &["--check"]].concat());
+    for (wrong, needle) in [
+        (&["--tau", "0"][..], "--tau"),
+        (&["--preset", "paper", "--loss", "pixel", "--lazy-adam"], "not with this loss"),
+        (&["--levles", "small"], "--levles"),
+    ] {
+        let output = check(wrong);
+        let said = String::from_utf8_lossy(&output.stderr).into_owned();
+        assert!(output.status.code() == Some(2) && said.contains(needle), "{said}");
+    }
+    let output = check(&["--levels", "small"]);
+    assert!(output.status.success() && output.stderr.is_empty() && std::fs::read(&out).unwrap() == b"good");
     fail(&["--method", "spectral", "--levels", "small"], &["footprints.safetensors", "no mask has a footprint"]);
     fail(&["--preset", "paper", "--levels", "small"], &["footprints.safetensors", "two masks"]);
     // Footprints of another run: one Gaussian less.

@@ -163,6 +163,10 @@ impl Program for Args {
         &self.common
     }
 
+    fn check(&self) -> Result<()> {
+        self.options().map(drop)
+    }
+
     fn run(self, stage: &Stage) -> Result<()> {
         let options = self.options()?;
         // The id maps' own size decides the resolution, so photographs count at full size.

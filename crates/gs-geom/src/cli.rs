@@ -47,6 +47,13 @@ impl Program for Args {
         &self.common
     }
 
+    fn check(&self) -> Result<()> {
+        match &self.command {
+            Command::Train(args) => args.options(self.common.seed).map(drop),
+            _ => Ok(()),
+        }
+    }
+
     fn run(self, stage: &Stage) -> Result<()> {
         match self.command {
             Command::Train(args) => args.run(stage),

@@ -542,9 +542,12 @@ fn bad_input_is_refused_in_one_line() {
     for (option, value) in
         [("--dssim", "1.5"), ("--densify-gradient", "NaN"), ("--max-gaussians", "0"), ("--max-scale", "0")]
     {
-        let e = train(scene(), &[option, value]);
-        assert!(e.contains(option) && e.contains("out of range"), "{e}");
+        // With --check before the photographs are looked for.
+        for e in [train(scene(), &[option, value]), train(&missing, &[option, value, "--check"])] {
+            assert!(e.contains(option) && e.contains("out of range"), "{e}");
+        }
     }
+    succeeds(&["train", "--scene", &missing, "--out", &out, "--check"]);
     let e = train(scene(), &["--memory-limit", "1M"]);
     assert!(e.contains("--memory-limit") && e.contains("--max-gaussians") && e.contains("at most 1M"), "{e}");
     assert_eq!(fs::read_to_string(&out).unwrap(), "a good geometry");

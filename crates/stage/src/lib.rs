@@ -58,6 +58,9 @@ pub struct CommonArgs {
     /// without a forecast [no limit]
     #[arg(long, global = true, value_name = "BYTES")]
     pub memory_limit: Option<Bytes>,
+    /// Check the options and do nothing else: no file is read or written
+    #[arg(long, global = true)]
+    pub check: bool,
 }
 
 /// What `--version` says: the version and the git revision.
@@ -74,6 +77,14 @@ pub trait Program: clap::Parser {
     /// Whether the command forecasts its memory, so that `--memory-limit` means something; where not, it is refused.
     fn forecasts(&self) -> bool {
         true
+    }
+
+    /// Refuses options that no input can mend, such as a value out of its range. [`main`] asks before [`Self::run`].
+    ///
+    /// # Errors
+    /// The first option that is wrong.
+    fn check(&self) -> Result<()> {
+        Ok(())
     }
 
     /// Does the work.
@@ -119,7 +130,7 @@ pub fn main<P: Program>() -> ExitCode {
         let e = Error::new(format!("cannot start the worker threads: {e}")).field("--threads").found(threads);
         return failed(&stage, &e.hint("give fewer threads, or the process more memory"));
     }
-    match program.run(&stage) {
+    match carry_out(program, &stage) {
         Ok(()) => stage.unwritten().map_or(ExitCode::SUCCESS, |e| failed(&stage, e)),
         Err(_) if stage.interrupted() => {
             stage.warn("interrupted");
@@ -150,6 +161,12 @@ fn of_the_command_line(mut e: clap::Error) -> Result<bool> {
     e.exit()
 }
 
+/// Checks the options, and runs the program unless `--check` asks for no more.
+fn carry_out<P: Program>(program: P, stage: &Stage) -> Result<()> {
+    program.check()?;
+    if program.common().check { Ok(()) } else { program.run(stage) }
+}
+
 /// The option whose value this very path is: whoever reads an error about it knows then which one to mend.
 fn given_by<'a>(arguments: &'a [String], path: &Path) -> Option<&'a str> {
     let options = arguments.iter().zip(arguments.iter().skip(1).map(Some).chain([None]));
@@ -162,6 +179,46 @@ fn given_by<'a>(arguments: &'a [String], path: &Path) -> Option<&'a str> {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use clap::Parser;
+
+    /// A program that cannot work.
+    #[derive(clap::Parser)]
+    struct Idle {
+        /// How many
+        #[arg(long, default_value_t = 3)]
+        count: usize,
+        #[command(flatten)]
+        common: CommonArgs,
+    }
+
+    impl Program for Idle {
+        const NAME: &'static str = "idle";
+
+        fn common(&self) -> &CommonArgs {
+            &self.common
+        }
+
+        fn check(&self) -> Result<()> {
+            if self.count > 0 { Ok(()) } else { Err(Error::new("nothing").field("--count")) }
+        }
+
+        fn run(self, _: &Stage) -> Result<()> {
+            Err(Error::new("it ran"))
+        }
+    }
+
+    #[test]
+    fn a_check_is_of_the_options_alone() {
+        let said = |arguments: &[&str]| {
+            let program = Idle::parse_from([&["idle"], arguments].concat());
+            carry_out(program, &Stage::silent("idle")).map_err(|e| e.to_string())
+        };
+        assert_eq!(said(&["--check"]), Ok(()));
+        assert!(said(&[]).unwrap_err().contains("it ran"));
+        for arguments in [&["--count", "0", "--check"][..], &["--count", "0"]] {
+            assert!(said(arguments).unwrap_err().contains("--count"));
+        }
+    }
 
     #[test]
     fn a_path_is_known_by_its_option() {

@@ -195,6 +195,10 @@ impl Program for Args {
         &self.common
     }
 
+    fn check(&self) -> Result<()> {
+        self.options(self.common.seed).map(drop)
+    }
+
     fn run(self, stage: &Stage) -> Result<()> {
         let options = self.options(stage.seed())?;
         match (&self.out, &self.masks_to) {

@@ -117,9 +117,14 @@ struct Rendered {
     dataset: Dataset,
 }
 
+/// Refuses what no scene can mend.
+pub(super) fn check_lerf(a: &LerfArgs) -> Result<()> {
+    mask_threshold(a.alpha, a.rendering)?;
+    a.language.selection().map(drop)
+}
+
 pub(super) fn run_lerf(a: &LerfArgs, stage: &Stage) -> Result<String> {
     let rendering = Rendering { silhouette: a.rendering, threshold: mask_threshold(a.alpha, a.rendering)? };
-    a.language.selection()?;
     let folder = labels_folder(a.labels.as_deref(), a.scene.as_deref())?;
     let named = a.scene.as_deref().map(folder_name).or_else(|| a.labels.as_deref().map(folder_name));
     let name = a.name.clone().or(named).unwrap_or_else(|| "scene".into());
@@ -279,7 +284,8 @@ pub(super) struct ScannetArgs {
     out: PathBuf,
 }
 
-pub(super) fn run_scannet(a: &ScannetArgs, stage: &Stage) -> Result<String> {
+/// Refuses what no scan can mend.
+pub(super) fn check_scannet(a: &ScannetArgs) -> Result<()> {
     if let Some(bad) = a.classes.iter().find(|c| !scannet::SETS.contains(c)) {
         return Err(Error::new("no such class set").field("--classes").found(bad).expected("19, 15 or 10"));
     }
@@ -288,6 +294,10 @@ pub(super) fn run_scannet(a: &ScannetArgs, stage: &Stage) -> Result<String> {
             .field("--negatives, --template, --join, --top-k, --threshold")
             .hint("leave them out"));
     }
+    Ok(())
+}
+
+pub(super) fn run_scannet(a: &ScannetArgs, stage: &Stage) -> Result<String> {
     let options = ScanOptions {
         association: a.association,
         opacity_rule: !a.keep_faint,

@@ -81,7 +81,8 @@ fn numbers<T: std::str::FromStr + Copy + Default, const N: usize>(text: &str, op
     })
 }
 
-pub(super) fn run(a: &QueryArgs, stage: &Stage, json_lines: bool) -> Result<String> {
+/// Refuses what no scene can mend.
+pub(super) fn check(a: &QueryArgs) -> Result<()> {
     if a.text.is_empty() && a.image.is_empty() && a.pixel.is_empty() && a.point.is_empty() && !a.interactive {
         return Err(Error::new("nothing is asked for")
             .field("--text")
@@ -96,9 +97,13 @@ pub(super) fn run(a: &QueryArgs, stage: &Stage, json_lines: bool) -> Result<Stri
             .found(format!("{} texts", a.text.len()))
             .expected("at least two --text"));
     }
+    mask_threshold(a.alpha, a.silhouette)?;
+    a.language.selection().map(drop)
+}
+
+pub(super) fn run(a: &QueryArgs, stage: &Stage, json_lines: bool) -> Result<String> {
     let rendering = Rendering { silhouette: a.silhouette, threshold: mask_threshold(a.alpha, a.silhouette)? };
     let options = ShowOptions { views: a.views.clone(), rendering };
-    a.language.selection()?;
     let dataset = load(&a.scene.scene, &LoadOptions { resolution: a.resolution, ..LoadOptions::default() }, stage)?;
     let claim = |out: &PathBuf| {
         let outputs = stage.outputs(out.join("query.json")).folder(out);
