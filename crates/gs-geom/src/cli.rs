@@ -34,7 +34,7 @@ enum Command {
     Render(render::RenderArgs),
     /// PSNR and SSIM on held-out views
     Eval(eval::EvalArgs),
-    /// Tell what is in a file of Gaussians: counts, bounds, histograms, faults
+    /// Tell what is in a file of Gaussians (counts, bounds, histograms, faults), or of which files a dataset consists
     Inspect(inspect::InspectArgs),
     /// Drop, crop, trim and re-order the Gaussians of a file
     Convert(convert::ConvertArgs),

@@ -1,7 +1,7 @@
 //! `gs-geom inspect` and `gs-geom convert` through the program.
 
-use gs_scene::{Gaussians, ply};
-use serde_json::Value;
+use gs_scene::{Gaussians, Image, ply};
+use serde_json::{Value, json};
 use std::fs;
 use std::path::PathBuf;
 use std::process::{Command, Output, Stdio};
@@ -63,6 +63,32 @@ fn a_file_is_inspected_in_text_and_json() {
     assert!(refused(&["inspect", "no/such.ply"]).contains("no/such.ply"));
     fs::write(&file, "ply\nformat ascii 1.0\nelement vertex 9\nend_header\n").unwrap();
     assert!(refused(&["inspect", &file]).contains("in.ply"));
+}
+
+#[test]
+fn the_files_of_a_dataset_are_listed() {
+    let dir = tempfile::tempdir().unwrap();
+    let root = dir.path().join("my scene");
+    let (photograph, scene) = (root.join("train/cam0/a 1.png"), root.to_string_lossy().into_owned());
+    Image { width: 8, height: 6, rgb: vec![0.5; 8 * 6 * 3], alpha: None }.write_png(&photograph).unwrap();
+    fs::write(root.join("notes.txt"), "not read").unwrap();
+    let pose = [[1.0, 0.0, 0.0, 0.0], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0], [0.0, 0.0, 0.0, 1.0]];
+    let frames = json!([{"file_path": "train/cam0/a 1.png", "transform_matrix": pose}]);
+    fs::write(root.join("transforms.json"), json!({"fl_x": 8.0, "frames": frames}).to_string()).unwrap();
+    let list = || succeeds(&["inspect", "--files", &scene]);
+    let before = list();
+    let lines: Vec<&str> = before.lines().collect();
+    assert!(lines.len() == 2 && lines[0].ends_with("/my scene/transforms.json"), "{before}");
+    let bytes = fs::metadata(&photograph).unwrap().len();
+    assert!(lines[1].starts_with(&format!("{bytes} ")) && lines[1].ends_with("/train/cam0/a 1.png"), "{before}");
+    assert_eq!(list(), before);
+    let facts: Value =
+        serde_json::from_str(succeeds(&["inspect", "--files", &scene, "--json"]).lines().last().unwrap()).unwrap();
+    assert_eq!(facts["bytes"], bytes);
+    // Edited: the same size, a later time.
+    fs::write(&photograph, fs::read(&photograph).unwrap()).unwrap();
+    assert_ne!(list(), before);
+    assert!(refused(&["inspect", "--files", "no/such"]).contains("no such folder"));
 }
 
 #[test]

@@ -58,6 +58,13 @@ pub fn find_model(scene: &Path) -> Option<PathBuf> {
         .find(|p| ["bin", "txt"].iter().any(|e| p.join(format!("cameras.{e}")).is_file()))
 }
 
+/// The files of the model in `folder`: of each `.bin` where there is one, else `.txt`.
+pub fn files_of(folder: &Path) -> Vec<PathBuf> {
+    let files =
+        ["cameras", "images", "points3D"].map(|name| ["bin", "txt"].map(|e| folder.join(format!("{name}.{e}"))));
+    files.into_iter().filter_map(|two| two.into_iter().find(|p| p.is_file())).collect()
+}
+
 /// Reads the model in `folder`; `.bin` where there is one, else `.txt`.
 ///
 /// # Errors

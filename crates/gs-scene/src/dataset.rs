@@ -125,6 +125,8 @@ pub struct Dataset {
     pub views: Vec<View>,
     /// Sparse points; may be empty.
     pub points: PointCloud,
+    /// All files that it consists of: cameras, poses, points, photographs.
+    pub files: Vec<PathBuf>,
     /// What was odd: views without a file, poses without numbers.
     pub warnings: Vec<String>,
 }
@@ -141,6 +143,8 @@ struct RawView {
 
 struct RawDataset {
     format: Format,
+    /// All but the photographs.
+    files: Vec<PathBuf>,
     views: Vec<RawView>,
     points: PointCloud,
     warnings: Vec<String>,
@@ -254,7 +258,9 @@ fn finish(root: &Path, mut raw: RawDataset, options: &LoadOptions) -> Result<Dat
         let (w, h) = smallest;
         raw.warnings.push(format!("photographs of {w}x{h} pixels after division by {d}: for a width, write {d}px"));
     }
-    Ok(Dataset { root: root.to_path_buf(), format: raw.format, views, points: raw.points, warnings: raw.warnings })
+    let RawDataset { format, mut files, points, warnings, .. } = raw;
+    files.extend(views.iter().map(|v| v.image_path.clone()));
+    Ok(Dataset { root: root.to_path_buf(), format, views, points, files, warnings })
 }
 
 impl Dataset {

@@ -62,6 +62,11 @@ fn points() -> PointCloud {
     PointCloud { positions: vec![[0.5, -0.25, 1.0], [1.0, 2.0, 3.0]], colors: vec![[1, 2, 3], [250, 251, 252]] }
 }
 
+/// Names of the files that a dataset consists of, below its folder.
+fn files(d: &Dataset) -> Vec<String> {
+    d.files.iter().map(|f| f.strip_prefix(&d.root).unwrap().to_string_lossy().into_owned()).collect()
+}
+
 /// A COLMAP scene in `root` with a photograph a camera.
 fn colmap_scene(root: &Path, cameras: &[Camera]) -> Vec<(String, Camera)> {
     let views: Vec<_> = cameras.iter().enumerate().map(|(i, c)| (format!("frame_{i:05}.png"), c.clone())).collect();
@@ -174,6 +179,9 @@ fn names_may_hold_blanks_and_folders_and_stems_stay_apart() {
     let stems: Vec<&str> = d.views.iter().map(dataset::View::stem).collect();
     assert_eq!(stems, ["c", "left_my photo", "right_my photo"]);
     assert_eq!(d.views[0].camera.fy, 20.0);
+    let model = ["cameras", "images", "points3D"].map(|name| format!("sparse/0/{name}.txt"));
+    let photographs = ["c.png", "left/my photo.png", "right/my photo.png"].map(|name| format!("images/{name}"));
+    assert_eq!(files(&d), [model, photographs].concat());
 }
 
 #[test]
@@ -346,6 +354,8 @@ fn transforms_give_the_poses_of_colmap() {
     assert_same_cameras(&a, &b, 1e-12);
     assert_eq!(a.points, b.points);
     assert_eq!(b.views[1].name, "frame_00001.png");
+    assert_eq!(files(&b)[..3], ["transforms.json", "sparse_pc.ply", "images/frame_00000.png"].map(String::from));
+    assert!(a.files.len() == 7 && b.files.len() == 6);
     // The file itself may be named as well as its folder.
     let by_file = dataset::load(&b.root.join("transforms.json"), &FULL).unwrap();
     assert_eq!(by_file.views, b.views);
@@ -461,6 +471,13 @@ fn both_layouts_of_scannet_agree() {
     a.views.sort_by(|a, b| a.name.cmp(&b.name));
     assert_same_cameras(&a, &b, 1e-12);
     assert_eq!((&a.points, &b.points), (&points(), &points()));
+    let mut read = files(&a);
+    read.sort();
+    let poses = ["0", "100", "20", "40"].map(|id| format!("pose/{id}.txt")).to_vec();
+    let photographs = ["0", "100", "20", "40"].map(|id| format!("color/{id}.jpg")).to_vec();
+    let others = ["intrinsic/intrinsic_color.txt", "scene0000_00_vh_clean_2.ply"].map(String::from);
+    assert_eq!(read, [photographs, others[..1].to_vec(), poses, others[1..].to_vec()].concat());
+    assert_eq!(files(&b)[..3], ["transforms_train.json", "transforms_test.json", "points3d.ply"].map(String::from));
     assert_eq!(b.views_of(Split::Test).count(), 1, "no file names held-out views, so every eighth is");
     // Frames extracted at half size under full-size intrinsics.
     image::RgbImage::new(20, 15).save(raw.join("color/20.jpg")).unwrap();

@@ -3,11 +3,14 @@
 use super::bytes;
 use crate::inspect::{Bin, Bounds, Report, inspect};
 use crate::memory;
-use gs_io::{Error, Result};
+use gs_io::{Error, IoContext, Result};
+use gs_scene::dataset::{self, LoadOptions};
 use gs_scene::ply;
+use serde_json::json;
 use stage::Stage;
 use std::fmt::Write as _;
 use std::path::PathBuf;
+use std::time::UNIX_EPOCH;
 
 /// Arguments of `gs-geom inspect`.
 #[derive(Debug, clap::Args)]
@@ -15,23 +18,48 @@ pub(super) struct InspectArgs {
     /// Gaussians, as a 3DGS PLY of any property order and encoding
     #[arg(value_name = "FILE")]
     file: PathBuf,
+    /// FILE is the folder of a dataset: list the files that it consists of, each with its bytes and the time of its last
+    /// change in seconds since 1970
+    #[arg(long)]
+    files: bool,
 }
 
 impl InspectArgs {
     /// Tells on standard output: text, or one JSON object.
     pub(super) fn run(&self, json: bool, stage: &Stage) -> Result<()> {
+        let told = if self.files { self.list(json)? } else { self.describe(json, stage)? };
+        stage.print(&told).map(drop)
+    }
+
+    fn describe(&self, json: bool, stage: &Stage) -> Result<String> {
         let file_bytes = bytes(&self.file)?;
         stage.needs(memory::of_file(file_bytes), "give a smaller file")?;
         let report = inspect(&ply::read_gaussians_as_they_are(&self.file)?);
-        let told = if json {
+        if json {
             let failed = |e: serde_json::Error| Error::new(e.to_string()).file(&self.file);
             let mut object = serde_json::to_value(&report).map_err(failed)?;
             object["file_bytes"] = file_bytes.into();
-            format!("{object}\n")
+            Ok(format!("{object}\n"))
         } else {
-            text(&report, file_bytes)
-        };
-        stage.print(&told).map(drop)
+            Ok(text(&report, file_bytes))
+        }
+    }
+
+    /// A line for each file of the dataset, by which make knows whether one has changed.
+    fn list(&self, json: bool) -> Result<String> {
+        let mut lines = String::new();
+        for file in dataset::load(&self.file, &LoadOptions::default())?.files {
+            let facts = std::fs::metadata(&file).at("read", &file)?;
+            let time = facts.modified().at("read", &file)?.duration_since(UNIX_EPOCH).unwrap_or_default();
+            let (bytes, seconds) = (facts.len(), format!("{}.{:09}", time.as_secs(), time.subsec_nanos()));
+            let _ = match json {
+                true => {
+                    writeln!(lines, "{}", json!({"file": file.to_string_lossy(), "bytes": bytes, "modified": seconds}))
+                }
+                false => writeln!(lines, "{bytes} {seconds} {}", file.display()),
+            };
+        }
+        Ok(lines)
     }
 }
 

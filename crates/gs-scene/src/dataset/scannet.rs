@@ -22,6 +22,7 @@ pub(super) fn load(root: &Path) -> Result<RawDataset> {
         .filter_map(|path| Some((path.file_stem()?.to_str()?.parse().ok()?, path)))
         .collect();
     frames.sort();
+    let mut files = vec![intrinsic.clone()];
     let mut warnings = Vec::new();
     let mut views = Vec::new();
     for (_, image_path) in frames {
@@ -44,10 +45,12 @@ pub(super) fn load(root: &Path) -> Result<RawDataset> {
         check_intrinsics(&lens).map_err(|e| e.file(&intrinsic))?;
         let name = image_path.file_name().unwrap_or_default().to_string_lossy().into_owned();
         views.push(RawView { name, image_path, lens, rotation, translation, split: None });
+        files.push(pose_path);
     }
     let scan = list(root)?.into_iter().find(|p| p.to_string_lossy().ends_with("_vh_clean_2.ply"));
-    let points = scan.map_or_else(|| Ok(PointCloud::default()), ply::read_points)?;
-    Ok(RawDataset { format: Format::ScanNet, views, points, warnings })
+    let points = scan.as_ref().map_or_else(|| Ok(PointCloud::default()), ply::read_points)?;
+    files.extend(scan);
+    Ok(RawDataset { format: Format::ScanNet, files, views, points, warnings })
 }
 
 /// Paths in a folder, sorted.

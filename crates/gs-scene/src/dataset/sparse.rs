@@ -33,5 +33,5 @@ pub(super) fn load(root: &Path, model: &Path) -> Result<RawDataset> {
             split: None,
         });
     }
-    Ok(RawDataset { format: Format::Colmap, views, points, warnings })
+    Ok(RawDataset { format: Format::Colmap, files: colmap::files_of(model), views, points, warnings })
 }

@@ -30,6 +30,7 @@ pub(super) fn find(root: &Path) -> Option<Vec<PathBuf>> {
 pub(super) fn load(root: &Path, files: &[PathBuf]) -> Result<RawDataset> {
     let mut out = RawDataset {
         format: Format::Transforms,
+        files: files.to_vec(),
         views: Vec::new(),
         points: PointCloud::default(),
         warnings: Vec::new(),
@@ -54,7 +55,8 @@ pub(super) fn load(root: &Path, files: &[PathBuf]) -> Result<RawDataset> {
         out.views.iter().filter(|v| v.split == Some(Split::Train)).map(|v| v.name.clone()).collect();
     out.views.retain(|v| v.split != Some(Split::Test) || !train.contains(&v.name));
     if let Some(path) = clouds.iter().map(|n| root.join(n)).find(|p| p.is_file()) {
-        out.points = ply::read_points(path)?;
+        out.points = ply::read_points(&path)?;
+        out.files.push(path);
     }
     Ok(out)
 }
