@@ -4,5 +4,5 @@
 set -euo pipefail
 scene=$(realpath "$1") ply=$(realpath "$2") out=$(realpath -m "$3")
 cd "$(dirname "$0")/.."
-target/release/gs-geom inspect --geometry "$ply"
+target/release/gs-geom inspect "$ply"
 make scene SCENE="$scene" GEOMETRY="$ply" OUT="$out" ${MASKS:+MASKS="$(realpath "$MASKS")"}

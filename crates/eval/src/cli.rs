@@ -282,6 +282,9 @@ struct ReportArgs {
     /// Folder of the run: geometry.ply and whatever else there is under its usual name
     #[arg(long, value_name = "DIR")]
     run_dir: PathBuf,
+    /// The Gaussians, where they are not in the run [default: geometry.ply there]
+    #[arg(long, value_name = "FILE")]
+    geometry: Option<PathBuf>,
     /// Dataset folder
     #[arg(long, value_name = "DIR")]
     scene: PathBuf,
@@ -449,6 +452,7 @@ fn run_report(a: &ReportArgs, stage: &Stage) -> Result<String> {
     };
     let options = ReportOptions {
         run_dir: a.run_dir.clone(),
+        geometry: a.geometry.clone().unwrap_or_else(|| a.run_dir.join("geometry.ply")),
         masks,
         title: a.title.clone().unwrap_or_else(name),
         out: a.out.clone(),
@@ -456,7 +460,7 @@ fn run_report(a: &ReportArgs, stage: &Stage) -> Result<String> {
         ablation: a.ablation.clone(),
     };
     let sizes = Sizes {
-        geometry: memory::bytes(&a.run_dir.join("geometry.ply")),
+        geometry: memory::bytes(&options.geometry),
         features: memory::bytes(&a.run_dir.join("features.safetensors")),
         pixels: memory::pixels(&dataset.views),
         ..Sizes::default()

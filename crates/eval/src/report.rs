@@ -21,6 +21,8 @@ use std::path::{Path, PathBuf};
 pub struct ReportOptions {
     /// Folder of the run's artifacts, under their usual names.
     pub run_dir: PathBuf,
+    /// The Gaussians, which may lie elsewhere.
+    pub geometry: PathBuf,
     /// Folder of id maps, if there are any.
     pub masks: Option<PathBuf>,
     /// Title of the page.

@@ -57,7 +57,7 @@ impl<'a> Material<'a> {
         metrics: &mut Metrics,
         inputs: &mut BTreeMap<String, String>,
     ) -> Result<Self> {
-        let geometry = options.run_dir.join("geometry.ply");
+        let geometry = options.geometry.clone();
         let geometry_hash = hash_file(&geometry)?;
         inputs.insert(role::GEOMETRY.into(), geometry_hash.clone());
         let path = options.run_dir.join("instances.safetensors");

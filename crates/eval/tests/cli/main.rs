@@ -321,6 +321,9 @@ fn a_report_of_geometry_alone_says_what_is_left_out() {
         assert!(skipped.contains(part), "{part}: {skipped}");
     }
     assert!(m["instance_miou"].is_null());
+    // Gaussians that somebody else trained do not lie in the run.
+    fs::rename(f.run().join("geometry.ply"), f.path().join("mine.ply")).unwrap();
+    f.good("report", "--run-dir|{}/run|--geometry|{}/mine.ply|--scene|{}/balls|--out|{}/report.html");
     let e = f.bad("report", "--run-dir|{}/none|--scene|{}/balls|--out|{}/r.html");
     assert!(e.contains("geometry.ply"), "{e}");
     let e = f.bad("report", "--run-dir|{}/run|--scene|{}/none|--out|{}/r.html");
