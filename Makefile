@@ -1,5 +1,7 @@
 # What people type. The rules of the pipeline are in pipelines/stages.mk, the parameters of each kind of dataset beside it.
 
+include pipelines/paths.mk
+
 .DEFAULT_GOAL := help
 SHELL := /bin/bash
 CARGO ?= cargo
@@ -159,7 +161,7 @@ bench-granularity: build ## Measure synthetic masks beside real ones (MASKS=fold
 
 SCENES ?=
 real-masks: build ## Score instances from a real SAM's masks of scenes with exact truth: out/real-masks (hours; SCENES=kitchen-10,room-10)
-	scripts/real_masks.py $(if $(SCENES),--scenes $(SCENES)) $(if $(PHOTOGRAPHS),--photographs $(PHOTOGRAPHS))
+	scripts/real_masks.py $(if $(SCENES),--scenes $(SCENES)) $(if $(PHOTOGRAPHS),--photographs "$$PHOTOGRAPHS")
 
 dist: ## Pack the programs with manual pages and completions: out/dist
 	scripts/dist.sh

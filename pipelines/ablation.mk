@@ -4,6 +4,7 @@
 # Every cell is a file: a killed make goes on where it was, and a changed line of the plan runs what depends on it. Each
 # stage runs on one thread; `make -j` runs as many as there are cores.
 
+include pipelines/paths.mk
 PLAN ?= pipelines/ablation.plan
 OUT ?= out/ablation
 RUNS ?= $(OUT)/runs

@@ -5,6 +5,7 @@
 # Each run is a make of its own on pipelines/<pipeline>.mk, so a killed batch goes on where it was, and a changed line of the
 # table runs what depends on it. pipelines/Snakefile is the same for more than one machine.
 
+include pipelines/paths.mk
 TABLE ?=
 OUT ?= out/batch
 BIN ?= target/release

@@ -2,6 +2,7 @@
 # time, then the paper's table with ours: OUT/table.md, table.html, metrics.json. A scene is pipelines/$(SET).mk, its
 # parameters pipelines/$(SET).conf.
 
+include pipelines/paths.mk
 ifeq ($(and $(DATA),$(or $(OUT),$(filter check,$(MAKECMDGOALS)))),)
 $(error say where the data set is and where to write: make $(SET) DATA=folder OUT=folder)
 endif
@@ -14,9 +15,9 @@ BIN ?= target/release
 METRICS := $(foreach s,$(SCENES),$(OUT)/$s/protocol/metrics.json)
 
 .PHONY: all check FORCE
+export SCENES MASKS CLIP TEXTS SAM EVERY
 check:
-	@SCENES="$(SCENES)" MASKS="$(MASKS)" CLIP="$(CLIP)" TEXTS="$(TEXTS)" SAM="$(SAM)" EVERY="$(EVERY)" \
-	  scripts/check_data.sh $(SET) $(DATA)
+	@scripts/check_data.sh $(SET) $(DATA)
 
 .DEFAULT_GOAL := all
 all: $(OUT)/metrics.json

@@ -2,14 +2,16 @@
 #:  GEOMETRY=file.ply   use these trained Gaussians instead of training
 #:  MASKS=folder        use these id maps (*_s.npy) instead of running SAM
 #:  CLIP=folder         image.onnx and text.onnx of a CLIP model [models/clip, if there]; without it no text queries
-#:  QUERIES="red_mug …" texts to ask for, with underscores for spaces
+#:  QUERIES="red_mug …" texts to ask for, with underscores for spaces, without quotes
 #:  RESOLUTION=640px    size of the photographs for stage 1: a width that wider ones are shrunk to, a divisor, or auto
 #:  QUALITY=balanced    fast, balanced or exact: pipelines/quality
 #:  ITERATIONS=3000     steps of stage 1; fast 1000, exact 10000
 #:  SEED=0              of every stage's random choices
 #:  THREADS=0           threads of every stage, 0 for one per core
 #:  CONF=file           settings from a file, one NAME = value a line
-#: and GEOM_ARGS, MASK_ARGS, GRAPH_ARGS, FEAT_ARGS, CLUSTER_ARGS, REPORT_ARGS: more options of a stage
+#: and GEOM_ARGS, MASK_ARGS, GRAPH_ARGS, FEAT_ARGS, CLUSTER_ARGS, SCORE_ARGS, REPORT_ARGS: more options of a stage
+
+include pipelines/paths.mk
 
 ifeq ($(SCENE),)
 $(error say which photographs: make scene SCENE=folder OUT=folder (see make help))
@@ -17,10 +19,6 @@ endif
 ifeq ($(OUT),)
 $(error say where to write: make scene SCENE=folder OUT=folder)
 endif
-
-# What is given must be there, before anything is built.
-given = $(if $($1),$(if $(wildcard $($1)),,$(error $1=$($1): no such file or folder)))
-$(foreach name,SCENE GEOMETRY MASKS CLIP CONF,$(call given,$(name)))
 
 include pipelines/custom.conf
 include pipelines/quality.mk
@@ -31,14 +29,14 @@ SETTINGS := QUALITY SCENE GEOMETRY MASKS CLIP SAM QUERIES RESOLUTION ITERATIONS 
   GEOM_ARGS MASK_ARGS GRAPH_ARGS FEAT_ARGS CLUSTER_ARGS SCORE_ARGS REPORT_ARGS
 include pipelines/settings.mk
 
-SCENE_FILES := $(wildcard $(addprefix $(SCENE)/,sparse/0/* sparse/* images/* transforms*.json color/* pose/* *.ply))
 ifeq ($(MASKS),)
-MASKS := $(OUT)/masks
+override MASKS := $(OUT)/masks
 MASKS_DONE := $(MASKS)/masks.json
 else
-MASKS_DONE := $(wildcard $(MASKS)/*_s.npy)
+MASKS_DONE = $(OPTIONS)/masks.files
 endif
 
+geom_FROM := RESOLUTION, ITERATIONS or GEOM_ARGS
 geom_OPTIONS := --resolution $(RESOLUTION) --iterations $(ITERATIONS) $(GEOM_ARGS)
 EVAL_ARGS ?= --resolution $(RESOLUTION)
 report_OPTIONS := --resolution $(RESOLUTION) $(REPORT_ARGS)

@@ -1,8 +1,10 @@
 # `make demo`: a synthetic scene with inconsistent granularity, every stage, and answers to text queries. Two minutes
 # on two cores once all is built, most of them stage 1.
 
+include pipelines/paths.mk
 OUT ?= out/demo
 SCENE := $(OUT)/scene
+$(call plain,SCENE)
 SCENE_FILES := $(SCENE)/truth/scene.json
 MASKS := $(SCENE)/language_features
 MASKS_DONE := $(SCENE_FILES)

@@ -1,5 +1,5 @@
 # What scenes of the benchmarks share: parameters, masks, texts, and the score by the protocol as the last file. The fragment
-# that includes this has read its parameters (*.conf) and set PROTOCOL, SCENE_FILES and PROTOCOL_FILES.
+# that includes this has read its parameters (*.conf) and set PROTOCOL and PROTOCOL_FILES.
 
 ifeq ($(and $(SCENE),$(OUT)),)
 $(error say which scene and where to write: SCENE=folder OUT=folder)
@@ -11,13 +11,13 @@ SETTINGS := QUALITY SCENE GEOMETRY MASKS SAM CLIP TEXTS EVERY SEED GEOM_ARGS MAS
 include pipelines/settings.mk
 
 # LangSplat's masks and features where they are there; else SAM's, and CLIP's of them.
-GIVEN := $(or $(MASKS),$(if $(wildcard $(SCENE)/language_features/*_s.npy),$(SCENE)/language_features))
-ifneq ($(GIVEN),)
-MASKS := $(GIVEN)
-MASKS_DONE := $(wildcard $(MASKS)/*_s.npy)
+LANGSPLAT := $(or $(MASKS),$(if $(wildcard $(SCENE)/language_features/*_s.npy),$(SCENE)/language_features))
+ifneq ($(LANGSPLAT),)
+MASKS := $(LANGSPLAT)
+MASKS_DONE = $(OPTIONS)/masks.files
 LANGUAGE := $(wildcard $(MASKS)/*_f.npy)
 else
-MASKS := $(OUT)/masks
+override MASKS := $(OUT)/masks
 MASKS_DONE := $(MASKS)/masks.json
 endif
 

@@ -4,14 +4,14 @@
 # them is linked to a folder of the same name below OUT. One that OpenGaussian converted (transforms_train.json) has only
 # those, and is used as it is.
 
+include pipelines/paths.mk
+$(call plain,SCENE)
 include pipelines/scannet.conf
 PROTOCOL := scannet
 ifeq ($(wildcard $(SCENE)/transforms_train.json),)
 SOURCE_FILES := $(wildcard $(addprefix $(SCENE)/,color/* pose/* intrinsic/* *.ply *.json))
 PHOTOGRAPHS := $(OUT)/frames/$(notdir $(SCENE))
 SCENE_FILES := $(PHOTOGRAPHS)/frames.txt
-else
-SCENE_FILES := $(wildcard $(addprefix $(SCENE)/,color/* transforms_*.json points3d.ply))
 endif
 PROTOCOL_FILES := $(wildcard $(addprefix $(SCENE)/,*.labels.ply *.segs.json *.aggregation.json))
 include pipelines/protocol.mk

@@ -3,14 +3,16 @@
 #
 # The values of a file that CONF names are in it; a dollar sign is doubled, as make reads it.
 
+$(foreach v,$(SETTINGS),$(if $(findstring $(newline),$($v)),$(error $v has a line break in it: give it in one line)))
+
 SEED ?= 0
 PIPELINE := $(firstword $(MAKEFILE_LIST))
 settings_LINES := 'PIPELINE = $(PIPELINE)' $(foreach v,$(SETTINGS),'$v = $(subst ','\'',$(subst $$,$$$$,$($v)))')
 
 .PHONY: settings checked
-# Reading the makefiles has checked what was given.
+# Reading the makefiles has checked what make must hold; this, what can be known before anything is built or run.
 checked:
-	@:
+	@scripts/check_settings.sh
 
 settings:
 	@mkdir -p $(OUT)

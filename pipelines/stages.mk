@@ -1,15 +1,18 @@
-# The DAG: which file is made from which, by which stage. A fragment that includes this sets
+# The DAG: which file is made from which, by which stage. A fragment that includes this has included paths.mk and sets
 #   SCENE       folder of photographs with poses          OUT      folder of everything made
-#   SCENE_FILES what the dataset consists of              MASKS    folder of id maps
-#   MASKS_DONE  the file that says the id maps are whole  CLIP     folder of a CLIP pair, or empty: no language
+#   MASKS       folder of id maps                         CLIP     folder of a CLIP pair, or empty: no language
+#   MASKS_DONE  the file that says the id maps are whole
 # and the options of each stage: GEOM_ARGS, GRAPH_ARGS, FEAT_ARGS, CLUSTER_ARGS, SCORE_ARGS, QUERIES, REPORT_ARGS. It may set
 #   PHOTOGRAPHS the data set's folder, where it is not SCENE itself
+#   SCENE_FILES what the dataset consists of, where that is not what gs-geom finds in it
 #   LANGUAGE    the masks' features, where they are there already
 #   PROTOCOL    lerf or scannet, to be scored by that; TEXTS, a table of text features instead of CLIP's
 #
 # Every target is a file that its stage writes whole or not at all, so a killed make goes on where it was. The options of a
 # stage are kept in $(OUT)/.options/ and count as one of its inputs: changed options run the stage again, and what follows
-# from it. A rebuilt program does not.
+# from it. So is a list of the files that people gave, with sizes and times. A rebuilt program runs nothing again.
+#
+# Folders and files that people gave may have any name, and no rule names them. OUT and MASKS are in the rules (paths.mk).
 
 .DELETE_ON_ERROR:
 .SUFFIXES:
@@ -25,12 +28,23 @@ ifndef QUALITY_FILE
 include pipelines/quality.mk
 endif
 
-GEOMETRY ?= $(OUT)/geometry.ply
+OPTIONS := $(OUT)/.options
 GRAPH := $(OUT)/graph.safetensors
 FOOTPRINTS := $(OUT)/footprints.safetensors
 FEATURES := $(OUT)/features.safetensors
 INSTANCES := $(OUT)/instances.safetensors
-OPTIONS := $(OUT)/.options
+SCENE_FILES ?= $(OPTIONS)/scene.files
+ifeq ($(GEOMETRY),)
+override GEOMETRY := $(OUT)/geometry.ply
+GEOMETRY_DONE := $(GEOMETRY)
+else
+GEOMETRY_DONE := $(OPTIONS)/geometry.files
+report_GEOMETRY = --geometry $(call arg,GEOMETRY)
+endif
+# The id maps, where SAM makes them.
+SAM_MAKES := $(filter $(OUT)/masks/masks.json,$(MASKS_DONE))
+export SAM_MAKES SCENE PHOTOGRAPHS OUT MASKS GEOMETRY CLIP SAM TEXTS QUERIES SEED THREADS
+export GEOM_ARGS MASK_ARGS GRAPH_ARGS FEAT_ARGS CLUSTER_ARGS SCORE_ARGS REPORT_ARGS EVAL_ARGS SYNTH_ARGS
 
 .DEFAULT_GOAL := all
 .PHONY: all FORCE
@@ -40,9 +54,21 @@ all: settings
 endif
 
 # $(OPTIONS)/NAME holds the options of stage NAME and is touched only when they change.
-$(OPTIONS)/%: FORCE
+put = { cmp -s - $@ <<< "$$text" || { printf '%s\n' "$$text" > $@.$$$$ && mv $@.$$$$ $@; }; }
+$(OPTIONS)/%: FORCE | checked-options
 	@mkdir -p $(@D)
-	@printf '%s\n' '$(subst ','\'',$($*_OPTIONS))' | cmp -s - $@ || { printf '%s\n' '$(subst ','\'',$($*_OPTIONS))' > $@.$$$$ && mv $@.$$$$ $@; }
+	@text='$(subst ','\'',$($*_OPTIONS))'; $(put)
+
+# $(OPTIONS)/NAME.files holds names, sizes and times of the files NAME, and is touched only when one of them changes.
+$(OPTIONS)/%.files: FORCE | checked-options
+	@mkdir -p $(@D)
+	@text=$$($($*_FILES)) && $(put)
+list = find -L $1 -maxdepth 1 -type f -name $2 -printf '%s %T@ %p\n' | LC_ALL=C sort
+scene_FILES = $(BIN)/gs-geom inspect --files $(call arg,PHOTOGRAPHS)
+geometry_FILES = $(call list,$(call arg,GEOMETRY),'*')
+masks_FILES = $(call list,$(MASKS)/,'*_s.npy')
+clip_FILES = $(call list,$(call arg,CLIP)/,'*')
+texts_FILES = $(call list,$(call arg,TEXTS),'*')
 
 # The seed counts as an option; 0 is every stage's own.
 SEED_ARGS := $(addprefix --seed ,$(filter-out 0,$(SEED)))
@@ -58,74 +84,105 @@ protocol_OPTIONS := $(PROTOCOL) $(CLIP) $(TEXTS) $(SCORE_ARGS)
 queries_OPTIONS := $(CLIP) $(QUERIES)
 report_OPTIONS ?= $(REPORT_ARGS)
 
+# What each stage runs. A path is written out, so that commands can be copied, unless a shell would take it apart.
+arg = $(if $(call odd,$($1)),"$$$1",$($1))
+geom_RUN = $(BIN)/gs-geom train --scene $(call arg,PHOTOGRAPHS) --out $(OUT)/geometry.ply $(geom_OPTIONS) $(COMMON)
+metrics_RUN = $(BIN)/gs-geom eval --scene $(call arg,PHOTOGRAPHS) --geometry $(call arg,GEOMETRY) --out $(OUT)/geom_metrics.json \
+  $(EVAL_ARGS) $(COMMON)
+masks_RUN = $(BIN)/mask-embed masks --scene $(call arg,PHOTOGRAPHS) --sam $(call arg,SAM) --out $(MASKS) $(MASK_ARGS) $(COMMON)
+embed_RUN = $(BIN)/mask-embed embed --scene $(call arg,PHOTOGRAPHS) --masks $(MASKS) --clip $(call arg,CLIP) $(COMMON)
+graph_RUN = $(BIN)/graph-precompute --scene $(call arg,PHOTOGRAPHS) --geometry $(call arg,GEOMETRY) --masks $(MASKS) \
+  --footprints $(FOOTPRINTS) --graph $(GRAPH) $(graph_OPTIONS) $(COMMON)
+feat_RUN = $(BIN)/feat-train --geometry $(call arg,GEOMETRY) --graph $(GRAPH) --footprints $(FOOTPRINTS) --out $(FEATURES) \
+  $(feat_OPTIONS) $(COMMON)
+cluster_RUN = $(BIN)/cluster-match --scene $(call arg,PHOTOGRAPHS) --geometry $(call arg,GEOMETRY) --graph $(GRAPH) --footprints $(FOOTPRINTS) \
+  --features $(FEATURES) --masks $(MASKS) --out $(INSTANCES) $(cluster_OPTIONS) $(COMMON)
+score_RUN = $(BIN)/eval score --scene $(call arg,PHOTOGRAPHS) --geometry $(call arg,GEOMETRY) --instances $(INSTANCES) --out $(OUT)/score.json \
+  $(if $(CLIP),--clip $(call arg,CLIP)) $(SCORE_ARGS) $(COMMON) --quiet
+protocol_RUN = $(BIN)/eval $(PROTOCOL) --scene $(call arg,PHOTOGRAPHS) --geometry $(call arg,GEOMETRY) --instances $(INSTANCES) \
+  --out $(OUT)/protocol $(if $(TEXTS),--text-features $(call arg,TEXTS),$(if $(CLIP),--clip $(call arg,CLIP))) $(SCORE_ARGS) $(COMMON) --quiet
+query_RUN = $(BIN)/eval query --scene $(call arg,PHOTOGRAPHS) --geometry $(call arg,GEOMETRY) --instances $(INSTANCES) --clip $(call arg,CLIP) \
+  --out $(OUT)/query $(foreach q,$(QUERIES),--text '$(subst ','\'',$(subst _,$(space),$q))') $(COMMON)
+report_RUN = $(BIN)/eval report --scene $(call arg,PHOTOGRAPHS) --run-dir $(OUT) $(report_GEOMETRY) --masks $(MASKS) --out $(OUT)/report.html \
+  $(report_OPTIONS) $(COMMON)
+space := $(subst ,, )
+
+# Before the first stage runs, every stage looks at its options.
+PROGRAMS := $(addprefix $(BIN)/,gs-geom mask-embed graph-precompute feat-train cluster-match eval)
+geom_FROM ?= GEOM_ARGS
+.PHONY: checked-options
+checked-options: checked | $(PROGRAMS)
+	@scripts/check_options.sh "$(geom_FROM)" $(geom_RUN)
+	@scripts/check_options.sh EVAL_ARGS $(metrics_RUN)
+	@$(if $(SAM_MAKES),scripts/check_options.sh MASK_ARGS $(masks_RUN))
+	@scripts/check_options.sh GRAPH_ARGS $(graph_RUN)
+	@scripts/check_options.sh FEAT_ARGS $(feat_RUN)
+	@scripts/check_options.sh CLUSTER_ARGS $(cluster_RUN)
+	@scripts/check_options.sh SCORE_ARGS $(if $(PROTOCOL),$(protocol_RUN),$(score_RUN))
+	@$(if $(QUERY),scripts/check_options.sh QUERIES $(query_RUN))
+	@scripts/check_options.sh REPORT_ARGS $(report_RUN)
+
 # For pipelines/Snakefile, where each of these is a job of its own.
 .PHONY: prepared
 prepared: $(SCENE_FILES)
 $(OPTIONS)/geometry.forecast: $(SCENE_FILES) scripts/geometry_forecast.sh | $(BIN)/gs-geom
 	@mkdir -p $(@D)
-	scripts/geometry_forecast.sh $@ $(BIN)/gs-geom train --scene $(PHOTOGRAPHS) $(geom_OPTIONS) $(COMMON)
+	scripts/geometry_forecast.sh $@ $(BIN)/gs-geom train --scene $(call arg,PHOTOGRAPHS) $(geom_OPTIONS) $(COMMON)
 
 # Stage 1. Not run when GEOMETRY names a PLY that exists already.
 $(OUT)/geometry.ply: $(SCENE_FILES) $(OPTIONS)/geom | $(BIN)/gs-geom
-	$(BIN)/gs-geom train --scene $(PHOTOGRAPHS) --out $@ $(geom_OPTIONS) $(COMMON)
+	$(geom_RUN)
 
-$(OUT)/geom_metrics.json: $(GEOMETRY) $(OPTIONS)/geom | $(BIN)/gs-geom
-	$(BIN)/gs-geom eval --scene $(PHOTOGRAPHS) --geometry $(GEOMETRY) --out $@ $(EVAL_ARGS) $(COMMON)
+$(OUT)/geom_metrics.json: $(SCENE_FILES) $(GEOMETRY_DONE) $(OPTIONS)/geom | $(BIN)/gs-geom
+	$(metrics_RUN)
 
 # Stage 0: id maps, where the data set has none.
 $(OUT)/masks/masks.json: $(SCENE_FILES) $(OPTIONS)/masks | $(BIN)/mask-embed
-	@test -e $(SAM)/encoder.onnx || { echo "no SAM model in $(SAM): run make models, or give MASKS=folder" >&2; exit 2; }
-	$(BIN)/mask-embed masks --scene $(PHOTOGRAPHS) --sam $(SAM) --out $(MASKS) $(MASK_ARGS) $(COMMON)
+	$(masks_RUN)
 
 # Stage 0, language half: CLIP features of every mask.
 ifneq ($(and $(CLIP),$(if $(LANGUAGE),,none)),)
 LANGUAGE := $(MASKS)/features.json
-$(LANGUAGE): $(MASKS_DONE) $(OPTIONS)/embed $(wildcard $(CLIP)/*) | $(BIN)/mask-embed
-	$(BIN)/mask-embed embed --scene $(PHOTOGRAPHS) --masks $(MASKS) --clip $(CLIP) $(COMMON)
+$(LANGUAGE): $(MASKS_DONE) $(OPTIONS)/embed $(OPTIONS)/clip.files | $(BIN)/mask-embed
+	$(embed_RUN)
 endif
 
 .PHONY: masked
 masked: $(MASKS_DONE) $(LANGUAGE)
 
 # Stage 2a writes two files in one run; the second hangs on the first so that `make -j` does not start it twice.
-$(GRAPH): $(GEOMETRY) $(MASKS_DONE) $(OPTIONS)/graph | $(BIN)/graph-precompute
-	$(BIN)/graph-precompute --scene $(PHOTOGRAPHS) --geometry $(GEOMETRY) --masks $(MASKS) \
-	  --footprints $(FOOTPRINTS) --graph $(GRAPH) $(graph_OPTIONS) $(COMMON)
+$(GRAPH): $(SCENE_FILES) $(GEOMETRY_DONE) $(MASKS_DONE) $(OPTIONS)/graph | $(BIN)/graph-precompute
+	$(graph_RUN)
 
 $(FOOTPRINTS): $(GRAPH)
 	@test -e $@ || { echo "$@ is gone: delete $(GRAPH) and run make again" >&2; exit 2; }
 	@touch $@
 
 # Stage 2b.
-$(FEATURES): $(GEOMETRY) $(GRAPH) $(FOOTPRINTS) $(OPTIONS)/feat | $(BIN)/feat-train
-	$(BIN)/feat-train --geometry $(GEOMETRY) --graph $(GRAPH) --footprints $(FOOTPRINTS) --out $@ $(feat_OPTIONS) $(COMMON)
+$(FEATURES): $(GEOMETRY_DONE) $(GRAPH) $(FOOTPRINTS) $(OPTIONS)/feat | $(BIN)/feat-train
+	$(feat_RUN)
 
 # Stage 3.
 $(INSTANCES): $(FEATURES) $(LANGUAGE) $(OPTIONS)/cluster | $(BIN)/cluster-match
-	$(BIN)/cluster-match --scene $(PHOTOGRAPHS) --geometry $(GEOMETRY) --graph $(GRAPH) --footprints $(FOOTPRINTS) \
-	  --features $(FEATURES) --masks $(MASKS) --out $@ $(cluster_OPTIONS) $(COMMON)
+	$(cluster_RUN)
 
 # Stage 4.
 $(OUT)/score.json: $(INSTANCES) $(OPTIONS)/score | $(BIN)/eval
-	$(BIN)/eval score --scene $(PHOTOGRAPHS) --geometry $(GEOMETRY) --instances $(INSTANCES) --out $@ \
-	  $(if $(CLIP),--clip $(CLIP)) $(SCORE_ARGS) $(COMMON) --quiet
+	$(score_RUN)
 
 # The same by a published protocol.
-$(OUT)/protocol/metrics.json: $(INSTANCES) $(PROTOCOL_FILES) $(OPTIONS)/protocol $(TEXTS) | $(BIN)/eval
-	$(BIN)/eval $(PROTOCOL) --scene $(PHOTOGRAPHS) --geometry $(GEOMETRY) --instances $(INSTANCES) --out $(@D) \
-	  $(if $(TEXTS),--text-features $(TEXTS),$(addprefix --clip ,$(CLIP))) $(SCORE_ARGS) $(COMMON) --quiet
+$(OUT)/protocol/metrics.json: $(INSTANCES) $(PROTOCOL_FILES) $(OPTIONS)/protocol $(if $(TEXTS),$(OPTIONS)/texts.files) | $(BIN)/eval
+	$(protocol_RUN)
 
 # QUERIES is a list of texts with underscores for spaces; without CLIP there is nothing to ask with.
 ifneq ($(and $(CLIP),$(QUERIES)),)
 QUERY := $(OUT)/query/query.json
-space := $(subst ,, )
 $(QUERY): $(INSTANCES) $(OPTIONS)/queries | $(BIN)/eval
-	$(BIN)/eval query --scene $(PHOTOGRAPHS) --geometry $(GEOMETRY) --instances $(INSTANCES) --clip $(CLIP) --out $(OUT)/query \
-	  $(foreach q,$(QUERIES),--text "$(subst _,$(space),$(q))") $(COMMON)
+	$(query_RUN)
 endif
 
 $(OUT)/report.html: $(INSTANCES) $(OUT)/geom_metrics.json $(OUT)/score.json $(QUERY) $(OPTIONS)/report | $(BIN)/eval
-	$(BIN)/eval report --scene $(PHOTOGRAPHS) --run-dir $(OUT) --masks $(MASKS) --out $@ $(report_OPTIONS) $(COMMON)
+	$(report_RUN)
 
 # The programs are built by the top-level Makefile; a fragment that is run alone builds what it lacks.
 $(BIN)/%:

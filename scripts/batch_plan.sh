@@ -12,8 +12,11 @@ set -euo pipefail
 table=$1 out=$2
 bad() { echo "$table, line $number: $*" >&2; exit 2; }
 [ -f "$table" ] || { echo "batch_plan.sh: no such table: $table" >&2; exit 2; }
-mkdir -p "$out"
 runs= number=0
+# What make and the shell take apart, as in pipelines/paths.mk.
+odd=$'$`\'"\\;&|<>(){}[]*?#%:='
+[[ $out != *["$odd "]* ]] || { echo "batch_plan.sh: OUT=$out: expected a name without spaces and without any of $odd" >&2; exit 2; }
+mkdir -p "$out"
 declare -A seen
 while IFS= read -r line || [ -n "$line" ]; do
   number=$((number + 1))
@@ -42,6 +45,7 @@ while IFS= read -r line || [ -n "$line" ]; do
   done <<< "${settings//;/$'\n'}"
   for scene in $scenes; do
     scene=${scene%/}
+    [[ $scene != *["$odd"]* && $scene != -* ]] || bad "scene $scene: expected a name without any of $odd"
     for seed in "${numbers[@]}"; do
       run=${scene##*/}/$variant-$seed
       [ -z "${seen[$run]-}" ] || bad "$run is given twice"

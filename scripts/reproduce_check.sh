@@ -33,6 +33,9 @@ for settings in "${found[@]}"; do
     case $line in
       'PIPELINE = '*) pipeline=$value ;;
       'GEOMETRY = ' | 'MASKS = ') ;; # the run's own
+      # A dollar sign is doubled in the file, as make reads it there; on the command line it takes these as they are.
+      'SCENE = '* | 'GEOMETRY = '* | 'MASKS = '* | 'CLIP = '* | 'SAM = '* | 'TEXTS = '* | 'QUERIES = '*)
+        arguments+=("$key=${value//'$$'/'$'}") ;;
       *) arguments+=("$key=$value") ;;
     esac
   done < "$settings"

@@ -73,6 +73,114 @@ make --no-print-directory scene SCENE="$work/nowhere" OUT="$work/n" > "$work/now
 grep -q "SCENE=$work/nowhere: no such" "$work/nowhere.log" && ! grep -q cargo "$work/nowhere.log" || { cat "$work/nowhere.log"; fail "a scene that is not there is not said at once"; }
 pass "a scene that is not there is said before anything is built"
 
+say "== paths of any name"
+# What people name may hold anything but a line break, or is refused by name in one line; nothing in it is ever run.
+theirs=$work/a/scene
+custom() { make --no-print-directory -f pipelines/custom.mk THREADS=2 MASKS="$theirs/language_features" "$@"; }
+said_in_one_line() { # said_in_one_line WORD COMMAND...: it must fail, say one line with WORD besides make's own, and run nothing
+  local word=$1 code=0
+  shift
+  "$@" > "$work/said" 2>&1 || code=$?
+  [ "$code" = 2 ] && [ "$(grep -vc '^make' "$work/said")" = 1 ] && grep -qF -- "$word" "$work/said" && [ -z "$(stages_of "$work/said")" ] \
+    || { cat "$work/said"; fail "exit code $code, expected one line about $word: $*"; }
+}
+payload='$(touch was-run)`touch was-run`$(shell touch was-run);touch was-run;'
+odd='two  words$HOME$$x'$payload\''"#&|<>()[]{}*?!%:=\~ñ'
+ln -s "$theirs" "$work/$odd"
+cp "$work/a/geometry.ply" "$work/$odd.ply"
+cp -r testdata/clip-tiny "$work/$odd.clip"
+any_name() {
+  custom OUT="$work/odd" SCENE="$work/$odd" GEOMETRY="$work/$odd.ply" CLIP="$work/$odd.clip" SAM="$odd" \
+    GRAPH_ARGS='--min-mask-pixels 10' FEAT_ARGS='--method contrastive --iterations 30' QUERIES="floor ${payload// /_}_kid's_toy"
+}
+any_name > "$work/odd.log" 2>&1 || { cat "$work/odd.log"; fail "paths of any name"; }
+[ -s "$work/odd/report.html" ] && [ "$(grep -c '"text"' "$work/odd/query/query.json")" -ge 2 ] || fail "no report of paths of any name"
+any_name > "$work/again.log" 2>&1
+[ -z "$(stages_of "$work/again.log")" ] || { cat "$work/again.log"; fail "a second make of paths of any name ran a stage"; }
+scripts/reproduce_check.sh "$work/odd" > "$work/again.log" 2>&1 || { cat "$work/again.log"; fail "reproduce-check of paths of any name"; }
+SCENE="$work/$odd" custom OUT="$work/odd" prepared > "$work/again.log" 2>&1 || { cat "$work/again.log"; fail "a path from the environment"; }
+for name in 'a b' 'a[b' 'a]b' 'a(b' 'a)b' "a'b" 'a"b' 'a$b' 'a`b' 'a;b' 'a#b' 'a%b' 'a:b' 'a=b' 'a\b' 'a*b' 'a&b' 'a|b'; do
+  ln -s "$theirs" "$work/$name"
+  custom OUT="$work/names" SCENE="$work/$name" prepared > "$work/odd.log" 2>&1 && grep -qF "$work/$name/images/" "$work/names/.options/scene.files" \
+    || { cat "$work/odd.log"; fail "SCENE=$name"; }
+  for setting in OUT MASKS CONF DATA; do
+    said_in_one_line "$setting=$work/$name: make cannot hold" make --no-print-directory help "$setting=$work/$name"
+  done
+done
+for setting in OUT MASKS CONF DATA TABLE PLAN INTO; do
+  said_in_one_line "$setting=" make --no-print-directory scene SCENE="$theirs" CARGO='touch was-run #' OUT="$work/n" "$setting=$payload"
+done
+for setting in SCENE GEOMETRY CLIP; do
+  said_in_one_line "$setting=" make --no-print-directory scene SCENE="$theirs" CARGO='touch was-run #' OUT="$work/n" "$setting=$payload"
+  said_in_one_line "$setting has a line break" make --no-print-directory scene OUT="$work/n" "$setting=$work/"$'a\ntouch was-run'
+done
+printf 'custom\t%s\tv\t0\t\n' '`touch${IFS}was-run`' > "$work/odd.tsv"
+said_in_one_line 'line 1: scene `touch' scripts/batch_plan.sh "$work/odd.tsv" "$work/batch"
+[ ! -e was-run ] && [ ! -e "$work/n" ] || { rm -f was-run; fail "part of a name was run, or something was made"; }
+(cd "$theirs" && find . -type f -print0 | sort -z | xargs -0 sha256sum) > "$work/before"
+ln -s "$theirs" "$work/same"
+for same in "$theirs" "$theirs/" "$theirs/." "$work/same"; do
+  said_in_one_line "OUT=$same" make --no-print-directory scene CARGO='touch was-run #' SCENE="$theirs" OUT="$same"
+done
+(cd "$theirs" && find . -type f -print0 | sort -z | xargs -0 sha256sum) | cmp - "$work/before" && [ ! -e was-run ] || fail "OUT=SCENE was not left alone"
+pass "paths of any name work or are refused by name in one line, nothing in them is run, and OUT is not SCENE"
+
+say "== options that cannot be meant"
+# Every stage looks at its options before the first of them runs.
+wrong() { # wrong NAME VALUE WORD [SETTING...]
+  said_in_one_line "$3" custom SCENE="$theirs" CLIP=testdata/clip-tiny OUT="$work/wrong" "$1=$2" "${@:4}"
+  grep -q "$1" "$work/said" || { cat "$work/said"; fail "no word of $1"; }
+}
+while IFS='|' read -r name misspelt out_of_range; do
+  own=()
+  [ "$name" != MASK_ARGS ] || own=(MASKS= SAM=crates/mask-embed/testdata/sam)
+  wrong "$name" "${misspelt}" "unexpected argument '${misspelt%% *}'" ${own+"${own[@]}"}
+  [ -z "$out_of_range" ] || wrong "$name" "$out_of_range" "${out_of_range%% *}" ${own+"${own[@]}"}
+  wrong "$name" "--x 'y" "close every quote" ${own+"${own[@]}"}
+done <<'LIST'
+GEOM_ARGS|--dsim 0.1|--dssim 2
+EVAL_ARGS|--holdou 8|--resolution 0px
+MASK_ARGS|--points-per-sid 6|--points-per-side 0
+GRAPH_ARGS|--anchor-ration 0.1|--k 0
+FEAT_ARGS|--levles small|--tau 0
+CLUSTER_ARGS|--jion 0.6|--join 0.2
+SCORE_ARGS|--alhpa 0.5|--alpha 3
+REPORT_ARGS|--tilte x|
+LIST
+wrong QUERIES '"red mug' 'no quotes around them'
+wrong QUERIES "'red mug' plate" 'no quotes around them'
+wrong RESOLUTION 64O 'not a resolution'
+wrong SEED x 'expected a number'
+wrong SAM "$work/nowhere" 'no SAM model' MASKS=
+[ ! -e "$work/wrong/geometry.ply" ] && [ ! -e "$work/wrong/.options" ] || fail "a stage ran with wrong options"
+pass "an option that cannot be meant is refused by the name of its setting before a stage runs"
+
+say "== an edited photograph"
+# Whatever the dataset's reader finds: folders below images/, input/ beside a COLMAP model, paths of transforms.json.
+edited() { # edited SCENE PHOTOGRAPH ANOTHER: stage 1 must run again when PHOTOGRAPH becomes ANOTHER, and not without cause
+  local geometry=(custom SCENE="$1" OUT="$1.out" ITERATIONS=2 RESOLUTION=32px "$1.out/geometry.ply")
+  for expected in 'gs-geom train,' '' 'gs-geom train,' ''; do
+    [ ! -e "$1.second" ] || { cp "$1/$3" "$1/$2" && rm "$1.second"; }
+    "${geometry[@]}" > "$work/edited.log" 2>&1 || { cat "$work/edited.log"; fail "$1"; }
+    [ "$(stages_of "$work/edited.log")" = "$expected" ] || { cat "$work/edited.log"; fail "$1: expected '$expected'"; }
+    [ -n "$expected" ] || touch "$1.second"
+  done
+}
+mkdir "$work/edited"
+cp -r "$theirs" "$work/edited/input"
+mv "$work/edited/input/images" "$work/edited/input/input"
+edited "$work/edited/input" input/frame_00002.png input/frame_00003.png
+target/release/synth-scene --quiet --layout opengaussian --size tiny --out "$work/edited/scene0000_00"
+for folder in train images/cam0; do
+  scene=$work/edited/${folder##*/}
+  cp -r "$work/edited/scene0000_00" "$scene"
+  mkdir -p "$scene/$(dirname "$folder")" && mv "$scene/color" "$scene/$folder"
+  sed -i "s|color/|$folder/|g" "$scene"/transforms_*.json
+  mapfile -t names < <(cd "$scene" && find "$folder" -type f | sort)
+  edited "$scene" "${names[1]}" "${names[2]}"
+done
+pass "an edited photograph in images/cam0/, train/ or input/ runs stage 1 again, and nothing else does"
+
 say "== artifacts of another scene"
 make --no-print-directory -f pipelines/demo.mk OUT="$work/c" SYNTH_ARGS='--seed 8 --objects 8 --views 6 --width 120 --height 90' \
   GEOM_ARGS='--iterations 30' "$work/c/geometry.ply" > "$work/c.log" 2>&1 || { cat "$work/c.log"; fail "another scene"; }
