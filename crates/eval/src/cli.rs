@@ -73,7 +73,7 @@ impl SceneArgs {
     fn files(&self, dataset: &Dataset, language: &LanguageArgs) -> impl Iterator<Item = PathBuf> {
         let own = [self.instances.clone(), self.geometry.clone()];
         let texts = [&language.text_features, &language.features].into_iter().flatten().cloned().collect::<Vec<_>>();
-        dataset.files().into_iter().chain(own).chain(texts)
+        dataset.files.iter().cloned().chain(own).chain(texts)
     }
 
     /// What is known of the memory that this scene takes, before it is read.
@@ -467,7 +467,8 @@ fn run_report(a: &ReportArgs, stage: &Stage) -> Result<String> {
     };
     stage.forecast(memory::of_report(&sizes), "give a smaller --resolution")?;
     let outputs = stage.outputs(&a.out).file(&a.out).file(report::metrics_path(&options));
-    let mut claim = outputs.reads(dataset.files()).reads(report::files(&a.run_dir)).claim()?;
+    let reads = report::files(&a.run_dir).chain([options.geometry.clone()]);
+    let mut claim = outputs.reads(&dataset.files).reads(reads).claim()?;
     let mut inputs = std::collections::BTreeMap::new();
     let metrics = report::run(&dataset, &options, &mut inputs)?;
     stage.record(&mut claim, json!({"command": "report"}), inputs, json!({"left_out": metrics.skipped.len()}))?;

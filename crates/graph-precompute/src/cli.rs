@@ -178,7 +178,7 @@ impl Program for Args {
             .main(&self.footprints)
             .artifact(&self.graph, Graph::FORMAT)
             .artifact(&self.footprints, Footprints::FORMAT)
-            .reads(dataset.files().into_iter().chain(masks).chain([self.geometry.clone()]))
+            .reads(dataset.files.iter().cloned().chain(masks).chain([self.geometry.clone()]))
             .claim()?;
         let watched = Watched::new([&self.geometry]).and(artifacts::watch_folder(&self.masks, "_s.npy")?);
         for warning in &dataset.warnings {

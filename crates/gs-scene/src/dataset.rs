@@ -269,11 +269,6 @@ impl Dataset {
         self.views.iter().filter(move |v| v.split == split)
     }
 
-    /// The files that it was read from.
-    pub fn files(&self) -> Vec<PathBuf> {
-        self.views.iter().map(|v| v.image_path.clone()).collect()
-    }
-
     /// Content hash: names, lenses, poses, sparse points and photographs. It depends neither on where the folder lies nor
     /// on how the dataset was loaded: all stages know a scene by the same hash.
     ///

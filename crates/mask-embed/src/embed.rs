@@ -105,7 +105,7 @@ pub fn run(args: &EmbedArgs, stage: &Stage) -> Result<()> {
     let notes = features.iter().map(|f| finished::note_path(f));
     // Features of maps that are gone would be taken for this run's.
     let outputs = stage.outputs(&manifest).file(&manifest).files(notes).files(&features).drop_stale();
-    let mut claim = outputs.reads(scene.files()).reads(maps).claim()?;
+    let mut claim = outputs.reads(&scene.files).reads(maps).claim()?;
     let clip = ClipImage::open(&args.clip, &args.engine.options())?;
     let watched =
         Watched::new(scene.views.iter().map(|v| &v.image_path)).and(artifacts::watch_folder(&args.masks, "_s.npy")?);
@@ -221,7 +221,7 @@ pub fn write_crops(args: &CropsArgs, stage: &Stage) -> Result<()> {
     let scene = photographs::open(&args.scene, stage)?;
     let maps = artifacts::folder_files(&args.masks, "_s.npy")?;
     let mut claim =
-        stage.outputs(&args.out).artifact(&args.out, CROPS_FORMAT).reads(scene.files()).reads(maps).claim()?;
+        stage.outputs(&args.out).artifact(&args.out, CROPS_FORMAT).reads(&scene.files).reads(maps).claim()?;
     let size = usize::from(args.size);
     let (mut pixels, mut view_of, mut mask_of, mut names) = (Vec::new(), Vec::new(), Vec::new(), Vec::new());
     let mut progress = stage.progress("views", scene.views.len() as u64);

@@ -118,7 +118,7 @@ pub fn run(args: &MasksArgs, stage: &Stage) -> Result<()> {
 fn claim(args: &MasksArgs, scene: &Dataset, manifest: &Path, stage: &Stage) -> Result<Claim> {
     let maps: Vec<PathBuf> = scene.views.iter().map(|v| maps_path(&args.out, v.stem())).collect();
     let notes = maps.iter().map(|m| finished::note_path(m));
-    let outputs = stage.outputs(manifest).file(manifest).files(notes).files(&maps).reads(scene.files()).drop_stale();
+    let outputs = stage.outputs(manifest).file(manifest).files(notes).files(&maps).reads(&scene.files).drop_stale();
     let pictures = scene.views.iter().map(|v| format!("{}.png", v.stem()));
     args.preview.iter().fold(outputs, |outputs, folder| outputs.files_in(folder, pictures.clone())).claim()
 }

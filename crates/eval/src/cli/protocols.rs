@@ -133,7 +133,7 @@ pub(super) fn run_lerf(a: &LerfArgs, stage: &Stage) -> Result<String> {
     let outputs = protocol_outputs(&a.out, &["table.md", "objects.csv", "pairs.csv"], stage);
     let outputs = a.save_predictions.iter().fold(outputs, |outputs, folder| outputs.folder(folder));
     let mut claim = outputs
-        .reads(dataset.iter().flat_map(Dataset::files))
+        .reads(dataset.iter().flat_map(|d| &d.files))
         .reads(a.instances.iter().chain(&a.geometry).chain(&a.language.text_features).chain(&a.language.features))
         .claim()?;
     let benchmark = LerfScene::named(&name);

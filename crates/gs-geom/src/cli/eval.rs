@@ -34,7 +34,7 @@ impl EvalArgs {
         stage.forecast(needed, "give a smaller --geometry or --resolution")?;
         let (gaussians, options) = self.geometry.read(self.scene.background, stage)?;
         let (alpha, masks) = (self.masks.alpha(), self.masks.load(&dataset, stage)?);
-        let reads = dataset.files().into_iter().chain(masks.files()).chain([self.geometry.geometry.clone()]);
+        let reads = dataset.files.iter().cloned().chain(masks.files()).chain([self.geometry.geometry.clone()]);
         let mut claim = stage.outputs(&self.out).file(&self.out).reads(reads).claim()?;
         let mut split = Split::Test;
         let mut views: Vec<&View> = dataset.views_of(split).collect();

@@ -41,7 +41,7 @@ impl RenderArgs {
         let views = choose(&dataset, &self.views)?;
         let extensions: &[&str] = if self.exr { &["png", "exr"] } else { &["png"] };
         let names = views.iter().flat_map(|v| extensions.iter().map(|e| format!("{}.{e}", v.stem())));
-        let reads = dataset.files().into_iter().chain([self.geometry.geometry.clone()]);
+        let reads = dataset.files.iter().cloned().chain([self.geometry.geometry.clone()]);
         let mut claim = stage.outputs(&self.out).files_in(&self.out, names).reads(reads).claim()?;
         let mut progress = stage.progress("view", views.len() as u64);
         for view in &views {

@@ -392,7 +392,7 @@ impl TrainArgs {
             Init::File(path) => Some(path.clone()),
             _ => None,
         };
-        outputs.reads(dataset.files().into_iter().chain(masks.files()).chain(init)).drop_stale().claim()
+        outputs.reads(dataset.files.iter().cloned().chain(masks.files()).chain(init)).drop_stale().claim()
     }
 
     /// The files that are hashed at one time and read at another.
