@@ -66,7 +66,7 @@ fn list(folder: &Path) -> Result<Vec<PathBuf>> {
 fn check_intrinsics(lens: &Lens) -> Result<()> {
     let [fx, fy, cx, cy] = lens.focal_center;
     let (w, h) = (f64::from(lens.size.0), f64::from(lens.size.1));
-    let sane = |f: f64| (1e-3..1e9).contains(&f);
+    let sane = |f: f64| f > 0.0 && f.is_finite();
     let central = |c: f64, size: f64| (0.25..0.75).contains(&(c / size));
     if sane(fx) && sane(fy) && central(cx, w) && central(cy, h) {
         return Ok(());

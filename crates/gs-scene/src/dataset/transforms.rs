@@ -206,7 +206,7 @@ fn lens(file: &Value, frame: &Value, image: &Path, field: &str) -> Result<Lens> 
     let of_angle = |angle: Option<f64>, size: u32| angle.map(|a| 0.5 * f64::from(size) / (0.5 * a).tan());
     let fx = get("fl_x")?.or(of_angle(get("camera_angle_x")?, w));
     let fy = get("fl_y")?.or(of_angle(get("camera_angle_y")?, h));
-    let focal = fx.or(fy).zip(fy.or(fx)).filter(|(x, y)| [x, y].iter().all(|f| (1e-3..1e9).contains(*f)));
+    let focal = fx.or(fy).zip(fy.or(fx)).filter(|(x, y)| [x, y].iter().all(|f| **f > 0.0 && f.is_finite()));
     let Some((fx, fy)) = focal else {
         return Err(Error::new("no usable focal length")
             .field(format!("{field}, fl_x or camera_angle_x"))
