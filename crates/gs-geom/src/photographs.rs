@@ -1,7 +1,7 @@
 //! The photographs to learn from, decoded once where memory allows, at the picture size in use.
 
 use crate::masks::Masks;
-use gs_io::Result;
+use gs_io::{Result, Watched};
 use gs_scene::dataset::View;
 use gs_scene::{Camera, Image, image_has_alpha};
 use rayon::prelude::*;
@@ -10,6 +10,7 @@ use rayon::prelude::*;
 pub struct Photographs<'a> {
     views: Vec<&'a View>,
     masks: Masks,
+    watched: Option<&'a Watched>,
     budget: usize,
     /// Bytes per pixel of each photograph: 3, and 1 for alpha.
     bytes: Vec<usize>,
@@ -68,15 +69,18 @@ impl<'a> Photographs<'a> {
     /// Decodes the photographs of `views` and keeps up to `budget` bytes of them.
     ///
     /// # Errors
-    /// When a photograph cannot be read or has another shape than its camera.
-    pub fn load(views: Vec<&'a View>, masks: Masks, budget: usize) -> Result<Self> {
+    /// When a photograph cannot be read, has another shape than its camera, or is not as `watched` saw it; so whenever one has
+    /// to be decoded again.
+    pub fn load(views: Vec<&'a View>, masks: Masks, budget: usize, watched: &'a Watched) -> Result<Self> {
+        let watched = Some(watched);
         let cameras: Vec<Camera> = views.iter().map(|v| v.camera.clone()).collect();
         let bytes = views.par_iter().map(|v| bytes_per_pixel(v, &masks)).collect::<Result<Vec<usize>>>()?;
         let fits = fitting(&cameras, &bytes, full_share(budget));
-        let decode =
-            |(view, fits): (&&View, bool)| fits.then(|| decode(view, &masks).map(|i| Picture::new(&i))).transpose();
+        let decode = |(view, fits): (&&View, bool)| {
+            fits.then(|| unchanged(view, &masks, watched).map(|i| Picture::new(&i))).transpose()
+        };
         let full = views.par_iter().zip(fits).map(decode).collect::<Result<_>>()?;
-        Ok(Self { views, masks, budget, bytes, divisor: 1, cameras, full, small: Vec::new() })
+        Ok(Self { views, masks, watched, budget, bytes, divisor: 1, cameras, full, small: Vec::new() })
     }
 
     /// No photographs, such as held-out ones where there are none.
@@ -85,6 +89,7 @@ impl<'a> Photographs<'a> {
         Self {
             views: vec![],
             masks,
+            watched: None,
             budget: 0,
             bytes: vec![],
             divisor: 1,
@@ -143,8 +148,12 @@ impl<'a> Photographs<'a> {
         let camera = &self.views[i].camera;
         match &self.full[i] {
             Some(picture) => Ok(picture.image(camera)),
-            None => Ok(Picture::new(&decode(self.views[i], &self.masks)?).image(camera)),
+            None => Ok(self.decoded(i)?.image(camera)),
         }
+    }
+
+    fn decoded(&self, i: usize) -> Result<Picture> {
+        Ok(Picture::new(&unchanged(self.views[i], &self.masks, self.watched)?))
     }
 
     fn shrink(&self, i: usize) -> Result<Picture> {
@@ -166,7 +175,7 @@ impl<'a> Photographs<'a> {
         match kept.get(i).and_then(Option::as_ref) {
             Some(picture) => Ok(picture.over(background)),
             None if self.divisor > 1 => Ok(self.shrink(i)?.over(background)),
-            None => Ok(Picture::new(&decode(self.views[i], &self.masks)?).over(background)),
+            None => Ok(self.decoded(i)?.over(background)),
         }
     }
 }
@@ -201,6 +210,17 @@ fn fitting(cameras: &[Camera], bytes: &[usize], budget: usize) -> Vec<bool> {
         fits
     };
     cameras.iter().zip(bytes).map(fits).collect()
+}
+
+/// As [`decode`], from files that are still as they were watched. They are looked at after they are read, so that what came of
+/// another content is never used.
+fn unchanged(view: &View, masks: &Masks, watched: Option<&Watched>) -> Result<Image> {
+    let image = decode(view, masks);
+    if let Some(watched) = watched {
+        watched.check_one(&view.image_path)?;
+        masks.of(view).map_or(Ok(()), |mask| watched.check_one(mask))?;
+    }
+    image
 }
 
 /// A view's photograph, multiplied by its alpha and its mask: pictures can then be shrunk before a background is put behind

@@ -125,6 +125,39 @@ fn a_run_whose_photographs_vanish_saves_a_checkpoint_and_goes_on_to_the_same_byt
 }
 
 #[test]
+fn a_touched_photograph_is_the_same_and_another_one_stops_the_run_at_once() {
+    let dir = Folder::new();
+    let (scene, whole) = (dir.path("scene"), dir.path("whole.ply"));
+    succeeds(&training(&scene, &whole, "400", &[]));
+    let photograph = format!("{scene}/images/04.png");
+    let (old, other) = (fs::read(&photograph).unwrap(), fs::read(format!("{scene}/images/05.png")).unwrap());
+    // Read again in every iteration, and kept in memory.
+    for (out, more) in [("a.ply", ["--image-cache", "0"]), ("b.ply", ["--image-cache", "1G"])] {
+        let out = dir.path(out);
+        let arguments = training(&scene, &out, "400", &[&more[..], &["--checkpoint-every", "20"]].concat());
+        let o = disturbed(&arguments, &out, || {
+            for i in 0..9 {
+                let (path, copy) = (format!("{scene}/images/{i:02}.png"), format!("{scene}/copy.png"));
+                fs::copy(&path, &copy).unwrap();
+                fs::rename(copy, path).unwrap();
+            }
+        });
+        assert!(o.status.success(), "{}", String::from_utf8_lossy(&o.stderr));
+        assert_eq!(fs::read(&out).unwrap(), fs::read(&whole).unwrap());
+
+        let o = disturbed(&arguments, &out, || fs::write(&photograph, &other).unwrap());
+        let said = String::from_utf8_lossy(&o.stderr);
+        assert_eq!(o.status.code(), Some(2), "{said}");
+        assert!(said.contains("saved a checkpoint after iteration"), "{said}");
+        assert!(said.contains("images/04.png: the file changed while this run was reading it"), "{said}");
+        fs::write(&photograph, &old).unwrap();
+        fs::remove_file(&out).unwrap();
+        assert!(succeeds(&arguments).contains("going on after iteration"));
+        assert_eq!(fs::read(&out).unwrap(), fs::read(&whole).unwrap());
+    }
+}
+
+#[test]
 #[cfg(unix)]
 fn signals_that_were_ignored_at_the_start_stay_ignored() {
     let dir = Folder::new();
@@ -132,7 +165,12 @@ fn signals_that_were_ignored_at_the_start_stay_ignored() {
     // A shell that ignores some of them, as nohup does SIGHUP and a shell in the background SIGINT.
     for (ignored, sent, ends) in [("", "HUP", 130), ("HUP", "HUP", 0), ("HUP", "TERM", 130), ("INT", "INT", 0)] {
         let out = dir.path(&format!("{ignored}{sent}.ply"));
-        let arguments = training(&scene, &out, "400", &["--checkpoint-every", "1", "--holdout", "0"]);
+        let arguments = training(
+            &scene,
+            &out,
+            if ends == 0 { "160" } else { "100000" },
+            &["--checkpoint-every", "20", "--holdout", "0"],
+        );
         let mut child = Command::new("sh")
             .args(["-c", &format!("trap '' {ignored}; exec \"$0\" \"$@\""), env!("CARGO_BIN_EXE_gs-geom")])
             .args(arguments)

@@ -9,7 +9,7 @@ use crate::photographs::Photographs;
 use crate::plan::{Limits, Plan, Speed, plan};
 use crate::schedule::{Purpose, Schedule, generator};
 use crate::train::{TrainOptions, Trainer};
-use gs_io::{Error, Result, write_bytes};
+use gs_io::{Error, Result, Watched, write_bytes};
 use gs_scene::dataset::{Dataset, Resolution, Split, View};
 use gs_scene::{Camera, Gaussians};
 use serde::{Deserialize, Serialize};
@@ -100,7 +100,8 @@ impl TrainArgs {
         let start = self.start(dataset, &cameras, extent, stage)?;
         let some = train.len().min(VIEWS);
         let views: Vec<&View> = (0..some).map(|i| train[i * train.len() / some]).collect();
-        let photographs = Photographs::load(views, masks.clone(), self.cache_bytes())?;
+        let watched = Watched::default();
+        let photographs = Photographs::load(views, masks.clone(), self.cache_bytes(), &watched)?;
         let gains = self.gains(&photographs)?;
         let count = start.len();
         let speed = probe(options.clone(), extent, photographs, start)?;

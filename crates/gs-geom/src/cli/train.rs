@@ -317,9 +317,9 @@ impl TrainArgs {
                 .expected("at least one view to learn from")
                 .hint("give --holdout 0, or more photographs"));
         }
-        let watched = self.watched(dataset);
+        let watched = self.watched(dataset, &masks);
         let forecast = self.forecast_start(dataset, &masks, &options.schedule, stage)?;
-        let photographs = Photographs::load(train.clone(), masks.clone(), self.cache_bytes())?;
+        let photographs = Photographs::load(train.clone(), masks.clone(), self.cache_bytes(), &watched)?;
         options.schedule.coarse = self.coarse(&self.gains(&photographs)?, self.iterations);
 
         let mut inputs = BTreeMap::from([(role::DATASET.to_string(), dataset.hash()?)]);
@@ -370,7 +370,7 @@ impl TrainArgs {
         let forecast = self.forecast(forecast, dataset, &state.gaussians, stage)?;
         // The training views' smaller pictures are not there yet.
         let left = full_share(self.cache_bytes()).saturating_sub(photographs.kept_bytes());
-        let heldout = Photographs::load(heldout, masks, left)?;
+        let heldout = Photographs::load(heldout, masks, left, &watched)?;
         let mut trainer = Trainer::resume(options, extent, photographs, heldout, state);
         let before = stage::cpu_seconds();
         let done = self.optimise(&mut trainer, &run, &watched, stage).and_then(|done| match done {
@@ -379,7 +379,7 @@ impl TrainArgs {
                 .and_then(|()| self.finish(&mut trainer, &run, &forecast, (plan, spent_since(before)), claim, stage)),
             false => Ok(()),
         });
-        done.inspect_err(|_| self.rescue(&trainer, &run, &watched, stage))
+        done.inspect_err(|_| self.rescue(&trainer, &run, stage))
     }
 
     /// The right to write everything that a run may leave.
@@ -396,22 +396,24 @@ impl TrainArgs {
     }
 
     /// The files that are hashed at one time and read at another.
-    fn watched(&self, dataset: &Dataset) -> Watched {
+    fn watched(&self, dataset: &Dataset, masks: &Masks) -> Watched {
         let init = match &self.init {
             Init::File(path) => Some(path),
             _ => None,
         };
-        Watched::new(dataset.views.iter().map(|v| &v.image_path).chain(init))
+        let masks = dataset.views.iter().filter_map(|v| masks.of(v));
+        Watched::by_content(dataset.views.iter().map(|v| &*v.image_path).chain(masks).chain(init.map(|i| &**i)))
     }
 
-    /// Saves what a failing run has done. An interrupted one has done so already.
-    fn rescue(&self, trainer: &Trainer<'_>, run: &Provenance, watched: &Watched, stage: &Stage) {
+    /// Saves what a failing run has done. An interrupted one has done so already. Where a photograph has changed it is what the
+    /// old one taught: none is used that is not as it was.
+    fn rescue(&self, trainer: &Trainer<'_>, run: &Provenance, stage: &Stage) {
         let iteration = trainer.state().progress.iteration;
         // What is not finite stays so: there is nothing to save.
         if stage.interrupted() || self.check_finite(&trainer.state().gaussians, iteration).is_err() {
             return;
         }
-        match watched.check_those_left().and_then(|()| self.save(trainer, run)) {
+        match self.save(trainer, run) {
             Ok(()) => stage.warn(&format!(
                 "saved a checkpoint after iteration {iteration}; mend the error below, and the same command goes on from it"
             )),
@@ -468,7 +470,6 @@ impl TrainArgs {
             let iteration = trainer.state().progress.iteration;
             let stop = self.stop_after.is_some_and(|last| iteration >= last);
             if stop || stage.interrupted() {
-                watched.check_those_left()?;
                 self.save(trainer, run)?;
                 let partial = beside(&self.out, PARTIAL);
                 let note = format!("unfinished: {iteration} of {} iterations", self.iterations);
@@ -493,7 +494,7 @@ impl TrainArgs {
                 Every::Seconds(s) => saved.elapsed().as_secs_f64() >= s,
             };
             if due && !trainer.is_done() {
-                // A checkpoint names the photographs as they were: it must not hold what others taught.
+                // Those that are kept in memory are not read again: a run that nobody can repeat should end here.
                 watched.check_those_left()?;
                 self.save(trainer, run)?;
                 saved = Instant::now();
