@@ -262,7 +262,7 @@ fn an_interrupted_run_leaves_a_checkpoint() {
     let args = ["--preset", "paper", "--iterations", "100000000", "--checkpoint-every", "0"];
     let mut child = command(dir.path(), &out, &args).stderr(Stdio::null()).spawn().unwrap();
     std::thread::sleep(Duration::from_millis(400));
-    let kill = Command::new("kill").args(["-INT", &child.id().to_string()]).status().unwrap();
+    let kill = Command::new("kill").args(["-TERM", &child.id().to_string()]).status().unwrap();
     assert!(kill.success());
     assert_eq!(child.wait().unwrap().code(), Some(130));
     assert!(beside(&out, ".checkpoint").exists() && !out.exists());
