@@ -221,6 +221,7 @@ impl Scene {
         let errors: Vec<&str> = said.lines().filter(|l| l.starts_with("cluster-match: error: ")).collect();
         assert_eq!((errors.len(), said.contains("panicked")), (1, false), "{said}");
         assert_eq!(std::fs::read(&out).unwrap(), b"good");
+        std::fs::remove_file(&out).unwrap();
     }
 }
 

@@ -13,6 +13,8 @@ pub struct Lock {
     /// None where the file system knows no locks.
     held: Option<(File, PathBuf)>,
     keep: bool,
+    /// Folders that were made for it, innermost first.
+    made: Vec<PathBuf>,
 }
 
 impl Lock {
@@ -23,7 +25,10 @@ impl Lock {
     pub fn take(output: impl AsRef<Path>) -> Result<Self> {
         let output = output.as_ref();
         let path = Self::path(output);
-        create_dir(path.parent().unwrap_or(Path::new(".")))?;
+        let folder = path.parent().filter(|p| !p.as_os_str().is_empty()).unwrap_or(Path::new("."));
+        let mut made: Vec<PathBuf> = folder.ancestors().take_while(|f| !f.exists()).map(Path::to_path_buf).collect();
+        made.retain(|f| !f.as_os_str().is_empty());
+        create_dir(folder)?;
         let open = || OpenOptions::new().write(true).create(true).truncate(false).open(&path);
         let file = loop {
             let file = open().at("create", &path)?;
@@ -36,12 +41,12 @@ impl Lock {
                         .file(output)
                         .hint("wait until it ends, or stop it; then run this again"));
                 }
-                Err(TryLockError::Error(_)) => return Ok(Self { held: None, keep: false }),
+                Err(TryLockError::Error(_)) => return Ok(Self { held: None, keep: false, made }),
             }
         };
         // A run that is refused leaves the signature of the one that was cut off.
         let keep = file.metadata().is_ok_and(|m| m.len() > 0);
-        Ok(Self { held: Some((file, path)), keep })
+        Ok(Self { held: Some((file, path)), keep, made })
     }
 
     /// `.<name>.lock` beside what `output` leads to.
@@ -79,6 +84,8 @@ impl Drop for Lock {
         if let Some((_, path)) = self.held.as_ref().filter(|_| !self.keep) {
             // Still locked: whoever opened it meanwhile finds it gone and makes another.
             let _ = std::fs::remove_file(path);
+            // A run that wrote nothing leaves no folder. One that holds something is not removed.
+            self.made.iter().for_each(|folder| _ = std::fs::remove_dir(folder));
         }
     }
 }
@@ -112,7 +119,7 @@ mod tests {
         Lock::take(dir.path().join("new/b.ply")).unwrap();
         drop(first);
         drop(Lock::take(&out).unwrap());
-        assert_eq!(std::fs::read_dir(dir.path().join("new")).unwrap().count(), 0);
+        assert_eq!(std::fs::read_dir(dir.path()).unwrap().count(), 0);
         let mut cut_off = Lock::take(&out).unwrap();
         cut_off.sign("gs-geom train").unwrap();
         cut_off.keep();

@@ -204,7 +204,8 @@ fn the_result_depends_neither_on_threads_nor_on_interruptions() {
     }
     std::fs::write(other.join("v1_s.npy"), &whole["v1_s.npy"][..1000]).unwrap();
     // It might as well have been edited by hand.
-    let masks = ["masks", "--scene", path(&scene.folder), "--sam", path(&fake_sam()), "--out", path(&other)];
+    let masks = scene.masks_args(&other, &[]);
+    let masks: Vec<&str> = masks.iter().map(String::as_str).collect();
     assert!(error(&masks).contains("v1_s.npy: the output exists and would be lost"));
     scene.make_masks(&other, &["--overwrite"]);
     assert_eq!(whole, contents(&other));

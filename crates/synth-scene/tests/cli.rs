@@ -280,7 +280,7 @@ fn masks_alone_are_those_of_the_full_run() {
     let o = masks(&ALL);
     let said = String::from_utf8_lossy(&o.stderr);
     assert_eq!(o.status.code(), Some(2));
-    assert!(said.contains("not synthetic masks") && said.lines().count() == 1, "{said}");
+    assert!(said.contains("masks.json: the output exists and would be lost") && said.lines().count() == 1, "{said}");
 }
 
 /// Which folders of a scene each fault may change.

@@ -20,6 +20,14 @@ pub const VIEWS: usize = 9;
 pub const CENTRES: [[f64; 3]; 2] = [[-0.6, 0.0, 0.5], [0.6, 0.0, 0.5]];
 const SIGMA: f64 = 0.3;
 
+/// What an artifact says that was made from these.
+pub fn provenance(geometry: &Path, scene: &Path) -> Provenance {
+    let dataset = dataset::load(scene, &LoadOptions::default()).unwrap().hash().unwrap();
+    let geometry = hash_file(geometry).unwrap();
+    let inputs = BTreeMap::from([(role::GEOMETRY.to_string(), geometry), (role::DATASET.to_string(), dataset)]);
+    Provenance { inputs, ..Provenance::default() }
+}
+
 pub struct Fixture {
     dir: tempfile::TempDir,
 }
@@ -78,12 +86,7 @@ impl Fixture {
     }
 
     fn provenance(&self) -> Provenance {
-        let mut inputs = BTreeMap::from([(role::GEOMETRY.to_string(), hash_file(self.geometry()).unwrap())]);
-        // A scan alone is no dataset.
-        if let Ok(dataset) = dataset::load(&self.scene(), &LoadOptions::default()) {
-            inputs.insert(role::DATASET.to_string(), dataset.hash().unwrap());
-        }
-        Provenance { inputs, ..Provenance::default() }
+        provenance(&self.geometry(), &self.scene())
     }
 
     /// Instances with `label(group)` for the Gaussians of group 0 (red), 1 (blue), 2 (floor).

@@ -23,15 +23,15 @@ fn a_query_writes_the_selection_in_every_form() {
     assert_eq!(red["ranking"][2]["instance"], 2);
     assert_eq!(red["views"][0]["view"], "frame_00002");
     let all = gs_scene::ply::read_gaussians(f.geometry()).unwrap();
-    let selected = gs_scene::ply::read_gaussians(f.path().join("out/red-ball.ply")).unwrap();
+    let selected = gs_scene::ply::read_gaussians(f.path().join("out/01-red-ball.ply")).unwrap();
     assert_eq!(selected, all.select(&[0]));
-    let mask = image::open(f.path().join("out/red-ball.frame_00002.mask.png")).unwrap().to_luma8();
+    let mask = image::open(f.path().join("out/01-red-ball.frame_00002.mask.png")).unwrap().to_luma8();
     assert_eq!(mask.dimensions(), (fixture::WIDTH, fixture::HEIGHT));
     let inside = mask.pixels().filter(|p| p.0 == [255]).count() as u64;
     assert_eq!(red["views"][0]["pixels"].as_u64(), Some(inside));
     let (x, y, _) = fixture::cameras()[2].project(glam::DVec3::from_array(fixture::CENTRES[0]));
     assert_eq!(mask[(x as u32, y as u32)].0, [255]);
-    assert!(f.path().join("out/blue-ball.frame_00004.overlay.png").exists());
+    assert!(f.path().join("out/02-blue-ball.frame_00004.overlay.png").exists());
     assert!(f.path().join("out/query.json.run.json").exists());
 }
 
@@ -117,8 +117,8 @@ fn artifacts_of_another_scene_are_refused() {
     gs_scene::ply::write_gaussians(f.geometry(), &g, &[]).unwrap();
     for (command, rest) in [
         ("query", "--text-features|{}/text.json|--text|red ball|--out|{}/out"),
-        ("score", "--out|{}/out"),
-        ("report", "--run-dir|{}/run|--scene|{}/balls|--out|{}/out"),
+        ("score", "--out|{}/out.json"),
+        ("report", "--run-dir|{}/run|--scene|{}/balls|--out|{}/out.html"),
     ] {
         let e = f.bad(command, rest);
         assert!(e.contains("instances.safetensors: inputs.geometry: made from another geometry"), "{e}");
@@ -132,7 +132,7 @@ fn artifacts_of_another_scene_are_refused() {
         fs::write(&transforms, text.replace(&format!("images/{}.png", stem(i)), &other)).unwrap();
     }
     let e = f.bad("score", "--out|{}/out");
-    assert!(e.contains("another scene; found frame_00000 and 8 more"), "{e}");
+    assert!(e.contains("instances.safetensors: inputs.dataset: made from another dataset"), "{e}");
     fs::remove_file(f.geometry()).unwrap();
     assert!(f.bad("score", "--out|{}/out").contains("geometry.ply: cannot open"));
     fs::write(f.instances(), b"short").unwrap();
@@ -324,9 +324,9 @@ fn a_report_of_geometry_alone_says_what_is_left_out() {
     // Gaussians that somebody else trained do not lie in the run.
     fs::rename(f.run().join("geometry.ply"), f.path().join("mine.ply")).unwrap();
     f.good("report", "--run-dir|{}/run|--geometry|{}/mine.ply|--scene|{}/balls|--out|{}/report.html");
-    let e = f.bad("report", "--run-dir|{}/none|--scene|{}/balls|--out|{}/r.html");
+    let e = f.bad("report", "--run-dir|{}/none|--scene|{}/balls|--out|{}/r/r.html");
     assert!(e.contains("geometry.ply"), "{e}");
-    let e = f.bad("report", "--run-dir|{}/run|--scene|{}/none|--out|{}/r.html");
+    let e = f.bad("report", "--run-dir|{}/run|--scene|{}/none|--out|{}/r/r.html");
     assert!(e.contains("none"), "{e}");
 }
 
@@ -435,7 +435,7 @@ fn a_report_shows_no_picture_from_outside_the_run() {
     let file = f.run().join("query/query.json");
     let written = fs::read_to_string(&file).unwrap();
     let picture = f.scene().join("images/frame_00001.png");
-    let name = "red-ball.frame_00002.overlay.png";
+    let name = "01-red-ball.frame_00002.overlay.png";
     assert!(written.contains(name));
     for outside in ["../../balls/images/frame_00001.png", picture.to_str().unwrap(), "./../../x.png", ""] {
         fs::write(&file, written.replace(name, outside)).unwrap();
@@ -554,7 +554,7 @@ fn an_interactive_query_reads_texts_from_a_pipe() {
         .collect();
     assert_eq!(lines.len(), 2);
     assert_eq!(lines[1]["selected"], serde_json::json!([1]));
-    assert!(out.join("red-ball/red-ball.ply").exists() && out.join("blue-ball/query.json").exists());
+    assert!(out.join("01-red-ball/01-red-ball.ply").exists() && out.join("02-blue-ball/query.json").exists());
 }
 
 #[test]
@@ -700,7 +700,7 @@ fn damaged_gaussians_are_left_out_and_said_to_be() {
     let f = Fixture::new(2);
     let selected = |extra: &str| {
         f.good("query", &format!("{TABLE}|--text|red ball|--text|blue ball|--segment|--views|frame_00002{extra}"));
-        fs::read(f.path().join("out/red-ball.frame_00002.mask.png")).unwrap()
+        fs::read(f.path().join("out/01-red-ball.frame_00002.mask.png")).unwrap()
     };
     let before = selected("");
     let mut g = gs_scene::ply::read_gaussians(f.geometry()).unwrap();
@@ -742,7 +742,7 @@ fn a_geometry_learnt_with_the_filter_is_shown_with_it() {
         let alpha = gs_raster::render(&g.select(&[0]), camera, &options).alpha;
         let expected = alpha.iter().filter(|&&a| a > 0.4).count();
         assert_eq!(f.json("out/query.json")["queries"][0]["views"][0]["pixels"], expected);
-        assert_eq!(gs_scene::ply::is_antialiased(f.path().join("out/red-ball.ply")).unwrap(), antialias);
+        assert_eq!(gs_scene::ply::is_antialiased(f.path().join("out/01-red-ball.ply")).unwrap(), antialias);
         pixels.push(expected);
     }
     assert!(pixels[1] < pixels[0], "{pixels:?}");
@@ -771,13 +771,13 @@ fn an_answer_may_be_coarser_or_finer() {
     };
     let (q, _) = ask("blue ball", "parent");
     assert_eq!((&q[0]["selected"], &q[0]["gaussians"]), (&serde_json::json!([1, 0]), &2.into()));
-    assert_eq!(gs_scene::ply::read_gaussians(f.path().join("out/blue-ball.ply")).unwrap().len(), 2);
+    assert_eq!(gs_scene::ply::read_gaussians(f.path().join("out/01-blue-ball.ply")).unwrap().len(), 2);
     fs::write(f.table(), r#"{"floor": [-0.6, -0.8], "blue ball": [0, 1]}"#).unwrap();
     let (q, _) = ask("floor", "parts");
     let sizes: Vec<u64> = q.as_array().unwrap().iter().map(|q| q["gaussians"].as_u64().unwrap()).collect();
     assert_eq!((sizes, &q[2]["kind"], &q[2]["text"]), (vec![81, 41, 40], &"part".into(), &"floor, part 2 of 2".into()));
-    assert_eq!(gs_scene::ply::read_gaussians(f.path().join("out/floor-part-2-of-2.ply")).unwrap().len(), 40);
-    assert!(f.path().join("out/floor-part-1-of-2.frame_00002.mask.png").exists());
+    assert_eq!(gs_scene::ply::read_gaussians(f.path().join("out/03-floor-part-2-of-2.ply")).unwrap().len(), 40);
+    assert!(f.path().join("out/02-floor-part-1-of-2.frame_00002.mask.png").exists());
     let (q, said) = ask("floor", "parent");
     assert!(q[0]["gaussians"] == 81 && said.contains("no parent but the whole scene"), "{said}");
     let (q, said) = ask("blue ball", "parts");

@@ -1,11 +1,11 @@
 //! The protocols on a synthetic scene, against `scripts/protocol_oracle.py`. Where there is no Python with numpy and
 //! OpenCV 4.8 to 4.10 (CAGS_PYTHON names one), the numbers it gave are the golden ones of `testdata/protocols.json`.
 
-use artifacts::{Instances, TruePoints, TrueScene, role};
-use gs_io::{Provenance, hash_bytes, hash_file};
+use crate::fixture::provenance;
+use artifacts::{Instances, TruePoints, TrueScene};
+use gs_io::{hash_bytes, hash_file};
 use gs_scene::Gaussians;
 use serde_json::{Map, Value, json};
-use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 use std::process::{Command, Output};
 
@@ -81,8 +81,7 @@ impl Scene {
             label,
             ..Instances::default()
         };
-        let inputs = BTreeMap::from([(role::GEOMETRY.to_string(), hash_file(this.geometry()).unwrap())]);
-        instances.write(this.instances(), Provenance { inputs, ..Provenance::default() }).unwrap();
+        instances.write(this.instances(), provenance(&this.geometry(), &this.scene())).unwrap();
         // Texts: names of things, without the last but one, which is then never asked for; and the names of classes.
         let axis = |i: usize| -> Vec<f32> { (0..DIM).map(|d| if d == i % DIM { 1.0 } else { 0.1 }).collect() };
         let mut texts = Map::new();
@@ -141,6 +140,8 @@ impl Scene {
     }
 
     fn run(&self, command: &str, rest: &[&str]) -> Output {
+        // One protocol does not write over the results of another.
+        let _ = std::fs::remove_dir_all(self.at("out"));
         let mut c = Command::new(env!("CARGO_BIN_EXE_eval"));
         c.arg(command).arg("--instances").arg(self.instances()).arg("--geometry").arg(self.geometry());
         c.arg("--scene").arg(self.scene()).arg("--text-features").arg(self.texts()).arg("--out").arg(self.at("out"));
@@ -360,8 +361,7 @@ fn damaged_gaussians_leave_the_evaluation_of_a_scan() {
     gs_scene::ply::write_gaussians(s.geometry(), &g, &[]).unwrap();
     let (mut i, _) = Instances::read(s.instances()).unwrap();
     (i.label[5], i.label[6]) = (-1, -1);
-    let inputs = BTreeMap::from([(role::GEOMETRY.to_string(), hash_file(s.geometry()).unwrap())]);
-    i.write(s.instances(), Provenance { inputs, ..Provenance::default() }).unwrap();
+    i.write(s.instances(), provenance(&s.geometry(), &s.scene())).unwrap();
     // By number they leave with their vertices, faint or not; their neighbours speak for the place.
     let notes = s.metrics("scannet", &["--association", "one-to-one", "--keep-faint"])["notes"].to_string();
     assert!(notes.contains(&format!("2 of {} vertices leave the evaluation", g.len())), "{notes}");
