@@ -206,7 +206,8 @@ refused() { # refused WORD COMMAND...: WORD must be in the one line of error
   local word=$1 code=0
   shift
   (cd "$outputs" && find . -type f -print0 | sort -z | xargs -0 sha256sum) > "$work/before"
-  "$@" --quiet > /dev/null 2> "$work/error" || code=$?
+  # What stands there is nobody's: it may be given up, and must not be.
+  "$@" --quiet --overwrite > /dev/null 2> "$work/error" || code=$?
   (cd "$outputs" && find . -type f -print0 | sort -z | xargs -0 sha256sum) > "$work/after"
   [ "$code" = 2 ] && [ "$(grep -c 'error: ' "$work/error")" = 1 ] && grep -q -- "$word" "$work/error" \
     && ! grep -q panicked "$work/error" && cmp -s "$work/before" "$work/after" \
