@@ -14,7 +14,7 @@ use artifacts::{
     instance_color, maps_path, role,
 };
 use clap::Parser;
-use gs_io::{Claim, Error, IoContext, Provenance, Result, Watched, hash_file, write_bytes};
+use gs_io::{Claim, Error, IoContext, Outputs, Provenance, Result, Watched, hash_file, write_bytes};
 use gs_raster::RasterOptions;
 use gs_scene::dataset::{self, LoadOptions, Resolution, View};
 use gs_scene::{Gaussians, Geometry, SH_C0, ply};
@@ -368,7 +368,7 @@ fn claim(a: &Args, stage: &Stage) -> Result<Claim> {
         .reads([&a.geometry, &a.graph, &a.footprints, &a.features])
         .reads(maps)
         .drop_stale();
-    a.per_instance_plys.iter().fold(outputs, |outputs, folder| outputs.folder(folder)).claim()
+    a.per_instance_plys.iter().fold(outputs, Outputs::folder).claim()
 }
 
 fn run(a: &Args, stage: &Stage) -> Result<()> {

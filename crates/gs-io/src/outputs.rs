@@ -139,8 +139,9 @@ impl Outputs {
                     past.check_own(&self.by, &path, None)?;
                 }
             }
-            for record in self.mains.iter().map(record_path).filter(|r| r.exists() && read_record(r).is_none()) {
-                return Err(not_own(&self.by, &record, "not a record of a run"));
+            let mut records = self.mains.iter().map(record_path);
+            if let Some(other) = records.find(|r| r.exists() && read_record(r).is_none()) {
+                return Err(not_own(&self.by, &other, "not a record of a run"));
             }
         }
         let mut locks = self.mains.iter().map(Lock::take).collect::<Result<Vec<_>>>()?;
@@ -221,7 +222,7 @@ impl Claim {
                     (None, _) => continue,
                     (Some(_), Some(hash)) if !changed => hash.clone(),
                     // What stood here and was given up, or is of an unfinished run, counts as written.
-                    (Some(_), None) if !changed && !(self.past.unfinished || given_up.contains(path)) => continue,
+                    (Some(_), None) if !(changed || self.past.unfinished || given_up.contains(path)) => continue,
                     _ => Some(hash_file(path)?),
                 };
                 files.insert(name(path), hash);
@@ -398,7 +399,9 @@ fn files_below(folder: &Path) -> Result<Vec<PathBuf>> {
             let (path, name) = (entry.path(), entry.file_name().to_string_lossy().into_owned());
             if entry.file_type().is_ok_and(|t| t.is_dir()) {
                 folders.push(path);
-            } else if !name.starts_with('.') && !(name.ends_with(".run.json") && read_record(&path).is_some()) {
+            } else if name.starts_with('.') || name.ends_with(".run.json") && read_record(&path).is_some() {
+                // Locks, temporary files and records are no outputs.
+            } else {
                 files.push(path);
             }
         }

@@ -14,7 +14,7 @@ use crate::scannet;
 use crate::scene::Scene;
 use artifacts::{MaskTruth, TrueObject, TruePart, TruePoints, TrueScene, features_path, maps_path};
 use clap::ValueEnum;
-use gs_io::{Claim, Error, IoContext, Result, create_dir, npy, write_bytes};
+use gs_io::{Claim, Error, IoContext, Outputs, Result, create_dir, npy, write_bytes};
 use gs_scene::{Camera, Image, PointCloud, colmap};
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
@@ -347,7 +347,7 @@ fn write_table(folder: &Path, language: &Language) -> Result<()> {
 fn claim(stage: &Stage, out: &Path, marker: &Path, layout: &Layout) -> Result<Claim> {
     let root = layout.root_files().into_iter().map(|name| out.join(name));
     let folders = all_folders().map(|f| out.join(f)).chain([layout.labels(out)]);
-    let outputs = folders.fold(stage.outputs(marker).file(marker).files(root), |outputs, f| outputs.folder(f));
+    let outputs = folders.fold(stage.outputs(marker).file(marker).files(root), Outputs::folder);
     outputs.drop_stale().claim()
 }
 

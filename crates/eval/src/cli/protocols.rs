@@ -131,7 +131,7 @@ pub(super) fn run_lerf(a: &LerfArgs, stage: &Stage) -> Result<String> {
     let scene = a.scene.as_ref().filter(|_| a.predictions.is_none());
     let mut dataset = scene.map(|scene| load(scene, &LoadOptions::default(), stage)).transpose()?;
     let outputs = protocol_outputs(&a.out, &["table.md", "objects.csv", "pairs.csv"], stage);
-    let outputs = a.save_predictions.iter().fold(outputs, |outputs, folder| outputs.folder(folder));
+    let outputs = a.save_predictions.iter().fold(outputs, Outputs::folder);
     let mut claim = outputs
         .reads(dataset.iter().flat_map(|d| &d.files))
         .reads(a.instances.iter().chain(&a.geometry).chain(&a.language.text_features).chain(&a.language.features))

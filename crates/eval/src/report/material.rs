@@ -78,7 +78,7 @@ impl<'a> Material<'a> {
         match &scores {
             Some(s) => metrics.skipped.extend(s.skipped.iter().cloned()),
             None if path.exists() => {
-                metrics.skipped.push("scores: score.json is of other instances (run eval score)".into())
+                metrics.skipped.push("scores: score.json is of other instances (run eval score)".into());
             }
             None => metrics.skipped.push("scores: the run has no score.json (eval score makes it)".into()),
         }
