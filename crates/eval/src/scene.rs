@@ -96,7 +96,7 @@ pub fn spread<T: Copy>(all: &[T], count: usize) -> Vec<T> {
 /// Most bytes of a name that is made of a text.
 const LONGEST_NAME: usize = 100;
 
-/// A text as part of a file name of at most [`LONGEST_NAME`] bytes: letters, digits and what is in `also`; everything else is
+/// A text as part of a file name of at most 100 bytes: letters, digits and what is in `also`; everything else is
 /// a hyphen.
 pub fn slug(text: &str, also: &str) -> String {
     let kept = |c: char| if c.is_alphanumeric() || also.contains(c) { c } else { ' ' };
