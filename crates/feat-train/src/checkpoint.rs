@@ -27,9 +27,7 @@ pub struct Checkpoint {
 
 /// Where the checkpoint of `output` lies.
 pub fn path(output: &Path) -> PathBuf {
-    let mut name = output.as_os_str().to_owned();
-    name.push(".checkpoint");
-    name.into()
+    gs_io::with_suffix(output, ".checkpoint")
 }
 
 /// Writes a checkpoint; `provenance` says which run it is of.

@@ -15,7 +15,7 @@ use crate::spectral::{SpectralOptions, spectral};
 use crate::train::{CurvePoint, TrainOptions, train};
 use artifacts::{Features, Footprints, Graph, Level, Row, role};
 use clap::ValueEnum;
-use gs_io::{Error, Result, Watched, hash_file, write_bytes};
+use gs_io::{Error, Result, Watched, hash_file, with_suffix, write_bytes};
 use gs_scene::{Geometry, SH_C0};
 use serde_json::{Value, json};
 use stage::curve::{self, Panel};
@@ -451,19 +451,12 @@ const SPECTRUM: [Panel; 1] = [("singular_value", "singular values", "#1f77b4")];
 const CURVE: &str = ".curve.jsonl";
 const PLOT: &str = ".curve.svg";
 
-/// `<output><suffix>`.
-fn beside(output: &Path, suffix: &str) -> PathBuf {
-    let mut name = output.as_os_str().to_owned();
-    name.push(suffix);
-    name.into()
-}
-
 /// Writes `<out>.curve.jsonl` and its picture, `<out>.curve.svg`.
 fn write_curve(out: &Path, points: impl Iterator<Item = Value>, panels: &[Panel]) -> Result<()> {
     let lines: Vec<String> = points.map(|p| p.to_string()).collect();
     let text: String = lines.iter().map(|l| format!("{l}\n")).collect();
-    write_bytes(beside(out, CURVE), text.as_bytes())?;
-    write_bytes(beside(out, PLOT), curve::svg(&lines, panels).as_bytes())
+    write_bytes(with_suffix(out, CURVE), text.as_bytes())?;
+    write_bytes(with_suffix(out, PLOT), curve::svg(&lines, panels).as_bytes())
 }
 
 impl Program for Args {
@@ -488,7 +481,7 @@ impl Program for Args {
             .outputs(&self.out)
             .artifact(&self.out, Features::FORMAT)
             .artifact(checkpoint::path(&self.out), checkpoint::FORMAT)
-            .files([CURVE, PLOT].map(|suffix| beside(&self.out, suffix)))
+            .files([CURVE, PLOT].map(|suffix| with_suffix(&self.out, suffix)))
             .reads([&self.geometry, &self.graph, &self.footprints])
             .claim()?;
         let watched = Watched::new([&self.geometry]);

@@ -60,9 +60,7 @@ struct Extra {
 
 /// Where the checkpoint of an output lies: `<output>.checkpoint`.
 pub fn path_of(output: &Path) -> PathBuf {
-    let mut name = output.as_os_str().to_owned();
-    name.push(".checkpoint");
-    name.into()
+    gs_io::with_suffix(output, ".checkpoint")
 }
 
 /// A fresh run's state, with the exposures of so many views (see [`Exposures::new`]).

@@ -206,10 +206,3 @@ impl GeometryArgs {
         Ok((gaussians, options))
     }
 }
-
-/// `<output><suffix>`.
-fn beside(output: &Path, suffix: &str) -> PathBuf {
-    let mut name = output.as_os_str().to_owned();
-    name.push(suffix);
-    name.into()
-}

@@ -1,9 +1,10 @@
 //! Outputs that appear whole or not at all.
 
+use crate::place::{folder_of, resolve};
 use crate::{IoContext, Result};
 use std::fs;
 use std::io::{BufWriter, Write};
-use std::path::{Path, PathBuf};
+use std::path::Path;
 
 /// Creates a folder and its parents.
 ///
@@ -11,17 +12,6 @@ use std::path::{Path, PathBuf};
 /// When the folder cannot be made (read-only file system, a file in the way).
 pub fn create_dir(dir: impl AsRef<Path>) -> Result<()> {
     fs::create_dir_all(&dir).at("create the folder", &dir)
-}
-
-/// The file that `path` leads to through symbolic links, there or not.
-pub(crate) fn resolve(path: &Path) -> PathBuf {
-    let mut target = path.to_path_buf();
-    // More links than systems follow are a circle.
-    for _ in 0..40 {
-        let Ok(next) = fs::read_link(&target) else { break };
-        target = target.parent().unwrap_or(Path::new(".")).join(next);
-    }
-    target
 }
 
 /// Writes `path` through `fill`: to a temporary name in the same folder, flushed to the disk, then renamed. A crash, a
@@ -32,10 +22,7 @@ pub(crate) fn resolve(path: &Path) -> PathBuf {
 /// When the folder cannot be written, when `fill` fails, or when flushing or renaming fails.
 pub fn write_atomic(path: impl AsRef<Path>, fill: impl FnOnce(&mut dyn Write) -> Result<()>) -> Result<()> {
     let path = &resolve(path.as_ref());
-    let folder = match path.parent() {
-        Some(p) if !p.as_os_str().is_empty() => p,
-        _ => Path::new("."),
-    };
+    let folder = folder_of(path);
     create_dir(folder)?;
     let stem = path.file_name().unwrap_or_default().to_string_lossy();
     let mut builder = tempfile::Builder::new();

@@ -12,6 +12,7 @@ mod hash;
 mod lock;
 pub mod npy;
 mod outputs;
+mod place;
 mod watch;
 
 pub use artifact::{Artifact, ArtifactWriter, Provenance};
@@ -20,4 +21,5 @@ pub use error::{Error, IoContext, Result, escaped};
 pub use hash::{hash_bytes, hash_file, hash_files};
 pub use lock::Lock;
 pub use outputs::{Claim, Outputs, Written, record_path};
+pub use place::with_suffix;
 pub use watch::Watched;

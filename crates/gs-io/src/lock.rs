@@ -1,6 +1,6 @@
 //! One run at a time for each output.
 
-use crate::atomic::resolve;
+use crate::place::{folder_of, node, resolve};
 use crate::{Error, IoContext, Result, create_dir};
 use std::fs::{File, OpenOptions, TryLockError};
 use std::io::Write;
@@ -25,7 +25,7 @@ impl Lock {
     pub fn take(output: impl AsRef<Path>) -> Result<Self> {
         let output = output.as_ref();
         let path = Self::path(output);
-        let folder = path.parent().filter(|p| !p.as_os_str().is_empty()).unwrap_or(Path::new("."));
+        let folder = folder_of(&path);
         let mut made: Vec<PathBuf> = folder.ancestors().take_while(|f| !f.exists()).map(Path::to_path_buf).collect();
         made.retain(|f| !f.as_os_str().is_empty());
         create_dir(folder)?;
@@ -90,18 +90,9 @@ impl Drop for Lock {
     }
 }
 
-/// Whether `file` is what `path` names.
-#[cfg(unix)]
+/// Whether `file` is what `path` names; where files have no numbers an open one cannot be removed.
 fn is_at(file: &File, path: &Path) -> bool {
-    use std::os::unix::fs::MetadataExt;
-    let id = |m: std::io::Result<std::fs::Metadata>| m.map(|m| (m.dev(), m.ino())).ok();
-    id(file.metadata()).is_some_and(|f| id(std::fs::metadata(path)) == Some(f))
-}
-
-/// An open file cannot be removed there.
-#[cfg(not(unix))]
-fn is_at(_: &File, _: &Path) -> bool {
-    true
+    file.metadata().is_ok_and(|open| std::fs::metadata(path).is_ok_and(|named| node(&open) == node(&named)))
 }
 
 #[cfg(test)]

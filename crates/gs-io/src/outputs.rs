@@ -1,9 +1,9 @@
 //! What a run may write, checked before it works: nothing that somebody else made is overwritten.
 
+use crate::place::{Identity, Stamp, folder_of, identity, place, stamp, with_suffix};
 use crate::{Error, IoContext, Lock, Result, artifact, hash_file};
 use serde::{Deserialize, Serialize};
 use std::collections::{BTreeMap, BTreeSet};
-use std::fs::Metadata;
 use std::path::{Path, PathBuf};
 
 /// Which run wrote which files; part of the record `<output>.run.json`.
@@ -24,9 +24,7 @@ struct Record {
 
 /// Where the record of `output` lies: `<output>.run.json`.
 pub fn record_path(output: impl AsRef<Path>) -> PathBuf {
-    let mut name = output.as_ref().as_os_str().to_owned();
-    name.push(".run.json");
-    name.into()
+    with_suffix(output, ".run.json")
 }
 
 /// The files and folders that a run will write, and the files that it reads. [`Self::claim`] checks them.
@@ -204,33 +202,31 @@ impl Claim {
     /// # Errors
     /// When an output cannot be read or a record cannot be written.
     pub fn finish(&mut self, mut record: impl FnMut(&Path, Written) -> Result<()>) -> Result<()> {
+        let claimed: BTreeSet<PathBuf> = self.outputs.files.iter().map(|(p, _)| place(p)).collect();
         if self.outputs.drop_stale {
-            self.remove_stale();
+            self.remove_stale(&claimed);
         }
-        let now = self.stamps();
-        let given_up: BTreeSet<PathBuf> =
-            self.outputs.files.iter().filter(|_| self.outputs.overwrite).map(|(p, _)| place(p)).collect();
-        for main in self.outputs.mains.clone() {
-            let folder = folder_of(&place(&main)).to_path_buf();
-            let name = |p: &Path| p.strip_prefix(&folder).unwrap_or(p).to_string_lossy().into_owned();
-            let mut files = BTreeMap::new();
-            for (path, stamp) in &now {
-                let changed = self.before.get(path).copied().flatten() != *stamp;
-                let hash = match (stamp, self.past.files.get(path)) {
-                    // Written after this: its hash is not known yet, and that of its predecessor no longer holds.
-                    (stamp, _) if (!changed || stamp.is_none()) && *path == place(&main) => None,
-                    (None, _) => continue,
-                    (Some(_), Some(hash)) if !changed => hash.clone(),
-                    // What stood here and was given up, or is of an unfinished run, counts as written.
-                    (Some(_), None) if !(changed || self.past.unfinished || given_up.contains(path)) => continue,
-                    _ => Some(hash_file(path)?),
-                };
-                files.insert(name(path), hash);
+        let mains: BTreeSet<PathBuf> = self.outputs.mains.iter().map(|main| place(main)).collect();
+        // What earlier runs wrote here stays theirs, hence this command's.
+        let mut files: BTreeMap<PathBuf, Option<String>> = self.past.files.clone();
+        files.retain(|path, _| path.exists());
+        for (path, stamp) in self.stamps() {
+            let changed = self.before.get(&path).copied().flatten() != stamp;
+            // What stood here and was given up, or is of an unfinished run, counts as written.
+            let adopted = self.past.unfinished || self.outputs.overwrite && claimed.contains(&path);
+            if mains.contains(&path) && (!changed || stamp.is_none()) {
+                // Written after this: its hash is not known yet, and that of its predecessor no longer holds.
+                files.insert(path, None);
+            } else if stamp.is_some() && (changed || adopted && !files.contains_key(&path)) {
+                let hash = hash_file(&path)?;
+                files.insert(path, Some(hash));
             }
-            // What earlier runs wrote here stays theirs, hence this command's.
-            let kept = self.past.files.iter().filter(|(p, _)| !now.contains_key(*p) && p.exists());
-            files.extend(kept.map(|(p, hash)| (name(p), hash.clone())));
-            record(&main, Written { by: self.outputs.by.clone(), files })?;
+        }
+        for main in &self.outputs.mains {
+            let place = place(main);
+            let name = |p: &Path| p.strip_prefix(folder_of(&place)).unwrap_or(p).to_string_lossy().into_owned();
+            let files = files.iter().map(|(path, hash)| (name(path), hash.clone())).collect();
+            record(main, Written { by: self.outputs.by.clone(), files })?;
         }
         self.finished = true;
         Ok(())
@@ -245,9 +241,8 @@ impl Claim {
     }
 
     /// Removes what an earlier run wrote and this one did not, as long as it is as that run left it.
-    fn remove_stale(&self) {
+    fn remove_stale(&self, claimed: &BTreeSet<PathBuf>) {
         let now = self.stamps();
-        let claimed: BTreeSet<PathBuf> = self.outputs.files.iter().map(|(p, _)| place(p)).collect();
         for (path, hash) in &self.past.files {
             let untouched = || self.before.get(path).copied().flatten() == now.get(path).copied().flatten();
             let same = || hash.is_some() && hash_file(path).ok() == *hash;
@@ -345,48 +340,6 @@ fn remove_partial(files: &[PathBuf]) {
             }
         }
     }
-}
-
-/// The folder that a file lies in.
-fn folder_of(path: &Path) -> &Path {
-    path.parent().filter(|p| !p.as_os_str().is_empty()).unwrap_or(Path::new("."))
-}
-
-/// The one name of a file, there or not: its folder without links, and its own name.
-fn place(path: &Path) -> PathBuf {
-    let folder = folder_of(path);
-    let folder = folder.canonicalize().or_else(|_| std::path::absolute(folder)).unwrap_or_else(|_| folder.into());
-    folder.join(path.file_name().unwrap_or_default())
-}
-
-/// What tells one file from another, whatever it is called.
-#[derive(Debug, PartialEq, Eq, PartialOrd, Ord)]
-enum Identity {
-    #[cfg(unix)]
-    Node(u64, u64),
-    Path(PathBuf),
-}
-
-/// The identity of what stands at `path`, through links; None where nothing does.
-fn identity(path: &Path) -> Option<Identity> {
-    #[cfg(unix)]
-    {
-        use std::os::unix::fs::MetadataExt;
-        std::fs::metadata(path).ok().map(|m| Identity::Node(m.dev(), m.ino()))
-    }
-    #[cfg(not(unix))]
-    path.canonicalize().ok().map(Identity::Path)
-}
-
-/// Length, time of the last change, and number of the file where there is one: a file that was written again has another.
-type Stamp = (u64, Option<std::time::SystemTime>, u64);
-
-fn stamp(m: &Metadata) -> Stamp {
-    #[cfg(unix)]
-    let number = std::os::unix::fs::MetadataExt::ino(m);
-    #[cfg(not(unix))]
-    let number = 0;
-    (m.len(), m.modified().ok(), number)
 }
 
 /// All files in a folder and the folders in it, without hidden ones and records, sorted.

@@ -1,10 +1,9 @@
 //! Inputs that change while a stage works on them.
 
+use crate::place::{Stamp, stamp};
 use crate::{Error, Result, hash_file};
-use std::fs::Metadata;
 use std::path::{Path, PathBuf};
 use std::sync::Mutex;
-use std::time::SystemTime;
 
 /// Files as they were when a stage began. A stage that reads a file twice (for its hash, then for its content) or late (a
 /// photograph, when its turn comes) asks whether they are still the same: otherwise its output would name parents that it was
@@ -20,17 +19,6 @@ struct File {
     stamp: Mutex<Stamp>,
     /// Content hash, where a file that was only touched has not changed.
     hash: Option<String>,
-}
-
-/// Length, time of the last change and, where there is one, number of the file: a copy under the same name is another file.
-type Stamp = (u64, Option<SystemTime>, u64);
-
-fn stamp(m: &Metadata) -> Stamp {
-    #[cfg(unix)]
-    let number = std::os::unix::fs::MetadataExt::ino(m);
-    #[cfg(not(unix))]
-    let number = 0;
-    (m.len(), m.modified().ok(), number)
 }
 
 impl File {
@@ -142,7 +130,12 @@ mod tests {
         // Another file with another time under the same name, twice.
         for _ in 0..2 {
             std::fs::write(&b, "one").unwrap();
-            std::fs::File::options().write(true).open(&b).unwrap().set_modified(SystemTime::UNIX_EPOCH).unwrap();
+            std::fs::File::options()
+                .write(true)
+                .open(&b)
+                .unwrap()
+                .set_modified(std::time::SystemTime::UNIX_EPOCH)
+                .unwrap();
             std::fs::rename(&b, &a).unwrap();
             assert!(stamp.check_those_left().is_err());
             content.check().unwrap();

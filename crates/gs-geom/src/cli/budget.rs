@@ -1,6 +1,5 @@
 //! `gs-geom train --time-budget`: measures the speed, plans, and says the plan as options.
 
-use super::beside;
 use super::train::TrainArgs;
 use crate::densify::{DensifyOptions, densify};
 use crate::init;
@@ -9,7 +8,7 @@ use crate::photographs::Photographs;
 use crate::plan::{Limits, Plan, Speed, plan};
 use crate::schedule::{Purpose, Schedule, generator};
 use crate::train::{TrainOptions, Trainer};
-use gs_io::{Error, Result, Watched, write_bytes};
+use gs_io::{Error, Result, Watched, with_suffix, write_bytes};
 use gs_scene::dataset::{Dataset, Resolution, Split, View};
 use gs_scene::{Camera, Gaussians};
 use serde::{Deserialize, Serialize};
@@ -43,7 +42,7 @@ struct Kept {
 
 /// Where the plan of an output lies while its run is unfinished.
 pub(super) fn plan_path(output: &Path) -> PathBuf {
-    beside(output, ".plan.json")
+    with_suffix(output, ".plan.json")
 }
 
 /// Reads `90`, `90s`, `10m` or `1.5h` as seconds.

@@ -6,7 +6,7 @@ mod start;
 
 use self::finish::spent_since;
 use super::budget::plan_path;
-use super::{Background, MaskArgs, SceneArgs, beside};
+use super::{Background, MaskArgs, SceneArgs};
 use crate::checkpoint::{self, State};
 use crate::content::{self, Gain};
 use crate::densify::{DensifyOptions, Strategy};
@@ -18,7 +18,7 @@ use crate::schedule::{LearningRates, Schedule};
 use crate::train::{TrainOptions, Trainer};
 use artifacts::role;
 use clap::ValueEnum;
-use gs_io::{Claim, Error, Provenance, Result, Watched, hash_file};
+use gs_io::{Claim, Error, Provenance, Result, Watched, hash_file, with_suffix};
 use gs_scene::dataset::{Dataset, Split, View};
 use gs_scene::{Camera, Gaussians, ply};
 use serde_json::{Value, json};
@@ -385,7 +385,7 @@ impl TrainArgs {
     /// The right to write everything that a run may leave.
     fn claim(&self, dataset: &Dataset, masks: &Masks, stage: &Stage) -> Result<Claim> {
         let exposures = Some(EXPOSURES).filter(|_| self.exposure);
-        let beside = [CURVE, PLOT, PARTIAL].into_iter().chain(exposures).map(|suffix| beside(&self.out, suffix));
+        let beside = [CURVE, PLOT, PARTIAL].into_iter().chain(exposures).map(|suffix| with_suffix(&self.out, suffix));
         let outputs = stage.outputs(&self.out).file(&self.out).files(beside).file(plan_path(&self.out));
         let outputs = outputs.artifact(checkpoint::path_of(&self.out), checkpoint::FORMAT);
         let init = match &self.init {
@@ -471,7 +471,7 @@ impl TrainArgs {
             let stop = self.stop_after.is_some_and(|last| iteration >= last);
             if stop || stage.interrupted() {
                 self.save(trainer, run)?;
-                let partial = beside(&self.out, PARTIAL);
+                let partial = with_suffix(&self.out, PARTIAL);
                 let note = format!("unfinished: {iteration} of {} iterations", self.iterations);
                 ply::write_gaussians(&partial, &trainer.state().gaussians, &[note])?;
                 stage.info(&format!(

@@ -2,14 +2,13 @@
 
 use super::{CURVE, EXPOSURES, PARTIAL, PLOT, TrainArgs, remove_if_there};
 use crate::checkpoint::{self, State};
-use crate::cli::beside;
 use crate::cli::budget::plan_path;
 use crate::curve;
 use crate::densify::drawable;
 use crate::memory::Forecast;
 use crate::metrics::Means;
 use crate::train::{Timings, Trainer};
-use gs_io::{Claim, Error, Provenance, Result, write_bytes};
+use gs_io::{Claim, Error, Provenance, Result, with_suffix, write_bytes};
 use gs_scene::ply;
 use serde_json::{Value, json};
 use stage::Stage;
@@ -51,8 +50,8 @@ impl TrainArgs {
             ));
         }
         let curve: String = progress.curve.iter().map(|line| format!("{line}\n")).collect();
-        write_bytes(beside(&self.out, CURVE), curve.as_bytes())?;
-        write_bytes(beside(&self.out, PLOT), curve::svg(&progress.curve).as_bytes())?;
+        write_bytes(with_suffix(&self.out, CURVE), curve.as_bytes())?;
+        write_bytes(with_suffix(&self.out, PLOT), curve::svg(&progress.curve).as_bytes())?;
         if !trainer.state().exposures.is_off() {
             let names = trainer.train_names();
             let maps: serde_json::Map<String, Value> = names
@@ -60,7 +59,7 @@ impl TrainArgs {
                 .map(|(name, map)| (name.to_string(), json!(map.chunks(4).collect::<Vec<_>>())))
                 .collect();
             let text = serde_json::to_vec_pretty(&maps).map_err(|e| Error::new(e.to_string()))?;
-            write_bytes(beside(&self.out, EXPOSURES), &text)?;
+            write_bytes(with_suffix(&self.out, EXPOSURES), &text)?;
         }
         let mut comments = comments(parameters, inputs);
         comments.extend(progress.extended.iter().map(|i| format!("extended after iteration {i}")));
@@ -91,7 +90,7 @@ impl TrainArgs {
         }
         stage.record(claim, parameters.clone(), inputs.clone(), summary)?;
         let state = Some(checkpoint::path_of(&self.out)).filter(|_| !self.keep_state);
-        for leftover in [beside(&self.out, PARTIAL), plan_path(&self.out)].into_iter().chain(state) {
+        for leftover in [with_suffix(&self.out, PARTIAL), plan_path(&self.out)].into_iter().chain(state) {
             remove_if_there(&leftover);
         }
         Ok(())
