@@ -19,7 +19,7 @@ use artifacts::{Features, role};
 use clap::{Parser, Subcommand};
 use gs_io::{Error, Result, Watched, write_bytes};
 use gs_scene::dataset::{self, Dataset, LoadOptions, Resolution, View};
-use onnx_models::{ClipImage, ClipText, EngineOptions};
+use onnx_models::{ClipImage, EngineOptions};
 use serde_json::{Value, json};
 use stage::{CommonArgs, Program, Stage};
 use std::path::{Path, PathBuf};
@@ -173,19 +173,20 @@ impl LanguageArgs {
     /// The source, which must fit the descriptors of a scene.
     fn source_for(&self, scene: &LabelledScene) -> Result<TextSource> {
         let source = self.source()?;
-        source.check_dim(scene.instances.dim, scene.path())?;
-        self.check_model(scene)?;
+        self.check_fits(&source, scene)?;
         Ok(source)
     }
 
-    /// Checks that the CLIP pair is the one whose other half encoded the masks, as far as the instances know it.
-    fn check_model(&self, scene: &LabelledScene) -> Result<()> {
+    /// Checks that a source has the descriptors' dimension, and that a CLIP pair is the one whose other half encoded the masks,
+    /// as far as the instances know it.
+    fn check_fits(&self, source: &TextSource, scene: &LabelledScene) -> Result<()> {
+        source.check_dim(scene.instances.dim, scene.path())?;
         let Some(clip) = self.clip.as_deref().filter(|_| !self.any_model) else { return Ok(()) };
         let made_with = |role: &str| scene.artifact.provenance().inputs.get(role).cloned();
         let (image, text) = (made_with(role::CLIP), made_with(role::CLIP_TEXT));
-        let same = |known: &Option<String>, here: Option<String>| known.is_some() && *known == here;
         let unknown = image.is_none() && text.is_none();
-        if unknown || same(&text, ClipText::hash_in(clip)) || same(&image, ClipImage::hash_in(clip)) {
+        // The text encoder is open, and has its hash already; the image encoder is read only where that does not tell.
+        if unknown || text == Some(source.hash()?) || image.is_some() && image == ClipImage::hash_in(clip) {
             return Ok(());
         }
         Err(Error::new("another CLIP model than the one that encoded the masks")

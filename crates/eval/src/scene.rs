@@ -102,14 +102,14 @@ pub fn slug(text: &str, also: &str) -> String {
     let kept = |c: char| if c.is_alphanumeric() || also.contains(c) { c } else { ' ' };
     let words: String = text.chars().map(kept).collect();
     let mut joined = words.split_whitespace().collect::<Vec<_>>().join("-");
-    joined.truncate((0..=LONGEST_NAME).rfind(|&n| joined.is_char_boundary(n)).unwrap_or(0));
+    joined.truncate(joined.floor_char_boundary(LONGEST_NAME));
     if joined.is_empty() { "query".into() } else { joined }
 }
 
 /// The file name of the answer to a text, number first: no two are the same, and none is a name that means something else.
 pub fn numbered(number: usize, text: &str) -> String {
     let mut name = format!("{number:02}-{}", slug(&text.to_lowercase(), ""));
-    name.truncate((0..=LONGEST_NAME).rfind(|&n| name.is_char_boundary(n)).unwrap_or(0));
+    name.truncate(name.floor_char_boundary(LONGEST_NAME));
     name
 }
 

@@ -96,7 +96,6 @@ fn no_maps(folder: &Path) -> Error {
 /// When scene, id maps or model cannot be read, or the output cannot be written.
 pub fn run(args: &EmbedArgs, stage: &Stage) -> Result<()> {
     let scene = photographs::open(&args.scene, stage)?;
-    check_maps(&args.masks, &scene.views)?;
     let out = args.out.as_ref().unwrap_or(&args.masks);
     let manifest = out.join("features.json");
     let maps = artifacts::folder_files(&args.masks, "_s.npy")?;
@@ -106,6 +105,7 @@ pub fn run(args: &EmbedArgs, stage: &Stage) -> Result<()> {
     // Features of maps that are gone would be taken for this run's.
     let outputs = stage.outputs(&manifest).file(&manifest).files(notes).files(&features).drop_stale();
     let mut claim = outputs.reads(&scene.files).reads(maps).claim()?;
+    check_maps(&args.masks, &scene.views)?;
     let clip = ClipImage::open(&args.clip, &args.engine.options())?;
     let watched =
         Watched::new(scene.views.iter().map(|v| &v.image_path)).and(artifacts::watch_folder(&args.masks, "_s.npy")?);

@@ -129,7 +129,7 @@ pub(super) fn run_lerf(a: &LerfArgs, stage: &Stage) -> Result<String> {
     let named = a.scene.as_deref().map(folder_name).or_else(|| a.labels.as_deref().map(folder_name));
     let name = a.name.clone().or(named).unwrap_or_else(|| "scene".into());
     let scene = a.scene.as_ref().filter(|_| a.predictions.is_none());
-    let mut dataset = scene.map(|scene| load(scene, &LoadOptions::default(), stage)).transpose()?;
+    let dataset = scene.map(|scene| load(scene, &LoadOptions::default(), stage)).transpose()?;
     let outputs = protocol_outputs(&a.out, &["table.md", "objects.csv", "pairs.csv"], stage);
     let outputs = a.save_predictions.iter().fold(outputs, Outputs::folder);
     let mut claim = outputs
@@ -176,11 +176,8 @@ pub(super) fn run_lerf(a: &LerfArgs, stage: &Stage) -> Result<String> {
     let mut answers = Answers::new();
     let mut rendered = None;
     let labels = frames.iter().flat_map(|f| f.categories.values()).map(|m| m.bits.len() as u64).sum();
-    if a.predictions.is_some() {
-        stage.forecast(memory::of_scores(&Sizes { labels, ..Sizes::default() }), "give fewer or smaller labels")?;
-    } else {
+    if let Some(dataset) = dataset {
         let part = |p: &Option<PathBuf>| p.clone().expect("clap asks for it");
-        let dataset = dataset.take().expect("loaded without --predictions");
         let files = SceneArgs { instances: part(&a.instances), geometry: part(&a.geometry), scene: part(&a.scene) };
         let sizes = Sizes { labels, ..files.sizes(&a.language, &dataset.views) };
         stage.forecast(memory::of_scores(&sizes), SMALLER)?;
@@ -209,6 +206,8 @@ pub(super) fn run_lerf(a: &LerfArgs, stage: &Stage) -> Result<String> {
         }
         inputs.clone_from(&scene.inputs);
         rendered = Some(Rendered { scene, dataset });
+    } else {
+        stage.forecast(memory::of_scores(&Sizes { labels, ..Sizes::default() }), "give fewer or smaller labels")?;
     }
     let mut pairs = Vec::new();
     let mut progress = stage.progress("frames", frames.len() as u64);
@@ -305,11 +304,11 @@ pub(super) fn run_scannet(a: &ScannetArgs, stage: &Stage) -> Result<String> {
         min_support: a.language.min_support.unwrap_or(2),
     };
     let files = ScanFiles::find(&a.scene.scene)?;
+    let parts = files.instances.iter().flat_map(|(segments, objects)| [segments, objects]).chain([&files.labels]);
     let mut claim = protocol_outputs(&a.out, &["table.md", "objects.csv"], stage)
-        .reads(files.instances.iter().flat_map(|(segments, objects)| [segments, objects]).chain([&files.labels]))
+        .reads(parts.clone())
         .reads([&a.scene.instances, &a.scene.geometry].into_iter().chain(&a.language.text_features))
         .claim()?;
-    let parts = files.instances.iter().flat_map(|(segments, objects)| [segments, objects]).chain([&files.labels]);
     let truth = parts.map(|p| memory::bytes(p)).sum();
     stage.forecast(memory::of_scan(&Sizes { truth, ..a.scene.sizes(&a.language, &[]) }), SMALLER)?;
     let scene = read_scene(&a.scene.instances, &a.scene.geometry, stage)?;

@@ -116,8 +116,7 @@ pub(super) fn run(a: &QueryArgs, stage: &Stage, json_lines: bool) -> Result<Stri
     let given = a.language.clip.is_some() || a.language.text_features.is_some();
     let source = if worded || given { Some(a.language.source()?) } else { None };
     if let Some(source) = source.as_ref().filter(|_| worded || !a.image.is_empty()) {
-        source.check_dim(scene.instances.dim, scene.path())?;
-        a.language.check_model(&scene)?;
+        a.language.check_fits(source, &scene)?;
     }
     let source = source.filter(|s| s.dim() == scene.instances.dim);
     scene.check_dataset(&dataset)?;
