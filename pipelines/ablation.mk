@@ -1,5 +1,5 @@
 # `make ablation`: the paper's ablation tables, readings of the paper, and our methods on synthetic scenes, one score per
-# cell (docs/accuracy.md). What is run stands in PLAN; what its lines mean in crates/eval/src/ablation/plan.rs.
+# cell (docs/accuracy.md). What is run stands in PLAN; what its lines mean in crates/stages/eval/src/ablation/plan.rs.
 #
 # Every cell is a file: a killed make goes on where it was, and a changed line of the plan runs what depends on it. Each
 # stage runs on one thread; `make -j` runs as many as there are cores.

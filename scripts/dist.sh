@@ -10,7 +10,7 @@ name=cags-$version-$target
 out=out/dist
 rm -rf "$out/$name"
 mkdir -p "$out/$name"/{bin,man,completions}
-# A build that goes on would have the revision of the last change to crates/stage (its build.rs); what is handed out names its own.
+# A build that goes on would have the revision of the last change to crates/lib/stage (its build.rs); what is handed out names its own.
 CAGS_REVISION=${CAGS_REVISION:-$(git rev-parse --short=12 HEAD)}
 export CAGS_REVISION
 cargo build --profile dist --locked --workspace --bins

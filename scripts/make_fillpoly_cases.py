@@ -1,7 +1,7 @@
-"""Golden masks of cv2.fillPoly for crates/eval's polygon rasteriser.
+"""Golden masks of cv2.fillPoly for crates/stages/eval's polygon rasteriser.
 
     pip install numpy opencv-python-headless==4.10.0.84
-    python scripts/make_fillpoly_cases.py > crates/eval/testdata/fillpoly.json
+    python scripts/make_fillpoly_cases.py > crates/stages/eval/testdata/fillpoly.json
 
 Each case: image size, vertices as floats (cast to int32 as LERF-OVS scorers do: truncation toward zero), and the
 filled pixels as runs [y, first x, last x].

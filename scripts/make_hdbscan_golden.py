@@ -1,5 +1,5 @@
 #!/usr/bin/env python3
-"""Writes what scikit-learn makes of small point sets, for the tests of crates/hdbscan-exact.
+"""Writes what scikit-learn makes of small point sets, for the tests of crates/lib/hdbscan-exact.
 
 Every edge of the mutual reachability graph that is dominated by one core distance ties with others, so the minimum spanning
 tree is not unique, and which points stand at a cluster's rim depends on which one was taken. Hence several lists of labels a case:

@@ -4,9 +4,9 @@
     python3 -m venv /tmp/onnx-venv && /tmp/onnx-venv/bin/pip install numpy onnx
     /tmp/onnx-venv/bin/python scripts/make_onnx_testdata.py
 
-crates/onnx-models/testdata/ops.onnx         floats and integers in, sum, product and a value in between
-crates/onnx-models/testdata/clip/            a dual encoder whose features can be computed by hand
-crates/mask-embed/testdata/sam/              a segmenter by colour with the inputs and outputs of SAM
+crates/lib/onnx-models/testdata/ops.onnx         floats and integers in, sum, product and a value in between
+crates/lib/onnx-models/testdata/clip/            a dual encoder whose features can be computed by hand
+crates/stages/mask-embed/testdata/sam/              a segmenter by colour with the inputs and outputs of SAM
 """
 
 from pathlib import Path
@@ -39,7 +39,7 @@ def ops():
     """sum = a + b and product = (a + b) * 2 + b, for floats a and integers b of any number of rows."""
     node = helper.make_node
     write(
-        ROOT / "crates/onnx-models/testdata/ops.onnx",
+        ROOT / "crates/lib/onnx-models/testdata/ops.onnx",
         [
             node("Cast", ["b"], ["b_float"], to=F),
             node("Add", ["a", "b_float"], ["sum"]),
@@ -56,7 +56,7 @@ def ops():
 def clip():
     """Image feature: mean of each channel, and 1. Text feature: how many ids are 0, 1, 2, 3 modulo 4."""
     node = helper.make_node
-    folder = ROOT / "crates/onnx-models/testdata/clip"
+    folder = ROOT / "crates/lib/onnx-models/testdata/clip"
     write(
         folder / "image.onnx",
         [
@@ -94,7 +94,7 @@ def sam():
     for prompts of several points. As in SAM's own export only the best of the last three is declared as an output.
     """
     node = helper.make_node
-    folder = ROOT / "crates/mask-embed/testdata/sam"
+    folder = ROOT / "crates/stages/mask-embed/testdata/sam"
     write(
         folder / "encoder.onnx",
         [node("AveragePool", ["input"], ["output"], kernel_shape=[4, 4], strides=[4, 4])],

@@ -6,7 +6,7 @@
     python scripts/protocol_oracle.py pictures LABELS            (writes LABELS/gt/<frame>/<category>.jpg)
     python scripts/protocol_oracle.py scannet GEOMETRY INSTANCES TEXTS SCAN [--association nearest] [--keep-faint]
 
-Prints JSON. The tests of crates/eval run it where this Python and these packages are, and expect equality to 1e-6.
+Prints JSON. The tests of crates/stages/eval run it where this Python and these packages are, and expect equality to 1e-6.
 Of OpenCV, 4.8 to 4.10: other versions fill some border pixels differently.
 """
 

@@ -38,7 +38,7 @@ pass "miniatures of LERF-OVS and ScanNet"
 
 # What make check-data says: nothing where all is there, else what, where, from which page, under which licence.
 check() { benchmark check "$@" > "$work/check.log" 2>&1; }
-given=(SAM=crates/mask-embed/testdata/sam TEXTS="$work/texts.json")
+given=(SAM=crates/stages/mask-embed/testdata/sam TEXTS="$work/texts.json")
 check SET=lerf-ovs DATA="$lerf" "${given[@]}" CLIP=testdata/clip-tiny || { cat "$work/check.log"; fail "all of LERF-OVS is there"; }
 check SET=scannet DATA="$scannet" SCENES="scene0000_00 scene0062_00" TEXTS="$work/names.json" \
   || { cat "$work/check.log"; fail "all of ScanNet is there"; }
@@ -66,7 +66,7 @@ run_lerf() {
 # The one of raw photographs has the features of another model, and so its texts.
 run_raw() {
   make --no-print-directory -f pipelines/lerf-ovs.mk SCENE="$lerf/teatime" OUT="$work/lerf/teatime" THREADS=1 \
-    SAM=crates/mask-embed/testdata/sam CLIP=testdata/clip-tiny GEOM_ARGS="$small --max-gaussians 4000" \
+    SAM=crates/stages/mask-embed/testdata/sam CLIP=testdata/clip-tiny GEOM_ARGS="$small --max-gaussians 4000" \
     GRAPH_ARGS='--min-mask-pixels 10' MASK_ARGS='--points-per-side 6'
 }
 run_raw > "$work/raw.log" 2>&1 || { cat "$work/raw.log"; fail "a scene of raw photographs"; }

@@ -133,7 +133,7 @@ wrong() { # wrong NAME VALUE WORD [SETTING...]
 }
 while IFS='|' read -r name misspelt out_of_range; do
   own=()
-  [ "$name" != MASK_ARGS ] || own=(MASKS= SAM=crates/mask-embed/testdata/sam)
+  [ "$name" != MASK_ARGS ] || own=(MASKS= SAM=crates/stages/mask-embed/testdata/sam)
   wrong "$name" "${misspelt}" "unexpected argument '${misspelt%% *}'" ${own+"${own[@]}"}
   [ -z "$out_of_range" ] || wrong "$name" "$out_of_range" "${out_of_range%% *}" ${own+"${own[@]}"}
   wrong "$name" "--x 'y" "close every quote" ${own+"${own[@]}"}

@@ -1,0 +1,429 @@
+//! Labels of scikit-learn and Python's hdbscan on small sets, made by scripts/make_hdbscan_golden.py, and properties of clusterings.
+
+use hdbscan_exact::{
+    Clustering, Edge, Options, Selection, adjusted_rand, approximate_predict, cluster, cluster_graph, core_distances,
+};
+use proptest::prelude::*;
+use std::collections::BTreeMap;
+use std::path::PathBuf;
+use std::str::FromStr;
+
+struct Case {
+    name: String,
+    points: Vec<f32>,
+    dim: usize,
+    options: Options,
+    /// What `sklearn.cluster.HDBSCAN` says.
+    labels: Vec<i32>,
+    /// What scikit-learn's tree code makes of the one spanning tree.
+    one_tree: Vec<i32>,
+    probabilities: Vec<f32>,
+    /// What Python's `hdbscan` says with an exact spanning tree.
+    python: Vec<i32>,
+    python_outliers: Vec<f32>,
+}
+
+fn numbers<T: FromStr>(line: Option<&str>) -> Vec<T> {
+    line.unwrap().split_whitespace().map(|v| v.parse().ok().unwrap()).collect()
+}
+
+fn read(file: &str, coordinates: Option<Vec<f32>>) -> Vec<Case> {
+    let path = PathBuf::from(env!("CARGO_MANIFEST_DIR")).join("testdata").join(file);
+    let text = std::fs::read_to_string(path).unwrap();
+    let mut lines = text.lines();
+    let mut out = Vec::new();
+    while let Some(head) = lines.next() {
+        let h: Vec<&str> = head.split_whitespace().collect();
+        let number = |i: usize| h[i].parse::<usize>().unwrap();
+        out.push(Case {
+            name: h[0].into(),
+            dim: number(1),
+            options: Options {
+                min_cluster_size: number(2),
+                min_samples: number(3),
+                epsilon: h[4].parse().unwrap(),
+                selection: if h[5] == "leaf" { Selection::Leaf } else { Selection::ExcessOfMass },
+                allow_single_cluster: h[6] == "1",
+            },
+            points: coordinates.clone().unwrap_or_else(|| numbers(lines.next())),
+            labels: numbers(lines.next()),
+            one_tree: numbers(lines.next()),
+            probabilities: numbers(lines.next()),
+            python: numbers(lines.next()),
+            python_outliers: numbers(lines.next()),
+        });
+    }
+    out
+}
+
+fn cases() -> Vec<Case> {
+    let cases = read("golden.txt", None);
+    assert_eq!(cases.len(), 18);
+    cases
+}
+
+/// Agreement with scikit-learn: exact for the one spanning tree, and at least `least` (adjusted Rand index) with what it says
+/// on its own, where the spanning tree is another one of those that tie.
+fn check(c: &Case, least: f64) {
+    let ours = cluster(&c.points, c.dim, &c.options);
+    assert_eq!(ours.labels.len(), c.one_tree.len());
+    assert_eq!(adjusted_rand(&ours.labels, &c.one_tree), 1.0, "{}", c.name);
+    for (i, (p, expected)) in ours.probabilities.iter().zip(&c.probabilities).enumerate() {
+        assert!((p - expected).abs() < 2e-5, "{}: probability of point {i} is {p}, expected {expected}", c.name);
+    }
+    let own = adjusted_rand(&ours.labels, &c.labels);
+    eprintln!("{}: ARI {own:.4} with scikit-learn's own tree", c.name);
+    assert!(own >= least, "{}: ARI {own} with scikit-learn's own tree", c.name);
+    let own = adjusted_rand(&ours.labels, &c.python);
+    let apart = ours.outlier_scores.iter().zip(&c.python_outliers).filter(|(a, b)| (*a - *b).abs() > 1e-3).count();
+    let share = apart as f64 / c.python.len() as f64;
+    eprintln!("{}: ARI {own:.4} with hdbscan, {share:.3} of the outlier scores differ", c.name);
+    assert!(own >= least, "{}: ARI {own} with hdbscan", c.name);
+}
+
+#[test]
+fn labels_and_probabilities_agree_with_scikit_learn() {
+    for c in cases() {
+        // Ties matter most among many small clusters of a few points, and on grids.
+        let least = if c.name.contains("uniform") || c.name == "grid" { 0.92 } else { 0.98 };
+        check(&c, least);
+    }
+}
+
+#[test]
+fn the_documentations_own_set() {
+    let path =
+        PathBuf::from(env!("CARGO_MANIFEST_DIR")).join("../../../../shared/data/oracle/hdbscan_clusterable_data.npy");
+    let Ok(bytes) = std::fs::read(&path) else {
+        eprintln!("skipped: {} is not present", path.display());
+        return;
+    };
+    // f64 [2309, 2], C order.
+    let header = 10 + usize::from(u16::from_le_bytes([bytes[8], bytes[9]]));
+    let points = bytes[header..].chunks_exact(8).map(|c| f64::from_le_bytes(c.try_into().unwrap()) as f32).collect();
+    let case = read("clusterable.txt", Some(points)).remove(0);
+    check(&case, 1.0);
+}
+
+/// What Python's `approximate_predict` says of queries to the points of a case.
+struct Predicted {
+    name: String,
+    queries: Vec<f32>,
+    labels: Vec<i32>,
+    probabilities: Vec<f32>,
+}
+
+fn predictions() -> Vec<Predicted> {
+    let path = PathBuf::from(env!("CARGO_MANIFEST_DIR")).join("testdata/predict.txt");
+    let text = std::fs::read_to_string(path).unwrap();
+    let mut lines = text.lines();
+    let mut out = Vec::new();
+    while let Some(name) = lines.next() {
+        out.push(Predicted {
+            name: name.into(),
+            queries: numbers(lines.next()),
+            labels: numbers(lines.next()),
+            probabilities: numbers(lines.next()),
+        });
+    }
+    out
+}
+
+#[test]
+fn predictions_agree_with_python() {
+    let cases = cases();
+    let predictions = predictions();
+    assert_eq!(predictions.len(), 8);
+    for Predicted { name, queries, labels, probabilities } in predictions {
+        let c = cases.iter().find(|c| c.name == name).unwrap();
+        let clustering = cluster(&c.points, c.dim, &c.options);
+        // The libraries may number the same clusters differently.
+        let number: BTreeMap<i32, i32> = c.python.iter().copied().zip(clustering.labels.iter().copied()).collect();
+        let number = |l: &i32| if *l < 0 { -1 } else { number[l] };
+        let expected: Vec<i32> = labels.iter().map(number).collect();
+        let found = approximate_predict(&c.points, c.dim, &clustering, &c.options, &queries);
+        assert_eq!((found.labels.len(), found.labels.iter().filter(|&&l| l >= 0).count() > 50), (200, true), "{name}");
+        let apart = found.labels.iter().zip(&expected).filter(|(a, b)| a != b).count();
+        let error = found.probabilities.iter().zip(&probabilities).map(|(a, b)| (a - b).abs()).fold(0.0, f32::max);
+        eprintln!("{name}: {apart} of 200 predictions differ from hdbscan's, probabilities by at most {error:.1e}");
+        assert_eq!(found.labels, expected, "{name}");
+        // Where edges tie, the trees are two of those that there are, and a point may leave them at another lambda.
+        let ties = ["blobs2", "collinear"].contains(&name.as_str());
+        assert!(error < if ties { 0.2 } else { 1e-6 }, "{name}: probabilities differ by {error}");
+    }
+}
+
+/// Where the spanning tree is not unique, the libraries differ from themselves as soon as the points come in another order
+/// (scripts/make_hdbscan_golden.py --permutations: least ARI with themselves over 50 orders). One labelling for every order
+/// cannot be nearer to them than that on all; it must not be farther either.
+#[test]
+fn no_farther_from_the_libraries_than_they_are_from_themselves() {
+    let path = PathBuf::from(env!("CARGO_MANIFEST_DIR")).join("testdata/permutations.txt");
+    let text = std::fs::read_to_string(path).unwrap();
+    let cases = cases();
+    assert_eq!(text.lines().count(), cases.len());
+    for (line, c) in text.lines().zip(&cases) {
+        let fields: Vec<&str> = line.split_whitespace().collect();
+        assert_eq!(fields[0], c.name);
+        let ours = cluster(&c.points, c.dim, &c.options).labels;
+        for (library, labels, least) in [("scikit-learn", &c.labels, fields[1]), ("hdbscan", &c.python, fields[3])] {
+            let (own, least) = (adjusted_rand(&ours, labels), least.parse::<f64>().unwrap());
+            eprintln!("{}: ARI {own:.4} with {library}, which has at least {least:.4} with itself", c.name);
+            // The file has four digits.
+            assert!(own + 5e-5 >= least, "{}: {own}, {library} with itself {least}", c.name);
+        }
+    }
+}
+
+/// Clusters the points in another order and puts the result back into the first one.
+fn permuted(points: &[f32], dim: usize, order: &[usize], options: &Options) -> Clustering {
+    let shuffled: Vec<f32> = order.iter().flat_map(|&i| points[i * dim..(i + 1) * dim].iter().copied()).collect();
+    let mut r = cluster(&shuffled, dim, options);
+    let found = r.clone();
+    for (to, &i) in order.iter().enumerate() {
+        (r.labels[i], r.nodes[i]) = (found.labels[to], found.nodes[to]);
+        (r.probabilities[i], r.outlier_scores[i]) = (found.probabilities[to], found.outlier_scores[to]);
+    }
+    r
+}
+
+#[test]
+fn the_order_of_points_does_not_matter() {
+    for c in cases() {
+        let n = c.labels.len();
+        let mut order: Vec<usize> = (0..n).collect();
+        order.sort_by_key(|i| (i * 7919 + 13) % n);
+        assert_eq!(permuted(&c.points, c.dim, &order, &c.options), cluster(&c.points, c.dim, &c.options), "{}", c.name);
+    }
+}
+
+proptest! {
+    #![proptest_config(ProptestConfig::with_cases(100))]
+
+    /// Ties included: the points lie on a grid, many at the same place.
+    #[test]
+    fn the_order_of_points_does_not_matter_among_ties(
+        coordinates in prop::collection::vec((-6i8..6, -6i8..6), 2..120),
+        by in any::<u32>(),
+        min_cluster_size in 2usize..8,
+        min_samples in 1usize..6,
+        leaf in any::<bool>(),
+        allow_single_cluster in any::<bool>(),
+        epsilon in prop::sample::select(vec![0.0, 1.5]),
+    ) {
+        let points: Vec<f32> = coordinates.iter().flat_map(|&(x, y)| [f32::from(x), f32::from(y)]).collect();
+        let selection = if leaf { Selection::Leaf } else { Selection::ExcessOfMass };
+        let options = Options { min_cluster_size, min_samples, epsilon, selection, allow_single_cluster };
+        let mut order: Vec<usize> = (0..coordinates.len()).collect();
+        order.sort_by_key(|&i| (i as u32 ^ by).wrapping_mul(2_654_435_761));
+        let straight = cluster(&points, 2, &options);
+        prop_assert_eq!(&permuted(&points, 2, &order, &options), &straight);
+        // What any clustering keeps to.
+        let k = straight.selected.len() as i32;
+        prop_assert!(straight.labels.iter().all(|&l| (-1..k).contains(&l)));
+        for (l, p) in straight.labels.iter().zip(&straight.probabilities) {
+            prop_assert!((0.0..=1.0).contains(p) && (*l >= 0 || *p == 0.0));
+        }
+        let mut sizes = vec![0; k as usize];
+        straight.labels.iter().filter(|&&l| l >= 0).for_each(|&l| sizes[l as usize] += 1);
+        let root = straight.tree.points;
+        prop_assert!(sizes.iter().zip(&straight.selected).all(|(&s, &c)| s >= min_cluster_size || c == root));
+        // Every point leaves the tree once, and clusters lose what they hold.
+        let m = straight.tree.points;
+        let points_of = |edges: &[hdbscan_exact::CondensedEdge]| edges.iter().filter(|e| e.child < m).map(|e| e.size).sum::<u32>();
+        prop_assert_eq!(points_of(&straight.tree.edges) as usize, coordinates.len());
+        for e in straight.tree.edges.iter().filter(|e| e.child >= m) {
+            let held: u32 = straight.tree.edges.iter().filter(|x| x.parent == e.child).map(|x| x.size).sum();
+            prop_assert_eq!(held, e.size);
+            // As many points name a cluster or one below it as smallest as it holds.
+            let below = |node: u32| {
+                let mut at = node;
+                while at > e.child {
+                    at = straight.tree.edges.iter().find(|x| x.child == at).map_or(0, |x| x.parent);
+                }
+                at == e.child
+            };
+            prop_assert_eq!(straight.nodes.iter().filter(|&&n| below(n)).count() as u32, e.size);
+        }
+    }
+}
+
+/// `n` points on a line, densest in the middle, so that they are one leaf of the hierarchy.
+fn heap(centre: f32, n: usize) -> impl Iterator<Item = f32> {
+    (0..n).map(move |i| {
+        let t = i as f32 - n as f32 / 2.0 + 0.25;
+        centre + 0.002 * t * t.abs()
+    })
+}
+
+#[test]
+fn clusters_born_below_epsilon_are_joined() {
+    // Two pairs of heaps: gaps of 1.5 within a pair, 50 between the pairs.
+    let points: Vec<f32> = [0.0, 1.5, 50.0, 51.5].into_iter().flat_map(|c| heap(c, 20)).collect();
+    let o = Options { min_cluster_size: 5, min_samples: 3, selection: Selection::Leaf, ..Options::default() };
+    let apart = cluster(&points, 1, &o);
+    assert_eq!(apart.selected.len(), 4);
+    assert!((0..80).all(|i| apart.labels[i] == apart.labels[i / 20 * 20 + 10]), "{:?}", apart.labels);
+    for selection in [Selection::Leaf, Selection::ExcessOfMass] {
+        let joined = cluster(&points, 1, &Options { epsilon: 2.0, selection, ..o });
+        assert_eq!(joined.selected.len(), 2);
+        assert!(
+            (0..80).all(|i| joined.labels[i] == joined.labels[i / 40 * 40]) && joined.labels[79] != joined.labels[0]
+        );
+    }
+}
+
+#[test]
+fn lambdas_of_two_pairs_are_those_of_paper_and_pencil() {
+    // Gaps 1 and 2 within the pairs, 7 between them; core distances are the gaps.
+    let o = Options { min_cluster_size: 2, min_samples: 2, ..Options::default() };
+    let r = cluster(&[0.0, 1.0, 8.0, 10.0], 1, &o);
+    assert_eq!(r.labels, [0, 0, 1, 1]);
+    let mut found: Vec<_> = r.tree.edges.iter().map(|e| (e.parent, e.child, e.lambda, e.size)).collect();
+    found.sort_by_key(|f| (f.0, f.1));
+    let (first, second) = (r.selected[0], r.selected[1]);
+    let expected = [
+        (4, 5, 1.0 / 7.0, 2),
+        (4, 6, 1.0 / 7.0, 2),
+        (first, 0, 1.0, 1),
+        (first, 1, 1.0, 1),
+        (second, 2, 0.5, 1),
+        (second, 3, 0.5, 1),
+    ];
+    assert_eq!(found, expected);
+    assert_eq!(r.probabilities, [1.0; 4]);
+}
+
+#[test]
+fn threads_do_not_matter() {
+    for c in &cases()[..4] {
+        let run = |threads| {
+            let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
+            pool.install(|| cluster(&c.points, c.dim, &c.options))
+        };
+        assert_eq!(run(1), run(3));
+    }
+}
+
+#[test]
+fn degenerate_sets_are_fine() {
+    let o = Options { min_cluster_size: 3, min_samples: 3, ..Options::default() };
+    assert!(cluster(&[], 2, &o).labels.is_empty());
+    assert_eq!(cluster(&[1.0, 2.0], 2, &o).labels, [-1]);
+    // Equal points: no hierarchy above them, so one cluster where one is allowed and noise where not.
+    assert_eq!(cluster(&[1.0; 20], 2, &o).labels, [-1; 10]);
+    assert_eq!(cluster(&[1.0; 20], 2, &Options { allow_single_cluster: true, ..o }).labels, [0; 10]);
+    // Two heaps of equal points.
+    let heaps: Vec<f32> = (0..12).map(|i| if i < 6 { 0.0 } else { 9.0 }).collect();
+    let two = cluster(&heaps, 1, &o);
+    assert_eq!(two.labels, [0, 0, 0, 0, 0, 0, 1, 1, 1, 1, 1, 1]);
+    assert!(two.probabilities.iter().all(|&p| p == 1.0));
+    // Zero and minus zero are one place; the largest numbers have distances.
+    assert_eq!(core_distances(&[0.0, -0.0, 1.0], 1, 2), [0.0, 0.0, 1.0]);
+    let far = cluster(&[-3e38, -3e38, -3e38, 3e38, 3e38, 3e38], 1, &o);
+    assert_eq!(far.labels, [0, 0, 0, 1, 1, 1]);
+}
+
+#[test]
+fn a_complete_graph_gives_the_clusters_of_the_points() {
+    for c in cases().iter().filter(|c| c.labels.len() <= 500 && !["grid", "duplicates"].contains(&c.name.as_str())) {
+        let n = c.labels.len();
+        let row = |i: usize| &c.points[i * c.dim..(i + 1) * c.dim];
+        // A graph's points are the caller's: named lexicographically here, as the points are.
+        let mut order: Vec<usize> = (0..n).collect();
+        order.sort_by(|&a, &b| row(a).partial_cmp(row(b)).unwrap());
+        let core = core_distances(&c.points, c.dim, c.options.min_samples);
+        let mut edges = Vec::new();
+        for a in 0..n {
+            for b in a + 1..n {
+                let (i, j) = (order[a], order[b]);
+                let d: f64 = row(i).iter().zip(row(j)).map(|(x, y)| (f64::from(*x) - f64::from(*y)).powi(2)).sum();
+                edges.push(Edge::new(a as u32, b as u32, d.sqrt().max(core[i]).max(core[j])));
+            }
+        }
+        let graph = cluster_graph(n, &edges[..], &c.options);
+        let points = cluster(&c.points, c.dim, &c.options);
+        let expected: Vec<i32> = order.iter().map(|&i| points.labels[i]).collect();
+        assert_eq!(graph.labels, expected, "{}", c.name);
+    }
+}
+
+#[test]
+fn parts_of_a_graph_are_apart_however_near_they_are() {
+    // Two chains of ten points and a lone pair, without an edge between them.
+    let chain = |from: u32| (from..from + 9).map(|i| Edge::new(i, i + 1, 0.5));
+    let edges: Vec<Edge> = chain(0).chain(chain(10)).chain([Edge::new(20, 21, 0.1)]).collect();
+    let o = Options { min_cluster_size: 5, ..Options::default() };
+    for options in [o, Options { epsilon: 100.0, ..o }, Options { selection: Selection::Leaf, ..o }] {
+        let r = cluster_graph(22, &edges[..], &options);
+        assert_eq!(r.selected.len(), 2);
+        assert!(
+            r.labels[..10].iter().all(|&l| l == r.labels[0]) && r.labels[10..20].iter().all(|&l| l == r.labels[10])
+        );
+        assert_ne!(r.labels[0], r.labels[10]);
+        assert_eq!(r.labels[20..], [-1, -1]);
+        assert!(r.tree.edges.iter().all(|e| e.child < 22 || e.lambda == 0.0));
+    }
+    assert!(cluster_graph(0, [], &o).labels.is_empty());
+    assert_eq!(cluster_graph(3, [], &o).labels, [-1; 3]);
+}
+
+#[test]
+fn outlier_scores_are_those_of_paper_and_pencil() {
+    // Gaps 1, 1, 2 and 6 within a heap, then a pair far off: the core distances (2 samples) are the gaps to the nearest.
+    let o = Options { min_cluster_size: 2, min_samples: 2, ..Options::default() };
+    let r = cluster(&[0.0, 1.0, 2.0, 4.0, 10.0, 100.0, 101.0], 1, &o);
+    // 0, 1, 2 leave at distance 1, 4 at 2, 10 at 6; the pair at 1.
+    let expected = [0.0, 0.0, 0.0, 0.5, 1.0 - 1.0 / 6.0, 0.0, 0.0];
+    assert!(
+        r.outlier_scores.iter().zip(expected).all(|(a, b): (&f32, f32)| (a - b).abs() < 1e-6),
+        "{:?}",
+        r.outlier_scores
+    );
+    assert_eq!(cluster(&[1.0; 5], 1, &o).outlier_scores, [0.0; 5]);
+}
+
+#[test]
+fn predictions_fall_into_the_cluster_around_them() {
+    let points: Vec<f32> = [0.0, 50.0].into_iter().flat_map(|c| heap(c, 30)).collect();
+    let o = Options { min_cluster_size: 5, min_samples: 3, ..Options::default() };
+    let c = cluster(&points, 1, &o);
+    let (a, b) = (c.labels[15], c.labels[45]);
+    assert!(a >= 0 && b >= 0 && a != b);
+    let p = approximate_predict(&points, 1, &c, &o, &[0.001, 50.001, 25.0, -1e6, 0.3]);
+    assert_eq!(p.labels[..2], [a, b]);
+    assert_eq!(p.labels[4], a);
+    // Halfway is nearer to one than they are to each other; what is farther off than that belongs to neither.
+    assert!(p.labels[2] >= 0 && p.probabilities[2] < 1e-3);
+    assert_eq!((p.labels[3], p.probabilities[3]), (-1, 0.0));
+    assert!(p.probabilities[0] > p.probabilities[4] && p.probabilities[4] > 0.0);
+    assert!(approximate_predict(&points, 1, &c, &o, &[]).labels.is_empty());
+    let none = cluster(&[], 1, &o);
+    assert_eq!(approximate_predict(&[], 1, &none, &o, &[1.0]).labels, [-1]);
+}
+
+#[test]
+fn points_asked_about_again_mostly_keep_their_clusters() {
+    for c in cases().iter().filter(|c| c.name.starts_with("blobs") || c.name == "moons") {
+        let clustering = cluster(&c.points, c.dim, &c.options);
+        let again = approximate_predict(&c.points, c.dim, &clustering, &c.options, &c.points);
+        let own = adjusted_rand(&again.labels, &clustering.labels);
+        // A query adds to the density, which moves the rims of small clusters.
+        assert!(own > if c.options.selection == Selection::Leaf { 0.8 } else { 0.95 }, "{}: ARI {own}", c.name);
+    }
+}
+
+/// A part of the graph that nothing joins to the rest is a root of its own: it is not the cluster where it divides.
+#[test]
+fn a_part_that_divides_gives_way_to_what_it_divides_into() {
+    let chain = |from: u32, to: u32| (from..to - 1).map(|a| Edge::new(a, a + 1, 1.0));
+    // Two chains with a bridge hardly longer than their links, and an island.
+    let edges: Vec<Edge> =
+        chain(0, 40).chain(chain(40, 80)).chain(chain(80, 90)).chain([Edge::new(39, 40, 1.2)]).collect();
+    let options = Options { min_cluster_size: 5, ..Options::default() };
+    let labels = cluster_graph(90, &edges[..], &options).labels;
+    assert!(labels.iter().all(|l| *l >= 0), "{labels:?}");
+    let of = |range: std::ops::Range<usize>| labels[range].iter().copied().collect::<std::collections::BTreeSet<_>>();
+    assert!([of(0..40), of(40..80), of(80..90)].iter().all(|l| l.len() == 1), "{labels:?}");
+    assert_eq!(of(0..90).len(), 3, "{labels:?}");
+}

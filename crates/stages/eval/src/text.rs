@@ -1,0 +1,332 @@
+//! Where text features come from: a CLIP text encoder, or a table made with one.
+
+use gs_io::{Error, IoContext, Result};
+use onnx_models::{ClipText, EngineOptions};
+use std::collections::BTreeMap;
+use std::io::Read;
+use std::path::{Path, PathBuf};
+
+/// A source of text features.
+pub enum TextSource {
+    /// A live encoder: any words.
+    Clip(Box<ClipText>),
+    /// A table of names, such as OpenGaussian's text_features.json: only its names.
+    Table(TextTable),
+}
+
+/// Text features by name.
+#[derive(Debug, Clone, PartialEq)]
+pub struct TextTable {
+    path: PathBuf,
+    dim: usize,
+    features: BTreeMap<String, Vec<f32>>,
+}
+
+impl TextTable {
+    /// Reads a table: a JSON object of name -> list of numbers, as OpenGaussian's text_features.json, or a NumPy `.npz`
+    /// with an array per name, of shape `[d]` or `[1, d]`. All vectors have one length.
+    ///
+    /// # Errors
+    /// When the file is missing or not such a table, is empty, its vectors differ in length, or a number is not finite.
+    pub fn read(path: impl AsRef<Path>) -> Result<Self> {
+        let path = path.as_ref();
+        let bytes = std::fs::read(path).at("read", path)?;
+        let features = if bytes.starts_with(b"PK") {
+            read_npz(&bytes).map_err(|e| e.file(path))?
+        } else {
+            serde_json::from_slice(&bytes).map_err(|e| {
+                Error::new(format!("not a table of text features: {e}"))
+                    .file(path)
+                    .expected("a JSON object of name -> list of numbers, or an npz of name -> vector")
+            })?
+        };
+        Self::new(path.to_path_buf(), features)
+    }
+
+    fn new(path: PathBuf, features: BTreeMap<String, Vec<f32>>) -> Result<Self> {
+        let dim = features.values().next().map_or(0, Vec::len);
+        if dim == 0 {
+            return Err(Error::new("no text features").file(path).hint("give a table with at least one name"));
+        }
+        for (name, v) in &features {
+            if v.len() != dim {
+                let e = Error::new("a vector of another length").file(path).field(name);
+                return Err(e.found(v.len()).expected(dim));
+            }
+            if let Some(bad) = v.iter().find(|x| !x.is_finite()) {
+                return Err(Error::new("a number is not finite").file(path).field(name).found(bad));
+            }
+        }
+        Ok(Self { path, dim, features })
+    }
+}
+
+/// Largest array of an npz that is believed, in bytes: a vector of text features has a few thousand.
+const LARGEST_ARRAY: u64 = 1 << 24;
+
+fn read_npz(bytes: &[u8]) -> Result<BTreeMap<String, Vec<f32>>> {
+    let broken =
+        |e: zip::result::ZipError| Error::new(format!("not an npz file: {e}")).hint("write it with numpy.savez");
+    let mut archive = zip::ZipArchive::new(std::io::Cursor::new(bytes)).map_err(broken)?;
+    let mut features = BTreeMap::new();
+    // All arrays together: entries may be packed a thousandfold, and several may be the same bytes of the file.
+    let mut left = (64 * bytes.len() as u64).max(LARGEST_ARRAY);
+    for i in 0..archive.len() {
+        let mut entry = archive.by_index(i).map_err(broken)?;
+        let name = entry.name().trim_end_matches(".npy").to_string();
+        let mut data = Vec::new();
+        // Not the size that the file claims, but what comes out.
+        let most = LARGEST_ARRAY.min(left);
+        let read = (&mut entry).take(most + 1).read_to_end(&mut data);
+        read.map_err(|e| Error::new(format!("not an npz file: {e}")).field(&name).hint("write it with numpy.savez"))?;
+        if data.len() as u64 > most {
+            return Err(Error::new("too large for a text feature").field(&name).expected("a vector per name"));
+        }
+        left -= data.len() as u64;
+        let array = gs_io::npy::parse(&data).map_err(|e| e.field(&name))?;
+        if !matches!(array.shape[..], [_] | [1, _]) {
+            let e = Error::new("not a vector").field(&name).found(format!("{:?}", array.shape));
+            return Err(e.expected("[d] or [1, d]"));
+        }
+        features.insert(name, array.data);
+    }
+    Ok(features)
+}
+
+impl TextSource {
+    /// Opens what the options name: a CLIP folder or a table.
+    ///
+    /// # Errors
+    /// When neither or both are given, or the one given cannot be used.
+    pub fn open(clip: Option<&Path>, table: Option<&Path>, engine: &EngineOptions) -> Result<Self> {
+        match (clip, table) {
+            (Some(clip), None) => Ok(Self::Clip(Box::new(ClipText::open(clip, engine)?))),
+            (None, Some(table)) => Ok(Self::Table(TextTable::read(table)?)),
+            (None, None) => {
+                Err(Error::new("no source of text features").field("--clip").expected("--clip or --text-features"))
+            }
+            (Some(_), Some(_)) => Err(Error::new("two sources of text features")
+                .field("--clip, --text-features")
+                .hint("give one of them")),
+        }
+    }
+
+    /// Numbers per feature.
+    pub fn dim(&self) -> usize {
+        match self {
+            Self::Clip(clip) => clip.dimension(),
+            Self::Table(table) => table.dim,
+        }
+    }
+
+    /// What it is, for people.
+    pub fn describe(&self) -> String {
+        match self {
+            Self::Clip(clip) if clip.config().name.is_empty() => "CLIP text encoder".into(),
+            Self::Clip(clip) => format!("CLIP text encoder {}", clip.config().name),
+            Self::Table(table) => format!("table of {} text features", table.features.len()),
+        }
+    }
+
+    /// Checks that descriptors of `dim` numbers can be compared with this source.
+    ///
+    /// # Errors
+    /// When there are no descriptors, or the dimensions differ.
+    pub fn check_dim(&self, dim: usize, instances: &Path) -> Result<()> {
+        let e = |what: &str| Error::new(what).file(instances).field("descriptor").found(format!("dimension {dim}"));
+        if dim == 0 {
+            return Err(e("the instances have no language features")
+                .hint("run mask-embed embed --clip (or add *_f.npy to the masks folder), then cluster-match again"));
+        }
+        if dim != self.dim() {
+            return Err(e("the text features are of another model than the masks'")
+                .expected(format!("{} ({})", self.dim(), self.describe()))
+                .hint("text and masks must be encoded with the two halves of one CLIP model"));
+        }
+        Ok(())
+    }
+
+    /// Features of `texts`, in order; none for a text that a table does not hold.
+    ///
+    /// # Errors
+    /// When the engine fails.
+    pub fn encode(&self, texts: &[String]) -> Result<Vec<Option<Vec<f32>>>> {
+        match self {
+            Self::Clip(clip) => {
+                let all = clip.encode(texts)?;
+                Ok(all.chunks_exact(clip.dimension()).map(|c| Some(c.to_vec())).collect())
+            }
+            Self::Table(table) => Ok(texts.iter().map(|t| table.features.get(t).cloned()).collect()),
+        }
+    }
+
+    /// Features of `texts` where each is put into the place of `{}` in every template, such as "a photo of a {}", and the
+    /// unit features of what comes out are averaged and scaled to unit length. Without templates: [`Self::encode`].
+    ///
+    /// # Errors
+    /// As [`Self::encode`].
+    pub fn encode_in(&self, templates: &[String], texts: &[String]) -> Result<Vec<Option<Vec<f32>>>> {
+        if templates.is_empty() {
+            return self.encode(texts);
+        }
+        let filled: Vec<String> = texts.iter().flat_map(|t| templates.iter().map(|p| p.replace("{}", t))).collect();
+        let features = self.encode(&filled)?;
+        Ok(features.chunks_exact(templates.len()).map(mean_direction).collect())
+    }
+
+    /// All names, where the source is a table.
+    pub fn names(&self) -> Vec<String> {
+        match self {
+            Self::Clip(_) => Vec::new(),
+            Self::Table(table) => table.features.keys().cloned().collect(),
+        }
+    }
+
+    /// Which features exactly: the content hash of the encoder's graph or of the table, for reports.
+    ///
+    /// # Errors
+    /// When the table cannot be read again.
+    pub fn hash(&self) -> Result<String> {
+        match self {
+            Self::Clip(clip) => Ok(clip.hash().into()),
+            Self::Table(table) => gs_io::hash_file(&table.path),
+        }
+    }
+
+    /// The error for a text that [`Self::encode`] knows no feature of; it names a few that it knows.
+    pub fn unknown(&self, text: &str) -> Error {
+        let mut e = Error::new("no such text in the table").field("--text").found(format!("{text:?}"));
+        if let Self::Table(table) = self {
+            let some: Vec<String> = closest(text, table.features.keys()).map(|n| format!("{n:?}")).collect();
+            let n = table.features.len();
+            e = e.file(&table.path).expected(format!("one of its {n} names, such as {}", some.join(", ")));
+        }
+        e.hint("a CLIP text encoder (--clip) takes any words")
+    }
+}
+
+/// The unit mean of unit features; none when one is missing.
+fn mean_direction(features: &[Option<Vec<f32>>]) -> Option<Vec<f32>> {
+    let unit = |v: &mut Vec<f64>| {
+        let norm = v.iter().map(|x| x * x).sum::<f64>().sqrt();
+        v.iter_mut().for_each(|x| *x /= if norm > 0.0 { norm } else { 1.0 });
+    };
+    let mut sum = vec![0.0; features.first()?.as_ref()?.len()];
+    for feature in features {
+        let mut one: Vec<f64> = feature.as_ref()?.iter().map(|&x| f64::from(x)).collect();
+        unit(&mut one);
+        sum.iter_mut().zip(&one).for_each(|(s, x)| *s += x);
+    }
+    unit(&mut sum);
+    Some(sum.into_iter().map(|x| x as f32).collect())
+}
+
+/// The five names that share most letters with `text`, by Dice's coefficient of letter pairs.
+fn closest<'a>(text: &str, names: impl Iterator<Item = &'a String>) -> impl Iterator<Item = &'a String> {
+    let pairs = |s: &str| -> std::collections::BTreeSet<(char, char)> {
+        let s = s.to_lowercase();
+        s.chars().zip(s.chars().skip(1)).collect()
+    };
+    let wanted = pairs(text);
+    let mut ranked: Vec<(f64, &String)> = names
+        .map(|n| {
+            let p = pairs(n);
+            (2.0 * p.intersection(&wanted).count() as f64 / (p.len() + wanted.len()).max(1) as f64, n)
+        })
+        .collect();
+    ranked.sort_by(|a, b| b.0.total_cmp(&a.0).then(a.1.cmp(b.1)));
+    ranked.into_iter().take(5).map(|r| r.1)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn table(json: &str) -> Result<TextSource> {
+        let dir = tempfile::tempdir().unwrap();
+        let path = dir.path().join("text.json");
+        std::fs::write(&path, json).unwrap();
+        TextSource::open(None, Some(&path), &EngineOptions::default())
+    }
+
+    #[test]
+    fn a_table_knows_its_names_and_suggests_near_ones() {
+        let t = table(r#"{"coffee mug": [1, 0], "coffee": [0, 1], "sheep": [0.6, 0.8]}"#).unwrap();
+        let found = t.encode(&["sheep".into(), "mug".into()]).unwrap();
+        assert_eq!(found, [Some(vec![0.6, 0.8]), None]);
+        let e = t.unknown("coffe mugg").to_string();
+        assert!(e.contains("one of its 3 names, such as \"coffee mug\", \"coffee\""), "{e}");
+        assert!(t.check_dim(2, Path::new("i")).is_ok());
+        let e = t.check_dim(512, Path::new("i")).unwrap_err().to_string();
+        assert!(e.contains("found dimension 512, expected 2"), "{e}");
+        let e = t.check_dim(0, Path::new("i")).unwrap_err().to_string();
+        assert!(e.contains("no language features") && e.contains("mask-embed"), "{e}");
+    }
+
+    fn npz(entries: &[(&str, &[usize], &[f32])]) -> Result<TextSource> {
+        let dir = tempfile::tempdir().unwrap();
+        let path = dir.path().join("text.npz");
+        let mut archive = zip::ZipWriter::new(std::fs::File::create(&path).unwrap());
+        for (name, shape, data) in entries {
+            let array = dir.path().join("a.npy");
+            gs_io::npy::write_f32(&array, shape, data).unwrap();
+            archive.start_file(format!("{name}.npy"), zip::write::SimpleFileOptions::default()).unwrap();
+            std::io::Write::write_all(&mut archive, &std::fs::read(&array).unwrap()).unwrap();
+        }
+        archive.finish().unwrap();
+        TextSource::open(None, Some(&path), &EngineOptions::default())
+    }
+
+    #[test]
+    fn an_npz_is_a_table_too() {
+        let t = npz(&[("coffee mug", &[2], &[1.0, 0.0]), ("sheep", &[1, 2], &[0.6, 0.8])]).unwrap();
+        assert_eq!(t.encode(&["sheep".into()]).unwrap(), [Some(vec![0.6, 0.8])]);
+        assert_eq!((t.dim(), t.names()), (2, vec!["coffee mug".to_string(), "sheep".into()]));
+        let e = npz(&[("a", &[2, 2], &[0.0; 4])]).err().unwrap().to_string();
+        assert!(e.contains("text.npz: a: not a vector; found [2, 2], expected [d] or [1, d]"), "{e}");
+        let e = npz(&[("a", &[1], &[f32::NAN])]).err().unwrap().to_string();
+        assert!(e.contains("a: a number is not finite"), "{e}");
+        assert!(npz(&[]).err().unwrap().to_string().contains("no text features"));
+        assert!(table("PK\u{3}\u{4}cut").err().unwrap().to_string().contains("not an npz file"));
+    }
+
+    #[test]
+    fn templates_are_averaged_as_directions() {
+        let t = table(r#"{"a cup": [3, 0], "the cup": [0, 1], "cup": [1, 1]}"#).unwrap();
+        let templates = ["a {}".to_string(), "the {}".into()];
+        let found = t.encode_in(&templates, &["cup".into(), "pot".into()]).unwrap();
+        let half = std::f32::consts::FRAC_1_SQRT_2;
+        assert_eq!(found, [Some(vec![half, half]), None], "each template counts alike, whatever its length");
+        assert_eq!(t.encode_in(&[], &["cup".into()]).unwrap(), [Some(vec![1.0, 1.0])]);
+    }
+
+    #[test]
+    fn bad_tables_are_errors() {
+        for (json, part) in [
+            ("[1]", "not a table"),
+            ("{}", "no text features"),
+            (r#"{"a": []}"#, "no text features"),
+            (r#"{"a": [1], "b": [1, 2]}"#, "b: a vector of another length; found 2, expected 1"),
+            (r#"{"a": [1e60]}"#, "number out of range"),
+            (r#"{"a": ["x"]}"#, "not a table"),
+        ] {
+            let e = table(json).err().unwrap().to_string();
+            assert!(e.contains(part), "{json}: {e}");
+        }
+    }
+
+    #[test]
+    fn opengaussians_table_reads() {
+        let path =
+            Path::new(env!("CARGO_MANIFEST_DIR")).join("../../../../shared/data/text/opengaussian_text_features.json");
+        if !path.exists() {
+            eprintln!("skipped: no opengaussian_text_features.json in the shared data");
+            return;
+        }
+        let t = TextSource::open(None, Some(&path), &EngineOptions::default()).unwrap();
+        assert_eq!(t.dim(), 512);
+        let v = t.encode(&["coffee mug".into()]).unwrap().remove(0).unwrap();
+        let norm: f32 = v.iter().map(|x| x * x).sum::<f32>().sqrt();
+        assert!((norm - 1.0).abs() < 1e-3);
+    }
+}

@@ -1,0 +1,418 @@
+//! The protocols on a synthetic scene, against `scripts/protocol_oracle.py`. Where there is no Python with numpy and
+//! OpenCV 4.8 to 4.10 (CAGS_PYTHON names one), the numbers it gave are the golden ones of `testdata/protocols.json`.
+
+use crate::fixture::provenance;
+use artifacts::{Instances, TruePoints, TrueScene};
+use gs_io::{hash_bytes, hash_file};
+use gs_scene::Gaussians;
+use serde_json::{Map, Value, json};
+use std::path::{Path, PathBuf};
+use std::process::{Command, Output};
+
+/// The ids of the classes that things take in turn; 40 is no class of any set.
+const NYU: [u32; 9] = [1, 2, 7, 5, 11, 33, 40, 3, 34];
+const NAMES: [(u32, &str); 19] = artifacts::NYU40;
+const DIM: usize = 24;
+
+struct Scene {
+    dir: tempfile::TempDir,
+}
+
+impl Scene {
+    /// A synthetic room; a Gaussian on every seventh or so point of its surfaces; instances as a method might find them:
+    /// two things joined, one cut in two, noise, one without a descriptor.
+    fn new() -> Self {
+        let dir = tempfile::tempdir().unwrap();
+        let scene = dir.path().join("scene0000_00");
+        let faults = synth_scene::masks::Faults { granularity: 0.5, boundary: 1, missing: 0.1, spurious: 0.0 };
+        let options = synth_scene::write::Options {
+            seed: 3,
+            objects: 6,
+            views: 5,
+            width: 120,
+            height: 90,
+            points: 50,
+            faults,
+            label_every: 2,
+            ..synth_scene::write::Options::default()
+        };
+        synth_scene::write::run(&stage::Stage::silent("synth-scene"), &scene, &options).unwrap();
+        let truth = TruePoints::read(scene.join("truth/points.safetensors")).unwrap();
+        let things = TrueScene::read(scene.join("truth/scene.json")).unwrap().objects;
+        let step = (truth.position.len() / 2500).max(1);
+        let points: Vec<usize> = (0..truth.position.len()).step_by(step).collect();
+        let this = Self { dir };
+        let mut g = Gaussians::default();
+        let mut label = Vec::new();
+        let (merged, cut) = (things.len() as i32 - 1, things.len() as i32 - 3);
+        for (n, &p) in points.iter().enumerate() {
+            let thing = truth.instance[p];
+            g.means.push(truth.position[p]);
+            let flat = [0.03f32, 0.02, 0.01 + 0.01 * (n % 3) as f32];
+            g.log_scales.push(flat.map(f32::ln));
+            g.rotations.push([1.0, 0.1 * (n % 5) as f32, 0.2, 0.05 * (n % 7) as f32]);
+            // Every eleventh is faint.
+            g.opacity_logits.push(if n % 11 == 0 { -3.0 } else { 3.0 });
+            g.sh.extend([0.0; 3]);
+            label.push(match thing {
+                _ if n % 13 == 0 => -1,
+                t if t == merged => merged - 1,
+                t if t == cut && n % 3 == 0 => merged,
+                t => t,
+            });
+        }
+        gs_scene::ply::write_gaussians(this.geometry(), &g, &[]).unwrap();
+        let k = things.len();
+        let mut descriptor = vec![0.0f32; k * DIM];
+        for i in 0..k {
+            descriptor[i * DIM + i % DIM] = 1.0;
+            descriptor[i * DIM + (i + 1) % DIM] = 0.3;
+        }
+        descriptor[4 * DIM..5 * DIM].fill(0.0);
+        let instances = Instances {
+            dim: DIM,
+            descriptor,
+            support: (0..k as u32).map(|i| if i == 1 { 1 } else { 3 + i }).collect(),
+            score: (0..k).map(|i| 0.2 + 0.1 * ((i * 5) % 7) as f32).collect(),
+            count: (0..k as i32).map(|i| label.iter().filter(|&&l| l == i).count() as u32).collect(),
+            centroid: vec![[0.0; 3]; k],
+            bbox_min: vec![[0.0; 3]; k],
+            bbox_max: vec![[0.0; 3]; k],
+            label,
+            ..Instances::default()
+        };
+        instances.write(this.instances(), provenance(&this.geometry(), &this.scene())).unwrap();
+        // Texts: names of things, without the last but one, which is then never asked for; and the names of classes.
+        let axis = |i: usize| -> Vec<f32> { (0..DIM).map(|d| if d == i % DIM { 1.0 } else { 0.1 }).collect() };
+        let mut texts = Map::new();
+        for t in things.iter().filter(|t| t.id as usize != k - 2) {
+            texts.insert(t.name.clone(), json!(axis(t.id as usize)));
+        }
+        for (id, name) in NAMES {
+            let thing = NYU.iter().position(|&n| n == id).unwrap_or(20);
+            texts.insert(name.into(), json!(axis(thing)));
+        }
+        std::fs::write(this.texts(), Value::Object(texts).to_string()).unwrap();
+        // The scan: vertices are the Gaussians' centres.
+        let mut ply = format!(
+            "ply\nformat binary_little_endian 1.0\nelement vertex {}\nproperty float x\nproperty float y\nproperty float z\n\
+             property uchar red\nproperty uchar green\nproperty uchar blue\nproperty uchar alpha\nproperty ushort label\n\
+             element face 0\nproperty list uchar int vertex_indices\nend_header\n",
+            points.len()
+        )
+        .into_bytes();
+        for (n, &p) in points.iter().enumerate() {
+            ply.extend(truth.position[p].iter().flat_map(|v| v.to_le_bytes()));
+            ply.extend([9, 9, 9, 255]);
+            let class = if n % 17 == 0 { 0 } else { NYU[truth.instance[p] as usize % NYU.len()] };
+            ply.extend((class as u16).to_le_bytes());
+        }
+        std::fs::write(scene.join("scene0000_00_vh_clean_2.labels.ply"), ply).unwrap();
+        // Two segments a thing; every nineteenth vertex is of a segment that nobody owns.
+        let segment =
+            |(n, &p): (usize, &usize)| if n % 19 == 0 { 9999 } else { 2 * truth.instance[p] + (n % 2) as i32 };
+        let segments: Vec<i32> = points.iter().enumerate().map(segment).collect();
+        let segs = json!({"params": {}, "sceneId": "scene0000_00", "segIndices": segments});
+        std::fs::write(scene.join("scene0000_00_vh_clean_2.0.010000.segs.json"), segs.to_string()).unwrap();
+        let groups: Vec<Value> = things
+            .iter()
+            .map(|t| json!({"id": t.id, "objectId": t.id, "segments": [2 * t.id, 2 * t.id + 1], "label": t.class}))
+            .collect();
+        let aggregation = json!({"sceneId": "scene0000_00", "segGroups": groups});
+        std::fs::write(scene.join("scene0000_00.aggregation.json"), aggregation.to_string()).unwrap();
+        this
+    }
+
+    fn at(&self, name: &str) -> PathBuf {
+        self.dir.path().join(name)
+    }
+    fn scene(&self) -> PathBuf {
+        self.at("scene0000_00")
+    }
+    fn geometry(&self) -> PathBuf {
+        self.at("geometry.ply")
+    }
+    fn instances(&self) -> PathBuf {
+        self.at("instances.safetensors")
+    }
+    fn texts(&self) -> PathBuf {
+        self.at("texts.json")
+    }
+
+    fn run(&self, command: &str, rest: &[&str]) -> Output {
+        // One protocol does not write over the results of another.
+        let _ = std::fs::remove_dir_all(self.at("out"));
+        let mut c = Command::new(env!("CARGO_BIN_EXE_eval"));
+        c.arg(command).arg("--instances").arg(self.instances()).arg("--geometry").arg(self.geometry());
+        c.arg("--scene").arg(self.scene()).arg("--text-features").arg(self.texts()).arg("--out").arg(self.at("out"));
+        c.args(rest).output().unwrap()
+    }
+
+    fn metrics(&self, command: &str, rest: &[&str]) -> Value {
+        let o = self.run(command, rest);
+        assert!(o.status.success(), "{}", String::from_utf8_lossy(&o.stderr));
+        serde_json::from_slice(&std::fs::read(self.at("out/metrics.json")).unwrap()).unwrap()
+    }
+
+    /// Content of everything that the scores depend on; of instances the values, whatever else their file holds.
+    fn hash(&self) -> String {
+        let (i, _) = Instances::read(self.instances()).unwrap();
+        let mut all = format!("{:?}{:?}{:?}{:?}", i.label, i.descriptor, i.support, i.score);
+        for name in ["geometry.ply", "texts.json"] {
+            all += &hash_file(self.at(name)).unwrap();
+        }
+        let mut labels: Vec<PathBuf> =
+            std::fs::read_dir(self.scene().join("label")).unwrap().map(|e| e.unwrap().path()).collect();
+        labels.retain(|p| p.extension().is_some_and(|e| e == "json"));
+        labels.sort();
+        labels.iter().for_each(|p| all += &hash_file(p).unwrap());
+        hash_bytes(all.as_bytes())
+    }
+}
+
+/// A Python that has what the oracle needs.
+fn python() -> Option<String> {
+    let python = std::env::var("CAGS_PYTHON").unwrap_or_else(|_| "python3".into());
+    let check = "import numpy, cv2; v = tuple(map(int, cv2.__version__.split('.')[:2])); assert (4, 8) <= v <= (4, 10)";
+    let found = Command::new(&python).args(["-c", check]).output().is_ok_and(|o| o.status.success());
+    found.then_some(python)
+}
+
+/// Runs the oracle where it can be run; else looks the case up among the golden values.
+struct Oracle {
+    python: Option<String>,
+    golden: Value,
+    hash: String,
+    made: Map<String, Value>,
+}
+
+fn golden_path() -> PathBuf {
+    Path::new(env!("CARGO_MANIFEST_DIR")).join("testdata/protocols.json")
+}
+
+impl Oracle {
+    fn new(scene: &Scene) -> Self {
+        let golden =
+            std::fs::read(golden_path()).ok().and_then(|b| serde_json::from_slice(&b).ok()).unwrap_or_default();
+        Self { python: python(), golden, hash: scene.hash(), made: Map::new() }
+    }
+
+    fn ask(&mut self, case: &str, arguments: &[&str]) -> Option<Value> {
+        let Some(python) = &self.python else {
+            if self.golden["hash"] != self.hash.as_str() {
+                eprintln!(
+                    "skipped {case}: no Python with OpenCV 4.8 to 4.10, and the golden values are of another scene"
+                );
+                return None;
+            }
+            return Some(self.golden["cases"][case].clone());
+        };
+        let script = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../../scripts/protocol_oracle.py");
+        let o = Command::new(python).arg(script).args(arguments).output().unwrap();
+        assert!(o.status.success(), "{}", String::from_utf8_lossy(&o.stderr));
+        let value: Value = serde_json::from_slice(&o.stdout).unwrap();
+        self.made.insert(case.into(), value.clone());
+        Some(value)
+    }
+
+    /// With CAGS_GOLDEN set, writes what the oracle said as the new golden values.
+    fn finish(self) {
+        if std::env::var_os("CAGS_GOLDEN").is_some() {
+            let all = json!({"hash": self.hash, "cases": self.made});
+            std::fs::write(golden_path(), serde_json::to_string_pretty(&all).unwrap() + "\n").unwrap();
+        }
+    }
+}
+
+#[track_caller]
+fn same(ours: &Value, theirs: &Value, what: &str) {
+    match (ours.as_f64(), theirs.as_f64()) {
+        (Some(a), Some(b)) => assert!((a - b).abs() < 1e-6, "{what}: {a} and {b}"),
+        _ => assert_eq!(ours, theirs, "{what}"),
+    }
+}
+
+#[test]
+fn the_protocols_agree_with_an_independent_implementation() {
+    let s = Scene::new();
+    let mut oracle = Oracle::new(&s);
+    let text = |p: PathBuf| p.to_string_lossy().into_owned();
+    let (labels, saved) = (text(s.scene().join("label")), text(s.at("saved")));
+    let mut spread = Vec::new();
+    for (rendering, averaging) in [("selected", "objects"), ("visible", "frames")] {
+        let folder = format!("{saved}-{rendering}");
+        let rest =
+            ["--rendering", rendering, "--averaging", averaging, "--localisation", "--save-predictions", &folder];
+        let ours = s.metrics("lerf", &rest);
+        assert!(ours["figures"]["pairs"].as_u64().unwrap() >= 8, "{}", ours["figures"]);
+        spread.push(ours["figures"]["miou"].as_f64().unwrap());
+        let case = format!("lerf {rendering}");
+        let Some(theirs) = oracle.ask(&case, &["lerf", &labels, &folder, "--averaging", averaging]) else { continue };
+        for figure in ["miou", "macc25", "macc50", "localisation"] {
+            same(&ours["figures"][figure], &theirs[figure], &format!("{case} {figure}"));
+        }
+        let pairs = theirs["pairs"].as_array().unwrap();
+        assert_eq!(pairs.len(), ours["pairs"].as_array().unwrap().len());
+        for (a, b) in ours["pairs"].as_array().unwrap().iter().zip(pairs) {
+            assert_eq!((&a["frame"], &a["category"]), (&b["frame"], &b["category"]));
+            same(&a["iou"], &b["iou"], &format!("{case} {} {}", a["frame"], a["category"]));
+            same(&a["localised"], &b["localised"], &format!("{case} {} {}", a["frame"], a["category"]));
+        }
+        assert!(ours["notes"].to_string().contains("it has no text feature"), "{}", ours["notes"]);
+    }
+    assert!(spread.iter().all(|m| (0.01..0.99).contains(m)), "a case that says nothing: {spread:?}");
+    if oracle.python.is_some() {
+        oracle.ask("pictures", &["pictures", &labels]);
+        let folder = format!("{saved}-selected");
+        let ours = s.metrics("lerf", &["--truth", "pictures"]);
+        let theirs = oracle.ask("lerf pictures", &["lerf", &labels, &folder, "--truth", "pictures"]).unwrap();
+        same(&ours["figures"]["miou"], &theirs["miou"], "truth from JPEGs");
+    }
+    // Masks read back score as those that were rendered.
+    let o = Command::new(env!("CARGO_BIN_EXE_eval"))
+        .args(["lerf", "--predictions", &format!("{saved}-selected"), "--labels", &labels, "--out"])
+        .arg(s.at("read"))
+        .output()
+        .unwrap();
+    assert!(o.status.success(), "{}", String::from_utf8_lossy(&o.stderr));
+    let read: Value = serde_json::from_slice(&std::fs::read(s.at("read/metrics.json")).unwrap()).unwrap();
+    same(&read["figures"]["miou"], &json!(spread[0]), "saved masks");
+
+    let (geometry, instances, texts, scan) =
+        (text(s.geometry()), text(s.instances()), text(s.texts()), text(s.scene()));
+    let mut seen = Vec::new();
+    for rest in [
+        &["--association", "one-to-one"][..],
+        &["--association", "one-to-one", "--keep-faint"],
+        &["--association", "one-to-one", "--undescribed", "none"],
+        &["--association", "nearest"],
+        &["--association", "volume"],
+    ] {
+        let ours = s.metrics("scannet", rest);
+        let case = format!("scannet {}", rest.join(" "));
+        let arguments = [&["scannet", &geometry, &instances, &texts, &scan], rest].concat();
+        let Some(theirs) = oracle.ask(&case, &arguments) else { continue };
+        for set in ours["sets"].as_array().unwrap() {
+            let size = set["size"].to_string();
+            for figure in ["miou", "macc"] {
+                same(&set[figure], &theirs["sets"][&size][figure], &format!("{case} {size} {figure}"));
+            }
+        }
+        for figure in ["miou", "acc25", "acc50", "ap25", "ap50"] {
+            same(&ours["instances"][figure], &theirs["instances"][figure], &format!("{case} instances {figure}"));
+        }
+        seen.push(ours["sets"][0]["miou"].to_string());
+    }
+    let all = seen.len();
+    seen.sort();
+    seen.dedup();
+    assert_eq!(seen.len(), all, "every rule gives another number: {seen:?}");
+    oracle.finish();
+}
+
+#[test]
+fn tables_join_scenes_and_refuse_what_does_not_fit() {
+    let s = Scene::new();
+    s.metrics("scannet", &[]);
+    std::fs::rename(s.at("out"), s.at("a")).unwrap();
+    let first: Value = serde_json::from_slice(&std::fs::read(s.at("a/metrics.json")).unwrap()).unwrap();
+    std::fs::create_dir(s.at("b")).unwrap();
+    let mut second = first.clone();
+    second["scene"] = json!("scene0062_00");
+    let put = |v: &Value| std::fs::write(s.at("b/metrics.json"), v.to_string()).unwrap();
+    put(&second);
+    let table = |folders: &[&str]| {
+        let mut c = Command::new(env!("CARGO_BIN_EXE_eval"));
+        c.arg("table").args(folders.iter().map(|f| s.at(f))).arg("--out").arg(s.at("t")).output().unwrap()
+    };
+    let o = table(&["a", "b"]);
+    assert!(o.status.success(), "{}", String::from_utf8_lossy(&o.stderr));
+    let printed = String::from_utf8(o.stdout).unwrap();
+    assert!(printed.contains("| CAGS | 32.60 | 48.90 | 41.10 | 62.00 | 54.80 | 75.90 | its paper |"), "{printed}");
+    assert!(printed.contains("not the 10") && printed.contains("text features table of"), "{printed}");
+    let t: Value = serde_json::from_slice(&std::fs::read(s.at("t/metrics.json")).unwrap()).unwrap();
+    same(&t["mean_over_scenes"]["19"]["miou"], &first["sets"][0]["miou"], "twice the same scene");
+    same(&t["pooled"]["19"]["macc"], &first["sets"][0]["macc"], "pooled with itself");
+    let cags = t["tables"][0]["rows"].as_array().unwrap().iter().find(|r| r["name"] == "CAGS").unwrap();
+    assert_eq!((&cags["percent"]["10 mIoU"], &cags["source"]), (&json!(54.8), &json!("its paper")));
+    assert_eq!(t["tables"][1]["rows"][1]["name"], "scene0062_00");
+    let page = std::fs::read_to_string(s.at("t/table.html")).unwrap();
+    assert!(page.contains("its paper") && page.contains("54.80") && page.contains("scene0062_00"));
+    let error = |folders: &[&str]| {
+        let o = table(folders);
+        assert_eq!(o.status.code(), Some(2));
+        String::from_utf8(o.stderr).unwrap()
+    };
+    assert!(error(&["a", "a"]).contains("a scene is given twice"));
+    second["sets"][0]["confusion"]["weights"] = json!([1.0]);
+    put(&second);
+    assert!(error(&["a", "b"]).contains("a confusion matrix does not fit"));
+    put(&json!({"protocol": "x"}));
+    assert!(error(&["a", "b"]).contains("protocol: not metrics of a protocol"));
+    s.metrics("lerf", &["--name", "another"]);
+    assert!(error(&["a", "out"]).contains("two protocols"));
+}
+
+#[test]
+fn damaged_gaussians_leave_the_evaluation_of_a_scan() {
+    let s = Scene::new();
+    let mut g = gs_scene::ply::read_gaussians(s.geometry()).unwrap();
+    (g.means[5][1], g.log_scales[6][0]) = (f32::NAN, f32::NAN);
+    gs_scene::ply::write_gaussians(s.geometry(), &g, &[]).unwrap();
+    let (mut i, _) = Instances::read(s.instances()).unwrap();
+    (i.label[5], i.label[6]) = (-1, -1);
+    i.write(s.instances(), provenance(&s.geometry(), &s.scene())).unwrap();
+    // By number they leave with their vertices, faint or not; their neighbours speak for the place.
+    let notes = s.metrics("scannet", &["--association", "one-to-one", "--keep-faint"])["notes"].to_string();
+    assert!(notes.contains(&format!("2 of {} vertices leave the evaluation", g.len())), "{notes}");
+    let notes = s.metrics("scannet", &["--association", "nearest", "--keep-faint"])["notes"].to_string();
+    assert!(!notes.contains("leave the evaluation"), "{notes}");
+    let said = String::from_utf8(s.run("scannet", &["--association", "volume"]).stderr).unwrap();
+    assert!(said.contains(&format!("skipped 2 of {} Gaussians: damaged", g.len())), "{said}");
+}
+
+#[test]
+fn scans_that_do_not_fit_are_refused() {
+    let s = Scene::new();
+    let bad = |rest: &[&str]| {
+        let o = s.run("scannet", rest);
+        let error = String::from_utf8(o.stderr).unwrap();
+        assert_eq!(o.status.code(), Some(2), "{error}");
+        assert!(!error.contains("panicked"), "{error}");
+        error
+    };
+    assert!(bad(&["--classes", "20"]).contains("--classes: no such class set"));
+    assert!(bad(&["--top-k", "2"]).contains("argmax of the plain cosine"));
+    let labels = s.scene().join("scene0000_00_vh_clean_2.labels.ply");
+    let whole = std::fs::read(&labels).unwrap();
+    let mut moved = whole.clone();
+    let at = moved.windows(11).position(|w| w == b"end_header\n").unwrap() + 11;
+    moved[at..at + 4].copy_from_slice(&100.0f32.to_le_bytes());
+    std::fs::write(&labels, &moved).unwrap();
+    assert!(bad(&[]).contains("vertex 0: the Gaussian of this number lies elsewhere"));
+    s.metrics("scannet", &["--association", "nearest"]);
+    std::fs::write(&labels, &whole[..whole.len() - 1]).unwrap();
+    assert!(bad(&[]).contains("cut short"));
+    std::fs::remove_file(&labels).unwrap();
+    assert!(bad(&[]).contains("*.labels.ply: not one file of labelled vertices; found 0"));
+}
+
+#[test]
+fn a_benchmark_scene_asks_its_own_table() {
+    let s = Scene::new();
+    let o = s.run("lerf", &["--name", "teatime"]);
+    assert!(o.status.success(), "{}", String::from_utf8_lossy(&o.stderr));
+    let m: Value = serde_json::from_slice(&std::fs::read(s.at("out/metrics.json")).unwrap()).unwrap();
+    let notes = m["notes"].to_string();
+    // frame_00001, 3 and 5 are labelled; none is teatime's.
+    assert!(notes.contains("none of the benchmark's") && notes.contains("published numbers have 59"), "{notes}");
+    assert!(notes.contains("no labelled object was scored"), "{notes}");
+    let label = s.scene().join("label");
+    std::fs::rename(label.join("frame_00001.json"), label.join("frame_00002.json")).unwrap();
+    let m = s.metrics("lerf", &["--name", "teatime"]);
+    assert!(m["pairs"].as_array().unwrap().iter().all(|p| p["iou"] == 0.0));
+    assert!(m["notes"].to_string().contains("not in the benchmark's table of queries"), "{}", m["notes"]);
+    let o = s.run("lerf", &["--queries", "table"]);
+    assert_eq!(o.status.code(), Some(2));
+    assert!(String::from_utf8_lossy(&o.stderr).contains("--name: no benchmark scene has this name"));
+}

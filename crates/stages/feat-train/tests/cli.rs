@@ -1,0 +1,325 @@
+//! The program on artifacts on disk: both methods, the same bytes for any thread count and after a kill, bad input.
+
+use artifacts::{Features, FootprintsBuilder, Graph, PixelSamples, Row, role};
+use gs_io::{Provenance, hash_file};
+use gs_scene::{Gaussians, ply};
+use std::collections::{BTreeMap, BTreeSet};
+use std::path::{Path, PathBuf};
+use std::process::{Command, Output, Stdio};
+use std::time::{Duration, Instant};
+
+/// Gaussians on a line: three things of 40 each; every view shows three masks, the middle thing sometimes in halves.
+const N: usize = 120;
+const VIEWS: usize = 12;
+
+fn inputs(dir: &Path) {
+    let g = Gaussians {
+        means: (0..N).map(|i| [i as f32, 0.0, 0.0]).collect(),
+        log_scales: vec![[0.0; 3]; N],
+        rotations: vec![[1.0, 0.0, 0.0, 0.0]; N],
+        opacity_logits: vec![2.0; N],
+        sh: (0..3 * N).map(|i| ((i * 7) % 5) as f32 * 0.2).collect(),
+        sh_degree: 0,
+    };
+    let geometry = dir.join("geometry.ply");
+    ply::write_gaussians(&geometry, &g, &[]).unwrap();
+    let inputs = BTreeMap::from([
+        (role::GEOMETRY.to_string(), hash_file(&geometry).unwrap()),
+        (role::MASKS.to_string(), "ab".repeat(32)),
+    ]);
+    let provenance = || Provenance { inputs: inputs.clone(), ..Provenance::default() };
+    graph().write(dir.join("graph.safetensors"), provenance()).unwrap();
+    footprints().write(dir.join("footprints.safetensors"), provenance()).unwrap();
+}
+
+fn graph() -> Graph {
+    let near = |i: usize, of: &[usize]| -> Vec<u32> {
+        let mut all: Vec<usize> = (0..of.len()).filter(|&j| of[j] != i).collect();
+        all.sort_by_key(|&j| (of[j].abs_diff(i), j));
+        all[..4].iter().map(|&j| j as u32).collect()
+    };
+    let everyone: Vec<usize> = (0..N).collect();
+    let anchors: Vec<usize> = (0..N).step_by(8).collect();
+    Graph {
+        kept: (0..N as u32).collect(),
+        anchors: anchors.iter().map(|&a| a as u32).collect(),
+        k: 4,
+        knn: anchors.iter().flat_map(|&a| near(a, &everyone)).collect(),
+        anchor_knn: anchors.iter().flat_map(|&a| near(a, &anchors)).collect(),
+        nearest_anchor: (0..N).map(|i| (((i + 3) / 8) as u32).min(anchors.len() as u32 - 1)).collect(),
+        gaussian_k: 4,
+        gaussian_knn: (0..N).flat_map(|i| near(i, &everyone)).collect(),
+        seen_views: vec![1; N],
+        seen_weight: vec![1.0; N],
+    }
+}
+
+fn footprints() -> FootprintsBuilder {
+    let pixels = PixelSamples { ptr: vec![0], ..PixelSamples::default() };
+    let mut f =
+        FootprintsBuilder { kept: (0..N as u32).collect(), row_ptr: vec![0], pixels, ..FootprintsBuilder::default() };
+    for v in 0..VIEWS {
+        f.views.push(format!("v{v}"));
+        let cuts: &[u32] = if v % 3 == 0 { &[0, 40, 60, 80, 120] } else { &[0, 40, 80, 120] };
+        for (k, w) in cuts.windows(2).enumerate() {
+            f.col.extend(w[0]..w[1]);
+            f.weight.extend((w[0]..w[1]).map(|i| 1.0 + (i % 3) as f32));
+            f.row_ptr.push(f.col.len() as u64);
+            let row = Row { view: v as u32, level: 3, mask: k as u32, pixels: 100, gated: 90, alpha: 0.9 };
+            // Four pixels of each mask, each showing three Gaussians.
+            for first in (w[0]..w[1] - 3).step_by(((w[1] - w[0]) / 4) as usize).take(4) {
+                f.pixels.row.push(f.rows.len() as u32);
+                f.pixels.col.extend(first..first + 3);
+                f.pixels.weight.extend([0.5, 0.2, 0.1]);
+                f.pixels.ptr.push(f.pixels.col.len() as u64);
+            }
+            f.rows.push(row);
+        }
+    }
+    f
+}
+
+fn command(dir: &Path, out: &Path, extra: &[&str]) -> Command {
+    let mut c = Command::new(env!("CARGO_BIN_EXE_feat-train"));
+    for name in ["geometry.ply", "graph.safetensors", "footprints.safetensors"] {
+        let option = format!("--{}", name.split('.').next().unwrap());
+        c.arg(option).arg(dir.join(name));
+    }
+    c.arg("--out").arg(out).args(extra);
+    c
+}
+
+fn run(dir: &Path, out: &Path, extra: &[&str]) -> Output {
+    command(dir, out, extra).output().unwrap()
+}
+
+fn succeed(dir: &Path, out: &Path, extra: &[&str]) -> Vec<u8> {
+    let output = run(dir, out, extra);
+    assert!(output.status.success(), "{extra:?}: {}", String::from_utf8_lossy(&output.stderr));
+    std::fs::read(out).unwrap()
+}
+
+fn beside(out: &Path, suffix: &str) -> PathBuf {
+    PathBuf::from(format!("{}{suffix}", out.display()))
+}
+
+fn setup() -> (tempfile::TempDir, PathBuf) {
+    let dir = tempfile::tempdir().unwrap();
+    inputs(dir.path());
+    let out = dir.path().join("features.safetensors");
+    (dir, out)
+}
+
+/// graph-precompute leaves damaged Gaussians out; this stage says so, and what it makes of the others is the same.
+#[test]
+fn damaged_gaussians_change_nothing() {
+    let (dir, out) = setup();
+    let options = ["--method", "contrastive", "--iterations", "100", "--lr", "0.01"];
+    succeed(dir.path(), &out, &options);
+    let values = || Features::read(&out).unwrap().0.values;
+    let before = values();
+    let geometry = dir.path().join("geometry.ply");
+    let mut g = ply::read_gaussians(&geometry).unwrap();
+    let rows: Vec<u32> = (0..N as u32).chain([0, 1]).collect();
+    g = g.select(&rows);
+    (g.sh[3 * N], g.means[N + 1][2]) = (f32::NAN, f32::INFINITY);
+    ply::write_gaussians(&geometry, &g, &[]).unwrap();
+    let inputs = BTreeMap::from([
+        (role::GEOMETRY.to_string(), hash_file(&geometry).unwrap()),
+        (role::MASKS.to_string(), "ab".repeat(32)),
+    ]);
+    let provenance = || Provenance { inputs: inputs.clone(), ..Provenance::default() };
+    let unseen = |values: Vec<f32>| values.into_iter().chain([0.0; 2]).collect();
+    let graph = Graph { seen_views: vec![1; N + 2], seen_weight: unseen(vec![1.0; N]), ..graph() };
+    graph.write(dir.path().join("graph.safetensors"), provenance()).unwrap();
+    footprints().write(dir.path().join("footprints.safetensors"), provenance()).unwrap();
+    let output = run(dir.path(), &out, &options);
+    let said = String::from_utf8_lossy(&output.stderr);
+    assert!(output.status.success() && said.contains("skipped 2 of 122 Gaussians: damaged"), "{said}");
+    assert_eq!(values(), before);
+}
+
+#[test]
+fn the_closed_form_tells_things_apart_and_not_their_halves() {
+    let (dir, out) = setup();
+    let first = succeed(dir.path(), &out, &["--method", "spectral", "--threads", "1"]);
+    assert!(first == succeed(dir.path(), &out, &["--method", "spectral", "--threads", "2"]));
+    let (f, _) = Features::read(&out).unwrap();
+    let cosine = |a: usize, b: usize| f.row(a).iter().zip(f.row(b)).map(|(a, b)| a * b).sum::<f32>();
+    assert!(cosine(5, 35) > 0.95 && cosine(85, 115) > 0.95, "{} {}", cosine(5, 35), cosine(85, 115));
+    assert!(cosine(45, 75) > 0.8, "the halves of a thing stay together: {}", cosine(45, 75));
+    assert!(cosine(5, 60) < 0.3 && cosine(60, 115) < 0.3 && cosine(5, 115) < 0.3);
+    let curve = std::fs::read_to_string(beside(&out, ".curve.jsonl")).unwrap();
+    assert!(curve.starts_with("{\"iteration\":1,\"singular_value\":"), "{curve}");
+}
+
+#[test]
+fn training_separates_masks_and_does_not_depend_on_threads() {
+    let (dir, out) = setup();
+    for variant in [
+        &["--preset", "paper"][..],
+        &["--method", "contrastive", "--neighbours", "anchors", "--loss", "half-mask", "--norm-axis", "gaussian"],
+        &["--method", "contrastive", "--neighbours", "anchor-inputs", "--loss", "cross-view", "--lazy-adam"],
+        &["--method", "contrastive", "--loss", "gaussian", "--layers", "0", "--init", "normal-small"],
+        &["--method", "contrastive", "--loss", "pixel", "--cohesion", "0.1", "--cohesion-of", "pixels"],
+        &["--method", "contrastive", "--half-weights"],
+    ] {
+        let with = |threads| {
+            let args =
+                [variant, &["--iterations", "300", "--lr", "0.01", "--seed", "4", "--threads", threads]].concat();
+            succeed(dir.path(), &out, &args)
+        };
+        assert!(with("1") == with("2"), "{variant:?}");
+        let curve = std::fs::read_to_string(beside(&out, ".curve.jsonl")).unwrap();
+        let points: Vec<serde_json::Value> = curve.lines().map(|l| serde_json::from_str(l).unwrap()).collect();
+        assert_eq!(points.len(), 6);
+        let of = |i: usize, key: &str| points[i][key].as_f64().unwrap();
+        assert!(of(5, "loss") < of(0, "loss"), "{variant:?} {curve}");
+        assert!(of(5, "separation") > of(0, "separation"), "{variant:?} {curve}");
+        assert!(!beside(&out, ".checkpoint").exists());
+        let picture = std::fs::read_to_string(beside(&out, ".curve.svg")).unwrap();
+        assert_eq!(picture.matches("<polyline").count(), 4, "loss, alignment, separation, rate: {picture}");
+    }
+}
+
+/// docs/method.md says which command line makes each row of the paper's ablation tables: all of them train.
+#[test]
+fn every_row_of_the_ablation_tables_trains() {
+    let (dir, out) = setup();
+    let docs = std::fs::read_to_string(Path::new(env!("CARGO_MANIFEST_DIR")).join("../../../docs/method.md")).unwrap();
+    let section = docs.split("## The paper's ablation tables").nth(1).unwrap().split("\n## ").next().unwrap();
+    let rows: Vec<&str> = section.lines().filter_map(|l| l.split("`--").nth(1)).collect();
+    assert_eq!(rows.len(), 5 + 4 + 5, "{section}");
+    let mut outputs = BTreeMap::new();
+    for row in rows {
+        let line = format!("--{}", row.split('`').next().unwrap());
+        let args: Vec<&str> = line.split(' ').chain(["--iterations", "200", "--lr", "0.01"]).collect();
+        succeed(dir.path(), &out, &args);
+        let curve = std::fs::read_to_string(beside(&out, ".curve.jsonl")).unwrap();
+        let losses: Vec<f64> = curve
+            .lines()
+            .map(|l| serde_json::from_str::<serde_json::Value>(l).unwrap()["loss"].as_f64().unwrap())
+            .collect();
+        assert!(losses[losses.len() - 1] < losses[0], "{line}: {losses:?}");
+        let values: Vec<u32> = Features::read(&out).unwrap().0.values.iter().map(|v| v.to_bits()).collect();
+        outputs.insert(line, values);
+    }
+    // The full method has three names and its features alone two; all else differs.
+    let distinct: BTreeSet<_> = outputs.values().collect();
+    assert_eq!((outputs.len(), distinct.len()), (14, 14 - 2 - 1));
+}
+
+#[test]
+fn a_killed_run_continues_to_the_same_bytes() {
+    let (dir, out) = setup();
+    let args = ["--preset", "paper", "--iterations", "6000", "--checkpoint-every", "100"];
+    let whole = succeed(dir.path(), &out, &args);
+    let curve = std::fs::read(beside(&out, ".curve.jsonl")).unwrap();
+    std::fs::remove_file(&out).unwrap();
+    let checkpoint = beside(&out, ".checkpoint");
+    let mut child = command(dir.path(), &out, &args).stderr(Stdio::null()).spawn().unwrap();
+    let started = Instant::now();
+    while !checkpoint.exists() {
+        assert!(started.elapsed() < Duration::from_secs(60), "no checkpoint comes");
+        std::thread::sleep(Duration::from_millis(2));
+    }
+    child.kill().unwrap();
+    child.wait().unwrap();
+    assert!(!out.exists(), "the run ended before it could be killed");
+    let mut unfinished = std::fs::read(&checkpoint).unwrap();
+    let output = run(dir.path(), &out, &args);
+    assert!(String::from_utf8_lossy(&output.stderr).contains("continuing from iteration"));
+    assert!(whole == std::fs::read(&out).unwrap());
+    assert!(curve == std::fs::read(beside(&out, ".curve.jsonl")).unwrap());
+    // A checkpoint of other parameters is not used, nor is a damaged one.
+    let middle = unfinished.len() / 2;
+    unfinished[middle] ^= 1;
+    std::fs::write(&checkpoint, &unfinished).unwrap();
+    let output = run(dir.path(), &out, &args);
+    assert!(String::from_utf8_lossy(&output.stderr).contains("starting anew"));
+    assert!(whole == std::fs::read(&out).unwrap());
+}
+
+#[test]
+fn training_stops_early_when_held_out_views_have_settled() {
+    let (dir, out) = setup();
+    let args = ["--preset", "paper", "--lr", "0.01", "--loss", "self", "--iterations", "50000", "--early-stop"];
+    succeed(dir.path(), &out, &args);
+    let record = std::fs::read_to_string(beside(&out, ".run.json")).unwrap();
+    let record: serde_json::Value = serde_json::from_str(&record).unwrap();
+    let done = record["summary"]["iterations"].as_u64().unwrap();
+    assert!((1000..50_000).contains(&done) && done.is_multiple_of(250), "{done}");
+    // What it learnt is what that many iterations learn.
+    let early = Features::read(&out).unwrap().0.values;
+    let done = done.to_string();
+    succeed(dir.path(), &out, &[&args[..6], &["--iterations", &done, "--early-stop"]].concat());
+    assert!(early == Features::read(&out).unwrap().0.values);
+}
+
+#[test]
+fn an_interrupted_run_leaves_a_checkpoint() {
+    let (dir, out) = setup();
+    let args = ["--preset", "paper", "--iterations", "100000000", "--checkpoint-every", "0"];
+    let mut child = command(dir.path(), &out, &args).stderr(Stdio::null()).spawn().unwrap();
+    std::thread::sleep(Duration::from_millis(400));
+    let kill = Command::new("kill").args(["-TERM", &child.id().to_string()]).status().unwrap();
+    assert!(kill.success());
+    assert_eq!(child.wait().unwrap().code(), Some(130));
+    assert!(beside(&out, ".checkpoint").exists() && !out.exists());
+}
+
+#[test]
+fn bad_input_is_one_line_and_leaves_the_output_alone() {
+    let (dir, out) = setup();
+    std::fs::write(&out, "good").unwrap();
+    let fail = |extra: &[&str], needles: &[&str]| {
+        let output = run(dir.path(), &out, &[extra, &["--overwrite"]].concat());
+        let said = String::from_utf8_lossy(&output.stderr).into_owned();
+        assert_eq!(output.status.code(), Some(2), "{said}");
+        for needle in needles {
+            assert!(said.contains(needle), "{needle:?} is not in {said:?}");
+        }
+        assert!(!said.contains("panicked"), "{said}");
+        assert_eq!(std::fs::read(&out).unwrap(), b"good");
+    };
+    fail(&["--preset", "paper", "--layers", "5"], &["--layers", "found 5", "0 to 4"]);
+    fail(&["--tau", "0"], &["--tau"]);
+    fail(&["--preset", "paper", "--dim", "65"], &["--dim", "65"]);
+    fail(&["--preset", "paper", "--loss", "pixel", "--lazy-adam"], &["--lazy-adam", "not with this loss"]);
+    // The same without a file to read.
+    let nowhere = dir.path().join("nowhere");
+    let check = |extra: &[&str]| run(&nowhere, &out, &[extra, &["--check"]].concat());
+    for (wrong, needle) in [
+        (&["--tau", "0"][..], "--tau"),
+        (&["--preset", "paper", "--loss", "pixel", "--lazy-adam"], "not with this loss"),
+        (&["--levles", "small"], "--levles"),
+    ] {
+        let output = check(wrong);
+        let said = String::from_utf8_lossy(&output.stderr).into_owned();
+        assert!(output.status.code() == Some(2) && said.contains(needle), "{said}");
+    }
+    let output = check(&["--levels", "small"]);
+    assert!(output.status.success() && output.stderr.is_empty() && std::fs::read(&out).unwrap() == b"good");
+    fail(&["--method", "spectral", "--levels", "small"], &["footprints.safetensors", "no mask has a footprint"]);
+    fail(&["--preset", "paper", "--levels", "small"], &["footprints.safetensors", "two masks"]);
+    // Footprints of another run: one Gaussian less.
+    let (_, graph_file) = Graph::read(dir.path().join("graph.safetensors")).unwrap();
+    let provenance = || Provenance { inputs: graph_file.provenance().inputs.clone(), ..Provenance::default() };
+    let path = dir.path().join("footprints.safetensors");
+    let without = FootprintsBuilder { pixels: PixelSamples::default(), ..footprints() };
+    without.write(&path, provenance()).unwrap();
+    fail(&["--preset", "paper", "--loss", "pixel"], &["footprints.safetensors", "pixel_row", "--pixel-samples"]);
+    let mut other = footprints();
+    other.kept.push(N as u32);
+    other.write(&path, provenance()).unwrap();
+    fail(&[], &["footprints.safetensors", "kept", "found 121 Gaussians"]);
+    let mut foreign = provenance();
+    foreign.inputs.insert(role::MASKS.into(), "cd".repeat(32));
+    footprints().write(&path, foreign).unwrap();
+    fail(&[], &["footprints.safetensors", "another masks"]);
+    let bytes = std::fs::read(&path).unwrap();
+    std::fs::write(&path, &bytes[..bytes.len() - 9]).unwrap();
+    fail(&[], &["footprints.safetensors"]);
+    std::fs::write(dir.path().join("geometry.ply"), "ply\n").unwrap();
+    fail(&[], &["graph.safetensors", "another geometry"]);
+}

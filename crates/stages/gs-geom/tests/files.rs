@@ -1,0 +1,246 @@
+//! `gs-geom inspect` and `gs-geom convert` through the program.
+
+use gs_scene::{Gaussians, Image, ply};
+use serde_json::{Value, json};
+use std::fs;
+use std::path::PathBuf;
+use std::process::{Command, Output, Stdio};
+
+fn run(arguments: &[&str]) -> Output {
+    Command::new(env!("CARGO_BIN_EXE_gs-geom")).args(arguments).output().unwrap()
+}
+
+fn succeeds(arguments: &[&str]) -> String {
+    let o = run(arguments);
+    assert!(o.status.success(), "{arguments:?}: {}", String::from_utf8_lossy(&o.stderr));
+    String::from_utf8_lossy(&o.stdout).into_owned()
+}
+
+fn refused(arguments: &[&str]) -> String {
+    let o = run(arguments);
+    let said = String::from_utf8_lossy(&o.stderr).into_owned();
+    assert!(o.status.code() == Some(2) && !said.contains("panicked"), "{arguments:?}: {said}");
+    said
+}
+
+/// Gaussians on a line, the later the fainter; one is not a number, one of infinite opacity.
+fn gaussians() -> Gaussians {
+    let n = 40;
+    let mut g = Gaussians {
+        means: (0..n).map(|i| [i as f32 * 0.25, 1.0, -2.0]).collect(),
+        log_scales: vec![[-3.0, -4.0, -3.0]; n],
+        rotations: vec![[1.0, 0.0, 0.0, 0.0]; n],
+        opacity_logits: (0..n).map(|i| 3.0 - 0.2 * i as f32).collect(),
+        sh: (0..n * 48).map(|i| (i as f32).sin()).collect(),
+        sh_degree: 3,
+    };
+    g.means[7][1] = f32::NAN;
+    g.opacity_logits[0] = f32::INFINITY;
+    g
+}
+
+fn written(dir: &tempfile::TempDir) -> String {
+    let path = dir.path().join("in.ply").to_string_lossy().into_owned();
+    ply::write_gaussians(&path, &gaussians(), &[]).unwrap();
+    path
+}
+
+#[test]
+fn a_file_is_inspected_in_text_and_json() {
+    let dir = tempfile::tempdir().unwrap();
+    let file = written(&dir);
+    let text = succeeds(&["inspect", &file]);
+    for wanted in ["Gaussians           40", "SH degree           3", "not finite          1 (means 1)"] {
+        assert!(text.contains(wanted), "{text}");
+    }
+    let json = succeeds(&["inspect", &file, "--json"]);
+    assert_eq!(json.lines().count(), 1);
+    let v: Value = serde_json::from_str(&json).unwrap();
+    assert_eq!((&v["gaussians"], &v["non_finite"]["means"]), (&40.into(), &1.into()));
+    assert_eq!(v["bounds"]["high"][0], 9.75);
+    assert_eq!(v["file_bytes"], fs::metadata(&file).unwrap().len());
+    assert!(refused(&["inspect", &file, "--threads", "1025"]).contains("1025 is not in 0..=1024"));
+    assert!(refused(&["inspect", "no/such.ply"]).contains("no/such.ply"));
+    fs::write(&file, "ply\nformat ascii 1.0\nelement vertex 9\nend_header\n").unwrap();
+    assert!(refused(&["inspect", &file]).contains("in.ply"));
+}
+
+#[test]
+fn the_files_of_a_dataset_are_listed() {
+    let dir = tempfile::tempdir().unwrap();
+    let root = dir.path().join("my scene");
+    let (photograph, scene) = (root.join("train/cam0/a 1.png"), root.to_string_lossy().into_owned());
+    Image { width: 8, height: 6, rgb: vec![0.5; 8 * 6 * 3], alpha: None }.write_png(&photograph).unwrap();
+    fs::write(root.join("notes.txt"), "not read").unwrap();
+    let pose = [[1.0, 0.0, 0.0, 0.0], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0], [0.0, 0.0, 0.0, 1.0]];
+    let frames = json!([{"file_path": "train/cam0/a 1.png", "transform_matrix": pose}]);
+    fs::write(root.join("transforms.json"), json!({"fl_x": 8.0, "frames": frames}).to_string()).unwrap();
+    let list = || succeeds(&["inspect", "--files", &scene]);
+    let before = list();
+    let lines: Vec<&str> = before.lines().collect();
+    assert!(lines.len() == 2 && lines[0].ends_with("/my scene/transforms.json"), "{before}");
+    let bytes = fs::metadata(&photograph).unwrap().len();
+    assert!(lines[1].starts_with(&format!("{bytes} ")) && lines[1].ends_with("/train/cam0/a 1.png"), "{before}");
+    assert_eq!(list(), before);
+    let facts: Value =
+        serde_json::from_str(succeeds(&["inspect", "--files", &scene, "--json"]).lines().last().unwrap()).unwrap();
+    assert_eq!(facts["bytes"], bytes);
+    // Edited: the same size, a later time.
+    fs::write(&photograph, fs::read(&photograph).unwrap()).unwrap();
+    assert_ne!(list(), before);
+    assert!(refused(&["inspect", "--files", "no/such"]).contains("no such folder"));
+}
+
+#[test]
+fn a_file_is_trimmed_cropped_pruned_and_ordered() {
+    let dir = tempfile::tempdir().unwrap();
+    let file = written(&dir);
+    let path = |name: &str| dir.path().join(name).to_string_lossy().into_owned();
+    let (out, map) = (path("new/out.ply"), path("map.npy"));
+    let crop = ["--crop", "-1,0,-2,5,2,-2", "--keep-map", &map, "--order", "opacity"];
+    succeeds(&[&["convert", &file, &out, "--sh-degree", "1", "--min-opacity", "0.5"], &crop[..]].concat());
+    let (g, all) = (ply::read_gaussians(&out).unwrap(), gaussians());
+    // 0 to 20 lie inside, 0 to 15 are opaque enough (0.2 * 15 = 3), 7 is broken; they are in order already.
+    let wanted: Vec<usize> = (0..16).filter(|&i| i != 7).collect();
+    let kept: Vec<usize> = gs_io::npy::read_f32(&map).unwrap().data.iter().map(|&v| v as usize).collect();
+    assert_eq!(kept, wanted);
+    assert_eq!((g.len(), g.sh_degree, g.opacity_logits[0]), (15, 1, 50.0));
+    for (i, &from) in kept.iter().enumerate() {
+        assert_eq!((g.means[i], g.sh_of(i)), (all.means[from], &all.sh_of(from)[..12]));
+    }
+    let record: Value = serde_json::from_slice(&fs::read(format!("{out}.run.json")).unwrap()).unwrap();
+    assert_eq!((&record["summary"]["not_finite"], &record["summary"]["of"]), (&1.into(), &40.into()));
+    assert_eq!(record["skipped"].as_array().unwrap().len(), 3);
+
+    // Back to degree 3: the 62 properties of the original code.
+    let full = path("full.ply");
+    succeeds(&["convert", &out, &full, "--sh-degree", "3", "--order", "morton", "--quiet"]);
+    let header = String::from_utf8_lossy(&fs::read(&full).unwrap()[..3000]).into_owned();
+    assert_eq!(header.matches("property float").count(), 62);
+    assert!(!header.contains(&*dir.path().to_string_lossy()));
+    assert_eq!(ply::read_gaussians(&full).unwrap().len(), 15);
+}
+
+/// Runs what a shell does before the program, such as `ulimit -f 1;`, and then the program.
+#[cfg(unix)]
+fn in_shell(before: &str, arguments: &[&str]) -> Command {
+    let mut c = Command::new("sh");
+    c.args(["-c", &format!("{before} exec \"$0\" \"$@\""), env!("CARGO_BIN_EXE_gs-geom")]).args(arguments);
+    c
+}
+
+/// What is said by a run that ends with exit code 2 and one line.
+#[cfg(unix)]
+fn one_line(command: &mut Command) -> String {
+    let o = command.stderr(Stdio::piped()).spawn().unwrap().wait_with_output().unwrap();
+    let said = String::from_utf8_lossy(&o.stderr).into_owned();
+    assert_eq!((o.status.code(), said.lines().count()), (Some(2), 1), "{said}");
+    said
+}
+
+#[test]
+#[cfg(target_os = "linux")]
+fn a_full_standard_output_is_an_error_and_a_closed_one_is_not() {
+    let dir = tempfile::tempdir().unwrap();
+    let file = written(&dir);
+    for arguments in [&["inspect", &file][..], &["inspect", &file, "--json"], &["--help"], &["--version"]] {
+        let said = one_line(in_shell("", arguments).stdout(fs::File::options().write(true).open("/dev/full").unwrap()));
+        assert!(said.contains("standard output: cannot write: No space left"), "{said}");
+        let mut child = in_shell("", arguments).stdout(Stdio::piped()).spawn().unwrap();
+        drop(child.stdout.take());
+        assert!(child.wait().unwrap().success(), "{arguments:?}");
+    }
+    // What events tell is lost, what is made is not.
+    let out = dir.path().join("out.ply").to_string_lossy().into_owned();
+    let full = fs::File::options().write(true).open("/dev/full").unwrap();
+    let said = one_line(in_shell("", &["convert", &file, &out, "--json"]).stdout(full));
+    assert!(said.contains("standard output: cannot write: No space left"), "{said}");
+    assert_eq!(ply::read_gaussians(&out).unwrap().len(), 39);
+}
+
+#[test]
+#[cfg(unix)]
+fn a_limit_on_the_length_of_files_is_an_error() {
+    let dir = tempfile::tempdir().unwrap();
+    let (file, out) = (written(&dir), dir.path().join("out.ply"));
+    let said = one_line(&mut in_shell("ulimit -f 1;", &["convert", &file, &out.to_string_lossy(), "--quiet"]));
+    assert!(said.contains("out.ply: cannot write: File too large") && said.contains("ulimit -f"), "{said}");
+    assert!(!out.exists());
+    let told = fs::File::create(dir.path().join("told.txt")).unwrap();
+    let said = one_line(in_shell("ulimit -f 1;", &["inspect", &file]).stdout(told));
+    assert!(said.contains("standard output: cannot write: File too large"), "{said}");
+}
+
+#[test]
+#[cfg(unix)]
+fn names_with_control_characters_are_escaped() {
+    let dir = tempfile::tempdir().unwrap();
+    let odd = |name: &str| dir.path().join(format!("a\nb\t\x1b[31m{name}")).to_string_lossy().into_owned();
+    let (file, out) = (odd("in.ply"), odd("out.ply"));
+    fs::rename(written(&dir), &file).unwrap();
+    let o = run(&["convert", &file, &out]);
+    let said = String::from_utf8(o.stderr).unwrap();
+    assert!(o.status.success() && said.contains(r"a\nb\t\u{1b}[31mout.ply"), "{said}");
+    assert_eq!(said.lines().count(), 3, "memory, what was skipped, what was written: {said}");
+    let missing = one_line(&mut in_shell("", &["inspect", &odd("none.ply")]));
+    assert!(missing.contains(r"a\nb\t\u{1b}[31mnone.ply: "), "{missing}");
+    // What the command line itself is refused for.
+    for arguments in [&["inspect", "x.ply", &odd("")][..], &["inspect", "x.ply", "--threads", &odd("")]] {
+        let said = refused(arguments);
+        assert!(said.contains(r"a\nb\t\u{1b}[31m") && !said.contains(['\t', '\x1b']), "{said}");
+    }
+}
+
+#[test]
+fn the_input_is_never_overwritten() {
+    let dir = tempfile::tempdir().unwrap();
+    let file = written(&dir);
+    let before = fs::read(&file).unwrap();
+    let path = |name: &str| dir.path().join(name).to_string_lossy().into_owned();
+    let roundabout = format!("{}/./in.ply", dir.path().display());
+    let mut names = vec![file.clone(), roundabout];
+    #[cfg(unix)]
+    {
+        std::os::unix::fs::symlink(&file, path("link.ply")).unwrap();
+        fs::hard_link(&file, path("hard.ply")).unwrap();
+        names.extend([path("link.ply"), path("hard.ply")]);
+    }
+    let out = path("out.ply");
+    for name in &names {
+        assert!(refused(&["convert", &file, name]).contains("the output is one of the inputs"), "{name}");
+        let map = refused(&["convert", &file, &out, "--keep-map", name]);
+        assert!(map.contains("the output is one of the inputs"), "{name}");
+    }
+    assert!(refused(&["convert", &file, &out, "--keep-map", &out]).contains("two outputs"));
+    assert!(refused(&["convert", &file, &out, "--min-opacity", "2"]).contains("--min-opacity"));
+    assert!(refused(&["convert", &file, &out, "--crop", "90,90,90,91,91,91"]).contains("no Gaussian is left"));
+    assert!(refused(&["convert", &file, &out, "--crop", "1,2"]).contains("not a box"));
+    assert!(refused(&["convert", &path("none.ply"), &out]).contains("none.ply"));
+    assert_eq!(fs::read(&file).unwrap(), before);
+    assert!(!PathBuf::from(out).exists());
+}
+
+#[test]
+fn real_files_are_inspected_and_converted() {
+    let splats = PathBuf::from(env!("CARGO_MANIFEST_DIR")).join("../../../../shared/data/splats");
+    if !splats.exists() {
+        eprintln!("skipped: {} is not present", splats.display());
+        return;
+    }
+    let dir = tempfile::tempdir().unwrap();
+    for (name, n, degree) in
+        [("guitar.ply", 90_854, 0), ("inria_layout_9k.ply", 9_080, 3), ("inria_train_1000.ply", 1_000, 3)]
+    {
+        let file = splats.join(name).to_string_lossy().into_owned();
+        let v: Value = serde_json::from_str(&succeeds(&["inspect", &file, "--json"])).unwrap();
+        assert_eq!((&v["gaussians"], &v["sh_degree"]), (&n.into(), &degree.into()), "{name}");
+        assert_eq!(v["non_finite"]["gaussians"], 0);
+        let sum: u64 = v["opacity"].as_array().unwrap().iter().map(|b| b["count"].as_u64().unwrap()).sum();
+        assert_eq!(sum, n);
+        let out = dir.path().join(name).to_string_lossy().into_owned();
+        succeeds(&["convert", &file, &out, "--order", "morton", "--sh-degree", "3"]);
+        let (a, b) = (ply::read_gaussians(&file).unwrap(), ply::read_gaussians(&out).unwrap());
+        let sum = |g: &Gaussians| g.opacity_logits.iter().map(|&v| f64::from(v)).sum::<f64>();
+        assert!(a.len() == b.len() && b.sh_degree == 3 && (sum(&a) - sum(&b)).abs() < 1e-6 * sum(&a).abs());
+    }
+}

@@ -1,0 +1,455 @@
+//! The program on small scenes, with a segmenter by colour in place of SAM and an encoder whose features can be computed
+//! by hand in place of CLIP (scripts/make_onnx_testdata.py makes both).
+
+use artifacts::{Level, MaskFeatures, MaskMaps, MaskTruth, TrueObject, TruePart, TrueScene, features_path, maps_path};
+use gs_io::Artifact;
+use gs_scene::Image;
+use std::collections::BTreeMap;
+use std::path::{Path, PathBuf};
+use std::process::{Command, Output};
+
+const WIDTH: usize = 128;
+const HEIGHT: usize = 64;
+
+fn fake_sam() -> PathBuf {
+    Path::new(env!("CARGO_MANIFEST_DIR")).join("testdata/sam")
+}
+
+fn fake_clip() -> PathBuf {
+    Path::new(env!("CARGO_MANIFEST_DIR")).join("../../lib/onnx-models/testdata/clip")
+}
+
+/// Colour of a pixel: a grey wall with a dark square, a bright square, and in it a slightly different one.
+fn color(view: usize, x: usize, y: usize) -> [u8; 3] {
+    let x = x.wrapping_sub(view * 8);
+    match (x, y) {
+        (80..112, 24..40) => [250, 235, 240],
+        (72..112, 16..48) => [250, 250, 240],
+        (16..48, 16..48) => [20, 30, 10],
+        _ => [128, 128, 128],
+    }
+}
+
+/// A scene of `views` photographs in transforms.json form.
+fn write_scene(folder: &Path, views: usize) {
+    let mut frames = Vec::new();
+    for v in 0..views {
+        let pixels: Vec<u8> = (0..WIDTH * HEIGHT).flat_map(|i| color(v, i % WIDTH, i / WIDTH)).collect();
+        Image::from_rgb8(WIDTH as u32, HEIGHT as u32, &pixels).write_png(folder.join(format!("v{v}.png"))).unwrap();
+        let pose = "[[1,0,0,0],[0,1,0,0],[0,0,1,3],[0,0,0,1]]";
+        frames.push(format!("{{\"file_path\": \"v{v}.png\", \"transform_matrix\": {pose}}}"));
+    }
+    let json =
+        format!("{{\"camera_angle_x\": 0.9, \"w\": {WIDTH}, \"h\": {HEIGHT}, \"frames\": [{}]}}", frames.join(","));
+    std::fs::write(folder.join("transforms.json"), json).unwrap();
+}
+
+fn run(args: &[&str]) -> Output {
+    Command::new(env!("CARGO_BIN_EXE_mask-embed")).args(args).output().unwrap()
+}
+
+fn ok(args: &[&str]) -> String {
+    let out = run(args);
+    let text = String::from_utf8_lossy(&out.stderr).into_owned();
+    assert!(out.status.success(), "{args:?}: {text}");
+    text
+}
+
+#[test]
+fn a_limit_that_nothing_is_held_against_is_refused() {
+    for args in [
+        &["tokenize", "--truth", "none", "--out", "none"][..],
+        &["crops", "--scene", "x", "--masks", "x", "--out", "x"],
+    ] {
+        let o = run(&[args, &["--memory-limit", "1G"]].concat());
+        let said = String::from_utf8_lossy(&o.stderr);
+        let line = "mask-embed: error: --memory-limit: this command does not forecast its memory; leave it out\n";
+        assert!(o.status.code() == Some(2) && said == line, "{said}");
+    }
+}
+
+#[test]
+fn more_memory_than_there_may_be_is_refused_before_the_first_view() {
+    let dir = tempfile::tempdir().unwrap();
+    let (scene, masks) = (dir.path().join("scene"), dir.path().join("masks"));
+    std::fs::create_dir(&scene).unwrap();
+    write_scene(&scene, 1);
+    let (sam, clip) = (fake_sam(), fake_clip());
+    let make = ["masks", "--scene", path(&scene), "--sam", path(&sam), "--out", path(&masks)];
+    let limit = ["--memory-limit", "2M"];
+    let e = error(&[&make[..], &limit[..]].concat());
+    assert!(e.contains("--memory-limit: more memory than there may be") && e.contains("--threads"), "{e}");
+    assert!(!masks.join("masks.json").exists() && !maps_path(&masks, "v0").exists());
+    ok(&make);
+    let embed = ["embed", "--scene", path(&scene), "--masks", path(&masks), "--clip", path(&clip)];
+    let e = error(&[&embed[..], &limit[..]].concat());
+    assert!(e.contains("--memory-limit"), "{e}");
+    assert!(!features_path(&masks, "v0").exists());
+    ok(&embed);
+    // What stands already needs no model to run.
+    ok(&[&embed[..], &limit[..]].concat());
+}
+
+/// The one line of an error, with exit code 2.
+fn error(args: &[&str]) -> String {
+    let out = run(args);
+    let text = String::from_utf8_lossy(&out.stderr).into_owned();
+    assert_eq!(out.status.code(), Some(2), "{args:?}: {text}");
+    let last = text.lines().last().unwrap_or_default().to_string();
+    assert!(last.starts_with("mask-embed: error: "), "{text}");
+    last
+}
+
+fn path(p: &Path) -> &str {
+    p.to_str().unwrap()
+}
+
+struct Scene {
+    _dir: tempfile::TempDir,
+    folder: PathBuf,
+    masks: PathBuf,
+}
+
+impl Scene {
+    fn new(views: usize) -> Self {
+        let dir = tempfile::tempdir().unwrap();
+        let folder = dir.path().join("scene");
+        std::fs::create_dir(&folder).unwrap();
+        write_scene(&folder, views);
+        Self { masks: dir.path().join("masks"), folder, _dir: dir }
+    }
+
+    fn masks_args<'a>(&'a self, out: &'a Path, more: &[&'a str]) -> Vec<String> {
+        let sam = fake_sam();
+        let mut args: Vec<String> = ["masks", "--scene", path(&self.folder), "--sam", path(&sam), "--out", path(out)]
+            .into_iter()
+            // The wall is three quarters of the picture.
+            .chain(["--points-per-side", "16", "--min-area", "20", "--max-area", "0.8"])
+            .map(String::from)
+            .collect();
+        args.extend(more.iter().map(ToString::to_string));
+        args
+    }
+
+    fn make_masks(&self, out: &Path, more: &[&str]) -> String {
+        let args = self.masks_args(out, more);
+        ok(&args.iter().map(String::as_str).collect::<Vec<_>>())
+    }
+}
+
+/// All files of a folder but the records of runs, by name.
+fn contents(folder: &Path) -> BTreeMap<String, Vec<u8>> {
+    std::fs::read_dir(folder)
+        .unwrap()
+        .map(|e| e.unwrap().path())
+        .filter(|p| !path(p).ends_with(".run.json"))
+        .map(|p| (p.file_name().unwrap().to_string_lossy().into_owned(), std::fs::read(&p).unwrap()))
+        .collect()
+}
+
+#[test]
+fn masks_follow_the_colours_at_every_level() {
+    let scene = Scene::new(2);
+    let previews = scene.masks.with_file_name("previews");
+    scene.make_masks(&scene.masks, &["--preview", path(&previews)]);
+    for v in 0..2 {
+        let maps = MaskMaps::read(maps_path(&scene.masks, &format!("v{v}"))).unwrap();
+        assert_eq!((maps.width, maps.height), (WIDTH, HEIGHT));
+        let at = |l: Level, x: usize, y: usize| maps.level(l)[y * WIDTH + x + v * 8];
+        for level in Level::ALL {
+            let (wall, dark, bright) = (at(level, 2, 2), at(level, 30, 30), at(level, 76, 44));
+            assert!(wall >= 0 && dark >= 0 && bright >= 0 && wall != dark && dark != bright && wall != bright);
+        }
+        // The inner square is apart at level small and part of the bright one at level large.
+        assert_ne!(at(Level::Small, 96, 32), at(Level::Small, 76, 44));
+        assert_eq!(at(Level::Large, 96, 32), at(Level::Large, 76, 44));
+        // A square's pixels, up to one at its border.
+        let dark = at(Level::Large, 30, 30);
+        for (i, &id) in maps.level(Level::Large).iter().enumerate() {
+            let (x, y) = ((i % WIDTH) as i64 - v as i64 * 8, (i / WIDTH) as i64);
+            let inside = (17..47).contains(&x) && (17..47).contains(&y);
+            let outside = !(15..49).contains(&x) || !(15..49).contains(&y);
+            assert!(if id == dark { !outside } else { !inside }, "at {x}, {y}");
+        }
+        // Ids count on from level to level and every one owns pixels.
+        let mut next = 0;
+        for level in Level::ALL {
+            let ids: std::collections::BTreeSet<i32> = maps.level(level).iter().copied().filter(|&i| i >= 0).collect();
+            assert!(ids.into_iter().eq(next..next + maps.level(level).iter().max().unwrap() + 1 - next));
+            next = maps.level(level).iter().max().unwrap() + 1;
+        }
+        let picture = Image::read(previews.join(format!("v{v}.png"))).unwrap();
+        assert_eq!((picture.width as usize, picture.height as usize), (2 * WIDTH, 2 * HEIGHT));
+    }
+    // A smaller map shows the same things.
+    let small = scene.masks.with_file_name("small");
+    scene.make_masks(&small, &["--map-size", "64"]);
+    let maps = MaskMaps::read(maps_path(&small, "v0")).unwrap();
+    assert_eq!((maps.width, maps.height), (64, 32));
+    assert_eq!(maps.level(Level::Large)[15 * 64 + 20], maps.level(Level::Large)[22 * 64 + 10]);
+}
+
+#[test]
+fn the_result_depends_neither_on_threads_nor_on_interruptions() {
+    let scene = Scene::new(3);
+    let other = scene.masks.with_file_name("other");
+    scene.make_masks(&scene.masks, &["--threads", "1"]);
+    let whole = contents(&scene.masks);
+    assert_eq!(whole.len(), 7, "three maps, three notes, a manifest: {:?}", whole.keys());
+    scene.make_masks(&other, &["--threads", "3"]);
+    assert_eq!(whole, contents(&other));
+    // As after a kill: no manifest, one view missing, one cut short, one without its note.
+    for name in ["masks.json", "v0_s.npy", "v2_s.json"] {
+        std::fs::remove_file(other.join(name)).unwrap();
+    }
+    std::fs::write(other.join("v1_s.npy"), &whole["v1_s.npy"][..1000]).unwrap();
+    // It might as well have been edited by hand.
+    let masks = scene.masks_args(&other, &[]);
+    let masks: Vec<&str> = masks.iter().map(String::as_str).collect();
+    assert!(error(&masks).contains("v1_s.npy: the output exists and would be lost"));
+    scene.make_masks(&other, &["--overwrite"]);
+    assert_eq!(whole, contents(&other));
+    // Again: nothing is made. With another parameter: everything is.
+    let touched = || std::fs::metadata(other.join("v1_s.npy")).unwrap().modified().unwrap();
+    let before = touched();
+    let said = scene.make_masks(&other, &[]);
+    assert!(said.contains("skipped 3 of 3 views: their id maps stand already"), "{said}");
+    assert_eq!(touched(), before);
+    let said = scene.make_masks(&other, &["--stability", "0.71"]);
+    assert!(!said.contains("stand already"), "{said}");
+    assert!(touched() > before);
+    // A changed photograph: that view alone.
+    scene.make_masks(&other, &[]);
+    std::fs::copy(scene.folder.join("v0.png"), scene.folder.join("v1.png")).unwrap();
+    let said = scene.make_masks(&other, &[]);
+    assert!(said.contains("skipped 2 of 3 views"), "{said}");
+    assert_eq!(std::fs::read(other.join("v1_s.npy")).unwrap(), whole["v0_s.npy"]);
+}
+
+#[test]
+fn fewer_points_are_asked_and_the_masks_stay() {
+    let scene = Scene::new(1);
+    let other = scene.masks.with_file_name("all");
+    scene.make_masks(&scene.masks, &[]);
+    scene.make_masks(&other, &["--skip-score", "2"]);
+    let facts = |folder: &Path| -> serde_json::Value {
+        let json: serde_json::Value =
+            serde_json::from_slice(&std::fs::read(folder.join("masks.json")).unwrap()).unwrap();
+        json["extra"]["views"]["v0"].clone()
+    };
+    let (few, all) = (facts(&scene.masks), facts(&other));
+    assert_eq!(all["facts"]["asked"], 16 * 8);
+    assert!(few["facts"]["asked"].as_u64().unwrap() < 40, "{few}");
+    assert_eq!(few["hash"], all["hash"]);
+}
+
+#[test]
+fn features_are_those_of_the_crops() {
+    let scene = Scene::new(2);
+    scene.make_masks(&scene.masks, &[]);
+    let clip = fake_clip();
+    let args = ["embed", "--scene", path(&scene.folder), "--masks", path(&scene.masks), "--clip", path(&clip)];
+    ok(&args);
+    let maps = MaskMaps::read(maps_path(&scene.masks, "v0")).unwrap();
+    let features = MaskFeatures::read(features_path(&scene.masks, "v0")).unwrap();
+    assert_eq!((features.count, features.dim), (maps.id_count(), 4));
+    // The dark square fills its crop: the feature is (mean of each channel, 1), scaled.
+    let dark = maps.level(Level::Large)[30 * WIDTH + 30];
+    let expected = [20.0, 30.0, 10.0, 255.0].map(|v: f64| v / (400.0f64 + 900.0 + 100.0 + 65025.0).sqrt());
+    for (f, e) in features.row(dark as usize).unwrap().iter().zip(expected) {
+        assert!((f64::from(*f) - e).abs() < 0.01, "{f} {e}");
+    }
+    for id in 0..features.count {
+        let norm: f32 = features.row(id).unwrap().iter().map(|v| v * v).sum();
+        assert!((norm - 1.0).abs() < 1e-5);
+    }
+    // Same bytes with other threads, and nothing to do the second time.
+    let first = contents(&scene.masks);
+    let said = ok(&args);
+    assert!(said.contains("skipped 2 of 2 views: their features stand already"), "{said}");
+    for name in ["v0_f.npy", "v1_f.npy", "v0_f.json", "features.json"] {
+        std::fs::remove_file(scene.masks.join(name)).unwrap();
+    }
+    ok(&[&args[..], &["--threads", "1"]].concat());
+    assert_eq!(first, contents(&scene.masks));
+}
+
+#[test]
+fn crops_are_written_for_training() {
+    let scene = Scene::new(2);
+    scene.make_masks(&scene.masks, &[]);
+    let out = scene.masks.with_file_name("crops.safetensors");
+    ok(&["crops", "--scene", path(&scene.folder), "--masks", path(&scene.masks), "--out", path(&out), "--size", "16"]);
+    let a = Artifact::open(&out, mask_embed::embed::CROPS_FORMAT, 1).unwrap();
+    let view = a.tensor::<u32>("view", &[None]).unwrap();
+    let mask = a.tensor::<u32>("mask", &[Some(view.len())]).unwrap();
+    let pixels = a.tensor::<u8>("pixels", &[Some(view.len()), Some(3), Some(16), Some(16)]).unwrap();
+    assert_eq!(a.provenance().extra["views"], serde_json::json!(["v0", "v1"]));
+    let maps = MaskMaps::read(maps_path(&scene.masks, "v0")).unwrap();
+    assert_eq!(view.iter().filter(|&&v| v == 0).count(), maps.id_count());
+    let dark = maps.level(Level::Large)[30 * WIDTH + 30] as u32;
+    let at = (0..view.len()).find(|&i| view[i] == 0 && mask[i] == dark).unwrap();
+    let crop = &pixels[at * 768..(at + 1) * 768];
+    assert_eq!([crop[8 * 16 + 8], crop[256 + 8 * 16 + 8], crop[512 + 8 * 16 + 8]], [20, 30, 10]);
+}
+
+fn write_grey(p: &Path, width: u32, values: &[u16]) {
+    let height = values.len() as u32 / width;
+    let picture = image::ImageBuffer::<image::Luma<u16>, _>::from_raw(width, height, values.to_vec()).unwrap();
+    picture.save(p).unwrap();
+}
+
+#[test]
+fn label_pictures_become_id_maps() {
+    let dir = tempfile::tempdir().unwrap();
+    let (labels, out) = (dir.path().join("labels"), dir.path().join("masks"));
+    std::fs::create_dir(&labels).unwrap();
+    image::GrayImage::from_raw(2, 2, vec![0, 3, 3, 9]).unwrap().save(labels.join("a.b.png")).unwrap();
+    for (level, values) in [("default", [1, 0]), ("small", [700, 60000]), ("medium", [0, 0]), ("large", [5, 5])] {
+        write_grey(&labels.join(format!("c_{level}.png")), 2, &values);
+    }
+    ok(&["import", "--labels", path(&labels), "--out", path(&out)]);
+    let a = MaskMaps::read(maps_path(&out, "a.b")).unwrap();
+    assert_eq!(a.ids, [-1, 0, 0, 1, -1, 2, 2, 3, -1, 4, 4, 5, -1, 6, 6, 7]);
+    let c = MaskMaps::read(maps_path(&out, "c")).unwrap();
+    assert_eq!(c.ids, [0, -1, 1, 2, -1, -1, 3, 3]);
+    assert!(out.join("masks.json").exists());
+
+    let import = || error(&["import", "--labels", path(&labels), "--out", path(&out)]);
+    write_grey(&labels.join("c_large.png"), 1, &[5, 5]);
+    assert!(import().contains("c_large.png: the levels of a view differ in size; found 1 x 2, expected 2 x 1"));
+    std::fs::remove_file(labels.join("c_large.png")).unwrap();
+    assert!(import().contains("c_large.png: the labels of a level are missing"));
+    std::fs::write(labels.join("c.png"), "no picture").unwrap();
+    assert!(import().contains("labels for all levels and for single ones"));
+    for level in ["default", "small", "medium"] {
+        std::fs::remove_file(labels.join(format!("c_{level}.png"))).unwrap();
+    }
+    assert!(import().contains("c.png: not a readable PNG"));
+    image::RgbImage::new(2, 1).save(labels.join("c.png")).unwrap();
+    assert!(import().contains("c.png: labels in colour; found Rgb8"));
+    std::fs::remove_dir_all(&labels).unwrap();
+    assert!(import().contains("labels: cannot list"));
+    std::fs::create_dir(&labels).unwrap();
+    assert!(import().contains("labels: no label pictures"));
+    assert_eq!(MaskMaps::read(maps_path(&out, "c")).unwrap(), c, "a good output was overwritten");
+    assert!(out.join("masks.json").exists());
+}
+
+#[test]
+fn captions_become_token_ids() {
+    let dir = tempfile::tempdir().unwrap();
+    let truth = dir.path().join("set/scene_000/scene/truth");
+    let object = TrueObject {
+        id: 0,
+        name: "red mug".into(),
+        class: "mug".into(),
+        color: "red".into(),
+        background: false,
+        parts: vec![TruePart { id: 0, name: "handle".into() }],
+    };
+    TrueScene { objects: vec![object], parameters: serde_json::Value::Null }.write(truth.join("scene.json")).unwrap();
+    let caption = "a photo of a cat".to_string();
+    let mask = MaskTruth { level: 1, instances: vec![0], part: Some(0), kind: "part".into(), caption };
+    MaskTruth::write_all(truth.join("masks.json"), &BTreeMap::from([("v0".into(), vec![mask])])).unwrap();
+    let out = dir.path().join("tokens.json");
+    ok(&["tokenize", "--truth", path(dir.path()), "--out", path(&out)]);
+    let ids: BTreeMap<String, Vec<i32>> = serde_json::from_slice(&std::fs::read(&out).unwrap()).unwrap();
+    assert_eq!(ids.keys().collect::<Vec<_>>(), ["a photo of a cat", "mug", "red mug"]);
+    assert_eq!(ids["a photo of a cat"], [320, 1125, 539, 320, 2368]);
+    assert_eq!(ids["red mug"][1..], ids["mug"]);
+    let e = error(&["tokenize", "--truth", path(&truth), "--out", path(&out)]);
+    assert!(e.contains("no synthetic scene under this folder"), "{e}");
+}
+
+#[test]
+fn bad_input_is_one_line_and_exit_code_2() {
+    let scene = Scene::new(2);
+    scene.make_masks(&scene.masks, &[]);
+    let good = contents(&scene.masks);
+    let with = |folder: &Path, sam: &Path, out: &Path| {
+        error(&["masks", "--scene", path(folder), "--sam", path(sam), "--out", path(out), "--points-per-side", "4"])
+    };
+    let dir = tempfile::tempdir().unwrap();
+    let e = with(&scene.folder, dir.path(), &scene.masks);
+    assert!(e.contains("encoder.onnx: no such model; `make models` fetches it"), "{e}");
+    // Encoder and decoder exchanged; the decoder twice; a cut decoder.
+    let sam = |encoder: &str, decoder: &str| {
+        std::fs::copy(fake_sam().join(encoder), dir.path().join("encoder.onnx")).unwrap();
+        std::fs::copy(fake_sam().join(decoder), dir.path().join("sam.onnx")).unwrap();
+    };
+    sam("sam.onnx", "encoder.onnx");
+    let e = with(&scene.folder, dir.path(), &scene.masks);
+    assert!(e.contains("encoder.onnx: SAM's encoder has one input; found 6"), "{e}");
+    sam("encoder.onnx", "encoder.onnx");
+    let e = with(&scene.folder, dir.path(), &scene.masks);
+    assert!(e.contains("sam.onnx: low_res_masks: the model has no such value"), "{e}");
+    std::fs::write(dir.path().join("sam.onnx"), "version https://git-lfs.github.com/spec/v1\n").unwrap();
+    let e = with(&scene.folder, dir.path(), &scene.masks);
+    assert!(e.contains("sam.onnx: not an ONNX model"), "{e}");
+    let e = with(&scene.folder.join("none"), &fake_sam(), &scene.masks);
+    assert!(e.contains("none"), "{e}");
+    assert_eq!(good, contents(&scene.masks), "a good output was touched");
+    // An output that cannot be written: a file stands where the folder should be.
+    let blocked = dir.path().join("blocked");
+    std::fs::write(&blocked, "x").unwrap();
+    let e = with(&scene.folder, &fake_sam(), &blocked.join("masks"));
+    assert!(e.contains("cannot create the folder"), "{e}");
+    // A photograph cut short: the other view is made, no manifest appears.
+    let photo = std::fs::read(scene.folder.join("v1.png")).unwrap();
+    std::fs::write(scene.folder.join("v1.png"), &photo[..photo.len() / 2]).unwrap();
+    let out = dir.path().join("out");
+    let e = with(&scene.folder, &fake_sam(), &out);
+    assert!(e.contains("v1.png: "), "{e}");
+    assert!(out.join("v0_s.npy").exists() && !out.join("v1_s.npy").exists() && !out.join("masks.json").exists());
+    std::fs::write(scene.folder.join("v1.png"), &photo).unwrap();
+
+    let embed = |masks: &Path, clip: &Path| {
+        error(&["embed", "--scene", path(&scene.folder), "--masks", path(masks), "--clip", path(clip)])
+    };
+    let e = embed(&scene.masks, dir.path());
+    assert!(e.contains("image.onnx: no such model"), "{e}");
+    let e = embed(&blocked.with_file_name("empty"), &fake_clip());
+    assert!(e.contains("empty: cannot list"), "{e}");
+    std::fs::write(maps_path(&scene.masks, "v0"), &good["v0_s.npy"][..500]).unwrap();
+    let e = embed(&scene.masks, &fake_clip());
+    assert!(e.contains("v0_s.npy: shape: the file's length does not fit its shape"), "{e}");
+    // clap's own errors have exit code 2 as well.
+    assert_eq!(run(&["masks", "--scene", "x", "--out", "y", "--nms-iou", "1.5"]).status.code(), Some(2));
+}
+
+#[test]
+fn id_maps_of_another_shape_are_refused_before_the_first_view() {
+    let scene = Scene::new(2);
+    scene.make_masks(&scene.masks, &[]);
+    let file = maps_path(&scene.masks, "v1");
+    let maps = MaskMaps::read(&file).unwrap();
+    MaskMaps { width: maps.height, height: maps.width, ids: maps.ids }.write(&file).unwrap();
+    let (clip, out) = (fake_clip(), scene.masks.with_file_name("out"));
+    let inputs = ["--scene", path(&scene.folder), "--masks", path(&scene.masks), "--out", path(&out)];
+    for command in [&["embed", "--clip", path(&clip)][..], &["crops"]] {
+        let e = error(&[command, &inputs[..]].concat());
+        let expected =
+            "v1_s.npy: shape: the id map has another shape than the photograph; found 64x128, expected 128x64";
+        assert!(e.contains(expected), "{e}");
+        assert!(!out.exists());
+    }
+    // Smaller maps are whole pictures, too.
+    MaskMaps { width: 64, height: 32, ids: vec![0; 4 * 64 * 32] }.write(&file).unwrap();
+    ok(&[&["embed", "--clip", path(&clip)], &inputs[..]].concat());
+}
+
+#[test]
+fn views_of_the_same_name_are_told_apart_by_folder() {
+    let scene = Scene::new(1);
+    let inner = scene.folder.join("b");
+    std::fs::create_dir(&inner).unwrap();
+    std::fs::copy(scene.folder.join("v0.png"), inner.join("v0.png")).unwrap();
+    let json = std::fs::read_to_string(scene.folder.join("transforms.json")).unwrap();
+    let (head, frame) = json.strip_suffix("]}").unwrap().split_at(json.find("{\"file_path").unwrap());
+    let twice = format!("{head}{frame},{}]}}", frame.replace("v0.png", "b/v0.png"));
+    std::fs::write(scene.folder.join("transforms.json"), twice).unwrap();
+    scene.make_masks(&scene.masks, &[]);
+    let maps: Vec<String> = contents(&scene.masks).into_keys().filter(|n| n.ends_with(".npy")).collect();
+    assert_eq!(maps.len(), 2, "{maps:?}");
+}
