@@ -12,6 +12,7 @@ mod log;
 mod machine;
 mod memory;
 mod progress;
+mod range;
 mod record;
 mod signals;
 
@@ -19,6 +20,7 @@ pub use log::Stage;
 pub use machine::Machine;
 pub use memory::Bytes;
 pub use progress::Progress;
+pub use range::{at_least, positive, within};
 pub use record::{RunRecord, cpu_seconds, peak_rss_bytes};
 
 use clap::builder::RangedU64ValueParser;
