@@ -6,6 +6,5 @@ pub mod compare;
 pub mod growth;
 pub mod page;
 pub mod plan;
-mod scatter;
 pub mod stress;
 pub mod tradeoff;

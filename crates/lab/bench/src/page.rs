@@ -2,11 +2,11 @@
 
 use crate::compare::Compared;
 use crate::growth::Growth;
-use crate::scatter::scatter;
 use crate::stress::Row;
-use crate::tradeoff::Curve;
-use eval::html::Page;
-use eval::sheet::line;
+use crate::tradeoff::{Curve, Measured};
+use report::html::Page;
+use report::plot::{Chart, Dot, number};
+use report::sheet::line;
 use std::fmt::Write;
 
 fn with_spread([median, least, most]: [f64; 3]) -> String {
@@ -55,7 +55,7 @@ fn growth_table(all: &[Growth]) -> (Vec<&'static str>, Vec<Vec<String>>) {
         vec![
             g.title.clone(),
             g.stage.name().into(),
-            list(g.sizes.iter().map(|s| eval::svg::number(*s)).collect()),
+            list(g.sizes.iter().map(|s| number(*s)).collect()),
             list(g.gaussians.iter().map(u64::to_string).collect()),
             list(g.costs.iter().map(|c| format!("{:.2}", c.cpu)).collect()),
             list(g.costs.iter().map(|c| format!("{:.0}", c.peak as f64 / 1e6)).collect()),
@@ -94,6 +94,20 @@ pub fn markdown(head: &[&str], rows: &[Vec<String>]) -> String {
     let head: Vec<String> = head.iter().map(|h| (*h).to_string()).collect();
     let rule = vec!["---".to_string(); head.len()];
     [head, rule].iter().chain(rows).map(|cells| line(cells)).collect()
+}
+
+/// Processor time over error, a circle for each setting with the range of its time; the front is joined by a line, the
+/// default is filled.
+fn scatter(curve: &Curve) -> String {
+    let dot = |(p, &error): (&Measured, &f64)| {
+        let [median, least, most] = p.cpu();
+        Dot { at: (error, median), range: (least, most), filled: p.default, label: p.label.clone() }
+    };
+    let dots: Vec<Dot> = curve.points.iter().zip(&curve.errors).map(dot).collect();
+    let mut line: Vec<(f64, f64)> = dots.iter().zip(&curve.front).filter(|(_, f)| **f).map(|(d, _)| d.at).collect();
+    line.sort_by(|a, b| a.0.total_cmp(&b.0));
+    let title = format!("{} ({})", curve.title, curve.scene);
+    Chart { title, axes: format!("{}; upwards: CPU seconds", curve.measure), line, dots }.svg()
 }
 
 /// The page.

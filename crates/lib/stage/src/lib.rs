@@ -6,7 +6,6 @@
 //!
 //! `PROGRAM --generate man DIR` writes manual pages, `PROGRAM --generate bash DIR` (zsh, fish, ...) completions.
 
-pub mod curve;
 mod generate;
 mod log;
 mod machine;

@@ -5,11 +5,11 @@ use crate::labels::{self, FrameLabels};
 use crate::protocol::lerf::{self, Averaging, Figures, Pair, Predicted};
 use crate::protocol::published;
 use crate::scene::LabelledScene;
-use crate::sheet::Sheet;
 use crate::silhouette::{self, Silhouette};
 use gs_io::{Error, Result, write_bytes};
 use gs_scene::Camera;
 use gs_scene::dataset::{Dataset, View};
+use report::sheet::Sheet;
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
@@ -188,7 +188,7 @@ pub fn save_predictions(folder: &Path, frame: &FrameLabels, predictions: &[Predi
     for p in predictions {
         let path = |extension: &str| folder.join(prediction_name(&frame.frame, &p.category, extension));
         if let Predicted::Pixels(mask) = &p.mask {
-            write_bytes(path("png"), &crate::picture::mask_png(mask)?)?;
+            write_bytes(path("png"), &report::picture::mask_png(mask.width, mask.height, &mask.bits)?)?;
         }
         if let Some(map) = &p.relevancy {
             gs_io::npy::write_f32(path("npy"), &[frame.height as usize, frame.width as usize], map)?;

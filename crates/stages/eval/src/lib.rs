@@ -3,9 +3,7 @@
 pub mod ablation;
 pub mod ask;
 pub mod cli;
-pub mod curves;
 pub mod granularity;
-pub mod html;
 pub mod label_iou;
 pub mod labels;
 pub mod lerf;
@@ -14,7 +12,6 @@ pub mod mask_stats;
 pub mod memory;
 pub mod metrics;
 pub mod pca;
-pub mod picture;
 pub mod place;
 pub mod polygon;
 pub mod protocol;
@@ -26,9 +23,7 @@ pub mod scan;
 pub mod scene;
 pub mod score;
 pub mod segment;
-pub mod sheet;
 pub mod silhouette;
-pub mod svg;
 pub mod text;
 
 pub use mask::Mask;

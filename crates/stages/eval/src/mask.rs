@@ -44,27 +44,6 @@ impl Mask {
         }
         if either == 0 { 0.0 } else { both as f64 / either as f64 }
     }
-
-    /// The pixels outside the set within `radius` (Chebyshev) of it: an outline that hides nothing of the inside.
-    pub fn outline(&self, radius: usize) -> Self {
-        // A square window is two passes of a line window.
-        let (w, h) = (self.width, self.height);
-        let mut rows = Self::new(w, h);
-        for y in 0..h {
-            for x in 0..w {
-                rows.bits[y * w + x] =
-                    (x.saturating_sub(radius)..(x + radius + 1).min(w)).any(|u| self.bits[y * w + u]);
-            }
-        }
-        let mut out = Self::new(w, h);
-        for y in 0..h {
-            for x in 0..w {
-                let near = (y.saturating_sub(radius)..(y + radius + 1).min(h)).any(|v| rows.bits[v * w + x]);
-                out.bits[y * w + x] = near && !self.bits[y * w + x];
-            }
-        }
-        out
-    }
 }
 
 #[cfg(test)]
@@ -92,12 +71,5 @@ mod tests {
     #[test]
     fn the_threshold_is_strict() {
         assert_eq!(Mask::above(3, 1, &[0.69, 0.7, 0.71], 0.7).bits, [false, false, true]);
-    }
-
-    #[test]
-    fn the_outline_surrounds_without_overlap() {
-        let (m, o) = (block(3, 6), block(3, 6).outline(1));
-        assert_eq!(o.count(), 5 * 4 - 6);
-        assert!(m.bits.iter().zip(&o.bits).all(|(a, b)| !(a & b)));
     }
 }

@@ -2,7 +2,6 @@
 
 use crate::ask::Answered;
 use crate::lerf::Rendering;
-use crate::picture::{HIGHLIGHT, Picture, mask_png};
 use crate::place::Place;
 use crate::ranking::Ranked;
 use crate::scene::{LabelledScene, find_view, numbered, slug, spread};
@@ -10,6 +9,7 @@ use crate::segment::{self, Segment, Segmentation};
 use artifacts::instance_color;
 use gs_io::{Error, Result, write_bytes};
 use gs_scene::dataset::{Dataset, View};
+use report::picture::{HIGHLIGHT, Picture, mask_png};
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeSet;
 use std::fmt::Write;
@@ -166,8 +166,8 @@ pub fn write(
         for (&q, mask) in here.iter().zip(&masks) {
             let stem = format!("{}.{}", shown[q].file, view_name(dataset, view));
             let (overlay, mask_file) = (format!("{stem}.overlay.png"), format!("{stem}.mask.png"));
-            write_bytes(out.join(&overlay), &photo.highlighted(mask, HIGHLIGHT).png()?)?;
-            write_bytes(out.join(&mask_file), &mask_png(mask)?)?;
+            write_bytes(out.join(&overlay), &photo.highlighted(&mask.bits, HIGHLIGHT).png()?)?;
+            write_bytes(out.join(&mask_file), &mask_png(mask.width, mask.height, &mask.bits)?)?;
             pictures[q].push(QueryView { view: view.stem().into(), overlay, mask: mask_file, pixels: mask.count() });
         }
     }

@@ -8,8 +8,8 @@ mod sections;
 
 use self::material::{Material, optional_json};
 use crate::ablation::{self, Table};
-use crate::html::Page;
 use crate::runs::{self, Run, grouped};
+use ::report::html::Page;
 use gs_io::{Error, Result, write_bytes};
 use gs_scene::dataset::{Dataset, Split};
 use serde::{Deserialize, Serialize};

@@ -41,7 +41,7 @@ impl Run {
         let Value::Object(summary) = &self.record.summary else { return String::new() };
         let figure = |(key, value): (&String, &Value)| {
             let text = match value {
-                Value::Number(n) if n.is_f64() => crate::svg::number(n.as_f64()?),
+                Value::Number(n) if n.is_f64() => report::plot::number(n.as_f64()?),
                 Value::Number(n) => grouped(&n.to_string()),
                 Value::String(s) => s.clone(),
                 Value::Bool(b) => b.to_string(),

@@ -1,6 +1,6 @@
 //! The training curve as a picture: loss, held-out PSNR and number of Gaussians over the iterations.
 
-use stage::curve::Panel;
+use report::curve::Panel;
 
 const PANELS: [Panel; 3] = [
     ("loss", "training loss", "#1f77b4"),
@@ -8,9 +8,9 @@ const PANELS: [Panel; 3] = [
     ("gaussians", "Gaussians", "#d62728"),
 ];
 
-/// An SVG of the lines of `<output>.curve.jsonl`; see [`stage::curve::svg`].
+/// An SVG of the lines of `<output>.curve.jsonl`; see [`report::curve::svg`].
 pub fn svg(lines: &[String]) -> String {
-    stage::curve::svg(lines, &PANELS)
+    report::curve::svg(lines, &PANELS)
 }
 
 #[cfg(test)]

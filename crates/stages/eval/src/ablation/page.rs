@@ -1,7 +1,7 @@
 //! Tables of an ablation on a page.
 
 use super::tables::{Table, blocks, remark};
-use crate::html::Page;
+use report::html::Page;
 
 /// A section for each table.
 pub fn sections(page: &mut Page, tables: &[Table]) {

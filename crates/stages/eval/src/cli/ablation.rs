@@ -1,8 +1,8 @@
 //! `eval ablation`.
 
 use crate::ablation::{self, Plan, Runs, Table};
-use crate::html::Page;
 use gs_io::{Error, IoContext, Result, write_bytes};
+use report::html::Page;
 use serde_json::json;
 use stage::Stage;
 use std::collections::BTreeMap;

@@ -1,8 +1,8 @@
 //! Published numbers, and tables in the layout of the CAGS paper with ours below them.
 
 use super::lerf::{Figures, dataset_figures};
-use crate::sheet::{Row, Sheet, Table};
 use artifacts::LERF_OVS;
+use report::sheet::{Row, Sheet, Table};
 
 /// mIoU and mAcc@0.25 in percent of a method on LERF-OVS: waldo_kitchen, ramen, figurines, teatime, mean.
 struct LerfRow {

@@ -1,9 +1,9 @@
 //! What the sections of a report draw from.
 
 use super::{Metrics, ReportOptions};
-use crate::picture::Picture;
 use crate::scene::{LabelledScene, find_view, spread};
 use crate::score::Scores;
+use ::report::picture::Picture;
 use artifacts::role;
 use gs_io::{Error, IoContext, Result, hash_file};
 use gs_raster::RasterOptions;

@@ -2,12 +2,12 @@
 
 use super::Metrics;
 use super::material::{Material, is_of, optional_json};
-use crate::html::{Figure, Page};
 use crate::pca::pca;
-use crate::picture::Picture;
 use crate::query::QueryResults;
 use crate::runs::{self, Run, grouped};
-use crate::{curves, svg};
+use ::report::curve;
+use ::report::html::{Figure, Page};
+use ::report::picture::Picture;
 use artifacts::{Features, Level, MaskMaps, NOISE_COLOR, hash_folder, instance_color, maps_path, role};
 use gs_io::{Error, IoContext, Result};
 use gs_scene::dataset::{Dataset, Split, View};
@@ -315,12 +315,11 @@ pub(super) fn training(m: &Material, page: &mut Page, metrics: &mut Metrics) -> 
         let file = path.file_name().unwrap_or_default().to_string_lossy().into_owned();
         let stage = file.trim_end_matches(".curve.jsonl");
         let stage = stage.trim_end_matches(".ply").trim_end_matches(".safetensors");
-        for mut series in curves::read(&path)? {
-            series.name = format!("{stage}: {}", series.name.replace('_', " "));
-            charts.push(svg::chart(&series));
+        for mut chart in curve::read(&path)? {
+            chart.title = format!("{stage}: {}", chart.title.replace('_', " "));
+            charts.push(chart.svg());
         }
     }
-    charts.retain(|c| !c.is_empty());
     if charts.is_empty() {
         metrics.skipped.push("training curves: the run has no *.curve.jsonl".into());
         return Ok(());

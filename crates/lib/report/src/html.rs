@@ -127,7 +127,7 @@ impl Page {
     }
 }
 
-const STYLE: &str = include_str!("report.css");
+const STYLE: &str = include_str!("page.css");
 
 #[cfg(test)]
 mod tests {

@@ -1,6 +1,5 @@
 //! Pictures for people: overlays, id maps in colours, and their encoding.
 
-use crate::Mask;
 use gs_io::{Error, Result};
 use image::{DynamicImage, RgbImage};
 
@@ -34,14 +33,14 @@ impl Picture {
     /// # Panics
     /// When the mask has another size.
     #[must_use]
-    pub fn highlighted(&self, mask: &Mask, color: [f32; 3]) -> Self {
-        assert_eq!((self.width, self.height), (mask.width, mask.height));
-        let outline = mask.outline((self.width.max(self.height) / 400).max(1));
+    pub fn highlighted(&self, mask: &[bool], color: [f32; 3]) -> Self {
+        assert_eq!(self.pixels.len(), mask.len());
+        let outline = outline(mask, self.width, (self.width.max(self.height) / 400).max(1));
         let pixels = (0..self.pixels.len()).map(|i| {
             let c = self.pixels[i];
-            if outline.bits[i] {
+            if outline[i] {
                 color
-            } else if mask.bits[i] {
+            } else if mask[i] {
                 blend(c, color, 0.125)
             } else {
                 let grey = 0.299 * c[0] + 0.587 * c[1] + 0.114 * c[2];
@@ -99,9 +98,12 @@ impl Picture {
 ///
 /// # Errors
 /// When encoding fails.
-pub fn mask_png(mask: &Mask) -> Result<Vec<u8>> {
-    let bytes = mask.bits.iter().map(|&b| 255 * u8::from(b)).collect();
-    let grey = image::GrayImage::from_raw(mask.width as u32, mask.height as u32, bytes).expect("sizes agree");
+///
+/// # Panics
+/// When `mask` has less than a value per pixel.
+pub fn mask_png(width: usize, height: usize, mask: &[bool]) -> Result<Vec<u8>> {
+    let bytes = mask.iter().map(|&b| 255 * u8::from(b)).collect();
+    let grey = image::GrayImage::from_raw(width as u32, height as u32, bytes).expect("sizes agree");
     encode(&DynamicImage::ImageLuma8(grey), image::ImageFormat::Png)
 }
 
@@ -109,6 +111,27 @@ fn encode(picture: &DynamicImage, format: image::ImageFormat) -> Result<Vec<u8>>
     let mut out = std::io::Cursor::new(Vec::new());
     picture.write_to(&mut out, format).map_err(|e| Error::new(format!("cannot encode a picture: {e}")))?;
     Ok(out.into_inner())
+}
+
+/// The pixels outside a mask within `radius` (Chebyshev) of it: an outline that hides nothing of the inside.
+fn outline(mask: &[bool], width: usize, radius: usize) -> Vec<bool> {
+    // A square window is two passes of a line window.
+    let height = mask.len() / width.max(1);
+    let mut rows = vec![false; mask.len()];
+    let mut out = rows.clone();
+    for y in 0..height {
+        for x in 0..width {
+            rows[y * width + x] =
+                mask[y * width..][x.saturating_sub(radius)..(x + radius + 1).min(width)].contains(&true);
+        }
+    }
+    for y in 0..height {
+        for x in 0..width {
+            let near = (y.saturating_sub(radius)..(y + radius + 1).min(height)).any(|v| rows[v * width + x]);
+            out[y * width + x] = near && !mask[y * width + x];
+        }
+    }
+    out
 }
 
 /// `(1 - t) a + t b`.
@@ -126,12 +149,20 @@ mod tests {
 
     #[test]
     fn a_highlight_marks_outline_inside_and_outside() {
-        let mut mask = Mask::new(8, 6);
-        mask.bits[2 * 8 + 3] = true;
+        let mut mask = vec![false; 8 * 6];
+        mask[2 * 8 + 3] = true;
         let h = picture().highlighted(&mask, [1.0, 0.0, 0.0]);
         assert_eq!(h.pixels[2 * 8 + 3], [0.5625, 0.4375, 0.4375]);
         assert_eq!(h.pixels[2 * 8 + 4], [1.0, 0.0, 0.0]);
         assert!((h.pixels[0][0] - 0.395).abs() < 1e-6);
+    }
+
+    #[test]
+    fn the_outline_surrounds_without_overlap() {
+        let mask: Vec<bool> = (0..40).map(|i| (1..3).contains(&(i / 10)) && (3..6).contains(&(i % 10))).collect();
+        let o = outline(&mask, 10, 1);
+        assert_eq!(o.iter().filter(|&&b| b).count(), 5 * 4 - 6);
+        assert!(mask.iter().zip(&o).all(|(a, b)| !(a & b)));
     }
 
     #[test]
@@ -142,9 +173,9 @@ mod tests {
         assert_eq!((png.dimensions(), png[(0, 0)].0, png[(1, 0)].0), ((8, 6), [255, 0, 51], [128; 3]));
         let jpeg = image::load_from_memory(&p.jpeg(4, 80).unwrap()).unwrap();
         assert_eq!((jpeg.width(), jpeg.height()), (4, 3));
-        let mut mask = Mask::new(8, 6);
-        mask.bits[9] = true;
-        let m = image::load_from_memory(&mask_png(&mask).unwrap()).unwrap().to_luma8();
+        let mut mask = vec![false; 8 * 6];
+        mask[9] = true;
+        let m = image::load_from_memory(&mask_png(8, 6, &mask).unwrap()).unwrap().to_luma8();
         assert_eq!((m[(1, 1)].0, m[(0, 0)].0), ([255], [0]));
     }
 
