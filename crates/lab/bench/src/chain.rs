@@ -54,7 +54,7 @@ pub struct Options(BTreeMap<Stage, Vec<String>>);
 impl Options {
     /// Options of one stage, with spaces between.
     pub fn of(stage: Stage, text: &str) -> Self {
-        Self(BTreeMap::from([(stage, text.split_whitespace().map(String::from).collect())]))
+        Self(BTreeMap::from([(stage, words(text))]))
     }
 
     /// Reads `stage: options; stage: options`.
@@ -120,11 +120,15 @@ pub struct Programs {
 }
 
 impl Programs {
-    /// Runs a program to its end, quietly.
+    /// Runs a command line, the program's name first, to its end, quietly.
     ///
     /// # Errors
     /// When it cannot be started or fails; the error holds what it said.
-    pub fn run<S: AsRef<std::ffi::OsStr>>(&self, program: &str, arguments: &[S]) -> Result<()> {
+    ///
+    /// # Panics
+    /// When the command line is empty.
+    pub fn run(&self, command: &[String]) -> Result<()> {
+        let (program, arguments) = command.split_first().expect("a program");
         let path = self.folder.join(program);
         let output = Command::new(&path)
             .args(arguments)
@@ -139,45 +143,95 @@ impl Programs {
     }
 }
 
-/// The files of a scene and of what the stages make of it.
+/// The files of a scene and of what the stages make of it. Who reads and writes which of them is the pipeline.
 #[derive(Debug, Clone)]
 pub struct Files {
     /// Folder of the photographs.
     pub scene: PathBuf,
     /// Folder of the masks.
     pub masks: PathBuf,
-    /// `geometry.ply`.
+    /// Text features of the categories.
+    pub texts: PathBuf,
+    /// The Gaussians.
     pub geometry: PathBuf,
-    /// Folder of everything after it.
-    pub out: PathBuf,
+    /// The graph.
+    pub graph: PathBuf,
+    /// The footprints beside it.
+    pub footprints: PathBuf,
+    /// The features.
+    pub features: PathBuf,
+    /// The instances.
+    pub instances: PathBuf,
+    /// Their score.
+    pub score: PathBuf,
 }
 
 impl Files {
     /// A synthetic scene in `folder`, with what is made of it.
     pub fn of(folder: &Path) -> Self {
         let scene = folder.join("scene");
-        let masks = scene.join("language_features");
-        Self { scene, masks, geometry: folder.join("geometry.ply"), out: folder.join("exact") }
-    }
-
-    /// The file that a stage writes; of the graph's two the graph.
-    pub fn output(&self, stage: Stage) -> PathBuf {
-        match stage {
-            Stage::Geometry => self.geometry.clone(),
-            Stage::Graph => self.out.join("graph.safetensors"),
-            Stage::Features => self.out.join("features.safetensors"),
-            Stage::Instances => self.out.join("instances.safetensors"),
+        let own = |name: &str| folder.join("exact").join(name);
+        Self {
+            masks: scene.join("language_features"),
+            texts: scene.join("truth/text_features.json"),
+            geometry: folder.join("geometry.ply"),
+            graph: own("graph.safetensors"),
+            footprints: own("footprints.safetensors"),
+            features: own("features.safetensors"),
+            instances: own("instances.safetensors"),
+            score: own("score.json"),
+            scene,
         }
     }
 
-    /// The footprints beside the graph.
-    pub fn footprints(&self) -> PathBuf {
-        self.out.join("footprints.safetensors")
+    /// The same scene, masks and geometry; everything after them in another folder.
+    #[must_use]
+    pub fn within(&self, folder: &Path) -> Self {
+        let own = |path: &Path| folder.join(path.file_name().unwrap_or_default());
+        Self {
+            graph: own(&self.graph),
+            footprints: own(&self.footprints),
+            features: own(&self.features),
+            instances: own(&self.instances),
+            score: own(&self.score),
+            ..self.clone()
+        }
     }
 
-    /// The score of the instances.
-    pub fn score(&self) -> PathBuf {
-        self.out.join("score.json")
+    /// The file that a stage writes; of the graph's two the graph.
+    pub fn output(&self, stage: Stage) -> &Path {
+        match stage {
+            Stage::Geometry => &self.geometry,
+            Stage::Graph => &self.graph,
+            Stage::Features => &self.features,
+            Stage::Instances => &self.instances,
+        }
+    }
+
+    /// The command line of a stage: its program, then its arguments without further options.
+    pub fn command(&self, stage: Stage) -> Vec<String> {
+        let (scene, geometry) = (("--scene", &*self.scene), ("--geometry", &*self.geometry));
+        let (graph, footprints) = (("--graph", &*self.graph), ("--footprints", &*self.footprints));
+        let (masks, out) = (("--masks", &*self.masks), ("--out", self.output(stage)));
+        match stage {
+            Stage::Geometry => command(&["gs-geom", "train", "--no-resume"], &[scene, out]),
+            Stage::Graph => command(&["graph-precompute"], &[scene, geometry, masks, footprints, graph]),
+            Stage::Features => command(&["feat-train"], &[geometry, graph, footprints, out]),
+            Stage::Instances => {
+                let features = ("--features", &*self.features);
+                command(&["cluster-match"], &[scene, geometry, graph, footprints, features, masks, out])
+            }
+        }
+    }
+
+    /// The command line of the score.
+    pub fn scoring(&self) -> Vec<String> {
+        let mut files = vec![("--scene", &*self.scene), ("--geometry", &*self.geometry)];
+        files.extend([("--instances", &*self.instances), ("--out", &*self.score)]);
+        if self.texts.exists() {
+            files.push(("--text-features", &self.texts));
+        }
+        command(&["eval", "score"], &files)
     }
 
     /// Runs a stage.
@@ -185,24 +239,8 @@ impl Files {
     /// # Errors
     /// See [`Programs::run`].
     pub fn run(&self, programs: &Programs, stage: Stage, options: &Options) -> Result<Cost> {
-        create_dir(&self.out)?;
-        let text = |p: &Path| p.to_string_lossy().into_owned();
-        let file = |name: &str, p: PathBuf| [name.to_string(), text(&p)];
-        let (scene, geometry) = (file("--scene", self.scene.clone()), file("--geometry", self.geometry.clone()));
-        let (graph, masks) = (file("--graph", self.output(Stage::Graph)), file("--masks", self.masks.clone()));
-        let footprints = file("--footprints", self.footprints());
-        let out = file("--out", self.output(stage));
-        let (program, mut arguments) = match stage {
-            Stage::Geometry => ("gs-geom", [&["train".to_string(), "--no-resume".into()][..], &scene, &out].concat()),
-            Stage::Graph => ("graph-precompute", [scene, geometry, masks, footprints, graph].concat()),
-            Stage::Features => ("feat-train", [geometry, graph, footprints, out].concat()),
-            Stage::Instances => {
-                let features = file("--features", self.output(Stage::Features));
-                ("cluster-match", [scene, geometry, graph, footprints, features, masks, out].concat())
-            }
-        };
-        arguments.extend(options.get(stage).iter().cloned());
-        programs.run(program, &arguments)?;
+        create_dir(self.output(stage).parent().unwrap_or(Path::new(".")))?;
+        programs.run(&[&self.command(stage)[..], options.get(stage)].concat())?;
         let record = stage::RunRecord::read(self.output(stage))?;
         let (cpu, peak) = (record.cpu_seconds.unwrap_or(f64::NAN), record.peak_rss_bytes.unwrap_or(0));
         Ok(Cost { wall: record.wall_seconds, cpu, peak })
@@ -213,17 +251,20 @@ impl Files {
     /// # Errors
     /// See [`Programs::run`].
     pub fn evaluate(&self, programs: &Programs) -> Result<Value> {
-        let (score, texts) = (self.score(), self.scene.join("truth/text_features.json"));
-        let text = |p: &Path| p.to_string_lossy().into_owned();
-        let mut arguments = vec!["score".to_string(), "--scene".into(), text(&self.scene)];
-        arguments.extend(["--geometry".into(), text(&self.geometry), "--out".into(), text(&score)]);
-        arguments.extend(["--instances".into(), text(&self.output(Stage::Instances))]);
-        if texts.exists() {
-            arguments.extend(["--text-features".into(), text(&texts)]);
-        }
-        programs.run("eval", &arguments)?;
-        read_json(&score)
+        programs.run(&self.scoring())?;
+        read_json(&self.score)
     }
+}
+
+/// Words, then options with files.
+pub fn command(words: &[&str], files: &[(&str, &Path)]) -> Vec<String> {
+    let files = files.iter().flat_map(|(option, path)| [(*option).to_string(), path.to_string_lossy().into_owned()]);
+    words.iter().map(|w| (*w).to_string()).chain(files).collect()
+}
+
+/// Options as they are typed, with spaces between.
+pub fn words(text: &str) -> Vec<String> {
+    text.split_whitespace().map(String::from).collect()
 }
 
 /// Reads a JSON file.

@@ -1,80 +1,55 @@
 //! The command line.
 
 use crate::chain::{Programs, STAGES};
+use crate::page::Results;
 use crate::plan::Plan;
-use crate::{compare, growth, page, tradeoff};
+use crate::{cells, compare, growth, page, tables, tradeoff};
 use gs_io::{Claim, Error, Result, create_dir, write_bytes};
 use serde::Serialize;
 use serde_json::json;
-use stage::{CommonArgs, Stage};
+use stage::{CommonArgs, Machine, Stage};
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
-/// Benchmarks of the pipeline: run time against error, growth, two builds beside each other.
+/// Experiments on the pipeline: tables of scores, run time against error, growth, two builds beside each other
 #[derive(Debug, clap::Parser)]
 #[command(name = "bench", version)]
 pub struct Args {
     #[command(subcommand)]
     command: Command,
+    /// Folder of the stages' programs
+    #[arg(long, global = true, value_name = "DIR", default_value = "target/release")]
+    bin: PathBuf,
+    /// Folder for scenes and what is made of them; what run and compare find there is not made again
+    #[arg(long, global = true, value_name = "DIR", default_value = "out/bench/work")]
+    work: PathBuf,
+    /// Output file, JSON; the same is written beside it as .md and .html (compare writes no .html)
+    #[arg(long, global = true, value_name = "FILE", default_value = "out/bench/report.json")]
+    out: PathBuf,
+    /// What of it to do: names of tables, knobs and axes, with commas between; for stress parts of names of scenes [all]
+    #[arg(long, global = true, value_name = "NAMES", value_delimiter = ',')]
+    only: Vec<String>,
     #[command(flatten)]
     common: CommonArgs,
 }
 
 #[derive(Debug, clap::Subcommand)]
 enum Command {
-    /// Time every setting of every approximation of a plan, and measure its error against the exact one
-    Tradeoff(TradeoffArgs),
+    /// Run a plan: its tables of scores, then every setting of its approximations and every size, timed. Runs of tables are
+    /// of one thread each, as many at a time as --threads says; timed runs go one after another
+    Run {
+        /// The plan, such as pipelines/ablation.plan
+        plan: PathBuf,
+    },
     /// Time all stages of two builds in turns
-    Compare(CompareArgs),
-    /// Run every stage on hostile scenes and with hostile settings, and hold what comes out against what should
-    Stress(StressArgs),
-}
-
-/// Options of every command.
-#[derive(Debug, clap::Args)]
-struct Common {
-    /// Folder of the stages' programs
-    #[arg(long, value_name = "DIR", default_value = "target/release")]
-    bin: PathBuf,
-    /// Folder for scenes and what is made of them; what tradeoff and compare find there is not made again
-    #[arg(long, value_name = "DIR")]
-    work: PathBuf,
-    /// Output file, JSON; a .md (and but for compare a .html) of the same is written beside it
-    #[arg(long, value_name = "FILE")]
-    out: PathBuf,
-}
-
-#[derive(Debug, clap::Args)]
-struct TradeoffArgs {
-    #[command(flatten)]
-    common: Common,
-    /// What to measure, such as pipelines/tradeoffs.plan
-    #[arg(long, value_name = "FILE")]
-    plan: PathBuf,
-    /// Only these knobs and axes of the plan [all]
-    #[arg(long, value_name = "NAMES", value_delimiter = ',')]
-    only: Vec<String>,
-}
-
-#[derive(Debug, clap::Args)]
-struct CompareArgs {
-    #[command(flatten)]
-    common: Common,
-    /// The plan whose scenes are run, such as pipelines/tradeoffs.plan
-    #[arg(long, value_name = "FILE")]
-    plan: PathBuf,
-    /// Folder of the programs to compare with
-    #[arg(long, value_name = "DIR")]
-    base: PathBuf,
-}
-
-#[derive(Debug, clap::Args)]
-struct StressArgs {
-    #[command(flatten)]
-    common: Common,
-    /// Only scenes whose name contains this
-    #[arg(long, value_name = "TEXT", default_value = "")]
-    only: String,
+    Compare {
+        /// The plan whose scenes are run, such as pipelines/tradeoffs.plan
+        plan: PathBuf,
+        /// Folder of the programs to compare with
+        base: PathBuf,
+    },
+    /// Run every stage on hostile scenes and with hostile settings, and check the results
+    Stress,
 }
 
 impl stage::Program for Args {
@@ -91,10 +66,11 @@ impl stage::Program for Args {
     fn run(self, stage: &Stage) -> Result<()> {
         // Timings are of one thread unless more are asked for: fewer other programs get between.
         let threads = self.common.threads.max(1);
+        let programs = programs(&self.bin, threads)?;
         match &self.command {
-            Command::Tradeoff(a) => tradeoffs(a, threads, stage),
-            Command::Compare(a) => comparison(a, threads, stage),
-            Command::Stress(a) => stress(a, threads, stage),
+            Command::Run { plan } => self.experiments(&Plan::read(plan)?.only(&self.only)?, &programs, stage),
+            Command::Compare { plan, base } => self.comparison(&Plan::read(plan)?, base, &programs, stage),
+            Command::Stress => self.stress(&programs, stage),
         }
     }
 }
@@ -106,88 +82,78 @@ fn programs(folder: &Path, threads: usize) -> Result<Programs> {
     Err(Error::new("no programs here").file(folder).expected("gs-geom and the other stages").hint("run make build"))
 }
 
-/// The right to write the results: JSON, and the same as Markdown and HTML beside it.
-fn claim(out: &Path, stage: &Stage) -> Result<Claim> {
-    stage.outputs(out).file(out).files(["md", "html"].map(|extension| out.with_extension(extension))).claim()
-}
-
-fn write(out: &Path, value: &impl Serialize) -> Result<()> {
-    let text = serde_json::to_vec_pretty(value).map_err(|e| Error::new(e.to_string()).file(out))?;
-    write_bytes(out, &text)
-}
-
-fn tradeoffs(a: &TradeoffArgs, threads: usize, stage: &Stage) -> Result<()> {
-    let c = &a.common;
-    let plan = Plan::read(&a.plan)?;
-    let programs = programs(&c.bin, threads)?;
-    let mut claim = claim(&c.out, stage)?;
-    create_dir(&c.work)?;
-    let names: Vec<&str> = plan.knobs.iter().map(|k| &*k.name).chain(plan.axes.iter().map(|x| &*x.name)).collect();
-    if let Some(unknown) = a.only.iter().find(|o| !names.contains(&o.as_str())) {
-        return Err(Error::new("no such knob or axis").field("--only").found(unknown).expected(names.join(", ")));
+impl Args {
+    /// The right to write the results: JSON, and the same as Markdown and HTML beside it.
+    fn claim(&self, stage: &Stage) -> Result<Claim> {
+        let beside = ["md", "html"].map(|extension| self.out.with_extension(extension));
+        let claim = stage.outputs(&self.out).file(&self.out).files(beside).claim()?;
+        create_dir(&self.work)?;
+        Ok(claim)
     }
-    let wanted = |name: &str| a.only.is_empty() || a.only.iter().any(|o| o == name);
-    let (mut curves, mut grown) = (Vec::new(), Vec::new());
-    let any = plan.knobs.iter().any(|k| wanted(&k.name));
-    for scene in plan.scenes.iter().filter(|_| any) {
-        let folder = c.work.join(&scene.name);
-        let base = tradeoff::prepare(&programs, scene, &folder)?;
-        for s in STAGES.into_iter().skip(1) {
-            base.run(&programs, s, &crate::chain::Options::default())?;
+
+    fn write(&self, value: &impl Serialize, text: &str, page: Option<&str>) -> Result<()> {
+        let json = serde_json::to_vec_pretty(value).map_err(|e| Error::new(e.to_string()).file(&self.out))?;
+        write_bytes(&self.out, &json)?;
+        write_bytes(self.out.with_extension("md"), text.as_bytes())?;
+        page.map_or(Ok(()), |page| write_bytes(self.out.with_extension("html"), page.as_bytes()))
+    }
+
+    fn experiments(&self, plan: &Plan, programs: &Programs, stage: &Stage) -> Result<()> {
+        let mut claim = self.claim(stage)?;
+        let mut results = Results::default();
+        if !plan.tables.is_empty() {
+            cells::run(programs, plan, &self.work, stage)?;
+            results.tables = tables::results(plan, &self.work)?;
         }
-        for knob in plan.knobs.iter().filter(|k| wanted(&k.name)) {
-            stage.info(&format!("{} on {}", knob.title, scene.name));
-            curves.push(tradeoff::measure(&programs, &plan, knob, scene, &base, &folder)?);
+        for scene in plan.scenes.iter().filter(|_| !plan.knobs.is_empty()) {
+            let folder = self.work.join(&scene.name);
+            let base = tradeoff::prepare(programs, scene, &folder)?;
+            for s in STAGES.into_iter().skip(1) {
+                base.run(programs, s, &crate::chain::Options::default())?;
+            }
+            for knob in &plan.knobs {
+                stage.info(&format!("{} on {}", knob.title, scene.name));
+                results.curves.push(tradeoff::measure(programs, plan, knob, scene, &base, &folder)?);
+            }
         }
+        for axis in &plan.axes {
+            stage.info(&format!("growth along {}", axis.title));
+            results.growth.extend(growth::measure(programs, plan, axis, &self.work)?);
+        }
+        page::warnings(&results.curves).iter().for_each(|w| stage.warn(w));
+        let subtitle = format!("Revision {}, {}.", stage::REVISION, Machine::here());
+        self.write(&results, &page::text(&results, &subtitle), Some(&page::html(&results, &subtitle)))?;
+        let summary = json!({"tables": results.tables.len(), "curves": results.curves.len(),
+            "dominated": page::warnings(&results.curves).len()});
+        stage.record(&mut claim, json!({"command": "run"}), BTreeMap::new(), summary)?;
+        tables::check(plan, &results.tables)
     }
-    for axis in plan.axes.iter().filter(|x| wanted(&x.name)) {
-        stage.info(&format!("growth along {}", axis.title));
-        grown.extend(growth::measure(&programs, &plan, axis, &c.work)?);
+
+    fn comparison(&self, plan: &Plan, base: &Path, own: &Programs, stage: &Stage) -> Result<()> {
+        let mut claim = self.claim(stage)?;
+        let all = compare::compare(&programs(base, own.threads)?, own, plan, &self.work)?;
+        let (head, rows) = page::compare_table(&all);
+        let text = page::markdown(&head, &rows);
+        text.lines().for_each(|l| stage.info(l));
+        self.write(&all, &text, None)?;
+        stage.record(&mut claim, json!({"command": "compare"}), BTreeMap::new(), json!({}))
     }
-    page::warnings(&curves).iter().for_each(|w| stage.warn(w));
-    write(&c.out, &json!({"threads": threads, "curves": curves, "growth": grown}))?;
-    write_bytes(c.out.with_extension("md"), page::text(&curves, &grown).as_bytes())?;
-    let subtitle = format!("{} runs of each, {threads} threads", plan.repeats);
-    write_bytes(c.out.with_extension("html"), page::html(&curves, &grown, &subtitle).as_bytes())?;
-    let summary = json!({"curves": curves.len(), "dominated": page::warnings(&curves).len()});
-    stage.record(&mut claim, json!({"command": "tradeoff"}), BTreeMap::new(), summary)
-}
 
-fn comparison(a: &CompareArgs, threads: usize, stage: &Stage) -> Result<()> {
-    let c = &a.common;
-    let plan = Plan::read(&a.plan)?;
-    let mut claim = claim(&c.out, stage)?;
-    let all = compare::compare(&programs(&a.base, threads)?, &programs(&c.bin, threads)?, &plan, &c.work)?;
-    let (head, rows) = page::compare_table(&all);
-    let text = page::markdown(&head, &rows);
-    text.lines().for_each(|l| stage.info(l));
-    write(&c.out, &all)?;
-    write_bytes(c.out.with_extension("md"), text.as_bytes())?;
-    stage.record(&mut claim, json!({"command": "compare"}), BTreeMap::new(), json!({}))
-}
-
-fn stress(a: &StressArgs, threads: usize, stage: &Stage) -> Result<()> {
-    let c = &a.common;
-    let mut claim = claim(&c.out, stage)?;
-    create_dir(&c.work)?;
-    let rows = crate::stress::run(&programs(&c.bin, threads)?, &c.work, &a.only, &|name| stage.info(name))?;
-    write(&c.out, &rows)?;
-    let (text, page) = page::stress(&rows);
-    write_bytes(c.out.with_extension("md"), text.as_bytes())?;
-    write_bytes(c.out.with_extension("html"), page.as_bytes())?;
-    let bad: Vec<_> = rows.iter().filter(|r| !r.good).collect();
-    stage.record(
-        &mut claim,
-        json!({"command": "stress"}),
-        BTreeMap::new(),
-        json!({"cells": rows.len(), "bad": bad.len()}),
-    )?;
-    stage.info(&format!("{} of {} cells are good", rows.len() - bad.len(), rows.len()));
-    match bad.first() {
-        None => Ok(()),
-        Some(first) => Err(Error::new(format!("{} cells are not good", bad.len()))
-            .file(&c.out)
-            .field(format!("{}, {}", first.scene, first.stage))
-            .found(&first.note)),
+    fn stress(&self, programs: &Programs, stage: &Stage) -> Result<()> {
+        let mut claim = self.claim(stage)?;
+        let rows = crate::stress::run(programs, &self.work, &self.only, &|name| stage.info(name))?;
+        let (text, page) = page::stress(&rows);
+        self.write(&rows, &text, Some(&page))?;
+        let bad: Vec<_> = rows.iter().filter(|r| !r.good).collect();
+        let summary = json!({"cells": rows.len(), "bad": bad.len()});
+        stage.record(&mut claim, json!({"command": "stress"}), BTreeMap::new(), summary)?;
+        stage.info(&format!("{} of {} cells are good", rows.len() - bad.len(), rows.len()));
+        match bad.first() {
+            None => Ok(()),
+            Some(first) => Err(Error::new(format!("{} cells are not good", bad.len()))
+                .file(&self.out)
+                .field(format!("{}, {}", first.scene, first.stage))
+                .found(&first.note)),
+        }
     }
 }

@@ -38,7 +38,7 @@ pub fn compare(base: &Programs, own: &Programs, plan: &Plan, folder: &Path) -> R
         let options = Options::of(Stage::Geometry, &scene.geometry);
         let side = |name: &str| {
             let out = folder.join(&scene.name).join(name);
-            Files { geometry: out.join("geometry.ply"), out, ..root.clone() }
+            Files { geometry: out.join("geometry.ply"), ..root.within(&out) }
         };
         let sides = [(base, side("base")), (own, side("own"))];
         let mut costs = [vec![Vec::<Cost>::new(); STAGES.len()], vec![Vec::new(); STAGES.len()]];
@@ -52,7 +52,7 @@ pub fn compare(base: &Programs, own: &Programs, plan: &Plan, folder: &Path) -> R
         for stage in STAGES {
             let [b, o] = [0, 1].map(|s| spread(costs[s][stage as usize].iter().map(|c| c.cpu).collect()));
             let [mb, mo] = [0, 1].map(|s| spread(costs[s][stage as usize].iter().map(|c| c.peak as f64).collect())[0]);
-            let same_data = data(&sides[0].1.output(stage))? == data(&sides[1].1.output(stage))?;
+            let same_data = data(sides[0].1.output(stage))? == data(sides[1].1.output(stage))?;
             let (scene, ratio, memory_ratio) = (scene.name.clone(), o[0] / b[0].max(1e-9), mo / mb.max(1.0));
             all.push(Compared { scene, stage, base: b, own: o, ratio, memory_ratio, same_data });
         }

@@ -3,10 +3,12 @@
 use crate::compare::Compared;
 use crate::growth::Growth;
 use crate::stress::Row;
+use crate::tables::{self, Table};
 use crate::tradeoff::{Curve, Measured};
 use report::html::Page;
 use report::plot::{Chart, Dot, number};
 use report::sheet::line;
+use serde::Serialize;
 use std::fmt::Write;
 
 fn with_spread([median, least, most]: [f64; 3]) -> String {
@@ -89,6 +91,9 @@ pub fn warnings(curves: &[Curve]) -> Vec<String> {
     beaten.map(|(c, by)| format!("{} on {}: the default is dominated by \"{by}\"", c.title, c.scene)).collect()
 }
 
+/// A table with a title, a head and rows.
+pub type Block = (String, Vec<String>, Vec<Vec<String>>);
+
 /// A table in Markdown.
 pub fn markdown(head: &[&str], rows: &[Vec<String>]) -> String {
     let head: Vec<String> = head.iter().map(|h| (*h).to_string()).collect();
@@ -110,39 +115,64 @@ fn scatter(curve: &Curve) -> String {
     Chart { title, axes: format!("{}; upwards: CPU seconds", curve.measure), line, dots }.svg()
 }
 
+/// What a plan gave.
+#[derive(Debug, Default, Serialize)]
+pub struct Results {
+    /// Tables of scores.
+    pub tables: Vec<Table>,
+    /// Run time against error.
+    pub curves: Vec<Curve>,
+    /// Run time against size.
+    pub growth: Vec<Growth>,
+}
+
 /// The page.
-pub fn html(curves: &[Curve], growth: &[Growth], subtitle: &str) -> String {
+pub fn html(results: &Results, subtitle: &str) -> String {
     let mut page = Page::default();
-    page.section("trade-offs", "Run time against error");
-    for warning in warnings(curves) {
+    for table in &results.tables {
+        page.section(&format!("table-{}", table.name), &table.title);
+        for (title, head, rows) in tables::blocks(table) {
+            page.heading(&title, "");
+            let head: Vec<&str> = head.iter().map(String::as_str).collect();
+            page.table(&head, &rows);
+        }
+        page.paragraph(&tables::remark(table));
+    }
+    if !results.curves.is_empty() {
+        page.section("trade-offs", "Run time against error");
+    }
+    for warning in warnings(&results.curves) {
         page.note(&warning);
     }
-    for c in curves {
+    for c in &results.curves {
         page.heading(&c.title, &c.scene);
         page.charts(&[scatter(c)]);
         let (head, rows) = curve_table(c);
         page.table(&head, &rows);
     }
-    if !growth.is_empty() {
+    if !results.growth.is_empty() {
         page.section("growth", "Growth");
-        let (head, rows) = growth_table(growth);
+        let (head, rows) = growth_table(&results.growth);
         page.table(&head, &rows);
     }
-    page.finish("Benchmarks of the stages", subtitle)
+    page.finish("Experiments", subtitle)
 }
 
 /// The same as Markdown, without pictures.
-pub fn text(curves: &[Curve], growth: &[Growth]) -> String {
-    let mut text = String::from("# Benchmarks of the stages\n\n");
-    for warning in warnings(curves) {
+pub fn text(results: &Results, subtitle: &str) -> String {
+    let mut text = format!("# Experiments\n\n{subtitle}\n");
+    for table in &results.tables {
+        let _ = writeln!(text, "\n## {}\n\n{}", table.title, tables::text(table));
+    }
+    for warning in warnings(&results.curves) {
         let _ = writeln!(text, "* {warning}");
     }
-    for c in curves {
+    for c in &results.curves {
         let (head, rows) = curve_table(c);
         let _ = writeln!(text, "\n## {} ({})\n\nlost: {}\n\n{}", c.title, c.scene, c.measure, markdown(&head, &rows));
     }
-    if !growth.is_empty() {
-        let (head, rows) = growth_table(growth);
+    if !results.growth.is_empty() {
+        let (head, rows) = growth_table(&results.growth);
         let _ = writeln!(text, "\n## Growth\n\n{}", markdown(&head, &rows));
     }
     text

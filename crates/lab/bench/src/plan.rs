@@ -1,16 +1,30 @@
-//! The plan of the trade-offs: a text file of lines, a keyword and fields with `|` between; `#` begins a comment line.
+//! What to run and to measure: a text file of lines, a keyword with a name for most, then fields with `|` between; `#` begins
+//! a comment line.
 //!
 //! | line | meaning |
 //! |---|---|
-//! | `scene NAME \| synth-scene \| geometry` | a scene: options of synth-scene, and of gs-geom train |
-//! | `repeats \| COUNT` | how often each point is timed, in turns |
+//! | `scene NAME \| options \| options` | a scene: options of synth-scene, and of gs-geom train |
+//! | **tables** | scores of features and clusterings, on every scene with every seed |
+//! | `seeds \| 0 1 2` | seeds of every scene |
+//! | `masks \| options` | faults of all masks but their granularity: options of synth-scene |
+//! | `footprints NAME \| options` | options of graph-precompute |
+//! | `features NAME \| footprints \| options` | options of feat-train |
+//! | `clustering NAME \| options` | options of cluster-match |
+//! | `table NAME \| p values \| reference row \| title` | a table, at granularity noise of these p; `-`: no reference |
+//! | `row TABLE \| features \| clustering \| paper \| label` | a row; paper: its mIoU, mAcc and perhaps memory in GB, or `-` |
+//! | `expect TABLE \| features.clustering \| p \| metric \| low \| high` | the mean must lie in this range |
+//! | **trade-offs** | run time against error, on every scene |
+//! | `repeats \| COUNT` | how often each point is timed, in turns; 3 where it is not given |
 //! | `knob NAME \| STAGE \| title` | an approximation of a stage: `geometry`, `graph`, `features`, `instances` or `pipeline` |
-//! | `point KNOB \| LABEL \| options \| role` | a setting; role: `exact`, `default`, both or none. Options of other stages than the knob's: `stage: options; stage: options` |
+//! | `point KNOB \| label \| options \| role` | a setting; role: `exact`, `default`, both or none. Options of more than the knob's stage: `stage: options; stage: options` |
+//! | **growth** | run time against size |
 //! | `axis NAME \| title \| STAGE ...` | a size that stages are timed against |
-//! | `size AXIS \| VALUE \| scene \| geometry` | one size: options of synth-scene and gs-geom train |
+//! | `size AXIS \| value \| options \| options` | one size: options of synth-scene and of gs-geom train |
 
 use crate::chain::{Options, Stage};
 use gs_io::{Error, IoContext, Result};
+use serde::{Deserialize, Serialize};
+use std::collections::BTreeMap;
 use std::path::Path;
 
 /// A scene to measure on.
@@ -22,6 +36,69 @@ pub struct Scene {
     pub scene: String,
     /// Options of gs-geom train.
     pub geometry: String,
+}
+
+/// What the paper prints for a row, on LERF-OVS, in percent.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+pub struct Paper {
+    /// mIoU.
+    pub miou: f64,
+    /// mAcc.
+    pub macc: f64,
+    /// Memory in GB.
+    pub memory: Option<f64>,
+}
+
+/// A row of a table.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct Row {
+    /// Name of a way of making features.
+    pub features: String,
+    /// Name of a way of clustering.
+    pub clustering: String,
+    /// The paper's numbers.
+    pub paper: Option<Paper>,
+    /// What it is called.
+    pub label: String,
+}
+
+impl Row {
+    /// `features.clustering`: the name of its files.
+    pub fn id(&self) -> String {
+        format!("{}.{}", self.features, self.clustering)
+    }
+}
+
+/// A table.
+#[derive(Debug, Clone, PartialEq)]
+pub struct TablePlan {
+    /// Its name.
+    pub name: String,
+    /// Probabilities of other granularity, as written.
+    pub p: Vec<String>,
+    /// The row that others are compared with, by id.
+    pub reference: Option<String>,
+    /// Its title.
+    pub title: String,
+    /// Its rows.
+    pub rows: Vec<Row>,
+}
+
+/// A range that a mean must lie in.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Expected {
+    /// Table.
+    pub table: String,
+    /// Row, by id.
+    pub row: String,
+    /// Probability of other granularity, as written.
+    pub p: String,
+    /// Name of a metric.
+    pub metric: String,
+    /// Least value.
+    pub low: f64,
+    /// Largest value.
+    pub high: f64,
 }
 
 /// A setting of a knob.
@@ -72,11 +149,21 @@ pub struct Axis {
     pub sizes: Vec<Size>,
 }
 
-/// What to measure.
-#[derive(Debug, Clone, PartialEq)]
+/// A plan.
+#[derive(Debug, Clone, Default, PartialEq)]
 pub struct Plan {
-    /// Scenes of the knobs.
+    /// Scenes of tables and knobs.
     pub scenes: Vec<Scene>,
+    /// Seeds of the tables.
+    pub seeds: Vec<u64>,
+    /// Options by `keyword name`, or by keyword alone.
+    options: BTreeMap<String, String>,
+    /// Which footprints features are made from.
+    pub footprints_of: BTreeMap<String, String>,
+    /// Tables.
+    pub tables: Vec<TablePlan>,
+    /// What must come out of them.
+    pub expected: Vec<Expected>,
     /// How often each point is timed.
     pub repeats: usize,
     /// Approximations.
@@ -85,28 +172,44 @@ pub struct Plan {
     pub axes: Vec<Axis>,
 }
 
+/// Keywords with the number of fields after them, and whether they have a name.
+const KEYWORDS: [(&str, usize, bool); 14] = [
+    ("scene", 2, true),
+    ("seeds", 1, false),
+    ("masks", 1, false),
+    ("footprints", 1, true),
+    ("features", 2, true),
+    ("clustering", 1, true),
+    ("table", 3, true),
+    ("row", 4, true),
+    ("expect", 5, true),
+    ("repeats", 1, false),
+    ("knob", 2, true),
+    ("point", 3, true),
+    ("axis", 2, true),
+    ("size", 3, true),
+];
+
 impl Plan {
     /// Reads a plan.
     ///
     /// # Errors
-    /// When it cannot be read, a line is not understood, names what was not introduced, or a knob lacks its one exact or its
-    /// one default point; the error names the line.
+    /// When it cannot be read, a line is not one of the above, names what no line before it defines, or a knob lacks its one
+    /// exact or its one default point; the error names the line.
     pub fn read(path: impl AsRef<Path>) -> Result<Self> {
         let path = path.as_ref();
         let text = std::fs::read_to_string(path).at("read", path)?;
         Self::parse(&text).map_err(|e| e.file(path))
     }
 
-    /// Reads the text of a plan; errors as [`Self::read`].
+    /// Reads the text of a plan.
     ///
     /// # Errors
-    /// See there.
+    /// See [`Self::read`].
     pub fn parse(text: &str) -> Result<Self> {
-        let mut plan = Self { scenes: Vec::new(), repeats: 3, knobs: Vec::new(), axes: Vec::new() };
-        for (number, line) in text.lines().enumerate() {
-            if !line.trim().is_empty() && !line.starts_with('#') {
-                plan.line(line).map_err(|e| e.field(format!("line {}", number + 1)))?;
-            }
+        let mut plan = Self { repeats: 3, ..Self::default() };
+        for (i, line) in text.lines().enumerate().filter(|(_, l)| !l.trim().is_empty() && !l.starts_with('#')) {
+            plan.take(line).map_err(|e| e.field(format!("line {}", i + 1)))?;
         }
         for k in &plan.knobs {
             let count = |f: fn(&Point) -> bool| k.points.iter().filter(|p| f(p)).count();
@@ -114,54 +217,145 @@ impl Plan {
                 return Err(Error::new("a knob without its one exact and its one default point").field(&k.name));
             }
         }
+        if !plan.tables.is_empty() && plan.seeds.is_empty() {
+            return Err(Error::new("tables without seeds").expected("a line \"seeds | 0 1 2\""));
+        }
         Ok(plan)
     }
 
-    fn line(&mut self, line: &str) -> Result<()> {
+    fn take(&mut self, line: &str) -> Result<()> {
         let fields: Vec<&str> = line.split('|').map(str::trim).collect();
-        let (keyword, name) = fields[0].split_once(' ').unwrap_or((fields[0], ""));
-        let name = name.trim();
-        let field =
-            |i: usize| fields.get(i).copied().ok_or_else(|| Error::new("a line with too few fields").found(line));
-        let unknown = |what: &str| Error::new(format!("no such {what}")).found(name).found(line);
-        let scene = |name: &str, at: usize| -> Result<Scene> {
-            Ok(Scene { name: name.into(), scene: field(at)?.into(), geometry: field(at + 1)?.into() })
-        };
+        let (keyword, name) = fields[0].split_once(' ').map_or((fields[0], ""), |(k, n)| (k, n.trim()));
+        let wrong = |expected: &str| Error::new("not a line of a plan").found(line).expected(expected);
+        let known = KEYWORDS.iter().find(|k| k.0 == keyword);
+        let &(_, count, named) = known.ok_or_else(|| wrong(&KEYWORDS.map(|k| k.0).join(", ")))?;
+        // The role of a point may be left out.
+        let rest = &fields[1..];
+        let role = keyword == "point" && rest.len() == count - 1 || rest.len() == count;
+        if !role || name.is_empty() == named {
+            return Err(wrong(&format!("{count} fields after {keyword}{}", if named { " and a name" } else { "" })));
+        }
+        if !name.chars().all(|c| c.is_ascii_alphanumeric() || c == '-') {
+            return Err(Error::new("not a name").found(name).expected("letters, digits and -"));
+        }
         match keyword {
-            "scene" => self.scenes.push(scene(name, 1)?),
-            "repeats" => self.repeats = number(field(1)?)? as usize,
+            "scene" => self.scenes.push(scene(name, rest[0], rest[1])),
+            "seeds" => {
+                let seeds = rest[0].split_whitespace().map(|s| s.parse().map_err(|_| wrong("whole numbers")));
+                self.seeds = seeds.collect::<Result<_>>()?;
+            }
+            "table" => self.tables.push(table(name, rest)?),
+            "row" => {
+                self.defined("features", rest[0])?;
+                self.defined("clustering", rest[1])?;
+                let row = Row {
+                    features: rest[0].into(),
+                    clustering: rest[1].into(),
+                    paper: paper(rest[2]).ok_or_else(|| wrong("numbers of the paper, or -"))?,
+                    label: rest[3].into(),
+                };
+                by_name(&mut self.tables, "table", name, |t| &t.name)?.rows.push(row);
+            }
+            "expect" => {
+                let number = |s: &str| s.parse::<f64>().map_err(|_| wrong("numbers as bounds"));
+                let (table, row, p, metric) = (name.into(), rest[0].into(), rest[1].into(), rest[2].into());
+                self.expected.push(Expected { table, row, p, metric, low: number(rest[3])?, high: number(rest[4])? });
+            }
+            "repeats" => self.repeats = positive(rest[0])? as usize,
             "knob" => {
-                let stage = (field(1)? != "pipeline").then(|| field(1)?.parse()).transpose()?;
-                let (name, title) = (name.into(), field(2)?.into());
-                self.knobs.push(Knob { name, stage, title, points: Vec::new() });
+                let stage = (rest[0] != "pipeline").then(|| rest[0].parse()).transpose()?;
+                self.knobs.push(Knob { name: name.into(), stage, title: rest[1].into(), points: Vec::new() });
             }
             "point" => {
-                let knob = self.knobs.iter_mut().find(|k| k.name == name).ok_or_else(|| unknown("knob"))?;
-                let roles: Vec<&str> = fields.get(3).map(|r| r.split(' ').collect()).unwrap_or_default();
+                let knob = by_name(&mut self.knobs, "knob", name, |k| &k.name)?;
                 let options = match knob.stage {
-                    Some(stage) if !field(2)?.contains(':') => Options::of(stage, field(2)?),
-                    _ => Options::parse(field(2)?)?,
+                    Some(stage) if !rest[1].contains(':') => Options::of(stage, rest[1]),
+                    _ => Options::parse(rest[1])?,
                 };
-                let (exact, default) = (roles.contains(&"exact"), roles.contains(&"default"));
-                knob.points.push(Point { label: field(1)?.into(), options, exact, default });
+                let is = |role: &str| rest.get(2).is_some_and(|r| r.split(' ').any(|r| r == role));
+                let (exact, default) = (is("exact"), is("default"));
+                knob.points.push(Point { label: rest[0].into(), options, exact, default });
             }
             "axis" => {
-                let stages = field(2)?.split(' ').map(str::parse).collect::<Result<_>>()?;
-                self.axes.push(Axis { name: name.into(), title: field(1)?.into(), stages, sizes: Vec::new() });
+                let stages = rest[1].split(' ').map(str::parse).collect::<Result<_>>()?;
+                self.axes.push(Axis { name: name.into(), title: rest[0].into(), stages, sizes: Vec::new() });
             }
             "size" => {
-                let value = number(field(1)?)?;
-                let scene = scene(&format!("{name}-{}", field(1)?), 2)?;
-                let axis = self.axes.iter_mut().find(|a| a.name == name).ok_or_else(|| unknown("axis"))?;
-                axis.sizes.push(Size { value, scene });
+                let value = positive(rest[0])?;
+                let scene = scene(&format!("{name}-{}", rest[0]), rest[1], rest[2]);
+                by_name(&mut self.axes, "axis", name, |a| &a.name)?.sizes.push(Size { value, scene });
             }
-            _ => return Err(Error::new("no such keyword").found(keyword)),
+            _ => {
+                if keyword == "features" {
+                    self.defined("footprints", rest[0])?;
+                    self.footprints_of.insert(name.into(), rest[0].into());
+                }
+                if self.options.insert(format!("{keyword} {name}"), rest[count - 1].into()).is_some() {
+                    return Err(Error::new("defined twice").found(line));
+                }
+            }
         }
         Ok(())
     }
+
+    fn defined(&self, keyword: &str, name: &str) -> Result<()> {
+        let known = self.options.contains_key(&format!("{keyword} {name}"));
+        known.then_some(()).ok_or_else(|| Error::new(format!("no such {keyword}")).found(name))
+    }
+
+    /// The options of a line by keyword and name (empty for a keyword without); empty where there is no such line.
+    pub fn options_of(&self, keyword: &str, name: &str) -> &str {
+        self.options.get(&format!("{keyword} {name}")).map_or("", |s| s)
+    }
+
+    /// Keeps only the tables, knobs and axes of these names; all where there is none.
+    ///
+    /// # Errors
+    /// When the plan has none of a name.
+    pub fn only(mut self, names: &[String]) -> Result<Self> {
+        let (tables, knobs) = (self.tables.iter().map(|t| &t.name), self.knobs.iter().map(|k| &k.name));
+        let all: Vec<&String> = tables.chain(knobs).chain(self.axes.iter().map(|a| &a.name)).collect();
+        if let Some(unknown) = names.iter().find(|n| !all.contains(n)) {
+            let all: Vec<&str> = all.into_iter().map(String::as_str).collect();
+            return Err(Error::new("not in the plan").field("--only").found(unknown).expected(all.join(", ")));
+        }
+        let wanted = |name: &String| names.is_empty() || names.contains(name);
+        self.tables.retain(|t| wanted(&t.name));
+        self.knobs.retain(|k| wanted(&k.name));
+        self.axes.retain(|a| wanted(&a.name));
+        self.expected.retain(|e| wanted(&e.table));
+        Ok(self)
+    }
 }
 
-fn number(text: &str) -> Result<f64> {
+fn scene(name: &str, scene: &str, geometry: &str) -> Scene {
+    Scene { name: name.into(), scene: scene.into(), geometry: geometry.into() }
+}
+
+fn table(name: &str, fields: &[&str]) -> Result<TablePlan> {
+    let p: Vec<String> = fields[0].split_whitespace().map(String::from).collect();
+    if p.is_empty() || !p.iter().all(|p| p.parse::<f64>().is_ok_and(|p| (0.0..=1.0).contains(&p))) {
+        return Err(Error::new("not probabilities").found(fields[0]).expected("numbers from 0 to 1"));
+    }
+    let reference = (fields[1] != "-").then(|| fields[1].to_string());
+    Ok(TablePlan { name: name.into(), p, reference, title: fields[2].into(), rows: Vec::new() })
+}
+
+fn by_name<'a, T>(all: &'a mut [T], what: &str, name: &str, of: fn(&T) -> &String) -> Result<&'a mut T> {
+    all.iter_mut().find(|t| of(t) == name).ok_or_else(|| Error::new(format!("no such {what}")).found(name))
+}
+
+/// Numbers of the paper: Some(None) for `-`, None for nonsense.
+fn paper(text: &str) -> Option<Option<Paper>> {
+    if text == "-" {
+        return Some(None);
+    }
+    let numbers: Vec<f64> = text.split_whitespace().map(str::parse).collect::<std::result::Result<_, _>>().ok()?;
+    let (&[miou, macc], memory) = (numbers.get(..2)?, numbers.get(2).copied()) else { return None };
+    Some(Some(Paper { miou, macc, memory }))
+}
+
+fn positive(text: &str) -> Result<f64> {
     let value = text.parse::<f64>().ok().filter(|v| *v > 0.0 && v.is_finite());
     value.ok_or_else(|| Error::new("not a number").found(text).expected("a number above 0"))
 }
@@ -172,12 +366,22 @@ mod tests {
 
     const TEXT: &str = "# a comment
 scene a | --size tiny | --iterations 10
+seeds | 0 1
+masks | --missing 0
+footprints gated | --pixel-samples 16
+features paper | gated | --preset paper
+clustering free | --cluster free
+table t | 0 0.5 | paper.free | A title
+row t | paper | free | 50.79 69.62 2.1 | full
+row t | paper | free | - | ours
+expect t | paper.free | 0.5 | instance_miou | 0.1 | 0.9
 repeats | 5
 knob cut | graph | Footprint cut
 point cut | none | | exact
 point cut | small | --cut 0.01 | default
 knob quality | pipeline | Quality
 point quality | exact | geometry: --iterations 20; graph: --cut 0 | exact default
+point quality | other | |
 axis views | Photographs | graph features
 size views | 8 | --size tiny --views 8 | --iterations 10
 ";
@@ -185,7 +389,7 @@ size views | 8 | --size tiny --views 8 | --iterations 10
     #[test]
     fn a_plan_is_read() {
         let p = Plan::parse(TEXT).unwrap();
-        assert_eq!((p.scenes.len(), p.repeats, p.knobs.len()), (1, 5, 2));
+        assert_eq!((p.scenes.len(), p.repeats, p.knobs.len(), &p.seeds[..]), (1, 5, 2, &[0, 1][..]));
         let cut = &p.knobs[0];
         assert_eq!(cut.stage, Some(Stage::Graph));
         assert!(cut.points[0].exact && !cut.points[0].default && cut.points[1].default);
@@ -193,20 +397,37 @@ size views | 8 | --size tiny --views 8 | --iterations 10
         assert_eq!(p.knobs[1].points[0].options.get(Stage::Geometry), ["--iterations", "20"]);
         assert_eq!((p.axes[0].stages.len(), p.axes[0].sizes[0].value), (2, 8.0));
         assert_eq!(p.axes[0].sizes[0].scene.name, "views-8");
+        assert_eq!((p.options_of("features", "paper"), p.options_of("masks", "")), ("--preset paper", "--missing 0"));
+        let row = &p.tables[0].rows[0];
+        assert_eq!(row.paper, Some(Paper { miou: 50.79, macc: 69.62, memory: Some(2.1) }));
+        assert_eq!((row.id().as_str(), p.tables[0].rows[1].paper), ("paper.free", None));
+        assert_eq!(p.expected[0].high, 0.9);
+        let only = p.clone().only(&["cut".into(), "views".into()]).unwrap();
+        assert_eq!((only.tables.len(), only.knobs.len(), only.axes.len(), only.expected.len()), (0, 1, 1, 0));
+        assert!(p.only(&["cuts".into()]).unwrap_err().to_string().contains("t, cut, quality, views"));
     }
 
     #[test]
     fn mistakes_name_their_line() {
         for (from, to, said) in [
-            ("repeats | 5", "repeats | x", "line 3"),
-            ("knob cut | graph", "knob cut | grph", "line 4"),
-            ("point cut | none", "point cot | none", "cot"),
+            ("repeats | 5", "repeats | x", "line 12"),
+            ("knob cut | graph", "knob cut | grph", "line 13"),
+            ("point cut | none", "point cot | none", "no such knob; found cot"),
             ("| exact\npoint cut", "|\npoint cut", "exact"),
-            ("axis views", "axes views", "keyword"),
+            ("axis views", "axes views", "not a line of a plan"),
             ("graph: --cut 0", "grph: --cut 0", "grph"),
+            ("row t | paper", "row t | papers", "papers"),
+            ("row t | paper", "row u | paper", "no such table"),
+            ("| gated | --preset", "| gate | --preset", "no such footprints"),
+            ("0 0.5 |", "0 1.5 |", "probabilities"),
+            ("50.79 69.62 2.1", "50.79", "numbers of the paper"),
+            ("scene a", "scene", "a name"),
+            ("seeds | 0 1", "seeds | a", "seeds"),
+            ("seeds | 0 1\n", "", "seeds"),
         ] {
+            assert!(TEXT.contains(from), "{from}");
             let e = Plan::parse(&TEXT.replacen(from, to, 1)).unwrap_err().to_string();
-            assert!(e.contains(said), "{e}");
+            assert!(e.contains(said), "{to}: {e}");
         }
     }
 }

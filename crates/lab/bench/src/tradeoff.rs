@@ -1,7 +1,8 @@
 //! Run time against error: every setting of an approximation, timed in turns, beside the exact one.
 
-use crate::chain::{Cost, Files, Options, Programs, STAGES, Stage, read_json};
+use crate::chain::{Cost, Files, Options, Programs, STAGES, Stage, command, read_json, words};
 use crate::plan::{Knob, Plan, Scene};
+use crate::task::Task;
 use artifacts::Instances;
 use gs_io::{Error, Result, create_dir, write_bytes};
 use hdbscan_exact::adjusted_rand;
@@ -128,24 +129,18 @@ pub fn front(times: &[f64], errors: &[f64]) -> Vec<bool> {
     (0..times.len()).map(|i| !(0..times.len()).any(|j| beats(j, i))).collect()
 }
 
-/// Makes a synthetic scene and its geometry, unless they are there and made the same way.
+/// Makes a synthetic scene and its geometry in a folder, unless they are there and made the same way.
 ///
 /// # Errors
 /// When a program fails.
 pub fn prepare(programs: &Programs, scene: &Scene, folder: &Path) -> Result<Files> {
     let files = Files::of(folder);
-    let how = format!("{} | {}", scene.scene, scene.geometry);
-    let note = folder.join("made-by.txt");
-    if std::fs::read_to_string(&note).is_ok_and(|t| t == how) {
-        return Ok(files);
-    }
-    create_dir(folder)?;
-    let out = files.scene.to_string_lossy().into_owned();
-    let mut arguments = vec!["--out".to_string(), out, "--features".into()];
-    arguments.extend(scene.scene.split_whitespace().map(String::from));
-    programs.run("synth-scene", &arguments)?;
-    files.run(programs, Stage::Geometry, &Options::of(Stage::Geometry, &scene.geometry))?;
-    write_bytes(&note, how.as_bytes())?;
+    let mut photographs = command(&["synth-scene", "--features"], &[("--out", &files.scene)]);
+    photographs.extend(words(&scene.scene));
+    let photographs = Task::new(files.scene.join("truth/scene.json"), photographs, &[]);
+    let geometry = [files.command(Stage::Geometry), words(&scene.geometry)].concat();
+    let geometry = Task::new(files.geometry.clone(), geometry, &[&photographs]);
+    [photographs, geometry].iter().try_for_each(|task| task.run(programs).map(|_| ()))?;
     Ok(files)
 }
 
@@ -190,7 +185,7 @@ pub fn measure(
                 Some(Stage::Geometry) | None => out.join("geometry.ply"),
                 _ => base.geometry.clone(),
             };
-            Files { out, geometry, ..base.clone() }
+            Files { geometry, ..base.within(&out) }
         })
         .collect();
     let all = points.iter().all(|p| p.costs.len() >= plan.repeats);
@@ -241,18 +236,16 @@ fn merged(scene: &Options, setting: &Options) -> Options {
 /// # Errors
 /// When a file cannot be copied.
 pub fn inherit(base: &Files, own: &Files, first: Stage) -> Result<()> {
-    create_dir(&own.out)?;
-    let copy = |from: &Path, to: &Path| {
-        std::fs::copy(from, to).map(|_| ()).map_err(|e| Error::new(format!("cannot copy: {e}")).file(from))
+    let copy = |stage: Stage, from: &Path, to: &Path| match stage < first {
+        false => Ok(()),
+        true => {
+            create_dir(to.parent().unwrap_or(Path::new(".")))?;
+            std::fs::copy(from, to).map(|_| ()).map_err(|e| Error::new(format!("cannot copy: {e}")).file(from))
+        }
     };
-    if first > Stage::Graph {
-        copy(&base.output(Stage::Graph), &own.output(Stage::Graph))?;
-        copy(&base.footprints(), &own.footprints())?;
-    }
-    if first > Stage::Features {
-        copy(&base.output(Stage::Features), &own.output(Stage::Features))?;
-    }
-    Ok(())
+    copy(Stage::Graph, &base.graph, &own.graph)?;
+    copy(Stage::Graph, &base.footprints, &own.footprints)?;
+    copy(Stage::Features, &base.features, &own.features)
 }
 
 fn quality(programs: &Programs, knob: &Knob, own: &Files, exact: &Files) -> Result<Quality> {
@@ -263,7 +256,7 @@ fn quality(programs: &Programs, knob: &Knob, own: &Files, exact: &Files) -> Resu
     if knob.stage == Some(Stage::Geometry) {
         return Ok(Quality { psnr, ..Quality::default() });
     }
-    let labels = |f: &Files| Ok::<_, Error>(Instances::read(f.output(Stage::Instances))?.0.label);
+    let labels = |f: &Files| Ok::<_, Error>(Instances::read(&f.instances)?.0.label);
     let agreement = match knob.stage {
         Some(_) => Some(adjusted_rand(&labels(own)?, &labels(exact)?)),
         None => None,

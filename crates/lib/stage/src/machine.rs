@@ -37,6 +37,13 @@ impl Machine {
     }
 }
 
+impl std::fmt::Display for Machine {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        let cpu = if self.cpu.is_empty() { "unknown processor" } else { &self.cpu };
+        write!(f, "{cpu}, {} cores, {}", self.cores, self.system)
+    }
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;

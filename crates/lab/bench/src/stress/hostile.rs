@@ -2,7 +2,7 @@
 
 use super::oracle::{geometry_is_damaged, render_error};
 use super::world::World;
-use crate::chain::{Files, Options, Programs, STAGES, Stage};
+use crate::chain::{Files, Options, Programs, STAGES, Stage, command, words};
 use crate::tradeoff::inherit;
 use artifacts::{Features, Footprints, Instances};
 use glam::{DQuat, DVec3};
@@ -94,20 +94,19 @@ impl Case {
     }
 }
 
-/// Runs the matrix on a tiny synthetic scene in `folder`: the scenes whose name contains `only`.
+/// Runs the matrix on a tiny synthetic scene in `folder`: the scenes whose name contains one of `only`, or all.
 ///
 /// # Errors
 /// When the undisturbed scene cannot be made; what a hostile one does is a row.
-pub fn run(programs: &Programs, folder: &Path, only: &str, said: &dyn Fn(&str)) -> Result<Vec<Row>> {
+pub fn run(programs: &Programs, folder: &Path, only: &[String], said: &dyn Fn(&str)) -> Result<Vec<Row>> {
     let files = Files::of(&folder.join("base"));
-    let out = files.scene.to_string_lossy().into_owned();
-    let scene = ["--size", "tiny", "--views", "12", "--objects", "6", "--corruption", "mild", "--out", &out];
-    programs.run("synth-scene", &scene)?;
+    let scene = words("synth-scene --size tiny --views 12 --objects 6 --corruption mild");
+    programs.run(&[scene, command(&[], &[("--out", &files.scene)])].concat())?;
     files.run(programs, Stage::Geometry, &Options::of(Stage::Geometry, GEOMETRY))?;
     let world = World::read(&files.scene, &files.masks, &files.geometry)?;
     let base = Base::new(programs, &world, &folder.join("undisturbed"))?;
     let mut rows = Vec::new();
-    for case in cases(&world).into_iter().filter(|c| c.name.contains(only)) {
+    for case in cases(&world).into_iter().filter(|c| only.is_empty() || only.iter().any(|o| c.name.contains(o.as_str()))) {
         said(case.name);
         rows.extend(base.rows(programs, &case, &folder.join(case.name.replace(' ', "-")))?);
     }
@@ -139,7 +138,7 @@ fn weights(path: &Path) -> Result<Vec<(u32, f32)>> {
 }
 
 fn files_of(folder: &Path) -> Files {
-    Files { out: folder.join("out"), ..Files::of(folder) }
+    Files::of(folder).within(&folder.join("out"))
 }
 
 impl Base {
@@ -154,8 +153,8 @@ impl Base {
         trained.run(programs, Stage::Geometry, &options)?;
         Ok(Self {
             psnr: trained_psnr(&trained.geometry),
-            labels: Instances::read(files.output(Stage::Instances))?.0.label,
-            footprints: weights(&files.footprints())?,
+            labels: Instances::read(&files.instances)?.0.label,
+            footprints: weights(&files.footprints)?,
             files,
         })
     }
@@ -214,7 +213,7 @@ impl Base {
     /// 1 - adjusted Rand index with the undisturbed instances, where it is known which Gaussian is which.
     fn disagreement(&self, own: &Files, case: &Case) -> Result<Option<f64>> {
         let Some(origin) = &case.origin else { return Ok(None) };
-        let labels = Instances::read(own.output(Stage::Instances))?.0.label;
+        let labels = Instances::read(&own.instances)?.0.label;
         let before: Vec<i32> = origin.iter().map(|&o| self.labels[o as usize]).collect();
         Ok(Some(1.0 - adjusted_rand(&labels, &before)))
     }
@@ -222,7 +221,7 @@ impl Base {
     /// Sum of absolute changes of the Gaussians' weights over their sum; of each one's share where it was divided.
     fn footprint_change(&self, own: &Files, origin: Option<&[u32]>) -> Result<f64> {
         let mut now = std::collections::BTreeMap::<u32, f64>::new();
-        for (i, w) in weights(&own.footprints())? {
+        for (i, w) in weights(&own.footprints)? {
             *now.entry(origin.map_or(i, |o| o[i as usize])).or_default() += f64::from(w);
         }
         let total: f64 = self.footprints.iter().map(|(_, w)| f64::from(*w)).sum();
@@ -269,8 +268,8 @@ fn outcome<T>(run: Result<T>, damaged: impl FnOnce() -> Result<bool>) -> Outcome
 fn is_damaged(files: &Files, stage: Stage) -> Result<bool> {
     let output = files.output(stage);
     Ok(match stage {
-        Stage::Geometry => geometry_is_damaged(&output)?,
-        Stage::Graph => weights(&files.footprints())?.iter().any(|(_, w)| !w.is_finite()),
+        Stage::Geometry => geometry_is_damaged(output)?,
+        Stage::Graph => weights(&files.footprints)?.iter().any(|(_, w)| !w.is_finite()),
         Stage::Features => Features::read(output)?.0.values.iter().any(|v| !v.is_finite()),
         Stage::Instances => {
             let i = Instances::read(output)?.0;

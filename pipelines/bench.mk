@@ -1,0 +1,53 @@
+# Benchmarks of one part each; `make bench` is the one of them all. What they write is in out/bench.
+
+# PLYs to measure besides the synthetic scenes.
+SPLATS ?=
+# The rasteriser per pixel-Gaussian pair on one core: raster.json.
+bench-raster:
+	$(CARGO) bench -p gs-raster --bench raster -- $(abspath $(SPLATS)) $(CURDIR)/out/bench/raster.json
+
+# gs-geom's quality for the time: geom.json, docs/images/geometry.svg.
+bench-geom:
+	scripts/bench_geom.sh
+
+# gs-geom's cost against Gaussians, pixels and threads: growth.json.
+bench-growth:
+	scripts/bench_growth.sh
+
+# gs-geom's memory forecast beside measured peaks: memory.md.
+bench-memory:
+	scripts/bench_memory.sh
+
+# feat-train at a million Gaussians: train.json.
+bench-train:
+	$(CARGO) bench -p feat-train --bench train -- --out $(CURDIR)/out/bench/train.json
+
+# Anchors and neighbours beside fpsample and pykdtree (needs Python; POSITIONS=points or file.npy): graph.json.
+POSITIONS ?= 1000000
+bench-graph:
+	$(CARGO) build --release -p graph-precompute --benches
+	@test -x out/bench/python/bin/python || { python3 -m venv out/bench/python \
+	  && out/bench/python/bin/pip install -q numpy scipy fpsample pykdtree; }
+	out/bench/python/bin/python scripts/bench_graph.py $(POSITIONS) out/bench/graph.json
+
+# HDBSCAN beside hdbscan-rs and fast_hdbscan (needs Python; POINTS=1000000x6 or file.npy, TRUTH=file.npy, RUNS): cluster.json.
+POINTS ?= 1000000x6
+RUNS ?= 3
+TRUTH ?=
+bench-cluster:
+	$(CARGO) build --release -p hdbscan-exact --benches
+	@test -x out/bench/python-cluster/bin/python || { python3 -m venv out/bench/python-cluster \
+	  && out/bench/python-cluster/bin/pip install -q numpy scikit-learn hdbscan-rs fast_hdbscan; }
+	out/bench/python-cluster/bin/python scripts/bench_cluster.py $(POINTS) out/bench/cluster.json $(RUNS) $(TRUTH)
+
+# cluster-match --cluster graph at a million Gaussians: cluster-graph.json.
+bench-cluster-graph:
+	$(CARGO) bench -p cluster-match --bench graph -- --out $(CURDIR)/out/bench/cluster-graph.json
+
+# A query over a million Gaussians and 500 instances: query.json.
+bench-query:
+	$(CARGO) bench -p eval --bench query -- --out $(CURDIR)/out/bench/query.json
+
+# Synthetic masks beside real ones (MASKS=folder FOOTPRINTS=file): granularity.md.
+bench-granularity: build
+	scripts/bench_granularity.sh
