@@ -274,7 +274,8 @@ mod tests {
                 std::fs::create_dir_all(&folder).unwrap();
                 for (row, more) in [("paper", 0.0), ("ours", 0.3)] {
                     let miou = 0.1 * (i + 1) as f64 + more;
-                    let scores = format!("{{\"instance_miou\": {miou}, \"instances_per_thing\": 2, \"gaussians\": null}}");
+                    let scores =
+                        format!("{{\"instance_miou\": {miou}, \"instances_per_thing\": 2, \"gaussians\": null}}");
                     std::fs::write(folder.join(format!("{row}.free.score.json")), scores).unwrap();
                 }
             }

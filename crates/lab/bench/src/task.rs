@@ -82,9 +82,7 @@ impl Tasks {
                 }
                 Ok(())
             })?;
-            if stage.interrupted() {
-                return Err(gs_io::Error::new("interrupted"));
-            }
+            stage.go_on()?;
         }
         Ok(())
     }

@@ -240,9 +240,7 @@ pub fn run(stage: &Stage, out: &Path, options: &Options) -> Result<()> {
     let mut masks = BTreeMap::new();
     let mut labelled = 0;
     for (v, camera) in cameras.iter().enumerate() {
-        if stage.interrupted() {
-            return Err(Error::new("interrupted").file(out));
-        }
+        stage.go_on()?;
         let frame = render::render(&scene, &light, camera);
         points.add(&scene, camera, &frame);
         let stem = &stems[v];
@@ -314,9 +312,7 @@ pub fn run_masks(stage: &Stage, folder: &Path, options: &Options) -> Result<()> 
     let mut progress = stage.progress("views", cameras.len() as u64);
     let mut masks = BTreeMap::new();
     for (v, camera) in cameras.iter().enumerate() {
-        if stage.interrupted() {
-            return Err(Error::new("interrupted").file(folder));
-        }
+        stage.go_on()?;
         let frame = render::identify(&scene, camera);
         let shown = options.write_masks(folder, &stems[v], v, &scene, &frame, language.as_ref())?;
         masks.insert(stems[v].clone(), shown);

@@ -6,7 +6,21 @@ use std::path::{Path, PathBuf};
 /// Result with the workspace's [`Error`].
 pub type Result<T, E = Error> = std::result::Result<T, E>;
 
-/// Why something could not be done, for the person who has to mend it: one line that names the file, the field, what
+/// What kind of error it is, for programs that call these ones.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
+pub enum ErrorKind {
+    /// An option, a file or a setting is not what it must be.
+    #[default]
+    Invalid,
+    /// The system could not read or write a file.
+    Io,
+    /// It could be done, but something would be lost, or more taken than allowed.
+    Refused,
+    /// The person or the system asked the program to stop.
+    Interrupted,
+}
+
+/// Why something could not be done, for the person who has to fix it: one line that names the file, the field, what
 /// was found, what was expected and what to do.
 ///
 /// ```
@@ -28,6 +42,7 @@ pub struct Error(Box<Parts>);
 
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
 struct Parts {
+    kind: ErrorKind,
     what: String,
     file: Option<PathBuf>,
     field: Option<String>,
@@ -40,6 +55,16 @@ impl Error {
     /// An error that says `what` is wrong.
     pub fn new(what: impl Into<String>) -> Self {
         Self(Box::new(Parts { what: what.into(), ..Parts::default() }))
+    }
+
+    /// An error of another kind than [`ErrorKind::Invalid`].
+    pub fn of(kind: ErrorKind, what: impl Into<String>) -> Self {
+        Self(Box::new(Parts { kind, what: what.into(), ..Parts::default() }))
+    }
+
+    /// Which kind of error it is.
+    pub fn kind(&self) -> ErrorKind {
+        self.0.kind
     }
 
     /// Names the file (or folder) at fault. The first file named stays: inner layers know best.
@@ -139,7 +164,7 @@ impl<T> IoContext<T> for std::io::Result<T> {
                 std::io::ErrorKind::UnexpectedEof => "the file is cut short: make or copy it again",
                 _ => "check the file and its folder",
             };
-            Error::new(format!("cannot {action}: {e}")).file(file).hint(hint)
+            Error::of(ErrorKind::Io, format!("cannot {action}: {e}")).file(file).hint(hint)
         })
     }
 }
@@ -162,5 +187,6 @@ mod tests {
         let e = std::fs::read("/no/such/file").at("read", "/no/such/file").unwrap_err();
         assert!(e.to_string().starts_with("/no/such/file: cannot read: "), "{e}");
         assert!(e.to_string().ends_with("check the path"), "{e}");
+        assert_eq!((e.kind(), Error::new("x").kind()), (ErrorKind::Io, ErrorKind::Invalid));
     }
 }

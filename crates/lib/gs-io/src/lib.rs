@@ -17,7 +17,7 @@ mod watch;
 
 pub use artifact::{Artifact, ArtifactWriter, Provenance};
 pub use atomic::{create_dir, write_atomic, write_bytes};
-pub use error::{Error, IoContext, Result, escaped};
+pub use error::{Error, ErrorKind, IoContext, Result, escaped};
 pub use hash::{hash_bytes, hash_file, hash_files};
 pub use lock::Lock;
 pub use outputs::{Claim, Outputs, Written, record_path};

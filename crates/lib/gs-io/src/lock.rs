@@ -1,7 +1,7 @@
 //! One run at a time for each output.
 
 use crate::place::{folder_of, node, resolve};
-use crate::{Error, IoContext, Result, create_dir};
+use crate::{Error, ErrorKind, IoContext, Result, create_dir};
 use std::fs::{File, OpenOptions, TryLockError};
 use std::io::Write;
 use std::path::{Path, PathBuf};
@@ -37,7 +37,7 @@ impl Lock {
                 // Its holder ended, and removed it, between our opening and locking it.
                 Ok(()) => {}
                 Err(TryLockError::WouldBlock) => {
-                    return Err(Error::new("another run is writing this output")
+                    return Err(Error::of(ErrorKind::Refused, "another run is writing this output")
                         .file(output)
                         .hint("wait until it ends, or stop it; then run this again"));
                 }

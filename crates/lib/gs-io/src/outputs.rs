@@ -1,7 +1,7 @@
 //! What a run may write, checked before it works: nothing that somebody else made is overwritten.
 
 use crate::place::{Identity, Stamp, folder_of, identity, place, stamp, with_suffix};
-use crate::{Error, IoContext, Lock, Result, artifact, hash_file};
+use crate::{Error, ErrorKind, IoContext, Lock, Result, artifact, hash_file};
 use serde::{Deserialize, Serialize};
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
@@ -117,7 +117,9 @@ impl Outputs {
         let input_folders: BTreeSet<Identity> = self.inputs.iter().filter_map(|p| identity(folder_of(p))).collect();
         for path in &files {
             if identity(path).is_some_and(|i| inputs.contains(&i)) {
-                return Err(Error::new("the output is one of the inputs").file(path).hint("choose another name"));
+                return Err(Error::of(ErrorKind::Refused, "the output is one of the inputs")
+                    .file(path)
+                    .hint("choose another name"));
             }
         }
         for (folder, _) in &self.folders {
@@ -313,7 +315,7 @@ impl Past {
 }
 
 fn not_own(by: &str, path: &Path, found: &str) -> Error {
-    Error::new("the output exists and would be lost")
+    Error::of(ErrorKind::Refused, "the output exists and would be lost")
         .file(path)
         .found(found)
         .expected(format!("nothing, or a file that {by} wrote"))

@@ -122,6 +122,14 @@ impl Stage {
         flag.load(Ordering::SeqCst)
     }
 
+    /// Asks whether the work may go on.
+    ///
+    /// # Errors
+    /// When it was interrupted ([`Self::interrupted`]).
+    pub fn go_on(&self) -> Result<()> {
+        if self.interrupted() { Err(Error::of(gs_io::ErrorKind::Interrupted, "interrupted")) } else { Ok(()) }
+    }
+
     /// Marks the stage as interrupted, as a signal would: whatever error ends it now, the exit code is 130.
     pub fn stop(&self) {
         self.interrupted();

@@ -1,7 +1,7 @@
 //! Amounts of memory, and what a run may take.
 
 use crate::{Machine, Stage};
-use gs_io::{Error, Result};
+use gs_io::{Error, ErrorKind, Result};
 use std::fmt;
 use std::str::FromStr;
 
@@ -85,7 +85,7 @@ impl Stage {
 }
 
 fn too_much(bytes: u64, limit: Bytes, hint: &str) -> Error {
-    Error::new("more memory than there may be")
+    Error::of(ErrorKind::Refused, "the run needs more memory than it may take")
         .found(format!("about {} needed", Bytes(bytes)))
         .expected(format!("at most {limit}"))
         .hint(hint)

@@ -106,7 +106,9 @@ pub fn run(programs: &Programs, folder: &Path, only: &[String], said: &dyn Fn(&s
     let world = World::read(&files.scene, &files.masks, &files.geometry)?;
     let base = Base::new(programs, &world, &folder.join("undisturbed"))?;
     let mut rows = Vec::new();
-    for case in cases(&world).into_iter().filter(|c| only.is_empty() || only.iter().any(|o| c.name.contains(o.as_str()))) {
+    for case in
+        cases(&world).into_iter().filter(|c| only.is_empty() || only.iter().any(|o| c.name.contains(o.as_str())))
+    {
         said(case.name);
         rows.extend(base.rows(programs, &case, &folder.join(case.name.replace(' ', "-")))?);
     }
