@@ -62,7 +62,11 @@ impl Lock {
     /// When there is no room for it.
     pub(crate) fn sign(&mut self, by: &str) -> Result<()> {
         if let Some((file, path)) = &self.held {
-            file.set_len(0).and_then(|()| (&mut &*file).write_all(by.as_bytes())).at("write", path)?;
+            // Never empty for a moment: a kill right then would leave files that are nobody's.
+            if std::fs::read(path).ok().as_deref() != Some(by.as_bytes()) {
+                let mut out = file;
+                out.write_all(by.as_bytes()).and_then(|()| file.set_len(by.len() as u64)).at("write", path)?;
+            }
         }
         self.keep = false;
         Ok(())
@@ -116,9 +120,17 @@ mod tests {
         cut_off.keep();
         drop(cut_off);
         assert_eq!(Lock::signature(&out).as_deref(), Some("gs-geom train"));
-        let mut next = Lock::take(&out).unwrap();
-        next.sign("gs-geom train").unwrap();
-        drop(next);
+        for by in ["gs-geom train", "gs-geom", "gs-geom convert"] {
+            let mut next = Lock::take(&out).unwrap();
+            next.sign(by).unwrap();
+            assert_eq!(Lock::signature(&out).as_deref(), Some(by));
+            next.keep();
+        }
+        drop(Lock::take(&out).unwrap());
+        assert!(Lock::signature(&out).is_some(), "one that wrote nothing leaves what it found");
+        let mut last = Lock::take(&out).unwrap();
+        last.sign("gs-geom").unwrap();
+        drop(last);
         assert_eq!(Lock::signature(&out), None);
     }
 }
