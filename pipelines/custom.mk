@@ -37,8 +37,8 @@ MASKS_DONE = $(OPTIONS)/masks.files
 endif
 
 geom_FROM := RESOLUTION, ITERATIONS or GEOM_ARGS
-geom_OPTIONS := --resolution $(RESOLUTION) --iterations $(ITERATIONS) $(GEOM_ARGS)
+GEOM_FIRST := --resolution $(RESOLUTION) --iterations $(ITERATIONS)
 EVAL_ARGS ?= --resolution $(RESOLUTION)
-report_OPTIONS := --resolution $(RESOLUTION) $(REPORT_ARGS)
+REPORT_FIRST := --resolution $(RESOLUTION)
 
 include pipelines/stages.mk

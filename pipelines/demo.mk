@@ -18,8 +18,7 @@ FEAT_ARGS ?=
 CLUSTER_ARGS ?=
 SCORE_ARGS ?=
 QUERIES ?= green_kettle pink_coffee_set black_laptop yellow_toy_car
-# The tables of an ablation, where there is one, are a section of the report.
-REPORT_ARGS ?= --title Demo $(if $(wildcard out/ablation/components.json),--ablation out/ablation)
+REPORT_ARGS ?= --title Demo
 
 QUALITY ?= balanced
 SETTINGS := QUALITY SEED CLIP SYNTH_ARGS GEOM_ARGS GRAPH_ARGS FEAT_ARGS CLUSTER_ARGS SCORE_ARGS QUERIES REPORT_ARGS

@@ -53,7 +53,8 @@ ifneq ($(SETTINGS),)
 all: settings
 endif
 
-# $(OPTIONS)/NAME holds the options of stage NAME and is touched only when they change.
+# $(OPTIONS)/NAME holds the options of stage NAME. FORCE runs its recipe every time, but `put` writes the file only when the text
+# is another one, so that its time, and all that make decides by it, stays.
 put = { cmp -s - $@ <<< "$$text" || { printf '%s\n' "$$text" > $@.$$$$ && mv $@.$$$$ $@; }; }
 $(OPTIONS)/%: FORCE | checked-options
 	@mkdir -p $(@D)
@@ -70,11 +71,11 @@ masks_FILES = $(call list,$(MASKS)/,'*_s.npy')
 clip_FILES = $(call list,$(call arg,CLIP)/,'*')
 texts_FILES = $(call list,$(call arg,TEXTS),'*')
 
-# The seed counts as an option; 0 is every stage's own.
+# The options of every stage; those of people come after a fragment's own (GEOM_FIRST, REPORT_FIRST), and win. The seed counts
+# as an option; 0 is every stage's own.
 SEED_ARGS := $(addprefix --seed ,$(filter-out 0,$(SEED)))
-geom_OPTIONS ?= $(GEOM_ARGS)
-geom_OPTIONS := $(GEOM_QUALITY) $(geom_OPTIONS) $(SEED_ARGS)
-graph_OPTIONS := $(GRAPH_QUALITY) $(GRAPH_ARGS) $(SEED_ARGS)
+geom_OPTIONS := $(GEOM_QUALITY) $(GEOM_FIRST) $(GEOM_ARGS) $(SEED_ARGS)
+graph_OPTIONS := $(GRAPH_ARGS) $(SEED_ARGS)
 feat_OPTIONS := $(FEAT_QUALITY) $(FEAT_ARGS) $(SEED_ARGS)
 cluster_OPTIONS := $(CLUSTER_ARGS) $(SEED_ARGS)
 embed_OPTIONS := $(CLIP)
@@ -82,9 +83,9 @@ masks_OPTIONS := $(SAM) $(MASK_ARGS)
 score_OPTIONS := $(CLIP) $(SCORE_ARGS)
 protocol_OPTIONS := $(PROTOCOL) $(CLIP) $(TEXTS) $(SCORE_ARGS)
 queries_OPTIONS := $(CLIP) $(QUERIES)
-report_OPTIONS ?= $(REPORT_ARGS)
+report_OPTIONS := $(REPORT_FIRST) $(REPORT_ARGS)
 
-# What each stage runs. A path is written out, so that commands can be copied, unless a shell would take it apart.
+# What each stage runs. `arg` writes a path out, so that commands can be copied, or as "$NAME" where a shell would take it apart.
 arg = $(if $(call odd,$($1)),"$$$1",$($1))
 geom_RUN = $(BIN)/gs-geom train --scene $(call arg,PHOTOGRAPHS) --out $(OUT)/geometry.ply $(geom_OPTIONS) $(COMMON)
 metrics_RUN = $(BIN)/gs-geom eval --scene $(call arg,PHOTOGRAPHS) --geometry $(call arg,GEOMETRY) --out $(OUT)/geom_metrics.json \
@@ -107,7 +108,7 @@ report_RUN = $(BIN)/eval report --scene $(call arg,PHOTOGRAPHS) --run-dir $(OUT)
   $(report_OPTIONS) $(COMMON)
 space := $(subst ,, )
 
-# Before the first stage runs, every stage looks at its options.
+# Before the first stage runs, every stage checks its options. geom_FROM says in errors where those of stage 1 come from.
 PROGRAMS := $(addprefix $(BIN)/,gs-geom mask-embed graph-precompute feat-train cluster-match eval)
 geom_FROM ?= GEOM_ARGS
 .PHONY: checked-options
