@@ -1,7 +1,7 @@
 #!/usr/bin/env bash
 # Fuzz every format that the stages read (crates/lab/hostile-files), one after the other, for so many seconds each; further
 # arguments are formats, where not all are meant. Needs a nightly toolchain and cargo-fuzz. A finding ends the run: its input
-# lies in fuzz/artifacts/<format>/ and, once mended, in crates/lab/hostile-files/testdata/<format>/.
+# lies in fuzz/artifacts/<format>/ and, once fixed, in crates/lab/hostile-files/testdata/<format>/.
 set -euo pipefail
 cd "$(dirname "$0")/.."
 seconds=${1:-600}

@@ -40,7 +40,7 @@ const MOST_THREADS: u64 = 1024;
 #[derive(Debug, Clone, Default, clap::Args)]
 #[command(next_help_heading = "Common options")]
 pub struct CommonArgs {
-    /// Worker threads, at most 1024; 0 means one per core. The results do not depend on it
+    /// Worker threads, at most 1024; 0 means one per core. They do not change the results
     #[arg(long, global = true, default_value_t = 0, value_name = "COUNT", value_parser = RangedU64ValueParser::<usize>::new().range(..=MOST_THREADS))]
     pub threads: usize,
     /// Seed of every random choice: the same seed gives the same bytes
@@ -52,11 +52,10 @@ pub struct CommonArgs {
     /// Write events as JSON lines to standard output instead of text to standard error
     #[arg(long, global = true)]
     pub json: bool,
-    /// Write over files that this command did not write, such as older results or your own; inputs are never written
+    /// Also overwrite files that this command did not write. Inputs are never overwritten
     #[arg(long, global = true)]
     pub overwrite: bool,
-    /// Most memory the run may take, such as 4G: a stage whose forecast is more refuses at the start, and so does a command
-    /// without a forecast [no limit]
+    /// Most memory the run may take, such as 4G. A stage that forecasts more refuses to start [no limit]
     #[arg(long, global = true, value_name = "BYTES")]
     pub memory_limit: Option<Bytes>,
     /// Check the options and do nothing else: no file is read or written
@@ -80,7 +79,7 @@ pub trait Program: clap::Parser {
         true
     }
 
-    /// Refuses options that no input can mend, such as a value out of its range. [`main`] asks before [`Self::run`].
+    /// Refuses options that no input can fix, such as a value out of its range. [`main`] asks before [`Self::run`].
     ///
     /// # Errors
     /// The first option that is wrong.
@@ -91,7 +90,7 @@ pub trait Program: clap::Parser {
     /// Does the work.
     ///
     /// # Errors
-    /// Whatever the person who started the program has to mend.
+    /// Whatever the person who started the program has to fix.
     fn run(self, stage: &Stage) -> Result<()>;
 }
 
@@ -168,7 +167,7 @@ fn carry_out<P: Program>(program: P, stage: &Stage) -> Result<()> {
     if program.common().check { Ok(()) } else { program.run(stage) }
 }
 
-/// The option whose value this very path is: whoever reads an error about it knows then which one to mend.
+/// The option whose value this very path is: whoever reads an error about it knows which one to fix.
 fn given_by<'a>(arguments: &'a [String], path: &Path) -> Option<&'a str> {
     let options = arguments.iter().zip(arguments.iter().skip(1).map(Some).chain([None]));
     options.filter(|(option, _)| option.starts_with("--")).find_map(|(option, next)| match option.split_once('=') {
