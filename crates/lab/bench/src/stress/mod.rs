@@ -1,7 +1,8 @@
 //! Numerical stress: hostile scenes and settings through every stage, and changes of a scene that must not change the result.
 
-mod hostile;
+mod cases;
+mod matrix;
 mod oracle;
 pub mod world;
 
-pub use hostile::{Row, run};
+pub use matrix::{Row, run};
