@@ -20,7 +20,8 @@ pub use graph::Graph;
 pub use instances::{Family, Instances, Match, OrientedBox, TreeEdge};
 pub use lerf_ovs::{LERF_OVS, LerfScene};
 pub use masks::{
-    LEVELS, Level, MaskFeatures, MaskMaps, features_path, folder_files, hash_folder, maps_path, stems, watch_folder,
+    LEVELS, Level, MaskFeatures, MaskMaps, features_path, folder_files, hash_folder, maps_path, same_shape, stems,
+    watch_folder,
 };
 pub use nyu40::NYU40;
 pub use palette::{NOISE_COLOR, instance_color};

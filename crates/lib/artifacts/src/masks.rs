@@ -174,11 +174,10 @@ impl MaskMaps {
     /// Refuses maps, read from `file`, of another shape than a photograph of `width` x `height`: maps may be of another size.
     ///
     /// # Errors
-    /// When the aspect ratios differ by more than 2 % and two pixels.
+    /// When they have not the [`same_shape`].
     pub fn expect_shape(&self, width: u32, height: u32, file: impl AsRef<Path>) -> Result<()> {
-        let (w, h) = (self.width as f64, self.height as f64);
-        let expected = w * f64::from(height) / f64::from(width);
-        if (expected - h).abs() <= (0.02 * h).max(2.0) {
+        let (w, h) = (self.width, self.height);
+        if same_shape([w as u32, h as u32], [width, height]) {
             return Ok(());
         }
         Err(Error::new("the id map has another shape than the photograph")
@@ -193,6 +192,14 @@ impl MaskMaps {
     pub fn id_count(&self) -> usize {
         self.ids.iter().max().map_or(0, |&m| (m + 1) as usize)
     }
+}
+
+/// Whether a picture has the shape (aspect ratio) of a photograph: its height is that of the photograph scaled to its width,
+/// to 2 % or two pixels. Both are given as width and height.
+pub fn same_shape([width, height]: [u32; 2], photograph: [u32; 2]) -> bool {
+    let [w, h] = photograph.map(f64::from);
+    let expected = f64::from(width) * h / w;
+    (expected - f64::from(height)).abs() <= (0.02 * f64::from(height)).max(2.0)
 }
 
 /// The language features of the masks of one view.

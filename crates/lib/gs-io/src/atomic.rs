@@ -59,6 +59,16 @@ pub fn write_bytes(path: impl AsRef<Path>, bytes: &[u8]) -> Result<()> {
     write_atomic(path, |w| w.write_all(bytes).at("write", path))
 }
 
+/// Writes a value as JSON for people, with line breaks, as [`write_atomic`] does.
+///
+/// # Errors
+/// As [`write_atomic`], and when the value has no JSON, such as a map whose keys are not text.
+pub fn write_json(path: impl AsRef<Path>, value: &impl serde::Serialize) -> Result<()> {
+    let path = path.as_ref();
+    let json = serde_json::to_vec_pretty(value).map_err(|e| crate::Error::new(e.to_string()).file(path))?;
+    write_bytes(path, &json)
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;

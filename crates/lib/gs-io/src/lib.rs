@@ -16,7 +16,7 @@ mod place;
 mod watch;
 
 pub use artifact::{Artifact, ArtifactWriter, Provenance};
-pub use atomic::{create_dir, write_atomic, write_bytes};
+pub use atomic::{create_dir, write_atomic, write_bytes, write_json};
 pub use error::{Error, ErrorKind, IoContext, Result, escaped};
 pub use hash::{hash_bytes, hash_file, hash_files};
 pub use lock::Lock;
