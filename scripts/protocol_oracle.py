@@ -4,7 +4,7 @@
     pip install "numpy<2" opencv-python-headless==4.10.0.84
     python scripts/protocol_oracle.py lerf LABELS PREDICTIONS [--averaging frames] [--truth pictures]
     python scripts/protocol_oracle.py pictures LABELS            (writes LABELS/gt/<frame>/<category>.jpg)
-    python scripts/protocol_oracle.py scannet GEOMETRY INSTANCES TEXTS SCAN [--association nearest] [--keep-faint]
+    python scripts/protocol_oracle.py scannet GEOMETRY INSTANCES TEXTS SCAN [--association nearest]
 
 Prints JSON. The tests of crates/stages/eval run it where this Python and these packages are, and expect equality to 1e-6.
 Of OpenCV, 4.8 to 4.10: other versions fill some border pixels differently.
@@ -189,7 +189,7 @@ def scannet(args):
     means = np.stack([g["x"], g["y"], g["z"]], 1).astype(np.float64)
     opacity = 1 / (1 + np.exp(-g["opacity"].astype(np.float64)))
     scales = np.exp(np.stack([g[f"scale_{k}"] for k in range(3)], 1).astype(np.float64))
-    speaks = np.ones(len(g), bool) if args.keep_faint else opacity >= 0.1
+    speaks = opacity >= 0.1
     gaussian, counts = np.arange(len(v)), np.ones(len(v), bool)
     if args.association == "one-to-one":
         counts = speaks
@@ -205,7 +205,7 @@ def scannet(args):
         t /= np.linalg.norm(t, axis=1, keepdims=True)
         similarity = np.where(described[:, None], (descriptor / np.where(norms > 0, norms, 1)[:, None]) @ t.T, 0.0)
         known = described[np.maximum(label, 0)] & (label >= 0)
-        cls = np.where(known, np.argmax(similarity, 1)[np.maximum(label, 0)], 0 if args.undescribed == "first" else -1)
+        cls = np.where(known, np.argmax(similarity, 1)[np.maximum(label, 0)], 0)
         truth = np.array([ids.index(int(i)) if int(i) in ids else -1 for i in v["label"]])
         weight = np.ones(len(v))
         if args.association == "volume":
@@ -277,8 +277,6 @@ def main():
     for name in ["geometry", "instances", "texts", "scan"]:
         c.add_argument(name)
     c.add_argument("--association", default="one-to-one", choices=["one-to-one", "nearest", "volume"])
-    c.add_argument("--keep-faint", action="store_true")
-    c.add_argument("--undescribed", default="first", choices=["first", "none"])
     c.set_defaults(run=scannet)
     args = parser.parse_args()
     print(json.dumps(args.run(args)))

@@ -145,7 +145,7 @@ GRAPH_ARGS|--anchor-ration 0.1|--k 0
 FEAT_ARGS|--levles small|--tau 0
 CLUSTER_ARGS|--jion 0.6|--join 0.2
 SCORE_ARGS|--alhpa 0.5|--alpha 3
-REPORT_ARGS|--tilte x|
+REPORT_ARGS|--veiws x|
 LIST
 wrong QUERIES '"red mug' 'no quotes around them'
 wrong QUERIES "'red mug' plate" 'no quotes around them'

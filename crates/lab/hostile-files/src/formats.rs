@@ -3,8 +3,8 @@
 use crate::seeds;
 use artifacts::{Features, Footprints, Graph, Instances, MaskFeatures, MaskMaps, TruePoints, TrueScene};
 use clap::Parser;
-use eval::protocol::instances::read_truth;
-use eval::text::{TextSource, TextTable};
+use eval::protocols::instances::read_truth;
+use eval::query::text::{TextSource, TextTable};
 use gs_scene::dataset::{self, LoadOptions, Resolution};
 use gs_scene::{Geometry, Image, PointCloud, ply};
 use stage::{Program, Stage};
@@ -242,7 +242,7 @@ fn check_artifact(bytes: &[u8]) {
 
 fn check_labels(bytes: &[u8]) {
     with("labels/frame_00001.json", bytes, |path| {
-        if let Some(frame) = sound(eval::labels::read(path), path) {
+        if let Some(frame) = sound(eval::score::labels::read(path), path) {
             assert_eq!(frame.frame, "frame_00001");
             for (name, mask) in &frame.categories {
                 assert_eq!(mask.bits.len(), frame.width as usize * frame.height as usize);
@@ -259,7 +259,7 @@ fn check_scannet(bytes: &[u8]) {
         let [segs, aggregation, labels] = [0, 1, 2].map(|i| folder().join(SCANNET[i]));
         let scan = folder().join("scannet");
         if let Some((vertices, _)) = sound(ply::read_labels(&labels, "label"), &scan)
-            && let Some(truth) = sound(read_truth(&segs, &aggregation, vertices.len(), &["wall".into()]), &scan)
+            && let Some(truth) = sound(read_truth(&segs, &aggregation, vertices.len()), &scan)
         {
             assert_eq!(truth.len(), vertices.len());
         }
@@ -276,7 +276,7 @@ fn check_id_png(bytes: &[u8]) {
         if let Some(i) = sound(Image::read(path), path) {
             assert_eq!(i.rgb.len(), 3 * i.width as usize * i.height as usize);
         }
-        sound(eval::labels::read_mask(path), path);
+        sound(eval::score::labels::read_mask(path), path);
         let out = folder().join("maps");
         let args = ["mask-embed", "import", "--quiet", "--labels"].map(Into::into);
         let args = args.into_iter().chain([dir.clone().into_os_string(), "--out".into(), out.clone().into()]);

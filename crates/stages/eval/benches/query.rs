@@ -3,9 +3,9 @@
 //! descriptors anew for every query, as a script does.
 
 use artifacts::Instances;
-use eval::ask::Asker;
-use eval::ranking::{Index, Scoring, Selection};
-use eval::segment;
+use eval::query::ask::Asker;
+use eval::query::ranking::{Index, Scoring, Selection};
+use eval::query::segment;
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use std::time::Instant;

@@ -1,29 +1,22 @@
 //! The last stage: text queries, evaluation protocols and the report.
+//!
+//! [`options`] holds the options of every command; [`cli`] says which command runs what: [`query`] answers questions,
+//! [`score`] compares with the truth of a scene, [`protocols`] follows the published benchmarks, [`page`] makes the report.
+//! They share the labelled Gaussians ([`scene`]), how a selection becomes a mask ([`silhouette`]), which Gaussian is nearest
+//! ([`nearest`]) and the forecast of memory ([`memory`]).
 
 pub mod ablation;
-pub mod ask;
 pub mod cli;
-pub mod granularity;
-pub mod label_iou;
-pub mod labels;
-pub mod lerf;
 mod mask;
 pub mod mask_stats;
 pub mod memory;
-pub mod metrics;
-pub mod pca;
-pub mod place;
-pub mod polygon;
-pub mod protocol;
+pub mod nearest;
+pub mod options;
+pub mod page;
+pub mod protocols;
 pub mod query;
-pub mod ranking;
-pub mod report;
-pub mod runs;
-pub mod scan;
 pub mod scene;
 pub mod score;
-pub mod segment;
 pub mod silhouette;
-pub mod text;
 
 pub use mask::Mask;

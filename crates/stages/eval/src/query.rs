@@ -1,329 +1,118 @@
-//! `eval query`: what was asked for, shown: PLYs, masks, overlays, `query.json`.
+//! `eval query`: what texts, pictures and places mean.
+//!
+//! [`text`] has the features of texts, [`ranking`] compares them with the instances, [`ask`] selects, [`granularity`] makes an
+//! answer coarser or finer, [`place`] answers for pixels and points, [`image`] for pictures, [`segment`] divides the cloud;
+//! [`show`] writes the answers, [`interactive`] answers texts one by one.
 
-use crate::ask::Answered;
-use crate::lerf::Rendering;
-use crate::place::Place;
-use crate::ranking::Ranked;
-use crate::scene::{LabelledScene, find_view, numbered, slug, spread};
-use crate::segment::{self, Segment, Segmentation};
-use artifacts::instance_color;
-use gs_io::{Error, Result, write_bytes};
-use gs_scene::dataset::{Dataset, View};
-use report::picture::{HIGHLIGHT, Picture, mask_png};
-use serde::{Deserialize, Serialize};
-use std::collections::BTreeSet;
-use std::fmt::Write;
-use std::path::Path;
+pub mod ask;
+pub mod granularity;
+mod image;
+mod interactive;
+pub mod place;
+pub mod ranking;
+pub mod segment;
+pub mod show;
+pub mod text;
 
-/// Ranked instances that `query.json` keeps for each text.
-const KEPT_RANKS: usize = 20;
-/// Views that show a query where none are named.
-const DEFAULT_VIEWS: usize = 3;
+use self::ask::{Asked, Asker};
+use self::show::{Divided, ShowOptions};
+use self::text::TextSource;
+use crate::memory::{self, SMALLER, Sizes};
+use crate::options::QueryOptions;
+use crate::scene::{LabelledScene, find_view, load};
+use crate::silhouette::Silhouette;
+use gs_io::Result;
+use gs_scene::dataset::LoadOptions;
+use serde_json::{Value, json};
+use stage::Stage;
 
-/// What is asked for.
-pub struct Asked {
-    /// What it is called in `query.json` and in names of files: the text, a picture's name, a place.
-    pub name: String,
-    /// `text`, `image`, `pixel`, `point`, or `part` of what was found.
-    pub kind: &'static str,
-    /// The answer.
-    pub answer: Answered,
-    /// Where, for a pixel or a point.
-    pub place: Option<Place>,
-}
-
-/// How to show answers.
-pub struct ShowOptions {
-    /// Names of the views for pictures; empty: those in which the selected instances were matched best.
-    pub views: Vec<String>,
-    /// How a selection becomes a mask, and above which value a pixel belongs.
-    pub rendering: Rendering,
-}
-
-/// A division of the cloud among texts, to be written.
-pub struct Divided {
-    /// The texts.
-    pub texts: Vec<String>,
-    /// Index of the text per Gaussian, -1 for none.
-    pub labels: Vec<i32>,
-    /// Instances of each text.
-    pub instances: Vec<Vec<u32>>,
-}
-
-/// `query.json`.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-pub struct QueryResults {
-    /// Where text features came from.
-    pub text_source: String,
-    /// Numbers per descriptor.
-    pub dimension: usize,
-    /// Instances in the scene.
-    pub instances: usize,
-    /// The answer to each query, in the order given.
-    pub queries: Vec<QueryResult>,
-    /// The cloud divided among the texts, where that was asked for.
-    #[serde(default)]
-    pub segmentation: Option<Segmentation>,
-}
-
-/// The answer to one text.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-pub struct QueryResult {
-    /// The text, or what else was asked for.
-    pub text: String,
-    /// `text`, `image`, `pixel`, `point`, or `part` of what was found.
-    #[serde(default)]
-    pub kind: String,
-    /// Where, for a pixel or a point.
-    #[serde(default)]
-    pub place: Option<Place>,
-    /// Selected instances, best first.
-    pub selected: Vec<u32>,
-    /// Score of the best selected instance: cosine, relevancy, or share of a pixel.
-    pub score: Option<f32>,
-    /// Gaussians selected.
-    pub gaussians: usize,
-    /// File of the selected Gaussians, beside `query.json`; none when nothing is selected.
-    pub ply: Option<String>,
-    /// The best instances, selected or not.
-    pub ranking: Vec<RankedInstance>,
-    /// Pictures.
-    pub views: Vec<QueryView>,
-}
-
-/// An instance in `query.json`.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-pub struct RankedInstance {
-    /// Index of the instance.
-    pub instance: u32,
-    /// Cosine with the text; relevancy with negatives; share of a pixel.
-    pub score: f32,
-    /// Views that support its descriptor.
-    pub support: u32,
-    /// Its Gaussians.
-    pub gaussians: u32,
-}
-
-/// Pictures of an answer in one view.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-pub struct QueryView {
-    /// Stem of the view.
-    pub view: String,
-    /// File of the photograph with the selection brought out, beside `query.json`.
-    pub overlay: String,
-    /// File of the mask (255 inside, 0 outside), beside `query.json`.
-    pub mask: String,
-    /// Pixels of the mask.
-    pub pixels: usize,
-}
-
-/// Writes the answers' PLYs, pictures and `query.json` into `out`.
-///
-/// # Errors
-/// When a view is unknown, or a file cannot be read or written.
-pub fn write(
-    scene: &LabelledScene,
-    dataset: &Dataset,
-    source: String,
-    asked: Vec<Asked>,
-    divided: Option<Divided>,
-    options: &ShowOptions,
-    out: &Path,
-) -> Result<QueryResults> {
-    let named: Vec<&View> = options.views.iter().map(|v| find_view(dataset, v)).collect::<Result<_>>()?;
-    let mut shown = Vec::new();
-    for (number, asked) in (1..).zip(asked) {
-        let file = numbered(number, &asked.name);
-        let own = asked.place.as_ref().and_then(|p| p.view.as_deref()).and_then(|v| find_view(dataset, v).ok());
-        let mut views =
-            if named.is_empty() { best_views(scene, dataset, &asked.answer.selected) } else { named.clone() };
-        if let Some(own) = own.filter(|o| !views.iter().any(|v| v.name == o.name)) {
-            views.insert(0, own);
-        }
-        shown.push(Shown { asked, file, views });
-    }
-    for Shown { asked, file, .. } in shown.iter().filter(|s| !s.asked.answer.gaussians.is_empty()) {
-        let ids: Vec<String> = asked.answer.selected.iter().map(u32::to_string).collect();
-        let text: String = asked.name.chars().map(|c| if c.is_control() { ' ' } else { c }).collect();
-        let own = vec![format!("cags query: {text}"), format!("cags instances: {}", ids.join(" "))];
-        let comments = scene.geometry.comments(own);
-        let path = out.join(format!("{file}.ply"));
-        gs_scene::ply::write_gaussians(&path, &scene.gaussians().select(&asked.answer.gaussians), &comments)?;
-    }
-    let segmentation = divided.map(|d| write_segmentation(scene, dataset, &named, d, out)).transpose()?;
-    let mut pictures: Vec<Vec<QueryView>> = vec![Vec::new(); shown.len()];
-    for view in &dataset.views {
-        let here: Vec<usize> =
-            (0..shown.len()).filter(|&q| shown[q].views.iter().any(|v| v.name == view.name)).collect();
-        if here.is_empty() {
-            continue;
-        }
-        let photo = view.load_image()?;
-        let photo = Picture::new(photo.width as usize, photo.height as usize, &photo.rgb);
-        let selections: Vec<&[u32]> = here.iter().map(|&q| &shown[q].asked.answer.gaussians[..]).collect();
-        let Rendering { silhouette, threshold } = options.rendering;
-        let masks = silhouette.masks(scene.gaussians(), &scene.raster, &selections, &view.camera, threshold);
-        for (&q, mask) in here.iter().zip(&masks) {
-            let stem = format!("{}.{}", shown[q].file, view_name(dataset, view));
-            let (overlay, mask_file) = (format!("{stem}.overlay.png"), format!("{stem}.mask.png"));
-            write_bytes(out.join(&overlay), &photo.highlighted(&mask.bits, HIGHLIGHT).png()?)?;
-            write_bytes(out.join(&mask_file), &mask_png(mask.width, mask.height, &mask.bits)?)?;
-            pictures[q].push(QueryView { view: view.stem().into(), overlay, mask: mask_file, pixels: mask.count() });
-        }
-    }
-    let results = QueryResults {
-        text_source: source,
-        dimension: scene.instances.dim,
-        instances: scene.instances.len(),
-        queries: shown.into_iter().zip(pictures).map(|(s, views)| s.result(views)).collect(),
-        segmentation,
-    };
-    let path = out.join("query.json");
-    let json = serde_json::to_vec_pretty(&results).map_err(|e| Error::new(e.to_string()).file(&path))?;
-    write_bytes(&path, &json)?;
-    Ok(results)
-}
-
-/// Writes `labels.npy`, `segmentation.ply` and renders of it.
-fn write_segmentation(
-    scene: &LabelledScene,
-    dataset: &Dataset,
-    named: &[&View],
-    divided: Divided,
-    out: &Path,
-) -> Result<Segmentation> {
-    let Divided { texts, labels, instances } = divided;
-    let coloured = segment::coloured(scene.gaussians(), &labels);
-    let (npy, ply) = ("labels.npy", "segmentation.ply");
-    gs_io::npy::write_i32(out.join(npy), &[labels.len()], &labels)?;
-    let comments: Vec<String> = texts.iter().enumerate().map(|(t, text)| format!("cags label {t}: {text}")).collect();
-    gs_scene::ply::write_gaussians(out.join(ply), &coloured, &scene.geometry.comments(comments))?;
-    let all: Vec<&View> = dataset.views.iter().collect();
-    for view in if named.is_empty() { spread(&all, DEFAULT_VIEWS) } else { named.to_vec() } {
-        let image = gs_raster::render(&coloured, &view.camera, &scene.raster);
-        let picture = Picture::new(image.width as usize, image.height as usize, &image.rgb);
-        write_bytes(out.join(format!("segmentation.{}.png", view_name(dataset, view))), &picture.png()?)?;
-    }
-    let segments = texts.into_iter().zip(instances).enumerate().map(|(t, (text, instances))| Segment {
-        gaussians: labels.iter().filter(|&&l| l == t as i32).count(),
-        color: instance_color(t as u32),
-        text,
-        instances,
+pub(crate) fn run(o: &QueryOptions, parameters: Value, stage: &Stage, json_lines: bool) -> Result<String> {
+    let load_options = LoadOptions { resolution: o.views.resolution, ..LoadOptions::default() };
+    let dataset = load(&o.inputs.scene, &load_options, stage)?;
+    let out = o.out.as_ref().map(|o| &o.out);
+    let claim = out.map(|out| {
+        let outputs = stage.outputs(out.join("query.json")).folder(out);
+        let tables = o.texts.text_features.iter().chain(&o.choice.features);
+        outputs.reads(o.inputs.files(&dataset)).reads(tables.chain(&o.image)).claim()
     });
-    let segments = segments.collect();
-    let unlabelled = labels.iter().filter(|&&l| l < 0).count();
-    Ok(Segmentation { segments, unlabelled, labels: npy.into(), ply: ply.into() })
-}
-
-struct Shown<'a> {
-    asked: Asked,
-    file: String,
-    views: Vec<&'a View>,
-}
-
-impl Shown<'_> {
-    fn result(self, views: Vec<QueryView>) -> QueryResult {
-        let Asked { name, kind, answer, place } = self.asked;
-        let ply = (!answer.gaussians.is_empty()).then(|| format!("{}.ply", self.file));
-        result(name, kind, place, &answer, ply, views)
+    let mut claim = claim.transpose()?;
+    stage.forecast(memory::of_query(&Sizes::new(&o.inputs, &o.texts, &dataset.views)), SMALLER)?;
+    let scene = o.inputs.read(&dataset, stage)?;
+    let source = source(o, &scene)?;
+    for view in &o.views.views {
+        find_view(&dataset, view)?;
     }
-}
-
-fn result(
-    name: String,
-    kind: &str,
-    place: Option<Place>,
-    answer: &Answered,
-    ply: Option<String>,
-    views: Vec<QueryView>,
-) -> QueryResult {
-    let ranked = |r: &Ranked| RankedInstance {
-        instance: r.instance,
-        score: r.score,
-        support: r.support,
-        gaussians: r.gaussians,
+    let asker = Asker::new(&scene, source, &o.choice, o.texts.min_support)?;
+    if scene.all_noise() {
+        stage.warn("all Gaussians are noise: every query selects nothing");
+    }
+    let show = ShowOptions { views: o.views.views.clone(), rendering: o.masking.rendering(Silhouette::Visible) };
+    let (summary, printed) = match out {
+        Some(out) if !o.interactive => {
+            let (asked, divided) = answers(o, &scene, &asker, stage)?;
+            let places = place::answers(&o.pixel, &o.point, &o.text, &scene, &dataset, &asker)?;
+            let asked = asked.into_iter().chain(places).collect();
+            let results = show::write(&scene, &dataset, asker.describe(), asked, divided, &show, out)?;
+            results.warnings().for_each(|w| stage.warn(&w));
+            let nothing = results.queries.iter().filter(|q| q.gaussians == 0).count();
+            let summary =
+                json!({"queries": results.queries.len(), "instances": results.instances, "selected_nothing": nothing});
+            (summary, show::table(&results))
+        }
+        _ => {
+            interactive::run(o, &scene, &dataset, &asker, &show, stage, json_lines)?;
+            (json!({}), String::new())
+        }
     };
-    QueryResult {
-        text: name,
-        kind: kind.into(),
-        place,
-        score: answer.score,
-        gaussians: answer.gaussians.len(),
-        ply,
-        ranking: answer.ranking.iter().take(KEPT_RANKS).map(ranked).collect(),
-        selected: answer.selected.clone(),
-        views,
+    if let Some(claim) = &mut claim {
+        stage.record(claim, parameters, scene.inputs.clone(), summary)?;
     }
+    Ok(printed)
 }
 
-/// An answer as [`QueryResults`] holds it, without files: for queries that are only printed.
-pub fn unwritten(asked: &Asked) -> QueryResult {
-    result(asked.name.clone(), asked.kind, None, &asked.answer, None, Vec::new())
+/// The source of text features; none where only pictures or places are asked for, and it does not fit the instances.
+fn source(o: &QueryOptions, scene: &LabelledScene) -> Result<Option<TextSource>> {
+    let worded = !o.text.is_empty() || o.interactive;
+    if !worded && !o.texts.given() {
+        return Ok(None);
+    }
+    let source = TextSource::open(&o.texts)?;
+    if worded || !o.image.is_empty() {
+        source.check_fits(scene, &o.texts)?;
+    }
+    Ok(Some(source).filter(|s| s.dim() == scene.instances.dim))
 }
 
-/// A view's stem as part of a file name (names of views may hold folders), with its number where two would be the same.
-fn view_name(dataset: &Dataset, view: &View) -> String {
-    let name = |v: &View| slug(v.stem(), "_.");
-    let own = name(view);
-    let twins = dataset.views.iter().filter(|v| name(v) == own).count();
-    let number = dataset.views.iter().position(|v| v.name == view.name).unwrap_or(0);
-    if twins > 1 { format!("{number:04}-{own}") } else { own }
-}
-
-/// Views to show a selection in: of those in which its instances were matched with at least half of the best score, a
-/// few that lie apart; without matches, a few of all views.
-fn best_views<'a>(scene: &LabelledScene, dataset: &'a Dataset, selected: &[u32]) -> Vec<&'a View> {
-    let matches = || scene.instances.matches.iter().filter(|m| selected.contains(&m.instance));
-    let best = matches().map(|m| m.score).fold(0.0, f32::max);
-    let good: BTreeSet<&str> =
-        matches().filter(|m| m.score >= 0.5 * best).map(|m| scene.instances.views[m.view as usize].as_str()).collect();
-    let candidates: Vec<&View> = dataset.views.iter().filter(|v| good.contains(v.stem())).collect();
-    let all: Vec<&View> = dataset.views.iter().collect();
-    spread(if candidates.is_empty() { &all } else { &candidates }, DEFAULT_VIEWS)
-}
-
-/// The rankings as a table for the terminal.
-pub fn table(results: &QueryResults, rows: usize) -> String {
-    let mut s: String = results.queries.iter().map(|q| answer_table(q, rows)).collect();
-    if let Some(d) = &results.segmentation {
-        let _ = writeln!(s, "segmentation ({} Gaussians without a text)", d.unlabelled);
-        for segment in &d.segments {
-            let _ = writeln!(
-                s,
-                "  {:>10} Gaussians {:>4} instances  {}",
-                segment.gaussians,
-                segment.instances.len(),
-                segment.text
-            );
+/// The answers to texts and pictures, and the cloud divided among the texts where that is asked for.
+fn answers(
+    o: &QueryOptions,
+    scene: &LabelledScene,
+    asker: &Asker<'_>,
+    stage: &Stage,
+) -> Result<(Vec<Asked>, Option<Divided>)> {
+    let features = if o.text.is_empty() { Vec::new() } else { asker.known_features(&o.text)? };
+    let texts = o.text.iter().zip(&features);
+    let mut asked: Vec<Asked> = texts.map(|(text, f)| Asked::new(text.clone(), "text", asker.answer(f))).collect();
+    let divided = o.segment.then(|| {
+        let (labels, instances) = segment::divide(
+            &asker.index,
+            &scene.instances.label,
+            scene.instances.len(),
+            &features,
+            &asker.scoring,
+            o.choice.threshold,
+        );
+        Divided { texts: o.text.clone(), labels, instances }
+    });
+    if let Some(clip) = o.texts.clip.as_deref().filter(|_| !o.image.is_empty()) {
+        for (path, feature) in o.image.iter().zip(image::features(&o.image, clip, scene)?) {
+            let name = path.file_stem().unwrap_or_default().to_string_lossy().into_owned();
+            asked.push(Asked::new(name, "image", asker.answer(&feature)));
         }
     }
-    s
-}
-
-/// One ranking as a table for the terminal.
-pub fn answer_table(q: &QueryResult, rows: usize) -> String {
-    let mut s = String::new();
-    let _ = writeln!(s, "{:?} ({} Gaussians selected)", q.text, q.gaussians);
-    if let Some(place) = &q.place {
-        if let Some([x, y, z]) = place.position {
-            let _ = writeln!(s, "  at {x:.4} {y:.4} {z:.4}");
-        }
-        for (name, score) in &place.names {
-            let _ = writeln!(s, "  {score:>8.4} {name}");
-        }
-    }
-    if q.kind == "part" {
-        return s;
-    }
-    let _ = writeln!(s, "  {:>4} {:>9} {:>8} {:>6} {:>10}", "rank", "instance", "score", "views", "Gaussians");
-    for (i, r) in q.ranking.iter().take(rows).enumerate() {
-        let mark = if q.selected.contains(&r.instance) { "  selected" } else { "" };
-        let _ =
-            writeln!(s, "  {:>4} {:>9} {:>8.4} {:>6} {:>10}{mark}", i + 1, r.instance, r.score, r.support, r.gaussians);
-    }
-    if q.ranking.is_empty() {
-        let _ =
-            writeln!(s, "  {}", if q.place.is_some() { "nothing is there" } else { "no instance has a descriptor" });
-    }
-    s
+    let warn = |why: &str| stage.warn(why);
+    Ok((
+        asked.into_iter().flat_map(|one| granularity::apply(o.granularity, &scene.instances, one, &warn)).collect(),
+        divided,
+    ))
 }

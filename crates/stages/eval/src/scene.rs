@@ -1,12 +1,54 @@
 //! What every command loads: instances with their geometry, and the views of the scene.
 
+use crate::nearest::nearest;
+use crate::options::Inputs;
 use artifacts::{Instances, role};
 use gs_io::{Artifact, Error, Result, Watched, hash_file};
 use gs_raster::RasterOptions;
-use gs_scene::dataset::{Dataset, View};
+use gs_scene::dataset::{self, Dataset, LoadOptions, View};
 use gs_scene::{Gaussians, Geometry};
+use stage::Stage;
 use std::collections::BTreeMap;
-use std::path::Path;
+use std::path::{Path, PathBuf};
+
+/// Gaussians of less opacity are not taken for a surface.
+pub const MIN_OPACITY: f32 = 0.1;
+
+/// Loads a dataset and passes on its warnings.
+///
+/// # Errors
+/// When it cannot be read.
+pub fn load(folder: &Path, options: &LoadOptions, stage: &Stage) -> Result<Dataset> {
+    let dataset = dataset::load(folder, options)?;
+    dataset.warnings.iter().for_each(|w| stage.warn(w));
+    Ok(dataset)
+}
+
+impl Inputs {
+    /// The files of the scene, its geometry and its instances.
+    pub fn files<'a>(&'a self, dataset: &'a Dataset) -> impl Iterator<Item = &'a PathBuf> {
+        dataset.files.iter().chain([&self.instances, &self.geometry])
+    }
+
+    /// Reads instances and geometry, which must be those of the dataset. Damaged Gaussians are reported.
+    ///
+    /// # Errors
+    /// As [`LabelledScene::read`] and [`LabelledScene::check_dataset`].
+    pub fn read(&self, dataset: &Dataset, stage: &Stage) -> Result<LabelledScene> {
+        let scene = LabelledScene::read(&self.instances, &self.geometry)?;
+        if let Some(damage) = scene.geometry.damage() {
+            stage.skipped(&damage);
+        }
+        scene.check_dataset(dataset)?;
+        Ok(scene)
+    }
+}
+
+/// The name of a folder, also of `.`.
+pub fn folder_name(path: &Path) -> String {
+    let full = path.canonicalize().unwrap_or_else(|_| path.to_path_buf());
+    full.file_name().map_or("scene".into(), |n| n.to_string_lossy().into_owned())
+}
 
 /// Instances with the Gaussians they label.
 pub struct LabelledScene {
@@ -47,6 +89,20 @@ impl LabelledScene {
             BTreeMap::from([(role::GEOMETRY.into(), geometry_hash), ("instances".into(), artifact.hash().into())]);
         let raster = RasterOptions::of(&geometry);
         Ok(Self { geometry, raster, instances: labelled, artifact, inputs })
+    }
+
+    /// Whether no Gaussian belongs to an instance.
+    pub fn all_noise(&self) -> bool {
+        self.instances.label.iter().all(|&l| l < 0)
+    }
+
+    /// The nearest Gaussian for each point, of those with an instance and an opacity of at least 0.1: fainter ones are no
+    /// surface (docs/protocols.md). None where there is no such Gaussian.
+    pub fn nearest_labelled(&self, points: &[[f32; 3]]) -> Vec<Option<u32>> {
+        let (g, label) = (self.gaussians(), &self.instances.label);
+        let counts = |&i: &u32| label[i as usize] >= 0 && g.opacity(i as usize) >= MIN_OPACITY;
+        let candidates: Vec<u32> = (0..g.len() as u32).filter(counts).collect();
+        nearest(g, &candidates, points)
     }
 
     /// All Gaussians.

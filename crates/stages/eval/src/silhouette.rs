@@ -3,13 +3,15 @@
 use crate::Mask;
 use gs_raster::RasterOptions;
 use gs_scene::{Camera, Gaussians};
+use serde::{Deserialize, Serialize};
 
 /// How a selection becomes a mask. The two give different scores: say which was used (docs/protocols.md).
-#[derive(Debug, Clone, Copy, PartialEq, Eq, clap::ValueEnum)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, clap::ValueEnum, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
 pub enum Silhouette {
-    /// Render the selected Gaussians alone; what stands before them does not hide them (OpenGaussian, CAGS).
+    /// Render the selected Gaussians alone; what stands before them does not hide them (OpenGaussian, CAGS)
     Selected,
-    /// Render all Gaussians, count the share of the selected: what is hidden is not shown (AG2aussian, LaGa).
+    /// Render all Gaussians, count the share of the selected: what is hidden is not shown (AG2aussian, LaGa)
     Visible,
 }
 
@@ -29,7 +31,18 @@ impl Silhouette {
             Self::Visible => "visible",
         }
     }
+}
 
+/// The rule by which selections become masks.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Rendering {
+    /// Rendered alone, or as far as visible.
+    pub silhouette: Silhouette,
+    /// The value above which a pixel belongs.
+    pub threshold: f32,
+}
+
+impl Rendering {
     /// Masks of several selections (ascending indices of Gaussians) in one view, in order; rendered as `raster` says.
     pub fn masks(
         self,
@@ -37,11 +50,12 @@ impl Silhouette {
         raster: &RasterOptions,
         selections: &[&[u32]],
         camera: &Camera,
-        threshold: f32,
     ) -> Vec<Mask> {
-        match self {
-            Self::Selected => selections.iter().map(|s| alone(gaussians, raster, s, camera, threshold)).collect(),
-            Self::Visible => visible(gaussians, raster, selections, camera, threshold),
+        match self.silhouette {
+            Silhouette::Selected => {
+                selections.iter().map(|s| alone(gaussians, raster, s, camera, self.threshold)).collect()
+            }
+            Silhouette::Visible => visible(gaussians, raster, selections, camera, self.threshold),
         }
     }
 }
@@ -140,6 +154,9 @@ mod tests {
         RasterOptions::default()
     }
 
+    const SELECTED: Rendering = Rendering { silhouette: Silhouette::Selected, threshold: 0.7 };
+    const VISIBLE: Rendering = Rendering { silhouette: Silhouette::Visible, threshold: 0.5 };
+
     #[test]
     fn silhouettes_of_a_marked_geometry_are_those_of_the_filtered_render() {
         let (mut g, camera) = balls();
@@ -149,10 +166,10 @@ mod tests {
             let direct = RasterOptions { antialias, ..RasterOptions::default() };
             let mut pixels = 0;
             for (own, threshold) in [(0u32, 0.2), (1, 0.2)] {
-                let alone = &Silhouette::Selected.masks(&g, &raster, &[&[own]], &camera, threshold)[0];
+                let alone = &Rendering { threshold, ..SELECTED }.masks(&g, &raster, &[&[own]], &camera)[0];
                 let alpha = gs_raster::render(&g.select(&[own]), &camera, &direct).alpha;
                 assert_eq!(*alone, Mask::above(64, 48, &alpha, threshold));
-                let seen = &Silhouette::Visible.masks(&g, &raster, &[&[own]], &camera, threshold)[0];
+                let seen = &Rendering { threshold, ..VISIBLE }.masks(&g, &raster, &[&[own]], &camera)[0];
                 let member: Vec<f32> = (0..2).map(|i| f32::from(u8::from(i == own))).collect();
                 let share = gs_raster::render_features(&g, &member, 1, &camera, &direct);
                 assert_eq!(*seen, Mask::above(64, 48, &share, threshold));
@@ -167,8 +184,8 @@ mod tests {
     fn a_hidden_part_counts_only_when_rendered_alone() {
         let (g, camera) = balls();
         let far: &[u32] = &[1];
-        let alone = &Silhouette::Selected.masks(&g, &raster(), &[far], &camera, 0.7)[0];
-        let seen = &Silhouette::Visible.masks(&g, &raster(), &[far, &[0, 1]], &camera, 0.5);
+        let alone = &SELECTED.masks(&g, &raster(), &[far], &camera)[0];
+        let seen = &VISIBLE.masks(&g, &raster(), &[far, &[0, 1]], &camera);
         let centre = 24 * 64 + 32;
         assert!(alone.bits[centre] && !seen[0].bits[centre] && seen[1].bits[centre]);
         assert!(seen[0].count() > 20, "its rim is seen");
@@ -191,8 +208,8 @@ mod tests {
     #[test]
     fn nothing_selected_covers_nothing() {
         let (g, camera) = balls();
-        for s in [Silhouette::Selected, Silhouette::Visible] {
-            assert_eq!(s.masks(&g, &raster(), &[&[]], &camera, s.default_threshold())[0].count(), 0);
+        for s in [SELECTED, VISIBLE] {
+            assert_eq!(s.masks(&g, &raster(), &[&[]], &camera)[0].count(), 0);
         }
     }
 
@@ -201,7 +218,7 @@ mod tests {
         let (g, camera) = balls();
         let selections: Vec<&[u32]> =
             (0..CHANNELS + 3).map(|i| if i % 2 == 0 { &[0u32][..] } else { &[1][..] }).collect();
-        let masks = Silhouette::Visible.masks(&g, &raster(), &selections, &camera, 0.5);
+        let masks = VISIBLE.masks(&g, &raster(), &selections, &camera);
         assert_eq!(masks.len(), CHANNELS + 3);
         assert_eq!(masks[CHANNELS], masks[0]);
         assert_eq!(masks[CHANNELS + 1], masks[1]);

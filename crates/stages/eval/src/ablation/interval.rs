@@ -1,6 +1,6 @@
 //! Mean and 95% interval of a few values.
 
-use crate::metrics;
+use crate::score::metrics;
 use serde::{Deserialize, Serialize};
 
 /// A mean with its 95% interval.

@@ -37,10 +37,6 @@ fn an_ablation_makes_tables_and_fills_documents() {
     let page = fs::read_to_string(f.path().join("out/report.html")).unwrap();
     assert!(page.contains("id=\"ablation-layers\"") && page.contains("full &lt;method&gt;"));
 
-    // The report of a run shows the tables too.
-    f.good("report", "--run-dir|{}/run|--scene|{}/balls|--ablation|{}/out|--out|{}/report.html");
-    assert!(fs::read_to_string(f.path().join("report.html")).unwrap().contains("id=\"ablation-layers\""));
-
     // What is wrong is said, and nothing is overwritten.
     fs::remove_dir_all(run(1)).unwrap();
     fs::write(f.path().join("plan"), format!("{PLAN}expect layers | paper.free | 0.5 | instance_miou | 2 | 3\n"))

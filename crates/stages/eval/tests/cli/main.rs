@@ -99,7 +99,7 @@ fn bad_queries_are_one_line_and_leave_no_output() {
     let e = with("--text|red ball");
     assert!(e.contains("expected --clip or --text-features"), "{e}");
     let e = with("--text-features|{}/text.json|--text|red ball|--alpha|1.5");
-    assert!(e.contains("--alpha"), "{e}");
+    assert!(e.contains("'--alpha <VALUE>': expected 0 to 1"), "{e}");
     fs::write(f.table(), r#"{"red ball": [1, 0, 0]}"#).unwrap();
     let e = with("--text-features|{}/text.json|--text|red ball");
     assert!(e.contains("another model") && e.contains("found dimension 2, expected 3"), "{e}");
@@ -141,7 +141,7 @@ fn artifacts_of_another_scene_are_refused() {
 }
 
 #[test]
-fn a_perfect_run_scores_high_and_the_csv_agrees() {
+fn a_perfect_run_scores_high() {
     let f = Fixture::new(2);
     let printed = f.good("score", "--text-features|{}/text.json|--out|{}/s/score.json");
     let s = f.json("s/score.json");
@@ -153,12 +153,8 @@ fn a_perfect_run_scores_high_and_the_csv_agrees() {
     assert!(s["query_miou"].as_f64().unwrap() > 0.8, "{printed}");
     assert_eq!((s["query_macc25"].as_f64(), s["query_pairs"].as_u64()), (Some(1.0), Some(4)));
     assert_eq!(s["queries"][1]["text"], "red ball");
-    let csv = fs::read_to_string(f.path().join("s/score.queries.csv")).unwrap();
-    let ious: Vec<f64> = csv.lines().skip(1).map(|l| l.rsplit(',').next().unwrap().parse().unwrap()).collect();
-    let mean = ious.iter().sum::<f64>() / ious.len() as f64;
-    assert!((mean - s["query_miou"].as_f64().unwrap()).abs() < 1e-5);
-    let things = fs::read_to_string(f.path().join("s/score.things.csv")).unwrap();
-    assert!(things.contains("2,\"floor\",true,100,1.000000,2,1"), "{things}");
+    let floor = &s["things"][2];
+    assert_eq!((&floor["name"], &floor["background"], &floor["iou"]), (&"floor".into(), &true.into(), &1.0.into()));
     // The best instance for a label is the one that its text selects.
     assert_eq!(
         (s["label_miou"].as_f64(), s["labels"].as_array().unwrap().len()),
@@ -312,9 +308,9 @@ fn a_report_of_geometry_alone_says_what_is_left_out() {
         fs::remove_file(f.run().join(name)).unwrap();
     }
     fs::remove_dir_all(f.scene().join("language_features")).unwrap();
-    f.good("report", "--run-dir|{}/run|--scene|{}/balls|--title|Two <balls>|--out|{}/report.html");
+    f.good("report", "--run-dir|{}/run|--scene|{}/balls|--out|{}/report.html");
     let html = fs::read_to_string(f.path().join("report.html")).unwrap();
-    assert!(html.contains("<title>Two &lt;balls&gt;</title>") && html.contains("held out"));
+    assert!(html.contains("<title>run</title>") && html.contains("held out"));
     let m = f.json("metrics.json");
     let skipped = m["skipped"].to_string();
     for part in ["instances", "features", "id maps", "scores", "text queries", "PSNR"] {
@@ -347,7 +343,7 @@ fn threads_do_not_change_a_byte() {
             compared += 1;
         }
     }
-    assert!(compared >= 10, "{compared}");
+    assert!(compared >= 8, "{compared}");
 }
 
 #[test]
@@ -392,7 +388,7 @@ fn places_say_what_is_there() {
     assert!(e.contains("--pixel: the pixel lies outside the view; found 96,1"), "{e}");
     assert!(f.bad("query", "--out|{}/out|--pixel|frame_00002").contains("--pixel: not understood"));
     assert!(f.bad("query", "--out|{}/out|--point|1,2,inf").contains("--point: not a point"));
-    assert!(f.bad("query", "--out|{}/out").contains("nothing is asked for"));
+    assert!(f.bad("query", "--out|{}/out").contains("required arguments were not provided"));
 }
 
 #[test]
@@ -411,12 +407,10 @@ fn points_outside_the_scene_are_refused() {
 #[test]
 fn empty_texts_are_refused() {
     let f = Fixture::new(2);
-    let report = "--run-dir|{}/run|--scene|{}/balls|--out|{}/report.html";
     for (command, arguments, option) in [
         ("query", format!("{TABLE}|--text|red ball|--text="), "--text"),
         ("query", format!("{TABLE}|--text|red ball|--negatives=thing,"), "--negatives"),
         ("lerf", "--out|{}/out|--name=".into(), "--name"),
-        ("report", format!("{report}|--title="), "--title"),
     ] {
         let e = f.bad(command, &arguments);
         assert!(e.contains(&format!("'{option} <")) && e.contains("': an empty text; expected words"), "{e}");
@@ -424,7 +418,7 @@ fn empty_texts_are_refused() {
     let e = f.bad("query", &format!("{TABLE}|--text|red ball|--negatives=thing, ,stuff"));
     assert!(e.contains("invalid value ' ' for '--negatives <TEXTS>': an empty text"), "{e}");
     assert!(f.bad("query", &format!("{TABLE}|--text|red ball|--template=")).contains("no place for the text"));
-    assert!(!f.path().join("out").exists() && !f.path().join("report.html").exists());
+    assert!(!f.path().join("out").exists());
 }
 
 #[test]
@@ -475,21 +469,19 @@ fn a_picture_is_a_query() {
     let (width, height) = (image.width as usize, image.height as usize);
     let whole = onnx_models::RgbImage { width, height, pixels: image.to_rgb8() };
     let map = onnx_models::LabelMap { width, height, ids: &vec![0; width * height] };
-    let bounds = onnx_models::Bounds { x0: 8, y0: 4, x1: 40, y1: 36 };
+    let bounds = onnx_models::Bounds { x0: 0, y0: 0, x1: width, y1: height };
     let feature = encoder.encode(&onnx_models::crop_mask(&whole, &map, 0, bounds, encoder.size())).unwrap();
     let opposite: Vec<f32> = feature.iter().map(|v| -v).collect();
     f.write_described(&[opposite, feature, vec![0.0; 4]], |g| g as i32);
     let ask =
         |rest: &str| format!("--clip|{clip}|--image|{}|{rest}|--views|frame_00002|--out|{{}}/out", picture.display());
-    f.good("query", &ask("--crop|8,4,40,36"));
+    f.good("query", &ask(""));
     let q = &f.json("out/query.json")["queries"][0];
     assert_eq!(
         (&q["kind"], &q["text"], &q["selected"]),
         (&"image".into(), &"frame_00002".into(), &serde_json::json!([1]))
     );
     assert!((q["score"].as_f64().unwrap() - 1.0).abs() < 1e-6);
-    assert!(f.bad("query", &ask("--crop|8,4,8,36")).contains("--crop: not a part of the picture"));
-    assert!(f.bad("query", &ask("--crop|8,4")).contains("--crop: not understood"));
     let e = f.bad("query", &format!("{TABLE}|--image|{}", picture.display()));
     assert!(e.contains("pictures need an image encoder"), "{e}");
     f.write_instances(2, |g| g as i32);
@@ -514,15 +506,12 @@ fn negatives_templates_and_joining_change_the_answer() {
     assert_eq!(join("0.9")["selected"].as_array().unwrap()[0], 1);
     assert!(!join("0.9")["selected"].to_string().contains('0'), "{}", join("0.9")["selected"]);
     assert!(join("0.93")["selected"].to_string().contains('0'));
-    assert_eq!(
-        join("0.93|--join-siblings")["selected"],
-        serde_json::json!([1]),
-        "there is no tree, so nobody has siblings"
-    );
     let bad = |rest: &str| f.bad("query", &format!("{TABLE}|--text|ball|{rest}"));
     assert!(bad("--negatives|stuff").contains("no such text in the table"));
-    assert!(bad("--template|a photo").contains("--template: no place for the text"));
-    assert!(bad("--join|0|--features|{}/run/features.safetensors").contains("--join: not a distance"));
+    assert!(bad("--template|a photo").contains("no place for the text; expected {} in it"));
+    assert!(
+        bad("--join|0|--features|{}/run/features.safetensors").contains("'--join <DISTANCE>': expected more than 0")
+    );
     assert!(bad("--join|1|--features|{}/run/none").contains("none"));
 }
 
@@ -623,7 +612,10 @@ fn odd_instances_are_answered_with_a_line() {
     warned("query", &query);
     assert_eq!(f.json("out/query.json")["queries"][0]["gaussians"], 83);
     // Nothing reaches the threshold.
-    assert!(warned("query", &format!("{query}|--threshold|2")).contains("nothing is selected"));
+    assert!(
+        warned("query", &format!("{TABLE}|--text|thing|--views|frame_00002|--threshold|0.9"))
+            .contains("nothing is selected")
+    );
     // A view that no label names, an unknown category, labels of another shape.
     f.write_instances(2, |g| g as i32);
     f.write_label(4, &[("red ball", 0), ("green ball", 1)], (fixture::WIDTH, fixture::HEIGHT));

@@ -200,10 +200,9 @@ impl Oracle {
     fn ask(&mut self, case: &str, arguments: &[&str]) -> Option<Value> {
         let Some(python) = &self.python else {
             if self.golden["hash"] != self.hash.as_str() {
-                eprintln!(
-                    "skipped {case}: no Python with OpenCV 4.8 to 4.10, and the golden values are of another scene"
+                panic!(
+                    "{case}: the golden values are of another scene; set CAGS_PYTHON and CAGS_GOLDEN=1 to make new ones"
                 );
-                return None;
             }
             return Some(self.golden["cases"][case].clone());
         };
@@ -239,17 +238,17 @@ fn the_protocols_agree_with_an_independent_implementation() {
     let text = |p: PathBuf| p.to_string_lossy().into_owned();
     let (labels, saved) = (text(s.scene().join("label")), text(s.at("saved")));
     let mut spread = Vec::new();
-    for (rendering, averaging) in [("selected", "objects"), ("visible", "frames")] {
+    for (rendering, averaging, figures) in [("selected", "objects", "figures"), ("visible", "frames", "frame_figures")]
+    {
         let folder = format!("{saved}-{rendering}");
-        let rest =
-            ["--rendering", rendering, "--averaging", averaging, "--localisation", "--save-predictions", &folder];
+        let rest = ["--silhouette", rendering, "--localisation", "--save-predictions", &folder];
         let ours = s.metrics("lerf", &rest);
         assert!(ours["figures"]["pairs"].as_u64().unwrap() >= 8, "{}", ours["figures"]);
         spread.push(ours["figures"]["miou"].as_f64().unwrap());
         let case = format!("lerf {rendering}");
         let Some(theirs) = oracle.ask(&case, &["lerf", &labels, &folder, "--averaging", averaging]) else { continue };
         for figure in ["miou", "macc25", "macc50", "localisation"] {
-            same(&ours["figures"][figure], &theirs[figure], &format!("{case} {figure}"));
+            same(&ours[figures][figure], &theirs[figure], &format!("{case} {figure}"));
         }
         let pairs = theirs["pairs"].as_array().unwrap();
         assert_eq!(pairs.len(), ours["pairs"].as_array().unwrap().len());
@@ -281,13 +280,7 @@ fn the_protocols_agree_with_an_independent_implementation() {
     let (geometry, instances, texts, scan) =
         (text(s.geometry()), text(s.instances()), text(s.texts()), text(s.scene()));
     let mut seen = Vec::new();
-    for rest in [
-        &["--association", "one-to-one"][..],
-        &["--association", "one-to-one", "--keep-faint"],
-        &["--association", "one-to-one", "--undescribed", "none"],
-        &["--association", "nearest"],
-        &["--association", "volume"],
-    ] {
+    for rest in [&["--association", "one-to-one"][..], &["--association", "nearest"], &["--association", "volume"]] {
         let ours = s.metrics("scannet", rest);
         let case = format!("scannet {}", rest.join(" "));
         let arguments = [&["scannet", &geometry, &instances, &texts, &scan], rest].concat();
@@ -363,9 +356,10 @@ fn damaged_gaussians_leave_the_evaluation_of_a_scan() {
     (i.label[5], i.label[6]) = (-1, -1);
     i.write(s.instances(), provenance(&s.geometry(), &s.scene())).unwrap();
     // By number they leave with their vertices, faint or not; their neighbours speak for the place.
-    let notes = s.metrics("scannet", &["--association", "one-to-one", "--keep-faint"])["notes"].to_string();
-    assert!(notes.contains(&format!("2 of {} vertices leave the evaluation", g.len())), "{notes}");
-    let notes = s.metrics("scannet", &["--association", "nearest", "--keep-faint"])["notes"].to_string();
+    let notes = s.metrics("scannet", &["--association", "one-to-one"])["notes"].to_string();
+    let faint = (0..g.len()).filter(|n| n % 11 == 0).count();
+    assert!(notes.contains(&format!("{} of {} vertices leave the evaluation", faint + 2, g.len())), "{notes}");
+    let notes = s.metrics("scannet", &["--association", "nearest"])["notes"].to_string();
     assert!(!notes.contains("leave the evaluation"), "{notes}");
     let said = String::from_utf8(s.run("scannet", &["--association", "volume"]).stderr).unwrap();
     assert!(said.contains(&format!("skipped 2 of {} Gaussians: damaged", g.len())), "{said}");
@@ -381,8 +375,6 @@ fn scans_that_do_not_fit_are_refused() {
         assert!(!error.contains("panicked"), "{error}");
         error
     };
-    assert!(bad(&["--classes", "20"]).contains("--classes: no such class set"));
-    assert!(bad(&["--top-k", "2"]).contains("argmax of the plain cosine"));
     let labels = s.scene().join("scene0000_00_vh_clean_2.labels.ply");
     let whole = std::fs::read(&labels).unwrap();
     let mut moved = whole.clone();
@@ -405,14 +397,11 @@ fn a_benchmark_scene_asks_its_own_table() {
     let m: Value = serde_json::from_slice(&std::fs::read(s.at("out/metrics.json")).unwrap()).unwrap();
     let notes = m["notes"].to_string();
     // frame_00001, 3 and 5 are labelled; none is teatime's.
-    assert!(notes.contains("none of the benchmark's") && notes.contains("published numbers have 59"), "{notes}");
+    assert!(notes.contains("not in the benchmark") && notes.contains("published numbers have 59"), "{notes}");
     assert!(notes.contains("no labelled object was scored"), "{notes}");
     let label = s.scene().join("label");
     std::fs::rename(label.join("frame_00001.json"), label.join("frame_00002.json")).unwrap();
     let m = s.metrics("lerf", &["--name", "teatime"]);
     assert!(m["pairs"].as_array().unwrap().iter().all(|p| p["iou"] == 0.0));
     assert!(m["notes"].to_string().contains("not in the benchmark's table of queries"), "{}", m["notes"]);
-    let o = s.run("lerf", &["--queries", "table"]);
-    assert_eq!(o.status.code(), Some(2));
-    assert!(String::from_utf8_lossy(&o.stderr).contains("--name: no benchmark scene has this name"));
 }

@@ -1,7 +1,10 @@
 //! Where text features come from: a CLIP text encoder, or a table made with one.
 
+use crate::options::TextOptions;
+use crate::scene::LabelledScene;
+use artifacts::role;
 use gs_io::{Error, IoContext, Result};
-use onnx_models::{ClipText, EngineOptions};
+use onnx_models::{ClipImage, ClipText, EngineOptions};
 use std::collections::BTreeMap;
 use std::io::Read;
 use std::path::{Path, PathBuf};
@@ -97,21 +100,52 @@ impl TextSource {
     /// Opens what the options name: a CLIP folder or a table.
     ///
     /// # Errors
-    /// When neither or both are given, or the one given cannot be used.
-    pub fn open(clip: Option<&Path>, table: Option<&Path>, engine: &EngineOptions) -> Result<Self> {
-        match (clip, table) {
-            (Some(clip), None) => Ok(Self::Clip(Box::new(ClipText::open(clip, engine)?))),
+    /// When neither is given, or the one given cannot be used.
+    pub fn open(o: &TextOptions) -> Result<Self> {
+        match (&o.clip, &o.text_features) {
+            (Some(clip), _) => Ok(Self::Clip(Box::new(ClipText::open(clip, &EngineOptions::default())?))),
             (None, Some(table)) => Ok(Self::Table(TextTable::read(table)?)),
             (None, None) => {
                 Err(Error::new("no source of text features").field("--clip").expected("--clip or --text-features"))
             }
-            (Some(_), Some(_)) => Err(Error::new("two sources of text features")
-                .field("--clip, --text-features")
-                .hint("give one of them")),
         }
     }
 
-    /// Numbers per feature.
+    /// Opens what the options name, which must fit the descriptors of a scene.
+    ///
+    /// # Errors
+    /// As [`Self::open`] and [`Self::check_fits`].
+    pub fn open_for(scene: &LabelledScene, o: &TextOptions) -> Result<Self> {
+        let source = Self::open(o)?;
+        source.check_fits(scene, o)?;
+        Ok(source)
+    }
+
+    /// Checks that a source has the descriptors' dimension, and that a CLIP pair is the one whose other half encoded the masks,
+    /// as far as the instances know it.
+    ///
+    /// # Errors
+    /// When it is another model.
+    pub fn check_fits(&self, scene: &LabelledScene, o: &TextOptions) -> Result<()> {
+        self.check_dim(scene.instances.dim, scene.path())?;
+        let Some(clip) = o.clip.as_deref().filter(|_| !o.any_model) else { return Ok(()) };
+        let made_with = |role: &str| scene.artifact.provenance().inputs.get(role).cloned();
+        let (image, text) = (made_with(role::CLIP), made_with(role::CLIP_TEXT));
+        let unknown = image.is_none() && text.is_none();
+        // The text encoder is open, and has its hash already; the image encoder is read only where that does not tell.
+        if unknown || text == Some(self.hash()?) || image.is_some() && image == ClipImage::hash_in(clip) {
+            return Ok(());
+        }
+        Err(Error::new("another CLIP model than the one that encoded the masks")
+            .file(clip)
+            .field("--clip")
+            .expected(format!("the model that {} was made with", scene.path().display()))
+            .hint(
+                "give that model, run mask-embed embed and cluster-match with this one, or accept it with --any-model",
+            ))
+    }
+
+    /// Dimension of the features.
     pub fn dim(&self) -> usize {
         match self {
             Self::Clip(clip) => clip.dimension(),
@@ -128,11 +162,8 @@ impl TextSource {
         }
     }
 
-    /// Checks that descriptors of `dim` numbers can be compared with this source.
-    ///
-    /// # Errors
-    /// When there are no descriptors, or the dimensions differ.
-    pub fn check_dim(&self, dim: usize, instances: &Path) -> Result<()> {
+    /// Checks that descriptors of this dimension can be compared with this source.
+    fn check_dim(&self, dim: usize, instances: &Path) -> Result<()> {
         let e = |what: &str| Error::new(what).file(instances).field("descriptor").found(format!("dimension {dim}"));
         if dim == 0 {
             return Err(e("the instances have no language features")
@@ -158,6 +189,15 @@ impl TextSource {
             }
             Self::Table(table) => Ok(texts.iter().map(|t| table.features.get(t).cloned()).collect()),
         }
+    }
+
+    /// Features of `texts`, all of which must have one; `option` gave them.
+    ///
+    /// # Errors
+    /// When a table does not hold a text, or the engine fails.
+    pub fn known(&self, texts: &[String], option: &str) -> Result<Vec<Vec<f32>>> {
+        let one = |(f, text): (Option<Vec<f32>>, &String)| f.ok_or_else(|| self.unknown(text).field(option));
+        self.encode(texts)?.into_iter().zip(texts).map(one).collect()
     }
 
     /// Features of `texts` where each is put into the place of `{}` in every template, such as "a photo of a {}", and the
@@ -246,7 +286,7 @@ mod tests {
         let dir = tempfile::tempdir().unwrap();
         let path = dir.path().join("text.json");
         std::fs::write(&path, json).unwrap();
-        TextSource::open(None, Some(&path), &EngineOptions::default())
+        Ok(TextSource::Table(TextTable::read(&path)?))
     }
 
     #[test]
@@ -274,7 +314,7 @@ mod tests {
             std::io::Write::write_all(&mut archive, &std::fs::read(&array).unwrap()).unwrap();
         }
         archive.finish().unwrap();
-        TextSource::open(None, Some(&path), &EngineOptions::default())
+        Ok(TextSource::Table(TextTable::read(&path)?))
     }
 
     #[test]
@@ -316,14 +356,11 @@ mod tests {
     }
 
     #[test]
+    #[ignore = "needs opengaussian_text_features.json; run make test-data"]
     fn opengaussians_table_reads() {
         let path =
             Path::new(env!("CARGO_MANIFEST_DIR")).join("../../../../shared/data/text/opengaussian_text_features.json");
-        if !path.exists() {
-            eprintln!("skipped: no opengaussian_text_features.json in the shared data");
-            return;
-        }
-        let t = TextSource::open(None, Some(&path), &EngineOptions::default()).unwrap();
+        let t = TextSource::Table(TextTable::read(path).unwrap());
         assert_eq!(t.dim(), 512);
         let v = t.encode(&["coffee mug".into()]).unwrap().remove(0).unwrap();
         let norm: f32 = v.iter().map(|x| x * x).sum::<f32>().sqrt();

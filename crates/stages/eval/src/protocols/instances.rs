@@ -1,7 +1,7 @@
 //! Class-agnostic instances of a ScanNet scan: truth from segs and aggregation, mIoU and average precision
 //! (docs/protocols.md).
 
-use crate::metrics;
+use crate::score::metrics;
 use gs_io::{Error, IoContext, Result};
 use serde::{Deserialize, Serialize};
 use std::collections::{BTreeMap, BTreeSet};
@@ -26,19 +26,17 @@ struct Aggregation {
 #[serde(rename_all = "camelCase")]
 struct Group {
     object_id: i32,
-    #[serde(default)]
-    label: String,
     segments: Vec<i64>,
 }
 
 /// The true instance of every vertex: `<scan>_vh_clean_2.0.010000.segs.json` gives each vertex a segment
 /// (`segIndices`), `<scan>.aggregation.json` gives each object its segments (`segGroups[].objectId, segments, label`).
-/// -1 for vertices of no object, and of objects whose label is in `without`.
+/// -1 for vertices of no object.
 ///
 /// # Errors
 /// When a file is missing or not such a file, when there is not a segment for each of `vertices` vertices, or two objects
 /// claim one segment.
-pub fn read_truth(segs: &Path, aggregation: &Path, vertices: usize, without: &[String]) -> Result<Vec<i32>> {
+pub fn read_truth(segs: &Path, aggregation: &Path, vertices: usize) -> Result<Vec<i32>> {
     let read = |path: &Path| std::fs::read(path).at("read", path);
     let bad = |path: &Path, what: &str, e: serde_json::Error| Error::new(format!("{what}: {e}")).file(path);
     let s: Segs = serde_json::from_slice(&read(segs)?).map_err(|e| bad(segs, "not a file of segments", e))?;
@@ -64,7 +62,7 @@ pub fn read_truth(segs: &Path, aggregation: &Path, vertices: usize, without: &[S
         }
     }
     let id = |segment: &i64| match object.get(segment) {
-        Some(group) if group.object_id >= 0 && !without.contains(&group.label) => group.object_id,
+        Some(group) if group.object_id >= 0 => group.object_id,
         _ => -1,
     };
     Ok(s.seg_indices.iter().map(id).collect())
@@ -243,14 +241,13 @@ mod tests {
         let groups = r#"{"segGroups":[{"id":0,"objectId":0,"segments":[5],"label":"wall"},
                          {"id":1,"objectId":1,"segments":[7,9],"label":"chair"}]}"#;
         std::fs::write(&a, groups).unwrap();
-        assert_eq!(read_truth(&s, &a, 5, &[]).unwrap(), [0, 0, 1, 1, -1]);
-        assert_eq!(read_truth(&s, &a, 5, &["wall".into()]).unwrap(), [-1, -1, 1, 1, -1]);
-        let e = read_truth(&s, &a, 6, &[]).unwrap_err().to_string();
+        assert_eq!(read_truth(&s, &a, 5).unwrap(), [0, 0, 1, 1, -1]);
+        let e = read_truth(&s, &a, 6).unwrap_err().to_string();
         assert!(e.contains("segIndices: not a segment per vertex; found 5, expected 6"), "{e}");
         std::fs::write(&a, groups.replace("[7,9]", "[5,9]")).unwrap();
-        let e = read_truth(&s, &a, 5, &[]).unwrap_err().to_string();
+        let e = read_truth(&s, &a, 5).unwrap_err().to_string();
         assert!(e.contains("segment 5 of objects 0 and 1"), "{e}");
         std::fs::write(&a, "{}").unwrap();
-        assert!(read_truth(&s, &a, 5, &[]).unwrap_err().to_string().contains("not an aggregation file"));
+        assert!(read_truth(&s, &a, 5).unwrap_err().to_string().contains("not an aggregation file"));
     }
 }

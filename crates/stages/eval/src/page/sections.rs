@@ -1,16 +1,17 @@
 //! The sections of a report, in their order on the page.
 
-use super::Metrics;
 use super::material::{Material, is_of, optional_json};
-use crate::pca::pca;
-use crate::query::QueryResults;
-use crate::runs::{self, Run, grouped};
-use ::report::curve;
-use ::report::html::{Figure, Page};
-use ::report::picture::Picture;
+use super::metrics::Metrics;
+use super::pca::pca;
+use super::runs::{self, Run, grouped};
+use crate::query::show::QueryResults;
+use crate::score::{QueryScore, ThingScore};
 use artifacts::{Features, Level, MaskMaps, NOISE_COLOR, hash_folder, instance_color, maps_path, role};
 use gs_io::{Error, IoContext, Result};
 use gs_scene::dataset::{Dataset, Split, View};
+use report::curve;
+use report::html::{Figure, Page};
+use report::picture::Picture;
 use std::path::{Component, Path, PathBuf};
 
 /// Width of pictures on the page, two or three beside each other.
@@ -75,7 +76,7 @@ pub(super) fn photographs(m: &Material, page: &mut Page) -> Result<()> {
 }
 
 pub(super) fn id_maps(m: &Material, page: &mut Page, metrics: &mut Metrics) -> Result<()> {
-    let Some(folder) = m.options.masks.as_deref().filter(|f| f.is_dir()) else {
+    let Some(folder) = m.masks.as_deref().filter(|f| f.is_dir()) else {
         metrics.skipped.push("id maps: no folder of masks was given".into());
         return Ok(());
     };
@@ -144,7 +145,7 @@ pub(super) fn features(m: &Material, page: &mut Page, metrics: &mut Metrics) -> 
     }
     page.section("features", "Features");
     page.paragraph(&format!(
-        "The {} numbers that every Gaussian carries, as colours: the three leading principal components are red, green \
+        "The feature of every Gaussian, of dimension {}, as a colour: the three leading principal components are red, green \
          and blue. Gaussians of one colour are one thing to the clustering.",
         features.dim
     ));
@@ -270,7 +271,7 @@ pub(super) fn score_tables(m: &Material, page: &mut Page) {
             s.things.len(),
             s.merging.unwrap_or_default(),
         ));
-        let row = |t: &crate::score::ThingScore| {
+        let row = |t: &ThingScore| {
             let instance = t.instance.map_or("–".into(), |i| i.to_string());
             let name = if t.background { format!("{} (background)", t.name) } else { t.name.clone() };
             vec![name, grouped(&t.points.to_string()), format!("{:.3}", t.iou), instance, t.fragments.to_string()]
@@ -280,7 +281,8 @@ pub(super) fn score_tables(m: &Material, page: &mut Page) {
     }
     if !s.queries.is_empty() {
         page.section("query-scores", "Queries against the labels");
-        let how = s.silhouette.as_ref().map_or(String::new(), |(name, t)| format!(" Silhouettes: {name}, above {t}."));
+        let how =
+            s.silhouette.as_ref().map_or(String::new(), |(s, t)| format!(" Silhouettes: {}, above {t}.", s.name()));
         page.paragraph(&format!(
             "IoU of the selection with labelled polygons over {} pairs of frame and category: mIoU {:.3}, {:.0}% above \
              0.25, {:.0}% above 0.5.{how} Where other things hide part of an object, its label ends there: with the \
@@ -291,7 +293,7 @@ pub(super) fn score_tables(m: &Material, page: &mut Page) {
             100.0 * s.query_macc50.unwrap_or_default(),
             s.query_miou_visible.map_or("–".into(), |v| format!("{v:.3}")),
         ));
-        let row = |q: &crate::score::QueryScore| {
+        let row = |q: &QueryScore| {
             let cosine = q.score.map_or("–".into(), |c| format!("{c:.3}"));
             let ids = q.selected.iter().map(u32::to_string).collect::<Vec<_>>().join(" ");
             let ids = if ids.is_empty() { "–".into() } else { ids };

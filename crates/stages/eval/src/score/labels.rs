@@ -1,8 +1,12 @@
 //! LERF-OVS labels: one ISAT JSON file per labelled frame, with polygons by category; or the pictures that the published
 //! scorers made of them.
 
-use crate::{Mask, polygon};
-use gs_io::{Error, IoContext, Result, Watched};
+use super::polygon::fill_polygon;
+use crate::Mask;
+use artifacts::same_shape;
+use gs_io::{Error, IoContext, Result};
+use gs_scene::Camera;
+use gs_scene::dataset::View;
 use serde::Deserialize;
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
@@ -25,6 +29,25 @@ pub struct FrameLabels {
     pub categories: BTreeMap<String, Mask>,
     /// Boxes of each category, x1 y1 x2 y2 in pixels: one per polygon as the file gives it, or else around the polygon.
     pub boxes: BTreeMap<String, Vec<[f64; 4]>>,
+}
+
+impl FrameLabels {
+    /// The camera of a view in the size of its labelled image.
+    ///
+    /// # Errors
+    /// When the labelled image has another shape than the photograph; `labels` names the folder.
+    pub fn camera(&self, view: &View, labels: &Path) -> Result<Camera> {
+        let (w, h) = (self.width, self.height);
+        if !same_shape([w, h], [view.camera.width, view.camera.height]) {
+            return Err(Error::new("the labelled image has another shape than the photograph")
+                .file(labels.join(format!("{}.json", self.frame)))
+                .field("info")
+                .found(format!("{w}x{h}"))
+                .expected(format!("{}x{} or a multiple", view.camera.width, view.camera.height))
+                .hint("use the labels of this scene"));
+        }
+        Ok(view.camera.resized(w, h))
+    }
 }
 
 #[derive(Deserialize)]
@@ -74,14 +97,6 @@ pub fn read_folder(folder: impl AsRef<Path>) -> Result<Vec<FrameLabels>> {
     files(folder.as_ref())?.iter().map(read).collect()
 }
 
-/// Notes how a label folder and its files are now, for a stage that reads them more than once.
-///
-/// # Errors
-/// When the folder cannot be read.
-pub fn watch_folder(folder: &Path) -> Result<Watched> {
-    Ok(Watched::new(files(folder)?).and(Watched::new([folder])))
-}
-
 /// All `*.json` of a folder, by name.
 fn files(folder: &Path) -> Result<Vec<PathBuf>> {
     let mut paths = Vec::new();
@@ -120,7 +135,7 @@ pub fn read(path: impl AsRef<Path>) -> Result<FrameLabels> {
         let vertices: Vec<[i64; 2]> = object.segmentation.iter().map(|&[x, y]| [x as i64, y as i64]).collect();
         let mask =
             categories.entry(object.category.clone()).or_insert_with(|| Mask::new(width as usize, height as usize));
-        polygon::fill_polygon(mask, &vertices);
+        fill_polygon(mask, &vertices);
     }
     let frame = path.file_stem().unwrap_or_default().to_string_lossy().into_owned();
     Ok(FrameLabels { frame, width, height, categories, boxes })

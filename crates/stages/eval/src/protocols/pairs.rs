@@ -1,28 +1,9 @@
-//! LERF-OVS: selection of objects in 3D, scored in 2D (docs/protocols.md).
+//! Scores of objects selected in 3D, in 2D: by (frame, category) pairs, as LERF-OVS has them (docs/protocols.md).
 
 use crate::Mask;
-use crate::metrics::{fraction_above, mean};
+use crate::score::metrics::{fraction_above, mean};
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
-
-/// How IoUs become one number for a scene.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, clap::ValueEnum)]
-#[serde(rename_all = "kebab-case")]
-pub enum Averaging {
-    /// Mean over all (frame, category) pairs (OpenGaussian, CAGS)
-    Objects,
-    /// Mean over the categories of a frame, then over frames (THGS, Segment-then-Splat)
-    Frames,
-}
-
-/// What a method says of one category in one frame.
-#[derive(Debug, Clone, PartialEq)]
-pub enum Predicted {
-    /// The pixels, in the size of the truth.
-    Pixels(Mask),
-    /// Nothing, and why: scores 0.
-    Nothing(String),
-}
 
 /// One (frame, category) pair.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -44,14 +25,20 @@ pub struct Pair {
 }
 
 impl Pair {
-    /// Scores one pair: |g & p| / |g | p|, where an empty union and a missing prediction score 0.
+    /// Scores one pair: |g & p| / |g | p|, where an empty union and a missing prediction, with its reason, score 0.
     ///
     /// # Panics
     /// When the prediction has another size than the truth: callers render or check sizes before.
-    pub fn new(frame: &str, category: &str, truth: &Mask, predicted: &Predicted, localised: Option<bool>) -> Self {
+    pub fn new(
+        frame: &str,
+        category: &str,
+        truth: &Mask,
+        predicted: &Result<Mask, String>,
+        localised: Option<bool>,
+    ) -> Self {
         let (iou, predicted_pixels, why) = match predicted {
-            Predicted::Pixels(mask) => (truth.iou(mask), mask.count(), None),
-            Predicted::Nothing(why) => (0.0, 0, Some(why.clone())),
+            Ok(mask) => (truth.iou(mask), mask.count(), None),
+            Err(why) => (0.0, 0, Some(why.clone())),
         };
         let truth_pixels = truth.count();
         let zero = (iou == 0.0).then(|| {
@@ -83,55 +70,51 @@ pub struct Figures {
     pub pairs: usize,
 }
 
-/// Scores a scene by the protocol of OpenGaussian, which CAGS's numbers follow: one IoU per (frame, category) of the
-/// truth, 0 where a prediction is missing; mIoU is their mean, mAcc the fraction above 0.25 (or 0.5), strictly. With
-/// [`Averaging::Frames`] each of these is first taken within a frame, then averaged over frames. Zeros all for no pairs.
-pub fn scene_figures(pairs: &[Pair], averaging: Averaging) -> Figures {
-    let groups: Vec<Vec<&Pair>> = match averaging {
-        Averaging::Objects => vec![pairs.iter().collect()],
-        Averaging::Frames => {
-            let mut by_frame = BTreeMap::<&str, Vec<&Pair>>::new();
-            pairs.iter().for_each(|p| by_frame.entry(&p.frame).or_default().push(p));
-            by_frame.into_values().collect()
+impl Figures {
+    /// Scores a scene by the protocol of OpenGaussian, which CAGS's numbers follow: one IoU per (frame, category) of the
+    /// truth, 0 where a prediction is missing; mIoU is their mean, mAcc the fraction above 0.25 (or 0.5), strictly. Zeros all
+    /// for no pairs.
+    pub fn of_pairs(pairs: &[Pair]) -> Self {
+        let ious: Vec<f64> = pairs.iter().map(|p| p.iou).collect();
+        let located: Vec<f64> = pairs.iter().filter_map(|p| p.localised).map(|l| f64::from(u8::from(l))).collect();
+        Self {
+            miou: mean(&ious),
+            macc25: fraction_above(&ious, 0.25),
+            macc50: fraction_above(&ious, 0.5),
+            localisation: (!located.is_empty()).then(|| mean(&located)),
+            pairs: pairs.len(),
         }
-    };
-    let over = |f: &dyn Fn(&[f64]) -> f64| {
-        mean(&groups.iter().map(|g| f(&g.iter().map(|p| p.iou).collect::<Vec<_>>())).collect::<Vec<_>>())
-    };
-    let located: Vec<f64> = groups
-        .iter()
-        .map(|g| g.iter().filter_map(|p| p.localised).map(|l| f64::from(u8::from(l))).collect::<Vec<_>>())
-        .filter(|g| !g.is_empty())
-        .map(|g| mean(&g))
-        .collect();
-    Figures {
-        miou: over(&mean),
-        macc25: over(&|v| fraction_above(v, 0.25)),
-        macc50: over(&|v| fraction_above(v, 0.5)),
-        localisation: (!located.is_empty()).then(|| mean(&located)),
-        pairs: pairs.len(),
     }
+
+    /// The same taken within each frame, then averaged over frames (THGS, Segment-then-Splat).
+    pub fn of_frames(pairs: &[Pair]) -> Self {
+        Self::mean(&grouped(pairs, |p| &p.frame).values().map(|p| Self::of_pairs(p)).collect::<Vec<_>>())
+    }
+
+    /// The unweighted mean, whatever the numbers of pairs: of a dataset over its scenes (docs/protocols.md). Localisation over
+    /// those that have it.
+    pub fn mean(all: &[Self]) -> Self {
+        let over = |f: fn(&Self) -> f64| mean(&all.iter().map(f).collect::<Vec<_>>());
+        let located: Vec<f64> = all.iter().filter_map(|s| s.localisation).collect();
+        Self {
+            miou: over(|s| s.miou),
+            macc25: over(|s| s.macc25),
+            macc50: over(|s| s.macc50),
+            localisation: (!located.is_empty()).then(|| mean(&located)),
+            pairs: all.iter().map(|s| s.pairs).sum(),
+        }
+    }
+}
+
+fn grouped<'a>(pairs: &'a [Pair], key: fn(&Pair) -> &String) -> BTreeMap<&'a str, Vec<Pair>> {
+    let mut groups = BTreeMap::<&str, Vec<Pair>>::new();
+    pairs.iter().for_each(|p| groups.entry(key(p)).or_default().push(p.clone()));
+    groups
 }
 
 /// The figures of every category over its frames, by name.
 pub fn object_figures(pairs: &[Pair]) -> BTreeMap<String, Figures> {
-    let mut by_category = BTreeMap::<&str, Vec<Pair>>::new();
-    pairs.iter().for_each(|p| by_category.entry(&p.category).or_default().push(p.clone()));
-    by_category.into_iter().map(|(c, pairs)| (c.into(), scene_figures(&pairs, Averaging::Objects))).collect()
-}
-
-/// The dataset's figures: the unweighted mean over scenes, whatever their number of pairs (docs/protocols.md). Localisation
-/// over the scenes that have it.
-pub fn dataset_figures(scenes: &[Figures]) -> Figures {
-    let over = |f: &dyn Fn(&Figures) -> f64| mean(&scenes.iter().map(f).collect::<Vec<_>>());
-    let located: Vec<f64> = scenes.iter().filter_map(|s| s.localisation).collect();
-    Figures {
-        miou: over(&|s| s.miou),
-        macc25: over(&|s| s.macc25),
-        macc50: over(&|s| s.macc50),
-        localisation: (!located.is_empty()).then(|| mean(&located)),
-        pairs: scenes.iter().map(|s| s.pairs).sum(),
-    }
+    grouped(pairs, |p| &p.category).into_iter().map(|(c, pairs)| (c.into(), Figures::of_pairs(&pairs))).collect()
 }
 
 /// Side of the window that smooths relevancy, in pixels.
@@ -204,7 +187,7 @@ mod tests {
     }
 
     fn pair(frame: &str, category: &str, iou: f64) -> Pair {
-        let mut p = Pair::new(frame, category, &block(0, 4), &Predicted::Pixels(block(0, 4)), None);
+        let mut p = Pair::new(frame, category, &block(0, 4), &Ok(block(0, 4)), None);
         p.iou = iou;
         p
     }
@@ -212,24 +195,24 @@ mod tests {
     #[test]
     fn every_zero_has_a_reason() {
         let truth = block(0, 4);
-        let zero = |p: Predicted| Pair::new("f", "c", &truth, &p, None).zero;
-        assert_eq!(zero(Predicted::Pixels(block(2, 8))), None);
-        assert_eq!(zero(Predicted::Pixels(block(9, 9))).unwrap(), "the mask is empty in this view");
-        assert_eq!(zero(Predicted::Pixels(block(9, 12))).unwrap(), "the mask misses the object");
-        assert_eq!(zero(Predicted::Nothing("never asked".into())).unwrap(), "never asked");
-        let p = Pair::new("f", "c", &block(0, 0), &Predicted::Pixels(block(0, 0)), None);
+        let zero = |p: Result<Mask, String>| Pair::new("f", "c", &truth, &p, None).zero;
+        assert_eq!(zero(Ok(block(2, 8))), None);
+        assert_eq!(zero(Ok(block(9, 9))).unwrap(), "the mask is empty in this view");
+        assert_eq!(zero(Ok(block(9, 12))).unwrap(), "the mask misses the object");
+        assert_eq!(zero(Err("never asked".into())).unwrap(), "never asked");
+        let p = Pair::new("f", "c", &block(0, 0), &Ok(block(0, 0)), None);
         assert_eq!((p.iou, p.zero.unwrap().as_str()), (0.0, "the label covers no pixel"), "an empty union scores 0");
     }
 
     #[test]
     fn thresholds_are_strict_and_averages_differ_by_rule() {
         let pairs = [pair("a", "x", 0.25), pair("a", "y", 0.75), pair("a", "z", 0.5), pair("b", "x", 1.0)];
-        let f = scene_figures(&pairs, Averaging::Objects);
+        let f = Figures::of_pairs(&pairs);
         assert_eq!((f.miou, f.macc25, f.macc50, f.pairs), (0.625, 0.75, 0.5, 4));
-        let f = scene_figures(&pairs, Averaging::Frames);
+        let f = Figures::of_frames(&pairs);
         assert_eq!((f.miou, f.macc50), (0.75, (1.0 / 3.0 + 1.0) / 2.0));
         assert_eq!(object_figures(&pairs)["x"].miou, 0.625);
-        assert_eq!(scene_figures(&[], Averaging::Frames).miou, 0.0);
+        assert_eq!(Figures::of_frames(&[]).miou, 0.0);
     }
 
     #[test]
@@ -237,8 +220,8 @@ mod tests {
         // The paper's own row: 37.62, 36.29, 60.85 and 68.40 make 50.79 although waldo_kitchen has 22 pairs, ramen 71.
         let scene = |miou: f64, pairs: usize| Figures { miou, macc25: 0.0, macc50: 0.0, localisation: None, pairs };
         let all = [scene(37.62, 22), scene(36.29, 71), scene(60.85, 56), scene(68.40, 59)];
-        assert!((dataset_figures(&all).miou - 50.79).abs() < 5e-3);
-        assert_eq!(dataset_figures(&all).pairs, 208);
+        assert!((Figures::mean(&all).miou - 50.79).abs() < 5e-3);
+        assert_eq!(Figures::mean(&all).pairs, 208);
     }
 
     #[test]

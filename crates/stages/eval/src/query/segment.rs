@@ -1,6 +1,6 @@
 //! Semantic segmentation of the cloud: every Gaussian gets the text that fits its instance best.
 
-use crate::ranking::{Index, Scoring};
+use super::ranking::{Index, Scoring};
 use artifacts::{NOISE_COLOR, instance_color};
 use gs_scene::{Gaussians, SH_C0};
 use serde::{Deserialize, Serialize};

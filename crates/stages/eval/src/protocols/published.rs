@@ -1,6 +1,7 @@
 //! Published numbers, and tables in the layout of the CAGS paper with ours below them.
 
-use super::lerf::{Figures, dataset_figures};
+use super::classes::{SCENES, SETS};
+use super::pairs::Figures;
 use artifacts::LERF_OVS;
 use report::sheet::{Row, Sheet, Table};
 
@@ -72,7 +73,7 @@ pub fn lerf_sheet(scenes: &[(String, Figures)], notes: Vec<String>) -> Sheet {
     let of = |name: &str| scenes.iter().find(|s| s.0 == name).map(|s| s.1);
     let others: Vec<&(String, Figures)> =
         scenes.iter().filter(|s| LERF_OVS.iter().all(|standard| standard.name != s.0)).collect();
-    let ours = dataset_figures(&scenes.iter().map(|s| s.1).collect::<Vec<_>>());
+    let ours = Figures::mean(&scenes.iter().map(|s| s.1).collect::<Vec<_>>());
     let mut columns = Vec::new();
     for metric in ["mIoU", "mAcc@0.25"] {
         columns.extend(LERF_OVS.iter().map(|s| format!("{metric} {}", s.name)));
@@ -135,7 +136,7 @@ const SCANNET: [(&str, [Published; 3], &str); 13] = [
 
 /// Columns of [`SetRow`]s.
 pub fn set_columns() -> Vec<String> {
-    super::scannet::SETS.iter().flat_map(|n| [format!("{n} mIoU"), format!("{n} mAcc")]).collect()
+    SETS.iter().flat_map(|n| [format!("{n} mIoU"), format!("{n} mAcc")]).collect()
 }
 
 /// A row's cells, in percent.
@@ -150,7 +151,7 @@ pub fn scannet_sheet(ours: &[(String, SetRow)], scenes: usize, notes: Vec<String
     let published = SCANNET.iter().map(|(name, values, source)| Row::published(name, source, cells(values)));
     let rows = published.chain(ours.iter().map(|(name, row)| Row::measured(name, set_cells(*row)))).collect();
     let mut remarks = Vec::new();
-    if scenes != super::scannet::SCENES.len() {
+    if scenes != SCENES.len() {
         remarks.push(format!(
             "Ours: {scenes} scene(s), not the 10 of the published rows: do not compare the means with them."
         ));

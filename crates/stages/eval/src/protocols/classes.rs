@@ -36,17 +36,8 @@ pub fn class_set(size: usize) -> Option<Vec<(u32, &'static str)>> {
     SETS.contains(&size).then(|| NYU40.into_iter().filter(|&(id, _)| keep(id)).collect())
 }
 
-/// How Gaussians and the scan's vertices are brought together.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, clap::ValueEnum)]
-#[serde(rename_all = "kebab-case")]
-pub enum Association {
-    /// Gaussian i is vertex i: positions were frozen, nothing was added or removed (OpenGaussian, CAGS)
-    OneToOne,
-    /// Every vertex takes the class of its nearest Gaussian (GaussianWorld, Split&Splat)
-    Nearest,
-    /// Every Gaussian gets a true class from the labelled vertices around it and counts by its volume (Dr. Splat, VALA)
-    Volume,
-}
+/// The true class of a point, as an index into the set, and its weight; none for a point that no label tells.
+pub type Truth = (Option<usize>, f64);
 
 /// Counts (or weights) of points by true and predicted class.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -63,10 +54,16 @@ impl Confusion {
         Self { classes, weights: vec![0.0; classes * (classes + 1)] }
     }
 
-    /// Adds a point of true class `truth` and predicted class `predicted` (indices into the set). Points without a true
-    /// class are no part of the evaluation: whatever is predicted for them costs nothing.
-    pub fn add(&mut self, truth: usize, predicted: Option<usize>, weight: f64) {
-        self.weights[truth * (self.classes + 1) + predicted.unwrap_or(self.classes)] += weight;
+    /// The confusion of points by their truth and predicted class. Points without a true class are no part of the evaluation:
+    /// whatever is predicted for them costs nothing.
+    pub fn of(classes: usize, points: impl IntoIterator<Item = (Truth, Option<usize>)>) -> Self {
+        let mut confusion = Self::new(classes);
+        for ((truth, weight), predicted) in points {
+            if let Some(truth) = truth {
+                confusion.weights[truth * (classes + 1) + predicted.unwrap_or(classes)] += weight;
+            }
+        }
+        confusion
     }
 
     /// Adds the points of another scene: pooled scores come from the sum.
@@ -111,35 +108,6 @@ pub fn truth_classes(labels: &[u32], set: &[(u32, &str)]) -> Vec<Option<usize>> 
     labels.iter().map(|l| set.iter().position(|c| c.0 == *l)).collect()
 }
 
-/// Scores vertices: `truth` class and `predicted` class of each; `counts` says which take part (with the opacity rule,
-/// those whose Gaussian is not faint).
-///
-/// # Panics
-/// When lengths differ.
-pub fn score_vertices(
-    truth: &[Option<usize>],
-    predicted: &[Option<usize>],
-    counts: &[bool],
-    classes: usize,
-) -> Confusion {
-    let truth: Vec<(Option<usize>, f64)> = truth.iter().map(|&t| (t, 1.0)).collect();
-    score_volumes(&truth, predicted, counts, classes)
-}
-
-/// Index of the nearest Gaussian among `speakers` (ascending indices) for each vertex; none when there are none.
-pub fn nearest(gaussians: &Gaussians, speakers: &[u32], vertices: &[[f32; 3]]) -> Vec<Option<u32>> {
-    let positions: Vec<[f32; 3]> = speakers.iter().map(|&i| gaussians.means[i as usize]).collect();
-    nearest_of(&positions, vertices).into_iter().map(|n| n.map(|n| speakers[n as usize])).collect()
-}
-
-/// Index of the nearest of `positions` for each point; none when there are none.
-pub fn nearest_of(positions: &[[f32; 3]], points: &[[f32; 3]]) -> Vec<Option<u32>> {
-    let tree = (!positions.is_empty()).then(|| ImmutableKdTree::<f32, 3>::new_from_slice(positions).ok()).flatten();
-    let Some(tree) = tree else { return vec![None; points.len()] };
-    let one = |p: &[f32; 3]| Some(tree.query(p).nearest_one::<SquaredEuclidean<f32>>().execute().item);
-    points.par_iter().map(one).collect()
-}
-
 /// How far labelled vertices speak for a Gaussian, in its largest scales.
 const REACH: f32 = 5.0;
 /// Most vertices that speak for one.
@@ -154,7 +122,7 @@ pub fn volume_truth(
     vertices: &[[f32; 3]],
     truth: &[Option<usize>],
     classes: usize,
-) -> Vec<(Option<usize>, f64)> {
+) -> Vec<Truth> {
     let labelled: Vec<usize> = (0..vertices.len()).filter(|&v| truth[v].is_some()).collect();
     let positions: Vec<[f32; 3]> = labelled.iter().map(|&v| vertices[v]).collect();
     let tree = (!positions.is_empty()).then(|| ImmutableKdTree::<f32, 3>::new_from_slice(&positions).ok()).flatten();
@@ -188,23 +156,6 @@ pub fn volume_truth(
     (0..gaussians.len()).into_par_iter().map(one).collect()
 }
 
-/// Scores Gaussians against [`volume_truth`]: every Gaussian that has a true class counts with its weight.
-pub fn score_volumes(
-    truth: &[(Option<usize>, f64)],
-    predicted: &[Option<usize>],
-    counts: &[bool],
-    classes: usize,
-) -> Confusion {
-    assert!(truth.len() == predicted.len() && truth.len() == counts.len());
-    let mut confusion = Confusion::new(classes);
-    for ((&(t, weight), &p), _) in truth.iter().zip(predicted).zip(counts).filter(|(_, c)| **c) {
-        if let Some(t) = t {
-            confusion.add(t, p, weight);
-        }
-    }
-    confusion
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -221,38 +172,26 @@ mod tests {
         assert_eq!(t, [None, Some(0), None, Some(9), None, None], "unlabelled, outside the set, and ids beyond 40");
     }
 
+    fn confusion(classes: usize, truth: &[Option<usize>], predicted: &[Option<usize>]) -> Confusion {
+        Confusion::of(classes, truth.iter().zip(predicted).map(|(&t, &p)| ((t, 1.0), p)))
+    }
+
     #[test]
     fn only_classes_of_the_truth_count_and_points_without_truth_cost_nothing() {
         // Class 0: 3 points, 2 found. Class 1: 1 point, found, but one of class 0 is taken for it. Class 2 is absent from
-        // the truth though predicted once for a class-0 point... here for an unlabelled point, which is free.
+        // the truth, and what is predicted for an unlabelled point is free.
         let truth = [Some(0), Some(0), Some(0), Some(1), None];
-        let predicted = [Some(0), Some(0), Some(1), Some(1), Some(0)];
-        let c = score_vertices(&truth, &predicted, &[true; 5], 3);
+        let c = confusion(3, &truth, &[Some(0), Some(0), Some(1), Some(1), Some(0)]);
         assert_eq!(c.class(0), Some((2.0 / 3.0, 2.0 / 3.0)));
-        assert_eq!(c.class(1), Some((0.5, 1.0)));
-        assert_eq!(c.class(2), None);
+        assert_eq!((c.class(1), c.class(2)), (Some((0.5, 1.0)), None));
         assert_eq!(c.means(), Some(((2.0 / 3.0 + 0.5) / 2.0, (2.0 / 3.0 + 1.0) / 2.0)));
-        let none = score_vertices(&truth, &[None; 5], &[true; 5], 3);
-        assert_eq!(none.means(), Some((0.0, 0.0)));
+        assert_eq!(confusion(3, &truth, &[None; 5]).means(), Some((0.0, 0.0)));
         assert_eq!(Confusion::new(3).means(), None);
     }
 
     #[test]
-    fn the_opacity_rule_takes_points_out() {
-        let truth = [Some(0), Some(0)];
-        let predicted = [Some(0), Some(1)];
-        assert_eq!(score_vertices(&truth, &predicted, &[true, true], 2).means().unwrap().0, 0.5);
-        assert_eq!(score_vertices(&truth, &predicted, &[true, false], 2).means().unwrap().0, 1.0);
-    }
-
-    #[test]
     fn pooled_is_not_the_mean_over_scenes() {
-        let scene = |hits: f64, misses: f64| {
-            let mut c = Confusion::new(1);
-            c.add(0, Some(0), hits);
-            c.add(0, None, misses);
-            c
-        };
+        let scene = |hits: f64, misses: f64| Confusion::of(1, [((Some(0), hits), Some(0)), ((Some(0), misses), None)]);
         let (a, b) = (scene(90.0, 10.0), scene(1.0, 9.0));
         let mean = (a.means().unwrap().0 + b.means().unwrap().0) / 2.0;
         let mut pooled = a;
@@ -283,17 +222,6 @@ mod tests {
         assert!((v[0].1 - 0.5 * 0.01).abs() < 1e-8, "opacity times the product of scales");
         assert_eq!(volume_truth(&g, &vertices, &[None, None, Some(0)], 2)[0].0, None, "out of reach");
         assert_eq!(volume_truth(&g, &[], &[], 2)[0].0, None);
-        let c = score_volumes(&v, &[Some(1)], &[true], 2);
-        assert_eq!(c.class(1), Some((1.0, 1.0)));
-    }
-
-    #[test]
-    fn the_nearest_gaussian_speaks_for_a_vertex() {
-        let mut g = Gaussians::default();
-        for x in [0.0, 1.0, 2.0] {
-            g.means.push([x, 0.0, 0.0]);
-        }
-        assert_eq!(nearest(&g, &[0, 2], &[[0.9, 0.0, 0.0], [1.2, 0.0, 0.0]]), [Some(0), Some(2)]);
-        assert_eq!(nearest(&g, &[], &[[0.0; 3]]), [None]);
+        assert_eq!(Confusion::of(2, [(v[0], Some(1))]).class(1), Some((1.0, 1.0)));
     }
 }

@@ -165,7 +165,7 @@ mod tests {
 
     #[test]
     fn every_pixel_is_as_opencv_fills_it() {
-        let cases: Vec<Case> = serde_json::from_str(include_str!("../testdata/fillpoly.json")).unwrap();
+        let cases: Vec<Case> = serde_json::from_str(include_str!("../../testdata/fillpoly.json")).unwrap();
         assert!(cases.len() >= 20);
         for case in cases {
             let mut expected = Mask::new(case.width, case.height);

@@ -1,14 +1,14 @@
 //! Instances ranked by how well their descriptors fit a feature, and the choice among them.
 
 use artifacts::{Features, Instances};
-use serde::Serialize;
+use serde::{Deserialize, Serialize};
 
 /// An instance in a ranking.
-#[derive(Debug, Clone, Copy, PartialEq, Serialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct Ranked {
     /// Index of the instance.
     pub instance: u32,
-    /// Cosine of descriptor and feature, -1 to 1; with negatives the relevancy, 0 to 1 ([`Scoring`]).
+    /// Cosine of descriptor and feature, -1 to 1; with negatives the relevancy, 0 to 1 ([`Scoring`]); of a place its share.
     pub score: f32,
     /// Views in which the instance was matched with a mask.
     pub support: u32,
@@ -39,9 +39,9 @@ pub struct Selection {
 impl Selection {
     /// The rule behind `--top-k` and `--threshold`: the best instance alone by default; with a threshold, all that
     /// reach it.
-    pub fn new(top_k: Option<usize>, threshold: Option<f32>, min_support: u32) -> Self {
-        let default = if threshold.is_some() { usize::MAX } else { 1 };
-        Self { top_k: top_k.unwrap_or(default), threshold, min_support }
+    pub fn new(top_k: Option<u32>, threshold: Option<f32>, min_support: u32) -> Self {
+        let default = if threshold.is_some() { u32::MAX } else { 1 };
+        Self { top_k: top_k.unwrap_or(default) as usize, threshold, min_support }
     }
 
     /// The chosen instances, best first.
@@ -159,21 +159,17 @@ impl<'a> Index<'a> {
 const JOIN_AMONG: usize = 10;
 
 /// Joins instances that look alike in instance-feature space, as OpenGaussian's query does: of the 10 best of the ranking,
-/// those whose mean feature lies within a distance of the best one's. Its further test, that both are leaves of one coarse
-/// cluster, is here that both lie below one parent in the tree of clusters; by option, for that tree is finer than its 32
-/// to 64 coarse clusters.
+/// those whose mean feature lies within a distance of the best one's. Its further test, that both are leaves of one of its
+/// 32 to 64 coarse clusters, is left out: there are no such clusters here.
 pub struct Join {
     distance: f64,
-    /// Per instance those that share its parent, where that is asked for.
-    siblings: Option<Vec<Vec<u32>>>,
     /// Mean of the unit features of each instance's Gaussians; none without any.
     means: Vec<Option<Vec<f64>>>,
 }
 
 impl Join {
-    /// Prepares joining within `distance` (OpenGaussian: 0.9), by the features that the instances were clustered from, among
-    /// all instances or only those that share the best one's parent.
-    pub fn new(instances: &Instances, features: &Features, distance: f32, siblings_only: bool) -> Self {
+    /// Prepares joining within `distance` (OpenGaussian: 0.9), by the features that the instances were clustered from.
+    pub fn new(instances: &Instances, features: &Features, distance: f32) -> Self {
         let mut sums: Vec<(Vec<f64>, usize)> = vec![(vec![0.0; features.dim], 0); instances.len()];
         for (at, &gaussian) in features.kept.iter().enumerate() {
             let Ok(label) = usize::try_from(instances.label[gaussian as usize]) else { continue };
@@ -187,10 +183,7 @@ impl Join {
         }
         let mean =
             |(sum, count): (Vec<f64>, usize)| (count > 0).then(|| sum.into_iter().map(|v| v / count as f64).collect());
-        let family = |k: usize| instances.family(k).and_then(|f| f.parent);
-        let siblings = |k: usize| family(k).map_or(Vec::new(), |p| instances.instances_of_cluster(p));
-        let siblings = siblings_only.then(|| (0..instances.len()).map(siblings).collect());
-        Self { distance: f64::from(distance), siblings, means: sums.into_iter().map(mean).collect() }
+        Self { distance: f64::from(distance), means: sums.into_iter().map(mean).collect() }
     }
 
     /// `selected` and what joins its first, in the order of the ranking.
@@ -198,11 +191,10 @@ impl Join {
         let mut all = selected.to_vec();
         let Some(&first) = selected.first() else { return all };
         let Some(best) = &self.means[first as usize] else { return all };
-        let near = |i: u32| self.siblings.as_ref().is_none_or(|s| s[first as usize].contains(&i));
         for r in ranking.iter().filter(|r| r.support >= min_support).take(JOIN_AMONG) {
             let Some(mean) = &self.means[r.instance as usize] else { continue };
             let squared: f64 = mean.iter().zip(best).map(|(a, b)| (a - b).powi(2)).sum();
-            if squared.sqrt() < self.distance && near(r.instance) && !all.contains(&r.instance) {
+            if squared.sqrt() < self.distance && !all.contains(&r.instance) {
                 all.push(r.instance);
             }
         }
@@ -213,7 +205,6 @@ impl Join {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use artifacts::TreeEdge;
 
     fn instances() -> Instances {
         let k = 4;
@@ -285,15 +276,10 @@ mod tests {
         let values = vec![1.0, 0.0, 0.9, 0.3, -2.0, 0.1, -1.0, 0.0, 0.0, 0.0];
         let f = Features { kept: vec![0, 1, 2, 3, 4], dim: 2, values };
         let ranking = rank(&[1.0, 0.0]);
-        assert_eq!(Join::new(&i, &f, 0.9, false).extend(&ranking, 0, &[0]), [0, 1]);
-        assert_eq!(Join::new(&i, &f, 0.1, false).extend(&ranking, 0, &[0]), [0]);
-        assert_eq!(Join::new(&i, &f, 3.0, false).extend(&ranking, 0, &[0]), [0, 1, 3]);
-        assert_eq!(Join::new(&i, &f, 3.0, false).extend(&ranking, 5, &[0]), [0, 3], "support counts here too");
-        assert!(Join::new(&i, &f, 3.0, false).extend(&ranking, 0, &[]).is_empty());
-        // Only below one parent: 6 holds the instances 0 and 3, and 1 stands alone.
-        let edge = |parent, child, instance| TreeEdge { parent, child, lambda: 1.0, size: 2, instance };
-        i.tree = vec![edge(5, 6, -1), edge(5, 7, 1), edge(6, 8, 0), edge(6, 9, 3)];
-        assert_eq!(Join::new(&i, &f, 3.0, true).extend(&ranking, 0, &[0]), [0, 3]);
-        assert_eq!(Join::new(&i, &f, 3.0, true).extend(&ranking, 0, &[1]), [1]);
+        assert_eq!(Join::new(&i, &f, 0.9).extend(&ranking, 0, &[0]), [0, 1]);
+        assert_eq!(Join::new(&i, &f, 0.1).extend(&ranking, 0, &[0]), [0]);
+        assert_eq!(Join::new(&i, &f, 3.0).extend(&ranking, 0, &[0]), [0, 1, 3]);
+        assert_eq!(Join::new(&i, &f, 3.0).extend(&ranking, 5, &[0]), [0, 3], "support counts here too");
+        assert!(Join::new(&i, &f, 3.0).extend(&ranking, 0, &[]).is_empty());
     }
 }

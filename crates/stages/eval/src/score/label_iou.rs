@@ -1,7 +1,6 @@
 //! Instances against polygon labels, without text: how well any instance fits each labelled object in each view.
 
-use crate::labels::FrameLabels;
-use crate::lerf;
+use super::labels::FrameLabels;
 use crate::scene::LabelledScene;
 use crate::silhouette::Silhouette;
 use gs_io::Result;
@@ -44,7 +43,7 @@ pub fn score(
         let map = match dataset.views.iter().find(|v| v.stem() == frame.frame) {
             None => vec![-1; frame.width as usize * frame.height as usize],
             Some(view) => {
-                let camera = lerf::labelled_camera(view, frame, folder)?;
+                let camera = frame.camera(view, folder)?;
                 instance_map(scene.gaussians(), &scene.instances.label, &camera, &scene.raster)
             }
         };
@@ -101,6 +100,7 @@ fn instance_map(gaussians: &Gaussians, label: &[i32], camera: &Camera, raster: &
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::silhouette::Rendering;
     use glam::DVec3;
 
     #[test]
@@ -115,7 +115,8 @@ mod tests {
         }
         let camera = Camera::look_at(DVec3::ZERO, DVec3::Z, -DVec3::Y, 75, 50, 1.0);
         let map = instance_map(&g, &[2, 0, 0, -1], &camera, &RasterOptions::default());
-        let masks = Silhouette::Visible.masks(&g, &RasterOptions::default(), &[&[1, 2], &[], &[0]], &camera, 0.5);
+        let visible = Rendering { silhouette: Silhouette::Visible, threshold: 0.5 };
+        let masks = visible.masks(&g, &RasterOptions::default(), &[&[1, 2], &[], &[0]], &camera);
         for (at, &i) in map.iter().enumerate() {
             for (k, mask) in masks.iter().enumerate() {
                 assert_eq!(mask.bits[at], i == k as i32, "pixel {at}, instance {k}");

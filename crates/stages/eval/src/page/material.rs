@@ -1,14 +1,15 @@
 //! What the sections of a report draw from.
 
-use super::{Metrics, ReportOptions};
+use super::metrics::Metrics;
+use crate::options::ReportOptions;
 use crate::scene::{LabelledScene, find_view, spread};
 use crate::score::Scores;
-use ::report::picture::Picture;
 use artifacts::role;
 use gs_io::{Error, IoContext, Result, hash_file};
 use gs_raster::RasterOptions;
 use gs_scene::dataset::{Dataset, Split, View};
 use gs_scene::{Gaussians, Geometry};
+use report::picture::Picture;
 use stage::RunRecord;
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
@@ -19,6 +20,8 @@ const VIEWS: usize = 3;
 pub(super) struct Material<'a> {
     pub(super) options: &'a ReportOptions,
     pub(super) dataset: &'a Dataset,
+    /// Folder of id maps, if there is one.
+    pub(super) masks: Option<PathBuf>,
     scene: Known,
     pub(super) raster: RasterOptions,
     pub(super) geometry_hash: String,
@@ -54,10 +57,11 @@ impl<'a> Material<'a> {
     pub(super) fn read(
         dataset: &'a Dataset,
         options: &'a ReportOptions,
+        geometry: PathBuf,
+        masks: Option<PathBuf>,
         metrics: &mut Metrics,
         inputs: &mut BTreeMap<String, String>,
     ) -> Result<Self> {
-        let geometry = options.geometry.clone();
         let geometry_hash = hash_file(&geometry)?;
         inputs.insert(role::GEOMETRY.into(), geometry_hash.clone());
         let path = options.run_dir.join("instances.safetensors");
@@ -83,7 +87,7 @@ impl<'a> Material<'a> {
             None => metrics.skipped.push("scores: the run has no score.json (eval score makes it)".into()),
         }
         let mut shown = Vec::new();
-        for view in views_to_show(dataset, &options.views)? {
+        for view in views_to_show(dataset, &options.views.views)? {
             let photo = view.load_image()?;
             let photo = Picture::new(photo.width as usize, photo.height as usize, &photo.rgb);
             let rendered = gs_raster::render(&geometry.gaussians, &view.camera, &raster);
@@ -91,7 +95,7 @@ impl<'a> Material<'a> {
             let psnr = psnr(&photo, &render);
             shown.push(Shown { view, photo, render, psnr });
         }
-        Ok(Self { options, dataset, scene, raster, geometry_hash, scores, shown })
+        Ok(Self { options, dataset, masks, scene, raster, geometry_hash, scores, shown })
     }
 
     pub(super) fn gaussians(&self) -> &Gaussians {

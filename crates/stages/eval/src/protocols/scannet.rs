@@ -1,65 +1,28 @@
-//! `eval scannet`: semantic classes and class-agnostic instances of a ScanNet scan, by [`crate::protocol::scannet`] and
-//! [`crate::protocol::instances`].
+//! `eval scannet`: semantic classes and class-agnostic instances of a ScanNet scan.
 
-use crate::protocol::instances::{self, InstanceFigures};
-use crate::protocol::published::{self, SetRow};
-use crate::protocol::scannet::{self, Association, Confusion};
-use crate::ranking::{Index, Scoring};
-use crate::scene::LabelledScene;
-use gs_io::{Error, IoContext, Result, write_bytes};
+use super::classes::{self, Confusion, SETS, Truth};
+use super::instances::{self, InstanceFigures};
+use super::lerf::{outputs, sources};
+use super::published::{self, SetRow};
+use crate::memory::{self, SMALLER, Sizes};
+use crate::nearest::nearest;
+use crate::options::{Association, ScannetOptions};
+use crate::query::ranking::{Index, Scoring};
+use crate::query::text::TextSource;
+use crate::scene::{LabelledScene, MIN_OPACITY, folder_name, load};
+use gs_io::{Error, IoContext, Result, write_bytes, write_json};
+use gs_scene::dataset::LoadOptions;
 use report::sheet::{Row, Sheet, Table};
 use serde::{Deserialize, Serialize};
+use serde_json::{Value, json};
+use stage::Stage;
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
-/// Opacity below which the rule leaves a Gaussian out.
-pub const FAINT: f32 = 0.1;
 /// How far a Gaussian may lie from the vertex of its number, in metres, for the two to be one.
 const FROZEN: f32 = 1e-3;
-
-/// What becomes of Gaussians whose instance has no descriptor (too few views matched it), and of noise.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, clap::ValueEnum)]
-#[serde(rename_all = "kebab-case")]
-pub enum Undescribed {
-    /// The first class of the set, "wall": the argmax of all-zero similarities in the published scorer
-    First,
-    /// No class: they count as missed
-    None,
-}
-
-/// How a scan is scored.
-#[derive(Debug, Clone, PartialEq)]
-pub struct ScanOptions {
-    /// How Gaussians and vertices are brought together.
-    pub association: Association,
-    /// Whether Gaussians of opacity below 0.1 leave the evaluation (OpenGaussian's rule).
-    pub opacity_rule: bool,
-    /// What becomes of Gaussians without a descriptor.
-    pub undescribed: Undescribed,
-    /// Instances matched in fewer views have no descriptor (OpenGaussian: 2).
-    pub min_support: u32,
-}
-
-impl ScanOptions {
-    /// The rule in words.
-    pub fn describe(&self) -> String {
-        let association = match self.association {
-            Association::OneToOne => "Gaussian i is vertex i",
-            Association::Nearest => "every vertex takes its nearest Gaussian",
-            Association::Volume => "volume-aware pseudo-truth per Gaussian",
-        };
-        let faint = if self.opacity_rule { "left out" } else { "kept" };
-        let undescribed = match self.undescribed {
-            Undescribed::First => "the first class",
-            Undescribed::None => "no class",
-        };
-        format!(
-            "{association}; Gaussians of opacity below {FAINT} {faint}; instances matched in fewer than {} views and noise \
-             get {undescribed}; argmax of the cosine over the set's names; means over the classes present",
-            self.min_support
-        )
-    }
-}
+/// Views that must have matched an instance for it to have a descriptor, where nothing else is asked for (OpenGaussian).
+const MIN_SUPPORT: u32 = 2;
 
 /// The files of a scan that hold its truth.
 #[derive(Debug, Clone, PartialEq)]
@@ -164,22 +127,21 @@ pub struct ScanMetrics {
     pub notes: Vec<String>,
 }
 
-/// What the scan's vertices, or its Gaussians, are compared with.
+/// The Gaussian of each vertex of the scan.
 struct Matched {
-    /// Gaussian of every vertex; none where none speaks.
+    /// None where there is no Gaussian at all.
     gaussian: Vec<Option<u32>>,
     /// Whether a vertex takes part.
     counts: Vec<bool>,
 }
 
-fn matched(scene: &LabelledScene, vertices: &[[f32; 3]], options: &ScanOptions, labels: &Path) -> Result<Matched> {
+/// Brings vertices and Gaussians together. Faint Gaussians leave the evaluation, by OpenGaussian's rule, and so do damaged ones.
+fn matched(scene: &LabelledScene, vertices: &[[f32; 3]], association: Association, labels: &Path) -> Result<Matched> {
     let g = scene.gaussians();
-    let whole = scene.geometry.whole();
-    let faint = |i: usize| !whole[i] || options.opacity_rule && g.opacity(i) < FAINT;
-    if options.association != Association::OneToOne {
-        let speakers: Vec<u32> = (0..g.len() as u32).filter(|&i| !faint(i as usize)).collect();
-        let gaussian = scannet::nearest(g, &speakers, vertices);
-        return Ok(Matched { gaussian, counts: vec![true; vertices.len()] });
+    let seen = seen(scene);
+    if association != Association::OneToOne {
+        let candidates: Vec<u32> = (0..g.len() as u32).filter(|&i| seen[i as usize]).collect();
+        return Ok(Matched { gaussian: nearest(g, &candidates, vertices), counts: vec![true; vertices.len()] });
     }
     let hint = "the geometry was densified, pruned or moved: use --association nearest or volume";
     if g.len() != vertices.len() {
@@ -190,6 +152,7 @@ fn matched(scene: &LabelledScene, vertices: &[[f32; 3]], options: &ScanOptions, 
             .expected(format!("{}, as many as Gaussians", g.len()))
             .hint(hint));
     }
+    let whole = scene.geometry.whole();
     let apart = |i: &usize| whole[*i] && (0..3).any(|k| (g.means[*i][k] - vertices[*i][k]).abs() > FROZEN);
     if let Some(i) = (0..g.len()).find(apart) {
         return Err(Error::new("the Gaussian of this number lies elsewhere")
@@ -199,107 +162,160 @@ fn matched(scene: &LabelledScene, vertices: &[[f32; 3]], options: &ScanOptions, 
             .expected(format!("{:?}", g.means[i]))
             .hint(hint));
     }
-    let counts = (0..g.len()).map(|i| !faint(i)).collect();
-    Ok(Matched { gaussian: (0..g.len() as u32).map(Some).collect(), counts })
+    Ok(Matched { gaussian: (0..g.len() as u32).map(Some).collect(), counts: seen })
 }
 
-/// Scores a scan. `texts` are the features of the names of [`artifacts::NYU40`], in that order; `sizes` the class sets.
-///
-/// # Errors
-/// When the truth is damaged or does not fit the Gaussians.
-///
-/// # Panics
-/// When a size is none of [`scannet::SETS`] or `texts` are not as many as names, or of another dimension.
-pub fn score(
-    scene: &LabelledScene,
-    files: &ScanFiles,
-    texts: Option<&[Vec<f32>]>,
-    sizes: &[usize],
-    options: &ScanOptions,
-    without: &[String],
-) -> Result<(Vec<SetFigures>, Option<InstanceFigures>, Vec<String>)> {
-    let (vertices, labels) = gs_scene::ply::read_labels(&files.labels, "label")?;
+/// Which Gaussians are neither faint nor damaged.
+fn seen(scene: &LabelledScene) -> Vec<bool> {
     let g = scene.gaussians();
-    let matched = matched(scene, &vertices, options, &files.labels)?;
+    scene.geometry.whole().iter().enumerate().map(|(i, whole)| *whole && g.opacity(i) >= MIN_OPACITY).collect()
+}
+
+pub(crate) fn run(o: &ScannetOptions, parameters: Value, stage: &Stage) -> Result<String> {
+    let folder = &o.inputs.scene;
+    let files = ScanFiles::find(folder)?;
+    let parts = files.instances.iter().flat_map(|(segments, objects)| [segments, objects]).chain([&files.labels]);
+    let mut claim = outputs(&o.out.out, stage)
+        .reads(parts.clone())
+        .reads([&o.inputs.instances, &o.inputs.geometry].into_iter().chain(&o.texts.text_features))
+        .claim()?;
+    let truth = parts.map(|p| memory::bytes(p)).sum();
+    stage.forecast(memory::of_scan(&Sizes { truth, ..Sizes::new(&o.inputs, &o.texts, &[]) }), SMALLER)?;
+    let scene = o.inputs.read(&load(folder, &LoadOptions::default(), stage)?, stage)?;
     let mut notes = Vec::new();
-    let mut sets = Vec::new();
-    let label = &scene.instances.label;
-    if label.iter().all(|&l| l < 0) {
+    let source = o.texts.given().then(|| TextSource::open_for(&scene, &o.texts)).transpose()?;
+    let features = sources(&scene, source.as_ref())?;
+    let (vertices, labels) = gs_scene::ply::read_labels(&files.labels, "label")?;
+    let matched = matched(&scene, &vertices, o.association, &files.labels)?;
+    if scene.all_noise() {
         notes.push("all Gaussians are noise: no vertex has an instance".into());
     }
     let out = matched.counts.iter().filter(|c| !**c).count();
     if out > 0 {
-        notes.push(format!(
-            "{out} of {} vertices leave the evaluation: their Gaussian is faint or damaged",
-            vertices.len()
-        ));
+        let all = vertices.len();
+        notes.push(format!("{out} of {all} vertices leave the evaluation: their Gaussian is faint or damaged"));
     }
-    if let Some(texts) = texts {
-        assert_eq!(texts.len(), artifacts::NYU40.len());
-        let index = Index::new(&scene.instances);
-        let by_name: Vec<Vec<Option<f32>>> = texts.iter().map(|t| index.scores(t, &Scoring::default())).collect();
-        for &size in sizes {
-            let set = scannet::class_set(size).expect("a known size");
-            let names: Vec<usize> = (0..texts.len()).filter(|&n| set.contains(&artifacts::NYU40[n])).collect();
-            let of_instance = |k: usize| {
-                let mut best: Option<(usize, f32)> = None;
-                if scene.instances.support[k] >= options.min_support {
-                    for (c, &n) in names.iter().enumerate() {
-                        if let Some(s) = by_name[n][k].filter(|s| best.is_none_or(|b| *s > b.1)) {
-                            best = Some((c, s));
-                        }
-                    }
-                }
-                best.map(|b| b.0)
-            };
-            let of_instances: Vec<Option<usize>> = (0..scene.instances.len()).map(of_instance).collect();
-            let described: Vec<Option<usize>> =
-                label.iter().map(|&l| usize::try_from(l).ok().and_then(|l| of_instances[l])).collect();
-            let fallback = (options.undescribed == Undescribed::First).then_some(0);
-            let class: Vec<Option<usize>> = described.iter().map(|c| c.or(fallback)).collect();
-            let truth = scannet::truth_classes(&labels, &set);
-            let (confusion, lost) = if options.association == Association::Volume {
-                let truth = scannet::volume_truth(g, &vertices, &truth, set.len());
-                let whole = scene.geometry.whole();
-                let counts = |i: usize| whole[i] && (!options.opacity_rule || g.opacity(i) >= FAINT);
-                let counts: Vec<bool> = (0..g.len()).map(counts).collect();
-                let lost =
-                    (0..g.len()).filter(|&i| counts[i] && truth[i].0.is_some() && described[i].is_none()).count();
-                (scannet::score_volumes(&truth, &class, &counts, set.len()), lost)
-            } else {
-                let of = |from: &[Option<usize>], i: Option<u32>| i.and_then(|i| from[i as usize]);
-                let predicted: Vec<Option<usize>> = matched.gaussian.iter().map(|&i| of(&class, i)).collect();
-                let lost = (0..vertices.len()).filter(|&v| {
-                    matched.counts[v] && truth[v].is_some() && of(&described, matched.gaussian[v]).is_none()
-                });
-                let lost = lost.count();
-                (scannet::score_vertices(&truth, &predicted, &matched.counts, set.len()), lost)
-            };
-            if lost > 0 {
-                let get = if fallback.is_some() { format!("{:?}", set[0].1) } else { "no class".into() };
-                notes.push(format!("{size} classes: {lost} labelled points have no descriptor and get {get}"));
-            }
-            if confusion.means().is_none() {
-                notes.push(format!("{size} classes: no labelled point takes part, so there is no score"));
-            }
-            sets.push(SetFigures::new(&set, confusion));
+    let min_support = o.texts.min_support.unwrap_or(MIN_SUPPORT);
+    let mut sets = Vec::new();
+    if let Some(source) = source {
+        let names: Vec<String> = artifacts::NYU40.iter().map(|c| c.1.to_string()).collect();
+        let texts = source.known(&names, "--text-features")?;
+        let truth = Labelled { vertices: &vertices, labels: &labels, matched: &matched };
+        for size in SETS {
+            sets.push(truth.score(&scene, size, &texts, o.association, min_support, &mut notes));
         }
+    } else {
+        notes.push("no class scores: neither --clip nor --text-features was given".to_string());
     }
-    let instances = match &files.instances {
-        None => {
-            notes.push("no instance score: the scan has no segs.json with its aggregation.json".into());
-            None
-        }
-        Some((segs, aggregation)) => {
-            let mut truth = instances::read_truth(segs, aggregation, vertices.len(), without)?;
-            for (t, _) in truth.iter_mut().zip(&matched.counts).filter(|(_, counts)| !**counts) {
-                *t = -1;
-            }
-            let predicted: Vec<i32> = matched.gaussian.iter().map(|i| i.map_or(-1, |i| label[i as usize])).collect();
-            Some(instances::score(&truth, &predicted, &scene.instances.score, instances::MIN_POINTS))
-        }
+    let instances = instance_figures(&scene, &files, &matched, vertices.len(), &mut notes)?;
+    let rule = rule(o.association, min_support);
+    let protocol = ScanMetrics::PROTOCOL.into();
+    let metrics = ScanMetrics { protocol, scene: folder_name(folder), rule, features, sets, instances, notes };
+    metrics.notes.iter().for_each(|n| stage.warn(n));
+    metrics.write(&o.out.out)?;
+    let summary = json!({"rows": metrics.row(), "instances": metrics.instances});
+    stage.record(&mut claim, parameters, scene.inputs.clone(), summary)?;
+    Ok(sheet(&[metrics]).markdown())
+}
+
+/// The rule in words.
+fn rule(association: Association, min_support: u32) -> String {
+    let association = match association {
+        Association::OneToOne => "Gaussian i is vertex i",
+        Association::Nearest => "every vertex takes its nearest Gaussian",
+        Association::Volume => "volume-aware pseudo-truth per Gaussian",
     };
-    Ok((sets, instances, notes))
+    format!(
+        "{association}; Gaussians of opacity below {MIN_OPACITY} left out; instances matched in fewer than {min_support} \
+         views and noise get the first class; argmax of the cosine over the set's names; means over the classes present"
+    )
+}
+
+/// The labelled vertices of a scan.
+struct Labelled<'a> {
+    vertices: &'a [[f32; 3]],
+    labels: &'a [u32],
+    matched: &'a Matched,
+}
+
+impl Labelled<'_> {
+    /// Scores the classes of a set. `texts` are the features of the names of [`artifacts::NYU40`], in that order. Gaussians
+    /// whose instance has no descriptor, and noise, get the first class of the set, "wall": the argmax of all-zero
+    /// similarities in the published scorer.
+    fn score(
+        &self,
+        scene: &LabelledScene,
+        size: usize,
+        texts: &[Vec<f32>],
+        association: Association,
+        min_support: u32,
+        notes: &mut Vec<String>,
+    ) -> SetFigures {
+        let set = classes::class_set(size).expect("a known size");
+        let class = gaussian_classes(scene, &set, texts, min_support);
+        let truth = classes::truth_classes(self.labels, &set);
+        // True class, weight and Gaussian of every point that takes part.
+        let points: Vec<(Truth, Option<u32>)> = if association == Association::Volume {
+            let truth = classes::volume_truth(scene.gaussians(), self.vertices, &truth, set.len());
+            let seen = seen(scene);
+            (0..truth.len()).filter(|&i| seen[i]).map(|i| (truth[i], Some(i as u32))).collect()
+        } else {
+            let counted = (0..truth.len()).filter(|&v| self.matched.counts[v]);
+            counted.map(|v| ((truth[v], 1.0), self.matched.gaussian[v])).collect()
+        };
+        let lost =
+            points.iter().filter(|(t, i)| t.0.is_some() && i.is_none_or(|i| class[i as usize].is_none())).count();
+        if lost > 0 {
+            notes.push(format!("{size} classes: {lost} labelled points have no descriptor and get {:?}", set[0].1));
+        }
+        let predicted = |i: u32| class[i as usize].unwrap_or(0);
+        let confusion = Confusion::of(set.len(), points.into_iter().map(|(t, i)| (t, i.map(predicted))));
+        if confusion.means().is_none() {
+            notes.push(format!("{size} classes: no labelled point takes part, so there is no score"));
+        }
+        SetFigures::new(&set, confusion)
+    }
+}
+
+/// The class of each Gaussian: that of the highest cosine with its instance's descriptor; none without a descriptor.
+fn gaussian_classes(
+    scene: &LabelledScene,
+    set: &[(u32, &str)],
+    texts: &[Vec<f32>],
+    min_support: u32,
+) -> Vec<Option<usize>> {
+    let index = Index::new(&scene.instances);
+    let names = (0..texts.len()).filter(|&n| set.contains(&artifacts::NYU40[n]));
+    let scores: Vec<Vec<Option<f32>>> = names.map(|n| index.scores(&texts[n], &Scoring::default())).collect();
+    let best = |k: usize| {
+        let described = scene.instances.support[k] >= min_support;
+        let scored = scores.iter().enumerate().filter_map(|(c, of)| Some((c, of[k]?))).filter(|_| described);
+        scored.fold(None, |best: Option<(usize, f32)>, s| if best.is_none_or(|b| s.1 > b.1) { Some(s) } else { best })
+    };
+    let of_instance: Vec<Option<usize>> = (0..scene.instances.len()).map(|k| best(k).map(|b| b.0)).collect();
+    let label = &scene.instances.label;
+    label.iter().map(|&l| usize::try_from(l).ok().and_then(|l| of_instance[l])).collect()
+}
+
+/// Scores instances without classes, where the scan has segments and objects.
+fn instance_figures(
+    scene: &LabelledScene,
+    files: &ScanFiles,
+    matched: &Matched,
+    vertices: usize,
+    notes: &mut Vec<String>,
+) -> Result<Option<InstanceFigures>> {
+    let Some((segs, aggregation)) = &files.instances else {
+        notes.push("no instance score: the scan has no segs.json with its aggregation.json".into());
+        return Ok(None);
+    };
+    let mut truth = instances::read_truth(segs, aggregation, vertices)?;
+    for (t, _) in truth.iter_mut().zip(&matched.counts).filter(|(_, counts)| !**counts) {
+        *t = -1;
+    }
+    let label = &scene.instances.label;
+    let predicted: Vec<i32> = matched.gaussian.iter().map(|i| i.map_or(-1, |i| label[i as usize])).collect();
+    Ok(Some(instances::score(&truth, &predicted, &scene.instances.score, instances::MIN_POINTS)))
 }
 
 impl ScanMetrics {
@@ -308,30 +324,19 @@ impl ScanMetrics {
 
     /// mIoU and mAcc of the sets of 19, 15 and 10 classes.
     pub fn row(&self) -> SetRow {
-        scannet::SETS.map(|size| {
+        SETS.map(|size| {
             let set = self.sets.iter().find(|s| s.size == size)?;
             set.miou.zip(set.macc)
         })
     }
 
-    /// Writes `metrics.json`, `table.md` and `objects.csv` (one row per class and set) into a folder.
+    /// Writes `metrics.json` and `table.md` into a folder.
     ///
     /// # Errors
     /// When a file cannot be written.
-    pub fn write(&self, out: &Path) -> Result<PathBuf> {
-        let mut csv = String::from("set,id,class,truth,iou,recall\n");
-        let figure = |v: Option<f64>| v.map_or(String::new(), |v| format!("{v:.6}"));
-        for s in &self.sets {
-            for c in &s.classes {
-                csv += &format!("{},{},{},{},{},{}\n", s.size, c.id, c.name, c.truth, figure(c.iou), figure(c.recall));
-            }
-        }
-        write_bytes(out.join("objects.csv"), csv.as_bytes())?;
+    pub fn write(&self, out: &Path) -> Result<()> {
         write_bytes(out.join("table.md"), sheet(std::slice::from_ref(self)).markdown().as_bytes())?;
-        let path = out.join("metrics.json");
-        let json = serde_json::to_vec_pretty(self).map_err(|e| Error::new(e.to_string()).file(&path))?;
-        write_bytes(&path, &json)?;
-        Ok(path)
+        write_json(out.join("metrics.json"), self)
     }
 }
 
@@ -339,7 +344,7 @@ impl ScanMetrics {
 pub fn summary(scans: &[ScanMetrics]) -> [(&'static str, SetRow); 2] {
     let mut mean = [None; 3];
     let mut pooled = [None; 3];
-    for (at, size) in scannet::SETS.into_iter().enumerate() {
+    for (at, size) in SETS.into_iter().enumerate() {
         let rows: Vec<(f64, f64)> = scans.iter().filter_map(|s| s.row()[at]).collect();
         let n = rows.len() as f64;
         let sum = rows.iter().fold((0.0, 0.0), |s, r| (s.0 + r.0, s.1 + r.1));

@@ -1,0 +1,383 @@
+//! The options of every command: defaults, ranges and help. The record of a run has them all as `parameters`.
+
+use crate::silhouette::{Rendering, Silhouette};
+use gs_io::{Error, Result};
+use gs_scene::dataset::Resolution;
+use serde::{Serialize, Serializer};
+use std::path::PathBuf;
+
+/// The scene and what was found in it.
+#[derive(Debug, Clone, clap::Args, Serialize)]
+pub struct Inputs {
+    /// Dataset folder (COLMAP, transforms.json or ScanNet)
+    #[arg(long, value_name = "DIR")]
+    pub scene: PathBuf,
+    /// The geometry.ply that the instances were made from
+    #[arg(long, value_name = "FILE")]
+    pub geometry: PathBuf,
+    /// instances.safetensors of cluster-match
+    #[arg(long, value_name = "FILE")]
+    pub instances: PathBuf,
+}
+
+/// Where text features come from, and which instances have a descriptor.
+#[derive(Debug, Clone, clap::Args, Serialize)]
+pub struct TextOptions {
+    /// CLIP folder with text.onnx: the other half of the model that encoded the masks
+    #[arg(long, value_name = "DIR")]
+    pub clip: Option<PathBuf>,
+    /// Table of text features by name, JSON or npz, instead of --clip
+    #[arg(long, value_name = "FILE", conflicts_with = "clip")]
+    pub text_features: Option<PathBuf>,
+    /// Accept another CLIP model than the one that encoded the masks, if its features have the same dimension
+    #[arg(long, requires = "clip")]
+    pub any_model: bool,
+    /// Use only instances that were matched with masks in at least this many views [default: 1; scannet: 2]
+    #[arg(long, value_name = "VIEWS")]
+    pub min_support: Option<u32>,
+}
+
+impl TextOptions {
+    /// Whether there is a source of text features.
+    pub fn given(&self) -> bool {
+        self.clip.is_some() || self.text_features.is_some()
+    }
+}
+
+/// Which instances answer a text.
+#[derive(Debug, Clone, clap::Args, Serialize)]
+pub struct Choice {
+    /// Select at most this many instances, best first [default: 1, or all with --threshold]
+    #[arg(long, value_name = "COUNT", value_parser = stage::at_least(1u32))]
+    pub top_k: Option<u32>,
+    /// Select only instances whose score is at least this, -1 to 1: the cosine, or with --negatives the relevancy
+    #[arg(long, value_name = "SCORE", allow_negative_numbers = true, value_parser = stage::within(-1.0f32..=1.0))]
+    pub threshold: Option<f32>,
+    /// Score by LERF's relevancy against these texts, with commas between, such as object,things,stuff,texture
+    #[arg(long, value_delimiter = ',', value_name = "TEXTS", value_parser = words)]
+    pub negatives: Vec<String>,
+    /// Put every text into this template, such as "a photo of a {}"; several templates are averaged
+    #[arg(long, value_name = "TEMPLATE", value_parser = template)]
+    pub template: Vec<String>,
+    /// Also select those of the ten best instances whose mean feature is within this distance of the best one's, as
+    /// OpenGaussian does with 0.9
+    #[arg(long, value_name = "DISTANCE", requires = "features", value_parser = stage::positive::<f32>)]
+    pub join: Option<f32>,
+    /// features.safetensors that the instances were clustered from, for --join
+    #[arg(long, value_name = "FILE")]
+    pub features: Option<PathBuf>,
+}
+
+impl Choice {
+    /// What differs from "the instance of the highest cosine", in words, for the rule of a score.
+    pub fn describe(&self, min_support: Option<u32>) -> String {
+        let parts = [
+            self.top_k.map(|k| format!("top {k}")),
+            self.threshold.map(|t| format!("score at least {t}")),
+            min_support.map(|n| format!("matched in at least {n} views")),
+            (!self.negatives.is_empty()).then(|| format!("relevancy against {}", self.negatives.join(", "))),
+            (!self.template.is_empty()).then(|| format!("templates {}", self.template.join(", "))),
+            self.join.map(|d| format!("look-alikes within {d} joined")),
+        ];
+        parts.into_iter().flatten().map(|part| format!("; {part}")).collect()
+    }
+}
+
+/// How a selection becomes a mask.
+#[derive(Debug, Clone, clap::Args, Serialize)]
+pub struct Masking {
+    /// Render the selected Gaussians alone, as OpenGaussian and CAGS score, or count only what is visible of them
+    /// [default: visible in query, selected in score and lerf]
+    #[arg(long, value_enum)]
+    pub silhouette: Option<Silhouette>,
+    /// A pixel belongs to the mask above this opacity, 0 to 1 [default: 0.7 for selected, 0.5 for visible]
+    #[arg(long, value_name = "VALUE", value_parser = stage::within(0.0f32..=1.0))]
+    pub alpha: Option<f32>,
+}
+
+impl Masking {
+    /// The rule, where `default` is the command's silhouette.
+    pub fn rendering(&self, default: Silhouette) -> Rendering {
+        let silhouette = self.silhouette.unwrap_or(default);
+        Rendering { silhouette, threshold: self.alpha.unwrap_or(silhouette.default_threshold()) }
+    }
+}
+
+/// What pictures show.
+#[derive(Debug, Clone, clap::Args, Serialize)]
+pub struct Views {
+    /// Views to show, by name, with commas between [default: three; query: in which the selection is seen well; report: of
+    /// the held-out ones]
+    #[arg(long, value_delimiter = ',', value_name = "NAMES")]
+    pub views: Vec<String>,
+    /// Size of the pictures: a divisor of the photographs' size, a width such as 640px, or auto for 1600px
+    #[arg(long, default_value = "auto")]
+    #[serde(serialize_with = "as_text")]
+    pub resolution: Resolution,
+}
+
+/// Where labels lie.
+#[derive(Debug, Clone, clap::Args, Serialize)]
+pub struct Labels {
+    /// Folder of LERF-OVS labels [default: label/ in the scene; lerf: or label/<scene>/ beside it]
+    #[arg(long, value_name = "DIR")]
+    pub labels: Option<PathBuf>,
+}
+
+/// Where the result goes.
+#[derive(Debug, Clone, clap::Args, Serialize)]
+pub struct Out {
+    /// Output
+    #[arg(long, value_name = "PATH")]
+    pub out: PathBuf,
+}
+
+/// How coarse the answer to a text or a picture is.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, clap::ValueEnum, Serialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Granularity {
+    /// The instances as they were selected by the clustering
+    Instance,
+    /// What the best instance is a part of: its parent in the tree, with its siblings
+    Parent,
+    /// The parts of the best instance, each an answer of its own beside it
+    Parts,
+}
+
+/// `eval query`.
+#[derive(Debug, Clone, clap::Args, Serialize)]
+#[command(group(clap::ArgGroup::new("asked").required(true).multiple(true).args(["text", "image", "pixel", "point", "interactive"])))]
+#[command(mut_arg("out", |a| a.required(false).required_unless_present("interactive").value_name("DIR").help("Output folder")))]
+pub struct QueryOptions {
+    /// What is asked about.
+    #[command(flatten)]
+    #[serde(flatten)]
+    pub inputs: Inputs,
+    /// Where text features come from.
+    #[command(flatten)]
+    #[serde(flatten)]
+    pub texts: TextOptions,
+    /// What is selected.
+    #[command(flatten)]
+    #[serde(flatten)]
+    pub choice: Choice,
+    /// What to look for, in words; may be given several times
+    #[arg(long, value_name = "WORDS", value_parser = words)]
+    pub text: Vec<String>,
+    /// A picture of what to look for (needs image.onnx in the --clip folder); may be given several times
+    #[arg(long, value_name = "FILE")]
+    pub image: Vec<PathBuf>,
+    /// What is at this pixel of this view? May be given several times
+    #[arg(long, value_name = "VIEW:X,Y")]
+    pub pixel: Vec<String>,
+    /// What is at this point of the world? May be given several times
+    #[arg(long, value_name = "X,Y,Z", allow_hyphen_values = true)]
+    pub point: Vec<String>,
+    /// Answer texts and pictures with the instance found, what it is a part of, or its parts
+    #[arg(long, value_enum, default_value = "instance")]
+    pub granularity: Granularity,
+    /// Divide all Gaussians among the texts: labels.npy and segmentation.ply
+    #[arg(long)]
+    pub segment: bool,
+    /// Keep everything loaded and read texts from standard input, one a line; with --out each gets a folder in it
+    #[arg(long, conflicts_with_all = ["text", "image", "pixel", "point", "segment"])]
+    pub interactive: bool,
+    /// What pictures show.
+    #[command(flatten)]
+    #[serde(flatten)]
+    pub views: Views,
+    /// How the selection is shown.
+    #[command(flatten)]
+    #[serde(flatten)]
+    pub masking: Masking,
+    /// Where the answers go.
+    #[command(flatten)]
+    #[serde(flatten)]
+    pub out: Option<Out>,
+}
+
+/// `eval score`.
+#[derive(Debug, Clone, clap::Args, Serialize)]
+#[command(mut_arg("out", |a| a.value_name("FILE").help("Output JSON")))]
+pub struct ScoreOptions {
+    /// What is scored.
+    #[command(flatten)]
+    #[serde(flatten)]
+    pub inputs: Inputs,
+    /// Where text features come from.
+    #[command(flatten)]
+    #[serde(flatten)]
+    pub texts: TextOptions,
+    /// What is selected.
+    #[command(flatten)]
+    #[serde(flatten)]
+    pub choice: Choice,
+    /// Where labels lie.
+    #[command(flatten)]
+    #[serde(flatten)]
+    pub labels: Labels,
+    /// How selections become masks.
+    #[command(flatten)]
+    #[serde(flatten)]
+    pub masking: Masking,
+    /// Where the scores go.
+    #[command(flatten)]
+    #[serde(flatten)]
+    pub out: Out,
+}
+
+/// Where the true masks of labels come from.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, clap::ValueEnum, Serialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum Truth {
+    /// Fill the labels' polygons as OpenCV does, corners truncated
+    Polygons,
+    /// Pictures that LangSplat's scorer made, gt/<frame>/<category>.jpg, above grey level 10
+    Pictures,
+}
+
+/// `eval lerf`.
+#[derive(Debug, Clone, clap::Args, Serialize)]
+#[command(
+    mut_arg("scene", unless_predicted),
+    mut_arg("geometry", unless_predicted),
+    mut_arg("instances", unless_predicted)
+)]
+#[command(mut_arg("out", |a| a.value_name("DIR").help("Output folder: metrics.json, table.md")))]
+pub struct LerfOptions {
+    /// What is scored, unless masks of another program are.
+    #[command(flatten)]
+    #[serde(flatten)]
+    pub inputs: Option<Inputs>,
+    /// Score masks that another program saved, <frame>_<category>.png above grey level 10, instead of instances
+    #[arg(long, value_name = "DIR", conflicts_with_all = ["scene", "geometry", "instances", "localisation"], requires = "labels")]
+    pub predictions: Option<PathBuf>,
+    /// Where text features come from.
+    #[command(flatten)]
+    #[serde(flatten)]
+    pub texts: TextOptions,
+    /// What is selected.
+    #[command(flatten)]
+    #[serde(flatten)]
+    pub choice: Choice,
+    /// Where labels lie.
+    #[command(flatten)]
+    #[serde(flatten)]
+    pub labels: Labels,
+    /// Name of the scene; one of the benchmark's four is asked the benchmark's queries, any other its labels' categories
+    /// [default: that of its folder]
+    #[arg(long, value_parser = words)]
+    pub name: Option<String>,
+    /// Where the true masks come from
+    #[arg(long, value_enum, default_value = "polygons")]
+    pub truth: Truth,
+    /// How selections become masks.
+    #[command(flatten)]
+    #[serde(flatten)]
+    pub masking: Masking,
+    /// Also score localisation: the most relevant pixel lies in a box of the category
+    #[arg(long)]
+    pub localisation: bool,
+    /// Save the masks (and relevancy maps) that were scored
+    #[arg(long, value_name = "DIR")]
+    pub save_predictions: Option<PathBuf>,
+    /// Where the scores go.
+    #[command(flatten)]
+    #[serde(flatten)]
+    pub out: Out,
+}
+
+fn unless_predicted(argument: clap::Arg) -> clap::Arg {
+    argument.required(false).required_unless_present("predictions")
+}
+
+/// How Gaussians and the scan's vertices are brought together.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, clap::ValueEnum, Serialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum Association {
+    /// Gaussian i is vertex i: positions were frozen, nothing was added or removed (OpenGaussian, CAGS)
+    OneToOne,
+    /// Every vertex takes the class of its nearest Gaussian (GaussianWorld, Split&Splat)
+    Nearest,
+    /// Every Gaussian gets a true class from the labelled vertices around it and counts by its volume (Dr. Splat, VALA)
+    Volume,
+}
+
+/// `eval scannet`.
+#[derive(Debug, Clone, clap::Args, Serialize)]
+#[command(mut_arg("out", |a| a.value_name("DIR").help("Output folder: metrics.json, table.md")))]
+pub struct ScannetOptions {
+    /// What is scored.
+    #[command(flatten)]
+    #[serde(flatten)]
+    pub inputs: Inputs,
+    /// Where text features come from.
+    #[command(flatten)]
+    #[serde(flatten)]
+    pub texts: TextOptions,
+    /// How Gaussians and vertices are brought together
+    #[arg(long, value_enum, default_value = "one-to-one")]
+    pub association: Association,
+    /// Where the scores go.
+    #[command(flatten)]
+    #[serde(flatten)]
+    pub out: Out,
+}
+
+/// `eval table`.
+#[derive(Debug, Clone, clap::Args, Serialize)]
+#[command(mut_arg("out", |a| a.value_name("DIR").help("Output folder: metrics.json, table.md and table.html of the dataset")))]
+pub struct TableOptions {
+    /// Folders (or metrics.json files) that eval lerf or eval scannet wrote, one a scene
+    #[arg(required = true, value_name = "DIR")]
+    pub scenes: Vec<PathBuf>,
+    /// Where the table goes.
+    #[command(flatten)]
+    #[serde(flatten)]
+    pub out: Out,
+}
+
+/// `eval report`.
+#[derive(Debug, Clone, clap::Args, Serialize)]
+#[command(mut_arg("out", |a| a.value_name("FILE").help("The page; metrics.json is written beside it")))]
+pub struct ReportOptions {
+    /// Dataset folder (COLMAP, transforms.json or ScanNet)
+    #[arg(long, value_name = "DIR")]
+    pub scene: PathBuf,
+    /// Folder of the run: geometry.ply and whatever else there is under its usual name
+    #[arg(long, value_name = "DIR")]
+    pub run_dir: PathBuf,
+    /// The Gaussians, where they are not in the run [default: geometry.ply there]
+    #[arg(long, value_name = "FILE")]
+    pub geometry: Option<PathBuf>,
+    /// Folder of id maps (*_s.npy) [default: masks/ in the run, or language_features/ in the scene]
+    #[arg(long, value_name = "DIR")]
+    pub masks: Option<PathBuf>,
+    /// What pictures show.
+    #[command(flatten)]
+    #[serde(flatten)]
+    pub views: Views,
+    /// Every how many views one is held out; 0 for none
+    #[arg(long, default_value_t = 8, value_name = "N")]
+    pub holdout: usize,
+    /// Where the page goes.
+    #[command(flatten)]
+    #[serde(flatten)]
+    pub out: Out,
+}
+
+/// A text of an option: CLIP has a feature for no words, too, and it resembles anything.
+fn words(text: &str) -> Result<String> {
+    if text.trim().is_empty() {
+        return Err(Error::new("an empty text").expected("words").hint("leave the option out, or give it words"));
+    }
+    Ok(text.into())
+}
+
+fn template(text: &str) -> Result<String> {
+    if text.contains("{}") { Ok(text.into()) } else { Err(Error::new("no place for the text").expected("{} in it")) }
+}
+
+fn as_text<T: std::fmt::Display, S: Serializer>(value: &T, to: S) -> std::result::Result<S::Ok, S::Error> {
+    to.collect_str(value)
+}

@@ -1,0 +1,146 @@
+//! `eval report`: everything about a run on one self-contained page, and its figures in `metrics.json`.
+//!
+//! Only the scene and the geometry have to be there. Whatever else a run did not make leaves its section out, with a
+//! line that says why. [`material`] reads what there is, [`sections`] writes the page, with the records of the stages
+//! ([`runs`]) and features as colours ([`pca`]).
+
+mod material;
+mod metrics;
+mod pca;
+mod runs;
+mod sections;
+
+use self::material::{Material, optional_json};
+use self::metrics::{Metrics, QueryFigure};
+use self::runs::{Run, grouped};
+use crate::memory::{self, Sizes};
+use crate::options::ReportOptions;
+use crate::scene::{folder_name, load};
+use gs_io::{Result, write_bytes, write_json};
+use gs_scene::dataset::{Dataset, LoadOptions, Split};
+use report::html::Page;
+use serde_json::{Value, json};
+use stage::Stage;
+use std::collections::BTreeMap;
+use std::path::{Path, PathBuf};
+
+pub(crate) fn run(o: &ReportOptions, parameters: Value, stage: &Stage) -> Result<String> {
+    let load_options = LoadOptions { resolution: o.views.resolution, holdout: o.holdout };
+    let dataset = load(&o.scene, &load_options, stage)?;
+    let sizes = Sizes {
+        geometry: memory::bytes(&geometry(o)),
+        features: memory::bytes(&o.run_dir.join("features.safetensors")),
+        pixels: memory::pixels(&dataset.views),
+        ..Sizes::default()
+    };
+    stage.forecast(memory::of_report(&sizes), "give a smaller --resolution")?;
+    let (out, figures) = (&o.out.out, o.out.out.with_file_name("metrics.json"));
+    let outputs = stage.outputs(out).file(out).file(&figures);
+    let mut claim = outputs.reads(&dataset.files).reads(files(&o.run_dir).chain([geometry(o)])).claim()?;
+    let mut inputs = BTreeMap::new();
+    let mut metrics = Metrics::default();
+    let page = write(&dataset, o, &mut metrics, &mut inputs)?;
+    write_bytes(out, page.as_bytes())?;
+    write_json(&figures, &metrics)?;
+    stage.record(&mut claim, parameters, inputs, json!({"left_out": metrics.skipped.len()}))?;
+    stage.info(&format!("wrote {}", out.display()));
+    Ok(metrics.table())
+}
+
+/// The Gaussians, which may lie outside of the run.
+fn geometry(o: &ReportOptions) -> PathBuf {
+    o.geometry.clone().unwrap_or_else(|| o.run_dir.join("geometry.ply"))
+}
+
+/// The folder of id maps, if there is one.
+fn masks(o: &ReportOptions) -> Option<PathBuf> {
+    let in_place = [o.run_dir.join("masks"), o.scene.join("language_features")];
+    o.masks.clone().or_else(|| in_place.into_iter().find(|m| m.is_dir()))
+}
+
+/// Writes the page; gives its text, with the figures in `metrics`.
+fn write(
+    dataset: &Dataset,
+    o: &ReportOptions,
+    metrics: &mut Metrics,
+    inputs: &mut BTreeMap<String, String>,
+) -> Result<String> {
+    let material = Material::read(dataset, o, geometry(o), masks(o), metrics, inputs)?;
+    let records = run_records(&material)?;
+    metrics.gaussians = material.gaussians().len();
+    metrics.instances = material.labelled().map(|l| l.instances.len());
+    geometry_figures(&material, metrics)?;
+    metrics.seconds = runs::seconds(&records);
+    for r in &records {
+        if let Some(bytes) = r.record.peak_rss_bytes {
+            let peak = metrics.peak_bytes.entry(r.name()).or_default();
+            *peak = bytes.max(*peak);
+        }
+    }
+
+    let mut page = Page::default();
+    page.tiles(&sections::tiles(metrics, dataset));
+    sections::photographs(&material, &mut page)?;
+    sections::id_maps(&material, &mut page, metrics)?;
+    sections::features(&material, &mut page, metrics)?;
+    sections::instances(&material, &mut page, metrics)?;
+    sections::queries(&material, &mut page, metrics)?;
+    sections::score_tables(&material, &mut page);
+    sections::training(&material, &mut page, metrics)?;
+    sections::stages(&records, &mut page);
+    sections::left_out(&records, &mut page, metrics);
+
+    let subtitle = format!(
+        "{} photographs ({} held out) of {}x{} pixels, {} Gaussians",
+        dataset.views.len(),
+        dataset.views.iter().filter(|v| v.split == Split::Test).count(),
+        dataset.views.first().map_or(0, |v| v.camera.width),
+        dataset.views.first().map_or(0, |v| v.camera.height),
+        grouped(&material.gaussians().len().to_string()),
+    );
+    Ok(page.finish(&folder_name(&o.run_dir), &subtitle))
+}
+
+/// The files of a run that the page tells of.
+fn files(run_dir: &Path) -> impl Iterator<Item = PathBuf> {
+    let names = [
+        "geometry.ply",
+        "geom_metrics.json",
+        "geometry.ply.curve.jsonl",
+        "graph.safetensors",
+        "footprints.safetensors",
+        "features.safetensors",
+        "features.safetensors.curve.jsonl",
+        "instances.safetensors",
+        "score.json",
+        "query/query.json",
+    ];
+    names.map(|name| run_dir.join(name)).into_iter()
+}
+
+fn run_records(m: &Material) -> Result<Vec<Run>> {
+    let mut folders: Vec<&Path> = vec![&m.options.run_dir, &m.dataset.root];
+    folders.extend(m.masks.as_deref());
+    runs::read_all(&folders, &m.options.out.out)
+}
+
+/// PSNR and SSIM from `geom_metrics.json`, the output of gs-geom eval.
+fn geometry_figures(m: &Material, metrics: &mut Metrics) -> Result<()> {
+    match optional_json::<Value>(&m.file("geom_metrics.json"))? {
+        Some(v) => {
+            let number = |names: [&str; 2]| names.iter().find_map(|n| v.get(n).and_then(Value::as_f64));
+            metrics.psnr_heldout = number(["psnr_heldout", "psnr"]);
+            metrics.ssim_heldout = number(["ssim_heldout", "ssim"]);
+        }
+        None => metrics.skipped.push("PSNR and SSIM: the run has no geom_metrics.json (gs-geom eval makes it)".into()),
+    }
+    if let Some(s) = &m.scores {
+        (metrics.instance_miou, metrics.object_miou) = (s.instance_miou, s.object_miou);
+        (metrics.query_miou, metrics.query_miou_visible) = (s.query_miou, s.query_miou_visible);
+        metrics.query_macc25 = s.query_macc25;
+        metrics.query_count = s.queries.len();
+        let figure = |q: &crate::score::QueryScore| QueryFigure { text: q.text.clone(), iou: q.iou, score: q.score };
+        metrics.queries = s.queries.iter().map(figure).collect();
+    }
+    Ok(())
+}

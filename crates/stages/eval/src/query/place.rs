@@ -1,0 +1,186 @@
+//! What is at a pixel of a view, or at a point in space.
+
+use super::ask::{Answered, Asked, Asker, Place};
+use super::ranking::{Index, Ranked};
+use crate::scene::{LabelledScene, find_view};
+use gs_io::{Error, Result};
+use gs_raster::{TILE, tile_weights};
+use gs_scene::dataset::{Dataset, View};
+use std::collections::BTreeMap;
+
+/// Names that a place is given.
+const NAMES: usize = 5;
+/// Farther than this from all labelled Gaussians, in sizes of the scene, a point lies outside of it.
+const FAR: f64 = 10.0;
+
+/// The answers to places: `pixels` as VIEW:X,Y, then `points` as X,Y,Z. They are named by `texts`, or by all names of the
+/// table.
+///
+/// # Errors
+/// When a place is not understood, or lies outside its view or the scene.
+pub fn answers(
+    pixels: &[String],
+    points: &[String],
+    texts: &[String],
+    scene: &LabelledScene,
+    dataset: &Dataset,
+    asker: &Asker<'_>,
+) -> Result<Vec<Asked>> {
+    let namer = if pixels.is_empty() && points.is_empty() { Namer::default() } else { Namer::new(asker, texts)? };
+    let mut asked = Vec::new();
+    for text in pixels {
+        let bad = || Error::new("not understood").field("--pixel").found(text).expected("VIEW:X,Y");
+        let (view, at) = text.rsplit_once(':').ok_or_else(bad)?;
+        let view = find_view(dataset, view)?;
+        let (found, ranking) = at_pixel(scene, &asker.index, view, numbers(at, "--pixel")?)?;
+        asked.push(located(text, "pixel", found, ranking, asker, &namer));
+    }
+    for text in points {
+        let point: [f32; 3] = numbers(text, "--point")?;
+        if point.iter().any(|v| !v.is_finite()) {
+            return Err(Error::new("not a point").field("--point").found(text).expected("finite numbers"));
+        }
+        let (found, ranking) = at_point(scene, &asker.index, point)?;
+        asked.push(located(text, "point", found, ranking, asker, &namer));
+    }
+    Ok(asked)
+}
+
+/// Numbers with commas between, as many as `N`.
+fn numbers<T: std::str::FromStr + Copy, const N: usize>(text: &str, option: &str) -> Result<[T; N]> {
+    let parsed: Option<Vec<T>> = text.split(',').map(|p| p.trim().parse().ok()).collect();
+    parsed.and_then(|all| <[T; N]>::try_from(all).ok()).ok_or_else(|| {
+        Error::new("not understood").field(option).found(text).expected(format!("{N} numbers with commas between"))
+    })
+}
+
+/// Texts that places may be called.
+#[derive(Default)]
+struct Namer {
+    texts: Vec<String>,
+    features: Vec<Vec<f32>>,
+}
+
+impl Namer {
+    fn new(asker: &Asker<'_>, texts: &[String]) -> Result<Self> {
+        let Some(source) = &asker.source else { return Ok(Self::default()) };
+        let names = if texts.is_empty() { source.names() } else { texts.to_vec() };
+        let found = asker.features(&names)?;
+        let (texts, features) = names.into_iter().zip(found).filter_map(|(n, f)| Some((n, f?))).unzip();
+        Ok(Self { texts, features })
+    }
+
+    fn names(&self, asker: &Asker<'_>, instance: u32) -> Vec<(String, f32)> {
+        let score = |f: &Vec<f32>| asker.index.scores(f, &asker.scoring)[instance as usize];
+        let mut names: Vec<(String, f32)> =
+            self.texts.iter().zip(&self.features).filter_map(|(t, f)| Some((t.clone(), score(f)?))).collect();
+        names.sort_by(|a, b| b.1.total_cmp(&a.1).then(a.0.cmp(&b.0)));
+        names.truncate(NAMES);
+        names
+    }
+}
+
+/// The instance with the largest share of a place is the answer, whatever the options of selection say.
+fn located(
+    text: &str,
+    kind: &'static str,
+    mut place: Place,
+    ranking: Vec<Ranked>,
+    asker: &Asker<'_>,
+    namer: &Namer,
+) -> Asked {
+    let first = ranking.first().copied();
+    place.names = first.map_or(Vec::new(), |r| namer.names(asker, r.instance));
+    let selected: Vec<u32> = first.map(|r| r.instance).into_iter().collect();
+    let gaussians = asker.index.members(&selected);
+    let answer = Answered { score: first.map(|r| r.score), gaussians, selected, ranking };
+    Asked { name: format!("{kind} {text}"), kind, answer, place: Some(place) }
+}
+
+/// What pixel (x, y) of a view shows: the instances by falling share of the pixel's blending weight.
+///
+/// # Errors
+/// When the pixel lies outside the view.
+fn at_pixel(scene: &LabelledScene, index: &Index<'_>, view: &View, pixel: [u32; 2]) -> Result<(Place, Vec<Ranked>)> {
+    let camera = &view.camera;
+    let [x, y] = pixel.map(|v| v as usize);
+    if pixel[0] >= camera.width || pixel[1] >= camera.height {
+        return Err(Error::new("the pixel lies outside the view")
+            .field("--pixel")
+            .found(format!("{x},{y}"))
+            .expected(format!("x below {} and y below {} in {}", camera.width, camera.height, view.stem())));
+    }
+    let here = tile_weights(scene.gaussians(), camera, &scene.raster, true, |t| {
+        let inside = (t.x0..t.x0 + t.width).contains(&x) && (t.y0..t.y0 + t.height).contains(&y);
+        let at = inside.then(|| (y - t.y0) * TILE + x - t.x0)?;
+        let weights = t.gaussians.iter().zip(t.weights.chunks_exact(TILE * TILE));
+        Some(weights.map(|(&i, w)| (i, f64::from(w[at]))).filter(|w| w.1 > 0.0).collect::<Vec<_>>())
+    });
+    let weights: Vec<(u32, f64)> = here.into_iter().flatten().flatten().collect();
+    let alpha: f64 = weights.iter().map(|w| w.1).sum();
+    let mut shares = BTreeMap::<i32, f64>::new();
+    let mut position = [0.0f64; 3];
+    for &(i, w) in &weights {
+        *shares.entry(scene.instances.label[i as usize]).or_default() += w;
+        let mean = scene.gaussians().means[i as usize];
+        (0..3).for_each(|k| position[k] += w / alpha * f64::from(mean[k]));
+    }
+    let noise = shares.get(&-1).copied().unwrap_or(0.0);
+    let mut ranking: Vec<Ranked> = shares
+        .into_iter()
+        .filter_map(|(l, share)| Some(ranked(scene, index, usize::try_from(l).ok()?, share as f32)))
+        .collect();
+    ranking.sort_by(|a, b| b.score.total_cmp(&a.score).then(a.instance.cmp(&b.instance)));
+    let place = Place {
+        view: Some(view.stem().into()),
+        pixel: Some(pixel),
+        position: (alpha > 0.0).then_some(position),
+        alpha_or_distance: Some(alpha),
+        noise,
+        names: Vec::new(),
+    };
+    Ok((place, ranking))
+}
+
+/// What is at a point of the world: the instance of the nearest labelled Gaussian of opacity at least 0.1.
+///
+/// # Errors
+/// When that Gaussian is so far that it says nothing of the point.
+fn at_point(scene: &LabelledScene, index: &Index<'_>, point: [f32; 3]) -> Result<(Place, Vec<Ranked>)> {
+    let (g, label) = (scene.gaussians(), &scene.instances.label);
+    let found = scene.nearest_labelled(&[point])[0];
+    let mean = found.map(|i| g.means[i as usize].map(f64::from));
+    let distance = mean.map(|m| (0..3).map(|k| (m[k] - f64::from(point[k])).powi(2)).sum::<f64>().sqrt());
+    let most = FAR * g.spread();
+    if let Some(distance) = distance.filter(|d| *d > most) {
+        return Err(Error::new("the point lies outside the scene")
+            .field("--point")
+            .found(format!("{point:?}, {distance:.4e} from the nearest labelled Gaussian"))
+            .expected(format!("at most {most:.4e} from it, in units of the scene"))
+            .hint("gs-geom inspect tells the bounds of the geometry"));
+    }
+    let ranking = found.map(|i| ranked(scene, index, label[i as usize] as usize, 1.0)).into_iter().collect();
+    let place =
+        Place { view: None, pixel: None, position: mean, alpha_or_distance: distance, noise: 0.0, names: Vec::new() };
+    Ok((place, ranking))
+}
+
+fn ranked(scene: &LabelledScene, index: &Index<'_>, instance: usize, score: f32) -> Ranked {
+    let (support, gaussians) = (scene.instances.support[instance], index.gaussians_of(instance).len() as u32);
+    Ranked { instance: instance as u32, score, support, gaussians }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn numbers_are_all_there_or_an_error() {
+        assert_eq!(numbers::<u32, 2>("3, 4", "--pixel").unwrap(), [3, 4]);
+        assert_eq!(numbers::<f32, 3>("-1,2.5,1e2", "--point").unwrap(), [-1.0, 2.5, 100.0]);
+        for bad in ["", "3", "3,", "3,4,5", "3,x", "-1,2", "3,4,"] {
+            let e = numbers::<u32, 2>(bad, "--pixel").unwrap_err().to_string();
+            assert!(e.contains("--pixel: not understood") && e.contains("2 numbers"), "{bad}: {e}");
+        }
+    }
+}

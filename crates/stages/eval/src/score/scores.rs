@@ -1,0 +1,146 @@
+//! What `eval score` finds: `score.json`.
+
+use super::label_iou::LabelScore;
+use crate::silhouette::Silhouette;
+use serde::{Deserialize, Serialize};
+
+/// `score.json`. Fields are null where the scene has no truth for them; `skipped` says why.
+#[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
+pub struct Scores {
+    /// Mean over all true things of the best IoU with any instance.
+    pub instance_miou: Option<f64>,
+    /// The same over objects only, without floor, walls and other background.
+    pub object_miou: Option<f64>,
+    /// Fraction of true things with best IoU above 0.25.
+    pub instance_macc25: Option<f64>,
+    /// Fraction of true things with best IoU above 0.5.
+    pub instance_macc50: Option<f64>,
+    /// True things that fell into several instances.
+    pub fragmented: Option<usize>,
+    /// Instances that hold several true things.
+    pub merging: Option<usize>,
+    /// Fragmentation: instances per true thing (see [`InstanceScore`](super::metrics::InstanceScore)).
+    pub instances_per_thing: Option<f64>,
+    /// Merging: true things per instance.
+    pub things_per_instance: Option<f64>,
+    /// Average precision at IoU 0.25 over surface points, by ScanNet's matching,
+    /// of instances of at least 100 points.
+    pub ap25: Option<f64>,
+    /// The same at IoU 0.5.
+    pub ap50: Option<f64>,
+    /// The same scores over Gaussians instead of surface points.
+    pub gaussians: Option<GaussianScores>,
+    /// Each true thing.
+    pub things: Vec<ThingScore>,
+    /// Mean over all labelled objects of all labelled views of the best IoU with any instance's visible pixels.
+    pub label_miou: Option<f64>,
+    /// Fraction of them with best IoU above 0.25.
+    pub label_macc25: Option<f64>,
+    /// Fraction of them with best IoU above 0.5.
+    pub label_macc50: Option<f64>,
+    /// Each labelled object of each labelled view.
+    pub labels: Vec<LabelScore>,
+    /// Mean IoU over all (frame, category) pairs.
+    pub query_miou: Option<f64>,
+    /// Fraction of pairs with IoU above 0.25.
+    pub query_macc25: Option<f64>,
+    /// Fraction of pairs with IoU above 0.5.
+    pub query_macc50: Option<f64>,
+    /// Mean IoU over all pairs when only what the view shows of the selection counts (occlusion-aware, share above 0.5),
+    /// whatever `silhouette` says. Labels outline what is seen, so hidden objects cost `query_miou` but not this.
+    pub query_miou_visible: Option<f64>,
+    /// Number of (frame, category) pairs.
+    pub query_pairs: usize,
+    /// Each query with its mean IoU.
+    pub queries: Vec<QueryScore>,
+    /// How selections became masks, `selected` or `visible`, and above which value.
+    pub silhouette: Option<(Silhouette, f32)>,
+    /// What was left out, and why.
+    pub skipped: Vec<String>,
+}
+
+/// Scores over Gaussians of opacity at least 0.1, each belonging to the thing of the nearest surface point.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct GaussianScores {
+    /// Gaussians that count.
+    pub count: usize,
+    /// Mean over true things of the best IoU with any instance.
+    pub instance_miou: f64,
+    /// Average precision at IoU 0.25, of instances of at least 10 Gaussians.
+    pub ap25: Option<f64>,
+    /// The same at IoU 0.5.
+    pub ap50: Option<f64>,
+}
+
+/// How one true thing was found.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct ThingScore {
+    /// Id of the thing.
+    pub id: i32,
+    /// Its name, where the truth has one.
+    pub name: String,
+    /// Whether it is background.
+    pub background: bool,
+    /// Points of its surface.
+    pub points: usize,
+    /// Best IoU with any instance.
+    pub iou: f64,
+    /// The instance that gives it.
+    pub instance: Option<i32>,
+    /// Instances that hold at least a tenth of it.
+    pub fragments: usize,
+}
+
+/// How one query was answered.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct QueryScore {
+    /// The category of the labels, which is the text.
+    pub text: String,
+    /// Mean IoU over its frames.
+    pub iou: f64,
+    /// Selected instances, best first.
+    pub selected: Vec<u32>,
+    /// Cosine of the best.
+    pub score: Option<f32>,
+    /// Stem and IoU of each labelled frame.
+    pub frames: Vec<(String, f64)>,
+}
+
+impl Scores {
+    /// The scores as a table for the terminal.
+    pub fn table(&self) -> String {
+        let mut s = String::new();
+        let mut line = |name: &str, value: Option<String>| {
+            if let Some(value) = value {
+                s += &format!("{name:<16} {value}\n");
+            }
+        };
+        let number = |v: Option<f64>| v.map(|v| format!("{v:.4}"));
+        line("instance_miou", number(self.instance_miou));
+        line("object_miou", number(self.object_miou));
+        line("instance_macc25", number(self.instance_macc25));
+        line("instance_macc50", number(self.instance_macc50));
+        line("fragmented", self.fragmented.map(|n| format!("{n} of {} things", self.things.len())));
+        line("merging", self.merging.map(|n| format!("{n} instances")));
+        line("label_miou", number(self.label_miou));
+        line("label_macc25", number(self.label_macc25));
+        line("label_macc50", number(self.label_macc50));
+        line("labels", self.label_miou.map(|_| format!("{} objects in views", self.labels.len())));
+        line("instances/thing", number(self.instances_per_thing));
+        line("things/instance", number(self.things_per_instance));
+        line("ap25", number(self.ap25));
+        line("ap50", number(self.ap50));
+        line("per Gaussian", number(self.gaussians.as_ref().map(|g| g.instance_miou)));
+        line("  ap25", number(self.gaussians.as_ref().and_then(|g| g.ap25)));
+        line("  ap50", number(self.gaussians.as_ref().and_then(|g| g.ap50)));
+        line("query_miou", number(self.query_miou));
+        line("  visible only", number(self.query_miou_visible));
+        line("query_macc25", number(self.query_macc25));
+        line("query_macc50", number(self.query_macc50));
+        line("queries", self.query_miou.map(|_| format!("{} in {} pairs", self.queries.len(), self.query_pairs)));
+        for reason in &self.skipped {
+            s += &format!("skipped          {reason}\n");
+        }
+        s
+    }
+}
