@@ -20,7 +20,7 @@ bench-memory:
 
 # feat-train at a million Gaussians: train.json.
 bench-train:
-	$(CARGO) bench -p feat-train --bench train -- --out $(CURDIR)/out/bench/train.json
+	$(CARGO) bench -p feat-train --bench train
 
 # Anchors and neighbours beside fpsample and pykdtree (needs Python; POSITIONS=points or file.npy): graph.json.
 POSITIONS ?= 1000000

@@ -96,8 +96,7 @@ fn add(tasks: &mut Tasks, plan: &Plan, files: &Files, (scene, seed): (&Scene, u6
     let footprints = plan.footprints_of.get(&row.features).map_or("", String::as_str);
     let graph = run(Stage::Graph, plan.options_of("footprints", footprints));
     let graph = tasks.add(2, Task::new(files.graph.clone(), graph, &[&geometry, &masks]));
-    let features = format!("{} --checkpoint-every 0", plan.options_of("features", &row.features));
-    let features = run(Stage::Features, &features);
+    let features = run(Stage::Features, plan.options_of("features", &row.features));
     let features = tasks.add(3, Task::new(files.features.clone(), features, &[&graph]));
     let instances = run(Stage::Instances, plan.options_of("clustering", &row.clustering));
     let instances = tasks.add(4, Task::new(files.instances.clone(), instances, &[&features]));

@@ -1,11 +1,13 @@
 //! One iteration by rendering and averaging, as without footprints: features are rasterised, averaged over the masks'
 //! pixels, and the gradient goes back from the pixels to the Gaussians.
 
-use feat_train::adam::{Adam, Rates};
-use feat_train::fast::{Engine, Shortcuts};
-use feat_train::loss::{self, Loss};
-use feat_train::model::Model;
-use feat_train::scene::{Context, MaskSet};
+use feat_train::contrastive::adam::{Adam, Rates};
+use feat_train::contrastive::context::Context;
+use feat_train::contrastive::engine::Engine;
+use feat_train::contrastive::loss;
+use feat_train::contrastive::masks::MaskSet;
+use feat_train::contrastive::model::Model;
+use feat_train::options::Loss;
 use glam::DVec3;
 use gs_raster::{RasterOptions, TILE, TileWeights, render_features, tile_weights};
 use gs_scene::{Camera, Gaussians};
@@ -80,7 +82,7 @@ impl View {
     }
 
     /// The footprints of the masks.
-    pub fn masks(&self, context: &Context) -> MaskSet<f32> {
+    pub fn masks(&self, context: &Context) -> MaskSet {
         let width = self.camera.width as usize;
         let mut weight = std::collections::BTreeMap::<(u32, u16), f64>::new();
         let tiles = tile_weights(&self.gaussians, &self.camera, &self.options, true, |t| {
@@ -143,14 +145,14 @@ impl View {
 
     /// One iteration of `model` both ways; times are medians of `runs`.
     pub fn compare(&self, context: &Context, model: &Model<f32>, runs: usize) -> Compared {
-        let (d, tau) = (model.settings.dim, model.settings.tau);
+        let (d, tau) = (model.dim, model.options.tau);
         let set = self.masks(context);
-        let mut engine = Engine::new(context, model, Shortcuts::default());
-        engine.propagate(model, 0);
-        let found = engine.evaluate(model, &set, 0);
+        let mut engine = Engine::new(context, model);
+        engine.propagate(model);
+        let found = engine.evaluate(model, &set, 0, None);
         let centroids = engine.centroids(model, &set);
         let mut adam = Adam::new(model.features.len());
-        engine.backward(&mut model.clone(), &mut adam, &set, &found, 0, &Rates::none(), 0);
+        engine.backward(&mut model.clone(), &mut adam, &set, &found, 0, &Rates::none());
         let features = engine.final_features(model);
         let averages = self.averages(&features, d);
         let rendered = loss::evaluate(Loss::Printed, &averages, None, d, tau);
@@ -168,9 +170,9 @@ impl View {
         let (mut model, mut i) = (model.clone(), 0);
         let engine = median(runs, || {
             i += 1;
-            engine.propagate(&model, i);
-            let found = engine.evaluate(&model, &set, i);
-            engine.backward(&mut model, &mut adam, &set, &found, i, &Rates::at(1e-3, i), i);
+            engine.propagate(&model);
+            let found = engine.evaluate(&model, &set, i, None);
+            engine.backward(&mut model, &mut adam, &set, &found, i, &Rates::at(1e-3, i));
         });
         Compared {
             rendering,

@@ -7,17 +7,21 @@
 //! view, as masks of inconsistent granularity are. A Gaussian belongs to the mask it lies in, and within two Gaussians of
 //! a border, where its splat reaches over, to the masks of both sides (three or four at a corner): 1.2 entries a Gaussian.
 //! A mask's weights sum to about 0.9, the mean alpha of its pixels; the 750,000 pixels of a view are shared out by area.
-//!
-//! Those masks follow no things. With [`Things`] they do: a fifth of the scene's 240 things of one to four parts are in
-//! a window, and each is shown by a view whole, or, with probability 0.5, in its parts or merged with a neighbour.
 
-use artifacts::Graph;
-use feat_train::real::Weight;
-use feat_train::scene::{Context, MaskSet, Neighbours};
+use artifacts::{FootprintsBuilder, Graph, Row, ScratchEntries, role};
+use feat_train::contrastive::context::Context;
+use feat_train::contrastive::masks::MaskSet;
+use feat_train::options::Neighbours;
+use gs_io::{Provenance, hash_file};
+use gs_scene::{Gaussians, ply};
 use rand::seq::SliceRandom;
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use rayon::prelude::*;
+use stage::RunRecord;
+use std::collections::BTreeMap;
+use std::path::Path;
+use std::process::Command;
 
 /// Neighbours of an anchor.
 const K: usize = 16;
@@ -126,56 +130,89 @@ fn steps(spacing: (usize, usize)) -> Vec<(i64, i64)> {
 }
 
 impl Scene {
-    /// The graph in the order of training; without `curve`, anchors stay in the order of the sampling.
-    pub fn context(&self, kind: Neighbours, curve: bool) -> Context {
-        let nowhere;
-        let positions = if curve {
-            &self.positions
-        } else {
-            nowhere = vec![[0.0; 3]; self.positions.len()];
-            &nowhere
-        };
-        Context::new(&self.graph, &self.colors, positions, kind, true)
-    }
-
-    /// The masks of `count` views, without entries below `cut`, and the largest share of a mask that this drops.
-    pub fn cut_views<W: Weight>(&self, context: &Context, count: usize, cut: f32) -> (Vec<MaskSet<W>>, f64) {
-        let mut place = vec![0u32; context.order.len()];
-        for (p, &i) in context.order.iter().enumerate() {
-            place[i as usize] = p as u32;
-        }
-        let views = (0..count).map(|v| self.view(context, &place, v as u64, cut));
-        let (sets, dropped): (Vec<_>, Vec<f64>) = views.unzip();
-        (sets, dropped.into_iter().fold(0.0, f64::max))
+    /// The graph in the order of training.
+    pub fn context(&self) -> Context {
+        Context::new(&self.graph, &self.colors, &self.positions, Neighbours::Gaussians, true)
     }
 
     /// The masks of `count` views.
     pub fn views(&self, context: &Context, count: usize) -> Vec<MaskSet> {
-        self.cut_views(context, count, 0.0).0
+        let mut place = vec![0u32; context.order.len()];
+        for (p, &i) in context.order.iter().enumerate() {
+            place[i as usize] = p as u32;
+        }
+        let view = |v: usize| {
+            let (mut entries, pixels) = self.entries(v as u64);
+            entries.iter_mut().for_each(|e| e.0 = place[e.0 as usize]);
+            MaskSet::from_entries((0..pixels.len() as u32).collect(), pixels, entries, context)
+        };
+        (0..count).map(view).collect()
     }
 
-    fn view<W: Weight>(&self, context: &Context, place: &[u32], v: u64, cut: f32) -> (MaskSet<W>, f64) {
-        let (mut entries, pixels) = self.entries(v, None);
-        let mut dropped = vec![0.0; pixels.len()];
-        entries.iter().filter(|e| e.2 < cut).for_each(|e| dropped[e.1 as usize] += f64::from(e.2));
-        entries.retain(|e| e.2 >= cut);
-        entries.iter_mut().for_each(|e| e.0 = place[e.0 as usize]);
-        let set = MaskSet::from_entries((0..pixels.len() as u32).collect(), pixels, entries, context);
-        (set, dropped.into_iter().fold(0.0, f64::max))
+    /// Runs `feat-train` on the scene with `views` views, as files in `folder`, and gives the record of the run.
+    pub fn run(&self, views: usize, options: &[&str], folder: &Path) -> RunRecord {
+        let file = |name: &str| folder.join(format!("scene-{name}"));
+        let (geometry, graph, footprints) =
+            (file("geometry.ply"), file("graph.safetensors"), file("footprints.safetensors"));
+        let n = self.positions.len();
+        let gaussians = Gaussians {
+            means: self.positions.clone(),
+            log_scales: vec![[0.0; 3]; n],
+            rotations: vec![[1.0, 0.0, 0.0, 0.0]; n],
+            opacity_logits: vec![2.0; n],
+            sh: vec![0.0; 3 * n],
+            sh_degree: 0,
+        };
+        ply::write_gaussians(&geometry, &gaussians, &[]).expect("room for the geometry");
+        drop(gaussians);
+        let inputs = BTreeMap::from([(role::GEOMETRY.to_string(), hash_file(&geometry).expect("just written"))]);
+        let provenance = Provenance { inputs, ..Provenance::default() };
+        self.graph.write(&graph, provenance.clone()).expect("room for the graph");
+        self.write_footprints(views, &footprints, provenance);
+        let out = file("features.safetensors");
+        let mut command = Command::new(env!("CARGO_BIN_EXE_feat-train"));
+        command.args(options).arg("--quiet").arg("--overwrite").arg("--out").arg(&out);
+        for (option, file) in [("--geometry", &geometry), ("--graph", &graph), ("--footprints", &footprints)] {
+            command.arg(option).arg(file);
+        }
+        assert!(command.status().expect("the program starts").success());
+        let record = RunRecord::read(&out).expect("the program writes a record");
+        for file in [geometry, graph, footprints, out] {
+            std::fs::remove_file(file).expect("just written");
+        }
+        record
     }
 
-    /// Gaussian, mask and weight, as a share of the mask, of all entries of a view, and the pixels of its masks. Without
-    /// things, masks are cells of a grid.
-    pub fn entries(&self, v: u64, things: Option<&Things>) -> (Vec<(u32, u16, f32)>, Vec<f64>) {
+    /// Masks and entries of all views, which are in memory one at a time.
+    fn write_footprints(&self, views: usize, path: &Path, provenance: Provenance) {
+        let mut builder =
+            FootprintsBuilder { kept: self.graph.kept.clone(), row_ptr: vec![0], ..FootprintsBuilder::default() };
+        let mut scratch = ScratchEntries::beside(path).expect("room for footprints");
+        for v in 0..views {
+            builder.views.push(v.to_string());
+            let (mut entries, pixels) = self.entries(v as u64);
+            entries.sort_unstable_by_key(|e| (e.1, e.0));
+            let mut entries = entries.into_iter().peekable();
+            for (k, pixels) in pixels.into_iter().enumerate() {
+                while let Some((i, _, w)) = entries.next_if(|e| usize::from(e.1) == k) {
+                    scratch.push(i, w * pixels as f32).expect("room for footprints");
+                }
+                builder.row_ptr.push(scratch.count);
+                let pixels = pixels as u32;
+                builder.rows.push(Row { view: v as u32, level: 3, mask: k as u32, pixels, gated: pixels, alpha: 0.9 });
+            }
+        }
+        builder.write_with(scratch, path, provenance).expect("room for footprints");
+    }
+
+    /// Gaussian, mask and weight, as a share of the mask, of all entries of a view, and the pixels of its masks.
+    fn entries(&self, v: u64) -> (Vec<(u32, u16, f32)>, Vec<f64>) {
         let mut rng = ChaCha8Rng::seed_from_u64(2);
         rng.set_stream(v);
         let side = self.side;
         let width = (side as f64 * 0.2f64.sqrt()) as usize;
         let corner = (rng.random_range(0..=side - width), rng.random_range(0..=side - width));
-        let (masks, cells) = match things {
-            None => grid(width, &mut rng),
-            Some(things) => things.shown(side, width, corner, &mut rng),
-        };
+        let (masks, cells) = grid(width, &mut rng);
         let cell_of = |y: usize, x: usize| cells[y * width + x];
         let mut entries: Vec<(u32, u16, f32)> = Vec::with_capacity(width * width * 5 / 4);
         let mut sum = vec![0.0f64; masks];
@@ -224,72 +261,4 @@ fn grid(width: usize, rng: &mut ChaCha8Rng) -> (usize, Vec<u16>) {
         (r * masks / rows + cells[r].partition_point(|&c| c <= x) - 1) as u16
     };
     (masks, (0..width * width).map(|i| cell_of(i / width, i % width)).collect())
-}
-
-/// Things that the surface is made of.
-pub struct Things {
-    /// Thing of each place of the surface, and which of its parts.
-    at: Vec<(u16, u8)>,
-    /// Number of parts of each thing.
-    parts: Vec<u8>,
-    /// Things along a side.
-    across: usize,
-}
-
-impl Things {
-    /// 15 x 16 things around jittered centres, each cut into one to four parts by angle.
-    pub fn new(side: usize) -> Self {
-        let mut rng = ChaCha8Rng::seed_from_u64(3);
-        let (down, across) = (15usize, 16usize);
-        let (high, wide) = (side as f32 / down as f32, side as f32 / across as f32);
-        let centres: Vec<[f32; 2]> = (0..down * across)
-            .map(|t| {
-                let mut jitter = || rng.random_range(0.2f32..0.8);
-                [((t / across) as f32 + jitter()) * high, ((t % across) as f32 + jitter()) * wide]
-            })
-            .collect();
-        let parts: Vec<u8> = centres.iter().map(|_| rng.random_range(1..=4)).collect();
-        let nearest = |i: usize| {
-            let (y, x) = ((i / side) as f32, (i % side) as f32);
-            let (cy, cx) = ((y / high) as usize, (x / wide) as usize);
-            let around = (cy.saturating_sub(2)..(cy + 3).min(down))
-                .flat_map(|r| (cx.saturating_sub(2)..(cx + 3).min(across)).map(move |c| r * across + c));
-            let off = |t: usize| [y - centres[t][0], x - centres[t][1]];
-            let square = |t: &usize| off(*t).iter().map(|d| d * d).sum::<f32>();
-            let t = around.min_by(|a, b| square(a).total_cmp(&square(b))).expect("its own cell");
-            let [dy, dx] = off(t);
-            let turn = dy.atan2(dx) / std::f32::consts::TAU + 0.5;
-            (t as u16, ((turn * f32::from(parts[t])) as u8).min(parts[t] - 1))
-        };
-        let at = (0..side * side).into_par_iter().map(nearest).collect();
-        Self { at, parts, across }
-    }
-
-    /// How a view shows the things of its window: the number of masks, and the mask of each place.
-    fn shown(&self, side: usize, width: usize, corner: (usize, usize), rng: &mut ChaCha8Rng) -> (usize, Vec<u16>) {
-        let things = self.parts.len();
-        // The mask of each part of each thing, by a first numbering.
-        let mut mask: Vec<[usize; 4]> = (0..things).map(|t| [4 * t; 4]).collect();
-        for t in 0..things {
-            match rng.random_range(0..4) {
-                0 => mask[t] = std::array::from_fn(|part| 4 * t + part),
-                1 if t % self.across > 0 => mask[t] = mask[t - 1],
-                _ => {}
-            }
-        }
-        let window = (0..width * width).map(|i| {
-            let (t, part) = self.at[(i / width + corner.0) * side + i % width + corner.1];
-            mask[t as usize][part as usize]
-        });
-        let window: Vec<usize> = window.collect();
-        let mut number = vec![u16::MAX; 4 * things];
-        let mut masks = 0;
-        for &m in &window {
-            if number[m] == u16::MAX {
-                number[m] = masks;
-                masks += 1;
-            }
-        }
-        (masks as usize, window.into_iter().map(|m| number[m]).collect())
-    }
 }

@@ -3,5 +3,5 @@
 use std::process::ExitCode;
 
 fn main() -> ExitCode {
-    stage::main::<feat_train::cli::Args>()
+    stage::main::<feat_train::options::Args>()
 }

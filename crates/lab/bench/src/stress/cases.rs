@@ -199,11 +199,11 @@ fn settings(world: &World) -> Vec<Case> {
         ("tau 1e-4", "temperature 0.0001", format!("{short} --tau 0.0001")),
         ("tau 10", "temperature 10", format!("{short} --tau 10")),
         ("learning rates x 100", "features and weights", format!("{short} --lr 0.1 --weight-lr 0.1")),
-        ("100,000 iterations", "ten times the paper's", "--iterations 100000 --checkpoint-every 0".into()),
+        ("100,000 iterations", "ten times the paper's", "--iterations 100000".into()),
         ("one dimension", "contrastive features of dimension 1", format!("{short} --dim 1")),
     ];
     let case = |(name, note, options): (_, _, String)| Case {
-        options: Options::of(Stage::Features, &format!("--method contrastive {options}")),
+        options: Options::of(Stage::Features, &format!("--preset paper {options}")),
         tolerances: Tolerances::default(),
         from: From::Features,
         ..Case::new(name, note, world.clone())

@@ -1,20 +1,20 @@
-//! The same thing in another view: positives for [`crate::loss::Loss::CrossView`].
+//! The same thing in another view: positives for [`crate::options::Loss::CrossView`].
 //!
 //! A mask's counterpart in another view is the mask with the highest IoU, both counted in the Gaussians that both views
 //! show. Its centroid is the positive and is held constant, as a momentum encoder's keys are: the other view has its own
 //! turn.
 
-use crate::scene::MaskSet;
+use super::masks::MaskSet;
 
 /// Masks that overlap less than this are not of one thing.
 const LEAST_IOU: f64 = 0.5;
 
 /// For each mask of `a`, its counterpart in `b`, if any.
-pub fn counterparts<T>(a: &MaskSet<T>, b: &MaskSet<T>) -> Vec<Option<usize>> {
+pub fn counterparts(a: &MaskSet, b: &MaskSet) -> Vec<Option<usize>> {
     let (rows, columns) = (a.rows.len(), b.rows.len());
     let mut both = vec![0u32; rows * columns];
     let (mut of_a, mut of_b) = (vec![0u32; rows], vec![0u32; columns]);
-    let masks = |set: &MaskSet<T>, c: usize| set.start[c] as usize..set.start[c + 1] as usize;
+    let masks = |set: &MaskSet, c: usize| set.start[c] as usize..set.start[c + 1] as usize;
     let (mut i, mut j) = (0, 0);
     while i < a.columns.len() && j < b.columns.len() {
         match a.columns[i].cmp(&b.columns[j]) {
@@ -45,7 +45,7 @@ pub fn counterparts<T>(a: &MaskSet<T>, b: &MaskSet<T>) -> Vec<Option<usize>> {
 }
 
 /// The counterparts' rows of `centroids` `[masks of b][d]`, or zeros for masks without; `[masks of a][d]`.
-pub fn positives<T>(a: &MaskSet<T>, b: &MaskSet<T>, centroids: &[f64], d: usize) -> Vec<f64> {
+pub fn positives(a: &MaskSet, b: &MaskSet, centroids: &[f64], d: usize) -> Vec<f64> {
     let rows = counterparts(a, b).into_iter();
     rows.flat_map(|l| l.map_or_else(|| vec![0.0; d], |l| centroids[l * d..(l + 1) * d].to_vec())).collect()
 }
@@ -53,8 +53,8 @@ pub fn positives<T>(a: &MaskSet<T>, b: &MaskSet<T>, centroids: &[f64], d: usize)
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::scene::Neighbours;
-    use crate::testing::context;
+    use crate::contrastive::testing::context;
+    use crate::options::Neighbours;
 
     #[test]
     fn counterparts_overlap_most_among_what_both_views_show() {
@@ -62,7 +62,7 @@ mod tests {
         let set = |masks: &[std::ops::Range<u32>]| {
             let entries =
                 masks.iter().enumerate().flat_map(|(k, r)| r.clone().map(move |p| (p, k as u16, 1.0))).collect();
-            MaskSet::<f32>::from_entries(vec![0; masks.len()], vec![1.0; masks.len()], entries, &context)
+            MaskSet::from_entries(vec![0; masks.len()], vec![1.0; masks.len()], entries, &context)
         };
         let a = set(&[0..10, 10..20, 20..30]);
         // The first mask again, shifted by one; the others merged, of which b does not show the end; one of its own.

@@ -3,7 +3,7 @@
 //! The deviation is the unbiased one, and the paper's epsilon of 1e-10 is added to it. A deviation that is nothing but
 //! rounding noise counts as zero and gives zeros: a scene of one colour must not become amplified noise.
 
-use crate::real::Real;
+use super::real::Real;
 use rayon::prelude::*;
 
 /// Added to deviations (paper, "Neighborhood Feature Aggregation").
@@ -12,15 +12,6 @@ const EPSILON: f64 = 1e-10;
 const NOISE: f64 = 1e-6;
 /// Rows summed at a time.
 const CHUNK: usize = 8192;
-
-/// What is standardised together.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, clap::ValueEnum)]
-pub enum Axis {
-    /// Each channel over all Gaussians.
-    Channel,
-    /// Each Gaussian over its channels.
-    Gaussian,
-}
 
 /// Mean, deviation and its inverse.
 #[derive(Debug, Clone, Copy, Default, PartialEq)]

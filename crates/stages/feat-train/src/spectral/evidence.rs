@@ -4,7 +4,7 @@
 //! neighbours, and D the sums of rows and columns of S B. It is formed in [`Block`]s of Gaussians that lie together and so
 //! know the same few hundred masks: what is summed over a block's masks stays in cache.
 
-use crate::sparse::{Block, Matrix};
+use super::sparse::{Block, Matrix};
 use artifacts::{Footprints, Graph, Level};
 use rayon::prelude::*;
 use std::collections::VecDeque;
@@ -14,19 +14,9 @@ const BLOCK: usize = 2048;
 /// Gaussians whose evidence is collected by one task.
 const CHUNK: usize = 16384;
 
-/// What an entry of the evidence is.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, clap::ValueEnum)]
-pub enum Evidence {
-    /// Blending weight summed over the mask's pixels: a view counts as much as it sees.
-    Weight,
-    /// Square root of that.
-    Root,
-    /// Share of the Gaussian's weight in the view that falls into the mask: all views count the same.
-    Share,
-}
-
-/// Collects the evidence of all masks at `levels`; with `smooth`, spread over spatial neighbours.
-pub fn collect(footprints: &Footprints, graph: &Graph, levels: &[Level], evidence: Evidence, smooth: bool) -> Matrix {
+/// Collects the evidence of all masks at `levels`, spread over spatial neighbours: blending weights summed over the mask's
+/// pixels, so that a view counts as much as it sees.
+pub fn collect(footprints: &Footprints, graph: &Graph, levels: &[Level]) -> Matrix {
     let (start, gaussians, weights) = footprints.csr();
     let range = |r: usize| start[r] as usize..start[r + 1] as usize;
     let masks: Vec<u32> = (0..footprints.rows.len() as u32)
@@ -35,25 +25,14 @@ pub fn collect(footprints: &Footprints, graph: &Graph, levels: &[Level], evidenc
         .collect();
     let columns: Vec<(&[u32], &[f32])> =
         masks.iter().map(|&r| (&gaussians[range(r as usize)], &weights[range(r as usize)])).collect();
-    let mut rows = by_gaussian(graph.kept.len(), &columns);
-    match evidence {
-        Evidence::Weight => {}
-        Evidence::Root => rows.par_iter_mut().flat_map(|r| &mut r.value).for_each(|w| *w = w.sqrt()),
-        Evidence::Share => {
-            let unit_of = |mask: u32| {
-                let row = footprints.rows[masks[mask as usize] as usize];
-                (row.view, row.level)
-            };
-            rows.par_iter_mut().for_each(|r| shares(r, unit_of));
-        }
-    }
-    matrix(masks, rows, &Neighbours { k: graph.gaussian_k, items: &graph.gaussian_knn }, smooth)
+    let rows = by_gaussian(graph.kept.len(), &columns);
+    matrix(masks, rows, &Neighbours { k: graph.gaussian_k, items: &graph.gaussian_knn })
 }
 
 /// Spatial neighbours of every Gaussian, padded with itself.
-struct Neighbours<'a> {
-    k: usize,
-    items: &'a [u32],
+pub(super) struct Neighbours<'a> {
+    pub(super) k: usize,
+    pub(super) items: &'a [u32],
 }
 
 impl Neighbours<'_> {
@@ -64,7 +43,7 @@ impl Neighbours<'_> {
 
 /// Evidence of [`CHUNK`] consecutive Gaussians, a row each; masks ascend within a row.
 #[derive(Debug, Default)]
-struct Rows {
+pub(super) struct Rows {
     start: Vec<u32>,
     mask: Vec<u32>,
     value: Vec<f32>,
@@ -82,7 +61,7 @@ fn row_of(rows: &[Rows], i: usize) -> (&[u32], &[f32]) {
 }
 
 /// The same entries by Gaussian that `columns` has by mask, with Gaussians ascending.
-fn by_gaussian(n: usize, columns: &[(&[u32], &[f32])]) -> Vec<Rows> {
+pub(super) fn by_gaussian(n: usize, columns: &[(&[u32], &[f32])]) -> Vec<Rows> {
     let chunk = |c: usize| {
         let (first, last) = ((c * CHUNK) as u32, ((c + 1) * CHUNK).min(n) as u32);
         let ranges: Vec<(usize, usize)> = columns
@@ -111,22 +90,6 @@ fn by_gaussian(n: usize, columns: &[(&[u32], &[f32])]) -> Vec<Rows> {
         Rows { start, mask, value }
     };
     (0..n.div_ceil(CHUNK)).into_par_iter().map(chunk).collect()
-}
-
-/// Divides each Gaussian's entries of a view and level by their sum.
-fn shares(rows: &mut Rows, unit_of: impl Fn(u32) -> (u32, u32)) {
-    for i in 0..rows.start.len() - 1 {
-        let range = rows.start[i] as usize..rows.start[i + 1] as usize;
-        let (masks, values) = (&rows.mask[range.clone()], &mut rows.value[range]);
-        let mut from = 0;
-        while from < masks.len() {
-            let unit = unit_of(masks[from]);
-            let to = from + masks[from..].iter().take_while(|&&k| unit_of(k) == unit).count();
-            let sum: f32 = values[from..to].iter().sum();
-            values[from..to].iter_mut().for_each(|v| *v /= sum.max(f32::MIN_POSITIVE));
-            from = to;
-        }
-    }
 }
 
 /// Parts the Gaussians into patches of [`BLOCK`], each grown over the neighbours of its first, which lies at the rim of
@@ -185,16 +148,14 @@ struct Scratch {
 fn smoothed(
     patch: Vec<u32>,
     rows: &[Rows],
-    neighbours: Option<&Neighbours<'_>>,
+    neighbours: &Neighbours<'_>,
     scratch: &mut Scratch,
 ) -> (Block, Vec<f64>, Vec<f64>) {
     // Whose evidence counts: the patch and what surrounds it.
     let mut around: Vec<u32> = patch.clone();
-    if let Some(n) = neighbours {
-        around.extend(patch.iter().flat_map(|&i| n.of(i as usize)).map(|j| j as u32));
-        around.sort_unstable();
-        around.dedup();
-    }
+    around.extend(patch.iter().flat_map(|&i| neighbours.of(i as usize)).map(|j| j as u32));
+    around.sort_unstable();
+    around.dedup();
     let mut masks: Vec<u32> = Vec::new();
     for &i in &around {
         for &k in row_of(rows, i as usize).0 {
@@ -230,7 +191,7 @@ fn smoothed(
             count += 1;
         };
         add(i as usize);
-        neighbours.into_iter().flat_map(|n| n.of(i as usize)).for_each(add);
+        neighbours.of(i as usize).for_each(add);
         let share = 1.0 / count as f32;
         let mut total = 0.0;
         for (k, s) in sum.iter_mut().enumerate().filter(|(_, s)| **s > 0.0) {
@@ -251,14 +212,13 @@ fn smoothed(
 }
 
 /// C from the evidence.
-fn matrix(masks: Vec<u32>, rows: Vec<Rows>, neighbours: &Neighbours<'_>, smooth: bool) -> Matrix {
+pub(super) fn matrix(masks: Vec<u32>, rows: Vec<Rows>, neighbours: &Neighbours<'_>) -> Matrix {
     let n = rows.iter().map(|r| r.start.len() - 1).sum();
-    let spread = smooth.then_some(neighbours);
     let scratch = || Scratch { place: vec![0; n], local: vec![u32::MAX; masks.len()] };
     let made: Vec<(Block, Vec<f64>, Vec<f64>)> = patches(n, neighbours)
         .into_par_iter()
         .with_min_len(16)
-        .map_init(scratch, |scratch, patch| smoothed(patch, &rows, spread, scratch))
+        .map_init(scratch, |scratch, patch| smoothed(patch, &rows, neighbours, scratch))
         .collect();
     drop(rows);
     let inverse_root = |v: f64| if v > 0.0 { 1.0 / v.sqrt() } else { 0.0 };
@@ -274,66 +234,31 @@ fn matrix(masks: Vec<u32>, rows: Vec<Rows>, neighbours: &Neighbours<'_>, smooth:
 }
 
 #[cfg(test)]
-pub(crate) mod tests {
+mod tests {
     use super::*;
-    use rand::{Rng, SeedableRng};
-    use rand_chacha::ChaCha8Rng;
-
-    /// Evidence of `masks` random masks on `n` Gaussians, by mask.
-    fn columns(n: usize, masks: usize) -> Vec<(Vec<u32>, Vec<f32>)> {
-        let mut rng = ChaCha8Rng::seed_from_u64(2);
-        (0..masks)
-            .map(|_| {
-                let g: Vec<u32> = (0..n as u32).filter(|_| rng.random_range(0.0..1.0) < 0.3).collect();
-                let w = g.iter().map(|_| rng.random_range(0.1..3.0)).collect();
-                (g, w)
-            })
-            .collect()
-    }
-
-    /// Every Gaussian's neighbours on a line: before, behind, and two behind.
-    fn line(n: usize) -> Vec<u32> {
-        let inside = |i: i64, j: i64| if (0..n as i64).contains(&j) { j as u32 } else { i as u32 };
-        (0..n as i64).flat_map(|i| [i - 1, i + 1, i + 2].map(|j| inside(i, j))).collect()
-    }
-
-    /// A random matrix of `n` Gaussians and `masks` masks, smoothed or not.
-    pub fn random(n: usize, masks: usize, smooth: bool) -> Matrix {
-        let columns = columns(n, masks);
-        let slices: Vec<(&[u32], &[f32])> = columns.iter().map(|(g, w)| (&g[..], &w[..])).collect();
-        let items = line(n);
-        let neighbours = Neighbours { k: 3, items: &items };
-        matrix((0..masks as u32).collect(), by_gaussian(n, &slices), &neighbours, smooth)
-    }
+    use crate::spectral::testing::{columns, dense, line, random};
 
     #[test]
     fn the_matrix_is_evidence_averaged_over_neighbours_and_scaled() {
         // More Gaussians than a block and than a chunk.
         let (n, masks) = (CHUNK + 3000, 9);
-        let columns = columns(n, masks);
         let near = line(n);
-        for smooth in [false, true] {
-            let mut spread = vec![vec![0.0f64; n]; masks];
-            for (k, (gaussians, weights)) in columns.iter().enumerate() {
-                let mut plain = vec![0.0f64; n];
-                gaussians.iter().zip(weights).for_each(|(&i, &w)| plain[i as usize] = f64::from(w));
-                for i in 0..n {
-                    let around: Vec<f64> = near[i * 3..(i + 1) * 3]
-                        .iter()
-                        .filter(|&&j| smooth && j as usize != i)
-                        .map(|&j| plain[j as usize])
-                        .collect();
-                    spread[k][i] = (plain[i] + around.iter().sum::<f64>()) / (1 + around.len()) as f64;
-                }
+        let mut spread = vec![vec![0.0f64; n]; masks];
+        for (k, (gaussians, weights)) in columns(n, masks).iter().enumerate() {
+            let mut plain = vec![0.0f64; n];
+            gaussians.iter().zip(weights).for_each(|(&i, &w)| plain[i as usize] = f64::from(w));
+            for i in 0..n {
+                let others = near[i * 3..(i + 1) * 3].iter().filter(|&&j| j as usize != i);
+                let around: Vec<f64> = others.map(|&j| plain[j as usize]).collect();
+                spread[k][i] = (plain[i] + around.iter().sum::<f64>()) / (1 + around.len()) as f64;
             }
-            let m = random(n, masks, smooth);
-            let row_sums: Vec<f64> = (0..n).map(|i| spread.iter().map(|c| c[i]).sum()).collect();
-            for (k, column) in crate::sparse::tests::dense(&m).iter().enumerate() {
-                let column_sum: f64 = spread[k].iter().sum();
-                for i in (0..n).step_by(7) {
-                    let expected = spread[k][i] / (row_sums[i] * column_sum).sqrt().max(1e-300);
-                    assert!((column[i] - expected).abs() < 1e-6, "{smooth} {k} {i}: {} {expected}", column[i]);
-                }
+        }
+        let row_sums: Vec<f64> = (0..n).map(|i| spread.iter().map(|c| c[i]).sum()).collect();
+        for (k, column) in dense(&random(n, masks)).iter().enumerate() {
+            let column_sum: f64 = spread[k].iter().sum();
+            for i in (0..n).step_by(7) {
+                let expected = spread[k][i] / (row_sums[i] * column_sum).sqrt().max(1e-300);
+                assert!((column[i] - expected).abs() < 1e-6, "{k} {i}: {} {expected}", column[i]);
             }
         }
     }
@@ -353,13 +278,5 @@ pub(crate) mod tests {
             let (low, high) = (part.iter().min().unwrap(), part.iter().max().unwrap());
             assert_eq!((high - low) as usize + 1, part.len());
         }
-    }
-
-    #[test]
-    fn shares_sum_to_one_per_view() {
-        // Masks 0 and 1 are of one view, 2 of another.
-        let mut rows = Rows { start: vec![0, 2, 5], mask: vec![0, 2, 0, 1, 2], value: vec![1.0, 5.0, 2.0, 6.0, 5.0] };
-        shares(&mut rows, |r| (u32::from(r == 2), 3));
-        assert_eq!(rows.value, [1.0, 1.0, 0.25, 0.75, 1.0]);
     }
 }

@@ -1,25 +1,12 @@
 //! Losses on the centroids of the masks of one view (paper, "Mask-Aware Contrastive Learning"), in f64: there are few
 //! masks.
 
-/// What a mask is pulled to and pushed from.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, clap::ValueEnum)]
-pub enum Loss {
-    /// As the paper prints it: the positive is the mask itself, a constant; only the other masks push.
-    Printed,
-    /// The same with the mask itself in the denominator too: bounded below.
-    #[value(name = "self")]
-    WithSelf,
-    /// The positive is the centroid of a random half of the mask's Gaussians, in numerator and denominator.
-    HalfMask,
-    /// The positive is the centroid of the same thing's mask in another view, in numerator and denominator; a mask
-    /// without counterpart is its own positive.
-    CrossView,
-    /// Per Gaussian instead of per mask: each Gaussian against the centroids of all masks, its own masks being positive
-    /// in proportion to their weight.
-    Gaussian,
-    /// Per pixel: the rendered feature of each sampled pixel against the centroids of all masks, that of its own mask being
-    /// the positive.
-    Pixel,
+use crate::options::Loss;
+use crate::random::splitmix;
+
+/// Whether an entry belongs to the half of its mask that is the positive of [`Loss::HalfMask`].
+pub fn in_half(noise: u64, entry: usize) -> bool {
+    splitmix(noise ^ entry as u64) & 1 == 1
 }
 
 /// Centroids shorter than this have no direction and take no part.

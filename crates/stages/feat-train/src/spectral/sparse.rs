@@ -73,7 +73,7 @@ fn transposed_times(block: &Block, y: &[f32], p: usize, out: &mut [f32]) {
     }
 }
 
-/// The matrix C of [`crate::evidence`].
+/// The matrix C of `evidence`.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Matrix {
     /// Gaussians, n.
@@ -125,42 +125,26 @@ impl Matrix {
 }
 
 #[cfg(test)]
-pub(crate) mod tests {
-    use super::*;
-    use crate::evidence::tests::random;
-    use crate::linalg::{cross, multiply};
-
-    /// The matrix itself, by columns (masks).
-    pub fn dense(matrix: &Matrix) -> Vec<Vec<f64>> {
-        let mut out = vec![vec![0.0; matrix.gaussians]; matrix.masks.len()];
-        for block in &matrix.blocks {
-            for (row, &i) in block.gaussians.iter().enumerate() {
-                for at in block.start[row]..block.start[row + 1] {
-                    out[block.masks[block.mask[at] as usize] as usize][i as usize] = f64::from(block.value[at]);
-                }
-            }
-        }
-        out
-    }
+mod tests {
+    use crate::spectral::linalg::{cross, multiply};
+    use crate::spectral::testing::{dense, random};
 
     #[test]
     fn products_are_those_of_the_dense_matrix_whose_largest_singular_value_is_one() {
-        for smooth in [false, true] {
-            let m = random(5000, 12, smooth);
-            let c = dense(&m);
-            let x: Vec<Vec<f64>> = (0..3).map(|j| (0..12).map(|k| f64::from((k * 7 + j * 5) % 11)).collect()).collect();
-            let rows: Vec<f32> = (0..12).flat_map(|k| x.iter().map(move |c| c[k] as f32)).collect();
-            let (applied, normal) = (multiply(&c, &x), multiply(&cross(&c, &c), &x));
-            for j in 0..3 {
-                let (found, squared) = (m.apply(&rows, 3), m.normal(&rows, 3));
-                assert!((0..5000).all(|i| (f64::from(found[i * 3 + j]) - applied[j][i]).abs() < 1e-5), "{smooth}");
-                assert!((0..12).all(|k| (squared[k * 3 + j] - normal[j][k]).abs() < 1e-4), "{smooth}");
-            }
-            // D^1/2 1 is the leading pair of vectors, with singular value 1.
-            let right: Vec<f32> = m.column_scale.iter().map(|s| if *s > 0.0 { 1.0 / s } else { 0.0 }).collect();
-            for (y, s) in m.apply(&right, 1).iter().zip(&m.row_scale) {
-                assert!((y * s - f32::from(u8::from(*s > 0.0))).abs() < 1e-5, "{y} {s}");
-            }
+        let m = random(5000, 12);
+        let c = dense(&m);
+        let x: Vec<Vec<f64>> = (0..3).map(|j| (0..12).map(|k| f64::from((k * 7 + j * 5) % 11)).collect()).collect();
+        let rows: Vec<f32> = (0..12).flat_map(|k| x.iter().map(move |c| c[k] as f32)).collect();
+        let (applied, normal) = (multiply(&c, &x), multiply(&cross(&c, &c), &x));
+        for j in 0..3 {
+            let (found, squared) = (m.apply(&rows, 3), m.normal(&rows, 3));
+            assert!((0..5000).all(|i| (f64::from(found[i * 3 + j]) - applied[j][i]).abs() < 1e-5));
+            assert!((0..12).all(|k| (squared[k * 3 + j] - normal[j][k]).abs() < 1e-4));
+        }
+        // D^1/2 1 is the leading pair of vectors, with singular value 1.
+        let right: Vec<f32> = m.column_scale.iter().map(|s| if *s > 0.0 { 1.0 / s } else { 0.0 }).collect();
+        for (y, s) in m.apply(&right, 1).iter().zip(&m.row_scale) {
+            assert!((y * s - f32::from(u8::from(*s > 0.0))).abs() < 1e-5, "{y} {s}");
         }
     }
 }

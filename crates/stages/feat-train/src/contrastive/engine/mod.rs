@@ -1,4 +1,4 @@
-//! The model of [`crate::model`] in f32 for mask losses standardised per channel: the same numbers up to rounding, in
+//! The model of [`super::model`] in f32 for mask losses standardised per channel: the same numbers up to rounding, in
 //! about a tenth of the time. The readable model is the oracle it is tested against.
 //!
 //! An iteration makes five passes in parallel, each over chunks of fixed size whose sums are added up in order in f64:
@@ -10,51 +10,22 @@ mod kernels;
 #[cfg(test)]
 mod tests;
 
-use crate::adam::{Adam, Rates};
-use crate::loss::{self, Evaluated, Loss, directions};
-use crate::model::{COLOR, Model, Settings, splitmix};
-use crate::normalize::{Axis, Moments, channel_moments};
-use crate::real::Weight;
-use crate::scene::{Context, MaskSet, NONE, Neighbours, inputs_are_of_gaussians};
-use kernels::{BLOCK, Half, Lanes, Piece, adam_rows, centroids, columns_backward, for_width, inputs};
+use super::adam::{Adam, Rates};
+use super::alignment::alignment;
+use super::context::{Context, NONE};
+use super::loss::{self, Evaluated};
+use super::masks::MaskSet;
+use super::model::{COLOR, Model};
+use super::normalize::{Moments, channel_moments};
+use crate::options::{Axis, Contrastive, Loss, Neighbours};
+use kernels::{BLOCK, Half, Lanes, Piece, centroids, columns_backward, for_width, inputs};
 use rayon::prelude::*;
 use std::ops::Range;
-use std::time::{Duration, Instant};
 
 /// Rows of anchors are padded to multiples of this.
 const PAD: usize = 8;
 /// Gaussians worked on at a time, about.
 const GAUSSIANS: usize = 4096;
-
-/// What is done less often than the method asks for; the default is nothing.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub struct Shortcuts {
-    /// Means and deviations are taken anew every so many iterations; 1 is exact.
-    pub stats_every: u64,
-    /// Gaussians without gradient stay as they are, and so do their moments.
-    pub lazy_adam: bool,
-}
-
-impl Default for Shortcuts {
-    fn default() -> Self {
-        Self { stats_every: 1, lazy_adam: false }
-    }
-}
-
-/// Where the time went.
-#[derive(Debug, Clone, Copy, Default, PartialEq)]
-pub struct Timings {
-    /// The graph network forward, with the statistics.
-    pub propagate: Duration,
-    /// Centroids of the view's masks.
-    pub centroids: Duration,
-    /// The loss and its gradient of the centroids.
-    pub loss: Duration,
-    /// Gradients of the columns, Adam on all features, and their sums for the next statistics: one pass.
-    pub features: Duration,
-    /// The graph network backward.
-    pub backward: Duration,
-}
 
 /// Places and anchors worked on together: all places that receive these anchors' output.
 #[derive(Debug, Clone)]
@@ -99,8 +70,7 @@ fn transposed(w: &[f32], rows: usize) -> Vec<f32> {
 #[derive(Debug)]
 pub struct Engine<'a> {
     context: &'a Context,
-    settings: Settings,
-    shortcuts: Shortcuts,
+    options: Contrastive,
     d: usize,
     /// Channels of a padded feature.
     pitch: usize,
@@ -121,8 +91,6 @@ pub struct Engine<'a> {
     hat_gradient: Vec<f32>,
     /// Gradients of the outputs of two layers, and sums of one over anchors that have it as a neighbour.
     gradients: [Vec<Lanes>; 3],
-    /// Where the time went.
-    pub timings: Timings,
 }
 
 /// The parts of `values` that end at `ends`.
@@ -138,19 +106,19 @@ fn split<T>(mut values: &mut [T], ends: impl Iterator<Item = usize>) -> Vec<&mut
 }
 
 impl<'a> Engine<'a> {
-    /// Whether the engine can train with these settings; the readable model can with all.
-    pub fn serves(settings: &Settings) -> bool {
-        let of_masks = !matches!(settings.loss, Loss::Gaussian | Loss::Pixel);
-        settings.norm_axis == Axis::Channel && settings.cohesion == 0.0 && of_masks && !settings.unit_length
+    /// Whether the engine can train with these options; the readable model can with all.
+    pub fn serves(options: &Contrastive) -> bool {
+        let of_masks = !matches!(options.loss, Loss::Gaussian | Loss::Pixel);
+        options.norm_axis == Axis::Channel && options.cohesion == 0.0 && of_masks && !options.unit_length
     }
 
     /// For training `model` on `context`.
     ///
     /// # Panics
-    /// When the engine does not serve the model's settings.
-    pub fn new(context: &'a Context, model: &Model<f32>, shortcuts: Shortcuts) -> Self {
-        assert!(Self::serves(&model.settings), "settings of the readable model only");
-        let d = model.settings.dim;
+    /// When the engine does not serve the model's options.
+    pub fn new(context: &'a Context, model: &Model<f32>) -> Self {
+        assert!(Self::serves(&model.options), "options of the readable model only");
+        let d = model.dim;
         let m = if model.layers.is_empty() { 0 } else { context.anchors.len() };
         let (pitch, blocks) = (d.next_multiple_of(PAD), m.div_ceil(BLOCK));
         let lanes = |channels: usize| vec![[0.0f32; BLOCK]; blocks * channels];
@@ -165,8 +133,7 @@ impl<'a> Engine<'a> {
         let chunks = chunks(context);
         let mut engine = Self {
             context,
-            settings: model.settings.clone(),
-            shortcuts,
+            options: model.options.clone(),
             d,
             pitch,
             sums: vec![Sums::default(); chunks.len()],
@@ -180,7 +147,6 @@ impl<'a> Engine<'a> {
             hat_moments: Vec::new(),
             hat_gradient: vec![0.0; m * pitch],
             gradients: [lanes(widest), lanes(widest), if anchors { lanes(widest) } else { Vec::new() }],
-            timings: Timings::default(),
         };
         engine.sum_features(model);
         engine
@@ -194,24 +160,6 @@ impl<'a> Engine<'a> {
             + rows.map(|v| v.len() * size_of::<f32>()).iter().sum::<usize>()
     }
 
-    /// The statistics in use, for a checkpoint: with `stats_every` they are older than the features.
-    pub fn statistics(&self) -> Vec<f64> {
-        let all = self.moments.iter().chain(&self.hat_moments);
-        all.flat_map(|m| [m.mean, m.deviation, m.inverse, m.count]).collect()
-    }
-
-    /// Takes up the statistics of a checkpoint.
-    pub fn restore(&mut self, statistics: &[f64]) {
-        let mut all: Vec<Moments> = statistics
-            .chunks_exact(4)
-            .map(|s| Moments { mean: s[0], deviation: s[1], inverse: s[2], count: s[3] })
-            .collect();
-        if all.len() == 2 * self.d {
-            self.hat_moments = all.split_off(self.d);
-            self.moments = all;
-        }
-    }
-
     fn sum_features(&mut self, model: &Model<f32>) {
         let d = self.d;
         self.sums.par_iter_mut().zip(&self.chunks).for_each(|(sums, chunk)| {
@@ -219,29 +167,18 @@ impl<'a> Engine<'a> {
         });
     }
 
-    /// Whether statistics are taken anew in iteration `iteration`, which counts from 0.
-    fn due(&self, iteration: u64) -> bool {
-        iteration.is_multiple_of(self.shortcuts.stats_every) || self.moments.is_empty()
-    }
-
-    /// Runs the graph network; `iteration` counts from 0.
-    pub fn propagate(&mut self, model: &Model<f32>, iteration: u64) {
+    /// Runs the graph network.
+    pub fn propagate(&mut self, model: &Model<f32>) {
         if model.layers.is_empty() {
             return;
         }
-        let start = Instant::now();
         let (d, pitch, context) = (self.d, self.pitch, self.context);
-        let due = self.due(iteration);
-        if due {
-            self.moments = (0..d).map(|c| Moments::from_parts(self.sums.iter().map(|s| s.part(c)))).collect();
-        }
+        self.moments = (0..d).map(|c| Moments::from_parts(self.sums.iter().map(|s| s.part(c)))).collect();
         self.take_inputs(model);
         for l in 0..model.layers.len() {
             self.run_layer(model, l);
         }
-        if due || self.hat_moments.is_empty() {
-            self.hat_moments = output_moments(&self.output, d, &context.served);
-        }
+        self.hat_moments = output_moments(&self.output, d, &context.served);
         let (mean, inverse) = floats(&self.hat_moments);
         self.hat.par_chunks_mut(BLOCK * pitch).zip(self.output.par_chunks(d)).for_each(|(hat, y)| {
             for (a, hat) in hat.chunks_exact_mut(pitch).enumerate() {
@@ -250,14 +187,13 @@ impl<'a> Engine<'a> {
                 }
             }
         });
-        self.timings.propagate += start.elapsed();
     }
 
     /// Standardised features of the anchors, and, with Gaussians as neighbours, their sums.
     fn take_inputs(&mut self, model: &Model<f32>) {
         let (d, channels, context) = (self.d, self.d + COLOR, self.context);
         let (mean, inverse) = floats(&self.moments);
-        let of_gaussians = inputs_are_of_gaussians(context.kind);
+        let of_gaussians = context.neighbours_are_places();
         let blocks = self.inputs[0].par_chunks_mut(channels).zip(self.around[0].par_chunks_mut(channels));
         blocks.enumerate().for_each(|(block, (own, around))| {
             let anchors = block * BLOCK..((block + 1) * BLOCK).min(context.anchors.len());
@@ -296,17 +232,12 @@ impl<'a> Engine<'a> {
     }
 
     /// Centroids A f of all masks `[K][d]`, after [`Engine::propagate`].
-    pub fn centroids<W: Weight>(&self, model: &Model<f32>, set: &MaskSet<W>) -> Vec<f64> {
+    pub fn centroids(&self, model: &Model<f32>, set: &MaskSet) -> Vec<f64> {
         self.mask_means(model, set, None).0
     }
 
     /// Centroids of the masks `[K][d]`, and of their halves where asked for.
-    fn mask_means<W: Weight>(
-        &self,
-        model: &Model<f32>,
-        set: &MaskSet<W>,
-        half: Option<Half<'_>>,
-    ) -> (Vec<f64>, Vec<f64>) {
+    fn mask_means(&self, model: &Model<f32>, set: &MaskSet, half: Option<Half<'_>>) -> (Vec<f64>, Vec<f64>) {
         let (d, pitch) = (self.d, self.pitch);
         let length = set.len() * pitch;
         let parts: Vec<(Vec<f32>, Vec<f32>)> = self
@@ -321,7 +252,7 @@ impl<'a> Engine<'a> {
                 let mut halves = vec![0.0; if half.is_some() { length } else { 0 }];
                 let both = half.map(|half| (&mut halves[..], half));
                 let piece = self.piece(set, columns);
-                for_width!(d, centroids[W](d, pitch, piece, &model.features, &self.hat, &mut sums, both));
+                for_width!(d, centroids(d, pitch, piece, &model.features, &self.hat, &mut sums, both));
                 Some((sums, halves))
             })
             .collect();
@@ -338,7 +269,7 @@ impl<'a> Engine<'a> {
         (total(all), if half.is_some() { total(halves) } else { Vec::new() })
     }
 
-    fn piece<'b, W: Weight>(&'b self, set: &'b MaskSet<W>, columns: Range<usize>) -> Piece<'b, W> {
+    fn piece<'b>(&'b self, set: &'b MaskSet, columns: Range<usize>) -> Piece<'b> {
         Piece {
             columns: &set.columns[columns.clone()],
             start: &set.start[columns.start..=columns.end],
@@ -348,72 +279,48 @@ impl<'a> Engine<'a> {
         }
     }
 
-    /// The loss on one view and its gradients of the centroids. `noise` seeds the halves of [`Loss::HalfMask`].
-    pub fn evaluate<W: Weight>(&mut self, model: &Model<f32>, set: &MaskSet<W>, noise: u64) -> Evaluated {
-        self.evaluate_beside(model, set, noise, None)
-    }
-
-    /// [`Engine::evaluate`], with positives from another view `[K][d]` for [`Loss::CrossView`].
-    pub fn evaluate_beside<W: Weight>(
-        &mut self,
-        model: &Model<f32>,
-        set: &MaskSet<W>,
-        noise: u64,
-        beside: Option<&[f64]>,
-    ) -> Evaluated {
-        let start = Instant::now();
-        let s = &self.settings;
-        let half = move |entry: usize| in_half(noise, entry);
+    /// The loss on one view and its gradients of the centroids. `noise` seeds the halves of [`Loss::HalfMask`]; `beside` are
+    /// positives from another view `[K][d]` for [`Loss::CrossView`].
+    pub fn evaluate(&self, model: &Model<f32>, set: &MaskSet, noise: u64, beside: Option<&[f64]>) -> Evaluated {
+        let s = &self.options;
+        let half = move |entry: usize| loss::in_half(noise, entry);
         let with_halves = s.loss == Loss::HalfMask;
         let (means, positives) = self.mask_means(model, set, with_halves.then_some(&half));
-        let taken = start.elapsed();
         let positives = with_halves.then_some(&positives[..]).or(beside);
-        let evaluated = loss::evaluate(s.loss, &means, positives, self.d, s.tau);
-        self.timings.centroids += taken;
-        self.timings.loss += start.elapsed() - taken;
-        evaluated
+        loss::evaluate(s.loss, &means, positives, self.d, s.tau)
     }
 
     /// Takes the gradients of the centroids back, and moves the features by one step of Adam. Gives the gradients of the
-    /// network's weights. `iteration` counts from 0; `noise` is that of [`Engine::evaluate`].
-    pub fn backward<W: Weight>(
+    /// network's weights. `noise` is that of [`Engine::evaluate`].
+    pub fn backward(
         &mut self,
         model: &mut Model<f32>,
         adam: &mut Adam<f32>,
-        set: &MaskSet<W>,
+        set: &MaskSet,
         evaluated: &Evaluated,
         noise: u64,
         rates: &Rates,
-        iteration: u64,
     ) -> Vec<Vec<f32>> {
-        let start = Instant::now();
-        let totals = self.move_features(model, adam, set, evaluated, noise, rates, iteration);
-        let moved = start.elapsed();
-        let gradients = if model.layers.is_empty() { Vec::new() } else { self.network_gradients(model, &totals) };
-        self.timings.features += moved;
-        self.timings.backward += start.elapsed() - moved;
-        gradients
+        let totals = self.move_features(model, adam, set, evaluated, noise, rates);
+        if model.layers.is_empty() { Vec::new() } else { self.network_gradients(model, &totals) }
     }
 
     /// The pass over all features. Gives, per channel, the sums of g and of g y over anchors, y being the standardised
     /// output and g its gradient.
-    fn move_features<W: Weight>(
+    fn move_features(
         &mut self,
         model: &mut Model<f32>,
         adam: &mut Adam<f32>,
-        set: &MaskSet<W>,
+        set: &MaskSet,
         evaluated: &Evaluated,
         noise: u64,
         rates: &Rates,
-        iteration: u64,
     ) -> Vec<[f64; 2]> {
         let (d, pitch) = (self.d, self.pitch);
-        let half = move |entry: usize| in_half(noise, entry);
+        let half = move |entry: usize| loss::in_half(noise, entry);
         let masks = pad_rows(&evaluated.centroids, d, pitch);
         let halves = pad_rows(&evaluated.positives, d, pitch);
         let with_network = !model.layers.is_empty();
-        let sum_again = with_network && self.due(iteration + 1);
-        let lazy = self.shortcuts.lazy_adam;
         let places = || self.chunks.iter().map(|c| c.places.end * d);
         let mut hat_gradient = std::mem::take(&mut self.hat_gradient);
         let mut sums = std::mem::take(&mut self.sums);
@@ -435,9 +342,7 @@ impl<'a> Engine<'a> {
                 let columns = columns_in(set, chunk);
                 anchors.fill(0.0);
                 if columns.is_empty() {
-                    if !lazy {
-                        kernels::adam_without(p, m, v, rates);
-                    }
+                    kernels::adam_without(p, m, v, rates);
                 } else {
                     rows.clear();
                     rows.resize(p.len(), 0.0);
@@ -445,14 +350,10 @@ impl<'a> Engine<'a> {
                     let both = (!halves.is_empty()).then_some((&halves[..], &half as Half<'_>));
                     let to = (chunk.places.start, &mut rows[..]);
                     let to_anchors = (chunk.anchors.start, &mut anchors[..]);
-                    for_width!(d, columns_backward[W](d, pitch, piece, &masks, both, to, to_anchors));
-                    if lazy {
-                        for_width!(d, adam_rows(d, piece.columns, chunk.places.start, p, m, v, rows, rates));
-                    } else {
-                        kernels::adam(p, m, v, rows, rates);
-                    }
+                    for_width!(d, columns_backward(d, pitch, piece, &masks, both, to, to_anchors));
+                    kernels::adam(p, m, v, rows, rates);
                 }
-                if sum_again {
+                if with_network {
                     sums.of(d, p);
                 }
                 if anchors.is_empty() || columns_in(set, chunk).is_empty() {
@@ -539,7 +440,6 @@ impl<'a> Engine<'a> {
                 total.iter_mut().zip(part).for_each(|(t, p)| *t += f64::from(*p));
             }
             out[l] = total.into_iter().map(|v| v as f32).collect();
-            out[l][layer.frozen.clone()].fill(0.0);
             std::mem::swap(&mut gradient, &mut above);
         }
         self.gradients = [gradient, above, around];
@@ -574,14 +474,13 @@ impl<'a> Engine<'a> {
         });
     }
 
-    /// f_final of the Gaussian at `place`, into `out`.
-    fn final_feature(&self, model: &Model<f32>, place: usize, out: &mut [f32]) {
+    /// f_final of the Gaussian at `place`.
+    fn final_feature<'b>(&'b self, model: &'b Model<f32>, place: usize) -> impl Iterator<Item = f32> + 'b {
         let (d, source) = (self.d, self.context.source[place]);
-        out.copy_from_slice(&model.features[place * d..(place + 1) * d]);
-        if source != NONE && !self.hat.is_empty() {
-            let hat = &self.hat[source as usize * self.pitch..];
-            out.iter_mut().zip(hat).for_each(|(o, h)| *o += h);
-        }
+        let received = source != NONE && !self.hat.is_empty();
+        let hat = received.then(|| &self.hat[source as usize * self.pitch..]);
+        let own = model.features[place * d..(place + 1) * d].iter().enumerate();
+        own.map(move |(c, &v)| hat.map_or(v, |hat| v + hat[c]))
     }
 
     /// f_final of all Gaussians `[n][d]`, in the order of `kept`, after [`Engine::propagate`].
@@ -589,52 +488,22 @@ impl<'a> Engine<'a> {
         let d = self.d;
         let mut out = vec![0.0f32; model.features.len()];
         for (place, &i) in self.context.order.iter().enumerate() {
-            self.final_feature(model, place, &mut out[i as usize * d..(i as usize + 1) * d]);
+            let to = &mut out[i as usize * d..(i as usize + 1) * d];
+            to.iter_mut().zip(self.final_feature(model, place)).for_each(|(o, v)| *o = v);
         }
         out
     }
 
-    /// Mean over masks of the weighted mean cosine between a mask's Gaussians and its centroid.
-    pub fn alignment<W: Weight>(&self, model: &Model<f32>, set: &MaskSet<W>) -> f64 {
-        let (d, masks) = (self.d, set.len());
-        let (unit, _) = directions(&self.centroids(model, set), d);
-        let parts: Vec<Vec<f64>> = set
-            .pieces
-            .par_windows(2)
-            .map(|bounds| {
-                let mut sums = vec![0.0; 2 * masks];
-                let mut f = vec![0.0f32; d];
-                for c in bounds[0] as usize..bounds[1] as usize {
-                    self.final_feature(model, set.columns[c] as usize, &mut f);
-                    let length = f.iter().map(|v| f64::from(*v) * f64::from(*v)).sum::<f64>().sqrt();
-                    let inverse = if length > loss::SHORTEST { 1.0 / length } else { 0.0 };
-                    let (mask, weight) = set.entries(c);
-                    for (&k, &w) in mask.iter().zip(weight) {
-                        let k = k as usize;
-                        let along: f64 = unit[k * d..(k + 1) * d].iter().zip(&f).map(|(u, f)| u * f64::from(*f)).sum();
-                        sums[k] += f64::from(w.get()) * along * inverse;
-                        sums[masks + k] += f64::from(w.get());
-                    }
-                }
-                sums
-            })
-            .collect();
-        let mut sums = vec![0.0; 2 * masks];
-        for part in parts {
-            sums.iter_mut().zip(part).for_each(|(s, p)| *s += p);
-        }
-        let means = (0..masks).filter(|&k| sums[masks + k] > 0.0).map(|k| sums[k] / sums[masks + k]);
-        means.sum::<f64>() / masks.max(1) as f64
+    /// [`alignment`] of a view's masks.
+    pub fn alignment(&self, model: &Model<f32>, set: &MaskSet) -> f64 {
+        alignment(set, &self.centroids(model, set), self.d, |place, f| {
+            f.iter_mut().zip(self.final_feature(model, place)).for_each(|(f, v)| *f = f64::from(v));
+        })
     }
 }
 
-/// Whether an entry belongs to the half of its mask that is the positive of [`Loss::HalfMask`].
-fn in_half(noise: u64, entry: usize) -> bool {
-    splitmix(noise ^ entry as u64) & 1 == 1
-}
-
 /// Positions of the columns of `set` whose places lie in the chunk.
-fn columns_in<W: Weight>(set: &MaskSet<W>, chunk: &Chunk) -> Range<usize> {
+fn columns_in(set: &MaskSet, chunk: &Chunk) -> Range<usize> {
     let before = |place: usize| set.columns.partition_point(|&c| (c as usize) < place);
     before(chunk.places.start)..before(chunk.places.end)
 }
@@ -665,7 +534,7 @@ fn chunks(context: &Context) -> Vec<Chunk> {
 fn color_inputs(context: &Context, d: usize, own: &mut [Lanes], around: &mut [Lanes]) {
     let moments = channel_moments(context.colors.as_flattened(), COLOR, None);
     let color = |place: u32, c: usize| moments[c].apply(f64::from(context.colors[place as usize][c]));
-    let of_gaussians = inputs_are_of_gaussians(context.kind);
+    let of_gaussians = context.neighbours_are_places();
     for (a, &place) in context.anchors.iter().enumerate() {
         for c in 0..COLOR {
             let (channel, lane) = (a / BLOCK * (d + COLOR) + d + c, a % BLOCK);

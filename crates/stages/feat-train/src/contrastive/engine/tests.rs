@@ -1,21 +1,22 @@
 //! The engine against the readable model.
 
 use super::*;
-use crate::model::AnchorStart;
-use crate::network::Layer;
-use crate::testing::{context, mask_set};
+use crate::contrastive::network::Layer;
+use crate::contrastive::real::Real;
+use crate::contrastive::testing::{context, mask_set};
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
 
-fn settings(dim: usize, layers: usize, loss: Loss) -> Settings {
-    Settings { loss, ..Settings::printed(dim, layers) }
+fn options(layers: usize, loss: Loss) -> Contrastive {
+    Contrastive { layers, loss, ..Contrastive::default() }
 }
 
 /// The same model in f64.
 fn widened(model: &Model<f32>) -> Model<f64> {
     let wide = |v: &[f32]| v.iter().map(|&v| f64::from(v)).collect::<Vec<f64>>();
     Model {
-        settings: model.settings.clone(),
+        dim: model.dim,
+        options: model.options.clone(),
         features: wide(&model.features),
         layers: model
             .layers
@@ -26,7 +27,6 @@ fn widened(model: &Model<f32>) -> Model<f64> {
                 output: l.output,
                 weights: wide(&l.weights),
                 relu: l.relu,
-                frozen: l.frozen.clone(),
             })
             .collect(),
     }
@@ -39,24 +39,22 @@ fn difference(found: &[f32], exact: &[f64]) -> f64 {
     found.iter().zip(exact).map(|(f, e)| (f64::from(*f) - e).abs()).fold(0.0, f64::max) / largest.max(1e-30)
 }
 
-fn check(settings: Settings, kind: Neighbours, propagate: bool) {
-    let name = format!("{settings:?} {kind:?} {propagate}");
+fn check(d: usize, options: Contrastive, kind: Neighbours, propagate: bool) {
+    let name = format!("{d} {options:?} {kind:?} {propagate}");
     let context = context(4501, kind, propagate);
     let set = mask_set(&context, 23, 3);
-    let mut model = Model::<f32>::new(settings, &context, &mut ChaCha8Rng::seed_from_u64(5));
+    let mut model = Model::<f32>::new(d, options, &context, &mut ChaCha8Rng::seed_from_u64(5));
     let exact = widened(&model);
     let propagated = exact.propagate(&context);
-    let beside: Vec<f64> =
-        (0..23 * exact.settings.dim).map(|i| if i < 40 { (i * i % 7) as f64 - 2.0 } else { 0.0 }).collect();
-    let beside = (exact.settings.loss == Loss::CrossView).then_some(&beside[..]);
-    let step = exact.step_beside(&context, &propagated, &set, 77, beside);
+    let beside: Vec<f64> = (0..23 * d).map(|i| if i < 40 { (i * i % 7) as f64 - 2.0 } else { 0.0 }).collect();
+    let beside = (exact.options.loss == Loss::CrossView).then_some(&beside[..]);
+    let step = exact.step(&context, &propagated, &set, 77, beside);
 
-    let mut engine = Engine::new(&context, &model, Shortcuts::default());
-    engine.propagate(&model, 0);
-    let evaluated = engine.evaluate_beside(&model, &set, 77, beside);
+    let mut engine = Engine::new(&context, &model);
+    engine.propagate(&model);
+    let evaluated = engine.evaluate(&model, &set, 77, beside);
     assert!((evaluated.loss - step.loss).abs() <= 1e-5 * step.loss.abs(), "{name}: {} {}", evaluated.loss, step.loss);
     assert!((evaluated.separation - step.separation).abs() <= 1e-5);
-    let d = model.settings.dim;
     let alignment = exact.alignment(&context, &propagated, &set);
     assert!((engine.alignment(&model, &set) - alignment).abs() <= 1e-5, "{name}: alignment");
     let finals: Vec<f64> = exact.final_features(&context, &propagated).iter().map(|v| f64::from(*v)).collect();
@@ -64,7 +62,7 @@ fn check(settings: Settings, kind: Neighbours, propagate: bool) {
 
     let before = model.features.clone();
     let mut adam = Adam::new(before.len());
-    let layers = engine.backward(&mut model, &mut adam, &set, &evaluated, 77, &Rates::none(), 0);
+    let layers = engine.backward(&mut model, &mut adam, &set, &evaluated, 77, &Rates::none());
     assert!(before == model.features);
     let rows: Vec<f32> =
         set.columns.iter().flat_map(|&p| adam.mean[p as usize * d..(p as usize + 1) * d].to_vec()).collect();
@@ -84,24 +82,22 @@ fn agrees_with_the_readable_model() {
     use Neighbours::{AnchorInputs, Anchors, Gaussians};
     for layers in 0..=4 {
         for kind in [Gaussians, Anchors, AnchorInputs] {
-            check(settings(6, layers, Loss::Printed), kind, true);
+            check(6, options(layers, Loss::Printed), kind, true);
         }
     }
     for d in [2, 5, 16, 64] {
-        check(settings(d, 2, Loss::WithSelf), Anchors, true);
+        check(d, options(2, Loss::WithSelf), Anchors, true);
     }
-    check(settings(6, 2, Loss::HalfMask), Gaussians, true);
-    check(settings(6, 2, Loss::CrossView), Gaussians, true);
+    check(6, options(2, Loss::HalfMask), Gaussians, true);
+    check(6, options(2, Loss::CrossView), Gaussians, true);
     for kind in [Gaussians, Anchors] {
-        let start = Settings { anchor_start: AnchorStart::Feature, ..settings(6, 2, Loss::Printed) };
-        check(start.clone(), kind, true);
-        check(Settings { last_relu: false, ..start }, kind, true);
-        check(settings(6, 3, Loss::Printed), kind, false);
+        check(6, Contrastive { no_last_relu: true, ..options(2, Loss::Printed) }, kind, true);
+        check(6, options(3, Loss::Printed), kind, false);
     }
 }
 
 /// Trains the engine or the readable model for `iterations` on two views in turn.
-fn trained<T: crate::real::Real>(
+fn trained<T: Real>(
     model: &mut Model<T>,
     iterations: u64,
     mut step: impl FnMut(&mut Model<T>, u64) -> Vec<Vec<T>>,
@@ -116,13 +112,13 @@ fn trained<T: crate::real::Real>(
     model.features.iter().map(|v| v.get()).collect()
 }
 
-fn by_readable<T: crate::real::Real>(context: &Context, sets: &[MaskSet], model: &mut Model<T>, n: u64) -> Vec<f64> {
+fn by_readable<T: Real>(context: &Context, sets: &[MaskSet], model: &mut Model<T>, n: u64) -> Vec<f64> {
     let mut adam = Adam::<T>::new(model.features.len());
-    let d = model.settings.dim;
+    let d = model.dim;
     trained(model, n, |model, i| {
         let set = &sets[i as usize % sets.len()];
         let propagated = model.propagate(context);
-        let step = model.step(context, &propagated, set, i);
+        let step = model.step(context, &propagated, set, i, None);
         let mut dense = vec![T::default(); model.features.len()];
         for (row, &place) in step.features.chunks_exact(d).zip(&set.columns) {
             dense[place as usize * d..(place as usize + 1) * d].copy_from_slice(row);
@@ -132,14 +128,14 @@ fn by_readable<T: crate::real::Real>(context: &Context, sets: &[MaskSet], model:
     })
 }
 
-fn by_engine(context: &Context, sets: &[MaskSet], model: &mut Model<f32>, shortcuts: Shortcuts, n: u64) -> Vec<f64> {
-    let mut engine = Engine::new(context, model, shortcuts);
+fn by_engine(context: &Context, sets: &[MaskSet], model: &mut Model<f32>, n: u64) -> Vec<f64> {
+    let mut engine = Engine::new(context, model);
     let mut adam = Adam::new(model.features.len());
     trained(model, n, |model, i| {
         let set = &sets[i as usize % sets.len()];
-        engine.propagate(model, i);
-        let evaluated = engine.evaluate(model, set, i);
-        engine.backward(model, &mut adam, set, &evaluated, i, &Rates::at(1e-3, i + 1), i)
+        engine.propagate(model);
+        let evaluated = engine.evaluate(model, set, i, None);
+        engine.backward(model, &mut adam, set, &evaluated, i, &Rates::at(1e-3, i + 1))
     })
 }
 
@@ -147,11 +143,11 @@ fn by_engine(context: &Context, sets: &[MaskSet], model: &mut Model<f32>, shortc
 fn stays_with_the_readable_model_in_f64_for_1000_iterations() {
     let context = context(400, Neighbours::Gaussians, true);
     let sets = [mask_set(&context, 9, 3), mask_set(&context, 12, 4)];
-    let mut model = Model::<f32>::new(settings(6, 2, Loss::Printed), &context, &mut ChaCha8Rng::seed_from_u64(5));
+    let mut model = Model::<f32>::new(6, options(2, Loss::Printed), &context, &mut ChaCha8Rng::seed_from_u64(5));
     let start: Vec<f64> = model.features.iter().map(|v| f64::from(*v)).collect();
     let oracle = by_readable(&context, &sets, &mut widened(&model), 1000);
     let readable = by_readable(&context, &sets, &mut model.clone(), 1000);
-    let found = by_engine(&context, &sets, &mut model, Shortcuts::default(), 1000);
+    let found = by_engine(&context, &sets, &mut model, 1000);
     let apart = |a: &[f64], b: &[f64]| {
         let squares: f64 = a.iter().zip(b).map(|(a, b)| (a - b) * (a - b)).sum();
         (squares / a.len() as f64).sqrt()
@@ -174,32 +170,15 @@ fn threads_do_not_change_a_bit() {
         let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
         pool.install(|| {
             let mut rng = ChaCha8Rng::seed_from_u64(1);
-            let mut model = Model::<f32>::new(settings(6, 3, Loss::HalfMask), &context, &mut rng);
-            let features = by_engine(&context, &sets, &mut model, Shortcuts::default(), 5);
-            let mut engine = Engine::new(&context, &model, Shortcuts::default());
-            engine.propagate(&model, 5);
+            let mut model = Model::<f32>::new(6, options(3, Loss::HalfMask), &context, &mut rng);
+            let features = by_engine(&context, &sets, &mut model, 5);
+            let mut engine = Engine::new(&context, &model);
+            engine.propagate(&model);
             let alignment = engine.alignment(&model, &sets[0]);
             (features, model, alignment)
         })
     };
     assert!(with(1) == with(3));
-}
-
-#[test]
-fn shortcuts_change_little() {
-    let context = context(2000, Neighbours::Gaussians, true);
-    let sets = [mask_set(&context, 9, 3), mask_set(&context, 12, 4)];
-    let run = |shortcuts| {
-        let mut rng = ChaCha8Rng::seed_from_u64(1);
-        let mut model = Model::<f32>::new(settings(6, 2, Loss::Printed), &context, &mut rng);
-        by_engine(&context, &sets, &mut model, shortcuts, 60)
-    };
-    let exact = run(Shortcuts::default());
-    for shortcuts in [Shortcuts { stats_every: 5, lazy_adam: false }, Shortcuts { stats_every: 1, lazy_adam: true }] {
-        let found = run(shortcuts);
-        let off = found.iter().zip(&exact).map(|(f, e)| (f - e).abs()).fold(0.0, f64::max);
-        assert!(off > 0.0 && off < 0.06, "{shortcuts:?}: {off}");
-    }
 }
 
 /// A mask set of given masks over ranges of places, with one that has no entry at all.
@@ -213,17 +192,17 @@ fn set_of(context: &Context, masks: &[Range<u32>]) -> MaskSet {
 fn run_on(context: &Context, set: &MaskSet, model: &mut Model<f32>, n: u64) -> Vec<f64> {
     let pool = rayon::ThreadPoolBuilder::new().num_threads(1).build().unwrap();
     let sets = [set.clone()];
-    pool.install(|| by_engine(context, &sets, model, Shortcuts::default(), n))
+    pool.install(|| by_engine(context, &sets, model, n))
 }
 
 #[test]
 fn constant_features_and_colors_give_zeros_not_noise() {
     let mut context = context(640, Neighbours::Gaussians, true);
     context.colors.fill([0.1, 0.7, 0.3]);
-    let mut model = Model::<f32>::new(settings(6, 2, Loss::Printed), &context, &mut ChaCha8Rng::seed_from_u64(1));
+    let mut model = Model::<f32>::new(6, options(2, Loss::Printed), &context, &mut ChaCha8Rng::seed_from_u64(1));
     model.features.fill(0.1);
-    let mut engine = Engine::new(&context, &model, Shortcuts::default());
-    engine.propagate(&model, 0);
+    let mut engine = Engine::new(&context, &model);
+    engine.propagate(&model);
     assert!(engine.inputs[0].as_flattened().iter().all(|v| *v == 0.0));
     assert!(engine.around[0].as_flattened().iter().all(|v| *v == 0.0));
     assert!(engine.hat.iter().all(|v| *v == 0.0));
@@ -236,7 +215,7 @@ fn constant_features_and_colors_give_zeros_not_noise() {
 fn one_mask_or_masks_without_entries_or_direction_move_nothing_wrongly() {
     let context = context(64, Neighbours::Gaussians, true);
     let fresh =
-        |layers| Model::<f32>::new(settings(6, layers, Loss::Printed), &context, &mut ChaCha8Rng::seed_from_u64(1));
+        |layers| Model::<f32>::new(6, options(layers, Loss::Printed), &context, &mut ChaCha8Rng::seed_from_u64(1));
     // One mask: nothing to tell apart.
     let mut model = fresh(2);
     let start: Vec<f64> = model.features.iter().map(|v| f64::from(*v)).collect();
@@ -257,8 +236,8 @@ fn one_mask_or_masks_without_entries_or_direction_move_nothing_wrongly() {
 fn a_hundred_thousand_iterations_at_a_low_temperature_stay_finite() {
     let context = context(40, Neighbours::Gaussians, true);
     let set = mask_set(&context, 4, 3);
-    let cold = Settings { tau: 1e-3, ..settings(6, 2, Loss::Printed) };
-    let mut model = Model::<f32>::new(cold, &context, &mut ChaCha8Rng::seed_from_u64(1));
+    let cold = Contrastive { tau: 1e-3, ..options(2, Loss::Printed) };
+    let mut model = Model::<f32>::new(6, cold, &context, &mut ChaCha8Rng::seed_from_u64(1));
     let features = run_on(&context, &set, &mut model, 100_000);
     let weights = model.layers.iter().flat_map(|l| &l.weights);
     assert!(features.iter().all(|v| v.is_finite()) && weights.clone().all(|w| w.is_finite()));

@@ -5,7 +5,7 @@
 //! A block of Gaussians knows a few hundred masks; products of its rows are summed in a dense square that stays in
 //! cache, and the squares of all blocks are then added up mask by mask, in the order of blocks.
 
-use crate::sparse::{Block, Matrix};
+use super::sparse::{Block, Matrix};
 use multiversion::multiversion;
 use rayon::prelude::*;
 
@@ -183,13 +183,12 @@ fn row_times(masks: &[u32], values: &[f32], x: &[[f32; WIDTH]]) -> [f32; WIDTH] 
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::evidence::tests::random;
-    use crate::linalg::cross;
-    use crate::sparse::tests::dense;
+    use crate::spectral::linalg::cross;
+    use crate::spectral::testing::{dense, random};
 
     #[test]
     fn is_the_product_and_refuses_to_grow() {
-        let m = random(5000, 40, true);
+        let m = random(5000, 40);
         let c = dense(&m);
         let product = cross(&c, &c);
         let gram = Gram::new(&m, usize::MAX).unwrap();
@@ -210,7 +209,7 @@ mod tests {
 
     #[test]
     fn squares_in_bands_are_the_same() {
-        let m = random(300, 30, true);
+        let m = random(300, 30);
         let block = &m.blocks[0];
         let k = block.masks.len();
         let mut whole = vec![0.0; k * k];

@@ -1,6 +1,6 @@
 //! Adam (Kingma and Ba), dense: parameters without gradient keep moving by their momentum, as in the original.
 
-use crate::real::Real;
+use super::real::Real;
 use rayon::prelude::*;
 
 /// Decay of the mean of gradients.

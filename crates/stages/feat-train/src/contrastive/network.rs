@@ -4,11 +4,11 @@
 //! Σ W2 h_n = W2 Σ h_n, so neighbours are summed in the input's channels and, with Gaussians as neighbours, once for all
 //! layers. The inputs are detached: gradients reach the weights only.
 
-use crate::real::Real;
-use crate::scene::{Context, Neighbours};
+use super::context::Context;
+use super::real::Real;
+use crate::options::Neighbours;
 use rand::Rng;
 use rayon::prelude::*;
-use std::ops::Range;
 
 /// Anchors worked on at a time.
 const CHUNK: usize = 512;
@@ -26,8 +26,6 @@ pub struct Layer<T> {
     pub weights: Vec<T>,
     /// Whether what is negative becomes zero.
     pub relu: bool,
-    /// Which weights are zero and stay so: those of inputs that the layer does not read.
-    pub frozen: Range<usize>,
 }
 
 impl<T: Real> Layer<T> {
@@ -40,13 +38,7 @@ impl<T: Real> Layer<T> {
         let mut weights = draw(input * output, input);
         weights.extend(draw(neighbour * output, neighbour));
         weights.extend(draw(output, neighbour));
-        Self { input, neighbour, output, weights, relu: true, frozen: 0..0 }
-    }
-
-    /// Lets the layer read only the first `inputs` channels of the anchor's own feature.
-    pub fn read_only(&mut self, inputs: usize) {
-        self.frozen = inputs * self.output..self.input * self.output;
-        self.weights[self.frozen.clone()].fill(T::default());
+        Self { input, neighbour, output, weights, relu: true }
     }
 
     /// W1, W2 and the bias.
@@ -159,7 +151,6 @@ pub fn backward<T: Real>(
             }
         });
         out[l] = weight_gradients(layer, &activations.features[l], activations.sums_of(l), &gradient);
-        out[l][layer.frozen.clone()].fill(T::default());
         if l > 0 {
             gradient = input_gradients(layer, context, &gradient);
         }

@@ -1,4 +1,4 @@
-//! Features in closed form: leading singular vectors of the matrix of Gaussians and masks ([`crate::evidence`]).
+//! Features in closed form: leading singular vectors of the matrix of Gaussians and masks ([`super::evidence`]).
 //!
 //! Gaussians that share masks over many views get similar rows of the left singular vectors: it is what a spectral
 //! contrastive loss converges to. A vector's squared singular value says how well what it separates holds together: how
@@ -11,10 +11,10 @@
 //! eigenvectors come from block subspace iteration, filtered by Chebyshev polynomials (Zhou, Saad, Tiago and Chelikowsky
 //! 2006), with Rayleigh-Ritz. One product with C itself then gives all Gaussians.
 
-use crate::gram::{Gram, Panel, WIDTH};
-use crate::linalg::{Columns, cross, multiply, orthonormalise, symmetric_eigen};
-use crate::model::normal;
-use crate::sparse::Matrix;
+use super::gram::{Gram, Panel, WIDTH};
+use super::linalg::{Columns, cross, multiply, orthonormalise, symmetric_eigen};
+use super::sparse::Matrix;
+use crate::random::normal;
 use gs_io::{Error, Result};
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
@@ -34,6 +34,8 @@ const LEAST_SCALE: f64 = 1e-3;
 const MOST_GAIN: f64 = 1e4;
 /// Highest degree of a filter.
 const MOST_DEGREE: f64 = 24.0;
+/// Steepness of the step that scales vectors at the cutoff: nearly all or nothing, without a jump.
+const POWER: f64 = 16.0;
 /// CᵀC is formed where that takes at most so many entries for each of C, and so many more; else C is applied twice.
 const GRAM_ENTRIES: (usize, usize) = (4, 1 << 24);
 
@@ -46,8 +48,6 @@ pub struct SpectralOptions {
     pub auto: bool,
     /// Singular value c at which a vector's scale is a half.
     pub cutoff: f64,
-    /// Steepness p of the step.
-    pub power: f64,
     /// Seed of the starting vectors.
     pub seed: u64,
 }
@@ -55,14 +55,14 @@ pub struct SpectralOptions {
 impl SpectralOptions {
     /// Scale of a vector of this singular value.
     fn scale(&self, value: f64) -> f64 {
-        if value > 0.0 { 1.0 / (1.0 + (self.cutoff / value).powf(self.power)) } else { 0.0 }
+        if value > 0.0 { 1.0 / (1.0 + (self.cutoff / value).powf(POWER)) } else { 0.0 }
     }
 }
 
 /// Features of all Gaussians.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Spectral {
-    /// Numbers per Gaussian.
+    /// Dimension.
     pub dim: usize,
     /// `[n][dim]`, of unit length, or zero for Gaussians in no mask.
     pub features: Vec<f32>,
@@ -265,44 +265,41 @@ fn rows(columns: &Columns) -> Vec<f32> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::evidence::tests::random;
-    use crate::sparse::tests::dense;
+    use crate::spectral::testing::{dense, random};
 
     fn options() -> SpectralOptions {
-        SpectralOptions { most: 6, auto: false, cutoff: 1e6, power: 1.0, seed: 3 }
+        SpectralOptions { most: 6, auto: false, cutoff: 1e-6, seed: 3 }
     }
 
     #[test]
     fn agrees_with_a_dense_decomposition() {
-        for smooth in [false, true] {
-            let m = random(150, 40, smooth);
-            let c = dense(&m);
-            let (squares, right) = symmetric_eigen(&cross(&c, &c));
-            let s = spectral(&m, &options(), &Stage::silent("test")).unwrap();
-            assert_eq!(s.gram_entries, Some(1600));
-            for j in 0..6 {
-                assert!((s.singular_values[j] - squares[j].sqrt()).abs() < 1e-5, "{j}: {s:?}");
-            }
-            // Features, up to the signs of vectors, which their scalar products do not know.
-            let u = multiply(&c, &right[..6].to_vec());
-            let dot = |f: &dyn Fn(usize, usize) -> f64, a, b| (0..6).map(|j| f(a, j) * f(b, j)).sum::<f64>();
-            let exact = |i: usize, j: usize| u[j][i];
-            let found = |i: usize, j: usize| f64::from(s.features[i * 6 + j]);
-            for a in (0..150).step_by(7) {
-                let b = (a * 31 + 11) % 150;
-                let cosine = dot(&exact, a, b) / (dot(&exact, a, a) * dot(&exact, b, b)).sqrt();
-                assert!((dot(&found, a, b) - cosine).abs() < 2e-3, "{a} {b}: {cosine} {}", dot(&found, a, b));
-            }
+        let m = random(150, 40);
+        let c = dense(&m);
+        let (squares, right) = symmetric_eigen(&cross(&c, &c));
+        let s = spectral(&m, &options(), &Stage::silent("test")).unwrap();
+        assert_eq!(s.gram_entries, Some(1600));
+        for j in 0..6 {
+            assert!((s.singular_values[j] - squares[j].sqrt()).abs() < 1e-5, "{j}: {s:?}");
+        }
+        // Features, up to the signs of vectors, which their scalar products do not know.
+        let u = multiply(&c, &right[..6].to_vec());
+        let dot = |f: &dyn Fn(usize, usize) -> f64, a, b| (0..6).map(|j| f(a, j) * f(b, j)).sum::<f64>();
+        let exact = |i: usize, j: usize| u[j][i] / squares[j].sqrt();
+        let found = |i: usize, j: usize| f64::from(s.features[i * 6 + j]);
+        for a in (0..150).step_by(7) {
+            let b = (a * 31 + 11) % 150;
+            let cosine = dot(&exact, a, b) / (dot(&exact, a, a) * dot(&exact, b, b)).sqrt();
+            assert!((dot(&found, a, b) - cosine).abs() < 2e-3, "{a} {b}: {cosine} {}", dot(&found, a, b));
         }
     }
 
     #[test]
     fn more_vectors_than_masks_and_equal_results_on_any_threads() {
-        let m = random(60, 5, true);
-        let wide = SpectralOptions { most: 64, auto: true, cutoff: 0.5, power: 16.0, ..options() };
+        let m = random(60, 5);
+        let wide = SpectralOptions { most: 64, auto: true, cutoff: 0.5, ..options() };
         let s = spectral(&m, &wide, &Stage::silent("test")).unwrap();
         assert!(s.dim <= 5 && s.dim >= 1);
-        let big = random(9000, 30, true);
+        let big = random(9000, 30);
         let with = |threads| {
             let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
             pool.install(|| spectral(&big, &wide, &Stage::silent("test")).unwrap())
@@ -312,8 +309,8 @@ mod tests {
 
     #[test]
     fn the_formed_product_and_its_factors_find_the_same() {
-        let m = random(3000, 200, true);
-        let o = SpectralOptions { most: 20, auto: false, cutoff: 0.05, power: 16.0, seed: 1 };
+        let m = random(3000, 200);
+        let o = SpectralOptions { most: 20, auto: false, cutoff: 0.05, seed: 1 };
         let silent = Stage::silent("test");
         let gram = Gram::new(&m, usize::MAX).unwrap();
         let formed = singular_vectors(&Product::Formed(&gram), &m, &o, &silent).unwrap();

@@ -4,8 +4,8 @@
 //! `D` is the number of channels of a feature where it is known at compile time, or 0: the same loop, its length read
 //! from the argument `d`. The network works on blocks of anchors, a [`Lanes`] per channel.
 
-use crate::adam::Rates;
-use crate::real::Weight;
+use crate::contrastive::adam::Rates;
+use crate::contrastive::context::NONE;
 use multiversion::multiversion;
 
 /// Anchors of a block.
@@ -21,24 +21,24 @@ const TERMS: usize = 32;
 
 /// Calls a kernel with the number of channels as a constant where there is a version for it.
 macro_rules! for_width {
-    ($d:expr, $kernel:ident $([$more:ty])? ( $($argument:expr),* $(,)? )) => {
+    ($d:expr, $kernel:ident ( $($argument:expr),* $(,)? )) => {
         match $d {
-            2 => $kernel::<2 $(, $more)?>($($argument),*),
-            3 => $kernel::<3 $(, $more)?>($($argument),*),
-            4 => $kernel::<4 $(, $more)?>($($argument),*),
-            5 => $kernel::<5 $(, $more)?>($($argument),*),
-            6 => $kernel::<6 $(, $more)?>($($argument),*),
-            7 => $kernel::<7 $(, $more)?>($($argument),*),
-            8 => $kernel::<8 $(, $more)?>($($argument),*),
-            9 => $kernel::<9 $(, $more)?>($($argument),*),
-            10 => $kernel::<10 $(, $more)?>($($argument),*),
-            11 => $kernel::<11 $(, $more)?>($($argument),*),
-            12 => $kernel::<12 $(, $more)?>($($argument),*),
-            13 => $kernel::<13 $(, $more)?>($($argument),*),
-            14 => $kernel::<14 $(, $more)?>($($argument),*),
-            15 => $kernel::<15 $(, $more)?>($($argument),*),
-            16 => $kernel::<16 $(, $more)?>($($argument),*),
-            _ => $kernel::<0 $(, $more)?>($($argument),*),
+            2 => $kernel::<2>($($argument),*),
+            3 => $kernel::<3>($($argument),*),
+            4 => $kernel::<4>($($argument),*),
+            5 => $kernel::<5>($($argument),*),
+            6 => $kernel::<6>($($argument),*),
+            7 => $kernel::<7>($($argument),*),
+            8 => $kernel::<8>($($argument),*),
+            9 => $kernel::<9>($($argument),*),
+            10 => $kernel::<10>($($argument),*),
+            11 => $kernel::<11>($($argument),*),
+            12 => $kernel::<12>($($argument),*),
+            13 => $kernel::<13>($($argument),*),
+            14 => $kernel::<14>($($argument),*),
+            15 => $kernel::<15>($($argument),*),
+            16 => $kernel::<16>($($argument),*),
+            _ => $kernel::<0>($($argument),*),
         }
     };
 }
@@ -199,7 +199,7 @@ fn added(sums: &[f32; PARTIAL]) -> f32 {
 
 /// What the columns of a view are read from and what a piece of them is.
 #[derive(Clone, Copy)]
-pub struct Piece<'a, W> {
+pub struct Piece<'a> {
     /// Places of the columns.
     pub columns: &'a [u32],
     /// Where the entries of each begin, and where the last ends.
@@ -207,7 +207,7 @@ pub struct Piece<'a, W> {
     /// Masks of all entries of the view.
     pub mask: &'a [u16],
     /// Weights of all entries of the view.
-    pub weight: &'a [W],
+    pub weight: &'a [f32],
     /// Anchor of every place.
     pub source: &'a [u32],
 }
@@ -215,10 +215,10 @@ pub struct Piece<'a, W> {
 /// Adds w f_final of each entry to row `mask` of `sums`, rows of `O` padded from `d`. `hat` is empty without a network.
 /// Entries for which `half` holds are added to `halves` too.
 #[inline(always)]
-fn add_centroids<W: Weight>(
+fn add_centroids(
     d: usize,
     pitch: usize,
-    piece: Piece<'_, W>,
+    piece: Piece<'_>,
     features: &[f32],
     hat: &[f32],
     sums: &mut [f32],
@@ -229,14 +229,14 @@ fn add_centroids<W: Weight>(
         let f = &mut f[..d];
         f.copy_from_slice(row(features, place as usize, d));
         let source = piece.source[place as usize];
-        if source != crate::scene::NONE && !hat.is_empty() {
+        if source != NONE && !hat.is_empty() {
             let hat = &hat[source as usize * pitch..source as usize * pitch + d];
             for j in 0..d {
                 f[j] += hat[j];
             }
         }
         for e in piece.start[c] as usize..piece.start[c + 1] as usize {
-            let (k, w) = (piece.mask[e] as usize, piece.weight[e].get());
+            let (k, w) = (piece.mask[e] as usize, piece.weight[e]);
             let sum = &mut sums[k * pitch..k * pitch + d];
             for j in 0..d {
                 sum[j] += w * f[j];
@@ -255,10 +255,10 @@ fn add_centroids<W: Weight>(
 
 /// [`add_centroids`] of a view's columns.
 #[multiversion(targets("x86_64+avx512f+avx512vl", "x86_64+avx2"))]
-pub fn centroids<const D: usize, W: Weight>(
+pub fn centroids<const D: usize>(
     d: usize,
     pitch: usize,
-    piece: Piece<'_, W>,
+    piece: Piece<'_>,
     features: &[f32],
     hat: &[f32],
     sums: &mut [f32],
@@ -270,10 +270,10 @@ pub fn centroids<const D: usize, W: Weight>(
 /// Gradients of a piece of columns, given those of the masks `[K][pitch]`: of the features into `rows`, whose first is
 /// that of place `first`, and added up per anchor into `anchors`, whose first is `first_anchor` (empty without network).
 #[multiversion(targets("x86_64+avx512f+avx512vl", "x86_64+avx2"))]
-pub fn columns_backward<const D: usize, W: Weight>(
+pub fn columns_backward<const D: usize>(
     d: usize,
     pitch: usize,
-    piece: Piece<'_, W>,
+    piece: Piece<'_>,
     masks: &[f32],
     halves: Option<(&[f32], Half<'_>)>,
     (first, rows): (usize, &mut [f32]),
@@ -284,7 +284,7 @@ pub fn columns_backward<const D: usize, W: Weight>(
         let mut g = [0.0f32; 64];
         let g = &mut g[..d];
         for e in piece.start[c] as usize..piece.start[c + 1] as usize {
-            let (k, w) = (piece.mask[e] as usize, piece.weight[e].get());
+            let (k, w) = (piece.mask[e] as usize, piece.weight[e]);
             let from = &masks[k * pitch..k * pitch + d];
             for j in 0..d {
                 g[j] += w * from[j];
@@ -301,7 +301,7 @@ pub fn columns_backward<const D: usize, W: Weight>(
         let at = (place as usize - first) * d;
         rows[at..at + d].copy_from_slice(g);
         let source = piece.source[place as usize];
-        if source != crate::scene::NONE && !anchors.is_empty() {
+        if source != NONE && !anchors.is_empty() {
             let at = (source as usize - first_anchor) * pitch;
             let sum = &mut anchors[at..at + d];
             for j in 0..d {
@@ -336,28 +336,6 @@ pub fn adam(p: &mut [f32], m: &mut [f32], v: &mut [f32], g: &[f32], rates: &Rate
 pub fn adam_without(p: &mut [f32], m: &mut [f32], v: &mut [f32], rates: &Rates) {
     for ((p, m), v) in p.iter_mut().zip(m).zip(v) {
         adam_one(p, m, v, 0.0, rates);
-    }
-}
-
-/// One step of Adam for the rows at `columns` alone; `first` is the place of the first row.
-#[multiversion(targets("x86_64+avx512f+avx512vl", "x86_64+avx2"))]
-pub fn adam_rows<const D: usize>(
-    d: usize,
-    columns: &[u32],
-    first: usize,
-    p: &mut [f32],
-    m: &mut [f32],
-    v: &mut [f32],
-    g: &[f32],
-    rates: &Rates,
-) {
-    let d = width::<D>(d);
-    for &place in columns {
-        let at = (place as usize - first) * d;
-        let (p, m, v, g) = (&mut p[at..at + d], &mut m[at..at + d], &mut v[at..at + d], &g[at..at + d]);
-        for j in 0..d {
-            adam_one(&mut p[j], &mut m[j], &mut v[j], g[j], rates);
-        }
     }
 }
 

@@ -1,7 +1,8 @@
 //! A small random scene in memory.
 
-use crate::pixels::Pixels;
-use crate::scene::{Context, MaskSet, Neighbours, pieces};
+use super::context::Context;
+use super::masks::{MaskSet, Pixels};
+use crate::options::Neighbours;
 use artifacts::Graph;
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
@@ -48,31 +49,20 @@ pub fn context(n: usize, kind: Neighbours, propagate: bool) -> Context {
 pub fn mask_set(context: &Context, masks: usize, seed: u64) -> MaskSet {
     let mut rng = ChaCha8Rng::seed_from_u64(seed);
     let n = context.order.len();
-    let mut set = MaskSet {
-        rows: (0..masks as u32).collect(),
-        pixels: (0..masks).map(|k| 10.0 + k as f64).collect(),
-        start: vec![0],
-        ..MaskSet::default()
-    };
+    let mut entries = Vec::new();
     for place in 0..n as u32 {
         if rng.random_range(0.0..1.0) < 0.2 {
             continue;
         }
         let first = rng.random_range(0..masks as u32);
         let second = rng.random_range(0..masks as u32);
-        let mut mine = vec![first];
-        if second > first {
-            mine.push(second);
+        for k in [Some(first), (second > first).then_some(second)].into_iter().flatten() {
+            entries.push((place, k as u16, rng.random_range(0.01..0.1)));
         }
-        set.columns.push(place);
-        for k in mine {
-            set.mask.push(k as u16);
-            set.weight.push(rng.random_range(0.01..0.1));
-        }
-        set.start.push(set.mask.len() as u32);
     }
+    let pixels = (0..masks).map(|k| 10.0 + k as f64).collect();
+    let mut set = MaskSet::from_entries((0..masks as u32).collect(), pixels, entries, context);
     set.sampled = sampled(&set, &mut rng);
-    set.pieces = pieces(&set.columns, &|a, b| context.source[a as usize] != context.source[b as usize]);
     set
 }
 

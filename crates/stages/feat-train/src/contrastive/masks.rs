@@ -1,0 +1,219 @@
+//! The masks of each view as sparse matrices: masks times Gaussians, and sampled pixels times Gaussians.
+//!
+//! Rendering is as linear for a pixel as it is for a mask: the feature of pixel p is the row w[p,.] times the features.
+//! graph-precompute keeps the rows of some pixels of each mask (`--pixel-samples`), so losses of pixels need no rasteriser.
+
+use super::context::{Context, inverse};
+use artifacts::{Footprints, Level, PixelSamples};
+use gs_io::{Error, Result};
+
+/// Masks of a view at a level, at most: what 16 bits can number.
+const MOST_MASKS: usize = 1 << 16;
+/// Columns in a piece of work, about.
+const PIECE: usize = 2048;
+
+/// The masks of one view at one level: the matrix A of docs/method.md, by columns (Gaussians).
+#[derive(Debug, Clone, Default)]
+pub struct MaskSet {
+    /// Rows of the footprints artifact; K.
+    pub rows: Vec<u32>,
+    /// Gated pixels of each mask; K.
+    pub pixels: Vec<f64>,
+    /// Places in the training order, ascending; v.
+    pub columns: Vec<u32>,
+    /// Where the entries of each column begin; v + 1.
+    pub start: Vec<u32>,
+    /// Mask of each entry, below K, ascending within a column.
+    pub mask: Vec<u16>,
+    /// A[mask, column]: summed blending weight over gated pixels.
+    pub weight: Vec<f32>,
+    /// Bounds of the pieces in which columns are worked on; the Gaussians of an anchor are never parted.
+    pub pieces: Vec<u32>,
+    /// Single pixels of the masks; empty where the footprints have none.
+    pub sampled: Pixels,
+}
+
+impl MaskSet {
+    /// Entries of the column at position `c`: masks and weights.
+    #[inline]
+    pub fn entries(&self, c: usize) -> (&[u16], &[f32]) {
+        let range = self.start[c] as usize..self.start[c + 1] as usize;
+        (&self.mask[range.clone()], &self.weight[range])
+    }
+
+    /// Number of masks.
+    pub fn len(&self) -> usize {
+        self.rows.len()
+    }
+
+    /// Whether there is no mask.
+    pub fn is_empty(&self) -> bool {
+        self.rows.is_empty()
+    }
+}
+
+/// The mask sets of all views at the given levels, those with at least `least` masks that have a footprint.
+///
+/// # Errors
+/// When a view has more masks than 16 bits can number.
+pub fn mask_sets(footprints: &Footprints, context: &Context, levels: &[Level], least: usize) -> Result<Vec<MaskSet>> {
+    let place = inverse(&context.order);
+    let mut sets = Vec::new();
+    let mut from = 0;
+    while from < footprints.rows.len() {
+        let first = footprints.rows[from];
+        let same = |r: &artifacts::Row| (r.view, r.level) == (first.view, first.level);
+        let to = from + footprints.rows[from..].iter().take_while(|r| same(r)).count();
+        let rows: Vec<u32> = (from..to)
+            .filter(|&r| footprints.rows[r].gated > 0 && !footprints.entries(r).0.is_empty())
+            .map(|r| r as u32)
+            .collect();
+        if levels.iter().any(|&l| l as u32 == first.level) && rows.len() >= least {
+            if rows.len() > MOST_MASKS {
+                return Err(Error::new("more masks than can be numbered")
+                    .file(footprints.artifact().path())
+                    .field(format!("view {:?}", footprints.views[first.view as usize]))
+                    .found(rows.len())
+                    .expected(format!("at most {MOST_MASKS}")));
+            }
+            sets.push(mask_set(footprints, &rows, &place, context));
+        }
+        from = to;
+    }
+    Ok(sets)
+}
+
+fn mask_set(footprints: &Footprints, rows: &[u32], place: &[u32], context: &Context) -> MaskSet {
+    let count = rows.iter().map(|&r| footprints.entries(r as usize).0.len()).sum();
+    let mut entries: Vec<(u32, u16, f32)> = Vec::with_capacity(count);
+    for (k, &r) in rows.iter().enumerate() {
+        let (col, weight) = footprints.entries(r as usize);
+        let gated = footprints.rows[r as usize].gated as f32;
+        entries.extend(col.iter().zip(weight).map(|(&c, &w)| (place[c as usize], k as u16, w / gated)));
+    }
+    let pixels = rows.iter().map(|&r| f64::from(footprints.rows[r as usize].gated)).collect();
+    let mut set = MaskSet::from_entries(rows.to_vec(), pixels, entries, context);
+    set.sampled = Pixels::of_masks(&footprints.pixels, rows, |col| {
+        set.columns.binary_search(&place[col as usize]).ok().map(|c| c as u32)
+    });
+    set
+}
+
+impl MaskSet {
+    /// From entries (place in the training order, mask, weight), in any order.
+    pub fn from_entries(
+        rows: Vec<u32>,
+        pixels: Vec<f64>,
+        mut entries: Vec<(u32, u16, f32)>,
+        context: &Context,
+    ) -> Self {
+        entries.sort_unstable_by_key(|t| (t.0, t.1));
+        let mut set = Self {
+            rows,
+            pixels,
+            mask: entries.iter().map(|t| t.1).collect(),
+            weight: entries.iter().map(|t| t.2).collect(),
+            ..Self::default()
+        };
+        let columns = 1 + entries.windows(2).filter(|w| w[0].0 != w[1].0).count();
+        set.columns.reserve_exact(columns);
+        set.start.reserve_exact(columns + 1);
+        for (e, t) in entries.iter().enumerate() {
+            if set.columns.last() != Some(&t.0) {
+                set.columns.push(t.0);
+                set.start.push(e as u32);
+            }
+        }
+        set.start.push(entries.len() as u32);
+        set.pieces = pieces(&set.columns, context);
+        set
+    }
+}
+
+/// Cuts columns into pieces of about `PIECE`, only between the Gaussians of different anchors.
+fn pieces(columns: &[u32], context: &Context) -> Vec<u32> {
+    let mut cuts = vec![0u32];
+    for c in 1..columns.len() {
+        if c - *cuts.last().expect("begins with 0") as usize >= PIECE && context.parts(columns[c - 1], columns[c]) {
+            cuts.push(c as u32);
+        }
+    }
+    cuts.push(columns.len() as u32);
+    cuts
+}
+
+/// Pixels of the masks of one view: a sparse matrix of pixels and columns of the [`MaskSet`].
+#[derive(Debug, Clone, Default, PartialEq)]
+pub struct Pixels {
+    /// Mask of each pixel, below K, ascending; P.
+    pub mask: Vec<u16>,
+    /// Where the entries of each pixel begin; P + 1, or empty.
+    pub start: Vec<u32>,
+    /// Column of each entry, as a position in [`MaskSet::columns`].
+    pub column: Vec<u32>,
+    /// Blending weight of each entry.
+    pub weight: Vec<f32>,
+}
+
+impl Pixels {
+    /// Those of the masks `rows` (ascending rows of the footprints). `column` gives the position of a kept Gaussian among
+    /// the columns; entries without one, which a cut of the footprints may leave, are dropped.
+    pub fn of_masks(samples: &PixelSamples, rows: &[u32], column: impl Fn(u32) -> Option<u32>) -> Self {
+        let mut out = Self { start: vec![0], ..Self::default() };
+        for (k, &row) in rows.iter().enumerate() {
+            let from = samples.row.partition_point(|&r| r < row);
+            let to = from + samples.row[from..].partition_point(|&r| r == row);
+            for p in from..to {
+                for e in samples.ptr[p] as usize..samples.ptr[p + 1] as usize {
+                    if let Some(c) = column(samples.col[e]) {
+                        out.column.push(c);
+                        out.weight.push(samples.weight[e]);
+                    }
+                }
+                out.mask.push(k as u16);
+                out.start.push(out.column.len() as u32);
+            }
+        }
+        out
+    }
+
+    /// Number of pixels.
+    pub fn len(&self) -> usize {
+        self.mask.len()
+    }
+
+    /// Whether there is none.
+    pub fn is_empty(&self) -> bool {
+        self.mask.is_empty()
+    }
+
+    /// Columns and weights of pixel `p`.
+    pub fn entries(&self, p: usize) -> impl Iterator<Item = (usize, f64)> + '_ {
+        let range = self.start[p] as usize..self.start[p + 1] as usize;
+        self.column[range.clone()].iter().zip(&self.weight[range]).map(|(&c, &w)| (c as usize, f64::from(w)))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn pixels_follow_their_masks_and_cut_entries_are_dropped() {
+        let samples = PixelSamples {
+            row: vec![3, 5, 5, 9],
+            ptr: vec![0, 1, 3, 4, 5],
+            col: vec![0, 1, 2, 1, 7],
+            weight: vec![0.1, 0.2, 0.3, 0.4, 0.5],
+        };
+        let p = Pixels::of_masks(&samples, &[4, 5, 9], |c| (c != 2).then_some(c + 10));
+        let want = Pixels {
+            mask: vec![1, 1, 2],
+            start: vec![0, 1, 2, 3],
+            column: vec![11, 11, 17],
+            weight: vec![0.2, 0.4, 0.5],
+        };
+        assert_eq!(p, want);
+        assert!(Pixels::of_masks(&PixelSamples::default(), &[1, 2], Some).is_empty());
+    }
+}

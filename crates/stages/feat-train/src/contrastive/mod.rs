@@ -1,0 +1,121 @@
+//! The paper's stage 2, `feat-train --preset paper`: contextual propagation and contrastive learning on masks.
+//!
+//! * [`context`] and [`masks`]: what training reads of a scene.
+//! * [`model`], with [`network`], [`normalize`], [`loss`], [`terms`] and [`cross_view`]: the equations and their gradients,
+//!   readable, for f32 and f64 ([`real`]).
+//! * [`engine`]: the same in f32, fast. [`solver`] takes the one that serves the options.
+//! * [`train`]: the loop, on the [`state`], which [`checkpoint`] saves. [`adam`]: the optimiser.
+
+pub mod adam;
+mod alignment;
+pub mod checkpoint;
+pub mod context;
+pub mod cross_view;
+pub mod engine;
+pub mod loss;
+pub mod masks;
+pub mod model;
+pub mod network;
+pub mod normalize;
+pub mod real;
+pub mod solver;
+pub mod state;
+pub mod terms;
+#[cfg(test)]
+mod testing;
+pub mod train;
+
+use crate::inputs::Inputs;
+use crate::options::Args;
+use crate::outputs::{Made, write_curve};
+use context::Context;
+use gs_io::{Error, Result};
+use gs_scene::{Geometry, SH_C0};
+use masks::{MaskSet, mask_sets};
+use serde_json::json;
+use stage::Stage;
+use stage::curve::Panel;
+use state::CurvePoint;
+use train::{Training, train};
+
+/// Panels of the curve.
+const TRAINING: [Panel; 4] = [
+    ("loss", "loss", "#1f77b4"),
+    ("alignment", "alignment: mean cosine of a mask's Gaussians with its centroid", "#2ca02c"),
+    ("separation", "separation: 1 - mean cosine of different masks", "#d62728"),
+    ("rate", "learning rate of features", "#7f7f7f"),
+];
+
+/// Trains the features and writes their curve.
+///
+/// # Errors
+/// When an input does not fit, a file cannot be written, or the stage was interrupted.
+pub fn features(args: &Args, inputs: &Inputs, stage: &Stage) -> Result<Made> {
+    let context = frozen_graph(args, inputs, stage)?;
+    let sets = masks_to_learn_from(args, inputs, &context, stage)?;
+    let training =
+        Training { dim: args.options.trained_dim(), options: args.options.contrastive.clone(), seed: args.common.seed };
+    // A checkpoint serves runs of any number of iterations, as long as everything else is equal.
+    let mut parameters = args.options.parameters(args.common.seed);
+    parameters["contrastive"]["iterations"].take();
+    let provenance = stage.provenance("", 0, parameters, inputs.hashes.clone());
+    let path = checkpoint::path(&args.out);
+    let on_curve = |curve: &[CurvePoint]| write_curve(&args.out, curve.iter().map(|p| json!(p)), &TRAINING);
+    let trained = train(&context, &sets, &training, Some((&path, &provenance)), stage, on_curve)?;
+    let last = trained.curve.last().copied().unwrap_or_default();
+    let summary = json!({ "views": sets.len(), "last": last, "resumed_at": trained.resumed_at,
+        "iterations": trained.iterations, "gaussians": inputs.graph.kept.len(),
+        "network_bytes": trained.network_bytes });
+    Ok(Made { dim: training.dim, values: trained.features, summary })
+}
+
+/// The graph with the colours and positions of its Gaussians.
+fn frozen_graph(args: &Args, inputs: &Inputs, stage: &Stage) -> Result<Context> {
+    // Damaged Gaussians are not among the kept ones: graph-precompute leaves them out.
+    let geometry = Geometry::read(&args.geometry)?;
+    if let Some(damage) = geometry.damage() {
+        stage.skipped(&damage);
+    }
+    let gaussians = geometry.gaussians;
+    let kept = &inputs.graph.kept;
+    if let Some(&last) = kept.last().filter(|l| **l as usize >= gaussians.len()) {
+        return Err(Error::new("the graph has Gaussians that the geometry lacks")
+            .file(&args.graph)
+            .field("kept")
+            .found(last)
+            .expected(format!("below {}", gaussians.len()))
+            .hint("run graph-precompute on this geometry"));
+    }
+    let color = |&i: &u32| [0, 1, 2].map(|channel| 0.5 + SH_C0 * gaussians.sh_of(i as usize)[channel]);
+    let colors: Vec<[f32; 3]> = kept.iter().map(color).collect();
+    let positions: Vec<[f32; 3]> = kept.iter().map(|&i| gaussians.means[i as usize]).collect();
+    let options = &args.options.contrastive;
+    Ok(Context::new(&inputs.graph, &colors, &positions, options.neighbours, !options.no_propagation))
+}
+
+/// The masks of every view and level that teaches something.
+fn masks_to_learn_from(args: &Args, inputs: &Inputs, context: &Context, stage: &Stage) -> Result<Vec<MaskSet>> {
+    let (levels, options) = (args.options.levels(), &args.options.contrastive);
+    // A lone mask has none to be told from, but its pixels can be drawn together.
+    let least = if options.no_skip || options.cohesion > 0.0 { 1 } else { 2 };
+    let sets = mask_sets(&inputs.footprints, context, &levels, least)?;
+    let units = inputs.footprints.views.len() * levels.len();
+    if sets.len() < units {
+        let why = if least == 1 { "no mask" } else { "fewer than two masks" };
+        stage.skipped(&format!("{} of {units} views and levels: {why}", units - sets.len()));
+    }
+    if sets.is_empty() {
+        let what = if least == 1 { "no view has a mask" } else { "no view has two masks to tell apart" };
+        return Err(Error::new(what)
+            .file(&args.footprints)
+            .field(format!("levels {levels:?}"))
+            .hint("choose other --levels, or make masks with more than one segment a view"));
+    }
+    if options.needs_pixels() && sets.iter().all(|s| s.sampled.is_empty()) {
+        return Err(Error::new("no sampled pixels, which --loss pixel and --cohesion need")
+            .file(&args.footprints)
+            .field("pixel_row")
+            .hint("run graph-precompute with --pixel-samples 16"));
+    }
+    Ok(sets)
+}

@@ -1,0 +1,535 @@
+//! The model of the paper's stage 2: per-Gaussian features, the graph network that adds context, the loss on one view's
+//! masks, and their gradients. Written once for f32 and f64.
+
+use super::alignment::alignment;
+use super::context::{Context, NONE};
+use super::loss::{self, Evaluated, SHORTEST, dot};
+use super::masks::MaskSet;
+use super::network::{self, Activations, Layer};
+use super::normalize::{Moments, channel_moments, row_moments};
+use super::real::Real;
+use super::terms::{GaussianTerms, PixelTerms};
+use crate::options::{Axis, Contrastive, Init, Loss, Neighbours};
+use crate::random::normal;
+use rand::Rng;
+use rayon::prelude::*;
+use std::ops::Range;
+
+/// Channels between layers (paper: "an intermediate channel size of 16").
+const HIDDEN: usize = 16;
+/// Channels of a colour.
+pub const COLOR: usize = 3;
+/// Anchors worked on at a time.
+const CHUNK: usize = 512;
+
+/// Parameters.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Model<T> {
+    /// Dimension of a feature, d.
+    pub dim: usize,
+    /// What shapes the model.
+    pub options: Contrastive,
+    /// Features, `[n][d]`, in the training order.
+    pub features: Vec<T>,
+    /// The graph network.
+    pub layers: Vec<Layer<T>>,
+}
+
+/// What the graph network makes of the features.
+#[derive(Debug, Clone, Default)]
+pub struct Propagated<T> {
+    /// Standardised output of each anchor `[M][d]`; empty without layers.
+    pub hat: Vec<T>,
+    activations: Activations<T>,
+    /// Of each channel, or of each anchor.
+    moments: Vec<Moments>,
+}
+
+/// Loss and gradients of one view.
+#[derive(Debug, Clone, Default, PartialEq)]
+pub struct Step<T> {
+    /// The loss.
+    pub loss: f64,
+    /// 1 - mean cosine of the centroids of different masks.
+    pub separation: f64,
+    /// Gradient of the features of the view's columns `[v][d]`.
+    pub features: Vec<T>,
+    /// Gradient of each layer's weights.
+    pub layers: Vec<Vec<T>>,
+}
+
+impl<T: Real> Model<T> {
+    /// A model before training. `rng` draws features in the order of kept Gaussians, whatever the training order.
+    pub fn new(d: usize, options: Contrastive, context: &Context, rng: &mut impl Rng) -> Self {
+        let n = context.order.len();
+        let drawn: Vec<T> = (0..n * d)
+            .map(|_| {
+                T::of(match options.init {
+                    Init::Uniform => rng.random_range(0.0..1.0),
+                    Init::NormalSmall => 0.01 * normal(rng),
+                })
+            })
+            .collect();
+        let features =
+            context.order.iter().flat_map(|&i| drawn[i as usize * d..(i as usize + 1) * d].to_vec()).collect();
+        let mut layers = network::random_layers(options.layers, d + COLOR, HIDDEN, d, context.kind, rng);
+        if let Some(last) = layers.last_mut() {
+            last.relu = !options.no_last_relu;
+        }
+        Self { dim: d, options, features, layers }
+    }
+
+    /// Runs the graph network on the (detached) features.
+    pub fn propagate(&self, context: &Context) -> Propagated<T> {
+        if self.layers.is_empty() {
+            return Propagated::default();
+        }
+        let d = self.dim;
+        let (h, sums) = self.inputs(context);
+        let activations = network::forward(&self.layers, context, h, sums);
+        let output = activations.features.last().expect("there are layers");
+        let moments: Vec<Moments> = match self.options.norm_axis {
+            Axis::Channel => channel_moments(output, d, Some(&context.served)),
+            Axis::Gaussian => output
+                .chunks_exact(d)
+                .map(|row| row_moments(&row.iter().map(|v| v.get()).collect::<Vec<_>>()))
+                .collect(),
+        };
+        let hat = output.iter().enumerate().map(|(i, v)| T::of(self.moment(&moments, i).apply(v.get()))).collect();
+        Propagated { hat, activations, moments }
+    }
+
+    /// The moments that standardise entry `i` of an `[M][d]` array.
+    fn moment<'a>(&self, moments: &'a [Moments], i: usize) -> &'a Moments {
+        match self.options.norm_axis {
+            Axis::Channel => &moments[i % self.dim],
+            Axis::Gaussian => &moments[i / self.dim],
+        }
+    }
+
+    /// Standardised inputs h of the anchors, and their sums over neighbours: `[M][d + 3]` each.
+    fn inputs<'a>(&self, context: &'a Context) -> (Vec<T>, Vec<T>) {
+        let d = self.dim;
+        let channels = d + COLOR;
+        let moments: Vec<Moments> = match self.options.norm_axis {
+            Axis::Channel => {
+                let colors: Vec<f32> = context.colors.iter().flatten().copied().collect();
+                let mut moments = channel_moments(&self.features, d, None);
+                moments.extend(channel_moments(&colors, COLOR, None));
+                moments
+            }
+            Axis::Gaussian => Vec::new(),
+        };
+        let add = |place: usize, row: &mut [f64]| {
+            let mut h = [0.0; 64 + COLOR];
+            let h = &mut h[..channels];
+            let f = &self.features[place * d..(place + 1) * d];
+            h.iter_mut().zip(f).for_each(|(h, f)| *h = f.get());
+            h[d..].iter_mut().zip(context.colors[place]).for_each(|(h, c)| *h = f64::from(c));
+            match self.options.norm_axis {
+                Axis::Channel => row.iter_mut().zip(h).zip(&moments).for_each(|((r, h), m)| *r += m.apply(*h)),
+                Axis::Gaussian => {
+                    let m = row_moments(h);
+                    row.iter_mut().zip(h).for_each(|(r, h)| *r += m.apply(*h));
+                }
+            }
+        };
+        let anchors = context.anchors.len();
+        // Sums h over the places that `places_of(anchor)` names.
+        let gather = |places_of: &(dyn Fn(usize) -> &'a [u32] + Sync)| -> Vec<T> {
+            let mut out = vec![T::default(); anchors * channels];
+            out.par_chunks_mut(CHUNK * channels).enumerate().for_each(|(chunk, rows)| {
+                let mut sum = vec![0.0; channels];
+                for (i, row) in rows.chunks_exact_mut(channels).enumerate() {
+                    sum.fill(0.0);
+                    places_of(chunk * CHUNK + i).iter().for_each(|&place| add(place as usize, &mut sum));
+                    row.iter_mut().zip(&sum).for_each(|(r, &s)| *r = T::of(s));
+                }
+            });
+            out
+        };
+        let h = gather(&|a| &context.anchors[a..=a]);
+        let sums = match context.kind {
+            Neighbours::Gaussians | Neighbours::AnchorInputs => gather(&|a| context.neighbours_of(a)),
+            Neighbours::Anchors => network::neighbour_sums(context, &h, channels),
+        };
+        (h, sums)
+    }
+
+    /// f_final of the Gaussian at `place`: its own feature and what it receives. Gives its length before it was brought to
+    /// unit length, where that is asked for; else 1.
+    #[inline]
+    fn final_feature(&self, context: &Context, propagated: &Propagated<T>, place: usize, out: &mut [f64]) -> f64 {
+        let d = out.len();
+        let own = &self.features[place * d..(place + 1) * d];
+        out.iter_mut().zip(own).for_each(|(o, f)| *o = f.get());
+        let source = context.source[place];
+        if source != NONE && !propagated.hat.is_empty() {
+            let hat = &propagated.hat[source as usize * d..(source as usize + 1) * d];
+            out.iter_mut().zip(hat).for_each(|(o, h)| *o += h.get());
+        }
+        if !self.options.unit_length {
+            return 1.0;
+        }
+        let length = dot(out, out).sqrt();
+        out.iter_mut().for_each(|o| *o = if length > SHORTEST { *o / length } else { 0.0 });
+        length
+    }
+
+    /// f_final of all Gaussians `[n][d]`, in the order of `kept`.
+    pub fn final_features(&self, context: &Context, propagated: &Propagated<T>) -> Vec<f32> {
+        let d = self.dim;
+        let mut out = vec![0.0f32; self.features.len()];
+        let mut row = vec![0.0; d];
+        for (place, &i) in context.order.iter().enumerate() {
+            self.final_feature(context, propagated, place, &mut row);
+            let to = &mut out[i as usize * d..(i as usize + 1) * d];
+            to.iter_mut().zip(&row).for_each(|(o, &v)| *o = v as f32);
+        }
+        out
+    }
+
+    /// Sums over pieces of columns, in order: `visit(column, feature, sums)` adds to `sums`.
+    fn sum_columns(
+        &self,
+        context: &Context,
+        propagated: &Propagated<T>,
+        set: &MaskSet,
+        length: usize,
+        visit: impl Fn(usize, &[f64], &mut [f64]) + Sync,
+    ) -> Vec<f64> {
+        let parts: Vec<Vec<f64>> = set
+            .pieces
+            .par_windows(2)
+            .map(|bounds| {
+                let mut sums = vec![0.0; length];
+                let mut f = vec![0.0; self.dim];
+                for c in bounds[0]..bounds[1] {
+                    self.final_feature(context, propagated, set.columns[c as usize] as usize, &mut f);
+                    visit(c as usize, &f, &mut sums);
+                }
+                sums
+            })
+            .collect();
+        let mut total = vec![0.0; length];
+        for part in parts {
+            total.iter_mut().zip(part).for_each(|(t, p)| *t += p);
+        }
+        total
+    }
+
+    /// Centroids A f of all masks `[K][d]`.
+    pub fn centroids(&self, context: &Context, propagated: &Propagated<T>, set: &MaskSet) -> Vec<f64> {
+        let d = self.dim;
+        self.sum_columns(context, propagated, set, set.len() * d, |c, f, sums| {
+            let (masks, weights) = set.entries(c);
+            for (&k, w) in masks.iter().zip(weights) {
+                let to = &mut sums[k as usize * d..(k as usize + 1) * d];
+                to.iter_mut().zip(f).for_each(|(s, f)| *s += f64::from(*w) * f);
+            }
+        })
+    }
+
+    /// [`alignment`] of a view's masks.
+    pub fn alignment(&self, context: &Context, propagated: &Propagated<T>, set: &MaskSet) -> f64 {
+        alignment(set, &self.centroids(context, propagated, set), self.dim, |place, f| {
+            self.final_feature(context, propagated, place, f);
+        })
+    }
+
+    /// Loss and gradients on the masks of one view. `noise` seeds the halves of [`Loss::HalfMask`]; `beside` are positives
+    /// from another view `[K][d]` for [`Loss::CrossView`].
+    pub fn step(
+        &self,
+        context: &Context,
+        propagated: &Propagated<T>,
+        set: &MaskSet,
+        noise: u64,
+        beside: Option<&[f64]>,
+    ) -> Step<T> {
+        let view = self.look(context, propagated, set, noise, beside);
+        let d = self.dim;
+        // Back to the columns, piece by piece; the Gaussians of an anchor lie in one piece.
+        let parts: Vec<PieceGradients<T>> = set
+            .pieces
+            .par_windows(2)
+            .map(|bounds| self.piece_gradients(context, propagated, &view, bounds[0] as usize..bounds[1] as usize))
+            .collect();
+        let mut step = Step {
+            loss: view.evaluated.loss,
+            separation: view.evaluated.separation,
+            features: Vec::with_capacity(set.columns.len() * d),
+            layers: Vec::new(),
+        };
+        let mut hat_gradient = vec![0.0f64; propagated.hat.len()];
+        for (rows, to_anchors) in parts {
+            step.features.extend(rows);
+            for (a, sum) in to_anchors {
+                hat_gradient[a as usize * d..(a as usize + 1) * d].copy_from_slice(&sum);
+            }
+        }
+        if !self.layers.is_empty() {
+            let gradient = self.unstandardised(context, propagated, &hat_gradient);
+            step.layers = network::backward(&self.layers, context, &propagated.activations, gradient);
+        }
+        step
+    }
+
+    /// The loss on the masks of one view, and its gradients of centroids and pixels.
+    fn look<'a>(
+        &self,
+        context: &Context,
+        propagated: &Propagated<T>,
+        set: &'a MaskSet,
+        noise: u64,
+        beside: Option<&[f64]>,
+    ) -> View<'a> {
+        let (d, s) = (self.dim, &self.options);
+        let centroids = self.centroids(context, propagated, set);
+        let halves = (s.loss == Loss::HalfMask).then_some(noise);
+        let positives = halves.map(|noise| {
+            self.sum_columns(context, propagated, set, set.len() * d, |c, f, sums| {
+                for e in set.start[c] as usize..set.start[c + 1] as usize {
+                    if loss::in_half(noise, e) {
+                        let (k, w) = (set.mask[e] as usize, f64::from(set.weight[e]));
+                        sums[k * d..(k + 1) * d].iter_mut().zip(f).for_each(|(s, f)| *s += w * f);
+                    }
+                }
+            })
+        });
+        let mut evaluated = loss::evaluate(s.loss, &centroids, positives.as_deref().or(beside), d, s.tau);
+        let of_gaussians = (s.loss == Loss::Gaussian).then(|| GaussianTerms::new(d, s.tau, set, &centroids));
+        if let Some(terms) = &of_gaussians {
+            // The terms change the centroids too: sum their gradients over columns first.
+            let sums = self.sum_columns(context, propagated, set, centroids.len() + 1, |c, f, sums| {
+                let (gradient, value) = sums.split_at_mut(centroids.len());
+                value[0] += terms.add(c, f, Some(gradient), None);
+            });
+            evaluated.loss += sums[centroids.len()];
+            evaluated.centroids.iter_mut().zip(&sums).for_each(|(g, s)| *g += s);
+        }
+        let of_pixels = s.needs_pixels().then(|| {
+            let terms = PixelTerms::new(d, s, set, &centroids);
+            let feature = |c: usize, f: &mut [f64]| {
+                self.final_feature(context, propagated, set.columns[c] as usize, f);
+            };
+            let (value, to_columns) =
+                terms.gradients(&set.sampled, set.columns.len(), feature, &mut evaluated.centroids);
+            evaluated.loss += value;
+            to_columns
+        });
+        View { set, evaluated, halves, of_gaussians, of_pixels }
+    }
+
+    /// Gradients of the features of some columns, and of what their anchors give them.
+    fn piece_gradients(
+        &self,
+        context: &Context,
+        propagated: &Propagated<T>,
+        view: &View<'_>,
+        columns: Range<usize>,
+    ) -> PieceGradients<T> {
+        let (d, set, evaluated) = (self.dim, view.set, &view.evaluated);
+        let mut rows = Vec::with_capacity(columns.len() * d);
+        let mut to_anchors: Vec<(u32, Vec<f64>)> = Vec::new();
+        let (mut f, mut g) = (vec![0.0; d], vec![0.0; d]);
+        for c in columns {
+            g.fill(0.0);
+            for e in set.start[c] as usize..set.start[c + 1] as usize {
+                let (k, w) = (set.mask[e] as usize * d, f64::from(set.weight[e]));
+                g.iter_mut().zip(&evaluated.centroids[k..k + d]).for_each(|(g, v)| *g += w * v);
+                if view.halves.is_some_and(|noise| loss::in_half(noise, e)) {
+                    g.iter_mut().zip(&evaluated.positives[k..k + d]).for_each(|(g, v)| *g += w * v);
+                }
+            }
+            let place = set.columns[c] as usize;
+            let mut length = 1.0;
+            if view.of_gaussians.is_some() || self.options.unit_length {
+                length = self.final_feature(context, propagated, place, &mut f);
+            }
+            if let Some(terms) = &view.of_gaussians {
+                terms.add(c, &f, None, Some(&mut g));
+            }
+            if let Some(rows) = &view.of_pixels {
+                g.iter_mut().zip(&rows[c * d..(c + 1) * d]).for_each(|(g, v)| *g += v);
+            }
+            if self.options.unit_length {
+                let of_direction = std::mem::replace(&mut g, vec![0.0; d]);
+                loss::add_direction_gradient(&mut g, &f, length, &of_direction);
+            }
+            rows.extend(g.iter().map(|&v| T::of(v)));
+            let source = context.source[place];
+            if source != NONE && !propagated.hat.is_empty() {
+                match to_anchors.last_mut() {
+                    Some((a, sum)) if *a == source => sum.iter_mut().zip(&g).for_each(|(s, g)| *s += g),
+                    _ => to_anchors.push((source, g.clone())),
+                }
+            }
+        }
+        (rows, to_anchors)
+    }
+
+    /// Gradient of the network's output `[M][d]` from that of its standardised output.
+    fn unstandardised(&self, context: &Context, propagated: &Propagated<T>, g: &[f64]) -> Vec<T> {
+        let d = self.dim;
+        let groups = propagated.moments.len();
+        let group = |i: usize| match self.options.norm_axis {
+            Axis::Channel => i % d,
+            Axis::Gaussian => i / d,
+        };
+        let (mut sum_g, mut sum_gy) = (vec![0.0; groups], vec![0.0; groups]);
+        for (i, (&g, y)) in g.iter().zip(&propagated.hat).enumerate() {
+            sum_g[group(i)] += g;
+            sum_gy[group(i)] += g * y.get();
+        }
+        let weight = |i: usize| match self.options.norm_axis {
+            Axis::Channel => f64::from(context.served[i / d]),
+            Axis::Gaussian => 1.0,
+        };
+        g.par_iter()
+            .zip(&propagated.hat)
+            .enumerate()
+            .with_min_len(CHUNK)
+            .map(|(i, (&g, y))| {
+                let c = group(i);
+                T::of(propagated.moments[c].backward(weight(i), g, y.get(), sum_g[c], sum_gy[c]))
+            })
+            .collect()
+    }
+}
+
+/// Loss of a view, and what its columns' gradients are made of.
+struct View<'a> {
+    set: &'a MaskSet,
+    evaluated: Evaluated,
+    /// What draws the halves of masks that are positives, where the loss has them.
+    halves: Option<u64>,
+    of_gaussians: Option<GaussianTerms<'a>>,
+    /// Gradients of the columns' features from sampled pixels.
+    of_pixels: Option<Vec<f64>>,
+}
+
+/// Gradients from one piece of columns: of the columns' features, and, per anchor, of what its Gaussians receive.
+type PieceGradients<T> = (Vec<T>, Vec<(u32, Vec<f64>)>);
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::contrastive::testing::{context, mask_set};
+    use rand::SeedableRng;
+    use rand_chacha::ChaCha8Rng;
+
+    const D: usize = 4;
+
+    /// Compares every gradient with central differences.
+    fn check(options: Contrastive, kind: Neighbours, propagate: bool) {
+        let name = format!("{options:?} {kind:?} {propagate}");
+        let context = context(50, kind, propagate);
+        let set = mask_set(&context, 5, 3);
+        let mut rng = ChaCha8Rng::seed_from_u64(1);
+        let mut model = Model::<f64>::new(D, options, &context, &mut rng);
+        let propagated = model.propagate(&context);
+        // Positives for three masks of five.
+        let beside: Vec<f64> = (0..20).map(|i| if i < 12 { f64::from(i * i % 7) - 2.0 } else { 0.0 }).collect();
+        let beside = (model.options.loss == Loss::CrossView).then_some(&beside[..]);
+        let step = model.step(&context, &propagated, &set, 77, beside);
+        let close = |analytic: f64, plus: f64, minus: f64, h: f64, what: &str| {
+            let numeric = (plus - minus) / (2.0 * h);
+            assert!(
+                (analytic - numeric).abs() <= 1e-6 * (1.0 + analytic.abs().max(numeric.abs())),
+                "{name}: {what}: {analytic} {numeric}"
+            );
+        };
+        let (d, h) = (model.dim, 1e-6);
+        // Inputs of the network are detached: what anchors give stays as it is.
+        for (c, &place) in set.columns.iter().enumerate() {
+            for j in 0..d {
+                let at = place as usize * d + j;
+                let was = model.features[at];
+                let mut loss = |v: f64| {
+                    model.features[at] = v;
+                    model.step(&context, &propagated, &set, 77, beside).loss
+                };
+                let (plus, minus) = (loss(was + h), loss(was - h));
+                model.features[at] = was;
+                close(step.features[c * d + j], plus, minus, h, "feature");
+            }
+        }
+        assert!(step.features.iter().any(|g| g.abs() > 1e-4), "{name}: all gradients vanish");
+        for l in 0..model.layers.len() {
+            for i in 0..model.layers[l].weights.len() {
+                let was = model.layers[l].weights[i];
+                let mut loss = |v: f64| {
+                    model.layers[l].weights[i] = v;
+                    let p = model.propagate(&context);
+                    model.step(&context, &p, &set, 77, beside).loss
+                };
+                let (plus, minus) = (loss(was + h), loss(was - h));
+                model.layers[l].weights[i] = was;
+                close(step.layers[l][i], plus, minus, h, "weight");
+            }
+        }
+        let moved = step.layers.iter().flatten().any(|g| g.abs() > 1e-5);
+        assert_eq!(moved, model.options.layers > 0, "{name}: gradients of weights");
+    }
+
+    #[test]
+    fn gradients_are_those_of_finite_differences() {
+        use Neighbours::{Anchors, Gaussians};
+        for layers in 0..=4 {
+            check(Contrastive { layers, ..Contrastive::default() }, Gaussians, true);
+        }
+        for layers in [1, 3] {
+            check(Contrastive { layers, ..Contrastive::default() }, Anchors, true);
+        }
+        check(Contrastive::default(), Gaussians, false);
+        check(Contrastive::default(), Neighbours::AnchorInputs, true);
+        check(Contrastive { no_last_relu: true, ..Contrastive::default() }, Gaussians, true);
+        for kind in [Gaussians, Anchors] {
+            check(Contrastive { unit_length: true, no_last_relu: true, ..Contrastive::default() }, kind, true);
+        }
+        for loss in [Loss::Gaussian, Loss::Pixel] {
+            check(Contrastive { loss, unit_length: true, ..Contrastive::default() }, Gaussians, true);
+        }
+        for loss in [Loss::WithSelf, Loss::HalfMask, Loss::CrossView, Loss::Gaussian, Loss::Pixel] {
+            for norm_axis in [Axis::Channel, Axis::Gaussian] {
+                check(Contrastive { loss, norm_axis, ..Contrastive::default() }, Anchors, true);
+            }
+        }
+        let cohesive = Contrastive { cohesion: 0.3, tau: 0.5, init: Init::NormalSmall, ..Contrastive::default() };
+        check(cohesive.clone(), Gaussians, true);
+        check(Contrastive { loss: Loss::Pixel, layers: 0, ..cohesive.clone() }, Gaussians, true);
+        check(Contrastive { loss: Loss::Pixel, ..cohesive }, Anchors, true);
+    }
+
+    #[test]
+    fn threads_do_not_change_a_bit() {
+        let context = context(20_000, Neighbours::Anchors, true);
+        let set = mask_set(&context, 30, 3);
+        assert!(set.pieces.len() > 4);
+        let with = |threads| {
+            let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
+            pool.install(|| {
+                let model = Model::<f32>::new(D, Contrastive::default(), &context, &mut ChaCha8Rng::seed_from_u64(1));
+                let propagated = model.propagate(&context);
+                (
+                    model.step(&context, &propagated, &set, 7, None),
+                    propagated.hat,
+                    model.alignment(&context, &Propagated::default(), &set),
+                )
+            })
+        };
+        assert!(with(1) == with(3));
+    }
+
+    #[test]
+    fn a_scene_of_one_color_has_no_noise() {
+        let mut context = context(64, Neighbours::Gaussians, true);
+        context.colors.fill([0.1, 0.7, 0.3]);
+        let mut model = Model::<f32>::new(D, Contrastive::default(), &context, &mut ChaCha8Rng::seed_from_u64(1));
+        model.features.fill(0.1);
+        let (h, sums) = model.inputs(&context);
+        assert!(h.iter().chain(&sums).all(|v| *v == 0.0));
+        assert!(model.propagate(&context).hat.iter().all(|v| *v == 0.0));
+    }
+}

@@ -1,0 +1,163 @@
+//! The training loop of the paper's stage 2, with checkpoints.
+
+use super::checkpoint;
+use super::context::Context;
+use super::masks::MaskSet;
+use super::model::Model;
+use super::solver::Solver;
+use super::state::{CurvePoint, State};
+use crate::options::{Contrastive, Loss};
+use crate::random::splitmix;
+use gs_io::{Error, Provenance, Result};
+use rand::SeedableRng;
+use rand::seq::SliceRandom;
+use rand_chacha::ChaCha8Rng;
+use stage::Stage;
+use std::path::Path;
+
+/// Iterations between points of the curve: a point costs about an iteration, for the alignment of a view.
+const CURVE_EVERY: u64 = 50;
+/// Iterations between checkpoints: about 20 seconds at a million Gaussians, whose state takes less than one to write.
+const CHECKPOINT_EVERY: u64 = 1000;
+/// Of so many mask sets one is held out for `--early-stop`.
+const HELD_OUT: usize = 10;
+/// Of those held out, at most so many are looked at.
+const MOST_HELD_OUT: usize = 16;
+/// Iterations between looks at them.
+const LOOK_EVERY: u64 = 250;
+
+/// How to train.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Training {
+    /// Dimension of the features.
+    pub dim: usize,
+    /// Model, loss and schedule.
+    pub options: Contrastive,
+    /// Seed of the first features and weights, and of the order of views.
+    pub seed: u64,
+}
+
+/// What training gives.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Trained {
+    /// f_final `[n][d]`, in the order of `kept`.
+    pub features: Vec<f32>,
+    /// The curve.
+    pub curve: Vec<CurvePoint>,
+    /// Iteration of the checkpoint it continued from.
+    pub resumed_at: u64,
+    /// Iterations done: fewer than asked for when it stopped early.
+    pub iterations: u64,
+    /// Bytes that the graph network took; none where the readable model trained, which keeps no account.
+    pub network_bytes: Option<usize>,
+}
+
+/// Trains on `sets`, each with at least two masks. `checkpoint`: where checkpoints lie, and what one of this very run
+/// says of itself. `on_curve` is called with the whole curve at each checkpoint and at the end.
+///
+/// # Errors
+/// When the loss is not finite, a checkpoint cannot be written, or the stage was interrupted (after a last checkpoint).
+pub fn train(
+    context: &Context,
+    sets: &[MaskSet],
+    training: &Training,
+    checkpoint: Option<(&Path, &Provenance)>,
+    stage: &Stage,
+    on_curve: impl Fn(&[CurvePoint]) -> Result<()>,
+) -> Result<Trained> {
+    let Training { dim, options, seed } = training;
+    let mut rng = ChaCha8Rng::seed_from_u64(*seed);
+    let mut state = State::new(Model::new(*dim, options.clone(), context, &mut rng));
+    if let Some((path, provenance)) = checkpoint {
+        checkpoint::resume(&mut state, path, provenance, options.iterations, stage);
+    }
+    let resumed_at = state.iteration;
+    let mut solver = Solver::new(context, &state.model);
+    let (held_out, sets) = hold_out(sets, options.early_stop, stage);
+    let mut views = Views { count: sets.len() as u64, seed: *seed, epoch: u64::MAX, order: Vec::new() };
+    let mut progress = stage.progress("iterations", options.iterations).resumed_at(resumed_at);
+    while state.iteration < options.iterations {
+        let set = sets[views.at(state.iteration)];
+        let noise = splitmix(seed ^ splitmix(state.iteration));
+        // Another view to take positives from, for the loss that asks for them.
+        let other = sets[(splitmix(noise) % sets.len() as u64) as usize];
+        let beside = (options.loss == Loss::CrossView && !std::ptr::eq(other, set)).then_some(other);
+        let [loss, separation] = solver.forward(&state.model, set, beside, noise);
+        if !loss.is_finite() {
+            return Err(Error::new("the loss is not finite")
+                .field(format!("iteration {}", state.iteration + 1))
+                .found(loss)
+                .hint("lower --lr, or raise --tau"));
+        }
+        state.window.add(loss, separation);
+        if (state.iteration + 1).is_multiple_of(CURVE_EVERY) || state.iteration + 1 == options.iterations {
+            let alignment = solver.alignment(&state.model, set);
+            let point = state.window.take(state.iteration + 1, alignment, options.lr);
+            state.curve.push(point);
+        }
+        solver.update(&mut state, set, noise, options);
+        let settled = state.iteration.is_multiple_of(LOOK_EVERY)
+            && !held_out.is_empty()
+            && state.settled.look(solver.mean_loss(&state.model, &held_out));
+        let (unfinished, interrupted) = (state.iteration < options.iterations, stage.interrupted());
+        if let Some((path, provenance)) = checkpoint
+            && unfinished
+            && (interrupted || state.iteration.is_multiple_of(CHECKPOINT_EVERY))
+        {
+            checkpoint::write(path, provenance, &mut state)?;
+            on_curve(&state.curve)?;
+        }
+        if interrupted && unfinished {
+            return Err(Error::new("interrupted"));
+        }
+        progress.set(state.iteration, &[("loss", state.curve.last().map_or(loss, |p| p.loss))]);
+        if settled {
+            stage.info(&format!(
+                "stopped after {} of {} iterations: the loss of the held-out views no longer falls below {:.4}",
+                state.iteration, options.iterations, state.settled.lowest
+            ));
+            break;
+        }
+    }
+    let last = state.curve.last().copied().unwrap_or_default();
+    progress.finish(&[("loss", last.loss), ("alignment", last.alignment), ("separation", last.separation)]);
+    on_curve(&state.curve)?;
+    let features = solver.final_features(&state.model);
+    let network_bytes = solver.network_bytes();
+    Ok(Trained { features, curve: state.curve, resumed_at, iterations: state.iteration, network_bytes })
+}
+
+/// The sets that are held out and those that are learnt from.
+fn hold_out<'a>(sets: &'a [MaskSet], early_stop: bool, stage: &Stage) -> (Vec<&'a MaskSet>, Vec<&'a MaskSet>) {
+    let (held_out, seen): (Vec<_>, Vec<_>) =
+        sets.iter().enumerate().partition(|(i, _)| early_stop && i % HELD_OUT == HELD_OUT - 1);
+    if early_stop && held_out.is_empty() {
+        stage.warn(&format!("--early-stop needs {HELD_OUT} views with masks: training to the end"));
+    }
+    let sets = |of: Vec<(usize, &'a MaskSet)>| of.into_iter().map(|(_, set)| set);
+    (sets(held_out).take(MOST_HELD_OUT).collect(), sets(seen).collect())
+}
+
+/// The order of views: every view once in an epoch.
+struct Views {
+    count: u64,
+    seed: u64,
+    epoch: u64,
+    order: Vec<u32>,
+}
+
+impl Views {
+    /// The view of an iteration.
+    fn at(&mut self, iteration: u64) -> usize {
+        let epoch = iteration / self.count;
+        if epoch != self.epoch {
+            let mut rng = ChaCha8Rng::seed_from_u64(self.seed);
+            // Stream 0 drew the model.
+            rng.set_stream(epoch + 1);
+            self.epoch = epoch;
+            self.order = (0..self.count as u32).collect();
+            self.order.shuffle(&mut rng);
+        }
+        self.order[(iteration % self.count) as usize] as usize
+    }
+}

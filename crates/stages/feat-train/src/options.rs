@@ -1,0 +1,282 @@
+//! The options of `feat-train`, with their defaults and ranges. [`Options`] goes into the provenance of the features.
+
+#![allow(rustdoc::invalid_html_tags, reason = "help texts name files as <FILE>.curve.svg")]
+
+use artifacts::Level;
+use clap::{Parser, ValueEnum};
+use gs_io::{Error, Result};
+use serde::{Serialize, Serializer};
+use serde_json::{Value, json};
+use stage::{CommonArgs, at_least, positive, within};
+use std::path::PathBuf;
+
+/// Computes a feature for every Gaussian from the masks of all views
+#[derive(Debug, Parser)]
+#[command(name = "feat-train", version)]
+pub struct Args {
+    /// Gaussians, as a 3DGS PLY
+    #[arg(long, value_name = "FILE")]
+    pub(crate) geometry: PathBuf,
+    /// The graph.safetensors of graph-precompute
+    #[arg(long, value_name = "FILE")]
+    pub(crate) graph: PathBuf,
+    /// The footprints.safetensors of graph-precompute
+    #[arg(long, value_name = "FILE")]
+    pub(crate) footprints: PathBuf,
+    /// Output: the features. Their curve goes to <FILE>.curve.jsonl and, as a picture, to <FILE>.curve.svg
+    #[arg(long, value_name = "FILE")]
+    pub(crate) out: PathBuf,
+    #[command(flatten)]
+    pub(crate) options: Options,
+    #[command(flatten)]
+    pub(crate) common: CommonArgs,
+}
+
+/// What shapes the features.
+#[derive(Debug, Clone, PartialEq, clap::Args, Serialize)]
+pub struct Options {
+    /// Train the features with the paper's method instead of computing them in closed form
+    #[arg(long, value_enum)]
+    pub preset: Option<Preset>,
+    /// Mask levels to use, separated by commas: default, small, medium, large [default: all; large with --preset paper]
+    #[arg(long, value_name = "LEVELS", value_delimiter = ',')]
+    #[serde(serialize_with = "names")]
+    pub levels: Vec<Level>,
+    /// Dimension of the features, 1 to 512, or 2 to 64 with --preset paper [default: 6 with --preset paper; else as many
+    /// as --cutoff keeps, at most 256, and from 262,144 Gaussians on fewer, down to 64]
+    #[arg(long, value_name = "COUNT", value_parser = within(1usize..=512))]
+    pub dim: Option<usize>,
+    /// What only the closed form reads.
+    #[command(flatten)]
+    pub spectral: Spectral,
+    /// What only the paper's method reads.
+    #[command(flatten)]
+    pub contrastive: Contrastive,
+}
+
+/// A set of defaults.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum, Serialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum Preset {
+    /// The paper, read literally: contextual propagation and contrastive learning. The options under "Paper" change it.
+    Paper,
+}
+
+/// Options of the closed form.
+#[derive(Debug, Clone, Copy, PartialEq, clap::Args, Serialize)]
+#[command(next_help_heading = "Closed form (without --preset)")]
+pub struct Spectral {
+    /// Singular value below which a vector fades out, above 0: a low cutoff shows parts, a high one whole things. The nearer
+    /// the singular value of a vector is to 1, the better the vector separates things
+    #[arg(long, value_name = "VALUE", default_value_t = 0.6, value_parser = positive::<f64>)]
+    pub cutoff: f64,
+}
+
+/// Options of the paper's method.
+#[derive(Debug, Clone, PartialEq, clap::Args, Serialize)]
+#[command(next_help_heading = "Paper (with --preset paper)")]
+#[group(requires = "preset")]
+pub struct Contrastive {
+    /// Training iterations, one random view each
+    #[arg(long, value_name = "COUNT", default_value_t = 10_000)]
+    pub iterations: u64,
+    /// Layers of the graph network, 0 to 4; 0 trains the features without context
+    #[arg(long, value_name = "COUNT", default_value_t = 2, value_parser = within(0usize..=4))]
+    pub layers: usize,
+    /// Neighbours of an anchor
+    #[arg(long, value_enum, default_value_t = Neighbours::Gaussians)]
+    pub neighbours: Neighbours,
+    /// Leave out the ReLU after the last layer
+    #[arg(long)]
+    pub no_last_relu: bool,
+    /// Normalise the feature of each Gaussian to unit length before rendering
+    #[arg(long)]
+    pub unit_length: bool,
+    /// Values that share a mean and a standard deviation in the graph network
+    #[arg(long, value_enum, default_value_t = Axis::Channel)]
+    pub norm_axis: Axis,
+    /// Loss on the masks of a view
+    #[arg(long, value_enum, default_value_t = Loss::Printed)]
+    pub loss: Loss,
+    /// Initial features
+    #[arg(long, value_enum, default_value_t = Init::Uniform)]
+    pub init: Init,
+    /// Temperature of the loss, 1e-6 to 1e6
+    #[arg(long, value_name = "TAU", default_value_t = 0.1, value_parser = within(1e-6..=1e6))]
+    pub tau: f64,
+    /// Learning rate of the features, above 0
+    #[arg(long, value_name = "RATE", default_value_t = 1e-3, value_parser = positive::<f64>)]
+    pub lr: f64,
+    /// Learning rate of the graph network, above 0
+    #[arg(long, value_name = "RATE", default_value_t = 1e-3, value_parser = positive::<f64>)]
+    pub weight_lr: f64,
+    /// Weight of the cohesion loss, 0 or more: the mean distance of a mask's sampled pixels from its centroid. Needs
+    /// graph-precompute --pixel-samples
+    #[arg(long, value_name = "WEIGHT", default_value_t = 0.0, value_parser = at_least(0.0))]
+    pub cohesion: f64,
+    /// Add the output of the graph network to the anchors only, not to all Gaussians
+    #[arg(long)]
+    pub no_propagation: bool,
+    /// Hold out every tenth view, and stop when the loss of these views no longer falls
+    #[arg(long)]
+    pub early_stop: bool,
+    /// Use views with a single mask too, although their loss and gradient are zero
+    #[arg(long)]
+    pub no_skip: bool,
+}
+
+/// Neighbours of an anchor, whose features it sums.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum, Serialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum Neighbours {
+    /// The nearest Gaussians; their inputs are the same in every layer (the paper's formula).
+    Gaussians,
+    /// The nearest anchors, with their features of the layer before (the paper's text: "distance between anchors").
+    Anchors,
+    /// The nearest anchors, with the same inputs in every layer (the formula's inputs, the text's neighbours).
+    AnchorInputs,
+}
+
+/// Values that are standardised together.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum, Serialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum Axis {
+    /// Each channel over all Gaussians.
+    Channel,
+    /// Each Gaussian over its channels.
+    Gaussian,
+}
+
+/// Loss on the masks of a view.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum, Serialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum Loss {
+    /// As printed in the paper: the positive is the mask itself, a constant; the other masks are in the denominator.
+    Printed,
+    /// The same with the mask itself in the denominator too, so that the loss is bounded below.
+    #[value(name = "self")]
+    #[serde(rename = "self")]
+    WithSelf,
+    /// The positive is the centroid of a random half of the mask's Gaussians, in numerator and denominator.
+    HalfMask,
+    /// The positive is the centroid of the same thing's mask in another view, in numerator and denominator. A mask without
+    /// such a counterpart is its own positive.
+    CrossView,
+    /// Per Gaussian: each Gaussian against the centroids of all masks. Its positives are its own masks, by their weight.
+    Gaussian,
+    /// Per pixel: each sampled pixel against the centroids of all masks. Its positive is its own mask.
+    Pixel,
+}
+
+/// Initial features.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum, Serialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum Init {
+    /// Uniform in 0 to 1, as in OpenGaussian.
+    Uniform,
+    /// Normal, with a standard deviation of 0.01.
+    NormalSmall,
+}
+
+impl Default for Contrastive {
+    /// The paper, read literally.
+    fn default() -> Self {
+        #[derive(Parser)]
+        struct Alone {
+            #[arg(hide = true)]
+            preset: Option<String>,
+            #[command(flatten)]
+            options: Contrastive,
+        }
+        Alone::parse_from(["feat-train"]).options
+    }
+}
+
+impl Contrastive {
+    /// Whether the loss reads sampled pixels.
+    pub fn needs_pixels(&self) -> bool {
+        self.loss == Loss::Pixel || self.cohesion > 0.0
+    }
+}
+
+/// Dimension of the features with `--preset paper`, where `--dim` is not given.
+const PAPER_DIM: usize = 6;
+/// Dimension of the closed form where `--dim` is not given: between these, as long as all features together have at most
+/// so many values (256 MB).
+const MOST_VECTORS: usize = 256;
+const LEAST_VECTORS: usize = 64;
+const MOST_VALUES: usize = 1 << 26;
+
+impl Options {
+    /// Refuses what the ranges of single options let pass.
+    pub(crate) fn check(&self) -> Result<()> {
+        match self.dim {
+            Some(dim) if self.preset.is_some() && !(2..=64).contains(&dim) => {
+                Err(Error::new("out of range").field("--dim").found(dim).expected("2 to 64 with --preset paper"))
+            }
+            _ => Ok(()),
+        }
+    }
+
+    /// Levels of the masks that count.
+    pub(crate) fn levels(&self) -> Vec<Level> {
+        match (&self.levels[..], self.preset) {
+            ([], None) => Level::ALL.to_vec(),
+            ([], Some(Preset::Paper)) => vec![Level::Large],
+            (given, _) => given.to_vec(),
+        }
+    }
+
+    /// Whether masks of `level`, as the footprints number it, count.
+    pub(crate) fn uses(&self, level: u32) -> bool {
+        self.levels().iter().any(|&l| l as u32 == level)
+    }
+
+    /// Dimension of trained features.
+    pub(crate) fn trained_dim(&self) -> usize {
+        self.dim.unwrap_or(PAPER_DIM)
+    }
+
+    /// Vectors that the closed form keeps, at most.
+    pub(crate) fn most_vectors(&self, gaussians: usize) -> usize {
+        self.dim.unwrap_or((MOST_VALUES / gaussians.max(1)).clamp(LEAST_VECTORS, MOST_VECTORS))
+    }
+
+    /// All of them and the seed, with what depends on the preset filled in and without the options of the other method.
+    pub(crate) fn parameters(&self, seed: u64) -> Value {
+        let trained = self.preset.is_some();
+        let dim = if trained { Some(self.trained_dim()) } else { self.dim };
+        let mut parameters = json!(Self { levels: self.levels(), dim, ..self.clone() });
+        parameters["seed"] = json!(seed);
+        let other = if trained { "spectral" } else { "contrastive" };
+        parameters.as_object_mut().expect("a struct is an object").remove(other);
+        parameters
+    }
+}
+
+fn names<S: Serializer>(levels: &[Level], to: S) -> std::result::Result<S::Ok, S::Error> {
+    to.collect_seq(levels.iter().map(ToString::to_string))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn parameters_are_all_options_of_the_method_with_its_defaults() {
+        let of = |arguments: &[&str]| {
+            let files = ["feat-train", "--geometry", "g", "--graph", "g", "--footprints", "f", "--out", "o"];
+            Args::parse_from([&files, arguments].concat()).options.parameters(3)
+        };
+        let closed = json!({ "preset": null, "levels": ["default", "small", "medium", "large"], "dim": null,
+            "spectral": { "cutoff": 0.5 }, "seed": 3 });
+        assert_eq!(of(&["--cutoff", "0.5"]), closed);
+        let paper = of(&["--preset", "paper", "--loss", "self"]);
+        assert_eq!(
+            (&paper["preset"], &paper["levels"], &paper["dim"]),
+            (&json!("paper"), &json!(["large"]), &json!(6))
+        );
+        assert_eq!(paper["contrastive"], json!(Contrastive { loss: Loss::WithSelf, ..Contrastive::default() }));
+        assert_eq!(paper["contrastive"].as_object().map(serde_json::Map::len), Some(15));
+    }
+}
