@@ -2,7 +2,6 @@
 //! the closed form costs there. [`scene`] says how the scene is made. Writes out/bench/train.json; docs/training.md has the
 //! figures.
 
-mod rendering;
 mod scene;
 
 use feat_train::contrastive::adam::{Adam, Rates};
@@ -13,9 +12,11 @@ use feat_train::contrastive::masks::MaskSet;
 use feat_train::contrastive::model::Model;
 use feat_train::contrastive::train::{Trained, Training, train};
 use feat_train::options::{Contrastive, Loss};
+use glam::DVec3;
+use gs_raster::{RasterOptions, TILE, render_features, tile_weights};
+use gs_scene::{Camera, Gaussians};
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
-use rendering::View;
 use scene::{Scene, scene};
 use serde_json::{Value, json};
 use std::path::Path;
@@ -44,7 +45,7 @@ fn layered(layers: usize) -> Contrastive {
     Contrastive { layers, ..Contrastive::default() }
 }
 
-/// Processor time of this process; 0 where it is not told.
+/// Processor time of this process; 0 where the system does not say.
 fn cpu_seconds() -> f64 {
     stage::cpu_seconds().unwrap_or(0.0)
 }
@@ -118,22 +119,63 @@ fn early_stop() -> Value {
     })
 }
 
-/// An iteration on footprints beside rendering and averaging, on 102,400 Gaussians and one view of 1000 x 750.
+/// An iteration on footprints beside one that renders: features are rasterised, averaged over the pixels of masks, and
+/// the gradient goes back from the pixels to the Gaussians. 102,400 Gaussians, one view of 1000 x 750 from straight above,
+/// and a grid of 80 masks.
 fn against_rendering() -> Value {
-    let side = 320;
+    let (side, width, height, across, down) = (320, 1000, 750, 10, 8);
     let s = scene(side);
-    let context = s.context();
-    let mut model = Model::<f32>::new(DIM, layered(2), &context, &mut ChaCha8Rng::seed_from_u64(0));
-    // As after some training: centroids of different directions.
-    for (i, f) in model.features.iter_mut().enumerate() {
-        *f = 3.0 * *f - 1.5 + (i / 6000 % 7) as f32 * 0.3;
-    }
-    let found = View::new(&s.positions, side as f64, 1000, 750).compare(&context, &model, 5);
-    json!({
-        "gaussians": side * side, "width": 1000, "height": 750, "rendering_seconds": found.rendering,
-        "engine_seconds": found.engine, "ratio": found.rendering / found.engine,
-        "difference": { "centroids": found.centroids, "loss": found.loss, "gradients": found.gradients },
-    })
+    let (context, n) = (s.context(), s.positions.len());
+    let gaussians = Gaussians {
+        means: s.positions.clone(),
+        log_scales: vec![[-0.4, -0.5, -0.6]; n],
+        rotations: vec![[1.0, 0.0, 0.0, 0.0]; n],
+        opacity_logits: vec![2.0; n],
+        sh: vec![0.0; 3 * n],
+        sh_degree: 0,
+    };
+    let target = DVec3::new(side as f64 / 2.0, side as f64 / 2.0, 0.0);
+    let eye = target - DVec3::new(0.0, 0.0, side as f64);
+    let camera = Camera::look_at(eye, target, DVec3::Y, width as u32, height as u32, 0.9);
+    let options = RasterOptions::default();
+    let mask_of = |pixel: usize| pixel / width * down / height * across + pixel % width * across / width;
+    let features = vec![0.5f32; n * DIM];
+    let rendering = || {
+        let image = render_features(&gaussians, &features, DIM, &camera, &options);
+        let mut means = vec![0.0f32; across * down * DIM];
+        for (pixel, f) in image.chunks_exact(DIM).enumerate() {
+            let mean = &mut means[mask_of(pixel) * DIM..][..DIM];
+            mean.iter_mut().zip(f).for_each(|(m, f)| *m += f);
+        }
+        // The adjoint: as if the gradient of a mask were its mean.
+        let tiles = tile_weights(&gaussians, &camera, &options, true, |t| {
+            let mut sums = vec![0.0f32; t.gaussians.len() * DIM];
+            for (sum, w) in sums.chunks_exact_mut(DIM).zip(t.weights.chunks_exact(TILE * TILE)) {
+                for (at, w) in w.iter().enumerate().filter(|(_, w)| **w > 0.0) {
+                    let mean = &means[mask_of((t.y0 + at / TILE) * width + t.x0 + at % TILE) * DIM..];
+                    sum.iter_mut().zip(mean).for_each(|(s, g)| *s += w * g);
+                }
+            }
+            sums
+        });
+        assert!(!tiles.is_empty());
+    };
+    let clock = |f: &dyn Fn()| {
+        let start = Instant::now();
+        f();
+        start.elapsed().as_secs_f64()
+    };
+    let cell = |v: f32, cells: usize| ((v.max(0.0) as usize).min(side - 1)) * cells / side;
+    let entry = |(place, &i): (usize, &u32)| {
+        let [x, y, _] = s.positions[i as usize];
+        (place as u32, (cell(y, down) * across + cell(x, across)) as u16, 1e-3)
+    };
+    let entries = context.order.iter().enumerate().map(entry).collect();
+    let masks = across * down;
+    let set = MaskSet::from_entries((0..masks as u32).collect(), vec![9375.0; masks], entries, &context);
+    let engine = spread((0..RUNS).map(|_| run(&context, std::slice::from_ref(&set), 2, 10).seconds).collect())[1];
+    let rendering = spread((0..RUNS).map(|_| clock(&rendering)).collect())[1];
+    json!({ "gaussians": n, "rendering_seconds": rendering, "engine_seconds": engine, "ratio": rendering / engine })
 }
 
 /// The program itself, with the closed form.

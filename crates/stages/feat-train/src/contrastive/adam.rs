@@ -1,4 +1,4 @@
-//! Adam (Kingma and Ba), dense: parameters without gradient keep moving by their momentum, as in the original.
+//! Adam (Kingma and Ba), dense: parameters without a gradient are updated by their momentum, as in the original.
 
 use super::real::Real;
 use rayon::prelude::*;
@@ -9,7 +9,7 @@ const BETA1: f64 = 0.9;
 const BETA2: f64 = 0.999;
 /// Added to the root (OpenGaussian's value).
 const EPSILON: f64 = 1e-15;
-/// Means below this are nothing: without gradient they would decay into denormal numbers, which are slow.
+/// Means below this become zero: without a gradient they would decay into denormal numbers, which are slow.
 const TINY: f64 = 1e-30;
 /// So are mean squares below this.
 const TINY_SQUARE: f64 = 1e-37;
@@ -56,7 +56,7 @@ impl Rates {
         }
     }
 
-    /// A step that moves nothing and leaves the gradient in the place of its mean.
+    /// A step that changes no parameter and leaves the gradient in place of its mean.
     pub fn none() -> Self {
         Self { b1: 0.0, c1: 1.0, b2: 0.0, c2: 0.0, rate: 0.0, tiny: 0.0, ..Self::at(0.0, 1) }
     }

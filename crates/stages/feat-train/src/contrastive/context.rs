@@ -2,7 +2,7 @@
 //!
 //! Anchors lie along a space-filling curve and Gaussians in the order of their nearest anchor, so that everything an
 //! anchor serves lies together: sums over an anchor's Gaussians are sums over a range, no two threads ever add to the same
-//! place, and what a view sees, or an anchor sums, is mostly near in memory too.
+//! place, and what a view sees or an anchor sums is mostly close in memory too.
 
 use crate::options::Neighbours;
 use artifacts::Graph;
@@ -26,11 +26,11 @@ pub struct Context {
     pub served: Vec<u32>,
     /// Where the neighbours of each anchor begin in `neighbours`; M + 1. Padding is left out.
     pub neighbour_start: Vec<u32>,
-    /// Places in the training order, or anchors, as asked for.
+    /// The neighbours: places in the training order, or anchors, by their kind.
     pub neighbours: Vec<u32>,
-    /// Of which kind they are.
+    /// Kind of neighbours.
     pub kind: Neighbours,
-    /// The graph of anchors backwards, for gradients: where the anchors begin that have anchor a as a neighbour.
+    /// The reverse graph of anchors, for gradients: where the list of the anchors that have anchor a as a neighbour begins.
     pub reverse_start: Vec<u32>,
     /// Those anchors.
     pub reverse: Vec<u32>,
@@ -123,7 +123,7 @@ pub fn inverse(permutation: &[u32]) -> Vec<u32> {
     out
 }
 
-/// Adjacency lists the other way round; sources ascend.
+/// Reverses adjacency lists; sources ascend.
 fn transpose(start: &[u32], targets: &[u32], m: usize) -> (Vec<u32>, Vec<u32>) {
     let mut out_start = vec![0u32; m + 1];
     for &t in targets {

@@ -9,7 +9,7 @@ pub fn in_half(noise: u64, entry: usize) -> bool {
     splitmix(noise ^ entry as u64) & 1 == 1
 }
 
-/// Centroids shorter than this have no direction and take no part.
+/// Centroids shorter than this have no direction and are left out.
 pub const SHORTEST: f64 = 1e-12;
 
 /// Loss, its gradients, and how far apart the centroids are.
@@ -66,7 +66,7 @@ pub fn log_sum_exp(logits: &mut [f64]) -> f64 {
     max + sum.ln()
 }
 
-/// The centroids of a view's masks, as what single features are told apart by.
+/// The centroids of a view's masks, to classify single features by.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Prototypes {
     d: usize,
@@ -78,7 +78,7 @@ pub struct Prototypes {
 }
 
 impl Prototypes {
-    /// Of `centroids` `[K][d]`, at the temperature `tau`.
+    /// From `centroids` `[K][d]`, at the temperature `tau`.
     pub fn new(centroids: &[f64], d: usize, tau: f64) -> Self {
         let (unit, length) = directions(centroids, d);
         let alive = (0..length.len()).filter(|&k| length[k] > SHORTEST).collect();
@@ -146,8 +146,8 @@ pub fn cohesion(
 }
 
 /// The loss per mask, averaged over the masks that take part. `positives` are needed for [`Loss::HalfMask`], which gives
-/// their gradient too, and for [`Loss::CrossView`], where they are constant and zeros stand for none; [`Loss::Gaussian`] and
-/// [`Loss::Pixel`] are none of masks: their loss is 0 here and only the separation is of interest.
+/// their gradient too, and for [`Loss::CrossView`], where they are constant and zeros mean none. [`Loss::Gaussian`] and
+/// [`Loss::Pixel`] do not compare masks: their loss is 0 here, and only the separation counts.
 pub fn evaluate(loss: Loss, centroids: &[f64], positives: Option<&[f64]>, d: usize, tau: f64) -> Evaluated {
     let masks = centroids.len() / d;
     let (unit, length) = directions(centroids, d);

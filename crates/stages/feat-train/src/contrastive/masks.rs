@@ -1,15 +1,15 @@
 //! The masks of each view as sparse matrices: masks times Gaussians, and sampled pixels times Gaussians.
 //!
-//! Rendering is as linear for a pixel as it is for a mask: the feature of pixel p is the row w[p,.] times the features.
+//! Rendering is linear for a pixel as well as for a mask: the feature of pixel p is the row w[p,.] times the features.
 //! graph-precompute keeps the rows of some pixels of each mask (`--pixel-samples`), so losses of pixels need no rasteriser.
 
 use super::context::{Context, inverse};
 use artifacts::{Footprints, Level, PixelSamples};
 use gs_io::{Error, Result};
 
-/// Masks of a view at a level, at most: what 16 bits can number.
+/// Most masks of a view at a level: their numbers have 16 bits.
 const MOST_MASKS: usize = 1 << 16;
-/// Columns in a piece of work, about.
+/// Approximate number of columns that one task works on.
 const PIECE: usize = 2048;
 
 /// The masks of one view at one level: the matrix A of docs/method.md, by columns (Gaussians).
@@ -27,7 +27,7 @@ pub struct MaskSet {
     pub mask: Vec<u16>,
     /// A[mask, column]: summed blending weight over gated pixels.
     pub weight: Vec<f32>,
-    /// Bounds of the pieces in which columns are worked on; the Gaussians of an anchor are never parted.
+    /// Bounds of the pieces of columns that tasks work on; the Gaussians of an anchor are in one piece.
     pub pieces: Vec<u32>,
     /// Single pixels of the masks; empty where the footprints have none.
     pub sampled: Pixels,

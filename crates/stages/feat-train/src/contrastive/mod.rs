@@ -96,7 +96,7 @@ fn frozen_graph(args: &Args, inputs: &Inputs, stage: &Stage) -> Result<Context> 
 /// The masks of every view and level that teaches something.
 fn masks_to_learn_from(args: &Args, inputs: &Inputs, context: &Context, stage: &Stage) -> Result<Vec<MaskSet>> {
     let (levels, options) = (args.options.levels(), &args.options.contrastive);
-    // A lone mask has none to be told from, but its pixels can be drawn together.
+    // A single mask has no other to be separated from, but cohesion works on it.
     let least = if options.no_skip || options.cohesion > 0.0 { 1 } else { 2 };
     let sets = mask_sets(&inputs.footprints, context, &levels, least)?;
     let units = inputs.footprints.views.len() * levels.len();

@@ -156,8 +156,8 @@ impl<T: Real> Model<T> {
         (h, sums)
     }
 
-    /// f_final of the Gaussian at `place`: its own feature and what it receives. Gives its length before it was brought to
-    /// unit length, where that is asked for; else 1.
+    /// f_final of the Gaussian at `place`: its own feature and what it receives. Returns its length before normalisation to
+    /// unit length, or 1 without that normalisation.
     #[inline]
     fn final_feature(&self, context: &Context, propagated: &Propagated<T>, place: usize, out: &mut [f64]) -> f64 {
         let d = out.len();
@@ -398,11 +398,11 @@ impl<T: Real> Model<T> {
     }
 }
 
-/// Loss of a view, and what its columns' gradients are made of.
+/// Loss of a view, and what the gradients of its columns are computed from.
 struct View<'a> {
     set: &'a MaskSet,
     evaluated: Evaluated,
-    /// What draws the halves of masks that are positives, where the loss has them.
+    /// Seed of the halves of masks that are positives, where the loss has them.
     halves: Option<u64>,
     of_gaussians: Option<GaussianTerms<'a>>,
     /// Gradients of the columns' features from sampled pixels.

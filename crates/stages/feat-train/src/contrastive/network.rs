@@ -20,11 +20,11 @@ pub struct Layer<T> {
     pub input: usize,
     /// Channels of its neighbours' features.
     pub neighbour: usize,
-    /// Channels it gives.
+    /// Channels of its output.
     pub output: usize,
     /// W1 `[input][output]`, then W2 `[neighbour][output]`, then the bias `[output]`.
     pub weights: Vec<T>,
-    /// Whether what is negative becomes zero.
+    /// Whether negative outputs become zero.
     pub relu: bool,
 }
 

@@ -1,7 +1,7 @@
 //! Standardisation to mean 0 and deviation 1, forward and backward.
 //!
-//! The deviation is the unbiased one, and the paper's epsilon of 1e-10 is added to it. A deviation that is nothing but
-//! rounding noise counts as zero and gives zeros: a scene of one colour must not become amplified noise.
+//! The deviation is the unbiased one, and the paper's epsilon of 1e-10 is added to it. A deviation as small as rounding noise
+//! counts as zero and gives zeros: a scene of one colour must not become amplified noise.
 
 use super::real::Real;
 use rayon::prelude::*;

@@ -59,7 +59,7 @@ impl<'a> PixelTerms<'a> {
         Self { d, options, centroids, prototypes, pixels, masks }
     }
 
-    /// The terms; adds their gradient of the centroids and gives that of the columns' features `[columns][d]`. `feature`
+    /// The terms; adds their gradient of the centroids and returns that of the columns' features `[columns][d]`. `feature`
     /// writes the feature of a column.
     pub fn gradients(
         &self,

@@ -1,7 +1,7 @@
 //! CᵀC, masks by masks: which masks share Gaussians, and how much.
 //!
-//! It is as sparse as masks are small: for a million Gaussians and 300 views it has a twelfth of the entries that a product
-//! with C and its transpose goes through.
+//! The smaller the masks, the sparser it is: for a million Gaussians and 300 views it has a twelfth of the entries that a product
+//! with C and its transpose needs.
 //! A block of Gaussians knows a few hundred masks; products of its rows are summed in a dense square that stays in
 //! cache, and the squares of all blocks are then added up mask by mask, in the order of blocks.
 
@@ -37,7 +37,7 @@ struct Upper {
 }
 
 impl Upper {
-    /// Of a block, by its own numbers of masks.
+    /// From a block, by its own numbers of masks.
     fn of(block: &Block) -> Self {
         let m = block.masks.len();
         let mut out = Self { start: vec![0], ..Self::default() };
@@ -60,7 +60,7 @@ impl Upper {
     }
 }
 
-/// Adds the products of each row's entries in `band` with themselves and those behind.
+/// Adds the products of each row's entries in `band` with themselves and the entries after them.
 fn add_products(block: &Block, band: std::ops::Range<u32>, square: &mut [f32]) {
     let m = block.masks.len();
     for row in block.start.windows(2) {
@@ -79,7 +79,7 @@ fn add_products(block: &Block, band: std::ops::Range<u32>, square: &mut [f32]) {
 }
 
 impl Gram {
-    /// The product, or nothing where it takes more than `most` entries on the way there.
+    /// The product, or nothing where forming it takes more than `most` entries.
     pub fn new(matrix: &Matrix, most: usize) -> Option<Self> {
         let r = matrix.masks.len();
         let mut uppers: Vec<Upper> = Vec::with_capacity(matrix.blocks.len());
@@ -119,7 +119,7 @@ impl Gram {
         Some(Self::from_upper(&rows))
     }
 
-    /// The whole from what is on and above the diagonal.
+    /// The whole matrix from its entries on and above the diagonal.
     fn from_upper(rows: &[Vec<(u32, f32)>]) -> Self {
         let mut start = vec![0usize; rows.len() + 1];
         for (a, row) in rows.iter().enumerate() {
@@ -147,7 +147,7 @@ impl Gram {
         Self { start, mask, value }
     }
 
-    /// Entries.
+    /// Number of entries.
     pub fn entries(&self) -> usize {
         self.mask.len()
     }

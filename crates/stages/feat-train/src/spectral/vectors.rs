@@ -1,13 +1,14 @@
 //! Features in closed form: leading singular vectors of the matrix of Gaussians and masks ([`super::evidence`]).
 //!
 //! Gaussians that share masks over many views get similar rows of the left singular vectors: it is what a spectral
-//! contrastive loss converges to. A vector's squared singular value says how well what it separates holds together: how
-//! much of a random walk from a Gaussian to a mask that shows it, and back, stays there. Vectors are scaled by a smooth
-//! step in their singular values, σ^p / (σ^p + c^p): what holds together counts fully, what only few views separate fades
-//! out. The cutoff c is a knob of granularity: low shows parts, high whole things. (A plain power of σ, as in a diffusion
-//! map, fades the second vector already, and everything comes to lie near the first, which tells nothing apart.)
+//! contrastive loss converges to. The squared singular value of a vector says how many views agree with the parts that it
+//! separates: it is the probability that a random walk, from a Gaussian to a mask that shows it and back, stays in its part.
+//! Vectors are scaled by a smooth step in their singular values, σ^p / (σ^p + c^p): a separation that most views show counts
+//! fully, one that few views show fades out. The cutoff c sets the granularity: a low one shows parts, a high one whole
+//! things. (A plain power of σ, as in a diffusion map, already fades the second vector, so that all features come close to
+//! the first vector, which separates nothing.)
 //!
-//! The vectors are sought on the side of the masks, of which there are few: CᵀC is formed once ([`Gram`]), and its leading
+//! The vectors are computed for the masks, of which there are few: CᵀC is formed once ([`Gram`]), and its leading
 //! eigenvectors come from block subspace iteration, filtered by Chebyshev polynomials (Zhou, Saad, Tiago and Chelikowsky
 //! 2006), with Rayleigh-Ritz. One product with C itself then gives all Gaussians.
 
@@ -21,22 +22,23 @@ use rand_chacha::ChaCha8Rng;
 use rayon::prelude::*;
 use stage::Stage;
 
-/// Vectors carried beyond those asked for, at least: they speed up convergence.
+/// Least number of additional vectors in the iteration: they speed up convergence.
 const EXTRA: usize = 16;
-/// The iteration ends when every vector that matters is one of a matrix this near to CᵀC: its residual |CᵀC v - σ² v| times
-/// its scale is below. Where singular values are closer together than this, which vectors span them is open.
+/// The iteration ends when the residual |CᵀC v - σ² v| of every vector, times its scale, is below this. The vectors are then
+/// exact for a matrix that differs from CᵀC by no more. Singular values that are closer together than this have no unique
+/// vectors.
 const TOLERANCE: f64 = 1e-5;
-/// Or after this many products with CᵀC.
+/// The iteration also ends after this many products with CᵀC.
 const MOST_PASSES: usize = 400;
-/// `--dim auto` keeps vectors whose scale is at least this share of the first one's.
+/// Without `--dim`, vectors are kept whose scale is at least this share of the first one's.
 const LEAST_SCALE: f64 = 1e-3;
-/// A filter raises the first vector over the last by this factor at most: the digits of f32 must do for both.
+/// A filter raises the first vector over the last by this factor at most: both must fit into the digits of f32.
 const MOST_GAIN: f64 = 1e4;
 /// Highest degree of a filter.
 const MOST_DEGREE: f64 = 24.0;
-/// Steepness of the step that scales vectors at the cutoff: nearly all or nothing, without a jump.
+/// Exponent p of the step that scales vectors at the cutoff: steep, but smooth.
 const POWER: f64 = 16.0;
-/// CᵀC is formed where that takes at most so many entries for each of C, and so many more; else C is applied twice.
+/// CᵀC is formed where that takes at most this many entries for each entry of C, plus this many; else C is applied twice.
 const GRAM_ENTRIES: (usize, usize) = (4, 1 << 24);
 
 /// How many vectors, and how they are scaled.
@@ -164,7 +166,7 @@ fn singular_vectors(product: &Product<'_>, matrix: &Matrix, options: &SpectralOp
         let (vectors, w) = (multiply(&v, &rotation), multiply(&w, &rotation));
         let values: Vec<f64> = ritz.iter().map(|r| r.max(0.0).sqrt()).collect();
         if values.first().is_none_or(|v| *v <= 0.0) {
-            return Err(Error::new("the masks say nothing about any Gaussian")
+            return Err(Error::new("no mask has weight on any Gaussian")
                 .field("footprints")
                 .hint("check --levels and the masks"));
         }

@@ -21,25 +21,17 @@ const TERMS: usize = 32;
 
 /// Calls a kernel with the number of channels as a constant where there is a version for it.
 macro_rules! for_width {
-    ($d:expr, $kernel:ident ( $($argument:expr),* $(,)? )) => {
+    ($d:expr, $kernel:ident $arguments:tt) => {
+        for_width!(@ $d, $kernel, $arguments, 2 3 4 5 6 7 8 9 10 11 12 13 14 15 16)
+    };
+    (@ $d:expr, $kernel:ident, $arguments:tt, $($width:literal)*) => {
         match $d {
-            2 => $kernel::<2>($($argument),*),
-            3 => $kernel::<3>($($argument),*),
-            4 => $kernel::<4>($($argument),*),
-            5 => $kernel::<5>($($argument),*),
-            6 => $kernel::<6>($($argument),*),
-            7 => $kernel::<7>($($argument),*),
-            8 => $kernel::<8>($($argument),*),
-            9 => $kernel::<9>($($argument),*),
-            10 => $kernel::<10>($($argument),*),
-            11 => $kernel::<11>($($argument),*),
-            12 => $kernel::<12>($($argument),*),
-            13 => $kernel::<13>($($argument),*),
-            14 => $kernel::<14>($($argument),*),
-            15 => $kernel::<15>($($argument),*),
-            16 => $kernel::<16>($($argument),*),
-            _ => $kernel::<0>($($argument),*),
+            $($width => for_width!(@ $kernel, $width, $arguments),)*
+            _ => for_width!(@ $kernel, 0, $arguments),
         }
+    };
+    (@ $kernel:ident, $width:literal, ( $($argument:expr),* $(,)? )) => {
+        $kernel::<$width>($($argument),*)
     };
 }
 pub(super) use for_width;
@@ -151,7 +143,7 @@ pub fn relu(y: &mut [Lanes]) {
     }
 }
 
-/// What did not pass [`relu`] takes no gradient.
+/// Where [`relu`] gave zero the gradient becomes zero.
 #[multiversion(targets("x86_64+avx512f+avx512vl", "x86_64+avx2"))]
 pub fn relu_backward(y: &[Lanes], g: &mut [Lanes]) {
     for (g, &y) in g.as_flattened_mut().iter_mut().zip(y.as_flattened()) {
@@ -197,7 +189,7 @@ fn added(sums: &[f32; PARTIAL]) -> f32 {
     (four[0] + four[2]) + (four[1] + four[3])
 }
 
-/// What the columns of a view are read from and what a piece of them is.
+/// A piece of the columns of a view, and the arrays that they refer to.
 #[derive(Clone, Copy)]
 pub struct Piece<'a> {
     /// Places of the columns.
@@ -212,10 +204,10 @@ pub struct Piece<'a> {
     pub source: &'a [u32],
 }
 
-/// Adds w f_final of each entry to row `mask` of `sums`, rows of `O` padded from `d`. `hat` is empty without a network.
-/// Entries for which `half` holds are added to `halves` too.
-#[inline(always)]
-fn add_centroids(
+/// Adds w f_final of each entry of a view's columns to row `mask` of `sums`, rows of `pitch` padded from `d`. `hat` is empty
+/// without a network. Entries that are in the positive half of their mask are added to `halves` too.
+#[multiversion(targets("x86_64+avx512f+avx512vl", "x86_64+avx2"))]
+pub fn centroids<const D: usize>(
     d: usize,
     pitch: usize,
     piece: Piece<'_>,
@@ -224,6 +216,7 @@ fn add_centroids(
     sums: &mut [f32],
     mut halves: Option<(&mut [f32], Half<'_>)>,
 ) {
+    let d = width::<D>(d);
     for (c, &place) in piece.columns.iter().enumerate() {
         let mut f = [0.0f32; 64];
         let f = &mut f[..d];
@@ -253,20 +246,6 @@ fn add_centroids(
     }
 }
 
-/// [`add_centroids`] of a view's columns.
-#[multiversion(targets("x86_64+avx512f+avx512vl", "x86_64+avx2"))]
-pub fn centroids<const D: usize>(
-    d: usize,
-    pitch: usize,
-    piece: Piece<'_>,
-    features: &[f32],
-    hat: &[f32],
-    sums: &mut [f32],
-    halves: Option<(&mut [f32], Half<'_>)>,
-) {
-    add_centroids(width::<D>(d), pitch, piece, features, hat, sums, halves);
-}
-
 /// Gradients of a piece of columns, given those of the masks `[K][pitch]`: of the features into `rows`, whose first is
 /// that of place `first`, and added up per anchor into `anchors`, whose first is `first_anchor` (empty without network).
 #[multiversion(targets("x86_64+avx512f+avx512vl", "x86_64+avx2"))]
@@ -276,8 +255,10 @@ pub fn columns_backward<const D: usize>(
     piece: Piece<'_>,
     masks: &[f32],
     halves: Option<(&[f32], Half<'_>)>,
-    (first, rows): (usize, &mut [f32]),
-    (first_anchor, anchors): (usize, &mut [f32]),
+    first: usize,
+    rows: &mut [f32],
+    first_anchor: usize,
+    anchors: &mut [f32],
 ) {
     let d = width::<D>(d);
     for (c, &place) in piece.columns.iter().enumerate() {
@@ -315,7 +296,7 @@ pub fn columns_backward<const D: usize>(
 fn adam_one(p: &mut f32, m: &mut f32, v: &mut f32, g: f32, r: &Rates) {
     let mean = r.b1 * *m + r.c1 * g;
     let square = r.b2 * *v + r.c2 * g * g;
-    // Denormal numbers are slow, and nothing.
+    // Denormal numbers are slow, and as good as zero.
     let mean = if mean.abs() < r.tiny { 0.0 } else { mean };
     let square = if square < r.tiny_square { 0.0 } else { square };
     *m = mean;
@@ -342,7 +323,7 @@ pub fn adam_without(p: &mut [f32], m: &mut [f32], v: &mut [f32], rates: &Rates) 
 /// Per channel, the sums of (x - pivot) and of its square over rows, the pivot being the first row.
 #[multiversion(targets("x86_64+avx512f+avx512vl", "x86_64+avx2"))]
 pub fn channel_sums(d: usize, rows: &[f32], s1: &mut [f64], s2: &mut [f64]) {
-    // Some rows side by side are a row of independent sums: a loop without a thought for channels.
+    // Some rows side by side are one long row of independent sums: the loop does not depend on the number of channels.
     let width = APART * d;
     let pivots: Vec<f32> = rows.iter().take(d).copied().cycle().take(width).collect();
     let (mut a1, mut a2) = (vec![0.0f32; width], vec![0.0f32; width]);

@@ -2,9 +2,13 @@
 //! about a tenth of the time. The readable model is the oracle it is tested against.
 //!
 //! An iteration makes five passes in parallel, each over chunks of fixed size whose sums are added up in order in f64:
-//! the graph network over anchors, standardisation, centroids over the view's columns, then one pass that takes the
-//! gradient of the centroids back to the columns, moves all features (Adam) and sums them for the next iteration's
-//! statistics while they are at hand, and the network's backward pass over anchors.
+//!
+//! 1. the graph network over anchors;
+//! 2. standardisation of its output;
+//! 3. centroids of the masks over the view's columns;
+//! 4. the gradient of the centroids back to the columns, Adam on all features, and the sums of the features for the next
+//!    iteration's statistics, chunk by chunk while a chunk is in cache;
+//! 5. the backward pass of the network over anchors.
 
 mod kernels;
 #[cfg(test)]
@@ -290,7 +294,7 @@ impl<'a> Engine<'a> {
         loss::evaluate(s.loss, &means, positives, self.d, s.tau)
     }
 
-    /// Takes the gradients of the centroids back, and moves the features by one step of Adam. Gives the gradients of the
+    /// Takes the gradients of the centroids back, and updates the features by one step of Adam. Returns the gradients of the
     /// network's weights. `noise` is that of [`Engine::evaluate`].
     pub fn backward(
         &mut self,
@@ -301,13 +305,13 @@ impl<'a> Engine<'a> {
         noise: u64,
         rates: &Rates,
     ) -> Vec<Vec<f32>> {
-        let totals = self.move_features(model, adam, set, evaluated, noise, rates);
+        let totals = self.update_features(model, adam, set, evaluated, noise, rates);
         if model.layers.is_empty() { Vec::new() } else { self.network_gradients(model, &totals) }
     }
 
-    /// The pass over all features. Gives, per channel, the sums of g and of g y over anchors, y being the standardised
+    /// The pass over all features. Returns, per channel, the sums of g and of g y over anchors, y being the standardised
     /// output and g its gradient.
-    fn move_features(
+    fn update_features(
         &mut self,
         model: &mut Model<f32>,
         adam: &mut Adam<f32>,
@@ -348,9 +352,8 @@ impl<'a> Engine<'a> {
                     rows.resize(p.len(), 0.0);
                     let piece = this.piece(set, columns);
                     let both = (!halves.is_empty()).then_some((&halves[..], &half as Half<'_>));
-                    let to = (chunk.places.start, &mut rows[..]);
-                    let to_anchors = (chunk.anchors.start, &mut anchors[..]);
-                    for_width!(d, columns_backward(d, pitch, piece, &masks, both, to, to_anchors));
+                    let (place, anchor) = (chunk.places.start, chunk.anchors.start);
+                    for_width!(d, columns_backward(d, pitch, piece, &masks, both, place, rows, anchor, anchors));
                     kernels::adam(p, m, v, rows, rates);
                 }
                 if with_network {
