@@ -65,7 +65,7 @@ $(OPTIONS)/%.files: FORCE | checked-options
 	@mkdir -p $(@D)
 	@text=$$($($*_FILES)) && $(put)
 list = find -L $1 -maxdepth 1 -type f -name $2 -printf '%s %T@ %p\n' | LC_ALL=C sort
-scene_FILES = $(BIN)/gs-geom inspect --files $(call arg,PHOTOGRAPHS)
+scene_FILES = $(BIN)/gs-geom inspect $(call arg,PHOTOGRAPHS)
 geometry_FILES = $(call list,$(call arg,GEOMETRY),'*')
 masks_FILES = $(call list,$(MASKS)/,'*_s.npy')
 clip_FILES = $(call list,$(call arg,CLIP)/,'*')

@@ -22,7 +22,8 @@ run() {
     local name=$1 scene=$2 ply="$OUT/memory.runs/run.ply"
     shift 2
     [ -d "$scene" ] || { echo "skipping $name: no folder $scene" >&2; return; }
-    "$GS_GEOM" train --quiet --threads 2 --no-resume --scene "$scene" --out "$ply" "$@"
+    rm -f "$ply".*
+    "$GS_GEOM" train --quiet --threads 2 --overwrite --scene "$scene" --out "$ply" "$@"
     python3 - "$name" "$*" "$ply.run.json" >> "$OUT/memory.md" <<'PYTHON'
 import json, sys
 name, options, path = sys.argv[1:]

@@ -84,8 +84,7 @@ def main():
         def ours(n):
             out = folder / "ours.ply"
             return timed([geom, "train", "--scene", args.scene, "--resolution", args.resolution, "--iterations", n, "--out", out,
-                          "--schedule", "full", "--densify-from", 500, "--densify-every", 100, "--sh-every", 1000, "--opacity-reset-every", 3000,
-                          "--densify-until", 15000, "--no-resume", "--quiet", "--threads", threads], folder), out
+                          "--schedule", "full", "--densify", "none" if n <= 500 else "adaptive", "--quiet", "--threads", threads], folder), out
 
         def score(ply):
             out = folder / "score.json"

@@ -1,13 +1,17 @@
 #!/usr/bin/env bash
 # geometry_forecast.sh OUT COMMAND...: what a training may take: its memory in MB, as gs-geom itself says at its start for the
-# most Gaussians there may be, and its processor time in seconds, by docs/cluster.md. Runs the first iteration of COMMAND
-# (gs-geom train without --out) into a temporary folder and writes the two numbers to OUT.
+# most Gaussians there may be, and its processor time in seconds, by docs/cluster.md. Runs COMMAND (gs-geom train without --out)
+# into a temporary folder until it has printed its forecast, stops it, and writes the two numbers to OUT.
 set -euo pipefail
 out=$1
 shift
 folder=$(mktemp -d)
 trap 'rm -rf "$folder"' EXIT
-"$@" --out "$folder/geometry.ply" --stop-after 1 > "$folder/said" 2>&1 || { cat "$folder/said" >&2; exit 2; }
+"$@" --out "$folder/geometry.ply" > "$folder/said" 2>&1 &
+training=$!
+until grep -q 'memory: ' "$folder/said" || ! kill -0 "$training" 2> "$folder/ended"; do sleep 0.1; done
+kill "$training" 2> "$folder/ended" || true
+wait "$training" || true
 iterations=30000 previous=
 for word in "$@"; do
   case $previous in --iterations) iterations=$word ;; esac

@@ -87,7 +87,7 @@ scenes='figurines ramen waldo_kitchen' run_lerf > "$work/again.log" 2>&1
 pass "make lerf-ovs ends in the paper's table (figurines: mIoU $miou), and a second make runs nothing"
 
 benchmark SET=scannet DATA="$scannet" OUT="$work/scan" SCENES="scene0000_00 scene0062_00" TEXTS="$work/names.json" \
-  GEOM_ARGS="--fixed-points --resolution 2 --holdout 0 $small" GRAPH_ARGS='--holdout 0 --min-mask-pixels 10' all > "$work/scan.log" 2>&1 \
+  GEOM_ARGS="--densify fixed --resolution 2 --holdout 0 $small" GRAPH_ARGS='--holdout 0 --min-mask-pixels 10' all > "$work/scan.log" 2>&1 \
   || { cat "$work/scan.log"; fail "make scannet"; }
 [ "$(wc -l < "$work/scan/scene0000_00/frames/scene0000_00/frames.txt")" = 12 ] || fail "not every 20th frame"
 grep -q '| CAGS | 32.60 |' "$work/scan/table.md" && grep -q '| scene0062_00 |' "$work/scan/table.md" || fail "no table of ScanNet"

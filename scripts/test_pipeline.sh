@@ -138,7 +138,7 @@ while IFS='|' read -r name misspelt out_of_range; do
   [ -z "$out_of_range" ] || wrong "$name" "$out_of_range" "${out_of_range%% *}" ${own+"${own[@]}"}
   wrong "$name" "--x 'y" "close every quote" ${own+"${own[@]}"}
 done <<'LIST'
-GEOM_ARGS|--dsim 0.1|--dssim 2
+GEOM_ARGS|--densif mcmc|--densify-every 0
 EVAL_ARGS|--holdou 8|--resolution 0px
 MASK_ARGS|--points-per-sid 6|--points-per-side 0
 GRAPH_ARGS|--anchor-ration 0.1|--k 0

@@ -71,9 +71,9 @@ fn summary(mut values: Vec<f64>) -> (f64, f64) {
     (median, (values[values.len() * 3 / 4] - values[values.len() / 4]) / 2.0 / median)
 }
 
-/// Measures what an optimisation asks for; with `everything`, depth and the pulls that do not cancel as well.
+/// Measures what an optimisation asks for; with `everything`, depth as well.
 fn bench(name: &str, g: &Gaussians, camera: &Camera, everything: bool) -> Value {
-    let options = RasterOptions { depth: everything, absolute_pulls: everything, ..RasterOptions::default() };
+    let options = RasterOptions { depth: everything, ..RasterOptions::default() };
     let pixels = camera.width as usize * camera.height as usize;
     let d: Vec<f32> = (0..3 * pixels).map(|i| ((i * 7919) % 1000) as f32 * 2e-3 - 1.0).collect();
     let counts = tile_weights(g, camera, &options, true, |t| t.weights.iter().filter(|w| **w > 0.0).count());

@@ -58,8 +58,7 @@ pub(crate) fn pair_gradients(
             let mut tile = pixel_gradients(forward, options, d, w, rectangle);
             // The kernel does not come to those behind where all pixels have stopped.
             out.fill(SplatGradient::default());
-            let wanted = (d.depth.is_some(), options.absolute_pulls);
-            backward_tile(&tiles.splats, tiles.list(t), rectangle, wanted, &mut tile, out);
+            backward_tile(&tiles.splats, tiles.list(t), rectangle, d.depth.is_some(), &mut tile, out);
         }
     });
 }
@@ -81,60 +80,56 @@ pub(crate) fn gather(
     out.opacity_logits.resize(all, 0.0);
     out.sh.resize(all * stride, 0.0);
     out.mean2d.resize(all, [0.0; 2]);
-    out.mean2d_abs.resize(all, [0.0; 2]);
     let geometry = out.means.par_chunks_mut(CHUNK).zip(out.log_scales.par_chunks_mut(CHUNK));
     let geometry = geometry.zip(out.rotations.par_chunks_mut(CHUNK));
     let rest = out.opacity_logits.par_chunks_mut(CHUNK).zip(out.sh.par_chunks_mut(CHUNK * stride));
-    let centers = out.mean2d.par_chunks_mut(CHUNK).zip(out.mean2d_abs.par_chunks_mut(CHUNK));
-    let overflowed =
-        geometry.zip(rest).zip(centers).enumerate().map(|(chunk, (of_parameters, (mean2d, mean2d_abs)))| {
-            let (((means, log_scales), rotations), (opacity_logits, sh)) = of_parameters;
-            means.fill([0.0; 3]);
-            log_scales.fill([0.0; 3]);
-            rotations.fill([0.0; 4]);
-            opacity_logits.fill(0.0);
-            mean2d.fill([0.0; 2]);
-            mean2d_abs.fill([0.0; 2]);
-            let begin = chunk * CHUNK;
-            let from = tiles.index.partition_point(|&i| (i as usize) < begin);
-            let to = from + tiles.index[from..].partition_point(|&i| (i as usize) < begin + means.len());
-            let (mut done, mut overflowed) = (0, 0);
-            let mut lanes = Box::<Backward>::default();
-            let mut sums = [SplatGradient::default(); LANES];
-            for first in (from..to).step_by(LANES) {
-                let own = first..to.min(first + LANES);
-                for (l, i) in own.clone().enumerate() {
-                    let mut sum = SplatGradient::default();
-                    for &pair in &tiles.places[tiles.first[i] as usize..tiles.first[i + 1] as usize] {
-                        sum.add(&pairs[pair as usize]);
-                    }
-                    lanes.set(l, g, tiles.index[i] as usize, degree, &tiles.splats[i], &sum);
-                    sums[l] = sum;
+    let centers = out.mean2d.par_chunks_mut(CHUNK);
+    let overflowed = geometry.zip(rest).zip(centers).enumerate().map(|(chunk, (of_parameters, mean2d))| {
+        let (((means, log_scales), rotations), (opacity_logits, sh)) = of_parameters;
+        means.fill([0.0; 3]);
+        log_scales.fill([0.0; 3]);
+        rotations.fill([0.0; 4]);
+        opacity_logits.fill(0.0);
+        mean2d.fill([0.0; 2]);
+        let begin = chunk * CHUNK;
+        let from = tiles.index.partition_point(|&i| (i as usize) < begin);
+        let to = from + tiles.index[from..].partition_point(|&i| (i as usize) < begin + means.len());
+        let (mut done, mut overflowed) = (0, 0);
+        let mut lanes = Box::<Backward>::default();
+        let mut sums = [SplatGradient::default(); LANES];
+        for first in (from..to).step_by(LANES) {
+            let own = first..to.min(first + LANES);
+            for (l, i) in own.clone().enumerate() {
+                let mut sum = SplatGradient::default();
+                for &pair in &tiles.places[tiles.first[i] as usize..tiles.first[i + 1] as usize] {
+                    sum.add(&pairs[pair as usize]);
                 }
-                lanes.run(&tiles.lens, options, degree);
-                for (l, i) in own.enumerate() {
-                    let k = tiles.index[i] as usize - begin;
-                    sh[done * stride..k * stride].fill(0.0);
-                    done = k + 1;
-                    let d_sh = &mut sh[k * stride..(k + 1) * stride];
-                    let of_centers = sums[l].mean.iter().chain(&sums[l].mean_abs).all(|v| v.is_finite());
-                    let Some(p) = lanes.get(l, degree, d_sh).filter(|_| of_centers) else {
-                        // Not held by single precision: no gradient rather than NaN in an optimiser's state.
-                        d_sh.fill(0.0);
-                        overflowed += 1;
-                        continue;
-                    };
-                    means[k] = p.mean;
-                    log_scales[k] = p.log_scale;
-                    rotations[k] = p.rotation;
-                    opacity_logits[k] = p.opacity_logit;
-                    mean2d[k] = sums[l].mean;
-                    mean2d_abs[k] = sums[l].mean_abs;
-                }
+                lanes.set(l, g, tiles.index[i] as usize, degree, &tiles.splats[i], &sum);
+                sums[l] = sum;
             }
-            sh[done * stride..].fill(0.0);
-            overflowed
-        });
+            lanes.run(&tiles.lens, options, degree);
+            for (l, i) in own.enumerate() {
+                let k = tiles.index[i] as usize - begin;
+                sh[done * stride..k * stride].fill(0.0);
+                done = k + 1;
+                let d_sh = &mut sh[k * stride..(k + 1) * stride];
+                let of_centers = sums[l].mean.iter().all(|v| v.is_finite());
+                let Some(p) = lanes.get(l, degree, d_sh).filter(|_| of_centers) else {
+                    // Not held by single precision: no gradient rather than NaN in an optimiser's state.
+                    d_sh.fill(0.0);
+                    overflowed += 1;
+                    continue;
+                };
+                means[k] = p.mean;
+                log_scales[k] = p.log_scale;
+                rotations[k] = p.rotation;
+                opacity_logits[k] = p.opacity_logit;
+                mean2d[k] = sums[l].mean;
+            }
+        }
+        sh[done * stride..].fill(0.0);
+        overflowed
+    });
     out.overflowed = overflowed.sum();
 }
 

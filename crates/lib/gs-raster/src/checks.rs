@@ -1,7 +1,7 @@
 //! The renderer against the f64 reference on random scenes.
 
 use crate::reference::{Cuts, Gaussian, Pixel, backward as reference_backward, render as reference_render, widen};
-use crate::{PixelGradients, RasterOptions, backward, features_backward, forward, render_features};
+use crate::{PixelGradients, RasterOptions, backward, forward, render_features};
 use glam::DVec3;
 use gs_scene::{Camera, Gaussians};
 use proptest::prelude::*;
@@ -65,8 +65,7 @@ impl Dice {
         let one = |quiet: &bool| {
             let mut roll = || if *quiet { 0.0 } else { f64::from(self.between(-1.0, 1.0)) };
             let rgb = [roll(), roll(), roll()];
-            let (alpha, depth) = (roll(), roll());
-            Pixel { rgb, alpha, depth, features: (0..DIM).map(|_| roll()).collect(), doubt: 0.0, rounding: 0.0 }
+            Pixel { rgb, alpha: roll(), depth: roll(), ..Pixel::default() }
         };
         quiet.iter().map(one).collect()
     }
@@ -135,23 +134,18 @@ fn groups(degree: u8) -> Vec<(&'static str, std::ops::Range<usize>)> {
         ("rotations", 6..10),
         ("opacity logits", 10..11),
         ("harmonics", 11..bands),
-        ("features", bands..bands + DIM),
     ]
 }
 
 fn loss(scene: &[Gaussian], camera: &Camera, options: &RasterOptions, cuts: Cuts, d: &[Pixel]) -> f64 {
     let rendered = reference_render(scene, camera, options, cuts);
     let dot = |a: &[f64], b: &[f64]| a.iter().zip(b).map(|(x, y)| x * y).sum::<f64>();
-    rendered
-        .iter()
-        .zip(d)
-        .map(|(r, d)| dot(&r.rgb, &d.rgb) + r.alpha * d.alpha + r.depth * d.depth + dot(&r.features, &d.features))
-        .sum()
+    rendered.iter().zip(d).map(|(r, d)| dot(&r.rgb, &d.rgb) + r.alpha * d.alpha + r.depth * d.depth).sum()
 }
 
 /// A scene that every pixel sees without any cut: faint, wide Gaussians in front of the camera, colours away from zero.
-fn smooth_scene(dice: &mut Dice, degree: u8) -> (Gaussians, Vec<f32>, Camera) {
-    let (mut g, features) = dice.gaussians(6, degree);
+fn smooth_scene(dice: &mut Dice, degree: u8) -> (Gaussians, Camera) {
+    let (mut g, _) = dice.gaussians(6, degree);
     let c = Camera::look_at(DVec3::new(0.3, -0.2, -4.0), DVec3::ZERO, -DVec3::Y, 19, 13, 0.6);
     for i in 0..g.len() {
         g.log_scales[i] = dice.many(-0.1, 0.8);
@@ -165,10 +159,10 @@ fn smooth_scene(dice: &mut Dice, degree: u8) -> (Gaussians, Vec<f32>, Camera) {
     // One centre beside the image, where the Jacobian is clamped.
     g.means[0] = [2.6, 0.1, 0.2];
     g.log_scales[0] = [1.2, 1.0, 0.9];
-    (g, features, c)
+    (g, c)
 }
 
-fn columns(all: &[(Vec<f64>, [f64; 4])], range: &std::ops::Range<usize>) -> Vec<f64> {
+fn columns(all: &[(Vec<f64>, [f64; 2])], range: &std::ops::Range<usize>) -> Vec<f64> {
     all.iter().flat_map(|(v, _)| v[range.clone()].iter().copied()).collect()
 }
 
@@ -176,13 +170,13 @@ fn columns(all: &[(Vec<f64>, [f64; 4])], range: &std::ops::Range<usize>) -> Vec<
 fn gradients_are_the_central_differences() {
     for (degree, antialias) in [(0, false), (1, false), (2, false), (3, false), (0, true), (3, true)] {
         let mut dice = Dice::new(70 + u64::from(degree));
-        let (g, features, mut camera) = smooth_scene(&mut dice, degree);
+        let (g, mut camera) = smooth_scene(&mut dice, degree);
         if antialias {
             // Large pixels, against which the low-pass and so the compensation matter.
             camera = Camera::look_at(camera.position(), DVec3::ZERO, -DVec3::Y, 3, 2, 0.6);
         }
         let options = RasterOptions { background: [0.2, 0.5, 0.9], antialias, ..RasterOptions::default() };
-        let mut scene = widen(&g, &features, DIM);
+        let mut scene = widen(&g, &[], 0);
         let d = dice.pixels(&vec![false; (camera.width * camera.height) as usize]);
         let analytic = reference_backward(&scene, &camera, &options, Cuts::None, &d);
         let mut numeric = Vec::new();
@@ -201,13 +195,13 @@ fn gradients_are_the_central_differences() {
                 let (near, far) = (shifted(h) - shifted(-h), shifted(2.0 * h) - shifted(-2.0 * h));
                 row.push((8.0 * near - far) / (12.0 * h));
             }
-            numeric.push((row, [0.0; 4]));
+            numeric.push((row, [0.0; 2]));
         }
         // The renderer itself, on the same scene: no pixel of it is cut.
         let plain = reference_render(&scene, &camera, &options, Cuts::None);
         let cut = reference_render(&scene, &camera, &options, Cuts::Hard);
         assert!(plain.iter().zip(&cut).all(|(a, b)| a.alpha == b.alpha && b.doubt == 0.0), "the scene is smooth");
-        let ours = our_gradients(&g, &features, &camera, &options, &d);
+        let ours = our_gradients(&g, &camera, &options, &d);
         for (name, range) in groups(degree) {
             let exact = relative(&columns(&analytic, &range), &columns(&numeric, &range));
             let single = relative(&columns(&ours, &range), &columns(&numeric, &range));
@@ -224,72 +218,42 @@ proptest! {
     /// On scenes with every cut active; a pixel where rounding may turn a decision passes no gradient.
     #[test]
     fn backward_agrees(
-        seed in 0u64..u64::MAX, n in 1usize..40, degree in 0u8..=3, part in 0..3, antialias in any::<bool>()
+        seed in 0u64..u64::MAX, n in 1usize..40, degree in 0u8..=3, antialias in any::<bool>()
     ) {
         let mut dice = Dice::new(seed);
-        let (g, features) = dice.gaussians(n, degree);
+        let (g, _) = dice.gaussians(n, degree);
         let camera = dice.camera();
         let options = RasterOptions { background: dice.many(0.0, 1.0), antialias, ..RasterOptions::default() };
-        let scene = widen(&g, &features, DIM);
+        let scene = widen(&g, &[], 0);
         let truth = reference_render(&scene, &camera, &options, Cuts::Hard);
         let quiet: Vec<bool> = truth.iter().map(|t| t.doubt > 0.0).collect();
-        let mut d = dice.pixels(&quiet);
-        // Everything at once, or the colours or the features alone: absolute sums do not add.
-        for p in &mut d {
-            if part == 1 {
-                p.features.fill(0.0);
-            } else if part == 2 {
-                (p.rgb, p.alpha, p.depth) = ([0.0; 3], 0.0, 0.0);
-            }
-        }
+        let d = dice.pixels(&quiet);
         let theirs = reference_backward(&scene, &camera, &options, Cuts::Hard, &d);
-        let ours = our_gradients(&g, &features, &camera, &options, &d);
+        let ours = our_gradients(&g, &camera, &options, &d);
         for (name, range) in groups(degree) {
             let error = relative(&columns(&ours, &range), &columns(&theirs, &range));
             prop_assert!(error <= 1e-3, "{}: {:e}", name, error);
         }
-        let means = |all: &[(Vec<f64>, [f64; 4])], r: std::ops::Range<usize>| -> Vec<f64> {
-            all.iter().flat_map(|(_, m)| m[r.clone()].to_vec()).collect()
-        };
-        let error = relative(&means(&ours, 0..2), &means(&theirs, 0..2));
+        let means = |all: &[(Vec<f64>, [f64; 2])]| all.iter().flat_map(|(_, m)| *m).collect::<Vec<f64>>();
+        let error = relative(&means(&ours), &means(&theirs));
         prop_assert!(error <= 1e-3, "projected centres: {:e}", error);
-        if part > 0 {
-            let error = relative(&means(&ours, 2..4), &means(&theirs, 2..4));
-            prop_assert!(error <= 1e-3, "absolute sums of projected centres: {:e}", error);
-        }
     }
 }
 
 /// The renderer's gradients, in the layout of the reference's.
-fn our_gradients(
-    g: &Gaussians,
-    features: &[f32],
-    camera: &Camera,
-    options: &RasterOptions,
-    d: &[Pixel],
-) -> Vec<(Vec<f64>, [f64; 4])> {
+fn our_gradients(g: &Gaussians, camera: &Camera, options: &RasterOptions, d: &[Pixel]) -> Vec<(Vec<f64>, [f64; 2])> {
     let rgb: Vec<f32> = d.iter().flat_map(|p| p.rgb.map(|v| v as f32)).collect();
     let alpha: Vec<f32> = d.iter().map(|p| p.alpha as f32).collect();
     let depth: Vec<f32> = d.iter().map(|p| p.depth as f32).collect();
     let f = forward(g, camera, options);
     let pixels = PixelGradients { rgb: &rgb, alpha: Some(&alpha), depth: Some(&depth) };
     let p = backward(g, camera, options, &f, pixels);
-    let d_features: Vec<f32> = d.iter().flat_map(|p| p.features.iter().map(|&v| v as f32)).collect();
-    let f = features_backward(g, features, DIM, camera, options, &d_features);
     let stride = g.sh_stride();
     let one = |i: usize| {
-        let mut row = vec![0.0; 11];
-        let mut mean = [0.0; 4];
-        for p in [&p, &f.parameters] {
-            let [m, s, q] = [&p.means[i][..], &p.log_scales[i], &p.rotations[i]];
-            let own = m.iter().chain(s).chain(q).chain(&p.opacity_logits[i..=i]);
-            row.iter_mut().zip(own).for_each(|(sum, v)| *sum += f64::from(*v));
-            let [[x, y], [ax, ay]] = [p.mean2d[i], p.mean2d_abs[i]];
-            mean.iter_mut().zip([x, y, ax, ay]).for_each(|(sum, v)| *sum += f64::from(v));
-        }
-        let linear = p.sh[i * stride..(i + 1) * stride].iter().chain(&f.features[i * DIM..(i + 1) * DIM]);
-        row.extend(linear.map(|&v| f64::from(v)));
-        (row, mean)
+        let [m, s, q] = [&p.means[i][..], &p.log_scales[i], &p.rotations[i]];
+        let own = m.iter().chain(s).chain(q).chain(&p.opacity_logits[i..=i]);
+        let own = own.chain(&p.sh[i * stride..(i + 1) * stride]);
+        (own.map(|&v| f64::from(v)).collect(), p.mean2d[i].map(f64::from))
     };
     (0..g.len()).map(one).collect()
 }

@@ -1,8 +1,9 @@
 //! The forward pass.
 
+use crate::dropped::Dropped;
 use crate::kernels::forward_tile;
 use crate::tiles::{TILE, Tiles};
-use crate::types::{Dropped, RasterOptions, Rendered};
+use crate::types::{RasterOptions, Rendered};
 use gs_scene::{Camera, Gaussians};
 use rayon::prelude::*;
 
@@ -23,12 +24,6 @@ impl Forward {
     /// How many Gaussians were not drawn, and why.
     pub fn dropped(&self) -> Dropped {
         self.tiles.dropped
-    }
-
-    /// Half extents, in pixels, of the drawn Gaussians' visible ellipses, in the order of [`Self::visible`]: the larger of
-    /// the two axes' extents.
-    pub fn radii(&self) -> Vec<f32> {
-        self.tiles.splats.iter().map(|s| s.extent[0].max(s.extent[1])).collect()
     }
 
     /// Pixel-Gaussian pairs in the tiles' lists, an upper bound of what the kernels evaluate.

@@ -169,11 +169,15 @@ fn fresh(width: usize) -> [f32; PIXELS] {
     t
 }
 
-/// Rows, as bits, in which some pixel of vector `b` of `blocks` goes on.
+/// By vector of columns: rows, as bits and among those `inside`, in which some pixel goes on; whether there is one.
 #[inline(always)]
-fn live_rows<S: Simd>(simd: S, t: &[S::f32s], b: usize, blocks: usize) -> u32 {
-    let live = |r: usize| u32::from(simd.reduce_max_f32s(t[r * blocks + b]) > 0.0) << r;
-    (0..TILE).map(live).sum()
+fn some_go_on<S: Simd>(simd: S, t: &[S::f32s], inside: u32, live: &mut [u32]) -> bool {
+    let blocks = live.len();
+    for (b, rows) in live.iter_mut().enumerate() {
+        let live = |r: usize| u32::from(simd.reduce_max_f32s(t[r * blocks + b]) > 0.0) << r;
+        *rows = (0..TILE).map(live).sum::<u32>() & inside;
+    }
+    live.iter().any(|rows| *rows != 0)
 }
 
 #[inline(always)]
@@ -231,13 +235,8 @@ impl<const DEPTH: bool> WithSimd for ForwardTile<'_, DEPTH> {
         let mut near = [Splat::default(); BATCH];
         for (n, list) in self.list.chunks(BATCH).enumerate() {
             let t = vectors_mut::<S>(transmittance);
-            if n > 0 {
-                for b in 0..blocks {
-                    live[b] = live_rows(simd, t, b, blocks) & grid.inside;
-                }
-                if live[..blocks].iter().all(|rows| *rows == 0) {
-                    break;
-                }
+            if n > 0 && !some_go_on(simd, t, grid.inside, &mut live[..blocks]) {
+                break;
             }
             for (near, &entry) in near.iter_mut().zip(list) {
                 *near = self.splats[entry as usize];
@@ -294,26 +293,23 @@ pub(crate) struct TileGradients {
 /// Goes front to back like the forward pass: with s_i = c_i . d rgb + z_i d depth + d alpha, the gradient of alpha_i is
 /// T_i s_i - (sum of w_j s_j behind i) / (1 - alpha_i), and the sum behind is the total less what came before.
 ///
-/// `depth` and `absolute` say whether the gradients of depth, and those that do not cancel, are wanted; else they stay zero.
-/// What is not wanted leaves registers to the rest.
+/// `depth` says whether the gradients of depth are wanted; else they stay zero and leave registers to the rest.
 pub(crate) fn backward_tile(
     splats: &[Splat],
     list: &[u32],
     rectangle: Rectangle,
-    (depth, absolute): (bool, bool),
+    depth: bool,
     d: &mut TileGradients,
     out: &mut [SplatGradient],
 ) {
     let arch = Arch::new();
-    match (depth, absolute) {
-        (false, false) => arch.dispatch(BackwardTile::<false, false> { splats, list, rectangle, d, out }),
-        (false, true) => arch.dispatch(BackwardTile::<false, true> { splats, list, rectangle, d, out }),
-        (true, false) => arch.dispatch(BackwardTile::<true, false> { splats, list, rectangle, d, out }),
-        (true, true) => arch.dispatch(BackwardTile::<true, true> { splats, list, rectangle, d, out }),
+    match depth {
+        false => arch.dispatch(BackwardTile::<false> { splats, list, rectangle, d, out }),
+        true => arch.dispatch(BackwardTile::<true> { splats, list, rectangle, d, out }),
     }
 }
 
-struct BackwardTile<'a, const DEPTH: bool, const ABSOLUTE: bool> {
+struct BackwardTile<'a, const DEPTH: bool> {
     splats: &'a [Splat],
     list: &'a [u32],
     rectangle: Rectangle,
@@ -321,7 +317,7 @@ struct BackwardTile<'a, const DEPTH: bool, const ABSOLUTE: bool> {
     out: &'a mut [SplatGradient],
 }
 
-impl<const DEPTH: bool, const ABSOLUTE: bool> WithSimd for BackwardTile<'_, DEPTH, ABSOLUTE> {
+impl<const DEPTH: bool> WithSimd for BackwardTile<'_, DEPTH> {
     type Output = ();
 
     #[inline(always)]
@@ -339,13 +335,8 @@ impl<const DEPTH: bool, const ABSOLUTE: bool> WithSimd for BackwardTile<'_, DEPT
         let mut near = [Splat::default(); BATCH];
         for (n, (list, out)) in self.list.chunks(BATCH).zip(self.out.chunks_mut(BATCH)).enumerate() {
             let t = vectors_mut::<S>(&mut transmittance);
-            if n > 0 {
-                for b in 0..blocks {
-                    live[b] = live_rows(simd, t, b, blocks) & grid.inside;
-                }
-                if live[..blocks].iter().all(|rows| *rows == 0) {
-                    break;
-                }
+            if n > 0 && !some_go_on(simd, t, grid.inside, &mut live[..blocks]) {
+                break;
             }
             for (near, &entry) in near.iter_mut().zip(list) {
                 *near = self.splats[entry as usize];
@@ -354,17 +345,14 @@ impl<const DEPTH: bool, const ABSOLUTE: bool> WithSimd for BackwardTile<'_, DEPT
                 let falloff = Falloff::new(simd, s, &grid);
                 let color = s.color.map(|c| simd.splat_f32s(c));
                 let z = simd.splat_f32s(s.depth);
-                let [xx, xy, yy] = s.conic;
-                let mut sums = [[0.0f32; TILE]; 9];
+                let mut sums = [[0.0f32; TILE]; 7];
                 for b in 0..blocks {
                     let mut rows = falloff.rows[b] & live[b];
                     if rows == 0 {
                         continue;
                     }
                     let dx = simd.sub_f32s(vectors::<S>(&grid.x)[b], falloff.mean_x);
-                    let (xx_dx, xy_dx) =
-                        (simd.mul_f32s(simd.splat_f32s(xx), dx), simd.mul_f32s(simd.splat_f32s(xy), dx));
-                    let mut sum = [simd.splat_f32s(0.0); 9];
+                    let mut sum = [simd.splat_f32s(0.0); 7];
                     while rows != 0 {
                         let r = rows.trailing_zeros() as usize % TILE;
                         rows &= rows - 1;
@@ -395,31 +383,24 @@ impl<const DEPTH: bool, const ABSOLUTE: bool> WithSimd for BackwardTile<'_, DEPT
                         sum[3] = simd.mul_add_e_f32s(w, d_red[at], sum[3]);
                         sum[4] = simd.mul_add_e_f32s(w, d_green[at], sum[4]);
                         sum[5] = simd.mul_add_e_f32s(w, d_blue[at], sum[5]);
-                        if ABSOLUTE {
-                            let size = simd.abs_f32s(g);
-                            let gx = simd.abs_f32s(simd.add_f32s(xx_dx, simd.splat_f32s(xy * dy)));
-                            let gy = simd.abs_f32s(simd.add_f32s(xy_dx, simd.splat_f32s(yy * dy)));
-                            sum[6] = simd.mul_add_e_f32s(gx, size, sum[6]);
-                            sum[7] = simd.mul_add_e_f32s(gy, size, sum[7]);
-                        }
                         if DEPTH {
-                            sum[8] = simd.mul_add_e_f32s(w, d_depth[at], sum[8]);
+                            sum[6] = simd.mul_add_e_f32s(w, d_depth[at], sum[6]);
                         }
                     }
                     for (sums, sum) in sums.iter_mut().zip(sum) {
                         vectors_mut::<S>(sums)[b] = sum;
                     }
                 }
-                *out = splat_gradient::<DEPTH, ABSOLUTE>(s, &grid.x, &sums);
+                *out = splat_gradient::<DEPTH>(s, &grid.x, &sums);
             }
         }
     }
 }
 
-/// From the kernel's sums per column (g, g dy, g dy^2, colour, absolute gradients of the centre, depth, with
-/// g = - d loss / d sigma) to the splat.
+/// From the kernel's sums per column (g, g dy, g dy^2, colour, depth, with g = - d loss / d sigma) to
+/// the splat.
 #[inline(always)]
-fn splat_gradient<const DEPTH: bool, const ABSOLUTE: bool>(s: &Splat, x: &Row, sums: &[Row; 9]) -> SplatGradient {
+fn splat_gradient<const DEPTH: bool>(s: &Splat, x: &Row, sums: &[Row; 7]) -> SplatGradient {
     // g dx, g dx^2 and g dx dy follow from the columns' sums.
     let mut moments = [[0.0f32; TILE]; 3];
     for l in 0..TILE {
@@ -433,10 +414,9 @@ fn splat_gradient<const DEPTH: bool, const ABSOLUTE: bool>(s: &Splat, x: &Row, s
     let [xx, xy, yy] = s.conic;
     SplatGradient {
         mean: [xx * g_x + xy * g_y, xy * g_x + yy * g_y],
-        mean_abs: if ABSOLUTE { [folded(&sums[6]), folded(&sums[7])] } else { [0.0; 2] },
         conic: [-0.5 * g_xx, -g_xy, -0.5 * g_yy],
         opacity: g / s.opacity,
-        depth: if DEPTH { folded(&sums[8]) } else { 0.0 },
+        depth: if DEPTH { folded(&sums[6]) } else { 0.0 },
         color: [red, green, blue],
     }
 }
@@ -600,9 +580,9 @@ mod tests {
         let mut d =
             TileGradients { rgb: [wave(0), wave(1), wave(2)], depth: wave(3), alpha: wave(4), behind: [0.0; PIXELS] };
         let mut out = vec![SplatGradient::default(); splats.len()];
-        BackwardTile::<true, true> { splats, list: &list, rectangle, d: &mut d, out: &mut out }.with_simd(simd);
+        BackwardTile::<true> { splats, list: &list, rectangle, d: &mut d, out: &mut out }.with_simd(simd);
         for o in &out {
-            all.extend([&o.mean[..], &o.mean_abs, &o.conic, &[o.opacity, o.depth], &o.color].concat());
+            all.extend([&o.mean[..], &o.conic, &[o.opacity, o.depth], &o.color].concat());
         }
         for early_stop in [true, false] {
             let (mut alphas, mut weights) = (vec![0.0; PIXELS * splats.len()], vec![0.0; PIXELS * splats.len()]);

@@ -1,9 +1,8 @@
 //! Projection and harmonics of many Gaussians side by side, as loops that the compiler may turn into vectors of the processor
 //! at hand. They use what IEEE rounds one way only, so that all processors give the same bits.
 
-use crate::project::{
-    ParameterGradient, Parameters, Projected, Splat, SplatGradient, Unseen, project, project_backward,
-};
+use crate::dropped::Unseen;
+use crate::project::{ParameterGradient, Parameters, Projected, Splat, SplatGradient, project, project_backward};
 use crate::sh;
 use crate::types::RasterOptions;
 use gs_scene::{Gaussians, sh_coefficients};
@@ -269,7 +268,6 @@ fn backward_of<const DEGREE: u8>(p: &Backward, lens: &Lens, options: &RasterOpti
     for l in 0..LANES {
         let d = SplatGradient {
             mean: [0, 1].map(|k| f64::from(p.mean2d[k][l])),
-            mean_abs: [0.0; 2],
             conic: [0, 1, 2].map(|k| f64::from(p.conic[k][l])),
             opacity: f64::from(p.opacity[l]),
             depth: f64::from(p.depth[l]),

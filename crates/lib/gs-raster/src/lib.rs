@@ -12,6 +12,7 @@
 mod backward;
 #[cfg(test)]
 mod checks;
+mod dropped;
 mod features;
 mod forward;
 mod kernels;
@@ -26,11 +27,12 @@ mod weights;
 mod workspace;
 
 pub use backward::backward;
-pub use features::{FeatureGradients, features_backward, render_features};
+pub use dropped::Dropped;
+pub use features::render_features;
 pub use forward::{Forward, forward, render};
 pub use measure::{Measured, measure};
 pub use reference::{Pixel, render_gaussians as render_reference};
 pub use tiles::TILE;
-pub use types::{Dropped, Gradients, PixelGradients, RasterOptions, Rendered, near_plane};
+pub use types::{Gradients, PixelGradients, RasterOptions, Rendered, near_plane};
 pub use weights::{TileWeights, tile_weights};
 pub use workspace::Workspace;

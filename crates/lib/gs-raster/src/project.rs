@@ -47,25 +47,6 @@ pub(crate) struct Parameters {
     pub opacity_logit: f64,
 }
 
-/// Why a Gaussian is not drawn.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(crate) enum Unseen {
-    NotFinite,
-    Behind,
-    Degenerate,
-    Transparent,
-    Outside,
-}
-
-impl Unseen {
-    /// From [`Projected::unseen`]; none for what is drawn.
-    pub fn of(code: f64) -> Option<Self> {
-        [Self::NotFinite, Self::Behind, Self::Degenerate, Self::Transparent, Self::Outside]
-            .get((code as usize).wrapping_sub(1))
-            .copied()
-    }
-}
-
 type V3 = [f64; 3];
 
 #[inline(always)]
@@ -271,7 +252,7 @@ fn ellipse(p: &Parameters, lens: &Lens, antialias: bool) -> Ellipse {
 /// A Gaussian in the image, but for its colour.
 #[derive(Default)]
 pub(crate) struct Projected {
-    /// 0 for what is drawn, else the position of the reason in [`Unseen`], from 1.
+    /// 0 for what is drawn, else the position of the reason in [`crate::dropped::Unseen`], from 1.
     pub unseen: f64,
     pub mean: [f64; 2],
     pub conic: V3,
@@ -326,7 +307,6 @@ pub(crate) fn project(p: &Parameters, lens: &Lens, options: &RasterOptions) -> P
 #[derive(Debug, Clone, Copy, Default, PartialEq)]
 pub(crate) struct SplatGradient<T = f32> {
     pub mean: [T; 2],
-    pub mean_abs: [T; 2],
     pub conic: [T; 3],
     pub opacity: T,
     pub depth: T,
@@ -337,7 +317,6 @@ impl SplatGradient {
     pub fn add(&mut self, o: &Self) {
         for c in 0..2 {
             self.mean[c] += o.mean[c];
-            self.mean_abs[c] += o.mean_abs[c];
         }
         for c in 0..3 {
             self.conic[c] += o.conic[c];

@@ -25,11 +25,11 @@ pub(crate) struct Gaussian {
 
 #[cfg(test)]
 impl Gaussian {
-    /// Every parameter in a fixed order: centre, scales, rotation, opacity, harmonics, features.
+    /// Every parameter in a fixed order: centre, scales, rotation, opacity, harmonics.
     pub fn parameters(&mut self) -> Vec<&mut f64> {
-        let Self { mean, log_scale, rotation, opacity_logit, sh, features } = self;
+        let Self { mean, log_scale, rotation, opacity_logit, sh, .. } = self;
         let fixed = mean.iter_mut().chain(log_scale).chain(rotation).chain(std::iter::once(opacity_logit));
-        fixed.chain(sh).chain(features).collect()
+        fixed.chain(sh).collect()
     }
 
     fn view(&self) -> Parameters {
@@ -276,7 +276,7 @@ pub(crate) fn render(scene: &[Gaussian], camera: &Camera, options: &RasterOption
 }
 
 /// d loss / d parameters, given d loss / d pixels (whose `doubt` is not read): for each Gaussian, in the order of
-/// [`Gaussian::parameters`], and the gradient of its projected centre (sum, and sum of absolute values over pixels).
+/// [`Gaussian::parameters`], and the gradient of its projected centre.
 #[cfg(test)]
 pub(crate) fn backward(
     scene: &[Gaussian],
@@ -284,10 +284,9 @@ pub(crate) fn backward(
     options: &RasterOptions,
     cuts: Cuts,
     d: &[Pixel],
-) -> Vec<(Vec<f64>, [f64; 4])> {
+) -> Vec<(Vec<f64>, [f64; 2])> {
     let ellipses = ellipses(scene, camera, options);
     let mut splats = vec![SplatGradient::<f64>::default(); scene.len()];
-    let mut features: Vec<Vec<f64>> = scene.iter().map(|g| vec![0.0; g.features.len()]).collect();
     for (at, d) in d.iter().enumerate() {
         let (x, y) = (at % camera.width as usize, at / camera.width as usize);
         let (layers, _) = layers(&ellipses, x, y, cuts);
@@ -300,10 +299,6 @@ pub(crate) fn backward(
             for c in 0..3 {
                 value += d.rgb[c] * e.color[c];
                 out.color[c] += weight * d.rgb[c];
-            }
-            for (k, d) in d.features.iter().enumerate() {
-                value += d * scene[e.id].features[k];
-                features[e.id][k] += weight * d;
             }
             out.depth += weight * d.depth;
             let d_alpha = l.transmittance * (value - d_behind);
@@ -319,11 +314,8 @@ pub(crate) fn backward(
             out.conic[0] += d_sigma * 0.5 * x * x;
             out.conic[1] += d_sigma * x * y;
             out.conic[2] += d_sigma * 0.5 * y * y;
-            let d_mean = [-d_sigma * (a * x + b * y), -d_sigma * (b * x + c * y)];
-            for k in 0..2 {
-                out.mean[k] += d_mean[k];
-                out.mean_abs[k] += d_mean[k].abs();
-            }
+            out.mean[0] -= d_sigma * (a * x + b * y);
+            out.mean[1] -= d_sigma * (b * x + c * y);
         }
     }
     let lens = Lens::new(camera);
@@ -351,8 +343,7 @@ pub(crate) fn backward(
             all = [&p.mean[..], &p.log_scale, &p.rotation, &[p.opacity_logit]].concat();
         }
         all.extend(d_sh);
-        all.extend(&features[i]);
-        out.push((all, [d.mean[0], d.mean[1], d.mean_abs[0], d.mean_abs[1]]));
+        out.push((all, d.mean));
     }
     out
 }

@@ -1,8 +1,9 @@
 //! Which Gaussians touch which tile, front to back.
 
+use crate::dropped::Dropped;
 use crate::lanes::project_range;
 use crate::project::{Lens, Splat};
-use crate::types::{Dropped, RasterOptions};
+use crate::types::RasterOptions;
 use gs_scene::{Camera, Gaussians};
 use rayon::prelude::*;
 

@@ -1,7 +1,5 @@
 //! What goes in and what comes out.
 
-use crate::project::Unseen;
-
 /// How to rasterise.
 #[derive(Debug, Clone, PartialEq)]
 pub struct RasterOptions {
@@ -16,13 +14,11 @@ pub struct RasterOptions {
     pub antialias: bool,
     /// Render depth; else [`Rendered::depth`] is empty. What is not asked for is not computed.
     pub depth: bool,
-    /// Compute [`Gradients::mean2d_abs`]; else it is zero.
-    pub absolute_pulls: bool,
 }
 
 impl Default for RasterOptions {
     fn default() -> Self {
-        Self { background: [0.0; 3], sh_degree: 3, near: 0.01, antialias: false, depth: true, absolute_pulls: true }
+        Self { background: [0.0; 3], sh_degree: 3, near: 0.01, antialias: false, depth: true }
     }
 }
 
@@ -60,46 +56,6 @@ pub struct Rendered {
     pub depth: Vec<f32>,
 }
 
-/// How many Gaussians were not drawn, and why. A Gaussian counts once, under the first reason that holds.
-#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
-pub struct Dropped {
-    /// A parameter is NaN or infinite (infinite opacity logits are opacities of 0 and 1 and are fine), or the colour is.
-    pub not_finite: usize,
-    /// The centre is nearer than the near plane or behind the camera.
-    pub behind: usize,
-    /// The quaternion is zero, or single precision does not hold the projected covariance.
-    pub degenerate: usize,
-    /// The opacity is below 1/255, at which every contribution is skipped.
-    pub transparent: usize,
-    /// The region where alpha reaches 1/255 lies outside the image.
-    pub outside: usize,
-}
-
-impl Dropped {
-    /// All that were not drawn.
-    pub fn total(&self) -> usize {
-        self.not_finite + self.behind + self.degenerate + self.transparent + self.outside
-    }
-
-    pub(crate) fn count(&mut self, reason: Unseen) {
-        *match reason {
-            Unseen::NotFinite => &mut self.not_finite,
-            Unseen::Behind => &mut self.behind,
-            Unseen::Degenerate => &mut self.degenerate,
-            Unseen::Transparent => &mut self.transparent,
-            Unseen::Outside => &mut self.outside,
-        } += 1;
-    }
-
-    pub(crate) fn add(&mut self, o: &Self) {
-        self.not_finite += o.not_finite;
-        self.behind += o.behind;
-        self.degenerate += o.degenerate;
-        self.transparent += o.transparent;
-        self.outside += o.outside;
-    }
-}
-
 /// d loss / d rendered pixels.
 #[derive(Debug, Clone, Copy)]
 pub struct PixelGradients<'a> {
@@ -126,8 +82,6 @@ pub struct Gradients {
     pub sh: Vec<f32>,
     /// Of the projected centres, in pixels; zero for Gaussians that are not drawn.
     pub mean2d: Vec<[f32; 2]>,
-    /// Sum over pixels of the absolute values of that gradient (AbsGS); zero where [`RasterOptions::absolute_pulls`] is off.
-    pub mean2d_abs: Vec<[f32; 2]>,
     /// How many of the Gaussians drawn have a gradient that single precision does not hold: theirs are zero here.
     pub overflowed: usize,
 }

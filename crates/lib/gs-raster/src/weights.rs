@@ -36,24 +36,16 @@ pub fn tile_weights<R: Send>(
     early_stop: bool,
     f: impl Fn(&TileWeights<'_>) -> R + Sync,
 ) -> Vec<R> {
-    let tiles = tiles_without_color(g, camera, options);
-    (0..tiles.count()).into_par_iter().map(|t| with_weights(&tiles, t, early_stop, &f)).collect()
-}
-
-/// Tiles for callers that do not ask for colours: the harmonics are skipped.
-pub(crate) fn tiles_without_color(g: &Gaussians, camera: &Camera, options: &RasterOptions) -> Tiles {
-    Tiles::new(g, camera, &RasterOptions { sh_degree: 0, ..options.clone() })
-}
-
-/// Calls `f` with the weights of tile `t`.
-pub(crate) fn with_weights<R>(tiles: &Tiles, t: usize, early_stop: bool, f: impl FnOnce(&TileWeights<'_>) -> R) -> R {
-    let (x0, y0, width, height) = tiles.rectangle(t);
-    let list = tiles.list(t);
-    let gaussians: Vec<u32> = list.iter().map(|&e| tiles.index[e as usize]).collect();
-    let mut alphas = vec![0.0; list.len() * PIXELS];
-    let mut weights = vec![0.0; list.len() * PIXELS];
-    let alpha = weights_tile(&tiles.splats, list, (x0, y0, width, height), early_stop, &mut alphas, &mut weights);
-    let tile =
-        TileWeights { x0, y0, width, height, gaussians: &gaussians, alphas: &alphas, weights: &weights, alpha: &alpha };
-    f(&tile)
+    // Nobody asks for colours: the harmonics are skipped.
+    let tiles = Tiles::new(g, camera, &RasterOptions { sh_degree: 0, ..options.clone() });
+    let one = |t: usize| {
+        let (x0, y0, width, height) = tiles.rectangle(t);
+        let list = tiles.list(t);
+        let gaussians: Vec<u32> = list.iter().map(|&e| tiles.index[e as usize]).collect();
+        let (mut alphas, mut weights) = (vec![0.0; list.len() * PIXELS], vec![0.0; list.len() * PIXELS]);
+        let alpha = weights_tile(&tiles.splats, list, (x0, y0, width, height), early_stop, &mut alphas, &mut weights);
+        let [alphas, weights] = [&alphas, &weights];
+        f(&TileWeights { x0, y0, width, height, gaussians: &gaussians, alphas, weights, alpha: &alpha })
+    };
+    (0..tiles.count()).into_par_iter().map(one).collect()
 }

@@ -1,4 +1,4 @@
-//! Renderings and gradients of independent implementations, where they are present beside the project.
+//! Renderings and gradients of independent implementations.
 
 use glam::{DMat3, DVec3};
 use gs_raster::{PixelGradients, RasterOptions, backward, forward, render};
@@ -7,13 +7,8 @@ use std::collections::HashMap;
 use std::io::Read;
 use std::path::PathBuf;
 
-fn data(name: &str) -> Option<PathBuf> {
-    let path = PathBuf::from(env!("CARGO_MANIFEST_DIR")).join("../../../../shared/data/oracle").join(name);
-    if path.exists() {
-        return Some(path);
-    }
-    eprintln!("skipped: {} is not present", path.display());
-    None
+fn data(name: &str) -> PathBuf {
+    PathBuf::from(env!("CARGO_MANIFEST_DIR")).join("../../../../shared/data/oracle").join(name)
 }
 
 fn triples<const K: usize>(v: &[f32]) -> Vec<[f32; K]> {
@@ -34,10 +29,10 @@ fn relative(a: &[f32], b: &[f32]) -> f64 {
 }
 
 #[test]
+#[ignore = "needs shared/data/oracle; run make test-data"]
 fn matches_gsplat_on_the_gpu() {
     for name in ["tiny_case", "basic_case"] {
-        let Some(path) = data(&format!("{name}.safetensors")) else { return };
-        let bytes = std::fs::read(path).unwrap();
+        let bytes = std::fs::read(data(&format!("{name}.safetensors"))).unwrap();
         let t = safetensors::SafeTensors::deserialize(&bytes).unwrap();
         let get = |n: &str| -> Vec<f32> {
             t.tensor(n).unwrap().data().chunks_exact(4).map(|c| f32::from_le_bytes(c.try_into().unwrap())).collect()
@@ -71,10 +66,11 @@ fn matches_gsplat_on_the_gpu() {
 }
 
 #[test]
+#[ignore = "needs shared/data/oracle; run make test-data"]
 fn matches_the_f64_oracle_forward_and_backward() {
     for name in ["case_a", "case_b"] {
-        let Some(path) = data(&format!("{name}.npz")) else { return };
-        let mut zip = zip::ZipArchive::new(std::fs::File::open(path).unwrap()).unwrap();
+        let file = std::fs::File::open(data(&format!("{name}.npz"))).unwrap();
+        let mut zip = zip::ZipArchive::new(file).unwrap();
         let mut arrays: HashMap<String, Vec<f32>> = HashMap::new();
         for i in 0..zip.len() {
             let mut f = zip.by_index(i).unwrap();

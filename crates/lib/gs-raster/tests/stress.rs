@@ -3,9 +3,7 @@
 mod common;
 
 use common::{camera, random};
-use gs_raster::{
-    Dropped, PixelGradients, RasterOptions, backward, features_backward, forward, render_features, tile_weights,
-};
+use gs_raster::{Dropped, PixelGradients, RasterOptions, backward, forward, render_features, tile_weights};
 use gs_scene::{Camera, Gaussians};
 
 /// Renders and differentiates by every way there is; all numbers must be finite, alphas within 0 and 1.
@@ -24,19 +22,13 @@ fn survives(g: &Gaussians, camera: &Camera, what: &str) -> (Dropped, f64) {
     assert_eq!(f.visible().len() + f.dropped().total(), g.len(), "{what}: {:?}", f.dropped());
     let d: Vec<f32> = (0..3 * pixels).map(|i| (i as f32 * 0.7).sin()).collect();
     let of_pixels = PixelGradients { rgb: &d, alpha: Some(&d[..pixels]), depth: Some(&d[pixels..2 * pixels]) };
-    let gradients = [
-        backward(g, camera, &options, &f, of_pixels),
-        features_backward(g, &vec![0.5; 3 * g.len()], 3, camera, &options, &d).parameters,
-    ];
-    for p in &gradients {
-        finite(p.means.as_flattened(), "gradient of the centres");
-        finite(p.log_scales.as_flattened(), "gradient of the scales");
-        finite(p.rotations.as_flattened(), "gradient of the rotations");
-        finite(&p.opacity_logits, "gradient of the opacities");
-        finite(&p.sh, "gradient of the harmonics");
-        finite(p.mean2d.as_flattened(), "gradient of the projected centres");
-        finite(p.mean2d_abs.as_flattened(), "absolute gradient of the projected centres");
-    }
+    let p = backward(g, camera, &options, &f, of_pixels);
+    finite(p.means.as_flattened(), "gradient of the centres");
+    finite(p.log_scales.as_flattened(), "gradient of the scales");
+    finite(p.rotations.as_flattened(), "gradient of the rotations");
+    finite(&p.opacity_logits, "gradient of the opacities");
+    finite(&p.sh, "gradient of the harmonics");
+    finite(p.mean2d.as_flattened(), "gradient of the projected centres");
     finite(&render_features(g, &vec![1.0; 2 * g.len()], 2, camera, &options), "features");
     for early_stop in [true, false] {
         tile_weights(g, camera, &options, early_stop, |t| {

@@ -1,105 +1,62 @@
-//! Choosing, ordering and trimming Gaussians.
+//! `gs-geom convert`.
 
-use crate::inspect::Bounds;
-use gs_scene::{Gaussians, morton_order};
-use serde::Serialize;
+pub mod choice;
 
-/// In which order Gaussians are written.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, clap::ValueEnum)]
-#[serde(rename_all = "lowercase")]
-pub enum Order {
-    /// As in the input
-    None,
-    /// Along a Morton curve: neighbours in space lie near each other in the file
-    Morton,
-    /// The most opaque first
-    Opacity,
-}
+use crate::memory;
+use crate::options::{Convert, bytes};
+use crate::start;
+use artifacts::role;
+use choice::{arrange, choose};
+use gs_io::{Error, Result, hash_file};
+use gs_scene::ply;
+use serde_json::json;
+use stage::Stage;
+use std::collections::BTreeMap;
 
-/// Which Gaussians to keep.
-#[derive(Debug, Clone, Copy, PartialEq, Serialize)]
-pub struct Choice {
-    /// Least opacity, 0 to 1.
-    pub min_opacity: f32,
-    /// Box around the centres to keep, its faces included.
-    pub crop: Option<Bounds>,
-}
-
-/// The Gaussians chosen, and how many were not, by the first reason that applied.
-#[derive(Debug, Clone, PartialEq, Eq)]
-pub struct Chosen {
-    /// Indices, rising.
-    pub kept: Vec<u32>,
-    /// A number was not finite.
-    pub not_finite: usize,
-    /// Outside the box.
-    pub cropped: usize,
-    /// Too faint.
-    pub faint: usize,
-}
-
-/// Picks the Gaussians that can be used, lie inside the box, and are opaque enough.
-pub fn choose(g: &Gaussians, choice: &Choice) -> Chosen {
-    let mut chosen = Chosen { kept: Vec::new(), not_finite: 0, cropped: 0, faint: 0 };
-    let inside = |p: &[f32; 3], b: &Bounds| (0..3).all(|c| (b.low[c]..=b.high[c]).contains(&p[c]));
-    for i in 0..g.len() {
-        if !g.is_whole(i) {
-            chosen.not_finite += 1;
-        } else if choice.crop.is_some_and(|b| !inside(&g.means[i], &b)) {
-            chosen.cropped += 1;
-        } else if g.opacity(i) < choice.min_opacity {
-            chosen.faint += 1;
-        } else {
-            chosen.kept.push(i as u32);
+impl Convert {
+    pub(crate) fn run(&self, stage: &Stage) -> Result<()> {
+        let outputs = stage.outputs(&self.output).file(&self.output).reads([&self.input]);
+        let mut claim = outputs.claim()?;
+        stage.forecast(memory::of_file(bytes(&self.input)?), "give a smaller file")?;
+        let mut g = ply::read_gaussians_as_they_are(&self.input)?;
+        let all = g.len();
+        let mut chosen = choose(&g, self.min_opacity, self.crop);
+        let dropped =
+            [(chosen.not_finite, "not finite"), (chosen.cropped, "outside the box"), (chosen.faint, "too faint")];
+        for (n, why) in dropped.iter().filter(|d| d.0 > 0) {
+            stage.skipped(&format!("{n} of {all} Gaussians: {why}"));
         }
-    }
-    chosen
-}
-
-/// Puts indices in order; equal ones stay as they were.
-pub fn arrange(g: &Gaussians, kept: &mut [u32], order: Order) {
-    match order {
-        Order::None => {}
-        Order::Opacity => {
-            let logit = |i: u32| g.opacity_logits[i as usize];
-            kept.sort_by(|&a, &b| logit(b).total_cmp(&logit(a)));
+        if chosen.kept.is_empty() {
+            return Err(Error::new("no Gaussian is left")
+                .file(&self.input)
+                .found(format!("{all} Gaussians"))
+                .hint("give a lower --min-opacity or a larger --crop"));
         }
-        Order::Morton => {
-            let centres: Vec<[f32; 3]> = kept.iter().map(|&i| g.means[i as usize]).collect();
-            let ordered: Vec<u32> = morton_order(&centres).into_iter().map(|k| kept[k as usize]).collect();
-            kept.copy_from_slice(&ordered);
+        if let Some(degree) = self.sh_degree.filter(|&d| d > g.sh_degree) {
+            stage.forecast(memory::of_bands(chosen.kept.len(), g.sh_degree, degree), "give a lower --sh-degree")?;
         }
-    }
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-    use crate::optimiser::zeros;
-
-    #[test]
-    fn each_reason_is_counted_once() {
-        let mut g = zeros(5, 0);
-        g.means = vec![[0.0; 3], [2.0, 0.0, 0.0], [f32::NAN; 3], [1.0, 1.0, 1.0], [0.5; 3]];
-        g.opacity_logits = vec![0.0, -9.0, -9.0, f32::INFINITY, -9.0];
-        let crop = Some(Bounds { low: [0.0; 3], high: [1.0; 3] });
-        let c = choose(&g, &Choice { min_opacity: 0.1, crop });
-        assert_eq!(c, Chosen { kept: vec![0, 3], not_finite: 1, cropped: 1, faint: 1 });
-        assert_eq!(choose(&g, &Choice { min_opacity: 0.0, crop: None }).kept, [0, 1, 3, 4]);
-    }
-
-    #[test]
-    fn orders_are_stable() {
-        let mut g = zeros(4, 0);
-        g.means = vec![[1.0, 1.0, 1.0], [0.0; 3], [1.0, 0.0, 0.0], [0.0; 3]];
-        g.opacity_logits = vec![0.0, 2.0, 1.0, 2.0];
-        let run = |order| {
-            let mut all = vec![0, 1, 2, 3];
-            arrange(&g, &mut all, order);
-            all
-        };
-        assert_eq!(run(Order::None), [0, 1, 2, 3]);
-        assert_eq!(run(Order::Opacity), [1, 3, 2, 0]);
-        assert_eq!(run(Order::Morton), [1, 3, 2, 0]);
+        arrange(&g, &mut chosen.kept, self.order);
+        g = g.select(&chosen.kept);
+        g.bound_opacities();
+        let degree = self.sh_degree.unwrap_or(g.sh_degree);
+        g = start::with_degree(g, degree);
+        let parameters = serde_json::to_value(self).map_err(|e| Error::new(e.to_string()))?;
+        let inputs = BTreeMap::from([(role::GEOMETRY.to_string(), hash_file(&self.input)?)]);
+        let mut comments = vec![format!("made by gs-geom {} convert", env!("CARGO_PKG_VERSION"))];
+        comments.extend(inputs.iter().map(|(role, hash)| format!("{role} {hash}")));
+        comments.push(format!("parameters {parameters}"));
+        if ply::is_antialiased(&self.input)? {
+            comments.push(ply::ANTIALIASED.into());
+        }
+        ply::write_gaussians(&self.output, &g, &comments)?;
+        stage.info(&format!("{} of {all} Gaussians, SH degree {}, in {}", g.len(), g.sh_degree, self.output.display()));
+        let summary = json!({
+            "gaussians": g.len(),
+            "of": all,
+            "not_finite": chosen.not_finite,
+            "cropped": chosen.cropped,
+            "faint": chosen.faint,
+        });
+        stage.record(&mut claim, parameters, inputs, summary)
     }
 }

@@ -1,24 +1,23 @@
 //! Stage 1: optimisation of 3D Gaussians from posed photographs, on the CPU (Kerbl et al. 2023).
 //!
-//! [`train`] is the loop; what it is made of is pure and in a module each: [`loss`], [`optimiser`], [`densify`], [`mcmc`],
-//! [`schedule`], [`init`]. [`checkpoint`] makes a killed run go on to the bytes of an undisturbed one.
+//! * [`options`]: the options of every command; `run`: what the commands do, `gs-geom train` first; [`render`], [`eval`],
+//!   [`inspect`], [`convert`]: the other commands
+//! * [`training`]: the loop, and in its folder the loss, the optimiser, the schedule, exposures and checkpoints
+//! * [`densification`]: how the number of Gaussians changes
+//! * [`photographs`]: the photographs and their masks; [`start`]: the Gaussians before the first iteration
+//! * [`budget`]: a plan for a given time; [`memory`]: forecasts; [`metrics`]: PSNR and SSIM
 
-pub mod checkpoint;
-pub mod cli;
-pub mod content;
+pub mod bounds;
+pub mod budget;
 pub mod convert;
-pub mod curve;
-pub mod densify;
-pub mod exposure;
-pub mod init;
+pub mod densification;
+pub mod eval;
 pub mod inspect;
-pub mod loss;
-pub mod masks;
-pub mod mcmc;
 pub mod memory;
 pub mod metrics;
-pub mod optimiser;
+pub mod options;
 pub mod photographs;
-pub mod plan;
-pub mod schedule;
-pub mod train;
+pub mod render;
+mod run;
+pub mod start;
+pub mod training;

@@ -1,8 +1,8 @@
 //! PSNR and SSIM of renders against photographs.
 
-use crate::loss::{Pair, ssim};
-use crate::masks::{Alpha, Masks, multiply};
+use crate::photographs::masks::{Alpha, Masks, multiply};
 use crate::photographs::{Target, exact_target};
+use crate::training::loss::{Pair, ssim};
 use gs_io::Result;
 use gs_raster::{RasterOptions, render};
 use gs_scene::Gaussians;

@@ -1,9 +1,11 @@
 //! The photographs to learn from, decoded once where memory allows, at the picture size in use.
 
-use crate::masks::Masks;
+pub mod masks;
+
 use gs_io::{Result, Watched};
 use gs_scene::dataset::View;
 use gs_scene::{Camera, Image, image_has_alpha};
+use masks::Masks;
 use rayon::prelude::*;
 
 /// Photographs as 8-bit RGB, with alpha where they have it.
@@ -141,10 +143,7 @@ impl<'a> Photographs<'a> {
 
     /// Photograph `i` at its own size, over black where it has alpha. It is the same 8-bit picture whether it was kept or
     /// not.
-    ///
-    /// # Errors
-    /// When it has to be decoded again and cannot be.
-    pub fn image(&self, i: usize) -> Result<Image> {
+    fn image(&self, i: usize) -> Result<Image> {
         let camera = &self.views[i].camera;
         match &self.full[i] {
             Some(picture) => Ok(picture.image(camera)),
@@ -181,7 +180,7 @@ impl<'a> Photographs<'a> {
 }
 
 /// The camera at a fraction of its size, at least one pixel.
-pub fn shrunk(camera: &Camera, divisor: u32) -> Camera {
+fn shrunk(camera: &Camera, divisor: u32) -> Camera {
     let shrink = |v: u32| ((f64::from(v) / f64::from(divisor.max(1))).round() as u32).max(1);
     camera.resized(shrink(camera.width), shrink(camera.height))
 }

@@ -1,30 +1,19 @@
 //! Runs that fail, are extended, or are fed what breaks arithmetic.
 
+mod common;
+
+use common::{disturbed, killed, refused, succeeds};
 use glam::{DQuat, DVec3};
-use gs_geom::checkpoint;
+use gs_geom::training::checkpoint;
 use gs_raster::{RasterOptions, render};
-use gs_scene::{Camera, Gaussians, Image, ply};
+use gs_scene::{Camera, Gaussians, Image, PointCloud, ply};
 use serde_json::Value;
-use std::fmt::Write as _;
 use std::fs;
 use std::path::{Path, PathBuf};
-use std::process::{Command, Output};
+use std::process::Command;
 use std::time::Duration;
 
 const SIZE: (u32, u32) = (64, 48);
-
-fn program(arguments: &[&str]) -> Command {
-    let mut c = Command::new(env!("CARGO_BIN_EXE_gs-geom"));
-    c.args(arguments);
-    c
-}
-
-fn succeeds(arguments: &[&str]) -> String {
-    let o = program(arguments).output().unwrap();
-    let said = String::from_utf8_lossy(&o.stderr).into_owned();
-    assert!(o.status.success(), "{arguments:?}: {said}");
-    said
-}
 
 /// `n` Gaussians on a spiral around the origin.
 fn spiral(n: usize) -> Gaussians {
@@ -43,64 +32,42 @@ fn spiral(n: usize) -> Gaussians {
 /// the width.
 fn write_scene(root: &Path, views: usize, focal: f64, picture: impl Fn(&Camera) -> Vec<f32>) {
     let (w, h) = SIZE;
-    let f = focal * f64::from(w);
-    let camera = format!("1 PINHOLE {w} {h} {f} {f} {} {}\n", f64::from(w) / 2.0, f64::from(h) / 2.0);
-    fs::create_dir_all(root.join("sparse/0")).unwrap();
-    fs::write(root.join("sparse/0/cameras.txt"), camera).unwrap();
-    let (mut images, mut points) = (String::new(), String::new());
-    for i in 0..views {
+    let camera = |i: usize| {
         let a = i as f64 / views as f64 * std::f64::consts::TAU;
         let eye = DVec3::new(3.0 * a.cos(), 3.0 * a.sin(), 0.5);
         let mut c = Camera::look_at(eye, DVec3::ZERO, DVec3::Z, w, h, 1.0);
-        (c.fx, c.fy) = (f, f);
-        let picture = Image { width: w, height: h, rgb: picture(&c), alpha: None };
-        picture.write_png(root.join(format!("images/{i:02}.png"))).unwrap();
-        let (q, t) = (DQuat::from_mat3(&c.rotation), c.translation);
-        let pose = [q.w, q.x, q.y, q.z, t.x, t.y, t.z].map(|v| v.to_string()).join(" ");
-        writeln!(images, "{} {pose} 1 {i:02}.png\n", i + 1).unwrap();
-    }
-    for (i, p) in spiral(60).means.iter().enumerate() {
-        writeln!(points, "{} {} {} {} 200 100 50 0.5", i + 1, p[0], p[1], p[2]).unwrap();
-    }
-    fs::write(root.join("sparse/0/images.txt"), images).unwrap();
-    fs::write(root.join("sparse/0/points3D.txt"), points).unwrap();
+        (c.fx, c.fy) = (focal * f64::from(w), focal * f64::from(w));
+        c
+    };
+    let cameras: Vec<Camera> = (0..views).map(camera).collect();
+    let points = PointCloud { positions: spiral(60).means, colors: vec![[200, 100, 50]; 60] };
+    common::write_scene(root, &cameras, &points, |_, c, path| {
+        Image { width: w, height: h, rgb: picture(c), alpha: None }.write_png(path).unwrap();
+    });
 }
 
 fn spiral_seen_by(c: &Camera) -> Vec<f32> {
     render(&spiral(60), c, &RasterOptions::default()).rgb
 }
 
-struct Folder(tempfile::TempDir);
+/// A folder with a scene in it.
+struct Folder(common::Folder);
 
 impl Folder {
-    /// A folder with a scene in it.
     fn new() -> Self {
-        let folder = Self(tempfile::tempdir().unwrap());
+        let folder = Self(common::Folder::new());
         write_scene(Path::new(&folder.path("scene")), 9, 1.0, spiral_seen_by);
         folder
     }
 
     fn path(&self, name: &str) -> String {
-        self.0.path().join(name).to_string_lossy().into_owned()
+        self.0.path(name)
     }
 }
 
 fn training<'a>(scene: &'a str, out: &'a str, iterations: &'a str, more: &[&'a str]) -> Vec<&'a str> {
     let all = ["train", "--scene", scene, "--out", out, "--iterations", iterations, "--densify-every", "20"];
     [&all, more].concat()
-}
-
-/// Starts a training, waits until it is well under way, does something to its files, and gives how it ended.
-fn disturbed(arguments: &[&str], out: &str, disturb: impl FnOnce()) -> Output {
-    let child = program(arguments).stderr(std::process::Stdio::piped()).spawn().unwrap();
-    for _ in 0..2000 {
-        if PathBuf::from(format!("{out}.checkpoint")).exists() {
-            break;
-        }
-        std::thread::sleep(Duration::from_millis(2));
-    }
-    disturb();
-    child.wait_with_output().unwrap()
 }
 
 #[test]
@@ -111,7 +78,7 @@ fn a_run_whose_photographs_vanish_saves_a_checkpoint_and_goes_on_to_the_same_byt
     let photographs = format!("{scene}/images");
     let away = dir.path("away");
     let arguments = training(&scene, &out, "400", &["--image-cache", "0", "--checkpoint-every", "10"]);
-    let o = disturbed(&arguments, &out, || fs::rename(&photographs, &away).unwrap());
+    let o = disturbed(&arguments, &out, |_| fs::rename(&photographs, &away).unwrap());
     let said = String::from_utf8_lossy(&o.stderr);
     assert_eq!(o.status.code(), Some(2), "{said}");
     assert!(said.contains("saved a checkpoint after iteration") && said.contains("No such file"), "{said}");
@@ -135,7 +102,7 @@ fn a_touched_photograph_is_the_same_and_another_one_stops_the_run_at_once() {
     for (out, more) in [("a.ply", ["--image-cache", "0"]), ("b.ply", ["--image-cache", "1G"])] {
         let out = dir.path(out);
         let arguments = training(&scene, &out, "400", &[&more[..], &["--checkpoint-every", "20"]].concat());
-        let o = disturbed(&arguments, &out, || {
+        let o = disturbed(&arguments, &out, |_| {
             for i in 0..9 {
                 let (path, copy) = (format!("{scene}/images/{i:02}.png"), format!("{scene}/copy.png"));
                 fs::copy(&path, &copy).unwrap();
@@ -145,7 +112,7 @@ fn a_touched_photograph_is_the_same_and_another_one_stops_the_run_at_once() {
         assert!(o.status.success(), "{}", String::from_utf8_lossy(&o.stderr));
         assert_eq!(fs::read(&out).unwrap(), fs::read(&whole).unwrap());
 
-        let o = disturbed(&arguments, &out, || fs::write(&photograph, &other).unwrap());
+        let o = disturbed(&arguments, &out, |_| fs::write(&photograph, &other).unwrap());
         let said = String::from_utf8_lossy(&o.stderr);
         assert_eq!(o.status.code(), Some(2), "{said}");
         assert!(said.contains("saved a checkpoint after iteration"), "{said}");
@@ -192,7 +159,7 @@ fn a_run_that_cannot_write_its_result_saves_a_checkpoint() {
     let (scene, out) = (dir.path("scene"), dir.path("g.ply"));
     let arguments = training(&scene, &out, "300", &["--checkpoint-every", "10"]);
     // A folder where the result should go: the last step, like any that fails there, loses nothing.
-    let o = disturbed(&arguments, &out, || fs::create_dir(&out).unwrap());
+    let o = disturbed(&arguments, &out, |_| fs::create_dir(&out).unwrap());
     let said = String::from_utf8_lossy(&o.stderr);
     assert_eq!(o.status.code(), Some(2), "{said}");
     assert!(said.contains("saved a checkpoint after iteration 300"), "{said}");
@@ -204,61 +171,18 @@ fn a_run_that_cannot_write_its_result_saves_a_checkpoint() {
 }
 
 #[test]
-fn a_finished_run_can_be_given_more_iterations() {
-    let dir = Folder::new();
-    let (scene, out) = (dir.path("scene"), dir.path("g.ply"));
-    let state = PathBuf::from(format!("{out}.checkpoint"));
-    succeeds(&training(&scene, &out, "100", &["--keep-state"]));
-    assert!(state.exists());
-    let kept = fs::read(&out).unwrap();
-    // Again as it was: nothing is left to do, and the same comes out.
-    succeeds(&training(&scene, &out, "100", &["--keep-state"]));
-    assert_eq!(fs::read(&out).unwrap(), kept);
-    let copy = fs::read(&state).unwrap();
-    let said = succeeds(&training(&scene, &out, "150", &[]));
-    assert!(said.contains("going on after iteration 100") && said.contains("schedule of 150 iterations"), "{said}");
-    assert!(!state.exists());
-    let extended = fs::read(&out).unwrap();
-    let header = String::from_utf8_lossy(&extended[..4000]).into_owned();
-    assert!(header.contains("comment extended after iteration 100"));
-    let curve = fs::read_to_string(format!("{out}.curve.jsonl")).unwrap();
-    assert!(curve.contains("\"iteration\":100,") && curve.contains("\"iteration\":150,"));
-    // The same extension in two parts, with other threads, gives the same bytes.
-    fs::write(&state, copy).unwrap();
-    succeeds(&training(&scene, &out, "150", &["--stop-after", "120", "--threads", "1"]));
-    succeeds(&training(&scene, &out, "150", &[]));
-    assert_eq!(fs::read(&out).unwrap(), extended);
-}
-
-#[test]
-fn memory_is_foretold_and_recorded() {
-    let dir = Folder::new();
-    let (scene, out) = (dir.path("scene"), dir.path("g.ply"));
-    let said = succeeds(&training(&scene, &out, "20", &["--max-gaussians", "1000"]));
-    assert!(said.contains("memory: about") && said.contains("with 1000"), "{said}");
-    let record: Value = serde_json::from_slice(&fs::read(format!("{out}.run.json")).unwrap()).unwrap();
-    assert!(record["summary"]["memory_predicted_bytes"].as_u64().unwrap() > 10 << 20);
-    let wrong = program(&training(&scene, &out, "20", &["--image-cache", "512"])).output().unwrap();
-    assert_eq!(wrong.status.code(), Some(2));
-    assert!(String::from_utf8_lossy(&wrong.stderr).contains("512M or 2G"));
-}
-
-#[test]
 fn what_cannot_fit_is_refused_before_it_is_made() {
     let dir = Folder::new();
     let (scene, out, geometry) = (dir.path("scene"), dir.path("out"), dir.path("g.ply"));
     ply::write_gaussians(&geometry, &spiral(60), &[]).unwrap();
     let refused = |arguments: &[&str]| {
-        let o = program(arguments).output().unwrap();
-        let said = String::from_utf8_lossy(&o.stderr).into_owned();
-        assert_eq!((o.status.code(), said.matches("error: ").count()), (Some(2), 1), "{arguments:?}: {said}");
+        let said = refused(arguments);
         assert!(!Path::new(&out).exists(), "{arguments:?}");
         said
     };
     let random = ["--init", "random", "--init-points"];
     let start =
         |count: &str, more: &[&str]| refused(&[&training(&scene, &out, "20", &random)[..], &[count], more].concat());
-    assert!(start("3000000000", &["--memory-limit", "1G"]).contains("--init-points: out of range"));
     for more in [&["--memory-limit", "1G"][..], &["--memory-limit", "1G", "--time-budget", "9s"]] {
         let said = start("900000000", more);
         assert!(said.contains("--memory-limit: more memory than there may be"), "{said}");
@@ -286,8 +210,7 @@ fn what_cannot_fit_is_refused_before_it_is_made() {
 fn stressed(scene: &str, dir: &Folder, g: &Gaussians) -> (Gaussians, String) {
     let (init, out) = (dir.path("init.ply"), dir.path("stress.ply"));
     ply::write_gaussians(&init, g, &[]).unwrap();
-    let more = ["--init", &init, "--sh-degree", "1", "--sh-every", "5", "--holdout", "0", "--no-resume"];
-    let said = succeeds(&training(scene, &out, "45", &[&more[..], &["--opacity-reset-every", "25"]].concat()));
+    let said = succeeds(&training(scene, &out, "45", &["--init", &init, "--sh-degree", "1", "--holdout", "0"]));
     let result = ply::read_gaussians_as_they_are(&out).unwrap();
     for (name, values) in [
         ("means", result.means.as_flattened()),
@@ -348,20 +271,11 @@ fn gaussians_that_break_arithmetic_leave_every_parameter_finite() {
     }
 }
 
-/// Runs to exit code 2; what it said.
-fn refused(arguments: &[&str]) -> String {
-    let o = program(arguments).output().unwrap();
-    let said = String::from_utf8_lossy(&o.stderr).into_owned();
-    assert_eq!(o.status.code(), Some(2), "{arguments:?}: {said}");
-    said
-}
-
 #[test]
 fn gaussians_that_are_not_finite_are_never_written() {
     let dir = Folder::new();
     let (scene, out) = (dir.path("scene"), dir.path("g.ply"));
-    let said = succeeds(&training(&scene, &out, "60", &["--stop-after", "30"]));
-    assert!(said.contains("stopped after iteration 30"), "{said}");
+    killed(&training(&scene, &out, "60", &[]), &out);
     // The next step goes wrong.
     let state = PathBuf::from(format!("{out}.checkpoint"));
     let run = gs_io::Artifact::open(&state, checkpoint::FORMAT, checkpoint::VERSION).unwrap().provenance().clone();
@@ -370,7 +284,7 @@ fn gaussians_that_are_not_finite_are_never_written() {
     checkpoint::write(&state, &wrong, run).unwrap();
     let said = refused(&training(&scene, &out, "60", &[]));
     assert!(said.contains("g.ply: iteration 60: Gaussians are not finite; nothing is written; found "), "{said}");
-    assert!(said.contains("lower --position-rate") && !said.contains("saved a checkpoint"), "{said}");
+    assert!(said.contains("points and poses") && !said.contains("saved a checkpoint"), "{said}");
     assert!(!Path::new(&out).exists());
 }
 
@@ -455,7 +369,7 @@ fn pictures_of_one_colour_one_view_and_any_focal_length_stay_finite() {
         stressed(&root, &dir, &spiral(60));
         // From its own points, too.
         let out = dir.path("own.ply");
-        succeeds(&training(&root, &out, "40", &["--holdout", "0", "--no-resume"]));
+        succeeds(&training(&root, &out, "40", &["--holdout", "0"]));
         ply::read_gaussians(&out).unwrap();
     }
     let root = dir.path("black");

@@ -1,28 +1,20 @@
 //! Photographs of different exposures, with alpha or masks; and what a run starts from.
 
-use glam::{DQuat, DVec3};
+mod common;
+
+use common::{json, record, refused, succeeds};
+use glam::DVec3;
 use gs_raster::{RasterOptions, render};
 use gs_scene::{Camera, Gaussians, PointCloud, ply};
 use serde_json::Value;
-use std::fmt::Write as _;
 use std::fs;
 use std::path::Path;
-use std::process::{Command, Output};
 
 const SIZE: (u32, u32) = (64, 48);
 const VIEWS: usize = 24;
-const ITERATIONS: &str = "1000";
-
-fn run(arguments: &[&str]) -> Output {
-    Command::new(env!("CARGO_BIN_EXE_gs-geom")).args(arguments).output().unwrap()
-}
-
-fn succeeds(arguments: &[&str]) -> String {
-    let o = run(arguments);
-    let said = String::from_utf8_lossy(&o.stderr).into_owned();
-    assert!(o.status.success(), "{arguments:?}: {said}");
-    said
-}
+/// A training of a few seconds.
+const TRAINING: [&str; 10] =
+    ["--iterations", "1000", "--holdout", "6", "--sh-degree", "0", "--max-gaussians", "400", "--schedule", "full"];
 
 /// Opaque balls of different colours.
 fn balls() -> Gaussians {
@@ -48,16 +40,14 @@ fn cameras() -> Vec<Camera> {
 }
 
 /// A folder with a COLMAP scene of the balls; `change` may change the photographs, `[height][width][rgba]`.
-struct Folder(tempfile::TempDir);
+struct Folder(common::Folder);
 
 impl Folder {
     fn new(rgba: bool, change: impl Fn(usize, &mut [[f32; 4]])) -> Self {
-        let folder = Self(tempfile::tempdir().unwrap());
-        let root = folder.0.path().join("scene");
-        fs::create_dir_all(root.join("sparse/0")).unwrap();
-        fs::create_dir_all(root.join("images")).unwrap();
-        let (mut images, mut points) = (String::new(), String::new());
-        for (i, c) in cameras().iter().enumerate() {
+        let folder = Self(common::Folder::new());
+        let colors = (0..balls().len()).map(|i| balls().base_color(i).map(|v| (v.clamp(0.0, 1.0) * 255.0) as u8));
+        let points = PointCloud { positions: balls().means, colors: colors.collect() };
+        common::write_scene(Path::new(&folder.path("scene")), &cameras(), &points, |i, c, path| {
             let r = render(&balls(), c, &RasterOptions::default());
             // As files have them: not multiplied by alpha.
             let pixel = |(p, &a): (&[f32], &f32)| {
@@ -66,42 +56,31 @@ impl Folder {
             };
             let mut pixels: Vec<[f32; 4]> = r.rgb.chunks(3).zip(&r.alpha).map(pixel).collect();
             change(i, &mut pixels);
-            let bytes: Vec<u8> = pixels
-                .iter()
-                .flat_map(|p| p[..if rgba { 4 } else { 3 }].iter())
-                .map(|v| (v.clamp(0.0, 1.0) * 255.0).round() as u8)
-                .collect();
+            let values = pixels.iter().flat_map(|p| p[..if rgba { 4 } else { 3 }].iter());
+            let bytes: Vec<u8> = values.map(|v| (v.clamp(0.0, 1.0) * 255.0).round() as u8).collect();
             let kind = if rgba { image::ColorType::Rgba8 } else { image::ColorType::Rgb8 };
-            image::save_buffer(root.join(format!("images/{i:02}.png")), &bytes, SIZE.0, SIZE.1, kind).unwrap();
-            let (q, t) = (DQuat::from_mat3(&c.rotation), c.translation);
-            let pose = [q.w, q.x, q.y, q.z, t.x, t.y, t.z].map(|v| v.to_string()).join(" ");
-            writeln!(images, "{} {pose} 1 {i:02}.png\n", i + 1).unwrap();
-            if i == 0 {
-                let line = format!("1 PINHOLE {} {} {} {} {} {}\n", SIZE.0, SIZE.1, c.fx, c.fy, c.cx, c.cy);
-                fs::write(root.join("sparse/0/cameras.txt"), line).unwrap();
-            }
-        }
-        for (i, p) in balls().means.iter().enumerate() {
-            let c = balls().base_color(i).map(|v| (v.clamp(0.0, 1.0) * 255.0) as u8);
-            writeln!(points, "{} {} {} {} {} {} {} 0.5", i + 1, p[0], p[1], p[2], c[0], c[1], c[2]).unwrap();
-        }
-        fs::write(root.join("sparse/0/images.txt"), images).unwrap();
-        fs::write(root.join("sparse/0/points3D.txt"), points).unwrap();
+            image::save_buffer(path, &bytes, SIZE.0, SIZE.1, kind).unwrap();
+        });
         folder
     }
 
     fn path(&self, name: &str) -> String {
-        self.0.path().join(name).to_string_lossy().into_owned()
+        self.0.path(name)
     }
 
     /// Trains; the run's summary.
     fn train(&self, out: &str, more: &[&str]) -> Value {
         let (scene, out) = (self.path("scene"), self.path(out));
-        let all = ["train", "--scene", &scene, "--out", &out, "--iterations", ITERATIONS, "--holdout", "6"];
-        let all = [&all[..], &["--sh-degree", "0", "--max-gaussians", "400", "--schedule", "full"], more].concat();
-        succeeds(&all);
-        let record: Value = serde_json::from_slice(&fs::read(format!("{out}.run.json")).unwrap()).unwrap();
-        record["summary"].clone()
+        succeeds(&[&["train", "--scene", &scene, "--out", &out], &TRAINING[..], more].concat());
+        record(&out)["summary"].clone()
+    }
+
+    /// PSNR of a geometry on the held-out views, by `gs-geom eval`.
+    fn eval(&self, geometry: &str, more: &[&str]) -> f64 {
+        let (scene, geometry, out) = (self.path("scene"), self.path(geometry), self.path("m.json"));
+        let all = ["eval", "--scene", &scene, "--geometry", &geometry, "--holdout", "6", "--out", &out];
+        succeeds(&[&all[..], more].concat());
+        psnr(&json(&out))
     }
 }
 
@@ -120,9 +99,9 @@ fn exposures_that_differ_are_compensated() {
         }
     });
     let without = dir.train("a.ply", &[]);
-    let with = dir.train("b.ply", &["--exposure", "--threads", "1"]);
+    let with = dir.train("b.ply", &["--exposure"]);
     assert!(psnr(&with) > psnr(&without) + 2.0, "{} {}", psnr(&with), psnr(&without));
-    let maps: Value = serde_json::from_slice(&fs::read(dir.path("b.ply.exposures.json")).unwrap()).unwrap();
+    let maps = json(&dir.path("b.ply.exposures.json"));
     assert_eq!(maps.as_object().unwrap().len(), VIEWS - 4);
     // What a grey becomes: maps may mix the channels as well.
     let green = |name: &str| (0..3).map(|c| maps[name][1][c].as_f64().unwrap()).sum::<f64>();
@@ -130,19 +109,6 @@ fn exposures_that_differ_are_compensated() {
         let found = green(&format!("{i:02}.png"));
         assert!((found - f64::from(gain(i))).abs() < 0.06, "{i}: {found} {}", gain(i));
     }
-    // In parts, on other threads: the maps and their moments are part of the checkpoint.
-    for last in ["7", "301"] {
-        let (scene, out) = (dir.path("scene"), dir.path("c.ply"));
-        let all = ["train", "--scene", &scene, "--out", &out, "--iterations", ITERATIONS, "--holdout", "6"];
-        let all = [&all[..], &["--sh-degree", "0", "--max-gaussians", "400", "--schedule", "full"]].concat();
-        succeeds(&[&all[..], &["--exposure", "--stop-after", last]].concat());
-    }
-    dir.train("c.ply", &["--exposure", "--threads", "2"]);
-    assert_eq!(fs::read(dir.path("b.ply")).unwrap(), fs::read(dir.path("c.ply")).unwrap());
-    assert_eq!(
-        fs::read(dir.path("b.ply.exposures.json")).unwrap(),
-        fs::read(dir.path("c.ply.exposures.json")).unwrap()
-    );
 }
 
 /// Mean absolute difference of the alpha that a file's Gaussians have from that of the balls.
@@ -169,15 +135,7 @@ fn alpha_is_learnt_from_transparent_photographs() {
     assert!(matched < 0.6 * plain && random < 0.8 * plain, "{plain} {matched} {random}");
     assert!(psnr(&background) > 30.0, "{background}");
     // What should be opaque hides a background of another colour.
-    let (scene, out) = (dir.path("scene"), dir.path("m.json"));
-    let over_white = |geometry: &str| {
-        let geometry = dir.path(geometry);
-        let all = ["eval", "--scene", &scene, "--geometry", &geometry, "--holdout", "6", "--background", "white"];
-        succeeds(&[&all[..], &["--out", &out]].concat());
-        let m: Value = serde_json::from_slice(&fs::read(&out).unwrap()).unwrap();
-        psnr(&m)
-    };
-    let (plain, matched) = (over_white("a.ply"), over_white("b.ply"));
+    let [plain, matched] = ["a.ply", "b.ply"].map(|f| dir.eval(f, &["--background", "white"]));
     assert!(matched > plain + 2.0, "{plain} {matched}");
 }
 
@@ -201,31 +159,22 @@ fn masked_pixels_do_not_count() {
     let whole = dir.train("a.ply", &[]);
     let masked = dir.train("b.ply", &["--masks", &masks]);
     assert!(psnr(&masked) > 22.0 && psnr(&whole) < 18.0, "{masked} {whole}");
-    let (scene, out) = (dir.path("scene"), dir.path("m.json"));
-    let eval = |geometry: &str| {
-        let geometry = dir.path(geometry);
-        let all = ["eval", "--scene", &scene, "--geometry", &geometry, "--holdout", "6", "--masks", &masks];
-        succeeds(&[&all[..], &["--out", &out]].concat());
-        let m: Value = serde_json::from_slice(&fs::read(&out).unwrap()).unwrap();
-        psnr(&m)
-    };
+    let eval = |geometry: &str| dir.eval(geometry, &["--masks", &masks]);
     let (without, with) = (eval("a.ply"), eval("b.ply"));
     assert!(with > without + 1.0 && (with - psnr(&masked)).abs() < 0.2, "{without} {with} {masked}");
     black_masks_do_not_count(&dir, &masks, &eval);
     // Without a mask for some, and for all.
     fs::remove_file(Path::new(&masks).join("01.png")).unwrap();
-    let out = dir.path("c.ply");
+    let (scene, out) = (dir.path("scene"), dir.path("c.ply"));
     let train = ["train", "--scene", &scene, "--out", &out, "--iterations", "3", "--masks"];
     assert!(succeeds(&[&train[..], &[&masks]].concat()).contains("1 of 24 photographs have no mask"));
     fs::create_dir(dir.path("none")).unwrap();
-    let o = run(&[&train[..], &[&dir.path("none")]].concat());
-    let said = String::from_utf8_lossy(&o.stderr);
-    assert!(o.status.code() == Some(2) && said.contains("no masks in this folder"), "{said}");
+    assert!(refused(&[&train[..], &[&dir.path("none")]].concat()).contains("no masks in this folder"));
 }
 
 /// A held-out view whose mask is black has no figures, and the means are those of the others.
 fn black_masks_do_not_count(dir: &Folder, masks: &str, eval: &dyn Fn(&str) -> f64) {
-    let metrics = || -> Value { serde_json::from_slice(&fs::read(dir.path("m.json")).unwrap()).unwrap() };
+    let metrics = || json(&dir.path("m.json"));
     let figures = |m: &Value| m["views"].as_array().unwrap().iter().map(|v| v["psnr"].as_f64()).collect::<Vec<_>>();
     let before = figures(&metrics());
     let blacken = |i: usize| {
@@ -239,8 +188,7 @@ fn black_masks_do_not_count(dir: &Folder, masks: &str, eval: &dyn Fn(&str) -> f6
     assert_eq!(m["views"][1]["ssim"], Value::Null);
     let others = [0, 2, 3].map(|i| before[i].unwrap()).iter().sum::<f64>() / 3.0;
     assert!((mean - others).abs() < 1e-9, "{mean} {others}");
-    let record: Value = serde_json::from_slice(&fs::read(dir.path("m.json.run.json")).unwrap()).unwrap();
-    let said = record["skipped"].to_string();
+    let said = record(&dir.path("m.json"))["skipped"].to_string();
     assert!(said.contains("1 of the views measured: no pixel counts there (a black mask), in 06.png"), "{said}");
     // Training measures the same views in the same way.
     [0, 12, 18].into_iter().for_each(blacken);
@@ -251,20 +199,14 @@ fn black_masks_do_not_count(dir: &Folder, masks: &str, eval: &dyn Fn(&str) -> f6
 #[test]
 fn antialiased_gaussians_say_so_and_are_rendered_so() {
     let dir = Folder::new(false, |_, _| ());
-    let (scene, out) = (dir.path("scene"), dir.path("m.json"));
     dir.train("a.ply", &[]);
     let learnt = psnr(&dir.train("b.ply", &["--antialias"]));
-    let eval = |geometry: &str, resolution: &str| {
-        let all = ["eval", "--scene", &scene, "--geometry", geometry, "--holdout", "6", "--resolution", resolution];
-        succeeds(&[&all[..], &["--out", &out]].concat());
-        let m: Value = serde_json::from_slice(&fs::read(&out).unwrap()).unwrap();
-        psnr(&m)
-    };
-    let (plain, filtered) = (dir.path("a.ply"), dir.path("b.ply"));
-    assert!((eval(&filtered, "1") - learnt).abs() < 0.2);
+    let eval = |geometry: &str, resolution: &str| dir.eval(geometry, &["--resolution", resolution]);
+    assert!((eval("b.ply", "1") - learnt).abs() < 0.2);
     // Far away, where Gaussians are smaller than pixels, those learnt without the filter are too thick.
-    let (coarse, coarse_filtered) = (eval(&plain, "8"), eval(&filtered, "8"));
+    let (coarse, coarse_filtered) = (eval("a.ply", "8"), eval("b.ply", "8"));
     assert!(coarse_filtered > coarse, "{coarse} {coarse_filtered}");
+    let (plain, filtered) = (dir.path("a.ply"), dir.path("b.ply"));
     // What says so is the comment; convert hands it on.
     let converted = dir.path("c.ply");
     succeeds(&["convert", &filtered, &converted]);
@@ -273,7 +215,7 @@ fn antialiased_gaussians_say_so_and_are_rendered_so() {
     let at = bytes.windows(14).position(|w| w == b"antialias true").unwrap();
     bytes[at..at + 14].copy_from_slice(b"antialias none");
     fs::write(&filtered, bytes).unwrap();
-    assert!((eval(&filtered, "8") - coarse_filtered).abs() > 0.01);
+    assert!((eval("b.ply", "8") - coarse_filtered).abs() > 0.01);
 }
 
 #[test]
@@ -295,6 +237,5 @@ fn a_run_starts_from_what_it_is_told_to() {
         assert!(said.contains(says), "{init}: {said}");
         assert_eq!(ply::read_gaussians(&out).unwrap().len(), count, "{init}");
     }
-    let o = run(&["train", "--scene", &scene, "--out", &out, "--init", &format!("{scene}/images/00.png")]);
-    assert_eq!(o.status.code(), Some(2));
+    refused(&["train", "--scene", &scene, "--out", &out, "--init", &format!("{scene}/images/00.png")]);
 }

@@ -1,7 +1,7 @@
 //! Where Gaussians start: at the dataset's points, at random in front of the cameras, or as a PLY says.
 
-use crate::optimiser::zeros;
-use crate::schedule::{Purpose, generator};
+use crate::training::optimiser::zeros;
+use crate::training::schedule::{Purpose, generator};
 use glam::{DMat3, DVec3};
 use gs_io::{Error, Result};
 use gs_scene::{Camera, Gaussians, PointCloud, SH_C0, sh_coefficients};

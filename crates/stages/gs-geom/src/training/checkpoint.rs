@@ -1,21 +1,20 @@
 //! Checkpoints: everything a run needs to go on to the bytes of an undisturbed one.
 
-use crate::densify::Pull;
-use crate::exposure::{Exposures, NUMBERS};
-use crate::optimiser::Adam;
+use super::exposure::{Exposures, NUMBERS};
+use super::optimiser::Adam;
+use crate::densification::screen::ScreenGradients;
 use gs_io::{Artifact, ArtifactWriter, Error, Provenance, Result};
 use gs_scene::{Gaussians, sh_coefficients};
 use serde::{Deserialize, Serialize};
-use serde_json::Value;
 use std::path::{Path, PathBuf};
 
 /// Format name of the artifact.
 pub const FORMAT: &str = "gs-geom-checkpoint";
 /// Version of the format.
-pub const VERSION: u32 = 3;
+pub const VERSION: u32 = 4;
 
 /// State of an optimisation after some iterations. Random numbers are drawn from the seed and the iteration (see
-/// [`crate::schedule::generator`]), so no generator is part of it.
+/// [`super::schedule::generator`]), so no generator is part of it.
 #[derive(Debug, Clone, PartialEq)]
 pub struct State {
     /// The parameters.
@@ -23,7 +22,7 @@ pub struct State {
     /// The optimiser's moments.
     pub adam: Adam,
     /// What densification has seen.
-    pub pull: Pull,
+    pub seen: ScreenGradients,
     /// The photographs' exposures.
     pub exposures: Exposures,
     /// The rest.
@@ -38,7 +37,6 @@ pub struct ProgressState {
     /// Gradients of Gaussians that were not finite and so not used.
     pub dropped: u64,
     /// Most Gaussians in an iteration that could not be drawn: not finite; degenerate (see [`gs_raster::Dropped`]).
-    #[serde(default)]
     pub undrawn: [u64; 2],
     /// Gaussians cloned, split, removed and relocated so far.
     pub densified: [u64; 4],
@@ -46,9 +44,6 @@ pub struct ProgressState {
     pub window: ([f64; 3], u32),
     /// Lines of the training curve.
     pub curve: Vec<String>,
-    /// Iterations after which the run was given more of them; see [`read`].
-    #[serde(default)]
-    pub extended: Vec<u32>,
 }
 
 #[derive(Serialize, Deserialize)]
@@ -65,8 +60,8 @@ pub fn path_of(output: &Path) -> PathBuf {
 
 /// A fresh run's state, with the exposures of so many views (see [`Exposures::new`]).
 pub fn start(gaussians: Gaussians, exposures: usize) -> State {
-    let (adam, pull) = (Adam::new(&gaussians), Pull::new(gaussians.len()));
-    State { gaussians, adam, pull, exposures: Exposures::new(exposures), progress: ProgressState::default() }
+    let (adam, seen) = (Adam::new(&gaussians), ScreenGradients::new(gaussians.len()));
+    State { gaussians, adam, seen, exposures: Exposures::new(exposures), progress: ProgressState::default() }
 }
 
 /// Writes a checkpoint; `provenance` tells by which run.
@@ -80,8 +75,8 @@ pub fn write(path: &Path, state: &State, provenance: Provenance) -> Result<()> {
     let (n, e) = (state.gaussians.len(), &state.exposures);
     let exposures = [e.maps.len(), NUMBERS];
     let mut writer = ArtifactWriter::new(Provenance { extra, ..provenance })
-        .tensor("pull_sum", &[n], &state.pull.sum)
-        .tensor("pull_views", &[n], &state.pull.views)
+        .tensor("gradient_sum", &[n], &state.seen.sum)
+        .tensor("gradient_views", &[n], &state.seen.views)
         .tensor("exposure_maps", &exposures, e.maps.as_flattened())
         .tensor("exposure_first", &exposures, e.first.as_flattened())
         .tensor("exposure_second", &exposures, e.second.as_flattened())
@@ -97,9 +92,7 @@ pub fn write(path: &Path, state: &State, provenance: Provenance) -> Result<()> {
     writer.write(path)
 }
 
-/// Reads the checkpoint at `path`, if there is one of the same run: same program, parameters and inputs. A run may have
-/// more iterations than the checkpoint's; what was done stays as it is, and from there on the longer run's schedule
-/// holds, as if the iterations before had been its own.
+/// Reads the checkpoint at `path`, if there is one of the same run: same program, parameters and inputs.
 ///
 /// # Errors
 /// Says why the checkpoint cannot be used: damaged, or of another run.
@@ -111,21 +104,18 @@ pub fn read(path: &Path, run: &Provenance) -> Result<Option<State>> {
     let p = a.provenance();
     let same = [
         ("program", p.program == run.program),
-        ("parameters", p.parameters == run.parameters || extends(&p.parameters, &run.parameters)),
+        ("parameters", p.parameters == run.parameters),
         ("inputs", p.inputs == run.inputs),
     ];
     if let Some((field, _)) = same.iter().find(|(_, same)| !same) {
         return Err(Error::new("the checkpoint is of another run").file(path).field(*field));
     }
-    let mut extra: Extra = serde_json::from_value(p.extra.clone())
+    let extra: Extra = serde_json::from_value(p.extra.clone())
         .map_err(|e| Error::new(format!("damaged checkpoint: {e}")).file(path).field("extra"))?;
     if extra.sh_degree > 3 {
         return Err(Error::new("damaged checkpoint").file(path).field("sh_degree").found(extra.sh_degree));
     }
-    if p.parameters != run.parameters {
-        extra.progress.extended.push(extra.progress.iteration);
-    }
-    let n = a.tensor::<u32>("pull_views", &[None])?.len();
+    let n = a.tensor::<u32>("gradient_views", &[None])?.len();
     let group = |prefix: &str| -> Result<Gaussians> {
         let flat = |name: &str, width: usize| a.tensor::<f32>(&format!("{prefix}{name}"), &[Some(n), Some(width)]);
         Ok(Gaussians {
@@ -150,31 +140,19 @@ pub fn read(path: &Path, run: &Provenance) -> Result<Option<State>> {
         },
         gaussians: group("")?,
         adam: Adam { first: group("first_")?, second: group("second_")?, steps: extra.steps },
-        pull: Pull {
-            sum: a.tensor::<f32>("pull_sum", &[Some(n)])?.to_vec(),
-            views: a.tensor::<u32>("pull_views", &[Some(n)])?.to_vec(),
+        seen: ScreenGradients {
+            sum: a.tensor::<f32>("gradient_sum", &[Some(n)])?.to_vec(),
+            views: a.tensor::<u32>("gradient_views", &[Some(n)])?.to_vec(),
         },
         progress: extra.progress,
     }))
 }
 
-/// Whether the parameters differ only in that the new run has more iterations, and in the schedule, which follows from
-/// their number.
-fn extends(old: &Value, new: &Value) -> bool {
-    let iterations = |p: &Value| p["options"]["schedule"]["iterations"].as_u64();
-    let (Some(before), Some(now)) = (iterations(old), iterations(new)) else { return false };
-    let rest = |p: &Value| {
-        let mut p = p.clone();
-        p["options"]["schedule"] = Value::Null;
-        p
-    };
-    before < now && rest(old) == rest(new)
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::optimiser::zeros;
+    use crate::training::optimiser::zeros;
+    use serde_json::Value;
     use std::collections::BTreeMap;
 
     fn provenance(seed: u64) -> Provenance {
@@ -200,7 +178,7 @@ mod tests {
         let mut state = start(g, 3);
         fill(&mut state.adam.first.sh, 3.0);
         fill(state.adam.second.rotations.as_flattened_mut(), 4.0);
-        fill(&mut state.pull.sum, 5.0);
+        fill(&mut state.seen.sum, 5.0);
         fill(state.exposures.maps.as_flattened_mut(), 6.0);
         fill(state.exposures.second.as_flattened_mut(), 7.0);
         state.exposures.steps = vec![3, 1, 4];
@@ -212,7 +190,6 @@ mod tests {
             densified: [1, 2, 3, 4],
             window: ([0.1, 1.0 / 3.0, f64::MIN_POSITIVE], 7),
             curve: vec!["{\"iteration\":10}".into()],
-            extended: vec![4],
         };
         write(&path, &state, provenance(1)).unwrap();
         assert_eq!(read(&path, &provenance(1)).unwrap().unwrap(), state);
@@ -221,23 +198,5 @@ mod tests {
         let bytes = std::fs::read(&path).unwrap();
         std::fs::write(&path, &bytes[..bytes.len() - 9]).unwrap();
         assert!(read(&path, &provenance(1)).is_err());
-    }
-
-    #[test]
-    fn a_run_may_be_given_more_iterations_but_nothing_else() {
-        let parameters = |iterations: u32, rate: f32| serde_json::json!({"options": {"rate": rate, "schedule": {"iterations": iterations, "densify_until": iterations / 2}}});
-        let run = |parameters| Provenance { parameters, ..provenance(1) };
-        let dir = tempfile::tempdir().unwrap();
-        let path = dir.path().join("c");
-        let mut state = start(zeros(1, 0), 0);
-        state.progress.iteration = 70;
-        write(&path, &state, run(parameters(100, 0.5))).unwrap();
-        assert_eq!(read(&path, &run(parameters(100, 0.5))).unwrap().unwrap().progress.extended, Vec::<u32>::new());
-        assert_eq!(read(&path, &run(parameters(200, 0.5))).unwrap().unwrap().progress.extended, [70]);
-        assert!(read(&path, &run(parameters(99, 0.5))).is_err());
-        assert!(read(&path, &run(parameters(200, 0.25))).is_err());
-        for hostile in [serde_json::json!("x"), serde_json::json!({"options": 3}), Value::Null] {
-            assert!(!extends(&hostile, &parameters(2, 0.5)));
-        }
     }
 }

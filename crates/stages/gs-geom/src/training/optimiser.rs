@@ -1,4 +1,4 @@
-//! Adam with a learning rate per kind of parameter, for every Gaussian or only for those that a view draws.
+//! Adam with a learning rate per kind of parameter.
 
 use gs_raster::Gradients;
 use gs_scene::{Gaussians, sh_coefficients};
@@ -72,17 +72,13 @@ impl Adam {
         Self { first: zero(), second: zero(), steps: 0 }
     }
 
-    /// Moves the parameters one step (Kingma and Ba 2015, with bias correction by the number of steps). Spherical
+    /// Updates the parameters by one step (Kingma and Ba 2015, with bias correction by the number of steps). Spherical
     /// harmonics above `active_degree` have neither gradient nor moments yet and stay as they are.
     ///
-    /// With `drawn`, only the Gaussians marked there move, and the moments of the others keep what they were (the sparse
-    /// Adam of Taming 3DGS, Mallick et al. 2024): a view that does not show a Gaussian says nothing about it.
-    ///
     /// # Panics
-    /// When the gradients or the marks belong to another number of Gaussians.
-    pub fn step(&mut self, g: &mut Gaussians, d: &Gradients, rates: &Rates, active_degree: u8, drawn: Option<&[bool]>) {
+    /// When the gradients belong to another number of Gaussians.
+    pub fn step(&mut self, g: &mut Gaussians, d: &Gradients, rates: &Rates, active_degree: u8) {
         assert!(d.means.len() == g.len() && d.sh.len() == g.sh.len() && self.first.len() == g.len());
-        assert!(drawn.is_none_or(|drawn| drawn.len() == g.len()));
         self.steps += 1;
         let t = i32::try_from(self.steps).unwrap_or(i32::MAX);
         let step = Step {
@@ -97,13 +93,10 @@ impl Adam {
             }
             let size = CHUNK * stride;
             let moments = m.par_chunks_mut(size).zip(v.par_chunks_mut(size));
-            let all = p.par_chunks_mut(size).zip(moments).zip(d.par_chunks(size)).enumerate();
-            all.for_each(|(chunk, ((p, (m, v)), d))| match drawn {
-                None if rate.len() == stride && rate.iter().all(|&r| r == rate[0]) => {
-                    update_flat(p, m, v, d, rate[0], step);
-                }
-                None => update_rows(p, m, v, d, rate, stride, None, step),
-                Some(drawn) => update_rows(p, m, v, d, rate, stride, drawn.get(chunk * CHUNK..), step),
+            let all = p.par_chunks_mut(size).zip(moments).zip(d.par_chunks(size));
+            all.for_each(|((p, (m, v)), d)| match rate.len() == stride && rate.iter().all(|&r| r == rate[0]) {
+                true => update_flat(p, m, v, d, rate[0], step),
+                false => update_rows(p, m, v, d, rate, stride, step),
             });
         };
         macro_rules! group {
@@ -188,24 +181,11 @@ fn update_flat(p: &mut [f32], m: &mut [f32], v: &mut [f32], d: &[f32], rate: f32
     }
 }
 
-/// Updates the first `rates.len()` values of each row of `stride` values; with `drawn`, of each row marked there.
-#[expect(clippy::too_many_arguments, reason = "the three states of Adam, the gradient, and what to do with them")]
+/// Updates the first `rates.len()` values of each row of `stride` values.
 #[multiversion(targets("x86_64+avx512f+avx512vl", "x86_64+avx2"))]
-fn update_rows(
-    p: &mut [f32],
-    m: &mut [f32],
-    v: &mut [f32],
-    d: &[f32],
-    rates: &[f32],
-    stride: usize,
-    drawn: Option<&[bool]>,
-    s: Step,
-) {
+fn update_rows(p: &mut [f32], m: &mut [f32], v: &mut [f32], d: &[f32], rates: &[f32], stride: usize, s: Step) {
     let rows = p.chunks_exact_mut(stride).zip(m.chunks_exact_mut(stride)).zip(v.chunks_exact_mut(stride));
-    for (i, (((p, m), v), d)) in rows.zip(d.chunks_exact(stride)).enumerate() {
-        if drawn.is_some_and(|drawn| !drawn[i]) {
-            continue;
-        }
+    for (((p, m), v), d) in rows.zip(d.chunks_exact(stride)) {
         for ((((p, m), v), &d), &rate) in p.iter_mut().zip(m).zip(v).zip(d).zip(rates) {
             update_one(p, m, v, d, rate, s);
         }
@@ -227,7 +207,6 @@ pub fn drop_bad_gradients(d: &mut Gradients) -> u64 {
             || bad(&seen.opacity_logits[a..b])
             || bad(&seen.sh[a * stride..b * stride])
             || bad(seen.mean2d[a..b].as_flattened())
-            || bad(seen.mean2d_abs[a..b].as_flattened())
     };
     let of_chunk = |c: usize| {
         let (a, b) = (c * CHUNK, ((c + 1) * CHUNK).min(n));
@@ -242,7 +221,6 @@ pub fn drop_bad_gradients(d: &mut Gradients) -> u64 {
         d.opacity_logits[i] = 0.0;
         d.sh[i * stride..(i + 1) * stride].fill(0.0);
         d.mean2d[i] = [0.0; 2];
-        d.mean2d_abs[i] = [0.0; 2];
         dropped += 1;
     }
     dropped
@@ -271,7 +249,6 @@ mod tests {
             opacity_logits: (0..n).map(&value).collect(),
             sh: (0..n * stride).map(|i| value(i / stride)).collect(),
             mean2d: vec![[0.0; 2]; n],
-            mean2d_abs: vec![[0.0; 2]; n],
             overflowed: 0,
         }
     }
@@ -297,7 +274,7 @@ mod tests {
             let sequence = [0.5, -0.25, 3.0, 1e-9, 0.7];
             for s in sequence {
                 let d = gradients(n, g.sh_stride(), |i| s * (i + 1) as f32);
-                adam.step(&mut g, &d, &rates(0.01), degree, None);
+                adam.step(&mut g, &d, &rates(0.01), degree);
             }
             for i in [0, 1, n - 1] {
                 let own: Vec<f64> = sequence.iter().map(|&s| f64::from(s) * (i + 1) as f64).collect();
@@ -317,30 +294,9 @@ mod tests {
         let mut g = zeros(5, 3);
         let mut adam = Adam::new(&g);
         let d = gradients(5, g.sh_stride(), |_| 1.0);
-        adam.step(&mut g, &d, &Rates { means: 0.0, ..rates(0.1) }, 1, None);
+        adam.step(&mut g, &d, &Rates { means: 0.0, ..rates(0.1) }, 1);
         assert!(g.means.iter().flatten().all(|&v| v == 0.0));
         assert!(g.sh_of(4)[..12].iter().all(|&v| v < 0.0) && g.sh_of(4)[12..].iter().all(|&v| v == 0.0));
-    }
-
-    #[test]
-    fn only_drawn_gaussians_move_and_those_exactly_as_ever() {
-        for degree in [0, 1, 3] {
-            let n = 2 * CHUNK + 5;
-            let d = gradients(n, zeros(1, degree).sh_stride(), |i| (i as f32).sin());
-            let (mut dense, mut sparse) = (zeros(n, degree), zeros(n, degree));
-            let (mut a, mut b) = (Adam::new(&dense), Adam::new(&sparse));
-            let drawn: Vec<bool> = (0..n).map(|i| i % 3 != 1).collect();
-            for _ in 0..3 {
-                a.step(&mut dense, &d, &rates(0.1), degree, None);
-                b.step(&mut sparse, &d, &rates(0.1), degree, Some(&drawn));
-            }
-            let indices = |wanted: bool| (0..n as u32).filter(|&i| drawn[i as usize] == wanted).collect::<Vec<u32>>();
-            let (seen, unseen) = (indices(true), indices(false));
-            assert_eq!(sparse.select(&seen), dense.select(&seen));
-            assert_eq!(b.second.select(&seen), a.second.select(&seen));
-            assert_eq!(sparse.select(&unseen), zeros(unseen.len(), degree));
-            assert_eq!(b.first.select(&unseen), zeros(unseen.len(), degree));
-        }
     }
 
     #[test]
@@ -362,7 +318,7 @@ mod tests {
     fn selected_moments_follow_their_gaussians() {
         let mut g = zeros(3, 1);
         let mut adam = Adam::new(&g);
-        adam.step(&mut g, &gradients(3, 12, |i| i as f32), &rates(0.1), 1, None);
+        adam.step(&mut g, &gradients(3, 12, |i| i as f32), &rates(0.1), 1);
         let before = adam.first.clone();
         adam.select(&[2, 0, 2], 2);
         assert_eq!(adam.first.means[0], before.means[2]);

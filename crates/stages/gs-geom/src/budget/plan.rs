@@ -1,7 +1,8 @@
 //! What can be done in a given time: from the measured speed of a few iterations to a number of iterations, a picture
 //! size and a most number of Gaussians.
 
-use crate::schedule::Schedule;
+use crate::densification::rules::Growth;
+use crate::training::schedule::Schedule;
 use serde::{Deserialize, Serialize};
 
 /// Divisors of the picture size that a plan may choose.
@@ -76,14 +77,14 @@ pub struct Plan {
     pub seconds: f64,
 }
 
-/// The plan for these limits. `schedule` gives the schedule of a number of iterations.
+/// The plan for these limits. `course` gives the schedule and the growth of a number of iterations.
 ///
 /// Full pictures come first, then as many Gaussians as get `ITERATIONS_PER_GROWTH` iterations for each multiple of
 /// their first number. Where not even the first number gets them, the pictures become smaller; and where that does not
 /// suffice, there are fewer iterations.
-pub fn plan(speed: &Speed, limits: &Limits, schedule: impl Fn(u32) -> Schedule) -> Plan {
+pub fn plan(speed: &Speed, limits: &Limits, course: impl Fn(u32) -> (Schedule, Growth)) -> Plan {
     let fit = |gaussians: usize, divisor: f64| {
-        let seconds = |iterations: u32| expected(speed, limits, &schedule(iterations), gaussians, divisor);
+        let seconds = |iterations: u32| expected(speed, limits, &course(iterations), gaussians, divisor);
         // The most iterations that fit, at least one.
         let (mut low, mut high) = (1, limits.iterations.max(1));
         while low < high {
@@ -109,10 +110,16 @@ pub fn plan(speed: &Speed, limits: &Limits, schedule: impl Fn(u32) -> Schedule) 
 
 /// Seconds that a schedule should take when the number of Gaussians grows from its first to `gaussians` in the first half
 /// of densification.
-pub fn expected(speed: &Speed, limits: &Limits, schedule: &Schedule, gaussians: usize, divisor: f64) -> f64 {
+fn expected(
+    speed: &Speed,
+    limits: &Limits,
+    (schedule, growth): &(Schedule, Growth),
+    gaussians: usize,
+    divisor: f64,
+) -> f64 {
     let (start, most) = (limits.start as f64, gaussians as f64);
-    let from = f64::from(schedule.densify_from);
-    let until = from + 0.5 * (f64::from(schedule.densify_until) - from).max(1.0);
+    let from = f64::from(growth.from);
+    let until = from + 0.5 * (f64::from(growth.until) - from).max(1.0);
     let number =
         |iteration: f64| start + (most - start).max(0.0) * ((iteration - from) / (until - from)).clamp(0.0, 1.0);
     let part = f64::from(schedule.iterations) / f64::from(PARTS);
@@ -128,6 +135,7 @@ pub fn expected(speed: &Speed, limits: &Limits, schedule: &Schedule, gaussians: 
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::densification::Strategy;
     use proptest::prelude::*;
 
     const SPEED: Speed = Speed { gaussians: 10_000.0, pixels: 0.09, each: 0.01, exponent: 0.5 };
@@ -136,8 +144,12 @@ mod tests {
         Limits { seconds, iterations: 30_000, start: 10_000, gaussians: 1_000_000, divisor: 8.0, heldout: 0 }
     }
 
+    fn course(n: u32) -> (Schedule, Growth) {
+        (Schedule::for_iterations(n), Strategy::Adaptive.growth(n))
+    }
+
     fn planned(seconds: f64) -> Plan {
-        plan(&SPEED, &limits(seconds), Schedule::for_iterations)
+        plan(&SPEED, &limits(seconds), course)
     }
 
     #[test]
@@ -162,7 +174,7 @@ mod tests {
 
     #[test]
     fn small_pictures_at_the_start_leave_time_for_more_iterations() {
-        let coarse = |n| Schedule { coarse: vec![(n / 4, 8), (n / 2, 2)], ..Schedule::for_iterations(n) };
+        let coarse = |n| (Schedule { coarse: vec![(n / 4, 8), (n / 2, 2)], ..course(n).0 }, course(n).1);
         let p = plan(&SPEED, &limits(100.0), coarse);
         assert!(p.iterations > planned(100.0).iterations, "{p:?}");
     }
@@ -177,7 +189,7 @@ mod tests {
             divisor in 0.5f64..9.0,
         ) {
             let limits = Limits { seconds, iterations, start, gaussians: most, divisor, heldout: 2 };
-            let p = plan(&SPEED, &limits, Schedule::for_iterations);
+            let p = plan(&SPEED, &limits, course);
             prop_assert!((1..=iterations).contains(&p.iterations) && p.gaussians <= most.max(start));
             prop_assert!(p.divisor == 1.0 || p.divisor <= divisor);
             prop_assert!(p.seconds <= seconds || p.iterations == 1);

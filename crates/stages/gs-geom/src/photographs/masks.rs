@@ -16,7 +16,7 @@ pub enum Alpha {
     Background,
     /// The same, and what is rendered must be as opaque as the photograph
     Match,
-    /// Nothing is known of them: they do not count
+    /// Unknown: they do not count
     Ignore,
 }
 
@@ -25,8 +25,8 @@ pub enum Alpha {
 pub struct Masks(BTreeMap<String, PathBuf>);
 
 impl Masks {
-    /// The masks in a folder: a PNG or JPEG a view, called as the photograph with (as COLMAP has it) or without the
-    /// photograph's own extension. A view without a file has no mask.
+    /// The masks in a folder: a PNG or JPEG a view, with the name of the photograph, with (as COLMAP has it) or without its
+    /// extension. A view without a file has no mask.
     ///
     /// # Errors
     /// When no view has a mask there.

@@ -1,7 +1,7 @@
-//! What changes with the iteration: learning rates, degree of the spherical harmonics, picture size, densification, and
-//! the order of the views. Iterations count from 1.
+//! What changes with the iteration: learning rates, degree of the spherical harmonics, picture size, and the order of the
+//! views. Iterations count from 1.
 
-use crate::optimiser::Rates;
+use super::optimiser::Rates;
 use rand::seq::SliceRandom;
 use rand_chacha::ChaCha8Rng;
 use rand_chacha::rand_core::SeedableRng;
@@ -10,7 +10,7 @@ use serde::Serialize;
 /// Learning rates as 3DGS has them. The rates of the centres are per unit of the scene's extent.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize)]
 pub struct LearningRates {
-    /// Of the centres, at the start.
+    /// Of the centres, at the start; 0 keeps them in place.
     pub position: f64,
     /// Of the centres, at the end; exponential between.
     pub position_end: f64,
@@ -26,54 +26,57 @@ pub struct LearningRates {
 
 impl Default for LearningRates {
     fn default() -> Self {
-        Self { position: 1.6e-4, position_end: 1.6e-6, feature: 0.0025, opacity: 0.05, scaling: 0.005, rotation: 0.001 }
+        Self {
+            position: 1.6e-4,
+            position_end: 1.6e-4 / 100.0,
+            feature: 0.0025,
+            opacity: 0.05,
+            scaling: 0.005,
+            rotation: 0.001,
+        }
     }
 }
 
-/// From this divisor of the picture size on, pulls say nothing about where Gaussians are missing.
-const TOO_COARSE: u32 = 4;
-
-/// When what happens.
+/// What changes when.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct Schedule {
     /// Length of the optimisation.
     pub iterations: u32,
     /// The degree of the spherical harmonics grows by one every so many iterations.
     pub sh_every: u32,
-    /// Densification begins after this iteration.
-    pub densify_from: u32,
-    /// Densification and opacity resets end before this iteration.
-    pub densify_until: u32,
-    /// Iterations between densifications.
-    pub densify_every: u32,
-    /// Iterations between opacity resets; 0 for none.
-    pub opacity_reset_every: u32,
     /// Picture sizes: (last iteration, divisor of the training size), in order; afterwards the full training size.
     pub coarse: Vec<(u32, u32)>,
 }
 
 impl Schedule {
-    /// The schedule of 3DGS at 30,000 iterations and more. Shorter runs begin to densify and grow the degree earlier, in
-    /// proportion, and densify for a larger share, because they have fewer rounds; opacity resets keep their period, for
-    /// a short run has no time to recover from one.
+    /// The schedule of 3DGS at 30,000 iterations and more, with full pictures. Shorter runs grow the degree earlier, in
+    /// proportion.
     pub fn for_iterations(iterations: u32) -> Self {
-        let share = |numerator: u32, denominator: u32| {
-            u32::try_from(u64::from(iterations) * u64::from(numerator) / u64::from(denominator)).unwrap_or(u32::MAX)
-        };
-        Self {
-            iterations,
-            sh_every: share(1, 10).clamp(1, 1000),
-            densify_from: share(1, 20).min(500),
-            densify_until: if iterations < 15_000 { share(7, 10).min(7500) } else { share(1, 2) },
-            densify_every: share(1, 30).clamp(50, 100),
-            opacity_reset_every: 3000,
-            coarse: Vec::new(),
-        }
+        Self { iterations, sh_every: (iterations / 10).clamp(1, 1000), coarse: Vec::new() }
     }
 
-    /// Learning rates at an iteration, for a scene of this extent (see [`crate::init::extent`]).
+    /// The same with small pictures at the start: a quarter of the size for a sixth of the iterations, half for as many.
+    #[must_use]
+    pub fn coarse_to_fine(self) -> Self {
+        let n = self.iterations;
+        Self { coarse: vec![((n / 6).min(500), 4), ((n / 3).min(1000), 2)], ..self }
+    }
+
+    /// The picture sizes in words; none where they are full throughout.
+    pub fn sizes(&self) -> Option<String> {
+        let sizes: Vec<String> =
+            self.coarse.iter().map(|(last, divisor)| format!("1/{divisor} until {last}")).collect();
+        (!sizes.is_empty()).then(|| format!("{}, then full", sizes.join(", ")))
+    }
+
+    /// Share of the run that is over at an iteration, 0 to 1.
+    pub fn share(&self, iteration: u32) -> f64 {
+        (f64::from(iteration) / f64::from(self.iterations.max(1))).clamp(0.0, 1.0)
+    }
+
+    /// Learning rates at an iteration, for a scene of this extent (see [`crate::start::extent`]).
     pub fn rates(&self, base: &LearningRates, iteration: u32, extent: f64) -> Rates {
-        let t = (f64::from(iteration) / f64::from(self.iterations.max(1))).clamp(0.0, 1.0);
+        let t = self.share(iteration);
         let position = if base.position > 0.0 && base.position_end > 0.0 {
             (base.position.ln() * (1.0 - t) + base.position_end.ln() * t).exp()
         } else {
@@ -98,26 +101,6 @@ impl Schedule {
     pub fn divisor(&self, iteration: u32) -> u32 {
         self.coarse.iter().find(|(last, _)| iteration <= *last).map_or(1, |&(_, divisor)| divisor)
     }
-
-    /// Whether views are to be counted for densification by pulls at this iteration: before its end, and not with small
-    /// pictures. These pull at what blurs them and hide what is missing: to wait cost nothing and gave up to 0.4 dB.
-    pub fn observes(&self, iteration: u32) -> bool {
-        iteration < self.densify_until && self.divisor(iteration) < TOO_COARSE
-    }
-
-    /// Whether to densify after this iteration.
-    pub fn densifies(&self, iteration: u32) -> bool {
-        iteration > self.densify_from
-            && iteration < self.densify_until
-            && iteration.is_multiple_of(self.densify_every.max(1))
-    }
-
-    /// Whether to reset the opacities after this iteration.
-    pub fn resets_opacity(&self, iteration: u32) -> bool {
-        self.opacity_reset_every > 0
-            && iteration < self.densify_until
-            && iteration.is_multiple_of(self.opacity_reset_every)
-    }
 }
 
 /// A generator for one purpose at one iteration: nothing of it need be kept to go on after an interruption.
@@ -134,7 +117,7 @@ pub enum Purpose {
     Start = 1,
     /// The order of the views.
     Order = 2,
-    /// Where the halves of a split Gaussian go, and which Gaussians are given company.
+    /// Where the halves of a split Gaussian go, and which Gaussians are copied.
     Split = 3,
     /// The colour behind the scene.
     Background = 4,
@@ -176,16 +159,6 @@ mod tests {
     #[test]
     fn the_full_schedule_is_that_of_3dgs() {
         let s = Schedule::for_iterations(30_000);
-        let wanted = Schedule {
-            iterations: 30_000,
-            sh_every: 1000,
-            densify_from: 500,
-            densify_until: 15_000,
-            densify_every: 100,
-            opacity_reset_every: 3000,
-            coarse: vec![],
-        };
-        assert_eq!(s, wanted);
         let base = LearningRates::default();
         let close = |a: f32, b: f64| (f64::from(a) / b - 1.0).abs() < 1e-3;
         assert!(close(s.rates(&base, 0, 2.0).means, 3.2e-4));
@@ -193,25 +166,14 @@ mod tests {
         assert!(close(s.rates(&base, 30_000, 1.0).means, 1.6e-6));
         assert!(close(s.rates(&base, 7, 1.0).sh_rest, 0.0025 / 20.0));
         assert_eq!([0, 999, 1000, 2000, 3000, 30_000].map(|i| s.sh_degree(i, 3)), [0, 0, 1, 2, 3, 3]);
-        assert!(!s.densifies(500) && s.densifies(600) && !s.densifies(650) && !s.densifies(15_000));
-        assert!(s.resets_opacity(12_000) && !s.resets_opacity(15_000));
-    }
-
-    #[test]
-    fn short_runs_densify_too() {
-        for iterations in [1, 60, 300, 1000, 3000, 7000] {
-            let s = Schedule::for_iterations(iterations);
-            let rounds = (1..=iterations).filter(|&i| s.densifies(i)).count();
-            assert!(rounds >= iterations.min(3000) as usize / 160, "{iterations}: {rounds}");
-            assert!(s.densify_until <= iterations && s.sh_every >= 1);
-        }
     }
 
     #[test]
     fn picture_sizes_follow_each_other() {
         let s = Schedule { coarse: vec![(10, 4), (20, 2)], ..Schedule::for_iterations(100) };
         assert_eq!([1, 10, 11, 20, 21, 100].map(|i| s.divisor(i)), [4, 4, 2, 2, 1, 1]);
-        assert_eq!([1, 10, 11, 69, 70].map(|i| s.observes(i)), [false, false, true, true, false]);
+        assert_eq!(Schedule::for_iterations(600).coarse_to_fine().coarse, [(100, 4), (200, 2)]);
+        assert_eq!(Schedule::for_iterations(30_000).coarse_to_fine().coarse, [(500, 4), (1000, 2)]);
     }
 
     #[test]

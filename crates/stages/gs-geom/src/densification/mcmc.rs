@@ -1,8 +1,11 @@
 //! Densification as sampling: dead Gaussians move onto opaque ones, the number grows by a share per round up to an exact
-//! budget, noise explores, and opacity and size have a price (3DGS-MCMC, Kheradmand et al. 2024).
+//! budget, noise explores, and opacity and size have a penalty (3DGS-MCMC, Kheradmand et al. 2024).
 
-use crate::densify::Report;
-use crate::optimiser::Adam;
+use super::rules::{Densify, Moment, Report};
+use super::screen::ScreenGradients;
+use crate::training::checkpoint::State;
+use crate::training::optimiser::Adam;
+use crate::training::schedule::{Purpose, generator};
 use glam::{Quat, Vec3};
 use gs_raster::Gradients;
 use gs_scene::Gaussians;
@@ -26,9 +29,9 @@ const LEAST_NOISE: f32 = 1e-6;
 /// Gaussians per piece of parallel work.
 const CHUNK: usize = 2048;
 
-/// Parameters of the sampling.
+/// Hyper-parameters of the sampling.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize)]
-pub struct McmcOptions {
+pub struct Mcmc {
     /// Size of the noise on the centres, times their learning rate.
     pub noise: f32,
     /// Weight of the mean opacity in the loss.
@@ -41,15 +44,32 @@ pub struct McmcOptions {
     pub dead_opacity: f32,
 }
 
-impl Default for McmcOptions {
+impl Default for Mcmc {
     fn default() -> Self {
         Self { noise: 5e5, opacity_weight: 0.01, scale_weight: 0.01, growth: 0.05, dead_opacity: 0.005 }
     }
 }
 
+impl Densify for Mcmc {
+    fn regularise(&self, gaussians: &Gaussians, gradients: &mut Gradients) {
+        regularise(gaussians, gradients, self);
+    }
+
+    fn explore(&self, gaussians: &mut Gaussians, rate: f32, at: Moment<'_>) {
+        explore(gaussians, self, rate, at.seed, at.iteration);
+    }
+
+    fn round(&self, state: &mut State, at: Moment<'_>) -> Option<Report> {
+        let mut rng = generator(at.seed, Purpose::Split, u64::from(at.iteration));
+        let report = round(&mut state.gaussians, &mut state.adam, self, at.growth.max_gaussians, &mut rng);
+        state.seen = ScreenGradients::new(state.gaussians.len());
+        Some(report)
+    }
+}
+
 /// One round: moves dead Gaussians onto others, then adds some, up to `most` in all. Both are drawn in proportion to
 /// opacity, and what they land on is thinned so that the picture stays nearly the same.
-pub fn round(g: &mut Gaussians, adam: &mut Adam, options: &McmcOptions, most: usize, rng: &mut ChaCha8Rng) -> Report {
+fn round(g: &mut Gaussians, adam: &mut Adam, options: &Mcmc, most: usize, rng: &mut ChaCha8Rng) -> Report {
     let n = g.len();
     let alive = |g: &Gaussians, i: usize| g.opacity(i) > options.dead_opacity;
     let dead: Vec<u32> = (0..n as u32).filter(|&i| !alive(g, i as usize)).collect();
@@ -128,12 +148,12 @@ fn thinned(opacity: f64, n: usize) -> (f64, f64) {
     (each.clamp(LEAST_OPACITY, MOST_OPACITY), opacity / sum)
 }
 
-/// Adds the gradients of the prices on opacity and scale, for the Gaussians marked in `drawn` or for all.
-pub fn regularise(g: &Gaussians, d: &mut Gradients, options: &McmcOptions, drawn: Option<&[bool]>) {
+/// Adds the gradients of the penalties on opacity and scale.
+fn regularise(g: &Gaussians, d: &mut Gradients, options: &Mcmc) {
     let n = g.len().max(1) as f32;
     let (opacity, scale) = (options.opacity_weight / n, options.scale_weight / (3.0 * n));
     let rows = d.opacity_logits.par_iter_mut().zip(&mut d.log_scales).with_min_len(CHUNK);
-    rows.enumerate().filter(|(i, _)| drawn.is_none_or(|drawn| drawn[*i])).for_each(|(i, (d_opacity, d_scales))| {
+    rows.enumerate().for_each(|(i, (d_opacity, d_scales))| {
         let o = g.opacity(i);
         *d_opacity += opacity * o * (1.0 - o);
         for (d, s) in d_scales.iter_mut().zip(g.log_scales[i]) {
@@ -144,7 +164,7 @@ pub fn regularise(g: &Gaussians, d: &mut Gradients, options: &McmcOptions, drawn
 
 /// Moves the centres by noise of the Gaussians' own shapes, all the more the fainter they are (3DGS-MCMC, equation 8).
 /// `rate` is the centres' learning rate. The noise of a Gaussian depends on seed, iteration and its index alone.
-pub fn explore(g: &mut Gaussians, options: &McmcOptions, rate: f32, seed: u64, iteration: u32) {
+fn explore(g: &mut Gaussians, options: &Mcmc, rate: f32, seed: u64, iteration: u32) {
     let key = mixed(seed ^ mixed(u64::from(iteration)));
     let (scales, rotations, opacities) = (&g.log_scales, &g.rotations, &g.opacity_logits);
     g.means.par_iter_mut().enumerate().with_min_len(CHUNK).for_each(|(i, mean)| {
@@ -189,8 +209,7 @@ fn mixed(mut z: u64) -> u64 {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::optimiser::zeros;
-    use crate::schedule::{Purpose, generator};
+    use crate::training::optimiser::zeros;
     use proptest::prelude::*;
 
     fn logit(o: f64) -> f32 {
@@ -236,7 +255,7 @@ mod tests {
         let mut g = row(&opacities);
         let mut adam = Adam::new(&g);
         adam.first.sh.fill(1.0);
-        let options = McmcOptions::default();
+        let options = Mcmc::default();
         let report = round(&mut g, &mut adam, &options, 103, &mut generator(1, Purpose::Split, 5));
         assert_eq!((report.relocated, report.cloned, g.len()), (40, 3, 103));
         assert!((0..g.len()).all(|i| g.opacity(i) >= 0.0049 && g.means[i][0] >= 40.0));
@@ -267,7 +286,7 @@ mod tests {
             g.opacity_logits[i] = logit(0.005);
         }
         g.opacity_logits[n] = 2.0;
-        let options = McmcOptions { noise: 10.0, ..McmcOptions::default() };
+        let options = Mcmc { noise: 10.0, ..Mcmc::default() };
         let start = g.clone();
         explore(&mut g, &options, 0.02, 3, 17);
         let spread = |axis: Vec3| {
@@ -291,23 +310,22 @@ mod tests {
     }
 
     #[test]
-    fn prices_have_the_gradients_of_means() {
+    fn penalties_have_the_gradients_of_means() {
         let mut g = row(&[0.2, 0.7]);
         g.log_scales[1] = [0.1, -0.4, 0.9];
-        let options = McmcOptions::default();
-        let price = |g: &Gaussians| {
+        let options = Mcmc::default();
+        let penalty = |g: &Gaussians| {
             let o: f64 = g.opacity_logits.iter().map(|&l| 1.0 / (1.0 + (-f64::from(l)).exp())).sum();
             let s: f64 = g.log_scales.iter().flatten().map(|&s| f64::from(s).exp()).sum();
             0.01 * o / 2.0 + 0.01 * s / 6.0
         };
         let mut d = Gradients { opacity_logits: vec![0.0; 2], log_scales: vec![[0.0; 3]; 2], ..Gradients::default() };
-        regularise(&g, &mut d, &options, Some(&[false, true]));
-        assert_eq!((d.opacity_logits[0], d.log_scales[0]), (0.0, [0.0; 3]));
+        regularise(&g, &mut d, &options);
         let slope = |change: &dyn Fn(&mut Gaussians, f32)| {
             let (mut a, mut b) = (g.clone(), g.clone());
             change(&mut a, -0.01);
             change(&mut b, 0.01);
-            (price(&b) - price(&a)) / 0.02
+            (penalty(&b) - penalty(&a)) / 0.02
         };
         assert!((f64::from(d.opacity_logits[1]) / slope(&|g, h| g.opacity_logits[1] += h) - 1.0).abs() < 1e-3);
         assert!((f64::from(d.log_scales[1][2]) / slope(&|g, h| g.log_scales[1][2] += h) - 1.0).abs() < 1e-3);
@@ -323,7 +341,7 @@ mod tests {
             let mut g = row(&opacities);
             let mut adam = Adam::new(&g);
             let n = g.len();
-            round(&mut g, &mut adam, &McmcOptions::default(), most, &mut generator(seed, Purpose::Split, 1));
+            round(&mut g, &mut adam, &Mcmc::default(), most, &mut generator(seed, Purpose::Split, 1));
             prop_assert_eq!(g.len(), ((n as f64 * 1.05).ceil() as usize).min(most).max(n));
             prop_assert!(g.opacity_logits.iter().chain(g.log_scales.as_flattened()).all(|v| v.is_finite()));
         }

@@ -1,36 +1,19 @@
 //! `gs-geom eval`.
 
-use super::{GeometryArgs, MaskArgs, SceneArgs, bytes, largest_file, most_pixels};
-use crate::memory;
+use crate::memory::{self, Pictures};
 use crate::metrics::{Means, ViewMetrics, measure};
+use crate::options::{Eval, bytes};
 use artifacts::role;
 use gs_io::{Error, Result, hash_file, write_bytes};
 use gs_scene::dataset::{Split, View};
 use serde_json::json;
 use stage::Stage;
 use std::collections::BTreeMap;
-use std::path::PathBuf;
 
-/// Arguments of `gs-geom eval`.
-#[derive(Debug, clap::Args)]
-pub(super) struct EvalArgs {
-    #[command(flatten)]
-    scene: SceneArgs,
-    #[command(flatten)]
-    masks: MaskArgs,
-    #[command(flatten)]
-    geometry: GeometryArgs,
-    /// Where to write the figures, as JSON
-    #[arg(long, value_name = "FILE")]
-    out: PathBuf,
-}
-
-impl EvalArgs {
-    pub(super) fn run(&self, stage: &Stage) -> Result<()> {
+impl Eval {
+    pub(crate) fn run(&self, stage: &Stage) -> Result<()> {
         let dataset = self.scene.load(stage)?;
-        let (width, size) = (dataset.views.iter().map(|v| u64::from(v.camera.width)).max(), largest_file(&dataset)?);
-        let geometry = bytes(&self.geometry.geometry)?;
-        let needed = memory::of_figures(geometry, most_pixels(&dataset), width.unwrap_or(0), size);
+        let needed = memory::of_figures(bytes(&self.geometry.geometry)?, &Pictures::of(&dataset)?);
         stage.forecast(needed, "give a smaller --geometry or --resolution")?;
         let (gaussians, options) = self.geometry.read(self.scene.background, stage)?;
         let (alpha, masks) = (self.masks.alpha(), self.masks.load(&dataset, stage)?);
@@ -39,7 +22,7 @@ impl EvalArgs {
         let mut split = Split::Test;
         let mut views: Vec<&View> = dataset.views_of(split).collect();
         if views.is_empty() {
-            stage.warn("no view is held out: measuring on the training views, which says little of other views");
+            stage.warn("no view is held out: measuring on the training views, which says little about other views");
             split = Split::Train;
             views = dataset.views_of(split).collect();
         }
@@ -68,13 +51,9 @@ impl EvalArgs {
         });
         let text = serde_json::to_vec_pretty(&metrics).map_err(|e| Error::new(e.to_string()).file(&self.out))?;
         write_bytes(&self.out, &text)?;
-        let parameters = json!({
-            "resolution": self.scene.resolution.to_string(),
-            "holdout": self.scene.holdout,
-            "background": self.scene.background.color(),
-            "alpha": alpha,
-            "antialias": options.antialias,
-        });
+        let mut parameters = serde_json::to_value(self).map_err(|e| Error::new(e.to_string()))?;
+        parameters["alpha"] = json!(alpha);
+        parameters["antialias"] = json!(options.antialias);
         let mut inputs = BTreeMap::from([
             (role::DATASET.to_string(), dataset.hash()?),
             (role::GEOMETRY.to_string(), hash_file(&self.geometry.geometry)?),

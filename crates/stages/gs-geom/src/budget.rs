@@ -1,0 +1,191 @@
+//! `gs-geom train --time-budget`: measures the speed, plans, and says the plan as options.
+
+pub mod plan;
+
+use crate::densification::Strategy;
+use crate::densification::adaptive::{Adaptive, densify};
+use crate::densification::rules::Growth;
+use crate::options::Train;
+use crate::photographs::Photographs;
+use crate::photographs::masks::Masks;
+use crate::run::forecast::{cache_bytes, forecast_start, most_gaussians};
+use crate::run::init;
+use crate::run::outputs::plan_path;
+use crate::start;
+use crate::training::schedule::{Purpose, Schedule, generator};
+use crate::training::{Recipe, Trainer, checkpoint};
+use gs_io::{Error, Result, Watched, write_bytes};
+use gs_scene::dataset::{Dataset, Resolution, Split, View};
+use gs_scene::{Camera, Gaussians};
+use plan::{Limits, Plan, Speed, plan};
+use serde::{Deserialize, Serialize};
+use serde_json::{Value, json};
+use stage::Stage;
+use std::time::Instant;
+
+/// Photographs that the speed is measured on, evenly spread.
+const VIEWS: usize = 6;
+/// Iterations with small pictures before the measurements: new Gaussians are fainter than those of most of a run.
+const WARM_UP: u32 = 30;
+/// Divisor of the picture size for the warm-up and one of the measurements.
+const SMALL: u32 = 4;
+/// Share of the time to plan with; the rest is for what the plan does not see.
+const SHARE: f64 = 0.92;
+/// Narrower pictures are not planned, pixels.
+const LEAST_WIDTH: f64 = 160.0;
+
+/// What is kept of a plan until its run is done: a run that goes on after an interruption does not plan anew.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+struct Kept {
+    /// The time that was given, seconds.
+    budget: f64,
+    /// As `--resolution` says it.
+    resolution: String,
+    plan: Plan,
+    /// What the plan rests on.
+    speed: Speed,
+}
+
+/// The options with a plan for `budget` seconds in place of the budget, and the plan for the record.
+pub(crate) fn plan_for(
+    options: &Train,
+    budget: f64,
+    dataset: &Dataset,
+    masks: &Masks,
+    stage: &Stage,
+) -> Result<(Train, Value)> {
+    let kept = match kept(options, budget) {
+        Some(kept) => kept,
+        None => measured(options, budget, dataset, masks, stage)?,
+    };
+    let Plan { iterations, gaussians, seconds, .. } = kept.plan;
+    let mut planned = options.clone();
+    planned.iterations = iterations;
+    planned.max_gaussians = Some(gaussians);
+    planned.scene.resolution = kept.resolution.parse()?;
+    let said = format!("--iterations {iterations} --max-gaussians {gaussians} --resolution {}", kept.resolution);
+    stage.info(&format!("planned for {budget} s, to take {seconds:.0} s; the same without a budget:"));
+    let typed = std::env::args_os().map(|a| a.to_string_lossy().into_owned()).collect();
+    stage.info(&command(typed, &said));
+    let text = serde_json::to_vec_pretty(&kept).map_err(|e| Error::new(e.to_string()))?;
+    write_bytes(plan_path(&options.out), &text)?;
+    Ok((planned, json!({"options": said, "made": kept})))
+}
+
+/// The plan of an unfinished run with this budget.
+fn kept(options: &Train, budget: f64) -> Option<Kept> {
+    if !checkpoint::path_of(&options.out).exists() {
+        return None;
+    }
+    let kept: Kept = serde_json::from_slice(&std::fs::read(plan_path(&options.out)).ok()?).ok()?;
+    let plausible = kept.plan.iterations > 0 && kept.plan.gaussians > 0;
+    (plausible && kept.budget == budget && kept.resolution.parse::<Resolution>().is_ok()).then_some(kept)
+}
+
+/// Measures the speed and plans.
+fn measured(options: &Train, budget: f64, dataset: &Dataset, masks: &Masks, stage: &Stage) -> Result<Kept> {
+    let begun = Instant::now();
+    let most = most_gaussians(options, dataset);
+    let recipe = options.recipe(most, stage.seed());
+    let train: Vec<&View> = dataset.views_of(Split::Train).collect();
+    let cameras: Vec<&Camera> = train.iter().map(|v| &v.camera).collect();
+    let Some(width) = cameras.iter().map(|c| c.width).max() else {
+        return Err(Error::new("every view is held out").file(&options.scene.scene).hint("give --holdout 0"));
+    };
+    let extent = start::extent(&cameras, &dataset.points.positions);
+    forecast_start(options, dataset, masks, &recipe.growth, stage)?;
+    let gaussians = init::gaussians(options, dataset, &cameras, extent, stage)?;
+    let some = train.len().min(VIEWS);
+    let views: Vec<&View> = (0..some).map(|i| train[i * train.len() / some]).collect();
+    let watched = Watched::default();
+    let photographs = Photographs::load(views, masks.clone(), cache_bytes(options), &watched)?;
+    let count = gaussians.len();
+    let speed = probe(recipe, extent, photographs, gaussians)?;
+
+    let limits = Limits {
+        seconds: (SHARE * budget - begun.elapsed().as_secs_f64()).max(0.0),
+        iterations: options.iterations,
+        start: count,
+        gaussians: if options.densify == Strategy::Fixed { count } else { most.max(count) },
+        divisor: (f64::from(width) / LEAST_WIDTH).max(1.0),
+        heldout: dataset.views_of(Split::Test).count(),
+    };
+    let plan = plan(&speed, &limits, |iterations| {
+        let recipe = Train { iterations, ..options.clone() }.recipe(most, stage.seed());
+        (recipe.schedule, recipe.growth)
+    });
+    let resolution = match plan.divisor > 1.0 {
+        true => Resolution::Width((f64::from(width) / plan.divisor).round().max(1.0) as u32),
+        false => options.scene.resolution,
+    };
+    if plan.seconds > limits.seconds {
+        stage.warn(&format!("{budget} s are too few for this scene"));
+    }
+    Ok(Kept { budget, resolution: resolution.to_string(), plan, speed })
+}
+
+/// Times iterations on a copy of the start: after a warm-up with small pictures, with full ones, and with twice the
+/// Gaussians.
+fn probe(recipe: Recipe, extent: f64, photographs: Photographs<'_>, start: Gaussians) -> Result<Speed> {
+    let count = start.len();
+    let views = photographs.len() as u32;
+    let warm = WARM_UP.max(views);
+    // Iterations after the last are not run; the rates and the degree of the harmonics are those of a run's middle.
+    let schedule =
+        Schedule { iterations: warm + 3 * views, sh_every: (warm / 4).max(1), coarse: vec![(warm + views, SMALL)] };
+    let growth = Growth { until: 0, ..recipe.growth };
+    let exposures = if recipe.exposure { photographs.len() } else { 0 };
+    let state = checkpoint::start(start, exposures);
+    let recipe = Recipe { schedule, growth, ..recipe };
+    let mut trainer = Trainer::new(recipe, extent, photographs, Photographs::none(), state);
+    let time = |trainer: &mut Trainer<'_>, iterations: u32| -> Result<f64> {
+        let begun = Instant::now();
+        (0..iterations).try_for_each(|_| trainer.step())?;
+        Ok(begun.elapsed().as_secs_f64() / f64::from(iterations))
+    };
+    time(&mut trainer, warm)?;
+    let small = time(&mut trainer, views)?;
+    let full = time(&mut trainer, views)?;
+    trainer.change(|state| {
+        let all = Adaptive { gradient: 0.0, clone_scale: 0.0, max_scale: None, ..Adaptive::default() };
+        let mut rng = generator(0, Purpose::Split, 0);
+        densify(&mut state.gaussians, &mut state.adam, &mut state.seen, &all, usize::MAX, extent as f32, &mut rng);
+    });
+    let doubled = time(&mut trainer, views)?;
+    Ok(Speed::fit(count, full, (1.0 / f64::from(SMALL * SMALL), small), doubled))
+}
+
+/// The command line with `options` in place of the budget and of what they say.
+fn command(arguments: Vec<String>, options: &str) -> String {
+    let replaced = ["--time-budget", "--iterations", "--max-gaussians", "--resolution"];
+    let mut out: Vec<String> = Vec::new();
+    let mut skip = false;
+    for argument in arguments {
+        let name = argument.split('=').next().unwrap_or_default();
+        if std::mem::take(&mut skip) {
+            continue;
+        }
+        if replaced.contains(&name) {
+            skip = !argument.contains('=');
+        } else if argument.chars().all(|c| c.is_ascii_alphanumeric() || "-_./=:,+".contains(c)) && !argument.is_empty()
+        {
+            out.push(argument);
+        } else {
+            out.push(format!("'{}'", argument.replace('\'', r"'\''")));
+        }
+    }
+    out.push(options.into());
+    out.join(" ")
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_command_line_says_the_plan() {
+        let typed = "gs-geom train --scene a/b --time-budget 10m --iterations=5 --out".split(' ').map(String::from);
+        let typed: Vec<String> = typed.chain(["it's here".into()]).collect();
+        assert_eq!(command(typed, "--iterations 7"), r"gs-geom train --scene a/b --out 'it'\''s here' --iterations 7");
+    }
+}

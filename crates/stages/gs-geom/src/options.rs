@@ -1,0 +1,417 @@
+//! The options of every command: one struct each, with defaults and ranges. What shapes the result is serialised whole into
+//! the provenance; paths, and options that change no byte, are not.
+
+use crate::bounds::Bounds;
+use crate::convert::choice::Order;
+use crate::densification::Strategy;
+use crate::photographs::masks::{Alpha, Masks};
+use clap::builder::RangedU64ValueParser;
+use clap::{Parser, Subcommand, ValueEnum};
+use gs_io::{Error, IoContext, Result};
+use gs_raster::RasterOptions;
+use gs_scene::dataset::{self, Dataset, LoadOptions, Resolution};
+use gs_scene::{Gaussians, Geometry};
+use serde::{Serialize, Serializer};
+use stage::{Bytes, CommonArgs, Stage, positive, within};
+use std::fmt::Display;
+use std::path::{Path, PathBuf};
+use std::str::FromStr;
+
+/// Train 3D Gaussians on posed photographs, render them, measure them
+#[derive(Debug, Parser)]
+#[command(name = "gs-geom", version)]
+pub struct Args {
+    #[command(subcommand)]
+    pub(crate) command: Command,
+    #[command(flatten)]
+    pub(crate) common: CommonArgs,
+}
+
+#[derive(Debug, Subcommand)]
+pub(crate) enum Command {
+    /// Train Gaussians until they look like the photographs
+    Train(Box<Train>),
+    /// Render views of a dataset as PNG
+    Render(Render),
+    /// PSNR and SSIM on held-out views
+    Eval(Eval),
+    /// Describe a file of Gaussians (counts, bounds, histograms, faults), or list the files of a dataset
+    Inspect(Inspect),
+    /// Drop, crop, trim and re-order the Gaussians of a file
+    Convert(Convert),
+}
+
+/// Which photographs, and at which size.
+#[derive(Debug, Clone, clap::Args, Serialize)]
+pub(crate) struct SceneOptions {
+    /// Dataset folder (COLMAP, transforms.json or ScanNet)
+    #[arg(long, value_name = "DIR")]
+    #[serde(skip)]
+    pub scene: PathBuf,
+    /// Size of the photographs: a divisor, a width in pixels that wider ones are shrunk to such as 640px, or auto for 1600px
+    #[arg(long, value_name = "auto|WIDTHpx|DIVISOR", default_value = "auto")]
+    #[serde(serialize_with = "as_text")]
+    pub resolution: Resolution,
+    /// Hold out every n-th view, from the first; 0 holds none out
+    #[arg(long, value_name = "N", default_value_t = 8)]
+    pub holdout: usize,
+    /// Colour behind the scene, and behind transparent pixels of the photographs
+    #[arg(long, value_enum, default_value_t = Background::Black)]
+    pub background: Background,
+}
+
+/// Which pixels of the photographs count.
+#[derive(Debug, Clone, clap::Args, Serialize)]
+pub(crate) struct MaskOptions {
+    /// What transparent pixels of the photographs (alpha below 1) mean [background; with --masks ignore]
+    #[arg(long, value_enum)]
+    pub alpha: Option<Alpha>,
+    /// Folder of masks with the names of the photographs. Black pixels are transparent
+    #[arg(long, value_name = "DIR")]
+    #[serde(skip)]
+    pub masks: Option<PathBuf>,
+}
+
+/// Gaussians to draw.
+#[derive(Debug, Clone, clap::Args)]
+pub(crate) struct GeometryOptions {
+    /// Gaussians, as a 3DGS PLY
+    #[arg(long, value_name = "FILE")]
+    pub geometry: PathBuf,
+}
+
+/// Options of `gs-geom train`.
+#[derive(Debug, Clone, clap::Args, Serialize)]
+pub(crate) struct Train {
+    #[command(flatten)]
+    #[serde(flatten)]
+    pub scene: SceneOptions,
+    #[command(flatten)]
+    #[serde(flatten)]
+    pub masks: MaskOptions,
+    /// Where to write the Gaussians, as a 3DGS PLY; checkpoint, training curve and record of the run lie beside it
+    #[arg(long, value_name = "FILE")]
+    #[serde(skip)]
+    pub out: PathBuf,
+    /// Iterations, one view each; with --time-budget at most so many
+    #[arg(long, value_name = "COUNT", default_value_t = 30_000, value_parser = clap::value_parser!(u32).range(1..=100_000_000))]
+    pub iterations: u32,
+    /// Plan iterations, picture size and --max-gaussians so that the run ends within this time, such as 90s, 10m or 1h. The
+    /// plan depends on the machine's speed. It is printed as options that give the same bytes on any machine
+    #[arg(long, value_name = "TIME", value_parser = seconds)]
+    #[serde(skip)]
+    pub time_budget: Option<f64>,
+    /// Degree of the spherical harmonics, 0 to 3
+    #[arg(long, value_name = "DEGREE", default_value_t = 3, value_parser = clap::value_parser!(u8).range(0..=3))]
+    pub sh_degree: u8,
+    /// What to start from: the dataset's points (random points where it has none), random points in front of the cameras, or
+    /// a PLY of Gaussians or of points
+    #[arg(long, value_name = "points|random|FILE.ply", default_value = "points")]
+    pub init: Init,
+    /// Number of random points to start from, 1 to 1e9
+    #[arg(long, value_name = "COUNT", default_value_t = 20_000, value_parser = RangedU64ValueParser::<usize>::new().range(1..=MOST_GAUSSIANS))]
+    pub init_points: usize,
+    /// Keep Gaussians that are too faint to be seen in any view
+    #[arg(long)]
+    pub no_skip: bool,
+    /// How the number of Gaussians changes
+    #[arg(long, value_enum, default_value_t = Strategy::default())]
+    pub densify: Strategy,
+    /// Most Gaussians there may be, 1 to 1e9; with --densify mcmc their number at the end, if the iterations suffice [one for
+    /// 100 pixels of the training photographs, but at least 10,000 and twice the number at the start]
+    #[arg(long, value_name = "COUNT", value_parser = RangedU64ValueParser::<usize>::new().range(1..=MOST_GAUSSIANS))]
+    pub max_gaussians: Option<usize>,
+    /// Gradient of the projected centre above which a Gaussian is cloned or split, per half picture size [0.0002]
+    #[arg(long, value_name = "GRADIENT", value_parser = positive::<f32>)]
+    pub densify_gradient: Option<f32>,
+    /// Iterations between densifications [a thirtieth of --iterations, 50 to 100]
+    #[arg(long, value_name = "COUNT", value_parser = clap::value_parser!(u32).range(1..))]
+    pub densify_every: Option<u32>,
+    /// Keep the light of Gaussians smaller than a pixel (the 2D filter of Mip-Splatting), so that renders at other sizes
+    /// than the photographs' are neither thick nor dark. The PLY says so, and all commands render it so
+    #[arg(long)]
+    pub antialias: bool,
+    /// Train an affine map of colours for each training photograph, for cameras with automatic exposure or white balance.
+    /// Held-out views are rendered at the photographs' mean
+    #[arg(long)]
+    pub exposure: bool,
+    /// Picture sizes in the course of the run
+    #[arg(long, value_enum, default_value_t = PictureSizes::Coarse)]
+    pub schedule: PictureSizes,
+    /// Memory for decoded photographs, such as 512M or 2G; the others are decoded each time. 0 keeps none
+    #[arg(long, value_name = "BYTES", default_value_t = Bytes(2 << 30))]
+    #[serde(skip)]
+    pub image_cache: Bytes,
+    /// Write a checkpoint every so many iterations (500) or seconds (60s). The same command goes on from a checkpoint
+    #[arg(long, value_name = "COUNT|SECONDS", default_value = "60s")]
+    #[serde(skip)]
+    pub checkpoint_every: Every,
+}
+
+/// More Gaussians fit into no machine.
+const MOST_GAUSSIANS: u64 = 1_000_000_000;
+
+/// Options of `gs-geom render`.
+#[derive(Debug, clap::Args)]
+pub(crate) struct Render {
+    #[command(flatten)]
+    pub scene: SceneOptions,
+    #[command(flatten)]
+    pub geometry: GeometryOptions,
+    /// Folder for the pictures, named after the photographs
+    #[arg(long, value_name = "DIR")]
+    pub out: PathBuf,
+    /// test (held-out), train, all, or names of photographs separated by commas
+    #[arg(long, value_name = "VIEWS", default_value = "test")]
+    pub views: String,
+}
+
+/// Options of `gs-geom eval`.
+#[derive(Debug, clap::Args, Serialize)]
+pub(crate) struct Eval {
+    #[command(flatten)]
+    #[serde(flatten)]
+    pub scene: SceneOptions,
+    #[command(flatten)]
+    #[serde(flatten)]
+    pub masks: MaskOptions,
+    #[command(flatten)]
+    #[serde(skip)]
+    pub geometry: GeometryOptions,
+    /// Where to write the figures, as JSON
+    #[arg(long, value_name = "FILE")]
+    #[serde(skip)]
+    pub out: PathBuf,
+}
+
+/// Options of `gs-geom inspect`.
+#[derive(Debug, clap::Args)]
+pub(crate) struct Inspect {
+    /// Gaussians, as a 3DGS PLY of any property order and encoding; or the folder of a dataset, of which all files are
+    /// listed, each with its bytes and the time of its last change in seconds since 1970
+    #[arg(value_name = "FILE|FOLDER")]
+    pub file: PathBuf,
+}
+
+/// Options of `gs-geom convert`.
+#[derive(Debug, clap::Args, Serialize)]
+pub(crate) struct Convert {
+    /// Gaussians, as a 3DGS PLY of any property order and encoding
+    #[arg(value_name = "IN")]
+    #[serde(skip)]
+    pub input: PathBuf,
+    /// Where to write them: little-endian floats in the property order of the original 3DGS code, 62 properties at SH
+    /// degree 3; another file than IN
+    #[arg(value_name = "OUT")]
+    #[serde(skip)]
+    pub output: PathBuf,
+    /// Degree of the spherical harmonics, 0 to 3: higher bands are dropped, missing ones zero [as in IN]
+    #[arg(long, value_name = "DEGREE", value_parser = clap::value_parser!(u8).range(0..=3))]
+    pub sh_degree: Option<u8>,
+    /// Drop Gaussians fainter than this, 0 to 1
+    #[arg(long, value_name = "OPACITY", default_value_t = 0.0, value_parser = within(0.0f32..=1.0))]
+    pub min_opacity: f32,
+    /// Drop Gaussians whose centre lies outside this box, world units
+    #[arg(long, value_name = "X0,Y0,Z0,X1,Y1,Z1", allow_hyphen_values = true)]
+    pub crop: Option<Bounds>,
+    /// Order of the Gaussians
+    #[arg(long, value_enum, default_value_t = Order::None)]
+    pub order: Order,
+}
+
+#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum, Serialize)]
+#[serde(rename_all = "kebab-case")]
+pub(crate) enum Background {
+    Black,
+    White,
+    /// Training only: another colour in every iteration; renders are over black
+    Random,
+}
+
+impl Background {
+    pub fn color(self) -> [f32; 3] {
+        match self {
+            Self::Black | Self::Random => [0.0; 3],
+            Self::White => [1.0; 3],
+        }
+    }
+}
+
+/// Picture sizes in the course of a run.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum, Serialize)]
+#[serde(rename_all = "kebab-case")]
+pub(crate) enum PictureSizes {
+    /// A quarter for a sixth of the iterations, at most 500; half up to a third, at most 1,000; then full
+    Coarse,
+    /// Full from the start
+    Full,
+}
+
+/// What to start from.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize)]
+#[serde(rename_all = "kebab-case")]
+pub(crate) enum Init {
+    Points,
+    Random,
+    /// Its content is among the hashes of the inputs.
+    File(#[serde(skip)] PathBuf),
+}
+
+impl Init {
+    pub fn file(&self) -> Option<&Path> {
+        match self {
+            Self::File(path) => Some(path),
+            Self::Points | Self::Random => None,
+        }
+    }
+}
+
+impl FromStr for Init {
+    type Err = std::convert::Infallible;
+
+    fn from_str(s: &str) -> std::result::Result<Self, Self::Err> {
+        Ok(match s {
+            "points" => Self::Points,
+            "random" => Self::Random,
+            file => Self::File(file.into()),
+        })
+    }
+}
+
+/// How often to write a checkpoint.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(crate) enum Every {
+    Iterations(u32),
+    Seconds(f64),
+}
+
+impl FromStr for Every {
+    type Err = Error;
+
+    fn from_str(s: &str) -> Result<Self> {
+        let wrong = || Error::new("not a period").found(s).expected("iterations such as 500, or seconds such as 60s");
+        match s.strip_suffix('s') {
+            Some(t) => t.parse().ok().filter(|t: &f64| *t >= 0.0).map(Self::Seconds).ok_or_else(wrong),
+            None => s.parse().ok().filter(|n: &u32| *n > 0).map(Self::Iterations).ok_or_else(wrong),
+        }
+    }
+}
+
+/// Reads `90`, `90s`, `10m` or `1.5h` as seconds.
+fn seconds(text: &str) -> Result<f64> {
+    let units = [("s", 1.0), ("m", 60.0), ("h", 3600.0)];
+    let (number, unit) =
+        units.iter().find_map(|(suffix, unit)| Some((text.strip_suffix(suffix)?, *unit))).unwrap_or((text, 1.0));
+    let seconds = number.parse::<f64>().ok().map(|n| n * unit).filter(|s| *s > 0.0 && s.is_finite());
+    seconds.ok_or_else(|| Error::new("not a time").found(text).expected("a time such as 90s, 10m or 1.5h"))
+}
+
+fn as_text<S: Serializer>(value: &impl Display, serializer: S) -> std::result::Result<S::Ok, S::Error> {
+    serializer.collect_str(value)
+}
+
+/// Warnings of a dataset that are printed one by one.
+const WARNINGS_PRINTED: usize = 5;
+
+impl SceneOptions {
+    /// The dataset, without its warnings.
+    pub fn load_quietly(&self) -> Result<Dataset> {
+        dataset::load(&self.scene, &LoadOptions { resolution: self.resolution, holdout: self.holdout })
+    }
+
+    /// The dataset.
+    pub fn load(&self, stage: &Stage) -> Result<Dataset> {
+        let dataset = self.load_quietly()?;
+        for warning in dataset.warnings.iter().take(WARNINGS_PRINTED) {
+            stage.warn(warning);
+        }
+        if dataset.warnings.len() > WARNINGS_PRINTED {
+            stage.warn(&format!("{} more warnings about the dataset", dataset.warnings.len() - WARNINGS_PRINTED));
+        }
+        Ok(dataset)
+    }
+}
+
+impl MaskOptions {
+    /// What transparent pixels mean.
+    pub fn alpha(&self) -> Alpha {
+        let default = if self.masks.is_some() { Alpha::Ignore } else { Alpha::default() };
+        self.alpha.unwrap_or(default)
+    }
+
+    /// The masks of a dataset's views.
+    pub fn load(&self, dataset: &Dataset, stage: &Stage) -> Result<Masks> {
+        let Some(folder) = &self.masks else { return Ok(Masks::default()) };
+        let masks = Masks::find(folder, &dataset.views)?;
+        let views = dataset.views.len();
+        if masks.len() < views {
+            stage.warn(&format!("{} of {views} photographs have no mask: all their pixels count", views - masks.len()));
+        }
+        Ok(masks)
+    }
+}
+
+impl GeometryOptions {
+    /// The Gaussians, and how they are drawn over `background`. Bands of spherical harmonics that are zero in every
+    /// Gaussian are not evaluated: the pictures are the same.
+    pub fn read(&self, background: Background, stage: &Stage) -> Result<(Gaussians, RasterOptions)> {
+        let geometry = Geometry::read(&self.geometry)?;
+        if let Some(damage) = geometry.damage() {
+            stage.skipped(&damage);
+        }
+        let options = RasterOptions { background: background.color(), ..RasterOptions::of(&geometry) };
+        let gaussians = geometry.gaussians;
+        check_some(&gaussians, &self.geometry)?;
+        let (used, degree) = (options.sh_degree, gaussians.sh_degree);
+        if used < degree {
+            stage.skipped(&format!("spherical harmonics of degrees {} to {degree}: zero in every Gaussian", used + 1));
+        }
+        Ok((gaussians, options))
+    }
+}
+
+/// Refuses an empty file of Gaussians.
+pub(crate) fn check_some(gaussians: &Gaussians, path: &Path) -> Result<()> {
+    if gaussians.is_empty() {
+        return Err(Error::new("no Gaussians").file(path).field("element vertex").hint("train the geometry again"));
+    }
+    Ok(())
+}
+
+/// Bytes of a file.
+pub(crate) fn bytes(path: &Path) -> Result<u64> {
+    Ok(std::fs::metadata(path).at("read", path)?.len())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn periods_and_times_are_read() {
+        assert_eq!("40".parse::<Every>().unwrap(), Every::Iterations(40));
+        assert_eq!("2.5s".parse::<Every>().unwrap(), Every::Seconds(2.5));
+        for wrong in ["0", "-1", "s", "x", "-3s", ""] {
+            assert!(wrong.parse::<Every>().is_err(), "{wrong}");
+        }
+        for (text, wanted) in [("90", 90.0), ("90s", 90.0), ("10m", 600.0), ("1.5h", 5400.0)] {
+            assert_eq!(seconds(text).unwrap(), wanted);
+        }
+        for wrong in ["", "m", "-1s", "0", "1d", "infs"] {
+            assert!(seconds(wrong).is_err(), "{wrong}");
+        }
+    }
+
+    /// A path in the provenance would make the bytes of a result depend on the machine.
+    #[test]
+    fn the_provenance_has_every_choice_and_no_path() {
+        let typed =
+            ["gs-geom", "train", "--scene", "/s", "--out", "/o", "--masks", "/m", "--init", "/i.ply", "--holdout=3"];
+        let Command::Train(train) = Args::parse_from(typed).command else { panic!("train") };
+        let text = serde_json::to_string(&train).unwrap();
+        assert!(
+            !text.contains('/') && text.contains("\"holdout\":3") && text.contains("\"resolution\":\"auto\""),
+            "{text}"
+        );
+    }
+}

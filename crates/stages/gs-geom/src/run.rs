@@ -1,0 +1,158 @@
+//! What the commands do. [`train`] is the stage's own story; what it needs at each step is in a file beside this one.
+
+mod finish;
+pub(crate) mod forecast;
+pub(crate) mod init;
+mod iterate;
+pub(crate) mod outputs;
+
+use crate::budget;
+use crate::densification::Way;
+use crate::options::{Args, Background, Command, PictureSizes, Train};
+use crate::photographs::masks::Masks;
+use crate::photographs::{Photographs, full_share};
+use crate::training::{Recipe, Trainer, checkpoint};
+use artifacts::role;
+use forecast::{cache_bytes, forecast_start, most_gaussians};
+use gs_io::{Claim, Error, Provenance, Result, hash_file};
+use gs_scene::Camera;
+use gs_scene::dataset::{Dataset, Split, View};
+use serde_json::Value;
+use stage::{CommonArgs, Program, Stage};
+use std::collections::BTreeMap;
+
+impl Program for Args {
+    const NAME: &'static str = "gs-geom";
+
+    fn common(&self) -> &CommonArgs {
+        &self.common
+    }
+
+    fn run(self, stage: &Stage) -> Result<()> {
+        match self.command {
+            Command::Train(options) => train(&options, stage),
+            Command::Render(options) => options.run(stage),
+            Command::Eval(options) => options.run(stage),
+            Command::Inspect(options) => options.run(self.common.json, stage),
+            Command::Convert(options) => options.run(stage),
+        }
+    }
+}
+
+/// `gs-geom train`, with a plan where there is a budget of time.
+fn train(options: &Train, stage: &Stage) -> Result<()> {
+    // From here on a signal ends the run with a checkpoint.
+    stage.interrupted();
+    let dataset = options.scene.load(stage)?;
+    let masks = options.masks.load(&dataset, stage)?;
+    let mut claim = outputs::claim(options, &dataset, &masks, stage)?;
+    match options.time_budget {
+        Some(seconds) => {
+            let (planned, plan) = budget::plan_for(options, seconds, &dataset, &masks, stage)?;
+            let dataset = planned.scene.load_quietly()?;
+            learn(&planned, plan, &dataset, masks, &mut claim, stage)
+        }
+        None => learn(options, Value::Null, &dataset, masks, &mut claim, stage),
+    }
+}
+
+/// The run itself; `plan` is how its options came about, for the record.
+fn learn(
+    options: &Train,
+    plan: Value,
+    dataset: &Dataset,
+    masks: Masks,
+    claim: &mut Claim,
+    stage: &Stage,
+) -> Result<()> {
+    let (train, heldout) = split(options, dataset)?;
+    let recipe = options.recipe(most_gaussians(options, dataset), stage.seed());
+    let watched = outputs::watched(options, dataset, &masks);
+    let forecast = forecast_start(options, dataset, &masks, &recipe.growth, stage)?;
+    let photographs = Photographs::load(train.clone(), masks.clone(), cache_bytes(options), &watched)?;
+    let run = provenance(options, &recipe, dataset, &masks, stage)?;
+
+    let cameras: Vec<&Camera> = train.iter().map(|v| &v.camera).collect();
+    let extent = crate::start::extent(&cameras, &dataset.points.positions);
+    let state = match iterate::saved(options, &run, stage) {
+        Some(state) => state,
+        None => {
+            let exposures = if options.exposure { train.len() } else { 0 };
+            checkpoint::start(init::gaussians(options, dataset, &cameras, extent, stage)?, exposures)
+        }
+    };
+    outputs::check_finite(options, &state.gaussians, state.progress.iteration)?;
+    let (width, height, n) = (cameras[0].width, cameras[0].height, state.gaussians.len());
+    let counts = format!("{} training views and {} held out", train.len(), heldout.len());
+    stage.info(&format!("{counts}, {width}x{height} pixels; {n} Gaussians; extent {extent:.3}"));
+    if let Some(sizes) = recipe.schedule.sizes() {
+        stage.info(&format!("picture sizes: {sizes}"));
+    }
+    let forecast = forecast::forecast(options, forecast, dataset, &state.gaussians, stage)?;
+    // The training views' smaller pictures are not there yet.
+    let left = full_share(cache_bytes(options)).saturating_sub(photographs.kept_bytes());
+    let heldout = Photographs::load(heldout, masks, left, &watched)?;
+    let mut trainer = Trainer::new(recipe, extent, photographs, heldout, state);
+    let before = stage::cpu_seconds();
+    let done = iterate::iterate(options, &mut trainer, &run, &watched, stage).and_then(|()| {
+        watched.check()?;
+        let made = finish::Made { run: &run, forecast: &forecast, plan, cpu_seconds: finish::spent_since(before) };
+        finish::finish(options, &mut trainer, made, claim, stage)
+    });
+    done.inspect_err(|_| iterate::rescue(options, &trainer, &run, stage))
+}
+
+/// The views to learn from, and those held out.
+fn split<'a>(options: &Train, dataset: &'a Dataset) -> Result<(Vec<&'a View>, Vec<&'a View>)> {
+    let of = |split: Split| dataset.views_of(split).collect::<Vec<&View>>();
+    let (train, heldout) = (of(Split::Train), of(Split::Test));
+    if train.is_empty() {
+        return Err(Error::new("every view is held out")
+            .file(&options.scene.scene)
+            .found(format!("{} views", dataset.views.len()))
+            .expected("at least one view to learn from")
+            .hint("give --holdout 0, or more photographs"));
+    }
+    Ok((train, heldout))
+}
+
+impl Train {
+    /// What the options say, for at most so many Gaussians.
+    pub(crate) fn recipe(&self, max_gaussians: usize, seed: u64) -> Recipe {
+        let mut recipe = Recipe::new(self.densify, self.iterations);
+        if self.schedule == PictureSizes::Coarse {
+            recipe.schedule = recipe.schedule.coarse_to_fine();
+        }
+        if let (Some(gradient), Some(Way::Adaptive(way))) = (self.densify_gradient, &mut recipe.densification) {
+            way.gradient = gradient;
+        }
+        recipe.growth.every = self.densify_every.unwrap_or(recipe.growth.every);
+        recipe.growth.max_gaussians = max_gaussians;
+        Recipe {
+            seed,
+            background: self.scene.background.color(),
+            random_background: self.scene.background == Background::Random,
+            alpha: self.masks.alpha(),
+            antialias: self.antialias,
+            exposure: self.exposure,
+            ..recipe
+        }
+    }
+}
+
+/// What the result is made from: all options, what they amount to, and the hashes of the inputs.
+fn provenance(options: &Train, recipe: &Recipe, dataset: &Dataset, masks: &Masks, stage: &Stage) -> Result<Provenance> {
+    let as_json = |value: serde_json::Result<Value>| value.map_err(|e| Error::new(e.to_string()));
+    let mut parameters = as_json(serde_json::to_value(options))?;
+    if let (Value::Object(all), Value::Object(resolved)) = (&mut parameters, as_json(serde_json::to_value(recipe))?) {
+        all.extend(resolved);
+    }
+    let mut inputs = BTreeMap::from([(role::DATASET.to_string(), dataset.hash()?)]);
+    if let Some(init) = options.init.file() {
+        inputs.insert("init".into(), hash_file(init)?);
+    }
+    if let Some(hash) = masks.hash()? {
+        inputs.insert("photograph_masks".into(), hash);
+    }
+    Ok(stage.provenance(checkpoint::FORMAT, checkpoint::VERSION, parameters, inputs))
+}

@@ -1,0 +1,158 @@
+//! What a finished run leaves: Gaussians, curve, exposures and its record.
+
+use super::outputs::{CURVE, EXPOSURES, PARTIAL, PLOT, check_finite, plan_path, remove_if_there};
+use crate::densification::{Strategy, drawable};
+use crate::memory::Forecast;
+use crate::metrics::Means;
+use crate::options::Train;
+use crate::training::checkpoint::{self, ProgressState, State};
+use crate::training::{Timings, Trainer, curve};
+use gs_io::{Claim, Error, Provenance, Result, with_suffix, write_bytes};
+use gs_scene::{Gaussians, ply};
+use serde_json::{Value, json};
+use stage::Stage;
+use std::collections::BTreeMap;
+use std::time::Duration;
+
+/// How a result was made, for its record.
+pub(super) struct Made<'a> {
+    pub run: &'a Provenance,
+    pub forecast: &'a Forecast,
+    /// How the options came about.
+    pub plan: Value,
+    /// Processor time of the iterations.
+    pub cpu_seconds: Option<f64>,
+}
+
+/// Writes everything a finished run leaves.
+pub(super) fn finish(
+    options: &Train,
+    trainer: &mut Trainer<'_>,
+    made: Made<'_>,
+    claim: &mut Claim,
+    stage: &Stage,
+) -> Result<()> {
+    check_finite(options, &trainer.state().gaussians, trainer.state().progress.iteration)?;
+    let Means { psnr, ssim, uncounted } = trainer.heldout()?;
+    uncounted.iter().for_each(|why| stage.skipped(why));
+    let State { gaussians, progress, .. } = trainer.state();
+    let rows = rows(options, gaussians, stage);
+    report(progress, stage);
+    let (parameters, inputs) = (&made.run.parameters, &made.run.inputs);
+    write_beside(options, trainer)?;
+    ply::write_some_gaussians(&options.out, gaussians, &rows, &comments(parameters, inputs))?;
+    let [cloned, split, removed, relocated] = progress.densified;
+    let heldout = psnr.map_or(String::new(), |p| format!(", {p:.2} dB on held-out views"));
+    stage.info(&format!(
+        "{} Gaussians ({cloned} cloned, {split} split, {removed} removed, {relocated} relocated){heldout}; {}",
+        rows.len(),
+        shares(trainer.timings())
+    ));
+    let summary = json!({
+        "gaussians": rows.len(),
+        "psnr_heldout": psnr,
+        "ssim_heldout": ssim,
+        "iterations": progress.iteration,
+        "dropped_gradients": progress.dropped,
+        "most_undrawn": {"not_finite": progress.undrawn[0], "degenerate": progress.undrawn[1]},
+        "memory_predicted_bytes": made.forecast.peak(gaussians.len()),
+        "seconds": seconds(trainer.timings()),
+        "cpu_seconds": stage::cpu_seconds(),
+        "iteration_cpu_seconds": made.cpu_seconds,
+        "plan": made.plan,
+    });
+    stage.record(claim, parameters.clone(), inputs.clone(), summary)?;
+    for leftover in [with_suffix(&options.out, PARTIAL), plan_path(&options.out), checkpoint::path_of(&options.out)] {
+        remove_if_there(&leftover);
+    }
+    Ok(())
+}
+
+/// The Gaussians to write. Rows and no copy: the moments are still there, for a checkpoint if the disk is full.
+fn rows(options: &Train, gaussians: &Gaussians, stage: &Stage) -> Vec<u32> {
+    if options.no_skip || options.densify == Strategy::Fixed {
+        return (0..gaussians.len() as u32).collect();
+    }
+    let rows = drawable(gaussians);
+    if rows.len() < gaussians.len() {
+        stage.skipped(&format!("{} Gaussians: too faint to be drawn", gaussians.len() - rows.len()));
+    }
+    rows
+}
+
+/// Warns of what went wrong without harm.
+fn report(progress: &ProgressState, stage: &Stage) {
+    if progress.dropped > 0 {
+        stage.warn(&format!("{} gradients of Gaussians were not finite and were not used", progress.dropped));
+    }
+    let [not_finite, degenerate] = progress.undrawn;
+    if not_finite + degenerate > 0 {
+        stage.warn(&format!(
+            "Gaussians that could not be drawn, in the worst iteration: {not_finite} not finite, {degenerate} of a shape beyond single precision or with a quaternion of length 0"
+        ));
+    }
+}
+
+/// Writes the training curve, its plot, and the photographs' exposures.
+fn write_beside(options: &Train, trainer: &Trainer<'_>) -> Result<()> {
+    let State { progress, exposures, .. } = trainer.state();
+    let lines: String = progress.curve.iter().map(|line| format!("{line}\n")).collect();
+    write_bytes(with_suffix(&options.out, CURVE), lines.as_bytes())?;
+    write_bytes(with_suffix(&options.out, PLOT), curve::svg(&progress.curve).as_bytes())?;
+    if exposures.is_off() {
+        return Ok(());
+    }
+    let maps = trainer.train_names().zip(&exposures.maps);
+    let maps: serde_json::Map<String, Value> =
+        maps.map(|(name, map)| (name.to_string(), json!(map.chunks(4).collect::<Vec<_>>()))).collect();
+    let text = serde_json::to_vec_pretty(&maps).map_err(|e| Error::new(e.to_string()))?;
+    write_bytes(with_suffix(&options.out, EXPOSURES), &text)
+}
+
+/// Processor time since a moment at which it was `before`.
+pub(super) fn spent_since(before: Option<f64>) -> Option<f64> {
+    Some(stage::cpu_seconds()? - before?)
+}
+
+fn parts(t: Timings) -> [(&'static str, Duration); 5] {
+    [("forward", t.forward), ("loss", t.loss), ("backward", t.backward), ("Adam", t.adam), ("rest", t.rest)]
+}
+
+fn seconds(t: Timings) -> Value {
+    Value::Object(parts(t).into_iter().map(|(name, d)| (name.into(), json!(d.as_secs_f64()))).collect())
+}
+
+fn shares(t: Timings) -> String {
+    let total = parts(t).iter().map(|(_, d)| d.as_secs_f64()).sum::<f64>().max(1e-9);
+    let all: Vec<String> =
+        parts(t).iter().map(|(name, d)| format!("{name} {:.0}%", 100.0 * d.as_secs_f64() / total)).collect();
+    format!("{total:.1} s: {}", all.join(", "))
+}
+
+/// Provenance as comment lines of the PLY: program, inputs, parameters.
+fn comments(parameters: &Value, inputs: &BTreeMap<String, String>) -> Vec<String> {
+    fn add(lines: &mut Vec<String>, prefix: &str, value: &Value) {
+        for (key, value) in value.as_object().into_iter().flatten() {
+            match value {
+                Value::Object(_) => add(lines, &format!("{prefix}{key}."), value),
+                _ => lines.push(format!("{prefix}{key} {value}")),
+            }
+        }
+    }
+    let mut lines = vec![format!("made by gs-geom {}", env!("CARGO_PKG_VERSION"))];
+    lines.extend(inputs.iter().map(|(role, hash)| format!("{role} {hash}")));
+    add(&mut lines, "", parameters);
+    lines
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn comments_name_every_parameter_once() {
+        let parameters = json!({"resolution": "auto", "seed": 1, "rates": {"opacity": 0.05}});
+        let lines = comments(&parameters, &BTreeMap::from([("dataset".into(), "ab".into())]));
+        assert_eq!(lines[1..], ["dataset ab", "rates.opacity 0.05", "resolution \"auto\"", "seed 1"]);
+    }
+}

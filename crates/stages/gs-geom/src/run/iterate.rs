@@ -1,0 +1,104 @@
+//! The iterations of a training, with checkpoints.
+
+use super::outputs::{PARTIAL, check_finite};
+use crate::options::{Every, Train};
+use crate::training::Trainer;
+use crate::training::checkpoint::{self, State};
+use gs_io::{Error, Provenance, Result, Watched, with_suffix};
+use gs_scene::ply;
+use stage::Stage;
+use std::time::Instant;
+
+/// Weight of the last loss in the mean that the progress shows.
+const SMOOTHING: f64 = 0.02;
+
+/// The state of an interrupted run of the same parameters and inputs.
+pub(super) fn saved(options: &Train, run: &Provenance, stage: &Stage) -> Option<State> {
+    match checkpoint::read(&checkpoint::path_of(&options.out), run) {
+        Ok(state) => {
+            if let Some(state) = &state {
+                stage.info(&format!("going on after iteration {}", state.progress.iteration));
+            }
+            state
+        }
+        Err(e) => {
+            stage.warn(&format!("beginning anew: {e}"));
+            None
+        }
+    }
+}
+
+/// Runs the iterations that are left.
+pub(super) fn iterate(
+    options: &Train,
+    trainer: &mut Trainer<'_>,
+    run: &Provenance,
+    watched: &Watched,
+    stage: &Stage,
+) -> Result<()> {
+    let first = trainer.state().progress.iteration;
+    let mut progress = stage.progress("iteration", options.iterations.into()).resumed_at(first.into());
+    let mut last_save = Instant::now();
+    let mut smooth: Option<f64> = None;
+    trainer.complete_curve()?;
+    while !trainer.is_done() {
+        if stage.interrupted() {
+            return stop(options, trainer, run, stage);
+        }
+        trainer.step()?;
+        let iteration = trainer.state().progress.iteration;
+        let loss = trainer.last_loss().total;
+        let s = smooth.get_or_insert(loss);
+        *s += SMOOTHING * (loss - *s);
+        let mut fields = vec![("loss", *s), ("Gaussians", trainer.state().gaussians.len() as f64)];
+        fields.extend(trainer.last_heldout().map(|psnr| ("psnr", psnr)));
+        progress.set(iteration.into(), &fields);
+        let due = match options.checkpoint_every {
+            Every::Iterations(n) => iteration.is_multiple_of(n),
+            Every::Seconds(s) => last_save.elapsed().as_secs_f64() >= s,
+        };
+        if due && !trainer.is_done() {
+            // Those that are kept in memory are not read again: a run that nobody can repeat should end here.
+            watched.check_those_left()?;
+            save(options, trainer, run)?;
+            last_save = Instant::now();
+        }
+    }
+    progress.finish(&[("loss", smooth.unwrap_or(0.0))]);
+    Ok(())
+}
+
+/// Ends an interrupted run with a checkpoint and the Gaussians so far.
+fn stop(options: &Train, trainer: &Trainer<'_>, run: &Provenance, stage: &Stage) -> Result<()> {
+    save(options, trainer, run)?;
+    let iteration = trainer.state().progress.iteration;
+    let partial = with_suffix(&options.out, PARTIAL);
+    let note = format!("unfinished: {iteration} of {} iterations", options.iterations);
+    ply::write_gaussians(&partial, &trainer.state().gaussians, &[note])?;
+    stage.info(&format!(
+        "stopped after iteration {iteration}; the same command goes on from here. The Gaussians so far: {}",
+        partial.display()
+    ));
+    Err(Error::new("interrupted"))
+}
+
+/// Saves what a failing run has done. An interrupted one has done so already. Where a photograph has changed, it is what the
+/// old one taught: no photograph is used that is not as it was.
+pub(super) fn rescue(options: &Train, trainer: &Trainer<'_>, run: &Provenance, stage: &Stage) {
+    let iteration = trainer.state().progress.iteration;
+    // What is not finite stays so: there is nothing to save.
+    if stage.interrupted() || check_finite(options, &trainer.state().gaussians, iteration).is_err() {
+        return;
+    }
+    match save(options, trainer, run) {
+        Ok(()) => stage.warn(&format!(
+            "saved a checkpoint after iteration {iteration}; fix the error below, and the same command goes on from it"
+        )),
+        Err(e) => stage.warn(&format!("no checkpoint after iteration {iteration} could be saved: {e}")),
+    }
+}
+
+fn save(options: &Train, trainer: &Trainer<'_>, run: &Provenance) -> Result<()> {
+    check_finite(options, &trainer.state().gaussians, trainer.state().progress.iteration)?;
+    checkpoint::write(&checkpoint::path_of(&options.out), trainer.state(), run.clone())
+}

@@ -1,0 +1,397 @@
+//! The optimisation loop: [`Trainer::step`] renders a view, takes the gradient of the loss, updates and densifies.
+
+pub mod checkpoint;
+pub mod curve;
+pub mod exposure;
+pub mod loss;
+pub mod optimiser;
+pub mod schedule;
+
+use crate::densification::rules::{Growth, Moment};
+use crate::densification::{Strategy, Way};
+use crate::metrics::{self, Means};
+use crate::photographs::masks::{Alpha, alpha_loss, multiply};
+use crate::photographs::{Photographs, Target};
+use checkpoint::State;
+use gs_io::Result;
+use gs_raster::{PixelGradients, RasterOptions, Workspace, near_plane};
+use gs_scene::{Camera, morton_order};
+use loss::{Derivatives, Loss, Pair, l1_dssim};
+use optimiser::drop_bad_gradients;
+use rand::Rng;
+use schedule::{LearningRates, Purpose, Schedule, ViewOrder, generator};
+use serde::Serialize;
+use serde_json::{Value, json};
+use std::borrow::Cow;
+use std::time::{Duration, Instant};
+
+/// Weight of 1 - SSIM in the loss, as 3DGS has it.
+const DSSIM_WEIGHT: f32 = 0.2;
+/// Weight of the difference of alpha in the loss, for [`Alpha::Match`].
+const ALPHA_WEIGHT: f32 = 0.1;
+
+/// Every hyper-parameter that shapes the result.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct Recipe {
+    /// Seed of the views' order and of densification.
+    pub seed: u64,
+    /// What changes with the iteration.
+    pub schedule: Schedule,
+    /// Learning rates.
+    pub rates: LearningRates,
+    /// How the number of Gaussians changes; none where it stays.
+    pub densification: Option<Way>,
+    /// When it changes, and how far.
+    pub growth: Growth,
+    /// Colour behind the scene.
+    pub background: [f32; 3],
+    /// Train with another colour behind the scene in every iteration, so that what is transparent must be so;
+    /// `background` is then for held-out views alone.
+    pub random_background: bool,
+    /// What transparent pixels of the photographs mean.
+    pub alpha: Alpha,
+    /// Keep the light of Gaussians smaller than a pixel (the 2D filter of Mip-Splatting, Yu et al. 2024).
+    pub antialias: bool,
+    /// Train an affine map of colours for each training photograph.
+    pub exposure: bool,
+}
+
+impl Recipe {
+    /// The defaults of a strategy for a number of iterations.
+    pub fn new(strategy: Strategy, iterations: u32) -> Self {
+        let rates = LearningRates::default();
+        Self {
+            seed: 0,
+            schedule: Schedule::for_iterations(iterations),
+            rates: if strategy == Strategy::Fixed { LearningRates { position: 0.0, ..rates } } else { rates },
+            densification: strategy.way(),
+            growth: strategy.growth(iterations),
+            background: [0.0; 3],
+            random_background: false,
+            alpha: Alpha::default(),
+            antialias: false,
+            exposure: false,
+        }
+    }
+}
+
+/// Where the time of an optimisation went.
+#[derive(Debug, Clone, Copy, Default, PartialEq)]
+pub struct Timings {
+    /// Rendering.
+    pub forward: Duration,
+    /// Loss and its gradient.
+    pub loss: Duration,
+    /// Gradients of the parameters.
+    pub backward: Duration,
+    /// Adam.
+    pub adam: Duration,
+    /// Densification, held-out views, photographs.
+    pub rest: Duration,
+}
+
+/// A view to learn from in one iteration.
+struct Frame {
+    iteration: u32,
+    view: usize,
+    camera: Camera,
+    target: Target,
+    raster: RasterOptions,
+}
+
+/// An optimisation under way.
+pub struct Trainer<'a> {
+    recipe: Recipe,
+    extent: f64,
+    train: Photographs<'a>,
+    heldout: Photographs<'a>,
+    order: ViewOrder,
+    state: State,
+    workspace: Workspace,
+    /// d loss / d rendered colour.
+    gradient: Vec<f32>,
+    /// d loss / d rendered alpha.
+    alpha_gradient: Vec<f32>,
+    /// The render through its view's exposure.
+    exposed: Vec<f32>,
+    derivatives: Derivatives,
+    last: Loss,
+    last_heldout: Option<f64>,
+    timings: Timings,
+    clock: Instant,
+}
+
+impl<'a> Trainer<'a> {
+    /// Goes on from a checkpoint, or from [`checkpoint::start`]. `extent` is the scene's size (see [`crate::start::extent`]);
+    /// `heldout` may be empty.
+    ///
+    /// # Panics
+    /// When the state has exposures of another number of views.
+    pub fn new(recipe: Recipe, extent: f64, train: Photographs<'a>, heldout: Photographs<'a>, state: State) -> Self {
+        assert_eq!(state.exposures.maps.len(), if recipe.exposure { train.len() } else { 0 });
+        Self {
+            order: ViewOrder::new(recipe.seed, train.len()),
+            last_heldout: state.progress.curve.iter().rev().find_map(|line| heldout_of(line)),
+            recipe,
+            extent,
+            train,
+            heldout,
+            state,
+            workspace: Workspace::default(),
+            gradient: Vec::new(),
+            alpha_gradient: Vec::new(),
+            exposed: Vec::new(),
+            derivatives: Derivatives::default(),
+            last: Loss { l1: 0.0, ssim: 0.0, total: 0.0 },
+            timings: Timings::default(),
+            clock: Instant::now(),
+        }
+    }
+
+    /// Names of the training photographs, in the order of the exposures.
+    pub fn train_names(&self) -> impl Iterator<Item = &str> {
+        self.train.names()
+    }
+
+    /// The state, for a checkpoint.
+    pub fn state(&self) -> &State {
+        &self.state
+    }
+
+    /// Changes the Gaussians, with the optimiser's moments to follow them.
+    pub fn change(&mut self, change: impl FnOnce(&mut State)) {
+        change(&mut self.state);
+    }
+
+    /// Loss of the last iteration's view.
+    pub fn last_loss(&self) -> Loss {
+        self.last
+    }
+
+    /// PSNR of the last held-out check, dB.
+    pub fn last_heldout(&self) -> Option<f64> {
+        self.last_heldout
+    }
+
+    /// Where the time went.
+    pub fn timings(&self) -> Timings {
+        self.timings
+    }
+
+    /// Whether all iterations are done.
+    pub fn is_done(&self) -> bool {
+        self.state.progress.iteration >= self.recipe.schedule.iterations
+    }
+
+    /// One iteration.
+    ///
+    /// # Errors
+    /// When a photograph has to be decoded and cannot be; the state is then good for a checkpoint.
+    pub fn step(&mut self) -> Result<()> {
+        self.complete_curve()?;
+        self.clock = Instant::now();
+        let frame = self.frame()?;
+        self.render(&frame);
+        self.last = self.gradient(&frame);
+        self.update(&frame);
+        self.densify(&frame);
+        // Room for the held-out views.
+        drop(frame);
+        self.note()?;
+        self.lap(|t| &mut t.rest);
+        Ok(())
+    }
+
+    /// The view of the next iteration.
+    fn frame(&mut self) -> Result<Frame> {
+        let Recipe { schedule, alpha, seed, .. } = &self.recipe;
+        let iteration = self.state.progress.iteration + 1;
+        self.train.set_divisor(schedule.divisor(iteration))?;
+        let view = self.order.at(iteration);
+        let background = match self.recipe.random_background {
+            true => generator(*seed, Purpose::Background, u64::from(iteration)).random(),
+            false => self.recipe.background,
+        };
+        let raster = RasterOptions {
+            background,
+            sh_degree: schedule.sh_degree(iteration, self.state.gaussians.sh_degree),
+            antialias: self.recipe.antialias,
+            near: near_plane(self.extent),
+            depth: false,
+        };
+        let target = self.train.target(view, metrics::behind(*alpha, background))?;
+        let camera = self.train.camera(view).clone();
+        self.lap(|t| &mut t.rest);
+        Ok(Frame { iteration, view, camera, target, raster })
+    }
+
+    /// Renders the view.
+    fn render(&mut self, frame: &Frame) {
+        let State { gaussians, adam, progress, .. } = &mut self.state;
+        if let Some(way) = &self.recipe.densification {
+            way.rules().before(gaussians, adam, moment(&self.recipe, self.extent, frame.iteration));
+        }
+        let undrawn = self.workspace.forward(gaussians, &frame.camera, &frame.raster).dropped();
+        for (most, now) in progress.undrawn.iter_mut().zip([undrawn.not_finite, undrawn.degenerate]) {
+            *most = (*most).max(now as u64);
+        }
+        self.lap(|t| &mut t.forward);
+    }
+
+    /// Compares the render with the photograph: the loss, and its gradient by every parameter.
+    fn gradient(&mut self, frame: &Frame) -> Loss {
+        let (rgb, alpha) = (&self.workspace.forward.rendered.rgb, &self.workspace.forward.rendered.alpha);
+        let State { gaussians, exposures, .. } = &mut self.state;
+        // What the photograph would show, and which of its pixels count.
+        let map = exposures.maps.get(frame.view).copied();
+        let mut shown = match &map {
+            Some(map) => {
+                exposure::apply(map, rgb, &mut self.exposed);
+                Cow::Borrowed(&self.exposed[..])
+            }
+            None => Cow::Borrowed(&rgb[..]),
+        };
+        let counts = frame.target.alpha.as_ref().filter(|_| self.recipe.alpha == Alpha::Ignore);
+        if let Some(counts) = counts {
+            multiply(shown.to_mut(), counts);
+        }
+        let pair = Pair { render: &shown, target: &frame.target.rgb, width: frame.camera.width as usize };
+        let mut loss = l1_dssim(pair, DSSIM_WEIGHT, &mut self.gradient, &mut self.derivatives);
+        drop(shown);
+        if let Some(counts) = counts {
+            multiply(&mut self.gradient, counts);
+        }
+        if let Some(map) = &map {
+            let gradient = exposure::backward(map, rgb, &mut self.gradient);
+            exposures.step(frame.view, &gradient, self.recipe.schedule.share(frame.iteration));
+        }
+        let mut pixels = PixelGradients { rgb: &self.gradient, alpha: None, depth: None };
+        if let Some(wanted) = frame.target.alpha.as_ref().filter(|_| self.recipe.alpha == Alpha::Match) {
+            loss.total += alpha_loss(alpha, wanted, ALPHA_WEIGHT, &mut self.alpha_gradient);
+            pixels.alpha = Some(&self.alpha_gradient);
+        }
+        lap(&mut self.clock, &mut self.timings.loss);
+        self.workspace.backward(gaussians, &frame.camera, &frame.raster, pixels);
+        self.lap(|t| &mut t.backward);
+        loss
+    }
+
+    /// A step of Adam.
+    fn update(&mut self, frame: &Frame) {
+        let State { gaussians, adam, progress, .. } = &mut self.state;
+        let gradients = &mut self.workspace.gradients;
+        let rules = self.recipe.densification.as_ref().map(Way::rules);
+        let rates = self.recipe.schedule.rates(&self.recipe.rates, frame.iteration, self.extent);
+        if let Some(rules) = rules {
+            rules.regularise(gaussians, gradients);
+        }
+        progress.dropped += gradients.overflowed as u64 + drop_bad_gradients(gradients);
+        adam.step(gaussians, gradients, &rates, frame.raster.sh_degree);
+        if let Some(rules) = rules {
+            rules.explore(gaussians, rates.means, moment(&self.recipe, self.extent, frame.iteration));
+        }
+        self.lap(|t| &mut t.adam);
+    }
+
+    /// Lets the number of Gaussians change.
+    fn densify(&mut self, frame: &Frame) {
+        self.state.progress.iteration = frame.iteration;
+        let Some(way) = &self.recipe.densification else { return };
+        let at = moment(&self.recipe, self.extent, frame.iteration);
+        way.rules().observe(&mut self.state.seen, &self.workspace, &frame.camera, at);
+        if !at.growth.is_due(frame.iteration) {
+            return;
+        }
+        let Some(report) = way.rules().round(&mut self.state, at) else { return };
+        let State { gaussians, adam, progress, .. } = &mut self.state;
+        let counts = [report.cloned, report.split, report.removed, report.relocated];
+        progress.densified.iter_mut().zip(counts).for_each(|(sum, n)| *sum += n as u64);
+        // What lies together is drawn together.
+        let order = morton_order(&gaussians.means);
+        *gaussians = gaussians.select(&order);
+        adam.select(&order, order.len());
+    }
+
+    fn lap(&mut self, part: impl FnOnce(&mut Timings) -> &mut Duration) {
+        lap(&mut self.clock, part(&mut self.timings));
+    }
+
+    /// Adds to the training curve.
+    fn note(&mut self) -> Result<()> {
+        let (total, loss) = (self.recipe.schedule.iterations, self.last);
+        let progress = &mut self.state.progress;
+        if loss.total.is_finite() {
+            let (sums, count) = &mut progress.window;
+            sums.iter_mut().zip([loss.total, loss.l1, loss.ssim]).for_each(|(s, v)| *s += v);
+            *count += 1;
+        }
+        let iteration = progress.iteration;
+        if !iteration.is_multiple_of(total.div_ceil(100)) && iteration != total {
+            return Ok(());
+        }
+        let (sums, count) = std::mem::take(&mut progress.window);
+        let [loss, l1, ssim] = sums.map(|s| s / f64::from(count.max(1)));
+        let gaussians = self.state.gaussians.len();
+        let line = json!({"iteration": iteration, "loss": loss, "l1": l1, "ssim": ssim, "gaussians": gaussians});
+        progress.curve.push(line.to_string());
+        self.complete_curve()
+    }
+
+    /// Measures the held-out views where that is due and the curve's last line lacks it. A run that failed in it, because a
+    /// photograph could not be read, makes up for it when it goes on.
+    ///
+    /// # Errors
+    /// When a photograph has to be decoded and cannot be.
+    pub fn complete_curve(&mut self) -> Result<()> {
+        let (total, iteration) = (self.recipe.schedule.iterations, self.state.progress.iteration);
+        let due = iteration.is_multiple_of(total.div_ceil(10).max(1)) || iteration == total;
+        let Some(last) = self.state.progress.curve.last().filter(|_| due) else { return Ok(()) };
+        let Ok(mut line) = serde_json::from_str::<Value>(last) else { return Ok(()) };
+        if line["iteration"] != iteration || line.get("psnr_heldout").is_some() {
+            return Ok(());
+        }
+        if let Some(psnr) = self.heldout()?.psnr {
+            self.last_heldout = Some(psnr);
+            line["psnr_heldout"] = json!(psnr);
+            self.state.progress.curve.pop();
+            self.state.progress.curve.push(line.to_string());
+        }
+        Ok(())
+    }
+
+    /// Mean PSNR and SSIM over the held-out views with all spherical harmonics, at the scene's own exposure; none without
+    /// such views.
+    ///
+    /// # Errors
+    /// When a photograph has to be decoded and cannot be.
+    pub fn heldout(&mut self) -> Result<Means> {
+        let Recipe { alpha, background, antialias, .. } = self.recipe;
+        let near = near_plane(self.extent);
+        let options = RasterOptions { background, antialias, near, depth: false, ..RasterOptions::default() };
+        let mut all = Vec::with_capacity(self.heldout.len());
+        for i in 0..self.heldout.len() {
+            let (camera, target) =
+                (self.heldout.camera(i), self.heldout.target(i, metrics::behind(alpha, background))?);
+            self.workspace.forward(&self.state.gaussians, camera, &options);
+            let rgb = &mut self.workspace.forward.rendered.rgb;
+            all.push(metrics::compare(rgb, camera.width as usize, &target, alpha));
+        }
+        Ok(Means::of(self.heldout.names().zip(all.iter().copied())))
+    }
+}
+
+fn moment(recipe: &Recipe, extent: f64, iteration: u32) -> Moment<'_> {
+    Moment { iteration, seed: recipe.seed, extent, schedule: &recipe.schedule, growth: &recipe.growth }
+}
+
+/// Adds the time since `clock` to `spent`, and sets the clock.
+fn lap(clock: &mut Instant, spent: &mut Duration) {
+    let now = Instant::now();
+    *spent += now - *clock;
+    *clock = now;
+}
+
+/// The held-out PSNR that a line of the curve has.
+fn heldout_of(line: &str) -> Option<f64> {
+    serde_json::from_str::<Value>(line).ok()?["psnr_heldout"].as_f64()
+}

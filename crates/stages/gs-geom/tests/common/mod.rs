@@ -1,0 +1,108 @@
+//! What the tests share: running the program, and small COLMAP scenes.
+#![allow(dead_code, reason = "every test file uses another part")]
+
+pub mod world;
+
+use glam::DQuat;
+use gs_scene::{Camera, PointCloud};
+use serde_json::Value;
+use std::fmt::Write as _;
+use std::fs;
+use std::path::{Path, PathBuf};
+use std::process::{Command, Output, Stdio};
+use std::time::Duration;
+
+pub fn program(arguments: &[&str]) -> Command {
+    let mut c = Command::new(env!("CARGO_BIN_EXE_gs-geom"));
+    c.args(arguments);
+    c
+}
+
+pub fn run(arguments: &[&str]) -> Output {
+    program(arguments).output().unwrap()
+}
+
+/// Runs to exit code 0; what it printed to standard error.
+pub fn succeeds(arguments: &[&str]) -> String {
+    let o = run(arguments);
+    let said = String::from_utf8_lossy(&o.stderr).into_owned();
+    assert!(o.status.success(), "{arguments:?}: {said}");
+    said
+}
+
+/// Runs to exit code 2 and a single error; what it printed to standard error.
+pub fn refused(arguments: &[&str]) -> String {
+    let o = run(arguments);
+    let said = String::from_utf8_lossy(&o.stderr).into_owned();
+    assert_eq!((o.status.code(), said.matches("error: ").count()), (Some(2), 1), "{arguments:?}: {said}");
+    assert!(!said.contains("panicked"), "{said}");
+    said
+}
+
+/// Starts a training, waits for its first checkpoint, does something to its files, and gives how it ended.
+pub fn disturbed(arguments: &[&str], out: &str, disturb: impl FnOnce(&mut std::process::Child)) -> Output {
+    let mut child = program(arguments).stderr(Stdio::piped()).spawn().unwrap();
+    let checkpoint = PathBuf::from(format!("{out}.checkpoint"));
+    for _ in 0..5000 {
+        if checkpoint.exists() || child.try_wait().unwrap().is_some() {
+            break;
+        }
+        std::thread::sleep(Duration::from_millis(2));
+    }
+    disturb(&mut child);
+    child.wait_with_output().unwrap()
+}
+
+/// Kills a training after its first checkpoint.
+pub fn killed(arguments: &[&str], out: &str) {
+    disturbed(&[arguments, &["--checkpoint-every", "1"]].concat(), out, |child| child.kill().unwrap());
+}
+
+pub fn json(path: &str) -> Value {
+    serde_json::from_slice(&fs::read(path).unwrap()).unwrap()
+}
+
+/// The record of a run, beside its output.
+pub fn record(out: &str) -> Value {
+    json(&format!("{out}.run.json"))
+}
+
+pub struct Folder(tempfile::TempDir);
+
+impl Folder {
+    pub fn new() -> Self {
+        Self(tempfile::tempdir().unwrap())
+    }
+
+    pub fn path(&self, name: &str) -> String {
+        self.0.path().join(name).to_string_lossy().into_owned()
+    }
+
+    pub fn names(&self) -> Vec<String> {
+        let names = fs::read_dir(self.0.path()).unwrap().map(|e| e.unwrap().file_name().to_string_lossy().into_owned());
+        let mut names: Vec<String> = names.collect();
+        names.sort();
+        names
+    }
+}
+
+/// Writes a COLMAP text model of cameras that share one lens; `photograph` writes the photograph of each to a path.
+pub fn write_scene(root: &Path, cameras: &[Camera], points: &PointCloud, photograph: impl Fn(usize, &Camera, &Path)) {
+    fs::create_dir_all(root.join("sparse/0")).unwrap();
+    fs::create_dir_all(root.join("images")).unwrap();
+    let c = &cameras[0];
+    let camera = format!("1 PINHOLE {} {} {} {} {} {}\n", c.width, c.height, c.fx, c.fy, c.cx, c.cy);
+    let (mut images, mut text) = (String::new(), String::new());
+    for (i, c) in cameras.iter().enumerate() {
+        photograph(i, c, &root.join(format!("images/{i:02}.png")));
+        let (q, t) = (DQuat::from_mat3(&c.rotation), c.translation);
+        let pose = [q.w, q.x, q.y, q.z, t.x, t.y, t.z].map(|v| v.to_string()).join(" ");
+        writeln!(images, "{} {pose} 1 {i:02}.png\n", i + 1).unwrap();
+    }
+    for (i, (p, c)) in points.positions.iter().zip(&points.colors).enumerate() {
+        writeln!(text, "{} {} {} {} {} {} {} 0.5", i + 1, p[0], p[1], p[2], c[0], c[1], c[2]).unwrap();
+    }
+    for (name, text) in [("cameras", &camera), ("images", &images), ("points3D", &text)] {
+        fs::write(root.join(format!("sparse/0/{name}.txt")), text).unwrap();
+    }
+}
