@@ -1,6 +1,6 @@
 //! The stages one after another on a scene: what each is given, and what its run took.
 
-use gs_io::{Error, IoContext, Result, create_dir};
+use gs_io::{Error, IoContext, Result, create_dir, with_suffix};
 use serde::{Deserialize, Serialize};
 use serde_json::Value;
 use std::collections::BTreeMap;
@@ -214,7 +214,7 @@ impl Files {
         let (graph, footprints) = (("--graph", &*self.graph), ("--footprints", &*self.footprints));
         let (masks, out) = (("--masks", &*self.masks), ("--out", self.output(stage)));
         match stage {
-            Stage::Geometry => command(&["gs-geom", "train", "--no-resume"], &[scene, out]),
+            Stage::Geometry => command(&["gs-geom", "train"], &[scene, out]),
             Stage::Graph => command(&["graph-precompute"], &[scene, geometry, masks, footprints, graph]),
             Stage::Features => command(&["feat-train"], &[geometry, graph, footprints, out]),
             Stage::Instances => {
@@ -240,6 +240,8 @@ impl Files {
     /// See [`Programs::run`].
     pub fn run(&self, programs: &Programs, stage: Stage, options: &Options) -> Result<Cost> {
         create_dir(self.output(stage).parent().unwrap_or(Path::new(".")))?;
+        // A run that goes on from the checkpoint of a killed one would seem faster than it is.
+        let _ = std::fs::remove_file(with_suffix(self.output(stage), ".checkpoint"));
         programs.run(&[&self.command(stage)[..], options.get(stage)].concat())?;
         let record = stage::RunRecord::read(self.output(stage))?;
         let (cpu, peak) = (record.cpu_seconds.unwrap_or(f64::NAN), record.peak_rss_bytes.unwrap_or(0));

@@ -49,7 +49,7 @@ pub(super) enum From {
 }
 
 /// Options enough to see whether a hostile scene can be learnt.
-const GEOMETRY: &str = "--iterations 80 --sh-degree 0 --max-gaussians 3000 --densify-every 20 --opacity-reset-every 30";
+const GEOMETRY: &str = "--iterations 80 --sh-degree 0 --max-gaussians 3000 --densify-every 20";
 
 /// The options of ordinary cases.
 pub(super) fn options(geometry: &str) -> Options {
