@@ -7,7 +7,8 @@ use std::path::{Path, PathBuf};
 pub const LEVELS: usize = 4;
 
 /// A granularity level of SAM's masks, in the order of the files.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, serde::Serialize)]
+#[serde(rename_all = "lowercase")]
 pub enum Level {
     /// SAM's default masks.
     Default = 0,

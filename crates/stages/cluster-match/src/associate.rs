@@ -1,27 +1,18 @@
 //! Which mask of a view shows which instance (paper, "Instance Clustering and Semantic Matching").
 //!
 //! One rasterisation of a view serves all instances. The silhouette of an instance is where the instance rendered alone
-//! has alpha > 0.8: per pixel, 1 - prod(1 - alpha_i) over its own Gaussians, hidden ones included (OpenGaussian's rule); or,
-//! occlusion-aware, where its Gaussians have more than half of the blending weight. Its mean feature is that of its own
-//! Gaussians as rendered over the silhouette; a mask's is that of all Gaussians as rendered over the mask. Rendering is
-//! linear, so both are sums over Gaussians of feature times summed weight, and no feature image is made.
+//! has alpha > 0.8: per pixel, 1 - prod(1 - alpha_i) over its own Gaussians, hidden ones included (OpenGaussian's rule).
+//! Its mean feature is that of its own Gaussians as rendered over the silhouette; a mask's is that of all Gaussians as
+//! rendered over the mask. Rendering is linear, so both are sums over Gaussians of feature times summed weight, and no
+//! feature image is made.
 
 use artifacts::{Features, Level, MaskMaps, Match};
 use gs_raster::{RasterOptions, TILE, TileWeights, tile_weights};
 use gs_scene::{Camera, Gaussians};
 use std::collections::BTreeMap;
 
-/// What counts as an instance's silhouette.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, clap::ValueEnum)]
-pub enum Silhouette {
-    /// The instance rendered alone, alpha > 0.8
-    Selected,
-    /// Where it is seen: more than half of the blending weight
-    Visible,
-}
-
+/// An instance's silhouette is where the instance rendered alone has more alpha than this.
 const SELECTED_ALPHA: f32 = 0.8;
-const VISIBLE_WEIGHT: f32 = 0.5;
 const PIXELS: usize = TILE * TILE;
 
 /// Pixels of an instance or a mask in a view, and the sum of rendered features over them.
@@ -133,43 +124,23 @@ impl TileMasks {
 }
 
 /// Where each instance has its silhouette in a tile.
-fn silhouettes(t: &TileWeights<'_>, labels: &[i32], silhouette: Silhouette) -> BTreeMap<u32, [bool; PIXELS]> {
-    // Transmittance (selected) or weight (visible) of each instance at each pixel.
-    let mut coverage: BTreeMap<u32, [f32; PIXELS]> = BTreeMap::new();
-    for (g, &i) in t.gaussians.iter().enumerate() {
+fn silhouettes(t: &TileWeights<'_>, labels: &[i32]) -> BTreeMap<u32, [bool; PIXELS]> {
+    // Transmittance of each instance at each pixel.
+    let mut left: BTreeMap<u32, [f32; PIXELS]> = BTreeMap::new();
+    for (&i, alphas) in t.gaussians.iter().zip(t.alphas.chunks_exact(PIXELS)) {
         let Ok(label) = u32::try_from(labels[i as usize]) else { continue };
-        let own = g * PIXELS..(g + 1) * PIXELS;
-        match silhouette {
-            Silhouette::Selected => {
-                let left = coverage.entry(label).or_insert([1.0; PIXELS]);
-                left.iter_mut().zip(&t.alphas[own]).for_each(|(l, a)| *l *= 1.0 - a);
-            }
-            Silhouette::Visible => {
-                let sum = coverage.entry(label).or_insert([0.0; PIXELS]);
-                sum.iter_mut().zip(&t.weights[own]).for_each(|(s, w)| *s += w);
-            }
-        }
+        let left = left.entry(label).or_insert([1.0; PIXELS]);
+        left.iter_mut().zip(alphas).for_each(|(l, a)| *l *= 1.0 - a);
     }
-    let inside = |value: f32| match silhouette {
-        Silhouette::Selected => 1.0 - value > SELECTED_ALPHA,
-        Silhouette::Visible => value > VISIBLE_WEIGHT,
-    };
-    coverage
-        .into_iter()
-        .map(|(label, values)| (label, values.map(inside)))
+    left.into_iter()
+        .map(|(label, left)| (label, left.map(|l| 1.0 - l > SELECTED_ALPHA)))
         .filter(|(_, at)| at.iter().any(|&a| a))
         .collect()
 }
 
-fn tile_overlaps(
-    t: &TileWeights<'_>,
-    labels: &[i32],
-    table: &FeatureTable<'_>,
-    masks: &TileMasks,
-    silhouette: Silhouette,
-) -> Overlaps {
+fn tile_overlaps(t: &TileWeights<'_>, labels: &[i32], table: &FeatureTable<'_>, masks: &TileMasks) -> Overlaps {
     let dim = table.features.dim;
-    let inside = silhouettes(t, labels, silhouette);
+    let inside = silhouettes(t, labels);
     let mut out = Overlaps::default();
     // Areas.
     let mut of_mask = vec![Region::empty(dim); masks.ids.len()];
@@ -210,10 +181,7 @@ fn tile_overlaps(
         let (mut sum, mut visible) = (0.0f32, 0.0f32);
         for p in 0..PIXELS {
             visible += if pixels[p] { weights[p] } else { 0.0 };
-            let weight = match silhouette {
-                Silhouette::Selected => left[p] * alphas[p],
-                Silhouette::Visible => weights[p],
-            };
+            let weight = left[p] * alphas[p];
             left[p] *= 1.0 - alphas[p];
             sum += if pixels[p] { weight } else { 0.0 };
         }
@@ -224,8 +192,8 @@ fn tile_overlaps(
     out
 }
 
-/// Measures a view, once for each of `silhouettes`, in one rasterisation as `raster` says. `labels` are instances of all
-/// Gaussians (-1 for none); `camera` has the size of the id maps; masks are those of `levels`.
+/// Measures a view in one rasterisation, as `raster` says. `labels` are instances of all Gaussians (-1 for none); `camera`
+/// has the size of the id maps; masks are those of `levels`.
 pub fn overlaps(
     gaussians: &Gaussians,
     raster: &RasterOptions,
@@ -234,17 +202,14 @@ pub fn overlaps(
     camera: &Camera,
     maps: &MaskMaps,
     levels: &[Level],
-    silhouettes: &[Silhouette],
-) -> Vec<Overlaps> {
-    let early_stop = !silhouettes.contains(&Silhouette::Selected);
+) -> Overlaps {
+    // Hidden Gaussians count too, so no pixel is left before the last of them.
+    let early_stop = false;
     let tiles = tile_weights(gaussians, camera, raster, early_stop, |t| {
-        let masks = TileMasks::new(t, maps, levels);
-        silhouettes.iter().map(|&s| tile_overlaps(t, labels, table, &masks, s)).collect::<Vec<_>>()
+        tile_overlaps(t, labels, table, &TileMasks::new(t, maps, levels))
     });
-    let mut all = vec![Overlaps::default(); silhouettes.len()];
-    for tile in tiles {
-        all.iter_mut().zip(tile).for_each(|(all, tile)| all.add(tile));
-    }
+    let mut all = Overlaps::default();
+    tiles.into_iter().for_each(|tile| all.add(tile));
     all
 }
 
@@ -256,10 +221,10 @@ fn cosine(a: &[f64], b: &[f64]) -> f64 {
 }
 
 /// The best mask of each instance in a view: S = IoU x similarity of mean features (0 where it is negative), kept where it
-/// exceeds `threshold`; ties go to the lower mask id. Of several silhouettes each instance has the one that fits better.
-pub fn matches(overlaps: &[Overlaps], view: u32, threshold: f32) -> Vec<Match> {
+/// exceeds `threshold`; ties go to the lower mask id.
+pub fn matches(overlaps: &Overlaps, view: u32, threshold: f32) -> Vec<Match> {
     let mut best: BTreeMap<u32, Match> = BTreeMap::new();
-    for (overlaps, (&(instance, mask), &common)) in overlaps.iter().flat_map(|o| o.common.iter().map(move |c| (o, c))) {
+    for (&(instance, mask), &common) in &overlaps.common {
         let (Some(i), Some(m)) = (overlaps.instances.get(&instance), overlaps.masks.get(&mask)) else { continue };
         let union = i.area + m.area - common;
         let iou = f64::from(common) / f64::from(union.max(1));
@@ -310,47 +275,18 @@ mod tests {
         let (g, camera) = scene();
         let features = Features { kept: vec![0, 1, 2], dim: 2, values: vec![1.0, 0.0, 0.0, 1.0, -1.0, 0.2] };
         let table = FeatureTable::new(&features, 3);
-        for silhouette in [Silhouette::Selected, Silhouette::Visible] {
-            let raster = RasterOptions::default();
-            let all = overlaps(&g, &raster, &[0, 1, 2], &table, &camera, &maps(), &[Level::Large], &[silhouette]);
-            let o = &all[0];
-            assert_eq!(o.masks[&3].area + o.masks[&4].area, (W * H) as u32);
-            assert!(o.common.contains_key(&(0, 3)) && o.common.contains_key(&(1, 4)));
-            assert!(!o.common.contains_key(&(0, 4)) && !o.common.contains_key(&(1, 3)));
-            // The hidden blob has a silhouette of its own when rendered alone, and none (or a rim) when only the visible counts.
-            let hidden = o.instances.get(&2).map_or(0, |r| r.area);
-            match silhouette {
-                Silhouette::Selected => assert!(hidden > 4),
-                Silhouette::Visible => assert!(hidden * 4 < o.instances[&0].area),
-            }
-            let m = matches(&all, 5, 0.0);
-            assert_eq!((m[0].mask, m[0].view, m[1].mask), (3, 5, 4));
-            // It covers the mask of what hides it, but its features are its own and tell it from that.
-            assert!(m.iter().all(|m| m.instance != 2), "{m:?}");
-            assert!(matches(&all, 5, 0.99).is_empty());
-        }
-    }
-
-    #[test]
-    fn both_silhouettes_in_one_pass_are_those_of_two_and_the_better_counts() {
-        let (g, camera) = scene();
-        let features = Features { kept: vec![0, 1, 2], dim: 2, values: vec![1.0, 0.0, 0.0, 1.0, 1.0, 0.1] };
-        let table = FeatureTable::new(&features, 3);
-        let with = |s: &[Silhouette]| {
-            overlaps(&g, &RasterOptions::default(), &[0, 1, 2], &table, &camera, &maps(), &[Level::Large], s)
-        };
-        let (selected, visible) = (with(&[Silhouette::Selected]), with(&[Silhouette::Visible]));
-        let both = with(&[Silhouette::Selected, Silhouette::Visible]);
-        assert_eq!(both[0], selected[0]);
-        // Without the early stop weights below 1e-4 are not cut off.
-        assert_eq!(both[1].common, visible[0].common);
-        let best = |o: &[Overlaps]| matches(o, 0, 0.0);
-        let score = |m: &[Match], i: u32| m.iter().find(|m| m.instance == i).map_or(0.0, |m| m.score);
-        for i in 0..3 {
-            let either = score(&best(&selected), i).max(score(&best(&visible), i));
-            assert!((score(&best(&both), i) - either).abs() < 1e-4, "instance {i}");
-        }
-        assert!(score(&best(&selected), 2) > 1.5 * score(&best(&visible), 2), "the hidden one has most of it alone");
+        let o = overlaps(&g, &RasterOptions::default(), &[0, 1, 2], &table, &camera, &maps(), &[Level::Large]);
+        assert_eq!(o.masks[&3].area + o.masks[&4].area, (W * H) as u32);
+        assert!(o.common.contains_key(&(0, 3)) && o.common.contains_key(&(1, 4)));
+        assert!(!o.common.contains_key(&(0, 4)) && !o.common.contains_key(&(1, 3)));
+        // The hidden blob has a silhouette of its own, but little of it is seen.
+        let (hidden, seen) = (&o.instances[&2], &o.instances[&0]);
+        assert!(hidden.area > 4 && hidden.visible < 0.1 * seen.visible, "{hidden:?} {seen:?}");
+        let m = matches(&o, 5, 0.0);
+        assert_eq!((m[0].mask, m[0].view, m[1].mask), (3, 5, 4));
+        // It covers the mask of what hides it, but its features are its own and tell it from that.
+        assert!(m.iter().all(|m| m.instance != 2), "{m:?}");
+        assert!(matches(&o, 5, 0.99).is_empty());
     }
 
     #[test]
@@ -374,8 +310,7 @@ mod tests {
         let all = [1.0, 2.0, 0.5, 0.0, 0.0, 0.0, -1.0, 3.0, 0.25];
         let (labels, maps, levels) = ([0, -1, 0], maps(), [Level::Default, Level::Small]);
         let table = FeatureTable::new(&features, 3);
-        let all_overlaps = overlaps(&g, raster, &labels, &table, &camera, &maps, &levels, &[Silhouette::Selected]);
-        let o = &all_overlaps[0];
+        let o = overlaps(&g, raster, &labels, &table, &camera, &maps, &levels);
         let image = gs_raster::render_features(&g, &all, 3, &camera, options);
         let alone = g.select(&[0, 2]);
         let own = gs_raster::render_features(&alone, &features.values, 3, &camera, options);
@@ -405,7 +340,7 @@ mod tests {
         assert_eq!(o.common[&(0, 2)], o.instances[&0].area);
         // IoU of areas, and the cosine of the sums.
         let (i, m) = (&o.instances[&0], &o.masks[&0]);
-        let best = matches(&all_overlaps, 0, 0.0)[0];
+        let best = matches(&o, 0, 0.0)[0];
         let iou = f64::from(common(0)) / f64::from(i.area + m.area - common(0));
         assert_eq!(best.mask, 0);
         assert!((f64::from(best.score) - iou * cosine(&i.features, &m.features)).abs() < 1e-6);

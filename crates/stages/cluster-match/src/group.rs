@@ -1,34 +1,12 @@
 //! Clustering of Gaussians by their features.
 
+use crate::options::Space;
 use artifacts::{Features, Graph, TreeEdge};
-use hdbscan_exact::{Clustering, Edge, Options, approximate_predict, cluster, cluster_graph};
-use rand::seq::index;
-use rand_chacha::ChaCha8Rng;
-use rand_chacha::rand_core::SeedableRng;
+use hdbscan_exact::{Clustering, Edge, Options, cluster, cluster_graph};
 use rayon::prelude::*;
 
 /// Gaussians that one task handles.
 const CHUNK: usize = 4096;
-
-/// Which pairs of Gaussians the hierarchy may join.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, clap::ValueEnum)]
-pub enum Space {
-    /// Any two: HDBSCAN of standardised features as free points (the paper)
-    Free,
-    /// Spatial neighbours only: HDBSCAN on the graph of neighbours
-    Graph,
-}
-
-/// How far apart the features of two spatial neighbours are.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, clap::ValueEnum)]
-pub enum Distance {
-    /// 1 - cosine
-    Cosine,
-    /// Length of the difference of the features at unit length, sqrt(2 - 2 cosine)
-    Chord,
-    /// Length of the difference of the standardised features
-    Euclidean,
-}
 
 /// Features standardised per channel over all Gaussians, (f - mean) / deviation (paper, "Instance Clustering"); a channel
 /// without deviation becomes zeros. Sums in f64.
@@ -67,119 +45,44 @@ pub fn standardise(values: &[f32], dim: usize) -> Vec<f32> {
     out
 }
 
-/// Features averaged over each Gaussian and its spatial neighbours, `rounds` times.
-pub fn smooth(values: &[f32], dim: usize, neighbours: &[u32], k: usize, rounds: usize) -> Vec<f32> {
-    let mut now = values.to_vec();
-    for _ in 0..rounds {
-        let mut next = vec![0.0; now.len()];
-        next.par_chunks_mut(dim).enumerate().with_min_len(CHUNK).for_each(|(i, out)| {
-            out.copy_from_slice(&now[i * dim..(i + 1) * dim]);
-            for &j in &neighbours[i * k..(i + 1) * k] {
-                for (o, v) in out.iter_mut().zip(&now[j as usize * dim..(j as usize + 1) * dim]) {
-                    *o += v;
-                }
-            }
-            out.iter_mut().for_each(|o| *o /= (k + 1) as f32);
-        });
-        now = next;
-    }
-    now
-}
-
-/// Clusters the kept Gaussians. `distance` counts on the graph only.
-pub fn group(
-    features: &Features,
-    graph: &Graph,
-    space: Space,
-    distance: Distance,
-    smoothing: usize,
-    options: &Options,
-) -> Clustering {
+/// Clusters the kept Gaussians.
+pub fn group(features: &Features, graph: &Graph, space: Space, options: &Options) -> Clustering {
     let dim = features.dim.max(1);
-    let values = smooth(&features.values, dim, &graph.gaussian_knn, graph.gaussian_k, smoothing);
     match space {
-        Space::Free => cluster(&standardise(&values, dim), dim, options),
+        Space::Free => cluster(&standardise(&features.values, dim), dim, options),
         Space::Graph => {
-            let between = FeatureDistance::new(values, dim, distance);
-            let edges = neighbour_edges(graph, &between, options.min_samples);
-            drop(between);
+            let chords = Chords::new(features.values.clone(), dim);
+            let edges = neighbour_edges(graph, &chords, options.min_samples);
+            drop(chords);
             cluster_graph(features.kept.len(), edges, options)
         }
     }
 }
 
-/// Clusters a random `sample` of the kept Gaussians as free points, and gives the others the clusters that they would fall
-/// into. `min_cluster_size` shrinks with the sample, to 2 at least. The tree speaks of the sample alone.
-pub fn group_sample(
-    features: &Features,
-    graph: &Graph,
-    smoothing: usize,
-    sample: usize,
-    seed: u64,
-    options: &Options,
-) -> Clustering {
-    let dim = features.dim.max(1);
-    let n = features.kept.len();
-    let values = standardise(&smooth(&features.values, dim, &graph.gaussian_knn, graph.gaussian_k, smoothing), dim);
-    if sample >= n {
-        return cluster(&values, dim, options);
-    }
-    let mut chosen = index::sample(&mut ChaCha8Rng::seed_from_u64(seed), n, sample).into_vec();
-    chosen.sort_unstable();
-    let mut is_chosen = vec![false; n];
-    chosen.iter().for_each(|&i| is_chosen[i] = true);
-    let rest: Vec<usize> = (0..n).filter(|&i| !is_chosen[i]).collect();
-    let rows =
-        |of: &[usize]| -> Vec<f32> { of.iter().flat_map(|&i| &values[i * dim..(i + 1) * dim]).copied().collect() };
-    let least = (options.min_cluster_size as f64 * sample as f64 / n as f64).ceil() as usize;
-    let options = Options { min_cluster_size: least.max(2), ..*options };
-    let points = rows(&chosen);
-    let mut out = cluster(&points, dim, &options);
-    let others = approximate_predict(&points, dim, &out, &options, &rows(&rest));
-    let mut labels = vec![-1; n];
-    chosen.iter().zip(&out.labels).chain(rest.iter().zip(&others.labels)).for_each(|(&i, &l)| labels[i] = l);
-    let mut nodes = vec![0; n];
-    chosen.iter().zip(&out.nodes).chain(rest.iter().zip(&others.nodes)).for_each(|(&i, &node)| nodes[i] = node);
-    let mut probabilities = vec![0.0; n];
-    let all = chosen.iter().zip(&out.probabilities).chain(rest.iter().zip(&others.probabilities));
-    all.for_each(|(&i, &p)| probabilities[i] = p);
-    // Outlier scores are of clustered points only.
-    let mut outlier_scores = vec![0.0; n];
-    chosen.iter().zip(&out.outlier_scores).for_each(|(&i, &s)| outlier_scores[i] = s);
-    (out.labels, out.nodes) = (labels, nodes);
-    (out.probabilities, out.outlier_scores) = (probabilities, outlier_scores);
-    out
-}
-
-/// Distances of features, [`Distance`].
-struct FeatureDistance {
-    /// Features at unit length (zeros where there is no direction) or standardised.
+/// Distances of features on the graph: lengths of the difference at unit length, sqrt(2 - 2 cosine).
+struct Chords {
+    /// Features at unit length; zeros where there is no direction.
     values: Vec<f32>,
     /// Which of them have no direction.
     nowhere: Vec<bool>,
     dim: usize,
-    distance: Distance,
 }
 
-impl FeatureDistance {
-    fn new(values: Vec<f32>, dim: usize, distance: Distance) -> Self {
-        let mut values = if distance == Distance::Euclidean { standardise(&values, dim) } else { values };
-        if distance != Distance::Euclidean {
-            values.par_chunks_mut(dim).with_min_len(CHUNK).for_each(unit);
-        }
+impl Chords {
+    fn new(mut values: Vec<f32>, dim: usize) -> Self {
+        values.par_chunks_mut(dim).with_min_len(CHUNK).for_each(unit);
         let nowhere = values.par_chunks(dim).with_min_len(CHUNK).map(|row| row.iter().all(|&v| v == 0.0)).collect();
-        Self { values, nowhere, dim, distance }
+        Self { values, nowhere, dim }
     }
 
     fn get(&self, a: usize, b: usize) -> f64 {
-        let row = |i: usize| &self.values[i * self.dim..(i + 1) * self.dim];
+        // A feature without a direction has a cosine of 0 with any other.
+        if self.nowhere[a] || self.nowhere[b] {
+            return 2.0f64.sqrt();
+        }
         // Differences keep the digits that 1 - dot product would lose between near-equal features.
-        let square = match self.distance {
-            // A feature without a direction has a cosine of 0 with any other.
-            Distance::Cosine | Distance::Chord if self.nowhere[a] || self.nowhere[b] => 2.0,
-            _ => square_of_difference(row(a), row(b)),
-        };
-        if self.distance == Distance::Cosine { 0.5 * square } else { square.sqrt() }
+        let row = |i: usize| &self.values[i * self.dim..(i + 1) * self.dim];
+        square_of_difference(row(a), row(b)).sqrt()
     }
 }
 
@@ -207,7 +110,7 @@ fn unit(row: &mut [f32]) {
 
 /// Edges between spatial neighbours with mutual reachability, each once: a Gaussian's core distance is the distance to the
 /// (`min_samples` - 1)-th nearest in features among its spatial neighbours, or to the last where there are fewer.
-fn neighbour_edges(graph: &Graph, between: &FeatureDistance, min_samples: usize) -> Vec<Edge> {
+fn neighbour_edges(graph: &Graph, between: &Chords, min_samples: usize) -> Vec<Edge> {
     let (n, k) = (graph.kept.len(), graph.gaussian_k);
     let list = |i: usize| &graph.gaussian_knn[i * k..(i + 1) * k];
     // To all neighbours; rows are padded with the Gaussian itself, which does not count.
@@ -299,31 +202,11 @@ mod tests {
         let (f, g) = two_rods();
         let o = Options { min_cluster_size: 10, min_samples: 3, ..Options::default() };
         for space in [Space::Free, Space::Graph] {
-            for distance in [Distance::Cosine, Distance::Chord, Distance::Euclidean] {
-                let c = group(&f, &g, space, distance, 0, &o);
-                assert_eq!(c.selected.len(), 2, "{space:?} {distance:?}");
-                assert!(c.labels[5] != c.labels[45] && c.labels[5] >= 0 && c.labels[45] >= 0, "{space:?} {distance:?}");
-                let tree = tree(&c);
-                assert_eq!(tree.iter().filter(|e| e.instance >= 0).count(), 2);
-            }
+            let c = group(&f, &g, space, &o);
+            assert_eq!(c.selected.len(), 2, "{space:?}");
+            assert!(c.labels[5] != c.labels[45] && c.labels[5] >= 0 && c.labels[45] >= 0, "{space:?}");
+            assert_eq!(tree(&c).iter().filter(|e| e.instance >= 0).count(), 2);
         }
-    }
-
-    #[test]
-    fn a_sample_finds_the_same_two_rods() {
-        let (f, g) = two_rods();
-        let o = Options { min_cluster_size: 20, min_samples: 3, ..Options::default() };
-        let all = group(&f, &g, Space::Free, Distance::Chord, 0, &o);
-        assert_eq!(group_sample(&f, &g, 0, 60, 1, &o), all);
-        let c = group_sample(&f, &g, 0, 30, 1, &o);
-        assert_eq!((c.selected.len(), c.labels.len(), c.tree.points <= 30), (2, 60, true));
-        for rod in [&c.labels[..30], &c.labels[30..]] {
-            let known: Vec<i32> = rod.iter().copied().filter(|&l| l >= 0).collect();
-            assert!(known.len() > 20 && known.iter().all(|&l| l == known[0]), "{rod:?}");
-        }
-        let in_a_cluster = c.nodes.iter().filter(|n| c.selected.contains(n)).count();
-        assert_eq!(in_a_cluster, c.labels.iter().filter(|&&l| l >= 0).count(), "predicted ones have a node as well");
-        assert_eq!(c, group_sample(&f, &g, 0, 30, 1, &o));
     }
 
     #[test]
@@ -331,23 +214,18 @@ mod tests {
         let (mut f, g) = two_rods();
         f.values = (0..60).flat_map(|i| [1.0, 0.001 * (i % 7) as f32]).collect();
         let o = Options { min_cluster_size: 10, min_samples: 3, epsilon: 0.1, ..Options::default() };
-        let c = group(&f, &g, Space::Graph, Distance::Chord, 0, &o);
+        let c = group(&f, &g, Space::Graph, &o);
         assert_eq!(c.selected.len(), 2);
         assert_ne!(c.labels[5], c.labels[45]);
     }
 
     #[test]
     fn distances_are_those_of_the_angle() {
-        let values = [2.0, 0.0, 0.0, 3.0, 0.0, 0.0, 5.0, 5.0, 4.0, 0.0];
-        let (cosine, chord) =
-            [Distance::Cosine, Distance::Chord].map(|d| FeatureDistance::new(values.to_vec(), 2, d)).into();
+        let chords = Chords::new(vec![2.0, 0.0, 0.0, 3.0, 0.0, 0.0, 5.0, 5.0, 4.0, 0.0], 2);
         let root = 0.5f64.sqrt();
         for (a, b, expected) in [(0, 1, 1.0), (0, 3, 1.0 - root), (0, 4, 0.0), (0, 2, 1.0), (2, 2, 1.0)] {
-            assert!((cosine.get(a, b) - expected).abs() < 1e-7, "{a} {b}");
-            assert!((chord.get(a, b) - (2.0 * expected).sqrt()).abs() < 1e-7, "{a} {b}");
+            assert!((chords.get(a, b) - (2.0 * expected).sqrt()).abs() < 1e-7, "{a} {b}");
         }
-        let euclidean = FeatureDistance::new(vec![0.0, 7.0, 2.0, 7.0, 0.0, 7.0, 2.0, 7.0], 2, Distance::Euclidean);
-        assert!((euclidean.get(0, 1) - 2.0).abs() < 1e-6 && euclidean.get(0, 2) == 0.0);
     }
 
     #[test]
@@ -359,7 +237,7 @@ mod tests {
             gaussian_knn: vec![1, 0, 0, 1, 0, 2, 3, 3],
             ..Graph::default()
         };
-        let between = FeatureDistance::new(vec![0.0, 1.0, 3.0, 9.0], 1, Distance::Euclidean);
+        let between = Chords::new(vec![1.0, 0.0, 1.0, 0.1, 1.0, 0.3, 1.0, 0.9], 2);
         let pairs = |samples| -> Vec<(u32, u32, f64)> {
             neighbour_edges(&graph, &between, samples).into_iter().map(|e| (e.a, e.b, e.weight)).collect()
         };
@@ -370,12 +248,5 @@ mod tests {
         // Nine channels: whole partial sums and a rest.
         let (a, b): (Vec<f32>, Vec<f32>) = (0..9).map(|c| (c as f32, 2.0 * c as f32)).unzip();
         assert_eq!(square_of_difference(&a, &b), 204.0);
-    }
-
-    #[test]
-    fn smoothing_averages_over_neighbours() {
-        let s = smooth(&[0.0, 3.0, 6.0], 1, &[1, 2, 0, 2, 1, 0], 2, 1);
-        assert_eq!(s, [3.0, 3.0, 3.0]);
-        assert_eq!(smooth(&[0.0, 3.0, 6.0], 1, &[1, 2, 0, 2, 1, 0], 2, 0), [0.0, 3.0, 6.0]);
     }
 }

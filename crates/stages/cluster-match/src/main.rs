@@ -3,5 +3,5 @@
 use std::process::ExitCode;
 
 fn main() -> ExitCode {
-    stage::main::<cluster_match::cli::Args>()
+    stage::main::<cluster_match::options::Args>()
 }

@@ -1,0 +1,153 @@
+//! Reading the inputs, and checking that they belong together.
+
+use crate::options::Args;
+use artifacts::{Features, Footprints, Graph, MaskFeatures, MaskMaps, features_path, hash_folder, maps_path, role};
+use gs_io::{Error, IoContext, Provenance, Result, hash_file};
+use gs_scene::Geometry;
+use gs_scene::dataset::{self, Dataset, LoadOptions, Resolution, View};
+use stage::Stage;
+use std::collections::BTreeMap;
+use std::path::Path;
+
+/// The inputs, checked against each other.
+pub(crate) struct Inputs {
+    pub geometry: Geometry,
+    pub graph: Graph,
+    pub footprints: Footprints,
+    pub features: Features,
+    /// The views whose masks the footprints hold.
+    pub views: Vec<View>,
+    /// Content hash of each input, by role.
+    pub hashes: BTreeMap<String, String>,
+}
+
+impl Inputs {
+    pub fn read(a: &Args, stage: &Stage) -> Result<Self> {
+        let geometry = Geometry::read(&a.geometry)?;
+        if let Some(damage) = geometry.damage() {
+            stage.skipped(&damage);
+        }
+        let geometry_hash = hash_file(&a.geometry)?;
+        let (graph, graph_file) = Graph::read(&a.graph)?;
+        let footprints = Footprints::read(&a.footprints)?;
+        let (features, features_file) = Features::read(&a.features)?;
+        let masks = hash_folder(&a.masks, "_s.npy")?;
+        let dataset = dataset::load(&a.scene, &LoadOptions { resolution: Resolution::Divisor(1.0), holdout: 0 })?;
+        dataset.warnings.iter().for_each(|w| stage.warn(w));
+        let dataset_hash = dataset.hash()?;
+        graph_file.expect_input(role::GEOMETRY, &geometry_hash)?;
+        footprints.artifact().expect_input(role::GEOMETRY, &geometry_hash)?;
+        footprints.artifact().expect_input(role::MASKS, &masks)?;
+        graph_file.expect_input(role::DATASET, &dataset_hash)?;
+        footprints.artifact().expect_input(role::DATASET, &dataset_hash)?;
+        features_file.expect_input(role::GRAPH, graph_file.hash())?;
+        features_file.expect_input(role::FOOTPRINTS, footprints.artifact().hash())?;
+        check_features(a, &features, &graph, geometry.gaussians.len())?;
+        let views = matched_views(a, &dataset, &footprints, stage)?;
+        let mut hashes = BTreeMap::from([
+            (role::GEOMETRY.into(), geometry_hash),
+            (role::DATASET.into(), dataset_hash),
+            (role::GRAPH.into(), graph_file.hash().into()),
+            (role::FOOTPRINTS.into(), footprints.artifact().hash().into()),
+            (role::FEATURES.into(), features_file.hash().into()),
+            (role::MASK_FEATURES.into(), hash_folder(&a.masks, "_f.npy")?),
+        ]);
+        hashes.extend(clip_of_features(&a.masks, &masks)?);
+        hashes.insert(role::MASKS.into(), masks);
+        Ok(Self { geometry, graph, footprints, features, views, hashes })
+    }
+}
+
+fn check_features(a: &Args, features: &Features, graph: &Graph, gaussians: usize) -> Result<()> {
+    let wrong = |what: &str, field: &str| {
+        Err(Error::new(what).file(&a.features).field(field).hint("run feat-train again with this --graph"))
+    };
+    if graph.seen_views.len() != gaussians || graph.kept != features.kept {
+        return wrong("the features belong to other Gaussians than the graph", "kept");
+    }
+    if features.dim == 0 {
+        return wrong("the features have no dimension", "features");
+    }
+    Ok(())
+}
+
+/// The views that the footprints know, in their order.
+fn matched_views(a: &Args, dataset: &Dataset, footprints: &Footprints, stage: &Stage) -> Result<Vec<View>> {
+    let without: Vec<&str> =
+        dataset.views.iter().map(View::stem).filter(|s| !footprints.views.iter().any(|v| v == s)).collect();
+    if !without.is_empty() {
+        const SHOWN: usize = 5;
+        let more = if without.len() > SHOWN { ", ..." } else { "" };
+        stage.skipped(&format!(
+            "{} of {} views in matching: held out, or without masks ({}{more})",
+            without.len(),
+            dataset.views.len(),
+            without[..without.len().min(SHOWN)].join(", ")
+        ));
+    }
+    let view = |stem: &String| {
+        dataset.views.iter().find(|v| v.stem() == stem).cloned().ok_or_else(|| {
+            Error::new("a view of the footprints is not in the dataset")
+                .file(&a.scene)
+                .field("views")
+                .found(stem)
+                .hint("give the dataset that graph-precompute was given")
+        })
+    };
+    footprints.views.iter().map(view).collect()
+}
+
+/// Hashes of the CLIP model that made the mask features, as far as `features.json` of mask-embed names it.
+///
+/// # Errors
+/// When the features belong to other id maps.
+fn clip_of_features(folder: &Path, masks: &str) -> Result<BTreeMap<String, String>> {
+    let manifest = folder.join("features.json");
+    // Features of another program come without one.
+    if !manifest.exists() {
+        return Ok(BTreeMap::new());
+    }
+    let bytes = std::fs::read(&manifest).at("read", &manifest)?;
+    let known: Provenance = serde_json::from_slice(&bytes).map_err(|e| {
+        Error::new(format!("not a manifest of mask features: {e}")).file(&manifest).hint("run mask-embed embed again")
+    })?;
+    if known.inputs.get(role::MASKS).is_some_and(|m| m != masks) {
+        return Err(Error::new("the id maps were changed after their features were made")
+            .file(&manifest)
+            .field("inputs.masks")
+            .hint("run mask-embed embed again"));
+    }
+    Ok(known.inputs.into_iter().filter(|(role, _)| [role::CLIP, role::CLIP_TEXT].contains(&role.as_str())).collect())
+}
+
+/// The mask features of a view, if there are any; they must fit its id maps and have `dim` dimensions, where that is known.
+pub(crate) fn mask_features(
+    folder: &Path,
+    stem: &str,
+    maps: &MaskMaps,
+    dim: Option<usize>,
+) -> Result<Option<MaskFeatures>> {
+    let path = features_path(folder, stem);
+    if !path.is_file() {
+        return Ok(None);
+    }
+    let features = MaskFeatures::read(&path)?;
+    let wrong = |what: &str, field: &str, found: usize, expected: String| {
+        let e = Error::new(what).file(&path).field(field).found(found).expected(expected);
+        Err(e.hint("run mask-embed embed again"))
+    };
+    if features.count < maps.id_count() {
+        return wrong("fewer features than masks", "rows", features.count, format!("at least {}", maps.id_count()));
+    }
+    match dim {
+        Some(dim) if dim != features.dim => {
+            wrong("features of different models", "columns", features.dim, dim.to_string())
+        }
+        _ => Ok(Some(features)),
+    }
+}
+
+/// The id maps of a view.
+pub(crate) fn id_maps(folder: &Path, stem: &str) -> Result<MaskMaps> {
+    MaskMaps::read(maps_path(folder, stem))
+}

@@ -1,0 +1,173 @@
+//! The command line of `cluster-match`: every option with its default and range.
+
+#![allow(rustdoc::invalid_html_tags, reason = "help texts name files as <view>_s.npy")]
+
+use crate::outputs::SIDE_FILES;
+use artifacts::Level;
+use clap::Parser;
+use gs_io::{Error, Result};
+use hdbscan_exact::Selection;
+use serde::Serialize;
+use stage::{CommonArgs, Program, Stage};
+use std::path::PathBuf;
+
+/// Stage 3: 3D instances, the masks they are seen as, and a language descriptor for each
+#[derive(Debug, Parser)]
+#[command(name = "cluster-match", version)]
+pub struct Args {
+    /// Dataset folder (COLMAP, transforms.json or ScanNet)
+    #[arg(long, value_name = "DIR")]
+    pub(crate) scene: PathBuf,
+    /// The Gaussians, as a 3DGS PLY
+    #[arg(long, value_name = "FILE")]
+    pub(crate) geometry: PathBuf,
+    /// graph.safetensors of graph-precompute
+    #[arg(long, value_name = "FILE")]
+    pub(crate) graph: PathBuf,
+    /// footprints.safetensors of graph-precompute
+    #[arg(long, value_name = "FILE")]
+    pub(crate) footprints: PathBuf,
+    /// features.safetensors of feat-train
+    #[arg(long, value_name = "FILE")]
+    pub(crate) features: PathBuf,
+    /// Folder with id maps (<view>_s.npy) and, for language, mask features (<view>_f.npy)
+    #[arg(long, value_name = "DIR")]
+    pub(crate) masks: PathBuf,
+    /// Output file. Beside it are written <name>.ply (the Gaussians in the colours of their instances), <name>.labels.npy
+    /// (an i32 for every Gaussian, -1 for none) and <name>.json (the instances as text)
+    #[arg(long, value_name = "FILE")]
+    pub(crate) out: PathBuf,
+    /// Also write one PLY per instance into this folder
+    #[arg(long, value_name = "DIR")]
+    pub(crate) per_instance_plys: Option<PathBuf>,
+    #[command(flatten)]
+    pub(crate) settings: Settings,
+    #[command(flatten)]
+    pub(crate) common: CommonArgs,
+}
+
+/// What shapes the result. The provenance of the instances holds all of it.
+#[derive(Debug, Clone, clap::Args, Serialize)]
+#[command(next_help_heading = "Clustering")]
+pub(crate) struct Settings {
+    /// Cluster on the graph of spatial neighbours, or free points in feature space (the paper)
+    #[arg(long, value_enum, default_value_t = Space::Graph)]
+    pub cluster: Space,
+    /// Fewest Gaussians of an instance [default: 30; on the graph a thousandth of the Gaussians that are seen, at least 10
+    /// and at most 30, because small scenes have small things]
+    #[arg(long, value_name = "COUNT", value_parser = stage::within(2usize..=MOST))]
+    pub min_cluster_size: Option<usize>,
+    /// Neighbours, the Gaussian itself included, that set its core distance; for free points the default is 30
+    #[arg(long, value_name = "COUNT", value_parser = stage::within(1usize..=MOST), default_value = "10",
+        default_value_if("cluster", "free", "30"))]
+    pub min_samples: usize,
+    /// Join clusters that were born below this feature distance; for free points the default is 0.1
+    // Free points: as GARField and InstaScene. On the graph 0.1 to 0.2 give the same mIoU within 0.01 on synthetic scenes
+    // of mixed granularity; 0 gives hundreds of fragments, because near-equal features have lambdas without bound.
+    #[arg(long, value_name = "DISTANCE", value_parser = stage::at_least(0.0f64), default_value = "0.15",
+        default_value_if("cluster", "free", "0.1"))]
+    pub epsilon: f64,
+    /// Select the finest clusters instead of the most stable ones
+    #[arg(long)]
+    pub leaf: bool,
+    /// Allow one instance of all Gaussians where nothing divides them
+    #[arg(long)]
+    pub allow_single_cluster: bool,
+    /// What happens to Gaussians in no cluster
+    #[arg(long, value_enum, default_value_t = Noise::Nearest)]
+    pub noise: Noise,
+    /// Join instances that the masks show as one with at least this probability: more than 0.5, or 0 to join none; for free
+    /// points the default is 0
+    #[arg(long, value_name = "PROBABILITY", value_parser = join_probability, default_value = "0.6",
+        default_value_if("cluster", "free", "0"))]
+    pub join: f64,
+    /// Rounds in which a Gaussian may change to the neighbouring instance that its masks show; for free points the default
+    /// is 0
+    #[arg(long, value_name = "ROUNDS", default_value = "3", default_value_if("cluster", "free", "0"))]
+    pub votes: usize,
+    /// Levels of the masks that vote, join and match; for free points the default is large, as in the paper
+    #[arg(
+        long,
+        value_delimiter = ',',
+        value_name = "LEVELS",
+        default_value = "default,small,medium,large",
+        default_value_if("cluster", "free", "large"),
+        help_heading = "Matching"
+    )]
+    pub level: Vec<Level>,
+    /// Least association score of a match (IoU x similarity of features)
+    #[arg(long, default_value_t = 0.2, value_name = "SCORE", value_parser = stage::within(0.0..=1.0),
+        help_heading = "Matching")]
+    pub threshold: f64,
+}
+
+/// Largest count that an option takes: as many as there can be Gaussians.
+const MOST: usize = u32::MAX as usize;
+
+/// Which pairs of Gaussians the hierarchy may join.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, clap::ValueEnum, Serialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Space {
+    /// Any two: HDBSCAN of standardised features as free points (the paper)
+    Free,
+    /// Spatial neighbours only: HDBSCAN on the graph of neighbours
+    Graph,
+}
+
+/// What happens to Gaussians that the clustering calls noise.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, clap::ValueEnum, Serialize)]
+#[serde(rename_all = "lowercase")]
+pub(crate) enum Noise {
+    /// They get the instance of the nearest Gaussian in space that has one
+    Nearest,
+    /// They get no instance
+    Keep,
+}
+
+fn join_probability(text: &str) -> std::result::Result<f64, String> {
+    let good = |v: &f64| *v == 0.0 || *v > 0.5 && *v <= 1.0;
+    text.parse().ok().filter(good).ok_or_else(|| "expected 0, or more than 0.5 and at most 1".into())
+}
+
+impl Settings {
+    /// These settings for a scene of `n` Gaussians that are seen: nothing is left open.
+    pub fn for_gaussians(&self, n: usize) -> Self {
+        // Measured at 12,000 and 88,000 Gaussians (docs/accuracy.md).
+        let smallest = if self.cluster == Space::Graph { n.div_ceil(1000).clamp(10, 30) } else { 30 };
+        Self { min_cluster_size: self.min_cluster_size.or(Some(smallest)), ..self.clone() }
+    }
+
+    /// The options of HDBSCAN.
+    pub fn hdbscan(&self) -> hdbscan_exact::Options {
+        hdbscan_exact::Options {
+            min_cluster_size: self.min_cluster_size.unwrap_or(30),
+            min_samples: self.min_samples,
+            epsilon: self.epsilon,
+            selection: if self.leaf { Selection::Leaf } else { Selection::ExcessOfMass },
+            allow_single_cluster: self.allow_single_cluster,
+        }
+    }
+}
+
+impl Program for Args {
+    const NAME: &'static str = "cluster-match";
+
+    fn common(&self) -> &CommonArgs {
+        &self.common
+    }
+
+    fn check(&self) -> Result<()> {
+        match SIDE_FILES.iter().find(|e| self.out.with_extension(e) == self.out) {
+            Some(taken) => Err(Error::new("another output has this name")
+                .file(&self.out)
+                .field("--out")
+                .found(format!(".{taken}"))
+                .expected("a name such as instances.safetensors")),
+            None => Ok(()),
+        }
+    }
+
+    fn run(self, stage: &Stage) -> Result<()> {
+        crate::run::run(&self, stage)
+    }
+}

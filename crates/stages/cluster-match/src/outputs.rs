@@ -1,0 +1,134 @@
+//! What the stage writes: the artifact, and beside it what people and viewers read.
+
+use crate::health::Health;
+use crate::inputs::Inputs;
+use crate::options::{Args, Settings};
+use artifacts::{Instances, NOISE_COLOR, instance_color};
+use gs_io::{Claim, Error, Outputs, Result, write_bytes};
+use gs_scene::{Gaussians, SH_C0, ply};
+use serde_json::{Value, json};
+use stage::Stage;
+use std::path::Path;
+
+/// What is written beside the output, by extension: coloured Gaussians, labels, and the instances as text.
+pub(crate) const SIDE_FILES: [&str; 3] = ["ply", "labels.npy", "json"];
+
+/// What the record of the run says of the clustering.
+pub(crate) struct Figures {
+    /// Gaussians that the clustering called noise.
+    pub noise: usize,
+    /// Seconds that it took.
+    pub clustering_seconds: f64,
+}
+
+/// The right to write the instances and what lies beside them.
+pub(crate) fn claim(a: &Args, stage: &Stage) -> Result<Claim> {
+    let mut maps = Vec::new();
+    for suffix in ["_s.npy", "_f.npy"] {
+        maps.extend(artifacts::folder_files(&a.masks, suffix)?);
+    }
+    let outputs = stage
+        .outputs(&a.out)
+        .artifact(&a.out, Instances::FORMAT)
+        .files(SIDE_FILES.map(|extension| a.out.with_extension(extension)))
+        .reads([&a.geometry, &a.graph, &a.footprints, &a.features])
+        .reads(maps)
+        .drop_stale();
+    a.per_instance_plys.iter().fold(outputs, Outputs::folder).claim()
+}
+
+/// Writes everything, the artifact last: where it is new, so is everything beside it.
+pub(crate) fn write(
+    a: &Args,
+    stage: &Stage,
+    inputs: &Inputs,
+    instances: &Instances,
+    settings: &Settings,
+    figures: &Figures,
+    claim: &mut Claim,
+) -> Result<()> {
+    let fail = |e: serde_json::Error| Error::new(e.to_string());
+    let parameters = serde_json::to_value(settings).map_err(fail)?;
+    let own = vec![format!("made by cluster-match {}", env!("CARGO_PKG_VERSION")), format!("parameters {parameters}")];
+    let (gaussians, comments) = (&inputs.geometry.gaussians, inputs.geometry.comments(own));
+    let [colors, list, table] = SIDE_FILES.map(|extension| a.out.with_extension(extension));
+    ply::write_gaussians(colors, &colored(gaussians, &instances.label), &comments)?;
+    gs_io::npy::write_i32(list, &[instances.label.len()], &instances.label)?;
+    write_bytes(table, &serde_json::to_vec_pretty(&as_text(instances, &parameters)).map_err(fail)?)?;
+    if let Some(folder) = &a.per_instance_plys {
+        write_instance_plys(folder, gaussians, instances, &comments)?;
+    }
+    let matched = instances.support.iter().filter(|&&s| s > 0).count();
+    let health = Health::of(instances, &inputs.footprints, &inputs.graph.kept, &settings.level);
+    health.say(stage);
+    let summary = json!({
+        "largest_share": health.largest, "mask_purity": health.purity,
+        "instances": instances.len(), "noise": figures.noise, "matched": matched, "matches": instances.matches.len(),
+        "clustering_seconds": figures.clustering_seconds,
+    });
+    stage.record(claim, parameters.clone(), inputs.hashes.clone(), summary)?;
+    instances.write(&a.out, stage.provenance(Instances::FORMAT, 1, parameters, inputs.hashes.clone()))?;
+    stage.info(&format!("wrote {}: {} instances, {matched} matched with masks", a.out.display(), instances.len()));
+    Ok(())
+}
+
+/// The geometry in the colours of its instances, as a plain 3DGS PLY that any viewer shows.
+fn colored(g: &Gaussians, labels: &[i32]) -> Gaussians {
+    let color = |&l: &i32| u32::try_from(l).map_or(NOISE_COLOR, instance_color).map(|v| (v - 0.5) / SH_C0);
+    Gaussians {
+        means: g.means.clone(),
+        log_scales: g.log_scales.clone(),
+        rotations: g.rotations.clone(),
+        opacity_logits: g.opacity_logits.clone(),
+        sh: labels.iter().flat_map(color).collect(),
+        sh_degree: 0,
+    }
+}
+
+/// The instances as JSON: where they are, how large, and as which masks they were seen.
+fn as_text(instances: &Instances, parameters: &Value) -> Value {
+    let sizes = instances.cluster_sizes();
+    let gaussians = |cluster: u32| sizes.get(&cluster).copied().unwrap_or(0);
+    let part = |&p: &u32| json!({"cluster": p, "gaussians": gaussians(p)});
+    let list: Vec<Value> = (0..instances.len())
+        .map(|k| {
+            let own = instances.matches.iter().filter(|m| m.instance as usize == k);
+            let matches: Vec<Value> = own
+                .map(|m| json!({"view": instances.views[m.view as usize], "mask": m.mask, "score": m.score}))
+                .collect();
+            let family = instances.family(k);
+            let parent = family.as_ref().and_then(|f| f.parent).map(
+                |p| json!({"cluster": p, "gaussians": gaussians(p), "instances": instances.instances_of_cluster(p)}),
+            );
+            let parts: Vec<Value> = family.iter().flat_map(|f| &f.parts).map(part).collect();
+            let b = &instances.oriented[k];
+            json!({
+                "oriented_box": {"center": b.center, "axes": b.axes, "half_size": b.half_size},
+                "clusters": family.map(|f| f.own), "parent": parent, "parts": parts,
+                "instance": k, "gaussians": instances.count[k], "support": instances.support[k],
+                "score": instances.score[k], "centroid": instances.centroid[k],
+                "bbox_min": instances.bbox_min[k], "bbox_max": instances.bbox_max[k],
+                "color": instance_color(k as u32), "matches": matches,
+            })
+        })
+        .collect();
+    let unlabelled = instances.label.iter().filter(|&&l| l < 0).count();
+    json!({
+        "gaussians": instances.label.len(), "without_instance": unlabelled, "descriptor_dim": instances.dim,
+        "parameters": parameters, "instances": list,
+    })
+}
+
+/// One PLY per instance, `instance_0000.ply` on.
+fn write_instance_plys(folder: &Path, g: &Gaussians, instances: &Instances, comments: &[String]) -> Result<()> {
+    let mut members = vec![Vec::new(); instances.len()];
+    for (i, &label) in instances.label.iter().enumerate() {
+        if let Ok(k) = usize::try_from(label) {
+            members[k].push(i as u32);
+        }
+    }
+    for (k, own) in members.iter().enumerate() {
+        ply::write_gaussians(folder.join(format!("instance_{k:04}.ply")), &g.select(own), comments)?;
+    }
+    Ok(())
+}

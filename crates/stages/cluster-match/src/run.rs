@@ -1,0 +1,125 @@
+//! The stage from its inputs to its outputs.
+
+use crate::assignment::Assignment;
+use crate::associate::{FeatureTable, matches, overlaps};
+use crate::describe::describe;
+use crate::group::group;
+use crate::inputs::{Inputs, id_maps, mask_features};
+use crate::options::{Args, Noise, Settings};
+use crate::outputs::{self, Figures};
+use artifacts::{Instances, MaskFeatures, Match};
+use gs_io::{Result, Watched};
+use gs_raster::RasterOptions;
+use gs_scene::dataset::View;
+use stage::Stage;
+use std::collections::BTreeMap;
+use std::time::Instant;
+
+/// Reads the inputs, finds the instances, matches them with masks, and writes them.
+pub(crate) fn run(a: &Args, stage: &Stage) -> Result<()> {
+    let mut claim = outputs::claim(a, stage)?;
+    let mut watched = Watched::new([&a.geometry]);
+    for suffix in ["_s.npy", "_f.npy"] {
+        watched = watched.and(artifacts::watch_folder(&a.masks, suffix)?);
+    }
+    let inputs = Inputs::read(a, stage)?;
+    let settings = a.settings.for_gaussians(inputs.graph.kept.len());
+    forecast(&inputs, stage)?;
+
+    let start = Instant::now();
+    let clustering = group(&inputs.features, &inputs.graph, settings.cluster, &settings.hdbscan());
+    let noise = clustering.labels.iter().filter(|&&l| l < 0).count();
+    let figures = Figures { noise, clustering_seconds: start.elapsed().as_secs_f64() };
+    let found = Assignment::new(&clustering, &inputs.graph.kept, inputs.geometry.gaussians.len());
+    drop(clustering);
+    stage.info(&format!("{} instances among {} Gaussians, {noise} noise", found.instances, inputs.graph.kept.len()));
+    if found.instances == 0 {
+        stage.warn(
+            "everything is noise: no instance was found; give a smaller --min-cluster-size, or --allow-single-cluster \
+             where the scene is one thing",
+        );
+    }
+    let found = correct(found, &inputs, &settings, stage)?;
+
+    let (matches, features) = match_views(a, &settings, &inputs, &found.labels, stage)?;
+    if features.is_empty() {
+        stage.skipped("language descriptors: the masks have no features (*_f.npy; mask-embed embed makes them)");
+    }
+    let views = inputs.views.iter().map(|v| v.stem().to_string()).collect();
+    let means = &inputs.geometry.gaussians.means;
+    let described = describe(means, found.labels, found.instances, matches, &features);
+    let instances = Instances { views, tree: found.tree, node: found.nodes, ..described };
+    watched.check()?;
+    outputs::write(a, stage, &inputs, &instances, &settings, &figures, &mut claim)
+}
+
+/// Says how much memory the run will take.
+fn forecast(inputs: &Inputs, stage: &Stage) -> Result<()> {
+    let (entries, samples) = (inputs.footprints.csr().1.len(), inputs.footprints.pixels.col.len());
+    let (gaussians, features) = (inputs.geometry.gaussians.len(), &inputs.features);
+    let needed = crate::memory::forecast(gaussians, features.kept.len(), features.dim, entries, samples);
+    stage.forecast(needed, "drop small footprint entries: graph-precompute --cut 0.001")
+}
+
+/// Corrects the clustering by what it does not know: where Gaussians lie, and how the masks of each view cut the scene.
+fn correct(mut found: Assignment, inputs: &Inputs, settings: &Settings, stage: &Stage) -> Result<Assignment> {
+    let (means, graph, footprints) = (&inputs.geometry.gaussians.means, &inputs.graph, &inputs.footprints);
+    let mut kept = vec![false; means.len()];
+    graph.kept.iter().for_each(|&i| kept[i as usize] = true);
+    if settings.noise == Noise::Nearest {
+        let noise: Vec<bool> = found.labels.iter().zip(&kept).map(|(&l, &k)| k && l < 0).collect();
+        found.fill_from_nearest(means, |i| noise[i])?;
+    }
+    if settings.votes > 0 {
+        let changed = found.vote(graph, footprints, &settings.level, settings.votes);
+        stage.info(&format!("votes of the masks changed the instance of {changed} Gaussians"));
+    }
+    if settings.join > 0.0 {
+        let before = found.instances;
+        found.join(&graph.kept, footprints, &settings.level, settings.join);
+        if found.instances < before {
+            stage.info(&format!("{} instances after joining pieces that the masks show as one", found.instances));
+        }
+    }
+    // Damaged Gaussians have no place, so they are nobody's neighbour and stay without an instance.
+    let whole = inputs.geometry.whole();
+    let unseen = (0..means.len()).filter(|&i| !kept[i] && whole[i]).count();
+    if unseen > 0 {
+        let n = means.len();
+        stage.skipped(&format!(
+            "{unseen} of {n} Gaussians in clustering: never seen; labelled from their nearest neighbour"
+        ));
+        found.fill_from_nearest(means, |i| !kept[i] && whole[i])?;
+    }
+    Ok(found)
+}
+
+/// Matches the instances with the masks of every view; and the mask features by view index.
+fn match_views(
+    a: &Args,
+    settings: &Settings,
+    inputs: &Inputs,
+    labels: &[i32],
+    stage: &Stage,
+) -> Result<(Vec<Match>, BTreeMap<u32, MaskFeatures>)> {
+    let (gaussians, raster) = (&inputs.geometry.gaussians, RasterOptions::of(&inputs.geometry));
+    let table = FeatureTable::new(&inputs.features, gaussians.len());
+    let mut found = Vec::new();
+    let mut features: BTreeMap<u32, MaskFeatures> = BTreeMap::new();
+    let mut progress = stage.progress("matching views", inputs.views.len() as u64);
+    for (index, stem) in inputs.views.iter().map(View::stem).enumerate() {
+        let maps = id_maps(&a.masks, stem)?;
+        let camera = inputs.views[index].camera.resized(maps.width as u32, maps.height as u32);
+        let overlaps = overlaps(gaussians, &raster, labels, &table, &camera, &maps, &settings.level);
+        found.extend(matches(&overlaps, index as u32, settings.threshold as f32));
+        let dim = features.values().next().map(|f| f.dim);
+        features.extend(mask_features(&a.masks, stem, &maps, dim)?.map(|f| (index as u32, f)));
+        progress.step();
+    }
+    progress.finish(&[("matches", found.len() as f64)]);
+    let (with, all) = (features.len(), inputs.views.len());
+    if with > 0 && with < all {
+        stage.warn(&format!("{} of {all} views have no mask features", all - with));
+    }
+    Ok((found, features))
+}
