@@ -42,7 +42,7 @@ bench-cluster:
 
 # cluster-match --cluster graph at a million Gaussians: cluster-graph.json.
 bench-cluster-graph:
-	$(CARGO) bench -p cluster-match --bench graph -- --out $(CURDIR)/out/bench/cluster-graph.json
+	$(CARGO) bench -p cluster-match --bench graph
 
 # A query over a million Gaussians and 500 instances: query.json.
 bench-query:
