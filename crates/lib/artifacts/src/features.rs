@@ -1,6 +1,6 @@
 //! `features.safetensors`: a feature vector per kept Gaussian.
 
-use crate::graph::check_kept;
+use crate::checks::check_kept;
 use gs_io::{Artifact, ArtifactWriter, Error, Provenance, Result};
 use std::path::Path;
 
@@ -9,7 +9,7 @@ use std::path::Path;
 pub struct Features {
     /// Original indices of the kept Gaussians, ascending; n.
     pub kept: Vec<u32>,
-    /// Numbers per Gaussian.
+    /// Dimension of a feature.
     pub dim: usize,
     /// `[n][dim]`, finite.
     pub values: Vec<f32>,

@@ -1,11 +1,10 @@
 //! `footprints.safetensors`: which Gaussians make up which mask.
 
-use crate::graph::{below, check_kept};
-use gs_io::{Artifact, ArtifactWriter, Error, IoContext, Provenance, Result};
+use crate::ScratchEntries;
+use crate::checks::{below, check_kept, view_names};
+use gs_io::{Artifact, ArtifactWriter, Error, Provenance, Result};
 use serde_json::json;
-use std::fs::File;
-use std::io::{BufWriter, Read, Seek, SeekFrom, Write};
-use std::path::{Path, PathBuf};
+use std::path::Path;
 
 /// Facts of one mask of one view at one level.
 #[derive(Debug, Clone, Copy, Default, PartialEq)]
@@ -197,86 +196,12 @@ impl Columns {
     }
 }
 
-/// Entries of footprints in scratch files without a name, so that no more than one view's are in memory while they are
-/// computed. The files go with the process.
-#[derive(Debug)]
-pub struct ScratchEntries {
-    col: BufWriter<File>,
-    weight: BufWriter<File>,
-    /// Entries so far.
-    pub count: u64,
-    folder: PathBuf,
-}
-
-impl ScratchEntries {
-    /// Bytes worked on at a time when columns are numbered anew.
-    const CHUNK: usize = 1 << 20;
-
-    /// Scratch files in the folder in which `output` will lie.
-    ///
-    /// # Errors
-    /// When they cannot be made there.
-    pub fn beside(output: &Path) -> Result<Self> {
-        let folder = match output.parent() {
-            Some(p) if !p.as_os_str().is_empty() => p.to_path_buf(),
-            _ => PathBuf::from("."),
-        };
-        gs_io::create_dir(&folder)?;
-        let file = || tempfile::tempfile_in(&folder).at("create a scratch file in", &folder).map(BufWriter::new);
-        Ok(Self { col: file()?, weight: file()?, count: 0, folder })
-    }
-
-    /// Adds an entry.
-    ///
-    /// # Errors
-    /// When the disk is full.
-    pub fn push(&mut self, col: u32, weight: f32) -> Result<()> {
-        self.count += 1;
-        self.col.write_all(&col.to_ne_bytes()).at("write a scratch file in", &self.folder)?;
-        self.weight.write_all(&weight.to_ne_bytes()).at("write a scratch file in", &self.folder)
-    }
-
-    /// Replaces every column `c` by `position[c]`.
-    ///
-    /// # Errors
-    /// When a scratch file cannot be read or written.
-    pub fn renumber(&mut self, position: &[u32]) -> Result<()> {
-        let folder = &self.folder;
-        self.col.flush().at("write a scratch file in", folder)?;
-        let file = self.col.get_mut();
-        let (mut at, end) = (0, 4 * self.count);
-        let mut bytes = vec![0u8; Self::CHUNK];
-        while at < end {
-            let some = &mut bytes[..Self::CHUNK.min((end - at) as usize)];
-            file.seek(SeekFrom::Start(at)).at("read a scratch file in", folder)?;
-            file.read_exact(some).at("read a scratch file in", folder)?;
-            for c in some.chunks_exact_mut(4) {
-                let old = u32::from_ne_bytes([c[0], c[1], c[2], c[3]]);
-                c.copy_from_slice(&position[old as usize].to_ne_bytes());
-            }
-            file.seek(SeekFrom::Start(at)).at("write a scratch file in", folder)?;
-            file.write_all(some).at("write a scratch file in", folder)?;
-            at += some.len() as u64;
-        }
-        Ok(())
-    }
-
-    /// The files of columns and of weights.
-    fn finish(self) -> Result<(File, File)> {
-        let folder = self.folder;
-        let done = |w: BufWriter<File>| {
-            w.into_inner().map_err(std::io::IntoInnerError::into_error).at("write a scratch file in", &folder)
-        };
-        Ok((done(self.col)?, done(self.weight)?))
-    }
-}
-
 impl Footprints {
     /// Format name in the file.
     pub const FORMAT: &str = "footprints";
     const VERSION: u32 = 1;
 
-    /// Opens and checks the artifact; columns and weights stay memory-mapped.
+    /// Opens and checks the artifact; columns and weights are not copied.
     ///
     /// # Errors
     /// When the file is damaged, tensors do not fit together, or an index is out of range.
@@ -284,8 +209,7 @@ impl Footprints {
         let a = Artifact::open(path, Self::FORMAT, Self::VERSION)?;
         let kept = a.tensor::<u32>("kept", &[None])?.to_vec();
         check_kept(&a, &kept, usize::MAX)?;
-        let views: Vec<String> = serde_json::from_value(a.provenance().extra["views"].clone())
-            .map_err(|e| Error::new(format!("no list of view names: {e}")).file(a.path()).field("views"))?;
+        let views = view_names(&a)?;
         let row_view = a.tensor::<u32>("row_view", &[None])?;
         let r = row_view.len();
         let column = |name: &str| a.tensor::<u32>(name, &[Some(r)]);
@@ -316,17 +240,15 @@ impl Footprints {
 
     /// Entries of row `r`: positions in `kept` (ascending) and summed weights.
     pub fn entries(&self, r: usize) -> (&[u32], &[f32]) {
-        let (start, end) = (self.row_ptr[r] as usize, self.row_ptr[r + 1] as usize);
-        // Checked when the artifact was opened.
-        let col = self.artifact.tensor::<u32>("col", &[None]).expect("checked on opening");
-        let weight = self.artifact.tensor::<f32>("weight", &[None]).expect("checked on opening");
-        (&col[start..end], &weight[start..end])
+        let (ptr, col, weight) = self.csr();
+        let range = ptr[r] as usize..ptr[r + 1] as usize;
+        (&col[range.clone()], &weight[range])
     }
 
     /// All column indices and weights with the row pointers: a CSR matrix.
     pub fn csr(&self) -> (&[u64], &[u32], &[f32]) {
-        let col = self.artifact.tensor::<u32>("col", &[None]).expect("checked on opening");
-        let weight = self.artifact.tensor::<f32>("weight", &[None]).expect("checked on opening");
+        let col = self.artifact.tensor("col", &[None]).expect("checked on opening");
+        let weight = self.artifact.tensor("weight", &[None]).expect("checked on opening");
         (&self.row_ptr, col, weight)
     }
 

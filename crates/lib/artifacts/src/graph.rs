@@ -1,7 +1,8 @@
 //! `graph.safetensors`: anchors and neighbours.
 
+use crate::checks::{below, check_kept};
 use crate::role;
-use gs_io::{Artifact, ArtifactWriter, Error, Provenance, Result};
+use gs_io::{Artifact, ArtifactWriter, Provenance, Result};
 use std::path::Path;
 
 /// The anchor graph of the paper's "Local Graph Sampling", and which Gaussians take part.
@@ -92,31 +93,5 @@ impl Graph {
     /// The hash of the geometry this graph belongs to.
     pub fn geometry_hash(artifact: &Artifact) -> &str {
         artifact.provenance().inputs.get(role::GEOMETRY).map_or("", String::as_str)
-    }
-}
-
-/// Checks that every index of tensor `name` is below `limit`.
-pub(crate) fn below(a: &Artifact, name: &str, indices: &[u32], limit: usize) -> Result<()> {
-    match indices.iter().position(|&i| i as usize >= limit) {
-        None => Ok(()),
-        Some(at) => Err(Error::new("index out of range")
-            .file(a.path())
-            .field(format!("{name}[{at}]"))
-            .found(indices[at])
-            .expected(format!("below {limit}"))
-            .hint("run the stage that makes it again")),
-    }
-}
-
-/// Checks that `kept` ascends and stays below `total` (where known: `usize::MAX` otherwise).
-pub(crate) fn check_kept(a: &Artifact, kept: &[u32], total: usize) -> Result<()> {
-    below(a, "kept", kept, total)?;
-    match kept.windows(2).position(|w| w[0] >= w[1]) {
-        None => Ok(()),
-        Some(at) => Err(Error::new("indices do not ascend")
-            .file(a.path())
-            .field(format!("kept[{}]", at + 1))
-            .found(kept[at + 1])
-            .expected(format!("more than {}", kept[at]))),
     }
 }

@@ -1,6 +1,6 @@
 //! `instances.safetensors`: the 3D instances with what language and geometry know of them.
 
-use crate::graph::below;
+use crate::checks::{below, view_names};
 use gs_io::{Artifact, ArtifactWriter, Error, Provenance, Result};
 use serde_json::json;
 use std::collections::{BTreeMap, BTreeSet};
@@ -52,7 +52,7 @@ pub struct OrientedBox {
 pub struct Instances {
     /// Instance of every Gaussian, -1 for noise; N.
     pub label: Vec<i32>,
-    /// Numbers per descriptor; 0 when the scene has no language features.
+    /// Dimension of a descriptor; 0 when the scene has no language features.
     pub dim: usize,
     /// Language descriptors, of unit length or zero; `[K][dim]`.
     pub descriptor: Vec<f32>,
@@ -68,7 +68,7 @@ pub struct Instances {
     pub bbox_min: Vec<[f32; 3]>,
     /// Upper corner of that box; K.
     pub bbox_max: Vec<[f32; 3]>,
-    /// Box around their centres along their principal axes; K, or none at all in files of before there were such boxes.
+    /// Box around their centres along their principal axes; K.
     pub oriented: Vec<OrientedBox>,
     /// Names of the views (file stems) that matches speak of.
     pub views: Vec<String>,
@@ -76,8 +76,7 @@ pub struct Instances {
     pub matches: Vec<Match>,
     /// Condensed tree of the clustering (cluster-to-cluster edges only), so that a query can choose the granularity.
     pub tree: Vec<TreeEdge>,
-    /// The smallest cluster of the tree that holds each Gaussian, -1 for one that is in none; N, or none at all in files of
-    /// before it was kept.
+    /// The smallest cluster of the tree that holds each Gaussian, -1 for one that is in none; N.
     pub node: Vec<i32>,
 }
 
@@ -153,7 +152,7 @@ impl Instances {
         within
     }
 
-    /// The Gaussians of a cluster of the tree, ascending; none in files of before [`Self::node`].
+    /// The Gaussians of a cluster of the tree, ascending.
     pub fn gaussians_of_cluster(&self, cluster: u32) -> Vec<u32> {
         let within = self.within(cluster);
         let own = |node: i32| u32::try_from(node).is_ok_and(|n| within.contains(&n));
@@ -197,17 +196,11 @@ impl Instances {
         let center = column(&self.oriented, |b| b.center);
         let axes = column(&self.oriented, |b| b.axes);
         let half = column(&self.oriented, |b| b.half_size);
-        let mut writer = ArtifactWriter::new(provenance);
-        if self.oriented.len() == k {
-            writer = writer
-                .tensor("obb_center", &[k, 3], center.as_flattened())
-                .tensor("obb_axes", &[k, 3, 3], axes.as_flattened().as_flattened())
-                .tensor("obb_half_size", &[k, 3], half.as_flattened());
-        }
-        if !self.node.is_empty() {
-            writer = writer.tensor("node", &[self.node.len()], &self.node);
-        }
-        writer
+        ArtifactWriter::new(provenance)
+            .tensor("obb_center", &[k, 3], center.as_flattened())
+            .tensor("obb_axes", &[k, 3, 3], axes.as_flattened().as_flattened())
+            .tensor("obb_half_size", &[k, 3], half.as_flattened())
+            .tensor("node", &[self.node.len()], &self.node)
             .tensor("label", &[self.label.len()], &self.label)
             .tensor("descriptor", &[k, self.dim], &self.descriptor)
             .tensor("support", &[k], &self.support)
@@ -238,53 +231,17 @@ impl Instances {
         let count = a.tensor::<u32>("count", &[None])?.to_vec();
         let k = count.len();
         let dim = a.shape("descriptor").and_then(|s| s.get(1).copied()).unwrap_or(0);
-        let views: Vec<String> = serde_json::from_value(a.provenance().extra["views"].clone())
-            .map_err(|e| Error::new(format!("no list of view names: {e}")).file(a.path()).field("views"))?;
+        let views = view_names(&a)?;
         let triples = |name: &str| -> Result<Vec<[f32; 3]>> {
-            Ok(a.tensor::<f32>(name, &[Some(k), Some(3)])?.chunks_exact(3).map(|c| [c[0], c[1], c[2]]).collect())
+            Ok(a.tensor::<f32>(name, &[Some(k), Some(3)])?.as_chunks::<3>().0.to_vec())
         };
-        let instance = a.tensor::<u32>("match_instance", &[None])?;
-        let m = instance.len();
-        let (view, mask) = (a.tensor::<u32>("match_view", &[Some(m)])?, a.tensor::<u32>("match_mask", &[Some(m)])?);
-        let score = a.tensor::<f32>("match_score", &[Some(m)])?;
-        let visible = match a.has("match_visible") {
-            true => a.tensor::<f32>("match_visible", &[Some(m)])?.to_vec(),
-            false => vec![0.0; m],
-        };
-        below(&a, "match_instance", instance, k)?;
-        below(&a, "match_view", view, views.len())?;
-        let parent = a.tensor::<u32>("tree_parent", &[None])?;
-        let t = parent.len();
-        let (child, size) = (a.tensor::<u32>("tree_child", &[Some(t)])?, a.tensor::<u32>("tree_size", &[Some(t)])?);
-        let lambda = a.tensor::<f32>("tree_lambda", &[Some(t)])?;
-        let selected = a.tensor::<i32>("tree_instance", &[Some(t)])?;
         let label = a.tensor::<i32>("label", &[None])?.to_vec();
-        for (name, values) in [("label", &label[..]), ("tree_instance", selected)] {
-            if let Some(at) = values.iter().position(|&l| l < -1 || l >= k as i32) {
-                return Err(Error::new("index out of range")
-                    .file(a.path())
-                    .field(format!("{name}[{at}]"))
-                    .found(values[at])
-                    .expected(format!("-1 to {}", k as i64 - 1)));
-            }
-        }
-        if let Some(at) = (0..t).find(|&i| child[i] <= parent[i]) {
-            return Err(Error::new("the tree of clusters is damaged")
-                .file(a.path())
-                .field(format!("tree_child[{at}]"))
-                .found(child[at])
-                .expected(format!("more than its parent {}", parent[at]))
-                .hint("run cluster-match again"));
-        }
-        let node = if a.has("node") { a.tensor::<i32>("node", &[Some(label.len())])?.to_vec() } else { Vec::new() };
-        let mut oriented = Vec::new();
-        if a.shape("obb_center").is_some() {
-            let (center, half) = (triples("obb_center")?, triples("obb_half_size")?);
-            let axes = a.tensor::<f32>("obb_axes", &[Some(k), Some(3), Some(3)])?.as_chunks::<3>().0.as_chunks::<3>().0;
-            oriented = (0..k).map(|i| OrientedBox { center: center[i], axes: axes[i], half_size: half[i] }).collect();
-        }
+        check_labels(&a, "label", &label, k)?;
+        let (center, half) = (triples("obb_center")?, triples("obb_half_size")?);
+        let axes = a.tensor::<f32>("obb_axes", &[Some(k), Some(3), Some(3)])?.as_chunks::<3>().0.as_chunks::<3>().0;
         let instances = Self {
-            oriented,
+            oriented: (0..k).map(|i| OrientedBox { center: center[i], axes: axes[i], half_size: half[i] }).collect(),
+            node: a.tensor("node", &[Some(label.len())])?.to_vec(),
             label,
             dim,
             descriptor: a.tensor("descriptor", &[Some(k), Some(dim)])?.to_vec(),
@@ -294,29 +251,54 @@ impl Instances {
             bbox_min: triples("bbox_min")?,
             bbox_max: triples("bbox_max")?,
             count,
-            matches: (0..m)
-                .map(|i| Match {
-                    instance: instance[i],
-                    view: view[i],
-                    mask: mask[i],
-                    score: score[i],
-                    visible: visible[i],
-                })
-                .collect(),
-            tree: (0..t)
-                .map(|i| TreeEdge {
-                    parent: parent[i],
-                    child: child[i],
-                    lambda: lambda[i],
-                    size: size[i],
-                    instance: selected[i],
-                })
-                .collect(),
-            node,
+            matches: read_matches(&a, k, views.len())?,
+            tree: read_tree(&a, k)?,
             views,
         };
         Ok((instances, a))
     }
+}
+
+/// Checks that labels are instances, or -1.
+fn check_labels(a: &Artifact, name: &str, labels: &[i32], instances: usize) -> Result<()> {
+    match labels.iter().position(|&l| l < -1 || l >= instances as i32) {
+        None => Ok(()),
+        Some(at) => Err(Error::new("index out of range")
+            .file(a.path())
+            .field(format!("{name}[{at}]"))
+            .found(labels[at])
+            .expected(format!("-1 to {}", instances as i64 - 1))),
+    }
+}
+
+fn read_matches(a: &Artifact, instances: usize, views: usize) -> Result<Vec<Match>> {
+    let instance = a.tensor::<u32>("match_instance", &[None])?;
+    let m = Some(instance.len());
+    let (view, mask) = (a.tensor::<u32>("match_view", &[m])?, a.tensor::<u32>("match_mask", &[m])?);
+    let (score, visible) = (a.tensor::<f32>("match_score", &[m])?, a.tensor::<f32>("match_visible", &[m])?);
+    below(a, "match_instance", instance, instances)?;
+    below(a, "match_view", view, views)?;
+    let at = |i| Match { instance: instance[i], view: view[i], mask: mask[i], score: score[i], visible: visible[i] };
+    Ok((0..instance.len()).map(at).collect())
+}
+
+fn read_tree(a: &Artifact, instances: usize) -> Result<Vec<TreeEdge>> {
+    let parent = a.tensor::<u32>("tree_parent", &[None])?;
+    let t = Some(parent.len());
+    let (child, size) = (a.tensor::<u32>("tree_child", &[t])?, a.tensor::<u32>("tree_size", &[t])?);
+    let (lambda, instance) = (a.tensor::<f32>("tree_lambda", &[t])?, a.tensor::<i32>("tree_instance", &[t])?);
+    check_labels(a, "tree_instance", instance, instances)?;
+    if let Some(at) = (0..parent.len()).find(|&i| child[i] <= parent[i]) {
+        return Err(Error::new("the tree of clusters is damaged")
+            .file(a.path())
+            .field(format!("tree_child[{at}]"))
+            .found(child[at])
+            .expected(format!("more than its parent {}", parent[at]))
+            .hint("run cluster-match again"));
+    }
+    let edge =
+        |i| TreeEdge { parent: parent[i], child: child[i], lambda: lambda[i], size: size[i], instance: instance[i] };
+    Ok((0..parent.len()).map(edge).collect())
 }
 
 #[cfg(test)]
@@ -338,15 +320,14 @@ mod tests {
                 centroid: vec![[0.0; 3], [1.0; 3]],
                 bbox_min: vec![[0.0; 3]; 2],
                 bbox_max: vec![[1.0; 3]; 2],
-                // Files without oriented boxes are read, too.
-                oriented: match dim {
-                    0 => Vec::new(),
-                    _ => vec![OrientedBox { half_size: [3.0, 2.0, 1.0], axes: [[0.5; 3]; 3], ..Default::default() }; 2],
-                },
+                oriented: vec![
+                    OrientedBox { half_size: [3.0, 2.0, 1.0], axes: [[0.5; 3]; 3], ..Default::default() };
+                    2
+                ],
                 views: vec!["a".into()],
                 matches: vec![Match { instance: 0, view: 0, mask: 7, score: 0.5, visible: 12.5 }],
                 tree: vec![TreeEdge { parent: 4, child: 5, lambda: 2.0, size: 2, instance: 1 }],
-                node: if dim == 0 { Vec::new() } else { vec![4, -1, 5, 5] },
+                node: vec![4, -1, 5, 5],
             };
             i.write(&p, Provenance::default()).unwrap();
             assert_eq!(Instances::read(&p).unwrap().0, i);

@@ -4,6 +4,7 @@
 //! Indices: N counts the Gaussians of `geometry.ply`; *kept* are the Gaussians that some view sees, as ascending
 //! original indices, n of them. Graph, footprints and features speak of kept Gaussians by their position in that list.
 
+mod checks;
 mod features;
 mod footprints;
 mod graph;
@@ -12,10 +13,11 @@ mod lerf_ovs;
 mod masks;
 mod nyu40;
 mod palette;
+mod scratch;
 mod truth;
 
 pub use features::Features;
-pub use footprints::{Footprints, FootprintsBuilder, PixelSamples, Row, ScratchEntries};
+pub use footprints::{Footprints, FootprintsBuilder, PixelSamples, Row};
 pub use graph::Graph;
 pub use instances::{Family, Instances, Match, OrientedBox, TreeEdge};
 pub use lerf_ovs::{LERF_OVS, LerfScene};
@@ -25,6 +27,7 @@ pub use masks::{
 };
 pub use nyu40::NYU40;
 pub use palette::{NOISE_COLOR, instance_color};
+pub use scratch::ScratchEntries;
 pub use truth::{MaskTruth, TrueObject, TruePart, TruePoints, TrueScene};
 
 /// Roles under which artifacts record the hashes of their inputs.

@@ -1,7 +1,9 @@
 //! A scene of two balls above a floor, small enough to know everything about it: photographs rendered from the
 //! Gaussians themselves, truth and labels in closed form.
 
-use artifacts::{Features, Instances, MaskMaps, Match, TrueObject, TruePart, TruePoints, TrueScene, maps_path, role};
+use artifacts::{
+    Features, Instances, MaskMaps, Match, OrientedBox, TrueObject, TruePart, TruePoints, TrueScene, maps_path, role,
+};
 use glam::DVec3;
 use gs_io::{Provenance, hash_file};
 use gs_raster::RasterOptions;
@@ -108,6 +110,8 @@ impl Fixture {
             centroid: vec![[0.0; 3]; k],
             bbox_min: vec![[-1.0; 3]; k],
             bbox_max: vec![[1.0; 3]; k],
+            oriented: vec![OrientedBox::default(); k],
+            node: vec![-1; groups().len()],
             views: (0..VIEWS).map(stem).collect(),
             matches: vec![
                 Match { instance: 0, view: 1, mask: 0, score: 0.9, ..Match::default() },

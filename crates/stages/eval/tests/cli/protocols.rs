@@ -2,7 +2,7 @@
 //! OpenCV 4.8 to 4.10 (CAGS_PYTHON names one), the numbers it gave are the golden ones of `testdata/protocols.json`.
 
 use crate::fixture::provenance;
-use artifacts::{Instances, TruePoints, TrueScene};
+use artifacts::{Instances, OrientedBox, TruePoints, TrueScene};
 use gs_io::{hash_bytes, hash_file};
 use gs_scene::Gaussians;
 use serde_json::{Map, Value, json};
@@ -78,6 +78,8 @@ impl Scene {
             centroid: vec![[0.0; 3]; k],
             bbox_min: vec![[0.0; 3]; k],
             bbox_max: vec![[0.0; 3]; k],
+            oriented: vec![OrientedBox::default(); k],
+            node: vec![-1; label.len()],
             label,
             ..Instances::default()
         };

@@ -1,0 +1,81 @@
+//! Entries of footprints on disk while they are computed.
+
+use gs_io::{IoContext, Result};
+use std::fs::File;
+use std::io::{BufWriter, Read, Seek, SeekFrom, Write};
+use std::path::{Path, PathBuf};
+
+const READ: &str = "read a scratch file in";
+const WRITE: &str = "write a scratch file in";
+
+/// Entries of footprints in scratch files without a name, so that no more than one view's are in memory while they are
+/// computed. The files go with the process.
+#[derive(Debug)]
+pub struct ScratchEntries {
+    col: BufWriter<File>,
+    weight: BufWriter<File>,
+    /// Entries so far.
+    pub count: u64,
+    folder: PathBuf,
+}
+
+impl ScratchEntries {
+    /// Bytes worked on at a time when columns are numbered anew.
+    const CHUNK: usize = 1 << 20;
+
+    /// Scratch files in the folder in which `output` will lie.
+    ///
+    /// # Errors
+    /// When they cannot be made there.
+    pub fn beside(output: &Path) -> Result<Self> {
+        let folder = match output.parent() {
+            Some(p) if !p.as_os_str().is_empty() => p.to_path_buf(),
+            _ => PathBuf::from("."),
+        };
+        gs_io::create_dir(&folder)?;
+        let file = || tempfile::tempfile_in(&folder).at("create a scratch file in", &folder).map(BufWriter::new);
+        Ok(Self { col: file()?, weight: file()?, count: 0, folder })
+    }
+
+    /// Adds an entry.
+    ///
+    /// # Errors
+    /// When the disk is full.
+    pub fn push(&mut self, col: u32, weight: f32) -> Result<()> {
+        self.count += 1;
+        self.col.write_all(&col.to_ne_bytes()).at(WRITE, &self.folder)?;
+        self.weight.write_all(&weight.to_ne_bytes()).at(WRITE, &self.folder)
+    }
+
+    /// Replaces every column `c` by `position[c]`.
+    ///
+    /// # Errors
+    /// When a scratch file cannot be read or written.
+    pub fn renumber(&mut self, position: &[u32]) -> Result<()> {
+        let folder = &self.folder;
+        self.col.flush().at(WRITE, folder)?;
+        let file = self.col.get_mut();
+        let (mut at, end) = (0, 4 * self.count);
+        let mut bytes = vec![0u8; Self::CHUNK];
+        while at < end {
+            let some = &mut bytes[..Self::CHUNK.min((end - at) as usize)];
+            file.seek(SeekFrom::Start(at)).at(READ, folder)?;
+            file.read_exact(some).at(READ, folder)?;
+            for c in some.chunks_exact_mut(4) {
+                let old = u32::from_ne_bytes([c[0], c[1], c[2], c[3]]);
+                c.copy_from_slice(&position[old as usize].to_ne_bytes());
+            }
+            file.seek(SeekFrom::Start(at)).at(WRITE, folder)?;
+            file.write_all(some).at(WRITE, folder)?;
+            at += some.len() as u64;
+        }
+        Ok(())
+    }
+
+    /// The files of columns and of weights.
+    pub(crate) fn finish(self) -> Result<(File, File)> {
+        let folder = self.folder;
+        let done = |w: BufWriter<File>| w.into_inner().map_err(std::io::IntoInnerError::into_error).at(WRITE, &folder);
+        Ok((done(self.col)?, done(self.weight)?))
+    }
+}
