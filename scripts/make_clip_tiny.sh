@@ -18,5 +18,4 @@ for ((s = 0; s < scenes; s++)); do
   "$bin/synth-scene" --out "$dir/scene" --seed $((1000 + s)) --objects 11 --views 8 --width 480 --height 360 --granularity-p "$p" --quiet
   "$bin/mask-embed" crops --scene "$dir/scene" --masks "$dir/scene/language_features" --out "$dir/crops.safetensors" --size 64 --quiet
 done
-"$bin/mask-embed" tokenize --truth "$out" --out "$out/tokens.json" --quiet
 "$python" scripts/train_clip_tiny.py --crops "$out" --out testdata/clip-tiny "$@"

@@ -10,8 +10,7 @@ the scenes' truth says of each mask.  It knows those things and no others: it is
 
 Needs PyPI numpy, jax (CPU) and onnx.  --crops is a folder with, per scene S, S/crops.safetensors (pixels u8
 [n,3,64,64], view u32 [n], mask u32 [n], view names in its metadata), S/scene/truth/masks.json and S/scene/truth/scene.json.
-The ids of every caption come from tokens.json in the same folder, written by `mask-embed tokenize`, so that training
-and inference share one tokenizer.
+The token ids of every caption lie in the metadata of the crops, so that training and inference share one tokenizer.
 """
 
 import argparse
@@ -64,10 +63,11 @@ def captions_of(mask, objects, rng_phrases):
 
 
 def load(folder):
-    pixels, texts, scenes = [], [], []
+    pixels, texts, scenes, tokens = [], [], [], {}
     for s, path in enumerate(sorted(folder.glob("*/crops.safetensors"))):
         crops = read_safetensors(path)
         views = crops["__metadata__"]["extra"]["views"]
+        tokens.update(crops["__metadata__"]["extra"]["tokens"])
         masks = json.loads((path.parent / "scene/truth/masks.json").read_text())
         objects = json.loads((path.parent / "scene/truth/scene.json").read_text())["objects"]
         for i in range(len(crops["pixels"])):
@@ -75,7 +75,7 @@ def load(folder):
             pixels.append(crops["pixels"][i])
             texts.append(captions_of(mask, objects, None))
             scenes.append(s)
-    return np.stack(pixels), texts, np.array(scenes)
+    return np.stack(pixels), texts, np.array(scenes), dict(sorted(tokens.items()))
 
 
 # --------------------------------------------------------------------------------------------------------------- model
@@ -246,8 +246,7 @@ def main():
     ap.add_argument("--seed", type=int, default=0, help="seed (default 0)")
     args = ap.parse_args()
 
-    tokens = json.loads((args.crops / "tokens.json").read_text())  # text -> list of CLIP ids without start and end
-    pixels, texts, scenes = load(args.crops)
+    pixels, texts, scenes, tokens = load(args.crops)  # tokens: text -> list of CLIP ids without start and end
     known = sorted({i for ids in tokens.values() for i in ids})
     spare = 64  # rows that all other ids share by their remainder: unknown words differ, and mean nothing
     table = 1 + len(known) + np.arange(VOCABULARY) % spare

@@ -2,13 +2,11 @@
 
 #![allow(rustdoc::invalid_html_tags, reason = "help texts name files as <view>_s.npy")]
 
-use crate::outputs::SIDE_FILES;
 use artifacts::Level;
 use clap::Parser;
-use gs_io::{Error, Result};
 use hdbscan_exact::Selection;
 use serde::Serialize;
-use stage::{CommonArgs, Program, Stage};
+use stage::CommonArgs;
 use std::path::PathBuf;
 
 /// Stage 3: 3D instances, the masks they are seen as, and a language descriptor for each
@@ -124,7 +122,7 @@ pub(crate) enum Noise {
     Keep,
 }
 
-fn join_probability(text: &str) -> std::result::Result<f64, String> {
+fn join_probability(text: &str) -> Result<f64, String> {
     let good = |v: &f64| *v == 0.0 || *v > 0.5 && *v <= 1.0;
     text.parse().ok().filter(good).ok_or_else(|| "expected 0, or more than 0.5 and at most 1".into())
 }
@@ -146,28 +144,5 @@ impl Settings {
             selection: if self.leaf { Selection::Leaf } else { Selection::ExcessOfMass },
             allow_single_cluster: self.allow_single_cluster,
         }
-    }
-}
-
-impl Program for Args {
-    const NAME: &'static str = "cluster-match";
-
-    fn common(&self) -> &CommonArgs {
-        &self.common
-    }
-
-    fn check(&self) -> Result<()> {
-        match SIDE_FILES.iter().find(|e| self.out.with_extension(e) == self.out) {
-            Some(taken) => Err(Error::new("another output has this name")
-                .file(&self.out)
-                .field("--out")
-                .found(format!(".{taken}"))
-                .expected("a name such as instances.safetensors")),
-            None => Ok(()),
-        }
-    }
-
-    fn run(self, stage: &Stage) -> Result<()> {
-        crate::run::run(&self, stage)
     }
 }

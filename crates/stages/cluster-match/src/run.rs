@@ -8,15 +8,38 @@ use crate::inputs::{Inputs, id_maps, mask_features};
 use crate::options::{Args, Noise, Settings};
 use crate::outputs::{self, Figures};
 use artifacts::{Instances, MaskFeatures, Match};
-use gs_io::{Result, Watched};
+use gs_io::{Error, Result, Watched};
 use gs_raster::RasterOptions;
 use gs_scene::dataset::View;
-use stage::Stage;
+use stage::{CommonArgs, Program, Stage};
 use std::collections::BTreeMap;
 use std::time::Instant;
 
+impl Program for Args {
+    const NAME: &'static str = "cluster-match";
+
+    fn common(&self) -> &CommonArgs {
+        &self.common
+    }
+
+    fn check(&self) -> Result<()> {
+        match outputs::SIDE_FILES.iter().find(|e| self.out.with_extension(e) == self.out) {
+            Some(taken) => Err(Error::new("another output has this name")
+                .file(&self.out)
+                .field("--out")
+                .found(format!(".{taken}"))
+                .expected("a name such as instances.safetensors")),
+            None => Ok(()),
+        }
+    }
+
+    fn run(self, stage: &Stage) -> Result<()> {
+        run(&self, stage)
+    }
+}
+
 /// Reads the inputs, finds the instances, matches them with masks, and writes them.
-pub(crate) fn run(a: &Args, stage: &Stage) -> Result<()> {
+fn run(a: &Args, stage: &Stage) -> Result<()> {
     let mut claim = outputs::claim(a, stage)?;
     let mut watched = Watched::new([&a.geometry]);
     for suffix in ["_s.npy", "_f.npy"] {

@@ -5,8 +5,9 @@
 //! (level large) has been found there yet and the small mask has not been asked often. The rounds are fixed by the grid,
 //! so that the result does not depend on the number of threads.
 
-use crate::logits::Logits;
+use crate::logits::{Grid, Logits};
 use crate::nms::{MaskNms, Pixels, box_nms, mask_nms, merges_things, nesting_levels};
+use crate::options::Choice;
 use crate::sam::{Candidates, Embedded, Sam};
 use artifacts::LEVELS;
 use gs_io::Result;
@@ -17,27 +18,15 @@ const STABILITY_OFFSET: f32 = 1.0;
 /// How often a small mask is asked in the hope of the whole thing that it is part of.
 const ASK_UNTIL_WHOLE: usize = 5;
 
-/// How masks are asked for and chosen.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Choice {
-    /// Points of the grid along the longer side of the photograph; along the shorter as many as fit the same distance.
-    pub points_per_side: usize,
-    /// Least predicted IoU.
-    pub predicted_iou: f32,
-    /// Least stability: IoU of the mask cut 1 above and 1 below its threshold.
-    pub stability: f32,
-    /// Largest part of the photograph that a mask may cover: what is larger is no thing but most of the room.
-    pub max_area: f64,
-    /// IoU of boxes above which the better mask stays.
-    pub box_nms: f64,
-    /// LangSplat's rule within a level.
-    pub mask_nms: MaskNms,
-    /// Points within a small-level mask of at least this score (predicted IoU x stability) need not be asked again; above
-    /// 1 every point is asked.
-    pub skip_score: f32,
-    /// Whether a level takes masks of the other levels where it has none: see [`fill`].
-    pub fill: bool,
-}
+/// Largest part of the photograph that a mask may cover: what is larger is no thing but most of the room.
+const MAX_AREA: f64 = 0.6;
+/// Points within a small-level mask of at least this score (predicted IoU x stability) are not asked: the answers would be
+/// much the same three masks.
+const SKIP_SCORE: f32 = 0.8;
+/// Of masks whose boxes overlap by more than this (IoU) the best stays: as in SAM's own script.
+const BOX_NMS: f64 = 0.7;
+/// LangSplat's rule within a level, with a score that suits MobileSAM's soft edges (0.7 there).
+const MASK_NMS: MaskNms = MaskNms { iou: 0.8, score: 0.6, inner: 0.5 };
 
 /// One mask of one prompt, good enough to be considered.
 #[derive(Debug, Clone)]
@@ -52,30 +41,6 @@ pub struct Proposal {
     pub pixels: Pixels,
     /// How sure it is of them.
     pub logits: Logits,
-}
-
-/// The part of the decoder's square that shows the photograph.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Grid {
-    /// Columns.
-    pub width: usize,
-    /// Rows.
-    pub height: usize,
-    /// Width and height of the photograph in these pixels; up to a pixel less.
-    pub extent: [f64; 2],
-}
-
-impl Grid {
-    fn of(embedded: &Embedded) -> Self {
-        let [w, h] = embedded.extent.map(|e| (e.ceil() as usize).clamp(1, Sam::MASK_SIDE));
-        Self { width: w, height: h, extent: embedded.extent }
-    }
-
-    fn index(&self, [x, y]: [f64; 2]) -> usize {
-        let column = ((x * self.extent[0]) as usize).min(self.width - 1);
-        let row = ((y * self.extent[1]) as usize).min(self.height - 1);
-        row * self.width + column
-    }
 }
 
 /// Considered masks of a photograph.
@@ -125,11 +90,11 @@ pub fn propose(sam: &Sam, embedded: &Embedded, choice: &Choice) -> Result<Propos
         points += round.len();
         let at_level = |l: usize| masks.iter().filter(move |m| m.level == l).map(|m| (m.score, &m.pixels));
         let small: Vec<(&Pixels, usize)> = at_level(1)
-            .filter(|(score, _)| *score >= choice.skip_score)
+            .filter(|(score, _)| *score >= SKIP_SCORE)
             .map(|(_, p)| (p, asked.iter().filter(|&&a| p.contains(grid.index(a))).count()))
             .collect();
         let whole: Vec<&Pixels> =
-            at_level(LEVELS - 1).filter(|(score, _)| *score > choice.mask_nms.score).map(|(_, p)| p).collect();
+            at_level(LEVELS - 1).filter(|(score, _)| *score > MASK_NMS.score).map(|(_, p)| p).collect();
         let known = |point: [f64; 2]| {
             let i = grid.index(point);
             let is_whole = whole.iter().any(|w| w.contains(i));
@@ -149,7 +114,7 @@ fn consider(answer: &Candidates, grid: &Grid, choice: &Choice) -> Vec<Proposal> 
     let mut good = Vec::new();
     for (m, &quality) in answer.quality.iter().enumerate() {
         // A quality that is not a number is not good.
-        if quality.is_nan() || quality < choice.predicted_iou {
+        if quality.is_nan() || quality < choice.pred_iou as f32 {
             continue;
         }
         let square = answer.mask(m);
@@ -158,8 +123,8 @@ fn consider(answer: &Candidates, grid: &Grid, choice: &Choice) -> Vec<Proposal> 
         let stability = above(STABILITY_OFFSET) as f32 / above(-STABILITY_OFFSET).max(1) as f32;
         let inside: Vec<bool> = (0..grid.height).flat_map(|y| row(y).iter().map(|&l| l > 0.0)).collect();
         let pixels = Pixels::new(grid.width, inside.into_iter());
-        let most = (choice.max_area * grid.extent[0] * grid.extent[1]) as usize;
-        if stability < choice.stability || pixels.area == 0 || pixels.area > most {
+        let most = (MAX_AREA * grid.extent[0] * grid.extent[1]) as usize;
+        if stability < choice.stability as f32 || pixels.area == 0 || pixels.area > most {
             continue;
         }
         let level = if count == 1 { 0 } else { (m + 1).min(LEVELS - 1) };
@@ -173,16 +138,16 @@ fn consider(answer: &Candidates, grid: &Grid, choice: &Choice) -> Vec<Proposal> 
 /// things go ([`merges_things`]), then box suppression, then LangSplat's.
 ///
 /// Levels are SAM's own three masks per prompt; default is all of them together. A decoder that gives one mask per
-/// prompt leaves the levels to nesting ([`nesting_levels`]). Then, if so chosen, [`fill`].
-pub fn levels(masks: &[Proposal], choice: &Choice) -> [Vec<usize>; LEVELS] {
+/// prompt leaves the levels to nesting ([`nesting_levels`]). Then [`fill`].
+pub fn levels(masks: &[Proposal]) -> [Vec<usize>; LEVELS] {
     let by_boxes = |c: Vec<usize>| -> Vec<usize> {
         let (pixels, quality): (Vec<&Pixels>, Vec<f32>) =
             c.iter().map(|&i| (&masks[i].pixels, masks[i].quality)).unzip();
-        box_nms(&pixels, &quality, choice.box_nms).into_iter().map(|k| c[k]).collect()
+        box_nms(&pixels, &quality, BOX_NMS).into_iter().map(|k| c[k]).collect()
     };
     let by_masks = |c: Vec<usize>| -> Vec<usize> {
         let (pixels, score): (Vec<&Pixels>, Vec<f32>) = c.iter().map(|&i| (&masks[i].pixels, masks[i].score)).unzip();
-        mask_nms(&pixels, &score, choice.mask_nms).into_iter().map(|k| c[k]).collect()
+        mask_nms(&pixels, &score, MASK_NMS).into_iter().map(|k| c[k]).collect()
     };
     // Masks of level large are whole things; a mask around several of them is none itself.
     let things: Vec<(&Pixels, f32)> =
@@ -196,7 +161,7 @@ pub fn levels(masks: &[Proposal], choice: &Choice) -> [Vec<usize>; LEVELS] {
             *slot = by_masks(by_boxes(single.iter().copied().filter(|&i| masks[i].level == level).collect()));
         }
     } else {
-        let good: Vec<usize> = all.iter().copied().filter(|&i| masks[i].score > choice.mask_nms.score).collect();
+        let good: Vec<usize> = all.iter().copied().filter(|&i| masks[i].score > MASK_NMS.score).collect();
         let pixels: Vec<&Pixels> = good.iter().map(|&i| &masks[i].pixels).collect();
         let nested = nesting_levels(&pixels);
         for (level, slot) in chosen.iter_mut().enumerate().skip(1) {
@@ -205,7 +170,7 @@ pub fn levels(masks: &[Proposal], choice: &Choice) -> [Vec<usize>; LEVELS] {
         }
     }
     chosen[0] = by_masks(all);
-    if choice.fill { fill(masks, &chosen) } else { chosen }
+    fill(masks, &chosen)
 }
 
 /// Part of a mask that a level must not cover yet for the level to take it.
@@ -260,16 +225,7 @@ mod tests {
         }
     }
 
-    const CHOICE: Choice = Choice {
-        points_per_side: 4,
-        predicted_iou: 0.7,
-        stability: 0.7,
-        max_area: 1.0,
-        box_nms: 0.7,
-        mask_nms: MaskNms { iou: 0.8, score: 0.5, inner: 0.5 },
-        skip_score: 0.8,
-        fill: false,
-    };
+    const CHOICE: Choice = Choice { points_per_side: 4, pred_iou: 0.7, stability: 0.7 };
 
     #[test]
     fn filters_see_quality_and_stability_of_the_photograph_part_only() {
@@ -283,9 +239,11 @@ mod tests {
         // Mask 0: stability 1; mask 1: 1/2, not stable; mask 2: low quality.
         assert_eq!(good.iter().map(|p| (p.level, p.pixels.area)).collect::<Vec<_>>(), [(1, side)]);
         assert!((good[0].score - 0.9).abs() < 1e-6);
-        assert!(consider(&answer, &grid, &Choice { max_area: 0.4, ..CHOICE }).is_empty());
-        let nan = Candidates { quality: vec![f32::NAN], logits: vec![9.0; side * side] };
-        assert!(consider(&nan, &grid, &CHOICE).is_empty());
+        // A mask of everything, and one without a quality.
+        for quality in [0.9, f32::NAN] {
+            let all = Candidates { quality: vec![quality], logits: vec![9.0; side * side] };
+            assert!(consider(&all, &grid, &CHOICE).is_empty());
+        }
     }
 
     #[test]
@@ -299,7 +257,7 @@ mod tests {
         };
         // A thing of two parts, and a thing alone.
         let single = [rect(0, 10, 0), rect(0, 6, 0), rect(6, 10, 0), rect(12, 20, 0)];
-        let l = levels(&single, &CHOICE);
+        let l = levels(&single);
         let sorted = |v: &[usize]| {
             let mut v = v.to_vec();
             v.sort_unstable();
@@ -310,12 +268,9 @@ mod tests {
         assert_eq!(sorted(&l[3]), [0, 3]);
         // The same masks with SAM's levels.
         let own = [rect(0, 10, 3), rect(0, 6, 1), rect(6, 10, 2), rect(12, 20, 3)];
-        let l = levels(&own, &CHOICE);
-        assert_eq!((sorted(&l[1]), sorted(&l[2]), sorted(&l[3])), (vec![1], vec![2], vec![0, 3]));
-        assert!(levels(&[], &CHOICE).iter().all(Vec::is_empty));
-        // Filled: the part that lies in no whole of level small is taken there, the whole is not; the lone thing is
-        // taken everywhere.
-        let l = levels(&own, &Choice { fill: true, ..CHOICE });
+        let l = levels(&own);
+        // The part that lies in no whole of level small is taken there, the whole is not; the lone thing is taken everywhere.
         assert_eq!((sorted(&l[1]), sorted(&l[2]), sorted(&l[3])), (vec![1, 2, 3], vec![1, 2, 3], vec![0, 3]));
+        assert!(levels(&[]).iter().all(Vec::is_empty));
     }
 }

@@ -1,19 +1,22 @@
-//! What is already done: beside each output of a view lies a small JSON file that says what it was made from. A view
-//! whose file says the same as this run would, and whose output is as it was written, is not made again.
+//! What is done already: beside each output of a view lies a small JSON file, its note, which says what the output was made
+//! from. A view whose note says the same as this run would, and whose output is as it was written, is not made again.
 
 use gs_io::{Error, IoContext, Result, hash_bytes, hash_file, write_bytes};
+use gs_scene::dataset::View;
 use serde::{Deserialize, Serialize, de::DeserializeOwned};
+use serde_json::{Value, json};
+use stage::{Progress, Stage};
 use std::path::{Path, PathBuf};
 
 /// The note beside an output.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-pub(crate) struct Note<T> {
+struct Note<T> {
     /// Hash of everything that shaped the output: program, parameters, models, photograph.
     made_from: String,
     /// Content hash of the output.
-    pub(crate) hash: String,
+    hash: String,
     /// Facts of the output for the manifest.
-    pub(crate) facts: T,
+    facts: T,
 }
 
 /// One hash for all that shapes an output.
@@ -27,18 +30,68 @@ pub(crate) fn note_path(output: &Path) -> PathBuf {
     output.with_extension("json")
 }
 
-/// The note of an output that needs not be made again.
-pub(crate) fn find<T: DeserializeOwned>(output: &Path, made_from: &str) -> Option<Note<T>> {
+/// The note of an output that need not be made again.
+fn find<T: DeserializeOwned>(output: &Path, made_from: &str) -> Option<Note<T>> {
     let note: Note<T> = serde_json::from_slice(&std::fs::read(note_path(output)).ok()?).ok()?;
     let same = note.made_from == made_from && hash_file(output).ok()? == note.hash;
     same.then_some(note)
 }
 
 /// Writes the note of an output that has just been written.
-pub(crate) fn write<T: Serialize>(output: &Path, made_from: &str, facts: T) -> Result<Note<T>> {
+fn write<T: Serialize>(output: &Path, made_from: &str, facts: T) -> Result<Note<T>> {
     let note = Note { made_from: made_from.to_string(), hash: hash_file(output)?, facts };
     write_json(&note_path(output), &note)?;
     Ok(note)
+}
+
+/// The views of a scene, one after the other.
+pub(crate) struct Views<'a> {
+    stage: &'a Stage,
+    progress: Progress<'a>,
+    /// Hash and facts of each view's output, for the manifest.
+    pub listed: serde_json::Map<String, Value>,
+    /// Views whose outputs were there already.
+    kept: usize,
+}
+
+impl<'a> Views<'a> {
+    pub fn new(stage: &'a Stage, count: usize) -> Self {
+        let progress = stage.progress("views", count as u64);
+        Self { stage, progress, listed: serde_json::Map::new(), kept: 0 }
+    }
+
+    /// The facts of a view's output, which `make` writes unless it is done already.
+    ///
+    /// # Errors
+    /// When `make` fails, or the stage is asked to end.
+    pub fn next<T: Serialize + DeserializeOwned>(
+        &mut self,
+        view: &View,
+        output: &Path,
+        made_from: &str,
+        make: impl FnOnce() -> Result<T>,
+    ) -> Result<T> {
+        if self.stage.interrupted() {
+            return Err(Error::new(
+                "interrupted; the finished views stay, and the same command continues with the next",
+            ));
+        }
+        let done = find::<T>(output, made_from);
+        self.kept += usize::from(done.is_some());
+        let note = done.map_or_else(|| write(output, made_from, make()?), Ok)?;
+        self.listed.insert(view.stem().to_string(), json!({ "hash": note.hash, "facts": note.facts }));
+        self.progress.step();
+        Ok(note.facts)
+    }
+
+    /// Ends the progress; says of how many views the outputs, called `what`, were there already.
+    pub fn finish(self, what: &str) -> serde_json::Map<String, Value> {
+        self.progress.finish(&[]);
+        if self.kept > 0 {
+            self.stage.skipped(&format!("{} of {} views: their {what} are done already", self.kept, self.listed.len()));
+        }
+        self.listed
+    }
 }
 
 /// Writes JSON for people and programs, whole or not at all.

@@ -1,9 +1,8 @@
 //! `mask-embed import`: id maps from label pictures.
 
-use crate::args::ImportArgs;
-use crate::finished;
 use crate::masks::count_masks;
-use crate::memory;
+use crate::options::ImportArgs;
+use crate::{finished, memory};
 use artifacts::{LEVELS, Level, MaskMaps, hash_folder, maps_path};
 use gs_io::{Error, IoContext, Result, hash_files};
 use image::DynamicImage;
@@ -111,10 +110,11 @@ fn load(paths: &[PathBuf]) -> Result<MaskMaps> {
 ///
 /// # Errors
 /// When a picture cannot be read or is not grey, the levels of a view differ in size, or the output cannot be written.
-pub fn run(args: &ImportArgs, stage: &Stage) -> Result<()> {
+pub(crate) fn run(args: &ImportArgs, stage: &Stage) -> Result<()> {
     let found = find(&args.labels)?;
-    let manifest = args.out.join("masks.json");
-    let maps = found.keys().map(|view| maps_path(&args.out, view));
+    let folder = &args.maps.out;
+    let manifest = folder.join("masks.json");
+    let maps = found.keys().map(|view| maps_path(folder, view));
     let outputs = stage.outputs(&manifest).file(&manifest).files(maps).drop_stale();
     let mut claim = outputs.reads(found.values().flatten()).claim()?;
     // A file whose size cannot be told is refused below.
@@ -134,14 +134,14 @@ pub fn run(args: &ImportArgs, stage: &Stage) -> Result<()> {
     finished::remove_manifest(&manifest)?;
     let mut progress = stage.progress("views", found.len() as u64);
     for (view, paths) in &found {
-        load(paths)?.write(maps_path(&args.out, view))?;
+        load(paths)?.write(maps_path(folder, view))?;
         progress.step();
     }
     progress.finish(&[]);
     let files = found.values().flatten().map(|p| (p.file_name().unwrap_or_default().to_string_lossy(), p));
     let inputs = BTreeMap::from([("labels".to_string(), hash_files(files)?)]);
     let mut provenance = stage.provenance("masks", 1, json!({}), inputs.clone());
-    provenance.extra = json!({ "views": views, "hash": hash_folder(&args.out, "_s.npy")? });
+    provenance.extra = json!({ "views": views, "hash": hash_folder(folder, "_s.npy")? });
     finished::write_json(&manifest, &provenance)?;
     stage.record(&mut claim, json!({}), inputs, json!({ "views": views.len() }))
 }

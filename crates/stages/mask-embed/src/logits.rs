@@ -1,6 +1,32 @@
 //! How sure a mask is of each pixel, kept where it matters.
 
-use crate::automatic::Grid;
+use crate::sam::{Embedded, Sam};
+
+/// The part of the decoder's square that shows the photograph.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Grid {
+    /// Columns.
+    pub width: usize,
+    /// Rows.
+    pub height: usize,
+    /// Width and height of the photograph in these pixels; up to a pixel less.
+    pub extent: [f64; 2],
+}
+
+impl Grid {
+    /// That of an encoded photograph.
+    pub fn of(embedded: &Embedded) -> Self {
+        let [w, h] = embedded.extent.map(|e| (e.ceil() as usize).clamp(1, Sam::MASK_SIDE));
+        Self { width: w, height: h, extent: embedded.extent }
+    }
+
+    /// The pixel at a point, `x` and `y` in 0..1 of width and height.
+    pub fn index(&self, [x, y]: [f64; 2]) -> usize {
+        let column = ((x * self.extent[0]) as usize).min(self.width - 1);
+        let row = ((y * self.extent[1]) as usize).min(self.height - 1);
+        row * self.width + column
+    }
+}
 
 /// Logits of a mask within the box of its pixels and one pixel around. Further out no logit is positive, nor is any
 /// number interpolated between two of them, so that [`Self::enlarge`] needs no more; most masks are much smaller than

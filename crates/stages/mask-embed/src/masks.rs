@@ -1,12 +1,13 @@
 //! `mask-embed masks`: id maps from photographs with SAM.
 
-use crate::args::MasksArgs;
-use crate::automatic::{Choice, levels, propose};
+use crate::automatic::{levels, propose};
+use crate::finished::{self, Views};
+use crate::options::{Choice, MasksArgs};
 use crate::paint::{paint, preview};
 use crate::sam::Sam;
-use crate::{finished, memory, photographs};
+use crate::{memory, photographs};
 use artifacts::{LEVELS, Level, MaskMaps, maps_path, role};
-use gs_io::{Claim, Error, Result, Watched};
+use gs_io::{Claim, Result, Watched};
 use gs_scene::Image;
 use gs_scene::dataset::{Dataset, View};
 use onnx_models::RgbImage;
@@ -33,103 +34,86 @@ pub(crate) fn count_masks(maps: &MaskMaps) -> [usize; LEVELS] {
     Level::ALL.map(|l| maps.level(l).iter().filter(|&&id| id >= 0).collect::<BTreeSet<_>>().len())
 }
 
-/// Makes the id maps of every view of a scene that do not stand already, then the manifest.
+/// Makes the id maps of every view of a scene that are not done already, then the manifest.
 ///
 /// # Errors
 /// When scene or models cannot be read, a photograph cannot be decoded, or the output cannot be written.
-pub fn run(args: &MasksArgs, stage: &Stage) -> Result<()> {
+pub(crate) fn run(args: &MasksArgs, stage: &Stage) -> Result<()> {
     let scene = photographs::open(&args.scene, stage)?;
-    let manifest = args.out.join("masks.json");
+    let folder = &args.maps.out;
+    let manifest = folder.join("masks.json");
     let mut claim = claim(args, &scene, &manifest, stage)?;
     let sam = Sam::open(&args.sam, &args.engine.options())?;
     let watched = Watched::new(scene.views.iter().map(|v| &v.image_path));
-    let choice = args.choice.choice();
-    let engine = if args.engine.onnx_runtime.is_some() { "onnxruntime" } else { "rten" };
-    let parameters = json!({
-        "choice": args.choice.json(), "map_size": args.map_size, "min_area": args.min_area,
-        "resolution": args.scene.resolution.to_string(), "engine": engine,
-    });
-    let dataset_hash = scene.hash()?;
-    warn_of_strangers(&args.out, scene.views.iter().map(View::stem), stage)?;
+    let parameters = json!(args);
+    let inputs =
+        BTreeMap::from([(role::DATASET.to_string(), scene.hash()?), ("sam".to_string(), sam.hash().to_string())]);
+    warn_of_strangers(folder, scene.views.iter().map(View::stem), stage)?;
 
-    let mut views = BTreeMap::new();
-    let mut progress = stage.progress("views", scene.views.len() as u64);
-    let (mut kept, mut asked, mut points, mut foretold) = (0, 0, 0, false);
+    let mut views = Views::new(stage, scene.views.len());
+    let (mut asked, mut points, mut large, mut foretold) = (0, 0, 0, false);
     for view in &scene.views {
-        if stage.interrupted() {
-            return Err(Error::new(
-                "interrupted; the views that are done stay, and the same command goes on with the next",
-            ));
-        }
-        let output = maps_path(&args.out, view.stem());
+        let output = maps_path(folder, view.stem());
         let (image, image_hash) = photographs::read(view)?;
         let key = finished::made_from(&[&parameters.to_string(), sam.hash(), &image_hash]);
-        let note = if let Some(note) = finished::find::<Facts>(&output, &key) {
-            kept += 1;
-            note
-        } else {
+        let facts: Facts = views.next(view, &output, &key, || {
             if !std::mem::replace(&mut foretold, true) {
                 foretell(args, &sam, &scene.views, stage)?;
             }
-            let embedded = sam.encode(&image)?;
-            let proposals = propose(&sam, &embedded, &choice)?;
-            let chosen = levels(&proposals.masks, &choice);
-            let [width, height] = map_size(&image, args.map_size);
-            let scale = (width * height) as f64 / (image.width * image.height) as f64;
-            let maps = paint(&proposals, &chosen, width, height, (args.min_area as f64 * scale).ceil() as usize);
-            let facts = Facts {
-                size: [width, height],
-                masks: count_masks(&maps),
-                points: proposals.points,
-                asked: proposals.asked,
-            };
+            let (maps, facts) = make(args, &sam, &image)?;
             finished::remove_manifest(&manifest)?;
             maps.write(&output)?;
-            finished::write(&output, &key, facts)?
-        };
+            Ok(facts)
+        })?;
         if let Some(folder) = &args.preview {
             let picture = preview(&image, &MaskMaps::read(&output)?);
             Image::from_rgb8(picture.width as u32, picture.height as u32, &picture.pixels)
                 .write_png(folder.join(format!("{}.png", view.stem())))?;
         }
-        asked += note.facts.asked;
-        points += note.facts.points;
-        views.insert(view.stem().to_string(), json!({ "hash": note.hash, "facts": note.facts }));
-        progress.step();
+        asked += facts.asked;
+        points += facts.points;
+        large += facts.masks[Level::Large as usize];
     }
-    progress.finish(&[]);
-    if kept > 0 {
-        stage.skipped(&format!("{kept} of {} views: their id maps stand already", scene.views.len()));
-    }
+    let views = views.finish("id maps");
     if asked < points {
         stage.skipped(&format!("{} of {points} points: within masks already found", points - asked));
     }
     watched.check()?;
-    let mut inputs = BTreeMap::from([(role::DATASET.to_string(), dataset_hash)]);
-    inputs.insert("sam".into(), sam.hash().to_string());
     let mut provenance = stage.provenance("masks", 1, parameters.clone(), inputs.clone());
+    let count = views.len();
     provenance.extra = json!({ "views": views });
     finished::write_json(&manifest, &provenance)?;
-    let masks: usize = views.values().filter_map(|v| v["facts"]["masks"][3].as_u64()).sum::<u64>() as usize;
-    stage.record(&mut claim, parameters, inputs, json!({ "views": views.len(), "masks_large": masks }))
+    stage.record(&mut claim, parameters, inputs, json!({ "views": count, "masks_large": large }))
+}
+
+/// The id maps of a photograph.
+fn make(args: &MasksArgs, sam: &Sam, image: &RgbImage) -> Result<(MaskMaps, Facts)> {
+    let proposals = propose(sam, &sam.encode(image)?, &args.choice)?;
+    let [width, height] = map_size(image, args.map_size);
+    let scale = (width * height) as f64 / (image.width * image.height) as f64;
+    let smallest = (args.min_area as f64 * scale).ceil() as usize;
+    let maps = paint(&proposals, &levels(&proposals.masks), width, height, smallest);
+    let (points, asked) = (proposals.points, proposals.asked);
+    let facts = Facts { size: [width, height], masks: count_masks(&maps), points, asked };
+    Ok((maps, facts))
 }
 
 /// The right to write id maps, their notes, the manifest and the previews. Maps that this program did not make stay.
 fn claim(args: &MasksArgs, scene: &Dataset, manifest: &Path, stage: &Stage) -> Result<Claim> {
-    let maps: Vec<PathBuf> = scene.views.iter().map(|v| maps_path(&args.out, v.stem())).collect();
+    let maps: Vec<PathBuf> = scene.views.iter().map(|v| maps_path(&args.maps.out, v.stem())).collect();
     let notes = maps.iter().map(|m| finished::note_path(m));
     let outputs = stage.outputs(manifest).file(manifest).files(notes).files(&maps).reads(&scene.files).drop_stale();
     let pictures = scene.views.iter().map(|v| format!("{}.png", v.stem()));
     args.preview.iter().fold(outputs, |outputs, folder| outputs.files_in(folder, pictures.clone())).claim()
 }
 
-/// Says how much memory the photographs will take, and refuses more than there may be.
+/// Says how much memory the photographs will take.
 fn foretell(args: &MasksArgs, sam: &Sam, views: &[View], stage: &Stage) -> Result<()> {
     let nothing = RgbImage { width: 4, height: 3, pixels: vec![0; 36] };
     // The encoder a second time, on top of what the decoder leaves with each thread.
-    propose(sam, &sam.encode(&nothing)?, &Choice { points_per_side: 4, ..args.choice.choice() })?;
+    propose(sam, &sam.encode(&nothing)?, &Choice { points_per_side: 4, ..args.choice })?;
     sam.encode(&nothing)?;
-    let side = args.choice.choice().points_per_side as u64;
+    let side = args.choice.points_per_side as u64;
     let pixels = memory::largest(views);
     let map = if args.map_size == 0 { pixels } else { pixels.min((args.map_size * args.map_size * 3 / 4) as u64) };
     let needed = memory::of_masks(memory::so_far(), side * side * 3 / 4, pixels, map);

@@ -95,8 +95,8 @@ fn color(id: i32) -> [u8; 3] {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::automatic::{Grid, Proposal};
-    use crate::logits::Logits;
+    use crate::automatic::Proposal;
+    use crate::logits::{Grid, Logits};
     use crate::nms::Pixels;
 
     /// Proposals on a 20 x 10 grid, each a rectangle x0..x1, y0..y1.

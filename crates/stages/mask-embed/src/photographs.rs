@@ -1,6 +1,6 @@
 //! The photographs of a scene as 8-bit pictures.
 
-use crate::args::SceneArgs;
+use crate::options::SceneArgs;
 use gs_io::{Result, hash_bytes};
 use gs_scene::dataset::{self, Dataset, LoadOptions, View};
 use onnx_models::RgbImage;

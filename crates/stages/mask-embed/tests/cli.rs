@@ -19,10 +19,12 @@ fn fake_clip() -> PathBuf {
     Path::new(env!("CARGO_MANIFEST_DIR")).join("../../lib/onnx-models/testdata/clip")
 }
 
-/// Colour of a pixel: a grey wall with a dark square, a bright square, and in it a slightly different one.
+/// Colour of a pixel: a green ceiling over a grey wall with a dark square, a bright square, and in it a slightly different
+/// one.
 fn color(view: usize, x: usize, y: usize) -> [u8; 3] {
     let x = x.wrapping_sub(view * 8);
     match (x, y) {
+        (_, 0..12) => [60, 180, 60],
         (80..112, 24..40) => [250, 235, 240],
         (72..112, 16..48) => [250, 250, 240],
         (16..48, 16..48) => [20, 30, 10],
@@ -57,15 +59,10 @@ fn ok(args: &[&str]) -> String {
 
 #[test]
 fn a_limit_that_nothing_is_held_against_is_refused() {
-    for args in [
-        &["tokenize", "--truth", "none", "--out", "none"][..],
-        &["crops", "--scene", "x", "--masks", "x", "--out", "x"],
-    ] {
-        let o = run(&[args, &["--memory-limit", "1G"]].concat());
-        let said = String::from_utf8_lossy(&o.stderr);
-        let line = "mask-embed: error: --memory-limit: this command does not forecast its memory; leave it out\n";
-        assert!(o.status.code() == Some(2) && said == line, "{said}");
-    }
+    let o = run(&["crops", "--scene", "x", "--masks", "x", "--out", "x", "--memory-limit", "1G"]);
+    let said = String::from_utf8_lossy(&o.stderr);
+    let line = "mask-embed: error: --memory-limit: this command does not forecast its memory; leave it out\n";
+    assert!(o.status.code() == Some(2) && said == line, "{said}");
 }
 
 #[test]
@@ -123,8 +120,7 @@ impl Scene {
         let sam = fake_sam();
         let mut args: Vec<String> = ["masks", "--scene", path(&self.folder), "--sam", path(&sam), "--out", path(out)]
             .into_iter()
-            // The wall is three quarters of the picture.
-            .chain(["--points-per-side", "16", "--min-area", "20", "--max-area", "0.8"])
+            .chain(["--points-per-side", "16", "--min-area", "20"])
             .map(String::from)
             .collect();
         args.extend(more.iter().map(ToString::to_string));
@@ -157,7 +153,7 @@ fn masks_follow_the_colours_at_every_level() {
         assert_eq!((maps.width, maps.height), (WIDTH, HEIGHT));
         let at = |l: Level, x: usize, y: usize| maps.level(l)[y * WIDTH + x + v * 8];
         for level in Level::ALL {
-            let (wall, dark, bright) = (at(level, 2, 2), at(level, 30, 30), at(level, 76, 44));
+            let (wall, dark, bright) = (at(level, 2, 20), at(level, 30, 30), at(level, 76, 44));
             assert!(wall >= 0 && dark >= 0 && bright >= 0 && wall != dark && dark != bright && wall != bright);
         }
         // The inner square is apart at level small and part of the bright one at level large.
@@ -213,10 +209,10 @@ fn the_result_depends_neither_on_threads_nor_on_interruptions() {
     let touched = || std::fs::metadata(other.join("v1_s.npy")).unwrap().modified().unwrap();
     let before = touched();
     let said = scene.make_masks(&other, &[]);
-    assert!(said.contains("skipped 3 of 3 views: their id maps stand already"), "{said}");
+    assert!(said.contains("skipped 3 of 3 views: their id maps are done already"), "{said}");
     assert_eq!(touched(), before);
     let said = scene.make_masks(&other, &["--stability", "0.71"]);
-    assert!(!said.contains("stand already"), "{said}");
+    assert!(!said.contains("done already"), "{said}");
     assert!(touched() > before);
     // A changed photograph: that view alone.
     scene.make_masks(&other, &[]);
@@ -227,20 +223,19 @@ fn the_result_depends_neither_on_threads_nor_on_interruptions() {
 }
 
 #[test]
-fn fewer_points_are_asked_and_the_masks_stay() {
+fn points_within_masks_already_found_are_not_asked() {
     let scene = Scene::new(1);
-    let other = scene.masks.with_file_name("all");
-    scene.make_masks(&scene.masks, &[]);
-    scene.make_masks(&other, &["--skip-score", "2"]);
-    let facts = |folder: &Path| -> serde_json::Value {
-        let json: serde_json::Value =
-            serde_json::from_slice(&std::fs::read(folder.join("masks.json")).unwrap()).unwrap();
-        json["extra"]["views"]["v0"].clone()
-    };
-    let (few, all) = (facts(&scene.masks), facts(&other));
-    assert_eq!(all["facts"]["asked"], 16 * 8);
-    assert!(few["facts"]["asked"].as_u64().unwrap() < 40, "{few}");
-    assert_eq!(few["hash"], all["hash"]);
+    let said = scene.make_masks(&scene.masks, &[]);
+    assert!(said.contains("of 128 points: within masks already found"), "{said}");
+    let json: serde_json::Value =
+        serde_json::from_slice(&std::fs::read(scene.masks.join("masks.json")).unwrap()).unwrap();
+    assert!(json["extra"]["views"]["v0"]["facts"]["asked"].as_u64().unwrap() < 48, "{json}");
+    // The provenance holds every option that shapes the maps.
+    let expected = serde_json::json!({
+        "resolution": "auto", "engine": "rten", "map_size": 800, "min_area": 20,
+        "points_per_side": 16, "pred_iou": 0.7, "stability": 0.7,
+    });
+    assert_eq!(json["parameters"], expected);
 }
 
 #[test]
@@ -266,7 +261,7 @@ fn features_are_those_of_the_crops() {
     // Same bytes with other threads, and nothing to do the second time.
     let first = contents(&scene.masks);
     let said = ok(&args);
-    assert!(said.contains("skipped 2 of 2 views: their features stand already"), "{said}");
+    assert!(said.contains("skipped 2 of 2 views: their features are done already"), "{said}");
     for name in ["v0_f.npy", "v1_f.npy", "v0_f.json", "features.json"] {
         std::fs::remove_file(scene.masks.join(name)).unwrap();
     }
@@ -278,13 +273,30 @@ fn features_are_those_of_the_crops() {
 fn crops_are_written_for_training() {
     let scene = Scene::new(2);
     scene.make_masks(&scene.masks, &[]);
+    let truth = scene.folder.join("truth");
+    let object = TrueObject {
+        id: 0,
+        name: "red mug".into(),
+        class: "mug".into(),
+        color: "red".into(),
+        background: false,
+        parts: vec![TruePart { id: 0, name: "handle".into() }],
+    };
+    TrueScene { objects: vec![object], parameters: serde_json::Value::Null }.write(truth.join("scene.json")).unwrap();
+    let caption = "a photo of a cat".to_string();
+    let mask = MaskTruth { level: 1, instances: vec![0], part: Some(0), kind: "part".into(), caption };
+    MaskTruth::write_all(truth.join("masks.json"), &BTreeMap::from([("v0".into(), vec![mask])])).unwrap();
     let out = scene.masks.with_file_name("crops.safetensors");
     ok(&["crops", "--scene", path(&scene.folder), "--masks", path(&scene.masks), "--out", path(&out), "--size", "16"]);
-    let a = Artifact::open(&out, mask_embed::embed::CROPS_FORMAT, 1).unwrap();
+    let a = Artifact::open(&out, mask_embed::crops::CROPS_FORMAT, 1).unwrap();
     let view = a.tensor::<u32>("view", &[None]).unwrap();
     let mask = a.tensor::<u32>("mask", &[Some(view.len())]).unwrap();
     let pixels = a.tensor::<u8>("pixels", &[Some(view.len()), Some(3), Some(16), Some(16)]).unwrap();
     assert_eq!(a.provenance().extra["views"], serde_json::json!(["v0", "v1"]));
+    let tokens: BTreeMap<String, Vec<i32>> = serde_json::from_value(a.provenance().extra["tokens"].clone()).unwrap();
+    assert_eq!(tokens.keys().collect::<Vec<_>>(), ["a photo of a cat", "mug", "red mug"]);
+    assert_eq!(tokens["a photo of a cat"], [320, 1125, 539, 320, 2368]);
+    assert_eq!(tokens["red mug"][1..], tokens["mug"]);
     let maps = MaskMaps::read(maps_path(&scene.masks, "v0")).unwrap();
     assert_eq!(view.iter().filter(|&&v| v == 0).count(), maps.id_count());
     let dark = maps.level(Level::Large)[30 * WIDTH + 30] as u32;
@@ -334,32 +346,6 @@ fn label_pictures_become_id_maps() {
     assert!(import().contains("labels: no label pictures"));
     assert_eq!(MaskMaps::read(maps_path(&out, "c")).unwrap(), c, "a good output was overwritten");
     assert!(out.join("masks.json").exists());
-}
-
-#[test]
-fn captions_become_token_ids() {
-    let dir = tempfile::tempdir().unwrap();
-    let truth = dir.path().join("set/scene_000/scene/truth");
-    let object = TrueObject {
-        id: 0,
-        name: "red mug".into(),
-        class: "mug".into(),
-        color: "red".into(),
-        background: false,
-        parts: vec![TruePart { id: 0, name: "handle".into() }],
-    };
-    TrueScene { objects: vec![object], parameters: serde_json::Value::Null }.write(truth.join("scene.json")).unwrap();
-    let caption = "a photo of a cat".to_string();
-    let mask = MaskTruth { level: 1, instances: vec![0], part: Some(0), kind: "part".into(), caption };
-    MaskTruth::write_all(truth.join("masks.json"), &BTreeMap::from([("v0".into(), vec![mask])])).unwrap();
-    let out = dir.path().join("tokens.json");
-    ok(&["tokenize", "--truth", path(dir.path()), "--out", path(&out)]);
-    let ids: BTreeMap<String, Vec<i32>> = serde_json::from_slice(&std::fs::read(&out).unwrap()).unwrap();
-    assert_eq!(ids.keys().collect::<Vec<_>>(), ["a photo of a cat", "mug", "red mug"]);
-    assert_eq!(ids["a photo of a cat"], [320, 1125, 539, 320, 2368]);
-    assert_eq!(ids["red mug"][1..], ids["mug"]);
-    let e = error(&["tokenize", "--truth", path(&truth), "--out", path(&out)]);
-    assert!(e.contains("no synthetic scene under this folder"), "{e}");
 }
 
 #[test]
@@ -415,7 +401,7 @@ fn bad_input_is_one_line_and_exit_code_2() {
     let e = embed(&scene.masks, &fake_clip());
     assert!(e.contains("v0_s.npy: shape: the file's length does not fit its shape"), "{e}");
     // clap's own errors have exit code 2 as well.
-    assert_eq!(run(&["masks", "--scene", "x", "--out", "y", "--nms-iou", "1.5"]).status.code(), Some(2));
+    assert_eq!(run(&["masks", "--scene", "x", "--out", "y", "--stability", "1.5"]).status.code(), Some(2));
 }
 
 #[test]

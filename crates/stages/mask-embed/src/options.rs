@@ -1,0 +1,182 @@
+//! The command line of `mask-embed`: every option with its default and range.
+
+#![allow(rustdoc::invalid_html_tags, reason = "help texts name files as <view>_s.npy")]
+
+use gs_scene::dataset::Resolution;
+use onnx_models::EngineOptions;
+use serde::{Serialize, Serializer};
+use stage::CommonArgs;
+use std::path::PathBuf;
+
+/// Id maps and CLIP features of photographs, in LangSplat's files.
+#[derive(Debug, Clone, clap::Parser)]
+#[command(name = "mask-embed", version)]
+pub struct Args {
+    #[command(flatten)]
+    pub(crate) common: CommonArgs,
+    #[command(subcommand)]
+    pub(crate) task: Task,
+}
+
+#[derive(Debug, Clone, clap::Subcommand)]
+pub(crate) enum Task {
+    /// Make id maps of photographs with SAM
+    Masks(Box<MasksArgs>),
+    /// Make CLIP features of the masks of existing id maps
+    Embed(EmbedArgs),
+    /// Make id maps from label pictures
+    Import(ImportArgs),
+    /// Write the pictures of all masks into one file, for training an encoder
+    Crops(CropsArgs),
+}
+
+/// Which photographs.
+#[derive(Debug, Clone, clap::Args, Serialize)]
+pub(crate) struct SceneArgs {
+    /// Scene folder: COLMAP, transforms.json or ScanNet
+    #[arg(long, value_name = "FOLDER")]
+    #[serde(skip)]
+    pub scene: PathBuf,
+    /// Size of the photographs: a divisor, a width that wider ones are shrunk to such as 640px, or auto for 1600px
+    #[arg(long, default_value = "auto", value_name = "auto|WIDTHpx|DIVISOR")]
+    #[serde(serialize_with = "as_typed")]
+    pub resolution: Resolution,
+}
+
+fn as_typed<S: Serializer>(resolution: &Resolution, serializer: S) -> Result<S::Ok, S::Error> {
+    serializer.collect_str(resolution)
+}
+
+/// Which engine runs the models.
+#[derive(Debug, Clone, clap::Args, Serialize)]
+pub(crate) struct EngineArgs {
+    /// Run the models with ONNX Runtime instead of the built-in engine: path of libonnxruntime.so, version 1.20 or later.
+    /// Needs ORT_DISABLE_TELEMETRY=1 in the environment [default: the built-in engine, rten]
+    #[arg(long, value_name = "LIBRARY")]
+    #[serde(rename = "engine", serialize_with = "engine_name")]
+    pub onnx_runtime: Option<PathBuf>,
+}
+
+#[allow(clippy::ref_option, reason = "serde asks for this type")]
+fn engine_name<S: Serializer>(library: &Option<PathBuf>, serializer: S) -> Result<S::Ok, S::Error> {
+    serializer.serialize_str(if library.is_some() { "onnxruntime" } else { "rten" })
+}
+
+impl EngineArgs {
+    /// Options for [`onnx_models::open`].
+    pub fn options(&self) -> EngineOptions {
+        EngineOptions { onnx_runtime: self.onnx_runtime.clone(), threads_per_run: 1 }
+    }
+}
+
+/// Existing id maps.
+#[derive(Debug, Clone, clap::Args, Serialize)]
+pub(crate) struct MapsArgs {
+    /// Folder with id maps (<view>_s.npy)
+    #[arg(long, value_name = "FOLDER")]
+    #[serde(skip)]
+    pub masks: PathBuf,
+}
+
+/// New id maps.
+#[derive(Debug, Clone, clap::Args, Serialize)]
+pub(crate) struct NewMapsArgs {
+    /// Output folder for id maps (<view>_s.npy) and, written last, masks.json
+    #[arg(long, value_name = "FOLDER")]
+    #[serde(skip)]
+    pub out: PathBuf,
+}
+
+/// Id maps from photographs with SAM.
+#[derive(Debug, Clone, clap::Args, Serialize)]
+pub(crate) struct MasksArgs {
+    #[command(flatten)]
+    #[serde(flatten)]
+    pub scene: SceneArgs,
+    #[command(flatten)]
+    #[serde(flatten)]
+    pub engine: EngineArgs,
+    #[command(flatten)]
+    #[serde(flatten)]
+    pub maps: NewMapsArgs,
+    /// Folder with SAM's encoder.onnx and sam.onnx, as `make models` fetches them
+    #[arg(long, default_value = "models", value_name = "FOLDER")]
+    #[serde(skip)]
+    pub sam: PathBuf,
+    /// Longest side of the id maps in pixels; 0 for the size of the photograph
+    #[arg(long, default_value_t = 800, value_name = "PIXELS")]
+    pub map_size: usize,
+    /// Masks, islands and holes of fewer pixels of the photograph are removed
+    #[arg(long, default_value_t = 200, value_name = "PIXELS")]
+    pub min_area: usize,
+    /// Also write a picture of each view's masks into this folder
+    #[arg(long, value_name = "FOLDER")]
+    #[serde(skip)]
+    pub preview: Option<PathBuf>,
+    #[command(flatten)]
+    #[serde(flatten)]
+    pub choice: Choice,
+}
+
+/// How masks are asked for and chosen.
+#[derive(Debug, Clone, Copy, PartialEq, clap::Args, Serialize)]
+#[command(next_help_heading = "Choice of masks")]
+pub struct Choice {
+    /// Points asked along the longer side of a photograph; along the shorter as many as fit the same distance
+    #[arg(long, default_value_t = 32, value_name = "COUNT", value_parser = stage::within(1usize..=256))]
+    pub points_per_side: usize,
+    /// Least IoU that SAM predicts for a mask, 0 to 1
+    #[arg(long, default_value_t = 0.7, value_name = "IOU", value_parser = stage::within(0.0..=1.0))]
+    pub pred_iou: f64,
+    /// Least stability of a mask, 0 to 1: IoU of the mask cut a little tighter and a little looser. SAM's own script has
+    /// 0.85; the edges of MobileSAM are softer
+    #[arg(long, default_value_t = 0.7, value_name = "IOU", value_parser = stage::within(0.0..=1.0))]
+    pub stability: f64,
+}
+
+/// CLIP features of existing id maps.
+#[derive(Debug, Clone, clap::Args)]
+pub(crate) struct EmbedArgs {
+    #[command(flatten)]
+    pub scene: SceneArgs,
+    #[command(flatten)]
+    pub engine: EngineArgs,
+    #[command(flatten)]
+    pub maps: MapsArgs,
+    /// Folder with CLIP's image.onnx and clip.json
+    #[arg(long, value_name = "FOLDER")]
+    pub clip: PathBuf,
+    /// Output folder for <view>_f.npy and, written last, features.json [default: the folder of the id maps]
+    #[arg(long, value_name = "FOLDER")]
+    pub out: Option<PathBuf>,
+}
+
+/// Id maps from label pictures.
+#[derive(Debug, Clone, clap::Args)]
+pub(crate) struct ImportArgs {
+    /// Folder with grey PNGs of 8 or 16 bits, 0 for no mask: <view>.png for all levels, or <view>_default.png,
+    /// <view>_small.png, <view>_medium.png and <view>_large.png
+    #[arg(long, value_name = "FOLDER")]
+    pub labels: PathBuf,
+    #[command(flatten)]
+    pub maps: NewMapsArgs,
+}
+
+/// Crops of all masks in one file.
+#[derive(Debug, Clone, clap::Args, Serialize)]
+pub(crate) struct CropsArgs {
+    #[command(flatten)]
+    #[serde(flatten)]
+    pub scene: SceneArgs,
+    #[command(flatten)]
+    #[serde(flatten)]
+    pub maps: MapsArgs,
+    /// Output file (safetensors): pixels u8 [n, 3, S, S], view u32 [n], mask u32 [n]; in the metadata the names of the
+    /// views and, of a synthetic scene, the token ids of every caption
+    #[arg(long, value_name = "FILE")]
+    #[serde(skip)]
+    pub out: PathBuf,
+    /// Side S of the crops in pixels
+    #[arg(long, default_value_t = 64, value_name = "PIXELS", value_parser = stage::within(1usize..=1024))]
+    pub size: usize,
+}
