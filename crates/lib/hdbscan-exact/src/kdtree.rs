@@ -1,4 +1,5 @@
-//! A kd-tree, and walks over it for a group of points at a time.
+//! A kd-tree in any dimension, and walks over it for a group of points at a time. docs/architecture.md says which tree of
+//! the workspace is for what.
 //!
 //! What decides is computed in f64. What only tells whether something need be looked at is computed in f32, many points at
 //! a time, against limits raised by more than f32 can be wrong ([`rough_limit`]): nothing that matters is ever passed over.

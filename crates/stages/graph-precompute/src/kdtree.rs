@@ -1,4 +1,5 @@
-//! A kd-tree whose answers have one defined order: by distance, then by index.
+//! A kd-tree whose answers have one defined order: by distance, then by index. docs/architecture.md says which tree of the
+//! workspace is for what.
 //!
 //! Distances are squared Euclidean, in f32, summed as (dx² + dy²) + dz². The distance to a bounding box is computed with
 //! the same operations, and f32 rounding is monotone, so a box is never farther than a point inside it: pruning is exact,
@@ -97,7 +98,7 @@ impl KdTree {
 
     /// For each query point (with the index to leave out, if any): its `k` nearest points as in [`Self::nearest`],
     /// `[queries][k]`. Where there are fewer than `k`, rows are filled up with `pad(query)`.
-    pub fn nearest_many(
+    fn nearest_many(
         &self,
         queries: &[([f32; 3], Option<u32>)],
         k: usize,

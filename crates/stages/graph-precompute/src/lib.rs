@@ -1,16 +1,20 @@
 //! Stage 2a: what is computed once because geometry is frozen.
 //!
-//! [`footprint`] rasterises each view once and keeps which Gaussians make up which mask; [`graph`] samples anchors among
-//! the Gaussians that were seen and finds neighbours. `docs/method.md` has the equations.
+//! `options` is the command line, `run` the story. `precompute` goes through the views: [`footprint`] rasterises each once
+//! and keeps which Gaussians make up which mask; then [`graph`] samples anchors ([`fps`]) among the Gaussians that were seen
+//! and finds neighbours ([`kdtree`]), at [`positions`] that f32 can bear. `memory` forecasts the peak. `docs/method.md` has
+//! the equations.
 
-pub mod cli;
-pub mod contract;
 pub mod footprint;
 pub mod fps;
 pub mod graph;
 pub mod kdtree;
-pub mod memory;
+mod memory;
+mod options;
 pub mod positions;
-pub mod precompute;
+mod precompute;
+mod run;
 #[cfg(test)]
 mod testing;
+
+pub use options::Args;

@@ -3,5 +3,5 @@
 use std::process::ExitCode;
 
 fn main() -> ExitCode {
-    stage::main::<graph_precompute::cli::Args>()
+    stage::main::<graph_precompute::Args>()
 }

@@ -10,12 +10,12 @@ const SIZE: u32 = 48;
 const VIEWS: usize = 5;
 
 /// A transforms.json scene of two clusters of Gaussians, one mask each and one for both.
-fn scene(dir: &Path) {
+fn scene(dir: &Path, size: u32) {
     let mut frames = Vec::new();
     std::fs::create_dir_all(dir.join("masks")).unwrap();
     for v in 0..VIEWS {
         let eye = DVec3::new(v as f64 * 0.1 - 0.2, -0.2, -3.0);
-        let c = Camera::look_at(eye, DVec3::ZERO, DVec3::NEG_Y, SIZE, SIZE, 0.9);
+        let c = Camera::look_at(eye, DVec3::ZERO, DVec3::NEG_Y, size, size, 0.9);
         let (r, t) = (c.rotation.transpose(), c.position());
         // OpenGL axes: y and z turned round.
         let row = |i: usize| [r.col(0)[i], -r.col(1)[i], -r.col(2)[i], t[i]];
@@ -23,21 +23,21 @@ fn scene(dir: &Path) {
             "file_path": format!("images/v{v}.png"),
             "transform_matrix": [row(0), row(1), row(2), [0.0, 0.0, 0.0, 1.0]],
         }));
-        let n = (SIZE * SIZE) as usize;
-        Image { width: SIZE, height: SIZE, rgb: vec![0.5; 3 * n], alpha: None }
+        let n = (size * size) as usize;
+        Image { width: size, height: size, rgb: vec![0.5; 3 * n], alpha: None }
             .write_png(dir.join(format!("images/v{v}.png")))
             .unwrap();
-        let half: Vec<i32> = (0..n).map(|p| i32::from(p % SIZE as usize >= SIZE as usize / 2)).collect();
+        let half: Vec<i32> = (0..n).map(|p| i32::from(p % size as usize >= size as usize / 2)).collect();
         let mut ids = half.clone();
         ids.extend(half.iter().map(|i| i + 2));
         ids.extend(half.iter().map(|i| i + 4));
         ids.extend(vec![6; n]);
-        MaskMaps { width: SIZE as usize, height: SIZE as usize, ids }
+        MaskMaps { width: size as usize, height: size as usize, ids }
             .write(dir.join(format!("masks/v{v}_s.npy")))
             .unwrap();
     }
-    let f = 0.5 * f64::from(SIZE) / 0.45f64.tan();
-    let transforms = serde_json::json!({ "w": SIZE, "h": SIZE, "fl_x": f, "fl_y": f, "frames": frames });
+    let f = 0.5 * f64::from(size) / 0.45f64.tan();
+    let transforms = serde_json::json!({ "w": size, "h": size, "fl_x": f, "fl_y": f, "frames": frames });
     std::fs::write(dir.join("transforms.json"), transforms.to_string()).unwrap();
     ply::write_gaussians(dir.join("geometry.ply"), &gaussians(), &[]).unwrap();
 }
@@ -69,11 +69,16 @@ fn run(dir: &Path, out: &Path, extra: &[&str]) -> Output {
 }
 
 fn setup() -> (tempfile::TempDir, PathBuf, PathBuf) {
+    setup_of(SIZE)
+}
+
+/// A scene with photographs of this size, and a folder for the output.
+fn setup_of(size: u32) -> (tempfile::TempDir, PathBuf, PathBuf) {
     let dir = tempfile::tempdir().unwrap();
     let (s, o) = (dir.path().join("scene"), dir.path().join("out"));
     std::fs::create_dir_all(s.join("images")).unwrap();
     std::fs::create_dir_all(&o).unwrap();
-    scene(&s);
+    scene(&s, size);
     (dir, s, o)
 }
 
@@ -105,12 +110,39 @@ fn artifacts_are_right_and_the_same_for_any_number_of_threads() {
     let sum = |r: usize| f.entries(r).1.iter().map(|&w| f64::from(w)).sum::<f64>();
     assert!((sum(0) + sum(1) - sum(6)).abs() < 1e-3 * sum(6) && sum(6) > 100.0);
 
+    // The provenance holds every option.
+    let expected = serde_json::json!({
+        "views": "train", "holdout": 8, "anchor_ratio": 0.1, "k": 16, "gate": 0.7, "min_mask_pixels": 50.0, "cut": 0.0,
+        "pixel_samples": 0, "no_skip": false, "preset": null, "seed": 0,
+    });
+    assert_eq!(a.provenance().parameters, expected);
+
     let said = succeed(&run(&s, &o, &["--no-skip", "--views", "all", "--cut", "0.01", "--min-mask-pixels", "0"]));
     assert!(said.contains("the cut dropped at most"), "{said}");
     assert_eq!(Graph::read(o.join("graph.safetensors")).unwrap().0.kept.len(), 61);
     let cut = Footprints::read(o.join("footprints.safetensors")).unwrap();
     assert_eq!(cut.views.len(), 5);
     assert!(cut.csr().1.len() * 4 < f.csr().1.len() * 5);
+}
+
+#[test]
+fn the_forecast_is_near_the_peak() {
+    const SIDE: usize = 25;
+    let (_dir, s, o) = setup_of(192);
+    let one = gaussians().select(&[0]);
+    let mut g = one.select(&vec![0; SIDE * SIDE * SIDE]);
+    for (i, p) in g.means.iter_mut().enumerate() {
+        let at = |i: usize| (i % SIDE) as f32 / SIDE as f32 - 0.5;
+        *p = [2.5 * at(i), 2.5 * at(i / SIDE), 0.3 * at(i / SIDE / SIDE)];
+    }
+    g.log_scales.fill([-2.8; 3]);
+    ply::write_gaussians(s.join("geometry.ply"), &g, &[]).unwrap();
+    succeed(&run(&s, &o, &["--threads", "2"]));
+    let record = stage::RunRecord::read(o.join("graph.safetensors")).unwrap();
+    if let (Some(forecast), Some(peak)) = (record.memory_predicted_bytes, record.peak_rss_bytes) {
+        let ratio = forecast as f64 / peak as f64;
+        assert!((0.6..1.8).contains(&ratio), "forecast {forecast}, peak {peak}");
+    }
 }
 
 #[test]
@@ -130,10 +162,12 @@ fn bad_input_is_one_line_and_leaves_outputs_alone() {
         assert_eq!(std::fs::read(o.join("graph.safetensors")).unwrap(), b"good");
         assert_eq!(std::fs::read(o.join("footprints.safetensors")).unwrap(), b"good");
     };
-    fail(&["--k", "0"], &["--k", "found 0"]);
-    fail(&["--anchor-ratio", "NaN"], &["--anchor-ratio"]);
-    fail(&["--gate", "1.5"], &["--gate", "found 1.5"]);
-    fail(&["--pixel-samples", "5000"], &["--pixel-samples", "found 5000"]);
+    // clap's own errors have exit code 2 as well, and name option and range.
+    fail(&["--k", "0"], &["--k", "expected 1 to 1024"]);
+    fail(&["--anchor-ratio", "NaN"], &["--anchor-ratio", "to 1"]);
+    fail(&["--gate", "1.5"], &["--gate", "expected 0 to 0.999"]);
+    fail(&["--pixel-samples", "5000"], &["--pixel-samples", "expected 0 to 4096"]);
+    fail(&["--holdout", "1"], &["scene", "all views are held out", "--holdout 0"]);
     fail(&["--min-mask-pixels", "1000000"], &["masks", "too small", "--min-mask-pixels"]);
     let masks = s.join("masks/v2_s.npy");
     let good = std::fs::read(&masks).unwrap();

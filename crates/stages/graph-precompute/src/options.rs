@@ -1,0 +1,92 @@
+//! The command line of `graph-precompute`: every option with its default and range.
+
+#![allow(rustdoc::invalid_html_tags, reason = "help texts name files as <view>_s.npy")]
+
+use serde::Serialize;
+use stage::CommonArgs;
+use std::path::PathBuf;
+
+/// Footprints of masks, anchors and neighbours of frozen Gaussians
+#[derive(Debug, clap::Parser)]
+#[command(name = "graph-precompute", version)]
+pub struct Args {
+    /// Dataset folder (COLMAP, transforms.json or ScanNet)
+    #[arg(long, value_name = "DIR")]
+    pub(crate) scene: PathBuf,
+    /// Gaussians, as a 3DGS PLY
+    #[arg(long, value_name = "FILE")]
+    pub(crate) geometry: PathBuf,
+    /// Folder with id maps (<view>_s.npy)
+    #[arg(long, value_name = "DIR")]
+    pub(crate) masks: PathBuf,
+    /// Output file of the footprints
+    #[arg(long, value_name = "FILE")]
+    pub(crate) footprints: PathBuf,
+    /// Output file of the graph (written last)
+    #[arg(long, value_name = "FILE")]
+    pub(crate) graph: PathBuf,
+    #[command(flatten)]
+    pub(crate) settings: Settings,
+    #[command(flatten)]
+    pub(crate) common: CommonArgs,
+}
+
+/// What shapes the result. The provenance of both artifacts holds all of it.
+#[derive(Debug, Clone, PartialEq, clap::Args, Serialize)]
+pub(crate) struct Settings {
+    /// Views whose masks are used; the protocols learn from training views only
+    #[arg(long, value_enum, default_value_t = Views::Train)]
+    pub views: Views,
+    /// Hold out every N-th view; 0 holds none out
+    #[arg(long, value_name = "N", default_value_t = 8)]
+    pub holdout: usize,
+    /// Share of the Gaussians that become anchors; at least one does
+    #[arg(long, value_name = "SHARE", default_value_t = 0.1, value_parser = stage::within(1e-9..=1.0))]
+    pub anchor_ratio: f64,
+    /// Neighbours per anchor
+    #[arg(long, value_name = "COUNT", default_value_t = 16, value_parser = stage::within(1usize..=1024))]
+    pub k: usize,
+    /// A pixel counts where its accumulated alpha exceeds this
+    #[arg(long, value_name = "ALPHA", default_value_t = 0.7, value_parser = stage::within(0.0..=0.999))]
+    pub gate: f64,
+    /// Leave out masks of fewer pixels, counted in an image of 986 x 728 and scaled down for smaller id maps
+    #[arg(long, value_name = "PIXELS", default_value_t = 50.0, value_parser = stage::within(0.0..=1e9))]
+    pub min_mask_pixels: f64,
+    /// Drop footprint entries below this share of their mask; 0 keeps all. The largest change is reported
+    #[arg(long, value_name = "SHARE", default_value_t = 0.0, value_parser = stage::within(0.0..=0.999))]
+    pub cut: f64,
+    /// Also keep this many random pixels of each mask, for the losses of feat-train that look at single pixels
+    #[arg(long, value_name = "COUNT", default_value_t = 0, value_parser = stage::within(0usize..=4096))]
+    pub pixel_samples: usize,
+    /// Keep Gaussians that no view sees
+    #[arg(long)]
+    pub no_skip: bool,
+    /// Options that go together [default: none]
+    #[arg(long, value_enum)]
+    pub preset: Option<Preset>,
+}
+
+/// Which views' masks to use.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, clap::ValueEnum, Serialize)]
+#[serde(rename_all = "lowercase")]
+pub(crate) enum Views {
+    /// Training views
+    Train,
+    /// Training views and held-out views
+    All,
+}
+
+/// Options that go together.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, clap::ValueEnum, Serialize)]
+#[serde(rename_all = "lowercase")]
+pub(crate) enum Preset {
+    /// The paper read literally: anchors are sampled among all Gaussians, seen or not
+    Paper,
+}
+
+impl Settings {
+    /// Whether Gaussians that no view sees take part.
+    pub fn keep_unseen(&self) -> bool {
+        self.no_skip || self.preset == Some(Preset::Paper)
+    }
+}
