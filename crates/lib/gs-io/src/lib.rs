@@ -18,7 +18,7 @@ mod watch;
 pub use artifact::{Artifact, ArtifactWriter, Provenance};
 pub use atomic::{create_dir, write_atomic, write_bytes, write_json};
 pub use error::{Error, ErrorKind, IoContext, Result, escaped};
-pub use hash::{hash_bytes, hash_file, hash_files};
+pub use hash::{hash_bytes, hash_file, hash_files, mixed};
 pub use lock::Lock;
 pub use outputs::{Claim, Outputs, Written, record_path};
 pub use place::with_suffix;

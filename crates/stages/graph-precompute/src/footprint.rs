@@ -5,6 +5,7 @@
 //! do not depend on the number of threads.
 
 use artifacts::{LEVELS, MaskMaps, Row};
+use gs_io::mixed;
 use gs_raster::{RasterOptions, TILE, TileWeights};
 use gs_scene::{Camera, Gaussians};
 use rayon::prelude::*;
@@ -106,14 +107,6 @@ fn lowest_keys(mut pixels: Vec<Pixel>, count: usize) -> Vec<Pixel> {
         kept <= count
     });
     pixels
-}
-
-/// A well-mixed number (splitmix64).
-fn mixed(counter: u64) -> u64 {
-    let mut z = counter.wrapping_add(0x9E37_79B9_7F4A_7C15);
-    z = (z ^ (z >> 30)).wrapping_mul(0xBF58_476D_1CE4_E5B9);
-    z = (z ^ (z >> 27)).wrapping_mul(0x94D0_49BB_1331_11EB);
-    z ^ (z >> 31)
 }
 
 /// Gated pixels of a tile whose keys are low, and what they show.
