@@ -122,55 +122,9 @@ pub fn spanning_tree(points: &[f32], dim: usize, weights: &[u32], min_samples: u
     let leaves: Vec<u32> = tree.leaves(0).collect();
     let mut out: Vec<Edge> = Vec::with_capacity(n - 1);
     while out.len() < n - 1 {
-        // What points know already, for sure or as candidates.
         caps.reset();
-        known.par_iter_mut().enumerate().with_min_len(1024).for_each(|(i, k)| {
-            let own = search.component[i];
-            if k.best.is_none_or(|(_, q)| search.component[q as usize] == own) {
-                // A candidate is the cheapest for sure when it costs no more than any edge of this point must, and no
-                // other point as near was left out of the candidates.
-                let first = candidates.first(&search, i, &mut k.next);
-                let certain = |(e, _): &(Edge, u32)| e.weight == near.core[i] && near.complete[i];
-                k.best = first.filter(certain);
-                if let Some((edge, _)) = first {
-                    caps.lower(own, edge.weight);
-                }
-            }
-            if let Some((edge, _)) = k.best {
-                caps.lower(own, edge.weight);
-            }
-        });
-        // Points that may know something cheaper look for it.
-        let mut rest = &mut known[..];
-        let mut of_leaf: Vec<&mut [Known]> = Vec::with_capacity(leaves.len());
-        for &leaf in &leaves {
-            let node = &tree.nodes[leaf as usize];
-            let (own, others) = rest.split_at_mut((node.end - node.start) as usize);
-            of_leaf.push(own);
-            rest = others;
-        }
-        of_leaf.into_par_iter().zip(&leaves).with_min_len(8).for_each_init(
-            || (Group::default(), Vec::new()),
-            |(group, asking), (known, &leaf)| {
-                let start = tree.nodes[leaf as usize].start;
-                asking.clear();
-                for (lane, k) in known.iter().enumerate() {
-                    let own = search.component[start as usize + lane];
-                    if k.best.is_none() && k.floor <= caps.get(own) {
-                        asking.push((own, start + lane as u32));
-                    }
-                }
-                // Points of one component ask together.
-                asking.sort_unstable();
-                for points in asking.chunk_by(|a, b| a.0 == b.0) {
-                    let (found, least) = cheapest_edges(&search, points, &caps, group);
-                    for (&(_, at), found) in points.iter().zip(found) {
-                        let k = &mut known[(at - start) as usize];
-                        (k.best, k.floor) = (found, k.floor.max(least));
-                    }
-                }
-            },
-        );
+        recall(&search, &candidates, &caps, &mut known);
+        search_more(&search, &leaves, &caps, &mut known);
         // Every component's cheapest edge joins; in one total order these edges close no cycle.
         let mut cheapest: Vec<Option<Edge>> = vec![None; n];
         for (i, k) in known.iter().enumerate() {
@@ -183,6 +137,61 @@ pub fn spanning_tree(points: &[f32], dim: usize, weights: &[u32], min_samples: u
     }
     out.par_sort_unstable_by(Edge::order);
     (out, core)
+}
+
+/// Gives points the edges that they know already, for sure or as candidates, and lowers the caps of their components.
+fn recall(search: &Search<'_>, candidates: &Candidates<'_>, caps: &Caps, known: &mut [Known]) {
+    known.par_iter_mut().enumerate().with_min_len(1024).for_each(|(i, k)| {
+        let own = search.component[i];
+        if k.best.is_none_or(|(_, q)| search.component[q as usize] == own) {
+            // A candidate is the cheapest for sure when it costs no more than any edge of this point must, and no
+            // other point as near was left out of the candidates.
+            let first = candidates.first(search, i, &mut k.next);
+            let certain = |(e, _): &(Edge, u32)| e.weight == search.core[i] && candidates.of.complete[i];
+            k.best = first.filter(certain);
+            if let Some((edge, _)) = first {
+                caps.lower(own, edge.weight);
+            }
+        }
+        if let Some((edge, _)) = k.best {
+            caps.lower(own, edge.weight);
+        }
+    });
+}
+
+/// Lets the points search that may have a cheaper edge than their component knows, leaf by leaf.
+fn search_more(search: &Search<'_>, leaves: &[u32], caps: &Caps, known: &mut [Known]) {
+    let nodes = &search.tree.nodes;
+    let mut rest = known;
+    let mut of_leaf: Vec<&mut [Known]> = Vec::with_capacity(leaves.len());
+    for &leaf in leaves {
+        let node = &nodes[leaf as usize];
+        let (own, others) = rest.split_at_mut((node.end - node.start) as usize);
+        of_leaf.push(own);
+        rest = others;
+    }
+    of_leaf.into_par_iter().zip(leaves).with_min_len(8).for_each_init(
+        || (Group::default(), Vec::new()),
+        |(group, asking), (known, &leaf)| {
+            let start = nodes[leaf as usize].start;
+            asking.clear();
+            for (lane, k) in known.iter().enumerate() {
+                let own = search.component[start as usize + lane];
+                if k.best.is_none() && k.floor <= caps.get(own) {
+                    asking.push((own, start + lane as u32));
+                }
+            }
+            // Points of one component ask together.
+            asking.sort_unstable();
+            for points in asking.chunk_by(|a, b| a.0 == b.0) {
+                let (found, least) = cheapest_edges(search, points, caps, group);
+                for (&(_, at), found) in points.iter().zip(found) {
+                    let k = &mut known[(at - start) as usize];
+                    (k.best, k.floor) = (found, k.floor.max(least));
+                }
+            }
+        },
+    );
 }
 
 fn keep_less(slot: &mut Option<Edge>, edge: Edge) {
