@@ -83,12 +83,6 @@ impl Stage {
         self.skipped.lock().expect("no panic holds this lock").push(what.to_string());
     }
 
-    /// The same, with about what it saved: work on `done` things took `seconds`, and `left` of the kind were skipped.
-    pub fn skipped_some(&self, what: &str, left: usize, done: usize, seconds: f64) {
-        let saved = seconds * left as f64 / done.max(1) as f64;
-        self.skipped(&format!("{what} (saves about {saved:.2} s)"));
-    }
-
     pub(crate) fn memory_limit(&self) -> Option<crate::Bytes> {
         self.common.memory_limit
     }
