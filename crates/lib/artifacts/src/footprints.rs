@@ -132,7 +132,7 @@ impl FootprintsBuilder {
             .write(path)
     }
 
-    /// [`FootprintsBuilder::write`] with the entries of all rows from scratch files; `col` and `weight` are not looked at.
+    /// [`FootprintsBuilder::write`] with the entries of all rows from scratch files; `col` and `weight` are ignored.
     ///
     /// # Errors
     /// When a file cannot be read or written.

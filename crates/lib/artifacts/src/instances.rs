@@ -1,4 +1,4 @@
-//! `instances.safetensors`: the 3D instances with what language and geometry know of them.
+//! `instances.safetensors`: the 3D instances with their descriptors, boxes and matches.
 
 use crate::checks::{below, view_names};
 use gs_io::{Artifact, ArtifactWriter, Error, Provenance, Result};
@@ -70,7 +70,7 @@ pub struct Instances {
     pub bbox_max: Vec<[f32; 3]>,
     /// Box around their centres along their principal axes; K.
     pub oriented: Vec<OrientedBox>,
-    /// Names of the views (file stems) that matches speak of.
+    /// Names of the views (file stems) of the matches.
     pub views: Vec<String>,
     /// All matches, ordered by instance, view.
     pub matches: Vec<Match>,
@@ -80,7 +80,7 @@ pub struct Instances {
     pub node: Vec<i32>,
 }
 
-/// Where an instance stands in the tree of clusters.
+/// The place of an instance in the tree of clusters.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
 pub struct Family {
     /// Its own cluster; several where it was joined from pieces.
@@ -88,7 +88,7 @@ pub struct Family {
     /// The cluster that it and its siblings are parts of. None where that is the whole scene or a heap of things that
     /// nothing connects.
     pub parent: Option<u32>,
-    /// The clusters that it falls into when looked at more finely: the pieces it was joined from, or those below its own.
+    /// The clusters that it consists of: the pieces it was joined from, or those below its own.
     pub parts: Vec<u32>,
 }
 
@@ -112,7 +112,7 @@ impl Instances {
         &self.descriptor[instance * self.dim..(instance + 1) * self.dim]
     }
 
-    /// Where an instance stands in the tree; `None` for one that is not in it: all there is (the root).
+    /// The place of an instance in the tree; `None` for one that is not in it, because it is the root.
     pub fn family(&self, instance: usize) -> Option<Family> {
         let own: Vec<u32> = self.tree.iter().filter(|e| e.instance == instance as i32).map(|e| e.child).collect();
         let (&first, others) = own.split_first()?;

@@ -2,7 +2,7 @@
 //! is said in one place. docs/artifacts.md is the same for readers in other languages.
 //!
 //! Indices: N counts the Gaussians of `geometry.ply`; *kept* are the Gaussians that some view sees, as ascending
-//! original indices, n of them. Graph, footprints and features speak of kept Gaussians by their position in that list.
+//! original indices, n of them. Graph, footprints and features name kept Gaussians by their position in that list.
 
 mod checks;
 mod features;

@@ -208,7 +208,7 @@ pub fn same_shape([width, height]: [u32; 2], photograph: [u32; 2]) -> bool {
 pub struct MaskFeatures {
     /// Number of masks over all levels.
     pub count: usize,
-    /// Numbers per feature.
+    /// Dimension of a feature.
     pub dim: usize,
     /// `[count][dim]`, unit length, or zero for a mask without pixels.
     pub values: Vec<f32>,

@@ -17,7 +17,7 @@ use std::sync::atomic::{AtomicU64, Ordering::Relaxed};
 const MIXED: u32 = u32::MAX;
 
 /// Weights of the cheapest edges that components are known to have, shared by the threads of a round. They only tell what
-/// need not be looked at (edges of greater weight, never equal), so the tree does not depend on who writes first. Weights
+/// can be skipped (edges of greater weight, never equal), so the tree does not depend on who writes first. Weights
 /// are not negative, so their bits order as they do.
 struct Caps(Vec<AtomicU64>);
 
@@ -53,7 +53,7 @@ struct Search<'a> {
 /// An edge of a point, and its other end in tree order.
 type Found = Option<(Edge, u32)>;
 
-/// What a point knows.
+/// What is known of a point's edges.
 #[derive(Debug, Clone, Copy)]
 struct Known {
     /// Its cheapest edge to another component.

@@ -1,8 +1,8 @@
 //! A kd-tree in any dimension, and walks over it for a group of points at a time. docs/architecture.md says which tree of
 //! the workspace is for what.
 //!
-//! What decides is computed in f64. What only tells whether something need be looked at is computed in f32, many points at
-//! a time, against limits raised by more than f32 can be wrong ([`rough_limit`]): nothing that matters is ever passed over.
+//! Decisions are made in f64. What may be skipped is decided in f32, many points at a time, against limits raised by more
+//! than f32 can be wrong ([`rough_limit`]): nothing that matters is ever skipped.
 
 use rayon::prelude::*;
 use std::cmp::Ordering;
@@ -115,7 +115,7 @@ impl KdTree {
         Self::by_density(points, dim, &[])
     }
 
-    /// A tree that parts dense and scattered points, too: where `core` (one for each point) tells how far apart they are, it
+    /// A tree that also separates dense and scattered points: where `core` (one for each point) tells how far apart they are, it
     /// is split by like another coordinate. Then few scattered points do not make the boxes of many dense ones wide, and
     /// nodes are alike in core distance and in component.
     pub fn by_density(points: &[f32], dim: usize, core: &[f64]) -> Self {
@@ -256,11 +256,11 @@ pub(crate) struct Group {
     /// Lower and upper corner of the box around them, padded as those of nodes.
     low: Vec<f32>,
     high: Vec<f32>,
-    /// Nodes to be looked at, with their squared distances in f32.
+    /// Nodes still to visit, with their squared distances in f32.
     stack: Vec<(f32, u32)>,
 }
 
-/// What a walk is for.
+/// What a walk does at the nodes that it reaches.
 pub(crate) trait Visitor {
     /// Whether a node may hold something of interest at all.
     fn wants(&self, node: u32) -> bool;

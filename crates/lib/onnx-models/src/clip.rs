@@ -14,7 +14,7 @@ const BATCH: usize = 16;
 /// Longest side of a picture that a model may ask for; larger is a damaged configuration.
 const MAX_SIZE: usize = 4096;
 
-/// `clip.json`: what has to be known beside the two graphs. Every field may be left out.
+/// `clip.json`: what the two graphs do not tell. Every field may be left out.
 ///
 /// ```json
 /// {
@@ -32,15 +32,15 @@ const MAX_SIZE: usize = 4096;
 pub struct ClipConfig {
     /// Which model this is: image and text features of different models cannot be compared.
     pub name: String,
-    /// Numbers per feature; checked against what the graphs give. 0 when not said.
+    /// Dimension of a feature; checked against the graphs. 0 when not given.
     pub dimension: usize,
-    /// Side S of the pictures in pixels. When not said (0): what `image.onnx` declares, else 224.
+    /// Side S of the pictures in pixels. When not given (0): what `image.onnx` declares, else 224.
     pub image_size: usize,
     /// Subtracted from each channel of the picture, scaled to 0..1.
     pub mean: [f32; 3],
     /// Divides each channel afterwards.
     pub std: [f32; 3],
-    /// Ids per text. When not said (0): what `text.onnx` declares, else 77.
+    /// Ids per text. When not given (0): what `text.onnx` declares, else 77.
     pub context_length: usize,
     /// Id that fills short texts.
     pub pad_id: i32,
@@ -204,7 +204,7 @@ impl ClipImage {
     pub const BATCH: usize = BATCH;
 
     /// Opens `image.onnx` and `clip.json` of a folder, or a file and the `clip.json` beside it. The model runs once, on
-    /// black, which checks it and tells its dimension.
+    /// black, which checks it and gives its dimension.
     ///
     /// # Errors
     /// When a file is missing or damaged, or the graph is not `[n, 3, S, S]` -> `[n, d]`.
@@ -231,7 +231,7 @@ impl ClipImage {
         self.size
     }
 
-    /// Numbers per feature.
+    /// Dimension of a feature.
     pub fn dimension(&self) -> usize {
         self.encoder.dimension
     }
@@ -278,7 +278,7 @@ pub struct ClipText {
 
 impl ClipText {
     /// Opens `text.onnx` and `clip.json` of a folder, or a file and the `clip.json` beside it. The model runs once, on
-    /// an empty text, which checks it and tells its dimension.
+    /// an empty text, which checks it and gives its dimension.
     ///
     /// # Errors
     /// When a file is missing or damaged, or the graph is not `[n, 77]` -> `[n, d]`.
@@ -300,7 +300,7 @@ impl ClipText {
         &self.config
     }
 
-    /// Numbers per feature.
+    /// Dimension of a feature.
     pub fn dimension(&self) -> usize {
         self.encoder.dimension
     }

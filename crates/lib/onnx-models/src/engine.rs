@@ -30,7 +30,7 @@ pub enum Outputs<'a> {
     Values(&'a [&'a str]),
 }
 
-/// Kind of numbers in a tensor. Engines differ in integer width (rten has 32 bits only), so widths are converted.
+/// Element type of a tensor. Engines differ in integer width (rten has 32 bits only), so widths are converted.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Kind {
     /// 32-bit floats.
@@ -51,14 +51,14 @@ impl std::fmt::Display for Kind {
     }
 }
 
-/// What a model says of an input or output.
+/// What a model declares about an input or output.
 #[derive(Debug, Clone, PartialEq)]
 pub struct ValueInfo {
     /// Its name.
     pub name: String,
     /// Extents; `None` where they are free. `None` altogether when the model does not say.
     pub shape: Option<Vec<Option<usize>>>,
-    /// Kind of its numbers, if the model says.
+    /// Its element type, if the model declares it.
     pub kind: Option<Kind>,
 }
 
@@ -133,7 +133,9 @@ fn check_inputs(path: &Path, declared: &[ValueInfo], given: &[(&str, Tensor)]) -
         }
     }
     match declared.iter().find(|d| given.iter().all(|(name, _)| *name != d.name)) {
-        Some(d) => Err(wrong("the model wants an input that is not known here").field(format!("input {}", d.name))),
+        Some(d) => {
+            Err(wrong("the model has an input that this program does not know").field(format!("input {}", d.name)))
+        }
         None => Ok(()),
     }
 }
@@ -141,7 +143,7 @@ fn check_inputs(path: &Path, declared: &[ValueInfo], given: &[(&str, Tensor)]) -
 /// Opens an ONNX file with the engine that `options` choose.
 ///
 /// # Errors
-/// When the file is missing or not an ONNX model, a wanted output does not exist, the engine does not know an operator,
+/// When the file is missing or not an ONNX model, a wanted output does not exist, the engine lacks an operator,
 /// or ONNX Runtime cannot be loaded.
 pub fn open(path: impl AsRef<Path>, outputs: Outputs, options: &EngineOptions) -> Result<Box<dyn Model>> {
     let path = path.as_ref();

@@ -10,7 +10,7 @@ use ort::value::{Outlet, TensorElementType, TensorRef, ValueType};
 use std::path::{Path, PathBuf};
 use std::sync::{Mutex, PoisonError};
 
-/// The library that this process has loaded: there can be but one.
+/// The library that this process has loaded; there can be only one.
 static LOADED: Mutex<Option<(PathBuf, Environment)>> = Mutex::new(None);
 
 const TELEMETRY: &str = "ORT_DISABLE_TELEMETRY";
@@ -44,7 +44,7 @@ fn environment(library: &Path) -> Result<Environment> {
     };
     let env = ort::init_from(library).map_err(|e| unusable(&e))?;
     let env = env.with_name("onnx-models").with_telemetry(false).build().map_err(|e| unusable(&e))?;
-    // What goes wrong comes back as an error; its own log would be a second, longer telling on standard error.
+    // Faults come back as errors; the library's own log would repeat them on standard error.
     env.set_log_level(LogLevel::Fatal);
     *loaded = Some((library.to_path_buf(), env.clone()));
     Ok(env)

@@ -66,7 +66,7 @@ fn inputs_that_do_not_fit_are_named() {
             assert!(e.contains("ops.onnx: input ") && !e.contains('\n'), "{e}");
             e
         };
-        assert!(error(&[a()]).contains("input b: the model wants an input that is not known here"));
+        assert!(error(&[a()]).contains("input b: the model has an input that this program does not know"));
         assert!(
             error(&[a(), b(&[2, 3]), ("c", Tensor::i32(&[1], vec![0]))]).contains("input c: the model has no such")
         );

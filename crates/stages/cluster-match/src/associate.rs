@@ -72,7 +72,7 @@ impl<'a> FeatureTable<'a> {
     /// The table for a scene of `gaussians` Gaussians.
     ///
     /// # Panics
-    /// When `features` speak of other Gaussians than these.
+    /// When a feature belongs to a Gaussian beyond `gaussians`.
     pub fn new(features: &'a Features, gaussians: usize) -> Self {
         let mut position = vec![None; gaussians];
         for (at, &i) in features.kept.iter().enumerate() {

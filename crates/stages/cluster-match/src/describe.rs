@@ -158,7 +158,7 @@ mod tests {
         }
         let x = DVec3::from(b[0].axes[0].map(f64::from)).cross(DVec3::from(b[0].axes[1].map(f64::from)));
         assert!(x.dot(DVec3::from(b[0].axes[2].map(f64::from))) > 0.999);
-        // Of nothing, nothing.
+        // An empty instance has an empty box.
         assert_eq!(b[1].half_size, [0.0; 3]);
     }
 }

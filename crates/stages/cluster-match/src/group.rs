@@ -8,7 +8,7 @@ use rayon::prelude::*;
 /// Gaussians that one task handles.
 const CHUNK: usize = 4096;
 
-/// Features standardised per channel over all Gaussians, (f - mean) / deviation (paper, "Instance Clustering"); a channel
+/// Features standardised per dimension over all Gaussians, (f - mean) / deviation (paper, "Instance Clustering"); a dimension
 /// without deviation becomes zeros. Sums in f64.
 pub fn standardise(values: &[f32], dim: usize) -> Vec<f32> {
     let n = (values.len() / dim.max(1)).max(1) as f64;
@@ -167,7 +167,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn standardised_channels_have_mean_0_and_deviation_1_and_constants_vanish() {
+    fn standardised_dimensions_have_mean_0_and_deviation_1_and_constants_vanish() {
         let values: Vec<f32> = (0..1000).flat_map(|i| [i as f32 * 0.5 + 1e4, 0.1, -(i as f32)]).collect();
         let s = standardise(&values, 3);
         for c in [0, 2] {
@@ -229,7 +229,7 @@ mod tests {
     }
 
     #[test]
-    fn every_pair_of_neighbours_has_one_edge_whoever_names_whom() {
+    fn every_pair_of_neighbours_has_one_edge() {
         // 0 and 1 name each other, 2 names 0 only, 3 is alone: padded with itself.
         let graph = Graph {
             kept: (0..4).collect(),
@@ -245,7 +245,7 @@ mod tests {
         assert_eq!(pairs(1), [(0, 1, near), (0, 2, far)]);
         // Core distances of the second nearest, itself included, change nothing here; a larger edge stays.
         assert_eq!(pairs(2), [(0, 1, near), (0, 2, far)]);
-        // Nine channels: whole partial sums and a rest.
+        // Nine dimensions: whole partial sums and a rest.
         let (a, b): (Vec<f32>, Vec<f32>) = (0..9).map(|c| (c as f32, 2.0 * c as f32)).unzip();
         assert_eq!(square_of_difference(&a, &b), 204.0);
     }

@@ -1,11 +1,11 @@
-//! What a user should know about the instances: whether one of them swallows the scene, and how well the masks fit them.
+//! Warnings about the result: one instance that holds too much of the scene, or masks that do not fit the instances.
 
 use crate::join::mask_weights;
 use artifacts::{Footprints, Instances, Level};
 use stage::Stage;
 
-/// From this share of all Gaussians in one instance on, the user is warned.
-const SWALLOWS: f64 = 1.0 / 3.0;
+/// The user is warned when one instance holds more than this share of all Gaussians.
+const TOO_LARGE: f64 = 1.0 / 3.0;
 /// Below this purity the user is warned.
 const IMPURE: f64 = 0.7;
 
@@ -21,7 +21,7 @@ pub struct Health {
 }
 
 impl Health {
-    /// Of these instances; `kept` are the original indices of the Gaussians that the footprints know.
+    /// The health of `instances`; `kept` are the original indices of the Gaussians in the footprints.
     pub fn of(instances: &Instances, footprints: &Footprints, kept: &[u32], levels: &[Level]) -> Self {
         let labelled: usize = instances.count.iter().map(|&c| c as usize).sum();
         let largest = instances.count.iter().max().map_or(0.0, |&c| f64::from(c) / labelled.max(1) as f64);
@@ -39,7 +39,7 @@ impl Health {
         let percent = |v: f64| format!("{:.0} %", 100.0 * v);
         let purity = self.purity.map_or("no masks".into(), |p| format!("masks lie in one instance by {}", percent(p)));
         stage.info(&format!("the largest instance holds {} of the Gaussians; {purity}", percent(self.largest)));
-        if self.largest > SWALLOWS {
+        if self.largest > TOO_LARGE {
             stage.warn(&format!(
                 "one instance holds {} of the Gaussians; if it is more than floor or walls, try --level small, or feat-train \
                  --levels small",

@@ -49,8 +49,8 @@ impl Profile {
     }
 }
 
-/// How probably a random bit of the one and a random bit of the other lie in the same mask, over the views that see both, each
-/// counted by the smaller of the shares of their weight that they have there.
+/// The probability that a random part of `a` and a random part of `b` lie in the same mask, averaged over the views that see
+/// both. A view counts by the smaller of the two shares of weight that lie in it.
 fn agreement(a: &Profile, b: &Profile, unit_of: &[u32]) -> f64 {
     let common = |u: usize| (a.units[u] / a.total).min(b.units[u] / b.total);
     let both: Vec<f64> = (0..a.units.len()).map(common).filter(|w| *w > 0.0).collect();

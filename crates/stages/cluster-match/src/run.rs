@@ -84,7 +84,7 @@ fn forecast(inputs: &Inputs, stage: &Stage) -> Result<()> {
     stage.forecast(needed, "drop small footprint entries: graph-precompute --cut 0.001")
 }
 
-/// Corrects the clustering by what it does not know: where Gaussians lie, and how the masks of each view cut the scene.
+/// Corrects the clustering by where Gaussians lie and by the masks of each view.
 fn correct(mut found: Assignment, inputs: &Inputs, settings: &Settings, stage: &Stage) -> Result<Assignment> {
     let (means, graph, footprints) = (&inputs.geometry.gaussians.means, &inputs.graph, &inputs.footprints);
     let mut kept = vec![false; means.len()];

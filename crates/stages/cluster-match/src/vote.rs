@@ -1,8 +1,8 @@
 //! Labels by votes of masks.
 //!
-//! The tree of the clustering cuts where features differ most, which at the rim of a thing is a few Gaussians off, and noise
-//! goes to whoever is nearest. Once instances are known, so is how each view cuts them: a Gaussian goes to that of the
-//! instances around it whose masks hold its weight, and its neighbours' weight, most.
+//! The clustering cuts where features differ most. At the rim of a thing this is wrong by a few Gaussians, and noise has
+//! the label of its nearest neighbour. Once instances are known, each view tells where they end: a Gaussian gets the label of
+//! the neighbouring instance whose masks hold most of its weight and of its neighbours' weight.
 
 use crate::join::{mask_weights, units};
 use artifacts::{Footprints, Graph, Level};
@@ -10,12 +10,13 @@ use rayon::prelude::*;
 
 /// Gaussians that one task handles.
 const CHUNK: usize = 8192;
-/// A Gaussian leaves its instance for another with this much more votes only.
+/// A Gaussian changes its instance only for one with this many times its votes.
 const LEAD: f32 = 1.02;
 
-/// Moves Gaussians to the instance around them with most votes, `rounds` times or until none moves. `labels` are those of the kept
-/// Gaussians; those in none (-1) stay so. A Gaussian's votes for an instance are its weights, and those of its spatial
-/// neighbours, in all masks, each times the share of the instance that the view shows in this mask. Returns how many moved.
+/// Gives Gaussians the neighbouring instance with most votes, in at most `rounds` rounds, until none changes. `labels` are
+/// those of the kept Gaussians; those in no instance (-1) stay so. A Gaussian's votes for an instance are its weights, and those of its spatial
+/// neighbours, in all masks, each times the share of the instance that the view shows in this mask. Returns how many
+/// labels changed.
 pub fn by_votes(
     labels: &mut [i32],
     instances: usize,
@@ -36,14 +37,14 @@ pub fn by_votes(
     moved
 }
 
-/// Who moves, and where to.
+/// The Gaussians whose label changes in this round, with the new one.
 fn vote(labels: &[i32], instances: usize, footprints: &Footprints, graph: &Graph, levels: &[Level]) -> Vec<(u32, u32)> {
     let k = graph.gaussian_k;
     let around = |i: usize| {
         let neighbours = graph.gaussian_knn[i * k..(i + 1) * k].iter().map(|&j| j as usize);
         std::iter::once(i).chain(neighbours.filter(move |&j| j != i))
     };
-    // Who has a choice, and which.
+    // The Gaussians with several instances around them, and these.
     let choices: Vec<(u32, Vec<u32>)> = (0..labels.len())
         .into_par_iter()
         .with_min_len(CHUNK)
@@ -55,7 +56,7 @@ fn vote(labels: &[i32], instances: usize, footprints: &Footprints, graph: &Graph
             (choice.len() > 1).then_some((i as u32, choice))
         })
         .collect();
-    // Which votes of which Gaussians they ask for, ascending.
+    // The votes that they need: (Gaussian, instance), ascending.
     let mut asked: Vec<(u32, u32)> = choices
         .par_iter()
         .with_min_len(CHUNK)
@@ -85,7 +86,7 @@ fn vote(labels: &[i32], instances: usize, footprints: &Footprints, graph: &Graph
         .collect()
 }
 
-/// The votes of each Gaussian for each instance that is asked for.
+/// The votes for each pair of Gaussian and instance in `asked`.
 fn count(
     asked: &[(u32, u32)],
     labels: &[i32],
@@ -175,7 +176,7 @@ mod tests {
         let moved = by_votes(&mut labels, 2, &footprints, &graph, &[Level::Large], 5);
         assert_eq!((moved, &labels), (3, &expected));
         assert_eq!(by_votes(&mut labels, 2, &footprints, &graph, &[Level::Large], 5), 0);
-        // No masks of this level: nobody votes, nobody moves.
+        // No masks of this level: no votes, no change.
         let mut off = vec![0; 20];
         off[3] = 1;
         assert_eq!(by_votes(&mut off, 2, &footprints, &graph, &[Level::Small], 5), 0);

@@ -22,13 +22,13 @@ pub struct ViewFootprints {
     pub entries: Vec<Vec<(u32, f32)>>,
     /// Gaussians that contribute to the view, ascending, and their weights summed over all pixels.
     pub seen: Vec<(u32, f64)>,
-    /// Masks left out for having fewer pixels than asked for.
+    /// Masks left out because they have too few pixels.
     pub small_masks: usize,
     /// Single pixels of the masks, in the order of `rows`.
     pub pixels: Vec<Pixel>,
 }
 
-/// What a view is looked at for.
+/// How the footprints of a view are measured.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct FootprintOptions {
     /// Accumulated alpha above which a pixel counts for the weights.
@@ -177,7 +177,7 @@ struct TileSums {
     pixels: Vec<Pixel>,
 }
 
-/// What one tile says of a mask.
+/// What one tile adds to a mask's facts.
 struct Fact {
     row: u32,
     gated: u32,

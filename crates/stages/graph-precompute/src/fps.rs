@@ -1,14 +1,14 @@
 //! Farthest point sampling, exact.
 //!
 //! Every kd-tree node keeps the largest distance of a point inside to the anchors chosen so far. A new anchor can only
-//! change nodes whose box is nearer to it than that; all others are passed over. The point with the largest distance at
+//! change nodes whose box is nearer to it than that; all others are skipped. The point with the largest distance at
 //! the root is the next anchor, and when the sampling ends every point knows its nearest anchor.
 
 use crate::kdtree::{KdTree, LANES, distance};
 use multiversion::multiversion;
 use std::ops::Range;
 
-/// Anchors and whom they serve.
+/// Anchors, and the nearest anchor of every point.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Sample {
     /// Chosen points, in the order of choice.

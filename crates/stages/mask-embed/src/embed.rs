@@ -62,7 +62,7 @@ pub(crate) fn run(args: &EmbedArgs, stage: &Stage) -> Result<()> {
     let dataset_hash = scene.hash()?;
 
     let mut views = Views::new(stage, scene.views.len());
-    let (mut masks, mut pictures, mut foretold) = (0, 0, false);
+    let (mut masks, mut pictures, mut forecast_made) = (0, 0, false);
     for view in &scene.views {
         let Some(maps) = read_maps(folder, view, stage)? else { continue };
         let (image, image_hash) = photographs::read(view)?;
@@ -70,8 +70,8 @@ pub(crate) fn run(args: &EmbedArgs, stage: &Stage) -> Result<()> {
         let key = finished::made_from(&[&parameters.to_string(), clip.hash(), &image_hash, &maps_hash]);
         let output = features_path(out, view.stem());
         let facts: Facts = views.next(view, &output, &key, || {
-            if !std::mem::replace(&mut foretold, true) {
-                foretell(&clip, &scene.views, stage)?;
+            if !std::mem::replace(&mut forecast_made, true) {
+                forecast(&clip, &scene.views, stage)?;
             }
             let (features, pictures) = embed(&clip, &image, &maps)?;
             let shown = features.values.chunks(features.dim).filter(|r| r.iter().any(|&v| v != 0.0)).count();
@@ -160,7 +160,7 @@ fn embed(clip: &ClipImage, image: &RgbImage, maps: &MaskMaps) -> Result<(MaskFea
 }
 
 /// Says how much memory the photographs will take.
-fn foretell(clip: &ClipImage, views: &[View], stage: &Stage) -> Result<()> {
+fn forecast(clip: &ClipImage, views: &[View], stage: &Stage) -> Result<()> {
     let size = clip.size();
     clip.encode(&vec![0; ClipImage::BATCH * rayon::current_num_threads() * 3 * size * size])?;
     let pixels = memory::largest(views);

@@ -48,17 +48,17 @@ pub(crate) fn run(args: &MasksArgs, stage: &Stage) -> Result<()> {
     let parameters = json!(args);
     let inputs =
         BTreeMap::from([(role::DATASET.to_string(), scene.hash()?), ("sam".to_string(), sam.hash().to_string())]);
-    warn_of_strangers(folder, scene.views.iter().map(View::stem), stage)?;
+    warn_of_other_maps(folder, scene.views.iter().map(View::stem), stage)?;
 
     let mut views = Views::new(stage, scene.views.len());
-    let (mut asked, mut points, mut large, mut foretold) = (0, 0, 0, false);
+    let (mut asked, mut points, mut large, mut forecast_made) = (0, 0, 0, false);
     for view in &scene.views {
         let output = maps_path(folder, view.stem());
         let (image, image_hash) = photographs::read(view)?;
         let key = finished::made_from(&[&parameters.to_string(), sam.hash(), &image_hash]);
         let facts: Facts = views.next(view, &output, &key, || {
-            if !std::mem::replace(&mut foretold, true) {
-                foretell(args, &sam, &scene.views, stage)?;
+            if !std::mem::replace(&mut forecast_made, true) {
+                forecast(args, &sam, &scene.views, stage)?;
             }
             let (maps, facts) = make(args, &sam, &image)?;
             finished::remove_manifest(&manifest)?;
@@ -108,7 +108,7 @@ fn claim(args: &MasksArgs, scene: &Dataset, manifest: &Path, stage: &Stage) -> R
 }
 
 /// Says how much memory the photographs will take.
-fn foretell(args: &MasksArgs, sam: &Sam, views: &[View], stage: &Stage) -> Result<()> {
+fn forecast(args: &MasksArgs, sam: &Sam, views: &[View], stage: &Stage) -> Result<()> {
     let nothing = RgbImage { width: 4, height: 3, pixels: vec![0; 36] };
     // The encoder a second time, on top of what the decoder leaves with each thread.
     propose(sam, &sam.encode(&nothing)?, &Choice { points_per_side: 4, ..args.choice })?;
@@ -127,15 +127,15 @@ fn map_size(image: &RgbImage, longest: usize) -> [usize; 2] {
     [image.width, image.height].map(|n| ((n as f64 * scale).round() as usize).max(1))
 }
 
-/// Id maps of views that the scene does not have would be taken for its own by whoever reads the folder.
-fn warn_of_strangers<'a>(folder: &Path, stems: impl Iterator<Item = &'a str>, stage: &Stage) -> Result<()> {
+/// Warns of id maps of other views in the folder: later stages would take them for maps of this scene.
+fn warn_of_other_maps<'a>(folder: &Path, stems: impl Iterator<Item = &'a str>, stage: &Stage) -> Result<()> {
     let own: BTreeSet<&str> = stems.collect();
-    let strangers: Vec<String> = artifacts::stems(folder)?.into_iter().filter(|s| !own.contains(s.as_str())).collect();
-    if let Some(first) = strangers.first() {
+    let others: Vec<String> = artifacts::stems(folder)?.into_iter().filter(|s| !own.contains(s.as_str())).collect();
+    if let Some(first) = others.first() {
         stage.warn(&format!(
             "{}: {} id maps of views that are not in the scene, such as {first}; delete them if they are old",
             folder.display(),
-            strangers.len()
+            others.len()
         ));
     }
     Ok(())

@@ -1,5 +1,5 @@
-//! How much memory a run will take, told before its first photograph. What a model takes is known to nobody before it has
-//! run, so it runs once on an empty picture. docs/performance.md holds the forecast against measured peaks.
+//! How much memory a run will take, said before its first photograph. The models run once on an empty picture first, because
+//! their need is known only then. docs/performance.md compares the forecast with measured peaks.
 
 use gs_scene::dataset::View;
 use stage::peak_rss_bytes;

@@ -79,17 +79,17 @@ pub fn box_nms(masks: &[&Pixels], scores: &[f32], threshold: f64) -> Vec<usize> 
 /// Thresholds of [`mask_nms`].
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct MaskNms {
-    /// A mask that overlaps a better one by more than this (IoU) goes.
+    /// A mask that overlaps a better one by more than this (IoU) is dropped.
     pub iou: f64,
-    /// A mask with a lower score than this goes.
+    /// A mask with a lower score than this is dropped.
     pub score: f32,
-    /// A mask of which this much or less is shared with a larger one around it goes: see [`mask_nms`].
+    /// How much of a fragment and of the mask around it may be shared before it is no fragment: see [`mask_nms`].
     pub inner: f64,
 }
 
-/// LangSplat's suppression by masks within a level. A mask goes when its score is low; when it overlaps a better one too
+/// LangSplat's suppression by masks within a level. A mask is dropped when its score is low; when it overlaps a better one too
 /// much; or when it is a fragment: with a = the part of it that lies in another mask and b = the part of the other that
-/// lies in it, a >= 0.85, b < 0.5 and a b < `inner`. Unlike there, a mask of low score goes first and so removes nothing
+/// lies in it, a >= 0.85, b < 0.5 and a b < `inner`. Unlike there, a mask of low score is dropped first and so removes nothing
 /// itself. Gives the indices that stay, best first.
 pub fn mask_nms(masks: &[&Pixels], scores: &[f32], rule: MaskNms) -> Vec<usize> {
     let mut order = by_score(scores);

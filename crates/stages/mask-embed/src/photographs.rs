@@ -6,7 +6,7 @@ use gs_scene::dataset::{self, Dataset, LoadOptions, View};
 use onnx_models::RgbImage;
 use stage::Stage;
 
-/// Opens the scene; what is odd about it is said.
+/// Opens the scene and logs its warnings.
 pub(crate) fn open(args: &SceneArgs, stage: &Stage) -> Result<Dataset> {
     let options = LoadOptions { resolution: args.resolution, ..LoadOptions::default() };
     let scene = dataset::load(&args.scene, &options)?;

@@ -1,6 +1,7 @@
 //! Islands and holes of a mask.
 
-/// Removes connected islands of fewer than `min` pixels, but not the largest, from a mask `[height][width]`, and fills holes of fewer than `min` pixels. Neighbours share an edge.
+/// Removes connected islands of fewer than `min` pixels, except the largest, from a mask `[height][width]`, and fills holes
+/// of fewer than `min` pixels. Neighbours share an edge.
 pub fn clean(mask: &mut [bool], width: usize, min: usize) {
     remove_small(mask, width, min, true);
     remove_small(mask, width, min, false);

@@ -33,7 +33,7 @@ pub struct Embedded {
     pub extent: [f64; 2],
 }
 
-/// What the decoder says of one point.
+/// The decoder's answer for one point.
 pub struct Candidates {
     /// Predicted IoU of each mask.
     pub quality: Vec<f32>,
