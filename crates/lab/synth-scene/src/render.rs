@@ -1,6 +1,9 @@
 //! Photographs by ray tracing, with what each pixel shows.
 
-use crate::light::LightMap;
+pub mod bvh;
+pub mod light;
+
+use crate::render::light::LightMap;
 use crate::scene::{Hit, Scene};
 use glam::DVec3;
 use gs_scene::Camera;

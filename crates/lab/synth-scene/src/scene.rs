@@ -1,11 +1,28 @@
 //! A placed scene: things, their parts and the primitives they are made of, with ray queries.
 
-use crate::bvh::{Aabb, Bvh};
-use crate::families::Family;
-use crate::material::Material;
-use crate::model::Model;
-use crate::shape::Shape;
+use crate::render::bvh::{Aabb, Bvh};
+use crate::things::material::Material;
+use crate::things::model::Model;
+use crate::things::shape::Shape;
 use glam::{DMat3, DVec2, DVec3};
+
+pub mod cameras;
+pub mod families;
+pub mod layout;
+
+/// A family of scenes.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, clap::ValueEnum)]
+pub enum Family {
+    /// Tables with a few things each that do not touch, chairs, paintings
+    #[default]
+    Studio,
+    /// One crowded table top, as LERF's figurines and teatime
+    Table,
+    /// A kitchen counter with sink, stove, shelves and wall cabinets
+    Kitchen,
+    /// A furnished room, as ScanNet's, with what stands on its furniture
+    Room,
+}
 
 /// A thing of the scene: an object or background.
 #[derive(Debug, Clone)]

@@ -1,11 +1,11 @@
 //! What several tests need.
 
-use crate::cameras::{self, Path};
-use crate::layout;
-use crate::light::LightMap;
-use crate::polygon::Polygon;
+use crate::render::light::LightMap;
 use crate::render::{self, Frame};
 use crate::scene::Scene;
+use crate::scene::cameras::{self, Path};
+use crate::scene::layout;
+use crate::truth::polygon::Polygon;
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
 use std::sync::OnceLock;

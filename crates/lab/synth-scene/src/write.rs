@@ -1,17 +1,17 @@
 //! Makes a scene and writes all of it.
 
-use crate::benchmark::{self, Layout};
-use crate::cameras::{self, Path as CameraPath};
-use crate::families::{self, Family};
-use crate::label;
-use crate::language::{Language, Speech};
-use crate::light::LightMap;
-use crate::masks::{self, Faults};
 use crate::memory::{self, Amounts};
-use crate::points::{self, Collector};
+use crate::render::light::LightMap;
 use crate::render::{self, Frame};
-use crate::scannet;
 use crate::scene::Scene;
+use crate::scene::cameras::{self, Path as CameraPath};
+use crate::scene::{Family, families};
+use crate::truth::benchmark::{self, Layout};
+use crate::truth::label;
+use crate::truth::language::{Language, Speech};
+use crate::truth::masks::{self, Faults};
+use crate::truth::points::{self, Collector};
+use crate::truth::scannet;
 use artifacts::{MaskTruth, TrueObject, TruePart, TruePoints, TrueScene, features_path, maps_path};
 use clap::ValueEnum;
 use gs_io::{Claim, Error, IoContext, Outputs, Result, create_dir, npy, write_bytes};

@@ -1,8 +1,8 @@
 //! The things that scenes are made of: for each class, its colours, where it stands and how it is built.
 
-use crate::material::{Material, PAINTS, Paint, Pattern, albedo};
-use crate::model::{Model, z_towards};
-use crate::shape::Shape;
+use crate::things::material::{Material, PAINTS, Paint, Pattern, albedo};
+use crate::things::model::{Model, z_towards};
+use crate::things::shape::Shape;
 use glam::{DMat3, DVec3};
 use rand::Rng;
 use rand_chacha::ChaCha8Rng;
@@ -926,12 +926,12 @@ pub fn wall(length: f64, height: f64, color: DVec3) -> Model {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::furniture::{ALONG_WALLS, ON_WALLS, SHELF, SINK, STOVE, WALL_CABINET};
+    use crate::things::furniture::{ALONG_WALLS, ON_WALLS, SHELF, SINK, STOVE, WALL_CABINET};
     use rand::SeedableRng;
 
     fn all() -> impl Iterator<Item = &'static Class> {
         let hung = ON_WALLS.iter().map(|c| &c.0).chain([&SHELF.0, &WALL_CABINET.0, &SINK, &STOVE]);
-        CLASSES.iter().chain(crate::props::PROPS).chain(ALONG_WALLS).chain(hung)
+        CLASSES.iter().chain(crate::things::props::PROPS).chain(ALONG_WALLS).chain(hung)
     }
 
     #[test]
@@ -961,8 +961,11 @@ mod tests {
             for piece in &m.pieces {
                 for face in 0..piece.shape.faces() {
                     for k in 0..400 {
-                        let at =
-                            crate::shape::ChartPoint { face, u: f64::from(k % 20) / 19.0, v: f64::from(k / 20) / 19.0 };
+                        let at = crate::things::shape::ChartPoint {
+                            face,
+                            u: f64::from(k % 20) / 19.0,
+                            v: f64::from(k / 20) / 19.0,
+                        };
                         low = low.min((piece.rotation * piece.shape.surface(at).0 + piece.offset).z);
                     }
                 }

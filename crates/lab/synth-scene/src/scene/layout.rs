@@ -1,9 +1,9 @@
 //! Where things stand: a room, tables, and things that do not touch each other on tables, floor and walls.
 
-use crate::catalogue::{self, CLASSES, Class, Naming, Place};
-use crate::material::{PAINTS, albedo};
-use crate::model::Model;
 use crate::scene::{Scene, SceneBuilder, Thing};
+use crate::things::catalogue::{self, CLASSES, Class, Naming, Place};
+use crate::things::material::{PAINTS, albedo};
+use crate::things::model::Model;
 use glam::{DVec2, DVec3};
 use rand::Rng;
 use rand::seq::SliceRandom;
@@ -299,7 +299,7 @@ fn background(scene: &mut SceneBuilder, tables: &[DVec2], room: DVec2, rng: &mut
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::shape::ChartPoint;
+    use crate::things::shape::ChartPoint;
     use rand::SeedableRng;
 
     #[test]

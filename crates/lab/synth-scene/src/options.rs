@@ -2,11 +2,11 @@
 
 #![allow(rustdoc::invalid_html_tags, reason = "help texts name files as <view>_s.npy")]
 
-use crate::benchmark::{Layout, LayoutName};
-use crate::cameras::Path as CameraPath;
-use crate::families::Family;
-use crate::language::Speech;
-use crate::masks::Faults;
+use crate::scene::Family;
+use crate::scene::cameras::Path as CameraPath;
+use crate::truth::benchmark::{Layout, LayoutName};
+use crate::truth::language::Speech;
+use crate::truth::masks::Faults;
 use crate::write::{self, Options};
 use clap::{Parser, ValueEnum};
 use gs_io::{Error, Result};

@@ -1,37 +1,23 @@
-//! Families of scenes besides the studio of [`crate::layout`]: a crowded table top, a kitchen counter, a furnished room.
+//! Families of scenes besides the studio of [`crate::scene::layout`]: a crowded table top, a kitchen counter, a furnished room.
 //!
 //! What they have that the studio lacks: up to hundreds of things; things that touch (half a millimetre apart), stand on
-//! others and hide each other; few colours for many things; patterns, mirrors and sizes ([`crate::dress`]); thin wires
+//! others and hide each other; few colours for many things; patterns, mirrors and sizes ([`crate::things::dress`]); thin wires
 //! and stems; furniture, shelves with rows of books, walls with doors and windows.
 
-use crate::catalogue::{self, CLASSES, Class, Place};
-use crate::dress::dress;
-use crate::furniture::{self, ALONG_WALLS, ON_WALLS, SHELF, SINK, STOVE, WALL_CABINET};
-use crate::layout::{self, Footprint, TABLE_HEIGHT, WALL_HEIGHT, WALLS, name_of};
-use crate::material::{PAINTS, albedo};
-use crate::model::Model;
-use crate::props::PROPS;
-use crate::scene::{Scene, SceneBuilder, Thing};
+use crate::scene::layout::{self, Footprint, TABLE_HEIGHT, WALL_HEIGHT, WALLS, name_of};
+use crate::scene::{Family, Scene, SceneBuilder, Thing};
+use crate::things::catalogue::{self, CLASSES, Class, Place};
+use crate::things::dress::dress;
+use crate::things::furniture::{self, ALONG_WALLS, ON_WALLS, SHELF, SINK, STOVE, WALL_CABINET};
+use crate::things::material::{PAINTS, albedo};
+use crate::things::model::Model;
+use crate::things::props::PROPS;
 use glam::{DVec2, DVec3};
 use rand::Rng;
 use rand::seq::SliceRandom;
 use rand_chacha::ChaCha8Rng;
 use std::collections::BTreeSet;
 use std::f64::consts::{FRAC_PI_2, TAU};
-
-/// A family of scenes.
-#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, clap::ValueEnum)]
-pub enum Family {
-    /// Tables with a few things each that do not touch, chairs, paintings
-    #[default]
-    Studio,
-    /// One crowded table top, as LERF's figurines and teatime
-    Table,
-    /// A kitchen counter with sink, stove, shelves and wall cabinets
-    Kitchen,
-    /// A furnished room, as ScanNet's, with what stands on its furniture
-    Room,
-}
 
 /// Colours of one scene: few, so that many things share one.
 const PALETTE: usize = 4;
@@ -485,7 +471,7 @@ mod tests {
     #[test]
     fn rooms_have_furniture_of_the_benchmark() {
         let scene = plan(Family::Room, 60, &mut ChaCha8Rng::seed_from_u64(3));
-        let labels: BTreeSet<u32> = scene.things.iter().map(|t| crate::scannet::label(t.class)).collect();
+        let labels: BTreeSet<u32> = scene.things.iter().map(|t| crate::truth::scannet::label(t.class)).collect();
         assert!(labels.iter().filter(|&&l| l != 40).count() >= 8, "{labels:?}");
         let books = scene.things.iter().filter(|t| t.name.contains("book") && t.position.z > 0.9).count();
         assert!(books > 0, "shelves are used");

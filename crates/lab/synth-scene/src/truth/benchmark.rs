@@ -1,8 +1,8 @@
 //! Miniatures of the benchmarks: where the files of a scene lie, and what they are called, in the layout of LERF-OVS, of
 //! ScanNet as its tools extract it, and of ScanNet as OpenGaussian converts it.
 
-use crate::scannet;
 use crate::scene::Scene;
+use crate::truth::scannet;
 use artifacts::{LERF_OVS, LerfScene};
 use clap::ValueEnum;
 use gs_io::{Error, Result, create_dir, write_bytes};

@@ -1,9 +1,9 @@
 //! More things for table tops and kitchen counters, with thin structures, contents and flat tops to put others on.
 
-use crate::catalogue::{Class, Naming, Place, ivory, metal, tip, vary, wood};
-use crate::material::{Material, PAINTS, Paint, Pattern, albedo};
-use crate::model::{Model, z_towards};
-use crate::shape::Shape;
+use crate::things::catalogue::{Class, Naming, Place, ivory, metal, tip, vary, wood};
+use crate::things::material::{Material, PAINTS, Paint, Pattern, albedo};
+use crate::things::model::{Model, z_towards};
+use crate::things::shape::Shape;
 use glam::{DMat3, DVec3};
 use rand::Rng;
 use rand_chacha::ChaCha8Rng;

@@ -1,7 +1,7 @@
 //! A thing in its own frame: named parts made of primitives. z is up, the origin is where it stands.
 
-use crate::material::Material;
-use crate::shape::Shape;
+use crate::things::material::Material;
+use crate::things::shape::Shape;
 use glam::{DMat3, DVec3};
 
 /// A primitive of a model.

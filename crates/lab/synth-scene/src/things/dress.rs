@@ -1,7 +1,7 @@
 //! What makes things hard to tell apart and parts hard to keep together: patterns within one thing, mirrors, sizes.
 
-use crate::material::{Paint, Pattern};
-use crate::model::Model;
+use crate::things::material::{Paint, Pattern};
+use crate::things::model::Model;
 use glam::DVec3;
 use rand::Rng;
 use rand_chacha::ChaCha8Rng;

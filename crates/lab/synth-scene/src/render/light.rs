@@ -5,7 +5,7 @@
 //! the open room, and one bounce.
 
 use crate::scene::Scene;
-use crate::shape::ChartPoint;
+use crate::things::shape::ChartPoint;
 use glam::{DMat3, DVec3};
 use rayon::prelude::*;
 use std::f64::consts::{PI, TAU};

@@ -1,9 +1,9 @@
 //! Furniture of rooms and kitchens. Backs are at +y, fronts face -y; what hangs on walls has its back at y = 0.
 
-use crate::catalogue::{Class, Naming, Place, metal, vary, wood};
-use crate::material::{Material, Paint, Pattern, albedo};
-use crate::model::Model;
-use crate::shape::Shape;
+use crate::things::catalogue::{Class, Naming, Place, metal, vary, wood};
+use crate::things::material::{Material, Paint, Pattern, albedo};
+use crate::things::model::Model;
+use crate::things::shape::Shape;
 use glam::DVec3;
 use rand_chacha::ChaCha8Rng;
 

@@ -1,9 +1,9 @@
 //! Where the photographs are taken from.
 
-use crate::families::Family;
-use crate::layout::TABLE_HEIGHT;
-use crate::points::normal;
+use crate::scene::Family;
 use crate::scene::Scene;
+use crate::scene::layout::TABLE_HEIGHT;
+use crate::truth::points::normal;
 use glam::{DMat3, DVec2, DVec3, EulerRot};
 use gs_scene::Camera;
 use rand::Rng;
@@ -192,7 +192,7 @@ mod tests {
         for (family, objects) in [(Family::Table, 40), (Family::Kitchen, 50), (Family::Room, 70), (Family::Room, 30)] {
             for path in [Path::Ring, Path::Walk] {
                 let rng = &mut ChaCha8Rng::seed_from_u64(objects as u64);
-                let scene = crate::families::plan(family, objects, rng);
+                let scene = crate::scene::families::plan(family, objects, rng);
                 let mut seen = vec![0usize; scene.things.len()];
                 for camera in place(&scene, path, 24, 96, 72, rng) {
                     let frame = crate::render::identify(&scene, &camera);

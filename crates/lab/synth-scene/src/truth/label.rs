@@ -1,8 +1,8 @@
 //! Polygon labels of a view in LERF-OVS's form (ISAT JSON).
 
-use crate::polygon;
 use crate::render::Frame;
 use crate::scene::Scene;
+use crate::truth::polygon;
 use gs_io::{Error, Result, write_bytes};
 use serde_json::json;
 use std::path::Path;
@@ -50,8 +50,8 @@ pub fn write(path: &Path, image: &str, scene: &Scene, frame: &Frame) -> Result<(
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::polygon::Polygon;
     use crate::testing::{example, fill};
+    use crate::truth::polygon::Polygon;
 
     #[test]
     fn filled_polygons_give_back_the_instance_map() {

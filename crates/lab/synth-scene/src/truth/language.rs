@@ -6,10 +6,10 @@
 //! word. [`Language::encode`] makes of a mask the mean of what its crop shows by share of pixels, as far as the knobs say
 //! with what lies around it within the crop and with noise.
 
-use crate::points::normal;
 use crate::render::Frame;
-use crate::scannet;
 use crate::scene::Scene;
+use crate::truth::points::normal;
+use crate::truth::scannet;
 use artifacts::{Level, MaskFeatures, MaskMaps};
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
@@ -173,8 +173,8 @@ impl Language {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::masks::{self, Faults};
     use crate::testing::example;
+    use crate::truth::masks::{self, Faults};
     use artifacts::MaskTruth;
 
     fn dot(a: &[f64], b: &[f64]) -> f64 {
