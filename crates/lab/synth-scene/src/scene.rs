@@ -9,9 +9,11 @@ use glam::{DMat3, DVec2, DVec3};
 pub mod cameras;
 pub mod families;
 pub mod layout;
+pub mod room;
 
 /// A family of scenes.
-#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, clap::ValueEnum)]
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, clap::ValueEnum, serde::Serialize)]
+#[serde(rename_all = "lowercase")]
 pub enum Family {
     /// Tables with a few things each that do not touch, chairs, paintings
     #[default]
@@ -122,6 +124,18 @@ pub struct Scene {
     bvh: Bvh,
 }
 
+/// Who a thing is: the first fields of [`Thing`].
+pub struct Identity {
+    /// What it is called; unique in the scene.
+    pub name: String,
+    /// Its class.
+    pub class: &'static str,
+    /// Its main colour's name.
+    pub color: &'static str,
+    /// Whether it is floor, wall or table.
+    pub background: bool,
+}
+
 /// Collects placed things.
 #[derive(Default)]
 pub struct SceneBuilder {
@@ -131,21 +145,23 @@ pub struct SceneBuilder {
 }
 
 impl SceneBuilder {
-    /// Adds `model` turned by `yaw` at `position`. The parts of `thing` are filled in.
-    pub fn place(&mut self, model: &Model, mut thing: Thing) {
+    /// Adds `model` turned by `yaw` at `position`.
+    pub fn place(&mut self, model: &Model, who: Identity, position: DVec3, yaw: f64) {
         let (index, first) = (self.things.len() as u32, self.parts.len() as u32);
         self.parts.extend(model.parts.iter().map(|&name| Part { name, thing: index }));
-        thing.parts = first..self.parts.len() as u32;
-        let turn = DMat3::from_rotation_z(thing.yaw);
+        let turn = DMat3::from_rotation_z(yaw);
         self.primitives.extend(model.pieces.iter().map(|piece| Primitive {
             shape: piece.shape.clone(),
             rotation: turn * piece.rotation,
-            origin: turn * piece.offset + thing.position,
+            origin: turn * piece.offset + position,
             material: piece.material,
             part: first + piece.part as u32,
             thing: index,
         }));
-        self.things.push(thing);
+        let Identity { name, class, color, background } = who;
+        let (x, y, height) = model.extent();
+        let (parts, footprint) = (first..self.parts.len() as u32, DVec2::new(x, y));
+        self.things.push(Thing { name, class, color, background, parts, position, yaw, footprint, height });
     }
 
     /// The scene, ready for rays.

@@ -1,9 +1,13 @@
-//! What stands in a scene: surfaces, what they are made of, models of them, and the classes of things.
+//! What stands in a scene: surfaces and what they are made of, models, and the classes of things by kind.
 
 pub mod catalogue;
+pub mod class;
+mod dishes;
 pub mod dress;
 pub mod furniture;
 pub mod material;
 pub mod model;
-pub mod props;
+mod props;
 pub mod shape;
+mod toys;
+pub mod walls;

@@ -2,7 +2,7 @@
 
 use crate::scene::Family;
 use crate::scene::Scene;
-use crate::scene::layout::TABLE_HEIGHT;
+use crate::scene::room::TABLE_HEIGHT;
 use crate::truth::points::normal;
 use glam::{DMat3, DVec2, DVec3, EulerRot};
 use gs_scene::Camera;

@@ -4,14 +4,15 @@
 //! others and hide each other; few colours for many things; patterns, mirrors and sizes ([`crate::things::dress`]); thin wires
 //! and stems; furniture, shelves with rows of books, walls with doors and windows.
 
-use crate::scene::layout::{self, Footprint, TABLE_HEIGHT, WALL_HEIGHT, WALLS, name_of};
-use crate::scene::{Family, Scene, SceneBuilder, Thing};
-use crate::things::catalogue::{self, CLASSES, Class, Place};
+use crate::scene::layout;
+use crate::scene::room::{Footprint, TABLE_HEIGHT, either_way, enclose, name_of, wall_span};
+use crate::scene::{Family, Identity, Scene, SceneBuilder};
+use crate::things::catalogue::{ALONG_WALLS, CLASSES, ON_WALLS, PROPS, SHELF, SINK, STOVE, WALL_CABINET};
+use crate::things::class::{Class, Place};
 use crate::things::dress::dress;
-use crate::things::furniture::{self, ALONG_WALLS, ON_WALLS, SHELF, SINK, STOVE, WALL_CABINET};
-use crate::things::material::{PAINTS, albedo};
+use crate::things::furniture;
+use crate::things::material::PAINTS;
 use crate::things::model::Model;
-use crate::things::props::PROPS;
 use glam::{DVec2, DVec3};
 use rand::Rng;
 use rand::seq::SliceRandom;
@@ -84,10 +85,14 @@ fn table(objects: usize, growth: f64, rng: &mut ChaCha8Rng) -> Option<Scene> {
     let area = (objects as f64 * 0.020).max(0.6) * growth;
     let top = DVec2::new((1.3 * area).sqrt(), (area / 1.3).sqrt());
     let mut p = Planner::new(0.5 * top + 1.6, rng);
-    p.background();
-    let mut model = catalogue::table(top.to_array(), TABLE_HEIGHT, 0.85 + 0.3 * p.rng.random::<f64>());
+    let mut model = furniture::table(top.to_array(), TABLE_HEIGHT, 0.85 + 0.3 * p.rng.random::<f64>());
     model.top([0.0, 0.0], (0.5 * top - 0.02).to_array(), TABLE_HEIGHT);
-    p.put(&model, "table", "brown", "table".into(), true, DVec3::ZERO, 0.0);
+    p.put(
+        &model,
+        Identity { name: "table".into(), class: "table", color: "brown", background: true },
+        DVec3::ZERO,
+        0.0,
+    );
     let classes: Vec<&'static Class> =
         CLASSES.iter().filter(|c| c.place == Place::Table).chain(PROPS).filter(|c| c.name != "row of books").collect();
     p.scatter(&classes, objects)?;
@@ -97,10 +102,10 @@ fn table(objects: usize, growth: f64, rng: &mut ChaCha8Rng) -> Option<Scene> {
 fn kitchen(objects: usize, growth: f64, rng: &mut ChaCha8Rng) -> Option<Scene> {
     let length = (objects as f64 * 0.045).max(2.2) * growth;
     let mut p = Planner::new(DVec2::new(0.5 * length + 0.9, 1.9), rng);
-    p.background();
     let model = furniture::counter(length, COUNTER[0], COUNTER[1]);
     let at = DVec3::new(0.0, p.half.y - 0.5 * COUNTER[0] - 0.03, 0.0);
-    p.put(&model, "counter", "grey", "counter".into(), true, at, 0.0);
+    let counter = Identity { name: "counter".into(), class: "counter", color: "grey", background: true };
+    p.put(&model, counter, at, 0.0);
     let mut left = objects;
     // What is built in, as far as the number of things allows; half of them at least stand about.
     let fixed = |left: &mut usize, p: &mut Planner<'_>, place: &dyn Fn(&mut Planner<'_>) -> Option<()>| {
@@ -131,20 +136,19 @@ fn kitchen(objects: usize, growth: f64, rng: &mut ChaCha8Rng) -> Option<Scene> {
 fn room(objects: usize, growth: f64, rng: &mut ChaCha8Rng) -> Option<Scene> {
     let size = (objects as f64 / 60.0).sqrt().max(0.85) * growth;
     let mut p = Planner::new(DVec2::new(2.6 + 0.5 * size, 2.4 + 0.4 * size), rng);
-    p.background();
     let furniture = (objects * 2 / 5).clamp(1, 8 + objects / 8);
     let mut made = 0;
     let tables = if furniture >= 3 { 1 + objects / 80 } else { 1 };
     let mut centres = Vec::new();
     for k in 0..tables {
         let (w, d) = (1.2 * (0.9 + 0.2 * p.rng.random::<f64>()), 0.8);
-        let mut model = catalogue::table([w, d], TABLE_HEIGHT, 0.8 + 0.4 * p.rng.random::<f64>());
+        let mut model = furniture::table([w, d], TABLE_HEIGHT, 0.8 + 0.4 * p.rng.random::<f64>());
         model.top([0.0, 0.0], [0.5 * w - 0.02, 0.5 * d - 0.02], TABLE_HEIGHT);
         let x = (k as f64 - 0.5 * (tables - 1) as f64) * 1.5;
         let name = if k == 0 { "wooden table".to_string() } else { format!("wooden table {}", k + 1) };
         let at = DVec3::new(x, 0.0, 0.0);
         p.floor.push(Footprint { centre: at.truncate(), half: DVec2::new(0.5 * w, 0.5 * d), yaw: 0.0 });
-        p.put(&model, "table", "brown", name, false, at, 0.0);
+        p.put(&model, Identity { name, class: "table", color: "brown", background: false }, at, 0.0);
         centres.push(DVec3::new(x, 0.0, TABLE_HEIGHT));
         made += 1;
     }
@@ -184,8 +188,10 @@ impl<'a> Planner<'a> {
         let mut palette: Vec<usize> = (0..PAINTS.len()).collect();
         palette.shuffle(rng);
         palette.truncate(PALETTE);
+        let mut scene = SceneBuilder::default();
+        enclose(&mut scene, half);
         Self {
-            scene: SceneBuilder::default(),
+            scene,
             supports: Vec::new(),
             hung: Vec::new(),
             floor: Vec::new(),
@@ -201,18 +207,7 @@ impl<'a> Planner<'a> {
     }
 
     /// Puts a model into the scene and its flat tops among the supports.
-    #[allow(clippy::too_many_arguments)]
-    fn put(
-        &mut self,
-        model: &Model,
-        class: &'static str,
-        color: &'static str,
-        name: String,
-        background: bool,
-        position: DVec3,
-        yaw: f64,
-    ) {
-        let (x, y, height) = model.extent();
+    fn put(&mut self, model: &Model, who: Identity, position: DVec3, yaw: f64) {
         let turn = DVec2::from_angle(yaw);
         for top in &model.tops {
             let centre = position.truncate() + turn.rotate(DVec2::from_array(top.centre));
@@ -223,27 +218,12 @@ impl<'a> Planner<'a> {
                 taken: Vec::new(),
             });
         }
-        let footprint = DVec2::new(x, y);
-        self.names.insert(name.clone());
-        let thing = Thing { name, class, color, background, parts: 0..0, position, yaw, footprint, height };
-        self.scene.place(model, thing);
-    }
-
-    fn background(&mut self) {
-        let half = self.half;
-        let floor = catalogue::floor(half.to_array());
-        self.put(&floor, "floor", "brown", "floor".into(), true, DVec3::ZERO, 0.0);
-        for (k, (color, srgb)) in WALLS.into_iter().enumerate() {
-            let (length, distance) = if k % 2 == 0 { (half.x, half.y) } else { (half.y, half.x) };
-            let yaw = FRAC_PI_2 * k as f64;
-            let at = DVec2::from_angle(yaw).rotate(DVec2::new(0.0, distance)).extend(0.0);
-            let wall = catalogue::wall(2.0 * length + 0.1, WALL_HEIGHT, albedo(srgb));
-            self.put(&wall, "wall", color, format!("{color} wall"), true, at, yaw);
-        }
+        self.names.insert(who.name.clone());
+        self.scene.place(model, who, position, yaw);
     }
 
     /// A thing of a class in a colour of the scene, dressed, with a name that no other thing has.
-    fn make(&mut self, class: &'static Class, sized: bool, scale: f64) -> (Model, &'static str, String) {
+    fn make(&mut self, class: &'static Class, sized: bool, scale: f64) -> (Model, Identity) {
         let mut paints: Vec<usize> = class.paints.iter().copied().filter(|p| self.palette.contains(p)).collect();
         for attempt in 0.. {
             // When all names of the scene's colours are taken, others come in.
@@ -252,14 +232,14 @@ impl<'a> Planner<'a> {
             }
             let paint = &PAINTS[paints[self.rng.random_range(0..paints.len())]];
             let other = &PAINTS[self.palette[self.rng.random_range(0..PALETTE)]];
-            let (model, words) = dress((class.build)(paint, self.rng).scaled(scale), paint, other, sized, self.rng);
+            let (model, words) = dress(class.make(paint, self.rng).scaled(scale), paint, other, sized, self.rng);
             let plain = name_of(class, paint.name, true);
             let mut name = [&words[..], &[plain.as_str()]].concat().join(" ");
             if attempt > 60 {
                 name = format!("{name} {}", attempt - 59);
             }
             if !self.names.contains(&name) {
-                return (model, paint.name, name);
+                return (model, Identity { name, class: class.name, color: paint.name, background: false });
             }
         }
         unreachable!("numbers do not run out")
@@ -267,7 +247,7 @@ impl<'a> Planner<'a> {
 
     /// Puts a thing on a support, a given one or any; touching another where chance and space allow it.
     fn stand(&mut self, class: &'static Class, on: Option<usize>, scale: f64) -> Option<()> {
-        let (model, color, name) = self.make(class, on.is_none(), scale);
+        let (model, who) = self.make(class, on.is_none(), scale);
         let (x, y, height) = model.extent();
         let half = DVec2::new(x, y);
         let areas: Vec<f64> = self.supports.iter().map(|s| s.place.half.x * s.place.half.y).collect();
@@ -287,7 +267,7 @@ impl<'a> Planner<'a> {
             if height > support.headroom {
                 continue;
             }
-            let random = DVec2::new(self.rng.random::<f64>() * 2.0 - 1.0, self.rng.random::<f64>() * 2.0 - 1.0);
+            let random = DVec2::new(either_way(self.rng), either_way(self.rng));
             let (turn, touching): (f64, f64) = (self.rng.random(), self.rng.random());
             let beside = match support.taken.len() {
                 0 => None,
@@ -310,7 +290,7 @@ impl<'a> Planner<'a> {
             if footprint.inside(&support.place) && !support.taken.iter().any(|t| t.touches(&footprint, gap)) {
                 let position = footprint.centre.extend(support.height);
                 self.supports[s].taken.push(footprint);
-                self.put(&model, class.name, color, name, false, position, footprint.yaw);
+                self.put(&model, who, position, footprint.yaw);
                 return Some(());
             }
         }
@@ -338,12 +318,12 @@ impl<'a> Planner<'a> {
 
     /// Puts a thing with its back to a wall, a given one or any.
     fn along_wall(&mut self, class: &'static Class, on: Option<usize>) -> Option<()> {
-        let (model, color, name) = self.make(class, false, 1.0);
+        let (model, who) = self.make(class, false, 1.0);
         let (x, y, height) = model.extent();
         for _ in 0..TRIES {
             let wall = on.unwrap_or(self.rng.random_range(0..4));
-            let (length, distance) = self.wall(wall);
-            let along = (self.rng.random::<f64>() * 2.0 - 1.0) * (length - x - 0.05);
+            let (length, distance) = wall_span(self.half, wall);
+            let along = either_way(self.rng) * (length - x - 0.05);
             let turn = DVec2::from_angle(FRAC_PI_2 * wall as f64);
             let centre = turn.rotate(DVec2::new(along, distance - y - 0.03));
             let footprint = Footprint { centre, half: DVec2::new(x, y), yaw: FRAC_PI_2 * wall as f64 };
@@ -354,7 +334,7 @@ impl<'a> Planner<'a> {
             if free {
                 self.floor.push(footprint);
                 self.hung.push(Hung { wall, along: [along - x, along + x], up: [0.0, height] });
-                self.put(&model, class.name, color, name, false, centre.extend(0.0), footprint.yaw);
+                self.put(&model, who, centre.extend(0.0), footprint.yaw);
                 return Some(());
             }
         }
@@ -363,19 +343,19 @@ impl<'a> Planner<'a> {
 
     /// Hangs a thing on a wall at a height, anywhere or at a given place (wall, along it).
     fn hang(&mut self, class: &'static Class, height: f64, at: Option<(usize, f64)>) -> Option<()> {
-        let (model, color, name) = self.make(class, false, 1.0);
+        let (model, who) = self.make(class, false, 1.0);
         let (x, _, up) = model.extent();
         // Pictures hang from their middle.
         let up = if class.name == "painting" { [height - up, height + up] } else { [height, height + up] };
         for _ in 0..TRIES {
             let wall = at.map_or_else(|| self.rng.random_range(0..4), |a| a.0);
-            let (length, distance) = self.wall(wall);
-            let along = at.map_or_else(|| (self.rng.random::<f64>() * 2.0 - 1.0) * (length - x - 0.05), |a| a.1);
+            let (length, distance) = wall_span(self.half, wall);
+            let along = at.map_or_else(|| either_way(self.rng) * (length - x - 0.05), |a| a.1);
             if self.is_free(wall, along, x, up) {
                 let yaw = FRAC_PI_2 * wall as f64;
                 let position = DVec2::from_angle(yaw).rotate(DVec2::new(along, distance)).extend(height);
                 self.hung.push(Hung { wall, along: [along - x, along + x], up });
-                self.put(&model, class.name, color, name, false, position, yaw);
+                self.put(&model, who, position, yaw);
                 return Some(());
             }
         }
@@ -384,25 +364,20 @@ impl<'a> Planner<'a> {
 
     /// Puts a thing near the middle of the room, where a walk around it does not pass.
     fn free_standing(&mut self, class: &'static Class) -> Option<()> {
-        let (model, color, name) = self.make(class, false, 1.0);
+        let (model, who) = self.make(class, false, 1.0);
         let (x, y, _) = model.extent();
         let within = (self.half - 1.55).max(DVec2::splat(0.5));
         for _ in 0..TRIES {
-            let random = DVec2::new(self.rng.random::<f64>() * 2.0 - 1.0, self.rng.random::<f64>() * 2.0 - 1.0);
+            let random = DVec2::new(either_way(self.rng), either_way(self.rng));
             let yaw = FRAC_PI_2 * f64::from(self.rng.random_range(0..4)) + 0.5 * (self.rng.random::<f64>() - 0.5);
             let footprint = Footprint { centre: random * within, half: DVec2::new(x, y), yaw };
             if !self.floor.iter().any(|f| f.touches(&footprint, 0.02)) {
                 self.floor.push(footprint);
-                self.put(&model, class.name, color, name, false, footprint.centre.extend(0.0), yaw);
+                self.put(&model, who, footprint.centre.extend(0.0), yaw);
                 return Some(());
             }
         }
         None
-    }
-
-    /// Half the length of a wall and its distance from the middle.
-    fn wall(&self, wall: usize) -> (f64, f64) {
-        if wall.is_multiple_of(2) { (self.half.x, self.half.y) } else { (self.half.y, self.half.x) }
     }
 
     fn is_free(&self, wall: usize, along: f64, half: f64, up: [f64; 2]) -> bool {
@@ -415,6 +390,7 @@ impl<'a> Planner<'a> {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::scene::Thing;
     use rand::SeedableRng;
 
     const FAMILIES: [Family; 3] = [Family::Table, Family::Kitchen, Family::Room];

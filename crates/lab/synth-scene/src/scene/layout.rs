@@ -1,8 +1,11 @@
 //! Where things stand: a room, tables, and things that do not touch each other on tables, floor and walls.
 
-use crate::scene::{Scene, SceneBuilder, Thing};
-use crate::things::catalogue::{self, CLASSES, Class, Naming, Place};
-use crate::things::material::{PAINTS, albedo};
+use crate::scene::room::{Footprint, TABLE_HEIGHT, either_way, enclose, name_of, wall_span};
+use crate::scene::{Identity, Scene, SceneBuilder};
+use crate::things::catalogue::CLASSES;
+use crate::things::class::{Class, Place};
+use crate::things::furniture;
+use crate::things::material::PAINTS;
 use crate::things::model::Model;
 use glam::{DVec2, DVec3};
 use rand::Rng;
@@ -10,14 +13,11 @@ use rand::seq::SliceRandom;
 use rand_chacha::ChaCha8Rng;
 use std::f64::consts::{FRAC_PI_2, TAU};
 
-/// Height of the table tops in metres.
-pub const TABLE_HEIGHT: f64 = 0.72;
 const TABLE: [f64; 2] = [1.36, 1.00];
 /// Distance of the centres of neighbouring tables.
 const TABLE_SPACING: [f64; 2] = [2.8, 2.5];
 /// From the centres of the outer tables to the walls.
 const MARGIN: f64 = 2.45;
-pub(crate) const WALL_HEIGHT: f64 = 2.7;
 const PAINTING_HEIGHT: f64 = 1.12;
 /// Free space between two things, in metres.
 const GAP: f64 = 0.012;
@@ -30,78 +30,6 @@ const PER_TABLE: usize = 10;
 const MOST_PAINTINGS: usize = 4;
 
 const ORDINALS: [&str; 9] = ["second", "third", "fourth", "fifth", "sixth", "seventh", "eighth", "ninth", "tenth"];
-pub(crate) const WALLS: [(&str, [f64; 3]); 4] = [
-    ("white", [0.87, 0.86, 0.83]),
-    ("green", [0.70, 0.78, 0.68]),
-    ("yellow", [0.88, 0.82, 0.66]),
-    ("blue", [0.66, 0.75, 0.82]),
-];
-
-/// A rectangle on the ground, turned.
-#[derive(Debug, Clone, Copy)]
-pub(crate) struct Footprint {
-    pub centre: DVec2,
-    pub half: DVec2,
-    pub yaw: f64,
-}
-
-impl Footprint {
-    pub fn axes(&self) -> [DVec2; 2] {
-        let x = DVec2::from_angle(self.yaw);
-        [x, x.perp()]
-    }
-
-    fn corners(&self) -> [DVec2; 4] {
-        let [x, y] = self.axes();
-        let (x, y) = (x * self.half.x, y * self.half.y);
-        [self.centre + x + y, self.centre + x - y, self.centre - x + y, self.centre - x - y]
-    }
-
-    /// Whether the two come closer than `gap`, by separating axes.
-    pub fn touches(&self, other: &Self, gap: f64) -> bool {
-        let span = |corners: [DVec2; 4], axis: DVec2| {
-            corners
-                .iter()
-                .map(|c| c.dot(axis))
-                .fold((f64::INFINITY, f64::NEG_INFINITY), |(l, h), v| (l.min(v), h.max(v)))
-        };
-        self.axes().into_iter().chain(other.axes()).all(|axis| {
-            let (a, b) = (span(self.corners(), axis), span(other.corners(), axis));
-            a.0 < b.1 + gap && b.0 < a.1 + gap
-        })
-    }
-
-    /// Whether it lies within another one.
-    pub fn inside(&self, other: &Self) -> bool {
-        let [x, y] = other.axes();
-        self.corners().iter().all(|&c| {
-            let d = c - other.centre;
-            d.dot(x).abs() <= other.half.x && d.dot(y).abs() <= other.half.y
-        })
-    }
-
-    /// A footprint of half extents `half` beside this one, `gap` away from it. `turn` (0 to 1) chooses the side and the
-    /// turn, `shift` (-1 to 1) how far the middles are apart along the side.
-    pub fn beside(&self, half: DVec2, gap: f64, turn: f64, shift: f64) -> Self {
-        let side = (turn * 16.0) as usize;
-        let turned = side / 4 % 2 == 1;
-        let size = if turned { DVec2::new(half.y, half.x) } else { half };
-        let [x, y] = self.axes();
-        let sign = if side.is_multiple_of(2) { 1.0 } else { -1.0 };
-        let slide = 0.6 * shift * (self.half + size);
-        let offset = match side / 2 % 2 {
-            0 => x * (sign * (self.half.x + size.x + gap)) + y * slide.y,
-            _ => y * (sign * (self.half.y + size.y + gap)) + x * slide.x,
-        };
-        let half_turns = FRAC_PI_2 * (f64::from(turned) + 2.0 * (side / 8) as f64);
-        Self { centre: self.centre + offset, half, yaw: self.yaw + half_turns }
-    }
-
-    fn within(&self, centre: DVec2, half: DVec2) -> bool {
-        self.corners().iter().all(|&c| (c - centre).abs().cmple(half).all())
-    }
-}
-
 /// A thing that has been chosen but not placed.
 struct Chosen {
     class: &'static Class,
@@ -125,41 +53,14 @@ pub fn plan(objects: usize, rng: &mut ChaCha8Rng) -> Scene {
     };
     let mut scene = SceneBuilder::default();
     background(&mut scene, &centres, room, rng);
-    let mut repeated = vec![0usize; CLASSES.len()];
-    let class_index = |c: &Class| CLASSES.iter().position(|d| d.name == c.name).unwrap_or(0);
-    for c in &chosen {
-        repeated[class_index(c.class)] += 1;
-    }
     for c in &chosen {
         let Some((position, yaw)) = c.at else { continue };
-        let (x, y, height) = c.model.extent();
+        let repeated = chosen.iter().filter(|d| d.class.name == c.class.name).count() > 1;
         let color = PAINTS[c.paint].name;
-        let thing = Thing {
-            name: name_of(c.class, color, repeated[class_index(c.class)] > 1),
-            class: c.class.name,
-            color,
-            background: false,
-            parts: 0..0,
-            position,
-            yaw,
-            footprint: DVec2::new(x, y),
-            height,
-        };
-        scene.place(&c.model, thing);
+        let name = name_of(c.class, color, repeated);
+        scene.place(&c.model, Identity { name, class: c.class.name, color, background: false }, position, yaw);
     }
     scene.build(room, centres.iter().map(|c| c.extend(TABLE_HEIGHT)).collect())
-}
-
-pub(crate) fn name_of(class: &Class, color: &str, repeated: bool) -> String {
-    match class.naming {
-        Naming::Plain if !repeated => class.name.to_string(),
-        Naming::Of(before, after) => {
-            // "in a" becomes "in an" before a vowel.
-            let n = if before.ends_with(" a") && color.starts_with(['a', 'e', 'i', 'o', 'u']) { "n" } else { "" };
-            format!("{before}{n} {color} {after}")
-        }
-        Naming::Plain | Naming::Colored => format!("{color} {}", class.name),
-    }
 }
 
 /// Classes and colours: no pair twice, classes and colours as evenly used as can be.
@@ -187,7 +88,7 @@ fn choose(objects: usize, rng: &mut ChaCha8Rng) -> Vec<Chosen> {
             let Some(&paint) = pick.get(rng.random_range(0..pick.len().max(1))) else { continue };
             used.push((class.name, paint));
             paint_uses[paint] += 1;
-            all.push(Chosen { class, paint, model: (class.build)(&PAINTS[paint], rng), at: None });
+            all.push(Chosen { class, paint, model: class.make(&PAINTS[paint], rng), at: None });
         }
     }
     all
@@ -226,9 +127,7 @@ fn arrange(chosen: &mut [Chosen], tables: &[DVec2], room: DVec2, rng: &mut ChaCh
     for i in order {
         let (x, y, _) = chosen[i].model.extent();
         let half = DVec2::new(x, y);
-        let random = |rng: &mut ChaCha8Rng, half: DVec2| {
-            DVec2::new(rng.random::<f64>() * 2.0 - 1.0, rng.random::<f64>() * 2.0 - 1.0) * half
-        };
+        let random = |rng: &mut ChaCha8Rng, half: DVec2| DVec2::new(either_way(rng), either_way(rng)) * half;
         chosen[i].at = (0..TRIES).find_map(|_| match chosen[i].class.place {
             Place::Table => {
                 // Fill the emptiest table, so that tables are alike.
@@ -252,8 +151,8 @@ fn arrange(chosen: &mut [Chosen], tables: &[DVec2], room: DVec2, rng: &mut ChaCh
             }
             Place::Wall => {
                 let wall = rng.random_range(0..4usize);
-                let (length, distance) = if wall % 2 == 0 { (room.x, room.y) } else { (room.y, room.x) };
-                let along = (rng.random::<f64>() * 2.0 - 1.0) * (length - half.x - 0.3).min(tables.len() as f64 * 1.2);
+                let (length, distance) = wall_span(room, wall);
+                let along = either_way(rng) * (length - half.x - 0.3).min(tables.len() as f64 * 1.2);
                 let fits = !on_wall.iter().any(|&(w, a)| w == wall && (a - along).abs() < 2.0 * half.x + 0.1);
                 fits.then(|| {
                     on_wall.push((wall, along));
@@ -271,34 +170,27 @@ fn arrange(chosen: &mut [Chosen], tables: &[DVec2], room: DVec2, rng: &mut ChaCh
 }
 
 fn background(scene: &mut SceneBuilder, tables: &[DVec2], room: DVec2, rng: &mut ChaCha8Rng) {
-    let thing = |name: String, class, color, position, yaw, model: &Model| {
-        let (x, y, height) = model.extent();
-        Thing { name, class, color, background: true, parts: 0..0, position, yaw, footprint: DVec2::new(x, y), height }
-    };
-    let floor = catalogue::floor(room.to_array());
-    scene.place(&floor, thing("floor".into(), "floor", "brown", DVec3::ZERO, 0.0, &floor));
-    for (k, (color, srgb)) in WALLS.into_iter().enumerate() {
-        let (length, distance) = if k % 2 == 0 { (room.x, room.y) } else { (room.y, room.x) };
-        let yaw = FRAC_PI_2 * k as f64;
-        let at = DVec2::from_angle(yaw).rotate(DVec2::new(0.0, distance)).extend(0.0);
-        // A little longer than the room, so that walls meet behind its corners.
-        let wall = catalogue::wall(2.0 * length + 0.1, WALL_HEIGHT, albedo(srgb));
-        scene.place(&wall, thing(format!("{color} wall"), "wall", color, at, yaw, &wall));
-    }
+    enclose(scene, room);
     for (k, &centre) in tables.iter().enumerate() {
-        let table = catalogue::table(TABLE, TABLE_HEIGHT, 0.85 + 0.3 * rng.random::<f64>());
+        let table = furniture::table(TABLE, TABLE_HEIGHT, 0.85 + 0.3 * rng.random::<f64>());
         let name = match k {
             0 => "table".to_string(),
             1..=9 => format!("{} table", ORDINALS[k - 1]),
             _ => format!("table {}", k + 1),
         };
-        scene.place(&table, thing(name, "table", "brown", centre.extend(0.0), 0.0, &table));
+        scene.place(
+            &table,
+            Identity { name, class: "table", color: "brown", background: true },
+            centre.extend(0.0),
+            0.0,
+        );
     }
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::scene::Thing;
     use crate::things::shape::ChartPoint;
     use rand::SeedableRng;
 

@@ -27,11 +27,45 @@ pub const PAINTS: [Paint; 10] = [
     Paint { name: "black", srgb: [0.16, 0.16, 0.18] },
 ];
 
+// Positions in PAINTS.
+pub(super) const RED: usize = 0;
+pub(super) const BLUE: usize = 1;
+pub(super) const GREEN: usize = 2;
+pub(super) const YELLOW: usize = 3;
+pub(super) const ORANGE: usize = 4;
+pub(super) const PURPLE: usize = 5;
+pub(super) const PINK: usize = 6;
+pub(super) const TURQUOISE: usize = 7;
+pub(super) const WHITE: usize = 8;
+pub(super) const BLACK: usize = 9;
+pub(super) const VIVID: &[usize] = &[RED, BLUE, GREEN, YELLOW, ORANGE, PURPLE, PINK, TURQUOISE];
+pub(super) const ANY: &[usize] = &[RED, BLUE, GREEN, YELLOW, ORANGE, PURPLE, PINK, TURQUOISE, WHITE, BLACK];
+
 impl Paint {
     /// Linear reflectance.
     pub fn albedo(&self) -> DVec3 {
         albedo(self.srgb)
     }
+
+    /// A matt surface of this colour.
+    pub fn matt(&self) -> Material {
+        matt(self.srgb)
+    }
+
+    /// A glazed or polished surface of this colour.
+    pub fn glazed(&self) -> Material {
+        glazed(self.srgb)
+    }
+}
+
+/// A matt surface of an sRGB colour.
+pub fn matt(srgb: [f64; 3]) -> Material {
+    Material::matt(albedo(srgb))
+}
+
+/// A glazed or polished surface of an sRGB colour.
+pub fn glazed(srgb: [f64; 3]) -> Material {
+    Material::glazed(albedo(srgb))
 }
 
 /// Linear reflectance of an sRGB colour.
@@ -114,7 +148,19 @@ impl Material {
 
     /// A glazed or polished surface.
     pub fn glazed(albedo: DVec3) -> Self {
-        Self { specular: 0.10, ..Self::matt(albedo) }
+        Self::matt(albedo).gleaming(0.10)
+    }
+
+    /// The same material with a highlight of another strength.
+    #[must_use]
+    pub fn gleaming(self, specular: f64) -> Self {
+        Self { specular, ..self }
+    }
+
+    /// The same material in another colour, linear.
+    #[must_use]
+    pub fn in_color(self, albedo: DVec3) -> Self {
+        Self { albedo, ..self }
     }
 
     /// The same material with another pattern.

@@ -28,6 +28,8 @@ pub struct Model {
     pub pieces: Vec<Piece>,
     /// Flat tops that other things may stand on.
     pub tops: Vec<Top>,
+    /// The part that pieces go to.
+    current: usize,
 }
 
 /// A flat rectangle of a model that other things may stand on.
@@ -44,55 +46,72 @@ pub struct Top {
 }
 
 impl Model {
-    /// Adds a part; returns its number.
-    pub fn part(&mut self, name: &'static str) -> usize {
+    /// Begins a part: pieces go to it until another one is begun.
+    pub fn part(&mut self, name: &'static str) -> &mut Self {
+        self.current = self.parts.len();
         self.parts.push(name);
-        self.parts.len() - 1
+        self
+    }
+
+    /// Goes on with the part of this name.
+    pub fn again(&mut self, name: &str) -> &mut Self {
+        self.current = self.parts.iter().rposition(|&p| p == name).unwrap_or(self.current);
+        self
     }
 
     /// Adds an upright primitive.
-    pub fn add(&mut self, part: usize, shape: Shape, offset: [f64; 3], material: Material) {
-        self.add_turned(part, shape, offset, DMat3::IDENTITY, material);
+    pub fn add(&mut self, shape: Shape, offset: [f64; 3], material: Material) {
+        self.add_turned(shape, offset, DMat3::IDENTITY, material);
     }
 
     /// Adds a rotated primitive.
-    pub fn add_turned(&mut self, part: usize, shape: Shape, offset: [f64; 3], rotation: DMat3, material: Material) {
-        self.pieces.push(Piece { part, shape, rotation, offset: DVec3::from_array(offset), material });
+    pub fn add_turned(&mut self, shape: Shape, offset: [f64; 3], rotation: DMat3, material: Material) {
+        let offset = DVec3::from_array(offset);
+        self.pieces.push(Piece { part: self.current, shape, rotation, offset, material });
+    }
+
+    /// Adds a solid of revolution about the vertical through the origin.
+    pub fn lathe(&mut self, profile: &[(f64, f64)], material: Material) {
+        self.turn(profile, [0.0; 3], material);
     }
 
     /// Adds a solid of revolution about the vertical through `offset`.
-    pub fn turn(&mut self, part: usize, profile: &[(f64, f64)], offset: [f64; 3], material: Material) {
-        for shape in Shape::turned(profile) {
-            self.add(part, shape, offset, material);
-        }
+    pub fn turn(&mut self, profile: &[(f64, f64)], offset: [f64; 3], material: Material) {
+        self.turn_rotated(profile, offset, DMat3::IDENTITY, material);
     }
 
     /// Adds a solid of revolution about a rotated axis.
-    pub fn turn_rotated(
-        &mut self,
-        part: usize,
-        profile: &[(f64, f64)],
-        offset: [f64; 3],
-        rotation: DMat3,
-        material: Material,
-    ) {
+    pub fn turn_rotated(&mut self, profile: &[(f64, f64)], offset: [f64; 3], rotation: DMat3, material: Material) {
         for shape in Shape::turned(profile) {
-            self.add_turned(part, shape, offset, rotation, material);
+            self.add_turned(shape, offset, rotation, material);
         }
     }
 
     /// Adds a block with its lower side's centre at `foot`.
-    pub fn block(&mut self, part: usize, size: [f64; 3], round: f64, foot: [f64; 3], material: Material) {
-        let half = 0.5 * DVec3::from_array(size);
-        let shape = Shape::Block { half, round };
-        self.add(part, shape, [foot[0], foot[1], foot[2] + half.z], material);
+    pub fn block(&mut self, size: [f64; 3], round: f64, foot: [f64; 3], material: Material) {
+        let half = size.map(|s| 0.5 * s);
+        self.add(Shape::block(half, round), [foot[0], foot[1], foot[2] + half[2]], material);
+    }
+
+    /// Adds four blocks, at the corners of the rectangle with the half extents `corner`.
+    pub fn legs(&mut self, corner: [f64; 2], size: [f64; 3], round: f64, material: Material) {
+        for (x, y) in [(-1.0, -1.0), (1.0, -1.0), (-1.0, 1.0), (1.0, 1.0)] {
+            self.block(size, round, [x * corner[0], y * corner[1], 0.0], material);
+        }
+    }
+
+    /// Adds a rim around a rectangle of the given size, of bars that are `bar` wide and `height` high.
+    pub fn rim(&mut self, [w, d]: [f64; 2], [bar, height]: [f64; 2], round: f64, material: Material) {
+        for (x, y, size) in [(0.0, 0.5, [w, bar]), (0.0, -0.5, [w, bar]), (0.5, 0.0, [bar, d]), (-0.5, 0.0, [bar, d])] {
+            self.block([size[0], size[1], height], round, [x * (w - bar), y * (d - bar), 0.0], material);
+        }
     }
 
     /// Adds a round rod from `a` to `b`.
-    pub fn rod(&mut self, part: usize, a: [f64; 3], b: [f64; 3], radius: f64, material: Material) {
+    pub fn rod(&mut self, a: [f64; 3], b: [f64; 3], radius: f64, material: Material) {
         let (a, b) = (DVec3::from_array(a), DVec3::from_array(b));
         let shape = Shape::Capsule { half: 0.5 * (b - a).length(), radius };
-        self.add_turned(part, shape, (0.5 * (a + b)).to_array(), z_towards(b - a), material);
+        self.add_turned(shape, (0.5 * (a + b)).to_array(), z_towards(b - a), material);
     }
 
     /// Adds a flat top under the open air.
@@ -108,6 +127,12 @@ impl Model {
     /// The same model `factor` times as large.
     #[must_use]
     pub fn scaled(mut self, factor: f64) -> Self {
+        self.scale(factor);
+        self
+    }
+
+    /// Makes the model `factor` times as large.
+    pub fn scale(&mut self, factor: f64) {
         for piece in &mut self.pieces {
             piece.offset *= factor;
             piece.shape = piece.shape.scaled(factor);
@@ -118,7 +143,6 @@ impl Model {
             top.height *= factor;
             top.room = top.room.map(|r| r * factor);
         }
-        self
     }
 
     /// Corners of the boxes around all pieces, in the model's frame.
@@ -152,6 +176,11 @@ impl Shape {
     }
 }
 
+/// A profile for [`Model::turn`] from its radii and heights.
+pub fn profile<const N: usize>(radii: [f64; N], heights: [f64; N]) -> [(f64, f64); N] {
+    std::array::from_fn(|i| (radii[i], heights[i]))
+}
+
 /// A rotation that takes z to `direction`.
 pub fn z_towards(direction: DVec3) -> DMat3 {
     let z = direction.normalize_or(DVec3::Z);
@@ -167,8 +196,7 @@ mod tests {
     #[test]
     fn a_rod_joins_its_ends() {
         let mut m = Model::default();
-        let p = m.part("rod");
-        m.rod(p, [0.1, 0.2, 0.3], [0.4, 0.0, 0.9], 0.01, Material::matt(DVec3::ONE));
+        m.part("rod").rod([0.1, 0.2, 0.3], [0.4, 0.0, 0.9], 0.01, Material::matt(DVec3::ONE));
         let piece = &m.pieces[0];
         let Shape::Capsule { half, .. } = piece.shape else { panic!("a capsule") };
         let end = piece.rotation * DVec3::new(0.0, 0.0, half) + piece.offset;
@@ -179,8 +207,7 @@ mod tests {
     #[test]
     fn scaling_scales_the_extent() {
         let mut m = Model::default();
-        let p = m.part("box");
-        m.block(p, [0.2, 0.4, 0.6], 0.01, [0.0; 3], Material::matt(DVec3::ONE));
+        m.part("box").block([0.2, 0.4, 0.6], 0.01, [0.0; 3], Material::matt(DVec3::ONE));
         let (x, y, z) = m.scaled(2.0).extent();
         assert!((x - 0.2).abs() < 1e-12 && (y - 0.4).abs() < 1e-12 && (z - 1.2).abs() < 1e-12);
     }

@@ -87,6 +87,16 @@ impl Shape {
             .collect()
     }
 
+    /// A block with the given half extents and radius of its edges.
+    pub fn block(half: [f64; 3], round: f64) -> Self {
+        Self::Block { half: DVec3::from_array(half), round }
+    }
+
+    /// An ellipsoid with the given semi-axes.
+    pub fn ellipsoid(radii: [f64; 3]) -> Self {
+        Self::Ellipsoid { radii: DVec3::from_array(radii) }
+    }
+
     /// A sphere.
     pub fn sphere(radius: f64) -> Self {
         Self::Ellipsoid { radii: DVec3::splat(radius) }
@@ -395,9 +405,9 @@ mod tests {
     fn samples() -> Vec<Shape> {
         let mut all = Shape::turned(&[(0.0, 0.0), (0.3, 0.0), (0.5, 0.8), (0.4, 0.8), (0.2, 0.1), (0.0, 0.1)]);
         all.extend([
-            Shape::Block { half: DVec3::new(0.5, 0.3, 0.2), round: 0.0 },
-            Shape::Block { half: DVec3::new(0.5, 0.3, 0.2), round: 0.05 },
-            Shape::Ellipsoid { radii: DVec3::new(0.5, 0.3, 0.2) },
+            Shape::block([0.5, 0.3, 0.2], 0.0),
+            Shape::block([0.5, 0.3, 0.2], 0.05),
+            Shape::ellipsoid([0.5, 0.3, 0.2]),
             Shape::Ring { major: 0.5, minor: 0.1, arc: PI },
             Shape::Ring { major: 0.5, minor: 0.1, arc: 1.2 },
             Shape::Capsule { half: 0.4, radius: 0.2 },
@@ -453,8 +463,8 @@ mod tests {
     #[test]
     fn rays_through_the_middle_meet_a_solid_on_both_sides() {
         let solids = [
-            Shape::Block { half: DVec3::splat(0.3), round: 0.0 },
-            Shape::Block { half: DVec3::splat(0.3), round: 0.1 },
+            Shape::block([0.3; 3], 0.0),
+            Shape::block([0.3; 3], 0.1),
             Shape::sphere(0.3),
             Shape::Capsule { half: 0.2, radius: 0.3 },
         ];
