@@ -3,7 +3,7 @@
 use crate::render::light::LightMap;
 use crate::render::{self, Frame};
 use crate::scene::Scene;
-use crate::scene::cameras::{self, Path};
+use crate::scene::cameras;
 use crate::scene::layout;
 use crate::truth::polygon::Polygon;
 use rand::SeedableRng;
@@ -17,7 +17,7 @@ pub fn example() -> &'static (Scene, Frame) {
         let mut rng = ChaCha8Rng::seed_from_u64(5);
         let scene = layout::plan(10, &mut rng);
         let light = LightMap::bake(&scene, 3.0);
-        let cameras = cameras::place(&scene, Path::Ring, 4, 240, 180, &mut rng);
+        let cameras = cameras::place(&scene, 4, 240, 180, &mut rng);
         let frame = render::render(&scene, &light, &cameras[1]);
         (scene, frame)
     })

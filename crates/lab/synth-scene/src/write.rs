@@ -1,19 +1,16 @@
-//! Makes a scene and writes all of it.
+//! The program told from beginning to end: furnish a room, photograph it, write all of it.
 
 use crate::memory::{self, Amounts};
+pub use crate::options::Options;
 use crate::render::light::LightMap;
 use crate::render::{self, Frame};
-use crate::scene::Scene;
-use crate::scene::cameras::{self, Path as CameraPath};
-use crate::scene::{Family, families};
+use crate::scene::{Family, Scene, cameras, families};
 use crate::truth::benchmark::{self, Layout};
-use crate::truth::label;
-use crate::truth::language::{Language, Speech};
-use crate::truth::masks::{self, Faults};
+use crate::truth::language::Language;
+use crate::truth::masks;
 use crate::truth::points::{self, Collector};
-use crate::truth::scannet;
+use crate::truth::{label, scannet};
 use artifacts::{MaskTruth, TrueObject, TruePart, TruePoints, TrueScene, features_path, maps_path};
-use clap::ValueEnum;
 use gs_io::{Claim, Error, IoContext, Outputs, Result, create_dir, npy, write_bytes};
 use gs_scene::{Camera, Image, PointCloud, colmap};
 use rand::SeedableRng;
@@ -22,37 +19,6 @@ use serde_json::{Value, json};
 use stage::Stage;
 use std::collections::BTreeMap;
 use std::path::Path;
-
-/// What shapes a scene.
-#[derive(Debug, Clone, PartialEq)]
-pub struct Options {
-    /// Seed of every random choice.
-    pub seed: u64,
-    /// What kind of scene.
-    pub family: Family,
-    /// Things besides floor, walls, tables and counters; 1 to 60 in the studio, to 250 elsewhere.
-    pub objects: usize,
-    /// Number of photographs, at least 1.
-    pub views: usize,
-    /// Their width in pixels.
-    pub width: u32,
-    /// Their height in pixels.
-    pub height: u32,
-    /// Points of the sparse cloud; fewer where the views show fewer.
-    pub points: usize,
-    /// The camera's path; by default a ring around one table, a walk between several.
-    pub cameras: Option<CameraPath>,
-    /// Faults of the id maps.
-    pub faults: Faults,
-    /// CLIP-like features of the masks, where asked for.
-    pub speech: Option<Speech>,
-    /// Noise of the poses in `sparse/0`, in degrees about and centimetres along each axis.
-    pub pose_noise: f64,
-    /// Every how many views get polygon labels; 0 for none.
-    pub label_every: usize,
-    /// Where the files lie, and what they are called.
-    pub layout: Layout,
-}
 
 /// Standard deviation of the sparse cloud's points in metres.
 const POINT_NOISE: f64 = 0.003;
@@ -73,27 +39,6 @@ const VERTICES: u64 = 4;
 const FIRST_VIEW: u64 = 16;
 const FIRST_SPEECH: u64 = 1 << 32;
 const FIRST_PATCHES: u64 = 2 << 32;
-
-impl Default for Options {
-    /// The demo's scene with perfect masks.
-    fn default() -> Self {
-        Self {
-            seed: 0,
-            family: Family::Studio,
-            objects: 10,
-            views: 30,
-            width: 480,
-            height: 360,
-            points: 9_000,
-            cameras: None,
-            faults: Faults::default(),
-            speech: None,
-            pose_noise: 0.0,
-            label_every: 4,
-            layout: Layout::Colmap,
-        }
-    }
-}
 
 impl Options {
     /// A generator of one of the streams.
@@ -134,52 +79,14 @@ impl Options {
         }
     }
 
-    fn path(&self, scene: &Scene) -> CameraPath {
-        let ring = match self.family {
-            Family::Studio => scene.tables.len() == 1,
-            Family::Table => true,
-            Family::Kitchen | Family::Room => false,
-        };
-        self.cameras.unwrap_or(if ring { CameraPath::Ring } else { CameraPath::Walk })
-    }
-
     /// The cameras in that room.
     pub fn cameras(&self, scene: &Scene) -> Vec<Camera> {
-        let rng = &mut self.rng(CAMERAS);
-        cameras::place(scene, self.path(scene), self.views, self.width, self.height, rng)
+        cameras::place(scene, self.views, self.width, self.height, &mut self.rng(CAMERAS))
     }
 
-    fn parameters(&self, scene: &Scene) -> Value {
-        let path = match self.path(scene) {
-            CameraPath::Ring => "ring",
-            CameraPath::Walk => "walk",
-        };
-        let mut all = json!({
-            "seed": self.seed, "objects": self.objects, "views": self.views, "width": self.width,
-            "height": self.height, "points": self.points, "cameras": path, "granularity_p": self.faults.granularity,
-            "boundary_noise": self.faults.boundary, "missing": self.faults.missing, "label_every": self.label_every,
-        });
-        // What is not used is not named: older scenes of the same bytes lack it too.
-        if self.family != Family::Studio {
-            all["family"] = json!(self.family.to_possible_value().map(|v| v.get_name().to_string()));
-        }
-        match &self.layout {
-            Layout::Colmap => {}
-            Layout::LerfOvs(scene) => all["layout"] = json!(format!("lerf-ovs {}", scene.name)),
-            Layout::Scan { name, converted: false } => all["layout"] = json!(format!("scannet {name}")),
-            Layout::Scan { name, converted: true } => all["layout"] = json!(format!("opengaussian {name}")),
-        }
-        let mut used = |name: &str, value: f64| {
-            if value != 0.0 {
-                all[name] = json!(value);
-            }
-        };
-        used("spurious", self.faults.spurious);
-        used("pose_noise", self.pose_noise);
-        if let Some(speech) = self.speech {
-            all["features"] = json!({ "leaking": speech.leaking, "noise": speech.noise });
-        }
-        all
+    /// The options as written beside what they made.
+    fn parameters(&self) -> Value {
+        serde_json::to_value(self).unwrap_or_default()
     }
 
     /// Writes a view's id maps, and features where asked for, into a folder; returns what the masks show.
@@ -221,7 +128,6 @@ pub fn run(stage: &Stage, out: &Path, options: &Options) -> Result<()> {
     let marker = out.join("truth/scene.json");
     let mut claim = claim(stage, out, &marker, &options.layout)?;
     let scene = options.scene();
-    let parameters = options.parameters(&scene);
     let cameras = options.cameras(&scene);
     stage.info(&format!(
         "{} things of {} parts and {} surfaces",
@@ -231,62 +137,26 @@ pub fn run(stage: &Stage, out: &Path, options: &Options) -> Result<()> {
     ));
     stage.forecast(memory::forecast(&options.amounts(&scene, &cameras)), FEWER)?;
     prepare(out, &marker, &options.layout)?;
-    let light = options.light(&scene);
     let language = options.language(&scene);
-    let stems = options.layout.stems(cameras.len());
-    let labels = options.layout.labels(out);
-    let mut progress = stage.progress("views", cameras.len() as u64);
     let mut points = Collector::default();
-    let mut masks = BTreeMap::new();
-    let mut labelled = 0;
-    for (v, camera) in cameras.iter().enumerate() {
-        stage.go_on()?;
-        let frame = render::render(&scene, &light, camera);
-        points.add(&scene, camera, &frame);
-        let stem = &stems[v];
-        write_view(out, options.layout.images(), stem, &frame)?;
-        let shown = options.write_masks(&out.join("language_features"), stem, v, &scene, &frame, language.as_ref())?;
-        masks.insert(stem.clone(), shown);
-        if options.layout.is_labelled(v, stem, options.label_every) {
-            label::write(&labels.join(format!("{stem}.json")), &format!("{stem}.png"), &scene, &frame)?;
-            labelled += 1;
-        }
-        progress.step();
-    }
-    progress.finish(&[]);
-
+    let (masks, labelled) = photograph(stage, out, options, &scene, &cameras, language.as_ref(), &mut points)?;
     let sparse = points.sparse(&scene, options.points, POINT_NOISE, &mut options.rng(POINTS));
-    let named = |cameras: Vec<Camera>| -> Vec<(String, Camera)> {
-        stems.iter().map(|stem| format!("{stem}.png")).zip(cameras).collect()
-    };
-    if options.pose_noise > 0.0 {
-        colmap::write_model(&out.join("truth/sparse/0"), &named(cameras.clone()), &PointCloud::default())?;
-    }
-    let views = named(cameras::perturbed(&cameras, options.pose_noise, &mut options.rng(POSES)));
-    options.layout.write_cameras(out, &views, &sparse)?;
+    write_cameras(out, options, &cameras, &sparse)?;
     if let Some(language) = &language {
         write_table(&out.join("truth"), language)?;
     }
-    let truth = points.truth(&scene);
-    let mut provenance = stage.provenance(TruePoints::FORMAT, 1, parameters.clone(), BTreeMap::new());
-    provenance.extra = json!({ "classes": scene.classes() });
-    truth.write(out.join("truth/points.safetensors"), provenance)?;
-    if options.layout == Layout::Colmap && options.family == Family::Room {
-        scannet::write(&out.join(SCAN), scannet::SCAN, &scene, &truth, points.colors())?;
-    }
-    let (vertices, colors) = points.vertices(&scene, options.points, &mut options.rng(VERTICES));
-    options.layout.write_scan(out, &scene, &vertices, &colors)?;
+    let parameters = options.parameters();
+    let truth_points = write_points(stage, out, options, &scene, &points, &parameters)?;
     MaskTruth::write_all(out.join("truth/masks.json"), &masks)?;
     let summary = json!({
-        "objects": options.objects, "parts": scene.parts.len(), "views": views.len(), "labelled_views": labelled,
-        "masks": masks.values().map(Vec::len).sum::<usize>(), "points": sparse.len(),
-        "truth_points": truth.position.len(),
+        "objects": options.objects, "parts": scene.parts.len(), "views": cameras.len(), "labelled_views": labelled,
+        "masks": masks.values().map(Vec::len).sum::<usize>(), "points": sparse.len(), "truth_points": truth_points,
     });
     // The record before the marker: a rule that finds the marker finds everything.
     stage.record(&mut claim, parameters.clone(), BTreeMap::new(), summary)?;
     remove_unused(out, &options.layout);
     true_scene(&scene, parameters).write(&marker)?;
-    stage.info(&format!("{} photographs, {} points, {}", views.len(), sparse.len(), marker.display()));
+    stage.info(&format!("{} photographs, {} points, {}", cameras.len(), sparse.len(), marker.display()));
     Ok(())
 }
 
@@ -309,25 +179,101 @@ pub fn run_masks(stage: &Stage, folder: &Path, options: &Options) -> Result<()> 
     // An empty list says that the masks are not complete.
     MaskTruth::write_all(&marker, &BTreeMap::new())?;
     let language = options.language(&scene);
-    let mut progress = stage.progress("views", cameras.len() as u64);
-    let mut masks = BTreeMap::new();
-    for (v, camera) in cameras.iter().enumerate() {
-        stage.go_on()?;
-        let frame = render::identify(&scene, camera);
-        let shown = options.write_masks(folder, &stems[v], v, &scene, &frame, language.as_ref())?;
-        masks.insert(stems[v].clone(), shown);
-        progress.step();
-    }
-    progress.finish(&[]);
+    let masks = each_view(stage, options, &cameras, |v, stem, camera| {
+        options.write_masks(folder, stem, v, &scene, &render::identify(&scene, camera), language.as_ref())
+    })?;
     if let Some(language) = &language {
         write_table(folder, language)?;
     }
     let count = masks.values().map(Vec::len).sum::<usize>();
     let summary = json!({ "views": cameras.len(), "masks": count });
     MaskTruth::write_all(&marker, &masks)?;
-    stage.record(&mut claim, options.parameters(&scene), BTreeMap::new(), summary)?;
+    stage.record(&mut claim, options.parameters(), BTreeMap::new(), summary)?;
     stage.info(&format!("{count} masks in {} views, {}", cameras.len(), marker.display()));
     Ok(())
+}
+
+/// What the masks of each view show, by the stem of its files.
+type Shown = BTreeMap<String, Vec<MaskTruth>>;
+
+/// Runs `make` for every view and collects what its masks show.
+fn each_view(
+    stage: &Stage,
+    options: &Options,
+    cameras: &[Camera],
+    mut make: impl FnMut(usize, &str, &Camera) -> Result<Vec<MaskTruth>>,
+) -> Result<Shown> {
+    let mut progress = stage.progress("views", cameras.len() as u64);
+    let mut masks = BTreeMap::new();
+    for (v, (camera, stem)) in cameras.iter().zip(options.layout.stems(cameras.len())).enumerate() {
+        stage.go_on()?;
+        let shown = make(v, &stem, camera)?;
+        masks.insert(stem, shown);
+        progress.step();
+    }
+    progress.finish(&[]);
+    Ok(masks)
+}
+
+/// Writes photographs, masks and labels, and collects the points that the views see. Returns what the masks show and the
+/// number of labelled views.
+fn photograph(
+    stage: &Stage,
+    out: &Path,
+    options: &Options,
+    scene: &Scene,
+    cameras: &[Camera],
+    language: Option<&Language>,
+    points: &mut Collector,
+) -> Result<(Shown, usize)> {
+    let light = options.light(scene);
+    let labels = options.layout.labels(out);
+    let mut labelled = 0;
+    let masks = each_view(stage, options, cameras, |v, stem, camera| {
+        let frame = render::render(scene, &light, camera);
+        points.add(scene, camera, &frame);
+        write_view(out, options.layout.images(), stem, &frame)?;
+        if options.layout.is_labelled(v, stem, options.label_every) {
+            label::write(&labels.join(format!("{stem}.json")), &format!("{stem}.png"), scene, &frame)?;
+            labelled += 1;
+        }
+        options.write_masks(&out.join("language_features"), stem, v, scene, &frame, language)
+    })?;
+    Ok((masks, labelled))
+}
+
+/// Writes the poses, noisy where asked for, and the sparse cloud.
+fn write_cameras(out: &Path, options: &Options, cameras: &[Camera], sparse: &PointCloud) -> Result<()> {
+    let stems = options.layout.stems(cameras.len());
+    let named = |cameras: Vec<Camera>| -> Vec<(String, Camera)> {
+        stems.iter().map(|stem| format!("{stem}.png")).zip(cameras).collect()
+    };
+    if options.pose_noise > 0.0 {
+        colmap::write_model(&out.join("truth/sparse/0"), &named(cameras.to_vec()), &PointCloud::default())?;
+    }
+    let views = named(cameras::perturbed(cameras, options.pose_noise, &mut options.rng(POSES)));
+    options.layout.write_cameras(out, &views, sparse)
+}
+
+/// Writes the true points and the scan made of them; returns how many points there are.
+fn write_points(
+    stage: &Stage,
+    out: &Path,
+    options: &Options,
+    scene: &Scene,
+    points: &Collector,
+    parameters: &Value,
+) -> Result<usize> {
+    let truth = points.truth(scene);
+    let mut provenance = stage.provenance(TruePoints::FORMAT, 1, parameters.clone(), BTreeMap::new());
+    provenance.extra = json!({ "classes": scene.classes() });
+    truth.write(out.join("truth/points.safetensors"), provenance)?;
+    if options.layout == Layout::Colmap && options.family == Family::Room {
+        scannet::write(&out.join(SCAN), scannet::SCAN, scene, &truth, points.colors())?;
+    }
+    let (vertices, colors) = points.vertices(scene, options.points, &mut options.rng(VERTICES));
+    options.layout.write_scan(out, scene, &vertices, &colors)?;
+    Ok(truth.position.len())
 }
 
 /// Name of the table of text features.

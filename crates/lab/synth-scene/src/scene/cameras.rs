@@ -10,15 +10,6 @@ use rand::Rng;
 use rand_chacha::ChaCha8Rng;
 use std::f64::consts::{PI, TAU};
 
-/// How the photographer moves.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, clap::ValueEnum)]
-pub enum Path {
-    /// Once around the room at two heights, looking inwards.
-    Ring,
-    /// Around one table after the other, near and far, high and low.
-    Walk,
-}
-
 /// Horizontal field of view in radians.
 const FIELD: f64 = 0.90;
 /// Heights of the ring's two levels.
@@ -33,15 +24,15 @@ const WALL_DISTANCE: f64 = 0.68;
 const CLEARANCE: f64 = 0.35;
 
 /// `views` cameras; pictures of `width` x `height` pixels.
-pub fn place(scene: &Scene, path: Path, views: usize, width: u32, height: u32, rng: &mut ChaCha8Rng) -> Vec<Camera> {
+pub fn place(scene: &Scene, views: usize, width: u32, height: u32, rng: &mut ChaCha8Rng) -> Vec<Camera> {
     (0..views)
         .map(|i| {
-            let (mut eye, mut target) = match (scene.family, path) {
-                (Family::Studio, Path::Ring) => ring(scene, i, views),
-                (Family::Studio, Path::Walk) => walk(scene, i, views),
-                (Family::Table, _) => table(scene, path, i, views),
-                (Family::Kitchen, _) => kitchen(scene, path, i, views),
-                (Family::Room, _) => room(scene, path, i, views),
+            let (mut eye, mut target) = match scene.family {
+                Family::Studio if scene.tables.len() == 1 => ring(scene, i, views),
+                Family::Studio => walk(scene, i, views),
+                Family::Table => table(scene, i, views),
+                Family::Kitchen => kitchen(scene, i, views),
+                Family::Room => room(scene, i, views),
             };
             let mut shake = |size: f64| DVec3::new(rng.random(), rng.random(), rng.random()) * 2.0 * size - size;
             eye += shake(0.05);
@@ -115,60 +106,32 @@ fn top_half(scene: &Scene) -> DVec2 {
     scene.things.iter().find(is_top).map_or(DVec2::ONE, |t| t.footprint)
 }
 
-/// A ring: three rounds, from beside the table to above it. A walk: around the edge, close to what stands there.
-fn table(scene: &Scene, path: Path, i: usize, views: usize) -> (DVec3, DVec3) {
+/// Three rounds, from beside the table to above it.
+fn table(scene: &Scene, i: usize, views: usize) -> (DVec3, DVec3) {
     let (top, half) = (scene.tables[0], top_half(scene));
-    match path {
-        Path::Ring => {
-            let angle = TAU * (i as f64 + 0.25) / views as f64;
-            let around = DVec2::from_angle(angle);
-            let (out, up) = [(0.75, 0.45), (0.50, 0.80), (0.20, 1.10)][i % 3];
-            let eye = around * (half + out);
-            (top + eye.extend(up), top + (around * half * 0.25).extend(0.03))
-        }
-        Path::Walk => {
-            let (at, _) = border(half + 0.42, 2.0 * (i as f64 + 0.5) / views as f64);
-            let up = if 2 * i < views { 0.45 } else { 0.80 };
-            (top + at.extend(up), top + (at * 0.35).extend(0.03))
-        }
-    }
+    let around = DVec2::from_angle(TAU * (i as f64 + 0.25) / views as f64);
+    let (out, up) = [(0.75, 0.45), (0.50, 0.80), (0.20, 1.10)][i % 3];
+    (top + (around * (half + out)).extend(up), top + (around * half * 0.25).extend(0.03))
 }
 
-/// A ring: an arc in front of the counter. A walk: along the counter and back, at two heights and distances.
-fn kitchen(scene: &Scene, path: Path, i: usize, views: usize) -> (DVec3, DVec3) {
+/// Along the counter and back, at two heights and distances.
+fn kitchen(scene: &Scene, i: usize, views: usize) -> (DVec3, DVec3) {
     let (top, half) = (scene.tables[0], top_half(scene));
     let t = (i as f64 + 0.5) / views as f64;
-    let up = [1.40, 1.75][i % 2];
-    match path {
-        Path::Ring => {
-            let angle = PI * (1.08 + 0.84 * t);
-            let eye = DVec2::new(half.x * angle.cos(), top.y - 0.55 + 1.45 * angle.sin());
-            (eye.extend(up), DVec3::new(0.55 * eye.x, top.y, top.z + 0.15))
-        }
-        Path::Walk => {
-            let (x, away) = if t < 0.5 { (4.0 * t - 1.0, 1.15) } else { (3.0 - 4.0 * t, 1.45) };
-            let x = x * (half.x - 0.25);
-            let sway = 0.45 * (TAU * 6.0 * t).sin();
-            (DVec3::new(x, top.y - away, up), DVec3::new(x + sway, top.y, top.z + 0.18))
-        }
-    }
+    let (x, away) = if t < 0.5 { (4.0 * t - 1.0, 1.15) } else { (3.0 - 4.0 * t, 1.45) };
+    let x = x * (half.x - 0.25);
+    let sway = 0.45 * (TAU * 6.0 * t).sin();
+    (DVec3::new(x, top.y - away, [1.40, 1.75][i % 2]), DVec3::new(x + sway, top.y, top.z + 0.18))
 }
 
-/// A round through the room between what stands at the walls and in the middle. A ring looks inwards, a walk ahead and to
-/// both sides.
-fn room(scene: &Scene, path: Path, i: usize, views: usize) -> (DVec3, DVec3) {
+/// A round through the room between what stands at the walls and in the middle, looking ahead and to both sides.
+fn room(scene: &Scene, i: usize, views: usize) -> (DVec3, DVec3) {
     let t = (i as f64 + 0.5) / views as f64;
     let (at, ahead) = border(scene.room - ROOM_AWAY, t);
     let eye = at.extend(1.52 + 0.12 * (TAU * 7.0 * t).sin());
-    match path {
-        Path::Ring => (eye, (at * 0.15).extend(0.65)),
-        Path::Walk => {
-            // Left is inwards; what is right is too near to be seen whole.
-            let turn = 0.55 + 1.15 * (TAU * 5.0 * t).sin();
-            let look = DVec2::from_angle(turn).rotate(ahead);
-            (eye, eye + look.extend(-0.38))
-        }
-    }
+    // Left is inwards; what is right is too near to be seen whole.
+    let look = DVec2::from_angle(0.55 + 1.15 * (TAU * 5.0 * t).sin()).rotate(ahead);
+    (eye, eye + look.extend(-0.38))
 }
 
 /// Lifts the camera over things that it would come too close to.
@@ -190,23 +153,23 @@ mod tests {
     #[test]
     fn cameras_see_things_and_stand_in_none() {
         for (family, objects) in [(Family::Table, 40), (Family::Kitchen, 50), (Family::Room, 70), (Family::Room, 30)] {
-            for path in [Path::Ring, Path::Walk] {
+            {
                 let rng = &mut ChaCha8Rng::seed_from_u64(objects as u64);
                 let scene = crate::scene::families::plan(family, objects, rng);
                 let mut seen = vec![0usize; scene.things.len()];
-                for camera in place(&scene, path, 24, 96, 72, rng) {
+                for camera in place(&scene, 24, 96, 72, rng) {
                     let frame = crate::render::identify(&scene, &camera);
                     let near = frame.distance.iter().copied().fold(f64::INFINITY, f64::min);
-                    assert!(near > 0.12, "{family:?} {path:?}: {near} m from something");
-                    assert!(frame.thing.iter().all(|&t| t >= 0), "{family:?} {path:?}: outside the room");
+                    assert!(near > 0.12, "{family:?}: {near} m from something");
+                    assert!(frame.thing.iter().all(|&t| t >= 0), "{family:?}: outside the room");
                     let mut here = vec![0usize; scene.things.len()];
                     frame.thing.iter().for_each(|&t| here[t as usize] += 1);
-                    assert!(here.iter().filter(|&&n| n > 0).count() >= 3, "{family:?} {path:?}: sees nothing");
+                    assert!(here.iter().filter(|&&n| n > 0).count() >= 3, "{family:?}: sees nothing");
                     seen.iter_mut().zip(here).for_each(|(s, n)| *s += usize::from(n >= 4));
                 }
                 let objects = scene.things.iter().zip(&seen).filter(|(t, _)| !t.background);
                 let often = objects.clone().filter(|(_, n)| **n >= 2).count();
-                assert!(5 * often >= 3 * objects.count(), "{family:?} {path:?}: {often} are seen in two views");
+                assert!(5 * often >= 3 * objects.count(), "{family:?}: {often} are seen in two views");
             }
         }
     }

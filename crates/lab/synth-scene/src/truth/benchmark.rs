@@ -7,8 +7,10 @@ use artifacts::{LERF_OVS, LerfScene};
 use clap::ValueEnum;
 use gs_io::{Error, Result, create_dir, write_bytes};
 use gs_scene::{Camera, PointCloud, colmap, ply};
+use serde::{Serialize, Serializer};
 use serde_json::{Value, json};
 use std::collections::BTreeSet;
+use std::fmt;
 use std::path::{Path, PathBuf};
 
 /// The layouts by name.
@@ -38,6 +40,23 @@ pub enum Layout {
         /// Whether it lies there as OpenGaussian converts it.
         converted: bool,
     },
+}
+
+impl fmt::Display for Layout {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Self::Colmap => write!(f, "colmap"),
+            Self::LerfOvs(scene) => write!(f, "lerf-ovs {}", scene.name),
+            Self::Scan { name, converted: false } => write!(f, "scannet {name}"),
+            Self::Scan { name, converted: true } => write!(f, "opengaussian {name}"),
+        }
+    }
+}
+
+impl Serialize for Layout {
+    fn serialize<S: Serializer>(&self, serializer: S) -> std::result::Result<S::Ok, S::Error> {
+        serializer.collect_str(self)
+    }
 }
 
 /// Every how many frames of a recording one is used.

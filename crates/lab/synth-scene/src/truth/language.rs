@@ -3,7 +3,7 @@
 //! A word's vector is a fixed random direction that depends on the word alone, so scenes and seeds agree as with a real
 //! encoder. A thing's vector mixes the words of its class and colour with its own name, so "red mug" is nearer to "blue
 //! mug" than to "red bowl", and nearer to that than to "green plant"; a part's vector mixes its thing's with the part's
-//! word. [`Language::encode`] makes of a mask the mean of what its crop shows by share of pixels, as far as the knobs say
+//! word. [`Language::encode`] makes of a mask the mean of what its crop shows by share of pixels, as far as the settings say
 //! with what lies around it within the crop and with noise.
 
 use crate::render::Frame;
@@ -13,6 +13,7 @@ use crate::truth::scannet;
 use artifacts::{Level, MaskFeatures, MaskMaps};
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
+use serde::Serialize;
 use std::collections::BTreeMap;
 
 /// Numbers per feature, as CLIP's ViT-B has.
@@ -26,8 +27,8 @@ const CLASS: [f64; 2] = [0.8, 0.6];
 /// Texts that LERF's relevancy compares with.
 const NEGATIVES: [&str; 4] = ["object", "things", "stuff", "texture"];
 
-/// The knobs of the features.
-#[derive(Debug, Clone, Copy, Default, PartialEq)]
+/// Faults of the features.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Serialize)]
 pub struct Speech {
     /// Weight of a pixel that lies in the mask's bounding box but not in the mask, 0 to 1: 0 is a crop whose surroundings
     /// are blacked out, 1 a plain crop.

@@ -1,7 +1,7 @@
 //! Id maps as a segmentation model would give them: masks of things at four levels, with the faults of real ones.
 //!
 //! Without faults, levels `default` and `large` show every thing whole, `medium` shows parts with same-named parts of
-//! a thing together ("cookies"), and `small` shows every part by itself. Four faults, each with its own knob:
+//! a thing together ("cookies"), and `small` shows every part by itself. Four faults, each with its own option:
 //! * granularity: with probability p a thing is shown otherwise in a view and level. On `default` and `large` it is
 //!   then, with equal chance, split into its parts or merged with its nearest free neighbour on the same ground; on
 //!   `small` and `medium` it is shown whole, or two of its parts become one. A thing without such a choice (one part,
@@ -16,15 +16,18 @@ use artifacts::{LEVELS, Level, MaskMaps, MaskTruth};
 use glam::DVec2;
 use rand::Rng;
 use rand_chacha::ChaCha8Rng;
+use serde::Serialize;
 use std::collections::BTreeMap;
 use std::f64::consts::{PI, TAU};
 
-/// The knobs of the faults.
-#[derive(Debug, Clone, Copy, Default, PartialEq)]
+/// How strong each fault is.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Serialize)]
 pub struct Faults {
     /// Probability that a thing is shown at another granularity than the level's, 0 to 1.
+    #[serde(rename = "granularity_p")]
     pub granularity: f64,
     /// Largest growth or shrinkage of a mask in pixels.
+    #[serde(rename = "boundary_noise")]
     pub boundary: u32,
     /// Probability that a mask is missing, 0 to 1.
     pub missing: f64,
