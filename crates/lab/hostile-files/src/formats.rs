@@ -162,6 +162,10 @@ fn check_scene(root: &Path) {
         assert!([c.fx, c.fy, c.cx, c.cy].iter().all(|v| v.is_finite()));
         let within = view.image_path.strip_prefix(root).expect("a photograph within the scene");
         assert!(!within.components().any(|c| c == Component::ParentDir), "{} leads out", view.image_path.display());
+        if let Some(image) = sound(view.load_image(), root) {
+            assert_eq!((image.width, image.height), (c.width, c.height));
+            assert!(image.rgb.iter().all(|v| (0.0..=1.0).contains(v)));
+        }
         // Stages name their files after it.
         let stem = Path::new(view.stem()).components().collect::<Vec<_>>();
         assert!(matches!(stem[..], [Component::Normal(_)]), "{:?} is no file name", view.stem());

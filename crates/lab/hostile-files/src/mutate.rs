@@ -16,46 +16,23 @@ impl Dice {
         (self.next() % n.max(1) as u64) as usize
     }
 
+    fn text(&mut self) -> &'static str {
+        TEXT.split('|').nth(self.below(20)).unwrap_or_default()
+    }
+
     fn of<'a, T>(&mut self, all: &'a [T]) -> &'a T {
         &all[self.below(all.len())]
     }
 }
 
+const NAN: u64 = f64::NAN.to_bits();
+const INFINITE: u64 = f64::INFINITY.to_bits();
+/// Two numbers of single precision that are none.
+const NANS: u64 = 0x7fc0_0000_7fc0_0000;
 /// Numbers that lie, as the formats' own integers and floats.
-const WORDS: [u64; 10] = [
-    0,
-    1,
-    0xff,
-    0xffff,
-    1 << 31,
-    1 << 40,
-    u64::MAX,
-    0x7ff8_0000_0000_0000,
-    0x7ff0_0000_0000_0000,
-    0x7fc0_0000_7fc0_0000,
-];
-const TEXT: [&str; 20] = [
-    "-",
-    "9",
-    "99999999999",
-    "18446744073709551615",
-    "nan",
-    "-Infinity",
-    "1e308",
-    " ",
-    "\n",
-    "\r",
-    "\"",
-    "[",
-    "{",
-    "]",
-    "}",
-    "../../x",
-    "/etc/x",
-    "\\",
-    "\0",
-    "é",
-];
+const WORDS: [u64; 10] = [0, 1, 0xff, 0xffff, 1 << 31, 1 << 40, u64::MAX, NAN, INFINITE, NANS];
+/// Words that lie or break the syntax, apart by `|`.
+const TEXT: &str = "-|9|99999999999|18446744073709551615|nan|-Infinity|1e308| |\n|\r|\"|[|{|]|}|../../x|/etc/x|\\|\0|é";
 
 /// A damaged copy of `good`: cut, flipped, spliced with itself or `other`, or with a number that lies. Equal seeds do equal
 /// damage.
@@ -79,9 +56,9 @@ pub fn mutate(good: &[u8], other: &[u8], seed: u64) -> Vec<u8> {
                 let digit = bytes.iter().skip(at).position(u8::is_ascii_digit).map(|p| p + at);
                 let start = digit.unwrap_or(at);
                 let end = start + bytes[start.min(n)..].iter().take_while(|b| b.is_ascii_digit()).count();
-                bytes.splice(start.min(n)..end.min(n), dice.of(&TEXT).bytes());
+                bytes.splice(start.min(n)..end.min(n), dice.text().bytes());
             }
-            6 => _ = bytes.splice(at..at, dice.of(&TEXT).bytes()),
+            6 => _ = bytes.splice(at..at, dice.text().bytes()),
             7 => {
                 let from = if dice.below(2) == 0 { good } else { other };
                 let start = dice.below(from.len());

@@ -211,5 +211,6 @@ pub(crate) fn id_png() -> Vec<Vec<u8>> {
         made("a.png", |p| narrow.save(p).expect("written")),
         made("a.png", |p| wide.save(p).expect("written")),
         made("a.png", |p| colour.save(p).expect("written")),
+        made("a.jpg", |p| colour.save(p).expect("written")),
     ]
 }

@@ -282,6 +282,19 @@ mod tests {
     }
 
     #[test]
+    fn a_picture_whose_header_lies_is_refused_before_it_is_decoded() {
+        let mut png = ramp(20, 16).to_png();
+        // Width and height in IHDR, and the chunk's checksum after its 13 bytes.
+        png[16..20].copy_from_slice(&16_000u32.to_be_bytes());
+        png[20..24].copy_from_slice(&16_000u32.to_be_bytes());
+        let bit = |c: u32| if c & 1 == 1 { c >> 1 ^ 0xEDB8_8320 } else { c >> 1 };
+        let crc = !png[12..29].iter().fold(!0u32, |crc, &b| (0..8).fold(crc ^ u32::from(b), |c, _| bit(c)));
+        png[29..33].copy_from_slice(&crc.to_be_bytes());
+        let e = decode(&png, Path::new("a.png")).unwrap_err().to_string();
+        assert!(e.contains("size: the picture is too large, or its header lies; found 16000x16000"), "{e}");
+    }
+
+    #[test]
     fn the_content_not_the_name_says_what_a_file_is() {
         let dir = tempfile::tempdir().unwrap();
         let path = dir.path().join("a.jpg");
