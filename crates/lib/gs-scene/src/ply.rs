@@ -44,6 +44,12 @@ impl Table<'_> {
 /// Longest header that is read on its own, bytes.
 const MAX_HEADER: u64 = 1 << 20;
 
+/// What `take` makes of the vertices of a file; errors name the file.
+fn vertices<T>(path: &Path, take: impl FnOnce(&Table<'_>) -> Result<T>) -> Result<T> {
+    let bytes = std::fs::read(path).at("read", path)?;
+    table::read(&bytes).and_then(|table| take(&table)).map_err(|e| e.file(path))
+}
+
 fn read_header(path: &Path) -> Result<(Vec<String>, bool)> {
     let mut bytes = Vec::new();
     let file = std::fs::File::open(path).at("open", path)?;
@@ -86,28 +92,22 @@ pub fn holds_gaussians(path: impl AsRef<Path>) -> Result<bool> {
 /// # Errors
 /// When the file is damaged or is no 3DGS PLY, or a parameter is not finite.
 pub fn read_gaussians(path: impl AsRef<Path>) -> Result<Gaussians> {
-    let path = path.as_ref();
-    let bytes = std::fs::read(path).at("read", path)?;
-    parse_gaussians(&bytes).map_err(|e| e.file(path))
+    vertices(path.as_ref(), whole_gaussians_of)
 }
 
 /// Reads the Gaussians of a 3DGS PLY as [`read_gaussians`] does, but takes every number as it stands, finite or not: for
-/// looking at damaged files and mending them.
+/// looking at damaged files and repairing them.
 ///
 /// # Errors
 /// When the file is damaged or is no 3DGS PLY.
 pub fn read_gaussians_as_they_are(path: impl AsRef<Path>) -> Result<Gaussians> {
-    let path = path.as_ref();
-    let bytes = std::fs::read(path).at("read", path)?;
-    let parse = || gaussians_of(&table::read(&bytes)?);
-    parse().map_err(|e| e.file(path))
+    vertices(path.as_ref(), gaussians_of)
 }
 
-fn parse_gaussians(bytes: &[u8]) -> Result<Gaussians> {
-    let table = table::read(bytes)?;
+fn whole_gaussians_of(table: &Table<'_>) -> Result<Gaussians> {
     // The positions once more than needed, to name a bad one before any other fault.
     table.positions()?;
-    let mut g = gaussians_of(&table)?;
+    let mut g = gaussians_of(table)?;
     let n = g.len();
     g.bound_opacities();
     let finite = |name: &str, values: &[f32]| {
@@ -245,9 +245,7 @@ fn write_rows(
 /// # Errors
 /// When the file is damaged, has no positions, or one is not finite, or a colour lies outside its range.
 pub fn read_points(path: impl AsRef<Path>) -> Result<PointCloud> {
-    let path = path.as_ref();
-    let bytes = std::fs::read(path).at("read", path)?;
-    parse_points(&bytes).map_err(|e| e.file(path))
+    vertices(path.as_ref(), points_of)
 }
 
 /// Reads the positions of a PLY's vertices and a whole-number property of each, such as `label` of ScanNet's
@@ -257,13 +255,10 @@ pub fn read_points(path: impl AsRef<Path>) -> Result<PointCloud> {
 /// When the file is damaged, lacks the property, a position is not finite, or a value is not a whole number from 0 to
 /// 16,777,216.
 pub fn read_labels(path: impl AsRef<Path>, property: &str) -> Result<(Vec<[f32; 3]>, Vec<u32>)> {
-    let path = path.as_ref();
-    let bytes = std::fs::read(path).at("read", path)?;
-    parse_labels(&bytes, property).map_err(|e| e.file(path))
+    vertices(path.as_ref(), |table| labels_of(table, property))
 }
 
-fn parse_labels(bytes: &[u8], property: &str) -> Result<(Vec<[f32; 3]>, Vec<u32>)> {
-    let table = table::read(bytes)?;
+fn labels_of(table: &Table<'_>, property: &str) -> Result<(Vec<[f32; 3]>, Vec<u32>)> {
     let positions = table.positions()?;
     let column = table.find(property).ok_or_else(|| {
         Error::new("the vertices lack a property").field(property).hint("give the *.labels.ply of the scan")
@@ -278,8 +273,7 @@ fn parse_labels(bytes: &[u8], property: &str) -> Result<(Vec<[f32; 3]>, Vec<u32>
     Ok((positions, labels))
 }
 
-fn parse_points(bytes: &[u8]) -> Result<PointCloud> {
-    let table = table::read(bytes)?;
+fn points_of(table: &Table<'_>) -> Result<PointCloud> {
     let positions = table.positions()?;
     let channel = |name| {
         let Some(c) = table.find(name) else { return Ok(vec![255; table.count]) };
@@ -340,7 +334,7 @@ mod tests {
         let text = "ply\nformat ascii 1.0\nelement vertex 2\nproperty float x\nproperty float y\nproperty float z\n\
                     property ushort label\nelement face 1\nproperty list uchar int vertex_indices\nend_header\n\
                     1 2 3 0\n4 5 6 65535\n3 0 1 1\n";
-        let read = |text: &str, property| parse_labels(text.as_bytes(), property);
+        let read = |text: &str, property| labels_of(&table::read(text.as_bytes())?, property);
         assert_eq!(read(text, "label").unwrap(), (vec![[1.0, 2.0, 3.0], [4.0, 5.0, 6.0]], vec![0, 65535]));
         assert!(read(text, "class").unwrap_err().to_string().contains("class: the vertices lack a property"));
         let e = read(&text.replace("ushort", "float").replace("65535", "-1"), "label").unwrap_err().to_string();

@@ -1,22 +1,17 @@
-//! Real captures and trained splats, where they are present beside the project.
+//! Real captures and trained splats, which lie beside the project.
 
 use gs_scene::dataset::{self, Format, LoadOptions, Resolution, Split};
 use gs_scene::{Gaussians, ply};
 use std::path::PathBuf;
 
-fn data(name: &str) -> Option<PathBuf> {
-    let path = PathBuf::from(env!("CARGO_MANIFEST_DIR")).join("../../../../shared/data").join(name);
-    if path.exists() {
-        return Some(path);
-    }
-    eprintln!("skipped: {} is not present", path.display());
-    None
+fn data(name: &str) -> PathBuf {
+    PathBuf::from(env!("CARGO_MANIFEST_DIR")).join("../../../../shared/data").join(name)
 }
 
 #[test]
+#[ignore = "needs shared/data/desk; run make test-data"]
 fn the_desk_photographs_load() {
-    let Some(desk) = data("desk") else { return };
-    let d = dataset::load(&desk, &LoadOptions { resolution: Resolution::Divisor(8.0), holdout: 8 }).unwrap();
+    let d = dataset::load(&data("desk"), &LoadOptions { resolution: Resolution::Divisor(8.0), holdout: 8 }).unwrap();
     assert_eq!((d.format, d.views.len(), d.points.len()), (Format::Colmap, 29, 7562));
     assert_eq!(d.views_of(Split::Test).count(), 4);
     assert_eq!((d.views[0].camera.width, d.views[0].camera.height), (238, 134));
@@ -31,12 +26,12 @@ fn the_desk_photographs_load() {
 }
 
 #[test]
+#[ignore = "needs shared/data/splats; run make test-data"]
 fn trained_splats_load_and_round_trip() {
     for (name, n, degree) in
         [("guitar.ply", 90_854, 0), ("inria_layout_9k.ply", 9_080, 3), ("inria_train_1000.ply", 1_000, 3)]
     {
-        let Some(path) = data(&format!("splats/{name}")) else { return };
-        let g = ply::read_gaussians(&path).unwrap();
+        let g = ply::read_gaussians(data(&format!("splats/{name}"))).unwrap();
         assert_eq!((g.len(), g.sh_degree), (n, degree), "{name}");
         let dir = tempfile::tempdir().unwrap();
         let copy = dir.path().join("copy.ply");
