@@ -5,28 +5,16 @@ mod text;
 
 use crate::PointCloud;
 use crate::distortion::Distortion;
+use crate::lens::Lens;
 pub use binary::write_model;
 use glam::{DMat3, DQuat, DVec3};
 use gs_io::{Error, IoContext, Result};
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
-/// A camera's intrinsics as COLMAP gives them.
-#[derive(Debug, Clone, PartialEq)]
-pub struct Intrinsics {
-    /// Width in pixels.
-    pub width: u32,
-    /// Height in pixels.
-    pub height: u32,
-    /// fx, fy, cx, cy in pixels.
-    pub focal_center: [f64; 4],
-    /// Lens distortion; zero for pinhole models.
-    pub distortion: Distortion,
-}
-
 /// A registered image.
 #[derive(Debug, Clone, PartialEq)]
-pub struct Registered {
+pub(crate) struct Registered {
     /// File name relative to the images folder.
     pub name: String,
     /// Key of its camera.
@@ -39,9 +27,9 @@ pub struct Registered {
 
 /// A sparse model.
 #[derive(Debug, Clone, PartialEq)]
-pub struct Model {
-    /// Intrinsics by camera id.
-    pub cameras: BTreeMap<u32, Intrinsics>,
+pub(crate) struct Model {
+    /// Cameras by id.
+    pub cameras: BTreeMap<u32, Lens>,
     /// Registered images, in file order.
     pub images: Vec<Registered>,
     /// Sparse points; empty when the file is missing.
@@ -51,40 +39,34 @@ pub struct Model {
 const AGAIN: &str = "export the COLMAP model again";
 
 /// The folder that holds a sparse model within a scene, if any: `sparse/0`, `sparse`, `colmap/sparse/0` or the folder itself.
-pub fn find_model(scene: &Path) -> Option<PathBuf> {
+pub(crate) fn find_model(scene: &Path) -> Option<PathBuf> {
     ["sparse/0", "sparse", "colmap/sparse/0", "."]
         .into_iter()
         .map(|p| scene.join(p))
-        .find(|p| ["bin", "txt"].iter().any(|e| p.join(format!("cameras.{e}")).is_file()))
+        .find(|p| file_of(p, "cameras").is_some())
 }
 
 /// The files of the model in `folder`: of each `.bin` where there is one, else `.txt`.
-pub fn files_of(folder: &Path) -> Vec<PathBuf> {
-    let files =
-        ["cameras", "images", "points3D"].map(|name| ["bin", "txt"].map(|e| folder.join(format!("{name}.{e}"))));
-    files.into_iter().filter_map(|two| two.into_iter().find(|p| p.is_file())).collect()
+pub(crate) fn files_of(folder: &Path) -> Vec<PathBuf> {
+    ["cameras", "images", "points3D"].iter().filter_map(|name| file_of(folder, name)).collect()
+}
+
+/// A file of a model: `.bin` where there is one, else `.txt`.
+fn file_of(folder: &Path, name: &str) -> Option<PathBuf> {
+    ["bin", "txt"].iter().map(|e| folder.join(format!("{name}.{e}"))).find(|p| p.is_file())
 }
 
 /// Reads the model in `folder`; `.bin` where there is one, else `.txt`.
 ///
 /// # Errors
 /// When a file is missing, damaged, or uses a camera model that is not supported.
-pub fn read_model(folder: &Path) -> Result<Model> {
-    let part = |name: &str| -> Result<(PathBuf, bool, Vec<u8>)> {
-        let binary = folder.join(format!("{name}.bin"));
-        let (path, is_binary) =
-            if binary.is_file() { (binary, true) } else { (folder.join(format!("{name}.txt")), false) };
-        let bytes = std::fs::read(&path).at("read", &path)?;
-        Ok((path, is_binary, bytes))
-    };
-    let (path, binary, bytes) = part("cameras")?;
-    let cameras = if binary { binary::cameras(&bytes) } else { text::cameras(&bytes) }.map_err(|e| e.file(&path))?;
+pub(crate) fn read_model(folder: &Path) -> Result<Model> {
+    let (path, cameras) = part(folder, "cameras", binary::cameras, text::cameras)?;
     if cameras.is_empty() {
         return Err(Error::new("the model has no camera").file(&path).field("camera count").found(0).hint(AGAIN));
     }
     let cameras_path = path;
-    let (path, binary, bytes) = part("images")?;
-    let images = if binary { binary::images(&bytes) } else { text::images(&bytes) }.map_err(|e| e.file(&path))?;
+    let (path, images) = part(folder, "images", binary::images, text::images)?;
     if images.is_empty() {
         return Err(Error::new("the model has no image")
             .file(&path)
@@ -92,27 +74,33 @@ pub fn read_model(folder: &Path) -> Result<Model> {
             .found(0)
             .hint("COLMAP registered no photograph: give it more of them, with more overlap"));
     }
-    for image in &images {
-        if !cameras.contains_key(&image.camera) {
-            return Err(Error::new("the image's camera is unknown")
-                .file(&path)
-                .field(&image.name)
-                .found(format!("camera {}", image.camera))
-                .expected(format!("one of the {} in {}", cameras.len(), cameras_path.display()))
-                .hint(AGAIN));
-        }
+    if let Some(image) = images.iter().find(|i| !cameras.contains_key(&i.camera)) {
+        return Err(Error::new("the image's camera is unknown")
+            .file(&path)
+            .field(&image.name)
+            .found(format!("camera {}", image.camera))
+            .expected(format!("one of the {} in {}", cameras.len(), cameras_path.display()))
+            .hint(AGAIN));
     }
-    let has_points = ["bin", "txt"].iter().any(|e| folder.join(format!("points3D.{e}")).is_file());
-    let points = if has_points {
-        let (path, binary, bytes) = part("points3D")?;
-        if binary { binary::points(&bytes) } else { text::points(&bytes) }.map_err(|e| e.file(&path))?
-    } else {
-        PointCloud::default()
+    let points = match file_of(folder, "points3D") {
+        Some(_) => part(folder, "points3D", binary::points, text::points)?.1,
+        None => PointCloud::default(),
     };
     Ok(Model { cameras, images, points })
 }
 
-fn intrinsics(model: &str, width: u64, height: u64, p: &[f64], field: &str) -> Result<Intrinsics> {
+type Read<T> = fn(&[u8]) -> Result<T>;
+
+/// Reads one of the files of a model; gives its path too.
+fn part<T>(folder: &Path, name: &str, binary: Read<T>, text: Read<T>) -> Result<(PathBuf, T)> {
+    let path = file_of(folder, name).unwrap_or_else(|| folder.join(format!("{name}.txt")));
+    let bytes = std::fs::read(&path).at("read", &path)?;
+    let read = if path.extension().is_some_and(|e| e == "bin") { binary } else { text };
+    let value = read(&bytes).map_err(|e| e.file(&path))?;
+    Ok((path, value))
+}
+
+fn intrinsics(model: &str, width: u64, height: u64, p: &[f64], field: &str) -> Result<Lens> {
     let fail = |what: &str| Error::new(what).field(field);
     let d = Distortion::default();
     let (focal_center, distortion) = match (model, p) {
@@ -145,11 +133,11 @@ fn intrinsics(model: &str, width: u64, height: u64, p: &[f64], field: &str) -> R
             .expected("finite numbers, focal lengths above zero")
             .hint(AGAIN));
     }
-    Ok(Intrinsics { width: width as u32, height: height as u32, focal_center, distortion })
+    Ok(Lens { size: (width as u32, height as u32), focal_center, distortion })
 }
 
 /// Adds a camera; ids are unique.
-fn push_camera(out: &mut BTreeMap<u32, Intrinsics>, id: u32, camera: Intrinsics, field: &str) -> Result<()> {
+fn push_camera(out: &mut BTreeMap<u32, Lens>, id: u32, camera: Lens, field: &str) -> Result<()> {
     match out.insert(id, camera) {
         None => Ok(()),
         Some(_) => Err(Error::new("two cameras have the same id").field(field).found(id).hint(AGAIN)),

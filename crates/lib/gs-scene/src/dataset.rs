@@ -5,13 +5,14 @@ mod sparse;
 mod transforms;
 mod view;
 
+use crate::lens::Lens;
 use crate::{Camera, PointCloud, colmap};
 use glam::{DMat3, DMat4, DQuat, DVec3};
 use gs_io::{Error, IoContext, Result, hash_bytes, hash_file};
 use rayon::prelude::*;
 use std::path::{Component, Path, PathBuf};
 pub use view::View;
-use view::{Lens, stems};
+use view::stems;
 
 /// Which layout a folder has.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]

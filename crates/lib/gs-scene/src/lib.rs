@@ -1,4 +1,4 @@
-//! The scene: [`Gaussians`], [`Camera`]s, [`dataset`]s, images and 3DGS PLY files.
+//! What all stages read: [`Gaussians`] and their [`ply`] files, [`Camera`]s, [`dataset`]s of posed photographs, and images.
 //!
 //! Conventions, once for the whole workspace:
 //! * World and camera coordinates are right-handed; cameras look along +z with x right and y down (OpenCV, COLMAP).
@@ -13,6 +13,7 @@ mod distortion;
 mod gaussians;
 mod geometry;
 mod image;
+mod lens;
 mod order;
 pub mod ply;
 mod points;

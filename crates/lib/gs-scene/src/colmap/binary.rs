@@ -1,6 +1,7 @@
 //! COLMAP's binary model files, in and out. Little-endian, without padding.
 
-use super::{AGAIN, Intrinsics, Registered, intrinsics, pose, push_camera, push_point};
+use super::{AGAIN, Registered, intrinsics, pose, push_camera, push_point};
+use crate::lens::Lens;
 use crate::{Camera, PointCloud};
 use glam::DQuat;
 use gs_io::{Error, Result, write_bytes};
@@ -45,16 +46,20 @@ impl<'a> Cursor<'a> {
         Ok(head)
     }
 
+    fn array<const N: usize>(&mut self, field: &str) -> Result<[u8; N]> {
+        Ok(self.take(N, field)?.try_into().expect("so many bytes"))
+    }
+
     fn u32(&mut self, field: &str) -> Result<u32> {
-        Ok(u32::from_le_bytes(self.take(4, field)?.try_into().expect("four bytes")))
+        self.array(field).map(u32::from_le_bytes)
     }
 
     fn u64(&mut self, field: &str) -> Result<u64> {
-        Ok(u64::from_le_bytes(self.take(8, field)?.try_into().expect("eight bytes")))
+        self.array(field).map(u64::from_le_bytes)
     }
 
     fn f64(&mut self, field: &str) -> Result<f64> {
-        Ok(f64::from_le_bytes(self.take(8, field)?.try_into().expect("eight bytes")))
+        self.array(field).map(f64::from_le_bytes)
     }
 
     /// A count of things that take at least `size` bytes each.
@@ -85,7 +90,7 @@ impl<'a> Cursor<'a> {
 }
 
 /// `cameras.bin`.
-pub(super) fn cameras(bytes: &[u8]) -> Result<BTreeMap<u32, Intrinsics>> {
+pub(super) fn cameras(bytes: &[u8]) -> Result<BTreeMap<u32, Lens>> {
     let mut c = Cursor::new(bytes);
     let n = c.count(48, "camera count")?;
     let mut out = BTreeMap::new();
@@ -115,10 +120,8 @@ pub(super) fn images(bytes: &[u8]) -> Result<Vec<Registered>> {
     for i in 0..n {
         let field = format!("image {i}");
         c.u32(&field)?;
-        let mut numbers = [0.0; 7];
-        for v in &mut numbers {
-            *v = c.f64(&field)?;
-        }
+        let q = [c.f64(&field)?, c.f64(&field)?, c.f64(&field)?, c.f64(&field)?];
+        let t = [c.f64(&field)?, c.f64(&field)?, c.f64(&field)?];
         let camera = c.u32(&field)?;
         let end = c.rest.iter().position(|&b| b == 0);
         let end = end.ok_or_else(|| Error::new("the image's name does not end").field(&field).hint(AGAIN))?;
@@ -126,8 +129,7 @@ pub(super) fn images(bytes: &[u8]) -> Result<Vec<Registered>> {
         c.take(1, &field)?;
         let points = c.count(24, &field)?;
         c.take(24 * points, &field)?;
-        let (rotation, translation) =
-            pose([numbers[0], numbers[1], numbers[2], numbers[3]], [numbers[4], numbers[5], numbers[6]], &field)?;
+        let (rotation, translation) = pose(q, t, &field)?;
         out.push(Registered { name, camera, rotation, translation });
     }
     c.end("image count", n)?;
@@ -143,11 +145,11 @@ pub(super) fn points(bytes: &[u8]) -> Result<PointCloud> {
         let field = format!("point {i}");
         c.u64(&field)?;
         let p = [c.f64(&field)?, c.f64(&field)?, c.f64(&field)?];
-        let color = c.take(3, &field)?;
+        let color = c.array(&field)?;
         c.f64(&field)?;
         let track = c.count(8, &field)?;
         c.take(8 * track, &field)?;
-        push_point(&mut out, p, [color[0], color[1], color[2]], &field)?;
+        push_point(&mut out, p, color, &field)?;
     }
     c.end("point count", n)?;
     Ok(out)

@@ -1,7 +1,8 @@
 //! COLMAP's text model files.
 
-use super::{AGAIN, Intrinsics, Registered, intrinsics, pose, push_camera, push_point};
+use super::{AGAIN, Registered, intrinsics, pose, push_camera, push_point};
 use crate::PointCloud;
+use crate::lens::Lens;
 use gs_io::{Error, Result};
 use std::collections::BTreeMap;
 
@@ -26,7 +27,7 @@ fn too_few(line: usize, text: &str, expected: &str) -> Error {
 }
 
 /// `cameras.txt`.
-pub(super) fn cameras(bytes: &[u8]) -> Result<BTreeMap<u32, Intrinsics>> {
+pub(super) fn cameras(bytes: &[u8]) -> Result<BTreeMap<u32, Lens>> {
     let mut out = BTreeMap::new();
     for (line, text) in lines(bytes, false)? {
         let words: Vec<&str> = text.split_ascii_whitespace().collect();

@@ -1,8 +1,9 @@
 //! ScanNet as its tools extract it: `color/<id>.jpg`, `pose/<id>.txt`, `intrinsic/intrinsic_color.txt`, and the scan's
 //! vertices in `*_vh_clean_2.ply`.
 
-use super::{Format, Lens, RawDataset, RawView, invert_pose, read_text};
+use super::{Format, RawDataset, RawView, invert_pose, read_text};
 use crate::distortion::Distortion;
+use crate::lens::Lens;
 use crate::{PointCloud, image, ply};
 use glam::DMat4;
 use gs_io::{Error, IoContext, Result};

@@ -1,6 +1,6 @@
 //! A COLMAP sparse model beside its photographs.
 
-use super::{Format, Lens, RawDataset, RawView, check_inside};
+use super::{Format, RawDataset, RawView, check_inside};
 use crate::colmap;
 use gs_io::Result;
 use std::path::Path;
@@ -19,15 +19,10 @@ pub(super) fn load(root: &Path, model: &Path) -> Result<RawDataset> {
             warnings.push(format!("{}: no such photograph, view skipped", image_path.display()));
             continue;
         }
-        let camera = &cameras[&image.camera];
         views.push(RawView {
             name: image.name,
             image_path,
-            lens: Lens {
-                size: (camera.width, camera.height),
-                focal_center: camera.focal_center,
-                distortion: camera.distortion,
-            },
+            lens: cameras[&image.camera],
             rotation: image.rotation,
             translation: image.translation,
             split: None,
