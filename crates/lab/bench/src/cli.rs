@@ -133,7 +133,7 @@ impl Args {
         let mut claim = self.claim(stage)?;
         let all = compare::compare(&programs(base, own.threads)?, own, plan, &self.work)?;
         let (head, rows) = page::compare_table(&all);
-        let text = page::markdown(&head, &rows);
+        let text = report::sheet::markdown(&head, &rows);
         text.lines().for_each(|l| stage.info(l));
         self.write(&all, &text, None)?;
         stage.record(&mut claim, json!({"command": "compare"}), BTreeMap::new(), json!({}))

@@ -7,7 +7,7 @@ use crate::tables::{self, Table};
 use crate::tradeoff::{Curve, Measured};
 use report::html::Page;
 use report::plot::{Chart, Dot, number};
-use report::sheet::line;
+use report::sheet::markdown;
 use serde::Serialize;
 use std::fmt::Write;
 
@@ -89,16 +89,6 @@ pub fn compare_table(all: &[Compared]) -> (Vec<&'static str>, Vec<Vec<String>>) 
 pub fn warnings(curves: &[Curve]) -> Vec<String> {
     let beaten = curves.iter().filter_map(|c| Some((c, c.dominated_by.as_ref()?)));
     beaten.map(|(c, by)| format!("{} on {}: the default is dominated by \"{by}\"", c.title, c.scene)).collect()
-}
-
-/// A table with a title, a head and rows.
-pub type Block = (String, Vec<String>, Vec<Vec<String>>);
-
-/// A table in Markdown.
-pub fn markdown(head: &[&str], rows: &[Vec<String>]) -> String {
-    let head: Vec<String> = head.iter().map(|h| (*h).to_string()).collect();
-    let rule = vec!["---".to_string(); head.len()];
-    [head, rule].iter().chain(rows).map(|cells| line(cells)).collect()
 }
 
 /// Processor time over error, a circle for each setting with the range of its time; the front is joined by a line, the

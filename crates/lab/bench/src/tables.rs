@@ -3,9 +3,9 @@
 
 use crate::cells::{Cell, METRICS, read};
 use crate::interval::Interval;
-use crate::page::{Block, markdown};
 use crate::plan::{Plan, Row, TablePlan};
 use gs_io::{Error, Result};
+use report::sheet::markdown;
 use serde::Serialize;
 use std::collections::BTreeMap;
 use std::fmt::Write;
@@ -168,6 +168,9 @@ fn shown(interval: Option<&Interval>, share: bool, signed: bool) -> String {
         None => mean,
     }
 }
+
+/// A table with a title, a head and rows.
+pub type Block = (String, Vec<String>, Vec<Vec<String>>);
 
 /// What a table shows: titles, heads and rows. First the two main metrics by p, then all metrics at one p.
 pub fn blocks(table: &Table) -> Vec<Block> {

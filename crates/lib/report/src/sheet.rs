@@ -128,6 +128,13 @@ pub fn line(cells: &[String]) -> String {
     format!("| {} |\n", cells.iter().map(|c| c.replace('|', "\\|")).collect::<Vec<_>>().join(" | "))
 }
 
+/// A table in Markdown.
+pub fn markdown(head: &[&str], rows: &[Vec<String>]) -> String {
+    let head: Vec<String> = head.iter().map(|h| (*h).to_string()).collect();
+    let rule = vec!["---".to_string(); head.len()];
+    [head, rule].iter().chain(rows).map(|cells| line(cells)).collect()
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;

@@ -1,6 +1,5 @@
 //! The commands of `eval`.
 
-mod ablation;
 mod masks;
 
 use crate::options::{LerfOptions, QueryOptions, ReportOptions, ScannetOptions, ScoreOptions, TableOptions};
@@ -38,9 +37,6 @@ enum Command {
     Masks(masks::MasksArgs),
     /// Make one self-contained HTML page of a run, and metrics.json beside it
     Report(ReportOptions),
-    /// Bring the scores of an ablation together: tables as JSON, Markdown and HTML
-    #[serde(skip)]
-    Ablation(ablation::AblationArgs),
 }
 
 impl Program for Args {
@@ -51,7 +47,7 @@ impl Program for Args {
     }
 
     fn forecasts(&self) -> bool {
-        !matches!(self.command, Command::Table(_) | Command::Masks(_) | Command::Ablation(_))
+        !matches!(self.command, Command::Table(_) | Command::Masks(_))
     }
 
     fn check(&self) -> Result<()> {
@@ -69,7 +65,7 @@ impl Program for Args {
     }
 
     fn run(self, stage: &Stage) -> Result<()> {
-        // Masks and ablation write records of their own.
+        // Masks writes a record of its own.
         let parameters = serde_json::to_value(&self.command).unwrap_or_default();
         let text = match &self.command {
             Command::Query(o) => query::run(o, parameters, stage, self.common.json)?,
@@ -79,7 +75,6 @@ impl Program for Args {
             Command::Score(o) => score::run(o, parameters, stage)?,
             Command::Masks(a) => masks::run(a, stage)?,
             Command::Report(o) => page::run(o, parameters, stage)?,
-            Command::Ablation(a) => ablation::run(a, stage)?,
         };
         if !self.common.quiet && !self.common.json {
             stage.print(&text)?;

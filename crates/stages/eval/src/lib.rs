@@ -5,7 +5,6 @@
 //! They share the labelled Gaussians ([`scene`]), how a selection becomes a mask ([`silhouette`]), which Gaussian is nearest
 //! ([`nearest`]) and the forecast of memory ([`memory`]).
 
-pub mod ablation;
 pub mod cli;
 mod mask;
 pub mod mask_stats;

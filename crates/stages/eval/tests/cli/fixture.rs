@@ -201,7 +201,7 @@ impl Fixture {
         let place = self.path().display().to_string();
         let mut c = Command::new(env!("CARGO_BIN_EXE_eval"));
         c.arg(command);
-        if !["report", "ablation"].contains(&command) {
+        if command != "report" {
             let (i, g, s) = (self.instances(), self.geometry(), self.scene());
             c.arg("--instances").arg(i).arg("--geometry").arg(g).arg("--scene").arg(s);
         }
