@@ -63,6 +63,14 @@ pub struct CommonArgs {
     pub check: bool,
 }
 
+/// Whether a stage skips what a scene does not need, for the stages that do.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, clap::Args, serde::Serialize)]
+pub struct SkipArgs {
+    /// Skip nothing: also do the work that changes no result, such as on Gaussians that no view sees (docs/performance.md)
+    #[arg(long)]
+    pub no_skip: bool,
+}
+
 /// What `--version` says: the version and the git revision.
 const VERSION: &str = concat!(env!("CARGO_PKG_VERSION"), " (", env!("CAGS_REVISION"), ")");
 

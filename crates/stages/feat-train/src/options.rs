@@ -120,9 +120,10 @@ pub struct Contrastive {
     /// Hold out every tenth view, and stop when the loss of these views no longer falls
     #[arg(long)]
     pub early_stop: bool,
-    /// Use views with a single mask too, although their loss and gradient are zero
-    #[arg(long)]
-    pub no_skip: bool,
+    /// What is skipped.
+    #[command(flatten)]
+    #[serde(flatten)]
+    pub skip: stage::SkipArgs,
 }
 
 /// Neighbours of an anchor, whose features it sums.

@@ -1,8 +1,8 @@
 //! What both methods give, and the curve that they write beside it.
 
 use gs_io::{Result, with_suffix, write_bytes};
+use report::curve::{self, Panel};
 use serde_json::Value;
-use stage::curve::{self, Panel};
 use std::path::Path;
 
 /// Features and what the record of the run says of them.

@@ -58,9 +58,10 @@ pub(crate) struct Settings {
     /// Also keep this many random pixels of each mask, for the losses of feat-train that look at single pixels
     #[arg(long, value_name = "COUNT", default_value_t = 0, value_parser = stage::within(0usize..=4096))]
     pub pixel_samples: usize,
-    /// Keep Gaussians that no view sees
-    #[arg(long)]
-    pub no_skip: bool,
+    /// What is skipped.
+    #[command(flatten)]
+    #[serde(flatten)]
+    pub skip: stage::SkipArgs,
     /// Options that go together [default: none]
     #[arg(long, value_enum)]
     pub preset: Option<Preset>,
@@ -87,6 +88,6 @@ pub(crate) enum Preset {
 impl Settings {
     /// Whether Gaussians that no view sees take part.
     pub fn keep_unseen(&self) -> bool {
-        self.no_skip || self.preset == Some(Preset::Paper)
+        self.skip.no_skip || self.preset == Some(Preset::Paper)
     }
 }

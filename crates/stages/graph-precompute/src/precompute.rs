@@ -64,9 +64,7 @@ pub(crate) fn precompute(
     let usable = c.usable(stage);
     let mut progress = stage.progress("views", views.len() as u64);
     for view in &views {
-        if stage.interrupted() {
-            return Err(Error::new("interrupted"));
-        }
+        stage.go_on()?;
         c.add(view, masks, settings, seed)?;
         progress.step();
     }

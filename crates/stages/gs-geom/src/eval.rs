@@ -29,9 +29,7 @@ impl Eval {
         let mut progress = stage.progress("view", views.len() as u64);
         let mut figures: Vec<ViewMetrics> = Vec::new();
         for view in &views {
-            if stage.interrupted() {
-                return Err(Error::new("interrupted"));
-            }
+            stage.go_on()?;
             figures.push(measure(&gaussians, view, &options, alpha, &masks)?);
             progress.step();
         }

@@ -111,9 +111,10 @@ pub(crate) struct Train {
     /// Number of random points to start from, 1 to 1e9
     #[arg(long, value_name = "COUNT", default_value_t = 20_000, value_parser = RangedU64ValueParser::<usize>::new().range(1..=MOST_GAUSSIANS))]
     pub init_points: usize,
-    /// Keep Gaussians that are too faint to be seen in any view
-    #[arg(long)]
-    pub no_skip: bool,
+    /// What is skipped.
+    #[command(flatten)]
+    #[serde(flatten)]
+    pub skip: stage::SkipArgs,
     /// How the number of Gaussians changes
     #[arg(long, value_enum, default_value_t = Strategy::default())]
     pub densify: Strategy,

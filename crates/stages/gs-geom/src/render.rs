@@ -23,9 +23,7 @@ impl Render {
         let mut claim = stage.outputs(&self.out).files_in(&self.out, names).reads(reads).claim()?;
         let mut progress = stage.progress("view", views.len() as u64);
         for view in &views {
-            if stage.interrupted() {
-                return Err(Error::new("interrupted"));
-            }
+            stage.go_on()?;
             let r = render(&gaussians, &view.camera, &options);
             let picture = Image { width: r.width, height: r.height, rgb: r.rgb, alpha: None };
             picture.write_png(self.out.join(format!("{}.png", view.stem())))?;

@@ -185,12 +185,12 @@ fn what_cannot_fit_is_refused_before_it_is_made() {
         |count: &str, more: &[&str]| refused(&[&training(&scene, &out, "20", &random)[..], &[count], more].concat());
     for more in [&["--memory-limit", "1G"][..], &["--memory-limit", "1G", "--time-budget", "9s"]] {
         let said = start("900000000", more);
-        assert!(said.contains("--memory-limit: more memory than there may be"), "{said}");
+        assert!(said.contains("--memory-limit: the run needs more memory than it may take"), "{said}");
         // Few of the points may be kept, but all are made.
         let said = start("900000000", &[more, &["--max-gaussians", "60"]].concat());
         assert!(said.contains("found about 12.6G needed"), "{said}");
     }
-    assert!(start("900000000", &[]).contains("memory of this machine: more memory than there may be"));
+    assert!(start("900000000", &[]).contains("memory of this machine: the run needs more memory than it may take"));
     // Every command has a forecast.
     let limit = ["--memory-limit", "1M"];
     let drawn = ["--scene", &scene, "--geometry", &geometry, "--out", &out];
@@ -201,7 +201,10 @@ fn what_cannot_fit_is_refused_before_it_is_made() {
         &["inspect", &geometry],
         &["convert", &geometry, &out],
     ] {
-        assert!(refused(&[arguments, &limit].concat()).contains("--memory-limit: more memory than there may be"));
+        assert!(
+            refused(&[arguments, &limit].concat())
+                .contains("--memory-limit: the run needs more memory than it may take")
+        );
     }
     succeeds(&["inspect", &geometry, "--memory-limit", "1G"]);
 }

@@ -1,7 +1,7 @@
 //! What is done already: beside each output of a view lies a small JSON file, its note, which says what the output was made
 //! from. A view whose note says the same as this run would, and whose output is as it was written, is not made again.
 
-use gs_io::{Error, IoContext, Result, hash_bytes, hash_file, write_bytes};
+use gs_io::{Error, ErrorKind, IoContext, Result, hash_bytes, hash_file, write_bytes};
 use gs_scene::dataset::View;
 use serde::{Deserialize, Serialize, de::DeserializeOwned};
 use serde_json::{Value, json};
@@ -72,9 +72,8 @@ impl<'a> Views<'a> {
         make: impl FnOnce() -> Result<T>,
     ) -> Result<T> {
         if self.stage.interrupted() {
-            return Err(Error::new(
-                "interrupted; the finished views stay, and the same command continues with the next",
-            ));
+            let what = "interrupted; the finished views stay, and the same command continues with the next";
+            return Err(Error::of(ErrorKind::Interrupted, what));
         }
         let done = find::<T>(output, made_from);
         self.kept += usize::from(done.is_some());

@@ -75,7 +75,7 @@ fn more_memory_than_there_may_be_is_refused_before_the_first_view() {
     let make = ["masks", "--scene", path(&scene), "--sam", path(&sam), "--out", path(&masks)];
     let limit = ["--memory-limit", "2M"];
     let e = error(&[&make[..], &limit[..]].concat());
-    assert!(e.contains("--memory-limit: more memory than there may be") && e.contains("--threads"), "{e}");
+    assert!(e.contains("--memory-limit: the run needs more memory than it may take") && e.contains("--threads"), "{e}");
     assert!(!masks.join("masks.json").exists() && !maps_path(&masks, "v0").exists());
     ok(&make);
     let embed = ["embed", "--scene", path(&scene), "--masks", path(&masks), "--clip", path(&clip)];

@@ -108,7 +108,7 @@ pub fn train(
             on_curve(&state.curve)?;
         }
         if interrupted && unfinished {
-            return Err(Error::new("interrupted"));
+            stage.go_on()?;
         }
         progress.set(state.iteration, &[("loss", state.curve.last().map_or(loss, |p| p.loss))]);
         if settled {

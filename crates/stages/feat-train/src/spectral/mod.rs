@@ -16,9 +16,9 @@ use crate::inputs::Inputs;
 use crate::options::Args;
 use crate::outputs::{Made, write_curve};
 use gs_io::{Error, Result};
+use report::curve::Panel;
 use serde_json::json;
 use stage::Stage;
-use stage::curve::Panel;
 use std::time::Instant;
 use vectors::{SpectralOptions, spectral};
 

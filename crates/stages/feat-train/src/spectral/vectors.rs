@@ -154,9 +154,7 @@ fn singular_vectors(product: &Product<'_>, matrix: &Matrix, options: &SpectralOp
     let mut progress = stage.progress("passes", MOST_PASSES as u64);
     let mut passes = 0;
     loop {
-        if stage.interrupted() {
-            return Err(Error::new("interrupted"));
-        }
+        stage.go_on()?;
         let (x, mut columns) = (panels(&v), v.len());
         let w = product.apply(&x);
         passes += 1;

@@ -70,7 +70,7 @@ pub(super) fn finish(
 
 /// The Gaussians to write. Rows and no copy: the moments are still there, for a checkpoint if the disk is full.
 fn rows(options: &Train, gaussians: &Gaussians, stage: &Stage) -> Vec<u32> {
-    if options.no_skip || options.densify == Strategy::Fixed {
+    if options.skip.no_skip || options.densify == Strategy::Fixed {
         return (0..gaussians.len() as u32).collect();
     }
     let rows = drawable(gaussians);

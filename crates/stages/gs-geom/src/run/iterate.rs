@@ -4,7 +4,7 @@ use super::outputs::{PARTIAL, check_finite};
 use crate::options::{Every, Train};
 use crate::training::Trainer;
 use crate::training::checkpoint::{self, State};
-use gs_io::{Error, Provenance, Result, Watched, with_suffix};
+use gs_io::{Error, ErrorKind, Provenance, Result, Watched, with_suffix};
 use gs_scene::ply;
 use stage::Stage;
 use std::time::Instant;
@@ -79,7 +79,7 @@ fn stop(options: &Train, trainer: &Trainer<'_>, run: &Provenance, stage: &Stage)
         "stopped after iteration {iteration}; the same command goes on from here. The Gaussians so far: {}",
         partial.display()
     ));
-    Err(Error::new("interrupted"))
+    Err(Error::of(ErrorKind::Interrupted, "interrupted"))
 }
 
 /// Saves what a failing run has done. An interrupted one has done so already. Where a photograph has changed, it is what the
