@@ -63,10 +63,8 @@ pub(crate) struct SceneOptions {
 /// Which pixels of the photographs count.
 #[derive(Debug, Clone, clap::Args, Serialize)]
 pub(crate) struct MaskOptions {
-    /// What transparent pixels of the photographs (alpha below 1) mean [background; with --masks ignore]
-    #[arg(long, value_enum)]
-    pub alpha: Option<Alpha>,
-    /// Folder of masks with the names of the photographs. Black pixels are transparent
+    /// Folder of masks with the names of the photographs. Black pixels, and transparent ones of the photographs, do not
+    /// count. Without this option a photograph's transparent pixels (alpha below 1) show --background
     #[arg(long, value_name = "DIR")]
     #[serde(skip)]
     pub masks: Option<PathBuf>,
@@ -336,8 +334,7 @@ impl SceneOptions {
 impl MaskOptions {
     /// What transparent pixels mean.
     pub fn alpha(&self) -> Alpha {
-        let default = if self.masks.is_some() { Alpha::Ignore } else { Alpha::default() };
-        self.alpha.unwrap_or(default)
+        if self.masks.is_some() { Alpha::Ignore } else { Alpha::Background }
     }
 
     /// The masks of a dataset's views.

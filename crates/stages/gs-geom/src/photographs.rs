@@ -9,6 +9,7 @@ use masks::Masks;
 use rayon::prelude::*;
 
 /// Photographs as 8-bit RGB, with alpha where they have it.
+#[derive(Default)]
 pub struct Photographs<'a> {
     views: Vec<&'a View>,
     masks: Masks,
@@ -44,13 +45,8 @@ impl Picture {
     }
 
     fn over(&self, background: [f32; 3]) -> Target {
-        let mut rgb: Vec<f32> = self.rgb.iter().map(|&v| unit(v)).collect();
-        for (pixel, &a) in rgb.as_chunks_mut::<3>().0.iter_mut().zip(self.alpha.iter().flatten()) {
-            for (v, b) in pixel.iter_mut().zip(background) {
-                *v += (1.0 - unit(a)) * b;
-            }
-        }
-        Target { rgb, alpha: self.alpha.as_ref().map(|a| a.iter().map(|&v| unit(v)).collect()) }
+        let values = |bytes: &Vec<u8>| bytes.iter().map(|&v| unit(v)).collect();
+        Target::over(values(&self.rgb), self.alpha.as_ref().map(values), background)
     }
 }
 
@@ -61,6 +57,18 @@ pub struct Target {
     pub rgb: Vec<f32>,
     /// `[height][width]`, 0 to 1, where the photograph has an alpha channel or a mask.
     pub alpha: Option<Vec<f32>>,
+}
+
+impl Target {
+    /// A photograph that is multiplied by its alpha, with a colour behind it.
+    fn over(mut rgb: Vec<f32>, alpha: Option<Vec<f32>>, background: [f32; 3]) -> Self {
+        for (pixel, a) in rgb.as_chunks_mut::<3>().0.iter_mut().zip(alpha.iter().flatten()) {
+            for (v, b) in pixel.iter_mut().zip(background) {
+                *v += (1.0 - a) * b;
+            }
+        }
+        Self { rgb, alpha }
+    }
 }
 
 fn unit(v: u8) -> f32 {
@@ -87,18 +95,7 @@ impl<'a> Photographs<'a> {
 
     /// No photographs, such as held-out ones where there are none.
     pub fn none() -> Self {
-        let masks = Masks::default();
-        Self {
-            views: vec![],
-            masks,
-            watched: None,
-            budget: 0,
-            bytes: vec![],
-            divisor: 1,
-            cameras: vec![],
-            full: vec![],
-            small: vec![],
-        }
+        Self { divisor: 1, ..Self::default() }
     }
 
     /// Bytes of the photographs that are kept at their own size.
@@ -246,13 +243,8 @@ fn decode(view: &View, masks: &Masks) -> Result<Image> {
 /// # Errors
 /// When a file cannot be read or has another size than the camera.
 pub fn exact_target(view: &View, masks: &Masks, background: [f32; 3]) -> Result<Target> {
-    let Image { mut rgb, alpha, .. } = decode(view, masks)?;
-    for (pixel, a) in rgb.as_chunks_mut::<3>().0.iter_mut().zip(alpha.iter().flatten()) {
-        for (v, b) in pixel.iter_mut().zip(background) {
-            *v += (1.0 - a) * b;
-        }
-    }
-    Ok(Target { rgb, alpha })
+    let Image { rgb, alpha, .. } = decode(view, masks)?;
+    Ok(Target::over(rgb, alpha, background))
 }
 
 #[cfg(test)]

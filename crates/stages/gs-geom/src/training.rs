@@ -1,7 +1,6 @@
 //! The optimisation loop: [`Trainer::step`] renders a view, takes the gradient of the loss, updates and densifies.
 
 pub mod checkpoint;
-pub mod curve;
 pub mod exposure;
 pub mod loss;
 pub mod optimiser;
@@ -10,7 +9,7 @@ pub mod schedule;
 use crate::densification::rules::{Growth, Moment};
 use crate::densification::{Strategy, Way};
 use crate::metrics::{self, Means};
-use crate::photographs::masks::{Alpha, alpha_loss, multiply};
+use crate::photographs::masks::{Alpha, multiply};
 use crate::photographs::{Photographs, Target};
 use checkpoint::State;
 use gs_io::Result;
@@ -27,8 +26,6 @@ use std::time::{Duration, Instant};
 
 /// Weight of 1 - SSIM in the loss, as 3DGS has it.
 const DSSIM_WEIGHT: f32 = 0.2;
-/// Weight of the difference of alpha in the loss, for [`Alpha::Match`].
-const ALPHA_WEIGHT: f32 = 0.1;
 
 /// Every hyper-parameter that shapes the result.
 #[derive(Debug, Clone, PartialEq, Serialize)]
@@ -110,8 +107,6 @@ pub struct Trainer<'a> {
     workspace: Workspace,
     /// d loss / d rendered colour.
     gradient: Vec<f32>,
-    /// d loss / d rendered alpha.
-    alpha_gradient: Vec<f32>,
     /// The render through its view's exposure.
     exposed: Vec<f32>,
     derivatives: Derivatives,
@@ -139,7 +134,6 @@ impl<'a> Trainer<'a> {
             state,
             workspace: Workspace::default(),
             gradient: Vec::new(),
-            alpha_gradient: Vec::new(),
             exposed: Vec::new(),
             derivatives: Derivatives::default(),
             last: Loss { l1: 0.0, ssim: 0.0, total: 0.0 },
@@ -240,7 +234,7 @@ impl<'a> Trainer<'a> {
 
     /// Compares the render with the photograph: the loss, and its gradient by every parameter.
     fn gradient(&mut self, frame: &Frame) -> Loss {
-        let (rgb, alpha) = (&self.workspace.forward.rendered.rgb, &self.workspace.forward.rendered.alpha);
+        let rgb = &self.workspace.forward.rendered.rgb;
         let State { gaussians, exposures, .. } = &mut self.state;
         // What the photograph would show, and which of its pixels count.
         let map = exposures.maps.get(frame.view).copied();
@@ -256,7 +250,7 @@ impl<'a> Trainer<'a> {
             multiply(shown.to_mut(), counts);
         }
         let pair = Pair { render: &shown, target: &frame.target.rgb, width: frame.camera.width as usize };
-        let mut loss = l1_dssim(pair, DSSIM_WEIGHT, &mut self.gradient, &mut self.derivatives);
+        let loss = l1_dssim(pair, DSSIM_WEIGHT, &mut self.gradient, &mut self.derivatives);
         drop(shown);
         if let Some(counts) = counts {
             multiply(&mut self.gradient, counts);
@@ -265,11 +259,7 @@ impl<'a> Trainer<'a> {
             let gradient = exposure::backward(map, rgb, &mut self.gradient);
             exposures.step(frame.view, &gradient, self.recipe.schedule.share(frame.iteration));
         }
-        let mut pixels = PixelGradients { rgb: &self.gradient, alpha: None, depth: None };
-        if let Some(wanted) = frame.target.alpha.as_ref().filter(|_| self.recipe.alpha == Alpha::Match) {
-            loss.total += alpha_loss(alpha, wanted, ALPHA_WEIGHT, &mut self.alpha_gradient);
-            pixels.alpha = Some(&self.alpha_gradient);
-        }
+        let pixels = PixelGradients { rgb: &self.gradient, alpha: None, depth: None };
         lap(&mut self.clock, &mut self.timings.loss);
         self.workspace.backward(gaussians, &frame.camera, &frame.raster, pixels);
         self.lap(|t| &mut t.backward);

@@ -124,19 +124,18 @@ fn alpha_error(file: &str) -> f64 {
 
 #[test]
 fn alpha_is_learnt_from_transparent_photographs() {
-    // Over black, dark things may be transparent or opaque; over any colour, or where alpha is compared, they may not.
+    // Over black, dark things may be transparent or opaque; over any colour they may not.
     let dir = Folder::new(true, |_, pixels| {
         pixels.iter_mut().for_each(|p| p[..3].iter_mut().for_each(|v| *v *= 0.1));
     });
     let background = dir.train("a.ply", &[]);
-    dir.train("b.ply", &["--alpha", "match"]);
-    dir.train("c.ply", &["--background", "random"]);
-    let [plain, matched, random] = ["a.ply", "b.ply", "c.ply"].map(|f| alpha_error(&dir.path(f)));
-    assert!(matched < 0.6 * plain && random < 0.8 * plain, "{plain} {matched} {random}");
+    dir.train("b.ply", &["--background", "random"]);
+    let [plain, random] = ["a.ply", "b.ply"].map(|f| alpha_error(&dir.path(f)));
+    assert!(random < 0.8 * plain, "{plain} {random}");
     assert!(psnr(&background) > 30.0, "{background}");
     // What should be opaque hides a background of another colour.
-    let [plain, matched] = ["a.ply", "b.ply"].map(|f| dir.eval(f, &["--background", "white"]));
-    assert!(matched > plain + 2.0, "{plain} {matched}");
+    let [plain, random] = ["a.ply", "b.ply"].map(|f| dir.eval(f, &["--background", "white"]));
+    assert!(random > plain + 1.0, "{plain} {random}");
 }
 
 #[test]

@@ -1,6 +1,5 @@
-//! Which pixels of a photograph count, and how: alpha channels and mask files.
+//! Which pixels of a photograph count: alpha channels and mask files.
 
-use clap::ValueEnum;
 use gs_io::{Error, Result, hash_bytes, hash_file};
 use gs_scene::dataset::View;
 use serde::Serialize;
@@ -8,15 +7,13 @@ use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
 /// What transparent pixels of the photographs mean.
-#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, ValueEnum)]
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum Alpha {
-    /// Nothing is there: the photograph lies over --background
+    /// Nothing is there: the photograph lies over the background.
     #[default]
     Background,
-    /// The same, and what is rendered must be as opaque as the photograph
-    Match,
-    /// Unknown: they do not count
+    /// Unknown: they do not count.
     Ignore,
 }
 
@@ -86,34 +83,5 @@ impl Masks {
 pub fn multiply(rgb: &mut [f32], alpha: &[f32]) {
     for (pixel, a) in rgb.as_chunks_mut::<3>().0.iter_mut().zip(alpha) {
         pixel.iter_mut().for_each(|v| *v *= a);
-    }
-}
-
-/// `weight` times the mean absolute difference of what was rendered from what it should be, `[pixels]` both, and its
-/// derivative into `gradient` (resized to fit).
-pub fn alpha_loss(rendered: &[f32], wanted: &[f32], weight: f32, gradient: &mut Vec<f32>) -> f64 {
-    let scale = weight / wanted.len().max(1) as f32;
-    gradient.clear();
-    gradient.extend(rendered.iter().zip(wanted).map(|(r, w)| match r - w {
-        0.0 => 0.0,
-        d => d.signum() * scale,
-    }));
-    let sum: f64 = rendered.iter().zip(wanted).map(|(r, w)| f64::from((r - w).abs())).sum();
-    f64::from(weight) * sum / wanted.len().max(1) as f64
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn the_loss_of_alpha_and_its_gradient() {
-        let mut gradient = vec![9.0; 7];
-        let loss = alpha_loss(&[0.5, 0.25, 1.0, 0.0], &[1.0, 0.0, 1.0, 0.0], 2.0, &mut gradient);
-        assert!((loss - 2.0 * 0.75 / 4.0).abs() < 1e-12);
-        assert_eq!(gradient, [-0.5, 0.5, 0.0, 0.0]);
-        let mut rgb = vec![1.0; 6];
-        multiply(&mut rgb, &[0.5, 0.0]);
-        assert_eq!(rgb, [0.5, 0.5, 0.5, 0.0, 0.0, 0.0]);
     }
 }

@@ -6,13 +6,21 @@ use crate::memory::Forecast;
 use crate::metrics::Means;
 use crate::options::Train;
 use crate::training::checkpoint::{self, ProgressState, State};
-use crate::training::{Timings, Trainer, curve};
+use crate::training::{Timings, Trainer};
 use gs_io::{Claim, Error, Provenance, Result, with_suffix, write_bytes};
 use gs_scene::{Gaussians, ply};
 use serde_json::{Value, json};
 use stage::Stage;
+use report::curve::Panel;
 use std::collections::BTreeMap;
 use std::time::Duration;
+
+/// The plot of the training curve.
+const PANELS: [Panel; 3] = [
+    ("loss", "training loss", "#1f77b4"),
+    ("psnr_heldout", "PSNR on held-out views, dB", "#2ca02c"),
+    ("gaussians", "Gaussians", "#d62728"),
+];
 
 /// How a result was made, for its record.
 pub(super) struct Made<'a> {
@@ -98,7 +106,7 @@ fn write_beside(options: &Train, trainer: &Trainer<'_>) -> Result<()> {
     let State { progress, exposures, .. } = trainer.state();
     let lines: String = progress.curve.iter().map(|line| format!("{line}\n")).collect();
     write_bytes(with_suffix(&options.out, CURVE), lines.as_bytes())?;
-    write_bytes(with_suffix(&options.out, PLOT), curve::svg(&progress.curve).as_bytes())?;
+    write_bytes(with_suffix(&options.out, PLOT), report::curve::svg(&progress.curve, &PANELS).as_bytes())?;
     if exposures.is_off() {
         return Ok(());
     }

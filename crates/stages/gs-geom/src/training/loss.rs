@@ -25,7 +25,7 @@ const RUN: usize = 64;
 pub struct Loss {
     /// Mean absolute difference.
     pub l1: f64,
-    /// Structural similarity, -1 to 1; 0 where its weight is 0.
+    /// Structural similarity, -1 to 1.
     pub ssim: f64,
     /// (1 - w) L1 + w (1 - SSIM).
     pub total: f64,
@@ -58,11 +58,10 @@ pub struct Derivatives {
 /// When the pictures have different sizes or are not whole rows of RGB.
 pub fn l1_dssim(pair: Pair<'_>, dssim_weight: f32, gradient: &mut Vec<f32>, d: &mut Derivatives) -> Loss {
     let (n, row) = pair.check();
-    let with_ssim = dssim_weight > 0.0;
     for map in [&mut d.mean, &mut d.square, &mut d.product] {
-        map.resize(if with_ssim { n } else { 0 }, 0.0);
+        map.resize(n, 0.0);
     }
-    let ssim = if with_ssim { ssim_map(pair, Some(d)) / n as f64 } else { 0.0 };
+    let ssim = ssim_map(pair, Some(d)) / n as f64;
     let (l1_scale, ssim_scale) = ((1.0 - dssim_weight) / n as f32, -dssim_weight / n as f32);
     gradient.resize(n, 0.0);
     let l1: Vec<f64> = gradient
@@ -71,17 +70,13 @@ pub fn l1_dssim(pair: Pair<'_>, dssim_weight: f32, gradient: &mut Vec<f32>, d: &
         .map_init(Scratch::default, |scratch, (band, out)| {
             let (y0, y1) = (band * BAND, band * BAND + out.len() / row);
             let (x, y) = (&pair.render[y0 * row..y1 * row], &pair.target[y0 * row..y1 * row]);
-            if with_ssim {
-                chain(x, y, scratch.blur([&d.mean, &d.square, &d.product], row, y0, y1), ssim_scale, out);
-            } else {
-                out.fill(0.0);
-            }
+            chain(x, y, scratch.blur([&d.mean, &d.square, &d.product], row, y0, y1), ssim_scale, out);
             add_l1(x, y, l1_scale, out)
         })
         .collect();
     let l1 = l1.iter().sum::<f64>() / n as f64;
     let w = f64::from(dssim_weight);
-    Loss { l1, ssim, total: (1.0 - w) * l1 + if with_ssim { w * (1.0 - ssim) } else { 0.0 } }
+    Loss { l1, ssim, total: (1.0 - w) * l1 + w * (1.0 - ssim) }
 }
 
 /// Mean SSIM of two pictures.
