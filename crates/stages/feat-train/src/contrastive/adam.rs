@@ -22,43 +22,31 @@ fn corrected(rate: f64, step: u64) -> (f64, f64) {
     (rate / power(BETA1), power(BETA2).sqrt())
 }
 
-/// One step's constants in f32: m' = b1 m + c1 g, v' = b2 v + c2 g², p' = p - rate m' / (root √v' + epsilon).
+/// What changes from step to step in f32: p' = p - rate m' / (root √v' + epsilon).
 #[derive(Debug, Clone, Copy, PartialEq)]
-#[allow(missing_docs, reason = "the letters are those of the formula")]
 pub struct Rates {
-    pub b1: f32,
-    pub c1: f32,
-    pub b2: f32,
-    pub c2: f32,
-    pub rate: f32,
-    pub root: f32,
-    pub epsilon: f32,
-    /// Means below this are set to zero.
-    pub tiny: f32,
-    /// Mean squares below this are set to zero.
-    pub tiny_square: f32,
+    rate: f32,
+    root: f32,
 }
 
 impl Rates {
     /// Of step `step`, which counts from 1.
     pub fn at(rate: f64, step: u64) -> Self {
         let (rate, root) = corrected(rate, step);
-        Self {
-            b1: BETA1 as f32,
-            c1: (1.0 - BETA1) as f32,
-            b2: BETA2 as f32,
-            c2: (1.0 - BETA2) as f32,
-            rate: rate as f32,
-            root: (1.0 / root) as f32,
-            epsilon: EPSILON as f32,
-            tiny: TINY as f32,
-            tiny_square: TINY_SQUARE as f32,
-        }
+        Self { rate: rate as f32, root: (1.0 / root) as f32 }
     }
 
-    /// A step that changes no parameter and leaves the gradient in place of its mean.
-    pub fn none() -> Self {
-        Self { b1: 0.0, c1: 1.0, b2: 0.0, c2: 0.0, rate: 0.0, tiny: 0.0, ..Self::at(0.0, 1) }
+    /// Updates a parameter `p` and the moments `m` and `v` of its gradient `g`.
+    #[inline(always)]
+    pub fn update(&self, p: &mut f32, m: &mut f32, v: &mut f32, g: f32) {
+        let mean = BETA1 as f32 * *m + (1.0 - BETA1) as f32 * g;
+        let square = BETA2 as f32 * *v + (1.0 - BETA2) as f32 * g * g;
+        // Denormal numbers are slow, and as good as zero.
+        let mean = if mean.abs() < TINY as f32 { 0.0 } else { mean };
+        let square = if square < TINY_SQUARE as f32 { 0.0 } else { square };
+        *m = mean;
+        *v = square;
+        *p -= self.rate * mean / (square.sqrt() * self.root + EPSILON as f32);
     }
 }
 

@@ -292,23 +292,11 @@ pub fn columns_backward<const D: usize>(
     }
 }
 
-#[inline(always)]
-fn adam_one(p: &mut f32, m: &mut f32, v: &mut f32, g: f32, r: &Rates) {
-    let mean = r.b1 * *m + r.c1 * g;
-    let square = r.b2 * *v + r.c2 * g * g;
-    // Denormal numbers are slow, and as good as zero.
-    let mean = if mean.abs() < r.tiny { 0.0 } else { mean };
-    let square = if square < r.tiny_square { 0.0 } else { square };
-    *m = mean;
-    *v = square;
-    *p -= r.rate * mean / (square.sqrt() * r.root + r.epsilon);
-}
-
 /// One step of Adam.
 #[multiversion(targets("x86_64+avx512f+avx512vl", "x86_64+avx2"))]
 pub fn adam(p: &mut [f32], m: &mut [f32], v: &mut [f32], g: &[f32], rates: &Rates) {
     for (((p, m), v), &g) in p.iter_mut().zip(m).zip(v).zip(g) {
-        adam_one(p, m, v, g, rates);
+        rates.update(p, m, v, g);
     }
 }
 
@@ -316,7 +304,7 @@ pub fn adam(p: &mut [f32], m: &mut [f32], v: &mut [f32], g: &[f32], rates: &Rate
 #[multiversion(targets("x86_64+avx512f+avx512vl", "x86_64+avx2"))]
 pub fn adam_without(p: &mut [f32], m: &mut [f32], v: &mut [f32], rates: &Rates) {
     for ((p, m), v) in p.iter_mut().zip(m).zip(v) {
-        adam_one(p, m, v, 0.0, rates);
+        rates.update(p, m, v, 0.0);
     }
 }
 
