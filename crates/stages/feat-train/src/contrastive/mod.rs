@@ -4,10 +4,10 @@
 //! * [`model`], with [`network`], [`normalize`], [`loss`], [`terms`] and [`cross_view`]: the equations and their gradients,
 //!   readable, for f32 and f64 ([`real`]).
 //! * [`engine`]: the same in f32, fast. [`solver`] takes the one that serves the options.
-//! * [`train`]: the loop, on the [`state`], which [`checkpoint`] saves. [`adam`]: the optimiser.
+//! * [`mod@train`]: the loop, on the [`state`], which [`checkpoint`] saves. [`adam`]: the optimiser.
 
 pub mod adam;
-mod alignment;
+pub mod alignment;
 pub mod checkpoint;
 pub mod context;
 pub mod cross_view;

@@ -230,7 +230,7 @@ impl<T: Real> Model<T> {
         })
     }
 
-    /// [`alignment`] of a view's masks.
+    /// [Alignment](alignment()) of a view's masks.
     pub fn alignment(&self, context: &Context, propagated: &Propagated<T>, set: &MaskSet) -> f64 {
         alignment(set, &self.centroids(context, propagated, set), self.dim, |place, f| {
             self.final_feature(context, propagated, place, f);

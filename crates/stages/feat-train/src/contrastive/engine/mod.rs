@@ -497,7 +497,7 @@ impl<'a> Engine<'a> {
         out
     }
 
-    /// [`alignment`] of a view's masks.
+    /// [Alignment](alignment()) of a view's masks.
     pub fn alignment(&self, model: &Model<f32>, set: &MaskSet) -> f64 {
         alignment(set, &self.centroids(model, set), self.d, |place, f| {
             f.iter_mut().zip(self.final_feature(model, place)).for_each(|(f, v)| *f = f64::from(v));
