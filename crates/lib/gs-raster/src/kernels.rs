@@ -467,7 +467,7 @@ impl WithSimd for WeightsTile<'_> {
         let mut transmittance = fresh(if self.early_stop { width } else { TILE });
         let mut accumulated = [0.0f32; PIXELS];
         let grid = Grid::new(self.rectangle);
-        // Columns beyond the image's right edge are nobody's pixels, though without a stop they have a transmittance.
+        // Columns beyond the image's right edge are no pixels, though without a stop they have a transmittance.
         let inside: Row = std::array::from_fn(|l| if l < width { 1.0 } else { 0.0 });
         let layers = self.alphas.chunks_exact_mut(PIXELS).zip(self.weights.chunks_exact_mut(PIXELS));
         for (&entry, (alphas, weights)) in self.list.iter().zip(layers) {

@@ -1,4 +1,4 @@
-//! The renderer once more, as plainly as it can be said: f64, pixel by pixel, all Gaussians, no tiles. The oracle of the tests
+//! The renderer once more, as simple as possible: f64, pixel by pixel, all Gaussians, no tiles. The oracle of the tests
 //! and of `bench stress`.
 //!
 //! It shares no code with the renderer except the types of its inputs; [`backward`] alone goes through the renderer's chain

@@ -1,4 +1,4 @@
-//! `gs-geom train --time-budget`: measures the speed, plans, and says the plan as options.
+//! `gs-geom train --time-budget`: measures the speed, plans, and prints the plan as options.
 
 pub mod plan;
 
@@ -64,9 +64,7 @@ pub(crate) fn plan_for(
     planned.max_gaussians = Some(gaussians);
     planned.scene.resolution = kept.resolution.parse()?;
     let said = format!("--iterations {iterations} --max-gaussians {gaussians} --resolution {}", kept.resolution);
-    stage.info(&format!("planned for {budget} s, to take {seconds:.0} s; the same without a budget:"));
-    let typed = std::env::args_os().map(|a| a.to_string_lossy().into_owned()).collect();
-    stage.info(&command(typed, &said));
+    stage.info(&format!("planned for {budget} s, to take {seconds:.0} s; the same in place of --time-budget: {said}"));
     let text = serde_json::to_vec_pretty(&kept).map_err(|e| Error::new(e.to_string()))?;
     write_bytes(plan_path(&options.out), &text)?;
     Ok((planned, json!({"options": said, "made": kept})))
@@ -153,39 +151,4 @@ fn probe(recipe: Recipe, extent: f64, photographs: Photographs<'_>, start: Gauss
     });
     let doubled = time(&mut trainer, views)?;
     Ok(Speed::fit(count, full, (1.0 / f64::from(SMALL * SMALL), small), doubled))
-}
-
-/// The command line with `options` in place of the budget and of what they say.
-fn command(arguments: Vec<String>, options: &str) -> String {
-    let replaced = ["--time-budget", "--iterations", "--max-gaussians", "--resolution"];
-    let mut out: Vec<String> = Vec::new();
-    let mut skip = false;
-    for argument in arguments {
-        let name = argument.split('=').next().unwrap_or_default();
-        if std::mem::take(&mut skip) {
-            continue;
-        }
-        if replaced.contains(&name) {
-            skip = !argument.contains('=');
-        } else if argument.chars().all(|c| c.is_ascii_alphanumeric() || "-_./=:,+".contains(c)) && !argument.is_empty()
-        {
-            out.push(argument);
-        } else {
-            out.push(format!("'{}'", argument.replace('\'', r"'\''")));
-        }
-    }
-    out.push(options.into());
-    out.join(" ")
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn the_command_line_says_the_plan() {
-        let typed = "gs-geom train --scene a/b --time-budget 10m --iterations=5 --out".split(' ').map(String::from);
-        let typed: Vec<String> = typed.chain(["it's here".into()]).collect();
-        assert_eq!(command(typed, "--iterations 7"), r"gs-geom train --scene a/b --out 'it'\''s here' --iterations 7");
-    }
 }

@@ -38,7 +38,7 @@ impl Strategy {
         }
     }
 
-    /// When and how far the number grows in so many iterations: as 3DGS has it at 30,000 and more. Shorter runs begin
+    /// When the number of Gaussians grows in a run of `iterations`: as in 3DGS at 30,000 and more. Shorter runs begin
     /// earlier, in proportion, and densify for a larger share, because they have fewer rounds. 3DGS-MCMC goes on for longer:
     /// it moves Gaussians to where they are of use.
     pub fn growth(self, iterations: u32) -> Growth {

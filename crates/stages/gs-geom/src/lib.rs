@@ -21,3 +21,10 @@ pub mod render;
 mod run;
 pub mod start;
 pub mod training;
+
+/// Property tests that are the same at every run.
+#[cfg(test)]
+fn property_tests(cases: u32) -> proptest::test_runner::Config {
+    let rng_seed = proptest::test_runner::RngSeed::Fixed(1);
+    proptest::test_runner::Config { cases, rng_seed, failure_persistence: None, ..Default::default() }
+}

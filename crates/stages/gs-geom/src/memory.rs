@@ -112,7 +112,7 @@ impl Forecast {
         }
     }
 
-    /// The same where the Gaussians of a view touch so many tiles, all told.
+    /// The same where the Gaussians of a view touch `entries` tiles, each counted for each Gaussian.
     #[must_use]
     pub fn with_tiles(self, entries: u64) -> Self {
         Self { tiles: PER_TILE * entries, ..self }
@@ -128,7 +128,7 @@ impl Forecast {
         self.decoding.max(training) + self.decoding.min(training) / 2
     }
 
-    /// Peak memory with so many Gaussians, bytes.
+    /// Peak memory with this number of Gaussians, bytes.
     pub fn peak(&self, gaussians: usize) -> Bytes {
         Bytes(
             (BASE + self.photographs + self.scratch())
@@ -140,12 +140,12 @@ impl Forecast {
 /// What the program takes for itself where it does not train.
 const PROGRAM: u64 = 5_000_000;
 
-/// Peak in bytes of `inspect` and `convert`, for a file of so many bytes: it and its Gaussians at the same time.
+/// Peak in bytes of `inspect` and `convert`, for a file of `geometry` bytes: the file and its Gaussians at the same time.
 pub fn of_file(geometry: u64) -> u64 {
     PROGRAM + 23 * geometry / 10
 }
 
-/// Peak in bytes of `convert` that gives so many Gaussians bands that they did not have.
+/// Peak in bytes of `convert` where it adds bands of spherical harmonics.
 pub fn of_bands(gaussians: usize, from: u8, to: u8) -> u64 {
     let numbers = |degree: u8| PLAIN_NUMBERS + 3 * sh_coefficients(degree) as u64;
     PROGRAM + 4 * gaussians as u64 * (numbers(from) + numbers(to))
@@ -160,39 +160,4 @@ pub fn of_renders(geometry: u64, pictures: &Pictures) -> u64 {
 pub fn of_figures(geometry: u64, pictures: &Pictures) -> u64 {
     let measuring = PROGRAM + 9 * geometry / 5 + 50 * pictures.pixels;
     of_file(geometry).max(PROGRAM + geometry + pictures.decoding()).max(measuring)
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-    use crate::training::checkpoint::start;
-    use crate::training::optimiser::zeros;
-
-    #[test]
-    fn a_gaussian_costs_at_least_its_arrays() {
-        for sh_degree in 0..=3 {
-            let n = 1000;
-            let state = start(zeros(n, sh_degree), 0);
-            let bytes = |g: &gs_scene::Gaussians| {
-                size_of_val(&g.means[..])
-                    + size_of_val(&g.log_scales[..])
-                    + size_of_val(&g.rotations[..])
-                    + size_of_val(&g.opacity_logits[..])
-                    + size_of_val(&g.sh[..])
-            };
-            let seen = size_of_val(&state.seen.sum[..]) + size_of_val(&state.seen.views[..]);
-            // Parameters, moments, sums of gradients, and the gradient of a step.
-            let known = bytes(&state.gaussians) * 2 + bytes(&state.adam.first) + bytes(&state.adam.second) + seen;
-            let forecast = Forecast::new(&Sizes {
-                photographs: 0,
-                pictures: Pictures { pixels: 0, width: 0, file: (0, 0) },
-                threads: 1,
-                decodes_again: false,
-                sh_degree,
-                densifies: false,
-            });
-            let told = forecast.per_gaussian * n as u64;
-            assert!(told >= known as u64 && told < 2 * known as u64, "degree {sh_degree}: {told} of {known}");
-        }
-    }
 }

@@ -86,7 +86,7 @@ pub struct Means {
     pub psnr: Option<f64>,
     /// Of the SSIM.
     pub ssim: Option<f64>,
-    /// What is to be said of views in which no pixel counts, where there are any.
+    /// A warning about views in which no pixel counts, if there are any.
     pub uncounted: Option<String>,
 }
 

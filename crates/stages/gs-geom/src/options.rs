@@ -91,7 +91,7 @@ pub(crate) struct Train {
     #[arg(long, value_name = "FILE")]
     #[serde(skip)]
     pub out: PathBuf,
-    /// Iterations, one view each; with --time-budget at most so many
+    /// Number of iterations, 1 to 1e8; each renders one view. With --time-budget, the largest number
     #[arg(long, value_name = "COUNT", default_value_t = 30_000, value_parser = clap::value_parser!(u32).range(1..=100_000_000))]
     pub iterations: u32,
     /// Plan iterations, picture size and --max-gaussians so that the run ends within this time, such as 90s, 10m or 1h. The
@@ -116,8 +116,8 @@ pub(crate) struct Train {
     /// How the number of Gaussians changes
     #[arg(long, value_enum, default_value_t = Strategy::default())]
     pub densify: Strategy,
-    /// Most Gaussians there may be, 1 to 1e9; with --densify mcmc their number at the end, if the iterations suffice [one for
-    /// 100 pixels of the training photographs, but at least 10,000 and twice the number at the start]
+    /// Largest number of Gaussians, 1 to 1e9. With --densify mcmc it is their number at the end, if there are enough
+    /// iterations [one for 100 pixels of the training photographs, but at least 10,000 and twice the dataset's points]
     #[arg(long, value_name = "COUNT", value_parser = RangedU64ValueParser::<usize>::new().range(1..=MOST_GAUSSIANS))]
     pub max_gaussians: Option<usize>,
     /// Gradient of the projected centre above which a Gaussian is cloned or split, per half picture size [0.0002]
@@ -126,8 +126,8 @@ pub(crate) struct Train {
     /// Iterations between densifications [a thirtieth of --iterations, 50 to 100]
     #[arg(long, value_name = "COUNT", value_parser = clap::value_parser!(u32).range(1..))]
     pub densify_every: Option<u32>,
-    /// Keep the light of Gaussians smaller than a pixel (the 2D filter of Mip-Splatting), so that renders at other sizes
-    /// than the photographs' are neither thick nor dark. The PLY says so, and all commands render it so
+    /// Lower the opacity of Gaussians smaller than a pixel (the 2D filter of Mip-Splatting), so that renders of other sizes
+    /// than the photographs look alike. The PLY says so, and all commands that render it do the same
     #[arg(long)]
     pub antialias: bool,
     /// Train an affine map of colours for each training photograph, for cameras with automatic exposure or white balance.
@@ -141,7 +141,7 @@ pub(crate) struct Train {
     #[arg(long, value_name = "BYTES", default_value_t = Bytes(2 << 30))]
     #[serde(skip)]
     pub image_cache: Bytes,
-    /// Write a checkpoint every so many iterations (500) or seconds (60s). The same command goes on from a checkpoint
+    /// Iterations (500) or seconds (60s) between checkpoints. The same command goes on from the last checkpoint
     #[arg(long, value_name = "COUNT|SECONDS", default_value = "60s")]
     #[serde(skip)]
     pub checkpoint_every: Every,

@@ -117,7 +117,7 @@ fn split<'a>(options: &Train, dataset: &'a Dataset) -> Result<(Vec<&'a View>, Ve
 }
 
 impl Train {
-    /// What the options say, for at most so many Gaussians.
+    /// The hyper-parameters that the options amount to.
     pub(crate) fn recipe(&self, max_gaussians: usize, seed: u64) -> Recipe {
         let mut recipe = Recipe::new(self.densify, self.iterations);
         if self.schedule == PictureSizes::Coarse {

@@ -249,6 +249,7 @@ mod tests {
     }
 
     proptest! {
+        #![proptest_config(crate::property_tests(256))]
         #[test]
         fn sizes_are_those_of_brute_force(
             cells in prop::collection::vec((0i8..6, 0i8..6, -1i8..2), 2..80),

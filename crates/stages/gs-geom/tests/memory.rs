@@ -17,7 +17,7 @@ fn forecasts_are_near_the_peaks() {
     let dir = Folder::new();
     let [geometry, metrics, pictures, converted] = ["g.ply", "m.json", "pictures", "c.ply"].map(|n| dir.path(n));
     let base = ["train", "--scene", scene(), "--threads", "2", "--iterations", "10", "--out", &geometry];
-    for count in ["2000", "150000"] {
+    for count in ["2000", "60000"] {
         let said = succeeds(&[&base[..], &["--init", "random", "--init-points", count]].concat());
         assert!(said.contains("memory: about"), "{said}");
         let found = ratio(&record(&geometry)["summary"]["memory_predicted_bytes"], &geometry);

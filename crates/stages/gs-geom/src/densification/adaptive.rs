@@ -79,7 +79,7 @@ impl Densify for Adaptive {
     }
 }
 
-/// Clones, splits and removes; afterwards `seen` starts from nothing. New Gaussians follow the old ones and have no
+/// Clones, splits and removes; afterwards `seen` is empty. New Gaussians follow the old ones and have no
 /// moments.
 pub fn densify(
     g: &mut Gaussians,
@@ -119,7 +119,7 @@ pub fn densify(
     Report { cloned: clone.len(), split: split.len(), removed, relocated: 0 }
 }
 
-/// Removes the Gaussians that `kept` refuses, unless none would be left; gives their number.
+/// Removes the Gaussians that `kept` refuses, unless none would be left; returns their number.
 fn keep(g: &mut Gaussians, adam: &mut Adam, kept: impl Fn(&Gaussians, usize) -> bool) -> usize {
     let sources: Vec<u32> = (0..g.len() as u32).filter(|&i| kept(g, i as usize)).collect();
     let removed = g.len() - sources.len();
@@ -245,6 +245,7 @@ mod tests {
     }
 
     proptest! {
+        #![proptest_config(crate::property_tests(256))]
         #[test]
         fn counts_add_up_and_the_cap_holds(
             gradients in prop::collection::vec(0.0f32..4e-4, 1..60),

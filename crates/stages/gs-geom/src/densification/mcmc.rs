@@ -260,7 +260,7 @@ mod tests {
         assert_eq!((report.relocated, report.cloned, g.len()), (40, 3, 103));
         assert!((0..g.len()).all(|i| g.opacity(i) >= 0.0049 && g.means[i][0] >= 40.0));
         assert!(g.check().is_ok() && adam.first.check().is_ok() && adam.first.len() == 103);
-        // Moments stay only of what nobody landed on.
+        // Only Gaussians without copies keep their moments.
         for i in 0..103 {
             let alone = (0..103).filter(|&j| g.means[j] == g.means[i]).count() == 1;
             assert_eq!(adam.first.sh_of(i)[0], f32::from(u8::from(alone)), "{i}");
@@ -332,6 +332,7 @@ mod tests {
     }
 
     proptest! {
+        #![proptest_config(crate::property_tests(256))]
         #[test]
         fn rounds_grow_by_their_share_and_stay_finite(
             opacities in prop::collection::vec(1e-6f64..0.9999, 1..80),

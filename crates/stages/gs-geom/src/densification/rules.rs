@@ -1,4 +1,4 @@
-//! What a way to densify may do in an iteration, and what it is told.
+//! What a way to densify may do in an iteration, and what it knows about the iteration.
 
 use super::screen::ScreenGradients;
 use crate::training::checkpoint::State;

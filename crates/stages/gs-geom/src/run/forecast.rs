@@ -12,7 +12,7 @@ use gs_scene::Gaussians;
 use gs_scene::dataset::{Dataset, Split, View};
 use stage::{Bytes, Stage};
 
-/// By default there is at most one Gaussian for so many pixels of the training photographs (docs/geometry.md).
+/// Pixels of the training photographs for each Gaussian, by default (docs/geometry.md).
 const PIXELS_PER_GAUSSIAN: usize = 100;
 /// The default of --max-gaussians is never less.
 const LEAST_GAUSSIANS: usize = 10_000;

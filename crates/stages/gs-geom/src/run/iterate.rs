@@ -58,7 +58,7 @@ pub(super) fn iterate(
             Every::Seconds(s) => last_save.elapsed().as_secs_f64() >= s,
         };
         if due && !trainer.is_done() {
-            // Those that are kept in memory are not read again: a run that nobody can repeat should end here.
+            // Photographs kept in memory are not read again, but a run that cannot be repeated should end here.
             watched.check_those_left()?;
             save(options, trainer, run)?;
             last_save = Instant::now();

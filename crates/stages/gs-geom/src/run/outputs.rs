@@ -52,7 +52,7 @@ pub(super) fn check_finite(options: &Train, gaussians: &Gaussians, iteration: u3
     }
 }
 
-/// Removes a file that is of no use any more.
+/// Removes a file that is no longer needed.
 pub(super) fn remove_if_there(path: &Path) {
     // What cannot be removed does no harm.
     let _ = std::fs::remove_file(path);

@@ -58,13 +58,13 @@ pub fn path_of(output: &Path) -> PathBuf {
     gs_io::with_suffix(output, ".checkpoint")
 }
 
-/// A fresh run's state, with the exposures of so many views (see [`Exposures::new`]).
+/// The state before the first iteration; `exposures` is the number of views with an exposure map.
 pub fn start(gaussians: Gaussians, exposures: usize) -> State {
     let (adam, seen) = (Adam::new(&gaussians), ScreenGradients::new(gaussians.len()));
     State { gaussians, adam, seen, exposures: Exposures::new(exposures), progress: ProgressState::default() }
 }
 
-/// Writes a checkpoint; `provenance` tells by which run.
+/// Writes a checkpoint; `provenance` is that of the run.
 ///
 /// # Errors
 /// When the file cannot be written.

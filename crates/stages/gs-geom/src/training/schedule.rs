@@ -42,7 +42,7 @@ impl Default for LearningRates {
 pub struct Schedule {
     /// Length of the optimisation.
     pub iterations: u32,
-    /// The degree of the spherical harmonics grows by one every so many iterations.
+    /// Iterations after which the degree of the spherical harmonics grows by one.
     pub sh_every: u32,
     /// Picture sizes: (last iteration, divisor of the training size), in order; afterwards the full training size.
     pub coarse: Vec<(u32, u32)>,
