@@ -37,20 +37,6 @@ def rasterise(data):
     return masks
 
 
-def boxes(data, category):
-    return [o["bbox"] for o in data["objects"] if o["category"] == category]
-
-
-def localised(values, rectangles):
-    smooth = cv2.filter2D(values.astype(np.float64), -1, np.full((30, 30), 1 / 900))
-    ys, xs = np.nonzero(smooth >= smooth.max() - 1e-6)
-    for x1, y1, x2, y2 in rectangles:
-        inside = (xs >= min(x1, x2)) & (xs <= max(x1, x2)) & (ys >= min(y1, y2)) & (ys <= max(y1, y2))
-        if inside.any():
-            return True
-    return False
-
-
 def lerf(args):
     pairs = []
     for frame, data in load_labels(args.labels):
@@ -68,8 +54,7 @@ def lerf(args):
                 p = cv2.imread(stem + ".png", cv2.IMREAD_GRAYSCALE) > 10
                 union = np.sum(p | truth[category])
                 iou = np.sum(p & truth[category]) / union if union else 0.0
-            hit = localised(np.load(stem + ".npy"), boxes(data, category)) if os.path.exists(stem + ".npy") else None
-            pairs.append({"frame": frame, "category": category, "iou": float(iou), "localised": hit})
+            pairs.append({"frame": frame, "category": category, "iou": float(iou)})
     groups = [pairs]
     if args.averaging == "frames":
         groups = [[p for p in pairs if p["frame"] == f] for f in sorted({p["frame"] for p in pairs})]
@@ -77,13 +62,10 @@ def lerf(args):
     def mean(score):
         return float(np.mean([np.mean([score(p) for p in g]) for g in groups]))
 
-    located = [[p["localised"] for p in g if p["localised"] is not None] for g in groups]
-    located = [np.mean(g) for g in located if g]
     return {
         "miou": mean(lambda p: p["iou"]),
         "macc25": mean(lambda p: p["iou"] > 0.25),
         "macc50": mean(lambda p: p["iou"] > 0.5),
-        "localisation": float(np.mean(located)) if located else None,
         "pairs": pairs,
     }
 
@@ -137,15 +119,6 @@ SETS = {
 }
 
 
-def rotations(q):
-    w, x, y, z = (q / np.linalg.norm(q, axis=1, keepdims=True)).T
-    return np.array([
-        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-    ]).transpose(2, 0, 1)  # fmt: skip
-
-
 def average_precision(truth, predicted, confidence, least, threshold):
     def groups(labels):
         return {int(i): labels == i for i in np.unique(labels) if i >= 0 and np.sum(labels == i) >= least}
@@ -188,7 +161,6 @@ def scannet(args):
     xyz = np.stack([v["x"], v["y"], v["z"]], 1).astype(np.float64)
     means = np.stack([g["x"], g["y"], g["z"]], 1).astype(np.float64)
     opacity = 1 / (1 + np.exp(-g["opacity"].astype(np.float64)))
-    scales = np.exp(np.stack([g[f"scale_{k}"] for k in range(3)], 1).astype(np.float64))
     speaks = opacity >= 0.1
     gaussian, counts = np.arange(len(v)), np.ones(len(v), bool)
     if args.association == "one-to-one":
@@ -207,32 +179,14 @@ def scannet(args):
         known = described[np.maximum(label, 0)] & (label >= 0)
         cls = np.where(known, np.argmax(similarity, 1)[np.maximum(label, 0)], 0)
         truth = np.array([ids.index(int(i)) if int(i) in ids else -1 for i in v["label"]])
-        weight = np.ones(len(v))
-        if args.association == "volume":
-            points, classes = xyz[truth >= 0], truth[truth >= 0]
-            axes = rotations(np.stack([g[f"rot_{k}"] for k in range(4)], 1).astype(np.float64))
-            pseudo = np.full(len(g), -1)
-            for i in range(len(g)):
-                d = points - means[i]
-                r = np.sum(d * d, 1)
-                near = np.argsort(r, kind="stable")[:1000]
-                near = near[r[near] <= (5 * scales[i].max()) ** 2]
-                votes = np.zeros(size)
-                m = np.sum((d[near] @ axes[i] / scales[i]) ** 2, 1)
-                np.add.at(votes, classes[near], np.exp(-m / 2))
-                if votes.max() > 0:
-                    pseudo[i] = int(np.argmax(votes))
-            truth, predicted, weight = pseudo, cls, opacity * scales.prod(1)
-            keep = (truth >= 0) & speaks
-        else:
-            predicted, keep = cls[gaussian], (truth >= 0) & counts
+        predicted, keep = cls[gaussian], (truth >= 0) & counts
         ious, recalls = [], []
         for c in range(size):
             is_c, said_c = keep & (truth == c), keep & (predicted == c)
-            if weight[is_c].sum() > 0:
-                both = weight[is_c & said_c].sum()
-                ious.append(both / weight[is_c | said_c].sum())
-                recalls.append(both / weight[is_c].sum())
+            if is_c.any():
+                both = np.sum(is_c & said_c)
+                ious.append(both / np.sum(is_c | said_c))
+                recalls.append(both / np.sum(is_c))
         out["sets"][str(size)] = {
             "miou": float(np.mean(ious)) if ious else None,
             "macc": float(np.mean(recalls)) if recalls else None,
@@ -276,7 +230,7 @@ def main():
     c = commands.add_parser("scannet")
     for name in ["geometry", "instances", "texts", "scan"]:
         c.add_argument(name)
-    c.add_argument("--association", default="one-to-one", choices=["one-to-one", "nearest", "volume"])
+    c.add_argument("--association", default="one-to-one", choices=["one-to-one", "nearest"])
     c.set_defaults(run=scannet)
     args = parser.parse_args()
     print(json.dumps(args.run(args)))

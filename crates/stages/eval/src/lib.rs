@@ -8,14 +8,14 @@
 pub mod cli;
 mod mask;
 pub mod mask_stats;
-pub mod memory;
-pub mod nearest;
-pub mod options;
-pub mod page;
+mod memory;
+mod nearest;
+mod options;
+mod page;
 pub mod protocols;
 pub mod query;
 pub mod scene;
 pub mod score;
-pub mod silhouette;
+mod silhouette;
 
 pub use mask::Mask;

@@ -1,4 +1,4 @@
-//! How much memory a command will take, told before it reads more than sizes. docs/performance.md holds it against
+//! Forecasts of the memory that a command takes, from the sizes of its files. docs/performance.md compares them with
 //! measured peaks.
 
 use crate::options::{Inputs, TextOptions};
@@ -23,7 +23,7 @@ pub struct Sizes {
 }
 
 impl Sizes {
-    /// What a scene, its texts and its largest view take, as far as files tell before they are read.
+    /// The sizes of a scene, its text features and its largest view, before any of them is read.
     pub fn new(inputs: &Inputs, texts: &TextOptions, views: &[View]) -> Self {
         Self {
             geometry: bytes(&inputs.geometry),
@@ -42,7 +42,7 @@ const PROGRAM: u64 = 8_000_000;
 /// What CLIP's tokenizer takes.
 const TOKENIZER: u64 = 16_000_000;
 
-/// Bytes of a file or, for a folder, of the files in it; 0 where it cannot be read, which whoever reads it will say.
+/// Bytes of a file or, for a folder, of the files in it; 0 where it cannot be read: that is an error later, when it is read.
 pub fn bytes(path: &Path) -> u64 {
     let of = |p: &Path| std::fs::metadata(p).map_or(0, |m| if m.is_file() { m.len() } else { 0 });
     match std::fs::read_dir(path) {

@@ -4,10 +4,10 @@ use gs_scene::Gaussians;
 use kiddo::{ImmutableKdTree, SquaredEuclidean};
 use rayon::prelude::*;
 
-/// Index of the nearest Gaussian among `speakers` (ascending indices) for each vertex; none when there are none.
-pub fn nearest(gaussians: &Gaussians, speakers: &[u32], vertices: &[[f32; 3]]) -> Vec<Option<u32>> {
-    let positions: Vec<[f32; 3]> = speakers.iter().map(|&i| gaussians.means[i as usize]).collect();
-    nearest_of(&positions, vertices).into_iter().map(|n| n.map(|n| speakers[n as usize])).collect()
+/// Index of the nearest Gaussian among `candidates` (ascending indices) for each vertex; none when there are none.
+pub fn nearest(gaussians: &Gaussians, candidates: &[u32], vertices: &[[f32; 3]]) -> Vec<Option<u32>> {
+    let positions: Vec<[f32; 3]> = candidates.iter().map(|&i| gaussians.means[i as usize]).collect();
+    nearest_of(&positions, vertices).into_iter().map(|n| n.map(|n| candidates[n as usize])).collect()
 }
 
 /// Index of the nearest of `positions` for each point; none when there are none.
@@ -23,7 +23,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn the_nearest_gaussian_speaks_for_a_vertex() {
+    fn the_nearest_candidate_is_found() {
         let mut g = Gaussians::default();
         for x in [0.0, 1.0, 2.0] {
             g.means.push([x, 0.0, 0.0]);

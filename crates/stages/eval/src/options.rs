@@ -149,15 +149,12 @@ pub enum Granularity {
 #[command(group(clap::ArgGroup::new("asked").required(true).multiple(true).args(["text", "image", "pixel", "point", "interactive"])))]
 #[command(mut_arg("out", |a| a.required(false).required_unless_present("interactive").value_name("DIR").help("Output folder")))]
 pub struct QueryOptions {
-    /// What is asked about.
     #[command(flatten)]
     #[serde(flatten)]
     pub inputs: Inputs,
-    /// Where text features come from.
     #[command(flatten)]
     #[serde(flatten)]
     pub texts: TextOptions,
-    /// What is selected.
     #[command(flatten)]
     #[serde(flatten)]
     pub choice: Choice,
@@ -182,15 +179,12 @@ pub struct QueryOptions {
     /// Keep everything loaded and read texts from standard input, one a line; with --out each gets a folder in it
     #[arg(long, conflicts_with_all = ["text", "image", "pixel", "point", "segment"])]
     pub interactive: bool,
-    /// What pictures show.
     #[command(flatten)]
     #[serde(flatten)]
     pub views: Views,
-    /// How the selection is shown.
     #[command(flatten)]
     #[serde(flatten)]
     pub masking: Masking,
-    /// Where the answers go.
     #[command(flatten)]
     #[serde(flatten)]
     pub out: Option<Out>,
@@ -200,27 +194,21 @@ pub struct QueryOptions {
 #[derive(Debug, Clone, clap::Args, Serialize)]
 #[command(mut_arg("out", |a| a.value_name("FILE").help("Output JSON")))]
 pub struct ScoreOptions {
-    /// What is scored.
     #[command(flatten)]
     #[serde(flatten)]
     pub inputs: Inputs,
-    /// Where text features come from.
     #[command(flatten)]
     #[serde(flatten)]
     pub texts: TextOptions,
-    /// What is selected.
     #[command(flatten)]
     #[serde(flatten)]
     pub choice: Choice,
-    /// Where labels lie.
     #[command(flatten)]
     #[serde(flatten)]
     pub labels: Labels,
-    /// How selections become masks.
     #[command(flatten)]
     #[serde(flatten)]
     pub masking: Masking,
-    /// Where the scores go.
     #[command(flatten)]
     #[serde(flatten)]
     pub out: Out,
@@ -245,22 +233,18 @@ pub enum Truth {
 )]
 #[command(mut_arg("out", |a| a.value_name("DIR").help("Output folder: metrics.json, table.md")))]
 pub struct LerfOptions {
-    /// What is scored, unless masks of another program are.
     #[command(flatten)]
     #[serde(flatten)]
     pub inputs: Option<Inputs>,
     /// Score masks that another program saved, <frame>_<category>.png above grey level 10, instead of instances
-    #[arg(long, value_name = "DIR", conflicts_with_all = ["scene", "geometry", "instances", "localisation"], requires = "labels")]
+    #[arg(long, value_name = "DIR", conflicts_with_all = ["scene", "geometry", "instances"], requires = "labels")]
     pub predictions: Option<PathBuf>,
-    /// Where text features come from.
     #[command(flatten)]
     #[serde(flatten)]
     pub texts: TextOptions,
-    /// What is selected.
     #[command(flatten)]
     #[serde(flatten)]
     pub choice: Choice,
-    /// Where labels lie.
     #[command(flatten)]
     #[serde(flatten)]
     pub labels: Labels,
@@ -271,17 +255,12 @@ pub struct LerfOptions {
     /// Where the true masks come from
     #[arg(long, value_enum, default_value = "polygons")]
     pub truth: Truth,
-    /// How selections become masks.
     #[command(flatten)]
     #[serde(flatten)]
     pub masking: Masking,
-    /// Also score localisation: the most relevant pixel lies in a box of the category
-    #[arg(long)]
-    pub localisation: bool,
-    /// Save the masks (and relevancy maps) that were scored
+    /// Save the masks that were scored
     #[arg(long, value_name = "DIR")]
     pub save_predictions: Option<PathBuf>,
-    /// Where the scores go.
     #[command(flatten)]
     #[serde(flatten)]
     pub out: Out,
@@ -299,26 +278,21 @@ pub enum Association {
     OneToOne,
     /// Every vertex takes the class of its nearest Gaussian (GaussianWorld, Split&Splat)
     Nearest,
-    /// Every Gaussian gets a true class from the labelled vertices around it and counts by its volume (Dr. Splat, VALA)
-    Volume,
 }
 
 /// `eval scannet`.
 #[derive(Debug, Clone, clap::Args, Serialize)]
 #[command(mut_arg("out", |a| a.value_name("DIR").help("Output folder: metrics.json, table.md")))]
 pub struct ScannetOptions {
-    /// What is scored.
     #[command(flatten)]
     #[serde(flatten)]
     pub inputs: Inputs,
-    /// Where text features come from.
     #[command(flatten)]
     #[serde(flatten)]
     pub texts: TextOptions,
     /// How Gaussians and vertices are brought together
     #[arg(long, value_enum, default_value = "one-to-one")]
     pub association: Association,
-    /// Where the scores go.
     #[command(flatten)]
     #[serde(flatten)]
     pub out: Out,
@@ -331,7 +305,6 @@ pub struct TableOptions {
     /// Folders (or metrics.json files) that eval lerf or eval scannet wrote, one a scene
     #[arg(required = true, value_name = "DIR")]
     pub scenes: Vec<PathBuf>,
-    /// Where the table goes.
     #[command(flatten)]
     #[serde(flatten)]
     pub out: Out,
@@ -353,14 +326,12 @@ pub struct ReportOptions {
     /// Folder of id maps (*_s.npy) [default: masks/ in the run, or language_features/ in the scene]
     #[arg(long, value_name = "DIR")]
     pub masks: Option<PathBuf>,
-    /// What pictures show.
     #[command(flatten)]
     #[serde(flatten)]
     pub views: Views,
-    /// Every how many views one is held out; 0 for none
+    /// Hold out every Nth view, as in training; 0 for none
     #[arg(long, default_value_t = 8, value_name = "N")]
     pub holdout: usize,
-    /// Where the page goes.
     #[command(flatten)]
     #[serde(flatten)]
     pub out: Out,

@@ -4,11 +4,11 @@
 //! [`lerf`], [`scannet`] and [`table`] are the commands. LERF-OVS: [`predict`] makes masks, [`pairs`] scores them. ScanNet:
 //! [`classes`] scores classes of vertices, [`instances`] class-agnostic instances. [`published`] has the published numbers.
 
-pub mod classes;
+pub(crate) mod classes;
 pub mod instances;
-pub mod lerf;
-pub mod pairs;
-pub mod predict;
-pub mod published;
-pub mod scannet;
-pub mod table;
+pub(crate) mod lerf;
+pub(crate) mod pairs;
+pub(crate) mod predict;
+pub(crate) mod published;
+pub(crate) mod scannet;
+pub(crate) mod table;

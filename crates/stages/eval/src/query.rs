@@ -5,13 +5,13 @@
 //! [`show`] writes the answers, [`interactive`] answers texts one by one.
 
 pub mod ask;
-pub mod granularity;
+mod granularity;
 mod image;
 mod interactive;
-pub mod place;
+mod place;
 pub mod ranking;
 pub mod segment;
-pub mod show;
+pub(crate) mod show;
 pub mod text;
 
 use self::ask::{Asked, Asker};

@@ -3,7 +3,7 @@
 //! [`truth`] scores instances against true surfaces, [`label_iou`] against polygons ([`labels`], filled as [`polygon`] says),
 //! both by [`metrics`]; [`scores`] is what comes out.
 
-pub mod label_iou;
+mod label_iou;
 pub mod labels;
 pub mod metrics;
 mod polygon;
@@ -120,7 +120,7 @@ fn score_queries(
         scores.skipped.push(format!("query scores: {} holds no labelled object", folder.display()));
         return Ok(());
     }
-    let answers = predict::ask(asker, &texts, false)?;
+    let answers = predict::ask(asker, &texts)?;
     for (text, _) in answers.iter().filter(|(_, a)| matches!(a, Answer::Unasked(_))) {
         stage.warn(&format!("no text feature of the category {text:?}: it counts as IoU 0"));
     }

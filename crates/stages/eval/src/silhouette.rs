@@ -89,28 +89,6 @@ fn visible(
     shares.iter().map(|share| Mask::above(w, h, share, threshold)).collect()
 }
 
-/// Relevancy rendered as `raster` says, `[height][width]` for each of `relevancies` (a value per instance): every Gaussian has its
-/// instance's value, one of no instance 0, and so has what lies behind the Gaussians.
-///
-/// # Panics
-/// When `label` is not a label per Gaussian or exceeds the instances.
-pub fn relevancy_maps(
-    gaussians: &Gaussians,
-    raster: &RasterOptions,
-    label: &[i32],
-    relevancies: &[&[f32]],
-    camera: &Camera,
-) -> Vec<Vec<f32>> {
-    assert_eq!(label.len(), gaussians.len());
-    blended(gaussians, raster, relevancies.len(), camera, |values, k, d| {
-        for (i, &l) in label.iter().enumerate() {
-            if l >= 0 {
-                values[i * d] = relevancies[k][l as usize];
-            }
-        }
-    })
-}
-
 /// Blends `count` values per Gaussian. `fill(values, k, d)` writes value k of Gaussian i to `values[i * d]`.
 fn blended(
     gaussians: &Gaussians,
@@ -158,29 +136,6 @@ mod tests {
     const VISIBLE: Rendering = Rendering { silhouette: Silhouette::Visible, threshold: 0.5 };
 
     #[test]
-    fn silhouettes_of_a_marked_geometry_are_those_of_the_filtered_render() {
-        let (mut g, camera) = balls();
-        g.log_scales = vec![[-5.0; 3], [-4.2; 3]];
-        let areas = [false, true].map(|antialias| {
-            let raster = RasterOptions::of(&gs_scene::Geometry { antialias, ..Default::default() });
-            let direct = RasterOptions { antialias, ..RasterOptions::default() };
-            let mut pixels = 0;
-            for (own, threshold) in [(0u32, 0.2), (1, 0.2)] {
-                let alone = &Rendering { threshold, ..SELECTED }.masks(&g, &raster, &[&[own]], &camera)[0];
-                let alpha = gs_raster::render(&g.select(&[own]), &camera, &direct).alpha;
-                assert_eq!(*alone, Mask::above(64, 48, &alpha, threshold));
-                let seen = &Rendering { threshold, ..VISIBLE }.masks(&g, &raster, &[&[own]], &camera)[0];
-                let member: Vec<f32> = (0..2).map(|i| f32::from(u8::from(i == own))).collect();
-                let share = gs_raster::render_features(&g, &member, 1, &camera, &direct);
-                assert_eq!(*seen, Mask::above(64, 48, &share, threshold));
-                pixels += alone.count() + seen.count();
-            }
-            pixels
-        });
-        assert!(areas[1] < areas[0], "the filter thins what is smaller than a pixel: {areas:?}");
-    }
-
-    #[test]
     fn a_hidden_part_counts_only_when_rendered_alone() {
         let (g, camera) = balls();
         let far: &[u32] = &[1];
@@ -194,15 +149,6 @@ mod tests {
         let s2 = (f * 0.125).powi(2) + 0.3;
         let area = std::f64::consts::PI * s2 * 2.0 * (0.99753f64 / 0.7).ln();
         assert!((alone.count() as f64 - area).abs() < 0.06 * area + 4.0, "{} {area}", alone.count());
-    }
-
-    #[test]
-    fn relevancy_is_that_of_what_is_seen() {
-        let (g, camera) = balls();
-        let maps = relevancy_maps(&g, &raster(), &[1, 0], &[&[0.25, 1.0], &[0.5, 0.0]], &camera);
-        let centre = 24 * 64 + 32;
-        assert!(maps[0][centre] > 0.95 && maps[1][centre] < 0.03, "the near ball");
-        assert_eq!(relevancy_maps(&g, &raster(), &[-1, -1], &[&[]], &camera)[0], vec![0.0; 64 * 48]);
     }
 
     #[test]

@@ -136,7 +136,7 @@ fn ask(
         Some(b) => b.queries.iter().map(|q| (*q).to_string()).collect(),
         None => categories.iter().map(|c| (*c).clone()).collect(),
     };
-    let mut answers = predict::ask(&asker, &texts, o.localisation)?;
+    let mut answers = predict::ask(&asker, &texts)?;
     drop(asker);
     for category in categories.into_iter().filter(|c| !texts.contains(c)) {
         let why = "the category is not in the benchmark's table of queries";
@@ -172,7 +172,7 @@ fn score(
         let predictions = match (asked, &o.predictions) {
             (Some(a), _) => predict::predict(&a.scene, &a.dataset, frame, &a.answers, rendering, folder)?,
             (None, Some(saved)) => predict::read_predictions(saved, frame)?,
-            (None, None) => Vec::new(),
+            (None, None) => predict::Predictions::new(),
         };
         if let Some(save) = &o.save_predictions {
             predict::save_predictions(save, frame, &predictions)?;
@@ -317,10 +317,10 @@ mod tests {
     fn zeros_are_counted_by_reason() {
         let mut truth = Mask::new(4, 1);
         truth.bits[0] = true;
-        let pair = |c: &str, p: std::result::Result<Mask, String>| Pair::new("frame_00001", c, &truth, &p, None);
+        let pair = |c: &str, p: std::result::Result<Mask, String>| Pair::new("frame_00001", c, &truth, &p);
         let why = || Err("no Gaussian is selected".into());
         let pairs = vec![pair("a", Ok(truth.clone())), pair("c", why()), pair("d", why())];
-        let answer = Answer::Selected { instances: vec![4, 2], score: Some(0.5), gaussians: vec![], relevancy: None };
+        let answer = Answer::Selected { instances: vec![4, 2], score: Some(0.5), gaussians: vec![] };
         let answers = Answers::from([("c".to_string(), answer)]);
         let m = LerfMetrics::new("s".into(), "r".into(), BTreeMap::new(), pairs, &answers, vec![]);
         assert_eq!(

@@ -18,8 +18,6 @@ pub struct Pair {
     pub truth_pixels: usize,
     /// Pixels of the prediction.
     pub predicted_pixels: usize,
-    /// Whether the most relevant pixel lies in a box of the category; none where relevancy is not known.
-    pub localised: Option<bool>,
     /// Why the IoU is 0, where it is.
     pub zero: Option<String>,
 }
@@ -29,13 +27,7 @@ impl Pair {
     ///
     /// # Panics
     /// When the prediction has another size than the truth: callers render or check sizes before.
-    pub fn new(
-        frame: &str,
-        category: &str,
-        truth: &Mask,
-        predicted: &Result<Mask, String>,
-        localised: Option<bool>,
-    ) -> Self {
+    pub fn new(frame: &str, category: &str, truth: &Mask, predicted: &Result<Mask, String>) -> Self {
         let (iou, predicted_pixels, why) = match predicted {
             Ok(mask) => (truth.iou(mask), mask.count(), None),
             Err(why) => (0.0, 0, Some(why.clone())),
@@ -51,7 +43,7 @@ impl Pair {
                 .into()
             })
         });
-        Self { frame: frame.into(), category: category.into(), iou, truth_pixels, predicted_pixels, localised, zero }
+        Self { frame: frame.into(), category: category.into(), iou, truth_pixels, predicted_pixels, zero }
     }
 }
 
@@ -64,8 +56,6 @@ pub struct Figures {
     pub macc25: f64,
     /// Fraction with IoU above 0.5, strictly.
     pub macc50: f64,
-    /// Localisation accuracy over the pairs whose relevancy is known; none without any.
-    pub localisation: Option<f64>,
     /// Number of pairs.
     pub pairs: usize,
 }
@@ -76,12 +66,10 @@ impl Figures {
     /// for no pairs.
     pub fn of_pairs(pairs: &[Pair]) -> Self {
         let ious: Vec<f64> = pairs.iter().map(|p| p.iou).collect();
-        let located: Vec<f64> = pairs.iter().filter_map(|p| p.localised).map(|l| f64::from(u8::from(l))).collect();
         Self {
             miou: mean(&ious),
             macc25: fraction_above(&ious, 0.25),
             macc50: fraction_above(&ious, 0.5),
-            localisation: (!located.is_empty()).then(|| mean(&located)),
             pairs: pairs.len(),
         }
     }
@@ -91,16 +79,13 @@ impl Figures {
         Self::mean(&grouped(pairs, |p| &p.frame).values().map(|p| Self::of_pairs(p)).collect::<Vec<_>>())
     }
 
-    /// The unweighted mean, whatever the numbers of pairs: of a dataset over its scenes (docs/protocols.md). Localisation over
-    /// those that have it.
+    /// The unweighted mean, whatever the numbers of pairs: of a dataset over its scenes (docs/protocols.md).
     pub fn mean(all: &[Self]) -> Self {
         let over = |f: fn(&Self) -> f64| mean(&all.iter().map(f).collect::<Vec<_>>());
-        let located: Vec<f64> = all.iter().filter_map(|s| s.localisation).collect();
         Self {
             miou: over(|s| s.miou),
             macc25: over(|s| s.macc25),
             macc50: over(|s| s.macc50),
-            localisation: (!located.is_empty()).then(|| mean(&located)),
             pairs: all.iter().map(|s| s.pairs).sum(),
         }
     }
@@ -117,65 +102,6 @@ pub fn object_figures(pairs: &[Pair]) -> BTreeMap<String, Figures> {
     grouped(pairs, |p| &p.category).into_iter().map(|(c, pairs)| (c.into(), Figures::of_pairs(&pairs))).collect()
 }
 
-/// Side of the window that smooths relevancy, in pixels.
-const WINDOW: usize = 30;
-/// Smoothed values this near the largest are as large: rendered values carry rounding of about 1e-7.
-const TIE: f64 = 1e-6;
-
-/// Localisation (LangSplat): smooths a relevancy map (`[height][width]`) by the mean over a 30 x 30 window (from 15
-/// pixels before to 14 after, mirrored at the border without repeating it, as `cv2.filter2D` does) and asks whether a
-/// pixel of the largest value lies in any of the `boxes` (x1, y1, x2, y2 in either order, borders included). Values within
-/// 1e-6 of the largest count as equal to it.
-///
-/// # Panics
-/// When `map` is not `width` x `height`.
-pub fn localised(map: &[f32], width: usize, height: usize, boxes: &[[f64; 4]]) -> bool {
-    assert_eq!(map.len(), width * height);
-    if map.is_empty() {
-        return false;
-    }
-    let smooth = smoothed(map, width, height);
-    let largest = smooth.iter().copied().fold(f64::NEG_INFINITY, f64::max);
-    (0..smooth.len()).filter(|&i| smooth[i] >= largest - TIE).any(|i| {
-        let (x, y) = ((i % width) as f64, (i / width) as f64);
-        boxes
-            .iter()
-            .any(|&[x1, y1, x2, y2]| (x1.min(x2)..=x1.max(x2)).contains(&x) && (y1.min(y2)..=y1.max(y2)).contains(&y))
-    })
-}
-
-fn smoothed(map: &[f32], width: usize, height: usize) -> Vec<f64> {
-    // The mean over a square is that over rows of that over columns; each is a difference of running sums.
-    let pass = |values: &[f64], len: usize, lines: usize, at: &dyn Fn(usize, usize) -> usize| {
-        let mut out = vec![0.0; values.len()];
-        for line in 0..lines {
-            let mut sums = vec![0.0];
-            for i in 0..len + WINDOW - 1 {
-                let from = mirrored(i as i64 - (WINDOW / 2) as i64, len as i64);
-                sums.push(sums[i] + values[at(line, from)]);
-            }
-            for i in 0..len {
-                out[at(line, i)] = (sums[i + WINDOW] - sums[i]) / WINDOW as f64;
-            }
-        }
-        out
-    };
-    let values: Vec<f64> = map.iter().map(|&v| f64::from(v)).collect();
-    let rows = pass(&values, width, height, &|y, x| y * width + x);
-    pass(&rows, height, width, &|x, y| y * width + x)
-}
-
-/// Index within 0..n of position `i` when the line is mirrored about its end pixels.
-fn mirrored(mut i: i64, n: i64) -> usize {
-    if n == 1 {
-        return 0;
-    }
-    while !(0..n).contains(&i) {
-        i = if i < 0 { -i } else { 2 * (n - 1) - i };
-    }
-    i as usize
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -187,7 +113,7 @@ mod tests {
     }
 
     fn pair(frame: &str, category: &str, iou: f64) -> Pair {
-        let mut p = Pair::new(frame, category, &block(0, 4), &Ok(block(0, 4)), None);
+        let mut p = Pair::new(frame, category, &block(0, 4), &Ok(block(0, 4)));
         p.iou = iou;
         p
     }
@@ -195,12 +121,12 @@ mod tests {
     #[test]
     fn every_zero_has_a_reason() {
         let truth = block(0, 4);
-        let zero = |p: Result<Mask, String>| Pair::new("f", "c", &truth, &p, None).zero;
+        let zero = |p: Result<Mask, String>| Pair::new("f", "c", &truth, &p).zero;
         assert_eq!(zero(Ok(block(2, 8))), None);
         assert_eq!(zero(Ok(block(9, 9))).unwrap(), "the mask is empty in this view");
         assert_eq!(zero(Ok(block(9, 12))).unwrap(), "the mask misses the object");
         assert_eq!(zero(Err("never asked".into())).unwrap(), "never asked");
-        let p = Pair::new("f", "c", &block(0, 0), &Ok(block(0, 0)), None);
+        let p = Pair::new("f", "c", &block(0, 0), &Ok(block(0, 0)));
         assert_eq!((p.iou, p.zero.unwrap().as_str()), (0.0, "the label covers no pixel"), "an empty union scores 0");
     }
 
@@ -218,29 +144,9 @@ mod tests {
     #[test]
     fn the_dataset_is_the_mean_of_scenes_not_of_pairs() {
         // The paper's own row: 37.62, 36.29, 60.85 and 68.40 make 50.79 although waldo_kitchen has 22 pairs, ramen 71.
-        let scene = |miou: f64, pairs: usize| Figures { miou, macc25: 0.0, macc50: 0.0, localisation: None, pairs };
+        let scene = |miou: f64, pairs: usize| Figures { miou, macc25: 0.0, macc50: 0.0, pairs };
         let all = [scene(37.62, 22), scene(36.29, 71), scene(60.85, 56), scene(68.40, 59)];
         assert!((Figures::mean(&all).miou - 50.79).abs() < 5e-3);
         assert_eq!(Figures::mean(&all).pairs, 208);
-    }
-
-    #[test]
-    fn localisation_looks_at_the_smoothed_peak() {
-        let (w, h) = (80, 60);
-        let mut map = vec![0.0f32; w * h];
-        // A lone bright pixel on the left, a wide weaker patch on the right: smoothing prefers the patch.
-        map[30 * w + 5] = 1.0;
-        (20..40).for_each(|y| map[y * w + 50..y * w + 70].fill(0.5));
-        assert!(localised(&map, w, h, &[[70.0, 40.0, 50.0, 20.0]]), "corners in either order");
-        assert!(!localised(&map, w, h, &[[0.0, 25.0, 10.0, 35.0]]));
-        assert!(localised(&map, w, h, &[[0.0, 0.0, 1.0, 1.0], [59.0, 29.0, 61.0, 31.0]]), "any box");
-        assert!(!localised(&map, w, h, &[]));
-        assert!(localised(&[0.5; 4], 2, 2, &[[1.0, 1.0, 1.0, 1.0]]), "a flat map is all peak, smaller than the window");
-    }
-
-    #[test]
-    fn mirroring_does_not_repeat_the_border() {
-        assert_eq!((-3..7).map(|i| mirrored(i, 4)).collect::<Vec<_>>(), [3, 2, 1, 0, 1, 2, 3, 2, 1, 0]);
-        assert_eq!(mirrored(-100, 1), 0);
     }
 }

@@ -13,8 +13,11 @@ struct LerfRow {
     macc25: [Option<f64>; 5],
 }
 
-const fn all(v: [f64; 5]) -> [Option<f64>; 5] {
-    [Some(v[0]), Some(v[1]), Some(v[2]), Some(v[3]), Some(v[4])]
+const fn full(method: &'static str, source: &'static str, miou: [f64; 5], macc25: [f64; 5]) -> LerfRow {
+    const fn all(v: [f64; 5]) -> [Option<f64>; 5] {
+        [Some(v[0]), Some(v[1]), Some(v[2]), Some(v[3]), Some(v[4])]
+    }
+    LerfRow { method, source, miou: all(miou), macc25: all(macc25) }
 }
 
 /// A row of which only the means are known.
@@ -24,46 +27,21 @@ const fn means(method: &'static str, source: &'static str, miou: f64, macc25: Op
 
 /// Rows under the same rule: selected-only rendering, (frame, category) pairs, mean over scenes; by mean mIoU.
 const LERF: [LerfRow; 15] = [
-    LerfRow {
-        method: "LangSplat",
-        source: "CAGS paper",
-        miou: all([9.18, 7.92, 10.16, 11.38, 9.66]),
-        macc25: all([9.09, 11.27, 8.93, 20.34, 12.41]),
-    },
+    full("LangSplat", "CAGS paper", [9.18, 7.92, 10.16, 11.38, 9.66], [9.09, 11.27, 8.93, 20.34, 12.41]),
     means("LEGaussians", "OpenGaussian paper", 16.21, Some(23.82)),
     means("SuperGSeg", "VALA paper", 35.94, Some(52.02)),
-    LerfRow {
-        method: "OpenGaussian",
-        source: "CAGS paper",
-        miou: all([22.70, 31.01, 39.29, 60.44, 38.36]),
-        macc25: all([31.82, 42.25, 55.36, 76.27, 51.43]),
-    },
-    LerfRow {
-        method: "Dr. Splat",
-        source: "CAGS paper",
-        miou: all([37.05, 24.33, 54.42, 57.35, 43.29]),
-        macc25: all([63.64, 35.21, 80.36, 77.97, 64.30]),
-    },
+    full("OpenGaussian", "CAGS paper", [22.70, 31.01, 39.29, 60.44, 38.36], [31.82, 42.25, 55.36, 76.27, 51.43]),
+    full("Dr. Splat", "CAGS paper", [37.05, 24.33, 54.42, 57.35, 43.29], [63.64, 35.21, 80.36, 77.97, 64.30]),
     means("InstanceGaussian", "COS3D paper", 45.30, Some(58.44)),
     means("Occam's LGS (adapted)", "VALA paper", 47.22, Some(74.84)),
     means("LightSplat", "its authors", 47.58, Some(68.32)),
     means("ProFuse", "its authors", 48.67, None),
     means("VoteSplat", "another's table", 50.10, Some(67.38)),
     means("COS3D", "its paper", 50.76, Some(72.08)),
-    LerfRow {
-        method: "CAGS",
-        source: "its paper",
-        miou: all([37.62, 36.29, 60.85, 68.40, 50.79]),
-        macc25: all([63.64, 46.48, 82.14, 86.44, 69.62]),
-    },
+    full("CAGS", "its paper", [37.62, 36.29, 60.85, 68.40, 50.79], [63.64, 46.48, 82.14, 86.44, 69.62]),
     means("OpenGaFF", "arXiv 2605.06088", 54.36, Some(80.84)),
     means("Split&Splat", "arXiv 2602.03809", 55.68, Some(73.05)),
-    LerfRow {
-        method: "VALA",
-        source: "arXiv 2509.05515v2",
-        miou: all([55.71, 45.41, 60.38, 70.61, 58.02]),
-        macc25: all([86.36, 67.61, 89.29, 88.14, 82.85]),
-    },
+    full("VALA", "arXiv 2509.05515v2", [55.71, 45.41, 60.38, 70.61, 58.02], [86.36, 67.61, 89.29, 88.14, 82.85]),
 ];
 
 /// The paper's LERF-OVS table: published rows, then ours, in percent. `scenes` are the figures of the scenes scored, by
@@ -96,9 +74,6 @@ pub fn lerf_sheet(scenes: &[(String, Figures)], notes: Vec<String>) -> Sheet {
     rows.push(Row::measured("ours", cells));
     let mut remarks =
         vec![format!("Ours also: mAcc@0.5 {:.2}, {} (frame, category) pairs.", 100.0 * ours.macc50, ours.pairs)];
-    if let Some(l) = ours.localisation {
-        remarks.push(format!("Localisation accuracy {:.2}.", 100.0 * l));
-    }
     if !LERF_OVS.iter().all(|s| of(s.name).is_some()) {
         remarks.push("Our mean is over the scenes scored here, not over the four of the published means: do not compare it with them.".into());
     }
@@ -180,7 +155,7 @@ mod tests {
 
     #[test]
     fn tables_have_as_many_cells_in_every_row() {
-        let f = Figures { miou: 0.5079, macc25: 0.6962, macc50: 0.4, localisation: Some(0.5), pairs: 59 };
+        let f = Figures { miou: 0.5079, macc25: 0.6962, macc50: 0.4, pairs: 59 };
         for scenes in [vec![("teatime".to_string(), f)], vec![("my|room".into(), f), ("ramen".into(), f)]] {
             let t = lerf_sheet(&scenes, vec!["a note".into()]).markdown();
             let rows: Vec<usize> =

@@ -1,6 +1,6 @@
 //! `eval scannet`: semantic classes and class-agnostic instances of a ScanNet scan.
 
-use super::classes::{self, Confusion, SETS, Truth};
+use super::classes::{self, Confusion, SETS};
 use super::instances::{self, InstanceFigures};
 use super::lerf::{outputs, sources};
 use super::published::{self, SetRow};
@@ -139,11 +139,11 @@ struct Matched {
 fn matched(scene: &LabelledScene, vertices: &[[f32; 3]], association: Association, labels: &Path) -> Result<Matched> {
     let g = scene.gaussians();
     let seen = seen(scene);
-    if association != Association::OneToOne {
+    if association == Association::Nearest {
         let candidates: Vec<u32> = (0..g.len() as u32).filter(|&i| seen[i as usize]).collect();
         return Ok(Matched { gaussian: nearest(g, &candidates, vertices), counts: vec![true; vertices.len()] });
     }
-    let hint = "the geometry was densified, pruned or moved: use --association nearest or volume";
+    let hint = "the geometry was densified, pruned or moved: use --association nearest";
     if g.len() != vertices.len() {
         return Err(Error::new("not a Gaussian per vertex")
             .file(labels)
@@ -200,9 +200,9 @@ pub(crate) fn run(o: &ScannetOptions, parameters: Value, stage: &Stage) -> Resul
     if let Some(source) = source {
         let names: Vec<String> = artifacts::NYU40.iter().map(|c| c.1.to_string()).collect();
         let texts = source.known(&names, "--text-features")?;
-        let truth = Labelled { vertices: &vertices, labels: &labels, matched: &matched };
+        let truth = Labelled { labels: &labels, matched: &matched };
         for size in SETS {
-            sets.push(truth.score(&scene, size, &texts, o.association, min_support, &mut notes));
+            sets.push(truth.score(&scene, size, &texts, min_support, &mut notes));
         }
     } else {
         notes.push("no class scores: neither --clip nor --text-features was given".to_string());
@@ -223,7 +223,6 @@ fn rule(association: Association, min_support: u32) -> String {
     let association = match association {
         Association::OneToOne => "Gaussian i is vertex i",
         Association::Nearest => "every vertex takes its nearest Gaussian",
-        Association::Volume => "volume-aware pseudo-truth per Gaussian",
     };
     format!(
         "{association}; Gaussians of opacity below {MIN_OPACITY} left out; instances matched in fewer than {min_support} \
@@ -233,7 +232,6 @@ fn rule(association: Association, min_support: u32) -> String {
 
 /// The labelled vertices of a scan.
 struct Labelled<'a> {
-    vertices: &'a [[f32; 3]],
     labels: &'a [u32],
     matched: &'a Matched,
 }
@@ -247,29 +245,20 @@ impl Labelled<'_> {
         scene: &LabelledScene,
         size: usize,
         texts: &[Vec<f32>],
-        association: Association,
         min_support: u32,
         notes: &mut Vec<String>,
     ) -> SetFigures {
         let set = classes::class_set(size).expect("a known size");
         let class = gaussian_classes(scene, &set, texts, min_support);
         let truth = classes::truth_classes(self.labels, &set);
-        // True class, weight and Gaussian of every point that takes part.
-        let points: Vec<(Truth, Option<u32>)> = if association == Association::Volume {
-            let truth = classes::volume_truth(scene.gaussians(), self.vertices, &truth, set.len());
-            let seen = seen(scene);
-            (0..truth.len()).filter(|&i| seen[i]).map(|i| (truth[i], Some(i as u32))).collect()
-        } else {
-            let counted = (0..truth.len()).filter(|&v| self.matched.counts[v]);
-            counted.map(|v| ((truth[v], 1.0), self.matched.gaussian[v])).collect()
-        };
-        let lost =
-            points.iter().filter(|(t, i)| t.0.is_some() && i.is_none_or(|i| class[i as usize].is_none())).count();
+        let counted = || (0..truth.len()).filter(|&v| self.matched.counts[v]);
+        let of = |v: usize| self.matched.gaussian[v].map(|i| class[i as usize]);
+        let lost = counted().filter(|&v| truth[v].is_some() && of(v).flatten().is_none()).count();
         if lost > 0 {
             notes.push(format!("{size} classes: {lost} labelled points have no descriptor and get {:?}", set[0].1));
         }
-        let predicted = |i: u32| class[i as usize].unwrap_or(0);
-        let confusion = Confusion::of(set.len(), points.into_iter().map(|(t, i)| (t, i.map(predicted))));
+        let points = counted().map(|v| (truth[v], of(v).map(|class| class.unwrap_or(0))));
+        let confusion = Confusion::of(set.len(), points);
         if confusion.means().is_none() {
             notes.push(format!("{size} classes: no labelled point takes part, so there is no score"));
         }

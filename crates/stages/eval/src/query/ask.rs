@@ -157,15 +157,4 @@ impl<'a> Asker<'a> {
         let gaussians = self.index.members(&selected);
         Answered { ranking, selected, score, gaussians }
     }
-
-    /// Relevancy of every instance for a map of it, 0 to 1: LERF's with negatives, else (1 + cosine) / 2; 0 for an
-    /// instance without a descriptor.
-    ///
-    /// # Panics
-    /// As [`Self::answer`].
-    pub fn relevancy(&self, feature: &[f32]) -> Vec<f32> {
-        let plain = self.scoring.negatives.is_empty();
-        let one = |s: Option<f32>| s.map_or(0.0, |s| if plain { 0.5 * (1.0 + s) } else { s });
-        self.index.scores(feature, &self.scoring).into_iter().map(one).collect()
-    }
 }

@@ -5,8 +5,8 @@ use super::ask::{Answered, Asked};
 use crate::options::Granularity;
 use artifacts::Instances;
 
-/// The answer at a granularity: one, or with parts one for the instance and one for each part. `say` is told where
-/// the tree has nothing coarser or finer, and the answer stays as it is.
+/// The answer at a granularity: one, or with parts one for the instance and one for each part. Where the
+/// tree has nothing coarser or finer, the answer stays as it is and `say` gets the reason.
 pub fn apply(granularity: Granularity, instances: &Instances, asked: Asked, say: &dyn Fn(&str)) -> Vec<Asked> {
     let Some(&best) = asked.answer.selected.first().filter(|_| granularity != Granularity::Instance) else {
         return vec![asked];

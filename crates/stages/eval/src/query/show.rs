@@ -218,7 +218,7 @@ impl Asked {
 }
 
 impl QueryResults {
-    /// What is said of queries that select nothing.
+    /// A warning for each query that selects nothing.
     pub fn warnings(&self) -> impl Iterator<Item = String> {
         self.queries.iter().filter(|q| q.gaussians == 0).map(|q| {
             if q.selected.is_empty() {

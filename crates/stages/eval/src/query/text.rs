@@ -64,7 +64,7 @@ impl TextTable {
     }
 }
 
-/// Largest array of an npz that is believed, in bytes: a vector of text features has a few thousand.
+/// Largest array of an npz that is read, in bytes: a vector of text features has a few thousand.
 const LARGEST_ARRAY: u64 = 1 << 24;
 
 fn read_npz(bytes: &[u8]) -> Result<BTreeMap<String, Vec<f32>>> {
@@ -132,7 +132,7 @@ impl TextSource {
         let made_with = |role: &str| scene.artifact.provenance().inputs.get(role).cloned();
         let (image, text) = (made_with(role::CLIP), made_with(role::CLIP_TEXT));
         let unknown = image.is_none() && text.is_none();
-        // The text encoder is open, and has its hash already; the image encoder is read only where that does not tell.
+        // The text encoder is open, and has its hash already; the image encoder is read only where that is not enough.
         if unknown || text == Some(self.hash()?) || image.is_some() && image == ClipImage::hash_in(clip) {
             return Ok(());
         }

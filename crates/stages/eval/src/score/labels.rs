@@ -11,7 +11,7 @@ use serde::Deserialize;
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
 
-/// Largest width or height of a labelled frame that is believed, in pixels.
+/// Largest accepted width or height of a labelled frame, in pixels.
 const MAX_SIDE: u64 = 1 << 15;
 /// Pixels that the masks of all categories of a frame may have at most: a small file of polygons can ask for any number.
 const MAX_PIXELS: u64 = 1 << 28;
@@ -27,8 +27,6 @@ pub struct FrameLabels {
     pub height: u32,
     /// Pixels of each category; several polygons of one category are joined.
     pub categories: BTreeMap<String, Mask>,
-    /// Boxes of each category, x1 y1 x2 y2 in pixels: one per polygon as the file gives it, or else around the polygon.
-    pub boxes: BTreeMap<String, Vec<[f64; 4]>>,
 }
 
 impl FrameLabels {
@@ -77,16 +75,6 @@ struct Info {
 struct Object {
     category: String,
     segmentation: Vec<[f64; 2]>,
-    #[serde(default)]
-    bbox: Option<Vec<f64>>,
-}
-
-/// The box around some points; none for none.
-fn box_around(points: impl Iterator<Item = [f64; 2]>) -> Option<[f64; 4]> {
-    points.fold(None, |b: Option<[f64; 4]>, [x, y]| {
-        let [x1, y1, x2, y2] = b.unwrap_or([x, y, x, y]);
-        Some([x1.min(x), y1.min(y), x2.max(x), y2.max(y)])
-    })
 }
 
 /// Reads all `*.json` of a label folder, by name.
@@ -97,17 +85,17 @@ pub fn read_folder(folder: impl AsRef<Path>) -> Result<Vec<FrameLabels>> {
     files(folder.as_ref())?.iter().map(read).collect()
 }
 
-/// All `*.json` of a folder, by name.
-fn files(folder: &Path) -> Result<Vec<PathBuf>> {
-    let mut paths = Vec::new();
-    for entry in std::fs::read_dir(folder).at("list", folder)? {
-        let path = entry.at("list", folder)?.path();
-        if path.extension().is_some_and(|e| e == "json") {
-            paths.push(path);
-        }
-    }
+/// What a folder holds, by name.
+fn list(folder: &Path) -> Result<Vec<PathBuf>> {
+    let entries = std::fs::read_dir(folder).at("list", folder)?;
+    let mut paths = entries.map(|e| Ok(e.at("list", folder)?.path())).collect::<Result<Vec<_>>>()?;
     paths.sort();
     Ok(paths)
+}
+
+/// All `*.json` of a folder, by name.
+fn files(folder: &Path) -> Result<Vec<PathBuf>> {
+    Ok(list(folder)?.into_iter().filter(|p| p.extension().is_some_and(|e| e == "json")).collect())
 }
 
 /// Pixels of the masks of all categories of all frames of a label folder, a byte each in memory; files that cannot be read
@@ -126,11 +114,7 @@ pub fn read(path: impl AsRef<Path>) -> Result<FrameLabels> {
     let isat = parse(path)?;
     let (width, height) = (isat.info.width as u32, isat.info.height as u32);
     let mut categories = BTreeMap::new();
-    let mut boxes = BTreeMap::<String, Vec<[f64; 4]>>::new();
     for object in &isat.objects {
-        let given = object.bbox.as_deref().and_then(|b| <[f64; 4]>::try_from(b).ok());
-        let around = given.or_else(|| box_around(object.segmentation.iter().copied()));
-        boxes.entry(object.category.clone()).or_default().extend(around);
         // JSON has no infinities or NaN; the cast truncates toward zero and saturates.
         let vertices: Vec<[i64; 2]> = object.segmentation.iter().map(|&[x, y]| [x as i64, y as i64]).collect();
         let mask =
@@ -138,7 +122,7 @@ pub fn read(path: impl AsRef<Path>) -> Result<FrameLabels> {
         fill_polygon(mask, &vertices);
     }
     let frame = path.file_stem().unwrap_or_default().to_string_lossy().into_owned();
-    Ok(FrameLabels { frame, width, height, categories, boxes })
+    Ok(FrameLabels { frame, width, height, categories })
 }
 
 /// Reads one label file without filling its polygons.
@@ -183,23 +167,16 @@ pub fn read_mask(path: &Path) -> Result<Mask> {
 }
 
 /// Reads the pictures that LangSplat's scorer made of the labels, `<folder>/<frame>/<category>.jpg` (or png), with pixels
-/// above [`GREY`]. Boxes are those around the pixels.
+/// above [`GREY`].
 ///
 /// # Errors
 /// When the folder cannot be read, a file is no picture, or pictures of one frame differ in size.
 pub fn read_pictures(folder: impl AsRef<Path>) -> Result<Vec<FrameLabels>> {
     let folder = folder.as_ref();
-    let list = |folder: &Path| -> Result<Vec<PathBuf>> {
-        let entries = std::fs::read_dir(folder).at("list", folder)?;
-        let mut paths = entries.map(|e| Ok(e.at("list", folder)?.path())).collect::<Result<Vec<_>>>()?;
-        paths.sort();
-        Ok(paths)
-    };
     let mut frames = Vec::new();
     for place in list(folder)?.into_iter().filter(|p| p.is_dir()) {
         let frame = place.file_name().unwrap_or_default().to_string_lossy().into_owned();
-        let mut labels =
-            FrameLabels { frame, width: 0, height: 0, categories: BTreeMap::new(), boxes: BTreeMap::new() };
+        let mut labels = FrameLabels { frame, width: 0, height: 0, categories: BTreeMap::new() };
         for path in list(&place)? {
             if !path.extension().is_some_and(|e| ["jpg", "jpeg", "png"].iter().any(|k| e == *k)) {
                 continue;
@@ -214,9 +191,6 @@ pub fn read_pictures(folder: impl AsRef<Path>) -> Result<Vec<FrameLabels>> {
                     .expected(format!("{}x{}", labels.width, labels.height)));
             }
             let category = path.file_stem().unwrap_or_default().to_string_lossy().into_owned();
-            let lit = (0..mask.bits.len()).filter(|&i| mask.bits[i]);
-            let around = box_around(lit.map(|i| [(i % mask.width) as f64, (i / mask.width) as f64]));
-            labels.boxes.insert(category.clone(), around.into_iter().collect());
             labels.categories.insert(category, mask);
         }
         if !labels.categories.is_empty() {
@@ -249,8 +223,6 @@ mod tests {
         assert_eq!((labels.frame.as_str(), labels.width, labels.height), ("frame_00007", 20, 10));
         assert_eq!(labels.categories["cup"].count(), 4 * 3 + 4, "truncated corners, borders included");
         assert_eq!(labels.categories["lid"].count(), 0);
-        assert_eq!(labels.boxes["cup"], [[1.0, 1.0, 4.0, 3.0], [10.0, 1.0, 11.0, 2.0]], "given, or around the polygon");
-        assert_eq!(labels.boxes["lid"].len(), 0);
         assert_eq!(read_folder(dir.path()).unwrap(), [labels]);
     }
 
@@ -266,7 +238,6 @@ mod tests {
         assert_eq!((labels.len(), labels[0].frame.as_str(), labels[0].width), (1, "frame_00007", 4));
         let cup = &labels[0].categories["red cup"];
         assert_eq!(cup.bits, [false, false, true, true, false, false, true, false], "10 is still ringing");
-        assert_eq!(labels[0].boxes["red cup"], [[2.0, 0.0, 3.0, 1.0]]);
         image::GrayImage::new(3, 2).save(place.join("spoon.png")).unwrap();
         assert!(read_pictures(dir.path()).unwrap_err().to_string().contains("differ in size; found 3x2, expected 4x2"));
         std::fs::write(place.join("spoon.png"), "no").unwrap();

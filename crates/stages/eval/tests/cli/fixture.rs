@@ -218,6 +218,14 @@ impl Fixture {
         String::from_utf8(o.stdout).unwrap()
     }
 
+    /// Runs `eval`, expects success, and gives what it said on standard error.
+    pub fn warned(&self, command: &str, arguments: &str) -> String {
+        let o = self.eval(command, arguments);
+        let said = String::from_utf8(o.stderr).unwrap();
+        assert!(o.status.success(), "{said}");
+        said
+    }
+
     /// Runs `eval`, expects exit code 2 and one line of error, and gives that line.
     pub fn bad(&self, command: &str, arguments: &str) -> String {
         let o = self.eval(command, arguments);

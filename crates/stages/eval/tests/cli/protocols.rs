@@ -243,13 +243,13 @@ fn the_protocols_agree_with_an_independent_implementation() {
     for (rendering, averaging, figures) in [("selected", "objects", "figures"), ("visible", "frames", "frame_figures")]
     {
         let folder = format!("{saved}-{rendering}");
-        let rest = ["--silhouette", rendering, "--localisation", "--save-predictions", &folder];
+        let rest = ["--silhouette", rendering, "--save-predictions", &folder];
         let ours = s.metrics("lerf", &rest);
         assert!(ours["figures"]["pairs"].as_u64().unwrap() >= 8, "{}", ours["figures"]);
         spread.push(ours["figures"]["miou"].as_f64().unwrap());
         let case = format!("lerf {rendering}");
         let Some(theirs) = oracle.ask(&case, &["lerf", &labels, &folder, "--averaging", averaging]) else { continue };
-        for figure in ["miou", "macc25", "macc50", "localisation"] {
+        for figure in ["miou", "macc25", "macc50"] {
             same(&ours[figures][figure], &theirs[figure], &format!("{case} {figure}"));
         }
         let pairs = theirs["pairs"].as_array().unwrap();
@@ -257,7 +257,6 @@ fn the_protocols_agree_with_an_independent_implementation() {
         for (a, b) in ours["pairs"].as_array().unwrap().iter().zip(pairs) {
             assert_eq!((&a["frame"], &a["category"]), (&b["frame"], &b["category"]));
             same(&a["iou"], &b["iou"], &format!("{case} {} {}", a["frame"], a["category"]));
-            same(&a["localised"], &b["localised"], &format!("{case} {} {}", a["frame"], a["category"]));
         }
         assert!(ours["notes"].to_string().contains("it has no text feature"), "{}", ours["notes"]);
     }
@@ -282,7 +281,7 @@ fn the_protocols_agree_with_an_independent_implementation() {
     let (geometry, instances, texts, scan) =
         (text(s.geometry()), text(s.instances()), text(s.texts()), text(s.scene()));
     let mut seen = Vec::new();
-    for rest in [&["--association", "one-to-one"][..], &["--association", "nearest"], &["--association", "volume"]] {
+    for rest in [&["--association", "one-to-one"][..], &["--association", "nearest"]] {
         let ours = s.metrics("scannet", rest);
         let case = format!("scannet {}", rest.join(" "));
         let arguments = [&["scannet", &geometry, &instances, &texts, &scan], rest].concat();
@@ -363,7 +362,7 @@ fn damaged_gaussians_leave_the_evaluation_of_a_scan() {
     assert!(notes.contains(&format!("{} of {} vertices leave the evaluation", faint + 2, g.len())), "{notes}");
     let notes = s.metrics("scannet", &["--association", "nearest"])["notes"].to_string();
     assert!(!notes.contains("leave the evaluation"), "{notes}");
-    let said = String::from_utf8(s.run("scannet", &["--association", "volume"]).stderr).unwrap();
+    let said = String::from_utf8(s.run("scannet", &["--association", "nearest"]).stderr).unwrap();
     assert!(said.contains(&format!("skipped 2 of {} Gaussians: damaged", g.len())), "{said}");
 }
 
