@@ -226,11 +226,7 @@ pub enum Truth {
 
 /// `eval lerf`.
 #[derive(Debug, Clone, clap::Args, Serialize)]
-#[command(
-    mut_arg("scene", unless_predicted),
-    mut_arg("geometry", unless_predicted),
-    mut_arg("instances", unless_predicted)
-)]
+#[command(mut_args(unless_predicted))]
 #[command(mut_arg("out", |a| a.value_name("DIR").help("Output folder: metrics.json, table.md")))]
 pub struct LerfOptions {
     #[command(flatten)]
@@ -266,8 +262,12 @@ pub struct LerfOptions {
     pub out: Out,
 }
 
+/// The inputs are required unless masks of another program are scored.
 fn unless_predicted(argument: clap::Arg) -> clap::Arg {
-    argument.required(false).required_unless_present("predictions")
+    match argument.get_id().as_str() {
+        "scene" | "geometry" | "instances" => argument.required(false).required_unless_present("predictions"),
+        _ => argument,
+    }
 }
 
 /// How Gaussians and the scan's vertices are brought together.

@@ -91,7 +91,7 @@ impl Figures {
     }
 }
 
-fn grouped<'a>(pairs: &'a [Pair], key: fn(&Pair) -> &String) -> BTreeMap<&'a str, Vec<Pair>> {
+fn grouped(pairs: &[Pair], key: fn(&Pair) -> &String) -> BTreeMap<&str, Vec<Pair>> {
     let mut groups = BTreeMap::<&str, Vec<Pair>>::new();
     pairs.iter().for_each(|p| groups.entry(key(p)).or_default().push(p.clone()));
     groups
