@@ -26,7 +26,7 @@ macro_rules! formats {
 formats!(ply, colmap_bin, colmap_txt, transforms, npy, npz, artifact, labels, scannet, id_png);
 
 #[test]
-fn findings_stay_mended() {
+fn findings_stay_fixed() {
     let mut count = 0;
     for format in &FORMATS {
         let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("testdata").join(format.name);
