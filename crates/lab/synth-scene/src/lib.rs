@@ -11,6 +11,7 @@
 
 pub mod memory;
 pub mod options;
+mod random;
 pub mod render;
 pub mod scene;
 #[cfg(test)]

@@ -17,7 +17,6 @@ pub struct Amounts {
 pub fn forecast(a: &Amounts) -> u64 {
     // Rehashing touches every bucket of the table of cells, of which there is a power of two.
     let buckets = (a.points * 8 / 7).next_power_of_two();
-    // Fitted to measured peaks (docs/performance.md). Photographs are traced and packed besides what masks need.
-    let pixel = if a.texels == 0 { 75 } else { 100 };
-    (7_200_000 + pixel * a.pixels + 32 * a.texels + 50 * a.points + 17 * buckets + 30 * a.vertices) as u64
+    // Fitted to measured peaks, which tests/cli.rs holds it against.
+    (7_200_000 + 75 * a.pixels + 32 * a.texels + 50 * a.points + 17 * buckets + 30 * a.vertices) as u64
 }

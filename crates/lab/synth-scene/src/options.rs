@@ -6,11 +6,10 @@ use crate::scene::Family;
 use crate::truth::benchmark::{Layout, LayoutName};
 use crate::truth::language::Speech;
 use crate::truth::masks::Faults;
-use crate::write;
 use clap::{Parser, ValueEnum};
 use gs_io::{Error, Result};
 use serde::Serialize;
-use stage::{CommonArgs, Program, Stage, within};
+use stage::{CommonArgs, within};
 use std::path::PathBuf;
 
 /// Make a room with things in it: photographs, poses, id maps, and the truth about all of them
@@ -23,12 +22,12 @@ use std::path::PathBuf;
 pub struct Args {
     /// Folder to write; an earlier synthetic scene in it is replaced
     #[arg(long, value_name = "DIR", required_unless_present = "masks_to")]
-    out: Option<PathBuf>,
+    pub(crate) out: Option<PathBuf>,
     /// Write only the masks of the scene, without photographs, into this folder: <view>_s.npy (and <view>_f.npy and
     /// text_features.json with --features), and masks.json, which says what each mask shows. Things and cameras do not
     /// depend on the faults, so the photographs of one scene serve many sets of masks
     #[arg(long, value_name = "DIR", conflicts_with = "out")]
-    masks_to: Option<PathBuf>,
+    pub(crate) masks_to: Option<PathBuf>,
     /// Names and places of the files: as COLMAP writes them, or as in a benchmark
     #[arg(long, value_enum, default_value = "colmap", conflicts_with = "masks_to")]
     layout: LayoutName,
@@ -78,7 +77,7 @@ pub struct Args {
     #[arg(long)]
     features: bool,
     #[command(flatten)]
-    common: CommonArgs,
+    pub(crate) common: CommonArgs,
 }
 
 /// Sizes of scenes.
@@ -160,31 +159,29 @@ pub struct Options {
 impl Default for Options {
     /// The demo's scene with perfect masks.
     fn default() -> Self {
-        Self {
-            seed: 0,
-            family: Family::Studio,
-            objects: 10,
-            views: 30,
-            width: 480,
-            height: 360,
-            points: 9_000,
-            faults: Faults::default(),
-            speech: None,
-            pose_noise: 0.0,
-            label_every: LABEL_EVERY,
-            layout: Layout::Colmap,
-        }
+        Size::Demo.options()
+    }
+}
+
+impl Size {
+    /// A studio of this size with perfect masks.
+    fn options(self) -> Options {
+        let (objects, views, width, height, points) = match self {
+            Self::Tiny => (8, 8, 160, 120, 1_500),
+            Self::Demo => (10, 30, 480, 360, 9_000),
+            Self::Large => (40, 120, 640, 480, 40_000),
+        };
+        let (family, faults, layout) = (Family::Studio, Faults::default(), Layout::Colmap);
+        let (seed, speech, pose_noise, label_every) = (0, None, 0.0, LABEL_EVERY);
+        Options { seed, family, objects, views, width, height, points, faults, speech, pose_noise, label_every, layout }
     }
 }
 
 impl Args {
-    fn options(&self, seed: u64) -> Result<Options> {
-        let (objects, views, width, height, points) = match self.size {
-            Size::Tiny => (8, 8, 160, 120, 1_500),
-            Size::Demo => (10, 30, 480, 360, 9_000),
-            Size::Large => (40, 120, 640, 480, 40_000),
-        };
-        let objects = self.objects.unwrap_or(objects);
+    /// The scene that the options describe.
+    pub(crate) fn options(&self, seed: u64) -> Result<Options> {
+        let size = self.size.options();
+        let objects = self.objects.unwrap_or(size.objects);
         if self.family == Family::Studio && objects > MOST_IN_STUDIO {
             return Err(Error::new("too many things for a studio")
                 .field("--objects")
@@ -197,10 +194,10 @@ impl Args {
             seed,
             family: self.family,
             objects,
-            views: self.views.unwrap_or(views),
-            width: self.width.unwrap_or(width),
-            height: self.height.unwrap_or(height),
-            points: self.points.unwrap_or(points),
+            views: self.views.unwrap_or(size.views),
+            width: self.width.unwrap_or(size.width),
+            height: self.height.unwrap_or(size.height),
+            points: self.points.unwrap_or(size.points),
             faults: Faults {
                 granularity: self.granularity_p.unwrap_or(faults.granularity),
                 boundary: self.boundary_noise.unwrap_or(faults.boundary),
@@ -209,29 +206,8 @@ impl Args {
             },
             speech: self.features.then(|| self.corruption.speech()),
             pose_noise: self.pose_noise,
-            label_every: LABEL_EVERY,
             layout: self.out.as_deref().map_or(Ok(Layout::Colmap), |out| Layout::new(self.layout, out))?,
+            ..size
         })
-    }
-}
-
-impl Program for Args {
-    const NAME: &'static str = "synth-scene";
-
-    fn common(&self) -> &CommonArgs {
-        &self.common
-    }
-
-    fn check(&self) -> Result<()> {
-        self.options(self.common.seed).map(drop)
-    }
-
-    fn run(self, stage: &Stage) -> Result<()> {
-        let options = self.options(stage.seed())?;
-        match (&self.out, &self.masks_to) {
-            (_, Some(folder)) => write::run_masks(stage, folder, &options),
-            (Some(out), None) => write::run(stage, out, &options),
-            (None, None) => Err(Error::new("no folder to write to").field("--out")),
-        }
     }
 }

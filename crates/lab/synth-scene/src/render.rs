@@ -64,46 +64,30 @@ fn shown(scene: &Scene, camera: &Camera, eye: DVec3, x: usize, y: usize) -> (i32
 
 /// Renders the scene; the same bytes for any number of threads.
 pub fn render(scene: &Scene, light: &LightMap, camera: &Camera) -> Frame {
-    let (w, h) = (camera.width as usize, camera.height as usize);
-    struct Row {
-        rgb: Vec<u8>,
-        thing: Vec<i32>,
-        part: Vec<i32>,
-        distance: Vec<f64>,
-    }
     let eye = camera.position();
-    let rows: Vec<Row> = (0..h)
-        .into_par_iter()
-        .map(|y| {
-            let mut row = Row {
-                rgb: Vec::with_capacity(3 * w),
-                thing: vec![-1; w],
-                part: vec![-1; w],
-                distance: vec![f64::INFINITY; w],
-            };
-            for x in 0..w {
-                (row.thing[x], row.part[x], row.distance[x]) = shown(scene, camera, eye, x, y);
-                let mut sum = DVec3::ZERO;
-                for [sx, sy] in SAMPLES {
-                    let direction = ray(camera, x as f64 + sx, y as f64 + sy);
-                    if let Some(hit) = scene.trace(eye, direction, 0.0) {
-                        // Each sample is clipped by itself, or bright ones would eat the edges around them.
-                        sum += (EXPOSURE * shade_with_mirror(scene, light, direction, &hit)).min(DVec3::ONE);
-                    }
-                }
-                row.rgb.extend((sum / SAMPLES.len() as f64).to_array().map(to_srgb8));
+    let pixel = |at: usize| {
+        let (x, y) = (at % camera.width as usize, at / camera.width as usize);
+        let mut sum = DVec3::ZERO;
+        for [sx, sy] in SAMPLES {
+            let direction = ray(camera, x as f64 + sx, y as f64 + sy);
+            if let Some(hit) = scene.trace(eye, direction, 0.0) {
+                // Each sample is clipped by itself, or bright ones would eat the edges around them.
+                sum += (EXPOSURE * shade_with_mirror(scene, light, direction, &hit)).min(DVec3::ONE);
             }
-            row
-        })
-        .collect();
-    let mut frame =
-        Frame { width: w, height: h, rgb: Vec::new(), thing: Vec::new(), part: Vec::new(), distance: Vec::new() };
-    for row in rows {
-        frame.rgb.extend(row.rgb);
-        frame.thing.extend(row.thing);
-        frame.part.extend(row.part);
-        frame.distance.extend(row.distance);
-    }
+        }
+        (sum / SAMPLES.len() as f64).to_array().map(to_srgb8)
+    };
+    let mut frame = identify(scene, camera);
+    let row = frame.width;
+    frame.rgb = vec![0; 3 * frame.thing.len()];
+    frame
+        .rgb
+        .as_chunks_mut::<3>()
+        .0
+        .par_iter_mut()
+        .with_min_len(row)
+        .enumerate()
+        .for_each(|(at, rgb)| *rgb = pixel(at));
     frame
 }
 

@@ -5,6 +5,7 @@ use crate::render::{self, Frame};
 use crate::scene::Scene;
 use crate::scene::cameras;
 use crate::scene::layout;
+use crate::things::shape::{ChartPoint, Shape};
 use crate::truth::polygon::Polygon;
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
@@ -21,6 +22,12 @@ pub fn example() -> &'static (Scene, Frame) {
         let frame = render::render(&scene, &light, &cameras[1]);
         (scene, frame)
     })
+}
+
+/// Places all over the chart of a shape, `n` x `n` a face, from edge to edge.
+pub fn chart_points(shape: &Shape, n: u32) -> impl Iterator<Item = ChartPoint> + use<> {
+    let at = move |k: u32| f64::from(k) / f64::from(n - 1);
+    (0..shape.faces()).flat_map(move |face| (0..n * n).map(move |k| ChartPoint { face, u: at(k % n), v: at(k / n) }))
 }
 
 /// What OpenCV's fillPoly does with whole coordinates: even-odd inside, and the line itself.

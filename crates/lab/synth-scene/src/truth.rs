@@ -7,3 +7,13 @@ pub mod masks;
 pub mod points;
 pub mod polygon;
 pub mod scannet;
+
+use gs_io::{Error, Result, write_bytes};
+use serde::Serialize;
+use std::path::Path;
+
+/// Writes a JSON file.
+pub(crate) fn write_json(path: &Path, value: &impl Serialize) -> Result<()> {
+    let json = serde_json::to_vec(value).map_err(|e| Error::new(e.to_string()).file(path))?;
+    write_bytes(path, &json)
+}

@@ -1,22 +1,23 @@
 //! The program told from beginning to end: furnish a room, photograph it, write all of it.
 
 use crate::memory::{self, Amounts};
+use crate::options::Args;
 pub use crate::options::Options;
 use crate::render::light::LightMap;
 use crate::render::{self, Frame};
 use crate::scene::{Family, Scene, cameras, families};
-use crate::truth::benchmark::{self, Layout};
+use crate::truth::benchmark::{FOLDERS, Layout};
 use crate::truth::language::Language;
 use crate::truth::masks;
 use crate::truth::points::{self, Collector};
-use crate::truth::{label, scannet};
+use crate::truth::{label, scannet, write_json};
 use artifacts::{MaskTruth, TrueObject, TruePart, TruePoints, TrueScene, features_path, maps_path};
-use gs_io::{Claim, Error, IoContext, Outputs, Result, create_dir, npy, write_bytes};
+use gs_io::{Claim, Error, IoContext, Outputs, Result, create_dir, npy};
 use gs_scene::{Camera, Image, PointCloud, colmap};
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
 use serde_json::{Value, json};
-use stage::Stage;
+use stage::{CommonArgs, Program, Stage};
 use std::collections::BTreeMap;
 use std::path::Path;
 
@@ -26,8 +27,6 @@ const POINT_NOISE: f64 = 0.003;
 const FINE_HEIGHT: f64 = 360.0;
 /// What takes less memory.
 const FEWER: &str = "make smaller photographs (--width, --height) or fewer of them";
-/// Folders of a scene, all of which this program owns.
-const FOLDERS: [&str; 5] = ["images", "sparse", "language_features", "label", "truth"];
 /// Folder of the scan, which only furnished rooms have.
 const SCAN: &str = "scan";
 /// Streams of the random generator, so that more views do not move the furniture.
@@ -39,6 +38,27 @@ const VERTICES: u64 = 4;
 const FIRST_VIEW: u64 = 16;
 const FIRST_SPEECH: u64 = 1 << 32;
 const FIRST_PATCHES: u64 = 2 << 32;
+
+impl Program for Args {
+    const NAME: &'static str = "synth-scene";
+
+    fn common(&self) -> &CommonArgs {
+        &self.common
+    }
+
+    fn check(&self) -> Result<()> {
+        self.options(self.common.seed).map(drop)
+    }
+
+    fn run(self, stage: &Stage) -> Result<()> {
+        let options = self.options(stage.seed())?;
+        match (&self.out, &self.masks_to) {
+            (_, Some(folder)) => run_masks(stage, folder, &options),
+            (Some(out), None) => run(stage, out, &options),
+            (None, None) => Err(Error::new("no folder to write to").field("--out")),
+        }
+    }
+}
 
 impl Options {
     /// A generator of one of the streams.
@@ -280,15 +300,13 @@ fn write_points(
 const TABLE: &str = "text_features.json";
 
 fn write_table(folder: &Path, language: &Language) -> Result<()> {
-    let path = folder.join(TABLE);
-    let json = serde_json::to_vec(&language.table()).map_err(|e| Error::new(e.to_string()).file(&path))?;
-    write_bytes(&path, &json)
+    write_json(&folder.join(TABLE), &language.table())
 }
 
 /// The right to write a scene. Its folders may hold nothing but an earlier synthetic scene.
 fn claim(stage: &Stage, out: &Path, marker: &Path, layout: &Layout) -> Result<Claim> {
     let root = layout.root_files().into_iter().map(|name| out.join(name));
-    let folders = all_folders().map(|f| out.join(f)).chain([layout.labels(out)]);
+    let folders = FOLDERS.iter().map(|f| out.join(f)).chain([layout.labels(out)]);
     let outputs = folders.fold(stage.outputs(marker).file(marker).files(root), Outputs::folder);
     outputs.drop_stale().claim()
 }
@@ -298,32 +316,16 @@ fn prepare(out: &Path, marker: &Path, layout: &Layout) -> Result<()> {
     if marker.exists() {
         std::fs::remove_file(marker).at("replace", marker)?;
     }
-    folders(layout).try_for_each(|f| create_dir(out.join(f)))?;
-    benchmark::prepare(layout, out)
+    layout.folders().into_iter().try_for_each(|f| create_dir(out.join(f)))
 }
 
 /// Removes the empty folders of an earlier scene of another layout.
 fn remove_unused(out: &Path, layout: &Layout) {
-    let used: Vec<&str> = folders(layout).chain(benchmark::used_folders(layout).iter().copied()).collect();
-    for folder in all_folders().filter(|f| !used.contains(f)) {
+    let used = layout.folders();
+    for folder in FOLDERS.into_iter().filter(|f| !used.contains(f)) {
         // One that is not empty, or not there, stays as it is.
         let _ = std::fs::remove_dir(out.join(folder));
     }
-}
-
-/// The folders that a scene of any layout may have.
-fn all_folders() -> impl Iterator<Item = &'static str> {
-    FOLDERS.into_iter().rev().chain([SCAN]).chain(benchmark::FOLDERS)
-}
-
-/// Those of the folders of a scene that stand in this layout.
-fn folders(layout: &Layout) -> impl DoubleEndedIterator<Item = &'static str> {
-    let unused: &[&str] = match layout {
-        Layout::Colmap => &[],
-        Layout::LerfOvs(_) => &["label"],
-        Layout::Scan { .. } => &["images", "sparse", "label"],
-    };
-    FOLDERS.into_iter().filter(move |f| !unused.contains(f))
 }
 
 /// Writes a view's photograph and what each of its pixels shows.

@@ -20,6 +20,13 @@ fn make(out: &Path, arguments: &[&str]) {
     assert!(o.status.success(), "{}", String::from_utf8_lossy(&o.stderr));
 }
 
+/// What a run says that is refused.
+fn refused(out: &Path, arguments: &[&str]) -> String {
+    let o = synth_scene(out, arguments);
+    assert_eq!(o.status.code(), Some(2), "{arguments:?}");
+    String::from_utf8_lossy(&o.stderr).trim_end().to_string()
+}
+
 /// All files below a folder with their contents, without the records of runs.
 fn contents(root: &Path) -> BTreeMap<PathBuf, Vec<u8>> {
     let mut all = BTreeMap::new();
@@ -85,9 +92,7 @@ fn a_dataset_of_another_origin_is_left_alone() {
     let dir = tempfile::tempdir().unwrap();
     std::fs::create_dir(dir.path().join("images")).unwrap();
     std::fs::write(dir.path().join("images/holiday.jpg"), "dear").unwrap();
-    let o = synth_scene(dir.path(), &[]);
-    let said = String::from_utf8_lossy(&o.stderr);
-    assert_eq!(o.status.code(), Some(2));
+    let said = refused(dir.path(), &[]);
     assert!(said.contains("images/holiday.jpg: the output exists and would be lost"), "{said}");
     assert_eq!(said.lines().count(), 1, "{said}");
     assert_eq!(std::fs::read(dir.path().join("images/holiday.jpg")).unwrap(), b"dear");
@@ -111,9 +116,7 @@ fn bad_options_are_refused_before_anything_is_written() {
         (["--spurious", "1.1"], "--spurious"),
         (["--pose-noise", "11"], "--pose-noise"),
     ] {
-        let o = synth_scene(&out, &arguments);
-        let said = String::from_utf8_lossy(&o.stderr);
-        assert_eq!(o.status.code(), Some(2), "{arguments:?}");
+        let said = refused(&out, &arguments);
         assert!(said.contains(part) && said.contains("expected"), "{said}");
         assert!(!out.exists(), "nothing is begun");
     }
@@ -124,9 +127,7 @@ fn more_memory_than_there_may_be_is_refused_before_an_earlier_scene_goes() {
     let dir = tempfile::tempdir().unwrap();
     make(dir.path(), &["--views", "2"]);
     let before = contents(dir.path());
-    let o = synth_scene(dir.path(), &["--views", "3", "--memory-limit", "2M"]);
-    let said = String::from_utf8_lossy(&o.stderr);
-    assert_eq!(o.status.code(), Some(2), "{said}");
+    let said = refused(dir.path(), &["--views", "3", "--memory-limit", "2M"]);
     assert!(said.contains("--memory-limit") && said.contains("needed") && said.lines().count() == 1, "{said}");
     assert_eq!(contents(dir.path()), before);
 }
@@ -152,9 +153,7 @@ fn an_output_that_cannot_be_written_is_an_error_of_one_line() {
     let dir = tempfile::tempdir().unwrap();
     let file = dir.path().join("file");
     std::fs::write(&file, "in the way").unwrap();
-    let o = synth_scene(&file.join("scene"), &[]);
-    let said = String::from_utf8_lossy(&o.stderr);
-    assert_eq!(o.status.code(), Some(2));
+    let said = refused(&file.join("scene"), &[]);
     assert!(said.contains("cannot create the folder") && said.lines().count() == 1, "{said}");
     assert_eq!(std::fs::read(&file).unwrap(), b"in the way");
 }
@@ -359,8 +358,9 @@ fn families_are_written_whole_and_rooms_as_scans_too() {
     assert_eq!(at, TruePoints::read(dir.path().join("scene/truth/points.safetensors")).unwrap().position);
     make(&dir.path().join("scene"), &SMALL);
     assert!(!dir.path().join("scene/scan").exists());
-    let o = synth_scene(&dir.path().join("many"), &["--family", "table", "--objects", "251"]);
-    assert!(String::from_utf8_lossy(&o.stderr).contains("expected 1 to 250"));
+    assert!(
+        refused(&dir.path().join("many"), &["--family", "table", "--objects", "251"]).contains("expected 1 to 250")
+    );
 }
 
 #[test]
@@ -421,7 +421,6 @@ fn miniatures_of_the_benchmarks_read_as_what_they_are() {
         assert!(maps.id_count() > 0);
     }
 
-    let o = synth_scene(&dir.path().join("kitchen"), &["--layout", "lerf-ovs"]);
-    assert_eq!(o.status.code(), Some(2));
-    assert!(String::from_utf8_lossy(&o.stderr).contains("the folder's name is none of the benchmark's"));
+    let said = refused(&dir.path().join("kitchen"), &["--layout", "lerf-ovs"]);
+    assert!(said.contains("the folder's name is none of the benchmark's"));
 }

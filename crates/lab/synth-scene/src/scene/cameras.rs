@@ -1,9 +1,9 @@
 //! Where the photographs are taken from.
 
+use crate::random::normal;
 use crate::scene::Family;
 use crate::scene::Scene;
 use crate::scene::room::TABLE_HEIGHT;
-use crate::truth::points::normal;
 use glam::{DMat3, DVec2, DVec3, EulerRot};
 use gs_scene::Camera;
 use rand::Rng;

@@ -4,8 +4,9 @@
 //! others and hide each other; few colours for many things; patterns, mirrors and sizes ([`crate::things::dress`]); thin wires
 //! and stems; furniture, shelves with rows of books, walls with doors and windows.
 
+use crate::random::either_way;
 use crate::scene::layout;
-use crate::scene::room::{Footprint, TABLE_HEIGHT, either_way, enclose, name_of, wall_span};
+use crate::scene::room::{Footprint, TABLE_HEIGHT, enclose, name_of, wall_span};
 use crate::scene::{Family, Identity, Scene, SceneBuilder};
 use crate::things::catalogue::{ALONG_WALLS, CLASSES, ON_WALLS, PROPS, SHELF, SINK, STOVE, WALL_CABINET};
 use crate::things::class::{Class, Place};

@@ -1,6 +1,7 @@
 //! Where things stand: a room, tables, and things that do not touch each other on tables, floor and walls.
 
-use crate::scene::room::{Footprint, TABLE_HEIGHT, either_way, enclose, name_of, wall_span};
+use crate::random::either_way;
+use crate::scene::room::{Footprint, TABLE_HEIGHT, enclose, name_of, wall_span};
 use crate::scene::{Identity, Scene, SceneBuilder};
 use crate::things::catalogue::CLASSES;
 use crate::things::class::{Class, Place};
@@ -191,7 +192,7 @@ fn background(scene: &mut SceneBuilder, tables: &[DVec2], room: DVec2, rng: &mut
 mod tests {
     use super::*;
     use crate::scene::Thing;
-    use crate::things::shape::ChartPoint;
+    use crate::testing::chart_points;
     use rand::SeedableRng;
 
     #[test]
@@ -226,25 +227,18 @@ mod tests {
                 if t.background {
                     continue;
                 }
-                for face in 0..p.shape.faces() {
-                    for k in 0..100 {
-                        let at = ChartPoint { face, u: f64::from(k % 10) / 9.0, v: f64::from(k / 10) / 9.0 };
-                        let q = p.to_world(p.shape.surface(at).0) - t.position;
-                        let local = DVec2::from_angle(-t.yaw).rotate(q.truncate());
-                        assert!((local.abs() - t.footprint).max_element() < 1e-6, "{} leaves its footprint", t.name);
-                        assert!(q.z < t.height + 1e-6 && (t.class == "painting" || q.z > -2e-3), "{}: {}", t.name, q.z);
-                    }
+                for at in chart_points(&p.shape, 10) {
+                    let q = p.to_world(p.shape.surface(at).0) - t.position;
+                    let local = DVec2::from_angle(-t.yaw).rotate(q.truncate());
+                    assert!((local.abs() - t.footprint).max_element() < 1e-6, "{} leaves its footprint", t.name);
+                    assert!(q.z < t.height + 1e-6 && (t.class == "painting" || q.z > -2e-3), "{}: {}", t.name, q.z);
                 }
             }
             let things: Vec<&Thing> = scene.things.iter().filter(|t| !t.background && t.class != "painting").collect();
             for (i, a) in things.iter().enumerate() {
                 for b in &things[..i] {
-                    assert!(
-                        a.position.z != b.position.z || !column(a).touches(&column(b), 0.01),
-                        "{} and {}",
-                        a.name,
-                        b.name
-                    );
+                    let apart = a.position.z != b.position.z || !column(a).touches(&column(b), 0.01);
+                    assert!(apart, "{} and {}", a.name, b.name);
                 }
             }
         }

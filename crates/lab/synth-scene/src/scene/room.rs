@@ -5,8 +5,6 @@ use crate::things::class::{Class, Naming};
 use crate::things::material::albedo;
 use crate::things::walls;
 use glam::{DVec2, DVec3};
-use rand::Rng;
-use rand_chacha::ChaCha8Rng;
 use std::f64::consts::FRAC_PI_2;
 
 /// Height of the table tops in metres.
@@ -95,11 +93,6 @@ pub(crate) fn name_of(class: &Class, color: &str, repeated: bool) -> String {
         }
         Naming::Plain | Naming::Colored => format!("{color} {}", class.name),
     }
-}
-
-/// A random number of -1 to 1.
-pub(crate) fn either_way(rng: &mut ChaCha8Rng) -> f64 {
-    rng.random::<f64>() * 2.0 - 1.0
 }
 
 /// Half the length of a wall of a room with the given half extents, and its distance from the middle.

@@ -86,8 +86,8 @@ pub const STOVE: Class = Class::new("stove", Place::Table, &[BLACK, WHITE], furn
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::testing::chart_points;
     use crate::things::material::PAINTS;
-    use crate::things::shape::ChartPoint;
     use rand::SeedableRng;
     use rand_chacha::ChaCha8Rng;
 
@@ -121,11 +121,8 @@ mod tests {
             let m = class.make(&PAINTS[class.paints[0]], &mut ChaCha8Rng::seed_from_u64(1));
             let mut low = f64::INFINITY;
             for piece in &m.pieces {
-                for face in 0..piece.shape.faces() {
-                    for k in 0..400 {
-                        let at = ChartPoint { face, u: f64::from(k % 20) / 19.0, v: f64::from(k / 20) / 19.0 };
-                        low = low.min((piece.rotation * piece.shape.surface(at).0 + piece.offset).z);
-                    }
+                for at in chart_points(&piece.shape, 20) {
+                    low = low.min((piece.rotation * piece.shape.surface(at).0 + piece.offset).z);
                 }
             }
             assert!((-1e-3..0.003).contains(&low), "{}: lowest point {low}", class.name);

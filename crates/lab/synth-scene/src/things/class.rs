@@ -3,7 +3,6 @@
 use crate::things::material::{Material, Paint, Pattern, albedo};
 use crate::things::model::Model;
 use glam::{DMat3, DVec3};
-use rand::Rng;
 use rand_chacha::ChaCha8Rng;
 
 /// Where a thing stands.
@@ -80,8 +79,4 @@ pub(super) fn ivory() -> DVec3 {
 /// About x by `degrees`: tips +y up.
 pub(super) fn tip(degrees: f64) -> DMat3 {
     DMat3::from_rotation_x(degrees.to_radians())
-}
-
-pub(super) fn vary(rng: &mut ChaCha8Rng, amount: f64) -> f64 {
-    1.0 + amount * (2.0 * rng.random::<f64>() - 1.0)
 }

@@ -1,6 +1,7 @@
 //! Dishes, pots, cutlery, and food on them.
 
-use crate::things::class::{ivory, metal, tip, vary, wood};
+use crate::random::vary;
+use crate::things::class::{ivory, metal, tip, wood};
 use crate::things::material::{Material, PAINTS, Paint, Pattern, matt};
 use crate::things::model::{Model, profile, z_towards};
 use crate::things::shape::Shape;

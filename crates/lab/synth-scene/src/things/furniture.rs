@@ -1,6 +1,7 @@
 //! Furniture. Backs are at +y, fronts face -y; what hangs on walls has its back at y = 0.
 
-use crate::things::class::{ivory, metal, tip, vary, wood};
+use crate::random::vary;
+use crate::things::class::{ivory, metal, tip, wood};
 use crate::things::material::{Material, Paint, Pattern, matt};
 use crate::things::model::Model;
 use crate::things::shape::Shape;

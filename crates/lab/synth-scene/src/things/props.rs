@@ -1,6 +1,7 @@
 //! Other things for table tops: lamps, books, plants, what lies on desks.
 
-use crate::things::class::{ivory, metal, tip, vary};
+use crate::random::vary;
+use crate::things::class::{ivory, metal, tip};
 use crate::things::material::{BLUE, GREEN, Material, PAINTS, Paint, Pattern, RED, YELLOW, albedo, glazed, matt};
 use crate::things::model::{Model, profile, z_towards};
 use crate::things::shape::Shape;

@@ -1,6 +1,7 @@
 //! Toys.
 
-use crate::things::class::{ivory, metal, tip, vary};
+use crate::random::vary;
+use crate::things::class::{ivory, metal, tip};
 use crate::things::material::{Material, PAINTS, Paint, Pattern, albedo, glazed, matt};
 use crate::things::model::Model;
 use crate::things::shape::Shape;

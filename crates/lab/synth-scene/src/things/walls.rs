@@ -1,6 +1,7 @@
 //! Floor and walls, and what hangs on them: backs are at y = 0, fronts face -y.
 
-use crate::things::class::{ivory, metal, vary};
+use crate::random::vary;
+use crate::things::class::{ivory, metal};
 use crate::things::material::{Material, Paint, Pattern, matt};
 use crate::things::model::Model;
 use crate::things::shape::Shape;

@@ -2,10 +2,10 @@
 //! ScanNet as its tools extract it, and of ScanNet as OpenGaussian converts it.
 
 use crate::scene::Scene;
-use crate::truth::scannet;
+use crate::truth::{scannet, write_json};
 use artifacts::{LERF_OVS, LerfScene};
 use clap::ValueEnum;
-use gs_io::{Error, Result, create_dir, write_bytes};
+use gs_io::{Error, Result, write_bytes};
 use gs_scene::{Camera, PointCloud, colmap, ply};
 use serde::{Serialize, Serializer};
 use serde_json::{Value, json};
@@ -59,6 +59,9 @@ impl Serialize for Layout {
     }
 }
 
+/// The folders that a scene of some layout may have, all of which this program owns.
+pub(crate) const FOLDERS: [&str; 9] =
+    ["truth", "label", "language_features", "sparse", "images", "scan", "color", "pose", "intrinsic"];
 /// Every how many frames of a recording one is used.
 const FRAME_STEP: usize = 20;
 
@@ -85,6 +88,17 @@ impl Layout {
                 Ok(Self::Scan { name: folder, converted: name == LayoutName::Opengaussian })
             }
         }
+    }
+
+    /// Those of [`FOLDERS`] that a scene of this layout always has.
+    pub(crate) fn folders(&self) -> Vec<&'static str> {
+        let own: &[&str] = match self {
+            Self::Colmap => &["images", "sparse", "label"],
+            Self::LerfOvs(_) => &["images", "sparse"],
+            Self::Scan { converted: false, .. } => &["color", "pose", "intrinsic"],
+            Self::Scan { converted: true, .. } => &["color"],
+        };
+        [&["language_features", "truth"], own].concat()
     }
 
     /// Folder of the photographs.
@@ -222,29 +236,7 @@ fn write_transforms(out: &Path, views: &[(String, Camera)]) -> Result<()> {
     let all = json!({
         "w": k.width, "h": k.height, "fl_x": k.fx, "fl_y": k.fy, "cx": k.cx, "cy": k.cy, "frames": frames,
     });
-    for name in ["transforms_train.json", "transforms_test.json"] {
-        let path = out.join(name);
-        let bytes = serde_json::to_vec(&all).map_err(|e| Error::new(e.to_string()).file(&path))?;
-        write_bytes(&path, &bytes)?;
-    }
-    Ok(())
-}
-
-/// Folders that a scene of some layout may have beside those of [`Layout::Colmap`].
-pub(crate) const FOLDERS: [&str; 3] = ["color", "pose", "intrinsic"];
-
-/// Those of [`FOLDERS`] that stand in this layout.
-pub(crate) fn used_folders(layout: &Layout) -> &'static [&'static str] {
-    match layout {
-        Layout::Scan { converted: false, .. } => &FOLDERS,
-        Layout::Scan { converted: true, .. } => &FOLDERS[..1],
-        Layout::Colmap | Layout::LerfOvs(_) => &[],
-    }
-}
-
-/// Makes the empty folders that a scan must have.
-pub(crate) fn prepare(layout: &Layout, out: &Path) -> Result<()> {
-    used_folders(layout).iter().try_for_each(|f| create_dir(out.join(f)))
+    ["transforms_train.json", "transforms_test.json"].iter().try_for_each(|name| write_json(&out.join(name), &all))
 }
 
 #[cfg(test)]

@@ -2,8 +2,8 @@
 
 use crate::render::Frame;
 use crate::scene::Scene;
-use crate::truth::polygon;
-use gs_io::{Error, Result, write_bytes};
+use crate::truth::{polygon, write_json};
+use gs_io::Result;
 use serde_json::json;
 use std::path::Path;
 
@@ -42,9 +42,7 @@ pub fn write(path: &Path, image: &str, scene: &Scene, frame: &Frame) -> Result<(
     let info = json!({
         "description": "ISAT", "name": image, "width": frame.width, "height": frame.height, "depth": 3, "note": "",
     });
-    let json = serde_json::to_vec(&json!({ "info": info, "objects": objects }))
-        .map_err(|e| Error::new(e.to_string()).file(path))?;
-    write_bytes(path, &json)
+    write_json(path, &json!({ "info": info, "objects": objects }))
 }
 
 #[cfg(test)]

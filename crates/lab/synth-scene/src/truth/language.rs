@@ -6,9 +6,9 @@
 //! word. [`Language::encode`] makes of a mask the mean of what its crop shows by share of pixels, as far as the settings say
 //! with what lies around it within the crop and with noise.
 
+use crate::random::normal;
 use crate::render::Frame;
 use crate::scene::Scene;
-use crate::truth::points::normal;
 use crate::truth::scannet;
 use artifacts::{Level, MaskFeatures, MaskMaps};
 use rand::SeedableRng;

@@ -1,15 +1,14 @@
 //! Points on the surfaces that the cameras see: the truth that instances are scored against, and the sparse cloud that
 //! structure from motion would have found.
 
+use crate::random::normal;
 use crate::render::{self, Frame, ray};
 use crate::scene::Scene;
 use artifacts::TruePoints;
 use glam::DVec3;
 use gs_scene::{Camera, PointCloud};
-use rand::Rng;
 use rand_chacha::ChaCha8Rng;
 use std::collections::{BTreeMap, HashMap, HashSet};
-use std::f64::consts::TAU;
 
 /// Cells of which one point each is kept, in metres: on objects, tables, floor and walls.
 const CELLS: [f64; 3] = [0.006, 0.012, 0.03];
@@ -140,10 +139,4 @@ fn ground(scene: &Scene, part: u32) -> usize {
         (true, "table") => 1,
         (true, _) => 2,
     }
-}
-
-/// A standard normal number (Box and Muller).
-pub(crate) fn normal(rng: &mut ChaCha8Rng) -> f64 {
-    let (a, b): (f64, f64) = (rng.random(), rng.random());
-    (-2.0 * (1.0 - a).ln()).sqrt() * (TAU * b).cos()
 }

@@ -2,8 +2,9 @@
 //! for what the catalogue has.
 
 use crate::scene::Scene;
+use crate::truth::write_json;
 use artifacts::{NYU40, TruePoints};
-use gs_io::{Error, Result, create_dir, write_bytes};
+use gs_io::{Result, create_dir, write_bytes};
 use gs_scene::{PointCloud, ply};
 use serde::Serialize;
 use serde_json::{Value, json};
@@ -97,11 +98,6 @@ struct Segments<'a> {
     params: BTreeMap<String, Value>,
     scene_id: &'a str,
     seg_indices: &'a [i32],
-}
-
-fn write_json(path: &Path, value: &impl Serialize) -> Result<()> {
-    let json = serde_json::to_vec(value).map_err(|e| Error::new(e.to_string()).file(path))?;
-    write_bytes(path, &json)
 }
 
 #[cfg(test)]
