@@ -152,8 +152,9 @@ pub fn of_bands(gaussians: usize, from: u8, to: u8) -> u64 {
 }
 
 /// Peak in bytes of `render`.
-pub fn of_renders(geometry: u64, pictures: &Pictures) -> u64 {
-    of_file(geometry).max(PROGRAM + 9 * geometry / 5 + 28 * pictures.pixels)
+pub fn of_renders(geometry: u64, pictures: &Pictures, exr: bool) -> u64 {
+    let bytes = if exr { 74 } else { 28 };
+    of_file(geometry).max(PROGRAM + 9 * geometry / 5 + bytes * pictures.pixels)
 }
 
 /// Peak in bytes of `eval`.

@@ -163,6 +163,9 @@ pub(crate) struct Render {
     /// test (held-out), train, all, or names of photographs separated by commas
     #[arg(long, value_name = "VIEWS", default_value = "test")]
     pub views: String,
+    /// Also write NAME.exr: R, G, B, A (accumulated alpha) and Z (mean depth along the optical axis) as 32-bit floats
+    #[arg(long)]
+    pub exr: bool,
 }
 
 /// Options of `gs-geom eval`.

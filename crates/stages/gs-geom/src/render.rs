@@ -3,28 +3,33 @@
 use crate::memory::{self, Pictures};
 use crate::options::{Render, bytes};
 use artifacts::role;
-use gs_io::{Error, Result, hash_file};
-use gs_raster::render;
+use gs_io::{Error, Result, hash_file, write_bytes};
+use gs_raster::{Rendered, render};
 use gs_scene::Image;
 use gs_scene::dataset::{Dataset, Split, View};
 use serde_json::json;
 use stage::Stage;
 use std::collections::{BTreeMap, BTreeSet};
+use std::io::Cursor;
 
 impl Render {
     pub(crate) fn run(&self, stage: &Stage) -> Result<()> {
         let dataset = self.scene.load(stage)?;
-        let needed = memory::of_renders(bytes(&self.geometry.geometry)?, &Pictures::of(&dataset)?);
+        let needed = memory::of_renders(bytes(&self.geometry.geometry)?, &Pictures::of(&dataset)?, self.exr);
         stage.forecast(needed, "give a smaller --geometry or --resolution")?;
         let (gaussians, options) = self.geometry.read(self.scene.background, stage)?;
         let views = choose(&dataset, &self.views)?;
-        let names = views.iter().map(|v| format!("{}.png", v.stem()));
+        let extensions: &[&str] = if self.exr { &["png", "exr"] } else { &["png"] };
+        let names = views.iter().flat_map(|v| extensions.iter().map(|e| format!("{}.{e}", v.stem())));
         let reads = dataset.files.iter().cloned().chain([self.geometry.geometry.clone()]);
         let mut claim = stage.outputs(&self.out).files_in(&self.out, names).reads(reads).claim()?;
         let mut progress = stage.progress("view", views.len() as u64);
         for view in &views {
             stage.go_on()?;
             let r = render(&gaussians, &view.camera, &options);
+            if self.exr {
+                write_bytes(self.out.join(format!("{}.exr", view.stem())), &exr_bytes(&r)?)?;
+            }
             let picture = Image { width: r.width, height: r.height, rgb: r.rgb, alpha: None };
             picture.write_png(self.out.join(format!("{}.png", view.stem())))?;
             progress.step();
@@ -69,4 +74,19 @@ fn choose<'a>(dataset: &'a Dataset, wanted: &str) -> Result<Vec<&'a View>> {
         return Err(Error::new("two views would have the same file name").file(&dataset.root).field(&twice.name));
     }
     Ok(views)
+}
+
+/// R, G, B, A and Z of a render as an OpenEXR file. Z is the mean depth of what is seen, 0 where nothing is.
+fn exr_bytes(r: &Rendered) -> Result<Vec<u8>> {
+    use exr::prelude::{AnyChannel, AnyChannels, FlatSamples, Image, WritableImage};
+    let channel = |name: &str, values: Vec<f32>| AnyChannel::<FlatSamples>::new(name, FlatSamples::F32(values));
+    let color = |c: usize| r.rgb.iter().skip(c).step_by(3).copied().collect();
+    let depth = r.depth.iter().zip(&r.alpha).map(|(z, a)| if *a > 0.0 { z / a } else { 0.0 }).collect();
+    let colors = ["R", "G", "B"].into_iter().enumerate().map(|(c, name)| channel(name, color(c)));
+    let all = colors.chain([channel("A", r.alpha.clone()), channel("Z", depth)]).collect();
+    let image = Image::from_channels((r.width as usize, r.height as usize), AnyChannels::sort(all));
+    let mut bytes = Cursor::new(Vec::new());
+    let written = image.write().non_parallel().to_buffered(&mut bytes);
+    written.map_err(|e| Error::new(format!("cannot encode as OpenEXR: {e}")))?;
+    Ok(bytes.into_inner())
 }

@@ -185,13 +185,22 @@ fn views_are_rendered_and_measured() {
     ply::write_gaussians(&geometry, &g, &[]).unwrap();
     let base = ["--scene", scene(), "--geometry", &geometry];
     let out = dir.path("views");
-    succeeds(&[&["render"], &base[..], &["--out", &out]].concat());
+    succeeds(&[&["render"], &base[..], &["--out", &out, "--exr"]].concat());
     for name in ["00", "08"] {
         let picture = Image::read(format!("{out}/{name}.png")).unwrap();
         let photo = Image::read(format!("{}/images/{name}.png", scene())).unwrap();
         assert_eq!(picture.to_rgb8(), photo.to_rgb8(), "the same Gaussians, the same picture");
+        let exr = exr::prelude::read_all_flat_layers_from_file(format!("{out}/{name}.exr")).unwrap();
+        let channels = &exr.layer_data[0].channel_data.list;
+        let names: Vec<String> = channels.iter().map(|c| c.name.to_string()).collect();
+        assert_eq!(names, ["A", "B", "G", "R", "Z"]);
+        let values = |i: usize| channels[i].sample_data.values_as_f32().collect::<Vec<f32>>();
+        let (alpha, depth) = (values(0), values(4));
+        assert_eq!(alpha.len(), (SIZE.0 * SIZE.1) as usize);
+        let seen: Vec<f32> = alpha.iter().zip(&depth).filter(|(a, _)| **a > 0.5).map(|(_, z)| *z).collect();
+        assert!(!seen.is_empty() && seen.iter().all(|z| (1.0..6.0).contains(z)));
     }
-    assert_eq!(fs::read_dir(&out).unwrap().count(), 2);
+    assert_eq!(fs::read_dir(&out).unwrap().count(), 4);
     let some = dir.path("some");
     succeeds(&[&["render"], &base[..], &["--out", &some, "--views", "03,05.png", "--resolution", "2"]].concat());
     assert_eq!(fs::read_dir(&some).unwrap().count(), 2);

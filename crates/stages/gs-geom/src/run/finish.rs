@@ -9,9 +9,9 @@ use crate::training::checkpoint::{self, ProgressState, State};
 use crate::training::{Timings, Trainer};
 use gs_io::{Claim, Error, Provenance, Result, with_suffix, write_bytes};
 use gs_scene::{Gaussians, ply};
+use report::curve::Panel;
 use serde_json::{Value, json};
 use stage::Stage;
-use report::curve::Panel;
 use std::collections::BTreeMap;
 use std::time::Duration;
 
