@@ -6,7 +6,7 @@ SPLATS ?=
 bench-raster:
 	$(CARGO) bench -p gs-raster --bench raster -- $(abspath $(SPLATS)) $(CURDIR)/out/bench/raster.json
 
-# gs-geom's quality for the time: geom.json, docs/images/geometry.svg.
+# gs-geom's quality for the time: geom.json, geom.md.
 bench-geom:
 	scripts/bench_geom.sh
 

@@ -1,5 +1,5 @@
 #!/bin/bash
-# Quality for the time of gs-geom's alternatives: out/bench/geom.json and geom.md, the table of docs/geometry.md.
+# Quality for the time of gs-geom's alternatives: out/bench/geom.json and geom.md, the table of docs/results/geometry.md.
 # DESK is a folder of photographs with COLMAP poses (skipped where there is none); RESOLUTION, ITERATIONS, SEEDS and
 # MAX_GAUSSIANS say what is run. Finished runs are kept in out/bench/geom.runs: stop it and start it again, or start with few
 # seeds and add some. Remove that folder after a change of the program.
