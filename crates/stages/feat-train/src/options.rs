@@ -120,10 +120,10 @@ pub struct Contrastive {
     /// Hold out every tenth view, and stop when the loss of these views no longer falls
     #[arg(long)]
     pub early_stop: bool,
-    /// What is skipped.
-    #[command(flatten)]
-    #[serde(flatten)]
-    pub skip: stage::SkipArgs,
+    /// Skip nothing: also use views with a single mask, although their loss and gradient are zero
+    // Not stage::SkipArgs: the requirement of this group does not reach into another struct.
+    #[arg(long)]
+    pub no_skip: bool,
 }
 
 /// Neighbours of an anchor, whose features it sums.

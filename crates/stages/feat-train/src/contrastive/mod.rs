@@ -97,7 +97,7 @@ fn frozen_graph(args: &Args, inputs: &Inputs, stage: &Stage) -> Result<Context> 
 fn masks_to_learn_from(args: &Args, inputs: &Inputs, context: &Context, stage: &Stage) -> Result<Vec<MaskSet>> {
     let (levels, options) = (args.options.levels(), &args.options.contrastive);
     // A single mask has no other to be separated from, but cohesion works on it.
-    let least = if options.skip.no_skip || options.cohesion > 0.0 { 1 } else { 2 };
+    let least = if options.no_skip || options.cohesion > 0.0 { 1 } else { 2 };
     let sets = mask_sets(&inputs.footprints, context, &levels, least)?;
     let units = inputs.footprints.views.len() * levels.len();
     if sets.len() < units {
