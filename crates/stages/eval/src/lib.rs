@@ -1,9 +1,9 @@
 //! The last stage: text queries, evaluation protocols and the report.
 //!
-//! [`options`] holds the options of every command; [`cli`] says which command runs what: [`query`] answers questions,
-//! [`score`] compares with the truth of a scene, [`protocols`] follows the published benchmarks, [`page`] makes the report.
-//! They share the labelled Gaussians ([`scene`]), how a selection becomes a mask ([`silhouette`]), which Gaussian is nearest
-//! ([`nearest`]) and the forecast of memory ([`memory`]).
+//! `options` holds the options of every command; `cli` says which command runs what: `query` answers questions,
+//! `score` compares with the truth of a scene, `protocols` follows the published benchmarks, `page` makes the report.
+//! They share the labelled Gaussians (`scene`), how a selection becomes a mask (`silhouette`), which Gaussian is nearest
+//! (`nearest`) and the forecast of memory (`memory`).
 
 pub mod cli;
 mod mask;

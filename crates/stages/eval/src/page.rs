@@ -1,8 +1,8 @@
 //! `eval report`: everything about a run on one self-contained page, and its figures in `metrics.json`.
 //!
 //! Only the scene and the geometry have to be there. Whatever else a run did not make leaves its section out, with a
-//! line that says why. [`material`] reads what there is, [`sections`] writes the page, with the records of the stages
-//! ([`runs`]) and features as colours ([`pca`]).
+//! line that says why. `material` reads what there is, `sections` writes the page, with the records of the stages
+//! (`runs`) and features as colours (`pca`).
 
 mod material;
 mod metrics;

@@ -1,8 +1,8 @@
 //! `eval query`: what texts, pictures and places mean.
 //!
-//! [`text`] has the features of texts, [`ranking`] compares them with the instances, [`ask`] selects, [`granularity`] makes an
-//! answer coarser or finer, [`place`] answers for pixels and points, [`image`] for pictures, [`segment`] divides the cloud;
-//! [`show`] writes the answers, [`interactive`] answers texts one by one.
+//! `text` has the features of texts, `ranking` compares them with the instances, `ask` selects, `granularity` makes an
+//! answer coarser or finer, `place` answers for pixels and points, `image` for pictures, `segment` divides the cloud;
+//! `show` writes the answers, `interactive` answers texts one by one.
 
 pub mod ask;
 mod granularity;

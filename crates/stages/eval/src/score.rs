@@ -1,7 +1,7 @@
 //! `eval score`: instances and text queries against the truth of a scene.
 //!
-//! [`truth`] scores instances against true surfaces, [`label_iou`] against polygons ([`labels`], filled as [`polygon`] says),
-//! both by [`metrics`]; [`scores`] is what comes out.
+//! `truth` scores instances against true surfaces, `label_iou` against polygons (`labels`, filled as `polygon` says),
+//! both by `metrics`; `scores` is what comes out.
 
 mod label_iou;
 pub mod labels;
