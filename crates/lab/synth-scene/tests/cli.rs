@@ -143,8 +143,9 @@ fn a_run_takes_about_the_memory_that_it_forecasts() {
         make(&dir.path().join(name), &[&["--threads", "2"], options].concat());
         let record = stage::RunRecord::read(dir.path().join(name).join("truth/scene.json")).unwrap();
         let Some(peak) = record.peak_rss_bytes else { return };
-        let ratio = record.memory_predicted_bytes.unwrap() as f64 / peak as f64;
-        assert!((0.7..1.4).contains(&ratio), "{name}: {ratio}");
+        let (forecast, peak) = (record.memory_predicted_bytes.unwrap() as f64, peak as f64);
+        // How much of the program itself lies in memory differs from system to system: 20 MB.
+        assert!((forecast - peak).abs() < 0.4 * peak + 20e6, "{name}: forecast {forecast}, peak {peak}");
     }
 }
 

@@ -306,8 +306,9 @@ fn the_provenance_holds_every_option_and_the_forecast_is_near_the_peak() {
     assert_eq!(a.provenance().parameters, expected);
     let record = RunRecord::read(s.path("out/instances.safetensors")).unwrap();
     if let (Some(forecast), Some(peak)) = (record.memory_predicted_bytes, record.peak_rss_bytes) {
-        let ratio = forecast as f64 / peak as f64;
-        assert!((0.5..2.0).contains(&ratio), "forecast {forecast}, peak {peak}");
+        let (forecast, peak) = (forecast as f64, peak as f64);
+        // How much of the program itself lies in memory differs from system to system: 20 MB.
+        assert!((forecast - peak).abs() < 0.5 * peak + 20e6, "forecast {forecast}, peak {peak}");
     }
 }
 

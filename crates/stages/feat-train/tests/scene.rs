@@ -17,7 +17,8 @@ fn a_run_takes_about_the_memory_that_it_forecasts() {
         let record = s.run(15, options, folder.path());
         let forecast = record.memory_predicted_bytes.expect("feat-train forecasts its memory") as f64;
         let Some(peak) = record.peak_rss_bytes else { continue };
-        let ratio = forecast / peak as f64;
-        assert!((0.5..2.0).contains(&ratio), "{options:?}: {ratio} of {peak}");
+        let peak = peak as f64;
+        // How much of the program itself lies in memory differs from system to system: 20 MB.
+        assert!((forecast - peak).abs() < 0.5 * peak + 20e6, "{options:?}: forecast {forecast}, peak {peak}");
     }
 }

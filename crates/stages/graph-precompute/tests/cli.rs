@@ -140,8 +140,9 @@ fn the_forecast_is_near_the_peak() {
     succeed(&run(&s, &o, &["--threads", "2"]));
     let record = stage::RunRecord::read(o.join("graph.safetensors")).unwrap();
     if let (Some(forecast), Some(peak)) = (record.memory_predicted_bytes, record.peak_rss_bytes) {
-        let ratio = forecast as f64 / peak as f64;
-        assert!((0.6..1.8).contains(&ratio), "forecast {forecast}, peak {peak}");
+        let (forecast, peak) = (forecast as f64, peak as f64);
+        // How much of the program itself lies in memory differs from system to system: 20 MB.
+        assert!((forecast - peak).abs() < 0.5 * peak + 20e6, "forecast {forecast}, peak {peak}");
     }
 }
 

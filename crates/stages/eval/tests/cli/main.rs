@@ -249,7 +249,8 @@ fn more_memory_than_there_may_be_is_refused_at_the_start() {
     let record = f.json("score.json.run.json");
     let of = |key: &str| record[key].as_f64();
     if let (Some(forecast), Some(peak)) = (of("memory_predicted_bytes"), of("peak_rss_bytes")) {
-        assert!((0.4..2.5).contains(&(forecast / peak)), "forecast {forecast}, peak {peak}");
+        // How much of the program itself lies in memory differs from system to system: 20 MB.
+        assert!((forecast - peak).abs() < 0.5 * peak + 20e6, "forecast {forecast}, peak {peak}");
     }
 }
 
