@@ -20,13 +20,14 @@ pub struct Args {
     /// Folder of the stages' programs
     #[arg(long, global = true, value_name = "DIR", default_value = "target/release")]
     bin: PathBuf,
-    /// Folder for scenes and what is made of them; what run and compare find there is not made again
+    /// Folder for scenes and what is made of them. Finished runs of tables and knobs there are not done again: remove it after
+    /// a change of the programs
     #[arg(long, global = true, value_name = "DIR", default_value = "out/bench/work")]
     work: PathBuf,
     /// Output file, JSON; the same is written beside it as .md and .html (compare writes no .html)
     #[arg(long, global = true, value_name = "FILE", default_value = "out/bench/report.json")]
     out: PathBuf,
-    /// What of it to do: names of tables, knobs and axes, with commas between; for stress parts of names of scenes [all]
+    /// What run does: names of tables, knobs and axes, with commas between; what stress does: parts of names of scenes [all]
     #[arg(long, global = true, value_name = "NAMES", value_delimiter = ',')]
     only: Vec<String>,
     #[command(flatten)]

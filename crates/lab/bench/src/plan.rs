@@ -214,7 +214,7 @@ impl Plan {
         for k in &plan.knobs {
             let count = |f: fn(&Point) -> bool| k.points.iter().filter(|p| f(p)).count();
             if count(|p| p.exact) != 1 || count(|p| p.default) != 1 {
-                return Err(Error::new("a knob without its one exact and its one default point").field(&k.name));
+                return Err(Error::new("a knob needs exactly one exact and one default point").field(&k.name));
             }
         }
         if !plan.tables.is_empty() && plan.seeds.is_empty() {
@@ -261,7 +261,10 @@ impl Plan {
                 let (table, row, p, metric) = (name.into(), rest[0].into(), rest[1].into(), rest[2].into());
                 self.expected.push(Expected { table, row, p, metric, low: number(rest[3])?, high: number(rest[4])? });
             }
-            "repeats" => self.repeats = positive(rest[0])? as usize,
+            "repeats" => {
+                let count = rest[0].parse().ok().filter(|c| *c > 0);
+                self.repeats = count.ok_or_else(|| wrong("a whole number above 0"))?;
+            }
             "knob" => {
                 let stage = (rest[0] != "pipeline").then(|| rest[0].parse()).transpose()?;
                 self.knobs.push(Knob { name: name.into(), stage, title: rest[1].into(), points: Vec::new() });

@@ -236,7 +236,7 @@ pub fn blocks(table: &Table) -> Vec<Block> {
 pub fn remark(table: &Table) -> String {
     let runs = table.scenes.len() * table.seeds.len();
     let mut s = format!(
-        "Mean ± 95% interval (Student's t) over {runs} scenes: {} with {} seed{} each.",
+        "Mean ± 95% interval (Student's t) over {runs} runs: scenes {}, {} seed{} each.",
         table.scenes.join(", "),
         table.seeds.len(),
         if table.seeds.len() == 1 { "" } else { "s" },

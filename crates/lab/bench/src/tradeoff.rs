@@ -4,7 +4,7 @@ use crate::chain::{Cost, Files, Options, Programs, STAGES, Stage, command, read_
 use crate::plan::{Knob, Plan, Scene};
 use crate::task::Task;
 use artifacts::Instances;
-use gs_io::{Error, Result, create_dir, write_bytes};
+use gs_io::{Error, Result, create_dir, write_json};
 use hdbscan_exact::adjusted_rand;
 use serde::{Deserialize, Serialize};
 use serde_json::Value;
@@ -165,7 +165,10 @@ pub fn measure(
     folder: &Path,
 ) -> Result<Curve> {
     let known = folder.join(format!("{}.json", knob.name));
-    let old: Vec<Measured> = read_json(&known).ok().and_then(|v| serde_json::from_value(v).ok()).unwrap_or_default();
+    let how = format!("{} | {} | {:?} | {} threads", scene.scene, scene.geometry, knob.stage, programs.threads);
+    let kept = read_json(&known).ok().filter(|kept| kept["how"] == how.as_str());
+    let old: Vec<Measured> =
+        kept.and_then(|kept| serde_json::from_value(kept["points"].clone()).ok()).unwrap_or_default();
     let mut points: Vec<Measured> = knob
         .points
         .iter()
@@ -209,8 +212,7 @@ pub fn measure(
         for i in 0..points.len() {
             points[i].quality = quality(programs, knob, &files[i], &files[exact])?;
         }
-        let text = serde_json::to_vec_pretty(&points).map_err(|e| Error::new(e.to_string()))?;
-        write_bytes(&known, &text)?;
+        write_json(&known, &serde_json::json!({"how": how, "points": points}))?;
     }
     Ok(Curve::new(knob, &scene.name, points))
 }

@@ -66,7 +66,7 @@ pub struct CommonArgs {
 /// Whether a stage skips what a scene does not need, for the stages that do.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, clap::Args, serde::Serialize)]
 pub struct SkipArgs {
-    /// Skip nothing: also do the work that changes no result, such as on Gaussians that no view sees (docs/performance.md)
+    /// Skip nothing: keep what no view shows, such as Gaussians that are never seen or too faint (docs/performance.md)
     #[arg(long)]
     pub no_skip: bool,
 }
