@@ -123,8 +123,8 @@ pub fn run(programs: &Programs, plan: &Plan, folder: &Path, stage: &stage::Stage
     let programs = Programs { threads: 1, ..programs.clone() };
     // Hundreds of coloured PLYs would fill the disk.
     tasks.run(&programs, stage, |output| {
-        for side in ["ply", "labels.npy"].map(|e| output.with_extension(e)).iter().filter(|s| **s != *output) {
-            if output.to_string_lossy().ends_with(".instances.safetensors") {
+        if output.to_string_lossy().ends_with(".instances.safetensors") {
+            for side in ["ply", "labels.npy"].map(|e| output.with_extension(e)) {
                 let _ = std::fs::remove_file(side);
             }
         }

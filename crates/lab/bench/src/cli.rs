@@ -4,7 +4,7 @@ use crate::chain::{Programs, STAGES};
 use crate::page::Results;
 use crate::plan::Plan;
 use crate::{cells, compare, growth, page, tables, tradeoff};
-use gs_io::{Claim, Error, Result, create_dir, write_bytes};
+use gs_io::{Claim, Error, Result, create_dir, write_bytes, write_json};
 use serde::Serialize;
 use serde_json::json;
 use stage::{CommonArgs, Machine, Stage};
@@ -93,8 +93,7 @@ impl Args {
     }
 
     fn write(&self, value: &impl Serialize, text: &str, page: Option<&str>) -> Result<()> {
-        let json = serde_json::to_vec_pretty(value).map_err(|e| Error::new(e.to_string()).file(&self.out))?;
-        write_bytes(&self.out, &json)?;
+        write_json(&self.out, value)?;
         write_bytes(self.out.with_extension("md"), text.as_bytes())?;
         page.map_or(Ok(()), |page| write_bytes(self.out.with_extension("html"), page.as_bytes()))
     }

@@ -4,11 +4,11 @@ use crate::chain::{Cost, Options, Programs, STAGES, Stage};
 use crate::plan::{Axis, Plan};
 use crate::tradeoff::{prepare, spread};
 use gs_io::Result;
-use serde::{Deserialize, Serialize};
+use serde::Serialize;
 use std::path::Path;
 
 /// A stage along an axis.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct Growth {
     /// The axis.
     pub axis: String,

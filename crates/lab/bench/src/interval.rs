@@ -1,9 +1,9 @@
 //! Mean and 95% interval of a few values.
 
-use serde::{Deserialize, Serialize};
+use serde::Serialize;
 
 /// A mean with its 95% interval.
-#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Serialize)]
 pub struct Interval {
     /// The mean.
     pub mean: f64,

@@ -23,7 +23,7 @@
 
 use crate::chain::{Options, Stage};
 use gs_io::{Error, IoContext, Result};
-use serde::{Deserialize, Serialize};
+use serde::Serialize;
 use std::collections::BTreeMap;
 use std::path::Path;
 
@@ -39,7 +39,7 @@ pub struct Scene {
 }
 
 /// What the paper prints for a row, on LERF-OVS, in percent.
-#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Serialize)]
 pub struct Paper {
     /// mIoU.
     pub miou: f64,
@@ -50,7 +50,7 @@ pub struct Paper {
 }
 
 /// A row of a table.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct Row {
     /// Name of a way of making features.
     pub features: String,

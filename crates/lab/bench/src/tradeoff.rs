@@ -60,7 +60,7 @@ pub fn spread(mut values: Vec<f64>) -> [f64; 3] {
 }
 
 /// A knob on a scene.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct Curve {
     /// The knob.
     pub knob: String,

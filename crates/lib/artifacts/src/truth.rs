@@ -1,6 +1,6 @@
 //! The ground truth of a synthetic scene: `truth/scene.json`, `truth/points.safetensors`, `truth/masks.json`.
 
-use gs_io::{Artifact, ArtifactWriter, Error, IoContext, Provenance, Result, write_bytes};
+use gs_io::{Artifact, ArtifactWriter, Error, IoContext, Provenance, Result, write_json};
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
 use std::path::Path;
@@ -76,7 +76,7 @@ impl TrueScene {
     /// # Errors
     /// When the file cannot be written.
     pub fn write(&self, path: impl AsRef<Path>) -> Result<()> {
-        write_json(path.as_ref(), self)
+        write_json(path, self)
     }
 }
 
@@ -94,18 +94,13 @@ impl MaskTruth {
     /// # Errors
     /// When the file cannot be written.
     pub fn write_all(path: impl AsRef<Path>, masks: &BTreeMap<String, Vec<Self>>) -> Result<()> {
-        write_json(path.as_ref(), masks)
+        write_json(path, masks)
     }
 }
 
 fn read_json<T: serde::de::DeserializeOwned>(path: &Path) -> Result<T> {
     let bytes = std::fs::read(path).at("read", path)?;
     serde_json::from_slice(&bytes).map_err(|e| Error::new(format!("not the JSON expected: {e}")).file(path))
-}
-
-fn write_json<T: Serialize>(path: &Path, value: &T) -> Result<()> {
-    let json = serde_json::to_vec_pretty(value).map_err(|e| Error::new(e.to_string()).file(path))?;
-    write_bytes(path, &json)
 }
 
 /// `truth/points.safetensors`: samples of the surfaces that some view sees; P of them.

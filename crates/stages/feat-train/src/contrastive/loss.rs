@@ -2,11 +2,11 @@
 //! masks.
 
 use crate::options::Loss;
-use crate::random::splitmix;
+use gs_io::mixed;
 
 /// Whether an entry belongs to the half of its mask that is the positive of [`Loss::HalfMask`].
 pub fn in_half(noise: u64, entry: usize) -> bool {
-    splitmix(noise ^ entry as u64) & 1 == 1
+    mixed(noise ^ entry as u64) & 1 == 1
 }
 
 /// Centroids shorter than this have no direction and are left out.

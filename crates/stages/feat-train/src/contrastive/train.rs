@@ -7,8 +7,7 @@ use super::model::Model;
 use super::solver::Solver;
 use super::state::{CurvePoint, State};
 use crate::options::{Contrastive, Loss};
-use crate::random::splitmix;
-use gs_io::{Error, Provenance, Result};
+use gs_io::{Error, Provenance, Result, mixed};
 use rand::SeedableRng;
 use rand::seq::SliceRandom;
 use rand_chacha::ChaCha8Rng;
@@ -78,9 +77,9 @@ pub fn train(
     let mut progress = stage.progress("iterations", options.iterations).resumed_at(resumed_at);
     while state.iteration < options.iterations {
         let set = sets[views.at(state.iteration)];
-        let noise = splitmix(seed ^ splitmix(state.iteration));
+        let noise = mixed(seed ^ mixed(state.iteration));
         // Another view to take positives from, for the loss that asks for them.
-        let other = sets[(splitmix(noise) % sets.len() as u64) as usize];
+        let other = sets[(mixed(noise) % sets.len() as u64) as usize];
         let beside = (options.loss == Loss::CrossView && !std::ptr::eq(other, set)).then_some(other);
         let [loss, separation] = solver.forward(&state.model, set, beside, noise);
         if !loss.is_finite() {
