@@ -30,6 +30,13 @@ bench-graph:
 	  && out/bench/python/bin/pip install -q numpy scipy fpsample pykdtree; }
 	out/bench/python/bin/python scripts/bench_graph.py $(POSITIONS) out/bench/graph.json
 
+# mask-embed masks: the default beside every point of the grid, on PHOTOGRAPHS=folder (else 4 ray-traced ones): sam.json.
+bench-sam: build
+	@test -n "$$PHOTOGRAPHS" || test -d out/bench/sam/images || target/release/synth-scene --out out/bench/sam --family kitchen \
+	  --seed 3 --objects 24 --views 4 --width 640 --height 480 --points 1000 --corruption exact
+	$(CARGO) bench -p mask-embed --bench sam -- "$$(realpath "$${PHOTOGRAPHS:-out/bench/sam/images}")" $(CURDIR)/models \
+	  $(CURDIR)/out/bench/sam.json
+
 # HDBSCAN beside hdbscan-rs and fast_hdbscan (needs Python; POINTS=1000000x6 or file.npy, TRUTH=file.npy, RUNS): cluster.json.
 POINTS ?= 1000000x6
 RUNS ?= 3

@@ -6,7 +6,8 @@
 
 crates/lib/onnx-models/testdata/ops.onnx         floats and integers in, sum, product and a value in between
 crates/lib/onnx-models/testdata/clip/            a dual encoder whose features can be computed by hand
-crates/stages/mask-embed/testdata/sam/              a segmenter by colour with the inputs and outputs of SAM
+crates/stages/mask-embed/testdata/sam/           a segmenter by colour with the inputs and outputs of SAM
+crates/stages/mask-embed/testdata/sam-tiny/      a decoder with SAM's architecture and names, narrow and with random weights
 """
 
 from pathlib import Path
@@ -170,7 +171,160 @@ def sam():
     )
 
 
+class Decoder:
+    """SAM's mask decoder (Kirillov et al. 2023, appendix A) as PyTorch's exporter writes it, narrow."""
+
+    WIDTH, INNER, HEADS, SIDE = 16, 8, 8, 64
+
+    def __init__(self):
+        self.random = np.random.default_rng(1)
+        self.nodes, self.constants = [], []
+
+    def op(self, kind, *inputs, **attributes):
+        """The name of a new value."""
+        name = f"v{len(self.nodes)}"
+        self.nodes.append(helper.make_node(kind, [self.name(i) for i in inputs], [name], **attributes))
+        return name
+
+    def name(self, i):
+        return i if isinstance(i, str) else self.constant(f"c{len(self.constants)}", i)
+
+    def constant(self, name, array):
+        self.constants.append(constant(name, array))
+        return name
+
+    def weight(self, name, *shape):
+        return self.constant(name, self.random.normal(0, shape[0] ** -0.5, shape).astype(np.float32))
+
+    def linear(self, x, name, inputs, outputs):
+        """A layer of tokens or pixels: the exporter renames its matrix."""
+        product = self.op("MatMul", x, self.weight(f"onnx::MatMul_{len(self.nodes)}", inputs, outputs))
+        return self.op("Add", self.weight(f"{name}.bias", outputs), product)
+
+    def norm(self, x, name):
+        scale = self.constant(f"{name}.weight", self.random.uniform(0.5, 1.5, self.WIDTH).astype(np.float32))
+        return self.op("LayerNormalization", x, scale, self.weight(f"{name}.bias", self.WIDTH), epsilon=1e-5, axis=-1)
+
+    def heads(self, x, width):
+        split = self.op("Reshape", x, np.array([1, -1, self.HEADS, width // self.HEADS]))
+        return self.op("Transpose", split, perm=[0, 2, 1, 3])
+
+    def attention(self, name, q, k, v, inner):
+        q, k, v = (self.heads(self.linear(x, f"{name}.{p}_proj", self.WIDTH, inner), inner) for x, p in ((q, "q"), (k, "k"), (v, "v")))
+        scores = self.op("MatMul", q, self.op("Transpose", k, perm=[0, 1, 3, 2]))
+        weights = self.op("Softmax", self.op("Div", scores, np.float32((inner / self.HEADS) ** 0.5)), axis=-1)
+        sums = self.op("Transpose", self.op("MatMul", weights, v), perm=[0, 2, 1, 3])
+        return self.linear(self.op("Reshape", sums, np.array([1, -1, inner])), f"{name}.out_proj", inner, self.WIDTH)
+
+    def gelu(self, x):
+        erf = self.op("Erf", self.op("Div", x, np.float32(2**0.5)))
+        return self.op("Mul", self.op("Mul", x, self.op("Add", erf, np.float32(1))), np.float32(0.5))
+
+    def mlp(self, x, name, outputs):
+        for i in range(3):
+            n = outputs if i == 2 else self.WIDTH
+            weight, bias = self.weight(f"{name}.layers.{i}.weight", n, self.WIDTH), self.weight(f"{name}.layers.{i}.bias", n)
+            x = self.op("Gemm", x, weight, bias, transB=1)
+            x = x if i == 2 else self.op("Relu", x)
+        return x
+
+    def enlarge(self, x, name, inputs, outputs):
+        weight, bias = self.weight(f"{name}.weight", inputs, outputs, 2, 2), self.weight(f"{name}.bias", outputs)
+        return self.op("ConvTranspose", x, weight, bias, strides=[2, 2], dilations=[1, 1], kernel_shape=[2, 2])
+
+    def tokens(self):
+        """Those of the predicted IoU, of four masks, and of the points."""
+        place = self.op("Sub", self.op("Div", "point_coords", np.float32(512)), np.float32(1))
+        angle = self.op("Mul", self.op("MatMul", place, self.weight("frequencies", 2, self.WIDTH // 2)), np.float32(2 * np.pi))
+        place = self.op("Concat", self.op("Sin", angle), self.op("Cos", angle), axis=-1)
+        label = self.op("Unsqueeze", "point_labels", np.array([2]))
+        points = self.op("Add", self.op("Mul", place, self.op("Relu", label)), self.op("Mul", label, self.weight("label", self.WIDTH)))
+        own = self.constant("own", self.random.normal(0, 1, (1, 5, self.WIDTH)).astype(np.float32))
+        return self.op("Concat", own, points, axis=1)
+
+    def build(self, folder):
+        width, inner, side = self.WIDTH, self.INNER, self.SIDE
+        # Inputs without use here must not vanish from the graph's interface.
+        unused = [self.op("ReduceMax", i, keepdims=0) for i in ("mask_input", "has_mask_input", "orig_im_size")]
+        nothing = self.op("Mul", self.op("Mul", self.op("Mul", *unused[:2]), unused[2]), np.float32(0))
+        rows = self.op("Reshape", self.op("Add", "image_embeddings", nothing), np.array([1, width, side * side]))
+        pixels = self.op("Transpose", rows, perm=[0, 2, 1])
+        add = lambda a, b: self.op("Add", a, b)
+        places = add(self.weight("columns", 1, side, width), self.weight("rows", side, 1, width))
+        places = self.op("Reshape", places, np.array([1, side * side, width]))
+        tokens = x = self.tokens()
+        for i in range(2):
+            name = f"mask_decoder.transformer.layers.{i}"
+            asks = add(x, tokens) if i else x
+            own = self.attention(f"{name}.self_attn", asks, asks, x, width)
+            x = self.norm(add(x, own) if i else own, f"{name}.norm1")
+            placed = add(pixels, places)
+            x = add(x, self.attention(f"{name}.cross_attn_token_to_image", add(x, tokens), placed, pixels, inner))
+            x = self.norm(x, f"{name}.norm2")
+            hidden = self.op("Relu", self.linear(x, f"{name}.mlp.lin1", width, 2 * width))
+            x = self.norm(add(x, self.linear(hidden, f"{name}.mlp.lin2", 2 * width, width)), f"{name}.norm3")
+            taken = self.attention(f"{name}.cross_attn_image_to_token", placed, add(x, tokens), x, inner)
+            pixels = self.norm(add(pixels, taken), f"{name}.norm4")
+        name = "mask_decoder.transformer.final_attn_token_to_image"
+        x = add(x, self.attention(name, add(x, tokens), add(pixels, places), pixels, inner))
+        x = self.norm(x, "mask_decoder.transformer.norm_final_attn")
+
+        picture = self.op("Reshape", self.op("Transpose", pixels, perm=[0, 2, 1]), np.array([1, width, side, side]))
+        picture = self.enlarge(picture, "mask_decoder.output_upscaling.0", width, 8)
+        centred = self.op("Sub", picture, self.op("ReduceMean", picture, axes=[1]))
+        variance = self.op("ReduceMean", self.op("Mul", centred, centred), axes=[1])
+        normed = self.op("Div", centred, self.op("Sqrt", self.op("Add", variance, np.float32(1e-6))))
+        picture = add(self.op("Mul", self.weight("onnx::Mul_1", 8, 1, 1), normed), self.weight("onnx::Add_2", 8, 1, 1))
+        picture = self.gelu(self.enlarge(self.gelu(picture), "mask_decoder.output_upscaling.3", 8, 4))
+
+        token = lambda i: self.op("Gather", x, np.int64(i), axis=1)
+        weights = [self.mlp(token(1 + m), f"mask_decoder.output_hypernetworks_mlps.{m}", 4) for m in range(4)]
+        weights = self.op("Concat", *(self.op("Unsqueeze", w, np.array([1])) for w in weights), axis=1)
+        masks = self.op("MatMul", weights, self.op("Reshape", picture, np.array([1, 4, -1])))
+        quality = self.mlp(token(0), "mask_decoder.iou_prediction_head", 4)
+
+        # The choice, as in SAM's export.
+        best = self.op("ArgMax", self.op("Add", quality, np.array([[-1000, 0, 0, 0]], np.float32)), axis=1, keepdims=0)
+        all_masks = self.op("Reshape", masks, np.array([1, 4, 4 * side, 4 * side]))
+        chosen = self.op("Gather", self.op("Reshape", all_masks, np.array([4, 16 * side * side])), best)
+        self.nodes.append(helper.make_node("Reshape", [chosen, self.name(np.array([1, 1, 4 * side, 4 * side]))], ["low_res_masks"]))
+        chosen = self.op("Gather", self.op("Flatten", quality, axis=0), best, axis=1)
+        self.nodes.append(helper.make_node("Reshape", [chosen, self.name(np.array([1, 1]))], ["iou_predictions"]))
+        self.nodes.append(helper.make_node("Identity", ["low_res_masks"], ["masks"]))
+        inputs = [
+            value("image_embeddings", F, [1, width, side, side]),
+            value("point_coords", F, [1, "num_points", 2]),
+            value("point_labels", F, [1, "num_points"]),
+            value("mask_input", F, [1, 1, 256, 256]),
+            value("has_mask_input", F, [1]),
+            value("orig_im_size", F, [2]),
+        ]
+        outputs = [
+            value("masks", F, [1, 1, "height", "width"]),
+            value("iou_predictions", F, [1, 1]),
+            value("low_res_masks", F, [1, 1, 256, 256]),
+        ]
+        write(folder / "sam.onnx", self.nodes, inputs, outputs, self.constants)
+
+
+def sam_tiny():
+    folder = ROOT / "crates/stages/mask-embed/testdata/sam-tiny"
+    decoder = Decoder()
+    decoder.build(folder)
+    write(
+        folder / "encoder.onnx",
+        [
+            helper.make_node("AveragePool", ["input"], ["small"], kernel_shape=[16, 16], strides=[16, 16]),
+            helper.make_node("Conv", ["small", "spread"], ["output"], strides=[1, 1], dilations=[1, 1], kernel_shape=[1, 1]),
+        ],
+        [value("input", F, ["batch_size", 3, 1024, 1024])],
+        [value("output", F, ["batch_size", decoder.WIDTH, 64, 64])],
+        [constant("spread", decoder.random.normal(0, 1, (decoder.WIDTH, 3, 1, 1)).astype(np.float32))],
+    )
+
+
 if __name__ == "__main__":
     ops()
     clip()
     sam()
+    sam_tiny()

@@ -1,4 +1,4 @@
-//! The little of the ONNX file format that is needed to give a model other outputs.
+//! The little of the ONNX file format that is needed to give a model other outputs and to read its weights.
 //!
 //! An ONNX file is a protobuf message ModelProto whose field 7 is the GraphProto; its field 1 repeats nodes, field 12
 //! outputs. A value inside the graph becomes an output by being named there, which every engine understands, and what
@@ -16,8 +16,14 @@ const NODE_INPUT: u64 = 1;
 const NODE_OUTPUT: u64 = 2;
 const NODE_OP_TYPE: u64 = 4;
 const VALUE_NAME: u64 = 1;
+const TENSOR_DIMS: u64 = 1;
+const TENSOR_TYPE: u64 = 2;
+const TENSOR_NAME: u64 = 8;
+const TENSOR_RAW: u64 = 9;
 /// TensorProto.data_location, 1 for a separate file.
 const TENSOR_LOCATION: u64 = 14;
+/// TensorProto.DataType of 32-bit floats.
+const FLOAT: u64 = 1;
 
 /// One operator of the graph.
 #[derive(Debug, Clone, Default, PartialEq)]
@@ -37,6 +43,8 @@ pub struct Graph {
     pub producers: BTreeMap<String, Node>,
     /// Names of the declared outputs.
     pub outputs: Vec<String>,
+    /// Where in the file each constant array lies, by its name.
+    pub initializers: BTreeMap<String, Range<usize>>,
     /// Whether weights lie in a separate file.
     pub external_data: bool,
 }
@@ -161,7 +169,13 @@ impl Graph {
                 }
                 GRAPH_INITIALIZER => {
                     let external = |f: &Field| f.number == TENSOR_LOCATION && matches!(f.value, Value::Varint(1));
-                    graph.external_data |= fields(bytes, inner)?.iter().any(external);
+                    let tensor = fields(bytes, inner.clone())?;
+                    graph.external_data |= tensor.iter().any(external);
+                    for f in &tensor {
+                        if let (TENSOR_NAME, Value::Bytes(r)) = (f.number, &f.value) {
+                            graph.initializers.insert(text(bytes, r)?, inner.clone());
+                        }
+                    }
                 }
                 _ => {}
             }
@@ -198,6 +212,35 @@ impl Graph {
         push_bytes(&mut model, MODEL_GRAPH, &graph);
         model.extend_from_slice(&bytes[whole.end..]);
         Ok(model)
+    }
+
+    /// Shape and values of the constant array `name`; `None` where there is none, or where its values are no 32-bit floats
+    /// within the file.
+    pub fn weights(&self, bytes: &[u8], name: &str) -> Option<(Vec<usize>, Vec<f32>)> {
+        let (mut shape, mut values, mut kind) = (Vec::new(), Vec::new(), 0);
+        for f in fields(bytes, self.initializers.get(name)?.clone()).ok()? {
+            match (f.number, f.value) {
+                (TENSOR_DIMS, Value::Varint(n)) => shape.push(usize::try_from(n).ok()?),
+                (TENSOR_DIMS, Value::Bytes(packed)) => {
+                    let mut at = packed.start;
+                    while at < packed.end {
+                        shape.push(usize::try_from(varint(bytes, &mut at).ok()?).ok()?);
+                    }
+                }
+                (TENSOR_TYPE, Value::Varint(t)) => kind = t,
+                (TENSOR_RAW, Value::Bytes(r)) => {
+                    values = bytes[r].as_chunks().0.iter().map(|&b| f32::from_le_bytes(b)).collect();
+                }
+                _ => {}
+            }
+        }
+        let count = shape.iter().try_fold(1usize, |n, &d| n.checked_mul(d))?;
+        (kind == FLOAT && values.len() == count).then_some((shape, values))
+    }
+
+    /// The first operator that reads the value `name`.
+    pub fn consumer(&self, name: &str) -> Option<&Node> {
+        self.producers.values().find(|n| n.inputs.iter().any(|i| i == name))
     }
 
     /// The operator that makes the value `name`.

@@ -1,9 +1,9 @@
 //! Masks of everything in a photograph: SAM asked at a grid of points.
 //!
-//! The points of the grid are asked from coarse to fine. A point is not asked when it lies within a small-level mask of
-//! high score found in an earlier round, because the answer would be much the same three masks; unless no whole thing
-//! (level large) has been found there yet and the small mask has not been asked often. The rounds are fixed by the grid,
-//! so that the result does not depend on the number of threads.
+//! The points of the grid are asked from coarse to fine. A point is not asked when it lies within a small-level mask
+//! found in an earlier round, because the answer would be much the same three masks; unless no whole thing (level large)
+//! has been found there yet and the small mask has not been asked often. The rounds are fixed by the grid, so that the
+//! result does not depend on the number of threads.
 
 use crate::logits::{Grid, Logits};
 use crate::nms::{MaskNms, Pixels, box_nms, mask_nms, merges_things, nesting_levels};
@@ -20,9 +20,6 @@ const ASK_UNTIL_WHOLE: usize = 5;
 
 /// Largest part of the photograph that a mask may cover: what is larger is no thing but most of the room.
 const MAX_AREA: f64 = 0.6;
-/// Points within a small-level mask of at least this score (predicted IoU x stability) are not asked: the answers would be
-/// much the same three masks.
-const SKIP_SCORE: f32 = 0.8;
 /// Of masks whose boxes overlap by more than this (IoU) the best stays: as in SAM's own script.
 const BOX_NMS: f64 = 0.7;
 /// LangSplat's rule within a level, with a score that suits MobileSAM's soft edges (0.7 there).
@@ -88,20 +85,20 @@ pub fn propose(sam: &Sam, embedded: &Embedded, choice: &Choice) -> Result<Propos
     let mut points = 0;
     for round in rounds(choice.points_per_side, embedded.frame[0] as f64 / embedded.frame[1] as f64) {
         points += round.len();
-        let at_level = |l: usize| masks.iter().filter(move |m| m.level == l).map(|m| (m.score, &m.pixels));
-        let small: Vec<(&Pixels, usize)> = at_level(1)
-            .filter(|(score, _)| *score >= SKIP_SCORE)
-            .map(|(_, p)| (p, asked.iter().filter(|&&a| p.contains(grid.index(a))).count()))
-            .collect();
-        let whole: Vec<&Pixels> =
-            at_level(LEVELS - 1).filter(|(score, _)| *score > MASK_NMS.score).map(|(_, p)| p).collect();
+        let at_level = |l: usize| masks.iter().filter(move |m| m.level == l);
+        let times = |p: &Pixels| asked.iter().filter(|&&a| p.contains(grid.index(a))).count();
+        let small: Vec<(&Pixels, usize)> = at_level(1).map(|m| (&m.pixels, times(&m.pixels))).collect();
+        let good = at_level(LEVELS - 1).filter(|m| m.score > MASK_NMS.score);
+        let whole: Vec<&Pixels> = good.map(|m| &m.pixels).collect();
         let known = |point: [f64; 2]| {
             let i = grid.index(point);
             let is_whole = whole.iter().any(|w| w.contains(i));
             small.iter().any(|(s, times)| s.contains(i) && (is_whole || *times >= ASK_UNTIL_WHOLE))
         };
-        let ask: Vec<[f64; 2]> = round.into_iter().filter(|&p| !known(p)).collect();
-        let found = parallel_map(ask.len(), |i| Ok(consider(&sam.decode(embedded, ask[i])?, &grid, choice)))?;
+        let ask: Vec<[f64; 2]> = round.into_iter().filter(|&p| choice.no_skip || !known(p)).collect();
+        let found = parallel_map(ask.len(), |i| {
+            Ok(consider(&sam.decode(embedded, ask[i], choice.pred_iou as f32)?, &grid, choice))
+        })?;
         masks.extend(found.into_iter().flatten());
         asked.extend(ask);
     }
@@ -110,14 +107,9 @@ pub fn propose(sam: &Sam, embedded: &Embedded, choice: &Choice) -> Result<Propos
 
 /// Masks of one answer that pass the filters.
 fn consider(answer: &Candidates, grid: &Grid, choice: &Choice) -> Vec<Proposal> {
-    let count = answer.quality.len();
     let mut good = Vec::new();
-    for (m, &quality) in answer.quality.iter().enumerate() {
-        // A quality that is not a number is not good.
-        if quality.is_nan() || quality < choice.pred_iou as f32 {
-            continue;
-        }
-        let square = answer.mask(m);
+    for (&(m, quality), square) in answer.masks.iter().zip(answer.logits.chunks_exact(Sam::MASK_SIDE * Sam::MASK_SIDE))
+    {
         let row = |y: usize| &square[y * Sam::MASK_SIDE..y * Sam::MASK_SIDE + grid.width];
         let above = |t: f32| (0..grid.height).map(|y| row(y).iter().filter(|&&l| l > t).count()).sum::<usize>();
         let stability = above(STABILITY_OFFSET) as f32 / above(-STABILITY_OFFSET).max(1) as f32;
@@ -127,7 +119,7 @@ fn consider(answer: &Candidates, grid: &Grid, choice: &Choice) -> Vec<Proposal> 
         if stability < choice.stability as f32 || pixels.area == 0 || pixels.area > most {
             continue;
         }
-        let level = if count == 1 { 0 } else { (m + 1).min(LEVELS - 1) };
+        let level = if answer.count == 1 { 0 } else { (m + 1).min(LEVELS - 1) };
         let logits = Logits::new(row, grid, pixels.bounds);
         good.push(Proposal { level, quality, score: quality * stability, pixels, logits });
     }
@@ -225,25 +217,23 @@ mod tests {
         }
     }
 
-    const CHOICE: Choice = Choice { points_per_side: 4, pred_iou: 0.7, stability: 0.7 };
+    const CHOICE: Choice = Choice { points_per_side: 4, pred_iou: 0.7, stability: 0.7, no_skip: false };
 
     #[test]
-    fn filters_see_quality_and_stability_of_the_photograph_part_only() {
+    fn filters_see_the_stability_of_the_photograph_part_only() {
         let side = Sam::MASK_SIDE;
         let grid = Grid { width: side, height: 2, extent: [side as f64, 2.0] };
-        // Row 0 is inside by a wide margin; row 1 is undecided in masks 1 and 2; below the photograph all is inside.
+        // Row 0 is inside by a wide margin; row 1 is undecided in mask 1; below the photograph all is inside.
         let mask = |row1: f32| (0..side * side).map(move |i| if i / side == 1 { row1 } else { 9.0 });
-        let logits: Vec<f32> = mask(-9.0).chain(mask(0.5)).chain(mask(-0.5)).collect();
-        let answer = Candidates { quality: vec![0.9, 0.9, 0.6], logits };
+        let logits: Vec<f32> = mask(-9.0).chain(mask(0.5)).collect();
+        let answer = Candidates { count: 3, masks: vec![(0, 0.9), (1, 0.9)], logits };
         let good = consider(&answer, &grid, &CHOICE);
-        // Mask 0: stability 1; mask 1: 1/2, not stable; mask 2: low quality.
+        // Mask 0: stability 1; mask 1: 1/2, not stable.
         assert_eq!(good.iter().map(|p| (p.level, p.pixels.area)).collect::<Vec<_>>(), [(1, side)]);
         assert!((good[0].score - 0.9).abs() < 1e-6);
-        // A mask of everything, and one without a quality.
-        for quality in [0.9, f32::NAN] {
-            let all = Candidates { quality: vec![quality], logits: vec![9.0; side * side] };
-            assert!(consider(&all, &grid, &CHOICE).is_empty());
-        }
+        // A mask of everything.
+        let all = Candidates { count: 1, masks: vec![(0, 0.9)], logits: vec![9.0; side * side] };
+        assert!(consider(&all, &grid, &CHOICE).is_empty());
     }
 
     #[test]

@@ -43,7 +43,7 @@ pub(crate) fn run(args: &MasksArgs, stage: &Stage) -> Result<()> {
     let folder = &args.maps.out;
     let manifest = folder.join("masks.json");
     let mut claim = claim(args, &scene, &manifest, stage)?;
-    let sam = Sam::open(&args.sam, &args.engine.options())?;
+    let sam = Sam::open(&args.sam, &args.engine.options(), args.choice.no_skip)?;
     let watched = Watched::new(scene.views.iter().map(|v| &v.image_path));
     let parameters = json!(args);
     let inputs =

@@ -227,15 +227,18 @@ fn points_within_masks_already_found_are_not_asked() {
     let scene = Scene::new(1);
     let said = scene.make_masks(&scene.masks, &[]);
     assert!(said.contains("of 128 points: within masks already found"), "{said}");
-    let json: serde_json::Value =
-        serde_json::from_slice(&std::fs::read(scene.masks.join("masks.json")).unwrap()).unwrap();
-    assert!(json["extra"]["views"]["v0"]["facts"]["asked"].as_u64().unwrap() < 48, "{json}");
+    let manifest = || serde_json::from_slice(&std::fs::read(scene.masks.join("masks.json")).unwrap()).unwrap();
+    let asked = |json: &serde_json::Value| json["extra"]["views"]["v0"]["facts"]["asked"].as_u64().unwrap();
+    let json: serde_json::Value = manifest();
+    assert!(asked(&json) < 48, "{json}");
     // The provenance holds every option that shapes the maps.
     let expected = serde_json::json!({
         "resolution": "auto", "engine": "rten", "map_size": 800, "min_area": 20,
-        "points_per_side": 16, "pred_iou": 0.7, "stability": 0.7,
+        "points_per_side": 16, "pred_iou": 0.7, "stability": 0.7, "no_skip": false,
     });
     assert_eq!(json["parameters"], expected);
+    scene.make_masks(&scene.masks, &["--no-skip"]);
+    assert_eq!(asked(&manifest()), 128);
 }
 
 #[test]

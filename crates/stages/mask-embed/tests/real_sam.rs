@@ -13,17 +13,18 @@ fn laptop_kettle_and_plush_are_three_wholes() {
     let models = root.join("models");
     let photo = image::open(photo).unwrap().to_rgb8();
     let photo = RgbImage { width: photo.width() as usize, height: photo.height() as usize, pixels: photo.into_raw() };
-    let sam = Sam::open(models, &EngineOptions::default()).unwrap();
+    let sam = Sam::open(models, &EngineOptions::default(), false).unwrap();
     let embedded = sam.encode(&photo).unwrap();
     assert_eq!(embedded.frame, [1024, 575]);
     // A point on the keyboard, the kettle, the plush's side; the last of three masks is the whole thing. Areas in
     // pixels of a 256-wide picture.
     let whole =
         [([0.5, 0.522], 2600..3100), ([0.245, 0.522], 400..620), ([0.781, 0.522], 1300..1800)].map(|(p, area)| {
-            let answer = sam.decode(&embedded, p).unwrap();
-            assert_eq!(answer.quality.len(), 3);
-            let mask = Pixels::new(Sam::MASK_SIDE, answer.mask(2).iter().map(|&l| l > 0.0));
-            assert!(answer.quality[2] > 0.75 && area.contains(&mask.area), "{p:?}: {} {:?}", mask.area, answer.quality);
+            let answer = sam.decode(&embedded, p, 0.0).unwrap();
+            assert_eq!(answer.masks.len(), 3);
+            let whole = answer.logits.chunks_exact(Sam::MASK_SIDE * Sam::MASK_SIDE).nth(2).unwrap();
+            let mask = Pixels::new(Sam::MASK_SIDE, whole.iter().map(|&l| l > 0.0));
+            assert!(answer.masks[2].1 > 0.75 && area.contains(&mask.area), "{p:?}: {} {:?}", mask.area, answer.masks);
             mask
         });
     for (i, a) in whole.iter().enumerate() {

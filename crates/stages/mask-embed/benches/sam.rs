@@ -1,0 +1,139 @@
+//! SAM on photographs: the default beside every point of the grid, in one run. `cargo bench -p mask-embed --bench sam --
+//! PHOTOGRAPHS MODELS OUT` takes up to 8 pictures of a folder and writes JSON.
+//!
+//! Each photograph goes through three settings in turn: the default; `--no-skip` (every point, each through the decoder's
+//! whole graph); and every point with the default's decoder, which shows what the decoder is worth alone. Recall is the
+//! share of the masks of `--no-skip` that a mask of the default's meets with an IoU of 0.7 at the same level, in the id
+//! maps.
+
+use artifacts::{Level, MaskMaps};
+use mask_embed::Choice;
+use mask_embed::automatic::{levels, propose};
+use mask_embed::paint::paint;
+use mask_embed::sam::Sam;
+use onnx_models::{EngineOptions, RgbImage};
+use serde_json::json;
+use std::collections::BTreeMap;
+use std::path::{Path, PathBuf};
+use std::time::Instant;
+
+/// Photographs of a run.
+const PHOTOGRAPHS: usize = 8;
+/// A mask is found above this IoU.
+const FOUND: f64 = 0.7;
+/// Longest side of the id maps, and their smallest mask, as by default.
+const MAP_SIDE: usize = 800;
+const MIN_AREA: f64 = 200.0;
+
+/// What a setting took for one photograph, in seconds, and what it made.
+struct Run {
+    encode: f64,
+    decode: f64,
+    choose: f64,
+    asked: usize,
+    maps: MaskMaps,
+}
+
+impl Run {
+    fn seconds(&self) -> f64 {
+        self.encode + self.decode + self.choose
+    }
+}
+
+fn run(sam: &Sam, image: &RgbImage, no_skip: bool) -> Run {
+    let choice = Choice { points_per_side: 32, pred_iou: 0.7, stability: 0.7, no_skip };
+    let start = Instant::now();
+    let embedded = sam.encode(image).expect("the encoder runs");
+    let encode = start.elapsed().as_secs_f64();
+    let proposals = propose(sam, &embedded, &choice).expect("the decoder runs");
+    let decode = start.elapsed().as_secs_f64() - encode;
+    let scale = (MAP_SIDE as f64 / image.width.max(image.height) as f64).min(1.0);
+    let [width, height] = [image.width, image.height].map(|n| (n as f64 * scale).round() as usize);
+    let smallest = (MIN_AREA * scale * scale).ceil() as usize;
+    let maps = paint(&proposals, &levels(&proposals.masks), width, height, smallest);
+    let choose = start.elapsed().as_secs_f64() - encode - decode;
+    Run { encode, decode, choose, asked: proposals.asked, maps }
+}
+
+/// Masks of `all` at levels small, medium and large, and how many of them `some` has.
+fn recall(some: &MaskMaps, all: &MaskMaps) -> [usize; 2] {
+    let mut found = [0, 0];
+    for level in &Level::ALL[1..] {
+        let (mut both, mut areas) = (BTreeMap::<_, usize>::new(), [BTreeMap::<i32, usize>::new(), BTreeMap::new()]);
+        for (&a, &b) in some.level(*level).iter().zip(all.level(*level)) {
+            *both.entry((b, a)).or_default() += 1;
+            *areas[0].entry(a).or_default() += 1;
+            *areas[1].entry(b).or_default() += 1;
+        }
+        for (b, area) in areas[1].iter().filter(|(id, _)| **id >= 0) {
+            let iou = |(a, n): (&i32, &usize)| *n as f64 / (area + areas[0][a] - n) as f64;
+            let mates = both.range((*b, 0)..=(*b, i32::MAX)).map(|((_, a), n)| (a, n));
+            found[0] += usize::from(mates.map(iou).fold(0.0, f64::max) >= FOUND);
+            found[1] += 1;
+        }
+    }
+    found
+}
+
+fn mean(runs: &[Run], of: impl Fn(&Run) -> f64) -> f64 {
+    runs.iter().map(of).sum::<f64>() / runs.len() as f64
+}
+
+fn main() {
+    // Cargo adds --bench.
+    let arguments: Vec<String> = std::env::args().skip(1).filter(|a| !a.starts_with("--")).collect();
+    let [folder, models, out] = arguments.as_slice() else {
+        eprintln!("sam: expected PHOTOGRAPHS MODELS OUT, found {arguments:?}");
+        std::process::exit(2);
+    };
+    let pictures = std::fs::read_dir(folder).expect("a folder of photographs").map(|e| e.expect("an entry").path());
+    let read = |path: PathBuf| {
+        let image = image::open(&path).ok()?.to_rgb8();
+        let [width, height] = [image.width(), image.height()].map(|n| n as usize);
+        Some((path, RgbImage { width, height, pixels: image.into_raw() }))
+    };
+    let mut pictures: Vec<(PathBuf, RgbImage)> = pictures.filter_map(read).collect();
+    pictures.sort_by(|a, b| a.0.cmp(&b.0));
+    let step = pictures.len().div_ceil(PHOTOGRAPHS).max(1);
+    let [fast, plain] = [false, true].map(|plain| Sam::open(models, &EngineOptions::default(), plain).expect("models"));
+    let mut runs: [Vec<Run>; 3] = Default::default();
+    let mut found = [0, 0];
+    for (path, image) in pictures.iter().step_by(step) {
+        let each = [(&fast, false), (&plain, true), (&fast, true)].map(|(sam, no_skip)| run(sam, image, no_skip));
+        let [hit, all] = recall(&each[0].maps, &each[1].maps);
+        let seconds = each.each_ref().map(Run::seconds);
+        eprintln!(
+            "{}: {:.2} s, all points {:.2} s and {:.2} s, {hit} of {all} masks",
+            path.display(),
+            seconds[0],
+            seconds[1],
+            seconds[2]
+        );
+        found = [found[0] + hit, found[1] + all];
+        runs.iter_mut().zip(each).for_each(|(all, one)| all.push(one));
+    }
+    let [default, full, full_fast] = &runs;
+    let per_point = |runs: &[Run]| 1e3 * mean(runs, |r| r.decode) / mean(runs, |r| r.asked as f64);
+    let report = json!({
+        "photographs": default.len(),
+        "threads": rayon::current_num_threads(),
+        "seconds_per_photograph": mean(default, Run::seconds),
+        "seconds_per_photograph_full_grid": mean(full, Run::seconds),
+        "seconds_per_photograph_full_grid_own_decoder": mean(full_fast, Run::seconds),
+        "speedup": mean(full, Run::seconds) / mean(default, Run::seconds),
+        "prompts": mean(default, |r| r.asked as f64),
+        "prompts_full_grid": mean(full, |r| r.asked as f64),
+        "recall_iou70": found[0] as f64 / found[1] as f64,
+        "masks_full_grid": found[1],
+        "seconds": {
+            "encoder": mean(default, |r| r.encode),
+            "decoder": mean(default, |r| r.decode),
+            "choice_and_painting": mean(default, |r| r.choose),
+        },
+        "milliseconds_per_prompt": { "default": per_point(default), "whole_graph": per_point(full) },
+    });
+    let text = serde_json::to_string_pretty(&report).expect("numbers");
+    std::fs::create_dir_all(Path::new(out).parent().expect("a folder")).expect("the folder of the report");
+    std::fs::write(out, text.clone() + "\n").expect("the report");
+    eprintln!("{text}");
+}

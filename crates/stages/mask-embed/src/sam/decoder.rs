@@ -1,0 +1,532 @@
+//! SAM's mask decoder (Kirillov et al. 2023, appendix A, "Lightweight mask decoder") for one point, with less work than
+//! its graph:
+//!
+//! * A few tokens look at many pixels. The graph maps every pixel to keys and values; here the tokens' side is mapped
+//!   instead: `q (X W)' = (q W') X'` and `a (X W) = (a X) W`, the same sums in another order.
+//! * What the first layer needs of the photograph is computed once for all points ([`Photograph`]).
+//! * Masks whose predicted IoU is too low are never drawn.
+//!
+//! The graph itself is the oracle: [`super::Sam`] compares the two when it opens a model.
+
+use super::planar::{biased_gelu, dot, head_scores, norm, softmax, softmax_tokens};
+use super::weights::{self, File};
+use super::{Candidates, MASK_SIDE};
+use gs_io::{Error, Result};
+use onnx_models::Tensor;
+use rayon::{ThreadPool, ThreadPoolBuilder};
+use rten_gemm::{GemmExecutor, GemmInputA, GemmInputB, GemmOptions, PackedAMatrix, PackedBMatrix};
+use rten_tensor::{Matrix, MatrixLayout, NdTensorView};
+use std::sync::Mutex;
+
+/// Heads of every attention.
+const HEADS: usize = 8;
+/// Side and number of the encoder's pixels.
+const SIDE: usize = MASK_SIDE / 4;
+const PIXELS: usize = SIDE * SIDE;
+/// Pixels that are enlarged together.
+const CHUNK: usize = 256;
+/// Added to variances, as in PyTorch's layer norm and in SAM's own for pictures.
+const EPSILON: f32 = 1e-5;
+const EPSILON_OF_PICTURES: f32 = 1e-6;
+
+/// `x W + b`, rows times columns.
+struct Linear {
+    weight: PackedBMatrix<f32>,
+    bias: Vec<f32>,
+}
+
+struct Norm {
+    scale: Vec<f32>,
+    shift: Vec<f32>,
+}
+
+/// An attention. Of one between tokens and pixels, the pixels' `k` or `q` holds its transposed matrix.
+struct Attention {
+    q: Linear,
+    k: Linear,
+    v: Linear,
+    out: Linear,
+}
+
+struct Layer {
+    own: Attention,
+    to_pixels: Attention,
+    mlp: [Linear; 2],
+    to_tokens: Attention,
+    norms: [Norm; 4],
+}
+
+/// Enlargement: twice by two, each a matrix for the four pixels that a pixel becomes, `[4 * channels][inputs]`.
+struct Enlargement {
+    first: PackedAMatrix<f32>,
+    first_bias: Vec<f32>,
+    norm: Norm,
+    second: PackedAMatrix<f32>,
+    second_bias: Vec<f32>,
+}
+
+/// What the first layer needs of a photograph, `[channels][PIXELS]` each.
+pub(super) struct Photograph {
+    /// The embedding.
+    pub values: Vec<f32>,
+    /// Encoding of the pixels' places.
+    pub places: Vec<f32>,
+    /// Keys and values for the tokens, queries to the tokens.
+    pub keys: Vec<f32>,
+    pub sums: Vec<f32>,
+    pub queries: Vec<f32>,
+    /// Pixels of the photograph; the others fill the square.
+    pub inside: Vec<usize>,
+}
+
+impl Photograph {
+    /// From the values [`Names::photograph`] of a photograph that takes the first `width` x `height` pixels; `None` when
+    /// the values are not of SAM's shapes.
+    pub fn new(values: &[Tensor], [width, height]: [usize; 2]) -> Option<Self> {
+        let planar = |t: &Tensor| {
+            let channels = *t.shape.last()?;
+            let v = t.as_f32().filter(|_| t.shape == [1, PIXELS, channels])?;
+            Some((0..v.len()).map(|i| v[i % PIXELS * channels + i / PIXELS]).collect::<Vec<f32>>())
+        };
+        let [placed, values, keys, sums, queries] = values else { return None };
+        let (placed, values) = (planar(placed)?, planar(values)?);
+        let places = placed.iter().zip(&values).map(|(p, v)| p - v).collect();
+        let inside = (0..PIXELS).filter(|p| p % SIDE < width && p / SIDE < height).collect();
+        Some(Self { values, places, keys: planar(keys)?, sums: planar(sums)?, queries: planar(queries)?, inside })
+    }
+}
+
+/// Memory of a decoding, `[..][PIXELS]` each.
+#[derive(Default)]
+struct Desk {
+    pixels: Vec<f32>,
+    /// The pixels with their places.
+    placed: Vec<f32>,
+    /// `[heads][tokens]`.
+    scores: Vec<f32>,
+}
+
+/// Kept from point to point: memory, and the one thread that rten's product runs on, which takes all of the pool that it
+/// is called in.
+struct Worker {
+    pool: ThreadPool,
+    desk: Desk,
+}
+
+impl Worker {
+    fn new() -> Result<Self> {
+        let pool = ThreadPoolBuilder::new().num_threads(1).build();
+        Ok(Self { pool: pool.map_err(|e| Error::new(format!("no thread: {e}")))?, desk: Desk::default() })
+    }
+}
+
+/// The decoder's weights.
+pub(super) struct Decoder {
+    gemm: GemmExecutor,
+    layers: Vec<Layer>,
+    last: Attention,
+    last_norm: Norm,
+    quality: Vec<Linear>,
+    /// For each mask the layers that make its weights of the enlarged channels.
+    masks: Vec<Vec<Linear>>,
+    enlargement: Enlargement,
+    /// Channels of tokens and pixels.
+    width: usize,
+    workers: Mutex<Vec<Worker>>,
+}
+
+/// Names of the values in the graph that [`Photograph`] and the tokens are read from.
+pub(super) struct Names {
+    /// The embedding with and without places, then keys, values and queries of the first layer: `[1, PIXELS, channels]`.
+    pub photograph: [String; 5],
+    /// The tokens of a point: `[1, tokens, channels]`.
+    pub tokens: String,
+}
+
+fn matrix(values: &[f32], columns: usize) -> Matrix<'_> {
+    NdTensorView::from_data([values.len() / columns, columns], values)
+}
+
+fn add(a: &[f32], b: &[f32]) -> Vec<f32> {
+    a.iter().zip(b).map(|(a, b)| a + b).collect()
+}
+
+impl Norm {
+    /// Of every row.
+    fn rows(&self, values: &mut [f32]) {
+        for row in values.chunks_exact_mut(self.scale.len()) {
+            let mean = row.iter().sum::<f32>() / row.len() as f32;
+            let variance = row.iter().map(|v| (v - mean) * (v - mean)).sum::<f32>() / row.len() as f32;
+            let inverse = 1.0 / (variance + EPSILON).sqrt();
+            for ((v, scale), shift) in row.iter_mut().zip(&self.scale).zip(&self.shift) {
+                *v = (*v - mean) * inverse * scale + shift;
+            }
+        }
+    }
+}
+
+/// Reads the weights of a file and refuses shapes that do not fit each other.
+struct Reader<'a> {
+    file: &'a File<'a>,
+    gemm: &'a GemmExecutor,
+    /// Channels of tokens and pixels.
+    width: usize,
+}
+
+impl Reader<'_> {
+    /// A layer from and to so many channels.
+    fn linear(&self, end: &str, [from, to]: [usize; 2], transposed: bool) -> Option<Linear> {
+        let weights::Layer { mut weight, bias, .. } = self.file.layer(end)?;
+        let fits = [weight.rows, weight.columns] == [from, to];
+        if transposed {
+            weight = weight.transposed();
+        }
+        fits.then(|| Linear { weight: self.gemm.prepack_b(matrix(&weight.values, weight.columns)), bias })
+    }
+
+    fn norm(&self, end: &str) -> Option<Norm> {
+        let of = |what: &str| self.file.vector(&format!("{end}.{what}")).filter(|v| v.len() == self.width);
+        Some(Norm { scale: of("weight")?, shift: of("bias")? })
+    }
+
+    /// `turned` names the part that belongs to the pixels.
+    fn attention(&self, end: &str, turned: &str) -> Option<Attention> {
+        let inner = self.file.vector(&format!("{end}.q_proj.bias"))?.len();
+        let part = |p: &str| self.linear(&format!("{end}.{p}_proj"), [self.width, inner], p == turned);
+        let out = self.linear(&format!("{end}.out_proj"), [inner, self.width], false)?;
+        (inner % HEADS == 0).then_some(Attention { q: part("q")?, k: part("k")?, v: part("v")?, out })
+    }
+
+    fn layer(&self, i: usize) -> Option<Layer> {
+        let end = format!("transformer.layers.{i}");
+        let norm = |n: usize| self.norm(&format!("{end}.norm{n}"));
+        let hidden = self.file.vector(&format!("{end}.mlp.lin1.bias"))?.len();
+        let mlp = |n: usize, shape| self.linear(&format!("{end}.mlp.lin{n}"), shape, false);
+        Some(Layer {
+            own: self.attention(&format!("{end}.self_attn"), "")?,
+            to_pixels: self.attention(&format!("{end}.cross_attn_token_to_image"), "k")?,
+            mlp: [mlp(1, [self.width, hidden])?, mlp(2, [hidden, self.width])?],
+            to_tokens: self.attention(&format!("{end}.cross_attn_image_to_token"), "q")?,
+            norms: [norm(1)?, norm(2)?, norm(3)?, norm(4)?],
+        })
+    }
+
+    /// Three linear layers to `outputs` channels.
+    fn mlp(&self, end: &str, outputs: usize) -> Option<Vec<Linear>> {
+        let to = |i: usize| if i == 2 { outputs } else { self.width };
+        (0..3).map(|i| self.linear(&format!("{end}.layers.{i}"), [self.width, to(i)], false)).collect()
+    }
+
+    /// A transposed convolution of 2 x 2 with stride 2, `[inputs][outputs][2][2]`.
+    fn enlarge(&self, end: &str, inputs: usize) -> Option<(PackedAMatrix<f32>, Vec<f32>)> {
+        let (shape, values) = self.file.array(&format!("{end}.weight"))?;
+        let bias = self.file.vector(&format!("{end}.bias"))?;
+        let outputs = bias.len();
+        let at = |place: usize, output: usize, input: usize| values[(input * outputs + output) * 4 + place];
+        let by_place = (0..4 * outputs * inputs).map(|i| at(i / inputs / outputs, i / inputs % outputs, i % inputs));
+        (outputs > 0 && shape == [inputs, outputs, 2, 2])
+            .then(|| (self.gemm.prepack_a(matrix(&by_place.collect::<Vec<_>>(), inputs)), bias))
+    }
+
+    fn enlargement(&self) -> Option<Enlargement> {
+        let (first, first_bias) = self.enlarge("output_upscaling.0", self.width)?;
+        let (second, second_bias) = self.enlarge("output_upscaling.3", first_bias.len())?;
+        let [scale, shift] = self.file.scale_and_shift_before("output_upscaling.3.weight")?;
+        (scale.len() == first_bias.len() && shift.len() == first_bias.len()).then_some(Enlargement {
+            first,
+            first_bias,
+            norm: Norm { scale, shift },
+            second,
+            second_bias,
+        })
+    }
+
+    fn names(&self) -> Option<Names> {
+        let layer = |end: &str| self.file.layer(&format!("transformer.layers.0.{end}"));
+        let [k, v] = [layer("cross_attn_token_to_image.k_proj")?, layer("cross_attn_token_to_image.v_proj")?];
+        let q = layer("cross_attn_image_to_token.q_proj")?;
+        let tokens = layer("self_attn.q_proj")?.reads;
+        Some(Names { photograph: [k.reads, v.reads, k.makes, v.makes, q.makes], tokens })
+    }
+}
+
+/// `x` [tokens][channels] as [heads * tokens][channels] with zeros for the channels of other heads.
+fn by_head(x: &[f32], channels: usize) -> Vec<f32> {
+    let (tokens, width) = (x.len() / channels, channels / HEADS);
+    let mut out = vec![0.0; HEADS * x.len()];
+    for (i, row) in out.chunks_exact_mut(channels).enumerate() {
+        let (h, t) = (i / tokens, i % tokens);
+        row[h * width..][..width].copy_from_slice(&x[t * channels + h * width..][..width]);
+    }
+    out
+}
+
+/// Each head's channels of `x` [heads * tokens][channels], joined to [tokens][channels].
+fn of_heads(x: &[f32], channels: usize) -> Vec<f32> {
+    let (tokens, width) = (x.len() / channels / HEADS, channels / HEADS);
+    (0..tokens * channels)
+        .map(|i| (i / channels, i % channels))
+        .map(|(t, c)| x[(c / width * tokens + t) * channels + c])
+        .collect()
+}
+
+/// Scores `[heads][tokens][PIXELS]` of tokens `[tokens][channels]` with pixels `[channels][PIXELS]`.
+fn scores_by_head<'a>(x: &[f32], pixels: &[f32], channels: usize, scores: &'a mut [f32]) -> &'a mut [f32] {
+    let (tokens, width) = (x.len() / channels, channels / HEADS);
+    let scores = &mut scores[..HEADS * tokens * PIXELS];
+    for (h, scores) in scores.chunks_exact_mut(tokens * PIXELS).enumerate() {
+        let pixels = &pixels[h * width * PIXELS..(h + 1) * width * PIXELS];
+        head_scores(&x[h * width..], channels, pixels, PIXELS, scores);
+    }
+    scores
+}
+
+impl Decoder {
+    /// The decoder of a file, and where in its graph the inputs are; `None` when it is not built like SAM's.
+    pub fn read(file: &File) -> Option<(Self, Names)> {
+        let gemm = GemmExecutor::new();
+        let width = file.vector("transformer.layers.0.self_attn.out_proj.bias")?.len();
+        let reader = Reader { file, gemm: &gemm, width };
+        let enlargement = reader.enlargement()?;
+        let drawn = enlargement.second_bias.len();
+        let masks = (0..).map_while(|i| reader.mlp(&format!("output_hypernetworks_mlps.{i}"), drawn));
+        let masks: Vec<Vec<Linear>> = masks.collect();
+        let names = reader.names()?;
+        let decoder = Self {
+            layers: vec![reader.layer(0)?, reader.layer(1)?],
+            last: reader.attention("transformer.final_attn_token_to_image", "k")?,
+            last_norm: reader.norm("transformer.norm_final_attn")?,
+            quality: reader.mlp("iou_prediction_head", masks.len())?,
+            masks,
+            enlargement,
+            width,
+            workers: Mutex::default(),
+            gemm,
+        };
+        Some((decoder, names))
+    }
+
+    /// Whether a photograph and its tokens have the channels that the weights expect.
+    pub fn fits(&self, photograph: &Photograph, tokens: &[f32]) -> bool {
+        let Layer { to_pixels, to_tokens, .. } = &self.layers[0];
+        let Photograph { values, places, keys, sums, queries, .. } = photograph;
+        let [own, others] = [self.width, to_pixels.q.bias.len()].map(|n| n * PIXELS);
+        let channels =
+            [values, places].iter().all(|v| v.len() == own) && [keys, sums].iter().all(|v| v.len() == others);
+        let queries = queries.len() == to_tokens.q.bias.len() * PIXELS;
+        channels && queries && tokens.len().is_multiple_of(self.width) && tokens.len() / self.width > self.masks.len()
+    }
+
+    /// `out = a b + keep * out`, `a` [m][k] and `b` [k][n].
+    fn product(&self, a: Matrix, b: Matrix, keep: f32, out: &mut [f32]) {
+        let (a, b) = (GemmInputA::Unpacked(a), GemmInputB::Unpacked(b));
+        self.gemm.gemm(out, a, b, GemmOptions { beta: keep, ..Default::default() }).expect("the shapes fit");
+    }
+
+    fn times(&self, a: Matrix, weight: &PackedBMatrix<f32>) -> Vec<f32> {
+        let (b, rows) = (GemmInputB::Packed(weight), a.rows());
+        let mut out = vec![0.0; rows * b.cols()];
+        self.gemm.gemm(&mut out, GemmInputA::Unpacked(a), b, GemmOptions::default()).expect("the shapes fit");
+        out
+    }
+
+    fn linear(&self, layer: &Linear, x: &[f32]) -> Vec<f32> {
+        let inputs = GemmInputB::Packed(&layer.weight).rows();
+        let mut out = self.times(matrix(x, inputs), &layer.weight);
+        let bias = layer.bias.iter().cycle();
+        out.iter_mut().zip(bias).for_each(|(o, b)| *o += b);
+        out
+    }
+
+    /// Linear layers with ReLU between them.
+    fn mlp(&self, layers: &[Linear], x: &[f32]) -> Vec<f32> {
+        layers.iter().enumerate().fold(x.to_vec(), |mut x, (i, layer)| {
+            if i > 0 {
+                x.iter_mut().for_each(|v| *v = v.max(0.0));
+            }
+            self.linear(layer, &x)
+        })
+    }
+
+    /// Queries or keys, divided by the root of a head's width.
+    fn scaled(&self, layer: &Linear, x: &[f32]) -> Vec<f32> {
+        let scale = ((layer.bias.len() / HEADS) as f32).sqrt().recip();
+        self.linear(layer, x).into_iter().map(|v| v * scale).collect()
+    }
+
+    fn attend_tokens(&self, own: &Attention, asks: &[f32], values: &[f32]) -> Vec<f32> {
+        let channels = own.q.bias.len();
+        let (width, tokens) = (channels / HEADS, values.len() / channels);
+        let [q, k, v] = [self.scaled(&own.q, asks), self.linear(&own.k, asks), self.linear(&own.v, values)];
+        let mut sums = vec![0.0; values.len()];
+        for (t, h) in (0..tokens).flat_map(|t| (0..HEADS).map(move |h| (t, h))) {
+            let part = |x: usize| x * channels + h * width..x * channels + (h + 1) * width;
+            let mut weights: Vec<f32> = (0..tokens).map(|s| dot(&q[part(t)], &k[part(s)])).collect();
+            softmax(&mut weights);
+            for (s, weight) in weights.iter().enumerate() {
+                sums[part(t)].iter_mut().zip(&v[part(s)]).for_each(|(o, v)| *o += weight * v);
+            }
+        }
+        self.linear(&own.out, &sums)
+    }
+
+    /// What tokens take from the pixels of the desk.
+    fn attend_pixels(&self, attention: &Attention, asks: &[f32], desk: &mut Desk) -> Vec<f32> {
+        let q = self.scaled(&attention.q, asks);
+        let inner = attention.q.bias.len();
+        let queries = self.times(matrix(&by_head(&q, inner), inner), &attention.k.weight);
+        let channels = desk.pixels.len() / PIXELS;
+        let rows = queries.len() / channels;
+        // The keys' bias adds the same to all pixels of a row, which softmax does not see.
+        let scores = &mut desk.scores[..rows * PIXELS];
+        self.product(matrix(&queries, channels), matrix(&desk.placed, PIXELS), 0.0, scores);
+        scores.chunks_exact_mut(PIXELS).for_each(softmax);
+        let mut sums = vec![0.0; channels * rows];
+        self.product(matrix(&desk.pixels, PIXELS), matrix(scores, PIXELS).transposed(), 0.0, &mut sums);
+        let sums = self.times(matrix(&sums, rows).transposed(), &attention.v.weight);
+        // Weights sum to one, so that the values' bias comes on top.
+        let bias = attention.v.bias.iter().cycle();
+        let sums: Vec<f32> = of_heads(&sums, inner).iter().zip(bias).map(|(s, b)| s + b).collect();
+        self.linear(&attention.out, &sums)
+    }
+
+    /// The same in the first layer, whose keys and values are known.
+    fn attend_photograph(&self, attention: &Attention, asks: &[f32], known: &Photograph, desk: &mut Desk) -> Vec<f32> {
+        let q = self.scaled(&attention.q, asks);
+        let inner = attention.q.bias.len();
+        let (tokens, width) = (q.len() / inner, inner / HEADS);
+        let scores = scores_by_head(&q, &known.keys, inner, &mut desk.scores);
+        scores.chunks_exact_mut(PIXELS).for_each(softmax);
+        let row = |x, i| &<[f32]>::as_chunks::<PIXELS>(x).0[i];
+        let sum = |t: usize, c: usize| dot(row(scores, c / width * tokens + t), row(&known.sums, c));
+        let sums: Vec<f32> = (0..tokens * inner).map(|i| sum(i / inner, i % inner)).collect();
+        self.linear(&attention.out, &sums)
+    }
+
+    /// The pixels take from the tokens and are normalised.
+    fn update_pixels(&self, layer: &Layer, asks: &[f32], values: &[f32], known: Option<&Photograph>, desk: &mut Desk) {
+        let attention = &layer.to_tokens;
+        let k = self.scaled(&attention.k, asks);
+        let inner = attention.k.bias.len();
+        let (tokens, channels) = (k.len() / inner, desk.pixels.len() / PIXELS);
+        let mut shift = vec![0.0; HEADS * tokens];
+        let scores = if let Some(known) = known {
+            scores_by_head(&k, &known.queries, inner, &mut desk.scores)
+        } else {
+            let keys = by_head(&k, inner);
+            shift = keys.chunks_exact(inner).map(|k| dot(k, &attention.q.bias)).collect();
+            let keys = self.times(matrix(&keys, inner), &attention.q.weight);
+            let scores = &mut desk.scores[..shift.len() * PIXELS];
+            self.product(matrix(&keys, channels), matrix(&desk.placed, PIXELS), 0.0, scores);
+            scores
+        };
+        for (scores, shift) in scores.chunks_exact_mut(tokens * PIXELS).zip(shift.chunks_exact(tokens)) {
+            softmax_tokens(scores, PIXELS, shift);
+        }
+        let v = self.linear(&attention.v, values);
+        let values = self.times(matrix(&by_head(&v, inner), inner), &attention.out.weight);
+        self.product(matrix(&values, channels).transposed(), matrix(scores, PIXELS), 1.0, &mut desk.pixels);
+        let Norm { scale, shift } = &layer.norms[3];
+        norm(&mut desk.pixels, PIXELS, EPSILON, &attention.out.bias, scale, shift);
+    }
+
+    /// Masks of a point whose predicted IoU is at least `least`, from its tokens `[tokens][channels]`. Logits outside
+    /// the photograph are 0.
+    pub fn decode(&self, photograph: &Photograph, tokens: &[f32], least: f32) -> Result<Candidates> {
+        let worker = self.workers.lock().expect("no panic holds this lock").pop();
+        let mut worker = worker.map_or_else(Worker::new, Ok)?;
+        let Worker { pool, desk } = &mut worker;
+        let answer = pool.install(|| self.decode_at(desk, photograph, tokens, least));
+        self.workers.lock().expect("no panic holds this lock").push(worker);
+        Ok(answer)
+    }
+
+    fn decode_at(&self, desk: &mut Desk, photograph: &Photograph, tokens: &[f32], least: f32) -> Candidates {
+        let channels = self.width;
+        desk.pixels.clone_from(&photograph.values);
+        desk.scores.resize(HEADS * tokens.len() / channels * PIXELS, 0.0);
+        let mut x = tokens.to_vec();
+        for (i, layer) in self.layers.iter().enumerate() {
+            let [norm_own, norm_pixels, norm_mlp, _] = &layer.norms;
+            // The first layer has no places among the tokens, and nothing to add to.
+            x = match i {
+                0 => self.attend_tokens(&layer.own, &x, &x),
+                _ => add(&x, &self.attend_tokens(&layer.own, &add(&x, tokens), &x)),
+            };
+            norm_own.rows(&mut x);
+            let asks = add(&x, tokens);
+            let known = (i == 0).then_some(photograph);
+            let taken = match known {
+                Some(known) => self.attend_photograph(&layer.to_pixels, &asks, known, desk),
+                None => self.attend_pixels(&layer.to_pixels, &asks, desk),
+            };
+            x = add(&x, &taken);
+            norm_pixels.rows(&mut x);
+            x = add(&x, &self.mlp(&layer.mlp, &x));
+            norm_mlp.rows(&mut x);
+            self.update_pixels(layer, &add(&x, tokens), &x, known, desk);
+            desk.placed.clear();
+            desk.placed.extend(desk.pixels.iter().zip(&photograph.places).map(|(v, p)| v + p));
+        }
+
+        // Tokens: the predicted IoU's, one for each mask, the point's. The first of four masks is not wanted.
+        let wanted = usize::from(self.masks.len() == 4)..self.masks.len();
+        let rows = |x: &[f32]| {
+            let masks = &x[(1 + wanted.start) * channels..(1 + wanted.end) * channels];
+            [&x[..channels], masks].concat()
+        };
+        let (mut x, asks) = (rows(&x), rows(&add(&x, tokens)));
+        x = add(&x, &self.attend_pixels(&self.last, &asks, desk));
+        self.last_norm.rows(&mut x);
+        let quality = self.mlp(&self.quality, &x[..channels]);
+        let mut candidates = Candidates::default();
+        let mut weights = Vec::new();
+        for (level, m) in wanted.enumerate() {
+            if quality[m] >= least {
+                candidates.masks.push((level, quality[m]));
+                weights.extend(self.mlp(&self.masks[m], &x[(1 + level) * channels..(2 + level) * channels]));
+            }
+        }
+        candidates.count = x.len() / channels - 1;
+        candidates.logits = self.draw(desk, photograph, &weights, candidates.masks.len());
+        candidates
+    }
+
+    /// Logits `[masks][MASK_SIDE][MASK_SIDE]` of masks with the weights `[masks][enlarged channels]`.
+    fn draw(&self, desk: &Desk, photograph: &Photograph, weights: &[f32], masks: usize) -> Vec<f32> {
+        let mut logits = vec![0.0; masks * MASK_SIDE * MASK_SIDE];
+        if masks == 0 {
+            return logits;
+        }
+        let Enlargement { first, first_bias, norm: Norm { scale, shift }, second, second_bias } = &self.enlargement;
+        let (middle, last) = (first_bias.len(), second_bias.len());
+        let multiply = |a, b: Matrix, out: &mut [f32]| {
+            let (a, b) = (GemmInputA::Packed(a), GemmInputB::Unpacked(b));
+            self.gemm.gemm(out, a, b, GemmOptions::default()).expect("the shapes fit");
+        };
+        for inside in photograph.inside.chunks(CHUNK) {
+            let n = inside.len();
+            let pixels = desk.pixels.chunks_exact(PIXELS);
+            let pixels: Vec<f32> = pixels.flat_map(|row| inside.iter().map(|&p| row[p])).collect();
+            let [mut once, mut twice] = [middle, last].map(|channels| vec![0.0; 4 * channels * n]);
+            let mut drawn = vec![0.0; masks * n];
+            multiply(first, matrix(&pixels, n), &mut once);
+            for (place, values) in once.chunks_exact_mut(middle * n).enumerate() {
+                norm(values, n, EPSILON_OF_PICTURES, first_bias, scale, shift);
+                biased_gelu(values, 0.0);
+                multiply(second, matrix(values, n), &mut twice);
+                for (inner, values) in twice.chunks_exact_mut(last * n).enumerate() {
+                    values.chunks_exact_mut(n).zip(second_bias).for_each(|(v, &bias)| biased_gelu(v, bias));
+                    head_scores(weights, last, values, n, &mut drawn);
+                    let [dy, dx] = [place / 2 * 2 + inner / 2, place % 2 * 2 + inner % 2];
+                    for (drawn, logits) in drawn.chunks_exact(n).zip(logits.chunks_exact_mut(MASK_SIDE * MASK_SIDE)) {
+                        for (&logit, &p) in drawn.iter().zip(inside) {
+                            logits[(p / SIDE * 4 + dy) * MASK_SIDE + p % SIDE * 4 + dx] = logit;
+                        }
+                    }
+                }
+            }
+        }
+        logits
+    }
+}

@@ -1,0 +1,337 @@
+//! SAM through ONNX: a picture is encoded once, then asked for the masks at a point.
+//!
+//! The two graphs are those of SAM's own export script: an encoder with a square input of 1024 pixels, and a decoder with
+//! `image_embeddings`, `point_coords`, `point_labels`, `mask_input`, `has_mask_input` and `orig_im_size`. The export
+//! declares the best mask only, but computes four: one for prompts of several points, and whole, part and subpart for a
+//! single one. The four are found in the graph before the choice among them and taken instead (`all_masks`); the
+//! enlargement to the photograph's size, which is most of the memory and much of the time, is then never computed.
+//! Where the decoder is built as SAM's, [`decoder`] takes the place of most of the graph.
+
+mod decoder;
+mod planar;
+mod weights;
+
+use decoder::{Decoder, Names, Photograph};
+use gs_io::{Error, IoContext, Result, hash_files};
+use onnx_models::{EngineOptions, Graph, Model, Outputs, RgbImage, Tensor, open, resize_rgb};
+use std::path::Path;
+use weights::File;
+
+/// Mean and standard deviation of each channel in SAM's training, of 255.
+const MEAN: [f32; 3] = [123.675, 116.28, 103.53];
+const STD: [f32; 3] = [58.395, 57.12, 57.375];
+/// Side of the masks that the decoder makes and takes.
+const MASK_SIDE: usize = 256;
+
+/// SAM's two models.
+pub struct Sam {
+    encoder: Box<dyn Model>,
+    decoding: Decoding,
+    side: usize,
+    hash: String,
+}
+
+enum Decoding {
+    /// The graph gives all masks and qualities.
+    Graph(Box<dyn Model>),
+    /// The decoder is built as SAM's.
+    Parts(Box<Parts>),
+}
+
+/// The parts of a decoder's graph that are still asked, and what takes the place of the others.
+struct Parts {
+    photograph: Box<dyn Model>,
+    tokens: Box<dyn Model>,
+    decoder: Decoder,
+}
+
+/// A picture as the decoder wants it.
+pub struct Embedded {
+    values: Tensor<'static>,
+    photograph: Option<Photograph>,
+    /// Width and height of the picture within the encoder's square.
+    pub frame: [usize; 2],
+    /// Width and height of the picture within a mask, possibly with a fraction.
+    pub extent: [f64; 2],
+}
+
+/// The decoder's answer for one point.
+#[derive(Debug, Clone, Default)]
+pub struct Candidates {
+    /// Masks that the decoder makes for a point.
+    pub count: usize,
+    /// Those of sufficient predicted IoU: which one, from the smallest on, and its predicted IoU.
+    pub masks: Vec<(usize, f32)>,
+    /// Logits of `masks`, `[masks][MASK_SIDE][MASK_SIDE]`, of the whole square.
+    pub logits: Vec<f32>,
+}
+
+impl Candidates {
+    /// Those of masks with all qualities and logits that are at least `least`. With several masks the first is the one
+    /// for prompts of several points, and is left out.
+    fn of_graph(quality: &[f32], logits: &[f32], least: f32) -> Self {
+        let skip = usize::from(quality.len() == 4);
+        let mut found = Self { count: quality.len() - skip, ..Self::default() };
+        for (i, (&q, logits)) in quality.iter().zip(logits.chunks_exact(MASK_SIDE * MASK_SIDE)).enumerate().skip(skip) {
+            // A quality that is not a number is not sufficient.
+            if q >= least {
+                found.masks.push((i - skip, q));
+                found.logits.extend(logits);
+            }
+        }
+        found
+    }
+}
+
+/// The values of all masks and qualities, and of the one that is declared, in the decoder's graph. `None` where the
+/// graph does not choose.
+///
+/// The choice is `masks[arange, best]`: exporters write it as Gather of a Flatten, or as GatherND, followed by changes of
+/// shape only.
+fn before_choice(graph: &Graph, output: &str) -> Option<String> {
+    let mut name = output.to_string();
+    loop {
+        let node = graph.producer(&name)?;
+        let first = node.inputs.first()?.clone();
+        match node.op.as_str() {
+            "Unsqueeze" | "Squeeze" | "Reshape" | "Identity" | "Cast" => name = first,
+            "GatherND" => return Some(first),
+            "Gather" => {
+                let flat = graph.producer(&first).filter(|n| n.op == "Flatten" || n.op == "Reshape")?;
+                return flat.inputs.first().cloned();
+            }
+            _ => return None,
+        }
+    }
+}
+
+/// Names of the outputs to ask the decoder for: all masks and qualities where they can be found, else the declared ones.
+fn all_masks(graph: &Graph) -> [String; 2] {
+    let declared = ["low_res_masks", "iou_predictions"].map(String::from);
+    match [before_choice(graph, &declared[0]), before_choice(graph, &declared[1])] {
+        [Some(masks), Some(quality)] => [masks, quality],
+        _ => declared,
+    }
+}
+
+impl Sam {
+    /// Side of the masks in pixels.
+    pub const MASK_SIDE: usize = MASK_SIDE;
+
+    /// Opens `encoder.onnx` and `sam.onnx` of a folder. `plain` asks the decoder's whole graph for every point, for
+    /// comparison.
+    ///
+    /// # Errors
+    /// When a file is missing or damaged, or is not SAM.
+    pub fn open(folder: impl AsRef<Path>, options: &EngineOptions, plain: bool) -> Result<Self> {
+        let folder = folder.as_ref();
+        let [encoder_path, decoder_path] = ["encoder.onnx", "sam.onnx"].map(|n| folder.join(n));
+        for path in [&encoder_path, &decoder_path] {
+            if !path.exists() {
+                return Err(Error::new("no such model")
+                    .file(path)
+                    .hint("`make models` fetches it, or give the folder with --sam"));
+            }
+        }
+        let wrong = |what: &str, path: &Path| {
+            Error::new(what).file(path).hint("give a folder with SAM's encoder.onnx and decoder sam.onnx")
+        };
+        let encoder = open(&encoder_path, Outputs::Declared, &EngineOptions { threads_per_run: 0, ..options.clone() })?;
+        let [input] = encoder.inputs() else {
+            return Err(wrong("SAM's encoder has one input", &encoder_path).found(encoder.inputs().len()));
+        };
+        let side = input.fixed(3).unwrap_or(1024);
+        if input.shape.as_ref().is_none_or(|s| s.len() != 4) || !(64..=4096).contains(&side) {
+            return Err(wrong("the input is not a picture", &encoder_path)
+                .field(&input.name)
+                .found(format!("{:?}", input.shape))
+                .expected("[1, 3, 1024, 1024]"));
+        }
+        let bytes = std::fs::read(&decoder_path).at("read", &decoder_path)?;
+        let graph = Graph::parse(&bytes).map_err(|e| e.file(&decoder_path))?;
+        let [masks, quality] = all_masks(&graph);
+        let part = |values: &[&str]| {
+            let options = EngineOptions { threads_per_run: 1, ..options.clone() };
+            open(&decoder_path, Outputs::Values(values), &options)
+        };
+        let whole = part(&[&masks, &quality])?;
+        let parts = match Decoder::read(&File { graph: &graph, bytes: &bytes }).filter(|_| !plain) {
+            Some((decoder, Names { photograph, tokens })) => {
+                let photograph = part(&photograph.each_ref().map(String::as_str))?;
+                Some(Parts { photograph, tokens: part(&[&tokens])?, decoder })
+            }
+            None => None,
+        };
+        let decoding = match parts {
+            Some(parts) if parts.agree_with(&*whole, side)? => Decoding::Parts(Box::new(parts)),
+            _ => Decoding::Graph(whole),
+        };
+        let hash = hash_files([("encoder.onnx", &encoder_path), ("sam.onnx", &decoder_path)])?;
+        Ok(Self { encoder, decoding, side, hash })
+    }
+
+    /// Content hash of both models.
+    pub fn hash(&self) -> &str {
+        &self.hash
+    }
+
+    /// Encodes a picture: longest side resized to the square's, zeros to the right and below.
+    ///
+    /// # Errors
+    /// When the engine fails.
+    pub fn encode(&self, image: &RgbImage) -> Result<Embedded> {
+        let side = self.side;
+        let scale = side as f64 / image.width.max(image.height) as f64;
+        let frame = [image.width, image.height].map(|n| ((n as f64 * scale).round() as usize).clamp(1, side));
+        let small = resize_rgb(image, frame[0], frame[1]);
+        let mut pixels = vec![0f32; 3 * side * side];
+        for (i, p) in small.pixels.chunks_exact(3).enumerate() {
+            let at = i / frame[0] * side + i % frame[0];
+            for c in 0..3 {
+                pixels[c * side * side + at] = (f32::from(p[c]) - MEAN[c]) / STD[c];
+            }
+        }
+        let name = self.encoder.inputs()[0].name.clone();
+        let mut out = self.encoder.run(&[(&name, Tensor::f32(&[1, 3, side, side], pixels))])?;
+        if out.len() != 1 || out[0].as_f32().is_none_or(|v| v.iter().any(|v| !v.is_finite())) {
+            return Err(Error::new("the encoder does not give one array of finite numbers").file(self.encoder.path()));
+        }
+        let values = out.swap_remove(0);
+        let extent = frame.map(|n| n as f64 * MASK_SIDE as f64 / side as f64);
+        let photograph = match &self.decoding {
+            Decoding::Graph(_) => None,
+            Decoding::Parts(parts) => parts.photograph(&values, extent)?,
+        };
+        Ok(Embedded { values, photograph, frame, extent })
+    }
+
+    /// Masks at a point of the picture, `x` and `y` in 0..1 of its width and height, whose predicted IoU is at least
+    /// `least`. One thread; may be called from several at once.
+    ///
+    /// # Errors
+    /// When the engine fails or does not give masks of 256 x 256.
+    pub fn decode(&self, embedded: &Embedded, [x, y]: [f64; 2], least: f32) -> Result<Candidates> {
+        let point = [(x * embedded.frame[0] as f64) as f32, (y * embedded.frame[1] as f64) as f32];
+        match (&self.decoding, &embedded.photograph) {
+            (Decoding::Graph(graph), _) => ask_graph(&**graph, &embedded.values, point, least),
+            (Decoding::Parts(parts), Some(photograph)) => parts.ask(&embedded.values, photograph, point, least),
+            (Decoding::Parts(parts), None) => Err(Error::new("the encoder's embedding does not suit the decoder")
+                .file(parts.tokens.path())
+                .found(format!("{:?}", embedded.values.shape))),
+        }
+    }
+}
+
+impl Parts {
+    /// What the photograph alone decides; `None` where the shapes are not SAM's.
+    fn photograph(&self, values: &Tensor, extent: [f64; 2]) -> Result<Option<Photograph>> {
+        let pixels = extent.map(|n| (n / 4.0).ceil() as usize);
+        Ok(Photograph::new(&self.photograph.run(&inputs(values, [0.0; 2]))?, pixels))
+    }
+
+    fn ask(&self, values: &Tensor, photograph: &Photograph, point: [f32; 2], least: f32) -> Result<Candidates> {
+        let tokens = self.tokens.run(&inputs(values, point))?;
+        let Some(tokens) = tokens[0].as_f32().filter(|t| self.decoder.fits(photograph, t)) else {
+            return Err(Error::new("the decoder's tokens do not suit its weights").file(self.tokens.path()));
+        };
+        self.decoder.decode(photograph, tokens, least)
+    }
+
+    /// Whether the answer about a point is the whole graph's.
+    fn agree_with(&self, whole: &dyn Model, side: usize) -> Result<bool> {
+        let embedding = whole.inputs().iter().find(|i| i.name == "image_embeddings").and_then(|i| i.shape.as_ref());
+        let Some(shape) = embedding.and_then(|s| s.iter().copied().collect::<Option<Vec<usize>>>()) else {
+            return Ok(false);
+        };
+        // Any numbers of about the size of an embedding's.
+        let numbers = (0..shape.iter().product()).map(|i: usize| (i as f32).sin() * (i as f32 * 0.01).cos());
+        let values = Tensor::f32(&shape, numbers.collect::<Vec<_>>());
+        let Some(photograph) = self.photograph(&values, [MASK_SIDE as f64; 2])? else { return Ok(false) };
+        let point = [0.25, 0.75].map(|p| p * side as f32);
+        let want = ask_graph(whole, &values, point, f32::NEG_INFINITY)?;
+        let Ok(got) = self.ask(&values, &photograph, point, f32::NEG_INFINITY) else { return Ok(false) };
+        let near = |a: f32, b: f32| (a - b).abs() <= 1e-3 * (1.0 + a.abs());
+        Ok(want.count == got.count
+            && want.masks.len() == got.masks.len()
+            && want.masks.iter().zip(&got.masks).all(|(a, b)| near(a.1, b.1))
+            && want.logits.iter().zip(&got.logits).all(|(&a, &b)| near(a, b)))
+    }
+}
+
+/// The whole graph's answer for a point in the encoder's pixels.
+fn ask_graph(graph: &dyn Model, values: &Tensor, point: [f32; 2], least: f32) -> Result<Candidates> {
+    let out = graph.run(&inputs(values, point))?;
+    let (Some(logits), Some(quality)) = (out[0].as_f32(), out[1].as_f32()) else {
+        return Err(Error::new("the decoder's outputs are not floats").file(graph.path()));
+    };
+    let count = quality.len();
+    if count == 0 || logits.len() != count * MASK_SIDE * MASK_SIDE {
+        return Err(Error::new("the decoder does not give masks of 256 x 256 and a quality for each")
+            .file(graph.path())
+            .found(format!("{:?} and {:?}", out[0].shape, out[1].shape)));
+    }
+    Ok(Candidates::of_graph(quality, logits, least))
+}
+
+/// What the decoder's graph is asked with: a point in the encoder's pixels.
+fn inputs<'a>(values: &'a Tensor, point: [f32; 2]) -> [(&'static str, Tensor<'a>); 6] {
+    [
+        ("image_embeddings", values.view()),
+        // The second point, of label -1, stands for "no box".
+        ("point_coords", Tensor::f32(&[1, 2, 2], vec![point[0], point[1], 0.0, 0.0])),
+        ("point_labels", Tensor::f32(&[1, 2], vec![1.0, -1.0])),
+        ("mask_input", Tensor::f32(&[1, 1, MASK_SIDE, MASK_SIDE], vec![0.0; MASK_SIDE * MASK_SIDE])),
+        ("has_mask_input", Tensor::f32(&[1], vec![0.0])),
+        ("orig_im_size", Tensor::f32(&[2], vec![MASK_SIDE as f32; 2])),
+    ]
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn tiny() -> std::path::PathBuf {
+        Path::new(env!("CARGO_MANIFEST_DIR")).join("testdata/sam-tiny")
+    }
+
+    fn picture() -> RgbImage {
+        let pixels = (0..60 * 40 * 3).map(|i: usize| ((i as f32 * 0.01).sin() * 100.0 + 120.0) as u8).collect();
+        RgbImage { width: 60, height: 40, pixels }
+    }
+
+    #[test]
+    fn the_decoder_gives_the_answers_of_its_graph() {
+        let options = EngineOptions::default();
+        let [fast, plain] = [false, true].map(|plain| Sam::open(tiny(), &options, plain).unwrap());
+        assert!(matches!(fast.decoding, Decoding::Parts(_)) && matches!(plain.decoding, Decoding::Graph(_)));
+        let [a, b] = [&fast, &plain].map(|sam| sam.encode(&picture()).unwrap());
+        let near = |a: f32, b: f32| (a - b).abs() < 2e-4 * (1.0 + a.abs());
+        let mut least = f32::NEG_INFINITY;
+        for point in [[0.1, 0.2], [0.5, 0.5], [0.9, 0.3], [0.7, 0.99]] {
+            let [got, want] = [(&fast, &a), (&plain, &b)].map(|(sam, e)| sam.decode(e, point, least).unwrap());
+            assert_eq!((got.count, got.masks.len()), (3, want.masks.len()));
+            assert!(got.masks.iter().zip(&want.masks).all(|(a, b)| a.0 == b.0 && near(a.1, b.1)), "{got:?}");
+            // Below the photograph's 683 of 1024 rows nothing is drawn but the rest of a pixel.
+            for (i, (&a, &b)) in got.logits.iter().zip(&want.logits).enumerate() {
+                assert!(near(a, b) || (i / MASK_SIDE % MASK_SIDE >= 172 && a == 0.0), "{i}: {a} {b}");
+            }
+            // The next point leaves out the worst mask.
+            least = want.masks.iter().map(|m| m.1).fold(f32::INFINITY, f32::min) + 1e-3;
+        }
+    }
+
+    #[test]
+    fn a_decoder_that_only_looks_like_sams_is_asked_through_its_graph() {
+        let folder = tempfile::tempdir().unwrap();
+        std::fs::copy(tiny().join("encoder.onnx"), folder.path().join("encoder.onnx")).unwrap();
+        let mut bytes = std::fs::read(tiny().join("sam.onnx")).unwrap();
+        // GELU becomes another function: the activation's node is renamed to one that has the same inputs.
+        let at = bytes.windows(3).position(|w| w == b"Erf").unwrap();
+        bytes[at..at + 3].copy_from_slice(b"Sin");
+        std::fs::write(folder.path().join("sam.onnx"), bytes).unwrap();
+        let sam = Sam::open(folder.path(), &EngineOptions::default(), false).unwrap();
+        assert!(matches!(sam.decoding, Decoding::Graph(_)));
+        let embedded = sam.encode(&picture()).unwrap();
+        assert_eq!(sam.decode(&embedded, [0.5, 0.5], f32::NEG_INFINITY).unwrap().masks.len(), 3);
+    }
+}

@@ -1,0 +1,210 @@
+//! Loops over pixels for SAM's decoder, compiled for the processor at hand. Arrays are planar: `[channels][pixels]`, so
+//! that pixels lie side by side.
+
+use multiversion::multiversion;
+
+/// Pixels that are worked on together, so that all channels of them stay in the cache.
+const BLOCK: usize = 256;
+
+/// e^x, relative error below 2e-7; 0 below -87.
+#[inline(always)]
+fn exp(x: f32) -> f32 {
+    /// Adding this rounds to a whole number, which then stands in the lowest bits.
+    const ROUND: f32 = 12_582_912.0;
+    let x = x.clamp(-87.0, 88.0);
+    let shifted = x * std::f32::consts::LOG2_E + ROUND;
+    let whole = shifted - ROUND;
+    // ln 2 in two parts, the first exact in few bits.
+    let r = (x - whole * 0.693_359_4) + whole * 2.121_944_4e-4;
+    // Taylor's series to the seventh power: |r| <= ln 2 / 2.
+    let p = 1.0 / 5040.0;
+    let p = p * r + 1.0 / 720.0;
+    let p = p * r + 1.0 / 120.0;
+    let p = p * r + 1.0 / 24.0;
+    let p = p * r + 1.0 / 6.0;
+    let p = p * r + 0.5;
+    let p = p * r + 1.0;
+    let p = p * r + 1.0;
+    f32::from_bits(p.to_bits().wrapping_add(shifted.to_bits() << 23))
+}
+
+/// x times the normal distribution's integral up to x. The error function is formula 7.1.26 of Abramowitz and Stegun's
+/// handbook, off by at most 1.5e-7.
+#[inline(always)]
+fn gelu(x: f32) -> f32 {
+    let z = x.abs() * std::f32::consts::FRAC_1_SQRT_2;
+    let t = 1.0 / (1.0 + 0.327_591_1 * z);
+    let p = 1.061_405_4 * t - 1.453_152;
+    let p = p * t + 1.421_413_7;
+    let p = p * t - 0.284_496_74;
+    let p = p * t + 0.254_829_6;
+    let rest = 0.5 * p * t * exp(-z * z);
+    // The integral up to -|x| is `rest`.
+    x * if x < 0.0 { rest } else { 1.0 - rest }
+}
+
+/// GELU of every value, after a bias.
+#[multiversion(targets("x86_64+avx512f+avx512vl", "x86_64+avx2"))]
+pub(super) fn biased_gelu(values: &mut [f32], bias: f32) {
+    for v in values {
+        *v = gelu(*v + bias);
+    }
+}
+
+/// Scores of a head's tokens: `out[t][pixel]` = sum over the head's channels of `query[t][c] * keys[c][pixel]`.
+/// `query` has `stride` values for each token, `keys` `pixels` for each channel.
+#[multiversion(targets("x86_64+avx512f+avx512vl", "x86_64+avx2"))]
+pub(super) fn head_scores(query: &[f32], stride: usize, keys: &[f32], pixels: usize, out: &mut [f32]) {
+    for (query, out) in query.chunks(stride).zip(out.chunks_exact_mut(pixels)) {
+        for from in (0..pixels).step_by(BLOCK) {
+            let to = (from + BLOCK).min(pixels);
+            let out = &mut out[from..to];
+            out.fill(0.0);
+            for (q, keys) in query.iter().zip(keys.chunks_exact(pixels)) {
+                for (o, k) in out.iter_mut().zip(&keys[from..to]) {
+                    *o += q * k;
+                }
+            }
+        }
+    }
+}
+
+/// Sum of `a[i] * b[i]`.
+#[multiversion(targets("x86_64+avx512f+avx512vl", "x86_64+avx2"))]
+pub(super) fn dot(a: &[f32], b: &[f32]) -> f32 {
+    let mut lanes = [0.0f32; 64];
+    let ((a, rest_a), (b, rest_b)) = (a.as_chunks::<64>(), b.as_chunks::<64>());
+    for (a, b) in a.iter().zip(b) {
+        for l in 0..64 {
+            lanes[l] += a[l] * b[l];
+        }
+    }
+    lanes.iter().sum::<f32>() + rest_a.iter().zip(rest_b).map(|(a, b)| a * b).sum::<f32>()
+}
+
+/// Softmax of a row.
+#[multiversion(targets("x86_64+avx512f+avx512vl", "x86_64+avx2"))]
+pub(super) fn softmax(row: &mut [f32]) {
+    let most = row.iter().copied().fold(f32::NEG_INFINITY, f32::max);
+    let mut lanes = [0.0f32; 64];
+    for block in row.chunks_mut(64) {
+        for (v, sum) in block.iter_mut().zip(&mut lanes) {
+            *v = exp(*v - most);
+            *sum += *v;
+        }
+    }
+    let scale = 1.0 / lanes.iter().sum::<f32>();
+    row.iter_mut().for_each(|v| *v *= scale);
+}
+
+/// Softmax over the tokens of a head, pixel by pixel: `scores[t][pixel] + shift[t]` becomes the weight of token t.
+#[multiversion(targets("x86_64+avx512f+avx512vl", "x86_64+avx2"))]
+pub(super) fn softmax_tokens(scores: &mut [f32], pixels: usize, shift: &[f32]) {
+    let (mut most, mut sum) = ([0.0f32; BLOCK], [0.0f32; BLOCK]);
+    for from in (0..pixels).step_by(BLOCK) {
+        let to = (from + BLOCK).min(pixels);
+        most.fill(f32::NEG_INFINITY);
+        sum.fill(0.0);
+        for (row, shift) in scores.chunks_exact(pixels).zip(shift) {
+            for (m, s) in most.iter_mut().zip(&row[from..to]) {
+                *m = m.max(*s + shift);
+            }
+        }
+        for (row, shift) in scores.chunks_exact_mut(pixels).zip(shift) {
+            for ((s, m), sum) in row[from..to].iter_mut().zip(&most).zip(&mut sum) {
+                *s = exp(*s + shift - m);
+                *sum += *s;
+            }
+        }
+        sum.iter_mut().for_each(|s| *s = 1.0 / *s);
+        for row in scores.chunks_exact_mut(pixels) {
+            for (s, inverse) in row[from..to].iter_mut().zip(&sum) {
+                *s *= inverse;
+            }
+        }
+    }
+}
+
+/// Layer norm over the channels of every pixel, after a bias per channel: `(x - mean) / deviation * scale + shift`.
+#[multiversion(targets("x86_64+avx512f+avx512vl", "x86_64+avx2"))]
+pub(super) fn norm(values: &mut [f32], pixels: usize, epsilon: f32, bias: &[f32], scale: &[f32], shift: &[f32]) {
+    let share = 1.0 / bias.len() as f32;
+    let (mut mean, mut inverse) = ([0.0f32; BLOCK], [0.0f32; BLOCK]);
+    for from in (0..pixels).step_by(BLOCK) {
+        let to = (from + BLOCK).min(pixels);
+        mean.fill(0.0);
+        for (row, bias) in values.chunks_exact_mut(pixels).zip(bias) {
+            for (v, m) in row[from..to].iter_mut().zip(&mut mean) {
+                *v += bias;
+                *m += *v;
+            }
+        }
+        mean.iter_mut().for_each(|m| *m *= share);
+        inverse.fill(0.0);
+        for row in values.chunks_exact(pixels) {
+            for ((v, m), s) in row[from..to].iter().zip(&mean).zip(&mut inverse) {
+                *s += (v - m) * (v - m);
+            }
+        }
+        inverse.iter_mut().for_each(|s| *s = 1.0 / (*s * share + epsilon).sqrt());
+        for ((row, scale), shift) in values.chunks_exact_mut(pixels).zip(scale).zip(shift) {
+            for ((v, m), i) in row[from..to].iter_mut().zip(&mean).zip(&inverse) {
+                *v = (*v - m) * i * scale + shift;
+            }
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn exponential_and_gelu_keep_their_bounds() {
+        for i in -8600..8700 {
+            let x = i as f32 * 0.01;
+            let want = f64::from(x).exp();
+            assert!((f64::from(exp(x)) / want - 1.0).abs() < 2e-7, "{x}: {}", exp(x));
+        }
+        // Values of x Phi(x) from tables of the normal distribution.
+        for (x, phi) in [(0.0, 0.5), (1.0, 0.841_344_7), (-1.0, 0.158_655_3), (2.5, 0.993_790_3), (-3.0, 0.001_349_9)] {
+            assert!((gelu(x) - x * phi).abs() < 3e-7 * x.abs().max(1.0), "{x}: {}", gelu(x));
+        }
+        assert!(gelu(-40.0).abs() < 1e-30 && gelu(40.0) == 40.0);
+    }
+
+    #[test]
+    fn softmax_over_pixels_and_over_tokens_agree() {
+        let (tokens, pixels) = (3, 300);
+        let scores: Vec<f32> = (0..tokens * pixels).map(|i| (i as f32 * 0.37).sin() * 20.0).collect();
+        let mut by_pixel = scores.clone();
+        softmax_tokens(&mut by_pixel, pixels, &[0.5, 0.0, -0.5]);
+        for p in 0..pixels {
+            let mut row: Vec<f32> = (0..tokens).map(|t| scores[t * pixels + p] + 0.5 - 0.5 * t as f32).collect();
+            softmax(&mut row);
+            for t in 0..tokens {
+                assert!((row[t] - by_pixel[t * pixels + p]).abs() < 1e-6);
+            }
+        }
+    }
+
+    #[test]
+    fn scores_sums_and_norms_are_those_of_their_formulas() {
+        let pixels = 300;
+        let keys: Vec<f32> = (0..2 * pixels).map(|i| (i as f32 * 0.1).cos()).collect();
+        let mut out = vec![9.0; 2 * pixels];
+        head_scores(&[1.0, 2.0, 7.0, -1.0, 0.5, 7.0], 3, &keys, pixels, &mut out);
+        for p in 0..pixels {
+            assert!((out[p] - (keys[p] + 2.0 * keys[pixels + p])).abs() < 1e-6);
+            assert!((out[pixels + p] - (0.5 * keys[pixels + p] - keys[p])).abs() < 1e-6);
+        }
+        assert!((dot(&keys, &keys) - keys.iter().map(|k| k * k).sum::<f32>()).abs() < 1e-3);
+        let mut values = keys.clone();
+        norm(&mut values, pixels, 0.0, &[1.0, 0.0], &[1.0, 2.0], &[0.0, 3.0]);
+        for p in 0..pixels {
+            // Of two numbers the one is a deviation above the mean, the other one below.
+            let sign = (keys[p] + 1.0 - keys[pixels + p]).signum();
+            assert!((values[p] - sign).abs() < 1e-3 && (values[pixels + p] - (3.0 - 2.0 * sign)).abs() < 1e-3);
+        }
+    }
+}
