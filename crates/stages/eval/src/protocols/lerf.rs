@@ -307,31 +307,3 @@ pub fn sheet(scenes: &[LerfMetrics]) -> Sheet {
     }
     published::lerf_sheet(&figures, notes)
 }
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-    use crate::Mask;
-
-    #[test]
-    fn zeros_are_counted_by_reason() {
-        let mut truth = Mask::new(4, 1);
-        truth.bits[0] = true;
-        let pair = |c: &str, p: std::result::Result<Mask, String>| Pair::new("frame_00001", c, &truth, &p);
-        let why = || Err("no Gaussian is selected".into());
-        let pairs = vec![pair("a", Ok(truth.clone())), pair("c", why()), pair("d", why())];
-        let answer = Answer::Selected { instances: vec![4, 2], score: Some(0.5), gaussians: vec![] };
-        let answers = Answers::from([("c".to_string(), answer)]);
-        let m = LerfMetrics::new("s".into(), "r".into(), BTreeMap::new(), pairs, &answers, vec![]);
-        assert_eq!(
-            m.notes,
-            ["2 of 3 pairs score 0 because no Gaussian is selected: c in frame_00001, d in frame_00001"]
-        );
-        assert_eq!(
-            (&m.objects["c"].instances[..], m.objects["c"].score, m.objects["a"].score),
-            (&[4, 2][..], Some(0.5), None)
-        );
-        let none = LerfMetrics::new("s".into(), "r".into(), BTreeMap::new(), vec![], &answers, vec![]);
-        assert!(none.notes[0].contains("no labelled object"));
-    }
-}

@@ -169,18 +169,3 @@ fn ranked(scene: &LabelledScene, index: &Index<'_>, instance: usize, score: f32)
     let (support, gaussians) = (scene.instances.support[instance], index.gaussians_of(instance).len() as u32);
     Ranked { instance: instance as u32, score, support, gaussians }
 }
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn numbers_are_all_there_or_an_error() {
-        assert_eq!(numbers::<u32, 2>("3, 4", "--pixel").unwrap(), [3, 4]);
-        assert_eq!(numbers::<f32, 3>("-1,2.5,1e2", "--point").unwrap(), [-1.0, 2.5, 100.0]);
-        for bad in ["", "3", "3,", "3,4,5", "3,x", "-1,2", "3,4,"] {
-            let e = numbers::<u32, 2>(bad, "--pixel").unwrap_err().to_string();
-            assert!(e.contains("--pixel: not understood") && e.contains("2 numbers"), "{bad}: {e}");
-        }
-    }
-}

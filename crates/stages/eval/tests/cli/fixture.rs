@@ -9,12 +9,15 @@ use gs_io::{Provenance, hash_file};
 use gs_raster::RasterOptions;
 use gs_scene::dataset::{self, LoadOptions};
 use gs_scene::{Camera, Gaussians, Image};
-use serde_json::json;
+use serde_json::{Value, json};
 use std::collections::BTreeMap;
 use std::f64::consts::TAU;
 use std::path::{Path, PathBuf};
 use std::process::{Command, Output};
 
+/// Arguments of a query, and of a score, with the table of texts.
+pub const TABLE: &str = "--text-features|{}/text.json|--out|{}/out";
+pub const SCORE: &str = "--text-features|{}/text.json|--out|{}/score.json";
 pub const WIDTH: u32 = 96;
 pub const HEIGHT: u32 = 72;
 pub const VIEWS: usize = 9;
@@ -39,10 +42,9 @@ impl Fixture {
     pub fn new(language: usize) -> Self {
         let f = Self { dir: tempfile::tempdir().unwrap() };
         let (scene, run) = (f.scene(), f.run());
-        std::fs::create_dir_all(scene.join("images")).unwrap();
-        std::fs::create_dir_all(scene.join("label")).unwrap();
-        std::fs::create_dir_all(scene.join("truth")).unwrap();
-        std::fs::create_dir_all(&run).unwrap();
+        for folder in [scene.join("images"), scene.join("label"), scene.join("truth"), run] {
+            std::fs::create_dir_all(folder).unwrap();
+        }
         let g = gaussians();
         gs_scene::ply::write_gaussians(f.geometry(), &g, &[]).unwrap();
         let mut frames = Vec::new();
@@ -98,7 +100,7 @@ impl Fixture {
     }
 
     /// The same with descriptors of one's own.
-    pub fn write_described(&self, descriptors: &[Vec<f32>; 3], label: impl Fn(usize) -> i32) {
+    fn write_described(&self, descriptors: &[Vec<f32>; 3], label: impl Fn(usize) -> i32) {
         let k = 3;
         let instances = Instances {
             label: groups().into_iter().map(label).collect(),
@@ -121,6 +123,13 @@ impl Fixture {
             ..Instances::default()
         };
         instances.write(self.instances(), self.provenance()).unwrap();
+    }
+
+    /// Makes instance 1 the one of this feature; instance 2 has none.
+    pub fn write_found(&self, feature: Vec<f32>) {
+        let opposite: Vec<f32> = feature.iter().map(|v| -v).collect();
+        let none = vec![0.0; feature.len()];
+        self.write_described(&[opposite, feature, none], |g| g as i32);
     }
 
     /// Changes the instances, or makes them those of a geometry that was changed.
@@ -196,49 +205,77 @@ impl Fixture {
         TrueScene { objects, parameters: json!({}) }.write(self.scene().join("truth/scene.json")).unwrap();
     }
 
-    /// Runs `eval` with these arguments after the scene's; `{}` stands for the fixture's folder, `<>` for `{}`.
+    /// The command, with the scene and what was found in it where it reads `inputs`.
+    pub fn command(&self, command: &str, inputs: bool) -> Command {
+        let mut c = Command::new(env!("CARGO_BIN_EXE_eval"));
+        c.arg(command).current_dir(self.path());
+        if inputs {
+            c.arg("--instances").arg(self.instances()).arg("--geometry").arg(self.geometry());
+            c.arg("--scene").arg(self.scene());
+        }
+        c
+    }
+
+    /// Runs `eval` with these arguments, `|` between them; `{}` stands for the fixture's folder, `<>` for `{}`.
     pub fn eval(&self, command: &str, arguments: &str) -> Output {
         let place = self.path().display().to_string();
-        let mut c = Command::new(env!("CARGO_BIN_EXE_eval"));
-        c.arg(command);
-        if command != "report" {
-            let (i, g, s) = (self.instances(), self.geometry(), self.scene());
-            c.arg("--instances").arg(i).arg("--geometry").arg(g).arg("--scene").arg(s);
-        }
-        c.args(
-            arguments.split('|').map(|a| a.trim().replace("{}", &place).replace("<>", "{}")).filter(|a| !a.is_empty()),
-        );
-        c.output().unwrap()
+        let inputs = ["query", "score", "lerf"].contains(&command) && !arguments.contains("--predictions");
+        let arguments = arguments.split('|').map(|a| a.trim().replace("{}", &place).replace("<>", "{}"));
+        self.command(command, inputs).args(arguments.filter(|a| !a.is_empty())).output().unwrap()
     }
 
     /// Runs `eval`, expects success, and gives what it printed.
+    #[track_caller]
     pub fn good(&self, command: &str, arguments: &str) -> String {
         let o = self.eval(command, arguments);
         assert!(o.status.success(), "{}", String::from_utf8_lossy(&o.stderr));
         String::from_utf8(o.stdout).unwrap()
     }
 
-    /// Runs `eval`, expects success, and gives what it said on standard error.
-    pub fn warned(&self, command: &str, arguments: &str) -> String {
+    /// The answers of `eval query` with the table of texts, in the folder `out`.
+    #[track_caller]
+    pub fn query(&self, arguments: &str) -> Value {
+        self.good("query", &format!("{TABLE}|{arguments}"));
+        self.json("out/query.json")["queries"].clone()
+    }
+
+    /// The scores of `eval score` with the table of texts.
+    #[track_caller]
+    pub fn score(&self, arguments: &str) -> Value {
+        self.good("score", &format!("{SCORE}|{arguments}"));
+        self.json("score.json")
+    }
+
+    /// Runs `eval`, expects success and that standard error holds these parts.
+    #[track_caller]
+    pub fn warned(&self, command: &str, arguments: &str, parts: &[&str]) {
         let o = self.eval(command, arguments);
         let said = String::from_utf8(o.stderr).unwrap();
-        assert!(o.status.success(), "{said}");
-        said
+        assert!(o.status.success() && parts.iter().all(|part| said.contains(part)), "{parts:?}: {said}");
     }
 
-    /// Runs `eval`, expects exit code 2 and one line of error, and gives that line.
-    pub fn bad(&self, command: &str, arguments: &str) -> String {
-        let o = self.eval(command, arguments);
-        let error = String::from_utf8(o.stderr).unwrap();
-        assert_eq!(o.status.code(), Some(2), "{error}");
-        let lines: Vec<&str> = error.lines().filter(|l| l.contains("error: ")).collect();
-        assert!(lines.len() == 1 && !error.contains("panicked"), "{error}");
-        lines[0].to_string()
+    /// Runs `eval`, expects exit code 2 and one line of error that holds these parts.
+    #[track_caller]
+    pub fn bad(&self, command: &str, arguments: &str, parts: &[&str]) {
+        failed(&self.eval(command, arguments), parts);
     }
 
-    pub fn json(&self, path: &str) -> serde_json::Value {
-        serde_json::from_slice(&std::fs::read(self.path().join(path)).unwrap()).unwrap()
+    pub fn json(&self, path: &str) -> Value {
+        read_json(&self.path().join(path))
     }
+}
+
+/// Expects exit code 2 and one line of error that holds these parts.
+#[track_caller]
+pub fn failed(o: &Output, parts: &[&str]) {
+    let error = String::from_utf8_lossy(&o.stderr);
+    assert!(o.status.code() == Some(2) && !error.contains("panicked"), "{error}");
+    let lines: Vec<&str> = error.lines().filter(|l| l.contains("error: ")).collect();
+    assert!(lines.len() == 1 && parts.iter().all(|part| lines[0].contains(part)), "{parts:?}: {error}");
+}
+
+pub fn read_json(path: &Path) -> Value {
+    serde_json::from_slice(&std::fs::read(path).unwrap()).unwrap()
 }
 
 pub fn stem(i: usize) -> String {
