@@ -19,3 +19,10 @@ pub mod score;
 mod silhouette;
 
 pub use mask::Mask;
+pub use protocols::instances::read_truth;
+pub use query::ask::Asker;
+pub use query::ranking::{Index, Scoring, Selection};
+pub use query::segment::divide;
+pub use query::text::{TextSource, TextTable};
+pub use scene::numbered;
+pub use score::labels::{read as read_labels, read_mask};
