@@ -3,8 +3,7 @@
 use crate::seeds;
 use artifacts::{Features, Footprints, Graph, Instances, MaskFeatures, MaskMaps, TruePoints, TrueScene};
 use clap::Parser;
-use eval::protocols::instances::read_truth;
-use eval::query::text::{TextSource, TextTable};
+use eval::{TextSource, TextTable, read_labels, read_mask, read_truth};
 use gs_scene::dataset::{self, LoadOptions, Resolution};
 use gs_scene::{Geometry, Image, PointCloud, ply};
 use stage::{Program, Stage};
@@ -249,12 +248,12 @@ fn check_artifact(bytes: &[u8]) {
 
 fn check_labels(bytes: &[u8]) {
     with("labels/frame_00001.json", bytes, |path| {
-        if let Some(frame) = sound(eval::score::labels::read(path), path) {
+        if let Some(frame) = sound(read_labels(path), path) {
             assert_eq!(frame.frame, "frame_00001");
             for (name, mask) in &frame.categories {
                 assert_eq!(mask.bits.len(), frame.width as usize * frame.height as usize);
                 // Pictures of queries are named so.
-                let file = eval::scene::numbered(1, name);
+                let file = eval::numbered(1, name);
                 assert!(!file.is_empty() && !file.contains(['/', '\\', '\0']) && !file.contains(".."), "{file:?}");
             }
         }
@@ -283,7 +282,7 @@ fn check_id_png(bytes: &[u8]) {
         if let Some(i) = sound(Image::read(path), path) {
             assert_eq!(i.rgb.len(), 3 * i.width as usize * i.height as usize);
         }
-        sound(eval::score::labels::read_mask(path), path);
+        sound(read_mask(path), path);
         let out = folder().join("maps");
         let args = ["mask-embed", "import", "--quiet", "--labels"].map(Into::into);
         let args = args.into_iter().chain([dir.clone().into_os_string(), "--out".into(), out.clone().into()]);
