@@ -3,9 +3,7 @@
 //! does.
 
 use artifacts::Instances;
-use eval::query::ask::Asker;
-use eval::query::ranking::{Index, Scoring, Selection};
-use eval::query::segment;
+use eval::{Asker, Index, Scoring, Selection};
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use std::time::Instant;
@@ -68,7 +66,7 @@ fn main() {
     let relevancy = ask(&asker);
     let segmentation = times(&[()], |()| {
         let divided =
-            segment::divide(&asker.index, &instances.label, INSTANCES, &texts[..20], &Scoring::default(), None);
+            eval::divide(&asker.index, &instances.label, INSTANCES, &texts[..20], &Scoring::default(), None);
         assert_eq!(divided.0.len(), GAUSSIANS);
     });
     let scan = times(&texts[..21], |text| {

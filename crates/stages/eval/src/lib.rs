@@ -7,15 +7,15 @@
 
 pub mod cli;
 mod mask;
-pub mod mask_stats;
+mod mask_stats;
 mod memory;
 mod nearest;
 mod options;
 mod page;
-pub mod protocols;
-pub mod query;
-pub mod scene;
-pub mod score;
+mod protocols;
+mod query;
+mod scene;
+mod score;
 mod silhouette;
 
 pub use mask::Mask;

@@ -18,9 +18,6 @@ impl Mask {
     }
 
     /// The pixels whose value exceeds `threshold` (strictly).
-    ///
-    /// # Panics
-    /// When `values` does not hold `width` x `height` numbers.
     pub fn above(width: usize, height: usize, values: &[f32], threshold: f32) -> Self {
         assert_eq!(values.len(), width * height);
         Self { width, height, bits: values.iter().map(|&v| v > threshold).collect() }
@@ -32,9 +29,6 @@ impl Mask {
     }
 
     /// Intersection over union; 0 when both sets are empty (docs/protocols.md).
-    ///
-    /// # Panics
-    /// When the masks differ in size.
     pub fn iou(&self, other: &Self) -> f64 {
         assert_eq!((self.width, self.height), (other.width, other.height));
         let (mut both, mut either) = (0usize, 0usize);

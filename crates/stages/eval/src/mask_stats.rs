@@ -51,9 +51,6 @@ pub struct MaskStats {
 }
 
 /// Measures the id maps of a folder, with footprints of these very masks also their consistency.
-///
-/// # Errors
-/// When the folder holds no id maps, a file is damaged, or the footprints are of other views.
 pub fn measure(folder: &Path, footprints: Option<&Footprints>) -> Result<MaskStats> {
     let stems = artifacts::stems(folder)?;
     if stems.is_empty() {

@@ -15,9 +15,6 @@ use std::path::{Path, PathBuf};
 pub const MIN_OPACITY: f32 = 0.1;
 
 /// Loads a dataset and passes on its warnings.
-///
-/// # Errors
-/// When it cannot be read.
 pub fn load(folder: &Path, options: &LoadOptions, stage: &Stage) -> Result<Dataset> {
     let dataset = dataset::load(folder, options)?;
     dataset.warnings.iter().for_each(|w| stage.warn(w));
@@ -31,9 +28,6 @@ impl Inputs {
     }
 
     /// Reads instances and geometry, which must be those of the dataset. Damaged Gaussians are reported.
-    ///
-    /// # Errors
-    /// As [`LabelledScene::read`] and [`LabelledScene::check_dataset`].
     pub fn read(&self, dataset: &Dataset, stage: &Stage) -> Result<LabelledScene> {
         let scene = LabelledScene::read(&self.instances, &self.geometry)?;
         if let Some(damage) = scene.geometry.damage() {
@@ -66,9 +60,6 @@ pub struct LabelledScene {
 
 impl LabelledScene {
     /// Reads `instances.safetensors` and the geometry it was made from.
-    ///
-    /// # Errors
-    /// When a file is missing or damaged, or the instances belong to another geometry.
     pub fn read(instances: &Path, geometry: &Path) -> Result<Self> {
         let (labelled, artifact) = Instances::read(instances)?;
         let watched = Watched::new([geometry]);
@@ -116,9 +107,6 @@ impl LabelledScene {
     }
 
     /// Checks that the dataset is the one that the instances were made from.
-    ///
-    /// # Errors
-    /// When it has other photographs, cameras or points, or a photograph cannot be read.
     pub fn check_dataset(&self, dataset: &Dataset) -> Result<()> {
         self.artifact.expect_input(role::DATASET, &dataset.hash()?).map_err(|e| {
             e.expected(format!("the photographs, cameras and points of {}", dataset.root.display()))
@@ -128,9 +116,6 @@ impl LabelledScene {
 }
 
 /// The view of this name: a file name, with or without its extension.
-///
-/// # Errors
-/// When there is none; the message names a few that exist.
 pub fn find_view<'a>(dataset: &'a Dataset, name: &str) -> Result<&'a View> {
     dataset.views.iter().find(|v| v.name == name || v.stem() == name).ok_or_else(|| {
         let some: Vec<&str> = dataset.views.iter().take(4).map(View::stem).collect();

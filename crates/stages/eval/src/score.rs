@@ -10,7 +10,7 @@ mod polygon;
 mod scores;
 mod truth;
 
-pub use self::scores::{GaussianScores, QueryScore, Scores, ThingScore};
+pub use self::scores::{QueryScore, Scores, ThingScore};
 
 use self::labels::FrameLabels;
 use crate::memory::{self, SMALLER, Sizes};
@@ -77,9 +77,6 @@ pub(crate) fn run(o: &ScoreOptions, parameters: Value, stage: &Stage) -> Result<
 }
 
 /// Scores the instances against the polygons of `folder`, without asking for anything: [`label_iou::score`].
-///
-/// # Errors
-/// When labels are damaged.
 fn score_labels(
     scene: &LabelledScene,
     dataset: &Dataset,
@@ -101,9 +98,6 @@ fn score_labels(
 
 /// Scores text queries against `label/*.json` of the scene, by the protocol of [`crate::protocols::pairs`] with every
 /// category of the labels asked for. `rendering` says how a selection becomes a mask.
-///
-/// # Errors
-/// When labels are damaged or of another size, or the text encoder fails.
 fn score_queries(
     scene: &LabelledScene,
     dataset: &Dataset,

@@ -14,9 +14,6 @@ const STEPS: usize = 200;
 
 /// The `count` leading principal components of `rows` (`[n][dim]`), fewer where the rows vary along fewer, by power iteration
 /// on the covariance in f64.
-///
-/// # Panics
-/// When `dim` is 0 or does not divide the number of values.
 pub fn pca(rows: &[f32], dim: usize, count: usize) -> Pca {
     assert!(dim > 0 && rows.len().is_multiple_of(dim));
     let n = (rows.len() / dim).max(1) as f64;

@@ -55,9 +55,6 @@ impl Run {
 
 /// All records in these folders and their sub-folders (three deep), in the order of the pipeline; each file once, and
 /// not the record of `except`.
-///
-/// # Errors
-/// When a record is damaged. Folders that do not exist hold no records.
 pub fn read_all(folders: &[&Path], except: &Path) -> Result<Vec<Run>> {
     let mut paths: BTreeMap<PathBuf, PathBuf> = BTreeMap::new();
     for folder in folders {

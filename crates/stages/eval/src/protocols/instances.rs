@@ -34,8 +34,7 @@ struct Group {
 /// -1 for vertices of no object.
 ///
 /// # Errors
-/// When a file is missing or not such a file, when there is not a segment for each of `vertices` vertices, or two objects
-/// claim one segment.
+/// When a file is not such a file, segments are not as many as `vertices`, or two objects claim one.
 pub fn read_truth(segs: &Path, aggregation: &Path, vertices: usize) -> Result<Vec<i32>> {
     let read = |path: &Path| std::fs::read(path).at("read", path);
     let bad = |path: &Path, what: &str, e: serde_json::Error| Error::new(format!("{what}: {e}")).file(path);
@@ -89,9 +88,6 @@ pub struct InstanceFigures {
 
 /// Scores the predicted instance of every point (negative: none) against the true one (negative: no object, which counts
 /// neither for nor against), with the `confidence` of each predicted instance.
-///
-/// # Panics
-/// When lengths differ or a predicted id has no confidence.
 pub fn score(truth: &[i32], predicted: &[i32], confidence: &[f32], min_points: usize) -> InstanceFigures {
     let best = metrics::score_instances(truth, predicted);
     let ids: BTreeSet<i32> = predicted.iter().copied().filter(|&p| p >= 0).collect();
@@ -115,9 +111,6 @@ pub fn score(truth: &[i32], predicted: &[i32], confidence: &[f32], min_points: u
 /// distinct confidence, precision p_i and recall r_i of what is at least that confident; after them (1, 0); the result is
 /// the sum over i of p_i (r_(i-1) - r_(i+1)) / 2, with r repeated before the first and 0 after the last. None without a
 /// true instance that takes part.
-///
-/// # Panics
-/// As [`score`].
 pub fn average_precision(
     truth: &[i32],
     predicted: &[i32],

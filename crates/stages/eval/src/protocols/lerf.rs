@@ -280,9 +280,6 @@ impl LerfMetrics {
     }
 
     /// Writes `metrics.json` and `table.md` into a folder.
-    ///
-    /// # Errors
-    /// When a file cannot be written.
     pub fn write(&self, out: &Path) -> Result<()> {
         write_bytes(out.join("table.md"), sheet(std::slice::from_ref(self)).markdown().as_bytes())?;
         write_json(out.join("metrics.json"), self)

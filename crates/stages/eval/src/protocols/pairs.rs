@@ -24,9 +24,6 @@ pub struct Pair {
 
 impl Pair {
     /// Scores one pair: |g & p| / |g | p|, where an empty union and a missing prediction, with its reason, score 0.
-    ///
-    /// # Panics
-    /// When the prediction has another size than the truth: callers render or check sizes before.
     pub fn new(frame: &str, category: &str, truth: &Mask, predicted: &Result<Mask, String>) -> Self {
         let (iou, predicted_pixels, why) = match predicted {
             Ok(mask) => (truth.iou(mask), mask.count(), None),

@@ -31,9 +31,6 @@ pub enum Answer {
 pub type Answers = BTreeMap<String, Answer>;
 
 /// Asks for texts; a text that a table does not hold is unasked.
-///
-/// # Errors
-/// When the text encoder fails.
 pub fn ask(asker: &Asker<'_>, texts: &[String]) -> Result<Answers> {
     let one = |(text, feature): (&String, Option<Vec<f32>>)| {
         let answer = feature.map_or_else(
@@ -52,9 +49,6 @@ pub fn ask(asker: &Asker<'_>, texts: &[String]) -> Result<Answers> {
 pub type Predictions = BTreeMap<String, std::result::Result<Mask, String>>;
 
 /// Renders the answers to every category of a labelled frame, in the size of the labelled image.
-///
-/// # Errors
-/// When the labelled image has another shape than the photograph; `labels` names the folder.
 pub fn predict(
     scene: &LabelledScene,
     dataset: &Dataset,
@@ -87,9 +81,6 @@ pub fn predict(
 
 /// Reads predictions that a program saved as pictures, `<folder>/<frame>_<category>.png`, pixels above grey level 10: the
 /// layout of OpenGaussian's `renders_cluster_silhouette`. A missing file is a missing prediction.
-///
-/// # Errors
-/// When a picture cannot be read or has another size than the labels.
 pub fn read_predictions(folder: &Path, frame: &FrameLabels) -> Result<Predictions> {
     let one = |category: &String| {
         let path = picture(folder, frame, category);
@@ -115,9 +106,6 @@ fn picture(folder: &Path, frame: &FrameLabels, category: &str) -> PathBuf {
 }
 
 /// Writes what [`read_predictions`] reads.
-///
-/// # Errors
-/// When a file cannot be written.
 pub fn save_predictions(folder: &Path, frame: &FrameLabels, predictions: &Predictions) -> Result<()> {
     for (category, mask) in predictions {
         if let Ok(mask) = mask {

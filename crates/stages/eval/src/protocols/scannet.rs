@@ -36,9 +36,6 @@ pub struct ScanFiles {
 impl ScanFiles {
     /// Finds the truth in a scan's folder. The segments are those of the same mesh as the labels: the finer
     /// `*_vh_clean.segs.json` and its aggregation belong to another mesh.
-    ///
-    /// # Errors
-    /// When the folder cannot be read or holds no `*.labels.ply`, or several.
     pub fn find(folder: &Path) -> Result<Self> {
         let mut names = Vec::new();
         for entry in std::fs::read_dir(folder).at("list", folder)? {
@@ -320,9 +317,6 @@ impl ScanMetrics {
     }
 
     /// Writes `metrics.json` and `table.md` into a folder.
-    ///
-    /// # Errors
-    /// When a file cannot be written.
     pub fn write(&self, out: &Path) -> Result<()> {
         write_bytes(out.join("table.md"), sheet(std::slice::from_ref(self)).markdown().as_bytes())?;
         write_json(out.join("metrics.json"), self)

@@ -86,9 +86,6 @@ fn join(path: &Path, distance: f32, scene: &LabelledScene) -> Result<Join> {
 
 impl<'a> Asker<'a> {
     /// What answers queries about a scene by the options.
-    ///
-    /// # Errors
-    /// When the features of `--join` are of another scene, or a negative has no feature.
     pub fn new(
         scene: &'a LabelledScene,
         source: Option<TextSource>,
@@ -116,12 +113,6 @@ impl<'a> Asker<'a> {
     }
 
     /// Features of texts, all of which must have one.
-    ///
-    /// # Errors
-    /// When a table does not hold a text, or the engine fails.
-    ///
-    /// # Panics
-    /// As [`Self::features`].
     pub fn known_features(&self, texts: &[String]) -> Result<Vec<Vec<f32>>> {
         let source = self.source.as_ref().expect("a source of text features");
         let one = |(f, text): (Option<Vec<f32>>, &String)| f.ok_or_else(|| source.unknown(text));
@@ -129,20 +120,11 @@ impl<'a> Asker<'a> {
     }
 
     /// Features of texts, in order; none for a text that a table does not hold.
-    ///
-    /// # Errors
-    /// When the engine fails.
-    ///
-    /// # Panics
-    /// Without a source of text features: callers check.
     pub fn features(&self, texts: &[String]) -> Result<Vec<Option<Vec<f32>>>> {
         self.source.as_ref().expect("a source of text features").encode_in(&self.templates, texts)
     }
 
     /// Answers one feature.
-    ///
-    /// # Panics
-    /// When the feature has another dimension than the descriptors.
     pub fn answer(&self, feature: &[f32]) -> Answered {
         self.select(self.index.rank(feature, &self.scoring))
     }

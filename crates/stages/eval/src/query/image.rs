@@ -6,9 +6,6 @@ use onnx_models::{Bounds, ClipImage, EngineOptions, LabelMap, RgbImage, crop_mas
 use std::path::{Path, PathBuf};
 
 /// Features of the pictures, padded to a square with black, as masks are shown to CLIP.
-///
-/// # Errors
-/// When there is no image encoder or it does not fit the instances, or a picture cannot be read.
 pub(super) fn features(pictures: &[PathBuf], clip: &Path, scene: &LabelledScene) -> Result<Vec<Vec<f32>>> {
     // --clip may name text.onnx itself; the image encoder lies beside it.
     let folder = if clip.is_dir() { clip } else { clip.parent().unwrap_or(Path::new("")) };

@@ -13,9 +13,6 @@ use std::path::Path;
 use std::time::{Duration, Instant};
 
 /// Reads texts line by line until the end, or `:quit`. A text that a table does not hold is a warning.
-///
-/// # Errors
-/// When standard input cannot be read or an answer cannot be written.
 pub(super) fn run(
     o: &QueryOptions,
     scene: &LabelledScene,

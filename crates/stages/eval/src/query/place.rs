@@ -15,9 +15,6 @@ const FAR: f64 = 10.0;
 
 /// The answers to places: `pixels` as VIEW:X,Y, then `points` as X,Y,Z. They are named by `texts`, or by all names of the
 /// table.
-///
-/// # Errors
-/// When a place is not understood, or lies outside its view or the scene.
 pub fn answers(
     pixels: &[String],
     points: &[String],
@@ -98,9 +95,6 @@ fn located(
 }
 
 /// What pixel (x, y) of a view shows: the instances by falling share of the pixel's blending weight.
-///
-/// # Errors
-/// When the pixel lies outside the view.
 fn at_pixel(scene: &LabelledScene, index: &Index<'_>, view: &View, pixel: [u32; 2]) -> Result<(Place, Vec<Ranked>)> {
     let camera = &view.camera;
     let [x, y] = pixel.map(|v| v as usize);
@@ -143,9 +137,6 @@ fn at_pixel(scene: &LabelledScene, index: &Index<'_>, view: &View, pixel: [u32; 
 }
 
 /// What is at a point of the world: the instance of the nearest labelled Gaussian of opacity at least 0.1.
-///
-/// # Errors
-/// When that Gaussian is so far that it says nothing of the point.
 fn at_point(scene: &LabelledScene, index: &Index<'_>, point: [f32; 3]) -> Result<(Place, Vec<Ranked>)> {
     let (g, label) = (scene.gaussians(), &scene.instances.label);
     let found = scene.nearest_labelled(&[point])[0];

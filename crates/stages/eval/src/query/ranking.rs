@@ -101,9 +101,6 @@ impl<'a> Index<'a> {
     }
 
     /// Score of every instance; none for one without a descriptor (no view matched it) or when the feature is zero.
-    ///
-    /// # Panics
-    /// When a feature has another length than the descriptors.
     pub fn scores(&self, feature: &[f32], scoring: &Scoring) -> Vec<Option<f32>> {
         let dim = self.instances.dim;
         assert!(feature.len() == dim && scoring.negatives.iter().all(|n| n.len() == dim));
@@ -125,9 +122,6 @@ impl<'a> Index<'a> {
     }
 
     /// All instances that have a score, best first, ties by index.
-    ///
-    /// # Panics
-    /// As [`Self::scores`].
     pub fn rank(&self, feature: &[f32], scoring: &Scoring) -> Vec<Ranked> {
         let ranked = |(k, score): (usize, Option<f32>)| {
             let (support, gaussians) = (self.instances.support[k], self.gaussians_of(k).len() as u32);

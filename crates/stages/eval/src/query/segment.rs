@@ -33,9 +33,6 @@ pub struct Segmentation {
 
 /// Divides the Gaussians among `features`: each instance goes to the feature of highest score (ties: the first), if that
 /// reaches `threshold`. Returns the index of the text per Gaussian, -1 for none, and per text its instances.
-///
-/// # Panics
-/// When a feature has another dimension than the descriptors.
 pub fn divide(
     index: &Index<'_>,
     label: &[i32],

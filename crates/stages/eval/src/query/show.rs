@@ -92,9 +92,6 @@ pub struct QueryView {
 }
 
 /// Writes the answers' PLYs, pictures and `query.json` into `out`.
-///
-/// # Errors
-/// When a view is unknown, or a file cannot be read or written.
 pub fn write(
     scene: &LabelledScene,
     dataset: &Dataset,

@@ -30,7 +30,7 @@ impl TextTable {
     /// with an array per name, of shape `[d]` or `[1, d]`. All vectors have one length.
     ///
     /// # Errors
-    /// When the file is missing or not such a table, is empty, its vectors differ in length, or a number is not finite.
+    /// When the file is no such table, is empty, or a number is not finite.
     pub fn read(path: impl AsRef<Path>) -> Result<Self> {
         let path = path.as_ref();
         let bytes = std::fs::read(path).at("read", path)?;
@@ -98,9 +98,6 @@ fn read_npz(bytes: &[u8]) -> Result<BTreeMap<String, Vec<f32>>> {
 
 impl TextSource {
     /// Opens what the options name: a CLIP folder or a table.
-    ///
-    /// # Errors
-    /// When neither is given, or the one given cannot be used.
     pub fn open(o: &TextOptions) -> Result<Self> {
         match (&o.clip, &o.text_features) {
             (Some(clip), _) => Ok(Self::Clip(Box::new(ClipText::open(clip, &EngineOptions::default())?))),
@@ -112,9 +109,6 @@ impl TextSource {
     }
 
     /// Opens what the options name, which must fit the descriptors of a scene.
-    ///
-    /// # Errors
-    /// As [`Self::open`] and [`Self::check_fits`].
     pub fn open_for(scene: &LabelledScene, o: &TextOptions) -> Result<Self> {
         let source = Self::open(o)?;
         source.check_fits(scene, o)?;
@@ -123,9 +117,6 @@ impl TextSource {
 
     /// Checks that a source has the descriptors' dimension, and that a CLIP pair is the one whose other half encoded the masks,
     /// as far as the instances know it.
-    ///
-    /// # Errors
-    /// When it is another model.
     pub fn check_fits(&self, scene: &LabelledScene, o: &TextOptions) -> Result<()> {
         self.check_dim(scene.instances.dim, scene.path())?;
         let Some(clip) = o.clip.as_deref().filter(|_| !o.any_model) else { return Ok(()) };
@@ -178,9 +169,6 @@ impl TextSource {
     }
 
     /// Features of `texts`, in order; none for a text that a table does not hold.
-    ///
-    /// # Errors
-    /// When the engine fails.
     pub fn encode(&self, texts: &[String]) -> Result<Vec<Option<Vec<f32>>>> {
         match self {
             Self::Clip(clip) => {
@@ -192,9 +180,6 @@ impl TextSource {
     }
 
     /// Features of `texts`, all of which must have one; `option` gave them.
-    ///
-    /// # Errors
-    /// When a table does not hold a text, or the engine fails.
     pub fn known(&self, texts: &[String], option: &str) -> Result<Vec<Vec<f32>>> {
         let one = |(f, text): (Option<Vec<f32>>, &String)| f.ok_or_else(|| self.unknown(text).field(option));
         self.encode(texts)?.into_iter().zip(texts).map(one).collect()
@@ -202,9 +187,6 @@ impl TextSource {
 
     /// Features of `texts` where each is put into the place of `{}` in every template, such as "a photo of a {}", and the
     /// unit features of what comes out are averaged and scaled to unit length. Without templates: [`Self::encode`].
-    ///
-    /// # Errors
-    /// As [`Self::encode`].
     pub fn encode_in(&self, templates: &[String], texts: &[String]) -> Result<Vec<Option<Vec<f32>>>> {
         if templates.is_empty() {
             return self.encode(texts);
@@ -223,9 +205,6 @@ impl TextSource {
     }
 
     /// Which features exactly: the content hash of the encoder's graph or of the table, for reports.
-    ///
-    /// # Errors
-    /// When the table cannot be read again.
     pub fn hash(&self) -> Result<String> {
         match self {
             Self::Clip(clip) => Ok(clip.hash().into()),

@@ -29,9 +29,6 @@ pub struct LabelScore {
 /// The best instance for each labelled object of each frame, as far as it is visible: an
 /// instance owns the pixels of which it gives more than half of the blended weight. Objects of a frame that is no view
 /// have IoU 0.
-///
-/// # Errors
-/// When a labelled image has another shape than its photograph; `folder` is that of the labels.
 pub fn score(
     scene: &LabelledScene,
     dataset: &Dataset,

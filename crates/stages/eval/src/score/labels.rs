@@ -31,9 +31,6 @@ pub struct FrameLabels {
 
 impl FrameLabels {
     /// The camera of a view in the size of its labelled image.
-    ///
-    /// # Errors
-    /// When the labelled image has another shape than the photograph; `labels` names the folder.
     pub fn camera(&self, view: &View, labels: &Path) -> Result<Camera> {
         let (w, h) = (self.width, self.height);
         if !same_shape([w, h], [view.camera.width, view.camera.height]) {
@@ -78,9 +75,6 @@ struct Object {
 }
 
 /// Reads all `*.json` of a label folder, by name.
-///
-/// # Errors
-/// When the folder cannot be read, a file is not such a label file, or its image size is absurd.
 pub fn read_folder(folder: impl AsRef<Path>) -> Result<Vec<FrameLabels>> {
     files(folder.as_ref())?.iter().map(read).collect()
 }
@@ -108,7 +102,7 @@ pub fn pixels(folder: &Path) -> u64 {
 /// Reads one label file and fills its polygons: vertices are truncated toward zero, borders included (docs/protocols.md).
 ///
 /// # Errors
-/// As [`read_folder`].
+/// When the file is no such label file, or its image size is absurd.
 pub fn read(path: impl AsRef<Path>) -> Result<FrameLabels> {
     let path = path.as_ref();
     let isat = parse(path)?;
@@ -155,7 +149,7 @@ fn parse(path: &Path) -> Result<Isat> {
 /// JPEG, whose ringing lights up dark pixels beside the object: a scorer that tests "above 0" has larger objects.
 pub const GREY: u8 = 10;
 
-/// The pixels of a picture above [`GREY`], in its grey levels.
+/// The pixels of a picture above grey level 10.
 ///
 /// # Errors
 /// When the file cannot be read as a picture.
@@ -168,9 +162,6 @@ pub fn read_mask(path: &Path) -> Result<Mask> {
 
 /// Reads the pictures that LangSplat's scorer made of the labels, `<folder>/<frame>/<category>.jpg` (or png), with pixels
 /// above [`GREY`].
-///
-/// # Errors
-/// When the folder cannot be read, a file is no picture, or pictures of one frame differ in size.
 pub fn read_pictures(folder: impl AsRef<Path>) -> Result<Vec<FrameLabels>> {
     let folder = folder.as_ref();
     let mut frames = Vec::new();

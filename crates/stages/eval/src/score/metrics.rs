@@ -47,9 +47,6 @@ pub const FRAGMENT: f64 = 0.1;
 
 /// Scores labels of points: `truth` and `predicted` hold an id per point, negative for none. Points without a true
 /// object do not count; points without a prediction count against their object.
-///
-/// # Panics
-/// When the two differ in length.
 pub fn score_instances(truth: &[i32], predicted: &[i32]) -> InstanceScore {
     assert_eq!(truth.len(), predicted.len());
     let mut pairs: Vec<(i32, i32)> =

@@ -12,9 +12,6 @@ use std::path::Path;
 /// Scores the instances against `truth/points.safetensors` of the scene: each surface point takes the label of the
 /// nearest labelled Gaussian of opacity at least 0.1; then per true thing the best IoU over instances. Without that
 /// file, `scores.skipped` says so.
-///
-/// # Errors
-/// When the truth is damaged.
 pub fn score_instances(scene: &LabelledScene, root: &Path, scores: &mut Scores) -> Result<()> {
     let path = root.join("truth/points.safetensors");
     if !path.exists() {
