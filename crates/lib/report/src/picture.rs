@@ -4,7 +4,7 @@ use gs_io::{Error, Result};
 use image::{DynamicImage, RgbImage};
 
 /// Colour by which a selection is marked, sRGB in 0 to 1.
-pub const HIGHLIGHT: [f32; 3] = [0.78, 1.0, 0.05];
+const HIGHLIGHT: [f32; 3] = [0.78, 1.0, 0.05];
 
 /// An sRGB picture, values 0 to 1.
 #[derive(Debug, Clone, PartialEq)]
@@ -22,26 +22,27 @@ impl Picture {
     ///
     /// # Panics
     /// When `rgb` has another length.
-    pub fn new(width: usize, height: usize, rgb: &[f32]) -> Self {
+    pub fn new(width: u32, height: u32, rgb: &[f32]) -> Self {
+        let (width, height) = (width as usize, height as usize);
         assert_eq!(rgb.len(), width * height * 3);
         let pixels = rgb.chunks_exact(3).map(|c| [c[0], c[1], c[2]].map(|v| v.clamp(0.0, 1.0))).collect();
         Self { width, height, pixels }
     }
 
-    /// Brings out a mask: the rest is dimmed and greyed, the mask lightly tinted and outlined with `color`.
+    /// Brings out a mask: the rest is dimmed and greyed, the mask lightly tinted and outlined.
     ///
     /// # Panics
     /// When the mask has another size.
     #[must_use]
-    pub fn highlighted(&self, mask: &[bool], color: [f32; 3]) -> Self {
+    pub fn highlighted(&self, mask: &[bool]) -> Self {
         assert_eq!(self.pixels.len(), mask.len());
         let outline = outline(mask, self.width, (self.width.max(self.height) / 400).max(1));
         let pixels = (0..self.pixels.len()).map(|i| {
             let c = self.pixels[i];
             if outline[i] {
-                color
+                HIGHLIGHT
             } else if mask[i] {
-                blend(c, color, 0.125)
+                blend(c, HIGHLIGHT, 0.125)
             } else {
                 let grey = 0.299 * c[0] + 0.587 * c[1] + 0.114 * c[2];
                 blend(c, [grey; 3], 0.6).map(|v| 0.12 + 0.55 * v)
@@ -151,9 +152,9 @@ mod tests {
     fn a_highlight_marks_outline_inside_and_outside() {
         let mut mask = vec![false; 8 * 6];
         mask[2 * 8 + 3] = true;
-        let h = picture().highlighted(&mask, [1.0, 0.0, 0.0]);
-        assert_eq!(h.pixels[2 * 8 + 3], [0.5625, 0.4375, 0.4375]);
-        assert_eq!(h.pixels[2 * 8 + 4], [1.0, 0.0, 0.0]);
+        let h = picture().highlighted(&mask);
+        assert_eq!(h.pixels[2 * 8 + 3].map(|v| (v * 1e4).round()), [5350.0, 5625.0, 4438.0]);
+        assert_eq!(h.pixels[2 * 8 + 4], HIGHLIGHT);
         assert!((h.pixels[0][0] - 0.395).abs() < 1e-6);
     }
 

@@ -3,7 +3,7 @@
 //! does.
 
 use artifacts::Instances;
-use eval::{Asker, Index, Scoring, Selection};
+use eval::{Asker, Index, Selection};
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use std::time::Instant;
@@ -56,18 +56,15 @@ fn main() {
     let index = Index::new(&instances);
     let load = started.elapsed().as_secs_f64();
     let selection = Selection::new(None, None, 1);
-    let mut asker =
-        Asker { index, source: None, templates: Vec::new(), scoring: Scoring::default(), selection, join: None };
+    let mut asker = Asker { index, source: None, templates: Vec::new(), negatives: Vec::new(), selection, join: None };
     let ask = |asker: &Asker<'_>| times(&texts, |text| assert!(!asker.answer(text).gaussians.is_empty()));
     let best = ask(&asker);
     asker.selection = Selection::new(Some(10), None, 1);
     let top10 = ask(&asker);
-    asker.scoring = Scoring { negatives: texts[..4].to_vec() };
+    asker.negatives = texts[..4].to_vec();
     let relevancy = ask(&asker);
     let segmentation = times(&[()], |()| {
-        let divided =
-            eval::divide(&asker.index, &instances.label, INSTANCES, &texts[..20], &Scoring::default(), None);
-        assert_eq!(divided.0.len(), GAUSSIANS);
+        assert_eq!(eval::divide(&asker.index, &texts[..20], &[], None).0.len(), GAUSSIANS);
     });
     let scan = times(&texts[..21], |text| {
         let cosine = |d: &[f32]| d.iter().zip(text).map(|(a, b)| a * b).sum::<f32>();

@@ -1,9 +1,9 @@
 //! The commands of `eval`.
 
-mod masks;
-
-use crate::options::{LerfOptions, QueryOptions, ReportOptions, ScannetOptions, ScoreOptions, TableOptions};
-use crate::{page, protocols, query, score};
+use crate::options::{
+    LerfOptions, MasksOptions, QueryOptions, ReportOptions, ScannetOptions, ScoreOptions, TableOptions,
+};
+use crate::{mask_stats, page, protocols, query, score};
 use clap::{Parser, Subcommand};
 use gs_io::{Error, Result};
 use serde::Serialize;
@@ -33,8 +33,7 @@ enum Command {
     /// Score instances and text queries against the truth of the scene
     Score(ScoreOptions),
     /// Measure id maps: how many, how large, and how often one view splits or merges what another shows
-    #[serde(skip)]
-    Masks(masks::MasksArgs),
+    Masks(MasksOptions),
     /// Make one self-contained HTML page of a run, and metrics.json beside it
     Report(ReportOptions),
 }
@@ -65,7 +64,6 @@ impl Program for Args {
     }
 
     fn run(self, stage: &Stage) -> Result<()> {
-        // Masks writes a record of its own.
         let parameters = serde_json::to_value(&self.command).unwrap_or_default();
         let text = match &self.command {
             Command::Query(o) => query::run(o, parameters, stage, self.common.json)?,
@@ -73,7 +71,7 @@ impl Program for Args {
             Command::Scannet(o) => protocols::scannet::run(o, parameters, stage)?,
             Command::Table(o) => protocols::table::run(o, parameters, stage)?,
             Command::Score(o) => score::run(o, parameters, stage)?,
-            Command::Masks(a) => masks::run(a, stage)?,
+            Command::Masks(o) => mask_stats::run(o, parameters, stage)?,
             Command::Report(o) => page::run(o, parameters, stage)?,
         };
         if !self.common.quiet && !self.common.json {

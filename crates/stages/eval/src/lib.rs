@@ -21,7 +21,7 @@ mod silhouette;
 pub use mask::Mask;
 pub use protocols::instances::read_truth;
 pub use query::ask::Asker;
-pub use query::ranking::{Index, Scoring, Selection};
+pub use query::ranking::{Index, Selection};
 pub use query::segment::divide;
 pub use query::text::{TextSource, TextTable};
 pub use scene::numbered;

@@ -17,12 +17,6 @@ impl Mask {
         Self { width, height, bits: vec![false; width * height] }
     }
 
-    /// The pixels whose value exceeds `threshold` (strictly).
-    pub fn above(width: usize, height: usize, values: &[f32], threshold: f32) -> Self {
-        assert_eq!(values.len(), width * height);
-        Self { width, height, bits: values.iter().map(|&v| v > threshold).collect() }
-    }
-
     /// Number of pixels in the set.
     pub fn count(&self) -> usize {
         self.bits.iter().filter(|&&b| b).count()
@@ -60,10 +54,5 @@ mod tests {
         assert_eq!(block(0, 4).iou(&block(0, 4)), 1.0);
         assert_eq!(block(0, 4).iou(&block(5, 9)), 0.0);
         assert_eq!(Mask::new(3, 3).iou(&Mask::new(3, 3)), 0.0, "an empty union scores nothing");
-    }
-
-    #[test]
-    fn the_threshold_is_strict() {
-        assert_eq!(Mask::above(3, 1, &[0.69, 0.7, 0.71], 0.7).bits, [false, false, true]);
     }
 }

@@ -7,9 +7,13 @@
 //! is *split* when at least two of the other view's masks hold a quarter of that weight each, and *merged* when the mask
 //! that holds most of it is itself split, with this mask among the pieces.
 
-use artifacts::{Footprints, Level, MaskMaps, maps_path};
-use gs_io::{Error, Result};
-use serde::{Deserialize, Serialize};
+use crate::options::MasksOptions;
+use artifacts::{Footprints, Level, MaskMaps, maps_path, role};
+use gs_io::{Error, Result, write_json};
+use report::sheet::markdown;
+use serde::Serialize;
+use serde_json::{Value, json};
+use stage::Stage;
 use std::collections::BTreeMap;
 use std::path::Path;
 
@@ -20,8 +24,23 @@ const PIECE: f64 = 0.25;
 /// Quantiles of the masks' areas.
 const QUANTILES: [f64; 5] = [0.1, 0.25, 0.5, 0.75, 0.9];
 
+pub(crate) fn run(o: &MasksOptions, parameters: Value, stage: &Stage) -> Result<String> {
+    let maps = artifacts::folder_files(&o.masks, "_s.npy")?;
+    let mut claim = stage.outputs(&o.out).file(&o.out).reads(maps).reads(&o.footprints).claim()?;
+    let footprints = o.footprints.as_deref().map(Footprints::read).transpose()?;
+    let mut inputs = BTreeMap::from([(role::MASKS.to_string(), artifacts::hash_folder(&o.masks, "_s.npy")?)]);
+    if let Some(f) = &footprints {
+        f.artifact().expect_input(role::MASKS, &inputs[role::MASKS])?;
+        inputs.insert(role::FOOTPRINTS.into(), f.artifact().hash().into());
+    }
+    let stats = measure(&o.masks, footprints.as_ref())?;
+    write_json(&o.out, &stats)?;
+    stage.record(&mut claim, parameters, inputs, json!({"views": stats.views}))?;
+    Ok(table(&stats))
+}
+
 /// Statistics of one level.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Serialize)]
 pub struct LevelStats {
     /// Name of the level.
     pub level: String,
@@ -42,12 +61,12 @@ pub struct LevelStats {
 }
 
 /// Statistics of a folder of masks.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Serialize)]
 pub struct MaskStats {
     /// Views.
     pub views: usize,
     /// Each level.
-    pub levels: Vec<LevelStats>,
+    pub levels: [LevelStats; 4],
 }
 
 /// Measures the id maps of a folder, with footprints of these very masks also their consistency.
@@ -65,9 +84,7 @@ pub fn measure(folder: &Path, footprints: Option<&Footprints>) -> Result<MaskSta
             .found(other)
             .hint("run graph-precompute on these masks"));
     }
-    let mut counts: Vec<Vec<f64>> = vec![Vec::new(); Level::ALL.len()];
-    let mut areas: Vec<Vec<f64>> = vec![Vec::new(); Level::ALL.len()];
-    let mut covered: Vec<Vec<f64>> = vec![Vec::new(); Level::ALL.len()];
+    let [mut counts, mut areas, mut covered]: [[Vec<f64>; 4]; 3] = Default::default();
     for stem in &stems {
         let maps = MaskMaps::read(maps_path(folder, stem))?;
         let image = (maps.width * maps.height) as f64;
@@ -81,26 +98,15 @@ pub fn measure(folder: &Path, footprints: Option<&Footprints>) -> Result<MaskSta
         }
     }
     let pairs = footprints.map(closest_views);
-    let levels = Level::ALL
-        .into_iter()
-        .map(|level| {
-            let l = level as usize;
-            let fate = footprints.zip(pairs.as_ref()).map(|(f, pairs)| compare(f, level as u32, pairs));
-            let share = |of: fn(&Fate) -> usize| {
-                fate.as_ref().filter(|f| f.compared > 0).map(|f| of(f) as f64 / f.compared as f64)
-            };
-            LevelStats {
-                level: level.to_string(),
-                masks: mean_and_spread(&counts[l]),
-                area: quantiles(&mut areas[l]),
-                covered: mean_and_spread(&covered[l])[0],
-                compared: fate.as_ref().map_or(0, |f| f.compared),
-                split: share(|f| f.split),
-                merged: share(|f| f.merged),
-                stable: share(|f| f.stable),
-            }
-        })
-        .collect();
+    let levels = Level::ALL.map(|level| {
+        let l = level as usize;
+        let fates = footprints.zip(pairs.as_ref()).map(|(f, pairs)| compare(f, level as u32, pairs));
+        let [compared, fates @ ..] = fates.unwrap_or_default();
+        let [split, merged, stable] = fates.map(|n| (compared > 0).then(|| n as f64 / compared as f64));
+        let (masks, area) = (mean_and_spread(&counts[l]), quantiles(&mut areas[l]));
+        let covered = mean_and_spread(&covered[l])[0];
+        LevelStats { level: level.to_string(), masks, area, covered, compared, split, merged, stable }
+    });
     Ok(MaskStats { views: stems.len(), levels })
 }
 
@@ -135,14 +141,6 @@ fn closest_views(f: &Footprints) -> Vec<Option<usize>> {
             others.max_by_key(|&(n, b)| (n, std::cmp::Reverse(b))).map(|s| s.1)
         })
         .collect()
-}
-
-#[derive(Default)]
-struct Fate {
-    compared: usize,
-    split: usize,
-    merged: usize,
-    stable: usize,
 }
 
 /// Weight of each mask of view `from` by the masks of view `to` that own its Gaussians: row -> (row, weight), with the
@@ -183,12 +181,13 @@ fn pieces(by: &BTreeMap<usize, f64>) -> Vec<usize> {
     by.iter().filter(|(_, w)| **w >= PIECE * seen).map(|(r, _)| *r).collect()
 }
 
-fn compare(f: &Footprints, level: u32, pairs: &[Option<usize>]) -> Fate {
+/// How many masks of a level could be compared, and how many of them are split, merged, neither.
+fn compare(f: &Footprints, level: u32, pairs: &[Option<usize>]) -> [usize; 4] {
     let mut rows: Vec<Vec<usize>> = vec![Vec::new(); f.views.len()];
     for (r, row) in f.rows.iter().enumerate().filter(|(_, row)| row.level == level) {
         rows[row.view as usize].push(r);
     }
-    let mut fate = Fate::default();
+    let mut fates = [0; 4];
     for (a, b) in pairs.iter().enumerate().filter_map(|(a, b)| Some((a, (*b)?))) {
         let there = shares(f, &rows[a], &owners(f, &rows[b]));
         let back = shares(f, &rows[b], &owners(f, &rows[a]));
@@ -197,44 +196,31 @@ fn compare(f: &Footprints, level: u32, pairs: &[Option<usize>]) -> Fate {
             if seen < SEEN * all || *all <= 0.0 {
                 continue;
             }
-            fate.compared += 1;
             let split = pieces(by).len() > 1;
             let most = by.iter().max_by(|x, y| x.1.total_cmp(y.1)).map(|m| m.0);
             let merged = most.and_then(|m| back.get(m)).is_some_and(|(_, by)| {
                 let pieces = pieces(by);
                 pieces.len() > 1 && pieces.contains(r)
             });
-            fate.split += usize::from(split);
-            fate.merged += usize::from(merged);
-            fate.stable += usize::from(!split && !merged);
+            let is = [true, split, merged, !split && !merged];
+            fates.iter_mut().zip(is).for_each(|(n, is)| *n += usize::from(is));
         }
     }
-    fate
+    fates
 }
 
 /// The statistics as a Markdown table.
 pub fn table(stats: &MaskStats) -> String {
-    let mut s = String::from(
-        "| Level | Masks per view | Area at 10 / 50 / 90 % of masks, % of the image | Covered | Split | Merged | Neither |\n\
-         | --- | --- | --- | --- | --- | --- | --- |\n",
-    );
     let percent = |v: Option<f64>| v.map_or("–".to_string(), |v| format!("{:.0} %", 100.0 * v));
-    for l in &stats.levels {
-        s += &format!(
-            "| {} | {:.1} ± {:.1} | {:.2} / {:.2} / {:.2} | {} | {} | {} | {} |\n",
-            l.level,
-            l.masks[0],
-            l.masks[1],
-            100.0 * l.area[0],
-            100.0 * l.area[2],
-            100.0 * l.area[4],
-            percent(Some(l.covered)),
-            percent(l.split),
-            percent(l.merged),
-            percent(l.stable),
-        );
-    }
-    s
+    let row = |l: &LevelStats| {
+        let [low, _, middle, _, high] = l.area.map(|v| 100.0 * v);
+        let masks = format!("{:.1} ± {:.1}", l.masks[0], l.masks[1]);
+        let shares = [Some(l.covered), l.split, l.merged, l.stable].map(percent);
+        [vec![l.level.clone(), masks, format!("{low:.2} / {middle:.2} / {high:.2}")], shares.to_vec()].concat()
+    };
+    let area = "Area at 10 / 50 / 90 % of masks, % of the image";
+    let head = ["Level", "Masks per view", area, "Covered", "Split", "Merged", "Neither"];
+    markdown(&head, &stats.levels.iter().map(row).collect::<Vec<_>>())
 }
 
 #[cfg(test)]
@@ -268,8 +254,7 @@ mod tests {
 
     fn fate(views: [&[&[u32]]; 2]) -> [usize; 4] {
         let (_dir, f) = footprints(views);
-        let fate = compare(&f, 0, &closest_views(&f));
-        [fate.compared, fate.split, fate.merged, fate.stable]
+        compare(&f, 0, &closest_views(&f))
     }
 
     #[test]
@@ -294,12 +279,7 @@ mod tests {
         let l = &stats.levels[0];
         assert_eq!((stats.views, l.masks, l.covered), (1, [2.0, 0.0], 0.8));
         assert_eq!((l.area[0], l.area[4], l.split), (0.3, 0.5, None));
-        assert!(
-            table(&stats).contains("| large | 2.0 ± 0.0 | 30.00 / 50.00 / 50.00 | 80 % | – | – | – |"),
-            "{}",
-            table(&stats)
-        );
-        let empty = tempfile::tempdir().unwrap();
-        assert!(measure(empty.path(), None).unwrap_err().to_string().contains("no id maps"));
+        let table = table(&stats);
+        assert!(table.contains("| large | 2.0 ± 0.0 | 30.00 / 50.00 / 50.00 | 80 % | – | – | – |"), "{table}");
     }
 }

@@ -116,22 +116,6 @@ pub struct Views {
     pub resolution: Resolution,
 }
 
-/// Where labels lie.
-#[derive(Debug, Clone, clap::Args, Serialize)]
-pub struct Labels {
-    /// Folder of LERF-OVS labels [default: label/ in the scene; lerf: or label/<scene>/ beside it]
-    #[arg(long, value_name = "DIR")]
-    pub labels: Option<PathBuf>,
-}
-
-/// Where the result goes.
-#[derive(Debug, Clone, clap::Args, Serialize)]
-pub struct Out {
-    /// Output
-    #[arg(long, value_name = "PATH")]
-    pub out: PathBuf,
-}
-
 /// How coarse the answer to a text or a picture is.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, clap::ValueEnum, Serialize)]
 #[serde(rename_all = "lowercase")]
@@ -147,7 +131,6 @@ pub enum Granularity {
 /// `eval query`.
 #[derive(Debug, Clone, clap::Args, Serialize)]
 #[command(group(clap::ArgGroup::new("asked").required(true).multiple(true).args(["text", "image", "pixel", "point", "interactive"])))]
-#[command(mut_arg("out", |a| a.required(false).required_unless_present("interactive").value_name("DIR").help("Output folder")))]
 pub struct QueryOptions {
     #[command(flatten)]
     #[serde(flatten)]
@@ -185,14 +168,13 @@ pub struct QueryOptions {
     #[command(flatten)]
     #[serde(flatten)]
     pub masking: Masking,
-    #[command(flatten)]
-    #[serde(flatten)]
-    pub out: Option<Out>,
+    /// Output folder
+    #[arg(long, value_name = "DIR", required_unless_present = "interactive")]
+    pub out: Option<PathBuf>,
 }
 
 /// `eval score`.
 #[derive(Debug, Clone, clap::Args, Serialize)]
-#[command(mut_arg("out", |a| a.value_name("FILE").help("Output JSON")))]
 pub struct ScoreOptions {
     #[command(flatten)]
     #[serde(flatten)]
@@ -203,15 +185,15 @@ pub struct ScoreOptions {
     #[command(flatten)]
     #[serde(flatten)]
     pub choice: Choice,
-    #[command(flatten)]
-    #[serde(flatten)]
-    pub labels: Labels,
+    /// Folder of LERF-OVS labels [default: label/ in the scene]
+    #[arg(long, value_name = "DIR")]
+    pub labels: Option<PathBuf>,
     #[command(flatten)]
     #[serde(flatten)]
     pub masking: Masking,
-    #[command(flatten)]
-    #[serde(flatten)]
-    pub out: Out,
+    /// Output JSON
+    #[arg(long, value_name = "FILE")]
+    pub out: PathBuf,
 }
 
 /// Where the true masks of labels come from.
@@ -227,7 +209,6 @@ pub enum Truth {
 /// `eval lerf`.
 #[derive(Debug, Clone, clap::Args, Serialize)]
 #[command(mut_args(unless_predicted))]
-#[command(mut_arg("out", |a| a.value_name("DIR").help("Output folder: metrics.json, table.md")))]
 pub struct LerfOptions {
     #[command(flatten)]
     #[serde(flatten)]
@@ -241,9 +222,9 @@ pub struct LerfOptions {
     #[command(flatten)]
     #[serde(flatten)]
     pub choice: Choice,
-    #[command(flatten)]
-    #[serde(flatten)]
-    pub labels: Labels,
+    /// Folder of LERF-OVS labels [default: label/ in the scene, or label/<scene>/ beside it]
+    #[arg(long, value_name = "DIR")]
+    pub labels: Option<PathBuf>,
     /// Name of the scene; one of the benchmark's four is asked the benchmark's queries, any other its labels' categories
     /// [default: that of its folder]
     #[arg(long, value_parser = words)]
@@ -257,9 +238,9 @@ pub struct LerfOptions {
     /// Save the masks that were scored
     #[arg(long, value_name = "DIR")]
     pub save_predictions: Option<PathBuf>,
-    #[command(flatten)]
-    #[serde(flatten)]
-    pub out: Out,
+    /// Output folder: metrics.json, table.md
+    #[arg(long, value_name = "DIR")]
+    pub out: PathBuf,
 }
 
 /// The inputs are required unless masks of another program are scored.
@@ -282,7 +263,6 @@ pub enum Association {
 
 /// `eval scannet`.
 #[derive(Debug, Clone, clap::Args, Serialize)]
-#[command(mut_arg("out", |a| a.value_name("DIR").help("Output folder: metrics.json, table.md")))]
 pub struct ScannetOptions {
     #[command(flatten)]
     #[serde(flatten)]
@@ -293,26 +273,39 @@ pub struct ScannetOptions {
     /// How Gaussians and vertices are brought together
     #[arg(long, value_enum, default_value = "one-to-one")]
     pub association: Association,
-    #[command(flatten)]
-    #[serde(flatten)]
-    pub out: Out,
+    /// Output folder: metrics.json, table.md
+    #[arg(long, value_name = "DIR")]
+    pub out: PathBuf,
 }
 
 /// `eval table`.
 #[derive(Debug, Clone, clap::Args, Serialize)]
-#[command(mut_arg("out", |a| a.value_name("DIR").help("Output folder: metrics.json, table.md and table.html of the dataset")))]
 pub struct TableOptions {
     /// Folders (or metrics.json files) that eval lerf or eval scannet wrote, one a scene
     #[arg(required = true, value_name = "DIR")]
     pub scenes: Vec<PathBuf>,
-    #[command(flatten)]
-    #[serde(flatten)]
-    pub out: Out,
+    /// Output folder: metrics.json, table.md and table.html of the dataset
+    #[arg(long, value_name = "DIR")]
+    pub out: PathBuf,
+}
+
+/// `eval masks`.
+#[derive(Debug, Clone, clap::Args, Serialize)]
+pub struct MasksOptions {
+    /// Folder of id maps (*_s.npy)
+    #[arg(long, value_name = "DIR")]
+    pub masks: PathBuf,
+    /// footprints.safetensors of graph-precompute for these masks: also say how many masks are split or merged in the
+    /// view that shares most Gaussians
+    #[arg(long, value_name = "FILE")]
+    pub footprints: Option<PathBuf>,
+    /// Output JSON
+    #[arg(long, value_name = "FILE")]
+    pub out: PathBuf,
 }
 
 /// `eval report`.
 #[derive(Debug, Clone, clap::Args, Serialize)]
-#[command(mut_arg("out", |a| a.value_name("FILE").help("The page; metrics.json is written beside it")))]
 pub struct ReportOptions {
     /// Dataset folder (COLMAP, transforms.json or ScanNet)
     #[arg(long, value_name = "DIR")]
@@ -332,9 +325,9 @@ pub struct ReportOptions {
     /// Hold out every Nth view, as in training; 0 for none
     #[arg(long, default_value_t = 8, value_name = "N")]
     pub holdout: usize,
-    #[command(flatten)]
-    #[serde(flatten)]
-    pub out: Out,
+    /// The page; metrics.json is written beside it
+    #[arg(long, value_name = "FILE")]
+    pub out: PathBuf,
 }
 
 /// A text of an option: CLIP has a feature for no words, too, and it resembles anything.

@@ -34,7 +34,7 @@ pub(crate) fn run(o: &ReportOptions, parameters: Value, stage: &Stage) -> Result
         ..Sizes::default()
     };
     stage.forecast(memory::of_report(&sizes), "give a smaller --resolution")?;
-    let (out, figures) = (&o.out.out, o.out.out.with_file_name("metrics.json"));
+    let (out, figures) = (&o.out, o.out.with_file_name("metrics.json"));
     let outputs = stage.outputs(out).file(out).file(&figures);
     let mut claim = outputs.reads(&dataset.files).reads(files(&o.run_dir).chain([geometry(o)])).claim()?;
     let mut inputs = BTreeMap::new();
@@ -121,7 +121,7 @@ fn files(run_dir: &Path) -> impl Iterator<Item = PathBuf> {
 fn run_records(m: &Material) -> Result<Vec<Run>> {
     let mut folders: Vec<&Path> = vec![&m.options.run_dir, &m.dataset.root];
     folders.extend(m.masks.as_deref());
-    runs::read_all(&folders, &m.options.out.out)
+    runs::read_all(&folders, &m.options.out)
 }
 
 /// PSNR and SSIM from `geom_metrics.json`, the output of gs-geom eval.

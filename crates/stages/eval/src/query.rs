@@ -15,12 +15,10 @@ pub(crate) mod show;
 pub mod text;
 
 use self::ask::{Asked, Asker};
-use self::show::{Divided, ShowOptions};
 use self::text::TextSource;
 use crate::memory::{self, SMALLER, Sizes};
 use crate::options::QueryOptions;
 use crate::scene::{LabelledScene, find_view, load};
-use crate::silhouette::Silhouette;
 use gs_io::Result;
 use gs_scene::dataset::LoadOptions;
 use serde_json::{Value, json};
@@ -29,7 +27,7 @@ use stage::Stage;
 pub(crate) fn run(o: &QueryOptions, parameters: Value, stage: &Stage, json_lines: bool) -> Result<String> {
     let load_options = LoadOptions { resolution: o.views.resolution, ..LoadOptions::default() };
     let dataset = load(&o.inputs.scene, &load_options, stage)?;
-    let out = o.out.as_ref().map(|o| &o.out);
+    let out = o.out.as_deref();
     let claim = out.map(|out| {
         let outputs = stage.outputs(out.join("query.json")).folder(out);
         let tables = o.texts.text_features.iter().chain(&o.choice.features);
@@ -46,13 +44,15 @@ pub(crate) fn run(o: &QueryOptions, parameters: Value, stage: &Stage, json_lines
     if scene.all_noise() {
         stage.warn("all Gaussians are noise: every query selects nothing");
     }
-    let show = ShowOptions { views: o.views.views.clone(), rendering: o.masking.rendering(Silhouette::Visible) };
     let (summary, printed) = match out {
         Some(out) if !o.interactive => {
-            let (asked, divided) = answers(o, &scene, &asker, stage)?;
-            let places = place::answers(&o.pixel, &o.point, &o.text, &scene, &dataset, &asker)?;
-            let asked = asked.into_iter().chain(places).collect();
-            let results = show::write(&scene, &dataset, asker.describe(), asked, divided, &show, out)?;
+            let known = |s: &TextSource| s.known(&asker.templates, &o.text, "--text");
+            let features = asker.source.as_ref().map_or(Ok(Vec::new()), known)?;
+            let mut asked = answers(o, &features, &scene, &asker, stage)?;
+            asked.extend(place::answers(o, &scene, &dataset, &asker)?);
+            let divided = o.segment.then(|| segment::write(o, &features, &scene, &dataset, &asker, out));
+            let segmentation = divided.transpose()?;
+            let results = show::write(o, &scene, &dataset, &asker, asked, segmentation, out)?;
             results.warnings().for_each(|w| stage.warn(&w));
             let nothing = results.queries.iter().filter(|q| q.gaussians == 0).count();
             let summary =
@@ -60,7 +60,7 @@ pub(crate) fn run(o: &QueryOptions, parameters: Value, stage: &Stage, json_lines
             (summary, show::table(&results))
         }
         _ => {
-            interactive::run(o, &scene, &dataset, &asker, &show, stage, json_lines)?;
+            interactive::run(o, &scene, &dataset, &asker, stage, json_lines)?;
             (json!({}), String::new())
         }
     };
@@ -72,47 +72,31 @@ pub(crate) fn run(o: &QueryOptions, parameters: Value, stage: &Stage, json_lines
 
 /// The source of text features; none where only pictures or places are asked for, and it does not fit the instances.
 fn source(o: &QueryOptions, scene: &LabelledScene) -> Result<Option<TextSource>> {
-    let worded = !o.text.is_empty() || o.interactive;
-    if !worded && !o.texts.given() {
+    if !o.text.is_empty() || !o.image.is_empty() || o.interactive {
+        return TextSource::open_for(scene, &o.texts).map(Some);
+    }
+    if !o.texts.given() {
         return Ok(None);
     }
-    let source = TextSource::open(&o.texts)?;
-    if worded || !o.image.is_empty() {
-        source.check_fits(scene, &o.texts)?;
-    }
-    Ok(Some(source).filter(|s| s.dim() == scene.instances.dim))
+    Ok(Some(TextSource::open(&o.texts)?).filter(|s| s.dim() == scene.instances.dim))
 }
 
-/// The answers to texts and pictures, and the cloud divided among the texts where that is asked for.
+/// The answers to texts, of these features, and to pictures.
 fn answers(
     o: &QueryOptions,
+    features: &[Vec<f32>],
     scene: &LabelledScene,
     asker: &Asker<'_>,
     stage: &Stage,
-) -> Result<(Vec<Asked>, Option<Divided>)> {
-    let features = if o.text.is_empty() { Vec::new() } else { asker.known_features(&o.text)? };
-    let texts = o.text.iter().zip(&features);
-    let mut asked: Vec<Asked> = texts.map(|(text, f)| Asked::new(text.clone(), "text", asker.answer(f))).collect();
-    let divided = o.segment.then(|| {
-        let (labels, instances) = segment::divide(
-            &asker.index,
-            &scene.instances.label,
-            scene.instances.len(),
-            &features,
-            &asker.scoring,
-            o.choice.threshold,
-        );
-        Divided { texts: o.text.clone(), labels, instances }
-    });
+) -> Result<Vec<Asked>> {
+    let texts = o.text.iter().zip(features);
+    let mut asked: Vec<Asked> = texts.map(|(t, f)| Asked::new(t.clone(), "text", None, asker.answer(f))).collect();
     if let Some(clip) = o.texts.clip.as_deref().filter(|_| !o.image.is_empty()) {
         for (path, feature) in o.image.iter().zip(image::features(&o.image, clip, scene)?) {
             let name = path.file_stem().unwrap_or_default().to_string_lossy().into_owned();
-            asked.push(Asked::new(name, "image", asker.answer(&feature)));
+            asked.push(Asked::new(name, "image", None, asker.answer(&feature)));
         }
     }
     let warn = |why: &str| stage.warn(why);
-    Ok((
-        asked.into_iter().flat_map(|one| granularity::apply(o.granularity, &scene.instances, one, &warn)).collect(),
-        divided,
-    ))
+    Ok(asked.into_iter().flat_map(|one| granularity::apply(o.granularity, &scene.instances, one, &warn)).collect())
 }

@@ -2,7 +2,7 @@
 
 use crate::nearest::nearest;
 use crate::options::Inputs;
-use artifacts::{Instances, role};
+use artifacts::{Features, Instances, role};
 use gs_io::{Artifact, Error, Result, Watched, hash_file};
 use gs_raster::RasterOptions;
 use gs_scene::dataset::{self, Dataset, LoadOptions, View};
@@ -115,20 +115,42 @@ impl LabelledScene {
     }
 }
 
+/// Reads the features of some of `gaussians` Gaussians of a geometry.
+pub fn read_features(path: &Path, geometry_hash: &str, gaussians: usize) -> Result<Features> {
+    let (features, artifact) = Features::read(path)?;
+    artifact.expect_input(role::GEOMETRY, geometry_hash)?;
+    if features.kept.last().is_some_and(|&last| last as usize >= gaussians) {
+        return Err(Error::new("index out of range").file(path).field("kept").hint("run feat-train again"));
+    }
+    Ok(features)
+}
+
 /// The view of this name: a file name, with or without its extension.
 pub fn find_view<'a>(dataset: &'a Dataset, name: &str) -> Result<&'a View> {
     dataset.views.iter().find(|v| v.name == name || v.stem() == name).ok_or_else(|| {
         let some: Vec<&str> = dataset.views.iter().take(4).map(View::stem).collect();
-        Error::new("no such view").file(&dataset.root).field("--views").found(name).expected(format!(
-            "one of {} names such as {}",
-            dataset.views.len(),
-            some.join(", ")
-        ))
+        let expected = format!("one of {} names such as {}", dataset.views.len(), some.join(", "));
+        Error::new("no such view").file(&dataset.root).field("--views").found(name).expected(expected)
     })
 }
 
+/// Views that are shown where none are named.
+const VIEWS: usize = 3;
+
+/// The views of these names; without names a few of those that `fit`, or of all where none does, which lie apart.
+pub fn views_to_show<'a>(dataset: &'a Dataset, names: &[String], fit: impl Fn(&View) -> bool) -> Result<Vec<&'a View>> {
+    if !names.is_empty() {
+        return names.iter().map(|n| find_view(dataset, n)).collect();
+    }
+    let mut views: Vec<&View> = dataset.views.iter().filter(|v| fit(v)).collect();
+    if views.is_empty() {
+        views = dataset.views.iter().collect();
+    }
+    Ok(spread(&views, VIEWS))
+}
+
 /// At most `count` of `all`, evenly spread, in order.
-pub fn spread<T: Copy>(all: &[T], count: usize) -> Vec<T> {
+fn spread<T: Copy>(all: &[T], count: usize) -> Vec<T> {
     let n = all.len();
     let k = count.min(n);
     (0..k).map(|i| all[(2 * i + 1) * n / (2 * k)]).collect()

@@ -16,12 +16,12 @@ use self::labels::FrameLabels;
 use crate::memory::{self, SMALLER, Sizes};
 use crate::options::ScoreOptions;
 use crate::protocols::pairs::{Figures, object_figures};
-use crate::protocols::predict::{self, Answer};
+use crate::protocols::predict;
 use crate::query::ask::Asker;
 use crate::query::text::TextSource;
 use crate::scene::{LabelledScene, load};
 use crate::silhouette::{Rendering, Silhouette};
-use gs_io::{Error, Result, write_json};
+use gs_io::{Result, write_json};
 use gs_scene::dataset::{Dataset, LoadOptions};
 use serde_json::{Value, json};
 use stage::Stage;
@@ -30,13 +30,13 @@ use std::path::Path;
 
 pub(crate) fn run(o: &ScoreOptions, parameters: Value, stage: &Stage) -> Result<String> {
     let dataset = load(&o.inputs.scene, &LoadOptions::default(), stage)?;
-    let labels = o.labels.labels.clone().unwrap_or_else(|| dataset.root.join("label"));
-    let out = &o.out.out;
+    let labels = labels::folder(o.labels.as_deref(), &dataset.root)?;
+    let out = &o.out;
     let tables = o.texts.text_features.iter().chain(&o.choice.features);
     let mut claim = stage.outputs(out).file(out).reads(o.inputs.files(&dataset).chain(tables)).claim()?;
     let sizes = Sizes {
         truth: memory::bytes(&dataset.root.join("truth/points.safetensors")),
-        labels: labels::pixels(&labels),
+        labels: labels.as_deref().map_or(0, labels::pixels),
         ..Sizes::new(&o.inputs, &o.texts, &dataset.views)
     };
     stage.forecast(memory::of_scores(&sizes), SMALLER)?;
@@ -46,9 +46,9 @@ pub(crate) fn run(o: &ScoreOptions, parameters: Value, stage: &Stage) -> Result<
     }
     let mut scores = Scores::default();
     truth::score_instances(&scene, &dataset.root, &mut scores)?;
-    if labels.is_dir() {
-        let frames = labels::read_folder(&labels)?;
-        score_labels(&scene, &dataset, &labels, &frames, &mut scores)?;
+    if let Some(labels) = &labels {
+        let frames = labels::read_folder(labels)?;
+        score_labels(&scene, &dataset, labels, &frames, &mut scores)?;
         if scene.instances.dim == 0 {
             let why = "query scores: the instances have no language features, because the masks were not encoded with a \
                        CLIP model (mask-embed embed --clip)";
@@ -58,13 +58,11 @@ pub(crate) fn run(o: &ScoreOptions, parameters: Value, stage: &Stage) -> Result<
         } else {
             let source = TextSource::open_for(&scene, &o.texts)?;
             let asker = Asker::new(&scene, Some(source), &o.choice, o.texts.min_support)?;
-            let rendering = o.masking.rendering(Silhouette::Selected);
-            score_queries(&scene, &dataset, &labels, &frames, &asker, rendering, &mut scores, stage)?;
+            score_queries(o, &scene, &dataset, &frames, &asker, &mut scores, stage)?;
         }
-    } else if o.labels.labels.is_some() {
-        return Err(Error::new("no such folder").file(&labels).field("--labels").hint("check the path"));
     } else {
-        scores.skipped.push(format!("label and query scores: the scene has no {}", labels.display()));
+        let place = dataset.root.join("label");
+        scores.skipped.push(format!("label and query scores: the scene has no {}", place.display()));
     }
     scores.skipped.iter().for_each(|s| stage.skipped(s));
     write_json(out, &scores)?;
@@ -84,7 +82,7 @@ fn score_labels(
     frames: &[FrameLabels],
     scores: &mut Scores,
 ) -> Result<()> {
-    scores.labels = label_iou::score(scene, dataset, frames, folder)?;
+    scores.labels = label_iou::score(scene, dataset, frames)?;
     let ious: Vec<f64> = scores.labels.iter().map(|l| l.iou).collect();
     if ious.is_empty() {
         scores.skipped.push(format!("label scores: {} labels no object of a view", folder.display()));
@@ -96,41 +94,41 @@ fn score_labels(
     Ok(())
 }
 
-/// Scores text queries against `label/*.json` of the scene, by the protocol of [`crate::protocols::pairs`] with every
-/// category of the labels asked for. `rendering` says how a selection becomes a mask.
+/// Scores text queries against the labels, by the protocol of [`crate::protocols::pairs`] with every category of the labels
+/// asked for.
 fn score_queries(
+    o: &ScoreOptions,
     scene: &LabelledScene,
     dataset: &Dataset,
-    folder: &Path,
     frames: &[FrameLabels],
     asker: &Asker<'_>,
-    rendering: Rendering,
     scores: &mut Scores,
     stage: &Stage,
 ) -> Result<()> {
-    let texts: BTreeSet<String> = frames.iter().flat_map(|f| f.categories.keys().cloned()).collect();
-    let texts: Vec<String> = texts.into_iter().collect();
+    let texts: BTreeSet<&String> = frames.iter().flat_map(|f| f.categories.keys()).collect();
     if texts.is_empty() {
-        scores.skipped.push(format!("query scores: {} holds no labelled object", folder.display()));
+        scores.skipped.push("query scores: the labels hold no labelled object".into());
         return Ok(());
     }
-    let answers = predict::ask(asker, &texts)?;
-    for (text, _) in answers.iter().filter(|(_, a)| matches!(a, Answer::Unasked(_))) {
-        stage.warn(&format!("no text feature of the category {text:?}: it counts as IoU 0"));
+    let answers = predict::ask(asker, &texts.into_iter().cloned().collect::<Vec<_>>())?;
+    for (text, answer) in &answers {
+        match answer {
+            Err(_) => stage.warn(&format!("no text feature of the category {text:?}: it counts as IoU 0")),
+            Ok(a) if a.gaussians.is_empty() => {
+                stage.warn(&format!("nothing is selected for {text:?}: it counts as IoU 0"));
+            }
+            Ok(_) => {}
+        }
     }
-    let empty = |a: &Answer| matches!(a, Answer::Selected { gaussians, .. } if gaussians.is_empty());
-    for (text, _) in answers.iter().filter(|(_, a)| empty(a)) {
-        stage.warn(&format!("nothing is selected for {text:?}: it counts as IoU 0"));
-    }
-    let seen = Rendering { silhouette: Silhouette::Visible, threshold: Silhouette::Visible.default_threshold() };
+    let rendering = o.masking.rendering(Silhouette::Selected);
     let (mut pairs, mut visible) = (Vec::new(), Vec::new());
     for frame in frames {
         if !dataset.views.iter().any(|v| v.stem() == frame.frame) {
             let name = &frame.frame;
             stage.warn(&format!("the labelled frame {name} is no view of the scene: its objects count as IoU 0"));
         }
-        for (rendering, all) in [(rendering, &mut pairs), (seen, &mut visible)] {
-            let predictions = predict::predict(scene, dataset, frame, &answers, rendering, folder)?;
+        for (rendering, all) in [(rendering, &mut pairs), (Rendering::SEEN, &mut visible)] {
+            let predictions = predict::predict(scene, dataset, frame, &answers, rendering)?;
             all.extend(predict::pairs(frame, &predictions));
         }
     }
@@ -139,22 +137,12 @@ fn score_queries(
     (scores.query_macc25, scores.query_macc50) = (Some(figures.macc25), Some(figures.macc50));
     scores.query_miou_visible = Some(Figures::of_pairs(&visible).miou);
     scores.silhouette = Some((rendering.silhouette, rendering.threshold));
-    scores.queries = object_figures(&pairs)
-        .into_iter()
-        .map(|(text, figures)| {
-            let (selected, score) = match answers.get(&text) {
-                Some(Answer::Selected { instances, score, .. }) => (instances.clone(), *score),
-                _ => (Vec::new(), None),
-            };
-            let mine = pairs.iter().filter(|p| p.category == text);
-            QueryScore {
-                frames: mine.map(|p| (p.frame.clone(), p.iou)).collect(),
-                iou: figures.miou,
-                selected,
-                score,
-                text,
-            }
-        })
-        .collect();
+    let query = |(text, figures): (String, Figures)| {
+        let (selected, score) = predict::chosen(&answers, &text);
+        let mine = pairs.iter().filter(|p| p.category == text);
+        let frames = mine.map(|p| (p.frame.clone(), p.iou)).collect();
+        QueryScore { text, iou: figures.miou, selected, score, frames }
+    };
+    scores.queries = object_figures(&pairs).into_iter().map(query).collect();
     Ok(())
 }

@@ -17,7 +17,7 @@ pub enum Silhouette {
 
 impl Silhouette {
     /// The value above which a pixel belongs, where none is given: 0.7 of accumulated alpha, or half of the pixel.
-    pub fn default_threshold(self) -> f32 {
+    pub const fn default_threshold(self) -> f32 {
         match self {
             Self::Selected => 0.7,
             Self::Visible => 0.5,
@@ -42,7 +42,13 @@ pub struct Rendering {
     pub threshold: f32,
 }
 
+/// Selections rendered at once; more are done in turns, which bounds the memory.
+const CHANNELS: usize = 16;
+
 impl Rendering {
+    /// What is seen of a selection, by the threshold where none is given.
+    pub const SEEN: Self = Self { silhouette: Silhouette::Visible, threshold: Silhouette::Visible.default_threshold() };
+
     /// Masks of several selections (ascending indices of Gaussians) in one view, in order; rendered as `raster` says.
     pub fn masks(
         self,
@@ -51,63 +57,32 @@ impl Rendering {
         selections: &[&[u32]],
         camera: &Camera,
     ) -> Vec<Mask> {
-        match self.silhouette {
-            Silhouette::Selected => {
-                selections.iter().map(|s| alone(gaussians, raster, s, camera, self.threshold)).collect()
+        let (width, height) = (camera.width as usize, camera.height as usize);
+        let above = |v: &f32| *v > self.threshold;
+        let alone = |selection: &&[u32]| {
+            if selection.is_empty() {
+                return Mask::new(width, height);
             }
-            Silhouette::Visible => visible(gaussians, raster, selections, camera, self.threshold),
+            // Of the render only alpha counts.
+            let raster = RasterOptions { sh_degree: 0, depth: false, ..raster.clone() };
+            let alpha = gs_raster::render(&gaussians.select(selection), camera, &raster).alpha;
+            Mask { width, height, bits: alpha.iter().map(above).collect() }
+        };
+        let visible = |some: &[&[u32]]| {
+            let d = some.len();
+            let mut member = vec![0.0f32; gaussians.len() * d];
+            for (k, selection) in some.iter().enumerate() {
+                selection.iter().for_each(|&i| member[i as usize * d + k] = 1.0);
+            }
+            let shares = gs_raster::render_features(gaussians, &member, d, camera, raster);
+            let mask = |k| Mask { width, height, bits: shares.iter().skip(k).step_by(d).map(above).collect() };
+            (0..d).map(mask).collect::<Vec<_>>()
+        };
+        match self.silhouette {
+            Silhouette::Selected => selections.iter().map(alone).collect(),
+            Silhouette::Visible => selections.chunks(CHANNELS).flat_map(visible).collect(),
         }
     }
-}
-
-fn alone(gaussians: &Gaussians, raster: &RasterOptions, selection: &[u32], camera: &Camera, threshold: f32) -> Mask {
-    let (w, h) = (camera.width as usize, camera.height as usize);
-    if selection.is_empty() {
-        return Mask::new(w, h);
-    }
-    // Of the render only alpha counts.
-    let raster = RasterOptions { sh_degree: 0, depth: false, ..raster.clone() };
-    Mask::above(w, h, &gs_raster::render(&gaussians.select(selection), camera, &raster).alpha, threshold)
-}
-
-/// Selections rendered at once; more are done in turns, which bounds the memory.
-const CHANNELS: usize = 16;
-
-fn visible(
-    gaussians: &Gaussians,
-    raster: &RasterOptions,
-    selections: &[&[u32]],
-    camera: &Camera,
-    threshold: f32,
-) -> Vec<Mask> {
-    let (w, h) = (camera.width as usize, camera.height as usize);
-    let shares = blended(gaussians, raster, selections.len(), camera, |member, k, d| {
-        for &i in selections[k] {
-            member[i as usize * d] = 1.0;
-        }
-    });
-    shares.iter().map(|share| Mask::above(w, h, share, threshold)).collect()
-}
-
-/// Blends `count` values per Gaussian. `fill(values, k, d)` writes value k of Gaussian i to `values[i * d]`.
-fn blended(
-    gaussians: &Gaussians,
-    raster: &RasterOptions,
-    count: usize,
-    camera: &Camera,
-    fill: impl Fn(&mut [f32], usize, usize),
-) -> Vec<Vec<f32>> {
-    let mut maps = Vec::with_capacity(count);
-    for first in (0..count).step_by(CHANNELS) {
-        let d = CHANNELS.min(count - first);
-        let mut values = vec![0.0f32; gaussians.len() * d];
-        if !gaussians.is_empty() {
-            (0..d).for_each(|k| fill(&mut values[k..], first + k, d));
-        }
-        let image = gs_raster::render_features(gaussians, &values, d, camera, raster);
-        maps.extend((0..d).map(|k| image.iter().skip(k).step_by(d).copied().collect::<Vec<f32>>()));
-    }
-    maps
 }
 
 #[cfg(test)]
@@ -128,19 +103,17 @@ mod tests {
         (g, Camera::look_at(DVec3::ZERO, DVec3::Z, -DVec3::Y, 64, 48, 1.0))
     }
 
-    fn raster() -> RasterOptions {
-        RasterOptions::default()
-    }
-
     const SELECTED: Rendering = Rendering { silhouette: Silhouette::Selected, threshold: 0.7 };
-    const VISIBLE: Rendering = Rendering { silhouette: Silhouette::Visible, threshold: 0.5 };
+
+    fn masks(rendering: Rendering, selections: &[&[u32]]) -> Vec<Mask> {
+        let (g, camera) = balls();
+        rendering.masks(&g, &RasterOptions::default(), selections, &camera)
+    }
 
     #[test]
     fn a_hidden_part_counts_only_when_rendered_alone() {
-        let (g, camera) = balls();
-        let far: &[u32] = &[1];
-        let alone = &SELECTED.masks(&g, &raster(), &[far], &camera)[0];
-        let seen = &VISIBLE.masks(&g, &raster(), &[far, &[0, 1]], &camera);
+        let alone = &masks(SELECTED, &[&[1]])[0];
+        let seen = &masks(Rendering::SEEN, &[&[1], &[0, 1]]);
         let centre = 24 * 64 + 32;
         assert!(alone.bits[centre] && !seen[0].bits[centre] && seen[1].bits[centre]);
         assert!(seen[0].count() > 20, "its rim is seen");
@@ -153,20 +126,18 @@ mod tests {
 
     #[test]
     fn nothing_selected_covers_nothing() {
-        let (g, camera) = balls();
-        for s in [SELECTED, VISIBLE] {
-            assert_eq!(s.masks(&g, &raster(), &[&[]], &camera)[0].count(), 0);
+        for rendering in [SELECTED, Rendering::SEEN] {
+            assert_eq!(masks(rendering, &[&[]])[0].count(), 0);
         }
+        let (g, camera) = balls();
+        let most = gs_raster::render(&g, &camera, &RasterOptions::default()).alpha.into_iter().fold(0.0, f32::max);
+        assert_eq!(masks(Rendering { threshold: most, ..SELECTED }, &[&[0, 1]])[0].count(), 0, "the threshold is strict");
     }
 
     #[test]
     fn many_selections_are_rendered_in_turns() {
-        let (g, camera) = balls();
-        let selections: Vec<&[u32]> =
-            (0..CHANNELS + 3).map(|i| if i % 2 == 0 { &[0u32][..] } else { &[1][..] }).collect();
-        let masks = VISIBLE.masks(&g, &raster(), &selections, &camera);
-        assert_eq!(masks.len(), CHANNELS + 3);
-        assert_eq!(masks[CHANNELS], masks[0]);
-        assert_eq!(masks[CHANNELS + 1], masks[1]);
+        let selections: Vec<&[u32]> = [&[0u32][..], &[1]].into_iter().cycle().take(CHANNELS + 3).collect();
+        let masks = masks(Rendering::SEEN, &selections);
+        assert_eq!((masks.len(), &masks[CHANNELS..][..2]), (CHANNELS + 3, &masks[..2]));
     }
 }

@@ -2,7 +2,7 @@
 
 use super::metrics::Metrics;
 use crate::options::ReportOptions;
-use crate::scene::{LabelledScene, find_view, spread};
+use crate::scene::{LabelledScene, views_to_show};
 use crate::score::Scores;
 use artifacts::role;
 use gs_io::{Error, IoContext, Result, hash_file};
@@ -14,8 +14,6 @@ use stage::RunRecord;
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
-/// Views shown from the scene.
-const VIEWS: usize = 3;
 /// Everything the sections draw from.
 pub(super) struct Material<'a> {
     pub(super) options: &'a ReportOptions,
@@ -87,11 +85,11 @@ impl<'a> Material<'a> {
             None => metrics.skipped.push("scores: the run has no score.json (eval score makes it)".into()),
         }
         let mut shown = Vec::new();
-        for view in views_to_show(dataset, &options.views.views)? {
+        for view in views_to_show(dataset, &options.views.views, |v| v.split == Split::Test)? {
             let photo = view.load_image()?;
-            let photo = Picture::new(photo.width as usize, photo.height as usize, &photo.rgb);
+            let photo = Picture::new(photo.width, photo.height, &photo.rgb);
             let rendered = gs_raster::render(&geometry.gaussians, &view.camera, &raster);
-            let render = Picture::new(rendered.width as usize, rendered.height as usize, &rendered.rgb);
+            let render = Picture::new(rendered.width, rendered.height, &rendered.rgb);
             let psnr = psnr(&photo, &render);
             shown.push(Shown { view, photo, render, psnr });
         }
@@ -112,16 +110,6 @@ impl<'a> Material<'a> {
     pub(super) fn file(&self, name: &str) -> PathBuf {
         self.options.run_dir.join(name)
     }
-}
-
-/// The views named, or a few held-out ones, or a few of all.
-fn views_to_show<'a>(dataset: &'a Dataset, names: &[String]) -> Result<Vec<&'a View>> {
-    if !names.is_empty() {
-        return names.iter().map(|n| find_view(dataset, n)).collect();
-    }
-    let held_out: Vec<&View> = dataset.views.iter().filter(|v| v.split == Split::Test).collect();
-    let all: Vec<&View> = dataset.views.iter().collect();
-    Ok(spread(if held_out.is_empty() { &all } else { &held_out }, VIEWS))
 }
 
 fn psnr(a: &Picture, b: &Picture) -> f64 {

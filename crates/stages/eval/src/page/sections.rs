@@ -5,8 +5,9 @@ use super::metrics::Metrics;
 use super::pca::pca;
 use super::runs::{self, Run, grouped};
 use crate::query::show::QueryResults;
+use crate::scene::read_features;
 use crate::score::{QueryScore, ThingScore};
-use artifacts::{Features, Level, MaskMaps, NOISE_COLOR, hash_folder, instance_color, maps_path, role};
+use artifacts::{Level, MaskMaps, NOISE_COLOR, hash_folder, instance_color, maps_path, role};
 use gs_io::{Error, IoContext, Result};
 use gs_scene::dataset::{Dataset, Split, View};
 use report::curve;
@@ -127,11 +128,7 @@ pub(super) fn features(m: &Material, page: &mut Page, metrics: &mut Metrics) -> 
         metrics.skipped.push("features: the run has no features.safetensors (feat-train makes it)".into());
         return Ok(());
     }
-    let (features, artifact) = Features::read(&path)?;
-    artifact.expect_input(role::GEOMETRY, &m.geometry_hash)?;
-    if features.kept.last().is_some_and(|&i| i as usize >= m.gaussians().len()) {
-        return Err(Error::new("index out of range").file(&path).field("kept").hint("run feat-train again"));
-    }
+    let features = read_features(&path, &m.geometry_hash, m.gaussians().len())?;
     if features.dim == 0 || features.kept.is_empty() {
         metrics.skipped.push("features: no Gaussian has one".into());
         return Ok(());
@@ -167,7 +164,7 @@ fn render_colors(m: &Material, colors: &[Option<[f32; 3]>], view: &View) -> Pict
     let out = gs_raster::render_features(m.gaussians(), &channels, 4, &camera, &m.raster);
     let over = |p: &[f32]| [0, 1, 2].map(|k| p[k] + (1.0 - p[3]).max(0.0) * BACKDROP[k]);
     let rgb: Vec<f32> = out.chunks_exact(4).flat_map(over).collect();
-    Picture::new(camera.width as usize, camera.height as usize, &rgb)
+    Picture::new(camera.width, camera.height, &rgb)
 }
 
 pub(super) fn instances(m: &Material, page: &mut Page, metrics: &mut Metrics) -> Result<()> {
@@ -235,7 +232,7 @@ pub(super) fn queries(m: &Material, page: &mut Page, metrics: &mut Metrics) -> R
         for v in &q.views {
             let path = beside(&folder, &v.overlay)?;
             let picture = gs_scene::Image::read(&path)?;
-            let picture = Picture::new(picture.width as usize, picture.height as usize, &picture.rgb);
+            let picture = Picture::new(picture.width, picture.height, &picture.rgb);
             figures.push(figure(&picture, 3, v.view.clone())?);
         }
         page.heading(&format!("\u{201c}{}\u{201d}", q.text), &facts.join(", "));

@@ -11,38 +11,21 @@ use gs_scene::dataset::Dataset;
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
-/// What is known of one text.
-#[derive(Debug, Clone, PartialEq)]
-pub enum Answer {
-    /// It was asked.
-    Selected {
-        /// Selected instances, best first.
-        instances: Vec<u32>,
-        /// Score of the best.
-        score: Option<f32>,
-        /// Their Gaussians, ascending.
-        gaussians: Vec<u32>,
-    },
-    /// It could not be asked, and why.
-    Unasked(String),
+/// The answer to each category; or why it could not be asked.
+pub type Answers = BTreeMap<String, std::result::Result<Answered, String>>;
+
+/// Asks for texts.
+pub fn ask(asker: &Asker<'_>, texts: &[String]) -> Result<Answers> {
+    let Some(source) = &asker.source else { return Ok(Answers::new()) };
+    let answer = |f: Option<Vec<f32>>| f.map(|f| asker.answer(&f)).ok_or_else(|| "it has no text feature".into());
+    let features = source.encode_in(&asker.templates, texts)?;
+    Ok(texts.iter().cloned().zip(features.into_iter().map(answer)).collect())
 }
 
-/// The answers by category.
-pub type Answers = BTreeMap<String, Answer>;
-
-/// Asks for texts; a text that a table does not hold is unasked.
-pub fn ask(asker: &Asker<'_>, texts: &[String]) -> Result<Answers> {
-    let one = |(text, feature): (&String, Option<Vec<f32>>)| {
-        let answer = feature.map_or_else(
-            || Answer::Unasked("it has no text feature".into()),
-            |f| {
-                let Answered { selected, score, gaussians, .. } = asker.answer(&f);
-                Answer::Selected { instances: selected, score, gaussians }
-            },
-        );
-        (text.clone(), answer)
-    };
-    Ok(texts.iter().zip(asker.features(texts)?).map(one).collect())
+/// The instances that a category selects, best first, and the score of the best.
+pub fn chosen(answers: &Answers, category: &str) -> (Vec<u32>, Option<f32>) {
+    let answer = answers.get(category).and_then(|a| a.as_ref().ok());
+    answer.map_or((Vec::new(), None), |a| (a.selected.clone(), a.score))
 }
 
 /// The mask of each category of a frame, in the size of the labels; or why there is none.
@@ -55,28 +38,23 @@ pub fn predict(
     frame: &FrameLabels,
     answers: &Answers,
     rendering: Rendering,
-    labels: &Path,
 ) -> Result<Predictions> {
-    let categories = frame.categories.keys();
+    let categories = frame.categories.keys().cloned();
     let Some(view) = dataset.views.iter().find(|v| v.stem() == frame.frame) else {
-        return Ok(categories.map(|c| (c.clone(), Err("the frame is no view of the scene".into()))).collect());
+        return Ok(categories.map(|c| (c, Err("the frame is no view of the scene".into()))).collect());
     };
-    let camera = frame.camera(view, labels)?;
-    let selected = |c: &String| match answers.get(c) {
-        Some(Answer::Selected { gaussians, .. }) => Some(&gaussians[..]),
-        _ => None,
+    let selected = |c: &String| answers[c].as_ref().map_or(&[][..], |a| &a.gaussians);
+    let selections: Vec<&[u32]> = frame.categories.keys().map(selected).collect();
+    let masks = rendering.masks(scene.gaussians(), &scene.raster, &selections, &frame.camera(view)?);
+    let one = |(category, mask): (String, Mask)| {
+        let prediction = match &answers[&category] {
+            Ok(a) if a.gaussians.is_empty() => Err("no Gaussian is selected".into()),
+            Ok(_) => Ok(mask),
+            Err(why) => Err(why.clone()),
+        };
+        (category, prediction)
     };
-    let selections: Vec<&[u32]> = categories.clone().filter_map(selected).collect();
-    // In the order of the categories that were asked for.
-    let mut masks = rendering.masks(scene.gaussians(), &scene.raster, &selections, &camera).into_iter();
-    let mut one = |category: &String| match answers.get(category) {
-        Some(Answer::Selected { gaussians, .. }) => {
-            masks.next().filter(|_| !gaussians.is_empty()).ok_or_else(|| "no Gaussian is selected".into())
-        }
-        Some(Answer::Unasked(why)) => Err(why.clone()),
-        None => Err("the category was not asked for".into()),
-    };
-    Ok(categories.map(|c| (c.clone(), one(c))).collect())
+    Ok(categories.zip(masks).map(one).collect())
 }
 
 /// Reads predictions that a program saved as pictures, `<folder>/<frame>_<category>.png`, pixels above grey level 10: the

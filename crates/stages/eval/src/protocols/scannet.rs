@@ -2,21 +2,22 @@
 
 use super::classes::{self, Confusion, SETS};
 use super::instances::{self, InstanceFigures};
-use super::lerf::{outputs, sources};
+use super::metrics::{Metrics, Protocol, outputs, sources};
 use super::published::{self, SetRow};
 use crate::memory::{self, SMALLER, Sizes};
 use crate::nearest::nearest;
 use crate::options::{Association, ScannetOptions};
-use crate::query::ranking::{Index, Scoring};
+use crate::query::ranking::Index;
 use crate::query::text::TextSource;
 use crate::scene::{LabelledScene, MIN_OPACITY, folder_name, load};
-use gs_io::{Error, IoContext, Result, write_bytes, write_json};
+use crate::score::labels::list;
+use crate::score::metrics;
+use gs_io::{Error, Result};
 use gs_scene::dataset::LoadOptions;
 use report::sheet::{Row, Sheet, Table};
 use serde::{Deserialize, Serialize};
 use serde_json::{Value, json};
 use stage::Stage;
-use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
 /// How far a Gaussian may lie from the vertex of its number, in metres, for the two to be one.
@@ -37,14 +38,10 @@ impl ScanFiles {
     /// Finds the truth in a scan's folder. The segments are those of the same mesh as the labels: the finer
     /// `*_vh_clean.segs.json` and its aggregation belong to another mesh.
     pub fn find(folder: &Path) -> Result<Self> {
-        let mut names = Vec::new();
-        for entry in std::fs::read_dir(folder).at("list", folder)? {
-            names.push(entry.at("list", folder)?.file_name().to_string_lossy().into_owned());
-        }
-        names.sort();
+        let names: Vec<String> = list(folder)?.iter().map(|p| p.to_string_lossy().into_owned()).collect();
         let with = |end: &str, without: &str| {
             let fits = |n: &&String| n.ends_with(end) && (without.is_empty() || !n.ends_with(without));
-            names.iter().filter(fits).map(|n| folder.join(n)).collect::<Vec<_>>()
+            names.iter().filter(fits).map(PathBuf::from).collect::<Vec<_>>()
         };
         let labels = with(".labels.ply", "");
         let [labels] = &labels[..] else {
@@ -69,7 +66,7 @@ pub struct ClassFigures {
     pub id: u32,
     /// Its name, the text asked.
     pub name: String,
-    /// Weight of its true points: their number, or volume.
+    /// Number of its true points.
     pub truth: f64,
     /// IoU; none where the truth has none of it.
     pub iou: Option<f64>,
@@ -105,23 +102,13 @@ impl SetFigures {
     }
 }
 
-/// `metrics.json` of `eval scannet`.
+/// The figures of a scan, in `metrics.json`.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-pub struct ScanMetrics {
-    /// `scannet`.
-    pub protocol: String,
-    /// Name of the scan.
-    pub scene: String,
-    /// The rule in words.
-    pub rule: String,
-    /// Files and models that the numbers come from.
-    pub features: BTreeMap<String, String>,
+pub struct ScanFigures {
     /// Score of each class set.
     pub sets: Vec<SetFigures>,
     /// Class-agnostic instances, where the scan has segs and aggregation.
     pub instances: Option<InstanceFigures>,
-    /// What is odd: points without a prediction, what was left out.
-    pub notes: Vec<String>,
 }
 
 /// The Gaussian of each vertex of the scan.
@@ -172,7 +159,7 @@ pub(crate) fn run(o: &ScannetOptions, parameters: Value, stage: &Stage) -> Resul
     let folder = &o.inputs.scene;
     let files = ScanFiles::find(folder)?;
     let parts = files.instances.iter().flat_map(|(segments, objects)| [segments, objects]).chain([&files.labels]);
-    let mut claim = outputs(&o.out.out, stage)
+    let mut claim = outputs(&o.out, stage)
         .reads(parts.clone())
         .reads([&o.inputs.instances, &o.inputs.geometry].into_iter().chain(&o.texts.text_features))
         .claim()?;
@@ -196,23 +183,21 @@ pub(crate) fn run(o: &ScannetOptions, parameters: Value, stage: &Stage) -> Resul
     let mut sets = Vec::new();
     if let Some(source) = source {
         let names: Vec<String> = artifacts::NYU40.iter().map(|c| c.1.to_string()).collect();
-        let texts = source.known(&names, "--text-features")?;
-        let truth = Labelled { labels: &labels, matched: &matched };
+        let texts = source.known(&[], &names, "--text-features")?;
         for size in SETS {
-            sets.push(truth.score(&scene, size, &texts, min_support, &mut notes));
+            sets.push(set_figures(&scene, &labels, &matched, size, &texts, min_support, &mut notes));
         }
     } else {
         notes.push("no class scores: neither --clip nor --text-features was given".to_string());
     }
     let instances = instance_figures(&scene, &files, &matched, vertices.len(), &mut notes)?;
     let rule = rule(o.association, min_support);
-    let protocol = ScanMetrics::PROTOCOL.into();
-    let metrics = ScanMetrics { protocol, scene: folder_name(folder), rule, features, sets, instances, notes };
-    metrics.notes.iter().for_each(|n| stage.warn(n));
-    metrics.write(&o.out.out)?;
-    let summary = json!({"rows": metrics.row(), "instances": metrics.instances});
+    let (protocol, figures) = (ScanFigures::NAME.into(), ScanFigures { sets, instances });
+    let metrics = Metrics { protocol, scene: folder_name(folder), rule, features, figures, notes };
+    let table = metrics.write(&o.out, stage)?;
+    let summary = json!({"rows": metrics.figures.row(), "instances": metrics.figures.instances});
     stage.record(&mut claim, parameters, scene.inputs.clone(), summary)?;
-    Ok(sheet(&[metrics]).markdown())
+    Ok(table)
 }
 
 /// The rule in words.
@@ -227,40 +212,33 @@ fn rule(association: Association, min_support: u32) -> String {
     )
 }
 
-/// The labelled vertices of a scan.
-struct Labelled<'a> {
-    labels: &'a [u32],
-    matched: &'a Matched,
-}
-
-impl Labelled<'_> {
-    /// Scores the classes of a set. `texts` are the features of the names of [`artifacts::NYU40`], in that order. Gaussians
-    /// whose instance has no descriptor, and noise, get the first class of the set, "wall": the argmax of all-zero
-    /// similarities in the published scorer.
-    fn score(
-        &self,
-        scene: &LabelledScene,
-        size: usize,
-        texts: &[Vec<f32>],
-        min_support: u32,
-        notes: &mut Vec<String>,
-    ) -> SetFigures {
-        let set = classes::class_set(size).expect("a known size");
-        let class = gaussian_classes(scene, &set, texts, min_support);
-        let truth = classes::truth_classes(self.labels, &set);
-        let counted = || (0..truth.len()).filter(|&v| self.matched.counts[v]);
-        let of = |v: usize| self.matched.gaussian[v].map(|i| class[i as usize]);
-        let lost = counted().filter(|&v| truth[v].is_some() && of(v).flatten().is_none()).count();
-        if lost > 0 {
-            notes.push(format!("{size} classes: {lost} labelled points have no descriptor and get {:?}", set[0].1));
-        }
-        let points = counted().map(|v| (truth[v], of(v).map(|class| class.unwrap_or(0))));
-        let confusion = Confusion::of(set.len(), points);
-        if confusion.means().is_none() {
-            notes.push(format!("{size} classes: no labelled point takes part, so there is no score"));
-        }
-        SetFigures::new(&set, confusion)
+/// Scores the classes of a set. `texts` are the features of the names of [`artifacts::NYU40`], in that order. Gaussians
+/// whose instance has no descriptor, and noise, get the first class of the set, "wall": the argmax of all-zero
+/// similarities in the published scorer.
+fn set_figures(
+    scene: &LabelledScene,
+    labels: &[u32],
+    matched: &Matched,
+    size: usize,
+    texts: &[Vec<f32>],
+    min_support: u32,
+    notes: &mut Vec<String>,
+) -> SetFigures {
+    let set = classes::class_set(size);
+    let class = gaussian_classes(scene, &set, texts, min_support);
+    let truth = classes::truth_classes(labels, &set);
+    let counted = || (0..truth.len()).filter(|&v| matched.counts[v]);
+    let of = |v: usize| matched.gaussian[v].and_then(|i| class[i as usize]);
+    let lost = counted().filter(|&v| truth[v].is_some() && of(v).is_none()).count();
+    if lost > 0 {
+        notes.push(format!("{size} classes: {lost} labelled points have no descriptor and get {:?}", set[0].1));
     }
+    let points = counted().map(|v| (truth[v], matched.gaussian[v].map(|_| of(v).unwrap_or(0))));
+    let confusion = Confusion::of(set.len(), points);
+    if confusion.means().is_none() {
+        notes.push(format!("{size} classes: no labelled point takes part, so there is no score"));
+    }
+    SetFigures::new(&set, confusion)
 }
 
 /// The class of each Gaussian: that of the highest cosine with its instance's descriptor; none without a descriptor.
@@ -272,7 +250,7 @@ fn gaussian_classes(
 ) -> Vec<Option<usize>> {
     let index = Index::new(&scene.instances);
     let names = (0..texts.len()).filter(|&n| set.contains(&artifacts::NYU40[n]));
-    let scores: Vec<Vec<Option<f32>>> = names.map(|n| index.scores(&texts[n], &Scoring::default())).collect();
+    let scores: Vec<Vec<Option<f32>>> = names.map(|n| index.scores(&texts[n], &[])).collect();
     let best = |k: usize| {
         let described = scene.instances.support[k] >= min_support;
         let scored = scores.iter().enumerate().filter_map(|(c, of)| Some((c, of[k]?))).filter(|_| described);
@@ -304,69 +282,71 @@ fn instance_figures(
     Ok(Some(instances::score(&truth, &predicted, &scene.instances.score, instances::MIN_POINTS)))
 }
 
-impl ScanMetrics {
-    /// The protocol's name in the file.
-    pub const PROTOCOL: &str = "scannet";
-
+impl ScanFigures {
     /// mIoU and mAcc of the sets of 19, 15 and 10 classes.
-    pub fn row(&self) -> SetRow {
+    fn row(&self) -> SetRow {
         SETS.map(|size| {
             let set = self.sets.iter().find(|s| s.size == size)?;
             set.miou.zip(set.macc)
         })
     }
-
-    /// Writes `metrics.json` and `table.md` into a folder.
-    pub fn write(&self, out: &Path) -> Result<()> {
-        write_bytes(out.join("table.md"), sheet(std::slice::from_ref(self)).markdown().as_bytes())?;
-        write_json(out.join("metrics.json"), self)
-    }
 }
 
 /// Both ways of bringing scans together: the mean of the scans' means, and the means of the pooled points.
-pub fn summary(scans: &[ScanMetrics]) -> [(&'static str, SetRow); 2] {
-    let mut mean = [None; 3];
-    let mut pooled = [None; 3];
-    for (at, size) in SETS.into_iter().enumerate() {
-        let rows: Vec<(f64, f64)> = scans.iter().filter_map(|s| s.row()[at]).collect();
-        let n = rows.len() as f64;
-        let sum = rows.iter().fold((0.0, 0.0), |s, r| (s.0 + r.0, s.1 + r.1));
-        mean[at] = (!rows.is_empty()).then_some((sum.0 / n, sum.1 / n));
+fn means(scans: &[Metrics<ScanFigures>]) -> [SetRow; 2] {
+    let mean = |at: usize| {
+        let rows: Vec<(f64, f64)> = scans.iter().filter_map(|s| s.figures.row()[at]).collect();
+        let over = |f: fn(&(f64, f64)) -> f64| metrics::mean(&rows.iter().map(f).collect::<Vec<_>>());
+        (!rows.is_empty()).then(|| (over(|r| r.0), over(|r| r.1)))
+    };
+    let pooled = |size: usize| {
         let mut all = Confusion::new(size);
-        scans.iter().flat_map(|s| &s.sets).filter(|s| s.size == size).for_each(|s| all.merge(&s.confusion));
-        pooled[at] = all.means();
-    }
-    [("ours, mean over scenes", mean), ("ours, points pooled", pooled)]
+        let sets = scans.iter().flat_map(|s| &s.figures.sets).filter(|s| s.size == size);
+        sets.for_each(|s| all.merge(&s.confusion));
+        all.means()
+    };
+    [[0, 1, 2].map(mean), SETS.map(pooled)]
 }
 
-/// The paper's table with the scans given, the scans one by one, and notes that name rule and feature files.
-pub fn sheet(scans: &[ScanMetrics]) -> Sheet {
-    let rows = summary(scans).map(|(name, row)| (name.to_string(), row));
-    let mut notes =
-        vec!["Published rows: percent, as printed in the source named; the authors' feature files.".to_string()];
-    for s in scans {
-        let features: Vec<String> = s.features.iter().map(|(k, v)| format!("{k} {v}")).collect();
-        notes.push(format!("{}: {}. From {}.", s.scene, s.rule, features.join("; ")));
-        notes.extend(s.notes.iter().map(|n| format!("{}: {n}.", s.scene)));
+impl Protocol for ScanFigures {
+    const NAME: &str = "scannet";
+
+    fn is_sound(&self) -> bool {
+        let sound = |s: &SetFigures| s.confusion.classes == s.size && s.confusion.is_sound();
+        self.sets.iter().all(|s| SETS.contains(&s.size) && sound(s))
     }
-    let mut sheet = published::scannet_sheet(&rows, scans.len(), notes);
-    let instance = ["instance mIoU", "@25", "@50", "AP25", "AP50"].map(String::from);
-    let row = |s: &ScanMetrics| {
-        let i = s.instances.as_ref();
-        let figures =
-            [i.map(|i| i.miou), i.map(|i| i.acc25), i.map(|i| i.acc50), i.and_then(|i| i.ap25), i.and_then(|i| i.ap50)];
-        let mut cells = published::set_cells(s.row());
-        cells.extend(figures.map(|v| v.map(|v| 100.0 * v)));
-        Row::measured(&s.scene, cells)
-    };
-    sheet.more.push(Table {
-        title: "Scans one by one".into(),
-        head: "Scan".into(),
-        columns: published::set_columns().into_iter().chain(instance).collect(),
-        rows: scans.iter().map(row).collect(),
-        sources: false,
-    });
-    sheet
+
+    fn sheet(scans: &[Metrics<Self>], notes: Vec<String>) -> Sheet {
+        let [mean, pooled] = means(scans);
+        let rows = [("ours, mean over scenes", mean), ("ours, points pooled", pooled)];
+        let mut sheet = published::scannet_sheet(&rows, scans.len(), notes);
+        let row = |s: &Metrics<Self>| {
+            let i = s.figures.instances.as_ref();
+            let figures = i.map_or([None; 5], |i| [Some(i.miou), Some(i.acc25), Some(i.acc50), i.ap25, i.ap50]);
+            let mut cells = published::set_cells(s.figures.row());
+            cells.extend(figures.map(|v| v.map(|v| 100.0 * v)));
+            Row::measured(&s.scene, cells)
+        };
+        let instance = ["instance mIoU", "@25", "@50", "AP25", "AP50"].map(String::from);
+        sheet.more.push(Table {
+            title: "Scans one by one".into(),
+            head: "Scan".into(),
+            columns: published::set_columns().into_iter().chain(instance).collect(),
+            rows: scans.iter().map(row).collect(),
+            sources: false,
+        });
+        sheet
+    }
+
+    fn summary(scans: &[Metrics<Self>]) -> Value {
+        let sized = |row: SetRow| -> Value {
+            let cell = |r: Option<(f64, f64)>| json!({"miou": r.map(|r| r.0), "macc": r.map(|r| r.1)});
+            Value::Object(SETS.iter().zip(row).map(|(size, r)| (size.to_string(), cell(r))).collect())
+        };
+        let [mean, pooled] = means(scans).map(sized);
+        let scenes: Vec<&str> = scans.iter().map(|m| m.scene.as_str()).collect();
+        json!({"protocol": "scannet dataset", "scenes": scenes, "mean_over_scenes": mean, "pooled": pooled})
+    }
 }
 
 #[cfg(test)]

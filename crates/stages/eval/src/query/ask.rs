@@ -1,13 +1,12 @@
 //! Asking instances for what a feature means: the parts of a query that stay loaded between queries.
 
-use super::ranking::{Index, Join, Ranked, Scoring, Selection};
+use super::ranking::{Index, Join, Ranked, Selection};
 use super::text::TextSource;
 use crate::options::Choice;
-use crate::scene::LabelledScene;
-use artifacts::{Features, role};
-use gs_io::{Error, Result};
+use crate::scene::{LabelledScene, read_features};
+use artifacts::role;
+use gs_io::Result;
 use serde::{Deserialize, Serialize};
-use std::path::Path;
 
 /// Everything that answers queries about one set of instances.
 pub struct Asker<'a> {
@@ -17,8 +16,8 @@ pub struct Asker<'a> {
     pub source: Option<TextSource>,
     /// Templates that every text is put into; none: the text as it is.
     pub templates: Vec<String>,
-    /// How descriptors are compared with features.
-    pub scoring: Scoring,
+    /// Features of texts that mean nothing in particular ([`Index::scores`]).
+    pub negatives: Vec<Vec<f32>>,
     /// Which instances of a ranking are selected.
     pub selection: Selection,
     /// Whether look-alikes of the best are selected with it.
@@ -56,32 +55,61 @@ pub struct Place {
     pub names: Vec<(String, f32)>,
 }
 
-/// What was asked for, with its answer.
-pub struct Asked {
-    /// What it is called in `query.json` and in names of files: the text, a picture's name, a place.
-    pub name: String,
+/// Ranked instances that `query.json` keeps for each text.
+const KEPT_RANKS: usize = 20;
+
+/// The answer to one query, in `query.json`.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct QueryResult {
+    /// What was asked for, also in names of files: the text, a picture's name, a place.
+    pub text: String,
     /// `text`, `image`, `pixel`, `point`, or `part` of what was found.
-    pub kind: &'static str,
-    /// The answer.
-    pub answer: Answered,
+    pub kind: String,
     /// Where, for a pixel or a point.
     pub place: Option<Place>,
+    /// Selected instances, best first.
+    pub selected: Vec<u32>,
+    /// Score of the best selected instance: cosine, relevancy, or share of a pixel.
+    pub score: Option<f32>,
+    /// Gaussians selected.
+    pub gaussians: usize,
+    /// File of the selected Gaussians, beside `query.json`; none when nothing is selected.
+    pub ply: Option<String>,
+    /// The best instances, selected or not.
+    pub ranking: Vec<Ranked>,
+    /// Pictures.
+    pub views: Vec<QueryView>,
+}
+
+/// Pictures of an answer in one view.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct QueryView {
+    /// Stem of the view.
+    pub view: String,
+    /// File of the photograph with the selection brought out, beside `query.json`.
+    pub overlay: String,
+    /// File of the mask (255 inside, 0 outside), beside `query.json`.
+    pub mask: String,
+    /// Pixels of the mask.
+    pub pixels: usize,
+}
+
+/// An answer, with the Gaussians that it selects, ascending.
+pub struct Asked {
+    pub result: QueryResult,
+    pub gaussians: Vec<u32>,
 }
 
 impl Asked {
-    /// The answer to a text or a picture.
-    pub fn new(name: String, kind: &'static str, answer: Answered) -> Self {
-        Self { name, kind, answer, place: None }
+    /// What was asked for with its answer, of which there is no file yet.
+    pub fn new(text: String, kind: &str, place: Option<Place>, answer: Answered) -> Self {
+        let Answered { mut ranking, selected, score, gaussians } = answer;
+        ranking.truncate(KEPT_RANKS);
+        let (kind, count) = (kind.into(), gaussians.len());
+        let result =
+            QueryResult { text, kind, place, selected, score, gaussians: count, ply: None, ranking, views: Vec::new() };
+        Self { result, gaussians }
     }
-}
-
-fn join(path: &Path, distance: f32, scene: &LabelledScene) -> Result<Join> {
-    let (features, artifact) = Features::read(path)?;
-    artifact.expect_input(role::GEOMETRY, scene.inputs.get(role::GEOMETRY).map_or("", |h| h))?;
-    if features.kept.last().is_some_and(|&last| last as usize >= scene.instances.label.len()) {
-        return Err(Error::new("the features are of other Gaussians").file(path).field("kept"));
-    }
-    Ok(Join::new(&scene.instances, &features, distance))
 }
 
 impl<'a> Asker<'a> {
@@ -93,44 +121,26 @@ impl<'a> Asker<'a> {
         min_support: Option<u32>,
     ) -> Result<Self> {
         let join = match (&choice.features, choice.join) {
-            (Some(path), Some(distance)) => Some(join(path, distance, scene)?),
+            (Some(path), Some(distance)) => {
+                let features = read_features(path, &scene.inputs[role::GEOMETRY], scene.gaussians().len())?;
+                Some(Join::new(&scene.instances, &features, distance))
+            }
             _ => None,
         };
-        let negatives = source.as_ref().map_or(Ok(Vec::new()), |s| s.known(&choice.negatives, "--negatives"))?;
+        let negatives = source.as_ref().map_or(Ok(Vec::new()), |s| s.known(&[], &choice.negatives, "--negatives"))?;
         Ok(Self {
             index: Index::new(&scene.instances),
             source,
             templates: choice.template.clone(),
-            scoring: Scoring { negatives },
+            negatives,
             selection: Selection::new(choice.top_k, choice.threshold, min_support.unwrap_or(1)),
             join,
         })
     }
 
-    /// The source of text features, in words.
-    pub fn describe(&self) -> String {
-        self.source.as_ref().map_or("none".into(), TextSource::describe)
-    }
-
-    /// Features of texts, all of which must have one.
-    pub fn known_features(&self, texts: &[String]) -> Result<Vec<Vec<f32>>> {
-        let source = self.source.as_ref().expect("a source of text features");
-        let one = |(f, text): (Option<Vec<f32>>, &String)| f.ok_or_else(|| source.unknown(text));
-        self.features(texts)?.into_iter().zip(texts).map(one).collect()
-    }
-
-    /// Features of texts, in order; none for a text that a table does not hold.
-    pub fn features(&self, texts: &[String]) -> Result<Vec<Option<Vec<f32>>>> {
-        self.source.as_ref().expect("a source of text features").encode_in(&self.templates, texts)
-    }
-
-    /// Answers one feature.
+    /// Answers one feature of the descriptors' dimension.
     pub fn answer(&self, feature: &[f32]) -> Answered {
-        self.select(self.index.rank(feature, &self.scoring))
-    }
-
-    /// Selects from a ranking that is there already.
-    pub fn select(&self, ranking: Vec<Ranked>) -> Answered {
+        let ranking = self.index.rank(feature, &self.negatives);
         let mut selected = self.selection.choose(&ranking);
         if let Some(join) = &self.join {
             selected = join.extend(&ranking, self.selection.min_support, &selected);

@@ -2,7 +2,7 @@
 
 use super::ask::{Asked, Asker};
 use super::granularity;
-use super::show::{self, ShowOptions};
+use super::show;
 use crate::options::QueryOptions;
 use crate::scene::{LabelledScene, numbered};
 use gs_io::{Error, Result};
@@ -18,7 +18,6 @@ pub(super) fn run(
     scene: &LabelledScene,
     dataset: &Dataset,
     asker: &Asker<'_>,
-    show: &ShowOptions,
     stage: &Stage,
     json_lines: bool,
 ) -> Result<()> {
@@ -34,22 +33,19 @@ pub(super) fn run(
             continue;
         }
         let started = Instant::now();
-        let feature = asker.features(&[text.to_string()])?.remove(0);
+        let feature = source.encode_in(&asker.templates, &[text.to_string()])?.remove(0);
         let encoding = started.elapsed();
         let Some(feature) = feature else {
             stage.warn(&source.unknown(text).to_string());
             continue;
         };
         let started = Instant::now();
-        let asked = Asked::new(text.into(), "text", asker.answer(&feature));
+        let asked = Asked::new(text.into(), "text", None, asker.answer(&feature));
         let took = started.elapsed();
         let asked = granularity::apply(o.granularity, &scene.instances, asked, &|why| stage.warn(why));
         let shown = match &o.out {
-            None => asked.iter().map(|a| a.result(None, Vec::new())).collect(),
-            Some(o) => {
-                let folder = o.out.join(free_name(&o.out, text));
-                show::write(scene, dataset, source.describe(), asked, None, show, &folder)?.queries
-            }
+            None => asked.into_iter().map(|a| a.result).collect(),
+            Some(out) => show::write(o, scene, dataset, asker, asked, None, &out.join(free_name(out, text)))?.queries,
         };
         let mut printed = String::new();
         for one in &shown {

@@ -2,6 +2,7 @@
 
 use super::ask::{Answered, Asked, Asker, Place};
 use super::ranking::{Index, Ranked};
+use crate::options::QueryOptions;
 use crate::scene::{LabelledScene, find_view};
 use gs_io::{Error, Result};
 use gs_raster::{TILE, tile_weights};
@@ -13,32 +14,28 @@ const NAMES: usize = 5;
 /// Farther than this from all labelled Gaussians, in sizes of the scene, a point lies outside of it.
 const FAR: f64 = 10.0;
 
-/// The answers to places: `pixels` as VIEW:X,Y, then `points` as X,Y,Z. They are named by `texts`, or by all names of the
+/// The answers to places: pixels as VIEW:X,Y, then points as X,Y,Z. They are named by the texts, or by all names of the
 /// table.
-pub fn answers(
-    pixels: &[String],
-    points: &[String],
-    texts: &[String],
-    scene: &LabelledScene,
-    dataset: &Dataset,
-    asker: &Asker<'_>,
-) -> Result<Vec<Asked>> {
-    let namer = if pixels.is_empty() && points.is_empty() { Namer::default() } else { Namer::new(asker, texts)? };
+pub fn answers(o: &QueryOptions, scene: &LabelledScene, dataset: &Dataset, asker: &Asker<'_>) -> Result<Vec<Asked>> {
+    let mut named = Vec::new();
+    if let Some(source) = asker.source.as_ref().filter(|_| !o.pixel.is_empty() || !o.point.is_empty()) {
+        let texts = if o.text.is_empty() { source.names() } else { o.text.clone() };
+        let features = source.encode_in(&asker.templates, &texts)?;
+        named.extend(texts.into_iter().zip(features).filter_map(|(text, f)| Some((text, f?))));
+    }
     let mut asked = Vec::new();
-    for text in pixels {
+    for text in &o.pixel {
         let bad = || Error::new("not understood").field("--pixel").found(text).expected("VIEW:X,Y");
         let (view, at) = text.rsplit_once(':').ok_or_else(bad)?;
-        let view = find_view(dataset, view)?;
-        let (found, ranking) = at_pixel(scene, &asker.index, view, numbers(at, "--pixel")?)?;
-        asked.push(located(text, "pixel", found, ranking, asker, &namer));
+        let found = at_pixel(scene, &asker.index, find_view(dataset, view)?, numbers(at, "--pixel")?)?;
+        asked.push(located(text, "pixel", found, asker, &named));
     }
-    for text in points {
+    for text in &o.point {
         let point: [f32; 3] = numbers(text, "--point")?;
         if point.iter().any(|v| !v.is_finite()) {
             return Err(Error::new("not a point").field("--point").found(text).expected("finite numbers"));
         }
-        let (found, ranking) = at_point(scene, &asker.index, point)?;
-        asked.push(located(text, "point", found, ranking, asker, &namer));
+        asked.push(located(text, "point", at_point(scene, &asker.index, point)?, asker, &named));
     }
     Ok(asked)
 }
@@ -51,47 +48,26 @@ fn numbers<T: std::str::FromStr + Copy, const N: usize>(text: &str, option: &str
     })
 }
 
-/// Texts that places may be called.
-#[derive(Default)]
-struct Namer {
-    texts: Vec<String>,
-    features: Vec<Vec<f32>>,
-}
-
-impl Namer {
-    fn new(asker: &Asker<'_>, texts: &[String]) -> Result<Self> {
-        let Some(source) = &asker.source else { return Ok(Self::default()) };
-        let names = if texts.is_empty() { source.names() } else { texts.to_vec() };
-        let found = asker.features(&names)?;
-        let (texts, features) = names.into_iter().zip(found).filter_map(|(n, f)| Some((n, f?))).unzip();
-        Ok(Self { texts, features })
-    }
-
-    fn names(&self, asker: &Asker<'_>, instance: u32) -> Vec<(String, f32)> {
-        let score = |f: &Vec<f32>| asker.index.scores(f, &asker.scoring)[instance as usize];
-        let mut names: Vec<(String, f32)> =
-            self.texts.iter().zip(&self.features).filter_map(|(t, f)| Some((t.clone(), score(f)?))).collect();
-        names.sort_by(|a, b| b.1.total_cmp(&a.1).then(a.0.cmp(&b.0)));
-        names.truncate(NAMES);
-        names
-    }
-}
-
-/// The instance with the largest share of a place is the answer, whatever the options of selection say.
+/// The instance with the largest share of a place is the answer, whatever the options of selection say. `named` are texts
+/// that the place may be called, with their features.
 fn located(
     text: &str,
-    kind: &'static str,
-    mut place: Place,
-    ranking: Vec<Ranked>,
+    kind: &str,
+    (mut place, ranking): (Place, Vec<Ranked>),
     asker: &Asker<'_>,
-    namer: &Namer,
+    named: &[(String, Vec<f32>)],
 ) -> Asked {
     let first = ranking.first().copied();
-    place.names = first.map_or(Vec::new(), |r| namer.names(asker, r.instance));
+    if let Some(first) = first {
+        let score = |f: &[f32]| asker.index.scores(f, &asker.negatives)[first.instance as usize];
+        place.names = named.iter().filter_map(|(text, f)| Some((text.clone(), score(f)?))).collect();
+        place.names.sort_by(|a, b| b.1.total_cmp(&a.1).then(a.0.cmp(&b.0)));
+        place.names.truncate(NAMES);
+    }
     let selected: Vec<u32> = first.map(|r| r.instance).into_iter().collect();
     let gaussians = asker.index.members(&selected);
     let answer = Answered { score: first.map(|r| r.score), gaussians, selected, ranking };
-    Asked { name: format!("{kind} {text}"), kind, answer, place: Some(place) }
+    Asked::new(format!("{kind} {text}"), kind, Some(place), answer)
 }
 
 /// What pixel (x, y) of a view shows: the instances by falling share of the pixel's blending weight.
@@ -120,11 +96,8 @@ fn at_pixel(scene: &LabelledScene, index: &Index<'_>, view: &View, pixel: [u32; 
         (0..3).for_each(|k| position[k] += w / alpha * f64::from(mean[k]));
     }
     let noise = shares.get(&-1).copied().unwrap_or(0.0);
-    let mut ranking: Vec<Ranked> = shares
-        .into_iter()
-        .filter_map(|(l, share)| Some(ranked(scene, index, usize::try_from(l).ok()?, share as f32)))
-        .collect();
-    ranking.sort_by(|a, b| b.score.total_cmp(&a.score).then(a.instance.cmp(&b.instance)));
+    let shares = shares.into_iter().filter_map(|(l, share)| Some((usize::try_from(l).ok()?, share as f32)));
+    let ranking = index.ranking(shares);
     let place = Place {
         view: Some(view.stem().into()),
         pixel: Some(pixel),
@@ -150,13 +123,8 @@ fn at_point(scene: &LabelledScene, index: &Index<'_>, point: [f32; 3]) -> Result
             .expected(format!("at most {most:.4e} from it, in units of the scene"))
             .hint("gs-geom inspect tells the bounds of the geometry"));
     }
-    let ranking = found.map(|i| ranked(scene, index, label[i as usize] as usize, 1.0)).into_iter().collect();
+    let ranking = index.ranking(found.map(|i| (label[i as usize] as usize, 1.0)).into_iter());
     let place =
         Place { view: None, pixel: None, position: mean, alpha_or_distance: distance, noise: 0.0, names: Vec::new() };
     Ok((place, ranking))
-}
-
-fn ranked(scene: &LabelledScene, index: &Index<'_>, instance: usize, score: f32) -> Ranked {
-    let (support, gaussians) = (scene.instances.support[instance], index.gaussians_of(instance).len() as u32);
-    Ranked { instance: instance as u32, score, support, gaussians }
 }

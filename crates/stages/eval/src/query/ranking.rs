@@ -8,21 +8,12 @@ use serde::{Deserialize, Serialize};
 pub struct Ranked {
     /// Index of the instance.
     pub instance: u32,
-    /// Cosine of descriptor and feature, -1 to 1; with negatives the relevancy, 0 to 1 ([`Scoring`]); of a place its share.
+    /// Cosine of descriptor and feature, -1 to 1; with negatives the relevancy, 0 to 1 ([`Index::scores`]); of a place its share.
     pub score: f32,
     /// Views in which the instance was matched with a mask.
     pub support: u32,
     /// Gaussians of the instance.
     pub gaussians: u32,
-}
-
-/// How a descriptor is compared with a feature.
-#[derive(Debug, Clone, Default, PartialEq)]
-pub struct Scoring {
-    /// Features of texts that mean nothing in particular ("object", "things", "stuff", "texture"). Without any the score
-    /// is the plain cosine (docs/protocols.md). With them it is LERF's relevancy: over the negatives n the
-    /// smallest exp(10 p) / (exp(10 p) + exp(10 n)) of the cosines p and n with the feature and the negative.
-    pub negatives: Vec<Vec<f32>>,
 }
 
 /// Which instances of a ranking answer a query.
@@ -57,7 +48,7 @@ impl Selection {
 
 /// Instances laid out for many queries: descriptors with their lengths, and the Gaussians of each instance together.
 pub struct Index<'a> {
-    instances: &'a Instances,
+    pub(super) instances: &'a Instances,
     norms: Vec<f64>,
     /// Gaussians by instance, ascending within each.
     members: Vec<u32>,
@@ -101,18 +92,21 @@ impl<'a> Index<'a> {
     }
 
     /// Score of every instance; none for one without a descriptor (no view matched it) or when the feature is zero.
-    pub fn scores(&self, feature: &[f32], scoring: &Scoring) -> Vec<Option<f32>> {
+    ///
+    /// Without `negatives` it is the plain cosine (docs/protocols.md). With features of texts that mean nothing in particular
+    /// ("object", "things", "stuff", "texture") it is LERF's relevancy: over the negatives n the smallest
+    /// exp(10 p) / (exp(10 p) + exp(10 n)) of the cosines p and n with the feature and the negative.
+    pub fn scores(&self, feature: &[f32], negatives: &[Vec<f32>]) -> Vec<Option<f32>> {
         let dim = self.instances.dim;
-        assert!(feature.len() == dim && scoring.negatives.iter().all(|n| n.len() == dim));
+        assert!(feature.len() == dim && negatives.iter().all(|n| n.len() == dim));
         let feature_norm = norm(feature);
-        let negative_norms: Vec<f64> = scoring.negatives.iter().map(|n| norm(n)).collect();
+        let negatives: Vec<(&[f32], f64)> = negatives.iter().map(|n| (&n[..], norm(n))).collect();
         let one = |k: usize| {
             let (d, length) = (self.instances.descriptor_of(k), self.norms[k]);
             let cosine = |v: &[f32], n: f64| if n > 0.0 { dot(d, v) / (length * n) } else { 0.0 };
             (length * feature_norm > 0.0).then(|| {
                 let p = cosine(feature, feature_norm);
-                let worst = scoring.negatives.iter().zip(&negative_norms).map(|(v, &n)| cosine(v, n));
-                match worst.fold(None, |m: Option<f64>, n| Some(m.map_or(n, |m| m.max(n)))) {
+                match negatives.iter().map(|&(v, n)| cosine(v, n)).reduce(f64::max) {
                     None => p as f32,
                     Some(n) => (1.0 / (1.0 + (10.0 * (n - p)).exp())) as f32,
                 }
@@ -122,19 +116,24 @@ impl<'a> Index<'a> {
     }
 
     /// All instances that have a score, best first, ties by index.
-    pub fn rank(&self, feature: &[f32], scoring: &Scoring) -> Vec<Ranked> {
-        let ranked = |(k, score): (usize, Option<f32>)| {
+    pub fn rank(&self, feature: &[f32], negatives: &[Vec<f32>]) -> Vec<Ranked> {
+        let scores = self.scores(feature, negatives).into_iter().enumerate();
+        self.ranking(scores.filter_map(|(k, score)| Some((k, score?))))
+    }
+
+    /// Instances with their scores, best first, ties by index.
+    pub fn ranking(&self, scores: impl Iterator<Item = (usize, f32)>) -> Vec<Ranked> {
+        let ranked = |(k, score)| {
             let (support, gaussians) = (self.instances.support[k], self.gaussians_of(k).len() as u32);
-            Some(Ranked { instance: k as u32, score: score?, support, gaussians })
+            Ranked { instance: k as u32, score, support, gaussians }
         };
-        let mut ranking: Vec<Ranked> =
-            self.scores(feature, scoring).into_iter().enumerate().filter_map(ranked).collect();
+        let mut ranking: Vec<Ranked> = scores.map(ranked).collect();
         ranking.sort_by(|a, b| b.score.total_cmp(&a.score).then(a.instance.cmp(&b.instance)));
         ranking
     }
 
     /// The Gaussians of an instance, ascending.
-    pub fn gaussians_of(&self, instance: usize) -> &[u32] {
+    fn gaussians_of(&self, instance: usize) -> &[u32] {
         &self.members[self.starts[instance]..self.starts[instance + 1]]
     }
 
@@ -217,7 +216,7 @@ mod tests {
     }
 
     fn rank(feature: &[f32]) -> Vec<Ranked> {
-        Index::new(&instances()).rank(feature, &Scoring::default())
+        Index::new(&instances()).rank(feature, &[])
     }
 
     #[test]
@@ -233,8 +232,7 @@ mod tests {
     #[test]
     fn relevancy_is_the_worst_softmax_against_the_negatives() {
         let i = instances();
-        let scoring = Scoring { negatives: vec![vec![0.0, 3.0], vec![-1.0, 0.0]] };
-        let s = Index::new(&i).scores(&[2.0, 0.0], &scoring);
+        let s = Index::new(&i).scores(&[2.0, 0.0], &[vec![0.0, 3.0], vec![-1.0, 0.0]]);
         let softmax = |p: f64, n: f64| (10.0 * p).exp() / ((10.0 * p).exp() + (10.0 * n).exp());
         assert!((f64::from(s[0].unwrap()) - softmax(1.0, 0.0)).abs() < 1e-6);
         assert!((f64::from(s[1].unwrap()) - softmax(0.6, 0.8)).abs() < 1e-6);

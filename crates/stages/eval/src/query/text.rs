@@ -34,7 +34,7 @@ impl TextTable {
     pub fn read(path: impl AsRef<Path>) -> Result<Self> {
         let path = path.as_ref();
         let bytes = std::fs::read(path).at("read", path)?;
-        let features = if bytes.starts_with(b"PK") {
+        let features: BTreeMap<String, Vec<f32>> = if bytes.starts_with(b"PK") {
             read_npz(&bytes).map_err(|e| e.file(path))?
         } else {
             serde_json::from_slice(&bytes).map_err(|e| {
@@ -43,10 +43,6 @@ impl TextTable {
                     .expected("a JSON object of name -> list of numbers, or an npz of name -> vector")
             })?
         };
-        Self::new(path.to_path_buf(), features)
-    }
-
-    fn new(path: PathBuf, features: BTreeMap<String, Vec<f32>>) -> Result<Self> {
         let dim = features.values().next().map_or(0, Vec::len);
         if dim == 0 {
             return Err(Error::new("no text features").file(path).hint("give a table with at least one name"));
@@ -60,7 +56,7 @@ impl TextTable {
                 return Err(Error::new("a number is not finite").file(path).field(name).found(bad));
             }
         }
-        Ok(Self { path, dim, features })
+        Ok(Self { path: path.to_path_buf(), dim, features })
     }
 }
 
@@ -108,32 +104,37 @@ impl TextSource {
         }
     }
 
-    /// Opens what the options name, which must fit the descriptors of a scene.
+    /// Opens what the options name. It must have the descriptors' dimension, and a CLIP pair must be the one whose other half
+    /// encoded the masks, as far as the instances know it.
     pub fn open_for(scene: &LabelledScene, o: &TextOptions) -> Result<Self> {
         let source = Self::open(o)?;
-        source.check_fits(scene, o)?;
-        Ok(source)
-    }
-
-    /// Checks that a source has the descriptors' dimension, and that a CLIP pair is the one whose other half encoded the masks,
-    /// as far as the instances know it.
-    pub fn check_fits(&self, scene: &LabelledScene, o: &TextOptions) -> Result<()> {
-        self.check_dim(scene.instances.dim, scene.path())?;
-        let Some(clip) = o.clip.as_deref().filter(|_| !o.any_model) else { return Ok(()) };
+        let dim = scene.instances.dim;
+        let found = format!("dimension {dim}");
+        let e = |what: &str| Error::new(what).file(scene.path()).field("descriptor").found(&found);
+        if dim == 0 {
+            return Err(e("the instances have no language features")
+                .hint("run mask-embed embed --clip (or add *_f.npy to the masks folder), then cluster-match again"));
+        }
+        if dim != source.dim() {
+            return Err(e("the text features are of another model than the masks'")
+                .expected(format!("{} ({})", source.dim(), source.describe()))
+                .hint("text and masks must be encoded with the two halves of one CLIP model"));
+        }
+        let Some(clip) = o.clip.as_deref().filter(|_| !o.any_model) else { return Ok(source) };
         let made_with = |role: &str| scene.artifact.provenance().inputs.get(role).cloned();
         let (image, text) = (made_with(role::CLIP), made_with(role::CLIP_TEXT));
         let unknown = image.is_none() && text.is_none();
         // The text encoder is open, and has its hash already; the image encoder is read only where that is not enough.
-        if unknown || text == Some(self.hash()?) || image.is_some() && image == ClipImage::hash_in(clip) {
-            return Ok(());
+        if unknown || text == Some(source.hash()?) || image.is_some() && image == ClipImage::hash_in(clip) {
+            return Ok(source);
         }
+        let hint =
+            "give that model, run mask-embed embed and cluster-match with this one, or accept it with --any-model";
         Err(Error::new("another CLIP model than the one that encoded the masks")
             .file(clip)
             .field("--clip")
             .expected(format!("the model that {} was made with", scene.path().display()))
-            .hint(
-                "give that model, run mask-embed embed and cluster-match with this one, or accept it with --any-model",
-            ))
+            .hint(hint))
     }
 
     /// Dimension of the features.
@@ -153,23 +154,8 @@ impl TextSource {
         }
     }
 
-    /// Checks that descriptors of this dimension can be compared with this source.
-    fn check_dim(&self, dim: usize, instances: &Path) -> Result<()> {
-        let e = |what: &str| Error::new(what).file(instances).field("descriptor").found(format!("dimension {dim}"));
-        if dim == 0 {
-            return Err(e("the instances have no language features")
-                .hint("run mask-embed embed --clip (or add *_f.npy to the masks folder), then cluster-match again"));
-        }
-        if dim != self.dim() {
-            return Err(e("the text features are of another model than the masks'")
-                .expected(format!("{} ({})", self.dim(), self.describe()))
-                .hint("text and masks must be encoded with the two halves of one CLIP model"));
-        }
-        Ok(())
-    }
-
     /// Features of `texts`, in order; none for a text that a table does not hold.
-    pub fn encode(&self, texts: &[String]) -> Result<Vec<Option<Vec<f32>>>> {
+    fn encode(&self, texts: &[String]) -> Result<Vec<Option<Vec<f32>>>> {
         match self {
             Self::Clip(clip) => {
                 let all = clip.encode(texts)?;
@@ -179,14 +165,14 @@ impl TextSource {
         }
     }
 
-    /// Features of `texts`, all of which must have one; `option` gave them.
-    pub fn known(&self, texts: &[String], option: &str) -> Result<Vec<Vec<f32>>> {
+    /// [`Self::encode_in`] for texts that must all have a feature; `option` gave them.
+    pub fn known(&self, templates: &[String], texts: &[String], option: &str) -> Result<Vec<Vec<f32>>> {
         let one = |(f, text): (Option<Vec<f32>>, &String)| f.ok_or_else(|| self.unknown(text).field(option));
-        self.encode(texts)?.into_iter().zip(texts).map(one).collect()
+        self.encode_in(templates, texts)?.into_iter().zip(texts).map(one).collect()
     }
 
     /// Features of `texts` where each is put into the place of `{}` in every template, such as "a photo of a {}", and the
-    /// unit features of what comes out are averaged and scaled to unit length. Without templates: [`Self::encode`].
+    /// unit features of what comes out are averaged and scaled to unit length. None for a text that a table does not hold.
     pub fn encode_in(&self, templates: &[String], texts: &[String]) -> Result<Vec<Option<Vec<f32>>>> {
         if templates.is_empty() {
             return self.encode(texts);
@@ -275,11 +261,6 @@ mod tests {
         assert_eq!(found, [Some(vec![0.6, 0.8]), None]);
         let e = t.unknown("coffe mugg").to_string();
         assert!(e.contains("one of its 3 names, such as \"coffee mug\", \"coffee\""), "{e}");
-        assert!(t.check_dim(2, Path::new("i")).is_ok());
-        let e = t.check_dim(512, Path::new("i")).unwrap_err().to_string();
-        assert!(e.contains("found dimension 512, expected 2"), "{e}");
-        let e = t.check_dim(0, Path::new("i")).unwrap_err().to_string();
-        assert!(e.contains("no language features") && e.contains("mask-embed"), "{e}");
     }
 
     fn npz(entries: &[(&str, &[usize], &[f32])]) -> Result<TextSource> {

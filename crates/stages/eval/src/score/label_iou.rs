@@ -2,14 +2,13 @@
 
 use super::labels::FrameLabels;
 use crate::scene::LabelledScene;
-use crate::silhouette::Silhouette;
+use crate::silhouette::Rendering;
 use gs_io::Result;
 use gs_raster::{RasterOptions, TILE};
 use gs_scene::dataset::Dataset;
 use gs_scene::{Camera, Gaussians};
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
-use std::path::Path;
 
 /// How a labelled object is found in a view.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -29,20 +28,12 @@ pub struct LabelScore {
 /// The best instance for each labelled object of each frame, as far as it is visible: an
 /// instance owns the pixels of which it gives more than half of the blended weight. Objects of a frame that is no view
 /// have IoU 0.
-pub fn score(
-    scene: &LabelledScene,
-    dataset: &Dataset,
-    frames: &[FrameLabels],
-    folder: &Path,
-) -> Result<Vec<LabelScore>> {
+pub fn score(scene: &LabelledScene, dataset: &Dataset, frames: &[FrameLabels]) -> Result<Vec<LabelScore>> {
     let mut scores = Vec::new();
     for frame in frames {
         let map = match dataset.views.iter().find(|v| v.stem() == frame.frame) {
             None => vec![-1; frame.width as usize * frame.height as usize],
-            Some(view) => {
-                let camera = frame.camera(view, folder)?;
-                instance_map(scene.gaussians(), &scene.instances.label, &camera, &scene.raster)
-            }
+            Some(view) => instance_map(scene.gaussians(), &scene.instances.label, &frame.camera(view)?, &scene.raster),
         };
         let mut sizes = BTreeMap::<i32, usize>::new();
         map.iter().filter(|&&i| i >= 0).for_each(|&i| *sizes.entry(i).or_default() += 1);
@@ -72,7 +63,6 @@ fn instance_map(gaussians: &Gaussians, label: &[i32], camera: &Camera, raster: &
     if gaussians.is_empty() {
         return map;
     }
-    let threshold = Silhouette::Visible.default_threshold();
     let tiles = gs_raster::tile_weights(gaussians, camera, raster, true, |tile| {
         let mut shares = BTreeMap::<i32, Vec<f32>>::new();
         for (k, &g) in tile.gaussians.iter().enumerate().filter(|(_, g)| label[**g as usize] >= 0) {
@@ -84,7 +74,7 @@ fn instance_map(gaussians: &Gaussians, label: &[i32], camera: &Camera, raster: &
         for y in 0..tile.height {
             for x in 0..tile.width {
                 let at = y * TILE + x;
-                let winner = shares.iter().find(|(_, s)| s[at] > threshold).map_or(-1, |(i, _)| *i);
+                let winner = shares.iter().find(|(_, s)| s[at] > Rendering::SEEN.threshold).map_or(-1, |(i, _)| *i);
                 shown.push(((tile.y0 + y) * w + tile.x0 + x, winner));
             }
         }
@@ -97,7 +87,6 @@ fn instance_map(gaussians: &Gaussians, label: &[i32], camera: &Camera, raster: &
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::silhouette::Rendering;
     use glam::DVec3;
 
     #[test]
@@ -112,8 +101,7 @@ mod tests {
         }
         let camera = Camera::look_at(DVec3::ZERO, DVec3::Z, -DVec3::Y, 75, 50, 1.0);
         let map = instance_map(&g, &[2, 0, 0, -1], &camera, &RasterOptions::default());
-        let visible = Rendering { silhouette: Silhouette::Visible, threshold: 0.5 };
-        let masks = visible.masks(&g, &RasterOptions::default(), &[&[1, 2], &[], &[0]], &camera);
+        let masks = Rendering::SEEN.masks(&g, &RasterOptions::default(), &[&[1, 2], &[], &[0]], &camera);
         for (at, &i) in map.iter().enumerate() {
             for (k, mask) in masks.iter().enumerate() {
                 assert_eq!(mask.bits[at], i == k as i32, "pixel {at}, instance {k}");

@@ -19,6 +19,8 @@ const MAX_PIXELS: u64 = 1 << 28;
 /// The labels of one frame.
 #[derive(Debug, Clone, PartialEq)]
 pub struct FrameLabels {
+    /// The file, or the folder of pictures.
+    pub file: PathBuf,
     /// Name of the frame: the file's stem, which is the view's stem.
     pub frame: String,
     /// Width in pixels of the labelled image.
@@ -31,11 +33,11 @@ pub struct FrameLabels {
 
 impl FrameLabels {
     /// The camera of a view in the size of its labelled image.
-    pub fn camera(&self, view: &View, labels: &Path) -> Result<Camera> {
+    pub fn camera(&self, view: &View) -> Result<Camera> {
         let (w, h) = (self.width, self.height);
         if !same_shape([w, h], [view.camera.width, view.camera.height]) {
             return Err(Error::new("the labelled image has another shape than the photograph")
-                .file(labels.join(format!("{}.json", self.frame)))
+                .file(&self.file)
                 .field("info")
                 .found(format!("{w}x{h}"))
                 .expected(format!("{}x{} or a multiple", view.camera.width, view.camera.height))
@@ -75,12 +77,22 @@ struct Object {
 }
 
 /// Reads all `*.json` of a label folder, by name.
-pub fn read_folder(folder: impl AsRef<Path>) -> Result<Vec<FrameLabels>> {
-    files(folder.as_ref())?.iter().map(read).collect()
+pub fn read_folder(folder: &Path) -> Result<Vec<FrameLabels>> {
+    files(folder)?.iter().map(read).collect()
+}
+
+/// Where the labels of a scene lie: in the folder given, in the scene, or beside it; none where there are none.
+pub fn folder(given: Option<&Path>, scene: &Path) -> Result<Option<PathBuf>> {
+    if let Some(given) = given {
+        let e = || Error::new("no such folder").file(given).field("--labels").hint("check the path");
+        return if given.is_dir() { Ok(Some(given.into())) } else { Err(e()) };
+    }
+    let beside = scene.canonicalize().ok().and_then(|s| Some(s.parent()?.join("label").join(s.file_name()?)));
+    Ok([Some(scene.join("label")), beside].into_iter().flatten().find(|f| f.is_dir()))
 }
 
 /// What a folder holds, by name.
-fn list(folder: &Path) -> Result<Vec<PathBuf>> {
+pub fn list(folder: &Path) -> Result<Vec<PathBuf>> {
     let entries = std::fs::read_dir(folder).at("list", folder)?;
     let mut paths = entries.map(|e| Ok(e.at("list", folder)?.path())).collect::<Result<Vec<_>>>()?;
     paths.sort();
@@ -116,7 +128,7 @@ pub fn read(path: impl AsRef<Path>) -> Result<FrameLabels> {
         fill_polygon(mask, &vertices);
     }
     let frame = path.file_stem().unwrap_or_default().to_string_lossy().into_owned();
-    Ok(FrameLabels { frame, width, height, categories })
+    Ok(FrameLabels { file: path.into(), frame, width, height, categories })
 }
 
 /// Reads one label file without filling its polygons.
@@ -162,13 +174,13 @@ pub fn read_mask(path: &Path) -> Result<Mask> {
 
 /// Reads the pictures that LangSplat's scorer made of the labels, `<folder>/<frame>/<category>.jpg` (or png), with pixels
 /// above [`GREY`].
-pub fn read_pictures(folder: impl AsRef<Path>) -> Result<Vec<FrameLabels>> {
-    let folder = folder.as_ref();
+pub fn read_pictures(folder: &Path) -> Result<Vec<FrameLabels>> {
     let mut frames = Vec::new();
     for place in list(folder)?.into_iter().filter(|p| p.is_dir()) {
         let frame = place.file_name().unwrap_or_default().to_string_lossy().into_owned();
-        let mut labels = FrameLabels { frame, width: 0, height: 0, categories: BTreeMap::new() };
-        for path in list(&place)? {
+        let paths = list(&place)?;
+        let mut labels = FrameLabels { file: place, frame, width: 0, height: 0, categories: BTreeMap::new() };
+        for path in paths {
             if !path.extension().is_some_and(|e| ["jpg", "jpeg", "png"].iter().any(|k| e == *k)) {
                 continue;
             }

@@ -1,0 +1,94 @@
+//! What the protocols of all benchmarks write for a scene.
+
+use crate::query::text::TextSource;
+use crate::scene::LabelledScene;
+use artifacts::role;
+use gs_io::{Outputs, Result, write_bytes, write_json};
+use report::sheet::Sheet;
+use serde::de::DeserializeOwned;
+use serde::{Deserialize, Serialize};
+use serde_json::Value;
+use stage::Stage;
+use std::collections::BTreeMap;
+use std::path::Path;
+
+/// `metrics.json` of a scene, with the figures of a protocol.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct Metrics<F> {
+    /// Name of the protocol.
+    pub protocol: String,
+    /// Name of the scene.
+    pub scene: String,
+    /// The rule that the numbers follow, in words.
+    pub rule: String,
+    /// Files and models that the numbers come from.
+    pub features: BTreeMap<String, String>,
+    /// What was measured.
+    #[serde(flatten)]
+    pub figures: F,
+    /// What is odd: zeros with their reasons, what was left out.
+    pub notes: Vec<String>,
+}
+
+/// The figures of a scene by a protocol.
+pub trait Protocol: Serialize + DeserializeOwned {
+    /// The protocol's name in the file.
+    const NAME: &str;
+
+    /// Whether figures that were read from a file fit together.
+    fn is_sound(&self) -> bool {
+        true
+    }
+
+    /// Figures by another rule, in words.
+    fn remark(&self) -> Option<String> {
+        None
+    }
+
+    /// The paper's table with these scenes.
+    fn sheet(scenes: &[Metrics<Self>], notes: Vec<String>) -> Sheet;
+
+    /// What `metrics.json` says of these scenes together.
+    fn summary(scenes: &[Metrics<Self>]) -> Value;
+}
+
+impl<F: Protocol> Metrics<F> {
+    /// Writes `metrics.json` and `table.md` into a folder; gives the table.
+    pub fn write(&self, out: &Path, stage: &Stage) -> Result<String> {
+        self.notes.iter().for_each(|n| stage.warn(n));
+        let table = sheet(std::slice::from_ref(self)).markdown();
+        write_bytes(out.join("table.md"), table.as_bytes())?;
+        write_json(out.join("metrics.json"), self)?;
+        Ok(table)
+    }
+}
+
+/// The paper's table with the scenes given, and notes that name rule and feature files.
+pub fn sheet<F: Protocol>(scenes: &[Metrics<F>]) -> Sheet {
+    let mut notes =
+        vec!["Published rows: percent, as printed in the source named; the authors' feature files.".to_string()];
+    for s in scenes {
+        let features: Vec<String> = s.features.iter().map(|(k, v)| format!("{k} {v}")).collect();
+        notes.push(format!("{}: {}. From {}.", s.scene, s.rule, features.join("; ")));
+        notes.extend(s.figures.remark().iter().chain(&s.notes).map(|n| format!("{}: {n}.", s.scene)));
+    }
+    F::sheet(scenes, notes)
+}
+
+/// `metrics.json` of a protocol, whose record lies beside it, and `table.md` in the same folder.
+pub fn outputs(folder: &Path, stage: &Stage) -> Outputs {
+    let metrics = folder.join("metrics.json");
+    stage.outputs(&metrics).file(&metrics).file(folder.join("table.md"))
+}
+
+/// What the answers of a scene come from, with the first digits of the hashes.
+pub fn sources(scene: &LabelledScene, texts: Option<&TextSource>) -> Result<BTreeMap<String, String>> {
+    let mut features = BTreeMap::from([("instances".to_string(), format!("{:.12}", scene.artifact.hash()))]);
+    if let Some(source) = texts {
+        features.insert("text features".into(), format!("{} ({:.12})", source.describe(), source.hash()?));
+    }
+    if let Some(masks) = scene.artifact.provenance().inputs.get(role::MASK_FEATURES) {
+        features.insert("mask features".into(), format!("{masks:.12}"));
+    }
+    Ok(features)
+}
