@@ -8,6 +8,7 @@
 //! that holds most of it is itself split, with this mask among the pieces.
 
 use crate::options::MasksOptions;
+use crate::score::metrics::counts;
 use artifacts::{Footprints, Level, MaskMaps, maps_path, role};
 use gs_io::{Error, Result, write_json};
 use report::sheet::markdown;
@@ -84,15 +85,14 @@ pub fn measure(folder: &Path, footprints: Option<&Footprints>) -> Result<MaskSta
             .found(other)
             .hint("run graph-precompute on these masks"));
     }
-    let [mut counts, mut areas, mut covered]: [[Vec<f64>; 4]; 3] = Default::default();
+    let [mut masks, mut areas, mut covered]: [[Vec<f64>; 4]; 3] = Default::default();
     for stem in &stems {
         let maps = MaskMaps::read(maps_path(folder, stem))?;
         let image = (maps.width * maps.height) as f64;
         for level in Level::ALL {
-            let mut pixels = BTreeMap::<i32, usize>::new();
-            maps.level(level).iter().filter(|&&id| id >= 0).for_each(|&id| *pixels.entry(id).or_default() += 1);
+            let pixels = counts(maps.level(level).iter().filter(|&&id| id >= 0));
             let l = level as usize;
-            counts[l].push(pixels.len() as f64);
+            masks[l].push(pixels.len() as f64);
             covered[l].push(pixels.values().sum::<usize>() as f64 / image);
             areas[l].extend(pixels.values().map(|&n| n as f64 / image));
         }
@@ -103,7 +103,7 @@ pub fn measure(folder: &Path, footprints: Option<&Footprints>) -> Result<MaskSta
         let fates = footprints.zip(pairs.as_ref()).map(|(f, pairs)| compare(f, level as u32, pairs));
         let [compared, fates @ ..] = fates.unwrap_or_default();
         let [split, merged, stable] = fates.map(|n| (compared > 0).then(|| n as f64 / compared as f64));
-        let (masks, area) = (mean_and_spread(&counts[l]), quantiles(&mut areas[l]));
+        let (masks, area) = (mean_and_spread(&masks[l]), quantiles(&mut areas[l]));
         let covered = mean_and_spread(&covered[l])[0];
         LevelStats { level: level.to_string(), masks, area, covered, compared, split, merged, stable }
     });

@@ -119,16 +119,13 @@ pub fn average_precision(
     threshold: f64,
 ) -> Option<f64> {
     assert_eq!(truth.len(), predicted.len());
-    let mut truth_points = BTreeMap::<i32, usize>::new();
-    let mut predicted_points = BTreeMap::<i32, usize>::new();
-    let mut common = BTreeMap::<(i32, i32), usize>::new();
-    for (&t, &p) in truth.iter().zip(predicted) {
-        *truth_points.entry(t).or_default() += 1;
-        *predicted_points.entry(p).or_default() += 1;
-        *common.entry((t, p)).or_default() += 1;
-    }
-    truth_points.retain(|&id, n| id >= 0 && *n >= min_points);
-    predicted_points.retain(|&id, n| id >= 0 && *n >= min_points);
+    let sizes = |ids: &[i32]| {
+        let mut sizes = metrics::counts(ids.iter().copied());
+        sizes.retain(|&id, n| id >= 0 && *n >= min_points);
+        sizes
+    };
+    let (truth_points, predicted_points) = (sizes(truth), sizes(predicted));
+    let common = metrics::counts(truth.iter().copied().zip(predicted.iter().copied()));
     if truth_points.is_empty() {
         return None;
     }
@@ -138,30 +135,17 @@ pub fn average_precision(
     };
     // Outcomes: confidence and whether it is a hit. What no prediction reaches is missed at every confidence.
     let mut outcomes: Vec<(f32, bool)> = Vec::new();
-    let mut taken = BTreeSet::new();
+    let mut taken = BTreeSet::<i32>::new();
     let mut missed = 0usize;
     for &t in truth_points.keys() {
-        let mut best: Option<f32> = None;
-        for &p in predicted_points.keys().filter(|&&p| overlaps(t, p)) {
-            if taken.contains(&p) {
-                continue;
-            }
-            let c = confidence[p as usize];
-            match best {
-                None => {
-                    taken.insert(p);
-                    best = Some(c);
-                }
-                Some(b) => {
-                    outcomes.push((b.min(c), false));
-                    best = Some(b.max(c));
-                }
-            }
-        }
-        match best {
-            Some(b) => outcomes.push((b, true)),
-            None => missed += 1,
-        }
+        let free = |p: &&i32| overlaps(t, **p) && !taken.contains(*p);
+        let matches: Vec<i32> = predicted_points.keys().filter(free).copied().collect();
+        taken.extend(matches.first());
+        let mut confidences: Vec<f32> = matches.iter().map(|&p| confidence[p as usize]).collect();
+        confidences.sort_by(f32::total_cmp);
+        missed += usize::from(matches.is_empty());
+        outcomes.extend(confidences.pop().map(|most| (most, true)));
+        outcomes.extend(confidences.into_iter().map(|c| (c, false)));
     }
     for (&p, &points) in &predicted_points {
         if truth_points.keys().any(|&t| overlaps(t, p)) {

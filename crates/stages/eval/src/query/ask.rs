@@ -38,7 +38,7 @@ pub struct Answered {
 }
 
 /// A place that was asked about.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
 pub struct Place {
     /// Stem of the view, for a pixel.
     pub view: Option<String>,

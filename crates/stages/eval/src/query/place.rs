@@ -104,7 +104,7 @@ fn at_pixel(scene: &LabelledScene, index: &Index<'_>, view: &View, pixel: [u32; 
         position: (alpha > 0.0).then_some(position),
         alpha_or_distance: Some(alpha),
         noise,
-        names: Vec::new(),
+        ..Place::default()
     };
     Ok((place, ranking))
 }
@@ -124,7 +124,5 @@ fn at_point(scene: &LabelledScene, index: &Index<'_>, point: [f32; 3]) -> Result
             .hint("gs-geom inspect tells the bounds of the geometry"));
     }
     let ranking = index.ranking(found.map(|i| (label[i as usize] as usize, 1.0)).into_iter());
-    let place =
-        Place { view: None, pixel: None, position: mean, alpha_or_distance: distance, noise: 0.0, names: Vec::new() };
-    Ok((place, ranking))
+    Ok((Place { position: mean, alpha_or_distance: distance, ..Place::default() }, ranking))
 }

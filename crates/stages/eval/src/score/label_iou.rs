@@ -1,6 +1,7 @@
 //! Instances against polygon labels, without text: how well any instance fits each labelled object in each view.
 
 use super::labels::FrameLabels;
+use super::metrics::counts;
 use crate::scene::LabelledScene;
 use crate::silhouette::Rendering;
 use gs_io::Result;
@@ -35,12 +36,10 @@ pub fn score(scene: &LabelledScene, dataset: &Dataset, frames: &[FrameLabels]) -
             None => vec![-1; frame.width as usize * frame.height as usize],
             Some(view) => instance_map(scene.gaussians(), &scene.instances.label, &frame.camera(view)?, &scene.raster),
         };
-        let mut sizes = BTreeMap::<i32, usize>::new();
-        map.iter().filter(|&&i| i >= 0).for_each(|&i| *sizes.entry(i).or_default() += 1);
+        let sizes = counts(map.iter().copied());
         for (category, mask) in &frame.categories {
-            let mut both = BTreeMap::<i32, usize>::new();
             let labelled = map.iter().zip(&mask.bits).filter(|(i, inside)| **inside && **i >= 0);
-            labelled.for_each(|(&i, _)| *both.entry(i).or_default() += 1);
+            let both = counts(labelled.map(|(i, _)| *i));
             let pixels = mask.count();
             let iou = |(i, n): (&i32, &usize)| (*n as f64 / (pixels + sizes[i] - n) as f64, *i);
             let best = both.iter().map(iou).max_by(|a, b| a.0.total_cmp(&b.0).then(b.1.cmp(&a.1)));

@@ -1,9 +1,9 @@
 //! Scores: class-agnostic 3D instances (docs/protocols.md) and object selection (the same).
 
-use serde::Serialize;
+use std::collections::{BTreeMap, BTreeSet};
 
 /// How one true object was found.
-#[derive(Debug, Clone, PartialEq, Serialize)]
+#[derive(Debug, Clone, PartialEq)]
 pub struct ObjectScore {
     /// Id of the true object.
     pub id: i32,
@@ -18,7 +18,7 @@ pub struct ObjectScore {
 }
 
 /// Class-agnostic score of predicted instances against true objects.
-#[derive(Debug, Clone, PartialEq, Serialize)]
+#[derive(Debug, Clone, PartialEq)]
 pub struct InstanceScore {
     /// Mean over true objects of the best IoU.
     pub miou: f64,
@@ -52,17 +52,12 @@ pub fn score_instances(truth: &[i32], predicted: &[i32]) -> InstanceScore {
     let mut pairs: Vec<(i32, i32)> =
         truth.iter().copied().zip(predicted.iter().copied()).filter(|p| p.0 >= 0).collect();
     pairs.sort_unstable();
-    let size = |ids: &mut dyn Iterator<Item = i32>| {
-        let mut sizes = std::collections::BTreeMap::<i32, usize>::new();
-        ids.for_each(|id| *sizes.entry(id).or_default() += 1);
-        sizes
-    };
-    let true_size = size(&mut pairs.iter().map(|p| p.0));
-    let predicted_size = size(&mut pairs.iter().map(|p| p.1));
+    let true_size = counts(pairs.iter().map(|p| p.0));
+    let predicted_size = counts(pairs.iter().map(|p| p.1));
     let mut objects: Vec<ObjectScore> =
         true_size.iter().map(|(&id, &points)| ObjectScore { id, points, iou: 0.0, best: None, fragments: 0 }).collect();
-    let mut held = std::collections::BTreeMap::<i32, usize>::new();
-    let (mut together, mut belonging) = (0usize, std::collections::BTreeSet::new());
+    let mut held = BTreeMap::<i32, usize>::new();
+    let (mut together, mut belonging) = (0usize, BTreeSet::new());
     for run in pairs.chunk_by(|a, b| a == b) {
         let ((id, instance), both) = (run[0], run.len());
         if instance < 0 {
@@ -96,6 +91,13 @@ pub fn score_instances(truth: &[i32], predicted: &[i32]) -> InstanceScore {
         points: pairs.len(),
         objects,
     }
+}
+
+/// How often each value comes.
+pub fn counts<T: Ord>(values: impl Iterator<Item = T>) -> BTreeMap<T, usize> {
+    let mut counts = BTreeMap::new();
+    values.for_each(|v| *counts.entry(v).or_default() += 1);
+    counts
 }
 
 /// Mean; 0 of nothing.
