@@ -42,9 +42,9 @@ pub struct Table {
 }
 
 impl Table {
-    fn head(&self) -> Vec<String> {
-        let source = self.sources.then(|| "source".to_string());
-        [self.head.clone()].into_iter().chain(self.columns.iter().cloned()).chain(source).collect()
+    fn head(&self) -> Vec<&str> {
+        let columns = [&self.head].into_iter().chain(&self.columns).map(String::as_str);
+        columns.chain(self.sources.then_some("source")).collect()
     }
 
     fn rows(&self, ours: impl Fn(&str) -> String) -> Vec<Vec<String>> {
@@ -58,10 +58,7 @@ impl Table {
     }
 
     fn markdown(&self) -> String {
-        let head = self.head();
-        let rule = vec!["---".to_string(); head.len()];
-        let rows = self.rows(|name| format!("**{name}**"));
-        [head, rule].iter().chain(&rows).map(|cells| line(cells)).collect()
+        markdown(&self.head(), &self.rows(|name| format!("**{name}**")))
     }
 
     fn json(&self) -> Value {
@@ -106,8 +103,7 @@ impl Sheet {
         let mut page = Page::default();
         for (at, table) in [&self.table].into_iter().chain(&self.more).enumerate() {
             page.section(&format!("table-{}", at + 1), &table.title);
-            let head = table.head();
-            page.table(&head.iter().map(String::as_str).collect::<Vec<_>>(), &table.rows(|name| format!("▸ {name}")));
+            page.table(&table.head(), &table.rows(|name| format!("▸ {name}")));
             if at == 0 {
                 self.remarks.iter().for_each(|r| page.paragraph(r));
             }
@@ -123,16 +119,13 @@ impl Sheet {
     }
 }
 
-/// A row of a Markdown table.
-pub fn line(cells: &[String]) -> String {
-    format!("| {} |\n", cells.iter().map(|c| c.replace('|', "\\|")).collect::<Vec<_>>().join(" | "))
-}
-
 /// A table in Markdown.
 pub fn markdown(head: &[&str], rows: &[Vec<String>]) -> String {
     let head: Vec<String> = head.iter().map(|h| (*h).to_string()).collect();
     let rule = vec!["---".to_string(); head.len()];
-    [head, rule].iter().chain(rows).map(|cells| line(cells)).collect()
+    let cell = |c: &String| c.replace('|', "\\|");
+    let line = |cells: &Vec<String>| format!("| {} |\n", cells.iter().map(cell).collect::<Vec<_>>().join(" | "));
+    [head, rule].iter().chain(rows).map(line).collect()
 }
 
 #[cfg(test)]

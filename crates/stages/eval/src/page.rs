@@ -17,11 +17,10 @@ use crate::memory::{self, Sizes};
 use crate::options::ReportOptions;
 use crate::scene::{folder_name, load};
 use gs_io::{Result, write_bytes, write_json};
-use gs_scene::dataset::{Dataset, LoadOptions, Split};
+use gs_scene::dataset::{LoadOptions, Split};
 use report::html::Page;
 use serde_json::{Value, json};
 use stage::Stage;
-use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
 pub(crate) fn run(o: &ReportOptions, parameters: Value, stage: &Stage) -> Result<String> {
@@ -37,12 +36,11 @@ pub(crate) fn run(o: &ReportOptions, parameters: Value, stage: &Stage) -> Result
     let (out, figures) = (&o.out, o.out.with_file_name("metrics.json"));
     let outputs = stage.outputs(out).file(out).file(&figures);
     let mut claim = outputs.reads(&dataset.files).reads(files(&o.run_dir).chain([geometry(o)])).claim()?;
-    let mut inputs = BTreeMap::new();
     let mut metrics = Metrics::default();
-    let page = write(&dataset, o, &mut metrics, &mut inputs)?;
-    write_bytes(out, page.as_bytes())?;
+    let material = Material::read(&dataset, o, &geometry(o), masks(o), &mut metrics)?;
+    write_bytes(out, write(&material, &mut metrics)?.as_bytes())?;
     write_json(&figures, &metrics)?;
-    stage.record(&mut claim, parameters, inputs, json!({"left_out": metrics.skipped.len()}))?;
+    stage.record(&mut claim, parameters, material.inputs, json!({"left_out": metrics.skipped.len()}))?;
     stage.info(&format!("wrote {}", out.display()));
     Ok(metrics.table())
 }
@@ -59,17 +57,12 @@ fn masks(o: &ReportOptions) -> Option<PathBuf> {
 }
 
 /// Writes the page; gives its text, with the figures in `metrics`.
-fn write(
-    dataset: &Dataset,
-    o: &ReportOptions,
-    metrics: &mut Metrics,
-    inputs: &mut BTreeMap<String, String>,
-) -> Result<String> {
-    let material = Material::read(dataset, o, geometry(o), masks(o), metrics, inputs)?;
-    let records = run_records(&material)?;
-    metrics.gaussians = material.gaussians().len();
-    metrics.instances = material.labelled().map(|l| l.instances.len());
-    geometry_figures(&material, metrics)?;
+fn write(material: &Material, metrics: &mut Metrics) -> Result<String> {
+    let (dataset, gaussians) = (material.dataset, material.geometry.gaussians.len());
+    let records = run_records(material)?;
+    metrics.gaussians = gaussians;
+    metrics.instances = material.found.as_ref().map(|(instances, _)| instances.len());
+    geometry_figures(material, metrics)?;
     metrics.seconds = runs::seconds(&records);
     for r in &records {
         if let Some(bytes) = r.record.peak_rss_bytes {
@@ -80,25 +73,24 @@ fn write(
 
     let mut page = Page::default();
     page.tiles(&sections::tiles(metrics, dataset));
-    sections::photographs(&material, &mut page)?;
-    sections::id_maps(&material, &mut page, metrics)?;
-    sections::features(&material, &mut page, metrics)?;
-    sections::instances(&material, &mut page, metrics)?;
-    sections::queries(&material, &mut page, metrics)?;
-    sections::score_tables(&material, &mut page);
-    sections::training(&material, &mut page, metrics)?;
+    sections::photographs(material, &mut page)?;
+    sections::id_maps(material, &mut page, metrics)?;
+    sections::features(material, &mut page, metrics)?;
+    sections::instances(material, &mut page, metrics)?;
+    sections::queries(material, &mut page, metrics)?;
+    sections::score_tables(material, &mut page);
+    sections::training(material, &mut page, metrics)?;
     sections::stages(&records, &mut page);
     sections::left_out(&records, &mut page, metrics);
 
+    let (width, height) = dataset.views.first().map_or((0, 0), |v| (v.camera.width, v.camera.height));
     let subtitle = format!(
-        "{} photographs ({} held out) of {}x{} pixels, {} Gaussians",
+        "{} photographs ({} held out) of {width}x{height} pixels, {} Gaussians",
         dataset.views.len(),
-        dataset.views.iter().filter(|v| v.split == Split::Test).count(),
-        dataset.views.first().map_or(0, |v| v.camera.width),
-        dataset.views.first().map_or(0, |v| v.camera.height),
-        grouped(&material.gaussians().len().to_string()),
+        dataset.views_of(Split::Test).count(),
+        grouped(&gaussians.to_string()),
     );
-    Ok(page.finish(&folder_name(&o.run_dir), &subtitle))
+    Ok(page.finish(&folder_name(&material.options.run_dir), &subtitle))
 }
 
 /// The files of a run that the page tells of.

@@ -131,7 +131,11 @@ mod tests {
         }
         let (g, camera) = balls();
         let most = gs_raster::render(&g, &camera, &RasterOptions::default()).alpha.into_iter().fold(0.0, f32::max);
-        assert_eq!(masks(Rendering { threshold: most, ..SELECTED }, &[&[0, 1]])[0].count(), 0, "the threshold is strict");
+        assert_eq!(
+            masks(Rendering { threshold: most, ..SELECTED }, &[&[0, 1]])[0].count(),
+            0,
+            "the threshold is strict"
+        );
     }
 
     #[test]

@@ -4,11 +4,11 @@ use super::metrics::Metrics;
 use crate::options::ReportOptions;
 use crate::scene::{LabelledScene, views_to_show};
 use crate::score::Scores;
-use artifacts::role;
-use gs_io::{Error, IoContext, Result, hash_file};
+use artifacts::{Instances, role};
+use gs_io::{Artifact, Error, IoContext, Result, hash_file};
 use gs_raster::RasterOptions;
+use gs_scene::Geometry;
 use gs_scene::dataset::{Dataset, Split, View};
-use gs_scene::{Gaussians, Geometry};
 use report::picture::Picture;
 use stage::RunRecord;
 use std::collections::BTreeMap;
@@ -20,27 +20,15 @@ pub(super) struct Material<'a> {
     pub(super) dataset: &'a Dataset,
     /// Folder of id maps, if there is one.
     pub(super) masks: Option<PathBuf>,
-    scene: Known,
+    pub(super) geometry: Geometry,
     pub(super) raster: RasterOptions,
-    pub(super) geometry_hash: String,
+    /// The instances with their file, where the run has some.
+    pub(super) found: Option<(Instances, Artifact)>,
+    /// Content hashes, by role.
+    pub(super) inputs: BTreeMap<String, String>,
     pub(super) scores: Option<Scores>,
     /// The views shown, with photograph and render.
     pub(super) shown: Vec<Shown<'a>>,
-}
-
-/// The Gaussians, with their instances where the run has some.
-enum Known {
-    Labelled(Box<LabelledScene>),
-    Geometry(Geometry),
-}
-
-impl Known {
-    fn geometry(&self) -> &Geometry {
-        match self {
-            Self::Labelled(scene) => &scene.geometry,
-            Self::Geometry(geometry) => geometry,
-        }
-    }
 }
 
 /// A view with what is shown of it.
@@ -55,28 +43,25 @@ impl<'a> Material<'a> {
     pub(super) fn read(
         dataset: &'a Dataset,
         options: &'a ReportOptions,
-        geometry: PathBuf,
+        geometry: &Path,
         masks: Option<PathBuf>,
         metrics: &mut Metrics,
-        inputs: &mut BTreeMap<String, String>,
     ) -> Result<Self> {
-        let geometry_hash = hash_file(&geometry)?;
-        inputs.insert(role::GEOMETRY.into(), geometry_hash.clone());
         let path = options.run_dir.join("instances.safetensors");
-        let scene = if path.exists() {
-            let labelled = LabelledScene::read(&path, &geometry)?;
+        let (geometry, found, inputs) = if path.exists() {
+            let labelled = LabelledScene::read(&path, geometry)?;
             labelled.check_dataset(dataset)?;
-            inputs.extend(labelled.inputs.clone());
-            Known::Labelled(Box::new(labelled))
+            let LabelledScene { geometry, instances, artifact, inputs, .. } = labelled;
+            (geometry, Some((instances, artifact)), inputs)
         } else {
             metrics.skipped.push("instances: the run has no instances.safetensors (cluster-match makes it)".into());
-            Known::Geometry(Geometry::read(&geometry)?)
+            let inputs = BTreeMap::from([(role::GEOMETRY.into(), hash_file(geometry)?)]);
+            (Geometry::read(geometry)?, None, inputs)
         };
-        let geometry = scene.geometry();
         metrics.skipped.extend(geometry.damage());
-        let raster = RasterOptions::of(geometry);
+        let raster = RasterOptions::of(&geometry);
         let path = options.run_dir.join("score.json");
-        let scores = if is_of(&path, inputs) { optional_json::<Scores>(&path)? } else { None };
+        let scores = if is_of(&path, &inputs) { optional_json::<Scores>(&path)? } else { None };
         match &scores {
             Some(s) => metrics.skipped.extend(s.skipped.iter().cloned()),
             None if path.exists() => {
@@ -93,18 +78,7 @@ impl<'a> Material<'a> {
             let psnr = psnr(&photo, &render);
             shown.push(Shown { view, photo, render, psnr });
         }
-        Ok(Self { options, dataset, masks, scene, raster, geometry_hash, scores, shown })
-    }
-
-    pub(super) fn gaussians(&self) -> &Gaussians {
-        &self.scene.geometry().gaussians
-    }
-
-    pub(super) fn labelled(&self) -> Option<&LabelledScene> {
-        match &self.scene {
-            Known::Labelled(scene) => Some(scene),
-            Known::Geometry(_) => None,
-        }
+        Ok(Self { options, dataset, masks, geometry, raster, found, inputs, scores, shown })
     }
 
     pub(super) fn file(&self, name: &str) -> PathBuf {

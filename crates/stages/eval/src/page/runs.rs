@@ -60,8 +60,7 @@ pub fn read_all(folders: &[&Path], except: &Path) -> Result<Vec<Run>> {
     for folder in folders {
         walk(folder, 3, &mut paths);
     }
-    let except = RunRecord::path(except);
-    if let Ok(except) = except.canonicalize() {
+    if let Ok(except) = RunRecord::path(except).canonicalize() {
         paths.remove(&except);
     }
     let mut runs = Vec::with_capacity(paths.len());
@@ -72,9 +71,8 @@ pub fn read_all(folders: &[&Path], except: &Path) -> Result<Vec<Run>> {
         runs.push(Run { output: output.file_name().unwrap_or_default().to_string_lossy().into_owned(), record });
     }
     let place = |r: &Run| ORDER.iter().position(|&s| s == r.record.program).unwrap_or(ORDER.len());
-    runs.sort_by(|a, b| (place(a), a.name(), &a.output).cmp(&(place(b), b.name(), &b.output)));
     // gs-geom eval comes after gs-geom train, whatever the alphabet says.
-    runs.sort_by_key(|r| (place(r), r.name().ends_with(" eval")));
+    runs.sort_by_cached_key(|r| (place(r), r.name().ends_with(" eval"), r.name(), r.output.clone()));
     let mut merged: Vec<Run> = Vec::with_capacity(runs.len());
     for run in runs {
         match merged.iter_mut().find(|m| m.did_as(&run)) {
@@ -118,14 +116,8 @@ pub fn seconds(runs: &[Run]) -> BTreeMap<String, f64> {
 /// A whole number with a comma between every three digits.
 pub fn grouped(digits: &str) -> String {
     let (sign, digits) = digits.strip_prefix('-').map_or(("", digits), |d| ("-", d));
-    let mut out = String::from(sign);
-    for (i, c) in digits.chars().enumerate() {
-        if i > 0 && (digits.len() - i).is_multiple_of(3) {
-            out.push(',');
-        }
-        out.push(c);
-    }
-    out
+    let groups: Vec<_> = digits.as_bytes().rchunks(3).rev().map(String::from_utf8_lossy).collect();
+    format!("{sign}{}", groups.join(","))
 }
 
 #[cfg(test)]

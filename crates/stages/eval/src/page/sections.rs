@@ -1,6 +1,6 @@
 //! The sections of a report, in their order on the page.
 
-use super::material::{Material, is_of, optional_json};
+use super::material::{Material, Shown, is_of, optional_json};
 use super::metrics::Metrics;
 use super::pca::pca;
 use super::runs::{self, Run, grouped};
@@ -13,6 +13,7 @@ use gs_scene::dataset::{Dataset, Split, View};
 use report::curve;
 use report::html::{Figure, Page};
 use report::picture::Picture;
+use std::collections::BTreeSet;
 use std::path::{Component, Path, PathBuf};
 
 /// Width of pictures on the page, two or three beside each other.
@@ -81,7 +82,7 @@ pub(super) fn id_maps(m: &Material, page: &mut Page, metrics: &mut Metrics) -> R
         metrics.skipped.push("id maps: no folder of masks was given".into());
         return Ok(());
     };
-    if let Some(a) = m.labelled().map(|l| &l.artifact).filter(|a| a.provenance().inputs.contains_key(role::MASKS)) {
+    if let Some((_, a)) = m.found.as_ref().filter(|(_, a)| a.provenance().inputs.contains_key(role::MASKS)) {
         a.expect_input(role::MASKS, &hash_folder(folder, "_s.npy")?)?;
     }
     let mut figures = Vec::new();
@@ -92,20 +93,14 @@ pub(super) fn id_maps(m: &Material, page: &mut Page, metrics: &mut Metrics) -> R
         }
         let maps = MaskMaps::read(&path)?;
         let level = maps.level(Level::Large);
-        let mut distinct: Vec<i32> = level.iter().copied().filter(|&id| id >= 0).collect();
-        distinct.sort_unstable();
-        distinct.dedup();
+        let distinct: BTreeSet<i32> = level.iter().copied().filter(|&id| id >= 0).collect();
         let (w, h) = (s.photo.width, s.photo.height);
-        let overlay: Vec<Option<[f32; 3]>> = (0..w * h)
-            .map(|i| {
-                let (x, y) = (i % w * maps.width / w, i / w * maps.height / h);
-                // Ids of the large level begin after those of the others; only their differences matter for colours.
-                Some(match u32::try_from(level[y * maps.width + x]) {
-                    Ok(id) => instance_color(id),
-                    Err(_) => NOISE_COLOR,
-                })
-            })
-            .collect();
+        // Ids of the large level begin after those of the others; only their differences matter for colours.
+        let color = |i: usize| {
+            let (x, y) = (i % w * maps.width / w, i / w * maps.height / h);
+            u32::try_from(level[y * maps.width + x]).map_or(NOISE_COLOR, instance_color)
+        };
+        let overlay: Vec<[f32; 3]> = (0..w * h).map(color).collect();
         let caption = format!("{}: {} masks", s.view.stem(), distinct.len());
         figures.push(figure(&s.photo.overlaid(&overlay, 0.6), 3, caption)?);
     }
@@ -128,7 +123,7 @@ pub(super) fn features(m: &Material, page: &mut Page, metrics: &mut Metrics) -> 
         metrics.skipped.push("features: the run has no features.safetensors (feat-train makes it)".into());
         return Ok(());
     }
-    let features = read_features(&path, &m.geometry_hash, m.gaussians().len())?;
+    let features = read_features(&path, &m.inputs[role::GEOMETRY], m.geometry.gaussians.len())?;
     if features.dim == 0 || features.kept.is_empty() {
         metrics.skipped.push("features: no Gaussian has one".into());
         return Ok(());
@@ -136,7 +131,7 @@ pub(super) fn features(m: &Material, page: &mut Page, metrics: &mut Metrics) -> 
     let step = features.kept.len().div_ceil(PCA_ROWS);
     let rows: Vec<f32> = features.values.chunks_exact(features.dim).step_by(step).flatten().copied().collect();
     let p = pca(&rows, features.dim, 3);
-    let mut colors = vec![None; m.gaussians().len()];
+    let mut colors = vec![None; m.geometry.gaussians.len()];
     for (&i, c) in features.kept.iter().zip(p.colors(&features.values)) {
         colors[i as usize] = Some(c);
     }
@@ -146,12 +141,8 @@ pub(super) fn features(m: &Material, page: &mut Page, metrics: &mut Metrics) -> 
          and blue. Gaussians of one colour are one thing to the clustering.",
         features.dim
     ));
-    let mut figures = Vec::new();
-    for s in &m.shown {
-        let picture = render_colors(m, &colors, s.view);
-        figures.push(figure(&picture, 3, s.view.stem().to_string())?);
-    }
-    page.figures(3, &figures);
+    let colored = |s: &Shown| figure(&render_colors(m, &colors, s.view), 3, s.view.stem().to_string());
+    page.figures(3, &m.shown.iter().map(colored).collect::<Result<Vec<_>>>()?);
     Ok(())
 }
 
@@ -161,15 +152,14 @@ fn render_colors(m: &Material, colors: &[Option<[f32; 3]>], view: &View) -> Pict
     let height = (f64::from(view.camera.height) * f64::from(width) / f64::from(view.camera.width)).round() as u32;
     let camera = view.camera.resized(width, height.max(1));
     let channels: Vec<f32> = colors.iter().flat_map(|c| c.map_or([0.0; 4], |[r, g, b]| [r, g, b, 1.0])).collect();
-    let out = gs_raster::render_features(m.gaussians(), &channels, 4, &camera, &m.raster);
+    let out = gs_raster::render_features(&m.geometry.gaussians, &channels, 4, &camera, &m.raster);
     let over = |p: &[f32]| [0, 1, 2].map(|k| p[k] + (1.0 - p[3]).max(0.0) * BACKDROP[k]);
     let rgb: Vec<f32> = out.chunks_exact(4).flat_map(over).collect();
     Picture::new(camera.width, camera.height, &rgb)
 }
 
 pub(super) fn instances(m: &Material, page: &mut Page, metrics: &mut Metrics) -> Result<()> {
-    let Some(labelled) = m.labelled() else { return Ok(()) };
-    let inst = &labelled.instances;
+    let Some((inst, _)) = &m.found else { return Ok(()) };
     page.section("instances", "Instances");
     if inst.is_empty() {
         page.note("The clustering found no instance: all Gaussians are noise.");
@@ -187,8 +177,7 @@ pub(super) fn instances(m: &Material, page: &mut Page, metrics: &mut Metrics) ->
     let mut figures = Vec::new();
     for s in &m.shown {
         figures.push(figure(&s.photo, 2, format!("{}: photograph", s.view.stem()))?);
-        let picture = render_colors(m, &colors, s.view);
-        figures.push(figure(&picture, 2, format!("{}: instances", s.view.stem()))?);
+        figures.push(figure(&render_colors(m, &colors, s.view), 2, format!("{}: instances", s.view.stem()))?);
     }
     page.figures(2, &figures);
     Ok(())
@@ -197,10 +186,10 @@ pub(super) fn instances(m: &Material, page: &mut Page, metrics: &mut Metrics) ->
 pub(super) fn queries(m: &Material, page: &mut Page, metrics: &mut Metrics) -> Result<()> {
     let folder = m.file("query");
     let path = folder.join("query.json");
-    let current = m.labelled().is_none_or(|l| is_of(&path, &l.inputs));
+    let current = m.found.is_none() || is_of(&path, &m.inputs);
     let results = if current { optional_json::<QueryResults>(&path)? } else { None };
     let Some(results) = results.filter(|r| !r.queries.is_empty()) else {
-        let without_language = m.labelled().is_some_and(|l| l.instances.dim == 0);
+        let without_language = m.found.as_ref().is_some_and(|(instances, _)| instances.dim == 0);
         metrics.skipped.push(if without_language {
             "text queries: the instances have no language features, because the masks were not encoded with a CLIP \
              model (mask-embed embed --clip)"
