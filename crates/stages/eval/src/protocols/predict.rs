@@ -16,7 +16,7 @@ pub type Answers = BTreeMap<String, std::result::Result<Answered, String>>;
 
 /// Asks for texts.
 pub fn ask(asker: &Asker<'_>, texts: &[String]) -> Result<Answers> {
-    let Some(source) = &asker.source else { return Ok(Answers::new()) };
+    let source = asker.source.as_ref().expect("a source of text features");
     let answer = |f: Option<Vec<f32>>| f.map(|f| asker.answer(&f)).ok_or_else(|| "it has no text feature".into());
     let features = source.encode_in(&asker.templates, texts)?;
     Ok(texts.iter().cloned().zip(features.into_iter().map(answer)).collect())

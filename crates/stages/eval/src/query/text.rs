@@ -198,7 +198,7 @@ impl TextSource {
         }
     }
 
-    /// The error for a text that [`Self::encode`] knows no feature of; it names a few that it knows.
+    /// The error for a text without a feature; it names a few that have one.
     pub fn unknown(&self, text: &str) -> Error {
         let mut e = Error::new("no such text in the table").field("--text").found(format!("{text:?}"));
         if let Self::Table(table) = self {
