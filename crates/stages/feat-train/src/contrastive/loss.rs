@@ -39,7 +39,6 @@ pub fn directions(rows: &[f64], d: usize) -> (Vec<f64>, Vec<f64>) {
     (unit, lengths)
 }
 
-/// Scalar product.
 pub fn dot(a: &[f64], b: &[f64]) -> f64 {
     a.iter().zip(b).map(|(a, b)| a * b).sum()
 }
@@ -86,14 +85,8 @@ impl Prototypes {
     }
 
     /// Cross-entropy of the softmax over all masks of the cosines with `f`, against its `share` in each mask `[K]`. Adds
-    /// the gradients of the centroids `[K][d]` and of `f` where asked for.
-    pub fn cross_entropy(
-        &self,
-        f: &[f64],
-        share: &[f64],
-        centroids: Option<&mut [f64]>,
-        feature: Option<&mut [f64]>,
-    ) -> f64 {
+    /// the gradients of the centroids `[K][d]` and of `f`.
+    pub fn cross_entropy(&self, f: &[f64], share: &[f64], to_centroids: &mut [f64], to_feature: &mut [f64]) -> f64 {
         let (d, tau) = (self.d, self.tau);
         let (u, f_length) = directions(f, d);
         if f_length[0] <= SHORTEST || self.alive.len() < 2 {
@@ -105,41 +98,28 @@ impl Prototypes {
         let value = mine * log_sum_exp(&mut softmax) - positive;
         // Gradient of each cosine.
         let g: Vec<f64> = self.alive.iter().zip(&softmax).map(|(&k, p)| (mine * p - share[k]) / tau).collect();
-        if let Some(to) = centroids {
-            for (&k, g) in self.alive.iter().zip(&g) {
-                let scaled: Vec<f64> = u.iter().map(|u| g * u).collect();
-                let range = k * d..(k + 1) * d;
-                add_direction_gradient(&mut to[range.clone()], &self.unit[range], self.length[k], &scaled);
-            }
+        let mut sum = vec![0.0; d];
+        for (&k, g) in self.alive.iter().zip(&g) {
+            let range = k * d..(k + 1) * d;
+            let unit = &self.unit[range.clone()];
+            let scaled: Vec<f64> = u.iter().map(|u| g * u).collect();
+            add_direction_gradient(&mut to_centroids[range], unit, self.length[k], &scaled);
+            sum.iter_mut().zip(unit).for_each(|(s, u)| *s += g * u);
         }
-        if let Some(to) = feature {
-            let mut sum = vec![0.0; d];
-            for (&k, g) in self.alive.iter().zip(&g) {
-                sum.iter_mut().zip(&self.unit[k * d..(k + 1) * d]).for_each(|(s, u)| *s += g * u);
-            }
-            add_direction_gradient(to, &u, f_length[0], &sum);
-        }
+        add_direction_gradient(to_feature, &u, f_length[0], &sum);
         value
     }
 }
 
-/// Distance of `f` from `centroid` times `scale`; adds the gradients of both where asked for.
-pub fn cohesion(
-    f: &[f64],
-    centroid: &[f64],
-    scale: f64,
-    to_centroid: Option<&mut [f64]>,
-    to_feature: Option<&mut [f64]>,
-) -> f64 {
+/// Distance of `f` from `centroid` times `scale`; adds the gradients of both.
+pub fn cohesion(f: &[f64], centroid: &[f64], scale: f64, to_centroid: &mut [f64], to_feature: &mut [f64]) -> f64 {
     let difference: Vec<f64> = f.iter().zip(centroid).map(|(f, c)| f - c).collect();
     let distance = dot(&difference, &difference).sqrt();
     if distance > SHORTEST {
-        let g = |v: &f64| scale * v / distance;
-        if let Some(to) = to_centroid {
-            to.iter_mut().zip(&difference).for_each(|(t, v)| *t -= g(v));
-        }
-        if let Some(to) = to_feature {
-            to.iter_mut().zip(&difference).for_each(|(t, v)| *t += g(v));
+        for ((c, f), v) in to_centroid.iter_mut().zip(to_feature).zip(&difference) {
+            let g = scale * v / distance;
+            *c -= g;
+            *f += g;
         }
     }
     scale * distance

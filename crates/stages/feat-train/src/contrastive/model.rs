@@ -8,7 +8,7 @@ use super::masks::MaskSet;
 use super::network::{self, Activations, Layer};
 use super::normalize::{Moments, channel_moments, row_moments};
 use super::real::Real;
-use super::terms::{GaussianTerms, PixelTerms};
+use super::terms;
 use crate::options::{Axis, Contrastive, Init, Loss, Neighbours};
 use crate::random::normal;
 use rand::Rng;
@@ -27,11 +27,9 @@ const CHUNK: usize = 512;
 pub struct Model<T> {
     /// Dimension of a feature, d.
     pub dim: usize,
-    /// What shapes the model.
     pub options: Contrastive,
     /// Features, `[n][d]`, in the training order.
     pub features: Vec<T>,
-    /// The graph network.
     pub layers: Vec<Layer<T>>,
 }
 
@@ -48,13 +46,11 @@ pub struct Propagated<T> {
 /// Loss and gradients of one view.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct Step<T> {
-    /// The loss.
     pub loss: f64,
     /// 1 - mean cosine of the centroids of different masks.
     pub separation: f64,
     /// Gradient of the features of the view's columns `[v][d]`.
     pub features: Vec<T>,
-    /// Gradient of each layer's weights.
     pub layers: Vec<Vec<T>>,
 }
 
@@ -189,45 +185,37 @@ impl<T: Real> Model<T> {
         out
     }
 
-    /// Sums over pieces of columns, in order: `visit(column, feature, sums)` adds to `sums`.
-    fn sum_columns(
+    /// Centroids A f of all masks `[K][d]`.
+    pub fn centroids(&self, context: &Context, propagated: &Propagated<T>, set: &MaskSet) -> Vec<f64> {
+        self.mask_sums(context, propagated, set, |_| true)
+    }
+
+    /// The sums of a row of A f over those of its entries that `counts` names, over pieces of columns, in order; `[K][d]`.
+    fn mask_sums(
         &self,
         context: &Context,
         propagated: &Propagated<T>,
         set: &MaskSet,
-        length: usize,
-        visit: impl Fn(usize, &[f64], &mut [f64]) + Sync,
+        counts: impl Fn(usize) -> bool + Sync,
     ) -> Vec<f64> {
-        let parts: Vec<Vec<f64>> = set
-            .pieces
-            .par_windows(2)
-            .map(|bounds| {
-                let mut sums = vec![0.0; length];
-                let mut f = vec![0.0; self.dim];
-                for c in bounds[0]..bounds[1] {
-                    self.final_feature(context, propagated, set.columns[c as usize] as usize, &mut f);
-                    visit(c as usize, &f, &mut sums);
+        let d = self.dim;
+        let piece = |bounds: &[u32]| {
+            let (mut sums, mut f) = (vec![0.0; set.len() * d], vec![0.0; d]);
+            for c in bounds[0] as usize..bounds[1] as usize {
+                self.final_feature(context, propagated, set.columns[c] as usize, &mut f);
+                for e in (set.start[c] as usize..set.start[c + 1] as usize).filter(|&e| counts(e)) {
+                    let (k, w) = (set.mask[e] as usize, f64::from(set.weight[e]));
+                    sums[k * d..(k + 1) * d].iter_mut().zip(&f).for_each(|(s, f)| *s += w * f);
                 }
-                sums
-            })
-            .collect();
-        let mut total = vec![0.0; length];
+            }
+            sums
+        };
+        let parts: Vec<Vec<f64>> = set.pieces.par_windows(2).map(piece).collect();
+        let mut total = vec![0.0; set.len() * d];
         for part in parts {
             total.iter_mut().zip(part).for_each(|(t, p)| *t += p);
         }
         total
-    }
-
-    /// Centroids A f of all masks `[K][d]`.
-    pub fn centroids(&self, context: &Context, propagated: &Propagated<T>, set: &MaskSet) -> Vec<f64> {
-        let d = self.dim;
-        self.sum_columns(context, propagated, set, set.len() * d, |c, f, sums| {
-            let (masks, weights) = set.entries(c);
-            for (&k, w) in masks.iter().zip(weights) {
-                let to = &mut sums[k as usize * d..(k as usize + 1) * d];
-                to.iter_mut().zip(f).for_each(|(s, f)| *s += f64::from(*w) * f);
-            }
-        })
     }
 
     /// [Alignment](alignment()) of a view's masks.
@@ -287,38 +275,22 @@ impl<T: Real> Model<T> {
         let (d, s) = (self.dim, &self.options);
         let centroids = self.centroids(context, propagated, set);
         let halves = (s.loss == Loss::HalfMask).then_some(noise);
-        let positives = halves.map(|noise| {
-            self.sum_columns(context, propagated, set, set.len() * d, |c, f, sums| {
-                for e in set.start[c] as usize..set.start[c + 1] as usize {
-                    if loss::in_half(noise, e) {
-                        let (k, w) = (set.mask[e] as usize, f64::from(set.weight[e]));
-                        sums[k * d..(k + 1) * d].iter_mut().zip(f).for_each(|(s, f)| *s += w * f);
-                    }
-                }
-            })
-        });
+        let positives =
+            halves.map(|noise| self.mask_sums(context, propagated, set, |entry| loss::in_half(noise, entry)));
         let mut evaluated = loss::evaluate(s.loss, &centroids, positives.as_deref().or(beside), d, s.tau);
-        let of_gaussians = (s.loss == Loss::Gaussian).then(|| GaussianTerms::new(d, s.tau, set, &centroids));
-        if let Some(terms) = &of_gaussians {
-            // The terms change the centroids too: sum their gradients over columns first.
-            let sums = self.sum_columns(context, propagated, set, centroids.len() + 1, |c, f, sums| {
-                let (gradient, value) = sums.split_at_mut(centroids.len());
-                value[0] += terms.add(c, f, Some(gradient), None);
-            });
-            evaluated.loss += sums[centroids.len()];
-            evaluated.centroids.iter_mut().zip(&sums).for_each(|(g, s)| *g += s);
-        }
-        let of_pixels = s.needs_pixels().then(|| {
-            let terms = PixelTerms::new(d, s, set, &centroids);
-            let feature = |c: usize, f: &mut [f64]| {
-                self.final_feature(context, propagated, set.columns[c] as usize, f);
-            };
-            let (value, to_columns) =
-                terms.gradients(&set.sampled, set.columns.len(), feature, &mut evaluated.centroids);
+        let to_centroids = &mut evaluated.centroids;
+        let feature = |c: usize, f: &mut [f64]| {
+            self.final_feature(context, propagated, set.columns[c] as usize, f);
+        };
+        let of_gaussians = (s.loss == Loss::Gaussian)
+            .then(|| terms::of_gaussians(d, s.tau, set, feature, &centroids, &mut *to_centroids));
+        let of_pixels = s.needs_pixels().then(|| terms::of_pixels(d, s, set, feature, &centroids, to_centroids));
+        let mut to_columns = Vec::new();
+        for (value, rows) in [of_gaussians, of_pixels].into_iter().flatten() {
             evaluated.loss += value;
-            to_columns
-        });
-        View { set, evaluated, halves, of_gaussians, of_pixels }
+            to_columns.push(rows);
+        }
+        View { set, evaluated, halves, to_columns }
     }
 
     /// Gradients of the features of some columns, and of what their anchors give them.
@@ -343,17 +315,11 @@ impl<T: Real> Model<T> {
                 }
             }
             let place = set.columns[c] as usize;
-            let mut length = 1.0;
-            if view.of_gaussians.is_some() || self.options.unit_length {
-                length = self.final_feature(context, propagated, place, &mut f);
-            }
-            if let Some(terms) = &view.of_gaussians {
-                terms.add(c, &f, None, Some(&mut g));
-            }
-            if let Some(rows) = &view.of_pixels {
+            for rows in &view.to_columns {
                 g.iter_mut().zip(&rows[c * d..(c + 1) * d]).for_each(|(g, v)| *g += v);
             }
             if self.options.unit_length {
+                let length = self.final_feature(context, propagated, place, &mut f);
                 let of_direction = std::mem::replace(&mut g, vec![0.0; d]);
                 loss::add_direction_gradient(&mut g, &f, length, &of_direction);
             }
@@ -404,9 +370,8 @@ struct View<'a> {
     evaluated: Evaluated,
     /// Seed of the halves of masks that are positives, where the loss has them.
     halves: Option<u64>,
-    of_gaussians: Option<GaussianTerms<'a>>,
-    /// Gradients of the columns' features from sampled pixels.
-    of_pixels: Option<Vec<f64>>,
+    /// Gradients of the columns' features `[columns][d]` from terms of single Gaussians and pixels.
+    to_columns: Vec<Vec<f64>>,
 }
 
 /// Gradients from one piece of columns: of the columns' features, and, per anchor, of what its Gaussians receive.
