@@ -7,19 +7,14 @@ use std::collections::BTreeMap;
 
 /// The inputs, but for the geometry, of which only training needs more than its hash.
 pub struct Inputs {
-    /// Anchors and neighbours.
     pub graph: Graph,
-    /// Blending weights of the masks.
     pub footprints: Footprints,
     /// Hashes of all inputs, by role.
     pub hashes: BTreeMap<String, String>,
 }
 
 impl Inputs {
-    /// Reads the files that `args` names.
-    ///
-    /// # Errors
-    /// When a file is missing or damaged, or they are not of one run.
+    /// Reads the files that `args` names, and refuses those that are not of one run.
     pub fn read(args: &Args) -> Result<Self> {
         let geometry = hash_file(&args.geometry)?;
         let (graph, graph_file) = Graph::read(&args.graph)?;
@@ -51,17 +46,4 @@ fn difference(footprints: &[u32], graph: &[u32]) -> Option<(String, String)> {
     }
     let at = footprints.iter().zip(graph).position(|(a, b)| a != b)?;
     Some((format!("Gaussian {} at position {at}", footprints[at]), format!("{}, as in the graph", graph[at])))
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn a_difference_names_what_differs() {
-        let said = |a: &[u32], b: &[u32]| difference(a, b).map(|(found, expected)| format!("{found} / {expected}"));
-        assert_eq!(said(&[1, 2], &[1, 2]), None);
-        assert_eq!(said(&[1, 2], &[1]).as_deref(), Some("2 Gaussians / 1, as in the graph"));
-        assert_eq!(said(&[1, 2, 4], &[1, 3, 4]).as_deref(), Some("Gaussian 2 at position 1 / 3, as in the graph"));
-    }
 }

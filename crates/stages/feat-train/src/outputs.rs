@@ -7,11 +7,9 @@ use std::path::Path;
 
 /// Features and what the record of the run says of them.
 pub struct Made {
-    /// Dimension.
     pub dim: usize,
     /// `[n][dim]`, in the order of the graph's kept Gaussians.
     pub values: Vec<f32>,
-    /// Figures of the result.
     pub summary: Value,
 }
 
@@ -19,9 +17,6 @@ pub struct Made {
 pub const CURVE: [&str; 2] = [".curve.jsonl", ".curve.svg"];
 
 /// Writes the curve of `out` as lines of JSON and as a picture.
-///
-/// # Errors
-/// When a file cannot be written.
 pub fn write_curve(out: &Path, points: impl Iterator<Item = Value>, panels: &[Panel]) -> Result<()> {
     let lines: Vec<String> = points.map(|p| p.to_string()).collect();
     let text: String = lines.iter().map(|l| format!("{l}\n")).collect();

@@ -4,17 +4,16 @@
 mod scene;
 
 #[test]
-fn views_of_the_benchmark_have_the_masks_that_they_promise() {
-    let s = scene::scene(60);
-    let views = s.views(&s.context(), 1);
-    assert!((60..=100).contains(&views[0].len()) && views[0].columns.len() > 60 * 60 / 6);
-}
-
-#[test]
 fn a_run_takes_about_the_memory_that_it_forecasts() {
-    let (s, folder) = (scene::scene(120), tempfile::tempdir().unwrap());
+    let folder = tempfile::tempdir().unwrap();
+    scene::write(120, 15, folder.path());
+    let footprints = artifacts::Footprints::read(folder.path().join("footprints.safetensors")).unwrap();
+    for view in footprints.rows.chunk_by(|a, b| a.view == b.view) {
+        assert!((60..=100).contains(&view.len()), "masks as the benchmark promises them");
+    }
+    assert!(footprints.csr().1.len() > 15 * 120 * 120 / 6);
     for options in [&["--dim", "64"][..], &["--preset", "paper", "--iterations", "20"]] {
-        let record = s.run(15, options, folder.path());
+        let record = scene::run(folder.path(), options);
         let forecast = record.memory_predicted_bytes.expect("feat-train forecasts its memory") as f64;
         let Some(peak) = record.peak_rss_bytes else { continue };
         let peak = peak as f64;

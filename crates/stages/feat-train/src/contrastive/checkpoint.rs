@@ -15,9 +15,6 @@ pub fn path(output: &Path) -> PathBuf {
 }
 
 /// Writes all that training needs to go on as if it had never stopped; `provenance` says which run it is of.
-///
-/// # Errors
-/// When the file cannot be written.
 pub fn write(path: &Path, provenance: &Provenance, state: &mut State) -> Result<()> {
     let curve: Vec<f64> =
         state.curve.iter().flat_map(|p| [p.iteration as f64, p.loss, p.alignment, p.separation, p.rate]).collect();

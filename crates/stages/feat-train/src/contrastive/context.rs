@@ -28,11 +28,9 @@ pub struct Context {
     pub neighbour_start: Vec<u32>,
     /// The neighbours: places in the training order, or anchors, by their kind.
     pub neighbours: Vec<u32>,
-    /// Kind of neighbours.
     pub kind: Neighbours,
     /// The reverse graph of anchors, for gradients: where the list of the anchors that have anchor a as a neighbour begins.
     pub reverse_start: Vec<u32>,
-    /// Those anchors.
     pub reverse: Vec<u32>,
 }
 
@@ -90,7 +88,6 @@ impl Context {
         Self { order, colors, anchors, source, served, neighbour_start, neighbours, kind, reverse_start, reverse }
     }
 
-    /// Neighbours of anchor `a`.
     #[inline]
     pub fn neighbours_of(&self, a: usize) -> &[u32] {
         &self.neighbours[self.neighbour_start[a] as usize..self.neighbour_start[a + 1] as usize]

@@ -41,21 +41,12 @@ impl MaskSet {
         (&self.mask[range.clone()], &self.weight[range])
     }
 
-    /// Number of masks.
     pub fn len(&self) -> usize {
         self.rows.len()
-    }
-
-    /// Whether there is no mask.
-    pub fn is_empty(&self) -> bool {
-        self.rows.is_empty()
     }
 }
 
 /// The mask sets of all views at the given levels, those with at least `least` masks that have a footprint.
-///
-/// # Errors
-/// When a view has more masks than 16 bits can number.
 pub fn mask_sets(footprints: &Footprints, context: &Context, levels: &[Level], least: usize) -> Result<Vec<MaskSet>> {
     let place = inverse(&context.order);
     let mut sets = Vec::new();
@@ -177,17 +168,14 @@ impl Pixels {
         out
     }
 
-    /// Number of pixels.
     pub fn len(&self) -> usize {
         self.mask.len()
     }
 
-    /// Whether there is none.
     pub fn is_empty(&self) -> bool {
         self.mask.is_empty()
     }
 
-    /// Columns and weights of pixel `p`.
     pub fn entries(&self, p: usize) -> impl Iterator<Item = (usize, f64)> + '_ {
         let range = self.start[p] as usize..self.start[p + 1] as usize;
         self.column[range.clone()].iter().zip(&self.weight[range]).map(|(&c, &w)| (c as usize, f64::from(w)))

@@ -6,67 +6,40 @@
 //! * [`engine`]: the same in f32, fast. [`solver`] takes the one that serves the options.
 //! * [`mod@train`]: the loop, on the [`state`], which [`checkpoint`] saves. [`adam`]: the optimiser.
 
-pub mod adam;
-pub mod alignment;
+mod adam;
+mod alignment;
 pub mod checkpoint;
-pub mod context;
-pub mod cross_view;
-pub mod engine;
-pub mod loss;
-pub mod masks;
-pub mod model;
-pub mod network;
-pub mod normalize;
-pub mod real;
-pub mod solver;
-pub mod state;
-pub mod terms;
+mod context;
+mod cross_view;
+mod engine;
+mod loss;
+mod masks;
+mod model;
+mod network;
+mod normalize;
+mod real;
+mod solver;
+mod state;
+mod terms;
 #[cfg(test)]
 mod testing;
-pub mod train;
+mod train;
 
 use crate::inputs::Inputs;
 use crate::options::Args;
-use crate::outputs::{Made, write_curve};
+use crate::outputs::Made;
 use context::Context;
 use gs_io::{Error, Result};
 use gs_scene::{Geometry, SH_C0};
 use masks::{MaskSet, mask_sets};
-use report::curve::Panel;
-use serde_json::json;
 use stage::Stage;
-use state::CurvePoint;
-use train::{Training, train};
-
-/// Panels of the curve.
-const TRAINING: [Panel; 4] = [
-    ("loss", "loss", "#1f77b4"),
-    ("alignment", "alignment: mean cosine of a mask's Gaussians with its centroid", "#2ca02c"),
-    ("separation", "separation: 1 - mean cosine of different masks", "#d62728"),
-    ("rate", "learning rate of features", "#7f7f7f"),
-];
+use train::train;
 
 /// Trains the features and writes their curve.
-///
-/// # Errors
-/// When an input does not fit, a file cannot be written, or the stage was interrupted.
 pub fn features(args: &Args, inputs: &Inputs, stage: &Stage) -> Result<Made> {
     let context = frozen_graph(args, inputs, stage)?;
     let sets = masks_to_learn_from(args, inputs, &context, stage)?;
-    let training =
-        Training { dim: args.options.trained_dim(), options: args.options.contrastive.clone(), seed: args.common.seed };
-    // A checkpoint serves runs of any number of iterations, as long as everything else is equal.
-    let mut parameters = args.options.parameters(args.common.seed);
-    parameters["contrastive"]["iterations"].take();
-    let provenance = stage.provenance("", 0, parameters, inputs.hashes.clone());
-    let path = checkpoint::path(&args.out);
-    let on_curve = |curve: &[CurvePoint]| write_curve(&args.out, curve.iter().map(|p| json!(p)), &TRAINING);
-    let trained = train(&context, &sets, &training, Some((&path, &provenance)), stage, on_curve)?;
-    let last = trained.curve.last().copied().unwrap_or_default();
-    let summary = json!({ "views": sets.len(), "last": last, "resumed_at": trained.resumed_at,
-        "iterations": trained.iterations, "gaussians": inputs.graph.kept.len(),
-        "network_bytes": trained.network_bytes });
-    Ok(Made { dim: training.dim, values: trained.features, summary })
+    train(args, inputs, &context, &sets, stage)
 }
 
 /// The graph with the colours and positions of its Gaussians.

@@ -466,35 +466,4 @@ mod tests {
         check(Contrastive { loss: Loss::Pixel, layers: 0, ..cohesive.clone() }, Gaussians, true);
         check(Contrastive { loss: Loss::Pixel, ..cohesive }, Anchors, true);
     }
-
-    #[test]
-    fn threads_do_not_change_a_bit() {
-        let context = context(20_000, Neighbours::Anchors, true);
-        let set = mask_set(&context, 30, 3);
-        assert!(set.pieces.len() > 4);
-        let with = |threads| {
-            let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
-            pool.install(|| {
-                let model = Model::<f32>::new(D, Contrastive::default(), &context, &mut ChaCha8Rng::seed_from_u64(1));
-                let propagated = model.propagate(&context);
-                (
-                    model.step(&context, &propagated, &set, 7, None),
-                    propagated.hat,
-                    model.alignment(&context, &Propagated::default(), &set),
-                )
-            })
-        };
-        assert!(with(1) == with(3));
-    }
-
-    #[test]
-    fn a_scene_of_one_color_has_no_noise() {
-        let mut context = context(64, Neighbours::Gaussians, true);
-        context.colors.fill([0.1, 0.7, 0.3]);
-        let mut model = Model::<f32>::new(D, Contrastive::default(), &context, &mut ChaCha8Rng::seed_from_u64(1));
-        model.features.fill(0.1);
-        let (h, sums) = model.inputs(&context);
-        assert!(h.iter().chain(&sums).all(|v| *v == 0.0));
-        assert!(model.propagate(&context).hat.iter().all(|v| *v == 0.0));
-    }
 }

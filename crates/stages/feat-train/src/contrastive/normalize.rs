@@ -16,7 +16,6 @@ const CHUNK: usize = 8192;
 /// Mean, deviation and its inverse.
 #[derive(Debug, Clone, Copy, Default, PartialEq)]
 pub struct Moments {
-    /// Mean.
     pub mean: f64,
     /// Unbiased standard deviation.
     pub deviation: f64,
@@ -51,7 +50,6 @@ impl Moments {
         Self::from_sums(pivot, s1, s2, count)
     }
 
-    /// Standardises a value.
     #[inline]
     pub fn apply(&self, v: f64) -> f64 {
         (v - self.mean) * self.inverse

@@ -12,15 +12,11 @@ use crate::options::Contrastive;
 
 /// One of the two, and what it found of the iteration under way.
 pub enum Solver<'a> {
-    /// The engine.
     Fast(Box<Engine<'a>>, Evaluated),
     /// The readable model; `dense` has room for gradients of all features.
     Plain {
-        /// The graph.
         context: &'a Context,
-        /// What the graph network made of the features.
         propagated: Propagated<f32>,
-        /// Loss and gradients.
         step: Step<f32>,
         /// All zeros but for the columns of the view at hand.
         dense: Vec<f32>,

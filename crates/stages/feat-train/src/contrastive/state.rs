@@ -5,24 +5,20 @@ use super::model::Model;
 
 /// Parameters, the optimiser's moments, and how training has gone so far.
 pub struct State {
-    /// Features and graph network.
     pub model: Model<f32>,
     /// Moments of the features.
     pub features: Adam<f32>,
     /// Moments of each layer's weights.
     pub layers: Vec<Adam<f32>>,
-    /// Iterations done.
     pub iteration: u64,
     /// Means for the next point of the curve.
     pub window: Window,
     /// The loss of held-out views.
     pub settled: Settled,
-    /// The curve so far.
     pub curve: Vec<CurvePoint>,
 }
 
 impl State {
-    /// Before the first iteration.
     pub fn new(model: Model<f32>) -> Self {
         Self {
             features: Adam::new(model.features.len()),
@@ -55,7 +51,6 @@ impl State {
 /// A point of the training curve.
 #[derive(Debug, Clone, Copy, Default, PartialEq, serde::Serialize)]
 pub struct CurvePoint {
-    /// Iterations done.
     pub iteration: u64,
     /// Mean loss since the point before.
     pub loss: f64,
@@ -70,16 +65,12 @@ pub struct CurvePoint {
 /// Sums since the last point of the curve.
 #[derive(Debug, Clone, Copy, Default, PartialEq)]
 pub struct Window {
-    /// Of losses.
     pub loss: f64,
-    /// Of separations.
     pub separation: f64,
-    /// Iterations.
     pub count: f64,
 }
 
 impl Window {
-    /// Adds an iteration.
     pub fn add(&mut self, loss: f64, separation: f64) {
         self.loss += loss;
         self.separation += separation;
@@ -101,9 +92,7 @@ const BETTER: f64 = 1e-3;
 /// Lowest loss of the held-out views, and how many looks ago it was.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Settled {
-    /// Lowest loss.
     pub lowest: f64,
-    /// Looks since.
     pub looks: f64,
 }
 

@@ -33,13 +33,11 @@ pub fn graph(n: usize, k: usize) -> Graph {
     }
 }
 
-/// Random colours.
 pub fn colors(n: usize) -> Vec<[f32; 3]> {
     let mut rng = ChaCha8Rng::seed_from_u64(9);
     (0..n).map(|_| std::array::from_fn(|_| rng.random_range(0.0..1.0))).collect()
 }
 
-/// The context of [`graph`].
 pub fn context(n: usize, kind: Neighbours, propagate: bool) -> Context {
     let positions: Vec<[f32; 3]> = (0..n).map(|i| [i as f32, 0.0, 0.0]).collect();
     Context::new(&graph(n, 3), &colors(n), &positions, kind, propagate)

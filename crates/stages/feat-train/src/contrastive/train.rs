@@ -6,13 +6,16 @@ use super::masks::MaskSet;
 use super::model::Model;
 use super::solver::Solver;
 use super::state::{CurvePoint, State};
-use crate::options::{Contrastive, Loss};
-use gs_io::{Error, Provenance, Result, mixed};
+use crate::inputs::Inputs;
+use crate::options::{Args, Loss};
+use crate::outputs::{Made, write_curve};
+use gs_io::{Error, Result, mixed};
 use rand::SeedableRng;
 use rand::seq::SliceRandom;
 use rand_chacha::ChaCha8Rng;
+use report::curve::Panel;
+use serde_json::json;
 use stage::Stage;
-use std::path::Path;
 
 /// Iterations between points of the curve: a point costs about an iteration, for the alignment of a view.
 const CURVE_EVERY: u64 = 50;
@@ -25,61 +28,36 @@ const MOST_HELD_OUT: usize = 16;
 /// Iterations between looks at them.
 const LOOK_EVERY: u64 = 250;
 
-/// How to train.
-#[derive(Debug, Clone, PartialEq)]
-pub struct Training {
-    /// Dimension of the features.
-    pub dim: usize,
-    /// Model, loss and schedule.
-    pub options: Contrastive,
-    /// Seed of the first features and weights, and of the order of views.
-    pub seed: u64,
-}
+/// Panels of the curve.
+const PANELS: [Panel; 4] = [
+    ("loss", "loss", "#1f77b4"),
+    ("alignment", "alignment: mean cosine of a mask's Gaussians with its centroid", "#2ca02c"),
+    ("separation", "separation: 1 - mean cosine of different masks", "#d62728"),
+    ("rate", "learning rate of features", "#7f7f7f"),
+];
 
-/// What training gives.
-#[derive(Debug, Clone, PartialEq)]
-pub struct Trained {
-    /// f_final `[n][d]`, in the order of `kept`.
-    pub features: Vec<f32>,
-    /// The curve.
-    pub curve: Vec<CurvePoint>,
-    /// Iteration of the checkpoint it continued from.
-    pub resumed_at: u64,
-    /// Iterations done: fewer than asked for when it stopped early.
-    pub iterations: u64,
-    /// Bytes that the graph network took; none where the readable model trained, which keeps no account.
-    pub network_bytes: Option<usize>,
-}
-
-/// Trains on `sets`, each with at least two masks. `checkpoint`: where checkpoints lie, and what one of this very run
-/// says of itself. `on_curve` is called with the whole curve at each checkpoint and at the end.
-///
-/// # Errors
-/// When the loss is not finite, a checkpoint cannot be written, or the stage was interrupted (after a last checkpoint).
-pub fn train(
-    context: &Context,
-    sets: &[MaskSet],
-    training: &Training,
-    checkpoint: Option<(&Path, &Provenance)>,
-    stage: &Stage,
-    on_curve: impl Fn(&[CurvePoint]) -> Result<()>,
-) -> Result<Trained> {
-    let Training { dim, options, seed } = training;
-    let mut rng = ChaCha8Rng::seed_from_u64(*seed);
-    let mut state = State::new(Model::new(*dim, options.clone(), context, &mut rng));
-    if let Some((path, provenance)) = checkpoint {
-        checkpoint::resume(&mut state, path, provenance, options.iterations, stage);
-    }
+/// Trains on `sets`, with checkpoints beside the output, and writes the curve at each of them and at the end.
+pub fn train(args: &Args, inputs: &Inputs, context: &Context, sets: &[MaskSet], stage: &Stage) -> Result<Made> {
+    let (options, seed, dim) = (&args.options.contrastive, args.common.seed, args.options.trained_dim());
+    let mut rng = ChaCha8Rng::seed_from_u64(seed);
+    let mut state = State::new(Model::new(dim, options.clone(), context, &mut rng));
+    // A checkpoint serves runs of any number of iterations, as long as everything else is equal.
+    let mut parameters = args.options.parameters(seed);
+    parameters["contrastive"]["iterations"].take();
+    let provenance = stage.provenance("", 0, parameters, inputs.hashes.clone());
+    let path = checkpoint::path(&args.out);
+    checkpoint::resume(&mut state, &path, &provenance, options.iterations, stage);
+    let draw = |curve: &[CurvePoint]| write_curve(&args.out, curve.iter().map(|p| json!(p)), &PANELS);
     let resumed_at = state.iteration;
     let mut solver = Solver::new(context, &state.model);
-    let (held_out, sets) = hold_out(sets, options.early_stop, stage);
-    let mut views = Views { count: sets.len() as u64, seed: *seed, epoch: u64::MAX, order: Vec::new() };
+    let (held_out, seen) = hold_out(sets, options.early_stop, stage);
+    let mut order = Views { count: seen.len() as u64, seed, epoch: u64::MAX, order: Vec::new() };
     let mut progress = stage.progress("iterations", options.iterations).resumed_at(resumed_at);
     while state.iteration < options.iterations {
-        let set = sets[views.at(state.iteration)];
+        let set = seen[order.at(state.iteration)];
         let noise = mixed(seed ^ mixed(state.iteration));
         // Another view to take positives from, for the loss that asks for them.
-        let other = sets[(mixed(noise) % sets.len() as u64) as usize];
+        let other = seen[(mixed(noise) % seen.len() as u64) as usize];
         let beside = (options.loss == Loss::CrossView && !std::ptr::eq(other, set)).then_some(other);
         let [loss, separation] = solver.forward(&state.model, set, beside, noise);
         if !loss.is_finite() {
@@ -99,12 +77,9 @@ pub fn train(
             && !held_out.is_empty()
             && state.settled.look(solver.mean_loss(&state.model, &held_out));
         let (unfinished, interrupted) = (state.iteration < options.iterations, stage.interrupted());
-        if let Some((path, provenance)) = checkpoint
-            && unfinished
-            && (interrupted || state.iteration.is_multiple_of(CHECKPOINT_EVERY))
-        {
-            checkpoint::write(path, provenance, &mut state)?;
-            on_curve(&state.curve)?;
+        if unfinished && (interrupted || state.iteration.is_multiple_of(CHECKPOINT_EVERY)) {
+            checkpoint::write(&path, &provenance, &mut state)?;
+            draw(&state.curve)?;
         }
         if interrupted && unfinished {
             stage.go_on()?;
@@ -120,10 +95,10 @@ pub fn train(
     }
     let last = state.curve.last().copied().unwrap_or_default();
     progress.finish(&[("loss", last.loss), ("alignment", last.alignment), ("separation", last.separation)]);
-    on_curve(&state.curve)?;
-    let features = solver.final_features(&state.model);
-    let network_bytes = solver.network_bytes();
-    Ok(Trained { features, curve: state.curve, resumed_at, iterations: state.iteration, network_bytes })
+    draw(&state.curve)?;
+    let summary = json!({ "views": sets.len(), "last": last, "resumed_at": resumed_at, "iterations": state.iteration,
+        "gaussians": inputs.graph.kept.len(), "network_bytes": solver.network_bytes() });
+    Ok(Made { dim, values: solver.final_features(&state.model), summary })
 }
 
 /// The sets that are held out and those that are learnt from.
@@ -146,7 +121,6 @@ struct Views {
 }
 
 impl Views {
-    /// The view of an iteration.
     fn at(&mut self, iteration: u64) -> usize {
         let epoch = iteration / self.count;
         if epoch != self.epoch {

@@ -136,7 +136,6 @@ fn patches(n: usize, neighbours: &Neighbours<'_>) -> Vec<Vec<u32>> {
     out
 }
 
-/// Room for a task that makes blocks.
 struct Scratch {
     /// Where each Gaussian's row is in the block's copy.
     place: Vec<u32>,

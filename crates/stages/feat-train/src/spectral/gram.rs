@@ -147,7 +147,6 @@ impl Gram {
         Self { start, mask, value }
     }
 
-    /// Number of entries.
     pub fn entries(&self) -> usize {
         self.mask.len()
     }

@@ -22,13 +22,9 @@ use stage::Stage;
 use std::time::Instant;
 use vectors::{SpectralOptions, spectral};
 
-/// The curve's only panel.
 const SPECTRUM: [Panel; 1] = [("singular_value", "singular values", "#1f77b4")];
 
 /// Computes the features and writes their spectrum as the curve.
-///
-/// # Errors
-/// When no mask has a footprint, the curve cannot be written, or the stage was interrupted.
 pub fn features(args: &Args, inputs: &Inputs, stage: &Stage) -> Result<Made> {
     let clock = Instant::now();
     let levels = args.options.levels();

@@ -17,7 +17,6 @@ pub struct Block {
     pub start: Vec<usize>,
     /// Mask of each entry, as an index into `masks`, ascending within a row.
     pub mask: Vec<u32>,
-    /// Value of each entry.
     pub value: Vec<f32>,
 }
 
@@ -89,7 +88,6 @@ pub struct Matrix {
 }
 
 impl Matrix {
-    /// Entries that are stored.
     pub fn entries(&self) -> usize {
         self.blocks.iter().map(|b| b.mask.len()).sum()
     }

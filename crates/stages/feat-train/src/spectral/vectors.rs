@@ -50,7 +50,6 @@ pub struct SpectralOptions {
     pub auto: bool,
     /// Singular value c at which a vector's scale is a half.
     pub cutoff: f64,
-    /// Seed of the starting vectors.
     pub seed: u64,
 }
 
@@ -64,7 +63,6 @@ impl SpectralOptions {
 /// Features of all Gaussians.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Spectral {
-    /// Dimension.
     pub dim: usize,
     /// `[n][dim]`, of unit length, or zero for Gaussians in no mask.
     pub features: Vec<f32>,
@@ -78,10 +76,6 @@ pub struct Spectral {
     pub gram_entries: Option<usize>,
 }
 
-/// Computes the features.
-///
-/// # Errors
-/// When there is no evidence, or the stage was interrupted.
 pub fn spectral(matrix: &Matrix, options: &SpectralOptions, stage: &Stage) -> Result<Spectral> {
     let gram = Gram::new(matrix, GRAM_ENTRIES.0 * matrix.entries() + GRAM_ENTRIES.1);
     let product = gram.as_ref().map_or(Product::Factors(matrix), Product::Formed);

@@ -292,7 +292,6 @@ pub fn columns_backward<const D: usize>(
     }
 }
 
-/// One step of Adam.
 #[multiversion(targets("x86_64+avx512f+avx512vl", "x86_64+avx2"))]
 pub fn adam(p: &mut [f32], m: &mut [f32], v: &mut [f32], g: &[f32], rates: &Rates) {
     for (((p, m), v), &g) in p.iter_mut().zip(m).zip(v).zip(g) {

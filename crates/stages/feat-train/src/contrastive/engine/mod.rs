@@ -117,9 +117,6 @@ impl<'a> Engine<'a> {
     }
 
     /// For training `model` on `context`.
-    ///
-    /// # Panics
-    /// When the engine does not serve the model's options.
     pub fn new(context: &'a Context, model: &Model<f32>) -> Self {
         assert!(Self::serves(&model.options), "options of the readable model only");
         let d = model.dim;
@@ -171,7 +168,6 @@ impl<'a> Engine<'a> {
         });
     }
 
-    /// Runs the graph network.
     pub fn propagate(&mut self, model: &Model<f32>) {
         if model.layers.is_empty() {
             return;
