@@ -1,6 +1,7 @@
-//! Checks that several artifacts share.
+//! What readers and writers of several artifacts share.
 
 use gs_io::{Artifact, Error, Result};
+use std::fmt::Display;
 
 /// Names of the views (file stems) that an artifact speaks of.
 pub(crate) fn view_names(a: &Artifact) -> Result<Vec<String>> {
@@ -8,28 +9,45 @@ pub(crate) fn view_names(a: &Artifact) -> Result<Vec<String>> {
         .map_err(|e| Error::new(format!("no list of view names: {e}")).file(a.path()).field("views"))
 }
 
-/// Checks that every index of tensor `name` is below `limit`.
-pub(crate) fn below(a: &Artifact, name: &str, indices: &[u32], limit: usize) -> Result<()> {
-    match indices.iter().position(|&i| i as usize >= limit) {
+/// Refuses tensor `name` where one of its values is not `good`, as a function of its position and itself.
+pub(crate) fn check<T: Copy + Display>(
+    a: &Artifact,
+    name: &str,
+    values: &[T],
+    good: impl Fn(usize, T) -> bool,
+    wrong: &str,
+    expected: impl Fn(usize) -> String,
+) -> Result<()> {
+    match (0..values.len()).find(|&i| !good(i, values[i])) {
         None => Ok(()),
-        Some(at) => Err(Error::new("index out of range")
+        Some(at) => Err(Error::new(wrong)
             .file(a.path())
             .field(format!("{name}[{at}]"))
-            .found(indices[at])
-            .expected(format!("below {limit}"))
+            .found(values[at])
+            .expected(expected(at))
             .hint("run the stage that makes it again")),
     }
+}
+
+/// Checks that every index of tensor `name` is below `limit`.
+pub(crate) fn below(a: &Artifact, name: &str, indices: &[u32], limit: usize) -> Result<()> {
+    check(a, name, indices, |_, i| (i as usize) < limit, "index out of range", |_| format!("below {limit}"))
 }
 
 /// Checks that `kept` ascends and stays below `total` (where known: `usize::MAX` otherwise).
 pub(crate) fn check_kept(a: &Artifact, kept: &[u32], total: usize) -> Result<()> {
     below(a, "kept", kept, total)?;
-    match kept.windows(2).position(|w| w[0] >= w[1]) {
-        None => Ok(()),
-        Some(at) => Err(Error::new("indices do not ascend")
-            .file(a.path())
-            .field(format!("kept[{}]", at + 1))
-            .found(kept[at + 1])
-            .expected(format!("more than {}", kept[at]))),
-    }
+    let ascends = |at: usize, k| at == 0 || kept[at - 1] < k;
+    check(a, "kept", kept, ascends, "indices do not ascend", |at| format!("more than {}", kept[at - 1]))
+}
+
+/// Checks that labels are instances, or -1.
+pub(crate) fn check_labels(a: &Artifact, name: &str, labels: &[i32], instances: usize) -> Result<()> {
+    let good = |_, l| (-1..instances as i64).contains(&i64::from(l));
+    check(a, name, labels, good, "index out of range", |_| format!("-1 to {}", instances as i64 - 1))
+}
+
+/// One field of all rows of a table, as a tensor.
+pub(crate) fn column<S, T>(all: &[S], field: impl Fn(&S) -> T) -> Vec<T> {
+    all.iter().map(field).collect()
 }

@@ -1,7 +1,7 @@
 //! `footprints.safetensors`: which Gaussians make up which mask.
 
 use crate::ScratchEntries;
-use crate::checks::{below, check_kept, view_names};
+use crate::checks::{below, check, check_kept, column, view_names};
 use gs_io::{Artifact, ArtifactWriter, Error, Provenance, Result};
 use serde_json::json;
 use std::path::Path;
@@ -65,9 +65,8 @@ impl PixelSamples {
         below(a, "pixel_col", &col, kept)?;
         check_pointers(a, "pixel_ptr", &ptr, col.len())?;
         check_weights(a, "pixel_weight", &weight)?;
-        if row.windows(2).any(|w| w[0] > w[1]) {
-            return Err(Error::new("does not ascend").file(a.path()).field("pixel_row"));
-        }
+        let expected = |at: usize| format!("{} or more", row[at - 1]);
+        check(a, "pixel_row", &row, |at, r| at == 0 || row[at - 1] <= r, "does not ascend", expected)?;
         Ok(Self { row, ptr, col, weight })
     }
 
@@ -94,10 +93,7 @@ fn check_pointers(a: &Artifact, name: &str, ptr: &[u64], entries: usize) -> Resu
 }
 
 fn check_weights(a: &Artifact, name: &str, weight: &[f32]) -> Result<()> {
-    match weight.iter().position(|w| !w.is_finite() || *w < 0.0) {
-        Some(at) => Err(Error::new("not a weight").file(a.path()).field(format!("{name}[{at}]")).found(weight[at])),
-        None => Ok(()),
-    }
+    check(a, name, weight, |_, w| w.is_finite() && w >= 0.0, "not a weight", |_| "0 or more".into())
 }
 
 /// Footprints while they are computed.
@@ -120,79 +116,65 @@ pub struct FootprintsBuilder {
 }
 
 impl FootprintsBuilder {
+    /// Adds a mask with its entries: positions in `kept`, ascending, and weights.
+    pub fn push(&mut self, row: Row, entries: impl IntoIterator<Item = (u32, f32)>) {
+        if self.row_ptr.is_empty() {
+            self.row_ptr.push(0);
+        }
+        for (col, weight) in entries {
+            self.col.push(col);
+            self.weight.push(weight);
+        }
+        self.row_ptr.push(self.col.len() as u64);
+        self.rows.push(row);
+    }
+
     /// Writes the artifact.
     ///
     /// # Errors
-    /// When the file cannot be written.
+    /// When a file cannot be written.
     pub fn write(&self, path: impl AsRef<Path>, provenance: Provenance) -> Result<()> {
-        let rows = Columns::of(&self.rows);
-        self.writer(&rows, provenance)
-            .tensor("col", &[self.col.len()], &self.col)
-            .tensor("weight", &[self.weight.len()], &self.weight)
-            .write(path)
+        let mut entries = ScratchEntries::beside(path.as_ref())?;
+        self.col.iter().zip(&self.weight).try_for_each(|(&col, &weight)| entries.push(col, weight))?;
+        self.write_with(entries, path, provenance)
     }
 
     /// [`FootprintsBuilder::write`] with the entries of all rows from scratch files; `col` and `weight` are ignored.
     ///
     /// # Errors
     /// When a file cannot be read or written.
-    pub fn write_with(&self, entries: ScratchEntries, path: impl AsRef<Path>, provenance: Provenance) -> Result<()> {
-        let count = entries.count as usize;
-        let (col, weight) = entries.finish()?;
-        let rows = Columns::of(&self.rows);
-        self.writer(&rows, provenance)
-            .tensor_from_file::<u32>("col", &[count], col)
-            .tensor_from_file::<f32>("weight", &[count], weight)
-            .write(path)
-    }
-
-    /// All but the entries.
-    fn writer<'a>(&'a self, rows: &'a Columns, mut provenance: Provenance) -> ArtifactWriter<'a> {
+    pub fn write_with(
+        &self,
+        entries: ScratchEntries,
+        path: impl AsRef<Path>,
+        mut provenance: Provenance,
+    ) -> Result<()> {
         provenance.format = Footprints::FORMAT.into();
         provenance.version = Footprints::VERSION;
         provenance.extra = json!({ "views": self.views });
-        let r = self.rows.len();
         let mut writer = ArtifactWriter::new(provenance);
-        if !self.pixels.is_empty() {
-            let p = &self.pixels;
+        let (r, p, rows) = (self.rows.len(), &self.pixels, &self.rows);
+        if !p.is_empty() {
             writer = writer
                 .tensor("pixel_row", &[p.row.len()], &p.row)
                 .tensor("pixel_ptr", &[p.ptr.len()], &p.ptr)
                 .tensor("pixel_col", &[p.col.len()], &p.col)
                 .tensor("pixel_weight", &[p.weight.len()], &p.weight);
         }
+        let count = entries.count as usize;
+        let (col, weight) = entries.finish()?;
         writer
             .tensor("kept", &[self.kept.len()], &self.kept)
-            .tensor("row_view", &[r], &rows.view)
-            .tensor("row_level", &[r], &rows.level)
-            .tensor("row_mask", &[r], &rows.mask)
-            .tensor("row_pixels", &[r], &rows.pixels)
-            .tensor("row_gated", &[r], &rows.gated)
-            .tensor("row_alpha", &[r], &rows.alpha)
+            .tensor("row_view", &[r], &column(rows, |r| r.view))
+            .tensor("row_level", &[r], &column(rows, |r| r.level))
+            .tensor("row_mask", &[r], &column(rows, |r| r.mask))
+            .tensor("row_pixels", &[r], &column(rows, |r| r.pixels))
+            .tensor("row_gated", &[r], &column(rows, |r| r.gated))
+            .tensor("row_alpha", &[r], &column(rows, |r| r.alpha))
             .tensor("row_ptr", &[r + 1], &self.row_ptr)
-    }
-}
-
-/// The rows, a field at a time.
-struct Columns {
-    view: Vec<u32>,
-    level: Vec<u32>,
-    mask: Vec<u32>,
-    pixels: Vec<u32>,
-    gated: Vec<u32>,
-    alpha: Vec<f32>,
-}
-
-impl Columns {
-    fn of(rows: &[Row]) -> Self {
-        Self {
-            view: rows.iter().map(|r| r.view).collect(),
-            level: rows.iter().map(|r| r.level).collect(),
-            mask: rows.iter().map(|r| r.mask).collect(),
-            pixels: rows.iter().map(|r| r.pixels).collect(),
-            gated: rows.iter().map(|r| r.gated).collect(),
-            alpha: rows.iter().map(|r| r.alpha).collect(),
-        }
+            .tensor_from_file::<u32>("col", &[count], col)
+            .tensor_from_file::<f32>("weight", &[count], weight)
+            .write(path)
     }
 }
 
@@ -210,23 +192,17 @@ impl Footprints {
         let kept = a.tensor::<u32>("kept", &[None])?.to_vec();
         check_kept(&a, &kept, usize::MAX)?;
         let views = view_names(&a)?;
-        let row_view = a.tensor::<u32>("row_view", &[None])?;
-        let r = row_view.len();
+        let view = a.tensor::<u32>("row_view", &[None])?;
+        let r = view.len();
         let column = |name: &str| a.tensor::<u32>(name, &[Some(r)]);
         let (level, mask) = (column("row_level")?, column("row_mask")?);
         let (pixels, gated) = (column("row_pixels")?, column("row_gated")?);
         let alpha = a.tensor::<f32>("row_alpha", &[Some(r)])?;
-        let rows: Vec<Row> = (0..r)
-            .map(|i| Row {
-                view: row_view[i],
-                level: level[i],
-                mask: mask[i],
-                pixels: pixels[i],
-                gated: gated[i],
-                alpha: alpha[i],
-            })
-            .collect();
-        below(&a, "row_view", row_view, views.len())?;
+        let (facts, areas) = (view.iter().zip(level).zip(mask), pixels.iter().zip(gated).zip(alpha));
+        let row =
+            |(((&view, &level), &mask), ((&pixels, &gated), &alpha))| Row { view, level, mask, pixels, gated, alpha };
+        let rows: Vec<Row> = facts.zip(areas).map(row).collect();
+        below(&a, "row_view", view, views.len())?;
         below(&a, "row_level", level, crate::LEVELS)?;
         let row_ptr = a.tensor::<u64>("row_ptr", &[Some(r + 1)])?.to_vec();
         let col = a.tensor::<u32>("col", &[None])?;
@@ -267,15 +243,10 @@ mod tests {
         let dir = tempfile::tempdir().unwrap();
         let p = dir.path().join("f.safetensors");
         let row = |mask| Row { view: 0, level: 3, mask, pixels: 9, gated: 8, alpha: 0.9 };
-        let mut b = FootprintsBuilder {
-            views: vec!["frame_00001".into()],
-            kept: vec![1, 4, 6],
-            rows: vec![row(0), row(5)],
-            row_ptr: vec![0, 2, 3],
-            col: vec![0, 2, 1],
-            weight: vec![1.0, 2.0, 3.0],
-            ..FootprintsBuilder::default()
-        };
+        let (views, kept) = (vec!["frame_00001".into()], vec![1, 4, 6]);
+        let mut b = FootprintsBuilder { views, kept, ..FootprintsBuilder::default() };
+        b.push(row(0), [(0, 1.0), (2, 2.0)]);
+        b.push(row(5), [(1, 3.0)]);
         b.write(&p, Provenance::default()).unwrap();
         let f = Footprints::read(&p).unwrap();
         assert_eq!(f.rows, b.rows);

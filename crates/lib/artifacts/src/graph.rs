@@ -1,7 +1,6 @@
 //! `graph.safetensors`: anchors and neighbours.
 
 use crate::checks::{below, check_kept};
-use crate::role;
 use gs_io::{Artifact, ArtifactWriter, Provenance, Result};
 use std::path::Path;
 
@@ -88,10 +87,5 @@ impl Graph {
         below(&a, "nearest_anchor", &graph.nearest_anchor, m)?;
         below(&a, "gaussian_knn", &graph.gaussian_knn, n)?;
         Ok((graph, a))
-    }
-
-    /// The hash of the geometry this graph belongs to.
-    pub fn geometry_hash(artifact: &Artifact) -> &str {
-        artifact.provenance().inputs.get(role::GEOMETRY).map_or("", String::as_str)
     }
 }

@@ -1,7 +1,7 @@
 //! `instances.safetensors`: the 3D instances with their descriptors, boxes and matches.
 
-use crate::checks::{below, view_names};
-use gs_io::{Artifact, ArtifactWriter, Error, Provenance, Result};
+use crate::checks::{below, check, check_labels, column, view_names};
+use gs_io::{Artifact, ArtifactWriter, Provenance, Result};
 use serde_json::json;
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::Path;
@@ -190,9 +190,6 @@ impl Instances {
         provenance.version = Self::VERSION;
         provenance.extra = json!({ "views": self.views });
         let (k, m, t) = (self.len(), self.matches.len(), self.tree.len());
-        fn column<S, T>(all: &[S], f: impl Fn(&S) -> T) -> Vec<T> {
-            all.iter().map(f).collect()
-        }
         let center = column(&self.oriented, |b| b.center);
         let axes = column(&self.oriented, |b| b.axes);
         let half = column(&self.oriented, |b| b.half_size);
@@ -259,18 +256,6 @@ impl Instances {
     }
 }
 
-/// Checks that labels are instances, or -1.
-fn check_labels(a: &Artifact, name: &str, labels: &[i32], instances: usize) -> Result<()> {
-    match labels.iter().position(|&l| l < -1 || l >= instances as i32) {
-        None => Ok(()),
-        Some(at) => Err(Error::new("index out of range")
-            .file(a.path())
-            .field(format!("{name}[{at}]"))
-            .found(labels[at])
-            .expected(format!("-1 to {}", instances as i64 - 1))),
-    }
-}
-
 fn read_matches(a: &Artifact, instances: usize, views: usize) -> Result<Vec<Match>> {
     let instance = a.tensor::<u32>("match_instance", &[None])?;
     let m = Some(instance.len());
@@ -288,14 +273,8 @@ fn read_tree(a: &Artifact, instances: usize) -> Result<Vec<TreeEdge>> {
     let (child, size) = (a.tensor::<u32>("tree_child", &[t])?, a.tensor::<u32>("tree_size", &[t])?);
     let (lambda, instance) = (a.tensor::<f32>("tree_lambda", &[t])?, a.tensor::<i32>("tree_instance", &[t])?);
     check_labels(a, "tree_instance", instance, instances)?;
-    if let Some(at) = (0..parent.len()).find(|&i| child[i] <= parent[i]) {
-        return Err(Error::new("the tree of clusters is damaged")
-            .file(a.path())
-            .field(format!("tree_child[{at}]"))
-            .found(child[at])
-            .expected(format!("more than its parent {}", parent[at]))
-            .hint("run cluster-match again"));
-    }
+    let expected = |at: usize| format!("more than its parent {}", parent[at]);
+    check(a, "tree_child", child, |at, c| c > parent[at], "the tree of clusters is damaged", expected)?;
     let edge =
         |i| TreeEdge { parent: parent[i], child: child[i], lambda: lambda[i], size: size[i], instance: instance[i] };
     Ok((0..parent.len()).map(edge).collect())
