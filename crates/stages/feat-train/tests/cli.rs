@@ -12,24 +12,27 @@ use std::time::{Duration, Instant};
 const N: usize = 120;
 const VIEWS: usize = 12;
 
-fn inputs(dir: &Path) {
-    let g = Gaussians {
+fn gaussians() -> Gaussians {
+    Gaussians {
         means: (0..N).map(|i| [i as f32, 0.0, 0.0]).collect(),
         log_scales: vec![[0.0; 3]; N],
         rotations: vec![[1.0, 0.0, 0.0, 0.0]; N],
         opacity_logits: vec![2.0; N],
         sh: (0..3 * N).map(|i| ((i * 7) % 5) as f32 * 0.2).collect(),
         sh_degree: 0,
-    };
+    }
+}
+
+fn write(dir: &Path, gaussians: &Gaussians, graph: &Graph) {
     let geometry = dir.join("geometry.ply");
-    ply::write_gaussians(&geometry, &g, &[]).unwrap();
+    ply::write_gaussians(&geometry, gaussians, &[]).unwrap();
     let inputs = BTreeMap::from([
         (role::GEOMETRY.to_string(), hash_file(&geometry).unwrap()),
         (role::MASKS.to_string(), "ab".repeat(32)),
     ]);
-    let provenance = || Provenance { inputs: inputs.clone(), ..Provenance::default() };
-    graph().write(dir.join("graph.safetensors"), provenance()).unwrap();
-    footprints().write(dir.join("footprints.safetensors"), provenance()).unwrap();
+    let provenance = Provenance { inputs, ..Provenance::default() };
+    graph.write(dir.join("graph.safetensors"), provenance.clone()).unwrap();
+    footprints().write(dir.join("footprints.safetensors"), provenance).unwrap();
 }
 
 fn graph() -> Graph {
@@ -56,16 +59,11 @@ fn graph() -> Graph {
 
 fn footprints() -> FootprintsBuilder {
     let pixels = PixelSamples { ptr: vec![0], ..PixelSamples::default() };
-    let mut f =
-        FootprintsBuilder { kept: (0..N as u32).collect(), row_ptr: vec![0], pixels, ..FootprintsBuilder::default() };
+    let mut f = FootprintsBuilder { kept: (0..N as u32).collect(), pixels, ..FootprintsBuilder::default() };
     for v in 0..VIEWS {
         f.views.push(format!("v{v}"));
         let cuts: &[u32] = if v % 3 == 0 { &[0, 40, 60, 80, 120] } else { &[0, 40, 80, 120] };
         for (k, w) in cuts.windows(2).enumerate() {
-            f.col.extend(w[0]..w[1]);
-            f.weight.extend((w[0]..w[1]).map(|i| 1.0 + (i % 3) as f32));
-            f.row_ptr.push(f.col.len() as u64);
-            let row = Row { view: v as u32, level: 3, mask: k as u32, pixels: 100, gated: 90, alpha: 0.9 };
             // Four pixels of each mask, each showing three Gaussians.
             for first in (w[0]..w[1] - 3).step_by(((w[1] - w[0]) / 4) as usize).take(4) {
                 f.pixels.row.push(f.rows.len() as u32);
@@ -73,7 +71,8 @@ fn footprints() -> FootprintsBuilder {
                 f.pixels.weight.extend([0.5, 0.2, 0.1]);
                 f.pixels.ptr.push(f.pixels.col.len() as u64);
             }
-            f.rows.push(row);
+            let row = Row { view: v as u32, level: 3, mask: k as u32, pixels: 100, gated: 90, alpha: 0.9 };
+            f.push(row, (w[0]..w[1]).map(|i| (i, 1.0 + (i % 3) as f32)));
         }
     }
     f
@@ -105,7 +104,7 @@ fn beside(out: &Path, suffix: &str) -> PathBuf {
 
 fn setup() -> (tempfile::TempDir, PathBuf) {
     let dir = tempfile::tempdir().unwrap();
-    inputs(dir.path());
+    write(dir.path(), &gaussians(), &graph());
     let out = dir.path().join("features.safetensors");
     (dir, out)
 }
@@ -118,21 +117,10 @@ fn damaged_gaussians_change_nothing() {
     succeed(dir.path(), &out, &options);
     let values = || Features::read(&out).unwrap().0.values;
     let before = values();
-    let geometry = dir.path().join("geometry.ply");
-    let mut g = ply::read_gaussians(&geometry).unwrap();
     let rows: Vec<u32> = (0..N as u32).chain([0, 1]).collect();
-    g = g.select(&rows);
+    let mut g = gaussians().select(&rows);
     (g.sh[3 * N], g.means[N + 1][2]) = (f32::NAN, f32::INFINITY);
-    ply::write_gaussians(&geometry, &g, &[]).unwrap();
-    let inputs = BTreeMap::from([
-        (role::GEOMETRY.to_string(), hash_file(&geometry).unwrap()),
-        (role::MASKS.to_string(), "ab".repeat(32)),
-    ]);
-    let provenance = || Provenance { inputs: inputs.clone(), ..Provenance::default() };
-    let unseen = |values: Vec<f32>| values.into_iter().chain([0.0; 2]).collect();
-    let graph = Graph { seen_views: vec![1; N + 2], seen_weight: unseen(vec![1.0; N]), ..graph() };
-    graph.write(dir.path().join("graph.safetensors"), provenance()).unwrap();
-    footprints().write(dir.path().join("footprints.safetensors"), provenance()).unwrap();
+    write(dir.path(), &g, &Graph { seen_views: vec![1; N + 2], seen_weight: vec![1.0; N + 2], ..graph() });
     let output = run(dir.path(), &out, &options);
     let said = String::from_utf8_lossy(&output.stderr);
     assert!(output.status.success() && said.contains("skipped 2 of 122 Gaussians: damaged"), "{said}");
@@ -210,35 +198,41 @@ fn every_row_of_the_ablation_tables_trains() {
     assert_eq!((outputs.len(), distinct.len()), (13, 13 - 2));
 }
 
+/// Killed at once, or interrupted, after which it writes a last checkpoint.
 #[test]
-fn a_killed_run_continues_to_the_same_bytes() {
+fn a_stopped_run_continues_to_the_same_bytes() {
     let (dir, out) = setup();
     let args = ["--preset", "paper", "--iterations", "6000"];
     let whole = succeed(dir.path(), &out, &args);
     let curve = std::fs::read(beside(&out, ".curve.jsonl")).unwrap();
-    std::fs::remove_file(&out).unwrap();
     let checkpoint = beside(&out, ".checkpoint");
-    let mut child = command(dir.path(), &out, &args).stderr(Stdio::null()).spawn().unwrap();
-    let started = Instant::now();
-    while !checkpoint.exists() {
-        assert!(started.elapsed() < Duration::from_secs(60), "no checkpoint comes");
-        std::thread::sleep(Duration::from_millis(2));
+    let says = |word: &str| {
+        let output = run(dir.path(), &out, &args);
+        let said = String::from_utf8_lossy(&output.stderr);
+        assert!(said.contains(word), "{said}");
+        assert!(whole == std::fs::read(&out).unwrap());
+        assert!(curve == std::fs::read(beside(&out, ".curve.jsonl")).unwrap());
+    };
+    let mut unfinished = Vec::new();
+    for (signal, code) in [("-KILL", None), ("-TERM", Some(130))] {
+        std::fs::remove_file(&out).unwrap();
+        let mut child = command(dir.path(), &out, &args).stderr(Stdio::null()).spawn().unwrap();
+        let started = Instant::now();
+        while !checkpoint.exists() {
+            assert!(started.elapsed() < Duration::from_secs(60), "no checkpoint comes");
+            std::thread::sleep(Duration::from_millis(2));
+        }
+        assert!(Command::new("kill").args([signal, &child.id().to_string()]).status().unwrap().success());
+        assert_eq!(child.wait().unwrap().code(), code);
+        assert!(!out.exists(), "the run ended before it could be stopped");
+        unfinished = std::fs::read(&checkpoint).unwrap();
+        says("continuing from iteration");
     }
-    child.kill().unwrap();
-    child.wait().unwrap();
-    assert!(!out.exists(), "the run ended before it could be killed");
-    let mut unfinished = std::fs::read(&checkpoint).unwrap();
-    let output = run(dir.path(), &out, &args);
-    assert!(String::from_utf8_lossy(&output.stderr).contains("continuing from iteration"));
-    assert!(whole == std::fs::read(&out).unwrap());
-    assert!(curve == std::fs::read(beside(&out, ".curve.jsonl")).unwrap());
-    // A checkpoint of other parameters is not used, nor is a damaged one.
+    // A damaged checkpoint is not used.
     let middle = unfinished.len() / 2;
     unfinished[middle] ^= 1;
     std::fs::write(&checkpoint, &unfinished).unwrap();
-    let output = run(dir.path(), &out, &args);
-    assert!(String::from_utf8_lossy(&output.stderr).contains("starting anew"));
-    assert!(whole == std::fs::read(&out).unwrap());
+    says("starting anew");
 }
 
 #[test]
@@ -255,18 +249,6 @@ fn training_stops_early_when_held_out_views_have_settled() {
     let done = done.to_string();
     succeed(dir.path(), &out, &[&args[..6], &["--iterations", &done, "--early-stop"]].concat());
     assert!(early == Features::read(&out).unwrap().0.values);
-}
-
-#[test]
-fn an_interrupted_run_leaves_a_checkpoint() {
-    let (dir, out) = setup();
-    let args = ["--preset", "paper", "--iterations", "100000000"];
-    let mut child = command(dir.path(), &out, &args).stderr(Stdio::null()).spawn().unwrap();
-    std::thread::sleep(Duration::from_millis(400));
-    let kill = Command::new("kill").args(["-TERM", &child.id().to_string()]).status().unwrap();
-    assert!(kill.success());
-    assert_eq!(child.wait().unwrap().code(), Some(130));
-    assert!(beside(&out, ".checkpoint").exists() && !out.exists());
 }
 
 #[test]
