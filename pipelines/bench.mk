@@ -47,10 +47,6 @@ bench-cluster:
 	  && out/bench/python-cluster/bin/pip install -q numpy scikit-learn hdbscan-rs fast_hdbscan; }
 	out/bench/python-cluster/bin/python scripts/bench_cluster.py $(POINTS) out/bench/cluster.json $(RUNS) $(TRUTH)
 
-# cluster-match --cluster graph at a million Gaussians: cluster-graph.json.
-bench-cluster-graph:
-	$(CARGO) bench -p cluster-match --bench graph
-
 # A query over a million Gaussians and 500 instances: query.json.
 bench-query:
 	$(CARGO) bench -p eval --bench query -- --out $(CURDIR)/out/bench/query.json

@@ -38,9 +38,6 @@ impl Assignment {
 
     /// Gives every Gaussian for which `wanted` holds the instance and the node of the nearest Gaussian that has an instance;
     /// ties go to the lower index. Nothing changes where no Gaussian has one.
-    ///
-    /// # Errors
-    /// When the tree of centres cannot be built.
     pub fn fill_from_nearest(&mut self, means: &[[f32; 3]], wanted: impl Fn(usize) -> bool + Sync) -> Result<()> {
         let finite = |p: &[f32; 3]| p.iter().all(|v| v.is_finite());
         // Distinct places only: the tree cannot split heaps of coincident points.

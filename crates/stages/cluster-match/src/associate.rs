@@ -18,7 +18,6 @@ const PIXELS: usize = TILE * TILE;
 /// Pixels of an instance or a mask in a view, and the sum of rendered features over them.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct Region {
-    /// Pixels.
     pub area: u32,
     /// Sum of rendered features over the pixels, `[dim]`.
     pub features: Vec<f64>,
@@ -70,9 +69,6 @@ pub struct FeatureTable<'a> {
 
 impl<'a> FeatureTable<'a> {
     /// The table for a scene of `gaussians` Gaussians.
-    ///
-    /// # Panics
-    /// When a feature belongs to a Gaussian beyond `gaussians`.
     pub fn new(features: &'a Features, gaussians: usize) -> Self {
         let mut position = vec![None; gaussians];
         for (at, &i) in features.kept.iter().enumerate() {

@@ -198,18 +198,6 @@ mod tests {
     }
 
     #[test]
-    fn both_spaces_find_two_rods() {
-        let (f, g) = two_rods();
-        let o = Options { min_cluster_size: 10, min_samples: 3, ..Options::default() };
-        for space in [Space::Free, Space::Graph] {
-            let c = group(&f, &g, space, &o);
-            assert_eq!(c.selected.len(), 2, "{space:?}");
-            assert!(c.labels[5] != c.labels[45] && c.labels[5] >= 0 && c.labels[45] >= 0, "{space:?}");
-            assert_eq!(tree(&c).iter().filter(|e| e.instance >= 0).count(), 2);
-        }
-    }
-
-    #[test]
     fn rods_of_one_feature_are_one_thing_in_features_and_two_in_space() {
         let (mut f, g) = two_rods();
         f.values = (0..60).flat_map(|i| [1.0, 0.001 * (i % 7) as f32]).collect();

@@ -64,21 +64,19 @@ mod tests {
     #[test]
     fn it_counts_the_largest_instance_and_what_masks_hold_of_one() {
         // Instance 0 holds Gaussians 0 to 5, instance 1 holds 6 and 7. One mask fits, one holds 3 and 1.
-        let mut b = FootprintsBuilder { kept: (0..8).collect(), row_ptr: vec![0], ..FootprintsBuilder::default() };
-        b.views = vec!["a".into()];
+        let kept: Vec<u32> = (0..8).collect();
+        let (views, of_all) = (vec!["a".into()], kept.clone());
+        let mut b = FootprintsBuilder { views, kept: of_all, ..FootprintsBuilder::default() };
         for (mask, gaussians) in [&[0u32, 1][..], &[3, 4, 5, 6]].into_iter().enumerate() {
             let pixels = gaussians.len() as u32;
-            b.rows.push(Row { view: 0, level: 3, mask: mask as u32, pixels, gated: pixels, alpha: 1.0 });
-            b.col.extend(gaussians);
-            b.weight.extend(gaussians.iter().map(|_| 1.0));
-            b.row_ptr.push(b.col.len() as u64);
+            let row = Row { view: 0, level: 3, mask: mask as u32, pixels, gated: pixels, alpha: 1.0 };
+            b.push(row, gaussians.iter().map(|&i| (i, 1.0)));
         }
         let dir = tempfile::tempdir().unwrap();
         let path = dir.path().join("f.safetensors");
         b.write(&path, Provenance::default()).unwrap();
         let footprints = Footprints::read(&path).unwrap();
         let instances = Instances { label: vec![0, 0, 0, 0, 0, 0, 1, 1], count: vec![6, 2], ..Instances::default() };
-        let kept: Vec<u32> = (0..8).collect();
         let health = Health::of(&instances, &footprints, &kept, &[Level::Large]);
         assert_eq!(health, Health { largest: 0.75, purity: Some(5.0 / 6.0) });
         assert_eq!(Health::of(&instances, &footprints, &kept, &[Level::Small]).purity, None);

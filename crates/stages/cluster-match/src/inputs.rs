@@ -98,9 +98,6 @@ fn matched_views(a: &Args, dataset: &Dataset, footprints: &Footprints, stage: &S
 }
 
 /// Hashes of the CLIP model that made the mask features, as far as `features.json` of mask-embed names it.
-///
-/// # Errors
-/// When the features belong to other id maps.
 fn clip_of_features(folder: &Path, masks: &str) -> Result<BTreeMap<String, String>> {
     let manifest = folder.join("features.json");
     // Features of another program come without one.

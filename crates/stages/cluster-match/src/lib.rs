@@ -1,20 +1,20 @@
 //! Stage 3: 3D instances from features, the masks they were seen as, and a language descriptor for each.
 //!
-//! [`options`] is the command line, `run` the story, `inputs` and `outputs` its ends. [`group`] clusters Gaussians;
+//! [`options`] is the command line, `run` the story, `inputs` and `outputs` its ends. `group` clusters Gaussians;
 //! `assignment` keeps who belongs to which instance, gives noise and unseen Gaussians to their neighbours, and applies what
-//! the masks say: [`vote`] corrects rims, [`join`] joins pieces of one thing. [`associate`] matches instances with the
-//! masks of each view, [`describe`] gathers what is known of each instance, [`health`] says how far masks and instances
-//! agree, [`memory`] forecasts the peak.
+//! the masks say: `vote` corrects rims, `join` joins pieces of one thing. `associate` matches instances with the
+//! masks of each view, `describe` gathers what is known of each instance, `health` says how far masks and instances
+//! agree, `memory` forecasts the peak.
 
 mod assignment;
-pub mod associate;
-pub mod describe;
-pub mod group;
-pub mod health;
+mod associate;
+mod describe;
+mod group;
+mod health;
 mod inputs;
-pub mod join;
-pub mod memory;
+mod join;
+mod memory;
 pub mod options;
 mod outputs;
 mod run;
-pub mod vote;
+mod vote;

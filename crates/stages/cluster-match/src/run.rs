@@ -33,47 +33,48 @@ impl Program for Args {
         }
     }
 
+    /// Reads the inputs, finds the instances, matches them with masks, and writes them.
     fn run(self, stage: &Stage) -> Result<()> {
-        run(&self, stage)
-    }
-}
+        let a = &self;
+        let mut claim = outputs::claim(a, stage)?;
+        let mut watched = Watched::new([&a.geometry]);
+        for suffix in ["_s.npy", "_f.npy"] {
+            watched = watched.and(artifacts::watch_folder(&a.masks, suffix)?);
+        }
+        let inputs = Inputs::read(a, stage)?;
+        let settings = a.settings.for_gaussians(inputs.graph.kept.len());
+        forecast(&inputs, stage)?;
 
-/// Reads the inputs, finds the instances, matches them with masks, and writes them.
-fn run(a: &Args, stage: &Stage) -> Result<()> {
-    let mut claim = outputs::claim(a, stage)?;
-    let mut watched = Watched::new([&a.geometry]);
-    for suffix in ["_s.npy", "_f.npy"] {
-        watched = watched.and(artifacts::watch_folder(&a.masks, suffix)?);
-    }
-    let inputs = Inputs::read(a, stage)?;
-    let settings = a.settings.for_gaussians(inputs.graph.kept.len());
-    forecast(&inputs, stage)?;
+        let start = Instant::now();
+        let clustering = group(&inputs.features, &inputs.graph, settings.cluster, &settings.hdbscan());
+        let noise = clustering.labels.iter().filter(|&&l| l < 0).count();
+        let figures = Figures { noise, clustering_seconds: start.elapsed().as_secs_f64() };
+        let found = Assignment::new(&clustering, &inputs.graph.kept, inputs.geometry.gaussians.len());
+        drop(clustering);
+        stage.info(&format!(
+            "{} instances among {} Gaussians, {noise} noise",
+            found.instances,
+            inputs.graph.kept.len()
+        ));
+        if found.instances == 0 {
+            stage.warn(
+                "everything is noise: no instance was found; give a smaller --min-cluster-size, or --allow-single-cluster \
+                 where the scene is one thing",
+            );
+        }
+        let found = correct(found, &inputs, &settings, stage)?;
 
-    let start = Instant::now();
-    let clustering = group(&inputs.features, &inputs.graph, settings.cluster, &settings.hdbscan());
-    let noise = clustering.labels.iter().filter(|&&l| l < 0).count();
-    let figures = Figures { noise, clustering_seconds: start.elapsed().as_secs_f64() };
-    let found = Assignment::new(&clustering, &inputs.graph.kept, inputs.geometry.gaussians.len());
-    drop(clustering);
-    stage.info(&format!("{} instances among {} Gaussians, {noise} noise", found.instances, inputs.graph.kept.len()));
-    if found.instances == 0 {
-        stage.warn(
-            "everything is noise: no instance was found; give a smaller --min-cluster-size, or --allow-single-cluster \
-             where the scene is one thing",
-        );
+        let (matches, features) = match_views(a, &settings, &inputs, &found.labels, stage)?;
+        if features.is_empty() {
+            stage.skipped("language descriptors: the masks have no features (*_f.npy; mask-embed embed makes them)");
+        }
+        let views = inputs.views.iter().map(|v| v.stem().to_string()).collect();
+        let means = &inputs.geometry.gaussians.means;
+        let described = describe(means, found.labels, found.instances, matches, &features);
+        let instances = Instances { views, tree: found.tree, node: found.nodes, ..described };
+        watched.check()?;
+        outputs::write(a, stage, &inputs, &instances, &settings, &figures, &mut claim)
     }
-    let found = correct(found, &inputs, &settings, stage)?;
-
-    let (matches, features) = match_views(a, &settings, &inputs, &found.labels, stage)?;
-    if features.is_empty() {
-        stage.skipped("language descriptors: the masks have no features (*_f.npy; mask-embed embed makes them)");
-    }
-    let views = inputs.views.iter().map(|v| v.stem().to_string()).collect();
-    let means = &inputs.geometry.gaussians.means;
-    let described = describe(means, found.labels, found.instances, matches, &features);
-    let instances = Instances { views, tree: found.tree, node: found.nodes, ..described };
-    watched.check()?;
-    outputs::write(a, stage, &inputs, &instances, &settings, &figures, &mut claim)
 }
 
 /// Says how much memory the run will take.

@@ -147,14 +147,12 @@ mod tests {
     fn a_rim_goes_where_its_masks_are_and_strays_come_home() {
         // 20 Gaussians in a row; in each of 4 views masks show 0..10 and 10..20. Labels are off by two, and one is astray.
         let n = 20u32;
-        let mut b = FootprintsBuilder { kept: (0..n).collect(), row_ptr: vec![0], ..FootprintsBuilder::default() };
+        let mut b = FootprintsBuilder { kept: (0..n).collect(), ..FootprintsBuilder::default() };
         for view in 0..4 {
             b.views.push(view.to_string());
             for mask in 0..2 {
-                b.rows.push(Row { view, level: 3, mask, pixels: 10, gated: 10, alpha: 1.0 });
-                b.col.extend(mask * 10..mask * 10 + 10);
-                b.weight.extend([1.0; 10]);
-                b.row_ptr.push(b.col.len() as u64);
+                let row = Row { view, level: 3, mask, pixels: 10, gated: 10, alpha: 1.0 };
+                b.push(row, (mask * 10..mask * 10 + 10).map(|i| (i, 1.0)));
             }
         }
         let dir = tempfile::tempdir().unwrap();

@@ -7,7 +7,6 @@ use gs_scene::dataset::{self, LoadOptions, Resolution};
 use gs_scene::{Camera, Gaussians, Image, ply};
 use serde_json::{Value, json};
 use stage::RunRecord;
-use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 use std::process::{Command, Output};
 
@@ -121,16 +120,6 @@ impl Scene {
     /// Writes graph, footprints and features; `change` may change the features first.
     fn artifacts(&self, change: impl Fn(&mut Features)) {
         let n = 2 * EACH;
-        let provenance = |inputs: &[(&str, String)]| Provenance {
-            parameters: json!({"holdout": 0}),
-            inputs: inputs.iter().map(|(role, hash)| ((*role).to_string(), hash.clone())).collect(),
-            ..Provenance::default()
-        };
-        let origin = [
-            (role::GEOMETRY, hash_file(self.path("geometry.ply")).unwrap()),
-            (role::DATASET, self.dataset().hash().unwrap()),
-            (role::MASKS, hash_folder(self.path("masks"), "_s.npy").unwrap()),
-        ];
         let means = gaussians().means;
         let near = |i: usize| -> Vec<u32> {
             let square = |j: usize| (0..3).map(|k| (means[i][k] - means[j][k]).powi(2)).sum::<f32>();
@@ -150,34 +139,41 @@ impl Scene {
             seen_views,
             ..Graph::default()
         };
-        graph.write(self.path("graph.safetensors"), provenance(&origin)).unwrap();
-        let mut footprints = FootprintsBuilder {
-            views: (0..VIEWS).map(|v| format!("v{v}")).collect(),
-            kept: graph.kept.clone(),
-            row_ptr: vec![0],
-            ..FootprintsBuilder::default()
-        };
+        let views = (0..VIEWS).map(|v| format!("v{v}")).collect();
+        let mut footprints = FootprintsBuilder { views, kept: graph.kept.clone(), ..FootprintsBuilder::default() };
         // As the id maps have it: both things in one medium mask, each in its large one.
         for view in 0..VIEWS as u32 {
             for (level, mask, own) in [(2, 2, 0..n), (3, 3, 0..EACH), (3, 4, EACH..n)] {
-                footprints.rows.push(Row { view, level, mask, pixels: 50, gated: 50, alpha: 1.0 });
-                footprints.weight.extend(own.clone().map(|_| 1.0));
-                footprints.col.extend(own.map(|i| i as u32));
-                footprints.row_ptr.push(footprints.col.len() as u64);
+                let row = Row { view, level, mask, pixels: 50, gated: 50, alpha: 1.0 };
+                footprints.push(row, own.map(|i| (i as u32, 1.0)));
             }
         }
-        footprints.write(self.path("footprints.safetensors"), provenance(&origin)).unwrap();
-        let hash = |name: &str, format: &str| Artifact::open(self.path(name), format, 1).unwrap().hash().to_string();
         let value = |i: usize| {
             let noise = |k: usize| ((i * 31 + k * 17) % 23) as f32 * 0.004;
             if i < EACH { [1.0, noise(1), noise(2)] } else { [noise(3), 1.0, noise(4)] }
         };
-        let mut features = Features { kept: graph.kept, dim: 3, values: (0..n).flat_map(value).collect() };
+        let mut features = Features { kept: graph.kept.clone(), dim: 3, values: (0..n).flat_map(value).collect() };
         change(&mut features);
-        let inputs = [
-            (role::GRAPH, hash("graph.safetensors", Graph::FORMAT)),
-            (role::FOOTPRINTS, hash("footprints.safetensors", "footprints")),
-        ];
+        self.write(&graph, &footprints, &features);
+    }
+
+    fn write(&self, graph: &Graph, footprints: &FootprintsBuilder, features: &Features) {
+        let provenance = |inputs: &[(&str, String)]| Provenance {
+            parameters: json!({"holdout": 0}),
+            inputs: inputs.iter().map(|(role, hash)| ((*role).to_string(), hash.clone())).collect(),
+            ..Provenance::default()
+        };
+        let origin = provenance(&[
+            (role::GEOMETRY, hash_file(self.path("geometry.ply")).unwrap()),
+            (role::DATASET, self.dataset().hash().unwrap()),
+            (role::MASKS, hash_folder(self.path("masks"), "_s.npy").unwrap()),
+        ]);
+        let [to_graph, to_footprints] = ["graph.safetensors", "footprints.safetensors"].map(|name| self.path(name));
+        graph.write(&to_graph, origin.clone()).unwrap();
+        footprints.write(&to_footprints, origin).unwrap();
+        let hash = |path, format: &str| Artifact::open(path, format, 1).unwrap().hash().to_string();
+        let inputs =
+            [(role::GRAPH, hash(to_graph, Graph::FORMAT)), (role::FOOTPRINTS, hash(to_footprints, "footprints"))];
         features.write(self.path("features.safetensors"), provenance(&inputs)).unwrap();
     }
 
@@ -413,18 +409,6 @@ fn scenes_without_anything_are_results_not_errors() {
     assert!(i.matches.is_empty() && i.support == [0, 0]);
     // One Gaussian.
     ply::write_gaussians(s.path("geometry.ply"), &gaussians().select(&[0]), &[]).unwrap();
-    let provenance = |inputs: [(&str, String); 3]| Provenance {
-        parameters: json!({"holdout": 0}),
-        inputs: inputs.map(|(role, hash)| (role.to_string(), hash)).into_iter().collect::<BTreeMap<_, _>>(),
-        ..Provenance::default()
-    };
-    let origin = || {
-        provenance([
-            (role::GEOMETRY, hash_file(s.path("geometry.ply")).unwrap()),
-            (role::DATASET, s.dataset().hash().unwrap()),
-            (role::MASKS, hash_folder(s.path("masks"), "_s.npy").unwrap()),
-        ])
-    };
     let graph = Graph {
         kept: vec![0],
         anchors: vec![0],
@@ -433,18 +417,9 @@ fn scenes_without_anything_are_results_not_errors() {
         seen_weight: vec![1.0],
         ..Graph::default()
     };
-    graph.write(s.path("graph.safetensors"), origin()).unwrap();
     let footprints =
         FootprintsBuilder { views: vec!["v0".into()], kept: vec![0], row_ptr: vec![0], ..Default::default() };
-    footprints.write(s.path("footprints.safetensors"), origin()).unwrap();
-    let hash = |name: &str, format: &str| Artifact::open(s.path(name), format, 1).unwrap().hash().to_string();
-    let features = Features { kept: vec![0], dim: 2, values: vec![1.0, 0.0] };
-    let inputs = [
-        (role::GRAPH, hash("graph.safetensors", Graph::FORMAT)),
-        (role::FOOTPRINTS, hash("footprints.safetensors", "footprints")),
-        (role::GEOMETRY, String::new()),
-    ];
-    features.write(s.path("features.safetensors"), provenance(inputs)).unwrap();
+    s.write(&graph, &footprints, &Features { kept: vec![0], dim: 2, values: vec![1.0, 0.0] });
     let (i, said) = s.succeed(&[]);
     assert_eq!(i.label, [-1]);
     assert!(said.contains("skipped 3 of 4 views in matching") && said.contains("v1, v2, v3"), "{said}");
