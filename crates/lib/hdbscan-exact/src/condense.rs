@@ -58,13 +58,7 @@ pub(crate) fn condense(edges: &[Edge], weights: &[u32], core: &[f64], min_cluste
     while let Some((node, cluster)) = open.pop() {
         if (node as usize) < m {
             // A point with duplicates that is a cluster by itself: it dissolves at its core distance.
-            let size = weights[node as usize];
-            tree.edges.push(CondensedEdge {
-                parent: cluster,
-                child: node,
-                lambda: lambda_of(core[node as usize]),
-                size,
-            });
+            drop_all(node, cluster, lambda_of(core[node as usize]), weights, &merges, &mut tree.edges);
             continue;
         }
         let merge = &merges[node as usize - m];

@@ -42,7 +42,7 @@ pub(crate) fn density_tree(points: &[f32], dim: usize, weights: &[u32], min_samp
         .map_init(Search::default, |search, &root| {
             let mut out = Vec::new();
             for leaf in first.leaves(root) {
-                search_leaf(&first, &weights, leaf, root, min_samples, search);
+                search_leaf(&first, &weights, &first, leaf, root, min_samples, search);
                 out.extend(search.found.iter().take(search.count).map(|f| f.last().map_or(0.0, |b| b.0).sqrt()));
             }
             out
@@ -76,7 +76,7 @@ pub(crate) fn neighbours(tree: &KdTree, weights: &[u32], min_samples: usize) -> 
         .par_iter()
         .with_min_len(8)
         .map_init(Search::default, |search, &leaf| {
-            search_leaf(tree, &weights, leaf, 0, min_samples, search);
+            search_leaf(tree, &weights, tree, leaf, 0, min_samples, search);
             let start = tree.nodes[leaf as usize].start;
             let mut near = vec![NONE; search.count * kept];
             let rows = (start..).zip(&search.found[..search.count]).zip(near.chunks_exact_mut(kept));
@@ -144,31 +144,29 @@ struct Nearest<'a> {
     reach: f32,
 }
 
-/// Finds the nearest points of each point of a leaf among those below `root`.
+/// Finds the nearest points in `tree`, below `root`, of each point of a leaf of `from`: the same tree, or another.
 #[multiversion(targets("x86_64+avx2+fma", "aarch64+neon"))]
-fn search_leaf(tree: &KdTree, weights: &[u32], leaf: u32, root: u32, min_samples: usize, search: &mut Search) {
-    let node = &tree.nodes[leaf as usize];
-    let mut group = std::mem::take(&mut search.group);
-    group.gather(tree, node.start..node.end);
-    search.start(group.places.len());
-    let wanted = min_samples as u64;
-    let mut nearest = Nearest { tree, weights, wanted, own: NONE, of: search, reach: f32::INFINITY };
-    // The own leaf first: it holds the nearest points, more often than not.
-    nearest.leaf(&group, leaf);
-    nearest.own = leaf;
-    group.walk(tree, root, &mut nearest);
-    search.group = group;
-}
-
-/// Finds the nearest points in `tree` of each point of a leaf of another tree.
-#[multiversion(targets("x86_64+avx2+fma", "aarch64+neon"))]
-fn search_elsewhere(tree: &KdTree, weights: &[u32], from: &KdTree, leaf: u32, wanted: u64, search: &mut Search) {
+fn search_leaf(
+    tree: &KdTree,
+    weights: &[u32],
+    from: &KdTree,
+    leaf: u32,
+    root: u32,
+    min_samples: usize,
+    search: &mut Search,
+) {
     let node = &from.nodes[leaf as usize];
     let mut group = std::mem::take(&mut search.group);
     group.gather(from, node.start..node.end);
     search.start(group.places.len());
+    let wanted = min_samples as u64;
     let mut nearest = Nearest { tree, weights, wanted, own: NONE, of: search, reach: f32::INFINITY };
-    group.walk(tree, 0, &mut nearest);
+    if std::ptr::eq(tree, from) {
+        // The own leaf first: it holds the nearest points, more often than not.
+        nearest.leaf(&group, leaf);
+        nearest.own = leaf;
+    }
+    group.walk(tree, root, &mut nearest);
     search.group = group;
 }
 
@@ -182,7 +180,7 @@ pub(crate) fn nearest(tree: &KdTree, weights: &[u32], queries: &[f32], wanted: u
     let rows: Vec<Vec<Vec<(f64, u32)>>> = leaves
         .par_iter()
         .map_init(Search::default, |search, &leaf| {
-            search_elsewhere(tree, &weights, &from, leaf, wanted as u64, search);
+            search_leaf(tree, &weights, &from, leaf, 0, wanted, search);
             let rows = search.found[..search.count].iter();
             rows.map(|row| row.iter().map(|&(d, q)| (d.sqrt(), q)).collect()).collect()
         })
