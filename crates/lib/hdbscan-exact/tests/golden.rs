@@ -258,17 +258,6 @@ fn lambdas_of_two_pairs_are_those_of_paper_and_pencil() {
 }
 
 #[test]
-fn threads_do_not_matter() {
-    for c in &cases()[..4] {
-        let run = |threads| {
-            let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
-            pool.install(|| cluster(&c.points, c.dim, &c.options))
-        };
-        assert_eq!(run(1), run(3));
-    }
-}
-
-#[test]
 fn degenerate_sets_are_fine() {
     let o = Options { min_cluster_size: 3, min_samples: 3, ..Options::default() };
     assert!(cluster(&[], 2, &o).labels.is_empty());
