@@ -1,7 +1,7 @@
 //! Reading the inputs, and checking that they belong together.
 
 use crate::options::Args;
-use artifacts::{Features, Footprints, Graph, MaskFeatures, MaskMaps, features_path, hash_folder, maps_path, role};
+use artifacts::{Features, Footprints, Graph, MaskFeatures, MaskMaps, features_path, hash_folder, role};
 use gs_io::{Error, IoContext, Provenance, Result, hash_file};
 use gs_scene::Geometry;
 use gs_scene::dataset::{self, Dataset, LoadOptions, Resolution, View};
@@ -142,9 +142,4 @@ pub(crate) fn mask_features(
         }
         _ => Ok(Some(features)),
     }
-}
-
-/// The id maps of a view.
-pub(crate) fn id_maps(folder: &Path, stem: &str) -> Result<MaskMaps> {
-    MaskMaps::read(maps_path(folder, stem))
 }

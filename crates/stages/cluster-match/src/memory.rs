@@ -1,8 +1,11 @@
 //! How much memory a run will take, said before it starts. docs/performance.md compares it with measured peaks.
 
-/// Peak memory in bytes for so many Gaussians, `kept` of them with features of `dim` dimensions, and footprints of `entries` entries
-/// besides `samples` of sampled pixels.
-pub fn forecast(gaussians: usize, kept: usize, dim: usize, entries: usize, samples: usize) -> u64 {
+use crate::inputs::Inputs;
+
+/// Peak memory in bytes.
+pub fn forecast(inputs: &Inputs) -> u64 {
+    let (entries, samples) = (inputs.footprints.csr().1.len(), inputs.footprints.pixels.col.len());
+    let (gaussians, kept, dim) = (inputs.geometry.gaussians.len(), inputs.features.kept.len(), inputs.features.dim);
     // Fitted to 15 runs of 5,000 to 80,000 Gaussians and up to 12 million entries, within 5 %.
     12_800_000
         + 19 * entries as u64 / 2

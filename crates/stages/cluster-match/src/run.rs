@@ -4,10 +4,11 @@ use crate::assignment::Assignment;
 use crate::associate::{FeatureTable, matches, overlaps};
 use crate::describe::describe;
 use crate::group::group;
-use crate::inputs::{Inputs, id_maps, mask_features};
+use crate::inputs::{Inputs, mask_features};
+use crate::memory;
 use crate::options::{Args, Noise, Settings};
 use crate::outputs::{self, Figures};
-use artifacts::{Instances, MaskFeatures, Match};
+use artifacts::{Instances, MaskFeatures, MaskMaps, Match, maps_path};
 use gs_io::{Error, Result, Watched};
 use gs_raster::RasterOptions;
 use gs_scene::dataset::View;
@@ -43,7 +44,7 @@ impl Program for Args {
         }
         let inputs = Inputs::read(a, stage)?;
         let settings = a.settings.for_gaussians(inputs.graph.kept.len());
-        forecast(&inputs, stage)?;
+        stage.forecast(memory::forecast(&inputs), "drop small footprint entries: graph-precompute --cut 0.001")?;
 
         let start = Instant::now();
         let clustering = group(&inputs.features, &inputs.graph, settings.cluster, &settings.hdbscan());
@@ -75,14 +76,6 @@ impl Program for Args {
         watched.check()?;
         outputs::write(a, stage, &inputs, &instances, &settings, &figures, &mut claim)
     }
-}
-
-/// Says how much memory the run will take.
-fn forecast(inputs: &Inputs, stage: &Stage) -> Result<()> {
-    let (entries, samples) = (inputs.footprints.csr().1.len(), inputs.footprints.pixels.col.len());
-    let (gaussians, features) = (inputs.geometry.gaussians.len(), &inputs.features);
-    let needed = crate::memory::forecast(gaussians, features.kept.len(), features.dim, entries, samples);
-    stage.forecast(needed, "drop small footprint entries: graph-precompute --cut 0.001")
 }
 
 /// Corrects the clustering by where Gaussians lie and by the masks of each view.
@@ -132,7 +125,7 @@ fn match_views(
     let mut features: BTreeMap<u32, MaskFeatures> = BTreeMap::new();
     let mut progress = stage.progress("matching views", inputs.views.len() as u64);
     for (index, stem) in inputs.views.iter().map(View::stem).enumerate() {
-        let maps = id_maps(&a.masks, stem)?;
+        let maps = MaskMaps::read(maps_path(&a.masks, stem))?;
         let camera = inputs.views[index].camera.resized(maps.width as u32, maps.height as u32);
         let overlaps = overlaps(gaussians, &raster, labels, &table, &camera, &maps, &settings.level);
         found.extend(matches(&overlaps, index as u32, settings.threshold as f32));
