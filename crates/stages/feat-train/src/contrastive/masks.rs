@@ -51,14 +51,11 @@ pub fn mask_sets(footprints: &Footprints, context: &Context, levels: &[Level], l
     let place = inverse(&context.order);
     let mut sets = Vec::new();
     let mut from = 0;
-    while from < footprints.rows.len() {
-        let first = footprints.rows[from];
-        let same = |r: &artifacts::Row| (r.view, r.level) == (first.view, first.level);
-        let to = from + footprints.rows[from..].iter().take_while(|r| same(r)).count();
-        let rows: Vec<u32> = (from..to)
-            .filter(|&r| footprints.rows[r].gated > 0 && !footprints.entries(r).0.is_empty())
-            .map(|r| r as u32)
-            .collect();
+    for group in footprints.rows.chunk_by(|a, b| (a.view, a.level) == (b.view, b.level)) {
+        let (first, all) = (group[0], from..from + group.len());
+        from = all.end;
+        let shows = |&r: &usize| footprints.rows[r].gated > 0 && !footprints.entries(r).0.is_empty();
+        let rows: Vec<u32> = all.filter(shows).map(|r| r as u32).collect();
         if levels.iter().any(|&l| l as u32 == first.level) && rows.len() >= least {
             if rows.len() > MOST_MASKS {
                 return Err(Error::new("more masks than can be numbered")
@@ -69,7 +66,6 @@ pub fn mask_sets(footprints: &Footprints, context: &Context, levels: &[Level], l
             }
             sets.push(mask_set(footprints, &rows, &place, context));
         }
-        from = to;
     }
     Ok(sets)
 }

@@ -15,8 +15,6 @@ use rand::Rng;
 use rayon::prelude::*;
 use std::ops::Range;
 
-/// Channels between layers (paper: "an intermediate channel size of 16").
-const HIDDEN: usize = 16;
 /// Channels of a colour.
 pub const COLOR: usize = 3;
 /// Anchors worked on at a time.
@@ -68,7 +66,7 @@ impl<T: Real> Model<T> {
             .collect();
         let features =
             context.order.iter().flat_map(|&i| drawn[i as usize * d..(i as usize + 1) * d].to_vec()).collect();
-        let mut layers = network::random_layers(options.layers, d + COLOR, HIDDEN, d, context.kind, rng);
+        let mut layers = network::random_layers(options.layers, d + COLOR, d, context.kind, rng);
         if let Some(last) = layers.last_mut() {
             last.relu = !options.no_last_relu;
         }

@@ -10,6 +10,8 @@ use crate::options::Neighbours;
 use rand::Rng;
 use rayon::prelude::*;
 
+/// Channels between layers (paper: "an intermediate channel size of 16").
+const HIDDEN: usize = 16;
 /// Anchors worked on at a time.
 const CHUNK: usize = 512;
 
@@ -53,16 +55,15 @@ impl<T: Real> Layer<T> {
 pub fn random_layers<T: Real>(
     count: usize,
     input: usize,
-    hidden: usize,
     output: usize,
     kind: Neighbours,
     rng: &mut impl Rng,
 ) -> Vec<Layer<T>> {
     (0..count)
         .map(|l| {
-            let own = if l == 0 { input } else { hidden };
+            let own = if l == 0 { input } else { HIDDEN };
             let neighbour = if kind == Neighbours::Anchors { own } else { input };
-            Layer::random(own, neighbour, if l + 1 == count { output } else { hidden }, rng)
+            Layer::random(own, neighbour, if l + 1 == count { output } else { HIDDEN }, rng)
         })
         .collect()
 }

@@ -74,7 +74,9 @@ impl<'a> Solver<'a> {
         let State { model, features, layers, iteration, .. } = state;
         let gradients = match self {
             Self::Fast(engine, evaluated) => {
-                engine.backward(model, features, set, evaluated, noise, &Rates::at(options.lr, *iteration))
+                let rates = Rates::at(options.lr, *iteration);
+                let totals = engine.update_features(model, features, set, evaluated, noise, &rates);
+                engine.network_gradients(model, &totals)
             }
             Self::Plain { step, dense, .. } => {
                 let d = model.dim;

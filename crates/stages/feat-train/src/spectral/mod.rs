@@ -20,7 +20,7 @@ use report::curve::Panel;
 use serde_json::json;
 use stage::Stage;
 use std::time::Instant;
-use vectors::{SpectralOptions, spectral};
+use vectors::{Spectral, SpectralOptions, spectral};
 
 const SPECTRUM: [Panel; 1] = [("singular_value", "singular values", "#1f77b4")];
 
@@ -43,28 +43,27 @@ pub fn features(args: &Args, inputs: &Inputs, stage: &Stage) -> Result<Made> {
         cutoff,
         seed: args.common.seed,
     };
-    let found = spectral(&matrix, &options, stage)?;
+    let Spectral { dim, features, found, gram_entries } = spectral(&matrix, &options, stage)?;
     let vectors_seconds = clock.elapsed().as_secs_f64() - evidence_seconds;
-    let above = found.singular_values.iter().filter(|v| **v > cutoff).count();
-    if above > found.dim {
-        let more = if above == found.singular_values.len() { " or more" } else { "" };
+    let above = found.values.iter().filter(|v| **v > cutoff).count();
+    if above > dim {
+        let more = if above == found.values.len() { " or more" } else { "" };
         stage.warn(&format!(
-            "{above}{more} singular values exceed the cutoff of {cutoff}, but only the first {} are kept: small things may \
-             run together; give a larger --dim",
-            found.dim
+            "{above}{more} singular values exceed the cutoff of {cutoff}, but only the first {dim} are kept: small things \
+             may run together; give a larger --dim"
         ));
     }
-    let without = found.features.chunks_exact(found.dim).filter(|f| f.iter().all(|v| *v == 0.0)).count();
+    let without = features.chunks_exact(dim).filter(|f| f.iter().all(|v| *v == 0.0)).count();
     if without > 0 {
         stage.info(&format!("{without} of {} Gaussians lie in no mask: their features are zero", matrix.gaussians));
     }
-    let values = found.singular_values.iter().enumerate();
+    let values = found.values.iter().enumerate();
     write_curve(&args.out, values.map(|(i, v)| json!({ "iteration": i + 1, "singular_value": v })), &SPECTRUM)?;
     let summary = json!({
-        "masks": matrix.masks.len(), "dim": found.dim, "passes": found.passes, "residual": found.residual,
+        "masks": matrix.masks.len(), "dim": dim, "passes": found.passes, "residual": found.residual,
         "evidence_seconds": evidence_seconds, "vectors_seconds": vectors_seconds, "cpu_seconds": stage::cpu_seconds(),
-        "without_mask": without, "entries": matrix.entries(), "gram_entries": found.gram_entries,
-        "singular_values": found.singular_values,
+        "without_mask": without, "entries": matrix.entries(), "gram_entries": gram_entries,
+        "singular_values": found.values,
     });
-    Ok(Made { dim: found.dim, values: found.features, summary })
+    Ok(Made { dim, values: features, summary })
 }

@@ -66,12 +66,7 @@ pub struct Spectral {
     pub dim: usize,
     /// `[n][dim]`, of unit length, or zero for Gaussians in no mask.
     pub features: Vec<f32>,
-    /// Singular values found, descending; at least `dim`.
-    pub singular_values: Vec<f64>,
-    /// Products with CᵀC that it took.
-    pub passes: usize,
-    /// Largest scaled residual of a vector ([`SpectralOptions`]' scale times |CᵀC v - σ² v|).
-    pub residual: f64,
+    pub found: Found,
     /// Entries of CᵀC, where it was formed.
     pub gram_entries: Option<usize>,
 }
@@ -79,7 +74,7 @@ pub struct Spectral {
 pub fn spectral(matrix: &Matrix, options: &SpectralOptions, stage: &Stage) -> Result<Spectral> {
     let gram = Gram::new(matrix, GRAM_ENTRIES.0 * matrix.entries() + GRAM_ENTRIES.1);
     let product = gram.as_ref().map_or(Product::Factors(matrix), Product::Formed);
-    let found = singular_vectors(&product, matrix, options, stage)?;
+    let mut found = singular_vectors(&product, matrix, options, stage)?;
     let gram_entries = gram.as_ref().map(Gram::entries);
     drop(gram);
     let scale = |j: usize| options.scale(found.values[j]);
@@ -88,7 +83,7 @@ pub fn spectral(matrix: &Matrix, options: &SpectralOptions, stage: &Stage) -> Re
         dim = (0..dim).take_while(|&j| scale(j) >= LEAST_SCALE * scale(0)).count();
     }
     // C v = sigma u; the row's own scale cancels when rows are normalised.
-    let mut scaled: Columns = found.vectors;
+    let mut scaled = std::mem::take(&mut found.vectors);
     scaled.truncate(dim);
     for (j, vector) in scaled.iter_mut().enumerate() {
         let by = scale(j) / found.values[j].max(f64::MIN_POSITIVE);
@@ -100,14 +95,7 @@ pub fn spectral(matrix: &Matrix, options: &SpectralOptions, stage: &Stage) -> Re
         let inverse = if length > 0.0 { 1.0 / length } else { 0.0 };
         row.iter_mut().for_each(|v| *v = (f64::from(*v) * inverse) as f32);
     });
-    Ok(Spectral {
-        dim,
-        features,
-        singular_values: found.values,
-        passes: found.passes,
-        residual: found.residual,
-        gram_entries,
-    })
+    Ok(Spectral { dim, features, found, gram_entries })
 }
 
 /// CᵀC, to multiply by.
@@ -130,11 +118,14 @@ impl Product<'_> {
 }
 
 /// Leading right singular vectors and values, descending; each vector's largest entry is positive.
-struct Found {
+#[derive(Debug, Clone, PartialEq)]
+pub struct Found {
     vectors: Columns,
-    values: Vec<f64>,
-    passes: usize,
-    residual: f64,
+    pub values: Vec<f64>,
+    /// Products with CᵀC that it took.
+    pub passes: usize,
+    /// Largest scaled residual of a vector ([`SpectralOptions`]' scale times |CᵀC v - σ² v|).
+    pub residual: f64,
 }
 
 fn singular_vectors(product: &Product<'_>, matrix: &Matrix, options: &SpectralOptions, stage: &Stage) -> Result<Found> {
@@ -273,7 +264,7 @@ mod tests {
         let s = spectral(&m, &options(), &Stage::silent("test")).unwrap();
         assert_eq!(s.gram_entries, Some(1600));
         for j in 0..6 {
-            assert!((s.singular_values[j] - squares[j].sqrt()).abs() < 1e-5, "{j}: {s:?}");
+            assert!((s.found.values[j] - squares[j].sqrt()).abs() < 1e-5, "{j}: {s:?}");
         }
         // Features, up to the signs of vectors, which their scalar products do not know.
         let u = multiply(&c, &right[..6].to_vec());

@@ -149,7 +149,9 @@ impl<'a> Engine<'a> {
             hat_gradient: vec![0.0; m * pitch],
             gradients: [lanes(widest), lanes(widest), if anchors { lanes(widest) } else { Vec::new() }],
         };
-        engine.sum_features(model);
+        engine.sums.par_iter_mut().zip(&engine.chunks).for_each(|(sums, chunk)| {
+            sums.of(d, &model.features[chunk.places.start * d..chunk.places.end * d]);
+        });
         engine
     }
 
@@ -159,13 +161,6 @@ impl<'a> Engine<'a> {
         let rows = [&self.hat, &self.hat_gradient, &self.rows];
         blocks.map(|v| v.len() * size_of::<Lanes>()).sum::<usize>()
             + rows.map(|v| v.len() * size_of::<f32>()).iter().sum::<usize>()
-    }
-
-    fn sum_features(&mut self, model: &Model<f32>) {
-        let d = self.d;
-        self.sums.par_iter_mut().zip(&self.chunks).for_each(|(sums, chunk)| {
-            sums.of(d, &model.features[chunk.places.start * d..chunk.places.end * d]);
-        });
     }
 
     pub fn propagate(&mut self, model: &Model<f32>) {
@@ -290,24 +285,10 @@ impl<'a> Engine<'a> {
         loss::evaluate(s.loss, &means, positives, self.d, s.tau)
     }
 
-    /// Takes the gradients of the centroids back, and updates the features by one step of Adam. Returns the gradients of the
-    /// network's weights. `noise` is that of [`Engine::evaluate`].
-    pub fn backward(
-        &mut self,
-        model: &mut Model<f32>,
-        adam: &mut Adam<f32>,
-        set: &MaskSet,
-        evaluated: &Evaluated,
-        noise: u64,
-        rates: &Rates,
-    ) -> Vec<Vec<f32>> {
-        let totals = self.update_features(model, adam, set, evaluated, noise, rates);
-        if model.layers.is_empty() { Vec::new() } else { self.network_gradients(model, &totals) }
-    }
-
-    /// The pass over all features. Returns, per channel, the sums of g and of g y over anchors, y being the standardised
-    /// output and g its gradient.
-    fn update_features(
+    /// Takes the gradients of the centroids back, and updates the features by one step of Adam. `noise` is that of
+    /// [`Engine::evaluate`]. Returns, per channel, the sums of g and of g y over anchors, y being the standardised output and
+    /// g its gradient.
+    pub fn update_features(
         &mut self,
         model: &mut Model<f32>,
         adam: &mut Adam<f32>,
@@ -381,7 +362,8 @@ impl<'a> Engine<'a> {
         totals
     }
 
-    fn network_gradients(&mut self, model: &Model<f32>, totals: &[[f64; 2]]) -> Vec<Vec<f32>> {
+    /// Gradients of the network's weights, given what [`Engine::update_features`] returned.
+    pub fn network_gradients(&mut self, model: &Model<f32>, totals: &[[f64; 2]]) -> Vec<Vec<f32>> {
         let context = self.context;
         let mut out = vec![Vec::new(); model.layers.len()];
         let [mut gradient, mut above, mut around] = std::mem::take(&mut self.gradients);

@@ -47,7 +47,8 @@ fn check(d: usize, options: Contrastive, kind: Neighbours, propagate: bool) {
 
     let before = model.features.clone();
     let mut adam = Adam::new(before.len());
-    let layers = engine.backward(&mut model, &mut adam, &set, &evaluated, 77, &Rates::at(0.0, 1));
+    let totals = engine.update_features(&mut model, &mut adam, &set, &evaluated, 77, &Rates::at(0.0, 1));
+    let layers = engine.network_gradients(&model, &totals);
     assert!(before == model.features);
     // The first mean is a tenth of the gradient.
     adam.mean.iter_mut().for_each(|m| *m *= 10.0);
