@@ -99,12 +99,8 @@ impl<'a> Candidates<'a> {
 /// The spanning tree of points `[n][dim]` under mutual reachability max(core a, core b, distance), n - 1 edges in ascending
 /// order, and the core distances it is made with. It is the minimum one of the total order of [`Edge::order`], which is
 /// unique. `weights` are how many points each stands for; see [`crate::Options::min_samples`].
-///
-/// # Panics
-/// When there is not a weight for every point.
-pub fn spanning_tree(points: &[f32], dim: usize, weights: &[u32], min_samples: usize) -> (Vec<Edge>, Vec<f64>) {
+pub(crate) fn spanning_tree(points: &[f32], dim: usize, weights: &[u32], min_samples: usize) -> (Vec<Edge>, Vec<f64>) {
     let n = weights.len();
-    assert_eq!(points.len(), n * dim, "a weight for every point");
     let tree = density_tree(points, dim, weights, min_samples);
     let near = neighbours(&tree, weights, min_samples);
     let mut core = vec![0.0; n];
@@ -321,7 +317,7 @@ mod tests {
     use super::*;
     use crate::core_distances;
     use crate::kdtree::Unique;
-    use crate::spanning_forest;
+    use crate::linkage::spanning_forest;
     use proptest::prelude::*;
 
     /// The spanning tree from all pairs in order.

@@ -17,9 +17,8 @@ mod predict;
 mod select;
 
 pub use agreement::adjusted_rand;
-pub use boruvka::spanning_tree;
 pub use condense::{CondensedEdge, CondensedTree};
-pub use linkage::{Edge, spanning_forest};
+pub use linkage::Edge;
 pub use neighbours::core_distances;
 pub use predict::{Prediction, approximate_predict};
 pub use select::Selection;
@@ -78,7 +77,7 @@ pub fn cluster(points: &[f32], dim: usize, options: &Options) -> Clustering {
     assert!(dim > 0 && points.len().is_multiple_of(dim), "points are [n][dim]");
     assert!(points.iter().all(|v| v.is_finite()), "points are finite");
     let unique = kdtree::Unique::new(points, dim);
-    let (edges, core) = spanning_tree(&unique.points, dim, &unique.weights, options.min_samples);
+    let (edges, core) = boruvka::spanning_tree(&unique.points, dim, &unique.weights, options.min_samples);
     let tree = condense::condense(&edges, &unique.weights, &core, options.min_cluster_size);
     select::label(tree, &unique.of_point, options)
 }
@@ -89,7 +88,7 @@ pub fn cluster(points: &[f32], dim: usize, options: &Options) -> Clustering {
 /// # Panics
 /// When an edge names a point beyond `n` or has a weight that is NaN or negative.
 pub fn cluster_graph(n: usize, edges: impl Into<Vec<Edge>>, options: &Options) -> Clustering {
-    let forest = spanning_forest(n, edges);
+    let forest = linkage::spanning_forest(n, edges);
     let tree = condense::condense(&forest, &vec![1; n], &vec![0.0; n], options.min_cluster_size);
     let identity: Vec<u32> = (0..n as u32).collect();
     select::label(tree, &identity, options)

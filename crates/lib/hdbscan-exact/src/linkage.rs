@@ -66,10 +66,7 @@ impl UnionFind {
 
 /// The minimum spanning tree of a graph over `n` points (Kruskal), n - 1 edges in ascending order; parts that are not
 /// connected are joined, lowest index first, by edges of infinite weight.
-///
-/// # Panics
-/// When an edge names a point beyond `n` or has a weight that is NaN or negative.
-pub fn spanning_forest(n: usize, edges: impl Into<Vec<Edge>>) -> Vec<Edge> {
+pub(crate) fn spanning_forest(n: usize, edges: impl Into<Vec<Edge>>) -> Vec<Edge> {
     let mut sorted: Vec<Edge> = edges.into();
     assert!(sorted.par_iter().all(|e| (e.b as usize) < n && e.weight >= 0.0), "edges lie within the points");
     sorted.par_sort_unstable_by(Edge::order);
