@@ -89,15 +89,15 @@ impl<T: Real> Model<T> {
                 .map(|row| row_moments(&row.iter().map(|v| v.get()).collect::<Vec<_>>()))
                 .collect(),
         };
-        let hat = output.iter().enumerate().map(|(i, v)| T::of(self.moment(&moments, i).apply(v.get()))).collect();
+        let hat = output.iter().enumerate().map(|(i, v)| T::of(moments[self.group(i)].apply(v.get()))).collect();
         Propagated { hat, activations, moments }
     }
 
-    /// The moments that standardise entry `i` of an `[M][d]` array.
-    fn moment<'a>(&self, moments: &'a [Moments], i: usize) -> &'a Moments {
+    /// Which of the moments standardise entry `i` of an `[M][d]` array.
+    fn group(&self, i: usize) -> usize {
         match self.options.norm_axis {
-            Axis::Channel => &moments[i % self.dim],
-            Axis::Gaussian => &moments[i / self.dim],
+            Axis::Channel => i % self.dim,
+            Axis::Gaussian => i / self.dim,
         }
     }
 
@@ -337,14 +337,10 @@ impl<T: Real> Model<T> {
     fn unstandardised(&self, context: &Context, propagated: &Propagated<T>, g: &[f64]) -> Vec<T> {
         let d = self.dim;
         let groups = propagated.moments.len();
-        let group = |i: usize| match self.options.norm_axis {
-            Axis::Channel => i % d,
-            Axis::Gaussian => i / d,
-        };
         let (mut sum_g, mut sum_gy) = (vec![0.0; groups], vec![0.0; groups]);
         for (i, (&g, y)) in g.iter().zip(&propagated.hat).enumerate() {
-            sum_g[group(i)] += g;
-            sum_gy[group(i)] += g * y.get();
+            sum_g[self.group(i)] += g;
+            sum_gy[self.group(i)] += g * y.get();
         }
         let weight = |i: usize| match self.options.norm_axis {
             Axis::Channel => f64::from(context.served[i / d]),
@@ -355,7 +351,7 @@ impl<T: Real> Model<T> {
             .enumerate()
             .with_min_len(CHUNK)
             .map(|(i, (&g, y))| {
-                let c = group(i);
+                let c = self.group(i);
                 T::of(propagated.moments[c].backward(weight(i), g, y.get(), sum_g[c], sum_gy[c]))
             })
             .collect()

@@ -49,15 +49,10 @@ pub(super) struct Rows {
     value: Vec<f32>,
 }
 
-impl Rows {
-    fn row(&self, i: usize) -> (&[u32], &[f32]) {
-        let range = self.start[i] as usize..self.start[i + 1] as usize;
-        (&self.mask[range.clone()], &self.value[range])
-    }
-}
-
 fn row_of(rows: &[Rows], i: usize) -> (&[u32], &[f32]) {
-    rows[i / CHUNK].row(i % CHUNK)
+    let (rows, i) = (&rows[i / CHUNK], i % CHUNK);
+    let range = rows.start[i] as usize..rows.start[i + 1] as usize;
+    (&rows.mask[range.clone()], &rows.value[range])
 }
 
 /// The same entries by Gaussian that `columns` has by mask, with Gaussians ascending.
@@ -136,19 +131,14 @@ fn patches(n: usize, neighbours: &Neighbours<'_>) -> Vec<Vec<u32>> {
     out
 }
 
-struct Scratch {
-    /// Where each Gaussian's row is in the block's copy.
-    place: Vec<u32>,
-    /// Each mask's number within the block.
-    local: Vec<u32>,
-}
-
-/// S B of the Gaussians of a patch, with its sums over rows, in the patch's order, and over the block's masks.
+/// S B of the Gaussians of a patch, with its sums over rows, in the patch's order, and over the block's masks. Room is needed
+/// for where each Gaussian's row is in the block's copy, and for each mask's number within the block, `u32::MAX` outside it.
 fn smoothed(
     patch: Vec<u32>,
     rows: &[Rows],
     neighbours: &Neighbours<'_>,
-    scratch: &mut Scratch,
+    place: &mut [u32],
+    local: &mut [u32],
 ) -> (Block, Vec<f64>, Vec<f64>) {
     // Whose evidence counts: the patch and what surrounds it.
     let mut around: Vec<u32> = patch.clone();
@@ -158,26 +148,26 @@ fn smoothed(
     let mut masks: Vec<u32> = Vec::new();
     for &i in &around {
         for &k in row_of(rows, i as usize).0 {
-            if scratch.local[k as usize] == u32::MAX {
-                scratch.local[k as usize] = 0;
+            if local[k as usize] == u32::MAX {
+                local[k as usize] = 0;
                 masks.push(k);
             }
         }
     }
     masks.sort_unstable();
     for (at, &k) in masks.iter().enumerate() {
-        scratch.local[k as usize] = at as u32;
+        local[k as usize] = at as u32;
     }
     // Their rows by the block's numbers.
     let (mut start, mut mask, mut value) = (vec![0], Vec::<u32>::new(), Vec::<f32>::new());
     for (at, &i) in around.iter().enumerate() {
-        scratch.place[i as usize] = at as u32;
+        place[i as usize] = at as u32;
         let (k, v) = row_of(rows, i as usize);
-        mask.extend(k.iter().map(|&k| scratch.local[k as usize]));
+        mask.extend(k.iter().map(|&k| local[k as usize]));
         value.extend_from_slice(v);
         start.push(mask.len());
     }
-    masks.iter().for_each(|&k| scratch.local[k as usize] = u32::MAX);
+    masks.iter().for_each(|&k| local[k as usize] = u32::MAX);
 
     let mut block = Block { start: vec![0], ..Block::default() };
     let (mut row_sums, mut column_sums) = (Vec::with_capacity(patch.len()), vec![0.0f64; masks.len()]);
@@ -185,7 +175,7 @@ fn smoothed(
     for &i in &patch {
         let mut count = 0;
         let mut add = |j: usize| {
-            let range = start[scratch.place[j] as usize]..start[scratch.place[j] as usize + 1];
+            let range = start[place[j] as usize]..start[place[j] as usize + 1];
             mask[range.clone()].iter().zip(&value[range]).for_each(|(&k, v)| sum[k as usize] += v);
             count += 1;
         };
@@ -213,11 +203,11 @@ fn smoothed(
 /// C from the evidence.
 pub(super) fn matrix(masks: Vec<u32>, rows: Vec<Rows>, neighbours: &Neighbours<'_>) -> Matrix {
     let n = rows.iter().map(|r| r.start.len() - 1).sum();
-    let scratch = || Scratch { place: vec![0; n], local: vec![u32::MAX; masks.len()] };
+    let room = || (vec![0; n], vec![u32::MAX; masks.len()]);
     let made: Vec<(Block, Vec<f64>, Vec<f64>)> = patches(n, neighbours)
         .into_par_iter()
         .with_min_len(16)
-        .map_init(scratch, |scratch, patch| smoothed(patch, &rows, neighbours, scratch))
+        .map_init(room, |(place, local), patch| smoothed(patch, &rows, neighbours, place, local))
         .collect();
     drop(rows);
     let inverse_root = |v: f64| if v > 0.0 { 1.0 / v.sqrt() } else { 0.0 };
