@@ -8,6 +8,7 @@ use gs_io::{Error, Result};
 use hdbscan_exact::Clustering;
 use kiddo::{ImmutableKdTree, SquaredEuclidean};
 use rayon::prelude::*;
+use std::collections::HashSet;
 use std::num::NonZero;
 
 /// The instances of all Gaussians of a scene.
@@ -40,15 +41,12 @@ impl Assignment {
     /// ties go to the lower index. Nothing changes where no Gaussian has one.
     pub fn fill_from_nearest(&mut self, means: &[[f32; 3]], wanted: impl Fn(usize) -> bool + Sync) -> Result<()> {
         let finite = |p: &[f32; 3]| p.iter().all(|v| v.is_finite());
-        // Distinct places only: the tree cannot split heaps of coincident points.
-        let mut known: Vec<u32> =
-            (0..means.len() as u32).filter(|&i| self.labels[i as usize] >= 0 && finite(&means[i as usize])).collect();
-        known.sort_by(|&a, &b| {
-            let (p, q) = (means[a as usize], means[b as usize]);
-            p[0].total_cmp(&q[0]).then(p[1].total_cmp(&q[1])).then(p[2].total_cmp(&q[2])).then(a.cmp(&b))
-        });
-        known.dedup_by(|b, a| means[*a as usize] == means[*b as usize]);
-        known.sort_unstable();
+        // The first Gaussian of each place: the tree cannot split heaps of coincident points. Adding zero makes -0 to 0.
+        let mut places = HashSet::new();
+        let known: Vec<u32> = (0..means.len() as u32)
+            .filter(|&i| self.labels[i as usize] >= 0 && finite(&means[i as usize]))
+            .filter(|&i| places.insert(means[i as usize].map(|v| (v + 0.0).to_bits())))
+            .collect();
         let Some(&first) = known.first() else { return Ok(()) };
         // Centred, so that far-away scenes keep their digits.
         let origin = means[first as usize];

@@ -87,12 +87,6 @@ impl<'a> FeatureTable<'a> {
     }
 }
 
-/// Coordinates of a tile's pixels within the tile.
-fn pixels(t: &TileWeights<'_>) -> impl Iterator<Item = (usize, usize)> + use<> {
-    let (width, height) = (t.width, t.height);
-    (0..height).flat_map(move |y| (0..width).map(move |x| (x, y)))
-}
-
 /// The masks in a tile, and of each level which of them every pixel belongs to (index into `ids`).
 struct TileMasks {
     ids: Vec<u32>,
@@ -105,7 +99,7 @@ impl TileMasks {
         for &level in levels {
             let map = maps.level(level);
             let mut at = [None; PIXELS];
-            for (x, y) in pixels(t) {
+            for (x, y) in (0..t.height).flat_map(|y| (0..t.width).map(move |x| (x, y))) {
                 let Ok(id) = u32::try_from(map[(t.y0 + y) * maps.width + t.x0 + x]) else { continue };
                 let known = out.ids.iter().position(|&k| k == id).unwrap_or_else(|| {
                     out.ids.push(id);
@@ -288,17 +282,13 @@ mod tests {
     #[test]
     fn areas_and_features_are_those_of_rendered_images() {
         // Without and with the 2D filter, as a marked geometry asks for; it shrinks what is smaller than a pixel.
-        let areas = [false, true].map(|antialias| {
-            let geometry = Geometry { antialias, ..Geometry::default() };
-            are_those_of_rendered_images(
-                &RasterOptions::of(&geometry),
-                &RasterOptions { antialias, ..Default::default() },
-            )
-        });
+        let areas = [false, true].map(are_those_of_rendered_images);
         assert!(areas[1] < areas[0], "{areas:?}");
     }
 
-    fn are_those_of_rendered_images(raster: &RasterOptions, options: &RasterOptions) -> u32 {
+    fn are_those_of_rendered_images(antialias: bool) -> u32 {
+        let raster = &RasterOptions::of(&Geometry { antialias, ..Geometry::default() });
+        let options = &RasterOptions { antialias, ..RasterOptions::default() };
         let (mut g, camera) = scene();
         // Half transparent, so that silhouettes have shades.
         g.opacity_logits = vec![2.5, 2.0, 1.5];

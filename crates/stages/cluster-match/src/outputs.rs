@@ -13,14 +13,6 @@ use std::path::Path;
 /// What is written beside the output, by extension: coloured Gaussians, labels, and the instances as text.
 pub(crate) const SIDE_FILES: [&str; 3] = ["ply", "labels.npy", "json"];
 
-/// What the record of the run says of the clustering.
-pub(crate) struct Figures {
-    /// Gaussians that the clustering called noise.
-    pub noise: usize,
-    /// Seconds that it took.
-    pub clustering_seconds: f64,
-}
-
 /// The right to write the instances and what lies beside them.
 pub(crate) fn claim(a: &Args, stage: &Stage) -> Result<Claim> {
     let mut maps = Vec::new();
@@ -37,14 +29,16 @@ pub(crate) fn claim(a: &Args, stage: &Stage) -> Result<Claim> {
     a.per_instance_plys.iter().fold(outputs, Outputs::folder).claim()
 }
 
-/// Writes everything, the artifact last: where it is new, so is everything beside it.
+/// Writes everything, the artifact last: where it is new, so is everything beside it. `noise` counts the Gaussians that the
+/// clustering called so.
 pub(crate) fn write(
     a: &Args,
     stage: &Stage,
     inputs: &Inputs,
     instances: &Instances,
     settings: &Settings,
-    figures: &Figures,
+    noise: usize,
+    clustering_seconds: f64,
     claim: &mut Claim,
 ) -> Result<()> {
     let fail = |e: serde_json::Error| Error::new(e.to_string());
@@ -63,8 +57,8 @@ pub(crate) fn write(
     health.say(stage);
     let summary = json!({
         "largest_share": health.largest, "mask_purity": health.purity,
-        "instances": instances.len(), "noise": figures.noise, "matched": matched, "matches": instances.matches.len(),
-        "clustering_seconds": figures.clustering_seconds,
+        "instances": instances.len(), "noise": noise, "matched": matched, "matches": instances.matches.len(),
+        "clustering_seconds": clustering_seconds,
     });
     stage.record(claim, parameters.clone(), inputs.hashes.clone(), summary)?;
     instances.write(&a.out, stage.provenance(Instances::FORMAT, 1, parameters, inputs.hashes.clone()))?;

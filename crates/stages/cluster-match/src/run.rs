@@ -7,7 +7,7 @@ use crate::group::group;
 use crate::inputs::{Inputs, mask_features};
 use crate::memory;
 use crate::options::{Args, Noise, Settings};
-use crate::outputs::{self, Figures};
+use crate::outputs;
 use artifacts::{Instances, MaskFeatures, MaskMaps, Match, maps_path};
 use gs_io::{Error, Result, Watched};
 use gs_raster::RasterOptions;
@@ -49,7 +49,7 @@ impl Program for Args {
         let start = Instant::now();
         let clustering = group(&inputs.features, &inputs.graph, settings.cluster, &settings.hdbscan());
         let noise = clustering.labels.iter().filter(|&&l| l < 0).count();
-        let figures = Figures { noise, clustering_seconds: start.elapsed().as_secs_f64() };
+        let seconds = start.elapsed().as_secs_f64();
         let found = Assignment::new(&clustering, &inputs.graph.kept, inputs.geometry.gaussians.len());
         drop(clustering);
         stage.info(&format!(
@@ -74,7 +74,7 @@ impl Program for Args {
         let described = describe(means, found.labels, found.instances, matches, &features);
         let instances = Instances { views, tree: found.tree, node: found.nodes, ..described };
         watched.check()?;
-        outputs::write(a, stage, &inputs, &instances, &settings, &figures, &mut claim)
+        outputs::write(a, stage, &inputs, &instances, &settings, noise, seconds, &mut claim)
     }
 }
 
