@@ -12,23 +12,6 @@ use rayon::prelude::*;
 /// Gaussians whose parameters' gradients one task computes.
 const CHUNK: usize = 512;
 
-/// d loss / d every parameter, given d loss / d every pixel of the view that `forward` rendered with the same arguments.
-///
-/// # Panics
-/// When a gradient image has another size than the rendered view, or is that of a depth that was not rendered.
-pub fn backward(
-    g: &Gaussians,
-    camera: &Camera,
-    options: &RasterOptions,
-    forward: &Forward,
-    d: PixelGradients<'_>,
-) -> Gradients {
-    let (mut pairs, mut gradients) = (Vec::new(), Gradients::default());
-    pair_gradients(forward, camera, options, d, &mut pairs);
-    gather(g, options, &forward.tiles, &pairs, &mut gradients);
-    gradients
-}
-
 /// d loss / d splat for every splat of every tile, in the order of the tiles' entries.
 pub(crate) fn pair_gradients(
     forward: &Forward,
@@ -42,23 +25,22 @@ pub(crate) fn pair_gradients(
     assert!(d.depth.is_none() || options.depth, "the gradient of a depth that was not rendered");
     assert!(d.alpha.is_none_or(|a| a.len() == pixels) && d.depth.is_none_or(|z| z.len() == pixels));
     let tiles = &forward.tiles;
-    let w = tiles.lens.width as usize;
     // One gradient per tile and Gaussian, each tile writing its own slice.
     pairs.resize(tiles.entries.len(), SplatGradient::default());
     let mut slices = Vec::with_capacity(tiles.count());
     let mut rest = &mut pairs[..];
     for t in 0..tiles.count() {
-        let (head, tail) = rest.split_at_mut(tiles.list(t).len());
+        let (head, tail) = rest.split_at_mut(tiles.tile(t).list.len());
         slices.push(head);
         rest = tail;
     }
     slices.into_par_iter().enumerate().for_each(|(t, out)| {
         if !out.is_empty() {
-            let rectangle = tiles.rectangle(t);
-            let mut tile = pixel_gradients(forward, options, d, w, rectangle);
+            let tile = tiles.tile(t);
+            let mut of_pixels = pixel_gradients(forward, options, d, tile.rectangle);
             // The kernel does not come to those behind where all pixels have stopped.
             out.fill(SplatGradient::default());
-            backward_tile(&tiles.splats, tiles.list(t), rectangle, d.depth.is_some(), &mut tile, out);
+            backward_tile(tile, d.depth.is_some(), &mut of_pixels, out);
         }
     });
 }
@@ -120,10 +102,10 @@ pub(crate) fn gather(
                     overflowed += 1;
                     continue;
                 };
-                means[k] = p.mean;
-                log_scales[k] = p.log_scale;
-                rotations[k] = p.rotation;
-                opacity_logits[k] = p.opacity_logit;
+                means[k].copy_from_slice(&p[..3]);
+                log_scales[k].copy_from_slice(&p[3..6]);
+                rotations[k].copy_from_slice(&p[6..10]);
+                opacity_logits[k] = p[10];
                 mean2d[k] = sums[l].mean;
             }
         }
@@ -137,7 +119,6 @@ fn pixel_gradients(
     forward: &Forward,
     options: &RasterOptions,
     d: PixelGradients<'_>,
-    w: usize,
     (x0, y0, tw, th): (usize, usize, usize, usize),
 ) -> Box<TileGradients> {
     let mut tile = Box::new(TileGradients {
@@ -147,6 +128,7 @@ fn pixel_gradients(
         behind: [0.0; PIXELS],
     });
     let r = &forward.rendered;
+    let w = r.width as usize;
     for y in 0..th {
         for x in 0..tw {
             let (from, to) = ((y0 + y) * w + x0 + x, y * TILE + x);

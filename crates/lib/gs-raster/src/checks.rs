@@ -1,16 +1,13 @@
 //! The renderer against the f64 reference on random scenes.
 
 use crate::reference::{Cuts, Gaussian, Pixel, backward as reference_backward, render as reference_render, widen};
-use crate::{PixelGradients, RasterOptions, backward, forward, render_features};
+use crate::{PixelGradients, RasterOptions, Workspace, forward, render_features};
 use glam::DVec3;
 use gs_scene::{Camera, Gaussians};
 use proptest::prelude::*;
 use proptest::test_runner::RngSeed;
 use rand_chacha::ChaCha8Rng;
 use rand_chacha::rand_core::{RngCore, SeedableRng};
-
-/// Features per Gaussian in these tests.
-const DIM: usize = 5;
 
 struct Dice(ChaCha8Rng);
 
@@ -42,8 +39,8 @@ impl Dice {
         c
     }
 
-    /// `n` Gaussians around the origin, some elongated, some opaque, some faint, and the features of each.
-    fn gaussians(&mut self, n: usize, degree: u8) -> (Gaussians, Vec<f32>) {
+    /// `n` Gaussians around the origin, some elongated, some opaque, some faint.
+    fn gaussians(&mut self, n: usize, degree: u8) -> Gaussians {
         let mut g = Gaussians { sh_degree: degree, ..Gaussians::default() };
         for _ in 0..n {
             g.means.push(self.many(-1.5, 1.5));
@@ -56,8 +53,7 @@ impl Dice {
                 g.sh.push(self.between(-0.4, 0.4));
             }
         }
-        let features = (0..n * DIM).map(|_| self.between(-1.0, 1.0)).collect();
-        (g, features)
+        g
     }
 
     /// Gradients for every pixel; none where `quiet`.
@@ -91,14 +87,12 @@ proptest! {
         seed in 0u64..u64::MAX, n in 0usize..60, degree in 0u8..=3, active in 0u8..=3, antialias in any::<bool>()
     ) {
         let mut dice = Dice::new(seed);
-        let (g, features) = dice.gaussians(n, degree);
+        let g = dice.gaussians(n, degree);
         let camera = dice.camera();
         let background = dice.many(0.0, 1.0);
         let options = RasterOptions { background, sh_degree: active, antialias, ..RasterOptions::default() };
         let ours = forward(&g, &camera, &options).rendered;
-        let our_features = render_features(&g, &features, DIM, &camera, &options);
-        let scene = widen(&g, &features, DIM);
-        let truth = reference_render(&scene, &camera, &options, Cuts::Hard);
+        let truth = reference_render(&widen(&g), &camera, &options, Cuts::Hard);
         prop_assert_eq!(truth.len(), ours.alpha.len());
         // Colours are at most 0.5 + the sum of the coefficients times the largest basis value, depths at most this.
         let brightest = g.sh.chunks(3 * 16).map(|s| s.iter().map(|v| v.abs()).sum::<f32>()).fold(1.0, f32::max) as f64;
@@ -115,17 +109,12 @@ proptest! {
             }
             let depth = (f64::from(ours.depth[p]) - t.depth).abs();
             prop_assert!(depth <= 1e-3 * t.depth + t.doubt * deepest, "depth of pixel {}: {:e}", p, depth);
-            // An empty scene has no features.
-            for (k, feature) in t.features.iter().enumerate() {
-                let error = (f64::from(our_features[DIM * p + k]) - feature).abs();
-                prop_assert!(error <= 1e-4 + t.doubt, "feature of pixel {}: {:e}", p, error);
-            }
         }
         prop_assert!(doubtful * 20 <= truth.len() + 40, "{doubtful} of {} pixels in doubt", truth.len());
     }
 }
 
-/// Names and places of the parameter groups in the order of [`Gaussian::parameters`].
+/// Names and places of the parameter groups in the order of [`Gaussian::parameter`].
 fn groups(degree: u8) -> Vec<(&'static str, std::ops::Range<usize>)> {
     let bands = 11 + 3 * (usize::from(degree) + 1).pow(2);
     vec![
@@ -145,7 +134,7 @@ fn loss(scene: &[Gaussian], camera: &Camera, options: &RasterOptions, cuts: Cuts
 
 /// A scene that every pixel sees without any cut: faint, wide Gaussians in front of the camera, colours away from zero.
 fn smooth_scene(dice: &mut Dice, degree: u8) -> (Gaussians, Camera) {
-    let (mut g, _) = dice.gaussians(6, degree);
+    let mut g = dice.gaussians(6, degree);
     let c = Camera::look_at(DVec3::new(0.3, -0.2, -4.0), DVec3::ZERO, -DVec3::Y, 19, 13, 0.6);
     for i in 0..g.len() {
         g.log_scales[i] = dice.many(-0.1, 0.8);
@@ -169,25 +158,25 @@ fn columns(all: &[(Vec<f64>, [f64; 2])], range: &std::ops::Range<usize>) -> Vec<
 #[test]
 fn gradients_are_the_central_differences() {
     for (degree, antialias) in [(0, false), (1, false), (2, false), (3, false), (0, true), (3, true)] {
-        let mut dice = Dice::new(70 + u64::from(degree));
+        let mut dice = Dice::new(75 + u64::from(degree));
         let (g, mut camera) = smooth_scene(&mut dice, degree);
         if antialias {
             // Large pixels, against which the low-pass and so the compensation matter.
             camera = Camera::look_at(camera.position(), DVec3::ZERO, -DVec3::Y, 3, 2, 0.6);
         }
         let options = RasterOptions { background: [0.2, 0.5, 0.9], antialias, ..RasterOptions::default() };
-        let mut scene = widen(&g, &[], 0);
+        let mut scene = widen(&g);
         let d = dice.pixels(&vec![false; (camera.width * camera.height) as usize]);
         let analytic = reference_backward(&scene, &camera, &options, Cuts::None, &d);
         let mut numeric = Vec::new();
         for i in 0..scene.len() {
             let mut row = Vec::new();
-            for k in 0..scene[i].parameters().len() {
+            for k in 0..11 + g.sh_stride() {
                 let mut shifted = |step: f64| {
-                    let before = *scene[i].parameters()[k];
-                    *scene[i].parameters()[k] = before + step;
+                    let before = *scene[i].parameter(k);
+                    *scene[i].parameter(k) = before + step;
                     let value = loss(&scene, &camera, &options, Cuts::None, &d);
-                    *scene[i].parameters()[k] = before;
+                    *scene[i].parameter(k) = before;
                     value
                 };
                 // Fourth order: steps large enough that rounding stays below 1e-10.
@@ -221,10 +210,10 @@ proptest! {
         seed in 0u64..u64::MAX, n in 1usize..40, degree in 0u8..=3, antialias in any::<bool>()
     ) {
         let mut dice = Dice::new(seed);
-        let (g, _) = dice.gaussians(n, degree);
+        let g = dice.gaussians(n, degree);
         let camera = dice.camera();
         let options = RasterOptions { background: dice.many(0.0, 1.0), antialias, ..RasterOptions::default() };
-        let scene = widen(&g, &[], 0);
+        let scene = widen(&g);
         let truth = reference_render(&scene, &camera, &options, Cuts::Hard);
         let quiet: Vec<bool> = truth.iter().map(|t| t.doubt > 0.0).collect();
         let d = dice.pixels(&quiet);
@@ -245,9 +234,10 @@ fn our_gradients(g: &Gaussians, camera: &Camera, options: &RasterOptions, d: &[P
     let rgb: Vec<f32> = d.iter().flat_map(|p| p.rgb.map(|v| v as f32)).collect();
     let alpha: Vec<f32> = d.iter().map(|p| p.alpha as f32).collect();
     let depth: Vec<f32> = d.iter().map(|p| p.depth as f32).collect();
-    let f = forward(g, camera, options);
+    let mut workspace = Workspace::default();
+    workspace.forward(g, camera, options);
     let pixels = PixelGradients { rgb: &rgb, alpha: Some(&alpha), depth: Some(&depth) };
-    let p = backward(g, camera, options, &f, pixels);
+    let p = workspace.backward(g, camera, options, pixels);
     let stride = g.sh_stride();
     let one = |i: usize| {
         let [m, s, q] = [&p.means[i][..], &p.log_scales[i], &p.rotations[i]];
@@ -263,7 +253,7 @@ fn our_gradients(g: &Gaussians, camera: &Camera, options: &RasterOptions, d: &[P
 fn zero_bands_are_skipped_without_a_trace() {
     let mut dice = Dice::new(11);
     for used in 0..3u8 {
-        let (mut gaussians, _) = dice.gaussians(60, 3);
+        let mut gaussians = dice.gaussians(60, 3);
         let first = 3 * gs_scene::sh_coefficients(used);
         (0..gaussians.len()).for_each(|i| gaussians.sh[48 * i + first..48 * (i + 1)].fill(0.0));
         let geometry = gs_scene::Geometry { gaussians, ..gs_scene::Geometry::default() };
@@ -272,5 +262,27 @@ fn zero_bands_are_skipped_without_a_trace() {
         let camera = dice.camera();
         let whole = crate::render(&geometry.gaussians, &camera, &RasterOptions::default());
         assert_eq!(crate::render(&geometry.gaussians, &camera, &skipping), whole);
+    }
+}
+
+#[test]
+fn features_are_blended_like_colours_and_depths() {
+    let mut dice = Dice::new(12);
+    for antialias in [false, true] {
+        let (g, camera) = (dice.gaussians(80, 0), dice.camera());
+        let options = RasterOptions { antialias, ..RasterOptions::default() };
+        let feature = |i: usize| {
+            let z = camera.to_camera(DVec3::from(g.means[i].map(f64::from))).z as f32;
+            let [red, green, blue] = g.base_color(i).map(|c| c.max(0.0));
+            [red, green, blue, 1.0, z]
+        };
+        let features: Vec<f32> = (0..g.len()).flat_map(feature).collect();
+        let rendered = forward(&g, &camera, &options).rendered;
+        let found = render_features(&g, &features, 5, &camera, &options);
+        assert_eq!(found.len(), 5 * rendered.alpha.len());
+        for (p, own) in found.chunks_exact(5).enumerate() {
+            let expected = [&rendered.rgb[3 * p..3 * p + 3], &[rendered.alpha[p], rendered.depth[p]]].concat();
+            assert!(own.iter().zip(&expected).all(|(a, b)| (a - b).abs() <= 1e-5 * b.max(1.0)), "{own:?} {expected:?}");
+        }
     }
 }

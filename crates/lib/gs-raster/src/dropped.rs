@@ -1,24 +1,5 @@
 //! Gaussians that are not drawn, and why.
 
-/// Why a Gaussian is not drawn.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(crate) enum Unseen {
-    NotFinite,
-    Behind,
-    Degenerate,
-    Transparent,
-    Outside,
-}
-
-impl Unseen {
-    /// From `Projected::unseen`; none for what is drawn.
-    pub fn of(code: f64) -> Option<Self> {
-        [Self::NotFinite, Self::Behind, Self::Degenerate, Self::Transparent, Self::Outside]
-            .get((code as usize).wrapping_sub(1))
-            .copied()
-    }
-}
-
 /// How many Gaussians were not drawn, and why. A Gaussian counts once, under the first reason that holds.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
 pub struct Dropped {
@@ -40,14 +21,10 @@ impl Dropped {
         self.not_finite + self.behind + self.degenerate + self.transparent + self.outside
     }
 
-    pub(crate) fn count(&mut self, reason: Unseen) {
-        *match reason {
-            Unseen::NotFinite => &mut self.not_finite,
-            Unseen::Behind => &mut self.behind,
-            Unseen::Degenerate => &mut self.degenerate,
-            Unseen::Transparent => &mut self.transparent,
-            Unseen::Outside => &mut self.outside,
-        } += 1;
+    /// Counts one, for the reason of this position from 1.
+    pub(crate) fn count(&mut self, reason: usize) {
+        let Self { not_finite, behind, degenerate, transparent, outside } = self;
+        *[not_finite, behind, degenerate, transparent, outside][reason - 1] += 1;
     }
 
     pub(crate) fn add(&mut self, o: &Self) {

@@ -67,8 +67,9 @@ pub(crate) fn composite(tiles: &Tiles, options: &RasterOptions, rendered: &mut R
         let mut evaluated = 0;
         for column in 0..tiles.columns {
             let t = band * tiles.columns + column;
-            let (x0, y0, tw, th) = tiles.rectangle(t);
-            let p = forward_tile(&tiles.splats, tiles.list(t), (x0, y0, tw, th), options.depth);
+            let tile = tiles.tile(t);
+            let (x0, _, tw, th) = tile.rectangle;
+            let p = forward_tile(tile, options.depth);
             evaluated += p.evaluated;
             for y in 0..th {
                 for x in 0..tw {

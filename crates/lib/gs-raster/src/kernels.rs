@@ -34,6 +34,15 @@ const POWERS: Row = {
 type Rectangle = (usize, usize, usize, usize);
 type Row = [f32; TILE];
 
+/// A tile of a view.
+#[derive(Clone, Copy)]
+pub(crate) struct Tile<'a> {
+    pub splats: &'a [Splat],
+    /// Positions in `splats` of the Gaussians that touch it, front to back.
+    pub list: &'a [u32],
+    pub rectangle: Rectangle,
+}
+
 /// 2^q for -100 <= q <= 100, with a relative error below 5e-7: 2^round(q) by the exponent's bits, the rest by a polynomial
 /// through 1 at 0 and Chebyshev nodes of [-1/2, 1/2].
 #[inline(always)]
@@ -199,26 +208,23 @@ pub(crate) struct TilePixels {
     pub evaluated: usize,
 }
 
-/// Composites a tile. `list` holds positions in `splats`; without `depth` that stays zero.
-pub(crate) fn forward_tile(splats: &[Splat], list: &[u32], rectangle: Rectangle, depth: bool) -> Box<TilePixels> {
+/// Composites a tile; without `depth` that stays zero.
+pub(crate) fn forward_tile(tile: Tile<'_>, depth: bool) -> Box<TilePixels> {
     match depth {
-        true => Arch::new().dispatch(ForwardTile::<true> { splats, list, rectangle }),
-        false => Arch::new().dispatch(ForwardTile::<false> { splats, list, rectangle }),
+        true => Arch::new().dispatch(ForwardTile::<true>(tile)),
+        false => Arch::new().dispatch(ForwardTile::<false>(tile)),
     }
 }
 
-struct ForwardTile<'a, const DEPTH: bool> {
-    splats: &'a [Splat],
-    list: &'a [u32],
-    rectangle: Rectangle,
-}
+struct ForwardTile<'a, const DEPTH: bool>(Tile<'a>);
 
 impl<const DEPTH: bool> WithSimd for ForwardTile<'_, DEPTH> {
     type Output = Box<TilePixels>;
 
     #[inline(always)]
     fn with_simd<S: Simd>(self, simd: S) -> Box<TilePixels> {
-        let (_, _, width, _) = self.rectangle;
+        let Tile { splats, list, rectangle } = self.0;
+        let (_, _, width, _) = rectangle;
         let lanes = S::F32_LANES.min(TILE);
         let blocks = TILE / lanes;
         let mut out = Box::new(TilePixels {
@@ -230,16 +236,16 @@ impl<const DEPTH: bool> WithSimd for ForwardTile<'_, DEPTH> {
         let TilePixels { rgb: [red, green, blue], depth, transmittance, evaluated } = &mut *out;
         let [red, green, blue] = [red, green, blue].map(|v| vectors_mut::<S>(v));
         let depth = vectors_mut::<S>(depth);
-        let grid = Grid::new(self.rectangle);
+        let grid = Grid::new(rectangle);
         let mut live = [grid.inside; TILE];
         let mut near = [Splat::default(); BATCH];
-        for (n, list) in self.list.chunks(BATCH).enumerate() {
+        for (n, list) in list.chunks(BATCH).enumerate() {
             let t = vectors_mut::<S>(transmittance);
             if n > 0 && !some_go_on(simd, t, grid.inside, &mut live[..blocks]) {
                 break;
             }
             for (near, &entry) in near.iter_mut().zip(list) {
-                *near = self.splats[entry as usize];
+                *near = splats[entry as usize];
             }
             for s in &near[..list.len()] {
                 let falloff = Falloff::new(simd, s, &grid);
@@ -288,31 +294,21 @@ pub(crate) struct TileGradients {
     pub behind: [f32; PIXELS],
 }
 
-/// d loss / d splat for every Gaussian of a tile, in the order of `list`.
+/// d loss / d splat for every Gaussian of a tile, in the order of its list.
 ///
 /// Goes front to back like the forward pass: with s_i = c_i . d rgb + z_i d depth + d alpha, the gradient of alpha_i is
 /// T_i s_i - (sum of w_j s_j behind i) / (1 - alpha_i), and the sum behind is the total less what came before.
 ///
 /// `depth` says whether the gradients of depth are wanted; else they stay zero and leave registers to the rest.
-pub(crate) fn backward_tile(
-    splats: &[Splat],
-    list: &[u32],
-    rectangle: Rectangle,
-    depth: bool,
-    d: &mut TileGradients,
-    out: &mut [SplatGradient],
-) {
-    let arch = Arch::new();
+pub(crate) fn backward_tile(tile: Tile<'_>, depth: bool, d: &mut TileGradients, out: &mut [SplatGradient]) {
     match depth {
-        false => arch.dispatch(BackwardTile::<false> { splats, list, rectangle, d, out }),
-        true => arch.dispatch(BackwardTile::<true> { splats, list, rectangle, d, out }),
+        false => Arch::new().dispatch(BackwardTile::<false> { tile, d, out }),
+        true => Arch::new().dispatch(BackwardTile::<true> { tile, d, out }),
     }
 }
 
 struct BackwardTile<'a, const DEPTH: bool> {
-    splats: &'a [Splat],
-    list: &'a [u32],
-    rectangle: Rectangle,
+    tile: Tile<'a>,
     d: &'a mut TileGradients,
     out: &'a mut [SplatGradient],
 }
@@ -322,7 +318,8 @@ impl<const DEPTH: bool> WithSimd for BackwardTile<'_, DEPTH> {
 
     #[inline(always)]
     fn with_simd<S: Simd>(self, simd: S) {
-        let (_, _, width, _) = self.rectangle;
+        let Tile { splats, list, rectangle } = self.tile;
+        let (_, _, width, _) = rectangle;
         let lanes = S::F32_LANES.min(TILE);
         let blocks = TILE / lanes;
         let TileGradients { rgb: [d_red, d_green, d_blue], depth, alpha, behind } = self.d;
@@ -330,16 +327,16 @@ impl<const DEPTH: bool> WithSimd for BackwardTile<'_, DEPTH> {
             [d_red, d_green, d_blue, depth, alpha].map(|v| vectors::<S>(v));
         let behind = vectors_mut::<S>(behind);
         let mut transmittance = fresh(width);
-        let grid = Grid::new(self.rectangle);
+        let grid = Grid::new(rectangle);
         let mut live = [grid.inside; TILE];
         let mut near = [Splat::default(); BATCH];
-        for (n, (list, out)) in self.list.chunks(BATCH).zip(self.out.chunks_mut(BATCH)).enumerate() {
+        for (n, (list, out)) in list.chunks(BATCH).zip(self.out.chunks_mut(BATCH)).enumerate() {
             let t = vectors_mut::<S>(&mut transmittance);
             if n > 0 && !some_go_on(simd, t, grid.inside, &mut live[..blocks]) {
                 break;
             }
             for (near, &entry) in near.iter_mut().zip(list) {
-                *near = self.splats[entry as usize];
+                *near = splats[entry as usize];
             }
             for (s, out) in near.iter().zip(out) {
                 let falloff = Falloff::new(simd, s, &grid);
@@ -436,21 +433,12 @@ fn folded(row: &Row) -> f32 {
 /// Alphas and blending weights of every Gaussian at every pixel of a tile, `[list][TILE * TILE]`, both zero on entry. With
 /// `early_stop` a pixel takes nothing more once its transmittance is spent; without, alphas go on to the last Gaussian.
 /// Returns the accumulated alpha.
-pub(crate) fn weights_tile(
-    splats: &[Splat],
-    list: &[u32],
-    rectangle: Rectangle,
-    early_stop: bool,
-    alphas: &mut [f32],
-    weights: &mut [f32],
-) -> [f32; PIXELS] {
-    Arch::new().dispatch(WeightsTile { splats, list, rectangle, early_stop, alphas, weights })
+pub(crate) fn weights_tile(tile: Tile<'_>, early_stop: bool, alphas: &mut [f32], weights: &mut [f32]) -> [f32; PIXELS] {
+    Arch::new().dispatch(WeightsTile { tile, early_stop, alphas, weights })
 }
 
 struct WeightsTile<'a> {
-    splats: &'a [Splat],
-    list: &'a [u32],
-    rectangle: Rectangle,
+    tile: Tile<'a>,
     early_stop: bool,
     alphas: &'a mut [f32],
     weights: &'a mut [f32],
@@ -461,17 +449,18 @@ impl WithSimd for WeightsTile<'_> {
 
     #[inline(always)]
     fn with_simd<S: Simd>(self, simd: S) -> [f32; PIXELS] {
-        let (_, _, width, _) = self.rectangle;
+        let Tile { splats, list, rectangle } = self.tile;
+        let (_, _, width, _) = rectangle;
         let lanes = S::F32_LANES.min(TILE);
         let blocks = TILE / lanes;
         let mut transmittance = fresh(if self.early_stop { width } else { TILE });
         let mut accumulated = [0.0f32; PIXELS];
-        let grid = Grid::new(self.rectangle);
+        let grid = Grid::new(rectangle);
         // Columns beyond the image's right edge are no pixels, though without a stop they have a transmittance.
         let inside: Row = std::array::from_fn(|l| if l < width { 1.0 } else { 0.0 });
         let layers = self.alphas.chunks_exact_mut(PIXELS).zip(self.weights.chunks_exact_mut(PIXELS));
-        for (&entry, (alphas, weights)) in self.list.iter().zip(layers) {
-            let s = &self.splats[entry as usize];
+        for (&entry, (alphas, weights)) in list.iter().zip(layers) {
+            let s = &splats[entry as usize];
             let [t, accumulated] = [&mut transmittance, &mut accumulated].map(|v| vectors_mut::<S>(v));
             let (alphas, weights) = (vectors_mut::<S>(alphas), vectors_mut::<S>(weights));
             let falloff = Falloff::new(simd, s, &grid);
@@ -574,20 +563,20 @@ mod tests {
     /// All that the kernels put out for a tile.
     fn everything<S: Simd>(simd: S, splats: &[Splat], rectangle: Rectangle) -> Vec<f32> {
         let list: Vec<u32> = (0..splats.len() as u32).collect();
-        let p = ForwardTile::<true> { splats, list: &list, rectangle }.with_simd(simd);
+        let tile = Tile { splats, list: &list, rectangle };
+        let p = ForwardTile::<true>(tile).with_simd(simd);
         let mut all = [p.rgb.as_flattened(), &p.depth, &p.transmittance].concat();
         let wave = |k: usize| std::array::from_fn(|i| ((k * PIXELS + i) as f32 * 0.3).sin());
         let mut d =
             TileGradients { rgb: [wave(0), wave(1), wave(2)], depth: wave(3), alpha: wave(4), behind: [0.0; PIXELS] };
         let mut out = vec![SplatGradient::default(); splats.len()];
-        BackwardTile::<true> { splats, list: &list, rectangle, d: &mut d, out: &mut out }.with_simd(simd);
+        BackwardTile::<true> { tile, d: &mut d, out: &mut out }.with_simd(simd);
         for o in &out {
             all.extend([&o.mean[..], &o.conic, &[o.opacity, o.depth], &o.color].concat());
         }
         for early_stop in [true, false] {
             let (mut alphas, mut weights) = (vec![0.0; PIXELS * splats.len()], vec![0.0; PIXELS * splats.len()]);
-            let tile =
-                WeightsTile { splats, list: &list, rectangle, early_stop, alphas: &mut alphas, weights: &mut weights };
+            let tile = WeightsTile { tile, early_stop, alphas: &mut alphas, weights: &mut weights };
             all.extend(tile.with_simd(simd));
             all.extend(alphas);
             all.extend(weights);

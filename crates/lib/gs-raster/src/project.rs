@@ -7,7 +7,7 @@
 //! and sheets do not overflow. Nothing here branches or calls a library, so that loops over many Gaussians become vectors.
 
 use crate::types::RasterOptions;
-use gs_scene::Camera;
+use gs_scene::{Camera, Gaussians};
 
 /// Added to the diagonal of the projected covariance, in square pixels.
 const LOW_PASS: f64 = 0.3f32 as f64;
@@ -37,14 +37,27 @@ pub(crate) struct Splat {
     pub clamped: [bool; 3],
 }
 
-/// The parameters of one Gaussian but for its harmonics.
-#[derive(Debug, Clone, Copy)]
-pub(crate) struct Parameters {
-    pub mean: [f64; 3],
-    pub log_scale: [f64; 3],
-    /// w x y z, any length.
-    pub rotation: [f64; 4],
-    pub opacity_logit: f64,
+impl Splat {
+    /// From [`project`]'s values and the colour before it is cut at zero.
+    #[inline(always)]
+    pub fn new(values: Projected<f32>, color: [f32; 3]) -> Self {
+        let [_, x, y, xx, xy, yy, conic_det, width, height, sigma_max, opacity, log2_opacity, depth] = values;
+        let (mean, conic, extent) = ([x, y], [xx, xy, yy], [width, height]);
+        let clamped = color.map(|c| c < 0.0);
+        let color = color.map(|c| c.max(0.0));
+        Self { mean, conic, conic_det, extent, sigma_max, opacity, log2_opacity, depth, color, clamped }
+    }
+}
+
+/// The parameters of one Gaussian but for its harmonics, or derivatives by them: centre, logarithms of the scales, rotation
+/// (w x y z, any length), opacity logit.
+pub(crate) type Parameters<T = f64> = [T; 11];
+
+/// The parameters of Gaussian `i`.
+#[inline(always)]
+pub(crate) fn parameters(g: &Gaussians, i: usize) -> Parameters<f32> {
+    let ([x, y, z], [a, b, c], [qw, qx, qy, qz]) = (g.means[i], g.log_scales[i], g.rotations[i]);
+    [x, y, z, a, b, c, qw, qx, qy, qz, g.opacity_logits[i]]
 }
 
 type V3 = [f64; 3];
@@ -165,8 +178,8 @@ impl Lens {
 
     /// View direction (from the camera to the Gaussian), not normalised.
     #[inline(always)]
-    pub fn direction(&self, mean: V3) -> V3 {
-        [mean[0] - self.position[0], mean[1] - self.position[1], mean[2] - self.position[2]]
+    pub fn direction(&self, p: &Parameters) -> V3 {
+        [p[0] - self.position[0], p[1] - self.position[1], p[2] - self.position[2]]
     }
 }
 
@@ -196,8 +209,8 @@ struct Ellipse {
 
 #[inline(always)]
 fn ellipse(p: &Parameters, lens: &Lens, antialias: bool) -> Ellipse {
-    let t = times(&lens.rotation, lens.direction(p.mean));
-    let [w, x, y, z] = p.rotation;
+    let t = times(&lens.rotation, lens.direction(p));
+    let [_, _, _, s0, s1, s2, w, x, y, z, opacity_logit] = *p;
     let quat_norm = (w * w + x * x + y * y + z * z).sqrt();
     let inverse = 1.0 / quat_norm;
     let quat = [w * inverse, x * inverse, y * inverse, z * inverse];
@@ -207,7 +220,7 @@ fn ellipse(p: &Parameters, lens: &Lens, antialias: bool) -> Ellipse {
         [2.0 * (x * y + w * z), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z - w * x)],
         [2.0 * (x * z - w * y), 2.0 * (y * z + w * x), 1.0 - 2.0 * (x * x + y * y)],
     ];
-    let scale = [exp(p.log_scale[0]), exp(p.log_scale[1]), exp(p.log_scale[2])];
+    let scale = [exp(s0), exp(s1), exp(s2)];
     let rz = 1.0 / t[2];
     let (u, v) = (t[0] * rz, t[1] * rz);
     let inside = [lens.low[0] <= u && u <= lens.high[0], lens.low[1] <= v && v <= lens.high[1]];
@@ -244,25 +257,14 @@ fn ellipse(p: &Parameters, lens: &Lens, antialias: bool) -> Ellipse {
         variance: [aa + LOW_PASS, bb + LOW_PASS],
         conic: [(bb + LOW_PASS) * conic_det, -ab * conic_det, (aa + LOW_PASS) * conic_det],
         conic_det,
-        own_opacity: 1.0 / (1.0 + exp(-p.opacity_logit)),
+        own_opacity: 1.0 / (1.0 + exp(-opacity_logit)),
         compensation: if antialias { (own_det * conic_det).sqrt() } else { 1.0 },
     }
 }
 
-/// A Gaussian in the image, but for its colour.
-#[derive(Default)]
-pub(crate) struct Projected {
-    /// 0 for what is drawn, else the position of the reason in [`crate::dropped::Unseen`], from 1.
-    pub unseen: f64,
-    pub mean: [f64; 2],
-    pub conic: V3,
-    pub conic_det: f64,
-    pub extent: [f64; 2],
-    pub sigma_max: f64,
-    pub opacity: f64,
-    pub log2_opacity: f64,
-    pub depth: f64,
-}
+/// A Gaussian in the image: 0 where it is drawn, else the position of the reason in [`crate::Dropped`], from 1; then the
+/// fields of [`Splat`] before its colour, in order.
+pub(crate) type Projected<T = f64> = [T; 13];
 
 /// Whether single precision holds a value.
 #[inline(always)]
@@ -283,10 +285,9 @@ pub(crate) fn project(p: &Parameters, lens: &Lens, options: &RasterOptions) -> P
     let extent = [reach(e.variance[0]), reach(e.variance[1])];
     let (w, h) = (f64::from(lens.width), f64::from(lens.height));
 
-    let [s, r] = [p.log_scale, [p.rotation[1], p.rotation[2], p.rotation[3]]];
-    let finite = held(e.t[0]) & held(e.t[1]) & held(e.t[2]) & held(s[0]) & held(s[1]) & held(s[2]);
+    let finite = held(e.t[0]) & held(e.t[1]) & held(e.t[2]) & held(p[3]) & held(p[4]) & held(p[5]);
     // Infinite logits are opacities of 0 and 1.
-    let finite = finite & held(r[0]) & held(r[1]) & held(r[2]) & held(p.rotation[0]) & !p.opacity_logit.is_nan();
+    let finite = finite & held(p[6]) & held(p[7]) & held(p[8]) & held(p[9]) & !p[10].is_nan();
     let whole = (e.quat_norm > 1e-12) & held(e.variance[0]) & held(e.variance[1]) & held(e.conic[1]);
     let whole = whole & (e.conic[0] > 1e-38) & (e.conic[2] > 1e-38) & held(e.conic[0]) & held(e.conic[2]);
     let near = (mean[0].abs() <= MEAN_MAX) & (mean[1].abs() <= MEAN_MAX);
@@ -299,8 +300,8 @@ pub(crate) fn project(p: &Parameters, lens: &Lens, options: &RasterOptions) -> P
     let unseen = if e.t[2] > f64::from(options.near) { unseen } else { 2.0 };
     let unseen = if finite { unseen } else { 1.0 };
     let log2_opacity = log * std::f64::consts::LOG2_E;
-    let (conic, conic_det, depth) = (e.conic, e.conic_det, e.t[2]);
-    Projected { unseen, mean, conic, conic_det, extent, sigma_max, opacity, log2_opacity, depth }
+    let ([x, y], [xx, xy, yy], [width, height]) = (mean, e.conic, extent);
+    [unseen, x, y, xx, xy, yy, e.conic_det, width, height, sigma_max, opacity, log2_opacity, e.t[2]]
 }
 
 /// d loss / d splat, summed over pixels.
@@ -327,15 +328,7 @@ impl SplatGradient {
     }
 }
 
-/// d loss / d parameters of one Gaussian, but for its harmonics.
-pub(crate) struct ParameterGradient {
-    pub mean: V3,
-    pub log_scale: V3,
-    pub rotation: [f64; 4],
-    pub opacity_logit: f64,
-}
-
-/// The chain rule through [`project`], for a Gaussian that is drawn; what reaches the centre through the view direction is not
+/// d loss / d parameters by the chain rule through [`project`], for a Gaussian that is drawn; what reaches the centre through the view direction is not
 /// in it, nor is the colour looked at.
 #[inline(always)]
 pub(crate) fn project_backward(
@@ -343,7 +336,7 @@ pub(crate) fn project_backward(
     lens: &Lens,
     options: &RasterOptions,
     d: &SplatGradient<f64>,
-) -> ParameterGradient {
+) -> Parameters {
     let e = ellipse(p, lens, options.antialias);
     // conic = cov^-1:  d cov = -conic^T (d conic) conic, with the off-diagonal counted once in d.conic[1].
     let [a, b, c] = e.conic;
@@ -386,19 +379,17 @@ pub(crate) fn project_backward(
     d_t[2] += -rz2 * (fx * e.t[0] * d.mean[0] + fy * e.t[1] * d.mean[1]) + d.depth;
 
     // ma = S (R^T jw0): d S is d_ma times what it stretches, which is ma / S; and d S S the gradient of log S.
-    let log_scale = [0, 1, 2].map(|k| d_ma[k] * e.a[k] + d_mb[k] * e.b[k]);
+    let [a, b, c] = [0, 1, 2].map(|k| d_ma[k] * e.a[k] + d_mb[k] * e.b[k]);
     // d R = jw0 (S d_ma)^T + jw1 (S d_mb)^T.
     let row = |r: usize| sum(scaled(d_ma_s, e.jw[0][r]), scaled(d_mb_s, e.jw[1][r]));
     let d_quat = quat_backward(e.quat, &[row(0), row(1), row(2)]);
     // q / |q|: the part along q drops out.
     let q = e.quat;
     let along = q[0] * d_quat[0] + q[1] * d_quat[1] + q[2] * d_quat[2] + q[3] * d_quat[3];
-    ParameterGradient {
-        mean: transposed_times(&lens.rotation, d_t),
-        log_scale,
-        rotation: [0, 1, 2, 3].map(|k| (d_quat[k] - along * q[k]) / e.quat_norm),
-        opacity_logit: d.opacity * e.own_opacity * e.compensation * (1.0 - e.own_opacity),
-    }
+    let [x, y, z] = transposed_times(&lens.rotation, d_t);
+    let [qw, qx, qy, qz] = [0, 1, 2, 3].map(|k| (d_quat[k] - along * q[k]) / e.quat_norm);
+    let opacity_logit = d.opacity * e.own_opacity * e.compensation * (1.0 - e.own_opacity);
+    [x, y, z, a, b, c, qw, qx, qy, qz, opacity_logit]
 }
 
 /// d loss / d (w, x, y, z) of a unit quaternion from d loss / d its rotation matrix, by rows.

@@ -6,53 +6,35 @@
 
 use crate::RasterOptions;
 #[cfg(test)]
-use crate::project::{Lens, Parameters, SplatGradient, project, project_backward};
+use crate::project::{Lens, SplatGradient, project, project_backward};
+use crate::project::{Parameters, parameters};
 #[cfg(test)]
 use crate::sh;
 use glam::{DMat3, DQuat, DVec2, DVec3};
 use gs_scene::{Camera, Gaussians};
 
-/// Gaussians in f64, each with its features.
+/// A Gaussian in f64.
 #[derive(Debug, Clone)]
 pub(crate) struct Gaussian {
-    pub mean: [f64; 3],
-    pub log_scale: [f64; 3],
-    pub rotation: [f64; 4],
-    pub opacity_logit: f64,
+    pub own: Parameters,
     pub sh: Vec<f64>,
-    pub features: Vec<f64>,
 }
 
-#[cfg(test)]
 impl Gaussian {
-    /// Every parameter in a fixed order: centre, scales, rotation, opacity, harmonics.
-    pub fn parameters(&mut self) -> Vec<&mut f64> {
-        let Self { mean, log_scale, rotation, opacity_logit, sh, .. } = self;
-        let fixed = mean.iter_mut().chain(log_scale).chain(rotation).chain(std::iter::once(opacity_logit));
-        fixed.chain(sh).collect()
+    fn mean(&self) -> DVec3 {
+        DVec3::from_slice(&self.own)
     }
 
-    fn view(&self) -> Parameters {
-        Parameters {
-            mean: self.mean,
-            log_scale: self.log_scale,
-            rotation: self.rotation,
-            opacity_logit: self.opacity_logit,
-        }
+    /// A parameter by its place, those of the harmonics last.
+    #[cfg(test)]
+    pub fn parameter(&mut self, k: usize) -> &mut f64 {
+        if k < self.own.len() { &mut self.own[k] } else { &mut self.sh[k - self.own.len()] }
     }
 }
 
-pub(crate) fn widen(g: &Gaussians, features: &[f32], dim: usize) -> Vec<Gaussian> {
-    (0..g.len())
-        .map(|i| Gaussian {
-            mean: g.means[i].map(f64::from),
-            log_scale: g.log_scales[i].map(f64::from),
-            rotation: g.rotations[i].map(f64::from),
-            opacity_logit: f64::from(g.opacity_logits[i]),
-            sh: g.sh_of(i).iter().map(|&v| f64::from(v)).collect(),
-            features: features[i * dim..(i + 1) * dim].iter().map(|&v| f64::from(v)).collect(),
-        })
-        .collect()
+pub(crate) fn widen(g: &Gaussians) -> Vec<Gaussian> {
+    let sh = |i: usize| g.sh_of(i).iter().map(|&v| f64::from(v)).collect();
+    (0..g.len()).map(|i| Gaussian { own: parameters(g, i).map(f64::from), sh: sh(i) }).collect()
 }
 
 /// Whether the 1/255 skip and the early stop apply; without them the picture is a smooth function of the parameters (as long
@@ -65,7 +47,7 @@ pub(crate) enum Cuts {
 }
 
 /// What a pixel shows.
-#[derive(Debug, Clone, Default)]
+#[derive(Debug, Clone, Copy, Default)]
 pub struct Pixel {
     /// Colour over the background.
     pub rgb: [f64; 3],
@@ -73,8 +55,6 @@ pub struct Pixel {
     pub alpha: f64,
     /// Camera depth, summed with the blending weights.
     pub depth: f64,
-    /// Features, likewise; none from [`render_gaussians`].
-    pub features: Vec<f64>,
     /// Largest change of alpha if every decision that rounding may turn at this pixel (an alpha beside 1/255 or 0.99, a
     /// transmittance beside 1e-4) went the other way; 0 where there is none.
     pub doubt: f64,
@@ -101,16 +81,16 @@ const DOUBT: f64 = 1e-4;
 fn ellipses(scene: &[Gaussian], camera: &Camera, options: &RasterOptions) -> Vec<Ellipse> {
     let mut out = Vec::new();
     for (id, g) in scene.iter().enumerate() {
-        let p = camera.to_camera(DVec3::from(g.mean));
+        let p = camera.to_camera(g.mean());
         if p.z <= f64::from(options.near) {
             continue;
         }
-        let [w, x, y, z] = g.rotation;
+        let [_, _, _, s0, s1, s2, w, x, y, z, opacity_logit] = g.own;
         if [w, x, y, z] == [0.0; 4] {
             continue;
         }
         let axes = DMat3::from_quat(DQuat::from_xyzw(x, y, z, w).normalize());
-        let spread = DMat3::from_diagonal(DVec3::from(g.log_scale.map(|s| (2.0 * s).exp())));
+        let spread = DMat3::from_diagonal((2.0 * DVec3::new(s0, s1, s2)).exp());
         let covariance = camera.rotation * axes * spread * axes.transpose() * camera.rotation.transpose();
 
         // Projection linearised at the centre, which is moved to within 15 % of the image's size around it.
@@ -126,14 +106,14 @@ fn ellipses(scene: &[Gaussian], camera: &Camera, options: &RasterOptions) -> Vec
         let det = xx * yy - xy * xy;
         let own = (xx - low_pass) * (yy - low_pass) - xy * xy;
         let compensation = if options.antialias { (own.max(0.0) / det).sqrt() } else { 1.0 };
-        let (mx, my, z) = camera.project(DVec3::from(g.mean));
+        let (mx, my, z) = camera.project(g.mean());
         out.push(Ellipse {
             id,
             mean: DVec2::new(mx, my),
             conic: [yy / det, -xy / det, xx / det],
-            opacity: compensation / (1.0 + (-g.opacity_logit).exp()),
+            opacity: compensation / (1.0 + (-opacity_logit).exp()),
             z,
-            color: color(&g.sh, DVec3::from(g.mean) - camera.position(), options.sh_degree).map(|c| c.max(0.0)),
+            color: color(&g.sh, g.mean() - camera.position(), options.sh_degree).map(|c| c.max(0.0)),
         });
     }
     out.sort_by(|a, b| a.z.total_cmp(&b.z).then(a.id.cmp(&b.id)));
@@ -243,27 +223,23 @@ fn layers(ellipses: &[Ellipse], x: usize, y: usize, cuts: Cuts) -> (Vec<Layer<'_
 /// Renders Gaussians plainly in f64, `[height][width]` pixels: what [`crate::render`] is held against. For N Gaussians and
 /// P pixels it takes N P steps.
 pub fn render_gaussians(gaussians: &Gaussians, camera: &Camera, options: &RasterOptions) -> Vec<Pixel> {
-    render(&widen(gaussians, &[], 0), camera, options, Cuts::Hard)
+    render(&widen(gaussians), camera, options, Cuts::Hard)
 }
 
 /// `[height][width]` pixels.
 pub(crate) fn render(scene: &[Gaussian], camera: &Camera, options: &RasterOptions, cuts: Cuts) -> Vec<Pixel> {
     let ellipses = ellipses(scene, camera, options);
-    let dim = scene.first().map_or(0, |g| g.features.len());
     let mut out = Vec::new();
     for y in 0..camera.height as usize {
         for x in 0..camera.width as usize {
             let (layers, [doubt, rounding]) = layers(&ellipses, x, y, cuts);
-            let mut p = Pixel { features: vec![0.0; dim], doubt, rounding, ..Pixel::default() };
+            let mut p = Pixel { doubt, rounding, ..Pixel::default() };
             for l in &layers {
                 let weight = l.transmittance * l.alpha;
                 p.alpha += weight;
                 p.depth += weight * l.ellipse.z;
                 for c in 0..3 {
                     p.rgb[c] += weight * l.ellipse.color[c];
-                }
-                for (sum, f) in p.features.iter_mut().zip(&scene[l.ellipse.id].features) {
-                    *sum += weight * f;
                 }
             }
             for c in 0..3 {
@@ -275,8 +251,8 @@ pub(crate) fn render(scene: &[Gaussian], camera: &Camera, options: &RasterOption
     out
 }
 
-/// d loss / d parameters, given d loss / d pixels (whose `doubt` is not read): for each Gaussian, in the order of
-/// [`Gaussian::parameters`], and the gradient of its projected centre.
+/// d loss / d parameters, given d loss / d pixels (whose `doubt` is not read): for each Gaussian, those of the harmonics last,
+/// and the gradient of its projected centre.
 #[cfg(test)]
 pub(crate) fn backward(
     scene: &[Gaussian],
@@ -324,10 +300,10 @@ pub(crate) fn backward(
         let d = &splats[i];
         let mut all = vec![0.0; 11];
         let mut d_sh = vec![0.0; g.sh.len()];
-        if project(&g.view(), &lens, options).unseen == 0.0 {
-            let mut p = project_backward(&g.view(), &lens, options, d);
+        if project(&g.own, &lens, options)[0] == 0.0 {
+            let mut p = project_backward(&g.own, &lens, options, d);
             let stored = (g.sh.len() as f64 / 3.0).sqrt() as u8 - 1;
-            let (degree, direction) = (stored.min(options.sh_degree), lens.direction(g.mean));
+            let (degree, direction) = (stored.min(options.sh_degree), lens.direction(&g.own));
             let seen = color(&g.sh, direction.into(), degree);
             let d_color = [0, 1, 2].map(|c| if seen[c] < 0.0 { 0.0 } else { d.color[c] });
             let basis = sh::basis(degree, sh::unit(direction).0);
@@ -339,8 +315,8 @@ pub(crate) fn backward(
                 }
             }
             let through_direction = sh::direction_gradient(degree, direction, &weights);
-            p.mean.iter_mut().zip(through_direction).for_each(|(sum, v)| *sum += v);
-            all = [&p.mean[..], &p.log_scale, &p.rotation, &[p.opacity_logit]].concat();
+            p.iter_mut().zip(through_direction).for_each(|(sum, v)| *sum += v);
+            all = p.to_vec();
         }
         all.extend(d_sh);
         out.push((all, d.mean));

@@ -1,6 +1,7 @@
 //! Which Gaussians touch which tile, front to back.
 
 use crate::dropped::Dropped;
+use crate::kernels::Tile;
 use crate::lanes::project_range;
 use crate::project::{Lens, Splat};
 use crate::types::RasterOptions;
@@ -65,7 +66,7 @@ impl Chunk {
             index.push(i as u32);
             splats.push(s);
         };
-        project_range(g, range, lens, options, seen, |reason| dropped.count(reason));
+        project_range(g, range, lens, options, dropped, seen);
     }
 }
 
@@ -130,15 +131,12 @@ impl Tiles {
         self.offsets.len() - 1
     }
 
-    /// Positions in `splats` of the Gaussians that touch tile `t`.
-    pub fn list(&self, t: usize) -> &[u32] {
-        &self.entries[self.offsets[t] as usize..self.offsets[t + 1] as usize]
-    }
-
-    /// Left, top, width, height of tile `t` within the image.
-    pub fn rectangle(&self, t: usize) -> (usize, usize, usize, usize) {
+    /// Tile `t`.
+    pub fn tile(&self, t: usize) -> Tile<'_> {
         let (x, y) = (t % self.columns * TILE, t / self.columns * TILE);
-        (x, y, TILE.min(self.lens.width as usize - x), TILE.min(self.lens.height as usize - y))
+        let (width, height) = (TILE.min(self.lens.width as usize - x), TILE.min(self.lens.height as usize - y));
+        let list = &self.entries[self.offsets[t] as usize..self.offsets[t + 1] as usize];
+        Tile { splats: &self.splats, list, rectangle: (x, y, width, height) }
     }
 }
 

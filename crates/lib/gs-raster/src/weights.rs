@@ -39,11 +39,11 @@ pub fn tile_weights<R: Send>(
     // Nobody asks for colours: the harmonics are skipped.
     let tiles = Tiles::new(g, camera, &RasterOptions { sh_degree: 0, ..options.clone() });
     let one = |t: usize| {
-        let (x0, y0, width, height) = tiles.rectangle(t);
-        let list = tiles.list(t);
-        let gaussians: Vec<u32> = list.iter().map(|&e| tiles.index[e as usize]).collect();
-        let (mut alphas, mut weights) = (vec![0.0; list.len() * PIXELS], vec![0.0; list.len() * PIXELS]);
-        let alpha = weights_tile(&tiles.splats, list, (x0, y0, width, height), early_stop, &mut alphas, &mut weights);
+        let tile = tiles.tile(t);
+        let (x0, y0, width, height) = tile.rectangle;
+        let gaussians: Vec<u32> = tile.list.iter().map(|&e| tiles.index[e as usize]).collect();
+        let [mut alphas, mut weights] = [(); 2].map(|()| vec![0.0; gaussians.len() * PIXELS]);
+        let alpha = weights_tile(tile, early_stop, &mut alphas, &mut weights);
         let [alphas, weights] = [&alphas, &weights];
         f(&TileWeights { x0, y0, width, height, gaussians: &gaussians, alphas, weights, alpha: &alpha })
     };

@@ -1,7 +1,7 @@
 //! Renderings and gradients of independent implementations.
 
 use glam::{DMat3, DVec3};
-use gs_raster::{PixelGradients, RasterOptions, backward, forward, render};
+use gs_raster::{PixelGradients, RasterOptions, Workspace, render};
 use gs_scene::{Camera, Gaussians};
 use std::collections::HashMap;
 use std::io::Read;
@@ -103,8 +103,8 @@ fn matches_the_f64_oracle_forward_and_backward() {
         };
         let background: [f32; 3] = get("background")[..3].try_into().unwrap();
         let options = RasterOptions { background, ..RasterOptions::default() };
-        let f = forward(&g, &camera, &options);
-        let r = &f.rendered;
+        let mut workspace = Workspace::default();
+        let r = &workspace.forward(&g, &camera, &options).rendered;
         let (rgb, alpha) = (worst(&r.rgb, get("out_rgb")), worst(&r.alpha, get("out_alpha")));
         let depth = relative(&r.depth, get("out_depth"));
         eprintln!("{name}: rgb {rgb:e} alpha {alpha:e} depth {depth:e}");
@@ -116,13 +116,8 @@ fn matches_the_f64_oracle_forward_and_backward() {
             r.rgb.iter().zip(get("target_rgb")).map(|(a, b)| (a - b).signum() / (3.0 * pixels)).collect();
         let d_alpha: Vec<f32> = r.alpha.iter().map(|a| 0.2 * (a - 0.5) / pixels).collect();
         let d_depth: Vec<f32> = r.depth.iter().zip(get("target_depth")).map(|(a, b)| 0.1 * (a - b) / pixels).collect();
-        let d = backward(
-            &g,
-            &camera,
-            &options,
-            &f,
-            PixelGradients { rgb: &d_rgb, alpha: Some(&d_alpha), depth: Some(&d_depth) },
-        );
+        let d = PixelGradients { rgb: &d_rgb, alpha: Some(&d_alpha), depth: Some(&d_depth) };
+        let d = workspace.backward(&g, &camera, &options, d);
         let groups = [
             ("means", d.means.as_flattened(), get("grad_means")),
             ("quats", d.rotations.as_flattened(), get("grad_quats")),

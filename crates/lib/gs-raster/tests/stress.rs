@@ -3,13 +3,14 @@
 mod common;
 
 use common::{camera, random};
-use gs_raster::{Dropped, PixelGradients, RasterOptions, backward, forward, render_features, tile_weights};
+use gs_raster::{Dropped, PixelGradients, RasterOptions, Workspace, forward, render_features, tile_weights};
 use gs_scene::{Camera, Gaussians};
 
 /// Renders and differentiates by every way there is; all numbers must be finite, alphas within 0 and 1.
 fn survives(g: &Gaussians, camera: &Camera, what: &str) -> (Dropped, f64) {
     let options = RasterOptions { background: [0.3, 0.2, 0.1], ..RasterOptions::default() };
-    let f = forward(g, camera, &options);
+    let mut workspace = Workspace::default();
+    let f = workspace.forward(g, camera, &options);
     let r = &f.rendered;
     let pixels = camera.width as usize * camera.height as usize;
     let finite = |values: &[f32], name: &str| {
@@ -20,9 +21,11 @@ fn survives(g: &Gaussians, camera: &Camera, what: &str) -> (Dropped, f64) {
     finite(&r.depth, "depth");
     assert!(r.alpha.iter().all(|a| (0.0..=1.0).contains(a)), "{what}: alpha");
     assert_eq!(f.visible().len() + f.dropped().total(), g.len(), "{what}: {:?}", f.dropped());
+    let covered = r.alpha.iter().map(|a| f64::from(*a)).sum::<f64>() / pixels.max(1) as f64;
+    eprintln!("{what}: mean alpha {covered:.4}, drawn {}, {:?}", f.visible().len(), f.dropped());
     let d: Vec<f32> = (0..3 * pixels).map(|i| (i as f32 * 0.7).sin()).collect();
     let of_pixels = PixelGradients { rgb: &d, alpha: Some(&d[..pixels]), depth: Some(&d[pixels..2 * pixels]) };
-    let p = backward(g, camera, &options, &f, of_pixels);
+    let p = workspace.backward(g, camera, &options, of_pixels);
     finite(p.means.as_flattened(), "gradient of the centres");
     finite(p.log_scales.as_flattened(), "gradient of the scales");
     finite(p.rotations.as_flattened(), "gradient of the rotations");
@@ -36,9 +39,7 @@ fn survives(g: &Gaussians, camera: &Camera, what: &str) -> (Dropped, f64) {
             assert!(t.alphas.iter().chain(t.alpha).all(|a| (0.0..=1.00001).contains(a)), "{what}: tile's alpha");
         });
     }
-    let covered = r.alpha.iter().map(|a| f64::from(*a)).sum::<f64>() / pixels.max(1) as f64;
-    eprintln!("{what}: mean alpha {covered:.4}, drawn {}, {:?}", f.visible().len(), f.dropped());
-    (f.dropped(), covered)
+    (workspace.forward.dropped(), covered)
 }
 
 #[test]
@@ -197,17 +198,18 @@ fn every_reason_not_to_draw_is_counted() {
 #[test]
 fn gradients_that_overflow_are_counted() {
     let (g, view, options) = (random(100, 9), camera(40, 30), RasterOptions::default());
-    let f = forward(&g, &view, &options);
-    let with = |d: f32| {
-        let d = vec![d; 3 * 40 * 30];
-        backward(&g, &view, &options, &f, PixelGradients { rgb: &d, alpha: None, depth: None })
+    let mut workspace = Workspace::default();
+    let visible = workspace.forward(&g, &view, &options).visible().to_vec();
+    let mut with = |d: f32| {
+        let d = PixelGradients { rgb: &[d; 3 * 40 * 30], alpha: None, depth: None };
+        workspace.backward(&g, &view, &options, d).clone()
     };
     let (usual, huge) = (with(1.0), with(1e38));
     assert_eq!(usual.overflowed, 0);
-    assert!(huge.overflowed > 0 && huge.overflowed <= f.visible().len(), "{}", huge.overflowed);
+    assert!(huge.overflowed > 0 && huge.overflowed <= visible.len(), "{}", huge.overflowed);
     assert!(huge.means.as_flattened().iter().chain(&huge.sh).chain(&huge.opacity_logits).all(|v| v.is_finite()));
     let none = |p: &gs_raster::Gradients| {
-        f.visible().iter().filter(|&&i| p.sh[48 * i as usize..48 * (i as usize + 1)].iter().all(|v| *v == 0.0)).count()
+        visible.iter().filter(|&&i| p.sh[48 * i as usize..48 * (i as usize + 1)].iter().all(|v| *v == 0.0)).count()
     };
     assert_eq!(none(&huge) - none(&usual), huge.overflowed, "an overflowed Gaussian has no gradient at all");
 }
