@@ -111,22 +111,14 @@ impl Error {
 impl fmt::Display for Error {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         let p = &self.0;
-        let mut line = String::new();
-        if let Some(file) = &p.file {
-            line += &format!("{}: ", file.display());
-        }
-        if let Some(field) = &p.field {
-            line += &format!("{field}: ");
-        }
+        let place = [p.file.as_ref().map(|f| f.display().to_string()), p.field.clone()];
+        let values = [("found", &p.found), ("expected", &p.expected)];
+        let values = values.iter().filter_map(|(word, v)| Some(format!("{word} {}", v.as_ref()?)));
+        let values = values.collect::<Vec<_>>().join(", ");
+        let mut line: String = place.iter().flatten().map(|part| format!("{part}: ")).collect();
         line += &p.what;
-        match (&p.found, &p.expected) {
-            (Some(found), Some(expected)) => line += &format!("; found {found}, expected {expected}"),
-            (Some(found), None) => line += &format!("; found {found}"),
-            (None, Some(expected)) => line += &format!("; expected {expected}"),
-            (None, None) => {}
-        }
-        if let Some(hint) = &p.hint {
-            line += &format!("; {hint}");
+        for part in [Some(&values).filter(|v| !v.is_empty()), p.hint.as_ref()].into_iter().flatten() {
+            line += &format!("; {part}");
         }
         f.write_str(&escaped(&line))
     }
@@ -135,11 +127,8 @@ impl fmt::Display for Error {
 /// A message as one line that does nothing to a terminal: names of files, and names within them, may hold line breaks and
 /// other control characters, which are written as `\n` or `\u{1b}`.
 pub fn escaped(message: &str) -> String {
-    let mut line = String::with_capacity(message.len());
-    for c in message.chars() {
-        if c.is_control() { line.extend(c.escape_default()) } else { line.push(c) }
-    }
-    line
+    let one = |c: char| if c.is_control() { c.escape_default().to_string() } else { c.to_string() };
+    message.chars().map(one).collect()
 }
 
 impl std::error::Error for Error {}
