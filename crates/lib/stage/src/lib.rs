@@ -127,7 +127,8 @@ pub fn main<P: Program>() -> ExitCode {
             return told.map_or_else(|e| failed(&Stage::silent(P::NAME), &e), |_| ExitCode::SUCCESS);
         }
     };
-    let stage = Stage::new(P::NAME, program.common()).with_command(command);
+    let mut stage = Stage::new(P::NAME, program.common());
+    stage.command = command;
     if program.common().memory_limit.is_some() && !program.forecasts() {
         let e = Error::new("this command does not forecast its memory").field("--memory-limit").hint("leave it out");
         return failed(&stage, &e);
@@ -139,7 +140,7 @@ pub fn main<P: Program>() -> ExitCode {
         return failed(&stage, &e.hint("give fewer threads, or the process more memory"));
     }
     match carry_out(program, &stage) {
-        Ok(()) => stage.unwritten().map_or(ExitCode::SUCCESS, |e| failed(&stage, e)),
+        Ok(()) => stage.unwritten.get().map_or(ExitCode::SUCCESS, |e| failed(&stage, e)),
         Err(_) if stage.interrupted() => {
             stage.warn("interrupted");
             ExitCode::from(130)

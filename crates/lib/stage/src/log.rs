@@ -1,7 +1,7 @@
 //! What a stage says, and the facts of its run.
 
 use crate::{CommonArgs, Machine, Progress, RunRecord, signals};
-use gs_io::{Claim, Error, IoContext, Outputs, Provenance, Result, Written, escaped};
+use gs_io::{Claim, Error, IoContext, Outputs, Provenance, Result, escaped, write_json};
 use serde_json::{Value, json};
 use std::collections::BTreeMap;
 use std::io::{ErrorKind, Write};
@@ -13,13 +13,15 @@ use std::time::{Instant, SystemTime, UNIX_EPOCH};
 /// A running stage: its voice, its clock, its seed and the record of its run.
 pub struct Stage {
     name: &'static str,
-    command: Option<String>,
-    common: CommonArgs,
+    pub(crate) command: Option<String>,
+    pub(crate) common: CommonArgs,
     started: Instant,
     skipped: Mutex<Vec<String>>,
-    predicted: Mutex<Option<u64>>,
+    /// Bytes that the run was forecast to take at its peak.
+    pub(crate) predicted: Mutex<Option<u64>>,
     interrupted: OnceLock<Arc<AtomicBool>>,
-    unwritten: OnceLock<Error>,
+    /// Why an event could not be written, if one could not.
+    pub(crate) unwritten: OnceLock<Error>,
 }
 
 impl Stage {
@@ -40,12 +42,6 @@ impl Stage {
     /// A stage that says nothing, for tests of stage libraries.
     pub fn silent(name: &'static str) -> Self {
         Self::new(name, &CommonArgs { quiet: true, ..CommonArgs::default() })
-    }
-
-    /// The same, running this subcommand.
-    #[must_use]
-    pub(crate) fn with_command(self, command: Option<String>) -> Self {
-        Self { command, ..self }
     }
 
     /// The program's name.
@@ -83,14 +79,6 @@ impl Stage {
         self.skipped.lock().expect("no panic holds this lock").push(what.to_string());
     }
 
-    pub(crate) fn memory_limit(&self) -> Option<crate::Bytes> {
-        self.common.memory_limit
-    }
-
-    pub(crate) fn predict(&self, bytes: u64) {
-        *self.predicted.lock().expect("no panic holds this lock") = Some(bytes);
-    }
-
     /// Says why the stage failed.
     pub fn error(&self, error: &Error) {
         if self.common.json {
@@ -101,7 +89,7 @@ impl Stage {
 
     /// A progress line or bar over `total` steps.
     pub fn progress(&self, label: &'static str, total: u64) -> Progress<'_> {
-        Progress::new(self, label, total, self.common.quiet, self.common.json)
+        Progress::new(self, label, total)
     }
 
     /// Whether Ctrl-C or a termination signal has come. The first call begins to catch them, so a stage that never
@@ -169,21 +157,9 @@ impl Stage {
         inputs: BTreeMap<String, String>,
         summary: Value,
     ) -> Result<()> {
-        claim.finish(|main, written| {
-            self.run_record(parameters.clone(), inputs.clone(), summary.clone(), written).write(main)
-        })
-    }
-
-    fn run_record(
-        &self,
-        parameters: Value,
-        inputs: BTreeMap<String, String>,
-        summary: Value,
-        written: Written,
-    ) -> RunRecord {
         let elapsed = self.started.elapsed();
         let began = SystemTime::now() - elapsed;
-        RunRecord {
+        let mut record = RunRecord {
             program: self.name.into(),
             version: env!("CARGO_PKG_VERSION").into(),
             revision: crate::REVISION.into(),
@@ -201,8 +177,12 @@ impl Stage {
             memory_predicted_bytes: *self.predicted.lock().expect("no panic holds this lock"),
             skipped: self.skipped.lock().expect("no panic holds this lock").clone(),
             summary,
-            written,
-        }
+            written: Default::default(),
+        };
+        claim.finish(|main, written| {
+            record.written = written;
+            write_json(RunRecord::path(main), &record)
+        })
     }
 
     pub(crate) fn event(&self, kind: &str, fields: &[(&str, Value)]) {
@@ -212,11 +192,6 @@ impl Stage {
         if let Err(e) = self.print(&format!("{}\n", Value::Object(o))) {
             self.unwritten.get_or_init(|| e);
         }
-    }
-
-    /// Why an event could not be written, if one could not.
-    pub(crate) fn unwritten(&self) -> Option<&Error> {
-        self.unwritten.get()
     }
 
     /// Writes what a command tells to standard output; whether somebody still reads it. A closed pipe is the reader's choice,

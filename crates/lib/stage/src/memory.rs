@@ -14,21 +14,14 @@ impl FromStr for Bytes {
 
     fn from_str(s: &str) -> Result<Self> {
         let plain = s.strip_suffix("iB").or_else(|| s.strip_suffix('B')).unwrap_or(s);
-        let (digits, unit) = match plain.char_indices().last() {
-            Some((at, 'K' | 'k')) => (&plain[..at], 10),
-            Some((at, 'M' | 'm')) => (&plain[..at], 20),
-            Some((at, 'G' | 'g')) => (&plain[..at], 30),
-            Some((at, 'T' | 't')) => (&plain[..at], 40),
-            _ => (plain, 0),
-        };
-        let value: Option<f64> = digits.parse().ok().filter(|v| (0.0..1e6).contains(v));
-        match value {
-            // A bare number could be taken for megabytes as well as bytes.
-            Some(v) if unit > 0 || v == 0.0 => Ok(Self((v * f64::from(1u32 << (unit - 10).max(0)) * 1024.0) as u64)),
-            _ => Err(Error::new("not an amount of memory")
-                .found(s)
-                .expected("a number with a unit such as 512M or 2G, or 0")),
-        }
+        let power = plain.chars().last().and_then(|unit| "KMGT".find(unit.to_ascii_uppercase()));
+        let digits = &plain[..plain.len() - usize::from(power.is_some())];
+        // A bare number could be taken for megabytes as well as bytes.
+        let unit = power.map_or(0.0, |p| 1024f64.powi(p as i32 + 1));
+        let value = digits.parse().ok().filter(|v| (0.0..1e6).contains(v) && (unit > 0.0 || *v == 0.0));
+        value.map(|v: f64| Self((v * unit) as u64)).ok_or_else(|| {
+            Error::new("not an amount of memory").found(s).expected("a number with a unit such as 512M or 2G, or 0")
+        })
     }
 }
 
@@ -37,11 +30,8 @@ impl fmt::Display for Bytes {
         for (unit, shift) in [("T", 40), ("G", 30), ("M", 20), ("K", 10)] {
             if self.0 >= 1 << shift {
                 let value = self.0 as f64 / (1u64 << shift) as f64;
-                return if value.fract() == 0.0 || value >= 100.0 {
-                    write!(f, "{value:.0}{unit}")
-                } else {
-                    write!(f, "{value:.1}{unit}")
-                };
+                let digits = usize::from(value.fract() != 0.0 && value < 100.0);
+                return write!(f, "{value:.digits$}{unit}");
             }
         }
         write!(f, "{}", self.0)
@@ -64,8 +54,8 @@ impl Stage {
     /// # Errors
     /// When it is more than the limit.
     pub fn needs(&self, bytes: u64, hint: &str) -> Result<()> {
-        self.predict(bytes);
-        match self.memory_limit() {
+        *self.predicted.lock().expect("no panic holds this lock") = Some(bytes);
+        match self.common.memory_limit {
             Some(limit) if bytes > limit.0 => Err(too_much(bytes, limit, hint).field("--memory-limit")),
             _ => Ok(()),
         }
@@ -77,7 +67,7 @@ impl Stage {
     /// # Errors
     /// When it is more than the limit.
     pub fn needs_at_once(&self, bytes: u64, hint: &str) -> Result<()> {
-        match (self.memory_limit(), Machine::here().memory_bytes) {
+        match (self.common.memory_limit, Machine::here().memory_bytes) {
             (None, Some(all)) if bytes > all => Err(too_much(bytes, Bytes(all), hint).field("memory of this machine")),
             _ => self.needs(bytes, hint),
         }

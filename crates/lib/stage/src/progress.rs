@@ -31,16 +31,15 @@ enum Out {
 }
 
 impl<'a> Progress<'a> {
-    pub(crate) fn new(stage: &'a Stage, label: &'static str, total: u64, quiet: bool, json: bool) -> Self {
-        let out = if json {
+    pub(crate) fn new(stage: &'a Stage, label: &'static str, total: u64) -> Self {
+        let out = if stage.common.json {
             Out::Events
-        } else if quiet {
+        } else if stage.common.quiet {
             Out::Silent
         } else if std::io::stderr().is_terminal() {
             let style = ProgressStyle::with_template("{prefix} {bar:30} {pos}/{len} {per_sec} eta {eta} {msg}")
                 .unwrap_or_else(|_| ProgressStyle::default_bar());
-            let bar = ProgressBar::new(total).with_style(style).with_prefix(label);
-            Out::Bar(bar)
+            Out::Bar(ProgressBar::new(total).with_style(style).with_prefix(label))
         } else {
             Out::Lines
         };
@@ -69,8 +68,8 @@ impl<'a> Progress<'a> {
                 bar.set_position(done);
                 bar.set_message(text(fields));
             }
-            Out::Lines if self.last_said.elapsed() >= LINE_EVERY => self.say_line(fields),
-            Out::Events if self.last_said.elapsed() >= EVENT_EVERY => self.say_event(fields),
+            Out::Lines if self.last_said.elapsed() >= LINE_EVERY => self.say(fields),
+            Out::Events if self.last_said.elapsed() >= EVENT_EVERY => self.say(fields),
             Out::Lines | Out::Events => {}
         }
     }
@@ -82,51 +81,32 @@ impl<'a> Progress<'a> {
 
     /// Ends the progress with a last line.
     pub fn finish(mut self, fields: &[(&str, f64)]) {
+        if let Out::Bar(bar) = &self.out {
+            bar.finish_and_clear();
+        }
+        self.say(fields);
+    }
+
+    /// A line, or an event.
+    fn say(&mut self, fields: &[(&str, f64)]) {
+        self.last_said = Instant::now();
+        let Self { label, total, done, .. } = *self;
+        let rate = (done - self.first) as f64 / self.started.elapsed().as_secs_f64().max(1e-9);
+        let eta = (rate > 0.0).then(|| total.saturating_sub(done) as f64 / rate);
         match &self.out {
             Out::Silent => {}
-            Out::Bar(bar) => {
-                bar.finish_and_clear();
-                self.say_line(fields);
+            Out::Events => {
+                let mut all = vec![("label", json!(label)), ("done", json!(done)), ("total", json!(total))];
+                all.extend([("per_second", json!(rate)), ("eta_seconds", json!(eta))]);
+                all.extend(fields.iter().map(|&(k, v)| (k, json!(v))));
+                self.stage.event("progress", &all);
             }
-            Out::Lines => self.say_line(fields),
-            Out::Events => self.say_event(fields),
+            Out::Bar(_) | Out::Lines => {
+                let eta = eta.map_or(String::new(), |s| format!(", eta {s:.0} s"));
+                let sep = if fields.is_empty() { "" } else { ", " };
+                self.stage.line(&format!("{label} {done}/{total} ({}{eta}){sep}{}", pace(rate), text(fields)));
+            }
         }
-    }
-
-    fn rate(&self) -> f64 {
-        (self.done - self.first) as f64 / self.started.elapsed().as_secs_f64().max(1e-9)
-    }
-
-    fn eta(&self) -> Option<f64> {
-        let rate = self.rate();
-        (rate > 0.0).then(|| self.total.saturating_sub(self.done) as f64 / rate)
-    }
-
-    fn say_line(&mut self, fields: &[(&str, f64)]) {
-        self.last_said = Instant::now();
-        let eta = self.eta().map_or(String::new(), |s| format!(", eta {s:.0} s"));
-        let sep = if fields.is_empty() { "" } else { ", " };
-        self.stage.line(&format!(
-            "{} {}/{} ({}{eta}){sep}{}",
-            self.label,
-            self.done,
-            self.total,
-            pace(self.rate()),
-            text(fields)
-        ));
-    }
-
-    fn say_event(&mut self, fields: &[(&str, f64)]) {
-        self.last_said = Instant::now();
-        let mut all = vec![
-            ("label", json!(self.label)),
-            ("done", json!(self.done)),
-            ("total", json!(self.total)),
-            ("per_second", json!(self.rate())),
-            ("eta_seconds", json!(self.eta())),
-        ];
-        all.extend(fields.iter().map(|&(k, v)| (k, json!(v))));
-        self.stage.event("progress", &all);
     }
 }
 

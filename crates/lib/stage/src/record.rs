@@ -1,7 +1,7 @@
 //! The record of a run, beside its output.
 
 use crate::Machine;
-use gs_io::{Error, IoContext, Result, Written, hash_file, record_path, write_bytes};
+use gs_io::{Error, IoContext, Result, Written, hash_file, record_path};
 use serde::{Deserialize, Serialize};
 use serde_json::Value;
 use std::collections::BTreeMap;
@@ -64,12 +64,6 @@ impl RunRecord {
         let bytes = std::fs::read(&path).at("read", &path)?;
         serde_json::from_slice(&bytes).map_err(|e| Error::new(format!("not a record of a run: {e}")).file(&path))
     }
-
-    pub(crate) fn write(&self, output: impl AsRef<Path>) -> Result<()> {
-        let path = Self::path(output);
-        let json = serde_json::to_vec_pretty(self).map_err(|e| Error::new(e.to_string()).file(&path))?;
-        write_bytes(path, &json)
-    }
 }
 
 /// Hash of the running program's file; empty where it cannot be read.
@@ -97,9 +91,10 @@ pub fn peak_rss_bytes() -> Option<u64> {
 mod tests {
     use super::*;
     use crate::Stage;
+    use gs_io::write_bytes;
 
     #[test]
-    fn a_record_reads_back() {
+    fn a_record_says_what_ran_where_and_when() {
         let dir = tempfile::tempdir().unwrap();
         let out = dir.path().join("a.ply");
         let stage = Stage::silent("gs-geom");
@@ -114,16 +109,6 @@ mod tests {
         assert_eq!(r.skipped, ["3 of 10 Gaussians: never seen"]);
         assert!(r.wall_seconds >= 0.0 && r.peak_rss_bytes.is_none_or(|b| b > 1 << 18));
         assert!(RunRecord::read(dir.path().join("b")).is_err());
-    }
-
-    #[test]
-    fn a_record_says_what_ran_where_and_when() {
-        let dir = tempfile::tempdir().unwrap();
-        let out = dir.path().join("a.ply");
-        let stage = Stage::silent("gs-geom");
-        let mut claim = stage.outputs(&out).claim().unwrap();
-        stage.record(&mut claim, Value::Null, BTreeMap::new(), Value::Null).unwrap();
-        let r = RunRecord::read(&out).unwrap();
         assert_eq!((r.revision.as_str(), r.program_hash.len()), (crate::REVISION, 64), "{r:?}");
         assert!(crate::REVISION == "unknown" || crate::REVISION.len() >= 7);
         assert!(r.machine == Machine::here() && r.started > 1_700_000_000);
