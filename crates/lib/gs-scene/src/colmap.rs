@@ -4,8 +4,8 @@ mod binary;
 mod text;
 
 use crate::PointCloud;
-use crate::distortion::Distortion;
-use crate::lens::Lens;
+use crate::dataset::{Format, RawDataset, RawView, check_inside};
+use crate::lens::{Distortion, Lens};
 pub use binary::write_model;
 use glam::{DMat3, DQuat, DVec3};
 use gs_io::{Error, IoContext, Result};
@@ -13,27 +13,14 @@ use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
 /// A registered image.
-#[derive(Debug, Clone, PartialEq)]
-pub(crate) struct Registered {
+struct Registered {
     /// File name relative to the images folder.
-    pub name: String,
+    name: String,
     /// Key of its camera.
-    pub camera: u32,
-    /// Rotation, camera from world.
-    pub rotation: DMat3,
-    /// Translation, camera from world.
-    pub translation: DVec3,
-}
-
-/// A sparse model.
-#[derive(Debug, Clone, PartialEq)]
-pub(crate) struct Model {
-    /// Cameras by id.
-    pub cameras: BTreeMap<u32, Lens>,
-    /// Registered images, in file order.
-    pub images: Vec<Registered>,
-    /// Sparse points; empty when the file is missing.
-    pub points: PointCloud,
+    camera: u32,
+    /// Camera from world.
+    rotation: DMat3,
+    translation: DVec3,
 }
 
 const AGAIN: &str = "export the COLMAP model again";
@@ -46,27 +33,23 @@ pub(crate) fn find_model(scene: &Path) -> Option<PathBuf> {
         .find(|p| file_of(p, "cameras").is_some())
 }
 
-/// The files of the model in `folder`: of each `.bin` where there is one, else `.txt`.
-pub(crate) fn files_of(folder: &Path) -> Vec<PathBuf> {
-    ["cameras", "images", "points3D"].iter().filter_map(|name| file_of(folder, name)).collect()
-}
-
 /// A file of a model: `.bin` where there is one, else `.txt`.
 fn file_of(folder: &Path, name: &str) -> Option<PathBuf> {
     ["bin", "txt"].iter().map(|e| folder.join(format!("{name}.{e}"))).find(|p| p.is_file())
 }
 
-/// Reads the model in `folder`; `.bin` where there is one, else `.txt`.
+/// Loads the model in folder `model` of the scene `root`; photographs lie in `images`, `input`, or the scene itself. Without
+/// `points3D` there are no points.
 ///
 /// # Errors
 /// When a file is missing, damaged, or uses a camera model that is not supported.
-pub(crate) fn read_model(folder: &Path) -> Result<Model> {
-    let (path, cameras) = part(folder, "cameras", binary::cameras, text::cameras)?;
+pub(crate) fn load(root: &Path, model: &Path) -> Result<RawDataset> {
+    let (cameras_path, cameras) = part(model, "cameras", binary::cameras, text::cameras)?;
     if cameras.is_empty() {
-        return Err(Error::new("the model has no camera").file(&path).field("camera count").found(0).hint(AGAIN));
+        let e = Error::new("the model has no camera").file(&cameras_path);
+        return Err(e.field("camera count").found(0).hint(AGAIN));
     }
-    let cameras_path = path;
-    let (path, images) = part(folder, "images", binary::images, text::images)?;
+    let (path, images) = part(model, "images", binary::images, text::images)?;
     if images.is_empty() {
         return Err(Error::new("the model has no image")
             .file(&path)
@@ -82,11 +65,26 @@ pub(crate) fn read_model(folder: &Path) -> Result<Model> {
             .expected(format!("one of the {} in {}", cameras.len(), cameras_path.display()))
             .hint(AGAIN));
     }
-    let points = match file_of(folder, "points3D") {
-        Some(_) => part(folder, "points3D", binary::points, text::points)?.1,
-        None => PointCloud::default(),
-    };
-    Ok(Model { cameras, images, points })
+    let mut files = vec![cameras_path, path];
+    let mut points = PointCloud::default();
+    if file_of(model, "points3D").is_some() {
+        let (path, found) = part(model, "points3D", binary::points, text::points)?;
+        files.push(path);
+        points = found;
+    }
+    let folder = ["images", "input"].iter().map(|d| root.join(d)).find(|d| d.is_dir());
+    let folder = folder.unwrap_or_else(|| root.to_path_buf());
+    let (mut views, mut warnings) = (Vec::new(), Vec::new());
+    for Registered { name, camera, rotation, translation } in images {
+        check_inside(&name, "images").map_err(|e| e.file(model))?;
+        let image_path = folder.join(&name);
+        if image_path.is_file() {
+            views.push(RawView { name, image_path, lens: cameras[&camera], rotation, translation, split: None });
+        } else {
+            warnings.push(format!("{}: no such photograph, view skipped", image_path.display()));
+        }
+    }
+    Ok(RawDataset { format: Format::Colmap, files, views, points, warnings })
 }
 
 type Read<T> = fn(&[u8]) -> Result<T>;

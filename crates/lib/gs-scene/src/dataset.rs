@@ -1,7 +1,6 @@
 //! Posed photographs: [`load`] recognises the layout of a folder and gives its views.
 
 mod scannet;
-mod sparse;
 mod transforms;
 mod view;
 
@@ -23,16 +22,6 @@ pub enum Format {
     Transforms,
     /// ScanNet: `color/`, `pose/`, `intrinsic/`.
     ScanNet,
-}
-
-impl std::fmt::Display for Format {
-    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-        f.write_str(match self {
-            Self::Colmap => "COLMAP",
-            Self::Transforms => "transforms.json",
-            Self::ScanNet => "ScanNet",
-        })
-    }
 }
 
 /// What a view is for.
@@ -133,22 +122,22 @@ pub struct Dataset {
 }
 
 /// A view before resolution and split are applied.
-struct RawView {
-    name: String,
-    image_path: PathBuf,
-    lens: Lens,
-    rotation: DMat3,
-    translation: DVec3,
-    split: Option<Split>,
+pub(crate) struct RawView {
+    pub name: String,
+    pub image_path: PathBuf,
+    pub lens: Lens,
+    pub rotation: DMat3,
+    pub translation: DVec3,
+    pub split: Option<Split>,
 }
 
-struct RawDataset {
-    format: Format,
+pub(crate) struct RawDataset {
+    pub format: Format,
     /// All but the photographs.
-    files: Vec<PathBuf>,
-    views: Vec<RawView>,
-    points: PointCloud,
-    warnings: Vec<String>,
+    pub files: Vec<PathBuf>,
+    pub views: Vec<RawView>,
+    pub points: PointCloud,
+    pub warnings: Vec<String>,
 }
 
 /// Focal lengths in longer sides of the photograph. A pinhole camera of the least sees 179.9 degrees; lenses stay below 150.
@@ -209,7 +198,7 @@ pub fn load(path: &Path, options: &LoadOptions) -> Result<Dataset> {
             .file(path)
             .hint("give the folder of a COLMAP, transforms.json or ScanNet scene"));
     } else if let Some(model) = colmap::find_model(path) {
-        sparse::load(path, &model)?
+        colmap::load(path, &model)?
     } else if let Some(files) = transforms::find(path) {
         transforms::load(path, &files)?
     } else if scannet::is_scannet(path) {
@@ -290,7 +279,7 @@ impl Dataset {
 }
 
 /// Refuses a name inside a file that leads out of the dataset's folder.
-fn check_inside(name: &str, field: &str) -> Result<()> {
+pub(crate) fn check_inside(name: &str, field: &str) -> Result<()> {
     let inside = |c: Component| matches!(c, Component::Normal(_) | Component::CurDir);
     if !name.is_empty() && Path::new(name).components().all(inside) {
         return Ok(());

@@ -85,10 +85,22 @@ impl Gaussians {
         [0, 1, 2].map(|c| 0.5 + SH_C0 * sh[c])
     }
 
-    /// Whether every number of Gaussian `i` can be used: all are finite, but that an infinite opacity logit can, too.
+    /// The properties among which Gaussian `i` has a number that cannot be used, if it has one: all must be finite, but that an
+    /// opacity logit may be infinite.
+    pub fn damage(&self, i: usize) -> Option<&'static str> {
+        let groups = [
+            ("x, y, z", &self.means[i][..]),
+            ("scale_*", &self.log_scales[i]),
+            ("rot_*", &self.rotations[i]),
+            ("f_dc_* or f_rest_*", self.sh_of(i)),
+        ];
+        let damaged = groups.iter().find(|(_, values)| !values.iter().all(|v| v.is_finite()));
+        damaged.map(|(name, _)| *name).or(self.opacity_logits[i].is_nan().then_some("opacity"))
+    }
+
+    /// Whether every number of Gaussian `i` can be used.
     pub fn is_whole(&self, i: usize) -> bool {
-        let geometric = self.means[i].iter().chain(&self.log_scales[i]).chain(&self.rotations[i]);
-        geometric.chain(self.sh_of(i)).all(|v| v.is_finite()) && !self.opacity_logits[i].is_nan()
+        self.damage(i).is_none()
     }
 
     /// Whether every number of Gaussian `i` is finite.

@@ -129,7 +129,6 @@ mod tests {
         ply::write_gaussians(&path, &sample(), &["antialias true".into()]).unwrap();
         let read = Geometry::read(&path).unwrap();
         assert!(read.antialias && read.damage().is_none());
-        ply::write_gaussians(&path, &read.gaussians, &read.comments(vec!["mine".into()])).unwrap();
-        assert_eq!(ply::read_comments(&path).unwrap(), ["mine", "antialias true"]);
+        assert_eq!(read.comments(vec!["mine".into()]), ["mine", "antialias true"]);
     }
 }

@@ -1,6 +1,6 @@
 //! Photographs and other pictures, as f32 RGB.
 
-use gs_io::{Error, IoContext, Result, write_atomic};
+use gs_io::{Error, IoContext, Result, write_bytes};
 use image::{DynamicImage, ImageReader};
 use rayon::prelude::*;
 use std::io::Cursor;
@@ -120,9 +120,7 @@ impl Image {
     /// # Errors
     /// When the file cannot be written.
     pub fn write_png(&self, path: impl AsRef<Path>) -> Result<()> {
-        let path = path.as_ref();
-        let png = self.to_png();
-        write_atomic(path, |w| w.write_all(&png).at("write", path))
+        write_bytes(path, &self.to_png())
     }
 
     /// The image at another size; each new pixel is the mean of the area it covers (bilinear where the image grows).
@@ -142,7 +140,7 @@ impl Image {
     }
 
     /// Bilinear value of channel values at pixel coordinates (centres at +0.5), the border repeated.
-    pub fn sample(&self, x: f64, y: f64) -> [f32; 3] {
+    pub(crate) fn sample(&self, x: f64, y: f64) -> [f32; 3] {
         let (w, h) = (self.width as usize, self.height as usize);
         let mut out = [0.0; 3];
         for (at, weight) in corners(x, y, w, h) {
@@ -154,7 +152,7 @@ impl Image {
     }
 
     /// Bilinear alpha at pixel coordinates; 1 without an alpha channel.
-    pub fn sample_alpha(&self, x: f64, y: f64) -> f32 {
+    pub(crate) fn sample_alpha(&self, x: f64, y: f64) -> f32 {
         let (w, h) = (self.width as usize, self.height as usize);
         self.alpha.as_ref().map_or(1.0, |a| corners(x, y, w, h).iter().map(|&(at, weight)| weight * a[at]).sum())
     }
@@ -228,27 +226,17 @@ mod tests {
     }
 
     #[test]
-    fn halving_averages_two_by_two() {
-        let image = ramp(6, 4);
-        let half = image.resize_area(3, 2);
-        for (x, y, c) in (0..3).flat_map(|x| (0..2).flat_map(move |y| (0..3).map(move |c| (x, y, c)))) {
-            let at = |x: usize, y: usize| image.rgb[3 * (y * 6 + x) + c];
-            let mean =
-                (at(2 * x, 2 * y) + at(2 * x + 1, 2 * y) + at(2 * x, 2 * y + 1) + at(2 * x + 1, 2 * y + 1)) / 4.0;
-            assert!((half.rgb[3 * (y * 3 + x) + c] - mean).abs() < 1e-6);
-        }
-    }
-
-    #[test]
-    fn five_pixels_to_two_share_the_middle_one() {
-        let gray = [0.1f32, 0.2, 0.4, 0.8, 1.0];
-        let image =
-            Image { width: 5, height: 1, rgb: gray.iter().flat_map(|&v| [v; 3]).collect(), alpha: Some(gray.into()) };
-        let small = image.resize_area(2, 1);
-        let expected = [(0.1 + 0.2 + 0.2) / 2.5, (0.2 + 0.8 + 1.0) / 2.5];
-        let alpha = small.alpha.unwrap();
-        for i in 0..2 {
-            assert!((small.rgb[3 * i] - expected[i]).abs() < 1e-6 && (alpha[i] - expected[i]).abs() < 1e-6);
+    fn shrinking_averages_areas() {
+        // Five columns to two share the middle one; four rows to two are pairs.
+        let (across, down) = ([0.1f32, 0.2, 0.4, 0.8, 1.0], [0.9, 0.7, 0.2, 0.4]);
+        let gray: Vec<f32> = down.iter().flat_map(|d| across.map(|a| a * d)).collect();
+        let rgb = gray.iter().flat_map(|v| [*v, 0.5 * v, 0.25 * v]).collect();
+        let small = Image { width: 5, height: 4, rgb, alpha: Some(gray) }.resize_area(2, 2);
+        let (across, down) = ([0.5 / 2.5, 2.0 / 2.5], [0.8, 0.3]);
+        for (i, alpha) in small.alpha.unwrap().into_iter().enumerate() {
+            let expected = across[i % 2] * down[i / 2];
+            let rgb = [small.rgb[3 * i], 2.0 * small.rgb[3 * i + 1], 4.0 * small.rgb[3 * i + 2]];
+            assert!([alpha, rgb[0], rgb[1], rgb[2]].iter().all(|v| (v - expected).abs() < 1e-6));
         }
     }
 
@@ -267,14 +255,15 @@ mod tests {
     #[test]
     fn files_round_trip_and_keep_alpha() {
         let dir = tempfile::tempdir().unwrap();
-        let path = dir.path().join("a.png");
+        // The content, not the name, says what a file is.
+        let path = dir.path().join("a.jpg");
         let image = ramp(7, 5);
         image.write_png(&path).unwrap();
         assert_eq!(Image::read(&path).unwrap(), image);
         assert_eq!(size_of(&path).unwrap(), (7, 5));
         assert!(!has_alpha(&path).unwrap());
         let gray = image::GrayAlphaImage::from_raw(2, 1, vec![51, 102, 255, 0]).unwrap();
-        gray.save(&path).unwrap();
+        gray.save_with_format(&path, image::ImageFormat::Png).unwrap();
         let back = Image::read(&path).unwrap();
         assert_eq!(back.rgb, [0.2, 0.2, 0.2, 1.0, 1.0, 1.0]);
         assert_eq!(back.alpha.unwrap(), [0.4, 0.0]);
@@ -292,14 +281,6 @@ mod tests {
         png[29..33].copy_from_slice(&crc.to_be_bytes());
         let e = decode(&png, Path::new("a.png")).unwrap_err().to_string();
         assert!(e.contains("size: the picture is too large, or its header lies; found 16000x16000"), "{e}");
-    }
-
-    #[test]
-    fn the_content_not_the_name_says_what_a_file_is() {
-        let dir = tempfile::tempdir().unwrap();
-        let path = dir.path().join("a.jpg");
-        ramp(4, 4).write_png(&path).unwrap();
-        assert_eq!(Image::read(&path).unwrap(), ramp(4, 4));
     }
 
     proptest! {

@@ -1,9 +1,38 @@
 //! The camera as it took a photograph, with the distortion of its lens.
 
-use crate::distortion::Distortion;
 use crate::image;
 use gs_io::{Error, Result};
 use std::path::Path;
+
+/// Coefficients of OpenCV's model; SIMPLE_RADIAL and RADIAL are its special cases.
+#[derive(Debug, Clone, Copy, Default, PartialEq)]
+pub(crate) struct Distortion {
+    /// Radial coefficients of r^2, r^4 and r^6 in the numerator.
+    pub(crate) k: [f64; 3],
+    /// Radial coefficients of r^2, r^4 and r^6 in the denominator (FULL_OPENCV).
+    pub(crate) denominator: [f64; 3],
+    /// Tangential coefficients.
+    pub(crate) p: [f64; 2],
+}
+
+impl Distortion {
+    /// Whether all coefficients are zero.
+    pub(crate) fn is_none(&self) -> bool {
+        *self == Self::default()
+    }
+
+    /// Where the lens sends the ray through (x, y, 1): normalised image coordinates, undistorted to distorted.
+    pub(crate) fn distort(&self, x: f64, y: f64) -> (f64, f64) {
+        let r2 = x * x + y * y;
+        let poly = |c: &[f64; 3]| 1.0 + r2 * (c[0] + r2 * (c[1] + r2 * c[2]));
+        let radial = poly(&self.k) / poly(&self.denominator);
+        let [p1, p2] = self.p;
+        (
+            x * radial + 2.0 * p1 * x * y + p2 * (r2 + 2.0 * x * x),
+            y * radial + p1 * (r2 + 2.0 * y * y) + 2.0 * p2 * x * y,
+        )
+    }
+}
 
 /// The camera as it took the photograph.
 #[derive(Debug, Clone, Copy, PartialEq)]

@@ -9,19 +9,16 @@
 mod camera;
 pub mod colmap;
 pub mod dataset;
-mod distortion;
 mod gaussians;
 mod geometry;
 mod image;
 mod lens;
 mod order;
 pub mod ply;
-mod points;
 
 pub use camera::Camera;
-pub use distortion::Distortion;
 pub use gaussians::{Gaussians, SH_C0, sh_coefficients};
 pub use geometry::Geometry;
 pub use image::{Image, decode as decode_image, has_alpha as image_has_alpha, size_of as image_size};
 pub use order::morton_order;
-pub use points::PointCloud;
+pub use ply::PointCloud;

@@ -6,38 +6,30 @@
 
 mod table;
 
-use crate::{Gaussians, PointCloud, sh_coefficients};
+use crate::{Gaussians, sh_coefficients};
 use gs_io::{Error, IoContext, Result, write_atomic};
 use std::io::Read;
 use std::path::Path;
-use table::{AGAIN, Column, Table};
+use table::{AGAIN, Table};
 
-impl Table<'_> {
-    fn columns<const N: usize>(&self, names: [&str; N]) -> Result<[Column; N]> {
-        let mut found = [None; N];
-        for (f, name) in found.iter_mut().zip(names) {
-            *f = Some(self.column(name)?);
-        }
-        Ok(found.map(|f| f.expect("each was found")))
+/// Coloured points, such as COLMAP's or a scan's vertices.
+#[derive(Debug, Clone, Default, PartialEq)]
+pub struct PointCloud {
+    /// Positions in the world.
+    pub positions: Vec<[f32; 3]>,
+    /// 8-bit sRGB colours, as many as positions.
+    pub colors: Vec<[u8; 3]>,
+}
+
+impl PointCloud {
+    /// Number of points.
+    pub fn len(&self) -> usize {
+        self.positions.len()
     }
 
-    /// The vertices' positions, which must be finite.
-    fn positions(&self) -> Result<Vec<[f32; 3]>> {
-        let positions = self.positions_as_they_are()?;
-        let bad = |p: &[f32; 3]| p.iter().any(|v| !v.is_finite());
-        if let Some(first) = positions.iter().position(bad) {
-            let all = positions.iter().filter(|p| bad(p)).count();
-            return Err(Error::new("a position is not finite")
-                .field(format!("vertex {first}"))
-                .found(format!("{:?}, and {all} of {} vertices are so", positions[first], self.count))
-                .expected("finite x, y and z")
-                .hint("remove these vertices, or export the PLY again"));
-        }
-        Ok(positions)
-    }
-
-    fn positions_as_they_are(&self) -> Result<Vec<[f32; 3]>> {
-        Ok(self.arrays(self.columns(["x", "y", "z"])?))
+    /// Whether there are none.
+    pub fn is_empty(&self) -> bool {
+        self.positions.is_empty()
     }
 }
 
@@ -50,20 +42,13 @@ fn vertices<T>(path: &Path, take: impl FnOnce(&Table<'_>) -> Result<T>) -> Resul
     table::read(&bytes).and_then(|table| take(&table)).map_err(|e| e.file(path))
 }
 
+/// The comment lines of a PLY's header, without the word `comment`, and whether its vertices have an opacity.
 fn read_header(path: &Path) -> Result<(Vec<String>, bool)> {
     let mut bytes = Vec::new();
     let file = std::fs::File::open(path).at("open", path)?;
     file.take(MAX_HEADER).read_to_end(&mut bytes).at("read", path)?;
     let (comments, there) = table::read_header(&bytes, "opacity").map_err(|e| e.file(path))?;
     Ok((comments.into_iter().map(String::from).collect(), there))
-}
-
-/// The comment lines of a PLY's header, without the word `comment`.
-///
-/// # Errors
-/// When the file cannot be read or has no PLY header.
-pub fn read_comments(path: impl AsRef<Path>) -> Result<Vec<String>> {
-    Ok(read_header(path.as_ref())?.0)
 }
 
 /// The comment of a PLY whose Gaussians were learnt with the 2D filter of Mip-Splatting.
@@ -73,15 +58,15 @@ pub const ANTIALIASED: &str = "antialias true";
 /// are to be rendered with it.
 ///
 /// # Errors
-/// As [`read_comments`].
+/// When the file cannot be read or has no PLY header.
 pub fn is_antialiased(path: impl AsRef<Path>) -> Result<bool> {
-    Ok(read_comments(path)?.iter().any(|c| c == ANTIALIASED))
+    Ok(read_header(path.as_ref())?.0.iter().any(|c| c == ANTIALIASED))
 }
 
 /// Whether a PLY's vertices are Gaussians rather than points: whether they have an opacity.
 ///
 /// # Errors
-/// As [`read_comments`].
+/// As [`is_antialiased`].
 pub fn holds_gaussians(path: impl AsRef<Path>) -> Result<bool> {
     Ok(read_header(path.as_ref())?.1)
 }
@@ -92,7 +77,16 @@ pub fn holds_gaussians(path: impl AsRef<Path>) -> Result<bool> {
 /// # Errors
 /// When the file is damaged or is no 3DGS PLY, or a parameter is not finite.
 pub fn read_gaussians(path: impl AsRef<Path>) -> Result<Gaussians> {
-    vertices(path.as_ref(), whole_gaussians_of)
+    let path = path.as_ref();
+    let mut g = read_gaussians_as_they_are(path)?;
+    g.bound_opacities();
+    let Some((first, parameter)) = (0..g.len()).find_map(|i| Some((i, g.damage(i)?))) else { return Ok(g) };
+    let all = (first..g.len()).filter(|&i| !g.is_whole(i)).count();
+    Err(Error::new("a parameter is not finite")
+        .file(path)
+        .field(format!("vertex {first}, {parameter}"))
+        .found(format!("{all} of {} vertices with such a one", g.len()))
+        .hint("remove these vertices, or export the PLY again"))
 }
 
 /// Reads the Gaussians of a 3DGS PLY as [`read_gaussians`] does, but takes every number as it stands, finite or not: for
@@ -104,38 +98,8 @@ pub fn read_gaussians_as_they_are(path: impl AsRef<Path>) -> Result<Gaussians> {
     vertices(path.as_ref(), gaussians_of)
 }
 
-fn whole_gaussians_of(table: &Table<'_>) -> Result<Gaussians> {
-    // The positions once more than needed, to name a bad one before any other fault.
-    table.positions()?;
-    let mut g = gaussians_of(table)?;
-    let n = g.len();
-    g.bound_opacities();
-    let finite = |name: &str, values: &[f32]| {
-        // Without leaving early, so that it runs at the memory's speed.
-        if values.iter().fold(true, |all, v| all & v.is_finite()) {
-            return Ok(());
-        }
-        let bad: Vec<usize> = (0..values.len()).filter(|&i| !values[i].is_finite()).collect();
-        Err(Error::new("a parameter is not finite")
-            .field(format!("vertex {}, {name}", bad[0] / (values.len() / n)))
-            .found(format!("{}, and {} such numbers in all", values[bad[0]], bad.len()))
-            .hint("remove these vertices, or export the PLY again"))
-    };
-    finite("scale_*", g.log_scales.as_flattened())?;
-    finite("rot_*", g.rotations.as_flattened())?;
-    finite("opacity", &g.opacity_logits)?;
-    finite("f_dc_* or f_rest_*", &g.sh)?;
-    Ok(g)
-}
-
 fn gaussians_of(table: &Table<'_>) -> Result<Gaussians> {
-    let means = table.positions_as_they_are()?;
-    let scale = table.columns(["scale_0", "scale_1", "scale_2"])?;
-    let rotation = table.columns(["rot_0", "rot_1", "rot_2", "rot_3"])?;
-    let [opacity] = table.columns(["opacity"])?;
-    let mut sh_columns = table.columns(["f_dc_0", "f_dc_1", "f_dc_2"])?.to_vec();
-    let rest = rest_columns(table)?;
-    let sh_degree = match rest.len() {
+    let sh_degree = match table.count_of("f_rest_") {
         0 => 0,
         9 => 1,
         24 => 2,
@@ -150,31 +114,16 @@ fn gaussians_of(table: &Table<'_>) -> Result<Gaussians> {
     };
     // The file holds them channel by channel, memory coefficient by coefficient.
     let k = sh_coefficients(sh_degree);
-    sh_columns.extend((0..k - 1).flat_map(|c| [rest[c], rest[k - 1 + c], rest[2 * (k - 1) + c]]));
+    let mut sh = ["f_dc_0", "f_dc_1", "f_dc_2"].map(String::from).to_vec();
+    sh.extend((0..k - 1).flat_map(|c| [0, 1, 2].map(|channel| format!("f_rest_{}", channel * (k - 1) + c))));
     Ok(Gaussians {
-        means,
-        log_scales: table.arrays(scale),
-        rotations: table.arrays(rotation),
-        opacity_logits: table.gather(&[opacity]),
-        sh: table.gather(&sh_columns),
+        means: table.arrays(["x", "y", "z"])?,
+        log_scales: table.arrays(["scale_0", "scale_1", "scale_2"])?,
+        rotations: table.arrays(["rot_0", "rot_1", "rot_2", "rot_3"])?,
+        opacity_logits: table.values(&["opacity"])?,
+        sh: table.values(&sh)?,
         sh_degree,
     })
-}
-
-/// The columns f_rest_0, f_rest_1 and so on, without a gap.
-fn rest_columns(table: &Table<'_>) -> Result<Vec<Column>> {
-    let count = table.count_of("f_rest_");
-    let find = |i: usize| {
-        let name = format!("f_rest_{i}");
-        table.find(&name).ok_or_else(|| {
-            Error::new("a spherical-harmonics property is missing")
-                .field(name)
-                .found(format!("{count} properties f_rest_* without it"))
-                .expected("0, 9, 24 or 45, numbered from 0 without a gap")
-                .hint(AGAIN)
-        })
-    };
-    (0..count).map(find).collect()
 }
 
 fn header(count: usize, comments: &[String], properties: &[(&str, String)]) -> String {
@@ -245,7 +194,42 @@ fn write_rows(
 /// # Errors
 /// When the file is damaged, has no positions, or one is not finite, or a colour lies outside its range.
 pub fn read_points(path: impl AsRef<Path>) -> Result<PointCloud> {
-    vertices(path.as_ref(), points_of)
+    vertices(path.as_ref(), |table| {
+        let positions = positions(table)?;
+        let channel = |name| {
+            let Some(c) = table.find(name) else { return Ok(vec![255; table.count]) };
+            let (most, kind) = if c.is_float() { (1.0, "float") } else { (255.0, "whole number") };
+            let byte = |(i, v): (usize, f32)| {
+                // Rounded first: arithmetic on floats ends a little beside 0 and 1.
+                let scaled = (255.0 / most * v).round();
+                if (0.0..=255.0).contains(&scaled) {
+                    return Ok(scaled as u8);
+                }
+                Err(Error::new("a colour is out of range")
+                    .field(format!("vertex {i}, {name}"))
+                    .found(v)
+                    .expected(format!("0 to {most}, since the property is a {kind}"))
+                    .hint("store red, green and blue as uchar from 0 to 255"))
+            };
+            table.gather(&[c]).into_iter().enumerate().map(byte).collect::<Result<Vec<u8>>>()
+        };
+        let (r, g, b) = (channel("red")?, channel("green")?, channel("blue")?);
+        let colors = (0..table.count).map(|i| [r[i], g[i], b[i]]).collect();
+        Ok(PointCloud { positions, colors })
+    })
+}
+
+/// The vertices' positions, which must be finite.
+fn positions(table: &Table<'_>) -> Result<Vec<[f32; 3]>> {
+    let positions = table.arrays(["x", "y", "z"])?;
+    let bad = |p: &[f32; 3]| p.iter().any(|v| !v.is_finite());
+    let Some(first) = positions.iter().position(bad) else { return Ok(positions) };
+    let all = positions.iter().filter(|p| bad(p)).count();
+    Err(Error::new("a position is not finite")
+        .field(format!("vertex {first}"))
+        .found(format!("{:?}, and {all} of {} vertices are so", positions[first], table.count))
+        .expected("finite x, y and z")
+        .hint("remove these vertices, or export the PLY again"))
 }
 
 /// Reads the positions of a PLY's vertices and a whole-number property of each, such as `label` of ScanNet's
@@ -255,49 +239,16 @@ pub fn read_points(path: impl AsRef<Path>) -> Result<PointCloud> {
 /// When the file is damaged, lacks the property, a position is not finite, or a value is not a whole number from 0 to
 /// 16,777,216.
 pub fn read_labels(path: impl AsRef<Path>, property: &str) -> Result<(Vec<[f32; 3]>, Vec<u32>)> {
-    vertices(path.as_ref(), |table| labels_of(table, property))
-}
-
-fn labels_of(table: &Table<'_>, property: &str) -> Result<(Vec<[f32; 3]>, Vec<u32>)> {
-    let positions = table.positions()?;
-    let column = table.find(property).ok_or_else(|| {
-        Error::new("the vertices lack a property").field(property).hint("give the *.labels.ply of the scan")
-    })?;
-    let whole = |(i, v): (usize, f32)| {
-        if v.fract() == 0.0 && (0.0..=16_777_216.0).contains(&v) {
-            return Ok(v as u32);
-        }
-        Err(Error::new("not a label").field(format!("vertex {i}, {property}")).found(v))
-    };
-    let labels = table.gather(&[column]).into_iter().enumerate().map(whole).collect::<Result<Vec<u32>>>()?;
-    Ok((positions, labels))
-}
-
-fn points_of(table: &Table<'_>) -> Result<PointCloud> {
-    let positions = table.positions()?;
-    let channel = |name| {
-        let Some(c) = table.find(name) else { return Ok(vec![255; table.count]) };
-        let most = if c.is_float() { 1.0 } else { 255.0 };
-        let byte = |(i, v): (usize, f32)| {
-            // Rounded first: arithmetic on floats ends a little beside 0 and 1.
-            let scaled = (255.0 / most * v).round();
-            if (0.0..=255.0).contains(&scaled) {
-                return Ok(scaled as u8);
+    vertices(path.as_ref(), |table| {
+        let whole = |(i, v): (usize, f32)| {
+            if v.fract() == 0.0 && (0.0..=16_777_216.0).contains(&v) {
+                return Ok(v as u32);
             }
-            Err(Error::new("a colour is out of range")
-                .field(format!("vertex {i}, {name}"))
-                .found(v)
-                .expected(format!(
-                    "0 to {most}, since the property is a {}",
-                    if c.is_float() { "float" } else { "whole number" }
-                ))
-                .hint("store red, green and blue as uchar from 0 to 255"))
+            Err(Error::new("not a label").field(format!("vertex {i}, {property}")).found(v))
         };
-        table.gather(&[c]).into_iter().enumerate().map(byte).collect::<Result<Vec<u8>>>()
-    };
-    let (r, g, b) = (channel("red")?, channel("green")?, channel("blue")?);
-    let colors = (0..table.count).map(|i| [r[i], g[i], b[i]]).collect();
-    Ok(PointCloud { positions, colors })
+        let labels = table.values(&[property])?.into_iter().enumerate().map(whole).collect::<Result<Vec<u32>>>()?;
+        Ok((positions(table)?, labels))
+    })
 }
 
 /// Writes a coloured point cloud, little-endian.
@@ -323,21 +274,4 @@ pub fn write_points(path: impl AsRef<Path>, points: &PointCloud, comments: &[Str
         }
         Ok(())
     })
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn labels_are_read_beside_positions() {
-        let text = "ply\nformat ascii 1.0\nelement vertex 2\nproperty float x\nproperty float y\nproperty float z\n\
-                    property ushort label\nelement face 1\nproperty list uchar int vertex_indices\nend_header\n\
-                    1 2 3 0\n4 5 6 65535\n3 0 1 1\n";
-        let read = |text: &str, property| labels_of(&table::read(text.as_bytes())?, property);
-        assert_eq!(read(text, "label").unwrap(), (vec![[1.0, 2.0, 3.0], [4.0, 5.0, 6.0]], vec![0, 65535]));
-        assert!(read(text, "class").unwrap_err().to_string().contains("class: the vertices lack a property"));
-        let e = read(&text.replace("ushort", "float").replace("65535", "-1"), "label").unwrap_err().to_string();
-        assert!(e.contains("vertex 1, label: not a label; found -1"), "{e}");
-    }
 }

@@ -83,20 +83,17 @@ fn write(path: &Path, text: &str) {
     fs::write(path, text).unwrap();
 }
 
-fn quaternion(c: &Camera) -> [f64; 4] {
-    let q = glam::DQuat::from_mat3(&c.rotation);
-    [q.w, q.x, q.y, q.z]
-}
-
-/// The same model as text, with `model` and its parameters.
+/// Writes the model as text, with `model` and its parameters, in place of a binary one.
 fn text_model(folder: &Path, views: &[(String, Camera)], model: &str, parameters: &[f64]) {
+    let _ = fs::remove_dir_all(folder);
     let words = |v: &[f64]| v.iter().map(f64::to_string).collect::<Vec<_>>().join(" ");
     let c = &views[0].1;
     let size = format!("{} {}", c.width, c.height);
     write(&folder.join("cameras.txt"), &format!("# Camera list\n7 {model} {size} {}\n", words(parameters)));
     let mut images = String::from("# Image list\n# two lines an image\n");
     for (i, (name, c)) in views.iter().enumerate() {
-        let pose = words(&[&quaternion(c)[..], &c.translation.to_array()].concat());
+        let [x, y, z, w] = glam::DQuat::from_mat3(&c.rotation).to_array();
+        let pose = words(&[&[w, x, y, z][..], &c.translation.to_array()].concat());
         // Half of the images see nothing: an empty line.
         let seen = if i % 2 == 0 { "1.5 2.5 -1 3.0 4.0 12" } else { "" };
         images += &format!("{} {pose} 7 {name}\n{seen}\n", i + 1);
@@ -111,10 +108,7 @@ fn assert_same_cameras(a: &Dataset, b: &Dataset, tolerance: f64) {
     for (a, b) in a.views.iter().zip(&b.views) {
         assert_eq!((a.camera.width, a.camera.height), (b.camera.width, b.camera.height));
         let numbers = |c: &Camera| {
-            let mut v = vec![c.fx, c.fy, c.cx, c.cy];
-            v.extend(c.rotation.to_cols_array());
-            v.extend(c.translation.to_array());
-            v
+            [&[c.fx, c.fy, c.cx, c.cy][..], &c.rotation.to_cols_array(), &c.translation.to_array()].concat()
         };
         for (x, y) in numbers(&a.camera).into_iter().zip(numbers(&b.camera)) {
             assert!((x - y).abs() < tolerance, "{}: {x} {y}", a.name);
@@ -156,7 +150,6 @@ fn text_and_binary_models_are_the_same() {
     let (a, b) = (dir.path().join("a"), dir.path().join("b"));
     let views = colmap_scene(&a, &cameras(5, 40, 30));
     colmap_scene(&b, &cameras(5, 40, 30));
-    fs::remove_dir_all(b.join("sparse")).unwrap();
     let c = &views[0].1;
     text_model(&b.join("sparse"), &views, "PINHOLE", &[c.fx, c.fy, c.cx, c.cy]);
     let (a, b) = (dataset::load(&a, &FULL).unwrap(), dataset::load(&b, &FULL).unwrap());
@@ -168,7 +161,6 @@ fn text_and_binary_models_are_the_same() {
 fn names_may_hold_blanks_and_folders_and_stems_stay_apart() {
     let dir = tempfile::tempdir().unwrap();
     let mut views = colmap_scene(dir.path(), &cameras(3, 16, 12));
-    fs::remove_dir_all(dir.path().join("sparse")).unwrap();
     let images = dir.path().join("images");
     for (i, name) in ["left/my photo.png", "right/my photo.png", "c.png"].into_iter().enumerate() {
         fs::create_dir_all(images.join(name).parent().unwrap()).unwrap();
@@ -219,19 +211,10 @@ fn holding_out_and_shrinking() {
         assert!(e.contains("not a resolution") && e.contains("auto"), "{e}");
     }
     assert_eq!("auto".parse::<Resolution>().unwrap(), Resolution::Auto);
-}
-
-/// `240` for `240px` is easily typed.
-#[test]
-fn a_divisor_that_leaves_next_to_nothing_is_warned_of() {
-    let dir = tempfile::tempdir().unwrap();
-    colmap_scene(dir.path(), &cameras(2, 120, 90));
-    let warnings = |d: f64| {
-        dataset::load(dir.path(), &LoadOptions { resolution: Resolution::Divisor(d), ..FULL }).unwrap().warnings
-    };
-    assert_eq!(warnings(2.0), [""; 0]);
-    let said = warnings(40.0).join(" ");
-    assert!(said.contains("3x2 pixels") && said.contains("write 40px"), "{said}");
+    // 20 for 20px is easily typed.
+    let resolution = Resolution::Divisor(20.0);
+    let said = dataset::load(dir.path(), &LoadOptions { resolution, ..FULL }).unwrap().warnings.join(" ");
+    assert!(full.warnings.is_empty() && said.contains("2x2 pixels") && said.contains("write 20px"), "{said}");
 }
 
 #[test]
@@ -303,10 +286,6 @@ fn undistortion_matches_the_closed_form() {
     let opencv = [fx, fy, cx, cy, d[0], d[1], d[2], d[3]];
     check_undistortion("OPENCV", &opencv, [fx, fy, cx, cy], d);
     check_undistortion("FULL_OPENCV", &[&opencv[..], &[0.0; 4]].concat(), [fx, fy, cx, cy], d);
-}
-
-#[test]
-fn the_rational_model_divides() {
     // (1 + a r2) / (1 + a r2) is no distortion at all.
     let parameters = [100.0, 100.0, 80.0, 60.0, 0.2, 0.1, 0.0, 0.0, 0.05, 0.2, 0.1, 0.05];
     check_undistortion("FULL_OPENCV", &parameters, [100.0, 100.0, 80.0, 60.0], [0.0; 4]);
@@ -316,7 +295,6 @@ fn the_rational_model_divides() {
 fn impossible_lenses_are_refused() {
     let dir = tempfile::tempdir().unwrap();
     let views = colmap_scene(dir.path(), &cameras(1, 40, 30));
-    fs::remove_dir_all(dir.path().join("sparse")).unwrap();
     for (model, parameters, expected) in [
         ("SIMPLE_RADIAL", &[20.0, 20.0, 15.0, -1e6][..], "frame_00000.png: camera: the lens distortion is too strong"),
         (
@@ -490,67 +468,69 @@ fn both_layouts_of_scannet_agree() {
 
 #[test]
 fn errors_name_file_field_found_and_expected() {
-    let said = |spoil: &dyn Fn(&Path)| {
-        let dir = tempfile::tempdir().unwrap();
-        colmap_scene(dir.path(), &cameras(2, 20, 16));
-        spoil(dir.path());
-        dataset::load(dir.path(), &FULL).unwrap_err().to_string()
-    };
-    let check = |e: &str, file: &str, expected: &str| {
-        assert!(e.contains(file) && e.contains(expected) && !e.contains('\n'), "{e}\nlacks {file} or {expected}");
-    };
-    // Bytes of the model that are overwritten from a place on.
-    for (file, at, bytes, expected) in [
-        ("cameras.bin", 0, &u64::MAX.to_le_bytes()[..], "length; found 18446744073709551615, expected at most 1"),
-        ("cameras.bin", 0, &0u64.to_le_bytes(), ": camera count: the count does not fit the file's length"),
-        ("cameras.bin", 12, &99u32.to_le_bytes(), ": camera 0: unknown camera model; found model 99"),
-        ("cameras.bin", 12, &5u32.to_le_bytes(), ": camera 0: the file is cut short"),
-        ("cameras.bin", 16, &0u64.to_le_bytes(), ": camera 0: impossible image size; found 0x16"),
-        ("frame_00000.png", 8, &42u32.to_le_bytes(), ": the image's camera is unknown; found camera 1"),
-        ("images.bin", 12, &f64::NAN.to_le_bytes(), ": image 0: impossible pose; found quaternion [NaN"),
-        ("images.bin", 44, &f64::INFINITY.to_le_bytes(), ": image 0: impossible pose"),
-        ("images.bin", 0, &1u64.to_le_bytes(), ": image count: the count does not fit the file's length; found 1, and"),
-        ("points3D.bin", 16, &f64::NAN.to_le_bytes(), ": point 0: the position is not finite"),
-        ("points3D.bin", 0, &u64::MAX.to_le_bytes(), ": point count: the count does not fit"),
-    ] {
-        let e = said(&|root| {
-            let path = root.join("sparse/0").join(if file.ends_with("png") { "cameras.bin" } else { file });
-            let mut b = fs::read(&path).unwrap();
-            b[at..at + bytes.len()].copy_from_slice(bytes);
-            fs::write(path, b).unwrap();
-        });
-        check(&e, file, expected);
+    fn put<const N: usize>(mut file: Vec<u8>, at: usize, bytes: [u8; N]) -> Vec<u8> {
+        file[at..at + N].copy_from_slice(&bytes);
+        file
     }
-    // Files cut short by some bytes.
-    for (file, cut, expected) in
-        [("images.bin", 9, ": image 1: the image's name does not end"), ("points3D.bin", 1, "points3D.bin: ")]
-    {
-        let e = said(&|root| {
-            let path = root.join("sparse/0").join(file);
-            let b = fs::read(&path).unwrap();
-            fs::write(path, &b[..b.len() - cut]).unwrap();
-        });
-        check(&e, file, expected);
-    }
-    type Spoil = fn(&Path);
-    let others: [(Spoil, &str, &str); 5] = [
-        (|p| fs::write(p.join("sparse/0/cameras.bin"), [0; 8]).unwrap(), "cameras.bin", ": the model has no camera"),
-        (|p| fs::write(p.join("sparse/0/images.bin"), [0; 8]).unwrap(), "images.bin", ": the model has no image"),
-        (|p| fs::remove_file(p.join("sparse/0/images.bin")).unwrap(), "images.txt", ": cannot read"),
+    type Spoil = fn(Vec<u8>) -> Vec<u8>;
+    let cases: [(&str, Spoil, &str); 17] = [
         (
-            |p| plain(16, 20).write_png(p.join("images/frame_00001.png")).unwrap(),
-            "frame_00001.png: size",
-            "the photograph has another size than its camera; found 16x20, expected 20x16",
+            "cameras.bin",
+            |b| put(b, 0, u64::MAX.to_le_bytes()),
+            "cameras.bin: camera count: the count does not fit the file's length; found 18446744073709551615, expected at most 1",
         ),
         (
-            |p| fs::write(p.join("images/frame_00001.png"), "not a picture").unwrap(),
+            "cameras.bin",
+            |b| put(b, 0, 0u64.to_le_bytes()),
+            "cameras.bin: camera count: the count does not fit the file's length",
+        ),
+        ("cameras.bin", |_| vec![0; 8], "cameras.bin: camera count: the model has no camera"),
+        ("cameras.bin", |b| put(b, 12, [99, 0, 0, 0]), "cameras.bin: camera 0: unknown camera model; found model 99"),
+        ("cameras.bin", |b| put(b, 12, [5, 0, 0, 0]), "cameras.bin: camera 0: the file is cut short"),
+        ("cameras.bin", |b| put(b, 16, [0; 8]), "cameras.bin: camera 0: impossible image size; found 0x16"),
+        (
+            "cameras.bin",
+            |b| put(b, 8, [42, 0, 0, 0]),
+            "frame_00000.png: the image's camera is unknown; found camera 1, expected one of the 1 in",
+        ),
+        (
+            "images.bin",
+            |b| put(b, 0, 1u64.to_le_bytes()),
+            "images.bin: image count: the count does not fit the file's length; found 1, and",
+        ),
+        (
+            "images.bin",
+            |b| put(b, 12, f64::NAN.to_le_bytes()),
+            "images.bin: image 0: impossible pose; found quaternion [NaN",
+        ),
+        ("images.bin", |b| put(b, 44, f64::INFINITY.to_le_bytes()), "images.bin: image 0: impossible pose"),
+        ("images.bin", |b| b[..b.len() - 9].to_vec(), "images.bin: image 1: the image's name does not end"),
+        ("images.bin", |_| vec![0; 8], "images.bin: image count: the model has no image"),
+        ("points3D.bin", |b| put(b, 16, f64::NAN.to_le_bytes()), "points3D.bin: point 0: the position is not finite"),
+        ("points3D.bin", |b| put(b, 0, u64::MAX.to_le_bytes()), "points3D.bin: point count: the count does not fit"),
+        ("points3D.bin", |b| b[..b.len() - 1].to_vec(), "points3D.bin: "),
+        (
             "frame_00001.png",
-            ": not a readable picture",
+            |_| plain(16, 20).to_png(),
+            "frame_00001.png: size: the photograph has another size than its camera; found 16x20, expected 20x16",
         ),
+        ("frame_00001.png", |_| b"not a picture".to_vec(), "frame_00001.png: not a readable picture"),
     ];
-    for (spoil, file, expected) in others {
-        check(&said(&spoil), file, expected);
+    let dir = tempfile::tempdir().unwrap();
+    colmap_scene(dir.path(), &cameras(2, 20, 16));
+    let refused = |expected: &str| {
+        let e = dataset::load(dir.path(), &FULL).unwrap_err().to_string();
+        assert!(e.contains(expected) && !e.contains('\n'), "{e}\nlacks {expected}");
+    };
+    for (name, spoil, expected) in cases {
+        let path = dir.path().join(if name.ends_with("png") { "images" } else { "sparse/0" }).join(name);
+        let good = fs::read(&path).unwrap();
+        fs::write(&path, spoil(good.clone())).unwrap();
+        refused(expected);
+        fs::write(&path, good).unwrap();
     }
+    fs::remove_file(dir.path().join("sparse/0/images.bin")).unwrap();
+    refused("images.txt: cannot read");
 }
 
 #[test]

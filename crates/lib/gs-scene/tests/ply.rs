@@ -104,7 +104,8 @@ fn file(bytes: &[u8]) -> (tempfile::TempDir, PathBuf) {
 }
 
 fn read(bytes: &[u8]) -> gs_io::Result<Gaussians> {
-    ply::read_gaussians(file(bytes).1.as_path())
+    let (_dir, path) = file(bytes);
+    ply::read_gaussians(path)
 }
 
 fn refuse(bytes: &[u8]) -> String {
@@ -120,8 +121,7 @@ fn every_encoding_order_and_degree_reads_the_same() {
         let g = sample(5, degree);
         for kind in [Kind::Ascii, Kind::Little, Kind::Big] {
             for list in [false, true] {
-                let (_dir, path) = file(&encode(&g, kind, list));
-                assert_eq!(ply::read_gaussians(&path).unwrap(), g);
+                assert_eq!(read(&encode(&g, kind, list)).unwrap(), g);
             }
         }
     }
@@ -178,19 +178,17 @@ fn points_round_trip_and_colours_of_other_types_are_read() {
 }
 
 #[test]
-fn positions_that_are_not_finite_are_counted_and_named() {
+fn parameters_must_be_finite_but_opacity_may_be_infinite() {
     let mut g = sample(6, 0);
     g.means[2][1] = f32::NAN;
     g.means[5][0] = f32::INFINITY;
     let e = refuse(&encode(&g, Kind::Little, false));
-    assert!(e.contains("vertex 2: a position is not finite") && e.contains("2 of 6 vertices"), "{e}");
-    // Doubles beyond f32 are as bad.
-    let text = "ply\nformat ascii 1.0\nelement vertex 1\nproperty double x\nproperty double y\nproperty double z\nend_header\n";
-    assert!(refuse(format!("{text}1e300 0 0\n").as_bytes()).contains("vertex 0: a position is not finite"));
-}
-
-#[test]
-fn other_parameters_must_be_finite_but_opacity_may_be_infinite() {
+    assert!(e.contains("vertex 2, x, y, z: a parameter is not finite; found 2 of 6 vertices"), "{e}");
+    // As are positions of points; doubles beyond f32 are as bad.
+    let text = "ply\nformat ascii 1.0\nelement vertex 2\nproperty double x\nproperty double y\nproperty double z\nend_header\n";
+    let (_dir, path) = file(format!("{text}0 0 0\n1e300 0 0\n").as_bytes());
+    let e = ply::read_points(&path).unwrap_err().to_string();
+    assert!(e.contains("vertex 1: a position is not finite") && e.contains("1 of 2 vertices"), "{e}");
     let mut g = sample(4, 1);
     g.opacity_logits[1] = f32::INFINITY;
     g.opacity_logits[3] = f32::NEG_INFINITY;
@@ -250,9 +248,9 @@ fn damage_is_named() {
     };
     for (degree, from, to, expected) in [
         (1, "f_rest_8", "f_last", "f_rest_*: impossible number of spherical-harmonics properties; found 8"),
-        (3, "f_rest_9\n", "other\n", "f_rest_9: a spherical-harmonics property is missing; found 44"),
-        (3, "f_rest_9\n", "f_rest_45\n", "f_rest_9: a spherical-harmonics property is missing; found 45"),
-        (1, "f_rest_8\n", "f_rest_9\n", "f_rest_8: a spherical-harmonics property is missing"),
+        (3, "f_rest_9\n", "other\n", "f_rest_*: impossible number of spherical-harmonics properties; found 44"),
+        (3, "f_rest_9\n", "f_rest_45\n", "f_rest_9: the vertices lack a property"),
+        (1, "f_rest_8\n", "f_rest_9\n", "f_rest_8: the vertices lack a property"),
         (0, "7 2 100", "7 9999999 100", "element camera: the file is cut short"),
         (0, "7 2 100", "7 2 many", "camera 0: not a number; found many"),
     ] {
@@ -263,17 +261,14 @@ fn damage_is_named() {
 
 #[test]
 fn a_count_smaller_than_the_data_is_refused() {
-    let dir = tempfile::tempdir().unwrap();
-    let path = dir.path().join("g.ply");
+    let (_dir, path) = file(b"");
     ply::write_gaussians(&path, &sample(4, 0), &[]).unwrap();
     let good = std::fs::read(&path).unwrap();
     let at = good.windows(16).position(|w| w == b"element vertex 4").unwrap() + 15;
     let fewer = [&good[..at], b"3", &good[at + 1..]].concat();
     let e = refuse(&fewer);
-    assert!(
-        e.contains("found 68 bytes more, expected the end of the file after element vertex 3, as the header says"),
-        "{e}"
-    );
+    let expected = "found 68 bytes more, expected the end of the file after element vertex 3, as the header says";
+    assert!(e.contains(expected), "{e}");
     // Faces are no remains, and an empty line at the end is none either.
     let spaced = [&encode(&sample(4, 0), Kind::Ascii, false)[..], b"\n\r\n"].concat();
     assert_eq!(read(&spaced).unwrap(), sample(4, 0));
@@ -299,6 +294,21 @@ fn colours_keep_to_the_range_of_their_type() {
     assert!(colours("ushort", "0 0 65535").unwrap_err().contains("blue: a colour is out of range; found 65535"));
     assert!(colours("float", "nan 0 0").unwrap_err().contains("red: a colour is out of range"));
     assert!(colours("char", "-1 0 0").unwrap_err().contains("expected 0 to 255"));
+}
+
+#[test]
+fn labels_are_read_beside_positions() {
+    let text = "ply\nformat ascii 1.0\nelement vertex 2\nproperty float x\nproperty float y\nproperty float z\n\
+                property ushort label\nelement face 1\nproperty list uchar int vertex_indices\nend_header\n\
+                1 2 3 0\n4 5 6 65535\n3 0 1 1\n";
+    let read = |text: &str, property| {
+        let (_dir, path) = file(text.as_bytes());
+        ply::read_labels(path, property).map_err(|e| e.to_string())
+    };
+    assert_eq!(read(text, "label").unwrap(), (vec![[1.0, 2.0, 3.0], [4.0, 5.0, 6.0]], vec![0, 65535]));
+    assert!(read(text, "class").unwrap_err().contains("class: the vertices lack a property"));
+    let e = read(&text.replace("ushort", "float").replace("65535", "-1"), "label").unwrap_err();
+    assert!(e.contains("vertex 1, label: not a label; found -1"), "{e}");
 }
 
 #[test]

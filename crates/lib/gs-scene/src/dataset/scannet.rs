@@ -2,8 +2,7 @@
 //! vertices in `*_vh_clean_2.ply`.
 
 use super::{Format, RawDataset, RawView, invert_pose, read_text};
-use crate::distortion::Distortion;
-use crate::lens::Lens;
+use crate::lens::{Distortion, Lens};
 use crate::{PointCloud, image, ply};
 use glam::DMat4;
 use gs_io::{Error, IoContext, Result};

@@ -1,8 +1,7 @@
 //! `transforms.json` of nerfstudio, instant-ngp and Blender; OpenGaussian's conversion of ScanNet is one of these.
 
 use super::{Format, RawDataset, RawView, Split, check_inside, invert_pose, read_text};
-use crate::distortion::Distortion;
-use crate::lens::Lens;
+use crate::lens::{Distortion, Lens};
 use crate::{PointCloud, image, ply};
 use glam::{DMat4, DVec4};
 use gs_io::{Error, Result};

@@ -216,15 +216,6 @@ impl<'a> Table<'a> {
         Self { count: element.count, stride, columns, rows }
     }
 
-    /// The column of a property.
-    pub(super) fn column(&self, name: &str) -> Result<Column> {
-        self.find(name).ok_or_else(|| {
-            Error::new("the vertices lack a property")
-                .field(name)
-                .hint("give another kind of PLY: 3DGS Gaussians have f_dc_*, opacity, scale_* and rot_*")
-        })
-    }
-
     /// The column of a property, where there is one.
     pub(super) fn find(&self, name: &str) -> Option<Column> {
         self.columns.iter().find(|(n, _)| n == name).map(|(_, c)| *c)
@@ -262,9 +253,21 @@ impl<'a> Table<'a> {
         out
     }
 
-    /// The values of a few columns, one array a vertex.
-    pub(super) fn arrays<const N: usize>(&self, columns: [Column; N]) -> Vec<[f32; N]> {
-        self.gather(&columns).as_chunks().0.to_vec()
+    /// The values of some properties, `[count][properties]`.
+    pub(super) fn values(&self, names: &[impl AsRef<str>]) -> Result<Vec<f32>> {
+        let column = |name: &str| {
+            self.find(name).ok_or_else(|| {
+                Error::new("the vertices lack a property").field(name).hint(
+                    "give another kind of PLY: 3DGS Gaussians have f_dc_*, opacity, scale_* and rot_*, scans' labels label",
+                )
+            })
+        };
+        Ok(self.gather(&names.iter().map(|name| column(name.as_ref())).collect::<Result<Vec<_>>>()?))
+    }
+
+    /// The values of a few properties, one array a vertex.
+    pub(super) fn arrays<const N: usize>(&self, names: [&str; N]) -> Result<Vec<[f32; N]>> {
+        Ok(self.values(&names)?.as_chunks().0.to_vec())
     }
 }
 
