@@ -268,7 +268,7 @@ fn damaged_gaussians_are_skipped_as_in_every_stage() {
     }
     // What is trained on has to be whole: refused before any work.
     let out = dir.path("g.ply");
-    assert!(refused(&training(&out, &["--init", &damaged])).contains("vertex 7: a position is not finite"));
+    assert!(refused(&training(&out, &["--init", &damaged])).contains("vertex 7, x, y, z: a parameter is not finite"));
     g.means.fill([f32::NAN; 3]);
     ply::write_gaussians(&damaged, &g, &[]).unwrap();
     let e = refused(&["eval", "--scene", scene(), "--geometry", &damaged, "--out", &out]);
