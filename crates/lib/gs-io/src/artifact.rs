@@ -115,9 +115,6 @@ impl<'a> ArtifactWriter<'a> {
     }
 
     /// Writes the file through a temporary name. The same content gives the same bytes.
-    ///
-    /// # Errors
-    /// When the file cannot be written.
     pub fn write(self, path: impl AsRef<Path>) -> Result<()> {
         let path = path.as_ref();
         let fail = |e: &dyn std::fmt::Display| Error::new(format!("cannot serialise: {e}")).file(path);
@@ -191,9 +188,6 @@ pub struct Artifact {
 
 impl Artifact {
     /// Opens `path` and checks that it is an artifact of this `format` and `version`.
-    ///
-    /// # Errors
-    /// When the file is missing, damaged, of another format or version.
     pub fn open(path: impl AsRef<Path>, format: &str, version: u32) -> Result<Self> {
         let path = path.as_ref();
         let mut file = File::open(path).at("open", path)?;
@@ -270,9 +264,6 @@ impl Artifact {
     }
 
     /// The tensor `name`, without a copy. `shape` gives the expected extents, `None` where any will do.
-    ///
-    /// # Errors
-    /// When the tensor is missing, of another type or shape.
     pub fn tensor<T: Element>(&self, name: &str, shape: &[Option<usize>]) -> Result<&[T]> {
         let fail = |what: &str| Error::new(what).file(&self.path).field(name).hint("run the stage that makes it again");
         let info = self.tensors.get(name).ok_or_else(|| fail("missing tensor"))?;
@@ -295,9 +286,6 @@ impl Artifact {
     }
 
     /// Checks that this artifact was made from the input of the given role with this hash.
-    ///
-    /// # Errors
-    /// Says which artifact comes from another parent.
     pub fn expect_input(&self, role: &str, hash: &str) -> Result<()> {
         match self.provenance.inputs.get(role) {
             Some(h) if h == hash => Ok(()),

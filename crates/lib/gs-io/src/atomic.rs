@@ -7,9 +7,6 @@ use std::io::{BufWriter, Write};
 use std::path::Path;
 
 /// Creates a folder and its parents.
-///
-/// # Errors
-/// When the folder cannot be made (read-only file system, a file in the way).
 pub fn create_dir(dir: impl AsRef<Path>) -> Result<()> {
     fs::create_dir_all(&dir).at("create the folder", &dir)
 }
@@ -17,9 +14,6 @@ pub fn create_dir(dir: impl AsRef<Path>) -> Result<()> {
 /// Writes `path` through `fill`: to a temporary name in the same folder, flushed to the disk, then renamed. A crash, a
 /// full disk or an error from `fill` leaves whatever stood at `path` untouched. A symbolic link stays, and the file that it
 /// leads to is written; a file keeps its permissions.
-///
-/// # Errors
-/// When the folder cannot be written, when `fill` fails, or when flushing or renaming fails.
 pub fn write_atomic(path: impl AsRef<Path>, fill: impl FnOnce(&mut dyn Write) -> Result<()>) -> Result<()> {
     let path = &resolve(path.as_ref());
     let folder = folder_of(path);
@@ -51,18 +45,12 @@ pub fn write_atomic(path: impl AsRef<Path>, fill: impl FnOnce(&mut dyn Write) ->
 }
 
 /// Writes `bytes` to `path` as [`write_atomic`] does.
-///
-/// # Errors
-/// As [`write_atomic`].
 pub fn write_bytes(path: impl AsRef<Path>, bytes: &[u8]) -> Result<()> {
     let path = path.as_ref();
     write_atomic(path, |w| w.write_all(bytes).at("write", path))
 }
 
 /// Writes a value as JSON for people, with line breaks, as [`write_atomic`] does.
-///
-/// # Errors
-/// As [`write_atomic`], and when the value has no JSON, such as a map whose keys are not text.
 pub fn write_json(path: impl AsRef<Path>, value: &impl serde::Serialize) -> Result<()> {
     let path = path.as_ref();
     let json = serde_json::to_vec_pretty(value).map_err(|e| crate::Error::new(e.to_string()).file(path))?;

@@ -18,9 +18,6 @@ pub fn mixed(counter: u64) -> u64 {
 }
 
 /// Content hash of a file, read in pieces.
-///
-/// # Errors
-/// When the file cannot be read.
 pub fn hash_file(path: impl AsRef<Path>) -> Result<String> {
     let path = path.as_ref();
     let file = File::open(path).at("open", path)?;
@@ -30,9 +27,6 @@ pub fn hash_file(path: impl AsRef<Path>) -> Result<String> {
 }
 
 /// One hash for several files: of their names (as given, not the path to them) and contents, in the order given.
-///
-/// # Errors
-/// When a file cannot be read.
 pub fn hash_files<N: AsRef<str>, P: AsRef<Path>>(files: impl IntoIterator<Item = (N, P)>) -> Result<String> {
     let mut h = blake3::Hasher::new();
     for (name, path) in files {

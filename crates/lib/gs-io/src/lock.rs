@@ -57,9 +57,6 @@ impl Lock {
     }
 
     /// Writes into the lock who holds it.
-    ///
-    /// # Errors
-    /// When there is no room for it.
     pub(crate) fn sign(&mut self, by: &str) -> Result<()> {
         if let Some((file, path)) = &self.held {
             // Never empty for a moment: a kill right then would leave files that are nobody's.

@@ -27,9 +27,6 @@ pub fn read_f32(path: impl AsRef<Path>) -> Result<Npy<f32>> {
 }
 
 /// Parses an npy from memory; see [`read_f32`].
-///
-/// # Errors
-/// As [`read_f32`], without the file's name.
 pub fn parse(bytes: &[u8]) -> Result<Npy<f32>> {
     let bad = |what: &str| Error::new(what).hint("write it again with numpy.save");
     if bytes.len() < 10 || &bytes[..6] != MAGIC {
@@ -120,9 +117,6 @@ fn write(path: &Path, descr: &str, shape: &[usize], body: &[u8]) -> Result<()> {
 
 /// Writes an f32 array. The product of `shape` must be the number of values.
 ///
-/// # Errors
-/// When the file cannot be written.
-///
 /// # Panics
 /// When `shape` does not fit `data`.
 pub fn write_f32(path: impl AsRef<Path>, shape: &[usize], data: &[f32]) -> Result<()> {
@@ -131,9 +125,6 @@ pub fn write_f32(path: impl AsRef<Path>, shape: &[usize], data: &[f32]) -> Resul
 }
 
 /// Writes an i32 array as [`write_f32`] does.
-///
-/// # Errors
-/// As [`write_f32`].
 pub fn write_i32(path: impl AsRef<Path>, shape: &[usize], data: &[i32]) -> Result<()> {
     assert_eq!(shape.iter().product::<usize>(), data.len());
     write(path.as_ref(), "<i4", shape, bytemuck::cast_slice(data))

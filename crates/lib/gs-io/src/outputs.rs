@@ -194,9 +194,6 @@ pub struct Claim {
 
 impl Claim {
     /// Ends the work: removes what is stale, and hands the list of what was written to `record`, once for each main output.
-    ///
-    /// # Errors
-    /// When an output cannot be read or a record cannot be written.
     pub fn finish(&mut self, mut record: impl FnMut(&Path, Written) -> Result<()>) -> Result<()> {
         let claimed: BTreeSet<PathBuf> = self.outputs.files.iter().map(|(p, _)| place(p)).collect();
         if self.outputs.drop_stale {

@@ -64,26 +64,17 @@ impl Watched {
     }
 
     /// Checks that all files are still there and the same.
-    ///
-    /// # Errors
-    /// Names the first file that changed or is gone.
     pub fn check(&self) -> Result<()> {
         first(self.files.iter(), true)
     }
 
     /// Checks that no file has become another, for a stage that cannot go on without one of them: what it has read so far
     /// was there, and it says itself which it misses.
-    ///
-    /// # Errors
-    /// Names the first file that changed.
     pub fn check_those_left(&self) -> Result<()> {
         first(self.files.iter(), false)
     }
 
     /// The same for one of the files, after it was read again.
-    ///
-    /// # Errors
-    /// When the file changed.
     pub fn check_one(&self, path: &Path) -> Result<()> {
         first(self.files.iter().filter(|f| f.path == path), false)
     }

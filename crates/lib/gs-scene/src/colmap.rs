@@ -40,9 +40,6 @@ fn file_of(folder: &Path, name: &str) -> Option<PathBuf> {
 
 /// Loads the model in folder `model` of the scene `root`; photographs lie in `images`, `input`, or the scene itself. Without
 /// `points3D` there are no points.
-///
-/// # Errors
-/// When a file is missing, damaged, or uses a camera model that is not supported.
 pub(crate) fn load(root: &Path, model: &Path) -> Result<RawDataset> {
     let (cameras_path, cameras) = part(model, "cameras", binary::cameras, text::cameras)?;
     if cameras.is_empty() {

@@ -261,9 +261,6 @@ impl Dataset {
 
     /// Content hash: names, lenses, poses, sparse points and photographs. It depends neither on where the folder lies nor
     /// on how the dataset was loaded: all stages know a scene by the same hash.
-    ///
-    /// # Errors
-    /// When a photograph cannot be read.
     pub fn hash(&self) -> Result<String> {
         let mut text = String::new();
         let files: Result<Vec<String>> = self.views.par_iter().map(|v| hash_file(&v.image_path)).collect();

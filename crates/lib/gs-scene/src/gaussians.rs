@@ -131,9 +131,6 @@ impl Gaussians {
     }
 
     /// Checks that the arrays fit together.
-    ///
-    /// # Errors
-    /// Names the array of another length.
     pub fn check(&self) -> Result<()> {
         let n = self.len();
         let lengths = [

@@ -25,9 +25,6 @@ pub struct Image {
 }
 
 /// Width and height of a picture file, from its header.
-///
-/// # Errors
-/// When the file cannot be read or is no picture.
 pub fn size_of(path: impl AsRef<Path>) -> Result<(u32, u32)> {
     let path = path.as_ref();
     let reader = ImageReader::open(path).at("open", path)?.with_guessed_format().at("read", path)?;
@@ -54,9 +51,6 @@ pub fn decode(bytes: &[u8], path: &Path) -> Result<DynamicImage> {
 }
 
 /// Whether a picture file has an alpha channel, from its header.
-///
-/// # Errors
-/// As [`size_of`].
 pub fn has_alpha(path: impl AsRef<Path>) -> Result<bool> {
     let path = path.as_ref();
     let reader = ImageReader::open(path).at("open", path)?.with_guessed_format().at("read", path)?;
@@ -116,9 +110,6 @@ impl Image {
     }
 
     /// Writes a PNG, 8 bits a channel, without alpha.
-    ///
-    /// # Errors
-    /// When the file cannot be written.
     pub fn write_png(&self, path: impl AsRef<Path>) -> Result<()> {
         write_bytes(path, &self.to_png())
     }

@@ -56,17 +56,11 @@ pub const ANTIALIASED: &str = "antialias true";
 
 /// Whether a PLY's comments say that its Gaussians were learnt with the 2D filter of Mip-Splatting ([`ANTIALIASED`]), and so
 /// are to be rendered with it.
-///
-/// # Errors
-/// When the file cannot be read or has no PLY header.
 pub fn is_antialiased(path: impl AsRef<Path>) -> Result<bool> {
     Ok(read_header(path.as_ref())?.0.iter().any(|c| c == ANTIALIASED))
 }
 
 /// Whether a PLY's vertices are Gaussians rather than points: whether they have an opacity.
-///
-/// # Errors
-/// As [`is_antialiased`].
 pub fn holds_gaussians(path: impl AsRef<Path>) -> Result<bool> {
     Ok(read_header(path.as_ref())?.1)
 }
@@ -91,9 +85,6 @@ pub fn read_gaussians(path: impl AsRef<Path>) -> Result<Gaussians> {
 
 /// Reads the Gaussians of a 3DGS PLY as [`read_gaussians`] does, but takes every number as it stands, finite or not: for
 /// looking at damaged files and repairing them.
-///
-/// # Errors
-/// When the file is damaged or is no 3DGS PLY.
 pub fn read_gaussians_as_they_are(path: impl AsRef<Path>) -> Result<Gaussians> {
     vertices(path.as_ref(), gaussians_of)
 }
@@ -135,17 +126,11 @@ fn header(count: usize, comments: &[String], properties: &[(&str, String)]) -> S
 }
 
 /// Writes the standard 3DGS layout: little-endian floats, 62 properties at degree 3. `comments` become comment lines.
-///
-/// # Errors
-/// When the arrays do not fit together or the file cannot be written.
 pub fn write_gaussians(path: impl AsRef<Path>, gaussians: &Gaussians, comments: &[String]) -> Result<()> {
     write_rows(path.as_ref(), gaussians, (gaussians.len(), 0..gaussians.len()), comments)
 }
 
 /// The same for the Gaussians `rows` only, in that order, without a copy of them.
-///
-/// # Errors
-/// As [`write_gaussians`]; positions in `rows` are below the number of Gaussians.
 pub fn write_some_gaussians(
     path: impl AsRef<Path>,
     gaussians: &Gaussians,

@@ -9,9 +9,6 @@ use std::path::Path;
 pub(crate) const HELP: &str = "Manual pages and completions: --generate man|bash|zsh|fish|elvish|powershell FOLDER";
 
 /// Writes what `PROGRAM --generate KIND DIR` asks for: `man`, or a shell whose completions are wanted.
-///
-/// # Errors
-/// When there is no such kind, the folder is missing from the arguments, or it cannot be written.
 pub(crate) fn generate<P: CommandFactory>(name: &'static str, arguments: &[String]) -> Result<()> {
     let shells = Shell::value_variants().iter().map(ToString::to_string).collect::<Vec<_>>().join(", ");
     let usage = || {

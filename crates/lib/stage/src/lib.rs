@@ -88,9 +88,6 @@ pub trait Program: clap::Parser {
     }
 
     /// Refuses options that no input can fix, such as a value out of its range. [`main`] asks before [`Self::run`].
-    ///
-    /// # Errors
-    /// The first option that is wrong.
     fn check(&self) -> Result<()> {
         Ok(())
     }

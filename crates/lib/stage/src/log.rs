@@ -105,9 +105,6 @@ impl Stage {
     }
 
     /// Asks whether the work may go on.
-    ///
-    /// # Errors
-    /// When it was interrupted ([`Self::interrupted`]).
     pub fn go_on(&self) -> Result<()> {
         if self.interrupted() { Err(Error::of(gs_io::ErrorKind::Interrupted, "interrupted")) } else { Ok(()) }
     }
@@ -147,9 +144,6 @@ impl Stage {
     /// Writes `<output>.run.json`, the whole of [`RunRecord`]: what ran on what and where, what it took, a summary of the
     /// result, and what it wrote.
     /// Call it last; it is not an artifact, its content differs from run to run.
-    ///
-    /// # Errors
-    /// When an output cannot be read or the record cannot be written.
     pub fn record(
         &self,
         claim: &mut Claim,

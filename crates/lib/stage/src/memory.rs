@@ -40,9 +40,6 @@ impl fmt::Display for Bytes {
 
 impl Stage {
     /// Says how much memory the run will take at its peak, and [`Self::needs`] it.
-    ///
-    /// # Errors
-    /// When it is more than the limit.
     pub fn forecast(&self, bytes: u64, hint: &str) -> Result<()> {
         self.info(&format!("memory: about {} at the peak", Bytes(bytes)));
         self.needs(bytes, hint)
@@ -50,9 +47,6 @@ impl Stage {
 
     /// Notes how much memory the run will take at its peak for the record, and refuses more than `--memory-limit`. `hint` says
     /// what would take less.
-    ///
-    /// # Errors
-    /// When it is more than the limit.
     pub fn needs(&self, bytes: u64, hint: &str) -> Result<()> {
         *self.predicted.lock().expect("no panic holds this lock") = Some(bytes);
         match self.common.memory_limit {
@@ -63,9 +57,6 @@ impl Stage {
 
     /// The same for what the run takes soon after its start, whatever it does later: without `--memory-limit` the machine's
     /// memory is the limit.
-    ///
-    /// # Errors
-    /// When it is more than the limit.
     pub fn needs_at_once(&self, bytes: u64, hint: &str) -> Result<()> {
         match (self.common.memory_limit, Machine::here().memory_bytes) {
             (None, Some(all)) if bytes > all => Err(too_much(bytes, Bytes(all), hint).field("memory of this machine")),

@@ -24,9 +24,6 @@ where
 }
 
 /// A finite number above 0.
-///
-/// # Errors
-/// When `text` is not one.
 pub fn positive<T>(text: &str) -> Result<T, String>
 where
     T: FromStr + Clone + Into<f64>,

@@ -56,9 +56,6 @@ impl RunRecord {
     }
 
     /// Reads the record of `output`.
-    ///
-    /// # Errors
-    /// When it is missing or not such a record.
     pub fn read(output: impl AsRef<Path>) -> Result<Self> {
         let path = Self::path(output);
         let bytes = std::fs::read(&path).at("read", &path)?;

@@ -157,9 +157,6 @@ pub(super) fn points(bytes: &[u8]) -> Result<PointCloud> {
 
 /// Writes a binary model with one PINHOLE camera per view: `cameras.bin`, `images.bin`, `points3D.bin`. Equal
 /// intrinsics share a camera.
-///
-/// # Errors
-/// When a file cannot be written.
 pub fn write_model(folder: &Path, views: &[(String, Camera)], points: &PointCloud) -> Result<()> {
     let mut cameras: Vec<&Camera> = Vec::new();
     let same = |a: &Camera, b: &Camera| {

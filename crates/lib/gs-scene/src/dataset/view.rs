@@ -60,9 +60,6 @@ impl View {
 
     /// Decodes a mask of the photograph, a picture of the same size, as `[height][width]`, 0 (black) to 1 (white), at the
     /// camera's size.
-    ///
-    /// # Errors
-    /// As [`Self::load_image`].
     pub fn load_mask(&self, path: &Path) -> Result<Vec<f32>> {
         let mask = self.load(path)?;
         Ok(mask.rgb.as_chunks::<3>().0.iter().map(|p| p.iter().sum::<f32>() / 3.0).collect())
