@@ -7,6 +7,7 @@
 //! and sheets do not overflow. Nothing here branches or calls a library, so that loops over many Gaussians become vectors.
 
 use crate::types::RasterOptions;
+use glam::{DMat3, DVec3};
 use gs_scene::{Camera, Gaussians};
 
 /// Added to the diagonal of the projected covariance, in square pixels.
@@ -58,40 +59,6 @@ pub(crate) type Parameters<T = f64> = [T; 11];
 pub(crate) fn parameters(g: &Gaussians, i: usize) -> Parameters<f32> {
     let ([x, y, z], [a, b, c], [qw, qx, qy, qz]) = (g.means[i], g.log_scales[i], g.rotations[i]);
     [x, y, z, a, b, c, qw, qx, qy, qz, g.opacity_logits[i]]
-}
-
-type V3 = [f64; 3];
-
-#[inline(always)]
-fn dot(a: V3, b: V3) -> f64 {
-    a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
-}
-
-#[inline(always)]
-fn scaled(a: V3, s: f64) -> V3 {
-    [a[0] * s, a[1] * s, a[2] * s]
-}
-
-#[inline(always)]
-fn sum(a: V3, b: V3) -> V3 {
-    [a[0] + b[0], a[1] + b[1], a[2] + b[2]]
-}
-
-#[inline(always)]
-fn cross(a: V3, b: V3) -> V3 {
-    [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]]
-}
-
-/// Rows times a column.
-#[inline(always)]
-fn times(m: &[V3; 3], v: V3) -> V3 {
-    [dot(m[0], v), dot(m[1], v), dot(m[2], v)]
-}
-
-/// Columns times a column.
-#[inline(always)]
-fn transposed_times(m: &[V3; 3], v: V3) -> V3 {
-    sum(sum(scaled(m[0], v[0]), scaled(m[1], v[1])), scaled(m[2], v[2]))
 }
 
 /// e^x for -700 <= x <= 700 (nearer ones beyond), with a relative error below 1e-13: 2^n by the exponent's bits, the rest by
@@ -148,8 +115,10 @@ pub(crate) fn ln(x: f64) -> f64 {
 /// A camera ready for many Gaussians.
 #[derive(Default)]
 pub(crate) struct Lens {
-    rotation: [V3; 3],
-    position: V3,
+    /// Camera from world, and its transpose.
+    rotation: DMat3,
+    back: DMat3,
+    position: DVec3,
     focal: [f64; 2],
     center: [f64; 2],
     /// Bounds of x/z and y/z in the Jacobian.
@@ -165,8 +134,9 @@ impl Lens {
         let size = [f64::from(c.width), f64::from(c.height)];
         let margin = [0, 1].map(|k| 0.15 * size[k] / focal[k]);
         Self {
-            rotation: [0, 1, 2].map(|r| c.rotation.row(r).into()),
-            position: c.position().into(),
+            rotation: c.rotation,
+            back: c.rotation.transpose(),
+            position: c.position(),
             focal,
             center,
             low: [0, 1].map(|k| -center[k] / focal[k] - margin[k]),
@@ -178,29 +148,30 @@ impl Lens {
 
     /// View direction (from the camera to the Gaussian), not normalised.
     #[inline(always)]
-    pub fn direction(&self, p: &Parameters) -> V3 {
-        [p[0] - self.position[0], p[1] - self.position[1], p[2] - self.position[2]]
+    pub fn direction(&self, p: &Parameters) -> DVec3 {
+        DVec3::new(p[0], p[1], p[2]) - self.position
     }
 }
 
 /// Intermediate values that the backward pass needs again.
 struct Ellipse {
-    t: V3,
+    t: DVec3,
     clamped: [f64; 2],
     inside: [bool; 2],
     /// Rows of J * W.
-    jw: [V3; 2],
-    rotation: [V3; 3],
+    jw: [DVec3; 2],
+    /// Transposed.
+    rotation: DMat3,
     quat: [f64; 4],
     quat_norm: f64,
-    scale: V3,
+    scale: DVec3,
     /// Scale times rotation, transposed, times the rows of J * W.
-    a: V3,
-    b: V3,
+    a: DVec3,
+    b: DVec3,
     /// Of the projection along x and y, the low-pass included.
     variance: [f64; 2],
     /// Inverse of the projected covariance: xx, xy, yy.
-    conic: V3,
+    conic: [f64; 3],
     conic_det: f64,
     own_opacity: f64,
     /// By how much antialiasing lowers the opacity.
@@ -209,18 +180,18 @@ struct Ellipse {
 
 #[inline(always)]
 fn ellipse(p: &Parameters, lens: &Lens, antialias: bool) -> Ellipse {
-    let t = times(&lens.rotation, lens.direction(p));
+    let t = lens.rotation * lens.direction(p);
     let [_, _, _, s0, s1, s2, w, x, y, z, opacity_logit] = *p;
     let quat_norm = (w * w + x * x + y * y + z * z).sqrt();
     let inverse = 1.0 / quat_norm;
     let quat = [w * inverse, x * inverse, y * inverse, z * inverse];
     let [w, x, y, z] = quat;
-    let rotation = [
-        [1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y - w * z), 2.0 * (x * z + w * y)],
-        [2.0 * (x * y + w * z), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z - w * x)],
-        [2.0 * (x * z - w * y), 2.0 * (y * z + w * x), 1.0 - 2.0 * (x * x + y * y)],
-    ];
-    let scale = [exp(s0), exp(s1), exp(s2)];
+    let rotation = DMat3::from_cols(
+        DVec3::new(1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y - w * z), 2.0 * (x * z + w * y)),
+        DVec3::new(2.0 * (x * y + w * z), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z - w * x)),
+        DVec3::new(2.0 * (x * z - w * y), 2.0 * (y * z + w * x), 1.0 - 2.0 * (x * x + y * y)),
+    );
+    let scale = DVec3::new(exp(s0), exp(s1), exp(s2));
     let rz = 1.0 / t[2];
     let (u, v) = (t[0] * rz, t[1] * rz);
     let inside = [lens.low[0] <= u && u <= lens.high[0], lens.low[1] <= v && v <= lens.high[1]];
@@ -231,17 +202,13 @@ fn ellipse(p: &Parameters, lens: &Lens, antialias: bool) -> Ellipse {
     let clamped = [clamp(u, lens.low[0], lens.high[0]), clamp(v, lens.low[1], lens.high[1])];
     let [fx, fy] = lens.focal;
     let jw = [
-        transposed_times(&lens.rotation, [fx * rz, 0.0, -fx * clamped[0] * rz]),
-        transposed_times(&lens.rotation, [0.0, fy * rz, -fy * clamped[1] * rz]),
+        lens.back * DVec3::new(fx * rz, 0.0, -fx * clamped[0] * rz),
+        lens.back * DVec3::new(0.0, fy * rz, -fy * clamped[1] * rz),
     ];
-    let own = |row: V3| {
-        let v = transposed_times(&rotation, row);
-        [v[0] * scale[0], v[1] * scale[1], v[2] * scale[2]]
-    };
-    let (a, b) = (own(jw[0]), own(jw[1]));
+    let (a, b) = (rotation * jw[0] * scale, rotation * jw[1] * scale);
     // |a x b|^2 for the determinant without the low-pass: xx yy - xy^2 would cancel for needles.
-    let (aa, ab, bb, normal) = (dot(a, a), dot(a, b), dot(b, b), cross(a, b));
-    let own_det = dot(normal, normal);
+    let (aa, ab, bb, normal) = (a.dot(a), a.dot(b), b.dot(b), a.cross(b));
+    let own_det = normal.dot(normal);
     let conic_det = 1.0 / (own_det + LOW_PASS * (aa + bb + LOW_PASS));
     Ellipse {
         t,
@@ -348,28 +315,27 @@ pub(crate) fn project_backward(
         // c^2 = det(C) / det(C + k I): by Cayley and Hamilton, the derivative of c by C is k / (2 c det(C + k I)) times the
         // product of adj(C) and (C + k I)^-1, which cancels nothing.
         let by = d.opacity * e.own_opacity * 0.5 * LOW_PASS / e.compensation * e.conic_det;
-        let adj = [e.variance[1] - LOW_PASS, -dot(e.a, e.b), e.variance[0] - LOW_PASS];
+        let adj = [e.variance[1] - LOW_PASS, -e.a.dot(e.b), e.variance[0] - LOW_PASS];
         d_cov[0] += by * (adj[0] * a + adj[1] * b);
         d_cov[1] += by * (adj[0] * b + adj[1] * c);
         d_cov[2] += by * (adj[1] * b + adj[2] * c);
     }
 
     // cov2d = (JW) Sigma (JW)^T, Sigma = M M^T, M = R S.
-    let d_ma = sum(scaled(e.a, 2.0 * d_cov[0]), scaled(e.b, 2.0 * d_cov[1]));
-    let d_mb = sum(scaled(e.a, 2.0 * d_cov[1]), scaled(e.b, 2.0 * d_cov[2]));
+    let d_ma = e.a * (2.0 * d_cov[0]) + e.b * (2.0 * d_cov[1]);
+    let d_mb = e.a * (2.0 * d_cov[1]) + e.b * (2.0 * d_cov[2]);
     // ma = S R^T jw0: d jw0 = R S d_ma; d M = jw0 d_ma^T + jw1 d_mb^T.
-    let stretched = |v: V3| [v[0] * e.scale[0], v[1] * e.scale[1], v[2] * e.scale[2]];
-    let (d_ma_s, d_mb_s) = (stretched(d_ma), stretched(d_mb));
-    let (d_jw0, d_jw1) = (times(&e.rotation, d_ma_s), times(&e.rotation, d_mb_s));
+    let (d_ma_s, d_mb_s) = (d_ma * e.scale, d_mb * e.scale);
+    let (d_jw0, d_jw1) = (e.rotation.transpose() * d_ma_s, e.rotation.transpose() * d_mb_s);
 
     // jw = W^T j: d j = W d_jw.
-    let (d_j0, d_j1) = (times(&lens.rotation, d_jw0), times(&lens.rotation, d_jw1));
+    let (d_j0, d_j1) = (lens.rotation * d_jw0, lens.rotation * d_jw1);
     let rz = 1.0 / e.t[2];
     let rz2 = rz * rz;
     let [fx, fy] = lens.focal;
     let (jx, jy) = (fx * rz2 * d_j0[2], fy * rz2 * d_j1[2]);
     let (cx, cy) = (e.clamped[0] * jx, e.clamped[1] * jy);
-    let mut d_t = [if e.inside[0] { -jx } else { 0.0 }, if e.inside[1] { -jy } else { 0.0 }, 0.0];
+    let mut d_t = DVec3::new(if e.inside[0] { -jx } else { 0.0 }, if e.inside[1] { -jy } else { 0.0 }, 0.0);
     d_t[2] += -fx * rz2 * d_j0[0] - fy * rz2 * d_j1[1];
     d_t[2] += if e.inside[0] { 2.0 * cx } else { cx };
     d_t[2] += if e.inside[1] { 2.0 * cy } else { cy };
@@ -381,12 +347,12 @@ pub(crate) fn project_backward(
     // ma = S (R^T jw0): d S is d_ma times what it stretches, which is ma / S; and d S S the gradient of log S.
     let [a, b, c] = [0, 1, 2].map(|k| d_ma[k] * e.a[k] + d_mb[k] * e.b[k]);
     // d R = jw0 (S d_ma)^T + jw1 (S d_mb)^T.
-    let row = |r: usize| sum(scaled(d_ma_s, e.jw[0][r]), scaled(d_mb_s, e.jw[1][r]));
+    let row = |r: usize| d_ma_s * e.jw[0][r] + d_mb_s * e.jw[1][r];
     let d_quat = quat_backward(e.quat, &[row(0), row(1), row(2)]);
     // q / |q|: the part along q drops out.
     let q = e.quat;
     let along = q[0] * d_quat[0] + q[1] * d_quat[1] + q[2] * d_quat[2] + q[3] * d_quat[3];
-    let [x, y, z] = transposed_times(&lens.rotation, d_t);
+    let DVec3 { x, y, z } = lens.back * d_t;
     let [qw, qx, qy, qz] = [0, 1, 2, 3].map(|k| (d_quat[k] - along * q[k]) / e.quat_norm);
     let opacity_logit = d.opacity * e.own_opacity * e.compensation * (1.0 - e.own_opacity);
     [x, y, z, a, b, c, qw, qx, qy, qz, opacity_logit]
@@ -394,7 +360,7 @@ pub(crate) fn project_backward(
 
 /// d loss / d (w, x, y, z) of a unit quaternion from d loss / d its rotation matrix, by rows.
 #[inline(always)]
-fn quat_backward([w, x, y, z]: [f64; 4], d: &[V3; 3]) -> [f64; 4] {
+fn quat_backward([w, x, y, z]: [f64; 4], d: &[DVec3; 3]) -> [f64; 4] {
     let g = |r: usize, c: usize| d[r][c];
     [
         2.0 * (-z * g(0, 1) + y * g(0, 2) + z * g(1, 0) - x * g(1, 2) - y * g(2, 0) + x * g(2, 1)),

@@ -304,7 +304,7 @@ pub(crate) fn backward(
             let mut p = project_backward(&g.own, &lens, options, d);
             let stored = (g.sh.len() as f64 / 3.0).sqrt() as u8 - 1;
             let (degree, direction) = (stored.min(options.sh_degree), lens.direction(&g.own));
-            let seen = color(&g.sh, direction.into(), degree);
+            let seen = color(&g.sh, direction, degree);
             let d_color = [0, 1, 2].map(|c| if seen[c] < 0.0 { 0.0 } else { d.color[c] });
             let basis = sh::basis(degree, sh::unit(direction).0);
             let mut weights = [0.0; 16];
@@ -315,7 +315,7 @@ pub(crate) fn backward(
                 }
             }
             let through_direction = sh::direction_gradient(degree, direction, &weights);
-            p.iter_mut().zip(through_direction).for_each(|(sum, v)| *sum += v);
+            p.iter_mut().zip(through_direction.to_array()).for_each(|(sum, v)| *sum += v);
             all = p.to_vec();
         }
         all.extend(d_sh);
