@@ -1,10 +1,31 @@
-//! Numerically hostile scenes: no panic, nothing but finite numbers, and what is dropped is counted.
+//! Numerically hostile scenes: no panic, nothing but finite numbers, and what is dropped is counted. Neither the number of
+//! threads nor what is not asked for shows in a single bit.
 
-mod common;
-
-use common::{camera, random};
-use gs_raster::{Dropped, PixelGradients, RasterOptions, Workspace, forward, render_features, tile_weights};
+use glam::DVec3;
+use gs_raster::{Dropped, PixelGradients, RasterOptions, Rendered, Workspace, forward, render_features, tile_weights};
 use gs_scene::{Camera, Gaussians};
+use rand_chacha::ChaCha8Rng;
+use rand_chacha::rand_core::{RngCore, SeedableRng};
+
+/// `n` Gaussians of degree 3 in a cube of side 3, of all opacities.
+fn random(n: usize, seed: u64) -> Gaussians {
+    let mut rng = ChaCha8Rng::seed_from_u64(seed);
+    let mut roll = |low: f32, high: f32| low + (high - low) * (rng.next_u32() >> 8) as f32 / 16_777_216.0;
+    let mut g = Gaussians { sh_degree: 3, ..Gaussians::default() };
+    for _ in 0..n {
+        g.means.push([roll(-1.5, 1.5), roll(-1.5, 1.5), roll(-1.5, 1.5)]);
+        g.log_scales.push([roll(-5.0, -1.0), roll(-5.0, -1.0), roll(-5.0, -1.0)]);
+        g.rotations.push([roll(-1.0, 1.0), roll(-1.0, 1.0), roll(-1.0, 1.0), roll(-1.0, 1.0)]);
+        g.opacity_logits.push(roll(-5.0, 6.0));
+        g.sh.extend((0..48).map(|_| roll(-0.5, 0.5)));
+    }
+    g
+}
+
+/// A camera four units from the origin, which it looks at.
+fn camera(width: u32, height: u32) -> Camera {
+    Camera::look_at(DVec3::new(1.0, -2.0, -3.3), DVec3::ZERO, DVec3::Z, width, height, 0.9)
+}
 
 /// Renders and differentiates by every way there is; all numbers must be finite, alphas within 0 and 1.
 fn survives(g: &Gaussians, camera: &Camera, what: &str) -> (Dropped, f64) {
@@ -99,7 +120,7 @@ fn centres_on_the_camera_plane_and_far_away() {
     // A scene moved by 1e6 with its camera: f32 centres have steps of 1/16 there, so only the count must be alike.
     let mut g = random(400, 3);
     let near = survives(&g, &view, "scene at the origin").0;
-    let shift = glam::DVec3::new(1e6, -1e6, 1e6);
+    let shift = DVec3::new(1e6, -1e6, 1e6);
     for m in &mut g.means {
         *m = (glam::Vec3::from(*m).as_dvec3() + shift).as_vec3().into();
     }
@@ -232,6 +253,56 @@ fn focal_lengths_and_sizes_of_image() {
     for bad in [0.0, f64::NAN, f64::INFINITY] {
         survives(&g, &Camera { fx: bad, ..camera(20, 20) }, &format!("focal length {bad}"));
         survives(&g, &Camera { cx: bad, ..camera(20, 20) }, &format!("principal point {bad}"));
-        survives(&g, &Camera { translation: glam::DVec3::splat(bad), ..camera(20, 20) }, &format!("pose {bad}"));
+        survives(&g, &Camera { translation: DVec3::splat(bad), ..camera(20, 20) }, &format!("pose {bad}"));
     }
+}
+
+#[test]
+fn one_two_three_and_seven_threads_give_the_same_bits() {
+    // More Gaussians than one task projects, and an image whose edge cuts tiles.
+    let (g, dim) = (random(6000, 5), 3);
+    let camera = camera(203, 117);
+    let features: Vec<f32> = g.sh.iter().copied().take(g.len() * dim).collect();
+    let options = RasterOptions { background: [0.1, 0.2, 0.3], ..RasterOptions::default() };
+    let run = || {
+        let mut workspace = Workspace::default();
+        let pixels = workspace.forward(&g, &camera, &options).rendered.alpha.len();
+        let d: Vec<f32> = (0..3 * pixels).map(|i| (i as f32 * 0.37).sin()).collect();
+        let d = PixelGradients { rgb: &d, alpha: Some(&d[..pixels]), depth: Some(&d[pixels..2 * pixels]) };
+        workspace.backward(&g, &camera, &options, d);
+        let weights = [true, false].map(|early_stop| {
+            tile_weights(&g, &camera, &options, early_stop, |t| {
+                (t.gaussians.to_vec(), t.alphas.to_vec(), t.weights.to_vec(), t.alpha.to_vec())
+            })
+        });
+        let features = render_features(&g, &features, dim, &camera, &options);
+        (workspace.forward.rendered, workspace.gradients, features, weights)
+    };
+    let on = |threads: usize| rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap().install(run);
+    let one = on(1);
+    assert!(one.0.alpha.iter().any(|a| *a > 0.5) && one.1.means.iter().any(|m| m[0] != 0.0));
+    for threads in [2, 3, 7] {
+        // Equality of floats is equality of bits here: nothing is NaN, and a zero's sign has nowhere to come from.
+        assert!(on(threads) == one, "{threads} threads");
+    }
+}
+
+#[test]
+fn what_is_not_asked_for_changes_nothing_else() {
+    let g = random(3000, 6);
+    let camera = camera(203, 117);
+    let all = RasterOptions { background: [0.1, 0.2, 0.3], ..RasterOptions::default() };
+    let d: Vec<f32> = (0..3 * 203 * 117).map(|i| (i as f32 * 0.37).sin()).collect();
+    let run = |options: &RasterOptions| {
+        let mut workspace = Workspace::default();
+        workspace.forward(&g, &camera, options);
+        let d = PixelGradients { rgb: &d, alpha: Some(&d[..203 * 117]), depth: None };
+        workspace.backward(&g, &camera, options, d);
+        (workspace.gradients, workspace.forward.rendered)
+    };
+    let (gradients, rendered) = run(&all);
+    assert!(rendered.depth.iter().any(|z| *z > 0.0));
+    let (few, picture) = run(&RasterOptions { depth: false, ..all });
+    assert!(few == gradients && picture.depth.is_empty());
+    assert!(picture == Rendered { depth: Vec::new(), ..rendered });
 }
