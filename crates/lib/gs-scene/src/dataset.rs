@@ -5,7 +5,7 @@ mod transforms;
 mod view;
 
 use crate::lens::Lens;
-use crate::{Camera, PointCloud, colmap};
+use crate::{Camera, PointCloud, colmap, image};
 use glam::{DMat3, DMat4, DQuat, DVec3};
 use gs_io::{Error, IoContext, Result, hash_bytes, hash_file};
 use rayon::prelude::*;
@@ -227,7 +227,10 @@ fn finish(root: &Path, mut raw: RawDataset, options: &LoadOptions) -> Result<Dat
     let stems = stems(&names).map_err(|e| e.file(root))?;
     raw.views
         .par_iter()
-        .map(|v| v.lens.check_size(&v.image_path).and_then(|()| v.check(raw.format)))
+        .map(|v| {
+            v.lens.expect_size(image::size_of(&v.image_path)?, &v.image_path)?;
+            v.check(raw.format)
+        })
         .collect::<Result<Vec<()>>>()?;
     let names_its_own = raw.views.iter().any(|v| v.split == Some(Split::Test));
     let views = raw.views.into_iter().zip(stems).enumerate().map(|(i, (v, stem))| {

@@ -87,18 +87,9 @@ impl Image {
     pub fn read(path: impl AsRef<Path>) -> Result<Self> {
         let path = path.as_ref();
         let decoded = decode(&std::fs::read(path).at("read", path)?, path)?;
-        let (w, h) = (decoded.width(), decoded.height());
-        if !decoded.color().has_alpha() {
-            return Ok(Self::from_rgb8(w, h, decoded.into_rgb8().as_raw()));
-        }
-        let rgba = decoded.into_rgba8();
-        let unit = |v: u8| f32::from(v) / 255.0;
-        Ok(Self {
-            width: w,
-            height: h,
-            rgb: rgba.pixels().flat_map(|p| [unit(p[0]), unit(p[1]), unit(p[2])]).collect(),
-            alpha: Some(rgba.pixels().map(|p| unit(p[3])).collect()),
-        })
+        let alpha = || decoded.to_rgba8().pixels().map(|p| f32::from(p[3]) / 255.0).collect();
+        let alpha = decoded.color().has_alpha().then(alpha);
+        Ok(Self { alpha, ..Self::from_rgb8(decoded.width(), decoded.height(), decoded.into_rgb8().as_raw()) })
     }
 
     /// The image as a PNG in memory, 8 bits a channel, without alpha.

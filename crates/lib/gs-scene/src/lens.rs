@@ -1,6 +1,5 @@
 //! The camera as it took a photograph, with the distortion of its lens.
 
-use crate::image;
 use gs_io::{Error, Result};
 use std::path::Path;
 
@@ -47,10 +46,6 @@ pub(crate) struct Lens {
 
 impl Lens {
     /// Refuses a photograph of another size.
-    pub(crate) fn check_size(&self, path: &Path) -> Result<()> {
-        self.expect_size(image::size_of(path)?, path)
-    }
-
     pub(crate) fn expect_size(&self, (w, h): (u32, u32), path: &Path) -> Result<()> {
         if (w, h) == self.size {
             return Ok(());

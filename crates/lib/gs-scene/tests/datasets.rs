@@ -397,11 +397,6 @@ fn frames_have_their_own_cameras_and_missing_files_are_listed() {
     assert!(d.warnings[1].contains("gone.png: no such photograph, view skipped"), "{:?}", d.warnings);
 }
 
-/// ScanNet's file of intrinsics.
-fn intrinsic_text(c: &Camera) -> String {
-    format!("{} 0 {} 0\n0 {} {} 0\n0 0 1 0\n0 0 0 1\n", c.fx, c.cx, c.fy, c.cy)
-}
-
 /// ScanNet's pose file.
 fn pose_text(c: &Camera) -> String {
     let r = c.rotation.transpose();
@@ -429,7 +424,8 @@ fn both_layouts_of_scannet_agree() {
     }
     write(&raw.join("color/notes.txt"), "not a frame");
     let c = &cameras[0];
-    write(&raw.join("intrinsic/intrinsic_color.txt"), &intrinsic_text(c));
+    let intrinsics = format!("{} 0 {} 0\n0 {} {} 0\n0 0 1 0\n0 0 0 1\n", c.fx, c.cx, c.fy, c.cy);
+    write(&raw.join("intrinsic/intrinsic_color.txt"), &intrinsics);
     ply::write_points(raw.join("scene0000_00_vh_clean_2.ply"), &points(), &[]).unwrap();
     ply::write_points(converted.join("points3d.ply"), &points(), &[]).unwrap();
     frames.pop();
@@ -534,7 +530,7 @@ fn errors_name_file_field_found_and_expected() {
 }
 
 #[test]
-fn cameras_that_no_one_has_are_refused_in_every_layout() {
+fn cameras_that_no_one_has_are_refused_whatever_the_layout() {
     let dir = tempfile::tempdir().unwrap();
     let root = |name: &str| dir.path().join(name);
     let camera = &cameras(1, 40, 30)[0];
@@ -549,15 +545,6 @@ fn cameras_that_no_one_has_are_refused_in_every_layout() {
         write(&root("json/transforms.json"), &json.to_string());
         dataset::load(&root("json"), &FULL).map_err(|e| e.to_string())
     };
-    let scannet = |c: Camera| {
-        for folder in ["color", "pose", "intrinsic"] {
-            fs::create_dir_all(root("scan").join(folder)).unwrap();
-        }
-        plain(40, 30).write_png(root("scan/color/0.png")).unwrap();
-        write(&root("scan/intrinsic/intrinsic_color.txt"), &intrinsic_text(&c));
-        write(&root("scan/pose/0.txt"), &pose_text(&c));
-        dataset::load(&root("scan"), &FULL).map_err(|e| e.to_string())
-    };
     type Change = fn(&mut Camera);
     let of = |change: Change| {
         let mut c = camera.clone();
@@ -567,7 +554,6 @@ fn cameras_that_no_one_has_are_refused_in_every_layout() {
     let focal = ": focal lengths: no camera has this; found ";
     let point = ": principal point: no camera has this; found ";
     let pose = ": translation: no camera has this; found [";
-    let far: Change = |c| c.translation = DVec3::new(0.0, 1e300, 0.0);
     let cases: [(Change, &str); 7] = [
         (|c| c.fx = 1e9, focal),
         (|c| (c.fx, c.fy) = (1e-9, 1e-9), focal),
@@ -575,14 +561,13 @@ fn cameras_that_no_one_has_are_refused_in_every_layout() {
         (|c| c.cx = 1e6, point),
         (|c| c.cy = -200.0, point),
         (|c| c.translation.x = 2e12, pose),
-        (far, pose),
+        (|c| c.translation.y = 1e300, pose),
     ];
     for (change, expected) in cases {
         for e in [colmap(of(change)), transforms(of(change))].map(Result::unwrap_err) {
             assert!(e.contains(&format!(".png{expected}")) && e.contains("; correct the camera in "), "{e}");
         }
     }
-    assert!(scannet(of(far)).unwrap_err().contains(&format!("0.png{pose}")));
     // A satellite's camera, one of 170 degrees, a quarter cut out of a photograph, a scene in metres from the Earth's middle.
     let real: [Change; 4] = [
         |c| (c.fx, c.fy) = (2e5, 2e5),

@@ -13,16 +13,9 @@ const AGAIN: &str = "export the transforms again";
 
 /// The transforms files of a folder, if it has any.
 pub(super) fn find(root: &Path) -> Option<Vec<PathBuf>> {
-    let whole = root.join("transforms.json");
-    if whole.is_file() {
-        return Some(vec![whole]);
-    }
-    let parts: Vec<PathBuf> = ["transforms_train.json", "transforms_test.json"]
-        .iter()
-        .map(|n| root.join(n))
-        .filter(|p| p.is_file())
-        .collect();
-    (!parts.is_empty()).then_some(parts)
+    let there = |names: &[&str]| names.iter().map(|n| root.join(n)).filter(|p| p.is_file()).collect::<Vec<PathBuf>>();
+    let parts = [&["transforms.json"][..], &["transforms_train.json", "transforms_test.json"]];
+    parts.into_iter().map(there).find(|files| !files.is_empty())
 }
 
 /// Reads views from the files; the split comes from the names `transforms_train.json` and `transforms_test.json`, or

@@ -356,10 +356,6 @@ fn take_rows<'a>(element: &Element, encoding: Encoding, body: &mut &'a [u8]) -> 
 /// Reads the vertices of a PLY file. The other elements are walked through and left out: nothing may follow the last one.
 pub(super) fn read(bytes: &[u8]) -> Result<Table<'_>> {
     let header = parse_header(bytes)?;
-    let missing = || Error::new("the file has no vertices").field("element vertex").hint(AGAIN);
-    if !header.elements.iter().any(|e| e.name == "vertex") {
-        return Err(missing());
-    }
     let mut body = header.body;
     let mut table = None;
     for element in &header.elements {
@@ -376,5 +372,5 @@ pub(super) fn read(bytes: &[u8]) -> Result<Table<'_>> {
             .expected(format!("the end of the file after {}, as the header says", counts.join(", ")))
             .hint(AGAIN));
     }
-    table.ok_or_else(missing)
+    table.ok_or_else(|| Error::new("the file has no vertices").field("element vertex").hint(AGAIN))
 }
