@@ -32,7 +32,7 @@ impl Forward {
     }
 }
 
-/// Renders a view and keeps what [`crate::backward`] needs.
+/// Renders a view and keeps what [`crate::Workspace::backward`] needs.
 pub fn forward(g: &Gaussians, camera: &Camera, options: &RasterOptions) -> Forward {
     let mut forward = Forward::default();
     forward.again(g, camera, options);
