@@ -2,8 +2,8 @@
 
 mod common;
 
-use common::world::{SIZE, points, scene, world, write_world};
-use common::{Folder, json, killed, record, refused, run, succeeds};
+use common::world::{PIXELS, SIZE, balls, points, scene, write_world};
+use common::{Folder, json, killed, record, refused, run, succeeds, training};
 use gs_scene::{Image, PointCloud, ply};
 use serde_json::Value;
 use std::fs;
@@ -11,21 +11,13 @@ use std::path::PathBuf;
 use std::process::Command;
 use std::sync::OnceLock;
 
-/// Arguments of a short training that densifies.
-fn training<'a>(out: &'a str, more: &[&'a str]) -> Vec<&'a str> {
-    let mut all = vec!["train", "--scene", scene(), "--out", out, "--iterations", "160"];
-    all.extend(["--densify-every", "20", "--seed", "7"]);
-    all.extend(more);
-    all
-}
-
 /// Geometry and curve of an undisturbed training.
 fn undisturbed() -> &'static (Vec<u8>, Vec<u8>) {
     static ONCE: OnceLock<(Vec<u8>, Vec<u8>)> = OnceLock::new();
     ONCE.get_or_init(|| {
         let dir = Folder::new();
         let out = dir.path("g.ply");
-        succeeds(&training(&out, &["--threads", "2"]));
+        succeeds(&training(scene(), &out, "160", &["--threads", "2"]));
         (fs::read(&out).unwrap(), fs::read(format!("{out}.curve.jsonl")).unwrap())
     })
 }
@@ -65,6 +57,7 @@ fn a_small_world_is_learnt_well() {
     assert_eq!(losses.len(), 100);
     assert!(losses[99] < 0.3 * losses[0], "{losses:?}");
     assert!(curve.lines().last().unwrap().contains("psnr_heldout"));
+    assert!(fs::read_to_string(format!("{out}.curve.svg")).unwrap().contains("held-out"));
     assert!(!PathBuf::from(format!("{out}.checkpoint")).exists());
     let record = record(&out);
     assert_eq!(record["summary"]["gaussians"], g.len());
@@ -74,7 +67,7 @@ fn a_small_world_is_learnt_well() {
 fn thread_counts_do_not_matter_and_seeds_do() {
     let dir = Folder::new();
     let out = dir.path("g.ply");
-    succeeds(&training(&out, &["--threads", "1"]));
+    succeeds(&training(scene(), &out, "160", &["--threads", "1"]));
     assert_eq!(fs::read(&out).unwrap(), undisturbed().0);
     assert_eq!(fs::read(format!("{out}.curve.jsonl")).unwrap(), undisturbed().1);
     let other = dir.path("h.ply");
@@ -109,8 +102,8 @@ fn a_time_budget_is_a_plan_that_can_be_run_without_it() {
 fn a_killed_run_goes_on_to_the_same_bytes() {
     let dir = Folder::new();
     let out = dir.path("g.ply");
-    killed(&training(&out, &[]), &out);
-    succeeds(&training(&out, &["--checkpoint-every", "0.01s"]));
+    killed(&training(scene(), &out, "160", &[]), &out);
+    succeeds(&training(scene(), &out, "160", &["--checkpoint-every", "0.01s"]));
     assert_eq!(fs::read(&out).unwrap(), undisturbed().0);
     assert_eq!(fs::read(format!("{out}.curve.jsonl")).unwrap(), undisturbed().1);
     assert_eq!(dir.names(), ["g.ply", "g.ply.curve.jsonl", "g.ply.curve.svg", "g.ply.run.json"]);
@@ -121,8 +114,7 @@ fn a_killed_run_goes_on_to_the_same_bytes() {
 fn a_signal_ends_with_a_checkpoint_and_usable_gaussians() {
     let dir = Folder::new();
     let out = dir.path("g.ply");
-    let mut arguments = training(&out, &["--checkpoint-every", "1"]);
-    arguments[6] = "100000";
+    let arguments = training(scene(), &out, "100000", &["--checkpoint-every", "1"]);
     let o = common::disturbed(&arguments, &out, |child| {
         assert!(Command::new("kill").args(["-TERM", &child.id().to_string()]).status().unwrap().success());
     });
@@ -135,8 +127,8 @@ fn a_signal_ends_with_a_checkpoint_and_usable_gaussians() {
 fn a_checkpoint_of_other_parameters_is_not_used() {
     let dir = Folder::new();
     let out = dir.path("g.ply");
-    killed(&training(&out, &["--holdout", "5"]), &out);
-    let o = run(&training(&out, &[]));
+    killed(&training(scene(), &out, "160", &["--holdout", "5"]), &out);
+    let o = run(&training(scene(), &out, "160", &[]));
     let said = String::from_utf8_lossy(&o.stderr);
     assert!(o.status.success() && said.contains("beginning anew") && said.contains("another run"), "{said}");
     assert_eq!(fs::read(&out).unwrap(), undisturbed().0);
@@ -146,7 +138,7 @@ fn a_checkpoint_of_other_parameters_is_not_used() {
 fn densify_fixed_keeps_number_order_and_place() {
     let dir = Folder::new();
     let out = dir.path("g.ply");
-    succeeds(&training(&out, &["--densify", "fixed"]));
+    succeeds(&training(scene(), &out, "160", &["--densify", "fixed"]));
     let (g, cloud) = (ply::read_gaussians(&out).unwrap(), points());
     assert_eq!(g.means.len(), cloud.len());
     for (a, b) in g.means.iter().zip(&cloud.positions) {
@@ -180,7 +172,7 @@ fn a_scene_without_points_starts_at_random_and_a_ply_can_be_refined() {
 #[test]
 fn views_are_rendered_and_measured() {
     let dir = Folder::new();
-    let (g, _) = world();
+    let g = balls(60);
     let geometry = dir.path("g.ply");
     ply::write_gaussians(&geometry, &g, &[]).unwrap();
     let base = ["--scene", scene(), "--geometry", &geometry];
@@ -196,7 +188,7 @@ fn views_are_rendered_and_measured() {
         assert_eq!(names, ["A", "B", "G", "R", "Z"]);
         let values = |i: usize| channels[i].sample_data.values_as_f32().collect::<Vec<f32>>();
         let (alpha, depth) = (values(0), values(4));
-        assert_eq!(alpha.len(), (SIZE.0 * SIZE.1) as usize);
+        assert_eq!(alpha.len(), PIXELS);
         let seen: Vec<f32> = alpha.iter().zip(&depth).filter(|(a, _)| **a > 0.5).map(|(_, z)| *z).collect();
         assert!(!seen.is_empty() && seen.iter().all(|z| (1.0..6.0).contains(z)));
     }
@@ -224,22 +216,22 @@ fn views_are_rendered_and_measured() {
 #[test]
 fn what_is_skipped_changes_nothing() {
     let dir = Folder::new();
-    let (mut g, _) = world();
+    let mut g = balls(60);
     g.opacity_logits[10..15].fill(-9.0);
     let start = dir.path("start.ply");
     ply::write_gaussians(&start, &g, &[]).unwrap();
     let (out, all) = (dir.path("g.ply"), dir.path("all.ply"));
     let refine = ["--init", &start, "--densify", "none"];
-    succeeds(&training(&out, &refine));
-    succeeds(&training(&all, &[&refine[..], &["--no-skip"]].concat()));
+    succeeds(&training(scene(), &out, "160", &refine));
+    succeeds(&training(scene(), &all, "160", &[&refine[..], &["--no-skip"]].concat()));
     let (drawn, whole) = (ply::read_gaussians(&out).unwrap(), ply::read_gaussians(&all).unwrap());
     let rows: Vec<u32> = (0..whole.len() as u32).filter(|&i| whole.opacity(i as usize) >= 1.0 / 255.0).collect();
     assert!(rows.len() < whole.len(), "{} Gaussians, all of them drawn", whole.len());
     assert_eq!(drawn, whole.select(&rows));
 
-    let g = gs_geom::start::with_degree(world().0, 3);
-    let geometry = dir.path("zeros.ply");
-    ply::write_gaussians(&geometry, &g, &[]).unwrap();
+    let (flat, geometry) = (dir.path("flat.ply"), dir.path("zeros.ply"));
+    ply::write_gaussians(&flat, &balls(60), &[]).unwrap();
+    succeeds(&["convert", &flat, &geometry, "--sh-degree", "3"]);
     let metrics = dir.path("m.json");
     let said = succeeds(&["eval", "--scene", scene(), "--geometry", &geometry, "--out", &metrics]);
     assert!(said.contains("skipped spherical harmonics of degrees 1 to 3"), "{said}");
@@ -248,7 +240,7 @@ fn what_is_skipped_changes_nothing() {
 #[test]
 fn damaged_gaussians_are_skipped_as_in_every_stage() {
     let dir = Folder::new();
-    let (mut g, _) = world();
+    let mut g = balls(60);
     g.means[7][1] = f32::NAN;
     let (damaged, without, metrics) = (dir.path("damaged.ply"), dir.path("without.ply"), dir.path("m.json"));
     ply::write_gaussians(&damaged, &g, &[]).unwrap();
@@ -268,7 +260,8 @@ fn damaged_gaussians_are_skipped_as_in_every_stage() {
     }
     // What is trained on has to be whole: refused before any work.
     let out = dir.path("g.ply");
-    assert!(refused(&training(&out, &["--init", &damaged])).contains("vertex 7, x, y, z: a parameter is not finite"));
+    let said = refused(&training(scene(), &out, "160", &["--init", &damaged]));
+    assert!(said.contains("vertex 7, x, y, z: a parameter is not finite"), "{said}");
     g.means.fill([f32::NAN; 3]);
     ply::write_gaussians(&damaged, &g, &[]).unwrap();
     let e = refused(&["eval", "--scene", scene(), "--geometry", &damaged, "--out", &out]);
@@ -318,7 +311,7 @@ fn bad_input_is_refused_in_one_line() {
 
     let cut = dir.path("cut.ply");
     let whole = dir.path("whole.ply");
-    ply::write_gaussians(&whole, &world().0, &[]).unwrap();
+    ply::write_gaussians(&whole, &balls(60), &[]).unwrap();
     let bytes = fs::read(&whole).unwrap();
     fs::write(&cut, &bytes[..bytes.len() - 5]).unwrap();
     assert!(train(scene(), &["--init", &cut]).contains("cut.ply"));

@@ -2,86 +2,52 @@
 
 mod common;
 
-use common::{json, record, refused, succeeds};
-use glam::DVec3;
+use common::world::{PIXELS, SIZE, balls, points, ring, scene, write_scene};
+use common::{Folder, json, record, refused, succeeds};
 use gs_raster::{RasterOptions, render};
 use gs_scene::{Camera, Gaussians, PointCloud, ply};
 use serde_json::Value;
 use std::fs;
 use std::path::Path;
 
-const SIZE: (u32, u32) = (64, 48);
 const VIEWS: usize = 24;
 /// A training of a few seconds.
 const TRAINING: [&str; 10] =
     ["--iterations", "1000", "--holdout", "6", "--sh-degree", "0", "--max-gaussians", "400", "--schedule", "full"];
 
-/// Opaque balls of different colours.
-fn balls() -> Gaussians {
-    let n = 40;
-    let t = |i: usize| i as f32 / n as f32;
-    Gaussians {
-        means: (0..n).map(|i| [(11.0 * t(i)).cos() * t(i), (11.0 * t(i)).sin() * t(i), t(i) - 0.5]).collect(),
-        log_scales: vec![[-1.9, -2.1, -1.8]; n],
-        rotations: vec![[1.0, 0.2, -0.1, 0.3]; n],
-        opacity_logits: vec![3.0; n],
-        sh: (0..3 * n).map(|i| (i as f32 * 1.7).sin()).collect(),
-        sh_degree: 0,
-    }
+/// A folder with a scene of the balls; `change` may change the photographs, `[height][width][rgba]`.
+fn photographed(rgba: bool, change: impl Fn(usize, &mut [[f32; 4]])) -> Folder {
+    let folder = Folder::new();
+    write_scene(&folder.path("scene"), &ring(VIEWS), &points(), |i, c, path| {
+        let r = render(&balls(60), c, &RasterOptions::default());
+        // As files have them: not multiplied by alpha.
+        let pixel = |(p, &a): (&[f32], &f32)| {
+            let straight = |v: f32| if rgba { v / a.max(1e-6) } else { v };
+            [straight(p[0]), straight(p[1]), straight(p[2]), a]
+        };
+        let mut pixels: Vec<[f32; 4]> = r.rgb.chunks(3).zip(&r.alpha).map(pixel).collect();
+        change(i, &mut pixels);
+        let values = pixels.iter().flat_map(|p| p[..if rgba { 4 } else { 3 }].iter());
+        let bytes: Vec<u8> = values.map(|v| (v.clamp(0.0, 1.0) * 255.0).round() as u8).collect();
+        let kind = if rgba { image::ColorType::Rgba8 } else { image::ColorType::Rgb8 };
+        image::save_buffer(path, &bytes, SIZE.0, SIZE.1, kind).unwrap();
+    });
+    folder
 }
 
-fn cameras() -> Vec<Camera> {
-    let at = |i: usize| {
-        let a = i as f64 / VIEWS as f64 * std::f64::consts::TAU;
-        let eye = DVec3::new(3.0 * a.cos(), 3.0 * a.sin(), 0.5);
-        Camera::look_at(eye, DVec3::ZERO, DVec3::Z, SIZE.0, SIZE.1, 0.8)
-    };
-    (0..VIEWS).map(at).collect()
+/// Trains; the run's summary.
+fn train(dir: &Folder, out: &str, more: &[&str]) -> Value {
+    let (scene, out) = (dir.path("scene"), dir.path(out));
+    succeeds(&[&["train", "--scene", &scene, "--out", &out], &TRAINING[..], more].concat());
+    record(&out)["summary"].clone()
 }
 
-/// A folder with a COLMAP scene of the balls; `change` may change the photographs, `[height][width][rgba]`.
-struct Folder(common::Folder);
-
-impl Folder {
-    fn new(rgba: bool, change: impl Fn(usize, &mut [[f32; 4]])) -> Self {
-        let folder = Self(common::Folder::new());
-        let colors = (0..balls().len()).map(|i| balls().base_color(i).map(|v| (v.clamp(0.0, 1.0) * 255.0) as u8));
-        let points = PointCloud { positions: balls().means, colors: colors.collect() };
-        common::write_scene(Path::new(&folder.path("scene")), &cameras(), &points, |i, c, path| {
-            let r = render(&balls(), c, &RasterOptions::default());
-            // As files have them: not multiplied by alpha.
-            let pixel = |(p, &a): (&[f32], &f32)| {
-                let straight = |v: f32| if rgba { v / a.max(1e-6) } else { v };
-                [straight(p[0]), straight(p[1]), straight(p[2]), a]
-            };
-            let mut pixels: Vec<[f32; 4]> = r.rgb.chunks(3).zip(&r.alpha).map(pixel).collect();
-            change(i, &mut pixels);
-            let values = pixels.iter().flat_map(|p| p[..if rgba { 4 } else { 3 }].iter());
-            let bytes: Vec<u8> = values.map(|v| (v.clamp(0.0, 1.0) * 255.0).round() as u8).collect();
-            let kind = if rgba { image::ColorType::Rgba8 } else { image::ColorType::Rgb8 };
-            image::save_buffer(path, &bytes, SIZE.0, SIZE.1, kind).unwrap();
-        });
-        folder
-    }
-
-    fn path(&self, name: &str) -> String {
-        self.0.path(name)
-    }
-
-    /// Trains; the run's summary.
-    fn train(&self, out: &str, more: &[&str]) -> Value {
-        let (scene, out) = (self.path("scene"), self.path(out));
-        succeeds(&[&["train", "--scene", &scene, "--out", &out], &TRAINING[..], more].concat());
-        record(&out)["summary"].clone()
-    }
-
-    /// PSNR of a geometry on the held-out views, by `gs-geom eval`.
-    fn eval(&self, geometry: &str, more: &[&str]) -> f64 {
-        let (scene, geometry, out) = (self.path("scene"), self.path(geometry), self.path("m.json"));
-        let all = ["eval", "--scene", &scene, "--geometry", &geometry, "--holdout", "6", "--out", &out];
-        succeeds(&[&all[..], more].concat());
-        psnr(&json(&out))
-    }
+/// PSNR of a geometry on the held-out views, by `gs-geom eval`.
+fn eval(dir: &Folder, geometry: &str, more: &[&str]) -> f64 {
+    let (scene, geometry, out) = (dir.path("scene"), dir.path(geometry), dir.path("m.json"));
+    let all = ["eval", "--scene", &scene, "--geometry", &geometry, "--holdout", "6", "--out", &out];
+    succeeds(&[&all[..], more].concat());
+    psnr(&json(&out))
 }
 
 fn psnr(summary: &Value) -> f64 {
@@ -93,13 +59,13 @@ fn exposures_that_differ_are_compensated() {
     // From one side all is bright, from the other dark. Every sixth view is held out and as the scene is; the others' gains
     // have a mean of 1.
     let gain = |i: usize| 1.0 + 0.3 * (i as f32 / VIEWS as f32 * std::f32::consts::TAU).sin();
-    let dir = Folder::new(false, |i, pixels| {
+    let dir = photographed(false, |i, pixels| {
         if i % 6 != 0 {
             pixels.iter_mut().for_each(|p| p[..3].iter_mut().for_each(|v| *v *= gain(i)));
         }
     });
-    let without = dir.train("a.ply", &[]);
-    let with = dir.train("b.ply", &["--exposure"]);
+    let without = train(&dir, "a.ply", &[]);
+    let with = train(&dir, "b.ply", &["--exposure"]);
     assert!(psnr(&with) > psnr(&without) + 2.0, "{} {}", psnr(&with), psnr(&without));
     let maps = json(&dir.path("b.ply.exposures.json"));
     assert_eq!(maps.as_object().unwrap().len(), VIEWS - 4);
@@ -115,8 +81,8 @@ fn exposures_that_differ_are_compensated() {
 fn alpha_error(file: &str) -> f64 {
     let g = ply::read_gaussians(file).unwrap();
     let alpha = |g: &Gaussians, c: &Camera| render(g, c, &RasterOptions::default()).alpha;
-    let errors = cameras().into_iter().map(|c| {
-        let (a, b) = (alpha(&g, &c), alpha(&balls(), &c));
+    let errors = ring(VIEWS).into_iter().map(|c| {
+        let (a, b) = (alpha(&g, &c), alpha(&balls(60), &c));
         a.iter().zip(&b).map(|(a, b)| f64::from((a - b).abs())).sum::<f64>() / a.len() as f64
     });
     errors.sum::<f64>() / VIEWS as f64
@@ -125,16 +91,16 @@ fn alpha_error(file: &str) -> f64 {
 #[test]
 fn alpha_is_learnt_from_transparent_photographs() {
     // Over black, dark things may be transparent or opaque; over any colour they may not.
-    let dir = Folder::new(true, |_, pixels| {
+    let dir = photographed(true, |_, pixels| {
         pixels.iter_mut().for_each(|p| p[..3].iter_mut().for_each(|v| *v *= 0.1));
     });
-    let background = dir.train("a.ply", &[]);
-    dir.train("b.ply", &["--background", "random"]);
+    let background = train(&dir, "a.ply", &[]);
+    train(&dir, "b.ply", &["--background", "random"]);
     let [plain, random] = ["a.ply", "b.ply"].map(|f| alpha_error(&dir.path(f)));
     assert!(random < 0.8 * plain, "{plain} {random}");
     assert!(psnr(&background) > 30.0, "{background}");
     // What should be opaque hides a background of another colour.
-    let [plain, random] = ["a.ply", "b.ply"].map(|f| dir.eval(f, &["--background", "white"]));
+    let [plain, random] = ["a.ply", "b.ply"].map(|f| eval(&dir, f, &["--background", "white"]));
     assert!(random > plain + 1.0, "{plain} {random}");
 }
 
@@ -145,23 +111,23 @@ fn masked_pixels_do_not_count() {
         let (x, y) = ((7 * i) % 40 + 6, (5 * i) % 24 + 4);
         (0..18).flat_map(move |dy| (0..18).map(move |dx| (y + dy) * SIZE.0 as usize + x + dx))
     };
-    let dir = Folder::new(false, |i, pixels| at(i).for_each(|p| pixels[p] = [0.9, 0.9, (i % 2) as f32, 1.0]));
+    let dir = photographed(false, |i, pixels| at(i).for_each(|p| pixels[p] = [0.9, 0.9, (i % 2) as f32, 1.0]));
     let masks = dir.path("masks");
     fs::create_dir(&masks).unwrap();
     for i in 0..VIEWS {
-        let mut mask = vec![255u8; (SIZE.0 * SIZE.1) as usize];
+        let mut mask = vec![255u8; PIXELS];
         at(i).for_each(|p| mask[p] = 0);
         // As COLMAP calls masks, and without the photograph's own extension.
         let name = if i % 2 == 0 { format!("{i:02}.png.png") } else { format!("{i:02}.png") };
         image::save_buffer(Path::new(&masks).join(name), &mask, SIZE.0, SIZE.1, image::ColorType::L8).unwrap();
     }
-    let whole = dir.train("a.ply", &[]);
-    let masked = dir.train("b.ply", &["--masks", &masks]);
+    let whole = train(&dir, "a.ply", &[]);
+    let masked = train(&dir, "b.ply", &["--masks", &masks]);
     assert!(psnr(&masked) > 22.0 && psnr(&whole) < 18.0, "{masked} {whole}");
-    let eval = |geometry: &str| dir.eval(geometry, &["--masks", &masks]);
-    let (without, with) = (eval("a.ply"), eval("b.ply"));
+    let masked_eval = |geometry: &str| eval(&dir, geometry, &["--masks", &masks]);
+    let (without, with) = (masked_eval("a.ply"), masked_eval("b.ply"));
     assert!(with > without + 1.0 && (with - psnr(&masked)).abs() < 0.2, "{without} {with} {masked}");
-    black_masks_do_not_count(&dir, &masks, &eval);
+    black_masks_do_not_count(&dir, &masks);
     // Without a mask for some, and for all.
     fs::remove_file(Path::new(&masks).join("01.png")).unwrap();
     let (scene, out) = (dir.path("scene"), dir.path("c.ply"));
@@ -172,16 +138,16 @@ fn masked_pixels_do_not_count() {
 }
 
 /// A held-out view whose mask is black has no figures, and the means are those of the others.
-fn black_masks_do_not_count(dir: &Folder, masks: &str, eval: &dyn Fn(&str) -> f64) {
+fn black_masks_do_not_count(dir: &Folder, masks: &str) {
     let metrics = || json(&dir.path("m.json"));
     let figures = |m: &Value| m["views"].as_array().unwrap().iter().map(|v| v["psnr"].as_f64()).collect::<Vec<_>>();
     let before = figures(&metrics());
     let blacken = |i: usize| {
-        let (file, mask) = (Path::new(masks).join(format!("{i:02}.png.png")), vec![0u8; (SIZE.0 * SIZE.1) as usize]);
+        let (file, mask) = (Path::new(masks).join(format!("{i:02}.png.png")), vec![0u8; PIXELS]);
         image::save_buffer(file, &mask, SIZE.0, SIZE.1, image::ColorType::L8).unwrap();
     };
     blacken(6);
-    let mean = eval("b.ply");
+    let mean = eval(dir, "b.ply", &["--masks", masks]);
     let m = metrics();
     assert_eq!(figures(&m), [before[0], None, before[2], before[3]]);
     assert_eq!(m["views"][1]["ssim"], Value::Null);
@@ -191,16 +157,16 @@ fn black_masks_do_not_count(dir: &Folder, masks: &str, eval: &dyn Fn(&str) -> f6
     assert!(said.contains("1 of the views measured: no pixel counts there (a black mask), in 06.png"), "{said}");
     // Training measures the same views in the same way.
     [0, 12, 18].into_iter().for_each(blacken);
-    let summary = dir.train("black.ply", &["--masks", masks]);
+    let summary = train(dir, "black.ply", &["--masks", masks]);
     assert_eq!(summary["psnr_heldout"], Value::Null, "{summary}");
 }
 
 #[test]
 fn antialiased_gaussians_say_so_and_are_rendered_so() {
-    let dir = Folder::new(false, |_, _| ());
-    dir.train("a.ply", &[]);
-    let learnt = psnr(&dir.train("b.ply", &["--antialias"]));
-    let eval = |geometry: &str, resolution: &str| dir.eval(geometry, &["--resolution", resolution]);
+    let dir = photographed(false, |_, _| ());
+    train(&dir, "a.ply", &[]);
+    let learnt = psnr(&train(&dir, "b.ply", &["--antialias"]));
+    let eval = |geometry: &str, resolution: &str| eval(&dir, geometry, &["--resolution", resolution]);
     assert!((eval("b.ply", "1") - learnt).abs() < 0.2);
     // Far away, where Gaussians are smaller than pixels, those learnt without the filter are too thick.
     let (coarse, coarse_filtered) = (eval("a.ply", "8"), eval("b.ply", "8"));
@@ -219,22 +185,22 @@ fn antialiased_gaussians_say_so_and_are_rendered_so() {
 
 #[test]
 fn a_run_starts_from_what_it_is_told_to() {
-    let dir = Folder::new(false, |_, _| ());
-    let (scene, out, cloud, gaussians) = (dir.path("scene"), dir.path("g.ply"), dir.path("p.ply"), dir.path("i.ply"));
-    let points = PointCloud { positions: balls().means[..7].to_vec(), colors: vec![[10, 20, 30]; 7] };
+    let dir = Folder::new();
+    let (out, cloud, gaussians) = (dir.path("g.ply"), dir.path("p.ply"), dir.path("i.ply"));
+    let points = PointCloud { positions: balls(60).means[..7].to_vec(), colors: vec![[10, 20, 30]; 7] };
     ply::write_points(&cloud, &points, &[]).unwrap();
-    ply::write_gaussians(&gaussians, &balls(), &[]).unwrap();
+    ply::write_gaussians(&gaussians, &balls(60), &[]).unwrap();
     for (init, count, says) in [
-        ("points", 40, "40 Gaussians"),
+        ("points", 60, "60 Gaussians"),
         ("random", 55, "starting from 55 random points"),
         (&cloud, 7, "starting from the 7 points"),
-        (&gaussians, 40, "40 Gaussians"),
+        (&gaussians, 60, "60 Gaussians"),
     ] {
         let all =
-            ["train", "--scene", &scene, "--out", &out, "--iterations", "2", "--init-points", "55", "--init", init];
+            ["train", "--scene", scene(), "--out", &out, "--iterations", "2", "--init-points", "55", "--init", init];
         let said = succeeds(&all);
         assert!(said.contains(says), "{init}: {said}");
         assert_eq!(ply::read_gaussians(&out).unwrap().len(), count, "{init}");
     }
-    refused(&["train", "--scene", &scene, "--out", &out, "--init", &format!("{scene}/images/00.png")]);
+    refused(&["train", "--scene", scene(), "--out", &out, "--init", &format!("{}/images/00.png", scene())]);
 }

@@ -1,14 +1,11 @@
-//! What the tests share: running the program, and small COLMAP scenes.
+//! What the tests share: running the program, and a small scene.
 #![allow(dead_code, reason = "every test file uses another part")]
 
 pub mod world;
 
-use glam::DQuat;
-use gs_scene::{Camera, PointCloud};
 use serde_json::Value;
-use std::fmt::Write as _;
 use std::fs;
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 use std::process::{Command, Output, Stdio};
 use std::time::Duration;
 
@@ -37,6 +34,12 @@ pub fn refused(arguments: &[&str]) -> String {
     assert_eq!((o.status.code(), said.matches("error: ").count()), (Some(2), 1), "{arguments:?}: {said}");
     assert!(!said.contains("panicked"), "{said}");
     said
+}
+
+/// Arguments of a short training that densifies.
+pub fn training<'a>(scene: &'a str, out: &'a str, iterations: &'a str, more: &[&'a str]) -> Vec<&'a str> {
+    let all = ["train", "--scene", scene, "--out", out, "--iterations", iterations, "--densify-every", "20"];
+    [&all, more].concat()
 }
 
 /// Starts a training, waits for its first checkpoint, does something to its files, and gives how it ended.
@@ -83,26 +86,5 @@ impl Folder {
         let mut names: Vec<String> = names.collect();
         names.sort();
         names
-    }
-}
-
-/// Writes a COLMAP text model of cameras that share one lens; `photograph` writes the photograph of each to a path.
-pub fn write_scene(root: &Path, cameras: &[Camera], points: &PointCloud, photograph: impl Fn(usize, &Camera, &Path)) {
-    fs::create_dir_all(root.join("sparse/0")).unwrap();
-    fs::create_dir_all(root.join("images")).unwrap();
-    let c = &cameras[0];
-    let camera = format!("1 PINHOLE {} {} {} {} {} {}\n", c.width, c.height, c.fx, c.fy, c.cx, c.cy);
-    let (mut images, mut text) = (String::new(), String::new());
-    for (i, c) in cameras.iter().enumerate() {
-        photograph(i, c, &root.join(format!("images/{i:02}.png")));
-        let (q, t) = (DQuat::from_mat3(&c.rotation), c.translation);
-        let pose = [q.w, q.x, q.y, q.z, t.x, t.y, t.z].map(|v| v.to_string()).join(" ");
-        writeln!(images, "{} {pose} 1 {i:02}.png\n", i + 1).unwrap();
-    }
-    for (i, (p, c)) in points.positions.iter().zip(&points.colors).enumerate() {
-        writeln!(text, "{} {} {} {} {} {} {} 0.5", i + 1, p[0], p[1], p[2], c[0], c[1], c[2]).unwrap();
-    }
-    for (name, text) in [("cameras", &camera), ("images", &images), ("points3D", &text)] {
-        fs::write(root.join(format!("sparse/0/{name}.txt")), text).unwrap();
     }
 }
