@@ -19,9 +19,6 @@ pub struct Sample {
 
 /// Chooses `count` of the tree's points: first `start`, then always the point farthest from those chosen, the lowest
 /// index among equals. Points that coincide with an anchor come last.
-///
-/// # Panics
-/// When `count` is 0 or more than there are points, or `start` is not a point.
 pub fn farthest_points(tree: &KdTree, count: usize, start: u32) -> Sample {
     let n = tree.index.len();
     assert!(count >= 1 && count <= n && (start as usize) < n, "sampling {count} of {n} points from {start}");

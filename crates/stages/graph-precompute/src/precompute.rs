@@ -46,9 +46,6 @@ pub struct Summary {
 
 /// Computes footprints and graph of a geometry from the `views` that have id maps in the folder `masks`. The entries of the
 /// footprints go into `entries`, view by view; the builder that comes back has none.
-///
-/// # Errors
-/// When the disk is full, an id map is damaged or of another shape, no view has masks, or no Gaussian is left.
 pub(crate) fn precompute(
     geometry: &Geometry,
     views: &[&View],

@@ -3,7 +3,7 @@
 pub mod plan;
 
 use crate::densification::Strategy;
-use crate::densification::adaptive::{Adaptive, densify};
+use crate::densification::adaptive::Adaptive;
 use crate::densification::rules::Growth;
 use crate::options::Train;
 use crate::photographs::Photographs;
@@ -14,7 +14,7 @@ use crate::run::outputs::plan_path;
 use crate::start;
 use crate::training::schedule::{Purpose, Schedule, generator};
 use crate::training::{Recipe, Trainer, checkpoint};
-use gs_io::{Error, Result, Watched, write_bytes};
+use gs_io::{Error, Result, Watched, write_json};
 use gs_scene::dataset::{Dataset, Resolution, Split, View};
 use gs_scene::{Camera, Gaussians};
 use plan::{Limits, Plan, Speed, plan};
@@ -65,8 +65,7 @@ pub(crate) fn plan_for(
     planned.scene.resolution = kept.resolution.parse()?;
     let said = format!("--iterations {iterations} --max-gaussians {gaussians} --resolution {}", kept.resolution);
     stage.info(&format!("planned for {budget} s, to take {seconds:.0} s; the same in place of --time-budget: {said}"));
-    let text = serde_json::to_vec_pretty(&kept).map_err(|e| Error::new(e.to_string()))?;
-    write_bytes(plan_path(&options.out), &text)?;
+    write_json(plan_path(&options.out), &kept)?;
     Ok((planned, json!({"options": said, "made": kept})))
 }
 
@@ -144,11 +143,8 @@ fn probe(recipe: Recipe, extent: f64, photographs: Photographs<'_>, start: Gauss
     time(&mut trainer, warm)?;
     let small = time(&mut trainer, views)?;
     let full = time(&mut trainer, views)?;
-    trainer.change(|state| {
-        let all = Adaptive { gradient: 0.0, clone_scale: 0.0, max_scale: None, ..Adaptive::default() };
-        let mut rng = generator(0, Purpose::Split, 0);
-        densify(&mut state.gaussians, &mut state.adam, &mut state.seen, &all, usize::MAX, extent as f32, &mut rng);
-    });
+    let all = Adaptive { gradient: 0.0, clone_scale: 0.0, ..Adaptive::default() };
+    all.densify(&mut trainer.state, usize::MAX, extent as f32, &mut generator(0, Purpose::Split, 0));
     let doubled = time(&mut trainer, views)?;
     Ok(Speed::fit(count, full, (1.0 / f64::from(SMALL * SMALL), small), doubled))
 }

@@ -40,7 +40,7 @@ impl Convert {
         g.bound_opacities();
         let degree = self.sh_degree.unwrap_or(g.sh_degree);
         g = start::with_degree(g, degree);
-        let parameters = serde_json::to_value(self).map_err(|e| Error::new(e.to_string()))?;
+        let parameters = json!(self);
         let inputs = BTreeMap::from([(role::GEOMETRY.to_string(), hash_file(&self.input)?)]);
         let mut comments = vec![format!("made by gs-geom {} convert", env!("CARGO_PKG_VERSION"))];
         comments.extend(inputs.iter().map(|(role, hash)| format!("{role} {hash}")));

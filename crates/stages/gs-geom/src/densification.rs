@@ -4,7 +4,6 @@
 pub mod adaptive;
 pub mod mcmc;
 pub mod rules;
-pub mod screen;
 
 use adaptive::Adaptive;
 use clap::ValueEnum;

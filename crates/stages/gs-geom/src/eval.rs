@@ -3,8 +3,9 @@
 use crate::memory::{self, Pictures};
 use crate::metrics::{Means, ViewMetrics, measure};
 use crate::options::{Eval, bytes};
+use crate::training::loss::Derivatives;
 use artifacts::role;
-use gs_io::{Error, Result, hash_file, write_bytes};
+use gs_io::{Result, hash_file, write_json};
 use gs_scene::dataset::{Split, View};
 use serde_json::json;
 use stage::Stage;
@@ -27,10 +28,10 @@ impl Eval {
             views = dataset.views_of(split).collect();
         }
         let mut progress = stage.progress("view", views.len() as u64);
-        let mut figures: Vec<ViewMetrics> = Vec::new();
+        let (mut figures, mut room): (Vec<ViewMetrics>, _) = (Vec::new(), Derivatives::default());
         for view in &views {
             stage.go_on()?;
-            figures.push(measure(&gaussians, view, &options, alpha, &masks)?);
+            figures.push(measure(&gaussians, view, &options, alpha, &masks, &mut room)?);
             progress.step();
         }
         let Means { psnr, ssim, uncounted } = Means::of(figures.iter().map(|f| (f.name.as_str(), f.psnr.zip(f.ssim))));
@@ -47,9 +48,8 @@ impl Eval {
             "gaussians": gaussians.len(),
             "views": figures,
         });
-        let text = serde_json::to_vec_pretty(&metrics).map_err(|e| Error::new(e.to_string()).file(&self.out))?;
-        write_bytes(&self.out, &text)?;
-        let mut parameters = serde_json::to_value(self).map_err(|e| Error::new(e.to_string()))?;
+        write_json(&self.out, &metrics)?;
+        let mut parameters = json!(self);
         parameters["alpha"] = json!(alpha);
         parameters["antialias"] = json!(options.antialias);
         let mut inputs = BTreeMap::from([

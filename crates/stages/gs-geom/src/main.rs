@@ -3,5 +3,5 @@
 use std::process::ExitCode;
 
 fn main() -> ExitCode {
-    stage::main::<gs_geom::options::Args>()
+    stage::main::<gs_geom::Args>()
 }

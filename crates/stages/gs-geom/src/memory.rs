@@ -54,9 +54,6 @@ pub struct Pictures {
 
 impl Pictures {
     /// Those of a dataset.
-    ///
-    /// # Errors
-    /// When a photograph's header cannot be read.
     pub fn of(dataset: &Dataset) -> Result<Self> {
         let mut of = Self { pixels: 0, width: 0, file: (0, 0) };
         for view in &dataset.views {
@@ -159,6 +156,6 @@ pub fn of_renders(geometry: u64, pictures: &Pictures, exr: bool) -> u64 {
 
 /// Peak in bytes of `eval`.
 pub fn of_figures(geometry: u64, pictures: &Pictures) -> u64 {
-    let measuring = PROGRAM + 9 * geometry / 5 + 50 * pictures.pixels;
+    let measuring = PROGRAM + 9 * geometry / 5 + 86 * pictures.pixels;
     of_file(geometry).max(PROGRAM + geometry + pictures.decoding()).max(measuring)
 }

@@ -2,7 +2,7 @@
 
 use crate::photographs::masks::{Alpha, Masks, multiply};
 use crate::photographs::{Target, exact_target};
-use crate::training::loss::{Pair, ssim};
+use crate::training::loss::{Derivatives, Pair, ssim};
 use gs_io::Result;
 use gs_raster::{RasterOptions, render};
 use gs_scene::Gaussians;
@@ -15,7 +15,6 @@ const MOST_PSNR: f64 = 100.0;
 /// Figures of one view.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct ViewMetrics {
-    /// Name of the photograph.
     pub name: String,
     /// `train` or `test`.
     pub split: &'static str,
@@ -26,9 +25,6 @@ pub struct ViewMetrics {
 }
 
 /// PSNR in dB for values from 0 to 1.
-///
-/// # Panics
-/// When the pictures have different sizes.
 pub fn psnr(a: &[f32], b: &[f32]) -> f64 {
     assert_eq!(a.len(), b.len());
     let sum: f64 = a.iter().zip(b).map(|(a, b)| f64::from(a - b).powi(2)).sum();
@@ -37,19 +33,17 @@ pub fn psnr(a: &[f32], b: &[f32]) -> f64 {
 }
 
 /// Renders a view and compares it with its photograph. The render is clamped to 0 to 1 but not rounded to 8 bits.
-///
-/// # Errors
-/// When the photograph or its mask cannot be read.
 pub fn measure(
     g: &Gaussians,
     view: &View,
     options: &RasterOptions,
     alpha: Alpha,
     masks: &Masks,
+    room: &mut Derivatives,
 ) -> Result<ViewMetrics> {
     let target = exact_target(view, masks, behind(alpha, options.background))?;
     let mut rgb = render(g, &view.camera, &RasterOptions { depth: false, ..options.clone() }).rgb;
-    let (psnr, ssim) = compare(&mut rgb, view.camera.width as usize, &target, alpha).unzip();
+    let (psnr, ssim) = compare(&mut rgb, view.camera.width as usize, &target, alpha, room).unzip();
     let split = if view.split == Split::Test { "test" } else { "train" };
     Ok(ViewMetrics { name: view.name.clone(), split, psnr, ssim })
 }
@@ -63,8 +57,14 @@ pub fn behind(alpha: Alpha, background: [f32; 3]) -> [f32; 3] {
 /// PSNR and SSIM of a render against `target`, which lies over [`behind`]. With [`Alpha::Ignore`] the PSNR is that of the
 /// pixels that count, each weighed by the square of its alpha; in the SSIM the others are black in both pictures. `rgb`
 /// (`[height][width][rgb]`) is clamped and masked in place. None where less than one pixel counts, as below a black mask:
-/// both pictures are black then, which says nothing.
-pub fn compare(rgb: &mut [f32], width: usize, target: &Target, alpha: Alpha) -> Option<(f64, f64)> {
+/// both pictures are black then, which says nothing. `room` is to work in, whatever it held before.
+pub fn compare(
+    rgb: &mut [f32],
+    width: usize,
+    target: &Target,
+    alpha: Alpha,
+    room: &mut Derivatives,
+) -> Option<(f64, f64)> {
     rgb.iter_mut().for_each(|v| *v = v.clamp(0.0, 1.0));
     let mut psnr_gain = 0.0;
     if let Some(weights) = target.alpha.as_ref().filter(|_| alpha == Alpha::Ignore) {
@@ -76,7 +76,7 @@ pub fn compare(rgb: &mut [f32], width: usize, target: &Target, alpha: Alpha) -> 
         psnr_gain = 10.0 * (count / weights.len() as f64).log10();
     }
     let psnr = (psnr(rgb, &target.rgb) + psnr_gain).min(MOST_PSNR);
-    Some((psnr, ssim(Pair { render: rgb, target: &target.rgb, width })))
+    Some((psnr, ssim(Pair { render: rgb, target: &target.rgb, width }, room)))
 }
 
 /// Means over views.

@@ -77,10 +77,6 @@ fn unit(v: u8) -> f32 {
 
 impl<'a> Photographs<'a> {
     /// Decodes the photographs of `views` and keeps up to `budget` bytes of them.
-    ///
-    /// # Errors
-    /// When a photograph cannot be read, has another shape than its camera, or is not as `watched` saw it; so whenever one has
-    /// to be decoded again.
     pub fn load(views: Vec<&'a View>, masks: Masks, budget: usize, watched: &'a Watched) -> Result<Self> {
         let watched = Some(watched);
         let cameras: Vec<Camera> = views.iter().map(|v| v.camera.clone()).collect();
@@ -114,15 +110,7 @@ impl<'a> Photographs<'a> {
         self.views.len()
     }
 
-    /// Whether there are none.
-    pub fn is_empty(&self) -> bool {
-        self.views.is_empty()
-    }
-
     /// Changes the picture size to the views' own divided by `divisor`.
-    ///
-    /// # Errors
-    /// As [`Self::load`].
     pub fn set_divisor(&mut self, divisor: u32) -> Result<()> {
         if divisor == self.divisor {
             return Ok(());
@@ -163,9 +151,6 @@ impl<'a> Photographs<'a> {
     }
 
     /// Photograph `i` with `background` behind its transparent pixels; over black it is multiplied by its alpha.
-    ///
-    /// # Errors
-    /// When it has to be decoded again and cannot be.
     pub fn target(&self, i: usize, background: [f32; 3]) -> Result<Target> {
         let kept = if self.divisor > 1 { &self.small } else { &self.full };
         match kept.get(i).and_then(Option::as_ref) {
@@ -189,9 +174,6 @@ pub fn full_share(budget: usize) -> usize {
 }
 
 /// Bytes of a kept photograph's pixel.
-///
-/// # Errors
-/// When the file's header cannot be read.
 pub fn bytes_per_pixel(view: &View, masks: &Masks) -> Result<usize> {
     Ok(if masks.of(view).is_some() || image_has_alpha(&view.image_path)? { 4 } else { 3 })
 }
@@ -239,9 +221,6 @@ fn decode(view: &View, masks: &Masks) -> Result<Image> {
 }
 
 /// A view's photograph at full precision, with a colour behind its transparent pixels.
-///
-/// # Errors
-/// When a file cannot be read or has another size than the camera.
 pub fn exact_target(view: &View, masks: &Masks, background: [f32; 3]) -> Result<Target> {
     let Image { rgb, alpha, .. } = decode(view, masks)?;
     Ok(Target::over(rgb, alpha, background))

@@ -40,8 +40,7 @@ impl Render {
             (role::DATASET.to_string(), dataset.hash()?),
             (role::GEOMETRY.to_string(), hash_file(&self.geometry.geometry)?),
         ]);
-        let parameters = serde_json::to_value(&self.scene).map_err(|e| Error::new(e.to_string()))?;
-        stage.record(&mut claim, parameters, inputs, json!({"views": views.len()}))
+        stage.record(&mut claim, json!(self.scene), inputs, json!({"views": views.len()}))
     }
 }
 

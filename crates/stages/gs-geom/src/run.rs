@@ -17,7 +17,7 @@ use forecast::{cache_bytes, forecast_start, most_gaussians};
 use gs_io::{Claim, Error, Provenance, Result, hash_file};
 use gs_scene::Camera;
 use gs_scene::dataset::{Dataset, Split, View};
-use serde_json::Value;
+use serde_json::{Value, json};
 use stage::{CommonArgs, Program, Stage};
 use std::collections::BTreeMap;
 
@@ -81,7 +81,7 @@ fn learn(
             checkpoint::start(init::gaussians(options, dataset, &cameras, extent, stage)?, exposures)
         }
     };
-    outputs::check_finite(options, &state.gaussians, state.progress.iteration)?;
+    outputs::check_finite(options, &state)?;
     let (width, height, n) = (cameras[0].width, cameras[0].height, state.gaussians.len());
     let counts = format!("{} training views and {} held out", train.len(), heldout.len());
     stage.info(&format!("{counts}, {width}x{height} pixels; {n} Gaussians; extent {extent:.3}"));
@@ -142,9 +142,8 @@ impl Train {
 
 /// What the result is made from: all options, what they amount to, and the hashes of the inputs.
 fn provenance(options: &Train, recipe: &Recipe, dataset: &Dataset, masks: &Masks, stage: &Stage) -> Result<Provenance> {
-    let as_json = |value: serde_json::Result<Value>| value.map_err(|e| Error::new(e.to_string()));
-    let mut parameters = as_json(serde_json::to_value(options))?;
-    if let (Value::Object(all), Value::Object(resolved)) = (&mut parameters, as_json(serde_json::to_value(recipe))?) {
+    let mut parameters = json!(options);
+    if let (Value::Object(all), Value::Object(resolved)) = (&mut parameters, json!(recipe)) {
         all.extend(resolved);
     }
     let mut inputs = BTreeMap::from([(role::DATASET.to_string(), dataset.hash()?)]);

@@ -34,9 +34,6 @@ pub fn extent(cameras: &[&Camera], points: &[[f32; 3]]) -> f64 {
 
 /// One Gaussian per point, in the points' order: round, as large as the root mean squared distance to the three nearest
 /// other places, opacity 0.1, the point's colour.
-///
-/// # Errors
-/// When there are no points, or one is not finite.
 pub fn from_points(points: &PointCloud, sh_degree: u8, extent: f64) -> Result<Gaussians> {
     let bad = points.positions.iter().position(|p| p.iter().any(|v| !v.is_finite()));
     if let Some(i) = bad {

@@ -5,6 +5,8 @@ pub mod exposure;
 pub mod loss;
 pub mod optimiser;
 pub mod schedule;
+#[cfg(test)]
+mod tests;
 
 use crate::densification::rules::{Growth, Moment};
 use crate::densification::{Strategy, Way};
@@ -32,9 +34,7 @@ const DSSIM_WEIGHT: f32 = 0.2;
 pub struct Recipe {
     /// Seed of the views' order and of densification.
     pub seed: u64,
-    /// What changes with the iteration.
     pub schedule: Schedule,
-    /// Learning rates.
     pub rates: LearningRates,
     /// How the number of Gaussians changes; none where it stays.
     pub densification: Option<Way>,
@@ -49,7 +49,7 @@ pub struct Recipe {
     pub alpha: Alpha,
     /// Keep the light of Gaussians smaller than a pixel (the 2D filter of Mip-Splatting, Yu et al. 2024).
     pub antialias: bool,
-    /// Train an affine map of colours for each training photograph.
+    /// Whether to train an affine map of colours for each training photograph.
     pub exposure: bool,
 }
 
@@ -75,13 +75,9 @@ impl Recipe {
 /// Where the time of an optimisation went.
 #[derive(Debug, Clone, Copy, Default, PartialEq)]
 pub struct Timings {
-    /// Rendering.
     pub forward: Duration,
-    /// Loss and its gradient.
     pub loss: Duration,
-    /// Gradients of the parameters.
     pub backward: Duration,
-    /// Adam.
     pub adam: Duration,
     /// Densification, held-out views, photographs.
     pub rest: Duration,
@@ -100,28 +96,27 @@ struct Frame {
 pub struct Trainer<'a> {
     recipe: Recipe,
     extent: f64,
-    train: Photographs<'a>,
+    pub train: Photographs<'a>,
     heldout: Photographs<'a>,
     order: ViewOrder,
-    state: State,
+    pub state: State,
     workspace: Workspace,
     /// d loss / d rendered colour.
     gradient: Vec<f32>,
     /// The render through its view's exposure.
     exposed: Vec<f32>,
     derivatives: Derivatives,
-    last: Loss,
-    last_heldout: Option<f64>,
-    timings: Timings,
+    /// Loss of the last iteration's view.
+    pub last: Loss,
+    /// PSNR of the last held-out check, dB.
+    pub last_heldout: Option<f64>,
+    pub timings: Timings,
     clock: Instant,
 }
 
 impl<'a> Trainer<'a> {
     /// Goes on from a checkpoint, or from [`checkpoint::start`]. `extent` is the scene's size (see [`crate::start::extent`]);
     /// `heldout` may be empty.
-    ///
-    /// # Panics
-    /// When the state has exposures of another number of views.
     pub fn new(recipe: Recipe, extent: f64, train: Photographs<'a>, heldout: Photographs<'a>, state: State) -> Self {
         assert_eq!(state.exposures.maps.len(), if recipe.exposure { train.len() } else { 0 });
         Self {
@@ -142,45 +137,12 @@ impl<'a> Trainer<'a> {
         }
     }
 
-    /// Names of the training photographs, in the order of the exposures.
-    pub fn train_names(&self) -> impl Iterator<Item = &str> {
-        self.train.names()
-    }
-
-    /// The state, for a checkpoint.
-    pub fn state(&self) -> &State {
-        &self.state
-    }
-
-    /// Changes the Gaussians, with the optimiser's moments to follow them.
-    pub fn change(&mut self, change: impl FnOnce(&mut State)) {
-        change(&mut self.state);
-    }
-
-    /// Loss of the last iteration's view.
-    pub fn last_loss(&self) -> Loss {
-        self.last
-    }
-
-    /// PSNR of the last held-out check, dB.
-    pub fn last_heldout(&self) -> Option<f64> {
-        self.last_heldout
-    }
-
-    /// Where the time went.
-    pub fn timings(&self) -> Timings {
-        self.timings
-    }
-
     /// Whether all iterations are done.
     pub fn is_done(&self) -> bool {
         self.state.progress.iteration >= self.recipe.schedule.iterations
     }
 
-    /// One iteration.
-    ///
-    /// # Errors
-    /// When a photograph has to be decoded and cannot be; the state is then good for a checkpoint.
+    /// One iteration. Where a photograph cannot be decoded again, the state is still good for a checkpoint.
     pub fn step(&mut self) -> Result<()> {
         self.complete_curve()?;
         self.clock = Instant::now();
@@ -192,7 +154,7 @@ impl<'a> Trainer<'a> {
         // Room for the held-out views.
         drop(frame);
         self.note()?;
-        self.lap(|t| &mut t.rest);
+        lap(&mut self.clock, &mut self.timings.rest);
         Ok(())
     }
 
@@ -215,7 +177,7 @@ impl<'a> Trainer<'a> {
         };
         let target = self.train.target(view, metrics::behind(*alpha, background))?;
         let camera = self.train.camera(view).clone();
-        self.lap(|t| &mut t.rest);
+        lap(&mut self.clock, &mut self.timings.rest);
         Ok(Frame { iteration, view, camera, target, raster })
     }
 
@@ -229,7 +191,7 @@ impl<'a> Trainer<'a> {
         for (most, now) in progress.undrawn.iter_mut().zip([undrawn.not_finite, undrawn.degenerate]) {
             *most = (*most).max(now as u64);
         }
-        self.lap(|t| &mut t.forward);
+        lap(&mut self.clock, &mut self.timings.forward);
     }
 
     /// Compares the render with the photograph: the loss, and its gradient by every parameter.
@@ -262,7 +224,7 @@ impl<'a> Trainer<'a> {
         let pixels = PixelGradients { rgb: &self.gradient, alpha: None, depth: None };
         lap(&mut self.clock, &mut self.timings.loss);
         self.workspace.backward(gaussians, &frame.camera, &frame.raster, pixels);
-        self.lap(|t| &mut t.backward);
+        lap(&mut self.clock, &mut self.timings.backward);
         loss
     }
 
@@ -271,16 +233,17 @@ impl<'a> Trainer<'a> {
         let State { gaussians, adam, progress, .. } = &mut self.state;
         let gradients = &mut self.workspace.gradients;
         let rules = self.recipe.densification.as_ref().map(Way::rules);
-        let rates = self.recipe.schedule.rates(&self.recipe.rates, frame.iteration, self.extent);
+        let rates = &self.recipe.rates;
+        let centres = self.recipe.schedule.rate_of_centres(rates, frame.iteration, self.extent);
         if let Some(rules) = rules {
             rules.regularise(gaussians, gradients);
         }
         progress.dropped += gradients.overflowed as u64 + drop_bad_gradients(gradients);
-        adam.step(gaussians, gradients, &rates, frame.raster.sh_degree);
+        adam.step(gaussians, gradients, centres, rates, frame.raster.sh_degree);
         if let Some(rules) = rules {
-            rules.explore(gaussians, rates.means, moment(&self.recipe, self.extent, frame.iteration));
+            rules.explore(gaussians, centres, moment(&self.recipe, self.extent, frame.iteration));
         }
-        self.lap(|t| &mut t.adam);
+        lap(&mut self.clock, &mut self.timings.adam);
     }
 
     /// Lets the number of Gaussians change.
@@ -300,10 +263,6 @@ impl<'a> Trainer<'a> {
         let order = morton_order(&gaussians.means);
         *gaussians = gaussians.select(&order);
         adam.select(&order, order.len());
-    }
-
-    fn lap(&mut self, part: impl FnOnce(&mut Timings) -> &mut Duration) {
-        lap(&mut self.clock, part(&mut self.timings));
     }
 
     /// Adds to the training curve.
@@ -329,9 +288,6 @@ impl<'a> Trainer<'a> {
 
     /// Measures the held-out views where that is due and the curve's last line lacks it. A run that failed in it, because a
     /// photograph could not be read, makes up for it when it goes on.
-    ///
-    /// # Errors
-    /// When a photograph has to be decoded and cannot be.
     pub fn complete_curve(&mut self) -> Result<()> {
         let (total, iteration) = (self.recipe.schedule.iterations, self.state.progress.iteration);
         let due = iteration.is_multiple_of(total.div_ceil(10).max(1)) || iteration == total;
@@ -351,9 +307,6 @@ impl<'a> Trainer<'a> {
 
     /// Mean PSNR and SSIM over the held-out views with all spherical harmonics, at the scene's own exposure; none without
     /// such views.
-    ///
-    /// # Errors
-    /// When a photograph has to be decoded and cannot be.
     pub fn heldout(&mut self) -> Result<Means> {
         let Recipe { alpha, background, antialias, .. } = self.recipe;
         let near = near_plane(self.extent);
@@ -364,7 +317,7 @@ impl<'a> Trainer<'a> {
                 (self.heldout.camera(i), self.heldout.target(i, metrics::behind(alpha, background))?);
             self.workspace.forward(&self.state.gaussians, camera, &options);
             let rgb = &mut self.workspace.forward.rendered.rgb;
-            all.push(metrics::compare(rgb, camera.width as usize, &target, alpha));
+            all.push(metrics::compare(rgb, camera.width as usize, &target, alpha, &mut self.derivatives));
         }
         Ok(Means::of(self.heldout.names().zip(all.iter().copied())))
     }

@@ -2,7 +2,6 @@
 //! ones); faint ones are removed, on request huge ones too (Kerbl et al. 2023, section 5.2).
 
 use super::rules::{Densify, Growth, Moment, Report};
-use super::screen::ScreenGradients;
 use crate::training::checkpoint::State;
 use crate::training::optimiser::Adam;
 use crate::training::schedule::{Purpose, generator};
@@ -19,6 +18,27 @@ const SPLIT_SHRINK: f32 = 1.6;
 const RESET_OPACITY: f32 = 0.01;
 /// From this divisor of the picture size on, gradients say nothing about where Gaussians are missing.
 const TOO_COARSE: u32 = 4;
+
+/// The gradients of each Gaussian's projected centre since the last densification.
+#[derive(Debug, Clone, Default, PartialEq)]
+pub struct ScreenGradients {
+    /// Sum over views of the length of d loss / d projected centre, N.
+    pub sum: Vec<f32>,
+    /// In how many views it was drawn, N.
+    pub views: Vec<u32>,
+}
+
+impl ScreenGradients {
+    /// Nothing seen yet.
+    pub fn new(count: usize) -> Self {
+        Self { sum: vec![0.0; count], views: vec![0; count] }
+    }
+
+    /// Mean over the views that drew it.
+    fn mean(&self, i: usize) -> f32 {
+        if self.views[i] == 0 { 0.0 } else { self.sum[i] / self.views[i] as f32 }
+    }
+}
 
 /// Hyper-parameters of adaptive density control.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize)]
@@ -49,6 +69,40 @@ impl Adaptive {
     fn observes(at: Moment<'_>) -> bool {
         at.iteration < at.growth.until && at.schedule.divisor(at.iteration) < TOO_COARSE
     }
+
+    /// Clones, splits and removes; afterwards nothing is seen. New Gaussians follow the old ones and have no moments.
+    pub fn densify(&self, state: &mut State, max_gaussians: usize, extent: f32, rng: &mut ChaCha8Rng) -> Report {
+        let State { gaussians: g, adam, seen, .. } = state;
+        let n = g.len();
+        let mut chosen: Vec<u32> = (0..n as u32).filter(|&i| seen.mean(i as usize) >= self.gradient).collect();
+        // Each adds one. Too many: the largest gradients, the first among equals.
+        chosen.sort_by(|&a, &b| seen.mean(b as usize).total_cmp(&seen.mean(a as usize)).then(a.cmp(&b)));
+        chosen.truncate(max_gaussians.saturating_sub(n));
+        chosen.sort_unstable();
+        let (clone, split): (Vec<u32>, Vec<u32>) =
+            chosen.into_iter().partition(|&i| largest_scale(g, i as usize) <= self.clone_scale * extent);
+
+        let mut sources: Vec<u32> = (0..n as u32).filter(|i| split.binary_search(i).is_err()).collect();
+        let fresh = sources.len();
+        sources.extend(&clone);
+        let halves = sources.len();
+        sources.extend(split.iter().flat_map(|&i| [i, i]));
+        *g = g.select(&sources);
+        (halves..g.len()).for_each(|i| halve(g, i, rng));
+        adam.select(&sources, fresh);
+
+        let huge = |i: usize| self.max_scale.is_some_and(|most| largest_scale(g, i) > most * extent);
+        let kept = |i: &u32| g.opacity(*i as usize) >= self.min_opacity && !huge(*i as usize);
+        let kept: Vec<u32> = (0..g.len() as u32).filter(kept).collect();
+        // Something is always left.
+        let removed = if kept.is_empty() { 0 } else { g.len() - kept.len() };
+        if removed > 0 {
+            *g = g.select(&kept);
+            adam.select(&kept, kept.len());
+        }
+        *seen = ScreenGradients::new(g.len());
+        Report { cloned: clone.len(), split: split.len(), removed, relocated: 0 }
+    }
 }
 
 impl Default for Adaptive {
@@ -66,76 +120,31 @@ impl Densify for Adaptive {
     }
 
     fn observe(&self, seen: &mut ScreenGradients, view: &Workspace, camera: &Camera, at: Moment<'_>) {
-        if Self::observes(at) {
-            seen.observe(view.forward.visible(), &view.gradients.mean2d, camera.width, camera.height);
+        if !Self::observes(at) {
+            return;
+        }
+        // Pixels to half widths and half heights: the loss's slope by x / (width / 2).
+        let (x, y) = (0.5 * camera.width as f32, 0.5 * camera.height as f32);
+        for i in view.forward.visible().iter().map(|&i| i as usize) {
+            let [gx, gy] = view.gradients.mean2d[i];
+            seen.sum[i] += (gx * x).hypot(gy * y);
+            seen.views[i] += 1;
         }
     }
 
     fn round(&self, state: &mut State, at: Moment<'_>) -> Option<Report> {
         let mut rng = generator(at.seed, Purpose::Split, u64::from(at.iteration));
-        let State { gaussians, adam, seen, .. } = state;
-        let most = at.growth.max_gaussians;
-        Self::observes(at).then(|| densify(gaussians, adam, seen, self, most, at.extent as f32, &mut rng))
+        Self::observes(at).then(|| self.densify(state, at.growth.max_gaussians, at.extent as f32, &mut rng))
     }
-}
-
-/// Clones, splits and removes; afterwards `seen` is empty. New Gaussians follow the old ones and have no
-/// moments.
-pub fn densify(
-    g: &mut Gaussians,
-    adam: &mut Adam,
-    seen: &mut ScreenGradients,
-    options: &Adaptive,
-    max_gaussians: usize,
-    extent: f32,
-    rng: &mut ChaCha8Rng,
-) -> Report {
-    let n = g.len();
-    let mut chosen: Vec<u32> = (0..n as u32).filter(|&i| seen.mean(i as usize) >= options.gradient).collect();
-    // Each adds one. Too many: the largest gradients, the first among equals.
-    chosen.sort_by(|&a, &b| seen.mean(b as usize).total_cmp(&seen.mean(a as usize)).then(a.cmp(&b)));
-    chosen.truncate(max_gaussians.saturating_sub(n));
-    chosen.sort_unstable();
-    let (clone, split): (Vec<u32>, Vec<u32>) =
-        chosen.into_iter().partition(|&i| largest_scale(g, i as usize) <= options.clone_scale * extent);
-
-    let mut is_split = vec![false; n];
-    split.iter().for_each(|&i| is_split[i as usize] = true);
-    let mut sources: Vec<u32> = (0..n as u32).filter(|&i| !is_split[i as usize]).collect();
-    let fresh = sources.len();
-    sources.extend(&clone);
-    let halves = sources.len();
-    sources.extend(split.iter().flat_map(|&i| [i, i]));
-    *g = g.select(&sources);
-    for i in halves..g.len() {
-        halve(g, i, rng);
-    }
-    adam.select(&sources, fresh);
-
-    let huge = |g: &Gaussians, i: usize| options.max_scale.is_some_and(|most| largest_scale(g, i) > most * extent);
-    let kept = |g: &Gaussians, i: usize| g.opacity(i) >= options.min_opacity && !huge(g, i);
-    let removed = keep(g, adam, kept);
-    *seen = ScreenGradients::new(g.len());
-    Report { cloned: clone.len(), split: split.len(), removed, relocated: 0 }
-}
-
-/// Removes the Gaussians that `kept` refuses, unless none would be left; returns their number.
-fn keep(g: &mut Gaussians, adam: &mut Adam, kept: impl Fn(&Gaussians, usize) -> bool) -> usize {
-    let sources: Vec<u32> = (0..g.len() as u32).filter(|&i| kept(g, i as usize)).collect();
-    let removed = g.len() - sources.len();
-    if removed == 0 || sources.is_empty() {
-        return 0;
-    }
-    *g = g.select(&sources);
-    adam.select(&sources, sources.len());
-    removed
 }
 
 /// Lowers every opacity to at most 0.01, and forgets their moments: what is needed comes back, floaters do not.
-pub fn reset_opacities(g: &mut Gaussians, adam: &mut Adam) {
+fn reset_opacities(g: &mut Gaussians, adam: &mut Adam) {
     let most = (RESET_OPACITY / (1.0 - RESET_OPACITY)).ln();
     g.opacity_logits.iter_mut().for_each(|o| *o = o.min(most));
-    adam.forget_opacities();
+    for moments in [&mut adam.first, &mut adam.second] {
+        moments.opacity_logits.fill(0.0);
+    }
 }
 
 fn largest_scale(g: &Gaussians, i: usize) -> f32 {
@@ -165,6 +174,7 @@ fn normal(rng: &mut ChaCha8Rng) -> f32 {
 mod tests {
     use super::*;
     use crate::densification::drawable;
+    use crate::training::checkpoint;
     use crate::training::optimiser::zeros;
     use proptest::prelude::*;
 
@@ -180,14 +190,15 @@ mod tests {
     }
 
     fn run(g: &mut Gaussians, gradients: &[f32], options: &Adaptive, most: usize) -> (Adam, Report) {
-        let mut adam = Adam::new(g);
-        adam.first.means.iter_mut().enumerate().for_each(|(i, m)| m[0] = 1.0 + i as f32);
+        let mut state = checkpoint::start(g.clone(), 0);
+        state.adam.first.means.iter_mut().enumerate().for_each(|(i, m)| m[0] = 1.0 + i as f32);
         let sum = gradients.iter().map(|p| 3.0 * p).collect();
-        let mut seen = ScreenGradients { sum, views: vec![3; gradients.len()] };
-        let report = densify(g, &mut adam, &mut seen, options, most, 10.0, &mut generator(0, Purpose::Split, 1));
-        assert_eq!(seen, ScreenGradients::new(g.len()));
-        assert!(g.check().is_ok() && adam.first.check().is_ok() && adam.first.len() == g.len());
-        (adam, report)
+        state.seen = ScreenGradients { sum, views: vec![3; gradients.len()] };
+        let report = options.densify(&mut state, most, 10.0, &mut generator(0, Purpose::Split, 1));
+        assert_eq!(state.seen, ScreenGradients::new(state.gaussians.len()));
+        *g = state.gaussians;
+        assert!(g.check().is_ok() && state.adam.first.check().is_ok() && state.adam.first.len() == g.len());
+        (state.adam, report)
     }
 
     #[test]

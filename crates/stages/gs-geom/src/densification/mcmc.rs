@@ -1,8 +1,8 @@
 //! Densification as sampling: dead Gaussians move onto opaque ones, the number grows by a share per round up to an exact
 //! budget, noise explores, and opacity and size have a penalty (3DGS-MCMC, Kheradmand et al. 2024).
 
+use super::adaptive::ScreenGradients;
 use super::rules::{Densify, Moment, Report};
-use super::screen::ScreenGradients;
 use crate::training::checkpoint::State;
 use crate::training::optimiser::Adam;
 use crate::training::schedule::{Purpose, generator};
@@ -28,6 +28,8 @@ const NOISE_OPACITY: f32 = 0.005;
 const LEAST_NOISE: f32 = 1e-6;
 /// Gaussians per piece of parallel work.
 const CHUNK: usize = 2048;
+/// The increment of SplitMix64 (Steele et al. 2014): its states can be jumped to.
+const INCREMENT: u64 = 0x9e37_79b9_7f4a_7c15;
 
 /// Hyper-parameters of the sampling.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize)]
@@ -51,8 +53,18 @@ impl Default for Mcmc {
 }
 
 impl Densify for Mcmc {
-    fn regularise(&self, gaussians: &Gaussians, gradients: &mut Gradients) {
-        regularise(gaussians, gradients, self);
+    /// Adds the gradients of the penalties on opacity and scale.
+    fn regularise(&self, g: &Gaussians, d: &mut Gradients) {
+        let n = g.len().max(1) as f32;
+        let (opacity, scale) = (self.opacity_weight / n, self.scale_weight / (3.0 * n));
+        let rows = d.opacity_logits.par_iter_mut().zip(&mut d.log_scales).with_min_len(CHUNK);
+        rows.enumerate().for_each(|(i, (d_opacity, d_scales))| {
+            let o = g.opacity(i);
+            *d_opacity += opacity * o * (1.0 - o);
+            for (d, s) in d_scales.iter_mut().zip(g.log_scales[i]) {
+                *d += scale * s.exp();
+            }
+        });
     }
 
     fn explore(&self, gaussians: &mut Gaussians, rate: f32, at: Moment<'_>) {
@@ -148,20 +160,6 @@ fn thinned(opacity: f64, n: usize) -> (f64, f64) {
     (each.clamp(LEAST_OPACITY, MOST_OPACITY), opacity / sum)
 }
 
-/// Adds the gradients of the penalties on opacity and scale.
-fn regularise(g: &Gaussians, d: &mut Gradients, options: &Mcmc) {
-    let n = g.len().max(1) as f32;
-    let (opacity, scale) = (options.opacity_weight / n, options.scale_weight / (3.0 * n));
-    let rows = d.opacity_logits.par_iter_mut().zip(&mut d.log_scales).with_min_len(CHUNK);
-    rows.enumerate().for_each(|(i, (d_opacity, d_scales))| {
-        let o = g.opacity(i);
-        *d_opacity += opacity * o * (1.0 - o);
-        for (d, s) in d_scales.iter_mut().zip(g.log_scales[i]) {
-            *d += scale * s.exp();
-        }
-    });
-}
-
 /// Moves the centres by noise of the Gaussians' own shapes, all the more the fainter they are (3DGS-MCMC, equation 8).
 /// `rate` is the centres' learning rate. The noise of a Gaussian depends on seed, iteration and its index alone.
 fn explore(g: &mut Gaussians, options: &Mcmc, rate: f32, seed: u64, iteration: u32) {
@@ -187,8 +185,6 @@ fn explore(g: &mut Gaussians, options: &Mcmc, rate: f32, seed: u64, iteration: u
 
 /// Three draws from the standard normal distribution (Box and Muller 1958), number `index` of the sequence `key`.
 fn normals(key: u64, index: u64) -> Vec3 {
-    /// The increment of SplitMix64 (Steele et al. 2014): its states can be jumped to.
-    const INCREMENT: u64 = 0x9e37_79b9_7f4a_7c15;
     let uniforms = |k: u64| {
         let bits = mixed(key.wrapping_add((2 * index + k + 1).wrapping_mul(INCREMENT)));
         [(bits >> 40) as u32, (bits >> 8) as u32 & 0xff_ffff].map(|v| (v as f32 + 0.5) / 16_777_216.0)
@@ -199,11 +195,9 @@ fn normals(key: u64, index: u64) -> Vec3 {
     Vec3::new(r * cos, r * sin, s * (std::f32::consts::TAU * d).cos())
 }
 
-/// The output function of SplitMix64 (Steele et al. 2014): every bit of the result depends on every bit of `z`.
-fn mixed(mut z: u64) -> u64 {
-    z = (z ^ (z >> 30)).wrapping_mul(0xbf58_476d_1ce4_e5b9);
-    z = (z ^ (z >> 27)).wrapping_mul(0x94d0_49bb_1331_11eb);
-    z ^ (z >> 31)
+/// The output function of SplitMix64 (Steele et al. 2014), for the state `z`.
+fn mixed(z: u64) -> u64 {
+    gs_io::mixed(z.wrapping_sub(INCREMENT))
 }
 
 #[cfg(test)]
@@ -313,14 +307,13 @@ mod tests {
     fn penalties_have_the_gradients_of_means() {
         let mut g = row(&[0.2, 0.7]);
         g.log_scales[1] = [0.1, -0.4, 0.9];
-        let options = Mcmc::default();
         let penalty = |g: &Gaussians| {
             let o: f64 = g.opacity_logits.iter().map(|&l| 1.0 / (1.0 + (-f64::from(l)).exp())).sum();
             let s: f64 = g.log_scales.iter().flatten().map(|&s| f64::from(s).exp()).sum();
             0.01 * o / 2.0 + 0.01 * s / 6.0
         };
         let mut d = Gradients { opacity_logits: vec![0.0; 2], log_scales: vec![[0.0; 3]; 2], ..Gradients::default() };
-        regularise(&g, &mut d, &options);
+        Mcmc::default().regularise(&g, &mut d);
         let slope = |change: &dyn Fn(&mut Gaussians, f32)| {
             let (mut a, mut b) = (g.clone(), g.clone());
             change(&mut a, -0.01);

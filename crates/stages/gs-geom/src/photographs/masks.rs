@@ -24,9 +24,6 @@ pub struct Masks(BTreeMap<String, PathBuf>);
 impl Masks {
     /// The masks in a folder: a PNG or JPEG a view, with the name of the photograph, with (as COLMAP has it) or without its
     /// extension. A view without a file has no mask.
-    ///
-    /// # Errors
-    /// When no view has a mask there.
     pub fn find(folder: &Path, views: &[View]) -> Result<Self> {
         let mut all = BTreeMap::new();
         for view in views {
@@ -67,9 +64,6 @@ impl Masks {
     }
 
     /// Content hash of names and files; none without masks.
-    ///
-    /// # Errors
-    /// When a file cannot be read.
     pub fn hash(&self) -> Result<Option<String>> {
         let mut text = String::new();
         for (name, path) in &self.0 {

@@ -1,13 +1,13 @@
 //! What a finished run leaves: Gaussians, curve, exposures and its record.
 
-use super::outputs::{CURVE, EXPOSURES, PARTIAL, PLOT, check_finite, plan_path, remove_if_there};
+use super::outputs::{CURVE, EXPOSURES, PARTIAL, PLOT, check_finite, plan_path};
 use crate::densification::{Strategy, drawable};
 use crate::memory::Forecast;
 use crate::metrics::Means;
 use crate::options::Train;
 use crate::training::checkpoint::{self, ProgressState, State};
 use crate::training::{Timings, Trainer};
-use gs_io::{Claim, Error, Provenance, Result, with_suffix, write_bytes};
+use gs_io::{Claim, Provenance, Result, with_suffix, write_bytes, write_json};
 use gs_scene::{Gaussians, ply};
 use report::curve::Panel;
 use serde_json::{Value, json};
@@ -40,10 +40,10 @@ pub(super) fn finish(
     claim: &mut Claim,
     stage: &Stage,
 ) -> Result<()> {
-    check_finite(options, &trainer.state().gaussians, trainer.state().progress.iteration)?;
+    check_finite(options, &trainer.state)?;
     let Means { psnr, ssim, uncounted } = trainer.heldout()?;
     uncounted.iter().for_each(|why| stage.skipped(why));
-    let State { gaussians, progress, .. } = trainer.state();
+    let State { gaussians, progress, .. } = &trainer.state;
     let rows = rows(options, gaussians, stage);
     report(progress, stage);
     let (parameters, inputs) = (&made.run.parameters, &made.run.inputs);
@@ -54,7 +54,7 @@ pub(super) fn finish(
     stage.info(&format!(
         "{} Gaussians ({cloned} cloned, {split} split, {removed} removed, {relocated} relocated){heldout}; {}",
         rows.len(),
-        shares(trainer.timings())
+        shares(trainer.timings)
     ));
     let summary = json!({
         "gaussians": rows.len(),
@@ -64,14 +64,15 @@ pub(super) fn finish(
         "dropped_gradients": progress.dropped,
         "most_undrawn": {"not_finite": progress.undrawn[0], "degenerate": progress.undrawn[1]},
         "memory_predicted_bytes": made.forecast.peak(gaussians.len()),
-        "seconds": seconds(trainer.timings()),
+        "seconds": seconds(trainer.timings),
         "cpu_seconds": stage::cpu_seconds(),
         "iteration_cpu_seconds": made.cpu_seconds,
         "plan": made.plan,
     });
     stage.record(claim, parameters.clone(), inputs.clone(), summary)?;
     for leftover in [with_suffix(&options.out, PARTIAL), plan_path(&options.out), checkpoint::path_of(&options.out)] {
-        remove_if_there(&leftover);
+        // What cannot be removed does no harm.
+        let _ = std::fs::remove_file(leftover);
     }
     Ok(())
 }
@@ -103,18 +104,17 @@ fn report(progress: &ProgressState, stage: &Stage) {
 
 /// Writes the training curve, its plot, and the photographs' exposures.
 fn write_beside(options: &Train, trainer: &Trainer<'_>) -> Result<()> {
-    let State { progress, exposures, .. } = trainer.state();
+    let State { progress, exposures, .. } = &trainer.state;
     let lines: String = progress.curve.iter().map(|line| format!("{line}\n")).collect();
     write_bytes(with_suffix(&options.out, CURVE), lines.as_bytes())?;
     write_bytes(with_suffix(&options.out, PLOT), report::curve::svg(&progress.curve, &PANELS).as_bytes())?;
     if exposures.is_off() {
         return Ok(());
     }
-    let maps = trainer.train_names().zip(&exposures.maps);
+    let maps = trainer.train.names().zip(&exposures.maps);
     let maps: serde_json::Map<String, Value> =
         maps.map(|(name, map)| (name.to_string(), json!(map.chunks(4).collect::<Vec<_>>()))).collect();
-    let text = serde_json::to_vec_pretty(&maps).map_err(|e| Error::new(e.to_string()))?;
-    write_bytes(with_suffix(&options.out, EXPOSURES), &text)
+    write_json(with_suffix(&options.out, EXPOSURES), &maps)
 }
 
 /// Processor time since a moment at which it was `before`.

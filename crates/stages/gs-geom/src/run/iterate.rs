@@ -36,7 +36,7 @@ pub(super) fn iterate(
     watched: &Watched,
     stage: &Stage,
 ) -> Result<()> {
-    let first = trainer.state().progress.iteration;
+    let first = trainer.state.progress.iteration;
     let mut progress = stage.progress("iteration", options.iterations.into()).resumed_at(first.into());
     let mut last_save = Instant::now();
     let mut smooth: Option<f64> = None;
@@ -46,12 +46,12 @@ pub(super) fn iterate(
             return stop(options, trainer, run, stage);
         }
         trainer.step()?;
-        let iteration = trainer.state().progress.iteration;
-        let loss = trainer.last_loss().total;
+        let iteration = trainer.state.progress.iteration;
+        let loss = trainer.last.total;
         let s = smooth.get_or_insert(loss);
         *s += SMOOTHING * (loss - *s);
-        let mut fields = vec![("loss", *s), ("Gaussians", trainer.state().gaussians.len() as f64)];
-        fields.extend(trainer.last_heldout().map(|psnr| ("psnr", psnr)));
+        let mut fields = vec![("loss", *s), ("Gaussians", trainer.state.gaussians.len() as f64)];
+        fields.extend(trainer.last_heldout.map(|psnr| ("psnr", psnr)));
         progress.set(iteration.into(), &fields);
         let due = match options.checkpoint_every {
             Every::Iterations(n) => iteration.is_multiple_of(n),
@@ -71,10 +71,10 @@ pub(super) fn iterate(
 /// Ends an interrupted run with a checkpoint and the Gaussians so far.
 fn stop(options: &Train, trainer: &Trainer<'_>, run: &Provenance, stage: &Stage) -> Result<()> {
     save(options, trainer, run)?;
-    let iteration = trainer.state().progress.iteration;
+    let iteration = trainer.state.progress.iteration;
     let partial = with_suffix(&options.out, PARTIAL);
     let note = format!("unfinished: {iteration} of {} iterations", options.iterations);
-    ply::write_gaussians(&partial, &trainer.state().gaussians, &[note])?;
+    ply::write_gaussians(&partial, &trainer.state.gaussians, &[note])?;
     stage.info(&format!(
         "stopped after iteration {iteration}; the same command goes on from here. The Gaussians so far: {}",
         partial.display()
@@ -85,9 +85,9 @@ fn stop(options: &Train, trainer: &Trainer<'_>, run: &Provenance, stage: &Stage)
 /// Saves what a failing run has done. An interrupted one has done so already. Where a photograph has changed, it is what the
 /// old one taught: no photograph is used that is not as it was.
 pub(super) fn rescue(options: &Train, trainer: &Trainer<'_>, run: &Provenance, stage: &Stage) {
-    let iteration = trainer.state().progress.iteration;
+    let iteration = trainer.state.progress.iteration;
     // What is not finite stays so: there is nothing to save.
-    if stage.interrupted() || check_finite(options, &trainer.state().gaussians, iteration).is_err() {
+    if stage.interrupted() || check_finite(options, &trainer.state).is_err() {
         return;
     }
     match save(options, trainer, run) {
@@ -99,6 +99,6 @@ pub(super) fn rescue(options: &Train, trainer: &Trainer<'_>, run: &Provenance, s
 }
 
 fn save(options: &Train, trainer: &Trainer<'_>, run: &Provenance) -> Result<()> {
-    check_finite(options, &trainer.state().gaussians, trainer.state().progress.iteration)?;
-    checkpoint::write(&checkpoint::path_of(&options.out), trainer.state(), run.clone())
+    check_finite(options, &trainer.state)?;
+    checkpoint::write(&checkpoint::path_of(&options.out), &trainer.state, run.clone())
 }

@@ -2,9 +2,8 @@
 
 use crate::options::Train;
 use crate::photographs::masks::Masks;
-use crate::training::checkpoint;
+use crate::training::checkpoint::{self, State};
 use gs_io::{Claim, Error, Result, Watched, with_suffix};
-use gs_scene::Gaussians;
 use gs_scene::dataset::Dataset;
 use stage::Stage;
 use std::path::{Path, PathBuf};
@@ -39,21 +38,16 @@ pub(super) fn watched(options: &Train, dataset: &Dataset, masks: &Masks) -> Watc
 }
 
 /// Refuses Gaussians that are not finite: no stage can use them, and no later step makes them finite.
-pub(super) fn check_finite(options: &Train, gaussians: &Gaussians, iteration: u32) -> Result<()> {
-    let bad: Vec<usize> = (0..gaussians.len()).filter(|&i| !gaussians.is_finite(i)).collect();
+pub(super) fn check_finite(options: &Train, state: &State) -> Result<()> {
+    let g = &state.gaussians;
+    let bad: Vec<usize> = (0..g.len()).filter(|&i| !g.is_finite(i)).collect();
     match bad.first() {
         None => Ok(()),
         Some(first) => Err(Error::new("Gaussians are not finite; nothing is written")
             .file(&options.out)
-            .field(format!("iteration {iteration}"))
-            .found(format!("{} of {}, the first is {first}", bad.len(), gaussians.len()))
+            .field(format!("iteration {}", state.progress.iteration))
+            .found(format!("{} of {}, the first is {first}", bad.len(), g.len()))
             .expected("finite numbers in all")
             .hint("check the scene's points and poses")),
     }
-}
-
-/// Removes a file that is no longer needed.
-pub(super) fn remove_if_there(path: &Path) {
-    // What cannot be removed does no harm.
-    let _ = std::fs::remove_file(path);
 }

@@ -2,7 +2,7 @@
 
 use super::exposure::{Exposures, NUMBERS};
 use super::optimiser::Adam;
-use crate::densification::screen::ScreenGradients;
+use crate::densification::adaptive::ScreenGradients;
 use gs_io::{Artifact, ArtifactWriter, Error, Provenance, Result};
 use gs_scene::{Gaussians, sh_coefficients};
 use serde::{Deserialize, Serialize};
@@ -65,9 +65,6 @@ pub fn start(gaussians: Gaussians, exposures: usize) -> State {
 }
 
 /// Writes a checkpoint; `provenance` is that of the run.
-///
-/// # Errors
-/// When the file cannot be written.
 pub fn write(path: &Path, state: &State, provenance: Provenance) -> Result<()> {
     let extra =
         Extra { steps: state.adam.steps, sh_degree: state.gaussians.sh_degree, progress: state.progress.clone() };
@@ -92,10 +89,8 @@ pub fn write(path: &Path, state: &State, provenance: Provenance) -> Result<()> {
     writer.write(path)
 }
 
-/// Reads the checkpoint at `path`, if there is one of the same run: same program, parameters and inputs.
-///
-/// # Errors
-/// Says why the checkpoint cannot be used: damaged, or of another run.
+/// Reads the checkpoint at `path`, if there is one of the same run: same program, parameters and inputs. An error says why it
+/// cannot be used.
 pub fn read(path: &Path, run: &Provenance) -> Result<Option<State>> {
     if !path.exists() {
         return Ok(None);
@@ -152,18 +147,10 @@ pub fn read(path: &Path, run: &Provenance) -> Result<Option<State>> {
 mod tests {
     use super::*;
     use crate::training::optimiser::zeros;
-    use serde_json::Value;
-    use std::collections::BTreeMap;
 
     fn provenance(seed: u64) -> Provenance {
-        Provenance {
-            format: FORMAT.into(),
-            version: VERSION,
-            program: "gs-geom 1".into(),
-            parameters: serde_json::json!({"seed": seed, "rate": 0.2f32}),
-            inputs: BTreeMap::from([("dataset".into(), "ab".into())]),
-            extra: Value::Null,
-        }
+        let parameters = serde_json::json!({"seed": seed, "rate": 0.2f32});
+        Provenance { format: FORMAT.into(), version: VERSION, parameters, ..Provenance::default() }
     }
 
     #[test]

@@ -47,9 +47,6 @@ impl Exposures {
 
     /// Moves the map of `view` against its gradient, at `t` of the run (0 to 1), and all maps so that their mean is the
     /// identity. A gradient that is not finite is not used.
-    ///
-    /// # Panics
-    /// When there is no such view.
     pub fn step(&mut self, view: usize, gradient: &[f64; NUMBERS], t: f64) {
         if gradient.iter().any(|g| !g.is_finite()) {
             return;

@@ -53,15 +53,9 @@ pub struct Derivatives {
 
 /// Loss of `pair.render` against `pair.target`, and d loss / d render into `gradient` (resized to fit); `d` is room to work
 /// in, whatever it held before.
-///
-/// # Panics
-/// When the pictures have different sizes or are not whole rows of RGB.
 pub fn l1_dssim(pair: Pair<'_>, dssim_weight: f32, gradient: &mut Vec<f32>, d: &mut Derivatives) -> Loss {
     let (n, row) = pair.check();
-    for map in [&mut d.mean, &mut d.square, &mut d.product] {
-        map.resize(n, 0.0);
-    }
-    let ssim = ssim_map(pair, Some(d)) / n as f64;
+    let ssim = ssim(pair, d);
     let (l1_scale, ssim_scale) = ((1.0 - dssim_weight) / n as f32, -dssim_weight / n as f32);
     gradient.resize(n, 0.0);
     let l1: Vec<f64> = gradient
@@ -79,15 +73,6 @@ pub fn l1_dssim(pair: Pair<'_>, dssim_weight: f32, gradient: &mut Vec<f32>, d: &
     Loss { l1, ssim, total: (1.0 - w) * l1 + w * (1.0 - ssim) }
 }
 
-/// Mean SSIM of two pictures.
-///
-/// # Panics
-/// As [`l1_dssim`].
-pub fn ssim(pair: Pair<'_>) -> f64 {
-    let (n, _) = pair.check();
-    ssim_map(pair, None) / n as f64
-}
-
 impl Pair<'_> {
     /// Number of values, and values per row.
     fn check(&self) -> (usize, usize) {
@@ -97,31 +82,24 @@ impl Pair<'_> {
     }
 }
 
-/// Sum of the SSIM map; where wanted, its derivatives.
-fn ssim_map(pair: Pair<'_>, derivatives: Option<&mut Derivatives>) -> f64 {
+/// Mean SSIM of two pictures, and the derivatives of its map.
+pub fn ssim(pair: Pair<'_>, d: &mut Derivatives) -> f64 {
     let (n, row) = pair.check();
-    let rows_of = |band: usize| (band * BAND, ((band + 1) * BAND).min(n / row));
-    let sums: Vec<f64> = match derivatives {
-        None => (0..n.div_ceil(BAND * row))
-            .into_par_iter()
-            .map_init(Scratch::default, |scratch, band| {
-                let (y0, y1) = rows_of(band);
-                ssim_only(scratch.blur_statistics(pair, row, y0, y1))
-            })
-            .collect(),
-        Some(d) => d
-            .mean
-            .par_chunks_mut(BAND * row)
-            .zip(d.square.par_chunks_mut(BAND * row))
-            .zip(d.product.par_chunks_mut(BAND * row))
-            .enumerate()
-            .map_init(Scratch::default, |scratch, (band, ((mean, square), product))| {
-                let (y0, y1) = rows_of(band);
-                ssim_with_derivatives(scratch.blur_statistics(pair, row, y0, y1), mean, square, product)
-            })
-            .collect(),
-    };
-    sums.iter().sum()
+    for map in [&mut d.mean, &mut d.square, &mut d.product] {
+        map.resize(n, 0.0);
+    }
+    let sums: Vec<f64> = d
+        .mean
+        .par_chunks_mut(BAND * row)
+        .zip(d.square.par_chunks_mut(BAND * row))
+        .zip(d.product.par_chunks_mut(BAND * row))
+        .enumerate()
+        .map_init(Scratch::default, |scratch, (band, ((mean, square), product))| {
+            let (y0, y1) = (band * BAND, band * BAND + mean.len() / row);
+            ssim_with_derivatives(scratch.blur_statistics(pair, row, y0, y1), mean, square, product)
+        })
+        .collect();
+    sums.iter().sum::<f64>() / n as f64
 }
 
 /// Buffers of one worker.
@@ -265,20 +243,6 @@ fn ssim_with_derivatives(maps: [&[f32]; 5], d_mean: &mut [f32], d_square: &mut [
     total
 }
 
-#[multiversion(targets("x86_64+avx512f+avx512vl", "x86_64+avx2"))]
-fn ssim_only(maps: [&[f32]; 5]) -> f64 {
-    let n = maps[0].len();
-    let [mx, my, xx, yy, xy] = maps.map(|m| &m[..n]);
-    let mut total = 0.0;
-    for i in 0..n {
-        let (mx, my) = (mx[i], my[i]);
-        let (var_x, var_y, cov) = (xx[i] - mx * mx, yy[i] - my * my, xy[i] - mx * my);
-        let s = (2.0 * mx * my + C1) * (2.0 * cov + C2) / ((mx * mx + my * my + C1) * (var_x + var_y + C2));
-        total += f64::from(s);
-    }
-    total
-}
-
 /// d SSIM / d x = blur(d mean) + 2 x blur(d E[x^2]) + y blur(d E[xy]): the window is symmetric, so the blur is its own
 /// adjoint.
 #[multiversion(targets("x86_64+avx512f+avx512vl", "x86_64+avx2"))]
@@ -375,7 +339,7 @@ mod tests {
             let weight = f64::from(weight);
             let (ssim_true, total) = oracle(&wide(&x), &wide(&y), w, weight);
             assert!((loss.total - total).abs() < 1e-6, "{loss:?} {total}");
-            assert!((ssim(Pair { render: &x, target: &y, width: w }) - ssim_true).abs() < 1e-6);
+            assert!((loss.ssim - ssim_true).abs() < 1e-6);
             for i in (0..x.len()).step_by(97) {
                 let at = |d: f64| {
                     let mut x = wide(&x);

@@ -1,5 +1,6 @@
 //! Adam with a learning rate per kind of parameter.
 
+use super::schedule::LearningRates;
 use gs_raster::Gradients;
 use gs_scene::{Gaussians, sh_coefficients};
 use multiversion::multiversion;
@@ -16,23 +17,6 @@ const LARGEST_GRADIENT: f32 = 1e18;
 /// Gaussians per piece of parallel work.
 const CHUNK: usize = 2048;
 
-/// Learning rates of one step.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Rates {
-    /// Of the centres, world units; 0 freezes them.
-    pub means: f32,
-    /// Of the logarithms of the scales.
-    pub log_scales: f32,
-    /// Of the quaternions.
-    pub rotations: f32,
-    /// Of the opacity logits.
-    pub opacity_logits: f32,
-    /// Of the constant colour term.
-    pub sh_constant: f32,
-    /// Of the other spherical harmonics.
-    pub sh_rest: f32,
-}
-
 /// Adam's state.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct Adam {
@@ -40,7 +24,6 @@ pub struct Adam {
     pub first: Gaussians,
     /// Second moments, in the layout of the parameters.
     pub second: Gaussians,
-    /// Steps taken.
     pub steps: u64,
 }
 
@@ -72,12 +55,10 @@ impl Adam {
         Self { first: zero(), second: zero(), steps: 0 }
     }
 
-    /// Updates the parameters by one step (Kingma and Ba 2015, with bias correction by the number of steps). Spherical
-    /// harmonics above `active_degree` have neither gradient nor moments yet and stay as they are.
-    ///
-    /// # Panics
-    /// When the gradients belong to another number of Gaussians.
-    pub fn step(&mut self, g: &mut Gaussians, d: &Gradients, rates: &Rates, active_degree: u8) {
+    /// Updates the parameters by one step (Kingma and Ba 2015, with bias correction by the number of steps). `centres` is the
+    /// rate of the centres, world units; 0 freezes them. Spherical harmonics above `active_degree` have neither gradient nor
+    /// moments yet and stay as they are.
+    pub fn step(&mut self, g: &mut Gaussians, d: &Gradients, centres: f32, rates: &LearningRates, active_degree: u8) {
         assert!(d.means.len() == g.len() && d.sh.len() == g.sh.len() && self.first.len() == g.len());
         self.steps += 1;
         let t = i32::try_from(self.steps).unwrap_or(i32::MAX);
@@ -100,50 +81,38 @@ impl Adam {
             });
         };
         macro_rules! group {
-            ($field:ident, $width:literal) => {
+            ($field:ident, $width:literal, $rate:expr) => {
                 rows(
                     g.$field.as_flattened_mut(),
                     m.$field.as_flattened_mut(),
                     v.$field.as_flattened_mut(),
                     d.$field.as_flattened(),
-                    &[rates.$field; $width],
+                    &[$rate; $width],
                     $width,
                 )
             };
         }
-        group!(means, 3);
-        group!(log_scales, 3);
-        group!(rotations, 4);
+        group!(means, 3, centres);
+        group!(log_scales, 3, rates.scaling as f32);
+        group!(rotations, 4, rates.rotation as f32);
         let opacity = (&mut m.opacity_logits, &mut v.opacity_logits);
-        rows(&mut g.opacity_logits, opacity.0, opacity.1, &d.opacity_logits, &[rates.opacity_logits], 1);
+        rows(&mut g.opacity_logits, opacity.0, opacity.1, &d.opacity_logits, &[rates.opacity as f32], 1);
 
         let stride = g.sh_stride();
-        let mut rate = vec![rates.sh_rest; 3 * sh_coefficients(active_degree.min(g.sh_degree))];
-        rate[..3].fill(rates.sh_constant);
+        let mut rate = vec![(rates.feature / 20.0) as f32; 3 * sh_coefficients(active_degree.min(g.sh_degree))];
+        rate[..3].fill(rates.feature as f32);
         rows(&mut g.sh, &mut m.sh, &mut v.sh, &d.sh, &rate, stride);
     }
 
     /// Keeps the moments of the Gaussians at `sources`, in that order; from position `fresh` on they start from zero.
-    ///
-    /// # Panics
-    /// When an index is out of range.
     pub fn select(&mut self, sources: &[u32], fresh: usize) {
         for moments in [&mut self.first, &mut self.second] {
-            let new = zeros(sources.len() - fresh, moments.sh_degree);
-            let mut kept = moments.select(&sources[..fresh]);
-            kept.means.extend(new.means);
-            kept.log_scales.extend(new.log_scales);
-            kept.rotations.extend(new.rotations);
-            kept.opacity_logits.extend(new.opacity_logits);
-            kept.sh.extend(new.sh);
-            *moments = kept;
+            *moments = moments.select(sources);
         }
+        self.forget(fresh as u32..sources.len() as u32);
     }
 
     /// Forgets the moments of some Gaussians, for when they are set to something else.
-    ///
-    /// # Panics
-    /// When an index is out of range.
     pub fn forget(&mut self, gaussians: impl Iterator<Item = u32> + Clone) {
         for moments in [&mut self.first, &mut self.second] {
             let stride = moments.sh_stride();
@@ -156,12 +125,6 @@ impl Adam {
                 moments.sh[i * stride..(i + 1) * stride].fill(0.0);
             }
         }
-    }
-
-    /// Forgets the opacities' moments, for when the opacities are set to something else.
-    pub fn forget_opacities(&mut self) {
-        self.first.opacity_logits.fill(0.0);
-        self.second.opacity_logits.fill(0.0);
     }
 }
 
@@ -230,15 +193,8 @@ pub fn drop_bad_gradients(d: &mut Gradients) -> u64 {
 mod tests {
     use super::*;
 
-    fn rates(rate: f32) -> Rates {
-        Rates {
-            means: rate,
-            log_scales: rate,
-            rotations: rate,
-            opacity_logits: rate,
-            sh_constant: rate,
-            sh_rest: rate / 20.0,
-        }
+    fn rates(rate: f64) -> LearningRates {
+        LearningRates { feature: rate, opacity: rate, scaling: rate, rotation: rate, ..LearningRates::default() }
     }
 
     fn gradients(n: usize, stride: usize, value: impl Fn(usize) -> f32) -> Gradients {
@@ -274,7 +230,7 @@ mod tests {
             let sequence = [0.5, -0.25, 3.0, 1e-9, 0.7];
             for s in sequence {
                 let d = gradients(n, g.sh_stride(), |i| s * (i + 1) as f32);
-                adam.step(&mut g, &d, &rates(0.01), degree);
+                adam.step(&mut g, &d, 0.01, &rates(0.01), degree);
             }
             for i in [0, 1, n - 1] {
                 let own: Vec<f64> = sequence.iter().map(|&s| f64::from(s) * (i + 1) as f64).collect();
@@ -294,7 +250,7 @@ mod tests {
         let mut g = zeros(5, 3);
         let mut adam = Adam::new(&g);
         let d = gradients(5, g.sh_stride(), |_| 1.0);
-        adam.step(&mut g, &d, &Rates { means: 0.0, ..rates(0.1) }, 1);
+        adam.step(&mut g, &d, 0.0, &rates(0.1), 1);
         assert!(g.means.iter().flatten().all(|&v| v == 0.0));
         assert!(g.sh_of(4)[..12].iter().all(|&v| v < 0.0) && g.sh_of(4)[12..].iter().all(|&v| v == 0.0));
     }
@@ -318,7 +274,7 @@ mod tests {
     fn selected_moments_follow_their_gaussians() {
         let mut g = zeros(3, 1);
         let mut adam = Adam::new(&g);
-        adam.step(&mut g, &gradients(3, 12, |i| i as f32), &rates(0.1), 1);
+        adam.step(&mut g, &gradients(3, 12, |i| i as f32), 0.1, &rates(0.1), 1);
         let before = adam.first.clone();
         adam.select(&[2, 0, 2], 2);
         assert_eq!(adam.first.means[0], before.means[2]);

@@ -1,7 +1,6 @@
 //! What changes with the iteration: learning rates, degree of the spherical harmonics, picture size, and the order of the
 //! views. Iterations count from 1.
 
-use super::optimiser::Rates;
 use rand::seq::SliceRandom;
 use rand_chacha::ChaCha8Rng;
 use rand_chacha::rand_core::SeedableRng;
@@ -40,7 +39,6 @@ impl Default for LearningRates {
 /// What changes when.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct Schedule {
-    /// Length of the optimisation.
     pub iterations: u32,
     /// Iterations after which the degree of the spherical harmonics grows by one.
     pub sh_every: u32,
@@ -74,22 +72,11 @@ impl Schedule {
         (f64::from(iteration) / f64::from(self.iterations.max(1))).clamp(0.0, 1.0)
     }
 
-    /// Learning rates at an iteration, for a scene of this extent (see [`crate::start::extent`]).
-    pub fn rates(&self, base: &LearningRates, iteration: u32, extent: f64) -> Rates {
+    /// Learning rate of the centres at an iteration, world units, for a scene of this extent (see [`crate::start::extent`]).
+    pub fn rate_of_centres(&self, rates: &LearningRates, iteration: u32, extent: f64) -> f32 {
         let t = self.share(iteration);
-        let position = if base.position > 0.0 && base.position_end > 0.0 {
-            (base.position.ln() * (1.0 - t) + base.position_end.ln() * t).exp()
-        } else {
-            0.0
-        };
-        Rates {
-            means: (position * extent) as f32,
-            log_scales: base.scaling as f32,
-            rotations: base.rotation as f32,
-            opacity_logits: base.opacity as f32,
-            sh_constant: base.feature as f32,
-            sh_rest: (base.feature / 20.0) as f32,
-        }
+        let rate = (rates.position.ln() * (1.0 - t) + rates.position_end.ln() * t).exp();
+        if rates.position > 0.0 { (rate * extent) as f32 } else { 0.0 }
     }
 
     /// Degree of the spherical harmonics in use at an iteration.
@@ -138,9 +125,6 @@ impl ViewOrder {
     }
 
     /// The view of an iteration.
-    ///
-    /// # Panics
-    /// When there are no views.
     pub fn at(&mut self, iteration: u32) -> usize {
         let (n, i) = (self.order.len() as u64, u64::from(iteration.saturating_sub(1)));
         if self.round != Some(i / n) {
@@ -161,10 +145,9 @@ mod tests {
         let s = Schedule::for_iterations(30_000);
         let base = LearningRates::default();
         let close = |a: f32, b: f64| (f64::from(a) / b - 1.0).abs() < 1e-3;
-        assert!(close(s.rates(&base, 0, 2.0).means, 3.2e-4));
-        assert!(close(s.rates(&base, 15_000, 1.0).means, 1.6e-5));
-        assert!(close(s.rates(&base, 30_000, 1.0).means, 1.6e-6));
-        assert!(close(s.rates(&base, 7, 1.0).sh_rest, 0.0025 / 20.0));
+        assert!(close(s.rate_of_centres(&base, 0, 2.0), 3.2e-4));
+        assert!(close(s.rate_of_centres(&base, 15_000, 1.0), 1.6e-5));
+        assert!(close(s.rate_of_centres(&base, 30_000, 1.0), 1.6e-6));
         assert_eq!([0, 999, 1000, 2000, 3000, 30_000].map(|i| s.sh_degree(i, 3)), [0, 0, 1, 2, 3, 3]);
     }
 

@@ -1,20 +1,12 @@
-//! The loop through the library: every way to densify, stopped and resumed, on any number of threads.
+//! The loop: every way to densify, stopped and resumed, on any number of threads.
 
-mod common;
-
-use common::world::scene;
-use gs_geom::densification::adaptive::Adaptive;
-use gs_geom::densification::rules::Growth;
-use gs_geom::densification::{Strategy, Way};
-use gs_geom::photographs::Photographs;
-use gs_geom::photographs::masks::Masks;
-use gs_geom::start;
-use gs_geom::training::checkpoint::{self, State};
-use gs_geom::training::{Recipe, Trainer};
+use super::*;
+use crate::densification::adaptive::Adaptive;
+use crate::photographs::masks::Masks;
+use crate::start;
+use crate::world::scene;
 use gs_io::{Provenance, Watched};
-use gs_scene::Camera;
 use gs_scene::dataset::{self, LoadOptions, Split};
-use std::collections::BTreeMap;
 
 /// A run in parts: after each of `stops` it goes on from a checkpoint file. Its state, with the PSNR on the held-out views.
 fn trained(recipe: &Recipe, cache: usize, stops: &[u32]) -> (State, f64) {
@@ -28,27 +20,21 @@ fn trained(recipe: &Recipe, cache: usize, stops: &[u32]) -> (State, f64) {
     let extent = start::extent(&cameras, &dataset.points.positions);
     let first = start::from_points(&dataset.points, 2, extent).unwrap();
     let mut state = checkpoint::start(first, if recipe.exposure { cameras.len() } else { 0 });
-    let dir = common::Folder::new();
-    let path = dir.path("checkpoint");
-    let provenance = Provenance {
-        format: checkpoint::FORMAT.into(),
-        version: checkpoint::VERSION,
-        program: "gs-geom".into(),
-        parameters: serde_json::to_value(recipe).unwrap(),
-        inputs: BTreeMap::new(),
-        extra: serde_json::Value::Null,
-    };
+    let dir = tempfile::tempdir().unwrap();
+    let path = dir.path().join("checkpoint");
+    let (format, version) = (checkpoint::FORMAT.into(), checkpoint::VERSION);
+    let provenance = Provenance { format, version, parameters: json!(recipe), ..Provenance::default() };
     for &stop in stops.iter().chain([&recipe.schedule.iterations]) {
         let (train, heldout) = (photographs(Split::Train), photographs(Split::Test));
         let mut trainer = Trainer::new(recipe.clone(), extent, train, heldout, state);
-        while trainer.state().progress.iteration < stop {
+        while trainer.state.progress.iteration < stop {
             trainer.step().unwrap();
         }
         if trainer.is_done() {
-            return (trainer.state().clone(), trainer.heldout().unwrap().psnr.unwrap());
+            return (trainer.state.clone(), trainer.heldout().unwrap().psnr.unwrap());
         }
-        checkpoint::write(path.as_ref(), trainer.state(), provenance.clone()).unwrap();
-        state = checkpoint::read(path.as_ref(), &provenance).unwrap().unwrap();
+        checkpoint::write(&path, &trainer.state, provenance.clone()).unwrap();
+        state = checkpoint::read(&path, &provenance).unwrap().unwrap();
     }
     unreachable!("a run ends");
 }
