@@ -117,14 +117,13 @@ fn tile_pixels(
     options: &FootprintOptions,
     below: &[u64],
 ) -> Vec<Pixel> {
-    let size = maps.width * maps.height;
     let mut out = Vec::new();
     for y in 0..tile.height {
         for x in 0..tile.width {
             let (at, pixel) = (y * TILE + x, (tile.y0 + y) * maps.width + tile.x0 + x);
+            let rows = rows_at(maps, row_of, pixel);
             for level in 0..LEVELS {
-                let id = maps.ids[level * size + pixel];
-                let row = if id < 0 { NONE } else { row_of[level][id as usize] };
+                let row = rows[level];
                 let key = mixed(options.seed ^ mixed((pixel * LEVELS + level) as u64));
                 if row == NONE || tile.alpha[at] <= options.gate || key > below[row as usize] {
                     continue;
@@ -167,6 +166,16 @@ fn mask_rows(maps: &MaskMaps, min_pixels: usize) -> (Vec<Row>, [Vec<u32>; LEVELS
     (rows, row_of, small)
 }
 
+/// The rows of the masks that a pixel belongs to, level by level.
+#[inline(always)]
+fn rows_at(maps: &MaskMaps, row_of: &[Vec<u32>; LEVELS], pixel: usize) -> [u32; LEVELS] {
+    let size = maps.width * maps.height;
+    std::array::from_fn(|level| match maps.ids[level * size + pixel] {
+        id if id >= 0 => row_of[level][id as usize],
+        _ => NONE,
+    })
+}
+
 /// What one tile adds.
 struct TileSums {
     /// (row, Gaussian, weight), Gaussians in the tile's order.
@@ -185,7 +194,6 @@ struct Fact {
 }
 
 fn tile_sums(tile: &TileWeights, maps: &MaskMaps, row_of: &[Vec<u32>; LEVELS], gate: f32) -> TileSums {
-    let size = maps.width * maps.height;
     let seen = Vec::with_capacity(tile.gaussians.len());
     let mut out = TileSums { entries: Vec::new(), seen, facts: Vec::new(), pixels: Vec::new() };
     // Cell 0 holds the pixels that count for no mask.
@@ -194,22 +202,16 @@ fn tile_sums(tile: &TileWeights, maps: &MaskMaps, row_of: &[Vec<u32>; LEVELS], g
     for y in 0..tile.height {
         for x in 0..tile.width {
             let pixel = (tile.y0 + y) * maps.width + tile.x0 + x;
-            let masks: [u32; LEVELS] = std::array::from_fn(|level| match maps.ids[level * size + pixel] {
-                id if id >= 0 => row_of[level][id as usize],
-                _ => NONE,
-            });
+            let masks = rows_at(maps, row_of, pixel);
             let at = y * TILE + x;
             let passes = tile.alpha[at] > gate;
             for &row in masks.iter().filter(|r| **r != NONE) {
-                let fact = match out.facts.iter().position(|f| f.row == row) {
-                    Some(i) => &mut out.facts[i],
-                    None => {
-                        out.facts.push(Fact { row, gated: 0, alpha: 0.0 });
-                        out.facts.last_mut().expect("just pushed")
-                    }
-                };
-                fact.gated += u32::from(passes);
-                fact.alpha += f64::from(tile.alpha[at]);
+                let at_fact = out.facts.iter().position(|f| f.row == row).unwrap_or_else(|| {
+                    out.facts.push(Fact { row, gated: 0, alpha: 0.0 });
+                    out.facts.len() - 1
+                });
+                out.facts[at_fact].gated += u32::from(passes);
+                out.facts[at_fact].alpha += f64::from(tile.alpha[at]);
             }
             if passes {
                 let cell = cells.iter().position(|c| *c == masks).unwrap_or_else(|| {

@@ -2,34 +2,17 @@
 
 use crate::fps::farthest_points;
 use crate::kdtree::{KdTree, distance};
+use artifacts::Graph;
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
 /// Spatial neighbours per Gaussian: the best of 4, 8, 16 and 32 on a scene of 12,000 (79, 81, 86 and 82 % instance mIoU).
 pub const GAUSSIAN_K: usize = 16;
 
-/// The graph's arrays, as in [`artifacts::Graph`].
-#[derive(Debug, Clone, Default, PartialEq, Eq)]
-pub struct AnchorGraph {
-    /// Anchors in the order of sampling; M.
-    pub anchors: Vec<u32>,
-    /// Nearest points of each anchor; `[M][k]`.
-    pub knn: Vec<u32>,
-    /// Nearest anchors of each anchor; `[M][k]`.
-    pub anchor_knn: Vec<u32>,
-    /// Nearest anchor of each point; n.
-    pub nearest_anchor: Vec<u32>,
-    /// Nearest points of each point; `[n][GAUSSIAN_K]`.
-    pub gaussian_knn: Vec<u32>,
-}
-
 /// The graph of `points` (finite, shifted to a near origin): a share of `anchor_ratio` of them are anchors, at least one,
-/// with `k` neighbours each. `seed` chooses the first anchor.
-pub fn anchor_graph(points: &[[f32; 3]], anchor_ratio: f64, k: usize, seed: u64) -> AnchorGraph {
+/// with `k` neighbours each. `seed` chooses the first anchor. What is not about neighbours is empty.
+pub fn anchor_graph(points: &[[f32; 3]], anchor_ratio: f64, k: usize, seed: u64) -> Graph {
     let n = points.len();
-    if n == 0 {
-        return AnchorGraph::default();
-    }
     let count = ((n as f64 * anchor_ratio) as usize).clamp(1, n);
     let start = ChaCha8Rng::seed_from_u64(seed).random_range(0..n as u32);
     let tree = KdTree::new(points);
@@ -37,12 +20,15 @@ pub fn anchor_graph(points: &[[f32; 3]], anchor_ratio: f64, k: usize, seed: u64)
     let (gaussian_knn, sample) = rayon::join(|| tree.all_nearest(GAUSSIAN_K), || farthest_points(&tree, count, start));
     let anchors = sample.anchors;
     let anchor_points: Vec<[f32; 3]> = anchors.iter().map(|&a| points[a as usize]).collect();
-    AnchorGraph {
+    Graph {
+        k,
         knn: tree.nearest_to(&anchors, k),
         anchor_knn: KdTree::new(&anchor_points).all_nearest(k),
+        gaussian_k: GAUSSIAN_K,
         gaussian_knn,
         nearest_anchor: sample.nearest,
         anchors,
+        ..Graph::default()
     }
 }
 
@@ -59,21 +45,15 @@ pub struct AnchorDistances {
     pub largest: f64,
 }
 
-impl AnchorGraph {
-    /// Distribution of the distances of `points` (those that the graph was made of) to their nearest anchors.
-    pub fn distances(&self, points: &[[f32; 3]]) -> AnchorDistances {
-        let to_anchor = |(p, &a): (&[f32; 3], &u32)| distance(points[self.anchors[a as usize] as usize], *p);
-        AnchorDistances::of(points.iter().zip(&self.nearest_anchor).map(to_anchor).collect())
-    }
-}
-
 impl AnchorDistances {
-    /// Of squared distances.
-    fn of(mut all: Vec<f32>) -> Self {
+    /// Of the points that a graph was made of.
+    pub fn of(graph: &Graph, points: &[[f32; 3]]) -> Self {
+        let to_anchor = |(p, &a): (&[f32; 3], &u32)| distance(points[graph.anchors[a as usize] as usize], *p);
+        let mut all: Vec<f32> = points.iter().zip(&graph.nearest_anchor).map(to_anchor).collect();
         all.sort_unstable_by(f32::total_cmp);
         let at = |share: f64| {
             let rank = (share * all.len() as f64).ceil() as usize;
-            all.get(rank.max(1) - 1).map_or(0.0, |d| f64::from(*d).sqrt())
+            f64::from(all[rank.max(1) - 1]).sqrt()
         };
         Self { median: at(0.5), p90: at(0.9), p99: at(0.99), largest: at(1.0) }
     }
@@ -82,7 +62,6 @@ impl AnchorDistances {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::kdtree::distance;
     use crate::testing::points;
     use proptest::prelude::*;
     use rand::Rng;
@@ -124,9 +103,8 @@ mod tests {
     fn distances_to_anchors_are_summed_up() {
         // Ten points in a row, the anchor first: distances 0 to 9.
         let points: Vec<[f32; 3]> = (0..10).map(|i| [i as f32, 0.0, 0.0]).collect();
-        let g = AnchorGraph { anchors: vec![0], nearest_anchor: vec![0; 10], ..AnchorGraph::default() };
-        assert_eq!(g.distances(&points), AnchorDistances { median: 4.0, p90: 8.0, p99: 9.0, largest: 9.0 });
-        assert_eq!(AnchorGraph::default().distances(&[]), AnchorDistances::default());
+        let g = Graph { anchors: vec![0], nearest_anchor: vec![0; 10], ..Graph::default() };
+        assert_eq!(AnchorDistances::of(&g, &points), AnchorDistances { median: 4.0, p90: 8.0, p99: 9.0, largest: 9.0 });
     }
 
     #[test]

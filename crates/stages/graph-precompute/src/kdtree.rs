@@ -87,71 +87,44 @@ impl KdTree {
         [self.axes[0][slot], self.axes[1][slot], self.axes[2][slot]]
     }
 
-    /// The `k` points nearest to `q`, nearest first, ties by index, without the point `except`; `found` is scratch and
-    /// result: (squared distance, index).
-    pub fn nearest(&self, q: [f32; 3], k: usize, except: Option<u32>, found: &mut Vec<(f32, u32)>) {
-        found.clear();
-        if k > 0 && !self.nodes.is_empty() {
-            search(self, q, k, except, found);
-        }
-    }
-
-    /// For each query point (with the index to leave out, if any): its `k` nearest points as in [`Self::nearest`],
-    /// `[queries][k]`. Where there are fewer than `k`, rows are filled up with `pad(query)`.
-    fn nearest_many(
-        &self,
-        queries: &[([f32; 3], Option<u32>)],
-        k: usize,
-        pad: impl Fn(usize) -> u32 + Sync,
-    ) -> Vec<u32> {
-        let mut out = vec![0u32; queries.len() * k];
-        out.par_chunks_mut((CHUNK * k).max(1)).enumerate().for_each(|(chunk, rows)| {
+    /// The `k` nearest other points of the points `of`, each of which is there once: `[of][k]`, nearest first, ties by index;
+    /// filled up with the point itself.
+    pub fn nearest_to(&self, of: &[u32], k: usize) -> Vec<u32> {
+        const NONE: u32 = u32::MAX;
+        let mut row_of = vec![NONE; self.index.len()];
+        of.iter().enumerate().for_each(|(row, &i)| row_of[i as usize] = row as u32);
+        // In slot order, so that one query's leaves are still in the cache for the next.
+        let slots: Vec<u32> =
+            (0..self.index.len() as u32).filter(|&s| row_of[self.index[s as usize] as usize] != NONE).collect();
+        let mut by_slot = vec![0u32; of.len() * k];
+        by_slot.par_chunks_mut((CHUNK * k).max(1)).zip(slots.par_chunks(CHUNK)).for_each(|(rows, slots)| {
             let mut found = Vec::with_capacity(k + 1);
-            for (i, row) in rows.chunks_exact_mut(k).enumerate() {
-                let query = chunk * CHUNK + i;
-                let (q, except) = queries[query];
-                self.nearest(q, k, except, &mut found);
-                for (o, &(_, index)) in row.iter_mut().zip(&found) {
-                    *o = index;
-                }
-                row[found.len()..].fill(pad(query));
+            for (row, &slot) in rows.chunks_exact_mut(k).zip(slots) {
+                let i = self.index[slot as usize];
+                search(self, self.at(slot as usize), k, Some(i), &mut found);
+                row.fill(i);
+                row.iter_mut().zip(&found).for_each(|(o, &(_, index))| *o = index);
             }
         });
-        out
-    }
-
-    /// The `k` nearest other points of the points `of`, `[of][k]` by index; filled up with the point itself.
-    pub fn nearest_to(&self, of: &[u32], k: usize) -> Vec<u32> {
-        // In slot order, so that one query's leaves are still in the cache for the next.
-        let mut slot_of = vec![0u32; self.index.len()];
-        self.index.iter().enumerate().for_each(|(slot, &i)| slot_of[i as usize] = slot as u32);
-        let mut order: Vec<u32> = (0..of.len() as u32).collect();
-        order.sort_unstable_by_key(|&o| slot_of[of[o as usize] as usize]);
-        let queries: Vec<_> =
-            order.iter().map(|&o| (self.at(slot_of[of[o as usize] as usize] as usize), Some(of[o as usize]))).collect();
-        let sorted = self.nearest_many(&queries, k, |q| of[order[q] as usize]);
-        let mut out = vec![0u32; sorted.len()];
-        for (row, &o) in sorted.chunks_exact(k.max(1)).zip(&order) {
-            out[o as usize * k..(o as usize + 1) * k].copy_from_slice(row);
-        }
-        out
-    }
-
-    /// The `k` nearest other points of every point, `[points][k]` by index; filled up with the point itself.
-    pub fn all_nearest(&self, k: usize) -> Vec<u32> {
-        let queries: Vec<_> = (0..self.index.len()).map(|s| (self.at(s), Some(self.index[s]))).collect();
-        let by_slot = self.nearest_many(&queries, k, |s| self.index[s]);
         let mut out = vec![0u32; by_slot.len()];
-        for (row, &i) in by_slot.chunks_exact(k.max(1)).zip(&self.index) {
-            out[i as usize * k..(i as usize + 1) * k].copy_from_slice(row);
+        for (row, &slot) in by_slot.chunks_exact(k.max(1)).zip(&slots) {
+            let at = row_of[self.index[slot as usize] as usize] as usize;
+            out[at * k..(at + 1) * k].copy_from_slice(row);
         }
         out
+    }
+
+    /// The same for every point, `[points][k]`.
+    pub fn all_nearest(&self, k: usize) -> Vec<u32> {
+        self.nearest_to(&(0..self.index.len() as u32).collect::<Vec<u32>>(), k)
     }
 }
 
-/// [`KdTree::nearest`] in a tree that is not empty, for k > 0.
+/// The `k` > 0 points nearest to `q` in a tree that is not empty, nearest first, ties by index, without the point `except`:
+/// `found` becomes (squared distance, index).
 #[multiversion(targets("x86_64+avx2+fma", "aarch64+neon"))]
 fn search(tree: &KdTree, q: [f32; 3], k: usize, except: Option<u32>, found: &mut Vec<(f32, u32)>) {
+    found.clear();
     // Preorder of a balanced tree: the stack holds one node per level.
     let mut stack = [(0.0f32, 0u32); 64];
     let mut depth = 1;
@@ -285,7 +258,7 @@ mod tests {
         fn neighbours_are_those_of_brute_force(p in points(1..400), k in 1usize..20, q in prop::array::uniform3(-3f32..3.0)) {
             let tree = KdTree::new(&p);
             let mut found = Vec::new();
-            tree.nearest(q, k, None, &mut found);
+            search(&tree, q, k, None, &mut found);
             prop_assert_eq!(&found, &brute(&p, q, k, None));
             let all = tree.all_nearest(k);
             for (i, row) in all.chunks_exact(k).enumerate() {

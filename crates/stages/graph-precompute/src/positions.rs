@@ -6,8 +6,6 @@ const LARGEST: f64 = 1e18;
 /// Positions relative to a scene origin.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Positions {
-    /// What was subtracted, in world units.
-    pub origin: [f64; 3],
     /// The shifted positions of the usable points, in the order given.
     pub points: Vec<[f32; 3]>,
     /// Indices of the usable points, ascending.
@@ -27,8 +25,7 @@ pub fn shifted(means: &[[f32; 3]]) -> Positions {
             *o = f64::from(*values.select_nth_unstable_by(middle, f32::total_cmp).1);
         }
     }
-    let mut out =
-        Positions { origin, points: Vec::with_capacity(means.len()), usable: Vec::with_capacity(means.len()) };
+    let mut out = Positions { points: Vec::with_capacity(means.len()), usable: Vec::with_capacity(means.len()) };
     for (i, p) in means.iter().enumerate() {
         let q = [0, 1, 2].map(|a| f64::from(p[a]) - origin[a]);
         if finite(p) && q.iter().all(|v| v.abs() <= LARGEST) {

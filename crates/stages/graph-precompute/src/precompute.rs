@@ -1,7 +1,7 @@
 //! Footprints of all views, then the graph over the Gaussians that were seen.
 
 use crate::footprint::{FootprintOptions, view_footprints};
-use crate::graph::{AnchorDistances, GAUSSIAN_K, anchor_graph};
+use crate::graph::{AnchorDistances, anchor_graph};
 use crate::options::Settings;
 use crate::positions::shifted;
 use artifacts::{FootprintsBuilder, Graph, MaskMaps, PixelSamples, ScratchEntries, maps_path};
@@ -18,7 +18,6 @@ const REFERENCE_PIXELS: f64 = 986.0 * 728.0;
 /// Figures of the result.
 #[derive(Debug, Clone, Default, PartialEq, serde::Serialize)]
 pub struct Summary {
-    /// Gaussians of the geometry.
     pub gaussians: usize,
     /// Of these, Gaussians with a parameter that is not finite.
     pub damaged: usize,
@@ -26,7 +25,6 @@ pub struct Summary {
     pub unusable: usize,
     /// Gaussians that take part.
     pub kept: usize,
-    /// Anchors.
     pub anchors: usize,
     /// How far the Gaussians that take part are from their anchors.
     pub anchor_distance: AnchorDistances,
@@ -36,7 +34,6 @@ pub struct Summary {
     pub masks: usize,
     /// Masks left out for being too small.
     pub small_masks: usize,
-    /// Entries of the footprints.
     pub entries: usize,
     /// Single pixels kept.
     pub pixels: usize,
@@ -78,7 +75,7 @@ pub(crate) fn precompute(
     let points = shifted(&points).points;
     let g = anchor_graph(&points, settings.anchor_ratio, settings.k, seed);
     let summary = Summary {
-        anchor_distance: g.distances(&points),
+        anchor_distance: AnchorDistances::of(&g, &points),
         anchors: g.anchors.len(),
         kept: c.out.kept.len(),
         masks: c.out.rows.len(),
@@ -86,18 +83,8 @@ pub(crate) fn precompute(
         pixels: c.out.pixels.len(),
         ..c.summary
     };
-    let graph = Graph {
-        kept: c.out.kept.clone(),
-        anchors: g.anchors,
-        k: settings.k,
-        knn: g.knn,
-        anchor_knn: g.anchor_knn,
-        nearest_anchor: g.nearest_anchor,
-        gaussian_k: GAUSSIAN_K,
-        gaussian_knn: g.gaussian_knn,
-        seen_views: c.seen_views,
-        seen_weight: c.seen_weight.iter().map(|&w| w as f32).collect(),
-    };
+    let seen_weight = c.seen_weight.iter().map(|&w| w as f32).collect();
+    let graph = Graph { kept: c.out.kept.clone(), seen_views: c.seen_views, seen_weight, ..g };
     Ok((c.out, graph, summary))
 }
 

@@ -2,43 +2,29 @@
 
 use artifacts::{Footprints, Graph, MaskMaps};
 use glam::DVec3;
-use gs_scene::{Camera, Gaussians, Image, ply};
+use gs_scene::{Camera, Gaussians, Image, PointCloud, colmap, ply};
 use std::path::{Path, PathBuf};
 use std::process::{Command, Output};
 
 const SIZE: u32 = 48;
 const VIEWS: usize = 5;
 
-/// A transforms.json scene of two clusters of Gaussians, one mask each and one for both.
+/// A COLMAP scene of two clusters of Gaussians, one mask each and one for both.
 fn scene(dir: &Path, size: u32) {
-    let mut frames = Vec::new();
+    let n = (size * size) as usize;
+    let half: Vec<i32> = (0..n).map(|p| i32::from(p % size as usize >= size as usize / 2)).collect();
+    let ids = [0, 2, 4].iter().flat_map(|level| half.iter().map(move |i| i + level)).chain(vec![6; n]).collect();
+    let maps = MaskMaps { width: size as usize, height: size as usize, ids };
+    let grey = Image { width: size, height: size, rgb: vec![0.5; 3 * n], alpha: None };
+    let mut views = Vec::new();
     std::fs::create_dir_all(dir.join("masks")).unwrap();
     for v in 0..VIEWS {
         let eye = DVec3::new(v as f64 * 0.1 - 0.2, -0.2, -3.0);
-        let c = Camera::look_at(eye, DVec3::ZERO, DVec3::NEG_Y, size, size, 0.9);
-        let (r, t) = (c.rotation.transpose(), c.position());
-        // OpenGL axes: y and z turned round.
-        let row = |i: usize| [r.col(0)[i], -r.col(1)[i], -r.col(2)[i], t[i]];
-        frames.push(serde_json::json!({
-            "file_path": format!("images/v{v}.png"),
-            "transform_matrix": [row(0), row(1), row(2), [0.0, 0.0, 0.0, 1.0]],
-        }));
-        let n = (size * size) as usize;
-        Image { width: size, height: size, rgb: vec![0.5; 3 * n], alpha: None }
-            .write_png(dir.join(format!("images/v{v}.png")))
-            .unwrap();
-        let half: Vec<i32> = (0..n).map(|p| i32::from(p % size as usize >= size as usize / 2)).collect();
-        let mut ids = half.clone();
-        ids.extend(half.iter().map(|i| i + 2));
-        ids.extend(half.iter().map(|i| i + 4));
-        ids.extend(vec![6; n]);
-        MaskMaps { width: size as usize, height: size as usize, ids }
-            .write(dir.join(format!("masks/v{v}_s.npy")))
-            .unwrap();
+        views.push((format!("v{v}.png"), Camera::look_at(eye, DVec3::ZERO, DVec3::NEG_Y, size, size, 0.9)));
+        grey.write_png(dir.join(format!("images/v{v}.png"))).unwrap();
+        maps.write(dir.join(format!("masks/v{v}_s.npy"))).unwrap();
     }
-    let f = 0.5 * f64::from(size) / 0.45f64.tan();
-    let transforms = serde_json::json!({ "w": size, "h": size, "fl_x": f, "fl_y": f, "frames": frames });
-    std::fs::write(dir.join("transforms.json"), transforms.to_string()).unwrap();
+    colmap::write_model(&dir.join("sparse/0"), &views, &PointCloud::default()).unwrap();
     ply::write_gaussians(dir.join("geometry.ply"), &gaussians(), &[]).unwrap();
 }
 
@@ -76,7 +62,6 @@ fn setup() -> (tempfile::TempDir, PathBuf, PathBuf) {
 fn setup_of(size: u32) -> (tempfile::TempDir, PathBuf, PathBuf) {
     let dir = tempfile::tempdir().unwrap();
     let (s, o) = (dir.path().join("scene"), dir.path().join("out"));
-    std::fs::create_dir_all(s.join("images")).unwrap();
     std::fs::create_dir_all(&o).unwrap();
     scene(&s, size);
     (dir, s, o)
