@@ -97,7 +97,8 @@ fn measured(options: &Train, budget: f64, dataset: &Dataset, masks: &Masks, stag
     let watched = Watched::default();
     let photographs = Photographs::load(views, masks.clone(), cache_bytes(options), &watched)?;
     let count = gaussians.len();
-    let speed = probe(recipe, extent, photographs, gaussians)?;
+    let none = Photographs::load(Vec::new(), Masks::default(), 0, &watched)?;
+    let speed = probe(recipe, extent, photographs, none, gaussians)?;
 
     let limits = Limits {
         seconds: (SHARE * budget - begun.elapsed().as_secs_f64()).max(0.0),
@@ -123,7 +124,13 @@ fn measured(options: &Train, budget: f64, dataset: &Dataset, masks: &Masks, stag
 
 /// Times iterations on a copy of the start: after a warm-up with small pictures, with full ones, and with twice the
 /// Gaussians.
-fn probe(recipe: Recipe, extent: f64, photographs: Photographs<'_>, start: Gaussians) -> Result<Speed> {
+fn probe<'a>(
+    recipe: Recipe,
+    extent: f64,
+    photographs: Photographs<'a>,
+    heldout: Photographs<'a>,
+    start: Gaussians,
+) -> Result<Speed> {
     let count = start.len();
     let views = photographs.len() as u32;
     let warm = WARM_UP.max(views);
@@ -134,7 +141,7 @@ fn probe(recipe: Recipe, extent: f64, photographs: Photographs<'_>, start: Gauss
     let exposures = if recipe.exposure { photographs.len() } else { 0 };
     let state = checkpoint::start(start, exposures);
     let recipe = Recipe { schedule, growth, ..recipe };
-    let mut trainer = Trainer::new(recipe, extent, photographs, Photographs::none(), state);
+    let mut trainer = Trainer::new(recipe, extent, photographs, heldout, state);
     let time = |trainer: &mut Trainer<'_>, iterations: u32| -> Result<f64> {
         let begun = Instant::now();
         (0..iterations).try_for_each(|_| trainer.step())?;

@@ -58,9 +58,7 @@ impl Strategy {
 #[derive(Debug, Clone, Copy, PartialEq, Serialize)]
 #[serde(untagged)]
 pub enum Way {
-    /// By gradients.
     Adaptive(Adaptive),
-    /// As sampling.
     Mcmc(Mcmc),
 }
 

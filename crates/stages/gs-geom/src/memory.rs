@@ -11,18 +11,16 @@ use stage::Bytes;
 
 /// The program itself, its threads' stacks and the allocator's slack.
 const BASE: u64 = 10 << 20;
-/// Per pixel in training: render with alpha 16, target 12, gradient 12, three maps of SSIM 36.
-const PER_PIXEL: u64 = 76;
+/// Per pixel of the largest view in training: render with alpha 16, target 12, gradient 12, three maps of SSIM 36.
+pub const PER_PIXEL: u64 = 76;
 /// Per pixel of a photograph's file while it is decoded: 8-bit and f32 RGB.
 const PER_DECODED_PIXEL: u64 = 15;
 /// Per pixel while it is shrunk: f32 RGB, once for the pixels of new width and old height, twice for the result.
 const PER_SHRUNK_PIXEL: u64 = 12;
 /// Per tile that a drawn Gaussian touches: its entry in the tile's list and in the Gaussian's, and its gradient.
-const PER_TILE: u64 = 56;
+pub const PER_TILE: u64 = 56;
 /// Per Gaussian in a step, besides its gradient: what the renderer keeps of those it draws, and their lists.
 const PER_DRAWN: u64 = 200;
-/// Numbers of a Gaussian besides its spherical harmonics: centre, scales, quaternion, opacity.
-const PLAIN_NUMBERS: u64 = 11;
 
 /// What a run's peak memory is made of, bytes.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
@@ -37,7 +35,6 @@ pub struct Forecast {
     pub pictures: u64,
     /// Lists of the tiles' Gaussians and their gradients, of the views tried.
     pub tiles: u64,
-    /// Per Gaussian.
     pub per_gaussian: u64,
 }
 
@@ -67,54 +64,28 @@ impl Pictures {
     }
 
     /// Bytes that a photograph takes on its way from its file to a view.
-    fn decoding(&self) -> u64 {
+    pub fn decoding(&self) -> u64 {
         let (w, h) = (u64::from(self.file.0), u64::from(self.file.1));
         PER_DECODED_PIXEL * w * h + PER_SHRUNK_PIXEL * (self.width * h + 2 * self.pixels)
     }
 }
 
-/// What is known before a run of how large it will be.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub struct Sizes {
-    /// Photographs that are kept decoded, bytes.
-    pub photographs: u64,
-    /// Of the photographs.
-    pub pictures: Pictures,
-    /// Photographs decoded at once.
-    pub threads: usize,
-    /// Whether some photographs are not kept and decoded again in training.
-    pub decodes_again: bool,
-    /// Degree of the spherical harmonics.
-    pub sh_degree: u8,
-    /// Whether the number of Gaussians may change.
-    pub densifies: bool,
+/// Bytes that a run takes for each Gaussian, with spherical harmonics of this degree.
+pub fn per_gaussian(sh_degree: u8, densifies: bool) -> u64 {
+    let numbers = 4 * numbers(sh_degree);
+    // Parameters, two moments and sums of gradients. Beside them in a step: the gradient with that of the projected centre, and
+    // the drawn Gaussians. Densification, at the end of a step, copies the parameters and each moment in turn, and the
+    // allocator does not give all of it back: half as much again was measured.
+    let copy = if densifies { numbers * 3 / 2 } else { 0 };
+    (3 * numbers + 8) + (numbers + 16 + PER_DRAWN + copy)
+}
+
+/// Numbers of a Gaussian: centre, scales, quaternion, opacity, spherical harmonics.
+fn numbers(sh_degree: u8) -> u64 {
+    11 + 3 * sh_coefficients(sh_degree) as u64
 }
 
 impl Forecast {
-    /// For a run of these sizes.
-    pub fn new(sizes: &Sizes) -> Self {
-        let numbers = 4 * (PLAIN_NUMBERS + 3 * sh_coefficients(sizes.sh_degree) as u64);
-        // Parameters, two moments and sums of gradients. Beside them in a step: the gradient with that of the projected centre, and
-        // the drawn Gaussians. Densification, at the end of a step, copies the parameters and each moment in turn, and the
-        // allocator does not give all of it back: half as much again was measured.
-        let copy = if sizes.densifies { numbers * 3 / 2 } else { 0 };
-        let (state, step) = (3 * numbers + 8, numbers + 16 + PER_DRAWN + copy);
-        Self {
-            photographs: sizes.photographs,
-            decoding: sizes.threads as u64 * sizes.pictures.decoding(),
-            decodes_again: sizes.decodes_again,
-            pictures: PER_PIXEL * sizes.pictures.pixels,
-            tiles: 0,
-            per_gaussian: state + step,
-        }
-    }
-
-    /// The same where the Gaussians of a view touch `entries` tiles, each counted for each Gaussian.
-    #[must_use]
-    pub fn with_tiles(self, entries: u64) -> Self {
-        Self { tiles: PER_TILE * entries, ..self }
-    }
-
     /// What comes and goes. The allocator keeps what decoding took, in pieces into which the pictures and tiles of training
     /// fit only in part: half of the lesser comes on top, as measured.
     pub fn scratch(&self) -> u64 {
@@ -144,7 +115,6 @@ pub fn of_file(geometry: u64) -> u64 {
 
 /// Peak in bytes of `convert` where it adds bands of spherical harmonics.
 pub fn of_bands(gaussians: usize, from: u8, to: u8) -> u64 {
-    let numbers = |degree: u8| PLAIN_NUMBERS + 3 * sh_coefficients(degree) as u64;
     PROGRAM + 4 * gaussians as u64 * (numbers(from) + numbers(to))
 }
 

@@ -2,10 +2,9 @@
 //! the provenance; paths, and options that change no byte, are not.
 
 use crate::bounds::Bounds;
-use crate::convert::choice::Order;
+use crate::convert::Order;
 use crate::densification::Strategy;
 use crate::photographs::masks::{Alpha, Masks};
-use clap::builder::RangedU64ValueParser;
 use clap::{Parser, Subcommand, ValueEnum};
 use gs_io::{Error, IoContext, Result};
 use gs_raster::RasterOptions;
@@ -107,7 +106,7 @@ pub(crate) struct Train {
     #[arg(long, value_name = "points|random|FILE.ply", default_value = "points")]
     pub init: Init,
     /// Number of random points to start from, 1 to 1e9
-    #[arg(long, value_name = "COUNT", default_value_t = 20_000, value_parser = RangedU64ValueParser::<usize>::new().range(1..=MOST_GAUSSIANS))]
+    #[arg(long, value_name = "COUNT", default_value_t = 20_000, value_parser = within(1..=MOST_GAUSSIANS))]
     pub init_points: usize,
     /// What is skipped.
     #[command(flatten)]
@@ -118,7 +117,7 @@ pub(crate) struct Train {
     pub densify: Strategy,
     /// Largest number of Gaussians, 1 to 1e9. With --densify mcmc it is their number at the end, if there are enough
     /// iterations [one for 100 pixels of the training photographs, but at least 10,000 and twice the dataset's points]
-    #[arg(long, value_name = "COUNT", value_parser = RangedU64ValueParser::<usize>::new().range(1..=MOST_GAUSSIANS))]
+    #[arg(long, value_name = "COUNT", value_parser = within(1..=MOST_GAUSSIANS))]
     pub max_gaussians: Option<usize>,
     /// Gradient of the projected centre above which a Gaussian is cloned or split, per half picture size [0.0002]
     #[arg(long, value_name = "GRADIENT", value_parser = positive::<f32>)]
@@ -148,7 +147,7 @@ pub(crate) struct Train {
 }
 
 /// More Gaussians fit into no machine.
-const MOST_GAUSSIANS: u64 = 1_000_000_000;
+const MOST_GAUSSIANS: usize = 1_000_000_000;
 
 /// Options of `gs-geom render`.
 #[derive(Debug, clap::Args)]
@@ -312,9 +311,6 @@ fn as_text<S: Serializer>(value: &impl Display, serializer: S) -> std::result::R
     serializer.collect_str(value)
 }
 
-/// Warnings of a dataset that are printed one by one.
-const WARNINGS_PRINTED: usize = 5;
-
 impl SceneOptions {
     /// The dataset, without its warnings.
     pub fn load_quietly(&self) -> Result<Dataset> {
@@ -324,12 +320,7 @@ impl SceneOptions {
     /// The dataset.
     pub fn load(&self, stage: &Stage) -> Result<Dataset> {
         let dataset = self.load_quietly()?;
-        for warning in dataset.warnings.iter().take(WARNINGS_PRINTED) {
-            stage.warn(warning);
-        }
-        if dataset.warnings.len() > WARNINGS_PRINTED {
-            stage.warn(&format!("{} more warnings about the dataset", dataset.warnings.len() - WARNINGS_PRINTED));
-        }
+        dataset.warnings.iter().for_each(|w| stage.warn(w));
         Ok(dataset)
     }
 }

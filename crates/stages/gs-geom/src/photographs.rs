@@ -9,11 +9,10 @@ use masks::Masks;
 use rayon::prelude::*;
 
 /// Photographs as 8-bit RGB, with alpha where they have it.
-#[derive(Default)]
 pub struct Photographs<'a> {
     views: Vec<&'a View>,
     masks: Masks,
-    watched: Option<&'a Watched>,
+    watched: &'a Watched,
     budget: usize,
     /// Bytes per pixel of each photograph: 3, and 1 for alpha.
     bytes: Vec<usize>,
@@ -78,7 +77,6 @@ fn unit(v: u8) -> f32 {
 impl<'a> Photographs<'a> {
     /// Decodes the photographs of `views` and keeps up to `budget` bytes of them.
     pub fn load(views: Vec<&'a View>, masks: Masks, budget: usize, watched: &'a Watched) -> Result<Self> {
-        let watched = Some(watched);
         let cameras: Vec<Camera> = views.iter().map(|v| v.camera.clone()).collect();
         let bytes = views.par_iter().map(|v| bytes_per_pixel(v, &masks)).collect::<Result<Vec<usize>>>()?;
         let fits = fitting(&cameras, &bytes, full_share(budget));
@@ -89,23 +87,16 @@ impl<'a> Photographs<'a> {
         Ok(Self { views, masks, watched, budget, bytes, divisor: 1, cameras, full, small: Vec::new() })
     }
 
-    /// No photographs, such as held-out ones where there are none.
-    pub fn none() -> Self {
-        Self { divisor: 1, ..Self::default() }
-    }
-
     /// Bytes of the photographs that are kept at their own size.
     pub fn kept_bytes(&self) -> usize {
         let size = |p: &Picture| p.rgb.len() + p.alpha.as_ref().map_or(0, Vec::len);
         self.full.iter().flatten().map(size).sum()
     }
 
-    /// Names of the photographs.
     pub fn names(&self) -> impl Iterator<Item = &str> + Clone {
         self.views.iter().map(|v| v.name.as_str())
     }
 
-    /// Number of photographs.
     pub fn len(&self) -> usize {
         self.views.len()
     }
@@ -192,12 +183,10 @@ fn fitting(cameras: &[Camera], bytes: &[usize], budget: usize) -> Vec<bool> {
 
 /// As [`decode`], from files that are still as they were watched. They are looked at after they are read, so that what came of
 /// another content is never used.
-fn unchanged(view: &View, masks: &Masks, watched: Option<&Watched>) -> Result<Image> {
+fn unchanged(view: &View, masks: &Masks, watched: &Watched) -> Result<Image> {
     let image = decode(view, masks);
-    if let Some(watched) = watched {
-        watched.check_one(&view.image_path)?;
-        masks.of(view).map_or(Ok(()), |mask| watched.check_one(mask))?;
-    }
+    watched.check_one(&view.image_path)?;
+    masks.of(view).map_or(Ok(()), |mask| watched.check_one(mask))?;
     image
 }
 

@@ -52,13 +52,13 @@ fn choose<'a>(dataset: &'a Dataset, wanted: &str) -> Result<Vec<&'a View>> {
         "train" => dataset.views_of(Split::Train).collect(),
         names => {
             let names: BTreeSet<&str> = names.split(',').map(str::trim).filter(|n| !n.is_empty()).collect();
-            let known = |n: &&&str| dataset.views.iter().any(|v| v.stem() == **n || v.name == **n);
-            if let Some(unknown) = names.iter().find(|n| !known(n)) {
-                return Err(Error::new("no such view").file(&dataset.root).field("--views").found(unknown).expected(
-                    format!("a photograph's name such as {}", dataset.views.first().map_or("", |v| v.stem())),
-                ));
+            let is = |v: &View, name: &str| v.stem() == name || v.name == name;
+            if let Some(unknown) = names.iter().find(|n| !dataset.views.iter().any(|v| is(v, n))) {
+                let like = dataset.views.first().map_or("", |v| v.stem());
+                let e = Error::new("no such view").file(&dataset.root).field("--views").found(unknown);
+                return Err(e.expected(format!("a photograph's name such as {like}")));
             }
-            dataset.views.iter().filter(|v| names.contains(v.stem()) || names.contains(v.name.as_str())).collect()
+            dataset.views.iter().filter(|v| names.iter().any(|n| is(v, n))).collect()
         }
     };
     if views.is_empty() {

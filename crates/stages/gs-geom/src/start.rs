@@ -78,10 +78,7 @@ pub fn some_points(points: &PointCloud, count: usize, seed: u64) -> PointCloud {
 fn spacing(positions: &[[f32; 3]], alone: f32) -> Vec<f32> {
     let mut order: Vec<u32> = (0..positions.len() as u32).collect();
     let key = |i: u32| positions[i as usize].map(|v| v + 0.0);
-    let compare = |a: &[f32; 3], b: &[f32; 3]| {
-        a.iter().zip(b).map(|(a, b)| a.total_cmp(b)).find(|o| o.is_ne()).unwrap_or(std::cmp::Ordering::Equal)
-    };
-    order.sort_unstable_by(|&a, &b| compare(&key(a), &key(b)));
+    order.sort_unstable_by(|&a, &b| key(a).partial_cmp(&key(b)).expect("positions are finite"));
     let mut places: Vec<[f32; 3]> = Vec::new();
     let mut place_of = vec![0u32; positions.len()];
     for i in order {

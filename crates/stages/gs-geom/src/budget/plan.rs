@@ -52,13 +52,11 @@ impl Speed {
 pub struct Limits {
     /// Time, seconds.
     pub seconds: f64,
-    /// Iterations.
     pub iterations: u32,
     /// Gaussians to begin with.
     pub start: usize,
     /// Gaussians.
     pub gaussians: usize,
-    /// Divisor of the picture size.
     pub divisor: f64,
     /// Held-out views, each rendered eleven times.
     pub heldout: usize,
@@ -67,11 +65,9 @@ pub struct Limits {
 /// What a run is to do.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct Plan {
-    /// Iterations.
     pub iterations: u32,
     /// Most Gaussians.
     pub gaussians: usize,
-    /// Divisor of the picture size.
     pub divisor: f64,
     /// How long it should take, seconds.
     pub seconds: f64,

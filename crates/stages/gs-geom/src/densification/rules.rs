@@ -33,24 +33,19 @@ impl Growth {
 pub struct Moment<'a> {
     /// From 1.
     pub iteration: u32,
-    /// Seed of the run.
     pub seed: u64,
     /// Size of the scene, world units.
     pub extent: f64,
-    /// What changes with the iteration.
     pub schedule: &'a Schedule,
-    /// When the number grows, and how far.
     pub growth: &'a Growth,
 }
 
 /// What a round of densification did.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
 pub struct Report {
-    /// Gaussians that got a copy.
     pub cloned: usize,
     /// Gaussians replaced by two smaller ones.
     pub split: usize,
-    /// Gaussians removed.
     pub removed: usize,
     /// Dead Gaussians moved elsewhere.
     pub relocated: usize,

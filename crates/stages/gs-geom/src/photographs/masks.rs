@@ -43,17 +43,14 @@ impl Masks {
         Ok(Self(all))
     }
 
-    /// The mask of a view.
     pub fn of(&self, view: &View) -> Option<&Path> {
         self.0.get(&view.name).map(PathBuf::as_path)
     }
 
-    /// Number of masks.
     pub fn len(&self) -> usize {
         self.0.len()
     }
 
-    /// The files.
     pub fn files(&self) -> impl Iterator<Item = PathBuf> {
         self.0.values().cloned()
     }

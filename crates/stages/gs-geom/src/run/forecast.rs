@@ -52,14 +52,16 @@ pub(crate) fn forecast_start(
     let share = full_share(cache_bytes(options));
     let train = whole.0.min(share);
     let heldout = whole.1.min(full_share(share.saturating_sub(train)));
-    let forecast = Forecast::new(&memory::Sizes {
+    let pictures = memory::Pictures::of(dataset)?;
+    let densifies = (1..=growth.until.min(options.iterations)).any(|i| growth.is_due(i));
+    let forecast = Forecast {
         photographs: (train + heldout) as u64,
-        pictures: memory::Pictures::of(dataset)?,
-        threads: rayon::current_num_threads(),
+        decoding: rayon::current_num_threads() as u64 * pictures.decoding(),
         decodes_again: (train, heldout) != whole,
-        sh_degree: options.sh_degree,
-        densifies: (1..=growth.until.min(options.iterations)).any(|i| growth.is_due(i)),
-    });
+        pictures: memory::PER_PIXEL * pictures.pixels,
+        tiles: 0,
+        per_gaussian: memory::per_gaussian(options.sh_degree, densifies),
+    };
     let (points, read) = match &options.init {
         Init::File(path) => (0, bytes(path)?),
         Init::Points if !dataset.points.is_empty() => (dataset.points.len(), 0),
@@ -75,7 +77,7 @@ pub(crate) fn forecast_start(
 /// Prints how much memory the run will take, with the Gaussians there are and with the most there may be.
 pub(super) fn forecast(
     options: &Train,
-    start: Forecast,
+    mut forecast: Forecast,
     dataset: &Dataset,
     gaussians: &Gaussians,
     stage: &Stage,
@@ -87,7 +89,7 @@ pub(super) fn forecast(
     let raster = RasterOptions { sh_degree: 0, antialias: options.antialias, ..RasterOptions::fit(gaussians) };
     let entries = |v: &View| forward(gaussians, &v.camera, &raster).pairs() / (TILE * TILE);
     let entries = dataset.views.iter().step_by(apart).map(entries).max().unwrap_or(0) as u64;
-    let forecast = start.with_tiles(entries);
+    forecast.tiles = memory::PER_TILE * entries;
     stage.info(&format!(
         "memory: about {} with {now} Gaussians, at most {} with {most} (photographs {}, pictures {}, {} bytes a Gaussian)",
         forecast.peak(now),

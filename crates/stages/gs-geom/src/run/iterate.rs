@@ -14,18 +14,10 @@ const SMOOTHING: f64 = 0.02;
 
 /// The state of an interrupted run of the same parameters and inputs.
 pub(super) fn saved(options: &Train, run: &Provenance, stage: &Stage) -> Option<State> {
-    match checkpoint::read(&checkpoint::path_of(&options.out), run) {
-        Ok(state) => {
-            if let Some(state) = &state {
-                stage.info(&format!("going on after iteration {}", state.progress.iteration));
-            }
-            state
-        }
-        Err(e) => {
-            stage.warn(&format!("beginning anew: {e}"));
-            None
-        }
-    }
+    let read = checkpoint::read(&checkpoint::path_of(&options.out), run);
+    let state = read.inspect_err(|e| stage.warn(&format!("beginning anew: {e}"))).ok().flatten()?;
+    stage.info(&format!("going on after iteration {}", state.progress.iteration));
+    Some(state)
 }
 
 /// Runs the iterations that are left.

@@ -17,22 +17,16 @@ pub const VERSION: u32 = 4;
 /// [`super::schedule::generator`]), so no generator is part of it.
 #[derive(Debug, Clone, PartialEq)]
 pub struct State {
-    /// The parameters.
     pub gaussians: Gaussians,
-    /// The optimiser's moments.
     pub adam: Adam,
-    /// What densification has seen.
     pub seen: ScreenGradients,
-    /// The photographs' exposures.
     pub exposures: Exposures,
-    /// The rest.
     pub progress: ProgressState,
 }
 
 /// Counters and the training curve.
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
 pub struct ProgressState {
-    /// Iterations done.
     pub iteration: u32,
     /// Gradients of Gaussians that were not finite and so not used.
     pub dropped: u64,
@@ -42,7 +36,6 @@ pub struct ProgressState {
     pub densified: [u64; 4],
     /// Sums of loss, L1 and SSIM, and their number, since the last line of the curve.
     pub window: ([f64; 3], u32),
-    /// Lines of the training curve.
     pub curve: Vec<String>,
 }
 

@@ -117,15 +117,13 @@ impl Scratch {
     /// Blurs three maps over rows y0 to y1.
     fn blur(&mut self, maps: [&[f32]; 3], row: usize, y0: usize, y1: usize) -> [&[f32]; 3] {
         let height = maps[0].len() / row;
-        self.run(3, row, height, y0, y1, |map, y, line| line.copy_from_slice(&maps[map][y * row..(y + 1) * row]));
-        let m = (y1 - y0) * row;
-        [0, 1, 2].map(|i| &self.out[i * m..(i + 1) * m])
+        self.run(row, height, y0, y1, |map, y, line| line.copy_from_slice(&maps[map][y * row..(y + 1) * row]))
     }
 
     /// Blurs x, y, x^2, y^2 and x y over rows y0 to y1.
     fn blur_statistics(&mut self, pair: Pair<'_>, row: usize, y0: usize, y1: usize) -> [&[f32]; 5] {
         let height = pair.render.len() / row;
-        self.run(5, row, height, y0, y1, |map, y, line| {
+        self.run(row, height, y0, y1, |map, y, line| {
             let (a, b) = (&pair.render[y * row..(y + 1) * row], &pair.target[y * row..(y + 1) * row]);
             let (a, b) = match map {
                 0 => return line.copy_from_slice(a),
@@ -137,28 +135,25 @@ impl Scratch {
             for ((l, a), b) in line.iter_mut().zip(a).zip(b) {
                 *l = a * b;
             }
-        });
-        let m = (y1 - y0) * row;
-        [0, 1, 2, 3, 4].map(|i| &self.out[i * m..(i + 1) * m])
+        })
     }
 
-    /// Blurs `maps` maps, whose rows `fill(map, y, line)` gives, over rows y0 to y1 into `self.out`.
-    fn run(
+    /// Blurs maps whose rows `fill(map, y, line)` gives over rows y0 to y1.
+    fn run<const MAPS: usize>(
         &mut self,
-        maps: usize,
         row: usize,
         height: usize,
         y0: usize,
         y1: usize,
         fill: impl Fn(usize, usize, &mut [f32]),
-    ) {
+    ) -> [&[f32]; MAPS] {
         let (first, last) = (y0.saturating_sub(RADIUS), (y1 + RADIUS).min(height));
         let (have, want) = (last - first, y1 - y0);
         self.padded.clear();
         self.padded.resize(row + 6 * RADIUS, 0.0);
-        self.rows.resize(maps * have * row, 0.0);
-        self.out.resize(maps * want * row, 0.0);
-        for map in 0..maps {
+        self.rows.resize(MAPS * have * row, 0.0);
+        self.out.resize(MAPS * want * row, 0.0);
+        for map in 0..MAPS {
             let rows = &mut self.rows[map * have * row..(map + 1) * have * row];
             for (y, blurred) in (first..last).zip(rows.chunks_exact_mut(row)) {
                 fill(map, y, &mut self.padded[3 * RADIUS..3 * RADIUS + row]);
@@ -169,6 +164,7 @@ impl Scratch {
                 blur_column(rows, y - first, out);
             }
         }
+        std::array::from_fn(|map| &self.out[map * want * row..(map + 1) * want * row])
     }
 }
 
