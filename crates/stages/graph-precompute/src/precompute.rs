@@ -28,7 +28,6 @@ pub struct Summary {
     pub anchors: usize,
     /// How far the Gaussians that take part are from their anchors.
     pub anchor_distance: AnchorDistances,
-    /// Views with masks.
     pub views: usize,
     /// Masks that own enough pixels, over all views and levels.
     pub masks: usize,

@@ -54,12 +54,8 @@ fn run(dir: &Path, out: &Path, extra: &[&str]) -> Output {
         .unwrap()
 }
 
-fn setup() -> (tempfile::TempDir, PathBuf, PathBuf) {
-    setup_of(SIZE)
-}
-
 /// A scene with photographs of this size, and a folder for the output.
-fn setup_of(size: u32) -> (tempfile::TempDir, PathBuf, PathBuf) {
+fn setup(size: u32) -> (tempfile::TempDir, PathBuf, PathBuf) {
     let dir = tempfile::tempdir().unwrap();
     let (s, o) = (dir.path().join("scene"), dir.path().join("out"));
     std::fs::create_dir_all(&o).unwrap();
@@ -75,7 +71,7 @@ fn succeed(output: &Output) -> String {
 
 #[test]
 fn artifacts_are_right_and_the_same_for_any_number_of_threads() {
-    let (_dir, s, o) = setup();
+    let (_dir, s, o) = setup(SIZE);
     let said = succeed(&run(&s, &o, &["--threads", "1"]));
     assert!(said.contains("skipped 1 of 61 Gaussians: never seen"), "{said}");
     let read = || ["graph.safetensors", "footprints.safetensors"].map(|f| std::fs::read(o.join(f)).unwrap());
@@ -113,7 +109,7 @@ fn artifacts_are_right_and_the_same_for_any_number_of_threads() {
 #[test]
 fn the_forecast_is_near_the_peak() {
     const SIDE: usize = 25;
-    let (_dir, s, o) = setup_of(192);
+    let (_dir, s, o) = setup(192);
     let one = gaussians().select(&[0]);
     let mut g = one.select(&vec![0; SIDE * SIDE * SIDE]);
     for (i, p) in g.means.iter_mut().enumerate() {
@@ -133,7 +129,7 @@ fn the_forecast_is_near_the_peak() {
 
 #[test]
 fn bad_input_is_one_line_and_leaves_outputs_alone() {
-    let (_dir, s, o) = setup();
+    let (_dir, s, o) = setup(SIZE);
     for f in ["graph.safetensors", "footprints.safetensors"] {
         std::fs::write(o.join(f), "good").unwrap();
     }
@@ -180,7 +176,7 @@ fn bad_input_is_one_line_and_leaves_outputs_alone() {
 /// `kept` is the mapping from what takes part to the PLY.
 #[test]
 fn damaged_gaussians_are_left_out_and_said_to_be() {
-    let (_dir, s, o) = setup();
+    let (_dir, s, o) = setup(SIZE);
     let mut g = gaussians();
     g.means[3][1] = f32::NAN;
     g.means[7][0] = f32::INFINITY;
@@ -205,7 +201,7 @@ fn damaged_gaussians_are_left_out_and_said_to_be() {
 
 #[test]
 fn pixels_are_kept_where_asked_for_and_change_nothing_else() {
-    let (_dir, s, o) = setup();
+    let (_dir, s, o) = setup(SIZE);
     let footprints = || Footprints::read(o.join("footprints.safetensors")).unwrap();
     succeed(&run(&s, &o, &[]));
     let without = footprints();
@@ -228,7 +224,7 @@ fn pixels_are_kept_where_asked_for_and_change_nothing_else() {
 
 #[test]
 fn one_gaussian_and_one_view_are_enough() {
-    let (_dir, s, o) = setup();
+    let (_dir, s, o) = setup(SIZE);
     let one = gaussians().select(&[0]);
     let mut one = Gaussians { log_scales: vec![[0.5; 3]], ..one };
     one.means[0] = [0.0; 3];

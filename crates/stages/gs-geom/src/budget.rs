@@ -14,8 +14,8 @@ use crate::run::outputs::plan_path;
 use crate::start;
 use crate::training::schedule::{Purpose, Schedule, generator};
 use crate::training::{Recipe, Trainer, checkpoint};
-use gs_io::{Error, Result, Watched, write_json};
-use gs_scene::dataset::{Dataset, Resolution, Split, View};
+use gs_io::{Result, Watched, write_json};
+use gs_scene::dataset::{Dataset, Resolution, View};
 use gs_scene::{Camera, Gaussians};
 use plan::{Limits, Plan, Speed, plan};
 use serde::{Deserialize, Serialize};
@@ -84,11 +84,9 @@ fn measured(options: &Train, budget: f64, dataset: &Dataset, masks: &Masks, stag
     let begun = Instant::now();
     let most = most_gaussians(options, dataset);
     let recipe = options.recipe(most, stage.seed());
-    let train: Vec<&View> = dataset.views_of(Split::Train).collect();
+    let (train, heldout) = init::split(options, dataset)?;
     let cameras: Vec<&Camera> = train.iter().map(|v| &v.camera).collect();
-    let Some(width) = cameras.iter().map(|c| c.width).max() else {
-        return Err(Error::new("every view is held out").file(&options.scene.scene).hint("give --holdout 0"));
-    };
+    let width = cameras.iter().map(|c| c.width).max().unwrap_or(1);
     let extent = start::extent(&cameras, &dataset.points.positions);
     forecast_start(options, dataset, masks, &recipe.growth, stage)?;
     let gaussians = init::gaussians(options, dataset, &cameras, extent, stage)?;
@@ -106,7 +104,7 @@ fn measured(options: &Train, budget: f64, dataset: &Dataset, masks: &Masks, stag
         start: count,
         gaussians: if options.densify == Strategy::Fixed { count } else { most.max(count) },
         divisor: (f64::from(width) / LEAST_WIDTH).max(1.0),
-        heldout: dataset.views_of(Split::Test).count(),
+        heldout: heldout.len(),
     };
     let plan = plan(&speed, &limits, |iterations| {
         let recipe = Train { iterations, ..options.clone() }.recipe(most, stage.seed());

@@ -2,12 +2,11 @@
 
 use crate::bounds::Bounds;
 use crate::memory;
-use crate::options::{Convert, bytes};
+use crate::options::{Convert, Order, bytes};
 use crate::start;
 use artifacts::role;
 use gs_io::{Error, Result, hash_file};
 use gs_scene::{Gaussians, morton_order, ply};
-use serde::Serialize;
 use serde_json::json;
 use stage::Stage;
 use std::collections::BTreeMap;
@@ -58,18 +57,6 @@ impl Convert {
         });
         stage.record(&mut claim, parameters, inputs, summary)
     }
-}
-
-/// In which order Gaussians are written.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, clap::ValueEnum)]
-#[serde(rename_all = "lowercase")]
-pub enum Order {
-    /// As in the input
-    None,
-    /// Along a Morton curve: neighbours in space lie near each other in the file
-    Morton,
-    /// The most opaque first
-    Opacity,
 }
 
 /// The Gaussians chosen, and how many were not, by the first reason that applied.

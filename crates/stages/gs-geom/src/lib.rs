@@ -27,10 +27,3 @@ mod training;
 mod world;
 
 pub use options::Args;
-
-/// Property tests that are the same at every run.
-#[cfg(test)]
-fn property_tests(cases: u32) -> proptest::test_runner::Config {
-    let rng_seed = proptest::test_runner::RngSeed::Fixed(1);
-    proptest::test_runner::Config { cases, rng_seed, failure_persistence: None, ..Default::default() }
-}

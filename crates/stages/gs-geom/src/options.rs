@@ -2,7 +2,6 @@
 //! the provenance; paths, and options that change no byte, are not.
 
 use crate::bounds::Bounds;
-use crate::convert::Order;
 use crate::densification::Strategy;
 use crate::photographs::masks::{Alpha, Masks};
 use clap::{Parser, Subcommand, ValueEnum};
@@ -69,7 +68,6 @@ pub(crate) struct MaskOptions {
     pub masks: Option<PathBuf>,
 }
 
-/// Gaussians to draw.
 #[derive(Debug, Clone, clap::Args)]
 pub(crate) struct GeometryOptions {
     /// Gaussians, as a 3DGS PLY
@@ -77,7 +75,6 @@ pub(crate) struct GeometryOptions {
     pub geometry: PathBuf,
 }
 
-/// Options of `gs-geom train`.
 #[derive(Debug, Clone, clap::Args, Serialize)]
 pub(crate) struct Train {
     #[command(flatten)]
@@ -149,7 +146,6 @@ pub(crate) struct Train {
 /// More Gaussians fit into no machine.
 const MOST_GAUSSIANS: usize = 1_000_000_000;
 
-/// Options of `gs-geom render`.
 #[derive(Debug, clap::Args)]
 pub(crate) struct Render {
     #[command(flatten)]
@@ -167,7 +163,6 @@ pub(crate) struct Render {
     pub exr: bool,
 }
 
-/// Options of `gs-geom eval`.
 #[derive(Debug, clap::Args, Serialize)]
 pub(crate) struct Eval {
     #[command(flatten)]
@@ -185,7 +180,6 @@ pub(crate) struct Eval {
     pub out: PathBuf,
 }
 
-/// Options of `gs-geom inspect`.
 #[derive(Debug, clap::Args)]
 pub(crate) struct Inspect {
     /// Gaussians, as a 3DGS PLY of any property order and encoding; or the folder of a dataset, of which all files are
@@ -194,7 +188,6 @@ pub(crate) struct Inspect {
     pub file: PathBuf,
 }
 
-/// Options of `gs-geom convert`.
 #[derive(Debug, clap::Args, Serialize)]
 pub(crate) struct Convert {
     /// Gaussians, as a 3DGS PLY of any property order and encoding
@@ -231,14 +224,22 @@ pub(crate) enum Background {
 
 impl Background {
     pub fn color(self) -> [f32; 3] {
-        match self {
-            Self::Black | Self::Random => [0.0; 3],
-            Self::White => [1.0; 3],
-        }
+        if self == Self::White { [1.0; 3] } else { [0.0; 3] }
     }
 }
 
-/// Picture sizes in the course of a run.
+/// In which order Gaussians are written.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, ValueEnum)]
+#[serde(rename_all = "lowercase")]
+pub(crate) enum Order {
+    /// As in the input
+    None,
+    /// Along a Morton curve: neighbours in space lie near each other in the file
+    Morton,
+    /// The most opaque first
+    Opacity,
+}
+
 #[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum, Serialize)]
 #[serde(rename_all = "kebab-case")]
 pub(crate) enum PictureSizes {
@@ -248,7 +249,6 @@ pub(crate) enum PictureSizes {
     Full,
 }
 
-/// What to start from.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize)]
 #[serde(rename_all = "kebab-case")]
 pub(crate) enum Init {
@@ -260,10 +260,7 @@ pub(crate) enum Init {
 
 impl Init {
     pub fn file(&self) -> Option<&Path> {
-        match self {
-            Self::File(path) => Some(path),
-            Self::Points | Self::Random => None,
-        }
+        if let Self::File(path) = self { Some(path) } else { None }
     }
 }
 

@@ -121,10 +121,7 @@ impl<'a> Photographs<'a> {
     /// not.
     fn image(&self, i: usize) -> Result<Image> {
         let camera = &self.views[i].camera;
-        match &self.full[i] {
-            Some(picture) => Ok(picture.image(camera)),
-            None => Ok(self.decoded(i)?.image(camera)),
-        }
+        self.full[i].as_ref().map_or_else(|| Ok(self.decoded(i)?.image(camera)), |p| Ok(p.image(camera)))
     }
 
     fn decoded(&self, i: usize) -> Result<Picture> {

@@ -14,9 +14,9 @@ use crate::photographs::{Photographs, full_share};
 use crate::training::{Recipe, Trainer, checkpoint};
 use artifacts::role;
 use forecast::{cache_bytes, forecast_start, most_gaussians};
-use gs_io::{Claim, Error, Provenance, Result, hash_file};
+use gs_io::{Claim, Provenance, Result, hash_file};
 use gs_scene::Camera;
-use gs_scene::dataset::{Dataset, Split, View};
+use gs_scene::dataset::Dataset;
 use serde_json::{Value, json};
 use stage::{CommonArgs, Program, Stage};
 use std::collections::BTreeMap;
@@ -65,7 +65,7 @@ fn learn(
     claim: &mut Claim,
     stage: &Stage,
 ) -> Result<()> {
-    let (train, heldout) = split(options, dataset)?;
+    let (train, heldout) = init::split(options, dataset)?;
     let recipe = options.recipe(most_gaussians(options, dataset), stage.seed());
     let watched = outputs::watched(options, dataset, &masks);
     let forecast = forecast_start(options, dataset, &masks, &recipe.growth, stage)?;
@@ -96,24 +96,10 @@ fn learn(
     let before = stage::cpu_seconds();
     let done = iterate::iterate(options, &mut trainer, &run, &watched, stage).and_then(|()| {
         watched.check()?;
-        let made = finish::Made { run: &run, forecast: &forecast, plan, cpu_seconds: finish::spent_since(before) };
-        finish::finish(options, &mut trainer, made, claim, stage)
+        let cpu_seconds = stage::cpu_seconds().zip(before).map(|(now, before)| now - before);
+        finish::finish(options, &mut trainer, &run, &forecast, plan, cpu_seconds, claim, stage)
     });
     done.inspect_err(|_| iterate::rescue(options, &trainer, &run, stage))
-}
-
-/// The views to learn from, and those held out.
-fn split<'a>(options: &Train, dataset: &'a Dataset) -> Result<(Vec<&'a View>, Vec<&'a View>)> {
-    let of = |split: Split| dataset.views_of(split).collect::<Vec<&View>>();
-    let (train, heldout) = (of(Split::Train), of(Split::Test));
-    if train.is_empty() {
-        return Err(Error::new("every view is held out")
-            .file(&options.scene.scene)
-            .found(format!("{} views", dataset.views.len()))
-            .expected("at least one view to learn from")
-            .hint("give --holdout 0, or more photographs"));
-    }
-    Ok((train, heldout))
 }
 
 impl Train {

@@ -43,7 +43,7 @@ pub fn from_points(points: &PointCloud, sh_degree: u8, extent: f64) -> Result<Ga
             .hint("remove it from the dataset"));
     }
     if points.is_empty() {
-        return Err(Error::new("no points to start from").field("points").hint("give --init-points a number"));
+        return Err(Error::new("no points to start from").hint("give another --init"));
     }
     let n = points.len();
     let mut g = zeros(n, sh_degree);
@@ -243,7 +243,6 @@ mod tests {
     }
 
     proptest! {
-        #![proptest_config(crate::property_tests(256))]
         #[test]
         fn sizes_are_those_of_brute_force(
             cells in prop::collection::vec((0i8..6, 0i8..6, -1i8..2), 2..80),

@@ -121,7 +121,7 @@ impl<'a> Trainer<'a> {
         assert_eq!(state.exposures.maps.len(), if recipe.exposure { train.len() } else { 0 });
         Self {
             order: ViewOrder::new(recipe.seed, train.len()),
-            last_heldout: state.progress.curve.iter().rev().find_map(|line| heldout_of(line)),
+            last_heldout: state.progress.curve.iter().rev().find_map(|line| parsed(line)?["psnr_heldout"].as_f64()),
             recipe,
             extent,
             train,
@@ -292,7 +292,7 @@ impl<'a> Trainer<'a> {
         let (total, iteration) = (self.recipe.schedule.iterations, self.state.progress.iteration);
         let due = iteration.is_multiple_of(total.div_ceil(10).max(1)) || iteration == total;
         let Some(last) = self.state.progress.curve.last().filter(|_| due) else { return Ok(()) };
-        let Ok(mut line) = serde_json::from_str::<Value>(last) else { return Ok(()) };
+        let Some(mut line) = parsed(last) else { return Ok(()) };
         if line["iteration"] != iteration || line.get("psnr_heldout").is_some() {
             return Ok(());
         }
@@ -334,7 +334,6 @@ fn lap(clock: &mut Instant, spent: &mut Duration) {
     *clock = now;
 }
 
-/// The held-out PSNR that a line of the curve has.
-fn heldout_of(line: &str) -> Option<f64> {
-    serde_json::from_str::<Value>(line).ok()?["psnr_heldout"].as_f64()
+fn parsed(line: &str) -> Option<Value> {
+    serde_json::from_str(line).ok()
 }

@@ -149,28 +149,26 @@ fn stressed(scene: &str, dir: &Folder, g: &Gaussians) -> (Gaussians, String) {
 #[test]
 fn gaussians_that_break_arithmetic_leave_every_parameter_finite() {
     let dir = Folder::new();
-    let (tiny, huge) = (1e-8f32.ln(), 1e4f32.ln());
-    let eye = [3.0f32, 0.0, 0.5];
-    type Change = Box<dyn Fn(&mut Gaussians, usize)>;
-    let cases: Vec<(&str, Change)> = vec![
-        ("needles", Box::new(|g, i| g.log_scales[i] = [0.0, 1e-6f32.ln(), 1e-6f32.ln()])),
-        ("specks", Box::new(move |g, i| g.log_scales[i] = [tiny; 3])),
-        ("giants", Box::new(move |g, i| g.log_scales[i] = [huge; 3])),
-        ("giant needles", Box::new(move |g, i| g.log_scales[i] = [huge, tiny, tiny])),
-        ("transparent", Box::new(|g, i| g.opacity_logits[i] = -50.0)),
-        ("opaque", Box::new(|g, i| g.opacity_logits[i] = f32::INFINITY)),
+    /// Standard deviations, as logarithms: of 1e-8 and 1e4.
+    const TINY: f32 = -18.420_681;
+    const HUGE: f32 = 9.210_34;
+    type Change = fn(&mut Gaussians, usize);
+    let cases: [(&str, Change); 14] = [
+        ("needles", |g, i| g.log_scales[i] = [0.0, 1e-6f32.ln(), 1e-6f32.ln()]),
+        ("specks", |g, i| g.log_scales[i] = [TINY; 3]),
+        ("giants", |g, i| g.log_scales[i] = [HUGE; 3]),
+        ("giant needles", |g, i| g.log_scales[i] = [HUGE, TINY, TINY]),
+        ("transparent", |g, i| g.opacity_logits[i] = -50.0),
+        ("opaque", |g, i| g.opacity_logits[i] = f32::INFINITY),
         // The plane through the first camera, across its axis, and the near plane.
-        (
-            "on the camera plane",
-            Box::new(move |g, i| g.means[i] = [eye[0] + 0.01 * (i % 3) as f32, i as f32 * 0.1, eye[2]]),
-        ),
-        ("in the camera", Box::new(move |g, i| g.means[i] = eye)),
-        ("far away", Box::new(|g, i| g.means[i] = [1e6, -1e6, 1e6 + i as f32])),
-        ("zero quaternions", Box::new(|g, i| g.rotations[i] = [0.0; 4])),
-        ("large quaternions", Box::new(|g, i| g.rotations[i] = [1e18, -1e18, 1e18, 0.0])),
-        ("small quaternions", Box::new(|g, i| g.rotations[i] = [1e-20, 0.0, 1e-20, 0.0])),
-        ("glaring", Box::new(|g, i| g.sh[3 * i..3 * i + 3].fill(1e30))),
-        ("black", Box::new(|g, i| g.sh[3 * i..3 * i + 3].fill(-1e30))),
+        ("on the camera plane", |g, i| g.means[i] = [3.0 + 0.01 * (i % 3) as f32, i as f32 * 0.1, 0.5]),
+        ("in the camera", |g, i| g.means[i] = [3.0, 0.0, 0.5]),
+        ("far away", |g, i| g.means[i] = [1e6, -1e6, 1e6 + i as f32]),
+        ("zero quaternions", |g, i| g.rotations[i] = [0.0; 4]),
+        ("large quaternions", |g, i| g.rotations[i] = [1e18, -1e18, 1e18, 0.0]),
+        ("small quaternions", |g, i| g.rotations[i] = [1e-20, 0.0, 1e-20, 0.0]),
+        ("glaring", |g, i| g.sh[3 * i..3 * i + 3].fill(1e30)),
+        ("black", |g, i| g.sh[3 * i..3 * i + 3].fill(-1e30)),
     ];
     for (name, change) in cases {
         let mut g = balls(60);

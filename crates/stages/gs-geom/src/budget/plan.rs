@@ -176,7 +176,6 @@ mod tests {
     }
 
     proptest! {
-        #![proptest_config(crate::property_tests(256))]
         #[test]
         fn plans_keep_to_their_limits(
             seconds in 0.01f64..1e5,

@@ -2,7 +2,7 @@
 //! ones); faint ones are removed, on request huge ones too (Kerbl et al. 2023, section 5.2).
 
 use super::rules::{Densify, Growth, Moment, Report};
-use crate::training::checkpoint::State;
+use crate::training::checkpoint::{ScreenGradients, State};
 use crate::training::optimiser::Adam;
 use crate::training::schedule::{Purpose, generator};
 use glam::{Quat, Vec3};
@@ -18,27 +18,6 @@ const SPLIT_SHRINK: f32 = 1.6;
 const RESET_OPACITY: f32 = 0.01;
 /// From this divisor of the picture size on, gradients say nothing about where Gaussians are missing.
 const TOO_COARSE: u32 = 4;
-
-/// The gradients of each Gaussian's projected centre since the last densification.
-#[derive(Debug, Clone, Default, PartialEq)]
-pub struct ScreenGradients {
-    /// Sum over views of the length of d loss / d projected centre, N.
-    pub sum: Vec<f32>,
-    /// In how many views it was drawn, N.
-    pub views: Vec<u32>,
-}
-
-impl ScreenGradients {
-    /// Nothing seen yet.
-    pub fn new(count: usize) -> Self {
-        Self { sum: vec![0.0; count], views: vec![0; count] }
-    }
-
-    /// Mean over the views that drew it.
-    fn mean(&self, i: usize) -> f32 {
-        if self.views[i] == 0 { 0.0 } else { self.sum[i] / self.views[i] as f32 }
-    }
-}
 
 /// Hyper-parameters of adaptive density control.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize)]
@@ -256,7 +235,6 @@ mod tests {
     }
 
     proptest! {
-        #![proptest_config(crate::property_tests(256))]
         #[test]
         fn counts_add_up_and_the_cap_holds(
             gradients in prop::collection::vec(0.0f32..4e-4, 1..60),

@@ -1,9 +1,8 @@
 //! Densification as sampling: dead Gaussians move onto opaque ones, the number grows by a share per round up to an exact
 //! budget, noise explores, and opacity and size have a penalty (3DGS-MCMC, Kheradmand et al. 2024).
 
-use super::adaptive::ScreenGradients;
 use super::rules::{Densify, Moment, Report};
-use crate::training::checkpoint::State;
+use crate::training::checkpoint::{ScreenGradients, State};
 use crate::training::optimiser::Adam;
 use crate::training::schedule::{Purpose, generator};
 use glam::{Quat, Vec3};
@@ -325,7 +324,6 @@ mod tests {
     }
 
     proptest! {
-        #![proptest_config(crate::property_tests(256))]
         #[test]
         fn rounds_grow_by_their_share_and_stay_finite(
             opacities in prop::collection::vec(1e-6f64..0.9999, 1..80),

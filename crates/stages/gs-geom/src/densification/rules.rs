@@ -1,7 +1,6 @@
 //! What a way to densify may do in an iteration, and what it knows about the iteration.
 
-use super::adaptive::ScreenGradients;
-use crate::training::checkpoint::State;
+use crate::training::checkpoint::{ScreenGradients, State};
 use crate::training::optimiser::Adam;
 use crate::training::schedule::Schedule;
 use gs_raster::{Gradients, Workspace};

@@ -55,18 +55,13 @@ impl Masks {
         self.0.values().cloned()
     }
 
-    /// Whether there are none.
-    pub fn is_empty(&self) -> bool {
-        self.0.is_empty()
-    }
-
     /// Content hash of names and files; none without masks.
     pub fn hash(&self) -> Result<Option<String>> {
         let mut text = String::new();
         for (name, path) in &self.0 {
             text += &format!("{name}\n{}\n", hash_file(path)?);
         }
-        Ok((!self.is_empty()).then(|| hash_bytes(text.as_bytes())))
+        Ok((!self.0.is_empty()).then(|| hash_bytes(text.as_bytes())))
     }
 }
 

@@ -13,7 +13,6 @@ use report::curve::Panel;
 use serde_json::{Value, json};
 use stage::Stage;
 use std::collections::BTreeMap;
-use std::time::Duration;
 
 /// The plot of the training curve.
 const PANELS: [Panel; 3] = [
@@ -22,21 +21,15 @@ const PANELS: [Panel; 3] = [
     ("gaussians", "Gaussians", "#d62728"),
 ];
 
-/// How a result was made, for its record.
-pub(super) struct Made<'a> {
-    pub run: &'a Provenance,
-    pub forecast: &'a Forecast,
-    /// How the options came about.
-    pub plan: Value,
-    /// Processor time of the iterations.
-    pub cpu_seconds: Option<f64>,
-}
-
-/// Writes everything a finished run leaves.
+/// Writes everything a finished run leaves. For its record: `plan` is how the options came about, and `cpu_seconds` the
+/// processor time of the iterations.
 pub(super) fn finish(
     options: &Train,
     trainer: &mut Trainer<'_>,
-    made: Made<'_>,
+    run: &Provenance,
+    forecast: &Forecast,
+    plan: Value,
+    cpu_seconds: Option<f64>,
     claim: &mut Claim,
     stage: &Stage,
 ) -> Result<()> {
@@ -46,7 +39,7 @@ pub(super) fn finish(
     let State { gaussians, progress, .. } = &trainer.state;
     let rows = rows(options, gaussians, stage);
     report(progress, stage);
-    let (parameters, inputs) = (&made.run.parameters, &made.run.inputs);
+    let Provenance { parameters, inputs, .. } = run;
     write_beside(options, trainer)?;
     ply::write_some_gaussians(&options.out, gaussians, &rows, &comments(parameters, inputs))?;
     let [cloned, split, removed, relocated] = progress.densified;
@@ -63,11 +56,11 @@ pub(super) fn finish(
         "iterations": progress.iteration,
         "dropped_gradients": progress.dropped,
         "most_undrawn": {"not_finite": progress.undrawn[0], "degenerate": progress.undrawn[1]},
-        "memory_predicted_bytes": made.forecast.peak(gaussians.len()),
-        "seconds": seconds(trainer.timings),
+        "memory_predicted_bytes": forecast.peak(gaussians.len()),
+        "seconds": BTreeMap::from(parts(trainer.timings)),
         "cpu_seconds": stage::cpu_seconds(),
-        "iteration_cpu_seconds": made.cpu_seconds,
-        "plan": made.plan,
+        "iteration_cpu_seconds": cpu_seconds,
+        "plan": plan,
     });
     stage.record(claim, parameters.clone(), inputs.clone(), summary)?;
     for leftover in [with_suffix(&options.out, PARTIAL), plan_path(&options.out), checkpoint::path_of(&options.out)] {
@@ -108,7 +101,7 @@ fn write_beside(options: &Train, trainer: &Trainer<'_>) -> Result<()> {
     let lines: String = progress.curve.iter().map(|line| format!("{line}\n")).collect();
     write_bytes(with_suffix(&options.out, CURVE), lines.as_bytes())?;
     write_bytes(with_suffix(&options.out, PLOT), report::curve::svg(&progress.curve, &PANELS).as_bytes())?;
-    if exposures.is_off() {
+    if exposures.maps.is_empty() {
         return Ok(());
     }
     let maps = trainer.train.names().zip(&exposures.maps);
@@ -117,23 +110,15 @@ fn write_beside(options: &Train, trainer: &Trainer<'_>) -> Result<()> {
     write_json(with_suffix(&options.out, EXPOSURES), &maps)
 }
 
-/// Processor time since a moment at which it was `before`.
-pub(super) fn spent_since(before: Option<f64>) -> Option<f64> {
-    Some(stage::cpu_seconds()? - before?)
-}
-
-fn parts(t: Timings) -> [(&'static str, Duration); 5] {
+/// Seconds of each part.
+fn parts(t: Timings) -> [(&'static str, f64); 5] {
     [("forward", t.forward), ("loss", t.loss), ("backward", t.backward), ("Adam", t.adam), ("rest", t.rest)]
-}
-
-fn seconds(t: Timings) -> Value {
-    Value::Object(parts(t).into_iter().map(|(name, d)| (name.into(), json!(d.as_secs_f64()))).collect())
+        .map(|(name, time)| (name, time.as_secs_f64()))
 }
 
 fn shares(t: Timings) -> String {
-    let total = parts(t).iter().map(|(_, d)| d.as_secs_f64()).sum::<f64>().max(1e-9);
-    let all: Vec<String> =
-        parts(t).iter().map(|(name, d)| format!("{name} {:.0}%", 100.0 * d.as_secs_f64() / total)).collect();
+    let total = parts(t).iter().map(|p| p.1).sum::<f64>().max(1e-9);
+    let all = parts(t).map(|(name, seconds)| format!("{name} {:.0}%", 100.0 * seconds / total));
     format!("{total:.1} s: {}", all.join(", "))
 }
 

@@ -1,13 +1,27 @@
-//! The Gaussians that `--init` says to start from.
+//! What a run learns from, and the Gaussians that `--init` says to start from.
 
 use crate::densification::Strategy;
 use crate::options::{Init, Train, check_some};
 use crate::start;
 use gs_io::{Error, Result};
-use gs_scene::dataset::Dataset;
+use gs_scene::dataset::{Dataset, Split, View};
 use gs_scene::{Camera, Gaussians, PointCloud, ply};
 use stage::Stage;
 use std::path::Path;
+
+/// The views to learn from, and those held out.
+pub(crate) fn split<'a>(options: &Train, dataset: &'a Dataset) -> Result<(Vec<&'a View>, Vec<&'a View>)> {
+    let of = |split: Split| dataset.views_of(split).collect::<Vec<&View>>();
+    let (train, heldout) = (of(Split::Train), of(Split::Test));
+    if train.is_empty() {
+        return Err(Error::new("every view is held out")
+            .file(&options.scene.scene)
+            .found(format!("{} views", dataset.views.len()))
+            .expected("at least one view to learn from")
+            .hint("give --holdout 0, or more photographs"));
+    }
+    Ok((train, heldout))
+}
 
 /// The Gaussians before the first iteration.
 pub(crate) fn gaussians(
@@ -22,9 +36,6 @@ pub(crate) fn gaussians(
             return from_gaussians(options, path, stage);
         }
         let read = ply::read_points(path)?;
-        if read.is_empty() {
-            return Err(Error::new("no points to start from").file(path).field("--init"));
-        }
         stage.info(&format!("starting from the {} points of {}", read.len(), path.display()));
         return from_points(options, &read, extent, stage).map_err(|e| e.file(path));
     }

@@ -2,7 +2,6 @@
 
 use super::exposure::{Exposures, NUMBERS};
 use super::optimiser::Adam;
-use crate::densification::adaptive::ScreenGradients;
 use gs_io::{Artifact, ArtifactWriter, Error, Provenance, Result};
 use gs_scene::{Gaussians, sh_coefficients};
 use serde::{Deserialize, Serialize};
@@ -22,6 +21,27 @@ pub struct State {
     pub seen: ScreenGradients,
     pub exposures: Exposures,
     pub progress: ProgressState,
+}
+
+/// The gradients of each Gaussian's projected centre since the last densification.
+#[derive(Debug, Clone, Default, PartialEq)]
+pub struct ScreenGradients {
+    /// Sum over views of the length of d loss / d projected centre, N.
+    pub sum: Vec<f32>,
+    /// In how many views it was drawn, N.
+    pub views: Vec<u32>,
+}
+
+impl ScreenGradients {
+    /// Nothing seen yet.
+    pub fn new(count: usize) -> Self {
+        Self { sum: vec![0.0; count], views: vec![0; count] }
+    }
+
+    /// Mean over the views that drew it.
+    pub fn mean(&self, i: usize) -> f32 {
+        if self.views[i] == 0 { 0.0 } else { self.sum[i] / self.views[i] as f32 }
+    }
 }
 
 /// Counters and the training curve.

@@ -38,11 +38,6 @@ impl Exposures {
         }
     }
 
-    /// Whether there is no compensation.
-    pub fn is_off(&self) -> bool {
-        self.maps.is_empty()
-    }
-
     /// Moves the map of `view` against its gradient, at `t` of the run (0 to 1), and all maps so that their mean is the
     /// identity. A gradient that is not finite is not used.
     pub fn step(&mut self, view: usize, gradient: &[f64; NUMBERS], t: f64) {

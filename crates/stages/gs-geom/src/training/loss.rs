@@ -350,7 +350,7 @@ mod tests {
     }
 
     proptest! {
-        #![proptest_config(crate::property_tests(24))]
+        #![proptest_config(ProptestConfig::with_cases(24))]
         #[test]
         fn equal_pictures_have_no_loss(w in 1usize..40, h in 1usize..70, seed in 0u64..99) {
             let x = noise(3 * w * h, seed);
