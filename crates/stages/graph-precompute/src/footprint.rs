@@ -177,6 +177,7 @@ fn rows_at(maps: &MaskMaps, row_of: &[Vec<u32>; LEVELS], pixel: usize) -> [u32; 
 }
 
 /// What one tile adds.
+#[derive(Default)]
 struct TileSums {
     /// (row, Gaussian, weight), Gaussians in the tile's order.
     entries: Vec<(u32, u32, f32)>,
@@ -194,8 +195,7 @@ struct Fact {
 }
 
 fn tile_sums(tile: &TileWeights, maps: &MaskMaps, row_of: &[Vec<u32>; LEVELS], gate: f32) -> TileSums {
-    let seen = Vec::with_capacity(tile.gaussians.len());
-    let mut out = TileSums { entries: Vec::new(), seen, facts: Vec::new(), pixels: Vec::new() };
+    let mut out = TileSums { seen: Vec::with_capacity(tile.gaussians.len()), ..TileSums::default() };
     // Cell 0 holds the pixels that count for no mask.
     let mut cells: Vec<[u32; LEVELS]> = vec![[NONE; LEVELS]];
     let mut cell_of = [0u16; TILE * TILE];

@@ -67,7 +67,6 @@ pub(crate) struct Settings {
     pub preset: Option<Preset>,
 }
 
-/// Which views' masks to use.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, clap::ValueEnum, Serialize)]
 #[serde(rename_all = "lowercase")]
 pub(crate) enum Views {
@@ -77,7 +76,6 @@ pub(crate) enum Views {
     All,
 }
 
-/// Options that go together.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, clap::ValueEnum, Serialize)]
 #[serde(rename_all = "lowercase")]
 pub(crate) enum Preset {

@@ -7,25 +7,28 @@ use std::path::{Path, PathBuf};
 use std::process::{Command, Output};
 
 const SIZE: u32 = 48;
-const VIEWS: usize = 5;
 
-/// A COLMAP scene of two clusters of Gaussians, one mask each and one for both.
-fn scene(dir: &Path, size: u32) {
+/// A COLMAP scene of two clusters of Gaussians in photographs of `size` x `size` pixels, one mask each and one for both; and a
+/// folder for the output.
+fn setup(size: u32) -> (tempfile::TempDir, PathBuf, PathBuf) {
+    let dir = tempfile::tempdir().unwrap();
+    let (s, o) = (dir.path().join("scene"), dir.path().join("out"));
+    std::fs::create_dir_all(&o).unwrap();
     let n = (size * size) as usize;
     let half: Vec<i32> = (0..n).map(|p| i32::from(p % size as usize >= size as usize / 2)).collect();
     let ids = [0, 2, 4].iter().flat_map(|level| half.iter().map(move |i| i + level)).chain(vec![6; n]).collect();
     let maps = MaskMaps { width: size as usize, height: size as usize, ids };
     let grey = Image { width: size, height: size, rgb: vec![0.5; 3 * n], alpha: None };
     let mut views = Vec::new();
-    std::fs::create_dir_all(dir.join("masks")).unwrap();
-    for v in 0..VIEWS {
-        let eye = DVec3::new(v as f64 * 0.1 - 0.2, -0.2, -3.0);
+    for v in 0..5 {
+        let eye = DVec3::new(f64::from(v) * 0.1 - 0.2, -0.2, -3.0);
         views.push((format!("v{v}.png"), Camera::look_at(eye, DVec3::ZERO, DVec3::NEG_Y, size, size, 0.9)));
-        grey.write_png(dir.join(format!("images/v{v}.png"))).unwrap();
-        maps.write(dir.join(format!("masks/v{v}_s.npy"))).unwrap();
+        grey.write_png(s.join(format!("images/v{v}.png"))).unwrap();
+        maps.write(s.join(format!("masks/v{v}_s.npy"))).unwrap();
     }
-    colmap::write_model(&dir.join("sparse/0"), &views, &PointCloud::default()).unwrap();
-    ply::write_gaussians(dir.join("geometry.ply"), &gaussians(), &[]).unwrap();
+    colmap::write_model(&s.join("sparse/0"), &views, &PointCloud::default()).unwrap();
+    ply::write_gaussians(s.join("geometry.ply"), &gaussians(), &[]).unwrap();
+    (dir, s, o)
 }
 
 fn gaussians() -> Gaussians {
@@ -52,15 +55,6 @@ fn run(dir: &Path, out: &Path, extra: &[&str]) -> Output {
         .args(extra)
         .output()
         .unwrap()
-}
-
-/// A scene with photographs of this size, and a folder for the output.
-fn setup(size: u32) -> (tempfile::TempDir, PathBuf, PathBuf) {
-    let dir = tempfile::tempdir().unwrap();
-    let (s, o) = (dir.path().join("scene"), dir.path().join("out"));
-    std::fs::create_dir_all(&o).unwrap();
-    scene(&s, size);
-    (dir, s, o)
 }
 
 fn succeed(output: &Output) -> String {

@@ -93,20 +93,17 @@ pub struct Means {
 impl Means {
     /// Of each view's name with its PSNR and SSIM.
     pub fn of<'a>(views: impl Iterator<Item = (&'a str, Option<(f64, f64)>)> + Clone) -> Self {
-        let figures = views.clone().filter_map(|v| v.1);
-        let mut blank = views.filter(|v| v.1.is_none()).map(|v| v.0);
-        let uncounted = blank.next().map(|first| {
-            let count = 1 + blank.count();
+        let figures: Vec<(f64, f64)> = views.clone().filter_map(|v| v.1).collect();
+        let blank: Vec<&str> = views.filter(|v| v.1.is_none()).map(|v| v.0).collect();
+        let uncounted = blank.first().map(|first| {
+            let count = blank.len();
             format!("{count} of the views measured: no pixel counts there (a black mask), in {first} for one")
         });
-        Self { psnr: mean(figures.clone().map(|f| f.0)), ssim: mean(figures.map(|f| f.1)), uncounted }
+        let mean = |of: fn(&(f64, f64)) -> f64| {
+            (!figures.is_empty()).then(|| figures.iter().map(of).sum::<f64>() / figures.len() as f64)
+        };
+        Self { psnr: mean(|f| f.0), ssim: mean(|f| f.1), uncounted }
     }
-}
-
-/// Mean of some figure over views; `None` of none.
-fn mean(values: impl Iterator<Item = f64>) -> Option<f64> {
-    let (sum, count) = values.fold((0.0, 0u32), |(s, n), v| (s + v, n + 1));
-    (count > 0).then(|| sum / f64::from(count))
 }
 
 #[cfg(test)]
@@ -117,7 +114,8 @@ mod tests {
     fn psnr_of_known_errors() {
         assert!((psnr(&[0.5; 12], &[0.6; 12]) - 20.0).abs() < 1e-5);
         assert_eq!(psnr(&[0.5; 12], &[0.5; 12]), 100.0);
-        assert_eq!(mean([1.0, 2.0].into_iter()), Some(1.5));
-        assert_eq!(mean([].into_iter()), None);
+        let means = Means::of([("a", Some((1.0, 0.25))), ("b", Some((2.0, 0.75)))].into_iter());
+        assert_eq!(means, Means { psnr: Some(1.5), ssim: Some(0.5), uncounted: None });
+        assert_eq!(Means::of([].into_iter()), Means::default());
     }
 }

@@ -287,11 +287,12 @@ impl FromStr for Every {
     type Err = Error;
 
     fn from_str(s: &str) -> Result<Self> {
-        let wrong = || Error::new("not a period").found(s).expected("iterations such as 500, or seconds such as 60s");
-        match s.strip_suffix('s') {
-            Some(t) => t.parse().ok().filter(|t: &f64| *t >= 0.0).map(Self::Seconds).ok_or_else(wrong),
-            None => s.parse().ok().filter(|n: &u32| *n > 0).map(Self::Iterations).ok_or_else(wrong),
-        }
+        let every = match s.strip_suffix('s') {
+            Some(t) => t.parse().ok().filter(|t: &f64| *t >= 0.0).map(Self::Seconds),
+            None => s.parse().ok().filter(|n: &u32| *n > 0).map(Self::Iterations),
+        };
+        let expected = "iterations such as 500, or seconds such as 60s";
+        every.ok_or_else(|| Error::new("not a period").found(s).expected(expected))
     }
 }
 

@@ -181,7 +181,6 @@ impl<'a> Trainer<'a> {
         Ok(Frame { iteration, view, camera, target, raster })
     }
 
-    /// Renders the view.
     fn render(&mut self, frame: &Frame) {
         let State { gaussians, adam, progress, .. } = &mut self.state;
         if let Some(way) = &self.recipe.densification {
@@ -246,7 +245,6 @@ impl<'a> Trainer<'a> {
         lap(&mut self.clock, &mut self.timings.adam);
     }
 
-    /// Lets the number of Gaussians change.
     fn densify(&mut self, frame: &Frame) {
         self.state.progress.iteration = frame.iteration;
         let Some(way) = &self.recipe.densification else { return };

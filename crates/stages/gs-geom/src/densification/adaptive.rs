@@ -1,7 +1,7 @@
 //! Adaptive density control: Gaussians whose projected centre has a large gradient are cloned (small ones) or split (large
 //! ones); faint ones are removed, on request huge ones too (Kerbl et al. 2023, section 5.2).
 
-use super::rules::{Densify, Growth, Moment, Report};
+use super::rules::{Densify, Moment, Report};
 use crate::training::checkpoint::{ScreenGradients, State};
 use crate::training::optimiser::Adam;
 use crate::training::schedule::{Purpose, generator};
@@ -38,11 +38,6 @@ pub struct Adaptive {
 }
 
 impl Adaptive {
-    /// Whether to reset the opacities after this iteration.
-    fn resets_opacity(&self, iteration: u32, growth: &Growth) -> bool {
-        self.reset_every > 0 && iteration > 0 && iteration < growth.until && iteration.is_multiple_of(self.reset_every)
-    }
-
     /// Whether views count at this iteration: before the end of densification, and not with small pictures. Their gradients
     /// come from blur and hide what is missing: to wait cost nothing and gave up to 0.4 dB.
     fn observes(at: Moment<'_>) -> bool {
@@ -93,7 +88,8 @@ impl Default for Adaptive {
 impl Densify for Adaptive {
     fn before(&self, gaussians: &mut Gaussians, adam: &mut Adam, at: Moment<'_>) {
         // Not at the end of the last iteration, so that held-out views are measured before.
-        if self.resets_opacity(at.iteration - 1, at.growth) {
+        let last = at.iteration - 1;
+        if self.reset_every > 0 && (1..at.growth.until).contains(&last) && last.is_multiple_of(self.reset_every) {
             reset_opacities(gaussians, adam);
         }
     }

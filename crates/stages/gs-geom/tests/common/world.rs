@@ -63,13 +63,11 @@ pub fn write_world(root: &str, views: usize, points: &PointCloud) {
 
 /// The balls with points and ten views, written once.
 pub fn scene() -> &'static str {
-    static ONCE: OnceLock<(tempfile::TempDir, String)> = OnceLock::new();
-    &ONCE
-        .get_or_init(|| {
-            let dir = tempfile::tempdir().unwrap();
-            let path = dir.path().to_string_lossy().into_owned();
-            write_world(&path, 10, &points());
-            (dir, path)
-        })
-        .1
+    static ONCE: OnceLock<tempfile::TempDir> = OnceLock::new();
+    let dir = ONCE.get_or_init(|| {
+        let dir = tempfile::tempdir().unwrap();
+        write_world(dir.path().to_str().unwrap(), 10, &points());
+        dir
+    });
+    dir.path().to_str().unwrap()
 }
