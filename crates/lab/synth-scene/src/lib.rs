@@ -1,23 +1,23 @@
 //! Procedural indoor scenes with exact ground truth.
 //!
-//! * [`options`]: the command line, and what it means for a scene.
-//! * [`mod@write`]: the program told from beginning to end: furnish, photograph, write. [`memory`] forecasts what that takes.
-//! * [`things`]: the classes of things and how each is built.
-//! * [`scene`]: what stands in a room, where it stands ([`scene::families`], [`scene::layout`]) and where cameras go.
-//! * [`render`]: photographs, and the light in the room.
-//! * [`truth`]: id maps with the faults of real ones, what each mask means, labels, points, scans, and where files lie.
+//! * `options`: the command line, and what it means for a scene.
+//! * [`mod@write`]: the program told from beginning to end: furnish, photograph, write.
+//! * `things`: the classes of things and how each is built.
+//! * `scene`: what stands in a room, where it stands (`families`, `layout`) and where cameras go.
+//! * `render`: photographs, and the light in the room.
+//! * `truth`: id maps with the faults of real ones, what each mask means, labels, points, scans, and where files lie.
 //!
 //! Lengths are in metres, z is up, the floor is at z = 0.
 
-pub mod memory;
-pub mod options;
+mod options;
 mod random;
-pub mod render;
-pub mod scene;
+mod render;
+mod scene;
 #[cfg(test)]
 mod testing;
-pub mod things;
-pub mod truth;
+mod things;
+mod truth;
 pub mod write;
 
+pub use options::Args;
 pub use truth::masks;

@@ -3,5 +3,5 @@
 use std::process::ExitCode;
 
 fn main() -> ExitCode {
-    stage::main::<synth_scene::options::Args>()
+    stage::main::<synth_scene::Args>()
 }

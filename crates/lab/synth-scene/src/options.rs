@@ -80,7 +80,6 @@ pub struct Args {
     pub(crate) common: CommonArgs,
 }
 
-/// Sizes of scenes.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
 pub enum Size {
     /// For tests: seconds for the whole pipeline.
@@ -136,9 +135,9 @@ pub struct Options {
     pub objects: usize,
     /// Number of photographs, at least 1.
     pub views: usize,
-    /// Their width in pixels.
+    /// Pixels of their width.
     pub width: u32,
-    /// Their height in pixels.
+    /// Pixels of their height.
     pub height: u32,
     /// Points of the sparse cloud; fewer where the views show fewer.
     pub points: usize,

@@ -11,9 +11,7 @@ use rayon::prelude::*;
 
 /// What a camera sees.
 pub struct Frame {
-    /// Width in pixels.
     pub width: usize,
-    /// Height in pixels.
     pub height: usize,
     /// The photograph, sRGB, `[height][width][3]`.
     pub rgb: Vec<u8>,

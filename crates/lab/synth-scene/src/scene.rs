@@ -31,9 +31,7 @@ pub enum Family {
 pub struct Thing {
     /// What it is called; unique in the scene.
     pub name: String,
-    /// Its class.
     pub class: &'static str,
-    /// Its main colour's name.
     pub color: &'static str,
     /// Whether it is floor, wall or table.
     pub background: bool,
@@ -52,26 +50,19 @@ pub struct Thing {
 /// A part of a thing.
 #[derive(Debug, Clone)]
 pub struct Part {
-    /// Its name, such as "handle".
     pub name: &'static str,
-    /// The thing it belongs to.
     pub thing: u32,
 }
 
 /// A surface placed in the world.
 #[derive(Debug, Clone)]
 pub struct Primitive {
-    /// The surface in its own frame.
     pub shape: Shape,
     /// `world_from_primitive`.
     pub rotation: DMat3,
-    /// Origin of its frame in the world.
     pub origin: DVec3,
-    /// What it is made of.
     pub material: Material,
-    /// Part it belongs to, a position in [`Scene::parts`].
     pub part: u32,
-    /// Thing it belongs to, a position in [`Scene::things`].
     pub thing: u32,
 }
 
@@ -99,21 +90,17 @@ impl Primitive {
 /// Where a ray meets the scene.
 #[derive(Debug, Clone, Copy)]
 pub struct Hit {
-    /// Distance along the ray.
     pub t: f64,
-    /// The primitive met.
     pub primitive: usize,
     /// The point in the primitive's frame.
     pub local: DVec3,
 }
 
-/// All that stands in a room.
+/// All that stands in a room. Things are background first; parts and primitives are in the order of their things.
+#[derive(Default)]
 pub struct Scene {
-    /// Things, background first.
     pub things: Vec<Thing>,
-    /// Parts, in the order of their things.
     pub parts: Vec<Part>,
-    /// Primitives, in the order of their parts' things.
     pub primitives: Vec<Primitive>,
     /// Half extents of the room in x and y.
     pub room: DVec2,
@@ -126,25 +113,13 @@ pub struct Scene {
 
 /// Who a thing is: the first fields of [`Thing`].
 pub struct Identity {
-    /// What it is called; unique in the scene.
     pub name: String,
-    /// Its class.
     pub class: &'static str,
-    /// Its main colour's name.
     pub color: &'static str,
-    /// Whether it is floor, wall or table.
     pub background: bool,
 }
 
-/// Collects placed things.
-#[derive(Default)]
-pub struct SceneBuilder {
-    things: Vec<Thing>,
-    parts: Vec<Part>,
-    primitives: Vec<Primitive>,
-}
-
-impl SceneBuilder {
+impl Scene {
     /// Adds `model` turned by `yaw` at `position`.
     pub fn place(&mut self, model: &Model, who: Identity, position: DVec3, yaw: f64) {
         let (index, first) = (self.things.len() as u32, self.parts.len() as u32);
@@ -165,14 +140,11 @@ impl SceneBuilder {
     }
 
     /// The scene, ready for rays.
-    pub fn build(self, room: DVec2, tables: Vec<DVec3>) -> Scene {
+    pub fn built(self, room: DVec2, tables: Vec<DVec3>) -> Self {
         let boxes: Vec<Aabb> = self.primitives.iter().map(Primitive::bounds).collect();
-        let Self { things, parts, primitives } = self;
-        Scene { things, parts, primitives, room, tables, family: Family::Studio, bvh: Bvh::new(&boxes) }
+        Self { room, tables, bvh: Bvh::new(&boxes), ..self }
     }
-}
 
-impl Scene {
     /// The first surface that the ray meets after `near`, if any. `direction` has unit length.
     pub fn trace(&self, origin: DVec3, direction: DVec3, near: f64) -> Option<Hit> {
         let mut best = None;

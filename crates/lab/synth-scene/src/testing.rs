@@ -24,9 +24,9 @@ pub fn example() -> &'static (Scene, Frame) {
     })
 }
 
-/// Places all over the chart of a shape, `n` x `n` a face, from edge to edge.
+/// Places all over the chart of a shape: the middles of `n` x `n` squares a face.
 pub fn chart_points(shape: &Shape, n: u32) -> impl Iterator<Item = ChartPoint> + use<> {
-    let at = move |k: u32| f64::from(k) / f64::from(n - 1);
+    let at = move |k: u32| (f64::from(k) + 0.5) / f64::from(n);
     (0..shape.faces()).flat_map(move |face| (0..n * n).map(move |k| ChartPoint { face, u: at(k % n), v: at(k / n) }))
 }
 

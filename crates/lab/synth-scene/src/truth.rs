@@ -13,7 +13,7 @@ use serde::Serialize;
 use std::path::Path;
 
 /// Writes a JSON file.
-pub(crate) fn write_json(path: &Path, value: &impl Serialize) -> Result<()> {
+pub fn write_json(path: &Path, value: &impl Serialize) -> Result<()> {
     let json = serde_json::to_vec(value).map_err(|e| Error::new(e.to_string()).file(path))?;
     write_bytes(path, &json)
 }

@@ -5,18 +5,13 @@ use glam::DVec3;
 /// An axis-aligned box.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Aabb {
-    /// Lower corner.
     pub min: DVec3,
-    /// Upper corner.
     pub max: DVec3,
 }
 
 impl Aabb {
-    /// The box that holds nothing.
     pub const EMPTY: Self = Self { min: DVec3::INFINITY, max: DVec3::NEG_INFINITY };
 
-    /// The box around both.
-    #[must_use]
     pub fn union(self, other: Self) -> Self {
         Self { min: self.min.min(other.min), max: self.max.max(other.max) }
     }
@@ -45,6 +40,7 @@ struct Node {
 }
 
 /// The hierarchy. Items are numbered as the boxes were given.
+#[derive(Default)]
 pub struct Bvh {
     nodes: Vec<Node>,
     items: Vec<u32>,
@@ -127,24 +123,14 @@ impl Bvh {
                 continue;
             }
             let (left, right) = (index + 1, node.next);
-            let a = self.nodes[left as usize].bounds.enter(origin, inverse, far);
-            let b = self.nodes[right as usize].bounds.enter(origin, inverse, far);
-            let mut push = |entry: (u32, f64)| {
+            let meet = |i: u32| self.nodes[i as usize].bounds.enter(origin, inverse, far).map(|t| (i, t));
+            let (mut near, mut other) = (meet(left), meet(right));
+            if near.zip(other).is_some_and(|(a, b)| b.1 < a.1) {
+                std::mem::swap(&mut near, &mut other);
+            }
+            for entry in [other, near].into_iter().flatten() {
                 stack[depth] = entry;
                 depth += 1;
-            };
-            match (a, b) {
-                (Some(s), Some(t)) if s <= t => {
-                    push((right, t));
-                    push((left, s));
-                }
-                (Some(s), Some(t)) => {
-                    push((left, s));
-                    push((right, t));
-                }
-                (Some(s), None) => push((left, s)),
-                (None, Some(t)) => push((right, t)),
-                (None, None) => {}
             }
         }
     }

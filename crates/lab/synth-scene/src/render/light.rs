@@ -14,7 +14,7 @@ use std::f64::consts::{PI, TAU};
 #[derive(Debug, Clone, Copy)]
 struct Lamp {
     centre: DVec3,
-    half: [f64; 2],
+    half: f64,
     radiance: DVec3,
 }
 
@@ -71,30 +71,26 @@ impl LightMap {
         let lamp = |x: f64, y: f64, size: f64, power: [f64; 3]| {
             let half = size * area.sqrt();
             let radiance = DVec3::from_array(power) * area.powf(0.6) / (4.0 * half * half);
-            Lamp { centre: DVec3::new(x * scene.room.x, y * scene.room.y, 2.65), half: [half, half], radiance }
+            Lamp { centre: DVec3::new(x * scene.room.x, y * scene.room.y, 2.65), half, radiance }
         };
         let lamps = [lamp(0.42, -0.34, 0.30, [14.5, 13.4, 11.8]), lamp(-0.50, 0.45, 0.45, [3.4, 3.6, 4.0])];
-        let (first, grids) = lay_out(scene, coarseness);
-        let count = grids.last().map_or(0, |g| g.start + g.nu * g.nv);
+        let (first, grids, count) = lay_out(scene, coarseness);
         let mut map = Self { lamps, first, grids, texels: Vec::new() };
         map.texels = map.for_each_texel(count, |grid, k, index| map.direct(scene, grid, k, index));
         map.tidy(&vec![true; count]);
         let indirect = map.for_each_texel(count, |grid, k, index| map.indirect(scene, grid, k, index));
-        let inside: Vec<bool> = indirect.iter().map(|t| t[3] < 0.5).collect();
         for (texel, extra) in map.texels.iter_mut().zip(&indirect) {
             for c in 0..3 {
                 texel[c] += extra[c];
             }
         }
-        let open: Vec<bool> = inside.iter().map(|i| !i).collect();
-        map.tidy(&open);
+        map.tidy(&indirect.iter().map(|t| t[3] >= 0.5).collect::<Vec<_>>());
         map
     }
 
     /// How many texels [`Self::bake`] computes.
     pub fn size(scene: &Scene, coarseness: f64) -> usize {
-        let (_, grids) = lay_out(scene, coarseness);
-        grids.last().map_or(0, |g| g.start + g.nu * g.nv)
+        lay_out(scene, coarseness).2
     }
 
     /// The light at `local`, a point on the surface of a primitive, interpolated.
@@ -107,7 +103,7 @@ impl LightMap {
         let mut sum = [0.0f64; 4];
         for (dx, wx) in [(0, 1.0 - fx), (1, fx)] {
             for (dy, wy) in [(0, 1.0 - fy), (1, fy)] {
-                let t = self.texels[g.texel(x0 as i64 + dx, y0 as i64 + dy)];
+                let t = self.texels[g.start + g.local(x0 as i64 + dx, y0 as i64 + dy)];
                 for c in 0..4 {
                     sum[c] += wx * wy * f64::from(t[c]);
                 }
@@ -149,11 +145,8 @@ impl LightMap {
             let mut seen = 0.0;
             for i in 0..LAMP_GRID * LAMP_GRID {
                 let (a, b) = ((i % LAMP_GRID) as f64 + jx, (i / LAMP_GRID) as f64 + jy);
-                let offset = DVec3::new(
-                    (2.0 * a / LAMP_GRID as f64 - 1.0) * lamp.half[0],
-                    (2.0 * b / LAMP_GRID as f64 - 1.0) * lamp.half[1],
-                    0.0,
-                );
+                let across = |k: f64| (2.0 * k / LAMP_GRID as f64 - 1.0) * lamp.half;
+                let offset = DVec3::new(across(a), across(b), 0.0);
                 let to = lamp.centre + offset - point;
                 let distance = to.length();
                 let direction = to / distance;
@@ -162,7 +155,7 @@ impl LightMap {
                     continue;
                 }
                 seen += 1.0;
-                let area = 4.0 * lamp.half[0] * lamp.half[1] / (LAMP_GRID * LAMP_GRID) as f64;
+                let area = 4.0 * lamp.half * lamp.half / (LAMP_GRID * LAMP_GRID) as f64;
                 sum += lamp.radiance * (area * cos * cos_lamp / (distance * distance * PI));
             }
             if l == 0 {
@@ -179,7 +172,8 @@ impl LightMap {
         if outside(scene, point) {
             return [0.0; 4];
         }
-        let frame = frame(normal);
+        let (x, y) = normal.any_orthonormal_pair();
+        let frame = DMat3::from_cols(x, y, normal);
         let [jx, jy] = jitter(index);
         let mut sum = DVec3::ZERO;
         let mut behind = 0;
@@ -202,7 +196,8 @@ impl LightMap {
                     }
                     let at = p.shape.chart(hit.local);
                     let g = &self.grids[self.first[hit.primitive] + at.face];
-                    let t = self.texels[g.texel((at.u * g.nu as f64) as i64, (at.v * g.nv as f64) as i64)];
+                    let texel = g.local((at.u * g.nu as f64) as i64, (at.v * g.nv as f64) as i64);
+                    let t = self.texels[g.start + texel];
                     let light = DVec3::new(f64::from(t[0]), f64::from(t[1]), f64::from(t[2]));
                     // What has bounced more often is taken as even.
                     sum += p.material.albedo * (light + 0.16 + p.material.glow);
@@ -249,10 +244,6 @@ impl LightMap {
 }
 
 impl Grid {
-    fn texel(&self, x: i64, y: i64) -> usize {
-        self.start + self.local(x, y)
-    }
-
     fn local(&self, x: i64, y: i64) -> usize {
         let (nu, nv) = (self.nu as i64, self.nv as i64);
         let x = if self.wraps { x.rem_euclid(nu) } else { x.clamp(0, nu - 1) };
@@ -277,22 +268,22 @@ impl Grid {
     }
 }
 
-/// The first grid of each primitive, and the grids of all faces.
-fn lay_out(scene: &Scene, coarseness: f64) -> (Vec<usize>, Vec<Grid>) {
+/// The first grid of each primitive, the grids of all faces, and the number of their texels.
+fn lay_out(scene: &Scene, coarseness: f64) -> (Vec<usize>, Vec<Grid>, usize) {
     let (mut first, mut grids, mut count) = (Vec::new(), Vec::new(), 0);
     for (primitive, p) in scene.primitives.iter().enumerate() {
         first.push(grids.len());
         let size = texel_size(scene, p.thing) * coarseness;
         for face in 0..p.shape.faces() {
             let (du, dv) = p.shape.face_size(face);
-            let wraps = p.shape.wraps();
+            let wraps = p.shape.faces() == 1;
             let nu = ((du / size).ceil() as usize).clamp(if wraps { 8 } else { 2 }, MOST);
             let nv = ((dv / size).ceil() as usize).clamp(2, MOST);
             grids.push(Grid { primitive, face, nu, nv, start: count, wraps });
             count += nu * nv;
         }
     }
-    (first, grids)
+    (first, grids, count)
 }
 
 /// Side of a texel in metres.
@@ -310,12 +301,6 @@ fn texel_size(scene: &Scene, thing: u32) -> f64 {
 /// Whether a point lies behind the walls or under the floor, where no camera goes.
 fn outside(scene: &Scene, point: DVec3) -> bool {
     point.z < -1e-3 || (point.truncate().abs() - scene.room).max_element() > 1e-3
-}
-
-/// A right-handed frame whose z is `normal`.
-fn frame(normal: DVec3) -> DMat3 {
-    let (x, y) = normal.any_orthonormal_pair();
-    DMat3::from_cols(x, y, normal)
 }
 
 /// Two numbers of 0..1 that belong to `index`.

@@ -49,9 +49,6 @@ pub fn place(scene: &Scene, views: usize, width: u32, height: u32, rng: &mut Cha
 /// The same cameras as structure from motion would have found them: turned about each axis by Gaussian noise of standard
 /// deviation `noise` degrees, and moved along each by as many centimetres.
 pub fn perturbed(cameras: &[Camera], noise: f64, rng: &mut ChaCha8Rng) -> Vec<Camera> {
-    if noise == 0.0 {
-        return cameras.to_vec();
-    }
     cameras
         .iter()
         .map(|camera| {
@@ -153,24 +150,22 @@ mod tests {
     #[test]
     fn cameras_see_things_and_stand_in_none() {
         for (family, objects) in [(Family::Table, 40), (Family::Kitchen, 50), (Family::Room, 70), (Family::Room, 30)] {
-            {
-                let rng = &mut ChaCha8Rng::seed_from_u64(objects as u64);
-                let scene = crate::scene::families::plan(family, objects, rng);
-                let mut seen = vec![0usize; scene.things.len()];
-                for camera in place(&scene, 24, 96, 72, rng) {
-                    let frame = crate::render::identify(&scene, &camera);
-                    let near = frame.distance.iter().copied().fold(f64::INFINITY, f64::min);
-                    assert!(near > 0.12, "{family:?}: {near} m from something");
-                    assert!(frame.thing.iter().all(|&t| t >= 0), "{family:?}: outside the room");
-                    let mut here = vec![0usize; scene.things.len()];
-                    frame.thing.iter().for_each(|&t| here[t as usize] += 1);
-                    assert!(here.iter().filter(|&&n| n > 0).count() >= 3, "{family:?}: sees nothing");
-                    seen.iter_mut().zip(here).for_each(|(s, n)| *s += usize::from(n >= 4));
-                }
-                let objects = scene.things.iter().zip(&seen).filter(|(t, _)| !t.background);
-                let often = objects.clone().filter(|(_, n)| **n >= 2).count();
-                assert!(5 * often >= 3 * objects.count(), "{family:?}: {often} are seen in two views");
+            let rng = &mut ChaCha8Rng::seed_from_u64(objects as u64);
+            let scene = crate::scene::families::plan(family, objects, rng);
+            let mut seen = vec![0usize; scene.things.len()];
+            for camera in place(&scene, 24, 96, 72, rng) {
+                let frame = crate::render::identify(&scene, &camera);
+                let near = frame.distance.iter().copied().fold(f64::INFINITY, f64::min);
+                assert!(near > 0.12, "{family:?}: {near} m from something");
+                assert!(frame.thing.iter().all(|&t| t >= 0), "{family:?}: outside the room");
+                let mut here = vec![0usize; scene.things.len()];
+                frame.thing.iter().for_each(|&t| here[t as usize] += 1);
+                assert!(here.iter().filter(|&&n| n > 0).count() >= 3, "{family:?}: sees nothing");
+                seen.iter_mut().zip(here).for_each(|(s, n)| *s += usize::from(n >= 4));
             }
+            let objects = scene.things.iter().zip(&seen).filter(|(t, _)| !t.background);
+            let often = objects.clone().filter(|(_, n)| **n >= 2).count();
+            assert!(5 * often >= 3 * objects.count(), "{family:?}: {often} are seen in two views");
         }
     }
 
@@ -191,6 +186,5 @@ mod tests {
         // Three axes, each with the variance 0.25.
         assert!((turns / 2000.0 - 0.75).abs() < 0.06, "{turns}");
         assert!((shifts / 2000.0 - 0.75).abs() < 0.06, "{shifts}");
-        assert_eq!(perturbed(&cameras[..1], 0.0, rng), cameras[..1]);
     }
 }

@@ -1,6 +1,6 @@
 //! What all rooms share: floor and walls, rectangles on the ground, and how things are called.
 
-use crate::scene::{Identity, SceneBuilder};
+use crate::scene::{Identity, Scene};
 use crate::things::class::{Class, Naming};
 use crate::things::material::albedo;
 use crate::things::walls;
@@ -76,11 +76,6 @@ impl Footprint {
         let half_turns = FRAC_PI_2 * (f64::from(turned) + 2.0 * (side / 8) as f64);
         Self { centre: self.centre + offset, half, yaw: self.yaw + half_turns }
     }
-
-    /// Whether it lies within an upright rectangle.
-    pub fn within(&self, centre: DVec2, half: DVec2) -> bool {
-        self.corners().iter().all(|&c| (c - centre).abs().cmple(half).all())
-    }
 }
 
 pub(crate) fn name_of(class: &Class, color: &str, repeated: bool) -> String {
@@ -101,7 +96,7 @@ pub(crate) fn wall_span(half: DVec2, wall: usize) -> (f64, f64) {
 }
 
 /// Places the floor and the walls of a room with the given half extents.
-pub(crate) fn enclose(scene: &mut SceneBuilder, half: DVec2) {
+pub(crate) fn enclose(scene: &mut Scene, half: DVec2) {
     let of = |name: String, class, color| Identity { name, class, color, background: true };
     scene.place(&walls::floor(half.to_array()), of("floor".into(), "floor", "brown"), DVec3::ZERO, 0.0);
     for (k, (color, srgb)) in WALLS.into_iter().enumerate() {

@@ -121,7 +121,7 @@ mod tests {
             let m = class.make(&PAINTS[class.paints[0]], &mut ChaCha8Rng::seed_from_u64(1));
             let mut low = f64::INFINITY;
             for piece in &m.pieces {
-                for at in chart_points(&piece.shape, 20) {
+                for at in chart_points(&piece.shape, 100) {
                     low = low.min((piece.rotation * piece.shape.surface(at).0 + piece.offset).z);
                 }
             }

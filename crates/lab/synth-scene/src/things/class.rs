@@ -27,14 +27,10 @@ pub enum Naming {
     Of(&'static str, &'static str),
 }
 
-/// A class of things.
 #[derive(Debug)]
 pub struct Class {
-    /// The class's name.
     pub name: &'static str,
-    /// How one of them is called.
     pub naming: Naming,
-    /// Where it stands.
     pub place: Place,
     /// Colours it comes in; they index [`PAINTS`](crate::things::material::PAINTS).
     pub paints: &'static [usize],

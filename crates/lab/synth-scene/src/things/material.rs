@@ -7,7 +7,6 @@ use std::f64::consts::TAU;
 /// A colour with a name that people use.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Paint {
-    /// The name.
     pub name: &'static str,
     /// sRGB, 0 to 1.
     pub srgb: [f64; 3],
@@ -42,17 +41,14 @@ pub(super) const VIVID: &[usize] = &[RED, BLUE, GREEN, YELLOW, ORANGE, PURPLE, P
 pub(super) const ANY: &[usize] = &[RED, BLUE, GREEN, YELLOW, ORANGE, PURPLE, PINK, TURQUOISE, WHITE, BLACK];
 
 impl Paint {
-    /// Linear reflectance.
     pub fn albedo(&self) -> DVec3 {
         albedo(self.srgb)
     }
 
-    /// A matt surface of this colour.
     pub fn matt(&self) -> Material {
         matt(self.srgb)
     }
 
-    /// A glazed or polished surface of this colour.
     pub fn glazed(&self) -> Material {
         glazed(self.srgb)
     }
@@ -73,56 +69,23 @@ pub fn albedo(srgb: [f64; 3]) -> DVec3 {
     DVec3::from_array(srgb.map(|c| if c <= 0.040_45 { c / 12.92 } else { ((c + 0.055) / 1.055).powf(2.4) }))
 }
 
-/// How a surface's colour varies over it.
+/// How a surface's colour varies over it. `other` is the second colour, linear; lengths are in metres.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum Pattern {
-    /// Faint clouds.
-    Clouds {
-        /// Size of a cloud in metres.
-        size: f64,
-        /// Relative amplitude.
-        amount: f64,
-    },
-    /// Soft-edged stripes of a second colour across a direction.
-    Stripes {
-        /// Second colour, linear.
-        other: DVec3,
-        /// Direction across the stripes; its length is stripes per metre.
-        across: DVec3,
-    },
-    /// Soft-edged squares of a second colour in x and y.
-    Checks {
-        /// Second colour, linear.
-        other: DVec3,
-        /// Side of a square in metres.
-        size: f64,
-    },
-    /// Boards along x with grain.
-    Wood {
-        /// Width of a board in metres.
-        board: f64,
-    },
-    /// Dark keys on a block's upper side.
-    Keys {
-        /// Colour of the keys, linear.
-        other: DVec3,
-        /// Half extents of the field of keys in x and y.
-        half: [f64; 2],
-        /// Height above which keys are drawn.
-        above: f64,
-    },
-    /// Layers of paper at the sides of a book: within the given box the second colour.
-    Pages {
-        /// Colour of the paper, linear.
-        other: DVec3,
-        /// Half extents of the inner box, in x, y and z.
-        inner: DVec3,
-    },
-    /// A few soft blobs of other colours: a painting.
-    Painting {
-        /// Number that chooses the picture.
-        picture: u32,
-    },
+    /// Faint clouds of this size and relative amplitude.
+    Clouds { size: f64, amount: f64 },
+    /// Soft-edged stripes across a direction, whose length is stripes per metre.
+    Stripes { other: DVec3, across: DVec3 },
+    /// Soft-edged squares of this side in x and y.
+    Checks { other: DVec3, size: f64 },
+    /// Boards along x with grain, `board` wide.
+    Wood { board: f64 },
+    /// Keys on a block's upper side: within half extents in x and y, above a height.
+    Keys { other: DVec3, half: [f64; 2], above: f64 },
+    /// Layers of paper at the sides of a book: outside of half extents in x and y, within those in z.
+    Pages { other: DVec3, inner: DVec3 },
+    /// A few soft blobs of other colours: a painting, chosen by a number.
+    Painting { picture: u32 },
 }
 
 /// What a surface is made of.
@@ -130,7 +93,6 @@ pub enum Pattern {
 pub struct Material {
     /// Diffuse reflectance, linear.
     pub albedo: DVec3,
-    /// Its variation.
     pub pattern: Pattern,
     /// Strength of the highlight, 0 to about 0.3.
     pub specular: f64,
@@ -152,25 +114,21 @@ impl Material {
     }
 
     /// The same material with a highlight of another strength.
-    #[must_use]
     pub fn gleaming(self, specular: f64) -> Self {
         Self { specular, ..self }
     }
 
     /// The same material in another colour, linear.
-    #[must_use]
     pub fn in_color(self, albedo: DVec3) -> Self {
         Self { albedo, ..self }
     }
 
     /// The same material with another pattern.
-    #[must_use]
     pub fn with(self, pattern: Pattern) -> Self {
         Self { pattern, ..self }
     }
 
     /// The same material giving off light.
-    #[must_use]
     pub fn glowing(self, glow: f64) -> Self {
         Self { glow, ..self }
     }

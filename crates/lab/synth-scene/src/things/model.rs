@@ -4,18 +4,13 @@ use crate::things::material::Material;
 use crate::things::shape::Shape;
 use glam::{DMat3, DVec3};
 
-/// A primitive of a model.
 #[derive(Debug, Clone)]
 pub struct Piece {
-    /// Part it belongs to.
     pub part: usize,
-    /// Its surface.
     pub shape: Shape,
     /// `model_from_piece`.
     pub rotation: DMat3,
-    /// Where its origin lies in the model.
     pub offset: DVec3,
-    /// What it is made of.
     pub material: Material,
 }
 
@@ -24,25 +19,20 @@ pub struct Piece {
 pub struct Model {
     /// Names of its parts; several may share a name, such as "cookie".
     pub parts: Vec<&'static str>,
-    /// Its primitives.
     pub pieces: Vec<Piece>,
     /// Flat tops that other things may stand on.
     pub tops: Vec<Top>,
-    /// The part that pieces go to.
     current: usize,
 }
 
-/// A flat rectangle of a model that other things may stand on.
+/// A flat rectangle in x and y that other things may stand on.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Top {
-    /// Its centre in x and y.
     pub centre: [f64; 2],
-    /// Its half extents in x and y.
     pub half: [f64; 2],
-    /// Its height.
     pub height: f64,
-    /// Height of what fits between it and what is above it; none for the open air.
-    pub room: Option<f64>,
+    /// Height of what fits between it and what is above it.
+    pub room: f64,
 }
 
 impl Model {
@@ -116,16 +106,15 @@ impl Model {
 
     /// Adds a flat top under the open air.
     pub fn top(&mut self, centre: [f64; 2], half: [f64; 2], height: f64) {
-        self.tops.push(Top { centre, half, height, room: None });
+        self.top_under(centre, half, height, 10.0);
     }
 
     /// Adds a flat top with something `room` above it.
     pub fn top_under(&mut self, centre: [f64; 2], half: [f64; 2], height: f64, room: f64) {
-        self.tops.push(Top { centre, half, height, room: Some(room) });
+        self.tops.push(Top { centre, half, height, room });
     }
 
     /// The same model `factor` times as large.
-    #[must_use]
     pub fn scaled(mut self, factor: f64) -> Self {
         self.scale(factor);
         self
@@ -141,7 +130,7 @@ impl Model {
             top.centre = top.centre.map(|c| c * factor);
             top.half = top.half.map(|h| h * factor);
             top.height *= factor;
-            top.room = top.room.map(|r| r * factor);
+            top.room *= factor;
         }
     }
 

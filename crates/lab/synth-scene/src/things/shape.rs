@@ -8,56 +8,28 @@ use std::f64::consts::{PI, TAU};
 /// A surface. Lengths are in metres; solids are centred at the origin of their frame.
 #[derive(Debug, Clone, PartialEq)]
 pub enum Shape {
-    /// A box with half extents `half` whose edges are rounded with radius `round`.
-    Block {
-        /// Half extents, rounding included.
-        half: DVec3,
-        /// Radius of the edges, at most the smallest half extent.
-        round: f64,
-    },
-    /// An ellipsoid.
-    Ellipsoid {
-        /// Semi-axes.
-        radii: DVec3,
-    },
+    /// A box with half extents `half`, rounding included, whose edges are rounded with radius `round`.
+    Block { half: DVec3, round: f64 },
+    /// An ellipsoid of these semi-axes.
+    Ellipsoid { radii: DVec3 },
     /// The line from `from` to `to` (radius, height) turned about z: a cylinder, a cone, a disc or a ring. Its outside
-    /// lies to the right of the direction of travel; the normals at both ends are given, for smooth profiles.
-    Turned {
-        /// Radius and height at the start.
-        from: DVec2,
-        /// Radius and height at the end.
-        to: DVec2,
-        /// Normal (radial, vertical) at the start.
-        from_normal: DVec2,
-        /// Normal (radial, vertical) at the end.
-        to_normal: DVec2,
-    },
+    /// lies to the right of the direction of travel; the normals (radial, vertical) at both ends are given, for smooth
+    /// profiles.
+    Turned { from: DVec2, to: DVec2, from_normal: DVec2, to_normal: DVec2 },
     /// A piece of a torus about z, from `-arc` to `arc` radians around +x, with round ends.
-    Ring {
-        /// Radius of the centre line.
-        major: f64,
-        /// Radius of the tube.
-        minor: f64,
-        /// Half the angle it spans; pi for a whole torus.
-        arc: f64,
-    },
-    /// A cylinder along z with round ends.
-    Capsule {
-        /// Half the distance of the two centres.
-        half: f64,
-        /// Radius.
-        radius: f64,
-    },
+    Ring { major: f64, minor: f64, arc: f64 },
+    /// A cylinder along z with round ends; `half` the distance of their centres.
+    Capsule { half: f64, radius: f64 },
 }
 
 /// A place in a shape's chart.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct ChartPoint {
-    /// Which face; only blocks have more than one.
+    /// Only blocks have more than one.
     pub face: usize,
-    /// First coordinate, 0 to 1; goes round for every shape but a block.
+    /// 0 to 1; goes round for every shape but a block.
     pub u: f64,
-    /// Second coordinate, 0 to 1.
+    /// 0 to 1.
     pub v: f64,
 }
 
@@ -87,17 +59,14 @@ impl Shape {
             .collect()
     }
 
-    /// A block with the given half extents and radius of its edges.
     pub fn block(half: [f64; 3], round: f64) -> Self {
         Self::Block { half: DVec3::from_array(half), round }
     }
 
-    /// An ellipsoid with the given semi-axes.
     pub fn ellipsoid(radii: [f64; 3]) -> Self {
         Self::Ellipsoid { radii: DVec3::from_array(radii) }
     }
 
-    /// A sphere.
     pub fn sphere(radius: f64) -> Self {
         Self::Ellipsoid { radii: DVec3::splat(radius) }
     }
@@ -126,13 +95,12 @@ impl Shape {
                     let (start, end) = (enter.max(near), exit.min(far));
                     return march(origin, direction, start, end, |p| block_distance(p, half, round));
                 }
-                first(enter, exit, near, far)
+                first([enter, exit], near, far)
             }
             Self::Ellipsoid { radii } => {
                 let (o, d) = (origin / radii, direction / radii);
                 let (a, b, c) = (d.length_squared(), o.dot(d), o.length_squared() - 1.0);
-                let (t0, t1) = quadratic(a, b, c)?;
-                first(t0, t1, near, far)
+                first(quadratic(a, b, c)?, near, far)
             }
             Self::Turned { from, to, .. } => turned_hit(from, to, origin, direction, near, far),
             Self::Ring { major, minor, arc } => {
@@ -159,9 +127,7 @@ impl Shape {
             }
             Self::Ellipsoid { radii } => (p / (radii * radii)).normalize_or_zero(),
             Self::Turned { from, to, from_normal, to_normal } => {
-                let along =
-                    (DVec2::new(p.truncate().length(), p.z) - from).dot(to - from) / (to - from).length_squared();
-                let n = from_normal.lerp(to_normal, along.clamp(0.0, 1.0)).normalize_or_zero();
+                let n = from_normal.lerp(to_normal, along(p, from, to).clamp(0.0, 1.0)).normalize_or_zero();
                 let radial = p.truncate().normalize_or_zero();
                 (radial * n.x).extend(n.y).normalize_or_zero()
             }
@@ -192,11 +158,6 @@ impl Shape {
         }
     }
 
-    /// Whether the chart's first coordinate goes round.
-    pub fn wraps(&self) -> bool {
-        !matches!(self, Self::Block { .. })
-    }
-
     /// Where a point of the surface lies in the chart.
     pub fn chart(&self, p: DVec3) -> ChartPoint {
         let turn = |angle: f64| (angle / TAU).rem_euclid(1.0);
@@ -211,11 +172,7 @@ impl Shape {
                 let q = p / radii;
                 (turn(q.y.atan2(q.x)), q.z.clamp(-1.0, 1.0).acos() / PI)
             }
-            Self::Turned { from, to, .. } => {
-                let along =
-                    (DVec2::new(p.truncate().length(), p.z) - from).dot(to - from) / (to - from).length_squared();
-                (turn(p.y.atan2(p.x)), along)
-            }
+            Self::Turned { from, to, .. } => (turn(p.y.atan2(p.x)), along(p, from, to)),
             Self::Ring { major, arc, .. } => {
                 let angle = p.y.atan2(p.x).clamp(-arc, arc);
                 let out = p.truncate().dot(DVec2::new(angle.cos(), angle.sin())) - major;
@@ -269,6 +226,11 @@ impl Shape {
     }
 }
 
+/// How far along the line that is turned a point of the surface lies, 0 to 1.
+fn along(p: DVec3, from: DVec2, to: DVec2) -> f64 {
+    (DVec2::new(p.truncate().length(), p.z) - from).dot(to - from) / (to - from).length_squared()
+}
+
 /// Outward direction of face 0..6 of a block: +x -x +y -y +z -z.
 fn axis(face: usize) -> DVec3 {
     let mut n = DVec3::ZERO;
@@ -303,12 +265,12 @@ fn slab(origin: DVec3, direction: DVec3, half: DVec3) -> Option<(f64, f64)> {
     (enter <= exit).then_some((enter, exit))
 }
 
-fn first(t0: f64, t1: f64, near: f64, far: f64) -> Option<f64> {
-    [t0, t1].into_iter().find(|&t| t > near && t < far)
+fn first(of: [f64; 2], near: f64, far: f64) -> Option<f64> {
+    of.into_iter().find(|&t| t > near && t < far)
 }
 
 /// Roots of a t^2 + 2 b t + c, ascending.
-fn quadratic(a: f64, b: f64, c: f64) -> Option<(f64, f64)> {
+fn quadratic(a: f64, b: f64, c: f64) -> Option<[f64; 2]> {
     let disc = b * b - a * c;
     if disc < 0.0 || a == 0.0 {
         return None;
@@ -316,7 +278,7 @@ fn quadratic(a: f64, b: f64, c: f64) -> Option<(f64, f64)> {
     // The root without cancellation first.
     let q = -(b + disc.sqrt().copysign(b));
     let (r, s) = (q / a, if q == 0.0 { 0.0 } else { c / q });
-    Some((r.min(s), r.max(s)))
+    Some([r.min(s), r.max(s)])
 }
 
 fn turned_hit(from: DVec2, to: DVec2, o: DVec3, d: DVec3, near: f64, far: f64) -> Option<f64> {
@@ -341,32 +303,19 @@ fn turned_hit(from: DVec2, to: DVec2, o: DVec3, d: DVec3, near: f64, far: f64) -
         let t = -c / (2.0 * b);
         return on(t).then_some(t);
     }
-    let (t0, t1) = quadratic(a, b, c)?;
-    [t0, t1].into_iter().find(|&t| on(t))
+    quadratic(a, b, c)?.into_iter().find(|&t| on(t))
 }
 
 fn capsule_hit(half: f64, radius: f64, o: DVec3, d: DVec3, near: f64, far: f64) -> Option<f64> {
-    let mut best = f64::INFINITY;
-    let mut keep = |t: f64, on: bool| {
-        if on && t > near && t < far && t < best {
-            best = t;
-        }
-    };
     let (od, dd) = (o.truncate(), d.truncate());
-    if let Some((t0, t1)) = quadratic(dd.length_squared(), od.dot(dd), od.length_squared() - radius * radius) {
-        for t in [t0, t1] {
-            keep(t, (o.z + t * d.z).abs() <= half);
-        }
-    }
-    for end in [-half, half] {
+    let side = quadratic(dd.length_squared(), od.dot(dd), od.length_squared() - radius * radius);
+    let side = side.into_iter().flatten().filter(|t| (o.z + t * d.z).abs() <= half);
+    let ends = [-half, half].into_iter().flat_map(|end| {
         let q = o - DVec3::new(0.0, 0.0, end);
-        if let Some((t0, t1)) = quadratic(1.0, q.dot(d), q.length_squared() - radius * radius) {
-            for t in [t0, t1] {
-                keep(t, (q.z + t * d.z) * end.signum() >= 0.0);
-            }
-        }
-    }
-    best.is_finite().then_some(best)
+        let cap = quadratic(1.0, q.dot(d), q.length_squared() - radius * radius);
+        cap.into_iter().flatten().filter(move |t| (q.z + t * d.z) * end.signum() >= 0.0)
+    });
+    side.chain(ends).filter(|&t| t > near && t < far).min_by(f64::total_cmp)
 }
 
 /// Sphere tracing between `start` and `end` with an exact distance.
@@ -401,6 +350,7 @@ fn ring_distance(p: DVec3, major: f64, minor: f64, arc: f64) -> f64 {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::testing::chart_points;
 
     fn samples() -> Vec<Shape> {
         let mut all = Shape::turned(&[(0.0, 0.0), (0.3, 0.0), (0.5, 0.8), (0.4, 0.8), (0.2, 0.1), (0.0, 0.1)]);
@@ -415,47 +365,25 @@ mod tests {
         all
     }
 
-    fn grid(shape: &Shape) -> impl Iterator<Item = ChartPoint> {
-        let faces = shape.faces();
-        (0..faces).flat_map(|face| {
-            (0..8).flat_map(move |i| {
-                (0..8).map(move |j| ChartPoint { face, u: (f64::from(i) + 0.5) / 8.0, v: (f64::from(j) + 0.5) / 8.0 })
-            })
-        })
-    }
-
     #[test]
-    fn a_ray_along_the_normal_meets_the_surface_where_the_chart_says() {
+    fn rays_the_chart_and_the_bounds_agree_with_the_surface() {
         for shape in samples() {
-            for at in grid(&shape) {
+            let (half, centre) = shape.bounds();
+            for at in chart_points(&shape, 8) {
                 let (p, n) = shape.surface(at);
                 assert!((n.length() - 1.0).abs() < 1e-9, "{shape:?} {at:?}");
                 let height = 0.02;
                 let t = shape.intersect(p + n * height, -n, 1e-9, 0.1).unwrap_or_else(|| panic!("{shape:?} {at:?}"));
                 assert!((t - height).abs() < 1e-3, "{shape:?} {at:?} {t}");
                 assert!((shape.normal(p + n * (height - t)) - n).length() < 0.05);
-            }
-        }
-    }
-
-    #[test]
-    fn the_chart_and_the_surface_are_inverse() {
-        for shape in samples().into_iter().filter(|s| !matches!(s, Shape::Block { round, .. } if *round > 0.0)) {
-            for at in grid(&shape) {
-                let back = shape.chart(shape.surface(at).0);
-                assert_eq!(back.face, at.face, "{shape:?}");
-                assert!((back.u - at.u).abs() < 1e-6 && (back.v - at.v).abs() < 1e-6, "{shape:?} {at:?} {back:?}");
-            }
-        }
-    }
-
-    #[test]
-    fn surfaces_stay_in_their_bounds() {
-        for shape in samples() {
-            let (half, centre) = shape.bounds();
-            for at in grid(&shape) {
-                let p = shape.surface(at).0 - centre;
-                assert!((p.abs() - half).max_element() < 1e-9, "{shape:?}");
+                assert!(((p - centre).abs() - half).max_element() < 1e-9, "{shape:?}");
+                // Of a rounded box the chart is that of the box around it.
+                let back = shape.chart(p);
+                let near = back.face == at.face && (back.u - at.u).abs() < 1e-6 && (back.v - at.v).abs() < 1e-6;
+                assert!(
+                    near || matches!(shape, Shape::Block { round, .. } if round > 0.0),
+                    "{shape:?} {at:?} {back:?}"
+                );
             }
         }
     }

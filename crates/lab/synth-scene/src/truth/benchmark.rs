@@ -3,14 +3,13 @@
 
 use crate::scene::Scene;
 use crate::truth::{scannet, write_json};
-use artifacts::{LERF_OVS, LerfScene};
+use artifacts::{LERF_OVS, LerfScene, TruePoints};
 use clap::ValueEnum;
 use gs_io::{Error, Result, write_bytes};
-use gs_scene::{Camera, PointCloud, colmap, ply};
+use gs_scene::{Camera, PointCloud, colmap};
 use serde::{Serialize, Serializer};
 use serde_json::{Value, json};
 use std::collections::BTreeSet;
-use std::fmt;
 use std::path::{Path, PathBuf};
 
 /// The layouts by name.
@@ -33,43 +32,30 @@ pub enum Layout {
     Colmap,
     /// A scene of LERF-OVS: things have the names that are asked for, and the frames that are scored are among the views.
     LerfOvs(&'static LerfScene),
-    /// A scan of this name, as extracted or converted.
-    Scan {
-        /// Name of the scan, such as `scene0000_00`.
-        name: String,
-        /// Whether it lies there as OpenGaussian converts it.
-        converted: bool,
-    },
-}
-
-impl fmt::Display for Layout {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        match self {
-            Self::Colmap => write!(f, "colmap"),
-            Self::LerfOvs(scene) => write!(f, "lerf-ovs {}", scene.name),
-            Self::Scan { name, converted: false } => write!(f, "scannet {name}"),
-            Self::Scan { name, converted: true } => write!(f, "opengaussian {name}"),
-        }
-    }
+    /// A scan of this name, such as `scene0000_00`, as extracted or as OpenGaussian converts it.
+    Scan { name: String, converted: bool },
 }
 
 impl Serialize for Layout {
     fn serialize<S: Serializer>(&self, serializer: S) -> std::result::Result<S::Ok, S::Error> {
-        serializer.collect_str(self)
+        serializer.collect_str(&match self {
+            Self::Colmap => "colmap".to_string(),
+            Self::LerfOvs(scene) => format!("lerf-ovs {}", scene.name),
+            Self::Scan { name, converted } => format!("{} {name}", if *converted { "opengaussian" } else { "scannet" }),
+        })
     }
 }
 
 /// The folders that a scene of some layout may have, all of which this program owns.
-pub(crate) const FOLDERS: [&str; 9] =
+pub const FOLDERS: [&str; 9] =
     ["truth", "label", "language_features", "sparse", "images", "scan", "color", "pose", "intrinsic"];
+/// The cameras of a converted scan.
+const TRANSFORMS: [&str; 2] = ["transforms_train.json", "transforms_test.json"];
 /// Every how many frames of a recording one is used.
 const FRAME_STEP: usize = 20;
 
 impl Layout {
-    /// The layout of a scene in the folder `out`.
-    ///
-    /// # Errors
-    /// When the folder's name is none of the benchmark's.
+    /// The layout of a scene in the folder `out`, whose name must be one of the benchmark's.
     pub fn new(name: LayoutName, out: &Path) -> Result<Self> {
         let folder = out.file_name().unwrap_or_default().to_string_lossy().into_owned();
         let unnamed = |expected: &str| {
@@ -88,17 +74,6 @@ impl Layout {
                 Ok(Self::Scan { name: folder, converted: name == LayoutName::Opengaussian })
             }
         }
-    }
-
-    /// Those of [`FOLDERS`] that a scene of this layout always has.
-    pub(crate) fn folders(&self) -> Vec<&'static str> {
-        let own: &[&str] = match self {
-            Self::Colmap => &["images", "sparse", "label"],
-            Self::LerfOvs(_) => &["images", "sparse"],
-            Self::Scan { converted: false, .. } => &["color", "pose", "intrinsic"],
-            Self::Scan { converted: true, .. } => &["color"],
-        };
-        [&["language_features", "truth"], own].concat()
     }
 
     /// Folder of the photographs.
@@ -152,9 +127,6 @@ impl Layout {
     }
 
     /// Writes poses, intrinsics and points. `views` are the file names of the photographs and their cameras.
-    ///
-    /// # Errors
-    /// When a file cannot be written.
     pub fn write_cameras(&self, out: &Path, views: &[(String, Camera)], sparse: &PointCloud) -> Result<()> {
         match self {
             Self::Colmap | Self::LerfOvs(_) => colmap::write_model(&out.join("sparse/0"), views, sparse),
@@ -164,33 +136,16 @@ impl Layout {
     }
 
     /// Names of the files that lie beside the folders.
-    pub(crate) fn root_files(&self) -> Vec<String> {
-        const TRANSFORMS: [&str; 3] = ["transforms_train.json", "transforms_test.json", "points3d.ply"];
+    pub fn root_files(&self) -> Vec<String> {
         let Self::Scan { name, converted } = self else { return Vec::new() };
-        let more = if *converted { &TRANSFORMS[..] } else { &[] };
-        scannet::files(name).into_iter().chain(more.iter().map(ToString::to_string)).collect()
+        let transforms = TRANSFORMS.iter().filter(|_| *converted).map(ToString::to_string);
+        scannet::files(name, *converted).into_iter().chain(transforms).collect()
     }
 
-    /// Writes the files of the scan's mesh: [`scannet::write`], and for a converted one `points3d.ply` instead of
-    /// `*_vh_clean_2.ply`.
-    ///
-    /// # Errors
-    /// When a file cannot be written.
-    pub fn write_scan(
-        &self,
-        out: &Path,
-        scene: &Scene,
-        points: &artifacts::TruePoints,
-        colors: &[[u8; 3]],
-    ) -> Result<()> {
+    /// Writes the files of the scan's mesh, if the layout has one.
+    pub fn write_scan(&self, out: &Path, scene: &Scene, points: &TruePoints, colors: &[[u8; 3]]) -> Result<()> {
         let Self::Scan { name, converted } = self else { return Ok(()) };
-        scannet::write(out, name, scene, points, colors)?;
-        if *converted {
-            let from = out.join(format!("{name}_vh_clean_2.ply"));
-            ply::write_points(out.join("points3d.ply"), &ply::read_points(&from)?, &[])?;
-            std::fs::remove_file(&from).map_err(|e| Error::new(format!("cannot remove: {e}")).file(&from))?;
-        }
-        Ok(())
+        scannet::write(out, name, *converted, scene, points, colors)
     }
 }
 
@@ -236,7 +191,7 @@ fn write_transforms(out: &Path, views: &[(String, Camera)]) -> Result<()> {
     let all = json!({
         "w": k.width, "h": k.height, "fl_x": k.fx, "fl_y": k.fy, "cx": k.cx, "cy": k.cy, "frames": frames,
     });
-    ["transforms_train.json", "transforms_test.json"].iter().try_for_each(|name| write_json(&out.join(name), &all))
+    TRANSFORMS.iter().try_for_each(|name| write_json(&out.join(name), &all))
 }
 
 #[cfg(test)]

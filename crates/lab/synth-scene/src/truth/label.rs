@@ -8,14 +8,11 @@ use serde_json::json;
 use std::path::Path;
 
 /// An object of which a view shows fewer pixels is not labelled in it.
-pub const SMALLEST: usize = 40;
+const SMALLEST: usize = 40;
 /// A separate piece of an object with fewer pixels is not labelled.
 const SMALLEST_PIECE: usize = 6;
 
 /// Writes polygons around what `frame` shows of each object; background is not labelled.
-///
-/// # Errors
-/// When the file cannot be written.
 pub fn write(path: &Path, image: &str, scene: &Scene, frame: &Frame) -> Result<()> {
     let mut objects = Vec::new();
     for (t, thing) in scene.things.iter().enumerate().filter(|(_, t)| !t.background) {

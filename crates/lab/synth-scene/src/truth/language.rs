@@ -37,13 +37,10 @@ pub struct Speech {
     pub noise: f64,
 }
 
-/// The vectors of a scene's things and parts.
+/// Unit vectors of a scene's things and parts, and of texts.
 pub struct Language {
-    /// Unit vectors by thing.
     things: Vec<Vec<f64>>,
-    /// Unit vectors by part.
     parts: Vec<Vec<f64>>,
-    /// Thing of each part.
     thing_of: Vec<usize>,
     names: BTreeMap<String, Vec<f64>>,
 }
@@ -76,8 +73,8 @@ fn class_vector(class: &str) -> Vec<f64> {
 }
 
 impl Language {
-    /// The vectors of all things and parts of a scene.
-    pub fn new(scene: &Scene) -> Self {
+    /// The vectors of all things and parts of a scene, and of further texts, such as those that a benchmark asks of other scenes.
+    pub fn new(scene: &Scene, texts: &[&str]) -> Self {
         let mut names: BTreeMap<String, Vec<f64>> =
             NEGATIVES.into_iter().chain(scannet::names()).map(|n| (n.to_string(), word(n))).collect();
         names.extend(scene.classes().into_iter().map(|c| (c.to_string(), class_vector(c))));
@@ -90,18 +87,12 @@ impl Language {
             })
             .collect();
         names.extend(scene.things.iter().map(|t| t.name.clone()).zip(things.iter().cloned()));
+        for &text in texts {
+            names.entry(text.into()).or_insert_with(|| word(text));
+        }
         let thing_of: Vec<usize> = scene.parts.iter().map(|p| p.thing as usize).collect();
         let parts = scene.parts.iter().map(|p| mix(PART, [&things[p.thing as usize], &word(p.name)])).collect();
         Self { things, parts, thing_of, names }
-    }
-
-    /// The same with the directions of further texts, as those that a benchmark asks of other scenes.
-    #[must_use]
-    pub fn with(mut self, texts: &[&str]) -> Self {
-        for &text in texts {
-            self.names.entry(text.into()).or_insert_with(|| word(text));
-        }
-        self
     }
 
     /// Vectors by text: of every thing's name, every class, the classes of ScanNet's benchmark and LERF's negatives.
@@ -191,7 +182,7 @@ mod tests {
     fn encode(maps: &MaskMaps, leaking: f64, noise: f64) -> Vec<Vec<f64>> {
         let (scene, frame) = example();
         let speech = Speech { leaking, noise };
-        let f = Language::new(scene).encode(frame, maps, &speech, &mut ChaCha8Rng::seed_from_u64(3));
+        let f = Language::new(scene, &[]).encode(frame, maps, &speech, &mut ChaCha8Rng::seed_from_u64(3));
         (0..f.count).map(|i| f.row(i).unwrap().iter().map(|&x| f64::from(x)).collect()).collect()
     }
 
@@ -210,7 +201,7 @@ mod tests {
     #[test]
     fn a_whole_thing_is_its_name_and_a_part_lies_between() {
         let (scene, _) = example();
-        let language = Language::new(scene);
+        let language = Language::new(scene, &[]);
         let (maps, truth) = exact();
         let features = encode(&maps, 0.0, 0.0);
         let table = language.table();

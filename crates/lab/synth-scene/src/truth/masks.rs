@@ -36,7 +36,7 @@ pub struct Faults {
 }
 
 /// Masks of fewer pixels are not given, as segmentation models drop them.
-pub const SMALLEST: usize = 16;
+const SMALLEST: usize = 16;
 /// How far a neighbour to merge with may stand away, in metres between footprints' bounding circles.
 const NEIGHBOUR: f64 = 0.45;
 
@@ -45,16 +45,17 @@ const PATCH: [f64; 2] = [0.0008, 0.02];
 /// A spurious mask is a patch of the things that own at least this share of it.
 const PATCH_OF: f64 = 0.1;
 
-/// A mask before it is painted.
-struct Candidate {
-    /// Parts shown; their pixels make the mask.
-    parts: Vec<u32>,
-    truth: MaskTruth,
-}
+/// A mask before it is painted: the parts shown, whose pixels make it, and what it shows.
+type Candidate = (Vec<u32>, MaskTruth);
+/// Parts that a mask shows, and what kind of mask it is.
+type Parts = (Vec<u32>, &'static str);
+const WHOLE: &str = "whole";
+const PART: &str = "part";
+const MERGED: &str = "merged";
 
 /// Id maps of one view and what each id shows, in the order of ids. Every id owns pixels. `patches` draws the spurious
 /// masks, so that they do not change the others.
-pub fn segment(
+pub(crate) fn segment(
     scene: &Scene,
     frame: &Frame,
     faults: &Faults,
@@ -74,7 +75,7 @@ pub fn segment(
             // Draw for every mask, so that one mask's fate does not change the others'.
             let lost = rng.random::<f64>() < faults.missing;
             if pixels >= SMALLEST {
-                candidates.push((Candidate { truth: describe(scene, &parts, level, kind), parts }, lost, pixels));
+                candidates.push(((parts.clone(), describe(scene, &parts, level, kind)), lost, pixels));
             }
         }
         // A level of a real file is never empty: the largest mask stays.
@@ -91,27 +92,20 @@ pub fn segment(
                 let pixels = patch(frame, patches);
                 let things = pixels.iter().map(|&at| frame.thing[at]).filter(|&t| t >= 0);
                 if pixels.len() >= SMALLEST {
-                    kept.push(Candidate { parts: Vec::new(), truth: describe_patch(scene, things, level) });
+                    kept.push((Vec::new(), describe_patch(scene, things, level)));
                     pixels.into_iter().for_each(|at| painted[at] = kept.len() as i32 - 1);
                 }
             }
         }
         let owned = compact(&painted, kept.len(), truth.len() as i32, &mut maps.ids);
-        truth.extend(kept.into_iter().zip(owned).filter(|(_, owned)| *owned).map(|(c, _)| c.truth));
+        truth.extend(kept.into_iter().zip(owned).filter(|(_, owned)| *owned).map(|((_, t), _)| t));
     }
     debug_assert_eq!(maps.ids.len(), LEVELS * frame.width * frame.height);
     (maps, truth)
 }
 
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-enum Kind {
-    Whole,
-    Part,
-    Merged,
-}
-
 /// The masks of a level as sets of parts. Only visible parts count.
-fn shown(scene: &Scene, visible: &[usize], level: Level, p: f64, rng: &mut ChaCha8Rng) -> Vec<(Vec<u32>, Kind)> {
+fn shown(scene: &Scene, visible: &[usize], level: Level, p: f64, rng: &mut ChaCha8Rng) -> Vec<Parts> {
     let parts_of =
         |t: usize| -> Vec<u32> { scene.things[t].parts.clone().filter(|&p| visible[p as usize] > 0).collect() };
     let coarse = matches!(level, Level::Default | Level::Large);
@@ -128,42 +122,30 @@ fn shown(scene: &Scene, visible: &[usize], level: Level, p: f64, rng: &mut ChaCh
             if let Some(other) = nearest(scene, t, &taken) {
                 (taken[t], taken[other]) = (true, true);
                 let (a, b) = (t.min(other), t.max(other));
-                out.push(([parts_of(a), parts_of(b)].concat(), Kind::Merged));
+                out.push(([parts_of(a), parts_of(b)].concat(), MERGED));
             }
         }
     }
     for t in (0..scene.things.len()).filter(|&t| !taken[t]) {
         let (odd, first_way, which) = draws[t];
         let parts = parts_of(t);
-        let split = |group: bool| -> Vec<(Vec<u32>, Kind)> {
-            let mut groups: BTreeMap<(&str, u32), Vec<u32>> = BTreeMap::new();
-            for &part in &parts {
-                let key = if group { 0 } else { part };
-                groups.entry((scene.parts[part as usize].name, key)).or_default().push(part);
-            }
-            let mut masks: Vec<Vec<u32>> = groups.into_values().collect();
-            masks.sort();
-            let kind = if masks.len() == 1 { Kind::Whole } else { Kind::Part };
-            masks.into_iter().map(|m| (m, kind)).collect()
-        };
-        let whole = || vec![(parts.clone(), Kind::Whole)];
-        let masks = match (coarse, odd, first_way) {
-            (true, true, false) => split(false),
-            (true, _, _) | (false, true, true) => whole(),
-            (false, false, _) => split(level == Level::Medium),
-            (false, true, false) => {
-                let mut masks = split(level == Level::Medium);
-                if masks.len() > 2 {
-                    let at = (which * (masks.len() - 1) as f64) as usize;
-                    let (joined, _) = masks.remove(at + 1);
-                    masks[at].0.extend(joined);
-                    masks
-                } else {
-                    whole()
-                }
-            }
-        };
-        out.extend(masks);
+        let mut groups: BTreeMap<(&str, u32), Vec<u32>> = BTreeMap::new();
+        for &part in &parts {
+            let key = if level == Level::Medium { 0 } else { part };
+            groups.entry((scene.parts[part as usize].name, key)).or_default().push(part);
+        }
+        let mut masks: Vec<Vec<u32>> = groups.into_values().collect();
+        masks.sort();
+        let whole = if coarse { !odd || first_way } else { odd && (first_way || masks.len() <= 2) };
+        if whole || masks.len() == 1 {
+            masks = vec![parts];
+        } else if odd && !coarse {
+            let at = (which * (masks.len() - 1) as f64) as usize;
+            let joined = masks.remove(at + 1);
+            masks[at].extend(joined);
+        }
+        let kind = if masks.len() == 1 { WHOLE } else { PART };
+        out.extend(masks.into_iter().map(|m| (m, kind)));
     }
     out
 }
@@ -185,14 +167,14 @@ fn nearest(scene: &Scene, t: usize, taken: &[bool]) -> Option<usize> {
         .map(|(_, o)| o)
 }
 
-fn describe(scene: &Scene, parts: &[u32], level: Level, kind: Kind) -> MaskTruth {
+fn describe(scene: &Scene, parts: &[u32], level: Level, kind: &str) -> MaskTruth {
     let mut instances: Vec<u32> = parts.iter().map(|&p| scene.parts[p as usize].thing).collect();
     instances.sort_unstable();
     instances.dedup();
     let name = |t: &u32| scene.things[*t as usize].name.clone();
     let caption = match kind {
-        Kind::Whole | Kind::Merged => instances.iter().map(name).collect::<Vec<_>>().join(" and "),
-        Kind::Part => {
+        WHOLE | MERGED => instances.iter().map(name).collect::<Vec<_>>().join(" and "),
+        _ => {
             let mut names: Vec<String> = Vec::new();
             for &p in parts {
                 let part = scene.parts[p as usize].name;
@@ -213,14 +195,9 @@ fn describe(scene: &Scene, parts: &[u32], level: Level, kind: Kind) -> MaskTruth
     };
     MaskTruth {
         level: level as u32,
-        part: (kind == Kind::Part && parts.len() == 1).then(|| parts[0]),
+        part: (kind == PART && parts.len() == 1).then(|| parts[0]),
         instances,
-        kind: match kind {
-            Kind::Whole => "whole",
-            Kind::Part => "part",
-            Kind::Merged => "merged",
-        }
-        .into(),
+        kind: kind.into(),
         caption,
     }
 }
@@ -261,10 +238,8 @@ fn describe_patch(scene: &Scene, things: impl Iterator<Item = i32>, level: Level
 /// Paints the masks in their order, each grown or shrunk; returns positions in `masks`, -1 for none.
 fn paint(frame: &Frame, masks: &[Candidate], parts: usize, boundary: u32, rng: &mut ChaCha8Rng) -> Vec<i32> {
     let mut owner = vec![-1i32; parts];
-    for (i, m) in masks.iter().enumerate() {
-        for &p in &m.parts {
-            owner[p as usize] = i as i32;
-        }
+    for (i, (shown, _)) in masks.iter().enumerate() {
+        shown.iter().for_each(|&p| owner[p as usize] = i as i32);
     }
     let exact: Vec<i32> = frame.part.iter().map(|&p| if p < 0 { -1 } else { owner[p as usize] }).collect();
     if boundary == 0 {
@@ -328,12 +303,11 @@ fn compact(painted: &[i32], masks: usize, first: i32, ids: &mut Vec<i32>) -> Vec
     for &m in painted.iter().filter(|&&m| m >= 0) {
         owned[m as usize] = true;
     }
-    let mut next = first;
     let new: Vec<i32> = owned
         .iter()
-        .map(|&o| {
-            next += i32::from(o);
-            next - 1
+        .scan(first - 1, |id, &o| {
+            *id += i32::from(o);
+            Some(*id)
         })
         .collect();
     ids.extend(painted.iter().map(|&m| if m < 0 { -1 } else { new[m as usize] }));
@@ -493,13 +467,5 @@ mod tests {
                 }
             }
         }
-    }
-
-    #[test]
-    fn growing_and_shrinking() {
-        let square: Vec<usize> = vec![11, 12, 13, 21, 22, 23, 31, 32, 33];
-        assert_eq!(eroded(&square, 10, 10), [22]);
-        assert_eq!(dilated(&[22], 10, 10), [12, 21, 22, 23, 32]);
-        assert_eq!(dilated(&[0], 10, 10), [0, 1, 10]);
     }
 }

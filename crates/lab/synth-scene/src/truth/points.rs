@@ -2,20 +2,16 @@
 //! structure from motion would have found.
 
 use crate::random::normal;
-use crate::render::{self, Frame, ray};
+use crate::render::{Frame, ray};
 use crate::scene::Scene;
 use artifacts::TruePoints;
 use glam::DVec3;
 use gs_scene::{Camera, PointCloud};
 use rand_chacha::ChaCha8Rng;
-use std::collections::{BTreeMap, HashMap, HashSet};
+use std::collections::HashSet;
 
 /// Cells of which one point each is kept, in metres: on objects, tables, floor and walls.
 const CELLS: [f64; 3] = [0.006, 0.012, 0.03];
-/// Side of the pixels and cells of [`expected`], in those of the photographs.
-const PREVIEW: u32 = 4;
-/// Cells that a surface within a larger one meets, of those of its face, as measured.
-const FILLED: f64 = 1.0;
 /// Share of the sparse cloud that lies on objects.
 const OBJECT_SHARE: f64 = 0.5;
 
@@ -25,7 +21,8 @@ pub struct Collector {
     seen: HashSet<(u32, [i32; 3])>,
     positions: Vec<DVec3>,
     parts: Vec<u32>,
-    colors: Vec<[u8; 3]>,
+    /// Of the points of [`Self::truth`], in its order.
+    pub colors: Vec<[u8; 3]>,
 }
 
 impl Collector {
@@ -61,11 +58,6 @@ impl Collector {
             part: self.parts.iter().map(|&p| p as i32).collect(),
             class: self.parts.iter().map(|p| class(thing(p))).collect(),
         }
-    }
-
-    /// Colours of the points of [`Self::truth`], in its order.
-    pub fn colors(&self) -> &[[u8; 3]] {
-        &self.colors
     }
 
     /// At most `count` of the points of [`Self::truth`] with their colours, evenly chosen, in its order: the vertices of a
@@ -104,31 +96,6 @@ impl Collector {
         }
         cloud
     }
-}
-
-/// About how many points a [`Collector`] will have of views by these cameras, from views of a fourth of their size: a
-/// square of four by four cells that `n` of their pixels fall into is met by `16 n` of the full ones, each in one of its
-/// cells.
-pub fn expected(scene: &Scene, cameras: &[Camera]) -> usize {
-    let mut met: HashMap<(u32, [i32; 3]), u32> = HashMap::new();
-    for camera in cameras {
-        let small = camera.resized(camera.width.div_ceil(PREVIEW), camera.height.div_ceil(PREVIEW));
-        let frame = render::identify(scene, &small);
-        let eye = small.position();
-        for at in (0..frame.part.len()).filter(|&at| frame.part[at] >= 0) {
-            let part = frame.part[at] as u32;
-            let (x, y) = (at % frame.width, at / frame.width);
-            let p = eye + ray(&small, x as f64 + 0.5, y as f64 + 0.5) * frame.distance[at];
-            let cell = (p / (f64::from(PREVIEW) * CELLS[ground(scene, part)])).floor().to_array().map(|v| v as i32);
-            *met.entry((part, cell)).or_default() += 1;
-        }
-    }
-    // Squares by their pixels, because a sum in the order of a hash map would not be the same in the next run.
-    let mut squares: BTreeMap<u32, usize> = BTreeMap::new();
-    met.into_values().for_each(|n| *squares.entry(n).or_default() += 1);
-    let (cells, pixels) = (FILLED * f64::from(PREVIEW * PREVIEW), f64::from(PREVIEW * PREVIEW));
-    let points = |n: u32| cells * (1.0 - (-f64::from(n) * pixels / cells).exp());
-    squares.into_iter().map(|(n, squares)| squares as f64 * points(n)).sum::<f64>() as usize
 }
 
 /// 0 for objects, 1 for tables, 2 for floor and walls.

@@ -12,41 +12,39 @@ const AROUND: [[i32; 2]; 8] = [[1, 0], [1, 1], [0, 1], [-1, 1], [-1, 0], [-1, -1
 
 /// Polygons around the pixels where `inside`, one per 8-connected piece of at least `smallest` pixels, from the top.
 pub fn trace(inside: &[bool], width: usize, height: usize, smallest: usize) -> Vec<Polygon> {
-    // A frame of empty pixels around the image saves all bounds checks.
+    // With a frame of empty pixels around the image, so that neighbours need no checks.
     let (w, h) = (width + 2, height + 2);
     let mut piece = vec![0u32; w * h];
     let filled = |x: i32, y: i32| {
         (0..width as i32).contains(&x) && (0..height as i32).contains(&y) && inside[y as usize * width + x as usize]
     };
     let at = |p: [i32; 2]| (p[1] + 1) as usize * w + (p[0] + 1) as usize;
-    let mut count = 0;
     let mut polygons = Vec::new();
-    for y in 0..height as i32 {
-        for x in 0..width as i32 {
-            if !filled(x, y) || piece[at([x, y])] != 0 {
-                continue;
+    let all = (0..height as i32).flat_map(|y| (0..width as i32).map(move |x| [x, y]));
+    for (count, start) in (1u32..).zip(all) {
+        let pixels = flood(start, &AROUND, |p| {
+            let new = filled(p[0], p[1]) && piece[at(p)] == 0;
+            if new {
+                piece[at(p)] = count;
             }
-            count += 1;
-            let mut pixels = vec![[x, y]];
-            piece[at([x, y])] = count;
-            let mut next = 0;
-            while let Some(&[px, py]) = pixels.get(next) {
-                next += 1;
-                for [dx, dy] in AROUND {
-                    let q = [px + dx, py + dy];
-                    if filled(q[0], q[1]) && piece[at(q)] == 0 {
-                        piece[at(q)] = count;
-                        pixels.push(q);
-                    }
-                }
-            }
-            if pixels.len() >= smallest {
-                let own = |p: [i32; 2]| piece[at(p)] == count;
-                polygons.push(outline(&pixels, own));
-            }
+            new
+        });
+        if pixels.len() >= smallest {
+            polygons.push(outline(&pixels, |p| piece[at(p)] == count));
         }
     }
     polygons
+}
+
+/// The pixels that `start` is connected with, itself first. `take` says whether a pixel belongs to them and is new.
+fn flood(start: [i32; 2], steps: &[[i32; 2]], mut take: impl FnMut([i32; 2]) -> bool) -> Vec<[i32; 2]> {
+    let mut pixels = Vec::from_iter(take(start).then_some(start));
+    let mut next = 0;
+    while let Some(&[x, y]) = pixels.get(next) {
+        next += 1;
+        pixels.extend(steps.iter().map(|[dx, dy]| [x + dx, y + dy]).filter(|&q| take(q)));
+    }
+    pixels
 }
 
 /// The line around one connected piece, holes cut out.
@@ -80,29 +78,16 @@ fn holes(pixels: &[[i32; 2]], own: impl Fn([i32; 2]) -> bool) -> Vec<(i32, i32)>
     let mut seen = vec![false; w * (y1 - y0 + 1) as usize];
     let mut found = Vec::new();
     // The first region met is the outside. Empty pixels connect by their sides, filled ones by corners too.
-    for y in y0..=y1 {
-        for x in x0..=x1 {
-            if own([x, y]) || seen[at(x, y)] {
-                continue;
+    for (y, x) in (y0..=y1).flat_map(|y| (x0..=x1).map(move |x| (y, x))) {
+        let hole = flood([x, y], &[[1, 0], [-1, 0], [0, 1], [0, -1]], |[x, y]| {
+            let new = (x0..=x1).contains(&x) && (y0..=y1).contains(&y) && !own([x, y]) && !seen[at(x, y)];
+            if new {
+                seen[at(x, y)] = true;
             }
-            let outside = x == x0 && y == y0;
-            let mut left = (x, y);
-            let mut stack = vec![[x, y]];
-            seen[at(x, y)] = true;
-            while let Some([px, py]) = stack.pop() {
-                left = left.min((px, py));
-                for [dx, dy] in [[1, 0], [-1, 0], [0, 1], [0, -1]] {
-                    let (qx, qy) = (px + dx, py + dy);
-                    if (x0..=x1).contains(&qx) && (y0..=y1).contains(&qy) && !own([qx, qy]) && !seen[at(qx, qy)] {
-                        seen[at(qx, qy)] = true;
-                        stack.push([qx, qy]);
-                    }
-                }
-            }
-            if !outside {
-                found.push(left);
-            }
-        }
+            new
+        });
+        let outside = x == x0 && y == y0;
+        found.extend(hole.into_iter().map(|[x, y]| (x, y)).min().filter(|_| !outside));
     }
     found.sort_unstable();
     found

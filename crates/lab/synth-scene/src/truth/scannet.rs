@@ -4,7 +4,7 @@
 use crate::scene::Scene;
 use crate::truth::write_json;
 use artifacts::{NYU40, TruePoints};
-use gs_io::{Result, create_dir, write_bytes};
+use gs_io::{Result, write_bytes};
 use gs_scene::{PointCloud, ply};
 use serde::Serialize;
 use serde_json::{Value, json};
@@ -42,24 +42,25 @@ pub fn label(class: &str) -> u32 {
     NYU40.iter().find(|b| Some(b.1) == name).map_or(OTHER, |b| b.0)
 }
 
-/// Ends of the names of a scan's files: vertices, their labels, segments, objects.
-const ENDS: [&str; 4] =
-    ["_vh_clean_2.ply", "_vh_clean_2.labels.ply", "_vh_clean_2.0.010000.segs.json", ".aggregation.json"];
-
-/// Names of the files that [`write`] writes.
-pub(crate) fn files(name: &str) -> [String; 4] {
-    ENDS.map(|end| format!("{name}{end}"))
+/// Names of the files that [`write`] writes: vertices, their labels, segments, objects. A scan that OpenGaussian has
+/// `converted` has `points3d.ply` for the vertices.
+pub fn files(name: &str, converted: bool) -> [String; 4] {
+    let ends = ["_vh_clean_2.ply", "_vh_clean_2.labels.ply", "_vh_clean_2.0.010000.segs.json", ".aggregation.json"];
+    let [vertices, labels, segs, objects] = ends.map(|end| format!("{name}{end}"));
+    [if converted { "points3d.ply".into() } else { vertices }, labels, segs, objects]
 }
 
-/// Writes the files of the scan `name` into `folder`: `*_vh_clean_2.ply` (vertices with colours, no faces), `*_vh_clean_2.labels.ply`
-/// (the same with a label id each), `*_vh_clean_2.0.010000.segs.json` (segments: parts) and `*.aggregation.json` (objects:
-/// things, background included). The vertices are the true surface points.
-///
-/// # Errors
-/// When a file cannot be written.
-pub fn write(folder: &Path, name: &str, scene: &Scene, points: &TruePoints, colors: &[[u8; 3]]) -> Result<()> {
-    create_dir(folder)?;
-    let [vertices, labels, segs, objects] = files(name);
+/// Writes the files of the scan `name` into `folder`: the vertices with colours, without faces; the same with a label id
+/// each; segments, which are parts; and objects: things, background included. The vertices are the true surface points.
+pub fn write(
+    folder: &Path,
+    name: &str,
+    converted: bool,
+    scene: &Scene,
+    points: &TruePoints,
+    colors: &[[u8; 3]],
+) -> Result<()> {
+    let [vertices, labels, segs, objects] = files(name, converted);
     let cloud = PointCloud { positions: points.position.clone(), colors: colors.to_vec() };
     ply::write_points(folder.join(vertices), &cloud, &[])?;
     let mut labelled = format!(
@@ -117,7 +118,7 @@ mod tests {
             part: parts.clone(),
         };
         let dir = tempfile::tempdir().unwrap();
-        write(dir.path(), SCAN, scene, &points, &vec![[9, 8, 7]; parts.len()]).unwrap();
+        write(dir.path(), SCAN, false, scene, &points, &vec![[9, 8, 7]; parts.len()]).unwrap();
         let (at, labels) = ply::read_labels(dir.path().join("scene0000_00_vh_clean_2.labels.ply"), "label").unwrap();
         assert_eq!(at, points.position);
         for (&l, &i) in labels.iter().zip(&points.instance) {
