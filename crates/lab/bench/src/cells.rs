@@ -7,14 +7,12 @@ use crate::task::{Task, Tasks};
 use gs_io::Result;
 use serde_json::Value;
 use stage::RunRecord;
-use std::path::{Path, PathBuf};
+use std::path::Path;
 
 /// A number that each cell gives.
 #[derive(Debug, Clone, Copy)]
 pub struct Metric {
-    /// Name in JSON.
     pub name: &'static str,
-    /// Heading in tables.
     pub title: &'static str,
     /// Whether it is a share, shown in percent.
     pub share: bool,
@@ -108,9 +106,6 @@ fn add(tasks: &mut Tasks, plan: &Plan, files: &Files, (scene, seed): (&Scene, u6
 }
 
 /// Runs what the plan's tables need and is not there yet.
-///
-/// # Errors
-/// When a program fails.
 pub fn run(programs: &Programs, plan: &Plan, folder: &Path, stage: &stage::Stage) -> Result<()> {
     let mut tasks = Tasks::default();
     for (scene, seed, name) in scenes(plan) {
@@ -131,24 +126,12 @@ pub fn run(programs: &Programs, plan: &Plan, folder: &Path, stage: &stage::Stage
     })
 }
 
-/// Cells of a row at a p, in the order of scenes and seeds, and the scores that are not there.
-///
-/// # Errors
-/// When a score is damaged.
-pub fn read(plan: &Plan, folder: &Path, row: &Row, p: &str) -> Result<(Vec<Cell>, Vec<PathBuf>)> {
-    let (mut cells, mut missing) = (Vec::new(), Vec::new());
-    for (_, _, name) in scenes(plan) {
-        let files = files(plan, folder, &name, p, row);
-        if files.score.exists() {
-            cells.push(cell(name, &files)?);
-        } else {
-            missing.push(files.score);
-        }
-    }
-    Ok((cells, missing))
+/// Cells of a row at a p, in the order of scenes and seeds.
+pub fn read(plan: &Plan, folder: &Path, row: &Row, p: &str) -> Result<Vec<Cell>> {
+    scenes(plan).map(|(_, _, name)| cell(files(plan, folder, &name, p, row), name)).collect()
 }
 
-fn cell(scene: String, files: &Files) -> Result<Cell> {
+fn cell(files: Files, scene: String) -> Result<Cell> {
     let score: Value = read_json(&files.score)?;
     let (features, instances) = (RunRecord::read(&files.features).ok(), RunRecord::read(&files.instances).ok());
     let number = |at: &str| features.as_ref().and_then(|r| r.summary.pointer(at)?.as_f64());

@@ -28,12 +28,7 @@ pub const STAGES: [Stage; 4] = [Stage::Geometry, Stage::Graph, Stage::Features, 
 impl Stage {
     /// As plans name it.
     pub fn name(self) -> &'static str {
-        match self {
-            Self::Geometry => "geometry",
-            Self::Graph => "graph",
-            Self::Features => "features",
-            Self::Instances => "instances",
-        }
+        ["geometry", "graph", "features", "instances"][self as usize]
     }
 }
 
@@ -47,7 +42,6 @@ impl FromStr for Stage {
     }
 }
 
-/// Options of stages.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
 pub struct Options(BTreeMap<Stage, Vec<String>>);
 
@@ -58,9 +52,6 @@ impl Options {
     }
 
     /// Reads `stage: options; stage: options`.
-    ///
-    /// # Errors
-    /// When a stage is unknown or a colon is missing.
     pub fn parse(text: &str) -> Result<Self> {
         let mut all = Self::default();
         for part in text.split(';').map(str::trim).filter(|p| !p.is_empty()) {
@@ -79,7 +70,6 @@ impl Options {
         self
     }
 
-    /// The options of a stage.
     pub fn get(&self, stage: Stage) -> &[String] {
         self.0.get(&stage).map_or(&[], Vec::as_slice)
     }
@@ -94,7 +84,6 @@ impl Options {
 /// What a run of a stage took, as its record says.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Serialize, Deserialize)]
 pub struct Cost {
-    /// Wall-clock seconds.
     pub wall: f64,
     /// Processor seconds of all its threads.
     pub cpu: f64,
@@ -113,20 +102,12 @@ impl std::ops::Add for Cost {
 /// Where the programs are, and how many threads they get.
 #[derive(Debug, Clone)]
 pub struct Programs {
-    /// Folder of the binaries.
     pub folder: PathBuf,
-    /// Worker threads of each.
     pub threads: usize,
 }
 
 impl Programs {
     /// Runs a command line, the program's name first, to its end, quietly.
-    ///
-    /// # Errors
-    /// When it cannot be started or fails; the error holds what it said.
-    ///
-    /// # Panics
-    /// When the command line is empty.
     pub fn run(&self, command: &[String]) -> Result<()> {
         let (program, arguments) = command.split_first().expect("a program");
         let path = self.folder.join(program);
@@ -146,23 +127,16 @@ impl Programs {
 /// The files of a scene and of what the stages make of it. Who reads and writes which of them is the pipeline.
 #[derive(Debug, Clone)]
 pub struct Files {
-    /// Folder of the photographs.
     pub scene: PathBuf,
-    /// Folder of the masks.
     pub masks: PathBuf,
     /// Text features of the categories.
     pub texts: PathBuf,
-    /// The Gaussians.
     pub geometry: PathBuf,
-    /// The graph.
     pub graph: PathBuf,
     /// The footprints beside it.
     pub footprints: PathBuf,
-    /// The features.
     pub features: PathBuf,
-    /// The instances.
     pub instances: PathBuf,
-    /// Their score.
     pub score: PathBuf,
 }
 
@@ -234,10 +208,6 @@ impl Files {
         command(&["eval", "score"], &files)
     }
 
-    /// Runs a stage.
-    ///
-    /// # Errors
-    /// See [`Programs::run`].
     pub fn run(&self, programs: &Programs, stage: Stage, options: &Options) -> Result<Cost> {
         create_dir(self.output(stage).parent().unwrap_or(Path::new(".")))?;
         // A run that goes on from the checkpoint of a killed one would seem faster than it is.
@@ -249,9 +219,6 @@ impl Files {
     }
 
     /// Scores the instances: the figures of `score.json`.
-    ///
-    /// # Errors
-    /// See [`Programs::run`].
     pub fn evaluate(&self, programs: &Programs) -> Result<Value> {
         programs.run(&self.scoring())?;
         read_json(&self.score)
@@ -269,10 +236,6 @@ pub fn words(text: &str) -> Vec<String> {
     text.split_whitespace().map(String::from).collect()
 }
 
-/// Reads a JSON file.
-///
-/// # Errors
-/// When it is missing or not JSON.
 pub fn read_json(path: &Path) -> Result<Value> {
     let bytes = std::fs::read(path).at("read", path)?;
     serde_json::from_slice(&bytes).map_err(|e| Error::new(format!("not JSON: {e}")).file(path))

@@ -10,9 +10,7 @@ use std::path::Path;
 /// A stage on a scene, by both builds.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct Compared {
-    /// The scene.
     pub scene: String,
-    /// The stage.
     pub stage: Stage,
     /// Processor seconds of the base: median, least, most.
     pub base: [f64; 3],
@@ -28,9 +26,6 @@ pub struct Compared {
 
 /// Times all stages of `base` and `own` on the plan's scenes, each after the other `plan.repeats` times. Both work on a
 /// scene that `own` made; each on its own artifacts.
-///
-/// # Errors
-/// When a program fails.
 pub fn compare(base: &Programs, own: &Programs, plan: &Plan, folder: &Path) -> Result<Vec<Compared>> {
     let mut all = Vec::new();
     for scene in &plan.scenes {

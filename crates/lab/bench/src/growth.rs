@@ -10,13 +10,9 @@ use std::path::Path;
 /// A stage along an axis.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct Growth {
-    /// The axis.
     pub axis: String,
-    /// What it counts.
     pub title: String,
-    /// The stage.
     pub stage: Stage,
-    /// Sizes.
     pub sizes: Vec<f64>,
     /// What the size was in the end: Gaussians.
     pub gaussians: Vec<u64>,
@@ -24,7 +20,6 @@ pub struct Growth {
     pub costs: Vec<Cost>,
     /// Exponent of the processor time, fitted by least squares of logarithms.
     pub time_exponent: f64,
-    /// Exponent of the peak memory.
     pub memory_exponent: f64,
 }
 
@@ -40,9 +35,6 @@ pub fn exponent(x: &[f64], y: &[f64]) -> f64 {
 }
 
 /// Times the stages along an axis, `plan.repeats` times each, in turns.
-///
-/// # Errors
-/// When a program fails.
 pub fn measure(programs: &Programs, plan: &Plan, axis: &Axis, folder: &Path) -> Result<Vec<Growth>> {
     let files = axis.sizes.iter().map(|s| prepare(programs, &s.scene, &folder.join(&s.scene.name)));
     let files: Vec<_> = files.collect::<Result<_>>()?;

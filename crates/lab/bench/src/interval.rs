@@ -5,11 +5,9 @@ use serde::Serialize;
 /// A mean with its 95% interval.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize)]
 pub struct Interval {
-    /// The mean.
     pub mean: f64,
     /// Half the width of the 95% interval of the mean by Student's t distribution; none for a single value.
     pub half: Option<f64>,
-    /// How many values.
     pub n: usize,
 }
 
@@ -34,9 +32,6 @@ const FEW: [f64; 10] = [12.7062, 4.3027, 3.1824, 2.7764, 2.5706, 2.4469, 2.3646,
 
 /// The value that Student's t with `freedom` degrees of freedom (at least 1) stays below with probability 0.975: from a
 /// table, then by the Cornish-Fisher expansion (Abramowitz and Stegun, 26.7.5), which is right to four decimals there.
-///
-/// # Panics
-/// When `freedom` is 0.
 pub fn student(freedom: usize) -> f64 {
     if let Some(t) = FEW.get(freedom - 1) {
         return *t;

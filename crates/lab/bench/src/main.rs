@@ -1,7 +1,21 @@
-//! The `bench` program.
+//! Experiments by a [`plan`]: tables of scores, run time against error, growth; two builds beside each other; numerical
+//! stress. All through the stages' binaries, as people run them.
+
+mod cells;
+mod chain;
+mod cli;
+mod compare;
+mod growth;
+mod interval;
+mod page;
+mod plan;
+mod stress;
+mod tables;
+mod task;
+mod tradeoff;
 
 use std::process::ExitCode;
 
 fn main() -> ExitCode {
-    stage::main::<bench::cli::Args>()
+    stage::main::<cli::Args>()
 }

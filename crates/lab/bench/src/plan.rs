@@ -27,10 +27,8 @@ use serde::Serialize;
 use std::collections::BTreeMap;
 use std::path::Path;
 
-/// A scene to measure on.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Scene {
-    /// Its name.
     pub name: String,
     /// Options of synth-scene.
     pub scene: String,
@@ -41,24 +39,18 @@ pub struct Scene {
 /// What the paper prints for a row, on LERF-OVS, in percent.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize)]
 pub struct Paper {
-    /// mIoU.
     pub miou: f64,
-    /// mAcc.
     pub macc: f64,
-    /// Memory in GB.
     pub memory: Option<f64>,
 }
 
-/// A row of a table.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct Row {
     /// Name of a way of making features.
     pub features: String,
     /// Name of a way of clustering.
     pub clustering: String,
-    /// The paper's numbers.
     pub paper: Option<Paper>,
-    /// What it is called.
     pub label: String,
 }
 
@@ -69,44 +61,33 @@ impl Row {
     }
 }
 
-/// A table.
 #[derive(Debug, Clone, PartialEq)]
 pub struct TablePlan {
-    /// Its name.
     pub name: String,
     /// Probabilities of other granularity, as written.
     pub p: Vec<String>,
     /// The row that others are compared with, by id.
     pub reference: Option<String>,
-    /// Its title.
     pub title: String,
-    /// Its rows.
     pub rows: Vec<Row>,
 }
 
 /// A range that a mean must lie in.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Expected {
-    /// Table.
     pub table: String,
-    /// Row, by id.
     pub row: String,
     /// Probability of other granularity, as written.
     pub p: String,
-    /// Name of a metric.
     pub metric: String,
-    /// Least value.
     pub low: f64,
-    /// Largest value.
     pub high: f64,
 }
 
 /// A setting of a knob.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Point {
-    /// What it is called.
     pub label: String,
-    /// Options of the stages it changes.
     pub options: Options,
     /// Whether the others' errors are differences from it.
     pub exact: bool,
@@ -117,11 +98,9 @@ pub struct Point {
 /// An approximation, with the settings to compare.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Knob {
-    /// Its name.
     pub name: String,
     /// The first stage that it changes; `None` for the whole pipeline.
     pub stage: Option<Stage>,
-    /// What it is.
     pub title: String,
     /// Its settings, one of them exact.
     pub points: Vec<Point>,
@@ -130,26 +109,20 @@ pub struct Knob {
 /// A size of the work.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Size {
-    /// How large.
     pub value: f64,
-    /// The scene of that size.
     pub scene: Scene,
 }
 
 /// Something that the work grows with.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Axis {
-    /// Its name.
     pub name: String,
-    /// What it counts.
     pub title: String,
     /// The stages whose growth is fitted.
     pub stages: Vec<Stage>,
-    /// By rising value.
     pub sizes: Vec<Size>,
 }
 
-/// A plan.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct Plan {
     /// Scenes of tables and knobs.
@@ -160,15 +133,11 @@ pub struct Plan {
     options: BTreeMap<String, String>,
     /// Which footprints features are made from.
     pub footprints_of: BTreeMap<String, String>,
-    /// Tables.
     pub tables: Vec<TablePlan>,
-    /// What must come out of them.
     pub expected: Vec<Expected>,
     /// How often each point is timed.
     pub repeats: usize,
-    /// Approximations.
     pub knobs: Vec<Knob>,
-    /// Growth.
     pub axes: Vec<Axis>,
 }
 
@@ -191,21 +160,13 @@ const KEYWORDS: [(&str, usize, bool); 14] = [
 ];
 
 impl Plan {
-    /// Reads a plan.
-    ///
-    /// # Errors
-    /// When it cannot be read, a line is not one of the above, names what no line before it defines, or a knob lacks its one
-    /// exact or its one default point; the error names the line.
+    /// Reads a plan; an error names the line.
     pub fn read(path: impl AsRef<Path>) -> Result<Self> {
         let path = path.as_ref();
         let text = std::fs::read_to_string(path).at("read", path)?;
         Self::parse(&text).map_err(|e| e.file(path))
     }
 
-    /// Reads the text of a plan.
-    ///
-    /// # Errors
-    /// See [`Self::read`].
     pub fn parse(text: &str) -> Result<Self> {
         let mut plan = Self { repeats: 3, ..Self::default() };
         for (i, line) in text.lines().enumerate().filter(|(_, l)| !l.trim().is_empty() && !l.starts_with('#')) {
@@ -238,6 +199,11 @@ impl Plan {
         if !name.chars().all(|c| c.is_ascii_alphanumeric() || c == '-') {
             return Err(Error::new("not a name").found(name).expected("letters, digits and -"));
         }
+        let part = ["row", "expect", "point", "size"].contains(&keyword);
+        let last = rest[rest.len() - 1].to_string();
+        if !part && self.options.insert(format!("{keyword} {name}"), last).is_some() {
+            return Err(Error::new("defined twice").found(line));
+        }
         match keyword {
             "scene" => self.scenes.push(scene(name, rest[0], rest[1])),
             "seeds" => {
@@ -254,7 +220,11 @@ impl Plan {
                     paper: paper(rest[2]).ok_or_else(|| wrong("numbers of the paper, or -"))?,
                     label: rest[3].into(),
                 };
-                by_name(&mut self.tables, "table", name, |t| &t.name)?.rows.push(row);
+                let table = by_name(&mut self.tables, "table", name, |t| &t.name)?;
+                if table.rows.iter().any(|r| r.id() == row.id()) {
+                    return Err(Error::new("defined twice").found(line));
+                }
+                table.rows.push(row);
             }
             "expect" => {
                 let number = |s: &str| s.parse::<f64>().map_err(|_| wrong("numbers as bounds"));
@@ -262,8 +232,7 @@ impl Plan {
                 self.expected.push(Expected { table, row, p, metric, low: number(rest[3])?, high: number(rest[4])? });
             }
             "repeats" => {
-                let count = rest[0].parse().ok().filter(|c| *c > 0);
-                self.repeats = count.ok_or_else(|| wrong("a whole number above 0"))?;
+                self.repeats = stage::within(1usize..=1000)(rest[0]).map_err(|e| wrong(&e))?;
             }
             "knob" => {
                 let stage = (rest[0] != "pipeline").then(|| rest[0].parse()).transpose()?;
@@ -284,19 +253,15 @@ impl Plan {
                 self.axes.push(Axis { name: name.into(), title: rest[0].into(), stages, sizes: Vec::new() });
             }
             "size" => {
-                let value = positive(rest[0])?;
+                let value = stage::positive(rest[0]).map_err(|e| wrong(&e))?;
                 let scene = scene(&format!("{name}-{}", rest[0]), rest[1], rest[2]);
                 by_name(&mut self.axes, "axis", name, |a| &a.name)?.sizes.push(Size { value, scene });
             }
-            _ => {
-                if keyword == "features" {
-                    self.defined("footprints", rest[0])?;
-                    self.footprints_of.insert(name.into(), rest[0].into());
-                }
-                if self.options.insert(format!("{keyword} {name}"), rest[count - 1].into()).is_some() {
-                    return Err(Error::new("defined twice").found(line));
-                }
+            "features" => {
+                self.defined("footprints", rest[0])?;
+                self.footprints_of.insert(name.into(), rest[0].into());
             }
+            _ => {}
         }
         Ok(())
     }
@@ -312,9 +277,6 @@ impl Plan {
     }
 
     /// Keeps only the tables, knobs and axes of these names; all where there is none.
-    ///
-    /// # Errors
-    /// When the plan has none of a name.
     pub fn only(mut self, names: &[String]) -> Result<Self> {
         let (tables, knobs) = (self.tables.iter().map(|t| &t.name), self.knobs.iter().map(|k| &k.name));
         let all: Vec<&String> = tables.chain(knobs).chain(self.axes.iter().map(|a| &a.name)).collect();
@@ -337,7 +299,7 @@ fn scene(name: &str, scene: &str, geometry: &str) -> Scene {
 
 fn table(name: &str, fields: &[&str]) -> Result<TablePlan> {
     let p: Vec<String> = fields[0].split_whitespace().map(String::from).collect();
-    if p.is_empty() || !p.iter().all(|p| p.parse::<f64>().is_ok_and(|p| (0.0..=1.0).contains(&p))) {
+    if p.is_empty() || !p.iter().all(|p| stage::within(0.0..=1.0)(p).is_ok()) {
         return Err(Error::new("not probabilities").found(fields[0]).expected("numbers from 0 to 1"));
     }
     let reference = (fields[1] != "-").then(|| fields[1].to_string());
@@ -358,11 +320,6 @@ fn paper(text: &str) -> Option<Option<Paper>> {
     Some(Some(Paper { miou, macc, memory }))
 }
 
-fn positive(text: &str) -> Result<f64> {
-    let value = text.parse::<f64>().ok().filter(|v| *v > 0.0 && v.is_finite());
-    value.ok_or_else(|| Error::new("not a number").found(text).expected("a number above 0"))
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -373,10 +330,11 @@ seeds | 0 1
 masks | --missing 0
 footprints gated | --pixel-samples 16
 features paper | gated | --preset paper
+features ours | gated |
 clustering free | --cluster free
 table t | 0 0.5 | paper.free | A title
 row t | paper | free | 50.79 69.62 2.1 | full
-row t | paper | free | - | ours
+row t | ours | free | - | ours
 expect t | paper.free | 0.5 | instance_miou | 0.1 | 0.9
 repeats | 5
 knob cut | graph | Footprint cut
@@ -413,8 +371,11 @@ size views | 8 | --size tiny --views 8 | --iterations 10
     #[test]
     fn mistakes_name_their_line() {
         for (from, to, said) in [
-            ("repeats | 5", "repeats | x", "line 12"),
-            ("knob cut | graph", "knob cut | grph", "line 13"),
+            ("repeats | 5", "repeats | x", "line 13"),
+            ("knob cut | graph", "knob cut | grph", "line 14"),
+            ("row t | ours", "row t | paper", "defined twice"),
+            ("knob quality", "knob cut", "defined twice"),
+            ("seeds | 0 1\n", "scene a | |\n", "defined twice"),
             ("point cut | none", "point cot | none", "no such knob; found cot"),
             ("| exact\npoint cut", "|\npoint cut", "exact"),
             ("axis views", "axes views", "not a line of a plan"),

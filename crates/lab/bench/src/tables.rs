@@ -9,12 +9,10 @@ use report::sheet::markdown;
 use serde::Serialize;
 use std::collections::BTreeMap;
 use std::fmt::Write;
-use std::path::{Path, PathBuf};
+use std::path::Path;
 
-/// A row with what came of it.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct RowResult {
-    /// The row.
     #[serde(flatten)]
     pub row: Row,
     /// Options of graph-precompute, feat-train and cluster-match.
@@ -31,46 +29,29 @@ pub struct RowResult {
     pub network_bytes_per_gaussian: Option<f64>,
 }
 
-/// A table with what came of it.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct Table {
-    /// Its name.
     pub name: String,
-    /// Its title.
     pub title: String,
-    /// Probabilities of other granularity.
     pub p: Vec<String>,
     /// Id of the row of reference.
     pub reference: Option<String>,
-    /// Scenes.
     pub scenes: Vec<String>,
-    /// Seeds of each.
     pub seeds: Vec<u64>,
-    /// Runs that are planned but not there.
-    pub missing: usize,
-    /// Its rows.
     pub rows: Vec<RowResult>,
 }
 
 /// Reads all cells of a plan.
-///
-/// # Errors
-/// When a score is damaged, or a reference is no row.
 pub fn results(plan: &Plan, folder: &Path) -> Result<Vec<Table>> {
     plan.tables.iter().map(|table| result(plan, folder, table)).collect()
 }
 
 fn result(plan: &Plan, folder: &Path, table: &TablePlan) -> Result<Table> {
-    let mut missing: Vec<PathBuf> = Vec::new();
     let mut rows: Vec<RowResult> = Vec::new();
     let mut cells: Vec<BTreeMap<&str, Vec<Cell>>> = Vec::new();
     for row in &table.rows {
-        let mut by_p = BTreeMap::new();
-        for p in &table.p {
-            let (found, lacking) = read(plan, folder, row, p)?;
-            missing.extend(lacking);
-            by_p.insert(p.as_str(), found);
-        }
+        let by_p = table.p.iter().map(|p| Ok((p.as_str(), read(plan, folder, row, p)?)));
+        let by_p = by_p.collect::<Result<BTreeMap<&str, Vec<Cell>>>>()?;
         let all = || by_p.values().flatten();
         let mean = |values: &[f64]| Interval::of(values).map(|i| i.mean);
         let by_p_mean = |of: &dyn Fn(&Cell) -> Option<f64>| -> BTreeMap<String, f64> {
@@ -94,7 +75,7 @@ fn result(plan: &Plan, folder: &Path, table: &TablePlan) -> Result<Table> {
         let at = table.rows.iter().position(|r| r.id() == *reference).ok_or_else(|| {
             Error::new("no such row").field(format!("table {}", table.name)).found(reference).hint("fix the plan")
         })?;
-        let base = cells[at].clone();
+        let base = &cells[at];
         for (row, by_p) in rows.iter_mut().zip(&cells).enumerate().filter(|(i, _)| *i != at).map(|(_, r)| r) {
             let same = |p: &str, c: &Cell| base[p].iter().find(|b| b.scene == c.scene).cloned();
             row.differences = table
@@ -115,7 +96,6 @@ fn result(plan: &Plan, folder: &Path, table: &TablePlan) -> Result<Table> {
         reference: table.reference.clone(),
         scenes: plan.scenes.iter().map(|s| s.name.clone()).collect(),
         seeds: plan.seeds.clone(),
-        missing: missing.len(),
         rows,
     })
 }
@@ -132,9 +112,6 @@ fn intervals<C>(
 }
 
 /// Holds the means against what the plan expects.
-///
-/// # Errors
-/// When one is outside of its range, or there is no such result.
 pub fn check(plan: &Plan, tables: &[Table]) -> Result<()> {
     for e in &plan.expected {
         let what = || format!("{} of {} at p {} in table {}", e.metric, e.row, e.p, e.table);
@@ -151,10 +128,8 @@ pub fn check(plan: &Plan, tables: &[Table]) -> Result<()> {
     Ok(())
 }
 
-/// The p whose results are shown in full: one half, where it is among them.
-fn shown_p(table: &Table) -> &str {
-    table.p.iter().find(|p| *p == "0.5").unwrap_or(&table.p[0])
-}
+/// The main metrics.
+const GAINS: [&str; 2] = ["instance_miou", "query_miou"];
 
 /// An interval as text: shares in percent.
 fn shown(interval: Option<&Interval>, share: bool, signed: bool) -> String {
@@ -169,73 +144,56 @@ fn shown(interval: Option<&Interval>, share: bool, signed: bool) -> String {
     }
 }
 
-/// A table with a title, a head and rows.
-pub type Block = (String, Vec<String>, Vec<Vec<String>>);
-
-/// What a table shows: titles, heads and rows. First the two main metrics by p, then all metrics at one p.
-pub fn blocks(table: &Table) -> Vec<Block> {
-    let mut out = Vec::new();
-    let paper = table.rows.iter().any(|r| r.row.paper.is_some());
-    let papers = |r: &RowResult| r.row.paper.map_or("–".into(), |p| format!("{:.2} / {:.2}", p.miou, p.macc));
-    if table.p.len() > 1 {
-        for metric in ["instance_miou", "query_miou"] {
-            let m = METRICS.iter().find(|m| m.name == metric).expect("a metric");
-            let mut head = vec![String::new()];
-            head.extend(table.p.iter().map(|p| format!("p = {p}")));
-            let row = |r: &RowResult| {
-                let cells = table.p.iter().map(|p| shown(r.results.get(p).and_then(|r| r.get(metric)), m.share, false));
-                [r.row.label.clone()].into_iter().chain(cells).collect()
-            };
-            out.push((format!("{}, %", m.title), head, table.rows.iter().map(row).collect()));
-        }
-    }
-    let p = shown_p(table);
-    let memory = table.rows.iter().any(|r| r.row.paper.is_some_and(|p| p.memory.is_some()));
-    let mut head = vec![String::new()];
-    if paper {
-        head.push("paper: mIoU / mAcc".into());
-    }
-    head.extend(METRICS.iter().map(|m| format!("{}{}", m.title, if m.share { ", %" } else { "" })));
-    if table.reference.is_some() {
-        head.extend(["gain, instance mIoU".into(), "gain, query mIoU".into()]);
-    }
-    let aligned = table.rows.iter().any(|r| !r.alignment.is_empty());
-    if aligned {
-        head.push("alignment".into());
-    }
-    head.push("seconds".into());
-    if memory {
-        head.extend(["network, MB per million Gaussians".into(), "paper, GB".into()]);
-    }
-    let row = |r: &RowResult| {
-        let mut cells = vec![r.row.label.clone()];
-        if paper {
-            cells.push(papers(r));
-        }
-        let results = r.results.get(p);
-        cells.extend(METRICS.iter().map(|m| shown(results.and_then(|r| r.get(m.name)), m.share, false)));
-        if table.reference.is_some() {
-            let gains = r.differences.get(p);
-            cells.extend(["instance_miou", "query_miou"].map(|m| shown(gains.and_then(|g| g.get(m)), true, true)));
-        }
-        if aligned {
-            cells.push(r.alignment.get(p).map_or("–".into(), |a| format!("{a:.2}")));
-        }
-        cells.push(r.seconds.get(p).map_or("–".into(), |s| format!("{s:.1}")));
-        if memory {
-            cells.push(r.network_bytes_per_gaussian.map_or("–".into(), |b| format!("{b:.0}")));
-            cells.push(r.row.paper.and_then(|p| p.memory).map_or("–".into(), |m| m.to_string()));
-        }
-        cells
+/// The table in Markdown: the two main metrics by p, then all metrics at one p, and over what the means are.
+pub fn text(table: &Table) -> String {
+    let mut out = String::new();
+    let mut block = |title: &str, head: &[String], row: &dyn Fn(&RowResult) -> Vec<String>| {
+        let head: Vec<&str> = head.iter().map(String::as_str).collect();
+        let rows: Vec<_> = table.rows.iter().map(row).collect();
+        let _ = writeln!(out, "{title}:\n\n{}", markdown(&head, &rows));
     };
-    out.push((format!("All metrics at p = {p}"), head, table.rows.iter().map(row).collect()));
-    out
-}
-
-/// What stands under a table: over what the means are, and what is missing.
-pub fn remark(table: &Table) -> String {
+    if table.p.len() > 1 {
+        let head: Vec<String> = [String::new()].into_iter().chain(table.p.iter().map(|p| format!("p = {p}"))).collect();
+        for m in METRICS.iter().filter(|m| GAINS.contains(&m.name)) {
+            block(&format!("{}, %", m.title), &head, &|r| {
+                let cells = table.p.iter().map(|p| shown(r.results.get(p).and_then(|r| r.get(m.name)), m.share, false));
+                [r.row.label.clone()].into_iter().chain(cells).collect()
+            });
+        }
+    }
+    // One half, where it is among them.
+    let p = table.p.iter().find(|p| *p == "0.5").unwrap_or(&table.p[0]);
+    let figure = |v: Option<f64>, places: usize| v.map_or("–".into(), |v| format!("{v:.places$}"));
+    let paper = |r: &RowResult| r.row.paper.map_or("–".into(), |p| format!("{:.2} / {:.2}", p.miou, p.macc));
+    let printed = |r: &RowResult| r.row.paper.and_then(|p| p.memory).map_or("–".into(), |m| m.to_string());
+    type Column<'a> = (String, Box<dyn Fn(&RowResult) -> String + 'a>);
+    let mut columns: Vec<Column<'_>> = vec![(String::new(), Box::new(|r| r.row.label.clone()))];
+    if table.rows.iter().any(|r| r.row.paper.is_some()) {
+        columns.push(("paper: mIoU / mAcc".into(), Box::new(paper)));
+    }
+    for m in &METRICS {
+        let head = format!("{}{}", m.title, if m.share { ", %" } else { "" });
+        let cell = |r: &RowResult| shown(r.results.get(p).and_then(|r| r.get(m.name)), m.share, false);
+        columns.push((head, Box::new(cell)));
+    }
+    for (m, title) in GAINS.into_iter().zip(["instance", "query"]).filter(|_| table.reference.is_some()) {
+        let cell = move |r: &RowResult| shown(r.differences.get(p).and_then(|g| g.get(m)), true, true);
+        columns.push((format!("gain, {title} mIoU"), Box::new(cell)));
+    }
+    if table.rows.iter().any(|r| !r.alignment.is_empty()) {
+        columns.push(("alignment".into(), Box::new(|r| figure(r.alignment.get(p).copied(), 2))));
+    }
+    columns.push(("seconds".into(), Box::new(|r| figure(r.seconds.get(p).copied(), 1))));
+    if table.rows.iter().any(|r| r.row.paper.is_some_and(|p| p.memory.is_some())) {
+        let network = |r: &RowResult| figure(r.network_bytes_per_gaussian, 0);
+        columns.push(("network, MB per million Gaussians".into(), Box::new(network)));
+        columns.push(("paper, GB".into(), Box::new(printed)));
+    }
+    let head: Vec<String> = columns.iter().map(|c| c.0.clone()).collect();
+    block(&format!("All metrics at p = {p}"), &head, &|r| columns.iter().map(|c| c.1(r)).collect());
     let runs = table.scenes.len() * table.seeds.len();
-    let mut s = format!(
+    let _ = write!(
+        out,
         "Mean ± 95% interval (Student's t) over {runs} runs: scenes {}, {} seed{} each.",
         table.scenes.join(", "),
         table.seeds.len(),
@@ -243,21 +201,9 @@ pub fn remark(table: &Table) -> String {
     );
     if let Some(r) = &table.reference {
         let label = table.rows.iter().find(|row| row.row.id() == *r).map_or(r.as_str(), |row| &row.row.label);
-        let _ = write!(s, " Gains are differences from \"{label}\" scene by scene, in points.");
+        let _ = write!(out, " Gains are differences from \"{label}\" scene by scene, in points.");
     }
-    if table.missing > 0 {
-        let _ = write!(s, " {} runs are missing.", table.missing);
-    }
-    s
-}
-
-/// The table in Markdown.
-pub fn text(table: &Table) -> String {
-    let blocks = blocks(table).into_iter().map(|(title, head, rows)| {
-        let head: Vec<&str> = head.iter().map(String::as_str).collect();
-        format!("{title}:\n\n{}\n", markdown(&head, &rows))
-    });
-    blocks.collect::<String>() + &remark(table) + "\n"
+    out + "\n"
 }
 
 #[cfg(test)]
@@ -296,7 +242,6 @@ mod tests {
     fn rows_have_means_intervals_and_paired_gains() {
         let (dir, plan) = runs("expect t | ours.free | 0.5 | instance_miou | 0.5 | 0.6\n");
         let tables = read(&dir, &plan).unwrap();
-        assert_eq!(tables[0].missing, 0);
         let rows = &tables[0].rows;
         let miou = rows[0].results["0.5"]["instance_miou"];
         // Values 0.1, 0.2, 0.3, 0.4: deviation sqrt(0.05 / 3), over sqrt(4), times t of 3.
@@ -312,16 +257,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_missing_is_counted_and_what_is_not_expected_is_refused() {
-        let (dir, plan) = runs("");
-        std::fs::remove_file(dir.path().join("b-1/p0.5/ours.free.score.json")).unwrap();
-        let tables = read(&dir, &plan).unwrap();
-        assert_eq!(tables[0].missing, 1);
-        let (result, gain) = (&tables[0].rows[1].results["0.5"], &tables[0].rows[1].differences["0.5"]);
-        assert_eq!((result["instance_miou"].n, gain["instance_miou"].n), (3, 3));
-        assert!((gain["instance_miou"].mean - 0.3).abs() < 1e-12, "pairs only");
-        assert!(text(&tables[0]).contains("1 runs are missing"));
-
+    fn what_is_not_expected_is_refused() {
         for (expect, word) in [
             ("expect t | ours.free | 0.5 | instance_miou | 0.6 | 0.9\n", "found 0.5500, expected 0.6 to 0.9"),
             ("expect t | ours.free | 0.5 | query_miou | 0 | 1\n", "no such result"),
@@ -331,6 +267,7 @@ mod tests {
             let e = read(&dir, &plan).unwrap_err().to_string();
             assert!(e.contains(word), "{e}");
         }
+        let (dir, plan) = runs("");
         std::fs::write(dir.path().join("a-0/p0/ours.free.score.json"), "{").unwrap();
         assert!(read(&dir, &plan).unwrap_err().to_string().contains("ours.free.score.json"));
     }

@@ -38,9 +38,6 @@ impl Task {
     }
 
     /// Runs it unless it is done; returns whether it ran.
-    ///
-    /// # Errors
-    /// See [`Programs::run`].
     pub fn run(&self, programs: &Programs) -> Result<bool> {
         if self.is_done() {
             return Ok(false);
@@ -67,9 +64,6 @@ impl Tasks {
     }
 
     /// Runs what is not done, as many at a time as there are worker threads. `after` is called when a task has run.
-    ///
-    /// # Errors
-    /// The first failure; tasks that run then end first.
     pub fn run(&self, programs: &Programs, stage: &stage::Stage, after: impl Fn(&Path) + Sync) -> Result<()> {
         let left: usize = self.0.iter().flat_map(BTreeMap::values).filter(|t| !t.is_done()).count();
         stage.info(&format!("{left} of {} runs to do", self.0.iter().map(BTreeMap::len).sum::<usize>()));

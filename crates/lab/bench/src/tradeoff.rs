@@ -23,20 +23,14 @@ pub struct Quality {
     pub query_miou: Option<f64>,
 }
 
-/// A setting on a scene.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Measured {
-    /// Its label.
     pub label: String,
-    /// Its options.
     pub options: String,
-    /// Whether it is the exact one.
     pub exact: bool,
-    /// Whether it is the default.
     pub default: bool,
     /// Cost of the stage and those after it, a run each. Of the geometry alone where that is what the knob changes.
     pub costs: Vec<Cost>,
-    /// What came of it.
     pub quality: Quality,
 }
 
@@ -46,7 +40,6 @@ impl Measured {
         spread(self.costs.iter().map(|c| c.cpu).collect())
     }
 
-    /// The same of wall-clock seconds.
     pub fn wall(&self) -> [f64; 3] {
         spread(self.costs.iter().map(|c| c.wall).collect())
     }
@@ -59,18 +52,13 @@ pub fn spread(mut values: Vec<f64>) -> [f64; 3] {
     if n == 0 { [f64::NAN; 3] } else { [0.5 * (values[(n - 1) / 2] + values[n / 2]), values[0], values[n - 1]] }
 }
 
-/// A knob on a scene.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct Curve {
-    /// The knob.
     pub knob: String,
-    /// What it is.
     pub title: String,
-    /// The scene.
     pub scene: String,
     /// What [`Self::errors`] means.
     pub measure: String,
-    /// The settings, as planned.
     pub points: Vec<Measured>,
     /// Loss of quality against the exact setting: decibels, or points of mIoU (the mean of instances and queries). Below 0
     /// where a setting is better.
@@ -130,9 +118,6 @@ pub fn front(times: &[f64], errors: &[f64]) -> Vec<bool> {
 }
 
 /// Makes a synthetic scene and its geometry in a folder, unless they are there and made the same way.
-///
-/// # Errors
-/// When a program fails.
 pub fn prepare(programs: &Programs, scene: &Scene, folder: &Path) -> Result<Files> {
     let files = Files::of(folder);
     let mut photographs = command(&["synth-scene", "--features"], &[("--out", &files.scene)]);
@@ -153,9 +138,6 @@ fn from(files: &Files, programs: &Programs, first: Stage, options: &Options) -> 
 }
 
 /// Measures a knob on a scene whose earlier stages have run. What was measured before with the same options is kept.
-///
-/// # Errors
-/// When a program fails.
 pub fn measure(
     programs: &Programs,
     plan: &Plan,
@@ -234,9 +216,6 @@ fn merged(scene: &Options, setting: &Options) -> Options {
 }
 
 /// Gives `own` what the stages before `first` made in `base`.
-///
-/// # Errors
-/// When a file cannot be copied.
 pub fn inherit(base: &Files, own: &Files, first: Stage) -> Result<()> {
     let copy = |stage: Stage, from: &Path, to: &Path| match stage < first {
         false => Ok(()),

@@ -1,20 +1,20 @@
 //! The matrix of hostile scenes and stages.
 
 use super::cases::{Case, From, cases, options};
-use super::oracle::{geometry_is_damaged, render_error};
+use super::oracle::render_error;
 use super::world::World;
 use crate::chain::{Files, Options, Programs, STAGES, Stage, command, words};
 use crate::tradeoff::inherit;
 use artifacts::{Features, Footprints, Instances};
 use gs_io::Result;
+use gs_scene::ply;
 use hdbscan_exact::adjusted_rand;
 use serde::Serialize;
+use std::collections::BTreeMap;
 use std::path::Path;
 
-/// A cell of the matrix.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct Row {
-    /// The hostile scene.
     pub scene: String,
     /// The stage, or `render`: the renderer alone against its f64 reference.
     pub stage: String,
@@ -22,7 +22,6 @@ pub struct Row {
     /// scene; of the graph the relative change of the footprints (L1); of instances 1 - adjusted Rand index. None where only
     /// survival is asked.
     pub error: Option<f64>,
-    /// What it may be.
     pub tolerance: Option<f64>,
     /// Whether a number of the output is not finite.
     pub non_finite: bool,
@@ -35,9 +34,10 @@ pub struct Row {
 impl Case {
     fn row(&self, stage: &str, error: Option<f64>, tolerance: Option<f64>, ended: Outcome) -> Row {
         let (non_finite, note) = match ended {
-            Outcome::Finished { non_finite } => (non_finite, self.note.to_string()),
-            Outcome::Refused(said) => (false, format!("{}; refused: {said}", self.note)),
-            Outcome::Crashed(said) => (true, format!("{}; crashed: {said}", self.note)),
+            Ok(non_finite) => (non_finite, self.note.to_string()),
+            Err((crashed, said)) => {
+                (crashed, format!("{}; {}: {said}", self.note, if crashed { "crashed" } else { "refused" }))
+            }
         };
         let within = tolerance.is_none_or(|most| error.is_some_and(|e| e <= most));
         let (scene, stage, good) = (self.name.into(), stage.into(), within && !non_finite);
@@ -49,14 +49,11 @@ impl Case {
         let World { shots, gaussians, .. } = &self.world;
         let seen = shots.iter().step_by(shots.len().div_ceil(2)).map(|s| render_error(gaussians, &s.camera));
         let (error, non_finite) = seen.fold((0.0f64, false), |(e, b), (error, bad)| (e.max(error), b | bad));
-        self.row("render", Some(error), self.tolerances.render, Outcome::Finished { non_finite })
+        self.row("render", Some(error), self.tolerances.render, Ok(non_finite))
     }
 }
 
 /// Runs the matrix on a tiny synthetic scene in `folder`: the scenes whose name contains one of `only`, or all.
-///
-/// # Errors
-/// When the undisturbed scene cannot be made; what a hostile one does is a row.
 pub fn run(programs: &Programs, folder: &Path, only: &[String], said: &dyn Fn(&str)) -> Result<Vec<Row>> {
     let files = Files::of(&folder.join("base"));
     let scene = words("synth-scene --size tiny --views 12 --objects 6 --corruption mild");
@@ -82,18 +79,18 @@ struct Base {
     /// None where nothing is held out.
     psnr: Option<f64>,
     labels: Vec<i32>,
-    footprints: Vec<(u32, f32)>,
+    footprints: BTreeMap<u32, f64>,
 }
 
 /// Sum of weights of each Gaussian over all masks, by its number in the whole scene.
-fn weights(path: &Path) -> Result<Vec<(u32, f32)>> {
+fn weights(path: &Path) -> Result<BTreeMap<u32, f64>> {
     let f = Footprints::read(path)?;
     let (_, columns, values) = f.csr();
-    let mut sums = std::collections::BTreeMap::<u32, f64>::new();
+    let mut sums = BTreeMap::new();
     for (c, v) in columns.iter().zip(values) {
-        *sums.entry(f.kept[*c as usize]).or_default() += f64::from(*v);
+        *sums.entry(f.kept[*c as usize]).or_insert(0.0) += f64::from(*v);
     }
-    Ok(sums.into_iter().map(|(i, s)| (i, s as f32)).collect())
+    Ok(sums)
 }
 
 fn files_of(folder: &Path) -> Files {
@@ -128,8 +125,8 @@ impl Base {
         let mut rows = vec![case.rendered(), self.geometry(programs, case, folder)];
         let t = case.tolerances;
         for (stage, tolerance) in [(Stage::Graph, t.graph), (Stage::Features, None), (Stage::Instances, t.instances)] {
-            let ended = outcome(own.run(programs, stage, &case.options), || is_damaged(&own, stage));
-            let finished = matches!(ended, Outcome::Finished { .. });
+            let ended = outcome(own.run(programs, stage, &case.options), &own, stage);
+            let finished = ended.is_ok();
             let error = match stage {
                 Stage::Graph if finished && tolerance.is_some() => {
                     Some(self.footprint_change(&own, case.origin.as_deref())?)
@@ -154,7 +151,7 @@ impl Base {
             options.extend(["--init".into(), own.geometry.to_string_lossy().into_owned()]);
         }
         let options = case.options.clone().with(Stage::Geometry, options);
-        let ended = outcome(trained.run(programs, Stage::Geometry, &options), || is_damaged(&trained, Stage::Geometry));
+        let ended = outcome(trained.run(programs, Stage::Geometry, &options), &trained, Stage::Geometry);
         let tolerance = case.tolerances.geometry;
         let lost = self.psnr.zip(trained_psnr(&trained.geometry)).map(|(before, after)| (before - after).max(0.0));
         case.row("geometry", tolerance.and(lost), tolerance, ended)
@@ -164,8 +161,7 @@ impl Base {
     fn trained_on_the_undisturbed(&self, programs: &Programs, case: &Case, own: &Files) -> Result<Row> {
         inherit(&self.files, own, Stage::Features)?;
         let files = Files { geometry: self.files.geometry.clone(), ..own.clone() };
-        let ended =
-            outcome(files.run(programs, Stage::Features, &case.options), || is_damaged(&files, Stage::Features));
+        let ended = outcome(files.run(programs, Stage::Features, &case.options), &files, Stage::Features);
         Ok(case.row("features", None, None, ended))
     }
 
@@ -179,47 +175,31 @@ impl Base {
 
     /// Sum of absolute changes of the Gaussians' weights over their sum; of each one's share where it was divided.
     fn footprint_change(&self, own: &Files, origin: Option<&[u32]>) -> Result<f64> {
-        let mut now = std::collections::BTreeMap::<u32, f64>::new();
+        let mut now = BTreeMap::new();
         for (i, w) in weights(&own.footprints)? {
-            *now.entry(origin.map_or(i, |o| o[i as usize])).or_default() += f64::from(w);
+            *now.entry(origin.map_or(i, |o| o[i as usize])).or_insert(0.0) += w;
         }
-        let total: f64 = self.footprints.iter().map(|(_, w)| f64::from(*w)).sum();
+        let total: f64 = self.footprints.values().sum();
         let sum: f64 = now.values().sum();
         // Pixels may be of another size.
         let scale = total / sum.max(1e-300);
         let mut change = 0.0;
         for (i, w) in &self.footprints {
-            change += (scale * now.remove(i).unwrap_or(0.0) - f64::from(*w)).abs();
+            change += (scale * now.remove(i).unwrap_or(0.0) - w).abs();
         }
         Ok((change + scale * now.values().sum::<f64>()) / total)
     }
 }
 
-/// How a stage ended.
-enum Outcome {
-    Finished {
-        non_finite: bool,
-    },
-    /// With a message in one line.
-    Refused(String),
-    /// A panic, a signal, or an output that cannot be read.
-    Crashed(String),
-}
+/// How a stage ended: whether what it wrote holds a number that is not finite; or whether it crashed, by a panic, a signal or
+/// an output that cannot be read, rather than refused, and what it said.
+type Outcome = std::result::Result<bool, (bool, String)>;
 
-fn outcome<T>(run: Result<T>, damaged: impl FnOnce() -> Result<bool>) -> Outcome {
-    match run {
-        Ok(_) => match damaged() {
-            Ok(non_finite) => Outcome::Finished { non_finite },
-            Err(e) => Outcome::Crashed(e.to_string()),
-        },
-        Err(e) => {
-            let said = e.to_string();
-            if said.contains("panicked") || said.contains("signal") {
-                Outcome::Crashed(said)
-            } else {
-                Outcome::Refused(said)
-            }
-        }
+fn outcome<T>(run: Result<T>, files: &Files, stage: Stage) -> Outcome {
+    let said = run.err().map(|e| e.to_string());
+    match said {
+        None => is_damaged(files, stage).map_err(|e| (true, e.to_string())),
+        Some(said) => Err((said.contains("panicked") || said.contains("signal"), said)),
     }
 }
 
@@ -227,8 +207,11 @@ fn outcome<T>(run: Result<T>, damaged: impl FnOnce() -> Result<bool>) -> Outcome
 fn is_damaged(files: &Files, stage: Stage) -> Result<bool> {
     let output = files.output(stage);
     Ok(match stage {
-        Stage::Geometry => geometry_is_damaged(output)?,
-        Stage::Graph => weights(&files.footprints)?.iter().any(|(_, w)| !w.is_finite()),
+        Stage::Geometry => {
+            let g = ply::read_gaussians_as_they_are(output)?;
+            (0..g.len()).any(|i| !g.is_whole(i))
+        }
+        Stage::Graph => weights(&files.footprints)?.values().any(|w| !w.is_finite()),
         Stage::Features => Features::read(output)?.0.values.iter().any(|v| !v.is_finite()),
         Stage::Instances => {
             let i = Instances::read(output)?.0;

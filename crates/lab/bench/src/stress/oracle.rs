@@ -1,9 +1,7 @@
 //! What came out, against what should have.
 
-use gs_io::Result;
 use gs_raster::{RasterOptions, render, render_reference};
-use gs_scene::{Camera, Gaussians, ply};
-use std::path::Path;
+use gs_scene::{Camera, Gaussians};
 
 /// Largest difference of colour and alpha between the renderer and the reference in f64, over all pixels, beyond what the
 /// rounding of inputs to single precision must change (exponents whose terms cancel, and alphas at a cut); and whether a pixel
@@ -24,13 +22,4 @@ pub fn render_error(gaussians: &Gaussians, camera: &Camera) -> (f64, bool) {
         worst = worst.max((error - (e.doubt + e.rounding) * brightest).max(0.0));
     }
     (worst, !finite)
-}
-
-/// Whether a PLY of Gaussians holds a number that is not finite.
-///
-/// # Errors
-/// When it cannot be read.
-pub fn geometry_is_damaged(path: &Path) -> Result<bool> {
-    let g = ply::read_gaussians_as_they_are(path)?;
-    Ok((0..g.len()).any(|i| !g.is_whole(i)))
 }

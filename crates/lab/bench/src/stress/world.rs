@@ -10,13 +10,9 @@ use std::path::Path;
 /// A posed photograph with its masks.
 #[derive(Debug, Clone)]
 pub struct Shot {
-    /// File name without extension.
     pub stem: String,
-    /// Where it was taken.
     pub camera: Camera,
-    /// The photograph.
     pub image: Image,
-    /// Its masks.
     pub masks: MaskMaps,
 }
 
@@ -25,7 +21,6 @@ pub struct Shot {
 pub struct World {
     /// By name.
     pub shots: Vec<Shot>,
-    /// Sparse points.
     pub points: PointCloud,
     /// Gaussians; without harmonics, so that turning the world does not change their colours.
     pub gaussians: Gaussians,
@@ -33,9 +28,6 @@ pub struct World {
 
 impl World {
     /// Reads a scene, its masks and its geometry.
-    ///
-    /// # Errors
-    /// When a file is missing or damaged.
     pub fn read(scene: &Path, masks: &Path, geometry: &Path) -> Result<Self> {
         let dataset = load(scene, &LoadOptions { resolution: Resolution::Divisor(1.0), ..LoadOptions::default() })?;
         let shots = dataset.views.iter().map(|v| {
@@ -47,9 +39,6 @@ impl World {
     }
 
     /// Writes it as a COLMAP scene with `language_features`, and `geometry.ply` beside `scene`, in a folder.
-    ///
-    /// # Errors
-    /// When a file cannot be written.
     pub fn write(&self, folder: &Path) -> Result<()> {
         let scene = folder.join("scene");
         let (images, masks, sparse) = (scene.join("images"), scene.join("language_features"), scene.join("sparse/0"));
@@ -67,7 +56,6 @@ impl World {
     }
 
     /// The world scaled by `scale`, then turned, then moved: what the cameras see stays.
-    #[must_use]
     pub fn moved(mut self, scale: f64, turn: DQuat, shift: DVec3) -> Self {
         let place = |p: [f32; 3]| (turn * (DVec3::from(p.map(f64::from)) * scale) + shift).to_array().map(|v| v as f32);
         self.gaussians.means.iter_mut().for_each(|m| *m = place(*m));
@@ -89,14 +77,12 @@ impl World {
     }
 
     /// Gaussian `order[i]` at place `i`.
-    #[must_use]
     pub fn with_gaussians(mut self, order: &[u32]) -> Self {
         self.gaussians = self.gaussians.select(order);
         self
     }
 
     /// Masks with other ids: `id` becomes `count - 1 - id`, level by level as before.
-    #[must_use]
     pub fn with_mask_ids_reversed(mut self) -> Self {
         for s in &mut self.shots {
             let n = s.masks.width * s.masks.height;
@@ -111,7 +97,6 @@ impl World {
     }
 
     /// Views under other names, so that their order is the other way round. Held-out views stay the same ones.
-    #[must_use]
     pub fn with_views_reversed(mut self) -> Self {
         let n = self.shots.len();
         for (i, s) in self.shots.iter_mut().enumerate() {
@@ -122,7 +107,6 @@ impl World {
     }
 
     /// Photographs and masks of twice the width and height.
-    #[must_use]
     pub fn at_twice_the_size(mut self) -> Self {
         for s in &mut self.shots {
             let (w, h) = (s.image.width as usize, s.image.height as usize);
@@ -146,7 +130,6 @@ impl World {
     }
 
     /// Each Gaussian twice, each with the opacity that makes two of them what one was.
-    #[must_use]
     pub fn with_gaussians_halved(mut self) -> Self {
         let n = self.gaussians.len() as u32;
         let twice: Vec<u32> = (0..n).flat_map(|i| [i, i]).collect();
