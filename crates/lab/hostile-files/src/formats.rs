@@ -19,10 +19,8 @@ pub struct Format {
     pub(crate) check: fn(&[u8]),
     /// Makes the small good files.
     pub(crate) seeds: fn() -> Vec<Vec<u8>>,
-    /// Memory that readers may hold whatever the file's length, bytes.
-    pub(crate) fixed: usize,
-    /// Memory that readers may hold for each byte of the file.
-    pub(crate) factor: usize,
+    /// Bytes of memory that readers may hold whatever the file's length, and for each of its bytes.
+    pub(crate) memory: (usize, usize),
 }
 
 /// Buffers, the names of a dataset, and what libraries set up on first use.
@@ -36,25 +34,35 @@ const PICTURE: usize = 2_000 * 24;
 
 /// All formats.
 pub const FORMATS: [Format; 10] = [
-    Format { name: "ply", check: check_ply, seeds: seeds::ply, fixed: FIXED, factor: BINARY },
-    Format { name: "colmap_bin", check: check_colmap_bin, seeds: seeds::colmap_bin, fixed: FIXED, factor: BINARY },
-    Format { name: "colmap_txt", check: check_colmap_txt, seeds: seeds::colmap_txt, fixed: FIXED, factor: BINARY },
-    Format { name: "transforms", check: check_transforms, seeds: seeds::transforms, fixed: FIXED, factor: JSON },
-    Format { name: "npy", check: check_npy, seeds: seeds::npy, fixed: FIXED, factor: BINARY },
+    Format { name: "ply", check: check_ply, seeds: seeds::ply, memory: (FIXED, BINARY) },
+    Format {
+        name: "colmap_bin",
+        check: |bytes| check_colmap("colmap_bin", "bin", bytes),
+        seeds: seeds::colmap_bin,
+        memory: (FIXED, BINARY),
+    },
+    Format {
+        name: "colmap_txt",
+        check: |bytes| check_colmap("colmap_txt", "txt", bytes),
+        seeds: seeds::colmap_txt,
+        memory: (FIXED, BINARY),
+    },
+    Format { name: "transforms", check: check_transforms, seeds: seeds::transforms, memory: (FIXED, JSON) },
+    Format { name: "npy", check: check_npy, seeds: seeds::npy, memory: (FIXED, BINARY) },
     // One array of 16 MiB is believed, then 64 bytes a byte; of one-byte numbers, as floats.
-    Format { name: "npz", check: check_npz, seeds: seeds::npz, fixed: 7 << 24, factor: JSON + 64 * 5 },
-    Format { name: "artifact", check: check_artifact, seeds: seeds::artifact, fixed: FIXED, factor: JSON },
+    Format { name: "npz", check: check_npz, seeds: seeds::npz, memory: (7 << 24, JSON + 64 * 5) },
+    Format { name: "artifact", check: check_artifact, seeds: seeds::artifact, memory: (FIXED, JSON) },
     // Polygons stand for pictures of the size that the file names; all of a frame have 2^28 pixels at most.
-    Format { name: "labels", check: check_labels, seeds: seeds::labels, fixed: FIXED + (1 << 28), factor: JSON },
-    Format { name: "scannet", check: check_scannet, seeds: seeds::scannet, fixed: FIXED, factor: JSON },
+    Format { name: "labels", check: check_labels, seeds: seeds::labels, memory: (FIXED + (1 << 28), JSON) },
+    Format { name: "scannet", check: check_scannet, seeds: seeds::scannet, memory: (FIXED, JSON) },
     // Writing takes a buffer of a megabyte for each file.
-    Format { name: "id_png", check: check_id_png, seeds: seeds::id_png, fixed: 4 * FIXED, factor: PICTURE },
+    Format { name: "id_png", check: check_id_png, seeds: seeds::id_png, memory: (4 * FIXED, PICTURE) },
 ];
 
 const FULL: LoadOptions = LoadOptions { resolution: Resolution::Divisor(1.0), holdout: 8 };
 
 /// A folder of this process with the good files that stand beside a damaged one.
-fn folder() -> &'static Path {
+pub(crate) fn folder() -> &'static Path {
     static MADE: OnceLock<tempfile::TempDir> = OnceLock::new();
     let dir = MADE.get_or_init(|| {
         // In memory where the system has such a place.
@@ -102,11 +110,6 @@ const SCANNET: [&str; 5] = [
     "scannet/intrinsic/intrinsic_color.txt",
     "scannet/pose/1.txt",
 ];
-
-/// Makes what stands beside damaged files, so that it is not counted.
-pub(crate) fn prepare() {
-    folder();
-}
 
 /// Puts the bytes at a place in the folder for as long as `read` runs; the good file comes back afterwards.
 fn with(name: &str, bytes: &[u8], read: impl FnOnce(&Path)) {
@@ -178,17 +181,9 @@ fn check_part(files: &[String], bytes: &[u8], read: impl FnOnce(&Path)) {
     with(&files[usize::from(which) % files.len()], bytes, read);
 }
 
-fn colmap(scene: &str, ext: &str, bytes: &[u8]) {
+fn check_colmap(scene: &str, ext: &str, bytes: &[u8]) {
     let files = ["cameras", "images", "points3D"].map(|name| format!("{scene}/sparse/0/{name}.{ext}"));
     check_part(&files, bytes, |_| check_scene(&folder().join(scene)));
-}
-
-fn check_colmap_bin(bytes: &[u8]) {
-    colmap("colmap_bin", "bin", bytes);
-}
-
-fn check_colmap_txt(bytes: &[u8]) {
-    colmap("colmap_txt", "txt", bytes);
 }
 
 fn check_transforms(bytes: &[u8]) {

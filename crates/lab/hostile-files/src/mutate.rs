@@ -5,11 +5,9 @@ struct Dice(u64);
 
 impl Dice {
     fn next(&mut self) -> u64 {
+        let drawn = gs_io::mixed(self.0);
         self.0 = self.0.wrapping_add(0x9e37_79b9_7f4a_7c15);
-        let mut z = self.0;
-        z = (z ^ (z >> 30)).wrapping_mul(0xbf58_476d_1ce4_e5b9);
-        z = (z ^ (z >> 27)).wrapping_mul(0x94d0_49bb_1331_11eb);
-        z ^ (z >> 31)
+        drawn
     }
 
     fn below(&mut self, n: usize) -> usize {
