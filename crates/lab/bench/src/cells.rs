@@ -98,11 +98,7 @@ fn add(tasks: &mut Tasks, plan: &Plan, files: &Files, (scene, seed): (&Scene, u6
     let features = tasks.add(3, Task::new(files.features.clone(), features, &[&graph]));
     let instances = run(Stage::Instances, plan.options_of("clustering", &row.clustering));
     let instances = tasks.add(4, Task::new(files.instances.clone(), instances, &[&features]));
-    let mut score = files.scoring();
-    if !files.texts.exists() {
-        score.extend(command(&[], &[("--text-features", &files.texts)]));
-    }
-    tasks.add(5, Task::new(files.score.clone(), score, &[&instances]));
+    tasks.add(5, Task::new(files.score.clone(), files.scoring(), &[&instances]));
 }
 
 /// Runs what the plan's tables need and is not there yet.

@@ -64,7 +64,6 @@ impl Options {
     }
 
     /// The same with other options of one stage.
-    #[must_use]
     pub fn with(mut self, stage: Stage, options: Vec<String>) -> Self {
         self.0.insert(stage, options);
         self
@@ -89,14 +88,6 @@ pub struct Cost {
     pub cpu: f64,
     /// Peak memory in bytes; 0 where the record of the run does not say.
     pub peak: u64,
-}
-
-impl std::ops::Add for Cost {
-    type Output = Self;
-
-    fn add(self, other: Self) -> Self {
-        Self { wall: self.wall + other.wall, cpu: self.cpu + other.cpu, peak: self.peak.max(other.peak) }
-    }
 }
 
 /// Where the programs are, and how many threads they get.
@@ -159,7 +150,6 @@ impl Files {
     }
 
     /// The same scene, masks and geometry; everything after them in another folder.
-    #[must_use]
     pub fn within(&self, folder: &Path) -> Self {
         let own = |path: &Path| folder.join(path.file_name().unwrap_or_default());
         Self {
@@ -201,10 +191,7 @@ impl Files {
     /// The command line of the score.
     pub fn scoring(&self) -> Vec<String> {
         let mut files = vec![("--scene", &*self.scene), ("--geometry", &*self.geometry)];
-        files.extend([("--instances", &*self.instances), ("--out", &*self.score)]);
-        if self.texts.exists() {
-            files.push(("--text-features", &self.texts));
-        }
+        files.extend([("--instances", &*self.instances), ("--out", &*self.score), ("--text-features", &*self.texts)]);
         command(&["eval", "score"], &files)
     }
 

@@ -4,7 +4,7 @@ use crate::chain::{Cost, Files, Options, Programs, STAGES, Stage, command, read_
 use crate::plan::{Knob, Plan, Scene};
 use crate::task::Task;
 use artifacts::Instances;
-use gs_io::{Error, Result, create_dir, write_json};
+use gs_io::{Error, IoContext, Result, create_dir, write_json};
 use hdbscan_exact::adjusted_rand;
 use serde::{Deserialize, Serialize};
 use serde_json::Value;
@@ -131,10 +131,10 @@ pub fn prepare(programs: &Programs, scene: &Scene, folder: &Path) -> Result<File
 
 /// Runs the stages from `first` on, and says what they cost together.
 fn from(files: &Files, programs: &Programs, first: Stage, options: &Options) -> Result<Cost> {
-    STAGES
-        .into_iter()
-        .filter(|s| *s >= first)
-        .try_fold(Cost::default(), |sum, s| Ok(sum + files.run(programs, s, options)?))
+    STAGES.into_iter().filter(|s| *s >= first).try_fold(Cost::default(), |sum, s| {
+        let own = files.run(programs, s, options)?;
+        Ok(Cost { wall: sum.wall + own.wall, cpu: sum.cpu + own.cpu, peak: sum.peak.max(own.peak) })
+    })
 }
 
 /// Measures a knob on a scene whose earlier stages have run. What was measured before with the same options is kept.
@@ -217,16 +217,15 @@ fn merged(scene: &Options, setting: &Options) -> Options {
 
 /// Gives `own` what the stages before `first` made in `base`.
 pub fn inherit(base: &Files, own: &Files, first: Stage) -> Result<()> {
-    let copy = |stage: Stage, from: &Path, to: &Path| match stage < first {
-        false => Ok(()),
-        true => {
-            create_dir(to.parent().unwrap_or(Path::new(".")))?;
-            std::fs::copy(from, to).map(|_| ()).map_err(|e| Error::new(format!("cannot copy: {e}")).file(from))
-        }
-    };
-    copy(Stage::Graph, &base.graph, &own.graph)?;
-    copy(Stage::Graph, &base.footprints, &own.footprints)?;
-    copy(Stage::Features, &base.features, &own.features)
+    let made = [
+        (Stage::Graph, &base.graph, &own.graph),
+        (Stage::Graph, &base.footprints, &own.footprints),
+        (Stage::Features, &base.features, &own.features),
+    ];
+    made.into_iter().filter(|(stage, ..)| *stage < first).try_for_each(|(_, from, to)| {
+        create_dir(to.parent().unwrap_or(Path::new(".")))?;
+        std::fs::copy(from, to).map(|_| ()).at("copy", from)
+    })
 }
 
 fn quality(programs: &Programs, knob: &Knob, own: &Files, exact: &Files) -> Result<Quality> {
