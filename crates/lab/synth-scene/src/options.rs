@@ -108,18 +108,13 @@ const MOST_IN_STUDIO: usize = 60;
 const LABEL_EVERY: usize = 4;
 
 impl Corruption {
-    fn faults(self) -> Faults {
+    /// The faults of masks and of features.
+    fn faults(self) -> (Faults, Speech) {
+        let mild = Faults { granularity: 0.3, boundary: 1, missing: 0.05, spurious: 0.0 };
         match self {
-            Self::Exact => Faults::default(),
-            Self::Mild => Faults { granularity: 0.3, boundary: 1, missing: 0.05, spurious: 0.0 },
-            Self::Sam => Faults { granularity: 0.5, boundary: 1, missing: 0.05, spurious: 0.15 },
-        }
-    }
-
-    fn speech(self) -> Speech {
-        match self {
-            Self::Exact | Self::Mild => Speech::default(),
-            Self::Sam => Speech { leaking: 0.1, noise: 0.5 },
+            Self::Exact => (Faults::default(), Speech::default()),
+            Self::Mild => (mild, Speech::default()),
+            Self::Sam => (Faults { granularity: 0.5, spurious: 0.15, ..mild }, Speech { leaking: 0.1, noise: 0.5 }),
         }
     }
 }
@@ -188,7 +183,7 @@ impl Args {
                 .expected(format!("1 to {MOST_IN_STUDIO}"))
                 .hint("choose another --family"));
         }
-        let faults = self.corruption.faults();
+        let (faults, speech) = self.corruption.faults();
         Ok(Options {
             seed,
             family: self.family,
@@ -203,7 +198,7 @@ impl Args {
                 missing: self.missing.unwrap_or(faults.missing),
                 spurious: self.spurious.unwrap_or(faults.spurious),
             },
-            speech: self.features.then(|| self.corruption.speech()),
+            speech: self.features.then_some(speech),
             pose_noise: self.pose_noise,
             layout: self.out.as_deref().map_or(Ok(Layout::Colmap), |out| Layout::new(self.layout, out))?,
             ..size

@@ -37,8 +37,14 @@ const MIRROR_NEAR: f64 = 1e-4;
 pub fn identify(scene: &Scene, camera: &Camera) -> Frame {
     let (w, h) = (camera.width as usize, camera.height as usize);
     let eye = camera.position();
-    let pixels: Vec<(i32, i32, f64)> =
-        (0..w * h).into_par_iter().with_min_len(w).map(|at| shown(scene, camera, eye, at % w, at / w)).collect();
+    let pixel = |at: usize| {
+        let direction = ray(camera, (at % w) as f64 + 0.5, (at / w) as f64 + 0.5);
+        scene.trace(eye, direction, 0.0).map_or((-1, -1, f64::INFINITY), |hit| {
+            let p = &scene.primitives[hit.primitive];
+            (p.thing as i32, p.part as i32, hit.t)
+        })
+    };
+    let pixels: Vec<(i32, i32, f64)> = (0..w * h).into_par_iter().with_min_len(w).map(pixel).collect();
     Frame {
         width: w,
         height: h,
@@ -46,17 +52,6 @@ pub fn identify(scene: &Scene, camera: &Camera) -> Frame {
         thing: pixels.iter().map(|p| p.0).collect(),
         part: pixels.iter().map(|p| p.1).collect(),
         distance: pixels.iter().map(|p| p.2).collect(),
-    }
-}
-
-/// Thing, part and distance at a pixel's centre.
-fn shown(scene: &Scene, camera: &Camera, eye: DVec3, x: usize, y: usize) -> (i32, i32, f64) {
-    match scene.trace(eye, ray(camera, x as f64 + 0.5, y as f64 + 0.5), 0.0) {
-        Some(hit) => {
-            let p = &scene.primitives[hit.primitive];
-            (p.thing as i32, p.part as i32, hit.t)
-        }
-        None => (-1, -1, f64::INFINITY),
     }
 }
 

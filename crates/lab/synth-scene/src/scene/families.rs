@@ -101,20 +101,24 @@ fn kitchen(objects: usize, growth: f64, rng: &mut ChaCha8Rng) -> Option<Scene> {
     let at = DVec3::new(0.0, p.half.y - 0.5 * COUNTER[0] - 0.03, 0.0);
     let counter = Identity { name: "counter".into(), class: "counter", color: "grey", background: true };
     p.put(&model, counter, at, 0.0);
-    let mut left = objects;
     // What is built in, as far as the number of things allows; half of them at least stand about.
-    let fixed = |left: &mut usize, p: &mut Planner<'_>, place: &dyn Fn(&mut Planner<'_>) -> Option<()>| {
-        (*left > objects / 2).then(|| place(p).map(|()| *left -= 1)).flatten()
-    };
-    for class in [&SINK, &STOVE] {
-        fixed(&mut left, &mut p, &|p| p.stand(class, Some(0), 1.0));
-    }
-    fixed(&mut left, &mut p, &|p| p.along_wall(&ALONG_WALLS[5], Some(0)));
     let places = (length / 1.25) as usize;
-    for k in 0..places {
-        let along = length * ((k as f64 + 0.5) / places as f64 - 0.5);
-        let (class, height) = if k % 2 == 0 { &SHELF } else { &WALL_CABINET };
-        fixed(&mut left, &mut p, &|p| p.hang(class, *height, Some((0, along))));
+    let mut left = objects;
+    for k in 0..3 + places {
+        if left <= objects / 2 {
+            break;
+        }
+        let placed = match k {
+            0 => p.stand(&SINK, Some(0), 1.0),
+            1 => p.stand(&STOVE, Some(0), 1.0),
+            2 => p.along_wall(&ALONG_WALLS[5], Some(0)),
+            _ => {
+                let along = length * ((k as f64 - 2.5) / places as f64 - 0.5);
+                let (class, height) = if k % 2 == 1 { &SHELF } else { &WALL_CABINET };
+                p.hang(class, *height, Some((0, along)))
+            }
+        };
+        left -= usize::from(placed.is_some());
     }
     let kitchen = ["toy", "puzzle", "clock", "gift", "headphones", "laptop", "row of", "pencil"];
     let classes: Vec<&'static Class> = CLASSES
@@ -222,7 +226,9 @@ impl<'a> Planner<'a> {
             }
             let paint = &PAINTS[paints[self.rng.random_range(0..paints.len())]];
             let other = &PAINTS[self.palette[self.rng.random_range(0..PALETTE)]];
-            let (model, words) = dress(class.make(paint, self.rng).scaled(scale), paint, other, sized, self.rng);
+            let mut model = class.make(paint, self.rng);
+            model.scale(scale);
+            let words = dress(&mut model, paint, other, sized, self.rng);
             let plain = name_of(class, paint.name, true);
             let mut name = [&words[..], &[plain.as_str()]].concat().join(" ");
             if attempt > 60 {

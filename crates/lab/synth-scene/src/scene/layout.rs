@@ -53,7 +53,17 @@ pub fn plan(objects: usize, rng: &mut ChaCha8Rng) -> Scene {
         tables += 1;
     };
     let mut scene = Scene::default();
-    background(&mut scene, &centres, room, rng);
+    enclose(&mut scene, room);
+    for (k, &centre) in centres.iter().enumerate() {
+        let table = furniture::table(TABLE, TABLE_HEIGHT, 0.85 + 0.3 * rng.random::<f64>());
+        let name = match k {
+            0 => "table".to_string(),
+            1..=9 => format!("{} table", ORDINALS[k - 1]),
+            _ => format!("table {}", k + 1),
+        };
+        let who = Identity { name, class: "table", color: "brown", background: true };
+        scene.place(&table, who, centre.extend(0.0), 0.0);
+    }
     for c in &chosen {
         let Some((position, yaw)) = c.at else { continue };
         let repeated = chosen.iter().filter(|d| d.class.name == c.class.name).count() > 1;
@@ -170,24 +180,6 @@ fn arrange(chosen: &mut [Chosen], tables: &[DVec2], room: DVec2, rng: &mut ChaCh
         }
     }
     true
-}
-
-fn background(scene: &mut Scene, tables: &[DVec2], room: DVec2, rng: &mut ChaCha8Rng) {
-    enclose(scene, room);
-    for (k, &centre) in tables.iter().enumerate() {
-        let table = furniture::table(TABLE, TABLE_HEIGHT, 0.85 + 0.3 * rng.random::<f64>());
-        let name = match k {
-            0 => "table".to_string(),
-            1..=9 => format!("{} table", ORDINALS[k - 1]),
-            _ => format!("table {}", k + 1),
-        };
-        scene.place(
-            &table,
-            Identity { name, class: "table", color: "brown", background: true },
-            centre.extend(0.0),
-            0.0,
-        );
-    }
 }
 
 #[cfg(test)]

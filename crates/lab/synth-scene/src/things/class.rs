@@ -5,12 +5,9 @@ use crate::things::model::Model;
 use glam::{DMat3, DVec3};
 use rand_chacha::ChaCha8Rng;
 
-/// Where a thing stands.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Place {
-    /// On a table.
     Table,
-    /// On the floor.
     Floor,
     /// On a wall; its back is at y = 0 and it faces -y.
     Wall,

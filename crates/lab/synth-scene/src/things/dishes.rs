@@ -88,12 +88,8 @@ pub(super) fn bowl_of_fruit(m: &mut Model, paint: &Paint, rng: &mut ChaCha8Rng) 
         let at = if k < 3 { [0.058 * a.cos(), 0.058 * a.sin(), 0.092] } else { [0.0, 0.0, 0.155] };
         m.part(name).add_turned(Shape::Ellipsoid { radii }, at, DMat3::from_rotation_z(a), skin);
         if name.contains("apple") {
-            m.rod(
-                [at[0], at[1], at[2] + 0.038],
-                [at[0] + 0.008, at[1], at[2] + 0.058],
-                0.003,
-                matt([0.46, 0.30, 0.18]),
-            );
+            let [x, y, z] = at;
+            m.rod([x, y, z + 0.038], [x + 0.008, y, z + 0.058], 0.003, matt([0.46, 0.30, 0.18]));
         }
     }
 }
@@ -107,19 +103,11 @@ pub(super) fn kettle(m: &mut Model, paint: &Paint, rng: &mut ChaCha8Rng) {
     );
     m.part("body").lathe(&profile, enamel);
     let out = DVec3::new(0.62, 0.0, 0.78);
-    m.part("spout").turn_rotated(
-        &[(0.026, 0.0), (0.013, 0.09), (0.009, 0.09), (0.012, 0.06), (0.0, 0.06)],
-        [0.075, 0.0, 0.055],
-        z_towards(out),
-        enamel,
-    );
+    let spout = [(0.026, 0.0), (0.013, 0.09), (0.009, 0.09), (0.012, 0.06), (0.0, 0.06)];
+    m.part("spout").turn_rotated(&spout, [0.075, 0.0, 0.055], z_towards(out), enamel);
     let dark = matt([0.20, 0.18, 0.17]).gleaming(0.08);
-    m.part("handle").add_turned(
-        Shape::Ring { major: 0.072, minor: 0.010, arc: 1.75 },
-        [0.0, 0.0, 0.150],
-        tip(90.0) * DMat3::from_rotation_z(FRAC_PI_2),
-        dark,
-    );
+    let ring = Shape::Ring { major: 0.072, minor: 0.010, arc: 1.75 };
+    m.part("handle").add_turned(ring, [0.0, 0.0, 0.150], tip(90.0) * DMat3::from_rotation_z(FRAC_PI_2), dark);
     m.part("lid")
         .lathe(&[(0.050, 0.146), (0.050, 0.152), (0.035, 0.160), (0.0, 0.163)], enamel.in_color(enamel.albedo * 0.8));
     m.add(Shape::sphere(0.013), [0.0, 0.0, 0.172], dark);
@@ -134,10 +122,8 @@ pub(super) fn bottle(m: &mut Model, paint: &Paint, rng: &mut ChaCha8Rng) {
         [0.0, 0.0, 0.008, 0.17, 0.20, 0.225, 0.25, 0.29, 0.29],
     );
     m.part("body").lathe(&profile, glass);
-    m.part("label").lathe(
-        &[(0.0455, 0.06), (0.0455, 0.14)],
-        Material::matt(ivory()).with(Pattern::Stripes { other: paint.albedo() * 0.6 + 0.3, across: DVec3::Z * 25.0 }),
-    );
+    let print = Pattern::Stripes { other: paint.albedo() * 0.6 + 0.3, across: DVec3::Z * 25.0 };
+    m.part("label").lathe(&[(0.0455, 0.06), (0.0455, 0.14)], Material::matt(ivory()).with(print));
     m.part("cap").lathe(&[(0.020, 0.275), (0.020, 0.305), (0.016, 0.309), (0.0, 0.309)], matt([0.85, 0.70, 0.30]));
     m.scale(k);
 }
@@ -172,15 +158,11 @@ pub(super) fn glass(m: &mut Model, paint: &Paint, rng: &mut ChaCha8Rng) {
 
 pub(super) fn jar(m: &mut Model, paint: &Paint, rng: &mut ChaCha8Rng) {
     let (r, h) = (0.045 * vary(rng, 0.15), 0.11 * vary(rng, 0.2));
-    m.part("body").lathe(
-        &[(0.0, 0.0), (0.95 * r, 0.0), (r, 0.008), (r, 0.85 * h), (0.8 * r, h), (0.0, h)],
-        paint.matt().gleaming(0.2),
-    );
+    let body = [(0.0, 0.0), (0.95 * r, 0.0), (r, 0.008), (r, 0.85 * h), (0.8 * r, h), (0.0, h)];
+    m.part("body").lathe(&body, paint.matt().gleaming(0.2));
     m.part("lid").lathe(&[(0.86 * r, h - 0.002), (0.86 * r, h + 0.018), (0.0, h + 0.018)], matt([0.85, 0.80, 0.72]));
-    m.part("label").lathe(
-        &[(1.008 * r, 0.22 * h), (1.008 * r, 0.65 * h)],
-        Material::matt(ivory()).with(Pattern::Stripes { other: paint.albedo(), across: DVec3::Z * 30.0 }),
-    );
+    let print = Pattern::Stripes { other: paint.albedo(), across: DVec3::Z * 30.0 };
+    m.part("label").lathe(&[(1.008 * r, 0.22 * h), (1.008 * r, 0.65 * h)], Material::matt(ivory()).with(print));
     m.top([0.0, 0.0], [0.6 * r, 0.6 * r], h + 0.0185);
 }
 
@@ -188,10 +170,8 @@ pub(super) fn pot(m: &mut Model, paint: &Paint, rng: &mut ChaCha8Rng) {
     let k = vary(rng, 0.12);
     let enamel = paint.matt().gleaming(0.2);
     m.part("body").lathe(&[(0.0, 0.0), (0.10, 0.0), (0.108, 0.010), (0.11, 0.11), (0.105, 0.11)], enamel);
-    m.part("lid").lathe(
-        &[(0.107, 0.112), (0.104, 0.120), (0.05, 0.132), (0.0, 0.134)],
-        enamel.in_color(enamel.albedo * 0.7 + 0.1),
-    );
+    let lid = enamel.in_color(enamel.albedo * 0.7 + 0.1);
+    m.part("lid").lathe(&[(0.107, 0.112), (0.104, 0.120), (0.05, 0.132), (0.0, 0.134)], lid);
     m.add(Shape::sphere(0.016), [0.0, 0.0, 0.146], matt([0.15; 3]));
     m.part("handles");
     for side in [-1.0, 1.0] {

@@ -20,42 +20,24 @@ const PAINTED: f64 = 0.97;
 
 /// Changes size, pattern and shine of a model at random; gives the words that tell it from its like, such as
 /// "small shiny striped". Furniture is not `sized`: it keeps its size and is no mirror.
-pub fn dress(
-    model: Model,
-    paint: &Paint,
-    other: &Paint,
-    sized: bool,
-    rng: &mut ChaCha8Rng,
-) -> (Model, Vec<&'static str>) {
+pub fn dress(model: &mut Model, paint: &Paint, other: &Paint, sized: bool, rng: &mut ChaCha8Rng) -> Vec<&'static str> {
     let draws: [f64; 4] = rng.random();
     let mut words = Vec::new();
-    let mut model = match draws[0] {
-        d if sized && d < SMALL => {
-            words.push("small");
-            model.scaled(SIZES[0])
-        }
-        d if sized && d < SMALL + LARGE => {
-            words.push("large");
-            model.scaled(SIZES[1])
-        }
-        _ => model,
-    };
+    if sized && draws[0] < SMALL + LARGE {
+        let small = draws[0] < SMALL;
+        words.push(if small { "small" } else { "large" });
+        model.scale(if small { SIZES[0] } else { SIZES[1] });
+    }
     let painted = |albedo: DVec3| albedo.normalize_or_zero().dot(paint.albedo().normalize_or_zero()) > PAINTED;
     let plain = |p: Pattern| matches!(p, Pattern::Clouds { .. });
-    let surfaces: Vec<usize> = (0..model.pieces.len())
-        .filter(|&i| {
-            let m = &model.pieces[i].material;
-            painted(m.albedo) && plain(m.pattern) && m.glow == 0.0
-        })
-        .collect();
+    let surfaces = model.pieces.iter_mut().map(|piece| &mut piece.material);
+    let mut surfaces: Vec<_> = surfaces.filter(|m| painted(m.albedo) && plain(m.pattern) && m.glow == 0.0).collect();
     if surfaces.is_empty() {
-        return (model, words);
+        return words;
     }
     if sized && draws[1] < SHINY {
         words.push("shiny");
-        for &i in &surfaces {
-            (model.pieces[i].material.specular, model.pieces[i].material.mirror) = (GLEAM[0], GLEAM[1]);
-        }
+        surfaces.iter_mut().for_each(|m| (m.specular, m.mirror) = (GLEAM[0], GLEAM[1]));
     }
     if draws[2] < PATTERNED {
         let (striped, other) = (draws[3] < 0.6, other.albedo() * 0.8 + 0.1);
@@ -64,9 +46,7 @@ pub fn dress(
             true => Pattern::Stripes { other, across: DVec3::new(6.0, 4.0, 16.0) },
             false => Pattern::Checks { other, size: 0.035 },
         };
-        for &i in &surfaces {
-            model.pieces[i].material.pattern = pattern;
-        }
+        surfaces.iter_mut().for_each(|m| m.pattern = pattern);
     }
-    (model, words)
+    words
 }

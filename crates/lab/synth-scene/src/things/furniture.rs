@@ -193,11 +193,8 @@ pub(super) fn stove(m: &mut Model, paint: &Paint, rng: &mut ChaCha8Rng) {
     m.part("top").block([w, d, 0.02], 0.004, [0.0; 3], paint.matt().gleaming(0.2));
     let iron = matt([0.30, 0.28, 0.28]);
     for (x, y) in [(-1.0, -1.0), (1.0, -1.0), (-1.0, 1.0), (1.0, 1.0)] {
-        m.part("hot plate").turn(
-            &[(0.085, 0.02), (0.083, 0.026), (0.0, 0.026)],
-            [x * 0.25 * w, y * 0.24 * d, 0.0],
-            iron,
-        );
+        let plate = [(0.085, 0.02), (0.083, 0.026), (0.0, 0.026)];
+        m.part("hot plate").turn(&plate, [x * 0.25 * w, y * 0.24 * d, 0.0], iron);
     }
     m.top([0.0, 0.0], [0.42 * w, 0.42 * d], 0.0265);
 }

@@ -114,12 +114,6 @@ impl Model {
         self.tops.push(Top { centre, half, height, room });
     }
 
-    /// The same model `factor` times as large.
-    pub fn scaled(mut self, factor: f64) -> Self {
-        self.scale(factor);
-        self
-    }
-
     /// Makes the model `factor` times as large.
     pub fn scale(&mut self, factor: f64) {
         for piece in &mut self.pieces {
@@ -134,20 +128,16 @@ impl Model {
         }
     }
 
-    /// Corners of the boxes around all pieces, in the model's frame.
-    fn corners(&self) -> impl Iterator<Item = DVec3> {
-        self.pieces.iter().flat_map(|piece| {
+    /// Half extents in x and y of an upright box around the origin that holds the model, and its height.
+    pub fn extent(&self) -> (f64, f64, f64) {
+        let corners = self.pieces.iter().flat_map(|piece| {
             let (half, centre) = piece.shape.bounds();
             (0..8).map(move |k| {
                 let sign = DVec3::new(f64::from(k & 1), f64::from(k >> 1 & 1), f64::from(k >> 2 & 1)) * 2.0 - 1.0;
                 piece.rotation * (centre + half * sign) + piece.offset
             })
-        })
-    }
-
-    /// Half extents in x and y of an upright box around the origin that holds the model, and its height.
-    pub fn extent(&self) -> (f64, f64, f64) {
-        self.corners().fold((0.0, 0.0, 0.0), |(x, y, z), c| (c.x.abs().max(x), c.y.abs().max(y), c.z.max(z)))
+        });
+        corners.fold((0.0, 0.0, 0.0), |(x, y, z), c| (c.x.abs().max(x), c.y.abs().max(y), c.z.max(z)))
     }
 }
 
@@ -197,7 +187,8 @@ mod tests {
     fn scaling_scales_the_extent() {
         let mut m = Model::default();
         m.part("box").block([0.2, 0.4, 0.6], 0.01, [0.0; 3], Material::matt(DVec3::ONE));
-        let (x, y, z) = m.scaled(2.0).extent();
+        m.scale(2.0);
+        let (x, y, z) = m.extent();
         assert!((x - 0.2).abs() < 1e-12 && (y - 0.4).abs() < 1e-12 && (z - 1.2).abs() < 1e-12);
     }
 }

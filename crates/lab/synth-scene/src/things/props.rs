@@ -52,12 +52,8 @@ pub(super) fn books(m: &mut Model, paint: &Paint, rng: &mut ChaCha8Rng) {
         let cover = Material::matt((paint.albedo() * shade + [0.0, 0.03, 0.0][k]).min(DVec3::splat(0.9)))
             .with(Pattern::Pages { other: ivory(), inner: half - DVec3::new(0.004, 0.004, 0.005) });
         let angle = 0.35 * (rng.random::<f64>() - 0.5);
-        m.part(name).add_turned(
-            Shape::Block { half, round: 0.002 },
-            [0.0, 0.0, z + half.z],
-            DMat3::from_rotation_z(angle),
-            cover,
-        );
+        let block = Shape::Block { half, round: 0.002 };
+        m.part(name).add_turned(block, [0.0, 0.0, z + half.z], DMat3::from_rotation_z(angle), cover);
         z += size[2] + 0.0005;
     }
     m.top([0.0, 0.0], [0.08, 0.05], z);
@@ -87,12 +83,8 @@ pub(super) fn book(m: &mut Model, paint: &Paint, rng: &mut ChaCha8Rng) {
     let half = 0.5 * DVec3::from_array(size);
     let pages = Pattern::Pages { other: ivory(), inner: half - DVec3::new(0.004, 0.004, 0.005) };
     m.part("cover").block(size, 0.002, [0.0; 3], paint.matt().with(pages));
-    m.part("title").block(
-        [0.5 * size[0], 0.25 * size[1], 0.001],
-        0.0,
-        [0.0, 0.2 * size[1], size[2]],
-        Material::matt(ivory()),
-    );
+    let (title, at) = ([0.5 * size[0], 0.25 * size[1], 0.001], [0.0, 0.2 * size[1], size[2]]);
+    m.part("title").block(title, 0.0, at, Material::matt(ivory()));
     m.top([0.0, -0.05 * size[1]], [0.45 * size[0], 0.4 * size[1]], size[2] + 0.0015);
 }
 
@@ -131,12 +123,8 @@ pub(super) fn plant(m: &mut Model, paint: &Paint, rng: &mut ChaCha8Rng) {
         let length = 0.10 - 0.003 * t;
         let centre = DVec3::new(0.0, 0.0, 0.10) + out * length;
         let green = albedo([0.22 + 0.015 * t, 0.50 + 0.012 * t, 0.20]);
-        m.add_turned(
-            Shape::ellipsoid([0.026, 0.007, length]),
-            centre.to_array(),
-            z_towards(out),
-            Material::matt(green),
-        );
+        let leaf = Shape::ellipsoid([0.026, 0.007, length]);
+        m.add_turned(leaf, centre.to_array(), z_towards(out), Material::matt(green));
     }
     m.scale(vary(rng, 0.08));
 }
@@ -157,12 +145,8 @@ pub(super) fn vase(m: &mut Model, paint: &Paint, rng: &mut ChaCha8Rng) {
         let out = 0.05 + 0.012 * f64::from(j % 2);
         let head = [out * a.cos(), out * a.sin(), 0.25 + 0.02 * f64::from(j % 3)];
         m.again("stems").rod([0.0, 0.0, 0.10], head, 0.003, matt([0.25, 0.50, 0.22]));
-        m.again("flowers").add_turned(
-            Shape::ellipsoid([0.026, 0.026, 0.012]),
-            head,
-            z_towards(DVec3::new(a.cos(), a.sin(), 1.5)),
-            Material::matt(petals),
-        );
+        let (flower, up) = (Shape::ellipsoid([0.026, 0.026, 0.012]), z_towards(DVec3::new(a.cos(), a.sin(), 1.5)));
+        m.again("flowers").add_turned(flower, head, up, Material::matt(petals));
         m.add(Shape::sphere(0.010), [head[0], head[1], head[2] + 0.008], Material::matt(PAINTS[3].albedo()));
     }
     m.scale(k);
@@ -186,18 +170,10 @@ pub(super) fn clock(m: &mut Model, paint: &Paint, rng: &mut ChaCha8Rng) {
     let (r, y) = (0.075, 0.028);
     let forward = tip(90.0);
     let lacquer = paint.matt().gleaming(0.12);
-    m.part("case").turn_rotated(
-        &[(0.0, -y), (0.9 * r, -y), (r, -0.6 * y), (r, y), (0.88 * r, y + 0.004), (0.88 * r, y - 0.004)],
-        [0.0, 0.0, 0.093],
-        forward,
-        lacquer,
-    );
-    m.part("face").turn_rotated(
-        &[(0.88 * r, y - 0.003), (0.0, y - 0.003)],
-        [0.0, 0.0, 0.093],
-        forward,
-        Material::matt(ivory()),
-    );
+    let case = [(0.0, -y), (0.9 * r, -y), (r, -0.6 * y), (r, y), (0.88 * r, y + 0.004), (0.88 * r, y - 0.004)];
+    let face = [(0.88 * r, y - 0.003), (0.0, y - 0.003)];
+    m.part("case").turn_rotated(&case, [0.0, 0.0, 0.093], forward, lacquer);
+    m.part("face").turn_rotated(&face, [0.0, 0.0, 0.093], forward, Material::matt(ivory()));
     m.part("hands");
     let ink = matt([0.15, 0.15, 0.18]);
     let time = rng.random::<f64>() * TAU;

@@ -46,12 +46,8 @@ pub(super) fn toy_duck(m: &mut Model, paint: &Paint, rng: &mut ChaCha8Rng) {
     m.part("wings");
     for side in [-1.0, 1.0] {
         m.again("head").add(Shape::sphere(0.007), [0.082, side * 0.022, 0.136], glazed([0.08, 0.08, 0.08]));
-        m.again("wings").add_turned(
-            Shape::ellipsoid([0.045, 0.014, 0.026]),
-            [-0.012, side * 0.056, 0.066],
-            DMat3::from_rotation_y(0.25),
-            skin.in_color(skin.albedo * 0.82),
-        );
+        let (wing, dark) = (Shape::ellipsoid([0.045, 0.014, 0.026]), skin.in_color(skin.albedo * 0.82));
+        m.again("wings").add_turned(wing, [-0.012, side * 0.056, 0.066], DMat3::from_rotation_y(0.25), dark);
     }
     m.scale(vary(rng, 0.1));
 }
@@ -63,16 +59,13 @@ pub(super) fn toy_car(m: &mut Model, paint: &Paint, rng: &mut ChaCha8Rng) {
     m.block([0.10, 0.080, 0.012], 0.005, [-0.012, 0.0, 0.104], lacquer);
     m.part("wheels");
     let rubber = matt([0.17, 0.17, 0.18]);
+    let tyre = [(0.0, 0.0), (0.028, 0.0), (0.028, 0.022), (0.024, 0.025), (0.0, 0.025)];
     for x in [-0.065, 0.065] {
         for side in [-1.0, 1.0] {
             let across = tip(-90.0 * side);
-            m.turn_rotated(
-                &[(0.0, 0.0), (0.028, 0.0), (0.028, 0.022), (0.024, 0.025), (0.0, 0.025)],
-                [x, side * 0.034, 0.0285],
-                across,
-                rubber,
-            );
-            m.turn_rotated(&[(0.013, 0.0255), (0.0, 0.0275)], [x, side * 0.034, 0.0285], across, metal());
+            let hub = [x, side * 0.034, 0.0285];
+            m.turn_rotated(&tyre, hub, across, rubber);
+            m.turn_rotated(&[(0.013, 0.0255), (0.0, 0.0275)], hub, across, metal());
         }
     }
     m.scale(vary(rng, 0.1));
@@ -87,12 +80,8 @@ pub(super) fn toy_blocks(m: &mut Model, paint: &Paint, rng: &mut ChaCha8Rng) {
         let color = (first + k) % 4;
         let half = DVec3::splat(0.5 * s);
         let angle = if k == 2 { 0.8 * (rng.random::<f64>() - 0.5) } else { 0.0 };
-        m.part(names[color]).add_turned(
-            Shape::Block { half, round: 0.005 },
-            [foot[0], foot[1], foot[2] + half.z],
-            DMat3::from_rotation_z(angle),
-            Material::matt(PAINTS[color].albedo()),
-        );
+        let (block, at) = (Shape::Block { half, round: 0.005 }, [foot[0], foot[1], foot[2] + half.z]);
+        m.part(names[color]).add_turned(block, at, DMat3::from_rotation_z(angle), PAINTS[color].matt());
     }
 }
 
@@ -130,10 +119,8 @@ pub(super) fn toy_rocket(m: &mut Model, paint: &Paint, rng: &mut ChaCha8Rng) {
 
 pub(super) fn ball(m: &mut Model, paint: &Paint, rng: &mut ChaCha8Rng) {
     let r = 0.05 * vary(rng, 0.25);
-    let half: Vec<(f64, f64)> =
-        (0..=6).map(|k| f64::from(k) * PI / 12.0).map(|a| (r * a.sin(), r - r * a.cos())).collect();
-    m.part("lower half").lathe(&half, paint.glazed());
-    let half: Vec<(f64, f64)> =
-        (6..=12).map(|k| f64::from(k) * PI / 12.0).map(|a| (r * a.sin(), r - r * a.cos())).collect();
-    m.part("upper half").lathe(&half, Material::glazed(paint.albedo() * 0.5 + ivory() * 0.5));
+    let line: Vec<(f64, f64)> =
+        (0..=12).map(|k| f64::from(k) * PI / 12.0).map(|a| (r * a.sin(), r - r * a.cos())).collect();
+    m.part("lower half").lathe(&line[..=6], paint.glazed());
+    m.part("upper half").lathe(&line[6..], Material::glazed(paint.albedo() * 0.5 + ivory() * 0.5));
 }

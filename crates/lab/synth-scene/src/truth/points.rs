@@ -63,17 +63,15 @@ impl Collector {
     /// At most `count` of the points of [`Self::truth`] with their colours, evenly chosen, in its order: the vertices of a
     /// scan.
     pub fn vertices(&self, scene: &Scene, count: usize, rng: &mut ChaCha8Rng) -> (TruePoints, Vec<[u8; 3]>) {
-        let all = self.truth(scene);
         let mut picked = rand::seq::index::sample(rng, self.parts.len(), count.min(self.parts.len())).into_vec();
         picked.sort_unstable();
-        let of = |from: &[i32]| picked.iter().map(|&i| from[i]).collect();
-        let points = TruePoints {
-            position: picked.iter().map(|&i| all.position[i]).collect(),
-            instance: of(&all.instance),
-            part: of(&all.part),
-            class: of(&all.class),
+        let chosen = Self {
+            seen: HashSet::new(),
+            positions: picked.iter().map(|&i| self.positions[i]).collect(),
+            parts: picked.iter().map(|&i| self.parts[i]).collect(),
+            colors: picked.iter().map(|&i| self.colors[i]).collect(),
         };
-        (points, picked.iter().map(|&i| self.colors[i]).collect())
+        (chosen.truth(scene), chosen.colors)
     }
 
     /// At most `count` of the points, half of them on objects, with noise of standard deviation `noise` metres.
