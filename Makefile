@@ -125,7 +125,7 @@ checked-out:
 
 # A revision to compare with, such as HEAD~5.
 BASE ?=
-bench: build ## Run time against error of every approximation, and growth: out/bench/report.md (BASE=revision: two builds in turns)
+bench: build ## Run time against error of every approximation, and growth: out/bench/report.html (BASE=revision: two builds in turns)
 ifeq ($(BASE),)
 	target/release/bench run pipelines/tradeoffs.plan --work out/bench/tradeoffs --out out/bench/report.json \
 	  $(if $(ONLY),--only $(ONLY),&& cp out/bench/report.md docs/results/tradeoffs.md)
@@ -133,7 +133,7 @@ else
 	scripts/bench_base.sh $(BASE)
 endif
 
-stress: build ## Hostile scenes and settings through every stage: out/stress/report.md
+stress: build ## Hostile scenes and settings through every stage: out/stress/report.html
 	target/release/bench stress --work out/stress/scenes --out out/stress/report.json
 
 SCENES ?=

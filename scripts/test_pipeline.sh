@@ -311,7 +311,7 @@ say "== a small ablation"
 # One tiny scene, one p, four rows, and the ranges that their results must lie in (pipelines/ablation-small.plan).
 ablation() { target/release/bench run "${plan:-pipelines/ablation-small.plan}" --work "$work/ablation/runs" --out "$work/ablation/report.json"; }
 ablation > "$work/ablation.log" 2>&1 || { tail -3 "$work/ablation.log"; fail "the small ablation"; }
-grep -q 'instance mIoU' "$work/ablation/report.md" || fail "no tables"
+grep -q 'instance mIoU' "$work/ablation/report.md" && [ -s "$work/ablation/report.html" ] || fail "no tables"
 ablation > "$work/again.log" 2>&1
 grep -q '^bench: 0 of 12 runs' "$work/again.log" || { cat "$work/again.log"; fail "a second run ran a stage"; }
 sed 's/^features spectral .*/& --dim 2/' pipelines/ablation-small.plan > "$work/broken.plan"
@@ -334,7 +334,7 @@ size views | 12 | --size tiny --views 12 | --iterations 20
 PLAN
 bench() { target/release/bench "$@" --quiet > "$work/bench.log" 2>&1 || { cat "$work/bench.log"; fail "bench $1"; }; }
 bench run "$work/tradeoffs.plan" --work "$work/trade" --out "$work/trade.json"
-grep -q 'all but nothing' "$work/trade.md" && grep -q 'Growth' "$work/trade.md" || fail "no trade-offs"
+grep -q 'all but nothing' "$work/trade.md" && grep -q 'Growth' "$work/trade.md" && [ -s "$work/trade.html" ] || fail "no trade-offs"
 # What keeps a fifth of a mask or nothing must lose something: the harness measures what it says.
 awk -F'|' '/all but nothing/ { found = $6 + 0 > 1 } END { exit !found }' "$work/trade.md" || fail "a coarse cut lost nothing"
 bench stress --only "metamorphic scaled" --work "$work/stress" --out "$work/stress.json"

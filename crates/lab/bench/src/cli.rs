@@ -24,7 +24,7 @@ pub struct Args {
     /// a change of the programs
     #[arg(long, global = true, value_name = "DIR", default_value = "out/bench/work")]
     work: PathBuf,
-    /// Output file, JSON; the same is written beside it as .md
+    /// Output file, JSON; the same is written beside it as .md and .html (compare writes no .html)
     #[arg(long, global = true, value_name = "FILE", default_value = "out/bench/report.json")]
     out: PathBuf,
     /// What run does: names of tables, knobs and axes, with commas between; what stress does: parts of names of scenes [all]
@@ -77,24 +77,25 @@ impl stage::Program for Args {
 }
 
 fn programs(folder: &Path, threads: usize) -> Result<Programs> {
-    let all = ["synth-scene", "gs-geom", "graph-precompute", "feat-train", "cluster-match", "eval"];
-    match all.into_iter().find(|program| !folder.join(program).exists()) {
-        None => Ok(Programs { folder: folder.into(), threads }),
-        Some(lacking) => Err(Error::new("a program is missing").file(folder).expected(lacking).hint("run make build")),
+    if folder.join("gs-geom").exists() {
+        return Ok(Programs { folder: folder.into(), threads });
     }
+    Err(Error::new("no programs here").file(folder).expected("gs-geom and the other stages").hint("run make build"))
 }
 
 impl Args {
-    /// The right to write the results: JSON, and the same as Markdown beside it.
+    /// The right to write the results: JSON, and the same as Markdown and HTML beside it.
     fn claim(&self, stage: &Stage) -> Result<Claim> {
-        let claim = stage.outputs(&self.out).files([&self.out, &self.out.with_extension("md")]).claim()?;
+        let beside = ["md", "html"].map(|extension| self.out.with_extension(extension));
+        let claim = stage.outputs(&self.out).file(&self.out).files(beside).claim()?;
         create_dir(&self.work)?;
         Ok(claim)
     }
 
-    fn write(&self, value: &impl Serialize, text: &str) -> Result<()> {
+    fn write(&self, value: &impl Serialize, text: &str, page: Option<&str>) -> Result<()> {
         write_json(&self.out, value)?;
-        write_bytes(self.out.with_extension("md"), text.as_bytes())
+        write_bytes(self.out.with_extension("md"), text.as_bytes())?;
+        page.map_or(Ok(()), |page| write_bytes(self.out.with_extension("html"), page.as_bytes()))
     }
 
     fn experiments(&self, plan: &Plan, programs: &Programs, stage: &Stage) -> Result<()> {
@@ -121,7 +122,7 @@ impl Args {
         }
         page::warnings(&results.curves).iter().for_each(|w| stage.warn(w));
         let subtitle = format!("Revision {}, {}.", stage::REVISION, Machine::here());
-        self.write(&results, &page::text(&results, &subtitle))?;
+        self.write(&results, &page::text(&results, &subtitle), Some(&page::html(&results, &subtitle)))?;
         let summary = json!({"tables": results.tables.len(), "curves": results.curves.len(),
             "dominated": page::warnings(&results.curves).len()});
         stage.record(&mut claim, json!({"command": "run"}), BTreeMap::new(), summary)?;
@@ -134,14 +135,15 @@ impl Args {
         let (head, rows) = page::compare_table(&all);
         let text = report::sheet::markdown(&head, &rows);
         text.lines().for_each(|l| stage.info(l));
-        self.write(&all, &text)?;
+        self.write(&all, &text, None)?;
         stage.record(&mut claim, json!({"command": "compare"}), BTreeMap::new(), json!({}))
     }
 
     fn stress(&self, programs: &Programs, stage: &Stage) -> Result<()> {
         let mut claim = self.claim(stage)?;
         let rows = crate::stress::run(programs, &self.work, &self.only, &|name| stage.info(name))?;
-        self.write(&rows, &page::stress(&rows))?;
+        let (text, page) = page::stress(&rows);
+        self.write(&rows, &text, Some(&page))?;
         let bad: Vec<_> = rows.iter().filter(|r| !r.good).collect();
         let summary = json!({"cells": rows.len(), "bad": bad.len()});
         stage.record(&mut claim, json!({"command": "stress"}), BTreeMap::new(), summary)?;

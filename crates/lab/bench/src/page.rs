@@ -1,11 +1,12 @@
-//! The measurements as tables.
+//! The measurements as tables and a page.
 
 use crate::compare::Compared;
 use crate::growth::Growth;
 use crate::stress::Row;
 use crate::tables::{self, Table};
-use crate::tradeoff::Curve;
-use report::plot::number;
+use crate::tradeoff::{Curve, Measured};
+use report::html::Page;
+use report::plot::{Chart, Dot, number};
 use report::sheet::markdown;
 use serde::Serialize;
 use std::fmt::Write;
@@ -90,6 +91,20 @@ pub fn warnings(curves: &[Curve]) -> Vec<String> {
     beaten.map(|(c, by)| format!("{} on {}: the default is dominated by \"{by}\"", c.title, c.scene)).collect()
 }
 
+/// Processor time over error, a circle for each setting with the range of its time; the front is joined by a line, the
+/// default is filled.
+fn scatter(curve: &Curve) -> String {
+    let dot = |(p, &error): (&Measured, &f64)| {
+        let [median, least, most] = p.cpu();
+        Dot { at: (error, median), range: (least, most), filled: p.default, label: p.label.clone() }
+    };
+    let dots: Vec<Dot> = curve.points.iter().zip(&curve.errors).map(dot).collect();
+    let mut line: Vec<(f64, f64)> = dots.iter().zip(&curve.front).filter(|(_, f)| **f).map(|(d, _)| d.at).collect();
+    line.sort_by(|a, b| a.0.total_cmp(&b.0));
+    let title = format!("{} ({})", curve.title, curve.scene);
+    Chart { title, axes: format!("{}; upwards: CPU seconds", curve.measure), line, dots }.svg()
+}
+
 /// What a plan gave.
 #[derive(Debug, Default, Serialize)]
 pub struct Results {
@@ -101,7 +116,39 @@ pub struct Results {
     pub growth: Vec<Growth>,
 }
 
-/// All of it as Markdown.
+/// The page.
+pub fn html(results: &Results, subtitle: &str) -> String {
+    let mut page = Page::default();
+    for table in &results.tables {
+        page.section(&format!("table-{}", table.name), &table.title);
+        for (title, head, rows) in tables::blocks(table) {
+            page.heading(&title, "");
+            let head: Vec<&str> = head.iter().map(String::as_str).collect();
+            page.table(&head, &rows);
+        }
+        page.paragraph(&tables::remark(table));
+    }
+    if !results.curves.is_empty() {
+        page.section("trade-offs", "Run time against error");
+    }
+    for warning in warnings(&results.curves) {
+        page.note(&warning);
+    }
+    for c in &results.curves {
+        page.heading(&c.title, &c.scene);
+        page.charts(&[scatter(c)]);
+        let (head, rows) = curve_table(c);
+        page.table(&head, &rows);
+    }
+    if !results.growth.is_empty() {
+        page.section("growth", "Growth");
+        let (head, rows) = growth_table(&results.growth);
+        page.table(&head, &rows);
+    }
+    page.finish("Experiments", subtitle)
+}
+
+/// The same as Markdown, without pictures.
 pub fn text(results: &Results, subtitle: &str) -> String {
     let mut text = format!("# Experiments\n\n{subtitle}\n");
     for table in &results.tables {
@@ -121,8 +168,8 @@ pub fn text(results: &Results, subtitle: &str) -> String {
     text
 }
 
-/// The matrix of stress as Markdown.
-pub fn stress(all: &[Row]) -> String {
+/// The matrix of stress as Markdown and as a page.
+pub fn stress(all: &[Row]) -> (String, String) {
     let head = ["scene", "stage", "error", "tolerance", "finite", "good", "what was asked, what was said"];
     let figure = |v: Option<f64>| v.map_or("–".into(), |v| if v == 0.0 { "0".into() } else { format!("{v:.1e}") });
     let yes = |is: bool| if is { "yes" } else { "NO" }.to_string();
@@ -133,6 +180,13 @@ pub fn stress(all: &[Row]) -> String {
             vec![r.scene.clone(), r.stage.clone(), error, tolerance, yes(!r.non_finite), yes(r.good), r.note.clone()]
         })
         .collect();
+    let mut page = Page::default();
+    page.section("stress", "Hostile scenes");
+    page.table(&head, &rows);
     let good = all.iter().filter(|r| r.good).count();
-    format!("# Numerical stress\n\n{good} of {} cells are good\n\n{}", all.len(), markdown(&head, &rows))
+    let subtitle = format!("{good} of {} cells are good", all.len());
+    (
+        format!("# Numerical stress\n\n{subtitle}\n\n{}", markdown(&head, &rows)),
+        page.finish("Numerical stress", &subtitle),
+    )
 }
