@@ -77,10 +77,11 @@ impl stage::Program for Args {
 }
 
 fn programs(folder: &Path, threads: usize) -> Result<Programs> {
-    if folder.join("gs-geom").exists() {
-        return Ok(Programs { folder: folder.into(), threads });
+    let all = ["synth-scene", "gs-geom", "graph-precompute", "feat-train", "cluster-match", "eval"];
+    match all.into_iter().find(|program| !folder.join(program).exists()) {
+        None => Ok(Programs { folder: folder.into(), threads }),
+        Some(lacking) => Err(Error::new("a program is missing").file(folder).expected(lacking).hint("run make build")),
     }
-    Err(Error::new("no programs here").file(folder).expected("gs-geom and the other stages").hint("run make build"))
 }
 
 impl Args {

@@ -16,6 +16,9 @@ mod tradeoff;
 
 use std::process::ExitCode;
 
+#[global_allocator]
+static ALLOCATOR: stage::Allocator = stage::Allocator;
+
 fn main() -> ExitCode {
     stage::main::<cli::Args>()
 }

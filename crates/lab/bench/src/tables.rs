@@ -144,18 +144,19 @@ fn shown(interval: Option<&Interval>, share: bool, signed: bool) -> String {
     }
 }
 
-/// The table in Markdown: the two main metrics by p, then all metrics at one p, and over what the means are.
-pub fn text(table: &Table) -> String {
-    let mut out = String::new();
-    let mut block = |title: &str, head: &[String], row: &dyn Fn(&RowResult) -> Vec<String>| {
-        let head: Vec<&str> = head.iter().map(String::as_str).collect();
-        let rows: Vec<_> = table.rows.iter().map(row).collect();
-        let _ = writeln!(out, "{title}:\n\n{}", markdown(&head, &rows));
+/// Title, head and rows.
+type Block = (String, Vec<String>, Vec<Vec<String>>);
+
+/// The two main metrics by p, then all metrics at one p.
+pub fn blocks(table: &Table) -> Vec<Block> {
+    let mut blocks = Vec::new();
+    let mut block = |title: String, head: &[String], row: &dyn Fn(&RowResult) -> Vec<String>| {
+        blocks.push((title, head.to_vec(), table.rows.iter().map(row).collect()));
     };
     if table.p.len() > 1 {
         let head: Vec<String> = [String::new()].into_iter().chain(table.p.iter().map(|p| format!("p = {p}"))).collect();
         for m in METRICS.iter().filter(|m| GAINS.contains(&m.name)) {
-            block(&format!("{}, %", m.title), &head, &|r| {
+            block(format!("{}, %", m.title), &head, &|r| {
                 let cells = table.p.iter().map(|p| shown(r.results.get(p).and_then(|r| r.get(m.name)), m.share, false));
                 [r.row.label.clone()].into_iter().chain(cells).collect()
             });
@@ -190,10 +191,14 @@ pub fn text(table: &Table) -> String {
         columns.push(("paper, GB".into(), Box::new(printed)));
     }
     let head: Vec<String> = columns.iter().map(|c| c.0.clone()).collect();
-    block(&format!("All metrics at p = {p}"), &head, &|r| columns.iter().map(|c| c.1(r)).collect());
+    block(format!("All metrics at p = {p}"), &head, &|r| columns.iter().map(|c| c.1(r)).collect());
+    blocks
+}
+
+/// Over what the means of a table are.
+pub fn remark(table: &Table) -> String {
     let runs = table.scenes.len() * table.seeds.len();
-    let _ = write!(
-        out,
+    let mut out = format!(
         "Mean ± 95% interval (Student's t) over {runs} runs: scenes {}, {} seed{} each.",
         table.scenes.join(", "),
         table.seeds.len(),
@@ -203,7 +208,16 @@ pub fn text(table: &Table) -> String {
         let label = table.rows.iter().find(|row| row.row.id() == *r).map_or(r.as_str(), |row| &row.row.label);
         let _ = write!(out, " Gains are differences from \"{label}\" scene by scene, in points.");
     }
-    out + "\n"
+    out
+}
+
+/// The table in Markdown.
+pub fn text(table: &Table) -> String {
+    let block = |(title, head, rows): Block| {
+        let head: Vec<&str> = head.iter().map(String::as_str).collect();
+        format!("{title}:\n\n{}\n", markdown(&head, &rows))
+    };
+    blocks(table).into_iter().map(block).collect::<String>() + &remark(table) + "\n"
 }
 
 #[cfg(test)]

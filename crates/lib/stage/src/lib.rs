@@ -1,11 +1,12 @@
 //! What makes a program a stage: arguments that mean the same everywhere, logging, progress, a record of the run, and
 //! exit codes.
 //!
-//! A stage's `main.rs` is one line: `fn main() -> ExitCode { stage::main::<Args>() }` for a clap parser `Args` that
-//! implements [`Program`]. Exit codes: 0 done; 2 an error, said in one line on standard error; 130 interrupted.
+//! A stage's `main.rs` names the [`Allocator`] and has one line: `fn main() -> ExitCode { stage::main::<Args>() }` for a clap
+//! parser `Args` that implements [`Program`]. Exit codes: 0 done; 2 an error, said in one line on standard error; 130 interrupted.
 //!
 //! `PROGRAM --generate man DIR` writes manual pages, `PROGRAM --generate bash DIR` (zsh, fish, ...) completions.
 
+mod allocator;
 mod generate;
 mod log;
 mod machine;
@@ -15,6 +16,7 @@ mod range;
 mod record;
 mod signals;
 
+pub use allocator::Allocator;
 pub use log::Stage;
 pub use machine::Machine;
 pub use memory::Bytes;
@@ -102,6 +104,7 @@ pub trait Program: clap::Parser {
 /// Parses the arguments, sets up threads and logging, runs the program and turns its result into an exit code.
 pub fn main<P: Program>() -> ExitCode {
     signals::outlive_long_files();
+    let _ = allocator::NAME.set(P::NAME);
     let arguments: Vec<String> = std::env::args_os().skip(1).map(|a| a.to_string_lossy().into_owned()).collect();
     let failed = |stage: &Stage, e: &Error| {
         stage.error(e);

@@ -1,6 +1,7 @@
 //! Amounts of memory, and what a run may take.
 
-use crate::{Machine, Stage};
+use crate::allocator::HINT;
+use crate::{Stage, machine};
 use gs_io::{Error, ErrorKind, Result};
 use std::fmt;
 use std::str::FromStr;
@@ -39,27 +40,35 @@ impl fmt::Display for Bytes {
 }
 
 impl Stage {
-    /// Says how much memory the run will take at its peak, and [`Self::needs`] it.
+    /// Says how much memory the run will take at its peak, and [`Self::needs_at_once`] it.
     pub fn forecast(&self, bytes: u64, hint: &str) -> Result<()> {
         self.info(&format!("memory: about {} at the peak", Bytes(bytes)));
-        self.needs(bytes, hint)
+        self.needs_at_once(bytes, hint)
     }
 
-    /// Notes how much memory the run will take at its peak for the record, and refuses more than `--memory-limit`. `hint` says
-    /// what would take less.
+    /// Notes how much memory the run will take at its peak for the record, refuses more than `--memory-limit`, and warns of
+    /// more than is free. `hint` says what would take less.
     pub fn needs(&self, bytes: u64, hint: &str) -> Result<()> {
         *self.predicted.lock().expect("no panic holds this lock") = Some(bytes);
-        match self.common.memory_limit {
-            Some(limit) if bytes > limit.0 => Err(too_much(bytes, limit, hint).field("--memory-limit")),
-            _ => Ok(()),
+        // Only the first hint is kept: all of a run's are the same.
+        let _ = HINT.set(hint.into());
+        match (self.common.memory_limit, machine::memory()) {
+            (Some(limit), _) if bytes > limit.0 => return Err(too_much(bytes, limit, hint).field("--memory-limit")),
+            (None, Some([_, free])) if bytes > free => {
+                self.warn(&format!("memory: about {} needed, {} free; {hint}", Bytes(bytes), Bytes(free)));
+            }
+            _ => {}
         }
+        Ok(())
     }
 
-    /// The same for what the run takes soon after its start, whatever it does later: without `--memory-limit` the machine's
-    /// memory is the limit.
+    /// The same for what the run takes for certain: without `--memory-limit` what the machine, or the program's control
+    /// group, has in all is the limit.
     pub fn needs_at_once(&self, bytes: u64, hint: &str) -> Result<()> {
-        match (self.common.memory_limit, Machine::here().memory_bytes) {
-            (None, Some(all)) if bytes > all => Err(too_much(bytes, Bytes(all), hint).field("memory of this machine")),
+        match (self.common.memory_limit, machine::memory()) {
+            (None, Some([all, _])) if bytes > all => {
+                Err(too_much(bytes, Bytes(all), hint).field("memory of this machine"))
+            }
             _ => self.needs(bytes, hint),
         }
     }

@@ -2,6 +2,9 @@
 
 use std::process::ExitCode;
 
+#[global_allocator]
+static ALLOCATOR: stage::Allocator = stage::Allocator;
+
 fn main() -> ExitCode {
     stage::main::<mask_embed::Args>()
 }
