@@ -4,6 +4,7 @@ use crate::automatic::Proposals;
 use crate::regions::clean;
 use artifacts::{LEVELS, MaskMaps, instance_color};
 use onnx_models::RgbImage;
+use rayon::prelude::*;
 
 /// Paints the chosen masks of each level into an id map of `width` x `height`.
 ///
@@ -23,13 +24,12 @@ pub fn paint(
     let mut ids = vec![-1i32; LEVELS * width * height];
     let mut first = 0;
     for (level, indices) in chosen.iter().enumerate() {
-        let mut masks: Vec<(usize, usize, Vec<bool>)> = Vec::new();
-        for &i in indices {
+        let whole = |&i: &usize| {
             let mut mask = proposals.masks[i].logits.enlarge(&proposals.grid, width, height);
             clean(&mut mask, width, min_area);
-            let area = mask.iter().filter(|&&m| m).count();
-            masks.push((area, i, mask));
-        }
+            (mask.iter().filter(|&&m| m).count(), i, mask)
+        };
+        let mut masks: Vec<(usize, usize, Vec<bool>)> = indices.par_iter().map(whole).collect();
         // From large to small; equal areas by order of prompts.
         masks.sort_by(|a, b| b.0.cmp(&a.0).then(a.1.cmp(&b.1)));
         let map = &mut ids[level * width * height..(level + 1) * width * height];

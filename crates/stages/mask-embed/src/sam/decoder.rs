@@ -8,7 +8,7 @@
 //!
 //! The graph itself is the oracle: [`super::Sam`] compares the two when it opens a model.
 
-use super::planar::{biased_gelu, dot, head_scores, norm, softmax, softmax_tokens};
+use super::planar::{biased_gelu, dot, head_scores, norm, softmax_rows, softmax_tokens};
 use super::weights::{self, File};
 use super::{Candidates, MASK_SIDE};
 use gs_io::{Error, Result};
@@ -23,8 +23,8 @@ const HEADS: usize = 8;
 /// Side and number of the encoder's pixels.
 const SIDE: usize = MASK_SIDE / 4;
 const PIXELS: usize = SIDE * SIDE;
-/// Pixels that are enlarged together.
-const CHUNK: usize = 256;
+/// Pixels that are worked on together: all their channels fit the processor's own cache.
+const TILE: usize = 128;
 /// Added to variances, as in PyTorch's layer norm and in SAM's own for pictures.
 const EPSILON: f32 = 1e-5;
 const EPSILON_OF_PICTURES: f32 = 1e-6;
@@ -65,7 +65,7 @@ struct Enlargement {
     second_bias: Vec<f32>,
 }
 
-/// What the first layer needs of a photograph, `[channels][PIXELS]` each.
+/// What the first layer needs of a photograph, `[tiles][channels][TILE]` each.
 pub(super) struct Photograph {
     /// The embedding.
     pub values: Vec<f32>,
@@ -86,7 +86,9 @@ impl Photograph {
         let planar = |t: &Tensor| {
             let channels = *t.shape.last()?;
             let v = t.as_f32().filter(|_| t.shape == [1, PIXELS, channels])?;
-            Some((0..v.len()).map(|i| v[i % PIXELS * channels + i / PIXELS]).collect::<Vec<f32>>())
+            let column = |rows: &[f32], c: usize| rows.iter().skip(c).step_by(channels).copied().collect::<Vec<_>>();
+            let tile = |rows| (0..channels).flat_map(move |c| column(rows, c));
+            Some(v.chunks(TILE * channels).flat_map(tile).collect::<Vec<f32>>())
         };
         let [placed, values, keys, sums, queries] = values else { return None };
         let (placed, values) = (planar(placed)?, planar(values)?);
@@ -96,13 +98,12 @@ impl Photograph {
     }
 }
 
-/// Memory of a decoding, `[..][PIXELS]` each.
+/// Memory of a decoding.
 #[derive(Default)]
 struct Desk {
+    /// `[tiles][channels][TILE]`.
     pixels: Vec<f32>,
-    /// The pixels with their places.
-    placed: Vec<f32>,
-    /// `[heads][tokens]`.
+    /// Of the tokens' next attention to the pixels, `[tiles][heads][tokens][TILE]`.
     scores: Vec<f32>,
 }
 
@@ -123,7 +124,7 @@ impl Worker {
 /// The decoder's weights.
 pub(super) struct Decoder {
     gemm: GemmExecutor,
-    layers: Vec<Layer>,
+    layers: [Layer; 2],
     last: Attention,
     last_norm: Norm,
     quality: Vec<Linear>,
@@ -145,6 +146,10 @@ pub(super) struct Names {
 
 fn matrix(values: &[f32], columns: usize) -> Matrix<'_> {
     NdTensorView::from_data([values.len() / columns, columns], values)
+}
+
+fn add_to(out: &mut [f32], a: &[f32], b: &[f32]) {
+    out.iter_mut().zip(a).zip(b).for_each(|((o, a), b)| *o = a + b);
 }
 
 fn add(a: &[f32], b: &[f32]) -> Vec<f32> {
@@ -270,15 +275,18 @@ fn of_heads(x: &[f32], channels: usize) -> Vec<f32> {
         .collect()
 }
 
-/// Scores `[heads][tokens][PIXELS]` of tokens `[tokens][channels]` with pixels `[channels][PIXELS]`.
-fn scores_by_head<'a>(x: &[f32], pixels: &[f32], channels: usize, scores: &'a mut [f32]) -> &'a mut [f32] {
-    let (tokens, width) = (x.len() / channels, channels / HEADS);
-    let scores = &mut scores[..HEADS * tokens * PIXELS];
-    for (h, scores) in scores.chunks_exact_mut(tokens * PIXELS).enumerate() {
-        let pixels = &pixels[h * width * PIXELS..(h + 1) * width * PIXELS];
-        head_scores(&x[h * width..], channels, pixels, PIXELS, scores);
+/// Scores `[heads][tokens][TILE]` of tokens `[tokens][channels]` with a tile's pixels `[channels][TILE]`.
+fn scores_by_head(x: &[f32], pixels: &[f32], channels: usize, scores: &mut [f32]) {
+    let width = channels / HEADS;
+    let heads = scores.chunks_exact_mut(x.len() / channels * TILE).zip(pixels.chunks_exact(width * TILE));
+    for (h, (scores, pixels)) in heads.enumerate() {
+        head_scores(&x[h * width..], channels, pixels, TILE, scores);
     }
-    scores
+}
+
+/// The tiles of an array.
+fn tiles(values: &[f32]) -> std::slice::ChunksExact<'_, f32> {
+    values.chunks_exact(values.len() / (PIXELS / TILE))
 }
 
 impl Decoder {
@@ -293,7 +301,7 @@ impl Decoder {
         let masks: Vec<Vec<Linear>> = masks.collect();
         let names = reader.names()?;
         let decoder = Self {
-            layers: vec![reader.layer(0)?, reader.layer(1)?],
+            layers: [reader.layer(0)?, reader.layer(1)?],
             last: reader.attention("transformer.final_attn_token_to_image", "k")?,
             last_norm: reader.norm("transformer.norm_final_attn")?,
             quality: reader.mlp("iou_prediction_head", masks.len())?,
@@ -362,7 +370,7 @@ impl Decoder {
         for (t, h) in (0..tokens).flat_map(|t| (0..HEADS).map(move |h| (t, h))) {
             let part = |x: usize| x * channels + h * width..x * channels + (h + 1) * width;
             let mut weights: Vec<f32> = (0..tokens).map(|s| dot(&q[part(t)], &k[part(s)])).collect();
-            softmax(&mut weights);
+            softmax_rows(&mut weights, 1, tokens);
             for (s, weight) in weights.iter().enumerate() {
                 sums[part(t)].iter_mut().zip(&v[part(s)]).for_each(|(o, v)| *o += weight * v);
             }
@@ -370,24 +378,27 @@ impl Decoder {
         self.linear(&own.out, &sums)
     }
 
-    /// What tokens take from the pixels of the desk.
-    fn attend_pixels(&self, attention: &Attention, asks: &[f32], desk: &mut Desk) -> Vec<f32> {
-        let q = self.scaled(&attention.q, asks);
+    /// What tokens ask the pixels, `[heads][tokens][channels]`. The keys' bias adds the same to all scores of a token, which
+    /// softmax does not see.
+    fn queries(&self, attention: &Attention, asks: &[f32]) -> Vec<f32> {
         let inner = attention.q.bias.len();
-        let queries = self.times(matrix(&by_head(&q, inner), inner), &attention.k.weight);
-        let channels = desk.pixels.len() / PIXELS;
-        let rows = queries.len() / channels;
-        // The keys' bias adds the same to all pixels of a row, which softmax does not see.
-        let scores = &mut desk.scores[..rows * PIXELS];
-        self.product(matrix(&queries, channels), matrix(&desk.placed, PIXELS), 0.0, scores);
-        scores.chunks_exact_mut(PIXELS).for_each(softmax);
-        let mut sums = vec![0.0; channels * rows];
-        self.product(matrix(&desk.pixels, PIXELS), matrix(scores, PIXELS).transposed(), 0.0, &mut sums);
+        let q = by_head(&self.scaled(&attention.q, asks), inner);
+        self.times(matrix(&q, inner), &attention.k.weight)
+    }
+
+    /// What the tokens of the desk's scores take from its pixels.
+    fn attend_pixels(&self, attention: &Attention, desk: &mut Desk) -> Vec<f32> {
+        let rows = desk.scores.len() / PIXELS;
+        softmax_rows(&mut desk.scores, rows, TILE);
+        let mut sums = vec![0.0; self.width * rows];
+        for (pixels, scores) in tiles(&desk.pixels).zip(tiles(&desk.scores)) {
+            self.product(matrix(pixels, TILE), matrix(scores, TILE).transposed(), 1.0, &mut sums);
+        }
         let sums = self.times(matrix(&sums, rows).transposed(), &attention.v.weight);
         // Weights sum to one, so that the values' bias comes on top.
         let bias = attention.v.bias.iter().cycle();
-        let sums: Vec<f32> = of_heads(&sums, inner).iter().zip(bias).map(|(s, b)| s + b).collect();
-        self.linear(&attention.out, &sums)
+        let sums = of_heads(&sums, attention.q.bias.len());
+        self.linear(&attention.out, &sums.iter().zip(bias).map(|(s, b)| s + b).collect::<Vec<f32>>())
     }
 
     /// The same in the first layer, whose keys and values are known.
@@ -395,39 +406,76 @@ impl Decoder {
         let q = self.scaled(&attention.q, asks);
         let inner = attention.q.bias.len();
         let (tokens, width) = (q.len() / inner, inner / HEADS);
-        let scores = scores_by_head(&q, &known.keys, inner, &mut desk.scores);
-        scores.chunks_exact_mut(PIXELS).for_each(softmax);
-        let row = |x, i| &<[f32]>::as_chunks::<PIXELS>(x).0[i];
-        let sum = |t: usize, c: usize| dot(row(scores, c / width * tokens + t), row(&known.sums, c));
-        let sums: Vec<f32> = (0..tokens * inner).map(|i| sum(i / inner, i % inner)).collect();
+        desk.scores.resize(HEADS * tokens * PIXELS, 0.0);
+        for (scores, keys) in desk.scores.chunks_exact_mut(HEADS * tokens * TILE).zip(tiles(&known.keys)) {
+            scores_by_head(&q, keys, inner, scores);
+        }
+        softmax_rows(&mut desk.scores, HEADS * tokens, TILE);
+        let mut sums = vec![0.0; tokens * inner];
+        for (scores, values) in tiles(&desk.scores).zip(tiles(&known.sums)) {
+            let row = |x, i| &<[f32]>::as_chunks::<TILE>(x).0[i];
+            for (i, sum) in sums.iter_mut().enumerate() {
+                let (t, c) = (i / inner, i % inner);
+                *sum += dot(row(scores, c / width * tokens + t), row(values, c));
+            }
+        }
         self.linear(&attention.out, &sums)
     }
 
-    /// The pixels take from the tokens and are normalised.
-    fn update_pixels(&self, layer: &Layer, asks: &[f32], values: &[f32], known: Option<&Photograph>, desk: &mut Desk) {
+    /// Tokens after they took `taken` from the pixels.
+    fn finish_tokens(&self, layer: &Layer, x: &[f32], taken: &[f32]) -> Vec<f32> {
+        let mut x = add(x, taken);
+        layer.norms[1].rows(&mut x);
+        let mut x = add(&x, &self.mlp(&layer.mlp, &x));
+        layer.norms[2].rows(&mut x);
+        x
+    }
+
+    /// The pixels take from the tokens `values`, which they know by `asks`, are normalised, and get their scores for the
+    /// tokens' next `queries`. In the first layer the pixels are those of the photograph.
+    fn update_pixels(
+        &self,
+        layer: &Layer,
+        [asks, values]: [&[f32]; 2],
+        queries: &[f32],
+        known: &Photograph,
+        desk: &mut Desk,
+    ) {
         let attention = &layer.to_tokens;
+        let (inner, width) = (attention.k.bias.len(), self.width);
         let k = self.scaled(&attention.k, asks);
-        let inner = attention.k.bias.len();
-        let (tokens, channels) = (k.len() / inner, desk.pixels.len() / PIXELS);
-        let mut shift = vec![0.0; HEADS * tokens];
-        let scores = if let Some(known) = known {
-            scores_by_head(&k, &known.queries, inner, &mut desk.scores)
-        } else {
-            let keys = by_head(&k, inner);
-            shift = keys.chunks_exact(inner).map(|k| dot(k, &attention.q.bias)).collect();
-            let keys = self.times(matrix(&keys, inner), &attention.q.weight);
-            let scores = &mut desk.scores[..shift.len() * PIXELS];
-            self.product(matrix(&keys, channels), matrix(&desk.placed, PIXELS), 0.0, scores);
-            scores
-        };
-        for (scores, shift) in scores.chunks_exact_mut(tokens * PIXELS).zip(shift.chunks_exact(tokens)) {
-            softmax_tokens(scores, PIXELS, shift);
-        }
+        let keys = by_head(&k, inner);
+        let first = std::ptr::eq(layer, &self.layers[0]);
+        let shift = |k: &[f32]| if first { 0.0 } else { dot(k, &attention.q.bias) };
+        let shift: Vec<f32> = keys.chunks_exact(inner).map(shift).collect();
+        let tokens = shift.len() / HEADS;
+        let keys = self.times(matrix(&keys, inner), &attention.q.weight);
         let v = self.linear(&attention.v, values);
         let values = self.times(matrix(&by_head(&v, inner), inner), &attention.out.weight);
-        self.product(matrix(&values, channels).transposed(), matrix(scores, PIXELS), 1.0, &mut desk.pixels);
-        let Norm { scale, shift } = &layer.norms[3];
-        norm(&mut desk.pixels, PIXELS, EPSILON, &attention.out.bias, scale, shift);
+        let Norm { scale, shift: offset } = &layer.norms[3];
+        let rows = queries.len() / width;
+        desk.pixels.resize(width * PIXELS, 0.0);
+        desk.scores.resize(rows * PIXELS, 0.0);
+        let mut placed = vec![0.0; width * TILE];
+        let mut scores = vec![0.0; shift.len() * TILE];
+        let known = tiles(&known.values).zip(tiles(&known.queries)).zip(tiles(&known.places));
+        let out = desk.pixels.chunks_exact_mut(width * TILE).zip(desk.scores.chunks_exact_mut(rows * TILE));
+        for (((known_values, known_queries), places), (pixels, out)) in known.zip(out) {
+            if first {
+                pixels.copy_from_slice(known_values);
+                scores_by_head(&k, known_queries, inner, &mut scores);
+            } else {
+                add_to(&mut placed, pixels, places);
+                self.product(matrix(&keys, width), matrix(&placed, TILE), 0.0, &mut scores);
+            }
+            for (scores, shift) in scores.chunks_exact_mut(tokens * TILE).zip(shift.chunks_exact(tokens)) {
+                softmax_tokens(scores, TILE, shift);
+            }
+            self.product(matrix(&values, width).transposed(), matrix(&scores, TILE), 1.0, pixels);
+            norm(pixels, TILE, EPSILON, &attention.out.bias, scale, offset);
+            add_to(&mut placed, pixels, places);
+            self.product(matrix(queries, width), matrix(&placed, TILE), 0.0, out);
+        }
     }
 
     /// Masks of a point whose predicted IoU is at least `least`, from its tokens `[tokens][channels]`. Logits outside
@@ -443,31 +491,20 @@ impl Decoder {
 
     fn decode_at(&self, desk: &mut Desk, photograph: &Photograph, tokens: &[f32], least: f32) -> Candidates {
         let channels = self.width;
-        desk.pixels.clone_from(&photograph.values);
-        desk.scores.resize(HEADS * tokens.len() / channels * PIXELS, 0.0);
-        let mut x = tokens.to_vec();
-        for (i, layer) in self.layers.iter().enumerate() {
-            let [norm_own, norm_pixels, norm_mlp, _] = &layer.norms;
-            // The first layer has no places among the tokens, and nothing to add to.
-            x = match i {
-                0 => self.attend_tokens(&layer.own, &x, &x),
-                _ => add(&x, &self.attend_tokens(&layer.own, &add(&x, tokens), &x)),
-            };
-            norm_own.rows(&mut x);
-            let asks = add(&x, tokens);
-            let known = (i == 0).then_some(photograph);
-            let taken = match known {
-                Some(known) => self.attend_photograph(&layer.to_pixels, &asks, known, desk),
-                None => self.attend_pixels(&layer.to_pixels, &asks, desk),
-            };
-            x = add(&x, &taken);
-            norm_pixels.rows(&mut x);
-            x = add(&x, &self.mlp(&layer.mlp, &x));
-            norm_mlp.rows(&mut x);
-            self.update_pixels(layer, &add(&x, tokens), &x, known, desk);
-            desk.placed.clear();
-            desk.placed.extend(desk.pixels.iter().zip(&photograph.places).map(|(v, p)| v + p));
-        }
+        let [first, second] = &self.layers;
+        // The first layer has no places among the tokens, and nothing to add to.
+        let mut x = self.attend_tokens(&first.own, tokens, tokens);
+        first.norms[0].rows(&mut x);
+        let taken = self.attend_photograph(&first.to_pixels, &add(&x, tokens), photograph, desk);
+        let x = self.finish_tokens(first, &x, &taken);
+
+        let placed = add(&x, tokens);
+        let mut y = add(&x, &self.attend_tokens(&second.own, &placed, &x));
+        second.norms[0].rows(&mut y);
+        let queries = self.queries(&second.to_pixels, &add(&y, tokens));
+        self.update_pixels(first, [&placed, &x], &queries, photograph, desk);
+        let taken = self.attend_pixels(&second.to_pixels, desk);
+        let y = self.finish_tokens(second, &y, &taken);
 
         // Tokens: the predicted IoU's, one for each mask, the point's. The first of four masks is not wanted.
         let wanted = usize::from(self.masks.len() == 4)..self.masks.len();
@@ -475,8 +512,10 @@ impl Decoder {
             let masks = &x[(1 + wanted.start) * channels..(1 + wanted.end) * channels];
             [&x[..channels], masks].concat()
         };
-        let (mut x, asks) = (rows(&x), rows(&add(&x, tokens)));
-        x = add(&x, &self.attend_pixels(&self.last, &asks, desk));
+        let placed = add(&y, tokens);
+        let queries = self.queries(&self.last, &rows(&placed));
+        self.update_pixels(second, [&placed, &y], &queries, photograph, desk);
+        let mut x = add(&rows(&y), &self.attend_pixels(&self.last, desk));
         self.last_norm.rows(&mut x);
         let quality = self.mlp(&self.quality, &x[..channels]);
         let mut candidates = Candidates::default();
@@ -504,13 +543,20 @@ impl Decoder {
             let (a, b) = (GemmInputA::Packed(a), GemmInputB::Unpacked(b));
             self.gemm.gemm(out, a, b, GemmOptions::default()).expect("the shapes fit");
         };
-        for inside in photograph.inside.chunks(CHUNK) {
+        for inside in photograph.inside.chunks(TILE) {
             let n = inside.len();
-            let pixels = desk.pixels.chunks_exact(PIXELS);
-            let pixels: Vec<f32> = pixels.flat_map(|row| inside.iter().map(|&p| row[p])).collect();
+            let at = |c: usize, p: usize| desk.pixels[(p / TILE * self.width + c) * TILE + p % TILE];
+            let gathered: Vec<f32>;
+            // In a photograph wider than high the chunks are whole tiles.
+            let pixels = if n == TILE && inside[0] % TILE == 0 && inside[n - 1] == inside[0] + n - 1 {
+                &desk.pixels[inside[0] * self.width..][..self.width * TILE]
+            } else {
+                gathered = (0..self.width).flat_map(|c| inside.iter().map(move |&p| at(c, p))).collect();
+                &gathered
+            };
             let [mut once, mut twice] = [middle, last].map(|channels| vec![0.0; 4 * channels * n]);
             let mut drawn = vec![0.0; masks * n];
-            multiply(first, matrix(&pixels, n), &mut once);
+            multiply(first, matrix(pixels, n), &mut once);
             for (place, values) in once.chunks_exact_mut(middle * n).enumerate() {
                 norm(values, n, EPSILON_OF_PICTURES, first_bias, scale, shift);
                 biased_gelu(values, 0.0);

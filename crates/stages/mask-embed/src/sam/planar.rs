@@ -82,19 +82,29 @@ pub(super) fn dot(a: &[f32], b: &[f32]) -> f32 {
     lanes.iter().sum::<f32>() + rest_a.iter().zip(rest_b).map(|(a, b)| a * b).sum::<f32>()
 }
 
-/// Softmax of a row.
+/// Softmax of each row of `[tiles][rows][width]`, over all its tiles.
 #[multiversion(targets("x86_64+avx512f+avx512vl", "x86_64+avx2"))]
-pub(super) fn softmax(row: &mut [f32]) {
-    let most = row.iter().copied().fold(f32::NEG_INFINITY, f32::max);
-    let mut lanes = [0.0f32; 64];
-    for block in row.chunks_mut(64) {
-        for (v, sum) in block.iter_mut().zip(&mut lanes) {
-            *v = exp(*v - most);
-            *sum += *v;
+pub(super) fn softmax_rows(values: &mut [f32], rows: usize, width: usize) {
+    for row in 0..rows {
+        let mut most = [f32::NEG_INFINITY; 64];
+        for block in values.chunks_exact(width).skip(row).step_by(rows).flat_map(|part| part.chunks(64)) {
+            block.iter().zip(&mut most).for_each(|(v, m)| *m = m.max(*v));
+        }
+        let most = most.into_iter().fold(f32::NEG_INFINITY, f32::max);
+        let mut sums = [0.0f32; 64];
+        for part in values.chunks_exact_mut(width).skip(row).step_by(rows) {
+            for block in part.chunks_mut(64) {
+                for (v, sum) in block.iter_mut().zip(&mut sums) {
+                    *v = exp(*v - most);
+                    *sum += *v;
+                }
+            }
+        }
+        let scale = 1.0 / sums.iter().sum::<f32>();
+        for part in values.chunks_exact_mut(width).skip(row).step_by(rows) {
+            part.iter_mut().for_each(|v| *v *= scale);
         }
     }
-    let scale = 1.0 / lanes.iter().sum::<f32>();
-    row.iter_mut().for_each(|v| *v *= scale);
 }
 
 /// Softmax over the tokens of a head, pixel by pixel: `scores[t][pixel] + shift[t]` becomes the weight of token t.
@@ -181,7 +191,7 @@ mod tests {
         softmax_tokens(&mut by_pixel, pixels, &[0.5, 0.0, -0.5]);
         for p in 0..pixels {
             let mut row: Vec<f32> = (0..tokens).map(|t| scores[t * pixels + p] + 0.5 - 0.5 * t as f32).collect();
-            softmax(&mut row);
+            softmax_rows(&mut row, 1, tokens);
             for t in 0..tokens {
                 assert!((row[t] - by_pixel[t * pixels + p]).abs() < 1e-6);
             }
