@@ -123,6 +123,22 @@ fn what_cannot_fit_is_refused_before_it_is_made() {
     succeeds(&["inspect", &geometry, "--memory-limit", "1G"]);
 }
 
+#[test]
+#[cfg(target_os = "linux")]
+fn memory_that_ends_is_said_in_one_line() {
+    let dir = Folder::new();
+    let out = dir.path("g.ply");
+    let random = ["--init", "random", "--init-points", "3000000", "--threads", "1", "--quiet"];
+    let ended = Command::new("sh")
+        .args(["-c", "ulimit -v 150000 && exec \"$0\" \"$@\"", env!("CARGO_BIN_EXE_gs-geom")])
+        .args(training(scene(), &out, "20", &random))
+        .output()
+        .unwrap();
+    let said = String::from_utf8_lossy(&ended.stderr);
+    assert!(ended.status.code() == Some(2) && said.lines().count() == 1, "{:?} {said}", ended.status);
+    assert!(said.starts_with("gs-geom: error: memory: there is no more: ") && !Path::new(&out).exists(), "{said}");
+}
+
 /// Trains on from `g` and gives the result, all finite, with what the program said.
 fn stressed(scene: &str, dir: &Folder, g: &Gaussians) -> (Gaussians, String) {
     let (init, out) = (dir.path("init.ply"), dir.path("stress.ply"));
