@@ -7,7 +7,7 @@
 use crate::{EngineOptions, Kind, Model, Outputs, Tensor, Tokenizer, open, parallel_map};
 use gs_io::{Error, IoContext, Result, hash_files};
 use serde::{Deserialize, Serialize};
-use std::path::{Path, PathBuf};
+use std::path::Path;
 
 /// Pictures or texts per run of a model whose batch is free. Fixed, so that results do not depend on anything else.
 const BATCH: usize = 16;
@@ -15,22 +15,10 @@ const BATCH: usize = 16;
 const MAX_SIZE: usize = 4096;
 
 /// `clip.json`: what the two graphs do not tell. Every field may be left out.
-///
-/// ```json
-/// {
-///   "name": "ViT-B-16 laion2b_s34b_b88k",
-///   "dimension": 512,
-///   "image_size": 224,
-///   "mean": [0.48145466, 0.4578275, 0.40821073],
-///   "std": [0.26862954, 0.26130258, 0.27577711],
-///   "context_length": 77,
-///   "pad_id": 0
-/// }
-/// ```
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct ClipConfig {
-    /// Which model this is: image and text features of different models cannot be compared.
+    /// Which model this is, such as `ViT-B-16 laion2b_s34b_b88k`: image and text features of different models cannot be compared.
     pub name: String,
     /// Dimension of a feature; checked against the graphs. 0 when not given.
     pub dimension: usize,
@@ -62,11 +50,8 @@ impl Default for ClipConfig {
 
 impl ClipConfig {
     /// Reads `clip.json` of a model folder; the defaults when there is none.
-    ///
-    /// # Errors
-    /// When the file cannot be read, is not such JSON, or a number makes no sense.
-    pub fn read(folder: impl AsRef<Path>) -> Result<Self> {
-        let path = folder.as_ref().join("clip.json");
+    fn read(folder: &Path) -> Result<Self> {
+        let path = folder.join("clip.json");
         if !path.exists() {
             return Ok(Self::default());
         }
@@ -101,11 +86,19 @@ struct Encoder {
     /// The batch that the graph insists on, if it does.
     fixed_batch: Option<usize>,
     hash: String,
+    config: ClipConfig,
 }
 
 impl Encoder {
-    fn open(path: &Path, rank: usize, kind: Kind, options: &EngineOptions) -> Result<Self> {
-        let model = open(path, Outputs::Declared, options)?;
+    /// Opens the graph `name` of a folder, or a file.
+    fn open(path: &Path, name: &str, rank: usize, kind: Kind, options: &EngineOptions) -> Result<Self> {
+        let path = &if path.is_dir() { path.join(name) } else { path.to_path_buf() };
+        if !path.exists() {
+            let hint = "export one with scripts/export_clip.py where a model hub can be reached, or use the one in testdata/clip-tiny";
+            return Err(Error::new("no such model").file(path).hint(hint));
+        }
+        let config = ClipConfig::read(path.parent().unwrap_or(Path::new("")))?;
+        let model = open(path, Outputs::Declared, &EngineOptions { threads_per_run: 1, ..options.clone() })?;
         let wrong = |what: &str| Error::new(what).file(path).hint("export the model with scripts/export_clip.py");
         let [input] = model.inputs() else {
             let names: Vec<&str> = model.inputs().iter().map(|i| i.name.as_str()).collect();
@@ -118,9 +111,8 @@ impl Encoder {
                 .expected(format!("{kind} of rank {rank}")));
         }
         let output = model.outputs().iter().position(|o| o.name.ends_with("_embeds")).unwrap_or(0);
-        let (name, fixed_batch) = (input.name.clone(), input.fixed(0).filter(|&b| b > 0));
-        let hash = hash_files([("", path)])?;
-        Ok(Self { input: name, output, dimension: 0, fixed_batch, hash, model })
+        let (input, fixed_batch, hash) = (input.name.clone(), input.fixed(0), hash_files([("", path)])?);
+        Ok(Self { input, output, dimension: config.dimension, fixed_batch, hash, model, config })
     }
 
     /// Features of `count` items, each unit length or zero. `fill` makes the input of items `range`, padded to `batch`.
@@ -177,25 +169,9 @@ fn hash_in(path: &Path, name: &str) -> Option<String> {
     hash_files([("", folder.join(name))]).ok()
 }
 
-/// Where a graph lies: in a folder under its usual name, or the file itself.
-fn locate(path: &Path, name: &str) -> Result<(PathBuf, PathBuf)> {
-    let (folder, file) = if path.is_dir() {
-        (path.to_path_buf(), path.join(name))
-    } else {
-        (path.parent().unwrap_or(Path::new("")).to_path_buf(), path.to_path_buf())
-    };
-    if !file.exists() {
-        return Err(Error::new("no such model").file(file).hint(
-            "export one with scripts/export_clip.py where a model hub can be reached, or use the one in testdata/clip-tiny",
-        ));
-    }
-    Ok((folder, file))
-}
-
 /// CLIP's image encoder.
 pub struct ClipImage {
     encoder: Encoder,
-    config: ClipConfig,
     size: usize,
 }
 
@@ -209,21 +185,17 @@ impl ClipImage {
     /// # Errors
     /// When a file is missing or damaged, or the graph is not `[n, 3, S, S]` -> `[n, d]`.
     pub fn open(path: impl AsRef<Path>, options: &EngineOptions) -> Result<Self> {
-        let (folder, file) = locate(path.as_ref(), "image.onnx")?;
-        let config = ClipConfig::read(folder)?;
-        let options = EngineOptions { threads_per_run: 1, ..options.clone() };
-        let encoder = Encoder::open(&file, 4, Kind::Float, &options)?;
-        let declared = encoder.model.inputs()[0].fixed(2).filter(|&s| s > 0);
-        let size = if config.image_size > 0 { config.image_size } else { declared.unwrap_or(224).min(MAX_SIZE) };
-        let mut this = Self { encoder, config, size };
-        this.encoder.dimension = this.config.dimension;
+        let encoder = Encoder::open(path.as_ref(), "image.onnx", 4, Kind::Float, options)?;
+        let declared = encoder.model.inputs()[0].fixed(2).unwrap_or(224).min(MAX_SIZE);
+        let size = if encoder.config.image_size > 0 { encoder.config.image_size } else { declared };
+        let mut this = Self { encoder, size };
         this.encoder.dimension = this.encode(&vec![0; 3 * size * size])?.len();
         Ok(this)
     }
 
     /// What is known of the model.
     pub fn config(&self) -> &ClipConfig {
-        &self.config
+        &self.encoder.config
     }
 
     /// Side S of the pictures in pixels.
@@ -259,7 +231,7 @@ impl ClipImage {
         self.encoder.encode(crops.len() / (3 * plane), |range, batch| {
             let mut pixels = Vec::with_capacity(batch * 3 * plane);
             for (c, values) in crops[range.start * 3 * plane..range.end * 3 * plane].chunks_exact(plane).enumerate() {
-                let (mean, std) = (self.config.mean[c % 3], self.config.std[c % 3]);
+                let (mean, std) = (self.encoder.config.mean[c % 3], self.encoder.config.std[c % 3]);
                 pixels.extend(values.iter().map(|&v| (f32::from(v) / 255.0 - mean) / std));
             }
             pixels.resize(batch * 3 * plane, 0.0);
@@ -271,7 +243,6 @@ impl ClipImage {
 /// CLIP's text encoder with its tokenizer.
 pub struct ClipText {
     encoder: Encoder,
-    config: ClipConfig,
     length: usize,
     tokenizer: Tokenizer,
 }
@@ -283,21 +254,18 @@ impl ClipText {
     /// # Errors
     /// When a file is missing or damaged, or the graph is not `[n, 77]` -> `[n, d]`.
     pub fn open(path: impl AsRef<Path>, options: &EngineOptions) -> Result<Self> {
-        let (folder, file) = locate(path.as_ref(), "text.onnx")?;
-        let config = ClipConfig::read(folder)?;
-        let options = EngineOptions { threads_per_run: 1, ..options.clone() };
-        let encoder = Encoder::open(&file, 2, Kind::Integer, &options)?;
+        let encoder = Encoder::open(path.as_ref(), "text.onnx", 2, Kind::Integer, options)?;
         let declared = encoder.model.inputs()[0].fixed(1).filter(|&l| (3..=MAX_SIZE).contains(&l));
-        let length = if config.context_length > 0 { config.context_length } else { declared.unwrap_or(77) };
-        let mut this = Self { encoder, config, length, tokenizer: Tokenizer::new() };
-        this.encoder.dimension = this.config.dimension;
+        let given = encoder.config.context_length;
+        let length = if given > 0 { given } else { declared.unwrap_or(77) };
+        let mut this = Self { encoder, length, tokenizer: Tokenizer::default() };
         this.encoder.dimension = this.encode(&[""])?.len();
         Ok(this)
     }
 
     /// What is known of the model.
     pub fn config(&self) -> &ClipConfig {
-        &self.config
+        &self.encoder.config
     }
 
     /// Dimension of a feature.
@@ -321,13 +289,9 @@ impl ClipText {
     /// When the engine fails, or the model gives something other than `[n, d]` finite floats.
     pub fn encode(&self, texts: &[impl AsRef<str> + Sync]) -> Result<Vec<f32>> {
         self.encoder.encode(texts.len(), |range, batch| {
-            let mut ids = Vec::with_capacity(batch * self.length);
-            for text in &texts[range] {
-                ids.extend(self.tokenizer.encode(text.as_ref(), self.length, self.config.pad_id));
-            }
-            while ids.len() < batch * self.length {
-                ids.extend(self.tokenizer.encode("", self.length, self.config.pad_id));
-            }
+            let texts = texts[range].iter().map(AsRef::as_ref).chain(std::iter::repeat("")).take(batch);
+            let encode = |text| self.tokenizer.encode(text, self.length, self.encoder.config.pad_id);
+            let ids: Vec<i32> = texts.flat_map(encode).collect();
             Tensor::i32(&[batch, self.length], ids)
         })
     }

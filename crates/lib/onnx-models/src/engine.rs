@@ -21,10 +21,9 @@ pub struct EngineOptions {
 }
 
 /// Which values of the graph a model gives.
-#[derive(Debug, Clone, Copy, Default)]
+#[derive(Debug, Clone, Copy)]
 pub enum Outputs<'a> {
     /// Those that the file declares as outputs.
-    #[default]
     Declared,
     /// These, in this order; any value of the graph will do, and nothing that they do not need is computed.
     Values(&'a [&'a str]),
@@ -65,7 +64,7 @@ pub struct ValueInfo {
 impl ValueInfo {
     /// The extent of `axis` where the model fixes it.
     pub fn fixed(&self, axis: usize) -> Option<usize> {
-        *self.shape.as_ref()?.get(axis)?
+        self.shape.as_ref()?.get(axis)?.filter(|&n| n > 0)
     }
 
     fn shape_text(&self) -> String {
@@ -103,41 +102,38 @@ pub trait Model: Send + Sync {
 
 fn check_inputs(path: &Path, declared: &[ValueInfo], given: &[(&str, Tensor)]) -> Result<()> {
     let names = || declared.iter().map(|d| d.name.as_str()).collect::<Vec<_>>().join(", ");
-    let wrong = |what: &str| Error::new(what).file(path).hint("this is not the kind of model asked for");
+    let wrong = |what: &str, name: &str| {
+        let hint = "this is not the kind of model asked for";
+        Error::new(what).file(path).field(format!("input {name}")).hint(hint)
+    };
     for (name, tensor) in given {
-        let field = || format!("input {name}");
         let Some(d) = declared.iter().find(|d| d.name == *name) else {
-            return Err(wrong("the model has no such input").field(field()).expected(format!("one of {}", names())));
+            return Err(wrong("the model has no such input", name).expected(format!("one of {}", names())));
         };
         if tensor.shape.iter().product::<usize>() != tensor.len() {
             return Err(Error::new("the number of values does not fit the shape")
                 .file(path)
-                .field(field())
+                .field(format!("input {name}"))
                 .found(format!("{} values", tensor.len()))
                 .expected(format!("{:?}", tensor.shape)));
         }
         if let Some(kind) = d.kind
             && kind != tensor.kind()
         {
-            return Err(wrong("the input is of another type").field(field()).found(kind).expected(tensor.kind()));
+            return Err(wrong("the input is of another type", name).found(kind).expected(tensor.kind()));
         }
         let fits = d.shape.as_ref().is_none_or(|s| {
             s.len() == tensor.shape.len() && s.iter().zip(&tensor.shape).all(|(d, &n)| d.is_none_or(|d| d == n))
         });
         if !fits {
             let found = format!("{} in the model", d.shape_text());
-            return Err(wrong("the input has another shape")
-                .field(field())
+            return Err(wrong("the input has another shape", name)
                 .found(found)
                 .expected(format!("{:?}", tensor.shape)));
         }
     }
-    match declared.iter().find(|d| given.iter().all(|(name, _)| *name != d.name)) {
-        Some(d) => {
-            Err(wrong("the model has an input that this program does not know").field(format!("input {}", d.name)))
-        }
-        None => Ok(()),
-    }
+    let unknown = declared.iter().find(|d| given.iter().all(|(name, _)| *name != d.name));
+    unknown.map_or(Ok(()), |d| Err(wrong("the model has an input that this program does not know", &d.name)))
 }
 
 /// Opens an ONNX file with the engine that `options` choose.
@@ -177,11 +173,7 @@ pub fn parallel_map<R: Send>(count: usize, f: impl Fn(usize) -> Result<R> + Sync
     let next = AtomicUsize::new(0);
     let results: Mutex<Vec<Option<Result<R>>>> = Mutex::new((0..count).map(|_| None).collect());
     let work = || {
-        loop {
-            let i = next.fetch_add(1, Ordering::Relaxed);
-            if i >= count {
-                break;
-            }
+        for i in std::iter::repeat_with(|| next.fetch_add(1, Ordering::Relaxed)).take_while(|&i| i < count) {
             let r = f(i);
             if r.is_err() {
                 // Work not yet begun has higher indices, whose errors would not be the one reported.
@@ -198,11 +190,7 @@ pub fn parallel_map<R: Send>(count: usize, f: impl Fn(usize) -> Result<R> + Sync
         }
     });
     let results = results.into_inner().expect("no panic holds this lock");
-    let mut done = Vec::with_capacity(count);
-    for r in results.into_iter().flatten() {
-        done.push(r?);
-    }
-    Ok(done)
+    results.into_iter().flatten().collect()
 }
 
 #[cfg(test)]

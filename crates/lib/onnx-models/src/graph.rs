@@ -108,8 +108,13 @@ fn fields(bytes: &[u8], range: Range<usize>) -> Result<Vec<Field>> {
     Ok(found)
 }
 
-fn text(bytes: &[u8], range: &Range<usize>) -> Result<String> {
-    std::str::from_utf8(&bytes[range.clone()]).map(ToString::to_string).map_err(|_| damaged())
+/// The texts of the fields `number` of a message.
+fn texts(bytes: &[u8], message: &Range<usize>, number: u64) -> Result<Vec<String>> {
+    let text = |f: Field| match f.value {
+        Value::Bytes(r) if f.number == number => Some(String::from_utf8(bytes[r].to_vec()).map_err(|_| damaged())),
+        _ => None,
+    };
+    fields(bytes, message.clone())?.into_iter().filter_map(text).collect()
 }
 
 fn graph_range(bytes: &[u8]) -> Result<(Range<usize>, Range<usize>)> {
@@ -147,35 +152,19 @@ impl Graph {
             let Value::Bytes(inner) = field.value else { continue };
             match field.number {
                 GRAPH_NODE => {
-                    let mut node = Node::default();
-                    for f in fields(bytes, inner)? {
-                        match (f.number, &f.value) {
-                            (NODE_INPUT, Value::Bytes(r)) => node.inputs.push(text(bytes, r)?),
-                            (NODE_OUTPUT, Value::Bytes(r)) => node.outputs.push(text(bytes, r)?),
-                            (NODE_OP_TYPE, Value::Bytes(r)) => node.op = text(bytes, r)?,
-                            _ => {}
-                        }
-                    }
+                    let of = |number| texts(bytes, &inner, number);
+                    let op = of(NODE_OP_TYPE)?.pop().unwrap_or_default();
+                    let node = Node { op, inputs: of(NODE_INPUT)?, outputs: of(NODE_OUTPUT)? };
                     for output in &node.outputs {
                         graph.producers.insert(output.clone(), node.clone());
                     }
                 }
-                GRAPH_OUTPUT => {
-                    for f in fields(bytes, inner)? {
-                        if let (VALUE_NAME, Value::Bytes(r)) = (f.number, &f.value) {
-                            graph.outputs.push(text(bytes, r)?);
-                        }
-                    }
-                }
+                GRAPH_OUTPUT => graph.outputs.extend(texts(bytes, &inner, VALUE_NAME)?),
                 GRAPH_INITIALIZER => {
                     let external = |f: &Field| f.number == TENSOR_LOCATION && matches!(f.value, Value::Varint(1));
-                    let tensor = fields(bytes, inner.clone())?;
-                    graph.external_data |= tensor.iter().any(external);
-                    for f in &tensor {
-                        if let (TENSOR_NAME, Value::Bytes(r)) = (f.number, &f.value) {
-                            graph.initializers.insert(text(bytes, r)?, inner.clone());
-                        }
-                    }
+                    graph.external_data |= fields(bytes, inner.clone())?.iter().any(external);
+                    let names = texts(bytes, &inner, TENSOR_NAME)?;
+                    graph.initializers.extend(names.into_iter().map(|name| (name, inner.clone())));
                 }
                 _ => {}
             }

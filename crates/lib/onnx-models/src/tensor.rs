@@ -50,17 +50,12 @@ impl<'a> Tensor<'a> {
     }
 
     /// Number of values.
-    pub fn len(&self) -> usize {
+    pub(crate) fn len(&self) -> usize {
         match &self.data {
             Data::F32(v) => v.len(),
             Data::I32(v) => v.len(),
             Data::I64(v) => v.len(),
         }
-    }
-
-    /// Whether there is no value.
-    pub fn is_empty(&self) -> bool {
-        self.len() == 0
     }
 
     /// Floats or whole numbers.

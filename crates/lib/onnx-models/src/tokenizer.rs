@@ -2,15 +2,11 @@
 
 use instant_clip_tokenizer::Token;
 
-/// Turns text into token ids: start mark, tokens of the lower-cased text, end mark, padding.
+/// Turns text into token ids: start mark, tokens of the lower-cased text, end mark, padding. Building its bundled
+/// vocabulary of 49,408 tokens takes some tens of milliseconds: keep it.
+#[derive(Default)]
 pub struct Tokenizer {
     bpe: instant_clip_tokenizer::Tokenizer,
-}
-
-impl Default for Tokenizer {
-    fn default() -> Self {
-        Self::new()
-    }
 }
 
 impl Tokenizer {
@@ -19,21 +15,13 @@ impl Tokenizer {
     /// Id that ends every text; the largest, by which text encoders find the end.
     pub const END: i32 = 49407;
 
-    /// Builds the vocabulary of 49,408 tokens, which is bundled. Takes some tens of milliseconds: keep it.
-    pub fn new() -> Self {
-        Self { bpe: instant_clip_tokenizer::Tokenizer::new() }
-    }
-
     /// Ids of `text`, exactly `length` of them (77 in all CLIP models; at least 3). A text that is too long is cut so
     /// that the end mark stays; a short one is filled with `pad`.
     pub fn encode(&self, text: &str, length: usize, pad: i32) -> Vec<i32> {
         let mut tokens = Vec::new();
         self.bpe.encode(text, &mut tokens);
-        let room = length.saturating_sub(2);
-        let mut ids = Vec::with_capacity(length);
-        ids.push(Self::START);
-        ids.extend(tokens.into_iter().take(room).map(|t: Token| i32::from(t.to_u16())));
-        ids.push(Self::END);
+        let tokens = tokens.into_iter().take(length.saturating_sub(2)).map(|t: Token| i32::from(t.to_u16()));
+        let mut ids: Vec<i32> = [Self::START].into_iter().chain(tokens).chain([Self::END]).collect();
         ids.resize(length, pad);
         ids
     }
@@ -45,7 +33,7 @@ mod tests {
 
     #[test]
     fn known_ids_of_openai_clip() {
-        let t = Tokenizer::new();
+        let t = Tokenizer::default();
         let ids = |s: &str| {
             let all = t.encode(s, 77, 0);
             assert_eq!(all.len(), 77);
@@ -64,7 +52,7 @@ mod tests {
 
     #[test]
     fn long_texts_keep_their_end_mark_and_padding_is_free() {
-        let t = Tokenizer::new();
+        let t = Tokenizer::default();
         let long = t.encode(&"cat ".repeat(200), 77, 0);
         assert_eq!((long.len(), long[75], long[76]), (77, 2368, Tokenizer::END));
         assert_eq!(t.encode("cat", 5, 7), [Tokenizer::START, 2368, Tokenizer::END, 7, 7]);

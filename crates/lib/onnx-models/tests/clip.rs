@@ -56,7 +56,7 @@ fn mean_and_std_are_taken_from_the_configuration() {
 fn text_features_come_from_the_real_tokenizer() {
     let clip = ClipText::open(folder(), &EngineOptions::default()).unwrap();
     let features = clip.encode(&["a photo of a cat", "hello world!"]).unwrap();
-    let tokenizer = Tokenizer::new();
+    let tokenizer = Tokenizer::default();
     for (i, text) in ["a photo of a cat", "hello world!"].into_iter().enumerate() {
         let mut counts = [0.0; 4];
         for id in tokenizer.encode(text, 77, 0) {

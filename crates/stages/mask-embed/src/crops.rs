@@ -73,7 +73,7 @@ fn tokens(scene: &Path) -> Result<BTreeMap<String, Vec<i32>>> {
         }
         texts.extend(MaskTruth::read_all(masks)?.into_values().flatten().map(|m| m.caption));
     }
-    let tokenizer = Tokenizer::new();
+    let tokenizer = Tokenizer::default();
     let ids = |text: &String| {
         let mut ids = tokenizer.encode(text, 77, -1);
         ids.retain(|&i| i >= 0 && i != Tokenizer::START && i != Tokenizer::END);
