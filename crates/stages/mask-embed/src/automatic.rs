@@ -6,7 +6,7 @@
 //! result does not depend on the number of threads.
 
 use crate::logits::{Grid, Logits};
-use crate::nms::{MaskNms, Pixels, box_nms, mask_nms, merges_things, nesting_levels};
+use crate::nms::{GOOD, Pixels, Rated, box_nms, mask_nms, merges_things, nesting_levels};
 use crate::options::Choice;
 use crate::sam::{Candidates, Embedded, Sam};
 use artifacts::LEVELS;
@@ -22,8 +22,6 @@ const ASK_UNTIL_WHOLE: usize = 5;
 const MAX_AREA: f64 = 0.6;
 /// Of masks whose boxes overlap by more than this (IoU) the best stays: as in SAM's own script.
 const BOX_NMS: f64 = 0.7;
-/// LangSplat's rule within a level, with a score that suits MobileSAM's soft edges (0.7 there).
-const MASK_NMS: MaskNms = MaskNms { iou: 0.8, score: 0.6, inner: 0.5 };
 
 /// One mask of one prompt, good enough to be considered.
 #[derive(Debug, Clone)]
@@ -34,7 +32,7 @@ pub struct Proposal {
     pub quality: f32,
     /// Predicted IoU x stability.
     pub score: f32,
-    /// Its pixels in the decoder's resolution, [`Grid::width`] x [`Grid::height`].
+    /// Its pixels in the decoder's resolution, those of `Grid`.
     pub pixels: Pixels,
     /// How sure it is of them.
     pub logits: Logits,
@@ -88,7 +86,7 @@ pub fn propose(sam: &Sam, embedded: &Embedded, choice: &Choice) -> Result<Propos
         let at_level = |l: usize| masks.iter().filter(move |m| m.level == l);
         let times = |p: &Pixels| asked.iter().filter(|&&a| p.contains(grid.index(a))).count();
         let small: Vec<(&Pixels, usize)> = at_level(1).map(|m| (&m.pixels, times(&m.pixels))).collect();
-        let good = at_level(LEVELS - 1).filter(|m| m.score > MASK_NMS.score);
+        let good = at_level(LEVELS - 1).filter(|m| m.score > GOOD);
         let whole: Vec<&Pixels> = good.map(|m| &m.pixels).collect();
         let known = |point: [f64; 2]| {
             let i = grid.index(point);
@@ -133,17 +131,15 @@ fn consider(answer: &Candidates, grid: &Grid, choice: &Choice) -> Vec<Proposal> 
 /// prompt leaves the levels to nesting ([`nesting_levels`]). Then [`fill`].
 pub fn levels(masks: &[Proposal]) -> [Vec<usize>; LEVELS] {
     let by_boxes = |c: Vec<usize>| -> Vec<usize> {
-        let (pixels, quality): (Vec<&Pixels>, Vec<f32>) =
-            c.iter().map(|&i| (&masks[i].pixels, masks[i].quality)).unzip();
-        box_nms(&pixels, &quality, BOX_NMS).into_iter().map(|k| c[k]).collect()
+        let rated: Vec<Rated> = c.iter().map(|&i| (&masks[i].pixels, masks[i].quality)).collect();
+        box_nms(&rated, BOX_NMS).into_iter().map(|k| c[k]).collect()
     };
     let by_masks = |c: Vec<usize>| -> Vec<usize> {
-        let (pixels, score): (Vec<&Pixels>, Vec<f32>) = c.iter().map(|&i| (&masks[i].pixels, masks[i].score)).unzip();
-        mask_nms(&pixels, &score, MASK_NMS).into_iter().map(|k| c[k]).collect()
+        let rated: Vec<Rated> = c.iter().map(|&i| (&masks[i].pixels, masks[i].score)).collect();
+        mask_nms(&rated).into_iter().map(|k| c[k]).collect()
     };
     // Masks of level large are whole things; a mask around several of them is none itself.
-    let things: Vec<(&Pixels, f32)> =
-        masks.iter().filter(|m| m.level == LEVELS - 1).map(|m| (&m.pixels, m.score)).collect();
+    let things: Vec<Rated> = masks.iter().filter(|m| m.level == LEVELS - 1).map(|m| (&m.pixels, m.score)).collect();
     let single: Vec<usize> =
         (0..masks.len()).filter(|&i| !merges_things(&masks[i].pixels, masks[i].score, &things)).collect();
     let all = by_boxes(single.clone());
@@ -153,7 +149,7 @@ pub fn levels(masks: &[Proposal]) -> [Vec<usize>; LEVELS] {
             *slot = by_masks(by_boxes(single.iter().copied().filter(|&i| masks[i].level == level).collect()));
         }
     } else {
-        let good: Vec<usize> = all.iter().copied().filter(|&i| masks[i].score > MASK_NMS.score).collect();
+        let good: Vec<usize> = all.iter().copied().filter(|&i| masks[i].score > GOOD).collect();
         let pixels: Vec<&Pixels> = good.iter().map(|&i| &masks[i].pixels).collect();
         let nested = nesting_levels(&pixels);
         for (level, slot) in chosen.iter_mut().enumerate().skip(1) {
@@ -178,12 +174,11 @@ pub fn fill(masks: &[Proposal], chosen: &[Vec<usize>; LEVELS]) -> [Vec<usize>; L
         let mut others: Vec<usize> =
             (1..LEVELS).filter(|&l| l != level).flat_map(|l| chosen[l].iter().copied()).collect();
         others.sort_by(|&a, &b| masks[b].score.total_cmp(&masks[a].score).then(a.cmp(&b)));
-        let mut covered = slot.iter().fold(None::<Pixels>, |all, &i| Some(union(all, &masks[i].pixels)));
+        let mut covered = slot.iter().fold(Pixels::default(), |all, &i| all.union(&masks[i].pixels));
         for i in others {
             let mask = &masks[i].pixels;
-            let taken = covered.as_ref().map_or(0, |c| c.overlap(mask));
-            if (mask.area - taken) as f64 >= FILL_FREE * mask.area as f64 {
-                covered = Some(union(covered, mask));
+            if (mask.area - covered.overlap(mask)) as f64 >= FILL_FREE * mask.area as f64 {
+                covered = covered.union(mask);
                 slot.push(i);
             }
         }
@@ -191,26 +186,18 @@ pub fn fill(masks: &[Proposal], chosen: &[Vec<usize>; LEVELS]) -> [Vec<usize>; L
     filled
 }
 
-fn union(all: Option<Pixels>, mask: &Pixels) -> Pixels {
-    all.map_or_else(|| mask.clone(), |a| a.union(mask))
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
     use proptest::prelude::*;
+    use std::collections::BTreeSet;
 
     proptest! {
         #[test]
         fn rounds_are_the_whole_grid(n in 1usize..40, aspect in 0.2f64..5.0) {
             let all: Vec<[f64; 2]> = rounds(n, aspect).concat();
             let long = if aspect >= 1.0 { 0 } else { 1 };
-            let distinct = |axis: usize| {
-                let mut v: Vec<u64> = all.iter().map(|p| p[axis].to_bits()).collect();
-                v.sort_unstable();
-                v.dedup();
-                v.len()
-            };
+            let distinct = |axis: usize| all.iter().map(|p| p[axis].to_bits()).collect::<BTreeSet<_>>().len();
             prop_assert_eq!(distinct(long), n);
             prop_assert_eq!(all.len(), n * distinct(1 - long));
             prop_assert!(all.iter().flatten().all(|&c| c > 0.0 && c < 1.0));
@@ -248,14 +235,8 @@ mod tests {
         // A thing of two parts, and a thing alone.
         let single = [rect(0, 10, 0), rect(0, 6, 0), rect(6, 10, 0), rect(12, 20, 0)];
         let l = levels(&single);
-        let sorted = |v: &[usize]| {
-            let mut v = v.to_vec();
-            v.sort_unstable();
-            v
-        };
-        assert_eq!(sorted(&l[1]), [1, 2, 3]);
-        assert_eq!(sorted(&l[2]), [1, 2, 3]);
-        assert_eq!(sorted(&l[3]), [0, 3]);
+        let sorted = |v: &[usize]| BTreeSet::from_iter(v.to_vec()).into_iter().collect::<Vec<_>>();
+        assert_eq!((sorted(&l[1]), sorted(&l[2]), sorted(&l[3])), (vec![1, 2, 3], vec![1, 2, 3], vec![0, 3]));
         // The same masks with SAM's levels.
         let own = [rect(0, 10, 3), rect(0, 6, 1), rect(6, 10, 2), rect(12, 20, 3)];
         let l = levels(&own);

@@ -1,7 +1,7 @@
 //! Which of many overlapping masks stay: SAM's suppression by boxes and LangSplat's by masks.
 
 /// A set of pixels of a small picture, one bit each.
-#[derive(Debug, Clone, PartialEq, Eq)]
+#[derive(Debug, Clone, Default, PartialEq, Eq)]
 pub struct Pixels {
     words: Vec<u64>,
     /// Number of pixels in the set.
@@ -32,14 +32,15 @@ impl Pixels {
     /// Pixels of either set; both of the same picture.
     #[must_use]
     pub fn union(&self, other: &Self) -> Self {
+        if self.area == 0 {
+            return other.clone();
+        } else if other.area == 0 {
+            return self.clone();
+        }
         let words: Vec<u64> = self.words.iter().zip(&other.words).map(|(a, b)| a | b).collect();
         let area = words.iter().map(|w| w.count_ones() as usize).sum();
         let (a, b) = (self.bounds, other.bounds);
-        let bounds = match (self.area, other.area) {
-            (0, _) => b,
-            (_, 0) => a,
-            _ => [a[0].min(b[0]), a[1].min(b[1]), a[2].max(b[2]), a[3].max(b[3])],
-        };
+        let bounds = [a[0].min(b[0]), a[1].min(b[1]), a[2].max(b[2]), a[3].max(b[3])];
         Self { words, area, bounds }
     }
 
@@ -57,56 +58,55 @@ impl Pixels {
     }
 }
 
+/// A mask and its score.
+pub type Rated<'a> = (&'a Pixels, f32);
+
+/// Least score of a good mask: LangSplat's is 0.7; this one suits MobileSAM's soft edges.
+pub const GOOD: f32 = 0.6;
+/// Of masks that overlap by more than this (IoU) LangSplat keeps the better one.
+const SAME: f64 = 0.8;
+/// How much of a fragment and of the mask around it may be shared before it is no fragment: see [`mask_nms`].
+const INNER: f64 = 0.5;
+
 /// Indices by descending score; equal scores keep their order, so that the result depends on nothing else.
-fn by_score(scores: &[f32]) -> Vec<usize> {
-    let mut order: Vec<usize> = (0..scores.len()).collect();
-    order.sort_by(|&a, &b| scores[b].total_cmp(&scores[a]).then(a.cmp(&b)));
+fn by_score(masks: &[Rated]) -> Vec<usize> {
+    let mut order: Vec<usize> = (0..masks.len()).collect();
+    order.sort_by(|&a, &b| masks[b].1.total_cmp(&masks[a].1));
     order
 }
 
 /// Suppression by boxes: of masks whose boxes overlap by more than `threshold` (IoU) the one of best score stays.
 /// Gives the indices that stay, best first.
-pub fn box_nms(masks: &[&Pixels], scores: &[f32], threshold: f64) -> Vec<usize> {
+pub fn box_nms(masks: &[Rated], threshold: f64) -> Vec<usize> {
     let mut kept: Vec<usize> = Vec::new();
-    for i in by_score(scores) {
-        if kept.iter().all(|&k| masks[k].box_iou(masks[i]) <= threshold) {
+    for i in by_score(masks) {
+        if kept.iter().all(|&k| masks[k].0.box_iou(masks[i].0) <= threshold) {
             kept.push(i);
         }
     }
     kept
 }
 
-/// Thresholds of [`mask_nms`].
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub struct MaskNms {
-    /// A mask that overlaps a better one by more than this (IoU) is dropped.
-    pub iou: f64,
-    /// A mask with a lower score than this is dropped.
-    pub score: f32,
-    /// How much of a fragment and of the mask around it may be shared before it is no fragment: see [`mask_nms`].
-    pub inner: f64,
-}
-
 /// LangSplat's suppression by masks within a level. A mask is dropped when its score is low; when it overlaps a better one too
 /// much; or when it is a fragment: with a = the part of it that lies in another mask and b = the part of the other that
-/// lies in it, a >= 0.85, b < 0.5 and a b < `inner`. Unlike there, a mask of low score is dropped first and so removes nothing
+/// lies in it, a >= 0.85, b < 0.5 and a b < `INNER`. Unlike there, a mask of low score is dropped first and so removes nothing
 /// itself. Gives the indices that stay, best first.
-pub fn mask_nms(masks: &[&Pixels], scores: &[f32], rule: MaskNms) -> Vec<usize> {
-    let mut order = by_score(scores);
-    order.retain(|&i| masks[i].area > 0 && scores[i] > rule.score);
+pub fn mask_nms(masks: &[Rated]) -> Vec<usize> {
+    let mut order = by_score(masks);
+    order.retain(|&i| masks[i].0.area > 0 && masks[i].1 > GOOD);
     let mut keep = vec![true; order.len()];
     for (p, &i) in order.iter().enumerate() {
         for (q, &j) in order.iter().enumerate().skip(p + 1) {
-            let both = masks[i].overlap(masks[j]) as f64;
+            let both = masks[i].0.overlap(masks[j].0) as f64;
             if both == 0.0 {
                 continue;
             }
-            let (ai, aj) = (masks[i].area as f64, masks[j].area as f64);
-            if both / (ai + aj - both) > rule.iou {
+            let (ai, aj) = (masks[i].0.area as f64, masks[j].0.area as f64);
+            if both / (ai + aj - both) > SAME {
                 keep[q] = false;
             }
             let (of_i, of_j) = (both / ai, both / aj);
-            if of_i * of_j < rule.inner {
+            if of_i * of_j < INNER {
                 if of_i < 0.5 && of_j >= 0.85 {
                     keep[q] = false;
                 }
@@ -122,9 +122,9 @@ pub fn mask_nms(masks: &[&Pixels], scores: &[f32], rule: MaskNms) -> Vec<usize> 
 /// Whether a mask merges several things: at least three of the `things`, apart from each other, lie in it (85% of each)
 /// and have a score that is no more than 0.1 below its own. SAM's largest masks are now and then half the room, which
 /// [`mask_nms`] would keep and drop everything in it.
-pub fn merges_things(mask: &Pixels, score: f32, things: &[(&Pixels, f32)]) -> bool {
+pub fn merges_things(mask: &Pixels, score: f32, things: &[Rated]) -> bool {
     let mut apart: Vec<&Pixels> = Vec::new();
-    for k in by_score(&things.iter().map(|t| t.1).collect::<Vec<f32>>()) {
+    for k in by_score(things) {
         let (thing, good) = (things[k].0, things[k].1 > score - 0.1);
         let most_of = |part: usize, whole: &Pixels| part as f64 >= 0.85 * whole.area as f64;
         let inside = good && thing.area < mask.area && most_of(thing.overlap(mask), thing);
@@ -160,8 +160,6 @@ mod tests {
         Pixels::new(20, (0..200).map(|i| (x0..x1).contains(&(i % 20)) && (y0..y1).contains(&(i / 20))))
     }
 
-    const RULE: MaskNms = MaskNms { iou: 0.8, score: 0.7, inner: 0.5 };
-
     #[test]
     fn pixels_count_and_overlap() {
         let a = rect(2, 3, 12, 8);
@@ -180,26 +178,27 @@ mod tests {
     #[test]
     fn boxes_that_overlap_leave_the_best() {
         let m = [rect(0, 0, 10, 10), rect(1, 0, 10, 10), rect(10, 0, 20, 10)];
-        let r: Vec<&Pixels> = m.iter().collect();
-        assert_eq!(box_nms(&r, &[0.8, 0.9, 0.7], 0.7), [1, 2]);
-        assert_eq!(box_nms(&r, &[0.8, 0.9, 0.7], 0.95), [1, 0, 2]);
+        let kept = |scores: [f32; 3], iou| box_nms(&m.iter().zip(scores).collect::<Vec<_>>(), iou);
+        assert_eq!(kept([0.8, 0.9, 0.7], 0.7), [1, 2]);
+        assert_eq!(kept([0.8, 0.9, 0.7], 0.95), [1, 0, 2]);
         // Equal scores: the first stays.
-        assert_eq!(box_nms(&r, &[0.9, 0.9, 0.9], 0.7), [0, 2]);
+        assert_eq!(kept([0.9, 0.9, 0.9], 0.7), [0, 2]);
     }
 
     #[test]
     fn masks_that_overlap_score_low_or_are_fragments_go() {
         let (whole, same, part, other) = (rect(0, 0, 10, 10), rect(0, 0, 10, 9), rect(0, 0, 4, 4), rect(12, 0, 20, 10));
-        let r = [&whole, &same, &part, &other];
+        let kept =
+            |scores: [f32; 4]| mask_nms(&[&whole, &same, &part, &other].into_iter().zip(scores).collect::<Vec<_>>());
         // `same` overlaps `whole` by 0.9; `part` is a fragment of both, whatever its score.
-        assert_eq!(mask_nms(&r, &[0.95, 0.9, 0.8, 0.75], RULE), [0, 3]);
-        assert_eq!(mask_nms(&r, &[0.8, 0.75, 0.99, 0.9], RULE), [3, 0]);
-        assert_eq!(mask_nms(&r, &[0.95, 0.9, 0.8, 0.65], RULE), [0]);
+        assert_eq!(kept([0.95, 0.9, 0.8, 0.75]), [0, 3]);
+        assert_eq!(kept([0.8, 0.75, 0.99, 0.9]), [3, 0]);
+        assert_eq!(kept([0.95, 0.9, 0.8, 0.55]), [0]);
         // More than half of the larger is no fragment; nor is a mask that lies half outside.
         let (big_part, half_out) = (rect(0, 0, 10, 6), rect(8, 0, 12, 4));
-        assert_eq!(mask_nms(&[&whole, &big_part, &half_out], &[0.9, 0.85, 0.8], RULE), [0, 1, 2]);
-        assert!(mask_nms(&[&rect(3, 3, 3, 3)], &[0.9], RULE).is_empty());
-        assert!(mask_nms(&[], &[], RULE).is_empty());
+        assert_eq!(mask_nms(&[(&whole, 0.9), (&big_part, 0.85), (&half_out, 0.8)]), [0, 1, 2]);
+        assert!(mask_nms(&[(&rect(3, 3, 3, 3), 0.9)]).is_empty());
+        assert!(mask_nms(&[]).is_empty());
     }
 
     #[test]

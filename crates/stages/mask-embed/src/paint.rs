@@ -74,22 +74,19 @@ pub fn preview(image: &RgbImage, maps: &MaskMaps) -> RgbImage {
                 let edge = (x + 1 < w && map[y * w + x + 1] != id) || (y + 1 < h && map[(y + 1) * w + x] != id);
                 let photo = &small.pixels[(y * w + x) * 3..][..3];
                 let at = ((level / 2 * h + y) * 2 * w + level % 2 * w + x) * 3;
+                let color = instance_color((id - first) as u32).map(|c| (c * 255.0).round() as u16);
                 for c in 0..3 {
                     out.pixels[at + c] = match id {
                         _ if edge => 255,
                         // No mask: the photograph, darkened.
                         -1 => photo[c] / 3,
-                        id => (u16::from(photo[c]) * 2 / 5 + u16::from(color(id - first)[c]) * 3 / 5) as u8,
+                        _ => (u16::from(photo[c]) * 2 / 5 + color[c] * 3 / 5) as u8,
                     };
                 }
             }
         }
     }
     out
-}
-
-fn color(id: i32) -> [u8; 3] {
-    instance_color(id as u32).map(|c| (c * 255.0).round() as u8)
 }
 
 #[cfg(test)]
