@@ -83,11 +83,8 @@ fn tokens(scene: &Path) -> Result<BTreeMap<String, Vec<i32>>> {
 }
 
 /// Writes the crops of all masks of a scene into one file.
-///
-/// # Errors
-/// When scene or id maps cannot be read, or the output cannot be written.
 pub(crate) fn run(args: &CropsArgs, stage: &Stage) -> Result<()> {
-    let (scene, folder) = (photographs::open(&args.scene, stage)?, &args.maps.masks);
+    let (scene, folder) = (photographs::open(&args.scene, stage)?, &args.masks);
     let maps = artifacts::folder_files(folder, "_s.npy")?;
     let mut claim =
         stage.outputs(&args.out).artifact(&args.out, CROPS_FORMAT).reads(&scene.files).reads(maps).claim()?;

@@ -2,16 +2,16 @@
 
 use crate::crops::{cut, no_maps, owners, read_maps};
 use crate::finished::{self, Views};
-use crate::options::{EmbedArgs, EngineArgs, SceneArgs};
-use crate::{memory, photographs};
+use crate::options::EmbedArgs;
+use crate::photographs;
 use artifacts::{MaskFeatures, MaskMaps, features_path, hash_folder, maps_path, role};
-use gs_io::{Claim, Result, Watched, hash_bytes, hash_file};
+use gs_io::{Claim, Result, Watched, hash_bytes, hash_file, write_json};
 use gs_scene::dataset::{Dataset, View};
-use onnx_models::{ClipConfig, ClipImage, ClipText, RgbImage};
+use onnx_models::{ClipImage, ClipText, RgbImage};
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 use serde_json::json;
-use stage::Stage;
+use stage::{Stage, peak_rss_bytes};
 use std::collections::{BTreeMap, HashMap};
 use std::path::{Path, PathBuf};
 
@@ -19,7 +19,7 @@ use std::path::{Path, PathBuf};
 const AT_A_TIME: usize = 4 * ClipImage::BATCH;
 
 /// Facts of a view's features.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Serialize, Deserialize)]
 struct Facts {
     /// Rows of the file.
     masks: usize,
@@ -40,11 +40,8 @@ fn check_maps(folder: &Path, views: &[View]) -> Result<()> {
 }
 
 /// Makes the features of every view's masks that are not done already, then the manifest.
-///
-/// # Errors
-/// When scene, id maps or model cannot be read, or the output cannot be written.
 pub(crate) fn run(args: &EmbedArgs, stage: &Stage) -> Result<()> {
-    let (scene, folder) = (photographs::open(&args.scene, stage)?, &args.maps.masks);
+    let (scene, folder) = (photographs::open(&args.scene, stage)?, &args.masks);
     let out = args.out.as_ref().unwrap_or(folder);
     let manifest = out.join("features.json");
     let mut claim = claim(args, &scene, out, &manifest, stage)?;
@@ -52,13 +49,10 @@ pub(crate) fn run(args: &EmbedArgs, stage: &Stage) -> Result<()> {
     let clip = ClipImage::open(&args.clip, &args.engine.options())?;
     let watched =
         Watched::new(scene.views.iter().map(|v| &v.image_path)).and(artifacts::watch_folder(folder, "_s.npy")?);
-    let parameters = json!(Parameters {
-        model: clip.config(),
-        image_size: clip.size(),
-        dimension: clip.dimension(),
-        scene: &args.scene,
-        engine: &args.engine,
-    });
+    let mut parameters = json!(args);
+    parameters["model"] = json!(clip.config());
+    parameters["image_size"] = clip.size().into();
+    parameters["dimension"] = clip.dimension().into();
     let dataset_hash = scene.hash()?;
 
     let mut views = Views::new(stage, scene.views.len());
@@ -100,25 +94,13 @@ pub(crate) fn run(args: &EmbedArgs, stage: &Stage) -> Result<()> {
     let mut provenance = stage.provenance("mask-features", 1, parameters.clone(), inputs.clone());
     let count = views.len();
     provenance.extra = json!({ "views": views });
-    finished::write_json(&manifest, &provenance)?;
+    write_json(&manifest, &provenance)?;
     stage.record(&mut claim, parameters, inputs, json!({ "views": count, "masks": masks, "pictures": pictures }))
-}
-
-/// What shaped the features.
-#[derive(Serialize)]
-struct Parameters<'a> {
-    model: &'a ClipConfig,
-    image_size: usize,
-    dimension: usize,
-    #[serde(flatten)]
-    scene: &'a SceneArgs,
-    #[serde(flatten)]
-    engine: &'a EngineArgs,
 }
 
 /// The right to write features, their notes and the manifest.
 fn claim(args: &EmbedArgs, scene: &Dataset, out: &Path, manifest: &Path, stage: &Stage) -> Result<Claim> {
-    let folder = &args.maps.masks;
+    let folder = &args.masks;
     let maps = artifacts::folder_files(folder, "_s.npy")?;
     let with_maps = scene.views.iter().map(View::stem).filter(|stem| maps_path(folder, stem).exists());
     let features: Vec<PathBuf> = with_maps.map(|stem| features_path(out, stem)).collect();
@@ -159,11 +141,12 @@ fn embed(clip: &ClipImage, image: &RgbImage, maps: &MaskMaps) -> Result<(MaskFea
     Ok((MaskFeatures { count: maps.id_count(), dim, values }, first.len()))
 }
 
-/// Says how much memory the photographs will take.
+/// Says how much memory the photographs will take, after a full batch of empty pictures has shown what the model takes.
+/// [`AT_A_TIME`] pictures wait for it, and the map of a photograph has as many pixels as itself at the most.
 fn forecast(clip: &ClipImage, views: &[View], stage: &Stage) -> Result<()> {
     let size = clip.size();
     clip.encode(&vec![0; ClipImage::BATCH * rayon::current_num_threads() * 3 * size * size])?;
-    let pixels = memory::largest(views);
-    let needed = memory::of_features(memory::so_far(), AT_A_TIME as u64, size as u64, pixels);
+    let needed =
+        peak_rss_bytes().unwrap_or(0) + (6 * size * size * AT_A_TIME) as u64 + 20 * photographs::largest(views);
     stage.forecast(needed, "give fewer --threads, or smaller photographs (--resolution)")
 }

@@ -1,13 +1,13 @@
 //! `mask-embed import`: id maps from label pictures.
 
+use crate::finished;
 use crate::masks::count_masks;
 use crate::options::ImportArgs;
-use crate::{finished, memory};
 use artifacts::{LEVELS, Level, MaskMaps, hash_folder, maps_path};
-use gs_io::{Error, IoContext, Result, hash_files};
+use gs_io::{Error, IoContext, Result, hash_files, write_json};
 use image::DynamicImage;
 use serde_json::json;
-use stage::Stage;
+use stage::{Stage, peak_rss_bytes};
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
 
@@ -39,32 +39,13 @@ fn read(path: &Path) -> Result<Labels> {
     Ok(Labels { width, height, values })
 }
 
-/// Id maps of four pictures of labels, which count for themselves: ids by ascending label, from level to level.
-fn number(levels: [&Labels; LEVELS]) -> MaskMaps {
-    let mut ids = Vec::with_capacity(LEVELS * levels[0].values.len());
-    let mut first = 0;
-    for labels in levels {
-        let distinct: BTreeSet<u16> = labels.values.iter().copied().filter(|&l| l > 0).collect();
-        let id_of: BTreeMap<u16, i32> = distinct.into_iter().zip(first..).collect();
-        ids.extend(labels.values.iter().map(|l| id_of.get(l).copied().unwrap_or(-1)));
-        first += id_of.len() as i32;
-    }
-    MaskMaps { width: levels[0].width, height: levels[0].height, ids }
-}
-
 /// Pictures by view: the one for all levels, or one for each.
 fn find(folder: &Path) -> Result<BTreeMap<String, Vec<PathBuf>>> {
-    let mut names = BTreeSet::new();
-    for entry in std::fs::read_dir(folder).at("list", folder)? {
-        let name = entry.at("list", folder)?.file_name().to_string_lossy().into_owned();
-        if let Some(stem) = name.strip_suffix(".png") {
-            names.insert(stem.to_string());
-        }
-    }
     let mut views: BTreeMap<String, Vec<PathBuf>> = BTreeMap::new();
-    for name in &names {
+    for picture in artifacts::folder_files(folder, ".png")? {
+        let name = picture.file_stem().unwrap_or_default().to_string_lossy();
         let level = Level::ALL.iter().find_map(|l| name.strip_suffix(&format!("_{l}")));
-        let view = level.unwrap_or(name);
+        let view = level.unwrap_or(&name);
         let all = Level::ALL.map(|l| folder.join(format!("{view}_{l}.png")));
         if level.is_none() {
             if all.iter().any(|p| p.exists()) {
@@ -74,7 +55,7 @@ fn find(folder: &Path) -> Result<BTreeMap<String, Vec<PathBuf>>> {
                     .expected("one picture, or one for each level")
                     .hint("delete what is not meant"));
             }
-            views.insert(view.to_string(), vec![folder.join(format!("{name}.png"))]);
+            views.insert(view.to_string(), vec![picture]);
         } else if !views.contains_key(view) {
             if let Some(missing) = all.iter().find(|p| !p.exists()) {
                 return Err(Error::new("the labels of a level are missing")
@@ -90,7 +71,7 @@ fn find(folder: &Path) -> Result<BTreeMap<String, Vec<PathBuf>>> {
     Ok(views)
 }
 
-/// The id maps of one view.
+/// The id maps of one view: ids by ascending label, counting on from level to level.
 fn load(paths: &[PathBuf]) -> Result<MaskMaps> {
     let labels = paths.iter().map(|p| read(p)).collect::<Result<Vec<Labels>>>()?;
     for (l, path) in labels.iter().zip(paths) {
@@ -101,18 +82,22 @@ fn load(paths: &[PathBuf]) -> Result<MaskMaps> {
                 .expected(format!("{} x {}, as the first", labels[0].width, labels[0].height)));
         }
     }
-    let of = |level: usize| labels.get(level).unwrap_or(&labels[0]);
-    Ok(number([of(0), of(1), of(2), of(3)]))
+    let Labels { width, height, .. } = labels[0];
+    let (mut ids, mut first) = (Vec::with_capacity(LEVELS * width * height), 0);
+    for Labels { values, .. } in labels.iter().cycle().take(LEVELS) {
+        let distinct: BTreeSet<u16> = values.iter().copied().filter(|&l| l > 0).collect();
+        let id_of: BTreeMap<u16, i32> = distinct.into_iter().zip(first..).collect();
+        ids.extend(values.iter().map(|l| id_of.get(l).copied().unwrap_or(-1)));
+        first += id_of.len() as i32;
+    }
+    Ok(MaskMaps { width, height, ids })
 }
 
 /// Turns label pictures into id maps, then writes the manifest. Nothing is written before all pictures have been read
 /// once.
-///
-/// # Errors
-/// When a picture cannot be read or is not grey, the levels of a view differ in size, or the output cannot be written.
 pub(crate) fn run(args: &ImportArgs, stage: &Stage) -> Result<()> {
     let found = find(&args.labels)?;
-    let folder = &args.maps.out;
+    let folder = &args.out;
     let manifest = folder.join("masks.json");
     let maps = found.keys().map(|view| maps_path(folder, view));
     let outputs = stage.outputs(&manifest).file(&manifest).files(maps).drop_stale();
@@ -121,7 +106,7 @@ pub(crate) fn run(args: &ImportArgs, stage: &Stage) -> Result<()> {
     let sizes = found.values().flatten().filter_map(|p| image::image_dimensions(p).ok());
     let pixels = sizes.map(|(w, h)| u64::from(w) * u64::from(h)).max().unwrap_or(0);
     let levels = found.values().map(Vec::len).max().unwrap_or(0) as u64;
-    stage.forecast(memory::of_import(memory::so_far(), pixels, levels), "give smaller pictures")?;
+    stage.forecast(peak_rss_bytes().unwrap_or(0) + (30 + 3 * levels) * pixels, "give smaller pictures")?;
     let mut views = BTreeMap::new();
     for (view, paths) in &found {
         let maps = load(paths)?;
@@ -142,20 +127,6 @@ pub(crate) fn run(args: &ImportArgs, stage: &Stage) -> Result<()> {
     let inputs = BTreeMap::from([("labels".to_string(), hash_files(files)?)]);
     let mut provenance = stage.provenance("masks", 1, json!({}), inputs.clone());
     provenance.extra = json!({ "views": views, "hash": hash_folder(folder, "_s.npy")? });
-    finished::write_json(&manifest, &provenance)?;
+    write_json(&manifest, &provenance)?;
     stage.record(&mut claim, json!({}), inputs, json!({ "views": views.len() }))
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn labels_become_ids_that_count_on() {
-        let l = |values: Vec<u16>| Labels { width: 3, height: 1, values };
-        let (a, b) = (l(vec![500, 0, 7]), l(vec![0, 9, 9]));
-        let m = number([&a, &b, &l(vec![0, 0, 0]), &a]);
-        assert_eq!(m.ids, [1, -1, 0, -1, 2, 2, -1, -1, -1, 4, -1, 3]);
-        assert_eq!(m.id_count(), 5);
-    }
 }

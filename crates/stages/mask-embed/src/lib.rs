@@ -1,25 +1,48 @@
 //! Stage 0: SAM masks and CLIP features of photographs through ONNX.
 //!
-//! `options` is the command line, `run` calls the command, and each command has a file: `masks` asks SAM for everything in each photograph ([`sam`],
+//! `options` is the command line, and each command has a file: `masks` asks SAM for everything in each photograph ([`sam`],
 //! [`automatic`]), chooses ([`nms`]) and writes id maps at four levels ([`paint`], `regions`); `import` takes them from label
 //! pictures instead; `embed` shows the picture of each mask to CLIP. All write LangSplat's files: `<view>_s.npy` and
 //! `<view>_f.npy`. [`crops`] gives the training script of the small encoder what the pipeline would see. `finished` knows
-//! which views are done already, [`logits`] how sure a mask is of each pixel.
+//! which views are done already, `logits` how sure a mask is of each pixel.
 
 pub mod automatic;
 pub mod crops;
-pub mod embed;
+mod embed;
 mod finished;
-pub mod import;
-pub mod logits;
-pub mod masks;
-mod memory;
+mod import;
+mod logits;
+mod masks;
 pub mod nms;
 mod options;
 pub mod paint;
 mod photographs;
 mod regions;
-mod run;
 pub mod sam;
 
 pub use options::{Args, Choice};
+
+use gs_io::Result;
+use options::Task;
+use stage::{CommonArgs, Program, Stage};
+
+impl Program for Args {
+    const NAME: &'static str = "mask-embed";
+
+    fn common(&self) -> &CommonArgs {
+        &self.common
+    }
+
+    fn forecasts(&self) -> bool {
+        !matches!(self.task, Task::Crops(_))
+    }
+
+    fn run(self, stage: &Stage) -> Result<()> {
+        match self.task {
+            Task::Masks(args) => masks::run(&args, stage),
+            Task::Embed(args) => embed::run(&args, stage),
+            Task::Import(args) => import::run(&args, stage),
+            Task::Crops(args) => crops::run(&args, stage),
+        }
+    }
+}

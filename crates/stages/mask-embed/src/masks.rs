@@ -4,21 +4,21 @@ use crate::automatic::{levels, propose};
 use crate::finished::{self, Views};
 use crate::options::{Choice, MasksArgs};
 use crate::paint::{paint, preview};
+use crate::photographs;
 use crate::sam::Sam;
-use crate::{memory, photographs};
 use artifacts::{LEVELS, Level, MaskMaps, maps_path, role};
-use gs_io::{Claim, Result, Watched};
+use gs_io::{Claim, Result, Watched, write_json};
 use gs_scene::Image;
 use gs_scene::dataset::{Dataset, View};
 use onnx_models::RgbImage;
 use serde::{Deserialize, Serialize};
 use serde_json::json;
-use stage::Stage;
+use stage::{Stage, peak_rss_bytes};
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
 
 /// Facts of a view's id maps.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Serialize, Deserialize)]
 struct Facts {
     /// Width and height of the maps.
     size: [usize; 2],
@@ -35,12 +35,9 @@ pub(crate) fn count_masks(maps: &MaskMaps) -> [usize; LEVELS] {
 }
 
 /// Makes the id maps of every view of a scene that are not done already, then the manifest.
-///
-/// # Errors
-/// When scene or models cannot be read, a photograph cannot be decoded, or the output cannot be written.
 pub(crate) fn run(args: &MasksArgs, stage: &Stage) -> Result<()> {
     let scene = photographs::open(&args.scene, stage)?;
-    let folder = &args.maps.out;
+    let folder = &args.out;
     let manifest = folder.join("masks.json");
     let mut claim = claim(args, &scene, &manifest, stage)?;
     let sam = Sam::open(&args.sam, &args.engine.options(), args.choice.no_skip)?;
@@ -48,7 +45,7 @@ pub(crate) fn run(args: &MasksArgs, stage: &Stage) -> Result<()> {
     let parameters = json!(args);
     let inputs =
         BTreeMap::from([(role::DATASET.to_string(), scene.hash()?), ("sam".to_string(), sam.hash().to_string())]);
-    warn_of_other_maps(folder, scene.views.iter().map(View::stem), stage)?;
+    warn_of_other_maps(folder, &scene.views, stage)?;
 
     let mut views = Views::new(stage, scene.views.len());
     let (mut asked, mut points, mut large, mut forecast_made) = (0, 0, 0, false);
@@ -82,7 +79,7 @@ pub(crate) fn run(args: &MasksArgs, stage: &Stage) -> Result<()> {
     let mut provenance = stage.provenance("masks", 1, parameters.clone(), inputs.clone());
     let count = views.len();
     provenance.extra = json!({ "views": views });
-    finished::write_json(&manifest, &provenance)?;
+    write_json(&manifest, &provenance)?;
     stage.record(&mut claim, parameters, inputs, json!({ "views": count, "masks_large": large }))
 }
 
@@ -100,23 +97,23 @@ fn make(args: &MasksArgs, sam: &Sam, image: &RgbImage) -> Result<(MaskMaps, Fact
 
 /// The right to write id maps, their notes, the manifest and the previews. Maps that this program did not make stay.
 fn claim(args: &MasksArgs, scene: &Dataset, manifest: &Path, stage: &Stage) -> Result<Claim> {
-    let maps: Vec<PathBuf> = scene.views.iter().map(|v| maps_path(&args.maps.out, v.stem())).collect();
+    let maps: Vec<PathBuf> = scene.views.iter().map(|v| maps_path(&args.out, v.stem())).collect();
     let notes = maps.iter().map(|m| finished::note_path(m));
     let outputs = stage.outputs(manifest).file(manifest).files(notes).files(&maps).reads(&scene.files).drop_stale();
     let pictures = scene.views.iter().map(|v| format!("{}.png", v.stem()));
     args.preview.iter().fold(outputs, |outputs, folder| outputs.files_in(folder, pictures.clone())).claim()
 }
 
-/// Says how much memory the photographs will take.
+/// Says how much memory the photographs will take. The models run once on an empty picture first: their need is known only
+/// then.
 fn forecast(args: &MasksArgs, sam: &Sam, views: &[View], stage: &Stage) -> Result<()> {
     let nothing = RgbImage { width: 4, height: 3, pixels: vec![0; 36] };
     // The encoder a second time, on top of what the decoder leaves with each thread.
     propose(sam, &sam.encode(&nothing)?, &Choice { points_per_side: 4, ..args.choice })?;
     sam.encode(&nothing)?;
-    let side = args.choice.points_per_side as u64;
-    let pixels = memory::largest(views);
+    let (side, pixels) = (args.choice.points_per_side as u64, photographs::largest(views));
     let map = if args.map_size == 0 { pixels } else { pixels.min((args.map_size * args.map_size * 3 / 4) as u64) };
-    let needed = memory::of_masks(memory::so_far(), side * side * 3 / 4, pixels, map);
+    let needed = peak_rss_bytes().unwrap_or(0) + 10_000 * (side * side * 3 / 4) + 6 * pixels + 30 * map;
     stage.forecast(needed, "give fewer --threads, or smaller photographs (--resolution) and maps (--map-size)")
 }
 
@@ -128,9 +125,9 @@ fn map_size(image: &RgbImage, longest: usize) -> [usize; 2] {
 }
 
 /// Warns of id maps of other views in the folder: later stages would take them for maps of this scene.
-fn warn_of_other_maps<'a>(folder: &Path, stems: impl Iterator<Item = &'a str>, stage: &Stage) -> Result<()> {
-    let own: BTreeSet<&str> = stems.collect();
-    let others: Vec<String> = artifacts::stems(folder)?.into_iter().filter(|s| !own.contains(s.as_str())).collect();
+fn warn_of_other_maps(folder: &Path, views: &[View], stage: &Stage) -> Result<()> {
+    let mut others = artifacts::stems(folder)?;
+    others.retain(|s| views.iter().all(|v| v.stem() != s));
     if let Some(first) = others.first() {
         stage.warn(&format!(
             "{}: {} id maps of views that are not in the scene, such as {first}; delete them if they are old",

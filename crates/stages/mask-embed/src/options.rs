@@ -69,24 +69,6 @@ impl EngineArgs {
     }
 }
 
-/// Existing id maps.
-#[derive(Debug, Clone, clap::Args, Serialize)]
-pub(crate) struct MapsArgs {
-    /// Folder with id maps (<view>_s.npy)
-    #[arg(long, value_name = "FOLDER")]
-    #[serde(skip)]
-    pub masks: PathBuf,
-}
-
-/// New id maps.
-#[derive(Debug, Clone, clap::Args, Serialize)]
-pub(crate) struct NewMapsArgs {
-    /// Output folder for id maps (<view>_s.npy) and, written last, masks.json
-    #[arg(long, value_name = "FOLDER")]
-    #[serde(skip)]
-    pub out: PathBuf,
-}
-
 /// Id maps from photographs with SAM.
 #[derive(Debug, Clone, clap::Args, Serialize)]
 pub(crate) struct MasksArgs {
@@ -96,9 +78,10 @@ pub(crate) struct MasksArgs {
     #[command(flatten)]
     #[serde(flatten)]
     pub engine: EngineArgs,
-    #[command(flatten)]
-    #[serde(flatten)]
-    pub maps: NewMapsArgs,
+    /// Output folder for id maps (<view>_s.npy) and, written last, masks.json
+    #[arg(long, value_name = "FOLDER")]
+    #[serde(skip)]
+    pub out: PathBuf,
     /// Folder with SAM's encoder.onnx and sam.onnx, as `make models` fetches them
     #[arg(long, default_value = "models", value_name = "FOLDER")]
     #[serde(skip)]
@@ -138,19 +121,25 @@ pub struct Choice {
 }
 
 /// CLIP features of existing id maps.
-#[derive(Debug, Clone, clap::Args)]
+#[derive(Debug, Clone, clap::Args, Serialize)]
 pub(crate) struct EmbedArgs {
     #[command(flatten)]
+    #[serde(flatten)]
     pub scene: SceneArgs,
     #[command(flatten)]
+    #[serde(flatten)]
     pub engine: EngineArgs,
-    #[command(flatten)]
-    pub maps: MapsArgs,
+    /// Folder with id maps (<view>_s.npy)
+    #[arg(long, value_name = "FOLDER")]
+    #[serde(skip)]
+    pub masks: PathBuf,
     /// Folder with CLIP's image.onnx and clip.json
     #[arg(long, value_name = "FOLDER")]
+    #[serde(skip)]
     pub clip: PathBuf,
     /// Output folder for <view>_f.npy and, written last, features.json [default: the folder of the id maps]
     #[arg(long, value_name = "FOLDER")]
+    #[serde(skip)]
     pub out: Option<PathBuf>,
 }
 
@@ -161,8 +150,9 @@ pub(crate) struct ImportArgs {
     /// <view>_small.png, <view>_medium.png and <view>_large.png
     #[arg(long, value_name = "FOLDER")]
     pub labels: PathBuf,
-    #[command(flatten)]
-    pub maps: NewMapsArgs,
+    /// Output folder for id maps (<view>_s.npy) and, written last, masks.json
+    #[arg(long, value_name = "FOLDER")]
+    pub out: PathBuf,
 }
 
 /// Crops of all masks in one file.
@@ -171,9 +161,10 @@ pub(crate) struct CropsArgs {
     #[command(flatten)]
     #[serde(flatten)]
     pub scene: SceneArgs,
-    #[command(flatten)]
-    #[serde(flatten)]
-    pub maps: MapsArgs,
+    /// Folder with id maps (<view>_s.npy)
+    #[arg(long, value_name = "FOLDER")]
+    #[serde(skip)]
+    pub masks: PathBuf,
     /// Output file (safetensors): pixels u8 [n, 3, S, S], view u32 [n], mask u32 [n]; in the metadata the names of the
     /// views and, of a synthetic scene, the token ids of every caption
     #[arg(long, value_name = "FILE")]

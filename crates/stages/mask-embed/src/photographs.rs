@@ -16,6 +16,11 @@ pub(crate) fn open(args: &SceneArgs, stage: &Stage) -> Result<Dataset> {
     Ok(scene)
 }
 
+/// Pixels of the largest photograph.
+pub(crate) fn largest(views: &[View]) -> u64 {
+    views.iter().map(|v| u64::from(v.camera.width) * u64::from(v.camera.height)).max().unwrap_or(0)
+}
+
 /// The photograph of a view, undistorted and at the resolution asked for, and the hash of its pixels.
 pub(crate) fn read(view: &View) -> Result<(RgbImage, String)> {
     let image = view.load_image()?;
