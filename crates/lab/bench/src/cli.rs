@@ -27,7 +27,7 @@ pub struct Args {
     /// Output file, JSON; the same is written beside it as .md and .html (compare writes no .html)
     #[arg(long, global = true, value_name = "FILE", default_value = "out/bench/report.json")]
     out: PathBuf,
-    /// What run does: names of tables, knobs and axes, with commas between; what stress does: parts of names of scenes [all]
+    /// What run does: names of tables, knobs and axes, with commas between; what stress does: parts of names of scenes [default: all]
     #[arg(long, global = true, value_name = "NAMES", value_delimiter = ',')]
     only: Vec<String>,
     #[command(flatten)]

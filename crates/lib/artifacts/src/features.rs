@@ -21,9 +21,6 @@ impl Features {
     const VERSION: u32 = 1;
 
     /// Writes the artifact.
-    ///
-    /// # Errors
-    /// When the file cannot be written.
     pub fn write(&self, path: impl AsRef<Path>, mut provenance: Provenance) -> Result<()> {
         provenance.format = Self::FORMAT.into();
         provenance.version = Self::VERSION;

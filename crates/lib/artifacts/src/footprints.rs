@@ -130,9 +130,6 @@ impl FootprintsBuilder {
     }
 
     /// Writes the artifact.
-    ///
-    /// # Errors
-    /// When a file cannot be written.
     pub fn write(&self, path: impl AsRef<Path>, provenance: Provenance) -> Result<()> {
         let mut entries = ScratchEntries::beside(path.as_ref())?;
         self.col.iter().zip(&self.weight).try_for_each(|(&col, &weight)| entries.push(col, weight))?;
@@ -140,9 +137,6 @@ impl FootprintsBuilder {
     }
 
     /// [`FootprintsBuilder::write`] with the entries of all rows from scratch files; `col` and `weight` are ignored.
-    ///
-    /// # Errors
-    /// When a file cannot be read or written.
     pub fn write_with(
         &self,
         entries: ScratchEntries,

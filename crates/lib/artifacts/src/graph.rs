@@ -36,9 +36,6 @@ impl Graph {
     const VERSION: u32 = 1;
 
     /// Writes the artifact.
-    ///
-    /// # Errors
-    /// When the file cannot be written.
     pub fn write(&self, path: impl AsRef<Path>, mut provenance: Provenance) -> Result<()> {
         provenance.format = Self::FORMAT.into();
         provenance.version = Self::VERSION;

@@ -182,9 +182,6 @@ impl Instances {
     }
 
     /// Writes the artifact.
-    ///
-    /// # Errors
-    /// When the file cannot be written.
     pub fn write(&self, path: impl AsRef<Path>, mut provenance: Provenance) -> Result<()> {
         provenance.format = Self::FORMAT.into();
         provenance.version = Self::VERSION;

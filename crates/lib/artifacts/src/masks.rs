@@ -56,9 +56,6 @@ pub fn features_path(folder: impl AsRef<Path>, stem: &str) -> PathBuf {
 }
 
 /// Stems of all views that have id maps in `folder`, sorted.
-///
-/// # Errors
-/// When the folder cannot be read.
 pub fn stems(folder: impl AsRef<Path>) -> Result<Vec<String>> {
     with_suffix(folder.as_ref(), "_s.npy")
 }
@@ -76,18 +73,12 @@ fn with_suffix(folder: &Path, suffix: &str) -> Result<Vec<String>> {
 }
 
 /// The files of a masks folder that end in `suffix` (`_s.npy` or `_f.npy`), sorted by stem.
-///
-/// # Errors
-/// When the folder cannot be read.
 pub fn folder_files(folder: impl AsRef<Path>, suffix: &str) -> Result<Vec<PathBuf>> {
     let folder = folder.as_ref();
     Ok(with_suffix(folder, suffix)?.into_iter().map(|stem| folder.join(stem + suffix)).collect())
 }
 
 /// One hash for all files of a masks folder that end in `suffix` (`_s.npy` or `_f.npy`): of names and contents.
-///
-/// # Errors
-/// When the folder or a file cannot be read.
 pub fn hash_folder(folder: impl AsRef<Path>, suffix: &str) -> Result<String> {
     let folder = folder.as_ref();
     let names = with_suffix(folder, suffix)?.into_iter().map(|s| s + suffix);
@@ -96,9 +87,6 @@ pub fn hash_folder(folder: impl AsRef<Path>, suffix: &str) -> Result<String> {
 
 /// Notes how the files that [`hash_folder`] would hash are now, for a stage that hashes them at one time and reads them at
 /// another.
-///
-/// # Errors
-/// When the folder cannot be read.
 pub fn watch_folder(folder: impl AsRef<Path>, suffix: &str) -> Result<Watched> {
     Ok(Watched::new(folder_files(folder, suffix)?))
 }
@@ -158,9 +146,6 @@ impl MaskMaps {
     }
 
     /// Writes `*_s.npy` as LangSplat does: f32 `[4, H, W]`.
-    ///
-    /// # Errors
-    /// When the file cannot be written.
     pub fn write(&self, path: impl AsRef<Path>) -> Result<()> {
         let data: Vec<f32> = self.ids.iter().map(|&i| i as f32).collect();
         npy::write_f32(path, &[LEVELS, self.height, self.width], &data)
@@ -237,9 +222,6 @@ impl MaskFeatures {
     }
 
     /// Writes `*_f.npy`: f32 `[masks, dim]`.
-    ///
-    /// # Errors
-    /// When the file cannot be written.
     pub fn write(&self, path: impl AsRef<Path>) -> Result<()> {
         npy::write_f32(path, &[self.count, self.dim], &self.values)
     }

@@ -72,9 +72,6 @@ impl TrueScene {
     }
 
     /// Writes `truth/scene.json`.
-    ///
-    /// # Errors
-    /// When the file cannot be written.
     pub fn write(&self, path: impl AsRef<Path>) -> Result<()> {
         write_json(path, self)
     }
@@ -90,9 +87,6 @@ impl MaskTruth {
     }
 
     /// Writes `truth/masks.json`.
-    ///
-    /// # Errors
-    /// When the file cannot be written.
     pub fn write_all(path: impl AsRef<Path>, masks: &BTreeMap<String, Vec<Self>>) -> Result<()> {
         write_json(path, masks)
     }
@@ -122,9 +116,6 @@ impl TruePoints {
     const VERSION: u32 = 1;
 
     /// Writes the artifact.
-    ///
-    /// # Errors
-    /// When the file cannot be written.
     pub fn write(&self, path: impl AsRef<Path>, mut provenance: Provenance) -> Result<()> {
         provenance.format = Self::FORMAT.into();
         provenance.version = Self::VERSION;

@@ -69,17 +69,11 @@ impl Picture {
     }
 
     /// The picture as a PNG file.
-    ///
-    /// # Errors
-    /// When encoding fails.
     pub fn png(&self) -> Result<Vec<u8>> {
         encode(&DynamicImage::ImageRgb8(self.rgb8()), image::ImageFormat::Png)
     }
 
     /// The picture as a JPEG file of the given quality (1 to 100), shrunk to at most `max_width`.
-    ///
-    /// # Errors
-    /// When encoding fails.
     pub fn jpeg(&self, max_width: usize, quality: u8) -> Result<Vec<u8>> {
         let mut full = self.rgb8();
         if self.width > max_width {

@@ -6,7 +6,7 @@
 //! result does not depend on the number of threads.
 
 use crate::logits::{Grid, Logits};
-use crate::nms::{GOOD, Pixels, Rated, box_nms, mask_nms, merges_things, nesting_levels};
+use crate::nms::{GOOD, Pixels, Rated, box_nms, mask_nms, merges_things};
 use crate::options::Choice;
 use crate::sam::{Candidates, Embedded, Sam};
 use artifacts::LEVELS;
@@ -26,7 +26,7 @@ const BOX_NMS: f64 = 0.7;
 /// One mask of one prompt, good enough to be considered.
 #[derive(Debug, Clone)]
 pub struct Proposal {
-    /// Level by SAM's own order: 1 small, 2 medium, 3 large; 0 for a decoder that gives one mask only.
+    /// Level by SAM's own order: 1 small, 2 medium, 3 large.
     pub level: usize,
     /// Predicted IoU.
     pub quality: f32,
@@ -117,9 +117,8 @@ fn consider(answer: &Candidates, grid: &Grid, choice: &Choice) -> Vec<Proposal> 
         if stability < choice.stability as f32 || pixels.area == 0 || pixels.area > most {
             continue;
         }
-        let level = if answer.count == 1 { 0 } else { (m + 1).min(LEVELS - 1) };
         let logits = Logits::new(row, grid, pixels.bounds);
-        good.push(Proposal { level, quality, score: quality * stability, pixels, logits });
+        good.push(Proposal { level: m + 1, quality, score: quality * stability, pixels, logits });
     }
     good
 }
@@ -127,8 +126,7 @@ fn consider(answer: &Candidates, grid: &Grid, choice: &Choice) -> Vec<Proposal> 
 /// The masks of each level (default, small, medium, large) as indices into `masks`: those that merge several
 /// things go ([`merges_things`]), then box suppression, then LangSplat's.
 ///
-/// Levels are SAM's own three masks per prompt; default is all of them together. A decoder that gives one mask per
-/// prompt leaves the levels to nesting ([`nesting_levels`]). Then [`fill`].
+/// Levels are SAM's own three masks per prompt; default is all of them together. Then [`fill`].
 pub fn levels(masks: &[Proposal]) -> [Vec<usize>; LEVELS] {
     let by_boxes = |c: Vec<usize>| -> Vec<usize> {
         let rated: Vec<Rated> = c.iter().map(|&i| (&masks[i].pixels, masks[i].quality)).collect();
@@ -142,22 +140,11 @@ pub fn levels(masks: &[Proposal]) -> [Vec<usize>; LEVELS] {
     let things: Vec<Rated> = masks.iter().filter(|m| m.level == LEVELS - 1).map(|m| (&m.pixels, m.score)).collect();
     let single: Vec<usize> =
         (0..masks.len()).filter(|&i| !merges_things(&masks[i].pixels, masks[i].score, &things)).collect();
-    let all = by_boxes(single.clone());
     let mut chosen: [Vec<usize>; LEVELS] = Default::default();
-    if masks.iter().any(|m| m.level > 0) {
-        for (level, slot) in chosen.iter_mut().enumerate().skip(1) {
-            *slot = by_masks(by_boxes(single.iter().copied().filter(|&i| masks[i].level == level).collect()));
-        }
-    } else {
-        let good: Vec<usize> = all.iter().copied().filter(|&i| masks[i].score > GOOD).collect();
-        let pixels: Vec<&Pixels> = good.iter().map(|&i| &masks[i].pixels).collect();
-        let nested = nesting_levels(&pixels);
-        for (level, slot) in chosen.iter_mut().enumerate().skip(1) {
-            let at_level = good.iter().zip(&nested).filter(|(_, n)| n[level - 1]).map(|(&i, _)| i);
-            *slot = by_masks(at_level.collect());
-        }
+    for (level, slot) in chosen.iter_mut().enumerate().skip(1) {
+        *slot = by_masks(by_boxes(single.iter().copied().filter(|&i| masks[i].level == level).collect()));
     }
-    chosen[0] = by_masks(all);
+    chosen[0] = by_masks(by_boxes(single));
     fill(masks, &chosen)
 }
 
@@ -213,18 +200,18 @@ mod tests {
         // Row 0 is inside by a wide margin; row 1 is undecided in mask 1; below the photograph all is inside.
         let mask = |row1: f32| (0..side * side).map(move |i| if i / side == 1 { row1 } else { 9.0 });
         let logits: Vec<f32> = mask(-9.0).chain(mask(0.5)).collect();
-        let answer = Candidates { count: 3, masks: vec![(0, 0.9), (1, 0.9)], logits };
+        let answer = Candidates { masks: vec![(0, 0.9), (1, 0.9)], logits };
         let good = consider(&answer, &grid, &CHOICE);
         // Mask 0: stability 1; mask 1: 1/2, not stable.
         assert_eq!(good.iter().map(|p| (p.level, p.pixels.area)).collect::<Vec<_>>(), [(1, side)]);
         assert!((good[0].score - 0.9).abs() < 1e-6);
         // A mask of everything.
-        let all = Candidates { count: 1, masks: vec![(0, 0.9)], logits: vec![9.0; side * side] };
+        let all = Candidates { masks: vec![(0, 0.9)], logits: vec![9.0; side * side] };
         assert!(consider(&all, &grid, &CHOICE).is_empty());
     }
 
     #[test]
-    fn one_mask_per_prompt_gets_its_levels_from_nesting() {
+    fn levels_take_masks_of_others_where_they_have_none() {
         let rect = |x0: usize, x1: usize, level: usize| Proposal {
             level,
             quality: 0.9,
@@ -232,12 +219,8 @@ mod tests {
             pixels: Pixels::new(20, (0..200).map(|i| (x0..x1).contains(&(i % 20)))),
             logits: Logits::new(|_| &[], &Grid { width: 0, height: 0, extent: [0.0; 2] }, [0; 4]),
         };
-        // A thing of two parts, and a thing alone.
-        let single = [rect(0, 10, 0), rect(0, 6, 0), rect(6, 10, 0), rect(12, 20, 0)];
-        let l = levels(&single);
         let sorted = |v: &[usize]| BTreeSet::from_iter(v.to_vec()).into_iter().collect::<Vec<_>>();
-        assert_eq!((sorted(&l[1]), sorted(&l[2]), sorted(&l[3])), (vec![1, 2, 3], vec![1, 2, 3], vec![0, 3]));
-        // The same masks with SAM's levels.
+        // A thing of two parts, and a thing alone.
         let own = [rect(0, 10, 3), rect(0, 6, 1), rect(6, 10, 2), rect(12, 20, 3)];
         let l = levels(&own);
         // The part that lies in no whole of level small is taken there, the whole is not; the lone thing is taken everywhere.

@@ -135,22 +135,6 @@ pub fn merges_things(mask: &Pixels, score: f32, things: &[Rated]) -> bool {
     apart.len() >= 3
 }
 
-/// Levels of masks that come without them, from nesting. A mask lies in another when 85% of it does and the other is
-/// larger. Small are the masks that contain none, large those that lie in none, medium those that lie in exactly one
-/// and, so that no level has holes, those that are both small and large. Gives the levels 1, 2, 3 of each mask.
-pub fn nesting_levels(masks: &[&Pixels]) -> Vec<[bool; 3]> {
-    let inside = |a: &Pixels, b: &Pixels| a.area < b.area && a.overlap(b) as f64 >= 0.85 * a.area as f64;
-    let n = masks.len();
-    (0..n)
-        .map(|i| {
-            let parents = (0..n).filter(|&j| inside(masks[i], masks[j])).count();
-            let children = (0..n).filter(|&j| inside(masks[j], masks[i])).count();
-            let (small, large) = (children == 0, parents == 0);
-            [small, parents == 1 || (small && large), large]
-        })
-        .collect()
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -213,16 +197,5 @@ mod tests {
         let same = rect(6, 0, 10, 3);
         assert!(!merges_things(&room, 0.6, &[(&a, 0.9), (&b, 0.9), (&same, 0.8)]));
         assert!(!merges_things(&room, 0.6, &[]));
-    }
-
-    #[test]
-    fn levels_follow_nesting() {
-        // A thing with a part with a subpart, and a thing alone.
-        let (thing, part, subpart, alone) =
-            (rect(0, 0, 10, 10), rect(0, 0, 6, 6), rect(1, 1, 3, 3), rect(12, 2, 18, 8));
-        assert_eq!(
-            nesting_levels(&[&thing, &part, &subpart, &alone]),
-            [[false, false, true], [false, true, false], [true, false, false], [true, true, true]]
-        );
     }
 }

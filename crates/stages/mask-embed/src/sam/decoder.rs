@@ -304,7 +304,7 @@ impl Decoder {
             layers: [reader.layer(0)?, reader.layer(1)?],
             last: reader.attention("transformer.final_attn_token_to_image", "k")?,
             last_norm: reader.norm("transformer.norm_final_attn")?,
-            quality: reader.mlp("iou_prediction_head", masks.len())?,
+            quality: reader.mlp("iou_prediction_head", masks.len()).filter(|_| (3..=4).contains(&masks.len()))?,
             masks,
             enlargement,
             width,
@@ -526,7 +526,6 @@ impl Decoder {
                 weights.extend(self.mlp(&self.masks[m], &x[(1 + level) * channels..(2 + level) * channels]));
             }
         }
-        candidates.count = x.len() / channels - 1;
         candidates.logits = self.draw(desk, photograph, &weights, candidates.masks.len());
         candidates
     }

@@ -5,7 +5,7 @@
 //! declares the best mask only, but computes four: one for prompts of several points, and whole, part and subpart for a
 //! single one. The four are found in the graph before the choice among them and taken instead (`all_masks`); the
 //! enlargement to the photograph's size, which is most of the memory and much of the time, is then never computed.
-//! Where the decoder is built as SAM's, [`decoder`] takes the place of most of the graph.
+//! Where the decoder is built as SAM's, `decoder` takes the place of most of the graph.
 
 mod decoder;
 mod planar;
@@ -58,9 +58,7 @@ pub struct Embedded {
 /// The decoder's answer for one point.
 #[derive(Debug, Clone, Default)]
 pub struct Candidates {
-    /// Masks that the decoder makes for a point.
-    pub count: usize,
-    /// Those of sufficient predicted IoU: which one, from the smallest on, and its predicted IoU.
+    /// Those of sufficient predicted IoU of SAM's three: which one, 0 for the smallest, and its predicted IoU.
     pub masks: Vec<(usize, f32)>,
     /// Logits of `masks`, `[masks][MASK_SIDE][MASK_SIDE]`, of the whole square.
     pub logits: Vec<f32>,
@@ -71,7 +69,7 @@ impl Candidates {
     /// for prompts of several points, and is left out.
     fn of_graph(quality: &[f32], logits: &[f32], least: f32) -> Self {
         let skip = usize::from(quality.len() == 4);
-        let mut found = Self { count: quality.len() - skip, ..Self::default() };
+        let mut found = Self::default();
         for (i, (&q, logits)) in quality.iter().zip(logits.chunks_exact(MASK_SIDE * MASK_SIDE)).enumerate().skip(skip) {
             // A quality that is not a number is not sufficient.
             if q >= least {
@@ -251,8 +249,7 @@ impl Parts {
         let want = ask_graph(whole, &values, point, f32::NEG_INFINITY)?;
         let Ok(got) = self.ask(&values, &photograph, point, f32::NEG_INFINITY) else { return Ok(false) };
         let near = |a: f32, b: f32| (a - b).abs() <= 1e-3 * (1.0 + a.abs());
-        Ok(want.count == got.count
-            && want.masks.len() == got.masks.len()
+        Ok(want.masks.len() == got.masks.len()
             && want.masks.iter().zip(&got.masks).all(|(a, b)| near(a.1, b.1))
             && want.logits.iter().zip(&got.logits).all(|(&a, &b)| near(a, b)))
     }
@@ -265,10 +262,11 @@ fn ask_graph(graph: &dyn Model, values: &Tensor, point: [f32; 2], least: f32) ->
         return Err(Error::new("the decoder's outputs are not floats").file(graph.path()));
     };
     let count = quality.len();
-    if count == 0 || logits.len() != count * MASK_SIDE * MASK_SIDE {
-        return Err(Error::new("the decoder does not give masks of 256 x 256 and a quality for each")
+    if !(3..=4).contains(&count) || logits.len() != count * MASK_SIDE * MASK_SIDE {
+        return Err(Error::new("the decoder's masks are not SAM's")
             .file(graph.path())
-            .found(format!("{:?} and {:?}", out[0].shape, out[1].shape)));
+            .found(format!("masks {:?} and their predicted IoU {:?}", out[0].shape, out[1].shape))
+            .expected("3 masks of 256 x 256 for a point, or 4 with the one for several points"));
     }
     Ok(Candidates::of_graph(quality, logits, least))
 }
@@ -309,7 +307,7 @@ mod tests {
         let mut least = f32::NEG_INFINITY;
         for point in [[0.1, 0.2], [0.5, 0.5], [0.9, 0.3], [0.7, 0.99]] {
             let [got, want] = [(&fast, &a), (&plain, &b)].map(|(sam, e)| sam.decode(e, point, least).unwrap());
-            assert_eq!((got.count, got.masks.len()), (3, want.masks.len()));
+            assert_eq!(got.masks.len(), want.masks.len());
             assert!(got.masks.iter().zip(&want.masks).all(|(a, b)| a.0 == b.0 && near(a.1, b.1)), "{got:?}");
             // Below the photograph's 683 of 1024 rows nothing is drawn but the rest of a pixel.
             for (i, (&a, &b)) in got.logits.iter().zip(&want.logits).enumerate() {
