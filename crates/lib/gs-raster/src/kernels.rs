@@ -7,7 +7,7 @@
 //! A transmittance is kept with its sign set once its pixel has stopped: such a pixel fails the test for going on by itself.
 
 use crate::project::{Splat, SplatGradient};
-use crate::tiles::{PIXELS, TILE};
+use crate::tiles::{PIXELS, Rectangle, TILE, Tile};
 use pulp::{Arch, Simd, WithSimd};
 
 /// Largest alpha of a Gaussian at a pixel.
@@ -30,18 +30,7 @@ const POWERS: Row = {
     powers
 };
 
-/// Left, top, width, height of a tile within the image.
-type Rectangle = (usize, usize, usize, usize);
 type Row = [f32; TILE];
-
-/// A tile of a view.
-#[derive(Clone, Copy)]
-pub(crate) struct Tile<'a> {
-    pub splats: &'a [Splat],
-    /// Positions in `splats` of the Gaussians that touch it, front to back.
-    pub list: &'a [u32],
-    pub rectangle: Rectangle,
-}
 
 /// 2^q for -100 <= q <= 100, with a relative error below 5e-7: 2^round(q) by the exponent's bits, the rest by a polynomial
 /// through 1 at 0 and Chebyshev nodes of [-1/2, 1/2].

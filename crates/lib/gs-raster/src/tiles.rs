@@ -1,7 +1,6 @@
 //! Which Gaussians touch which tile, front to back.
 
 use crate::dropped::Dropped;
-use crate::kernels::Tile;
 use crate::lanes::project_range;
 use crate::project::{Lens, Splat};
 use crate::types::RasterOptions;
@@ -16,6 +15,18 @@ pub(crate) const PIXELS: usize = TILE * TILE;
 const CHUNK: usize = 1024;
 /// Bits that one pass of the sort looks at.
 const DIGIT: usize = 11;
+
+/// Left, top, width, height of a tile within the image.
+pub(crate) type Rectangle = (usize, usize, usize, usize);
+
+/// A tile of a view.
+#[derive(Clone, Copy)]
+pub(crate) struct Tile<'a> {
+    pub splats: &'a [Splat],
+    /// Positions in `splats` of the Gaussians that touch it, front to back.
+    pub list: &'a [u32],
+    pub rectangle: Rectangle,
+}
 
 /// The Gaussians that a view sees, and the lists of its tiles. Building it again for another view reuses its memory.
 #[derive(Default)]

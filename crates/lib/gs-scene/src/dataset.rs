@@ -1,11 +1,12 @@
 //! Posed photographs: [`load`] recognises the layout of a folder and gives its views.
 
+pub mod colmap;
 mod scannet;
 mod transforms;
 mod view;
 
 use crate::lens::Lens;
-use crate::{Camera, PointCloud, colmap, image};
+use crate::{Camera, PointCloud, image};
 use glam::{DMat3, DMat4, DQuat, DVec3};
 use gs_io::{Error, IoContext, Result, hash_bytes, hash_file};
 use rayon::prelude::*;

@@ -7,7 +7,6 @@
 //! * Transforms are named `target_from_source`: `camera_from_world * p_world = p_camera`.
 
 mod camera;
-pub mod colmap;
 pub mod dataset;
 mod gaussians;
 mod geometry;
@@ -17,6 +16,7 @@ mod order;
 pub mod ply;
 
 pub use camera::Camera;
+pub use dataset::colmap;
 pub use gaussians::{Gaussians, SH_C0, sh_coefficients};
 pub use geometry::Geometry;
 pub use image::{Image, decode as decode_image, has_alpha as image_has_alpha, size_of as image_size};

@@ -173,6 +173,14 @@ pub struct QueryOptions {
     pub out: Option<PathBuf>,
 }
 
+/// Where labels lie.
+#[derive(Debug, Clone, clap::Args, Serialize)]
+pub struct Labels {
+    /// Folder of LERF-OVS labels [default: label/ in the scene, or label/<scene>/ beside it]
+    #[arg(long, value_name = "DIR")]
+    pub labels: Option<PathBuf>,
+}
+
 /// `eval score`.
 #[derive(Debug, Clone, clap::Args, Serialize)]
 pub struct ScoreOptions {
@@ -185,9 +193,9 @@ pub struct ScoreOptions {
     #[command(flatten)]
     #[serde(flatten)]
     pub choice: Choice,
-    /// Folder of LERF-OVS labels [default: label/ in the scene]
-    #[arg(long, value_name = "DIR")]
-    pub labels: Option<PathBuf>,
+    #[command(flatten)]
+    #[serde(flatten)]
+    pub labels: Labels,
     #[command(flatten)]
     #[serde(flatten)]
     pub masking: Masking,
@@ -222,9 +230,9 @@ pub struct LerfOptions {
     #[command(flatten)]
     #[serde(flatten)]
     pub choice: Choice,
-    /// Folder of LERF-OVS labels [default: label/ in the scene, or label/<scene>/ beside it]
-    #[arg(long, value_name = "DIR")]
-    pub labels: Option<PathBuf>,
+    #[command(flatten)]
+    #[serde(flatten)]
+    pub labels: Labels,
     /// Name of the scene; one of the benchmark's four is asked the benchmark's queries, any other its labels' categories
     /// [default: that of its folder]
     #[arg(long, value_parser = words)]

@@ -159,6 +159,15 @@ fn spread<T: Copy>(all: &[T], count: usize) -> Vec<T> {
 /// Most bytes of a name that is made of a text.
 const LONGEST_NAME: usize = 100;
 
+/// A view's stem as part of a file name (names of views may hold folders), with its number where two would be the same.
+pub fn view_name(dataset: &Dataset, view: &View) -> String {
+    let name = |v: &View| slug(v.stem(), "_.");
+    let own = name(view);
+    let twins = dataset.views.iter().filter(|v| name(v) == own).count();
+    let number = dataset.views.iter().position(|v| v.name == view.name).unwrap_or(0);
+    if twins > 1 { format!("{number:04}-{own}") } else { own }
+}
+
 /// A text as part of a file name of at most 100 bytes: letters, digits and what is in `also`; everything else is
 /// a hyphen.
 pub fn slug(text: &str, also: &str) -> String {

@@ -30,7 +30,7 @@ use std::path::Path;
 
 pub(crate) fn run(o: &ScoreOptions, parameters: Value, stage: &Stage) -> Result<String> {
     let dataset = load(&o.inputs.scene, &LoadOptions::default(), stage)?;
-    let labels = labels::folder(o.labels.as_deref(), &dataset.root)?;
+    let labels = labels::folder(o.labels.labels.as_deref(), &dataset.root)?;
     let out = &o.out;
     let tables = o.texts.text_features.iter().chain(&o.choice.features);
     let mut claim = stage.outputs(out).file(out).reads(o.inputs.files(&dataset).chain(tables)).claim()?;

@@ -2,9 +2,8 @@
 
 use super::ask::Asker;
 use super::ranking::Index;
-use super::show::view_name;
 use crate::options::QueryOptions;
-use crate::scene::{LabelledScene, views_to_show};
+use crate::scene::{LabelledScene, view_name, views_to_show};
 use artifacts::{NOISE_COLOR, instance_color};
 use gs_io::{Result, write_bytes};
 use gs_scene::dataset::Dataset;

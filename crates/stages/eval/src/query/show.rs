@@ -4,7 +4,7 @@ use super::ask::{Asked, Asker, QueryResult, QueryView};
 use super::segment::Segmentation;
 use super::text::TextSource;
 use crate::options::QueryOptions;
-use crate::scene::{LabelledScene, find_view, numbered, slug, views_to_show};
+use crate::scene::{LabelledScene, find_view, numbered, view_name, views_to_show};
 use crate::silhouette::Silhouette;
 use gs_io::{Result, write_bytes, write_json};
 use gs_scene::dataset::{Dataset, View};
@@ -99,15 +99,6 @@ impl QueryResults {
             }
         })
     }
-}
-
-/// A view's stem as part of a file name (names of views may hold folders), with its number where two would be the same.
-pub(super) fn view_name(dataset: &Dataset, view: &View) -> String {
-    let name = |v: &View| slug(v.stem(), "_.");
-    let own = name(view);
-    let twins = dataset.views.iter().filter(|v| name(v) == own).count();
-    let number = dataset.views.iter().position(|v| v.name == view.name).unwrap_or(0);
-    if twins > 1 { format!("{number:04}-{own}") } else { own }
 }
 
 /// The views named; else, of those in which the selected instances were matched with at least half of the best score, a few

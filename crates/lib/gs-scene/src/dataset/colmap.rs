@@ -3,8 +3,8 @@
 mod binary;
 mod text;
 
+use super::{Format, RawDataset, RawView, check_inside};
 use crate::PointCloud;
-use crate::dataset::{Format, RawDataset, RawView, check_inside};
 use crate::lens::{Distortion, Lens};
 pub use binary::write_model;
 use glam::{DMat3, DQuat, DVec3};
