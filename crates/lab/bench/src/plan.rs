@@ -231,9 +231,7 @@ impl Plan {
                 let (table, row, p, metric) = (name.into(), rest[0].into(), rest[1].into(), rest[2].into());
                 self.expected.push(Expected { table, row, p, metric, low: number(rest[3])?, high: number(rest[4])? });
             }
-            "repeats" => {
-                self.repeats = stage::within(1usize..=1000)(rest[0]).map_err(|e| wrong(&e))?;
-            }
+            "repeats" => self.repeats = stage::within(1usize..=1000)(rest[0]).map_err(|e| wrong(&e))?,
             "knob" => {
                 let stage = (rest[0] != "pipeline").then(|| rest[0].parse()).transpose()?;
                 self.knobs.push(Knob { name: name.into(), stage, title: rest[1].into(), points: Vec::new() });
