@@ -227,7 +227,7 @@ impl Graph {
         (kind == FLOAT && values.len() == count).then_some((shape, values))
     }
 
-    /// The first operator that reads the value `name`.
+    /// An operator that reads the value `name`.
     pub fn consumer(&self, name: &str) -> Option<&Node> {
         self.producers.values().find(|n| n.inputs.iter().any(|i| i == name))
     }

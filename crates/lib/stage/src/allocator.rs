@@ -2,6 +2,7 @@
 
 use crate::Bytes;
 use std::alloc::{GlobalAlloc, Layout, System};
+use std::io::Write;
 use std::sync::OnceLock;
 
 /// The program's name, and what would take less memory.
@@ -9,14 +10,16 @@ pub(crate) static NAME: OnceLock<&str> = OnceLock::new();
 pub(crate) static HINT: OnceLock<String> = OnceLock::new();
 
 /// The system's allocator, for a program's `#[global_allocator]`. Where it has no memory left the program says so in one
-/// line and ends with exit code 2, as after any other error; Rust alone would abort it with SIGABRT.
+/// line (no event with `--json`) and ends with exit code 2; Rust alone would abort it with SIGABRT.
 pub struct Allocator;
 
 /// Says what was asked for and ends the program at once. Nothing here allocates.
 fn give_up(bytes: usize) -> ! {
     let name = NAME.get().copied().unwrap_or("stage");
     let hint = HINT.get().map_or("free some memory", String::as_str);
-    eprintln!("{name}: error: memory: there is no more: {} asked for at once; {hint}", Bytes(bytes as u64));
+    // Locked to the end, so that one thread alone says it.
+    let mut out = std::io::stderr().lock();
+    let _ = writeln!(out, "{name}: error: memory: there is no more: {} asked for at once; {hint}", Bytes(bytes as u64));
     signal_hook::low_level::exit(2)
 }
 

@@ -57,7 +57,8 @@ pub struct CommonArgs {
     /// Also overwrite files that this command did not write. Inputs are never overwritten
     #[arg(long, global = true)]
     pub overwrite: bool,
-    /// Most memory the run may take, such as 4G. A stage that forecasts more refuses to start [no limit]
+    /// Most memory the run may take, such as 4G. A stage that forecasts more refuses to start [a quarter more
+    /// than the machine or the control group has]
     #[arg(long, global = true, value_name = "BYTES")]
     pub memory_limit: Option<Bytes>,
     /// Check the options and do nothing else: no file is read or written

@@ -37,9 +37,9 @@ pub(crate) fn memory() -> Option<[u64; 2]> {
         let mut parts = line.splitn(3, ':').skip(1);
         let (Some(controllers), Some(group)) = (parts.next(), parts.next()) else { continue };
         let [root, limit, usage, cache] = match controllers {
-            "" => ["/sys/fs/cgroup", "memory.max", "memory.current", "inactive_file "],
-            "memory" => {
-                ["/sys/fs/cgroup/memory", "memory.limit_in_bytes", "memory.usage_in_bytes", "total_inactive_file "]
+            "" => ["/sys/fs/cgroup", "memory.max", "memory.current", "file "],
+            c if c.split(',').any(|c| c == "memory") => {
+                ["/sys/fs/cgroup/memory", "memory.limit_in_bytes", "memory.usage_in_bytes", "total_cache "]
             }
             _ => continue,
         };

@@ -104,7 +104,10 @@ fn what_cannot_fit_is_refused_before_it_is_made() {
         let said = start("900000000", &[more, &["--max-gaussians", "60"]].concat());
         assert!(said.contains("found about 12.6G needed"), "{said}");
     }
-    assert!(start("900000000", &[]).contains("memory of this machine: the run needs more memory than it may take"));
+    assert!(
+        start("900000000", &[])
+            .contains("memory of this machine or its control group: the run needs more memory than it may take")
+    );
     // Every command has a forecast.
     let limit = ["--memory-limit", "1M"];
     let drawn = ["--scene", scene(), "--geometry", &geometry, "--out", &out];

@@ -95,10 +95,7 @@ fn mean(runs: &[Run], of: impl Fn(&Run) -> f64) -> f64 {
 fn main() {
     // Cargo adds --bench.
     let arguments: Vec<String> = std::env::args().skip(1).filter(|a| !a.starts_with("--")).collect();
-    let [folder, models, out] = arguments.as_slice() else {
-        eprintln!("sam: expected PHOTOGRAPHS MODELS OUT, found {arguments:?}");
-        std::process::exit(2);
-    };
+    let [folder, models, out] = arguments.as_slice() else { panic!("expected PHOTOGRAPHS MODELS OUT: {arguments:?}") };
     let pictures = std::fs::read_dir(folder).expect("a folder of photographs").map(|e| e.expect("an entry").path());
     let read = |path: PathBuf| {
         let image = image::open(&path).ok()?.to_rgb8();
@@ -116,13 +113,7 @@ fn main() {
         let [hit, all] = [recall(&each[0].masks, &each[1].masks), each[1].masks.len()];
         let maps = recall_of_maps(&each[0].maps, &each[1].maps);
         let seconds = each.each_ref().map(Run::seconds);
-        eprintln!(
-            "{}: {:.2} s, all points {:.2} s and {:.2} s, {hit} of {all} masks",
-            path.display(),
-            seconds[0],
-            seconds[1],
-            seconds[2]
-        );
+        eprintln!("{}: {seconds:.2?} s, {hit} of {all} masks", path.display());
         found = [found[0] + hit, found[1] + all];
         found_in_maps = [found_in_maps[0] + maps[0], found_in_maps[1] + maps[1]];
         runs.iter_mut().zip(each).for_each(|(all, one)| all.push(one));

@@ -38,10 +38,11 @@ impl ScanFiles {
     /// Finds the truth in a scan's folder. The segments are those of the same mesh as the labels: the finer
     /// `*_vh_clean.segs.json` and its aggregation belong to another mesh.
     pub fn find(folder: &Path) -> Result<Self> {
-        let names: Vec<String> = list(folder)?.iter().map(|p| p.to_string_lossy().into_owned()).collect();
+        let files = list(folder)?;
         let with = |end: &str, without: &str| {
-            let fits = |n: &&String| n.ends_with(end) && (without.is_empty() || !n.ends_with(without));
-            names.iter().filter(fits).map(PathBuf::from).collect::<Vec<_>>()
+            let ends = |p: &PathBuf, end: &str| p.as_os_str().as_encoded_bytes().ends_with(end.as_bytes());
+            let fits = |p: &&PathBuf| ends(p, end) && (without.is_empty() || !ends(p, without));
+            files.iter().filter(fits).cloned().collect::<Vec<_>>()
         };
         let labels = with(".labels.ply", "");
         let [labels] = &labels[..] else {

@@ -76,7 +76,7 @@ impl Schedule {
     pub fn rate_of_centres(&self, rates: &LearningRates, iteration: u32, extent: f64) -> f32 {
         let t = self.share(iteration);
         let rate = (rates.position.ln() * (1.0 - t) + rates.position_end.ln() * t).exp();
-        if rates.position > 0.0 { (rate * extent) as f32 } else { 0.0 }
+        if rates.position.min(rates.position_end) > 0.0 { (rate * extent) as f32 } else { 0.0 }
     }
 
     /// Degree of the spherical harmonics in use at an iteration.

@@ -84,7 +84,7 @@ impl Photograph {
     /// the values are not of SAM's shapes.
     pub fn new(values: &[Tensor], [width, height]: [usize; 2]) -> Option<Self> {
         let planar = |t: &Tensor| {
-            let channels = *t.shape.last()?;
+            let channels = *t.shape.last().filter(|c| **c > 0)?;
             let v = t.as_f32().filter(|_| t.shape == [1, PIXELS, channels])?;
             let column = |rows: &[f32], c: usize| rows.iter().skip(c).step_by(channels).copied().collect::<Vec<_>>();
             let tile = |rows| (0..channels).flat_map(move |c| column(rows, c));
@@ -293,7 +293,7 @@ impl Decoder {
     /// The decoder of a file, and where in its graph the inputs are; `None` when it is not built like SAM's.
     pub fn read(file: &File) -> Option<(Self, Names)> {
         let gemm = GemmExecutor::new();
-        let width = file.vector("transformer.layers.0.self_attn.out_proj.bias")?.len();
+        let width = file.layer("transformer.layers.0.self_attn.out_proj")?.bias.len();
         let reader = Reader { file, gemm: &gemm, width };
         let enlargement = reader.enlargement()?;
         let drawn = enlargement.second_bias.len();

@@ -81,14 +81,13 @@ impl Candidates {
     }
 }
 
-/// The values of all masks and qualities, and of the one that is declared, in the decoder's graph. `None` where the
-/// graph does not choose.
+/// The value from which the graph chose `output`; `None` where it does not choose.
 ///
 /// The choice is `masks[arange, best]`: exporters write it as Gather of a Flatten, or as GatherND, followed by changes of
 /// shape only.
 fn before_choice(graph: &Graph, output: &str) -> Option<String> {
     let mut name = output.to_string();
-    loop {
+    for _ in 0..16 {
         let node = graph.producer(&name)?;
         let first = node.inputs.first()?.clone();
         match node.op.as_str() {
@@ -101,6 +100,7 @@ fn before_choice(graph: &Graph, output: &str) -> Option<String> {
             _ => return None,
         }
     }
+    None
 }
 
 /// Names of the outputs to ask the decoder for: all masks and qualities where they can be found, else the declared ones.
@@ -153,16 +153,16 @@ impl Sam {
             open(&decoder_path, Outputs::Values(values), &options)
         };
         let whole = part(&[&masks, &quality])?;
-        let parts = match Decoder::read(&File { graph: &graph, bytes: &bytes }).filter(|_| !plain) {
-            Some((decoder, Names { photograph, tokens })) => {
-                let photograph = part(&photograph.each_ref().map(String::as_str))?;
-                Some(Parts { photograph, tokens: part(&[&tokens])?, decoder })
-            }
-            None => None,
+        // Whatever keeps the parts from being made or asked, the whole graph is there.
+        let parts = || {
+            let (decoder, Names { photograph, tokens }) = Decoder::read(&File { graph: &graph, bytes: &bytes })?;
+            let photograph = part(&photograph.each_ref().map(String::as_str)).ok()?;
+            let parts = Parts { photograph, tokens: part(&[&tokens]).ok()?, decoder };
+            parts.agree_with(&*whole, side).ok()?.then(|| Box::new(parts))
         };
-        let decoding = match parts {
-            Some(parts) if parts.agree_with(&*whole, side)? => Decoding::Parts(Box::new(parts)),
-            _ => Decoding::Graph(whole),
+        let decoding = match if plain { None } else { parts() } {
+            Some(parts) => Decoding::Parts(parts),
+            None => Decoding::Graph(whole),
         };
         let hash = hash_files([("encoder.onnx", &encoder_path), ("sam.onnx", &decoder_path)])?;
         Ok(Self { encoder, decoding, side, hash })
@@ -238,6 +238,8 @@ impl Parts {
     /// Whether the answer about a point is the whole graph's.
     fn agree_with(&self, whole: &dyn Model, side: usize) -> Result<bool> {
         let embedding = whole.inputs().iter().find(|i| i.name == "image_embeddings").and_then(|i| i.shape.as_ref());
+        let count = |s: &[Option<usize>]| s.iter().flatten().try_fold(1usize, |n, &d| n.checked_mul(d));
+        let embedding = embedding.filter(|s| count(s).is_some_and(|n| n <= 1 << 24));
         let Some(shape) = embedding.and_then(|s| s.iter().copied().collect::<Option<Vec<usize>>>()) else {
             return Ok(false);
         };

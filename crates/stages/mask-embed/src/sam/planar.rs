@@ -6,7 +6,7 @@ use multiversion::multiversion;
 /// Pixels that are worked on together, so that all channels of them stay in the cache.
 const BLOCK: usize = 256;
 
-/// e^x, relative error below 2e-7; 0 below -87.
+/// e^x, relative error below 2e-7; below -87 as at -87.
 #[inline(always)]
 fn exp(x: f32) -> f32 {
     /// Adding this rounds to a whole number, which then stands in the lowest bits.
