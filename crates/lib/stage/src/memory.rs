@@ -49,11 +49,25 @@ impl Stage {
     /// Notes how much memory the run will take at its peak for the record, refuses more than `--memory-limit`, and warns of
     /// more than is free. `hint` says what would take less.
     pub fn needs(&self, bytes: u64, hint: &str) -> Result<()> {
+        self.compare(bytes, hint, false)
+    }
+
+    /// The same, but without `--memory-limit` what the machine, or the program's control group, has in all is the limit.
+    /// Forecasts are up to a quarter above the peak: less above the limit is a warning.
+    pub fn needs_at_once(&self, bytes: u64, hint: &str) -> Result<()> {
+        self.compare(bytes, hint, true)
+    }
+
+    fn compare(&self, bytes: u64, hint: &str, at_once: bool) -> Result<()> {
         *self.predicted.lock().expect("no panic holds this lock") = Some(bytes);
         // The first is kept.
         let _ = HINT.set(hint.into());
         match (self.common.memory_limit, machine::memory()) {
             (Some(limit), _) if bytes > limit.0 => return Err(too_much(bytes, limit, hint).field("--memory-limit")),
+            (None, Some([all, _])) if at_once && bytes / 5 * 4 > all => {
+                let hint = format!("{hint}, or --memory-limit to try it all the same");
+                return Err(too_much(bytes, Bytes(all), &hint).field("memory of this machine or its control group"));
+            }
             // What the program holds already is part of both.
             (None, Some([_, free])) if bytes > free + crate::peak_rss_bytes().unwrap_or(0) => {
                 self.warn(&format!("memory: about {} needed, {} free; {hint}", Bytes(bytes), Bytes(free)));
@@ -61,18 +75,6 @@ impl Stage {
             _ => {}
         }
         Ok(())
-    }
-
-    /// The same, but without `--memory-limit` what the machine, or the program's control group, has in all is the limit.
-    /// Forecasts are up to a quarter above the peak: less above the limit is a warning.
-    pub fn needs_at_once(&self, bytes: u64, hint: &str) -> Result<()> {
-        match (self.common.memory_limit, machine::memory()) {
-            (None, Some([all, _])) if bytes / 5 * 4 > all => {
-                let hint = format!("{hint}, or --memory-limit to try it all the same");
-                Err(too_much(bytes, Bytes(all), &hint).field("memory of this machine or its control group"))
-            }
-            _ => self.needs(bytes, hint),
-        }
     }
 }
 

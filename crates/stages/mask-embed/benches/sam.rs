@@ -10,7 +10,7 @@ use artifacts::{Level, MaskMaps};
 use mask_embed::Choice;
 use mask_embed::automatic::{levels, propose};
 use mask_embed::nms::Pixels;
-use mask_embed::paint::paint;
+use mask_embed::paint::{MapSize, paint};
 use mask_embed::sam::Sam;
 use onnx_models::{EngineOptions, RgbImage};
 use serde_json::json;
@@ -24,7 +24,7 @@ const PHOTOGRAPHS: usize = 8;
 const FOUND: f64 = 0.7;
 /// Longest side of the id maps, and their smallest mask, as by default.
 const MAP_SIDE: usize = 800;
-const MIN_AREA: f64 = 200.0;
+const MIN_AREA: usize = 200;
 
 /// What a setting took for one photograph, in seconds, and what it made.
 struct Run {
@@ -49,11 +49,8 @@ fn run(sam: &Sam, image: &RgbImage, no_skip: bool) -> Run {
     let encode = start.elapsed().as_secs_f64();
     let proposals = propose(sam, &embedded, &choice).expect("the decoder runs");
     let decode = start.elapsed().as_secs_f64() - encode;
-    let scale = (MAP_SIDE as f64 / image.width.max(image.height) as f64).min(1.0);
-    let [width, height] = [image.width, image.height].map(|n| (n as f64 * scale).round() as usize);
-    let smallest = (MIN_AREA * scale * scale).ceil() as usize;
     let chosen = levels(&proposals.masks);
-    let maps = paint(&proposals, &chosen, width, height, smallest);
+    let maps = paint(&proposals, &chosen, MapSize::of(image, MAP_SIDE, MIN_AREA));
     let choose = start.elapsed().as_secs_f64() - encode - decode;
     let distinct: BTreeSet<usize> = chosen[1..].iter().flatten().copied().collect();
     let masks = distinct.into_iter().map(|i| proposals.masks[i].pixels.clone()).collect();

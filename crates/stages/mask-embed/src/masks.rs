@@ -3,7 +3,7 @@
 use crate::automatic::{levels, propose};
 use crate::finished::{self, Views};
 use crate::options::{Choice, MasksArgs};
-use crate::paint::{paint, preview};
+use crate::paint::{MapSize, paint, preview};
 use crate::photographs;
 use crate::sam::Sam;
 use artifacts::{LEVELS, Level, MaskMaps, maps_path, role};
@@ -86,12 +86,10 @@ pub(crate) fn run(args: &MasksArgs, stage: &Stage) -> Result<()> {
 /// The id maps of a photograph.
 fn make(args: &MasksArgs, sam: &Sam, image: &RgbImage) -> Result<(MaskMaps, Facts)> {
     let proposals = propose(sam, &sam.encode(image)?, &args.choice)?;
-    let [width, height] = map_size(image, args.map_size);
-    let scale = (width * height) as f64 / (image.width * image.height) as f64;
-    let smallest = (args.min_area as f64 * scale).ceil() as usize;
-    let maps = paint(&proposals, &levels(&proposals.masks), width, height, smallest);
+    let size = MapSize::of(image, args.map_size, args.min_area);
+    let maps = paint(&proposals, &levels(&proposals.masks), size);
     let (points, asked) = (proposals.points, proposals.asked);
-    let facts = Facts { size: [width, height], masks: count_masks(&maps), points, asked };
+    let facts = Facts { size: [size.width, size.height], masks: count_masks(&maps), points, asked };
     Ok((maps, facts))
 }
 
@@ -117,13 +115,6 @@ fn forecast(args: &MasksArgs, sam: &Sam, views: &[View], stage: &Stage) -> Resul
     stage.forecast(needed, "give fewer --threads, or smaller photographs (--resolution) and maps (--map-size)")
 }
 
-/// Size of the map: longest side `longest`, but not larger than the photograph; 0 for its own size.
-fn map_size(image: &RgbImage, longest: usize) -> [usize; 2] {
-    let side = image.width.max(image.height);
-    let scale = if longest == 0 { 1.0 } else { (longest as f64 / side as f64).min(1.0) };
-    [image.width, image.height].map(|n| ((n as f64 * scale).round() as usize).max(1))
-}
-
 /// Warns of id maps of other views in the folder: later stages would take them for maps of this scene.
 fn warn_of_other_maps(folder: &Path, views: &[View], stage: &Stage) -> Result<()> {
     let mut others = artifacts::stems(folder)?;
@@ -136,19 +127,4 @@ fn warn_of_other_maps(folder: &Path, views: &[View], stage: &Stage) -> Result<()
         ));
     }
     Ok(())
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn maps_keep_the_shape_and_never_grow() {
-        let image = |width, height| RgbImage { width, height, pixels: Vec::new() };
-        assert_eq!(map_size(&image(1600, 898), 800), [800, 449]);
-        assert_eq!(map_size(&image(600, 900), 300), [200, 300]);
-        assert_eq!(map_size(&image(320, 200), 800), [320, 200]);
-        assert_eq!(map_size(&image(320, 200), 0), [320, 200]);
-        assert_eq!(map_size(&image(5000, 2), 800), [800, 1]);
-    }
 }

@@ -6,20 +6,38 @@ use artifacts::{LEVELS, MaskMaps, instance_color};
 use onnx_models::RgbImage;
 use rayon::prelude::*;
 
-/// Paints the chosen masks of each level into an id map of `width` x `height`.
+/// Size of an id map.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct MapSize {
+    /// Width in pixels.
+    pub width: usize,
+    /// Height in pixels.
+    pub height: usize,
+    /// Pixels of the smallest island, hole and mask.
+    pub min_area: usize,
+}
+
+impl MapSize {
+    /// The longest side is `longest`, but no longer than the photograph's; 0 for its own size. `min_area` is in pixels of
+    /// the photograph.
+    pub fn of(image: &RgbImage, longest: usize, min_area: usize) -> Self {
+        let side = image.width.max(image.height);
+        let scale = if longest == 0 { 1.0 } else { (longest as f64 / side as f64).min(1.0) };
+        let [width, height] = [image.width, image.height].map(|n| ((n as f64 * scale).round() as usize).max(1));
+        let share = (width * height) as f64 / (image.width * image.height) as f64;
+        Self { width, height, min_area: (min_area as f64 * share).ceil() as usize }
+    }
+}
+
+/// Paints the chosen masks of each level into an id map.
 ///
 /// A mask is cut where its logits, linearly interpolated, pass 0; islands and holes of fewer than `min_area` pixels of
 /// the map are cleaned. Within a level the masks are painted from large to small, ids ascending: a later mask owns the
 /// pixels that it shares with an earlier one. A mask left with fewer than `min_area` pixels is not painted at all. Ids
 /// count on from level to level, and every id owns pixels, so that LangSplat's readers, which take the highest id of a
 /// level for its number of masks, agree.
-pub fn paint(
-    proposals: &Proposals,
-    chosen: &[Vec<usize>; LEVELS],
-    width: usize,
-    height: usize,
-    min_area: usize,
-) -> MaskMaps {
+pub fn paint(proposals: &Proposals, chosen: &[Vec<usize>; LEVELS], size: MapSize) -> MaskMaps {
+    let MapSize { width, height, min_area } = size;
     let min_area = min_area.max(1);
     let mut ids = vec![-1i32; LEVELS * width * height];
     let mut first = 0;
@@ -96,6 +114,20 @@ mod tests {
     use crate::logits::{Grid, Logits};
     use crate::nms::Pixels;
 
+    fn size(width: usize, height: usize, min_area: usize) -> MapSize {
+        MapSize { width, height, min_area }
+    }
+
+    #[test]
+    fn maps_keep_the_shape_and_never_grow() {
+        let image = |width, height| RgbImage { width, height, pixels: Vec::new() };
+        assert_eq!(MapSize::of(&image(1600, 898), 800, 200), size(800, 449, 50));
+        assert_eq!(MapSize::of(&image(600, 900), 300, 0), size(200, 300, 0));
+        assert_eq!(MapSize::of(&image(320, 200), 800, 7), size(320, 200, 7));
+        assert_eq!(MapSize::of(&image(320, 200), 0, 7), size(320, 200, 7));
+        assert_eq!(MapSize::of(&image(5000, 2), 800, 0), size(800, 1, 0));
+    }
+
     /// Proposals on a 20 x 10 grid, each a rectangle x0..x1, y0..y1.
     fn proposals(rects: &[[usize; 4]]) -> Proposals {
         let grid = Grid { width: 20, height: 10, extent: [20.0, 10.0] };
@@ -112,7 +144,7 @@ mod tests {
     #[test]
     fn ids_count_on_and_small_masks_lie_on_top() {
         let p = proposals(&[[2, 2, 5, 5], [0, 0, 10, 10], [12, 0, 20, 10]]);
-        let m = paint(&p, &[vec![0, 1, 2], vec![0], vec![], vec![1, 2]], 20, 10, 1);
+        let m = paint(&p, &[vec![0, 1, 2], vec![0], vec![], vec![1, 2]], size(20, 10, 1));
         let at = |level: usize, x: usize, y: usize| m.ids[level * 200 + y * 20 + x];
         // By area: 1 (100), 2 (80), 0 (9).
         assert_eq!((at(0, 0, 0), at(0, 13, 5), at(0, 3, 3), at(0, 11, 5)), (0, 1, 2, -1));
@@ -121,7 +153,7 @@ mod tests {
         assert_eq!((at(3, 3, 3), at(3, 13, 3)), (4, 5));
         assert_eq!(m.id_count(), 6);
         // The same at twice the size: the straight edges fall half way between logits of equal size.
-        let big = paint(&p, &[vec![0, 1, 2], vec![], vec![], vec![]], 40, 20, 1);
+        let big = paint(&p, &[vec![0, 1, 2], vec![], vec![], vec![]], size(40, 20, 1));
         for y in 0..20 {
             for x in 0..40 {
                 assert_eq!(big.ids[y * 40 + x], at(0, x / 2, y / 2), "at {x}, {y}");
@@ -134,9 +166,9 @@ mod tests {
         // The large mask is covered up to a strip of 10 pixels; the small one has 4.
         let p = proposals(&[[0, 0, 10, 10], [0, 0, 5, 10], [5, 0, 9, 10], [15, 5, 17, 7]]);
         let chosen = [vec![0, 1, 2, 3], vec![], vec![], vec![]];
-        let count = |min: usize| paint(&p, &chosen, 20, 10, min).id_count();
+        let count = |min: usize| paint(&p, &chosen, size(20, 10, min)).id_count();
         assert_eq!((count(1), count(5), count(11)), (4, 3, 2));
-        let m = paint(&p, &chosen, 20, 10, 11);
+        let m = paint(&p, &chosen, size(20, 10, 11));
         let mut owned = vec![0; 2];
         m.ids.iter().filter(|&&i| i >= 0).for_each(|&i| owned[i as usize] += 1);
         assert_eq!(owned, [50, 40]);

@@ -68,12 +68,12 @@ struct Enlargement {
 /// What the first layer needs of a photograph, `[tiles][channels][TILE]` each.
 pub(super) struct Photograph {
     /// The embedding.
-    pub values: Vec<f32>,
+    pub pixels: Vec<f32>,
     /// Encoding of the pixels' places.
     pub places: Vec<f32>,
     /// Keys and values for the tokens, queries to the tokens.
     pub keys: Vec<f32>,
-    pub sums: Vec<f32>,
+    pub values: Vec<f32>,
     pub queries: Vec<f32>,
     /// Pixels of the photograph; the others fill the square.
     pub inside: Vec<usize>,
@@ -90,11 +90,11 @@ impl Photograph {
             let tile = |rows| (0..channels).flat_map(move |c| column(rows, c));
             Some(v.chunks(TILE * channels).flat_map(tile).collect::<Vec<f32>>())
         };
-        let [placed, values, keys, sums, queries] = values else { return None };
-        let (placed, values) = (planar(placed)?, planar(values)?);
-        let places = placed.iter().zip(&values).map(|(p, v)| p - v).collect();
+        let [placed, pixels, keys, values, queries] = values else { return None };
+        let (placed, pixels) = (planar(placed)?, planar(pixels)?);
+        let places = placed.iter().zip(&pixels).map(|(p, v)| p - v).collect();
         let inside = (0..PIXELS).filter(|p| p % SIDE < width && p / SIDE < height).collect();
-        Some(Self { values, places, keys: planar(keys)?, sums: planar(sums)?, queries: planar(queries)?, inside })
+        Some(Self { pixels, places, keys: planar(keys)?, values: planar(values)?, queries: planar(queries)?, inside })
     }
 }
 
@@ -194,10 +194,10 @@ impl Reader<'_> {
         Some(Norm { scale: of("weight")?, shift: of("bias")? })
     }
 
-    /// `turned` names the part that belongs to the pixels.
-    fn attention(&self, end: &str, turned: &str) -> Option<Attention> {
+    /// `pixels` names the part that belongs to the pixels: its matrix is transposed.
+    fn attention(&self, end: &str, pixels: &str) -> Option<Attention> {
         let inner = self.file.vector(&format!("{end}.q_proj.bias"))?.len();
-        let part = |p: &str| self.linear(&format!("{end}.{p}_proj"), [self.width, inner], p == turned);
+        let part = |p: &str| self.linear(&format!("{end}.{p}_proj"), [self.width, inner], p == pixels);
         let out = self.linear(&format!("{end}.out_proj"), [inner, self.width], false)?;
         (inner % HEADS == 0).then_some(Attention { q: part("q")?, k: part("k")?, v: part("v")?, out })
     }
@@ -237,13 +237,9 @@ impl Reader<'_> {
         let (first, first_bias) = self.enlarge("output_upscaling.0", self.width)?;
         let (second, second_bias) = self.enlarge("output_upscaling.3", first_bias.len())?;
         let [scale, shift] = self.file.scale_and_shift_before("output_upscaling.3.weight")?;
-        (scale.len() == first_bias.len() && shift.len() == first_bias.len()).then_some(Enlargement {
-            first,
-            first_bias,
-            norm: Norm { scale, shift },
-            second,
-            second_bias,
-        })
+        let fits = [&scale, &shift].iter().all(|v| v.len() == first_bias.len());
+        let norm = Norm { scale, shift };
+        fits.then_some(Enlargement { first, first_bias, norm, second, second_bias })
     }
 
     fn names(&self) -> Option<Names> {
@@ -317,10 +313,10 @@ impl Decoder {
     /// Whether a photograph and its tokens have the channels that the weights expect.
     pub fn fits(&self, photograph: &Photograph, tokens: &[f32]) -> bool {
         let Layer { to_pixels, to_tokens, .. } = &self.layers[0];
-        let Photograph { values, places, keys, sums, queries, .. } = photograph;
+        let Photograph { pixels, places, keys, values, queries, .. } = photograph;
         let [own, others] = [self.width, to_pixels.q.bias.len()].map(|n| n * PIXELS);
         let channels =
-            [values, places].iter().all(|v| v.len() == own) && [keys, sums].iter().all(|v| v.len() == others);
+            [pixels, places].iter().all(|v| v.len() == own) && [keys, values].iter().all(|v| v.len() == others);
         let queries = queries.len() == to_tokens.q.bias.len() * PIXELS;
         channels && queries && tokens.len().is_multiple_of(self.width) && tokens.len() / self.width > self.masks.len()
     }
@@ -341,8 +337,7 @@ impl Decoder {
     fn linear(&self, layer: &Linear, x: &[f32]) -> Vec<f32> {
         let inputs = GemmInputB::Packed(&layer.weight).rows();
         let mut out = self.times(matrix(x, inputs), &layer.weight);
-        let bias = layer.bias.iter().cycle();
-        out.iter_mut().zip(bias).for_each(|(o, b)| *o += b);
+        out.iter_mut().zip(layer.bias.iter().cycle()).for_each(|(o, b)| *o += b);
         out
     }
 
@@ -412,7 +407,7 @@ impl Decoder {
         }
         softmax_rows(&mut desk.scores, HEADS * tokens, TILE);
         let mut sums = vec![0.0; tokens * inner];
-        for (scores, values) in tiles(&desk.scores).zip(tiles(&known.sums)) {
+        for (scores, values) in tiles(&desk.scores).zip(tiles(&known.values)) {
             let row = |x, i| &<[f32]>::as_chunks::<TILE>(x).0[i];
             for (i, sum) in sums.iter_mut().enumerate() {
                 let (t, c) = (i / inner, i % inner);
@@ -458,11 +453,11 @@ impl Decoder {
         desk.scores.resize(rows * PIXELS, 0.0);
         let mut placed = vec![0.0; width * TILE];
         let mut scores = vec![0.0; shift.len() * TILE];
-        let known = tiles(&known.values).zip(tiles(&known.queries)).zip(tiles(&known.places));
+        let known = tiles(&known.pixels).zip(tiles(&known.queries)).zip(tiles(&known.places));
         let out = desk.pixels.chunks_exact_mut(width * TILE).zip(desk.scores.chunks_exact_mut(rows * TILE));
-        for (((known_values, known_queries), places), (pixels, out)) in known.zip(out) {
+        for (((known_pixels, known_queries), places), (pixels, out)) in known.zip(out) {
             if first {
-                pixels.copy_from_slice(known_values);
+                pixels.copy_from_slice(known_pixels);
                 scores_by_head(&k, known_queries, inner, &mut scores);
             } else {
                 add_to(&mut placed, pixels, places);

@@ -65,8 +65,8 @@ pub struct Candidates {
 }
 
 impl Candidates {
-    /// Those of masks with all qualities and logits that are at least `least`. With several masks the first is the one
-    /// for prompts of several points, and is left out.
+    /// The masks whose predicted IoU is at least `least`. Of four masks the first is for prompts of several points, and is
+    /// left out.
     fn of_graph(quality: &[f32], logits: &[f32], least: f32) -> Self {
         let skip = usize::from(quality.len() == 4);
         let mut found = Self::default();
