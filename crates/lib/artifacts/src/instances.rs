@@ -58,7 +58,8 @@ pub struct Instances {
     pub descriptor: Vec<f32>,
     /// Views in which the instance was matched with a mask; K.
     pub support: Vec<u32>,
-    /// Mean association score of its matches; K.
+    /// Confidence that this is one whole thing, 0 to 1, to rank instances by: the mean association score of its matches times
+    /// (count / largest count)^(1/4); K.
     pub score: Vec<f32>,
     /// Number of Gaussians; K.
     pub count: Vec<u32>,
