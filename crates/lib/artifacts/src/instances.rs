@@ -182,11 +182,11 @@ impl Instances {
         instances
     }
 
-    /// Writes the artifact.
+    /// Writes the artifact. The names of views join what `provenance.extra` holds, such as [`Health`](crate::Health).
     pub fn write(&self, path: impl AsRef<Path>, mut provenance: Provenance) -> Result<()> {
         provenance.format = Self::FORMAT.into();
         provenance.version = Self::VERSION;
-        provenance.extra = json!({ "views": self.views });
+        provenance.extra["views"] = json!(self.views);
         let (k, m, t) = (self.len(), self.matches.len(), self.tree.len());
         let center = column(&self.oriented, |b| b.center);
         let axes = column(&self.oriented, |b| b.axes);

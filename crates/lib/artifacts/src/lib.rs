@@ -8,6 +8,7 @@ mod checks;
 mod features;
 mod footprints;
 mod graph;
+mod health;
 mod instances;
 mod lerf_ovs;
 mod masks;
@@ -19,6 +20,7 @@ mod truth;
 pub use features::Features;
 pub use footprints::{Footprints, FootprintsBuilder, PixelSamples, Row};
 pub use graph::Graph;
+pub use health::{Finding, Health, SHARED, SharedMasks};
 pub use instances::{Family, Instances, Match, OrientedBox, TreeEdge};
 pub use lerf_ovs::{LERF_OVS, LerfScene};
 pub use masks::{

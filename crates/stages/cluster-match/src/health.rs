@@ -1,58 +1,116 @@
-//! Warnings about the result: one instance that holds too much of the scene, or masks that do not fit the instances.
+//! What the result says of itself: whether one instance holds too much of the scene, masks contradict each other, or
+//! instances share their masks.
 
-use crate::join::mask_weights;
-use artifacts::{Footprints, Instances, Level};
+use crate::join::{mask_weights, units};
+use artifacts::{Footprints, Health, Instances, Level, SHARED, SharedMasks};
+use rayon::prelude::*;
 use stage::Stage;
+use std::collections::{BTreeMap, BTreeSet};
 
-/// The user is warned when one instance holds more than this share of all Gaussians.
-const TOO_LARGE: f64 = 1.0 / 3.0;
-/// Below this purity the user is warned.
-const IMPURE: f64 = 0.7;
+/// Fewest views and levels that must show both of a pair.
+const LEAST_SEEN: usize = 3;
+/// Pairs that are kept: there may be thousands where a floor falls into pieces.
+const KEPT: usize = 20;
 
-/// How far masks and instances agree.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Health {
-    /// Share of the labelled Gaussians in the largest instance, 0 to 1.
-    pub largest: f64,
-    /// Purity of the masks: the share of a mask's weight that lies in one instance, mean over masks by their weight. It is an
-    /// estimate: all views made the instances, so a mask that most views contradict shows here as impure. None without
-    /// masks.
-    pub purity: Option<f64>,
+/// What a view sees of an instance at one level.
+struct Seen {
+    /// View and level, as [`units`] counts them.
+    unit: u32,
+    /// Weight there, as a share of the instance's weight in all of them.
+    share: f64,
+    /// The mask that holds more than half of it.
+    main: Option<u32>,
 }
 
-impl Health {
-    /// The health of `instances`; `kept` are the original indices of the Gaussians in the footprints.
-    pub fn of(instances: &Instances, footprints: &Footprints, kept: &[u32], levels: &[Level]) -> Self {
-        let labelled: usize = instances.count.iter().map(|&c| c as usize).sum();
-        let largest = instances.count.iter().max().map_or(0.0, |&c| f64::from(c) / labelled.max(1) as f64);
-        let labels: Vec<i32> = kept.iter().map(|&i| instances.label[i as usize]).collect();
-        let (mut inside, mut all) = (0.0, 0.0);
-        for (_, of) in mask_weights(&labels, footprints, levels) {
-            inside += of.values().copied().fold(0.0, f64::max);
-            all += of.values().sum::<f64>();
-        }
-        Self { largest, purity: (all > 0.0).then(|| inside / all) }
+/// The health of `instances`; `kept` are the original indices of the Gaussians in the footprints.
+pub fn measure(instances: &Instances, footprints: &Footprints, kept: &[u32], levels: &[Level]) -> Health {
+    let labelled: usize = instances.count.iter().map(|&c| c as usize).sum();
+    let largest = instances.count.iter().max().map_or(0.0, |&c| f64::from(c) / labelled.max(1) as f64);
+    let labels: Vec<i32> = kept.iter().map(|&i| instances.label[i as usize]).collect();
+    let weights = mask_weights(&labels, footprints, levels);
+    let (mut inside, mut all) = (0.0, 0.0);
+    for (_, of) in &weights {
+        inside += of.values().copied().fold(0.0, f64::max);
+        all += of.values().sum::<f64>();
     }
+    let mut shared = shared(&seen(&weights, &units(footprints), instances.len()));
+    let sharing: BTreeSet<u32> = shared.iter().flat_map(|s| s.instances).collect();
+    let sharing: usize = sharing.into_iter().map(|k| instances.count[k as usize] as usize).sum();
+    // Of equals the first; the sort is stable.
+    shared.sort_by(|a, b| b.share.total_cmp(&a.share));
+    let pairs = shared.len();
+    shared.truncate(KEPT);
+    let (sharing, purity) = (sharing as f64 / labelled.max(1) as f64, (all > 0.0).then(|| inside / all));
+    Health { largest, purity, sharing, pairs, shared }
+}
 
-    /// A line for the user, and a warning where something looks wrong.
-    pub fn say(&self, stage: &Stage) {
-        let percent = |v: f64| format!("{:.0} %", 100.0 * v);
-        let purity = self.purity.map_or("no masks".into(), |p| format!("masks lie in one instance by {}", percent(p)));
-        stage.info(&format!("the largest instance holds {} of the Gaussians; {purity}", percent(self.largest)));
-        if self.largest > TOO_LARGE {
-            stage.warn(&format!(
-                "one instance holds {} of the Gaussians; if it is more than floor or walls, try --level small, or feat-train \
-                 --levels small",
-                percent(self.largest)
-            ));
-        }
-        if self.purity.is_some_and(|p| p < IMPURE) {
-            stage.warn(
-                "the masks of the views contradict each other; look at the masks in the report, and try feat-train --levels \
-                 small",
-            );
+/// A line for the user, and a warning where something looks wrong.
+pub fn say(health: &Health, stage: &Stage) {
+    let findings = health.findings();
+    let line: Vec<String> = findings.iter().map(|f| format!("{} {}", f.found, f.name)).collect();
+    stage.info(&line.join("; "));
+    findings.iter().filter_map(|f| f.advice.as_ref()).for_each(|a| stage.warn(a));
+}
+
+/// What each view sees of each instance, by instance and ascending unit. `unit_of` is that of each mask.
+fn seen(weights: &[(u32, BTreeMap<u32, f64>)], unit_of: &[u32], instances: usize) -> Vec<Vec<Seen>> {
+    // By instance and unit: the weight, and the largest in one mask.
+    let mut all: BTreeMap<(u32, u32), (f64, f64, u32)> = BTreeMap::new();
+    for (mask, of) in weights {
+        for (&k, &w) in of.iter().filter(|(_, w)| **w > 0.0) {
+            let (sum, most, main) = all.entry((k, unit_of[*mask as usize])).or_default();
+            *sum += w;
+            if w > *most {
+                (*most, *main) = (w, *mask);
+            }
         }
     }
+    let mut total = vec![0.0; instances];
+    all.iter().for_each(|((k, _), (sum, ..))| total[*k as usize] += sum);
+    let mut out: Vec<Vec<Seen>> = (0..instances).map(|_| Vec::new()).collect();
+    for ((k, unit), (sum, most, mask)) in all {
+        let main = (2.0 * most > sum).then_some(mask);
+        out[k as usize].push(Seen { unit, share: sum / total[k as usize], main });
+    }
+    out
+}
+
+/// The pairs that share most of their masks, by their numbers.
+fn shared(seen: &[Vec<Seen>]) -> Vec<SharedMasks> {
+    let mut mainly: BTreeMap<u32, Vec<u32>> = BTreeMap::new();
+    for (k, of) in seen.iter().enumerate() {
+        of.iter().filter_map(|s| s.main).for_each(|mask| mainly.entry(mask).or_default().push(k as u32));
+    }
+    let mut pairs: BTreeSet<[u32; 2]> = BTreeSet::new();
+    for held in mainly.values() {
+        let after = held.iter().enumerate().flat_map(|(at, &a)| held[at + 1..].iter().map(move |&b| [a, b]));
+        pairs.extend(after);
+    }
+    let pairs: Vec<[u32; 2]> = pairs.into_iter().collect();
+    pairs
+        .into_par_iter()
+        .filter_map(|instances| {
+            let share = share(&seen[instances[0] as usize], &seen[instances[1] as usize])?;
+            (share >= SHARED).then_some(SharedMasks { instances, share })
+        })
+        .collect()
+}
+
+/// The share of the units that see both in which they have one main mask; each unit counts by the smaller of the two shares of
+/// weight that lie in it. None where too few see both.
+fn share(a: &[Seen], b: &[Seen]) -> Option<f64> {
+    let (mut both, mut same, mut units, mut at) = (0.0, 0.0, 0, 0);
+    for s in a {
+        at += b[at..].iter().take_while(|o| o.unit < s.unit).count();
+        let Some(other) = b.get(at).filter(|o| o.unit == s.unit) else { continue };
+        let common = s.share.min(other.share);
+        both += common;
+        units += 1;
+        if s.main.is_some() && s.main == other.main {
+            same += common;
+        }
+    }
+    (units >= LEAST_SEEN && both > 0.0).then(|| same / both)
 }
 
 #[cfg(test)]
@@ -61,24 +119,55 @@ mod tests {
     use artifacts::{FootprintsBuilder, Row};
     use gs_io::Provenance;
 
-    #[test]
-    fn it_counts_the_largest_instance_and_what_masks_hold_of_one() {
-        // Instance 0 holds Gaussians 0 to 5, instance 1 holds 6 and 7. One mask fits, one holds 3 and 1.
-        let kept: Vec<u32> = (0..8).collect();
-        let (views, of_all) = (vec!["a".into()], kept.clone());
-        let mut b = FootprintsBuilder { views, kept: of_all, ..FootprintsBuilder::default() };
-        for (mask, gaussians) in [&[0u32, 1][..], &[3, 4, 5, 6]].into_iter().enumerate() {
-            let pixels = gaussians.len() as u32;
-            let row = Row { view: 0, level: 3, mask: mask as u32, pixels, gated: pixels, alpha: 1.0 };
-            b.push(row, gaussians.iter().map(|&i| (i, 1.0)));
+    /// Footprints of eight Gaussians, of all weight 1, with the masks of each view.
+    fn footprints(views: &[&[&[u32]]]) -> Footprints {
+        let names = (0..views.len()).map(|v| v.to_string()).collect();
+        let mut b = FootprintsBuilder { views: names, kept: (0..8).collect(), ..FootprintsBuilder::default() };
+        for (view, masks) in views.iter().enumerate() {
+            for (mask, gaussians) in masks.iter().enumerate() {
+                let pixels = gaussians.len() as u32;
+                let row = Row { view: view as u32, level: 3, mask: mask as u32, pixels, gated: pixels, alpha: 1.0 };
+                b.push(row, gaussians.iter().map(|&i| (i, 1.0)));
+            }
         }
         let dir = tempfile::tempdir().unwrap();
         let path = dir.path().join("f.safetensors");
         b.write(&path, Provenance::default()).unwrap();
-        let footprints = Footprints::read(&path).unwrap();
-        let instances = Instances { label: vec![0, 0, 0, 0, 0, 0, 1, 1], count: vec![6, 2], ..Instances::default() };
-        let health = Health::of(&instances, &footprints, &kept, &[Level::Large]);
-        assert_eq!(health, Health { largest: 0.75, purity: Some(5.0 / 6.0) });
-        assert_eq!(Health::of(&instances, &footprints, &kept, &[Level::Small]).purity, None);
+        Footprints::read(&path).unwrap()
+    }
+
+    fn instances(label: [i32; 8]) -> Instances {
+        let count = |k| label.iter().filter(|&&l| l == k).count() as u32;
+        let count = (0..=label.into_iter().max().unwrap()).map(count).collect();
+        Instances { label: label.to_vec(), count, ..Instances::default() }
+    }
+
+    fn health(instances: &Instances, footprints: &Footprints, level: Level) -> Health {
+        measure(instances, footprints, &(0..8).collect::<Vec<_>>(), &[level])
+    }
+
+    #[test]
+    fn it_counts_the_largest_instance_and_what_masks_hold_of_one() {
+        // Instance 0 holds Gaussians 0 to 5, instance 1 holds 6 and 7. One mask fits, one holds 3 and 1.
+        let footprints = footprints(&[&[&[0, 1], &[3, 4, 5, 6]]]);
+        let instances = instances([0, 0, 0, 0, 0, 0, 1, 1]);
+        let found = health(&instances, &footprints, Level::Large);
+        assert_eq!(found, Health { largest: 0.75, purity: Some(5.0 / 6.0), ..Health::default() });
+        assert_eq!(health(&instances, &footprints, Level::Small).purity, None);
+    }
+
+    #[test]
+    fn pieces_that_lie_in_the_same_masks_are_named() {
+        let (together, apart): (&[&[u32]], &[&[u32]]) = (&[&[0, 1, 2, 3], &[4, 5, 6, 7]], &[&[0, 1], &[2, 3], &[4, 5]]);
+        let instances = instances([0, 0, 1, 1, 2, 2, 3, 3]);
+        // 0 and 1 lie in one mask of four views in five. 2 and 3 always do where both are seen.
+        let found = health(&instances, &footprints(&[together, together, apart, together, together]), Level::Large);
+        let of = |a, b, share| SharedMasks { instances: [a, b], share };
+        let near = |a: &SharedMasks, b: SharedMasks| a.instances == b.instances && (a.share - b.share).abs() < 1e-12;
+        assert!(found.sharing == 1.0 && found.pairs == 2 && near(&found.shared[0], of(2, 3, 1.0)), "{found:?}");
+        assert!(near(&found.shared[1], of(0, 1, 0.8)), "{found:?}");
+        // Half of the views are not most, and two are too few.
+        let found = health(&instances, &footprints(&[together, apart, together, apart]), Level::Large);
+        assert_eq!((found.sharing, found.pairs, found.shared.len()), (0.0, 0, 0), "{found:?}");
     }
 }

@@ -1,9 +1,9 @@
 //! What the stage writes: the artifact, and beside it what people and viewers read.
 
-use crate::health::Health;
+use crate::health;
 use crate::inputs::Inputs;
 use crate::options::{Args, Settings};
-use artifacts::{Instances, NOISE_COLOR, instance_color};
+use artifacts::{Health, Instances, NOISE_COLOR, instance_color};
 use gs_io::{Claim, Error, Outputs, Result, write_bytes};
 use gs_scene::{Gaussians, SH_C0, ply};
 use serde_json::{Value, json};
@@ -48,20 +48,23 @@ pub(crate) fn write(
     let [colors, list, table] = SIDE_FILES.map(|extension| a.out.with_extension(extension));
     ply::write_gaussians(colors, &colored(gaussians, &instances.label), &comments)?;
     gs_io::npy::write_i32(list, &[instances.label.len()], &instances.label)?;
-    write_bytes(table, &serde_json::to_vec_pretty(&as_text(instances, &parameters)).map_err(fail)?)?;
+    let health = health::measure(instances, &inputs.footprints, &inputs.graph.kept, &settings.level);
+    health::say(&health, stage);
+    let text = as_text(instances, &health, &parameters);
+    write_bytes(table, &serde_json::to_vec_pretty(&text).map_err(fail)?)?;
     if let Some(folder) = &a.per_instance_plys {
         write_instance_plys(folder, gaussians, instances, &comments)?;
     }
     let matched = instances.support.iter().filter(|&&s| s > 0).count();
-    let health = Health::of(instances, &inputs.footprints, &inputs.graph.kept, &settings.level);
-    health.say(stage);
     let summary = json!({
-        "largest_share": health.largest, "mask_purity": health.purity,
+        "largest_share": health.largest, "mask_purity": health.purity, "sharing": health.sharing,
         "instances": instances.len(), "noise": noise, "matched": matched, "matches": instances.matches.len(),
         "clustering_seconds": clustering_seconds,
     });
     stage.record(claim, parameters.clone(), inputs.hashes.clone(), summary)?;
-    instances.write(&a.out, stage.provenance(Instances::FORMAT, 1, parameters, inputs.hashes.clone()))?;
+    let mut provenance = stage.provenance(Instances::FORMAT, 1, parameters, inputs.hashes.clone());
+    provenance.extra = json!({ "health": health });
+    instances.write(&a.out, provenance)?;
     stage.info(&format!("wrote {}: {} instances, {matched} matched with masks", a.out.display(), instances.len()));
     Ok(())
 }
@@ -80,7 +83,7 @@ fn colored(g: &Gaussians, labels: &[i32]) -> Gaussians {
 }
 
 /// The instances as JSON: where they are, how large, and as which masks they were seen.
-fn as_text(instances: &Instances, parameters: &Value) -> Value {
+fn as_text(instances: &Instances, health: &Health, parameters: &Value) -> Value {
     let sizes = instances.cluster_sizes();
     let gaussians = |cluster: u32| sizes.get(&cluster).copied().unwrap_or(0);
     let part = |&p: &u32| json!({"cluster": p, "gaussians": gaussians(p)});
@@ -109,7 +112,7 @@ fn as_text(instances: &Instances, parameters: &Value) -> Value {
     let unlabelled = instances.label.iter().filter(|&&l| l < 0).count();
     json!({
         "gaussians": instances.label.len(), "without_instance": unlabelled, "descriptor_dim": instances.dim,
-        "parameters": parameters, "instances": list,
+        "health": health, "parameters": parameters, "instances": list,
     })
 }
 

@@ -1,6 +1,8 @@
 //! The program on a small scene on disk: instances and descriptors, the same bytes for any thread count, and bad input.
 
-use artifacts::{Features, FootprintsBuilder, Graph, Instances, MaskFeatures, MaskMaps, Row, hash_folder, role};
+use artifacts::{
+    Features, FootprintsBuilder, Graph, Health, Instances, MaskFeatures, MaskMaps, Row, hash_folder, role,
+};
 use glam::DVec3;
 use gs_io::{Artifact, Provenance, hash_file};
 use gs_scene::dataset::{self, LoadOptions, Resolution};
@@ -263,6 +265,12 @@ fn instances_are_found_matched_and_described_the_same_for_any_number_of_threads(
     let text: Value = serde_json::from_slice(&std::fs::read(s.path("out/instances.json")).unwrap()).unwrap();
     assert_eq!(text["instances"].as_array().unwrap().len(), 2);
     assert_eq!(text["instances"][b]["matches"][1]["view"], "v1");
+    // How sound it is, said, listed and kept for the report.
+    let health = Health::of(&Instances::read(s.path("out/instances.safetensors")).unwrap().1).unwrap().unwrap();
+    assert_eq!(text["health"], json!(health));
+    let largest = f64::from(i.count[a].max(i.count[b])) / 81.0;
+    assert!(health.largest == largest && health.purity == Some(0.75) && health.pairs == 0, "{health:?}");
+    assert!(said.contains("of the Gaussians in the largest instance; "), "{said}");
     // Where it stands in the tree: its cluster holds its Gaussians, and above it is only the whole scene.
     for k in [a, b] {
         let own = i.family(k).unwrap().own;
@@ -320,7 +328,9 @@ fn options_do_what_they_say() {
     let (i, said) = s.succeed(&["--level", "medium"]);
     assert!(i.len() == 1 && i.label.iter().all(|&l| l == 0) && said.contains("1 instances after joining"), "{said}");
     assert!(i.tree.iter().all(|e| e.instance <= 0));
-    assert_eq!(s.succeed(&["--level", "medium", "--cluster", "free", "--min-samples", "5"]).0.len(), 2);
+    // Left apart, they are said to share their masks.
+    let (i, said) = s.succeed(&["--level", "medium", "--cluster", "free", "--min-samples", "5"]);
+    assert!(i.len() == 2 && said.contains("instances 0 and 1 share 100 % of their masks: each pair"), "{said}");
     let (i, _) = s.succeed(&["--level", "medium,large"]);
     assert!(i.matches.len() == 2 * VIEWS && i.matches.iter().all(|m| m.mask >= 3));
     assert!(s.succeed(&["--threshold", "1"]).0.matches.is_empty());

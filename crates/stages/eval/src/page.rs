@@ -77,6 +77,7 @@ fn write(material: &Material, metrics: &mut Metrics) -> Result<String> {
     sections::id_maps(material, &mut page, metrics)?;
     sections::features(material, &mut page, metrics)?;
     sections::instances(material, &mut page, metrics)?;
+    sections::soundness(material, &mut page, metrics)?;
     sections::queries(material, &mut page, metrics)?;
     sections::score_tables(material, &mut page);
     sections::training(material, &mut page, metrics)?;

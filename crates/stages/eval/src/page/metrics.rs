@@ -1,5 +1,6 @@
 //! The figures of a run.
 
+use artifacts::Health;
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
 
@@ -28,6 +29,8 @@ pub struct Metrics {
     pub gaussians: usize,
     /// Number of instances.
     pub instances: Option<usize>,
+    /// How far masks and instances agree; null where an older cluster-match made them.
+    pub health: Option<Health>,
     /// Wall-clock seconds by stage.
     pub seconds: BTreeMap<String, f64>,
     /// Peak memory in bytes by stage, where the system tells.

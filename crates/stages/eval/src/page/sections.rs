@@ -7,7 +7,7 @@ use super::runs::{self, Run, grouped};
 use crate::query::show::QueryResults;
 use crate::scene::read_features;
 use crate::score::{QueryScore, ThingScore};
-use artifacts::{Level, MaskMaps, NOISE_COLOR, hash_folder, instance_color, maps_path, role};
+use artifacts::{Health, Level, MaskMaps, NOISE_COLOR, SharedMasks, hash_folder, instance_color, maps_path, role};
 use gs_io::{Error, IoContext, Result};
 use gs_scene::dataset::{Dataset, Split, View};
 use report::curve;
@@ -180,6 +180,37 @@ pub(super) fn instances(m: &Material, page: &mut Page, metrics: &mut Metrics) ->
         figures.push(figure(&render_colors(m, &colors, s.view), 2, format!("{}: instances", s.view.stem()))?);
     }
     page.figures(2, &figures);
+    Ok(())
+}
+
+/// What cluster-match found of masks and instances, and what to try where that is doubtful.
+pub(super) fn soundness(m: &Material, page: &mut Page, metrics: &mut Metrics) -> Result<()> {
+    let Some((inst, artifact)) = m.found.as_ref().filter(|(instances, _)| !instances.is_empty()) else { return Ok(()) };
+    metrics.health = Health::of(artifact)?;
+    let Some(health) = &metrics.health else {
+        metrics
+            .skipped
+            .push("masks and instances: an older cluster-match made the instances, without their health".into());
+        return Ok(());
+    };
+    page.section("soundness", "Masks and instances: are they sound?");
+    let findings = health.findings();
+    page.checks(&findings.each_ref().map(|f| (f.name.into(), f.found.clone(), f.advice.is_none())));
+    if findings.iter().all(|f| f.advice.is_none()) {
+        page.paragraph(
+            "No instance holds too much of the scene, the masks of the views agree, and few instances share them.",
+        );
+    }
+    findings.iter().filter_map(|f| f.advice.as_ref()).for_each(|a| page.note(a));
+    if !health.shared.is_empty() {
+        let size = |k: u32| inst.count.get(k as usize).map_or("–".into(), |n| grouped(&n.to_string()));
+        let row = |s: &SharedMasks| {
+            let [a, b] = s.instances;
+            vec![a.to_string(), size(a), b.to_string(), size(b), format!("{:.0}", 100.0 * s.share)]
+        };
+        let rows: Vec<Vec<String>> = health.shared.iter().map(row).collect();
+        page.table(&["instance", "Gaussians", "and instance", "Gaussians", "% of masks shared"], &rows);
+    }
     Ok(())
 }
 

@@ -89,7 +89,7 @@ impl Fixture {
         self.path().join("text.json")
     }
 
-    fn provenance(&self) -> Provenance {
+    pub fn provenance(&self) -> Provenance {
         provenance(&self.geometry(), &self.scene())
     }
 

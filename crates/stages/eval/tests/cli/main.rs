@@ -3,7 +3,9 @@
 mod fixture;
 mod protocols;
 
+use artifacts::Instances;
 use fixture::{Fixture, HEIGHT, SCORE, TABLE, VIEWS, WIDTH, failed, stem};
+use gs_io::Provenance;
 use serde_json::{Value, json};
 use std::fs;
 use std::process::Stdio;
@@ -277,7 +279,36 @@ fn a_full_report_stands_alone() {
     assert_eq!((&m["psnr_heldout"], &m["gaussians"], &m["instances"]), (&json!(31.5), &json!(83), &json!(3)));
     assert_eq!((&m["query_count"], &m["queries"][1]["text"]), (&json!(2), &json!("red ball")));
     assert!(m["seconds"]["eval score"].as_f64().unwrap() > 0.0);
-    assert_eq!(m["skipped"], json!([]));
+    assert_eq!(m["skipped"].as_array().unwrap().len(), 1, "the instances' health: {}", m["skipped"]);
+}
+
+#[test]
+fn a_report_says_whether_masks_and_instances_are_sound() {
+    let f = Fixture::new(0);
+    let section = "<h2 id=\"soundness\">Masks and instances: are they sound?";
+    let report = |largest: f64, share: Option<f64>| {
+        let pair = |share| json!({"instances": [0, 2], "share": share});
+        let shared: Vec<Value> = share.into_iter().map(pair).collect();
+        let health = json!({"largest": largest, "purity": 0.9, "sharing": share.map_or(0.0, |_| 0.5), "pairs": shared.len(), "shared": shared});
+        let (instances, _) = Instances::read(f.instances()).unwrap();
+        let extra = json!({ "health": health });
+        instances.write(f.instances(), Provenance { extra, ..f.provenance() }).unwrap();
+        f.good("report", REPORT);
+        assert_eq!(f.json("metrics.json")["health"], health);
+        fs::read_to_string(f.path().join("report.html")).unwrap()
+    };
+    let html = report(0.25, None);
+    assert!(html.contains(section) && html.contains("<b>25 %</b>") && html.contains("<b>90 %</b>"), "{html}");
+    assert!(html.contains("few instances share them") && !html.contains("class=\"doubt\""));
+    let html = report(0.5, Some(0.85));
+    assert_eq!(html.matches("class=\"doubt\"").count(), 2);
+    assert!(html.contains("instances 0 and 2 share 85 % of their masks") && html.contains("--level small"), "{html}");
+    assert!(!html.contains("few instances share them"));
+    // Of an older program.
+    f.change_instances(|_| ());
+    f.good("report", REPORT);
+    assert!(!fs::read_to_string(f.path().join("report.html")).unwrap().contains(section));
+    assert!(f.json("metrics.json")["skipped"].to_string().contains("an older cluster-match"));
 }
 
 #[test]
