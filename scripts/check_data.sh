@@ -14,6 +14,8 @@ lack() { # lack WHAT WHERE SOURCE
   printf '  missing  %s\n           goes to %s   [%s]\n' "$1" "$2" "$3"
 }
 there() { printf '  ok       %s\n' "$1"; }
+# ScanNet's instances are scored without a text, too.
+[ "$set" = scannet ] && [ -z "$TEXTS$CLIP" ] && classless=1 || classless=
 
 # Masks and features of the photographs $1 of scene $2: LangSplat's or models to make them with. $3 where they come from.
 check_masks() {
@@ -22,13 +24,13 @@ check_masks() {
   if [ "$maps" -eq 0 ]; then
     printf '  none     masks in %s: SAM makes them\n' "$folder"
     [ -e "$SAM/encoder.onnx" ] || lack "SAM's encoder.onnx and sam.onnx" "$SAM (make models), or LangSplat's masks to $folder" sam
-    [ -n "$CLIP" ] || lack "a CLIP model for the masks' features" "any folder, given as CLIP=folder" clip
+    [ -n "$CLIP$classless" ] || lack "a CLIP model for the masks' features" "any folder, given as CLIP=folder" clip
   elif [ "$maps" -lt "$photographs" ]; then
     lack "$((photographs - maps)) of $photographs id maps (*_s.npy)" "$folder" "$3"
-  elif [ "$features" -lt "$maps" ]; then
+  elif [ "$features" -lt "$maps" ] && [ -z "$classless" ]; then
     lack "$((maps - features)) of $maps feature files (*_f.npy)" "$folder" "$3"
   else
-    there "$maps id maps with features"
+    there "$maps id maps, $features with features"
   fi
 }
 # What texts are encoded with.
@@ -37,6 +39,8 @@ check_texts() {
     if [ -f "$TEXTS" ]; then there "text features $TEXTS"; else lack "the table of text features" "$TEXTS" texts; fi
   elif [ -n "$CLIP" ]; then
     if [ -e "$CLIP/text.onnx" ]; then there "CLIP in $CLIP"; else lack "CLIP's text.onnx" "$CLIP" clip; fi
+  elif [ -n "$classless" ]; then
+    echo "  note     neither TEXTS nor CLIP: no scores of classes, only of instances without classes   [texts]"
   else
     lack "features of the texts that are asked, of the model that made the masks' features" \
       "any file, given as TEXTS=file, or a CLIP model given as CLIP=folder" texts
@@ -87,7 +91,11 @@ check_scannet() {
   fi
   [ "$(count "$scene" '*.labels.ply')" -gt 0 ] || lack "the vertices' labels, ${name}_vh_clean_2.labels.ply" "$scene" scannet
   if [ "$(count "$scene" '*_vh_clean_2.0.010000.segs.json')" -eq 0 ] || [ "$(count "$scene" "$name.aggregation.json")" -eq 0 ]; then
-    echo "  note     no segs.json with aggregation.json: no scores of instances (the paper's table needs none)   [scannet]"
+    if [ -n "$classless" ]; then
+      lack "instances to score without TEXTS or CLIP, ${name}_vh_clean_2.0.010000.segs.json and $name.aggregation.json" "$scene" scannet
+    else
+      echo "  note     no segs.json with aggregation.json: no scores of instances (the paper's table needs none)   [scannet]"
+    fi
   fi
   check_masks "$photographs" "$scene" opengaussian
 }

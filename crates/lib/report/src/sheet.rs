@@ -110,7 +110,9 @@ impl Sheet {
         }
         page.section("notes", "Notes");
         self.notes.iter().for_each(|n| page.note(n));
-        page.finish(&self.title, "Published figures and ours, in percent")
+        let whose =
+            if self.table.sources { "Published figures and ours, in percent" } else { "Our figures, in percent" };
+        page.finish(&self.title, whose)
     }
 
     /// Its tables as JSON: figures in percent by column, null where there is none.

@@ -40,6 +40,11 @@ pub trait Protocol: Serialize + DeserializeOwned {
         true
     }
 
+    /// Whether the table of these scenes has published rows.
+    fn is_published(_scenes: &[Metrics<Self>]) -> bool {
+        true
+    }
+
     /// Figures by another rule, in words.
     fn remark(&self) -> Option<String> {
         None
@@ -65,8 +70,8 @@ impl<F: Protocol> Metrics<F> {
 
 /// The paper's table with the scenes given, and notes that name rule and feature files.
 pub fn sheet<F: Protocol>(scenes: &[Metrics<F>]) -> Sheet {
-    let mut notes =
-        vec!["Published rows: percent, as printed in the source named; the authors' feature files.".to_string()];
+    let published = "Published rows: percent, as printed in the source named; the authors' feature files.";
+    let mut notes: Vec<String> = F::is_published(scenes).then(|| published.into()).into_iter().collect();
     for s in scenes {
         let features: Vec<String> = s.features.iter().map(|(k, v)| format!("{k} {v}")).collect();
         notes.push(format!("{}: {}. From {}.", s.scene, s.rule, features.join("; ")));

@@ -168,7 +168,9 @@ pub(crate) fn run(o: &ScannetOptions, parameters: Value, stage: &Stage) -> Resul
     stage.forecast(memory::of_scan(&Sizes { truth, ..Sizes::new(&o.inputs, &o.texts, &[]) }), SMALLER)?;
     let scene = o.inputs.read(&load(folder, &LoadOptions::default(), stage)?, stage)?;
     let mut notes = Vec::new();
-    let source = o.texts.given().then(|| TextSource::open_for(&scene, &o.texts)).transpose()?;
+    let why = without_classes(&scene, o);
+    let source = if why.is_none() { Some(TextSource::open_for(&scene, &o.texts)?) } else { None };
+    notes.extend(why.map(|why| format!("no class scores: {why}")));
     let features = sources(&scene, source.as_ref())?;
     let (vertices, labels) = gs_scene::ply::read_labels(&files.labels, "label")?;
     let matched = matched(&scene, &vertices, o.association, &files.labels)?;
@@ -188,11 +190,9 @@ pub(crate) fn run(o: &ScannetOptions, parameters: Value, stage: &Stage) -> Resul
         for size in SETS {
             sets.push(set_figures(&scene, &labels, &matched, size, &texts, min_support, &mut notes));
         }
-    } else {
-        notes.push("no class scores: neither --clip nor --text-features was given".to_string());
     }
     let instances = instance_figures(&scene, &files, &matched, vertices.len(), &mut notes)?;
-    let rule = rule(o.association, min_support);
+    let rule = rule(o.association, min_support, !sets.is_empty());
     let (protocol, figures) = (ScanFigures::NAME.into(), ScanFigures { sets, instances });
     let metrics = Metrics { protocol, scene: folder_name(folder), rule, features, figures, notes };
     let table = metrics.write(&o.out, stage)?;
@@ -201,16 +201,28 @@ pub(crate) fn run(o: &ScannetOptions, parameters: Value, stage: &Stage) -> Resul
     Ok(table)
 }
 
-/// The rule in words.
-fn rule(association: Association, min_support: u32) -> String {
+/// Why no class can be scored, where that is so; instances without classes are scored all the same.
+fn without_classes(scene: &LabelledScene, o: &ScannetOptions) -> Option<&'static str> {
+    if !o.texts.given() {
+        return Some("neither --clip nor --text-features was given");
+    }
+    let undescribed = "the instances have no language features, because the masks were not encoded with a CLIP model \
+                       (mask-embed embed --clip)";
+    (scene.instances.dim == 0).then_some(undescribed)
+}
+
+/// The rule in words; that of classes where they are scored.
+fn rule(association: Association, min_support: u32, classes: bool) -> String {
     let association = match association {
         Association::OneToOne => "Gaussian i is vertex i",
         Association::Nearest => "every vertex takes its nearest Gaussian",
     };
-    format!(
-        "{association}; Gaussians of opacity below {MIN_OPACITY} left out; instances matched in fewer than {min_support} \
-         views and noise get the first class; argmax of the cosine over the set's names; means over the classes present"
-    )
+    let of_classes = format!(
+        "; instances matched in fewer than {min_support} views and noise get the first class; argmax of the cosine over the \
+         set's names; means over the classes present"
+    );
+    let of_classes = if classes { of_classes } else { String::new() };
+    format!("{association}; Gaussians of opacity below {MIN_OPACITY} left out{of_classes}")
 }
 
 /// Scores the classes of a set. `texts` are the features of the names of [`artifacts::NYU40`], in that order. Gaussians
@@ -284,6 +296,16 @@ fn instance_figures(
 }
 
 impl ScanFigures {
+    /// Columns of [`Self::instance_cells`].
+    const INSTANCES: [&str; 5] = ["instance mIoU", "@25", "@50", "AP25", "AP50"];
+
+    /// Scores of instances without classes, in percent.
+    fn instance_cells(&self) -> [Option<f64>; 5] {
+        let i = self.instances.as_ref();
+        let figures = i.map_or([None; 5], |i| [Some(i.miou), Some(i.acc25), Some(i.acc50), i.ap25, i.ap50]);
+        figures.map(|v| v.map(|v| 100.0 * v))
+    }
+
     /// mIoU and mAcc of the sets of 19, 15 and 10 classes.
     fn row(&self) -> SetRow {
         SETS.map(|size| {
@@ -291,6 +313,15 @@ impl ScanFigures {
             set.miou.zip(set.macc)
         })
     }
+}
+
+/// Means over scans of [`ScanFigures::instance_cells`], each over the scans that have it.
+fn instance_means(scans: &[Metrics<ScanFigures>]) -> [Option<f64>; 5] {
+    let rows: Vec<_> = scans.iter().map(|s| s.figures.instance_cells()).collect();
+    std::array::from_fn(|c| {
+        let column: Vec<f64> = rows.iter().filter_map(|r| r[c]).collect();
+        (!column.is_empty()).then(|| metrics::mean(&column))
+    })
 }
 
 /// Both ways of bringing scans together: the mean of the scans' means, and the means of the pooled points.
@@ -317,25 +348,35 @@ impl Protocol for ScanFigures {
         self.sets.iter().all(|s| SETS.contains(&s.size) && sound(s))
     }
 
+    fn is_published(scans: &[Metrics<Self>]) -> bool {
+        scans.iter().any(|s| !s.figures.sets.is_empty())
+    }
+
     fn sheet(scans: &[Metrics<Self>], notes: Vec<String>) -> Sheet {
+        let columns = Self::INSTANCES.map(String::from);
+        let each = |title: &str, columns, rows| {
+            let (title, head) = (title.into(), "Scan".into());
+            Table { title, head, columns, rows, sources: false }
+        };
+        if !Self::is_published(scans) {
+            let row = |s: &Metrics<Self>| Row::measured(&s.scene, s.figures.instance_cells().to_vec());
+            let mut rows: Vec<Row> = scans.iter().map(row).collect();
+            if scans.len() > 1 {
+                rows.push(Row::measured("mean over scenes", instance_means(scans).to_vec()));
+            }
+            let table = each("Instances without classes", columns.to_vec(), rows);
+            return Sheet { title: "ScanNet".into(), table, remarks: Vec::new(), notes, more: Vec::new() };
+        }
         let [mean, pooled] = means(scans);
         let rows = [("ours, mean over scenes", mean), ("ours, points pooled", pooled)];
         let mut sheet = published::scannet_sheet(&rows, scans.len(), notes);
         let row = |s: &Metrics<Self>| {
-            let i = s.figures.instances.as_ref();
-            let figures = i.map_or([None; 5], |i| [Some(i.miou), Some(i.acc25), Some(i.acc50), i.ap25, i.ap50]);
             let mut cells = published::set_cells(s.figures.row());
-            cells.extend(figures.map(|v| v.map(|v| 100.0 * v)));
+            cells.extend(s.figures.instance_cells());
             Row::measured(&s.scene, cells)
         };
-        let instance = ["instance mIoU", "@25", "@50", "AP25", "AP50"].map(String::from);
-        sheet.more.push(Table {
-            title: "Scans one by one".into(),
-            head: "Scan".into(),
-            columns: published::set_columns().into_iter().chain(instance).collect(),
-            rows: scans.iter().map(row).collect(),
-            sources: false,
-        });
+        let columns = published::set_columns().into_iter().chain(columns).collect();
+        sheet.more.push(each("Scans one by one", columns, scans.iter().map(row).collect()));
         sheet
     }
 
@@ -346,7 +387,10 @@ impl Protocol for ScanFigures {
         };
         let [mean, pooled] = means(scans).map(sized);
         let scenes: Vec<&str> = scans.iter().map(|m| m.scene.as_str()).collect();
-        json!({"protocol": "scannet dataset", "scenes": scenes, "mean_over_scenes": mean, "pooled": pooled})
+        let columns = ScanFigures::INSTANCES.iter().map(|c| c.to_string());
+        let instances: serde_json::Map<String, Value> = columns.zip(instance_means(scans).map(|v| json!(v))).collect();
+        json!({"protocol": "scannet dataset", "scenes": scenes, "mean_over_scenes": mean, "pooled": pooled,
+            "instances_percent": instances})
     }
 }
 

@@ -337,6 +337,55 @@ fn tables_join_scenes_and_refuse_what_does_not_fit() {
 }
 
 #[test]
+fn instances_are_scored_where_there_is_no_text() {
+    let s = Scene::new();
+    let with = s.metrics("scannet", &[]);
+    let run = |text: bool| {
+        let _ = std::fs::remove_dir_all(s.at("out"));
+        let mut c = Command::new(env!("CARGO_BIN_EXE_eval"));
+        c.arg("scannet").arg("--instances").arg(s.instances()).arg("--geometry").arg(s.geometry());
+        c.arg("--scene").arg(s.scene()).arg("--out").arg(s.at("out"));
+        if text {
+            c.arg("--text-features").arg(s.texts());
+        }
+        let o = c.output().unwrap();
+        assert!(o.status.success(), "{}", String::from_utf8_lossy(&o.stderr));
+        (String::from_utf8(o.stdout).unwrap(), read_json(&s.at("out/metrics.json")))
+    };
+    let scored = |(printed, without): (String, Value), why: &str| {
+        assert_eq!(without["instances"], with["instances"]);
+        assert_eq!(without["sets"], json!([]));
+        // One table, of our figures alone, and one line that says why there is no other.
+        let heads: Vec<&str> =
+            printed.lines().filter(|l| l.starts_with("| Scan") || l.starts_with("| Methods")).collect();
+        assert_eq!(heads, ["| Scan | instance mIoU | @25 | @50 | AP25 | AP50 |"], "{printed}");
+        assert!(!printed.contains("19 mIoU") && !printed.contains("Published rows"), "{printed}");
+        assert_eq!(printed.matches("no class scores").count(), 1, "{printed}");
+        assert!(printed.contains(why), "{printed}");
+    };
+    scored(run(false), "neither --clip nor --text-features was given");
+    let (mut i, _) = Instances::read(s.instances()).unwrap();
+    (i.dim, i.descriptor) = (0, Vec::new());
+    i.write(s.instances(), provenance(&s.geometry(), &s.scene())).unwrap();
+    scored(run(true), "the instances have no language features");
+
+    // A table of such scans is one of instances, too, with their mean.
+    std::fs::rename(s.at("out"), s.at("a")).unwrap();
+    let mut second = read_json(&s.at("a/metrics.json"));
+    second["scene"] = json!("scene0062_00");
+    second["instances"]["miou"] = json!(0.0);
+    std::fs::create_dir(s.at("b")).unwrap();
+    std::fs::write(s.at("b/metrics.json"), second.to_string()).unwrap();
+    let mut c = Command::new(env!("CARGO_BIN_EXE_eval"));
+    let o = c.arg("table").args(["a", "b"].map(|n| s.at(n))).arg("--out").arg(s.at("t")).output().unwrap();
+    assert!(o.status.success(), "{}", String::from_utf8_lossy(&o.stderr));
+    let printed = String::from_utf8(o.stdout).unwrap();
+    assert!(printed.contains("| scene0062_00 | 0.00 |") && printed.contains("| mean over scenes |"), "{printed}");
+    let mean = read_json(&s.at("t/metrics.json"))["instances_percent"]["instance mIoU"].as_f64().unwrap();
+    assert!((mean - 50.0 * with["instances"]["miou"].as_f64().unwrap()).abs() < 1e-9);
+}
+
+#[test]
 fn damaged_gaussians_leave_the_evaluation_of_a_scan() {
     let s = Scene::new();
     let mut g = gs_scene::ply::read_gaussians(s.geometry()).unwrap();
