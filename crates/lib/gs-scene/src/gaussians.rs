@@ -120,12 +120,15 @@ impl Gaussians {
     #[must_use]
     pub fn select(&self, indices: &[u32]) -> Self {
         let at = || indices.iter().map(|&i| i as usize);
+        // Harmonics are most of it: no more room than they need.
+        let mut sh = Vec::with_capacity(indices.len() * self.sh_stride());
+        at().for_each(|i| sh.extend_from_slice(self.sh_of(i)));
         Self {
             means: at().map(|i| self.means[i]).collect(),
             log_scales: at().map(|i| self.log_scales[i]).collect(),
             rotations: at().map(|i| self.rotations[i]).collect(),
             opacity_logits: at().map(|i| self.opacity_logits[i]).collect(),
-            sh: at().flat_map(|i| self.sh_of(i).iter().copied()).collect(),
+            sh,
             sh_degree: self.sh_degree,
         }
     }

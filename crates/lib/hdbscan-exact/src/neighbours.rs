@@ -55,6 +55,8 @@ pub(crate) fn density_tree(points: &[f32], dim: usize, weights: &[u32], min_samp
             core[i as usize] = guess;
         }
     }
+    // In many dimensions a tree is most of the memory.
+    drop(first);
     KdTree::by_density(points, dim, &core)
 }
 

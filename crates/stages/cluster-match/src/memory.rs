@@ -1,15 +1,22 @@
 //! How much memory a run will take, said before it starts. docs/performance.md compares it with measured peaks.
 
 use crate::inputs::Inputs;
+use crate::options::Space;
 
-/// Peak memory in bytes.
-pub fn forecast(inputs: &Inputs) -> u64 {
+/// Peak memory in bytes of clustering in this space.
+pub fn forecast(inputs: &Inputs, space: Space) -> u64 {
     let (entries, samples) = (inputs.footprints.csr().1.len(), inputs.footprints.pixels.col.len());
     let (gaussians, kept, dim) = (inputs.geometry.gaussians.len(), inputs.features.kept.len(), inputs.features.dim);
-    // Fitted to 15 runs of 5,000 to 80,000 Gaussians and up to 12 million entries, within 5 %.
+    // Features as they are read and as they are clustered; free points are also parted from their duplicates and lie in a tree:
+    // coordinates, the leaves' blocks, boxes.
+    let value = match space {
+        Space::Graph => 123,
+        Space::Free => 240,
+    };
+    // Fitted to 15 runs of 5,000 to 80,000 Gaussians and up to 12 million entries, and to 18 with masks of all levels.
     12_800_000
-        + 19 * entries as u64 / 2
+        + 11 * entries as u64
         + 14 * samples as u64
         + 627 * gaussians as u64
-        + 123 * kept as u64 * dim as u64 / 10
+        + value * kept as u64 * dim as u64 / 10
 }

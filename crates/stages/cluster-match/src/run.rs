@@ -44,7 +44,10 @@ impl Program for Args {
         }
         let inputs = Inputs::read(a, stage)?;
         let settings = a.settings.for_gaussians(inputs.graph.kept.len());
-        stage.forecast(memory::forecast(&inputs), "drop small footprint entries: graph-precompute --cut 0.001")?;
+        stage.forecast(
+            memory::forecast(&inputs, settings.cluster),
+            "drop small footprint entries: graph-precompute --cut 0.001",
+        )?;
 
         let start = Instant::now();
         let clustering = group(&inputs.features, &inputs.graph, settings.cluster, &settings.hdbscan());

@@ -20,6 +20,8 @@ pub struct Sizes {
     pub pixels: u64,
     /// Bytes of the features that a report shows.
     pub features: u64,
+    /// Views that it shows.
+    pub shown: u64,
 }
 
 impl Sizes {
@@ -76,7 +78,8 @@ pub fn of_query(s: &Sizes) -> u64 {
 
 /// Peak in bytes of `report`.
 pub fn of_report(s: &Sizes) -> u64 {
-    PROGRAM + 5 * s.geometry / 2 + 4 * s.features + 65 * s.pixels
+    // Of each view shown photograph and render stay, and its figures as text, twice at the end.
+    PROGRAM + 5 * s.geometry / 2 + 4 * s.features + (65 + 32 * s.shown) * s.pixels
 }
 
 /// Peak in bytes of `scannet`.

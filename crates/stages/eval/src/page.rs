@@ -15,7 +15,7 @@ use self::metrics::{Metrics, QueryFigure};
 use self::runs::{Run, grouped};
 use crate::memory::{self, Sizes};
 use crate::options::ReportOptions;
-use crate::scene::{folder_name, load};
+use crate::scene::{VIEWS, folder_name, load};
 use gs_io::{Result, write_bytes, write_json};
 use gs_scene::dataset::{LoadOptions, Split};
 use report::html::Page;
@@ -30,6 +30,7 @@ pub(crate) fn run(o: &ReportOptions, parameters: Value, stage: &Stage) -> Result
         geometry: memory::bytes(&geometry(o)),
         features: memory::bytes(&o.run_dir.join("features.safetensors")),
         pixels: memory::pixels(&dataset.views),
+        shown: if o.views.views.is_empty() { VIEWS } else { o.views.views.len() } as u64,
         ..Sizes::default()
     };
     stage.forecast(memory::of_report(&sizes), "give a smaller --resolution")?;

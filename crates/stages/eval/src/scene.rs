@@ -135,7 +135,7 @@ pub fn find_view<'a>(dataset: &'a Dataset, name: &str) -> Result<&'a View> {
 }
 
 /// Views that are shown where none are named.
-const VIEWS: usize = 3;
+pub const VIEWS: usize = 3;
 
 /// The views of these names; without names a few of those that `fit`, or of all where none does, which lie apart.
 pub fn views_to_show<'a>(dataset: &'a Dataset, names: &[String], fit: impl Fn(&View) -> bool) -> Result<Vec<&'a View>> {

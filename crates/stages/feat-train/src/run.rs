@@ -32,7 +32,7 @@ impl Program for Args {
             .claim()?;
         let watched = Watched::new([&self.geometry]);
         let inputs = Inputs::read(&self)?;
-        let needed = memory::forecast(&inputs.footprints, &self.options);
+        let needed = memory::forecast(&inputs, &self.options);
         stage.forecast(needed, "drop small footprint entries: graph-precompute --cut 0.001")?;
 
         let made = match self.options.preset {

@@ -75,8 +75,9 @@ pub fn per_gaussian(sh_degree: u8, densifies: bool) -> u64 {
     let numbers = 4 * numbers(sh_degree);
     // Parameters, two moments and sums of gradients. Beside them in a step: the gradient with that of the projected centre, and
     // the drawn Gaussians. Densification, at the end of a step, copies the parameters and each moment in turn, and the
-    // allocator does not give all of it back: half as much again was measured.
-    let copy = if densifies { numbers * 3 / 2 } else { 0 };
+    // allocator does not give all of it back: twice as much was measured. Tiles are counted with the Gaussians of the start; a
+    // small one that comes later touches one or two.
+    let copy = if densifies { 2 * numbers + 2 * PER_TILE } else { 0 };
     (3 * numbers + 8) + (numbers + 16 + PER_DRAWN + copy)
 }
 

@@ -45,7 +45,9 @@ impl Logits {
         let [x0, y0, x1, y1] = bounds;
         let (left, top) = (x0.saturating_sub(1), y0.saturating_sub(1));
         let (right, bottom) = ((x1 + 1).min(grid.width), (y1 + 1).min(grid.height));
-        let values = (top..bottom).flat_map(|y| &row(y)[left..right]).copied().collect();
+        // No more room than that: there are thousands of masks.
+        let mut values = Vec::with_capacity((right - left) * bottom.saturating_sub(top));
+        (top..bottom).for_each(|y| values.extend_from_slice(&row(y)[left..right]));
         Self { bounds: [left, top, right, bottom], values }
     }
 

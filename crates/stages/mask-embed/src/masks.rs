@@ -111,7 +111,10 @@ fn forecast(args: &MasksArgs, sam: &Sam, views: &[View], stage: &Stage) -> Resul
     sam.encode(&nothing)?;
     let (side, pixels) = (args.choice.points_per_side as u64, photographs::largest(views));
     let map = if args.map_size == 0 { pixels } else { pixels.min((args.map_size * args.map_size * 3 / 4) as u64) };
-    let needed = peak_rss_bytes().unwrap_or(0) + 10_000 * (side * side * 3 / 4) + 6 * pixels + 30 * map;
+    // Of every third point of the grid or so that is asked three masks wait with their logits, 200 kB where one fills the
+    // picture; then the masks of a level in the map's size, a byte a pixel.
+    let waiting = 100_000 * (side * side * 3 / 4);
+    let needed = peak_rss_bytes().unwrap_or(0) + waiting + 6 * pixels + 60 * map;
     stage.forecast(needed, "give fewer --threads, or smaller photographs (--resolution) and maps (--map-size)")
 }
 

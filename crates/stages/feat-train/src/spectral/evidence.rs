@@ -29,6 +29,28 @@ pub fn collect(footprints: &Footprints, graph: &Graph, levels: &[Level]) -> Matr
     matrix(masks, rows, &Neighbours { k: graph.gaussian_k, items: &graph.gaussian_knn })
 }
 
+/// How many masks at `levels` each block of [`collect`]'s matrix will know, but for those that its neighbourhood adds.
+pub fn masks_of_blocks(footprints: &Footprints, graph: &Graph, levels: &[Level]) -> Vec<usize> {
+    let n = graph.kept.len();
+    let parts = patches(n, &Neighbours { k: graph.gaussian_k, items: &graph.gaussian_knn });
+    let mut block = vec![0u32; n];
+    for (b, part) in parts.iter().enumerate() {
+        part.iter().for_each(|&i| block[i as usize] = b as u32);
+    }
+    let used = |r: &usize| levels.iter().any(|&l| l as u32 == footprints.rows[*r].level);
+    // The last mask that a block was seen to know.
+    let (mut last, mut known) = (vec![usize::MAX; parts.len()], vec![0; parts.len()]);
+    for r in (0..footprints.rows.len()).filter(used) {
+        for &i in footprints.entries(r).0 {
+            let b = block[i as usize] as usize;
+            if last[b] != r {
+                (last[b], known[b]) = (r, known[b] + 1);
+            }
+        }
+    }
+    known
+}
+
 /// Spatial neighbours of every Gaussian, padded with itself.
 pub(super) struct Neighbours<'a> {
     pub(super) k: usize,

@@ -13,12 +13,24 @@ use rayon::prelude::*;
 pub const WIDTH: usize = 32;
 /// Some columns of a matrix with a row per mask, row after row.
 pub type Panel = Vec<[f32; WIDTH]>;
+/// CᵀC is formed where that takes at most this many entries for each entry of C, plus this many; else C is applied twice.
+pub const GRAM_ENTRIES: (usize, usize) = (4, 1 << 24);
 /// Entries of a square that are summed at a time.
 const SQUARE: usize = 1 << 23;
 /// Terms of a row's product before they go to the outer sum.
 const TERMS: usize = 128;
 /// Blocks worked on at a time.
 const BATCH: usize = 64;
+
+/// Bytes that forming CᵀC takes, from the masks of each block (`masks_of_blocks`) and the entries that they have in all.
+pub fn bytes(masks: &[usize], entries: u64) -> u64 {
+    let pairs: u64 = masks.iter().map(|&m| (m * m) as u64).sum();
+    // Of a block's pairs of masks three in ten share a Gaussian, counted once; above a number it is not formed.
+    let formed = (3 * pairs / 10).min(2 * GRAM_ENTRIES.0 as u64 * entries + GRAM_ENTRIES.1 as u64);
+    let square = masks.iter().map(|&m| m * m).max().unwrap_or(0).min(SQUARE) as u64;
+    let at_once = rayon::current_num_threads().min(masks.len()) as u64;
+    8 * formed + 4 * square * at_once
+}
 
 /// CᵀC by rows.
 #[derive(Debug, Clone, PartialEq)]
@@ -45,12 +57,21 @@ impl Upper {
         let mut square = vec![0.0f32; band * m];
         for first in (0..m).step_by(band) {
             let last = (first + band).min(m);
-            square.fill(0.0);
+            // New memory is zero already, and half of it is then never touched.
+            if first > 0 {
+                square.fill(0.0);
+            }
             add_products(block, first as u32..last as u32, &mut square);
+            let upper = |a: usize| {
+                square[(a - first) * m + a..(a - first + 1) * m].iter().enumerate().filter(|(_, v)| **v != 0.0)
+            };
+            // No more room than they need: the products of all blocks are most of the memory.
+            let count = (first..last).map(|a| upper(a).count()).sum();
+            out.other.reserve_exact(count);
+            out.value.reserve_exact(count);
             for a in first..last {
-                let row = &square[(a - first) * m..(a - first + 1) * m];
-                for (b, &v) in row.iter().enumerate().skip(a).filter(|(_, v)| **v != 0.0) {
-                    out.other.push(b as u32);
+                for (b, &v) in upper(a) {
+                    out.other.push((a + b) as u32);
                     out.value.push(v);
                 }
                 out.start.push(out.other.len());

@@ -12,7 +12,7 @@
 //! eigenvectors come from block subspace iteration, filtered by Chebyshev polynomials (Zhou, Saad, Tiago and Chelikowsky
 //! 2006), with Rayleigh-Ritz. One product with C itself then gives all Gaussians.
 
-use super::gram::{Gram, Panel, WIDTH};
+use super::gram::{GRAM_ENTRIES, Gram, Panel, WIDTH};
 use super::linalg::{Columns, cross, multiply, orthonormalise, symmetric_eigen};
 use super::sparse::Matrix;
 use crate::random::normal;
@@ -38,8 +38,6 @@ const MOST_GAIN: f64 = 1e4;
 const MOST_DEGREE: f64 = 24.0;
 /// Exponent p of the step that scales vectors at the cutoff: steep, but smooth.
 const POWER: f64 = 16.0;
-/// CᵀC is formed where that takes at most this many entries for each entry of C, plus this many; else C is applied twice.
-const GRAM_ENTRIES: (usize, usize) = (4, 1 << 24);
 
 /// How many vectors, and how they are scaled.
 #[derive(Debug, Clone, Copy, PartialEq)]
