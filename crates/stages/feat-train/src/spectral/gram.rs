@@ -29,7 +29,8 @@ pub fn bytes(masks: &[usize], entries: u64) -> u64 {
     let formed = (3 * pairs / 10).min(2 * GRAM_ENTRIES.0 as u64 * entries + GRAM_ENTRIES.1 as u64);
     let square = masks.iter().map(|&m| m * m).max().unwrap_or(0).min(SQUARE) as u64;
     let at_once = rayon::current_num_threads().min(masks.len()) as u64;
-    8 * formed + 4 * square * at_once
+    // The rows of sums, a third as many entries, join them before they go.
+    11 * formed + 4 * square * at_once
 }
 
 /// CᵀC by rows.
