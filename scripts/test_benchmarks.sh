@@ -95,6 +95,14 @@ miou=$(grep -F 'ours, mean' "$work/scan/table.md" | cut -d'|' -f3 | tr -d ' ')
 awk "BEGIN { exit !($miou > 15) }" || fail "the scans have an mIoU of $miou"
 pass "make scannet, extracted and converted, ends in the paper's table (19 classes: mIoU $miou)"
 
+# Without a text the instances alone are scored.
+check SET=scannet DATA="$scannet" SCENES=scene0062_00 TEXTS= || { cat "$work/check.log"; fail "ScanNet without texts is refused"; }
+grep -q 'only of instances without classes' "$work/check.log" || fail "no word of what is not scored"
+benchmark SET=scannet DATA="$scannet" OUT="$work/classless" SCENES=scene0062_00 GEOMETRY="$work/scan/scene0062_00/geometry.ply" \
+  GRAPH_ARGS='--holdout 0 --min-mask-pixels 10' all > "$work/scan.log" 2>&1 || { cat "$work/scan.log"; fail "make scannet without texts"; }
+grep -q '^| Scan | instance mIoU' "$work/classless/table.md" && ! grep -q 'CAGS' "$work/classless/table.md" || fail "no table of instances"
+pass "make scannet without texts ends in a table of instances without classes"
+
 scripts/reproduce_check.sh "$work/scan/scene0062_00" "$work/made-again" > "$work/check.log" 2>&1 || { cat "$work/check.log"; fail "reproduce-check"; }
 grep -q '^[1-9][0-9]* files are the same bytes, 0 differ' "$work/check.log" || { cat "$work/check.log"; fail "no file was compared"; }
 code=0
