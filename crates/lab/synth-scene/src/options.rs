@@ -52,14 +52,14 @@ pub struct Args {
     /// Points of the sparse cloud, or vertices of a scan, 1 to 10000000 [tiny 1500, demo 9000, large 40000]
     #[arg(long, value_name = "COUNT", value_parser = within(1usize..=10_000_000))]
     points: Option<usize>,
-    /// Defaults of the four options of faults below, and the faults of the features
+    /// Defaults of the six options of faults below, and the faults of the features
     #[arg(long, value_enum, default_value_t = Corruption::Mild)]
     corruption: Corruption,
     /// Probability that a mask level of a view shows a thing at another granularity: split into parts, or merged with
-    /// a neighbour [exact 0, mild 0.3, sam 0.5]
+    /// a neighbour [exact 0, mild 0.3, sam 0.1]
     #[arg(long, value_name = "PROBABILITY", value_parser = within(0.0..=1.0))]
     granularity_p: Option<f64>,
-    /// Most pixels that a mask grows or shrinks by, 0 to 16 [exact 0, mild 1, sam 1]
+    /// Most pixels that a mask grows or shrinks by, 0 to 16 [exact 0, mild 1, sam 2]
     #[arg(long, value_name = "PIXELS", value_parser = within(0u32..=16))]
     boundary_noise: Option<u32>,
     /// Probability that a mask is missing [exact 0, mild 0.05, sam 0.05]
@@ -68,6 +68,14 @@ pub struct Args {
     /// Masks that show no thing, for each mask of a level, 0 to 1 [exact 0, mild 0, sam 0.15]
     #[arg(long, value_name = "SHARE", value_parser = within(0.0..=1.0))]
     spurious: Option<f64>,
+    /// Probability that what lies apart in an image, with something in front, has masks of its own at level small, and
+    /// less often at the others [exact 0, mild 0, sam 1]
+    #[arg(long, value_name = "PROBABILITY", value_parser = within(0.0..=1.0))]
+    torn: Option<f64>,
+    /// Probability that of two objects that touch in an image one is in the other's mask at level large, where it covers
+    /// 1 % of the image; background and other levels follow as with a real model [exact 0, mild 0, sam 0.35]
+    #[arg(long, value_name = "PROBABILITY", value_parser = within(0.0..=1.0))]
+    swallow: Option<f64>,
     /// Noise of the poses in sparse/0, 0 to 10: standard deviation in degrees about each axis, and in centimetres along
     /// each axis. Photographs and truth keep the exact poses, which truth/sparse then holds
     #[arg(long, value_name = "SIZE", default_value_t = 0.0, value_parser = within(0.0..=10.0))]
@@ -97,7 +105,7 @@ pub enum Corruption {
     Exact,
     /// A few faults of granularity, edges a pixel off, some masks missing.
     Mild,
-    /// As inconsistent from view to view as SAM's masks of a real desk.
+    /// As MobileSAM's masks of ray-traced rooms: torn, swallowing, and so in most views alike.
     Sam,
 }
 
@@ -110,11 +118,14 @@ const LABEL_EVERY: usize = 4;
 impl Corruption {
     /// The faults of masks and of features.
     fn faults(self) -> (Faults, Speech) {
-        let mild = Faults { granularity: 0.3, boundary: 1, missing: 0.05, spurious: 0.0 };
+        let mild = Faults { granularity: 0.3, boundary: 1, missing: 0.05, ..Faults::default() };
         match self {
             Self::Exact => (Faults::default(), Speech::default()),
             Self::Mild => (mild, Speech::default()),
-            Self::Sam => (Faults { granularity: 0.5, spurious: 0.15, ..mild }, Speech { leaking: 0.1, noise: 0.5 }),
+            Self::Sam => {
+                let masks = Faults { granularity: 0.1, boundary: 2, spurious: 0.15, torn: 1.0, swallow: 0.35, ..mild };
+                (masks, Speech { leaking: 0.1, noise: 0.5 })
+            }
         }
     }
 }
@@ -197,6 +208,8 @@ impl Args {
                 boundary: self.boundary_noise.unwrap_or(faults.boundary),
                 missing: self.missing.unwrap_or(faults.missing),
                 spurious: self.spurious.unwrap_or(faults.spurious),
+                torn: self.torn.unwrap_or(faults.torn),
+                swallow: self.swallow.unwrap_or(faults.swallow),
             },
             speech: self.features.then_some(speech),
             pose_noise: self.pose_noise,

@@ -6,6 +6,7 @@ pub mod language;
 pub mod masks;
 pub mod points;
 pub mod polygon;
+pub(crate) mod regions;
 pub mod scannet;
 
 use gs_io::{Error, Result, write_bytes};

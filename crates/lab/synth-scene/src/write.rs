@@ -8,6 +8,7 @@ use crate::scene::{Family, Scene, cameras, families};
 use crate::truth::benchmark::{FOLDERS, Layout};
 use crate::truth::language::Language;
 use crate::truth::points::Collector;
+use crate::truth::regions::Pairs;
 use crate::truth::{label, masks, scannet, write_json};
 use artifacts::{MaskTruth, TrueObject, TruePart, TruePoints, TrueScene, features_path, maps_path};
 use gs_io::{IoContext, Outputs, Result, npy};
@@ -34,6 +35,7 @@ const VERTICES: u64 = 4;
 const FIRST_VIEW: u64 = 16;
 const FIRST_SPEECH: u64 = 1 << 32;
 const FIRST_PATCHES: u64 = 2 << 32;
+const FIRST_PAIRS: u64 = 1 << 48;
 
 impl Program for Args {
     const NAME: &'static str = "synth-scene";
@@ -134,7 +136,8 @@ impl<'a> Work<'a> {
             let frame = see(v, &stem, camera)?;
             let v = v as u64;
             let (rng, patches) = (&mut options.rng(FIRST_VIEW + v), &mut options.rng(FIRST_PATCHES + v));
-            let (maps, shown) = masks::segment(scene, &frame, &options.faults, rng, patches);
+            let pairs = Pairs { rng: options.rng(0), first: FIRST_PAIRS, view: v };
+            let (maps, shown) = masks::segment(scene, &frame, &options.faults, rng, patches, &pairs);
             maps.write(maps_path(folder, &stem))?;
             if let (Some(language), Some(speech)) = (language, &options.speech) {
                 let features = language.encode(&frame, &maps, speech, &mut options.rng(FIRST_SPEECH + v));

@@ -303,6 +303,8 @@ fn each_fault_changes_its_own_files_and_nothing_else() {
         ("--boundary-noise", "2", &edges),
         ("--missing", "0.5", &maps),
         ("--spurious", "0.5", &maps),
+        ("--torn", "1", &maps),
+        ("--swallow", "1", &maps),
         ("--pose-noise", "0.5", &poses),
     ] {
         let changed = with(option, &[option, value]);
@@ -330,13 +332,15 @@ fn a_corruption_sets_every_fault_and_an_option_replaces_one() {
         TrueScene::read(out.join("truth/scene.json")).unwrap().parameters
     };
     let sam = parameters("sam", &["--corruption", "sam", "--features", "--missing", "0.2"]);
-    for (name, value) in [("granularity_p", 0.5), ("boundary_noise", 1.0), ("missing", 0.2), ("spurious", 0.15)] {
+    let values = [("granularity_p", 0.1), ("boundary_noise", 2.0), ("missing", 0.2), ("spurious", 0.15)];
+    for (name, value) in values.into_iter().chain([("torn", 1.0), ("swallow", 0.35)]) {
         assert_eq!(sam[name].as_f64(), Some(value), "{name}");
     }
     assert_eq!(sam["features"], serde_json::json!({"leaking": 0.1, "noise": 0.5}));
     let mild = parameters("mild", &[]);
     assert_eq!((mild["granularity_p"].as_f64(), mild["spurious"].as_f64()), (Some(0.3), Some(0.0)));
     assert!(mild["features"].is_null());
+    assert!(mild.get("torn").is_none() && mild.get("swallow").is_none(), "as before there were such faults");
 }
 
 #[test]

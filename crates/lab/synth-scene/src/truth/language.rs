@@ -167,6 +167,7 @@ mod tests {
     use super::*;
     use crate::testing::example;
     use crate::truth::masks::{self, Faults};
+    use crate::truth::regions::Pairs;
     use artifacts::MaskTruth;
 
     fn dot(a: &[f64], b: &[f64]) -> f64 {
@@ -176,7 +177,8 @@ mod tests {
     fn exact() -> (MaskMaps, Vec<MaskTruth>) {
         let (scene, frame) = example();
         let mut rng = ChaCha8Rng::seed_from_u64(1);
-        masks::segment(scene, frame, &Faults::default(), &mut rng, &mut ChaCha8Rng::seed_from_u64(2))
+        let pairs = Pairs { rng: rng.clone(), first: 0, view: 0 };
+        masks::segment(scene, frame, &Faults::default(), &mut rng, &mut ChaCha8Rng::seed_from_u64(2), &pairs)
     }
 
     fn encode(maps: &MaskMaps, leaking: f64, noise: f64) -> Vec<Vec<f64>> {

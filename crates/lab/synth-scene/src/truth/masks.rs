@@ -1,17 +1,20 @@
 //! Id maps as a segmentation model would give them: masks of things at four levels, with the faults of real ones.
 //!
 //! Without faults, levels `default` and `large` show every thing whole, `medium` shows parts with same-named parts of
-//! a thing together ("cookies"), and `small` shows every part by itself. Four faults, each with its own option:
+//! a thing together ("cookies"), and `small` shows every part by itself. Six faults, each with its own option:
 //! * granularity: with probability p a thing is shown otherwise in a view and level. On `default` and `large` it is
 //!   then, with equal chance, split into its parts or merged with its nearest free neighbour on the same ground; on
 //!   `small` and `medium` it is shown whole, or two of its parts become one. A thing without such a choice (one part,
 //!   no neighbour) stays as it is, and background is never merged;
+//! * torn masks: what lies apart in the image has masks of its own;
+//! * swallowed masks: what touches another mask is in it, most often the same pairs ([`regions`]);
 //! * boundaries: each mask shrinks or grows by up to so many pixels; masks painted later win;
 //! * missing masks;
 //! * spurious masks: patches that are no thing, such as a highlight, a shadow or half of a wall.
 
 use crate::render::Frame;
 use crate::scene::Scene;
+use crate::truth::regions::{Pairs, Regions, neighbours};
 use artifacts::{LEVELS, Level, MaskMaps, MaskTruth};
 use glam::DVec2;
 use rand::Rng;
@@ -33,6 +36,18 @@ pub struct Faults {
     pub missing: f64,
     /// Spurious masks per mask of a level, 0 to 1.
     pub spurious: f64,
+    /// Probability that what lies apart in the image has masks of its own at level `small`, 0 to 1.
+    #[serde(skip_serializing_if = "none")]
+    pub torn: f64,
+    /// Probability that of two objects that touch one is swallowed at level `large`, where it covers a hundredth of the
+    /// image, 0 to 1.
+    #[serde(skip_serializing_if = "none")]
+    pub swallow: f64,
+}
+
+/// Scenes without a fault are written as if there were none of its kind.
+fn none(p: &f64) -> bool {
+    *p == 0.0
 }
 
 /// Masks of fewer pixels are not given, as segmentation models drop them.
@@ -45,22 +60,19 @@ const PATCH: [f64; 2] = [0.0008, 0.02];
 /// A spurious mask is a patch of the things that own at least this share of it.
 const PATCH_OF: f64 = 0.1;
 
-/// A mask before it is painted: the parts shown, whose pixels make it, and what it shows.
-type Candidate = (Vec<u32>, MaskTruth);
-/// Parts that a mask shows, and what kind of mask it is.
-type Parts = (Vec<u32>, &'static str);
 const WHOLE: &str = "whole";
 const PART: &str = "part";
 const MERGED: &str = "merged";
 
 /// Id maps of one view and what each id shows, in the order of ids. Every id owns pixels. `patches` draws the spurious
-/// masks, so that they do not change the others.
+/// masks and `pairs` what is torn and swallowed, so that they do not change the others.
 pub(crate) fn segment(
     scene: &Scene,
     frame: &Frame,
     faults: &Faults,
     rng: &mut ChaCha8Rng,
     patches: &mut ChaCha8Rng,
+    pairs: &Pairs,
 ) -> (MaskMaps, Vec<MaskTruth>) {
     let mut maps = MaskMaps { width: frame.width, height: frame.height, ids: Vec::new() };
     let mut truth = Vec::new();
@@ -69,43 +81,47 @@ pub(crate) fn segment(
         visible[p as usize] += 1;
     }
     for level in Level::ALL {
-        let mut candidates = Vec::new();
-        for (parts, kind) in shown(scene, &visible, level, faults.granularity, rng) {
-            let pixels: usize = parts.iter().map(|&p| visible[p as usize]).sum();
+        let mut regions = Regions::new(scene, frame, shown(scene, &visible, level, faults.granularity, rng));
+        if faults.torn > 0.0 {
+            regions.tear(frame, level, faults.torn, pairs);
+        }
+        if faults.swallow > 0.0 {
+            regions.swallow(scene, frame, level, faults.swallow, pairs);
+        }
+        let areas = regions.areas();
+        // A level of a real file is never empty: the largest mask stays.
+        let largest = (0..areas.len()).max_by_key(|&i| (areas[i], i));
+        let mut kept = Vec::new();
+        let mut position = vec![-1; areas.len()];
+        for (i, parts) in regions.parts.iter().enumerate() {
             // Draw for every mask, so that one mask's fate does not change the others'.
             let lost = rng.random::<f64>() < faults.missing;
-            if pixels >= SMALLEST {
-                candidates.push(((parts.clone(), describe(scene, &parts, level, kind)), lost, pixels));
+            if areas[i] >= SMALLEST && (!lost || Some(i) == largest) {
+                position[i] = kept.len() as i32;
+                kept.push(describe(scene, &visible, parts, areas[i], level));
             }
         }
-        // A level of a real file is never empty: the largest mask stays.
-        let largest = (0..candidates.len()).max_by_key(|&i| (candidates[i].2, i));
-        let mut kept: Vec<Candidate> = candidates
-            .into_iter()
-            .enumerate()
-            .filter(|(i, (_, lost, _))| !lost || Some(*i) == largest)
-            .map(|(_, (c, _, _))| c)
-            .collect();
-        let mut painted = paint(frame, &kept, scene.parts.len(), faults.boundary, rng);
+        regions.map.iter_mut().filter(|i| **i >= 0).for_each(|i| *i = position[*i as usize]);
+        let mut painted = paint(frame, regions.map, kept.len(), faults.boundary, rng);
         for _ in 0..kept.len() {
             if patches.random::<f64>() < faults.spurious {
                 let pixels = patch(frame, patches);
                 let things = pixels.iter().map(|&at| frame.thing[at]).filter(|&t| t >= 0);
                 if pixels.len() >= SMALLEST {
-                    kept.push((Vec::new(), describe_patch(scene, things, level)));
+                    kept.push(describe_patch(scene, things, level));
                     pixels.into_iter().for_each(|at| painted[at] = kept.len() as i32 - 1);
                 }
             }
         }
         let owned = compact(&painted, kept.len(), truth.len() as i32, &mut maps.ids);
-        truth.extend(kept.into_iter().zip(owned).filter(|(_, owned)| *owned).map(|((_, t), _)| t));
+        truth.extend(kept.into_iter().zip(owned).filter(|(_, owned)| *owned).map(|(t, _)| t));
     }
     debug_assert_eq!(maps.ids.len(), LEVELS * frame.width * frame.height);
     (maps, truth)
 }
 
 /// The masks of a level as sets of parts. Only visible parts count.
-fn shown(scene: &Scene, visible: &[usize], level: Level, p: f64, rng: &mut ChaCha8Rng) -> Vec<Parts> {
+fn shown(scene: &Scene, visible: &[usize], level: Level, p: f64, rng: &mut ChaCha8Rng) -> Vec<Vec<u32>> {
     let parts_of =
         |t: usize| -> Vec<u32> { scene.things[t].parts.clone().filter(|&p| visible[p as usize] > 0).collect() };
     let coarse = matches!(level, Level::Default | Level::Large);
@@ -122,7 +138,7 @@ fn shown(scene: &Scene, visible: &[usize], level: Level, p: f64, rng: &mut ChaCh
             if let Some(other) = nearest(scene, t, &taken) {
                 (taken[t], taken[other]) = (true, true);
                 let (a, b) = (t.min(other), t.max(other));
-                out.push(([parts_of(a), parts_of(b)].concat(), MERGED));
+                out.push([parts_of(a), parts_of(b)].concat());
             }
         }
     }
@@ -144,8 +160,7 @@ fn shown(scene: &Scene, visible: &[usize], level: Level, p: f64, rng: &mut ChaCh
             let joined = masks.remove(at + 1);
             masks[at].extend(joined);
         }
-        let kind = if masks.len() == 1 { WHOLE } else { PART };
-        out.extend(masks.into_iter().map(|m| (m, kind)));
+        out.extend(masks);
     }
     out
 }
@@ -167,10 +182,17 @@ fn nearest(scene: &Scene, t: usize, taken: &[bool]) -> Option<usize> {
         .map(|(_, o)| o)
 }
 
-fn describe(scene: &Scene, parts: &[u32], level: Level, kind: &str) -> MaskTruth {
+/// What a mask of these parts and so many pixels shows, of the `visible` pixels of each part.
+fn describe(scene: &Scene, visible: &[usize], parts: &[u32], pixels: usize, level: Level) -> MaskTruth {
     let mut instances: Vec<u32> = parts.iter().map(|&p| scene.parts[p as usize].thing).collect();
     instances.sort_unstable();
     instances.dedup();
+    let all = |t: &u32| scene.things[*t as usize].parts.clone().map(|p| visible[p as usize]).sum::<usize>();
+    let kind = match &instances[..] {
+        [only] if pixels < all(only) => PART,
+        [_] => WHOLE,
+        _ => MERGED,
+    };
     let name = |t: &u32| scene.things[*t as usize].name.clone();
     let caption = match kind {
         WHOLE | MERGED => instances.iter().map(name).collect::<Vec<_>>().join(" and "),
@@ -235,18 +257,13 @@ fn describe_patch(scene: &Scene, things: impl Iterator<Item = i32>, level: Level
     MaskTruth { level: level as u32, instances, part: None, kind: "spurious".into(), caption }
 }
 
-/// Paints the masks in their order, each grown or shrunk; returns positions in `masks`, -1 for none.
-fn paint(frame: &Frame, masks: &[Candidate], parts: usize, boundary: u32, rng: &mut ChaCha8Rng) -> Vec<i32> {
-    let mut owner = vec![-1i32; parts];
-    for (i, (shown, _)) in masks.iter().enumerate() {
-        shown.iter().for_each(|&p| owner[p as usize] = i as i32);
-    }
-    let exact: Vec<i32> = frame.part.iter().map(|&p| if p < 0 { -1 } else { owner[p as usize] }).collect();
+/// Paints so many masks in their order, each grown or shrunk; `exact` and the result hold their numbers, -1 for none.
+fn paint(frame: &Frame, exact: Vec<i32>, masks: usize, boundary: u32, rng: &mut ChaCha8Rng) -> Vec<i32> {
     if boundary == 0 {
         return exact;
     }
     let mut out = vec![-1; exact.len()];
-    let mut pixels: Vec<Vec<usize>> = vec![Vec::new(); masks.len()];
+    let mut pixels: Vec<Vec<usize>> = vec![Vec::new(); masks];
     for (at, &id) in exact.iter().enumerate().filter(|(_, id)| **id >= 0) {
         pixels[id as usize].push(at);
     }
@@ -270,18 +287,6 @@ fn paint(frame: &Frame, masks: &[Candidate], parts: usize, boundary: u32, rng: &
         }
     }
     out
-}
-
-fn neighbours(at: usize, width: usize, height: usize) -> impl Iterator<Item = usize> {
-    let (x, y) = (at % width, at / width);
-    [
-        (x > 0).then(|| at - 1),
-        (x + 1 < width).then(|| at + 1),
-        (y > 0).then(|| at - width),
-        (y + 1 < height).then(|| at + width),
-    ]
-    .into_iter()
-    .flatten()
 }
 
 /// Pixels all of whose four neighbours are in the mask too; beyond the image counts as within. `mask` ascends.
@@ -321,10 +326,15 @@ mod tests {
     use proptest::prelude::*;
     use rand::SeedableRng;
 
-    const EXACT: Faults = Faults { granularity: 0.0, boundary: 0, missing: 0.0, spurious: 0.0 };
+    const EXACT: Faults =
+        Faults { granularity: 0.0, boundary: 0, missing: 0.0, spurious: 0.0, torn: 0.0, swallow: 0.0 };
 
     fn rng() -> ChaCha8Rng {
         ChaCha8Rng::seed_from_u64(11)
+    }
+
+    fn pairs() -> Pairs {
+        Pairs { rng: rng(), first: 0, view: 0 }
     }
 
     /// Ids count on from level to level, each owns pixels and has its truth at its position.
@@ -342,7 +352,7 @@ mod tests {
     #[test]
     fn without_faults_large_masks_are_things_and_small_masks_are_parts() {
         let (scene, frame) = example();
-        let (maps, truth) = segment(scene, frame, &EXACT, &mut rng(), &mut rng());
+        let (maps, truth) = segment(scene, frame, &EXACT, &mut rng(), &mut rng(), &pairs());
         check_ids(&maps, &truth);
         for (at, &thing) in frame.thing.iter().enumerate() {
             for level in [Level::Default, Level::Large] {
@@ -365,7 +375,8 @@ mod tests {
     #[test]
     fn granularity_alone_changes_what_masks_show_but_no_boundary_of_parts() {
         let (scene, frame) = example();
-        let (maps, truth) = segment(scene, frame, &Faults { granularity: 1.0, ..EXACT }, &mut rng(), &mut rng());
+        let (maps, truth) =
+            segment(scene, frame, &Faults { granularity: 1.0, ..EXACT }, &mut rng(), &mut rng(), &pairs());
         check_ids(&maps, &truth);
         let large: Vec<&MaskTruth> = truth.iter().filter(|t| t.level == 3).collect();
         assert!(large.iter().any(|t| t.kind == "merged" && t.instances.len() == 2 && t.caption.contains(" and ")));
@@ -384,8 +395,8 @@ mod tests {
     #[test]
     fn boundary_alone_moves_edges_by_a_few_pixels() {
         let (scene, frame) = example();
-        let (exact, _) = segment(scene, frame, &EXACT, &mut rng(), &mut rng());
-        let (moved, truth) = segment(scene, frame, &Faults { boundary: 2, ..EXACT }, &mut rng(), &mut rng());
+        let (exact, _) = segment(scene, frame, &EXACT, &mut rng(), &mut rng(), &pairs());
+        let (moved, truth) = segment(scene, frame, &Faults { boundary: 2, ..EXACT }, &mut rng(), &mut rng(), &pairs());
         check_ids(&moved, &truth);
         let changed = exact.ids.iter().zip(&moved.ids).filter(|(a, b)| a != b).count();
         assert!(changed > 100 && changed < exact.ids.len() / 5, "{changed} of {}", exact.ids.len());
@@ -400,12 +411,12 @@ mod tests {
     #[test]
     fn missing_alone_drops_whole_masks() {
         let (scene, frame) = example();
-        let (_, all) = segment(scene, frame, &EXACT, &mut rng(), &mut rng());
-        let (maps, half) = segment(scene, frame, &Faults { missing: 0.5, ..EXACT }, &mut rng(), &mut rng());
+        let (_, all) = segment(scene, frame, &EXACT, &mut rng(), &mut rng(), &pairs());
+        let (maps, half) = segment(scene, frame, &Faults { missing: 0.5, ..EXACT }, &mut rng(), &mut rng(), &pairs());
         check_ids(&maps, &half);
         assert!(half.len() > all.len() / 4 && half.len() < 3 * all.len() / 4, "{} of {}", half.len(), all.len());
         assert!(half.iter().all(|t| all.contains(t)));
-        let (maps, none) = segment(scene, frame, &Faults { missing: 1.0, ..EXACT }, &mut rng(), &mut rng());
+        let (maps, none) = segment(scene, frame, &Faults { missing: 1.0, ..EXACT }, &mut rng(), &mut rng(), &pairs());
         check_ids(&maps, &none);
         assert_eq!(none.len(), 4, "the largest of each level stays");
     }
@@ -413,7 +424,7 @@ mod tests {
     #[test]
     fn spurious_alone_paints_patches_over_untouched_masks() {
         let (scene, frame) = example();
-        let with = |spurious| segment(scene, frame, &Faults { spurious, ..EXACT }, &mut rng(), &mut rng());
+        let with = |spurious| segment(scene, frame, &Faults { spurious, ..EXACT }, &mut rng(), &mut rng(), &pairs());
         let (exact, all) = with(0.0);
         for p in [0.3, 1.0] {
             let (maps, truth) = with(p);
@@ -434,17 +445,60 @@ mod tests {
         }
     }
 
+    #[test]
+    fn torn_alone_gives_connected_masks_of_the_same_things() {
+        let (scene, frame) = example();
+        let with = |torn| segment(scene, frame, &Faults { torn, ..EXACT }, &mut rng(), &mut rng(), &pairs());
+        let ((exact, all), (maps, truth)) = (with(0.0), with(1.0));
+        check_ids(&maps, &truth);
+        assert!(truth.len() > all.len());
+        let small = |m: &MaskMaps| m.level(Level::Small).to_vec();
+        let (whole, torn) = (small(&exact), small(&maps));
+        let mut from = BTreeMap::new();
+        for (&old, &new) in whole.iter().zip(&torn) {
+            assert_eq!(old < 0, new < 0);
+            assert_eq!(*from.entry(new).or_insert(old), old, "a piece is of one mask");
+        }
+    }
+
+    #[test]
+    fn swallow_alone_joins_masks_that_touch_and_most_often_the_same() {
+        let (scene, frame) = example();
+        let shown = |swallow, view| {
+            let pairs = Pairs { view, ..pairs() };
+            segment(scene, frame, &Faults { swallow, ..EXACT }, &mut rng(), &mut rng(), &pairs)
+        };
+        let (exact, all) = shown(0.0, 0);
+        let pair_of = |view| -> Vec<Vec<u32>> {
+            let (maps, truth) = shown(0.35, view);
+            check_ids(&maps, &truth);
+            assert!(truth.len() < all.len());
+            for level in Level::ALL {
+                let mut into = BTreeMap::new();
+                for (&old, &new) in exact.level(level).iter().zip(maps.level(level)).filter(|(old, _)| **old >= 0) {
+                    assert_eq!(*into.entry(old).or_insert(new), new, "a mask is swallowed whole");
+                }
+            }
+            truth.into_iter().filter(|t| t.level == 3 && t.kind == "merged").map(|t| t.instances).collect()
+        };
+        let first = pair_of(0);
+        assert!(!first.is_empty());
+        let again = (1..=10).filter(|&view| first.iter().any(|pair| pair_of(view).contains(pair))).count();
+        assert!(again >= 5, "{again} of 10 views swallow as the first does");
+    }
+
     proptest! {
         #![proptest_config(ProptestConfig::with_cases(24))]
         /// Whatever the faults, ids are dense, each has pixels and its truth, and what a mask says it shows is in it.
         #[test]
         fn any_faults_together_give_sound_maps(
-            granularity in 0.0..=1.0, boundary in 0u32..4, missing in 0.0..=1.0, spurious in 0.0..=1.0, seed: u64,
+            granularity in 0.0..=1.0, boundary in 0u32..4, missing in 0.0..=1.0, spurious in 0.0..=1.0,
+            torn in 0.0..=1.0, swallow in 0.0..=1.0, seed: u64,
         ) {
             let (scene, frame) = example();
-            let faults = Faults { granularity, boundary, missing, spurious };
+            let faults = Faults { granularity, boundary, missing, spurious, torn, swallow };
             let (a, b) = (&mut ChaCha8Rng::seed_from_u64(seed), &mut ChaCha8Rng::seed_from_u64(!seed));
-            let (maps, truth) = segment(scene, frame, &faults, a, b);
+            let (maps, truth) = segment(scene, frame, &faults, a, b, &Pairs { rng: ChaCha8Rng::seed_from_u64(seed), ..pairs() });
             check_ids(&maps, &truth);
             for t in &truth {
                 prop_assert!(!t.instances.is_empty() && t.instances.iter().all(|&i| (i as usize) < scene.things.len()));
