@@ -106,7 +106,7 @@ impl Regions {
             if pieces.len() < 2 || pairs.draw(first, first).1 >= p * APART[level as usize] {
                 continue;
             }
-            pieces.sort_by_key(|piece| piece.len());
+            pieces.sort_by_key(Vec::len);
             pieces.pop();
             for piece in pieces {
                 piece.iter().for_each(|&at| self.map[at] = self.parts.len() as i32);
