@@ -3,7 +3,7 @@
 use crate::chain::{Programs, STAGES};
 use crate::page::Results;
 use crate::plan::Plan;
-use crate::{cells, compare, growth, page, tables, tradeoff};
+use crate::{ceilings, cells, compare, growth, page, tables, tradeoff};
 use gs_io::{Claim, Error, Result, create_dir, write_bytes, write_json};
 use serde::Serialize;
 use serde_json::json;
@@ -24,7 +24,7 @@ pub struct Args {
     /// a change of the programs
     #[arg(long, global = true, value_name = "DIR", default_value = "out/bench/work")]
     work: PathBuf,
-    /// Output file, JSON; the same is written beside it as .md and .html (compare writes no .html)
+    /// Output file, JSON; the same is written beside it as .md and .html (compare writes no .html, ceilings writes instances)
     #[arg(long, global = true, value_name = "FILE", default_value = "out/bench/report.json")]
     out: PathBuf,
     /// What run does: names of tables, knobs and axes, with commas between; what stress does: parts of names of scenes [default: all]
@@ -51,6 +51,9 @@ enum Command {
     },
     /// Run every stage on hostile scenes and with hostile settings, and check the results
     Stress,
+    /// What instances of a synthetic scene can reach at most: true labels on the Gaussians, and masks grouped by the truth.
+    /// Instances for eval score, and how pure the masks are
+    Ceilings(ceilings::Inputs),
 }
 
 impl stage::Program for Args {
@@ -66,12 +69,12 @@ impl stage::Program for Args {
 
     fn run(self, stage: &Stage) -> Result<()> {
         // Timings are of one thread unless more are asked for: fewer other programs get between.
-        let threads = self.common.threads.max(1);
-        let programs = programs(&self.bin, threads)?;
+        let programs = || programs(&self.bin, self.common.threads.max(1));
         match &self.command {
-            Command::Run { plan } => self.experiments(&Plan::read(plan)?.only(&self.only)?, &programs, stage),
-            Command::Compare { plan, base } => self.comparison(&Plan::read(plan)?, base, &programs, stage),
-            Command::Stress => self.stress(&programs, stage),
+            Command::Run { plan } => self.experiments(&Plan::read(plan)?.only(&self.only)?, &programs()?, stage),
+            Command::Compare { plan, base } => self.comparison(&Plan::read(plan)?, base, &programs()?, stage),
+            Command::Stress => self.stress(&programs()?, stage),
+            Command::Ceilings(inputs) => ceilings::run(inputs, &self.out, stage),
         }
     }
 }

@@ -1,6 +1,7 @@
 //! Experiments by a [`plan`]: tables of scores, run time against error, growth; two builds beside each other; numerical
 //! stress. All through the stages' binaries, as people run them.
 
+mod ceilings;
 mod cells;
 mod chain;
 mod cli;

@@ -18,3 +18,6 @@ pub mod options;
 mod outputs;
 mod run;
 mod vote;
+
+pub use describe::describe;
+pub use join::mask_weights;

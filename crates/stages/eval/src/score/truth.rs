@@ -2,11 +2,12 @@
 
 use super::metrics::{self, InstanceScore};
 use super::scores::{GaussianScores, Scores, ThingScore};
-use crate::nearest::nearest_of;
+use crate::nearest::{nearest, nearest_of};
 use crate::protocols::instances::{MIN_POINTS, average_precision};
 use crate::scene::{LabelledScene, MIN_OPACITY};
 use artifacts::{TruePoints, TrueScene};
 use gs_io::Result;
+use gs_scene::Geometry;
 use std::path::Path;
 
 /// Scores the instances against `truth/points.safetensors` of the scene: each surface point takes the label of the
@@ -55,6 +56,30 @@ pub fn score_instances(scene: &LabelledScene, root: &Path, scores: &mut Scores) 
     Ok(())
 }
 
+/// Labels of Gaussians that suit [`score_instances`] best: each takes the thing of most of the surface points whose nearest
+/// Gaussian of opacity at least 0.1 it is (of equals the one of the lower id), one that is no point's nearest the thing of the
+/// point nearest to it. -1 for damaged Gaussians, and where there is no thing.
+pub fn true_labels(geometry: &Geometry, truth: &TruePoints) -> Vec<i32> {
+    let (g, whole) = (&geometry.gaussians, geometry.whole());
+    let mut labels: Vec<i32> = nearest_of(&truth.position, &g.means)
+        .into_iter()
+        .zip(whole)
+        .map(|(point, whole)| point.filter(|_| whole).map_or(-1, |p| truth.instance[p as usize]))
+        .collect();
+    let solid: Vec<u32> = (0..g.len() as u32).filter(|&i| g.opacity(i as usize) >= MIN_OPACITY).collect();
+    let mut owned: Vec<(u32, i32)> = nearest(g, &solid, &truth.position)
+        .into_iter()
+        .zip(&truth.instance)
+        .filter_map(|(gaussian, &thing)| gaussian.filter(|_| thing >= 0).map(|i| (i, thing)))
+        .collect();
+    owned.sort_unstable();
+    for own in owned.chunk_by(|a, b| a.0 == b.0) {
+        let most = own.chunk_by(|a, b| a == b).rev().max_by_key(|same| same.len());
+        labels[own[0].0 as usize] = most.map_or(-1, |same| same[0].1);
+    }
+    labels
+}
+
 /// True and predicted instances of fewer Gaussians take no part in average precision over Gaussians.
 const MIN_GAUSSIANS: usize = 10;
 
@@ -73,5 +98,60 @@ fn score_gaussians(scene: &LabelledScene, points: &TruePoints) -> GaussianScores
         instance_miou: metrics::score_instances(&truth, &predicted).miou,
         ap25: ap(0.25),
         ap50: ap(0.5),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use gs_scene::Gaussians;
+
+    /// Gaussians at these places on a line, with these opacity logits.
+    fn line(places: &[(f32, f32)]) -> Geometry {
+        let mut gaussians = Gaussians::default();
+        for &(x, logit) in places {
+            gaussians.means.push([x, 0.0, 0.0]);
+            gaussians.opacity_logits.push(logit);
+        }
+        Geometry { gaussians, ..Geometry::default() }
+    }
+
+    #[test]
+    fn no_labels_score_more_than_the_true_ones() {
+        let truth: Vec<(f32, i32)> =
+            vec![(0.0, 0), (0.2, 0), (0.9, 0), (1.1, 1), (1.2, 1), (2.0, 1), (2.9, 1), (3.0, 2), (3.1, 2), (4.0, 2)];
+        let points = TruePoints {
+            position: truth.iter().map(|&(x, _)| [x, 0.0, 0.0]).collect(),
+            instance: truth.iter().map(|&(_, thing)| thing).collect(),
+            ..TruePoints::default()
+        };
+        // The Gaussian at 1 lies nearest to a point of thing 0, but most of its points are of thing 1.
+        let geometry = line(&[(0.0, 4.0), (0.98, 4.0), (2.1, 4.0), (3.0, 4.0), (4.2, 4.0)]);
+        let found = nearest(&geometry.gaussians, &[0, 1, 2, 3, 4], &points.position);
+        let miou = |labels: &[i32]| {
+            let predicted: Vec<i32> = found.iter().map(|g| g.map_or(-1, |g| labels[g as usize])).collect();
+            metrics::score_instances(&points.instance, &predicted).miou
+        };
+        let labels = true_labels(&geometry, &points);
+        assert_eq!(labels, [0, 1, 1, 2, 2]);
+        let best = miou(&labels);
+        for code in 0..4i32.pow(5) {
+            let other: Vec<i32> = (0..5).map(|i| code / 4i32.pow(i) % 4 - 1).collect();
+            assert!(miou(&other) <= best, "{other:?} scores {}, the truth {best}", miou(&other));
+        }
+    }
+
+    #[test]
+    fn gaussians_that_are_no_surface_take_the_nearest_point() {
+        let points = TruePoints {
+            position: vec![[0.0; 3], [0.1, 0.0, 0.0], [1.0, 0.0, 0.0]],
+            instance: vec![3, 5, -1],
+            ..TruePoints::default()
+        };
+        // The second is faint, so both things are the first one's: of equals the lower id.
+        let mut geometry = line(&[(0.0, 4.0), (0.1, -4.0), (0.2, -50.0), (0.9, 4.0)]);
+        geometry.damaged = vec![2];
+        assert_eq!(true_labels(&geometry, &points), [3, 5, -1, -1]);
+        assert_eq!(true_labels(&geometry, &TruePoints::default()), [-1; 4]);
     }
 }
