@@ -32,7 +32,7 @@ pub struct Inputs {
 /// A ceiling, as the output lists it.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 struct Ceiling {
-    /// `true labels`, a level of masks, or `all levels`.
+    /// `true labels`, a level of masks, or `all` of them.
     name: String,
     /// Its instances, a file beside the output.
     instances: String,
@@ -49,6 +49,7 @@ type Mask = (u32, BTreeMap<u32, f64>);
 struct World {
     geometry: Geometry,
     footprints: Footprints,
+    points: TruePoints,
     /// The thing of every Gaussian, numbered from 0; -1 for none.
     truth: Vec<i32>,
     /// Content hashes, by role.
@@ -56,7 +57,7 @@ struct World {
 }
 
 /// Writes `out`, a JSON list of ceilings, and the instances of each beside it: `<out>.true-labels.safetensors`, one of every
-/// level that has masks, such as `<out>.small.safetensors`, and `<out>.all-levels.safetensors`.
+/// level that has masks, such as `<out>.small.safetensors`, and `<out>.all.safetensors`.
 ///
 /// # Errors
 /// When the scene has no truth, the files do not belong together, or one is damaged.
@@ -68,13 +69,13 @@ pub fn run(inputs: &Inputs, out: &Path, stage: &Stage) -> Result<()> {
     let dataset = dataset::load(&inputs.scene, &LoadOptions::default())?;
     let mut sets = vec![("true labels".to_string(), vec![])];
     sets.extend(Level::ALL.map(|level| (level.to_string(), vec![level])));
-    sets.push(("all levels".into(), Level::ALL.to_vec()));
+    sets.push(("all".into(), Level::ALL.to_vec()));
     let file = |name: &str| out.with_extension(name.replace(' ', "-") + ".safetensors");
     let outputs =
         stage.outputs(out).file(out).reads(&dataset.files).reads([&points, &inputs.geometry, &inputs.footprints]);
     let outputs = sets.iter().fold(outputs, |o, (name, _)| o.artifact(file(name), Instances::FORMAT));
     let mut claim = outputs.drop_stale().claim()?;
-    let world = World::read(inputs, &dataset, &TruePoints::read(&points)?)?;
+    let world = World::read(inputs, &dataset, TruePoints::read(&points)?)?;
     if let Some(damage) = world.geometry.damage() {
         stage.skipped(&damage);
     }
@@ -95,12 +96,13 @@ pub fn run(inputs: &Inputs, out: &Path, stage: &Stage) -> Result<()> {
         all.push(Ceiling { name, instances, masks: count, impure: impure(&masks) });
     }
     write_json(out, &all)?;
+    stage.info(&format!("wrote {} and the instances of {} ceilings, for eval score", out.display(), all.len()));
     let summary = json!({"ceilings": all.len()});
     stage.record(&mut claim, json!({"command": "ceilings"}), world.hashes, summary)
 }
 
 impl World {
-    fn read(inputs: &Inputs, dataset: &Dataset, points: &TruePoints) -> Result<Self> {
+    fn read(inputs: &Inputs, dataset: &Dataset, points: TruePoints) -> Result<Self> {
         let watched = Watched::new([&inputs.geometry]);
         let geometry = Geometry::read(&inputs.geometry)?;
         let hashes = BTreeMap::from([
@@ -115,15 +117,16 @@ impl World {
             let wrong = Error::new("a Gaussian that the geometry lacks").file(&inputs.footprints).field("kept");
             return Err(wrong.found(last).expected(format!("less than {n}")).hint("run graph-precompute again"));
         }
-        let truth = numbered(&eval::true_labels(&geometry, points));
-        Ok(Self { geometry, footprints, truth, hashes })
+        let truth = numbered(&eval::true_labels(&geometry, &points));
+        Ok(Self { geometry, footprints, points, truth, hashes })
     }
 
     /// Labels by ideal grouping: every mask is given the thing that holds most of its weight, and every Gaussian takes the
     /// thing with most weight in its masks; of equals the first. -1 for Gaussians in no mask.
     fn grouped(&self, masks: &[Mask]) -> Vec<i32> {
         let mut of_thing = BTreeMap::<u32, Vec<u32>>::new();
-        masks.iter().for_each(|(row, of)| of_thing.entry(main_thing(of).0).or_default().push(*row));
+        let some = masks.iter().filter(|(_, of)| !of.is_empty());
+        some.for_each(|(row, of)| of_thing.entry(main_thing(of).0).or_default().push(*row));
         let mut best = vec![0.0; self.footprints.kept.len()];
         let mut labels = vec![-1; self.truth.len()];
         for (thing, rows) in of_thing {
@@ -142,11 +145,12 @@ impl World {
         labels
     }
 
-    /// Instances of these labels, without masks, language or tree.
+    /// Instances of these labels, without masks, language or tree, ranked by how well they fit.
     fn instances(&self, labels: Vec<i32>) -> Instances {
         let (nodes, things) = (vec![-1; labels.len()], labels.iter().max().map_or(0, |&most| (most + 1) as usize));
+        let score = eval::true_confidence(&self.geometry, &labels, things, &self.points);
         let described = describe(&self.geometry.gaussians.means, labels, things, Vec::new(), &BTreeMap::new());
-        Instances { node: nodes, ..described }
+        Instances { score, node: nodes, ..described }
     }
 }
 
@@ -235,16 +239,15 @@ mod tests {
         let (inputs, out) = (example(dir.path()), dir.path().join("g.ceilings.json"));
         let stage = Stage::silent("bench");
         run(&inputs, &out, &stage).unwrap();
-        let labels = |name: &str| {
-            let path = dir.path().join(format!("g.ceilings.{name}.safetensors"));
-            Instances::read(path).unwrap().0.label
-        };
+        let read = |name: &str| Instances::read(dir.path().join(format!("g.ceilings.{name}.safetensors"))).unwrap().0;
+        let labels = |name: &str| read(name).label;
         assert_eq!(labels("true-labels"), [0, 0, 0, 0, 1, 1, 1, 1, 1]);
         assert_eq!(labels("small"), [0, 0, 0, 0, 1, 1, 1, 1, -1]);
         // The mask that is half and half goes to the first thing, with all that it holds.
         assert_eq!(labels("large"), [0, 0, 0, 0, 0, 0, 1, 1, -1]);
+        assert_eq!((read("large").score, read("large").count), (vec![4.0 / 6.0, 3.0 / 5.0], vec![6, 2]));
         // Of 2 for the large mask and 1 for the small one the large one wins.
-        assert_eq!(labels("all-levels"), [0, 0, 0, 0, 0, 0, 1, 1, -1]);
+        assert_eq!(labels("all"), [0, 0, 0, 0, 0, 0, 1, 1, -1]);
         let told: serde_json::Value = serde_json::from_slice(&fs::read(&out).unwrap()).unwrap();
         let of = |name: &str| {
             let c = told.as_array().unwrap().iter().find(|c| c["name"] == name).expect(name);
@@ -252,7 +255,7 @@ mod tests {
         };
         assert_eq!((of("true labels"), of("small")), ((None, None), (Some(2), Some(0.0))));
         assert_eq!(of("large"), (Some(3), Some(8.0 / 19.0)));
-        assert_eq!(of("all levels"), (Some(5), Some(8.0 / 27.0)));
+        assert_eq!(of("all"), (Some(5), Some(8.0 / 27.0)));
         assert_eq!(told.as_array().unwrap().len(), 4, "no levels without masks");
     }
 

@@ -1,5 +1,5 @@
 //! Experiments by a [`plan`]: tables of scores, run time against error, growth; two builds beside each other; numerical
-//! stress. All through the stages' binaries, as people run them.
+//! stress. All through the stages' binaries, as people run them. `ceilings` makes what the truth of a scene allows.
 
 mod ceilings;
 mod cells;

@@ -26,4 +26,4 @@ pub use query::segment::divide;
 pub use query::text::{TextSource, TextTable};
 pub use scene::numbered;
 pub use score::labels::{read as read_labels, read_mask};
-pub use score::true_labels;
+pub use score::{true_confidence, true_labels};

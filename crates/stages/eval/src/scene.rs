@@ -90,10 +90,7 @@ impl LabelledScene {
     /// The nearest Gaussian for each point, of those with an instance and an opacity of at least 0.1: fainter ones are no
     /// surface (docs/protocols.md). None where there is no such Gaussian.
     pub fn nearest_labelled(&self, points: &[[f32; 3]]) -> Vec<Option<u32>> {
-        let (g, label) = (self.gaussians(), &self.instances.label);
-        let counts = |&i: &u32| label[i as usize] >= 0 && g.opacity(i as usize) >= MIN_OPACITY;
-        let candidates: Vec<u32> = (0..g.len() as u32).filter(counts).collect();
-        nearest(g, &candidates, points)
+        nearest_solid(self.gaussians(), points, |i| self.instances.label[i] >= 0)
     }
 
     /// All Gaussians.
@@ -113,6 +110,13 @@ impl LabelledScene {
                 .hint("give the scene that the instances were made from, or run make again if it was edited")
         })
     }
+}
+
+/// The nearest Gaussian for each point, of those of opacity at least 0.1 for which `counts` holds.
+pub fn nearest_solid(g: &Gaussians, points: &[[f32; 3]], counts: impl Fn(usize) -> bool) -> Vec<Option<u32>> {
+    let solid = |&i: &u32| counts(i as usize) && g.opacity(i as usize) >= MIN_OPACITY;
+    let candidates: Vec<u32> = (0..g.len() as u32).filter(solid).collect();
+    nearest(g, &candidates, points)
 }
 
 /// Reads the features of some of `gaussians` Gaussians of a geometry.

@@ -11,7 +11,7 @@ mod scores;
 mod truth;
 
 pub use self::scores::{QueryScore, Scores, ThingScore};
-pub use self::truth::true_labels;
+pub use self::truth::{true_confidence, true_labels};
 
 use self::labels::FrameLabels;
 use crate::memory::{self, SMALLER, Sizes};

@@ -2,9 +2,9 @@
 
 use super::metrics::{self, InstanceScore};
 use super::scores::{GaussianScores, Scores, ThingScore};
-use crate::nearest::{nearest, nearest_of};
+use crate::nearest::nearest_of;
 use crate::protocols::instances::{MIN_POINTS, average_precision};
-use crate::scene::{LabelledScene, MIN_OPACITY};
+use crate::scene::{LabelledScene, MIN_OPACITY, nearest_solid};
 use artifacts::{TruePoints, TrueScene};
 use gs_io::Result;
 use gs_scene::Geometry;
@@ -66,8 +66,7 @@ pub fn true_labels(geometry: &Geometry, truth: &TruePoints) -> Vec<i32> {
         .zip(whole)
         .map(|(point, whole)| point.filter(|_| whole).map_or(-1, |p| truth.instance[p as usize]))
         .collect();
-    let solid: Vec<u32> = (0..g.len() as u32).filter(|&i| g.opacity(i as usize) >= MIN_OPACITY).collect();
-    let mut owned: Vec<(u32, i32)> = nearest(g, &solid, &truth.position)
+    let mut owned: Vec<(u32, i32)> = nearest_solid(g, &truth.position, |_| true)
         .into_iter()
         .zip(&truth.instance)
         .filter_map(|(gaussian, &thing)| gaussian.filter(|_| thing >= 0).map(|i| (i, thing)))
@@ -78,6 +77,22 @@ pub fn true_labels(geometry: &Geometry, truth: &TruePoints) -> Vec<i32> {
         labels[own[0].0 as usize] = most.map_or(-1, |same| same[0].1);
     }
     labels
+}
+
+/// The confidence of `instances` instances that suits average precision best: the IoU of each with the thing whose best it is,
+/// as [`score_instances`] finds it, 0 to 1. `labels` are those of all Gaussians, -1 for none.
+pub fn true_confidence(geometry: &Geometry, labels: &[i32], instances: usize, truth: &TruePoints) -> Vec<f32> {
+    let label = |nearest: Option<u32>| nearest.map_or(-1, |i| labels[i as usize]);
+    let found = nearest_solid(&geometry.gaussians, &truth.position, |i| labels[i] >= 0);
+    let predicted: Vec<i32> = found.into_iter().map(label).collect();
+    let mut confidence = vec![0.0f32; instances];
+    for thing in metrics::score_instances(&truth.instance, &predicted).objects {
+        if let Some(best) = thing.best {
+            let own = &mut confidence[best as usize];
+            *own = own.max(thing.iou as f32);
+        }
+    }
+    confidence
 }
 
 /// True and predicted instances of fewer Gaussians take no part in average precision over Gaussians.
@@ -127,13 +142,14 @@ mod tests {
         };
         // The Gaussian at 1 lies nearest to a point of thing 0, but most of its points are of thing 1.
         let geometry = line(&[(0.0, 4.0), (0.98, 4.0), (2.1, 4.0), (3.0, 4.0), (4.2, 4.0)]);
-        let found = nearest(&geometry.gaussians, &[0, 1, 2, 3, 4], &points.position);
+        let found = nearest_solid(&geometry.gaussians, &points.position, |_| true);
         let miou = |labels: &[i32]| {
             let predicted: Vec<i32> = found.iter().map(|g| g.map_or(-1, |g| labels[g as usize])).collect();
             metrics::score_instances(&points.instance, &predicted).miou
         };
         let labels = true_labels(&geometry, &points);
         assert_eq!(labels, [0, 1, 1, 2, 2]);
+        assert_eq!(true_confidence(&geometry, &labels, 4, &points), [2.0 / 3.0, 0.6, 0.75, 0.0]);
         let best = miou(&labels);
         for code in 0..4i32.pow(5) {
             let other: Vec<i32> = (0..5).map(|i| code / 4i32.pow(i) % 4 - 1).collect();
