@@ -4,8 +4,9 @@
     scripts/real_masks.py [--scenes kitchen-0,room-10] [--geometries 3] [--photographs FOLDER]
 
 For each scene (family-seed; seeds 0 to 2 are for tuning, 10 to 14 for reporting) it makes photographs, masks (slow, once),
-and Gaussians of several seeds, runs each method of METHODS, and writes OUT/real-masks.md and OUT/scores.json. Everything is
-kept in OUT (out/real-masks), so a second run makes only what is missing. --photographs scores the desk of testdata/desk too.
+and Gaussians of several seeds, runs each method of METHODS, asks bench for the ceilings, and writes OUT/real-masks.md and
+OUT/scores.json. Everything is kept in OUT (out/real-masks), so a second run makes only what is missing. --photographs scores the
+desk of testdata/desk too.
 """
 import argparse
 import json
@@ -19,41 +20,116 @@ FAMILIES = {"studio": 14, "table": 24, "kitchen": 24, "room": 24}
 TUNING, REPORTING = [0, 1, 2], [10, 11, 12, 13, 14]
 VIEWS = 32
 LARGE = (["--levels", "large"], ["--level", "large"])
-# Name: masks, options of feat-train, options of cluster-match.
+# Name: masks, options of feat-train, options of cluster-match. A method's files have its name: rename it where options change.
 METHODS = {
     "default": ("masks", [], []),
     "large level only": ("masks", *LARGE),
     "true masks, default": ("true", [], []),
     "true masks, large level only": ("true", *LARGE),
 }
+# What a scene's other methods are measured by.
+WHOLE = "true masks, large level only"
+COLUMNS = {"instance_miou": "instance mIoU", "ap25": "AP25", "ap50": "AP50", "label_miou": "label mIoU", "impure": "impure masks"}
+LEGEND = f"""\
+A scene's figure is the mean over its geometries (least to most). A figure of several scenes is the mean of theirs (least to most
+over scenes; largest distance between two geometries of one scene). The share of true masks is a scene's figure over that of
+"{WHOLE}". Ceilings: true labels on the Gaussians; the masks of a level, each given the thing that
+has most of it, and Gaussians that take the thing with most weight in their masks. Impure masks: the share of the masks' weight
+in masks of which less than 80 % is one thing.
+"""
 
 
 def run(program, *args):
     subprocess.run([BIN / program, *map(str, args), "--quiet"], check=True, stdout=subprocess.DEVNULL)
 
 
-def score(folder, scene, masks, method, geometry, labels):
-    """The scores of one method on one geometry."""
-    key, feat, cluster = METHODS[method]
-    base = folder / f"{geometry.stem}.{method.replace(' ', '-').replace(',', '')}"
-    graph, prints = (folder / f"{geometry.stem}.{key}.{what}.safetensors" for what in ("graph", "footprints"))
-    features, instances = (Path(f"{base}.{what}.safetensors") for what in ("features", "instances"))
+def graph_of(scene, masks, base):
+    """Graph and footprints of masks on the geometry `base`.ply; `masks` is a folder with its name in files."""
+    key, folder = masks
+    graph, prints = (Path(f"{base}.{key}.{what}.safetensors") for what in ("graph", "footprints"))
+    if not (graph.exists() and prints.exists()):
+        run("graph-precompute", "--scene", scene, "--geometry", f"{base}.ply", "--masks", folder, "--footprints", prints,
+            "--graph", graph)
+    return graph, prints
+
+
+def instances_of(scene, masks, base, method):
+    """The instances of a method, from masks, on the geometry `base`.ply."""
+    _, feat, cluster = METHODS[method]
+    own = f"{base}.{method.replace(' ', '-').replace(',', '')}"
+    features, instances = (Path(f"{own}.{what}.safetensors") for what in ("features", "instances"))
     if not instances.exists():
-        if not graph.exists():
-            run("graph-precompute", "--scene", scene, "--geometry", geometry, "--masks", masks, "--footprints", prints,
-                "--graph", graph)
-        inputs = ["--geometry", geometry, "--graph", graph, "--footprints", prints]
+        graph, prints = graph_of(scene, masks, base)
+        inputs = ["--geometry", f"{base}.ply", "--graph", graph, "--footprints", prints]
         run("feat-train", *inputs, "--out", features, *feat)
-        run("cluster-match", "--scene", scene, *inputs, "--features", features, "--masks", masks, "--out", instances,
+        run("cluster-match", "--scene", scene, *inputs, "--features", features, "--masks", masks[1], "--out", instances,
             *cluster)
-    out = Path(f"{base}.{labels.name if labels else 'truth'}.score.json")
+    return instances
+
+
+def ceilings_of(scene, masks, base):
+    """The ceilings of a scene with a truth: name, instances, share of impure masks."""
+    out = Path(f"{base}.{masks[0]}.ceilings.json")
+    if not out.exists():
+        run("bench", "ceilings", "--scene", scene, "--geometry", f"{base}.ply", "--footprints",
+            graph_of(scene, masks, base)[1], "--out", out)
+    for ceiling in json.loads(out.read_text()):
+        ideal = "" if ceiling["masks"] is None else " masks, ideal grouping"
+        yield f"ceiling: {ceiling['name']}{ideal}", out.parent / ceiling["instances"], ceiling["impure"]
+
+
+def score(scene, base, instances, labels, impure=None):
+    """The scores of instances on the geometry `base`.ply, by polygons in the folder `labels` or by the scene's truth."""
+    own = str(instances).removesuffix(".safetensors").removesuffix(".instances")
+    out = Path(f"{own}.{labels.name if labels else 'truth'}.score.json")
     if not out.exists():
         marks = ["--labels", labels] if labels else []
-        run("eval", "score", "--scene", scene, "--geometry", geometry, "--instances", instances, "--out", out, *marks)
-    return json.loads(out.read_text())
+        run("eval", "score", "--scene", scene, "--geometry", f"{base}.ply", "--instances", instances, "--out", out, *marks)
+    return {**json.loads(out.read_text()), "impure": impure}
 
 
-def main():
+def spread(values):
+    return f"{min(values):.3f} to {max(values):.3f}"
+
+
+def one(values):
+    """Of one scene: the mean over its geometries."""
+    return f"{statistics.mean(values):.3f}" + (f" ({spread(values)})" if len(values) > 1 else "") if values else "–"
+
+
+def several(scenes):
+    """Of several scenes, each with its geometries."""
+    scenes = [s for s in scenes if s]
+    means = [statistics.mean(s) for s in scenes]
+    apart = f"; {max(max(s) - min(s) for s in scenes):.3f}" if any(len(s) > 1 for s in scenes) else ""
+    return f"{statistics.mean(means):.3f}" + (f" ({spread(means)}{apart})" if len(means) > 1 else "") if means else "–"
+
+
+def table(scores):
+    """Markdown of `scores`: by scene, then method, the scores of its geometries."""
+    def values(scene, method, column):
+        return [r[column] for r in scores[scene].get(method, []) if r.get(column) is not None]
+
+    def share(scene, method, column):
+        own, whole = values(scene, method, column), values(scene, WHOLE, column)
+        return [statistics.mean(own) / statistics.mean(whole)] if own and whole and any(whole) else []
+
+    def line(name, method, cells):
+        return f"| {name} | {method} | {' | '.join(cells)} |"
+
+    lines = [LEGEND, line("scene", "method", COLUMNS.values()), "|---" * (len(COLUMNS) + 2) + "|"]
+    for scene in scores:
+        lines += [line(scene, method, [one(values(scene, method, c)) for c in COLUMNS]) for method in scores[scene]]
+    for what, seeds in (("tuning", TUNING), ("reporting", REPORTING)):
+        own = [s for s in scores if ":" not in s and int(s.rpartition("-")[2]) in seeds]
+        methods = list(dict.fromkeys(method for s in own for method in scores[s]))
+        for name, of in ((what, values), (f"{what}, share of true masks", share)):
+            lines += [line(f"**{name}**", method, [several([of(s, method, c) for s in own]) for c in COLUMNS])
+                      for method in methods if of is values or method != WHOLE]
+    return "\n".join(lines) + "\n"
+
+
+def arguments():
     everything = [f"{family}-{seed}" for seed in TUNING + REPORTING for family in FAMILIES]
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--scenes", default=",".join(everything), help="names with commas between [all 32]")
@@ -62,14 +138,19 @@ def main():
     parser.add_argument("--sam", type=Path, default=Path("models"), help="folder of the SAM model [models]")
     parser.add_argument("--out", type=Path, default=Path("out/real-masks"), help="folder [out/real-masks]")
     a = parser.parse_args()
-    scenes = [s for s in a.scenes.split(",") if s]
-    for name in scenes:
+    a.scenes = [s for s in a.scenes.split(",") if s]
+    for name in a.scenes:
         family, _, seed = name.rpartition("-")
         if family not in FAMILIES or not seed.isdigit():
             parser.error(f"--scenes: {name!r} is no scene; expected a name such as kitchen-10, of {', '.join(FAMILIES)}")
+    return a
+
+
+def main():
+    a = arguments()
     # Scene, photographs, options of stage 1, whether true masks are there, folders of labels.
     work = [(name, a.out / name / "scene", ["--resolution", "320px", "--iterations", "1500", "--sh-degree", "0"], True, [None])
-            for name in scenes]
+            for name in a.scenes]
     if a.photographs:
         labels = [Path("testdata/desk"), Path("testdata/desk-full")]
         work.append(("desk", a.photographs, ["--resolution", "640px", "--iterations", "3000"], False, labels))
@@ -83,40 +164,23 @@ def main():
                 "--views", VIEWS, "--width", 640, "--height", 480, "--points", 12000, "--corruption", "exact")
         # Goes on where it was, and does nothing where all views are done.
         run("mask-embed", "masks", "--scene", scene, "--sam", a.sam, "--out", folder / "masks")
+        masks = {"masks": ("masks", folder / "masks"), "true": ("true", scene / "language_features")}
         for seed in range(a.geometries):
-            geometry = folder / f"g{seed}.ply"
-            if not geometry.exists():
-                run("gs-geom", "train", "--scene", scene, *options, "--seed", seed, "--out", geometry)
-            for method, (key, _, _) in METHODS.items():
-                if key == "true" and not true:
-                    continue
-                masks = scene / "language_features" if key == "true" else folder / "masks"
+            base = folder / f"g{seed}"
+            if not Path(f"{base}.ply").exists():
+                run("gs-geom", "train", "--scene", scene, *options, "--seed", seed, "--out", f"{base}.ply")
+            made = [(method, instances_of(scene, masks[key], base, method), None)
+                    for method, (key, _, _) in METHODS.items() if true or key != "true"]
+            made += ceilings_of(scene, masks["masks"], base) if true else []
+            for method, instances, impure in made:
                 for marks in labels:
-                    s = score(folder, scene, masks, method, geometry, marks)
-                    row = scores.setdefault((f"{name}: {marks.name}" if marks else name, method), [])
-                    row.append({k: s[k] for k in ("instance_miou", "ap25", "ap50", "label_miou")})
+                    row = scores.setdefault(f"{name}: {marks.name}" if marks else name, {}).setdefault(method, [])
+                    s = score(scene, base, instances, marks, impure)
+                    row.append({k: s[k] for k in COLUMNS})
         print(f"{name} is done", flush=True)
-    (a.out / "scores.json").write_text(json.dumps([{"scene": k[0], "method": k[1], "scores": v} for k, v in scores.items()]))
-
-    def cell(values):
-        values = [v for v in values if v is not None]
-        if not values:
-            return "–"
-        spread = f" ({min(values):.3f} to {max(values):.3f})" if len(values) > 1 else ""
-        return f"{statistics.mean(values):.3f}{spread}"
-
-    lines = ["| scene | method | instance mIoU | AP25 | AP50 | label mIoU |", "|---|---|---|---|---|---|"]
-    for (name, method), rows in scores.items():
-        columns = [cell([r[k] for r in rows]) for k in ("instance_miou", "ap25", "ap50", "label_miou")]
-        lines.append(f"| {name} | {method} | {' | '.join(columns)} |")
-    for what, seeds in (("tuning", TUNING), ("reporting", REPORTING)):
-        for method in METHODS:
-            own = [r for (name, m), rows in scores.items() for r in rows
-                   if m == method and ":" not in name and int(name.rpartition("-")[2]) in seeds]
-            if own:
-                columns = [cell([r[k] for r in own]) for k in ("instance_miou", "ap25", "ap50")]
-                lines.append(f"| **{what}** | {method} | {' | '.join(columns)} | – |")
-    (a.out / "real-masks.md").write_text("\n".join(lines) + "\n")
+    (a.out / "scores.json").write_text(
+        json.dumps([{"scene": n, "method": m, "scores": v} for n, of in scores.items() for m, v in of.items()]))
+    (a.out / "real-masks.md").write_text(table(scores))
     print(a.out / "real-masks.md")
 
 
