@@ -341,4 +341,17 @@ bench stress --only "metamorphic scaled" --work "$work/stress" --out "$work/stre
 grep -q '"good": true' "$work/stress.json" || fail "no stress"
 pass "the harness of make bench and make stress measures what it says"
 
+# Nothing is better than the truth: not what the stages found, nor its masks grouped by it.
+tiny=$work/trade/tiny base=$work/trade/tiny/exact
+bench ceilings --scene "$tiny/scene" --geometry "$tiny/geometry.ply" --footprints "$base/footprints.safetensors" --out "$work/ceilings.json"
+reached() {
+  target/release/eval score --scene "$tiny/scene" --geometry "$tiny/geometry.ply" --instances "$1" --out "$work/reached.json" \
+    2> "$work/reached.log" | awk '$1 == "instance_miou" { print $2 }'
+}
+best=$(reached "$work/ceilings.true-labels.safetensors")
+for instances in "$base/instances.safetensors" "$work/ceilings.large.safetensors"; do
+  awk -v best="$best" -v other="$(reached "$instances")" 'BEGIN { exit !(other > 0 && best >= other) }' || fail "better than the truth: $instances"
+done
+pass "no instances are better than the ceilings of bench"
+
 say "$passed passed, 0 failed"
