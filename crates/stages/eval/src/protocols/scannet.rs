@@ -387,7 +387,7 @@ impl Protocol for ScanFigures {
         };
         let [mean, pooled] = means(scans).map(sized);
         let scenes: Vec<&str> = scans.iter().map(|m| m.scene.as_str()).collect();
-        let columns = ScanFigures::INSTANCES.iter().map(|c| c.to_string());
+        let columns = ScanFigures::INSTANCES.iter().map(ToString::to_string);
         let instances: serde_json::Map<String, Value> = columns.zip(instance_means(scans).map(|v| json!(v))).collect();
         json!({"protocol": "scannet dataset", "scenes": scenes, "mean_over_scenes": mean, "pooled": pooled,
             "instances_percent": instances})

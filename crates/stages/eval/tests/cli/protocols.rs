@@ -24,7 +24,7 @@ impl Scene {
     fn new() -> Self {
         let dir = tempfile::tempdir().unwrap();
         let scene = dir.path().join("scene0000_00");
-        let faults = synth_scene::masks::Faults { granularity: 0.5, boundary: 1, missing: 0.1, spurious: 0.0 };
+        let faults = synth_scene::masks::Faults { granularity: 0.5, boundary: 1, missing: 0.1, ..Default::default() };
         let options = synth_scene::write::Options {
             seed: 3,
             objects: 6,
