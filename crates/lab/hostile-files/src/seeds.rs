@@ -141,7 +141,7 @@ pub(crate) fn artifact() -> Vec<Vec<u8>> {
         seen_views: vec![1, 0, 2, 1],
         seen_weight: vec![0.5, 0.0, 1.0, 2.0],
     };
-    let features = Features { kept: vec![0, 2, 3], dim: 2, values: vec![0.5; 6] };
+    let features = Features { kept: vec![0, 2, 3], dim: 2, values: vec![0.5; 6], ..Features::default() };
     let row = Row { view: 0, level: 3, mask: 1, pixels: 9, gated: 8, alpha: 0.9 };
     let footprints = FootprintsBuilder {
         views: vec!["a".into()],

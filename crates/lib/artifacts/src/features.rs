@@ -13,6 +13,10 @@ pub struct Features {
     pub dim: usize,
     /// `[n][dim]`, finite.
     pub values: Vec<f32>,
+    /// Dimension of the features of parts; 0 where there are none.
+    pub parts_dim: usize,
+    /// Features that tell parts and small things apart, from the masks of level small; `[n][parts_dim]`, finite.
+    pub parts: Vec<f32>,
 }
 
 impl Features {
@@ -24,10 +28,13 @@ impl Features {
     pub fn write(&self, path: impl AsRef<Path>, mut provenance: Provenance) -> Result<()> {
         provenance.format = Self::FORMAT.into();
         provenance.version = Self::VERSION;
-        ArtifactWriter::new(provenance)
-            .tensor("kept", &[self.kept.len()], &self.kept)
-            .tensor("features", &[self.kept.len(), self.dim], &self.values)
-            .write(path)
+        let n = self.kept.len();
+        let writer = ArtifactWriter::new(provenance).tensor("kept", &[n], &self.kept);
+        let writer = writer.tensor("features", &[n, self.dim], &self.values);
+        match self.parts_dim {
+            0 => writer.write(path),
+            dim => writer.tensor("parts", &[n, dim], &self.parts).write(path),
+        }
     }
 
     /// Reads and checks the artifact.
@@ -38,20 +45,30 @@ impl Features {
         let a = Artifact::open(path, Self::FORMAT, Self::VERSION)?;
         let kept = a.tensor::<u32>("kept", &[None])?.to_vec();
         check_kept(&a, &kept, usize::MAX)?;
-        let values = a.tensor::<f32>("features", &[Some(kept.len()), None])?.to_vec();
-        let dim = a.shape("features").map_or(0, |s| s[1]);
-        if let Some(at) = values.iter().position(|v| !v.is_finite()) {
-            return Err(Error::new("not a finite number")
-                .file(a.path())
-                .field(format!("features[{}][{}]", at / dim, at % dim))
-                .found(values[at])
-                .hint("train the features again"));
-        }
-        Ok((Self { kept, dim, values }, a))
+        let (dim, values) = finite(&a, "features", kept.len())?;
+        let (parts_dim, parts) = match a.shape("parts") {
+            Some(_) => finite(&a, "parts", kept.len())?,
+            None => (0, Vec::new()),
+        };
+        Ok((Self { kept, dim, values, parts_dim, parts }, a))
     }
 
     /// Feature of the kept Gaussian at `position`.
     pub fn row(&self, position: usize) -> &[f32] {
         &self.values[position * self.dim..(position + 1) * self.dim]
     }
+}
+
+/// Columns and values of a tensor of `rows` rows, all finite.
+fn finite(a: &Artifact, name: &str, rows: usize) -> Result<(usize, Vec<f32>)> {
+    let values = a.tensor::<f32>(name, &[Some(rows), None])?.to_vec();
+    let dim = a.shape(name).map_or(0, |s| s[1]);
+    if let Some(at) = values.iter().position(|v| !v.is_finite()) {
+        return Err(Error::new("not a finite number")
+            .file(a.path())
+            .field(format!("{name}[{}][{}]", at / dim, at % dim))
+            .found(values[at])
+            .hint("train the features again"));
+    }
+    Ok((dim, values))
 }

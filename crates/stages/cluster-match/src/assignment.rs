@@ -8,8 +8,11 @@ use gs_io::{Error, Result};
 use hdbscan_exact::Clustering;
 use kiddo::{ImmutableKdTree, SquaredEuclidean};
 use rayon::prelude::*;
-use std::collections::HashSet;
+use std::collections::{BTreeMap, HashSet};
 use std::num::NonZero;
+
+/// Least share of a part that lies in an instance for it to be that instance's.
+const INSIDE: f64 = 0.7;
 
 /// The instances of all Gaussians of a scene.
 pub(crate) struct Assignment {
@@ -96,6 +99,55 @@ impl Assignment {
         self.tree.iter_mut().for_each(|e| renumber(&mut e.instance));
     }
 
+    /// Makes instances of those of `parts` that lie in a much larger instance: at least [`INSIDE`] of their Gaussians, and at most
+    /// `share` of its own. An instance of which more than half would leave stays as it is. In the tree such a part hangs below
+    /// the cluster of that instance. Returns how many there are.
+    pub fn split(&mut self, parts: &Self, share: f64) -> usize {
+        let mut common: BTreeMap<(i32, i32), usize> = BTreeMap::new();
+        let (mut sizes, mut part_sizes) = (vec![0usize; self.instances], vec![0usize; parts.instances]);
+        for (&whole, &part) in self.labels.iter().zip(&parts.labels) {
+            if let (Ok(w), Ok(p)) = (usize::try_from(whole), usize::try_from(part)) {
+                *common.entry((whole, part)).or_default() += 1;
+                sizes[w] += 1;
+                part_sizes[p] += 1;
+            }
+        }
+        let small = |&((whole, part), n): &((i32, i32), usize)| {
+            let (size, part_size) = (sizes[whole as usize] as f64, part_sizes[part as usize] as f64);
+            n as f64 >= INSIDE * part_size && part_size <= share * size
+        };
+        let mut found: BTreeMap<i32, Vec<(i32, usize)>> = BTreeMap::new();
+        for ((whole, part), n) in common.into_iter().filter(small) {
+            found.entry(whole).or_default().push((part, n));
+        }
+        found.retain(|&whole, parts| 2 * parts.iter().map(|(_, n)| n).sum::<usize>() <= sizes[whole as usize]);
+        let before = self.instances;
+        let mut new = BTreeMap::new();
+        for (whole, parts) in found {
+            // Of a joined instance the first cluster; the whole scene is no cluster of the tree.
+            let above = self.tree.iter().find(|e| e.instance == whole).copied();
+            for (part, n) in parts {
+                let node = above.map(|e| {
+                    let child = self.tree.iter().map(|e| e.child).max().map_or(0, |c| c + 1);
+                    let instance = self.instances as i32;
+                    // The features of wholes do not part them at any distance.
+                    let lambda = f32::MAX;
+                    self.tree.push(TreeEdge { parent: e.child, child, lambda, size: n as u32, instance });
+                    child as i32
+                });
+                new.insert((whole, part), (self.instances as i32, node));
+                self.instances += 1;
+            }
+        }
+        for (i, &part) in parts.labels.iter().enumerate() {
+            if let Some(&(instance, node)) = new.get(&(self.labels[i], part)) {
+                self.labels[i] = instance;
+                self.nodes[i] = node.unwrap_or(self.nodes[i]);
+            }
+        }
+        self.instances - before
+    }
+
     fn of_kept(&self, kept: &[u32]) -> Vec<i32> {
         kept.iter().map(|&i| self.labels[i as usize]).collect()
     }
@@ -104,6 +156,38 @@ impl Assignment {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn parts_much_smaller_than_their_instance_leave_it() {
+        let of = |labels: Vec<i32>, instances, tree: Vec<TreeEdge>| Assignment {
+            nodes: vec![5; labels.len()],
+            labels,
+            instances,
+            tree,
+            clusters: Vec::new(),
+        };
+        let edge = TreeEdge { parent: 4, child: 5, lambda: 2.0, size: 100, instance: 0 };
+        let wholes: Vec<i32> = (0..120).map(|i| i32::from(i >= 100)).collect();
+        // Part 0 is most of instance 0; 1 is small and lies in it; 2 lies half in either; 3 is half of instance 1.
+        let part = |i| match i {
+            0..90 => 0,
+            90..96 => 1,
+            96..104 => 2,
+            _ => 3,
+        };
+        let parts = of((0..120).map(part).collect(), 4, Vec::new());
+        let mut a = of(wholes.clone(), 2, vec![edge]);
+        assert_eq!((a.split(&parts, 0.1), a.instances), (1, 3));
+        let expected: Vec<i32> = (0..120).map(|i| if (90..96).contains(&i) { 2 } else { wholes[i] }).collect();
+        assert_eq!(a.labels, expected);
+        // It hangs below the instance's cluster.
+        assert_eq!(a.tree[1], TreeEdge { parent: 5, child: 6, lambda: f32::MAX, size: 6, instance: 2 });
+        assert!(a.nodes[90..96].iter().all(|&n| n == 6) && a.nodes.iter().filter(|&&n| n == 6).count() == 6);
+        // Nothing is small enough; or the instance would fall apart.
+        assert_eq!(of(wholes.clone(), 2, vec![edge]).split(&parts, 0.05), 0);
+        let crumbs = of((0..120).map(|i| i / 6).collect(), 20, Vec::new());
+        assert_eq!(of(wholes, 2, vec![edge]).split(&crumbs, 0.1), 0);
+    }
 
     #[test]
     fn the_nearest_labelled_gaussian_decides() {

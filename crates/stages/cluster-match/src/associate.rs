@@ -263,7 +263,12 @@ mod tests {
     #[test]
     fn instances_match_the_masks_they_are_seen_as() {
         let (g, camera) = scene();
-        let features = Features { kept: vec![0, 1, 2], dim: 2, values: vec![1.0, 0.0, 0.0, 1.0, -1.0, 0.2] };
+        let features = Features {
+            kept: vec![0, 1, 2],
+            dim: 2,
+            values: vec![1.0, 0.0, 0.0, 1.0, -1.0, 0.2],
+            ..Features::default()
+        };
         let table = FeatureTable::new(&features, 3);
         let o = overlaps(&g, &RasterOptions::default(), &[0, 1, 2], &table, &camera, &maps(), &[Level::Large]);
         assert_eq!(o.masks[&3].area + o.masks[&4].area, (W * H) as u32);
@@ -292,7 +297,8 @@ mod tests {
         let (mut g, camera) = scene();
         // Half transparent, so that silhouettes have shades.
         g.opacity_logits = vec![2.5, 2.0, 1.5];
-        let features = Features { kept: vec![0, 2], dim: 3, values: vec![1.0, 2.0, 0.5, -1.0, 3.0, 0.25] };
+        let features =
+            Features { kept: vec![0, 2], dim: 3, values: vec![1.0, 2.0, 0.5, -1.0, 3.0, 0.25], ..Features::default() };
         let all = [1.0, 2.0, 0.5, 0.0, 0.0, 0.0, -1.0, 3.0, 0.25];
         let (labels, maps, levels) = ([0, -1, 0], maps(), [Level::Default, Level::Small]);
         let table = FeatureTable::new(&features, 3);

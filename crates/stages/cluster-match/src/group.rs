@@ -1,7 +1,7 @@
 //! Clustering of Gaussians by their features.
 
 use crate::options::Space;
-use artifacts::{Features, Graph, TreeEdge};
+use artifacts::{Graph, TreeEdge};
 use hdbscan_exact::{Clustering, Edge, Options, cluster, cluster_graph};
 use rayon::prelude::*;
 
@@ -45,16 +45,16 @@ pub fn standardise(values: &[f32], dim: usize) -> Vec<f32> {
     out
 }
 
-/// Clusters the kept Gaussians.
-pub fn group(features: &Features, graph: &Graph, space: Space, options: &Options) -> Clustering {
-    let dim = features.dim.max(1);
+/// Clusters the kept Gaussians by their features, `[n][dim]`.
+pub fn group(features: &[f32], dim: usize, graph: &Graph, space: Space, options: &Options) -> Clustering {
+    let dim = dim.max(1);
     match space {
-        Space::Free => cluster(&standardise(&features.values, dim), dim, options),
+        Space::Free => cluster(&standardise(features, dim), dim, options),
         Space::Graph => {
-            let chords = Chords::new(features.values.clone(), dim);
+            let chords = Chords::new(features.to_vec(), dim);
             let edges = neighbour_edges(graph, &chords, options.min_samples);
             drop(chords);
-            cluster_graph(features.kept.len(), edges, options)
+            cluster_graph(graph.kept.len(), edges, options)
         }
     }
 }
@@ -179,7 +179,7 @@ mod tests {
     }
 
     /// Two rods along x with features along two axes; their ends touch neither in space nor in features.
-    fn two_rods() -> (Features, Graph) {
+    fn two_rods() -> (Vec<f32>, Graph) {
         let n = 60usize;
         let values =
             (0..n).flat_map(|i| if i < 30 { [1.0, 0.01 * (i % 7) as f32] } else { [0.01 * (i % 5) as f32, 1.0] });
@@ -187,22 +187,21 @@ mod tests {
             let (low, high) = if i < 30 { (0, 29) } else { (30, 59) };
             [i - 2, i - 1, i + 1, i + 2].map(|j| j.clamp(low, high) as u32)
         });
-        let features = Features { kept: (0..n as u32).collect(), dim: 2, values: values.collect() };
         let graph = Graph {
-            kept: features.kept.clone(),
+            kept: (0..n as u32).collect(),
             gaussian_k: 4,
             gaussian_knn: neighbours.collect(),
             ..Graph::default()
         };
-        (features, graph)
+        (values.collect(), graph)
     }
 
     #[test]
     fn rods_of_one_feature_are_one_thing_in_features_and_two_in_space() {
-        let (mut f, g) = two_rods();
-        f.values = (0..60).flat_map(|i| [1.0, 0.001 * (i % 7) as f32]).collect();
+        let (_, g) = two_rods();
+        let f: Vec<f32> = (0..60).flat_map(|i| [1.0, 0.001 * (i % 7) as f32]).collect();
         let o = Options { min_cluster_size: 10, min_samples: 3, epsilon: 0.1, ..Options::default() };
-        let c = group(&f, &g, Space::Graph, &o);
+        let c = group(&f, 2, &g, Space::Graph, &o);
         assert_eq!(c.selected.len(), 2);
         assert_ne!(c.labels[5], c.labels[45]);
     }

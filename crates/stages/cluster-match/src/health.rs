@@ -9,6 +9,8 @@ use std::collections::{BTreeMap, BTreeSet};
 
 /// Fewest views and levels that must show both of a pair.
 const LEAST_SEEN: usize = 3;
+/// Least ratio of the Gaussians of the two.
+const LEAST_RATIO: f64 = 0.1;
 /// Pairs that are kept: there may be thousands where a floor falls into pieces.
 const KEPT: usize = 20;
 
@@ -34,6 +36,12 @@ pub fn measure(instances: &Instances, footprints: &Footprints, kept: &[u32], lev
         all += of.values().sum::<f64>();
     }
     let mut shared = shared(&seen(&weights, &units(footprints), instances.len()));
+    // What stands on a shelf is in the shelf's masks.
+    let size = |k: u32| f64::from(instances.count[k as usize]);
+    shared.retain(|s| {
+        let [a, b] = s.instances.map(size);
+        a.min(b) >= LEAST_RATIO * a.max(b)
+    });
     let sharing: BTreeSet<u32> = shared.iter().flat_map(|s| s.instances).collect();
     let sharing: usize = sharing.into_iter().map(|k| instances.count[k as usize] as usize).sum();
     // Of equals the first; the sort is stable.
@@ -166,6 +174,10 @@ mod tests {
         let near = |a: &SharedMasks, b: SharedMasks| a.instances == b.instances && (a.share - b.share).abs() < 1e-12;
         assert!(found.sharing == 1.0 && found.pairs == 2 && near(&found.shared[0], of(2, 3, 1.0)), "{found:?}");
         assert!(near(&found.shared[1], of(0, 1, 0.8)), "{found:?}");
+        // What is small beside the other is no piece of it.
+        let mut large = instances.clone();
+        (large.count[0], large.count[3]) = (100, 100);
+        assert_eq!(health(&large, &footprints(&[together; 4]), Level::Large).pairs, 0);
         // Half of the views are not most, and two are too few.
         let found = health(&instances, &footprints(&[together, apart, together, apart]), Level::Large);
         assert_eq!((found.sharing, found.pairs, found.shared.len()), (0.0, 0, 0), "{found:?}");

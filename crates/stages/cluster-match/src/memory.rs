@@ -6,7 +6,8 @@ use crate::options::Space;
 /// Peak memory in bytes of clustering in this space.
 pub fn forecast(inputs: &Inputs, space: Space) -> u64 {
     let (entries, samples) = (inputs.footprints.csr().1.len(), inputs.footprints.pixels.col.len());
-    let (gaussians, kept, dim) = (inputs.geometry.gaussians.len(), inputs.features.kept.len(), inputs.features.dim);
+    let (gaussians, kept) = (inputs.geometry.gaussians.len(), inputs.features.kept.len() as u64);
+    let (dim, parts) = (inputs.features.dim as u64, inputs.features.parts_dim as u64);
     // Features as they are read and as they are clustered; free points are also parted from their duplicates and lie in a tree:
     // coordinates, the leaves' blocks, boxes.
     let value = match space {
@@ -18,5 +19,6 @@ pub fn forecast(inputs: &Inputs, space: Space) -> u64 {
         + 11 * entries as u64
         + 14 * samples as u64
         + 627 * gaussians as u64
-        + value * kept as u64 * dim as u64 / 10
+        + value * kept * dim.max(parts) / 10
+        + 8 * kept * dim.min(parts)
 }

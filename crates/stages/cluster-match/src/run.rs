@@ -8,7 +8,7 @@ use crate::inputs::{Inputs, mask_features};
 use crate::memory;
 use crate::options::{Args, Noise, Settings};
 use crate::outputs;
-use artifacts::{Instances, MaskFeatures, MaskMaps, Match, maps_path};
+use artifacts::{Instances, Level, MaskFeatures, MaskMaps, Match, maps_path};
 use gs_io::{Error, Result, Watched};
 use gs_raster::RasterOptions;
 use gs_scene::dataset::View;
@@ -50,7 +50,8 @@ impl Program for Args {
         )?;
 
         let start = Instant::now();
-        let clustering = group(&inputs.features, &inputs.graph, settings.cluster, &settings.hdbscan());
+        let (features, hdbscan) = (&inputs.features, settings.hdbscan());
+        let clustering = group(&features.values, features.dim, &inputs.graph, settings.cluster, &hdbscan);
         let noise = clustering.labels.iter().filter(|&&l| l < 0).count();
         let seconds = start.elapsed().as_secs_f64();
         let found = Assignment::new(&clustering, &inputs.graph.kept, inputs.geometry.gaussians.len());
@@ -81,17 +82,24 @@ impl Program for Args {
     }
 }
 
+/// Gives noise an instance, and lets the masks of `levels` vote. Returns how many Gaussians that changed.
+fn settle(found: &mut Assignment, inputs: &Inputs, settings: &Settings, levels: &[Level]) -> Result<usize> {
+    if settings.noise == Noise::Nearest {
+        let mut noise = vec![false; found.labels.len()];
+        inputs.graph.kept.iter().for_each(|&i| noise[i as usize] = found.labels[i as usize] < 0);
+        found.fill_from_nearest(&inputs.geometry.gaussians.means, |i| noise[i])?;
+    }
+    let votes = settings.votes;
+    Ok(if votes > 0 { found.vote(&inputs.graph, &inputs.footprints, levels, votes) } else { 0 })
+}
+
 /// Corrects the clustering by where Gaussians lie and by the masks of each view.
 fn correct(mut found: Assignment, inputs: &Inputs, settings: &Settings, stage: &Stage) -> Result<Assignment> {
     let (means, graph, footprints) = (&inputs.geometry.gaussians.means, &inputs.graph, &inputs.footprints);
     let mut kept = vec![false; means.len()];
     graph.kept.iter().for_each(|&i| kept[i as usize] = true);
-    if settings.noise == Noise::Nearest {
-        let noise: Vec<bool> = found.labels.iter().zip(&kept).map(|(&l, &k)| k && l < 0).collect();
-        found.fill_from_nearest(means, |i| noise[i])?;
-    }
+    let changed = settle(&mut found, inputs, settings, &settings.level)?;
     if settings.votes > 0 {
-        let changed = found.vote(graph, footprints, &settings.level, settings.votes);
         stage.info(&format!("votes of the masks changed the instance of {changed} Gaussians"));
     }
     if settings.join > 0.0 {
@@ -99,6 +107,16 @@ fn correct(mut found: Assignment, inputs: &Inputs, settings: &Settings, stage: &
         found.join(&graph.kept, footprints, &settings.level, settings.join);
         if found.instances < before {
             stage.info(&format!("{} instances after joining pieces that the masks show as one", found.instances));
+        }
+    }
+    let (parts, parts_dim) = (&inputs.features.parts, inputs.features.parts_dim);
+    if settings.split > 0.0 && parts_dim > 0 {
+        let clustering = group(parts, parts_dim, graph, settings.cluster, &settings.hdbscan());
+        let mut parts = Assignment::new(&clustering, &graph.kept, means.len());
+        settle(&mut parts, inputs, settings, &[Level::Small])?;
+        let split = found.split(&parts, settings.split);
+        if split > 0 {
+            stage.info(&format!("{split} small things within others are instances of their own"));
         }
     }
     // Damaged Gaussians have no place, so they are nobody's neighbour and stay without an instance.

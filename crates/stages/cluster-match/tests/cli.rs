@@ -145,7 +145,12 @@ impl Scene {
             let noise = |k: usize| ((i * 31 + k * 17) % 23) as f32 * 0.004;
             if i < EACH { [1.0, noise(1), noise(2)] } else { [noise(3), 1.0, noise(4)] }
         };
-        let mut features = Features { kept: graph.kept.clone(), dim: 3, values: (0..n).flat_map(value).collect() };
+        let mut features = Features {
+            kept: graph.kept.clone(),
+            dim: 3,
+            values: (0..n).flat_map(value).collect(),
+            ..Features::default()
+        };
         change(&mut features);
         self.write(&graph, &footprints, &features);
     }
@@ -296,7 +301,8 @@ fn the_provenance_holds_every_option_and_the_forecast_is_near_the_peak() {
     let (_, a) = Instances::read(s.path("out/instances.safetensors")).unwrap();
     let expected = json!({
         "cluster": "free", "min_cluster_size": 8, "min_samples": 30, "epsilon": 0.1, "leaf": false,
-        "allow_single_cluster": false, "noise": "keep", "join": 0.0, "votes": 0, "level": ["large"], "threshold": 0.2,
+        "allow_single_cluster": false, "noise": "keep", "join": 0.0, "votes": 0, "split": 0.0, "level": ["large"],
+        "threshold": 0.2,
     });
     assert_eq!(a.provenance().parameters, expected);
     let record = RunRecord::read(s.path("out/instances.safetensors")).unwrap();
@@ -305,6 +311,29 @@ fn the_provenance_holds_every_option_and_the_forecast_is_near_the_peak() {
         // How much of the program itself lies in memory differs from system to system: 20 MB.
         assert!((forecast - peak).abs() < 0.5 * peak + 20e6, "forecast {forecast}, peak {peak}");
     }
+}
+
+#[test]
+fn parts_that_are_small_beside_their_instance_leave_it() {
+    const SMALL: std::ops::Range<usize> = 0..10;
+    let s = Scene::new();
+    let part = |i: usize| if SMALL.contains(&i) { 2 } else { usize::from(i >= EACH) };
+    s.artifacts(|f| {
+        f.parts_dim = 3;
+        f.parts = (0..2 * EACH).flat_map(|i| [0, 1, 2].map(|c| f32::from(u8::from(c == part(i))))).collect();
+    });
+    let whole = s.succeed(&["--votes", "0", "--min-samples", "3", "--split", "0"]).0;
+    let (i, said) = s.succeed(&["--votes", "0", "--min-samples", "3", "--split", "0.3"]);
+    assert!(whole.len() == 2 && i.len() == 3 && said.contains("1 small things within others"), "{said}");
+    for (at, (&before, &after)) in whole.label.iter().zip(&i.label).enumerate().take(2 * EACH) {
+        assert_eq!(after, if SMALL.contains(&at) { 2 } else { before }, "{at}");
+    }
+    // It is a part of what it was in.
+    let family = i.family(2).unwrap();
+    assert_eq!(family.parent, Some(i.family(whole.label[0] as usize).unwrap().own[0]));
+    assert_eq!(i.gaussians_of_cluster(family.own[0]), SMALL.map(|i| i as u32).collect::<Vec<_>>());
+    // Larger than that share, it stays.
+    assert_eq!(s.succeed(&["--votes", "0", "--min-samples", "3"]).0.len(), 2);
 }
 
 #[test]
@@ -420,7 +449,7 @@ fn scenes_without_anything_are_results_not_errors() {
     };
     let footprints =
         FootprintsBuilder { views: vec!["v0".into()], kept: vec![0], row_ptr: vec![0], ..Default::default() };
-    s.write(&graph, &footprints, &Features { kept: vec![0], dim: 2, values: vec![1.0, 0.0] });
+    s.write(&graph, &footprints, &Features { kept: vec![0], dim: 2, values: vec![1.0, 0.0], ..Features::default() });
     let (i, said) = s.succeed(&[]);
     assert_eq!(i.label, [-1]);
     assert!(said.contains("skipped 3 of 4 views in matching") && said.contains("v1, v2, v3"), "{said}");

@@ -2,8 +2,10 @@
 
 use crate::inputs::Inputs;
 use crate::options::Options;
+use crate::spectral;
 use crate::spectral::evidence::masks_of_blocks;
 use crate::spectral::gram;
+use artifacts::Level;
 
 /// Peak memory in bytes of a run on these inputs.
 pub fn forecast(inputs: &Inputs, options: &Options) -> u64 {
@@ -16,11 +18,19 @@ pub fn forecast(inputs: &Inputs, options: &Options) -> u64 {
         let state = 500 * options.trained_dim() as u64 / 6 + if options.contrastive.layers > 0 { 36 } else { 0 };
         return 4_700_000 + 19 * entries.len() as u64 / 2 + read + state * gaussians;
     }
-    let rows = footprints.rows.iter().enumerate().filter(|(_, row)| options.uses(row.level));
-    let (masks, used) = rows.fold((0, 0), |(masks, used), (r, _)| (masks + 1, used + start[r + 1] - start[r]));
-    let dim = options.most_vectors(footprints.kept.len()).min(masks) as u64;
-    let product = gram::bytes(&masks_of_blocks(footprints, &inputs.graph, &options.levels()), used);
-    // The footprints, the graph, the matrix (the average over neighbours gives it two thirds more entries than the footprints
-    // have), and the features, for all of them and for the blocks at work.
-    3_600_000 + 8 * entries.len() as u64 + read + 462 * gaussians + 14 * used + product + 8 * gaussians * dim
+    // The matrix (the average over neighbours gives it two thirds more entries than the footprints have), and the features, for all
+    // of them and for the blocks at work.
+    let of = |levels: &[Level]| {
+        let rows = footprints.rows.iter().enumerate().filter(|(_, row)| levels.iter().any(|&l| l as u32 == row.level));
+        let (masks, used) = rows.fold((0, 0), |(masks, used), (r, _)| (masks + 1, used + start[r + 1] - start[r]));
+        let dim = options.most_vectors(footprints.kept.len()).min(masks) as u64;
+        let product = gram::bytes(&masks_of_blocks(footprints, &inputs.graph, levels), used);
+        (14 * used + product + 8 * gaussians * dim, 4 * gaussians * dim)
+    };
+    let levels = options.levels();
+    let (features, kept) = of(&levels);
+    // The features of parts are made when those are there.
+    let parts = if spectral::has_parts(&levels) { kept + of(&[Level::Small]).0 } else { 0 };
+    // With the footprints and the graph.
+    3_600_000 + 8 * entries.len() as u64 + read + 462 * gaussians + features.max(parts)
 }

@@ -228,11 +228,6 @@ impl Options {
         }
     }
 
-    /// Whether masks of `level`, as the footprints number it, count.
-    pub(crate) fn uses(&self, level: u32) -> bool {
-        self.levels().iter().any(|&l| l as u32 == level)
-    }
-
     /// Dimension of trained features.
     pub(crate) fn trained_dim(&self) -> usize {
         self.dim.unwrap_or(PAPER_DIM)

@@ -10,6 +10,8 @@ pub struct Made {
     pub dim: usize,
     /// `[n][dim]`, in the order of the graph's kept Gaussians.
     pub values: Vec<f32>,
+    /// Dimension of the features of parts, and they, `[n][dim]`; 0 where there are none.
+    pub parts: (usize, Vec<f32>),
     pub summary: Value,
 }
 

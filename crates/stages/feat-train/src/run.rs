@@ -41,7 +41,8 @@ impl Program for Args {
         };
 
         let parameters = self.options.parameters(self.common.seed);
-        let features = Features { kept: inputs.graph.kept, dim: made.dim, values: made.values };
+        let (parts_dim, parts) = made.parts;
+        let features = Features { kept: inputs.graph.kept, dim: made.dim, values: made.values, parts_dim, parts };
         watched.check()?;
         features.write(&self.out, stage.provenance("", 0, parameters.clone(), inputs.hashes.clone()))?;
         // The run is complete: what is left of it must not look like an unfinished one.

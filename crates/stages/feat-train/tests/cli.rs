@@ -24,6 +24,10 @@ fn gaussians() -> Gaussians {
 }
 
 fn write(dir: &Path, gaussians: &Gaussians, graph: &Graph) {
+    write_with(dir, gaussians, graph, footprints());
+}
+
+fn write_with(dir: &Path, gaussians: &Gaussians, graph: &Graph, footprints: FootprintsBuilder) {
     let geometry = dir.join("geometry.ply");
     ply::write_gaussians(&geometry, gaussians, &[]).unwrap();
     let inputs = BTreeMap::from([
@@ -32,7 +36,7 @@ fn write(dir: &Path, gaussians: &Gaussians, graph: &Graph) {
     ]);
     let provenance = Provenance { inputs, ..Provenance::default() };
     graph.write(dir.join("graph.safetensors"), provenance.clone()).unwrap();
-    footprints().write(dir.join("footprints.safetensors"), provenance).unwrap();
+    footprints.write(dir.join("footprints.safetensors"), provenance).unwrap();
 }
 
 fn graph() -> Graph {
@@ -145,6 +149,29 @@ fn the_closed_form_tells_things_apart_and_not_their_halves() {
     assert!(cosine(45, 75) > 0.8, "the halves of a thing stay together: {}", cosine(45, 75));
     assert!(cosine(5, 60) < 0.3 && cosine(60, 115) < 0.3 && cosine(5, 115) < 0.3);
     assert!(curve(&out, "iteration")[0] == 1.0 && curve(&out, "singular_value")[0] > 0.9);
+}
+
+#[test]
+fn parts_are_what_level_small_shows() {
+    let (dir, out) = setup();
+    succeed(dir.path(), &out, &[]);
+    assert_eq!(Features::read(&out).unwrap().0.parts_dim, 0, "no masks of level small");
+    let mut f = footprints();
+    for view in 0..VIEWS as u32 {
+        for part in 0..6 {
+            let row = Row { view, level: 1, mask: 5 + part, pixels: 100, gated: 90, alpha: 0.9 };
+            f.push(row, (20 * part..20 * part + 20).map(|i| (i, 1.0)));
+        }
+    }
+    write_with(dir.path(), &gaussians(), &graph(), f);
+    succeed(dir.path(), &out, &[]);
+    let (f, _) = Features::read(&out).unwrap();
+    let part = |i: usize| &f.parts[i * f.parts_dim..(i + 1) * f.parts_dim];
+    let cosine = |a: &[f32], b: &[f32]| a.iter().zip(b).map(|(a, b)| a * b).sum::<f32>();
+    assert!(cosine(part(5), part(15)) > 0.9 && cosine(part(5), part(35)) < 0.5, "halves of a thing are parts");
+    assert!(cosine(f.row(5), f.row(35)) > cosine(part(5), part(35)) + 0.2);
+    succeed(dir.path(), &out, &["--levels", "small"]);
+    assert_eq!(Features::read(&out).unwrap().0.parts_dim, 0, "the features are of that level");
 }
 
 #[test]

@@ -253,7 +253,7 @@ mod tests {
         let mut i = instances();
         i.label = vec![0, 1, 3, 3, -1];
         let values = vec![1.0, 0.0, 0.9, 0.3, -2.0, 0.1, -1.0, 0.0, 0.0, 0.0];
-        let f = Features { kept: vec![0, 1, 2, 3, 4], dim: 2, values };
+        let f = Features { kept: vec![0, 1, 2, 3, 4], dim: 2, values, ..Features::default() };
         let ranking = rank(&[1.0, 0.0]);
         assert_eq!(Join::new(&i, &f, 0.9).extend(&ranking, 0, &[0]), [0, 1]);
         assert_eq!(Join::new(&i, &f, 0.1).extend(&ranking, 0, &[0]), [0]);

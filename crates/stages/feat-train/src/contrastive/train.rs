@@ -98,7 +98,7 @@ pub fn train(args: &Args, inputs: &Inputs, context: &Context, sets: &[MaskSet], 
     draw(&state.curve)?;
     let summary = json!({ "views": sets.len(), "last": last, "resumed_at": resumed_at, "iterations": state.iteration,
         "gaussians": inputs.graph.kept.len(), "network_bytes": solver.network_bytes() });
-    Ok(Made { dim, values: solver.final_features(&state.model), summary })
+    Ok(Made { dim, values: solver.final_features(&state.model), parts: (0, Vec::new()), summary })
 }
 
 /// The sets that are held out and those that are learnt from.

@@ -15,6 +15,7 @@ pub mod vectors;
 use crate::inputs::Inputs;
 use crate::options::Args;
 use crate::outputs::{Made, write_curve};
+use artifacts::Level;
 use gs_io::{Error, Result};
 use report::curve::Panel;
 use serde_json::json;
@@ -23,6 +24,10 @@ use std::time::Instant;
 use vectors::{Spectral, SpectralOptions, spectral};
 
 const SPECTRUM: [Panel; 1] = [("singular_value", "singular values", "#1f77b4")];
+
+/// Cutoff of the features of parts, as a share of that of the features. Chosen on four scenes with real masks: at the same cutoff
+/// what stands on a shelf runs together with it.
+const PARTS_CUTOFF: f64 = 0.75;
 
 /// Computes the features and writes their spectrum as the curve.
 pub fn features(args: &Args, inputs: &Inputs, stage: &Stage) -> Result<Made> {
@@ -65,5 +70,25 @@ pub fn features(args: &Args, inputs: &Inputs, stage: &Stage) -> Result<Made> {
         "without_mask": without, "entries": matrix.entries(), "gram_entries": gram_entries,
         "singular_values": found.values,
     });
-    Ok(Made { dim, values: features, summary })
+    drop(matrix);
+    let parts = parts(&levels, inputs, &SpectralOptions { cutoff: PARTS_CUTOFF * cutoff, ..options }, stage)?;
+    Ok(Made { dim, values: features, parts, summary })
+}
+
+/// Whether there are features of parts: not where all features are of level small already, or none is.
+pub(crate) fn has_parts(levels: &[Level]) -> bool {
+    levels.contains(&Level::Small) && levels.iter().any(|&l| l != Level::Small)
+}
+
+/// Features of parts and their dimension: the masks of level small alone, with a lower cutoff. None where that has no masks.
+fn parts(levels: &[Level], inputs: &Inputs, options: &SpectralOptions, stage: &Stage) -> Result<(usize, Vec<f32>)> {
+    if !has_parts(levels) {
+        return Ok((0, Vec::new()));
+    }
+    let matrix = evidence::collect(&inputs.footprints, &inputs.graph, &[Level::Small]);
+    if matrix.masks.is_empty() {
+        return Ok((0, Vec::new()));
+    }
+    let Spectral { dim, features, .. } = spectral(&matrix, options, stage)?;
+    Ok((dim, features))
 }
