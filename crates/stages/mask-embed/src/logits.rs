@@ -1,5 +1,6 @@
 //! How sure a mask is of each pixel, kept where it matters.
 
+use crate::regions::Patch;
 use crate::sam::{Embedded, Sam};
 
 /// The part of the decoder's square that shows the photograph.
@@ -51,32 +52,35 @@ impl Logits {
         Self { bounds: [left, top, right, bottom], values }
     }
 
-    /// The mask at another resolution: pixels where the linearly interpolated logits are positive.
-    pub fn enlarge(&self, grid: &Grid, width: usize, height: usize) -> Vec<bool> {
+    /// The mask in a picture of another size: pixels where the linearly interpolated logits are positive.
+    pub fn enlarge(&self, grid: &Grid, width: usize, height: usize) -> Patch {
         let [left, top, right, bottom] = self.bounds;
-        let columns = taps(width, grid.extent[0], grid.width);
-        let rows = taps(height, grid.extent[1], grid.height);
-        let mut mask = vec![false; width * height];
-        for (out, &(y0, y1, fy)) in mask.chunks_exact_mut(width).zip(&rows) {
-            if y0 < top || y1 >= bottom {
-                continue;
-            }
+        let within = |taps: Vec<Taps>, first: usize, end: usize| {
+            let skipped = taps.iter().take_while(|t| t.0 < first).count();
+            (skipped, taps.into_iter().skip(skipped).take_while(|t| t.1 < end).collect::<Vec<_>>())
+        };
+        let (x, columns) = within(taps(width, grid.extent[0], grid.width), left, right);
+        let (y, rows) = within(taps(height, grid.extent[1], grid.height), top, bottom);
+        let mut mask = Vec::with_capacity(columns.len() * rows.len());
+        for (y0, y1, fy) in rows {
             let row = |y: usize| &self.values[(y - top) * (right - left)..][..right - left];
             let (above, below) = (row(y0), row(y1));
-            for (inside, &(x0, x1, fx)) in out.iter_mut().zip(&columns).filter(|(_, c)| c.0 >= left && c.1 < right) {
+            mask.extend(columns.iter().map(|&(x0, x1, fx)| {
                 let (x0, x1) = (x0 - left, x1 - left);
                 let a = above[x0] + (above[x1] - above[x0]) * fx;
                 let b = below[x0] + (below[x1] - below[x0]) * fx;
-                *inside = a + (b - a) * fy > 0.0;
-            }
+                a + (b - a) * fy > 0.0
+            }));
         }
-        mask
+        Patch { x, y, width: columns.len(), mask }
     }
 }
 
-/// Two neighbours and the weight of the second, for each of `n` pixels that `extent` pixels of the grid are enlarged to;
-/// the grid has `last` pixels.
-fn taps(n: usize, extent: f64, last: usize) -> Vec<(usize, usize, f32)> {
+/// Two neighbours and the weight of the second.
+type Taps = (usize, usize, f32);
+
+/// Those of each of `n` pixels that `extent` pixels of the grid are enlarged to; the grid has `last` pixels.
+fn taps(n: usize, extent: f64, last: usize) -> Vec<Taps> {
     (0..n)
         .map(|i| {
             let at = ((i as f64 + 0.5) / n as f64 * extent - 0.5).clamp(0.0, (last - 1) as f64);
@@ -121,7 +125,10 @@ mod tests {
             let pixels = Pixels::new(w, logits.iter().map(|&l| l > 0.0));
             let cut = Logits::new(|y| &logits[y * w..(y + 1) * w], &grid, pixels.bounds);
             prop_assert!(cut.values.len() <= logits.len());
-            prop_assert_eq!(cut.enlarge(&grid, width, height), enlarge_whole(&logits, &grid, width, height));
+            let patch = cut.enlarge(&grid, width, height);
+            let mut whole = vec![false; width * height];
+            patch.pixels().for_each(|(x, y)| whole[y * width + x] = true);
+            prop_assert_eq!(whole, enlarge_whole(&logits, &grid, width, height));
         }
     }
 }

@@ -112,9 +112,9 @@ fn forecast(args: &MasksArgs, sam: &Sam, views: &[View], stage: &Stage) -> Resul
     let (side, pixels) = (args.choice.points_per_side as u64, photographs::largest(views));
     let map = if args.map_size == 0 { pixels } else { pixels.min((args.map_size * args.map_size * 3 / 4) as u64) };
     // Of every third point of the grid or so that is asked three masks wait with their logits, 200 kB where one fills the
-    // picture; then the masks of a level in the map's size, a byte a pixel.
+    // picture; then the map, 16 bytes a pixel, and the masks of a level, a byte for each pixel of their boxes.
     let waiting = 100_000 * (side * side * 3 / 4);
-    let needed = peak_rss_bytes().unwrap_or(0) + waiting + 6 * pixels + 60 * map;
+    let needed = peak_rss_bytes().unwrap_or(0) + waiting + 6 * pixels + 30 * map;
     stage.forecast(needed, "give fewer --threads, or smaller photographs (--resolution) and maps (--map-size)")
 }
 

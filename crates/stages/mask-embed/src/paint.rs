@@ -1,7 +1,7 @@
 //! From chosen masks to an id map, and id maps as pictures.
 
 use crate::automatic::Proposals;
-use crate::regions::clean;
+use crate::regions::Patch;
 use artifacts::{LEVELS, MaskMaps, instance_color};
 use onnx_models::RgbImage;
 use rayon::prelude::*;
@@ -44,19 +44,17 @@ pub fn paint(proposals: &Proposals, chosen: &[Vec<usize>; LEVELS], size: MapSize
     for (level, indices) in chosen.iter().enumerate() {
         let whole = |&i: &usize| {
             let mut mask = proposals.masks[i].logits.enlarge(&proposals.grid, width, height);
-            clean(&mut mask, width, min_area);
-            (mask.iter().filter(|&&m| m).count(), i, mask)
+            mask.clean([width, height], min_area);
+            (mask.pixels().count(), i, mask)
         };
-        let mut masks: Vec<(usize, usize, Vec<bool>)> = indices.par_iter().map(whole).collect();
+        let mut masks: Vec<(usize, usize, Patch)> = indices.par_iter().map(whole).collect();
         // From large to small; equal areas by order of prompts.
         masks.sort_by(|a, b| b.0.cmp(&a.0).then(a.1.cmp(&b.1)));
         let map = &mut ids[level * width * height..(level + 1) * width * height];
         loop {
             map.fill(-1);
             for (id, (_, _, mask)) in masks.iter().enumerate() {
-                for (pixel, _) in map.iter_mut().zip(mask).filter(|(_, m)| **m) {
-                    *pixel = id as i32;
-                }
+                mask.pixels().for_each(|(x, y)| map[y * width + x] = id as i32);
             }
             let mut owned = vec![0usize; masks.len()];
             for id in map.iter().filter_map(|&id| usize::try_from(id).ok()) {
