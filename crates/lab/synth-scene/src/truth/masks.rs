@@ -7,7 +7,7 @@
 //!   `small` and `medium` it is shown whole, or two of its parts become one. A thing without such a choice (one part,
 //!   no neighbour) stays as it is, and background is never merged;
 //! * torn masks: what lies apart in the image has masks of its own;
-//! * swallowed masks: what touches another mask is in it, most often the same pairs ([`regions`]);
+//! * swallowed masks: what touches another mask is in it, most often the same pairs (regions.rs);
 //! * boundaries: each mask shrinks or grows by up to so many pixels; masks painted later win;
 //! * missing masks;
 //! * spurious masks: patches that are no thing, such as a highlight, a shadow or half of a wall.

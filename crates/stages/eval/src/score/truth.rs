@@ -56,7 +56,7 @@ pub fn score_instances(scene: &LabelledScene, root: &Path, scores: &mut Scores) 
     Ok(())
 }
 
-/// Labels of Gaussians that suit [`score_instances`] best: each takes the thing of most of the surface points whose nearest
+/// Labels of Gaussians that suit `eval score` best: each takes the thing of most of the surface points whose nearest
 /// Gaussian of opacity at least 0.1 it is (of equals the one of the lower id), one that is no point's nearest the thing of the
 /// point nearest to it. -1 for damaged Gaussians, and where there is no thing.
 pub fn true_labels(geometry: &Geometry, truth: &TruePoints) -> Vec<i32> {
@@ -80,7 +80,7 @@ pub fn true_labels(geometry: &Geometry, truth: &TruePoints) -> Vec<i32> {
 }
 
 /// The confidence of `instances` instances that suits average precision best: the IoU of each with the thing whose best it is,
-/// as [`score_instances`] finds it, 0 to 1. `labels` are those of all Gaussians, -1 for none.
+/// as `eval score` finds it, 0 to 1. `labels` are those of all Gaussians, -1 for none.
 pub fn true_confidence(geometry: &Geometry, labels: &[i32], instances: usize, truth: &TruePoints) -> Vec<f32> {
     let label = |nearest: Option<u32>| nearest.map_or(-1, |i| labels[i as usize]);
     let found = nearest_solid(&geometry.gaussians, &truth.position, |i| labels[i] >= 0);
