@@ -123,12 +123,13 @@ impl Assignment {
         found.retain(|&whole, parts| 2 * parts.iter().map(|(_, n)| n).sum::<usize>() <= sizes[whole as usize]);
         let before = self.instances;
         let mut new = BTreeMap::new();
+        let mut child = self.tree.iter().map(|e| e.child).max().unwrap_or(0);
         for (whole, parts) in found {
             // Of a joined instance the first cluster; the whole scene is no cluster of the tree.
             let above = self.tree.iter().find(|e| e.instance == whole).copied();
             for (part, n) in parts {
                 let node = above.map(|e| {
-                    let child = self.tree.iter().map(|e| e.child).max().map_or(0, |c| c + 1);
+                    child += 1;
                     let instance = self.instances as i32;
                     // The features of wholes do not part them at any distance.
                     let lambda = f32::MAX;

@@ -83,9 +83,9 @@ pub(crate) struct Settings {
     /// is 0
     #[arg(long, value_name = "ROUNDS", default_value = "3", default_value_if("cluster", "free", "0"))]
     pub votes: usize,
-    /// Make an instance of what the masks of level small show apart within an instance, if it has at most this share of that
-    /// instance's Gaussians, 0 to 0.5: what stands on a shelf is no shelf. 0 for none, as are features without parts; for free
-    /// points the default is 0
+    /// Let small parts leave their instance and become instances: what stands on a shelf is no shelf. The largest share of the
+    /// instance's Gaussians that such a part may have, 0 to 0.5; 0 lets none leave. The masks of level small show the parts, so
+    /// features of other levels alone have none; for free points the default is 0
     #[arg(long, value_name = "SHARE", value_parser = stage::within(0.0..=0.5), default_value = "0.03",
         default_value_if("cluster", "free", "0"))]
     pub split: f64,

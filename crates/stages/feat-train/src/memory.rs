@@ -3,7 +3,7 @@
 use crate::inputs::Inputs;
 use crate::options::Options;
 use crate::spectral;
-use crate::spectral::evidence::masks_of_blocks;
+use crate::spectral::evidence::{blocks, masks_of_blocks};
 use crate::spectral::gram;
 use artifacts::Level;
 
@@ -20,11 +20,12 @@ pub fn forecast(inputs: &Inputs, options: &Options) -> u64 {
     }
     // The matrix (the average over neighbours gives it two thirds more entries than the footprints have), and the features, for all
     // of them and for the blocks at work.
+    let blocks = blocks(&inputs.graph);
     let of = |levels: &[Level]| {
         let rows = footprints.rows.iter().enumerate().filter(|(_, row)| levels.iter().any(|&l| l as u32 == row.level));
         let (masks, used) = rows.fold((0, 0), |(masks, used), (r, _)| (masks + 1, used + start[r + 1] - start[r]));
         let dim = options.most_vectors(footprints.kept.len()).min(masks) as u64;
-        let product = gram::bytes(&masks_of_blocks(footprints, &inputs.graph, levels), used);
+        let product = gram::bytes(&masks_of_blocks(footprints, &blocks, levels), used);
         (14 * used + product + 8 * gaussians * dim, 4 * gaussians * dim)
     };
     let levels = options.levels();

@@ -29,17 +29,22 @@ pub fn collect(footprints: &Footprints, graph: &Graph, levels: &[Level]) -> Matr
     matrix(masks, rows, &Neighbours { k: graph.gaussian_k, items: &graph.gaussian_knn })
 }
 
-/// How many masks at `levels` each block of [`collect`]'s matrix will know, but for those that its neighbourhood adds.
-pub fn masks_of_blocks(footprints: &Footprints, graph: &Graph, levels: &[Level]) -> Vec<usize> {
+/// The block of [`collect`]'s matrix that each Gaussian will be in, and the number of blocks.
+pub fn blocks(graph: &Graph) -> (Vec<u32>, usize) {
     let n = graph.kept.len();
     let parts = patches(n, &Neighbours { k: graph.gaussian_k, items: &graph.gaussian_knn });
     let mut block = vec![0u32; n];
     for (b, part) in parts.iter().enumerate() {
         part.iter().for_each(|&i| block[i as usize] = b as u32);
     }
+    (block, parts.len())
+}
+
+/// How many masks at `levels` each of the [`blocks`] will know, but for those that its neighbourhood adds.
+pub fn masks_of_blocks(footprints: &Footprints, (block, count): &(Vec<u32>, usize), levels: &[Level]) -> Vec<usize> {
     let used = |r: &usize| levels.iter().any(|&l| l as u32 == footprints.rows[*r].level);
     // The last mask that a block was seen to know.
-    let (mut last, mut known) = (vec![usize::MAX; parts.len()], vec![0; parts.len()]);
+    let (mut last, mut known) = (vec![usize::MAX; *count], vec![0; *count]);
     for r in (0..footprints.rows.len()).filter(used) {
         for &i in footprints.entries(r).0 {
             let b = block[i as usize] as usize;
