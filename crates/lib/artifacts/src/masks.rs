@@ -157,6 +157,16 @@ impl MaskMaps {
         &self.ids[level as usize * n..(level as usize + 1) * n]
     }
 
+    /// Forgets the masks of all levels but these.
+    pub fn keep(&mut self, levels: &[Level]) {
+        let n = self.width * self.height;
+        for (level, ids) in Level::ALL.iter().zip(self.ids.chunks_exact_mut(n.max(1))) {
+            if !levels.contains(level) {
+                ids.fill(-1);
+            }
+        }
+    }
+
     /// Refuses maps, read from `file`, of another shape than a photograph of `width` x `height`: maps may be of another size.
     ///
     /// # Errors

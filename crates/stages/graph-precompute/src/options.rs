@@ -2,6 +2,7 @@
 
 #![allow(rustdoc::invalid_html_tags, reason = "help texts name files as <view>_s.npy")]
 
+use artifacts::Level;
 use serde::Serialize;
 use stage::CommonArgs;
 use std::path::PathBuf;
@@ -46,11 +47,18 @@ pub(crate) struct Settings {
     /// Neighbours per anchor
     #[arg(long, value_name = "COUNT", default_value_t = 16, value_parser = stage::within(1usize..=1024))]
     pub k: usize,
-    /// A pixel counts where its accumulated alpha exceeds this
-    #[arg(long, value_name = "ALPHA", default_value_t = 0.7, value_parser = stage::within(0.0..=0.999))]
+    /// Levels of the masks, with commas between: default, small, medium, large. The files hold no others, so the later stages
+    /// can use no others
+    #[arg(long, value_name = "LEVELS", value_delimiter = ',', default_value = "default,small,medium,large")]
+    pub levels: Vec<Level>,
+    /// A pixel counts where its accumulated alpha exceeds this; with --preset literal the default is 0
+    #[arg(long, value_name = "ALPHA", value_parser = stage::within(0.0..=0.999), default_value = "0.7",
+        default_value_if("preset", "literal", "0"))]
     pub gate: f64,
-    /// Leave out masks of fewer pixels, counted in an image of 986 x 728 and scaled down for smaller id maps
-    #[arg(long, value_name = "PIXELS", default_value_t = 50.0, value_parser = stage::within(0.0..=1e9))]
+    /// Leave out masks of fewer pixels, counted in an image of 986 x 728 and scaled down for smaller id maps; with --preset
+    /// literal the default is 0
+    #[arg(long, value_name = "PIXELS", value_parser = stage::within(0.0..=1e9), default_value = "50",
+        default_value_if("preset", "literal", "0"))]
     pub min_mask_pixels: f64,
     /// Drop footprint entries below this share of their mask; 0 keeps all. The largest change is reported
     #[arg(long, value_name = "SHARE", default_value_t = 0.0, value_parser = stage::within(0.0..=0.999))]
@@ -79,13 +87,13 @@ pub(crate) enum Views {
 #[derive(Debug, Clone, Copy, PartialEq, Eq, clap::ValueEnum, Serialize)]
 #[serde(rename_all = "lowercase")]
 pub(crate) enum Preset {
-    /// The paper read literally: anchors are sampled among all Gaussians, seen or not
-    Paper,
+    /// The paper as printed: anchors are sampled among all Gaussians, seen or not, and every pixel of every mask counts
+    Literal,
 }
 
 impl Settings {
     /// Whether Gaussians that no view sees take part.
     pub fn keep_unseen(&self) -> bool {
-        self.skip.no_skip || self.preset == Some(Preset::Paper)
+        self.skip.no_skip || self.preset == Some(Preset::Literal)
     }
 }

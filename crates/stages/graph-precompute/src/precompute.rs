@@ -150,7 +150,8 @@ impl<'a> Collected<'a> {
     /// Adds the masks of a view.
     fn add(&mut self, view: &View, masks: &Path, settings: &Settings, seed: u64) -> Result<()> {
         let file = maps_path(masks, view.stem());
-        let maps = MaskMaps::read(&file)?;
+        let mut maps = MaskMaps::read(&file)?;
+        maps.keep(&settings.levels);
         // The map may be smaller than the photograph, but not of another shape.
         maps.expect_shape(view.camera.width, view.camera.height, &file)?;
         let camera = view.camera.resized(maps.width as u32, maps.height as u32);

@@ -1,6 +1,6 @@
 //! The program on a small scene on disk: the artifacts, the same bytes for any thread count, and bad input.
 
-use artifacts::{Footprints, Graph, MaskMaps};
+use artifacts::{Footprints, Graph, MaskMaps, Level, Row};
 use glam::DVec3;
 use gs_scene::{Camera, Gaussians, Image, PointCloud, colmap, ply};
 use std::path::{Path, PathBuf};
@@ -87,7 +87,7 @@ fn artifacts_are_right_and_the_same_for_any_number_of_threads() {
 
     // The provenance holds every option.
     let expected = serde_json::json!({
-        "views": "train", "holdout": 8, "anchor_ratio": 0.1, "k": 16, "gate": 0.7, "min_mask_pixels": 50.0, "cut": 0.0,
+        "views": "train", "holdout": 8, "anchor_ratio": 0.1, "k": 16, "levels": ["default", "small", "medium", "large"], "gate": 0.7, "min_mask_pixels": 50.0, "cut": 0.0,
         "pixel_samples": 0, "no_skip": false, "preset": null, "seed": 0,
     });
     assert_eq!(a.provenance().parameters, expected);
@@ -189,8 +189,28 @@ fn damaged_gaussians_are_left_out_and_said_to_be() {
     let summary = &serde_json::from_str::<serde_json::Value>(&record).unwrap()["summary"];
     assert_eq!((&summary["damaged"], &summary["unusable"]), (&3.into(), &1.into()), "{record}");
     // The paper's preset keeps what no view sees, but nothing without a place.
-    succeed(&run(&s, &o, &["--preset", "paper"]));
-    assert_eq!(Graph::read(o.join("graph.safetensors")).unwrap().0.kept.len(), 57);
+    succeed(&run(&s, &o, &["--preset", "literal"]));
+    let (graph, a) = Graph::read(o.join("graph.safetensors")).unwrap();
+    assert_eq!(graph.kept.len(), 57);
+    let parameters = &a.provenance().parameters;
+    assert_eq!((&parameters["gate"], &parameters["min_mask_pixels"]), (&0.0.into(), &0.0.into()));
+}
+
+#[test]
+fn only_the_masks_of_the_named_levels_are_kept() {
+    let (_dir, s, o) = setup(SIZE);
+    let footprints = || Footprints::read(o.join("footprints.safetensors")).unwrap();
+    succeed(&run(&s, &o, &[]));
+    let all = footprints();
+    succeed(&run(&s, &o, &["--levels", "large,small"]));
+    let some = footprints();
+    let of = |f: &Footprints| -> Vec<(Row, Vec<(u32, f32)>)> {
+        let wanted = |r: &usize| [Level::Small, Level::Large].iter().any(|&l| l as u32 == f.rows[*r].level);
+        let entries = |r| f.entries(r).0.iter().copied().zip(f.entries(r).1.iter().copied()).collect();
+        (0..f.rows.len()).filter(wanted).map(|r| (f.rows[r], entries(r))).collect()
+    };
+    assert_eq!(of(&all), of(&some));
+    assert!(some.rows.len() < all.rows.len() && some.rows.len() == of(&some).len());
 }
 
 #[test]
