@@ -19,7 +19,7 @@ BIN = Path(os.environ.get("BIN", "target/release"))
 FAMILIES = {"studio": 14, "table": 24, "kitchen": 24, "room": 24}
 TUNING, REPORTING = [0, 1, 2], [10, 11, 12, 13, 14]
 VIEWS = 32
-LARGE = (["--levels", "large"], ["--level", "large"])
+LARGE = (["--levels", "large"], ["--levels", "large"])
 # Name: masks, options of feat-train, options of cluster-match. A method's files have its name: rename it where options change.
 METHODS = {
     "default": ("masks", [], []),

@@ -72,7 +72,7 @@ impl Health {
         let percent = |v: f64| format!("{:.0} %", 100.0 * v);
         let (largest, purity) = (percent(self.largest), self.purity.map_or("no masks".into(), percent));
         let too_large = format!(
-            "one instance holds {largest} of the Gaussians; if it is more than floor or walls, try cluster-match --level \
+            "one instance holds {largest} of the Gaussians; if it is more than floor or walls, try cluster-match --levels \
              small, or feat-train --levels small"
         );
         let impure = "the masks of the views contradict each other; look at the masks in the report, and try feat-train \
@@ -125,7 +125,7 @@ mod tests {
         let shared = vec![pair(3, 17, 0.85), pair(1, 2, 0.84), pair(4, 5, 0.83), pair(6, 7, 0.8)];
         let doubtful = Health { largest: 0.4, purity: Some(0.6), sharing: 0.2, pairs: 9, shared };
         let advice = doubtful.findings().map(|f| f.advice.unwrap());
-        assert!(advice[0].contains("40 %") && advice[0].contains("--level small"), "{advice:?}");
+        assert!(advice[0].contains("40 %") && advice[0].contains("--levels small"), "{advice:?}");
         assert!(advice[1].contains("contradict"), "{advice:?}");
         assert!(advice[2].starts_with("instances 3 and 17 share 85 % of their masks, "), "{advice:?}");
         assert!(advice[2].contains("and 6 more pairs") && !advice[2].contains("instances 6 and 7"), "{advice:?}");

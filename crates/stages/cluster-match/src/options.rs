@@ -98,7 +98,7 @@ pub(crate) struct Settings {
         default_value_if("cluster", "free", "large"),
         help_heading = "Matching"
     )]
-    pub level: Vec<Level>,
+    pub levels: Vec<Level>,
     /// Least association score of a match (IoU x similarity of features)
     #[arg(long, default_value_t = 0.2, value_name = "SCORE", value_parser = stage::within(0.0..=1.0),
         help_heading = "Matching")]

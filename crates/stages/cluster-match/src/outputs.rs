@@ -48,7 +48,7 @@ pub(crate) fn write(
     let [colors, list, table] = SIDE_FILES.map(|extension| a.out.with_extension(extension));
     ply::write_gaussians(colors, &colored(gaussians, &instances.label), &comments)?;
     gs_io::npy::write_i32(list, &[instances.label.len()], &instances.label)?;
-    let health = health::measure(instances, &inputs.footprints, &inputs.graph.kept, &settings.level);
+    let health = health::measure(instances, &inputs.footprints, &inputs.graph.kept, &settings.levels);
     health::say(&health, stage);
     let text = as_text(instances, &health, &parameters);
     write_bytes(table, &serde_json::to_vec_pretty(&text).map_err(fail)?)?;

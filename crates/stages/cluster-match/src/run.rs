@@ -98,13 +98,13 @@ fn correct(mut found: Assignment, inputs: &Inputs, settings: &Settings, stage: &
     let (means, graph, footprints) = (&inputs.geometry.gaussians.means, &inputs.graph, &inputs.footprints);
     let mut kept = vec![false; means.len()];
     graph.kept.iter().for_each(|&i| kept[i as usize] = true);
-    let changed = settle(&mut found, inputs, settings, &settings.level)?;
+    let changed = settle(&mut found, inputs, settings, &settings.levels)?;
     if settings.votes > 0 {
         stage.info(&format!("votes of the masks changed the instance of {changed} Gaussians"));
     }
     if settings.join > 0.0 {
         let before = found.instances;
-        found.join(&graph.kept, footprints, &settings.level, settings.join);
+        found.join(&graph.kept, footprints, &settings.levels, settings.join);
         if found.instances < before {
             stage.info(&format!("{} instances after joining pieces that the masks show as one", found.instances));
         }
@@ -148,7 +148,7 @@ fn match_views(
     for (index, stem) in inputs.views.iter().map(View::stem).enumerate() {
         let maps = MaskMaps::read(maps_path(&a.masks, stem))?;
         let camera = inputs.views[index].camera.resized(maps.width as u32, maps.height as u32);
-        let overlaps = overlaps(gaussians, &raster, labels, &table, &camera, &maps, &settings.level);
+        let overlaps = overlaps(gaussians, &raster, labels, &table, &camera, &maps, &settings.levels);
         found.extend(matches(&overlaps, index as u32, settings.threshold as f32));
         let dim = features.values().next().map(|f| f.dim);
         features.extend(mask_features(&a.masks, stem, &maps, dim)?.map(|f| (index as u32, f)));

@@ -351,26 +351,26 @@ fn options_do_what_they_say() {
         assert!(i.dim == 0 && i.descriptor.is_empty() && said.contains("skipped language descriptors"), "{said}");
     }
     // Another level: one mask for both things, which each covers half of, or the best of two levels.
-    let (i, _) = s.succeed(&["--level", "medium", "--join", "0"]);
+    let (i, _) = s.succeed(&["--levels", "medium", "--join", "0"]);
     assert!(i.matches.iter().all(|m| m.mask == 2 && m.score < 0.7) && !i.matches.is_empty());
     // What masks show as one is joined.
-    let (i, said) = s.succeed(&["--level", "medium"]);
+    let (i, said) = s.succeed(&["--levels", "medium"]);
     assert!(i.len() == 1 && i.label.iter().all(|&l| l == 0) && said.contains("1 instances after joining"), "{said}");
     assert!(i.tree.iter().all(|e| e.instance <= 0));
     // Left apart, they are said to share their masks.
-    let (i, said) = s.succeed(&["--level", "medium", "--cluster", "free", "--min-samples", "5"]);
+    let (i, said) = s.succeed(&["--levels", "medium", "--cluster", "free", "--min-samples", "5"]);
     assert!(i.len() == 2 && said.contains("instances 0 and 1 share 100 % of their masks: each pair"), "{said}");
-    let (i, _) = s.succeed(&["--level", "medium,large"]);
+    let (i, _) = s.succeed(&["--levels", "medium,large"]);
     assert!(i.matches.len() == 2 * VIEWS && i.matches.iter().all(|m| m.mask >= 3));
     assert!(s.succeed(&["--threshold", "1"]).0.matches.is_empty());
 
     // One PLY per instance, none left from an earlier run.
     let folder = s.path("plys");
     let plys = ["--per-instance-plys", folder.to_str().unwrap()];
-    assert_eq!(s.succeed(&[&plys[..], &["--level", "medium"]].concat()).0.len(), 1);
+    assert_eq!(s.succeed(&[&plys[..], &["--levels", "medium"]].concat()).0.len(), 1);
     s.succeed(&plys);
     assert!(folder.join("instance_0001.ply").exists());
-    s.succeed(&[&plys[..], &["--level", "medium"]].concat());
+    s.succeed(&[&plys[..], &["--levels", "medium"]].concat());
     assert!(!folder.join("instance_0001.ply").exists());
     std::fs::write(folder.join("mine.ply"), "mine").unwrap();
     assert_eq!(s.run(&plys).status.code(), Some(2));
@@ -465,7 +465,7 @@ fn bad_input_is_one_line_and_leaves_outputs_alone() {
         ("--epsilon", "NaN", "expected 0 or more"),
         ("--join", "0.5", "expected 0, or more than 0.5 and at most 1"),
         ("--threshold", "1.5", "expected 0 to 1"),
-        ("--level", "huge", "expected default, small, medium or large"),
+        ("--levels", "huge", "expected default, small, medium or large"),
     ] {
         let out = s.run(&[option, value]);
         let said = String::from_utf8_lossy(&out.stderr).into_owned();

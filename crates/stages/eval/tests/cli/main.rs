@@ -302,7 +302,7 @@ fn a_report_says_whether_masks_and_instances_are_sound() {
     assert!(html.contains("few instances share them") && !html.contains("class=\"doubt\""));
     let html = report(0.5, Some(0.85));
     assert_eq!(html.matches("class=\"doubt\"").count(), 2);
-    assert!(html.contains("instances 0 and 2 share 85 % of their masks") && html.contains("--level small"), "{html}");
+    assert!(html.contains("instances 0 and 2 share 85 % of their masks") && html.contains("--levels small"), "{html}");
     assert!(!html.contains("few instances share them"));
     // Of an older program.
     f.change_instances(|_| ());
