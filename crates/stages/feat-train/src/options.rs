@@ -3,9 +3,9 @@
 #![allow(rustdoc::invalid_html_tags, reason = "help texts name files as <FILE>.curve.svg")]
 
 use artifacts::Level;
-use clap::{Parser, ValueEnum};
+use clap::{ArgAction, Parser, ValueEnum};
 use gs_io::{Error, Result};
-use serde::{Serialize, Serializer};
+use serde::Serialize;
 use serde_json::{Value, json};
 use stage::{CommonArgs, at_least, positive, within};
 use std::path::PathBuf;
@@ -40,7 +40,6 @@ pub struct Options {
     pub preset: Option<Preset>,
     /// Mask levels to use, separated by commas: default, small, medium, large [default: all; large with --preset paper]
     #[arg(long, value_name = "LEVELS", value_delimiter = ',')]
-    #[serde(serialize_with = "names")]
     pub levels: Vec<Level>,
     /// Dimension of the features, 1 to 512, or 2 to 64 with --preset paper [default: 6 with --preset paper; else as many
     /// as --cutoff keeps, at most 256, and from 262,144 Gaussians on fewer, down to 64]
@@ -86,12 +85,15 @@ pub struct Contrastive {
     /// Neighbours of an anchor
     #[arg(long, value_enum, default_value_t = Neighbours::Gaussians)]
     pub neighbours: Neighbours,
-    /// Leave out the ReLU after the last layer
-    #[arg(long)]
-    pub no_last_relu: bool,
-    /// Normalise the feature of each Gaussian to unit length before rendering
-    #[arg(long)]
-    pub unit_length: bool,
+    /// Give every layer a bias, which the paper does not print
+    #[arg(long, value_name = "BOOL", action = ArgAction::Set, default_value_t = false)]
+    pub bias: bool,
+    /// Whether the last layer has a ReLU as the others do
+    #[arg(long, value_name = "BOOL", action = ArgAction::Set, default_value_t = true)]
+    pub last_relu: bool,
+    /// When the feature of each Gaussian is brought to unit length
+    #[arg(long, value_enum, default_value_t = UnitLength::Never)]
+    pub unit_length: UnitLength,
     /// Values that share a mean and a standard deviation in the graph network
     #[arg(long, value_enum, default_value_t = Axis::Channel)]
     pub norm_axis: Axis,
@@ -110,6 +112,10 @@ pub struct Contrastive {
     /// Learning rate of the graph network, above 0
     #[arg(long, value_name = "RATE", default_value_t = 1e-3, value_parser = positive::<f64>)]
     pub weight_lr: f64,
+    /// Pixels of each mask that a loss of pixels looks at, drawn anew in every iteration from those that graph-precompute
+    /// --pixel-samples kept; 0 takes all of them
+    #[arg(long, value_name = "COUNT", default_value_t = 0)]
+    pub pixels: usize,
     /// Weight of the cohesion loss, 0 or more: the mean distance of a mask's sampled pixels from its centroid. Needs
     /// graph-precompute --pixel-samples
     #[arg(long, value_name = "WEIGHT", default_value_t = 0.0, value_parser = at_least(0.0))]
@@ -136,6 +142,18 @@ pub enum Neighbours {
     Anchors,
     /// The nearest anchors, with the same inputs in every layer (the formula's inputs, the text's neighbours).
     AnchorInputs,
+}
+
+/// When the feature of a Gaussian is brought to unit length.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum, Serialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum UnitLength {
+    /// Never: as printed in the paper.
+    Never,
+    /// Before context is added to it, as OpenGaussian normalises what it renders.
+    Before,
+    /// After context was added to it.
+    After,
 }
 
 /// Values that are standardised together.
@@ -250,10 +268,6 @@ impl Options {
     }
 }
 
-fn names<S: Serializer>(levels: &[Level], to: S) -> std::result::Result<S::Ok, S::Error> {
-    to.collect_seq(levels.iter().map(ToString::to_string))
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -273,6 +287,6 @@ mod tests {
             (&json!("paper"), &json!(["large"]), &json!(6))
         );
         assert_eq!(paper["contrastive"], json!(Contrastive { loss: Loss::WithSelf, ..Contrastive::default() }));
-        assert_eq!(paper["contrastive"].as_object().map(serde_json::Map::len), Some(15));
+        assert_eq!(paper["contrastive"].as_object().map(serde_json::Map::len), Some(17));
     }
 }

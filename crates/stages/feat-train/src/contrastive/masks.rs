@@ -5,7 +5,7 @@
 
 use super::context::{Context, inverse};
 use artifacts::{Footprints, Level, PixelSamples};
-use gs_io::{Error, Result};
+use gs_io::{Error, Result, mixed};
 
 /// Most masks of a view at a level: their numbers have 16 bits.
 const MOST_MASKS: usize = 1 << 16;
@@ -164,8 +164,20 @@ impl Pixels {
         out
     }
 
-    pub fn len(&self) -> usize {
-        self.mask.len()
+    /// `count` pixels of each mask, chosen by `noise`, ascending; all pixels where `count` is 0.
+    pub fn drawn(&self, count: usize, noise: u64) -> Vec<usize> {
+        let mut all: Vec<usize> = (0..self.mask.len()).collect();
+        if count == 0 {
+            return all;
+        }
+        let mut chosen = Vec::new();
+        for of_mask in all.chunk_by_mut(|&a, &b| self.mask[a] == self.mask[b]) {
+            of_mask.sort_unstable_by_key(|&p| (mixed(noise ^ p as u64), p));
+            let (few, _) = of_mask.split_at_mut(count.min(of_mask.len()));
+            few.sort_unstable();
+            chosen.extend_from_slice(few);
+        }
+        chosen
     }
 
     pub fn is_empty(&self) -> bool {
@@ -199,5 +211,17 @@ mod tests {
         };
         assert_eq!(p, want);
         assert!(Pixels::of_masks(&PixelSamples::default(), &[1, 2], Some).is_empty());
+    }
+
+    #[test]
+    fn pixels_are_drawn_anew_but_as_many_of_every_mask() {
+        let pixels = Pixels { mask: [vec![0; 20], vec![3; 2], vec![4; 20]].concat(), ..Pixels::default() };
+        assert_eq!(pixels.drawn(0, 1), (0..42).collect::<Vec<_>>());
+        let (first, second) = (pixels.drawn(5, 1), pixels.drawn(5, 2));
+        for drawn in [&first, &second] {
+            assert_eq!([0, 3, 4].map(|k| drawn.iter().filter(|&&p| pixels.mask[p] == k).count()), [5, 2, 5]);
+            assert!(drawn.is_sorted());
+        }
+        assert_ne!(first, second);
     }
 }

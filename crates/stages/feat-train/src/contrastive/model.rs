@@ -9,7 +9,7 @@ use super::network::{self, Activations, Layer};
 use super::normalize::{Moments, channel_moments, row_moments};
 use super::real::Real;
 use super::terms;
-use crate::options::{Axis, Contrastive, Init, Loss, Neighbours};
+use crate::options::{Axis, Contrastive, Init, Loss, Neighbours, UnitLength};
 use crate::random::normal;
 use rand::Rng;
 use rayon::prelude::*;
@@ -66,9 +66,9 @@ impl<T: Real> Model<T> {
             .collect();
         let features =
             context.order.iter().flat_map(|&i| drawn[i as usize * d..(i as usize + 1) * d].to_vec()).collect();
-        let mut layers = network::random_layers(options.layers, d + COLOR, d, context.kind, rng);
+        let mut layers = network::random_layers(options.layers, d + COLOR, d, context.kind, options.bias, rng);
         if let Some(last) = layers.last_mut() {
-            last.relu = !options.no_last_relu;
+            last.relu = options.last_relu;
         }
         Self { dim: d, options, features, layers }
     }
@@ -150,23 +150,22 @@ impl<T: Real> Model<T> {
         (h, sums)
     }
 
-    /// f_final of the Gaussian at `place`: its own feature and what it receives. Returns its length before normalisation to
-    /// unit length, or 1 without that normalisation.
+    /// f_final of the Gaussian at `place`: its own feature and what it receives. Returns the length that was divided by, or 1
+    /// where nothing is brought to unit length.
     #[inline]
     fn final_feature(&self, context: &Context, propagated: &Propagated<T>, place: usize, out: &mut [f64]) -> f64 {
         let d = out.len();
         let own = &self.features[place * d..(place + 1) * d];
         out.iter_mut().zip(own).for_each(|(o, f)| *o = f.get());
+        let mut length = if self.options.unit_length == UnitLength::Before { make_unit(out) } else { 1.0 };
         let source = context.source[place];
         if source != NONE && !propagated.hat.is_empty() {
             let hat = &propagated.hat[source as usize * d..(source as usize + 1) * d];
             out.iter_mut().zip(hat).for_each(|(o, h)| *o += h.get());
         }
-        if !self.options.unit_length {
-            return 1.0;
+        if self.options.unit_length == UnitLength::After {
+            length = make_unit(out);
         }
-        let length = dot(out, out).sqrt();
-        out.iter_mut().for_each(|o| *o = if length > SHORTEST { *o / length } else { 0.0 });
         length
     }
 
@@ -223,8 +222,8 @@ impl<T: Real> Model<T> {
         })
     }
 
-    /// Loss and gradients on the masks of one view. `noise` seeds the halves of [`Loss::HalfMask`]; `beside` are positives
-    /// from another view `[K][d]` for [`Loss::CrossView`].
+    /// Loss and gradients on the masks of one view. `noise` seeds the halves of [`Loss::HalfMask`] and the choice of pixels;
+    /// `beside` are positives from another view `[K][d]` for [`Loss::CrossView`].
     pub fn step(
         &self,
         context: &Context,
@@ -282,7 +281,7 @@ impl<T: Real> Model<T> {
         };
         let of_gaussians = (s.loss == Loss::Gaussian)
             .then(|| terms::of_gaussians(d, s.tau, set, feature, &centroids, &mut *to_centroids));
-        let of_pixels = s.needs_pixels().then(|| terms::of_pixels(d, s, set, feature, &centroids, to_centroids));
+        let of_pixels = s.needs_pixels().then(|| terms::of_pixels(d, s, set, noise, feature, &centroids, to_centroids));
         let mut to_columns = Vec::new();
         for (value, rows) in [of_gaussians, of_pixels].into_iter().flatten() {
             evaluated.loss += value;
@@ -316,12 +315,18 @@ impl<T: Real> Model<T> {
             for rows in &view.to_columns {
                 g.iter_mut().zip(&rows[c * d..(c + 1) * d]).for_each(|(g, v)| *g += v);
             }
-            if self.options.unit_length {
+            if self.options.unit_length == UnitLength::After {
                 let length = self.final_feature(context, propagated, place, &mut f);
-                let of_direction = std::mem::replace(&mut g, vec![0.0; d]);
-                loss::add_direction_gradient(&mut g, &f, length, &of_direction);
+                of_direction(&mut g, &f, length);
             }
-            rows.extend(g.iter().map(|&v| T::of(v)));
+            let mut own = g.clone();
+            if self.options.unit_length == UnitLength::Before {
+                let feature = &self.features[place * d..(place + 1) * d];
+                f.iter_mut().zip(feature).for_each(|(f, v)| *f = v.get());
+                let length = make_unit(&mut f);
+                of_direction(&mut own, &f, length);
+            }
+            rows.extend(own.iter().map(|&v| T::of(v)));
             let source = context.source[place];
             if source != NONE && !propagated.hat.is_empty() {
                 match to_anchors.last_mut() {
@@ -356,6 +361,20 @@ impl<T: Real> Model<T> {
             })
             .collect()
     }
+}
+
+/// Divides a vector by its length, which is returned; one without direction becomes zeros.
+fn make_unit(v: &mut [f64]) -> f64 {
+    let length = dot(v, v).sqrt();
+    v.iter_mut().for_each(|v| *v = if length > SHORTEST { *v / length } else { 0.0 });
+    length
+}
+
+/// Turns the gradient of a direction `unit` into that of the vector of this `length`.
+fn of_direction(gradient: &mut [f64], unit: &[f64], length: f64) {
+    let of_unit = gradient.to_vec();
+    gradient.fill(0.0);
+    loss::add_direction_gradient(gradient, unit, length, &of_unit);
 }
 
 /// Loss of a view, and what the gradients of its columns are computed from.
@@ -443,12 +462,15 @@ mod tests {
         }
         check(Contrastive::default(), Gaussians, false);
         check(Contrastive::default(), Neighbours::AnchorInputs, true);
-        check(Contrastive { no_last_relu: true, ..Contrastive::default() }, Gaussians, true);
-        for kind in [Gaussians, Anchors] {
-            check(Contrastive { unit_length: true, no_last_relu: true, ..Contrastive::default() }, kind, true);
-        }
-        for loss in [Loss::Gaussian, Loss::Pixel] {
-            check(Contrastive { loss, unit_length: true, ..Contrastive::default() }, Gaussians, true);
+        check(Contrastive { last_relu: false, bias: true, ..Contrastive::default() }, Gaussians, true);
+        for unit_length in [UnitLength::Before, UnitLength::After] {
+            let unit = Contrastive { unit_length, ..Contrastive::default() };
+            for kind in [Gaussians, Anchors] {
+                check(Contrastive { last_relu: false, bias: true, ..unit.clone() }, kind, true);
+            }
+            for loss in [Loss::Gaussian, Loss::Pixel] {
+                check(Contrastive { loss, ..unit.clone() }, Gaussians, true);
+            }
         }
         for loss in [Loss::WithSelf, Loss::HalfMask, Loss::CrossView, Loss::Gaussian, Loss::Pixel] {
             for norm_axis in [Axis::Channel, Axis::Gaussian] {
@@ -457,7 +479,7 @@ mod tests {
         }
         let cohesive = Contrastive { cohesion: 0.3, tau: 0.5, init: Init::NormalSmall, ..Contrastive::default() };
         check(cohesive.clone(), Gaussians, true);
-        check(Contrastive { loss: Loss::Pixel, layers: 0, ..cohesive.clone() }, Gaussians, true);
+        check(Contrastive { loss: Loss::Pixel, layers: 0, pixels: 2, ..cohesive.clone() }, Gaussians, true);
         check(Contrastive { loss: Loss::Pixel, ..cohesive }, Anchors, true);
     }
 }

@@ -1,5 +1,5 @@
 //! The graph network on anchors (paper, "Neighborhood Feature Aggregation"):
-//! f_m^(l+1) = ReLU(W1 f_m^(l) + Σ_{n in N(m)} W2 h_n + b), with f_m^(0) = h_m.
+//! f_m^(l+1) = ReLU(W1 f_m^(l) + Σ_{n in N(m)} W2 h_n), with f_m^(0) = h_m; a bias is added where the options ask for it.
 //!
 //! Σ W2 h_n = W2 Σ h_n, so neighbours are summed in the input's channels and, with Gaussians as neighbours, once for all
 //! layers. The inputs are detached: gradients reach the weights only.
@@ -24,7 +24,7 @@ pub struct Layer<T> {
     pub neighbour: usize,
     /// Channels of its output.
     pub output: usize,
-    /// W1 `[input][output]`, then W2 `[neighbour][output]`, then the bias `[output]`.
+    /// W1 `[input][output]`, then W2 `[neighbour][output]`, then the bias `[output]` if there is one.
     pub weights: Vec<T>,
     /// Whether negative outputs become zero.
     pub relu: bool,
@@ -32,18 +32,20 @@ pub struct Layer<T> {
 
 impl<T: Real> Layer<T> {
     /// Uniform in ±1/sqrt(inputs), as linear layers usually start.
-    fn random(input: usize, neighbour: usize, output: usize, rng: &mut impl Rng) -> Self {
+    fn random(input: usize, neighbour: usize, output: usize, bias: bool, rng: &mut impl Rng) -> Self {
         let mut draw = |count: usize, fan_in: usize| -> Vec<T> {
             let bound = 1.0 / (fan_in as f64).sqrt();
             (0..count).map(|_| T::of(rng.random_range(-bound..bound))).collect()
         };
         let mut weights = draw(input * output, input);
         weights.extend(draw(neighbour * output, neighbour));
-        weights.extend(draw(output, neighbour));
+        if bias {
+            weights.extend(draw(output, neighbour));
+        }
         Self { input, neighbour, output, weights, relu: true }
     }
 
-    /// W1, W2 and the bias.
+    /// W1, W2 and the bias, which is empty where there is none.
     pub fn split(&self) -> (&[T], &[T], &[T]) {
         let (w1, rest) = self.weights.split_at(self.input * self.output);
         let (w2, bias) = rest.split_at(self.neighbour * self.output);
@@ -57,13 +59,14 @@ pub fn random_layers<T: Real>(
     input: usize,
     output: usize,
     kind: Neighbours,
+    bias: bool,
     rng: &mut impl Rng,
 ) -> Vec<Layer<T>> {
     (0..count)
         .map(|l| {
             let own = if l == 0 { input } else { HIDDEN };
             let neighbour = if kind == Neighbours::Anchors { own } else { input };
-            Layer::random(own, neighbour, if l + 1 == count { output } else { HIDDEN }, rng)
+            Layer::random(own, neighbour, if l + 1 == count { output } else { HIDDEN }, bias, rng)
         })
         .collect()
 }
@@ -98,7 +101,8 @@ pub fn forward<T: Real>(layers: &[Layer<T>], context: &Context, h: Vec<T>, sums:
         y.par_chunks_mut(CHUNK * layer.output).enumerate().for_each(|(chunk, rows)| {
             for (i, row) in rows.chunks_exact_mut(layer.output).enumerate() {
                 let a = chunk * CHUNK + i;
-                row.copy_from_slice(bias);
+                // Without a bias the row stays zero.
+                row.iter_mut().zip(bias).for_each(|(r, &b)| *r = b);
                 multiply_add(&x[a * layer.input..(a + 1) * layer.input], w1, row);
                 multiply_add(&s[a * layer.neighbour..(a + 1) * layer.neighbour], w2, row);
                 for v in row.iter_mut().filter(|v| layer.relu && **v < T::default()) {

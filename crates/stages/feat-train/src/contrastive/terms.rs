@@ -37,21 +37,25 @@ pub fn of_gaussians(
 }
 
 /// The mean over sampled pixels of the cross-entropy with the masks' centroids, and the mean over masks of the mean distance
-/// of their pixels from the centroid, as far as `options` ask for them. `feature` writes the feature of a column.
+/// of their pixels from the centroid, as far as `options` ask for them. `noise` chooses pixels where not all take part.
+/// `feature` writes the feature of a column.
 pub fn of_pixels(
     d: usize,
     options: &Contrastive,
     set: &MaskSet,
+    noise: u64,
     feature: impl Fn(usize, &mut [f64]) + Sync,
     centroids: &[f64],
     to_centroids: &mut [f64],
 ) -> (f64, Vec<f64>) {
     let (pixels, prototypes) = (&set.sampled, Prototypes::new(centroids, d, options.tau));
+    let drawn = pixels.drawn(options.pixels, noise);
     let mut of_mask = vec![0.0; set.len()];
-    pixels.mask.iter().for_each(|&k| of_mask[k as usize] += 1.0);
+    drawn.iter().for_each(|&p| of_mask[pixels.mask[p] as usize] += 1.0);
     let masks = of_mask.iter().filter(|n| **n > 0.0).count() as f64;
-    let bounds: Vec<usize> = (0..pixels.len()).step_by(CHUNK).chain([pixels.len()]).collect();
-    let (value, to_pixels) = sum(&bounds, d, to_centroids, |p, to_centroids, to_pixel| {
+    let bounds: Vec<usize> = (0..drawn.len()).step_by(CHUNK).chain([drawn.len()]).collect();
+    let (value, to_pixels) = sum(&bounds, d, to_centroids, |i, to_centroids, to_pixel| {
+        let p = drawn[i];
         let (mut f, mut one) = (vec![0.0; d], vec![0.0; d]);
         for (c, w) in pixels.entries(p) {
             feature(c, &mut one);
@@ -60,7 +64,7 @@ pub fn of_pixels(
         let (k, mut value) = (pixels.mask[p] as usize, 0.0);
         if options.loss == Loss::Pixel {
             let mut share = vec![0.0; set.len()];
-            share[k] = 1.0 / pixels.len() as f64;
+            share[k] = 1.0 / drawn.len() as f64;
             value += prototypes.cross_entropy(&f, &share, to_centroids, to_pixel);
         }
         if options.cohesion > 0.0 {
@@ -71,7 +75,7 @@ pub fn of_pixels(
         value
     });
     let mut to_columns = vec![0.0; set.columns.len() * d];
-    for (p, g) in to_pixels.chunks_exact(d).enumerate() {
+    for (&p, g) in drawn.iter().zip(to_pixels.chunks_exact(d)) {
         for (c, w) in pixels.entries(p) {
             to_columns[c * d..(c + 1) * d].iter_mut().zip(g).for_each(|(t, g)| *t += w * g);
         }

@@ -21,7 +21,7 @@ use super::loss::{self, Evaluated};
 use super::masks::MaskSet;
 use super::model::{COLOR, Model};
 use super::normalize::{Moments, channel_moments};
-use crate::options::{Axis, Contrastive, Loss, Neighbours};
+use crate::options::{Axis, Contrastive, Loss, Neighbours, UnitLength};
 use kernels::{BLOCK, Half, Lanes, Piece, centroids, columns_backward, for_width, inputs};
 use rayon::prelude::*;
 use std::ops::Range;
@@ -113,7 +113,8 @@ impl<'a> Engine<'a> {
     /// Whether the engine can train with these options; the readable model can with all.
     pub fn serves(options: &Contrastive) -> bool {
         let of_masks = !matches!(options.loss, Loss::Gaussian | Loss::Pixel);
-        options.norm_axis == Axis::Channel && options.cohesion == 0.0 && of_masks && !options.unit_length
+        options.norm_axis == Axis::Channel && options.cohesion == 0.0 && of_masks
+            && options.unit_length == UnitLength::Never
     }
 
     /// For training `model` on `context`.
@@ -216,7 +217,8 @@ impl<'a> Engine<'a> {
         let (w1, w2, bias) = layer.split();
         let inputs = self.inputs[l].par_chunks(layer.input).zip(self.around(l).par_chunks(layer.neighbour));
         output.par_chunks_mut(layer.output).zip(inputs).for_each(|(y, (x, s))| {
-            y.iter_mut().zip(bias).for_each(|(y, &b)| y.fill(b));
+            let bias = bias.iter().copied().chain(std::iter::repeat(0.0));
+            y.iter_mut().zip(bias).for_each(|(y, b)| y.fill(b));
             kernels::dense(x, w1, y);
             kernels::dense(s, w2, y);
             if layer.relu {

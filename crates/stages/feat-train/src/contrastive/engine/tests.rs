@@ -79,7 +79,7 @@ fn agrees_with_the_readable_model() {
     check(6, options(2, Loss::HalfMask), Gaussians, true);
     check(6, options(2, Loss::CrossView), Gaussians, true);
     for kind in [Gaussians, Anchors] {
-        check(6, Contrastive { no_last_relu: true, ..options(2, Loss::Printed) }, kind, true);
+        check(6, Contrastive { last_relu: false, bias: true, ..options(2, Loss::Printed) }, kind, true);
         check(6, options(3, Loss::Printed), kind, false);
     }
 }
