@@ -109,11 +109,15 @@ pub(crate) struct Train {
     #[command(flatten)]
     #[serde(flatten)]
     pub skip: stage::SkipArgs,
+    /// Options that go together [default: none]
+    #[arg(long, value_enum)]
+    pub preset: Option<Preset>,
     /// How the number of Gaussians changes
     #[arg(long, value_enum, default_value_t = Strategy::default())]
     pub densify: Strategy,
     /// Largest number of Gaussians, 1 to 1e9. With --densify mcmc it is their number at the end, if there are enough
-    /// iterations [one for 100 pixels of the training photographs, but at least 10,000 and twice the dataset's points]
+    /// iterations [one for 100 pixels of the training photographs, but at least 10,000 and twice the dataset's points; no
+    /// limit with --preset 3dgs]
     #[arg(long, value_name = "COUNT", value_parser = within(1..=MOST_GAUSSIANS))]
     pub max_gaussians: Option<usize>,
     /// Gradient of the projected centre above which a Gaussian is cloned or split, per half picture size [0.0002]
@@ -130,8 +134,8 @@ pub(crate) struct Train {
     /// Held-out views are rendered at the photographs' mean
     #[arg(long)]
     pub exposure: bool,
-    /// Picture sizes in the course of the run
-    #[arg(long, value_enum, default_value_t = PictureSizes::Coarse)]
+    /// Picture sizes in the course of the run; with --preset 3dgs the default is full
+    #[arg(long, value_enum, default_value = "coarse", default_value_if("preset", "3dgs", "full"))]
     pub schedule: PictureSizes,
     /// Memory for decoded photographs, such as 512M or 2G; the others are decoded each time. 0 keeps none
     #[arg(long, value_name = "BYTES", default_value_t = Bytes(2 << 30))]
@@ -141,6 +145,17 @@ pub(crate) struct Train {
     #[arg(long, value_name = "COUNT|SECONDS", default_value = "60s")]
     #[serde(skip)]
     pub checkpoint_every: Every,
+}
+
+/// A set of defaults.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum, Serialize)]
+pub(crate) enum Preset {
+    /// As 3DGS trains: pictures of full size from the start, no limit on the number of Gaussians, and after the first reset
+    /// of opacities no Gaussian larger than a tenth of the scene. (3DGS forgets the sizes on screen before it looks at them,
+    /// so its pruning by them never removes any.)
+    #[value(name = "3dgs")]
+    #[serde(rename = "3dgs")]
+    Stock,
 }
 
 /// More Gaussians fit into no machine.

@@ -8,7 +8,7 @@ pub(crate) mod outputs;
 
 use crate::budget;
 use crate::densification::Way;
-use crate::options::{Args, Background, Command, PictureSizes, Train};
+use crate::options::{Args, Background, Command, PictureSizes, Preset, Train};
 use crate::photographs::masks::Masks;
 use crate::photographs::{Photographs, full_share};
 use crate::training::{Recipe, Trainer, checkpoint};
@@ -102,6 +102,9 @@ fn learn(
     done.inspect_err(|_| iterate::rescue(options, &trainer, &run, stage))
 }
 
+/// Largest Gaussians with `--preset 3dgs`, as a share of the scene's extent.
+const STOCK_MAX_SCALE: f32 = 0.1;
+
 impl Train {
     /// The hyper-parameters that the options amount to.
     pub(crate) fn recipe(&self, max_gaussians: usize, seed: u64) -> Recipe {
@@ -109,8 +112,9 @@ impl Train {
         if self.schedule == PictureSizes::Coarse {
             recipe.schedule = recipe.schedule.coarse_to_fine();
         }
-        if let (Some(gradient), Some(Way::Adaptive(way))) = (self.densify_gradient, &mut recipe.densification) {
-            way.gradient = gradient;
+        if let Some(Way::Adaptive(way)) = &mut recipe.densification {
+            way.gradient = self.densify_gradient.unwrap_or(way.gradient);
+            way.max_scale = self.preset.map(|Preset::Stock| STOCK_MAX_SCALE);
         }
         recipe.growth.every = self.densify_every.unwrap_or(recipe.growth.every);
         recipe.growth.max_gaussians = max_gaussians;

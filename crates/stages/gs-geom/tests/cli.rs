@@ -5,7 +5,7 @@ mod common;
 use common::world::{PIXELS, SIZE, balls, points, scene, write_world};
 use common::{Folder, json, killed, record, refused, run, succeeds, training};
 use gs_scene::{Image, PointCloud, ply};
-use serde_json::Value;
+use serde_json::{Value, json};
 use std::fs;
 use std::path::PathBuf;
 use std::process::Command;
@@ -329,6 +329,25 @@ fn bad_input_is_refused_in_one_line() {
     let blocked = format!("{out}/g.ply");
     assert!(refused(&["train", "--scene", scene(), "--out", &blocked]).contains("cannot create the folder"));
     assert!(refused(&["train", "--scene", scene(), "--out", &shape]).contains("a folder is in the way"));
+}
+
+#[test]
+fn the_preset_of_3dgs_has_full_pictures_no_limit_and_removes_large_gaussians() {
+    let dir = Folder::new();
+    let out = dir.path("g.ply");
+    let with = |more: &[&str]| {
+        let base = ["train", "--scene", scene(), "--iterations", "12", "--overwrite", "--out", &out];
+        let said = succeeds(&[&base[..], more].concat());
+        (said, record(&out)["parameters"].clone())
+    };
+    let (said, p) = with(&["--preset", "3dgs"]);
+    assert!(said.contains("no limit to their number"), "{said}");
+    assert_eq!((&p["schedule"]["coarse"], &p["growth"]["max_gaussians"]), (&json!([]), &json!(usize::MAX)));
+    assert!((p["densification"]["max_scale"].as_f64().unwrap() - 0.1).abs() < 1e-6, "{p}");
+    let (said, p) = with(&["--preset", "3dgs", "--max-gaussians", "5000", "--schedule", "coarse"]);
+    assert!(said.contains("at most") && p["growth"]["max_gaussians"] == 5000, "{said} {p}");
+    assert_ne!(p["schedule"]["coarse"], json!([]));
+    assert_eq!(with(&[]).1["densification"]["max_scale"], Value::Null);
 }
 
 /// Checks that the forecast is near the peak.

@@ -29,8 +29,8 @@ pub struct Adaptive {
     pub min_opacity: f32,
     /// Gaussians up to this share of the scene's extent are cloned, larger ones split.
     pub clone_scale: f32,
-    /// Gaussians beyond this share of the scene's extent are removed, if there is one. 3DGS has 0.1; here there is none,
-    /// because that tears holes into plain walls and tables (docs/geometry.md).
+    /// Gaussians beyond this share of the scene's extent are removed after the first reset of opacities, if there is one.
+    /// 3DGS has 0.1; here there is none, because that tears holes into plain walls and tables (docs/geometry.md).
     pub max_scale: Option<f32>,
     /// Iterations between opacity resets; 0 for none. Short runs keep the period of 3DGS: they have no time to recover from
     /// one.
@@ -109,7 +109,8 @@ impl Densify for Adaptive {
 
     fn round(&self, state: &mut State, at: Moment<'_>) -> Option<Report> {
         let mut rng = generator(at.seed, Purpose::Split, u64::from(at.iteration));
-        Self::observes(at).then(|| self.densify(state, at.growth.max_gaussians, at.extent as f32, &mut rng))
+        let way = Self { max_scale: self.max_scale.filter(|_| at.iteration > self.reset_every), ..*self };
+        Self::observes(at).then(|| way.densify(state, at.growth.max_gaussians, at.extent as f32, &mut rng))
     }
 }
 

@@ -3,7 +3,7 @@
 use crate::densification::Strategy;
 use crate::densification::rules::Growth;
 use crate::memory::{self, Forecast};
-use crate::options::{Init, Train, bytes};
+use crate::options::{Init, Preset, Train, bytes};
 use crate::photographs::masks::Masks;
 use crate::photographs::{bytes_per_pixel, full_share};
 use gs_io::Result;
@@ -27,7 +27,11 @@ const LESS: &str = "give fewer --init-points or --max-gaussians, a smaller --res
 pub(crate) fn most_gaussians(options: &Train, dataset: &Dataset) -> usize {
     let pixels = |v: &View| v.camera.width as usize * v.camera.height as usize;
     let shown = dataset.views_of(Split::Train).map(pixels).sum::<usize>() / PIXELS_PER_GAUSSIAN;
-    options.max_gaussians.unwrap_or(shown.max(2 * dataset.points.len()).max(LEAST_GAUSSIANS))
+    let usual = match options.preset {
+        Some(Preset::Stock) if options.densify == Strategy::Adaptive => usize::MAX,
+        _ => shown.max(2 * dataset.points.len()).max(LEAST_GAUSSIANS),
+    };
+    options.max_gaussians.unwrap_or(usual)
 }
 
 /// Bytes for decoded photographs.
@@ -90,10 +94,14 @@ pub(super) fn forecast(
     let entries = |v: &View| forward(gaussians, &v.camera, &raster).pairs() / (TILE * TILE);
     let entries = dataset.views.iter().step_by(apart).map(entries).max().unwrap_or(0) as u64;
     forecast.tiles = memory::PER_TILE * entries;
+    // Without a limit nobody knows how many there will be: those there are must fit.
+    let (most, limit) = match most {
+        usize::MAX => (now, "no limit to their number".to_string()),
+        most => (most, format!("at most {} with {most}", forecast.peak(most))),
+    };
     stage.info(&format!(
-        "memory: about {} with {now} Gaussians, at most {} with {most} (photographs {}, pictures {}, {} bytes a Gaussian)",
+        "memory: about {} with {now} Gaussians, {limit} (photographs {}, pictures {}, {} bytes a Gaussian)",
         forecast.peak(now),
-        forecast.peak(most),
         Bytes(forecast.photographs),
         Bytes(forecast.scratch()),
         forecast.per_gaussian
