@@ -85,29 +85,44 @@ impl Prototypes {
     }
 
     /// Cross-entropy of the softmax over all masks of the cosines with `f`, against its `share` in each mask `[K]`. Adds
-    /// the gradients of the centroids `[K][d]` and of `f`.
-    pub fn cross_entropy(&self, f: &[f64], share: &[f64], to_centroids: &mut [f64], to_feature: &mut [f64]) -> f64 {
+    /// the gradients of the centroids' directions `[K][d]` and of `f`. `logits` is room for numbers.
+    pub fn cross_entropy(
+        &self,
+        f: &[f64],
+        share: &[f64],
+        logits: &mut Vec<f64>,
+        to_directions: &mut [f64],
+        to_feature: &mut [f64],
+    ) -> f64 {
         let (d, tau) = (self.d, self.tau);
         let (u, f_length) = directions(f, d);
         if f_length[0] <= SHORTEST || self.alive.len() < 2 {
             return 0.0;
         }
+        logits.clear();
+        logits.extend(self.alive.iter().map(|&k| dot(&u, &self.unit[k * d..(k + 1) * d]) / tau));
         let mine: f64 = self.alive.iter().map(|&k| share[k]).sum();
-        let mut softmax: Vec<f64> = self.alive.iter().map(|&k| dot(&u, &self.unit[k * d..(k + 1) * d]) / tau).collect();
-        let positive: f64 = self.alive.iter().zip(&softmax).map(|(&k, l)| share[k] * l).sum();
-        let value = mine * log_sum_exp(&mut softmax) - positive;
-        // Gradient of each cosine.
-        let g: Vec<f64> = self.alive.iter().zip(&softmax).map(|(&k, p)| (mine * p - share[k]) / tau).collect();
+        let positive: f64 = self.alive.iter().zip(&*logits).map(|(&k, l)| share[k] * l).sum();
+        let value = mine * log_sum_exp(logits) - positive;
         let mut sum = vec![0.0; d];
-        for (&k, g) in self.alive.iter().zip(&g) {
+        for (&k, p) in self.alive.iter().zip(&*logits) {
+            // Gradient of the cosine.
+            let g = (mine * p - share[k]) / tau;
             let range = k * d..(k + 1) * d;
-            let unit = &self.unit[range.clone()];
-            let scaled: Vec<f64> = u.iter().map(|u| g * u).collect();
-            add_direction_gradient(&mut to_centroids[range], unit, self.length[k], &scaled);
-            sum.iter_mut().zip(unit).for_each(|(s, u)| *s += g * u);
+            to_directions[range.clone()].iter_mut().zip(&u).for_each(|(t, u)| *t += g * u);
+            sum.iter_mut().zip(&self.unit[range]).for_each(|(s, u)| *s += g * u);
         }
         add_direction_gradient(to_feature, &u, f_length[0], &sum);
         value
+    }
+
+    /// Adds the gradient of the centroids `[K][d]`, given that of their directions.
+    pub fn add_gradient(&self, of_directions: &[f64], to_centroids: &mut [f64]) {
+        for &k in &self.alive {
+            let range = k * self.d..(k + 1) * self.d;
+            let (unit, g) = (&self.unit[range.clone()], &of_directions[range.clone()]);
+            add_direction_gradient(&mut to_centroids[range], unit, self.length[k], g);
+        }
     }
 }
 

@@ -25,14 +25,15 @@ pub fn of_gaussians(
     let pixels = |(&k, &w): (&u16, &f32)| f64::from(w) * set.pixels[k as usize];
     let total: f64 = set.mask.iter().zip(&set.weight).map(pixels).sum();
     let bounds: Vec<usize> = set.pieces.iter().map(|&c| c as usize).collect();
-    sum(&bounds, d, to_centroids, |c, to_centroids, to_feature| {
-        let (mut f, mut share) = (vec![0.0; d], vec![0.0; set.len()]);
-        feature(c, &mut f);
+    sum(&bounds, d, &prototypes, to_centroids, |c, room, sums, to_feature| {
+        let Room { f, share, logits, .. } = room;
+        feature(c, f);
+        share.fill(0.0);
         let (masks, weights) = set.entries(c);
         for (&k, &w) in masks.iter().zip(weights) {
             share[k as usize] += f64::from(w) * set.pixels[k as usize] / total;
         }
-        prototypes.cross_entropy(&f, &share, to_centroids, to_feature)
+        prototypes.cross_entropy(f, share, logits, &mut sums.directions, to_feature)
     })
 }
 
@@ -54,23 +55,24 @@ pub fn of_pixels(
     drawn.iter().for_each(|&p| of_mask[pixels.mask[p] as usize] += 1.0);
     let masks = of_mask.iter().filter(|n| **n > 0.0).count() as f64;
     let bounds: Vec<usize> = (0..drawn.len()).step_by(CHUNK).chain([drawn.len()]).collect();
-    let (value, to_pixels) = sum(&bounds, d, to_centroids, |i, to_centroids, to_pixel| {
+    let (value, to_pixels) = sum(&bounds, d, &prototypes, to_centroids, |i, room, sums, to_pixel| {
         let p = drawn[i];
-        let (mut f, mut one) = (vec![0.0; d], vec![0.0; d]);
+        let Room { f, one, share, logits } = room;
+        f.fill(0.0);
         for (c, w) in pixels.entries(p) {
-            feature(c, &mut one);
-            f.iter_mut().zip(&one).for_each(|(f, v)| *f += w * v);
+            feature(c, one);
+            f.iter_mut().zip(&*one).for_each(|(f, v)| *f += w * v);
         }
         let (k, mut value) = (pixels.mask[p] as usize, 0.0);
         if options.loss == Loss::Pixel {
-            let mut share = vec![0.0; set.len()];
+            share.fill(0.0);
             share[k] = 1.0 / drawn.len() as f64;
-            value += prototypes.cross_entropy(&f, &share, to_centroids, to_pixel);
+            value += prototypes.cross_entropy(f, share, logits, &mut sums.directions, to_pixel);
         }
         if options.cohesion > 0.0 {
             let range = k * d..(k + 1) * d;
             let scale = options.cohesion / (masks * of_mask[k]);
-            value += cohesion(&f, &centroids[range.clone()], scale, &mut to_centroids[range], to_pixel);
+            value += cohesion(f, &centroids[range.clone()], scale, &mut sums.centroids[range], to_pixel);
         }
         value
     });
@@ -83,28 +85,48 @@ pub fn of_pixels(
     (value, to_columns)
 }
 
+/// Room for one point: features, shares in masks, logits.
+struct Room {
+    f: Vec<f64>,
+    one: Vec<f64>,
+    share: Vec<f64>,
+    logits: Vec<f64>,
+}
+
+/// Gradients of the masks' centroids `[K][d]`: those that come by way of their directions, and the others.
+struct Sums {
+    directions: Vec<f64>,
+    centroids: Vec<f64>,
+}
+
 /// Adds up the terms of single points, from one of `bounds` to the next in parallel, and the parts in order. `term` adds its
-/// gradients of the centroids and of the point's own feature; those of the features are returned, `[points][d]`.
+/// gradients of the masks and of the point's own feature; those of the features are returned, `[points][d]`.
 fn sum(
     bounds: &[usize],
     d: usize,
+    prototypes: &Prototypes,
     centroids: &mut [f64],
-    term: impl Fn(usize, &mut [f64], &mut [f64]) -> f64 + Sync,
+    term: impl Fn(usize, &mut Room, &mut Sums, &mut [f64]) -> f64 + Sync,
 ) -> (f64, Vec<f64>) {
     let length = centroids.len();
+    let empty = || Sums { directions: vec![0.0; length], centroids: vec![0.0; length] };
     let part = |b: &[usize]| {
-        let (mut value, mut to_centroids, mut rows) = (0.0, vec![0.0; length], vec![0.0; (b[1] - b[0]) * d]);
+        let mut room = Room { f: vec![0.0; d], one: vec![0.0; d], share: vec![0.0; length / d], logits: Vec::new() };
+        let (mut value, mut sums, mut rows) = (0.0, empty(), vec![0.0; (b[1] - b[0]) * d]);
         for (p, row) in (b[0]..b[1]).zip(rows.chunks_exact_mut(d)) {
-            value += term(p, &mut to_centroids, row);
+            value += term(p, &mut room, &mut sums, row);
         }
-        (value, to_centroids, rows)
+        (value, sums, rows)
     };
-    let parts: Vec<(f64, Vec<f64>, Vec<f64>)> = bounds.par_windows(2).map(part).collect();
-    let (mut total, mut features) = (0.0, Vec::new());
-    for (value, to_centroids, rows) in parts {
+    let parts: Vec<(f64, Sums, Vec<f64>)> = bounds.par_windows(2).map(part).collect();
+    let (mut total, mut all, mut features) = (0.0, empty(), Vec::new());
+    for (value, sums, rows) in parts {
         total += value;
-        centroids.iter_mut().zip(to_centroids).for_each(|(c, g)| *c += g);
+        all.directions.iter_mut().zip(sums.directions).for_each(|(a, g)| *a += g);
+        all.centroids.iter_mut().zip(sums.centroids).for_each(|(a, g)| *a += g);
         features.extend(rows);
     }
+    prototypes.add_gradient(&all.directions, centroids);
+    centroids.iter_mut().zip(all.centroids).for_each(|(c, g)| *c += g);
     (total, features)
 }
