@@ -5,7 +5,7 @@
 //! |---|---|
 //! | `scene NAME \| options \| options` | a scene: options of synth-scene, and of gs-geom train |
 //! | **tables** | scores of features and clusterings, on every scene with every seed |
-//! | `seeds \| 0 1 2` | seeds of every scene |
+//! | `seeds \| tuning \| 0 1 2` | seeds of every scene. What is chosen is chosen on `tuning` seeds, below 10; what is claimed is measured on `reporting` seeds, 10 and more |
 //! | `masks \| options` | faults of all masks but their granularity: options of synth-scene |
 //! | `footprints NAME \| options` | options of graph-precompute |
 //! | `features NAME \| footprints \| options` | options of feat-train |
@@ -141,10 +141,13 @@ pub struct Plan {
     pub axes: Vec<Axis>,
 }
 
+/// Seeds below this are for choosing settings, the others for measuring what was chosen.
+const FIRST_REPORTING: u64 = 10;
+
 /// Keywords with the number of fields after them, and whether they have a name.
 const KEYWORDS: [(&str, usize, bool); 14] = [
     ("scene", 2, true),
-    ("seeds", 1, false),
+    ("seeds", 2, false),
     ("masks", 1, false),
     ("footprints", 1, true),
     ("features", 2, true),
@@ -179,7 +182,7 @@ impl Plan {
             }
         }
         if !plan.tables.is_empty() && plan.seeds.is_empty() {
-            return Err(Error::new("tables without seeds").expected("a line \"seeds | 0 1 2\""));
+            return Err(Error::new("tables without seeds").expected("a line \"seeds | tuning | 0 1 2\""));
         }
         Ok(plan)
     }
@@ -207,8 +210,16 @@ impl Plan {
         match keyword {
             "scene" => self.scenes.push(scene(name, rest[0], rest[1])),
             "seeds" => {
-                let seeds = rest[0].split_whitespace().map(|s| s.parse().map_err(|_| wrong("whole numbers")));
+                let seeds = rest[1].split_whitespace().map(|s| s.parse().map_err(|_| wrong("whole numbers")));
                 self.seeds = seeds.collect::<Result<_>>()?;
+                let (allowed, range) = match rest[0] {
+                    "tuning" => (0..FIRST_REPORTING, format!("seeds below {FIRST_REPORTING} for tuning")),
+                    "reporting" => (FIRST_REPORTING..u64::MAX, format!("seeds from {FIRST_REPORTING} on for reporting")),
+                    _ => return Err(wrong("tuning or reporting, then seeds")),
+                };
+                if let Some(seed) = self.seeds.iter().find(|s| !allowed.contains(*s)) {
+                    return Err(Error::new("a seed of the other kind").found(seed).expected(range));
+                }
             }
             "table" => self.tables.push(table(name, rest)?),
             "row" => {
@@ -324,7 +335,7 @@ mod tests {
 
     const TEXT: &str = "# a comment
 scene a | --size tiny | --iterations 10
-seeds | 0 1
+seeds | tuning | 0 1
 masks | --missing 0
 footprints gated | --pixel-samples 16
 features paper | gated | --preset paper
@@ -373,7 +384,7 @@ size views | 8 | --size tiny --views 8 | --iterations 10
             ("knob cut | graph", "knob cut | grph", "line 14"),
             ("row t | ours", "row t | paper", "defined twice"),
             ("knob quality", "knob cut", "defined twice"),
-            ("seeds | 0 1\n", "scene a | |\n", "defined twice"),
+            ("seeds | tuning | 0 1\n", "scene a | |\n", "defined twice"),
             ("point cut | none", "point cot | none", "no such knob; found cot"),
             ("| exact\npoint cut", "|\npoint cut", "exact"),
             ("axis views", "axes views", "not a line of a plan"),
@@ -384,8 +395,11 @@ size views | 8 | --size tiny --views 8 | --iterations 10
             ("0 0.5 |", "0 1.5 |", "probabilities"),
             ("50.79 69.62 2.1", "50.79", "numbers of the paper"),
             ("scene a", "scene", "a name"),
-            ("seeds | 0 1", "seeds | a", "seeds"),
-            ("seeds | 0 1\n", "", "seeds"),
+            ("tuning | 0 1", "tuning | a", "whole numbers"),
+            ("tuning | 0 1", "tuning | 0 10", "below 10"),
+            ("tuning | 0 1", "reporting | 9 10", "from 10 on"),
+            ("tuning | 0 1", "both | 0 10", "tuning or reporting"),
+            ("seeds | tuning | 0 1\n", "", "seeds"),
         ] {
             assert!(TEXT.contains(from), "{from}");
             let e = Plan::parse(&TEXT.replacen(from, to, 1)).unwrap_err().to_string();

@@ -224,7 +224,7 @@ pub fn text(table: &Table) -> String {
 mod tests {
     use super::*;
 
-    const PLAN: &str = "scene a | |\nscene b | |\nseeds | 0 1\nfootprints gated | --gate 0.7\nfeatures paper | gated | --preset paper\n\
+    const PLAN: &str = "scene a | |\nscene b | |\nseeds | tuning | 0 1\nfootprints gated | --gate 0.7\nfeatures paper | gated | --preset paper\n\
         features ours | gated | --method spectral\nclustering free | --cluster free\ntable t | 0 0.5 | paper.free | A table\n\
         row t | paper | free | 50.79 69.62 2.1 | full\nrow t | ours | free | - | ours\n";
 
