@@ -35,14 +35,15 @@ pub struct Args {
 /// What shapes the features.
 #[derive(Debug, Clone, PartialEq, clap::Args, Serialize)]
 pub struct Options {
-    /// Train the features with the paper's method instead of computing them in closed form
+    /// Train the features with the paper's method instead of computing them in closed form. The options under "Paper" change
+    /// it; where the two presets differ, their help says so
     #[arg(long, value_enum)]
     pub preset: Option<Preset>,
-    /// Mask levels to use, separated by commas: default, small, medium, large [default: all; large with --preset paper]
+    /// Mask levels to use, separated by commas: default, small, medium, large [default: all; large with --preset]
     #[arg(long, value_name = "LEVELS", value_delimiter = ',')]
     pub levels: Vec<Level>,
-    /// Dimension of the features, 1 to 512, or 2 to 64 with --preset paper [default: 6 with --preset paper; else as many
-    /// as --cutoff keeps, at most 256, and from 262,144 Gaussians on fewer, down to 64]
+    /// Dimension of the features, 1 to 512, or 2 to 64 with --preset [default: 6 with --preset; else as many as --cutoff
+    /// keeps, at most 256, and from 262,144 Gaussians on fewer, down to 64]
     #[arg(long, value_name = "COUNT", value_parser = within(1usize..=512))]
     pub dim: Option<usize>,
     /// What only the closed form reads.
@@ -57,7 +58,9 @@ pub struct Options {
 #[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum, Serialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum Preset {
-    /// The paper, read literally: contextual propagation and contrastive learning. The options under "Paper" change it.
+    /// The paper as printed: contextual propagation and contrastive learning.
+    Literal,
+    /// The reading of the paper that does best, among those that its text allows (docs/results/paper.md).
     Paper,
 }
 
@@ -73,7 +76,7 @@ pub struct Spectral {
 
 /// Options of the paper's method.
 #[derive(Debug, Clone, PartialEq, clap::Args, Serialize)]
-#[command(next_help_heading = "Paper (with --preset paper)")]
+#[command(next_help_heading = "Paper (with --preset)")]
 #[group(requires = "preset")]
 pub struct Contrastive {
     /// Training iterations, one random view each
@@ -185,6 +188,9 @@ pub enum Loss {
     Gaussian,
     /// Per pixel: each sampled pixel against the centroids of all masks. Its positive is its own mask.
     Pixel,
+    /// OpenGaussian's: centroids of different masks push each other apart, the nearest the most. Its other half is --cohesion
+    /// 0.1.
+    Separation,
 }
 
 /// Initial features.
@@ -198,7 +204,7 @@ pub enum Init {
 }
 
 impl Default for Contrastive {
-    /// The paper, read literally.
+    /// The paper as printed.
     fn default() -> Self {
         #[derive(Parser)]
         struct Alone {
@@ -218,7 +224,7 @@ impl Contrastive {
     }
 }
 
-/// Dimension of the features with `--preset paper`, where `--dim` is not given.
+/// Dimension of the features with `--preset`, where `--dim` is not given.
 const PAPER_DIM: usize = 6;
 /// Dimension of the closed form where `--dim` is not given: between these, as long as all features together have at most
 /// so many values (256 MB).
@@ -231,7 +237,7 @@ impl Options {
     pub(crate) fn check(&self) -> Result<()> {
         match self.dim {
             Some(dim) if self.preset.is_some() && !(2..=64).contains(&dim) => {
-                Err(Error::new("out of range").field("--dim").found(dim).expected("2 to 64 with --preset paper"))
+                Err(Error::new("out of range").field("--dim").found(dim).expected("2 to 64 with --preset"))
             }
             _ => Ok(()),
         }
@@ -241,7 +247,7 @@ impl Options {
     pub(crate) fn levels(&self) -> Vec<Level> {
         match (&self.levels[..], self.preset) {
             ([], None) => Level::ALL.to_vec(),
-            ([], Some(Preset::Paper)) => vec![Level::Large],
+            ([], Some(_)) => vec![Level::Large],
             (given, _) => given.to_vec(),
         }
     }

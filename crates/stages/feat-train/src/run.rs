@@ -3,7 +3,7 @@
 use crate::contrastive::{self, checkpoint};
 use crate::inputs::Inputs;
 use crate::memory;
-use crate::options::{Args, Preset};
+use crate::options::Args;
 use crate::outputs::CURVE;
 use crate::spectral;
 use artifacts::Features;
@@ -36,7 +36,7 @@ impl Program for Args {
         stage.forecast(needed, "drop small footprint entries: graph-precompute --cut 0.001")?;
 
         let made = match self.options.preset {
-            Some(Preset::Paper) => contrastive::features(&self, &inputs, stage)?,
+            Some(_) => contrastive::features(&self, &inputs, stage)?,
             None => spectral::features(&self, &inputs, stage)?,
         };
 

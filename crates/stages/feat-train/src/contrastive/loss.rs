@@ -140,6 +140,32 @@ pub fn cohesion(f: &[f64], centroid: &[f64], scale: f64, to_centroid: &mut [f64]
     scale * distance
 }
 
+/// OpenGaussian's loss between masks: the mean over ordered pairs of w / (|a - b|² + 1). Its weight goes by the rank of b among
+/// the neighbours of a: 1 for the nearest, 0.1 for the farthest, evenly between; it is a constant. Returns the value, and adds
+/// the gradient of the `centroids` `[K][d]`.
+fn separation(centroids: &[f64], d: usize, alive: &[usize], gradient: &mut [f64]) -> f64 {
+    let of = |k: usize| &centroids[k * d..(k + 1) * d];
+    let pairs = (alive.len() * (alive.len() - 1)) as f64;
+    let farthest = (alive.len() - 2).max(1) as f64;
+    let mut value = 0.0;
+    for &a in alive {
+        let squares = |b: usize| of(a).iter().zip(of(b)).map(|(a, b)| (a - b) * (a - b)).sum::<f64>();
+        let mut others: Vec<(f64, usize)> = alive.iter().filter(|&&b| b != a).map(|&b| (squares(b), b)).collect();
+        others.sort_by(|x, y| x.0.total_cmp(&y.0).then(x.1.cmp(&y.1)));
+        for (rank, (squared, b)) in others.into_iter().enumerate() {
+            let weight = (1.0 - 0.9 * rank as f64 / farthest) / pairs;
+            value += weight / (squared + 1.0);
+            let slope = -2.0 * weight / ((squared + 1.0) * (squared + 1.0));
+            for j in 0..d {
+                let pull = slope * (centroids[a * d + j] - centroids[b * d + j]);
+                gradient[a * d + j] += pull;
+                gradient[b * d + j] -= pull;
+            }
+        }
+    }
+    value
+}
+
 /// The loss per mask, averaged over the masks that take part. `positives` are needed for [`Loss::HalfMask`], which gives
 /// their gradient too, and for [`Loss::CrossView`], where they are constant and zeros mean none. [`Loss::Gaussian`] and
 /// [`Loss::Pixel`] do not compare masks: their loss is 0 here, and only the separation counts.
@@ -169,7 +195,7 @@ pub fn evaluate(loss: Loss, centroids: &[f64], positives: Option<&[f64]>, d: usi
         let mut logits: Vec<f64> = others.iter().map(|&j| dot(&u, &unit[j * d..(j + 1) * d]) / tau).collect();
         cosines += logits.iter().sum::<f64>() * tau;
         let own = match loss {
-            Loss::Gaussian | Loss::Pixel => continue,
+            Loss::Gaussian | Loss::Pixel | Loss::Separation => continue,
             Loss::Printed | Loss::WithSelf => 1.0 / tau,
             Loss::CrossView if !has_positive(k) => 1.0 / tau,
             Loss::HalfMask | Loss::CrossView => dot(&u, &of(&pos_unit, k)) / tau,
@@ -195,6 +221,9 @@ pub fn evaluate(loss: Loss, centroids: &[f64], positives: Option<&[f64]>, d: usi
         }
     }
     out.separation = 1.0 - cosines * share / (alive.len() - 1) as f64;
+    if loss == Loss::Separation {
+        out.loss = separation(centroids, d, &alive, &mut out.centroids);
+    }
     for k in alive {
         let range = k * d..(k + 1) * d;
         let (g, u) = (&unit_gradient[range.clone()], &unit[range.clone()]);
@@ -221,6 +250,17 @@ mod tests {
         assert!((e.loss - want).abs() < 1e-12, "{} {want}", e.loss);
         assert!((e.separation - (1.0 - 2.0 * r / 3.0)).abs() < 1e-12);
         assert!(evaluate(Loss::WithSelf, &c, None, 2, 0.1).loss >= 0.0);
+    }
+
+    #[test]
+    fn masks_push_their_nearest_away_the_most() {
+        let c = [1.0, 2.0, 4.0];
+        let e = evaluate(Loss::Separation, &c, None, 1, 0.1);
+        // Per mask the nearest with weight 1, the other with 0.1.
+        let want = (1.0 / 2.0 + 0.1 / 10.0) + (1.0 / 2.0 + 0.1 / 5.0) + (1.0 / 5.0 + 0.1 / 10.0);
+        assert!((e.loss - want / 6.0).abs() < 1e-12, "{}", e.loss);
+        assert!(e.centroids[0] > 0.0 && e.centroids[2] < 0.0, "less loss further out: {:?}", e.centroids);
+        assert!(evaluate(Loss::Separation, &[0.5, 1.0], None, 1, 0.1).loss > 0.0, "two masks");
     }
 
     #[test]

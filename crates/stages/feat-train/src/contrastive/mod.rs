@@ -1,4 +1,4 @@
-//! The paper's stage 2, `feat-train --preset paper`: contextual propagation and contrastive learning on masks.
+//! The paper's stage 2, `feat-train --preset literal` and `--preset paper`: contextual propagation and contrastive learning on masks.
 //!
 //! * [`context`] and [`masks`]: what training reads of a scene.
 //! * [`model`], with [`network`], [`normalize`], [`loss`], [`terms`] and [`cross_view`]: the equations and their gradients,

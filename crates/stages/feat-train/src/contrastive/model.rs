@@ -468,7 +468,7 @@ mod tests {
             for kind in [Gaussians, Anchors] {
                 check(Contrastive { last_relu: false, bias: true, ..unit.clone() }, kind, true);
             }
-            for loss in [Loss::Gaussian, Loss::Pixel] {
+            for loss in [Loss::Gaussian, Loss::Pixel, Loss::Separation] {
                 check(Contrastive { loss, ..unit.clone() }, Gaussians, true);
             }
         }
