@@ -14,6 +14,10 @@ PHOTOGRAPHS := $(OUT)/frames/$(notdir $(SCENE))
 SCENE_FILES := $(PHOTOGRAPHS)/frames.txt
 endif
 PROTOCOL_FILES := $(wildcard $(addprefix $(SCENE)/,*.labels.ply *.segs.json *.aggregation.json))
+# The scan's vertices stay where they are, photographs have half their size (-r 2), no view is held out. Gaussian i is
+# vertex i, and faint ones are left out.
+GEOM_FIRST := --densify fixed --resolution 2 --holdout 0 --iterations 30000
+GRAPH_FIRST := --holdout 0
 include pipelines/protocol.mk
 
 frames_OPTIONS := $(EVERY)

@@ -71,12 +71,12 @@ masks_FILES = $(call list,$(MASKS)/,'*_s.npy')
 clip_FILES = $(call list,$(call arg,CLIP)/,'*')
 texts_FILES = $(call list,$(call arg,TEXTS),'*')
 
-# The options of every stage; those of people come after a fragment's own (GEOM_FIRST, REPORT_FIRST), and win. The seed counts
-# as an option; 0 is every stage's own.
+# The options of every stage; those of people come after a fragment's own (GEOM_FIRST, GRAPH_FIRST, REPORT_FIRST), and win. The seed counts
+# as an option; 0 is every stage's own. A quality is about our own features, not about those of a preset.
 SEED_ARGS := $(addprefix --seed ,$(filter-out 0,$(SEED)))
 geom_OPTIONS := $(GEOM_QUALITY) $(GEOM_FIRST) $(GEOM_ARGS) $(SEED_ARGS)
-graph_OPTIONS := $(GRAPH_ARGS) $(SEED_ARGS)
-feat_OPTIONS := $(FEAT_QUALITY) $(FEAT_ARGS) $(SEED_ARGS)
+graph_OPTIONS := $(GRAPH_FIRST) $(GRAPH_ARGS) $(SEED_ARGS)
+feat_OPTIONS := $(if $(findstring --preset,$(FEAT_ARGS)),,$(FEAT_QUALITY)) $(FEAT_ARGS) $(SEED_ARGS)
 cluster_OPTIONS := $(CLUSTER_ARGS) $(SEED_ARGS)
 embed_OPTIONS := $(CLIP)
 masks_OPTIONS := $(SAM) $(MASK_ARGS)

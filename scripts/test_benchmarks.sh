@@ -87,7 +87,7 @@ scenes='figurines ramen waldo_kitchen' run_lerf > "$work/again.log" 2>&1
 pass "make lerf-ovs ends in the paper's table (figurines: mIoU $miou), and a second make runs nothing"
 
 benchmark SET=scannet DATA="$scannet" OUT="$work/scan" SCENES="scene0000_00 scene0062_00" TEXTS="$work/names.json" \
-  GEOM_ARGS="--densify fixed --resolution 2 --holdout 0 $small" GRAPH_ARGS='--holdout 0 --min-mask-pixels 10' all > "$work/scan.log" 2>&1 \
+  GEOM_ARGS="$small" GRAPH_ARGS='--min-mask-pixels 10' all > "$work/scan.log" 2>&1 \
   || { cat "$work/scan.log"; fail "make scannet"; }
 [ "$(wc -l < "$work/scan/scene0000_00/frames/scene0000_00/frames.txt")" = 12 ] || fail "not every 20th frame"
 grep -q '| CAGS | 32.60 |' "$work/scan/table.md" && grep -q '| scene0062_00 |' "$work/scan/table.md" || fail "no table of ScanNet"
@@ -99,7 +99,7 @@ pass "make scannet, extracted and converted, ends in the paper's table (19 class
 check SET=scannet DATA="$scannet" SCENES=scene0062_00 TEXTS= || { cat "$work/check.log"; fail "ScanNet without texts is refused"; }
 grep -q 'only of instances without classes' "$work/check.log" || fail "no word of what is not scored"
 benchmark SET=scannet DATA="$scannet" OUT="$work/classless" SCENES=scene0062_00 GEOMETRY="$work/scan/scene0062_00/geometry.ply" \
-  GRAPH_ARGS='--holdout 0 --min-mask-pixels 10' all > "$work/scan.log" 2>&1 || { cat "$work/scan.log"; fail "make scannet without texts"; }
+  GRAPH_ARGS='--min-mask-pixels 10' all > "$work/scan.log" 2>&1 || { cat "$work/scan.log"; fail "make scannet without texts"; }
 grep -q '^| Scan | instance mIoU' "$work/classless/table.md" && ! grep -q 'CAGS' "$work/classless/table.md" || fail "no table of instances"
 pass "make scannet without texts ends in a table of instances without classes"
 
