@@ -94,23 +94,25 @@ pub struct Contrastive {
     /// Whether the last layer has a ReLU as the others do
     #[arg(long, value_name = "BOOL", action = ArgAction::Set, default_value_t = true)]
     pub last_relu: bool,
-    /// When the feature of each Gaussian is brought to unit length
-    #[arg(long, value_enum, default_value_t = UnitLength::Never)]
+    /// When the feature of each Gaussian is brought to unit length; with --preset paper the default is after
+    #[arg(long, value_enum, default_value = "never", default_value_if("preset", "paper", "after"))]
     pub unit_length: UnitLength,
-    /// Values that share a mean and a standard deviation in the graph network
-    #[arg(long, value_enum, default_value_t = Axis::Channel)]
+    /// Values that share a mean and a standard deviation in the graph network; with --preset paper the default is gaussian
+    #[arg(long, value_enum, default_value = "channel", default_value_if("preset", "paper", "gaussian"))]
     pub norm_axis: Axis,
-    /// Loss on the masks of a view
-    #[arg(long, value_enum, default_value_t = Loss::Printed)]
+    /// Loss on the masks of a view; with --preset paper the default is gaussian
+    #[arg(long, value_enum, default_value = "printed", default_value_if("preset", "paper", "gaussian"))]
     pub loss: Loss,
-    /// Initial features
-    #[arg(long, value_enum, default_value_t = Init::Uniform)]
+    /// Initial features; with --preset paper the default is normal-small
+    #[arg(long, value_enum, default_value = "uniform", default_value_if("preset", "paper", "normal-small"))]
     pub init: Init,
-    /// Temperature of the loss, 1e-6 to 1e6
-    #[arg(long, value_name = "TAU", default_value_t = 0.1, value_parser = within(1e-6..=1e6))]
+    /// Temperature of the loss, 1e-6 to 1e6; with --preset paper the default is 0.2
+    #[arg(long, value_name = "TAU", value_parser = within(1e-6..=1e6), default_value = "0.1",
+        default_value_if("preset", "paper", "0.2"))]
     pub tau: f64,
-    /// Learning rate of the features, above 0
-    #[arg(long, value_name = "RATE", default_value_t = 1e-3, value_parser = positive::<f64>)]
+    /// Learning rate of the features, above 0; with --preset paper the default is 0.01
+    #[arg(long, value_name = "RATE", value_parser = positive::<f64>, default_value = "0.001",
+        default_value_if("preset", "paper", "0.01"))]
     pub lr: f64,
     /// Learning rate of the graph network, above 0
     #[arg(long, value_name = "RATE", default_value_t = 1e-3, value_parser = positive::<f64>)]
@@ -287,12 +289,22 @@ mod tests {
         let closed = json!({ "preset": null, "levels": ["default", "small", "medium", "large"], "dim": null,
             "spectral": { "cutoff": 0.5 }, "seed": 3 });
         assert_eq!(of(&["--cutoff", "0.5"]), closed);
-        let paper = of(&["--preset", "paper", "--loss", "self"]);
+        let literal = of(&["--preset", "literal", "--loss", "self"]);
         assert_eq!(
-            (&paper["preset"], &paper["levels"], &paper["dim"]),
-            (&json!("paper"), &json!(["large"]), &json!(6))
+            (&literal["preset"], &literal["levels"], &literal["dim"]),
+            (&json!("literal"), &json!(["large"]), &json!(6))
         );
-        assert_eq!(paper["contrastive"], json!(Contrastive { loss: Loss::WithSelf, ..Contrastive::default() }));
-        assert_eq!(paper["contrastive"].as_object().map(serde_json::Map::len), Some(17));
+        assert_eq!(literal["contrastive"], json!(Contrastive { loss: Loss::WithSelf, ..Contrastive::default() }));
+        assert_eq!(literal["contrastive"].as_object().map(serde_json::Map::len), Some(17));
+        let best = Contrastive {
+            init: Init::NormalSmall,
+            unit_length: UnitLength::After,
+            norm_axis: Axis::Gaussian,
+            tau: 0.5,
+            lr: 0.01,
+            loss: Loss::Gaussian,
+            ..Contrastive::default()
+        };
+        assert_eq!(of(&["--preset", "paper", "--tau", "0.5"])["contrastive"], json!(best), "what is given wins");
     }
 }

@@ -124,7 +124,7 @@ fn setup() -> (tempfile::TempDir, PathBuf) {
 #[test]
 fn damaged_gaussians_change_nothing() {
     let (dir, out) = setup();
-    let options = ["--preset", "paper", "--iterations", "100", "--lr", "0.01"];
+    let options = ["--preset", "literal", "--iterations", "100", "--lr", "0.01"];
     succeed(dir.path(), &out, &options);
     let values = || Features::read(&out).unwrap().0.values;
     let before = values();
@@ -186,7 +186,7 @@ fn training_separates_masks_and_does_not_depend_on_threads() {
     ] {
         let with = |threads| {
             let args =
-                ["--preset", "paper", "--iterations", "300", "--lr", "0.01", "--seed", "4", "--threads", threads];
+                ["--preset", "literal", "--iterations", "300", "--lr", "0.01", "--seed", "4", "--threads", threads];
             succeed(dir.path(), &out, &[&args[..], variant].concat())
         };
         assert!(with("1") == with("2"), "{variant:?}");
@@ -220,16 +220,16 @@ fn every_row_of_the_ablation_tables_trains() {
         let values: Vec<u32> = Features::read(&out).unwrap().0.values.iter().map(|v| v.to_bits()).collect();
         outputs.insert(line, values);
     }
-    // The full method has three names; all else differs.
+    // The full method has two names; all else differs.
     let distinct: BTreeSet<_> = outputs.values().collect();
-    assert_eq!((outputs.len(), distinct.len()), (13, 13 - 2));
+    assert_eq!((outputs.len(), distinct.len()), (13, 13 - 1));
 }
 
 /// Killed at once, or interrupted, after which it writes a last checkpoint.
 #[test]
 fn a_stopped_run_continues_to_the_same_bytes() {
     let (dir, out) = setup();
-    let args = ["--preset", "paper", "--iterations", "6000"];
+    let args = ["--preset", "literal", "--iterations", "6000"];
     let whole = succeed(dir.path(), &out, &args);
     let curve = std::fs::read(beside(&out, ".curve.jsonl")).unwrap();
     let checkpoint = beside(&out, ".checkpoint");
@@ -265,7 +265,7 @@ fn a_stopped_run_continues_to_the_same_bytes() {
 #[test]
 fn training_stops_early_when_held_out_views_have_settled() {
     let (dir, out) = setup();
-    let args = ["--preset", "paper", "--lr", "0.01", "--loss", "self", "--iterations", "50000", "--early-stop"];
+    let args = ["--preset", "literal", "--lr", "0.01", "--loss", "self", "--iterations", "50000", "--early-stop"];
     succeed(dir.path(), &out, &args);
     let record = std::fs::read_to_string(beside(&out, ".run.json")).unwrap();
     let record: serde_json::Value = serde_json::from_str(&record).unwrap();
