@@ -5,7 +5,7 @@
     scripts/search_readings.py effects FILE.json          main effects and the best rows, as Markdown
 
 Round 1 spreads readings and settings of HDBSCAN evenly over all factors. Round 2 is a full factorial around the best of it, round 3
-one of HDBSCAN's settings for the best reading. Each has a seed of its own for tuning, and no scene is a room: rooms only report.
+one of HDBSCAN's settings and what still moved. Each has a seed of its own for tuning, and no scene is a room: rooms only report.
 """
 import itertools
 import json
@@ -24,11 +24,11 @@ ROUNDS = {
            "epsilon": ["0", "0.05", "0.1", "0.3"], "select": ["eom", "leaf"], "noise": ["nearest", "keep"]}),
     "2": ({"loss": ["gaussian", "printed"], "init": ["normal-small", "uniform"], "unit-length": ["after", "before"],
            "norm-axis": ["gaussian", "channel"], "tau": ["0.2", "0.1"], "lr": ["0.001", "0.01"]}, {"noise": ["nearest", "keep"]}),
-    "3": ({}, {"min-cluster-size": ["20", "30", "60"], "min-samples": ["3", "10"], "epsilon": ["0", "0.1"],
-               "select": ["eom", "leaf"], "noise": ["nearest", "keep"]}),
+    "3": ({"tau": ["0.2", "0.4"], "lr": ["0.01", "0.03"]},
+          {"min-cluster-size": ["20", "30", "60"], "min-samples": ["3", "10"], "select": ["eom", "leaf"], "noise": ["nearest", "keep"]}),
 }
-# The best of round 2, which round 3 clusters.
-BEST = {"loss": "gaussian"}
+# The best of round 2, which round 3 goes on from.
+BEST = {"loss": "gaussian", "init": "normal-small", "unit-length": "after", "norm-axis": "gaussian"}
 # Readings of round 1; settings of HDBSCAN that are drawn for each, and how many of them are run.
 READINGS, DRAWN, RUN = 48, 6, 4
 SCENES = """\
