@@ -300,7 +300,7 @@ fn the_provenance_holds_every_option_and_the_forecast_is_near_the_peak() {
     s.succeed(&["--cluster", "free", "--noise", "keep"]);
     let (_, a) = Instances::read(s.path("out/instances.safetensors")).unwrap();
     let expected = json!({
-        "cluster": "free", "min_cluster_size": 8, "min_samples": 30, "epsilon": 0.1, "leaf": false,
+        "cluster": "free", "min_cluster_size": 8, "min_samples": 10, "epsilon": 0.0, "leaf": false,
         "allow_single_cluster": false, "noise": "keep", "join": 0.0, "votes": 0, "split": 0.0, "level": ["large"],
         "threshold": 0.2,
     });
