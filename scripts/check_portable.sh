@@ -20,7 +20,7 @@ stages() {
   local linked=(--graph "$out/graph.safetensors" --footprints "$out/footprints.safetensors")
   "$@" "$bin/gs-geom" train --scene scene --out "$out/geometry.ply" --iterations 60 "${common[@]}"
   "$@" "$bin/graph-precompute" "${of[@]}" --masks $masks "${linked[@]}" "${common[@]}"
-  "$@" "$bin/feat-train" --preset paper --iterations 20 --geometry "$out/geometry.ply" "${linked[@]}" \
+  "$@" "$bin/feat-train" --preset literal --iterations 20 --geometry "$out/geometry.ply" "${linked[@]}" \
     --out "$out/contrastive.safetensors" "${common[@]}"
   "$@" "$bin/feat-train" --geometry "$out/geometry.ply" "${linked[@]}" --out "$out/features.safetensors" "${common[@]}"
   "$@" "$bin/cluster-match" "${of[@]}" "${linked[@]}" --features "$out/features.safetensors" --masks $masks \

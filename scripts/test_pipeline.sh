@@ -23,7 +23,7 @@ tiny() {
     GEOM_ARGS='--iterations 300 --checkpoint-every 40' \
     FEAT_ARGS="${feat:-$feat_default}" GRAPH_ARGS='--min-mask-pixels 10' QUERIES='floor' "$@"
 }
-feat_default='--preset paper --iterations 300'
+feat_default='--preset literal --iterations 300'
 artifacts=(scene/sparse/0/cameras.bin scene/sparse/0/images.bin scene/sparse/0/points3D.bin scene/images/frame_00001.png
   scene/truth/points.safetensors scene/truth/scene.json geometry.ply graph.safetensors footprints.safetensors
   features.safetensors instances.safetensors instances.ply)
@@ -63,7 +63,7 @@ same "$work/a" "$work/b" || fail "one and two threads give different bytes"
 pass "one and two threads give the same bytes"
 
 say "== a changed option"
-feat='--preset paper --iterations 310' tiny "$work/b" 1 > "$work/changed.log" 2>&1
+feat='--preset literal --iterations 310' tiny "$work/b" 1 > "$work/changed.log" 2>&1
 ran=$(stages_of "$work/changed.log")
 [ "$ran" = 'cluster-match,eval query,eval report,eval score,feat-train,' ] || fail "a changed feat-train option ran: $ran"
 pass "a changed option runs what depends on it and nothing else"
@@ -91,7 +91,7 @@ cp "$work/a/geometry.ply" "$work/$odd.ply"
 cp -r testdata/clip-tiny "$work/$odd.clip"
 any_name() {
   custom OUT="$work/odd" SCENE="$work/$odd" GEOMETRY="$work/$odd.ply" CLIP="$work/$odd.clip" SAM="$odd" \
-    GRAPH_ARGS='--min-mask-pixels 10' FEAT_ARGS='--preset paper --iterations 30' QUERIES="floor ${payload// /_}_kid's_toy"
+    GRAPH_ARGS='--min-mask-pixels 10' FEAT_ARGS='--preset literal --iterations 30' QUERIES="floor ${payload// /_}_kid's_toy"
 }
 any_name > "$work/odd.log" 2>&1 || { cat "$work/odd.log"; fail "paths of any name"; }
 [ -s "$work/odd/report.html" ] && [ "$(grep -c '"text"' "$work/odd/query/query.json")" -ge 2 ] || fail "no report of paths of any name"
@@ -275,7 +275,7 @@ says() { # says COMMAND...: it must succeed and name the damage
 geometry=(--scene "$scene" --geometry "$d/geometry.ply")
 made=(--graph "$d/graph.safetensors" --footprints "$d/footprints.safetensors")
 says "$bin/graph-precompute" "${geometry[@]}" --masks "$masks" --min-mask-pixels 10 "${made[@]}"
-says "$bin/feat-train" --geometry "$d/geometry.ply" "${made[@]}" --preset paper --iterations 100 --out "$d/features.safetensors"
+says "$bin/feat-train" --geometry "$d/geometry.ply" "${made[@]}" --preset literal --iterations 100 --out "$d/features.safetensors"
 says "$bin/cluster-match" "${geometry[@]}" "${made[@]}" --features "$d/features.safetensors" --masks "$masks" --out "$d/instances.safetensors"
 says "$bin/eval" score "${geometry[@]}" --instances "$d/instances.safetensors" --clip testdata/clip-tiny --out "$d/score.json"
 says "$bin/eval" query "${geometry[@]}" --instances "$d/instances.safetensors" --clip testdata/clip-tiny --text floor --out "$d/query"

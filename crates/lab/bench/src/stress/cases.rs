@@ -203,7 +203,7 @@ fn settings(world: &World) -> Vec<Case> {
         ("one dimension", "contrastive features of dimension 1", format!("{short} --dim 1")),
     ];
     let case = |(name, note, options): (_, _, String)| Case {
-        options: Options::of(Stage::Features, &format!("--preset paper {options}")),
+        options: Options::of(Stage::Features, &format!("--preset literal {options}")),
         tolerances: Tolerances::default(),
         from: From::Features,
         ..Case::new(name, note, world.clone())
