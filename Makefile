@@ -101,7 +101,13 @@ ONLY ?=
 ablation: build ## Tables 3 to 5 on synthetic scenes by a plan: make ablation PLAN=file OUT=folder ONLY=tables (hours)
 	target/release/bench run $(or $(PLAN),pipelines/ablation.plan) --work $(or $(OUT),out/ablation)/runs \
 	  --out $(or $(OUT),out/ablation)/report.json --threads $(JOBS) $(if $(ONLY),--only $(ONLY))
-	$(if $(PLAN)$(OUT)$(ONLY),,cp out/ablation/report.md docs/results/ablation.md)
+	$(if $(PLAN)$(OUT)$(ONLY),,sed -i '/^# Tables/,$$d' docs/results/paper.md && sed '1s/.*/# Tables/' out/ablation/report.md >> docs/results/paper.md)
+
+search: build ## Search the readings of the paper for the best one, in three rounds: out/search (hours)
+	mkdir -p out/search
+	for n in 1 2 3; do scripts/search_readings.py plan $$n > out/search/$$n.plan \
+	  && target/release/bench run out/search/$$n.plan --work out/search/runs --out out/search/$$n.json --threads $(JOBS) \
+	  && scripts/search_readings.py effects out/search/$$n.json | tee out/search/$$n.md || exit; done
 
 batch: build ## Scenes x variants x seeds from a table, JOBS at a time: make batch TABLE=file OUT=folder (docs/cluster.md)
 	@$(PIPELINE) -j $(JOBS) -f pipelines/batch.mk all
