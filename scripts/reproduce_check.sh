@@ -14,7 +14,7 @@ else
   into=$(mktemp -d)
   trap 'rm -rf "$into"' EXIT
 fi
-mapfile -t found < <(find "$out" -maxdepth 3 -name settings.conf | sort)
+mapfile -t found < <(find -L "$out" -maxdepth 3 -name settings.conf | sort)
 [ ${#found[@]} -gt 0 ] || { echo "reproduce_check.sh: no settings.conf in $out: it was made by no pipeline, or is not finished" >&2; exit 2; }
 
 # What says when, where or how fast it was made, and what is left of unfinished runs.

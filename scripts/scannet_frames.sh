@@ -7,7 +7,7 @@ scan=$(realpath "$1") out=$2 every=$3
 rm -rf "$out"
 mkdir -p "$out/color" "$out/pose"
 ln -s "$scan/intrinsic" "$out/intrinsic"
-find "$scan" -maxdepth 1 -type f \( -name '*.ply' -o -name '*.json' \) -exec ln -s -t "$out" {} +
+find -L "$scan" -maxdepth 1 -type f \( -name '*.ply' -o -name '*.json' \) -exec ln -s -t "$out" {} +
 names=()
 while IFS= read -r photograph; do
   name=${photograph##*/}
@@ -16,6 +16,6 @@ while IFS= read -r photograph; do
   names+=("$name")
   ln -s "$photograph" "$out/color/$name"
   if [ -e "$scan/pose/$number.txt" ]; then ln -s "$scan/pose/$number.txt" "$out/pose/"; fi
-done < <(find "$scan/color/" -maxdepth 1 -type f | sort -V)
+done < <(find -L "$scan/color/" -maxdepth 1 -type f | sort -V)
 [ ${#names[@]} -gt 0 ] || { echo "scannet_frames.sh: no frame of $scan/color is a multiple of $every" >&2; exit 2; }
 printf '%s\n' "${names[@]}" > "$out/frames.txt"

@@ -38,10 +38,16 @@ impl Inputs {
     }
 }
 
-/// The name of a folder, also of `.`.
+/// A folder with all the folders above it as they were given: a link keeps its own name, because it is how people call
+/// what it leads to. Only of `..` at the end the name is asked from the file system.
+pub fn full_path(path: &Path) -> PathBuf {
+    let full = std::path::absolute(path).unwrap_or_else(|_| path.to_path_buf());
+    if full.file_name().is_some() { full } else { path.canonicalize().unwrap_or(full) }
+}
+
+/// The name of a folder, also of `.`; a link's own.
 pub fn folder_name(path: &Path) -> String {
-    let full = path.canonicalize().unwrap_or_else(|_| path.to_path_buf());
-    full.file_name().map_or("scene".into(), |n| n.to_string_lossy().into_owned())
+    full_path(path).file_name().map_or("scene".into(), |n| n.to_string_lossy().into_owned())
 }
 
 /// Instances with the Gaussians they label.

@@ -3,6 +3,7 @@
 
 use super::polygon::fill_polygon;
 use crate::Mask;
+use crate::scene::full_path;
 use artifacts::same_shape;
 use gs_io::{Error, IoContext, Result};
 use gs_scene::Camera;
@@ -81,13 +82,15 @@ pub fn read_folder(folder: &Path) -> Result<Vec<FrameLabels>> {
     files(folder)?.iter().map(read).collect()
 }
 
-/// Where the labels of a scene lie: in the folder given, in the scene, or beside it; none where there are none.
+/// Where the labels of a scene lie: in the folder given, in the scene, or beside it, where beside a linked scene is beside the
+/// link; none where there are none.
 pub fn folder(given: Option<&Path>, scene: &Path) -> Result<Option<PathBuf>> {
     if let Some(given) = given {
         let e = || Error::new("no such folder").file(given).field("--labels").hint("check the path");
         return if given.is_dir() { Ok(Some(given.into())) } else { Err(e()) };
     }
-    let beside = scene.canonicalize().ok().and_then(|s| Some(s.parent()?.join("label").join(s.file_name()?)));
+    let full = full_path(scene);
+    let beside = full.parent().zip(full.file_name()).map(|(data, name)| data.join("label").join(name));
     Ok([Some(scene.join("label")), beside].into_iter().flatten().find(|f| f.is_dir()))
 }
 

@@ -423,6 +423,34 @@ fn scans_that_do_not_fit_are_refused() {
 }
 
 #[test]
+fn a_linked_scene_has_the_name_and_the_labels_of_its_link() {
+    let s = Scene::new();
+    // The disc calls it otherwise, and has labels of another scene beside it.
+    let (store, data) = (s.at("store"), s.at("data"));
+    std::fs::create_dir_all(store.join("label/disc-7")).unwrap();
+    std::fs::create_dir_all(data.join("label")).unwrap();
+    std::fs::rename(s.scene(), store.join("disc-7")).unwrap();
+    std::fs::rename(store.join("disc-7/label"), data.join("label/my_room")).unwrap();
+    let link = data.join("my_room");
+    std::os::unix::fs::symlink("../store/disc-7", &link).unwrap();
+    let run = |command: &str, scene: &Path| {
+        let _ = std::fs::remove_dir_all(s.at("out"));
+        let mut c = Command::new(env!("CARGO_BIN_EXE_eval"));
+        c.arg(command).arg("--instances").arg(s.instances()).arg("--geometry").arg(s.geometry()).arg("--scene").arg(scene);
+        c.arg("--text-features").arg(s.texts()).arg("--out").arg(s.at("out")).current_dir(&link);
+        let o = c.output().unwrap();
+        assert!(o.status.success(), "{}", String::from_utf8_lossy(&o.stderr));
+        read_json(&s.at("out/metrics.json"))
+    };
+    for scene in [link.clone(), link.join("."), data.join("label/../my_room")] {
+        let m = run("lerf", &scene);
+        assert_eq!((&m["scene"], &m["features"]["labels"]), (&json!("my_room"), &json!("my_room")));
+        assert!(m["pairs"].as_array().unwrap().len() >= 8);
+        assert_eq!(run("scannet", &scene)["scene"], "my_room");
+    }
+}
+
+#[test]
 fn a_benchmark_scene_asks_its_own_table() {
     let s = Scene::new();
     let notes = s.metrics("lerf", &["--name", "teatime"])["notes"].to_string();
