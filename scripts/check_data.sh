@@ -133,7 +133,7 @@ for source in $needs; do
     sam) echo "    make models (needs npm): MobileSAM. Licence: Apache-2.0." ;;
     clip) echo "    scripts/export_clip.py, of any of open_clip's models (https://github.com/mlfoundations/open_clip); LangSplat's is
     ViT-B-16, laion2b_s34b_b88k. Licence: MIT (code and LAION's weights, on the model's page)." ;;
-    texts) echo "    assets/text_features.json of https://github.com/yanmin-wu/OpenGaussian: the texts of both benchmarks, for features
+    texts) echo "    assets/text_features.zip of https://github.com/yanmin-wu/OpenGaussian: the texts of both benchmarks, for features
     of CLIP ViT-B/16 laion2b_s34b_b88k. Licence: that of the repository." ;;
   esac
 done

@@ -26,7 +26,7 @@ pub struct TextOptions {
     /// CLIP folder with text.onnx: the other half of the model that encoded the masks
     #[arg(long, value_name = "DIR")]
     pub clip: Option<PathBuf>,
-    /// Table of text features by name, JSON or npz, instead of --clip
+    /// Table of text features by name, instead of --clip: JSON, OpenGaussian's text_features.zip, or npz
     #[arg(long, value_name = "FILE", conflicts_with = "clip")]
     pub text_features: Option<PathBuf>,
     /// Accept another CLIP model than the one that encoded the masks, if its features have the same dimension

@@ -26,23 +26,16 @@ pub struct TextTable {
 }
 
 impl TextTable {
-    /// Reads a table: a JSON object of name -> list of numbers, as OpenGaussian's text_features.json, or a NumPy `.npz`
-    /// with an array per name, of shape `[d]` or `[1, d]`. All vectors have one length.
+    /// Reads a table: a JSON object of name -> list of numbers, as OpenGaussian's `text_features.json`; the zip of that name
+    /// that it comes in; or a NumPy `.npz` with an array per name, of shape `[d]` or `[1, d]`. All vectors have one length.
     ///
     /// # Errors
     /// When the file is no such table, is empty, or a number is not finite.
     pub fn read(path: impl AsRef<Path>) -> Result<Self> {
         let path = path.as_ref();
         let bytes = std::fs::read(path).at("read", path)?;
-        let features: BTreeMap<String, Vec<f32>> = if bytes.starts_with(b"PK") {
-            read_npz(&bytes).map_err(|e| e.file(path))?
-        } else {
-            serde_json::from_slice(&bytes).map_err(|e| {
-                Error::new(format!("not a table of text features: {e}"))
-                    .file(path)
-                    .expected("a JSON object of name -> list of numbers, or an npz of name -> vector")
-            })?
-        };
+        let read = if bytes.starts_with(b"PK") { read_zip } else { read_json };
+        let features = read(&bytes).map_err(|e| e.file(path))?;
         let dim = features.values().next().map_or(0, Vec::len);
         if dim == 0 {
             return Err(Error::new("no text features").file(path).hint("give a table with at least one name"));
@@ -60,28 +53,62 @@ impl TextTable {
     }
 }
 
+/// Text features by name, as they are read.
+type Features = BTreeMap<String, Vec<f32>>;
+
+fn read_json(bytes: &[u8]) -> Result<Features> {
+    serde_json::from_slice(bytes).map_err(|e| {
+        Error::new(format!("not a table of text features: {e}"))
+            .expected("a JSON object of name -> list of numbers, that in a zip, or an npz of name -> vector")
+    })
+}
+
 /// Largest array of an npz that is read, in bytes: a vector of text features has a few thousand.
 const LARGEST_ARRAY: u64 = 1 << 24;
+/// The file in OpenGaussian's zip.
+const TABLE: &str = "text_features.json";
 
-fn read_npz(bytes: &[u8]) -> Result<BTreeMap<String, Vec<f32>>> {
-    let broken =
-        |e: zip::result::ZipError| Error::new(format!("not an npz file: {e}")).hint("write it with numpy.savez");
-    let mut archive = zip::ZipArchive::new(std::io::Cursor::new(bytes)).map_err(broken)?;
+type Archive<'a> = zip::ZipArchive<std::io::Cursor<&'a [u8]>>;
+
+/// A zip holds a table as JSON, or is an npz.
+fn read_zip(bytes: &[u8]) -> Result<Features> {
+    let broken = |e: zip::result::ZipError| Error::new(format!("not a readable zip: {e}")).hint("copy it again");
+    let mut archive = Archive::new(std::io::Cursor::new(bytes)).map_err(broken)?;
+    // All that comes out together: entries may be packed a thousandfold, and several may be the same bytes of the file.
+    let most = (64 * bytes.len() as u64).max(LARGEST_ARRAY);
+    let names: Vec<String> = archive.file_names().map(String::from).collect();
+    if let Some(table) = names.iter().position(|n| Path::new(n).file_name().is_some_and(|n| n == TABLE)) {
+        let json = unpack(&mut archive, table, most)?.1;
+        return read_json(&json).map_err(|e| e.field(TABLE));
+    }
+    if names.iter().any(|n| n.ends_with(".npy")) {
+        return read_npz(&mut archive, most);
+    }
+    Err(Error::new("no text features in this zip")
+        .found(format!("{} files: {}", names.len(), names.iter().take(3).cloned().collect::<Vec<_>>().join(", ")))
+        .expected(format!("{TABLE}, as OpenGaussian ships it, or the arrays of numpy.savez")))
+}
+
+/// Name and content of a file of a zip, of at most so many bytes: not the size that it claims, but what comes out.
+fn unpack(archive: &mut Archive<'_>, index: usize, most: u64) -> Result<(String, Vec<u8>)> {
+    let broken = |e: &dyn std::fmt::Display| Error::new(format!("not a readable zip: {e}")).hint("copy it again");
+    let mut entry = archive.by_index(index).map_err(|e| broken(&e))?;
+    let (name, mut data) = (entry.name().to_string(), Vec::new());
+    (&mut entry).take(most + 1).read_to_end(&mut data).map_err(|e| broken(&e).field(&name))?;
+    if data.len() as u64 > most {
+        let e = Error::new("too large for text features").field(&name);
+        return Err(e.expected(format!("at most {most} bytes")).hint("give a table of fewer names"));
+    }
+    Ok((name, data))
+}
+
+fn read_npz(archive: &mut Archive<'_>, most: u64) -> Result<Features> {
     let mut features = BTreeMap::new();
-    // All arrays together: entries may be packed a thousandfold, and several may be the same bytes of the file.
-    let mut left = (64 * bytes.len() as u64).max(LARGEST_ARRAY);
+    let mut left = most;
     for i in 0..archive.len() {
-        let mut entry = archive.by_index(i).map_err(broken)?;
-        let name = entry.name().trim_end_matches(".npy").to_string();
-        let mut data = Vec::new();
-        // Not the size that the file claims, but what comes out.
-        let most = LARGEST_ARRAY.min(left);
-        let read = (&mut entry).take(most + 1).read_to_end(&mut data);
-        read.map_err(|e| Error::new(format!("not an npz file: {e}")).field(&name).hint("write it with numpy.savez"))?;
-        if data.len() as u64 > most {
-            return Err(Error::new("too large for a text feature").field(&name).expected("a vector per name"));
-        }
+        let (file, data) = unpack(archive, i, LARGEST_ARRAY.min(left))?;
         left -= data.len() as u64;
+        let name = file.trim_end_matches(".npy").to_string();
         let array = gs_io::npy::parse(&data).map_err(|e| e.field(&name))?;
         if !matches!(array.shape[..], [_] | [1, _]) {
             let e = Error::new("not a vector").field(&name).found(format!("{:?}", array.shape));
@@ -263,18 +290,45 @@ mod tests {
         assert!(e.contains("one of its 3 names, such as \"coffee mug\", \"coffee\""), "{e}");
     }
 
-    fn npz(entries: &[(&str, &[usize], &[f32])]) -> Result<TextSource> {
+    fn zipped(name: &str, files: &[(String, Vec<u8>)]) -> Result<TextSource> {
         let dir = tempfile::tempdir().unwrap();
-        let path = dir.path().join("text.npz");
+        let path = dir.path().join(name);
         let mut archive = zip::ZipWriter::new(std::fs::File::create(&path).unwrap());
-        for (name, shape, data) in entries {
-            let array = dir.path().join("a.npy");
-            gs_io::npy::write_f32(&array, shape, data).unwrap();
-            archive.start_file(format!("{name}.npy"), zip::write::SimpleFileOptions::default()).unwrap();
-            std::io::Write::write_all(&mut archive, &std::fs::read(&array).unwrap()).unwrap();
+        for (name, bytes) in files {
+            archive.start_file(name, zip::write::SimpleFileOptions::default()).unwrap();
+            std::io::Write::write_all(&mut archive, bytes).unwrap();
         }
         archive.finish().unwrap();
         Ok(TextSource::Table(TextTable::read(&path)?))
+    }
+
+    fn npz(entries: &[(&str, &[usize], &[f32])]) -> Result<TextSource> {
+        let dir = tempfile::tempdir().unwrap();
+        let file = |&(name, shape, data): &(&str, &[usize], &[f32])| {
+            let array = dir.path().join("a.npy");
+            gs_io::npy::write_f32(&array, shape, data).unwrap();
+            (format!("{name}.npy"), std::fs::read(&array).unwrap())
+        };
+        zipped("text.npz", &entries.iter().map(file).collect::<Vec<_>>())
+    }
+
+    #[test]
+    fn opengaussians_table_reads_in_the_zip_that_it_comes_in() {
+        let file = |name: &str, content: &str| (name.to_string(), content.as_bytes().to_vec());
+        let table = file("assets/text_features.json", r#"{"coffee mug": [1, 0], "sheep": [0.6, 0.8]}"#);
+        // As the Finder packs it, too.
+        let finder = file("__MACOSX/assets/._text_features.json", "Mac OS X");
+        for files in [&[table.clone()][..], &[finder, table]] {
+            let t = zipped("text_features.zip", files).unwrap();
+            assert_eq!(t.encode(&["sheep".into()]).unwrap(), [Some(vec![0.6, 0.8])]);
+        }
+        let refused = |files: &[_], part: &str| {
+            let e = zipped("text_features.zip", files).err().unwrap().to_string();
+            assert!(e.contains("text_features.zip") && e.contains(part), "{e}");
+        };
+        refused(&[file("notes.txt", "x")], "no text features in this zip; found 1 files: notes.txt, expected text_features.json");
+        refused(&[file("text_features.json", "[1]")], "text_features.json: not a table of text features");
+        refused(&[file("text_features.json", &" ".repeat((1 << 24) + 1))], "too large for text features");
     }
 
     #[test]
@@ -287,7 +341,7 @@ mod tests {
         let e = npz(&[("a", &[1], &[f32::NAN])]).err().unwrap().to_string();
         assert!(e.contains("a: a number is not finite"), "{e}");
         assert!(npz(&[]).err().unwrap().to_string().contains("no text features"));
-        assert!(table("PK\u{3}\u{4}cut").err().unwrap().to_string().contains("not an npz file"));
+        assert!(table("PK\u{3}\u{4}cut").err().unwrap().to_string().contains("not a readable zip"));
     }
 
     #[test]
