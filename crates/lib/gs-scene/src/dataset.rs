@@ -279,6 +279,14 @@ impl Dataset {
     }
 }
 
+/// The file of this name with its extension in other letters, such as `a.JPG` for `a.jpg`: cameras and copying programs differ
+/// in that, and disks where it counts show it.
+fn other_case(folder: &Path, name: &str) -> Option<String> {
+    let (bare, extension) = name.rsplit_once('.')?;
+    let other = [extension.to_ascii_lowercase(), extension.to_ascii_uppercase()];
+    other.iter().map(|e| format!("{bare}.{e}")).find(|n| folder.join(n).is_file())
+}
+
 /// Refuses a name inside a file that leads out of the dataset's folder.
 pub(crate) fn check_inside(name: &str, field: &str) -> Result<()> {
     let inside = |c: Component| matches!(c, Component::Normal(_) | Component::CurDir);

@@ -582,6 +582,40 @@ fn cameras_that_no_one_has_are_refused_whatever_the_layout() {
 }
 
 #[test]
+fn extensions_may_be_in_capitals_whatever_the_model_says() {
+    let dir = tempfile::tempdir().unwrap();
+    let root = dir.path();
+    let cameras = cameras(3, 40, 30);
+    colmap_scene(root, &cameras);
+    // As cameras write them, as a program renamed them, and as another did.
+    let named = [("a.JPG", "a.JPG"), ("b.jpg", "b.JPG"), ("c.JPEG", "c.jpeg")];
+    let jpeg = image::RgbImage::from_raw(40, 30, plain(40, 30).to_rgb8()).unwrap();
+    fs::remove_dir_all(root.join("images")).unwrap();
+    fs::create_dir(root.join("images")).unwrap();
+    for (_, file) in named {
+        jpeg.save_with_format(root.join("images").join(file), image::ImageFormat::Jpeg).unwrap();
+    }
+    let views: Vec<_> = named.iter().zip(&cameras).map(|(n, c)| (n.0.to_string(), c.clone())).collect();
+    colmap::write_model(&root.join("sparse/0"), &views, &points()).unwrap();
+    let found = |d: &Dataset| d.views.iter().map(|v| (v.stem().to_string(), v.image_path.clone())).collect::<Vec<_>>();
+    let expected: Vec<_> =
+        named.iter().map(|(_, file)| (file[..1].to_string(), root.join("images").join(file))).collect();
+    let d = dataset::load(root, &FULL).unwrap();
+    assert_eq!((found(&d), d.warnings.len()), (expected.clone(), 0));
+    assert!(d.views.iter().all(|v| v.load_image().is_ok()));
+    fs::remove_dir_all(root.join("sparse")).unwrap();
+    let c = &cameras[0];
+    let frames: Vec<_> = named
+        .iter()
+        .map(|(name, _)| json!({"file_path": format!("images/{name}"), "transform_matrix": opengl(c)}))
+        .collect();
+    let json = json!({"w": 40, "h": 30, "fl_x": c.fx, "fl_y": c.fy, "cx": c.cx, "cy": c.cy, "frames": frames});
+    write(&root.join("transforms.json"), &json.to_string());
+    let d = dataset::load(root, &FULL).unwrap();
+    assert_eq!((found(&d), d.warnings.len()), (expected, 0));
+}
+
+#[test]
 fn missing_photographs_are_skipped_until_none_is_left() {
     let dir = tempfile::tempdir().unwrap();
     colmap_scene(dir.path(), &cameras(3, 20, 16));

@@ -117,9 +117,17 @@ fn masked_pixels_do_not_count() {
     for i in 0..VIEWS {
         let mut mask = vec![255u8; PIXELS];
         at(i).for_each(|p| mask[p] = 0);
-        // As COLMAP calls masks, and without the photograph's own extension.
-        let name = if i % 2 == 0 { format!("{i:02}.png.png") } else { format!("{i:02}.png") };
-        image::save_buffer(Path::new(&masks).join(name), &mask, SIZE.0, SIZE.1, image::ColorType::L8).unwrap();
+        // As COLMAP calls masks, and without the photograph's own extension, in capitals or not.
+        let name = [format!("{i:02}.png.png"), format!("{i:02}.png"), format!("{i:02}.PNG")];
+        image::save_buffer_with_format(
+            Path::new(&masks).join(&name[i % 3]),
+            &mask,
+            SIZE.0,
+            SIZE.1,
+            image::ColorType::L8,
+            image::ImageFormat::Png,
+        )
+        .unwrap();
     }
     let whole = train(&dir, "a.ply", &[]);
     let masked = train(&dir, "b.ply", &["--masks", &masks]);

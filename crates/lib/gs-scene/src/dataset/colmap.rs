@@ -3,7 +3,7 @@
 mod binary;
 mod text;
 
-use super::{Format, RawDataset, RawView, check_inside};
+use super::{Format, RawDataset, RawView, check_inside, other_case};
 use crate::PointCloud;
 use crate::lens::{Distortion, Lens};
 pub use binary::write_model;
@@ -74,7 +74,12 @@ pub(crate) fn load(root: &Path, model: &Path) -> Result<RawDataset> {
     let (mut views, mut warnings) = (Vec::new(), Vec::new());
     for Registered { name, camera, rotation, translation } in images {
         check_inside(&name, "images").map_err(|e| e.file(model))?;
-        let image_path = folder.join(&name);
+        let mut image_path = folder.join(&name);
+        if !image_path.is_file()
+            && let Some(other) = other_case(&folder, &name)
+        {
+            image_path = folder.join(other);
+        }
         if image_path.is_file() {
             views.push(RawView { name, image_path, lens: cameras[&camera], rotation, translation, split: None });
         } else {

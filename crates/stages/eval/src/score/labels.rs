@@ -184,7 +184,7 @@ pub fn read_pictures(folder: &Path) -> Result<Vec<FrameLabels>> {
         let paths = list(&place)?;
         let mut labels = FrameLabels { file: place, frame, width: 0, height: 0, categories: BTreeMap::new() };
         for path in paths {
-            if !path.extension().is_some_and(|e| ["jpg", "jpeg", "png"].iter().any(|k| e == *k)) {
+            if !path.extension().is_some_and(|e| ["jpg", "jpeg", "png"].iter().any(|k| e.eq_ignore_ascii_case(k))) {
                 continue;
             }
             let mask = read_mask(&path)?;
@@ -244,6 +244,9 @@ mod tests {
         assert_eq!((labels.len(), labels[0].frame.as_str(), labels[0].width), (1, "frame_00007", 4));
         let cup = &labels[0].categories["red cup"];
         assert_eq!(cup.bits, [false, false, true, true, false, false, true, false], "10 is still ringing");
+        grey(vec![255; 8]).save(place.join("plate.png")).unwrap();
+        std::fs::rename(place.join("plate.png"), place.join("plate.JPG")).unwrap();
+        assert_eq!(read_pictures(dir.path()).unwrap()[0].categories["plate"].count(), 8);
         image::GrayImage::new(3, 2).save(place.join("spoon.png")).unwrap();
         assert!(read_pictures(dir.path()).unwrap_err().to_string().contains("differ in size; found 3x2, expected 4x2"));
         std::fs::write(place.join("spoon.png"), "no").unwrap();

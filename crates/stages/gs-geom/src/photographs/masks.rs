@@ -29,7 +29,9 @@ impl Masks {
         for view in views {
             let bare = Path::new(&view.name).with_extension("").to_string_lossy().into_owned();
             let names = [view.name.clone(), format!("{}.png", view.name), format!("{bare}.png"), format!("{bare}.jpg")];
-            let named = names.iter().map(|n| folder.join(n)).chain([folder.join(format!("{}.png", view.stem()))]);
+            let names = names.into_iter().chain([format!("{}.png", view.stem())]);
+            let others = ["PNG", "JPG", "jpeg", "JPEG"].map(|e| format!("{bare}.{e}"));
+            let named = names.chain(others).map(|n| folder.join(n));
             if let Some(path) = named.into_iter().find(|p| p.is_file()) {
                 all.insert(view.name.clone(), path);
             }
