@@ -24,7 +24,7 @@ pub use health::{Finding, Health, SHARED, SharedMasks};
 pub use instances::{Family, Instances, Match, OrientedBox, TreeEdge};
 pub use lerf_ovs::{LERF_OVS, LerfScene};
 pub use masks::{
-    LEVELS, Level, MaskFeatures, MaskMaps, features_path, folder_files, hash_folder, maps_path, same_shape, stems,
+    LEVELS, Level, MaskFeatures, MaskFolder, MaskMaps, features_path, folder_files, hash_folder, maps_path, same_shape, stems,
     watch_folder,
 };
 pub use nyu40::NYU40;

@@ -1,6 +1,8 @@
 //! Id maps and mask features in LangSplat's layout: `<stem>_s.npy` and `<stem>_f.npy` in one folder.
 
-use gs_io::{Error, IoContext, Result, Watched, hash_files, npy};
+use crate::role;
+use gs_io::{Error, IoContext, Provenance, Result, Watched, hash_files, npy};
+use gs_scene::dataset::View;
 use std::path::{Path, PathBuf};
 
 /// Levels of an id map file.
@@ -190,6 +192,45 @@ impl MaskMaps {
     }
 }
 
+/// The id maps of a folder as the pinhole cameras of a scene see them.
+#[derive(Debug, Clone, PartialEq)]
+pub struct MaskFolder {
+    path: PathBuf,
+    /// Whether the maps were made from undistorted photographs.
+    undistorted: bool,
+}
+
+impl MaskFolder {
+    /// A folder, with what its `masks.json` says of it: `mask-embed masks` sees undistorted photographs, and names the dataset
+    /// that they are of. Maps of other programs, and imported ones, are of the photographs as they lie on disk.
+    pub fn open(path: impl Into<PathBuf>) -> Self {
+        let path = path.into();
+        let manifest = std::fs::read(path.join("masks.json")).ok();
+        let made = manifest.and_then(|bytes| serde_json::from_slice::<Provenance>(&bytes).ok());
+        let undistorted = made.is_some_and(|m| m.inputs.contains_key(role::DATASET));
+        Self { path, undistorted }
+    }
+
+    /// Whether the maps of this view have the distortion of its lens, which [`Self::read`] takes out.
+    pub fn bends(&self, view: &View) -> bool {
+        view.is_distorted() && !self.undistorted
+    }
+
+    /// Reads the id maps of a view, undistorted.
+    ///
+    /// # Errors
+    /// As [`MaskMaps::read`] and [`MaskMaps::expect_shape`].
+    pub fn read(&self, view: &View) -> Result<MaskMaps> {
+        let file = maps_path(&self.path, view.stem());
+        let mut maps = MaskMaps::read(&file)?;
+        maps.expect_shape(view.camera.width, view.camera.height, &file)?;
+        if self.bends(view) {
+            view.undistort_nearest(&mut maps.ids, maps.width, maps.height);
+        }
+        Ok(maps)
+    }
+}
+
 /// Whether a picture has the shape (aspect ratio) of a photograph: its height is that of the photograph scaled to its width,
 /// to 2 % or two pixels. Both are given as width and height.
 pub fn same_shape([width, height]: [u32; 2], photograph: [u32; 2]) -> bool {
@@ -262,5 +303,37 @@ mod tests {
         assert_eq!(MaskMaps::read(&p).unwrap().level(Level::Medium), [-1, 0, 1, 2, 3, 4]);
         npy::write_f32(&p, &[0, 3], &[]).unwrap();
         assert!(MaskMaps::read(&p).is_err());
+    }
+
+    #[test]
+    fn given_maps_of_a_distorted_lens_are_undistorted_and_our_own_are_not() {
+        let dir = tempfile::tempdir().unwrap();
+        let (root, masks) = (dir.path(), dir.path().join("masks"));
+        std::fs::create_dir_all(root.join("sparse/0")).unwrap();
+        let sparse = |name: &str, text: &str| std::fs::write(root.join("sparse/0").join(name), text).unwrap();
+        sparse("cameras.txt", "1 SIMPLE_RADIAL 80 60 50 40 30 -0.3\n");
+        sparse("images.txt", "1 1 0 0 0 0 0 0 1 a.png\n\n");
+        let grey = vec![0.5; 3 * 80 * 60];
+        gs_scene::Image { width: 80, height: 60, rgb: grey, alpha: None }.write_png(root.join("images/a.png")).unwrap();
+        let load = gs_scene::dataset::LoadOptions { resolution: "1".parse().unwrap(), holdout: 0 };
+        let view = gs_scene::dataset::load(root, &load).unwrap().views.remove(0);
+        // A wall that ends at column 20 of the photograph, 20 pixels left of its middle.
+        let ids = (0..4 * 80 * 60).map(|i| i32::from(i % 80 >= 20)).collect();
+        let given = MaskMaps { width: 80, height: 60, ids };
+        given.write(maps_path(&masks, "a")).unwrap();
+        let folder = MaskFolder::open(&masks);
+        let read = folder.read(&view).unwrap();
+        assert!(folder.bends(&view));
+        let begins = |row: usize| read.level(Level::Large)[80 * row..].iter().position(|&id| id == 1).unwrap();
+        // A barrel pulls inwards, and more so the farther out: in the middle row x of the undistorted picture is seen at
+        // 40 + (x - 40) (1 - 0.3 ((x - 40) / 50)^2).
+        assert_eq!([begins(30), begins(29)], [19, 19]);
+        assert!(begins(0) < 19 && begins(59) < 19, "{} {}", begins(0), begins(59));
+        let made = Provenance { inputs: [(role::DATASET.to_string(), String::new())].into(), ..Provenance::default() };
+        gs_io::write_json(masks.join("masks.json"), &made).unwrap();
+        assert_eq!(MaskFolder::open(&masks).read(&view).unwrap(), given, "mask-embed saw undistorted photographs");
+        let imported = Provenance { inputs: [("labels".to_string(), String::new())].into(), ..made };
+        gs_io::write_json(masks.join("masks.json"), &imported).unwrap();
+        assert_eq!(MaskFolder::open(&masks).read(&view).unwrap(), read);
     }
 }

@@ -262,6 +262,18 @@ fn check_undistortion(model: &str, parameters: &[f64], intrinsics: [f64; 4], dis
     }
     // 8 bits and bilinear interpolation on 160 pixels leave less than this; a shift of one pixel is 0.015.
     assert!(worst < 0.006, "{model}: {worst}");
+    assert_eq!(d.warnings.len(), usize::from(view.is_distorted()), "{:?}", d.warnings);
+    assert!(d.warnings.iter().all(|w| w.contains("the lenses of 1 of 1 photographs are distorted")), "{:?}", d.warnings);
+    // What cannot be mixed comes from the nearest pixel: half a pixel off, of a map of the same or of half the size.
+    for (shrink, most) in [(1, 0.012), (2, 0.02)] {
+        let (before, after) = (photo.resize_area(w / shrink, h / shrink), image.resize_area(w / shrink, h / shrink));
+        let planes = |i: &Image| [0, 1].map(|c| i.rgb.iter().skip(c).step_by(3).copied().collect::<Vec<_>>()).concat();
+        let mut found = planes(&before);
+        view.undistort_nearest(&mut found, (w / shrink) as usize, (h / shrink) as usize);
+        assert!(found.iter().all(|v| before.rgb.contains(v)), "{model}: a number that was not there");
+        let worst = found.iter().zip(planes(&after)).fold(0.0f32, |m, (a, b)| m.max((a - b).abs()));
+        assert!(worst < most, "{model}, shrunk by {shrink}: {worst}");
+    }
     if distortion != [0.0; 4] {
         let off = photo.rgb.iter().zip(&image.rgb).fold(0.0f32, |m, (a, b)| m.max((a - b).abs()));
         assert!(off > 0.02, "{model}: the distortion does something");

@@ -8,10 +8,9 @@ use crate::inputs::{Inputs, mask_features};
 use crate::memory;
 use crate::options::{Args, Noise, Settings};
 use crate::outputs;
-use artifacts::{Instances, Level, MaskFeatures, MaskMaps, Match, maps_path};
+use artifacts::{Instances, Level, MaskFeatures, MaskFolder, Match};
 use gs_io::{Error, Result, Watched};
 use gs_raster::RasterOptions;
-use gs_scene::dataset::View;
 use stage::{CommonArgs, Program, Stage};
 use std::collections::BTreeMap;
 use std::time::Instant;
@@ -145,13 +144,14 @@ fn match_views(
     let mut found = Vec::new();
     let mut features: BTreeMap<u32, MaskFeatures> = BTreeMap::new();
     let mut progress = stage.progress("matching views", inputs.views.len() as u64);
-    for (index, stem) in inputs.views.iter().map(View::stem).enumerate() {
-        let maps = MaskMaps::read(maps_path(&a.masks, stem))?;
-        let camera = inputs.views[index].camera.resized(maps.width as u32, maps.height as u32);
+    let folder = MaskFolder::open(&a.masks);
+    for (index, view) in inputs.views.iter().enumerate() {
+        let maps = folder.read(view)?;
+        let camera = view.camera.resized(maps.width as u32, maps.height as u32);
         let overlaps = overlaps(gaussians, &raster, labels, &table, &camera, &maps, &settings.levels);
         found.extend(matches(&overlaps, index as u32, settings.threshold as f32));
         let dim = features.values().next().map(|f| f.dim);
-        features.extend(mask_features(&a.masks, stem, &maps, dim)?.map(|f| (index as u32, f)));
+        features.extend(mask_features(&a.masks, view.stem(), &maps, dim)?.map(|f| (index as u32, f)));
         progress.step();
     }
     progress.finish(&[("matches", found.len() as f64)]);

@@ -4,7 +4,7 @@ use crate::footprint::{FootprintOptions, view_footprints};
 use crate::graph::{AnchorDistances, anchor_graph};
 use crate::options::Settings;
 use crate::positions::shifted;
-use artifacts::{FootprintsBuilder, Graph, MaskMaps, PixelSamples, ScratchEntries, maps_path};
+use artifacts::{FootprintsBuilder, Graph, MaskFolder, PixelSamples, ScratchEntries, maps_path};
 use gs_io::{Error, Result};
 use gs_raster::RasterOptions;
 use gs_scene::Geometry;
@@ -55,10 +55,15 @@ pub(crate) fn precompute(
     let mut c = Collected::new(geometry, entries);
     c.summary.views = views.len();
     let usable = c.usable(stage);
+    let folder = MaskFolder::open(masks);
+    let bent = views.iter().filter(|v| folder.bends(v)).count();
+    if bent > 0 {
+        stage.info(&format!("the id maps of {bent} views are undistorted, as their photographs are"));
+    }
     let mut progress = stage.progress("views", views.len() as u64);
     for view in &views {
         stage.go_on()?;
-        c.add(view, masks, settings, seed)?;
+        c.add(view, &folder, settings, seed)?;
         progress.step();
     }
     progress.finish(&[("masks", c.out.rows.len() as f64), ("entries", c.entries.count as f64)]);
@@ -148,12 +153,10 @@ impl<'a> Collected<'a> {
     }
 
     /// Adds the masks of a view.
-    fn add(&mut self, view: &View, masks: &Path, settings: &Settings, seed: u64) -> Result<()> {
-        let file = maps_path(masks, view.stem());
-        let mut maps = MaskMaps::read(&file)?;
-        maps.keep(&settings.levels);
+    fn add(&mut self, view: &View, masks: &MaskFolder, settings: &Settings, seed: u64) -> Result<()> {
         // The map may be smaller than the photograph, but not of another shape.
-        maps.expect_shape(view.camera.width, view.camera.height, &file)?;
+        let mut maps = masks.read(view)?;
+        maps.keep(&settings.levels);
         let camera = view.camera.resized(maps.width as u32, maps.height as u32);
         let index = self.out.views.len() as u32;
         let scale = (maps.width * maps.height) as f64 / REFERENCE_PIXELS;

@@ -1,7 +1,9 @@
 //! The program on a small scene on disk: the artifacts, the same bytes for any thread count, and bad input.
 
-use artifacts::{Footprints, Graph, MaskMaps, Level, Row};
+use artifacts::{Footprints, Graph, Level, MaskMaps, Row, maps_path, role};
 use glam::DVec3;
+use gs_io::Provenance;
+use gs_scene::dataset::{self, LoadOptions, Resolution};
 use gs_scene::{Camera, Gaussians, Image, PointCloud, colmap, ply};
 use std::path::{Path, PathBuf};
 use std::process::{Command, Output};
@@ -234,6 +236,42 @@ fn pixels_are_kept_where_asked_for_and_change_nothing_else() {
         let mine = &p.col[p.ptr[i] as usize..p.ptr[i + 1] as usize];
         assert!(!mine.is_empty() && mine.iter().all(|c| mask.contains(c)));
     }
+}
+
+#[test]
+fn given_maps_of_distorted_photographs_are_undistorted_with_them() {
+    let (_dir, s, o) = setup(SIZE);
+    // The views share a camera: the same with a barrel lens.
+    let f = 0.5 * f64::from(SIZE) / 0.45f64.tan();
+    std::fs::remove_file(s.join("sparse/0/cameras.bin")).unwrap();
+    let camera = format!("1 SIMPLE_RADIAL {SIZE} {SIZE} {f} 24 24 -0.3\n");
+    std::fs::write(s.join("sparse/0/cameras.txt"), camera).unwrap();
+    // A thing that ends left of the middle, as it is drawn on the photographs.
+    let n = (SIZE * SIZE) as usize;
+    let ids = (0..4 * n).map(|p| i32::from(p % SIZE as usize >= 14)).collect();
+    let drawn = MaskMaps { width: SIZE as usize, height: SIZE as usize, ids };
+    let load = LoadOptions { resolution: Resolution::Divisor(1.0), holdout: 8 };
+    let views = dataset::load(&s, &load).unwrap().views;
+    let mut flat = drawn.clone();
+    views[0].undistort_nearest(&mut flat.ids, flat.width, flat.height);
+    assert_ne!(flat, drawn);
+    let write = |maps: &MaskMaps| views.iter().for_each(|v| maps.write(maps_path(s.join("masks"), v.stem())).unwrap());
+    let rows = || {
+        let f = Footprints::read(o.join("footprints.safetensors")).unwrap();
+        (0..f.rows.len()).map(|r| (f.rows[r], f.entries(r).0.to_vec(), f.entries(r).1.to_vec())).collect::<Vec<_>>()
+    };
+    write(&drawn);
+    let said = succeed(&run(&s, &o, &[]));
+    assert!(said.contains("the lenses of 5 of 5 photographs are distorted"), "{said}");
+    assert!(said.contains("the id maps of 4 views are undistorted"), "{said}");
+    let given = rows();
+    // The maps that mask-embed would have made of the undistorted photographs are taken as they are.
+    write(&flat);
+    let made = Provenance { inputs: [(role::DATASET.to_string(), String::new())].into(), ..Provenance::default() };
+    gs_io::write_json(s.join("masks/masks.json"), &made).unwrap();
+    let said = succeed(&run(&s, &o, &[]));
+    assert!(!said.contains("id maps of 4 views"), "{said}");
+    assert!(given == rows() && !given.is_empty(), "other footprints");
 }
 
 #[test]

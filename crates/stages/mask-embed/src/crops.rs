@@ -4,7 +4,7 @@
 
 use crate::options::CropsArgs;
 use crate::photographs;
-use artifacts::{Level, MaskMaps, MaskTruth, TrueScene, hash_folder, maps_path, role};
+use artifacts::{Level, MaskFolder, MaskMaps, MaskTruth, TrueScene, hash_folder, maps_path, role};
 use gs_io::{ArtifactWriter, Error, Result};
 use gs_scene::dataset::View;
 use onnx_models::{Bounds, LabelMap, RgbImage, Tokenizer, crop_mask, mask_bounds};
@@ -49,9 +49,7 @@ pub(crate) fn read_maps(folder: &Path, view: &View, stage: &Stage) -> Result<Opt
         stage.warn(&format!("{}: no id maps of this view; it is left out", path.display()));
         return Ok(None);
     }
-    let maps = MaskMaps::read(&path)?;
-    maps.expect_shape(view.camera.width, view.camera.height, &path)?;
-    Ok(Some(maps))
+    MaskFolder::open(folder).read(view).map(Some)
 }
 
 pub(crate) fn no_maps(folder: &Path) -> Error {

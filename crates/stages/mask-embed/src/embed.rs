@@ -4,7 +4,7 @@ use crate::crops::{cut, no_maps, owners, read_maps};
 use crate::finished::{self, Views};
 use crate::options::EmbedArgs;
 use crate::photographs;
-use artifacts::{MaskFeatures, MaskMaps, features_path, hash_folder, maps_path, role};
+use artifacts::{MaskFeatures, MaskFolder, MaskMaps, features_path, hash_folder, maps_path, role};
 use gs_io::{Claim, Result, Watched, hash_bytes, hash_file, write_json};
 use gs_scene::dataset::{Dataset, View};
 use onnx_models::{ClipImage, ClipText, RgbImage};
@@ -31,11 +31,8 @@ struct Facts {
 
 /// Reads all id maps once, so that one that is damaged or of other photographs is found before the first is encoded.
 fn check_maps(folder: &Path, views: &[View]) -> Result<()> {
-    let fault = |v: &View| {
-        let path = maps_path(folder, v.stem());
-        let maps = path.exists().then(|| MaskMaps::read(&path))?;
-        maps.and_then(|m| m.expect_shape(v.camera.width, v.camera.height, &path)).err()
-    };
+    let there = |v: &&View| maps_path(folder, v.stem()).exists();
+    let fault = |v: &View| Some(v).filter(there).and_then(|v| MaskFolder::open(folder).read(v).err());
     views.par_iter().find_map_first(fault).map_or(Ok(()), Err)
 }
 
@@ -61,7 +58,8 @@ pub(crate) fn run(args: &EmbedArgs, stage: &Stage) -> Result<()> {
         let Some(maps) = read_maps(folder, view, stage)? else { continue };
         let (image, image_hash) = photographs::read(view)?;
         let maps_hash = hash_file(maps_path(folder, view.stem()))?;
-        let key = finished::made_from(&[&parameters.to_string(), clip.hash(), &image_hash, &maps_hash]);
+        let bent = if MaskFolder::open(folder).bends(view) { "\nundistorted" } else { "" };
+        let key = finished::made_from(&[&parameters.to_string(), clip.hash(), &image_hash, &(maps_hash + bent)]);
         let output = features_path(out, view.stem());
         let facts: Facts = views.next(view, &output, &key, || {
             if !std::mem::replace(&mut forecast_made, true) {

@@ -86,7 +86,22 @@ pub(crate) fn load(root: &Path, model: &Path) -> Result<RawDataset> {
             warnings.push(format!("{}: no such photograph, view skipped", image_path.display()));
         }
     }
+    warnings.extend(distorted(model, &views));
     Ok(RawDataset { format: Format::Colmap, files, views, points, warnings })
+}
+
+/// Says that the model's photographs are not undistorted, where they are not: who undistorted them has another model, too.
+fn distorted(model: &Path, views: &[RawView]) -> Option<String> {
+    let bent = views.iter().filter(|v| !v.lens.distortion.is_none()).count();
+    (bent > 0).then(|| {
+        format!(
+            "{}: the lenses of {bent} of {} photographs are distorted: photographs and id maps of them are undistorted as they \
+             are read, drawn labels are not; where the photographs are undistorted already, give the model that belongs \
+             to them (COLMAP's image_undistorter writes both)",
+            model.display(),
+            views.len()
+        )
+    })
 }
 
 type Read<T> = fn(&[u8]) -> Result<T>;

@@ -72,11 +72,42 @@ impl View {
         Ok(flat.resize_area(self.camera.width, self.camera.height))
     }
 
+    /// Whether the lens bends straight lines: what was made from the photograph as it lies on disk has them bent, too.
+    pub fn is_distorted(&self) -> bool {
+        !self.lens.distortion.is_none()
+    }
+
+    /// Takes the distortion out of numbers that cannot be mixed, such as mask ids: each pixel takes the number of the nearest
+    /// one, at the place that [`Self::load_image`] takes its colour from. `planes` are pictures `[height][width]`, one
+    /// after the other, of the photograph as it lies on disk, and may be smaller than it, not of another shape.
+    pub fn undistort_nearest<T: Copy>(&self, planes: &mut [T], width: usize, height: usize) {
+        if !self.is_distorted() || width * height == 0 {
+            return;
+        }
+        let (zoom, (w, h)) = (self.zoom(), self.lens.size);
+        let (sx, sy) = (f64::from(w) / width as f64, f64::from(h) / height as f64);
+        // The cast turns what is below zero, and NaN, into 0.
+        let nearest = |v: f64, size: usize| (v as usize).min(size - 1);
+        let from = (0..width * height).into_par_iter().map(|i| {
+            let (u, v) = self.lens.locate(zoom, ((i % width) as f64 + 0.5) * sx, ((i / width) as f64 + 0.5) * sy);
+            (nearest(v / sy, height) * width + nearest(u / sx, width)) as u32
+        });
+        let from: Vec<u32> = from.collect();
+        for plane in planes.chunks_exact_mut(width * height) {
+            let bent = plane.to_vec();
+            plane.iter_mut().zip(&from).for_each(|(to, &i)| *to = bent[i as usize]);
+        }
+    }
+
+    /// By how much the pinhole camera's focal lengths are longer than the lens's.
+    fn zoom(&self) -> f64 {
+        self.camera.resized(self.lens.size.0, self.lens.size.1).fx / self.lens.focal_center[0]
+    }
+
     /// Resamples the photograph as the pinhole camera would have seen it.
     fn undistort(&self, photo: &Image) -> Image {
         let w = photo.width as usize;
-        let full = self.camera.resized(photo.width, photo.height);
-        let zoom = full.fx / self.lens.focal_center[0];
+        let zoom = self.zoom();
         let locate = |x: usize, y: usize| self.lens.locate(zoom, x as f64 + 0.5, y as f64 + 0.5);
         let mut out = photo.clone();
         out.rgb.par_chunks_mut(3 * w).enumerate().for_each(|(y, row)| {

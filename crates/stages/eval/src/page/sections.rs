@@ -7,7 +7,7 @@ use super::runs::{self, Run, grouped};
 use crate::query::show::QueryResults;
 use crate::scene::read_features;
 use crate::score::{QueryScore, ThingScore};
-use artifacts::{Health, Level, MaskMaps, NOISE_COLOR, SharedMasks, hash_folder, instance_color, maps_path, role};
+use artifacts::{Health, Level, MaskFolder, NOISE_COLOR, SharedMasks, hash_folder, instance_color, maps_path, role};
 use gs_io::{Error, IoContext, Result};
 use gs_scene::dataset::{Dataset, Split, View};
 use report::curve;
@@ -87,11 +87,10 @@ pub(super) fn id_maps(m: &Material, page: &mut Page, metrics: &mut Metrics) -> R
     }
     let mut figures = Vec::new();
     for s in &m.shown {
-        let path = maps_path(folder, s.view.stem());
-        if !path.exists() {
+        if !maps_path(folder, s.view.stem()).exists() {
             continue;
         }
-        let maps = MaskMaps::read(&path)?;
+        let maps = MaskFolder::open(folder).read(s.view)?;
         let level = maps.level(Level::Large);
         let distinct: BTreeSet<i32> = level.iter().copied().filter(|&id| id >= 0).collect();
         let (w, h) = (s.photo.width, s.photo.height);
