@@ -21,6 +21,9 @@ override MASKS := $(OUT)/masks
 MASKS_DONE := $(MASKS)/masks.json
 endif
 
+# The rule of OpenGaussian needs the features; the table then has both rules.
+protocol_FIRST = $(if $(filter lerf,$(PROTOCOL)),--features $(FEATURES))
+
 include pipelines/stages.mk
 
 .DEFAULT_GOAL := scored

@@ -101,7 +101,7 @@ cluster_RUN = $(BIN)/cluster-match --scene $(call arg,PHOTOGRAPHS) --geometry $(
 score_RUN = $(BIN)/eval score --scene $(call arg,PHOTOGRAPHS) --geometry $(call arg,GEOMETRY) --instances $(INSTANCES) --out $(OUT)/score.json \
   $(if $(CLIP),--clip $(call arg,CLIP)) $(SCORE_ARGS) $(COMMON) --quiet
 protocol_RUN = $(BIN)/eval $(PROTOCOL) --scene $(call arg,PHOTOGRAPHS) --geometry $(call arg,GEOMETRY) --instances $(INSTANCES) \
-  --out $(OUT)/protocol $(if $(TEXTS),--text-features $(call arg,TEXTS),$(if $(CLIP),--clip $(call arg,CLIP))) $(SCORE_ARGS) $(COMMON) --quiet
+  --out $(OUT)/protocol $(protocol_FIRST) $(if $(TEXTS),--text-features $(call arg,TEXTS),$(if $(CLIP),--clip $(call arg,CLIP))) $(SCORE_ARGS) $(COMMON) --quiet
 query_RUN = $(BIN)/eval query --scene $(call arg,PHOTOGRAPHS) --geometry $(call arg,GEOMETRY) --instances $(INSTANCES) --clip $(call arg,CLIP) \
   --out $(OUT)/query $(foreach q,$(QUERIES),--text '$(subst ','\'',$(subst _,$(space),$q))') $(COMMON)
 report_RUN = $(BIN)/eval report --scene $(call arg,PHOTOGRAPHS) --run-dir $(OUT) $(report_GEOMETRY) --masks $(MASKS) --out $(OUT)/report.html \

@@ -32,6 +32,12 @@ impl Forward {
     }
 }
 
+/// Indices of the Gaussians that a view draws, ascending: those before the near plane that reach an alpha of 1/255 somewhere
+/// in the image.
+pub fn drawn(g: &Gaussians, camera: &Camera, options: &RasterOptions) -> Vec<u32> {
+    Tiles::new(g, camera, options).index
+}
+
 /// Renders a view and keeps what [`crate::Workspace::backward`] needs.
 pub fn forward(g: &Gaussians, camera: &Camera, options: &RasterOptions) -> Forward {
     let mut forward = Forward::default();

@@ -27,7 +27,7 @@ mod workspace;
 
 pub use dropped::Dropped;
 pub use features::render_features;
-pub use forward::{Forward, forward, render};
+pub use forward::{Forward, drawn, forward, render};
 pub use reference::{Pixel, render_gaussians as render_reference};
 pub use tiles::TILE;
 pub use types::{Gradients, PixelGradients, RasterOptions, Rendered, near_plane};

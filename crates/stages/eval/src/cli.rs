@@ -59,6 +59,7 @@ impl Program for Args {
             Command::Query(o) if !o.image.is_empty() && o.texts.clip.is_none() => {
                 Err(Error::new("pictures need an image encoder").field("--image").expected("--clip with image.onnx"))
             }
+            Command::Lerf(o) => o.check(),
             _ => Ok(()),
         }
     }

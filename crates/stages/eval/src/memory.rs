@@ -18,7 +18,7 @@ pub struct Sizes {
     pub labels: u64,
     /// Pixels of the largest view.
     pub pixels: u64,
-    /// Bytes of the features that a report shows.
+    /// Bytes of the features that a report shows, or that look-alikes are joined by.
     pub features: u64,
     /// Views that it shows.
     pub shown: u64,
@@ -68,7 +68,7 @@ pub fn pixels<'a>(views: impl IntoIterator<Item = &'a View>) -> u64 {
 pub fn of_scores(s: &Sizes) -> u64 {
     // The geometry's file and its Gaussians at the same time; then true points, masks and, where there are some, renders.
     let renders = if s.labels == 0 { 0 } else { 20 * s.pixels };
-    PROGRAM + s.language + 2 * s.geometry + 9 * s.truth / 5 + s.labels + renders
+    PROGRAM + s.language + 2 * (s.geometry + s.features) + 9 * s.truth / 5 + s.labels + renders
 }
 
 /// Peak in bytes of `query`.

@@ -45,7 +45,7 @@ impl TextOptions {
 }
 
 /// Which instances answer a text.
-#[derive(Debug, Clone, clap::Args, Serialize)]
+#[derive(Debug, Clone, Default, clap::Args, Serialize)]
 pub struct Choice {
     /// Select at most this many instances, best first [default: 1, or all with --threshold]
     #[arg(long, value_name = "COUNT", value_parser = stage::at_least(1u32))]
@@ -63,7 +63,7 @@ pub struct Choice {
     /// OpenGaussian does with 0.9
     #[arg(long, value_name = "DISTANCE", requires = "features", value_parser = stage::positive::<f32>)]
     pub join: Option<f32>,
-    /// features.safetensors that the instances were clustered from, for --join
+    /// features.safetensors that the instances were clustered from, for --join and in lerf for the rule of OpenGaussian
     #[arg(long, value_name = "FILE")]
     pub features: Option<PathBuf>,
 }
@@ -214,6 +214,29 @@ pub enum Truth {
     Pictures,
 }
 
+/// Which Gaussians a text selects and which of them are rendered.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, clap::ValueEnum, Serialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Rule {
+    /// All Gaussians of the best instance, or of those that the other options choose
+    #[value(name = "top1")]
+    Top1,
+    /// As OpenGaussian's render_lerf_by_text.py: support of 5 views, look-alikes joined, large Gaussians and outliers left
+    /// out, nothing where fewer than 100 are left
+    #[value(name = "opengaussian")]
+    OpenGaussian,
+}
+
+impl Rule {
+    /// The name it has on the command line.
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::Top1 => "top1",
+            Self::OpenGaussian => "opengaussian",
+        }
+    }
+}
+
 /// `eval lerf`.
 #[derive(Debug, Clone, clap::Args, Serialize)]
 #[command(mut_args(unless_predicted))]
@@ -224,6 +247,9 @@ pub struct LerfOptions {
     /// Score masks that another program saved, <frame>_<category>.png above grey level 10, instead of instances
     #[arg(long, value_name = "DIR", conflicts_with_all = ["scene", "geometry", "instances"], requires = "labels")]
     pub predictions: Option<PathBuf>,
+    /// The rule of the figures. With --features the table has the figures of both
+    #[arg(long, value_enum, default_value = "top1", conflicts_with = "predictions")]
+    pub protocol: Rule,
     #[command(flatten)]
     #[serde(flatten)]
     pub texts: TextOptions,
@@ -249,6 +275,36 @@ pub struct LerfOptions {
     /// Output folder: metrics.json, table.md
     #[arg(long, value_name = "DIR")]
     pub out: PathBuf,
+}
+
+impl LerfOptions {
+    /// Refuses what the rule of OpenGaussian fixes, and a want of the features that it needs.
+    pub fn check(&self) -> Result<()> {
+        if self.protocol == Rule::Top1 {
+            return Ok(());
+        }
+        let (choice, masking) = (&self.choice, &self.masking);
+        let fixed = [
+            ("--min-support", self.texts.min_support.is_some()),
+            ("--top-k", choice.top_k.is_some()),
+            ("--threshold", choice.threshold.is_some()),
+            ("--negatives", !choice.negatives.is_empty()),
+            ("--join", choice.join.is_some()),
+            ("--silhouette", masking.silhouette.is_some()),
+            ("--alpha", masking.alpha.is_some()),
+        ];
+        let e = |what: &str, field: &str| Error::new(what).field(field);
+        if let Some((option, _)) = fixed.iter().find(|(_, given)| *given) {
+            let e = e("--protocol opengaussian fixes it", option);
+            return Err(e.hint("leave it out, or use --protocol top1"));
+        }
+        match self.choice.features {
+            None => Err(e("--protocol opengaussian joins look-alikes by their features", "--features")
+                .found("none")
+                .expected("features.safetensors that the instances were clustered from")),
+            Some(_) => Ok(()),
+        }
+    }
 }
 
 /// The inputs are required unless masks of another program are scored.

@@ -15,7 +15,7 @@ pub use self::truth::{true_confidence, true_labels};
 
 use self::labels::FrameLabels;
 use crate::memory::{self, SMALLER, Sizes};
-use crate::options::ScoreOptions;
+use crate::options::{Rule, ScoreOptions};
 use crate::protocols::pairs::{Figures, object_figures};
 use crate::protocols::predict;
 use crate::query::ask::Asker;
@@ -129,7 +129,7 @@ fn score_queries(
             stage.warn(&format!("the labelled frame {name} is no view of the scene: its objects count as IoU 0"));
         }
         for (rendering, all) in [(rendering, &mut pairs), (Rendering::SEEN, &mut visible)] {
-            let predictions = predict::predict(scene, dataset, frame, &answers, rendering)?;
+            let predictions = predict::predict(scene, dataset, frame, &answers, rendering, Rule::Top1)?;
             all.extend(predict::pairs(frame, &predictions));
         }
     }

@@ -46,6 +46,9 @@ pub struct Rendering {
 const CHANNELS: usize = 16;
 
 impl Rendering {
+    /// A selection alone, by the threshold where none is given.
+    pub const SELECTED: Self =
+        Self { silhouette: Silhouette::Selected, threshold: Silhouette::Selected.default_threshold() };
     /// What is seen of a selection, by the threshold where none is given.
     pub const SEEN: Self = Self { silhouette: Silhouette::Visible, threshold: Silhouette::Visible.default_threshold() };
 
@@ -103,8 +106,6 @@ mod tests {
         (g, Camera::look_at(DVec3::ZERO, DVec3::Z, -DVec3::Y, 64, 48, 1.0))
     }
 
-    const SELECTED: Rendering = Rendering { silhouette: Silhouette::Selected, threshold: 0.7 };
-
     fn masks(rendering: Rendering, selections: &[&[u32]]) -> Vec<Mask> {
         let (g, camera) = balls();
         rendering.masks(&g, &RasterOptions::default(), selections, &camera)
@@ -112,7 +113,7 @@ mod tests {
 
     #[test]
     fn a_hidden_part_counts_only_when_rendered_alone() {
-        let alone = &masks(SELECTED, &[&[1]])[0];
+        let alone = &masks(Rendering::SELECTED, &[&[1]])[0];
         let seen = &masks(Rendering::SEEN, &[&[1], &[0, 1]]);
         let centre = 24 * 64 + 32;
         assert!(alone.bits[centre] && !seen[0].bits[centre] && seen[1].bits[centre]);
@@ -126,13 +127,13 @@ mod tests {
 
     #[test]
     fn nothing_selected_covers_nothing() {
-        for rendering in [SELECTED, Rendering::SEEN] {
+        for rendering in [Rendering::SELECTED, Rendering::SEEN] {
             assert_eq!(masks(rendering, &[&[]])[0].count(), 0);
         }
         let (g, camera) = balls();
         let most = gs_raster::render(&g, &camera, &RasterOptions::default()).alpha.into_iter().fold(0.0, f32::max);
         assert_eq!(
-            masks(Rendering { threshold: most, ..SELECTED }, &[&[0, 1]])[0].count(),
+            masks(Rendering { threshold: most, ..Rendering::SELECTED }, &[&[0, 1]])[0].count(),
             0,
             "the threshold is strict"
         );

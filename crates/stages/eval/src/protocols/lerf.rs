@@ -1,16 +1,17 @@
 //! `eval lerf`: a scene of LERF-OVS, or any scene with such labels.
 
 use super::metrics::{Metrics, Protocol, outputs, sources};
+use super::opengaussian;
 use super::pairs::{Figures, Pair, object_figures};
 use super::predict::{self, Answers};
 use super::published;
 use crate::memory::{self, SMALLER, Sizes};
-use crate::options::{Inputs, LerfOptions, Truth};
+use crate::options::{Choice, Inputs, LerfOptions, Rule, Truth};
 use crate::query::ask::Asker;
 use crate::query::text::TextSource;
 use crate::scene::{LabelledScene, folder_name, load};
 use crate::score::labels::{self, FrameLabels};
-use crate::silhouette::Silhouette;
+use crate::silhouette::{Rendering, Silhouette};
 use artifacts::LerfScene;
 use gs_io::{Error, Outputs, Result};
 use gs_scene::dataset::{Dataset, LoadOptions};
@@ -36,7 +37,9 @@ pub(crate) fn run(o: &LerfOptions, parameters: Value, stage: &Stage) -> Result<S
     let benchmark = LerfScene::named(&name);
     let (frames, mut notes) = labelled_frames(o.truth, &folder, benchmark)?;
     let labels = frames.iter().flat_map(|f| f.categories.values()).map(|m| m.bits.len() as u64).sum();
-    let sizes = o.inputs.as_ref().zip(dataset.as_ref()).map(|(i, d)| Sizes::new(i, &o.texts, &d.views));
+    let read = o.choice.features.as_deref().map_or(0, memory::bytes);
+    let sizes = o.inputs.as_ref().zip(dataset.as_ref());
+    let sizes = sizes.map(|(i, d)| Sizes { features: read, ..Sizes::new(i, &o.texts, &d.views) });
     let smaller = if o.predictions.is_some() { "give fewer or smaller labels" } else { SMALLER };
     stage.forecast(memory::of_scores(&Sizes { labels, ..sizes.unwrap_or_default() }), smaller)?;
     let mut features = BTreeMap::from([("labels".to_string(), folder_name(&folder))]);
@@ -46,12 +49,21 @@ pub(crate) fn run(o: &LerfOptions, parameters: Value, stage: &Stage) -> Result<S
     if asked.as_ref().is_some_and(|a| a.scene.all_noise()) {
         notes.push("all Gaussians are noise: every query selects nothing".into());
     }
-    let pairs = score(o, &frames, asked.as_ref(), stage)?;
-    let zeros = pairs.iter().filter(|p| p.zero.is_some()).count();
-    let (answers, inputs) = asked.map_or_else(Default::default, |a| (a.answers, a.scene.inputs));
-    let figures = LerfFigures::new(pairs, &answers);
+    let mut figures = None;
+    for (at, &of) in rules(o).iter().enumerate() {
+        let pairs = score(o, &frames, asked.as_ref(), at, stage)?;
+        let named = RuleFigures::new(of, rule(o, of, benchmark.is_some()), &pairs);
+        let answers = asked.as_ref().map(|a| &a.answers[at].1);
+        let main = figures.get_or_insert_with(|| LerfFigures::new(pairs, answers.unwrap_or(&Answers::new())));
+        if asked.is_some() {
+            main.rules.push(named);
+        }
+    }
+    let figures = figures.expect("there is a rule");
+    let zeros = figures.pairs.iter().filter(|p| p.zero.is_some()).count();
+    let inputs = asked.map_or_else(Default::default, |a| a.scene.inputs);
     notes.extend(figures.zeros());
-    let (protocol, rule) = (LerfFigures::NAME.into(), rule(o, benchmark.is_some()));
+    let (protocol, rule) = (LerfFigures::NAME.into(), rule(o, o.protocol, benchmark.is_some()));
     let metrics = Metrics { protocol, scene: name, rule, features, figures, notes };
     let table = metrics.write(&o.out, stage)?;
     stage.record(&mut claim, parameters, inputs, json!({"figures": metrics.figures.figures, "zeros": zeros}))?;
@@ -87,11 +99,37 @@ fn labelled_frames(
     Ok((frames, notes))
 }
 
+/// The rules that are scored, that of the figures first: the other one where the features that OpenGaussian's needs are given.
+fn rules(o: &LerfOptions) -> Vec<Rule> {
+    match (o.protocol, &o.choice.features) {
+        (Rule::OpenGaussian, _) => vec![Rule::OpenGaussian, Rule::Top1],
+        (Rule::Top1, Some(_)) if o.predictions.is_none() => vec![Rule::Top1, Rule::OpenGaussian],
+        (Rule::Top1, _) => vec![Rule::Top1],
+    }
+}
+
+/// A rule's choice among the instances, and the views that must have matched an instance.
+fn choice(o: &LerfOptions, rule: Rule) -> (Choice, Option<u32>) {
+    match rule {
+        Rule::Top1 => (o.choice.clone(), o.texts.min_support),
+        Rule::OpenGaussian => (opengaussian::choice(o), Some(opengaussian::MIN_SUPPORT)),
+    }
+}
+
+/// How a rule renders a selection.
+fn rendering(o: &LerfOptions, rule: Rule) -> Rendering {
+    match rule {
+        Rule::Top1 => o.masking.rendering(Silhouette::Selected),
+        Rule::OpenGaussian => Rendering::SELECTED,
+    }
+}
+
 /// A scene whose instances were asked for the categories of the labels.
 struct AskedScene {
     dataset: Dataset,
     scene: LabelledScene,
-    answers: Answers,
+    /// By each rule that is scored.
+    answers: Vec<(Rule, Answers)>,
 }
 
 /// Asks for the benchmark's texts, or for the labels' categories. `features` gains what the answers come from.
@@ -107,33 +145,49 @@ fn ask(
     let scene = inputs.read(&dataset, stage)?;
     let source = TextSource::open_for(&scene, &o.texts)?;
     features.extend(sources(&scene, Some(&source))?);
-    let asker = Asker::new(&scene, Some(source), &o.choice, o.texts.min_support)?;
     let categories: BTreeSet<&String> = frames.iter().flat_map(|f| f.categories.keys()).collect();
     let texts: Vec<String> = match benchmark {
         Some(b) => b.queries.iter().map(|q| (*q).to_string()).collect(),
         None => categories.iter().map(|c| (*c).clone()).collect(),
     };
-    let mut answers = predict::ask(&asker, &texts)?;
-    drop(asker);
-    for category in categories.into_iter().filter(|c| !texts.contains(c)) {
-        let why = "the category is not in the benchmark's table of queries";
-        answers.insert(category.clone(), Err(why.into()));
+    let encoded = source.encode_in(&o.choice.template, &texts)?;
+    let mut source = Some(source);
+    let mut answers = Vec::new();
+    for rule in rules(o) {
+        let (choice, support) = choice(o, rule);
+        // The rule of OpenGaussian has no negatives, so it needs no more features of texts.
+        let negatives = if rule == Rule::Top1 { source.take() } else { None };
+        let mut of = predict::answers(&Asker::new(&scene, negatives, &choice, support)?, &texts, &encoded);
+        for category in categories.iter().filter(|c| !texts.contains(c)) {
+            let why = "the category is not in the benchmark's table of queries";
+            of.insert((*category).clone(), Err(why.into()));
+        }
+        answers.push((rule, of));
     }
     Ok(AskedScene { dataset, scene, answers })
 }
 
-/// Scores every (frame, category): masks of the scene that was asked, or saved ones.
-fn score(o: &LerfOptions, frames: &[FrameLabels], asked: Option<&AskedScene>, stage: &Stage) -> Result<Vec<Pair>> {
-    let rendering = o.masking.rendering(Silhouette::Selected);
+/// Scores every (frame, category): masks of the scene that was asked by the rule at this place, or saved ones. The masks of the
+/// first rule are saved, where that is asked for.
+fn score(
+    o: &LerfOptions,
+    frames: &[FrameLabels],
+    asked: Option<&AskedScene>,
+    at: usize,
+    stage: &Stage,
+) -> Result<Vec<Pair>> {
     let mut pairs = Vec::new();
     let mut progress = stage.progress("frames", frames.len() as u64);
     for frame in frames {
         let predictions = match (asked, &o.predictions) {
-            (Some(a), _) => predict::predict(&a.scene, &a.dataset, frame, &a.answers, rendering)?,
+            (Some(a), _) => {
+                let (rule, answers) = &a.answers[at];
+                predict::predict(&a.scene, &a.dataset, frame, answers, rendering(o, *rule), *rule)?
+            }
             (None, Some(saved)) => predict::read_predictions(saved, frame)?,
             (None, None) => predict::Predictions::new(),
         };
-        if let Some(save) = &o.save_predictions {
+        if let Some(save) = o.save_predictions.as_ref().filter(|_| at == 0) {
             predict::save_predictions(save, frame, &predictions)?;
         }
         pairs.extend(predict::pairs(frame, &predictions));
@@ -144,8 +198,8 @@ fn score(o: &LerfOptions, frames: &[FrameLabels], asked: Option<&AskedScene>, st
 }
 
 /// The rule that the numbers follow, in words.
-fn rule(o: &LerfOptions, benchmark: bool) -> String {
-    let rendering = o.masking.rendering(Silhouette::Selected);
+fn rule(o: &LerfOptions, rule: Rule, benchmark: bool) -> String {
+    let rendering = rendering(o, rule);
     let (masks, asked) = match (&o.predictions, benchmark) {
         (Some(_), _) => ("saved masks above grey level 10".to_string(), ""),
         (None, own) => (
@@ -157,7 +211,9 @@ fn rule(o: &LerfOptions, benchmark: bool) -> String {
         Truth::Polygons => "polygons filled as cv2.fillPoly does, corners truncated",
         Truth::Pictures => "truth pictures above grey level 10",
     };
-    let choice = o.choice.describe(o.texts.min_support);
+    let (choice, support) = choice(o, rule);
+    let choice =
+        choice.describe(support) + &if rule == Rule::OpenGaussian { opengaussian::describe() } else { String::new() };
     format!("{masks}; {truth}; mean over (frame, category) pairs, missing = 0{asked}{choice}")
 }
 
@@ -172,6 +228,33 @@ pub struct LerfFigures {
     pub objects: BTreeMap<String, ObjectFigures>,
     /// Every (frame, category).
     pub pairs: Vec<Pair>,
+    /// Every rule that was scored, that of all the above first; empty for another program's masks.
+    #[serde(default)]
+    pub rules: Vec<RuleFigures>,
+}
+
+/// The figures of a scene by one rule.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct RuleFigures {
+    /// Its name: `top1` or `opengaussian`.
+    pub name: String,
+    /// What it is, in words.
+    pub rule: String,
+    /// The mean over pairs.
+    pub figures: Figures,
+    /// The mean over the categories of a frame, then over frames.
+    pub frame_figures: Figures,
+    /// Pairs that score 0, by the reason.
+    pub zeros: BTreeMap<String, usize>,
+}
+
+impl RuleFigures {
+    fn new(rule: Rule, words: String, pairs: &[Pair]) -> Self {
+        let mut zeros = BTreeMap::new();
+        pairs.iter().filter_map(|p| p.zero.clone()).for_each(|why| *zeros.entry(why).or_default() += 1);
+        let (figures, frame_figures) = (Figures::of_pairs(pairs), Figures::of_frames(pairs));
+        Self { name: rule.name().into(), rule: words, figures, frame_figures, zeros }
+    }
 }
 
 /// The figures of a category with the answer to it.
@@ -193,7 +276,8 @@ impl LerfFigures {
             (category, ObjectFigures { figures, instances, score })
         };
         let objects = object_figures(&pairs).into_iter().map(object).collect();
-        Self { figures: Figures::of_pairs(&pairs), frame_figures: Figures::of_frames(&pairs), objects, pairs }
+        let (figures, frame_figures) = (Figures::of_pairs(&pairs), Figures::of_frames(&pairs));
+        Self { figures, frame_figures, objects, pairs, rules: Vec::new() }
     }
 
     /// A line for every reason of a zero.
@@ -216,26 +300,53 @@ impl LerfFigures {
     }
 }
 
+/// A row of the table for every rule, in the order in which scenes have them: its name, and the figures of each scene by it.
+fn rows(scenes: &[Metrics<LerfFigures>]) -> Vec<(String, BTreeMap<String, Figures>)> {
+    let mut rows: Vec<(String, BTreeMap<String, Figures>)> = Vec::new();
+    for scene in scenes {
+        let named = scene.figures.rules.iter().map(|r| (format!("ours, {}", r.name), r.figures));
+        let alone = || ("masks of another program".to_string(), scene.figures.figures);
+        let named = if scene.figures.rules.is_empty() { vec![alone()] } else { named.collect() };
+        for (name, figures) in named {
+            let at = rows.iter().position(|r| r.0 == name).unwrap_or(rows.len());
+            if at == rows.len() {
+                rows.push((name, BTreeMap::new()));
+            }
+            rows[at].1.insert(scene.scene.clone(), figures);
+        }
+    }
+    rows
+}
+
 impl Protocol for LerfFigures {
     const NAME: &str = "lerf-ovs";
 
     fn remark(&self) -> Option<String> {
         let f = self.frame_figures;
         let [miou, macc25, macc50] = [f.miou, f.macc25, f.macc50].map(|v| 100.0 * v);
-        Some(format!("mean over frames instead of pairs: mIoU {miou:.2}, mAcc@0.25 {macc25:.2}, mAcc@0.5 {macc50:.2}"))
+        let mut remark =
+            format!("mean over frames instead of pairs: mIoU {miou:.2}, mAcc@0.25 {macc25:.2}, mAcc@0.5 {macc50:.2}");
+        for other in self.rules.iter().skip(1) {
+            remark += &format!(". The row of {} is by another rule: {}", other.name, other.rule);
+            let zeros =
+                other.zeros.iter().map(|(why, n)| format!("; {n} of {} pairs score 0 because {why}", self.pairs.len()));
+            remark.extend(zeros);
+        }
+        Some(remark)
     }
 
     fn sheet(scenes: &[Metrics<Self>], notes: Vec<String>) -> Sheet {
-        let figures: Vec<(String, Figures)> = scenes.iter().map(|s| (s.scene.clone(), s.figures.figures)).collect();
-        published::lerf_sheet(&figures, notes)
+        published::lerf_sheet(&rows(scenes), notes)
     }
 
     fn summary(scenes: &[Metrics<Self>]) -> Value {
         let over = |f: fn(&Self) -> Figures| Figures::mean(&scenes.iter().map(|m| f(&m.figures)).collect::<Vec<_>>());
         let named: BTreeMap<&str, _> = scenes.iter().map(|m| (m.scene.as_str(), m.figures.figures)).collect();
+        let rules: BTreeMap<String, _> =
+            rows(scenes).into_iter().map(|(name, row)| (name, Figures::mean(row.values()))).collect();
         json!({
             "protocol": "lerf-ovs dataset", "figures": over(|f| f.figures),
-            "frame_figures": over(|f| f.frame_figures), "scenes": named,
+            "frame_figures": over(|f| f.frame_figures), "scenes": named, "rows": rules,
         })
     }
 }

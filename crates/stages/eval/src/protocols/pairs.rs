@@ -77,8 +77,9 @@ impl Figures {
     }
 
     /// The unweighted mean, whatever the numbers of pairs: of a dataset over its scenes (docs/protocols.md).
-    pub fn mean(all: &[Self]) -> Self {
-        let over = |f: fn(&Self) -> f64| mean(&all.iter().map(f).collect::<Vec<_>>());
+    pub fn mean<'a>(all: impl IntoIterator<Item = &'a Self>) -> Self {
+        let all: Vec<&Self> = all.into_iter().collect();
+        let over = |f: fn(&Self) -> f64| mean(&all.iter().map(|s| f(s)).collect::<Vec<_>>());
         Self {
             miou: over(|s| s.miou),
             macc25: over(|s| s.macc25),

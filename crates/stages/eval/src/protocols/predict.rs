@@ -1,13 +1,16 @@
 //! Masks of labelled categories: from the instances that their names select, or from files.
 
+use super::opengaussian;
 use super::pairs::Pair;
 use crate::Mask;
+use crate::options::Rule;
 use crate::query::ask::{Answered, Asker};
 use crate::scene::LabelledScene;
 use crate::score::labels::{self, FrameLabels};
 use crate::silhouette::Rendering;
 use gs_io::{Error, Result, write_bytes};
 use gs_scene::dataset::Dataset;
+use std::borrow::Cow;
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
@@ -17,9 +20,16 @@ pub type Answers = BTreeMap<String, std::result::Result<Answered, String>>;
 /// Asks for texts.
 pub fn ask(asker: &Asker<'_>, texts: &[String]) -> Result<Answers> {
     let source = asker.source.as_ref().expect("a source of text features");
-    let answer = |f: Option<Vec<f32>>| f.map(|f| asker.answer(&f)).ok_or_else(|| "it has no text feature".into());
-    let features = source.encode_in(&asker.templates, texts)?;
-    Ok(texts.iter().cloned().zip(features.into_iter().map(answer)).collect())
+    Ok(answers(asker, texts, &source.encode_in(&asker.templates, texts)?))
+}
+
+/// Answers texts by their features.
+pub fn answers(asker: &Asker<'_>, texts: &[String], features: &[Option<Vec<f32>>]) -> Answers {
+    let answer = |f: &Option<Vec<f32>>| match f {
+        Some(f) => Ok(asker.answer(f)),
+        None => Err("it has no text feature".into()),
+    };
+    texts.iter().cloned().zip(features.iter().map(answer)).collect()
 }
 
 /// The instances that a category selects, best first, and the score of the best.
@@ -31,30 +41,38 @@ pub fn chosen(answers: &Answers, category: &str) -> (Vec<u32>, Option<f32>) {
 /// The mask of each category of a frame, in the size of the labels; or why there is none.
 pub type Predictions = BTreeMap<String, std::result::Result<Mask, String>>;
 
-/// Renders the answers to every category of a labelled frame, in the size of the labelled image.
+/// Renders the answers to every category of a labelled frame, in the size of the labelled image: all Gaussians that they
+/// select, or with [`Rule::OpenGaussian`] those that it leaves.
 pub fn predict(
     scene: &LabelledScene,
     dataset: &Dataset,
     frame: &FrameLabels,
     answers: &Answers,
     rendering: Rendering,
+    rule: Rule,
 ) -> Result<Predictions> {
     let categories = frame.categories.keys().cloned();
     let Some(view) = dataset.views.iter().find(|v| v.stem() == frame.frame) else {
         return Ok(categories.map(|c| (c, Err("the frame is no view of the scene".into()))).collect());
     };
-    let selected = |c: &String| answers[c].as_ref().map_or(&[][..], |a| &a.gaussians);
-    let selections: Vec<&[u32]> = frame.categories.keys().map(selected).collect();
-    let masks = rendering.masks(scene.gaussians(), &scene.raster, &selections, &frame.camera(view)?);
-    let one = |(category, mask): (String, Mask)| {
-        let prediction = match &answers[&category] {
-            Ok(a) if a.gaussians.is_empty() => Err("no Gaussian is selected".into()),
-            Ok(_) => Ok(mask),
-            Err(why) => Err(why.clone()),
-        };
-        (category, prediction)
+    let (g, camera) = (scene.gaussians(), frame.camera(view)?);
+    let in_view = (rule == Rule::OpenGaussian).then(|| {
+        let mut in_view = vec![false; g.len()];
+        gs_raster::drawn(g, &camera, &scene.raster).into_iter().for_each(|i| in_view[i as usize] = true);
+        in_view
+    });
+    let shown = |category: &String| -> std::result::Result<Cow<'_, [u32]>, String> {
+        let selected = &answers[category].as_ref().map_err(Clone::clone)?.gaussians;
+        match &in_view {
+            _ if selected.is_empty() => Err("no Gaussian is selected".into()),
+            None => Ok(selected.into()),
+            Some(in_view) => opengaussian::shown(g, selected, in_view).map(Cow::Owned),
+        }
     };
-    Ok(categories.zip(masks).map(one).collect())
+    let shown: Vec<_> = frame.categories.keys().map(shown).collect();
+    let selections: Vec<&[u32]> = shown.iter().map(|s| s.as_ref().map_or(&[][..], |s| s)).collect();
+    let masks = rendering.masks(g, &scene.raster, &selections, &camera);
+    Ok(categories.zip(shown.iter().zip(masks).map(|(s, mask)| s.clone().map(|_| mask))).collect())
 }
 
 /// Reads predictions that a program saved as pictures, `<folder>/<frame>_<category>.png`, pixels above grey level 10: the

@@ -4,6 +4,7 @@ use super::classes::{SCENES, SETS};
 use super::pairs::Figures;
 use artifacts::LERF_OVS;
 use report::sheet::{Row, Sheet, Table};
+use std::collections::{BTreeMap, BTreeSet};
 
 /// mIoU and mAcc@0.25 in percent of a method on LERF-OVS: waldo_kitchen, ramen, figurines, teatime, mean.
 struct LerfRow {
@@ -44,41 +45,41 @@ const LERF: [LerfRow; 15] = [
     full("VALA", "arXiv 2509.05515v2", [55.71, 45.41, 60.38, 70.61, 58.02], [86.36, 67.61, 89.29, 88.14, 82.85]),
 ];
 
-/// The paper's LERF-OVS table: published rows, then ours, in percent. `scenes` are the figures of the scenes scored, by
-/// name; scenes of other names than the four get a column of their own. The mean is over the scenes scored, and stands
-/// beside the published means only when all four are.
-pub fn lerf_sheet(scenes: &[(String, Figures)], notes: Vec<String>) -> Sheet {
-    let of = |name: &str| scenes.iter().find(|s| s.0 == name).map(|s| s.1);
-    let others: Vec<&(String, Figures)> =
-        scenes.iter().filter(|s| LERF_OVS.iter().all(|standard| standard.name != s.0)).collect();
-    let ours = Figures::mean(&scenes.iter().map(|s| s.1).collect::<Vec<_>>());
-    let mut columns = Vec::new();
-    for metric in ["mIoU", "mAcc@0.25"] {
-        columns.extend(LERF_OVS.iter().map(|s| format!("{metric} {}", s.name)));
-        columns.extend(others.iter().map(|s| format!("{metric} {}", s.0)));
-        columns.push(format!("{metric} Mean"));
-    }
+/// The paper's LERF-OVS table: published rows, then ours, in percent. `ours` are rows by name, each with the figures of its
+/// scenes by their name; scenes of other names than the four get a column of their own. A mean is over the scenes of its row,
+/// and stands beside the published means only when all four are among them.
+pub fn lerf_sheet(ours: &[(String, BTreeMap<String, Figures>)], notes: Vec<String>) -> Sheet {
+    let standard = LERF_OVS.iter().map(|s| s.name.to_string());
+    let scenes: BTreeSet<&String> = ours.iter().flat_map(|row| row.1.keys()).collect();
+    let others = scenes.into_iter().filter(|s| LERF_OVS.iter().all(|standard| standard.name != *s)).cloned();
+    let names: Vec<String> = standard.chain(others).collect();
+    let columns = ["mIoU", "mAcc@0.25"].into_iter().flat_map(|metric| {
+        names.iter().map(String::as_str).chain(["Mean"]).map(move |name| format!("{metric} {name}"))
+    });
+    let blank = vec![None; names.len() - LERF_OVS.len()];
     let published = |row: &LerfRow| {
-        let blank = others.iter().map(|_| None);
-        let cells =
-            |v: &[Option<f64>; 5]| v[..4].iter().copied().chain(blank.clone()).chain([v[4]]).collect::<Vec<_>>();
+        let cells = |v: &[Option<f64>; 5]| [&v[..4], &blank, &v[4..]].concat();
         Row::published(row.method, row.source, [cells(&row.miou), cells(&row.macc25)].concat())
     };
-    let mut rows: Vec<Row> = LERF.iter().map(published).collect();
-    let mut cells = Vec::new();
-    for metric in [|f: &Figures| 100.0 * f.miou, |f: &Figures| 100.0 * f.macc25] {
-        cells.extend(LERF_OVS.iter().map(|s| of(s.name).map(|f| metric(&f))));
-        cells.extend(others.iter().map(|s| Some(metric(&s.1))));
-        cells.push((!scenes.is_empty()).then(|| metric(&ours)));
+    let measured = |(name, row): &(String, BTreeMap<String, Figures>)| {
+        let over = (!row.is_empty()).then(|| Figures::mean(row.values()));
+        let cells = |metric: fn(&Figures) -> f64| {
+            let figures = names.iter().map(|n| row.get(n).copied()).chain([over]);
+            figures.map(|f| f.map(|f| 100.0 * metric(&f))).collect::<Vec<_>>()
+        };
+        Row::measured(name, [cells(|f| f.miou), cells(|f| f.macc25)].concat())
+    };
+    let rows = LERF.iter().map(published).chain(ours.iter().map(measured)).collect();
+    let also = |(name, row): &(String, BTreeMap<String, Figures>)| {
+        let mean = Figures::mean(row.values());
+        format!("Also, {name}: mAcc@0.5 {:.2}, {} (frame, category) pairs.", 100.0 * mean.macc50, mean.pairs)
+    };
+    let mut remarks: Vec<String> = ours.iter().map(also).collect();
+    if ours.iter().any(|(_, row)| !LERF_OVS.iter().all(|s| row.contains_key(s.name))) {
+        remarks.push("A measured mean is over the scenes of its row, here not over the four of the published means: do not compare it with them.".into());
     }
-    rows.push(Row::measured("ours", cells));
-    let mut remarks =
-        vec![format!("Ours also: mAcc@0.5 {:.2}, {} (frame, category) pairs.", 100.0 * ours.macc50, ours.pairs)];
-    if !LERF_OVS.iter().all(|s| of(s.name).is_some()) {
-        remarks.push("Our mean is over the scenes scored here, not over the four of the published means: do not compare it with them.".into());
-    }
-    let table =
-        Table { title: "Objects selected by text".into(), head: "Methods".into(), columns, rows, sources: true };
+    let (title, head, columns) = ("Objects selected by text".into(), "Methods".into(), columns.collect());
+    let table = Table { title, head, columns, rows, sources: true };
     Sheet { title: "LERF-OVS".into(), table, remarks, notes, more: Vec::new() }
 }
 
@@ -157,10 +158,12 @@ mod tests {
     fn tables_have_as_many_cells_in_every_row() {
         let f = Figures { miou: 0.5079, macc25: 0.6962, macc50: 0.4, pairs: 59 };
         for scenes in [vec![("teatime".to_string(), f)], vec![("my|room".into(), f), ("ramen".into(), f)]] {
-            let t = lerf_sheet(&scenes, vec!["a note".into()]).markdown();
+            let ours =
+                ["ours, top1", "ours, opengaussian"].map(|name| (name.to_string(), scenes.iter().cloned().collect()));
+            let t = lerf_sheet(&ours, vec!["a note".into()]).markdown();
             let rows: Vec<usize> =
                 t.lines().filter(|l| l.starts_with('|')).map(|l| l.replace("\\|", "").matches('|').count()).collect();
-            assert!(rows.len() == LERF.len() + 3 && rows.iter().all(|&n| n == rows[0]), "{t}");
+            assert!(rows.len() == LERF.len() + 4 && rows.iter().all(|&n| n == rows[0]), "{t}");
             assert!(t.contains("50.79") && t.contains("do not compare") && t.contains("- a note"));
         }
         let t = scannet_sheet(&[("ours", [Some((0.326, 0.489)), None, None])], 10, Vec::new()).markdown();

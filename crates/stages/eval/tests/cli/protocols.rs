@@ -2,7 +2,7 @@
 //! OpenCV 4.8 to 4.10 (CAGS_PYTHON names one), the numbers it gave are the golden ones of `testdata/protocols.json`.
 
 use crate::fixture::{failed, provenance, read_json};
-use artifacts::{Instances, OrientedBox, TruePoints, TrueScene};
+use artifacts::{Features, Instances, OrientedBox, TruePoints, TrueScene};
 use gs_io::{hash_bytes, hash_file};
 use gs_scene::Gaussians;
 use serde_json::{Map, Value, json};
@@ -139,6 +139,21 @@ impl Scene {
     }
     fn texts(&self) -> PathBuf {
         self.at("texts.json")
+    }
+    fn features(&self) -> PathBuf {
+        self.at("features.safetensors")
+    }
+
+    /// Features by instance: one direction for each but the last two, which look alike.
+    fn write_features(&self) {
+        let (instances, _) = Instances::read(self.instances()).unwrap();
+        let (dim, n) = (instances.len(), instances.label.len());
+        let mut values = vec![0.0; n * dim];
+        for (row, &label) in values.chunks_exact_mut(dim).zip(&instances.label) {
+            row[usize::try_from(label).map_or(0, |l| l.min(dim - 2))] = 2.0;
+        }
+        let features = Features { kept: (0..n as u32).collect(), dim, values, ..Features::default() };
+        features.write(self.features(), provenance(&self.geometry(), &self.scene())).unwrap();
     }
 
     fn run(&self, command: &str, rest: &[&str]) -> Output {
@@ -295,6 +310,54 @@ fn the_protocols_agree_with_an_independent_implementation() {
     }
     assert_ne!(seen[0], seen[1], "every rule gives another number");
     oracle.finish();
+}
+
+#[test]
+fn both_rules_of_selection_stand_in_one_table() {
+    let s = Scene::new();
+    s.write_features();
+    let (features, saved) = (s.features().display().to_string(), s.at("saved").display().to_string());
+    let alone = s.metrics("lerf", &[]);
+    assert_eq!(alone["rules"].as_array().unwrap().len(), 1);
+    let m = s.metrics("lerf", &["--features", &features]);
+    let (best, theirs) = (&m["rules"][0], &m["rules"][1]);
+    assert_eq!((&best["name"], &theirs["name"]), (&json!("top1"), &json!("opengaussian")));
+    assert_eq!(
+        (&best["figures"], &alone["figures"]),
+        (&m["figures"], &m["figures"]),
+        "the figures are those of the first"
+    );
+    assert_ne!(best["figures"]["miou"], theirs["figures"]["miou"]);
+    let table = std::fs::read_to_string(s.at("out/table.md")).unwrap();
+    assert!(table.contains("top1** |") && table.contains("opengaussian** |"), "{table}");
+    assert!(table.contains("outliers by neighbours left out"), "{table}");
+
+    let ask = ["--features", &features, "--protocol", "opengaussian", "--save-predictions", &saved];
+    let o = s.metrics("lerf", &ask);
+    assert_eq!((&o["rules"][0], &o["rules"][1], &o["figures"]), (theirs, best, &theirs["figures"]));
+    // Of the instances that 5 views matched the last two look alike: who selects one selects both.
+    let k = Instances::read(s.instances()).unwrap().0.len() as u64;
+    let selected = |name: &str, m: &Value| m["objects"][name]["instances"].clone();
+    let pair = |v: &Value| v == &json!([k - 1, k - 2]) || v == &json!([k - 2, k - 1]);
+    let objects = o["objects"].as_object().unwrap();
+    assert!(objects.keys().any(|name| pair(&selected(name, &o))), "{objects:?}");
+    assert!(objects.keys().all(|name| selected(name, &o).as_array().unwrap().iter().all(|i| i.as_u64() >= Some(2))));
+    assert!(theirs["zeros"].to_string().contains("fewer than 100 of its Gaussians"), "{theirs}");
+    // The masks that are saved are those of the figures.
+    let labels = s.scene().join("label").display().to_string();
+    let read = Command::new(env!("CARGO_BIN_EXE_eval"))
+        .args(["lerf", "--predictions", &saved, "--labels", &labels, "--out"])
+        .arg(s.at("read"))
+        .output()
+        .unwrap();
+    assert!(read.status.success(), "{}", String::from_utf8_lossy(&read.stderr));
+    let read = read_json(&s.at("read/metrics.json"));
+    same(&read["figures"]["miou"], &theirs["figures"]["miou"], "saved masks");
+    assert!(std::fs::read_to_string(s.at("read/table.md")).unwrap().contains("**masks of another program**"));
+
+    let bad = |rest: &[&str], parts: &[&str]| failed(&s.run("lerf", rest), parts);
+    bad(&["--protocol", "opengaussian"], &["--features: --protocol opengaussian joins", "found none"]);
+    bad(&[&ask[..4], &["--top-k", "2"]].concat(), &["--top-k: --protocol opengaussian fixes it"]);
 }
 
 #[test]
