@@ -1,5 +1,5 @@
 #!/usr/bin/env bash
-# batch_summary.sh TABLES: our rows of TABLES/<variant>-<seed>/table.md below each other, as Markdown on standard output.
+# batch_summary.sh TABLES: measured rows of TABLES/<variant>-<seed>/table.md below each other, as Markdown on standard output.
 set -euo pipefail
 previous=
 for table in "$1"/*/table.md; do
@@ -11,5 +11,5 @@ for table in "$1"/*/table.md; do
     sed -n 2p "$table"
     previous=$header
   fi
-  sed -n "s/^| \*\*\(ours[^*]*\)\*\* |/| $name: \1 |/p" "$table"
+  sed -n "s/^| \*\*\([^*]*\)\*\* |/| $name: \1 |/p" "$table"
 done

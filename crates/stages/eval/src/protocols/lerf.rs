@@ -1,6 +1,7 @@
 //! `eval lerf`: a scene of LERF-OVS, or any scene with such labels.
 
-use super::metrics::{Metrics, Protocol, outputs, sources};
+use super::made::Made;
+use super::metrics::{self, Metrics, Protocol, outputs, sources};
 use super::opengaussian;
 use super::pairs::{Figures, Pair, object_figures};
 use super::predict::{self, Answers};
@@ -61,10 +62,11 @@ pub(crate) fn run(o: &LerfOptions, parameters: Value, stage: &Stage) -> Result<S
     }
     let figures = figures.expect("there is a rule");
     let zeros = figures.pairs.iter().filter(|p| p.zero.is_some()).count();
+    let made = asked.as_ref().map(|a| Made::of(&a.scene));
     let inputs = asked.map_or_else(Default::default, |a| a.scene.inputs);
     notes.extend(figures.zeros());
     let (protocol, rule) = (LerfFigures::NAME.into(), rule(o, o.protocol, benchmark.is_some()));
-    let metrics = Metrics { protocol, scene: name, rule, features, figures, notes };
+    let metrics = Metrics { protocol, scene: name, rule, made, features, figures, notes };
     let table = metrics.write(&o.out, stage)?;
     stage.record(&mut claim, parameters, inputs, json!({"figures": metrics.figures.figures, "zeros": zeros}))?;
     Ok(table)
@@ -302,20 +304,23 @@ impl LerfFigures {
 
 /// A row of the table for every rule, in the order in which scenes have them: its name, and the figures of each scene by it.
 fn rows(scenes: &[Metrics<LerfFigures>]) -> Vec<(String, BTreeMap<String, Figures>)> {
-    let mut rows: Vec<(String, BTreeMap<String, Figures>)> = Vec::new();
-    for scene in scenes {
-        let named = scene.figures.rules.iter().map(|r| (format!("ours, {}", r.name), r.figures));
-        let alone = || ("masks of another program".to_string(), scene.figures.figures);
-        let named = if scene.figures.rules.is_empty() { vec![alone()] } else { named.collect() };
-        for (name, figures) in named {
-            let at = rows.iter().position(|r| r.0 == name).unwrap_or(rows.len());
-            if at == rows.len() {
-                rows.push((name, BTreeMap::new()));
-            }
-            rows[at].1.insert(scene.scene.clone(), figures);
+    let mut rules: Vec<&str> = Vec::new();
+    for rule in scenes.iter().flat_map(|s| s.figures.rules.iter()) {
+        if !rules.contains(&rule.name.as_str()) {
+            rules.push(&rule.name);
         }
     }
-    rows
+    let by_rule = |name: &str| {
+        let of = |s: &Metrics<LerfFigures>| s.figures.rules.iter().find(|r| r.name == name).map(|r| r.figures);
+        let by: Vec<_> = scenes.iter().filter_map(|s| Some((s, of(s)?))).collect();
+        let scenes: Vec<_> = by.iter().map(|(s, _)| *s).collect();
+        let figures = by.iter().map(|(s, figures)| (s.scene.clone(), *figures)).collect();
+        (format!("{}, {name}", metrics::row(&scenes, "unrecorded")), figures)
+    };
+    let saved: BTreeMap<String, Figures> =
+        scenes.iter().filter(|s| s.figures.rules.is_empty()).map(|s| (s.scene.clone(), s.figures.figures)).collect();
+    let saved = (!saved.is_empty()).then(|| ("masks of another program".to_string(), saved));
+    rules.into_iter().map(by_rule).chain(saved).collect()
 }
 
 impl Protocol for LerfFigures {

@@ -1,5 +1,6 @@
 //! What the protocols of all benchmarks write for a scene.
 
+use super::made::Made;
 use crate::query::text::TextSource;
 use crate::scene::LabelledScene;
 use artifacts::role;
@@ -21,6 +22,9 @@ pub struct Metrics<F> {
     pub scene: String,
     /// The rule that the numbers follow, in words.
     pub rule: String,
+    /// How the instances were made; none where another program's masks or labels were scored.
+    #[serde(default)]
+    pub made: Option<Made>,
     /// Files and models that the numbers come from.
     pub features: BTreeMap<String, String>,
     /// What was measured.
@@ -50,7 +54,7 @@ pub trait Protocol: Serialize + DeserializeOwned {
         None
     }
 
-    /// The paper's table with these scenes.
+    /// The paper's table with these scenes; what was measured has rows that begin with [`row`].
     fn sheet(scenes: &[Metrics<Self>], notes: Vec<String>) -> Sheet;
 
     /// What `metrics.json` says of these scenes together.
@@ -75,9 +79,24 @@ pub fn sheet<F: Protocol>(scenes: &[Metrics<F>]) -> Sheet {
     for s in scenes {
         let features: Vec<String> = s.features.iter().map(|(k, v)| format!("{k} {v}")).collect();
         notes.push(format!("{}: {}. From {}.", s.scene, s.rule, features.join("; ")));
-        notes.extend(s.figures.remark().iter().chain(&s.notes).map(|n| format!("{}: {n}.", s.scene)));
+        let stand_ins = s.made.iter().flat_map(Made::notes);
+        notes.extend(
+            s.figures
+                .remark()
+                .into_iter()
+                .chain(stand_ins)
+                .chain(s.notes.clone())
+                .map(|n| format!("{}: {n}.", s.scene)),
+        );
     }
     F::sheet(scenes, notes)
+}
+
+/// What a row of these scenes begins with: how their instances were made, or `another` where another program made what was
+/// scored.
+pub fn row<F>(scenes: &[&Metrics<F>], another: &str) -> String {
+    let made: Vec<&Made> = scenes.iter().filter_map(|s| s.made.as_ref()).collect();
+    if made.is_empty() { another.into() } else { Made::common(made).describe() }
 }
 
 /// `metrics.json` of a protocol, whose record lies beside it, and `table.md` in the same folder.

@@ -122,14 +122,14 @@ pub fn set_cells(row: SetRow) -> Vec<Option<f64>> {
 
 /// The paper's ScanNet table: published rows, then ours (mIoU and mAcc as fractions, for 19, 15 and 10 classes; none
 /// where a set was not scored), each under its name.
-pub fn scannet_sheet(ours: &[(&str, SetRow)], scenes: usize, notes: Vec<String>) -> Sheet {
+pub fn scannet_sheet(ours: &[(String, SetRow)], scenes: usize, notes: Vec<String>) -> Sheet {
     let cells = |v: &[Published; 3]| v.iter().flat_map(|v| [v.map(|v| v.0), v.and_then(|v| v.1)]).collect();
     let published = SCANNET.iter().map(|(name, values, source)| Row::published(name, source, cells(values)));
     let rows = published.chain(ours.iter().map(|(name, row)| Row::measured(name, set_cells(*row)))).collect();
     let mut remarks = Vec::new();
     if scenes != SCENES {
         remarks.push(format!(
-            "Ours: {scenes} scene(s), not the {SCENES} of the published rows: do not compare the means with them."
+            "Measured: {scenes} scene(s), not the {SCENES} of the published rows: do not compare the means with them."
         ));
     }
     let title = "Classes of vertices".into();
@@ -166,7 +166,7 @@ mod tests {
             assert!(rows.len() == LERF.len() + 4 && rows.iter().all(|&n| n == rows[0]), "{t}");
             assert!(t.contains("50.79") && t.contains("do not compare") && t.contains("- a note"));
         }
-        let t = scannet_sheet(&[("ours", [Some((0.326, 0.489)), None, None])], 10, Vec::new()).markdown();
+        let t = scannet_sheet(&[("ours".into(), [Some((0.326, 0.489)), None, None])], 10, Vec::new()).markdown();
         assert!(t.contains("| **ours** | 32.60 | 48.90 | – | – | – | – | measured |"), "{t}");
         assert!(!t.contains("do not compare"));
     }

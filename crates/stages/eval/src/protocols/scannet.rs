@@ -2,7 +2,8 @@
 
 use super::classes::{self, Confusion, SETS};
 use super::instances::{self, InstanceFigures};
-use super::metrics::{Metrics, Protocol, outputs, sources};
+use super::made::Made;
+use super::metrics::{self as all, Metrics, Protocol, outputs, sources};
 use super::published::{self, SetRow};
 use crate::memory::{self, SMALLER, Sizes};
 use crate::nearest::nearest;
@@ -194,7 +195,8 @@ pub(crate) fn run(o: &ScannetOptions, parameters: Value, stage: &Stage) -> Resul
     let instances = instance_figures(&scene, &files, &matched, vertices.len(), &mut notes)?;
     let rule = rule(o.association, min_support, !sets.is_empty());
     let (protocol, figures) = (ScanFigures::NAME.into(), ScanFigures { sets, instances });
-    let metrics = Metrics { protocol, scene: folder_name(folder), rule, features, figures, notes };
+    let made = Some(Made::of(&scene));
+    let metrics = Metrics { protocol, scene: folder_name(folder), rule, made, features, figures, notes };
     let table = metrics.write(&o.out, stage)?;
     let summary = json!({"rows": metrics.figures.row(), "instances": metrics.figures.instances});
     stage.record(&mut claim, parameters, scene.inputs.clone(), summary)?;
@@ -368,7 +370,8 @@ impl Protocol for ScanFigures {
             return Sheet { title: "ScanNet".into(), table, remarks: Vec::new(), notes, more: Vec::new() };
         }
         let [mean, pooled] = means(scans);
-        let rows = [("ours, mean over scenes", mean), ("ours, points pooled", pooled)];
+        let name = all::row(&scans.iter().collect::<Vec<_>>(), "labels of another program");
+        let rows = [(format!("{name}, mean over scenes"), mean), (format!("{name}, points pooled"), pooled)];
         let mut sheet = published::scannet_sheet(&rows, scans.len(), notes);
         let row = |s: &Metrics<Self>| {
             let mut cells = published::set_cells(s.figures.row());

@@ -361,6 +361,64 @@ fn both_rules_of_selection_stand_in_one_table() {
 }
 
 #[test]
+fn rows_say_how_instances_were_made() {
+    let s = Scene::new();
+    s.write_features();
+    let features = hash_file(s.features()).unwrap();
+    // As cluster-match and feat-train leave them: provenance, and a record of each run beside its output.
+    let (instances, made) = Instances::read(s.instances()).unwrap();
+    let mut provenance = made.provenance().clone();
+    provenance
+        .inputs
+        .extend([("features", &features), ("masks", &"maps".to_string())].map(|(k, v)| (k.into(), v.clone())));
+    provenance.parameters = json!({"cluster": "free"});
+    provenance.extra = Value::Null;
+    instances.write(s.instances(), provenance.clone()).unwrap();
+    std::fs::create_dir(s.at("masks")).unwrap();
+    let record = |output: PathBuf, parameters: Value, inputs: Value, files: Value| {
+        let record = json!({"program": "p", "version": "1", "revision": "", "program_hash": "", "parameters": parameters,
+            "arguments": ["--masks", "gone/masks", "--features", s.features()], "inputs": inputs, "seed": 0, "threads": 1,
+            "machine": stage::Machine::here(), "started": 0, "wall_seconds": 0.0, "cpu_seconds": null, "peak_rss_bytes": null,
+            "memory_predicted_bytes": null, "skipped": [], "summary": null, "written": {"by": "p", "files": files}});
+        std::fs::write(stage::RunRecord::path(output), record.to_string()).unwrap();
+    };
+    record(s.instances(), json!({}), json!(provenance.inputs), json!({}));
+    let row = |expected: &str| {
+        for command in ["lerf", "scannet"] {
+            s.metrics(command, &[]);
+            let table = std::fs::read_to_string(s.at("out/table.md")).unwrap();
+            assert!(table.contains(&format!("| **{expected}, ")), "{expected}: {table}");
+        }
+        std::fs::read_to_string(s.at("out/table.md")).unwrap()
+    };
+    let table = row("unrecorded method, free clustering, given masks, given features");
+    assert!(!table.contains("of LangSplat"), "{table}");
+    let trained = json!({"preset": "paper", "contrastive": {"iterations": 2000}});
+    record(s.features(), trained, json!({}), json!({"features.safetensors": features}));
+    row("paper (2000 iterations), free clustering, given masks, given features");
+    record(s.features(), json!({"preset": null}), json!({}), json!({"features.safetensors": features}));
+    row("closed form, free clustering, given masks, given features");
+    record(s.features(), json!({"preset": null}), json!({}), json!({"features.safetensors": "others"}));
+    row("unrecorded method, free clustering, given masks, given features");
+    // What mask-embed leaves in the folder of masks.
+    let manifest = |name: &str, inputs: Value| {
+        let manifest =
+            json!({"format": "masks", "version": 1, "program": "mask-embed", "parameters": {}, "inputs": inputs});
+        std::fs::write(s.at("masks").join(name), manifest.to_string()).unwrap();
+    };
+    manifest("masks.json", json!({"sam": "hash"}));
+    manifest("features.json", json!({"masks": "maps"}));
+    let table = row("unrecorded method, free clustering, SAM masks, CLIP features");
+    assert!(table.contains("scene0000_00: there are no masks of LangSplat; those of SAM"), "{table}");
+    assert!(table.contains("the masks have no features of LangSplat"), "{table}");
+    let made = &read_json(&s.at("out/metrics.json"))["made"];
+    assert_eq!((&made["clustering"], &made["masks"]), (&json!("free"), &json!("SAM")));
+    // A record of another run says nothing.
+    record(s.instances(), json!({}), json!({}), json!({}));
+    row("unrecorded method, free clustering, unrecorded masks, unrecorded features");
+}
+
+#[test]
 fn tables_join_scenes_and_refuse_what_does_not_fit() {
     let s = Scene::new();
     s.metrics("scannet", &[]);
