@@ -307,7 +307,7 @@ impl LerfOptions {
     }
 }
 
-/// The inputs are required unless masks of another program are scored.
+/// The inputs are required unless masks or labels of another program are scored.
 fn unless_predicted(argument: clap::Arg) -> clap::Arg {
     match argument.get_id().as_str() {
         "scene" | "geometry" | "instances" => argument.required(false).required_unless_present("predictions"),
@@ -327,15 +327,23 @@ pub enum Association {
 
 /// `eval scannet`.
 #[derive(Debug, Clone, clap::Args, Serialize)]
+#[command(mut_args(unless_predicted))]
 pub struct ScannetOptions {
     #[command(flatten)]
     #[serde(flatten)]
-    pub inputs: Inputs,
+    pub inputs: Option<Inputs>,
+    /// Score labels that another program gave the vertices, instead of instances: a file of one NYU40 id a vertex, .npy or text, 0
+    /// for none
+    #[arg(long, value_name = "FILE", conflicts_with_all = ["scene", "geometry", "instances"], requires = "labels")]
+    pub predictions: Option<PathBuf>,
+    /// Folder of the scan's truth, such as <scan>_vh_clean_2.labels.ply [default: the scene]
+    #[arg(long, value_name = "DIR")]
+    pub labels: Option<PathBuf>,
     #[command(flatten)]
     #[serde(flatten)]
     pub texts: TextOptions,
     /// How Gaussians and vertices are brought together
-    #[arg(long, value_enum, default_value = "one-to-one")]
+    #[arg(long, value_enum, default_value = "one-to-one", conflicts_with = "predictions")]
     pub association: Association,
     /// Output folder: metrics.json, table.md
     #[arg(long, value_name = "DIR")]

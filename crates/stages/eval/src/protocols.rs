@@ -3,7 +3,7 @@
 //!
 //! `lerf`, `scannet` and `table` are the commands; `metrics` is what they write for a scene, `made` how it was made. LERF-OVS: `predict` makes masks,
 //! `opengaussian` says which Gaussians they show by OpenGaussian's rule, `pairs` scores them. ScanNet:
-//! `classes` scores classes of vertices, `instances` class-agnostic instances. `published` has the published numbers.
+//! `classes` scores classes of vertices, also those that `vertex_labels` reads, `instances` class-agnostic instances. `published` has the published numbers.
 
 pub(crate) mod classes;
 pub mod instances;
@@ -16,3 +16,4 @@ pub(crate) mod predict;
 pub(crate) mod published;
 pub(crate) mod scannet;
 pub(crate) mod table;
+mod vertex_labels;

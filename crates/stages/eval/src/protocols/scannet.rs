@@ -5,20 +5,22 @@ use super::instances::{self, InstanceFigures};
 use super::made::Made;
 use super::metrics::{self as all, Metrics, Protocol, outputs, sources};
 use super::published::{self, SetRow};
+use super::vertex_labels;
 use crate::memory::{self, SMALLER, Sizes};
 use crate::nearest::nearest;
-use crate::options::{Association, ScannetOptions};
+use crate::options::{Association, Inputs, ScannetOptions};
 use crate::query::ranking::Index;
 use crate::query::text::TextSource;
 use crate::scene::{LabelledScene, MIN_OPACITY, folder_name, load};
 use crate::score::labels::list;
 use crate::score::metrics;
-use gs_io::{Error, Result};
+use gs_io::{Error, Result, hash_file};
 use gs_scene::dataset::LoadOptions;
 use report::sheet::{Row, Sheet, Table};
 use serde::{Deserialize, Serialize};
 use serde_json::{Value, json};
 use stage::Stage;
+use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
 /// How far a Gaussian may lie from the vertex of its number, in metres, for the two to be one.
@@ -158,16 +160,86 @@ fn seen(scene: &LabelledScene) -> Vec<bool> {
 }
 
 pub(crate) fn run(o: &ScannetOptions, parameters: Value, stage: &Stage) -> Result<String> {
-    let folder = &o.inputs.scene;
+    let (scene, truth) = (o.inputs.as_ref().map(|i| i.scene.as_path()), o.labels.as_deref());
+    let folder = truth.or(scene).unwrap_or(Path::new("."));
     let files = ScanFiles::find(folder)?;
+    match (&o.inputs, &o.predictions) {
+        (_, Some(labels)) => of_labels(o, labels, folder, &files, parameters, stage),
+        (Some(inputs), None) => of_instances(o, inputs, &files, parameters, stage),
+        (None, None) => Err(Error::new("nothing to score").field("--scene").expected("--scene or --predictions")),
+    }
+}
+
+/// Scores labels that another program gave the vertices.
+fn of_labels(
+    o: &ScannetOptions,
+    labels: &Path,
+    folder: &Path,
+    files: &ScanFiles,
+    parameters: Value,
+    stage: &Stage,
+) -> Result<String> {
+    let mut claim = outputs(&o.out, stage).reads([files.labels.as_path(), labels]).claim()?;
+    let truth = [files.labels.as_path(), labels].into_iter().map(memory::bytes).sum();
+    stage.forecast(memory::of_scan(&Sizes { truth, ..Sizes::default() }), SMALLER)?;
+    let (vertices, truth) = gs_scene::ply::read_labels(&files.labels, "label")?;
+    let said = vertex_labels::read(labels, vertices.len())?;
+    let mut notes = vec!["no instance score: these are labels of classes".into()];
+    let sets = SETS.map(|size| label_figures(size, &truth, &said, &mut notes)).into();
+    let hash = hash_file(labels)?;
+    let file = labels.file_name().unwrap_or_default().to_string_lossy();
+    let features = BTreeMap::from([("vertex labels".to_string(), format!("{file} ({hash:.12})"))]);
+    let rule = "labels of another program, vertex by vertex; no vertex left out, one without a class of the set missed; means over \
+                the classes present";
+    let (protocol, figures) = (ScanFigures::NAME.into(), ScanFigures { sets, instances: None });
+    let metrics =
+        Metrics { protocol, scene: folder_name(folder), rule: rule.into(), made: None, features, figures, notes };
+    let table = metrics.write(&o.out, stage)?;
+    let summary = json!({"rows": metrics.figures.row()});
+    stage.record(&mut claim, parameters, BTreeMap::from([("vertex labels".into(), hash)]), summary)?;
+    Ok(table)
+}
+
+/// Scores the classes of a set by the vertices' true labels and those of another program.
+fn label_figures(size: usize, truth: &[u32], said: &[u32], notes: &mut Vec<String>) -> SetFigures {
+    let set = classes::class_set(size);
+    let points: Vec<_> =
+        classes::truth_classes(truth, &set).into_iter().zip(classes::truth_classes(said, &set)).collect();
+    let missed = points.iter().filter(|(truth, said)| truth.is_some() && said.is_none()).count();
+    if missed > 0 {
+        notes.push(format!(
+            "{size} classes: {missed} labelled points are given no class of the set and count as missed"
+        ));
+    }
+    let confusion = Confusion::of(set.len(), points);
+    unscored(size, &confusion, notes);
+    SetFigures::new(&set, confusion)
+}
+
+/// Says of a set that no point has a class of it, where that is so.
+fn unscored(size: usize, confusion: &Confusion, notes: &mut Vec<String>) {
+    if confusion.means().is_none() {
+        notes.push(format!("{size} classes: no labelled point takes part, so there is no score"));
+    }
+}
+
+/// Scores the instances of a scene.
+fn of_instances(
+    o: &ScannetOptions,
+    inputs: &Inputs,
+    files: &ScanFiles,
+    parameters: Value,
+    stage: &Stage,
+) -> Result<String> {
+    let folder = &inputs.scene;
     let parts = files.instances.iter().flat_map(|(segments, objects)| [segments, objects]).chain([&files.labels]);
     let mut claim = outputs(&o.out, stage)
         .reads(parts.clone())
-        .reads([&o.inputs.instances, &o.inputs.geometry].into_iter().chain(&o.texts.text_features))
+        .reads([&inputs.instances, &inputs.geometry].into_iter().chain(&o.texts.text_features))
         .claim()?;
     let truth = parts.map(|p| memory::bytes(p)).sum();
-    stage.forecast(memory::of_scan(&Sizes { truth, ..Sizes::new(&o.inputs, &o.texts, &[]) }), SMALLER)?;
-    let scene = o.inputs.read(&load(folder, &LoadOptions::default(), stage)?, stage)?;
+    stage.forecast(memory::of_scan(&Sizes { truth, ..Sizes::new(inputs, &o.texts, &[]) }), SMALLER)?;
+    let scene = inputs.read(&load(folder, &LoadOptions::default(), stage)?, stage)?;
     let mut notes = Vec::new();
     let why = without_classes(&scene, o);
     let source = if why.is_none() { Some(TextSource::open_for(&scene, &o.texts)?) } else { None };
@@ -192,7 +264,7 @@ pub(crate) fn run(o: &ScannetOptions, parameters: Value, stage: &Stage) -> Resul
             sets.push(set_figures(&scene, &labels, &matched, size, &texts, min_support, &mut notes));
         }
     }
-    let instances = instance_figures(&scene, &files, &matched, vertices.len(), &mut notes)?;
+    let instances = instance_figures(&scene, files, &matched, vertices.len(), &mut notes)?;
     let rule = rule(o.association, min_support, !sets.is_empty());
     let (protocol, figures) = (ScanFigures::NAME.into(), ScanFigures { sets, instances });
     let made = Some(Made::of(&scene));
@@ -250,9 +322,7 @@ fn set_figures(
     }
     let points = counted().map(|v| (truth[v], matched.gaussian[v].map(|_| of(v).unwrap_or(0))));
     let confusion = Confusion::of(set.len(), points);
-    if confusion.means().is_none() {
-        notes.push(format!("{size} classes: no labelled point takes part, so there is no score"));
-    }
+    unscored(size, &confusion, notes);
     SetFigures::new(&set, confusion)
 }
 

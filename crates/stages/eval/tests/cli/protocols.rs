@@ -419,6 +419,58 @@ fn rows_say_how_instances_were_made() {
 }
 
 #[test]
+fn labels_of_another_program_are_scored_vertex_by_vertex() {
+    let s = Scene::new();
+    let ply = s.scene().join("scene0000_00_vh_clean_2.labels.ply");
+    let (_, truth) = gs_scene::ply::read_labels(&ply, "label").unwrap();
+    let file = s.at("labels.npy");
+    let run = |rest: &[&str]| {
+        let mut c = Command::new(env!("CARGO_BIN_EXE_eval"));
+        c.args(["scannet", "--predictions"]).arg(&file).arg("--labels").arg(s.scene());
+        c.arg("--out").arg(s.at("said")).args(rest).output().unwrap()
+    };
+    let score = |labels: &[i32]| {
+        gs_io::npy::write_i32(&file, &[labels.len()], labels).unwrap();
+        let o = run(&[]);
+        assert!(o.status.success(), "{}", String::from_utf8_lossy(&o.stderr));
+        read_json(&s.at("said/metrics.json"))
+    };
+    let same_as_truth: Vec<i32> = truth.iter().map(|&l| l as i32).collect();
+    let m = score(&same_as_truth);
+    assert!(m["sets"].as_array().unwrap().iter().all(|set| set["miou"] == 1.0 && set["macc"] == 1.0), "{}", m["sets"]);
+    assert!(m["made"].is_null() && m["instances"].is_null());
+    let table = std::fs::read_to_string(s.at("said/table.md")).unwrap();
+    assert!(table.contains("**labels of another program, mean over scenes** | 100.00 |"), "{table}");
+    assert!(table.contains("vertex labels labels.npy ("), "{table}");
+    // Chairs (5) are called walls (1), tables (7) nothing; vertices without a class of the set cost nothing whatever they get.
+    let said: Vec<i32> = truth
+        .iter()
+        .map(|&l| match l {
+            5 | 0 | 40 => 1,
+            7 => -1,
+            l => l as i32,
+        })
+        .collect();
+    let m = score(&said);
+    let count = |class: u32| truth.iter().filter(|&&l| l == class).count() as f64;
+    assert!(count(5) > 0.0 && count(7) > 0.0);
+    let class = |id: u32| {
+        let classes = m["sets"][0]["classes"].as_array().unwrap();
+        classes.iter().find(|c| c["id"] == id).map(|c| (c["iou"].clone(), c["recall"].clone())).unwrap()
+    };
+    same(&class(1).0, &json!(count(1) / (count(1) + count(5))), "walls");
+    assert_eq!((class(1).1, class(5), class(7)), (json!(1.0), (json!(0.0), json!(0.0)), (json!(0.0), json!(0.0))));
+    let present: Vec<u32> = NAMES.iter().map(|n| n.0).filter(|&id| count(id) > 0.0).collect();
+    let expected = (present.len() as f64 - 2.0) / present.len() as f64;
+    same(&m["sets"][0]["macc"], &json!(expected), "two of the classes are lost");
+    assert!(m["notes"].to_string().contains("count as missed"), "{}", m["notes"]);
+
+    failed(&run(&["--scene", "x"]), &[]);
+    std::fs::write(&file, "1 2 3").unwrap();
+    failed(&run(&[]), &["labels.npy: not a label per vertex; found 3"]);
+}
+
+#[test]
 fn tables_join_scenes_and_refuse_what_does_not_fit() {
     let s = Scene::new();
     s.metrics("scannet", &[]);
