@@ -169,6 +169,16 @@ impl MaskMaps {
         }
     }
 
+    /// The maps with every `step`-th pixel of every `step`-th row, the first ones among them, so that no id is blended; of `ids`
+    /// with fewer pixels than a step some vanish.
+    #[must_use]
+    pub fn shrunk(&self, step: usize) -> Self {
+        let rows = self.ids.chunks_exact(self.width.max(1)).enumerate();
+        let kept = rows.filter(|(row, _)| (row % self.height.max(1)).is_multiple_of(step));
+        let ids = kept.flat_map(|(_, row)| row.iter().copied().step_by(step)).collect();
+        Self { width: self.width.div_ceil(step), height: self.height.div_ceil(step), ids }
+    }
+
     /// Refuses maps, read from `file`, of another shape than a photograph of `width` x `height`: maps may be of another size.
     ///
     /// # Errors
@@ -286,6 +296,19 @@ impl MaskFeatures {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn shrunk_maps_keep_the_first_of_every_few_pixels() {
+        // 5 x 3 pixels at four levels: level, row and column are the digits of the id.
+        let id = |i: i32| 100 * (i / 15) + 10 * (i / 5 % 3) + i % 5;
+        let m = MaskMaps { width: 5, height: 3, ids: (0..60).map(id).collect() };
+        let half = m.shrunk(2);
+        assert_eq!((half.width, half.height), (3, 2));
+        assert_eq!(half.level(Level::Default), [0, 2, 4, 20, 22, 24]);
+        assert_eq!(half.level(Level::Large), [300, 302, 304, 320, 322, 324]);
+        assert_eq!(m.shrunk(1), m);
+        assert_eq!(m.shrunk(64).ids, [0, 100, 200, 300]);
+    }
 
     #[test]
     fn id_maps_read_back_and_refuse_blended_ids() {

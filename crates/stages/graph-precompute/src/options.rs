@@ -51,6 +51,11 @@ pub(crate) struct Settings {
     /// can use no others
     #[arg(long, value_name = "LEVELS", value_delimiter = ',', default_value = "default,small,medium,large")]
     pub levels: Vec<Level>,
+    /// Shrink id maps by this factor, 1 to 64, before footprints are measured: every N-th pixel of every N-th row stays, as in
+    /// OpenGaussian with -r N (2 on ScanNet)
+    #[arg(long, value_name = "N", default_value_t = 1, value_parser = stage::within(1usize..=64))]
+    #[serde(skip_serializing_if = "is_one")]
+    pub mask_divisor: usize,
     /// A pixel counts where its accumulated alpha exceeds this; with --preset literal the default is 0
     #[arg(long, value_name = "ALPHA", value_parser = stage::within(0.0..=0.999), default_value = "0.7",
         default_value_if("preset", "literal", "0"))]
@@ -89,6 +94,11 @@ pub(crate) enum Views {
 pub(crate) enum Preset {
     /// The paper as printed: anchors are sampled among all Gaussians, seen or not, and every pixel of every mask counts
     Literal,
+}
+
+/// Whether id maps stay as they are: the provenance names a divisor only where there is one.
+fn is_one(divisor: &usize) -> bool {
+    *divisor == 1
 }
 
 impl Settings {

@@ -157,6 +157,9 @@ impl<'a> Collected<'a> {
         // The map may be smaller than the photograph, but not of another shape.
         let mut maps = masks.read(view)?;
         maps.keep(&settings.levels);
+        if settings.mask_divisor > 1 {
+            maps = maps.shrunk(settings.mask_divisor);
+        }
         let camera = view.camera.resized(maps.width as u32, maps.height as u32);
         let index = self.out.views.len() as u32;
         let scale = (maps.width * maps.height) as f64 / REFERENCE_PIXELS;

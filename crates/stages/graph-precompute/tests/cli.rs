@@ -103,6 +103,27 @@ fn artifacts_are_right_and_the_same_for_any_number_of_threads() {
 }
 
 #[test]
+fn id_maps_are_shrunk_where_that_is_asked_for() {
+    let (_dir, s, o) = setup(SIZE);
+    let read = |extra: &[&str]| {
+        succeed(&run(&s, &o, extra));
+        Footprints::read(o.join("footprints.safetensors")).unwrap()
+    };
+    let whole = read(&[]);
+    let half = read(&["--mask-divisor", "2"]);
+    let parameters = |f: &Footprints| f.artifact().provenance().parameters["mask_divisor"].clone();
+    assert_eq!((parameters(&whole), parameters(&half)), (serde_json::Value::Null, serde_json::json!(2)));
+    assert_eq!(half.rows.len(), whole.rows.len());
+    assert!(half.rows.iter().zip(&whole.rows).all(|(half, whole)| 4 * half.pixels == whole.pixels));
+    // A quarter of the pixels shows a quarter of the weight, but for what the wider low-pass of small pictures adds.
+    let sum = |f: &Footprints| f.entries(6).1.iter().map(|&w| f64::from(w)).sum::<f64>();
+    let share = sum(&half) / sum(&whole);
+    assert!((0.2..0.3).contains(&share), "{share}");
+    let out = run(&s, &o, &["--mask-divisor", "0"]);
+    assert!(!out.status.success() && String::from_utf8_lossy(&out.stderr).contains("'--mask-divisor <N>'"));
+}
+
+#[test]
 fn the_forecast_is_near_the_peak() {
     const SIDE: usize = 25;
     let (_dir, s, o) = setup(192);
