@@ -24,8 +24,8 @@ pub use health::{Finding, Health, SHARED, SharedMasks};
 pub use instances::{Family, Instances, Match, OrientedBox, TreeEdge};
 pub use lerf_ovs::{LERF_OVS, LerfScene};
 pub use masks::{
-    LEVELS, Level, MaskFeatures, MaskFolder, MaskMaps, features_path, folder_files, hash_folder, maps_path, same_shape, stems,
-    watch_folder,
+    LEVELS, Level, MaskFeatures, MaskFolder, MaskMaps, features_path, folder_files, hash_folder, maps_path, same_shape,
+    stems, watch_folder,
 };
 pub use nyu40::NYU40;
 pub use palette::{NOISE_COLOR, instance_color};

@@ -263,7 +263,11 @@ fn check_undistortion(model: &str, parameters: &[f64], intrinsics: [f64; 4], dis
     // 8 bits and bilinear interpolation on 160 pixels leave less than this; a shift of one pixel is 0.015.
     assert!(worst < 0.006, "{model}: {worst}");
     assert_eq!(d.warnings.len(), usize::from(view.is_distorted()), "{:?}", d.warnings);
-    assert!(d.warnings.iter().all(|w| w.contains("the lenses of 1 of 1 photographs are distorted")), "{:?}", d.warnings);
+    assert!(
+        d.warnings.iter().all(|w| w.contains("the lenses of 1 of 1 photographs are distorted")),
+        "{:?}",
+        d.warnings
+    );
     // What cannot be mixed comes from the nearest pixel: half a pixel off, of a map of the same or of half the size.
     for (shrink, most) in [(1, 0.012), (2, 0.02)] {
         let (before, after) = (photo.resize_area(w / shrink, h / shrink), image.resize_area(w / shrink, h / shrink));

@@ -1,9 +1,9 @@
 //! The commands of `eval`.
 
 use crate::options::{
-    LerfOptions, MasksOptions, QueryOptions, ReportOptions, ScannetOptions, ScoreOptions, TableOptions,
+    CheckOptions, LerfOptions, MasksOptions, QueryOptions, ReportOptions, ScannetOptions, ScoreOptions, TableOptions,
 };
-use crate::{mask_stats, page, protocols, query, score};
+use crate::{check, mask_stats, page, protocols, query, score};
 use clap::{Parser, Subcommand};
 use gs_io::{Error, Result};
 use serde::Serialize;
@@ -32,6 +32,8 @@ enum Command {
     Table(TableOptions),
     /// Score instances and text queries against the truth of the scene
     Score(ScoreOptions),
+    /// Check that labels, texts and masks of a benchmark's scene can be read and fit together
+    Check(CheckOptions),
     /// Measure id maps: how many, how large, and how often one view splits or merges what another shows
     Masks(MasksOptions),
     /// Make one self-contained HTML page of a run, and metrics.json beside it
@@ -46,7 +48,7 @@ impl Program for Args {
     }
 
     fn forecasts(&self) -> bool {
-        !matches!(self.command, Command::Table(_) | Command::Masks(_))
+        !matches!(self.command, Command::Table(_) | Command::Check(_) | Command::Masks(_))
     }
 
     fn check(&self) -> Result<()> {
@@ -71,6 +73,7 @@ impl Program for Args {
             Command::Lerf(o) => protocols::lerf::run(o, parameters, stage)?,
             Command::Scannet(o) => protocols::scannet::run(o, parameters, stage)?,
             Command::Table(o) => protocols::table::run(o, parameters, stage)?,
+            Command::Check(o) => check::run(o, stage)?,
             Command::Score(o) => score::run(o, parameters, stage)?,
             Command::Masks(o) => mask_stats::run(o, parameters, stage)?,
             Command::Report(o) => page::run(o, parameters, stage)?,

@@ -1,10 +1,11 @@
 //! The last stage: text queries, evaluation protocols and the report.
 //!
 //! `options` holds the options of every command; `cli` says which command runs what: `query` answers questions,
-//! `score` compares with the truth of a scene, `protocols` follows the published benchmarks, `page` makes the report.
+//! `check` looks at what a benchmark needs, `score` compares with the truth of a scene, `protocols` follows the published benchmarks, `page` makes the report.
 //! They share the labelled Gaussians (`scene`), how a selection becomes a mask (`silhouette`), which Gaussian is nearest
 //! (`nearest`) and the forecast of memory (`memory`).
 
+mod check;
 pub mod cli;
 mod mask;
 mod mask_stats;

@@ -361,6 +361,36 @@ pub struct TableOptions {
     pub out: PathBuf,
 }
 
+/// How a scene will be scored.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, clap::ValueEnum, Serialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum Benchmark {
+    /// By polygons of LERF-OVS (eval lerf)
+    LerfOvs,
+    /// By the labelled vertices of a scan (eval scannet)
+    Scannet,
+}
+
+/// `eval check`.
+#[derive(Debug, Clone, clap::Args, Serialize)]
+pub struct CheckOptions {
+    /// Dataset folder (COLMAP, transforms.json or ScanNet)
+    #[arg(long, value_name = "DIR")]
+    pub scene: PathBuf,
+    /// How the scene will be scored
+    #[arg(long, value_enum)]
+    pub benchmark: Benchmark,
+    /// Folder of id maps (*_s.npy); those of one view are read
+    #[arg(long, value_name = "DIR")]
+    pub masks: Option<PathBuf>,
+    /// Table of text features that will be asked; a CLIP model needs no check, for it takes any words
+    #[arg(long, value_name = "FILE")]
+    pub text_features: Option<PathBuf>,
+    #[command(flatten)]
+    #[serde(flatten)]
+    pub labels: Labels,
+}
+
 /// `eval masks`.
 #[derive(Debug, Clone, clap::Args, Serialize)]
 pub struct MasksOptions {

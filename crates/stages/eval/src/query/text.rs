@@ -326,7 +326,10 @@ mod tests {
             let e = zipped("text_features.zip", files).err().unwrap().to_string();
             assert!(e.contains("text_features.zip") && e.contains(part), "{e}");
         };
-        refused(&[file("notes.txt", "x")], "no text features in this zip; found 1 files: notes.txt, expected text_features.json");
+        refused(
+            &[file("notes.txt", "x")],
+            "no text features in this zip; found 1 files: notes.txt, expected text_features.json",
+        );
         refused(&[file("text_features.json", "[1]")], "text_features.json: not a table of text features");
         refused(&[file("text_features.json", &" ".repeat((1 << 24) + 1))], "too large for text features");
     }

@@ -642,3 +642,69 @@ fn an_answer_may_be_coarser_or_finer() {
     assert_eq!(ask("floor", "parent", &["no parent but the whole scene"])[0]["gaussians"], 81);
     assert_eq!(ask("blue ball", "parts", &["instance 1 has no parts"]).as_array().unwrap().len(), 1);
 }
+
+#[test]
+fn a_scene_of_a_benchmark_is_checked_before_anything_runs() {
+    let f = Fixture::new(2);
+    let (scene, masks) = (f.scene(), f.scene().join("language_features"));
+    let run = || {
+        let mut c = f.command("check", false);
+        c.args(["--benchmark", "lerf-ovs", "--scene"]).arg(&scene).arg("--masks").arg(&masks);
+        c.arg("--text-features").arg(f.table()).output().unwrap()
+    };
+    let good = |parts: &[&str]| {
+        let o = run();
+        let said = [o.stdout, o.stderr].map(|s| String::from_utf8(s).unwrap()).concat();
+        assert!(o.status.success() && parts.iter().all(|part| said.contains(part)), "{said}");
+    };
+    let bad = |parts: &[&str]| failed(&run(), parts);
+    let map = masks.join(format!("{}_s.npy", stem(0)));
+    good(&[
+        "labels of 2 frames, 4 objects, 2 texts asked",
+        "text features of all 2 texts",
+        "_s.npy: 96x72 pixels, 8 masks",
+    ]);
+    // Texts.
+    let table = fs::read(f.table()).unwrap();
+    fs::write(f.table(), r#"{"red ball": [1, 0]}"#).unwrap();
+    bad(&["text.json", "texts that will be asked have no feature", "1 of 2 without, such as blue ball"]);
+    fs::write(f.table(), table).unwrap();
+    // Labels.
+    let label = scene.join(format!("label/{}.json", stem(4)));
+    let whole = fs::read_to_string(&label).unwrap();
+    fs::write(&label, &whole[..whole.len() / 2]).unwrap();
+    bad(&[&stem(4), "not a label file"]);
+    fs::write(&label, whole.replace("blue ball", " ")).unwrap();
+    bad(&[&stem(4), "a category without a name"]);
+    fs::write(&label, r#"{"info":{"width":96,"height":40},"objects":[]}"#).unwrap();
+    bad(&[&stem(4), "another shape than the photograph"]);
+    let empty = r#"{"info":{"width":96,"height":72},"objects":[{"category":"red ball","segmentation":[]}]}"#;
+    fs::write(&label, empty).unwrap();
+    good(&["red ball: its polygons hold no pixel"]);
+    fs::write(&label, &whole).unwrap();
+    fs::copy(&label, scene.join("label/frame_99999.json")).unwrap();
+    good(&["frame_99999.json: no photograph of this name"]);
+    // Masks: of another shape, of another dtype or blended, of other photographs; features of another run or model.
+    gs_io::npy::write_f32(&map, &[4, 40, 96], &[0.0; 4 * 40 * 96]).unwrap();
+    bad(&[&format!("{}_s.npy", stem(0)), "another shape than the photograph; found 96x40, expected 96x72"]);
+    gs_io::npy::write_f32(&map, &[4, 72, 96], &[0.5; 4 * 72 * 96]).unwrap();
+    bad(&["not a mask id; found 0.5"]);
+    gs_io::npy::write_f32(&map, &[4, 72, 96], &[1.0; 4 * 72 * 96]).unwrap();
+    let features = |rows: usize, dim: usize| {
+        let file = masks.join(format!("{}_f.npy", stem(0)));
+        gs_io::npy::write_f32(file, &[rows, dim], &vec![0.5; rows * dim]).unwrap();
+    };
+    features(1, 2);
+    bad(&["fewer features than masks; found 1, expected 2"]);
+    features(2, 3);
+    bad(&["another dimension than the text features; found 3, expected 2"]);
+    features(2, 2);
+    good(&["2 masks, features of dimension 2"]);
+    // All that is wrong is said at once.
+    fs::write(&label, "{").unwrap();
+    fs::remove_dir_all(&masks).unwrap();
+    gs_io::npy::write_f32(masks.join("other_s.npy"), &[1, 1], &[0.0]).unwrap();
+    let said = String::from_utf8(run().stderr).unwrap();
+    assert!(said.contains("not a label file") && said.contains("no id map is of a photograph"), "{said}");
+    assert!(said.contains("1 such as other_s.npy"), "{said}");
+}

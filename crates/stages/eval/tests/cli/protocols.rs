@@ -609,7 +609,13 @@ fn a_linked_scene_has_the_name_and_the_labels_of_its_link() {
     let run = |command: &str, scene: &Path| {
         let _ = std::fs::remove_dir_all(s.at("out"));
         let mut c = Command::new(env!("CARGO_BIN_EXE_eval"));
-        c.arg(command).arg("--instances").arg(s.instances()).arg("--geometry").arg(s.geometry()).arg("--scene").arg(scene);
+        c.arg(command)
+            .arg("--instances")
+            .arg(s.instances())
+            .arg("--geometry")
+            .arg(s.geometry())
+            .arg("--scene")
+            .arg(scene);
         c.arg("--text-features").arg(s.texts()).arg("--out").arg(s.at("out")).current_dir(&link);
         let o = c.output().unwrap();
         assert!(o.status.success(), "{}", String::from_utf8_lossy(&o.stderr));
@@ -621,6 +627,26 @@ fn a_linked_scene_has_the_name_and_the_labels_of_its_link() {
         assert!(m["pairs"].as_array().unwrap().len() >= 8);
         assert_eq!(run("scannet", &scene)["scene"], "my_room");
     }
+}
+
+#[test]
+fn the_truth_of_a_scan_is_checked_with_its_texts() {
+    let s = Scene::new();
+    let run = || {
+        let mut c = Command::new(env!("CARGO_BIN_EXE_eval"));
+        c.args(["check", "--benchmark", "scannet", "--scene"]).arg(s.scene());
+        c.arg("--text-features").arg(s.texts()).output().unwrap()
+    };
+    let o = run();
+    let said = String::from_utf8(o.stdout).unwrap();
+    assert!(o.status.success() && said.contains("text features of all 19 texts, dimension 24"), "{said}");
+    let segs = s.scene().join("scene0000_00_vh_clean_2.0.010000.segs.json");
+    std::fs::write(segs, r#"{"segIndices": [1, 2]}"#).unwrap();
+    failed(&run(), &["not a segment per vertex"]);
+    let labels = s.scene().join("scene0000_00_vh_clean_2.labels.ply");
+    let whole = std::fs::read(&labels).unwrap();
+    std::fs::write(&labels, &whole[..whole.len() - 1]).unwrap();
+    failed(&run(), &["labels.ply", "cut short"]);
 }
 
 #[test]
