@@ -83,7 +83,7 @@ fuzz: ## Fuzz every file reader for FUZZ_SECONDS each (needs a nightly toolchain
 ##@ Reproduce the paper
 
 # The data sets of the paper, in folder DATA; their parameters are in pipelines/*.conf.
-check-data: check-$(SET) ## Say what of a data set is missing: make check-data DATA=folder SET=lerf-ovs|scannet
+check-data: check-$(SET) ## Say what of a data set is missing or wrong, and what it may cost: make check-data DATA=folder SET=lerf-ovs|scannet
 
 lerf-ovs: check-lerf-ovs build ## The paper's table of LERF-OVS: make lerf-ovs DATA=folder OUT=folder
 	@$(PIPELINE) -f pipelines/benchmark.mk SET=lerf-ovs all

@@ -14,15 +14,19 @@ include $(CONF)
 BIN ?= target/release
 METRICS := $(foreach s,$(SCENES),$(OUT)/$s/protocol/metrics.json)
 
-.PHONY: all check FORCE
-export SCENES MASKS CLIP TEXTS SAM EVERY
+.PHONY: all check read FORCE
+export SCENES MASKS CLIP TEXTS SAM EVERY BIN GEOM_ARGS GRAPH_ARGS FEAT_ARGS
 check:
-	@scripts/check_data.sh $(SET) $(DATA)
+	@COST=yes scripts/check_data.sh $(SET) $(DATA)
+# The same once the programs are built, before the first scene runs: only they can read what is there.
+read: | $(BIN)/eval
+	@said=$$(scripts/check_data.sh $(SET) $(DATA) 2>&1) || { echo "$$said" >&2; exit 2; }
 
 .DEFAULT_GOAL := all
 all: $(OUT)/metrics.json
 	@cat $(OUT)/table.md
 
+$(METRICS): | read
 $(OUT)/%/protocol/metrics.json: FORCE
 	+@$(MAKE) --no-print-directory -f pipelines/$(SET).mk SCENE=$(DATA)/$* OUT=$(OUT)/$*
 

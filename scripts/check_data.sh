@@ -1,12 +1,16 @@
 #!/usr/bin/env bash
 # check_data.sh SET DATA: what of a data set (lerf-ovs, scannet) is missing in DATA, where it goes, where it comes from and
-# under which licence. SCENES (a list) and the settings MASKS, CLIP, TEXTS, SAM, EVERY are taken from the environment, as the
-# pipelines have them. Exit code 0: all is there; 2: something is missing. Nothing is downloaded.
+# under which licence. Of scenes that lack nothing labels, texts and the masks of one photograph are read (eval check), and with
+# COST what they may cost is said (gs-geom's forecast, cost_forecast.sh), if the programs in BIN are built. SCENES (a list)
+# and the settings MASKS, CLIP, TEXTS, SAM, EVERY, GEOM_ARGS, GRAPH_ARGS, FEAT_ARGS are taken from the environment, as the
+# pipelines have them. Exit code 0: all is there; 2: something is missing or wrong. Nothing is downloaded.
 set -uo pipefail
 set=${1-} data=${2-}
 [ -n "$data" ] || { echo "usage: check_data.sh lerf-ovs|scannet DATA (make check-data DATA=folder SET=lerf-ovs|scannet)" >&2; exit 2; }
-SCENES=${SCENES-} CLIP=${CLIP-} TEXTS=${TEXTS-} SAM=${SAM-models} EVERY=${EVERY:-20} MASKS=${MASKS-}
-missing=0 needs=
+SCENES=${SCENES-} CLIP=${CLIP-} TEXTS=${TEXTS-} SAM=${SAM-models} EVERY=${EVERY:-20} MASKS=${MASKS-} BIN=${BIN:-target/release}
+missing=0 wrong=0 needs= unread=
+scratch=$(mktemp -d)
+trap 'rm -rf "$scratch"' EXIT
 count() { find -L "$1" -maxdepth 1 -type f -name "$2" 2> /dev/null | wc -l; }
 lack() { # lack WHAT WHERE SOURCE
   missing=$((missing + 1))
@@ -100,17 +104,56 @@ check_scannet() {
   check_masks "$photographs" "$scene" opengaussian
 }
 
+# Reads what is there of scene $1, in folder $2.
+check_contents() {
+  local line arguments=(--benchmark "$set" --scene "$2") masks=${MASKS:-$2/language_features}
+  [ "$(count "$masks" '*_s.npy')" -eq 0 ] || arguments+=(--masks "$masks")
+  [ -z "$TEXTS" ] || arguments+=(--text-features "$TEXTS")
+  while IFS= read -r line; do
+    case $line in
+      'eval: error: '*) wrong=$((wrong + 1)) && printf '  wrong    %s\n' "${line#eval: error: }" ;;
+      'eval: warning: '*) printf '  note     %s\n' "${line#eval: warning: }" ;;
+      *) there "$line" ;;
+    esac
+  done < <("$BIN/eval" check "${arguments[@]}" 2>&1)
+}
+# What scene $1 may cost.
+say_cost() {
+  local photographs=$2 makes=
+  [ "$(count "${MASKS:-$2/language_features}" '*_s.npy')" -gt 0 ] || makes=yes
+  if [ "$set" = scannet ] && [ ! -e "$2/transforms_train.json" ]; then
+    photographs=$scratch/$1
+    scripts/scannet_frames.sh "$2" "$photographs" "$EVERY"
+  fi
+  # The settings of the stages are options with spaces between.
+  # shellcheck disable=SC2086
+  if scripts/geometry_forecast.sh "$scratch/numbers" "$BIN/gs-geom" train --scene "$photographs" ${GEOM_ARGS-} 2> "$scratch/error"; then
+    printf '  forecast %s\n' "$(MAKES_MASKS=$makes scripts/cost_forecast.sh "$scratch/numbers")"
+  else
+    wrong=$((wrong + 1))
+    printf '  wrong    %s\n' "$(tail -2 "$scratch/error" | head -1)"
+  fi
+}
+
 case $set in lerf-ovs | scannet) ;; *) echo "check_data.sh: SET: found '$set', expected lerf-ovs or scannet" >&2; exit 2 ;; esac
 [ -n "$SCENES" ] || { echo "check_data.sh: SCENES is empty" >&2; exit 2; }
 [ -d "$data" ] || echo "no such folder yet: $data"
 for scene in $SCENES; do
   echo "$scene"
+  before=$missing
   check_"${set%-ovs}" "$data/$scene"
+  [ "$missing" -eq "$before" ] || continue
+  if [ ! -x "$BIN/eval" ] || [ ! -x "$BIN/gs-geom" ]; then unread=yes && continue; fi
+  check_contents "$scene" "$data/$scene"
+  [ -z "${COST-}" ] || say_cost "$scene" "$data/$scene"
 done
 echo "texts"
 check_texts
 
+[ -z "$unread" ] || echo "not read: what is in the files, because the programs are not built (make build)"
+[ "$wrong" -eq 0 ] || printf '\n%d things cannot be used as they are\n' "$wrong"
 if [ "$missing" -eq 0 ]; then
+  [ "$wrong" -eq 0 ] || exit 2
   echo "all there: $(wc -w <<< "$SCENES") scenes of $set"
   exit 0
 fi

@@ -66,6 +66,24 @@ said "label/ramen/frame_00060.json" "points3D.bin" "1 of 10 feature files" "$wor
 said scene0645_00_vh_clean_2.labels.ply scan-net.org "Terms of Use" TEXTS=file SET=scannet DATA="$work/none"
 ! make --no-print-directory lerf-ovs DATA="$work/none" OUT="$work/out" > "$work/check.log" 2>&1 || fail "make lerf-ovs without data"
 grep -q 'things are missing' "$work/check.log" && [ ! -e "$work/out" ] || { cat "$work/check.log"; fail "make lerf-ovs ran without data"; }
+# What is there is read: a label file cut short, a text without a feature, a map of another shape; and what it costs is said.
+[ "$(check SET=lerf-ovs DATA="$lerf" SCENES="figurines ramen" "${given[@]}"; grep -c 'forecast at most .* CPU hours .* GB of memory' "$work/check.log")" = 2 ] \
+  || { cat "$work/check.log"; fail "no forecast of what a scene costs"; }
+grep -q 'ok       frame_[0-9]*_s.npy: 160x120 pixels' "$work/check.log" && grep -q 'ok       labels of 4 frames' "$work/check.log" \
+  || { cat "$work/check.log"; fail "masks and labels were not read"; }
+cp "$lerf/label/ramen/frame_00060.json" "$work/some/label/ramen/"
+cp -rL "$lerf/ramen/sparse" "$lerf/ramen/language_features" "$work/some/ramen/"
+head -c 300 "$lerf/label/ramen/frame_00060.json" > "$work/some/label/ramen/frame_00060.json"
+said "frame_00060.json: not a label file" "1 things cannot be used" SET=lerf-ovs DATA="$work/some" SCENES=ramen TEXTS="$work/texts.json"
+cp "$lerf/label/ramen/frame_00060.json" "$work/some/label/ramen/"
+echo '{"egg": [1, 0]}' > "$work/egg.json"
+said "texts that will be asked have no feature" SET=lerf-ovs DATA="$work/some" SCENES=ramen TEXTS="$work/egg.json"
+maps=("$work/some/ramen/language_features/"*_s.npy)
+cp "${maps[0]%_s.npy}_f.npy" "${maps[0]}"
+said "${maps[0]##*/}" "1 things cannot be used" SET=lerf-ovs DATA="$work/some" SCENES=ramen TEXTS="$work/texts.json"
+! make --no-print-directory lerf-ovs DATA="$work/some" SCENES=ramen OUT="$work/out" TEXTS="$work/texts.json" > "$work/check.log" 2>&1 \
+  || fail "make lerf-ovs with a broken map"
+[ ! -e "$work/out" ] || fail "make lerf-ovs ran with a broken map"
 pass "check-data names what is missing, where it goes, its page and its licence"
 
 small='--iterations 200'
