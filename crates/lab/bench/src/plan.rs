@@ -214,7 +214,9 @@ impl Plan {
                 self.seeds = seeds.collect::<Result<_>>()?;
                 let (allowed, range) = match rest[0] {
                     "tuning" => (0..FIRST_REPORTING, format!("seeds below {FIRST_REPORTING} for tuning")),
-                    "reporting" => (FIRST_REPORTING..u64::MAX, format!("seeds from {FIRST_REPORTING} on for reporting")),
+                    "reporting" => {
+                        (FIRST_REPORTING..u64::MAX, format!("seeds from {FIRST_REPORTING} on for reporting"))
+                    }
                     _ => return Err(wrong("tuning or reporting, then seeds")),
                 };
                 if let Some(seed) = self.seeds.iter().find(|s| !allowed.contains(*s)) {

@@ -113,7 +113,9 @@ impl<'a> Engine<'a> {
     /// Whether the engine can train with these options; the readable model can with all.
     pub fn serves(options: &Contrastive) -> bool {
         let of_masks = !matches!(options.loss, Loss::Gaussian | Loss::Pixel);
-        options.norm_axis == Axis::Channel && options.cohesion == 0.0 && of_masks
+        options.norm_axis == Axis::Channel
+            && options.cohesion == 0.0
+            && of_masks
             && options.unit_length == UnitLength::Never
     }
 
