@@ -7,5 +7,5 @@ PROTOCOL := lerf
 PROTOCOL_FILES := $(wildcard $(SCENE)/label/*.json $(dir $(SCENE))label/$(notdir $(SCENE))/*.json)
 # 3DGS on the photographs at their own size (at most 1600 wide), every eighth one held out. The selection is rendered alone
 # above 0.7, and the mean is over pairs of frame and category.
-GEOM_FIRST := --iterations 30000
+GEOM_FIRST = $(call unless,GEOM_ARGS,--iterations 30000)
 include pipelines/protocol.mk

@@ -16,8 +16,8 @@ endif
 PROTOCOL_FILES := $(wildcard $(addprefix $(SCENE)/,*.labels.ply *.segs.json *.aggregation.json))
 # The scan's vertices stay where they are, photographs have half their size (-r 2), no view is held out. Gaussian i is
 # vertex i, and faint ones are left out.
-GEOM_FIRST := --densify fixed --resolution 2 --holdout 0 --iterations 30000
-GRAPH_FIRST := --holdout 0
+GEOM_FIRST = $(foreach o,densify_fixed resolution_2 holdout_0 iterations_30000,$(call unless,GEOM_ARGS,--$(subst _,$(space),$o)))
+GRAPH_FIRST = $(call unless,GRAPH_ARGS,--holdout 0)
 include pipelines/protocol.mk
 
 frames_OPTIONS := $(EVERY)

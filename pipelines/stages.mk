@@ -71,7 +71,10 @@ masks_FILES = $(call list,$(MASKS)/,'*_s.npy')
 clip_FILES = $(call list,$(call arg,CLIP)/,'*')
 texts_FILES = $(call list,$(call arg,TEXTS),'*')
 
-# The options of every stage; those of people come after a fragment's own (GEOM_FIRST, GRAPH_FIRST, REPORT_FIRST), and win. The seed counts
+space := $(subst ,, )
+# An option with its value, such as --holdout 0, unless people give it in the variable $1.
+unless = $(if $(filter $(firstword $2),$($1)),,$2)
+# The options of every stage: a fragment's own (GEOM_FIRST, GRAPH_FIRST, REPORT_FIRST), then those of people. The seed counts
 # as an option; 0 is every stage's own. A quality is about our own features, not about those of a preset.
 SEED_ARGS := $(addprefix --seed ,$(filter-out 0,$(SEED)))
 geom_OPTIONS := $(GEOM_QUALITY) $(GEOM_FIRST) $(GEOM_ARGS) $(SEED_ARGS)
@@ -106,7 +109,6 @@ query_RUN = $(BIN)/eval query --scene $(call arg,PHOTOGRAPHS) --geometry $(call 
   --out $(OUT)/query $(foreach q,$(QUERIES),--text '$(subst ','\'',$(subst _,$(space),$q))') $(COMMON)
 report_RUN = $(BIN)/eval report --scene $(call arg,PHOTOGRAPHS) --run-dir $(OUT) $(report_GEOMETRY) --masks $(MASKS) --out $(OUT)/report.html \
   $(report_OPTIONS) $(COMMON)
-space := $(subst ,, )
 
 # Before the first stage runs, every stage checks its options. geom_FROM says in errors where those of stage 1 come from.
 PROGRAMS := $(addprefix $(BIN)/,gs-geom mask-embed graph-precompute feat-train cluster-match eval)
