@@ -55,7 +55,8 @@ fn check_labels(o: &CheckOptions, dataset: &Dataset, stage: &Stage) -> Result<(S
             continue;
         }
         match dataset.views.iter().find(|v| v.stem() == labels.frame) {
-            Some(view) => drop(labels.camera(view)?),
+            // Refuses labels of another shape than the photograph.
+            Some(view) => _ = labels.camera(view)?,
             None => stage.warn(&format!("{}: no photograph of this name: its labels score 0", path.display())),
         }
         if labels.categories.is_empty() {
