@@ -76,6 +76,14 @@ pub struct Prototypes {
     alive: Vec<usize>,
 }
 
+/// Room for the numbers of one point: an allocation for each of many points would cost more than the sums.
+#[derive(Debug, Default)]
+pub struct Room {
+    unit: Vec<f64>,
+    logits: Vec<f64>,
+    sum: Vec<f64>,
+}
+
 impl Prototypes {
     /// From `centroids` `[K][d]`, at the temperature `tau`.
     pub fn new(centroids: &[f64], d: usize, tau: f64) -> Self {
@@ -85,34 +93,37 @@ impl Prototypes {
     }
 
     /// Cross-entropy of the softmax over all masks of the cosines with `f`, against its `share` in each mask `[K]`. Adds
-    /// the gradients of the centroids' directions `[K][d]` and of `f`. `logits` is room for numbers.
+    /// the gradients of the centroids' directions `[K][d]` and of `f`.
     pub fn cross_entropy(
         &self,
         f: &[f64],
         share: &[f64],
-        logits: &mut Vec<f64>,
+        room: &mut Room,
         to_directions: &mut [f64],
         to_feature: &mut [f64],
     ) -> f64 {
-        let (d, tau) = (self.d, self.tau);
-        let (u, f_length) = directions(f, d);
-        if f_length[0] <= SHORTEST || self.alive.len() < 2 {
+        let (d, tau, length) = (self.d, self.tau, dot(f, f).sqrt());
+        if length <= SHORTEST || self.alive.len() < 2 {
             return 0.0;
         }
+        let Room { unit: u, logits, sum } = room;
+        u.clear();
+        u.extend(f.iter().map(|v| v / length));
         logits.clear();
-        logits.extend(self.alive.iter().map(|&k| dot(&u, &self.unit[k * d..(k + 1) * d]) / tau));
+        logits.extend(self.alive.iter().map(|&k| dot(u, &self.unit[k * d..(k + 1) * d]) / tau));
         let mine: f64 = self.alive.iter().map(|&k| share[k]).sum();
         let positive: f64 = self.alive.iter().zip(&*logits).map(|(&k, l)| share[k] * l).sum();
         let value = mine * log_sum_exp(logits) - positive;
-        let mut sum = vec![0.0; d];
+        sum.clear();
+        sum.resize(d, 0.0);
         for (&k, p) in self.alive.iter().zip(&*logits) {
             // Gradient of the cosine.
             let g = (mine * p - share[k]) / tau;
             let range = k * d..(k + 1) * d;
-            to_directions[range.clone()].iter_mut().zip(&u).for_each(|(t, u)| *t += g * u);
+            to_directions[range.clone()].iter_mut().zip(&*u).for_each(|(t, u)| *t += g * u);
             sum.iter_mut().zip(&self.unit[range]).for_each(|(s, u)| *s += g * u);
         }
-        add_direction_gradient(to_feature, &u, f_length[0], &sum);
+        add_direction_gradient(to_feature, u, length, sum);
         value
     }
 

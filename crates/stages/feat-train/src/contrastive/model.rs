@@ -84,10 +84,7 @@ impl<T: Real> Model<T> {
         let output = activations.features.last().expect("there are layers");
         let moments: Vec<Moments> = match self.options.norm_axis {
             Axis::Channel => channel_moments(output, d, Some(&context.served)),
-            Axis::Gaussian => output
-                .chunks_exact(d)
-                .map(|row| row_moments(&row.iter().map(|v| v.get()).collect::<Vec<_>>()))
-                .collect(),
+            Axis::Gaussian => output.chunks_exact(d).map(row_moments).collect(),
         };
         let hat = output.iter().enumerate().map(|(i, v)| T::of(moments[self.group(i)].apply(v.get()))).collect();
         Propagated { hat, activations, moments }
@@ -247,10 +244,10 @@ impl<T: Real> Model<T> {
             layers: Vec::new(),
         };
         let mut hat_gradient = vec![0.0f64; propagated.hat.len()];
-        for (rows, to_anchors) in parts {
-            step.features.extend(rows);
-            for (a, sum) in to_anchors {
-                hat_gradient[a as usize * d..(a as usize + 1) * d].copy_from_slice(&sum);
+        for part in parts {
+            step.features.extend(part.features);
+            for (&a, sum) in part.anchors.iter().zip(part.to_anchors.chunks_exact(d)) {
+                hat_gradient[a as usize * d..(a as usize + 1) * d].copy_from_slice(sum);
             }
         }
         if !self.layers.is_empty() {
@@ -299,9 +296,13 @@ impl<T: Real> Model<T> {
         columns: Range<usize>,
     ) -> PieceGradients<T> {
         let (d, set, evaluated) = (self.dim, view.set, &view.evaluated);
-        let mut rows = Vec::with_capacity(columns.len() * d);
-        let mut to_anchors: Vec<(u32, Vec<f64>)> = Vec::new();
-        let (mut f, mut g) = (vec![0.0; d], vec![0.0; d]);
+        let mut made = PieceGradients {
+            features: Vec::with_capacity(columns.len() * d),
+            anchors: Vec::new(),
+            to_anchors: Vec::new(),
+        };
+        // No allocation per Gaussian from here: there are many of them, and little work in one.
+        let (mut f, mut g, mut spare) = (vec![0.0; d], vec![0.0; d], vec![0.0; d]);
         for c in columns {
             g.fill(0.0);
             for e in set.start[c] as usize..set.start[c + 1] as usize {
@@ -317,25 +318,30 @@ impl<T: Real> Model<T> {
             }
             if self.options.unit_length == UnitLength::After {
                 let length = self.final_feature(context, propagated, place, &mut f);
-                of_direction(&mut g, &f, length);
+                spare.copy_from_slice(&g);
+                g.fill(0.0);
+                loss::add_direction_gradient(&mut g, &f, length, &spare);
             }
-            let mut own = g.clone();
+            let source = context.source[place];
+            if source != NONE && !propagated.hat.is_empty() {
+                if made.anchors.last() != Some(&source) {
+                    made.anchors.push(source);
+                    made.to_anchors.resize(made.anchors.len() * d, 0.0);
+                }
+                let sum = made.to_anchors.len() - d;
+                made.to_anchors[sum..].iter_mut().zip(&g).for_each(|(s, g)| *s += g);
+            }
             if self.options.unit_length == UnitLength::Before {
                 let feature = &self.features[place * d..(place + 1) * d];
                 f.iter_mut().zip(feature).for_each(|(f, v)| *f = v.get());
                 let length = make_unit(&mut f);
-                of_direction(&mut own, &f, length);
+                spare.copy_from_slice(&g);
+                g.fill(0.0);
+                loss::add_direction_gradient(&mut g, &f, length, &spare);
             }
-            rows.extend(own.iter().map(|&v| T::of(v)));
-            let source = context.source[place];
-            if source != NONE && !propagated.hat.is_empty() {
-                match to_anchors.last_mut() {
-                    Some((a, sum)) if *a == source => sum.iter_mut().zip(&g).for_each(|(s, g)| *s += g),
-                    _ => to_anchors.push((source, g.clone())),
-                }
-            }
+            made.features.extend(g.iter().map(|&v| T::of(v)));
         }
-        (rows, to_anchors)
+        made
     }
 
     /// Gradient of the network's output `[M][d]` from that of its standardised output.
@@ -370,13 +376,6 @@ fn make_unit(v: &mut [f64]) -> f64 {
     length
 }
 
-/// Turns the gradient of a direction `unit` into that of the vector of this `length`.
-fn of_direction(gradient: &mut [f64], unit: &[f64], length: f64) {
-    let of_unit = gradient.to_vec();
-    gradient.fill(0.0);
-    loss::add_direction_gradient(gradient, unit, length, &of_unit);
-}
-
 /// Loss of a view, and what the gradients of its columns are computed from.
 struct View<'a> {
     set: &'a MaskSet,
@@ -387,8 +386,13 @@ struct View<'a> {
     to_columns: Vec<Vec<f64>>,
 }
 
-/// Gradients from one piece of columns: of the columns' features, and, per anchor, of what its Gaussians receive.
-type PieceGradients<T> = (Vec<T>, Vec<(u32, Vec<f64>)>);
+/// Gradients from one piece of columns: of the columns' features `[c][d]`, and, for the anchors `[a]` that they receive from,
+/// of what each gives, `[a][d]`.
+struct PieceGradients<T> {
+    features: Vec<T>,
+    anchors: Vec<u32>,
+    to_anchors: Vec<f64>,
+}
 
 #[cfg(test)]
 mod tests {

@@ -99,10 +99,10 @@ pub fn channel_moments<T: Real>(values: &[T], d: usize, weights: Option<&[u32]>)
 }
 
 /// Moments of one Gaussian's channels.
-pub fn row_moments(row: &[f64]) -> Moments {
-    let pivot = row.first().copied().unwrap_or(0.0);
-    let s1: f64 = row.iter().map(|v| v - pivot).sum();
-    let s2: f64 = row.iter().map(|v| (v - pivot) * (v - pivot)).sum();
+pub fn row_moments<T: Real>(row: &[T]) -> Moments {
+    let pivot = row.first().map_or(0.0, |v| v.get());
+    let s1: f64 = row.iter().map(|v| v.get() - pivot).sum();
+    let s2: f64 = row.iter().map(|v| (v.get() - pivot) * (v.get() - pivot)).sum();
     Moments::from_sums(pivot, s1, s2, row.len() as f64)
 }
 

@@ -3,7 +3,7 @@
 //!
 //! A term gives its value and its gradient of the columns' features `[columns][d]`, and adds that of the centroids `[K][d]`.
 
-use super::loss::{Prototypes, cohesion};
+use super::loss::{self, Prototypes, cohesion};
 use super::masks::MaskSet;
 use crate::options::{Contrastive, Loss};
 use rayon::prelude::*;
@@ -26,14 +26,14 @@ pub fn of_gaussians(
     let total: f64 = set.mask.iter().zip(&set.weight).map(pixels).sum();
     let bounds: Vec<usize> = set.pieces.iter().map(|&c| c as usize).collect();
     sum(&bounds, d, &prototypes, to_centroids, |c, room, sums, to_feature| {
-        let Room { f, share, logits, .. } = room;
+        let Room { f, share, entropy, .. } = room;
         feature(c, f);
         share.fill(0.0);
         let (masks, weights) = set.entries(c);
         for (&k, &w) in masks.iter().zip(weights) {
             share[k as usize] += f64::from(w) * set.pixels[k as usize] / total;
         }
-        prototypes.cross_entropy(f, share, logits, &mut sums.directions, to_feature)
+        prototypes.cross_entropy(f, share, entropy, &mut sums.directions, to_feature)
     })
 }
 
@@ -57,7 +57,7 @@ pub fn of_pixels(
     let bounds: Vec<usize> = (0..drawn.len()).step_by(CHUNK).chain([drawn.len()]).collect();
     let (value, to_pixels) = sum(&bounds, d, &prototypes, to_centroids, |i, room, sums, to_pixel| {
         let p = drawn[i];
-        let Room { f, one, share, logits } = room;
+        let Room { f, one, share, entropy } = room;
         f.fill(0.0);
         for (c, w) in pixels.entries(p) {
             feature(c, one);
@@ -67,7 +67,7 @@ pub fn of_pixels(
         if options.loss == Loss::Pixel {
             share.fill(0.0);
             share[k] = 1.0 / drawn.len() as f64;
-            value += prototypes.cross_entropy(f, share, logits, &mut sums.directions, to_pixel);
+            value += prototypes.cross_entropy(f, share, entropy, &mut sums.directions, to_pixel);
         }
         if options.cohesion > 0.0 {
             let range = k * d..(k + 1) * d;
@@ -85,12 +85,12 @@ pub fn of_pixels(
     (value, to_columns)
 }
 
-/// Room for one point: features, shares in masks, logits.
+/// Room for one point: features, shares in masks.
 struct Room {
     f: Vec<f64>,
     one: Vec<f64>,
     share: Vec<f64>,
-    logits: Vec<f64>,
+    entropy: loss::Room,
 }
 
 /// Gradients of the masks' centroids `[K][d]`: those that come by way of their directions, and the others.
@@ -111,7 +111,8 @@ fn sum(
     let length = centroids.len();
     let empty = || Sums { directions: vec![0.0; length], centroids: vec![0.0; length] };
     let part = |b: &[usize]| {
-        let mut room = Room { f: vec![0.0; d], one: vec![0.0; d], share: vec![0.0; length / d], logits: Vec::new() };
+        let (f, share) = (vec![0.0; d], vec![0.0; length / d]);
+        let mut room = Room { one: f.clone(), f, share, entropy: loss::Room::default() };
         let (mut value, mut sums, mut rows) = (0.0, empty(), vec![0.0; (b[1] - b[0]) * d]);
         for (p, row) in (b[0]..b[1]).zip(rows.chunks_exact_mut(d)) {
             value += term(p, &mut room, &mut sums, row);
