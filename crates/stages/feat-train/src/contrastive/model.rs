@@ -41,6 +41,15 @@ pub struct Propagated<T> {
     moments: Vec<Moments>,
 }
 
+impl<T> Propagated<T> {
+    /// Bytes of all activations.
+    pub fn bytes(&self) -> usize {
+        let Activations { features, sums } = &self.activations;
+        let values = features.iter().chain(sums).chain([&self.hat]).map(Vec::len).sum::<usize>();
+        values * size_of::<T>()
+    }
+}
+
 /// Loss and gradients of one view.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct Step<T> {

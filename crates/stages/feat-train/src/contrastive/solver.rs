@@ -106,11 +106,11 @@ impl<'a> Solver<'a> {
         }
     }
 
-    /// Bytes that the graph network of the engine takes.
-    pub fn network_bytes(&self) -> Option<usize> {
+    /// Bytes that the graph network's activations take; with the engine, also their gradients.
+    pub fn network_bytes(&self) -> usize {
         match self {
-            Self::Fast(engine, _) => Some(engine.network_bytes()),
-            Self::Plain { .. } => None,
+            Self::Fast(engine, _) => engine.network_bytes(),
+            Self::Plain { propagated, .. } => propagated.bytes(),
         }
     }
 }
