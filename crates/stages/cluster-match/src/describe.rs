@@ -5,7 +5,7 @@ use glam::{DMat3, DVec3};
 use std::collections::BTreeMap;
 
 /// Gathers what is known of the instances. `labels` are those of all Gaussians, numbered 0 to K - 1 or -1; `features` are
-/// mask features by view index. Views, tree and nodes are left empty.
+/// mask features by view index. Scores are zero; views, tree and nodes are left empty.
 ///
 /// A descriptor is the mean of the unit features of the masks, at unit length (paper).
 pub fn describe(
@@ -45,12 +45,8 @@ pub fn describe(
     for m in &matches {
         of_instance[m.instance as usize].push(*m);
     }
-    let largest = f64::from(out.count.iter().copied().max().unwrap_or(0).max(1));
     for (k, own) in of_instance.iter().enumerate() {
         out.support[k] = own.len() as u32;
-        // Of two that fit their masks as well, the smaller one is more often a mere part.
-        let size = (f64::from(out.count[k]) / largest).sqrt().sqrt() as f32;
-        out.score[k] = size * own.iter().map(|m| m.score).sum::<f32>() / own.len().max(1) as f32;
         let rows = own.iter().filter_map(|m| unit(features.get(&m.view)?.row(m.mask as usize)?));
         let mut sum = vec![0.0f64; dim];
         rows.for_each(|row| sum.iter_mut().zip(row).for_each(|(s, v)| *s += f64::from(v)));
@@ -142,14 +138,6 @@ mod tests {
         assert!((i.descriptor_of(0)[0] - 0.5f32.sqrt()).abs() < 1e-6);
         assert_eq!(i.descriptor_of(1), [0.0, 0.0]);
         assert_eq!(i.matches[0].view, 0);
-    }
-
-    #[test]
-    fn of_two_that_fit_their_masks_as_well_the_larger_one_ranks_first() {
-        let m = |instance, score| Match { instance, view: 0, mask: 0, score, visible: 1.0 };
-        let labels: Vec<i32> = (0..17).map(|i| i32::from(i == 16)).collect();
-        let i = describe(&[[0.0; 3]; 17], labels, 2, vec![m(0, 0.8), m(1, 0.8)], &BTreeMap::new());
-        assert_eq!(i.score, [0.8, 0.4]);
     }
 
     #[test]

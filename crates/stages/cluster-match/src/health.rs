@@ -1,8 +1,8 @@
 //! What the result says of itself: whether one instance holds too much of the scene, masks contradict each other, or
 //! instances share their masks.
 
-use crate::join::{mask_weights, units};
-use artifacts::{Footprints, Health, Instances, Level, SHARED, SharedMasks};
+use crate::join::units;
+use artifacts::{Footprints, Health, Instances, SHARED, SharedMasks};
 use rayon::prelude::*;
 use stage::Stage;
 use std::collections::{BTreeMap, BTreeSet};
@@ -24,18 +24,16 @@ struct Seen {
     main: Option<u32>,
 }
 
-/// The health of `instances`; `kept` are the original indices of the Gaussians in the footprints.
-pub fn measure(instances: &Instances, footprints: &Footprints, kept: &[u32], levels: &[Level]) -> Health {
+/// The health of `instances`, from the weight of each in the masks (rows of the footprints).
+pub fn measure(instances: &Instances, footprints: &Footprints, weights: &[(u32, BTreeMap<u32, f64>)]) -> Health {
     let labelled: usize = instances.count.iter().map(|&c| c as usize).sum();
     let largest = instances.count.iter().max().map_or(0.0, |&c| f64::from(c) / labelled.max(1) as f64);
-    let labels: Vec<i32> = kept.iter().map(|&i| instances.label[i as usize]).collect();
-    let weights = mask_weights(&labels, footprints, levels);
     let (mut inside, mut all) = (0.0, 0.0);
-    for (_, of) in &weights {
+    for (_, of) in weights {
         inside += of.values().copied().fold(0.0, f64::max);
         all += of.values().sum::<f64>();
     }
-    let mut shared = shared(&seen(&weights, &units(footprints), instances.len()));
+    let mut shared = shared(&seen(weights, &units(footprints), instances.len()));
     // What stands on a shelf is in the shelf's masks.
     let size = |k: u32| f64::from(instances.count[k as usize]);
     shared.retain(|s| {
@@ -124,34 +122,12 @@ fn share(a: &[Seen], b: &[Seen]) -> Option<f64> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use artifacts::{FootprintsBuilder, Row};
-    use gs_io::Provenance;
-
-    /// Footprints of eight Gaussians, of all weight 1, with the masks of each view.
-    fn footprints(views: &[&[&[u32]]]) -> Footprints {
-        let names = (0..views.len()).map(|v| v.to_string()).collect();
-        let mut b = FootprintsBuilder { views: names, kept: (0..8).collect(), ..FootprintsBuilder::default() };
-        for (view, masks) in views.iter().enumerate() {
-            for (mask, gaussians) in masks.iter().enumerate() {
-                let pixels = gaussians.len() as u32;
-                let row = Row { view: view as u32, level: 3, mask: mask as u32, pixels, gated: pixels, alpha: 1.0 };
-                b.push(row, gaussians.iter().map(|&i| (i, 1.0)));
-            }
-        }
-        let dir = tempfile::tempdir().unwrap();
-        let path = dir.path().join("f.safetensors");
-        b.write(&path, Provenance::default()).unwrap();
-        Footprints::read(&path).unwrap()
-    }
-
-    fn instances(label: [i32; 8]) -> Instances {
-        let count = |k| label.iter().filter(|&&l| l == k).count() as u32;
-        let count = (0..=label.into_iter().max().unwrap()).map(count).collect();
-        Instances { label: label.to_vec(), count, ..Instances::default() }
-    }
+    use crate::join::mask_weights;
+    use crate::testing::{footprints, instances};
+    use artifacts::Level;
 
     fn health(instances: &Instances, footprints: &Footprints, level: Level) -> Health {
-        measure(instances, footprints, &(0..8).collect::<Vec<_>>(), &[level])
+        measure(instances, footprints, &mask_weights(&instances.label, footprints, &[level]))
     }
 
     #[test]

@@ -3,8 +3,8 @@
 //! [`options`] is the command line, `run` the story, `inputs` and `outputs` its ends. `group` clusters Gaussians;
 //! `assignment` keeps who belongs to which instance, gives noise and unseen Gaussians to their neighbours, and applies what
 //! the masks say: `vote` corrects rims, `join` joins pieces of one thing. `associate` matches instances with the
-//! masks of each view, `describe` gathers what is known of each instance, `health` says how far masks and instances
-//! agree, `memory` forecasts the peak.
+//! masks of each view, `describe` gathers what is known of each instance, `rank` says how sure it is one whole thing,
+//! `health` how far masks and instances agree, `memory` forecasts the peak.
 
 mod assignment;
 mod associate;
@@ -16,7 +16,10 @@ mod join;
 mod memory;
 pub mod options;
 mod outputs;
+mod rank;
 mod run;
+#[cfg(test)]
+mod testing;
 mod vote;
 
 pub use describe::describe;

@@ -29,18 +29,25 @@ pub(crate) fn claim(a: &Args, stage: &Stage) -> Result<Claim> {
     a.per_instance_plys.iter().fold(outputs, Outputs::folder).claim()
 }
 
-/// Writes everything, the artifact last: where it is new, so is everything beside it. `noise` counts the Gaussians that the
-/// clustering called so.
+/// What the stage found.
+pub(crate) struct Found {
+    pub instances: Instances,
+    pub health: Health,
+    /// Gaussians that the clustering called noise.
+    pub noise: usize,
+    pub clustering_seconds: f64,
+}
+
+/// Writes everything, the artifact last: where it is new, so is everything beside it.
 pub(crate) fn write(
     a: &Args,
     stage: &Stage,
     inputs: &Inputs,
-    instances: &Instances,
+    found: &Found,
     settings: &Settings,
-    noise: usize,
-    clustering_seconds: f64,
     claim: &mut Claim,
 ) -> Result<()> {
+    let Found { instances, health, noise, clustering_seconds } = found;
     let fail = |e: serde_json::Error| Error::new(e.to_string());
     let parameters = serde_json::to_value(settings).map_err(fail)?;
     let own = vec![format!("made by cluster-match {}", env!("CARGO_PKG_VERSION")), format!("parameters {parameters}")];
@@ -48,9 +55,8 @@ pub(crate) fn write(
     let [colors, list, table] = SIDE_FILES.map(|extension| a.out.with_extension(extension));
     ply::write_gaussians(colors, &colored(gaussians, &instances.label), &comments)?;
     gs_io::npy::write_i32(list, &[instances.label.len()], &instances.label)?;
-    let health = health::measure(instances, &inputs.footprints, &inputs.graph.kept, &settings.levels);
-    health::say(&health, stage);
-    let text = as_text(instances, &health, &parameters);
+    health::say(health, stage);
+    let text = as_text(instances, health, &parameters);
     write_bytes(table, &serde_json::to_vec_pretty(&text).map_err(fail)?)?;
     if let Some(folder) = &a.per_instance_plys {
         write_instance_plys(folder, gaussians, instances, &comments)?;

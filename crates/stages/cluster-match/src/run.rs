@@ -5,9 +5,11 @@ use crate::associate::{FeatureTable, matches, overlaps};
 use crate::describe::describe;
 use crate::group::group;
 use crate::inputs::{Inputs, mask_features};
-use crate::memory;
+use crate::join::mask_weights;
 use crate::options::{Args, Noise, Settings};
-use crate::outputs;
+use crate::outputs::{self, Found};
+use crate::rank::confidence;
+use crate::{health, memory};
 use artifacts::{Instances, Level, MaskFeatures, MaskFolder, Match};
 use gs_io::{Error, Result, Watched};
 use gs_raster::RasterOptions;
@@ -73,11 +75,16 @@ impl Program for Args {
             stage.skipped("language descriptors: the masks have no features (*_f.npy; mask-embed embed makes them)");
         }
         let views = inputs.views.iter().map(|v| v.stem().to_string()).collect();
-        let means = &inputs.geometry.gaussians.means;
+        let (means, footprints) = (&inputs.geometry.gaussians.means, &inputs.footprints);
+        let labels: Vec<i32> = inputs.graph.kept.iter().map(|&i| found.labels[i as usize]).collect();
+        let weights = mask_weights(&labels, footprints, &settings.levels);
         let described = describe(means, found.labels, found.instances, matches, &features);
-        let instances = Instances { views, tree: found.tree, node: found.nodes, ..described };
+        let mut instances = Instances { views, tree: found.tree, node: found.nodes, ..described };
+        instances.score = confidence(&instances, footprints, &weights);
+        let health = health::measure(&instances, footprints, &weights);
         watched.check()?;
-        outputs::write(a, stage, &inputs, &instances, &settings, noise, seconds, &mut claim)
+        let found = Found { instances, health, noise, clustering_seconds: seconds };
+        outputs::write(a, stage, &inputs, &found, &settings, &mut claim)
     }
 }
 
