@@ -1,5 +1,6 @@
 //! `footprints.safetensors`: which Gaussians make up which mask.
 
+use crate::Level;
 use crate::ScratchEntries;
 use crate::checks::{below, check, check_kept, column, view_names};
 use gs_io::{Artifact, ArtifactWriter, Error, Provenance, Result};
@@ -21,6 +22,13 @@ pub struct Row {
     pub gated: u32,
     /// Mean accumulated alpha over the mask's pixels.
     pub alpha: f32,
+}
+
+impl Row {
+    /// Whether its mask is of one of the `levels`.
+    pub fn is_of(&self, levels: &[Level]) -> bool {
+        levels.iter().any(|&l| l as u32 == self.level)
+    }
 }
 
 /// The footprints of all masks: a sparse matrix, masks x kept Gaussians, of blending weights summed over gated pixels.

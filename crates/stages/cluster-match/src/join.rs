@@ -79,7 +79,7 @@ pub fn units(footprints: &Footprints) -> Vec<u32> {
 pub fn mask_weights(labels: &[i32], footprints: &Footprints, levels: &[Level]) -> Vec<(u32, BTreeMap<u32, f64>)> {
     (0..footprints.rows.len() as u32)
         .into_par_iter()
-        .filter(|&r| levels.iter().any(|&l| l as u32 == footprints.rows[r as usize].level))
+        .filter(|&r| footprints.rows[r as usize].is_of(levels))
         .map(|r| {
             let (gaussians, weights) = footprints.entries(r as usize);
             let mut of: BTreeMap<u32, f64> = BTreeMap::new();

@@ -228,7 +228,7 @@ fn only_the_masks_of_the_named_levels_are_kept() {
     succeed(&run(&s, &o, &["--levels", "large,small"]));
     let some = footprints();
     let of = |f: &Footprints| -> Vec<(Row, Vec<(u32, f32)>)> {
-        let wanted = |r: &usize| [Level::Small, Level::Large].iter().any(|&l| l as u32 == f.rows[*r].level);
+        let wanted = |r: &usize| f.rows[*r].is_of(&[Level::Small, Level::Large]);
         let entries = |r| f.entries(r).0.iter().copied().zip(f.entries(r).1.iter().copied()).collect();
         (0..f.rows.len()).filter(wanted).map(|r| (f.rows[r], entries(r))).collect()
     };

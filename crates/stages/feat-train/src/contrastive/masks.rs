@@ -56,7 +56,7 @@ pub fn mask_sets(footprints: &Footprints, context: &Context, levels: &[Level], l
         from = all.end;
         let shows = |&r: &usize| footprints.rows[r].gated > 0 && !footprints.entries(r).0.is_empty();
         let rows: Vec<u32> = all.filter(shows).map(|r| r as u32).collect();
-        if levels.iter().any(|&l| l as u32 == first.level) && rows.len() >= least {
+        if first.is_of(levels) && rows.len() >= least {
             if rows.len() > MOST_MASKS {
                 return Err(Error::new("more masks than can be numbered")
                     .file(footprints.artifact().path())

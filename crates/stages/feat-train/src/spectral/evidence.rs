@@ -20,7 +20,7 @@ pub fn collect(footprints: &Footprints, graph: &Graph, levels: &[Level]) -> Matr
     let (start, gaussians, weights) = footprints.csr();
     let range = |r: usize| start[r] as usize..start[r + 1] as usize;
     let masks: Vec<u32> = (0..footprints.rows.len() as u32)
-        .filter(|&r| levels.iter().any(|&l| l as u32 == footprints.rows[r as usize].level))
+        .filter(|&r| footprints.rows[r as usize].is_of(levels))
         .filter(|&r| !range(r as usize).is_empty())
         .collect();
     let columns: Vec<(&[u32], &[f32])> =
@@ -42,7 +42,7 @@ pub fn blocks(graph: &Graph) -> (Vec<u32>, usize) {
 
 /// How many masks at `levels` each of the [`blocks`] will know, but for those that its neighbourhood adds.
 pub fn masks_of_blocks(footprints: &Footprints, (block, count): &(Vec<u32>, usize), levels: &[Level]) -> Vec<usize> {
-    let used = |r: &usize| levels.iter().any(|&l| l as u32 == footprints.rows[*r].level);
+    let used = |r: &usize| footprints.rows[*r].is_of(levels);
     // The last mask that a block was seen to know.
     let (mut last, mut known) = (vec![usize::MAX; *count], vec![0; *count]);
     for r in (0..footprints.rows.len()).filter(used) {
