@@ -32,7 +32,8 @@ impl Program for Args {
             .claim()?;
         let watched = Watched::new([&self.geometry]);
         let inputs = Inputs::read(&self)?;
-        let needed = memory::forecast(&inputs, &self.options);
+        let geometry = std::fs::metadata(&self.geometry).map_or(0, |m| m.len());
+        let needed = memory::forecast(&inputs, &self.options, geometry);
         stage.forecast(needed, "drop small footprint entries: graph-precompute --cut 0.001")?;
 
         let made = match self.options.preset {

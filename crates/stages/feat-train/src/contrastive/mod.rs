@@ -11,7 +11,7 @@ mod alignment;
 pub mod checkpoint;
 mod context;
 mod cross_view;
-mod engine;
+pub mod engine;
 mod loss;
 mod masks;
 mod model;
