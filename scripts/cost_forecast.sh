@@ -19,7 +19,7 @@ awk -v levels="$levels" -v closed="$closed" -v masks="${MAKES_MASKS:+1}" -v core
     instances = 14 * size ^ 0.84 * more ^ 0.89 * larger ^ 0.64
     sam = masks ? 8 * views : 0
     memory = most(megabytes * 2 ^ 20, 19.4e6 + 646 * n + 157 * pixels + 20400 * views)
-    memory = most(memory, closed ? 3.6e6 + 22 * entries + 974 * n : 4.7e6 + 9.5 * entries + 700 * n)
+    memory = most(memory, closed ? 3.6e6 + 22 * entries + 974 * n : 4.7e6 + 20 * entries + 518 * n)
     memory = most(memory, 12.8e6 + 11 * entries + 1415 * n)
     disk = 725 * n + 16 * entries + (masks ? 7.7e6 * views : 0)
     hours = (geometry + graph + features + instances + sam) / 3600
