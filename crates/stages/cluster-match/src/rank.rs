@@ -22,7 +22,8 @@ pub fn confidence(instances: &Instances, footprints: &Footprints, weights: &[(u3
     for (row, of) in weights {
         let (view, size) = (footprints.rows[*row as usize].view, of.values().sum::<f64>());
         for (&k, &w) in of {
-            let shown = seen[&(k, view)];
+            // Nothing is seen of what has no weight.
+            let Some(&shown) = seen.get(&(k, view)) else { continue };
             swallowed[k as usize][view as usize] |= 2.0 * w > shown && size > TIMES * shown;
         }
     }
