@@ -62,6 +62,17 @@ tiny "$work/b" 1 > "$work/b.log" 2>&1 || { cat "$work/b.log"; fail "the pipeline
 same "$work/a" "$work/b" || fail "one and two threads give different bytes"
 pass "one and two threads give the same bytes"
 
+say "== the paper's settings"
+for conf in literal paper; do
+  features="$(sed -n 's/^FEAT_ARGS = //p' "pipelines/$conf.conf") --iterations 50"
+  make --no-print-directory -f pipelines/custom.mk OUT="$work/$conf" THREADS=2 SCENE="$work/a/scene" GEOMETRY="$work/a/geometry.ply" \
+    MASKS="$work/a/scene/language_features" CONF="pipelines/$conf.conf" FEAT_ARGS="$features" > "$work/conf.log" 2>&1 \
+    || { cat "$work/conf.log"; fail "CONF=pipelines/$conf.conf"; }
+  grep -q "\"preset\": *\"$conf\"" "$work/$conf/features.safetensors.run.json" && grep -q '"cluster": *"free"' "$work/$conf/instances.safetensors.run.json" \
+    || fail "CONF=pipelines/$conf.conf is not what its stages ran with"
+done
+pass "literal.conf and paper.conf run"
+
 say "== a changed option"
 feat='--preset literal --iterations 310' tiny "$work/b" 1 > "$work/changed.log" 2>&1
 ran=$(stages_of "$work/changed.log")

@@ -1,5 +1,6 @@
 //! What to run and to measure: a text file of lines, a keyword with a name for most, then fields with `|` between; `#` begins
-//! a comment line.
+//! a comment line. `@FILE` among the options of footprints, features or clustering stands for those that FILE, a `.conf` of the
+//! pipelines beside the plan, gives this stage.
 //!
 //! | line | meaning |
 //! |---|---|
@@ -167,7 +168,13 @@ impl Plan {
     pub fn read(path: impl AsRef<Path>) -> Result<Self> {
         let path = path.as_ref();
         let text = std::fs::read_to_string(path).at("read", path)?;
-        Self::parse(&text).map_err(|e| e.file(path))
+        let folder = path.parent().unwrap_or(Path::new(""));
+        let lines = text
+            .lines()
+            .enumerate()
+            .map(|(i, line)| with_files(line, folder).map_err(|e| e.field(format!("line {}", i + 1))));
+        let lines = lines.collect::<Result<Vec<_>>>().map_err(|e| e.file(path))?;
+        Self::parse(&lines.join("\n")).map_err(|e| e.file(path))
     }
 
     pub fn parse(text: &str) -> Result<Self> {
@@ -304,6 +311,28 @@ impl Plan {
     }
 }
 
+/// Variables of a `.conf` with the options of a stage, by keyword.
+const VARIABLES: [(&str, &str); 3] =
+    [("footprints", "GRAPH_ARGS"), ("features", "FEAT_ARGS"), ("clustering", "CLUSTER_ARGS")];
+
+/// A line with the options of files in `folder` in place of every `@FILE`.
+fn with_files(line: &str, folder: &Path) -> Result<String> {
+    let keyword = line.split(' ').next().unwrap_or("");
+    let Some((_, variable)) = VARIABLES.iter().find(|v| v.0 == keyword) else { return Ok(line.into()) };
+    let word = |word: &str| match word.strip_prefix('@') {
+        Some(file) => {
+            let path = folder.join(file);
+            let text = std::fs::read_to_string(&path).at("read", &path)?;
+            let value = text.lines().filter_map(|l| l.split_once('=')).find(|(name, _)| name.trim() == *variable);
+            let no_line =
+                || Error::new("no options for this stage").file(&path).expected(format!("a line {variable} = …"));
+            Ok(value.ok_or_else(no_line)?.1.trim().to_string())
+        }
+        None => Ok(word.to_string()),
+    };
+    Ok(line.split(' ').map(word).collect::<Result<Vec<_>>>()?.join(" "))
+}
+
 fn scene(name: &str, scene: &str, geometry: &str) -> Scene {
     Scene { name: name.into(), scene: scene.into(), geometry: geometry.into() }
 }
@@ -377,6 +406,23 @@ size views | 8 | --size tiny --views 8 | --iterations 10
         let only = p.clone().only(&["cut".into(), "views".into()]).unwrap();
         assert_eq!((only.tables.len(), only.knobs.len(), only.axes.len(), only.expected.len()), (0, 1, 1, 0));
         assert!(p.only(&["cuts".into()]).unwrap_err().to_string().contains("t, cut, quality, views"));
+    }
+
+    #[test]
+    fn the_options_of_a_stage_may_stand_in_a_file() {
+        let folder = tempfile::tempdir().unwrap();
+        let (conf, plan) = (folder.path().join("paper.conf"), folder.path().join("a.plan"));
+        std::fs::write(&conf, "# FEAT_ARGS = no\nGRAPH_ARGS = --levels large\nFEAT_ARGS = --preset paper\n").unwrap();
+        std::fs::write(&plan, TEXT.replace("gated | --preset paper", "gated | @paper.conf --layers 0")).unwrap();
+        assert_eq!(Plan::read(&plan).unwrap().options_of("features", "paper"), "--preset paper --layers 0");
+        for (from, to, said) in [
+            ("| --cluster free", "| @paper.conf", "CLUSTER_ARGS"),
+            ("| --pixel-samples 16", "| @none.conf", "none.conf"),
+        ] {
+            std::fs::write(&plan, TEXT.replace(from, to)).unwrap();
+            let e = Plan::read(&plan).unwrap_err().to_string();
+            assert!(e.contains(said) && e.contains("line "), "{e}");
+        }
     }
 
     #[test]
