@@ -82,11 +82,11 @@ pub fn run(inputs: &Inputs, out: &Path, stage: &Stage) -> Result<()> {
     let kept: Vec<i32> = world.footprints.kept.iter().map(|&i| world.truth[i as usize]).collect();
     let mut all = Vec::new();
     for (name, levels) in sets {
-        let masks = mask_weights(&kept, &world.footprints, &levels);
+        let masks = mask_weights(&kept, &world.footprints, &levels)?;
         if masks.is_empty() && !levels.is_empty() {
             continue;
         }
-        let labels = if levels.is_empty() { world.truth.clone() } else { world.grouped(&masks) };
+        let labels = if levels.is_empty() { world.truth.clone() } else { world.grouped(&masks)? };
         let parameters = json!({"command": "ceilings", "ceiling": name});
         let provenance = stage.provenance(Instances::FORMAT, 1, parameters, world.hashes.clone());
         let path = file(&name);
@@ -123,7 +123,7 @@ impl World {
 
     /// Labels by ideal grouping: every mask is given the thing that holds most of its weight, and every Gaussian takes the
     /// thing with most weight in its masks; of equals the first. -1 for Gaussians in no mask.
-    fn grouped(&self, masks: &[Mask]) -> Vec<i32> {
+    fn grouped(&self, masks: &[Mask]) -> Result<Vec<i32>> {
         let mut of_thing = BTreeMap::<u32, Vec<u32>>::new();
         let some = masks.iter().filter(|(_, of)| !of.is_empty());
         some.for_each(|(row, of)| of_thing.entry(main_thing(of).0).or_default().push(*row));
@@ -132,8 +132,7 @@ impl World {
         for (thing, rows) in of_thing {
             let mut weight = vec![0.0f64; best.len()];
             for row in rows {
-                let (gaussians, weights) = self.footprints.entries(row as usize);
-                gaussians.iter().zip(weights).for_each(|(&i, &w)| weight[i as usize] += f64::from(w));
+                self.footprints.entries(row as usize)?.iter().for_each(|(i, w)| weight[i as usize] += f64::from(w));
             }
             for (i, (best, weight)) in best.iter_mut().zip(weight).enumerate() {
                 if weight > *best {
@@ -142,7 +141,7 @@ impl World {
                 }
             }
         }
-        labels
+        Ok(labels)
     }
 
     /// Instances of these labels, without masks, language or tree, ranked by how well they fit.

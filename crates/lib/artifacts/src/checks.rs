@@ -18,11 +18,24 @@ pub(crate) fn check<T: Copy + Display>(
     wrong: &str,
     expected: impl Fn(usize) -> String,
 ) -> Result<()> {
+    check_part(a, name, 0, values, good, wrong, expected)
+}
+
+/// [`check`] of some values, of which the first is the tensor's value `first`.
+pub(crate) fn check_part<T: Copy + Display>(
+    a: &Artifact,
+    name: &str,
+    first: usize,
+    values: &[T],
+    good: impl Fn(usize, T) -> bool,
+    wrong: &str,
+    expected: impl Fn(usize) -> String,
+) -> Result<()> {
     match (0..values.len()).find(|&i| !good(i, values[i])) {
         None => Ok(()),
         Some(at) => Err(Error::new(wrong)
             .file(a.path())
-            .field(format!("{name}[{at}]"))
+            .field(format!("{name}[{}]", first + at))
             .found(values[at])
             .expected(expected(at))
             .hint("run the stage that makes it again")),
@@ -31,7 +44,13 @@ pub(crate) fn check<T: Copy + Display>(
 
 /// Checks that every index of tensor `name` is below `limit`.
 pub(crate) fn below(a: &Artifact, name: &str, indices: &[u32], limit: usize) -> Result<()> {
-    check(a, name, indices, |_, i| (i as usize) < limit, "index out of range", |_| format!("below {limit}"))
+    below_part(a, name, 0, indices, limit)
+}
+
+/// [`below`] of some values, of which the first is the tensor's value `first`.
+pub(crate) fn below_part(a: &Artifact, name: &str, first: usize, indices: &[u32], limit: usize) -> Result<()> {
+    let expected = |_| format!("below {limit}");
+    check_part(a, name, first, indices, |_, i| (i as usize) < limit, "index out of range", expected)
 }
 
 /// Checks that `kept` ascends and stays below `total` (where known: `usize::MAX` otherwise).

@@ -2,7 +2,7 @@
 
 use crate::Level;
 use crate::ScratchEntries;
-use crate::checks::{below, check, check_kept, column, view_names};
+use crate::checks::{below, below_part, check, check_kept, check_part, column, view_names};
 use gs_io::{Artifact, ArtifactWriter, Error, Provenance, Result};
 use serde_json::json;
 use std::path::Path;
@@ -32,7 +32,8 @@ impl Row {
 }
 
 /// The footprints of all masks: a sparse matrix, masks x kept Gaussians, of blending weights summed over gated pixels.
-/// `weight / gated` is the matrix A of docs/method.md, with centroids c = A f.
+/// `weight / gated` is the matrix A of docs/method.md, with centroids c = A f. Its entries, which may be more than fit into
+/// memory, stay in the file.
 #[derive(Debug)]
 pub struct Footprints {
     /// Names of the views (file stems).
@@ -45,6 +46,29 @@ pub struct Footprints {
     pub pixels: PixelSamples,
     row_ptr: Vec<u64>,
     artifact: Artifact,
+}
+
+/// Entries of a mask: positions in `kept`, ascending, and summed weights.
+#[derive(Debug, Clone, Default, PartialEq)]
+pub struct Entries {
+    /// Positions in [`Footprints::kept`].
+    pub gaussians: Vec<u32>,
+    /// Blending weight of each, summed over the mask's gated pixels.
+    pub weights: Vec<f32>,
+}
+
+impl Entries {
+    /// Gaussians with their weights.
+    pub fn iter(&self) -> impl Iterator<Item = (u32, f32)> + '_ {
+        self.gaussians.iter().copied().zip(self.weights.iter().copied())
+    }
+
+    /// Those of Gaussians in `range`.
+    pub fn within(&self, range: std::ops::Range<u32>) -> impl Iterator<Item = (u32, f32)> + '_ {
+        let from = self.gaussians.partition_point(|&i| i < range.start);
+        let to = from + self.gaussians[from..].partition_point(|&i| i < range.end);
+        self.gaussians[from..to].iter().copied().zip(self.weights[from..to].iter().copied())
+    }
 }
 
 /// Single pixels of masks: a sparse matrix, pixels x kept Gaussians, of blending weights.
@@ -72,7 +96,7 @@ impl PixelSamples {
         below(a, "pixel_row", &row, rows)?;
         below(a, "pixel_col", &col, kept)?;
         check_pointers(a, "pixel_ptr", &ptr, col.len())?;
-        check_weights(a, "pixel_weight", &weight)?;
+        check_weights(a, "pixel_weight", 0, &weight)?;
         let expected = |at: usize| format!("{} or more", row[at - 1]);
         check(a, "pixel_row", &row, |at, r| at == 0 || row[at - 1] <= r, "does not ascend", expected)?;
         Ok(Self { row, ptr, col, weight })
@@ -100,8 +124,8 @@ fn check_pointers(a: &Artifact, name: &str, ptr: &[u64], entries: usize) -> Resu
     Ok(())
 }
 
-fn check_weights(a: &Artifact, name: &str, weight: &[f32]) -> Result<()> {
-    check(a, name, weight, |_, w| w.is_finite() && w >= 0.0, "not a weight", |_| "0 or more".into())
+fn check_weights(a: &Artifact, name: &str, first: usize, weight: &[f32]) -> Result<()> {
+    check_part(a, name, first, weight, |_, w| w.is_finite() && w >= 0.0, "not a weight", |_| "0 or more".into())
 }
 
 /// Footprints while they are computed.
@@ -185,12 +209,15 @@ impl Footprints {
     pub const FORMAT: &str = "footprints";
     const VERSION: u32 = 1;
 
-    /// Opens and checks the artifact; columns and weights are not copied.
+    /// Entries that are read at a time, about.
+    const MOST: usize = 1 << 22;
+
+    /// Opens and checks the artifact; its entries stay in the file.
     ///
     /// # Errors
     /// When the file is damaged, tensors do not fit together, or an index is out of range.
     pub fn read(path: impl AsRef<Path>) -> Result<Self> {
-        let a = Artifact::open(path, Self::FORMAT, Self::VERSION)?;
+        let a = Artifact::open_leaving(path, Self::FORMAT, Self::VERSION, &["col", "weight"])?;
         let kept = a.tensor::<u32>("kept", &[None])?.to_vec();
         check_kept(&a, &kept, usize::MAX)?;
         let views = view_names(&a)?;
@@ -207,27 +234,68 @@ impl Footprints {
         below(&a, "row_view", view, views.len())?;
         below(&a, "row_level", level, crate::LEVELS)?;
         let row_ptr = a.tensor::<u64>("row_ptr", &[Some(r + 1)])?.to_vec();
-        let col = a.tensor::<u32>("col", &[None])?;
-        let weight = a.tensor::<f32>("weight", &[Some(col.len())])?;
-        check_pointers(&a, "row_ptr", &row_ptr, col.len())?;
-        below(&a, "col", col, kept.len())?;
-        check_weights(&a, "weight", weight)?;
+        let count = a.count::<u32>("col")?;
+        if a.count::<f32>("weight")? != count {
+            return Err(Error::new("not one weight for each column").file(a.path()).field("weight"));
+        }
+        check_pointers(&a, "row_ptr", &row_ptr, count)?;
+        for from in (0..count).step_by(Self::MOST) {
+            let some = from..count.min(from + Self::MOST);
+            below_part(&a, "col", from, &a.read::<u32>("col", some.clone())?, kept.len())?;
+            check_weights(&a, "weight", from, &a.read::<f32>("weight", some)?)?;
+        }
         let pixels = PixelSamples::read(&a, r, kept.len())?;
         Ok(Self { views, kept, rows, pixels, row_ptr, artifact: a })
     }
 
-    /// Entries of row `r`: positions in `kept` (ascending) and summed weights.
-    pub fn entries(&self, r: usize) -> (&[u32], &[f32]) {
-        let (ptr, col, weight) = self.csr();
-        let range = ptr[r] as usize..ptr[r + 1] as usize;
-        (&col[range.clone()], &weight[range])
+    /// Number of entries of row `r`.
+    pub fn entries_of(&self, r: usize) -> usize {
+        (self.row_ptr[r + 1] - self.row_ptr[r]) as usize
     }
 
-    /// All column indices and weights with the row pointers: a CSR matrix.
-    pub fn csr(&self) -> (&[u64], &[u32], &[f32]) {
-        let col = self.artifact.tensor("col", &[None]).expect("checked on opening");
-        let weight = self.artifact.tensor("weight", &[None]).expect("checked on opening");
-        (&self.row_ptr, col, weight)
+    /// Number of all entries.
+    pub fn total(&self) -> u64 {
+        self.row_ptr[self.rows.len()]
+    }
+
+    /// Reads the entries of row `r`.
+    ///
+    /// # Errors
+    /// When the file can't be read, or was changed so that a Gaussian is out of range or a weight is not finite.
+    pub fn entries(&self, r: usize) -> Result<Entries> {
+        let range = self.row_ptr[r] as usize..self.row_ptr[r + 1] as usize;
+        let gaussians: Vec<u32> = self.artifact.read("col", range.clone())?;
+        let weights: Vec<f32> = self.artifact.read("weight", range)?;
+        let good = gaussians.iter().all(|&i| (i as usize) < self.kept.len()) && weights.iter().all(|w| w.is_finite());
+        if !good || !gaussians.is_sorted() {
+            return Err(Error::new("the file was changed while it was read")
+                .file(self.artifact.path())
+                .hint("run the stage again when nothing writes into its inputs"));
+        }
+        Ok(Entries { gaussians, weights })
+    }
+
+    /// Hands the entries of `rows` on, in their order and in batches: a batch is of as many rows as memory for a few million
+    /// entries takes.
+    ///
+    /// # Errors
+    /// Those of [`Footprints::entries`].
+    pub fn in_batches(&self, rows: &[u32], mut take: impl FnMut(&[u32], &[Entries])) -> Result<()> {
+        let mut from = 0;
+        while from < rows.len() {
+            let mut left = Self::MOST;
+            let fits = |&&r: &&u32| {
+                let count = self.entries_of(r as usize);
+                let fits = count <= left;
+                left = left.saturating_sub(count);
+                fits
+            };
+            let count = rows[from..].iter().take_while(fits).count().max(1);
+            let batch = &rows[from..from + count];
+            take(batch, &batch.iter().map(|&r| self.entries(r as usize)).collect::<Result<Vec<_>>>()?);
+            from += count;
+        }
+        Ok(())
     }
 
     /// The file behind.
@@ -252,8 +320,16 @@ mod tests {
         b.write(&p, Provenance::default()).unwrap();
         let f = Footprints::read(&p).unwrap();
         assert_eq!(f.rows, b.rows);
-        assert_eq!(f.entries(0), (&[0u32, 2][..], &[1.0f32, 2.0][..]));
-        assert_eq!(f.entries(1), (&[1u32][..], &[3.0f32][..]));
+        assert_eq!(f.entries(0).unwrap(), Entries { gaussians: vec![0, 2], weights: vec![1.0, 2.0] });
+        assert_eq!(f.entries(1).unwrap().within(1..2).collect::<Vec<_>>(), [(1, 3.0)]);
+        let mut batches = Vec::new();
+        f.in_batches(&[1, 0], |rows, entries| batches.push((rows.to_vec(), entries.to_vec()))).unwrap();
+        assert_eq!(batches, [(vec![1, 0], vec![f.entries(1).unwrap(), f.entries(0).unwrap()])]);
+        // Whoever changes the file meanwhile is told.
+        let bytes = std::fs::read(&p).unwrap();
+        std::fs::write(&p, vec![255; bytes.len()]).unwrap();
+        assert!(f.entries(0).unwrap_err().to_string().contains("was changed while it was read"));
+        std::fs::write(&p, &bytes).unwrap();
         assert!(f.pixels.is_empty());
         // From scratch files, under other numbers at first: the same bytes.
         let mut scratch = ScratchEntries::beside(&p).unwrap();

@@ -18,7 +18,7 @@ mod scratch;
 mod truth;
 
 pub use features::Features;
-pub use footprints::{Footprints, FootprintsBuilder, PixelSamples, Row};
+pub use footprints::{Entries, Footprints, FootprintsBuilder, PixelSamples, Row};
 pub use graph::Graph;
 pub use health::{Finding, Health, SHARED, SharedMasks};
 pub use instances::{Family, Instances, Match, OrientedBox, TreeEdge};
@@ -29,7 +29,7 @@ pub use masks::{
 };
 pub use nyu40::NYU40;
 pub use palette::{NOISE_COLOR, instance_color};
-pub use scratch::ScratchEntries;
+pub use scratch::{Scratch, ScratchEntries};
 pub use truth::{MaskTruth, TrueObject, TruePart, TruePoints, TrueScene};
 
 /// Roles under which artifacts record the hashes of their inputs.

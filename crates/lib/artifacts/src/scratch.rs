@@ -1,15 +1,72 @@
-//! Entries of footprints on disk while they are computed.
+//! What is too large for memory, in files without a name that go with the process.
 
+use bytemuck::Pod;
 use gs_io::{IoContext, Result};
 use std::fs::File;
 use std::io::{BufWriter, Read, Seek, SeekFrom, Write};
 use std::path::{Path, PathBuf};
+use std::sync::{Mutex, PoisonError};
 
 const READ: &str = "read a scratch file in";
 const WRITE: &str = "write a scratch file in";
 
-/// Entries of footprints in scratch files without a name, so that no more than one view's are in memory while they are
-/// computed. The files go with the process.
+/// A scratch file in the folder in which `output` will lie, and this folder.
+fn file_beside(output: &Path) -> Result<(File, PathBuf)> {
+    let folder = match output.parent() {
+        Some(p) if !p.as_os_str().is_empty() => p.to_path_buf(),
+        _ => PathBuf::from("."),
+    };
+    gs_io::create_dir(&folder)?;
+    Ok((tempfile::tempfile_in(&folder).at("create a scratch file in", &folder)?, folder))
+}
+
+/// Values in a scratch file: written once, read often, by several threads.
+#[derive(Debug)]
+pub struct Scratch {
+    file: Mutex<File>,
+    length: u64,
+    folder: PathBuf,
+}
+
+impl Scratch {
+    /// An empty one in the folder in which `output` will lie.
+    ///
+    /// # Errors
+    /// When it cannot be made there.
+    pub fn beside(output: &Path) -> Result<Self> {
+        let (file, folder) = file_beside(output)?;
+        Ok(Self { file: Mutex::new(file), length: 0, folder })
+    }
+
+    /// Adds values. Returns where they lie.
+    ///
+    /// # Errors
+    /// When the disk is full.
+    pub fn push<T: Pod>(&mut self, values: &[T]) -> Result<u64> {
+        let at = self.length;
+        let bytes: &[u8] = bytemuck::cast_slice(values);
+        let file = self.file.get_mut().unwrap_or_else(PoisonError::into_inner);
+        file.seek(SeekFrom::Start(at)).at(WRITE, &self.folder)?;
+        file.write_all(bytes).at(WRITE, &self.folder)?;
+        self.length += bytes.len() as u64;
+        Ok(at)
+    }
+
+    /// The `count` values that lie at `at`.
+    ///
+    /// # Errors
+    /// When the disk fails.
+    pub fn read<T: Pod>(&self, at: u64, count: usize) -> Result<Vec<T>> {
+        let mut out = vec![T::zeroed(); count];
+        let mut file = self.file.lock().unwrap_or_else(PoisonError::into_inner);
+        file.seek(SeekFrom::Start(at)).at(READ, &self.folder)?;
+        file.read_exact(bytemuck::cast_slice_mut(&mut out)).at(READ, &self.folder)?;
+        Ok(out)
+    }
+}
+
+/// Entries of footprints in scratch files, so that no more than one view's are in memory while they are
+/// computed.
 #[derive(Debug)]
 pub struct ScratchEntries {
     col: BufWriter<File>,
@@ -28,13 +85,8 @@ impl ScratchEntries {
     /// # Errors
     /// When they cannot be made there.
     pub fn beside(output: &Path) -> Result<Self> {
-        let folder = match output.parent() {
-            Some(p) if !p.as_os_str().is_empty() => p.to_path_buf(),
-            _ => PathBuf::from("."),
-        };
-        gs_io::create_dir(&folder)?;
-        let file = || tempfile::tempfile_in(&folder).at("create a scratch file in", &folder).map(BufWriter::new);
-        Ok(Self { col: file()?, weight: file()?, count: 0, folder })
+        let ((col, folder), (weight, _)) = (file_beside(output)?, file_beside(output)?);
+        Ok(Self { col: BufWriter::new(col), weight: BufWriter::new(weight), count: 0, folder })
     }
 
     /// Adds an entry.

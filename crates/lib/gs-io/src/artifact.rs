@@ -8,15 +8,21 @@
 //! The first entry of that JSON is a checksum of the whole file, so that a flipped bit anywhere in it is noticed when it is
 //! read, not taken for a feature: the BLAKE3 hash of the file with 64 zeros in the place of the checksum's digits.
 
-use crate::{Error, IoContext, Result, hash_bytes, write_atomic};
-use safetensors::tensor::{Dtype, Metadata, SafeTensors, TensorInfo};
+use crate::{Error, IoContext, Result, write_atomic};
+use safetensors::tensor::{Dtype, Metadata, TensorInfo};
 use serde::{Deserialize, Serialize};
 use std::collections::{BTreeMap, HashMap};
 use std::fs::File;
 use std::io::{Read, Seek, SeekFrom};
 use std::path::{Path, PathBuf};
+use std::sync::Mutex;
 
 const KEY: &str = "cags";
+
+/// Longest header in bytes: safetensors' own bound.
+const MOST_HEADER: u64 = 100_000_000;
+/// Bytes that are read at a time of a tensor that is left in the file.
+const PIECE: usize = 1 << 20;
 
 /// What the checksum is made over in its own place: it is the BLAKE3 hash of the file with these 64 zeros.
 const NO_CHECKSUM: &str = "0000000000000000000000000000000000000000000000000000000000000000";
@@ -172,50 +178,48 @@ impl<'a> ArtifactWriter<'a> {
 }
 
 /// An artifact, read and checked. It is held in memory, not mapped: a program that writes into the file or cuts it short
-/// while a stage works on it would change numbers that were checked, or end the stage by a signal.
+/// while a stage works on it would change numbers that were checked, or end the stage by a signal. Large tensors may be left
+/// in the file, to be read in parts.
 #[derive(Debug)]
 pub struct Artifact {
     path: PathBuf,
-    /// The file, in words so that its tensors are aligned; the last may be longer than the file.
-    words: Vec<u64>,
-    length: usize,
-    /// Where the tensors' bytes begin, and where among them each lies.
-    data: usize,
-    tensors: BTreeMap<String, TensorInfo>,
+    tensors: BTreeMap<String, Tensor>,
     provenance: Provenance,
     hash: String,
+    file: Mutex<File>,
+}
+
+#[derive(Debug)]
+struct Tensor {
+    dtype: Dtype,
+    shape: Vec<usize>,
+    /// Where its bytes lie in the file.
+    bytes: std::ops::Range<u64>,
+    /// Its bytes, in words so that they are aligned; the last may be longer. None where they were left in the file.
+    words: Option<Vec<u64>>,
 }
 
 impl Artifact {
     /// Opens `path` and checks that it is an artifact of this `format` and `version`.
     pub fn open(path: impl AsRef<Path>, format: &str, version: u32) -> Result<Self> {
+        Self::open_leaving(path, format, version, &[])
+    }
+
+    /// [`Artifact::open`], but the tensors `left` are only checked, and stay in the file: [`Artifact::read`] reads them in parts.
+    pub fn open_leaving(path: impl AsRef<Path>, format: &str, version: u32, left: &[&str]) -> Result<Self> {
         let path = path.as_ref();
         let mut file = File::open(path).at("open", path)?;
-        let length = file.metadata().at("read", path)?.len() as usize;
+        let length = file.metadata().at("read", path)?.len();
         if length == 0 {
             return Err(Error::new("the file is empty").file(path).hint("run the stage that makes it again"));
         }
-        let mut words = vec![0u64; length.div_ceil(8)];
-        file.read_exact(&mut bytemuck::cast_slice_mut(&mut words)[..length]).at("read", path)?;
-        Self::parse(path, words, length, format, version)
-    }
-
-    fn parse(path: &Path, words: Vec<u64>, length: usize, format: &str, version: u32) -> Result<Self> {
-        let bytes: &[u8] = &bytemuck::cast_slice(&words)[..length];
         let damaged = |e: &dyn std::fmt::Display| {
             Error::new(format!("not a safetensors artifact: {e}")).file(path).hint("run the stage that makes it again")
         };
-        let (header, metadata) = SafeTensors::read_metadata(bytes).map_err(|e| damaged(&e))?;
-        SafeTensors::deserialize(bytes).map_err(|e| damaged(&e))?;
-        let tensors: BTreeMap<String, TensorInfo> =
-            metadata.tensors().into_iter().map(|(name, info)| (name, info.clone())).collect();
-        // A tensor without elements takes no room whatever its other extents say; nothing real is wider than this.
-        let widest = length.max(1 << 16);
-        for (name, tensor) in &tensors {
-            if tensor.shape.iter().any(|&extent| extent > widest) {
-                return Err(damaged(&"an extent is out of proportion to the file").field(name));
-            }
-        }
+        let header = header_of(&mut file).map_err(|e| damaged(&e))?;
+        let metadata: Metadata = serde_json::from_slice(&header[8..]).map_err(|e| damaged(&e))?;
+        let tensors =
+            layout(&metadata, header.len() as u64, length).map_err(|(name, why)| damaged(&why).field(name))?;
         let json = metadata.metadata().as_ref().and_then(|m| m.get(KEY)).ok_or_else(|| {
             Error::new("no provenance: not written by this program").file(path).field(format!("__metadata__.{KEY}"))
         })?;
@@ -228,19 +232,41 @@ impl Artifact {
                 .expected(format!("{format} version {version}"))
                 .hint("check the order of the arguments, or run the stage that makes it again"));
         }
-        let at = checksum_at(&bytes[..8 + header]).ok_or_else(|| damaged(&"it has no checksum"))?;
-        if checksum(bytes, &at).as_bytes() != &bytes[at] {
+        let at = checksum_at(&header).ok_or_else(|| damaged(&"it has no checksum"))?;
+        let (mut whole, mut zeroed) = (blake3::Hasher::new(), blake3::Hasher::new());
+        whole.update(&header);
+        zeroed.update(&header[..at.start]).update(NO_CHECKSUM.as_bytes()).update(&header[at.end..]);
+        let mut take = |bytes: &[u8]| {
+            whole.update(bytes);
+            zeroed.update(bytes);
+        };
+        let mut read = BTreeMap::new();
+        for (name, mut tensor) in tensors {
+            let count = (tensor.bytes.end - tensor.bytes.start) as usize;
+            if left.contains(&name.as_str()) {
+                let mut piece = vec![0u8; count.min(PIECE)];
+                for from in (0..count).step_by(PIECE) {
+                    let piece = &mut piece[..PIECE.min(count - from)];
+                    file.read_exact(piece).at("read", path)?;
+                    take(piece);
+                }
+            } else {
+                let mut words = vec![0u64; count.div_ceil(8)];
+                let bytes = &mut bytemuck::cast_slice_mut(&mut words)[..count];
+                file.read_exact(bytes).at("read", path)?;
+                take(bytes);
+                tensor.words = Some(words);
+            }
+            read.insert(name, tensor);
+        }
+        if zeroed.finalize().to_hex().as_bytes() != &header[at] {
             return Err(Error::new("the file is damaged: its content does not have its checksum")
                 .file(path)
                 .field("checksum")
                 .hint("copy it again, or delete it and run the stage that makes it"));
         }
-        let hash = hash_bytes(bytes);
-        Ok(Self { path: path.to_path_buf(), words, length, data: 8 + header, tensors, provenance, hash })
-    }
-
-    fn bytes(&self) -> &[u8] {
-        &bytemuck::cast_slice(&self.words)[..self.length]
+        let hash = whole.finalize().to_hex().to_string();
+        Ok(Self { path: path.to_path_buf(), tensors: read, provenance, hash, file: Mutex::new(file) })
     }
 
     /// What the artifact says of itself.
@@ -263,26 +289,58 @@ impl Artifact {
         self.tensors.contains_key(name)
     }
 
-    /// The tensor `name`, without a copy. `shape` gives the expected extents, `None` where any will do.
-    pub fn tensor<T: Element>(&self, name: &str, shape: &[Option<usize>]) -> Result<&[T]> {
-        let fail = |what: &str| Error::new(what).file(&self.path).field(name).hint("run the stage that makes it again");
-        let info = self.tensors.get(name).ok_or_else(|| fail("missing tensor"))?;
+    fn expect<T: Element>(&self, name: &str, shape: &[Option<usize>]) -> Result<&Tensor> {
+        let tensor = self.tensors.get(name).ok_or_else(|| self.fail("missing tensor", name))?;
         let fits =
-            info.shape.len() == shape.len() && info.shape.iter().zip(shape).all(|(&s, e)| e.is_none_or(|e| e == s));
-        if info.dtype != T::DTYPE || !fits {
+            tensor.shape.len() == shape.len() && tensor.shape.iter().zip(shape).all(|(&s, e)| e.is_none_or(|e| e == s));
+        if tensor.dtype != T::DTYPE || !fits {
             let want: Vec<String> = shape.iter().map(|e| e.map_or("any".into(), |e| e.to_string())).collect();
-            return Err(fail("another tensor than expected")
-                .found(format!("{:?} {:?}", info.dtype, info.shape))
+            return Err(self
+                .fail("another tensor than expected", name)
+                .found(format!("{:?} {:?}", tensor.dtype, tensor.shape))
                 .expected(format!("{:?} [{}]", T::DTYPE, want.join(", "))));
         }
-        let (start, end) = info.data_offsets;
-        bytemuck::try_cast_slice(&self.bytes()[self.data + start..self.data + end])
-            .map_err(|_| fail("the tensor's data is not aligned"))
+        Ok(tensor)
+    }
+
+    fn fail(&self, what: &str, name: &str) -> Error {
+        Error::new(what).file(&self.path).field(name).hint("run the stage that makes it again")
+    }
+
+    /// The tensor `name`, without a copy. `shape` gives the expected extents, `None` where any will do.
+    ///
+    /// # Panics
+    /// When it was left in the file.
+    pub fn tensor<T: Element>(&self, name: &str, shape: &[Option<usize>]) -> Result<&[T]> {
+        let tensor = self.expect::<T>(name, shape)?;
+        let words = tensor.words.as_ref().expect("not left in the file");
+        Ok(&bytemuck::cast_slice(words)[..tensor.shape.iter().product()])
+    }
+
+    /// Number of values of `name`, of one axis, left in the file or not.
+    pub fn count<T: Element>(&self, name: &str) -> Result<usize> {
+        Ok(self.expect::<T>(name, &[None])?.shape[0])
+    }
+
+    /// Some values of `name`, of one axis, from the file. They were checked when it was opened, but not now: somebody may have
+    /// written into the file since.
+    ///
+    /// # Errors
+    /// When the file can no longer be read.
+    pub fn read<T: Element>(&self, name: &str, values: std::ops::Range<usize>) -> Result<Vec<T>> {
+        let tensor = self.expect::<T>(name, &[None])?;
+        assert!(values.end <= tensor.shape[0], "values {values:?} of {name}");
+        let mut out = vec![T::zeroed(); values.len()];
+        let mut file = self.file.lock().unwrap_or_else(std::sync::PoisonError::into_inner);
+        let from = tensor.bytes.start + (values.start * size_of::<T>()) as u64;
+        file.seek(SeekFrom::Start(from)).at("read", &self.path)?;
+        file.read_exact(bytemuck::cast_slice_mut(&mut out)).at("read", &self.path)?;
+        Ok(out)
     }
 
     /// The shape of tensor `name`, if there is one.
     pub fn shape(&self, name: &str) -> Option<Vec<usize>> {
-        self.tensors.get(name).map(|info| info.shape.clone())
+        self.tensors.get(name).map(|tensor| tensor.shape.clone())
     }
 
     /// Checks that this artifact was made from the input of the given role with this hash.
@@ -299,16 +357,50 @@ impl Artifact {
     }
 }
 
+/// The length of the header as 8 bytes, and the header.
+fn header_of(file: &mut File) -> std::io::Result<Vec<u8>> {
+    let mut header = vec![0; 8];
+    file.read_exact(&mut header)?;
+    let length = u64::from_le_bytes(header[..].try_into().expect("8 bytes"));
+    if length > MOST_HEADER || file.take(length).read_to_end(&mut header)? as u64 != length {
+        return Err(std::io::Error::other("the header is longer than the file"));
+    }
+    Ok(header)
+}
+
+/// The tensors in the order of their bytes, which must fill the file from `start` to `length`; else the one at fault, and why.
+fn layout(
+    metadata: &Metadata,
+    start: u64,
+    length: u64,
+) -> std::result::Result<Vec<(String, Tensor)>, (String, String)> {
+    // A tensor without elements takes no room whatever its other extents say; nothing real is wider than this.
+    let widest = length.max(1 << 16);
+    let mut out = Vec::new();
+    let mut at = start;
+    for name in metadata.offset_keys() {
+        let info = metadata.info(&name).expect("a name of its own");
+        let wrong = |why: &str| (name.clone(), why.to_string());
+        if info.shape.iter().any(|&extent| extent as u64 > widest) {
+            return Err(wrong("an extent is out of proportion to the file"));
+        }
+        let count = info.shape.iter().try_fold(info.dtype.bitsize() as u64 / 8, |n, &e| n.checked_mul(e as u64));
+        let (from, to) = info.data_offsets;
+        let end = count.and_then(|n| at.checked_add(n)).filter(|end| *end <= length);
+        let end = end.ok_or_else(|| wrong("its extents exceed the file"))?;
+        if [from, to].map(|offset| start.checked_add(offset as u64)) != [Some(at), Some(end)] {
+            return Err(wrong("its bytes are not where they should be"));
+        }
+        out.push((name, Tensor { dtype: info.dtype, shape: info.shape.clone(), bytes: at..end, words: None }));
+        at = end;
+    }
+    if at == length { Ok(out) } else { Err(("length".into(), "the file does not end with its last tensor".into())) }
+}
+
 /// The format of the artifact at `path`, by its header alone; None where it is not an artifact.
 pub(crate) fn format_of(path: &Path) -> Option<String> {
-    let mut file = File::open(path).ok()?;
-    let mut length = [0; 8];
-    file.read_exact(&mut length).ok()?;
-    let length = u64::from_le_bytes(length);
-    let mut header = Vec::new();
-    // safetensors' own bound.
-    (&mut file).take(length.min(100_000_000)).read_to_end(&mut header).ok()?;
-    let metadata: Metadata = serde_json::from_slice(&header).ok()?;
+    let header = header_of(&mut File::open(path).ok()?).ok()?;
+    let metadata: Metadata = serde_json::from_slice(&header[8..]).ok()?;
     Some(provenance_of(metadata.metadata().as_ref()?.get(KEY)?).ok()?.format)
 }
 
@@ -327,6 +419,7 @@ fn short(hash: &str) -> &str {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use safetensors::SafeTensors;
 
     fn sample() -> ArtifactWriter<'static> {
         let provenance = Provenance {
@@ -354,6 +447,9 @@ mod tests {
         assert!(a.expect_input("geometry", &"ab".repeat(32)).is_ok());
         let e = a.expect_input("geometry", &"00".repeat(32)).unwrap_err().to_string();
         assert!(e.contains("made from another geometry") && e.contains("abababababab"), "{e}");
+        let left = Artifact::open_leaving(&p, "sample", 1, &["b"]).unwrap();
+        assert_eq!((left.count::<u8>("b").unwrap(), left.read::<u8>("b", 1..3).unwrap()), (3, vec![2, 3]));
+        assert_eq!((left.hash(), left.tensor::<f32>("a", &[None, None]).unwrap()[3]), (a.hash(), 4.0));
         let e = a.tensor::<u32>("a", &[None]).unwrap_err().to_string();
         assert!(e.contains("found F32 [2, 2], expected U32 [any]"), "{e}");
         assert!(Artifact::open(&p, "graph", 1).is_err());
@@ -417,9 +513,10 @@ mod tests {
         sample().write(&p).unwrap();
         let mut bytes = std::fs::read(&p).unwrap();
         let opens = |bytes: &[u8]| {
-            let mut words = vec![0; bytes.len().div_ceil(8)];
-            bytemuck::cast_slice_mut(&mut words)[..bytes.len()].copy_from_slice(bytes);
-            Artifact::parse(&p, words, bytes.len(), "sample", 1).is_ok()
+            std::fs::write(&p, bytes).unwrap();
+            let left = Artifact::open_leaving(&p, "sample", 1, &["a"]).is_ok();
+            assert_eq!(Artifact::open(&p, "sample", 1).is_ok(), left);
+            left
         };
         for bit in 0..8 * bytes.len() {
             bytes[bit / 8] ^= 1 << (bit % 8);

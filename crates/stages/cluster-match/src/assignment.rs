@@ -76,9 +76,12 @@ impl Assignment {
 
     /// Lets the masks vote `rounds` times ([`by_votes`]). A Gaussian that changes its instance becomes one of the new
     /// instance's cluster. Returns how many changed.
-    pub fn vote(&mut self, graph: &Graph, footprints: &Footprints, levels: &[Level], rounds: usize) -> usize {
+    ///
+    /// # Errors
+    /// When the footprints can't be read.
+    pub fn vote(&mut self, graph: &Graph, footprints: &Footprints, levels: &[Level], rounds: usize) -> Result<usize> {
         let mut of_kept = self.of_kept(&graph.kept);
-        let changed = by_votes(&mut of_kept, self.instances, footprints, graph, levels, rounds);
+        let changed = by_votes(&mut of_kept, self.instances, footprints, graph, levels, rounds)?;
         for (&i, label) in graph.kept.iter().zip(of_kept) {
             if let Some(&cluster) = usize::try_from(label).ok().and_then(|l| self.clusters.get(l))
                 && self.labels[i as usize] != label
@@ -87,16 +90,20 @@ impl Assignment {
                 self.labels[i as usize] = label;
             }
         }
-        changed
+        Ok(changed)
     }
 
     /// Joins instances that the masks show as one with a probability of at least `least` ([`by_masks`]).
-    pub fn join(&mut self, kept: &[u32], footprints: &Footprints, levels: &[Level], least: f64) {
-        let number = by_masks(&self.of_kept(kept), self.instances, footprints, levels, least);
+    ///
+    /// # Errors
+    /// When the footprints can't be read.
+    pub fn join(&mut self, kept: &[u32], footprints: &Footprints, levels: &[Level], least: f64) -> Result<()> {
+        let number = by_masks(&self.of_kept(kept), self.instances, footprints, levels, least)?;
         self.instances = number.iter().max().map_or(0, |&n| n as usize + 1);
         let renumber = |l: &mut i32| *l = usize::try_from(*l).map_or(*l, |k| number[k] as i32);
         self.labels.iter_mut().for_each(renumber);
         self.tree.iter_mut().for_each(|e| renumber(&mut e.instance));
+        Ok(())
     }
 
     /// Makes instances of those of `parts` that lie in a much larger instance: at least [`INSIDE`] of their Gaussians, and at most

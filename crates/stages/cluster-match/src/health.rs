@@ -127,7 +127,7 @@ mod tests {
     use artifacts::Level;
 
     fn health(instances: &Instances, footprints: &Footprints, level: Level) -> Health {
-        measure(instances, footprints, &mask_weights(&instances.label, footprints, &[level]))
+        measure(instances, footprints, &mask_weights(&instances.label, footprints, &[level]).unwrap())
     }
 
     #[test]

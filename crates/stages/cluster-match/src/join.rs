@@ -5,6 +5,7 @@
 //! thing mostly lie in the same mask of a view, two things only where a view merges them.
 
 use artifacts::{Footprints, Level};
+use gs_io::Result;
 use rayon::prelude::*;
 use std::collections::BTreeMap;
 
@@ -76,34 +77,46 @@ pub fn units(footprints: &Footprints) -> Vec<u32> {
 
 /// The masks at `levels`, as rows of the footprints, and the weight of each instance in them. `labels` are those of the kept
 /// Gaussians, -1 for none.
-pub fn mask_weights(labels: &[i32], footprints: &Footprints, levels: &[Level]) -> Vec<(u32, BTreeMap<u32, f64>)> {
+///
+/// # Errors
+/// When the footprints can't be read.
+pub fn mask_weights(
+    labels: &[i32],
+    footprints: &Footprints,
+    levels: &[Level],
+) -> Result<Vec<(u32, BTreeMap<u32, f64>)>> {
     (0..footprints.rows.len() as u32)
         .into_par_iter()
         .filter(|&r| footprints.rows[r as usize].is_of(levels))
         .map(|r| {
-            let (gaussians, weights) = footprints.entries(r as usize);
             let mut of: BTreeMap<u32, f64> = BTreeMap::new();
-            for (&i, &w) in gaussians.iter().zip(weights) {
+            for (i, w) in footprints.entries(r as usize)?.iter() {
                 if let Ok(k) = u32::try_from(labels[i as usize]) {
                     *of.entry(k).or_default() += f64::from(w);
                 }
             }
-            (r, of)
+            Ok((r, of))
         })
         .collect()
 }
 
 /// Joins instances, those that agree most first, until no two agree by `least` (more than a half) or more. `labels` are those of
 /// the kept Gaussians, -1 for none. Returns the new number of each instance; numbers stay in order.
-pub fn by_masks(labels: &[i32], instances: usize, footprints: &Footprints, levels: &[Level], least: f64) -> Vec<u32> {
+pub fn by_masks(
+    labels: &[i32],
+    instances: usize,
+    footprints: &Footprints,
+    levels: &[Level],
+    least: f64,
+) -> Result<Vec<u32>> {
     let unit_of = units(footprints);
     let units = footprints.views.len() * artifacts::LEVELS;
     let mut masks = vec![Vec::new(); instances];
-    for (r, of) in mask_weights(labels, footprints, levels) {
+    for (r, of) in mask_weights(labels, footprints, levels)? {
         of.into_iter().filter(|(_, w)| *w > 0.0).for_each(|(k, w)| masks[k as usize].push((r, w)));
     }
     let mut profiles: Vec<Profile> = masks.into_iter().map(|m| Profile::new(m, &unit_of, units)).collect();
-    join(&mut profiles, &unit_of, least)
+    Ok(join(&mut profiles, &unit_of, least))
 }
 
 fn join(profiles: &mut [Profile], unit_of: &[u32], least: f64) -> Vec<u32> {

@@ -5,7 +5,7 @@ use crate::options::Space;
 
 /// Peak memory in bytes of clustering in this space.
 pub fn forecast(inputs: &Inputs, space: Space) -> u64 {
-    let (entries, samples) = (inputs.footprints.csr().1.len(), inputs.footprints.pixels.col.len());
+    let (entries, samples) = (inputs.footprints.total(), inputs.footprints.pixels.col.len());
     let (gaussians, kept) = (inputs.geometry.gaussians.len(), inputs.features.kept.len() as u64);
     let (dim, parts) = (inputs.features.dim as u64, inputs.features.parts_dim as u64);
     // Features as they are read and as they are clustered; free points are also parted from their duplicates and lie in a tree:
@@ -16,7 +16,7 @@ pub fn forecast(inputs: &Inputs, space: Space) -> u64 {
     };
     // Fitted to 15 runs of 5,000 to 80,000 Gaussians and up to 12 million entries, and to 18 with masks of all levels.
     12_800_000
-        + 11 * entries as u64
+        + 11 * entries.min(1 << 24)
         + 14 * samples as u64
         + 627 * gaussians as u64
         + value * kept * dim.max(parts) / 10

@@ -71,7 +71,7 @@ mod tests {
         let m = |instance, view| Match { instance, view, mask: 0, score: 0.8, visible: 1.0 };
         instances.matches = (0..3).flat_map(|k| (0..matched[k as usize]).map(move |view| m(k, view))).collect();
         let labels = instances.label.clone();
-        confidence(&instances, &footprints, &mask_weights(&labels, &footprints, &[Level::Large]))
+        confidence(&instances, &footprints, &mask_weights(&labels, &footprints, &[Level::Large]).unwrap())
     }
 
     #[test]

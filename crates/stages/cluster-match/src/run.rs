@@ -39,7 +39,7 @@ impl Program for Args {
     fn run(self, stage: &Stage) -> Result<()> {
         let a = &self;
         let mut claim = outputs::claim(a, stage)?;
-        let mut watched = Watched::new([&a.geometry]);
+        let mut watched = Watched::new([&a.geometry, &a.footprints]);
         for suffix in ["_s.npy", "_f.npy"] {
             watched = watched.and(artifacts::watch_folder(&a.masks, suffix)?);
         }
@@ -77,7 +77,7 @@ impl Program for Args {
         let views = inputs.views.iter().map(|v| v.stem().to_string()).collect();
         let (means, footprints) = (&inputs.geometry.gaussians.means, &inputs.footprints);
         let labels: Vec<i32> = inputs.graph.kept.iter().map(|&i| found.labels[i as usize]).collect();
-        let weights = mask_weights(&labels, footprints, &settings.levels);
+        let weights = mask_weights(&labels, footprints, &settings.levels)?;
         let described = describe(means, found.labels, found.instances, matches, &features);
         let mut instances = Instances { views, tree: found.tree, node: found.nodes, ..described };
         instances.score = confidence(&instances, footprints, &weights);
@@ -96,7 +96,7 @@ fn settle(found: &mut Assignment, inputs: &Inputs, settings: &Settings, levels: 
         found.fill_from_nearest(&inputs.geometry.gaussians.means, |i| noise[i])?;
     }
     let votes = settings.votes;
-    Ok(if votes > 0 { found.vote(&inputs.graph, &inputs.footprints, levels, votes) } else { 0 })
+    if votes > 0 { found.vote(&inputs.graph, &inputs.footprints, levels, votes) } else { Ok(0) }
 }
 
 /// Corrects the clustering by where Gaussians lie and by the masks of each view.
@@ -110,7 +110,7 @@ fn correct(mut found: Assignment, inputs: &Inputs, settings: &Settings, stage: &
     }
     if settings.join > 0.0 {
         let before = found.instances;
-        found.join(&graph.kept, footprints, &settings.levels, settings.join);
+        found.join(&graph.kept, footprints, &settings.levels, settings.join)?;
         if found.instances < before {
             stage.info(&format!("{} instances after joining pieces that the masks show as one", found.instances));
         }

@@ -5,8 +5,10 @@
 //! the neighbouring instance whose masks hold most of its weight and of its neighbours' weight.
 
 use crate::join::{mask_weights, units};
-use artifacts::{Footprints, Graph, Level};
+use artifacts::{Entries, Footprints, Graph, Level};
+use gs_io::Result;
 use rayon::prelude::*;
+use std::ops::Range;
 
 /// Gaussians that one task handles.
 const CHUNK: usize = 8192;
@@ -17,6 +19,9 @@ const LEAD: f32 = 1.02;
 /// those of the kept Gaussians; those in no instance (-1) stay so. A Gaussian's votes for an instance are its weights, and those of its spatial
 /// neighbours, in all masks, each times the share of the instance that the view shows in this mask. Returns how many
 /// labels changed.
+///
+/// # Errors
+/// When the footprints can't be read.
 pub fn by_votes(
     labels: &mut [i32],
     instances: usize,
@@ -24,21 +29,27 @@ pub fn by_votes(
     graph: &Graph,
     levels: &[Level],
     rounds: usize,
-) -> usize {
+) -> Result<usize> {
     let mut moved = 0;
     for _ in 0..rounds {
-        let new = vote(labels, instances, footprints, graph, levels);
+        let new = vote(labels, instances, footprints, graph, levels)?;
         if new.is_empty() {
             break;
         }
         moved += new.len();
         new.into_iter().for_each(|(i, label)| labels[i as usize] = label as i32);
     }
-    moved
+    Ok(moved)
 }
 
 /// The Gaussians whose label changes in this round, with the new one.
-fn vote(labels: &[i32], instances: usize, footprints: &Footprints, graph: &Graph, levels: &[Level]) -> Vec<(u32, u32)> {
+fn vote(
+    labels: &[i32],
+    instances: usize,
+    footprints: &Footprints,
+    graph: &Graph,
+    levels: &[Level],
+) -> Result<Vec<(u32, u32)>> {
     let k = graph.gaussian_k;
     let around = |i: usize| {
         let neighbours = graph.gaussian_knn[i * k..(i + 1) * k].iter().map(|&j| j as usize);
@@ -66,9 +77,9 @@ fn vote(labels: &[i32], instances: usize, footprints: &Footprints, graph: &Graph
         .collect();
     asked.par_sort_unstable();
     asked.dedup();
-    let votes = count(&asked, labels, instances, footprints, levels);
+    let votes = count(&asked, labels, instances, footprints, levels)?;
     let of = |j: usize, label: u32| votes[asked.binary_search(&(j as u32, label)).expect("asked for")];
-    choices
+    let changed = choices
         .par_iter()
         .with_min_len(CHUNK)
         .filter_map(|(i, choice)| {
@@ -83,7 +94,8 @@ fn vote(labels: &[i32], instances: usize, footprints: &Footprints, graph: &Graph
             }
             (best.0 != own).then_some((*i, best.0))
         })
-        .collect()
+        .collect();
+    Ok(changed)
 }
 
 /// The votes for each pair of Gaussian and instance in `asked`.
@@ -93,48 +105,65 @@ fn count(
     instances: usize,
     footprints: &Footprints,
     levels: &[Level],
-) -> Vec<f32> {
+) -> Result<Vec<f32>> {
     let unit_of = units(footprints);
-    let weights = mask_weights(labels, footprints, levels);
+    let weights = mask_weights(labels, footprints, levels)?;
     // Share of each instance in each mask, of what the mask's view and level show of it.
     let mut in_unit = vec![0.0f64; instances];
-    let mut shares: Vec<(u32, Vec<(u32, f32)>)> = Vec::with_capacity(weights.len());
+    let mut shares: Vec<Vec<(u32, f32)>> = Vec::with_capacity(weights.len());
     for unit in weights.chunk_by(|a, b| unit_of[a.0 as usize] == unit_of[b.0 as usize]) {
         in_unit.fill(0.0);
         unit.iter().flat_map(|(_, of)| of).for_each(|(&label, w)| in_unit[label as usize] += w);
-        for (r, of) in unit {
+        for (_, of) in unit {
             let share = |(&label, w): (&u32, &f64)| (label, (w / in_unit[label as usize].max(1e-300)) as f32);
-            shares.push((*r, of.iter().map(share).collect()));
+            shares.push(of.iter().map(share).collect());
         }
     }
-    let chunk = |c: usize| {
-        let (first, last) = ((c * CHUNK) as u32, ((c + 1) * CHUNK) as u32);
-        let own = &asked[asked.partition_point(|a| a.0 < first)..asked.partition_point(|a| a.0 < last)];
+    let mut chunks: Vec<Chunk<'_>> = (0..labels.len().div_ceil(CHUNK)).map(|c| Chunk::new(c, asked)).collect();
+    let rows: Vec<u32> = weights.iter().map(|(r, _)| *r).collect();
+    let mut at = 0;
+    footprints.in_batches(&rows, |_, batch| {
+        let shares = &shares[at..at + batch.len()];
+        at += batch.len();
+        chunks.par_iter_mut().for_each_init(|| vec![0.0f32; instances], |room, chunk| chunk.add(batch, shares, room));
+    })?;
+    Ok(chunks.into_iter().flat_map(|c| c.votes).collect())
+}
+
+/// The votes asked for of [`CHUNK`] Gaussians.
+struct Chunk<'a> {
+    gaussians: Range<u32>,
+    asked: &'a [(u32, u32)],
+    /// Where those of each Gaussian begin.
+    start: Vec<usize>,
+    votes: Vec<f32>,
+}
+
+impl<'a> Chunk<'a> {
+    fn new(c: usize, asked: &'a [(u32, u32)]) -> Self {
+        let gaussians = (c * CHUNK) as u32..((c + 1) * CHUNK) as u32;
+        let upto = |i: u32| asked.partition_point(|a| a.0 < i);
+        let asked = &asked[upto(gaussians.start)..upto(gaussians.end)];
         let mut start = vec![0usize; CHUNK + 1];
-        own.iter().for_each(|a| start[(a.0 - first) as usize + 1] += 1);
+        asked.iter().for_each(|a| start[(a.0 - gaussians.start) as usize + 1] += 1);
         (0..CHUNK).for_each(|i| start[i + 1] += start[i]);
-        let mut votes = vec![0.0f32; own.len()];
-        let mut share_of = vec![0.0f32; instances];
-        for (r, of) in &shares {
-            let (gaussians, weights) = footprints.entries(*r as usize);
-            let from = gaussians.partition_point(|&i| i < first);
-            let to = from + gaussians[from..].partition_point(|&i| i < last);
-            if from == to {
-                continue;
-            }
-            of.iter().for_each(|&(label, s)| share_of[label as usize] = s);
-            for (&i, &w) in gaussians[from..to].iter().zip(&weights[from..to]) {
-                let range = start[(i - first) as usize]..start[(i - first) as usize + 1];
-                for (v, a) in votes[range.clone()].iter_mut().zip(&own[range]) {
-                    *v += w * share_of[a.1 as usize];
+        Self { gaussians, asked, start, votes: vec![0.0; asked.len()] }
+    }
+
+    /// Adds those of some masks, of which `shares` has the share of each instance. `room` has a zero for each instance.
+    fn add(&mut self, masks: &[Entries], shares: &[Vec<(u32, f32)>], room: &mut [f32]) {
+        for (entries, of) in masks.iter().zip(shares) {
+            of.iter().for_each(|&(label, s)| room[label as usize] = s);
+            for (i, w) in entries.within(self.gaussians.clone()) {
+                let at = (i - self.gaussians.start) as usize;
+                let range = self.start[at]..self.start[at + 1];
+                for (v, a) in self.votes[range.clone()].iter_mut().zip(&self.asked[range]) {
+                    *v += w * room[a.1 as usize];
                 }
             }
-            of.iter().for_each(|&(label, _)| share_of[label as usize] = 0.0);
+            of.iter().for_each(|&(label, _)| room[label as usize] = 0.0);
         }
-        votes
-    };
-    let parts: Vec<Vec<f32>> = (0..labels.len().div_ceil(CHUNK)).into_par_iter().map(chunk).collect();
-    parts.concat()
+    }
 }
 
 #[cfg(test)]
@@ -171,12 +200,12 @@ mod tests {
         labels[17] = -1;
         let mut expected: Vec<i32> = (0..20).map(|i| i32::from(i >= 10)).collect();
         expected[17] = -1;
-        let moved = by_votes(&mut labels, 2, &footprints, &graph, &[Level::Large], 5);
+        let moved = by_votes(&mut labels, 2, &footprints, &graph, &[Level::Large], 5).unwrap();
         assert_eq!((moved, &labels), (3, &expected));
-        assert_eq!(by_votes(&mut labels, 2, &footprints, &graph, &[Level::Large], 5), 0);
+        assert_eq!(by_votes(&mut labels, 2, &footprints, &graph, &[Level::Large], 5).unwrap(), 0);
         // No masks of this level: no votes, no change.
         let mut off = vec![0; 20];
         off[3] = 1;
-        assert_eq!(by_votes(&mut off, 2, &footprints, &graph, &[Level::Small], 5), 0);
+        assert_eq!(by_votes(&mut off, 2, &footprints, &graph, &[Level::Small], 5).unwrap(), 0);
     }
 }

@@ -67,7 +67,7 @@ pub struct MaskStats {
     /// Views.
     pub views: usize,
     /// Each level.
-    pub levels: [LevelStats; 4],
+    pub levels: Vec<LevelStats>,
 }
 
 /// Measures the id maps of a folder, with footprints of these very masks also their consistency.
@@ -97,16 +97,20 @@ pub fn measure(folder: &Path, footprints: Option<&Footprints>) -> Result<MaskSta
             areas[l].extend(pixels.values().map(|&n| n as f64 / image));
         }
     }
-    let pairs = footprints.map(closest_views);
-    let levels = Level::ALL.map(|level| {
+    let pairs = footprints.map(closest_views).transpose()?;
+    let fates = |level: Level| match footprints.zip(pairs.as_ref()) {
+        Some((f, pairs)) => compare(f, level as u32, pairs),
+        None => Ok([0; 4]),
+    };
+    let mut levels = Vec::new();
+    for level in Level::ALL {
         let l = level as usize;
-        let fates = footprints.zip(pairs.as_ref()).map(|(f, pairs)| compare(f, level as u32, pairs));
-        let [compared, fates @ ..] = fates.unwrap_or_default();
+        let [compared, fates @ ..] = fates(level)?;
         let [split, merged, stable] = fates.map(|n| (compared > 0).then(|| n as f64 / compared as f64));
         let (masks, area) = (mean_and_spread(&masks[l]), quantiles(&mut areas[l]));
         let covered = mean_and_spread(&covered[l])[0];
-        LevelStats { level: level.to_string(), masks, area, covered, compared, split, merged, stable }
-    });
+        levels.push(LevelStats { level: level.to_string(), masks, area, covered, compared, split, merged, stable });
+    }
     Ok(MaskStats { views: stems.len(), levels })
 }
 
@@ -126,53 +130,53 @@ fn quantiles(values: &mut [f64]) -> [f64; 5] {
 }
 
 /// For each view the other one that shares the largest part of its Gaussians; none for a view without any.
-fn closest_views(f: &Footprints) -> Vec<Option<usize>> {
+fn closest_views(f: &Footprints) -> Result<Vec<Option<usize>>> {
     let words = f.kept.len().div_ceil(64);
     let mut seen = vec![vec![0u64; words]; f.views.len()];
     for (r, row) in f.rows.iter().enumerate().filter(|(_, row)| row.level == 0) {
-        for &c in f.entries(r).0 {
+        for c in f.entries(r)?.gaussians {
             seen[row.view as usize][c as usize / 64] |= 1 << (c % 64);
         }
     }
     let shared = |a: usize, b: usize| -> u32 { seen[a].iter().zip(&seen[b]).map(|(x, y)| (x & y).count_ones()).sum() };
-    (0..f.views.len())
-        .map(|a| {
-            let others = (0..f.views.len()).filter(|&b| b != a).map(|b| (shared(a, b), b)).filter(|s| s.0 > 0);
-            others.max_by_key(|&(n, b)| (n, std::cmp::Reverse(b))).map(|s| s.1)
-        })
-        .collect()
+    let closest = |a: usize| {
+        let others = (0..f.views.len()).filter(|&b| b != a).map(|b| (shared(a, b), b)).filter(|s| s.0 > 0);
+        others.max_by_key(|&(n, b)| (n, std::cmp::Reverse(b))).map(|s| s.1)
+    };
+    Ok((0..f.views.len()).map(closest).collect())
 }
+
+/// The weight of a mask, and of it what lies in each mask of another view.
+type Shares = (f64, BTreeMap<usize, f64>);
 
 /// Weight of each mask of view `from` by the masks of view `to` that own its Gaussians: row -> (row, weight), with the
 /// weight of the whole mask.
-fn shares(f: &Footprints, rows: &[usize], owner: &[u32]) -> BTreeMap<usize, (f64, BTreeMap<usize, f64>)> {
+fn shares(f: &Footprints, rows: &[usize], owner: &[u32]) -> Result<BTreeMap<usize, Shares>> {
     let one = |&r: &usize| {
-        let (col, weight) = f.entries(r);
         let mut by = BTreeMap::<usize, f64>::new();
         let mut all = 0.0;
-        for (&c, &w) in col.iter().zip(weight) {
+        for (c, w) in f.entries(r)?.iter() {
             all += f64::from(w);
             if owner[c as usize] != u32::MAX {
                 *by.entry(owner[c as usize] as usize).or_default() += f64::from(w);
             }
         }
-        (r, (all, by))
+        Ok((r, (all, by)))
     };
     rows.iter().map(one).collect()
 }
 
 /// The mask of each Gaussian with the largest weight; `u32::MAX` for none.
-fn owners(f: &Footprints, rows: &[usize]) -> Vec<u32> {
+fn owners(f: &Footprints, rows: &[usize]) -> Result<Vec<u32>> {
     let mut best = vec![(0.0f32, u32::MAX); f.kept.len()];
     for &r in rows {
-        let (col, weight) = f.entries(r);
-        for (&c, &w) in col.iter().zip(weight) {
+        for (c, w) in f.entries(r)?.iter() {
             if w > best[c as usize].0 {
                 best[c as usize] = (w, r as u32);
             }
         }
     }
-    best.into_iter().map(|b| b.1).collect()
+    Ok(best.into_iter().map(|b| b.1).collect())
 }
 
 /// The masks that hold a piece each of what is seen of a mask.
@@ -182,15 +186,15 @@ fn pieces(by: &BTreeMap<usize, f64>) -> Vec<usize> {
 }
 
 /// How many masks of a level could be compared, and how many of them are split, merged, neither.
-fn compare(f: &Footprints, level: u32, pairs: &[Option<usize>]) -> [usize; 4] {
+fn compare(f: &Footprints, level: u32, pairs: &[Option<usize>]) -> Result<[usize; 4]> {
     let mut rows: Vec<Vec<usize>> = vec![Vec::new(); f.views.len()];
     for (r, row) in f.rows.iter().enumerate().filter(|(_, row)| row.level == level) {
         rows[row.view as usize].push(r);
     }
     let mut fates = [0; 4];
     for (a, b) in pairs.iter().enumerate().filter_map(|(a, b)| Some((a, (*b)?))) {
-        let there = shares(f, &rows[a], &owners(f, &rows[b]));
-        let back = shares(f, &rows[b], &owners(f, &rows[a]));
+        let there = shares(f, &rows[a], &owners(f, &rows[b])?)?;
+        let back = shares(f, &rows[b], &owners(f, &rows[a])?)?;
         for (r, (all, by)) in &there {
             let seen: f64 = by.values().sum();
             if seen < SEEN * all || *all <= 0.0 {
@@ -206,7 +210,7 @@ fn compare(f: &Footprints, level: u32, pairs: &[Option<usize>]) -> [usize; 4] {
             fates.iter_mut().zip(is).for_each(|(n, is)| *n += usize::from(is));
         }
     }
-    fates
+    Ok(fates)
 }
 
 /// The statistics as a Markdown table.
@@ -254,7 +258,7 @@ mod tests {
 
     fn fate(views: [&[&[u32]]; 2]) -> [usize; 4] {
         let (_dir, f) = footprints(views);
-        compare(&f, 0, &closest_views(&f))
+        compare(&f, 0, &closest_views(&f).unwrap()).unwrap()
     }
 
     #[test]

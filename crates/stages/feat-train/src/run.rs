@@ -30,10 +30,10 @@ impl Program for Args {
             .files(CURVE.map(|suffix| with_suffix(&self.out, suffix)))
             .reads([&self.geometry, &self.graph, &self.footprints])
             .claim()?;
-        let watched = Watched::new([&self.geometry]);
+        let watched = Watched::new([&self.geometry, &self.footprints]);
         let inputs = Inputs::read(&self)?;
         let geometry = std::fs::metadata(&self.geometry).map_or(0, |m| m.len());
-        let needed = memory::forecast(&inputs, &self.options, geometry);
+        let needed = memory::forecast(&inputs, &self.options, geometry)?;
         stage.forecast(needed, "drop small footprint entries: graph-precompute --cut 0.001")?;
 
         let made = match self.options.preset {

@@ -11,7 +11,7 @@ fn a_run_takes_about_the_memory_that_it_forecasts() {
     for view in footprints.rows.chunk_by(|a, b| a.view == b.view) {
         assert!((60..=100).contains(&view.len()), "masks as the benchmark promises them");
     }
-    assert!(footprints.csr().1.len() > 15 * 120 * 120 / 6);
+    assert!(footprints.total() > 15 * 120 * 120 / 6);
     for options in [&["--dim", "64"][..], &["--preset", "paper", "--iterations", "20"]] {
         let record = scene::run(folder.path(), options);
         let forecast = record.memory_predicted_bytes.expect("feat-train forecasts its memory") as f64;

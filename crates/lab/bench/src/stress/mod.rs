@@ -89,10 +89,11 @@ struct Base {
 /// Sum of weights of each Gaussian over all masks, by its number in the whole scene.
 fn weights(path: &Path) -> Result<BTreeMap<u32, f64>> {
     let f = Footprints::read(path)?;
-    let (_, columns, values) = f.csr();
     let mut sums = BTreeMap::new();
-    for (c, v) in columns.iter().zip(values) {
-        *sums.entry(f.kept[*c as usize]).or_insert(0.0) += f64::from(*v);
+    for row in 0..f.rows.len() {
+        for (c, v) in f.entries(row)?.iter() {
+            *sums.entry(f.kept[c as usize]).or_insert(0.0) += f64::from(v);
+        }
     }
     Ok(sums)
 }

@@ -6,6 +6,7 @@
 use super::context::{Context, inverse};
 use artifacts::{Footprints, Level, PixelSamples};
 use gs_io::{Error, Result, mixed};
+use std::rc::Rc;
 
 /// Most masks of a view at a level: their numbers have 16 bits.
 const MOST_MASKS: usize = 1 << 16;
@@ -44,46 +45,93 @@ impl MaskSet {
     pub fn len(&self) -> usize {
         self.rows.len()
     }
-}
 
-/// The mask sets of all views at the given levels, those with at least `least` masks that have a footprint.
-pub fn mask_sets(footprints: &Footprints, context: &Context, levels: &[Level], least: usize) -> Result<Vec<MaskSet>> {
-    let place = inverse(&context.order);
-    let mut sets = Vec::new();
-    let mut from = 0;
-    for group in footprints.rows.chunk_by(|a, b| (a.view, a.level) == (b.view, b.level)) {
-        let (first, all) = (group[0], from..from + group.len());
-        from = all.end;
-        let shows = |&r: &usize| footprints.rows[r].gated > 0 && !footprints.entries(r).0.is_empty();
-        let rows: Vec<u32> = all.filter(shows).map(|r| r as u32).collect();
-        if first.is_of(levels) && rows.len() >= least {
-            if rows.len() > MOST_MASKS {
-                return Err(Error::new("more masks than can be numbered")
-                    .file(footprints.artifact().path())
-                    .field(format!("view {:?}", footprints.views[first.view as usize]))
-                    .found(rows.len())
-                    .expected(format!("at most {MOST_MASKS}")));
-            }
-            sets.push(mask_set(footprints, &rows, &place, context));
-        }
+    /// What it takes in memory, about.
+    fn bytes(&self) -> usize {
+        6 * self.mask.len() + 8 * self.columns.len() + 8 * self.sampled.column.len()
     }
-    Ok(sets)
 }
 
-fn mask_set(footprints: &Footprints, rows: &[u32], place: &[u32], context: &Context) -> MaskSet {
-    let count = rows.iter().map(|&r| footprints.entries(r as usize).0.len()).sum();
+/// The mask sets of all views at the given levels, those with at least `least` masks that have a footprint. A set is made when
+/// it is asked for, and kept where there is room.
+pub struct MaskSets<'a> {
+    footprints: &'a Footprints,
+    context: &'a Context,
+    /// Place in the training order of each kept Gaussian.
+    place: Vec<u32>,
+    /// Rows of the footprints artifact of each set.
+    rows: Vec<Vec<u32>>,
+    kept: Vec<Option<Rc<MaskSet>>>,
+    /// Bytes that sets may still take.
+    room: usize,
+}
+
+impl<'a> MaskSets<'a> {
+    /// Bytes of sets that are kept.
+    pub const MOST: usize = 1 << 29;
+
+    pub fn new(footprints: &'a Footprints, context: &'a Context, levels: &[Level], least: usize) -> Result<Self> {
+        let mut sets = Vec::new();
+        let mut from = 0;
+        for group in footprints.rows.chunk_by(|a, b| (a.view, a.level) == (b.view, b.level)) {
+            let (first, all) = (group[0], from..from + group.len());
+            from = all.end;
+            let shows = |&r: &usize| footprints.rows[r].gated > 0 && footprints.entries_of(r) > 0;
+            let rows: Vec<u32> = all.filter(shows).map(|r| r as u32).collect();
+            if first.is_of(levels) && rows.len() >= least {
+                if rows.len() > MOST_MASKS {
+                    return Err(Error::new("more masks than can be numbered")
+                        .file(footprints.artifact().path())
+                        .field(format!("view {:?}", footprints.views[first.view as usize]))
+                        .found(rows.len())
+                        .expected(format!("at most {MOST_MASKS}")));
+                }
+                sets.push(rows);
+            }
+        }
+        let (place, kept) = (inverse(&context.order), vec![None; sets.len()]);
+        Ok(Self { footprints, context, place, rows: sets, kept, room: Self::MOST })
+    }
+
+    pub fn len(&self) -> usize {
+        self.rows.len()
+    }
+
+    /// Whether some mask has sampled pixels.
+    pub fn have_pixels(&self) -> bool {
+        self.rows.iter().flatten().any(|r| self.footprints.pixels.row.binary_search(r).is_ok())
+    }
+
+    /// The set of this number.
+    ///
+    /// # Errors
+    /// When the footprints can't be read.
+    pub fn get(&mut self, number: usize) -> Result<Rc<MaskSet>> {
+        if let Some(set) = &self.kept[number] {
+            return Ok(Rc::clone(set));
+        }
+        let set = Rc::new(mask_set(self.footprints, &self.rows[number], &self.place, self.context)?);
+        if let Some(left) = self.room.checked_sub(set.bytes()) {
+            self.room = left;
+            self.kept[number] = Some(Rc::clone(&set));
+        }
+        Ok(set)
+    }
+}
+
+fn mask_set(footprints: &Footprints, rows: &[u32], place: &[u32], context: &Context) -> Result<MaskSet> {
+    let count = rows.iter().map(|&r| footprints.entries_of(r as usize)).sum();
     let mut entries: Vec<(u32, u16, f32)> = Vec::with_capacity(count);
     for (k, &r) in rows.iter().enumerate() {
-        let (col, weight) = footprints.entries(r as usize);
         let gated = footprints.rows[r as usize].gated as f32;
-        entries.extend(col.iter().zip(weight).map(|(&c, &w)| (place[c as usize], k as u16, w / gated)));
+        entries.extend(footprints.entries(r as usize)?.iter().map(|(i, w)| (place[i as usize], k as u16, w / gated)));
     }
     let pixels = rows.iter().map(|&r| f64::from(footprints.rows[r as usize].gated)).collect();
     let mut set = MaskSet::from_entries(rows.to_vec(), pixels, entries, context);
     set.sampled = Pixels::of_masks(&footprints.pixels, rows, |col| {
         set.columns.binary_search(&place[col as usize]).ok().map(|c| c as u32)
     });
-    set
+    Ok(set)
 }
 
 impl MaskSet {
@@ -180,10 +228,6 @@ impl Pixels {
         chosen
     }
 
-    pub fn is_empty(&self) -> bool {
-        self.mask.is_empty()
-    }
-
     pub fn entries(&self, p: usize) -> impl Iterator<Item = (usize, f64)> + '_ {
         let range = self.start[p] as usize..self.start[p + 1] as usize;
         self.column[range.clone()].iter().zip(&self.weight[range]).map(|(&c, &w)| (c as usize, f64::from(w)))
@@ -193,6 +237,33 @@ impl Pixels {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::contrastive::testing;
+    use artifacts::{FootprintsBuilder, Row};
+    use gs_io::Provenance;
+
+    #[test]
+    fn sets_that_are_not_kept_are_made_again() {
+        let folder = tempfile::tempdir().unwrap();
+        let file = folder.path().join("footprints.safetensors");
+        let views = vec!["a".into(), "b".into()];
+        let mut builder = FootprintsBuilder { views, kept: (0..40).collect(), ..FootprintsBuilder::default() };
+        for (view, mask) in [(0, 0), (0, 1), (1, 0), (1, 1)] {
+            let row = Row { view, mask, gated: 4, pixels: 4, ..Row::default() };
+            builder.push(row, (0..40).filter(|i| i % 2 == mask).map(|i| (i, 1.0)));
+        }
+        builder.write(&file, Provenance::default()).unwrap();
+        let footprints = Footprints::read(&file).unwrap();
+        let context = testing::context(40, crate::options::Neighbours::Gaussians, true);
+        let mut sets = MaskSets::new(&footprints, &context, &[Level::Default], 2).unwrap();
+        let kept = sets.get(1).unwrap();
+        assert!(sets.len() == 2 && Rc::ptr_eq(&kept, &sets.get(1).unwrap()));
+        sets.room = 0;
+        let made = sets.get(0).unwrap();
+        let again = sets.get(0).unwrap();
+        assert!(!Rc::ptr_eq(&made, &again));
+        assert_eq!((&made.columns, &made.mask, &made.weight), (&again.columns, &again.mask, &again.weight));
+        assert_eq!((made.columns.len(), made.weight[0]), (40, 0.25));
+    }
 
     #[test]
     fn pixels_follow_their_masks_and_cut_entries_are_dropped() {
@@ -210,7 +281,7 @@ mod tests {
             weight: vec![0.2, 0.4, 0.5],
         };
         assert_eq!(p, want);
-        assert!(Pixels::of_masks(&PixelSamples::default(), &[1, 2], Some).is_empty());
+        assert!(Pixels::of_masks(&PixelSamples::default(), &[1, 2], Some).mask.is_empty());
     }
 
     #[test]

@@ -13,7 +13,7 @@ mod context;
 mod cross_view;
 pub mod engine;
 mod loss;
-mod masks;
+pub mod masks;
 mod model;
 mod network;
 mod normalize;
@@ -31,7 +31,7 @@ use crate::outputs::Made;
 use context::Context;
 use gs_io::{Error, Result};
 use gs_scene::{Geometry, SH_C0};
-use masks::{MaskSet, mask_sets};
+use masks::MaskSets;
 use stage::Stage;
 use train::train;
 
@@ -39,7 +39,7 @@ use train::train;
 pub fn features(args: &Args, inputs: &Inputs, stage: &Stage) -> Result<Made> {
     let context = frozen_graph(args, inputs, stage)?;
     let sets = masks_to_learn_from(args, inputs, &context, stage)?;
-    train(args, inputs, &context, &sets, stage)
+    train(args, inputs, &context, sets, stage)
 }
 
 /// The graph with the colours and positions of its Gaussians.
@@ -67,24 +67,29 @@ fn frozen_graph(args: &Args, inputs: &Inputs, stage: &Stage) -> Result<Context> 
 }
 
 /// The masks of every view and level that teaches something.
-fn masks_to_learn_from(args: &Args, inputs: &Inputs, context: &Context, stage: &Stage) -> Result<Vec<MaskSet>> {
+fn masks_to_learn_from<'a>(
+    args: &Args,
+    inputs: &'a Inputs,
+    context: &'a Context,
+    stage: &Stage,
+) -> Result<MaskSets<'a>> {
     let (levels, options) = (args.options.levels(), &args.options.contrastive);
     // A single mask has no other to be separated from, but cohesion works on it.
     let least = if options.no_skip || options.cohesion > 0.0 { 1 } else { 2 };
-    let sets = mask_sets(&inputs.footprints, context, &levels, least)?;
+    let sets = MaskSets::new(&inputs.footprints, context, &levels, least)?;
     let units = inputs.footprints.views.len() * levels.len();
     if sets.len() < units {
         let why = if least == 1 { "no mask" } else { "fewer than two masks" };
         stage.skipped(&format!("{} of {units} views and levels: {why}", units - sets.len()));
     }
-    if sets.is_empty() {
+    if sets.len() == 0 {
         let what = if least == 1 { "no view has a mask" } else { "no view has two masks to tell apart" };
         return Err(Error::new(what)
             .file(&args.footprints)
             .field(format!("levels {levels:?}"))
             .hint("choose other --levels, or make masks with more than one segment a view"));
     }
-    if options.needs_pixels() && sets.iter().all(|s| s.sampled.is_empty()) {
+    if options.needs_pixels() && !sets.have_pixels() {
         return Err(Error::new("no sampled pixels, which --loss pixel and --cohesion need")
             .file(&args.footprints)
             .field("pixel_row")

@@ -9,6 +9,7 @@ use super::masks::MaskSet;
 use super::model::{Model, Propagated, Step};
 use super::state::State;
 use crate::options::Contrastive;
+use std::rc::Rc;
 
 /// One of the two, and what it found of the iteration under way.
 pub enum Solver<'a> {
@@ -55,7 +56,7 @@ impl<'a> Solver<'a> {
     }
 
     /// Mean loss of views, which nothing is learnt from.
-    pub fn mean_loss(&mut self, model: &Model<f32>, sets: &[&MaskSet]) -> f64 {
+    pub fn mean_loss(&mut self, model: &Model<f32>, sets: &[Rc<MaskSet>]) -> f64 {
         let losses: f64 = sets.iter().map(|set| self.forward(model, set, None, 0)[0]).sum();
         losses / sets.len() as f64
     }

@@ -2,7 +2,7 @@
 
 use super::checkpoint;
 use super::context::Context;
-use super::masks::MaskSet;
+use super::masks::MaskSets;
 use super::model::Model;
 use super::solver::Solver;
 use super::state::{CurvePoint, State};
@@ -37,7 +37,7 @@ const PANELS: [Panel; 4] = [
 ];
 
 /// Trains on `sets`, with checkpoints beside the output, and writes the curve at each of them and at the end.
-pub fn train(args: &Args, inputs: &Inputs, context: &Context, sets: &[MaskSet], stage: &Stage) -> Result<Made> {
+pub fn train(args: &Args, inputs: &Inputs, context: &Context, mut sets: MaskSets<'_>, stage: &Stage) -> Result<Made> {
     let (options, seed, dim) = (&args.options.contrastive, args.common.seed, args.options.trained_dim());
     let mut rng = ChaCha8Rng::seed_from_u64(seed);
     let mut state = State::new(Model::new(dim, options.clone(), context, &mut rng));
@@ -50,16 +50,19 @@ pub fn train(args: &Args, inputs: &Inputs, context: &Context, sets: &[MaskSet], 
     let draw = |curve: &[CurvePoint]| write_curve(&args.out, curve.iter().map(|p| json!(p)), &PANELS);
     let resumed_at = state.iteration;
     let mut solver = Solver::new(context, &state.model);
-    let (held_out, seen) = hold_out(sets, options.early_stop, stage);
+    let (held_out, seen) = hold_out(sets.len(), options.early_stop, stage);
+    let held_out = held_out.into_iter().map(|i| sets.get(i)).collect::<Result<Vec<_>>>()?;
     let mut order = Views { count: seen.len() as u64, seed, epoch: u64::MAX, order: Vec::new() };
     let mut progress = stage.progress("iterations", options.iterations).resumed_at(resumed_at);
     while state.iteration < options.iterations {
-        let set = seen[order.at(state.iteration)];
+        let number = seen[order.at(state.iteration)];
+        let set = &*sets.get(number)?;
         let noise = mixed(seed ^ mixed(state.iteration));
         // Another view to take positives from, for the loss that asks for them.
         let other = seen[(mixed(noise) % seen.len() as u64) as usize];
-        let beside = (options.loss == Loss::CrossView && !std::ptr::eq(other, set)).then_some(other);
-        let [loss, separation] = solver.forward(&state.model, set, beside, noise);
+        let beside = options.loss == Loss::CrossView && other != number;
+        let beside = beside.then(|| sets.get(other)).transpose()?;
+        let [loss, separation] = solver.forward(&state.model, set, beside.as_deref(), noise);
         if !loss.is_finite() {
             return Err(Error::new("the loss is not finite")
                 .field(format!("iteration {}", state.iteration + 1))
@@ -101,15 +104,14 @@ pub fn train(args: &Args, inputs: &Inputs, context: &Context, sets: &[MaskSet], 
     Ok(Made { dim, values: solver.final_features(&state.model), parts: (0, Vec::new()), summary })
 }
 
-/// The sets that are held out and those that are learnt from.
-fn hold_out<'a>(sets: &'a [MaskSet], early_stop: bool, stage: &Stage) -> (Vec<&'a MaskSet>, Vec<&'a MaskSet>) {
-    let (held_out, seen): (Vec<_>, Vec<_>) =
-        sets.iter().enumerate().partition(|(i, _)| early_stop && i % HELD_OUT == HELD_OUT - 1);
+/// The sets that are held out and those that are learnt from, of `count`.
+fn hold_out(count: usize, early_stop: bool, stage: &Stage) -> (Vec<usize>, Vec<usize>) {
+    let (mut held_out, seen): (Vec<_>, Vec<_>) = (0..count).partition(|i| early_stop && i % HELD_OUT == HELD_OUT - 1);
     if early_stop && held_out.is_empty() {
         stage.warn(&format!("--early-stop needs {HELD_OUT} views with masks: training to the end"));
     }
-    let sets = |of: Vec<(usize, &'a MaskSet)>| of.into_iter().map(|(_, set)| set);
-    (sets(held_out).take(MOST_HELD_OUT).collect(), sets(seen).collect())
+    held_out.truncate(MOST_HELD_OUT);
+    (held_out, seen)
 }
 
 /// The order of views: every view once in an epoch.

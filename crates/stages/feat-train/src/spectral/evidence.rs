@@ -4,29 +4,27 @@
 //! neighbours, and D the sums of rows and columns of S B. It is formed in [`Block`]s of Gaussians that lie together and so
 //! know the same few hundred masks: what is summed over a block's masks stays in cache.
 
-use super::sparse::{Block, Matrix};
-use artifacts::{Footprints, Graph, Level};
+use super::sparse::{Block, Blocks, Matrix};
+use artifacts::{Entries, Footprints, Graph, Level};
+use gs_io::Result;
 use rayon::prelude::*;
 use std::collections::VecDeque;
+use std::path::Path;
 
 /// Gaussians of a block.
 const BLOCK: usize = 2048;
+/// Footprint entries of the Gaussians whose blocks are made at a time: the footprints are read once for every so many.
+pub(super) const MOST: usize = 1 << 24;
 /// Gaussians whose evidence is collected by one task.
-const CHUNK: usize = 16384;
+const CHUNK: usize = 4096;
 
 /// Collects the evidence of all masks at `levels`, spread over spatial neighbours: blending weights summed over the mask's
-/// pixels, so that a view counts as much as it sees.
-pub fn collect(footprints: &Footprints, graph: &Graph, levels: &[Level]) -> Matrix {
-    let (start, gaussians, weights) = footprints.csr();
-    let range = |r: usize| start[r] as usize..start[r + 1] as usize;
-    let masks: Vec<u32> = (0..footprints.rows.len() as u32)
-        .filter(|&r| footprints.rows[r as usize].is_of(levels))
-        .filter(|&r| !range(r as usize).is_empty())
-        .collect();
-    let columns: Vec<(&[u32], &[f32])> =
-        masks.iter().map(|&r| (&gaussians[range(r as usize)], &weights[range(r as usize)])).collect();
-    let rows = by_gaussian(graph.kept.len(), &columns);
-    matrix(masks, rows, &Neighbours { k: graph.gaussian_k, items: &graph.gaussian_knn })
+/// pixels, so that a view counts as much as it sees. The matrix lies in a scratch file in the folder of `output`.
+pub fn collect(footprints: &Footprints, graph: &Graph, levels: &[Level], output: &Path) -> Result<Matrix> {
+    let used = |&r: &u32| footprints.rows[r as usize].is_of(levels) && footprints.entries_of(r as usize) > 0;
+    let masks: Vec<u32> = (0..footprints.rows.len() as u32).filter(used).collect();
+    let neighbours = Neighbours { k: graph.gaussian_k, items: &graph.gaussian_knn };
+    matrix(footprints, masks, &neighbours, MOST, output)
 }
 
 /// The block of [`collect`]'s matrix that each Gaussian will be in, and the number of blocks.
@@ -41,19 +39,31 @@ pub fn blocks(graph: &Graph) -> (Vec<u32>, usize) {
 }
 
 /// How many masks at `levels` each of the [`blocks`] will know, but for those that its neighbourhood adds.
-pub fn masks_of_blocks(footprints: &Footprints, (block, count): &(Vec<u32>, usize), levels: &[Level]) -> Vec<usize> {
-    let used = |r: &usize| footprints.rows[*r].is_of(levels);
+pub fn masks_of_blocks(
+    footprints: &Footprints,
+    (block, count): &(Vec<u32>, usize),
+    levels: &[Level],
+) -> Result<Vec<usize>> {
     // The last mask that a block was seen to know.
-    let (mut last, mut known) = (vec![usize::MAX; *count], vec![0; *count]);
-    for r in (0..footprints.rows.len()).filter(used) {
-        for &i in footprints.entries(r).0 {
-            let b = block[i as usize] as usize;
-            if last[b] != r {
-                (last[b], known[b]) = (r, known[b] + 1);
+    let (mut last, mut known) = (vec![u32::MAX; *count], vec![0; *count]);
+    let rows: Vec<u32> =
+        (0..footprints.rows.len() as u32).filter(|&r| footprints.rows[r as usize].is_of(levels)).collect();
+    footprints.in_batches(&rows, |rows, entries| {
+        for (&r, entries) in rows.iter().zip(entries) {
+            for &i in &entries.gaussians {
+                let b = block[i as usize] as usize;
+                if last[b] != r {
+                    (last[b], known[b]) = (r, known[b] + 1);
+                }
             }
         }
-    }
-    known
+    })?;
+    Ok(known)
+}
+
+/// Bytes that blocks take while they are made, of so many footprint entries: the average over neighbours gives them two thirds more.
+pub fn bytes(entries: u64) -> u64 {
+    22 * entries.min(MOST as u64)
 }
 
 /// Spatial neighbours of every Gaussian, padded with itself.
@@ -68,50 +78,82 @@ impl Neighbours<'_> {
     }
 }
 
-/// Evidence of [`CHUNK`] consecutive Gaussians, a row each; masks ascend within a row.
-#[derive(Debug, Default)]
-pub(super) struct Rows {
-    start: Vec<u32>,
+/// Evidence of some Gaussians, a row each; masks ascend within a row.
+struct Rows {
+    /// The Gaussians, ascending.
+    gaussians: Vec<u32>,
+    start: Vec<usize>,
     mask: Vec<u32>,
     value: Vec<f32>,
 }
 
-fn row_of(rows: &[Rows], i: usize) -> (&[u32], &[f32]) {
-    let (rows, i) = (&rows[i / CHUNK], i % CHUNK);
-    let range = rows.start[i] as usize..rows.start[i + 1] as usize;
-    (&rows.mask[range.clone()], &rows.value[range])
+impl Rows {
+    /// Those of `gaussians`, whose numbers of entries `counts` has. `place` has the place of each Gaussian among them, `u32::MAX`
+    /// for others.
+    fn read(
+        footprints: &Footprints,
+        masks: &[u32],
+        counts: &[u32],
+        gaussians: Vec<u32>,
+        place: &[u32],
+    ) -> Result<Self> {
+        let mut start = vec![0usize];
+        gaussians.iter().for_each(|&i| start.push(start[start.len() - 1] + counts[i as usize] as usize));
+        let count = start[gaussians.len()];
+        let (mut mask, mut value) = (vec![0u32; count], vec![0.0f32; count]);
+        let mut parts: Vec<Part<'_>> = Vec::new();
+        let (mut mask_left, mut value_left) = (&mut mask[..], &mut value[..]);
+        for (c, some) in gaussians.chunks(CHUNK).enumerate() {
+            let next = start[c * CHUNK..c * CHUNK + some.len()].to_vec();
+            let (first, end) = (next[0], start[c * CHUNK + some.len()]);
+            let mask;
+            let value;
+            (mask, mask_left) = mask_left.split_at_mut(end - first);
+            (value, value_left) = value_left.split_at_mut(end - first);
+            parts.push(Part { within: some[0]..some[some.len() - 1] + 1, chunk: c * CHUNK, first, next, mask, value });
+        }
+        let mut number = 0;
+        footprints.in_batches(masks, |_, batch| {
+            parts.par_iter_mut().for_each(|part| part.take(number, batch, place));
+            number += batch.len() as u32;
+        })?;
+        Ok(Self { gaussians, start, mask, value })
+    }
+
+    fn row(&self, at: u32) -> (&[u32], &[f32]) {
+        let range = self.start[at as usize]..self.start[at as usize + 1];
+        (&self.mask[range.clone()], &self.value[range])
+    }
 }
 
-/// The same entries by Gaussian that `columns` has by mask, with Gaussians ascending.
-pub(super) fn by_gaussian(n: usize, columns: &[(&[u32], &[f32])]) -> Vec<Rows> {
-    let chunk = |c: usize| {
-        let (first, last) = ((c * CHUNK) as u32, ((c + 1) * CHUNK).min(n) as u32);
-        let ranges: Vec<(usize, usize)> = columns
-            .iter()
-            .map(|(g, _)| {
-                let from = g.partition_point(|&g| g < first);
-                (from, from + g[from..].partition_point(|&g| g < last))
-            })
-            .collect();
-        let mut start = vec![0u32; (last - first) as usize + 1];
-        for ((g, _), &(from, to)) in columns.iter().zip(&ranges) {
-            g[from..to].iter().for_each(|&g| start[(g - first) as usize + 1] += 1);
-        }
-        (1..start.len()).for_each(|i| start[i] += start[i - 1]);
-        let mut next = start.clone();
-        let count = start[start.len() - 1] as usize;
-        let (mut mask, mut value) = (vec![0u32; count], vec![0.0f32; count]);
-        for (k, ((g, w), &(from, to))) in columns.iter().zip(&ranges).enumerate() {
-            for (&g, &w) in g[from..to].iter().zip(&w[from..to]) {
-                let at = &mut next[(g - first) as usize];
-                mask[*at as usize] = k as u32;
-                value[*at as usize] = w;
-                *at += 1;
+/// The rows of [`CHUNK`] Gaussians while they fill up.
+struct Part<'a> {
+    /// From the first to the last of them; others may lie between.
+    within: std::ops::Range<u32>,
+    /// Place of the first one.
+    chunk: usize,
+    /// Where the entries begin, and where the next one of each Gaussian goes.
+    first: usize,
+    next: Vec<usize>,
+    mask: &'a mut [u32],
+    value: &'a mut [f32],
+}
+
+impl Part<'_> {
+    /// Takes the entries of the masks from `number` on.
+    fn take(&mut self, number: u32, batch: &[Entries], place: &[u32]) {
+        for (k, entries) in (number..).zip(batch) {
+            for (i, w) in entries.within(self.within.clone()) {
+                let at = place[i as usize];
+                if at != u32::MAX {
+                    let next = &mut self.next[at as usize - self.chunk];
+                    self.mask[*next - self.first] = k;
+                    self.value[*next - self.first] = w;
+                    *next += 1;
+                }
             }
         }
-        Rows { start, mask, value }
-    };
-    (0..n.div_ceil(CHUNK)).into_par_iter().map(chunk).collect()
+    }
 }
 
 /// Parts the Gaussians into patches of [`BLOCK`], each grown over the neighbours of its first, which lies at the rim of
@@ -158,23 +200,23 @@ fn patches(n: usize, neighbours: &Neighbours<'_>) -> Vec<Vec<u32>> {
     out
 }
 
-/// S B of the Gaussians of a patch, with its sums over rows, in the patch's order, and over the block's masks. Room is needed
-/// for where each Gaussian's row is in the block's copy, and for each mask's number within the block, `u32::MAX` outside it.
+/// A block without scales, with its sums over rows, in the order of its Gaussians, and over its masks.
+type Sums = (Block, Vec<f64>, Vec<f64>);
+
+/// S B of the Gaussians of a patch. `place` has the place of each Gaussian among the rows; room is needed for where each row is
+/// in the block's copy, and for each mask's number within the block, `u32::MAX` outside it.
 fn smoothed(
-    patch: Vec<u32>,
-    rows: &[Rows],
+    patch: &[u32],
+    rows: &Rows,
     neighbours: &Neighbours<'_>,
-    place: &mut [u32],
-    local: &mut [u32],
-) -> (Block, Vec<f64>, Vec<f64>) {
+    place: &[u32],
+    (copy, local): &mut (Vec<u32>, Vec<u32>),
+) -> Sums {
     // Whose evidence counts: the patch and what surrounds it.
-    let mut around: Vec<u32> = patch.clone();
-    around.extend(patch.iter().flat_map(|&i| neighbours.of(i as usize)).map(|j| j as u32));
-    around.sort_unstable();
-    around.dedup();
+    let around = with_neighbours(patch, neighbours);
     let mut masks: Vec<u32> = Vec::new();
     for &i in &around {
-        for &k in row_of(rows, i as usize).0 {
+        for &k in rows.row(place[i as usize]).0 {
             if local[k as usize] == u32::MAX {
                 local[k as usize] = 0;
                 masks.push(k);
@@ -188,8 +230,8 @@ fn smoothed(
     // Their rows by the block's numbers.
     let (mut start, mut mask, mut value) = (vec![0], Vec::<u32>::new(), Vec::<f32>::new());
     for (at, &i) in around.iter().enumerate() {
-        place[i as usize] = at as u32;
-        let (k, v) = row_of(rows, i as usize);
+        copy[place[i as usize] as usize] = at as u32;
+        let (k, v) = rows.row(place[i as usize]);
         mask.extend(k.iter().map(|&k| local[k as usize]));
         value.extend_from_slice(v);
         start.push(mask.len());
@@ -199,10 +241,11 @@ fn smoothed(
     let mut block = Block { start: vec![0], ..Block::default() };
     let (mut row_sums, mut column_sums) = (Vec::with_capacity(patch.len()), vec![0.0f64; masks.len()]);
     let mut sum = vec![0.0f32; masks.len()];
-    for &i in &patch {
+    for &i in patch {
         let mut count = 0;
         let mut add = |j: usize| {
-            let range = start[place[j] as usize]..start[place[j] as usize + 1];
+            let at = copy[place[j] as usize] as usize;
+            let range = start[at]..start[at + 1];
             mask[range.clone()].iter().zip(&value[range]).for_each(|(&k, v)| sum[k as usize] += v);
             count += 1;
         };
@@ -219,45 +262,80 @@ fn smoothed(
             block.value.push(v);
         }
         row_sums.push(total);
-        block.start.push(block.mask.len());
+        block.start.push(block.mask.len() as u32);
     }
-    (block.gaussians, block.masks) = (patch, masks);
+    (block.gaussians, block.masks) = (patch.to_vec(), masks);
     block.mask.shrink_to_fit();
     block.value.shrink_to_fit();
     (block, row_sums, column_sums)
 }
 
-/// C from the evidence.
-pub(super) fn matrix(masks: Vec<u32>, rows: Vec<Rows>, neighbours: &Neighbours<'_>) -> Matrix {
-    let n = rows.iter().map(|r| r.start.len() - 1).sum();
-    let room = || (vec![0; n], vec![u32::MAX; masks.len()]);
-    let made: Vec<(Block, Vec<f64>, Vec<f64>)> = patches(n, neighbours)
-        .into_par_iter()
-        .with_min_len(16)
-        .map_init(room, |(place, local), patch| smoothed(patch, &rows, neighbours, place, local))
-        .collect();
-    drop(rows);
+/// Gaussians and their neighbours, ascending.
+fn with_neighbours(gaussians: &[u32], neighbours: &Neighbours<'_>) -> Vec<u32> {
+    let mut all = gaussians.to_vec();
+    all.extend(gaussians.iter().flat_map(|&i| neighbours.of(i as usize)).map(|j| j as u32));
+    all.sort_unstable();
+    all.dedup();
+    all
+}
+
+/// C from the footprints of `masks`: its blocks in groups of `most` entries or little more, each from a reading of the footprints.
+pub(super) fn matrix(
+    footprints: &Footprints,
+    masks: Vec<u32>,
+    neighbours: &Neighbours<'_>,
+    most: usize,
+    output: &Path,
+) -> Result<Matrix> {
+    let n = footprints.kept.len();
+    let mut counts = vec![0u32; n];
+    footprints.in_batches(&masks, |_, batch| {
+        batch.iter().flat_map(|e| &e.gaussians).for_each(|&i| counts[i as usize] += 1);
+    })?;
+    let mut blocks = Blocks::beside(output)?;
     let inverse_root = |v: f64| if v > 0.0 { 1.0 / v.sqrt() } else { 0.0 };
     let (mut row_scale, mut column_sums) = (vec![0.0f32; n], vec![0.0f64; masks.len()]);
-    for (block, sums, columns) in &made {
-        block.gaussians.iter().zip(sums).for_each(|(&i, &s)| row_scale[i as usize] = inverse_root(s) as f32);
-        block.masks.iter().zip(columns).for_each(|(&k, s)| column_sums[k as usize] += s);
+    let mut place = vec![u32::MAX; n];
+    let patches = patches(n, neighbours);
+    let mut left = &patches[..];
+    while !left.is_empty() {
+        let mut entries = 0;
+        let fits = |patch: &&Vec<u32>| {
+            entries += patch.iter().map(|&i| counts[i as usize] as usize).sum::<usize>();
+            entries <= most
+        };
+        let (group, later) = left.split_at(left.iter().take_while(fits).count().max(1));
+        left = later;
+        let around = with_neighbours(&group.concat(), neighbours);
+        around.iter().zip(0..).for_each(|(&i, at)| place[i as usize] = at);
+        let rows = Rows::read(footprints, &masks, &counts, around, &place)?;
+        let room = || (vec![0; rows.gaussians.len()], vec![u32::MAX; masks.len()]);
+        let made: Vec<Sums> = group
+            .par_iter()
+            .with_min_len(4)
+            .map_init(room, |room, patch| smoothed(patch, &rows, neighbours, &place, room))
+            .collect();
+        rows.gaussians.iter().for_each(|&i| place[i as usize] = u32::MAX);
+        drop(rows);
+        for (block, sums, columns) in made {
+            block.gaussians.iter().zip(sums).for_each(|(&i, s)| row_scale[i as usize] = inverse_root(s) as f32);
+            block.masks.iter().zip(columns).for_each(|(&k, s)| column_sums[k as usize] += s);
+            blocks.push(&block)?;
+        }
     }
     let column_scale: Vec<f32> = column_sums.into_iter().map(|s| inverse_root(s) as f32).collect();
-    let mut blocks: Vec<Block> = made.into_iter().map(|(block, ..)| block).collect();
-    blocks.par_iter_mut().for_each(|b| b.scale(&row_scale, &column_scale));
-    Matrix { gaussians: n, masks, blocks, row_scale, column_scale }
+    Ok(Matrix { gaussians: n, masks, row_scale, column_scale, blocks })
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::spectral::testing::{columns, dense, line, random};
+    use crate::spectral::testing::{columns, dense, line, random, random_in_groups};
 
     #[test]
     fn the_matrix_is_evidence_averaged_over_neighbours_and_scaled() {
         // More Gaussians than a block and than a chunk.
-        let (n, masks) = (CHUNK + 3000, 9);
+        let (n, masks) = (3 * CHUNK + 3000, 9);
         let near = line(n);
         let mut spread = vec![vec![0.0f64; n]; masks];
         for (k, (gaussians, weights)) in columns(n, masks).iter().enumerate() {
@@ -276,6 +354,16 @@ mod tests {
                 let expected = spread[k][i] / (row_sums[i] * column_sum).sqrt().max(1e-300);
                 assert!((column[i] - expected).abs() < 1e-6, "{k} {i}: {} {expected}", column[i]);
             }
+        }
+    }
+
+    #[test]
+    fn blocks_in_many_groups_are_the_same() {
+        let whole = random(9000, 20);
+        for most in [1, 20_000] {
+            let parts = random_in_groups(9000, 20, most);
+            assert!(parts.row_scale == whole.row_scale && parts.column_scale == whole.column_scale);
+            assert!(whole.batches().flatten().all(|b| parts.block(b).unwrap() == whole.block(b).unwrap()));
         }
     }
 

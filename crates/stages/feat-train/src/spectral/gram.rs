@@ -5,7 +5,8 @@
 //! A block of Gaussians knows a few hundred masks; products of its rows are summed in a dense square that stays in
 //! cache, and the squares of all blocks are then added up mask by mask, in the order of blocks.
 
-use super::sparse::{Block, Matrix};
+use super::sparse::{BATCH, Block, Matrix};
+use gs_io::Result;
 use multiversion::multiversion;
 use rayon::prelude::*;
 
@@ -19,18 +20,16 @@ pub const GRAM_ENTRIES: (usize, usize) = (4, 1 << 24);
 const SQUARE: usize = 1 << 23;
 /// Terms of a row's product before they go to the outer sum.
 const TERMS: usize = 128;
-/// Blocks worked on at a time.
-const BATCH: usize = 64;
 
-/// Bytes that forming CᵀC takes, from the masks of each block (`masks_of_blocks`) and the entries that they have in all.
-pub fn bytes(masks: &[usize], entries: u64) -> u64 {
-    let pairs: u64 = masks.iter().map(|&m| (m * m) as u64).sum();
+/// Bytes that forming CᵀC takes, from the masks of each block (`masks_of_blocks`), all masks, and the entries that they have.
+pub fn bytes(of_blocks: &[usize], masks: u64, entries: u64) -> u64 {
+    let pairs: u64 = of_blocks.iter().map(|&m| (m * m) as u64).sum();
     // Of a block's pairs of masks three in ten share a Gaussian, counted once; above a number it is not formed.
-    let formed = (3 * pairs / 10).min(2 * GRAM_ENTRIES.0 as u64 * entries + GRAM_ENTRIES.1 as u64);
-    let square = masks.iter().map(|&m| m * m).max().unwrap_or(0).min(SQUARE) as u64;
-    let at_once = rayon::current_num_threads().min(masks.len()) as u64;
-    // The rows of sums, a third as many entries, join them before they go.
-    11 * formed + 4 * square * at_once
+    let formed = (3 * pairs / 10).min(GRAM_ENTRIES.0 as u64 * entries + GRAM_ENTRIES.1 as u64).min(masks * masks / 2);
+    let square = of_blocks.iter().map(|&m| m * m).max().unwrap_or(0).min(SQUARE) as u64;
+    let at_once = rayon::current_num_threads().min(of_blocks.len()) as u64;
+    // The sums, and the whole matrix made of them; while they grow, a batch of blocks.
+    28 * formed + (14 * entries + 3 * pairs).min(BATCH.1 as u64) + 4 * square * at_once
 }
 
 /// CᵀC by rows.
@@ -85,8 +84,8 @@ impl Upper {
 /// Adds the products of each row's entries in `band` with themselves and the entries after them.
 fn add_products(block: &Block, band: std::ops::Range<u32>, square: &mut [f32]) {
     let m = block.masks.len();
-    for row in block.start.windows(2) {
-        let (masks, values) = (&block.mask[row[0]..row[1]], &block.value[row[0]..row[1]]);
+    for row in 0..block.gaussians.len() {
+        let (masks, values) = (&block.mask[block.row(row)], &block.value[block.row(row)]);
         let from = masks.partition_point(|&k| k < band.start);
         let to = masks.partition_point(|&k| k < band.end);
         for a in from..to {
@@ -100,52 +99,66 @@ fn add_products(block: &Block, band: std::ops::Range<u32>, square: &mut [f32]) {
     }
 }
 
+/// A row of CᵀC from its diagonal on, as a sum over blocks.
+#[derive(Debug, Default)]
+struct Sums {
+    /// The masks, ascending.
+    other: Vec<u32>,
+    value: Vec<f64>,
+}
+
+impl Sums {
+    /// Adds terms, in their order. `room` has a zero for each mask.
+    fn add(&mut self, terms: impl Iterator<Item = (u32, f32)>, room: &mut [f64]) {
+        self.other.iter().zip(&self.value).for_each(|(&k, &v)| room[k as usize] = v);
+        for (k, v) in terms {
+            if room[k as usize] == 0.0 {
+                self.other.push(k);
+            }
+            room[k as usize] += f64::from(v);
+        }
+        self.other.sort_unstable();
+        self.value.clear();
+        self.value.extend(self.other.iter().map(|&k| std::mem::take(&mut room[k as usize])));
+    }
+}
+
 impl Gram {
     /// The product, or nothing where forming it takes more than `most` entries.
-    pub fn new(matrix: &Matrix, most: usize) -> Option<Self> {
+    pub fn new(matrix: &Matrix, most: usize) -> Result<Option<Self>> {
         let r = matrix.masks.len();
-        let mut uppers: Vec<Upper> = Vec::with_capacity(matrix.blocks.len());
+        let mut sums: Vec<Sums> = (0..r).map(|_| Sums::default()).collect();
         let mut entries = 0;
-        for batch in matrix.blocks.chunks(BATCH) {
-            uppers.par_extend(batch.par_iter().map(Upper::of));
-            entries += uppers[uppers.len() - batch.len()..].iter().map(|u| u.other.len()).sum::<usize>();
+        for batch in matrix.batches() {
+            let uppers = matrix.of_batch(batch, |b| (Upper::of(&b), b.masks))?;
+            entries += uppers.iter().map(|(u, _)| u.other.len()).sum::<usize>();
             if entries > most {
-                return None;
+                return Ok(None);
             }
-        }
-        // Which blocks know a mask, and under which number.
-        let mut known: Vec<Vec<(u32, u32)>> = vec![Vec::new(); r];
-        for (b, block) in matrix.blocks.iter().enumerate() {
-            block.masks.iter().enumerate().for_each(|(at, &k)| known[k as usize].push((b as u32, at as u32)));
-        }
-        let add_up = |(sum, touched): &mut (Vec<f64>, Vec<u32>), known: &Vec<(u32, u32)>| {
-            for &(b, at) in known {
-                let (masks, upper) = (&matrix.blocks[b as usize].masks, &uppers[b as usize]);
-                let range = upper.start[at as usize]..upper.start[at as usize + 1];
-                for (&other, &v) in upper.other[range.clone()].iter().zip(&upper.value[range]) {
-                    let other = masks[other as usize];
-                    if sum[other as usize] == 0.0 {
-                        touched.push(other);
-                    }
-                    sum[other as usize] += f64::from(v);
-                }
+            // Which blocks know a mask, and under which number.
+            let mut known: Vec<Vec<(u32, u32)>> = vec![Vec::new(); r];
+            for (b, (_, masks)) in uppers.iter().enumerate() {
+                masks.iter().enumerate().for_each(|(at, &k)| known[k as usize].push((b as u32, at as u32)));
             }
-            touched.sort_unstable();
-            let row: Vec<(u32, f32)> =
-                touched.drain(..).map(|k| (k, std::mem::take(&mut sum[k as usize]) as f32)).collect();
-            row
-        };
-        let rows: Vec<Vec<(u32, f32)>> =
-            known.par_iter().with_min_len(256).map_init(|| (vec![0.0; r], Vec::new()), add_up).collect();
-        drop(uppers);
-        Some(Self::from_upper(&rows))
+            let add_up = |room: &mut Vec<f64>, (sums, known): (&mut Sums, &Vec<(u32, u32)>)| {
+                let of = |&(b, at): &(u32, u32)| {
+                    let (upper, masks) = &uppers[b as usize];
+                    let range = upper.start[at as usize]..upper.start[at as usize + 1];
+                    let others = upper.other[range.clone()].iter().map(|&other| masks[other as usize]);
+                    others.zip(upper.value[range].iter().copied())
+                };
+                sums.add(known.iter().flat_map(of), room);
+            };
+            sums.par_iter_mut().zip(&known).with_min_len(256).for_each_init(|| vec![0.0; r], add_up);
+        }
+        Ok(Some(Self::from_upper(&sums)))
     }
 
     /// The whole matrix from its entries on and above the diagonal.
-    fn from_upper(rows: &[Vec<(u32, f32)>]) -> Self {
+    fn from_upper(rows: &[Sums]) -> Self {
         let mut start = vec![0usize; rows.len() + 1];
         for (a, row) in rows.iter().enumerate() {
-            for &(b, _) in row {
+            for &b in &row.other {
                 start[a + 1] += 1;
                 start[b as usize + 1] += usize::from(b as usize != a);
             }
@@ -159,7 +172,8 @@ impl Gram {
             next[row] += 1;
         };
         for (a, row) in rows.iter().enumerate() {
-            for &(b, v) in row {
+            for (&b, &v) in row.other.iter().zip(&row.value) {
+                let v = v as f32;
                 put(a, b, v);
                 if b as usize != a {
                     put(b as usize, a as u32, v);
@@ -212,7 +226,7 @@ mod tests {
         let m = random(5000, 40);
         let c = dense(&m);
         let product = cross(&c, &c);
-        let gram = Gram::new(&m, usize::MAX).unwrap();
+        let gram = Gram::new(&m, usize::MAX).unwrap().unwrap();
         assert_eq!(gram.entries(), 1600);
         for first in [0usize, 20] {
             // Columns of the identity give columns of the matrix.
@@ -225,13 +239,13 @@ mod tests {
                 }
             }
         }
-        assert!(Gram::new(&m, 100).is_none());
+        assert!(Gram::new(&m, 100).unwrap().is_none());
     }
 
     #[test]
     fn squares_in_bands_are_the_same() {
         let m = random(300, 30);
-        let block = &m.blocks[0];
+        let block = &m.block(0).unwrap();
         let k = block.masks.len();
         let mut whole = vec![0.0; k * k];
         add_products(block, 0..k as u32, &mut whole);

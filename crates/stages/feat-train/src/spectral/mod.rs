@@ -20,6 +20,7 @@ use gs_io::{Error, Result};
 use report::curve::Panel;
 use serde_json::json;
 use stage::Stage;
+use std::path::Path;
 use std::time::Instant;
 use vectors::{Spectral, SpectralOptions, spectral};
 
@@ -33,7 +34,7 @@ const PARTS_CUTOFF: f64 = 0.75;
 pub fn features(args: &Args, inputs: &Inputs, stage: &Stage) -> Result<Made> {
     let clock = Instant::now();
     let levels = args.options.levels();
-    let matrix = evidence::collect(&inputs.footprints, &inputs.graph, &levels);
+    let matrix = evidence::collect(&inputs.footprints, &inputs.graph, &levels, &args.out)?;
     if matrix.masks.is_empty() {
         return Err(Error::new("no mask has a footprint")
             .file(&args.footprints)
@@ -71,7 +72,8 @@ pub fn features(args: &Args, inputs: &Inputs, stage: &Stage) -> Result<Made> {
         "singular_values": found.values,
     });
     drop(matrix);
-    let parts = parts(&levels, inputs, &SpectralOptions { cutoff: PARTS_CUTOFF * cutoff, ..options }, stage)?;
+    let parts =
+        parts(&args.out, &levels, inputs, &SpectralOptions { cutoff: PARTS_CUTOFF * cutoff, ..options }, stage)?;
     Ok(Made { dim, values: features, parts, summary })
 }
 
@@ -81,11 +83,17 @@ pub(crate) fn has_parts(levels: &[Level]) -> bool {
 }
 
 /// Features of parts and their dimension: the masks of level small alone, with a lower cutoff. None where that has no masks.
-fn parts(levels: &[Level], inputs: &Inputs, options: &SpectralOptions, stage: &Stage) -> Result<(usize, Vec<f32>)> {
+fn parts(
+    output: &Path,
+    levels: &[Level],
+    inputs: &Inputs,
+    options: &SpectralOptions,
+    stage: &Stage,
+) -> Result<(usize, Vec<f32>)> {
     if !has_parts(levels) {
         return Ok((0, Vec::new()));
     }
-    let matrix = evidence::collect(&inputs.footprints, &inputs.graph, &[Level::Small]);
+    let matrix = evidence::collect(&inputs.footprints, &inputs.graph, &[Level::Small], output)?;
     if matrix.masks.is_empty() {
         return Ok((0, Vec::new()));
     }

@@ -1,7 +1,9 @@
 //! Random evidence.
 
-use super::evidence::{Neighbours, by_gaussian, matrix};
+use super::evidence::{MOST, Neighbours, matrix};
 use super::sparse::Matrix;
+use artifacts::{Footprints, FootprintsBuilder, Row};
+use gs_io::Provenance;
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
@@ -25,18 +27,30 @@ pub fn line(n: usize) -> Vec<u32> {
 
 /// A random matrix of `n` Gaussians and `masks` masks.
 pub fn random(n: usize, masks: usize) -> Matrix {
-    let columns = columns(n, masks);
-    let slices: Vec<(&[u32], &[f32])> = columns.iter().map(|(g, w)| (&g[..], &w[..])).collect();
+    random_in_groups(n, masks, MOST)
+}
+
+/// The same, made from groups of `most` entries.
+pub fn random_in_groups(n: usize, masks: usize, most: usize) -> Matrix {
+    let folder = tempfile::tempdir().unwrap();
+    let file = folder.path().join("footprints.safetensors");
+    let mut builder = FootprintsBuilder { kept: (0..n as u32).collect(), ..FootprintsBuilder::default() };
+    builder.views.push("view".into());
+    for (gaussians, weights) in columns(n, masks) {
+        builder.push(Row::default(), gaussians.into_iter().zip(weights));
+    }
+    builder.write(&file, Provenance::default()).unwrap();
     let items = line(n);
-    matrix((0..masks as u32).collect(), by_gaussian(n, &slices), &Neighbours { k: 3, items: &items })
+    let neighbours = Neighbours { k: 3, items: &items };
+    matrix(&Footprints::read(&file).unwrap(), (0..masks as u32).collect(), &neighbours, most, &file).unwrap()
 }
 
 /// The matrix itself, by columns (masks).
 pub fn dense(matrix: &Matrix) -> Vec<Vec<f64>> {
     let mut out = vec![vec![0.0; matrix.gaussians]; matrix.masks.len()];
-    for block in &matrix.blocks {
+    for block in matrix.batches().flatten().map(|b| matrix.block(b).unwrap()) {
         for (row, &i) in block.gaussians.iter().enumerate() {
-            for at in block.start[row]..block.start[row + 1] {
+            for at in block.row(row) {
                 out[block.masks[block.mask[at] as usize] as usize][i as usize] = f64::from(block.value[at]);
             }
         }

@@ -70,7 +70,7 @@ pub struct Spectral {
 }
 
 pub fn spectral(matrix: &Matrix, options: &SpectralOptions, stage: &Stage) -> Result<Spectral> {
-    let gram = Gram::new(matrix, GRAM_ENTRIES.0 * matrix.entries() + GRAM_ENTRIES.1);
+    let gram = Gram::new(matrix, GRAM_ENTRIES.0 * matrix.entries() + GRAM_ENTRIES.1)?;
     let product = gram.as_ref().map_or(Product::Factors(matrix), Product::Formed);
     let mut found = singular_vectors(&product, matrix, options, stage)?;
     let gram_entries = gram.as_ref().map(Gram::entries);
@@ -87,7 +87,7 @@ pub fn spectral(matrix: &Matrix, options: &SpectralOptions, stage: &Stage) -> Re
         let by = scale(j) / found.values[j].max(f64::MIN_POSITIVE);
         vector.iter_mut().for_each(|v| *v *= by);
     }
-    let mut features = matrix.apply(&rows(&scaled), dim);
+    let mut features = matrix.apply(&rows(&scaled), dim)?;
     features.par_chunks_mut(dim).with_min_len(4096).for_each(|row| {
         let length = row.iter().map(|v| f64::from(*v) * f64::from(*v)).sum::<f64>().sqrt();
         let inverse = if length > 0.0 { 1.0 / length } else { 0.0 };
@@ -103,12 +103,12 @@ enum Product<'a> {
 }
 
 impl Product<'_> {
-    fn apply(&self, x: &[Panel]) -> Vec<Panel> {
+    fn apply(&self, x: &[Panel]) -> Result<Vec<Panel>> {
         let one = |x: &Panel| match self {
-            Self::Formed(gram) => gram.apply(x),
+            Self::Formed(gram) => Ok(gram.apply(x)),
             Self::Factors(matrix) => {
-                let out = matrix.normal(x.as_flattened(), WIDTH);
-                out.chunks_exact(WIDTH).map(|row| std::array::from_fn(|c| row[c] as f32)).collect()
+                let out = matrix.normal(x.as_flattened(), WIDTH)?;
+                Ok(out.chunks_exact(WIDTH).map(|row| std::array::from_fn(|c| row[c] as f32)).collect())
             }
         };
         x.iter().map(one).collect()
@@ -139,7 +139,7 @@ fn singular_vectors(product: &Product<'_>, matrix: &Matrix, options: &SpectralOp
     loop {
         stage.go_on()?;
         let (x, mut columns) = (panels(&v), v.len());
-        let w = product.apply(&x);
+        let w = product.apply(&x)?;
         passes += 1;
         // Ritz values and vectors of CᵀC in the space of v.
         let w = from_panels(&w, columns);
@@ -173,7 +173,7 @@ fn singular_vectors(product: &Product<'_>, matrix: &Matrix, options: &SpectralOp
             return Ok(Found { vectors, values, passes, residual });
         }
         columns = vectors.len();
-        let (filtered, degree) = filter(product, &panels(&vectors), &panels(&w), ritz[0], ritz[columns - 1].max(0.0));
+        let (filtered, degree) = filter(product, &panels(&vectors), &panels(&w), ritz[0], ritz[columns - 1].max(0.0))?;
         passes += degree - 1;
         v = from_panels(&filtered, columns);
         orthonormalise(&mut v);
@@ -182,7 +182,7 @@ fn singular_vectors(product: &Product<'_>, matrix: &Matrix, options: &SpectralOp
 
 /// A Chebyshev polynomial of CᵀC times X, small on the eigenvalues up to `low` and scaled to one at `high`; `w` is CᵀC X.
 /// Also its degree.
-fn filter(product: &Product<'_>, x: &[Panel], w: &[Panel], high: f64, low: f64) -> (Vec<Panel>, usize) {
+fn filter(product: &Product<'_>, x: &[Panel], w: &[Panel], high: f64, low: f64) -> Result<(Vec<Panel>, usize)> {
     // The unwanted interval, 0 to low, is mapped to -1 to 1.
     let half = (0.5 * low).max(1e-6 * high);
     let outside = (high - half) / half;
@@ -206,10 +206,10 @@ fn filter(product: &Product<'_>, x: &[Panel], w: &[Panel], high: f64, low: f64) 
     let mut now = scaled(w, x, first, None);
     for _ in 1..degree {
         let next = 1.0 / (2.0 / first - sigma);
-        let after = scaled(&product.apply(&now), &now, 2.0 * next, Some((&before, sigma * next)));
+        let after = scaled(&product.apply(&now)?, &now, 2.0 * next, Some((&before, sigma * next)));
         (before, now, sigma) = (now, after, next);
     }
-    (now, degree)
+    Ok((now, degree))
 }
 
 fn make_positive(column: &mut [f64]) {
@@ -295,7 +295,7 @@ mod tests {
         let m = random(3000, 200);
         let o = SpectralOptions { most: 20, auto: false, cutoff: 0.05, seed: 1 };
         let silent = Stage::silent("test");
-        let gram = Gram::new(&m, usize::MAX).unwrap();
+        let gram = Gram::new(&m, usize::MAX).unwrap().unwrap();
         let formed = singular_vectors(&Product::Formed(&gram), &m, &o, &silent).unwrap();
         let factors = singular_vectors(&Product::Factors(&m), &m, &o, &silent).unwrap();
         let c = dense(&m);
