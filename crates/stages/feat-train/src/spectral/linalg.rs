@@ -1,5 +1,6 @@
 //! Small dense linear algebra in f64, on columns. Work on columns is spread over threads; each sum has one order.
 
+use nalgebra::{DMatrix, SymmetricEigen};
 use rayon::prelude::*;
 
 /// A matrix as columns of equal length.
@@ -60,44 +61,15 @@ pub fn multiply(a: &Columns, m: &Columns) -> Columns {
         .collect()
 }
 
-/// Eigenvalues, descending, and eigenvectors of a symmetric matrix, by Jacobi rotations.
+/// Eigenvalues, descending, and eigenvectors of a symmetric matrix of finite numbers.
 pub fn symmetric_eigen(matrix: &Columns) -> (Vec<f64>, Columns) {
     let n = matrix.len();
-    let mut a: Columns = (0..n).map(|i| (0..n).map(|j| 0.5 * (matrix[i][j] + matrix[j][i])).collect()).collect();
-    let mut v: Columns = (0..n).map(|i| (0..n).map(|j| f64::from(u8::from(i == j))).collect()).collect();
-    for _sweep in 0..60 {
-        let off: f64 = (0..n).flat_map(|i| (0..i).map(move |j| (i, j))).map(|(i, j)| a[i][j] * a[i][j]).sum();
-        let all: f64 = a.iter().flatten().map(|x| x * x).sum();
-        if off <= 1e-30 * all {
-            break;
-        }
-        for p in 0..n {
-            for q in p + 1..n {
-                if a[p][q].abs() < f64::MIN_POSITIVE {
-                    continue;
-                }
-                let theta = (a[q][q] - a[p][p]) / (2.0 * a[p][q]);
-                let t = theta.signum() / (theta.abs() + theta.hypot(1.0));
-                let c = 1.0 / t.hypot(1.0);
-                let s = t * c;
-                for k in 0..n {
-                    let (x, y) = (a[k][p], a[k][q]);
-                    (a[k][p], a[k][q]) = (c * x - s * y, s * x + c * y);
-                }
-                for k in 0..n {
-                    let (x, y) = (a[p][k], a[q][k]);
-                    (a[p][k], a[q][k]) = (c * x - s * y, s * x + c * y);
-                }
-                let (left, right) = v.split_at_mut(q);
-                for (x, y) in left[p].iter_mut().zip(right[0].iter_mut()) {
-                    (*x, *y) = (c * *x - s * *y, s * *x + c * *y);
-                }
-            }
-        }
-    }
+    let symmetric = DMatrix::from_fn(n, n, |i, j| 0.5 * (matrix[i][j] + matrix[j][i]));
+    let found = SymmetricEigen::new(symmetric);
     let mut order: Vec<usize> = (0..n).collect();
-    order.sort_by(|&i, &j| a[j][j].total_cmp(&a[i][i]).then(i.cmp(&j)));
-    (order.iter().map(|&i| a[i][i]).collect(), order.iter().map(|&i| v[i].clone()).collect())
+    order.sort_by(|&i, &j| found.eigenvalues[j].total_cmp(&found.eigenvalues[i]).then(i.cmp(&j)));
+    let vector = |&i: &usize| found.eigenvectors.column(i).iter().copied().collect();
+    (order.iter().map(|&i| found.eigenvalues[i]).collect(), order.iter().map(vector).collect())
 }
 
 #[cfg(test)]
