@@ -87,30 +87,52 @@ impl<'a> FeatureTable<'a> {
     }
 }
 
-/// The masks in a tile, and of each level which of them every pixel belongs to (index into `ids`).
+/// The masks in a tile, and which of them every pixel belongs to.
 struct TileMasks {
     ids: Vec<u32>,
-    at: Vec<[Option<u16>; PIXELS]>,
+    /// The sets of masks that some pixel lies in, one of each level at most, as indices into `ids`.
+    sets: Vec<Vec<u16>>,
+    /// The pixels of each set.
+    pixels: Vec<Vec<u8>>,
 }
 
 impl TileMasks {
     fn new(t: &TileWeights<'_>, maps: &MaskMaps, levels: &[Level]) -> Self {
-        let mut out = Self { ids: Vec::new(), at: Vec::new() };
-        for &level in levels {
-            let map = maps.level(level);
-            let mut at = [None; PIXELS];
-            for (x, y) in (0..t.height).flat_map(|y| (0..t.width).map(move |x| (x, y))) {
-                let Ok(id) = u32::try_from(map[(t.y0 + y) * maps.width + t.x0 + x]) else { continue };
-                let known = out.ids.iter().position(|&k| k == id).unwrap_or_else(|| {
-                    out.ids.push(id);
-                    out.ids.len() - 1
+        let mut out = Self { ids: Vec::new(), sets: Vec::new(), pixels: Vec::new() };
+        let mut last = 0;
+        for (x, y) in (0..t.height).flat_map(|y| (0..t.width).map(move |x| (x, y))) {
+            let at = (t.y0 + y) * maps.width + t.x0 + x;
+            let ids = levels.iter().filter_map(|&level| u32::try_from(maps.level(level)[at]).ok());
+            let set: Vec<u16> = ids.map(|id| out.number(id)).collect();
+            if out.sets.get(last) != Some(&set) {
+                last = out.sets.iter().position(|s| *s == set).unwrap_or_else(|| {
+                    out.sets.push(set);
+                    out.pixels.push(Vec::new());
+                    out.sets.len() - 1
                 });
-                at[y * TILE + x] = Some(known as u16);
             }
-            out.at.push(at);
+            out.pixels[last].push((y * TILE + x) as u8);
         }
         out
     }
+
+    fn number(&mut self, id: u32) -> u16 {
+        let known = self.ids.iter().position(|&k| k == id).unwrap_or_else(|| {
+            self.ids.push(id);
+            self.ids.len() - 1
+        });
+        known as u16
+    }
+}
+
+/// The sum of some pixels' weights.
+fn sum_of(weights: &[f32], pixels: &[u8]) -> f32 {
+    let mut sums = [0.0; 4];
+    let mut four = pixels.chunks_exact(4);
+    for p in four.by_ref() {
+        (0..4).for_each(|k| sums[k] += weights[p[k] as usize]);
+    }
+    four.remainder().iter().map(|&p| weights[p as usize]).sum::<f32>() + (sums[0] + sums[1]) + (sums[2] + sums[3])
 }
 
 /// Where each instance has its silhouette in a tile.
@@ -133,34 +155,25 @@ fn tile_overlaps(t: &TileWeights<'_>, labels: &[i32], table: &FeatureTable<'_>, 
     let inside = silhouettes(t, labels);
     let mut out = Overlaps::default();
     // Areas.
-    let mut of_mask = vec![Region::empty(dim); masks.ids.len()];
-    for at in masks.at.iter().flatten().flatten() {
-        of_mask[*at as usize].area += 1;
-    }
-    for (&label, pixels) in &inside {
-        let area = pixels.iter().filter(|&&p| p).count() as u32;
+    for (&label, inside) in &inside {
+        let area = inside.iter().filter(|&&p| p).count() as u32;
         out.instances.insert(label, Region { area, ..Region::empty(dim) });
-        for at in &masks.at {
-            for mask in at.iter().zip(pixels).filter(|(_, inside)| **inside).filter_map(|(mask, _)| *mask) {
-                *out.common.entry((label, masks.ids[mask as usize])).or_default() += 1;
+        for (set, pixels) in masks.sets.iter().zip(&masks.pixels) {
+            let common = pixels.iter().filter(|&&p| inside[p as usize]).count() as u32;
+            for &mask in set.iter().filter(|_| common > 0) {
+                *out.common.entry((label, masks.ids[mask as usize])).or_default() += common;
             }
         }
     }
-    // Features: of each Gaussian its weights summed over masks and over the silhouette of its instance.
+    // Features: of each Gaussian its weights summed over sets of masks and over the silhouette of its instance.
     let mut left: BTreeMap<u32, [f32; PIXELS]> = inside.keys().map(|&label| (label, [1.0; PIXELS])).collect();
-    let mut sums = vec![0.0f32; masks.ids.len()];
+    let mut of_set = vec![vec![0.0; dim]; masks.sets.len()];
     for (g, &i) in t.gaussians.iter().enumerate() {
         let (alphas, weights) = (&t.alphas[g * PIXELS..(g + 1) * PIXELS], &t.weights[g * PIXELS..(g + 1) * PIXELS]);
-        sums.fill(0.0);
-        for at in &masks.at {
-            for (mask, w) in at.iter().zip(weights) {
-                if let Some(mask) = mask {
-                    sums[*mask as usize] += w;
-                }
+        for ((sum, pixels), set) in of_set.iter_mut().zip(&masks.pixels).zip(&masks.sets) {
+            if !set.is_empty() {
+                table.add_to(sum, i, sum_of(weights, pixels));
             }
-        }
-        for (region, &sum) in of_mask.iter_mut().zip(&sums) {
-            table.add_to(&mut region.features, i, sum);
         }
         let Ok(label) = u32::try_from(labels[i as usize]) else { continue };
         let (Some(pixels), Some(left), Some(region)) =
@@ -178,7 +191,13 @@ fn tile_overlaps(t: &TileWeights<'_>, labels: &[i32], table: &FeatureTable<'_>, 
         table.add_to(&mut region.features, i, sum);
         region.visible += f64::from(visible);
     }
-    out.masks = masks.ids.iter().copied().zip(of_mask).collect();
+    for ((set, pixels), features) in masks.sets.iter().zip(&masks.pixels).zip(&of_set) {
+        for &mask in set {
+            let region = out.masks.entry(masks.ids[mask as usize]).or_insert_with(|| Region::empty(dim));
+            region.area += pixels.len() as u32;
+            region.features.iter_mut().zip(features).for_each(|(sum, f)| *sum += f);
+        }
+    }
     out
 }
 
