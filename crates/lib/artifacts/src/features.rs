@@ -42,7 +42,8 @@ impl Features {
     /// # Errors
     /// When the file is damaged, tensors do not fit together, or a feature is not finite.
     pub fn read(path: impl AsRef<Path>) -> Result<(Self, Artifact)> {
-        let a = Artifact::open(path, Self::FORMAT, Self::VERSION)?;
+        // Left in the file, to be in memory once.
+        let a = Artifact::open_leaving(path, Self::FORMAT, Self::VERSION, &["features", "parts"])?;
         let kept = a.tensor::<u32>("kept", &[None])?.to_vec();
         check_kept(&a, &kept, usize::MAX)?;
         let (dim, values) = finite(&a, "features", kept.len())?;
@@ -61,8 +62,8 @@ impl Features {
 
 /// Columns and values of a tensor of `rows` rows, all finite.
 fn finite(a: &Artifact, name: &str, rows: usize) -> Result<(usize, Vec<f32>)> {
-    let values = a.tensor::<f32>(name, &[Some(rows), None])?.to_vec();
-    let dim = a.shape(name).map_or(0, |s| s[1]);
+    let dim = a.extents::<f32>(name, &[Some(rows), None])?[1];
+    let values: Vec<f32> = a.read(name, 0..rows * dim)?;
     if let Some(at) = values.iter().position(|v| !v.is_finite()) {
         return Err(Error::new("not a finite number")
             .file(a.path())

@@ -317,19 +317,23 @@ impl Artifact {
         Ok(&bytemuck::cast_slice(words)[..tensor.shape.iter().product()])
     }
 
-    /// Number of values of `name`, of one axis, left in the file or not.
-    pub fn count<T: Element>(&self, name: &str) -> Result<usize> {
-        Ok(self.expect::<T>(name, &[None])?.shape[0])
+    /// The extents of tensor `name`, left in the file or not. `shape` gives those expected, `None` where any will do.
+    pub fn extents<T: Element>(&self, name: &str, shape: &[Option<usize>]) -> Result<&[usize]> {
+        Ok(&self.expect::<T>(name, shape)?.shape)
     }
 
-    /// Some values of `name`, of one axis, from the file. They were checked when it was opened, but not now: somebody may have
+    /// Some values of `name` from the file, by their places in it. They were checked when it was opened, but not now: somebody may have
     /// written into the file since.
     ///
     /// # Errors
     /// When the file can no longer be read.
+    ///
+    /// # Panics
+    /// When the tensor is of another type, or shorter.
     pub fn read<T: Element>(&self, name: &str, values: std::ops::Range<usize>) -> Result<Vec<T>> {
-        let tensor = self.expect::<T>(name, &[None])?;
-        assert!(values.end <= tensor.shape[0], "values {values:?} of {name}");
+        let tensor = self.tensors.get(name).ok_or_else(|| self.fail("missing tensor", name))?;
+        let there = tensor.dtype == T::DTYPE && values.end <= tensor.shape.iter().product();
+        assert!(there, "values {values:?} of {name}");
         let mut out = vec![T::zeroed(); values.len()];
         let mut file = self.file.lock().unwrap_or_else(std::sync::PoisonError::into_inner);
         let from = tensor.bytes.start + (values.start * size_of::<T>()) as u64;
@@ -448,7 +452,10 @@ mod tests {
         let e = a.expect_input("geometry", &"00".repeat(32)).unwrap_err().to_string();
         assert!(e.contains("made from another geometry") && e.contains("abababababab"), "{e}");
         let left = Artifact::open_leaving(&p, "sample", 1, &["b"]).unwrap();
-        assert_eq!((left.count::<u8>("b").unwrap(), left.read::<u8>("b", 1..3).unwrap()), (3, vec![2, 3]));
+        assert_eq!(
+            (left.extents::<u8>("b", &[None]).unwrap()[0], left.read::<u8>("b", 1..3).unwrap()),
+            (3, vec![2, 3])
+        );
         assert_eq!((left.hash(), left.tensor::<f32>("a", &[None, None]).unwrap()[3]), (a.hash(), 4.0));
         let e = a.tensor::<u32>("a", &[None]).unwrap_err().to_string();
         assert!(e.contains("found F32 [2, 2], expected U32 [any]"), "{e}");
