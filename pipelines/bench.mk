@@ -22,6 +22,10 @@ bench-memory:
 bench-train:
 	$(CARGO) bench -p feat-train --bench train
 
+# Stages 2 to 4 on 1 and 3 million Gaussians and 300 photographs (needs Python with numpy: PYTHON; half an hour): scale/scale.md.
+bench-scale: build
+	scripts/bench_scale.sh
+
 # Anchors and neighbours beside fpsample and pykdtree (needs Python; POSITIONS=points or file.npy): graph.json.
 POSITIONS ?= 1000000
 bench-graph:

@@ -9,6 +9,7 @@ closed=1
 [[ ${FEAT_ARGS-} =~ --preset|--method ]] && closed=0
 awk -v levels="$levels" -v closed="$closed" -v masks="${MAKES_MASKS:+1}" -v cores="$(nproc)" '
   function most(a, b) { return a > b ? a : b }
+  function least(a, b) { return a < b ? a : b }
   {
     megabytes = $1; geometry = $2; n = $3; pixels = $4; views = $5
     # make demo (44,915 Gaussians, 26 views of 480 x 360): 4,345,891 entries, nearly one for each Gaussian, view and level.
@@ -19,9 +20,11 @@ awk -v levels="$levels" -v closed="$closed" -v masks="${MAKES_MASKS:+1}" -v core
     instances = 14 * size ^ 0.84 * more ^ 0.89 * larger ^ 0.64
     sam = masks ? 8 * views : 0
     memory = most(megabytes * 2 ^ 20, 19.4e6 + 646 * n + 157 * pixels + 20400 * views)
-    memory = most(memory, closed ? 3.6e6 + 22 * entries + 974 * n : 4.7e6 + 20 * entries + 518 * n)
-    memory = most(memory, 12.8e6 + 11 * entries + 1415 * n)
-    disk = 725 * n + 16 * entries + (masks ? 7.7e6 * views : 0)
+    # 40 masks of a view and level, each of which shares Gaussians with 600.
+    memory = most(memory, closed ? 3.8e8 + 940 * n + 36 * 600 * 40 * views * levels \
+      : 4.7e6 + 518 * n + least(14 * entries, 2 ^ 29) + 26 * entries / views / levels)
+    memory = most(memory, 5e7 + 1900 * n)
+    disk = 725 * n + 20 * entries + (masks ? 7.7e6 * views : 0)
     hours = (geometry + graph + features + instances + sam) / 3600
     printf "at most %.1f CPU hours (%s%.1f geometry, %.1f graph, %.1f features, %.1f instances), ", hours, \
       masks ? sprintf("%.1f masks, ", sam / 3600) : "", geometry / 3600, graph / 3600, features / 3600, instances / 3600

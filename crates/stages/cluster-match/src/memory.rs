@@ -11,14 +11,14 @@ pub fn forecast(inputs: &Inputs, space: Space) -> u64 {
     // Features as they are read and as they are clustered; free points are also parted from their duplicates and lie in a tree:
     // coordinates, the leaves' blocks, boxes.
     let value = match space {
-        Space::Graph => 123,
-        Space::Free => 240,
+        Space::Graph => 6,
+        Space::Free => 18,
     };
-    // Fitted to 15 runs of 5,000 to 80,000 Gaussians and up to 12 million entries, and to 18 with masks of all levels.
+    // Entries are read in batches of 4 million. Fitted to 11 runs of 5,000 to 950,000 Gaussians.
     12_800_000
-        + 11 * entries.min(1 << 24)
+        + 9 * entries.min(1 << 22)
         + 14 * samples as u64
-        + 627 * gaussians as u64
-        + value * kept * dim.max(parts) / 10
+        + 1000 * gaussians as u64
+        + value * kept * dim.max(parts)
         + 8 * kept * dim.min(parts)
 }

@@ -28,15 +28,15 @@ pub fn forecast(inputs: &Inputs, options: &Options, geometry: u64) -> Result<u64
         let (masks, used) =
             rows.fold((0, 0), |(masks, used), (r, _)| (masks + 1, used + footprints.entries_of(r) as u64));
         let dim = options.most_vectors(footprints.kept.len()).min(masks) as u64;
-        let product = gram::bytes(&masks_of_blocks(footprints, &blocks, levels)?, masks as u64, used);
-        Ok((evidence::bytes(used).max(product) + 8 * gaussians * dim, 4 * gaussians * dim))
+        let product = gram::bytes(&masks_of_blocks(footprints, &blocks, levels)?, masks, used);
+        Ok((evidence::bytes(used).max(product).max(5 * gaussians * dim), 4 * gaussians * dim))
     };
     let levels = options.levels();
     let (features, kept) = of(&levels)?;
     // The features of parts are made when those are there.
     let parts = if spectral::has_parts(&levels) { kept + of(&[Level::Small])?.0 } else { 0 };
     // With the footprints' rows and the graph.
-    Ok(3_600_000 + read + 462 * gaussians + features.max(parts))
+    Ok(6_200_000 + read + 360 * gaussians + features.max(parts))
 }
 
 /// With a preset: the peak is while the geometry is read, or in training. Fitted to 21 runs.

@@ -38,24 +38,29 @@ pub fn blocks(graph: &Graph) -> (Vec<u32>, usize) {
     (block, parts.len())
 }
 
-/// How many masks at `levels` each of the [`blocks`] will know, but for those that its neighbourhood adds.
+/// The masks at `levels`, by their place among these, that each of the [`blocks`] will know, but for those that its
+/// neighbourhood adds.
+///
+/// # Errors
+/// When the footprints can't be read.
 pub fn masks_of_blocks(
     footprints: &Footprints,
     (block, count): &(Vec<u32>, usize),
     levels: &[Level],
-) -> Result<Vec<usize>> {
-    // The last mask that a block was seen to know.
-    let (mut last, mut known) = (vec![u32::MAX; *count], vec![0; *count]);
+) -> Result<Vec<Vec<u32>>> {
+    let mut known: Vec<Vec<u32>> = vec![Vec::new(); *count];
     let rows: Vec<u32> =
         (0..footprints.rows.len() as u32).filter(|&r| footprints.rows[r as usize].is_of(levels)).collect();
-    footprints.in_batches(&rows, |rows, entries| {
-        for (&r, entries) in rows.iter().zip(entries) {
+    let mut mask = 0;
+    footprints.in_batches(&rows, |_, batch| {
+        for entries in batch {
             for &i in &entries.gaussians {
-                let b = block[i as usize] as usize;
-                if last[b] != r {
-                    (last[b], known[b]) = (r, known[b] + 1);
+                let known = &mut known[block[i as usize] as usize];
+                if known.last() != Some(&mask) {
+                    known.push(mask);
                 }
             }
+            mask += 1;
         }
     })?;
     Ok(known)

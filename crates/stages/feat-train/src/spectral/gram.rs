@@ -18,18 +18,33 @@ pub type Panel = Vec<[f32; WIDTH]>;
 pub const GRAM_ENTRIES: (usize, usize) = (4, 1 << 24);
 /// Entries of a square that are summed at a time.
 const SQUARE: usize = 1 << 23;
+/// Masks whose pairs are counted for the forecast, about.
+const SAMPLED: usize = 256;
 /// Terms of a row's product before they go to the outer sum.
 const TERMS: usize = 128;
 
-/// Bytes that forming CᵀC takes, from the masks of each block (`masks_of_blocks`), all masks, and the entries that they have.
-pub fn bytes(of_blocks: &[usize], masks: u64, entries: u64) -> u64 {
-    let pairs: u64 = of_blocks.iter().map(|&m| (m * m) as u64).sum();
-    // Of a block's pairs of masks three in ten share a Gaussian, counted once; above a number it is not formed.
-    let formed = (3 * pairs / 10).min(GRAM_ENTRIES.0 as u64 * entries + GRAM_ENTRIES.1 as u64).min(masks * masks / 2);
-    let square = of_blocks.iter().map(|&m| m * m).max().unwrap_or(0).min(SQUARE) as u64;
-    let at_once = rayon::current_num_threads().min(of_blocks.len()) as u64;
-    // The sums, and the whole matrix made of them; while they grow, a batch of blocks.
-    28 * formed + (14 * entries + 3 * pairs).min(BATCH.1 as u64) + 4 * square * at_once
+/// Bytes that forming CᵀC takes, from the masks that each block knows (`masks_of_blocks`), of `masks` in all, and the entries that
+/// they have. Fitted to 15 runs.
+pub fn bytes(known: &[Vec<u32>], masks: usize, entries: u64) -> u64 {
+    let all: u64 = known.iter().map(|k| (k.len() * k.len()) as u64).sum();
+    // Of a block's pairs of masks three in ten share a Gaussian, counted once. Above a number the sums end before they are a matrix.
+    let (found, most) = (3 * all / 10, GRAM_ENTRIES.0 as u64 * entries + GRAM_ENTRIES.1 as u64);
+    let sums = if found > most { 14 * most } else { 36 * found.min(pairs(known, masks)) };
+    sums + (14 * entries + 3 * all).min(BATCH.1 as u64)
+}
+
+/// Pairs of masks that some block knows, about: from what a few masks meet.
+fn pairs(known: &[Vec<u32>], masks: usize) -> u64 {
+    let every = masks.div_ceil(SAMPLED).max(1);
+    let met = |mask: usize| {
+        let mut met = vec![false; masks];
+        for block in known.iter().filter(|k| k.binary_search(&(mask as u32)).is_ok()) {
+            block.iter().for_each(|&k| met[k as usize] = true);
+        }
+        met.iter().filter(|m| **m).count() as u64
+    };
+    let sum: u64 = (0..masks).into_par_iter().step_by(every).map(met).sum();
+    sum * every as u64 / 2
 }
 
 /// CᵀC by rows.
@@ -108,18 +123,21 @@ struct Sums {
 }
 
 impl Sums {
-    /// Adds terms, in their order. `room` has a zero for each mask.
-    fn add(&mut self, terms: impl Iterator<Item = (u32, f32)>, room: &mut [f64]) {
-        self.other.iter().zip(&self.value).for_each(|(&k, &v)| room[k as usize] = v);
+    /// Adds terms, in their order. There is room for a zero for each mask, and for the masks of the row.
+    fn add(&mut self, terms: impl Iterator<Item = (u32, f32)>, (sums, masks): &mut (Vec<f64>, Vec<u32>)) {
+        masks.clear();
+        masks.extend(&self.other);
+        self.other.iter().zip(&self.value).for_each(|(&k, &v)| sums[k as usize] = v);
         for (k, v) in terms {
-            if room[k as usize] == 0.0 {
-                self.other.push(k);
+            if sums[k as usize] == 0.0 {
+                masks.push(k);
             }
-            room[k as usize] += f64::from(v);
+            sums[k as usize] += f64::from(v);
         }
-        self.other.sort_unstable();
-        self.value.clear();
-        self.value.extend(self.other.iter().map(|&k| std::mem::take(&mut room[k as usize])));
+        masks.sort_unstable();
+        // No more room than they need: the rows are most of the memory.
+        self.other = masks.clone();
+        self.value = masks.iter().map(|&k| std::mem::take(&mut sums[k as usize])).collect();
     }
 }
 
@@ -140,7 +158,7 @@ impl Gram {
             for (b, (_, masks)) in uppers.iter().enumerate() {
                 masks.iter().enumerate().for_each(|(at, &k)| known[k as usize].push((b as u32, at as u32)));
             }
-            let add_up = |room: &mut Vec<f64>, (sums, known): (&mut Sums, &Vec<(u32, u32)>)| {
+            let add_up = |room: &mut (Vec<f64>, Vec<u32>), (sums, known): (&mut Sums, &Vec<(u32, u32)>)| {
                 let of = |&(b, at): &(u32, u32)| {
                     let (upper, masks) = &uppers[b as usize];
                     let range = upper.start[at as usize]..upper.start[at as usize + 1];
@@ -149,13 +167,13 @@ impl Gram {
                 };
                 sums.add(known.iter().flat_map(of), room);
             };
-            sums.par_iter_mut().zip(&known).with_min_len(256).for_each_init(|| vec![0.0; r], add_up);
+            sums.par_iter_mut().zip(&known).with_min_len(256).for_each_init(|| (vec![0.0; r], Vec::new()), add_up);
         }
-        Ok(Some(Self::from_upper(&sums)))
+        Ok(Some(Self::from_upper(sums)))
     }
 
     /// The whole matrix from its entries on and above the diagonal.
-    fn from_upper(rows: &[Sums]) -> Self {
+    fn from_upper(rows: Vec<Sums>) -> Self {
         let mut start = vec![0usize; rows.len() + 1];
         for (a, row) in rows.iter().enumerate() {
             for &b in &row.other {
@@ -171,7 +189,7 @@ impl Gram {
             value[next[row]] = v;
             next[row] += 1;
         };
-        for (a, row) in rows.iter().enumerate() {
+        for (a, row) in rows.into_iter().enumerate() {
             for (&b, &v) in row.other.iter().zip(&row.value) {
                 let v = v as f32;
                 put(a, b, v);
