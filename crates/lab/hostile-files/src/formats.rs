@@ -3,9 +3,10 @@
 use crate::seeds;
 use artifacts::{Features, Footprints, Graph, Instances, MaskFeatures, MaskMaps, TruePoints, TrueScene};
 use clap::Parser;
-use eval::{TextSource, TextTable, read_labels, read_mask, read_truth};
+use eval::{read_labels, read_mask, read_truth};
 use gs_scene::dataset::{self, LoadOptions, Resolution};
 use gs_scene::{Geometry, Image, PointCloud, ply};
+use query::{TextSource, TextTable};
 use stage::{Program, Stage};
 use std::fs;
 use std::path::{Component, Path, PathBuf};

@@ -31,5 +31,5 @@ pub use forward::{Forward, drawn, forward, render};
 pub use reference::{Pixel, render_gaussians as render_reference};
 pub use tiles::TILE;
 pub use types::{Gradients, PixelGradients, RasterOptions, Rendered, near_plane};
-pub use weights::{TileWeights, tile_weights};
+pub use weights::{TileWeights, pixel_weights, tile_weights};
 pub use workspace::{Measured, Workspace};

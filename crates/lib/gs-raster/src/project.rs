@@ -124,6 +124,8 @@ pub(crate) struct Lens {
     /// Bounds of x/z and y/z in the Jacobian.
     low: [f64; 2],
     high: [f64; 2],
+    /// Corners of what is looked at, in pixels: Gaussians beside it are not drawn.
+    window: [[f64; 2]; 2],
     pub width: u32,
     pub height: u32,
 }
@@ -141,9 +143,15 @@ impl Lens {
             center,
             low: [0, 1].map(|k| -center[k] / focal[k] - margin[k]),
             high: [0, 1].map(|k| (size[k] - center[k]) / focal[k] + margin[k]),
+            window: [[0.0; 2], size],
             width: c.width,
             height: c.height,
         }
+    }
+
+    /// The same lens, where nothing is looked at but what lies between two corners, in pixels.
+    pub fn within(self, window: [[f64; 2]; 2]) -> Self {
+        Self { window, ..self }
     }
 
     /// View direction (from the camera to the Gaussian), not normalised.
@@ -250,7 +258,7 @@ pub(crate) fn project(p: &Parameters, lens: &Lens, options: &RasterOptions) -> P
     let sigma_max = log - ln(ALPHA_MIN);
     let reach = |variance: f64| (2.0 * sigma_max * variance).sqrt();
     let extent = [reach(e.variance[0]), reach(e.variance[1])];
-    let (w, h) = (f64::from(lens.width), f64::from(lens.height));
+    let [low, high] = lens.window;
 
     let finite = held(e.t[0]) & held(e.t[1]) & held(e.t[2]) & held(p[3]) & held(p[4]) & held(p[5]);
     // Infinite logits are opacities of 0 and 1.
@@ -258,8 +266,8 @@ pub(crate) fn project(p: &Parameters, lens: &Lens, options: &RasterOptions) -> P
     let whole = (e.quat_norm > 1e-12) & held(e.variance[0]) & held(e.variance[1]) & held(e.conic[1]);
     let whole = whole & (e.conic[0] > 1e-38) & (e.conic[2] > 1e-38) & held(e.conic[0]) & held(e.conic[2]);
     let near = (mean[0].abs() <= MEAN_MAX) & (mean[1].abs() <= MEAN_MAX);
-    let touches = (mean[0] + extent[0] > 0.0) & (mean[0] - extent[0] < w);
-    let touches = touches & (mean[1] + extent[1] > 0.0) & (mean[1] - extent[1] < h);
+    let touches = (mean[0] + extent[0] > low[0]) & (mean[0] - extent[0] < high[0]);
+    let touches = touches & (mean[1] + extent[1] > low[1]) & (mean[1] - extent[1] < high[1]);
     // The first reason that holds.
     let unseen = if near & touches { 0.0 } else { 5.0 };
     let unseen = if opacity >= ALPHA_MIN { unseen } else { 4.0 };

@@ -88,8 +88,22 @@ impl Tiles {
         tiles
     }
 
+    /// The tiles of a view, of which only the one that holds a pixel has its whole list; with that tile's number.
+    pub fn around(g: &Gaussians, camera: &Camera, options: &RasterOptions, [x, y]: [usize; 2]) -> (Self, usize) {
+        let tile = [x / TILE, y / TILE];
+        // A tile more on each side, for the rounding of edges in single precision.
+        let corner = |more: f64| tile.map(|t| (t as f64 + more) * TILE as f64);
+        let mut tiles = Self::default();
+        tiles.build_for(g, Lens::new(camera).within([corner(-1.0), corner(2.0)]), options);
+        let number = tile[1] * tiles.columns + tile[0];
+        (tiles, number)
+    }
+
     pub fn build(&mut self, g: &Gaussians, camera: &Camera, options: &RasterOptions) {
-        let lens = Lens::new(camera);
+        self.build_for(g, Lens::new(camera), options);
+    }
+
+    fn build_for(&mut self, g: &Gaussians, lens: Lens, options: &RasterOptions) {
         let columns = (lens.width as usize).div_ceil(TILE);
         let rows = (lens.height as usize).div_ceil(TILE);
         self.chunks.resize_with(g.len().div_ceil(CHUNK), Chunk::default);

@@ -1,7 +1,7 @@
 //! Per-pixel weights, for footprints, silhouettes and features.
 
 use crate::kernels::weights_tile;
-use crate::tiles::{PIXELS, Tiles};
+use crate::tiles::{PIXELS, TILE, Tiles};
 use crate::types::RasterOptions;
 use gs_scene::{Camera, Gaussians};
 use rayon::prelude::*;
@@ -36,16 +36,37 @@ pub fn tile_weights<R: Send>(
     early_stop: bool,
     f: impl Fn(&TileWeights<'_>) -> R + Sync,
 ) -> Vec<R> {
-    // Nobody asks for colours: the harmonics are skipped.
-    let tiles = Tiles::new(g, camera, &RasterOptions { sh_degree: 0, ..options.clone() });
-    let one = |t: usize| {
-        let tile = tiles.tile(t);
-        let (x0, y0, width, height) = tile.rectangle;
-        let gaussians: Vec<u32> = tile.list.iter().map(|&e| tiles.index[e as usize]).collect();
-        let [mut alphas, mut weights] = [(); 2].map(|()| vec![0.0; gaussians.len() * PIXELS]);
-        let alpha = weights_tile(tile, early_stop, &mut alphas, &mut weights);
-        let [alphas, weights] = [&alphas, &weights];
-        f(&TileWeights { x0, y0, width, height, gaussians: &gaussians, alphas, weights, alpha: &alpha })
-    };
-    (0..tiles.count()).into_par_iter().map(one).collect()
+    let tiles = Tiles::new(g, camera, &colourless(options));
+    (0..tiles.count()).into_par_iter().map(|t| one_tile(&tiles, t, early_stop, &f)).collect()
+}
+
+/// The Gaussians that a pixel (x, y) of the view shows, front to back, with their blending weights, 0 to 1 and all above 0: what
+/// [`tile_weights`] with `early_stop` has of it, without the work for the other tiles. Empty outside the view.
+pub fn pixel_weights(g: &Gaussians, camera: &Camera, options: &RasterOptions, [x, y]: [u32; 2]) -> Vec<(u32, f64)> {
+    if x >= camera.width || y >= camera.height {
+        return Vec::new();
+    }
+    let (x, y) = (x as usize, y as usize);
+    let (tiles, number) = Tiles::around(g, camera, &colourless(options), [x, y]);
+    one_tile(&tiles, number, true, &|t: &TileWeights<'_>| {
+        let at = (y - t.y0) * TILE + x - t.x0;
+        let weights = t.weights.iter().skip(at).step_by(PIXELS).map(|&w| f64::from(w));
+        t.gaussians.iter().copied().zip(weights).filter(|w| w.1 > 0.0).collect()
+    })
+}
+
+/// Nobody asks for colours: the harmonics are skipped.
+fn colourless(options: &RasterOptions) -> RasterOptions {
+    RasterOptions { sh_degree: 0, ..options.clone() }
+}
+
+/// What `f` makes of a tile.
+fn one_tile<R>(tiles: &Tiles, number: usize, early_stop: bool, f: &impl Fn(&TileWeights<'_>) -> R) -> R {
+    let tile = tiles.tile(number);
+    let (x0, y0, width, height) = tile.rectangle;
+    let gaussians: Vec<u32> = tile.list.iter().map(|&e| tiles.index[e as usize]).collect();
+    let [mut alphas, mut weights] = [(); 2].map(|()| vec![0.0; gaussians.len() * PIXELS]);
+    let alpha = weights_tile(tile, early_stop, &mut alphas, &mut weights);
+    let [alphas, weights] = [&alphas, &weights];
+    f(&TileWeights { x0, y0, width, height, gaussians: &gaussians, alphas, weights, alpha: &alpha })
 }

@@ -2,7 +2,10 @@
 //! threads nor what is not asked for shows in a single bit.
 
 use glam::DVec3;
-use gs_raster::{Dropped, PixelGradients, RasterOptions, Rendered, Workspace, forward, render_features, tile_weights};
+use gs_raster::{
+    Dropped, PixelGradients, RasterOptions, Rendered, TILE, Workspace, forward, pixel_weights, render_features,
+    tile_weights,
+};
 use gs_scene::{Camera, Gaussians};
 use rand_chacha::ChaCha8Rng;
 use rand_chacha::rand_core::{RngCore, SeedableRng};
@@ -305,4 +308,35 @@ fn what_is_not_asked_for_changes_nothing_else() {
     let (few, picture) = run(&RasterOptions { depth: false, ..all });
     assert!(few == gradients && picture.depth.is_empty());
     assert!(picture == Rendered { depth: Vec::new(), ..rendered });
+}
+
+#[test]
+fn a_pixel_alone_has_the_weights_that_it_has_in_the_view() {
+    let mut g = random(3000, 7);
+    // Some much larger than a tile, some far outside of the view, where the Jacobian is clamped to the image's edges.
+    for i in 0..100 {
+        g.log_scales[i] = [0.5, -1.0, -3.0];
+        g.means[100 + i] = g.means[100 + i].map(|v| 3.0 * v);
+    }
+    for camera in [camera(203, 117), Camera { cx: -40.0, fx: 90.0, ..camera(90, 60) }] {
+        let options = RasterOptions { antialias: true, ..RasterOptions::default() };
+        let size = [camera.width, camera.height];
+        let mut shown = 0;
+        for pixel in
+            [[0, 0], [15, 16], [100, 58], [size[0] - 1, size[1] - 1], [45, 30]].map(|[x, y]| [x % size[0], y % size[1]])
+        {
+            let [x, y] = pixel.map(|v| v as usize);
+            let of_view = tile_weights(&g, &camera, &options, true, |t| {
+                let inside = (t.x0..t.x0 + t.width).contains(&x) && (t.y0..t.y0 + t.height).contains(&y);
+                let weight = |k: usize| f64::from(t.weights[k * TILE * TILE + (y - t.y0) * TILE + x - t.x0]);
+                let all = t.gaussians.iter().enumerate().filter(|_| inside).map(|(k, &i)| (i, weight(k)));
+                all.filter(|w| w.1 > 0.0).collect::<Vec<_>>()
+            });
+            let alone = pixel_weights(&g, &camera, &options, pixel);
+            assert!(alone == of_view.concat(), "{pixel:?}");
+            shown += alone.len();
+        }
+        assert!(shown > 20, "{shown}");
+        assert!(pixel_weights(&g, &camera, &options, [size[0], 0]).is_empty(), "outside the view");
+    }
 }

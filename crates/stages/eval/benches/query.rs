@@ -3,7 +3,8 @@
 //! does.
 
 use artifacts::Instances;
-use eval::{Asker, Index, Selection};
+use eval::Asker;
+use query::{Index, Selection};
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use std::time::Instant;

@@ -4,12 +4,12 @@
 use crate::options::{Benchmark, CheckOptions};
 use crate::protocols::instances;
 use crate::protocols::scannet::ScanFiles;
-use crate::query::text::{TextSource, TextTable};
 use crate::scene::folder_name;
 use crate::score::labels;
 use artifacts::{LerfScene, MaskFeatures, MaskFolder, features_path};
 use gs_io::{Error, Result};
 use gs_scene::dataset::{self, Dataset, LoadOptions, Resolution};
+use query::{TextSource, TextTable};
 use stage::Stage;
 use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};

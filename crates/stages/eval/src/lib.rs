@@ -2,15 +2,14 @@
 //!
 //! `options` holds the options of every command; `cli` says which command runs what: `query` answers questions,
 //! `check` looks at what a benchmark needs, `score` compares with the truth of a scene, `protocols` follows the published benchmarks, `page` makes the report.
-//! They share the labelled Gaussians (`scene`), how a selection becomes a mask (`silhouette`), which Gaussian is nearest
-//! (`nearest`) and the forecast of memory (`memory`).
+//! They share what answers a question (the library `query`), what they load and how they name it (`scene`), how a selection
+//! becomes a mask (`silhouette`) and the forecast of memory (`memory`).
 
 mod check;
 pub mod cli;
 mod mask;
 mod mask_stats;
 mod memory;
-mod nearest;
 mod options;
 mod page;
 mod protocols;
@@ -19,12 +18,10 @@ mod scene;
 mod score;
 mod silhouette;
 
+pub use self::query::ask::Asker;
+pub use self::query::segment::divide;
 pub use mask::Mask;
 pub use protocols::instances::read_truth;
-pub use query::ask::Asker;
-pub use query::ranking::{Index, Selection};
-pub use query::segment::divide;
-pub use query::text::{TextSource, TextTable};
 pub use scene::numbered;
 pub use score::labels::{read as read_labels, read_mask};
 pub use score::{true_confidence, true_labels};

@@ -1,8 +1,9 @@
 //! Forecasts of the memory that a command takes, from the sizes of its files. docs/performance.md compares them with
 //! measured peaks.
 
-use crate::options::{Inputs, TextOptions};
+use crate::options::Inputs;
 use gs_scene::dataset::View;
+use query::TextOptions;
 use std::path::Path;
 
 /// Sizes of what a command reads.

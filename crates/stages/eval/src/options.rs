@@ -3,6 +3,7 @@
 use crate::silhouette::{Rendering, Silhouette};
 use gs_io::{Error, Result};
 use gs_scene::dataset::Resolution;
+use query::TextOptions;
 use serde::{Serialize, Serializer};
 use std::path::PathBuf;
 
@@ -18,30 +19,6 @@ pub struct Inputs {
     /// instances.safetensors of cluster-match
     #[arg(long, value_name = "FILE")]
     pub instances: PathBuf,
-}
-
-/// Where text features come from, and which instances have a descriptor.
-#[derive(Debug, Clone, clap::Args, Serialize)]
-pub struct TextOptions {
-    /// CLIP folder with text.onnx: the other half of the model that encoded the masks
-    #[arg(long, value_name = "DIR")]
-    pub clip: Option<PathBuf>,
-    /// Table of text features by name, instead of --clip: JSON, OpenGaussian's text_features.zip, or npz
-    #[arg(long, value_name = "FILE", conflicts_with = "clip")]
-    pub text_features: Option<PathBuf>,
-    /// Accept another CLIP model than the one that encoded the masks, if its features have the same dimension
-    #[arg(long, requires = "clip")]
-    pub any_model: bool,
-    /// Use only instances that were matched with masks in at least this many views [default: 1; scannet: 2]
-    #[arg(long, value_name = "VIEWS")]
-    pub min_support: Option<u32>,
-}
-
-impl TextOptions {
-    /// Whether there is a source of text features.
-    pub fn given(&self) -> bool {
-        self.clip.is_some() || self.text_features.is_some()
-    }
 }
 
 /// Which instances answer a text.

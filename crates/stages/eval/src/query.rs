@@ -1,6 +1,6 @@
 //! `eval query`: what texts, pictures and places mean.
 //!
-//! `text` has the features of texts, `ranking` compares them with the instances, `ask` selects, `granularity` makes an
+//! The library `query` has the features of texts and compares them with the instances; `ask` selects, `granularity` makes an
 //! answer coarser or finer, `place` answers for pixels and points, `image` for pictures, `segment` divides the cloud;
 //! `show` writes the answers, `interactive` answers texts one by one.
 
@@ -9,18 +9,16 @@ mod granularity;
 mod image;
 mod interactive;
 mod place;
-pub mod ranking;
 pub mod segment;
 pub(crate) mod show;
-pub mod text;
 
 use self::ask::{Asked, Asker};
-use self::text::TextSource;
 use crate::memory::{self, SMALLER, Sizes};
 use crate::options::QueryOptions;
-use crate::scene::{LabelledScene, find_view, load};
+use crate::scene::{find_view, load};
 use gs_io::Result;
 use gs_scene::dataset::LoadOptions;
+use query::{LabelledScene, TextSource};
 use serde_json::{Value, json};
 use stage::Stage;
 

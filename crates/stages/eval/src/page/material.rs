@@ -2,13 +2,14 @@
 
 use super::metrics::Metrics;
 use crate::options::ReportOptions;
-use crate::scene::{LabelledScene, views_to_show};
+use crate::scene::views_to_show;
 use crate::score::Scores;
 use artifacts::{Instances, role};
 use gs_io::{Artifact, Error, IoContext, Result, hash_file};
 use gs_raster::RasterOptions;
 use gs_scene::Geometry;
 use gs_scene::dataset::{Dataset, Split, View};
+use query::LabelledScene;
 use report::picture::Picture;
 use stage::RunRecord;
 use std::collections::BTreeMap;

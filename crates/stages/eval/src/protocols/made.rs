@@ -1,9 +1,9 @@
 //! How the instances of a scene were made, for the rows and notes of tables: read from their provenance and from the records of
 //! the runs before them.
 
-use crate::scene::LabelledScene;
 use artifacts::role;
 use gs_io::Provenance;
+use query::LabelledScene;
 use serde::{Deserialize, Serialize};
 use serde_json::Value;
 use stage::RunRecord;

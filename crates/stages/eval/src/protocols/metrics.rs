@@ -1,10 +1,9 @@
 //! What the protocols of all benchmarks write for a scene.
 
 use super::made::Made;
-use crate::query::text::TextSource;
-use crate::scene::LabelledScene;
 use artifacts::role;
 use gs_io::{Outputs, Result, write_bytes, write_json};
+use query::{LabelledScene, TextSource};
 use report::sheet::Sheet;
 use serde::de::DeserializeOwned;
 use serde::{Deserialize, Serialize};

@@ -1,11 +1,9 @@
 //! Asking instances for what a feature means: the parts of a query that stay loaded between queries.
 
-use super::ranking::{Index, Join, Ranked, Selection};
-use super::text::TextSource;
 use crate::options::Choice;
-use crate::scene::{LabelledScene, read_features};
 use artifacts::role;
 use gs_io::Result;
+use query::{Index, Join, LabelledScene, Ranked, Selection, TextSource, read_features};
 use serde::{Deserialize, Serialize};
 
 /// Everything that answers queries about one set of instances.

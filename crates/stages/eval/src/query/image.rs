@@ -1,8 +1,8 @@
 //! Features of pictures that are asked for.
 
-use crate::scene::LabelledScene;
 use gs_io::{Error, Result};
 use onnx_models::{Bounds, ClipImage, EngineOptions, LabelMap, RgbImage, crop_mask};
+use query::LabelledScene;
 use std::path::{Path, PathBuf};
 
 /// Features of the pictures, padded to a square with black, as masks are shown to CLIP.

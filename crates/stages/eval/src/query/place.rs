@@ -1,12 +1,11 @@
 //! What is at a pixel of a view, or at a point in space.
 
 use super::ask::{Answered, Asked, Asker, Place};
-use super::ranking::{Index, Ranked};
 use crate::options::QueryOptions;
-use crate::scene::{LabelledScene, find_view};
+use crate::scene::find_view;
 use gs_io::{Error, Result};
-use gs_raster::{TILE, tile_weights};
 use gs_scene::dataset::{Dataset, View};
+use query::{Index, LabelledScene, Ranked, pixel_weights};
 use std::collections::BTreeMap;
 
 /// Names that a place is given.
@@ -73,20 +72,14 @@ fn located(
 /// What pixel (x, y) of a view shows: the instances by falling share of the pixel's blending weight.
 fn at_pixel(scene: &LabelledScene, index: &Index<'_>, view: &View, pixel: [u32; 2]) -> Result<(Place, Vec<Ranked>)> {
     let camera = &view.camera;
-    let [x, y] = pixel.map(|v| v as usize);
-    if pixel[0] >= camera.width || pixel[1] >= camera.height {
+    let [x, y] = pixel;
+    if x >= camera.width || y >= camera.height {
         return Err(Error::new("the pixel lies outside the view")
             .field("--pixel")
             .found(format!("{x},{y}"))
             .expected(format!("x below {} and y below {} in {}", camera.width, camera.height, view.stem())));
     }
-    let here = tile_weights(scene.gaussians(), camera, &scene.raster, true, |t| {
-        let inside = (t.x0..t.x0 + t.width).contains(&x) && (t.y0..t.y0 + t.height).contains(&y);
-        let at = inside.then(|| (y - t.y0) * TILE + x - t.x0)?;
-        let weights = t.gaussians.iter().zip(t.weights.chunks_exact(TILE * TILE));
-        Some(weights.map(|(&i, w)| (i, f64::from(w[at]))).filter(|w| w.1 > 0.0).collect::<Vec<_>>())
-    });
-    let weights: Vec<(u32, f64)> = here.into_iter().flatten().flatten().collect();
+    let weights = pixel_weights(scene.gaussians(), camera, &scene.raster, pixel);
     let alpha: f64 = weights.iter().map(|w| w.1).sum();
     let mut shares = BTreeMap::<i32, f64>::new();
     let mut position = [0.0f64; 3];

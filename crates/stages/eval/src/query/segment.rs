@@ -1,13 +1,13 @@
 //! Semantic segmentation of the cloud: every Gaussian gets the text that fits its instance best.
 
 use super::ask::Asker;
-use super::ranking::Index;
 use crate::options::QueryOptions;
-use crate::scene::{LabelledScene, view_name, views_to_show};
+use crate::scene::{view_name, views_to_show};
 use artifacts::{NOISE_COLOR, instance_color};
 use gs_io::{Result, write_bytes};
 use gs_scene::dataset::Dataset;
 use gs_scene::{Gaussians, SH_C0};
+use query::{Index, LabelledScene};
 use report::picture::Picture;
 use serde::{Deserialize, Serialize};
 use std::path::Path;

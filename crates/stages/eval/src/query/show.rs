@@ -2,12 +2,12 @@
 
 use super::ask::{Asked, Asker, QueryResult, QueryView};
 use super::segment::Segmentation;
-use super::text::TextSource;
 use crate::options::QueryOptions;
-use crate::scene::{LabelledScene, find_view, numbered, view_name, views_to_show};
+use crate::scene::{find_view, numbered, view_name, views_to_show};
 use crate::silhouette::Silhouette;
 use gs_io::{Result, write_bytes, write_json};
 use gs_scene::dataset::{Dataset, View};
+use query::{LabelledScene, TextSource};
 use report::picture::{Picture, mask_png};
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeSet;

@@ -2,12 +2,12 @@
 
 use super::labels::FrameLabels;
 use super::metrics::counts;
-use crate::scene::LabelledScene;
 use crate::silhouette::Rendering;
 use gs_io::Result;
 use gs_raster::{RasterOptions, TILE};
 use gs_scene::dataset::Dataset;
 use gs_scene::{Camera, Gaussians};
+use query::LabelledScene;
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
 

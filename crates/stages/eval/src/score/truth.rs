@@ -2,12 +2,11 @@
 
 use super::metrics::{self, InstanceScore};
 use super::scores::{GaussianScores, Scores, ThingScore};
-use crate::nearest::nearest_of;
 use crate::protocols::instances::{MIN_POINTS, average_precision};
-use crate::scene::{LabelledScene, MIN_OPACITY, nearest_solid};
 use artifacts::{TruePoints, TrueScene};
 use gs_io::Result;
 use gs_scene::Geometry;
+use query::{LabelledScene, MIN_OPACITY, nearest_of, nearest_solid};
 use std::path::Path;
 
 /// Scores the instances against `truth/points.safetensors` of the scene: each surface point takes the label of the

@@ -1,13 +1,37 @@
 //! Where text features come from: a CLIP text encoder, or a table made with one.
 
-use crate::options::TextOptions;
 use crate::scene::LabelledScene;
 use artifacts::role;
 use gs_io::{Error, IoContext, Result};
 use onnx_models::{ClipImage, ClipText, EngineOptions};
+use serde::Serialize;
 use std::collections::BTreeMap;
 use std::io::Read;
 use std::path::{Path, PathBuf};
+
+/// Where text features come from, and which instances have a descriptor.
+#[derive(Debug, Clone, clap::Args, Serialize)]
+pub struct TextOptions {
+    /// CLIP folder with text.onnx: the other half of the model that encoded the masks
+    #[arg(long, value_name = "DIR")]
+    pub clip: Option<PathBuf>,
+    /// Table of text features by name, instead of --clip: JSON, OpenGaussian's text_features.zip, or npz
+    #[arg(long, value_name = "FILE", conflicts_with = "clip")]
+    pub text_features: Option<PathBuf>,
+    /// Accept another CLIP model than the one that encoded the masks, if its features have the same dimension
+    #[arg(long, requires = "clip")]
+    pub any_model: bool,
+    /// Use only instances that were matched with masks in at least this many views [default: 1; scannet: 2]
+    #[arg(long, value_name = "VIEWS")]
+    pub min_support: Option<u32>,
+}
+
+impl TextOptions {
+    /// Whether there is a source of text features.
+    pub fn given(&self) -> bool {
+        self.clip.is_some() || self.text_features.is_some()
+    }
+}
 
 /// A source of text features.
 pub enum TextSource {

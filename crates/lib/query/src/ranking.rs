@@ -48,7 +48,8 @@ impl Selection {
 
 /// Instances laid out for many queries: descriptors with their lengths, and the Gaussians of each instance together.
 pub struct Index<'a> {
-    pub(super) instances: &'a Instances,
+    /// The instances themselves.
+    pub instances: &'a Instances,
     norms: Vec<f64>,
     /// Gaussians by instance, ascending within each.
     members: Vec<u32>,

@@ -1,0 +1,13 @@
+//! What answers a question about one set of instances: the instances with their Gaussians (`scene`), features of texts
+//! (`text`), the ranking by them (`ranking`), which Gaussian is nearest to a point (`nearest`) and which a pixel shows.
+
+mod nearest;
+mod ranking;
+mod scene;
+mod text;
+
+pub use gs_raster::pixel_weights;
+pub use nearest::{nearest, nearest_of};
+pub use ranking::{Index, Join, Ranked, Selection};
+pub use scene::{LabelledScene, MIN_OPACITY, nearest_solid, read_features};
+pub use text::{TextOptions, TextSource, TextTable};

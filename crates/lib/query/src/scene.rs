@@ -1,0 +1,98 @@
+//! Instances with the geometry that they were made from.
+
+use crate::nearest::nearest;
+use artifacts::{Features, Instances, role};
+use gs_io::{Artifact, Error, Result, Watched, hash_file};
+use gs_raster::RasterOptions;
+use gs_scene::dataset::Dataset;
+use gs_scene::{Gaussians, Geometry};
+use std::collections::BTreeMap;
+use std::path::Path;
+
+/// Gaussians of less opacity are not taken for a surface.
+pub const MIN_OPACITY: f32 = 0.1;
+
+/// Instances with the Gaussians they label.
+pub struct LabelledScene {
+    /// The geometry with all its Gaussians; N.
+    pub geometry: Geometry,
+    /// How to render them.
+    pub raster: RasterOptions,
+    /// The instances; labels are as many as Gaussians.
+    pub instances: Instances,
+    /// The file of the instances.
+    pub artifact: Artifact,
+    /// Content hashes, by role.
+    pub inputs: BTreeMap<String, String>,
+}
+
+impl LabelledScene {
+    /// Reads `instances.safetensors` and the geometry it was made from.
+    pub fn read(instances: &Path, geometry: &Path) -> Result<Self> {
+        let (labelled, artifact) = Instances::read(instances)?;
+        let watched = Watched::new([geometry]);
+        let geometry_hash = hash_file(geometry)?;
+        artifact.expect_input(role::GEOMETRY, &geometry_hash)?;
+        let path = geometry;
+        let geometry = Geometry::read(path)?;
+        watched.check()?;
+        if labelled.label.len() != geometry.gaussians.len() {
+            return Err(Error::new("not a label per Gaussian")
+                .file(instances)
+                .field("label")
+                .found(labelled.label.len())
+                .expected(format!("{} ({})", geometry.gaussians.len(), path.display()))
+                .hint("run cluster-match again"));
+        }
+        let inputs =
+            BTreeMap::from([(role::GEOMETRY.into(), geometry_hash), ("instances".into(), artifact.hash().into())]);
+        let raster = RasterOptions::of(&geometry);
+        Ok(Self { geometry, raster, instances: labelled, artifact, inputs })
+    }
+
+    /// Whether no Gaussian belongs to an instance.
+    pub fn all_noise(&self) -> bool {
+        self.instances.label.iter().all(|&l| l < 0)
+    }
+
+    /// The nearest Gaussian for each point, of those with an instance and an opacity of at least 0.1: fainter ones are no
+    /// surface (docs/protocols.md). None where there is no such Gaussian.
+    pub fn nearest_labelled(&self, points: &[[f32; 3]]) -> Vec<Option<u32>> {
+        nearest_solid(self.gaussians(), points, |i| self.instances.label[i] >= 0)
+    }
+
+    /// All Gaussians.
+    pub fn gaussians(&self) -> &Gaussians {
+        &self.geometry.gaussians
+    }
+
+    /// Where the instances were read from.
+    pub fn path(&self) -> &Path {
+        self.artifact.path()
+    }
+
+    /// Checks that the dataset is the one that the instances were made from.
+    pub fn check_dataset(&self, dataset: &Dataset) -> Result<()> {
+        self.artifact.expect_input(role::DATASET, &dataset.hash()?).map_err(|e| {
+            e.expected(format!("the photographs, cameras and points of {}", dataset.root.display()))
+                .hint("give the scene that the instances were made from, or run make again if it was edited")
+        })
+    }
+}
+
+/// The nearest Gaussian for each point, of those of opacity at least 0.1 for which `counts` holds.
+pub fn nearest_solid(g: &Gaussians, points: &[[f32; 3]], counts: impl Fn(usize) -> bool) -> Vec<Option<u32>> {
+    let solid = |&i: &u32| counts(i as usize) && g.opacity(i as usize) >= MIN_OPACITY;
+    let candidates: Vec<u32> = (0..g.len() as u32).filter(solid).collect();
+    nearest(g, &candidates, points)
+}
+
+/// Reads the features of some of `gaussians` Gaussians of a geometry.
+pub fn read_features(path: &Path, geometry_hash: &str, gaussians: usize) -> Result<Features> {
+    let (features, artifact) = Features::read(path)?;
+    artifact.expect_input(role::GEOMETRY, geometry_hash)?;
+    if features.kept.last().is_some_and(|&last| last as usize >= gaussians) {
+        return Err(Error::new("index out of range").file(path).field("kept").hint("run feat-train again"));
+    }
+    Ok(features)
+}
