@@ -1,7 +1,7 @@
 //! The formats and what must hold of whatever their readers accept.
 
 use crate::seeds;
-use artifacts::{Features, Footprints, Graph, Instances, MaskFeatures, MaskMaps, TruePoints, TrueScene};
+use artifacts::{Edits, Features, Footprints, Graph, Instances, MaskFeatures, MaskMaps, TruePoints, TrueScene};
 use clap::Parser;
 use eval::{read_labels, read_mask, read_truth};
 use gs_scene::dataset::{self, LoadOptions, Resolution};
@@ -53,7 +53,7 @@ pub const FORMATS: [Format; 10] = [
     // One array of 16 MiB is believed, then 64 bytes a byte; of one-byte numbers, as floats.
     Format { name: "npz", check: check_npz, seeds: seeds::npz, memory: (7 << 24, JSON + 64 * 5) },
     Format { name: "artifact", check: check_artifact, seeds: seeds::artifact, memory: (FIXED, JSON) },
-    // Polygons stand for pictures of the size that the file names; all of a frame have 2^28 pixels at most.
+    // Edits of instances, too. Polygons stand for pictures of the size that the file names; all of a frame have 2^28 pixels at most.
     Format { name: "labels", check: check_labels, seeds: seeds::labels, memory: (FIXED + (1 << 28), JSON) },
     Format { name: "scannet", check: check_scannet, seeds: seeds::scannet, memory: (FIXED, JSON) },
     // Writing takes a buffer of a megabyte for each file.
@@ -244,6 +244,13 @@ fn check_artifact(bytes: &[u8]) {
 
 fn check_labels(bytes: &[u8]) {
     with("labels/frame_00001.json", bytes, |path| {
+        if let Some(edits) = sound(Edits::read(path), path) {
+            let (mut instances, means) = (seeds::instances(), [[0.0; 3]; 4]);
+            if let Ok(remarks) = edits.apply(&mut instances, &means) {
+                assert!(remarks.names.keys().all(|&k| instances.count[k as usize] > 0));
+                assert!(remarks.metres_per_unit.is_none_or(|m| m.is_finite() && m > 0.0));
+            }
+        }
         if let Some(frame) = sound(read_labels(path), path) {
             assert_eq!(frame.frame, "frame_00001");
             for (name, mask) in &frame.categories {

@@ -127,6 +127,27 @@ pub(crate) fn npz() -> Vec<Vec<u8>> {
 }
 
 /// One of each artifact.
+/// Two instances of four Gaussians.
+pub(crate) fn instances() -> Instances {
+    let edge = TreeEdge { parent: 4, child: 5, lambda: 1.0, size: 2, instance: 0 };
+    Instances {
+        label: vec![0, -1, 0, 1],
+        dim: 2,
+        descriptor: vec![1.0, 0.0, 0.0, 1.0],
+        support: vec![1, 2],
+        score: vec![0.5, 1.0],
+        count: vec![2, 1],
+        centroid: vec![[0.0; 3]; 2],
+        bbox_min: vec![[0.0; 3]; 2],
+        bbox_max: vec![[1.0; 3]; 2],
+        views: vec!["a".into()],
+        matches: vec![Match { instance: 1, view: 0, mask: 3, score: 0.5, visible: 2.0 }],
+        tree: vec![edge, TreeEdge { parent: 5, child: 6, instance: 1, ..edge }],
+        node: vec![5, -1, 5, 6],
+        oriented: vec![OrientedBox::default(); 2],
+    }
+}
+
 pub(crate) fn artifact() -> Vec<Vec<u8>> {
     let provenance = || Provenance { program: "test 1".into(), ..Provenance::default() };
     let graph = Graph {
@@ -152,29 +173,12 @@ pub(crate) fn artifact() -> Vec<Vec<u8>> {
         weight: vec![1.0, 0.5, 2.0],
         ..FootprintsBuilder::default()
     };
-    let edge = TreeEdge { parent: 4, child: 5, lambda: 1.0, size: 2, instance: 0 };
-    let instances = Instances {
-        label: vec![0, -1, 0, 1],
-        dim: 2,
-        descriptor: vec![1.0, 0.0, 0.0, 1.0],
-        support: vec![1, 2],
-        score: vec![0.5, 1.0],
-        count: vec![2, 1],
-        centroid: vec![[0.0; 3]; 2],
-        bbox_min: vec![[0.0; 3]; 2],
-        bbox_max: vec![[1.0; 3]; 2],
-        views: vec!["a".into()],
-        matches: vec![Match { instance: 1, view: 0, mask: 3, score: 0.5, visible: 2.0 }],
-        tree: vec![edge, TreeEdge { parent: 5, child: 6, instance: 1, ..edge }],
-        node: vec![5, -1, 5, 6],
-        oriented: vec![OrientedBox::default(); 2],
-    };
     let truth = TruePoints { position: vec![[0.0; 3]; 2], instance: vec![0, 1], part: vec![0, 0], class: vec![-1, 1] };
     vec![
         made("a", |p| graph.write(p, provenance()).expect("written")),
         made("a", |p| features.write(p, provenance()).expect("written")),
         made("a", |p| footprints.write(p, provenance()).expect("written")),
-        made("a", |p| instances.write(p, provenance()).expect("written")),
+        made("a", |p| instances().write(p, provenance()).expect("written")),
         made("a", |p| truth.write(p, provenance()).expect("written")),
     ]
 }
@@ -184,6 +188,9 @@ pub(crate) fn labels() -> Vec<Vec<u8>> {
         br#"{"info":{"description":"ISAT","name":"a.jpg","width":20,"height":10,"depth":3,"note":""},
 "objects":[{"category":"cup","group":1,"segmentation":[[1.9,1.2],[4.7,1.9],[4.2,3.3],[1.1,3.9]],"bbox":[1,1,4,3]},
 {"category":"../../cup","segmentation":[[10,1],[11,1],[30,2],[-10,20]]},{"category":"lid","segmentation":[]}]}"#
+            .to_vec(),
+        br#"{"format":"instances.edits","version":1,"instances":"ab","edits":[{"op":"rename","instance":1,"name":"kettle"},
+{"op":"merge","instances":[0,1]},{"op":"split","instance":0},{"op":"scale","from":[0,0,0],"to":[1,0,0],"metres":0.3}]}"#
             .to_vec(),
     ]
 }

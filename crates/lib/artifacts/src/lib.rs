@@ -5,6 +5,8 @@
 //! original indices, n of them. Graph, footprints and features name kept Gaussians by their position in that list.
 
 mod checks;
+mod edits;
+mod extents;
 mod features;
 mod footprints;
 mod graph;
@@ -17,6 +19,8 @@ mod palette;
 mod scratch;
 mod truth;
 
+pub use edits::{Edit, Edits, Remarks};
+pub use extents::Extents;
 pub use features::Features;
 pub use footprints::{Entries, Footprints, FootprintsBuilder, PixelSamples, Row};
 pub use graph::Graph;
@@ -50,6 +54,8 @@ pub mod role {
     pub const GRAPH: &str = "graph";
     /// `footprints.safetensors`.
     pub const FOOTPRINTS: &str = "footprints";
+    /// `instances.edits.json`.
+    pub const EDITS: &str = "edits";
     /// `features.safetensors`.
     pub const FEATURES: &str = "features";
 }
