@@ -1,8 +1,8 @@
 //! Instances with the geometry that they were made from.
 
 use crate::nearest::nearest;
-use artifacts::{Features, Instances, role};
-use gs_io::{Artifact, Error, Result, Watched, hash_file};
+use artifacts::{Edits, Features, Instances, Remarks, role};
+use gs_io::{Artifact, Error, IoContext, Result, Watched, hash_bytes, hash_file};
 use gs_raster::RasterOptions;
 use gs_scene::dataset::Dataset;
 use gs_scene::{Gaussians, Geometry};
@@ -18,8 +18,10 @@ pub struct LabelledScene {
     pub geometry: Geometry,
     /// How to render them.
     pub raster: RasterOptions,
-    /// The instances; labels are as many as Gaussians.
+    /// The instances, edits included; labels are as many as Gaussians.
     pub instances: Instances,
+    /// What the edits say beyond them.
+    pub remarks: Remarks,
     /// The file of the instances.
     pub artifact: Artifact,
     /// Content hashes, by role.
@@ -27,9 +29,13 @@ pub struct LabelledScene {
 }
 
 impl LabelledScene {
-    /// Reads `instances.safetensors` and the geometry it was made from.
-    pub fn read(instances: &Path, geometry: &Path) -> Result<Self> {
-        let (labelled, artifact) = Instances::read(instances)?;
+    /// Reads `instances.safetensors` and the geometry it was made from, and changes the instances by the edits, if there are
+    /// any ([`Edits::apply`]).
+    ///
+    /// # Errors
+    /// When a file is damaged, the geometry or the edits are of other instances, or an edit does not fit them.
+    pub fn read(instances: &Path, geometry: &Path, edits: Option<&Path>) -> Result<Self> {
+        let (mut labelled, artifact) = Instances::read(instances)?;
         let watched = Watched::new([geometry]);
         let geometry_hash = hash_file(geometry)?;
         artifact.expect_input(role::GEOMETRY, &geometry_hash)?;
@@ -44,10 +50,16 @@ impl LabelledScene {
                 .expected(format!("{} ({})", geometry.gaussians.len(), path.display()))
                 .hint("run cluster-match again"));
         }
-        let inputs =
+        let mut inputs =
             BTreeMap::from([(role::GEOMETRY.into(), geometry_hash), ("instances".into(), artifact.hash().into())]);
+        let mut remarks = Remarks::default();
+        if let Some(path) = edits {
+            let (edits, hash) = read_edits(path, &artifact)?;
+            remarks = edits.apply(&mut labelled, &geometry.gaussians.means).map_err(|e| e.file(path))?;
+            inputs.insert(role::EDITS.into(), hash);
+        }
         let raster = RasterOptions::of(&geometry);
-        Ok(Self { geometry, raster, instances: labelled, artifact, inputs })
+        Ok(Self { geometry, raster, instances: labelled, remarks, artifact, inputs })
     }
 
     /// Whether no Gaussian belongs to an instance.
@@ -78,6 +90,21 @@ impl LabelledScene {
                 .hint("give the scene that the instances were made from, or run make again if it was edited")
         })
     }
+}
+
+/// Reads edits of these instances, with their content hash.
+fn read_edits(path: &Path, instances: &Artifact) -> Result<(Edits, String)> {
+    let bytes = std::fs::read(path).at("read", path)?;
+    let edits = Edits::parse(&bytes).map_err(|e| e.file(path))?;
+    if edits.instances != instances.hash() {
+        return Err(Error::new("edits of other instances")
+            .file(path)
+            .field("instances")
+            .found(format!("{:.12}", edits.instances))
+            .expected(format!("{:.12} ({})", instances.hash(), instances.path().display()))
+            .hint("give the instances that were edited, or leave the edits out and make them again in explore"));
+    }
+    Ok((edits, hash_bytes(&bytes)))
 }
 
 /// The nearest Gaussian for each point, of those of opacity at least 0.1 for which `counts` holds.

@@ -19,6 +19,9 @@ pub struct Inputs {
     /// instances.safetensors of cluster-match
     #[arg(long, value_name = "FILE")]
     pub instances: PathBuf,
+    /// instances.edits.json of explore: what a person merged, split and named
+    #[arg(long, value_name = "FILE")]
+    pub edits: Option<PathBuf>,
 }
 
 /// Which instances answer a text.
@@ -222,7 +225,7 @@ pub struct LerfOptions {
     #[serde(flatten)]
     pub inputs: Option<Inputs>,
     /// Score masks that another program saved, <frame>_<category>.png above grey level 10, instead of instances
-    #[arg(long, value_name = "DIR", conflicts_with_all = ["scene", "geometry", "instances"], requires = "labels")]
+    #[arg(long, value_name = "DIR", conflicts_with_all = ["scene", "geometry", "instances", "edits"], requires = "labels")]
     pub predictions: Option<PathBuf>,
     /// The rule of the figures. With --features the table has the figures of both
     #[arg(long, value_enum, default_value = "top1", conflicts_with = "predictions")]
@@ -311,7 +314,7 @@ pub struct ScannetOptions {
     pub inputs: Option<Inputs>,
     /// Score labels that another program gave the vertices, instead of instances: a file of one NYU40 id a vertex, .npy or text, 0
     /// for none
-    #[arg(long, value_name = "FILE", conflicts_with_all = ["scene", "geometry", "instances"], requires = "labels")]
+    #[arg(long, value_name = "FILE", conflicts_with_all = ["scene", "geometry", "instances", "edits"], requires = "labels")]
     pub predictions: Option<PathBuf>,
     /// Folder of the scan's truth, such as <scan>_vh_clean_2.labels.ply [default: the scene]
     #[arg(long, value_name = "DIR")]

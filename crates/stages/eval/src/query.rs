@@ -48,6 +48,7 @@ pub(crate) fn run(o: &QueryOptions, parameters: Value, stage: &Stage, json_lines
             let features = asker.source.as_ref().map_or(Ok(Vec::new()), known)?;
             let mut asked = answers(o, &features, &scene, &asker, stage)?;
             asked.extend(place::answers(o, &scene, &dataset, &asker)?);
+            asked.iter_mut().for_each(|one| one.name(&scene.remarks.names));
             let divided = o.segment.then(|| segment::write(o, &features, &scene, &dataset, &asker, out));
             let segmentation = divided.transpose()?;
             let results = show::write(o, &scene, &dataset, &asker, asked, segmentation, out)?;

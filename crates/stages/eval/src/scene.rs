@@ -15,14 +15,14 @@ pub fn load(folder: &Path, options: &LoadOptions, stage: &Stage) -> Result<Datas
 }
 
 impl Inputs {
-    /// The files of the scene, its geometry and its instances.
+    /// The files of the scene, its geometry, its instances and their edits.
     pub fn files<'a>(&'a self, dataset: &'a Dataset) -> impl Iterator<Item = &'a PathBuf> {
-        dataset.files.iter().chain([&self.instances, &self.geometry])
+        dataset.files.iter().chain([&self.instances, &self.geometry]).chain(&self.edits)
     }
 
     /// Reads instances and geometry, which must be those of the dataset. Damaged Gaussians are reported.
     pub fn read(&self, dataset: &Dataset, stage: &Stage) -> Result<LabelledScene> {
-        let scene = LabelledScene::read(&self.instances, &self.geometry)?;
+        let scene = LabelledScene::read(&self.instances, &self.geometry, self.edits.as_deref())?;
         if let Some(damage) = scene.geometry.damage() {
             stage.skipped(&damage);
         }

@@ -50,7 +50,7 @@ impl<'a> Material<'a> {
     ) -> Result<Self> {
         let path = options.run_dir.join("instances.safetensors");
         let (geometry, found, inputs) = if path.exists() {
-            let labelled = LabelledScene::read(&path, geometry)?;
+            let labelled = LabelledScene::read(&path, geometry, None)?;
             labelled.check_dataset(dataset)?;
             let LabelledScene { geometry, instances, artifact, inputs, .. } = labelled;
             (geometry, Some((instances, artifact)), inputs)
@@ -94,9 +94,10 @@ fn psnr(a: &Picture, b: &Picture) -> f64 {
     -10.0 * mse.max(1e-20).log10()
 }
 
-/// Whether the record of an output of eval, if it has one, names the instances of this run.
+/// Whether the record of an output of eval, if it has one, names the instances of this run, as they are without edits.
 pub(super) fn is_of(output: &Path, inputs: &BTreeMap<String, String>) -> bool {
-    RunRecord::read(output).map_or(true, |record| record.inputs.get("instances") == inputs.get("instances"))
+    let same = |record: RunRecord| ["instances", role::EDITS].iter().all(|&r| record.inputs.get(r) == inputs.get(r));
+    RunRecord::read(output).map_or(true, same)
 }
 
 /// Reads a JSON file that need not exist.

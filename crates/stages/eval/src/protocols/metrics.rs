@@ -110,6 +110,9 @@ pub fn sources(scene: &LabelledScene, texts: Option<&TextSource>) -> Result<BTre
     if let Some(source) = texts {
         features.insert("text features".into(), format!("{} ({:.12})", source.describe(), source.hash()?));
     }
+    if let Some(edits) = scene.inputs.get(role::EDITS) {
+        features.insert("edits".into(), format!("{edits:.12}"));
+    }
     if let Some(masks) = scene.artifact.provenance().inputs.get(role::MASK_FEATURES) {
         features.insert("mask features".into(), format!("{masks:.12}"));
     }

@@ -5,6 +5,7 @@ use artifacts::role;
 use gs_io::Result;
 use query::{Index, Join, LabelledScene, Ranked, Selection, TextSource, read_features};
 use serde::{Deserialize, Serialize};
+use std::collections::BTreeMap;
 
 /// Everything that answers queries about one set of instances.
 pub struct Asker<'a> {
@@ -74,9 +75,20 @@ pub struct QueryResult {
     /// File of the selected Gaussians, beside `query.json`; none when nothing is selected.
     pub ply: Option<String>,
     /// The best instances, selected or not.
-    pub ranking: Vec<Ranked>,
+    pub ranking: Vec<Entry>,
     /// Pictures.
     pub views: Vec<QueryView>,
+}
+
+/// An instance in the ranking of `query.json`.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct Entry {
+    /// Which instance, and how well it fits.
+    #[serde(flatten)]
+    pub ranked: Ranked,
+    /// What a person named it, where one did.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub name: Option<String>,
 }
 
 /// Pictures of an answer in one view.
@@ -101,12 +113,17 @@ pub struct Asked {
 impl Asked {
     /// What was asked for with its answer, of which there is no file yet.
     pub fn new(text: String, kind: &str, place: Option<Place>, answer: Answered) -> Self {
-        let Answered { mut ranking, selected, score, gaussians } = answer;
-        ranking.truncate(KEPT_RANKS);
+        let Answered { ranking, selected, score, gaussians } = answer;
+        let ranking = ranking.into_iter().take(KEPT_RANKS).map(|ranked| Entry { ranked, name: None }).collect();
         let (kind, count) = (kind.into(), gaussians.len());
         let result =
             QueryResult { text, kind, place, selected, score, gaussians: count, ply: None, ranking, views: Vec::new() };
         Self { result, gaussians }
+    }
+
+    /// Puts in what instances were named.
+    pub fn name(&mut self, names: &BTreeMap<u32, String>) {
+        self.result.ranking.iter_mut().for_each(|e| e.name = names.get(&e.ranked.instance).cloned());
     }
 }
 

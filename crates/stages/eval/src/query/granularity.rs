@@ -23,8 +23,8 @@ pub fn apply(granularity: Granularity, instances: &Instances, asked: Asked, say:
         let mut selected = vec![best];
         selected.extend(instances.instances_of_cluster(parent).into_iter().filter(|&i| i != best));
         let gaussians = instances.gaussians_of_cluster(parent);
-        let QueryResult { text, kind, ranking, score, .. } = asked.result;
-        return vec![Asked::new(text, &kind, None, Answered { ranking, selected, score, gaussians })];
+        let result = QueryResult { selected, gaussians: gaussians.len(), ..asked.result };
+        return vec![Asked { result, gaussians }];
     }
     if family.parts.is_empty() {
         nothing("parts");

@@ -148,10 +148,12 @@ pub fn answer_table(q: &QueryResult) -> String {
         return s;
     }
     let _ = writeln!(s, "  {:>4} {:>9} {:>8} {:>6} {:>10}", "rank", "instance", "score", "views", "Gaussians");
-    for (i, r) in q.ranking.iter().take(ROWS).enumerate() {
+    for (i, entry) in q.ranking.iter().take(ROWS).enumerate() {
+        let r = &entry.ranked;
         let mark = if q.selected.contains(&r.instance) { "  selected" } else { "" };
-        let _ =
-            writeln!(s, "  {:>4} {:>9} {:>8.4} {:>6} {:>10}{mark}", i + 1, r.instance, r.score, r.support, r.gaussians);
+        let name = entry.name.as_ref().map_or(String::new(), |name| format!("  {name}"));
+        let (rank, instance, views) = (i + 1, r.instance, r.support);
+        let _ = writeln!(s, "  {rank:>4} {instance:>9} {:>8.4} {views:>6} {:>10}{mark}{name}", r.score, r.gaussians);
     }
     if q.ranking.is_empty() {
         s += if q.place.is_some() { "  nothing is there\n" } else { "  no instance has a descriptor\n" };

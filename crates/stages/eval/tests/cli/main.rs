@@ -708,3 +708,38 @@ fn a_scene_of_a_benchmark_is_checked_before_anything_runs() {
     assert!(said.contains("not a label file") && said.contains("no id map is of a photograph"), "{said}");
     assert!(said.contains("1 such as other_s.npy"), "{said}");
 }
+
+#[test]
+fn what_a_person_changed_of_the_instances_counts() {
+    let f = Fixture::new(2);
+    let file = f.path().join("instances.edits.json");
+    let hash = |f: &Fixture| gs_io::hash_file(f.instances()).unwrap();
+    let edits = json!([
+        {"op": "rename", "instance": 1, "name": "marble"},
+        {"op": "merge", "instances": [1, 0]},
+    ]);
+    let write = |instances: &str, edits: &Value| {
+        let all = json!({"format": "instances.edits", "version": 1, "instances": instances, "edits": edits});
+        fs::write(&file, all.to_string()).unwrap();
+    };
+    write(&hash(&f), &edits);
+    let question = format!("{TABLE}|--text|red ball|--edits|{{}}/instances.edits.json");
+    let printed = f.good("query", &question);
+    assert!(printed.contains("(2 Gaussians selected)") && printed.contains("  selected  marble"), "{printed}");
+    let ranking = &f.json("out/query.json")["queries"][0]["ranking"];
+    assert_eq!((&ranking[0]["instance"], &ranking[0]["name"]), (&json!(1), &json!("marble")));
+    assert!(ranking[1]["instance"] == 2 && ranking[1].get("name").is_none(), "{ranking}");
+    assert_eq!(f.json("out/query.json.run.json")["inputs"]["edits"], json!(gs_io::hash_file(&file).unwrap()));
+    // Scores count them too, and the report, which shows the instances as they were found, leaves such scores out.
+    f.good("score", &format!("{SCORE}|--edits|{{}}/instances.edits.json"));
+    fs::rename(f.path().join("score.json"), f.run().join("score.json")).unwrap();
+    fs::rename(f.path().join("score.json.run.json"), f.run().join("score.json.run.json")).unwrap();
+    f.good("report", REPORT);
+    assert!(f.json("metrics.json")["skipped"].to_string().contains("score.json is of other instances"));
+
+    write(&hash(&f), &json!([{"op": "split", "instance": 2}]));
+    f.bad("query", &question, &["instances.edits.json: edits[0].instance: the instance has no parts; found 2"]);
+    write("0123456789abcdef", &edits);
+    let e = "instances.edits.json: instances: edits of other instances; found 0123456789ab, expected ";
+    f.bad("query", &question, &[e, "make them again in explore"]);
+}
