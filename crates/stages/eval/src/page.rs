@@ -2,11 +2,10 @@
 //!
 //! Only the scene and the geometry have to be there. Whatever else a run did not make leaves its section out, with a
 //! line that says why. `material` reads what there is, `sections` writes the page, with the records of the stages
-//! (`runs`) and features as colours (`pca`).
+//! (`runs`).
 
 mod material;
 mod metrics;
-mod pca;
 mod runs;
 mod sections;
 

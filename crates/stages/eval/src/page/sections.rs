@@ -2,7 +2,6 @@
 
 use super::material::{Material, Shown, is_of, optional_json};
 use super::metrics::Metrics;
-use super::pca::pca;
 use super::runs::{self, Run, grouped};
 use crate::query::show::QueryResults;
 use crate::score::{QueryScore, ThingScore};
@@ -11,6 +10,7 @@ use gs_io::{Error, IoContext, Result};
 use gs_scene::dataset::{Dataset, Split, View};
 use query::read_features;
 use report::curve;
+use report::feature_colors;
 use report::html::{Figure, Page};
 use report::picture::Picture;
 use std::collections::BTreeSet;
@@ -19,8 +19,6 @@ use std::path::{Component, Path, PathBuf};
 /// Width of pictures on the page, two or three beside each other.
 const WIDTH_OF: [usize; 4] = [900, 900, 640, 440];
 const QUALITY: u8 = 86;
-/// Rows of features that principal components are computed from; more change no colour that one would see.
-const PCA_ROWS: usize = 100_000;
 /// Pictures of features and instances are rendered at most this wide: the page shows them smaller.
 const MAX_RENDER: u32 = 960;
 /// What is behind Gaussians in rendered pictures.
@@ -127,11 +125,8 @@ pub(super) fn features(m: &Material, page: &mut Page, metrics: &mut Metrics) -> 
         metrics.skipped.push("features: no Gaussian has one".into());
         return Ok(());
     }
-    let step = features.kept.len().div_ceil(PCA_ROWS);
-    let rows: Vec<f32> = features.values.chunks_exact(features.dim).step_by(step).flatten().copied().collect();
-    let p = pca(&rows, features.dim, 3);
     let mut colors = vec![None; m.geometry.gaussians.len()];
-    for (&i, c) in features.kept.iter().zip(p.colors(&features.values)) {
+    for (&i, c) in features.kept.iter().zip(feature_colors(&features.values, features.dim)) {
         colors[i as usize] = Some(c);
     }
     page.section("features", "Features");

@@ -1,7 +1,21 @@
 //! Principal components of feature vectors, to look at them as colours.
 
+/// Rows that principal components are computed from; more change no colour that one would see.
+const ROWS: usize = 100_000;
+
+/// Feature vectors (`[n][dim]`) as colours of 0 to 1: their three leading principal components are red, green and blue, two
+/// standard deviations to either side. Missing components give 0.5.
+pub fn feature_colors(values: &[f32], dim: usize) -> Vec<[f32; 3]> {
+    if dim == 0 || values.is_empty() {
+        return Vec::new();
+    }
+    let step = (values.len() / dim).div_ceil(ROWS);
+    let rows: Vec<f32> = values.chunks_exact(dim).step_by(step).flatten().copied().collect();
+    pca(&rows, dim, 3).colors(values)
+}
+
 /// Leading principal components.
-pub struct Pca {
+struct Pca {
     mean: Vec<f64>,
     /// Unit vectors by falling variance, largest entry positive.
     components: Vec<Vec<f64>>,
@@ -14,7 +28,7 @@ const STEPS: usize = 200;
 
 /// The `count` leading principal components of `rows` (`[n][dim]`), fewer where the rows vary along fewer, by power iteration
 /// on the covariance in f64.
-pub fn pca(rows: &[f32], dim: usize, count: usize) -> Pca {
+fn pca(rows: &[f32], dim: usize, count: usize) -> Pca {
     assert!(dim > 0 && rows.len().is_multiple_of(dim));
     let n = (rows.len() / dim).max(1) as f64;
     let mut mean = vec![0.0; dim];
@@ -80,7 +94,7 @@ fn leading(covariance: &[f64], found: &[Vec<f64>], dim: usize) -> (Vec<f64>, f64
 impl Pca {
     /// Colours of rows (`[n][dim]`): three components, two standard deviations to either side spread over 0 to 1.
     /// Missing components give 0.5.
-    pub fn colors(&self, rows: &[f32]) -> Vec<[f32; 3]> {
+    fn colors(&self, rows: &[f32]) -> Vec<[f32; 3]> {
         let tint = |row: &[f32]| {
             let centred: Vec<f64> = row.iter().zip(&self.mean).map(|(&v, m)| f64::from(v) - m).collect();
             [0, 1, 2].map(|k| match self.components.get(k) {
