@@ -9,6 +9,7 @@ mod table;
 use crate::{Gaussians, sh_coefficients};
 use gs_io::{Error, IoContext, Result, write_atomic};
 use std::io::Read;
+use std::io::Write;
 use std::path::Path;
 use table::{AGAIN, Table};
 
@@ -127,7 +128,8 @@ fn header(count: usize, comments: &[String], properties: &[(&str, String)]) -> S
 
 /// Writes the standard 3DGS layout: little-endian floats, 62 properties at degree 3. `comments` become comment lines.
 pub fn write_gaussians(path: impl AsRef<Path>, gaussians: &Gaussians, comments: &[String]) -> Result<()> {
-    write_rows(path.as_ref(), gaussians, (gaussians.len(), 0..gaussians.len()), comments)
+    let (path, rows) = (path.as_ref(), (gaussians.len(), 0..gaussians.len()));
+    write_atomic(path, |w| write_rows(w, path, gaussians, rows, comments))
 }
 
 /// The same for the Gaussians `rows` only, in that order, without a copy of them.
@@ -137,40 +139,49 @@ pub fn write_some_gaussians(
     rows: &[u32],
     comments: &[String],
 ) -> Result<()> {
-    write_rows(path.as_ref(), gaussians, (rows.len(), rows.iter().map(|&i| i as usize)), comments)
+    let (path, rows) = (path.as_ref(), (rows.len(), rows.iter().map(|&i| i as usize)));
+    write_atomic(path, |w| write_rows(w, path, gaussians, rows, comments))
 }
 
+/// The bytes of the file that [`write_some_gaussians`] writes.
+pub fn some_gaussians(gaussians: &Gaussians, rows: &[u32], comments: &[String]) -> Result<Vec<u8>> {
+    let mut bytes = Vec::new();
+    let rows = (rows.len(), rows.iter().map(|&i| i as usize));
+    write_rows(&mut bytes, Path::new("a PLY in memory"), gaussians, rows, comments)?;
+    Ok(bytes)
+}
+
+/// Writes a PLY to `w`, which errors call `place`.
 fn write_rows(
-    path: &Path,
+    w: &mut dyn Write,
+    place: &Path,
     gaussians: &Gaussians,
     (count, rows): (usize, impl Iterator<Item = usize>),
     comments: &[String],
 ) -> Result<()> {
-    gaussians.check().map_err(|e| e.file(path))?;
+    gaussians.check().map_err(|e| e.file(place))?;
     let k = sh_coefficients(gaussians.sh_degree);
     let mut names: Vec<String> =
         ["x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2"].map(String::from).into();
     names.extend((0..3 * (k - 1)).map(|i| format!("f_rest_{i}")));
     names.extend(["opacity", "scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3"].map(String::from));
     let properties: Vec<(&str, String)> = names.into_iter().map(|n| ("float", n)).collect();
-    write_atomic(path, |w| {
-        w.write_all(header(count, comments, &properties).as_bytes()).at("write", path)?;
-        let mut row: Vec<u8> = Vec::with_capacity(4 * properties.len());
-        for i in rows {
-            row.clear();
-            let mut put = |v: f32| row.extend_from_slice(&v.to_le_bytes());
-            gaussians.means[i].into_iter().chain([0.0; 3]).for_each(&mut put);
-            let sh = gaussians.sh_of(i);
-            sh[..3].iter().copied().for_each(&mut put);
-            for channel in 0..3 {
-                (1..k).for_each(|c| put(sh[3 * c + channel]));
-            }
-            put(gaussians.opacity_logits[i]);
-            gaussians.log_scales[i].into_iter().chain(gaussians.rotations[i]).for_each(&mut put);
-            w.write_all(&row).at("write", path)?;
+    w.write_all(header(count, comments, &properties).as_bytes()).at("write", place)?;
+    let mut row: Vec<u8> = Vec::with_capacity(4 * properties.len());
+    for i in rows {
+        row.clear();
+        let mut put = |v: f32| row.extend_from_slice(&v.to_le_bytes());
+        gaussians.means[i].into_iter().chain([0.0; 3]).for_each(&mut put);
+        let sh = gaussians.sh_of(i);
+        sh[..3].iter().copied().for_each(&mut put);
+        for channel in 0..3 {
+            (1..k).for_each(|c| put(sh[3 * c + channel]));
         }
-        Ok(())
-    })
+        put(gaussians.opacity_logits[i]);
+        gaussians.log_scales[i].into_iter().chain(gaussians.rotations[i]).for_each(&mut put);
+        w.write_all(&row).at("write", place)?;
+    }
+    Ok(())
 }
 
 /// Reads a coloured point cloud; white where the file has no colours. Colours stored as floats lie in 0 to 1, others in 0 to
