@@ -30,9 +30,13 @@ build: ## Build all programs into target/release
 
 demo: build ## Make a synthetic scene, run every stage on it, write out/demo/report.html
 	@$(PIPELINE) -f pipelines/demo.mk all
+	@echo "look at it, click on things, ask in words: make explore OUT=$(or $(OUT),out/demo)"
 
 scene: checked-scene build ## The same on your own photographs: make scene SCENE=folder OUT=folder
 	@$(PIPELINE) -f pipelines/custom.mk all
+
+explore: build ## Look at a finished run in the browser, click on things, ask in words: make explore OUT=folder
+	target/release/explore serve --run-dir $(or $(OUT),out/demo) --open --threads $(THREADS) $(EXPLORE_ARGS)
 
 # Settings that are missing or wrong are said before anything is built.
 checked-scene:
@@ -61,6 +65,7 @@ test: ## Run all tests that need nothing but this folder
 	scripts/test_pipeline.sh
 	scripts/test_benchmarks.sh
 	scripts/test_snakemake.sh
+	scripts/test_explore.sh
 
 test-data: ## Run the tests that need real photographs, models or oracles (docs/contributing.md)
 	$(CARGO) test --release --workspace -- --ignored

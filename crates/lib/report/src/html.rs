@@ -52,6 +52,12 @@ impl Page {
         let _ = write!(self.body, "<p>{}</p>", escape(text));
     }
 
+    /// A paragraph of plain text with a link at its end.
+    pub fn link(&mut self, text: &str, url: &str) {
+        let url = escape(url);
+        let _ = write!(self.body, r#"<p>{} <a href="{url}">{url}</a></p>"#, escape(text));
+    }
+
     /// A remark, set apart: what was left out and why.
     pub fn note(&mut self, text: &str) {
         let _ = write!(self.body, r#"<p class="note">{}</p>"#, escape(text));

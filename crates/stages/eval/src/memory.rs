@@ -28,12 +28,7 @@ pub struct Sizes {
 impl Sizes {
     /// The sizes of a scene, its text features and its largest view, before any of them is read.
     pub fn new(inputs: &Inputs, texts: &TextOptions, views: &[View]) -> Self {
-        Self {
-            geometry: bytes(&inputs.geometry),
-            language: language(texts.clip.as_deref(), texts.text_features.as_deref()),
-            pixels: pixels(views),
-            ..Self::default()
-        }
+        Self { geometry: bytes(&inputs.geometry), language: texts.bytes(), pixels: pixels(views), ..Self::default() }
     }
 }
 
@@ -42,8 +37,6 @@ pub const SMALLER: &str = "give a smaller geometry (gs-geom train --max-gaussian
 
 /// What the program takes for itself.
 const PROGRAM: u64 = 8_000_000;
-/// What CLIP's tokenizer takes.
-const TOKENIZER: u64 = 16_000_000;
 
 /// Bytes of a file or, for a folder, of the files in it; 0 where it cannot be read: that is an error later, when it is read.
 pub fn bytes(path: &Path) -> u64 {
@@ -52,12 +45,6 @@ pub fn bytes(path: &Path) -> u64 {
         Ok(entries) => entries.flatten().map(|e| of(&e.path())).sum(),
         Err(_) => of(path),
     }
-}
-
-/// Bytes that text features take: an encoder's weights and its tokenizer, or a table.
-fn language(clip: Option<&Path>, table: Option<&Path>) -> u64 {
-    let encoder = |c: &Path| TOKENIZER + bytes(&if c.is_dir() { c.join("text.onnx") } else { c.into() }) * 5 / 4;
-    clip.map_or(0, encoder) + table.map_or(0, |t| 2 * bytes(t))
 }
 
 /// Pixels of the largest view.

@@ -22,6 +22,9 @@ use serde_json::{Value, json};
 use stage::Stage;
 use std::path::{Path, PathBuf};
 
+/// Where explore serves a run unless it is told otherwise.
+const EXPLORE: &str = "http://127.0.0.1:7007/";
+
 pub(crate) fn run(o: &ReportOptions, parameters: Value, stage: &Stage) -> Result<String> {
     let load_options = LoadOptions { resolution: o.views.resolution, holdout: o.holdout };
     let dataset = load(&o.scene, &load_options, stage)?;
@@ -73,6 +76,10 @@ fn write(material: &Material, metrics: &mut Metrics) -> Result<String> {
 
     let mut page = Page::default();
     page.tiles(&sections::tiles(metrics, dataset));
+    if metrics.instances.is_some() {
+        let command = format!("explore serve --run-dir {}", material.options.run_dir.display());
+        page.link(&format!("To turn the scene, click on things and ask in words, run {command} and open"), EXPLORE);
+    }
     sections::photographs(material, &mut page)?;
     sections::id_maps(material, &mut page, metrics)?;
     sections::features(material, &mut page, metrics)?;

@@ -267,6 +267,9 @@ fn a_full_report_stands_alone() {
     let printed = f.good("report", REPORT);
     assert!(printed.contains("psnr_heldout     31.50 dB"), "{printed}");
     let html = fs::read_to_string(f.path().join("report.html")).unwrap();
+    let link = "href=\"http://127.0.0.1:7007/\">http://127.0.0.1:7007/</a>";
+    assert!(html.contains("explore serve --run-dir") && html.contains(link));
+    let html = html.replace(link, "");
     let ids = ["photographs", "id-maps", "features", "instances", "queries", "instance-scores", "query-scores"];
     for id in ids.into_iter().chain(["training", "stages"]) {
         assert!(html.contains(&format!("<h2 id=\"{id}\"")), "{id}");

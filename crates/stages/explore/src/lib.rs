@@ -1,0 +1,18 @@
+//! `explore`: a page to look at a scene, click on a thing, ask in words and take it home.
+//!
+//! `run_folder` finds what a run was made from, `world` loads it, `pack` brings the Gaussians down to 16 bytes each and
+//! `describe` says the rest as JSON. `serve` gives the page of `web/` a server on this machine, whose `answers` come from
+//! the rasteriser and the language model; `page` puts everything into one file that needs no server.
+
+mod answers;
+mod describe;
+mod options;
+mod pack;
+mod page;
+mod pictures;
+mod run_folder;
+mod serve;
+mod web;
+mod world;
+
+pub use options::Args;

@@ -1,0 +1,10 @@
+//! The `explore` program.
+
+use std::process::ExitCode;
+
+#[global_allocator]
+static ALLOCATOR: stage::Allocator = stage::Allocator;
+
+fn main() -> ExitCode {
+    stage::main::<explore::Args>()
+}

@@ -1,0 +1,121 @@
+//! The command line.
+
+use clap::{Parser, Subcommand};
+use gs_io::Result;
+use gs_scene::dataset::Resolution;
+use serde::{Serialize, Serializer};
+use stage::{CommonArgs, Program, Stage};
+use std::net::IpAddr;
+use std::path::PathBuf;
+
+/// Look at a scene in a browser, click on things, ask in words, take objects home
+#[derive(Debug, Parser)]
+#[command(name = "explore", version)]
+pub struct Args {
+    #[command(subcommand)]
+    command: Command,
+    #[command(flatten)]
+    common: CommonArgs,
+}
+
+#[derive(Debug, Subcommand, Serialize)]
+#[serde(tag = "command", rename_all = "lowercase")]
+enum Command {
+    /// Serve the page on this machine until Ctrl-C
+    Serve(ServeOptions),
+    /// Write the page as one HTML file that needs no server and no network
+    Page(PageOptions),
+}
+
+/// The run to look at.
+#[derive(Debug, Clone, clap::Args, Serialize)]
+pub struct Source {
+    /// Folder of a finished run, such as OUT of make: instances.safetensors must be in it
+    #[arg(long, value_name = "DIR")]
+    pub run_dir: PathBuf,
+    /// Dataset folder [default: the one that the instances were made from]
+    #[arg(long, value_name = "DIR")]
+    pub scene: Option<PathBuf>,
+    /// The geometry.ply that the instances were made from [default: the one that the run's record names]
+    #[arg(long, value_name = "FILE")]
+    pub geometry: Option<PathBuf>,
+    /// CLIP folder with text.onnx, for questions in words [default: the one that the run was scored with]
+    #[arg(long, value_name = "DIR")]
+    pub clip: Option<PathBuf>,
+    /// Table of text features by name, instead of --clip: JSON, OpenGaussian's text_features.zip, or npz
+    #[arg(long, value_name = "FILE", conflicts_with = "clip")]
+    pub text_features: Option<PathBuf>,
+    /// Bands of spherical harmonics that the page draws: 0 (16 bytes a Gaussian) or 1 (28 bytes, highlights move)
+    #[arg(long, value_name = "DEGREE", default_value_t = 0, value_parser = clap::value_parser!(u8).range(0..=1))]
+    pub sh: u8,
+}
+
+/// `explore serve`.
+#[derive(Debug, Clone, clap::Args, Serialize)]
+pub struct ServeOptions {
+    #[command(flatten)]
+    #[serde(flatten)]
+    pub source: Source,
+    /// Port; 0 takes any free one
+    #[arg(long, value_name = "NUMBER", default_value_t = 7007)]
+    pub port: u16,
+    /// Serve other machines too, at this address of this one, such as 0.0.0.0. The URL then holds a secret
+    /// [default: this machine only, 127.0.0.1]
+    #[arg(long, value_name = "ADDRESS")]
+    pub bind: Option<IpAddr>,
+    /// Open the page in the browser
+    #[arg(long)]
+    pub open: bool,
+}
+
+/// `explore page`.
+#[derive(Debug, Clone, clap::Args, Serialize)]
+pub struct PageOptions {
+    #[command(flatten)]
+    #[serde(flatten)]
+    pub source: Source,
+    /// A text that the page can answer; may be given several times. Without a server there is no language model
+    #[arg(long, value_name = "WORDS")]
+    pub text: Vec<String>,
+    /// Most photographs in the file, evenly spread over the views
+    #[arg(long, value_name = "COUNT", default_value_t = 40)]
+    pub photographs: usize,
+    /// Size of the photographs: a width that wider ones are shrunk to, such as 480px, or a divisor
+    #[arg(long, default_value = "480px")]
+    #[serde(serialize_with = "as_text")]
+    pub resolution: Resolution,
+    /// Output file
+    #[arg(long, value_name = "FILE")]
+    pub out: PathBuf,
+}
+
+fn as_text<S: Serializer>(resolution: &Resolution, s: S) -> Result<S::Ok, S::Error> {
+    s.collect_str(resolution)
+}
+
+impl Program for Args {
+    const NAME: &'static str = "explore";
+
+    fn common(&self) -> &CommonArgs {
+        &self.common
+    }
+
+    fn run(self, stage: &Stage) -> Result<()> {
+        let parameters = serde_json::to_value(&self.command).unwrap_or_default();
+        match &self.command {
+            Command::Serve(o) => crate::serve::run(o, stage),
+            Command::Page(o) => crate::page::run(o, parameters, stage),
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use clap::CommandFactory;
+
+    #[test]
+    fn the_command_line_is_sound() {
+        Args::command().debug_assert();
+    }
+}

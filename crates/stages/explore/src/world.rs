@@ -1,0 +1,187 @@
+//! A run, loaded.
+
+use crate::options::Source;
+use crate::pack::{Packed, pack};
+use crate::run_folder::RunFolder;
+use artifacts::{Edits, Instances, Remarks};
+use gs_io::{Error, Result};
+use gs_scene::Gaussians;
+use gs_scene::dataset::{self, Dataset, LoadOptions, Resolution, View};
+use query::{LabelledScene, TextSource};
+use stage::Stage;
+use std::collections::BTreeMap;
+
+/// What the page shows, and what answers its questions.
+pub struct World {
+    /// Where it was read from.
+    pub run: RunFolder,
+    /// The photographs.
+    pub dataset: Dataset,
+    /// Gaussians and instances, without anybody's edits.
+    pub scene: LabelledScene,
+    /// The Gaussians as the page gets them.
+    pub packed: Packed,
+    /// The different pairs of instance and cluster that Gaussians have: what the page shows and hides together.
+    pub cells: Vec<(i32, i32)>,
+    /// Cell of every Gaussian; N.
+    pub cell_of: Vec<u32>,
+    /// Colours of the features, rgb per packed Gaussian; empty where the run has no features.
+    pub feature_colors: Vec<[u8; 3]>,
+    /// Where text features come from, or why there are none.
+    pub words: std::result::Result<TextSource, String>,
+    /// What a person should know: photographs that are missing, features of another scene.
+    pub messages: Vec<String>,
+}
+
+/// Instances as a person left them.
+pub struct Edited {
+    /// What was done.
+    pub edits: Edits,
+    /// The instances after it.
+    pub instances: Instances,
+    /// Names and scale.
+    pub remarks: Remarks,
+}
+
+impl World {
+    /// Reads a run. What is needed for looking and clicking must be there and of one scene; without a language model or
+    /// features the page says so.
+    ///
+    /// # Errors
+    /// When files are missing, damaged or of different scenes.
+    pub fn read(o: &Source, resolution: Resolution, stage: &Stage) -> Result<Self> {
+        let run = RunFolder::find(o)?;
+        let dataset = dataset::load(&run.scene, &LoadOptions { resolution, ..LoadOptions::default() })?;
+        stage.forecast(forecast(&run, &dataset), "give a smaller geometry (gs-geom train --max-gaussians)")?;
+        let scene = LabelledScene::read(&run.instances, &run.geometry, None)?;
+        scene.check_dataset(&dataset)?;
+        let mut messages = dataset.warnings.clone();
+        messages.extend(scene.geometry.damage());
+        let words = words(&run, &scene);
+        let packed = pack(scene.gaussians(), o.sh);
+        let (cells, cell_of) = cells(&scene.instances);
+        let feature_colors = match feature_colors(&run, &scene, &packed) {
+            Ok(colors) => colors,
+            Err(e) => {
+                messages.push(format!("colours of features are left out: {e}"));
+                Vec::new()
+            }
+        };
+        messages.iter().for_each(|m| stage.warn(m));
+        let n = scene.gaussians().len();
+        if packed.order.len() < n {
+            stage.skipped(&format!("{} of {n} Gaussians: too faint to be drawn", n - packed.order.len()));
+        }
+        Ok(Self { run, dataset, scene, packed, cells, cell_of, feature_colors, words, messages })
+    }
+
+    /// All Gaussians of the geometry.
+    pub fn gaussians(&self) -> &Gaussians {
+        self.scene.gaussians()
+    }
+
+    /// The edits that lie in the run's folder, none where there are none.
+    ///
+    /// # Errors
+    /// When the file is damaged, or is about other instances.
+    pub fn saved_edits(&self) -> Result<Edits> {
+        let (path, hash) = (&self.run.edits, self.scene.artifact.hash());
+        if !path.exists() {
+            return Ok(Edits { instances: hash.into(), edits: Vec::new() });
+        }
+        let edits = Edits::read(path)?;
+        if edits.instances == hash {
+            return Ok(edits);
+        }
+        Err(Error::new("these edits are about other instances")
+            .file(path)
+            .field("instances")
+            .found(&edits.instances)
+            .expected(format!("{hash} ({})", self.run.instances.display()))
+            .hint("move the file away to start anew"))
+    }
+
+    /// The instances after some edits.
+    ///
+    /// # Errors
+    /// When an edit does not fit the instances.
+    pub fn edited(&self, edits: Edits) -> Result<Edited> {
+        let mut instances = self.scene.instances.clone();
+        let remarks = edits.apply(&mut instances, &self.gaussians().means)?;
+        Ok(Edited { edits, instances, remarks })
+    }
+
+    /// The view of this stem.
+    pub fn view(&self, stem: &str) -> Option<(usize, &View)> {
+        self.dataset.views.iter().enumerate().find(|(_, v)| v.stem() == stem)
+    }
+}
+
+/// Peak of memory in bytes: geometry, packed Gaussians and a photograph (docs/results/explore.md has measured peaks).
+fn forecast(run: &RunFolder, dataset: &Dataset) -> u64 {
+    const PROGRAM: u64 = 45_000_000;
+    let geometry = std::fs::metadata(&run.geometry).map_or(0, |m| m.len());
+    let pixels = |v: &View| u64::from(v.camera.width) * u64::from(v.camera.height);
+    PROGRAM + run.texts.bytes() + geometry * 19 / 10 + 40 * dataset.views.iter().map(pixels).max().unwrap_or(0)
+}
+
+fn words(run: &RunFolder, scene: &LabelledScene) -> std::result::Result<TextSource, String> {
+    if scene.instances.dim == 0 {
+        return Err(
+            "The instances have no language features: run make scene with CLIP=folder (scripts/export_clip.py \
+                    makes one). Clicking works, and names that you give can be found."
+                .into(),
+        );
+    }
+    if !run.texts.given() {
+        return Err(
+            "No language model: give --clip models/clip or --text-features FILE. Clicking works, and names that \
+                    you give can be found."
+                .into(),
+        );
+    }
+    TextSource::open_for(scene, &run.texts).map_err(|e| e.to_string())
+}
+
+/// The different pairs of label and node in order of their first Gaussian, and which of them each Gaussian has.
+fn cells(instances: &Instances) -> (Vec<(i32, i32)>, Vec<u32>) {
+    let mut known = BTreeMap::new();
+    let mut cells = Vec::new();
+    let pairs = instances.label.iter().copied().zip(instances.node.iter().copied());
+    let of = pairs.map(|pair| {
+        *known.entry(pair).or_insert_with(|| {
+            cells.push(pair);
+            cells.len() as u32 - 1
+        })
+    });
+    let of = of.collect();
+    (cells, of)
+}
+
+/// Grey of a Gaussian that no view sees and that has no features.
+const NO_FEATURE: [u8; 3] = [64; 3];
+
+fn feature_colors(run: &RunFolder, scene: &LabelledScene, packed: &Packed) -> Result<Vec<[u8; 3]>> {
+    let Some(path) = &run.features else { return Ok(Vec::new()) };
+    let hash = &scene.inputs[artifacts::role::GEOMETRY];
+    let features = query::read_features(path, hash, scene.gaussians().len())?;
+    let mut colors = vec![NO_FEATURE; scene.gaussians().len()];
+    let of_kept = report::feature_colors(&features.values, features.dim);
+    for (&i, color) in features.kept.iter().zip(of_kept) {
+        colors[i as usize] = color.map(|v| (255.0 * v).round() as u8);
+    }
+    Ok(packed.order.iter().map(|&i| colors[i as usize]).collect())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn cells_are_pairs_of_instance_and_cluster() {
+        let i = Instances { label: vec![0, 0, -1, 0, 1], node: vec![7, 8, -1, 7, 7], ..Instances::default() };
+        let (cells, of) = cells(&i);
+        assert_eq!(cells, [(0, 7), (0, 8), (-1, -1), (1, 7)]);
+        assert_eq!(of, [0, 1, 2, 0, 3]);
+    }
+}

@@ -1,0 +1,463 @@
+//! The page in a real browser: chromium with WebGL2 in software, driven through chromedriver.
+//!
+//! `scripts/test_explore.sh` runs these on the demo's scene; they need EXPLORE_RUN (a finished run with query/query.json) and
+//! both programs. EXPLORE_SCREENSHOT names a file for a picture of the page.
+
+use artifacts::{Edits, Instances};
+use base64::Engine;
+use fantoccini::actions::{InputSource, MouseActions, PointerAction};
+use fantoccini::{Client, ClientBuilder, Locator};
+use gs_io::Result;
+use gs_raster::RasterOptions;
+use gs_scene::dataset::{self, LoadOptions};
+use gs_scene::{Camera, Gaussians, Geometry};
+use serde_json::{Value, json};
+use std::io::{BufRead, BufReader};
+use std::path::{Path, PathBuf};
+use std::process::{Child, Command, Stdio};
+use std::time::Duration;
+
+/// The folder that make runs in: records of runs name paths from there.
+const ROOT: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/../../..");
+/// Least PSNR in dB between the page's picture of a camera and the rasteriser's, with the same bands of harmonics.
+const PSNR: f64 = 35.0;
+/// Size of the browser's window: small, because a processor draws the pictures.
+const WINDOW: (u32, u32) = (680, 480);
+/// Most seconds that a page may take to load the demo.
+const LOAD_SECONDS: f64 = 20.0;
+
+struct Running(Child);
+
+impl Drop for Running {
+    fn drop(&mut self) {
+        let _ = self.0.kill();
+        let _ = self.0.wait();
+    }
+}
+
+/// Starts a program and gives what stands in its output after `mark`, up to a space.
+fn start(program: &str, arguments: &[&str], mark: &str) -> (Running, String) {
+    let mut command = Command::new(program);
+    command.current_dir(ROOT);
+    let mut child = command.args(arguments).stdout(Stdio::piped()).stderr(Stdio::piped()).spawn().unwrap();
+    let out = BufReader::new(child.stdout.take().unwrap()).lines();
+    let err = BufReader::new(child.stderr.take().unwrap()).lines();
+    let (send, receive) = std::sync::mpsc::channel();
+    let both: [Box<dyn Iterator<Item = std::io::Result<String>> + Send>; 2] = [Box::new(out), Box::new(err)];
+    for lines in both {
+        let send = send.clone();
+        std::thread::spawn(move || lines.map_while(std::result::Result::ok).for_each(|l| drop(send.send(l))));
+    }
+    let running = Running(child);
+    let mut said = String::new();
+    while let Ok(line) = receive.recv_timeout(Duration::from_secs(60)) {
+        if let Some((_, rest)) = line.split_once(mark) {
+            return (running, rest.split(' ').next().unwrap_or_default().trim_end_matches('.').to_string());
+        }
+        said += &line;
+    }
+    panic!("{program} did not say {mark:?}: {said}");
+}
+
+struct Fixture {
+    run: PathBuf,
+    views: Vec<dataset::View>,
+    geometry: Geometry,
+    instances: Instances,
+}
+
+impl Fixture {
+    fn read() -> Self {
+        let run = PathBuf::from(std::env::var_os("EXPLORE_RUN").expect("EXPLORE_RUN: run scripts/test_explore.sh"));
+        let geometry = Geometry::read(run.join("geometry.ply")).unwrap();
+        let instances = Instances::read(run.join("instances.safetensors")).unwrap().0;
+        let views = dataset::load(&run.join("scene"), &LoadOptions::default()).unwrap().views;
+        Self { run, views, geometry, instances }
+    }
+
+    fn gaussians(&self) -> &Gaussians {
+        &self.geometry.gaussians
+    }
+
+    fn raster(&self, degree: u8) -> RasterOptions {
+        RasterOptions { sh_degree: degree, depth: false, ..RasterOptions::of(&self.geometry) }
+    }
+
+    /// The instance with the largest weight at a pixel, and its share of the pixel.
+    fn instance_at(&self, camera: &Camera, pixel: [u32; 2]) -> Option<(i32, f64)> {
+        let mut sums = std::collections::BTreeMap::<i32, f64>::new();
+        for (i, w) in query::pixel_weights(self.gaussians(), camera, &self.raster(0), pixel, |_| true) {
+            *sums.entry(self.instances.label[i as usize]).or_default() += w;
+        }
+        sums.into_iter().max_by(|a, b| a.1.total_cmp(&b.1))
+    }
+
+    /// For every instance that a view shows clearly: the view, and a pixel of it.
+    fn places(&self) -> Vec<(u32, usize, [u32; 2])> {
+        let mut places = Vec::new();
+        for k in 0..self.instances.len() as u32 {
+            let matches = self.instances.matches.iter().filter(|m| m.instance == k);
+            let Some(best) = matches.max_by(|a, b| (a.score * a.visible).total_cmp(&(b.score * b.visible))) else {
+                continue;
+            };
+            let stem = &self.instances.views[best.view as usize];
+            let (view, v) = self.views.iter().enumerate().find(|(_, v)| v.stem() == stem).unwrap();
+            let at = self.instances.centroid[k as usize].map(f64::from);
+            let (x, y, _) = v.camera.project(at.into());
+            // The page may be drawn with fewer pixels than the photograph has: what is around shows the same.
+            let (w, h) = (f64::from(v.camera.width), f64::from(v.camera.height));
+            let around =
+                [(0.0, 0.0), (-3.0, 0.0), (3.0, 0.0), (0.0, -3.0), (0.0, 3.0)].map(|(dx, dy)| (x + dx, y + dy));
+            let clear = |&(x, y): &(f64, f64)| {
+                let inside = x >= 0.0 && y >= 0.0 && x < w && y < h;
+                inside
+                    && self.instance_at(&v.camera, [x as u32, y as u32]).is_some_and(|(l, w)| l == k as i32 && w > 0.8)
+            };
+            if around.iter().all(clear) {
+                places.push((k, view, [x as u32, y as u32]));
+            }
+        }
+        places
+    }
+}
+
+/// Where a picture of the page is wanted.
+fn screenshot() -> Option<std::ffi::OsString> {
+    std::env::var_os("EXPLORE_SCREENSHOT").filter(|p| !p.is_empty())
+}
+
+struct Browser {
+    client: Client,
+    _driver: Running,
+}
+
+impl Browser {
+    async fn open() -> Self {
+        let (driver, port) = start("chromedriver", &["--port=0"], "successfully on port ");
+        let arguments = [
+            "--headless=new",
+            "--no-sandbox",
+            "--use-angle=swiftshader",
+            "--enable-unsafe-swiftshader",
+            "--disable-dev-shm-usage",
+            "--disable-background-networking",
+            "--disable-component-update",
+            "--no-first-run",
+            if screenshot().is_some() { "--force-device-scale-factor=1" } else { "--force-device-scale-factor=0.5" },
+            "--force-prefers-color-scheme=dark",
+            // Every name but this machine's is unknown: the network is cut.
+            "--host-resolver-rules=MAP * ~NOTFOUND, EXCLUDE 127.0.0.1",
+        ];
+        let size = format!("--window-size={},{}", WINDOW.0, WINDOW.1);
+        let arguments: Vec<&str> = arguments.into_iter().chain([&size[..]]).collect();
+        let wanted = json!({"goog:chromeOptions": {"args": arguments}, "timeouts": {"script": 240_000}});
+        let Value::Object(wanted) = wanted else { unreachable!() };
+        let mut builder = ClientBuilder::new(hyper_util::client::legacy::connect::HttpConnector::new());
+        let client =
+            builder.capabilities(wanted).connect(&format!("http://127.0.0.1:{port}")).await.expect("chromium starts");
+        Self { client, _driver: driver }
+    }
+
+    /// Runs JavaScript that may await; `page` is the page's handle for tests.
+    async fn js(&self, body: &str, given: Vec<Value>) -> Value {
+        let script = format!(
+            "const done = arguments[arguments.length - 1], given = arguments, page = globalThis.explore; \
+             (async () => {{ {body} }})().then((v) => done({{ v: v ?? null }}), (e) => done({{ e: String(e.stack ?? e) }}));"
+        );
+        let answer = self.client.execute_async(&script, given).await.expect("the browser runs a script");
+        assert!(answer.get("e").is_none(), "{body}: {answer}");
+        answer["v"].clone()
+    }
+
+    async fn load(&self, url: &str) -> f64 {
+        self.client.goto(url).await.unwrap();
+        for _ in 0..600 {
+            let state = self.js("return [page?.seconds ?? null, page?.errors ?? []]", vec![]).await;
+            assert_eq!(state[1], json!([]), "errors while loading {url}");
+            if let Some(seconds) = state[0].as_f64() {
+                return seconds;
+            }
+            tokio::time::sleep(Duration::from_millis(100)).await;
+        }
+        panic!("{url} did not load in a minute");
+    }
+
+    /// The page's picture of one of the scene's cameras at its own size, without marks.
+    async fn picture(&self, view: usize) -> Vec<u8> {
+        let script = "page.viewer.background = [0, 0, 0]; const camera = page.scene.cameras[given[0]]; \
+                      await page.viewer.show(camera); const rgb = page.viewer.pixels(); let text = ''; \
+                      for (let i = 0; i < rgb.length; i += 8192) text += String.fromCharCode(...rgb.subarray(i, i + 8192)); \
+                      return btoa(text);";
+        bytes(&self.js(script, vec![view.into()]).await)
+    }
+
+    /// A real click on what lies at a pixel of a view, after standing there.
+    async fn click(&self, view: usize, pixel: [u32; 2]) {
+        let script = "page.jump(given[0]); await page.viewer.busy; const c = page.viewer.camera, o = page.scene.cameras[given[0]]; \
+                      const canvas = document.getElementById('canvas'), rect = canvas.getBoundingClientRect(), s = rect.width / c.width; \
+                      const x = (given[1] + 0.5 - o.cx) / o.fx * c.fx + c.cx, y = (given[2] + 0.5 - o.cy) / o.fy * c.fy + c.cy; \
+                      return [Math.round(rect.left + x * s), Math.round(rect.top + y * s)];";
+        let at = self.js(script, vec![view.into(), pixel[0].into(), pixel[1].into()]).await;
+        let to = |k: usize| at[k].as_i64().unwrap() as i32 as i64;
+        let mouse = MouseActions::new("mouse".into())
+            .then(PointerAction::MoveTo { duration: None, x: to(0) as f64, y: to(1) as f64 })
+            .then(PointerAction::Down { button: 0 })
+            .then(PointerAction::Up { button: 0 });
+        self.client.perform_actions(mouse).await.unwrap();
+        self.client.release_actions().await.unwrap();
+    }
+
+    /// Waits until `condition`, JavaScript, is true.
+    async fn until(&self, condition: &str) {
+        for _ in 0..300 {
+            if self.js(&format!("return Boolean({condition})"), vec![]).await == json!(true) {
+                return;
+            }
+            tokio::time::sleep(Duration::from_millis(100)).await;
+        }
+        panic!(
+            "never: {condition}; {}",
+            self.js("return [page.errors, document.getElementById('hint').textContent]", vec![]).await
+        );
+    }
+
+    async fn selected(&self) -> Vec<u32> {
+        let ids = self.js("await page.viewer.busy; return page.selectedInstances()", vec![]).await;
+        serde_json::from_value(ids).unwrap()
+    }
+
+    async fn ask(&self, text: &str) {
+        let field = self.client.find(Locator::Id("text")).await.unwrap();
+        field.clear().await.unwrap();
+        field.send_keys(&format!("{text}\u{e007}")).await.unwrap();
+        self.until(&format!("page.state.answer?.text === {}", json!(text))).await;
+    }
+
+    async fn saved(&self, action: &str) -> Vec<u8> {
+        let script = "page.saved = null; await page.act(given[0]); const b = new Uint8Array(await page.saved.blob.arrayBuffer()); \
+                      let text = ''; for (let i = 0; i < b.length; i += 8192) text += String.fromCharCode(...b.subarray(i, i + 8192)); return btoa(text);";
+        bytes(&self.js(script, vec![action.into()]).await)
+    }
+
+    async fn no_errors(&self) {
+        assert_eq!(self.js("return page.errors", vec![]).await, json!([]));
+    }
+}
+
+fn bytes(base64: &Value) -> Vec<u8> {
+    base64::engine::general_purpose::STANDARD.decode(base64.as_str().unwrap()).unwrap()
+}
+
+fn psnr(a: &[u8], b: &[f32]) -> f64 {
+    assert_eq!(a.len(), b.len());
+    let squares = a.iter().zip(b).map(|(&a, &b)| (f64::from(a) / 255.0 - f64::from(b.clamp(0.0, 1.0))).powi(2));
+    -10.0 * (squares.sum::<f64>() / a.len() as f64).log10()
+}
+
+fn read_ply(bytes: &[u8]) -> Gaussians {
+    let file = tempfile::NamedTempFile::new().unwrap();
+    std::fs::write(file.path(), bytes).unwrap();
+    gs_scene::ply::read_gaussians(file.path()).unwrap()
+}
+
+/// What `eval query` answered: text, selected instances, PLY.
+fn answers(run: &Path) -> Vec<(String, Vec<u32>, Gaussians)> {
+    let all: Value = serde_json::from_slice(&std::fs::read(run.join("query/query.json")).unwrap()).unwrap();
+    let one = |q: &Value| {
+        let ply = run.join("query").join(q["ply"].as_str().unwrap());
+        let selected = serde_json::from_value(q["selected"].clone()).unwrap();
+        (q["text"].as_str().unwrap().to_string(), selected, gs_scene::ply::read_gaussians(ply).unwrap())
+    };
+    all["queries"].as_array().unwrap().iter().map(one).collect()
+}
+
+fn explore() -> &'static str {
+    env!("CARGO_BIN_EXE_explore")
+}
+
+/// The pictures of a few views are the rasteriser's.
+async fn pictures_agree(browser: &Browser, f: &Fixture, degree: u8) {
+    browser.js("await page.select([]); page.setColors('photograph'); return null", vec![]).await;
+    for view in [0, f.views.len() / 2] {
+        let shown = browser.picture(view).await;
+        let rendered = gs_raster::render(f.gaussians(), &f.views[view].camera, &f.raster(degree));
+        let found = psnr(&shown, &rendered.rgb);
+        eprintln!("view {view}, degree {degree}: {found:.1} dB");
+        assert!(found >= PSNR, "view {view}: {found:.1} dB");
+    }
+}
+
+/// Clicks on things that are seen clearly select them.
+async fn clicks_select(browser: &Browser, f: &Fixture, most: usize) {
+    let places = f.places();
+    assert!(places.len() >= 10, "only {} instances are seen clearly", places.len());
+    for &(instance, view, pixel) in &places {
+        let script = "return (await page.pick(page.scene.cameras[given[0]], given[1], given[2])).instance";
+        let found = browser.js(script, vec![view.into(), pixel[0].into(), pixel[1].into()]).await;
+        assert_eq!(found, json!(instance), "view {view}, pixel {pixel:?}");
+    }
+    for (instance, view, pixel) in places.into_iter().take(most) {
+        browser.js("await page.select([])", vec![]).await;
+        browser.click(view, pixel).await;
+        browser.until("page.selectedInstances().length").await;
+        assert_eq!(browser.selected().await, [instance], "view {view}, pixel {pixel:?}");
+    }
+}
+
+#[tokio::test]
+#[ignore = "needs chromium and a finished run; run scripts/test_explore.sh"]
+async fn a_served_scene_can_be_seen_clicked_asked_and_edited() {
+    let f = Fixture::read();
+    let edits = f.run.join("instances.edits.json");
+    let _ = std::fs::remove_file(&edits);
+    let run = f.run.to_str().unwrap();
+    let (_server, url) = start(explore(), &["serve", "--run-dir", run, "--port", "0"], "look at ");
+    let browser = Browser::open().await;
+    let seconds = browser.load(&url).await;
+    eprintln!("loaded in {seconds:.1} s");
+    assert!(seconds < LOAD_SECONDS, "{seconds}");
+    pictures_agree(&browser, &f, 0).await;
+    clicks_select(&browser, &f, usize::MAX).await;
+
+    // A text selects what eval query selects, and what is saved are the same Gaussians.
+    for (text, selected, gaussians) in answers(&f.run) {
+        browser.ask(&text).await;
+        assert_eq!(browser.selected().await, selected, "{text}");
+        assert_eq!(read_ply(&browser.saved("save-selection").await), gaussians, "{text}");
+        let rest = read_ply(&browser.saved("save-rest").await);
+        assert_eq!(rest.len() + gaussians.len(), f.gaussians().len());
+    }
+    if let Some(path) = screenshot() {
+        browser.client.set_window_size(1200, 800).await.unwrap();
+        browser
+            .js("page.jump(page.instances.views(page.selectedInstances()[0])[0][0]); await page.viewer.busy", vec![])
+            .await;
+        tokio::time::sleep(Duration::from_secs(2)).await;
+        std::fs::write(path, browser.client.screenshot().await.unwrap()).unwrap();
+    }
+
+    // Hidden, what lies behind shows; isolated, nothing else does.
+    let (instance, view, pixel) = f.places()[0];
+    let at = 3 * (pixel[1] * f.views[view].camera.width + pixel[0]) as usize;
+    browser.js("await page.selectInstances([given[0]])", vec![instance.into()]).await;
+    browser.js("await page.select([])", vec![]).await;
+    let whole = browser.picture(view).await;
+    browser.js("await page.selectInstances([given[0]]); await page.act('isolate')", vec![instance.into()]).await;
+    let alone = browser.picture(view).await;
+    let lit = |picture: &[u8]| picture.chunks(3).filter(|c| c.iter().any(|&v| v > 8)).count();
+    assert!(
+        lit(&alone) < lit(&whole) / 2 && alone[at..at + 3].iter().any(|&v| v > 8),
+        "isolated: {} of {}",
+        lit(&alone),
+        lit(&whole)
+    );
+    browser.js("await page.act('isolate'); await page.act('hide')", vec![]).await;
+    let without = browser.picture(view).await;
+    let change: i32 = (at..at + 3).map(|k| (i32::from(without[k]) - i32::from(whole[k])).abs()).sum();
+    let same = without
+        .chunks(3)
+        .zip(whole.chunks(3))
+        .filter(|(a, b)| a.iter().zip(*b).all(|(x, y)| x.abs_diff(*y) < 3))
+        .count();
+    assert!(change > 15 && same * 3 > whole.len() / 2, "hidden: changed by {change}, {same} pixels stayed");
+    browser.click(view, pixel).await;
+    tokio::time::sleep(Duration::from_millis(500)).await;
+    assert!(!browser.selected().await.contains(&instance), "what is hidden is not clicked");
+    browser.js("await page.act('show-all')", vec![]).await;
+
+    edits_are_those_of_the_stages(&browser, &f, &edits).await;
+    browser.no_errors().await;
+    browser.client.clone().close().await.unwrap();
+}
+
+/// Merging, naming, splitting and the scale: the page's labels are those of `artifacts::Edits`, also after undo and redo.
+async fn edits_are_those_of_the_stages(browser: &Browser, f: &Fixture, path: &Path) {
+    let split = (0..f.instances.len())
+        .find(|&k| f.instances.count[k] > 0 && f.instances.family(k).is_some_and(|x| x.parts.len() > 1));
+    let others: Vec<u32> = (0..f.instances.len() as u32).filter(|&k| Some(k as usize) != split).take(3).collect();
+    let mut wanted = vec![
+        json!({"op": "merge", "instances": [others[0], others[1]]}),
+        json!({"op": "rename", "instance": others[2], "name": "grandma's kettle"}),
+        json!({"op": "scale", "from": [0.0, 0.0, 0.0], "to": [2.0, 0.0, 0.0], "metres": 1.0}),
+    ];
+    wanted.extend(split.map(|k| json!({"op": "split", "instance": k})));
+    for edit in &wanted {
+        browser.js("await page.edit(given[0])", vec![edit.clone()]).await;
+    }
+    let saved = Edits::read(path).unwrap();
+    assert_eq!(saved.edits.len(), wanted.len());
+    let mut edited = f.instances.clone();
+    let remarks = saved.apply(&mut edited, &f.gaussians().means).unwrap();
+    assert_eq!(remarks.names[&others[2]], "grandma's kettle");
+    let page =
+        browser.js("return [page.scene.cells, [...page.instances.label], page.instances.metresPerUnit]", vec![]).await;
+    let cells: Vec<(i32, i32)> = serde_json::from_value(page[0].clone()).unwrap();
+    let labels: Vec<i32> = serde_json::from_value(page[1].clone()).unwrap();
+    for i in 0..edited.label.len() {
+        let own = (f.instances.label[i], f.instances.node[i]);
+        let cell = cells.iter().position(|c| *c == own).unwrap();
+        assert_eq!(labels[cell], edited.label[i], "Gaussian {i} of {own:?}");
+    }
+    assert_eq!(page[2].as_f64(), remarks.metres_per_unit);
+    browser.ask("grandma").await;
+    assert_eq!(browser.selected().await, [others[2]], "a name that a person gave is found");
+    // Undone to the start and done again.
+    for _ in &wanted {
+        browser.js("await page.act('undo')", vec![]).await;
+    }
+    assert_eq!(Edits::read(path).unwrap().edits.len(), 0);
+    let label = browser.js("return [...page.instances.label]", vec![]).await;
+    assert_eq!(label, json!(cells.iter().map(|c| c.0).collect::<Vec<_>>()));
+    for _ in &wanted {
+        browser.js("await page.act('redo')", vec![]).await;
+    }
+    assert_eq!(Edits::read(path).unwrap(), saved);
+    // The page starts from what was saved.
+    browser.client.refresh().await.unwrap();
+    browser.until("globalThis.explore?.seconds").await;
+    assert_eq!(browser.js("return page.instances.edits.length", vec![]).await, json!(wanted.len()));
+    std::fs::remove_file(path).unwrap();
+}
+
+#[tokio::test]
+#[ignore = "needs chromium and a finished run; run scripts/test_explore.sh"]
+async fn one_file_works_without_a_server() -> Result<()> {
+    let f = Fixture::read();
+    let out = f.run.join("page-test.html");
+    let known = answers(&f.run);
+    let mut arguments = vec![
+        "page",
+        "--run-dir",
+        f.run.to_str().unwrap(),
+        "--sh",
+        "1",
+        "--overwrite",
+        "--quiet",
+        "--out",
+        out.to_str().unwrap(),
+    ];
+    known.iter().for_each(|(text, ..)| arguments.extend(["--text", text]));
+    assert!(Command::new(explore()).current_dir(ROOT).args(&arguments).status().unwrap().success());
+    let browser = Browser::open().await;
+    let url = format!("file://{}", out.canonicalize().unwrap().display());
+    eprintln!(
+        "the file has {:.1} MB, loaded in {:.1} s",
+        std::fs::metadata(&out).unwrap().len() as f64 / 1e6,
+        browser.load(&url).await
+    );
+    pictures_agree(&browser, &f, f.gaussians().sh_degree.min(1)).await;
+    // The page's own picking gives the rasteriser's answers.
+    clicks_select(&browser, &f, 2).await;
+    for (text, selected, gaussians) in &known {
+        browser.ask(text).await;
+        assert_eq!(browser.selected().await, *selected, "{text}");
+        let saved = read_ply(&browser.saved("save-selection").await);
+        let drawn = (0..gaussians.len()).filter(|&i| gaussians.opacity(i) >= 1.0 / 255.0).count();
+        assert_eq!(saved.len(), drawn, "{text}: all that can be seen");
+    }
+    let asked = browser.js("return performance.getEntriesByType('resource').map((r) => r.name).filter((n) => !n.startsWith('data:') && !n.startsWith('blob:'))", vec![]).await;
+    assert_eq!(asked, json!([]), "the file asks nobody for anything");
+    browser.no_errors().await;
+    browser.client.clone().close().await.unwrap();
+    Ok(())
+}

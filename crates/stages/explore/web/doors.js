@@ -1,0 +1,109 @@
+// Where answers come from: a server on this machine, or what the file itself holds. Both have the same doors:
+// load(progress), photograph(view), thumbnail(instance), pick(...), find(text), save(edits), selection(...).
+import { Gaussians, largest } from "./gaussians.js";
+
+async function answer(response) {
+  if (response.ok) return response;
+  const text = await response.text();
+  throw new Error(text || `the server says ${response.status}`);
+}
+
+const post = (path, body, method = "POST") =>
+  fetch(path, { method, headers: { "content-type": "application/json" }, body: JSON.stringify(body) }).then(answer);
+
+export class Server {
+  // `progress(done, total)` in bytes.
+  async load(progress) {
+    const scene = await (await fetch("scene.json").then(answer)).json();
+    const response = await fetch("scene.bin").then(answer);
+    const bytes = new Uint8Array(scene.bytes), reader = response.body.getReader();
+    for (let at = 0; ;) {
+      const { done, value } = await reader.read();
+      if (done) break;
+      bytes.set(value, at);
+      progress((at += value.length), scene.bytes);
+    }
+    this.scene = scene;
+    this.gaussians = new Gaussians(scene, bytes.buffer);
+  }
+
+  photograph(view) {
+    return `photograph/${view}`;
+  }
+
+  thumbnail(instance) {
+    return `thumbnail/${instance}`;
+  }
+
+  async pick(camera, x, y, hidden) {
+    const { width, height, fx, fy, cx, cy, rotation, translation } = camera;
+    return (await post("pick", { camera: { width, height, fx, fy, cx, cy, rotation, translation }, x, y, hidden })).json();
+  }
+
+  async find(text) {
+    return (await fetch(`find?text=${encodeURIComponent(text)}`).then(answer)).json();
+  }
+
+  // The instances after the edits.
+  async save(edits) {
+    return (await post("edits", edits, "PUT")).json();
+  }
+
+  async selection(cells, others) {
+    return (await post("selection", { cells, others })).blob();
+  }
+}
+
+// The page as one file: nothing is asked of anybody.
+export class File {
+  async load(progress) {
+    const text = (id) => document.getElementById(id).textContent;
+    this.scene = JSON.parse(text("scene-json"));
+    this.pictures = JSON.parse(text("pictures-json"));
+    const base64 = text("scene-bin"), bytes = new Uint8Array(this.scene.bytes);
+    // A multiple of four letters at a time, so that the bar moves.
+    for (let at = 0, step = 1 << 20; at < base64.length; at += step) {
+      const part = atob(base64.slice(at, at + step));
+      for (let k = 0; k < part.length; k++) bytes[at / 4 * 3 + k] = part.charCodeAt(k);
+      progress(Math.min(bytes.length, at / 4 * 3), bytes.length);
+      await new Promise((go) => setTimeout(go));
+    }
+    this.gaussians = new Gaussians(this.scene, bytes.buffer);
+  }
+
+  photograph(view) {
+    return this.pictures.photographs[view] ?? null;
+  }
+
+  thumbnail(instance) {
+    return this.pictures.thumbnails[instance] ?? null;
+  }
+
+  async pick(camera, x, y, hidden, labelOf) {
+    const away = new Set(hidden);
+    const { weights, alpha, position } = this.gaussians.at(camera, x, y, (cell) => !away.has(cell));
+    return { ...largest(weights, labelOf), alpha, position };
+  }
+
+  async find(text, names) {
+    const wanted = text.trim().toLowerCase();
+    const named = [...names].filter(([, name]) => name.toLowerCase().includes(wanted)).map(([k]) => k);
+    const known = Object.keys(this.pictures.texts).find((t) => t.toLowerCase() === wanted);
+    if (!known && !named.length) {
+      const texts = Object.keys(this.pictures.texts);
+      throw new Error(texts.length ? `This file knows the answers to: ${texts.join(", ")}. Other words need explore serve.` : "This file was written without texts (explore page --text). Names that you give can be found.");
+    }
+    return { text, scores: known ? this.pictures.texts[known] : [], named };
+  }
+
+  async save() {
+    return null;
+  }
+
+  async selection(cells, others) {
+    const meant = new Set(cells);
+    const ply = this.gaussians.ply((c) => meant.has(c) !== others);
+    if (!ply) throw new Error("Nothing is selected: there is nothing to save.");
+    return ply;
+  }
+}

@@ -1,0 +1,14 @@
+#!/usr/bin/env bash
+# The page of explore in a real browser, on the demo's scene with a shorter training. Skipped where there is no chromium with its
+# driver (Debian: apt-get install chromium chromium-driver). SCREENSHOT=file keeps a picture of the page.
+set -euo pipefail
+cd "$(dirname "$0")/.."
+for program in chromium chromedriver; do
+  command -v $program > /dev/null || { echo "skipped: the browser tests of explore: no $program"; exit 0; }
+done
+cargo build --release --workspace --bins --tests
+work=$(mktemp -d)
+trap 'rm -rf "$work"' EXIT
+make --no-print-directory -f pipelines/demo.mk OUT="$work/demo" GEOM_ARGS='--iterations 600' > "$work/log" 2>&1 || { cat "$work/log"; exit 1; }
+EXPLORE_RUN="$work/demo" EXPLORE_SCREENSHOT="${SCREENSHOT:-}" cargo test --release --package explore --test browser -- --ignored --nocapture --test-threads 1
+echo "ok: the page of explore in chromium"
