@@ -78,6 +78,7 @@ pub fn scene(world: &World, edited: &Edited, blob: &Blob, mode: &str, photograph
         "bytes": blob.bytes.len(),
         "sections": sections,
         "cells": world.cells,
+        "cell_counts": counts(world),
         "tree": tree,
         "matches": matches,
         "instances": instances_of(None, world),
@@ -88,6 +89,13 @@ pub fn scene(world: &World, edited: &Edited, blob: &Blob, mode: &str, photograph
         "instances_hash": world.scene.artifact.hash(),
         "messages": world.messages,
     })
+}
+
+/// Gaussians of every cell, those that are never drawn among them.
+fn counts(world: &World) -> Vec<u32> {
+    let mut counts = vec![0; world.cells.len()];
+    world.cell_of.iter().for_each(|&c| counts[c as usize] += 1);
+    counts
 }
 
 /// The instances as a list.

@@ -39,7 +39,7 @@ pub struct Source {
     /// The geometry.ply that the instances were made from [default: the one that the run's record names]
     #[arg(long, value_name = "FILE")]
     pub geometry: Option<PathBuf>,
-    /// CLIP folder with text.onnx, for questions in words [default: the one that the run was scored with]
+    /// CLIP folder with text.onnx, for questions in words [default: the one that the run was scored or asked with]
     #[arg(long, value_name = "DIR")]
     pub clip: Option<PathBuf>,
     /// Table of text features by name, instead of --clip: JSON, OpenGaussian's text_features.zip, or npz

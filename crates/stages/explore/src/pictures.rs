@@ -12,6 +12,8 @@ use report::picture::Picture;
 const QUALITY: u8 = 82;
 /// Most pixels along the longer side of an instance's picture.
 const THUMBNAIL: usize = 144;
+/// Width of a photograph in a list, in pixels.
+const PREVIEW: usize = 240;
 /// Around an instance's picture, as a share of its size.
 const MARGIN: f64 = 0.15;
 
@@ -20,8 +22,20 @@ const MARGIN: f64 = 0.15;
 /// # Errors
 /// When it cannot be read.
 pub fn photograph(view: &View) -> Result<Vec<u8>> {
+    shrunk(view, usize::MAX)
+}
+
+/// The same, small.
+///
+/// # Errors
+/// When it cannot be read.
+pub fn preview(view: &View) -> Result<Vec<u8>> {
+    shrunk(view, PREVIEW)
+}
+
+fn shrunk(view: &View, most: usize) -> Result<Vec<u8>> {
     let image = view.load_image()?;
-    Picture::new(image.width, image.height, &image.rgb).jpeg(image.width as usize, QUALITY)
+    Picture::new(image.width, image.height, &image.rgb).jpeg(most, QUALITY)
 }
 
 /// The view that shows each instance best, by the matches with masks; none for one that no mask matched.

@@ -43,12 +43,12 @@ impl RunFolder {
                 .hint("run make again with this OUT: it goes on where it was"));
         }
         let of_instances = arguments(&instances);
-        let of_scores = arguments(&dir.join("score.json"));
+        let asked = ["score.json", "protocol/metrics.json", "query/query.json"].map(|f| arguments(&dir.join(f)));
         let features = dir.join("features.safetensors");
         let (clip, text_features) = (o.clip.clone(), o.text_features.clone());
         let mut texts = TextOptions { clip, text_features, any_model: false, min_support: None };
         if !texts.given() {
-            let there = |option: &str| path(&of_scores, option).and_then(|p| existing(&p, &dir));
+            let there = |option: &str| asked.iter().find_map(|a| existing(&path(a, option)?, &dir));
             (texts.clip, texts.text_features) = (there("--clip"), there("--text-features"));
         }
         Ok(Self {

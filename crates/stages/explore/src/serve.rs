@@ -24,6 +24,7 @@ use rand::TryRngCore;
 use rand::rngs::OsRng;
 use serde_json::Value;
 use stage::Stage;
+use std::collections::BTreeMap;
 use std::net::{IpAddr, Ipv4Addr, SocketAddr};
 use std::sync::{Arc, Mutex};
 use std::time::Duration;
@@ -41,6 +42,8 @@ struct Shared {
     world: World,
     blob: Blob,
     edited: Mutex<Edited>,
+    /// Small photographs, as far as they were asked for.
+    previews: Mutex<BTreeMap<usize, Bytes>>,
     /// Whether only those who name this machine are answered.
     local: bool,
 }
@@ -105,7 +108,7 @@ fn shared(o: &ServeOptions, local: bool, stage: &Stage) -> Result<Shared> {
         world.scene.instances.len(),
         blob.bytes.len() as f64 / 1e6
     ));
-    Ok(Shared { world, blob, edited: Mutex::new(edited), local })
+    Ok(Shared { world, blob, edited: Mutex::new(edited), previews: Mutex::default(), local })
 }
 
 fn routes(shared: Arc<Shared>) -> Router {
@@ -118,6 +121,7 @@ fn routes(shared: Arc<Shared>) -> Router {
             get(|State(s): Held| async move { typed("application/octet-stream", s.blob.bytes.clone()) }),
         )
         .route("/photograph/{view}", get(photograph))
+        .route("/preview/{view}", get(preview))
         .route("/thumbnail/{instance}", get(thumbnail))
         .route("/pick", post(pick))
         .route("/find", get(find))
@@ -209,6 +213,21 @@ async fn photograph(State(s): Held, Path(view): Path<usize>) -> Response {
         let view = s.world.dataset.views.get(view).ok_or_else(|| no_such("view"))?;
         let kept = [(header::CONTENT_TYPE, "image/jpeg"), (header::CACHE_CONTROL, KEEP)];
         pictures::photograph(view).map(|jpeg| (kept, jpeg))
+    })
+    .await
+}
+
+/// A small photograph. All of them together are a few megabytes, and each took a large one to decode: they are kept.
+async fn preview(State(s): Held, Path(view): Path<usize>) -> Response {
+    answer(move || {
+        let kept = |s: &Shared| s.previews.lock().expect("no panic holds this lock").get(&view).cloned();
+        let made = |s: &Shared| -> Result<Bytes> {
+            let photograph = s.world.dataset.views.get(view).ok_or_else(|| no_such("view"))?;
+            let jpeg = Bytes::from(pictures::preview(photograph)?);
+            s.previews.lock().expect("no panic holds this lock").insert(view, jpeg.clone());
+            Ok(jpeg)
+        };
+        kept(&s).map_or_else(|| made(&s), Ok).map(|jpeg| typed("image/jpeg", jpeg))
     })
     .await
 }

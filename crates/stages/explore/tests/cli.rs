@@ -224,7 +224,7 @@ fn the_server_answers_clicks_texts_edits_and_selections() {
     assert_eq!(ply(&json!({"cells": [1, 2]})), gaussians().select(&[1, 2]));
     assert_eq!(ply(&json!({"cells": [1, 2], "others": true})), gaussians().select(&[0, 3]));
 
-    for picture in ["/photograph/0", "/photograph/1", "/thumbnail/0", "/thumbnail/1"] {
+    for picture in ["/photograph/0", "/photograph/1", "/preview/1", "/preview/1", "/thumbnail/0", "/thumbnail/1"] {
         let (status, bytes) = server.get(picture);
         assert_eq!((status, &bytes[..2]), (200, &[0xff, 0xd8][..]), "{picture}");
     }

@@ -1,5 +1,5 @@
 // Where answers come from: a server on this machine, or what the file itself holds. Both have the same doors:
-// load(progress), photograph(view), thumbnail(instance), pick(...), find(text), save(edits), selection(...).
+// load(progress), photograph(view), preview(view), thumbnail(instance), pick(...), find(text), save(edits), selection(...).
 import { Gaussians, largest } from "./gaussians.js";
 
 async function answer(response) {
@@ -29,6 +29,10 @@ export class Server {
 
   photograph(view) {
     return `photograph/${view}`;
+  }
+
+  preview(view) {
+    return `preview/${view}`;
   }
 
   thumbnail(instance) {
@@ -73,6 +77,10 @@ export class File {
 
   photograph(view) {
     return this.pictures.photographs[view] ?? null;
+  }
+
+  preview(view) {
+    return this.photograph(view);
   }
 
   thumbnail(instance) {

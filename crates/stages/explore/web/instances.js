@@ -86,13 +86,13 @@ export class Instances {
       }
     } else if (edit.op === "split") {
       const k = edit.instance, { own, parts } = this.family(k);
-      if (!parts.length) return "This has no parts in the tree.";
+      if (parts.length < 2) return "This has no parts in the tree.";
       const inside = parts.map((p) => this.within(p));
       const members = this.cellsOf(k);
       const partOf = (cell) => inside.findIndex((s) => s.has(this.cells[cell][1]));
-      const sizes = parts.map((_, p) => members.filter((c) => partOf(c) === p).reduce((s, c) => s + this.sizes[c], 0));
+      const sizes = parts.map((_, p) => members.filter((c) => partOf(c) === p).reduce((s, c) => s + this.scene.cell_counts[c], 0));
       const keeps = sizes.indexOf(Math.max(...sizes));
-      const ids = parts.map((_, p) => (p === keeps ? k : this.origin.push([...this.origin[k]]) - 1));
+      const ids = parts.map((_, p) => (p === keeps ? k : this.origin.push(sizes[p] ? [...this.origin[k]] : []) - 1));
       for (const cell of members) {
         const part = partOf(cell);
         if (part >= 0) this.label[cell] = ids[part];

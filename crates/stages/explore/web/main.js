@@ -222,10 +222,9 @@ function setTool(tool) {
 const find = attempt(async (text) => {
   if (!text.trim()) return clearAnswer();
   const answer = await door.find(text, instances.names);
-  // A file knows the scores of the instances as they were; what was merged has the best of its pieces.
-  const scores = answer.scores.length && answer.scores.length !== instances.length
-    ? instances.origin.map((from) => from.map((k) => answer.scores[k]).filter((s) => s != null).reduce((a, b) => Math.max(a, b), -Infinity)).map((s) => (s === -Infinity ? null : s))
-    : answer.scores.map((s, k) => (instances.origin[k].length ? s : null));
+  // A file knows the scores of the instances as they were: what was split off since has those of the whole.
+  const best = (from) => from.map((k) => answer.scores[k]).filter((s) => s != null).reduce((a, b) => (a === null || b > a ? b : a), null);
+  const scores = answer.scores.length ? instances.origin.map((from, k) => (from.length ? answer.scores[k] ?? best(from) : null)) : [];
   const ranking = scores.map((score, k) => ({ k, score })).filter((r) => r.score !== null).sort((a, b) => b.score - a.score || a.k - b.k);
   const named = answer.named.filter((k) => instances.origin[k]?.length);
   const all = [...named.map((k) => ({ k, score: null })), ...ranking.filter((r) => !named.includes(r.k))];
@@ -298,7 +297,7 @@ function panel() {
   for (const k of chosen) for (const v of instances.views(k)) if (!(views.get(v[0])?.[3] >= v[3])) views.set(v[0], v);
   const best = [...views.values()].sort((a, b) => b[3] - a[3]).slice(0, 12);
   $("photographs").replaceChildren(...best.map(([view, mask, score]) => {
-    const { name } = scene.cameras[view], source = door.photograph(view);
+    const { name } = scene.cameras[view], source = door.preview(view);
     const title = `Stand where ${name} was taken; mask ${mask} fits by ${score.toFixed(2)}`;
     const button = element("button", { type: "button", title }, source ? "" : name);
     if (source) button.append(element("img", { src: source, alt: name, loading: "lazy" }));
@@ -326,7 +325,7 @@ const ACTIONS = [
   ["frame", "Look at it", "f", () => frame(), () => state.cells.size],
   ["rename", "Rename", "n", () => rename(), () => wholeInstance() !== null],
   ["merge", "Merge", "m", () => merge(), () => selectedInstances().length > 1],
-  ["split", "Split", "x", () => split(), () => wholeInstance() !== null && instances.family(wholeInstance()).parts.length],
+  ["split", "Split", "x", () => split(), () => wholeInstance() !== null && instances.family(wholeInstance()).parts.length > 1],
   ["save-selection", "Save as PLY", "p", () => savePly(false), () => state.cells.size],
   ["save-rest", "Save the rest as PLY", "shift+p", () => savePly(true), () => state.cells.size],
   ["save-json", "Save as JSON", "j", () => saveJson(), () => state.cells.size],
