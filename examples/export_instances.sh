@@ -1,6 +1,6 @@
 #!/bin/bash
 # export_instances.sh RUN OUT: every instance of a finished run as a PLY of its own, which viewers of Gaussians open; all of
-# them in one, coloured by instance, is RUN/instances.ply already.
+# them in one, with the property `instance`, is RUN/instances.ply already.
 set -euo pipefail
 run=$(realpath "$1") out=$(realpath -m "$2")
 cd "$(dirname "$0")/.."

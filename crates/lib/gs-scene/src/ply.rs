@@ -129,7 +129,21 @@ fn header(count: usize, comments: &[String], properties: &[(&str, String)]) -> S
 /// Writes the standard 3DGS layout: little-endian floats, 62 properties at degree 3. `comments` become comment lines.
 pub fn write_gaussians(path: impl AsRef<Path>, gaussians: &Gaussians, comments: &[String]) -> Result<()> {
     let (path, rows) = (path.as_ref(), (gaussians.len(), 0..gaussians.len()));
-    write_atomic(path, |w| write_rows(w, path, gaussians, rows, comments))
+    write_atomic(path, |w| write_rows(w, path, gaussians, rows, None, comments))
+}
+
+/// The same with a whole number more for each Gaussian, the property `instance`: -1 for none. `instance` has one per Gaussian.
+pub fn write_labelled_gaussians(
+    path: impl AsRef<Path>,
+    gaussians: &Gaussians,
+    instance: &[i32],
+    comments: &[String],
+) -> Result<()> {
+    let (path, n) = (path.as_ref(), gaussians.len());
+    if instance.len() != n {
+        return Err(Error::new("not a label per Gaussian").file(path).found(instance.len()).expected(n));
+    }
+    write_atomic(path, |w| write_rows(w, path, gaussians, (n, 0..n), Some(instance), comments))
 }
 
 /// The same for the Gaussians `rows` only, in that order, without a copy of them.
@@ -140,14 +154,14 @@ pub fn write_some_gaussians(
     comments: &[String],
 ) -> Result<()> {
     let (path, rows) = (path.as_ref(), (rows.len(), rows.iter().map(|&i| i as usize)));
-    write_atomic(path, |w| write_rows(w, path, gaussians, rows, comments))
+    write_atomic(path, |w| write_rows(w, path, gaussians, rows, None, comments))
 }
 
 /// The bytes of the file that [`write_some_gaussians`] writes.
 pub fn some_gaussians(gaussians: &Gaussians, rows: &[u32], comments: &[String]) -> Result<Vec<u8>> {
     let mut bytes = Vec::new();
     let rows = (rows.len(), rows.iter().map(|&i| i as usize));
-    write_rows(&mut bytes, Path::new("a PLY in memory"), gaussians, rows, comments)?;
+    write_rows(&mut bytes, Path::new("a PLY in memory"), gaussians, rows, None, comments)?;
     Ok(bytes)
 }
 
@@ -157,6 +171,7 @@ fn write_rows(
     place: &Path,
     gaussians: &Gaussians,
     (count, rows): (usize, impl Iterator<Item = usize>),
+    instance: Option<&[i32]>,
     comments: &[String],
 ) -> Result<()> {
     gaussians.check().map_err(|e| e.file(place))?;
@@ -165,7 +180,8 @@ fn write_rows(
         ["x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2"].map(String::from).into();
     names.extend((0..3 * (k - 1)).map(|i| format!("f_rest_{i}")));
     names.extend(["opacity", "scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3"].map(String::from));
-    let properties: Vec<(&str, String)> = names.into_iter().map(|n| ("float", n)).collect();
+    let mut properties: Vec<(&str, String)> = names.into_iter().map(|n| ("float", n)).collect();
+    properties.extend(instance.map(|_| ("int", "instance".to_string())));
     w.write_all(header(count, comments, &properties).as_bytes()).at("write", place)?;
     let mut row: Vec<u8> = Vec::with_capacity(4 * properties.len());
     for i in rows {
@@ -179,6 +195,7 @@ fn write_rows(
         }
         put(gaussians.opacity_logits[i]);
         gaussians.log_scales[i].into_iter().chain(gaussians.rotations[i]).for_each(&mut put);
+        row.extend(instance.iter().flat_map(|l| l[i].to_le_bytes()));
         w.write_all(&row).at("write", place)?;
     }
     Ok(())

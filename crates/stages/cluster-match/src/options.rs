@@ -35,6 +35,9 @@ pub struct Args {
     /// (an i32 for every Gaussian, -1 for none) and <name>.json (the instances as text)
     #[arg(long, value_name = "FILE")]
     pub(crate) out: PathBuf,
+    /// Paint the Gaussians of the PLY beside the output in the colours of their instances, instead of their own
+    #[arg(long)]
+    pub(crate) paint: bool,
     /// Also write one PLY per instance into this folder
     #[arg(long, value_name = "DIR")]
     pub(crate) per_instance_plys: Option<PathBuf>,

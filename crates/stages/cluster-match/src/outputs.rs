@@ -10,7 +10,7 @@ use serde_json::{Value, json};
 use stage::Stage;
 use std::path::Path;
 
-/// What is written beside the output, by extension: coloured Gaussians, labels, and the instances as text.
+/// What is written beside the output, by extension: Gaussians with their instances, labels, and the instances as text.
 pub(crate) const SIDE_FILES: [&str; 3] = ["ply", "labels.npy", "json"];
 
 /// The right to write the instances and what lies beside them.
@@ -52,8 +52,9 @@ pub(crate) fn write(
     let parameters = serde_json::to_value(settings).map_err(fail)?;
     let own = vec![format!("made by cluster-match {}", env!("CARGO_PKG_VERSION")), format!("parameters {parameters}")];
     let (gaussians, comments) = (&inputs.geometry.gaussians, inputs.geometry.comments(own));
-    let [colors, list, table] = SIDE_FILES.map(|extension| a.out.with_extension(extension));
-    ply::write_gaussians(colors, &colored(gaussians, &instances.label), &comments)?;
+    let [labelled, list, table] = SIDE_FILES.map(|extension| a.out.with_extension(extension));
+    let painted = a.paint.then(|| painted(gaussians, &instances.label));
+    ply::write_labelled_gaussians(labelled, painted.as_ref().unwrap_or(gaussians), &instances.label, &comments)?;
     gs_io::npy::write_i32(list, &[instances.label.len()], &instances.label)?;
     health::say(health, stage);
     let text = as_text(instances, health, &parameters);
@@ -75,8 +76,8 @@ pub(crate) fn write(
     Ok(())
 }
 
-/// The geometry in the colours of its instances, as a plain 3DGS PLY that any viewer shows.
-fn colored(g: &Gaussians, labels: &[i32]) -> Gaussians {
+/// The geometry in the colours of its instances.
+fn painted(g: &Gaussians, labels: &[i32]) -> Gaussians {
     let color = |&l: &i32| u32::try_from(l).map_or(NOISE_COLOR, instance_color).map(|v| (v - 0.5) / SH_C0);
     Gaussians {
         means: g.means.clone(),

@@ -259,12 +259,14 @@ fn instances_are_found_matched_and_described_the_same_for_any_number_of_threads(
     assert_eq!(i.descriptor_of(b), [0.0, 1.0, 0.0]);
     assert_eq!(i.tree.iter().filter(|e| e.instance >= 0).count(), 2);
 
-    // Beside it: the Gaussians in their instances' colours, labels, and a text.
-    let colored = ply::read_gaussians(s.path("out/instances.ply")).unwrap();
-    let g = gaussians();
-    assert_eq!((&colored.means, &colored.opacity_logits, colored.sh_degree), (&g.means, &g.opacity_logits, 0));
-    assert_eq!(colored.sh_of(0), colored.sh_of(1));
-    assert_ne!(colored.sh_of(0), colored.sh_of(EACH));
+    // Beside it: the Gaussians as they were with their instances, labels, and a text.
+    assert_eq!(ply::read_gaussians(s.path("out/instances.ply")).unwrap(), gaussians());
+    let file = std::fs::read(s.path("out/instances.ply")).unwrap();
+    let header = file.windows(11).position(|w| w == b"end_header\n").unwrap() + 11;
+    assert!(String::from_utf8_lossy(&file[..header]).contains("property int instance\n"));
+    let rows = file[header..].chunks_exact((file.len() - header) / i.label.len());
+    let written: Vec<i32> = rows.map(|r| i32::from_le_bytes(*r.last_chunk().unwrap())).collect();
+    assert_eq!(written, i.label);
     let labels = gs_io::npy::read_f32(s.path("out/instances.labels.npy")).unwrap();
     assert!(labels.data.iter().zip(&i.label).all(|(a, b)| *a == *b as f32) && labels.shape == [81]);
     let text: Value = serde_json::from_slice(&std::fs::read(s.path("out/instances.json")).unwrap()).unwrap();
@@ -363,6 +365,14 @@ fn options_do_what_they_say() {
     let (i, _) = s.succeed(&["--levels", "medium,large"]);
     assert!(i.matches.len() == 2 * VIEWS && i.matches.iter().all(|m| m.mask >= 3));
     assert!(s.succeed(&["--threshold", "1"]).0.matches.is_empty());
+
+    // Painted, Gaussians of one instance have one colour.
+    let i = s.succeed(&["--paint"]).0;
+    let painted = ply::read_gaussians(s.path("out/instances.ply")).unwrap();
+    let [a, b] = [0, 1].map(|k| i.label.iter().position(|&l| l == k).unwrap());
+    assert_eq!((&painted.means, painted.sh_degree), (&gaussians().means, 0));
+    assert!(painted.sh_of(a) != painted.sh_of(b));
+    assert!((0..81).filter(|&g| i.label[g] == 0).all(|g| painted.sh_of(g) == painted.sh_of(a)));
 
     // One PLY per instance, none left from an earlier run.
     let folder = s.path("plys");
