@@ -27,7 +27,7 @@ check_masks() {
   maps=$(count "$folder" '*_s.npy') features=$(count "$folder" '*_f.npy')
   if [ "$maps" -eq 0 ]; then
     printf '  none     masks in %s: SAM makes them\n' "$folder"
-    [ -e "$SAM/encoder.onnx" ] || lack "SAM's encoder.onnx and sam.onnx" "$SAM (make models), or LangSplat's masks to $folder" sam
+    [ -e "$SAM/encoder.onnx" ] || [ -e "$SAM/model.json" ] || lack "SAM's encoder.onnx and sam.onnx" "$SAM (make models), or LangSplat's masks to $folder" sam
     [ -n "$CLIP$classless" ] || lack "a CLIP model for the masks' features" "any folder, given as CLIP=folder" clip
   elif [ "$maps" -lt "$photographs" ]; then
     lack "$((photographs - maps)) of $photographs id maps (*_s.npy)" "$folder" "$3"

@@ -7,6 +7,9 @@
 crates/lib/onnx-models/testdata/ops.onnx         floats and integers in, sum, product and a value in between
 crates/lib/onnx-models/testdata/clip/            a dual encoder whose features can be computed by hand
 crates/stages/mask-embed/testdata/sam/           a segmenter by colour with the inputs and outputs of SAM
+crates/stages/mask-embed/testdata/sam2/          the same with the inputs and outputs of SAM 2.1's exports, described by model.json
+crates/stages/mask-embed/testdata/efficient-sam/ the same as EfficientSAM's
+crates/stages/mask-embed/testdata/edge-sam/      the same as EdgeSAM's
 crates/stages/mask-embed/testdata/sam-tiny/      a decoder with SAM's architecture and names, narrow and with random weights
 """
 
@@ -171,6 +174,145 @@ def sam():
     )
 
 
+def by_color(points, unused):
+    """Masks [4, 256, 256] and their qualities [1, 4] for a point in pixels of 1024, of the colours `picture` [1, 3, 256, 256];
+    the arrays `unused` are read and change nothing."""
+    node = helper.make_node
+    nodes = [
+        node("Reshape", [points, "every_2"], ["pairs"]),
+        node("Gather", ["pairs", "zero"], ["first_point"]),
+        node("Div", ["first_point", "four"], ["cell_float"]),
+        node("Cast", ["cell_float"], ["cell_xy"], to=I64),
+        node("Gather", ["cell_xy", "yx"], ["cell"]),
+        node("Transpose", ["picture"], ["channels_last"], perm=[0, 2, 3, 1]),
+        node("Squeeze", ["channels_last", "zero1"], ["colors"]),
+        node("GatherND", ["colors", "cell"], ["color"]),
+        node("Sub", ["colors", "color"], ["difference"]),
+        node("Abs", ["difference"], ["absolute"]),
+        node("ReduceMax", ["absolute"], ["distance"], axes=[2], keepdims=0),
+        node("Sub", ["thresholds", "distance"], ["margin"]),
+        node("Mul", ["margin", "twenty"], ["all_masks"]),
+    ]
+    last = "quality"
+    for i, name in enumerate(unused):
+        nodes += [
+            node("Cast", [name], [f"float_{i}"], to=F),
+            node("ReduceMax", [f"float_{i}"], [f"most_{i}"], keepdims=0),
+            node("Mul", [f"most_{i}", "nothing"], [f"nothing_{i}"]),
+            node("Add", [last, f"nothing_{i}"], [f"quality_{i}"]),
+        ]
+        last = f"quality_{i}"
+    nodes.append(node("Identity", [last], ["all_quality"]))
+    constants = [
+        constant("every_2", np.array([-1, 2], np.int64)),
+        constant("zero", np.int64(0)),
+        constant("zero1", np.array([0], np.int64)),
+        constant("yx", np.array([1, 0], np.int64)),
+        constant("four", np.float32(4)),
+        constant("twenty", np.float32(20)),
+        constant("nothing", np.float32(0)),
+        constant("thresholds", np.array([0.3, 0.15, 0.6, 1.2], np.float32).reshape(4, 1, 1)),
+        constant("quality", np.array([[0.5, 0.9, 0.95, 0.9]], np.float32)),
+    ]
+    return nodes, constants
+
+
+def exports():
+    """Other exports' inputs and outputs, by the scripts that make them (docs/masks.md)."""
+    node = helper.make_node
+    pool = lambda n, to, of="image": node("AveragePool", [of], [to], kernel_shape=[n, n], strides=[n, n])
+    three = [
+        node("Slice", ["all_masks", "from_1", "to_4", "zero1"], ["three_masks"]),
+        node("Slice", ["all_quality", "from_1", "to_4", "from_1"], ["three_scores"]),
+    ]
+    three_constants = [constant("from_1", np.array([1], np.int64)), constant("to_4", np.array([4], np.int64))]
+    stages = ROOT / "crates/stages/mask-embed/testdata"
+
+    folder = stages / "sam2"
+    features = [("high_res_feats_0", 256), ("high_res_feats_1", 128), ("image_embed", 64)]
+    feature_values = [value(name, F, [1, 3, n, n]) for name, n in features]
+    encoder = [pool(1024 // n, name) for name, n in features]
+    write(folder / "encoder.onnx", encoder, [value("image", F, [1, 3, 1024, 1024])], feature_values)
+    nodes, constants = by_color("point_coords", ["image_embed", "high_res_feats_1", "point_labels", "mask_input", "has_mask_input"])
+    write(
+        folder / "decoder.onnx",
+        [node("Identity", ["high_res_feats_0"], ["picture"]), *nodes, *three]
+        + [node("Unsqueeze", ["three_masks", "zero1"], ["masks"]), node("Identity", ["three_scores"], ["iou_predictions"])],
+        [
+            *reversed(feature_values),
+            value("point_coords", F, ["num_labels", "num_points", 2]),
+            value("point_labels", F, ["num_labels", "num_points"]),
+            value("mask_input", F, ["num_labels", 1, 256, 256]),
+            value("has_mask_input", F, ["num_labels"]),
+        ],
+        [value("masks", F, [1, 3, 256, 256]), value("iou_predictions", F, [1, 3])],
+        constants + three_constants,
+    )
+
+    folder = stages / "efficient-sam"
+    write(
+        folder / "encoder.onnx",
+        [
+            node("Sub", ["batched_images", "mean"], ["centred"]),
+            node("Div", ["centred", "std"], ["normed"]),
+            pool(4, "image_embeddings", "normed"),
+        ],
+        [value("batched_images", F, ["batch", 3, "height", "width"])],
+        [value("image_embeddings", F, ["batch", 3, "small_height", "small_width"])],
+        [
+            constant("mean", np.array([0.485, 0.456, 0.406], np.float32).reshape(1, 3, 1, 1)),
+            constant("std", np.array([0.229, 0.224, 0.225], np.float32).reshape(1, 3, 1, 1)),
+        ],
+    )
+    nodes, constants = by_color("rescaled", ["batched_point_labels"])
+    write(
+        folder / "decoder.onnx",
+        [
+            node("Cast", ["orig_im_size"], ["size"], to=F),
+            node("Div", ["side", "size"], ["scale"]),
+            node("Mul", ["batched_point_coords", "scale"], ["rescaled"]),
+            node("Identity", ["image_embeddings"], ["picture"]),
+            *nodes,
+            *three,
+            node("Unsqueeze", ["three_masks", "axes"], ["output_masks"]),
+            node("Unsqueeze", ["three_scores", "zero1"], ["iou_predictions"]),
+        ],
+        [
+            value("image_embeddings", F, ["batch", 3, 256, 256]),
+            value("batched_point_coords", F, [1, "num_points", 1, 2]),
+            value("batched_point_labels", F, [1, "num_points", 1]),
+            value("orig_im_size", I64, [2]),
+        ],
+        [value("output_masks", F, [1, 1, 3, 256, 256]), value("iou_predictions", F, [1, 1, 3])],
+        [*constants, *three_constants, constant("axes", np.array([0, 1], np.int64)), constant("side", np.float32(1024))],
+    )
+
+    folder = stages / "edge-sam"
+    write(
+        folder / "edge_sam_encoder.onnx",
+        [pool(4, "image_embeddings")],
+        [value("image", F, [1, 3, 1024, 1024])],
+        [value("image_embeddings", F, [1, 3, 256, 256])],
+    )
+    nodes, constants = by_color("point_coords", ["point_labels"])
+    write(
+        folder / "edge_sam_decoder.onnx",
+        [
+            node("Identity", ["image_embeddings"], ["picture"]),
+            *nodes,
+            node("Identity", ["all_quality"], ["scores"]),
+            node("Unsqueeze", ["all_masks", "zero1"], ["masks"]),
+        ],
+        [
+            value("image_embeddings", F, [1, 3, 256, 256]),
+            value("point_coords", F, [1, "num_points", 2]),
+            value("point_labels", F, [1, "num_points"]),
+        ],
+        [value("scores", F, [1, 4]), value("masks", F, [1, 4, 256, 256])],
+        constants,
+    )
+
+
 class Decoder:
     """SAM's mask decoder (Kirillov et al. 2023, appendix A) as PyTorch's exporter writes it, narrow."""
 
@@ -327,4 +469,5 @@ if __name__ == "__main__":
     ops()
     clip()
     sam()
+    exports()
     sam_tiny()

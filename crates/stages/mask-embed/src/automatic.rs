@@ -81,7 +81,7 @@ pub fn propose(sam: &Sam, embedded: &Embedded, choice: &Choice) -> Result<Propos
     let mut masks: Vec<Proposal> = Vec::new();
     let mut asked: Vec<[f64; 2]> = Vec::new();
     let mut points = 0;
-    for round in rounds(choice.points_per_side, embedded.frame[0] as f64 / embedded.frame[1] as f64) {
+    for round in rounds(choice.points_per_side, embedded.aspect) {
         points += round.len();
         let at_level = |l: usize| masks.iter().filter(move |m| m.level == l);
         let times = |p: &Pixels| asked.iter().filter(|&&a| p.contains(grid.index(a))).count();

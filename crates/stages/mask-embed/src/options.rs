@@ -82,7 +82,8 @@ pub(crate) struct MasksArgs {
     #[arg(long, value_name = "FOLDER")]
     #[serde(skip)]
     pub out: PathBuf,
-    /// Folder with SAM's encoder.onnx and sam.onnx, as `make models` fetches them
+    /// Folder with SAM's encoder.onnx and sam.onnx, as `make models` fetches them, or other exports with a model.json
+    /// (docs/masks.md)
     #[arg(long, default_value = "models", value_name = "FOLDER")]
     #[serde(skip)]
     pub sam: PathBuf,

@@ -97,8 +97,9 @@ impl Scene {
 
     fn masks_args(&self, out: &Path, more: &[&str]) -> Vec<String> {
         let choice = ["--points-per-side", "16", "--min-area", "20"];
-        let args = ["masks", "--scene", path(&self.folder), "--sam", SAM, "--out", path(out)];
-        [&args, &choice[..], more].concat().into_iter().map(String::from).collect()
+        let args = ["masks", "--scene", path(&self.folder), "--out", path(out)];
+        let sam: &[&str] = if more.contains(&"--sam") { &[] } else { &["--sam", SAM] };
+        [&args, sam, &choice[..], more].concat().into_iter().map(String::from).collect()
     }
 
     fn make_masks(&self, out: &Path, more: &[&str]) -> String {
@@ -190,6 +191,110 @@ fn the_result_depends_neither_on_threads_nor_on_interruptions() {
     let said = scene.make_masks(&other, &[]);
     assert!(said.contains("skipped 2 of 3 views"), "{said}");
     assert_eq!(std::fs::read(other.join("v1_s.npy")).unwrap(), whole["v0_s.npy"]);
+}
+
+/// A folder of an export other than SAM's own.
+fn export(name: &str) -> PathBuf {
+    Path::new(SAM).with_file_name(name)
+}
+
+#[test]
+fn other_exports_are_used_as_their_description_says() {
+    let scene = Scene::new(1);
+    scene.make_masks(&scene.masks, &[]);
+    let sam = MaskMaps::read(maps_path(&scene.masks, "v0")).unwrap();
+    for name in ["edge-sam", "sam2", "efficient-sam"] {
+        let out = scene.masks.with_file_name(name);
+        scene.make_masks(&out, &["--sam", path(&export(name))]);
+        let maps = MaskMaps::read(maps_path(&out, "v0")).unwrap();
+        if name == "edge-sam" {
+            assert_eq!(maps, sam, "the same numbers by other names");
+        }
+        for level in &Level::ALL[1..] {
+            let at = |x: usize, y: usize| maps.level(*level)[y * WIDTH + x];
+            let things = [at(2, 20), at(30, 30), at(76, 44), at(64, 4)];
+            assert!(things.iter().all(|&id| id >= 0), "{name}: {things:?}");
+            assert_eq!(things.iter().collect::<std::collections::BTreeSet<_>>().len(), 4, "{name}: {things:?}");
+            assert_eq!(at(96, 32) == at(76, 44), *level != Level::Small, "{name}");
+        }
+        // Stretched or not, a thing lies where it lies.
+        let dark = maps.level(Level::Large)[30 * WIDTH + 30];
+        let differ = |i: &usize| {
+            let inside = (16..48).contains(&(i % WIDTH)) && (16..48).contains(&(i / WIDTH));
+            (maps.level(Level::Large)[*i] == dark) != inside
+        };
+        assert!((0..WIDTH * HEIGHT).filter(differ).count() < 140, "{name}");
+    }
+}
+
+#[test]
+fn a_wrong_description_of_an_export_is_refused_before_the_first_view() {
+    let scene = Scene::new(1);
+    let whole = r#""fit": "stretch", "decoder": "decoder.onnx", "masks": "masks", "pad_point": false"#;
+    let all = r#""embeddings": {"image_embed": "image_embed", "high_res_feats_0": "high_res_feats_0", "high_res_feats_1": "high_res_feats_1"}"#;
+    let cases = [
+        ("sam2", "{".to_string(), "model.json: not a description of SAM's graphs: EOF"),
+        ("sam2", r#"{"mode": 1}"#.into(), "unknown field `mode`, expected one of `encoder`, `decoder`"),
+        ("sam2", r#"{"fit": "crop"}"#.into(), "unknown variant `crop`, expected `pad` or `stretch`"),
+        (
+            "sam2",
+            r#"{"std": [1, 0, 1]}"#.into(),
+            "std: not a usable value; found [1.0, 0.0, 1.0], expected three positive",
+        ),
+        ("sam2", r#"{"point_frame": -1}"#.into(), "point_frame: not a usable value; found -1, expected 0 to 4096"),
+        ("sam2", "{}".into(), "sam.onnx: no such model"),
+        ("sam2", r#"{"decoder": "decoder.onnx"}"#.into(), "decoder.onnx: low_res_masks: the model has no such value"),
+        ("sam2", format!("{{{whole}}}"), "embeddings: the encoder has several outputs, and nothing says where they go"),
+        (
+            "sam2",
+            format!(r#"{{{whole}, "embeddings": {{"image_embed": "embed"}}}}"#),
+            "encoder.onnx: embed: the encoder has no such output; expected high_res_feats_0, high_res_feats_1, image_embed",
+        ),
+        (
+            "sam2",
+            format!(r#"{{{whole}, "embeddings": {{"image_embed": "image_embed"}}}}"#),
+            "high_res_feats_1: nothing says what this input of the decoder gets",
+        ),
+        (
+            "sam2",
+            format!(r#"{{{whole}, {all}, "points": "points"}}"#),
+            "decoder.onnx: points: the decoder has no such input; expected image_embed",
+        ),
+        (
+            "sam2",
+            format!(r#"{{{whole}, {all}, "points": "mask_input"}}"#),
+            "nothing says what this input of the decoder gets",
+        ),
+        (
+            "sam2",
+            format!(r#"{{{whole}, {all}, "constants": {{"point_labels": 1}}}}"#),
+            "decoder.onnx: point_labels: the input of the decoder is named twice",
+        ),
+        (
+            "sam2",
+            format!(r#"{{{whole}, {all}, "constants": {{"has_mask_input": [0, 0]}}}}"#),
+            "has_mask_input: the input has another number of values; found 2 in model.json, expected one number",
+        ),
+        (
+            "sam2",
+            format!(
+                r#"{{{whole}, "embeddings": {{"image_embed": "high_res_feats_0", "high_res_feats_0": "image_embed", "high_res_feats_1": "high_res_feats_1"}}}}"#
+            ),
+            "decoder.onnx: input high_res_feats_0: the input has another shape",
+        ),
+        // SAM's own export needs no description; a wrong one is read all the same.
+        ("sam", r#"{"masks": "logits"}"#.into(), "sam.onnx: logits: the model has no such value"),
+    ];
+    for (name, text, expected) in cases {
+        let folder = tempfile::tempdir().unwrap();
+        for file in std::fs::read_dir(export(name)).unwrap().map(|e| e.unwrap().path()) {
+            std::fs::copy(&file, folder.path().join(file.file_name().unwrap())).unwrap();
+        }
+        std::fs::write(folder.path().join("model.json"), &text).unwrap();
+        let e = error(&scene.masks_args(&scene.masks, &["--sam", path(folder.path())]));
+        assert!(e.contains(expected), "{text}: {e}");
+        assert!(!maps_path(&scene.masks, "v0").exists());
+    }
 }
 
 #[test]

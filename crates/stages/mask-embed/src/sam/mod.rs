@@ -1,25 +1,25 @@
 //! SAM through ONNX: a picture is encoded once, then asked for the masks at a point.
 //!
 //! The two graphs are those of SAM's own export script: an encoder with a square input of 1024 pixels, and a decoder with
-//! `image_embeddings`, `point_coords`, `point_labels`, `mask_input`, `has_mask_input` and `orig_im_size`. The export
+//! `image_embeddings`, `point_coords`, `point_labels`, `mask_input`, `has_mask_input` and `orig_im_size`; or others that
+//! `model.json` describes (`export`). SAM's export
 //! declares the best mask only, but computes four: one for prompts of several points, and whole, part and subpart for a
 //! single one. The four are found in the graph before the choice among them and taken instead (`all_masks`); the
 //! enlargement to the photograph's size, which is most of the memory and much of the time, is then never computed.
 //! Where the decoder is built as SAM's, `decoder` takes the place of most of the graph.
 
 mod decoder;
+mod export;
 mod planar;
 mod weights;
 
 use decoder::{Decoder, Names, Photograph};
+use export::{Export, Fit, Prompt};
 use gs_io::{Error, IoContext, Result, hash_files};
 use onnx_models::{EngineOptions, Graph, Model, Outputs, RgbImage, Tensor, open, resize_rgb};
 use std::path::Path;
 use weights::File;
 
-/// Mean and standard deviation of each channel in SAM's training, of 255.
-const MEAN: [f32; 3] = [123.675, 116.28, 103.53];
-const STD: [f32; 3] = [58.395, 57.12, 57.375];
 /// Side of the masks that the decoder makes and takes.
 const MASK_SIDE: usize = 256;
 
@@ -27,7 +27,12 @@ const MASK_SIDE: usize = 256;
 pub struct Sam {
     encoder: Box<dyn Model>,
     decoding: Decoding,
+    prompt: Prompt,
     side: usize,
+    fit: Fit,
+    /// Of each channel, of 255.
+    mean: [f32; 3],
+    std: [f32; 3],
     hash: String,
 }
 
@@ -47,8 +52,10 @@ struct Parts {
 
 /// A picture as the decoder wants it.
 pub struct Embedded {
-    values: Tensor<'static>,
+    values: Vec<Tensor<'static>>,
     photograph: Option<Photograph>,
+    /// Width of the picture by its height.
+    pub aspect: f64,
     /// Width and height of the picture within the encoder's square.
     pub frame: [usize; 2],
     /// Width and height of the picture within a mask, possibly with a fraction.
@@ -104,8 +111,8 @@ fn before_choice(graph: &Graph, output: &str) -> Option<String> {
 }
 
 /// Names of the outputs to ask the decoder for: all masks and qualities where they can be found, else the declared ones.
-fn all_masks(graph: &Graph) -> [String; 2] {
-    let declared = ["low_res_masks", "iou_predictions"].map(String::from);
+fn all_masks(graph: &Graph, export: &Export) -> [String; 2] {
+    let declared = [export.masks.clone(), export.scores.clone()];
     match [before_choice(graph, &declared[0]), before_choice(graph, &declared[1])] {
         [Some(masks), Some(quality)] => [masks, quality],
         _ => declared,
@@ -116,14 +123,15 @@ impl Sam {
     /// Side of the masks in pixels.
     pub const MASK_SIDE: usize = MASK_SIDE;
 
-    /// Opens `encoder.onnx` and `sam.onnx` of a folder. `plain` asks the decoder's whole graph for every point, for
+    /// Opens the graphs of a folder: `encoder.onnx` and `sam.onnx`, or what `model.json` says. `plain` asks the decoder's whole graph for every point, for
     /// comparison.
     ///
     /// # Errors
     /// When a file is missing or damaged, or is not SAM.
     pub fn open(folder: impl AsRef<Path>, options: &EngineOptions, plain: bool) -> Result<Self> {
         let folder = folder.as_ref();
-        let [encoder_path, decoder_path] = ["encoder.onnx", "sam.onnx"].map(|n| folder.join(n));
+        let export = Export::read(folder)?;
+        let [encoder_path, decoder_path] = [&export.encoder, &export.decoder].map(|n| folder.join(n));
         for path in [&encoder_path, &decoder_path] {
             if !path.exists() {
                 return Err(Error::new("no such model")
@@ -147,60 +155,68 @@ impl Sam {
         }
         let bytes = std::fs::read(&decoder_path).at("read", &decoder_path)?;
         let graph = Graph::parse(&bytes).map_err(|e| e.file(&decoder_path))?;
-        let [masks, quality] = all_masks(&graph);
+        let [masks, quality] = all_masks(&graph, &export);
         let part = |values: &[&str]| {
             let options = EngineOptions { threads_per_run: 1, ..options.clone() };
             open(&decoder_path, Outputs::Values(values), &options)
         };
         let whole = part(&[&masks, &quality])?;
+        let prompt = Prompt::new(&export, &*encoder, &*whole, side)?;
         // Whatever keeps the parts from being made or asked, the whole graph is there.
         let parts = || {
             let (decoder, Names { photograph, tokens }) = Decoder::read(&File { graph: &graph, bytes: &bytes })?;
             let photograph = part(&photograph.each_ref().map(String::as_str)).ok()?;
             let parts = Parts { photograph, tokens: part(&[&tokens]).ok()?, decoder };
-            parts.agree_with(&*whole, side).ok()?.then(|| Box::new(parts))
+            parts.agree_with(&*whole, &prompt, side).ok()?.then(|| Box::new(parts))
         };
         let decoding = match if plain { None } else { parts() } {
             Some(parts) => Decoding::Parts(parts),
             None => Decoding::Graph(whole),
         };
-        let hash = hash_files([("encoder.onnx", &encoder_path), ("sam.onnx", &decoder_path)])?;
-        Ok(Self { encoder, decoding, side, hash })
+        let mut files = vec![("encoder.onnx", &encoder_path), ("sam.onnx", &decoder_path)];
+        let description = folder.join(export::FILE);
+        files.extend(description.exists().then_some((export::FILE, &description)));
+        let [mean, std] = [export.mean, export.std].map(|c| c.map(|v| (v * 255.0) as f32));
+        Ok(Self { encoder, decoding, prompt, side, fit: export.fit, mean, std, hash: hash_files(files)? })
     }
 
-    /// Content hash of both models.
+    /// Content hash of both models and their description.
     pub fn hash(&self) -> &str {
         &self.hash
     }
 
-    /// Encodes a picture: longest side resized to the square's, zeros to the right and below.
+    /// Encodes a picture.
     ///
     /// # Errors
     /// When the engine fails.
     pub fn encode(&self, image: &RgbImage) -> Result<Embedded> {
         let side = self.side;
         let scale = side as f64 / image.width.max(image.height) as f64;
-        let frame = [image.width, image.height].map(|n| ((n as f64 * scale).round() as usize).clamp(1, side));
+        let frame = match self.fit {
+            Fit::Pad => [image.width, image.height].map(|n| ((n as f64 * scale).round() as usize).clamp(1, side)),
+            Fit::Stretch => [side; 2],
+        };
         let small = resize_rgb(image, frame[0], frame[1]);
         let mut pixels = vec![0f32; 3 * side * side];
         for (i, p) in small.pixels.chunks_exact(3).enumerate() {
             let at = i / frame[0] * side + i % frame[0];
             for c in 0..3 {
-                pixels[c * side * side + at] = (f32::from(p[c]) - MEAN[c]) / STD[c];
+                pixels[c * side * side + at] = (f32::from(p[c]) - self.mean[c]) / self.std[c];
             }
         }
         let name = self.encoder.inputs()[0].name.clone();
-        let mut out = self.encoder.run(&[(&name, Tensor::f32(&[1, 3, side, side], pixels))])?;
-        if out.len() != 1 || out[0].as_f32().is_none_or(|v| v.iter().any(|v| !v.is_finite())) {
-            return Err(Error::new("the encoder does not give one array of finite numbers").file(self.encoder.path()));
+        let out = self.encoder.run(&[(&name, Tensor::f32(&[1, 3, side, side], pixels))])?;
+        let values: Vec<Tensor> = self.prompt.outputs().map(|i| out[i].clone()).collect();
+        if values.iter().any(|t| t.as_f32().is_none_or(|v| v.iter().any(|v| !v.is_finite()))) {
+            return Err(Error::new("the encoder does not give finite numbers").file(self.encoder.path()));
         }
-        let values = out.swap_remove(0);
         let extent = frame.map(|n| n as f64 * MASK_SIDE as f64 / side as f64);
         let photograph = match &self.decoding {
             Decoding::Graph(_) => None,
-            Decoding::Parts(parts) => parts.photograph(&values, extent)?,
+            Decoding::Parts(parts) => parts.photograph(&self.prompt, &values, extent)?,
         };
-        Ok(Embedded { values, photograph, frame, extent })
+        let aspect = image.width as f64 / image.height as f64;
+        Ok(Embedded { values, photograph, aspect, frame, extent })
     }
 
     /// Masks at a point of the picture, `x` and `y` in 0..1 of its width and height, whose predicted IoU is at least
@@ -210,25 +226,26 @@ impl Sam {
     /// When the engine fails or does not give masks of 256 x 256.
     pub fn decode(&self, embedded: &Embedded, [x, y]: [f64; 2], least: f32) -> Result<Candidates> {
         let point = [(x * embedded.frame[0] as f64) as f32, (y * embedded.frame[1] as f64) as f32];
+        let inputs = self.prompt.inputs(&embedded.values, point);
         match (&self.decoding, &embedded.photograph) {
-            (Decoding::Graph(graph), _) => ask_graph(&**graph, &embedded.values, point, least),
-            (Decoding::Parts(parts), Some(photograph)) => parts.ask(&embedded.values, photograph, point, least),
+            (Decoding::Graph(graph), _) => ask_graph(&**graph, &inputs, least),
+            (Decoding::Parts(parts), Some(photograph)) => parts.ask(&inputs, photograph, least),
             (Decoding::Parts(parts), None) => Err(Error::new("the encoder's embedding does not suit the decoder")
                 .file(parts.tokens.path())
-                .found(format!("{:?}", embedded.values.shape))),
+                .found(format!("{:?}", embedded.values[0].shape))),
         }
     }
 }
 
 impl Parts {
     /// What the photograph alone decides; `None` where the shapes are not SAM's.
-    fn photograph(&self, values: &Tensor, extent: [f64; 2]) -> Result<Option<Photograph>> {
+    fn photograph(&self, prompt: &Prompt, values: &[Tensor], extent: [f64; 2]) -> Result<Option<Photograph>> {
         let pixels = extent.map(|n| (n / 4.0).ceil() as usize);
-        Ok(Photograph::new(&self.photograph.run(&inputs(values, [0.0; 2]))?, pixels))
+        Ok(Photograph::new(&self.photograph.run(&prompt.inputs(values, [0.0; 2]))?, pixels))
     }
 
-    fn ask(&self, values: &Tensor, photograph: &Photograph, point: [f32; 2], least: f32) -> Result<Candidates> {
-        let tokens = self.tokens.run(&inputs(values, point))?;
+    fn ask(&self, inputs: &[(&str, Tensor)], photograph: &Photograph, least: f32) -> Result<Candidates> {
+        let tokens = self.tokens.run(inputs)?;
         let Some(tokens) = tokens[0].as_f32().filter(|t| self.decoder.fits(photograph, t)) else {
             return Err(Error::new("the decoder's tokens do not suit its weights").file(self.tokens.path()));
         };
@@ -236,8 +253,9 @@ impl Parts {
     }
 
     /// Whether the answer about a point is the whole graph's.
-    fn agree_with(&self, whole: &dyn Model, side: usize) -> Result<bool> {
-        let embedding = whole.inputs().iter().find(|i| i.name == "image_embeddings").and_then(|i| i.shape.as_ref());
+    fn agree_with(&self, whole: &dyn Model, prompt: &Prompt, side: usize) -> Result<bool> {
+        let embedding = whole.inputs().iter().find(|i| prompt.only_embedding() == Some(&i.name));
+        let embedding = embedding.and_then(|i| i.shape.as_ref());
         let count = |s: &[Option<usize>]| s.iter().flatten().try_fold(1usize, |n, &d| n.checked_mul(d));
         let embedding = embedding.filter(|s| count(s).is_some_and(|n| n <= 1 << 24));
         let Some(shape) = embedding.and_then(|s| s.iter().copied().collect::<Option<Vec<usize>>>()) else {
@@ -245,11 +263,11 @@ impl Parts {
         };
         // Any numbers of about the size of an embedding's.
         let numbers = (0..shape.iter().product()).map(|i: usize| (i as f32).sin() * (i as f32 * 0.01).cos());
-        let values = Tensor::f32(&shape, numbers.collect::<Vec<_>>());
-        let Some(photograph) = self.photograph(&values, [MASK_SIDE as f64; 2])? else { return Ok(false) };
-        let point = [0.25, 0.75].map(|p| p * side as f32);
-        let want = ask_graph(whole, &values, point, f32::NEG_INFINITY)?;
-        let Ok(got) = self.ask(&values, &photograph, point, f32::NEG_INFINITY) else { return Ok(false) };
+        let values = [Tensor::f32(&shape, numbers.collect::<Vec<_>>())];
+        let Some(photograph) = self.photograph(prompt, &values, [MASK_SIDE as f64; 2])? else { return Ok(false) };
+        let inputs = prompt.inputs(&values, [0.25, 0.75].map(|p| p * side as f32));
+        let want = ask_graph(whole, &inputs, f32::NEG_INFINITY)?;
+        let Ok(got) = self.ask(&inputs, &photograph, f32::NEG_INFINITY) else { return Ok(false) };
         let near = |a: f32, b: f32| (a - b).abs() <= 1e-3 * (1.0 + a.abs());
         Ok(want.masks.len() == got.masks.len()
             && want.masks.iter().zip(&got.masks).all(|(a, b)| near(a.1, b.1))
@@ -257,9 +275,9 @@ impl Parts {
     }
 }
 
-/// The whole graph's answer for a point in the encoder's pixels.
-fn ask_graph(graph: &dyn Model, values: &Tensor, point: [f32; 2], least: f32) -> Result<Candidates> {
-    let out = graph.run(&inputs(values, point))?;
+/// The whole graph's answer.
+fn ask_graph(graph: &dyn Model, inputs: &[(&str, Tensor)], least: f32) -> Result<Candidates> {
+    let out = graph.run(inputs)?;
     let (Some(logits), Some(quality)) = (out[0].as_f32(), out[1].as_f32()) else {
         return Err(Error::new("the decoder's outputs are not floats").file(graph.path()));
     };
@@ -271,19 +289,6 @@ fn ask_graph(graph: &dyn Model, values: &Tensor, point: [f32; 2], least: f32) ->
             .expected("3 masks of 256 x 256 for a point, or 4 with the one for several points"));
     }
     Ok(Candidates::of_graph(quality, logits, least))
-}
-
-/// What the decoder's graph is asked with: a point in the encoder's pixels.
-fn inputs<'a>(values: &'a Tensor, point: [f32; 2]) -> [(&'static str, Tensor<'a>); 6] {
-    [
-        ("image_embeddings", values.view()),
-        // The second point, of label -1, stands for "no box".
-        ("point_coords", Tensor::f32(&[1, 2, 2], vec![point[0], point[1], 0.0, 0.0])),
-        ("point_labels", Tensor::f32(&[1, 2], vec![1.0, -1.0])),
-        ("mask_input", Tensor::f32(&[1, 1, MASK_SIDE, MASK_SIDE], vec![0.0; MASK_SIDE * MASK_SIDE])),
-        ("has_mask_input", Tensor::f32(&[1], vec![0.0])),
-        ("orig_im_size", Tensor::f32(&[2], vec![MASK_SIDE as f32; 2])),
-    ]
 }
 
 #[cfg(test)]
