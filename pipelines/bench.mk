@@ -55,10 +55,11 @@ bench-cluster:
 bench-query:
 	$(CARGO) bench -p eval --bench query -- --out $(CURDIR)/out/bench/query.json
 
-# explore's answers to clicks and texts, and the size of its page, at a million Gaussians made of RUN's: explore.json.
+# explore's answers to clicks and texts, and the size of its page, at GAUSSIANS Gaussians made of RUN's: explore.json.
 RUN ?= out/demo
+GAUSSIANS ?= 1000000
 bench-explore:
-	$(CARGO) bench -p explore --bench latency -- $(abspath $(RUN)) $(CURDIR)/out/bench/explore.json
+	$(CARGO) bench -p explore --bench latency -- $(abspath $(RUN)) $(CURDIR)/out/bench/explore.json $(GAUSSIANS)
 
 # Synthetic masks beside real ones (MASKS=folder FOOTPRINTS=file): granularity.md.
 bench-granularity: build

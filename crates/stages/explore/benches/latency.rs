@@ -1,5 +1,6 @@
 //! What a click and a text take at a million Gaussians, and how large the page is: `cargo bench -p explore --bench latency --
-//! RUN OUT`. RUN is a finished run of the demo, whose Gaussians are cut into smaller ones until they are a million.
+//! RUN OUT [GAUSSIANS]`. RUN is a finished run of the demo, whose Gaussians are cut into smaller ones until they are a million,
+//! or so many.
 
 use artifacts::{Instances, role};
 use gs_io::{Provenance, hash_file, write_json};
@@ -14,6 +15,7 @@ use std::path::{Path, PathBuf};
 use std::process::{Command, Stdio};
 use std::time::Instant;
 
+/// Gaussians of the large scene, where nothing else is said.
 const GAUSSIANS: usize = 1_000_000;
 const CLICKS: usize = 201;
 const TEXTS: [&str; 5] = ["green kettle", "pink coffee set", "black laptop", "yellow toy car", "table"];
@@ -21,13 +23,14 @@ const TEXTS: [&str; 5] = ["green kettle", "pink coffee set", "black laptop", "ye
 fn main() {
     let mut arguments = std::env::args().skip(1).filter(|a| a != "--bench").map(PathBuf::from);
     let (Some(run), Some(out)) = (arguments.next(), arguments.next()) else {
-        eprintln!("usage: latency RUN OUT");
+        eprintln!("usage: latency RUN OUT [GAUSSIANS]");
         std::process::exit(2);
     };
     let scene = run.join("scene");
     let folder = out.parent().unwrap_or(Path::new(".")).join("explore");
     std::fs::create_dir_all(&folder).unwrap();
-    let large = enlarged(&run, &scene, &folder);
+    let count = arguments.next().and_then(|a| a.to_str()?.parse().ok()).unwrap_or(GAUSSIANS);
+    let large = enlarged(&run, &scene, &folder, count);
     let mut results = Vec::new();
     for run in [run.as_path(), &folder] {
         results.push(measured(run, &scene));
@@ -38,11 +41,11 @@ fn main() {
 }
 
 /// Cuts every Gaussian into smaller ones near its place, which belong to the same instance.
-fn enlarged(run: &Path, scene: &Path, folder: &Path) -> usize {
+fn enlarged(run: &Path, scene: &Path, folder: &Path, count: usize) -> usize {
     let mut g = gs_scene::ply::read_gaussians(run.join("geometry.ply")).unwrap();
     let mut instances = Instances::read(run.join("instances.safetensors")).unwrap().0;
-    let parts = GAUSSIANS.div_ceil(g.len());
-    let rows: Vec<u32> = (0..g.len() as u32).flat_map(|i| vec![i; parts]).take(GAUSSIANS).collect();
+    let parts = count.div_ceil(g.len());
+    let rows: Vec<u32> = (0..g.len() as u32).flat_map(|i| vec![i; parts]).take(count).collect();
     g = g.select(&rows);
     let mut random = ChaCha8Rng::seed_from_u64(0);
     let smaller = (parts as f32).ln() / 3.0;

@@ -15,7 +15,7 @@ const door = $("scene-json") ? new File() : new Server();
 const MOST_IN_MOTION = 1_500_000;
 // How long a frame may take in motion, in milliseconds; where it takes longer, fewer pixels are drawn, down to this share of each side.
 const FRAME = 16, COARSEST = 0.25;
-let viewer, visitor, instances, scene, gaussians;
+let viewer, visitor, instances, scene, gaussians, started = false;
 const state = { cells: new Set(), clicked: null, levels: null, hidden: new Set(), rest: "shown", colors: "photograph", answer: null, tool: "select", points: [], moving: false, sharpness: 1 };
 const held = new Set();
 
@@ -604,7 +604,7 @@ async function start() {
     if (milliseconds) state.sharpness = Math.min(1, Math.max(COARSEST, state.sharpness * Math.sqrt(FRAME / Math.max(1, milliseconds))));
     $("status").textContent = share < 1 ? `${Math.round(100 * share)} % of the Gaussians while moving` : `${instances.origin.filter((o) => o.length).length} instances`;
   });
-  visitor = new Visitor(scene.cameras, scene.spread, changed);
+  visitor = new Visitor(scene.cameras, scene.spread, (moving) => started && changed(moving));
   $("view").replaceChildren(element("option", { value: "" }, "my own"), ...scene.cameras.map((c) => element("option", { value: c.index }, c.name)));
   about();
   listen();
@@ -615,9 +615,14 @@ async function start() {
     visitor.rotation = lookingAlong([1, 1, -0.5], visitor.up);
     visitor.frame(state.center, scene.spread);
   }
-  await refresh();
+  // A coarse picture at once, wherever it is drawn; then a sharp one.
+  Object.assign(state, { moving: true, sharpness: COARSEST });
+  await draw();
+  started = true;
   $("loading").hidden = true;
   page.seconds = (performance.now() - begun) / 1000;
+  state.moving = false;
+  await refresh();
 }
 
 // For tests and for people who like to write: everything that a click can do.
