@@ -1,7 +1,7 @@
 //! Per-pixel weights, for footprints, silhouettes and features.
 
 use crate::kernels::weights_tile;
-use crate::tiles::{PIXELS, TILE, Tile, Tiles};
+use crate::tiles::{PIXELS, TILE, Tiles};
 use crate::types::RasterOptions;
 use gs_scene::{Camera, Gaussians};
 use rayon::prelude::*;
@@ -37,27 +37,18 @@ pub fn tile_weights<R: Send>(
     f: impl Fn(&TileWeights<'_>) -> R + Sync,
 ) -> Vec<R> {
     let tiles = Tiles::new(g, camera, &colourless(options));
-    (0..tiles.count()).into_par_iter().map(|t| one_tile(&tiles, tiles.tile(t), early_stop, &f)).collect()
+    (0..tiles.count()).into_par_iter().map(|t| one_tile(&tiles, t, early_stop, &f)).collect()
 }
 
 /// The Gaussians that a pixel (x, y) of the view shows, front to back, with their blending weights, 0 to 1 and all above 0: what
-/// [`tile_weights`] with `early_stop` has of it, without the work for the other tiles. As if there were no Gaussians but those
-/// that `counts`. Empty outside the view.
-pub fn pixel_weights(
-    g: &Gaussians,
-    camera: &Camera,
-    options: &RasterOptions,
-    [x, y]: [u32; 2],
-    counts: impl Fn(u32) -> bool,
-) -> Vec<(u32, f64)> {
+/// [`tile_weights`] with `early_stop` has of it, without the work for the other tiles. Empty outside the view.
+pub fn pixel_weights(g: &Gaussians, camera: &Camera, options: &RasterOptions, [x, y]: [u32; 2]) -> Vec<(u32, f64)> {
     if x >= camera.width || y >= camera.height {
         return Vec::new();
     }
     let (x, y) = (x as usize, y as usize);
     let (tiles, number) = Tiles::around(g, camera, &colourless(options), [x, y]);
-    let tile = tiles.tile(number);
-    let list: Vec<u32> = tile.list.iter().copied().filter(|&e| counts(tiles.index[e as usize])).collect();
-    one_tile(&tiles, Tile { list: &list, ..tile }, true, &|t: &TileWeights<'_>| {
+    one_tile(&tiles, number, true, &|t: &TileWeights<'_>| {
         let at = (y - t.y0) * TILE + x - t.x0;
         let weights = t.weights.iter().skip(at).step_by(PIXELS).map(|&w| f64::from(w));
         t.gaussians.iter().copied().zip(weights).filter(|w| w.1 > 0.0).collect()
@@ -70,7 +61,8 @@ fn colourless(options: &RasterOptions) -> RasterOptions {
 }
 
 /// What `f` makes of a tile.
-fn one_tile<R>(tiles: &Tiles, tile: Tile<'_>, early_stop: bool, f: &impl Fn(&TileWeights<'_>) -> R) -> R {
+fn one_tile<R>(tiles: &Tiles, number: usize, early_stop: bool, f: &impl Fn(&TileWeights<'_>) -> R) -> R {
+    let tile = tiles.tile(number);
     let (x0, y0, width, height) = tile.rectangle;
     let gaussians: Vec<u32> = tile.list.iter().map(|&e| tiles.index[e as usize]).collect();
     let [mut alphas, mut weights] = [(); 2].map(|()| vec![0.0; gaussians.len() * PIXELS]);

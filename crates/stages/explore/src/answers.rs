@@ -93,7 +93,11 @@ pub fn pick(world: &World, edited: &Edited, click: &Click) -> Result<Picked> {
     let cell_of = |i: u32| world.cell_of[i as usize];
     let seen = |i: u32| shown[cell_of(i) as usize];
     let g = world.gaussians();
-    let weights = query::pixel_weights(g, &camera, &world.scene.raster, [click.x, click.y], seen);
+    let (raster, pixel) = (&world.scene.raster, [click.x, click.y]);
+    let near = world.reach.candidates(g, &world.packed.order, &camera, f64::from(raster.near), pixel);
+    let near: Vec<u32> = near.into_iter().filter(|&i| seen(i)).collect();
+    let weights = query::pixel_weights(&g.select(&near), &camera, raster, pixel);
+    let weights: Vec<(u32, f64)> = weights.into_iter().map(|(i, w)| (near[i as usize], w)).collect();
     let alpha: f64 = weights.iter().map(|w| w.1).sum();
     let mut of_instance = BTreeMap::<i32, f64>::new();
     let mut of_cell = BTreeMap::<u32, f64>::new();

@@ -2,7 +2,7 @@
 //!
 //! `run_folder` finds what a run was made from, `world` loads it, `pack` brings the Gaussians down to 16 bytes each and
 //! `describe` says the rest as JSON. `serve` gives the page of `web/` a server on this machine, whose `answers` come from
-//! the rasteriser and the language model; `page` puts everything into one file that needs no server.
+//! the rasteriser, for Gaussians within `reach` of a click, and the language model; `page` puts everything into one file that needs no server.
 
 mod answers;
 mod describe;
@@ -10,6 +10,7 @@ mod options;
 mod pack;
 mod page;
 mod pictures;
+mod reach;
 mod run_folder;
 mod serve;
 mod web;

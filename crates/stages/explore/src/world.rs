@@ -2,6 +2,7 @@
 
 use crate::options::Source;
 use crate::pack::{Packed, pack};
+use crate::reach::Reach;
 use crate::run_folder::RunFolder;
 use artifacts::{Edits, Instances, Remarks};
 use gs_io::{Error, Result};
@@ -21,6 +22,8 @@ pub struct World {
     pub scene: LabelledScene,
     /// The Gaussians as the page gets them.
     pub packed: Packed,
+    /// Where their Gaussians can be seen.
+    pub reach: Reach,
     /// The different pairs of instance and cluster that Gaussians have: what the page shows and hides together.
     pub cells: Vec<(i32, i32)>,
     /// Cell of every Gaussian; N.
@@ -59,6 +62,7 @@ impl World {
         messages.extend(scene.geometry.damage());
         let words = words(&run, &scene);
         let packed = pack(scene.gaussians(), o.sh);
+        let reach = Reach::new(scene.gaussians(), &packed.order);
         let (cells, cell_of) = cells(&scene.instances);
         let feature_colors = match feature_colors(&run, &scene, &packed) {
             Ok(colors) => colors,
@@ -72,7 +76,7 @@ impl World {
         if packed.order.len() < n {
             stage.skipped(&format!("{} of {n} Gaussians: too faint to be drawn", n - packed.order.len()));
         }
-        Ok(Self { run, dataset, scene, packed, cells, cell_of, feature_colors, words, messages })
+        Ok(Self { run, dataset, scene, packed, reach, cells, cell_of, feature_colors, words, messages })
     }
 
     /// All Gaussians of the geometry.

@@ -88,7 +88,7 @@ impl Fixture {
     /// The instance with the largest weight at a pixel, and its share of the pixel.
     fn instance_at(&self, camera: &Camera, pixel: [u32; 2]) -> Option<(i32, f64)> {
         let mut sums = std::collections::BTreeMap::<i32, f64>::new();
-        for (i, w) in query::pixel_weights(self.gaussians(), camera, &self.raster(0), pixel, |_| true) {
+        for (i, w) in query::pixel_weights(self.gaussians(), camera, &self.raster(0), pixel) {
             *sums.entry(self.instances.label[i as usize]).or_default() += w;
         }
         sums.into_iter().max_by(|a, b| a.1.total_cmp(&b.1))

@@ -79,7 +79,7 @@ fn at_pixel(scene: &LabelledScene, index: &Index<'_>, view: &View, pixel: [u32; 
             .found(format!("{x},{y}"))
             .expected(format!("x below {} and y below {} in {}", camera.width, camera.height, view.stem())));
     }
-    let weights = pixel_weights(scene.gaussians(), camera, &scene.raster, pixel, |_| true);
+    let weights = pixel_weights(scene.gaussians(), camera, &scene.raster, pixel);
     let alpha: f64 = weights.iter().map(|w| w.1).sum();
     let mut shares = BTreeMap::<i32, f64>::new();
     let mut position = [0.0f64; 3];
