@@ -37,6 +37,11 @@ fn find<T: DeserializeOwned>(output: &Path, made_from: &str) -> Option<Note<T>> 
     same.then_some(note)
 }
 
+/// Whether an output need not be made again.
+pub(crate) fn is_done(output: &Path, made_from: &str) -> bool {
+    find::<Value>(output, made_from).is_some()
+}
+
 /// Writes the note of an output that has just been written.
 fn write<T: Serialize>(output: &Path, made_from: &str, facts: T) -> Result<Note<T>> {
     let note = Note { made_from: made_from.to_string(), hash: hash_file(output)?, facts };

@@ -5,9 +5,9 @@ use crate::finished::{self, Views};
 use crate::options::{Choice, MasksArgs};
 use crate::paint::{MapSize, paint, preview};
 use crate::photographs;
-use crate::sam::Sam;
+use crate::sam::{Embedded, Sam};
 use artifacts::{LEVELS, Level, MaskMaps, maps_path, role};
-use gs_io::{Claim, Result, Watched, write_json};
+use gs_io::{Claim, Error, Result, Watched, write_json};
 use gs_scene::Image;
 use gs_scene::dataset::{Dataset, View};
 use onnx_models::RgbImage;
@@ -16,6 +16,7 @@ use serde_json::json;
 use stage::{Stage, peak_rss_bytes};
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
+use std::sync::mpsc;
 
 /// Facts of a view's id maps.
 #[derive(Serialize, Deserialize)]
@@ -48,16 +49,24 @@ pub(crate) fn run(args: &MasksArgs, stage: &Stage) -> Result<()> {
     warn_of_other_maps(folder, &scene.views, stage)?;
 
     let mut views = Views::new(stage, scene.views.len());
-    let (mut asked, mut points, mut large, mut forecast_made) = (0, 0, 0, false);
-    for view in &scene.views {
-        let output = maps_path(folder, view.stem());
+    let mut forecast_made = false;
+    let prepare = |view| {
         let (image, image_hash) = photographs::read(view)?;
         let key = finished::made_from(&[&parameters.to_string(), sam.hash(), &image_hash]);
-        let facts: Facts = views.next(view, &output, &key, || {
+        let mut embedded = None;
+        if !finished::is_done(&maps_path(folder, view.stem()), &key) {
             if !std::mem::replace(&mut forecast_made, true) {
                 forecast(args, &sam, &scene.views, stage)?;
             }
-            let (maps, facts) = make(args, &sam, &image)?;
+            embedded = Some(sam.encode(&image)?);
+        }
+        Ok(Prepared { view, image, key, embedded })
+    };
+    let (mut asked, mut points, mut large) = (0, 0, 0);
+    let finish = |Prepared { view, image, key, embedded }: Prepared| {
+        let output = maps_path(folder, view.stem());
+        let facts: Facts = views.next(view, &output, &key, || {
+            let (maps, facts) = make(args, &sam, &image, embedded)?;
             finished::remove_manifest(&manifest)?;
             maps.write(&output)?;
             Ok(facts)
@@ -70,7 +79,9 @@ pub(crate) fn run(args: &MasksArgs, stage: &Stage) -> Result<()> {
         asked += facts.asked;
         points += facts.points;
         large += facts.masks[Level::Large as usize];
-    }
+        Ok(())
+    };
+    one_ahead(scene.views.iter(), prepare, finish)?;
     let views = views.finish("id maps");
     if asked < points {
         stage.skipped(&format!("{} of {points} points: within masks already found", points - asked));
@@ -83,9 +94,41 @@ pub(crate) fn run(args: &MasksArgs, stage: &Stage) -> Result<()> {
     stage.record(&mut claim, parameters, inputs, json!({ "views": count, "masks_large": large }))
 }
 
+/// A photograph on its way to its id maps.
+struct Prepared<'a> {
+    view: &'a View,
+    image: RgbImage,
+    /// Hash of what its maps are made from.
+    key: String,
+    /// For SAM's decoder, where maps are to be made.
+    embedded: Option<Embedded>,
+}
+
+/// Calls `make` for every item and `take` for what it made, in order. Where the program has more threads than one, the next item
+/// is made while the last is taken.
+fn one_ahead<I, T: Send>(
+    items: impl Iterator<Item = I> + Send,
+    make: impl FnMut(I) -> Result<T> + Send,
+    mut take: impl FnMut(T) -> Result<()>,
+) -> Result<()> {
+    let mut made = items.map(make);
+    if rayon::current_num_threads() <= 1 {
+        return made.try_for_each(|made| take(made?));
+    }
+    std::thread::scope(|scope| {
+        let (send, receive) = mpsc::sync_channel(0);
+        // It ends after an error, and when nobody receives any more.
+        let work = move || made.all(|made| made.is_ok() & send.send(made).is_ok());
+        let thread = std::thread::Builder::new().spawn_scoped(scope, work);
+        thread.map_err(|e| Error::new(format!("cannot start a thread: {e}")).hint("give --threads 1"))?;
+        receive.iter().try_for_each(|made| take(made?))
+    })
+}
+
 /// The id maps of a photograph.
-fn make(args: &MasksArgs, sam: &Sam, image: &RgbImage) -> Result<(MaskMaps, Facts)> {
-    let proposals = propose(sam, &sam.encode(image)?, &args.choice)?;
+fn make(args: &MasksArgs, sam: &Sam, image: &RgbImage, embedded: Option<Embedded>) -> Result<(MaskMaps, Facts)> {
+    let embedded = embedded.map_or_else(|| sam.encode(image), Ok)?;
+    let proposals = propose(sam, &embedded, &args.choice)?;
     let size = MapSize::of(image, args.map_size, args.min_area);
     let maps = paint(&proposals, &levels(&proposals.masks), size);
     let (points, asked) = (proposals.points, proposals.asked);
@@ -102,19 +145,18 @@ fn claim(args: &MasksArgs, scene: &Dataset, manifest: &Path, stage: &Stage) -> R
     args.preview.iter().fold(outputs, |outputs, folder| outputs.files_in(folder, pictures.clone())).claim()
 }
 
-/// Says how much memory the photographs will take. The models run once on an empty picture first: their need is known only
-/// then.
+/// Says how much memory the photographs will take. The models run on an empty picture first: their need is known only then.
 fn forecast(args: &MasksArgs, sam: &Sam, views: &[View], stage: &Stage) -> Result<()> {
     let nothing = RgbImage { width: 4, height: 3, pixels: vec![0; 36] };
-    // The encoder a second time, on top of what the decoder leaves with each thread.
-    propose(sam, &sam.encode(&nothing)?, &Choice { points_per_side: 4, ..args.choice })?;
-    sam.encode(&nothing)?;
+    // Twice: the decoder answers about one photograph while the next is encoded.
+    let choice = Choice { points_per_side: 4, ..args.choice };
+    one_ahead(0..2, |_| sam.encode(&nothing), |embedded| propose(sam, &embedded, &choice).map(drop))?;
     let (side, pixels) = (args.choice.points_per_side as u64, photographs::largest(views));
     let map = if args.map_size == 0 { pixels } else { pixels.min((args.map_size * args.map_size * 3 / 4) as u64) };
     // Of every third point of the grid or so that is asked three masks wait with their logits, 200 kB where one fills the
     // picture; then the map, 16 bytes a pixel, and the masks of a level, a byte for each pixel of their boxes.
     let waiting = 100_000 * (side * side * 3 / 4);
-    let needed = peak_rss_bytes().unwrap_or(0) + waiting + 6 * pixels + 30 * map;
+    let needed = peak_rss_bytes().unwrap_or(0) + waiting + 9 * pixels + 30 * map;
     stage.forecast(needed, "give fewer --threads, or smaller photographs (--resolution) and maps (--map-size)")
 }
 
@@ -130,4 +172,33 @@ fn warn_of_other_maps(folder: &Path, views: &[View], stage: &Stage) -> Result<()
         ));
     }
     Ok(())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn items_are_taken_in_order_up_to_the_first_error() {
+        let run = |bad: usize, refused: usize| {
+            let (made, mut taken) = (std::sync::atomic::AtomicUsize::new(0), Vec::new());
+            let make = |i| {
+                made.fetch_add(1, std::sync::atomic::Ordering::Relaxed);
+                if i == bad { Err(Error::new("not made")) } else { Ok(i) }
+            };
+            let take = |i| {
+                taken.push(i);
+                if i == refused { Err(Error::new("not taken")) } else { Ok(()) }
+            };
+            let error = one_ahead(0..100, make, take).err().map(|e| e.to_string());
+            (error, taken, made.into_inner())
+        };
+        let (error, taken, made) = run(usize::MAX, usize::MAX);
+        assert_eq!((error, taken, made), (None, (0..100).collect(), 100));
+        let (error, taken, made) = run(7, usize::MAX);
+        assert_eq!((error.as_deref(), taken, made), (Some("not made"), (0..7).collect(), 8));
+        let (error, taken, made) = run(usize::MAX, 7);
+        assert_eq!((error.as_deref(), taken), (Some("not taken"), (0..8).collect()));
+        assert!(made <= 10, "{made}");
+    }
 }
