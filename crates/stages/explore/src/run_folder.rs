@@ -37,7 +37,6 @@ impl RunFolder {
             let last = there.iter().find(|f| dir.join(f).is_file());
             return Err(Error::new("the run is not finished")
                 .file(&dir)
-                .field("--run-dir")
                 .found(last.map_or("no file of a run".into(), |f| format!("{f}, but no instances.safetensors")))
                 .expected("a folder with instances.safetensors")
                 .hint("run make again with this OUT: it goes on where it was"));
