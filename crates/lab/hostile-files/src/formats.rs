@@ -1,7 +1,9 @@
 //! The formats and what must hold of whatever their readers accept.
 
 use crate::seeds;
-use artifacts::{Edits, Features, Footprints, Graph, Instances, MaskFeatures, MaskMaps, TruePoints, TrueScene};
+use artifacts::{
+    Descriptors, Edits, Features, Footprints, Graph, Instances, MaskFeatures, MaskMaps, TruePoints, TrueScene,
+};
 use clap::Parser;
 use eval::{read_labels, read_mask, read_truth};
 use gs_scene::dataset::{self, LoadOptions, Resolution};
@@ -224,6 +226,9 @@ fn check_artifact(bytes: &[u8]) {
     with("a.safetensors", &sealed, |path| {
         sound(Graph::read(path), path);
         sound(Features::read(path), path);
+        if let Some((d, _)) = sound(Descriptors::read(path), path) {
+            d.row.iter().for_each(|&r| assert_eq!(d.of_row(r as usize).len(), d.slots * d.dim));
+        }
         if let Some(f) = sound(Footprints::read(path), path) {
             (0..f.rows.len()).for_each(|r| _ = f.entries(r));
         }

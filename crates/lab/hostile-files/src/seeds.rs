@@ -1,8 +1,8 @@
 //! Small good files of each format, from which damaged ones are made.
 
 use artifacts::{
-    Features, FootprintsBuilder, Graph, Instances, MaskFeatures, MaskMaps, Match, OrientedBox, Row, TreeEdge,
-    TruePoints,
+    Descriptors, Features, FootprintsBuilder, Graph, Instances, MaskFeatures, MaskMaps, Match, OrientedBox, Row,
+    TreeEdge, TruePoints,
 };
 use gs_io::Provenance;
 use gs_scene::{Camera, Gaussians, Image, PointCloud, colmap, ply};
@@ -163,6 +163,7 @@ pub(crate) fn artifact() -> Vec<Vec<u8>> {
         seen_weight: vec![0.5, 0.0, 1.0, 2.0],
     };
     let features = Features { kept: vec![0, 2, 3], dim: 2, values: vec![0.5; 6], ..Features::default() };
+    let descriptors = Descriptors { kept: vec![0, 3], row: vec![1, 0], slots: 2, dim: 2, values: vec![0.5; 8] };
     let row = Row { view: 0, level: 3, mask: 1, pixels: 9, gated: 8, alpha: 0.9 };
     let footprints = FootprintsBuilder {
         views: vec!["a".into()],
@@ -180,6 +181,7 @@ pub(crate) fn artifact() -> Vec<Vec<u8>> {
         made("a", |p| footprints.write(p, provenance()).expect("written")),
         made("a", |p| instances().write(p, provenance()).expect("written")),
         made("a", |p| truth.write(p, provenance()).expect("written")),
+        made("a", |p| descriptors.write(p, provenance()).expect("written")),
     ]
 }
 

@@ -61,7 +61,7 @@ impl Features {
 }
 
 /// Columns and values of a tensor of `rows` rows, all finite.
-fn finite(a: &Artifact, name: &str, rows: usize) -> Result<(usize, Vec<f32>)> {
+pub(crate) fn finite(a: &Artifact, name: &str, rows: usize) -> Result<(usize, Vec<f32>)> {
     let dim = a.extents::<f32>(name, &[Some(rows), None])?[1];
     let values: Vec<f32> = a.read(name, 0..rows * dim)?;
     if let Some(at) = values.iter().position(|v| !v.is_finite()) {
@@ -69,7 +69,7 @@ fn finite(a: &Artifact, name: &str, rows: usize) -> Result<(usize, Vec<f32>)> {
             .file(a.path())
             .field(format!("{name}[{}][{}]", at / dim, at % dim))
             .found(values[at])
-            .hint("train the features again"));
+            .hint("run the stage that makes it again"));
     }
     Ok((dim, values))
 }

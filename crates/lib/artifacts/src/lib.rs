@@ -5,6 +5,7 @@
 //! original indices, n of them. Graph, footprints and features name kept Gaussians by their position in that list.
 
 mod checks;
+mod descriptors;
 mod edits;
 mod extents;
 mod features;
@@ -19,6 +20,7 @@ mod palette;
 mod scratch;
 mod truth;
 
+pub use descriptors::Descriptors;
 pub use edits::{Edit, Edits, Remarks};
 pub use extents::Extents;
 pub use features::Features;

@@ -8,7 +8,7 @@ use serde::{Deserialize, Serialize};
 pub struct Ranked {
     /// Index of the instance.
     pub instance: u32,
-    /// Cosine of descriptor and feature, -1 to 1; with negatives the relevancy, 0 to 1 ([`Index::scores`]); of a place its share.
+    /// Cosine of descriptor and feature, -1 to 1; with negatives the relevancy, 0 to 1; of a place its share.
     pub score: f32,
     /// Views in which the instance was matched with a mask.
     pub support: u32,
@@ -46,6 +46,36 @@ impl Selection {
     }
 }
 
+/// A feature to compare descriptors with, and the lengths of what it takes.
+pub(crate) struct Question<'a> {
+    feature: &'a [f32],
+    length: f64,
+    negatives: Vec<(&'a [f32], f64)>,
+}
+
+impl<'a> Question<'a> {
+    /// A feature, and features of texts that mean nothing in particular ("object", "things", "stuff", "texture").
+    pub fn new(feature: &'a [f32], negatives: &'a [Vec<f32>]) -> Self {
+        let negatives = negatives.iter().map(|n| (&n[..], norm(n))).collect();
+        Self { feature, length: norm(feature), negatives }
+    }
+
+    /// Score of a descriptor of this length; none where one of both is zero.
+    ///
+    /// Without negatives it is the plain cosine (docs/protocols.md). With them it is LERF's relevancy: over the negatives n the
+    /// smallest exp(10 p) / (exp(10 p) + exp(10 n)) of the cosines p and n with the feature and the negative.
+    pub fn score(&self, descriptor: &[f32], length: f64) -> Option<f32> {
+        let cosine = |v: &[f32], n: f64| if n > 0.0 { dot(descriptor, v) / (length * n) } else { 0.0 };
+        (length * self.length > 0.0).then(|| {
+            let p = cosine(self.feature, self.length);
+            match self.negatives.iter().map(|&(v, n)| cosine(v, n)).reduce(f64::max) {
+                None => p as f32,
+                Some(n) => (1.0 / (1.0 + (10.0 * (n - p)).exp())) as f32,
+            }
+        })
+    }
+}
+
 /// Instances laid out for many queries: descriptors with their lengths, and the Gaussians of each instance together.
 pub struct Index<'a> {
     /// The instances themselves.
@@ -57,7 +87,7 @@ pub struct Index<'a> {
     starts: Vec<usize>,
 }
 
-fn norm(v: &[f32]) -> f64 {
+pub(crate) fn norm(v: &[f32]) -> f64 {
     dot(v, v).sqrt()
 }
 
@@ -92,28 +122,13 @@ impl<'a> Index<'a> {
         Self { instances, norms, members, starts }
     }
 
-    /// Score of every instance; none for one without a descriptor (no view matched it) or when the feature is zero.
-    ///
-    /// Without `negatives` it is the plain cosine (docs/protocols.md). With features of texts that mean nothing in particular
-    /// ("object", "things", "stuff", "texture") it is LERF's relevancy: over the negatives n the smallest
-    /// exp(10 p) / (exp(10 p) + exp(10 n)) of the cosines p and n with the feature and the negative.
+    /// Score of every instance: the plain cosine, or with `negatives` LERF's relevancy (docs/protocols.md); none for one without a
+    /// descriptor (no view matched it) or when the feature is zero.
     pub fn scores(&self, feature: &[f32], negatives: &[Vec<f32>]) -> Vec<Option<f32>> {
         let dim = self.instances.dim;
         assert!(feature.len() == dim && negatives.iter().all(|n| n.len() == dim));
-        let feature_norm = norm(feature);
-        let negatives: Vec<(&[f32], f64)> = negatives.iter().map(|n| (&n[..], norm(n))).collect();
-        let one = |k: usize| {
-            let (d, length) = (self.instances.descriptor_of(k), self.norms[k]);
-            let cosine = |v: &[f32], n: f64| if n > 0.0 { dot(d, v) / (length * n) } else { 0.0 };
-            (length * feature_norm > 0.0).then(|| {
-                let p = cosine(feature, feature_norm);
-                match negatives.iter().map(|&(v, n)| cosine(v, n)).reduce(f64::max) {
-                    None => p as f32,
-                    Some(n) => (1.0 / (1.0 + (10.0 * (n - p)).exp())) as f32,
-                }
-            })
-        };
-        (0..self.instances.len()).map(one).collect()
+        let question = Question::new(feature, negatives);
+        (0..self.instances.len()).map(|k| question.score(self.instances.descriptor_of(k), self.norms[k])).collect()
     }
 
     /// All instances that have a score, best first, ties by index.

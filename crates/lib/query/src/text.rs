@@ -1,8 +1,7 @@
 //! Where text features come from: a CLIP text encoder, or a table made with one.
 
-use crate::scene::LabelledScene;
 use artifacts::role;
-use gs_io::{Error, IoContext, Result};
+use gs_io::{Artifact, Error, IoContext, Result};
 use onnx_models::{ClipImage, ClipText, EngineOptions};
 use serde::Serialize;
 use std::collections::BTreeMap;
@@ -166,13 +165,12 @@ impl TextSource {
         }
     }
 
-    /// Opens what the options name. It must have the descriptors' dimension, and a CLIP pair must be the one whose other half
-    /// encoded the masks, as far as the instances know it.
-    pub fn open_for(scene: &LabelledScene, o: &TextOptions) -> Result<Self> {
+    /// Opens what the options name. It must have the dimension `dim` of the descriptors in `described`, and a CLIP pair must be
+    /// the one whose other half encoded the masks, as far as that file knows it.
+    pub fn open_for(described: &Artifact, dim: usize, o: &TextOptions) -> Result<Self> {
         let source = Self::open(o)?;
-        let dim = scene.instances.dim;
         let found = format!("dimension {dim}");
-        let e = |what: &str| Error::new(what).file(scene.path()).field("descriptor").found(&found);
+        let e = |what: &str| Error::new(what).file(described.path()).field("descriptor").found(&found);
         if dim == 0 {
             return Err(e("the instances have no language features")
                 .hint("run mask-embed embed --clip (or add *_f.npy to the masks folder), then cluster-match again"));
@@ -183,7 +181,7 @@ impl TextSource {
                 .hint("text and masks must be encoded with the two halves of one CLIP model"));
         }
         let Some(clip) = o.clip.as_deref().filter(|_| !o.any_model) else { return Ok(source) };
-        let made_with = |role: &str| scene.artifact.provenance().inputs.get(role).cloned();
+        let made_with = |role: &str| described.provenance().inputs.get(role).cloned();
         let (image, text) = (made_with(role::CLIP), made_with(role::CLIP_TEXT));
         let unknown = image.is_none() && text.is_none();
         // The text encoder is open, and has its hash already; the image encoder is read only where that is not enough.
@@ -195,7 +193,7 @@ impl TextSource {
         Err(Error::new("another CLIP model than the one that encoded the masks")
             .file(clip)
             .field("--clip")
-            .expected(format!("the model that {} was made with", scene.path().display()))
+            .expected(format!("the model that {} was made with", described.path().display()))
             .hint(hint))
     }
 

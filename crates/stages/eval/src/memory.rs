@@ -1,7 +1,6 @@
 //! Forecasts of the memory that a command takes, from the sizes of its files. docs/performance.md compares them with
 //! measured peaks.
 
-use crate::options::Inputs;
 use gs_scene::dataset::View;
 use query::TextOptions;
 use std::path::Path;
@@ -27,8 +26,8 @@ pub struct Sizes {
 
 impl Sizes {
     /// The sizes of a scene, its text features and its largest view, before any of them is read.
-    pub fn new(inputs: &Inputs, texts: &TextOptions, views: &[View]) -> Self {
-        Self { geometry: bytes(&inputs.geometry), language: texts.bytes(), pixels: pixels(views), ..Self::default() }
+    pub fn new(geometry: &Path, texts: &TextOptions, views: &[View]) -> Self {
+        Self { geometry: bytes(geometry), language: texts.bytes(), pixels: pixels(views), ..Self::default() }
     }
 }
 

@@ -3,7 +3,7 @@
 use crate::silhouette::{Rendering, Silhouette};
 use gs_io::{Error, Result};
 use gs_scene::dataset::Resolution;
-use query::TextOptions;
+use query::{Share, TextOptions};
 use serde::{Serialize, Serializer};
 use std::path::PathBuf;
 
@@ -163,10 +163,24 @@ pub struct Labels {
 
 /// `eval score`.
 #[derive(Debug, Clone, clap::Args, Serialize)]
+#[command(group(clap::ArgGroup::new("scored").required(true).multiple(true).args(["instances", "descriptors"])))]
 pub struct ScoreOptions {
-    #[command(flatten)]
-    #[serde(flatten)]
-    pub inputs: Inputs,
+    /// Dataset folder (COLMAP, transforms.json or ScanNet)
+    #[arg(long, value_name = "DIR")]
+    pub scene: PathBuf,
+    /// The geometry.ply that instances or descriptors were made from
+    #[arg(long, value_name = "FILE")]
+    pub geometry: PathBuf,
+    /// instances.safetensors of cluster-match
+    #[arg(long, value_name = "FILE")]
+    pub instances: Option<PathBuf>,
+    /// instances.edits.json of explore: what a person merged, split and named
+    #[arg(long, value_name = "FILE", requires = "instances")]
+    pub edits: Option<PathBuf>,
+    /// Descriptors of single Gaussians (descriptors.safetensors), which then answer the texts: those of at least the --threshold, the
+    /// --top-k best, or without both each Gaussian the text that it is most like
+    #[arg(long, value_name = "FILE", conflicts_with_all = ["join", "min_support"])]
+    pub descriptors: Option<PathBuf>,
     #[command(flatten)]
     #[serde(flatten)]
     pub texts: TextOptions,
@@ -182,6 +196,24 @@ pub struct ScoreOptions {
     /// Output JSON
     #[arg(long, value_name = "FILE")]
     pub out: PathBuf,
+}
+
+impl ScoreOptions {
+    /// The instances with their scene, where there are some.
+    pub fn inputs(&self) -> Option<Inputs> {
+        let Self { scene, geometry, instances, edits, .. } = self;
+        let (scene, geometry, edits) = (scene.clone(), geometry.clone(), edits.clone());
+        Some(Inputs { scene, geometry, instances: instances.clone()?, edits })
+    }
+
+    /// Which Gaussians with a descriptor answer a text.
+    pub fn share(&self) -> Share {
+        match (self.choice.threshold, self.choice.top_k) {
+            (Some(least), _) => Share::Threshold(least),
+            (None, Some(count)) => Share::Most(count as usize),
+            (None, None) => Share::MostAlike,
+        }
+    }
 }
 
 /// Where the true masks of labels come from.

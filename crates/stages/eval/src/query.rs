@@ -32,7 +32,7 @@ pub(crate) fn run(o: &QueryOptions, parameters: Value, stage: &Stage, json_lines
         outputs.reads(o.inputs.files(&dataset)).reads(tables.chain(&o.image)).claim()
     });
     let mut claim = claim.transpose()?;
-    stage.forecast(memory::of_query(&Sizes::new(&o.inputs, &o.texts, &dataset.views)), SMALLER)?;
+    stage.forecast(memory::of_query(&Sizes::new(&o.inputs.geometry, &o.texts, &dataset.views)), SMALLER)?;
     let scene = o.inputs.read(&dataset, stage)?;
     let source = source(o, &scene)?;
     for view in &o.views.views {
@@ -72,7 +72,7 @@ pub(crate) fn run(o: &QueryOptions, parameters: Value, stage: &Stage, json_lines
 /// The source of text features; none where only pictures or places are asked for, and it does not fit the instances.
 fn source(o: &QueryOptions, scene: &LabelledScene) -> Result<Option<TextSource>> {
     if !o.text.is_empty() || !o.image.is_empty() || o.interactive {
-        return TextSource::open_for(scene, &o.texts).map(Some);
+        return TextSource::open_for(&scene.artifact, scene.instances.dim, &o.texts).map(Some);
     }
     if !o.texts.given() {
         return Ok(None);

@@ -1,4 +1,4 @@
-//! `eval score`: instances and text queries against the truth of a scene.
+//! `eval score`: instances, or descriptors of Gaussians, and text queries against the truth of a scene.
 //!
 //! `truth` scores instances against true surfaces, `label_iou` against polygons (`labels`, filled as `polygon` says),
 //! both by `metrics`; `scores` is what comes out.
@@ -17,49 +17,57 @@ use self::labels::FrameLabels;
 use crate::memory::{self, SMALLER, Sizes};
 use crate::options::{Rule, ScoreOptions};
 use crate::protocols::pairs::{Figures, object_figures};
-use crate::protocols::predict;
-use crate::query::ask::Asker;
+use crate::protocols::predict::{self, Answers};
+use crate::query::ask::{Answered, Asker};
 use crate::scene::load;
 use crate::silhouette::{Rendering, Silhouette};
-use gs_io::{Result, write_json};
+use artifacts::role;
+use gs_io::{Result, Watched, hash_file, write_json};
+use gs_scene::Geometry;
 use gs_scene::dataset::{Dataset, LoadOptions};
-use query::{LabelledScene, TextSource};
+use query::{Chosen, DescribedGaussians, LabelledScene, TextSource};
 use serde_json::{Value, json};
 use stage::Stage;
-use std::collections::BTreeSet;
+use std::collections::{BTreeMap, BTreeSet};
 use std::path::Path;
 
 pub(crate) fn run(o: &ScoreOptions, parameters: Value, stage: &Stage) -> Result<String> {
-    let dataset = load(&o.inputs.scene, &LoadOptions::default(), stage)?;
+    let dataset = load(&o.scene, &LoadOptions::default(), stage)?;
     let labels = labels::folder(o.labels.labels.as_deref(), &dataset.root)?;
     let out = &o.out;
-    let tables = o.texts.text_features.iter().chain(&o.choice.features);
-    let mut claim = stage.outputs(out).file(out).reads(o.inputs.files(&dataset).chain(tables)).claim()?;
+    let own = [&o.instances, &o.edits, &o.descriptors, &o.texts.text_features, &o.choice.features];
+    let outputs = stage.outputs(out).file(out).reads(&dataset.files).reads([&o.geometry]);
+    let mut claim = outputs.reads(own.into_iter().flatten()).claim()?;
     let sizes = Sizes {
         truth: memory::bytes(&dataset.root.join("truth/points.safetensors")),
         labels: labels.as_deref().map_or(0, labels::pixels),
-        ..Sizes::new(&o.inputs, &o.texts, &dataset.views)
+        features: o.descriptors.as_deref().map_or(0, memory::bytes),
+        ..Sizes::new(&o.geometry, &o.texts, &dataset.views)
     };
     stage.forecast(memory::of_scores(&sizes), SMALLER)?;
-    let scene = o.inputs.read(&dataset, stage)?;
-    if scene.all_noise() {
-        stage.warn("all Gaussians are noise: every score is 0");
-    }
+    let found = Found::read(o, &dataset, stage)?;
     let mut scores = Scores::default();
-    truth::score_instances(&scene, &dataset.root, &mut scores)?;
+    match &found.instances {
+        Some(scene) if scene.all_noise() => stage.warn("all Gaussians are noise: every score is 0"),
+        Some(_) => {}
+        None => scores.skipped.push("instance and label scores: no --instances were given".into()),
+    }
+    if let Some(scene) = &found.instances {
+        truth::score_instances(scene, &dataset.root, &mut scores)?;
+    }
     if let Some(labels) = &labels {
         let frames = labels::read_folder(labels)?;
-        score_labels(&scene, &dataset, labels, &frames, &mut scores)?;
-        if scene.instances.dim == 0 {
+        if let Some(scene) = &found.instances {
+            score_labels(scene, &dataset, labels, &frames, &mut scores)?;
+        }
+        if found.dim() == 0 {
             let why = "query scores: the instances have no language features, because the masks were not encoded with a \
                        CLIP model (mask-embed embed --clip)";
             scores.skipped.push(why.into());
         } else if !o.texts.given() {
             scores.skipped.push("query scores: neither --clip nor --text-features was given".into());
         } else {
-            let source = TextSource::open_for(&scene, &o.texts)?;
-            let asker = Asker::new(&scene, Some(source), &o.choice, o.texts.min_support)?;
-            score_queries(o, &scene, &dataset, &frames, &asker, &mut scores, stage)?;
+            score_queries(o, &found, &dataset, &frames, &mut scores, stage)?;
         }
     } else {
         let place = dataset.root.join("label");
@@ -71,8 +79,69 @@ pub(crate) fn run(o: &ScoreOptions, parameters: Value, stage: &Stage) -> Result<
         "instance_miou": scores.instance_miou, "label_miou": scores.label_miou, "query_miou": scores.query_miou,
         "query_pairs": scores.query_pairs,
     });
-    stage.record(&mut claim, parameters, scene.inputs.clone(), summary)?;
+    stage.record(&mut claim, parameters, found.inputs, summary)?;
     Ok(scores.table())
+}
+
+/// What is scored: instances, Gaussians with descriptors of their own, or both; then these answer the texts.
+struct Found {
+    instances: Option<LabelledScene>,
+    /// With the geometry that they belong to, where there are no instances.
+    described: Option<(DescribedGaussians, Option<Geometry>)>,
+    /// Content hashes, by role.
+    inputs: BTreeMap<String, String>,
+}
+
+impl Found {
+    fn read(o: &ScoreOptions, dataset: &Dataset, stage: &Stage) -> Result<Self> {
+        let instances = o.inputs().map(|inputs| inputs.read(dataset, stage)).transpose()?;
+        let mut inputs = instances.as_ref().map_or_else(BTreeMap::new, |scene| scene.inputs.clone());
+        let Some(path) = &o.descriptors else { return Ok(Self { instances, described: None, inputs }) };
+        let watched = Watched::new([&o.geometry]);
+        let hash = hash_file(&o.geometry)?;
+        let own = if instances.is_none() { Some(Geometry::read(&o.geometry)?) } else { None };
+        watched.check()?;
+        let geometry = own.as_ref().or(instances.as_ref().map(|scene| &scene.geometry)).expect("one of both was read");
+        if let Some(damage) = own.as_ref().and_then(Geometry::damage) {
+            stage.skipped(&damage);
+        }
+        let described = DescribedGaussians::read(path, &hash, geometry.gaussians.len())?;
+        described.artifact.expect_input(role::DATASET, &dataset.hash()?)?;
+        inputs.extend([(role::GEOMETRY.into(), hash), ("descriptors".into(), described.artifact.hash().into())]);
+        Ok(Self { instances, described: Some((described, own)), inputs })
+    }
+
+    fn geometry(&self) -> &Geometry {
+        let own = self.described.as_ref().and_then(|d| d.1.as_ref());
+        own.or(self.instances.as_ref().map(|scene| &scene.geometry)).expect("instances or descriptors were given")
+    }
+
+    /// Dimension of the descriptors that answer; 0 where there are none.
+    fn dim(&self) -> usize {
+        match (&self.described, &self.instances) {
+            (Some((described, _)), _) => described.descriptors.dim,
+            (None, Some(scene)) => scene.instances.dim,
+            (None, None) => 0,
+        }
+    }
+
+    /// The answers to texts.
+    fn answers(&self, o: &ScoreOptions, texts: &[String]) -> Result<Answers> {
+        if let Some((described, _)) = &self.described {
+            let source = TextSource::open_for(&described.artifact, self.dim(), &o.texts)?;
+            let negatives = source.known(&[], &o.choice.negatives, "--negatives")?;
+            let features = source.encode_in(&o.choice.template, texts)?;
+            let chosen = described.choose(&features, &negatives, o.share()).into_iter().zip(&features);
+            let answer = |(Chosen { gaussians, score }, feature): (_, &Option<_>)| match feature {
+                Some(_) => Ok(Answered { gaussians, score, ..Answered::default() }),
+                None => Err("it has no text feature".into()),
+            };
+            return Ok(texts.iter().cloned().zip(chosen.map(answer)).collect());
+        }
+        let scene = self.instances.as_ref().expect("instances or descriptors were given");
+        let source = TextSource::open_for(&scene.artifact, self.dim(), &o.texts)?;
+        predict::ask(&Asker::new(scene, Some(source), &o.choice, o.texts.min_support)?, texts)
+    }
 }
 
 /// Scores the instances against the polygons of `folder`, without asking for anything: [`label_iou::score`].
@@ -99,10 +168,9 @@ fn score_labels(
 /// asked for.
 fn score_queries(
     o: &ScoreOptions,
-    scene: &LabelledScene,
+    found: &Found,
     dataset: &Dataset,
     frames: &[FrameLabels],
-    asker: &Asker<'_>,
     scores: &mut Scores,
     stage: &Stage,
 ) -> Result<()> {
@@ -111,7 +179,7 @@ fn score_queries(
         scores.skipped.push("query scores: the labels hold no labelled object".into());
         return Ok(());
     }
-    let answers = predict::ask(asker, &texts.into_iter().cloned().collect::<Vec<_>>())?;
+    let answers = found.answers(o, &texts.into_iter().cloned().collect::<Vec<_>>())?;
     for (text, answer) in &answers {
         match answer {
             Err(_) => stage.warn(&format!("no text feature of the category {text:?}: it counts as IoU 0")),
@@ -129,7 +197,7 @@ fn score_queries(
             stage.warn(&format!("the labelled frame {name} is no view of the scene: its objects count as IoU 0"));
         }
         for (rendering, all) in [(rendering, &mut pairs), (Rendering::SEEN, &mut visible)] {
-            let predictions = predict::predict(scene, dataset, frame, &answers, rendering, Rule::Top1)?;
+            let predictions = predict::predict(found.geometry(), dataset, frame, &answers, rendering, Rule::Top1)?;
             all.extend(predict::pairs(frame, &predictions));
         }
     }

@@ -144,7 +144,7 @@ fn words(run: &RunFolder, scene: &LabelledScene) -> std::result::Result<TextSour
                 .into(),
         );
     }
-    TextSource::open_for(scene, &run.texts).map_err(|e| e.to_string())
+    TextSource::open_for(&scene.artifact, scene.instances.dim, &run.texts).map_err(|e| e.to_string())
 }
 
 /// The different pairs of label and node in order of their first Gaussian, and which of them each Gaussian has.

@@ -40,7 +40,7 @@ pub(crate) fn run(o: &LerfOptions, parameters: Value, stage: &Stage) -> Result<S
     let labels = frames.iter().flat_map(|f| f.categories.values()).map(|m| m.bits.len() as u64).sum();
     let read = o.choice.features.as_deref().map_or(0, memory::bytes);
     let sizes = o.inputs.as_ref().zip(dataset.as_ref());
-    let sizes = sizes.map(|(i, d)| Sizes { features: read, ..Sizes::new(i, &o.texts, &d.views) });
+    let sizes = sizes.map(|(i, d)| Sizes { features: read, ..Sizes::new(&i.geometry, &o.texts, &d.views) });
     let smaller = if o.predictions.is_some() { "give fewer or smaller labels" } else { SMALLER };
     stage.forecast(memory::of_scores(&Sizes { labels, ..sizes.unwrap_or_default() }), smaller)?;
     let mut features = BTreeMap::from([("labels".to_string(), folder_name(&folder))]);
@@ -145,7 +145,7 @@ fn ask(
     stage: &Stage,
 ) -> Result<AskedScene> {
     let scene = inputs.read(&dataset, stage)?;
-    let source = TextSource::open_for(&scene, &o.texts)?;
+    let source = TextSource::open_for(&scene.artifact, scene.instances.dim, &o.texts)?;
     features.extend(sources(&scene, Some(&source))?);
     let categories: BTreeSet<&String> = frames.iter().flat_map(|f| f.categories.keys()).collect();
     let texts: Vec<String> = match benchmark {
@@ -184,7 +184,7 @@ fn score(
         let predictions = match (asked, &o.predictions) {
             (Some(a), _) => {
                 let (rule, answers) = &a.answers[at];
-                predict::predict(&a.scene, &a.dataset, frame, answers, rendering(o, *rule), *rule)?
+                predict::predict(&a.scene.geometry, &a.dataset, frame, answers, rendering(o, *rule), *rule)?
             }
             (None, Some(saved)) => predict::read_predictions(saved, frame)?,
             (None, None) => predict::Predictions::new(),

@@ -8,8 +8,9 @@ use crate::query::ask::{Answered, Asker};
 use crate::score::labels::{self, FrameLabels};
 use crate::silhouette::Rendering;
 use gs_io::{Error, Result, write_bytes};
+use gs_raster::RasterOptions;
+use gs_scene::Geometry;
 use gs_scene::dataset::Dataset;
-use query::LabelledScene;
 use std::borrow::Cow;
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
@@ -44,7 +45,7 @@ pub type Predictions = BTreeMap<String, std::result::Result<Mask, String>>;
 /// Renders the answers to every category of a labelled frame, in the size of the labelled image: all Gaussians that they
 /// select, or with [`Rule::OpenGaussian`] those that it leaves.
 pub fn predict(
-    scene: &LabelledScene,
+    geometry: &Geometry,
     dataset: &Dataset,
     frame: &FrameLabels,
     answers: &Answers,
@@ -55,10 +56,10 @@ pub fn predict(
     let Some(view) = dataset.views.iter().find(|v| v.stem() == frame.frame) else {
         return Ok(categories.map(|c| (c, Err("the frame is no view of the scene".into()))).collect());
     };
-    let (g, camera) = (scene.gaussians(), frame.camera(view)?);
+    let (g, raster, camera) = (&geometry.gaussians, RasterOptions::of(geometry), frame.camera(view)?);
     let in_view = (rule == Rule::OpenGaussian).then(|| {
         let mut in_view = vec![false; g.len()];
-        gs_raster::drawn(g, &camera, &scene.raster).into_iter().for_each(|i| in_view[i as usize] = true);
+        gs_raster::drawn(g, &camera, &raster).into_iter().for_each(|i| in_view[i as usize] = true);
         in_view
     });
     let shown = |category: &String| -> std::result::Result<Cow<'_, [u32]>, String> {
@@ -71,7 +72,7 @@ pub fn predict(
     };
     let shown: Vec<_> = frame.categories.keys().map(shown).collect();
     let selections: Vec<&[u32]> = shown.iter().map(|s| s.as_ref().map_or(&[][..], |s| s)).collect();
-    let masks = rendering.masks(g, &scene.raster, &selections, &camera);
+    let masks = rendering.masks(g, &raster, &selections, &camera);
     Ok(categories.zip(shown.iter().zip(masks).map(|(s, mask)| s.clone().map(|_| mask))).collect())
 }
 

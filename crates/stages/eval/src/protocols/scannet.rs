@@ -236,11 +236,12 @@ fn of_instances(
         .reads([&inputs.instances, &inputs.geometry].into_iter().chain(&o.texts.text_features))
         .claim()?;
     let truth = parts.map(|p| memory::bytes(p)).sum();
-    stage.forecast(memory::of_scan(&Sizes { truth, ..Sizes::new(inputs, &o.texts, &[]) }), SMALLER)?;
+    stage.forecast(memory::of_scan(&Sizes { truth, ..Sizes::new(&inputs.geometry, &o.texts, &[]) }), SMALLER)?;
     let scene = inputs.read(&load(folder, &LoadOptions::default(), stage)?, stage)?;
     let mut notes = Vec::new();
     let why = without_classes(&scene, o);
-    let source = if why.is_none() { Some(TextSource::open_for(&scene, &o.texts)?) } else { None };
+    let source =
+        if why.is_none() { Some(TextSource::open_for(&scene.artifact, scene.instances.dim, &o.texts)?) } else { None };
     notes.extend(why.map(|why| format!("no class scores: {why}")));
     let features = sources(&scene, source.as_ref())?;
     let (vertices, labels) = gs_scene::ply::read_labels(&files.labels, "label")?;

@@ -24,7 +24,7 @@ pub struct Asker<'a> {
 }
 
 /// The answer to one feature.
-#[derive(Debug, Clone, PartialEq)]
+#[derive(Debug, Clone, Default, PartialEq)]
 pub struct Answered {
     /// All instances with a score, best first.
     pub ranking: Vec<Ranked>,

@@ -3,7 +3,7 @@
 mod fixture;
 mod protocols;
 
-use artifacts::Instances;
+use artifacts::{Descriptors, Instances};
 use fixture::{Fixture, HEIGHT, SCORE, TABLE, VIEWS, WIDTH, failed, stem};
 use gs_io::Provenance;
 use serde_json::{Value, json};
@@ -171,6 +171,44 @@ fn a_perfect_run_scores_high() {
     assert_eq!((&labels[0]["category"], &labels[0]["instance"]), (&json!("blue ball"), &json!(1)));
     let v = f.score("--silhouette|visible");
     assert_eq!((&v["silhouette"][0], &v["query_miou"]), (&json!("visible"), &s["query_miou_visible"]));
+}
+
+#[test]
+fn gaussians_with_descriptors_of_their_own_answer_texts() {
+    let f = Fixture::new(2);
+    // The balls' Gaussians, a little off; the floor has none.
+    let values = vec![0.8, 0.6, 0.28, 0.96];
+    let mut d = Descriptors { kept: vec![0, 1], row: vec![0, 1], slots: 1, dim: 2, values };
+    let path = f.path().join("descriptors.safetensors");
+    d.write(&path, f.provenance()).unwrap();
+    let whole = f.score("");
+    let own = |more: &str| f.score(&format!("--descriptors|{{}}/descriptors.safetensors|{more}"));
+    let alike = own("");
+    assert_eq!((&alike["query_miou"], &alike["instance_miou"]), (&whole["query_miou"], &json!(1.0)));
+    assert_eq!((&alike["queries"][1]["text"], &alike["queries"][1]["selected"]), (&json!("red ball"), &json!([])));
+    assert!((alike["queries"][1]["score"].as_f64().unwrap() - 0.8).abs() < 1e-6);
+    // At 0.7 the blue ball's text takes its own alone, at 0.5 both.
+    assert_eq!(own("--threshold|0.7")["queries"][0]["iou"], whole["queries"][0]["iou"]);
+    assert!(own("--threshold|0.5")["queries"][0]["iou"].as_f64() < whole["queries"][0]["iou"].as_f64());
+    assert_eq!(own("--top-k|1")["query_miou"], whole["query_miou"]);
+    assert_eq!(own("--threshold|0.9")["query_miou"], whole["queries"][0]["iou"].as_f64().unwrap() / 2.0);
+    // Without instances only the queries are scored.
+    let mut alone = f.command("score", false);
+    alone.arg("--scene").arg(f.scene()).arg("--geometry").arg(f.geometry()).arg("--out").arg("score.json");
+    alone.arg("--text-features").arg(f.table());
+    let refused = alone.output().unwrap();
+    let said = String::from_utf8_lossy(&refused.stderr);
+    assert!(refused.status.code() == Some(2) && said.contains("--instances <FILE>|--descriptors <FILE>"), "{said}");
+    assert!(alone.arg("--descriptors").arg(&path).output().unwrap().status.success());
+    let alone = f.json("score.json");
+    assert_eq!((&alone["query_miou"], &alone["instance_miou"]), (&whole["query_miou"], &Value::Null));
+    assert!(alone["skipped"][0].as_str().unwrap().contains("no --instances were given"), "{alone}");
+    d.kept[1] = 99;
+    d.write(&path, f.provenance()).unwrap();
+    let wrong = format!("{SCORE}|--descriptors|{{}}/descriptors.safetensors");
+    f.bad("score", &wrong, &["a Gaussian that the geometry lacks", "found 99"]);
+    d.write(&path, Provenance::default()).unwrap();
+    f.bad("score", &wrong, &["descriptors.safetensors", "geometry"]);
 }
 
 #[test]
