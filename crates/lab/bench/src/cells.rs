@@ -2,12 +2,12 @@
 //! is made once.
 
 use crate::chain::{Files, Programs, Stage, command, read_json, words};
-use crate::plan::{Plan, Row, Scene};
+use crate::plan::{NAMED_MASKS, Plan, Product, Row, Scene};
 use crate::task::{Task, Tasks};
 use gs_io::Result;
 use serde_json::Value;
 use stage::RunRecord;
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
 /// A number that each cell gives.
 #[derive(Debug, Clone, Copy)]
@@ -46,15 +46,20 @@ pub struct Cell {
     pub scene: String,
     /// A value for each of [`METRICS`].
     pub values: Vec<Option<f64>>,
-    /// Processor seconds of feat-train and cluster-match.
+    /// Processor seconds of the features and of the clustering.
     pub seconds: Option<f64>,
+    /// Peak memory of both in bytes.
+    pub peak: Option<u64>,
     /// Mean cosine of a mask's Gaussians with its centroid in the last view trained on; none for closed forms.
     pub alignment: Option<f64>,
     /// Bytes of the graph network per Gaussian.
     pub network: Option<f64>,
 }
 
-/// Where a cell's files lie.
+const INSTANCES: &str = "instances.safetensors";
+const DESCRIPTORS: &str = "descriptors.safetensors";
+
+/// Where a cell's files lie; a clustering that makes descriptors alone has them in the place of its instances.
 fn files(plan: &Plan, folder: &Path, scene: &str, p: &str, row: &Row) -> Files {
     let (scene, own) = (folder.join(scene), folder.join(scene).join(format!("p{p}")));
     let footprints = plan.footprints_of.get(&row.features).map_or("", String::as_str);
@@ -66,7 +71,10 @@ fn files(plan: &Plan, folder: &Path, scene: &str, p: &str, row: &Row) -> Files {
         graph: file(footprints, "graph.safetensors"),
         footprints: file(footprints, "footprints.safetensors"),
         features: file(&row.features, "features.safetensors"),
-        instances: file(&row.id(), "instances.safetensors"),
+        instances: file(
+            &row.id(),
+            if plan.product(&row.clustering) == Product::Descriptors { DESCRIPTORS } else { INSTANCES },
+        ),
         score: file(&row.id(), "score.json"),
         scene: scene.join("scene"),
     }
@@ -86,7 +94,10 @@ fn add(tasks: &mut Tasks, plan: &Plan, files: &Files, (scene, seed): (&Scene, u6
     let run = |stage, options: &str| [files.command(stage), words(options)].concat();
     let photographs = Task::new(files.scene.join("truth/scene.json"), synth(("--out", &files.scene), ""), &[]);
     let photographs = tasks.add(0, photographs);
-    let masks = format!("{} --granularity-p {p} --features", plan.options_of("masks", ""));
+    let masks = match p {
+        p if NAMED_MASKS.contains(&p) => format!("--corruption {p} --features"),
+        p => format!("{} --granularity-p {p} --features", plan.options_of("masks", "")),
+    };
     let masks = Task::new(files.masks.join("masks.json"), synth(("--masks-to", &files.masks), &masks), &[&photographs]);
     let masks = tasks.add(1, masks);
     let geometry = run(Stage::Geometry, &scene.geometry);
@@ -94,11 +105,64 @@ fn add(tasks: &mut Tasks, plan: &Plan, files: &Files, (scene, seed): (&Scene, u6
     let footprints = plan.footprints_of.get(&row.features).map_or("", String::as_str);
     let graph = run(Stage::Graph, plan.options_of("footprints", footprints));
     let graph = tasks.add(2, Task::new(files.graph.clone(), graph, &[&geometry, &masks]));
-    let features = run(Stage::Features, plan.options_of("features", &row.features));
-    let features = tasks.add(3, Task::new(files.features.clone(), features, &[&graph]));
-    let instances = run(Stage::Instances, plan.options_of("clustering", &row.clustering));
-    let instances = tasks.add(4, Task::new(files.instances.clone(), instances, &[&features]));
-    tasks.add(5, Task::new(files.score.clone(), files.scoring(), &[&instances]));
+    let made = plan.options_of("features", &row.features);
+    let base = if made == "-" {
+        graph
+    } else {
+        let out = ("--out", &*files.features);
+        let command = peer(files, made, &[out]).unwrap_or_else(|| run(Stage::Features, made));
+        tasks.add(3, Task::new(files.features.clone(), command, &[&graph]))
+    };
+    let how = plan.options_of("clustering", &row.clustering);
+    let (product, beside) = (plan.product(&row.clustering), descriptors_beside(files));
+    let mut more = vec![("--out", &*files.instances)];
+    if made != "-" {
+        more.push(("--features", &files.features));
+    }
+    if product == Product::Both {
+        more.push(("--descriptors", &beside));
+    }
+    let command = peer(files, how, &more).unwrap_or_else(|| run(Stage::Instances, how));
+    let instances = tasks.add(4, Task::new(files.instances.clone(), command, &[&base]));
+    let mut scoring = files.scoring();
+    match product {
+        Product::Instances => {}
+        // The file is of another kind.
+        Product::Descriptors => {
+            scoring.iter_mut().filter(|w| *w == "--instances").for_each(|w| *w = "--descriptors".to_string());
+        }
+        Product::Both => scoring.extend(command_of(&[("--descriptors", &beside)])),
+    }
+    let options = plan.options_of("scoring", &row.clustering);
+    scoring.extend(words(options));
+    if options.contains("--join") {
+        scoring.extend(command_of(&[("--features", &files.features)]));
+    }
+    tasks.add(5, Task::new(files.score.clone(), scoring, &[&instances]));
+}
+
+fn command_of(files: &[(&str, &Path)]) -> Vec<String> {
+    command(&[], files)
+}
+
+/// Where a clustering puts descriptors that it makes beside instances.
+fn descriptors_beside(files: &Files) -> PathBuf {
+    let name = files.instances.file_name().unwrap_or_default().to_string_lossy().replace(INSTANCES, DESCRIPTORS);
+    files.instances.with_file_name(name)
+}
+
+/// The command line of a rival, where `options` are `peers SYSTEM ...`, with these files besides the inputs of all.
+fn peer(files: &Files, options: &str, more: &[(&str, &Path)]) -> Option<Vec<String>> {
+    let words = words(options.strip_prefix("peers ")?);
+    let (system, options) = words.split_first()?;
+    let inputs = [
+        ("--scene", &*files.scene),
+        ("--geometry", &files.geometry),
+        ("--graph", &files.graph),
+        ("--footprints", &files.footprints),
+        ("--masks", &files.masks),
+    ];
+    Some([command(&["peers", system], &[&inputs, more].concat()), options.to_vec()].concat())
 }
 
 /// Runs what the plan's tables need and is not there yet.
@@ -124,17 +188,25 @@ pub fn run(programs: &Programs, plan: &Plan, folder: &Path, stage: &stage::Stage
 
 /// Cells of a row at a p, in the order of scenes and seeds.
 pub fn read(plan: &Plan, folder: &Path, row: &Row, p: &str) -> Result<Vec<Cell>> {
-    scenes(plan).map(|(_, _, name)| cell(files(plan, folder, &name, p, row), name)).collect()
+    scenes(plan).map(|(_, _, name)| cell(plan, row, &files(plan, folder, &name, p, row), name)).collect()
 }
 
-fn cell(files: Files, scene: String) -> Result<Cell> {
+fn cell(plan: &Plan, row: &Row, files: &Files, scene: String) -> Result<Cell> {
     let score: Value = read_json(&files.score)?;
-    let (features, instances) = (RunRecord::read(&files.features).ok(), RunRecord::read(&files.instances).ok());
+    let instances = RunRecord::read(&files.instances).ok();
+    let (features, made) = (RunRecord::read(&files.features).ok(), plan.options_of("features", &row.features) != "-");
+    let features = features.filter(|_| made);
+    // Without features there is nothing to add to.
+    let both = |of: &dyn Fn(&RunRecord) -> Option<f64>, join: fn(f64, f64) -> f64| {
+        let own = of(instances.as_ref()?)?;
+        if made { Some(join(of(features.as_ref()?)?, own)) } else { Some(own) }
+    };
     let number = |at: &str| features.as_ref().and_then(|r| r.summary.pointer(at)?.as_f64());
     Ok(Cell {
         scene,
         values: METRICS.iter().map(|m| score.pointer(m.at).and_then(Value::as_f64)).collect(),
-        seconds: features.as_ref().zip(instances).and_then(|(f, i)| Some(f.cpu_seconds? + i.cpu_seconds?)),
+        seconds: both(&|r| r.cpu_seconds, |a, b| a + b),
+        peak: both(&|r| Some(r.peak_rss_bytes? as f64), f64::max).map(|bytes| bytes as u64),
         alignment: number("/last/alignment"),
         network: number("/network_bytes").zip(number("/gaussians")).filter(|n| n.1 > 0.0).map(|(b, n)| b / n),
     })

@@ -105,6 +105,10 @@ impl Args {
     fn experiments(&self, plan: &Plan, programs: &Programs, stage: &Stage) -> Result<()> {
         let mut claim = self.claim(stage)?;
         let mut results = Results::default();
+        if plan.has_rivals() && !programs.folder.join("peers").exists() {
+            let e = Error::new("a program is missing").file(&programs.folder).expected("peers");
+            return Err(e.hint("run make build"));
+        }
         if !plan.tables.is_empty() {
             cells::run(programs, plan, &self.work, stage)?;
             results.tables = tables::results(plan, &self.work)?;

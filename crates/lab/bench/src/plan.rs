@@ -9,9 +9,10 @@
 //! | `seeds \| tuning \| 0 1 2` | seeds of every scene. What is chosen is chosen on `tuning` seeds, below 10; what is claimed is measured on `reporting` seeds, 10 and more |
 //! | `masks \| options` | faults of all masks but their granularity: options of synth-scene |
 //! | `footprints NAME \| options` | options of graph-precompute |
-//! | `features NAME \| footprints \| options` | options of feat-train |
-//! | `clustering NAME \| options` | options of cluster-match |
-//! | `table NAME \| p values \| reference row \| title` | a table, at granularity noise of these p; `-`: no reference |
+//! | `features NAME \| footprints \| options` | options of feat-train; `peers SYSTEM options`: made by that; `-`: none |
+//! | `clustering NAME \| options` | options of cluster-match; `peers SYSTEM options`: a rival, which gets the features where there are some |
+//! | `scoring CLUSTERING \| product \| options` | what it makes, `instances`, `descriptors` or `both`, and options of eval score; without this line `instances` and none |
+//! | `table NAME \| masks \| reference row \| title` | a table, at granularity noise of these p, or with masks of `exact` or `sam`; `-`: no reference |
 //! | `row TABLE \| features \| clustering \| paper \| label` | a row; paper: its mIoU, mAcc and perhaps memory in GB, or `-` |
 //! | `expect TABLE \| features.clustering \| p \| metric \| low \| high` | the mean must lie in this range |
 //! | **trade-offs** | run time against error, on every scene |
@@ -43,6 +44,15 @@ pub struct Paper {
     pub miou: f64,
     pub macc: f64,
     pub memory: Option<f64>,
+}
+
+/// What a clustering makes.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
+pub enum Product {
+    #[default]
+    Instances,
+    Descriptors,
+    Both,
 }
 
 #[derive(Debug, Clone, PartialEq, Serialize)]
@@ -134,6 +144,8 @@ pub struct Plan {
     options: BTreeMap<String, String>,
     /// Which footprints features are made from.
     pub footprints_of: BTreeMap<String, String>,
+    /// What clusterings make that do not make instances alone.
+    products: BTreeMap<String, Product>,
     pub tables: Vec<TablePlan>,
     pub expected: Vec<Expected>,
     /// How often each point is timed.
@@ -142,17 +154,21 @@ pub struct Plan {
     pub axes: Vec<Axis>,
 }
 
+/// Masks that are no probability of other granularity, but `--corruption` of synth-scene.
+pub const NAMED_MASKS: [&str; 2] = ["exact", "sam"];
+
 /// Seeds below this are for choosing settings, the others for measuring what was chosen.
 const FIRST_REPORTING: u64 = 10;
 
 /// Keywords with the number of fields after them, and whether they have a name.
-const KEYWORDS: [(&str, usize, bool); 14] = [
+const KEYWORDS: [(&str, usize, bool); 15] = [
     ("scene", 2, true),
     ("seeds", 2, false),
     ("masks", 1, false),
     ("footprints", 1, true),
     ("features", 2, true),
     ("clustering", 1, true),
+    ("scoring", 2, true),
     ("table", 3, true),
     ("row", 4, true),
     ("expect", 5, true),
@@ -230,6 +246,16 @@ impl Plan {
                     return Err(Error::new("a seed of the other kind").found(seed).expected(range));
                 }
             }
+            "scoring" => {
+                self.defined("clustering", name)?;
+                let product = match rest[0] {
+                    "instances" => Product::Instances,
+                    "descriptors" => Product::Descriptors,
+                    "both" => Product::Both,
+                    _ => return Err(wrong("instances, descriptors or both")),
+                };
+                self.products.insert(name.into(), product);
+            }
             "table" => self.tables.push(table(name, rest)?),
             "row" => {
                 self.defined("features", rest[0])?;
@@ -294,16 +320,39 @@ impl Plan {
         self.options.get(&format!("{keyword} {name}")).map_or("", |s| s)
     }
 
-    /// Keeps only the tables, knobs and axes of these names; all where there is none.
+    /// Whether any features or clustering are those of a rival.
+    pub fn has_rivals(&self) -> bool {
+        self.options.values().any(|o| o.starts_with("peers "))
+    }
+
+    /// What a clustering makes.
+    pub fn product(&self, clustering: &str) -> Product {
+        self.products.get(clustering).copied().unwrap_or_default()
+    }
+
+    /// Keeps only the tables, knobs and axes of these names, and of the other tables the rows with clusterings of these names; all
+    /// where there is none.
     pub fn only(mut self, names: &[String]) -> Result<Self> {
         let (tables, knobs) = (self.tables.iter().map(|t| &t.name), self.knobs.iter().map(|k| &k.name));
-        let all: Vec<&String> = tables.chain(knobs).chain(self.axes.iter().map(|a| &a.name)).collect();
+        let rows = self.tables.iter().flat_map(|t| &t.rows).map(|r| &r.clustering);
+        let mut all: Vec<&String> = tables.chain(knobs).chain(self.axes.iter().map(|a| &a.name)).collect();
+        let named = all.len();
+        all.extend(rows);
         if let Some(unknown) = names.iter().find(|n| !all.contains(n)) {
-            let all: Vec<&str> = all.into_iter().map(String::as_str).collect();
-            return Err(Error::new("not in the plan").field("--only").found(unknown).expected(all.join(", ")));
+            let all: Vec<&str> = all[..named].iter().map(|n| n.as_str()).collect();
+            let expected = all.join(", ") + ", or a clustering of theirs";
+            return Err(Error::new("not in the plan").field("--only").found(unknown).expected(expected));
         }
         let wanted = |name: &String| names.is_empty() || names.contains(name);
-        self.tables.retain(|t| wanted(&t.name));
+        self.tables.iter_mut().filter(|t| !wanted(&t.name)).for_each(|t| {
+            // What the others are compared with stays.
+            let reference = t.reference.clone();
+            t.rows.retain(|r| wanted(&r.clustering) || reference.as_ref() == Some(&r.id()));
+            if !t.rows.iter().any(|r| wanted(&r.clustering)) {
+                t.rows.clear();
+            }
+        });
+        self.tables.retain(|t| !t.rows.is_empty());
         self.knobs.retain(|k| wanted(&k.name));
         self.axes.retain(|a| wanted(&a.name));
         self.expected.retain(|e| wanted(&e.table));
@@ -339,8 +388,8 @@ fn scene(name: &str, scene: &str, geometry: &str) -> Scene {
 
 fn table(name: &str, fields: &[&str]) -> Result<TablePlan> {
     let p: Vec<String> = fields[0].split_whitespace().map(String::from).collect();
-    if p.is_empty() || !p.iter().all(|p| stage::within(0.0..=1.0)(p).is_ok()) {
-        return Err(Error::new("not probabilities").found(fields[0]).expected("numbers from 0 to 1"));
+    if p.is_empty() || !p.iter().all(|p| NAMED_MASKS.contains(&p.as_str()) || stage::within(0.0..=1.0)(p).is_ok()) {
+        return Err(Error::new("not masks").found(fields[0]).expected("numbers from 0 to 1, exact or sam"));
     }
     let reference = (fields[1] != "-").then(|| fields[1].to_string());
     Ok(TablePlan { name: name.into(), p, reference, title: fields[2].into(), rows: Vec::new() })
@@ -405,6 +454,18 @@ size views | 8 | --size tiny --views 8 | --iterations 10
         assert_eq!(p.expected[0].high, 0.9);
         let only = p.clone().only(&["cut".into(), "views".into()]).unwrap();
         assert_eq!((only.tables.len(), only.knobs.len(), only.axes.len(), only.expected.len()), (0, 1, 1, 0));
+        let ours = p.clone().only(&["free".into()]).unwrap();
+        assert_eq!((ours.tables[0].rows.len(), ours.knobs.len()), (2, 0), "rows by their clustering");
+        let one = Plan::parse(
+            &TEXT
+                .replace("ours | free | -", "ours | graph | -")
+                .replace("table t", "clustering graph |\nscoring graph | both | --threshold 0.5\ntable t"),
+        );
+        let one = one.unwrap();
+        assert_eq!((one.product("graph"), one.product("free")), (Product::Both, Product::Instances));
+        assert_eq!(one.options_of("scoring", "graph"), "--threshold 0.5");
+        let rows = one.only(&["graph".into()]).unwrap().tables.remove(0).rows;
+        assert_eq!(rows.iter().map(Row::id).collect::<Vec<_>>(), ["paper.free", "ours.graph"], "with the reference");
         assert!(p.only(&["cuts".into()]).unwrap_err().to_string().contains("t, cut, quality, views"));
     }
 
@@ -431,6 +492,8 @@ size views | 8 | --size tiny --views 8 | --iterations 10
             ("repeats | 5", "repeats | x", "line 13"),
             ("knob cut | graph", "knob cut | grph", "line 14"),
             ("row t | ours", "row t | paper", "defined twice"),
+            ("table t", "scoring free | things |\ntable t", "descriptors"),
+            ("table t", "scoring fre | both |\ntable t", "no such clustering"),
             ("knob quality", "knob cut", "defined twice"),
             ("seeds | tuning | 0 1\n", "scene a | |\n", "defined twice"),
             ("point cut | none", "point cot | none", "no such knob; found cot"),
@@ -440,7 +503,7 @@ size views | 8 | --size tiny --views 8 | --iterations 10
             ("row t | paper", "row t | papers", "papers"),
             ("row t | paper", "row u | paper", "no such table"),
             ("| gated | --preset", "| gate | --preset", "no such footprints"),
-            ("0 0.5 |", "0 1.5 |", "probabilities"),
+            ("0 0.5 |", "0 1.5 |", "not masks"),
             ("50.79 69.62 2.1", "50.79", "numbers of the paper"),
             ("scene a", "scene", "a name"),
             ("tuning | 0 1", "tuning | a", "whole numbers"),

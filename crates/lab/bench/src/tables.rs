@@ -3,7 +3,7 @@
 
 use crate::cells::{Cell, METRICS, read};
 use crate::interval::Interval;
-use crate::plan::{Plan, Row, TablePlan};
+use crate::plan::{NAMED_MASKS, Plan, Row, TablePlan};
 use gs_io::{Error, Result};
 use report::sheet::markdown;
 use serde::Serialize;
@@ -21,8 +21,10 @@ pub struct RowResult {
     pub results: BTreeMap<String, BTreeMap<String, Interval>>,
     /// By p, then by metric: the same of the difference from the row of reference, cell by cell.
     pub differences: BTreeMap<String, BTreeMap<String, Interval>>,
-    /// Mean processor seconds of feat-train and cluster-match by p, over the scenes whose records have them.
+    /// Mean processor seconds of features and clustering by p, over the scenes whose records have them.
     pub seconds: BTreeMap<String, f64>,
+    /// Most memory that either takes in any scene, in bytes, by p.
+    pub peak_rss_bytes: BTreeMap<String, u64>,
     /// Mean cosine of a mask's Gaussians with its centroid at the end of training, by p.
     pub alignment: BTreeMap<String, f64>,
     /// Bytes of the graph network per Gaussian, where there is one.
@@ -65,6 +67,10 @@ fn result(plan: &Plan, folder: &Path, table: &TablePlan) -> Result<Table> {
             results: intervals(&by_p, |c, m| c.values[m]),
             differences: BTreeMap::new(),
             seconds: by_p_mean(&|c| c.seconds),
+            peak_rss_bytes: by_p
+                .iter()
+                .filter_map(|(p, cells)| Some((p.to_string(), cells.iter().filter_map(|c| c.peak).max()?)))
+                .collect(),
             alignment: by_p_mean(&|c| c.alignment),
             network_bytes_per_gaussian: mean(&all().filter_map(|c| c.network).collect::<Vec<_>>()),
             row: row.clone(),
@@ -131,6 +137,11 @@ pub fn check(plan: &Plan, tables: &[Table]) -> Result<()> {
 /// The main metrics.
 const GAINS: [&str; 2] = ["instance_miou", "query_miou"];
 
+/// Masks as a table names them.
+fn masks_of(p: &str) -> String {
+    if NAMED_MASKS.contains(&p) { format!("masks {p}") } else { format!("p = {p}") }
+}
+
 /// An interval as text: shares in percent.
 fn shown(interval: Option<&Interval>, share: bool, signed: bool) -> String {
     let Some(i) = interval else { return "–".into() };
@@ -154,7 +165,7 @@ pub fn blocks(table: &Table) -> Vec<Block> {
         blocks.push((title, head.to_vec(), table.rows.iter().map(row).collect()));
     };
     if table.p.len() > 1 {
-        let head: Vec<String> = [String::new()].into_iter().chain(table.p.iter().map(|p| format!("p = {p}"))).collect();
+        let head: Vec<String> = [String::new()].into_iter().chain(table.p.iter().map(|p| masks_of(p))).collect();
         for m in METRICS.iter().filter(|m| GAINS.contains(&m.name)) {
             block(format!("{}, %", m.title), &head, &|r| {
                 let cells = table.p.iter().map(|p| shown(r.results.get(p).and_then(|r| r.get(m.name)), m.share, false));
@@ -185,13 +196,15 @@ pub fn blocks(table: &Table) -> Vec<Block> {
         columns.push(("alignment".into(), Box::new(|r| figure(r.alignment.get(p).copied(), 2))));
     }
     columns.push(("seconds".into(), Box::new(|r| figure(r.seconds.get(p).copied(), 1))));
+    let megabytes = |r: &RowResult| figure(r.peak_rss_bytes.get(p).map(|&bytes| bytes as f64 / 1e6), 0);
+    columns.push(("peak MB".into(), Box::new(megabytes)));
     if table.rows.iter().any(|r| r.row.paper.is_some_and(|p| p.memory.is_some())) {
         let network = |r: &RowResult| figure(r.network_bytes_per_gaussian, 0);
         columns.push(("network, MB per million Gaussians".into(), Box::new(network)));
         columns.push(("paper, GB".into(), Box::new(printed)));
     }
     let head: Vec<String> = columns.iter().map(|c| c.0.clone()).collect();
-    block(format!("All metrics at p = {p}"), &head, &|r| columns.iter().map(|c| c.1(r)).collect());
+    block(format!("All metrics at {}", masks_of(p)), &head, &|r| columns.iter().map(|c| c.1(r)).collect());
     blocks
 }
 
