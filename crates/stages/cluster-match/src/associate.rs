@@ -18,6 +18,7 @@ const PIXELS: usize = TILE * TILE;
 /// Pixels of an instance or a mask in a view, and the sum of rendered features over them.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct Region {
+    /// Its pixels.
     pub area: u32,
     /// Sum of rendered features over the pixels, `[dim]`.
     pub features: Vec<f64>,

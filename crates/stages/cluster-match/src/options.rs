@@ -81,9 +81,9 @@ pub(crate) struct Settings {
     #[arg(long, value_name = "PROBABILITY", value_parser = join_probability, default_value = "0.6",
         default_value_if("cluster", "free", "0"))]
     pub join: f64,
-    /// Rounds in which a Gaussian may change to the neighbouring instance that its masks show; for free points the default
-    /// is 0
-    #[arg(long, value_name = "ROUNDS", default_value = "3", default_value_if("cluster", "free", "0"))]
+    /// Most rounds in which a Gaussian may change to the neighbouring instance that its masks show; for free points the
+    /// default is 0
+    #[arg(long, value_name = "ROUNDS", default_value = "8", default_value_if("cluster", "free", "0"))]
     pub votes: usize,
     /// Let small parts leave their instance and become instances: what stands on a shelf is no shelf. The largest share of the
     /// instance's Gaussians that such a part may have, 0 to 0.5; 0 lets none leave. The masks of level small show the parts, so

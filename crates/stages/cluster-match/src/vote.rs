@@ -2,7 +2,7 @@
 //!
 //! The clustering cuts where features differ most. At the rim of a thing this is wrong by a few Gaussians, and noise has
 //! the label of its nearest neighbour. Once instances are known, each view tells where they end: a Gaussian gets the label of
-//! the neighbouring instance whose masks hold most of its weight and of its neighbours' weight.
+//! the neighbouring instance whose masks hold most of its weight. Its neighbours have no say, or rims would be smooth.
 
 use crate::join::{mask_weights, units};
 use artifacts::{Entries, Footprints, Graph, Level};
@@ -16,9 +16,8 @@ const CHUNK: usize = 8192;
 const LEAD: f32 = 1.02;
 
 /// Gives Gaussians the neighbouring instance with most votes, in at most `rounds` rounds, until none changes. `labels` are
-/// those of the kept Gaussians; those in no instance (-1) stay so. A Gaussian's votes for an instance are its weights, and those of its spatial
-/// neighbours, in all masks, each times the share of the instance that the view shows in this mask. Returns how many
-/// labels changed.
+/// those of the kept Gaussians; those in no instance (-1) stay so. A Gaussian's votes for an instance are its weights in all masks,
+/// each times the share of the instance that the view shows in this mask. Returns how many labels changed.
 ///
 /// # Errors
 /// When the footprints can't be read.
@@ -51,50 +50,34 @@ fn vote(
     levels: &[Level],
 ) -> Result<Vec<(u32, u32)>> {
     let k = graph.gaussian_k;
-    let around = |i: usize| {
-        let neighbours = graph.gaussian_knn[i * k..(i + 1) * k].iter().map(|&j| j as usize);
-        std::iter::once(i).chain(neighbours.filter(move |&j| j != i))
-    };
-    // The Gaussians with several instances around them, and these.
-    let choices: Vec<(u32, Vec<u32>)> = (0..labels.len())
+    // The Gaussians with several instances around them, and these: (Gaussian, instance), ascending.
+    let asked: Vec<(u32, u32)> = (0..labels.len())
         .into_par_iter()
         .with_min_len(CHUNK)
         .filter(|&i| labels[i] >= 0)
-        .filter_map(|i| {
-            let mut choice: Vec<u32> = around(i).filter_map(|j| u32::try_from(labels[j]).ok()).collect();
+        .flat_map_iter(|i| {
+            let around = graph.gaussian_knn[i * k..(i + 1) * k].iter().map(|&j| labels[j as usize]);
+            let mut choice: Vec<u32> = around.chain([labels[i]]).filter_map(|l| u32::try_from(l).ok()).collect();
             choice.sort_unstable();
             choice.dedup();
-            (choice.len() > 1).then_some((i as u32, choice))
+            let choice = if choice.len() > 1 { choice } else { Vec::new() };
+            choice.into_iter().map(move |label| (i as u32, label))
         })
         .collect();
-    // The votes that they need: (Gaussian, instance), ascending.
-    let mut asked: Vec<(u32, u32)> = choices
-        .par_iter()
-        .with_min_len(CHUNK)
-        .flat_map_iter(|(i, choice)| {
-            around(*i as usize).flat_map(move |j| choice.iter().map(move |&label| (j as u32, label)))
-        })
-        .collect();
-    asked.par_sort_unstable();
-    asked.dedup();
     let votes = count(&asked, labels, instances, footprints, levels)?;
-    let of = |j: usize, label: u32| votes[asked.binary_search(&(j as u32, label)).expect("asked for")];
-    let changed = choices
-        .par_iter()
-        .with_min_len(CHUNK)
-        .filter_map(|(i, choice)| {
-            let own = labels[*i as usize] as u32;
-            let sum = |label: u32| around(*i as usize).map(|j| of(j, label)).sum::<f32>();
-            let mut best = (own, LEAD * sum(own));
-            for &label in choice.iter().filter(|&&label| label != own) {
-                let votes = sum(label);
-                if votes > best.1 {
-                    best = (label, votes);
-                }
-            }
-            (best.0 != own).then_some((*i, best.0))
-        })
-        .collect();
+    let mut changed = Vec::new();
+    let mut at = 0;
+    for choice in asked.chunk_by(|a, b| a.0 == b.0) {
+        let votes = &votes[at..at + choice.len()];
+        at += choice.len();
+        let (gaussian, own) = (choice[0].0, labels[choice[0].0 as usize] as u32);
+        let others = || choice.iter().zip(votes).map(|(c, &v)| (c.1, v));
+        let now = others().find(|o| o.0 == own).map_or(0.0, |o| LEAD * o.1);
+        let best = others().filter(|o| o.0 != own).fold((own, now), |b, o| if o.1 > b.1 { o } else { b });
+        if best.0 != own {
+            changed.push((gaussian, best.0));
+        }
+    }
     Ok(changed)
 }
 
@@ -172,16 +155,15 @@ mod tests {
     use artifacts::{FootprintsBuilder, Row};
     use gs_io::Provenance;
 
-    #[test]
-    fn a_rim_goes_where_its_masks_are_and_strays_come_home() {
-        // 20 Gaussians in a row; in each of 4 views masks show 0..10 and 10..20. Labels are off by two, and one is astray.
+    /// 20 Gaussians in a row, of which four views show two masks: those for which `second` holds, and the others.
+    fn row(second: impl Fn(u32) -> bool) -> (tempfile::TempDir, Footprints, Graph) {
         let n = 20u32;
         let mut b = FootprintsBuilder { kept: (0..n).collect(), ..FootprintsBuilder::default() };
         for view in 0..4 {
             b.views.push(view.to_string());
             for mask in 0..2 {
                 let row = Row { view, level: 3, mask, pixels: 10, gated: 10, alpha: 1.0 };
-                b.push(row, (mask * 10..mask * 10 + 10).map(|i| (i, 1.0)));
+                b.push(row, (0..n).filter(|&i| second(i) == (mask == 1)).map(|i| (i, 1.0)));
             }
         }
         let dir = tempfile::tempdir().unwrap();
@@ -195,6 +177,21 @@ mod tests {
             gaussian_knn: (0..20).flat_map(near).collect(),
             ..Graph::default()
         };
+        (dir, footprints, graph)
+    }
+
+    #[test]
+    fn a_thing_as_thin_as_a_gaussian_stays_what_its_masks_say() {
+        let (_dir, footprints, graph) = row(|i| i == 7);
+        let mut labels: Vec<i32> = (0..20).map(|i| i32::from(i == 7 || i == 8)).collect();
+        assert_eq!(by_votes(&mut labels, 2, &footprints, &graph, &[Level::Large], 5).unwrap(), 1);
+        assert_eq!(labels, (0..20).map(|i| i32::from(i == 7)).collect::<Vec<_>>());
+    }
+
+    #[test]
+    fn a_rim_goes_where_its_masks_are_and_strays_come_home() {
+        // Labels are off by two, and one is astray.
+        let (_dir, footprints, graph) = row(|i| i >= 10);
         let mut labels: Vec<i32> = (0..20).map(|i| i32::from(i >= 12)).collect();
         labels[4] = 1;
         labels[17] = -1;
