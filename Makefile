@@ -108,6 +108,14 @@ ablation: build ## Tables 3 to 5 on synthetic scenes by a plan: make ablation PL
 	  --out $(or $(OUT),out/ablation)/report.json --threads $(JOBS) $(if $(ONLY),--only $(ONLY))
 	$(if $(PLAN)$(OUT)$(ONLY),,sed -i '/^# Tables/,$$d' docs/results/paper.md && sed '1s/.*/# Tables/' out/ablation/report.md >> docs/results/paper.md)
 
+# docs/results/peers.md and .json are written anew by a run of the whole plan.
+peers: build ## The field's systems beside ours: make peers PLAN=file OUT=folder ONLY=systems (hours; docs/peers.md)
+	target/release/bench run $(or $(PLAN),pipelines/peers.plan) --work $(or $(OUT),out/peers)/runs \
+	  --out $(or $(OUT),out/peers)/report.json --threads $(JOBS) $(if $(ONLY),--only $(ONLY))
+	scripts/peers_summary.py $(or $(OUT),out/peers)/report.json $(or $(OUT),out/peers)/peers.json
+	$(if $(PLAN)$(OUT)$(ONLY),,sed -i '/^# Tables/,$$d' docs/results/peers.md && sed '1s/.*/# Tables/' out/peers/report.md >> docs/results/peers.md \
+	  && cp out/peers/peers.json docs/results/peers.json)
+
 search: build ## Search the readings of the paper for the best one, in three rounds: out/search (hours)
 	mkdir -p out/search
 	for n in 1 2 3; do scripts/search_readings.py plan $$n > out/search/$$n.plan \

@@ -331,6 +331,23 @@ grep -q 'not what the plan expects' "$work/broken.log" || { cat "$work/broken.lo
 grep -q '^bench: 3 of 12 runs' "$work/broken.log" || { cat "$work/broken.log"; fail "a changed line ran more than its features"; }
 pass "the small ablation gives what is expected, and a broken component does not"
 
+say "== the field's systems"
+# One tiny scene, two kinds of masks, all systems and ceilings, and the ranges that they must lie in; two of them alone first.
+peers() { make --no-print-directory peers PLAN=pipelines/peers-small.plan OUT="$work/peers" JOBS=2 "$@" > "$work/peers.log" 2>&1; }
+peers ONLY=labels,opengaussian,saga,laga,pairgs,mask-clustering,mean,dr-splat,vala || { tail -3 "$work/peers.log"; fail "make peers ONLY=systems"; }
+python3 -c 'import json, sys; assert len(json.load(open(sys.argv[1]))["systems"]) == 10, "with ours"' "$work/peers/peers.json" || fail "peers.json of some"
+peers || { tail -3 "$work/peers.log"; fail "make peers"; }
+python3 - "$work/peers/peers.json" <<'PY' || fail "peers.json lacks figures"
+import json, sys
+systems = json.load(open(sys.argv[1]))["systems"]
+assert len(systems) == 14, len(systems)
+for s in systems:
+    for masks in ("0.5", "sam"):
+        found = s["masks"][masks]
+        assert found["query_miou"] is not None and found["peak_rss_bytes"] > 0 and found["seconds"] is not None, (s["system"], found)
+PY
+pass "ten systems of the field run beside ours"
+
 say "== benchmarks"
 # The harness of make bench and make stress on a small part of their work.
 cat > "$work/tradeoffs.plan" <<'PLAN'

@@ -1,0 +1,258 @@
+//! What every system reads: the scene with its geometry, masks, their features and their footprints.
+
+use crate::cli::Peer;
+use artifacts::{
+    Descriptors, Features, Footprints, Graph, Level, MaskFeatures, MaskFolder, MaskMaps, Match, Row, features_path,
+    hash_folder, role,
+};
+use cluster_match::{FeatureTable, matches, overlaps};
+use gs_io::{Claim, Error, Result, Watched, hash_file};
+use gs_raster::{RasterOptions, TileWeights, tile_weights};
+use gs_scene::dataset::{self, Dataset, LoadOptions, Resolution, View};
+use gs_scene::{Camera, Geometry};
+use serde::Serialize;
+use stage::Stage;
+use std::collections::BTreeMap;
+use std::path::{Path, PathBuf};
+
+/// Files of one scene, and the masks to use.
+#[derive(Debug, Clone, clap::Args, Serialize)]
+pub struct Inputs {
+    /// Dataset folder (COLMAP, transforms.json or ScanNet)
+    #[arg(long, value_name = "DIR")]
+    #[serde(skip)]
+    pub scene: PathBuf,
+    /// The Gaussians, as a 3DGS PLY
+    #[arg(long, value_name = "FILE")]
+    #[serde(skip)]
+    pub geometry: PathBuf,
+    /// graph.safetensors of graph-precompute
+    #[arg(long, value_name = "FILE")]
+    #[serde(skip)]
+    pub graph: PathBuf,
+    /// footprints.safetensors of graph-precompute
+    #[arg(long, value_name = "FILE")]
+    #[serde(skip)]
+    pub footprints: PathBuf,
+    /// Folder with id maps (<view>_s.npy) and mask features (<view>_f.npy)
+    #[arg(long, value_name = "DIR")]
+    #[serde(skip)]
+    pub masks: PathBuf,
+    /// Output file: instances, or descriptors
+    #[arg(long, value_name = "FILE")]
+    #[serde(skip)]
+    pub out: PathBuf,
+    /// Levels of the masks that are used, with commas between: default, small, medium, large
+    #[arg(long, value_name = "LEVELS", value_delimiter = ',', default_value = "large")]
+    pub levels: Vec<Level>,
+}
+
+impl Inputs {
+    /// The right to write the output of a system.
+    pub fn claim(&self, peer: &dyn Peer, stage: &Stage) -> Result<Claim> {
+        let mut maps = Vec::new();
+        for suffix in ["_s.npy", "_f.npy"] {
+            maps.extend(artifacts::folder_files(&self.masks, suffix)?);
+        }
+        let outputs = stage.outputs(&self.out).reads([&self.geometry, &self.graph, &self.footprints]).reads(maps);
+        let outputs = outputs.artifact(&self.out, peer.format());
+        let outputs = peer.descriptors().iter().fold(outputs, |o, path| o.artifact(path, Descriptors::FORMAT));
+        outputs.drop_stale().claim()
+    }
+}
+
+/// A scene as a system sees it.
+#[derive(Debug)]
+pub struct World {
+    /// All Gaussians; N.
+    pub geometry: Geometry,
+    /// How to render them.
+    pub raster: RasterOptions,
+    /// Neighbours of the kept Gaussians.
+    pub graph: Graph,
+    /// Which kept Gaussians make up which mask, over all levels.
+    pub footprints: Footprints,
+    /// The views that the footprints know, in their order.
+    pub views: Vec<View>,
+    /// Mask features by view index, of unit length; empty where the masks have none.
+    pub features: BTreeMap<u32, MaskFeatures>,
+    /// Levels of the masks that are used.
+    pub levels: Vec<Level>,
+    /// Content hashes, by role.
+    pub hashes: BTreeMap<String, String>,
+    masks: MaskFolder,
+    watched: Watched,
+}
+
+impl World {
+    /// Reads the files and checks that they belong together.
+    ///
+    /// # Errors
+    /// When a file is damaged, was made from others, or some views have no mask features.
+    pub fn read(inputs: &Inputs, stage: &Stage) -> Result<Self> {
+        let mut watched = Watched::new([&inputs.geometry, &inputs.footprints]);
+        for suffix in ["_s.npy", "_f.npy"] {
+            watched = watched.and(artifacts::watch_folder(&inputs.masks, suffix)?);
+        }
+        let geometry = Geometry::read(&inputs.geometry)?;
+        if let Some(damage) = geometry.damage() {
+            stage.skipped(&damage);
+        }
+        let (graph, graph_file) = Graph::read(&inputs.graph)?;
+        let footprints = Footprints::read(&inputs.footprints)?;
+        let dataset = dataset::load(&inputs.scene, &LoadOptions { resolution: Resolution::Divisor(1.0), holdout: 0 })?;
+        let mut hashes = BTreeMap::from([
+            (role::GEOMETRY.to_string(), hash_file(&inputs.geometry)?),
+            (role::DATASET.to_string(), dataset.hash()?),
+            (role::MASKS.to_string(), hash_folder(&inputs.masks, "_s.npy")?),
+        ]);
+        hashes.iter().try_for_each(|(role, hash)| footprints.artifact().expect_input(role, hash))?;
+        graph_file.expect_input(role::GEOMETRY, &hashes[role::GEOMETRY])?;
+        graph_file.expect_input(role::DATASET, &hashes[role::DATASET])?;
+        hashes.insert(role::GRAPH.into(), graph_file.hash().into());
+        hashes.insert(role::FOOTPRINTS.into(), footprints.artifact().hash().into());
+        hashes.insert(role::MASK_FEATURES.into(), hash_folder(&inputs.masks, "_f.npy")?);
+        if graph.kept != footprints.kept {
+            return Err(Error::new("graph and footprints keep other Gaussians")
+                .file(&inputs.graph)
+                .field("kept")
+                .hint("run graph-precompute again"));
+        }
+        if let Some(last) = footprints.kept.last().filter(|&&last| last as usize >= geometry.gaussians.len()) {
+            return Err(Error::new("a Gaussian that the geometry lacks")
+                .file(&inputs.footprints)
+                .field("kept")
+                .found(last)
+                .expected(format!("less than {}", geometry.gaussians.len())));
+        }
+        let views = views_of(&dataset, &footprints, inputs)?;
+        let features = features_of(&footprints, inputs)?;
+        Ok(Self {
+            raster: RasterOptions::of(&geometry),
+            geometry,
+            graph,
+            footprints,
+            views,
+            features,
+            levels: inputs.levels.clone(),
+            hashes,
+            masks: MaskFolder::open(&inputs.masks),
+            watched,
+        })
+    }
+
+    /// Refuses inputs that changed since they were read.
+    pub fn unchanged(&self) -> Result<()> {
+        self.watched.check()
+    }
+
+    /// Number of all Gaussians.
+    pub fn gaussians(&self) -> usize {
+        self.geometry.gaussians.len()
+    }
+
+    /// Number of Gaussians that some view sees: those of the footprints.
+    pub fn kept(&self) -> usize {
+        self.footprints.kept.len()
+    }
+
+    /// Dimension of the mask features.
+    pub fn dim(&self) -> usize {
+        self.features.values().next().map_or(0, |f| f.dim)
+    }
+
+    /// Rows of the footprints whose masks are of the levels that are used, by view and mask.
+    pub fn rows(&self) -> Vec<u32> {
+        let rows = self.footprints.rows.iter().enumerate();
+        rows.filter(|(_, row)| row.is_of(&self.levels)).map(|(r, _)| r as u32).collect()
+    }
+
+    /// The feature of a mask, of unit length; none where it is zero.
+    pub fn feature(&self, row: &Row) -> Option<&[f32]> {
+        let feature = self.features.get(&row.view)?.row(row.mask as usize)?;
+        feature.iter().any(|&v| v != 0.0).then_some(feature)
+    }
+
+    /// The id maps of a view, and its camera in their size.
+    pub fn maps(&self, view: usize) -> Result<(MaskMaps, Camera)> {
+        let maps = self.masks.read(&self.views[view])?;
+        let camera = self.views[view].camera.resized(maps.width as u32, maps.height as u32);
+        Ok((maps, camera))
+    }
+
+    /// Calls `f` for every tile of a view, in parallel, and returns the results in tile order. With `early_stop` hidden Gaussians
+    /// have no alpha ([`tile_weights`]).
+    pub fn tiles<R: Send>(
+        &self,
+        camera: &Camera,
+        early_stop: bool,
+        f: impl Fn(&TileWeights<'_>) -> R + Sync,
+    ) -> Vec<R> {
+        tile_weights(&self.geometry.gaussians, camera, &self.raster, early_stop, f)
+    }
+
+    /// The features of feat-train for the kept Gaussians.
+    ///
+    /// # Errors
+    /// When they were made from another graph or other footprints.
+    pub fn learned(&self, path: &Path) -> Result<Features> {
+        let (features, file) = Features::read(path)?;
+        file.expect_input(role::GRAPH, &self.hashes[role::GRAPH])?;
+        file.expect_input(role::FOOTPRINTS, &self.hashes[role::FOOTPRINTS])?;
+        Ok(features)
+    }
+
+    /// Labels of all Gaussians from those of the kept ones; -1 elsewhere.
+    pub fn spread(&self, kept: &[i32]) -> Vec<i32> {
+        let mut labels = vec![-1; self.gaussians()];
+        self.footprints.kept.iter().zip(kept).for_each(|(&i, &label)| labels[i as usize] = label);
+        labels
+    }
+
+    /// Matches instances with masks as `cluster-match` does, for systems without a rule of their own: in each view the mask with
+    /// the largest IoU, where that exceeds `threshold`. `labels` are those of all Gaussians.
+    pub fn matches(&self, labels: &[i32], threshold: f32) -> Result<Vec<Match>> {
+        // Features that are all alike leave the IoU alone.
+        let alike = Features {
+            kept: self.footprints.kept.clone(),
+            dim: 1,
+            values: vec![1.0; self.kept()],
+            ..Features::default()
+        };
+        let table = FeatureTable::new(&alike, self.gaussians());
+        let mut all = Vec::new();
+        for view in 0..self.views.len() {
+            let (maps, camera) = self.maps(view)?;
+            let found = overlaps(&self.geometry.gaussians, &self.raster, labels, &table, &camera, &maps, &self.levels);
+            all.extend(matches(&found, view as u32, threshold));
+        }
+        all.sort_by_key(|m| (m.instance, m.view));
+        Ok(all)
+    }
+}
+
+/// The views of the footprints, in their order.
+fn views_of(dataset: &Dataset, footprints: &Footprints, inputs: &Inputs) -> Result<Vec<View>> {
+    let view = |stem: &String| {
+        let missing = || Error::new("a view of the footprints is not in the dataset").file(&inputs.scene).found(stem);
+        dataset.views.iter().find(|v| v.stem() == stem).cloned().ok_or_else(missing)
+    };
+    footprints.views.iter().map(view).collect()
+}
+
+/// The mask features of all views; none where no view has any.
+fn features_of(footprints: &Footprints, inputs: &Inputs) -> Result<BTreeMap<u32, MaskFeatures>> {
+    let mut all = BTreeMap::<u32, MaskFeatures>::new();
+    if artifacts::folder_files(&inputs.masks, "_f.npy")?.is_empty() {
+        return Ok(all);
+    }
+    for (view, stem) in footprints.views.iter().enumerate() {
+        let path = features_path(&inputs.masks, stem);
+        let features = MaskFeatures::read(&path)?;
+        if let Some(other) = all.values().next().filter(|f| f.dim != features.dim) {
+            return Err(Error::new("features of different models").file(&path).found(features.dim).expected(other.dim));
+        }
+        all.insert(view as u32, features);
+    }
+    Ok(all)
+}
