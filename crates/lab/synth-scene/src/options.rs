@@ -37,7 +37,8 @@ pub struct Args {
     /// Defaults of the five options below
     #[arg(long, value_enum, default_value_t = Size::Demo)]
     size: Size,
-    /// Things besides floor, walls, tables and counters, 1 to 250, in a studio 1 to 60 [tiny 8, demo 10, large 40]
+    /// Things besides floor, walls, tables, counters and what is built into a workshop, 1 to 250, in a studio 1 to 60
+    /// [tiny 8, demo 10, large 40]
     #[arg(long, value_name = "COUNT", value_parser = within(1usize..=MOST_OBJECTS))]
     objects: Option<usize>,
     /// Photographs, 1 to 2000 [tiny 8, demo 30, large 120]
@@ -137,7 +138,7 @@ pub struct Options {
     pub seed: u64,
     /// What kind of scene.
     pub family: Family,
-    /// Things besides floor, walls, tables and counters; 1 to 60 in the studio, to 250 elsewhere.
+    /// Things besides floor, walls, tables, counters and what is built into a workshop; 1 to 60 in the studio, to 250 elsewhere.
     pub objects: usize,
     /// Number of photographs, at least 1.
     pub views: usize,

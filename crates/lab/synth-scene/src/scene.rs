@@ -10,6 +10,7 @@ pub mod cameras;
 pub mod families;
 pub mod layout;
 pub mod room;
+pub mod workshop;
 
 /// A family of scenes.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, clap::ValueEnum, serde::Serialize)]
@@ -24,6 +25,8 @@ pub enum Family {
     Kitchen,
     /// A furnished room, as ScanNet's, with what stands on its furniture
     Room,
+    /// A workbench with a pegboard and shelves: many small, thin things that touch
+    Workshop,
 }
 
 /// A thing of the scene: an object or background.

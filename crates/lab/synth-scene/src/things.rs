@@ -9,5 +9,8 @@ pub mod material;
 pub mod model;
 mod props;
 pub mod shape;
+mod stores;
+mod tools;
 mod toys;
 pub mod walls;
+pub mod workshop;

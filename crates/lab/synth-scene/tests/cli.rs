@@ -80,6 +80,17 @@ fn the_same_seed_gives_the_same_bytes_for_any_number_of_threads() {
 }
 
 #[test]
+fn a_workshop_has_the_same_bytes_for_any_number_of_threads() {
+    let dir = tempfile::tempdir().unwrap();
+    let made = |name: &str, threads: &str| {
+        let out = dir.path().join(name);
+        make(&out, &["--family", "workshop", "--objects", "20", "--views", "2", "--threads", threads]);
+        contents(&out)
+    };
+    assert!(made("a", "1") == made("b", "2"));
+}
+
+#[test]
 fn an_unfinished_or_older_scene_is_replaced_whole() {
     let dir = tempfile::tempdir().unwrap();
     let (a, b) = (dir.path().join("a"), dir.path().join("b"));
@@ -346,7 +357,7 @@ fn a_corruption_sets_every_fault_and_an_option_replaces_one() {
 #[test]
 fn families_are_written_whole_and_rooms_as_scans_too() {
     let dir = tempfile::tempdir().unwrap();
-    for family in ["table", "kitchen", "room"] {
+    for family in ["table", "kitchen", "workshop", "room"] {
         let out = dir.path().join("scene");
         make(&out, &[&["--family", family], &SMALL[..]].concat());
         let truth = TrueScene::read(out.join("truth/scene.json")).unwrap();

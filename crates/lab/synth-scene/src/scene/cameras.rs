@@ -33,6 +33,7 @@ pub fn place(scene: &Scene, views: usize, width: u32, height: u32, rng: &mut Cha
                 Family::Table => table(scene, i, views),
                 Family::Kitchen => kitchen(scene, i, views),
                 Family::Room => room(scene, i, views),
+                Family::Workshop => workshop(scene, i, views),
             };
             let mut shake = |size: f64| DVec3::new(rng.random(), rng.random(), rng.random()) * 2.0 * size - size;
             eye += shake(0.05);
@@ -97,9 +98,9 @@ fn border(half: DVec2, along: f64) -> (DVec2, DVec2) {
     (corners[0], DVec2::X)
 }
 
-/// Half extents of the first table or counter.
+/// Half extents of the first table, counter or workbench.
 fn top_half(scene: &Scene) -> DVec2 {
-    let is_top = |t: &&crate::scene::Thing| t.class == "table" || t.class == "counter";
+    let is_top = |t: &&crate::scene::Thing| ["table", "counter", "workbench"].contains(&t.class);
     scene.things.iter().find(is_top).map_or(DVec2::ONE, |t| t.footprint)
 }
 
@@ -119,6 +120,20 @@ fn kitchen(scene: &Scene, i: usize, views: usize) -> (DVec3, DVec3) {
     let x = x * (half.x - 0.25);
     let sway = 0.45 * (TAU * 6.0 * t).sin();
     (DVec3::new(x, top.y - away, [1.40, 1.75][i % 2]), DVec3::new(x + sway, top.y, top.z + 0.18))
+}
+
+/// Along the bench and back, nearer and farther, looking at the bench, the wall above it and the upper shelves in turn.
+fn workshop(scene: &Scene, i: usize, views: usize) -> (DVec3, DVec3) {
+    let half = top_half(scene);
+    let t = (i as f64 + 0.5) / views as f64;
+    let (x, away) = if t < 0.5 { (4.0 * t - 1.0, 1.05) } else { (3.0 - 4.0 * t, 1.40) };
+    let end = half.x - 0.30;
+    let x = x * end;
+    // Not past the ends, where nothing is.
+    let ahead = (x + 0.40 * (TAU * 7.0 * t).sin()).clamp(-end, end);
+    let (eye, target) = [(1.58, 0.96), (1.38, 1.28), (1.62, 1.62)][i % 3];
+    let wall = scene.room.y;
+    (DVec3::new(x, wall - away, eye), DVec3::new(ahead, wall - 0.15, target))
 }
 
 /// A round through the room between what stands at the walls and in the middle, looking ahead and to both sides.
@@ -149,7 +164,14 @@ mod tests {
 
     #[test]
     fn cameras_see_things_and_stand_in_none() {
-        for (family, objects) in [(Family::Table, 40), (Family::Kitchen, 50), (Family::Room, 70), (Family::Room, 30)] {
+        let families = [
+            (Family::Table, 40),
+            (Family::Kitchen, 50),
+            (Family::Room, 70),
+            (Family::Room, 30),
+            (Family::Workshop, 90),
+        ];
+        for (family, objects) in families {
             let rng = &mut ChaCha8Rng::seed_from_u64(objects as u64);
             let scene = crate::scene::families::plan(family, objects, rng);
             let mut seen = vec![0usize; scene.things.len()];

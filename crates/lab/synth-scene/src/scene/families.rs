@@ -1,4 +1,5 @@
-//! Families of scenes besides the studio of [`crate::scene::layout`]: a crowded table top, a kitchen counter, a furnished room.
+//! Families of scenes besides the studio of [`crate::scene::layout`]: a crowded table top, a kitchen counter, a furnished room;
+//! the workshop is in [`crate::scene::workshop`].
 //!
 //! What they have that the studio lacks: up to hundreds of things; things that touch (half a millimetre apart), stand on
 //! others and hide each other; few colours for many things; patterns, mirrors and sizes ([`crate::things::dress`]); thin wires
@@ -7,6 +8,7 @@
 use crate::random::either_way;
 use crate::scene::layout;
 use crate::scene::room::{Footprint, TABLE_HEIGHT, enclose, name_of, wall_span};
+use crate::scene::workshop::workshop;
 use crate::scene::{Family, Identity, Scene};
 use crate::things::catalogue::{ALONG_WALLS, CLASSES, ON_WALLS, PROPS, SHELF, SINK, STOVE, WALL_CABINET};
 use crate::things::class::{Class, Place};
@@ -25,7 +27,7 @@ use std::f64::consts::{FRAC_PI_2, TAU};
 const PALETTE: usize = 4;
 /// Free space between things put down at random, and between things that touch, in metres.
 const GAP: f64 = 0.004;
-const CONTACT: f64 = 0.0005;
+pub(super) const CONTACT: f64 = 0.0005;
 /// Probability that a thing is put beside another one, touching it.
 const TOUCHING: f64 = 0.5;
 /// Places tried for a thing before the scene is planned anew with more room.
@@ -37,32 +39,35 @@ const COUNTER: [f64; 2] = [0.62, 0.90];
 const GROWTH: f64 = 1.15;
 
 /// A flat top that things may be put on, in the world.
-struct Support {
-    place: Footprint,
-    height: f64,
-    headroom: f64,
-    taken: Vec<Footprint>,
+pub(super) struct Support {
+    pub place: Footprint,
+    pub height: f64,
+    pub headroom: f64,
+    pub taken: Vec<Footprint>,
 }
 
 /// A stretch of a wall that is taken: wall, along it, from and to above the floor.
-struct Hung {
+pub(super) struct Hung {
     wall: usize,
     along: [f64; 2],
     up: [f64; 2],
 }
 
-struct Planner<'a> {
-    scene: Scene,
-    supports: Vec<Support>,
+/// A scene while it is being furnished.
+pub(super) struct Planner<'a> {
+    pub scene: Scene,
+    pub supports: Vec<Support>,
     hung: Vec<Hung>,
     floor: Vec<Footprint>,
-    half: DVec2,
-    names: BTreeSet<String>,
+    /// Half extents of the room.
+    pub half: DVec2,
+    /// Names that are taken.
+    pub names: BTreeSet<String>,
     palette: Vec<usize>,
-    rng: &'a mut ChaCha8Rng,
+    pub rng: &'a mut ChaCha8Rng,
 }
 
-/// A scene of the family with `objects` things besides floor, walls, and the table or counter.
+/// A scene of the family with `objects` things besides floor, walls, the table or counter, and what is built into a workshop.
 pub fn plan(family: Family, objects: usize, rng: &mut ChaCha8Rng) -> Scene {
     let mut growth = 1.0;
     loop {
@@ -71,6 +76,7 @@ pub fn plan(family: Family, objects: usize, rng: &mut ChaCha8Rng) -> Scene {
             Family::Table => table(objects, growth, rng),
             Family::Kitchen => kitchen(objects, growth, rng),
             Family::Room => room(objects, growth, rng),
+            Family::Workshop => workshop(objects, growth, rng),
         };
         if let Some(mut scene) = scene {
             scene.family = family;
@@ -182,7 +188,7 @@ fn room(objects: usize, growth: f64, rng: &mut ChaCha8Rng) -> Option<Scene> {
 }
 
 impl<'a> Planner<'a> {
-    fn new(half: DVec2, rng: &'a mut ChaCha8Rng) -> Self {
+    pub(super) fn new(half: DVec2, rng: &'a mut ChaCha8Rng) -> Self {
         let mut palette: Vec<usize> = (0..PAINTS.len()).collect();
         palette.shuffle(rng);
         palette.truncate(PALETTE);
@@ -201,7 +207,7 @@ impl<'a> Planner<'a> {
     }
 
     /// Puts a model into the scene and its flat tops among the supports.
-    fn put(&mut self, model: &Model, who: Identity, position: DVec3, yaw: f64) {
+    pub(super) fn put(&mut self, model: &Model, who: Identity, position: DVec3, yaw: f64) {
         let turn = DVec2::from_angle(yaw);
         for top in &model.tops {
             let centre = position.truncate() + turn.rotate(DVec2::from_array(top.centre));
@@ -217,7 +223,7 @@ impl<'a> Planner<'a> {
     }
 
     /// A thing of a class in a colour of the scene, dressed, with a name that no other thing has.
-    fn make(&mut self, class: &'static Class, sized: bool, scale: f64) -> (Model, Identity) {
+    pub(super) fn make(&mut self, class: &'static Class, sized: bool, scale: f64) -> (Model, Identity) {
         let mut paints: Vec<usize> = class.paints.iter().copied().filter(|p| self.palette.contains(p)).collect();
         for attempt in 0.. {
             // When all names of the scene's colours are taken, others come in.
@@ -244,6 +250,15 @@ impl<'a> Planner<'a> {
     /// Puts a thing on a support, a given one or any; touching another where chance and space allow it.
     fn stand(&mut self, class: &'static Class, on: Option<usize>, scale: f64) -> Option<()> {
         let (model, who) = self.make(class, on.is_none(), scale);
+        let (s, footprint) = self.find(&model, on)?;
+        let position = footprint.centre.extend(self.supports[s].height);
+        self.supports[s].taken.push(footprint);
+        self.put(&model, who, position, footprint.yaw);
+        Some(())
+    }
+
+    /// A free place for a model on a support, a given one or any, which comes with it.
+    pub(super) fn find(&mut self, model: &Model, on: Option<usize>) -> Option<(usize, Footprint)> {
         let (x, y, height) = model.extent();
         let half = DVec2::new(x, y);
         let areas: Vec<f64> = self.supports.iter().map(|s| s.place.half.x * s.place.half.y).collect();
@@ -284,10 +299,7 @@ impl<'a> Planner<'a> {
                 }
             };
             if footprint.inside(&support.place) && !support.taken.iter().any(|t| t.touches(&footprint, gap)) {
-                let position = footprint.centre.extend(support.height);
-                self.supports[s].taken.push(footprint);
-                self.put(&model, who, position, footprint.yaw);
-                return Some(());
+                return Some((s, footprint));
             }
         }
         None

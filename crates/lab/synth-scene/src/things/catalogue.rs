@@ -2,7 +2,7 @@
 
 use crate::things::class::{Class, Place};
 use crate::things::material::{ANY, BLACK, BLUE, GREEN, ORANGE, PINK, PURPLE, RED, TURQUOISE, VIVID, WHITE, YELLOW};
-use crate::things::{dishes, furniture, props, toys, walls};
+use crate::things::{dishes, furniture, props, stores, tools, toys, walls};
 
 const PALE: &[usize] = &[WHITE, TURQUOISE, YELLOW, PINK];
 const NOT_BLACK: &[usize] = &[RED, BLUE, GREEN, YELLOW, ORANGE, PURPLE, PINK, TURQUOISE, WHITE];
@@ -83,6 +83,83 @@ pub const SINK: Class = Class::new("sink", Place::Table, PALE, furniture::sink);
 /// The stove of kitchens, which stands on the counter.
 pub const STOVE: Class = Class::new("stove", Place::Table, &[BLACK, WHITE], furniture::stove);
 
+/// How a tool hangs on a pegboard.
+#[derive(Debug)]
+pub struct Hanging {
+    pub class: Class,
+    /// Whether the end of +x is above when it hangs, as it lies.
+    pub tip_up: bool,
+    /// Where the peg is, in x and y as it lies, -1 to 1 of its half extents.
+    pub peg: [f64; 2],
+}
+
+const fn hung(class: Class, tip_up: bool, peg: [f64; 2]) -> Hanging {
+    Hanging { class, tip_up, peg }
+}
+
+/// The tools of workshops that hang on a pegboard or lie on the bench.
+pub const HANGING: &[Hanging] = &[
+    hung(Class::new("screwdriver", Place::Table, VIVID, tools::screwdriver), false, [-0.94, 0.0]),
+    hung(Class::new("hammer", Place::Table, VIVID, tools::hammer), false, [-0.94, 0.0]),
+    hung(Class::new("saw", Place::Table, VIVID, tools::saw), false, [-0.80, 0.0]),
+    hung(Class::new("pliers", Place::Table, VIVID, tools::pliers), true, [0.17, 0.0]),
+    hung(Class::new("wrench", Place::Table, ANY, tools::wrench), false, [-0.87, 0.0]),
+    hung(Class::new("chisel", Place::Table, VIVID, tools::chisel), false, [-0.94, 0.0]),
+    hung(Class::new("paintbrush", Place::Table, ANY, tools::paintbrush), false, [-0.94, 0.0]),
+    hung(Class::new("file", Place::Table, VIVID, tools::file), false, [-0.94, 0.0]),
+    hung(Class::new("mallet", Place::Table, ANY, tools::mallet), false, [-0.94, 0.0]),
+    hung(Class::new("putty knife", Place::Table, VIVID, tools::putty_knife), false, [-0.94, 0.0]),
+    hung(Class::new("scissors", Place::Table, VIVID, tools::scissors), false, [-0.84, 0.5]),
+    hung(Class::new("hex key", Place::Table, ANY, tools::hex_key), false, [-0.83, 0.2]),
+    hung(Class::new("ruler", Place::Table, NOT_BLACK, tools::ruler), false, [-0.96, 0.0]),
+    hung(Class::new("clamp", Place::Table, VIVID, tools::clamp), true, [0.80, 0.34]),
+    hung(
+        Class::new("coil of cable", Place::Table, ANY, stores::coil_of_cable).of("coil of", "cable"),
+        false,
+        [-0.62, 0.0],
+    ),
+    hung(
+        Class::new("roll of tape", Place::Table, ANY, stores::roll_of_tape).of("roll of", "tape"),
+        false,
+        [-0.46, 0.0],
+    ),
+];
+/// What stands on the shelves of workshops.
+pub const STORES: &[Class] = &[
+    Class::new("screw jar", Place::Table, ANY, stores::screw_jar),
+    Class::new("manual", Place::Table, VIVID, stores::manual),
+    Class::new("tin can", Place::Table, VIVID, stores::tin_can),
+    Class::new("magazine", Place::Table, ANY, stores::magazine),
+    Class::new("paint can", Place::Table, ANY, stores::paint_can),
+    Class::new("spray can", Place::Table, ANY, stores::spray_can),
+    Class::new("screw box", Place::Table, VIVID, stores::screw_box),
+    Class::new("spool of wire", Place::Table, VIVID, stores::spool_of_wire).of("spool of", "wire"),
+    Class::new("glue bottle", Place::Table, VIVID, stores::glue_bottle),
+    Class::new("drawer box", Place::Table, VIVID, stores::drawer_box),
+    Class::new("set of screwdrivers", Place::Table, VIVID, stores::set_of_screwdrivers).of("set of", "screwdrivers"),
+    Class::new("pencil cup", Place::Table, ANY, stores::pencil_cup),
+    Class::new("stack of boxes", Place::Table, VIVID, stores::stack_of_boxes).of("stack of", "boxes"),
+    Class::new("rack of jars", Place::Table, VIVID, stores::rack_of_jars).of("rack of", "jars"),
+    Class::new("oil can", Place::Table, VIVID, stores::oil_can),
+    Class::new("jar of brushes", Place::Table, VIVID, stores::jar_of_brushes).of("jar of", "brushes"),
+    Class::new("battery", Place::Table, ANY, stores::battery),
+    Class::new("light bulb", Place::Table, &[WHITE, YELLOW, BLUE, PINK], tools::light_bulb),
+];
+/// The stores that stand side by side with their like.
+pub const IN_RUNS: [&str; 7] = ["screw jar", "manual", "tin can", "magazine", "paint can", "spray can", "screw box"];
+/// What lies on the benches of workshops besides.
+pub const BENCH: &[Class] = &[
+    Class::new("pencil", Place::Table, VIVID, tools::pencil),
+    Class::new("tape measure", Place::Table, VIVID, tools::tape_measure),
+    Class::new("utility knife", Place::Table, VIVID, tools::utility_knife),
+    Class::new("bolt", Place::Table, ANY, tools::bolt),
+    Class::new("power drill", Place::Table, VIVID, tools::power_drill),
+    Class::new("spirit level", Place::Table, VIVID, tools::spirit_level),
+    Class::new("tool box", Place::Table, VIVID, stores::tool_box),
+];
+/// The vise of workshops, fixed to the front edge of the bench.
+pub const VISE: Class = Class::new("vise", Place::Table, &[BLUE, RED, GREEN, BLACK], tools::vise);
+
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -93,7 +170,8 @@ mod tests {
 
     fn all() -> impl Iterator<Item = &'static Class> {
         let hung = ON_WALLS.iter().map(|c| &c.0).chain([&SHELF.0, &WALL_CABINET.0, &SINK, &STOVE]);
-        CLASSES.iter().chain(PROPS).chain(ALONG_WALLS).chain(hung)
+        let workshop = HANGING.iter().map(|h| &h.class).chain(STORES).chain(BENCH).chain([&VISE]);
+        CLASSES.iter().chain(PROPS).chain(ALONG_WALLS).chain(hung).chain(workshop)
     }
 
     #[test]

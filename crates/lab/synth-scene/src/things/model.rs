@@ -3,6 +3,7 @@
 use crate::things::material::Material;
 use crate::things::shape::Shape;
 use glam::{DMat3, DVec3};
+use std::f64::consts::FRAC_PI_2;
 
 #[derive(Debug, Clone)]
 pub struct Piece {
@@ -128,16 +129,64 @@ impl Model {
         }
     }
 
+    /// Moves the model so that its footprint lies around the origin.
+    pub fn centre(&mut self) {
+        let (low, high) = self.bounds();
+        self.shift(-0.5 * (low + high) * DVec3::new(1.0, 1.0, 0.0));
+    }
+
+    /// Turns what lies along x so that it hangs at y = 0 and faces -y, from z = 0 upwards: with the end of -x above, or with
+    /// that of +x. Nothing can stand on it then.
+    pub fn hang(&mut self, tip_up: bool) {
+        let half_turn = if tip_up { DMat3::from_diagonal(DVec3::new(-1.0, -1.0, 1.0)) } else { DMat3::IDENTITY };
+        self.turn_over(DMat3::from_cols(-DVec3::Z, DVec3::X, -DVec3::Y) * half_turn);
+        let (low, high) = self.bounds();
+        self.shift(-DVec3::new(0.5 * (low.x + high.x), high.y, low.z));
+    }
+
+    /// Lays what stands upright on its side at +x, around the origin.
+    pub fn lie_down(&mut self) {
+        self.turn_over(DMat3::from_rotation_y(FRAC_PI_2));
+        let (low, high) = self.bounds();
+        self.shift(-DVec3::new(0.5 * (low.x + high.x), 0.5 * (low.y + high.y), low.z));
+    }
+
+    fn turn_over(&mut self, turn: DMat3) {
+        for piece in &mut self.pieces {
+            piece.offset = turn * piece.offset;
+            piece.rotation = turn * piece.rotation;
+        }
+        self.tops.clear();
+    }
+
+    fn shift(&mut self, by: DVec3) {
+        self.pieces.iter_mut().for_each(|piece| piece.offset += by);
+        for top in &mut self.tops {
+            top.centre = [top.centre[0] + by.x, top.centre[1] + by.y];
+            top.height += by.z;
+        }
+    }
+
+    /// The lowest and the highest coordinates of a box that holds the model.
+    fn bounds(&self) -> (DVec3, DVec3) {
+        let (low, high) = (DVec3::splat(f64::INFINITY), DVec3::splat(f64::NEG_INFINITY));
+        self.corners().fold((low, high), |(low, high), c| (low.min(c), high.max(c)))
+    }
+
     /// Half extents in x and y of an upright box around the origin that holds the model, and its height.
     pub fn extent(&self) -> (f64, f64, f64) {
-        let corners = self.pieces.iter().flat_map(|piece| {
+        self.corners().fold((0.0, 0.0, 0.0), |(x, y, z), c| (c.x.abs().max(x), c.y.abs().max(y), c.z.max(z)))
+    }
+
+    /// The corners of the boxes around all pieces.
+    fn corners(&self) -> impl Iterator<Item = DVec3> {
+        self.pieces.iter().flat_map(|piece| {
             let (half, centre) = piece.shape.bounds();
             (0..8).map(move |k| {
                 let sign = DVec3::new(f64::from(k & 1), f64::from(k >> 1 & 1), f64::from(k >> 2 & 1)) * 2.0 - 1.0;
                 piece.rotation * (centre + half * sign) + piece.offset
             })
-        });
-        corners.fold((0.0, 0.0, 0.0), |(x, y, z), c| (c.x.abs().max(x), c.y.abs().max(y), c.z.max(z)))
+        })
     }
 }
 
@@ -181,6 +230,36 @@ mod tests {
         let end = piece.rotation * DVec3::new(0.0, 0.0, half) + piece.offset;
         assert!((end - DVec3::new(0.4, 0.0, 0.9)).length() < 1e-12);
         assert!((z_towards(DVec3::new(0.3, -0.2, 0.1)).determinant() - 1.0).abs() < 1e-12);
+    }
+
+    #[test]
+    fn what_hangs_has_its_back_at_the_wall_and_the_chosen_end_above() {
+        for tip_up in [false, true] {
+            let mut m = Model::default();
+            m.part("grip").block([0.2, 0.06, 0.04], 0.0, [0.3, 0.1, 0.0], Material::matt(DVec3::ONE));
+            m.part("tip").block([0.1, 0.02, 0.01], 0.0, [0.45, 0.1, 0.0], Material::matt(DVec3::ONE));
+            m.top([0.3, 0.1], [0.05, 0.02], 0.04);
+            m.centre();
+            let (x, y, _) = m.extent();
+            assert!((x - 0.15).abs() < 1e-12 && (y - 0.03).abs() < 1e-12);
+            assert!((m.tops[0].centre[0] + 0.05).abs() < 1e-12 && m.tops[0].centre[1].abs() < 1e-12);
+            m.hang(tip_up);
+            let (low, high) = m.bounds();
+            assert!((low - DVec3::new(-0.03, -0.04, 0.0)).length() < 1e-12, "{low}");
+            assert!((high - DVec3::new(0.03, 0.0, 0.3)).length() < 1e-12, "{high}");
+            assert_eq!(m.pieces[1].offset.z > m.pieces[0].offset.z, tip_up);
+            assert!((m.pieces[0].rotation.determinant() - 1.0).abs() < 1e-12 && m.tops.is_empty());
+        }
+    }
+
+    #[test]
+    fn what_lies_down_lies_on_the_ground() {
+        let mut m = Model::default();
+        m.part("book").block([0.02, 0.15, 0.20], 0.0, [0.1, 0.0, 0.0], Material::matt(DVec3::ONE));
+        m.lie_down();
+        let (low, high) = m.bounds();
+        assert!((low - DVec3::new(-0.10, -0.075, 0.0)).length() < 1e-12, "{low}");
+        assert!((high - DVec3::new(0.10, 0.075, 0.02)).length() < 1e-12, "{high}");
     }
 
     #[test]
