@@ -1,5 +1,7 @@
 //! What every system reads: the scene with its geometry, masks, their features and their footprints.
 
+#![allow(rustdoc::invalid_html_tags, reason = "help texts name files as <view>_s.npy")]
+
 use crate::cli::Peer;
 use artifacts::{
     Descriptors, Features, Footprints, Graph, Level, MaskFeatures, MaskFolder, MaskMaps, Match, Row, features_path,
