@@ -22,7 +22,7 @@ use crate::kmeans::k_means;
 use crate::product::{Grouping, Product, unit};
 use crate::world::{Inputs, World};
 use artifacts::{Features, Level, MaskMaps, Match};
-use cluster_match::{FeatureTable, Overlaps, overlaps};
+use cluster_match::{FeatureTable, Overlaps, best_masks, overlaps};
 use gs_io::{Error, Result};
 use gs_raster::{TILE, TileWeights, render_features};
 use gs_scene::Camera;
@@ -72,8 +72,8 @@ pub struct Options {
     #[arg(long, value_name = "FACTOR", default_value_t = 0.5, value_parser = stage::at_least(0.0f32))]
     position_weight: f32,
     /// Least score of a match
-    #[arg(long, value_name = "SCORE", default_value_t = 0.2, value_parser = stage::within(0.0..=1.0f64))]
-    threshold: f64,
+    #[arg(long, value_name = "SCORE", default_value_t = 0.2, value_parser = stage::within(0.0..=1.0f32))]
+    threshold: f32,
 }
 
 impl Peer for Options {
@@ -281,7 +281,7 @@ fn matched(
     labels: &[i32],
     shown: &Features,
     seen: &[Masks],
-    threshold: f64,
+    threshold: f32,
     stage: &Stage,
 ) -> Result<Vec<Match>> {
     let table = FeatureTable::new(shown, world.gaussians());
@@ -300,19 +300,12 @@ fn matched(
 
 /// The best mask of each cluster in a view, of those that are not `mixed`: IoU x (1 - L1 distance of mean features),
 /// above `threshold`; of equals the lower id.
-fn best(found: &Overlaps, view: u32, mixed: &BTreeSet<u32>, threshold: f64) -> Vec<Match> {
-    let mut best = BTreeMap::<u32, Match>::new();
-    for (&(instance, mask), &common) in found.common.iter().filter(|((_, mask), _)| !mixed.contains(mask)) {
-        let (Some(i), Some(m)) = (found.instances.get(&instance), found.masks.get(&mask)) else { continue };
-        let iou = f64::from(common) / f64::from((i.area + m.area - common).max(1));
+fn best(found: &Overlaps, view: u32, mixed: &BTreeSet<u32>, threshold: f32) -> Vec<Match> {
+    best_masks(found, view, threshold, |iou, i, (mask, m)| {
         let mean = |sum: &f64, area: u32| sum / f64::from(area.max(1));
         let apart = i.features.iter().zip(&m.features).map(|(a, b)| (mean(a, i.area) - mean(b, m.area)).abs());
-        let score = (iou * (1.0 - apart.sum::<f64>())) as f32;
-        if f64::from(score) > threshold && best.get(&instance).is_none_or(|b| score > b.score) {
-            best.insert(instance, Match { instance, view, mask, score, visible: i.visible as f32 });
-        }
-    }
-    best.into_values().collect()
+        if mixed.contains(&mask) { 0.0 } else { iou * (1.0 - apart.sum::<f64>()) }
+    })
 }
 
 #[cfg(test)]

@@ -233,12 +233,23 @@ fn cosine(a: &[f64], b: &[f64]) -> f64 {
 /// The best mask of each instance in a view: S = IoU x similarity of mean features (0 where it is negative), kept where it
 /// exceeds `threshold`; ties go to the lower mask id.
 pub fn matches(overlaps: &Overlaps, view: u32, threshold: f32) -> Vec<Match> {
+    best_masks(overlaps, view, threshold, |iou, i, (_, m)| iou * cosine(&i.features, &m.features).max(0.0))
+}
+
+/// The best mask of each instance in a view by a score of their IoU, the instance, and the mask with its id; kept where it exceeds
+/// `threshold`; ties go to the lower mask id.
+pub fn best_masks(
+    overlaps: &Overlaps,
+    view: u32,
+    threshold: f32,
+    score: impl Fn(f64, &Region, (u32, &Region)) -> f64,
+) -> Vec<Match> {
     let mut best: BTreeMap<u32, Match> = BTreeMap::new();
     for (&(instance, mask), &common) in &overlaps.common {
         let (Some(i), Some(m)) = (overlaps.instances.get(&instance), overlaps.masks.get(&mask)) else { continue };
         let union = i.area + m.area - common;
         let iou = f64::from(common) / f64::from(union.max(1));
-        let score = (iou * cosine(&i.features, &m.features).max(0.0)) as f32;
+        let score = score(iou, i, (mask, m)) as f32;
         let better = best.get(&instance).is_none_or(|b| score > b.score);
         if score > threshold && better {
             best.insert(instance, Match { instance, view, mask, score, visible: i.visible as f32 });

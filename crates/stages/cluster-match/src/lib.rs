@@ -22,6 +22,6 @@ mod run;
 mod testing;
 mod vote;
 
-pub use associate::{FeatureTable, Overlaps, Region, matches, overlaps};
+pub use associate::{FeatureTable, Overlaps, Region, best_masks, matches, overlaps};
 pub use describe::describe;
 pub use join::mask_weights;
