@@ -122,8 +122,8 @@ fn add(tasks: &mut Tasks, plan: &Plan, files: &Files, (scene, seed): (&Scene, u6
     if product == Product::Both {
         more.push(("--descriptors", &beside));
     }
-    let command = peer(files, how, &more).unwrap_or_else(|| run(Stage::Instances, how));
-    let instances = tasks.add(4, Task::new(files.instances.clone(), command, &[&base]));
+    let clustering = peer(files, how, &more).unwrap_or_else(|| run(Stage::Instances, how));
+    let instances = tasks.add(4, Task::new(files.instances.clone(), clustering, &[&base]));
     let mut scoring = files.scoring();
     match product {
         Product::Instances => {}
@@ -131,18 +131,14 @@ fn add(tasks: &mut Tasks, plan: &Plan, files: &Files, (scene, seed): (&Scene, u6
         Product::Descriptors => {
             scoring.iter_mut().filter(|w| *w == "--instances").for_each(|w| *w = "--descriptors".to_string());
         }
-        Product::Both => scoring.extend(command_of(&[("--descriptors", &beside)])),
+        Product::Both => scoring.extend(command(&[], &[("--descriptors", &beside)])),
     }
     let options = plan.options_of("scoring", &row.clustering);
     scoring.extend(words(options));
     if options.contains("--join") {
-        scoring.extend(command_of(&[("--features", &files.features)]));
+        scoring.extend(command(&[], &[("--features", &files.features)]));
     }
     tasks.add(5, Task::new(files.score.clone(), scoring, &[&instances]));
-}
-
-fn command_of(files: &[(&str, &Path)]) -> Vec<String> {
-    command(&[], files)
 }
 
 /// Where a clustering puts descriptors that it makes beside instances.
