@@ -53,6 +53,11 @@ pub trait Peer {
     /// What it reads and where it writes.
     fn inputs(&self) -> &Inputs;
 
+    /// The features of feat-train that it reads ([`World::learned`]).
+    fn features(&self) -> Option<&Path> {
+        None
+    }
+
     /// Where descriptors go that come beside instances.
     fn descriptors(&self) -> Option<&Path> {
         None
@@ -102,7 +107,7 @@ impl stage::Program for Args {
     fn run(self, stage: &Stage) -> Result<()> {
         let peer = self.system.peer();
         let mut claim = peer.inputs().claim(peer, stage)?;
-        let world = World::read(peer.inputs(), stage)?;
+        let world = World::read(peer, stage)?;
         let product = peer.make(&world, stage)?;
         world.unchanged()?;
         let parameters = serde_json::to_value(&self.system).map_err(|e| Error::new(e.to_string()))?;

@@ -20,9 +20,10 @@
 
 use crate::cli::Peer;
 use crate::product::{Grouping, Product, Table};
-use crate::world::{Inputs, World};
-use artifacts::{Features, Graph, Level, Match};
-use gs_io::{Error, Result};
+use crate::vectors::{add, group_means, most_alike, normalised, normed, smoothed};
+use crate::world::{Inputs, LearnedInputs, World};
+use artifacts::{Features, Level, Match};
+use gs_io::Result;
 use hdbscan_exact::{Options as Hdbscan, cluster};
 use rand::Rng;
 use rand_chacha::ChaCha8Rng;
@@ -45,11 +46,7 @@ const MOST_MASKS: usize = 2000;
 pub struct Options {
     #[command(flatten)]
     #[serde(flatten)]
-    inputs: Inputs,
-    /// features.safetensors of feat-train
-    #[arg(long, value_name = "FILE")]
-    #[serde(skip)]
-    features: PathBuf,
+    learned: LearnedInputs,
     /// Output file for the descriptors of Gaussians; without it there are instances alone
     #[arg(long, value_name = "FILE")]
     #[serde(skip)]
@@ -89,7 +86,11 @@ struct Objects {
 
 impl Peer for Options {
     fn inputs(&self) -> &Inputs {
-        &self.inputs
+        &self.learned.inputs
+    }
+
+    fn features(&self) -> Option<&Path> {
+        Some(&self.learned.features)
     }
 
     fn descriptors(&self) -> Option<&Path> {
@@ -97,21 +98,15 @@ impl Peer for Options {
     }
 
     fn make(&self, world: &World, stage: &Stage) -> Result<Product> {
-        let learned = world.learned(&self.features)?;
-        if learned.kept != world.footprints.kept {
-            return Err(Error::new("features of other Gaussians than the footprints")
-                .file(&self.features)
-                .field("kept")
-                .hint("run feat-train again"));
-        }
         let mut levels = world.levels.clone();
         levels.sort();
         levels.dedup();
         let mut all = Vec::new();
         for (rank, &level) in levels.iter().enumerate() {
-            let (dim, mut features) = affinity(&learned, level == Level::Small);
+            let (dim, mut features) = affinity(&world.learned, level == Level::Small);
             if self.smooth > 0 {
-                features = smooth(&features, dim, &world.graph, self.smooth as usize);
+                let (knn, k) = (&world.graph.gaussian_knn, world.graph.gaussian_k);
+                features = smoothed(&features, dim, knn, k, self.smooth as usize);
             }
             let objects = self.objects(world, stage, level, self.epsilon * (rank + 1) as f64, dim, &features)?;
             stage.info(&format!("level {level}: {} objects", objects.masks.len()));
@@ -148,7 +143,7 @@ impl Options {
             }
         })?;
         let size = self.min_cluster_size as usize;
-        if dim == 0 || masks.len() < size {
+        if masks.len() < size {
             return Ok(Objects { labels: vec![-1; world.kept()], ..Objects::default() });
         }
         // The library of the code does not count a point among its own neighbours.
@@ -156,15 +151,13 @@ impl Options {
         let of_mask = cluster(&prototypes, dim, &options).labels;
         let count = of_mask.iter().max().map_or(0, |&l| (l + 1) as usize);
         let mut own = vec![Vec::new(); count];
-        let mut centres = vec![vec![0.0f64; dim]; count];
-        for ((&row, &label), prototype) in masks.iter().zip(&of_mask).zip(prototypes.chunks_exact(dim)) {
+        for (&row, &label) in masks.iter().zip(&of_mask) {
             if let Ok(label) = usize::try_from(label) {
                 own[label].push(row);
-                centres[label].iter_mut().zip(prototype).for_each(|(c, &p)| *c += f64::from(p));
             }
         }
-        let centres: Vec<Vec<f32>> = centres.iter().map(|c| normed(c)).collect();
-        let labels = join(features, dim, &centres, self.similarity);
+        let centres = group_means(of_mask.iter().copied().zip(prototypes.chunks_exact(dim)), dim, count);
+        let labels = most_alike(features, dim, &centres, self.similarity);
         let describe = |(object, masks): (usize, &Vec<u32>)| {
             let features = masks.iter().filter_map(|&r| world.feature(&rows[r as usize]));
             let features: Vec<Vec<f32>> = features.map(|f| normed(&wide(f))).collect();
@@ -180,12 +173,6 @@ fn wide(v: &[f32]) -> Vec<f64> {
     v.iter().map(|&x| f64::from(x)).collect()
 }
 
-/// A vector at unit length; zero stays.
-fn normed(v: &[f64]) -> Vec<f32> {
-    let length = v.iter().map(|x| x * x).sum::<f64>().sqrt();
-    v.iter().map(|x| if length > 1e-12 { (x / length) as f32 } else { 0.0 }).collect()
-}
-
 fn dot(a: &[f32], b: &[f32]) -> f64 {
     a.iter().zip(b).map(|(&a, &b)| f64::from(a) * f64::from(b)).sum()
 }
@@ -193,7 +180,7 @@ fn dot(a: &[f32], b: &[f32]) -> f64 {
 /// Unit mean.
 fn mean(features: &[Vec<f32>], dim: usize) -> Vec<f32> {
     let mut sum = vec![0.0f64; dim];
-    features.iter().for_each(|f| sum.iter_mut().zip(f).for_each(|(s, &f)| *s += f64::from(f)));
+    features.iter().for_each(|f| add(&mut sum, f));
     normed(&sum)
 }
 
@@ -211,21 +198,6 @@ fn affinity(learned: &Features, parts: bool) -> (usize, Vec<f32>) {
     (dim, rows.collect())
 }
 
-/// Features averaged over each Gaussian and its nearest neighbours, `k` in all, at unit length.
-fn smooth(features: &[f32], dim: usize, graph: &Graph, k: usize) -> Vec<f32> {
-    let near = graph.gaussian_k;
-    let count = features.len() / dim.max(1);
-    let row = |i: usize| &features[i * dim..(i + 1) * dim];
-    let rows = (0..count).into_par_iter().flat_map_iter(|i| {
-        let mut sum = wide(row(i));
-        for &j in graph.gaussian_knn[i * near..(i + 1) * near].iter().take(k.saturating_sub(1)) {
-            sum.iter_mut().zip(row(j as usize)).for_each(|(s, &f)| *s += f64::from(f));
-        }
-        normed(&sum)
-    });
-    rows.collect()
-}
-
 /// Unit mean of the features over a mask's weights; none where it is zero.
 fn prototype(entries: impl Iterator<Item = (u32, f32)>, features: &[f32], dim: usize) -> Option<Vec<f32>> {
     let mut sum = vec![0.0f64; dim];
@@ -233,24 +205,7 @@ fn prototype(entries: impl Iterator<Item = (u32, f32)>, features: &[f32], dim: u
         let feature = &features[i as usize * dim..(i as usize + 1) * dim];
         sum.iter_mut().zip(feature).for_each(|(s, &f)| *s += f64::from(w) * f64::from(f));
     }
-    let prototype = normed(&sum);
-    prototype.iter().any(|&p| p != 0.0).then_some(prototype)
-}
-
-/// The object with the most similar centre for each Gaussian, from a cosine of `least`; ties go to the first, and a Gaussian
-/// without a feature joins none.
-fn join(features: &[f32], dim: usize, centres: &[Vec<f32>], least: f32) -> Vec<i32> {
-    let nearest = |feature: &[f32]| {
-        let mut best = (-1, f64::NEG_INFINITY);
-        for (o, centre) in centres.iter().enumerate() {
-            let cosine = dot(feature, centre);
-            best = if cosine > best.1 { (o as i32, cosine) } else { best };
-        }
-        let zero = feature.iter().all(|&f| f == 0.0);
-        // Cosines of -1 may come out a little lower.
-        if zero || (least > -1.0 && best.1 < f64::from(least)) { -1 } else { best.0 }
-    };
-    features.par_chunks_exact(dim).map(nearest).collect()
+    normalised(&sum)
 }
 
 /// The descriptors of an object from the unit features of its masks: centres of k-means for the number of clusters with the
@@ -439,18 +394,17 @@ mod tests {
         assert_eq!(dim, 3);
         all.iter().zip([0.6 * half, 0.8 * half, -half]).for_each(|(a, b)| assert!((a - b).abs() < 1e-6));
         // Three in a row, each with the first of its neighbours: (1, 0) + (0, 1) twice, (0, 1) alone.
-        let graph = Graph { gaussian_k: 1, gaussian_knn: vec![1, 0, 1], ..Graph::default() };
-        let smoothed = smooth(&[1.0, 0.0, 0.0, 1.0, 0.0, 1.0], 2, &graph, 2);
+        let smoothed = smoothed(&[1.0, 0.0, 0.0, 1.0, 0.0, 1.0], 2, &[1, 0, 1], 1, 2);
         smoothed.iter().zip([half, half, half, half, 0.0, 1.0]).for_each(|(a, b)| assert!((a - b).abs() < 1e-6));
     }
 
     #[test]
     fn gaussians_join_the_most_similar_object() {
-        let centres = [vec![1.0, 0.0], vec![0.0, 1.0]];
+        let centres = [1.0, 0.0, 0.0, 1.0];
         let features = [0.6, 0.8, 0.8, 0.6, 0.0, 0.0, -1.0, 0.0];
-        assert_eq!(join(&features, 2, &centres, -1.0), [1, 0, -1, 1]);
-        assert_eq!(join(&features, 2, &centres, 0.1), [1, 0, -1, -1]);
-        assert_eq!(join(&features, 2, &[], -1.0), [-1; 4]);
+        assert_eq!(most_alike(&features, 2, &centres, -1.0), [1, 0, -1, 1]);
+        assert_eq!(most_alike(&features, 2, &centres, 0.1), [1, 0, -1, -1]);
+        assert_eq!(most_alike(&features, 2, &[], -1.0), [-1; 4]);
     }
 
     #[test]

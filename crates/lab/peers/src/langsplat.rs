@@ -246,18 +246,7 @@ fn fit(
 #[cfg(test)]
 mod tests {
     use super::*;
-    use clap::Parser;
-
-    #[derive(Parser)]
-    struct Line {
-        #[command(flatten)]
-        options: Options,
-    }
-
-    fn options(more: &str) -> Options {
-        let all = format!("x --scene a --geometry b --graph c --footprints d --masks e --out f {more}");
-        Line::parse_from(all.split(' ')).options
-    }
+    use crate::testing::options;
 
     #[test]
     fn codes_render_to_what_most_pixels_say() {
@@ -271,7 +260,7 @@ mod tests {
             weight: vec![1.0, 1.0, 1.0, 1.0, 0.5],
         };
         let goal = vec![1.0, 0.0, 1.0, 0.0, 1.0, 0.0, 0.0, 1.0, 0.0, -1.0];
-        let options = options("--code 2 --iterations 2000 --batch 5");
+        let options = options::<Options>("--code 2 --iterations 2000 --batch 5");
         let (mut codes, _) = fit(std::slice::from_ref(&view), &[goal], 3, &options, &mut ChaCha8Rng::seed_from_u64(1));
         unit_rows(&mut codes, 2);
         assert!(codes[0] > 0.98 && codes[3] < -0.98, "{codes:?}");
@@ -282,7 +271,7 @@ mod tests {
     fn the_autoencoder_brings_features_back() {
         // Four directions of a space of eight, which fit on a sphere.
         let features: Vec<f32> = (0..64 * 8).map(|k| f32::from(u8::from((k / 8) % 4 == k % 8))).collect();
-        let options = options("--autoencoder-steps 300");
+        let options = options::<Options>("--autoencoder-steps 300");
         let mut rng = ChaCha8Rng::seed_from_u64(0);
         let all = Autoencoder::train(&features, 8, &options, &mut rng).unwrap();
         assert!(all.cosine(&features) > 0.95, "{}", all.cosine(&features));

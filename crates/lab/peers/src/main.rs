@@ -13,8 +13,12 @@ mod opengaussian;
 mod pairgs;
 mod product;
 mod saga;
+#[cfg(test)]
+mod testing;
 mod truth;
+mod union;
 mod uplift;
+mod vectors;
 mod world;
 
 use std::process::ExitCode;

@@ -18,7 +18,9 @@
 //! neighbours with edges up to a multiple of the usual distance, of at least 4 Gaussians.
 
 use crate::cli::Peer;
-use crate::product::{Grouping, Product, unit};
+use crate::product::{Grouping, Product};
+use crate::union::root;
+use crate::vectors::unit;
 use crate::world::{Inputs, World};
 use artifacts::{Graph, Match};
 use gs_io::Result;
@@ -395,13 +397,6 @@ fn cluster(mut nodes: Vec<Node>, masks: usize, thresholds: &[f64], consensus: f6
 
 /// The smallest member of each one's connected part.
 fn connected(n: usize, edges: impl IntoIterator<Item = (u32, u32)>) -> Vec<u32> {
-    fn root(parent: &mut [u32], mut i: u32) -> u32 {
-        while parent[i as usize] != i {
-            parent[i as usize] = parent[parent[i as usize] as usize];
-            i = parent[i as usize];
-        }
-        i
-    }
     let mut parent: Vec<u32> = (0..n as u32).collect();
     for (a, b) in edges {
         let (a, b) = (root(&mut parent, a), root(&mut parent, b));

@@ -19,11 +19,12 @@
 
 use crate::cli::Peer;
 use crate::kmeans::k_means;
-use crate::product::{Grouping, Product, unit};
-use crate::world::{Inputs, World};
+use crate::product::{Grouping, Product};
+use crate::vectors::unit;
+use crate::world::{Inputs, LearnedInputs, World};
 use artifacts::{Features, Level, MaskMaps, Match};
 use cluster_match::{FeatureTable, Overlaps, best_masks, overlaps};
-use gs_io::{Error, Result};
+use gs_io::Result;
 use gs_raster::{TILE, TileWeights, render_features};
 use gs_scene::Camera;
 use rand::SeedableRng;
@@ -31,7 +32,7 @@ use rand_chacha::ChaCha8Rng;
 use serde::Serialize;
 use stage::Stage;
 use std::collections::{BTreeMap, BTreeSet};
-use std::path::PathBuf;
+use std::path::Path;
 
 /// Rounds of k-means.
 const ROUNDS: usize = 100;
@@ -54,11 +55,7 @@ const PIXELS: usize = TILE * TILE;
 pub struct Options {
     #[command(flatten)]
     #[serde(flatten)]
-    inputs: Inputs,
-    /// features.safetensors of feat-train
-    #[arg(long, value_name = "FILE")]
-    #[serde(skip)]
-    features: PathBuf,
+    learned: LearnedInputs,
     /// Coarse clusters, by features and positions
     #[arg(long, value_name = "COUNT", default_value_t = 64, value_parser = stage::within(1..=10_000usize))]
     coarse: usize,
@@ -78,20 +75,20 @@ pub struct Options {
 
 impl Peer for Options {
     fn inputs(&self) -> &Inputs {
-        &self.inputs
+        &self.learned.inputs
+    }
+
+    fn features(&self) -> Option<&Path> {
+        Some(&self.learned.features)
     }
 
     fn make(&self, world: &World, stage: &Stage) -> Result<Product> {
-        let learned = world.learned(&self.features)?;
-        let dim = learned.dim;
-        if dim == 0 {
-            return Err(Error::new("features without numbers").file(&self.features).hint("run feat-train again"));
-        }
-        let mut features = learned.values;
+        let dim = world.learned.dim;
+        let mut features = world.learned.values.clone();
         features.chunks_exact_mut(dim).for_each(unit);
         // As they are shown: 0 to 1.
         let values = features.iter().map(|f| (f + 1.0) / 2.0).collect();
-        let shown = Features { kept: learned.kept, dim, values, ..Features::default() };
+        let shown = Features { kept: world.learned.kept.clone(), dim, values, ..Features::default() };
         let means = &world.geometry.gaussians.means;
         let places: Vec<[f32; 3]> = shown.kept.iter().map(|&i| means[i as usize]).collect();
         let mut rng = ChaCha8Rng::seed_from_u64(stage.seed());
@@ -311,14 +308,8 @@ fn best(found: &Overlaps, view: u32, mixed: &BTreeSet<u32>, threshold: f32) -> V
 #[cfg(test)]
 mod tests {
     use super::*;
-    use clap::{Args, FromArgMatches};
+    use crate::testing::options;
     use cluster_match::Region;
-
-    fn options(text: &str) -> Options {
-        let command = Options::augment_args(clap::Command::new("opengaussian"));
-        let files = "o --scene s --geometry g --graph g --footprints f --masks m --out o --features f ";
-        Options::from_arg_matches(&command.get_matches_from((files.to_string() + text).split_whitespace())).unwrap()
-    }
 
     #[test]
     fn positions_count_by_their_weight() {

@@ -19,6 +19,7 @@
 
 use crate::cli::Peer;
 use crate::product::{Grouping, Product};
+use crate::union::root;
 use crate::world::{Inputs, World};
 use gs_io::{Error, Result};
 use hdbscan_exact::{Edge, Selection, cluster_graph};
@@ -299,13 +300,6 @@ fn settle(labels: &mut [i32], pairs: &[(u32, u32)], affinities: &[f64]) {
     let mut order: Vec<usize> = (0..pairs.len()).collect();
     order.par_sort_by(|&a, &b| affinities[b].total_cmp(&affinities[a]));
     let mut above: Vec<u32> = (0..labels.len() as u32).collect();
-    let root = |above: &mut [u32], mut i: u32| {
-        while above[i as usize] != i {
-            above[i as usize] = above[above[i as usize] as usize];
-            i = above[i as usize];
-        }
-        i
-    };
     for (a, b) in order.into_iter().map(|e| pairs[e]) {
         let (a, b) = (root(&mut above, a), root(&mut above, b));
         let label = labels[a as usize].max(labels[b as usize]);
@@ -353,19 +347,7 @@ impl Peer for Options {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use clap::Parser;
-
-    #[derive(Parser)]
-    struct Command {
-        #[command(flatten)]
-        options: Options,
-    }
-
-    fn options(more: &[&str]) -> Options {
-        let files = ["scene", "geometry", "graph", "footprints", "masks", "out"].map(|f| format!("--{f}=x"));
-        let words = std::iter::once("pairgs").chain(files.iter().map(String::as_str)).chain(more.iter().copied());
-        Command::parse_from(words).options
-    }
+    use crate::testing::options;
 
     fn share(image: u32, mask: u32, weight: f32) -> Share {
         Share { image, mask, weight }
@@ -430,13 +412,13 @@ mod tests {
             pairs.push(pair);
             affinities.push(affinity);
         }
-        let (mut labels, k) = tree(13, &pairs, &affinities, &options(&["--min-size=3", "--min-points=2"]));
+        let (mut labels, k) = tree(13, &pairs, &affinities, &options("--min-size=3 --min-points=2"));
         assert_eq!(k, 3);
         assert_eq!(labels[12], -1);
         settle(&mut labels, &pairs, &affinities);
         let groups = [&labels[0..6], &labels[6..9], &labels[9..13]];
         assert!(groups.iter().all(|g| g.iter().all(|l| *l == g[0] && *l >= 0)), "{labels:?}");
-        let (_, k) = tree(13, &pairs, &affinities, &options(&["--min-size=3", "--min-points=2", "--redundant=1"]));
+        let (_, k) = tree(13, &pairs, &affinities, &options("--min-size=3 --min-points=2 --redundant=1"));
         assert_eq!(k, 4);
     }
 

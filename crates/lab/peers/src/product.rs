@@ -1,6 +1,7 @@
 //! What a system makes, and how it becomes a file.
 
 use crate::cli::Peer;
+use crate::vectors::unit;
 use crate::world::World;
 use artifacts::{Descriptors, Features, Instances, Match};
 use cluster_match::describe;
@@ -121,13 +122,5 @@ impl Grouping {
         let confidence = |k: usize| (all.support[k] as f32 + all.count[k] as f32 / most) / (views + 1.0);
         all.score = if scores.is_empty() { (0..k).map(confidence).collect() } else { scores };
         Instances { views: world.footprints.views.clone(), node: nodes, ..all }
-    }
-}
-
-/// Brings a vector to unit length; one of length zero stays.
-pub fn unit(v: &mut [f32]) {
-    let length = v.iter().map(|x| f64::from(*x).powi(2)).sum::<f64>().sqrt();
-    if length > 1e-12 {
-        v.iter_mut().for_each(|x| *x = (f64::from(*x) / length) as f32);
     }
 }

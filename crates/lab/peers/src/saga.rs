@@ -12,9 +12,10 @@
 //! cluster's descriptor is the mean of the masks that it is matched with, the one of the largest IoU in each view, above 0.2.
 
 use crate::cli::Peer;
-use crate::product::{Grouping, Product, unit};
-use crate::world::{Inputs, World};
-use gs_io::{Error, Result};
+use crate::product::{Grouping, Product};
+use crate::vectors::{group_means, most_alike, smoothed, unit};
+use crate::world::{Inputs, LearnedInputs, World};
+use gs_io::Result;
 use hdbscan_exact::{Options as Hdbscan, cluster};
 use rand::SeedableRng;
 use rand::seq::index::sample;
@@ -22,18 +23,14 @@ use rand_chacha::ChaCha8Rng;
 use rayon::prelude::*;
 use serde::Serialize;
 use stage::Stage;
-use std::path::PathBuf;
+use std::path::Path;
 
 /// Settings.
 #[derive(Debug, Clone, clap::Args, Serialize)]
 pub struct Options {
     #[command(flatten)]
     #[serde(flatten)]
-    inputs: Inputs,
-    /// features.safetensors of feat-train
-    #[arg(long, value_name = "FILE")]
-    #[serde(skip)]
-    features: PathBuf,
+    learned: LearnedInputs,
     /// Features that are averaged, those of a Gaussian and of its nearest neighbours, 1 to 16; as many as the graph has
     #[arg(long, value_name = "COUNT", default_value_t = 16, value_parser = stage::within(1..=16usize))]
     neighbours: usize,
@@ -56,16 +53,19 @@ pub struct Options {
 
 impl Peer for Options {
     fn inputs(&self) -> &Inputs {
-        &self.inputs
+        &self.learned.inputs
+    }
+
+    fn features(&self) -> Option<&Path> {
+        Some(&self.learned.features)
     }
 
     fn make(&self, world: &World, stage: &Stage) -> Result<Product> {
-        let learned = world.learned(&self.features)?;
-        if learned.dim == 0 {
-            return Err(Error::new("features without numbers").file(&self.features).hint("run feat-train again"));
-        }
+        let learned = &world.learned;
+        let mut features = learned.values.clone();
+        features.par_chunks_exact_mut(learned.dim).for_each(unit);
         let (knn, k) = (&world.graph.gaussian_knn, world.graph.gaussian_k);
-        let features = smoothed(&learned.values, learned.dim, knn, k, self.neighbours);
+        let features = smoothed(&features, learned.dim, knn, k, self.neighbours);
         let count = ((world.kept() as f64 * self.share).ceil() as usize).max(self.least).min(world.kept());
         let mut rng = ChaCha8Rng::seed_from_u64(stage.seed());
         let mut chosen = sample(&mut rng, world.kept(), count).into_vec();
@@ -75,22 +75,6 @@ impl Peer for Options {
         let matches = world.matches(&labels, self.threshold)?;
         Ok(Product::Instances(Grouping { labels, instances, matches, ..Grouping::default() }))
     }
-}
-
-/// Means of `count` unit features, each Gaussian's and its nearest neighbours', at unit length again; `knn` is `[n][k]`, nearest first.
-fn smoothed(features: &[f32], dim: usize, knn: &[u32], k: usize, count: usize) -> Vec<f32> {
-    let mut rows = features.to_vec();
-    rows.par_chunks_mut(dim.max(1)).for_each(unit);
-    let of = |i: usize| {
-        let mut sum = vec![0.0f32; dim];
-        let near = knn[i * k..i * k + k.min(count - 1)].iter().map(|&j| j as usize).filter(|&j| j != i);
-        for j in near.chain([i]) {
-            sum.iter_mut().zip(&rows[j * dim..(j + 1) * dim]).for_each(|(s, v)| *s += v);
-        }
-        unit(&mut sum);
-        sum
-    };
-    (0..rows.len() / dim.max(1)).into_par_iter().flat_map_iter(of).collect()
 }
 
 /// The cluster of every Gaussian, and their number: HDBSCAN of the `chosen`, and the cluster with the nearest centre for all;
@@ -107,43 +91,14 @@ fn clusters(features: &[f32], dim: usize, chosen: &[usize], o: &Options) -> (Vec
     };
     let found = cluster(&points, dim, &settings);
     let count = found.selected.len();
-    let mut sums = vec![0.0f64; count * dim];
-    for (&i, &label) in chosen.iter().zip(&found.labels) {
-        if let Ok(label) = usize::try_from(label) {
-            sums[label * dim..(label + 1) * dim].iter_mut().zip(row(i)).for_each(|(s, &v)| *s += f64::from(v));
-        }
-    }
-    let mut centres: Vec<f32> = sums.into_iter().map(|s| s as f32).collect();
-    centres.chunks_exact_mut(dim).for_each(unit);
-    let nearest = |p: &[f32]| {
-        let cosines = centres.chunks_exact(dim).map(|c| c.iter().zip(p).map(|(a, b)| a * b).sum::<f32>()).enumerate();
-        cosines.fold((-1, f32::MIN), |best, (l, c)| if c > best.1 { (l as i32, c) } else { best }).0
-    };
-    (features.par_chunks(dim).map(nearest).collect(), count)
+    let centres = group_means(found.labels.iter().copied().zip(chosen.iter().map(|&i| row(i))), dim, count);
+    (most_alike(features, dim, &centres, -1.0), count)
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
-    use clap::{Args, FromArgMatches};
-
-    fn options(text: &str) -> Options {
-        let command = Options::augment_args(clap::Command::new("saga"));
-        let files = "saga --scene s --geometry g --graph g --footprints f --masks m --out o --features f ";
-        Options::from_arg_matches(&command.get_matches_from((files.to_string() + text).split_whitespace())).unwrap()
-    }
-
-    #[test]
-    fn smoothing_is_the_mean_with_the_neighbours() {
-        // Along x, along y, along x; the middle one is everybody's neighbour, rows are padded with themselves.
-        let f = [2.0, 0.0, 0.0, 3.0, 4.0, 0.0];
-        let s = smoothed(&f, 2, &[1, 0, 0, 2, 1, 2], 2, 3);
-        let [a, b] = [0.5f32.sqrt(), 0.2f32.sqrt()];
-        for (found, expected) in s.iter().zip([a, a, 2.0 * b, b, a, a]) {
-            assert!((found - expected).abs() < 1e-6, "{s:?}");
-        }
-        assert_eq!(smoothed(&f, 2, &[1, 0, 0, 2, 1, 2], 2, 1), [1.0, 0.0, 0.0, 1.0, 1.0, 0.0]);
-    }
+    use crate::testing::options;
 
     #[test]
     fn those_outside_the_sample_join_the_nearest_centre() {

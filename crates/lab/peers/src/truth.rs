@@ -7,13 +7,14 @@
 //!   of these, the clustering loses.
 
 use crate::cli::Peer;
-use crate::product::{Grouping, Product, unit};
+use crate::product::{Grouping, Product};
+use crate::vectors::{group_means, most_alike, unit};
 use crate::world::{Inputs, World};
 use artifacts::{Features, Instances, TruePoints};
 use gs_io::{Error, Result};
 use serde::Serialize;
 use stage::Stage;
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
 /// Matches of less IoU show something else.
 const MATCHED: f32 = 0.2;
@@ -50,6 +51,10 @@ impl Peer for Options {
         &self.inputs
     }
 
+    fn features(&self) -> Option<&Path> {
+        self.features.as_deref().filter(|_| self.of == Truth::Clustering)
+    }
+
     fn format(&self) -> &'static str {
         if self.of == Truth::Features { Features::FORMAT } else { Instances::FORMAT }
     }
@@ -63,13 +68,11 @@ impl Peer for Options {
         let truth = eval::true_labels(&world.geometry, &points);
         let things = truth.iter().max().map_or(0, |&most| (most + 1) as usize);
         let kept: Vec<i32> = world.footprints.kept.iter().map(|&i| truth[i as usize]).collect();
-        let labels = match (self.of, &self.features) {
-            (Truth::Clustering, Some(features)) => {
-                let features = world.learned(features)?;
-                world.spread(&nearest_mean(&features.values, features.dim, &kept, things))
-            }
-            (Truth::Features, _) => return Ok(Product::Features(one_hot(&world.footprints.kept, &kept, things))),
-            _ => truth,
+        let learned = &world.learned;
+        let labels = match self.of {
+            Truth::Labels => truth,
+            Truth::Clustering => world.spread(&nearest_mean(&learned.values, learned.dim, &kept, things)),
+            Truth::Features => return Ok(Product::Features(one_hot(&world.footprints.kept, &kept, things))),
         };
         let scores = eval::true_confidence(&world.geometry, &labels, things, &points);
         let matches = world.matches(&labels, MATCHED)?;
@@ -77,30 +80,13 @@ impl Peer for Options {
     }
 }
 
-/// The thing of each Gaussian by its feature, `[n][dim]`: the one whose mean unit feature has the largest cosine with it, of equals
-/// the first; -1 without things. `truth` says whose means they are.
+/// The thing of each Gaussian by its feature, `[n][dim]`: the one whose mean unit feature it is most like. `truth` says whose means
+/// they are.
 fn nearest_mean(features: &[f32], dim: usize, truth: &[i32], things: usize) -> Vec<i32> {
     let mut rows = features.to_vec();
     rows.chunks_exact_mut(dim).for_each(unit);
-    let mut sums = vec![0.0f64; things * dim];
-    for (row, &thing) in rows.chunks_exact(dim).zip(truth) {
-        if let Ok(thing) = usize::try_from(thing) {
-            sums[thing * dim..(thing + 1) * dim].iter_mut().zip(row).for_each(|(s, &v)| *s += f64::from(v));
-        }
-    }
-    let mut means: Vec<f32> = sums.into_iter().map(|s| s as f32).collect();
-    means.chunks_exact_mut(dim).for_each(unit);
-    let nearest = |row: &[f32]| {
-        let mut best = (-1, f32::MIN);
-        for (thing, mean) in means.chunks_exact(dim).enumerate().filter(|(_, m)| m.iter().any(|&v| v != 0.0)) {
-            let cosine: f32 = row.iter().zip(mean).map(|(a, b)| a * b).sum();
-            if cosine > best.1 {
-                best = (thing as i32, cosine);
-            }
-        }
-        best.0
-    };
-    rows.chunks_exact(dim).map(nearest).collect()
+    let means = group_means(truth.iter().copied().zip(rows.chunks_exact(dim)), dim, things);
+    most_alike(&rows, dim, &means, -1.0)
 }
 
 /// A dimension for each thing; Gaussians of none have a zero.

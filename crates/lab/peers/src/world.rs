@@ -49,6 +49,18 @@ pub struct Inputs {
     pub levels: Vec<Level>,
 }
 
+/// The same, and learned features.
+#[derive(Debug, Clone, clap::Args, Serialize)]
+pub struct LearnedInputs {
+    #[command(flatten)]
+    #[serde(flatten)]
+    pub inputs: Inputs,
+    /// features.safetensors of feat-train
+    #[arg(long, value_name = "FILE")]
+    #[serde(skip)]
+    pub features: PathBuf,
+}
+
 impl Inputs {
     /// The right to write the output of a system.
     pub fn claim(&self, peer: &dyn Peer, stage: &Stage) -> Result<Claim> {
@@ -57,6 +69,7 @@ impl Inputs {
             maps.extend(artifacts::folder_files(&self.masks, suffix)?);
         }
         let outputs = stage.outputs(&self.out).reads([&self.geometry, &self.graph, &self.footprints]).reads(maps);
+        let outputs = outputs.reads(peer.features());
         let outputs = outputs.artifact(&self.out, peer.format());
         let outputs = peer.descriptors().iter().fold(outputs, |o, path| o.artifact(path, Descriptors::FORMAT));
         outputs.drop_stale().claim()
@@ -80,6 +93,8 @@ pub struct World {
     pub features: BTreeMap<u32, MaskFeatures>,
     /// Levels of the masks that are used.
     pub levels: Vec<Level>,
+    /// Features of feat-train, of 1 dimension or more for the kept Gaussians; without any where the system reads none.
+    pub learned: Features,
     /// Content hashes, by role.
     pub hashes: BTreeMap<String, String>,
     masks: MaskFolder,
@@ -91,7 +106,8 @@ impl World {
     ///
     /// # Errors
     /// When a file is damaged, was made from others, or some views have no mask features.
-    pub fn read(inputs: &Inputs, stage: &Stage) -> Result<Self> {
+    pub fn read(peer: &dyn Peer, stage: &Stage) -> Result<Self> {
+        let inputs = peer.inputs();
         let mut watched = Watched::new([&inputs.geometry, &inputs.footprints]);
         for suffix in ["_s.npy", "_f.npy"] {
             watched = watched.and(artifacts::watch_folder(&inputs.masks, suffix)?);
@@ -127,6 +143,10 @@ impl World {
                 .found(last)
                 .expected(format!("less than {}", geometry.gaussians.len())));
         }
+        let learned = match peer.features() {
+            Some(path) => learned(path, &footprints, &mut hashes)?,
+            None => Features::default(),
+        };
         let views = views_of(&dataset, &footprints, inputs)?;
         let features = features_of(&footprints, inputs)?;
         Ok(Self {
@@ -137,6 +157,7 @@ impl World {
             views,
             features,
             levels: inputs.levels.clone(),
+            learned,
             hashes,
             masks: MaskFolder::open(&inputs.masks),
             watched,
@@ -193,17 +214,6 @@ impl World {
         tile_weights(&self.geometry.gaussians, camera, &self.raster, early_stop, f)
     }
 
-    /// The features of feat-train for the kept Gaussians.
-    ///
-    /// # Errors
-    /// When they were made from another graph or other footprints.
-    pub fn learned(&self, path: &Path) -> Result<Features> {
-        let (features, file) = Features::read(path)?;
-        file.expect_input(role::GRAPH, &self.hashes[role::GRAPH])?;
-        file.expect_input(role::FOOTPRINTS, &self.hashes[role::FOOTPRINTS])?;
-        Ok(features)
-    }
-
     /// Labels of all Gaussians from those of the kept ones; -1 elsewhere.
     pub fn spread(&self, kept: &[i32]) -> Vec<i32> {
         let mut labels = vec![-1; self.gaussians()];
@@ -231,6 +241,22 @@ impl World {
         all.sort_by_key(|m| (m.instance, m.view));
         Ok(all)
     }
+}
+
+/// Learned features, which must be of the graph and the footprints in `hashes`; their own hash joins these.
+fn learned(path: &Path, footprints: &Footprints, hashes: &mut BTreeMap<String, String>) -> Result<Features> {
+    let (features, file) = Features::read(path)?;
+    file.expect_input(role::GRAPH, &hashes[role::GRAPH])?;
+    file.expect_input(role::FOOTPRINTS, &hashes[role::FOOTPRINTS])?;
+    let wrong = |what: &str, field: &str| Error::new(what).file(path).field(field).hint("run feat-train again");
+    if features.kept != footprints.kept {
+        return Err(wrong("features of other Gaussians than the footprints", "kept"));
+    }
+    if features.dim == 0 {
+        return Err(wrong("features without numbers", "features"));
+    }
+    hashes.insert(role::FEATURES.into(), file.hash().into());
+    Ok(features)
 }
 
 /// The views of the footprints, in their order.

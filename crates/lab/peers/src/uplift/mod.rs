@@ -18,7 +18,8 @@ pub use dr_splat::DrSplatOptions;
 pub use mean::MeanOptions;
 pub use vala::ValaOptions;
 
-use crate::product::{Product, Table, unit};
+use crate::product::{Product, Table};
+use crate::vectors::{normalised, unit};
 use crate::world::World;
 use artifacts::{Level, MaskMaps, Row};
 use glam::DVec3;
@@ -242,12 +243,6 @@ fn weighted_mean(features: &[(&[f32], f64)]) -> Option<Vec<f32>> {
         sum.iter_mut().zip(*feature).for_each(|(s, &f)| *s += weight * f64::from(f));
     }
     normalised(&sum)
-}
-
-/// A vector at unit length; none where it is zero.
-fn normalised(v: &[f64]) -> Option<Vec<f32>> {
-    let length = v.iter().map(|x| x * x).sum::<f64>().sqrt();
-    (length > 1e-12).then(|| v.iter().map(|x| (x / length) as f32).collect())
 }
 
 /// Whether a descriptor is one.

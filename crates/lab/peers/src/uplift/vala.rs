@@ -32,11 +32,10 @@
 //! a mean are means of cosines, but for its length. It is off by default. The query then scales relevancies to the
 //! scene's range and takes those above 0.8 of it (0.6 after a second scaling), at the level with the highest peak.
 
-use super::{
-    Centre, Finish, PIXELS, Shares, by_pixels, centres, described, give_centres, normalised, positions, slots,
-};
+use super::{Centre, Finish, PIXELS, Shares, by_pixels, centres, described, give_centres, positions, slots};
 use crate::cli::Peer;
 use crate::product::Product;
+use crate::vectors::normalised;
 use crate::world::{Inputs, World};
 use artifacts::Descriptors;
 use gs_io::Result;
