@@ -4,6 +4,7 @@ pub mod benchmark;
 pub mod label;
 pub mod language;
 pub mod masks;
+pub mod named;
 pub mod points;
 pub mod polygon;
 pub(crate) mod regions;

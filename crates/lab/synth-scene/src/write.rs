@@ -7,6 +7,7 @@ use crate::render::{self, Frame};
 use crate::scene::{Family, Scene, cameras, families};
 use crate::truth::benchmark::{FOLDERS, Layout};
 use crate::truth::language::Language;
+use crate::truth::named::{self, Named};
 use crate::truth::points::Collector;
 use crate::truth::regions::Pairs;
 use crate::truth::{label, masks, scannet, write_json};
@@ -104,7 +105,8 @@ impl<'a> Work<'a> {
     fn new(stage: &'a Stage, options: &'a Options) -> Self {
         let scene = options.scene();
         let cameras = options.cameras(&scene);
-        let language = options.speech.map(|_| Language::new(&scene, &options.layout.texts()));
+        let named: Vec<Named> = options.layout.finer(&scene).into_iter().flat_map(|(_, named)| named).collect();
+        let language = options.speech.map(|_| Language::new(&scene, &named, &options.layout.texts()));
         Self { stage, options, scene, cameras, language }
     }
 
@@ -217,13 +219,17 @@ pub fn run(stage: &Stage, out: &Path, options: &Options) -> Result<()> {
     let light = LightMap::bake(scene, options.coarseness());
     let mut points = Collector::default();
     let mut labelled = 0;
+    let labels = layout.labels(out);
+    let named = [(labels.clone(), named::things(scene))].into_iter();
+    let named: Vec<_> = named.chain(layout.finer(scene).into_iter().map(|(kind, n)| (labels.join(kind), n))).collect();
     let masks = work.write_masks(&out.join("language_features"), &out.join("truth"), |v, stem, camera| {
         let frame = render::render(scene, &light, camera);
         points.add(scene, camera, &frame);
         write_view(out, layout.images(), stem, &frame)?;
         if layout.is_labelled(v, stem, options.label_every) {
-            let path = layout.labels(out).join(format!("{stem}.json"));
-            label::write(&path, &format!("{stem}.png"), scene, &frame)?;
+            for (folder, named) in &named {
+                label::write(&folder.join(format!("{stem}.json")), &format!("{stem}.png"), scene, named, &frame)?;
+            }
             labelled += 1;
         }
         Ok(frame)

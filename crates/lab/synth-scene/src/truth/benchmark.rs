@@ -2,6 +2,7 @@
 //! ScanNet as its tools extract it, and of ScanNet as OpenGaussian converts it.
 
 use crate::scene::Scene;
+use crate::truth::named::{self, Named};
 use crate::truth::{scannet, write_json};
 use artifacts::{LERF_OVS, LerfScene, TruePoints};
 use clap::ValueEnum;
@@ -86,6 +87,15 @@ impl Layout {
         match self {
             Self::LerfOvs(s) => out.parent().unwrap_or(Path::new("")).join("label").join(s.name),
             _ => out.join("label"),
+        }
+    }
+
+    /// What of a scene has labels besides things, by the folder in that of the labels: its parts and groups. The benchmarks know things
+    /// alone.
+    pub fn finer(&self, scene: &Scene) -> Vec<(&'static str, Vec<Named>)> {
+        match self {
+            Self::Colmap => vec![("parts", named::parts(scene)), ("groups", named::groups(scene))],
+            Self::LerfOvs(_) | Self::Scan { .. } => Vec::new(),
         }
     }
 

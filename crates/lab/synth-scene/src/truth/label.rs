@@ -2,9 +2,11 @@
 
 use crate::render::Frame;
 use crate::scene::Scene;
+use crate::truth::named::Named;
 use crate::truth::{polygon, write_json};
 use gs_io::Result;
 use serde_json::json;
+use std::collections::BTreeMap;
 use std::path::Path;
 
 /// An object of which a view shows fewer pixels is not labelled in it.
@@ -12,22 +14,31 @@ const SMALLEST: usize = 40;
 /// A separate piece of an object with fewer pixels is not labelled.
 const SMALLEST_PIECE: usize = 6;
 
-/// Writes polygons around what `frame` shows of each object; background is not labelled.
-pub fn write(path: &Path, image: &str, scene: &Scene, frame: &Frame) -> Result<()> {
+/// Writes polygons around what `frame` shows of each of `named`. What consists of several things is labelled where all of them
+/// are to be seen.
+pub fn write(path: &Path, image: &str, scene: &Scene, named: &[Named], frame: &Frame) -> Result<()> {
+    let mut shown = vec![0usize; scene.parts.len()];
+    frame.part.iter().filter(|&&p| p >= 0).for_each(|&p| shown[p as usize] += 1);
     let mut objects = Vec::new();
-    for (t, thing) in scene.things.iter().enumerate().filter(|(_, t)| !t.background) {
-        let inside: Vec<bool> = frame.thing.iter().map(|&i| i == t as i32).collect();
-        if inside.iter().filter(|&&i| i).count() < SMALLEST {
+    for Named { name, id, parts } in named {
+        let mut of_thing: BTreeMap<u32, usize> = BTreeMap::new();
+        for &p in parts {
+            *of_thing.entry(scene.parts[p as usize].thing).or_default() += shown[p as usize];
+        }
+        if of_thing.values().any(|&pixels| pixels < SMALLEST) {
             continue;
         }
+        let mut own = vec![false; scene.parts.len()];
+        parts.iter().for_each(|&p| own[p as usize] = true);
+        let inside: Vec<bool> = frame.part.iter().map(|&p| p >= 0 && own[p as usize]).collect();
         for line in polygon::trace(&inside, frame.width, frame.height, SMALLEST_PIECE) {
             let range = |axis: usize| {
                 line.iter().map(|p| p[axis]).fold((i32::MAX, i32::MIN), |(low, high), v| (low.min(v), high.max(v)))
             };
             let ((x0, x1), (y0, y1)) = (range(0), range(1));
             objects.push(json!({
-                "category": thing.name,
-                "group": t,
+                "category": name,
+                "group": id,
                 "segmentation": line,
                 "bbox": [x0, y0, x1, y1],
                 "layer": objects.len() as f64 + 1.0,
@@ -46,6 +57,7 @@ pub fn write(path: &Path, image: &str, scene: &Scene, frame: &Frame) -> Result<(
 mod tests {
     use super::*;
     use crate::testing::{example, fill};
+    use crate::truth::named;
     use crate::truth::polygon::Polygon;
 
     #[test]
@@ -53,7 +65,7 @@ mod tests {
         let (scene, frame) = example();
         let dir = tempfile::tempdir().unwrap();
         let path = dir.path().join("frame_00001.json");
-        write(&path, "frame_00001.png", scene, frame).unwrap();
+        write(&path, "frame_00001.png", scene, &named::things(scene), frame).unwrap();
         let json: serde_json::Value = serde_json::from_slice(&std::fs::read(&path).unwrap()).unwrap();
         assert_eq!(json["info"]["width"], frame.width);
         let objects = json["objects"].as_array().unwrap();

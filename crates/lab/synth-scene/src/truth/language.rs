@@ -9,12 +9,13 @@
 use crate::random::normal;
 use crate::render::Frame;
 use crate::scene::Scene;
+use crate::truth::named::Named;
 use crate::truth::scannet;
 use artifacts::{Level, MaskFeatures, MaskMaps};
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
 use serde::Serialize;
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 
 /// Numbers per feature, as CLIP's ViT-B has.
 pub const DIM: usize = 512;
@@ -74,7 +75,8 @@ fn class_vector(class: &str) -> Vec<f64> {
 
 impl Language {
     /// The vectors of all things and parts of a scene, and of further texts, such as those that a benchmark asks of other scenes.
-    pub fn new(scene: &Scene, texts: &[&str]) -> Self {
+    /// `named` are parts and groups that are asked for by name; a group's vector is the mean of its things'.
+    pub fn new(scene: &Scene, named: &[Named], texts: &[&str]) -> Self {
         let mut names: BTreeMap<String, Vec<f64>> =
             NEGATIVES.into_iter().chain(scannet::names()).map(|n| (n.to_string(), word(n))).collect();
         names.extend(scene.classes().into_iter().map(|c| (c.to_string(), class_vector(c))));
@@ -91,11 +93,20 @@ impl Language {
             names.entry(text.into()).or_insert_with(|| word(text));
         }
         let thing_of: Vec<usize> = scene.parts.iter().map(|p| p.thing as usize).collect();
-        let parts = scene.parts.iter().map(|p| mix(PART, [&things[p.thing as usize], &word(p.name)])).collect();
+        let parts: Vec<Vec<f64>> =
+            scene.parts.iter().map(|p| mix(PART, [&things[p.thing as usize], &word(p.name)])).collect();
+        for Named { name, parts: own, .. } in named {
+            let of: BTreeSet<usize> = own.iter().map(|&p| thing_of[p as usize]).collect();
+            let vectors: Vec<&Vec<f64>> = match of.len() {
+                1 => own.iter().map(|&p| &parts[p as usize]).collect(),
+                _ => of.iter().map(|&t| &things[t]).collect(),
+            };
+            names.insert(name.clone(), unit((0..DIM).map(|k| vectors.iter().map(|v| v[k]).sum()).collect()));
+        }
         Self { things, parts, thing_of, names }
     }
 
-    /// Vectors by text: of every thing's name, every class, the classes of ScanNet's benchmark and LERF's negatives.
+    /// Vectors by text: of every thing's name, the parts and groups that were given, every class, the classes of ScanNet's benchmark and LERF's negatives.
     pub fn table(&self) -> BTreeMap<&str, Vec<f32>> {
         self.names.iter().map(|(n, v)| (n.as_str(), v.iter().map(|&x| x as f32).collect())).collect()
     }
@@ -184,7 +195,7 @@ mod tests {
     fn encode(maps: &MaskMaps, leaking: f64, noise: f64) -> Vec<Vec<f64>> {
         let (scene, frame) = example();
         let speech = Speech { leaking, noise };
-        let f = Language::new(scene, &[]).encode(frame, maps, &speech, &mut ChaCha8Rng::seed_from_u64(3));
+        let f = Language::new(scene, &[], &[]).encode(frame, maps, &speech, &mut ChaCha8Rng::seed_from_u64(3));
         (0..f.count).map(|i| f.row(i).unwrap().iter().map(|&x| f64::from(x)).collect()).collect()
     }
 
@@ -203,7 +214,7 @@ mod tests {
     #[test]
     fn a_whole_thing_is_its_name_and_a_part_lies_between() {
         let (scene, _) = example();
-        let language = Language::new(scene, &[]);
+        let language = Language::new(scene, &[], &[]);
         let (maps, truth) = exact();
         let features = encode(&maps, 0.0, 0.0);
         let table = language.table();

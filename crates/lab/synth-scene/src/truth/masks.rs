@@ -166,7 +166,7 @@ fn shown(scene: &Scene, visible: &[usize], level: Level, p: f64, rng: &mut ChaCh
 }
 
 /// The nearest free object on the same ground, if one is near.
-fn nearest(scene: &Scene, t: usize, taken: &[bool]) -> Option<usize> {
+pub(crate) fn nearest(scene: &Scene, t: usize, taken: &[bool]) -> Option<usize> {
     let a = &scene.things[t];
     if a.background {
         return None;
