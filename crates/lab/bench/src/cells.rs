@@ -25,7 +25,7 @@ const fn metric(name: &'static str, title: &'static str, share: bool, at: &'stat
 }
 
 /// All metrics, in the order of tables.
-pub const METRICS: [Metric; 11] = [
+pub const METRICS: [Metric; 13] = [
     metric("instance_miou", "instance mIoU", true, "/instance_miou"),
     metric("ap25", "AP25", true, "/ap25"),
     metric("ap50", "AP50", true, "/ap50"),
@@ -35,6 +35,8 @@ pub const METRICS: [Metric; 11] = [
     metric("query_miou", "query mIoU", true, "/query_miou"),
     metric("query_macc25", "query mAcc@0.25", true, "/query_macc25"),
     metric("query_miou_visible", "query mIoU, visible", true, "/query_miou_visible"),
+    metric("query_miou_parts", "of parts", true, "/parts/query_miou"),
+    metric("query_miou_groups", "of groups", true, "/groups/query_miou"),
     metric("fragmentation", "fragmentation", false, "/instances_per_thing"),
     metric("merging", "merging", false, "/things_per_instance"),
 ];

@@ -115,7 +115,7 @@ impl Edits {
     /// views with a match; the score is their best; edges of the tree name the first. *Split*: the part with most of the
     /// instance's Gaussians (ties: the first) keeps its id, with what lies in no part; the others are K, K + 1, ... in the order of
     /// the parts. They have descriptor, support, score and matches of the whole; a part without a Gaussian has none of these. The
-    /// edges of the tree name the parts. Count, centroid and boxes are measured again.
+    /// edges of the tree name the parts. Count, centroid and boxes are measured again. Either leaves no granules.
     ///
     /// # Errors
     /// When a change does not fit the instances that those before it left; it is named by its number. The instances are then
@@ -152,6 +152,9 @@ impl Edits {
             }
         }
         if !changed.is_empty() {
+            // What a person made of the instances is what texts are to find.
+            instances.granules.clear();
+            instances.granule_descriptor.clear();
             measure(instances, means, &changed);
         }
         Ok(remarks)
@@ -304,6 +307,7 @@ fn measure(instances: &mut Instances, means: &[[f32; 3]], which: &BTreeSet<u32>)
 mod tests {
     use super::*;
     use crate::instances::TreeEdge;
+    use crate::{Granule, Members};
 
     /// Instances 0 of parts 12 (Gaussians 0, 1) and 13 (2, 3, 4) with Gaussian 5 in neither, and 1 (6, 7); 8 is noise.
     fn example() -> (Instances, Vec<[f32; 3]>) {
@@ -327,6 +331,8 @@ mod tests {
             matches: vec![seen(0, 0), seen(0, 1), seen(0, 2), seen(1, 1)],
             tree: vec![edge(9, 10, 0), edge(9, 11, 1), edge(10, 12, -1), edge(10, 13, -1)],
             node: vec![12, 12, 13, 13, 13, 10, 11, 11, -1],
+            granules: vec![Granule { members: Members::Instance(1), support: 1, fit: 1.0 }],
+            granule_descriptor: vec![0.0, 1.0],
         };
         (instances, means)
     }

@@ -1,6 +1,7 @@
 //! `instances.safetensors`: the 3D instances with their descriptors, boxes and matches.
 
 use crate::checks::{below, check, check_labels, column, view_names};
+use crate::granules::{self, Granule, Members};
 use gs_io::{Artifact, ArtifactWriter, Provenance, Result};
 use serde_json::json;
 use std::collections::{BTreeMap, BTreeSet};
@@ -79,6 +80,10 @@ pub struct Instances {
     pub tree: Vec<TreeEdge>,
     /// The smallest cluster of the tree that holds each Gaussian, -1 for one that is in none; N.
     pub node: Vec<i32>,
+    /// What texts may ask for: parts, things and groups, those that many masks show well first; Q.
+    pub granules: Vec<Granule>,
+    /// Their language descriptors, of unit length or zero; `[Q][dim]`.
+    pub granule_descriptor: Vec<f32>,
 }
 
 /// The place of an instance in the tree of clusters.
@@ -191,7 +196,17 @@ impl Instances {
         let center = column(&self.oriented, |b| b.center);
         let axes = column(&self.oriented, |b| b.axes);
         let half = column(&self.oriented, |b| b.half_size);
+        let (granules, q) = (&self.granules, self.granules.len());
+        let members = |g: &Granule| match g.members {
+            Members::Instance(k) => (k as i32, 0),
+            Members::Cluster(c) => (-1, c),
+        };
         ArtifactWriter::new(provenance)
+            .tensor("granule_instance", &[q], &column(granules, |g| members(g).0))
+            .tensor("granule_cluster", &[q], &column(granules, |g| members(g).1))
+            .tensor("granule_support", &[q], &column(granules, |g| g.support))
+            .tensor("granule_fit", &[q], &column(granules, |g| g.fit))
+            .tensor("granule_descriptor", &[q, self.dim], &self.granule_descriptor)
             .tensor("obb_center", &[k, 3], center.as_flattened())
             .tensor("obb_axes", &[k, 3, 3], axes.as_flattened().as_flattened())
             .tensor("obb_half_size", &[k, 3], half.as_flattened())
@@ -233,6 +248,8 @@ impl Instances {
         let label = a.tensor::<i32>("label", &[None])?.to_vec();
         check_labels(&a, "label", &label, k)?;
         let (center, half) = (triples("obb_center")?, triples("obb_half_size")?);
+        let tree = read_tree(&a, k)?;
+        let granules = granules::read(&a, k, &tree)?;
         let axes = a.tensor::<f32>("obb_axes", &[Some(k), Some(3), Some(3)])?.as_chunks::<3>().0.as_chunks::<3>().0;
         let instances = Self {
             oriented: (0..k).map(|i| OrientedBox { center: center[i], axes: axes[i], half_size: half[i] }).collect(),
@@ -247,8 +264,13 @@ impl Instances {
             bbox_max: triples("bbox_max")?,
             count,
             matches: read_matches(&a, k, views.len())?,
-            tree: read_tree(&a, k)?,
+            tree,
             views,
+            granule_descriptor: match granules.is_empty() {
+                true => Vec::new(),
+                false => a.tensor("granule_descriptor", &[Some(granules.len()), Some(dim)])?.to_vec(),
+            },
+            granules,
         };
         Ok((instances, a))
     }
@@ -305,6 +327,11 @@ mod tests {
                 matches: vec![Match { instance: 0, view: 0, mask: 7, score: 0.5, visible: 12.5 }],
                 tree: vec![TreeEdge { parent: 4, child: 5, lambda: 2.0, size: 2, instance: 1 }],
                 node: vec![4, -1, 5, 5],
+                granules: vec![
+                    Granule { members: Members::Instance(1), support: 2, fit: 0.75 },
+                    Granule { members: Members::Cluster(5), support: 3, fit: 1.0 },
+                ],
+                granule_descriptor: vec![0.5; 2 * dim],
             };
             i.write(&p, Provenance::default()).unwrap();
             assert_eq!(Instances::read(&p).unwrap().0, i);

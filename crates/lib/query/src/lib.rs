@@ -1,13 +1,15 @@
 //! What answers a question about one set of instances: the instances with their Gaussians (`scene`), features of texts
-//! (`text`), the ranking by them (`ranking`), Gaussians with descriptors of their own (`gaussians`), which Gaussian is nearest to a point (`nearest`) and which a pixel shows.
+//! (`text`), the ranking by them (`ranking`), the part, thing or group that is meant (`granules`), Gaussians with descriptors of their own (`gaussians`), which Gaussian is nearest to a point (`nearest`) and which a pixel shows.
 
 mod gaussians;
+mod granules;
 mod nearest;
 mod ranking;
 mod scene;
 mod text;
 
 pub use gaussians::{Chosen, DescribedGaussians, Share};
+pub use granules::{Granules, Kind, Meant};
 pub use gs_raster::pixel_weights;
 pub use nearest::{nearest, nearest_of};
 pub use ranking::{Index, Join, Ranked, Selection};

@@ -34,16 +34,21 @@ pub fn describe(
     }
     for (k, own) in of_instance.iter().enumerate() {
         out.support[k] = own.len() as u32;
-        let rows = own.iter().filter_map(|m| unit(features.get(&m.view)?.row(m.mask as usize)?));
-        let mut sum = vec![0.0f64; dim];
-        rows.for_each(|row| sum.iter_mut().zip(row).for_each(|(s, v)| *s += f64::from(v)));
-        let sum: Vec<f32> = sum.into_iter().map(|v| v as f32).collect();
-        if let Some(d) = unit(&sum) {
-            out.descriptor[k * dim..(k + 1) * dim].copy_from_slice(&d);
-        }
+        let rows = own.iter().filter_map(|m| Some((1.0, features.get(&m.view)?.row(m.mask as usize)?)));
+        out.descriptor[k * dim..(k + 1) * dim].copy_from_slice(&mean_of_units(rows, dim));
     }
     matches.sort_by_key(|m| (m.instance, m.view));
     Instances { label: labels, matches, ..out }
+}
+
+/// The weighted mean of the rows, each at unit length, at unit length; zero where there is none.
+pub(crate) fn mean_of_units<'a>(rows: impl Iterator<Item = (f64, &'a [f32])>, dim: usize) -> Vec<f32> {
+    let mut sum = vec![0.0f64; dim];
+    for (weight, row) in rows.filter_map(|(weight, row)| Some((weight, unit(row)?))) {
+        sum.iter_mut().zip(row).for_each(|(s, v)| *s += weight * f64::from(v));
+    }
+    let sum: Vec<f32> = sum.into_iter().map(|v| v as f32).collect();
+    unit(&sum).unwrap_or(sum)
 }
 
 fn unit(row: &[f32]) -> Option<Vec<f32>> {

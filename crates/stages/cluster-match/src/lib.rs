@@ -9,6 +9,7 @@
 mod assignment;
 mod associate;
 mod describe;
+mod granules;
 mod group;
 mod health;
 mod inputs;

@@ -105,6 +105,16 @@ pub(crate) struct Settings {
     #[arg(long, default_value_t = 0.2, value_name = "SCORE", value_parser = stage::within(0.0..=1.0),
         help_heading = "Matching")]
     pub threshold: f64,
+    /// Look for parts, things and groups that texts may ask for, which masks of this many views show; 0 looks for none; for free
+    /// points the default is 0
+    #[arg(
+        long,
+        value_name = "VIEWS",
+        default_value = "2",
+        default_value_if("cluster", "free", "0"),
+        help_heading = "Matching"
+    )]
+    pub granules: usize,
 }
 
 /// Largest count that an option takes: as many as there can be Gaussians.

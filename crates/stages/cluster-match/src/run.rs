@@ -2,7 +2,8 @@
 
 use crate::assignment::Assignment;
 use crate::associate::{FeatureTable, matches, overlaps};
-use crate::describe::describe;
+use crate::describe::{describe, mean_of_units};
+use crate::granules::{self, Candidates, Shown};
 use crate::group::group;
 use crate::inputs::{Inputs, mask_features};
 use crate::join::mask_weights;
@@ -78,8 +79,25 @@ impl Program for Args {
         let (means, footprints) = (&inputs.geometry.gaussians.means, &inputs.footprints);
         let labels: Vec<i32> = inputs.graph.kept.iter().map(|&i| found.labels[i as usize]).collect();
         let weights = mask_weights(&labels, footprints, &settings.levels)?;
+        let granules = if settings.granules > 0 {
+            let nodes: Vec<i32> = inputs.graph.kept.iter().map(|&i| found.nodes[i as usize]).collect();
+            let parents = found.tree.iter().map(|e| (e.child, e.parent)).collect();
+            let candidates = Candidates::new(&labels, found.instances, &nodes, &parents);
+            granules::find(&candidates, &labels, &nodes, footprints, settings.granules)?
+        } else {
+            Vec::new()
+        };
         let described = describe(means, found.labels, found.instances, matches, &features);
         let mut instances = Instances { views, tree: found.tree, node: found.nodes, ..described };
+        for (granule, shown) in granules {
+            // A mask that fits twice as well counts four times.
+            let feature = |s: &Shown| {
+                let mask = footprints.rows[s.row as usize];
+                Some((s.fit * s.fit, features.get(&mask.view)?.row(mask.mask as usize)?))
+            };
+            instances.granule_descriptor.extend(mean_of_units(shown.iter().filter_map(feature), instances.dim));
+            instances.granules.push(granule);
+        }
         instances.score = confidence(&instances, footprints, &weights);
         let health = health::measure(&instances, footprints, &weights);
         watched.check()?;

@@ -57,7 +57,15 @@ fn main() {
     let index = Index::new(&instances);
     let load = started.elapsed().as_secs_f64();
     let selection = Selection::new(None, None, 1);
-    let mut asker = Asker { index, source: None, templates: Vec::new(), negatives: Vec::new(), selection, join: None };
+    let mut asker = Asker {
+        index,
+        source: None,
+        templates: Vec::new(),
+        negatives: Vec::new(),
+        selection,
+        join: None,
+        granules: None,
+    };
     let ask = |asker: &Asker<'_>| times(&texts, |text| assert!(!asker.answer(text).gaussians.is_empty()));
     let best = ask(&asker);
     asker.selection = Selection::new(Some(10), None, 1);

@@ -1,6 +1,7 @@
 //! The options of every command: defaults, ranges and help. The record of a run has them all as `parameters`.
 
 use crate::silhouette::{Rendering, Silhouette};
+use clap::builder::{PossibleValuesParser, TypedValueParser};
 use gs_io::{Error, Result};
 use gs_scene::dataset::Resolution;
 use query::{Share, TextOptions};
@@ -100,12 +101,20 @@ pub struct Views {
 #[derive(Debug, Clone, Copy, PartialEq, Eq, clap::ValueEnum, Serialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Granularity {
-    /// The instances as they were selected by the clustering
+    /// The part, the thing or the group of things that fits best; with --top-k, --threshold or --join instances
+    Any,
+    /// The best instance
     Instance,
     /// What the best instance is a part of: its parent in the tree, with its siblings
     Parent,
     /// The parts of the best instance, each an answer of its own beside it
     Parts,
+}
+
+/// The granularities that can be scored: one answer to each text.
+fn of_scores() -> impl TypedValueParser<Value = Granularity> {
+    let instance = |name: String| if name == "instance" { Granularity::Instance } else { Granularity::Any };
+    PossibleValuesParser::new(["any", "instance"]).map(instance)
 }
 
 /// `eval query`.
@@ -133,8 +142,8 @@ pub struct QueryOptions {
     /// What is at this point of the world? May be given several times
     #[arg(long, value_name = "X,Y,Z", allow_hyphen_values = true)]
     pub point: Vec<String>,
-    /// Answer texts and pictures with the instance found, what it is a part of, or its parts
-    #[arg(long, value_enum, default_value = "instance")]
+    /// What answers a text or a picture
+    #[arg(long, value_enum, default_value = "any")]
     pub granularity: Granularity,
     /// Divide all Gaussians among the texts: labels.npy and segmentation.ply
     #[arg(long)]
@@ -187,6 +196,9 @@ pub struct ScoreOptions {
     #[command(flatten)]
     #[serde(flatten)]
     pub choice: Choice,
+    /// What answers a text
+    #[arg(long, value_enum, default_value = "any", value_parser = of_scores())]
+    pub granularity: Granularity,
     #[command(flatten)]
     #[serde(flatten)]
     pub labels: Labels,
@@ -268,6 +280,9 @@ pub struct LerfOptions {
     #[command(flatten)]
     #[serde(flatten)]
     pub choice: Choice,
+    /// What answers a text by the rule top1
+    #[arg(long, value_enum, default_value = "any", value_parser = of_scores())]
+    pub granularity: Granularity,
     #[command(flatten)]
     #[serde(flatten)]
     pub labels: Labels,

@@ -38,7 +38,7 @@ pub(crate) fn run(o: &QueryOptions, parameters: Value, stage: &Stage, json_lines
     for view in &o.views.views {
         find_view(&dataset, view)?;
     }
-    let asker = Asker::new(&scene, source, &o.choice, o.texts.min_support)?;
+    let asker = Asker::new(&scene, source, &o.choice, o.texts.min_support, o.granularity)?;
     if scene.all_noise() {
         stage.warn("all Gaussians are noise: every query selects nothing");
     }

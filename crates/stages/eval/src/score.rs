@@ -10,13 +10,14 @@ mod polygon;
 mod scores;
 mod truth;
 
+use self::scores::FinerScore;
 pub use self::scores::{QueryScore, Scores, ThingScore};
 pub use self::truth::{true_confidence, true_labels};
 
 use self::labels::FrameLabels;
 use crate::memory::{self, SMALLER, Sizes};
 use crate::options::{Rule, ScoreOptions};
-use crate::protocols::pairs::{Figures, object_figures};
+use crate::protocols::pairs::{Figures, Pair, object_figures};
 use crate::protocols::predict::{self, Answers};
 use crate::query::ask::{Answered, Asker};
 use crate::scene::load;
@@ -68,6 +69,12 @@ pub(crate) fn run(o: &ScoreOptions, parameters: Value, stage: &Stage) -> Result<
             scores.skipped.push("query scores: neither --clip nor --text-features was given".into());
         } else {
             score_queries(o, &found, &dataset, &frames, &mut scores, stage)?;
+            for (kind, figures) in [("parts", &mut scores.parts), ("groups", &mut scores.groups)] {
+                let folder = labels.join(kind);
+                if folder.is_dir() {
+                    *figures = score_finer(o, &found, &dataset, &labels::read_folder(&folder)?, stage)?;
+                }
+            }
         }
     } else {
         let place = dataset.root.join("label");
@@ -140,7 +147,7 @@ impl Found {
         }
         let scene = self.instances.as_ref().expect("instances or descriptors were given");
         let source = TextSource::open_for(&scene.artifact, self.dim(), &o.texts)?;
-        predict::ask(&Asker::new(scene, Some(source), &o.choice, o.texts.min_support)?, texts)
+        predict::ask(&Asker::new(scene, Some(source), &o.choice, o.texts.min_support, o.granularity)?, texts)
     }
 }
 
@@ -164,6 +171,28 @@ fn score_labels(
     Ok(())
 }
 
+/// The IoU of every labelled category of every frame, by the rule that was asked for and where only what is visible counts.
+struct Asked {
+    answers: Answers,
+    rendering: Rendering,
+    pairs: Vec<Pair>,
+    visible: Vec<Pair>,
+}
+
+/// Scores names of parts or of groups of things as [`score_queries`] scores those of things; none where none is labelled.
+fn score_finer(
+    o: &ScoreOptions,
+    found: &Found,
+    dataset: &Dataset,
+    frames: &[FrameLabels],
+    stage: &Stage,
+) -> Result<Option<FinerScore>> {
+    let Some(Asked { pairs, visible, .. }) = ask(o, found, dataset, frames, stage)? else { return Ok(None) };
+    let Figures { miou, macc25, pairs, .. } = Figures::of_pairs(&pairs);
+    let query_miou_visible = Figures::of_pairs(&visible).miou;
+    Ok(Some(FinerScore { query_miou: miou, query_macc25: macc25, query_miou_visible, query_pairs: pairs }))
+}
+
 /// Scores text queries against the labels, by the protocol of [`crate::protocols::pairs`] with every category of the labels
 /// asked for.
 fn score_queries(
@@ -174,10 +203,36 @@ fn score_queries(
     scores: &mut Scores,
     stage: &Stage,
 ) -> Result<()> {
-    let texts: BTreeSet<&String> = frames.iter().flat_map(|f| f.categories.keys()).collect();
-    if texts.is_empty() {
+    let Some(Asked { answers, rendering, pairs, visible }) = ask(o, found, dataset, frames, stage)? else {
         scores.skipped.push("query scores: the labels hold no labelled object".into());
         return Ok(());
+    };
+    let figures = Figures::of_pairs(&pairs);
+    (scores.query_miou, scores.query_pairs) = (Some(figures.miou), figures.pairs);
+    (scores.query_macc25, scores.query_macc50) = (Some(figures.macc25), Some(figures.macc50));
+    scores.query_miou_visible = Some(Figures::of_pairs(&visible).miou);
+    scores.silhouette = Some((rendering.silhouette, rendering.threshold));
+    let query = |(text, figures): (String, Figures)| {
+        let (selected, score) = predict::chosen(&answers, &text);
+        let mine = pairs.iter().filter(|p| p.category == text);
+        let frames = mine.map(|p| (p.frame.clone(), p.iou)).collect();
+        QueryScore { text, iou: figures.miou, selected, score, frames }
+    };
+    scores.queries = object_figures(&pairs).into_iter().map(query).collect();
+    Ok(())
+}
+
+/// Asks every category of the labels and compares the answers; none where nothing is labelled.
+fn ask(
+    o: &ScoreOptions,
+    found: &Found,
+    dataset: &Dataset,
+    frames: &[FrameLabels],
+    stage: &Stage,
+) -> Result<Option<Asked>> {
+    let texts: BTreeSet<&String> = frames.iter().flat_map(|f| f.categories.keys()).collect();
+    if texts.is_empty() {
+        return Ok(None);
     }
     let answers = found.answers(o, &texts.into_iter().cloned().collect::<Vec<_>>())?;
     for (text, answer) in &answers {
@@ -201,17 +256,5 @@ fn score_queries(
             all.extend(predict::pairs(frame, &predictions));
         }
     }
-    let figures = Figures::of_pairs(&pairs);
-    (scores.query_miou, scores.query_pairs) = (Some(figures.miou), figures.pairs);
-    (scores.query_macc25, scores.query_macc50) = (Some(figures.macc25), Some(figures.macc50));
-    scores.query_miou_visible = Some(Figures::of_pairs(&visible).miou);
-    scores.silhouette = Some((rendering.silhouette, rendering.threshold));
-    let query = |(text, figures): (String, Figures)| {
-        let (selected, score) = predict::chosen(&answers, &text);
-        let mine = pairs.iter().filter(|p| p.category == text);
-        let frames = mine.map(|p| (p.frame.clone(), p.iou)).collect();
-        QueryScore { text, iou: figures.miou, selected, score, frames }
-    };
-    scores.queries = object_figures(&pairs).into_iter().map(query).collect();
-    Ok(())
+    Ok(Some(Asked { answers, rendering, pairs, visible }))
 }

@@ -159,7 +159,8 @@ fn ask(
         let (choice, support) = choice(o, rule);
         // The rule of OpenGaussian has no negatives, so it needs no more features of texts.
         let negatives = if rule == Rule::Top1 { source.take() } else { None };
-        let mut of = predict::answers(&Asker::new(&scene, negatives, &choice, support)?, &texts, &encoded);
+        let mut of =
+            predict::answers(&Asker::new(&scene, negatives, &choice, support, o.granularity)?, &texts, &encoded);
         for category in categories.iter().filter(|c| !texts.contains(c)) {
             let why = "the category is not in the benchmark's table of queries";
             of.insert((*category).clone(), Err(why.into()));

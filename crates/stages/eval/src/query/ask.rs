@@ -1,9 +1,9 @@
 //! Asking instances for what a feature means: the parts of a query that stay loaded between queries.
 
-use crate::options::Choice;
+use crate::options::{Choice, Granularity};
 use artifacts::role;
 use gs_io::Result;
-use query::{Index, Join, LabelledScene, Ranked, Selection, TextSource, read_features};
+use query::{Granules, Index, Join, Kind, LabelledScene, Ranked, Selection, TextSource, read_features};
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
 
@@ -21,6 +21,8 @@ pub struct Asker<'a> {
     pub selection: Selection,
     /// Whether look-alikes of the best are selected with it.
     pub join: Option<Join>,
+    /// Parts, things and groups, where these answer instead of instances.
+    pub granules: Option<Granules<'a>>,
 }
 
 /// The answer to one feature.
@@ -32,8 +34,23 @@ pub struct Answered {
     pub selected: Vec<u32>,
     /// Score of the first selected.
     pub score: Option<f32>,
-    /// Their Gaussians, ascending.
+    /// What was found, where it is no instance but a part, a thing or a group.
+    pub granule: Option<Found>,
+    /// The selected Gaussians, ascending.
     pub gaussians: Vec<u32>,
+}
+
+/// The part, thing or group that answers a query.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+pub struct Found {
+    /// Its index.
+    pub index: u32,
+    /// What it is.
+    pub kind: Kind,
+    /// Views in which a mask shows it.
+    pub support: u32,
+    /// Mean IoU with the best mask of each view, 0 to 1.
+    pub fit: f32,
 }
 
 /// A place that was asked about.
@@ -66,7 +83,10 @@ pub struct QueryResult {
     pub kind: String,
     /// Where, for a pixel or a point.
     pub place: Option<Place>,
-    /// Selected instances, best first.
+    /// What was found, where parts, things and groups answered.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub granule: Option<Found>,
+    /// Selected instances, best first; of a part the instance that it is a part of.
     pub selected: Vec<u32>,
     /// Score of the best selected instance: cosine, relevancy, or share of a pixel.
     pub score: Option<f32>,
@@ -113,11 +133,11 @@ pub struct Asked {
 impl Asked {
     /// What was asked for with its answer, of which there is no file yet.
     pub fn new(text: String, kind: &str, place: Option<Place>, answer: Answered) -> Self {
-        let Answered { ranking, selected, score, gaussians } = answer;
+        let Answered { ranking, selected, score, granule, gaussians } = answer;
         let ranking = ranking.into_iter().take(KEPT_RANKS).map(|ranked| Entry { ranked, name: None }).collect();
         let (kind, count) = (kind.into(), gaussians.len());
-        let result =
-            QueryResult { text, kind, place, selected, score, gaussians: count, ply: None, ranking, views: Vec::new() };
+        let (ply, views) = (None, Vec::new());
+        let result = QueryResult { text, kind, place, granule, selected, score, gaussians: count, ply, ranking, views };
         Self { result, gaussians }
     }
 
@@ -134,6 +154,7 @@ impl<'a> Asker<'a> {
         source: Option<TextSource>,
         choice: &Choice,
         min_support: Option<u32>,
+        granularity: Granularity,
     ) -> Result<Self> {
         let join = match (&choice.features, choice.join) {
             (Some(path), Some(distance)) => {
@@ -143,7 +164,9 @@ impl<'a> Asker<'a> {
             _ => None,
         };
         let negatives = source.as_ref().map_or(Ok(Vec::new()), |s| s.known(&[], &choice.negatives, "--negatives"))?;
+        let one = choice.top_k.is_none() && choice.threshold.is_none() && join.is_none();
         Ok(Self {
+            granules: (one && granularity == Granularity::Any).then(|| Granules::new(&scene.instances)),
             index: Index::new(&scene.instances),
             source,
             templates: choice.template.clone(),
@@ -156,12 +179,19 @@ impl<'a> Asker<'a> {
     /// Answers one feature of the descriptors' dimension.
     pub fn answer(&self, feature: &[f32]) -> Answered {
         let ranking = self.index.rank(feature, &self.negatives);
+        let (granules, least) = (self.granules.as_ref(), self.selection.min_support);
+        if let Some(meant) = granules.and_then(|g| g.meant(feature, &self.negatives, least)) {
+            let artifacts::Granule { support, fit, .. } = self.index.instances.granules[meant.granule as usize];
+            let granule = Some(Found { index: meant.granule, kind: meant.kind, support, fit });
+            let (selected, gaussians) = (meant.instances, meant.gaussians);
+            return Answered { ranking, selected, score: Some(meant.score), granule, gaussians };
+        }
         let mut selected = self.selection.choose(&ranking);
         if let Some(join) = &self.join {
             selected = join.extend(&ranking, self.selection.min_support, &selected);
         }
         let score = ranking.iter().find(|r| selected.first() == Some(&r.instance)).map(|r| r.score);
         let gaussians = self.index.members(&selected);
-        Answered { ranking, selected, score, gaussians }
+        Answered { ranking, selected, score, granule: None, gaussians }
     }
 }

@@ -8,7 +8,9 @@ use artifacts::Instances;
 /// The answer at a granularity: one, or with parts one for the instance and one for each part. Where the
 /// tree has nothing coarser or finer, the answer stays as it is and `say` gets the reason.
 pub fn apply(granularity: Granularity, instances: &Instances, asked: Asked, say: &dyn Fn(&str)) -> Vec<Asked> {
-    let Some(&best) = asked.result.selected.first().filter(|_| granularity != Granularity::Instance) else {
+    let Some(&best) =
+        asked.result.selected.first().filter(|_| [Granularity::Parent, Granularity::Parts].contains(&granularity))
+    else {
         return vec![asked];
     };
     let family = instances.family(best as usize).unwrap_or_default();
@@ -32,7 +34,8 @@ pub fn apply(granularity: Granularity, instances: &Instances, asked: Asked, say:
     let count = family.parts.len();
     let part = |(at, &cluster): (usize, &u32)| {
         let gaussians = instances.gaussians_of_cluster(cluster);
-        let answer = Answered { ranking: Vec::new(), selected: vec![best], score: asked.result.score, gaussians };
+        let (selected, score) = (vec![best], asked.result.score);
+        let answer = Answered { selected, score, gaussians, ..Answered::default() };
         Asked::new(format!("{name}, part {} of {count}", at + 1), "part", None, answer)
     };
     let mut parts: Vec<Asked> = family.parts.iter().enumerate().map(part).collect();

@@ -1,13 +1,13 @@
 //! The answers as files: PLYs, masks, overlays, `query.json`; and as text.
 
-use super::ask::{Asked, Asker, QueryResult, QueryView};
+use super::ask::{Asked, Asker, Found, QueryResult, QueryView};
 use super::segment::Segmentation;
 use crate::options::QueryOptions;
 use crate::scene::{find_view, numbered, view_name, views_to_show};
 use crate::silhouette::Silhouette;
 use gs_io::{Result, write_bytes, write_json};
 use gs_scene::dataset::{Dataset, View};
-use query::{LabelledScene, TextSource};
+use query::{Kind, LabelledScene, TextSource};
 use report::picture::{Picture, mask_png};
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeSet;
@@ -136,6 +136,14 @@ pub fn table(results: &QueryResults) -> String {
 pub fn answer_table(q: &QueryResult) -> String {
     let mut s = String::new();
     let _ = writeln!(s, "{:?} ({} Gaussians selected)", q.text, q.gaussians);
+    if let Some(Found { kind, support, fit, .. }) = q.granule {
+        let what = match kind {
+            Kind::Part => "a part of an instance",
+            Kind::Thing => "a thing",
+            Kind::Group => "a group of instances",
+        };
+        let _ = writeln!(s, "  {what}: masks of {support} views show it, mean IoU {fit:.2}");
+    }
     if let Some(place) = &q.place {
         if let Some([x, y, z]) = place.position {
             let _ = writeln!(s, "  at {x:.4} {y:.4} {z:.4}");

@@ -53,6 +53,12 @@ pub struct Scores {
     pub query_pairs: usize,
     /// Each query with its mean IoU.
     pub queries: Vec<QueryScore>,
+    /// Queries for parts of things ("handle of the red mug"), where the scene has labels of them.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub parts: Option<FinerScore>,
+    /// Queries for groups of things ("red mug and blue bowl"), likewise.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub groups: Option<FinerScore>,
     /// How selections became masks, `selected` or `visible`, and above which value.
     pub silhouette: Option<(Silhouette, f32)>,
     /// What was left out, and why.
@@ -89,6 +95,19 @@ pub struct ThingScore {
     pub instance: Option<i32>,
     /// Instances that hold at least a tenth of it.
     pub fragments: usize,
+}
+
+/// How queries of one kind were answered, over all (frame, category) pairs.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct FinerScore {
+    /// Mean IoU.
+    pub query_miou: f64,
+    /// Fraction with IoU above 0.25.
+    pub query_macc25: f64,
+    /// Mean IoU when only what the view shows of the selection counts.
+    pub query_miou_visible: f64,
+    /// Number of pairs.
+    pub query_pairs: usize,
 }
 
 /// How one query was answered.
@@ -137,6 +156,8 @@ impl Scores {
         line("  visible only", number(self.query_miou_visible));
         line("query_macc25", number(self.query_macc25));
         line("query_macc50", number(self.query_macc50));
+        line("parts", number(self.parts.as_ref().map(|p| p.query_miou)));
+        line("groups", number(self.groups.as_ref().map(|g| g.query_miou)));
         line("queries", self.query_miou.map(|_| format!("{} in {} pairs", self.queries.len(), self.query_pairs)));
         for reason in &self.skipped {
             s += &format!("skipped          {reason}\n");

@@ -1,0 +1,157 @@
+//! Which part, thing or group a feature means.
+
+use crate::ranking::{Question, norm};
+use artifacts::{Granule, Instances, Members};
+use serde::{Deserialize, Serialize};
+
+/// How much it counts that the masks show a granule as one, beside how well it suits the feature: the best score of all is one unit
+/// above the mean of all. 0.3 to 0.7 give the same on synthetic scenes within a point (docs/results/peers.md).
+const FIT: f64 = 0.6;
+/// A granule is a part of an instance when at least this share of it lies in the instance, of which it is at most [`PART`].
+const INSIDE: f64 = 0.8;
+/// See [`INSIDE`].
+const PART: f64 = 0.6;
+
+/// Granules laid out for many queries.
+pub struct Granules<'a> {
+    instances: &'a Instances,
+    lengths: Vec<f64>,
+}
+
+/// What a granule is beside the instances.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Kind {
+    /// A part of an instance.
+    Part,
+    /// An instance, more or less.
+    Thing,
+    /// Several instances, or pieces of several.
+    Group,
+}
+
+/// The granule that answers a query.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Meant {
+    /// Its index.
+    pub granule: u32,
+    /// What it is.
+    pub kind: Kind,
+    /// Its score with the feature: cosine or relevancy, as of instances.
+    pub score: f32,
+    /// The instances of which at least half is in it, those with most Gaussians in it first; of a part the instance that holds most of it.
+    pub instances: Vec<u32>,
+    /// Its Gaussians, ascending.
+    pub gaussians: Vec<u32>,
+}
+
+impl<'a> Granules<'a> {
+    /// Lays out the granules of these instances.
+    pub fn new(instances: &'a Instances) -> Self {
+        let lengths = instances.granule_descriptor.chunks_exact(instances.dim.max(1)).map(norm).collect();
+        Self { instances, lengths }
+    }
+
+    /// The granule that a feature means, of those that masks show in at least `min_support` views: the one with the highest sum of its
+    /// score, on a scale on which the mean of all is 0 and the best 1, and of its fit with masks, which counts 0.6. A part and the
+    /// whole often score the same, and then the masks tell. None where none has a score.
+    pub fn meant(&self, feature: &[f32], negatives: &[Vec<f32>], min_support: u32) -> Option<Meant> {
+        let Instances { granules, granule_descriptor, dim, .. } = self.instances;
+        let question = Question::new(feature, negatives);
+        let descriptors = granule_descriptor.chunks_exact((*dim).max(1)).zip(&self.lengths);
+        let score = |(q, (d, &length)): (usize, (&[f32], &f64))| Some((q, question.score(d, length)?));
+        let enough = |(q, _): &(usize, f32)| granules[*q].support >= min_support;
+        let scores: Vec<(usize, f32)> = descriptors.enumerate().filter_map(score).filter(enough).collect();
+        let mean = scores.iter().map(|s| f64::from(s.1)).sum::<f64>() / scores.len().max(1) as f64;
+        let above = scores.iter().map(|s| f64::from(s.1)).fold(mean, f64::max) - mean;
+        let rank = |&(q, score): &(usize, f32)| {
+            let scaled = if above > 0.0 { (f64::from(score) - mean) / above } else { 0.0 };
+            scaled + FIT * f64::from(granules[q].fit)
+        };
+        // Of equals the first.
+        let best = scores.iter().map(|s| (s, rank(s))).reduce(|a, b| if b.1 > a.1 { b } else { a });
+        best.map(|(&(q, score), _)| self.meaning(q as u32, score))
+    }
+
+    fn meaning(&self, granule: u32, score: f32) -> Meant {
+        let found: &Granule = &self.instances.granules[granule as usize];
+        let gaussians = found.gaussians(self.instances);
+        let mut inside = vec![0usize; self.instances.len()];
+        for &i in &gaussians {
+            if let Ok(k) = usize::try_from(self.instances.label[i as usize]) {
+                inside[k] += 1;
+            }
+        }
+        let mut most: Vec<usize> = (0..inside.len()).filter(|&k| inside[k] > 0).collect();
+        most.sort_by_key(|&k| std::cmp::Reverse(inside[k]));
+        let of_instance = |k: usize| inside[k] as f64 / f64::from(self.instances.count[k].max(1));
+        let kind = match (found.members, most.first()) {
+            (Members::Instance(_), _) | (_, None) => Kind::Thing,
+            (_, Some(&k)) if (inside[k] as f64) < INSIDE * gaussians.len() as f64 => Kind::Group,
+            (_, Some(&k)) if of_instance(k) <= PART => Kind::Part,
+            _ => Kind::Thing,
+        };
+        let mut instances: Vec<u32> = most.iter().filter(|&&k| of_instance(k) >= 0.5).map(|&k| k as u32).collect();
+        if instances.is_empty() || kind == Kind::Part {
+            instances = most.first().map(|&k| k as u32).into_iter().collect();
+        }
+        Meant { granule, kind, score, instances, gaussians }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use artifacts::TreeEdge;
+
+    /// A set of cup 0 (Gaussians 0 to 3, a handle 2, 3 of its own) and spoon 1 (Gaussians 4 to 6), and instance 2, a book (7).
+    fn scene() -> Instances {
+        let edge = |parent, child, instance| TreeEdge { parent, child, lambda: 1.0, size: 2, instance };
+        let granule = |members, support, fit| Granule { members, support, fit };
+        let u = 0.5f32.sqrt();
+        Instances {
+            label: vec![0, 0, 0, 0, 1, 1, 1, 2],
+            node: vec![11, 11, 13, 13, 12, 12, 12, 14],
+            tree: vec![edge(9, 10, -1), edge(9, 14, 2), edge(10, 11, 0), edge(10, 12, 1), edge(11, 13, -1)],
+            count: vec![4, 3, 1],
+            dim: 3,
+            granules: vec![
+                granule(Members::Instance(0), 5, 0.9),
+                granule(Members::Cluster(13), 3, 0.8),
+                granule(Members::Cluster(10), 4, 0.9),
+                granule(Members::Instance(1), 5, 0.5),
+                granule(Members::Cluster(12), 1, 0.5),
+            ],
+            granule_descriptor: [[1.0, 0.0, 0.0], [0.8, 0.0, 0.6], [u, u, 0.0], [0.0, 1.0, 0.0], [0.0, 1.0, 0.0]]
+                .concat(),
+            ..Instances::default()
+        }
+    }
+
+    fn meant(feature: [f32; 3]) -> Meant {
+        Granules::new(&scene()).meant(&feature, &[], 2).unwrap()
+    }
+
+    #[test]
+    fn words_find_the_part_the_thing_and_the_group() {
+        let cup = meant([1.0, 0.0, 0.0]);
+        assert_eq!((cup.granule, cup.kind, cup.instances, cup.gaussians), (0, Kind::Thing, vec![0], vec![0, 1, 2, 3]));
+        assert!((cup.score - 1.0).abs() < 1e-6);
+        let handle = meant([0.5, 0.0, 0.8]);
+        assert_eq!((handle.kind, handle.instances, handle.gaussians), (Kind::Part, vec![0], vec![2, 3]));
+        let set = meant([1.0, 1.0, 0.0]);
+        assert_eq!((set.kind, set.instances, set.gaussians), (Kind::Group, vec![0, 1], vec![0, 1, 2, 3, 4, 5, 6]));
+    }
+
+    #[test]
+    fn of_equal_scores_the_masks_decide_and_rare_ones_are_left_out() {
+        // Spoon and set are equally far from this; the masks show the set better.
+        let v = (std::f32::consts::PI / 8.0).sin_cos();
+        assert_eq!(meant([v.0, v.1, 0.0]).kind, Kind::Group);
+        let spoon = Granules::new(&scene()).meant(&[0.0, 1.0, -1.0], &[], 2).unwrap();
+        assert_eq!((spoon.granule, spoon.kind), (3, Kind::Thing));
+        assert_eq!(Granules::new(&scene()).meant(&[1.0; 3], &[], 6), None);
+        assert_eq!(Granules::new(&scene()).meant(&[0.0; 3], &[], 0), None);
+        assert_eq!(Granules::new(&Instances::default()).meant(&[], &[], 0), None);
+    }
+}

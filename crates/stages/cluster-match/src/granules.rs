@@ -1,0 +1,256 @@
+//! Parts, things and groups: what masks of several views show as one, for texts to choose among.
+//!
+//! Instances share the Gaussians out. A text does not: "coffee set" asks for a group, "spoon" for a part of it. So every
+//! instance and every cluster of the tree is compared with the masks of all levels in every view, by blending weight. What some
+//! mask fits in two views or more can be asked for, and these masks say what it means.
+
+use artifacts::{Footprints, Granule, LEVELS, Members};
+use gs_io::Result;
+use rayon::prelude::*;
+use std::collections::{BTreeMap, HashMap};
+
+/// A view counts when it shows at least this share of what the view that shows most does.
+const SHOWN: f64 = 0.05;
+/// A mask shows a granule when the two have at least this IoU.
+const LEAST_FIT: f64 = 0.3;
+/// Two granules are one when this share of the masks that show the second shows the first.
+const SAME: f64 = 0.9;
+/// A cluster is a candidate when it has at most this share of the Gaussians of the smallest candidate above it.
+const SHRINKS: f64 = 0.95;
+/// Fewest Gaussians of a candidate.
+const SMALLEST: usize = 3;
+
+/// What may be a granule.
+pub(crate) struct Candidates {
+    members: Vec<Members>,
+    /// The candidates that the Gaussians of each cluster are in, by cluster.
+    above: BTreeMap<i32, Vec<u32>>,
+}
+
+impl Candidates {
+    /// The instances, and the clusters of the tree that are clearly smaller than those above them. `labels` and `nodes` are those
+    /// of the kept Gaussians; `parents` has the cluster above each cluster.
+    pub fn new(labels: &[i32], instances: usize, nodes: &[i32], parents: &BTreeMap<u32, u32>) -> Self {
+        let mut sizes: BTreeMap<u32, usize> = BTreeMap::new();
+        nodes.iter().filter_map(|&n| u32::try_from(n).ok()).for_each(|n| *sizes.entry(n).or_default() += 1);
+        // Children have larger numbers than their parents.
+        for (child, parent) in parents.iter().rev() {
+            *sizes.entry(*parent).or_default() += sizes.get(child).copied().unwrap_or(0);
+        }
+        let mut members: Vec<Members> = (0..instances as u32).map(Members::Instance).collect();
+        let mut above: BTreeMap<i32, (usize, Vec<u32>)> = BTreeMap::new();
+        for (&child, &parent) in parents {
+            let size = sizes.get(&child).copied().unwrap_or(0);
+            let (mut smallest, mut own) = above.get(&(parent as i32)).cloned().unwrap_or((labels.len(), Vec::new()));
+            if size >= SMALLEST && size as f64 <= SHRINKS * smallest as f64 {
+                smallest = size;
+                own.push(members.len() as u32);
+                members.push(Members::Cluster(child));
+            }
+            above.insert(child as i32, (smallest, own));
+        }
+        Self { members, above: above.into_iter().map(|(node, (_, own))| (node, own)).collect() }
+    }
+}
+
+/// A mask that shows a candidate, as a row of the footprints.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(crate) struct Shown {
+    pub row: u32,
+    /// Their IoU, 0 to 1.
+    pub fit: f64,
+    /// Weight of what the view shows of the candidate.
+    seen: f64,
+}
+
+/// Finds what masks of at least `views` views show as one, what they show best and most often first, with these masks. `labels` and `nodes`
+/// are those of the kept Gaussians.
+///
+/// # Errors
+/// When the footprints can't be read.
+pub(crate) fn find(
+    candidates: &Candidates,
+    labels: &[i32],
+    nodes: &[i32],
+    footprints: &Footprints,
+    views: usize,
+) -> Result<Vec<(Granule, Vec<Shown>)>> {
+    let mut best: Vec<Vec<Shown>> = vec![Vec::new(); candidates.members.len()];
+    let mut first = 0;
+    for rows in footprints.rows.chunk_by(|a, b| a.view == b.view) {
+        let masks = (first..first + rows.len())
+            .into_par_iter()
+            .map(|r| Mask::new(r, candidates, labels, nodes, footprints))
+            .collect::<Result<Vec<Mask>>>()?;
+        first += rows.len();
+        best_of_view(&masks, &mut best);
+    }
+    let mut found: Vec<(f64, Granule, Vec<Shown>)> =
+        candidates.members.iter().zip(best).filter_map(|(&members, shown)| judge(members, shown, views)).collect();
+    // Of equals the first.
+    found.sort_by(|a, b| b.0.total_cmp(&a.0));
+    Ok(different(found))
+}
+
+/// What a mask shows of the candidates.
+struct Mask {
+    row: u32,
+    level: u32,
+    /// Weight of all its Gaussians.
+    area: f64,
+    /// Weight of each candidate in it, ascending.
+    of: Vec<(u32, f64)>,
+}
+
+impl Mask {
+    fn new(row: usize, c: &Candidates, labels: &[i32], nodes: &[i32], footprints: &Footprints) -> Result<Self> {
+        let (mut by_node, mut of): (BTreeMap<i32, f64>, BTreeMap<u32, f64>) = Default::default();
+        let mut area = 0.0;
+        for (i, w) in footprints.entries(row)?.iter() {
+            let w = f64::from(w);
+            area += w;
+            *by_node.entry(nodes[i as usize]).or_default() += w;
+            if let Ok(instance) = u32::try_from(labels[i as usize]) {
+                *of.entry(instance).or_default() += w;
+            }
+        }
+        for (node, w) in by_node {
+            c.above.get(&node).into_iter().flatten().for_each(|&own| *of.entry(own).or_default() += w);
+        }
+        Ok(Self { row: row as u32, level: footprints.rows[row].level, area, of: of.into_iter().collect() })
+    }
+}
+
+/// Adds the mask of a view that fits each candidate best, of equals the first. What a view shows of a candidate is what the masks of
+/// a level hold of it, of that level which holds most.
+fn best_of_view(masks: &[Mask], best: &mut [Vec<Shown>]) {
+    let mut seen: HashMap<u32, [f64; LEVELS]> = HashMap::new();
+    for m in masks {
+        m.of.iter().for_each(|&(c, w)| seen.entry(c).or_default()[m.level as usize] += w);
+    }
+    let mut of_view: BTreeMap<u32, Shown> = BTreeMap::new();
+    for m in masks {
+        for &(c, w) in m.of.iter().filter(|(_, w)| *w > 0.0) {
+            let seen = seen[&c].into_iter().fold(0.0, f64::max);
+            let shown = Shown { row: m.row, fit: w / (seen + m.area - w), seen };
+            let now = of_view.entry(c).or_insert(shown);
+            if shown.fit > now.fit {
+                *now = shown;
+            }
+        }
+    }
+    of_view.into_iter().for_each(|(c, shown)| best[c as usize].push(shown));
+}
+
+/// Whether a candidate is a granule, and how surely: the sum of its IoUs. `shown` has its best mask in every view that shows it.
+fn judge(members: Members, mut shown: Vec<Shown>, least: usize) -> Option<(f64, Granule, Vec<Shown>)> {
+    let most = shown.iter().map(|s| s.seen).fold(0.0, f64::max);
+    shown.retain(|s| s.seen >= SHOWN * most);
+    let views = shown.len();
+    let sum: f64 = shown.iter().map(|s| s.fit).sum();
+    shown.retain(|s| s.fit >= LEAST_FIT);
+    let granule = Granule { members, support: shown.len() as u32, fit: (sum / views.max(1) as f64) as f32 };
+    let sure = shown.iter().map(|s| s.fit).sum();
+    (shown.len() >= least).then_some((sure, granule, shown))
+}
+
+/// Leaves out what the same masks show as something before it.
+fn different(found: Vec<(f64, Granule, Vec<Shown>)>) -> Vec<(Granule, Vec<Shown>)> {
+    let mut shows: HashMap<u32, Vec<u32>> = HashMap::new();
+    let mut kept: Vec<(Granule, Vec<Shown>)> = Vec::new();
+    for (_, granule, shown) in found {
+        let mut common: BTreeMap<u32, usize> = BTreeMap::new();
+        for other in shown.iter().filter_map(|s| shows.get(&s.row)).flatten() {
+            *common.entry(*other).or_default() += 1;
+        }
+        if common.values().all(|&n| (n as f64) < SAME * shown.len() as f64) {
+            shown.iter().for_each(|s| shows.entry(s.row).or_default().push(kept.len() as u32));
+            kept.push((granule, shown));
+        }
+    }
+    kept
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use artifacts::{FootprintsBuilder, Level, Row};
+    use gs_io::Provenance;
+
+    const PARENTS: [(u32, u32); 4] = [(11, 10), (12, 10), (13, 11), (14, 11)];
+    /// A cup (11) of bowl (13: Gaussians 0 to 3) and handle (14: 4 to 6), and a spoon (12: 7 to 10); the root is 10.
+    const NODES: [i32; 11] = [13, 13, 13, 13, 14, 14, 14, 12, 12, 12, 12];
+    const LABELS: [i32; 11] = [0, 0, 0, 0, 0, 0, 0, 1, 1, 1, 1];
+
+    /// Masks of three views, by level, each with a weight of 1 for each of its Gaussians; the last view shows no handle.
+    fn footprints(masks: &[(Level, std::ops::Range<u32>)]) -> (tempfile::TempDir, Footprints) {
+        let mut b = FootprintsBuilder { kept: (0..11).collect(), ..FootprintsBuilder::default() };
+        for view in 0..3 {
+            b.views.push(view.to_string());
+            for (mask, (level, range)) in masks.iter().enumerate() {
+                let row = Row { view, level: *level as u32, mask: mask as u32, pixels: 10, gated: 10, alpha: 1.0 };
+                let shown = range.clone().filter(|i| view < 2 || !(4..7).contains(i));
+                b.push(row, shown.map(|i| (i, 1.0)));
+            }
+        }
+        let dir = tempfile::tempdir().unwrap();
+        let path = dir.path().join("f.safetensors");
+        b.write(&path, Provenance::default()).unwrap();
+        let footprints = Footprints::read(&path).unwrap();
+        (dir, footprints)
+    }
+
+    fn found(masks: &[(Level, std::ops::Range<u32>)]) -> Vec<(Granule, Vec<u32>)> {
+        let (_dir, f) = footprints(masks);
+        let candidates = Candidates::new(&LABELS, 2, &NODES, &PARENTS.into());
+        let found = find(&candidates, &LABELS, &NODES, &f, 2).unwrap();
+        found.into_iter().map(|(g, shown)| (g, shown.iter().map(|s| f.rows[s.row as usize].mask).collect())).collect()
+    }
+
+    #[test]
+    fn masks_of_each_level_find_their_part_and_thing() {
+        use Level::{Large, Small};
+        let all = [(Small, 0..4), (Small, 4..7), (Small, 7..11), (Large, 0..7), (Large, 7..11)];
+        let of = |members, support| Granule { members, support, fit: 1.0 };
+        let expected = [
+            (of(Members::Instance(0), 3), vec![3, 3, 0]),
+            (of(Members::Instance(1), 3), vec![2, 2, 2]),
+            (of(Members::Cluster(13), 3), vec![0, 0, 0]),
+            (of(Members::Cluster(14), 2), vec![1, 1]),
+        ];
+        // Of two masks that fit alike the first; what instance and cluster have in common is there once.
+        assert_eq!(found(&all), expected);
+    }
+
+    #[test]
+    fn what_no_mask_shows_as_one_is_no_granule() {
+        // One mask over everything: IoU 3 / 11 with the handle, which is too little, 4 / 11 with bowl and spoon.
+        let members: Vec<Members> = found(&[(Level::Large, 0..11)]).iter().map(|(g, _)| g.members).collect();
+        assert!(!members.contains(&Members::Cluster(14)), "{members:?}");
+        // The last view shows the bowl of the cup alone.
+        let cup = found(&[(Level::Large, 0..7), (Level::Large, 7..11)]);
+        assert_eq!(cup.len(), 2, "the bowl is nothing of its own: {cup:?}");
+        assert_eq!((cup[0].0.members, cup[0].0.support, cup[0].0.fit), (Members::Instance(0), 3, 1.0));
+    }
+
+    #[test]
+    fn a_cluster_much_like_the_one_above_is_no_candidate_of_its_own() {
+        // 100 Gaussians in 20, of which 97 in 21, of which 50 in 22.
+        let nodes: Vec<i32> = (0..100)
+            .map(|i| {
+                if i < 50 {
+                    22
+                } else if i < 97 {
+                    21
+                } else {
+                    20
+                }
+            })
+            .collect();
+        let parents = BTreeMap::from([(20, 19), (21, 20), (22, 21)]);
+        let c = Candidates::new(&vec![-1; 110], 0, &[nodes, vec![19; 10]].concat(), &parents);
+        assert_eq!(c.members, [Members::Cluster(20), Members::Cluster(22)]);
+        assert_eq!(c.above[&22], [0, 1]);
+        assert_eq!(c.above[&21], [0]);
+    }
+}
