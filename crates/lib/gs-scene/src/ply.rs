@@ -4,9 +4,11 @@
 //! writer writes what the original 3DGS code writes. Read by hand because a million Gaussians are 248 MB and generic
 //! readers need many times that.
 
+mod copy;
 mod table;
 
 use crate::{Gaussians, sh_coefficients};
+pub use copy::{INSTANCE, Vertices};
 use gs_io::{Error, IoContext, Result, write_atomic};
 use std::io::Read;
 use std::io::Write;

@@ -54,7 +54,14 @@ pub(crate) fn write(
     let (gaussians, comments) = (&inputs.geometry.gaussians, inputs.geometry.comments(own));
     let [labelled, list, table] = SIDE_FILES.map(|extension| a.out.with_extension(extension));
     let painted = a.paint.then(|| painted(gaussians, &instances.label));
-    ply::write_labelled_gaussians(labelled, painted.as_ref().unwrap_or(gaussians), &instances.label, &comments)?;
+    // As the file has them, with what other programs put beside the Gaussians' parameters; but stand-ins of damaged ones.
+    let as_they_are = painted.is_none() && inputs.geometry.damaged.is_empty() && ply::holds_gaussians(&a.geometry)?;
+    if as_they_are {
+        let rows: Vec<u32> = (0..gaussians.len() as u32).collect();
+        ply::Vertices::read(&a.geometry)?.write(labelled, &rows, Some(&instances.label), &comments)?;
+    } else {
+        ply::write_labelled_gaussians(labelled, painted.as_ref().unwrap_or(gaussians), &instances.label, &comments)?;
+    }
     gs_io::npy::write_i32(list, &[instances.label.len()], &instances.label)?;
     health::say(health, stage);
     let text = as_text(instances, health, &parameters);

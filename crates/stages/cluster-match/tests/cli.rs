@@ -415,6 +415,28 @@ fn damaged_gaussians_belong_to_nothing_and_harm_nobody() {
 }
 
 #[test]
+fn instances_ply_keeps_all_harmonics_and_what_other_programs_wrote() {
+    let s = Scene::new();
+    let mut g = gaussians();
+    let n = g.len();
+    (g.sh_degree, g.sh) = (3, (0..48 * n).map(|i| (i % 101) as f32 * 0.01).collect());
+    // Another program's number for each Gaussian, in place of the instance.
+    let theirs: Vec<i32> = (0..n as i32).map(|i| 1000 + i).collect();
+    ply::write_labelled_gaussians(s.path("named.ply"), &g, &theirs, &[]).unwrap();
+    let named = std::fs::read(s.path("named.ply")).unwrap();
+    let at = named.windows(9).position(|w| w == b" instance").unwrap();
+    let renamed = [&named[..at], b" segments", &named[at + 9..]].concat();
+    std::fs::write(s.path("geometry.ply"), renamed).unwrap();
+    s.artifacts(|_| {});
+    let (i, _) = s.succeed(&[]);
+    let out = s.path("out/instances.ply");
+    assert_eq!(ply::read_gaussians(&out).unwrap(), g);
+    let (_, kept) = ply::read_labels(&out, "segments").unwrap();
+    assert!(kept.iter().zip(&theirs).all(|(a, b)| *a == *b as u32));
+    assert_eq!(ply::read_labels(&out, "instance").is_err(), i.label.contains(&-1));
+}
+
+#[test]
 fn a_geometry_learnt_with_the_filter_is_matched_and_written_with_it() {
     let s = Scene::new();
     let (plain, _) = s.succeed(&[]);

@@ -49,6 +49,19 @@ impl Scalar {
         }
     }
 
+    fn name(self) -> &'static str {
+        match self {
+            Self::I8 => "char",
+            Self::U8 => "uchar",
+            Self::I16 => "short",
+            Self::U16 => "ushort",
+            Self::I32 => "int",
+            Self::U32 => "uint",
+            Self::F32 => "float",
+            Self::F64 => "double",
+        }
+    }
+
     #[inline]
     fn value(self, bytes: &[u8], big: bool) -> f64 {
         macro_rules! get {
@@ -191,6 +204,11 @@ impl Column {
     pub(super) fn is_float(self) -> bool {
         matches!(self.named, Scalar::F32 | Scalar::F64)
     }
+
+    /// The type of its values in the rows, as a header names it.
+    pub(super) fn type_name(self) -> &'static str {
+        self.scalar.name()
+    }
 }
 
 /// The rows of element `vertex`. Binary rows without lists stay where they lie in the file; all others are rewritten
@@ -214,6 +232,27 @@ impl<'a> Table<'a> {
             stride += scalar.size();
         }
         Self { count: element.count, stride, columns, rows }
+    }
+
+    /// The table on its own, without the file.
+    pub(super) fn into_owned(self) -> Table<'static> {
+        let Table { count, stride, columns, rows } = self;
+        Table { count, stride, columns, rows: Cow::Owned(rows.into_owned()) }
+    }
+
+    /// All properties with their names, in the order of the file.
+    pub(super) fn columns(&self) -> impl Iterator<Item = (&str, Column)> {
+        self.columns.iter().map(|(name, column)| (name.as_str(), *column))
+    }
+
+    /// Appends the bytes of a value, little-endian.
+    pub(super) fn put(&self, row: usize, column: Column, out: &mut Vec<u8>) {
+        let start = row * self.stride + column.at;
+        let value = &self.rows[start..start + column.scalar.size()];
+        match column.big {
+            true => out.extend(value.iter().rev()),
+            false => out.extend_from_slice(value),
+        }
     }
 
     /// The column of a property, where there is one.
