@@ -71,7 +71,7 @@ pub fn describe(
 }
 
 /// The centres of those Gaussians that are a surface; all of them where none is.
-fn solid_centers(g: &Gaussians, own: &[u32]) -> Vec<[f32; 3]> {
+pub fn solid_centers(g: &Gaussians, own: &[u32]) -> Vec<[f32; 3]> {
     let of = |least: f32| -> Vec<[f32; 3]> {
         own.iter().filter(|&&i| g.opacity(i as usize) >= least).map(|&i| g.means[i as usize]).collect()
     };

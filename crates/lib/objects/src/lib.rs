@@ -1,8 +1,9 @@
 //! The things of a scene, for people and programs that use them: `scene.json` (`scene`), what is up (`up`), upright boxes
-//! that a few floaters don't stretch (`upright`), what stands on, in, under and next to what (`relations`), and all of this
-//! from instances and Gaussians (`describe`). docs/objects.md has the fields and the rules.
+//! that a few floaters don't stretch (`upright`), what stands on, in, under and next to what (`relations`), all of this from
+//! instances and Gaussians (`describe`), and ids beside splats that cannot hold them (`ids`). docs/objects.md has the fields and the rules.
 
 mod describe;
+mod ids;
 mod relations;
 mod scene;
 #[cfg(test)]
@@ -10,7 +11,8 @@ mod testing;
 mod up;
 mod upright;
 
-pub use describe::{Names, describe, members};
+pub use describe::{Names, describe, members, solid_centers};
+pub use ids::Ids;
 pub use relations::relations;
 pub use scene::{BestView, Family, Name, NameSource, Object, Part, Relation, RelationKind, SCHEMA, Scene};
 pub use up::{Up, UpSource};

@@ -1,0 +1,10 @@
+//! The `export` program.
+
+use std::process::ExitCode;
+
+#[global_allocator]
+static ALLOCATOR: stage::Allocator = stage::Allocator;
+
+fn main() -> ExitCode {
+    stage::main::<export::Args>()
+}

@@ -1,0 +1,205 @@
+//! The commands: each claims its outputs, reads the scene and writes.
+
+use crate::hull::hull;
+use crate::names;
+use crate::options::{
+    Inputs, MeshFormat, MeshesOptions, ObjectsOptions, PointsOptions, SceneOptions, SplatsOptions, UpOptions,
+    UsdOptions,
+};
+use crate::points::{self, PointFormat};
+use crate::splats::{Splats, extension_of, format_of};
+use crate::usd::{self, Prim, StageOptions};
+use gs_io::{Claim, Error, Outputs, Result};
+use gs_scene::dataset::{self, LoadOptions};
+use objects::{Ids, Names, Scene, Up, members, solid_centers};
+use query::LabelledScene;
+use serde_json::{Value, json};
+use stage::Stage;
+use std::path::Path;
+
+/// `export scene`.
+pub fn scene(o: &SceneOptions, parameters: Value, stage: &Stage) -> Result<()> {
+    let mut claim = o.inputs.reads(stage.outputs(&o.out).file(&o.out)).reads(&o.query).claim()?;
+    let labelled = o.inputs.read(stage)?;
+    let names = o.query.as_deref().map_or(Ok(Names::new()), |path| names::read(path, &labelled))?;
+    let scene = describe(&labelled, &names, o.up.find(&labelled, stage)?);
+    scene.write(&o.out)?;
+    let summary = json!({
+        "objects": scene.objects.len(), "relations": scene.relations.len(),
+        "named": scene.objects.iter().filter(|o| o.name.is_some()).count(),
+    });
+    stage.info(&format!(
+        "wrote {}: {} objects, {} relations",
+        o.out.display(),
+        scene.objects.len(),
+        scene.relations.len()
+    ));
+    stage.record(&mut claim, parameters, labelled.inputs, summary)
+}
+
+/// `export objects`.
+pub fn objects(o: &ObjectsOptions, parameters: Value, stage: &Stage) -> Result<()> {
+    let mut claim = claim_folder(&o.out, "objects", &o.inputs, stage)?;
+    let labelled = o.inputs.read(stage)?;
+    let splats = Splats::new(&labelled, &o.inputs.geometry)?;
+    let wanted = wanted(&labelled, &o.only, "--only")?;
+    let members = members(&labelled.instances.label, labelled.instances.len());
+    for &id in &wanted {
+        let file = o.out.join(format!("{}.{}", stem(id), extension_of(o.format)));
+        splats.write(&file, o.format, &members[id as usize])?;
+    }
+    stage.info(&format!("wrote {} objects into {}", wanted.len(), o.out.display()));
+    stage.record(&mut claim, parameters, labelled.inputs.clone(), json!({ "objects": wanted.len() }))
+}
+
+/// `export splats`.
+pub fn splats(o: &SplatsOptions, parameters: Value, stage: &Stage) -> Result<()> {
+    let format = format_of(&o.out)?;
+    let outputs = stage.outputs(&o.out).file(&o.out).files(o.ids.then(|| Ids::path(&o.out)));
+    let mut claim = o.inputs.reads(outputs.drop_stale()).claim()?;
+    let labelled = o.inputs.read(stage)?;
+    let label = &labelled.instances.label;
+    let only = if o.only.is_empty() { None } else { Some(wanted(&labelled, &o.only, "--only")?) };
+    let without = if o.without.is_empty() { Vec::new() } else { wanted(&labelled, &o.without, "--without")? };
+    let meant = |l: i32| match u32::try_from(l) {
+        Ok(id) => only.as_ref().is_none_or(|only| only.contains(&id)) && !without.contains(&id),
+        Err(_) => only.is_none(),
+    };
+    let which: Vec<u32> = (0..label.len() as u32).filter(|&i| meant(label[i as usize])).collect();
+    if which.is_empty() {
+        return Err(Error::new("nothing is left to write").field("--without").hint("leave some objects"));
+    }
+    Splats::new(&labelled, &o.inputs.geometry)?.write(&o.out, format, &which)?;
+    if o.ids {
+        Ids::of(&o.out, which.iter().map(|&i| label[i as usize]).collect())?.write(&o.out)?;
+    }
+    stage.info(&format!("wrote {}: {} of {} Gaussians", o.out.display(), which.len(), label.len()));
+    stage.record(&mut claim, parameters, labelled.inputs.clone(), json!({ "gaussians": which.len() }))
+}
+
+/// `export points`.
+pub fn points(o: &PointsOptions, parameters: Value, stage: &Stage) -> Result<()> {
+    let format = PointFormat::of(&o.out)?;
+    let mut claim = o.inputs.reads(stage.outputs(&o.out).file(&o.out)).claim()?;
+    let labelled = o.inputs.read(stage)?;
+    let (g, whole) = (labelled.gaussians(), labelled.geometry.whole());
+    let solid = |&i: &u32| whole[i as usize] && g.opacity(i as usize) >= o.min_opacity;
+    let which: Vec<u32> = (0..g.len() as u32).filter(solid).collect();
+    points::write(&o.out, format, g, &labelled.instances.label, &which)?;
+    stage.info(&format!("wrote {}: {} points of {} Gaussians", o.out.display(), which.len(), g.len()));
+    stage.record(&mut claim, parameters, labelled.inputs.clone(), json!({ "points": which.len() }))
+}
+
+/// `export meshes`.
+pub fn meshes(o: &MeshesOptions, parameters: Value, stage: &Stage) -> Result<()> {
+    let mut claim = claim_folder(&o.out, "meshes", &o.inputs, stage)?;
+    let labelled = o.inputs.read(stage)?;
+    let wanted = wanted(&labelled, &o.only, "--only")?;
+    let scene = describe(&labelled, &Names::new(), None);
+    let members = members(&labelled.instances.label, labelled.instances.len());
+    let mut flat = Vec::new();
+    for object in scene.objects.iter().filter(|object| wanted.contains(&object.id)) {
+        let centers = solid_centers(labelled.gaussians(), &members[object.id as usize]);
+        let (mesh, is_box) = hull(&centers, &object.bounds, o.vertices);
+        flat.extend(is_box.then_some(object.id));
+        let stem = stem(object.id);
+        match o.format {
+            MeshFormat::Obj => mesh.write_obj(&o.out.join(format!("{stem}.obj")), &stem)?,
+            MeshFormat::Ply => mesh.write_ply(&o.out.join(format!("{stem}.ply")))?,
+        }
+    }
+    if !flat.is_empty() {
+        stage.warn(&format!("boxes in place of hulls, since the centres span no volume: objects {flat:?}"));
+    }
+    stage.info(&format!("wrote {} meshes into {}", wanted.len(), o.out.display()));
+    let summary = json!({ "meshes": wanted.len(), "boxes": flat });
+    stage.record(&mut claim, parameters, labelled.inputs.clone(), summary)
+}
+
+/// `export usd`.
+pub fn usd(o: &UsdOptions, parameters: Value, stage: &Stage) -> Result<()> {
+    usd::check_name(&o.out)?;
+    let mut claim = o.inputs.reads(stage.outputs(&o.out).file(&o.out)).claim()?;
+    let labelled = o.inputs.read(stage)?;
+    let up = o.up.find(&labelled, stage)?;
+    let scene = describe(&labelled, &Names::new(), up);
+    let (g, whole) = (labelled.gaussians(), labelled.geometry.whole());
+    let mut members = members(&labelled.instances.label, labelled.instances.len());
+    let mut prims: Vec<Prim> = Vec::new();
+    for object in &scene.objects {
+        let gaussians = std::mem::take(&mut members[object.id as usize]);
+        let (collider, _) = hull(&solid_centers(g, &gaussians), &object.bounds, o.vertices);
+        let name = object.name.as_ref().map(|n| n.text.clone());
+        prims.push(Prim { id: Some(object.id), name, gaussians, collider: Some(collider) });
+    }
+    let others = |&i: &u32| labelled.instances.label[i as usize] < 0 && whole[i as usize];
+    let gaussians = (0..g.len() as u32).filter(others).collect();
+    prims.push(Prim { id: None, name: None, gaussians, collider: None });
+    let options = StageOptions { up, metres_per_unit: labelled.remarks.metres_per_unit, sh_degree: o.sh };
+    usd::write(&o.out, g, &prims, &options)?;
+    stage.info(&format!("wrote {}: {} objects", o.out.display(), scene.objects.len()));
+    stage.record(&mut claim, parameters, labelled.inputs.clone(), json!({ "objects": scene.objects.len() }))
+}
+
+impl Inputs {
+    fn reads(&self, outputs: Outputs) -> Outputs {
+        outputs.reads([&self.geometry, &self.instances]).reads(&self.edits)
+    }
+
+    fn read(&self, stage: &Stage) -> Result<LabelledScene> {
+        let scene = LabelledScene::read(&self.instances, &self.geometry, self.edits.as_deref())?;
+        if let Some(damage) = scene.geometry.damage() {
+            stage.skipped(&damage);
+        }
+        if scene.all_noise() {
+            stage.warn("no Gaussian belongs to an object");
+        }
+        Ok(scene)
+    }
+}
+
+impl UpOptions {
+    /// What is up: as a person said, or by the cameras of the dataset.
+    fn find(&self, scene: &LabelledScene, stage: &Stage) -> Result<Option<Up>> {
+        let Some(folder) = &self.scene else { return Ok(self.up) };
+        let dataset = dataset::load(folder, &LoadOptions::default())?;
+        scene.check_dataset(&dataset)?;
+        let up = Up::of_cameras(dataset.views.iter().map(|v| &v.camera));
+        if up.is_none() {
+            stage.warn("the cameras do not tell what is up: give --up");
+        }
+        Ok(up)
+    }
+}
+
+fn describe(labelled: &LabelledScene, names: &Names, up: Option<Up>) -> Scene {
+    let inputs = labelled.inputs.clone();
+    objects::describe(&labelled.instances, labelled.gaussians(), &labelled.remarks, names, up, inputs)
+}
+
+/// The right to write a folder of files whose names follow from the scene.
+fn claim_folder(out: &Path, main: &str, inputs: &Inputs, stage: &Stage) -> Result<Claim> {
+    inputs.reads(stage.outputs(out.join(main)).folder(out).drop_stale()).claim()
+}
+
+/// Name of an object's file, without its extension.
+fn stem(id: u32) -> String {
+    format!("object_{id:04}")
+}
+
+/// The ids that an option names, ascending; all objects' where it names none.
+fn wanted(scene: &LabelledScene, ids: &[u32], option: &str) -> Result<Vec<u32>> {
+    let count = &scene.instances.count;
+    let all: Vec<u32> = (0..count.len() as u32).filter(|&k| count[k as usize] > 0).collect();
+    if let Some(id) = ids.iter().find(|id| all.binary_search(id).is_err()) {
+        let expected = match (all.first(), all.last()) {
+            (Some(first), Some(last)) => format!("ids of objects, {first} to {last}"),
+            _ => "none: the scene has no objects".into(),
+        };
+        return Err(Error::new("no such object").field(option).found(id).expected(expected));
+    }
+    if ids.is_empty() {
+        return Ok(all);
+    }
+    Ok(all.into_iter().filter(|id| ids.contains(id)).collect())
+}

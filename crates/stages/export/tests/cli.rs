@@ -1,0 +1,310 @@
+//! The program on a small scene: every command, what it writes, and bad input.
+
+use artifacts::{Edit, Edits, Extents, Instances, Match, role};
+use gs_io::{Artifact, Provenance, hash_file};
+use gs_scene::{Camera, Gaussians, Image, ply};
+use objects::{Ids, NameSource, RelationKind, Scene};
+use serde_json::{Value, json};
+use std::collections::BTreeMap;
+use std::path::{Path, PathBuf};
+use std::process::{Command, Output};
+
+/// Lower and upper corners of a table top, a mug on it, a book in a box, that box beside the mug, and a box under the table.
+const THINGS: [([f32; 3], [f32; 3]); 5] = [
+    ([0.0, 0.0, 0.7], [2.0, 1.0, 0.75]),
+    ([0.4, 0.4, 0.75], [0.5, 0.5, 0.85]),
+    ([0.62, 0.42, 0.76], [0.68, 0.48, 0.78]),
+    ([0.55, 0.35, 0.75], [0.75, 0.55, 0.9]),
+    ([0.8, 0.3, 0.0], [1.2, 0.7, 0.4]),
+];
+/// Gaussians of each.
+const EACH: usize = 9 * 9 * 9;
+
+/// Gaussians on grids through the things, with one of no thing first; harmonics of degree 1.
+fn gaussians() -> (Gaussians, Vec<i32>) {
+    let (mut means, mut label) = (vec![[50.0; 3]], vec![-1]);
+    for (k, (low, high)) in THINGS.iter().enumerate() {
+        for i in 0..EACH {
+            let at = [i % 9, i / 9 % 9, i / 81];
+            means.push([0, 1, 2].map(|c| low[c] + (high[c] - low[c]) * at[c] as f32 / 8.0));
+            label.push(k as i32);
+        }
+    }
+    let n = means.len();
+    let g = Gaussians {
+        log_scales: vec![[-4.0, -5.0, -4.5]; n],
+        rotations: (0..n).map(|i| [1.0, i as f32 * 0.001, 0.0, 0.5]).collect(),
+        opacity_logits: vec![3.0; n],
+        sh: (0..12 * n).map(|i| (i % 97) as f32 * 0.01).collect(),
+        sh_degree: 1,
+        means,
+    };
+    (g, label)
+}
+
+struct Run {
+    dir: tempfile::TempDir,
+}
+
+impl Run {
+    fn new() -> Self {
+        let run = Self { dir: tempfile::tempdir().unwrap() };
+        let (g, label) = gaussians();
+        ply::write_gaussians(run.path("geometry.ply"), &g, &[]).unwrap();
+        run.write(&g, label);
+        run
+    }
+
+    fn write(&self, g: &Gaussians, label: Vec<i32>) {
+        let k = THINGS.len();
+        let e = Extents::of(&g.means, &label, k);
+        let instances = Instances {
+            node: vec![-1; label.len()],
+            label,
+            support: vec![1; k],
+            score: (0..k).map(|i| 0.9 - 0.1 * i as f32).collect(),
+            count: e.count,
+            centroid: e.centroid,
+            bbox_min: e.bbox_min,
+            bbox_max: e.bbox_max,
+            oriented: e.oriented,
+            views: vec!["v0".into()],
+            matches: vec![Match { instance: 1, view: 0, mask: 12, score: 0.8, visible: 40.0 }],
+            ..Instances::default()
+        };
+        let mut inputs = BTreeMap::from([(role::GEOMETRY.into(), hash_file(self.path("geometry.ply")).unwrap())]);
+        if let Ok(dataset) = self.dataset() {
+            inputs.insert(role::DATASET.into(), dataset.hash().unwrap());
+        }
+        instances.write(self.path("instances.safetensors"), Provenance { inputs, ..Provenance::default() }).unwrap();
+    }
+
+    fn dataset(&self) -> gs_io::Result<gs_scene::dataset::Dataset> {
+        gs_scene::dataset::load(&self.path("photos"), &gs_scene::dataset::LoadOptions::default())
+    }
+
+    /// Photographs from around the table, tilted down.
+    fn photographs(&self) {
+        std::fs::create_dir_all(self.path("photos/images")).unwrap();
+        let mut frames = Vec::new();
+        for v in 0..4u32 {
+            let (sin, cos) = (f64::from(v) * 1.3).sin_cos();
+            let eye = glam::DVec3::new(1.0 + 3.0 * cos, 0.5 + 3.0 * sin, 2.5);
+            let c = Camera::look_at(eye, glam::DVec3::new(1.0, 0.5, 0.7), glam::DVec3::Z, 16, 16, 1.0);
+            let (r, t) = (c.rotation.transpose(), c.position());
+            let row = |i: usize| [r.col(0)[i], -r.col(1)[i], -r.col(2)[i], t[i]];
+            let name = format!("images/v{v}.png");
+            frames.push(json!({"file_path": name, "transform_matrix": [row(0), row(1), row(2), [0.0, 0.0, 0.0, 1.0]]}));
+            let image = Image { width: 16, height: 16, rgb: vec![0.5; 3 * 256], alpha: None };
+            image.write_png(self.path(&format!("photos/{name}"))).unwrap();
+        }
+        let f = 8.0 / 0.5f64.tan();
+        let transforms = json!({ "w": 16, "h": 16, "fl_x": f, "fl_y": f, "frames": frames });
+        std::fs::write(self.path("photos/transforms.json"), transforms.to_string()).unwrap();
+    }
+
+    fn edits(&self, edits: Vec<Edit>) {
+        let artifact = Artifact::open(self.path("instances.safetensors"), Instances::FORMAT, 1).unwrap();
+        Edits { instances: artifact.hash().into(), edits }.write(self.path("edits.json")).unwrap();
+    }
+
+    fn path(&self, name: &str) -> PathBuf {
+        self.dir.path().join(name)
+    }
+
+    /// Runs `export COMMAND` on the scene with an output of this name.
+    fn run(&self, command: &str, out: &str, extra: &[&str]) -> Output {
+        let [geometry, instances, out] = ["geometry.ply", "instances.safetensors", out].map(|f| self.path(f));
+        let mut run = Command::new(env!("CARGO_BIN_EXE_export"));
+        run.current_dir(self.dir.path()).arg(command).arg("--geometry").arg(geometry);
+        run.arg("--instances").arg(instances).arg("--out").arg(out).args(extra).output().unwrap()
+    }
+
+    fn succeed(&self, command: &str, out: &str, extra: &[&str]) -> String {
+        let o = self.run(command, out, extra);
+        let said = String::from_utf8_lossy(&o.stderr).into_owned();
+        assert!(o.status.success(), "{said}");
+        said
+    }
+
+    /// Expects exit code 2 and one line with all `needles`, and no output.
+    fn fail(&self, command: &str, out: &str, extra: &[&str], needles: &[&str]) {
+        let before = self.path(out).exists();
+        let o = self.run(command, out, extra);
+        let said = String::from_utf8_lossy(&o.stderr).into_owned();
+        assert_eq!(o.status.code(), Some(2), "{said}");
+        needles.iter().for_each(|n| assert!(said.contains(n), "{n:?} is not in {said:?}"));
+        let errors = said.lines().filter(|l| l.starts_with("export: error: ")).count();
+        assert_eq!((errors, said.contains("panicked")), (1, false), "{said}");
+        assert_eq!(self.path(out).exists(), before);
+    }
+}
+
+/// The files in a folder that objects are in.
+fn objects_in(folder: &Path) -> Vec<String> {
+    let names = std::fs::read_dir(folder).unwrap().map(|e| e.unwrap().file_name().into_string().unwrap());
+    let mut names: Vec<String> = names.filter(|n| n.starts_with("object_")).collect();
+    names.sort();
+    names
+}
+
+/// Why a value does not fit the schema of scene.json; empty where it does.
+fn against_schema(schema: &Value, value: &Value) -> String {
+    let (mut all, mut compiler) = (boon::Schemas::new(), boon::Compiler::new());
+    compiler.add_resource("scene.schema.json", schema.clone()).unwrap();
+    let index = compiler.compile("scene.schema.json", &mut all).unwrap();
+    all.validate(value, index).err().map(|e| e.to_string()).unwrap_or_default()
+}
+
+#[test]
+fn scene_json_tells_objects_and_relations_and_fits_its_schema() {
+    let run = Run::new();
+    let names = Edit::Rename { instance: 1, name: "red \"mug\"".into() };
+    run.edits(vec![names, Edit::Scale { from: [0.0; 3], to: [0.0, 0.0, 2.0], metres: 1.0 }]);
+    run.succeed("scene", "scene.json", &["--edits", "edits.json", "--up", "z"]);
+    let scene = Scene::read(run.path("scene.json")).unwrap();
+    assert_eq!((scene.objects.len(), scene.metres_per_unit), (5, Some(0.5)));
+    let mug = scene.object(1).unwrap();
+    assert_eq!(mug.name.as_ref().map(|n| (&n.text[..], n.from)), Some(("red \"mug\"", NameSource::Edits)));
+    assert_eq!(mug.best_view.as_ref().map(|b| (&b.view[..], b.mask)), Some(("v0", 12)));
+    let told: Vec<(u32, RelationKind, u32)> =
+        scene.relations.iter().map(|r| (r.subject, r.relation, r.object)).collect();
+    use RelationKind::{In, NextTo, On, Under};
+    assert_eq!(told, [(1, On, 0), (1, NextTo, 3), (2, In, 3), (3, On, 0), (4, Under, 0)]);
+
+    let printed = Command::new(env!("CARGO_BIN_EXE_export")).arg("schema").output().unwrap();
+    let schema: Value = serde_json::from_slice(&printed.stdout).unwrap();
+    let text: Value = serde_json::from_slice(&std::fs::read(run.path("scene.json")).unwrap()).unwrap();
+    assert_eq!(against_schema(&schema, &text), "");
+    // And the schema refuses what is none.
+    for change in
+        ["/objects/0/box/half_size/0", "/relations/0/relation", "/version", "/objects/1/best_view/mask", "/up"]
+    {
+        let mut damaged = text.clone();
+        *damaged.pointer_mut(change).unwrap() = json!(-1.5);
+        assert!(!against_schema(&schema, &damaged).is_empty(), "{change}");
+    }
+    // Without what is up there are no boxes that stand upright, and that fits too.
+    run.succeed("scene", "bare.json", &[]);
+    let bare: Value = serde_json::from_slice(&std::fs::read(run.path("bare.json")).unwrap()).unwrap();
+    assert_eq!(against_schema(&schema, &bare), "");
+    assert_eq!((&bare["up"], &bare["objects"][0]["box"]["upright"]), (&Value::Null, &json!(false)));
+}
+
+#[test]
+fn cameras_tell_what_is_up_and_queries_what_things_are_called() {
+    let run = Run::new();
+    run.photographs();
+    let (g, label) = gaussians();
+    run.write(&g, label);
+    let answer =
+        |text: &str, id: u32| json!({"text": text, "kind": "text", "ranking": [{"instance": id, "score": 0.5}]});
+    std::fs::write(run.path("query.json"), json!({"queries": [answer("mug", 1), answer("table", 0)]}).to_string())
+        .unwrap();
+    run.fail("scene", "scene.json", &["--query", "query.json"], &["query.json.run.json"]);
+    // The record of a query: that of any stage, with its inputs.
+    run.succeed("scene", "a.json", &["--up", "z"]);
+    let mut record: Value = serde_json::from_slice(&std::fs::read(run.path("a.json.run.json")).unwrap()).unwrap();
+    std::fs::write(run.path("query.json.run.json"), record.to_string()).unwrap();
+    run.succeed("scene", "scene.json", &["--scene", "photos", "--query", "query.json"]);
+    let scene = Scene::read(run.path("scene.json")).unwrap();
+    assert!((scene.up.unwrap().direction[2] - 1.0).abs() < 1e-6, "{:?}", scene.up);
+    let names: Vec<_> = scene.objects.iter().map(|o| o.name.as_ref().map(|n| n.text.clone())).collect();
+    assert_eq!(names, [Some("table".into()), Some("mug".into()), None, None, None]);
+    record["inputs"]["instances"] = json!("0123456789abcdef");
+    std::fs::write(run.path("query.json.run.json"), record.to_string()).unwrap();
+    run.fail("scene", "b.json", &["--query", "query.json"], &["queries of other instances; found 0123456789ab"]);
+}
+
+#[test]
+fn splats_keep_harmonics_and_ids_and_can_do_without_an_object() {
+    let run = Run::new();
+    let (g, label) = gaussians();
+    run.succeed("splats", "all.ply", &["--ids"]);
+    assert_eq!(ply::read_gaussians(run.path("all.ply")).unwrap(), g);
+    assert_eq!(Ids::read(run.path("all.ply"), g.len()).unwrap().instance, label);
+    run.succeed("splats", "rest.ply", &["--without", "1,3"]);
+    let rest: Vec<u32> = (0..g.len() as u32).filter(|&i| ![1, 3].contains(&label[i as usize])).collect();
+    assert_eq!(ply::read_gaussians(run.path("rest.ply")).unwrap(), g.select(&rest));
+    run.succeed("splats", "some.ply", &["--only", "4,0"]);
+    let (_, ids) = ply::read_labels(run.path("some.ply"), "instance").unwrap();
+    assert!(ids.len() == 2 * EACH && ids[..EACH].iter().all(|&i| i == 0) && ids[EACH..].iter().all(|&i| i == 4));
+
+    run.succeed("objects", "things", &[]);
+    let names: Vec<String> = (0..5).map(|k| format!("object_{k:04}.ply")).collect();
+    assert_eq!(objects_in(&run.path("things")), names);
+    let own: Vec<u32> = (0..g.len() as u32).filter(|&i| label[i as usize] == 3).collect();
+    assert_eq!(ply::read_gaussians(run.path("things/object_0003.ply")).unwrap(), g.select(&own));
+    // What an earlier run wrote and this one did not goes.
+    run.succeed("objects", "things", &["--only", "2"]);
+    assert_eq!(objects_in(&run.path("things")), ["object_0002.ply"]);
+    std::fs::write(run.path("things/mine.ply"), "mine").unwrap();
+    run.fail("objects", "things", &[], &["mine.ply", "the output exists and would be lost"]);
+}
+
+#[test]
+fn points_meshes_and_usd_are_written_the_same_each_time() {
+    let run = Run::new();
+    let bytes = |name: &str| std::fs::read(run.path(name)).unwrap();
+    for out in ["a.las", "a.ply"] {
+        run.succeed("points", out, &[]);
+        let first = bytes(out);
+        run.succeed("points", out, &["--threads", "1"]);
+        assert_eq!(bytes(out), first);
+    }
+    let mut reader = las::Reader::from_path(run.path("a.las")).unwrap();
+    assert_eq!(reader.read_all().unwrap().len(), 5 * EACH + 1);
+    run.succeed("points", "faint.ply", &["--min-opacity", "0.99"]);
+    assert!(ply::read_points(run.path("faint.ply")).unwrap().is_empty());
+
+    let said = run.succeed("meshes", "hulls", &[]);
+    assert!(said.contains("wrote 5 meshes") && !said.contains("boxes"), "{said}");
+    let text = String::from_utf8(bytes("hulls/object_0001.obj")).unwrap();
+    assert_eq!((text.matches("v ").count(), text.matches("f ").count()), (8, 12), "{text}");
+    run.succeed("meshes", "plys", &["--format", "ply", "--only", "1"]);
+    assert_eq!(ply::read_points(run.path("plys/object_0001.ply")).unwrap().len(), 8);
+
+    run.edits(vec![Edit::Rename { instance: 1, name: "mug".into() }]);
+    run.succeed("usd", "scene.usda", &["--up", "z", "--edits", "edits.json"]);
+    let stage = String::from_utf8(bytes("scene.usda")).unwrap();
+    assert_eq!(stage.matches("def ParticleField3DGaussianSplat").count(), 6, "five objects and what is in none");
+    assert_eq!(stage.matches("def Mesh \"collider\"").count(), 5);
+    assert!(stage.contains("displayName = \"mug\"") && stage.contains("sphericalHarmonicsDegree = 1"));
+    run.succeed("usd", "flat.usda", &["--sh", "0"]);
+    assert!(bytes("flat.usda").len() < stage.len());
+}
+
+#[test]
+fn what_cannot_be_done_is_said_in_one_line() {
+    let run = Run::new();
+    run.fail("objects", "o", &["--only", "9"], &["--only: no such object; found 9, expected ids of objects, 0 to 4"]);
+    run.fail("splats", "o.ply", &["--without", "0,7"], &["--without: no such object; found 7"]);
+    run.fail("splats", "o.xyz", &[], &["--out", "no format of splats has this extension; expected .ply"]);
+    run.fail("points", "o.e57", &[], &["expected .las or .ply"]);
+    run.fail("usd", "o.usdc", &[], &["expected .usda"]);
+    run.fail("scene", "geometry.ply", &[], &["the output is one of the inputs"]);
+    run.edits(vec![Edit::Merge { instances: vec![0, 1] }]);
+    run.fail("splats", "o.ply", &["--edits", "edits.json", "--only", "1"], &["no such object; found 1"]);
+    run.fail("scene", "o.json", &["--memory-limit", "1G"], &["does not forecast its memory"]);
+    // Other Gaussians than those of the instances.
+    let (g, _) = gaussians();
+    ply::write_gaussians(run.path("geometry.ply"), &g.select(&[1, 0, 2]), &[]).unwrap();
+    run.fail("scene", "o.json", &[], &["instances.safetensors"]);
+    let up = run.run("scene", "o.json", &["--up", "sideways"]);
+    assert_eq!(up.status.code(), Some(2));
+    assert!(String::from_utf8_lossy(&up.stderr).contains("not a direction"));
+}
+
+#[test]
+fn damaged_gaussians_go_nowhere() {
+    let run = Run::new();
+    let (mut g, label) = gaussians();
+    g.log_scales[0][0] = f32::NAN;
+    ply::write_gaussians(run.path("geometry.ply"), &g, &[]).unwrap();
+    run.write(&g, label);
+    let said = run.succeed("points", "a.las", &["--min-opacity", "0"]);
+    assert!(said.contains("skipped 1 of 3646 Gaussians: damaged"), "{said}");
+    assert_eq!(las::Reader::from_path(run.path("a.las")).unwrap().read_all().unwrap().len(), 5 * EACH);
+    run.succeed("splats", "all.ply", &[]);
+    assert!(ply::read_gaussians(run.path("all.ply")).is_ok(), "anyone can read it");
+}
