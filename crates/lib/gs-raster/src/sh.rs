@@ -1,55 +1,8 @@
-//! Real spherical harmonics up to degree 3, in 3DGS's order and signs.
+//! Gradients of colours from spherical harmonics.
 
 use glam::DVec3;
-
-const C0: f64 = 0.282_094_791_773_878_14;
-const C1: f64 = 0.488_602_511_902_919_9;
-const C2: [f64; 5] = [
-    1.092_548_430_592_079_2,
-    -1.092_548_430_592_079_2,
-    0.315_391_565_252_520_05,
-    -1.092_548_430_592_079_2,
-    0.546_274_215_296_039_6,
-];
-const C3: [f64; 7] = [
-    -0.590_043_589_926_643_5,
-    2.890_611_442_640_554_4,
-    -0.457_045_799_464_465_7,
-    0.373_176_332_590_115_4,
-    -0.457_045_799_464_465_7,
-    1.445_305_721_320_277_2,
-    -0.590_043_589_926_643_5,
-];
-
-/// Values of the basis at a unit direction; only the first (degree + 1)^2 are set.
-#[inline(always)]
-pub(crate) fn basis(degree: u8, DVec3 { x, y, z }: DVec3) -> [f64; 16] {
-    let mut b = [0.0; 16];
-    b[0] = C0;
-    if degree >= 1 {
-        b[1] = -C1 * y;
-        b[2] = C1 * z;
-        b[3] = -C1 * x;
-    }
-    let (xx, yy, zz) = (x * x, y * y, z * z);
-    if degree >= 2 {
-        b[4] = C2[0] * x * y;
-        b[5] = C2[1] * y * z;
-        b[6] = C2[2] * (2.0 * zz - xx - yy);
-        b[7] = C2[3] * x * z;
-        b[8] = C2[4] * (xx - yy);
-    }
-    if degree >= 3 {
-        b[9] = C3[0] * y * (3.0 * xx - yy);
-        b[10] = C3[1] * x * y * z;
-        b[11] = C3[2] * y * (4.0 * zz - xx - yy);
-        b[12] = C3[3] * z * (2.0 * zz - 3.0 * xx - 3.0 * yy);
-        b[13] = C3[4] * x * (4.0 * zz - xx - yy);
-        b[14] = C3[5] * z * (xx - yy);
-        b[15] = C3[6] * x * (xx - 3.0 * yy);
-    }
-    b
-}
+pub(crate) use gs_scene::harmonics::basis;
+use gs_scene::harmonics::{C1, C2, C3};
 
 /// Gradients of the basis functions as functions of x, y, z.
 #[inline(always)]

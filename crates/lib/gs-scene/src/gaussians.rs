@@ -103,6 +103,16 @@ impl Gaussians {
         self.damage(i).is_none()
     }
 
+    /// Checks that every Gaussian is whole.
+    pub fn check_whole(&self) -> Result<()> {
+        let Some((first, parameter)) = (0..self.len()).find_map(|i| Some((i, self.damage(i)?))) else { return Ok(()) };
+        let all = (first..self.len()).filter(|&i| !self.is_whole(i)).count();
+        Err(Error::new("a parameter is not finite")
+            .field(format!("vertex {first}, {parameter}"))
+            .found(format!("{all} of {} vertices with such a one", self.len()))
+            .hint("remove these vertices, or export the file again"))
+    }
+
     /// Whether every number of Gaussian `i` is finite.
     pub fn is_finite(&self, i: usize) -> bool {
         self.is_whole(i) && self.opacity_logits[i].is_finite()

@@ -1,13 +1,13 @@
 //! A finished geometry, as every stage after the first reads it.
 
-use crate::{Gaussians, ply};
+use crate::{Gaussians, ply, splat};
 use gs_io::{Error, Result};
 use std::path::Path;
 
 /// Opacity logit of a Gaussian that nothing shows.
 const INVISIBLE: f32 = -50.0;
 
-/// The Gaussians of a 3DGS PLY and how to treat them.
+/// The Gaussians of a file and how to treat them.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct Geometry {
     /// All Gaussians of the file, in its order, every number finite; [`Self::damaged`] ones are invisible stand-ins.
@@ -16,24 +16,26 @@ pub struct Geometry {
     pub damaged: Vec<u32>,
     /// Whether they were learnt with the 2D filter of Mip-Splatting, and so are to be rendered with it.
     pub antialias: bool,
+    /// What the file has that was left out, such as spherical harmonics of degree 4.
+    pub left_out: Vec<String>,
 }
 
 impl Geometry {
-    /// Reads a PLY. Damaged Gaussians do not condemn the rest: a transparent one takes the place of each, where its centre
+    /// Reads a file of any of the formats of [`splat`]. Damaged Gaussians do not condemn the rest: a transparent one takes the place of each, where its centre
     /// is or, if that is not finite, where the first whole Gaussian is, so that numbers stay and boxes do not grow. Infinite
-    /// opacity logits are no damage: they become +-50, as in [`ply::read_gaussians`].
+    /// opacity logits are no damage: they become +-50, as in [`splat::read_whole`].
     ///
     /// # Errors
-    /// When the file is damaged as a whole or is no 3DGS PLY, or all of its Gaussians are damaged.
+    /// When the file is damaged as a whole or is of no known format, or all of its Gaussians are damaged.
     pub fn read(path: impl AsRef<Path>) -> Result<Self> {
         let path = path.as_ref();
-        let mut g = ply::read_gaussians_as_they_are(path)?;
+        let splat::Splat { gaussians: mut g, antialias, left_out, .. } = splat::read(path)?;
         g.bound_opacities();
         let stride = g.sh_stride();
         let damaged: Vec<u32> = (0..g.len() as u32).filter(|&i| !g.is_whole(i as usize)).collect();
         let Some(first) = (0..g.len()).find(|&i| damaged.get(i) != Some(&(i as u32))) else {
             if g.is_empty() {
-                return Ok(Self { gaussians: g, damaged, antialias: ply::is_antialiased(path)? });
+                return Ok(Self { gaussians: g, damaged, antialias, left_out });
             }
             return Err(Error::new("no Gaussian is whole: every one has a number that is not finite")
                 .file(path)
@@ -50,17 +52,18 @@ impl Geometry {
             g.opacity_logits[i] = INVISIBLE;
             g.sh[i * stride..(i + 1) * stride].fill(0.0);
         }
-        Ok(Self { gaussians: g, damaged, antialias: ply::is_antialiased(path)? })
+        Ok(Self { gaussians: g, damaged, antialias, left_out })
     }
 
-    /// What is to be said of damaged Gaussians, where there are any.
+    /// What is to be said of damaged Gaussians and of what was left out, where there are any.
     pub fn damage(&self) -> Option<String> {
-        let first = self.damaged.first()?;
-        Some(format!(
-            "{} of {} Gaussians: damaged, a parameter is not finite (the first is vertex {first})",
-            self.damaged.len(),
-            self.gaussians.len()
-        ))
+        let damaged = self.damaged.first().map(|first| {
+            let (damaged, all) = (self.damaged.len(), self.gaussians.len());
+            format!("{damaged} of {all} Gaussians: damaged, a parameter is not finite (the first is vertex {first})")
+        });
+        let left_out = self.left_out.iter().map(|what| format!("not read: {what}"));
+        let said: Vec<String> = damaged.into_iter().chain(left_out).collect();
+        Some(said.join("; ")).filter(|said| !said.is_empty())
     }
 
     /// Whether each Gaussian is whole.

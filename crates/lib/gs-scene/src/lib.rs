@@ -10,10 +10,12 @@ mod camera;
 pub mod dataset;
 mod gaussians;
 mod geometry;
+pub mod harmonics;
 mod image;
 mod lens;
 mod order;
 pub mod ply;
+pub mod splat;
 
 pub use camera::Camera;
 pub use dataset::colmap;

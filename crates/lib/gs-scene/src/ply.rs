@@ -1,12 +1,14 @@
 //! PLY files: 3DGS Gaussians and coloured point clouds.
 //!
-//! The reader takes any property order, ascii and both binary byte orders, other elements and lists (skipped); the
+//! The reader takes any property order, ascii and both binary byte orders, other elements and lists (skipped), and
+//! PlayCanvas's compressed PLY; the
 //! writer writes what the original 3DGS code writes. Read by hand because a million Gaussians are 248 MB and generic
 //! readers need many times that.
 
 mod copy;
-mod table;
+pub(crate) mod table;
 
+use crate::splat::compressed_ply;
 use crate::{Gaussians, sh_coefficients};
 pub use copy::{INSTANCE, Vertices};
 use gs_io::{Error, IoContext, Result, write_atomic};
@@ -45,12 +47,15 @@ fn vertices<T>(path: &Path, take: impl FnOnce(&Table<'_>) -> Result<T>) -> Resul
     table::read(&bytes).and_then(|table| take(&table)).map_err(|e| e.file(path))
 }
 
-/// The comment lines of a PLY's header, without the word `comment`, and whether its vertices have an opacity.
-fn read_header(path: &Path) -> Result<(Vec<String>, bool)> {
+/// Properties of vertices by which Gaussians are known: as they are, and packed.
+const OF_GAUSSIANS: [&str; 2] = ["opacity", "packed_color"];
+
+/// The comment lines of a PLY's header, without the word `comment`, and whether its vertices have each of [`OF_GAUSSIANS`].
+fn read_header(path: &Path) -> Result<(Vec<String>, [bool; 2])> {
     let mut bytes = Vec::new();
     let file = std::fs::File::open(path).at("open", path)?;
     file.take(MAX_HEADER).read_to_end(&mut bytes).at("read", path)?;
-    let (comments, there) = table::read_header(&bytes, "opacity").map_err(|e| e.file(path))?;
+    let (comments, there) = table::read_header(&bytes, OF_GAUSSIANS).map_err(|e| e.file(path))?;
     Ok((comments.into_iter().map(String::from).collect(), there))
 }
 
@@ -65,7 +70,12 @@ pub fn is_antialiased(path: impl AsRef<Path>) -> Result<bool> {
 
 /// Whether a PLY's vertices are Gaussians rather than points: whether they have an opacity.
 pub fn holds_gaussians(path: impl AsRef<Path>) -> Result<bool> {
-    Ok(read_header(path.as_ref())?.1)
+    Ok(read_header(path.as_ref())?.1 != [false; 2])
+}
+
+/// Whether a PLY is a compressed one.
+pub(crate) fn is_compressed(path: &Path) -> Result<bool> {
+    Ok(read_header(path)?.1[1])
 }
 
 /// Reads the Gaussians of a 3DGS PLY. Without `f_rest_*` the spherical harmonics have degree 0; normals are ignored.
@@ -77,35 +87,37 @@ pub fn read_gaussians(path: impl AsRef<Path>) -> Result<Gaussians> {
     let path = path.as_ref();
     let mut g = read_gaussians_as_they_are(path)?;
     g.bound_opacities();
-    let Some((first, parameter)) = (0..g.len()).find_map(|i| Some((i, g.damage(i)?))) else { return Ok(g) };
-    let all = (first..g.len()).filter(|&i| !g.is_whole(i)).count();
-    Err(Error::new("a parameter is not finite")
-        .file(path)
-        .field(format!("vertex {first}, {parameter}"))
-        .found(format!("{all} of {} vertices with such a one", g.len()))
-        .hint("remove these vertices, or export the PLY again"))
+    g.check_whole().map_err(|e| e.file(path))?;
+    Ok(g)
 }
 
 /// Reads the Gaussians of a 3DGS PLY as [`read_gaussians`] does, but takes every number as it stands, finite or not: for
 /// looking at damaged files and repairing them.
 pub fn read_gaussians_as_they_are(path: impl AsRef<Path>) -> Result<Gaussians> {
-    vertices(path.as_ref(), gaussians_of)
+    let path = path.as_ref();
+    let bytes = std::fs::read(path).at("read", path)?;
+    from_bytes(&bytes).map_err(|e| e.file(path))
+}
+
+/// The Gaussians of a PLY's bytes, as [`read_gaussians_as_they_are`] gives them.
+fn from_bytes(bytes: &[u8]) -> Result<Gaussians> {
+    let [vertices, chunks, sh] = table::read_elements(bytes, ["vertex", "chunk", "sh"])?;
+    let vertices = vertices.ok_or_else(table::no_vertices)?;
+    if compressed_ply::is_compressed(&vertices) {
+        return compressed_ply::read(&vertices, chunks.as_ref(), sh.as_ref());
+    }
+    gaussians_of(&vertices)
 }
 
 fn gaussians_of(table: &Table<'_>) -> Result<Gaussians> {
-    let sh_degree = match table.count_of("f_rest_") {
-        0 => 0,
-        9 => 1,
-        24 => 2,
-        45 => 3,
-        n => {
-            return Err(Error::new("impossible number of spherical-harmonics properties")
-                .field("f_rest_*")
-                .found(n)
-                .expected("0, 9, 24 or 45")
-                .hint(AGAIN));
-        }
-    };
+    let rest = table.count_of("f_rest_");
+    let sh_degree = compressed_ply::degree_of_rest(rest).ok_or_else(|| {
+        Error::new("impossible number of spherical-harmonics properties")
+            .field("f_rest_*")
+            .found(rest)
+            .expected("0, 9, 24 or 45")
+            .hint(AGAIN)
+    })?;
     // The file holds them channel by channel, memory coefficient by coefficient.
     let k = sh_coefficients(sh_degree);
     let mut sh = ["f_dc_0", "f_dc_1", "f_dc_2"].map(String::from).to_vec();

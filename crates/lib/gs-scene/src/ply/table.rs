@@ -4,7 +4,7 @@ use gs_io::{Error, Result};
 use rayon::prelude::*;
 use std::borrow::Cow;
 
-pub(super) const AGAIN: &str = "export the PLY again";
+pub(crate) const AGAIN: &str = "export the PLY again";
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum Encoding {
@@ -111,12 +111,14 @@ struct Header<'a> {
     body: &'a [u8],
 }
 
-/// The comment lines of a file's header, and whether its vertices have the property `name`.
-pub(super) fn read_header<'a>(bytes: &'a [u8], name: &str) -> Result<(Vec<&'a str>, bool)> {
+/// The comment lines of a file's header, and for each of `names` whether its vertices have that property.
+pub(crate) fn read_header<'a, const N: usize>(bytes: &'a [u8], names: [&str; N]) -> Result<(Vec<&'a str>, [bool; N])> {
     let header = parse_header(bytes)?;
-    let vertices = header.elements.iter().filter(|e| e.name == "vertex");
-    let mut properties = vertices.flat_map(|e| &e.properties);
-    let there = properties.any(|p| matches!(p, Property::Scalar(n, _) if n == name));
+    let there = |name: &str| {
+        let vertices = header.elements.iter().filter(|e| e.name == "vertex");
+        vertices.flat_map(|e| &e.properties).any(|p| matches!(p, Property::Scalar(n, _) if n == name))
+    };
+    let there = names.map(there);
     Ok((header.comments, there))
 }
 
@@ -191,7 +193,7 @@ const ROWS: usize = 4096;
 
 /// A scalar property of the vertices.
 #[derive(Debug, Clone, Copy)]
-pub(super) struct Column {
+pub(crate) struct Column {
     at: usize,
     scalar: Scalar,
     big: bool,
@@ -200,8 +202,19 @@ pub(super) struct Column {
 }
 
 impl Column {
+    /// Its value in a row of words, where it is one ([`Table::words`]).
+    pub(crate) fn word(self, row: &[u8]) -> u32 {
+        let bytes = [row[self.at], row[self.at + 1], row[self.at + 2], row[self.at + 3]];
+        if self.big { u32::from_be_bytes(bytes) } else { u32::from_le_bytes(bytes) }
+    }
+
+    /// Its value in a row, where it is a byte ([`Table::bytes`]).
+    pub(crate) fn byte(self, row: &[u8]) -> u8 {
+        row[self.at]
+    }
+
     /// Whether the file stores it as a float or double.
-    pub(super) fn is_float(self) -> bool {
+    pub(crate) fn is_float(self) -> bool {
         matches!(self.named, Scalar::F32 | Scalar::F64)
     }
 
@@ -211,10 +224,11 @@ impl Column {
     }
 }
 
-/// The rows of element `vertex`. Binary rows without lists stay where they lie in the file; all others are rewritten
+/// The rows of an element. Binary rows without lists stay where they lie in the file; all others are rewritten
 /// as little-endian floats, without their lists.
-pub(super) struct Table<'a> {
-    pub(super) count: usize,
+pub(crate) struct Table<'a> {
+    pub(crate) name: String,
+    pub(crate) count: usize,
     stride: usize,
     columns: Vec<(String, Column)>,
     rows: Cow<'a, [u8]>,
@@ -231,7 +245,7 @@ impl<'a> Table<'a> {
             columns.push((name.clone(), Column { at: stride, scalar, big, named: *named }));
             stride += scalar.size();
         }
-        Self { count: element.count, stride, columns, rows }
+        Self { name: element.name.clone(), count: element.count, stride, columns, rows }
     }
 
     /// The table on its own, without the file.
@@ -256,17 +270,46 @@ impl<'a> Table<'a> {
     }
 
     /// The column of a property, where there is one.
-    pub(super) fn find(&self, name: &str) -> Option<Column> {
+    pub(crate) fn find(&self, name: &str) -> Option<Column> {
         self.columns.iter().find(|(n, _)| n == name).map(|(_, c)| *c)
     }
 
     /// How many properties have a name that begins so.
-    pub(super) fn count_of(&self, prefix: &str) -> usize {
+    pub(crate) fn count_of(&self, prefix: &str) -> usize {
         self.columns.iter().filter(|(n, _)| n.starts_with(prefix)).count()
     }
 
+    /// The columns of properties that the file stores as `uint`, in binary.
+    pub(crate) fn words<const N: usize>(&self, names: [&str; N]) -> Result<[Column; N]> {
+        self.of_type(names, Scalar::U32, "uint")
+    }
+
+    /// The columns of properties that the file stores as `uchar`, in binary.
+    pub(crate) fn bytes(&self, names: &[String]) -> Result<Vec<Column>> {
+        names.iter().map(|name| self.of_type([name], Scalar::U8, "uchar").map(|[c]| c)).collect()
+    }
+
+    fn of_type<const N: usize>(&self, names: [&str; N], scalar: Scalar, expected: &str) -> Result<[Column; N]> {
+        let mut all = Vec::with_capacity(N);
+        for name in names {
+            let found = self.find(name).filter(|c| c.scalar == scalar);
+            all.push(found.ok_or_else(|| {
+                Error::new("no such property in a binary PLY")
+                    .field(format!("element {}, property {name}", self.name))
+                    .expected(format!("property {expected} {name}"))
+                    .hint(AGAIN)
+            })?);
+        }
+        Ok(std::array::from_fn(|i| all[i]))
+    }
+
+    /// The rows as they lie, in order.
+    pub(crate) fn rows(&self) -> std::slice::ChunksExact<'_, u8> {
+        self.rows.chunks_exact(self.stride.max(1))
+    }
+
     /// The values of some columns, `[count][columns]`.
-    pub(super) fn gather(&self, columns: &[Column]) -> Vec<f32> {
+    pub(crate) fn gather(&self, columns: &[Column]) -> Vec<f32> {
         let mut out = vec![0.0; self.count * columns.len()];
         if out.is_empty() {
             return out;
@@ -293,7 +336,7 @@ impl<'a> Table<'a> {
     }
 
     /// The values of some properties, `[count][properties]`.
-    pub(super) fn values(&self, names: &[impl AsRef<str>]) -> Result<Vec<f32>> {
+    pub(crate) fn values(&self, names: &[impl AsRef<str>]) -> Result<Vec<f32>> {
         let column = |name: &str| {
             self.find(name).ok_or_else(|| {
                 Error::new("the vertices lack a property").field(name).hint(
@@ -305,7 +348,7 @@ impl<'a> Table<'a> {
     }
 
     /// The values of a few properties, one array a vertex.
-    pub(super) fn arrays<const N: usize>(&self, names: [&str; N]) -> Result<Vec<[f32; N]>> {
+    pub(crate) fn arrays<const N: usize>(&self, names: [&str; N]) -> Result<Vec<[f32; N]>> {
         Ok(self.values(&names)?.as_chunks().0.to_vec())
     }
 }
@@ -392,15 +435,18 @@ fn take_rows<'a>(element: &Element, encoding: Encoding, body: &mut &'a [u8]) -> 
     Ok(Cow::Owned(owned))
 }
 
-/// Reads the vertices of a PLY file. The other elements are walked through and left out: nothing may follow the last one.
-pub(super) fn read(bytes: &[u8]) -> Result<Table<'_>> {
+/// Reads the first elements of these names of a PLY file. The others are walked through and left out: nothing may follow the
+/// last one.
+pub(crate) fn read_elements<'a, const N: usize>(bytes: &'a [u8], names: [&str; N]) -> Result<[Option<Table<'a>>; N]> {
     let header = parse_header(bytes)?;
     let mut body = header.body;
-    let mut table = None;
+    let mut tables = [const { None }; N];
     for element in &header.elements {
         let rows = take_rows(element, header.encoding, &mut body)?;
-        if element.name == "vertex" && table.is_none() {
-            table = Some(Table::new(element, header.encoding, rows));
+        if let Some(i) = names.iter().position(|name| *name == element.name)
+            && tables[i].is_none()
+        {
+            tables[i] = Some(Table::new(element, header.encoding, rows));
         }
     }
     if !body.trim_ascii().is_empty() {
@@ -411,5 +457,16 @@ pub(super) fn read(bytes: &[u8]) -> Result<Table<'_>> {
             .expected(format!("the end of the file after {}, as the header says", counts.join(", ")))
             .hint(AGAIN));
     }
-    table.ok_or_else(|| Error::new("the file has no vertices").field("element vertex").hint(AGAIN))
+    Ok(tables)
+}
+
+/// What is said of a file without vertices.
+pub(crate) fn no_vertices() -> Error {
+    Error::new("the file has no vertices").field("element vertex").hint(AGAIN)
+}
+
+/// Reads the vertices of a PLY file, as [`read_elements`] does.
+pub(crate) fn read(bytes: &[u8]) -> Result<Table<'_>> {
+    let [vertices] = read_elements(bytes, ["vertex"])?;
+    vertices.ok_or_else(no_vertices)
 }

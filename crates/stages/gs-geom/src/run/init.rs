@@ -5,7 +5,7 @@ use crate::options::{Init, Train, check_some};
 use crate::start;
 use gs_io::{Error, Result};
 use gs_scene::dataset::{Dataset, Split, View};
-use gs_scene::{Camera, Gaussians, PointCloud, ply};
+use gs_scene::{Camera, Gaussians, PointCloud, ply, splat};
 use stage::Stage;
 use std::path::Path;
 
@@ -32,7 +32,7 @@ pub(crate) fn gaussians(
     stage: &Stage,
 ) -> Result<Gaussians> {
     if let Some(path) = options.init.file() {
-        if ply::holds_gaussians(path)? {
+        if splat::holds_gaussians(path)? {
             return from_gaussians(options, path, stage);
         }
         let read = ply::read_points(path)?;
@@ -71,7 +71,7 @@ fn from_points(options: &Train, points: &PointCloud, extent: f64, stage: &Stage)
 
 /// The Gaussians of a file, none of which may be damaged: no gradient repairs one, and `--densify fixed` keeps all.
 fn from_gaussians(options: &Train, path: &Path, stage: &Stage) -> Result<Gaussians> {
-    let g = ply::read_gaussians(path)?;
+    let g = splat::read_whole(path)?.gaussians;
     check_some(&g, path)?;
     let g = start::with_degree(g, options.sh_degree);
     if let Some(most) = most(options, g.len()) {
