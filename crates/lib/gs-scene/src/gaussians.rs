@@ -143,6 +143,21 @@ impl Gaussians {
         }
     }
 
+    /// The same with spherical harmonics of another degree: cut off, or filled with zeros.
+    #[must_use]
+    pub fn with_degree(self, sh_degree: u8) -> Self {
+        if self.sh_degree == sh_degree {
+            return self;
+        }
+        let (from, to) = (self.sh_stride(), 3 * sh_coefficients(sh_degree));
+        let mut sh = vec![0.0; self.len() * to];
+        for (new, old) in sh.chunks_exact_mut(to).zip(self.sh.chunks_exact(from)) {
+            let both = from.min(to);
+            new[..both].copy_from_slice(&old[..both]);
+        }
+        Self { sh, sh_degree, ..self }
+    }
+
     /// Checks that the arrays fit together.
     pub fn check(&self) -> Result<()> {
         let n = self.len();

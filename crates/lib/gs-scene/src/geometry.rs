@@ -21,14 +21,22 @@ pub struct Geometry {
 }
 
 impl Geometry {
-    /// Reads a file of any of the formats of [`splat`]. Damaged Gaussians do not condemn the rest: a transparent one takes the place of each, where its centre
+    /// Reads a file of any of the formats of [`splat`] that is one file. Damaged Gaussians do not condemn the rest: a transparent one takes the place of each, where its centre
     /// is or, if that is not finite, where the first whole Gaussian is, so that numbers stay and boxes do not grow. Infinite
     /// opacity logits are no damage: they become +-50, as in [`splat::read_whole`].
     ///
     /// # Errors
-    /// When the file is damaged as a whole or is of no known format, or all of its Gaussians are damaged.
+    /// When the file is damaged as a whole, is of no known format, or is several, or all of its Gaussians are damaged.
     pub fn read(path: impl AsRef<Path>) -> Result<Self> {
         let path = path.as_ref();
+        if let [_, .., last] = &splat::files(path)?[..] {
+            return Err(Error::new(
+                "the Gaussians lie in several files, and artifacts name a geometry by the hash of one",
+            )
+            .file(path)
+            .found(last.display())
+            .hint("make one file of them: gs-geom convert IN OUT.ply"));
+        }
         let splat::Splat { gaussians: mut g, antialias, left_out, .. } = splat::read(path)?;
         g.bound_opacities();
         let stride = g.sh_stride();

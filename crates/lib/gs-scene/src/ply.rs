@@ -180,7 +180,7 @@ pub fn some_gaussians(gaussians: &Gaussians, rows: &[u32], comments: &[String]) 
 }
 
 /// Writes a PLY to `w`, which errors call `place`.
-fn write_rows(
+pub(crate) fn write_rows(
     w: &mut dyn Write,
     place: &Path,
     gaussians: &Gaussians,

@@ -1,5 +1,8 @@
 //! Real captures and trained splats, which lie beside the project.
 
+mod common;
+
+use common::{Differences, ROUNDING};
 use gs_scene::dataset::{self, Format, LoadOptions, Resolution, Split};
 use gs_scene::{Gaussians, ply, splat};
 use std::path::PathBuf;
@@ -41,26 +44,6 @@ fn trained_splats_load_and_round_trip() {
     }
 }
 
-/// The largest differences between two versions of the same Gaussians: of centres, logarithms of scales, rotations (angle in
-/// radians), opacities and harmonic coefficients.
-fn differences(a: &Gaussians, b: &Gaussians) -> [f32; 5] {
-    assert_eq!((a.len(), a.sh_degree), (b.len(), b.sh_degree));
-    let most = |a: &[f32], b: &[f32]| a.iter().zip(b).fold(0.0f32, |m, (x, y)| m.max((x - y).abs()));
-    let angle = |i: usize| {
-        let length = |q: &[f32; 4]| q.iter().map(|v| v * v).sum::<f32>().sqrt();
-        let (p, q) = (&a.rotations[i], &b.rotations[i]);
-        let dot = p.iter().zip(q).map(|(x, y)| x * y).sum::<f32>() / (length(p) * length(q));
-        2.0 * dot.abs().min(1.0).acos()
-    };
-    [
-        most(a.means.as_flattened(), b.means.as_flattened()),
-        most(a.log_scales.as_flattened(), b.log_scales.as_flattened()),
-        (0..a.len()).map(angle).fold(0.0, f32::max),
-        (0..a.len()).map(|i| (a.opacity(i) - b.opacity(i)).abs()).fold(0.0, f32::max),
-        most(&a.sh, &b.sh),
-    ]
-}
-
 #[test]
 #[ignore = "needs shared/data/splats; run make test-data"]
 fn the_same_scan_in_two_formats_agrees() {
@@ -68,18 +51,43 @@ fn the_same_scan_in_two_formats_agrees() {
     // The PLY was made from the compressed one.
     let (plain, packed) = (read("guitar.ply"), read("guitar.compressed.ply"));
     assert_eq!((plain.kind.as_str(), packed.kind.as_str()), ("PLY", "compressed PLY"));
-    let [centre, scale, angle, opacity, sh] = differences(&plain.gaussians, &packed.gaussians);
-    assert!(
-        centre < 1e-5 && scale < 1e-5 && angle < 2e-3 && opacity < 1e-6 && sh < 1e-5,
-        "{centre} {scale} {angle} {opacity} {sh}"
-    );
+    Differences::between(&plain.gaussians, &packed.gaussians).within(ROUNDING);
     let (mut packed, spz) = (read("biker.compressed.ply"), read("biker.spz"));
     assert_eq!((spz.kind.as_str(), spz.gaussians.len()), ("SPZ version 4", 152_746));
     // SPZ holds no smaller scale.
     packed.gaussians.log_scales.as_flattened_mut().iter_mut().for_each(|s| *s = s.max(-10.0));
-    let [centre, scale, angle, opacity, sh] = differences(&packed.gaussians, &spz.gaussians);
-    assert!(
-        centre < 2e-4 && scale < 0.06 && angle < 4e-3 && opacity < 1e-6 && sh < 0.02,
-        "{centre} {scale} {angle} {opacity} {sh}"
-    );
+    // Half a step of SPZ and one of the chunks of the compressed PLY.
+    let step =
+        Differences { center: 2e-4, log_scale: 0.06, angle: 4e-3, opacity: 1e-6, color: 8e-3, harmonics: [0.0; 2] };
+    Differences::between(&packed.gaussians, &spz.gaussians).within(step);
+}
+
+#[test]
+#[ignore = "needs shared/data/splats; run make test-data"]
+fn sogs_are_plausible() {
+    for (name, kind, n, degree, size) in [
+        ("playbot_sog", "SOG version 2, unbundled", 31_000, 2, 0.2..2.0),
+        ("playbot_sog/meta.json", "SOG version 2, unbundled", 31_000, 2, 0.2..2.0),
+        ("statue.sog", "SOG version 2, bundled", 54_000, 0, 0.2..20.0),
+    ] {
+        let path = data(&format!("splats/{name}"));
+        let read = splat::read_whole(&path).unwrap();
+        let g = &read.gaussians;
+        println!("{name}: {} Gaussians, spread {}", g.len(), g.spread());
+        assert_eq!((read.kind.as_str(), g.sh_degree), (kind, degree));
+        assert!((g.len() as f64 / f64::from(n) - 1.0).abs() < 0.3, "{name}: {}", g.len());
+        assert!(size.contains(&g.spread()), "{name}: {}", g.spread());
+        // Colours are colours, most Gaussians are small and can be seen, rotations are of length 1.
+        let share = |of: &dyn Fn(usize) -> bool| (0..g.len()).filter(|&i| of(i)).count() as f64 / g.len() as f64;
+        assert!(share(&|i| g.base_color(i).iter().all(|c| (-0.2..1.2).contains(c))) > 0.95, "{name}");
+        assert!(share(&|i| g.opacity(i) > 0.02) > 0.9 && share(&|i| g.log_scales[i].iter().all(|s| *s < -2.0)) > 0.9);
+        assert!(share(&|i| (g.rotations[i].iter().map(|v| v * v).sum::<f32>() - 1.0).abs() < 1e-3) == 1.0, "{name}");
+    }
+    // Several files are no geometry of a stage, and their hash is that of all.
+    let unbundled = data("splats/playbot_sog/meta.json");
+    let e = gs_scene::Geometry::read(&unbundled).unwrap_err().to_string();
+    assert!(e.contains("several files") && e.contains("gs-geom convert"), "{e}");
+    assert_eq!(splat::files(&unbundled).unwrap().len(), 8);
+    assert_ne!(splat::hash(&unbundled).unwrap(), gs_io::hash_file(&unbundled).unwrap());
+    assert_eq!(splat::hash(data("splats/statue.sog")).unwrap(), gs_io::hash_file(data("splats/statue.sog")).unwrap());
 }

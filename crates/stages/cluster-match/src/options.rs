@@ -16,7 +16,7 @@ pub struct Args {
     /// Dataset folder (COLMAP, transforms.json or ScanNet)
     #[arg(long, value_name = "DIR")]
     pub(crate) scene: PathBuf,
-    /// The Gaussians, as a 3DGS PLY
+    /// The Gaussians: a PLY of 3DGS, or another format of docs/splats.md
     #[arg(long, value_name = "FILE")]
     pub(crate) geometry: PathBuf,
     /// graph.safetensors of graph-precompute

@@ -1,17 +1,14 @@
-//! Gaussians in 16 bytes each, for a page: the layout of PlayCanvas's compressed PLY (docs/explore.md). Gaussians that are
-//! near each other lie together, 256 to a chunk, and each number is a fraction of its chunk's range.
+//! The Gaussians that a page draws, as `gs_scene::splat::packing` has them (docs/explore.md), and the first band of their harmonics.
 
 use gs_scene::Gaussians;
+pub use gs_scene::splat::compressed_ply::CHUNK;
+use gs_scene::splat::packing::{self, along_a_curve, fraction};
 use rayon::prelude::*;
 
-/// Gaussians of a chunk.
-pub const CHUNK: usize = 256;
-/// Numbers of a chunk: least and most of position, logarithm of scale and colour, xyz each; two are for alignment.
-pub const CHUNK_FLOATS: usize = 20;
+/// Numbers of a chunk: those of `packing`, and two for alignment.
+pub const CHUNK_FLOATS: usize = packing::CHUNK_FLOATS + 2;
 /// Fainter than this a Gaussian is never drawn.
 const FAINTEST: f32 = 1.0 / 255.0;
-/// Logarithms of scales beyond this are cut.
-const LARGEST_LOG_SCALE: f32 = 20.0;
 
 /// The Gaussians of a scene as the page gets them; n of N.
 pub struct Packed {
@@ -30,11 +27,11 @@ pub struct Packed {
 
 /// Packs what is ever drawn. `degree` is 0 or 1.
 pub fn pack(g: &Gaussians, degree: u8) -> Packed {
-    let order = nearby(g);
+    let seen: Vec<u32> = (0..g.len() as u32).filter(|&i| g.opacity(i as usize) >= FAINTEST).collect();
+    let order = along_a_curve(g, &seen);
     let degree = degree.min(g.sh_degree);
-    let chunks: Vec<[f32; CHUNK_FLOATS]> = order.par_chunks(CHUNK).map(|some| ranges(g, some)).collect();
-    let words: Vec<[u32; 4]> =
-        order.par_iter().enumerate().map(|(at, &i)| words_of(g, i as usize, &chunks[at / CHUNK])).collect();
+    let packing::Packed { words, chunks } = packing::pack(g, &order);
+    let aligned = |chunk: [f32; packing::CHUNK_FLOATS]| std::array::from_fn(|i| chunk.get(i).copied().unwrap_or(0.0));
     let band = |i: &u32| &g.sh_of(*i as usize)[3..12];
     let harmonics_range = match degree {
         0 => 0.0,
@@ -44,80 +41,9 @@ pub fn pack(g: &Gaussians, degree: u8) -> Packed {
     let three = |c: &[f32]| ten(c[0]) << 20 | ten(c[1]) << 10 | ten(c[2]);
     let harmonics = match degree {
         0 => Vec::new(),
-        _ => order.iter().map(band).map(|b| [three(b), three(&b[3..]), three(&b[6..])]).collect(),
+        _ => order.par_iter().map(band).map(|b| [three(b), three(&b[3..]), three(&b[6..])]).collect(),
     };
-    Packed { order, words, chunks, harmonics, harmonics_range }
-}
-
-/// The Gaussians that can be seen, along a curve that keeps neighbours together (Morton's).
-fn nearby(g: &Gaussians) -> Vec<u32> {
-    let seen: Vec<u32> = (0..g.len() as u32).filter(|&i| g.opacity(i as usize) >= FAINTEST).collect();
-    // A few floaters far away must not take all the resolution.
-    let bounds = [0, 1, 2].map(|k| {
-        let mut along: Vec<f32> = seen.iter().map(|&i| g.means[i as usize][k]).collect();
-        along.sort_unstable_by(f32::total_cmp);
-        let at = |share: usize| along.get(along.len().saturating_sub(1) * share / 100).copied().unwrap_or(0.0);
-        (at(1), at(99))
-    });
-    let key = |&i: &u32| {
-        let cells =
-            [0, 1, 2].map(|k| u64::from(fraction(g.means[i as usize][k], bounds[k].0, bounds[k].1, (1 << 20) - 1)));
-        (0..20).fold(0u64, |key, bit| (0..3).fold(key, |key, k| key | (cells[k] >> bit & 1) << (3 * bit + k)))
-    };
-    let mut keyed: Vec<(u64, u32)> = seen.par_iter().map(|i| (key(i), *i)).collect();
-    keyed.par_sort_unstable();
-    keyed.into_iter().map(|(_, i)| i).collect()
-}
-
-/// Position, logarithm of scale and colour of a Gaussian.
-fn numbers(g: &Gaussians, i: usize) -> [[f32; 3]; 3] {
-    let scale = g.log_scales[i].map(|s| s.clamp(-LARGEST_LOG_SCALE, LARGEST_LOG_SCALE));
-    [g.means[i], scale, g.base_color(i)]
-}
-
-fn ranges(g: &Gaussians, some: &[u32]) -> [f32; CHUNK_FLOATS] {
-    let mut out = [0.0; CHUNK_FLOATS];
-    for group in 0..3 {
-        for k in 0..3 {
-            let values = || some.iter().map(|&i| numbers(g, i as usize)[group][k]);
-            out[6 * group + k] = values().fold(f32::INFINITY, f32::min);
-            out[6 * group + 3 + k] = values().fold(f32::NEG_INFINITY, f32::max);
-        }
-    }
-    out
-}
-
-/// Where `v` lies between `low` and `high`, in steps of 0 to `most`.
-fn fraction(v: f32, low: f32, high: f32, most: u32) -> u32 {
-    let range = f64::from(high) - f64::from(low);
-    let share = if range > 0.0 { (f64::from(v) - f64::from(low)) / range } else { 0.0 };
-    (share.clamp(0.0, 1.0) * f64::from(most)).round() as u32
-}
-
-fn words_of(g: &Gaussians, i: usize, chunk: &[f32; CHUNK_FLOATS]) -> [u32; 4] {
-    let [position, scale, color] = numbers(g, i);
-    let within = |v: [f32; 3], group: usize, most: [u32; 3]| {
-        [0, 1, 2].map(|k| fraction(v[k], chunk[6 * group + k], chunk[6 * group + 3 + k], most[k]))
-    };
-    let three = |[x, y, z]: [u32; 3]| x << 21 | y << 11 | z;
-    let [r, green, b] = within(color, 2, [255; 3]);
-    let opacity = fraction(g.opacity(i), 0.0, 1.0, 255);
-    [
-        three(within(position, 0, [2047, 1023, 2047])),
-        rotation(g.rotations[i]),
-        three(within(scale, 1, [2047, 1023, 2047])),
-        r << 24 | green << 16 | b << 8 | opacity,
-    ]
-}
-
-/// A quaternion w x y z by its three smaller parts, of the sign that makes the largest positive.
-fn rotation(q: [f32; 4]) -> u32 {
-    let norm = q.iter().map(|v| v * v).sum::<f32>().sqrt();
-    let largest = (0..4).max_by(|&a, &b| q[a].abs().total_cmp(&q[b].abs()).then(b.cmp(&a))).unwrap_or(0);
-    let sign = if q[largest] < 0.0 { -norm } else { norm };
-    let most = std::f32::consts::FRAC_1_SQRT_2;
-    let part = |k: usize| fraction(q[k] / sign, -most, most, 1023);
-    (0..4).filter(|&k| k != largest).fold(largest as u32, |word, k| word << 10 | part(k))
+    Packed { order, words, chunks: chunks.into_iter().map(aligned).collect(), harmonics, harmonics_range }
 }
 
 #[cfg(test)]
@@ -205,18 +131,5 @@ pub mod tests {
     fn nothing_packs_to_nothing() {
         let p = pack(&Gaussians::default(), 1);
         assert!(p.order.is_empty() && p.words.is_empty() && p.chunks.is_empty());
-    }
-
-    #[test]
-    fn the_largest_part_of_a_rotation_may_be_any() {
-        for q in [[1.0, 0.0, 0.0, 0.0], [0.0, -2.0, 0.0, 0.0], [0.5, 0.5, -0.5, 0.5], [0.1, 0.2, 0.3, -0.9]] {
-            let word = rotation(q);
-            let small = [20, 10, 0].map(|s| ((word >> s & 1023) as f32 / 1023.0 * 2.0 - 1.0) / 2f32.sqrt());
-            let mut back = small.to_vec();
-            back.insert((word >> 30) as usize, (1.0 - small.iter().map(|v| v * v).sum::<f32>()).max(0.0).sqrt());
-            let norm = q.iter().map(|v: &f32| v * v).sum::<f32>().sqrt();
-            let dot: f32 = (0..4).map(|k| back[k] * q[k] / norm).sum();
-            assert!(dot.abs() > 0.99999, "{q:?} {back:?}");
-        }
     }
 }

@@ -14,7 +14,7 @@ use std::path::PathBuf;
 #[derive(Debug, Parser)]
 #[command(name = "feat-train", version)]
 pub struct Args {
-    /// Gaussians, as a 3DGS PLY
+    /// Gaussians: a PLY of 3DGS, or another format of docs/splats.md
     #[arg(long, value_name = "FILE")]
     pub(crate) geometry: PathBuf,
     /// The graph.safetensors of graph-precompute

@@ -14,7 +14,7 @@ pub struct Args {
     /// Dataset folder (COLMAP, transforms.json or ScanNet)
     #[arg(long, value_name = "DIR")]
     pub(crate) scene: PathBuf,
-    /// Gaussians, as a 3DGS PLY
+    /// Gaussians: a PLY of 3DGS, or another format of docs/splats.md
     #[arg(long, value_name = "FILE")]
     pub(crate) geometry: PathBuf,
     /// Folder with id maps (<view>_s.npy)

@@ -1,22 +1,24 @@
-//! `gs-geom convert`: choosing, ordering and trimming Gaussians.
+//! `gs-geom convert`: choosing, ordering and trimming Gaussians, and writing them in another format.
 
 use crate::bounds::Bounds;
 use crate::memory;
 use crate::options::{Convert, Order, bytes};
-use crate::start;
 use artifacts::role;
-use gs_io::{Error, Result, hash_file};
-use gs_scene::{Gaussians, morton_order, ply};
+use gs_io::{Error, Result};
+use gs_scene::splat::{self, Extra, Format, Splat};
+use gs_scene::{Gaussians, morton_order};
 use serde_json::json;
 use stage::Stage;
 use std::collections::BTreeMap;
 
 impl Convert {
     pub(crate) fn run(&self, stage: &Stage) -> Result<()> {
-        let outputs = stage.outputs(&self.output).file(&self.output).reads([&self.input]);
+        Format::to_write(&self.output)?;
+        let outputs = stage.outputs(&self.output).file(&self.output).reads(splat::files(&self.input)?);
         let mut claim = outputs.claim()?;
         stage.forecast(memory::of_file(bytes(&self.input)?), "give a smaller file")?;
-        let mut g = ply::read_gaussians_as_they_are(&self.input)?;
+        let Splat { gaussians: mut g, antialias, kind, left_out } = splat::read(&self.input)?;
+        left_out.iter().for_each(|what| stage.skipped(&format!("not read: {what}")));
         let all = g.len();
         let mut chosen = choose(&g, self.min_opacity, self.crop);
         let dropped =
@@ -37,20 +39,18 @@ impl Convert {
         g = g.select(&chosen.kept);
         g.bound_opacities();
         let degree = self.sh_degree.unwrap_or(g.sh_degree);
-        g = start::with_degree(g, degree);
+        g = g.with_degree(degree);
         let parameters = json!(self);
-        let inputs = BTreeMap::from([(role::GEOMETRY.to_string(), hash_file(&self.input)?)]);
+        let inputs = BTreeMap::from([(role::GEOMETRY.to_string(), splat::hash(&self.input)?)]);
         let mut comments = vec![format!("made by gs-geom {} convert", env!("CARGO_PKG_VERSION"))];
         comments.extend(inputs.iter().map(|(role, hash)| format!("{role} {hash}")));
         comments.push(format!("parameters {parameters}"));
-        if ply::is_antialiased(&self.input)? {
-            comments.push(ply::ANTIALIASED.into());
-        }
-        ply::write_gaussians(&self.output, &g, &comments)?;
+        splat::write(&self.output, &g, &Extra { comments: &comments, antialias, instance: None })?;
         stage.info(&format!("{} of {all} Gaussians, SH degree {}, in {}", g.len(), g.sh_degree, self.output.display()));
         let summary = json!({
             "gaussians": g.len(),
             "of": all,
+            "from": kind,
             "not_finite": chosen.not_finite,
             "cropped": chosen.cropped,
             "faint": chosen.faint,

@@ -4,8 +4,9 @@ use crate::bounds::Bounds;
 use crate::memory;
 use crate::options::{Inspect, bytes};
 use gs_io::{IoContext, Result};
+use gs_scene::Gaussians;
 use gs_scene::dataset::{self, LoadOptions};
-use gs_scene::{Gaussians, ply};
+use gs_scene::splat::{self, Splat};
 use serde::Serialize;
 use serde_json::{Value, json};
 use stage::Stage;
@@ -22,16 +23,24 @@ const DECADES: std::ops::Range<i32> = -10..10;
 impl Inspect {
     /// Prints to standard output: text, or JSON objects.
     pub(crate) fn run(&self, json: bool, stage: &Stage) -> Result<()> {
-        let text = if self.file.is_dir() { self.list(json)? } else { self.describe(json, stage)? };
+        let of_gaussians = !self.file.is_dir() || self.file.join("meta.json").is_file();
+        let text = if !of_gaussians { self.list(json)? } else { self.describe(json, stage)? };
         stage.print(&text).map(drop)
     }
 
     fn describe(&self, json: bool, stage: &Stage) -> Result<String> {
-        let file_bytes = bytes(&self.file)?;
-        stage.needs(memory::of_file(file_bytes), "give a smaller file")?;
-        let report = inspect(&ply::read_gaussians_as_they_are(&self.file)?);
+        stage.needs(memory::of_file(bytes(&self.file)?), "give a smaller file")?;
+        let Splat { gaussians, antialias, kind, left_out } = splat::read(&self.file)?;
+        let report = inspect(&gaussians);
         let mut object = json!(report);
+        let mut file_bytes = 0;
+        for file in splat::files(&self.file)? {
+            file_bytes += std::fs::metadata(&file).at("read", &file)?.len();
+        }
         object["file_bytes"] = file_bytes.into();
+        object["format"] = kind.into();
+        object["antialias"] = antialias.into();
+        object["not_read"] = left_out.into();
         Ok(if json { format!("{object}\n") } else { text(&object, &report) })
     }
 

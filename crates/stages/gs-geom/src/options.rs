@@ -5,7 +5,7 @@ use crate::bounds::Bounds;
 use crate::densification::Strategy;
 use crate::photographs::masks::{Alpha, Masks};
 use clap::{Parser, Subcommand, ValueEnum};
-use gs_io::{Error, IoContext, Result};
+use gs_io::{Error, Result};
 use gs_raster::RasterOptions;
 use gs_scene::dataset::{self, Dataset, LoadOptions, Resolution};
 use gs_scene::{Gaussians, Geometry};
@@ -70,7 +70,7 @@ pub(crate) struct MaskOptions {
 
 #[derive(Debug, Clone, clap::Args)]
 pub(crate) struct GeometryOptions {
-    /// Gaussians, as a 3DGS PLY
+    /// Gaussians: a PLY of 3DGS, or another format of docs/splats.md
     #[arg(long, value_name = "FILE")]
     pub geometry: PathBuf,
 }
@@ -99,7 +99,7 @@ pub(crate) struct Train {
     #[arg(long, value_name = "DEGREE", default_value_t = 3, value_parser = clap::value_parser!(u8).range(0..=3))]
     pub sh_degree: u8,
     /// What to start from: the dataset's points (random points where it has none), random points in front of the cameras, or
-    /// a PLY of Gaussians or of points
+    /// a file of Gaussians (docs/splats.md) or a PLY of points
     #[arg(long, value_name = "points|random|FILE.ply", default_value = "points")]
     pub init: Init,
     /// Number of random points to start from, 1 to 1e9
@@ -197,20 +197,21 @@ pub(crate) struct Eval {
 
 #[derive(Debug, clap::Args)]
 pub(crate) struct Inspect {
-    /// Gaussians, as a 3DGS PLY of any property order and encoding; or the folder of a dataset, of which all files are
-    /// listed, each with its bytes and the time of its last change in seconds since 1970
+    /// Gaussians, in any format of docs/splats.md; or the folder of a dataset, of which all files are listed, each with its bytes
+    /// and the time of its last change in seconds since 1970
     #[arg(value_name = "FILE|FOLDER")]
     pub file: PathBuf,
 }
 
 #[derive(Debug, clap::Args, Serialize)]
 pub(crate) struct Convert {
-    /// Gaussians, as a 3DGS PLY of any property order and encoding
+    /// Gaussians: PLY of any property order and encoding, compressed PLY, SPZ, SOG (.sog, or its folder), .splat, .glb or .gltf
     #[arg(value_name = "IN")]
     #[serde(skip)]
     pub input: PathBuf,
-    /// Where to write them: little-endian floats in the property order of the original 3DGS code, 62 properties at SH
-    /// degree 3; another file than IN
+    /// Where to write them, in the format of the name: .ply (little-endian floats in the property order of the original 3DGS
+    /// code, 62 properties at SH degree 3), .compressed.ply, .spz, .splat (no harmonics beyond the constant one) or .glb; another
+    /// file than IN
     #[arg(value_name = "OUT")]
     #[serde(skip)]
     pub output: PathBuf,
@@ -383,9 +384,9 @@ pub(crate) fn check_some(gaussians: &Gaussians, path: &Path) -> Result<()> {
     Ok(())
 }
 
-/// Bytes of a file.
+/// Bytes that the Gaussians of a file would take as a PLY.
 pub(crate) fn bytes(path: &Path) -> Result<u64> {
-    Ok(std::fs::metadata(path).at("read", path)?.len())
+    gs_scene::splat::bytes_as_ply(path)
 }
 
 #[cfg(test)]

@@ -4,7 +4,7 @@ use crate::training::optimiser::zeros;
 use crate::training::schedule::{Purpose, generator};
 use glam::{DMat3, DVec3};
 use gs_io::{Error, Result};
-use gs_scene::{Camera, Gaussians, PointCloud, SH_C0, sh_coefficients};
+use gs_scene::{Camera, Gaussians, PointCloud, SH_C0};
 use kiddo::{ImmutableKdTree, SquaredEuclidean};
 use rand::Rng;
 use rand::seq::index::sample;
@@ -145,21 +145,6 @@ fn focus(cameras: &[&Camera]) -> DVec3 {
     if point.is_finite() && 2 * in_front > cameras.len() { point } else { fallback }
 }
 
-/// The Gaussians with spherical harmonics of another degree: cut off, or filled with zeros.
-#[must_use]
-pub fn with_degree(g: Gaussians, sh_degree: u8) -> Gaussians {
-    if g.sh_degree == sh_degree {
-        return g;
-    }
-    let (from, to) = (g.sh_stride(), 3 * sh_coefficients(sh_degree));
-    let mut sh = vec![0.0; g.len() * to];
-    for (new, old) in sh.chunks_exact_mut(to).zip(g.sh.chunks_exact(from)) {
-        let both = from.min(to);
-        new[..both].copy_from_slice(&old[..both]);
-    }
-    Gaussians { sh, sh_degree, ..g }
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -236,10 +221,10 @@ mod tests {
     fn degrees_are_cut_and_filled() {
         let mut g = zeros(2, 1);
         g.sh = (0..24).map(|v| v as f32).collect();
-        let up = with_degree(g.clone(), 3);
+        let up = g.clone().with_degree(3);
         assert_eq!(up.sh_of(1)[..12], g.sh[12..]);
         assert!(up.sh_of(1)[12..].iter().all(|&v| v == 0.0) && up.check().is_ok());
-        assert_eq!(with_degree(up, 1), g);
+        assert_eq!(up.with_degree(1), g);
     }
 
     proptest! {

@@ -4,9 +4,12 @@
 //! the position in 11, 10 and 11 bits, the logarithms of the scales likewise, the rotation in 2 bits and three times 10, and
 //! colour and opacity in four times 8; element `sh` has the rest of the harmonics.
 
+use super::packing;
 use crate::ply::table::{Column, Table};
 use crate::{Gaussians, SH_C0, sh_coefficients};
-use gs_io::{Error, Result};
+use gs_io::{Error, IoContext, Result};
+use std::io::Write;
+use std::path::Path;
 
 /// Gaussians of a chunk.
 pub const CHUNK: usize = 256;
@@ -141,4 +144,46 @@ fn coefficient(byte: u8) -> f32 {
         b => (f32::from(b) + 0.5) / 256.0,
     };
     (share - 0.5) * SH_RANGE
+}
+
+/// Writes a compressed PLY, which errors call `place`: in an order that keeps neighbours together, not that of `g`.
+pub(super) fn write(w: &mut dyn Write, place: &Path, g: &Gaussians, comments: &[String]) -> Result<()> {
+    let all: Vec<u32> = (0..g.len() as u32).collect();
+    let order = packing::along_a_curve(g, &all);
+    let packed = packing::pack(g, &order);
+    let rest = 3 * (sh_coefficients(g.sh_degree) - 1);
+    let mut header = String::from("ply\nformat binary_little_endian 1.0\n");
+    header.extend(comments.iter().map(|c| format!("comment {}\n", c.replace(['\n', '\r'], " "))));
+    header += &format!("element chunk {}\n", packed.chunks.len());
+    for (group, names) in [("", ["x", "y", "z"]), ("scale_", ["x", "y", "z"]), ("", ["r", "g", "b"])] {
+        for most in ["min", "max"] {
+            header.extend(names.map(|name| format!("property float {most}_{group}{name}\n")));
+        }
+    }
+    header += &format!("element vertex {}\n", g.len());
+    header.extend(PACKED.map(|name| format!("property uint {name}\n")));
+    if rest > 0 {
+        header += &format!("element sh {}\n", g.len());
+        header.extend((0..rest).map(|i| format!("property uchar f_rest_{i}\n")));
+    }
+    header += "end_header\n";
+    let mut put = |bytes: &[u8]| w.write_all(bytes).at("write", place);
+    put(header.as_bytes())?;
+    packed.chunks.iter().try_for_each(|chunk| put(chunk.map(f32::to_le_bytes).as_flattened()))?;
+    packed.words.iter().try_for_each(|words| put(words.map(u32::to_le_bytes).as_flattened()))?;
+    if rest > 0 {
+        let (k, mut row) = (rest / 3, vec![0; rest]);
+        for &i in &order {
+            // Channel by channel in the file, coefficient by coefficient in memory.
+            let sh = &g.sh_of(i as usize)[3..];
+            row.iter_mut().enumerate().for_each(|(j, byte)| *byte = byte_of(sh[j % k * 3 + j / k]));
+            put(&row)?;
+        }
+    }
+    Ok(())
+}
+
+/// The byte whose [`coefficient`] is nearest.
+fn byte_of(v: f32) -> u8 {
+    ((v / SH_RANGE + 0.5) * 256.0).floor().clamp(0.0, 255.0) as u8
 }

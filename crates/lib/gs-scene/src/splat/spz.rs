@@ -5,6 +5,8 @@
 //! of these. Axes are right, up, back, unless an extension says otherwise.
 
 use super::Splat;
+pub(super) mod writer;
+
 use super::axes::Axes;
 use super::compressed_ply::from_three;
 use super::stream::Stream;
@@ -108,6 +110,18 @@ impl Header {
     fn harmonics_bytes(&self) -> usize {
         3 * (sh_coefficients(self.degree) - 1)
     }
+}
+
+/// How many Gaussians a file claims to hold, and the degree of their harmonics here.
+pub(super) fn claim(path: &Path) -> Result<(u64, u8)> {
+    let mut file = BufReader::with_capacity(1 << 12, File::open(path).at("open", path)?);
+    let file_bytes = file.get_ref().metadata().at("read", path)?.len();
+    let start = match file.fill_buf().at("read", path)?.starts_with(&MAGIC) {
+        true => Stream::new(file).array("header")?,
+        false => Stream::new(GzDecoder::new(file)).array("header")?,
+    };
+    let header = Header::read(&start, file_bytes)?;
+    Ok((header.count as u64, header.degree.min(3)))
 }
 
 /// Reads an SPZ file; the caller names it in errors.

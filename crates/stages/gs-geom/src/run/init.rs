@@ -73,7 +73,7 @@ fn from_points(options: &Train, points: &PointCloud, extent: f64, stage: &Stage)
 fn from_gaussians(options: &Train, path: &Path, stage: &Stage) -> Result<Gaussians> {
     let g = splat::read_whole(path)?.gaussians;
     check_some(&g, path)?;
-    let g = start::with_degree(g, options.sh_degree);
+    let g = g.with_degree(options.sh_degree);
     if let Some(most) = most(options, g.len()) {
         return Err(Error::new("more Gaussians than --max-gaussians")
             .file(path)
