@@ -7,7 +7,7 @@ cd "$(dirname "$0")/.."
 seconds=${1:-600}
 shift || true
 formats=("$@")
-[ ${#formats[@]} -gt 0 ] || formats=(ply colmap_bin colmap_txt transforms npy npz artifact labels scannet id_png)
+[ ${#formats[@]} -gt 0 ] || formats=(ply colmap_bin colmap_txt transforms npy npz artifact labels scannet spz sog dot_splat gltf id_png)
 cargo +nightly fuzz --version > /dev/null || { echo "fuzz.sh: cargo install cargo-fuzz, rustup toolchain install nightly" >&2; exit 2; }
 cargo run --release -q -p hostile-files --example corpus -- fuzz/corpus
 for format in "${formats[@]}"; do

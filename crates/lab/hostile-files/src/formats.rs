@@ -7,10 +7,11 @@ use artifacts::{
 use clap::Parser;
 use eval::{read_labels, read_mask, read_truth};
 use gs_scene::dataset::{self, LoadOptions, Resolution};
-use gs_scene::{Geometry, Image, PointCloud, ply};
+use gs_scene::{Geometry, Image, PointCloud, ply, splat};
 use query::{TextSource, TextTable};
 use stage::{Program, Stage};
 use std::fs;
+use std::io::Write;
 use std::path::{Component, Path, PathBuf};
 use std::sync::OnceLock;
 
@@ -36,7 +37,7 @@ const JSON: usize = 200;
 const PICTURE: usize = 2_000 * 24;
 
 /// All formats.
-pub const FORMATS: [Format; 10] = [
+pub const FORMATS: [Format; 14] = [
     Format { name: "ply", check: check_ply, seeds: seeds::ply, memory: (FIXED, BINARY) },
     Format {
         name: "colmap_bin",
@@ -58,6 +59,14 @@ pub const FORMATS: [Format; 10] = [
     // Edits of instances, too. Polygons stand for pictures of the size that the file names; all of a frame have 2^28 pixels at most.
     Format { name: "labels", check: check_labels, seeds: seeds::labels, memory: (FIXED + (1 << 28), JSON) },
     Format { name: "scannet", check: check_scannet, seeds: seeds::scannet, memory: (FIXED, JSON) },
+    // Packed: a byte stands for as many as gzip makes of it, and a Gaussian takes 26 times what it has in the file. A window of
+    // zstd is believed up to 8 MiB, and held twice.
+    Format { name: "spz", check: check_spz, seeds: seeds::spz, memory: (20 * FIXED, 27_000) },
+    // 64 Gaussians a byte are believed, in as many pixels of several pictures; the palette of harmonics has 2^20 pixels.
+    Format { name: "sog", check: check_sog, seeds: seeds::sog, memory: (64 * FIXED, 64 * 400) },
+    Format { name: "dot_splat", check: check_dot_splat, seeds: seeds::dot_splat, memory: (FIXED, BINARY) },
+    // A byte may be read as a number, and stand in several vectors.
+    Format { name: "gltf", check: check_gltf, seeds: seeds::gltf, memory: (FIXED, 2 * JSON) },
     // Writing takes a buffer of a megabyte for each file.
     Format { name: "id_png", check: check_id_png, seeds: seeds::id_png, memory: (4 * FIXED, PICTURE) },
 ];
@@ -98,6 +107,9 @@ pub(crate) fn folder() -> &'static Path {
         }
         for i in 0..3 {
             put(&format!("scannet/pose/{i}.txt"), &seeds::scannet()[4][1..]);
+        }
+        for (name, bytes) in SOG.iter().zip(seeds::sog()) {
+            put(&format!("sog/{name}"), &bytes[1..]);
         }
         put("labels/one", b"");
         dir
@@ -154,6 +166,54 @@ fn check_ply(bytes: &[u8]) {
             assert_eq!(vertices.len(), labels.len());
         }
         sound(ply::is_antialiased(path), path);
+    });
+}
+
+/// Gives a file of Gaussians to their readers; errors name something in `inside`.
+fn check_splat(path: &Path, inside: &Path) {
+    if let Some(read) = sound(splat::read(path), inside) {
+        assert!(read.gaussians.check().is_ok());
+    }
+    if let Some(g) = sound(Geometry::read(path), inside) {
+        assert!(g.gaussians.means.iter().flatten().all(|v| v.is_finite()));
+    }
+    for file in sound(splat::files(path), inside).into_iter().flatten() {
+        assert_eq!(file.parent(), path.parent(), "{} leads out", file.display());
+    }
+    sound(splat::bytes_as_ply(path), inside);
+}
+
+fn check_spz(bytes: &[u8]) {
+    with("a.spz", bytes, |path| check_splat(path, path));
+    // What is in gzip is damaged inside it too.
+    if bytes.starts_with(b"NGSP") {
+        let mut packed = flate2::write::GzEncoder::new(Vec::new(), flate2::Compression::fast());
+        packed.write_all(bytes).expect("in memory");
+        with("a.spz", &packed.finish().expect("in memory"), |path| check_splat(path, path));
+    }
+}
+
+fn check_dot_splat(bytes: &[u8]) {
+    with("a.splat", bytes, |path| check_splat(path, path));
+}
+
+fn check_gltf(bytes: &[u8]) {
+    let name = if bytes.starts_with(b"glTF") { "a.glb" } else { "a.gltf" };
+    with(name, bytes, |path| check_splat(path, path));
+}
+
+/// The files of a SOG, in the order of their seeds; behind them an archive of all.
+const SOG: [&str; 9] =
+    ["meta.json", "l.webp", "u.webp", "q.webp", "s.webp", "c.webp", "p.webp", "n.webp", "a.sog"];
+
+fn check_sog(bytes: &[u8]) {
+    let files = SOG.map(|name| format!("sog/{name}"));
+    check_part(&files, bytes, |path| {
+        let folder = folder().join("sog");
+        check_splat(&folder.join("meta.json"), &folder);
+        if path.ends_with("a.sog") {
+            check_splat(path, path);
+        }
     });
 }
 

@@ -5,6 +5,7 @@ use artifacts::{
     TreeEdge, TruePoints,
 };
 use gs_io::Provenance;
+use gs_scene::splat::{self, Extra, Format as SplatFormat};
 use gs_scene::{Camera, Gaussians, Image, PointCloud, colmap, ply};
 use std::fs;
 use std::io::Write;
@@ -26,15 +27,90 @@ fn points() -> PointCloud {
     PointCloud { positions: vec![[0.0, 1.0, 2.0]; 6], colors: vec![[9, 8, 7]; 6] }
 }
 
-pub(crate) fn ply() -> Vec<Vec<u8>> {
-    let g = Gaussians {
+fn gaussians() -> Gaussians {
+    Gaussians {
         means: vec![[1.0, 2.0, 3.0]; 5],
         log_scales: vec![[-3.0; 3]; 5],
         rotations: vec![[1.0, 0.0, 0.0, 0.0]; 5],
         opacity_logits: vec![0.5; 5],
         sh: vec![0.25; 5 * 12],
         sh_degree: 1,
+    }
+}
+
+fn splat(format: SplatFormat) -> Vec<u8> {
+    splat::encode(format, &gaussians(), &Extra::default()).expect("written")
+}
+
+/// Of version 3 as it is; of versions 1 to 3 before they are packed; of version 4, with an extension.
+pub(crate) fn spz() -> Vec<Vec<u8>> {
+    let header = |version: u8, degree: u8, flags: u8| {
+        [&b"NGSP"[..], &[version, 0, 0, 0, 2, 0, 0, 0, degree, 12, flags, 0]].concat()
     };
+    let extension = [0x03, 0x00, 0xbe, 0xad, 4, 0, 0, 0, 6, 0, 0, 0];
+    let mut new = header(4, 0, 2);
+    new[15] = 5;
+    new.extend([32 + 12, 0, 0, 0]);
+    new.extend([0; 12]);
+    new.extend(extension);
+    // Frames of zstd of one block as it is.
+    let sizes = [18u8, 2, 6, 6, 8];
+    sizes.iter().for_each(|s| new.extend([9 + s, 0, 0, 0, 0, 0, 0, 0, *s, 0, 0, 0, 0, 0, 0, 0]));
+    for size in sizes {
+        new.extend([0x28, 0xb5, 0x2f, 0xfd, 0x20, size, 1 | size << 3, size >> 5, 0]);
+        new.extend(vec![7; usize::from(size)]);
+    }
+    vec![
+        splat(SplatFormat::Spz),
+        [header(1, 1, 0), vec![9; 12 + 2 + 6 + 6 + 6 + 18]].concat(),
+        [header(2, 4, 1), vec![9; 18 + 2 + 6 + 6 + 6 + 144]].concat(),
+        [header(3, 3, 2), vec![9; 18 + 2 + 6 + 6 + 8 + 90], extension.to_vec()].concat(),
+        new,
+    ]
+}
+
+/// A file of a SOG behind a byte that says which.
+pub(crate) fn sog() -> Vec<Vec<u8>> {
+    let picture = |width: u32| {
+        let pixels: Vec<u8> = (0..8 * width).flat_map(|i| [i as u8 % 2, 0, 3, 252 + i as u8 % 4]).collect();
+        let mut bytes = Vec::new();
+        let encoder = image_webp::WebPEncoder::new(&mut bytes);
+        encoder.encode(&pixels, width, 8, image_webp::ColorType::Rgba8).expect("written");
+        bytes
+    };
+    let table = format!("[{}1]", "0.5,".repeat(255));
+    let meta = format!(
+        r#"{{"version":2,"count":50,"means":{{"mins":[-1,-1,-1],"maxs":[1,1,1],"files":["l.webp","u.webp"]}},
+"scales":{{"codebook":{table},"files":["s.webp"]}},"quats":{{"files":["q.webp"]}},"sh0":{{"codebook":{table},"files":["c.webp"]}},
+"shN":{{"count":64,"bands":1,"codebook":{table},"files":["p.webp","n.webp"]}}}}"#
+    );
+    let mut parts = vec![meta.into_bytes()];
+    parts.extend([8, 8, 8, 8, 8, 192, 8].map(picture));
+    let mut archive = zip::ZipWriter::new(std::io::Cursor::new(Vec::new()));
+    let names = ["meta.json", "l.webp", "u.webp", "q.webp", "s.webp", "c.webp", "p.webp", "n.webp"];
+    for (name, bytes) in names.iter().zip(&parts) {
+        archive.start_file(*name, zip::write::SimpleFileOptions::default()).expect("begun");
+        archive.write_all(bytes).expect("written");
+    }
+    parts.push(archive.finish().expect("finished").into_inner());
+    parts.into_iter().zip(0u8..).map(|(bytes, i)| [vec![i], bytes].concat()).collect()
+}
+
+pub(crate) fn dot_splat() -> Vec<Vec<u8>> {
+    vec![splat(SplatFormat::Splat)]
+}
+
+pub(crate) fn gltf() -> Vec<Vec<u8>> {
+    let glb = splat(SplatFormat::Gltf);
+    // The same as text, of its nodes and with nothing in its buffer.
+    let length = u32::from_le_bytes([glb[12], glb[13], glb[14], glb[15]]) as usize;
+    let text = String::from_utf8_lossy(&glb[20..20 + length]).replace(r#"{"byteLength""#, r#"{"uri":"data:;base64,AAAA","byteLength""#);
+    let node = r#""nodes":[{"mesh":0,"rotation":[0,0,0.6,0.8],"scale":[2,2,2]}]"#;
+    vec![glb, text.replace(r#""nodes":[{"mesh":0}]"#, node).into_bytes()]
+}
+
+pub(crate) fn ply() -> Vec<Vec<u8>> {
+    let g = gaussians();
     let lists = "ply\nformat ascii 1.0\nelement face 2\nproperty list uchar int i\nelement vertex 2\nproperty float x\n\
                  property list uchar float l\nproperty float y\nproperty float z\nproperty ushort label\nend_header\n\
                  3 1 2 3\n1 4\n0.5 2 1 2 1 2 5\n1 0 2 3 6\n";
@@ -50,6 +126,7 @@ pub(crate) fn ply() -> Vec<Vec<u8>> {
         made("a.ply", |p| ply::write_points(p, &points(), &[]).expect("written")),
         lists.into(),
         big.concat(),
+        splat(SplatFormat::CompressedPly),
     ]
 }
 

@@ -109,6 +109,49 @@ fn a_file_is_trimmed_cropped_pruned_and_ordered() {
     assert_eq!(ply::read_gaussians(&full).unwrap().len(), 15);
 }
 
+#[test]
+fn a_file_is_converted_by_the_name_of_the_output_and_its_format_is_said() {
+    let dir = Folder::new();
+    let file = written(&dir);
+    let inspect = |file: &str| -> Value { serde_json::from_str(&succeeds(&["inspect", file, "--json"])).unwrap() };
+    assert_eq!(inspect(&file)["format"], "PLY");
+    let mut from = file;
+    for (name, format, degree) in [
+        ("a.compressed.ply", "compressed PLY", 3),
+        ("a.glb", "glTF 2.0 with KHR_gaussian_splatting", 3),
+        ("a.spz", "SPZ version 3", 3),
+        ("a.splat", ".splat", 0),
+        ("b.ply", "PLY", 0),
+    ] {
+        let out = dir.path(name);
+        succeeds(&["convert", &from, &out, "--quiet"]);
+        let facts = inspect(&out);
+        // The one that is not a number was dropped on the first way.
+        assert_eq!(
+            (&facts["format"], &facts["gaussians"], &facts["sh_degree"]),
+            (&format.into(), &39.into(), &degree.into())
+        );
+        assert_eq!(facts["file_bytes"], fs::metadata(&out).unwrap().len());
+        from = out;
+    }
+    let (g, all) = (ply::read_gaussians(&from).unwrap(), gaussians());
+    // Centres on a line, in the order of the compressed PLY; within its steps.
+    let mut along: Vec<f32> = g.means.iter().map(|m| m[0]).collect();
+    along.sort_unstable_by(f32::total_cmp);
+    let wanted = all.means.iter().filter(|m| m[1].is_finite()).map(|m| m[0]);
+    assert!(along.iter().zip(wanted).all(|(a, b)| (a - b).abs() < 0.005), "{along:?}");
+    let record: Value = serde_json::from_slice(&fs::read(format!("{from}.run.json")).unwrap()).unwrap();
+    assert_eq!(record["summary"]["from"], ".splat");
+    // Nothing is guessed from another name.
+    assert!(
+        refused(&["convert", &from, &dir.path("c.sog")])
+            .contains("ends in .ply, .compressed.ply, .spz, .splat or .glb")
+    );
+    fs::write(dir.path("d.spz"), "no splat").unwrap();
+    assert!(refused(&["convert", &dir.path("d.spz"), &dir.path("d.ply")]).contains("not a file of Gaussians"));
+    assert!(refused(&["inspect", &dir.path("d.spz")]).contains("d.spz: not a file of Gaussians"));
+}
+
 /// Runs what a shell does before the program, such as `ulimit -f 1;`, and then the program.
 #[cfg(unix)]
 fn in_shell(before: &str, arguments: &[&str]) -> Command {

@@ -15,6 +15,8 @@ use gs_io::{Error, IoContext, Result};
 use serde_json::Value;
 use std::path::{Path, PathBuf};
 
+/// Bytes of the buffers for each Gaussian at least: 24 where accessors do not overlap, and a mesh may be shown a few times.
+const LEAST_BYTES: usize = 8;
 const EXTENSION: &str = "KHR_gaussian_splatting";
 /// Left, up, forward to right, down, forward, and back.
 pub(super) const FLIPS: [f64; 3] = [-1.0, -1.0, 1.0];
@@ -100,6 +102,12 @@ pub(super) fn read(path: &Path) -> Result<Splat> {
                 let mut part = gaussians(primitive, &description, &buffers).map_err(at)?;
                 axes.apply(&mut part);
                 append(&mut all, part);
+                if all.len() > buffers.bytes() / LEAST_BYTES {
+                    return Err(Error::new("more Gaussians than its buffers can hold: meshes or accessors repeat the same bytes")
+                        .field("nodes")
+                        .found(format!("{} Gaussians", all.len()))
+                        .expected(format!("at most {} in {} bytes", buffers.bytes() / LEAST_BYTES, buffers.bytes())));
+                }
                 notes(&primitive["extensions"][EXTENSION], &mut left_out);
             }
         }

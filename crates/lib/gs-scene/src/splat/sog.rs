@@ -16,8 +16,8 @@ use zip::ZipArchive;
 
 /// The file that describes the others.
 pub(super) const META: &str = "meta.json";
-/// Pixels for each byte of all files beyond which a header lies.
-const PIXELS_PER_BYTE: u64 = 2_000;
+/// Gaussians for each byte of all files beyond which a header lies: scans have one in 13 bytes.
+const GAUSSIANS_PER_BYTE: u64 = 64;
 /// Pixels of the palette of harmonics: 65,536 rows of 15 at most.
 const MOST_PALETTE: u64 = 1 << 20;
 /// What an archive's file may be larger than the archive.
@@ -134,7 +134,7 @@ impl Reader {
             v => return Err(self.wrong("version").found(v).expected("2, or none for version 1")),
         };
         let count = count(&self.meta);
-        let most = self.bytes.saturating_mul(PIXELS_PER_BYTE);
+        let most = self.bytes.saturating_mul(GAUSSIANS_PER_BYTE);
         if count == 0 || count > most {
             return Err(self.wrong("count").found(count).expected(format!("1 to {most} in {} bytes", self.bytes)));
         }

@@ -36,6 +36,11 @@ impl<'a> Buffers<'a> {
         Ok(Self(all))
     }
 
+    /// Bytes of all of them.
+    pub(super) fn bytes(&self) -> usize {
+        self.0.iter().map(|b| b.len()).sum()
+    }
+
     /// An accessor by its number; errors are for its field.
     pub(super) fn accessor(&self, description: &Value, index: u64) -> Result<Accessor<'_>> {
         let accessor = &description["accessors"][index as usize];
