@@ -8,6 +8,8 @@ pub mod named;
 pub mod points;
 pub mod polygon;
 pub(crate) mod regions;
+#[cfg(test)]
+mod relations;
 pub mod scannet;
 
 use gs_io::{Error, Result, write_bytes};

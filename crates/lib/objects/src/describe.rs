@@ -38,11 +38,14 @@ pub fn describe(
 ) -> Scene {
     let members = members(&instances.label, instances.len());
     let sizes = instances.cluster_sizes();
-    let objects: Vec<Object> = (0..instances.len() as u32)
-        .filter(|&k| !members[k as usize].is_empty())
-        .map(|k| {
+    let there: Vec<u32> = (0..instances.len() as u32).filter(|&k| !members[k as usize].is_empty()).collect();
+    let centers: Vec<_> = there.iter().map(|&k| solid_centers(gaussians, &members[k as usize])).collect();
+    let objects: Vec<Object> = there
+        .iter()
+        .zip(&centers)
+        .map(|(&k, centers)| {
             let own = &members[k as usize];
-            let bounds = upright_box(&solid_centers(gaussians, own), up.map(|u| u.vector()));
+            let bounds = upright_box(centers, up.map(|u| u.vector()));
             let (parent, parts) = family(instances, &sizes, k);
             Object {
                 id: k,
@@ -65,7 +68,7 @@ pub fn describe(
         gaussians: gaussians.len() as u32,
         up,
         metres_per_unit: remarks.metres_per_unit,
-        relations: relations(&objects),
+        relations: relations(&objects, &centers),
         objects,
     }
 }
