@@ -8,6 +8,7 @@ use clap::Parser;
 use eval::{read_labels, read_mask, read_truth};
 use gs_scene::dataset::{self, LoadOptions, Resolution};
 use gs_scene::{Geometry, Image, PointCloud, ply, splat};
+use objects::{Ids, Scene};
 use query::{TextSource, TextTable};
 use stage::{Program, Stage};
 use std::fs;
@@ -56,7 +57,7 @@ pub const FORMATS: [Format; 14] = [
     // One array of 16 MiB is believed, then 64 bytes a byte; of one-byte numbers, as floats.
     Format { name: "npz", check: check_npz, seeds: seeds::npz, memory: (7 << 24, JSON + 64 * 5) },
     Format { name: "artifact", check: check_artifact, seeds: seeds::artifact, memory: (FIXED, JSON) },
-    // Edits of instances, too. Polygons stand for pictures of the size that the file names; all of a frame have 2^28 pixels at most.
+    // Edits of instances, scene.json and ids of Gaussians, too. Polygons stand for pictures of the size that the file names; all of a frame have 2^28 pixels at most.
     Format { name: "labels", check: check_labels, seeds: seeds::labels, memory: (FIXED + (1 << 28), JSON) },
     Format { name: "scannet", check: check_scannet, seeds: seeds::scannet, memory: (FIXED, JSON) },
     // Packed: a byte stands for as many as gzip makes of it, and a Gaussian takes 26 times what it has in the file. A window of
@@ -166,6 +167,7 @@ fn check_ply(bytes: &[u8]) {
             assert_eq!(vertices.len(), labels.len());
         }
         sound(ply::is_antialiased(path), path);
+        sound(ply::Vertices::read(path), path);
     });
 }
 
@@ -315,6 +317,16 @@ fn check_labels(bytes: &[u8]) {
                 assert!(remarks.names.keys().all(|&k| instances.count[k as usize] > 0));
                 assert!(remarks.metres_per_unit.is_none_or(|m| m.is_finite() && m > 0.0));
             }
+        }
+        if let Some(scene) = sound(Scene::read(path), path) {
+            scene
+                .relations
+                .iter()
+                .for_each(|r| assert!(scene.object(r.subject).is_some() && scene.object(r.object).is_some()));
+            assert!(scene.objects.iter().all(|o| o.bounds.corners().as_flattened().iter().all(|v| !v.is_nan())));
+        }
+        if let Some(ids) = sound(Ids::parse(bytes).map_err(|e| e.file(path)), path) {
+            assert!(ids.instance.iter().all(|&i| i >= -1));
         }
         if let Some(frame) = sound(read_labels(path), path) {
             assert_eq!(frame.frame, "frame_00001");

@@ -271,6 +271,14 @@ pub(crate) fn labels() -> Vec<Vec<u8>> {
         br#"{"format":"instances.edits","version":1,"instances":"ab","edits":[{"op":"rename","instance":1,"name":"kettle"},
 {"op":"merge","instances":[0,1]},{"op":"split","instance":0},{"op":"scale","from":[0,0,0],"to":[1,0,0],"metres":0.3}]}"#
             .to_vec(),
+        br#"{"format":"scene","version":1,"inputs":{"geometry":"ab"},"gaussians":9,"up":{"direction":[0,0,1],"from":"given"},
+"metres_per_unit":0.5,"objects":[{"id":1,"name":{"text":"mug","from":"edits"},"score":0.5,"gaussians":4,"parent":{"cluster":7,
+"gaussians":9,"objects":[1,2]},"parts":[{"cluster":8,"gaussians":2}],"centroid":[0,1,2],"box":{"center":[0,1,2],"half_size":[1,1,1],
+"axes":[[1,0,0],[0,1,0],[0,0,1]],"upright":true},"volume":8,"best_view":{"view":"a","mask":3,"score":0.5,"visible":2}},{"id":2,
+"name":null,"score":0,"gaussians":5,"parent":null,"parts":[],"centroid":[0,0,0],"box":{"center":[0,0,0],"half_size":[0,0,0],
+"axes":[[1,0,0],[0,1,0],[0,0,1]],"upright":true},"volume":0,"best_view":null}],"relations":[{"subject":1,"relation":"on","object":2}]}"#
+            .to_vec(),
+        br#"{"format":"gaussian-ids","version":1,"splat":"ab","instance":[0,-1,3,2147483647]}"#.to_vec(),
     ]
 }
 
