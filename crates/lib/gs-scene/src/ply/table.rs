@@ -250,8 +250,8 @@ impl<'a> Table<'a> {
 
     /// The table on its own, without the file.
     pub(super) fn into_owned(self) -> Table<'static> {
-        let Table { count, stride, columns, rows } = self;
-        Table { count, stride, columns, rows: Cow::Owned(rows.into_owned()) }
+        let Table { count, stride, columns, rows, name } = self;
+        Table { count, stride, columns, rows: Cow::Owned(rows.into_owned()), name }
     }
 
     /// All properties with their names, in the order of the file.
