@@ -86,6 +86,12 @@ pub struct SceneOptions {
 pub enum SplatFormat {
     /// PLY with all properties of the geometry and `instance`
     Ply,
+    /// SPZ version 3
+    Spz,
+    /// 32 bytes a Gaussian, no harmonics
+    Splat,
+    /// glTF with KHR_gaussian_splatting
+    Glb,
 }
 
 /// `export objects`.
@@ -120,7 +126,7 @@ pub struct SplatsOptions {
     /// Also write <name>.ids.json: the ids by the order of the Gaussians, for programs that drop unknown properties
     #[arg(long)]
     pub ids: bool,
-    /// Output file; its extension is the format: .ply
+    /// Output file; its extension is the format: .ply, .spz, .splat or .glb. Ids are in PLYs alone; others take --ids
     #[arg(long, value_name = "FILE")]
     pub out: PathBuf,
 }

@@ -3,6 +3,7 @@
 use crate::options::SplatFormat;
 use clap::ValueEnum;
 use gs_io::{Error, Result};
+use gs_scene::splat::{self, Extra};
 use gs_scene::{Geometry, ply};
 use query::LabelledScene;
 use std::path::Path;
@@ -12,8 +13,11 @@ use std::path::Path;
 /// # Errors
 /// When there is no such format.
 pub fn format_of(path: &Path) -> Result<SplatFormat> {
-    let extension = path.extension().unwrap_or_default().to_string_lossy().to_lowercase();
-    SplatFormat::from_str(&extension, false).map_err(|_| {
+    let name = path.file_name().unwrap_or_default().to_string_lossy().to_lowercase();
+    let extension = name.rsplit_once('.').map_or("", |(_, extension)| extension);
+    // A compressed PLY has another order.
+    let format = if name.ends_with(".compressed.ply") { "" } else { extension };
+    SplatFormat::from_str(format, false).map_err(|_| {
         let known: Vec<String> =
             SplatFormat::value_variants().iter().map(|f| format!(".{}", extension_of(*f))).collect();
         Error::new("no format of splats has this extension").file(path).expected(known.join(", "))
@@ -24,6 +28,9 @@ pub fn format_of(path: &Path) -> Result<SplatFormat> {
 pub fn extension_of(format: SplatFormat) -> &'static str {
     match format {
         SplatFormat::Ply => "ply",
+        SplatFormat::Spz => "spz",
+        SplatFormat::Splat => "splat",
+        SplatFormat::Glb => "glb",
     }
 }
 
@@ -58,9 +65,11 @@ impl<'a> Splats<'a> {
         let labels = &self.scene.instances.label;
         match (format, &self.rows) {
             (SplatFormat::Ply, Some(rows)) => rows.write(to, which, Some(labels), &self.comments),
-            (SplatFormat::Ply, None) => {
+            _ => {
                 let own: Vec<i32> = which.iter().map(|&i| labels[i as usize]).collect();
-                ply::write_labelled_gaussians(to, &self.scene.gaussians().select(which), &own, &self.comments)
+                let antialias = self.scene.geometry.antialias;
+                let extra = Extra { comments: &self.comments, antialias, instance: Some(&own) };
+                splat::write(to, &self.scene.gaussians().select(which), &extra)
             }
         }
     }
