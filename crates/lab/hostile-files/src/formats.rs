@@ -205,8 +205,7 @@ fn check_gltf(bytes: &[u8]) {
 }
 
 /// The files of a SOG, in the order of their seeds; behind them an archive of all.
-const SOG: [&str; 9] =
-    ["meta.json", "l.webp", "u.webp", "q.webp", "s.webp", "c.webp", "p.webp", "n.webp", "a.sog"];
+const SOG: [&str; 9] = ["meta.json", "l.webp", "u.webp", "q.webp", "s.webp", "c.webp", "p.webp", "n.webp", "a.sog"];
 
 fn check_sog(bytes: &[u8]) {
     let files = SOG.map(|name| format!("sog/{name}"));

@@ -104,7 +104,8 @@ pub(crate) fn gltf() -> Vec<Vec<u8>> {
     let glb = splat(SplatFormat::Gltf);
     // The same as text, of its nodes and with nothing in its buffer.
     let length = u32::from_le_bytes([glb[12], glb[13], glb[14], glb[15]]) as usize;
-    let text = String::from_utf8_lossy(&glb[20..20 + length]).replace(r#"{"byteLength""#, r#"{"uri":"data:;base64,AAAA","byteLength""#);
+    let text = String::from_utf8_lossy(&glb[20..20 + length])
+        .replace(r#"{"byteLength""#, r#"{"uri":"data:;base64,AAAA","byteLength""#);
     let node = r#""nodes":[{"mesh":0,"rotation":[0,0,0.6,0.8],"scale":[2,2,2]}]"#;
     vec![glb, text.replace(r#""nodes":[{"mesh":0}]"#, node).into_bytes()]
 }

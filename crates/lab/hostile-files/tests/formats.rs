@@ -22,7 +22,9 @@ macro_rules! formats {
         }
     };
 }
-formats!(ply, colmap_bin, colmap_txt, transforms, npy, npz, artifact, labels, scannet, spz, sog, dot_splat, gltf, id_png);
+formats!(
+    ply, colmap_bin, colmap_txt, transforms, npy, npz, artifact, labels, scannet, spz, sog, dot_splat, gltf, id_png
+);
 
 #[test]
 fn findings_stay_fixed() {

@@ -23,8 +23,7 @@ const DECADES: std::ops::Range<i32> = -10..10;
 impl Inspect {
     /// Prints to standard output: text, or JSON objects.
     pub(crate) fn run(&self, json: bool, stage: &Stage) -> Result<()> {
-        let of_gaussians = !self.file.is_dir() || self.file.join("meta.json").is_file();
-        let text = if !of_gaussians { self.list(json)? } else { self.describe(json, stage)? };
+        let text = if self.file.is_dir() { self.list(json)? } else { self.describe(json, stage)? };
         stage.print(&text).map(drop)
     }
 

@@ -103,10 +103,16 @@ pub(super) fn read(path: &Path) -> Result<Splat> {
                 axes.apply(&mut part);
                 append(&mut all, part);
                 if all.len() > buffers.bytes() / LEAST_BYTES {
-                    return Err(Error::new("more Gaussians than its buffers can hold: meshes or accessors repeat the same bytes")
-                        .field("nodes")
-                        .found(format!("{} Gaussians", all.len()))
-                        .expected(format!("at most {} in {} bytes", buffers.bytes() / LEAST_BYTES, buffers.bytes())));
+                    return Err(Error::new(
+                        "more Gaussians than its buffers can hold: meshes or accessors repeat the same bytes",
+                    )
+                    .field("nodes")
+                    .found(format!("{} Gaussians", all.len()))
+                    .expected(format!(
+                        "at most {} in {} bytes",
+                        buffers.bytes() / LEAST_BYTES,
+                        buffers.bytes()
+                    )));
                 }
                 notes(&primitive["extensions"][EXTENSION], &mut left_out);
             }
