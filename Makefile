@@ -18,7 +18,7 @@ PIPELINE = $(MAKE) --no-print-directory
 help: ## Say what can be made
 	@awk -F ':.*## ' '/^##@/ { print "\n" substr($$0, 5) ":" } /^[a-z-]+:.*## / { printf "  %-16s %s\n", $$1, $$2 }' Makefile
 	@echo
-	@echo "make scene needs SCENE=folder (COLMAP, transforms.json or ScanNet) and OUT=folder; it takes"
+	@echo "make scene needs SCENE=folder (COLMAP, transforms.json or ScanNet) or GEOMETRY=file, and OUT=folder; it takes"
 	@sed -nE 's/^#: ?/  /p' pipelines/custom.mk
 	@echo
 	@echo "Benchmarks of one part: make $$(sed -nE 's/^(bench-[a-z-]+):.*/\1/p' pipelines/bench.mk | paste -sd' ')"
@@ -32,7 +32,7 @@ demo: build ## Make a synthetic scene, run every stage on it, write out/demo/rep
 	@$(PIPELINE) -f pipelines/demo.mk all
 	@echo "look at it, click on things, ask in words: make explore OUT=$(or $(OUT),out/demo)"
 
-scene: checked-scene build ## The same on your own photographs: make scene SCENE=folder OUT=folder
+scene: checked-scene build ## The same on your own photographs, or on Gaussians alone: make scene SCENE=folder OUT=folder
 	@$(PIPELINE) -f pipelines/custom.mk all
 
 explore: build ## Look at a finished run in the browser, click on things, ask in words: make explore OUT=folder

@@ -1,5 +1,5 @@
 # `make scene SCENE=folder OUT=folder`: anyone's posed photographs. The defaults stand in pipelines/custom.conf.
-#:  GEOMETRY=file.ply   use these trained Gaussians instead of training
+#:  GEOMETRY=file.ply   use these trained Gaussians instead of training; without SCENE, renders of them instead of photographs
 #:  MASKS=folder        use these id maps (*_s.npy) instead of running SAM
 #:  CLIP=folder         image.onnx and text.onnx of a CLIP model [models/clip, if there]; without it no text queries
 #:  QUERIES="red_mug …" texts to ask for, with underscores for spaces, without quotes
@@ -9,12 +9,12 @@
 #:  SEED=0              of every stage's random choices
 #:  THREADS=0           threads of every stage, 0 for one per core
 #:  CONF=file           settings from a file, one NAME = value a line
-#: and GEOM_ARGS, MASK_ARGS, GRAPH_ARGS, FEAT_ARGS, CLUSTER_ARGS, SCORE_ARGS, REPORT_ARGS: more options of a stage
+#: and GEOM_ARGS, VIEW_ARGS, MASK_ARGS, GRAPH_ARGS, FEAT_ARGS, CLUSTER_ARGS, SCORE_ARGS, REPORT_ARGS: more options of a stage
 
 include pipelines/paths.mk
 
-ifeq ($(SCENE),)
-$(error say which photographs: make scene SCENE=folder OUT=folder (see make help))
+ifeq ($(SCENE)$(GEOMETRY),)
+$(error say which photographs or Gaussians: make scene SCENE=folder OUT=folder, or GEOMETRY=file OUT=folder (see make help))
 endif
 ifeq ($(OUT),)
 $(error say where to write: make scene SCENE=folder OUT=folder)
@@ -23,10 +23,15 @@ endif
 include pipelines/custom.conf
 include pipelines/quality.mk
 include $(CONF)
+ifeq ($(SCENE),)
+ifneq ($(MASKS),)
+$(error MASKS=$(MASKS): without SCENE there are no photographs that these masks could be of: leave MASKS out, or give SCENE)
+endif
+endif
 CLIP ?= $(patsubst %/,%,$(dir $(wildcard models/clip/text.onnx)))
 
 SETTINGS := QUALITY SCENE GEOMETRY MASKS CLIP SAM QUERIES RESOLUTION ITERATIONS SEED \
-  GEOM_ARGS MASK_ARGS GRAPH_ARGS FEAT_ARGS CLUSTER_ARGS SCORE_ARGS REPORT_ARGS
+  GEOM_ARGS VIEW_ARGS MASK_ARGS GRAPH_ARGS FEAT_ARGS CLUSTER_ARGS SCORE_ARGS REPORT_ARGS
 include pipelines/settings.mk
 
 ifeq ($(MASKS),)
@@ -40,5 +45,16 @@ geom_FROM := RESOLUTION, ITERATIONS or GEOM_ARGS
 GEOM_FIRST := --resolution $(RESOLUTION) --iterations $(ITERATIONS)
 EVAL_ARGS ?= --resolution $(RESOLUTION)
 REPORT_FIRST := --resolution $(RESOLUTION)
+
+# Renders of the Gaussians are the photographs (docs/views.md). None is held out, and to measure the Gaussians on renders of
+# themselves would mean nothing.
+ifeq ($(SCENE),)
+override SCENE := $(OUT)/views
+VIEWS_MADE := $(SCENE)/views.json
+SCENE_FILES := $(VIEWS_MADE)
+METRICS :=
+GRAPH_FIRST = $(call unless,GRAPH_ARGS,--holdout 0)
+REPORT_FIRST += $(call unless,REPORT_ARGS,--holdout 0)
+endif
 
 include pipelines/stages.mk

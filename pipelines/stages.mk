@@ -6,6 +6,8 @@
 #   PHOTOGRAPHS the data set's folder, where it is not SCENE itself
 #   SCENE_FILES what the dataset consists of, where that is not what gs-geom finds in it
 #   LANGUAGE    the masks' features, where they are there already
+#   VIEWS_MADE  the file that says that SCENE is whole, where it is made of the Gaussians
+#   METRICS     the Gaussians' PSNR and SSIM for the report, or empty
 #   PROTOCOL    lerf or scannet, to be scored by that; TEXTS, a table of text features instead of CLIP's
 #
 # Every target is a file that its stage writes whole or not at all, so a killed make goes on where it was. The options of a
@@ -44,7 +46,7 @@ endif
 # The id maps, where SAM makes them.
 SAM_MAKES := $(filter $(OUT)/masks/masks.json,$(MASKS_DONE))
 export SAM_MAKES SCENE PHOTOGRAPHS OUT MASKS GEOMETRY CLIP SAM TEXTS QUERIES SEED THREADS
-export GEOM_ARGS MASK_ARGS GRAPH_ARGS FEAT_ARGS CLUSTER_ARGS SCORE_ARGS REPORT_ARGS EVAL_ARGS SYNTH_ARGS
+export GEOM_ARGS VIEW_ARGS MASK_ARGS GRAPH_ARGS FEAT_ARGS CLUSTER_ARGS SCORE_ARGS REPORT_ARGS EVAL_ARGS SYNTH_ARGS
 
 .DEFAULT_GOAL := all
 .PHONY: all FORCE
@@ -78,6 +80,7 @@ unless = $(if $(filter $(firstword $2),$($1)),,$2)
 # as an option; 0 is every stage's own. A quality is about our own features, not about those of a preset.
 SEED_ARGS := $(addprefix --seed ,$(filter-out 0,$(SEED)))
 geom_OPTIONS := $(GEOM_QUALITY) $(GEOM_FIRST) $(GEOM_ARGS) $(SEED_ARGS)
+views_OPTIONS := $(VIEW_ARGS) $(SEED_ARGS)
 graph_OPTIONS := $(GRAPH_FIRST) $(GRAPH_ARGS) $(SEED_ARGS)
 feat_OPTIONS := $(if $(findstring --preset,$(FEAT_ARGS)),,$(FEAT_QUALITY)) $(FEAT_ARGS) $(SEED_ARGS)
 cluster_OPTIONS := $(CLUSTER_ARGS) $(SEED_ARGS)
@@ -92,6 +95,7 @@ report_OPTIONS := $(REPORT_FIRST) $(REPORT_ARGS)
 # What each stage runs. `arg` writes a path out, so that commands can be copied, or as "$NAME" where a shell would take it apart.
 arg = $(if $(call odd,$($1)),"$$$1",$($1))
 geom_RUN = $(BIN)/gs-geom train --scene $(call arg,PHOTOGRAPHS) --out $(OUT)/geometry.ply $(geom_OPTIONS) $(COMMON)
+views_RUN = $(BIN)/gs-geom views --geometry $(call arg,GEOMETRY) --out $(SCENE) $(views_OPTIONS) $(COMMON)
 metrics_RUN = $(BIN)/gs-geom eval --scene $(call arg,PHOTOGRAPHS) --geometry $(call arg,GEOMETRY) --out $(OUT)/geom_metrics.json \
   $(EVAL_ARGS) $(COMMON)
 masks_RUN = $(BIN)/mask-embed masks --scene $(call arg,PHOTOGRAPHS) --sam $(call arg,SAM) --out $(MASKS) $(masks_ARGS) $(COMMON)
@@ -117,6 +121,7 @@ geom_FROM ?= GEOM_ARGS
 .PHONY: checked-options
 checked-options: checked | $(PROGRAMS)
 	@scripts/check_options.sh "$(geom_FROM)" $(geom_RUN)
+	@$(if $(VIEWS_MADE),scripts/check_options.sh VIEW_ARGS $(views_RUN))
 	@scripts/check_options.sh EVAL_ARGS $(metrics_RUN)
 	@$(if $(SAM_MAKES),scripts/check_options.sh MASK_ARGS $(masks_RUN))
 	@scripts/check_options.sh GRAPH_ARGS $(graph_RUN)
@@ -139,6 +144,12 @@ $(OUT)/geometry.ply: $(SCENE_FILES) $(OPTIONS)/geom | $(BIN)/gs-geom
 
 $(OUT)/geom_metrics.json: $(SCENE_FILES) $(GEOMETRY_DONE) $(OPTIONS)/geom | $(BIN)/gs-geom
 	$(metrics_RUN)
+
+# Renders instead of photographs, where there are none.
+ifneq ($(VIEWS_MADE),)
+$(VIEWS_MADE): $(GEOMETRY_DONE) $(OPTIONS)/views | $(BIN)/gs-geom
+	$(views_RUN)
+endif
 
 # Stage 0: id maps, where the data set has none.
 $(OUT)/masks/masks.json: $(SCENE_FILES) $(OPTIONS)/masks | $(BIN)/mask-embed
@@ -185,7 +196,8 @@ $(QUERY): $(INSTANCES) $(OPTIONS)/queries | $(BIN)/eval
 	$(query_RUN)
 endif
 
-$(OUT)/report.html: $(INSTANCES) $(OUT)/geom_metrics.json $(OUT)/score.json $(QUERY) $(OPTIONS)/report | $(BIN)/eval
+METRICS ?= $(OUT)/geom_metrics.json
+$(OUT)/report.html: $(INSTANCES) $(METRICS) $(OUT)/score.json $(QUERY) $(OPTIONS)/report | $(BIN)/eval
 	$(report_RUN)
 
 # The programs are built by the top-level Makefile; a fragment that is run alone builds what it lacks.

@@ -84,6 +84,31 @@ make --no-print-directory scene SCENE="$work/nowhere" OUT="$work/n" > "$work/now
 grep -q "SCENE=$work/nowhere: no such" "$work/nowhere.log" && ! grep -q cargo "$work/nowhere.log" || { cat "$work/nowhere.log"; fail "a scene that is not there is not said at once"; }
 pass "a scene that is not there is said before anything is built"
 
+say "== Gaussians without photographs"
+# Renders take the photographs' place, and a small segmenter by colour that of SAM.
+virtual() { # virtual OUT THREADS
+  make --no-print-directory -f pipelines/custom.mk GEOMETRY="$work/a/geometry.ply" OUT="$1" THREADS="$2" CLIP= \
+    SAM=crates/stages/mask-embed/testdata/sam VIEW_ARGS='--views 6 --size 96x72' MASK_ARGS='--points-per-side 4' \
+    GRAPH_ARGS='--min-mask-pixels 4' FEAT_ARGS="$feat_default"
+}
+virtual "$work/v" 2 > "$work/v.log" 2>&1 || { cat "$work/v.log"; fail "make scene without photographs"; }
+for f in views/sparse/0/images.bin views/images/view_0000.png views/transforms.json views/contact.png views/views.json instances.ply report.html; do
+  [ -s "$work/v/$f" ] || fail "no $f of Gaussians without photographs"
+done
+[ ! -e "$work/v/geom_metrics.json" ] && grep -q 'seen_by_8' "$work/v/views/views.json" || fail "renders were measured against themselves"
+virtual "$work/v" 2 > "$work/again.log" 2>&1
+[ -z "$(stages_of "$work/again.log")" ] || { cat "$work/again.log"; fail "a second make without photographs ran a stage"; }
+virtual "$work/w" 1 > "$work/v.log" 2>&1 || { cat "$work/v.log"; fail "one thread without photographs"; }
+for f in views/images/view_0003.png views/sparse/0/images.bin views/views.json instances.safetensors; do
+  cmp "$work/v/$f" "$work/w/$f" || fail "without photographs, one and two threads give different bytes"
+done
+for setting in "MASKS=$work/a/scene/language_features" "VIEW_ARGS=--view 3" "GEOMETRY="; do
+  ! make --no-print-directory -f pipelines/custom.mk GEOMETRY="$work/a/geometry.ply" OUT="$work/n" \
+    SAM=crates/stages/mask-embed/testdata/sam "$setting" > "$work/said" 2>&1 && grep -qF -- "${setting%%=*}" "$work/said" \
+    && [ ! -e "$work/n" ] || { cat "$work/said"; fail "$setting without photographs"; }
+done
+pass "Gaussians alone become renders, masks and instances"
+
 say "== paths of any name"
 # What people name may hold anything but a line break, or is refused by name in one line; nothing in it is ever run.
 theirs=$work/a/scene

@@ -1,8 +1,8 @@
 //! Small good files of each format, from which damaged ones are made.
 
 use artifacts::{
-    Descriptors, Features, FootprintsBuilder, Graph, Instances, MaskFeatures, MaskMaps, Match, OrientedBox, Row,
-    TreeEdge, TruePoints,
+    Descriptors, Features, FootprintsBuilder, Granule, Graph, Instances, MaskFeatures, MaskMaps, Match, Members,
+    OrientedBox, Row, TreeEdge, TruePoints,
 };
 use gs_io::Provenance;
 use gs_scene::splat::{self, Extra, Format as SplatFormat};
@@ -204,7 +204,6 @@ pub(crate) fn npz() -> Vec<Vec<u8>> {
     ]
 }
 
-/// One of each artifact.
 /// Two instances of four Gaussians.
 pub(crate) fn instances() -> Instances {
     let edge = TreeEdge { parent: 4, child: 5, lambda: 1.0, size: 2, instance: 0 };
@@ -223,9 +222,12 @@ pub(crate) fn instances() -> Instances {
         tree: vec![edge, TreeEdge { parent: 5, child: 6, instance: 1, ..edge }],
         node: vec![5, -1, 5, 6],
         oriented: vec![OrientedBox::default(); 2],
+        granules: vec![Granule { members: Members::Cluster(5), support: 3, fit: 0.5 }],
+        granule_descriptor: vec![0.6, 0.8],
     }
 }
 
+/// One of each artifact.
 pub(crate) fn artifact() -> Vec<Vec<u8>> {
     let provenance = || Provenance { program: "test 1".into(), ..Provenance::default() };
     let graph = Graph {

@@ -87,6 +87,7 @@ impl Run {
             ],
             tree: vec![edge(10, 11, 0), edge(10, 12, 1), edge(12, 13, -1), edge(12, 14, -1)],
             node: vec![11, 13, 14, -1],
+            ..Instances::default()
         };
         instances.write(run.out().join("instances.safetensors"), provenance()).unwrap();
         let features =

@@ -5,6 +5,7 @@
 //! * `training`: the loop, and in its folder the loss, the optimiser, the schedule, exposures and checkpoints
 //! * `densification`: how the number of Gaussians changes
 //! * `photographs`: the photographs and their masks; `start`: the Gaussians before the first iteration
+//! * `views`: a dataset of renders from Gaussians alone
 //! * `budget`: a plan for a given time; `memory`: forecasts; `metrics`: PSNR and SSIM
 
 mod bounds;
@@ -21,6 +22,7 @@ mod render;
 mod run;
 mod start;
 mod training;
+mod views;
 #[cfg(test)]
 #[path = "../tests/common/world.rs"]
 #[allow(dead_code, reason = "the tests of the program use more of it")]

@@ -125,6 +125,12 @@ pub fn of_renders(geometry: u64, pictures: &Pictures, exr: bool) -> u64 {
     of_file(geometry).max(PROGRAM + 9 * geometry / 5 + bytes * pictures.pixels)
 }
 
+/// Peak in bytes of `views`: beside a render, two grids, a bit of every Gaussian for each camera that is tried, and of the file's
+/// Gaussians those that count.
+pub fn of_views(geometry: u64, pixels: u64, views: usize) -> u64 {
+    PROGRAM + 23 * geometry / 10 + 48 * pixels + (48 << 20) + 1_500_000 * views as u64 / 4
+}
+
 /// Peak in bytes of `eval`.
 pub fn of_figures(geometry: u64, pictures: &Pictures) -> u64 {
     let measuring = PROGRAM + 9 * geometry / 5 + 86 * pictures.pixels;

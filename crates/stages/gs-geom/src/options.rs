@@ -4,6 +4,7 @@
 use crate::bounds::Bounds;
 use crate::densification::Strategy;
 use crate::photographs::masks::{Alpha, Masks};
+use crate::views::Views;
 use clap::{Parser, Subcommand, ValueEnum};
 use gs_io::{Error, Result};
 use gs_raster::RasterOptions;
@@ -33,6 +34,8 @@ pub(crate) enum Command {
     Render(Render),
     /// PSNR and SSIM on held-out views
     Eval(Eval),
+    /// Make a dataset of renders, with cameras that see all of the scene, from Gaussians alone
+    Views(Views),
     /// Describe a file of Gaussians (counts, bounds, histograms, faults), or list the files of a dataset
     Inspect(Inspect),
     /// Drop, crop, trim and re-order the Gaussians of a file

@@ -33,6 +33,7 @@ impl Program for Args {
             Command::Train(options) => train(&options, stage),
             Command::Render(options) => options.run(stage),
             Command::Eval(options) => options.run(stage),
+            Command::Views(options) => options.run(stage),
             Command::Inspect(options) => options.run(self.common.json, stage),
             Command::Convert(options) => options.run(stage),
         }
