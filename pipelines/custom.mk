@@ -1,5 +1,5 @@
 # `make scene SCENE=folder OUT=folder`: anyone's posed photographs. The defaults stand in pipelines/custom.conf.
-#:  GEOMETRY=file.ply   use these trained Gaussians instead of training; without SCENE, renders of them instead of photographs
+#:  GEOMETRY=file.spz   use these trained Gaussians instead of training; without SCENE, renders of them instead of photographs
 #:  MASKS=folder        use these id maps (*_s.npy) instead of running SAM
 #:  CLIP=folder         image.onnx and text.onnx of a CLIP model [models/clip, if there]; without it no text queries
 #:  QUERIES="red_mug …" texts to ask for, with underscores for spaces, without quotes
