@@ -66,6 +66,7 @@ test: ## Run all tests that need nothing but this folder
 	scripts/test_benchmarks.sh
 	scripts/test_snakemake.sh
 	scripts/test_explore.sh
+	scripts/test_splats.sh
 
 test-data: ## Run the tests that need real photographs, models or oracles (docs/contributing.md)
 	$(CARGO) test --release --workspace -- --ignored

@@ -73,7 +73,7 @@ fn sogs_are_plausible() {
         let path = data(&format!("splats/{name}"));
         let read = splat::read_whole(&path).unwrap();
         let g = &read.gaussians;
-        println!("{name}: {} Gaussians, spread {}", g.len(), g.spread());
+        eprintln!("{name}: {} Gaussians, spread {}", g.len(), g.spread());
         assert_eq!((read.kind.as_str(), g.sh_degree), (kind, degree));
         assert!((g.len() as f64 / f64::from(n) - 1.0).abs() < 0.3, "{name}: {}", g.len());
         assert!(size.contains(&g.spread()), "{name}: {}", g.spread());

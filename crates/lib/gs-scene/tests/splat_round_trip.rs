@@ -122,7 +122,7 @@ proptest! {
 #[ignore = "prints a table; nothing to fail"]
 fn table_of_errors() {
     let g = scene(0, 3000, 3, 1.0);
-    println!("largest error of 3,000 Gaussians within {:.1} units", widest(&g.means));
+    eprintln!("largest error of 3,000 Gaussians within {:.1} units", widest(&g.means));
     for name in NAMES {
         let format = Format::to_write(name).unwrap();
         let bytes = splat::encode(format, &g, &Extra::default()).unwrap().len() as f64 / g.len() as f64;
@@ -132,7 +132,7 @@ fn table_of_errors() {
             Format::Splat => g.clone().with_degree(0),
             _ => g.clone(),
         };
-        println!("{name}: {bytes:.0} bytes a Gaussian, {:?}", Differences::between(&wanted, &back));
+        eprintln!("{name}: {bytes:.0} bytes a Gaussian, {:?}", Differences::between(&wanted, &back));
     }
 }
 

@@ -11,7 +11,7 @@ use std::process::Command;
 /// Converts a file by the program that SPLAT_TRANSFORM names.
 fn transform(from: &Path, to: &Path) {
     let program =
-        std::env::var("SPLAT_TRANSFORM").expect("SPLAT_TRANSFORM names the program; run scripts/check_splats.sh");
+        std::env::var("SPLAT_TRANSFORM").expect("SPLAT_TRANSFORM names the program; run scripts/test_splats.sh");
     let output = Command::new("node").arg(program).args(["-w", "-q", "-g", "cpu"]).arg(from).arg(to).output().unwrap();
     assert!(output.status.success() && to.exists(), "{}", String::from_utf8_lossy(&output.stderr));
 }
@@ -30,7 +30,7 @@ fn in_axes_of_spz(g: &Gaussians) -> Gaussians {
 }
 
 #[test]
-#[ignore = "needs npm's @playcanvas/splat-transform; run scripts/check_splats.sh"]
+#[ignore = "needs npm's @playcanvas/splat-transform; run scripts/test_splats.sh"]
 fn it_reads_what_we_write() {
     let dir = tempfile::tempdir().unwrap();
     for degree in [0, 1, 2, 3] {
@@ -44,7 +44,7 @@ fn it_reads_what_we_write() {
                 wanted = in_axes_of_spz(&wanted);
             }
             let found = ply::read_gaussians(&theirs).unwrap();
-            println!("{name}, degree {degree}: {:?}", Differences::between(&wanted, &found));
+            eprintln!("{name}, degree {degree}: {:?}", Differences::between(&wanted, &found));
             // It takes a byte of .splat's rotation as a share of 255, which is half a step from what the format's author writes.
             let angle = if name == "a.splat" { 0.02 } else { ROUNDING.angle };
             Differences::between(&wanted, &found).within(Differences { angle, ..ROUNDING });
@@ -53,7 +53,7 @@ fn it_reads_what_we_write() {
 }
 
 #[test]
-#[ignore = "needs npm's @playcanvas/splat-transform; run scripts/check_splats.sh"]
+#[ignore = "needs npm's @playcanvas/splat-transform; run scripts/test_splats.sh"]
 fn we_read_what_it_writes() {
     let dir = tempfile::tempdir().unwrap();
     let at = |name: &str| -> PathBuf { dir.path().join(name) };
@@ -77,14 +77,14 @@ fn we_read_what_it_writes() {
                 let own = ply::read_gaussians(at("c.ply")).unwrap();
                 if name == "b.spz" { in_axes_of_spz(&own) } else { own }
             };
-            println!("{name}, degree {degree}, {kind}: {:?}", Differences::between(&wanted, &found));
+            eprintln!("{name}, degree {degree}, {kind}: {:?}", Differences::between(&wanted, &found));
             Differences::between(&wanted, &found).within(ROUNDING);
         }
     }
 }
 
 #[test]
-#[ignore = "needs npm's @playcanvas/splat-transform and shared/data; run scripts/check_splats.sh"]
+#[ignore = "needs npm's @playcanvas/splat-transform and shared/data; run scripts/test_splats.sh"]
 fn real_files_read_as_it_reads_them() {
     let data = PathBuf::from(env!("CARGO_MANIFEST_DIR")).join("../../../../shared/data/splats");
     let dir = tempfile::tempdir().unwrap();
@@ -96,7 +96,7 @@ fn real_files_read_as_it_reads_them() {
             ours = in_axes_of_spz(&ours);
         }
         let differences = Differences::between(&ours, &ply::read_gaussians(&theirs).unwrap());
-        println!("{name}: {} Gaussians, {differences:?}", ours.len());
+        eprintln!("{name}: {} Gaussians, {differences:?}", ours.len());
         differences.within(ROUNDING);
     }
 }

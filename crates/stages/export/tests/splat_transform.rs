@@ -1,4 +1,4 @@
-//! Another program splits objects from our PLYs: splat-transform, which scripts/test_export.sh finds or installs.
+//! Another program splits objects from our PLYs: splat-transform, which scripts/test_splats.sh installs.
 
 use artifacts::{Extents, Instances, role};
 use gs_io::{Provenance, hash_file};
@@ -11,7 +11,7 @@ const GAUSSIANS: usize = 3000;
 const OBJECTS: i32 = 9;
 
 #[test]
-#[ignore = "needs splat-transform: scripts/test_export.sh"]
+#[ignore = "needs splat-transform: scripts/test_splats.sh"]
 fn splat_transform_splits_objects_from_our_ply() {
     let program = std::env::var_os("SPLAT_TRANSFORM").expect("SPLAT_TRANSFORM names the program");
     let dir = tempfile::tempdir().unwrap();
@@ -45,10 +45,15 @@ fn splat_transform_splits_objects_from_our_ply() {
     export.arg("splats").arg("--geometry").arg(path("geometry.ply")).arg("--instances").arg(path("i.safetensors"));
     assert!(export.arg("--out").arg(path("all.ply")).status().unwrap().success());
 
-    // Those with most, with fewest, and those of no object.
+    // Those with most, with fewest, and those of no object; the program reads all whole numbers as unsigned.
     for id in [-1, 3, 5, 8] {
-        let mut split = Command::new(&program);
-        split.arg("--overwrite").arg(path("all.ply")).arg("--filter-value").arg(format!("instance,eq,{id}"));
+        let mut split = Command::new("node");
+        split
+            .arg(&program)
+            .arg("--overwrite")
+            .arg(path("all.ply"))
+            .arg("--filter-value")
+            .arg(format!("instance,eq,{}", id as u32));
         let done = split.arg(path("one.ply")).output().unwrap();
         let own: Vec<u32> = (0..GAUSSIANS as u32).filter(|&i| label[i as usize] == id).collect();
         assert!(done.status.success() && !own.is_empty(), "{}", String::from_utf8_lossy(&done.stderr));
