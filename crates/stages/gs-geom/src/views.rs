@@ -129,7 +129,7 @@ impl Views {
             let e = Error::new("no place for a camera inside the scene").file(&self.geometry.geometry);
             e.hint("give --look outside-in")
         };
-        let (places, look) = match Places::new(matter, eye.centres, up, look, lens, rng) {
+        let (mut places, look) = match Places::new(matter, eye.centres, up, look, lens, rng) {
             Some(places) => (places, look),
             None if self.look == Look::Auto => {
                 let outside = Look::OutsideIn;

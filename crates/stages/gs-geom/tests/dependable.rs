@@ -116,12 +116,10 @@ fn what_cannot_fit_is_refused_before_it_is_made() {
         &[&["render"], &drawn[..]].concat(),
         &[&["eval"], &drawn[..]].concat(),
         &["inspect", &geometry],
-        &["convert", &geometry, &out],
+        &["convert", &geometry, &format!("{out}.ply")],
     ] {
-        assert!(
-            refused(&[arguments, &limit].concat())
-                .contains("--memory-limit: the run needs more memory than it may take")
-        );
+        let said = refused(&[arguments, &limit].concat());
+        assert!(said.contains("--memory-limit: the run needs more memory than it may take"), "{said}");
     }
     succeeds(&["inspect", &geometry, "--memory-limit", "1G"]);
 }

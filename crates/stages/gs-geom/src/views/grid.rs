@@ -8,6 +8,8 @@ use std::collections::VecDeque;
 pub const FREE: f64 = 0.1;
 /// Optical depth at which a ray ends: two thirds of the light are lost.
 const END: f64 = 1.0;
+/// The number of the free space that goes on outside the grid.
+pub const OUTSIDE: i32 = 0;
 /// How far a Gaussian reaches, standard deviations.
 const REACH: f64 = 2.0;
 
@@ -162,6 +164,20 @@ impl Grid {
         }
         (group, groups as usize)
     }
+
+    /// Which free space each cube is in: [`OUTSIDE`], or a number of its own for each that matter shuts off; -1 for matter.
+    pub fn spaces(&self) -> Vec<i32> {
+        let (mut space, groups) = self.groups(|c| self.depth[c] < FREE, false);
+        let mut number: Vec<i32> = (1..=groups as i32).collect();
+        for c in 0..space.len() {
+            let cube = self.cube_at(c);
+            if space[c] >= 0 && (cube.cmpeq(IVec3::ZERO).any() || cube.cmpeq(self.size - 1).any()) {
+                number[space[c] as usize] = OUTSIDE;
+            }
+        }
+        space.iter_mut().filter(|s| **s >= 0).for_each(|s| *s = number[*s as usize]);
+        space
+    }
 }
 
 /// Standard deviations of a Gaussian along its own axes, world units.
@@ -238,7 +254,7 @@ mod tests {
     #[test]
     fn directions_are_even() {
         let sum: DVec3 = directions(100).sum();
-        assert!(sum.length() < 0.2 && directions(64).all(|d| d.is_normalized()));
+        assert!(sum.length() < 0.2 && directions(64).all(DVec3::is_normalized));
     }
 
     #[test]

@@ -1,8 +1,8 @@
 //! Which Gaussians count, and where they are.
 
-use super::grid::{FREE, Grid, directions};
+use super::grid::{Grid, OUTSIDE, directions};
 use super::up::frame_of;
-use glam::{DMat3, DVec3, IVec3};
+use glam::{DMat3, DVec3};
 use gs_scene::Gaussians;
 use rand::Rng;
 use rand_chacha::ChaCha8Rng;
@@ -145,17 +145,9 @@ impl Matter {
     /// share, and the median enclosure of the free space that is not.
     pub fn inside(&self, rng: &mut ChaCha8Rng) -> Inside {
         let middle = |c: usize| self.grid.middle(self.grid.cube_at(c));
-        let free = |c: &usize| self.grid.depth[*c] < FREE;
-        let (group, groups) = self.grid.groups(|c| free(&c), false);
-        let mut outer = vec![false; groups];
-        for c in (0..group.len()).filter(free) {
-            let cube = self.grid.cube_at(c);
-            if cube.cmpeq(IVec3::ZERO).any() || cube.cmpeq(self.grid.size - 1).any() {
-                outer[group[c] as usize] = true;
-            }
-        }
+        let space = self.grid.spaces();
         let (open, shut): (Vec<usize>, Vec<usize>) =
-            (0..group.len()).filter(|c| free(c) && self.contains(middle(*c))).partition(|&c| outer[group[c] as usize]);
+            (0..space.len()).filter(|&c| space[c] >= 0 && self.contains(middle(c))).partition(|&c| space[c] == OUTSIDE);
         let shut_off = shut.len() as f64 / (open.len() + shut.len()).max(1) as f64;
         let mut found: Vec<f64> = Vec::new();
         if !open.is_empty() {

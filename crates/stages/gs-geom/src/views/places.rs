@@ -1,6 +1,6 @@
 //! Where cameras may stand, and what they look at.
 
-use super::grid::directions;
+use super::grid::{OUTSIDE, directions};
 use super::matter::Matter;
 use super::options::Look;
 use glam::DVec3;
@@ -47,6 +47,10 @@ pub struct Places<'a> {
     /// Free places in the room; none for an object.
     indoors: Vec<DVec3>,
     look: Look,
+    /// Which free space each cube is in, and those in which the first cameras around an object stand: no later one gets into
+    /// the object.
+    space: Vec<i32>,
+    entered: Vec<i32>,
     /// Whether the scene stands on a ground, which no camera looks at from below.
     pub ground: bool,
 }
@@ -66,7 +70,7 @@ impl<'a> Places<'a> {
             return None;
         }
         let ground = look == Look::OutsideIn && stands_on_ground(centres, up);
-        Some(Self { matter, lens, up, indoors, look, ground })
+        Some(Self { matter, lens, up, indoors, look, space: matter.grid.spaces(), entered: Vec::new(), ground })
     }
 
     /// The distance from which the core fits the picture.
@@ -78,7 +82,7 @@ impl<'a> Places<'a> {
     }
 
     /// Cameras all over: at stands far from each other and turned all around in a room, on spheres around an object.
-    pub fn all_over(&self, rng: &mut ChaCha8Rng) -> Vec<Camera> {
+    pub fn all_over(&mut self, rng: &mut ChaCha8Rng) -> Vec<Camera> {
         let (a, b) = across(self.up);
         let mut cameras = Vec::new();
         if self.look == Look::InsideOut {
@@ -108,6 +112,9 @@ impl<'a> Places<'a> {
                 }
             }
         }
+        self.entered = cameras.iter().map(|c| self.space_of(c.position())).collect();
+        self.entered.sort_unstable();
+        self.entered.dedup();
         cameras
     }
 
@@ -146,8 +153,8 @@ impl<'a> Places<'a> {
         best.map(|b| b.1)
     }
 
-    /// Whether a camera may stand here: nothing is near; around an object, also that it is above the ground, and that nothing
-    /// is between it and the core, such as the wall of a room that the object stands in.
+    /// Whether a camera may stand here: nothing is near; around an object, also that it is above the ground, that nothing is
+    /// between it and the core, such as the wall of a room that the object stands in, and that it is not in the object.
     fn may_stand(&self, eye: DVec3) -> bool {
         if !self.matter.grid.is_clear(eye, CLEARANCE) {
             return false;
@@ -156,7 +163,14 @@ impl<'a> Places<'a> {
         let away = from.length();
         let above = !self.ground || from.dot(self.up) >= ABOVE_GROUND * away;
         let open = || self.matter.grid.distance(eye, -from / away).is_none_or(|d| d >= away - self.matter.radius);
-        self.look == Look::InsideOut || above && away > 0.0 && open()
+        let entered = || self.entered.is_empty() || self.entered.contains(&self.space_of(eye));
+        self.look == Look::InsideOut || above && away > 0.0 && open() && entered()
+    }
+
+    /// The free space that a point is in.
+    fn space_of(&self, point: DVec3) -> i32 {
+        let cube = self.matter.grid.cube(point);
+        if self.matter.grid.has(cube) { self.space[self.matter.grid.index(cube)] } else { OUTSIDE }
     }
 
     /// A camera that looks along `forward`, upright; none where that is too steep.
