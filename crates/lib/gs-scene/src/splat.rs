@@ -228,10 +228,10 @@ pub fn write(path: impl AsRef<Path>, gaussians: &Gaussians, extra: &Extra<'_>) -
     write_atomic(path, |w| put(w, path, format, gaussians, extra).map_err(|e| e.file(path)))
 }
 
-/// The bytes of the file that [`write`] writes.
+/// The bytes of the file that [`write()`] writes.
 ///
 /// # Errors
-/// As [`write`]; [`Format::Sog`] is not written.
+/// As [`write()`]; [`Format::Sog`] is not written.
 pub fn encode(format: Format, gaussians: &Gaussians, extra: &Extra<'_>) -> Result<Vec<u8>> {
     check(format, gaussians, extra)?;
     let mut bytes = Vec::new();
