@@ -115,7 +115,7 @@ peers: build ## The field's systems beside ours: make peers PLAN=file OUT=folder
 	  --out $(or $(OUT),out/peers)/report.json --threads $(JOBS) $(if $(ONLY),--only $(ONLY))
 	scripts/peers_summary.py $(or $(OUT),out/peers)/report.json $(or $(OUT),out/peers)/peers.json
 	$(if $(PLAN)$(OUT)$(ONLY),,sed -i '/^# Tables/,$$d' docs/results/peers.md && sed '1s/.*/# Tables/' out/peers/report.md >> docs/results/peers.md \
-	  && cp out/peers/peers.json docs/results/peers.json)
+	  && cp out/peers/peers.json docs/results/peers.json && cp out/peers/report.svg docs/images/peers.svg)
 
 search: build ## Search the readings of the paper for the best one, in three rounds: out/search (hours)
 	mkdir -p out/search

@@ -62,7 +62,7 @@ const INSTANCES: &str = "instances.safetensors";
 const DESCRIPTORS: &str = "descriptors.safetensors";
 
 /// Where a cell's files lie; a clustering that makes descriptors alone has them in the place of its instances.
-fn files(plan: &Plan, folder: &Path, scene: &str, p: &str, row: &Row) -> Files {
+pub fn files(plan: &Plan, folder: &Path, scene: &str, p: &str, row: &Row) -> Files {
     let (scene, own) = (folder.join(scene), folder.join(scene).join(format!("p{p}")));
     let footprints = plan.footprints_of.get(&row.features).map_or("", String::as_str);
     let file = |name: &str, kind: &str| own.join(format!("{name}.{kind}"));
@@ -144,7 +144,7 @@ fn add(tasks: &mut Tasks, plan: &Plan, files: &Files, (scene, seed): (&Scene, u6
 }
 
 /// Where a clustering puts descriptors that it makes beside instances.
-fn descriptors_beside(files: &Files) -> PathBuf {
+pub fn descriptors_beside(files: &Files) -> PathBuf {
     let name = files.instances.file_name().unwrap_or_default().to_string_lossy().replace(INSTANCES, DESCRIPTORS);
     files.instances.with_file_name(name)
 }

@@ -3,7 +3,7 @@
 use crate::chain::{Programs, STAGES};
 use crate::page::Results;
 use crate::plan::Plan;
-use crate::{ceilings, cells, compare, growth, page, tables, tradeoff};
+use crate::{ceilings, cells, compare, growth, page, pictures, tables, tradeoff};
 use gs_io::{Claim, Error, Result, create_dir, write_bytes, write_json};
 use serde::Serialize;
 use serde_json::json;
@@ -24,7 +24,7 @@ pub struct Args {
     /// a change of the programs
     #[arg(long, global = true, value_name = "DIR", default_value = "out/bench/work")]
     work: PathBuf,
-    /// Output file, JSON; the same is written beside it as .md and .html (compare writes no .html, ceilings writes instances)
+    /// Output file, JSON; the same is written beside it as .md and .html, of a plan with rivals pictures as .svg (compare writes no .html, ceilings writes instances)
     #[arg(long, global = true, value_name = "FILE", default_value = "out/bench/report.json")]
     out: PathBuf,
     /// What run does: names of tables, knobs and axes, with commas between; what stress does: parts of names of scenes [default: all]
@@ -88,9 +88,9 @@ fn programs(folder: &Path, threads: usize) -> Result<Programs> {
 }
 
 impl Args {
-    /// The right to write the results: JSON, and the same as Markdown and HTML beside it.
+    /// The right to write the results: JSON, beside it the same as Markdown and HTML, and pictures.
     fn claim(&self, stage: &Stage) -> Result<Claim> {
-        let beside = ["md", "html"].map(|extension| self.out.with_extension(extension));
+        let beside = ["md", "html", "svg"].map(|extension| self.out.with_extension(extension));
         let claim = stage.outputs(&self.out).file(&self.out).files(beside).claim()?;
         create_dir(&self.work)?;
         Ok(claim)
@@ -109,9 +109,12 @@ impl Args {
             let e = Error::new("a program is missing").file(&programs.folder).expected("peers");
             return Err(e.hint("run make build"));
         }
-        if !plan.tables.is_empty() {
+        if let Some(table) = plan.tables.first() {
             cells::run(programs, plan, &self.work, stage)?;
             results.tables = tables::results(plan, &self.work)?;
+            if plan.has_rivals() {
+                pictures::write(plan, table, &self.work, &self.out.with_extension("svg"))?;
+            }
         }
         for scene in plan.scenes.iter().filter(|_| !plan.knobs.is_empty()) {
             let folder = self.work.join(&scene.name);

@@ -9,6 +9,7 @@ mod compare;
 mod growth;
 mod interval;
 mod page;
+mod pictures;
 mod plan;
 mod stress;
 mod tables;

@@ -15,7 +15,7 @@ pub struct TruePart {
 }
 
 /// A thing of the scene.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
 pub struct TrueObject {
     /// Instance id: the position in [`TrueScene::objects`].
     pub id: u32,

@@ -85,6 +85,11 @@ impl TextTable {
         }
         Ok(Self { path: path.to_path_buf(), dim, features })
     }
+
+    /// The feature of a name, as the file has it.
+    pub fn get(&self, name: &str) -> Option<&[f32]> {
+        self.features.get(name).map(Vec::as_slice)
+    }
 }
 
 /// Text features by name, as they are read.
