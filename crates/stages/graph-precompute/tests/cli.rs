@@ -187,7 +187,7 @@ fn bad_input_is_one_line_and_leaves_outputs_alone() {
     std::fs::write(&masks, &good).unwrap();
     fail(&[], &["no Gaussian is seen"]);
     std::fs::remove_file(s.join("geometry.ply")).unwrap();
-    fail(&[], &["geometry.ply", "cannot read"]);
+    fail(&[], &["geometry.ply", "cannot open"]);
 }
 
 /// `kept` is the mapping from what takes part to the PLY.
