@@ -1,12 +1,13 @@
 //! `gs-geom views`: from Gaussians alone, a dataset of photographs with poses.
 //!
 //! * `matter`: which Gaussians count and where they are, on the cubes of `grid`; `up`: which way is up
-//! * `places`: where cameras may stand; `sight`: what each would see; `choice`: those that see most
+//! * `places`: where cameras may stand; `sight`: what each would see; `front`: from which side; `choice`: those that see most
 //! * `coverage`: what the chosen ones show; `dataset`: the files; `options`
 
 mod choice;
 mod coverage;
 mod dataset;
+mod front;
 mod grid;
 mod matter;
 mod options;
@@ -24,6 +25,7 @@ use artifacts::role;
 use choice::{Choice, ENOUGH};
 use coverage::Coverage;
 use dataset::{MODEL, Sheet, name};
+use front::Front;
 use glam::DVec3;
 use gs_io::{Error, Result, Watched, hash_file, write_json};
 use gs_raster::{RasterOptions, render};
@@ -53,6 +55,7 @@ struct Plan {
     rule: Rule,
     ground: bool,
     tried: usize,
+    front: Front,
     /// What some camera that was tried sees.
     reachable: Bits,
 }
@@ -147,7 +150,7 @@ impl Views {
         stage.info(&format!("up {x:.3},{y:.3},{z:.3}, {}{on}", rule.name()));
         let mut choice = Choice::new(eye.centres.len(), matter.diagonal());
         let mut pool: Vec<Candidate> = Vec::new();
-        let mut tried = 0;
+        let (mut tried, mut front) = (0, None);
         let mut reachable = vec![0u64; eye.centres.len().div_ceil(64)];
         let mut progress = stage.progress("candidates", (ROUNDS + 1) as u64);
         for round in 0..=ROUNDS {
@@ -161,9 +164,11 @@ impl Views {
             };
             tried += cameras.len();
             let good: Vec<Option<Candidate>> = cameras.into_par_iter().map(|c| eye.look(c)).collect();
-            let good: Vec<Candidate> = good.into_iter().flatten().collect();
+            let mut good: Vec<Candidate> = good.into_iter().flatten().collect();
+            let front = front.get_or_insert_with(|| Front::of(&good, eye.centres));
+            good.par_iter_mut().for_each(|c| front.keep(&mut c.sight, c.camera.position(), eye.centres));
             for candidate in &good {
-                reachable.iter_mut().zip(&candidate.seen).for_each(|(all, one)| *all |= one);
+                reachable.iter_mut().zip(&candidate.sight.seen).for_each(|(all, one)| *all |= one);
             }
             pool.extend(good);
             // Half of the views are chosen before anything is aimed at.
@@ -175,7 +180,8 @@ impl Views {
             let e = Error::new("no camera sees the scene").file(&self.geometry.geometry);
             return Err(e.found(format!("{tried} cameras tried")).hint("give --look, or another --fov"));
         }
-        Ok(Plan { cameras: choice.cameras, look, inside, up, rule, ground: places.ground, tried, reachable })
+        let (cameras, front) = (choice.cameras, front.expect("made in the first round"));
+        Ok(Plan { cameras, look, inside, up, rule, ground: places.ground, tried, front, reachable })
     }
 
     /// Renders the views; what they cover, and each of them in words.
@@ -186,15 +192,16 @@ impl Views {
         for (i, camera) in plan.cameras.iter().enumerate() {
             stage.go_on()?;
             let r = render(eye.gaussians, camera, &RasterOptions { depth: true, ..eye.options.clone() });
-            let seen = eye.seen(camera, &r);
-            members(&seen).for_each(|k| sightings[k] = sightings[k].saturating_add(1));
+            let mut sight = eye.sight(camera, &r);
+            plan.front.keep(&mut sight, camera.position(), eye.centres);
+            members(&sight.seen).for_each(|k| sightings[k] = sightings[k].saturating_add(1));
             let shown = r.alpha.iter().filter(|&&a| a >= 0.5).count() as f64 / r.alpha.len() as f64;
             let image = Image { width: r.width, height: r.height, rgb: r.rgb, alpha: None };
             image.write_png(self.out.join("images").join(name(i)))?;
             sheet.add(&image);
             told.push(json!({
                 "name": name(i), "position": camera.position().to_array(), "forward": camera.rotation.row(2).to_array(),
-                "gaussians": members(&seen).count(), "shown": shown,
+                "gaussians": members(&sight.seen).count(), "shown": shown,
             }));
             progress.step();
         }

@@ -40,20 +40,20 @@ impl Choice {
                 }
                 worth[best] = now;
             };
-            let lacking = members(&pool[best].seen).filter(|&i| self.sightings[i] < ENOUGH).count();
+            let lacking = members(&pool[best].sight.seen).filter(|&i| self.sightings[i] < ENOUGH).count();
             if (lacking as f64) < (LEAST * self.sightings.len() as f64).max(1.0) {
                 return;
             }
             worth.remove(best);
-            let Candidate { camera, seen } = pool.remove(best);
-            members(&seen).for_each(|i| self.sightings[i] = (self.sightings[i] + 1).min(ENOUGH));
+            let Candidate { camera, sight } = pool.remove(best);
+            members(&sight.seen).for_each(|i| self.sightings[i] = (self.sightings[i] + 1).min(ENOUGH));
             self.cameras.push(camera);
         }
     }
 
     /// What a camera would add.
     fn worth(&self, candidate: &Candidate) -> f64 {
-        let all: u64 = members(&candidate.seen).filter_map(|i| WORTH.get(self.sightings[i] as usize)).sum();
+        let all: u64 = members(&candidate.sight.seen).filter_map(|i| WORTH.get(self.sightings[i] as usize)).sum();
         let apart = |c: &Camera| {
             let turn = c.rotation.row(2).dot(candidate.camera.rotation.row(2)).clamp(-1.0, 1.0).acos();
             turn + c.position().distance(candidate.camera.position()) / self.diagonal
@@ -70,11 +70,13 @@ fn greatest(values: &[f64]) -> usize {
 
 #[cfg(test)]
 mod tests {
+    use super::super::sight::Sight;
     use super::*;
     use glam::DVec3;
 
     fn candidate(eye: DVec3, seen: u64) -> Candidate {
-        Candidate { camera: Camera::look_at(eye, DVec3::ZERO, DVec3::Z, 8, 8, 1.0), seen: vec![seen] }
+        let sight = Sight { seen: vec![seen], shown: seen.count_ones() as usize };
+        Candidate { camera: Camera::look_at(eye, DVec3::ZERO, DVec3::Z, 8, 8, 1.0), sight }
     }
 
     #[test]

@@ -22,7 +22,7 @@ const TURNS: usize = 6;
 const PITCHES: [f64; 4] = [-0.1, -0.45, 0.15, -0.8];
 /// Directions from which an object is seen; distances, in the one from which all of it fits the picture.
 const SIDES: usize = 120;
-const DISTANCES: [f64; 2] = [1.0, 0.7];
+const DISTANCES: [f64; 3] = [1.0, 0.7, 0.4];
 /// Sine of the steepest view up or down: at 75 degrees.
 const STEEPEST: f64 = 0.966;
 /// Sine of the lowest elevation of a camera around a thing on the ground: 8 degrees.
@@ -130,7 +130,7 @@ impl<'a> Places<'a> {
         let side = self.matter.grid.side;
         let wanted = match self.look {
             Look::InsideOut => self.matter.diagonal() * rng.random_range(0.12..0.5),
-            _ => self.fitting() * rng.random_range(0.35..0.8),
+            _ => self.fitting() * rng.random_range(0.15..0.7),
         };
         let mut best: Option<(f64, Camera)> = None;
         for _ in 0..ATTEMPTS {
