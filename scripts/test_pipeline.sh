@@ -89,7 +89,7 @@ say "== Gaussians without photographs"
 virtual() { # virtual OUT THREADS
   make --no-print-directory -f pipelines/custom.mk GEOMETRY="$work/a/geometry.ply" OUT="$1" THREADS="$2" CLIP= \
     SAM=crates/stages/mask-embed/testdata/sam VIEW_ARGS='--views 6 --size 96x72' MASK_ARGS='--points-per-side 4' \
-    GRAPH_ARGS='--min-mask-pixels 4' FEAT_ARGS="$feat_default"
+    GRAPH_ARGS='--min-mask-pixels 4' FEAT_ARGS="$feat_default --levels small"
 }
 virtual "$work/v" 2 > "$work/v.log" 2>&1 || { cat "$work/v.log"; fail "make scene without photographs"; }
 for f in views/sparse/0/images.bin views/images/view_0000.png views/transforms.json views/contact.png views/views.json instances.ply report.html; do
