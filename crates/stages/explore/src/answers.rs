@@ -7,7 +7,6 @@ use gs_io::{Error, Result};
 use gs_scene::Camera;
 use query::Index;
 use serde::{Deserialize, Serialize};
-use serde_json::{Value, json};
 use std::collections::BTreeMap;
 
 /// Most pixels along a side of a picture that the page asks about.
@@ -126,12 +125,20 @@ fn edited_label(world: &World, edited: &Edited, cell: u32) -> Option<i32> {
     Some(edited.instances.label[first])
 }
 
-/// Scores of all instances for a text: `scores` has null for one without a descriptor. `names` are instances that a person
-/// gave a name which holds the text.
+/// What a text finds.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct Found {
+    /// Score of every instance, none for one without a descriptor; empty where only names answer.
+    pub scores: Vec<Option<f32>>,
+    /// Instances that a person gave a name which holds the text.
+    pub named: Vec<u32>,
+}
+
+/// What a text finds.
 ///
 /// # Errors
 /// When a table of text features does not have the text.
-pub fn find(world: &World, edited: &Edited, text: &str) -> Result<Value> {
+pub fn find(world: &World, edited: &Edited, text: &str) -> Result<Found> {
     let wanted = text.trim().to_lowercase();
     let named: Vec<u32> = edited
         .remarks
@@ -149,7 +156,7 @@ pub fn find(world: &World, edited: &Edited, text: &str) -> Result<Value> {
         Err(_) if !named.is_empty() => Vec::new(),
         Err(why) => return Err(Error::new(why.clone())),
     };
-    Ok(json!({"text": text, "scores": scores, "named": named}))
+    Ok(Found { scores, named })
 }
 
 /// Cosine of every instance with a text's feature; null for one without a descriptor.

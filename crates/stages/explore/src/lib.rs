@@ -3,9 +3,11 @@
 //! `run_folder` finds what a run was made from, `world` loads it, `pack` brings the Gaussians down to 16 bytes each and
 //! `describe` says the rest as JSON. `serve` gives the page of `web/` a server on this machine, whose `answers` come from
 //! the rasteriser, for Gaussians within `reach` of a click, and the language model; `page` puts everything into one file that needs no server.
+//! `tools` answers programs, over HTTP by `serve` and over the Model Context Protocol by `mcp`.
 
 mod answers;
 mod describe;
+mod mcp;
 mod options;
 mod pack;
 mod page;
@@ -13,6 +15,7 @@ mod pictures;
 mod reach;
 mod run_folder;
 mod serve;
+mod tools;
 mod web;
 mod world;
 

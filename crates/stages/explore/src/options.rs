@@ -1,7 +1,7 @@
 //! The command line.
 
 use clap::{Parser, Subcommand};
-use gs_io::Result;
+use gs_io::{Error, Result};
 use gs_scene::dataset::Resolution;
 use serde::{Serialize, Serializer};
 use stage::{CommonArgs, Program, Stage};
@@ -23,6 +23,8 @@ pub struct Args {
 enum Command {
     /// Serve the page on this machine until Ctrl-C
     Serve(ServeOptions),
+    /// Answer an agent on standard input and output, by the Model Context Protocol
+    Mcp(McpOptions),
     /// Write the page as one HTML file that needs no server and no network
     Page(PageOptions),
 }
@@ -66,6 +68,20 @@ pub struct ServeOptions {
     /// Open the page in the browser
     #[arg(long)]
     pub open: bool,
+    /// Folder that programs may write objects into (POST tools/export) [default: they may not]
+    #[arg(long, value_name = "DIR")]
+    pub exports: Option<PathBuf>,
+}
+
+/// `explore mcp`.
+#[derive(Debug, Clone, clap::Args, Serialize)]
+pub struct McpOptions {
+    #[command(flatten)]
+    #[serde(flatten)]
+    pub source: Source,
+    /// Folder that the agent may write objects into [default: it may not]
+    #[arg(long, value_name = "DIR")]
+    pub exports: Option<PathBuf>,
 }
 
 /// `explore page`.
@@ -100,10 +116,20 @@ impl Program for Args {
         &self.common
     }
 
+    fn check(&self) -> Result<()> {
+        match self.command {
+            Command::Mcp(_) if self.common.json => Err(Error::new("standard output is for the agent")
+                .field("--json")
+                .hint("leave --json out: messages go to standard error")),
+            _ => Ok(()),
+        }
+    }
+
     fn run(self, stage: &Stage) -> Result<()> {
         let parameters = serde_json::to_value(&self.command).unwrap_or_default();
         match &self.command {
             Command::Serve(o) => crate::serve::run(o, stage),
+            Command::Mcp(o) => crate::mcp::run(o, stage),
             Command::Page(o) => crate::page::run(o, parameters, stage),
         }
     }

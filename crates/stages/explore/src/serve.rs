@@ -7,8 +7,9 @@
 use crate::answers::{self, Click, Export};
 use crate::describe::Blob;
 use crate::options::ServeOptions;
+use crate::tools::Asked;
 use crate::world::{Edited, World};
-use crate::{describe, pictures, web};
+use crate::{describe, pictures, tools, web};
 use artifacts::{Edit, Edits};
 use axum::Router;
 use axum::body::Bytes;
@@ -26,6 +27,7 @@ use serde_json::Value;
 use stage::Stage;
 use std::collections::BTreeMap;
 use std::net::{IpAddr, Ipv4Addr, SocketAddr};
+use std::path::PathBuf;
 use std::sync::{Arc, Mutex};
 use std::time::Duration;
 
@@ -44,6 +46,8 @@ struct Shared {
     edited: Mutex<Edited>,
     /// Small photographs, as far as they were asked for.
     previews: Mutex<BTreeMap<usize, Bytes>>,
+    /// Folder that programs may write into.
+    exports: Option<PathBuf>,
     /// Whether only those who name this machine are answered.
     local: bool,
 }
@@ -108,7 +112,14 @@ fn shared(o: &ServeOptions, local: bool, stage: &Stage) -> Result<Shared> {
         world.scene.instances.len(),
         blob.bytes.len() as f64 / 1e6
     ));
-    Ok(Shared { world, blob, edited: Mutex::new(edited), previews: Mutex::default(), local })
+    Ok(Shared {
+        world,
+        blob,
+        edited: Mutex::new(edited),
+        previews: Mutex::default(),
+        exports: o.exports.clone(),
+        local,
+    })
 }
 
 fn routes(shared: Arc<Shared>) -> Router {
@@ -127,6 +138,8 @@ fn routes(shared: Arc<Shared>) -> Router {
         .route("/find", get(find))
         .route("/edits", axum::routing::put(save))
         .route("/selection", post(selection))
+        .route("/tools", get(|| async { json(&tools::described()) }))
+        .route("/tools/{name}", post(tool))
         .layer(DefaultBodyLimit::max(LARGEST_BODY))
         .layer(middleware::from_fn_with_state(Arc::clone(&shared), guard))
         .with_state(shared)
@@ -258,14 +271,14 @@ async fn pick(State(s): Held, body: Bytes) -> Response {
 
 /// `?text=...`.
 #[derive(serde::Deserialize)]
-struct Asked {
+struct Words {
     text: String,
 }
 
-async fn find(State(s): Held, Query(asked): Query<Asked>) -> Response {
+async fn find(State(s): Held, Query(asked): Query<Words>) -> Response {
     answer(move || {
         let edited = s.edited.lock().expect("no panic holds this lock");
-        answers::find(&s.world, &edited, &asked.text).map(|found| json(&found))
+        answers::find(&s.world, &edited, &asked.text).map(|found| json(&serde_json::json!(found)))
     })
     .await
 }
@@ -280,6 +293,22 @@ async fn save(State(s): Held, body: Bytes) -> Response {
         let list = describe::instances_of(Some(&new), &s.world);
         *s.edited.lock().expect("no panic holds this lock") = new;
         Ok(json(&Value::Array(list)))
+    })
+    .await
+}
+
+/// A tool's answer; what is wrong with a question is JSON too.
+async fn tool(State(s): Held, Path(name): Path<String>, body: Bytes) -> Response {
+    let ask = move || {
+        let arguments = if body.is_empty() { Value::Null } else { parsed(&body)? };
+        let edited = s.edited.lock().expect("no panic holds this lock");
+        tools::ask(&name, arguments, &Asked { world: &s.world, edited: &edited, exports: s.exports.as_deref() })
+    };
+    answer(move || {
+        Ok(match ask() {
+            Ok(answer) => json(&answer),
+            Err(e) => (StatusCode::BAD_REQUEST, json(&serde_json::json!({"error": e.to_string()}))).into_response(),
+        })
     })
     .await
 }

@@ -8,9 +8,11 @@ use artifacts::{Edits, Instances, Remarks};
 use gs_io::{Error, Result};
 use gs_scene::Gaussians;
 use gs_scene::dataset::{self, Dataset, LoadOptions, Resolution, View};
+use objects::Up;
 use query::{LabelledScene, TextSource};
 use stage::Stage;
 use std::collections::BTreeMap;
+use std::sync::OnceLock;
 
 /// What the page shows, and what answers its questions.
 pub struct World {
@@ -44,6 +46,18 @@ pub struct Edited {
     pub instances: Instances,
     /// Names and scale.
     pub remarks: Remarks,
+    objects: OnceLock<objects::Scene>,
+}
+
+impl Edited {
+    /// The objects as `scene.json` has them; found once.
+    pub fn objects(&self, world: &World) -> &objects::Scene {
+        self.objects.get_or_init(|| {
+            let up = Up::of_cameras(world.dataset.views.iter().map(|v| &v.camera));
+            let inputs = world.scene.inputs.clone();
+            objects::describe(&self.instances, world.gaussians(), &self.remarks, &BTreeMap::new(), up, inputs)
+        })
+    }
 }
 
 impl World {
@@ -112,7 +126,7 @@ impl World {
     pub fn edited(&self, edits: Edits) -> Result<Edited> {
         let mut instances = self.scene.instances.clone();
         let remarks = edits.apply(&mut instances, &self.gaussians().means)?;
-        Ok(Edited { edits, instances, remarks })
+        Ok(Edited { edits, instances, remarks, objects: OnceLock::new() })
     }
 
     /// The view of this stem.

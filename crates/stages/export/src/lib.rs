@@ -1,6 +1,6 @@
 //! `export`: the objects of a scene for other programs.
 //!
-//! [`options`](Args) is the command line; `run` reads the scene and writes what a command asks for: `splats` Gaussians,
+//! [`options`](Args) is the command line; `run` reads the scene and writes what a command asks for: splats itself,
 //! `points` labelled point clouds, `hull` and `mesh` closed meshes around objects, `usd` all of it as a USD stage, `names` what
 //! queries call them.
 
@@ -10,7 +10,6 @@ mod names;
 mod options;
 mod points;
 mod run;
-mod splats;
 mod usd;
 
 pub use hull::hull;

@@ -1,11 +1,11 @@
 //! The command line.
 
 use clap::{Parser, Subcommand, ValueEnum};
-use gs_io::Result;
+use gs_io::{Error, Result};
 use objects::Up;
 use serde::{Serialize, Serializer};
 use stage::{CommonArgs, Program, Stage};
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
 /// Take the objects of a scene to other programs: scene.json, splats, points, meshes, USD
 #[derive(Debug, Parser)]
@@ -92,6 +92,33 @@ pub enum SplatFormat {
     Splat,
     /// glTF with KHR_gaussian_splatting
     Glb,
+}
+
+impl SplatFormat {
+    /// The format of an output by its extension.
+    ///
+    /// # Errors
+    /// When there is no such format.
+    pub fn of(path: &Path) -> Result<Self> {
+        let name = path.file_name().unwrap_or_default().to_string_lossy().to_lowercase();
+        let extension = name.rsplit_once('.').map_or("", |(_, extension)| extension);
+        // A compressed PLY has another order.
+        let format = if name.ends_with(".compressed.ply") { "" } else { extension };
+        Self::from_str(format, false).map_err(|_| {
+            let known: Vec<String> = Self::value_variants().iter().map(|f| format!(".{}", f.extension())).collect();
+            Error::new("no format of splats has this extension").file(path).expected(known.join(", "))
+        })
+    }
+
+    /// The extension, without its dot.
+    pub fn extension(self) -> &'static str {
+        match self {
+            Self::Ply => "ply",
+            Self::Spz => "spz",
+            Self::Splat => "splat",
+            Self::Glb => "glb",
+        }
+    }
 }
 
 /// `export objects`.
@@ -212,7 +239,7 @@ impl Program for Args {
 
     fn check(&self) -> Result<()> {
         match &self.command {
-            Command::Splats(o) => crate::splats::format_of(&o.out).map(drop),
+            Command::Splats(o) => SplatFormat::of(&o.out).map(drop),
             Command::Points(o) => crate::points::PointFormat::of(&o.out).map(drop),
             Command::Usd(o) => crate::usd::check_name(&o.out),
             _ => Ok(()),

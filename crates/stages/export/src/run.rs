@@ -7,9 +7,9 @@ use crate::options::{
     UsdOptions,
 };
 use crate::points::{self, PointFormat};
-use crate::splats::{Splats, extension_of, format_of};
 use crate::usd::{self, Prim, StageOptions};
 use gs_io::{Claim, Error, Outputs, Result};
+use gs_scene::Labelled;
 use gs_scene::dataset::{self, LoadOptions};
 use objects::{Ids, Names, Scene, Up, members, solid_centers};
 use query::LabelledScene;
@@ -41,12 +41,12 @@ pub fn scene(o: &SceneOptions, parameters: Value, stage: &Stage) -> Result<()> {
 pub fn objects(o: &ObjectsOptions, parameters: Value, stage: &Stage) -> Result<()> {
     let mut claim = claim_folder(&o.out, "objects", &o.inputs, stage)?;
     let labelled = o.inputs.read(stage)?;
-    let splats = Splats::new(&labelled, &o.inputs.geometry)?;
+    let splats = splats_of(&labelled, &o.inputs)?;
     let wanted = wanted(&labelled, &o.only, "--only")?;
     let members = members(&labelled.instances.label, labelled.instances.len());
     for &id in &wanted {
-        let file = o.out.join(format!("{}.{}", stem(id), extension_of(o.format)));
-        splats.write(&file, o.format, &members[id as usize])?;
+        let file = o.out.join(format!("{}.{}", stem(id), o.format.extension()));
+        splats.write(&file, &members[id as usize])?;
     }
     stage.info(&format!("wrote {} objects into {}", wanted.len(), o.out.display()));
     stage.record(&mut claim, parameters, labelled.inputs.clone(), json!({ "objects": wanted.len() }))
@@ -54,7 +54,6 @@ pub fn objects(o: &ObjectsOptions, parameters: Value, stage: &Stage) -> Result<(
 
 /// `export splats`.
 pub fn splats(o: &SplatsOptions, parameters: Value, stage: &Stage) -> Result<()> {
-    let format = format_of(&o.out)?;
     let outputs = stage.outputs(&o.out).file(&o.out).files(o.ids.then(|| Ids::path(&o.out)));
     let mut claim = o.inputs.reads(outputs.drop_stale()).claim()?;
     let labelled = o.inputs.read(stage)?;
@@ -69,7 +68,7 @@ pub fn splats(o: &SplatsOptions, parameters: Value, stage: &Stage) -> Result<()>
     if which.is_empty() {
         return Err(Error::new("nothing is left to write").field("--without").hint("leave some objects"));
     }
-    Splats::new(&labelled, &o.inputs.geometry)?.write(&o.out, format, &which)?;
+    splats_of(&labelled, &o.inputs)?.write(&o.out, &which)?;
     if o.ids {
         Ids::of(&o.out, which.iter().map(|&i| label[i as usize]).collect())?.write(&o.out)?;
     }
@@ -170,6 +169,11 @@ impl UpOptions {
         }
         Ok(up)
     }
+}
+
+fn splats_of<'a>(scene: &'a LabelledScene, inputs: &Inputs) -> Result<Labelled<'a>> {
+    let made_by = concat!("export ", env!("CARGO_PKG_VERSION"));
+    Labelled::new(&scene.geometry, &inputs.geometry, &scene.instances.label, made_by)
 }
 
 fn describe(labelled: &LabelledScene, names: &Names, up: Option<Up>) -> Scene {

@@ -1,0 +1,99 @@
+//! `explore mcp`: the tools for an agent, over the Model Context Protocol on standard input and output.
+
+use crate::options::McpOptions;
+use crate::tools::{self, Asked, TOOLS};
+use crate::world::{Edited, World};
+use gs_io::{Error, Result};
+use gs_scene::dataset::Resolution;
+use rmcp::model::{
+    CallToolRequestParams, CallToolResponse, CallToolResult, Implementation, ListToolsResult, PaginatedRequestParams,
+    ServerCapabilities, ServerConfig, Tool,
+};
+use rmcp::service::{RequestContext, RoleServer};
+use rmcp::transport::stdio;
+use rmcp::{ErrorData, ServerHandler, serve_server};
+use serde_json::{Value, json};
+use stage::Stage;
+use std::path::PathBuf;
+use std::sync::{Arc, Mutex};
+use std::time::Duration;
+
+/// What an agent is told of all tools.
+const ABOUT: &str = "A scene of 3D Gaussians that is divided into objects. Ask list for the objects, find for one that a text \
+                     describes, then measure, relations or export with its id.";
+
+struct Shared {
+    world: World,
+    edited: Mutex<Edited>,
+    exports: Option<PathBuf>,
+}
+
+/// Answers until standard input ends.
+pub fn run(o: &McpOptions, stage: &Stage) -> Result<()> {
+    let world = World::read(&o.source, Resolution::Auto, stage)?;
+    let edited = world.edited(world.saved_edits()?)?;
+    let objects = edited.objects(&world).objects.len();
+    let door = Door(Arc::new(Shared { world, edited: Mutex::new(edited), exports: o.exports.clone() }));
+    stage.info(&format!("{objects} objects; answers on standard output until standard input ends"));
+    let runtime = tokio::runtime::Builder::new_multi_thread().worker_threads(2).enable_all().build();
+    let runtime = runtime.map_err(|e| Error::new(format!("cannot start: {e}")))?;
+    let failed =
+        |e: &dyn std::fmt::Display| Error::new(format!("the agent's side failed: {e}")).field("standard input");
+    let done = runtime.block_on(async {
+        let stopped = async {
+            while !stage.interrupted() {
+                tokio::time::sleep(Duration::from_millis(100)).await;
+            }
+        };
+        let served = async {
+            let running = serve_server(door, stdio()).await.map_err(|e| failed(&e))?;
+            running.waiting().await.map(drop).map_err(|e| failed(&e))
+        };
+        tokio::select! {
+            done = served => done,
+            () = stopped => Ok(()),
+        }
+    });
+    // A read of standard input cannot be taken back.
+    runtime.shutdown_background();
+    done
+}
+
+struct Door(Arc<Shared>);
+
+impl ServerHandler for Door {
+    fn get_info(&self) -> ServerConfig {
+        ServerConfig::new(ServerCapabilities::builder().enable_tools().build())
+            .with_server_info(Implementation::new("explore", env!("CARGO_PKG_VERSION")))
+            .with_instructions(ABOUT)
+    }
+
+    async fn list_tools(
+        &self,
+        _: Option<PaginatedRequestParams>,
+        _: RequestContext<RoleServer>,
+    ) -> std::result::Result<ListToolsResult, ErrorData> {
+        let tools = TOOLS.iter().map(|t| Tool::new(t.name, t.about, (t.schema)())).collect();
+        Ok(ListToolsResult::with_all_items(tools))
+    }
+
+    async fn call_tool(
+        &self,
+        request: CallToolRequestParams,
+        _: RequestContext<RoleServer>,
+    ) -> std::result::Result<CallToolResponse, ErrorData> {
+        let shared = Arc::clone(&self.0);
+        let work = move || {
+            let edited = shared.edited.lock().expect("no panic holds this lock");
+            let asked = Asked { world: &shared.world, edited: &edited, exports: shared.exports.as_deref() };
+            tools::ask(&request.name, request.arguments.map_or(Value::Null, Value::Object), &asked)
+        };
+        let answer = tokio::task::spawn_blocking(work).await;
+        let answer = answer.map_err(|_| ErrorData::internal_error("the program failed at this", None))?;
+        Ok(match answer {
+            Ok(answer) => CallToolResult::structured(answer),
+            Err(e) => CallToolResult::structured_error(json!({"error": e.to_string()})),
+        }
+        .into())
+    }
+}

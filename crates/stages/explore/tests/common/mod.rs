@@ -1,0 +1,179 @@
+//! A small run, and a server of it.
+#![allow(dead_code, reason = "each test uses a part of this")]
+
+use artifacts::{Features, Instances, OrientedBox, TreeEdge, role};
+use glam::DVec3;
+use gs_io::{Provenance, hash_file};
+use gs_scene::dataset::{self, LoadOptions};
+use gs_scene::{Camera, Gaussians, Image};
+use serde_json::{Value, json};
+use std::collections::BTreeMap;
+use std::io::{BufRead, BufReader, Read, Write};
+use std::net::TcpStream;
+use std::path::{Path, PathBuf};
+use std::process::{Child, Command, Output, Stdio};
+
+pub const SIZE: (u32, u32) = (64, 48);
+
+/// A run of two balls, one before the other, seen by two cameras; instance 0 is in front. Ball 1 has two parts.
+pub struct Run {
+    pub dir: tempfile::TempDir,
+}
+
+pub fn gaussians() -> Gaussians {
+    let mut g = Gaussians::default();
+    for (x, z, scale) in [(0.0, 2.0, 0.1f32), (0.0, 4.0, 0.4), (0.9, 4.0, 0.4), (0.0, 9.0, 0.1)] {
+        g.means.push([x, 0.0, z]);
+        g.log_scales.push([scale.ln(); 3]);
+        g.rotations.push([1.0, 0.0, 0.0, 0.0]);
+        g.opacity_logits.push(if z > 8.0 { -30.0 } else { 6.0 });
+        g.sh.extend([0.5, 0.0, -0.5]);
+    }
+    g
+}
+
+pub fn camera(x: f64) -> Camera {
+    Camera::look_at(DVec3::new(x, 0.0, 0.0), DVec3::new(0.0, 0.0, 4.0), -DVec3::Y, SIZE.0, SIZE.1, 1.0)
+}
+
+impl Run {
+    pub fn new() -> Self {
+        let run = Self { dir: tempfile::tempdir().unwrap() };
+        let (g, scene) = (gaussians(), run.scene());
+        std::fs::create_dir_all(scene.join("images")).unwrap();
+        std::fs::create_dir_all(run.out()).unwrap();
+        let geometry = run.out().join("geometry.ply");
+        gs_scene::ply::write_gaussians(&geometry, &g, &[]).unwrap();
+        let mut frames = Vec::new();
+        for (k, x) in [0.0, 0.5].into_iter().enumerate() {
+            let camera = camera(x);
+            let rgb = gs_raster::render(&g, &camera, &gs_raster::RasterOptions::default()).rgb;
+            let name = format!("images/f{k}.png");
+            Image { width: SIZE.0, height: SIZE.1, rgb, alpha: None }.write_png(scene.join(&name)).unwrap();
+            let (r, eye) = (camera.rotation, camera.position());
+            // OpenGL: y up, z backwards.
+            let row = |i: usize| [r.row(0)[i], -r.row(1)[i], -r.row(2)[i], eye[i]];
+            frames.push(json!({"file_path": name, "transform_matrix": [row(0), row(1), row(2), [0.0, 0.0, 0.0, 1.0]]}));
+        }
+        let c = camera(0.0);
+        let transforms =
+            json!({"w": SIZE.0, "h": SIZE.1, "fl_x": c.fx, "fl_y": c.fy, "cx": c.cx, "cy": c.cy, "frames": frames});
+        std::fs::write(scene.join("transforms.json"), transforms.to_string()).unwrap();
+        let dataset = dataset::load(&scene, &LoadOptions::default()).unwrap().hash().unwrap();
+        let inputs =
+            [(role::GEOMETRY.to_string(), hash_file(&geometry).unwrap()), (role::DATASET.to_string(), dataset)];
+        let provenance = || Provenance { inputs: BTreeMap::from(inputs.clone()), ..Provenance::default() };
+        let edge = |parent, child, instance| TreeEdge { parent, child, lambda: 1.0, size: 1, instance };
+        let instances = Instances {
+            label: vec![0, 1, 1, -1],
+            dim: 2,
+            descriptor: vec![1.0, 0.0, 0.0, 1.0],
+            support: vec![2, 2],
+            score: vec![0.9, 0.8],
+            count: vec![1, 2],
+            centroid: vec![g.means[0], [0.45, 0.0, 4.0]],
+            bbox_min: vec![g.means[0], g.means[1]],
+            bbox_max: vec![g.means[0], g.means[2]],
+            oriented: vec![
+                OrientedBox {
+                    axes: [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]],
+                    ..Default::default()
+                };
+                2
+            ],
+            views: vec!["f0".into(), "f1".into()],
+            matches: vec![
+                artifacts::Match { instance: 0, view: 0, mask: 1, score: 0.9, visible: 9.0 },
+                artifacts::Match { instance: 1, view: 1, mask: 2, score: 0.8, visible: 9.0 },
+            ],
+            tree: vec![edge(10, 11, 0), edge(10, 12, 1), edge(12, 13, -1), edge(12, 14, -1)],
+            node: vec![11, 13, 14, -1],
+            ..Instances::default()
+        };
+        instances.write(run.out().join("instances.safetensors"), provenance()).unwrap();
+        let features =
+            Features { kept: vec![0, 1, 2], dim: 2, values: vec![1.0, 0.0, 0.0, 1.0, 0.1, 0.9], ..Features::default() };
+        features.write(run.out().join("features.safetensors"), provenance()).unwrap();
+        std::fs::write(run.dir.path().join("text.json"), r#"{"near ball": [1, 0], "far ball": [0, 1]}"#).unwrap();
+        run
+    }
+
+    pub fn scene(&self) -> PathBuf {
+        self.dir.path().join("scene")
+    }
+
+    pub fn out(&self) -> PathBuf {
+        self.dir.path().join("out")
+    }
+
+    pub fn arguments(&self, command: &str) -> Vec<String> {
+        let at = |p: &Path| p.display().to_string();
+        let (out, scene) = (self.out(), self.scene());
+        let pairs = [("--run-dir", at(&out)), ("--scene", at(&scene)), ("--geometry", at(&out.join("geometry.ply")))];
+        let pairs = pairs.into_iter().flat_map(|(option, value)| [option.to_string(), value]);
+        let texts = ["--text-features".to_string(), at(&self.dir.path().join("text.json"))];
+        [command.to_string()].into_iter().chain(pairs).chain(texts).collect()
+    }
+
+    pub fn run(&self, command: &str, more: &[&str]) -> Output {
+        Command::new(env!("CARGO_BIN_EXE_explore")).args(self.arguments(command)).args(more).output().unwrap()
+    }
+
+    pub fn serve(&self, more: &[&str]) -> Server {
+        let mut command = Command::new(env!("CARGO_BIN_EXE_explore"));
+        let command = command.args(self.arguments("serve")).args(["--port", "0"]).args(more).stderr(Stdio::piped());
+        let mut child = command.spawn().unwrap();
+        let lines = BufReader::new(child.stderr.take().unwrap()).lines().map_while(Result::ok);
+        let url = lines.into_iter().find_map(|l| Some(l.split_once("http://")?.1.split(' ').next()?.to_string()));
+        let (host, path) = url
+            .expect("the server says where it is")
+            .split_once('/')
+            .map(|(h, p)| (h.to_string(), format!("/{p}")))
+            .unwrap();
+        Server { child, host, path }
+    }
+}
+
+pub struct Server {
+    child: Child,
+    pub host: String,
+    pub path: String,
+}
+
+impl Drop for Server {
+    fn drop(&mut self) {
+        let _ = self.child.kill();
+        let _ = self.child.wait();
+    }
+}
+
+impl Server {
+    /// Status, headers and body of an answer; `headers` end with line breaks.
+    pub fn ask(&self, method: &str, path: &str, headers: &str, body: &str) -> (u16, String, Vec<u8>) {
+        let mut stream = TcpStream::connect(&self.host).unwrap();
+        let host = if headers.contains("Host:") { String::new() } else { format!("Host: {}\r\n", self.host) };
+        write!(
+            stream,
+            "{method} {path} HTTP/1.1\r\n{host}Connection: close\r\nContent-Length: {}\r\n{headers}\r\n{body}",
+            body.len()
+        )
+        .unwrap();
+        let mut answer = Vec::new();
+        stream.read_to_end(&mut answer).unwrap();
+        let end = answer.windows(4).position(|w| w == b"\r\n\r\n").unwrap();
+        let head = String::from_utf8_lossy(&answer[..end]).into_owned();
+        let status = head.split(' ').nth(1).unwrap().parse().unwrap();
+        (status, head.to_lowercase(), answer[end + 4..].to_vec())
+    }
+
+    pub fn get(&self, path: &str) -> (u16, Vec<u8>) {
+        let (status, _, body) = self.ask("GET", path, "", "");
+        (status, body)
+    }
+
+    pub fn json(&self, method: &str, path: &str, body: &Value) -> Value {
+        let (status, _, answer) = self.ask(method, path, "Content-Type: application/json\r\n", &body.to_string());
+        assert_eq!(status, 200, "{path}: {}", String::from_utf8_lossy(&answer));
+        serde_json::from_slice(&answer).unwrap()
+    }
+}
