@@ -34,12 +34,15 @@ impl<'a> Labelled<'a> {
     /// # Errors
     /// When no format has such a name, or the file cannot be written.
     pub fn write(&self, to: &Path, which: &[u32]) -> Result<()> {
-        match (Format::to_write(to)?, &self.rows) {
+        let format = Format::to_write(to)?;
+        match (format, &self.rows) {
             (Format::Ply, Some(rows)) => rows.write(to, which, Some(self.label), &self.comments),
             _ => {
                 let own: Vec<i32> = which.iter().map(|&i| self.label[i as usize]).collect();
                 let antialias = self.geometry.antialias;
-                let extra = Extra { comments: &self.comments, antialias, instance: Some(&own) };
+                // No other format has a place for it.
+                let instance = (format == Format::Ply).then_some(&own[..]);
+                let extra = Extra { comments: &self.comments, antialias, instance };
                 splat::write(to, &self.geometry.gaussians.select(which), &extra)
             }
         }

@@ -202,7 +202,7 @@ fn list(asked: &Asked, list: &List) -> Value {
         "objects": objects.into_iter().map(brief).collect::<Vec<_>>(),
         "of": scene.objects.len(),
         "metres_per_unit": scene.metres_per_unit,
-        "up": scene.up.as_ref().map(|u: &Up| u.direction),
+        "up": scene.up.as_ref().map(|u: &Up| u.direction.map(|v| (1e4 * v).round() / 1e4)),
     })
 }
 

@@ -243,6 +243,25 @@ fn splats_keep_harmonics_and_ids_and_can_do_without_an_object() {
 }
 
 #[test]
+fn every_format_of_splats_is_written_with_ids_beside_it() {
+    let run = Run::new();
+    let (g, label) = gaussians();
+    for format in ["spz", "splat", "glb"] {
+        let (all, things) = (format!("all.{format}"), format!("things-{format}"));
+        run.succeed("splats", &all, &["--ids"]);
+        let read = gs_scene::splat::read(run.path(&all)).unwrap().gaussians;
+        assert_eq!(read.len(), g.len(), "{format}");
+        let off = |i: usize| (0..3).map(|c| (read.means[i][c] - g.means[i][c]).abs()).fold(0.0, f32::max);
+        assert!((0..g.len()).all(|i| off(i) < 0.01), "{format}: another order or other places");
+        assert_eq!(Ids::read(run.path(&all), g.len()).unwrap().instance, label, "{format}");
+        run.succeed("objects", &things, &["--format", format, "--only", "2"]);
+        assert_eq!(objects_in(&run.path(&things)), [format!("object_0002.{format}")]);
+        let thing = gs_scene::splat::read(run.path(&things).join(format!("object_0002.{format}"))).unwrap();
+        assert_eq!(thing.gaussians.len(), EACH, "{format}");
+    }
+}
+
+#[test]
 fn points_meshes_and_usd_are_written_the_same_each_time() {
     let run = Run::new();
     let bytes = |name: &str| std::fs::read(run.path(name)).unwrap();
