@@ -48,9 +48,21 @@ if python3 -c 'import numpy' 2> /dev/null; then
 else
   say "skipped: no python3 with numpy"
 fi
-examples/export_instances.sh "$work/a" "$work/viewer" > "$work/export.log" 2>&1 || { cat "$work/export.log"; fail "examples/export_instances.sh"; }
-[ -s "$work/viewer/instance_0000.ply" ] || fail "no instance was exported"
-pass "a shell example exports instances"
+examples/take_objects.sh "$work/a" "$work/taken" > "$work/export.log" 2>&1 || { cat "$work/export.log"; fail "examples/take_objects.sh"; }
+for f in scene.json objects/object_0000.ply meshes/object_0000.obj scene.usda; do [ -s "$work/taken/$f" ] || fail "no $f was taken"; done
+pass "a shell example takes objects"
+if command -v python3 > /dev/null; then
+  examples/simulator_usd.py "$work/taken" | grep -q 'objects can move' && grep -q PhysicsRigidBodyAPI "$work/taken/simulation.usda" || fail "examples/simulator_usd.py"
+  examples/blender_objects.py -- "$work/taken" > "$work/python.log" && grep -q 'object_0000.ply' "$work/python.log" || fail "examples/blender_objects.py"
+  target/release/explore serve --run-dir "$work/a" --clip testdata/clip-tiny --port 0 2> "$work/serve.log" & server=$!
+  for _ in $(seq 100); do url=$(sed -n 's/.*look at \(http[^ ]*\).*/\1/p' "$work/serve.log"); [ -z "$url" ] || break; sleep 0.1; done
+  examples/ask_scene.py floor "$url" > "$work/python.log" || { cat "$work/serve.log"; kill $server; fail "examples/ask_scene.py"; }
+  kill $server
+  grep -q '^size' "$work/python.log" || fail "examples/ask_scene.py answers nothing"
+  pass "Python examples make a simulator's stage, read objects for Blender and ask over HTTP"
+else
+  say "skipped: no python3"
+fi
 
 say "== a second make"
 tiny "$work/a" 2 > "$work/again.log" 2>&1
