@@ -47,8 +47,8 @@ pub struct Places<'a> {
     /// Free places in the room; none for an object.
     indoors: Vec<DVec3>,
     look: Look,
-    /// Which free space each cube is in, and those in which the first cameras around an object stand: no later one gets into
-    /// the object.
+    /// Which free space each cube is in, and those in which the farthest cameras around an object stand: no nearer one gets
+    /// into the object.
     space: Vec<i32>,
     entered: Vec<i32>,
     /// Whether the scene stands on a ground, which no camera looks at from below.
@@ -98,10 +98,12 @@ impl<'a> Places<'a> {
             return cameras;
         }
         let start = rng.random_range(0.0..TAU);
-        for (k, side) in directions(SIDES).enumerate() {
-            let (sin, cos) = start.sin_cos();
-            let side = side.z * self.up + (cos * side.x - sin * side.y) * a + (sin * side.x + cos * side.y) * b;
-            for distance in DISTANCES {
+        let (sin, cos) = start.sin_cos();
+        let sides: Vec<DVec3> = directions(SIDES)
+            .map(|s| s.z * self.up + (cos * s.x - sin * s.y) * a + (sin * s.x + cos * s.y) * b)
+            .collect();
+        for distance in DISTANCES {
+            for (k, &side) in sides.iter().enumerate() {
                 // From near, another part each time.
                 let off = if distance < 1.0 { 0.3 * self.matter.radius } else { 0.0 };
                 let corner = DVec3::new(1.0, if k % 2 == 0 { 1.0 } else { -1.0 }, if k % 3 == 0 { 1.0 } else { -1.0 });
@@ -111,10 +113,12 @@ impl<'a> Places<'a> {
                     cameras.extend(self.camera(eye, -side));
                 }
             }
+            if self.entered.is_empty() {
+                self.entered = cameras.iter().map(|c| self.space_of(c.position())).collect();
+                self.entered.sort_unstable();
+                self.entered.dedup();
+            }
         }
-        self.entered = cameras.iter().map(|c| self.space_of(c.position())).collect();
-        self.entered.sort_unstable();
-        self.entered.dedup();
         cameras
     }
 
