@@ -22,7 +22,7 @@ use crate::product::{Grouping, Product};
 use crate::union::root;
 use crate::world::{Inputs, World};
 use gs_io::{Error, Result};
-use hdbscan_exact::{Edge, Selection, cluster_graph};
+use hdbscan_exact::{Edge, Metric, Selection, cluster_graph};
 use nalgebra::DMatrix;
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
@@ -289,6 +289,7 @@ fn tree(n: usize, pairs: &[(u32, u32)], affinities: &[f64], options: &Options) -
         epsilon: distance(options.redundant),
         selection: Selection::ExcessOfMass,
         allow_single_cluster: false,
+        metric: Metric::Euclidean,
     };
     let clusters = cluster_graph(n, edges, &settings);
     (clusters.labels, clusters.selected.len())

@@ -11,7 +11,7 @@ use crate::linkage::{Edge, UnionFind};
 use crate::neighbours::{NONE, Neighbours, density_tree, neighbours};
 use multiversion::multiversion;
 use rayon::prelude::*;
-use std::sync::atomic::{AtomicU64, Ordering::Relaxed};
+use std::sync::atomic::{AtomicBool, AtomicU64, Ordering::Relaxed};
 
 /// The component of a node whose points belong to several.
 const MIXED: u32 = u32::MAX;
@@ -98,17 +98,23 @@ impl<'a> Candidates<'a> {
 
 /// The spanning tree of points `[n][dim]` under mutual reachability max(core a, core b, distance), n - 1 edges in ascending
 /// order, and the core distances it is made with. It is the minimum one of the total order of [`Edge::order`], which is
-/// unique. `weights` are how many points each stands for; see [`crate::Options::min_samples`].
-pub(crate) fn spanning_tree(points: &[f32], dim: usize, weights: &[u32], min_samples: usize) -> (Vec<Edge>, Vec<f64>) {
+/// unique. `weights` are how many points each stands for; see [`crate::Options::min_samples`]. None when `stop` is set meanwhile.
+pub(crate) fn spanning_tree(
+    points: &[f32],
+    dim: usize,
+    weights: &[u32],
+    min_samples: usize,
+    stop: &AtomicBool,
+) -> Option<(Vec<Edge>, Vec<f64>)> {
     let n = weights.len();
-    let tree = density_tree(points, dim, weights, min_samples);
-    let near = neighbours(&tree, weights, min_samples);
+    let tree = density_tree(points, dim, weights, min_samples, stop)?;
+    let near = neighbours(&tree, weights, min_samples, stop)?;
     let mut core = vec![0.0; n];
     for (&i, &c) in tree.order.iter().zip(&near.core) {
         core[i as usize] = c;
     }
     if n < 2 {
-        return (Vec::new(), core);
+        return Some((Vec::new(), core));
     }
     let mut search = Search::new(&tree, &near.core);
     let candidates = Candidates::new(&search, &near);
@@ -120,7 +126,10 @@ pub(crate) fn spanning_tree(points: &[f32], dim: usize, weights: &[u32], min_sam
     while out.len() < n - 1 {
         caps.reset();
         recall(&search, &candidates, &caps, &mut known);
-        search_more(&search, &leaves, &caps, &mut known);
+        search_more(&search, &leaves, &caps, &mut known, stop);
+        if stop.load(Relaxed) {
+            return None;
+        }
         // Every component's cheapest edge joins; in one total order these edges close no cycle.
         let mut cheapest: Vec<Option<Edge>> = vec![None; n];
         for (i, k) in known.iter().enumerate() {
@@ -132,7 +141,7 @@ pub(crate) fn spanning_tree(points: &[f32], dim: usize, weights: &[u32], min_sam
         search.update(&sets);
     }
     out.par_sort_unstable_by(Edge::order);
-    (out, core)
+    Some((out, core))
 }
 
 /// Gives points the edges that they know already, for sure or as candidates, and lowers the caps of their components.
@@ -156,7 +165,7 @@ fn recall(search: &Search<'_>, candidates: &Candidates<'_>, caps: &Caps, known: 
 }
 
 /// Lets the points search that may have a cheaper edge than their component knows, leaf by leaf.
-fn search_more(search: &Search<'_>, leaves: &[u32], caps: &Caps, known: &mut [Known]) {
+fn search_more(search: &Search<'_>, leaves: &[u32], caps: &Caps, known: &mut [Known], stop: &AtomicBool) {
     let nodes = &search.tree.nodes;
     let mut rest = known;
     let mut of_leaf: Vec<&mut [Known]> = Vec::with_capacity(leaves.len());
@@ -169,6 +178,9 @@ fn search_more(search: &Search<'_>, leaves: &[u32], caps: &Caps, known: &mut [Kn
     of_leaf.into_par_iter().zip(leaves).with_min_len(8).for_each_init(
         || (Group::default(), Vec::new()),
         |(group, asking), (known, &leaf)| {
+            if stop.load(Relaxed) {
+                return;
+            }
             let start = nodes[leaf as usize].start;
             asking.clear();
             for (lane, k) in known.iter().enumerate() {
@@ -315,6 +327,7 @@ fn cheapest_edges(search: &Search<'_>, points: &[(u32, u32)], caps: &Caps, group
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::NEVER;
     use crate::core_distances;
     use crate::kdtree::Unique;
     use crate::linkage::spanning_forest;
@@ -332,14 +345,14 @@ mod tests {
     #[test]
     fn a_line_is_spanned_by_its_gaps() {
         let points = [7.0f32, 0.0, 1.0, 3.5];
-        let (edges, core) = spanning_tree(&points, 1, &[1; 4], 1);
+        let (edges, core) = spanning_tree(&points, 1, &[1; 4], 1, &NEVER).unwrap();
         assert_eq!(edges, [Edge::new(1, 2, 1.0), Edge::new(2, 3, 2.5), Edge::new(0, 3, 3.5)]);
         assert_eq!(core, [0.0; 4]);
         // Core distances lift the edges of their points; a point that stands for three is its own neighbour.
-        let (edges, core) = spanning_tree(&points, 1, &[1, 1, 3, 1], 3);
+        let (edges, core) = spanning_tree(&points, 1, &[1, 1, 3, 1], 3, &NEVER).unwrap();
         assert_eq!(core, [6.0, 1.0, 0.0, 2.5]);
         assert_eq!(edges, [Edge::new(1, 2, 1.0), Edge::new(2, 3, 2.5), Edge::new(0, 2, 6.0)]);
-        assert!(spanning_tree(&[1.0, 2.0], 2, &[1], 4).0.is_empty());
+        assert!(spanning_tree(&[1.0, 2.0], 2, &[1], 4, &NEVER).unwrap().0.is_empty());
     }
 
     #[test]
@@ -357,7 +370,7 @@ mod tests {
         let unique = Unique::new(&points, 3);
         let spanned = |threads| {
             let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
-            pool.install(|| spanning_tree(&unique.points, 3, &unique.weights, 8))
+            pool.install(|| spanning_tree(&unique.points, 3, &unique.weights, 8, &NEVER).unwrap())
         };
         let (edges, core) = spanned(1);
         assert_eq!(edges, kruskal(&unique.points, 3, &core));
@@ -393,7 +406,7 @@ mod tests {
             for (c, &u) in all_core.iter().zip(&unique.of_point) {
                 core[u as usize] = *c;
             }
-            let (ours, own_core) = spanning_tree(&unique.points, dim, &unique.weights, min_samples);
+            let (ours, own_core) = spanning_tree(&unique.points, dim, &unique.weights, min_samples, &NEVER).unwrap();
             prop_assert_eq!(&own_core, &core);
             prop_assert_eq!(ours, kruskal(&unique.points, dim, &core));
         }

@@ -12,6 +12,7 @@ mod boruvka;
 mod condense;
 mod kdtree;
 mod linkage;
+mod metric;
 mod neighbours;
 mod predict;
 mod select;
@@ -19,9 +20,15 @@ mod select;
 pub use agreement::adjusted_rand;
 pub use condense::{CondensedEdge, CondensedTree};
 pub use linkage::Edge;
+pub use metric::Metric;
 pub use neighbours::core_distances;
 pub use predict::{Prediction, approximate_predict};
 pub use select::Selection;
+
+use std::sync::atomic::AtomicBool;
+
+/// For what is not to be stopped.
+static NEVER: AtomicBool = AtomicBool::new(false);
 
 /// Parameters of a clustering.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -36,6 +43,8 @@ pub struct Options {
     pub selection: Selection,
     /// Whether all points may be one cluster.
     pub allow_single_cluster: bool,
+    /// What distance is between points; edges of a graph have theirs.
+    pub metric: Metric,
 }
 
 impl Default for Options {
@@ -46,6 +55,7 @@ impl Default for Options {
             epsilon: 0.0,
             selection: Selection::ExcessOfMass,
             allow_single_cluster: false,
+            metric: Metric::Euclidean,
         }
     }
 }
@@ -72,14 +82,27 @@ pub struct Clustering {
 /// Clusters `points`, `[n][dim]` flattened.
 ///
 /// # Panics
-/// When `dim` is 0, does not divide the number of values, or a value is not finite.
+/// When `dim` is 0, does not divide the number of values, or a value is not finite; with [`Metric::Cosine`] also when a point
+/// is 0.
 pub fn cluster(points: &[f32], dim: usize, options: &Options) -> Clustering {
+    cluster_until(points, dim, options, &NEVER).expect("nothing stops it")
+}
+
+/// [`cluster`], which ends soon after `stop` is set, with nothing.
+///
+/// # Panics
+/// As [`cluster`].
+pub fn cluster_until(points: &[f32], dim: usize, options: &Options, stop: &AtomicBool) -> Option<Clustering> {
     assert!(dim > 0 && points.len().is_multiple_of(dim), "points are [n][dim]");
     assert!(points.iter().all(|v| v.is_finite()), "points are finite");
-    let unique = kdtree::Unique::new(points, dim);
-    let (edges, core) = boruvka::spanning_tree(&unique.points, dim, &unique.weights, options.min_samples);
+    let unique = kdtree::Unique::new(&options.metric.prepare(points, dim), dim);
+    let (mut edges, mut core) =
+        boruvka::spanning_tree(&unique.points, dim, &unique.weights, options.min_samples, stop)?;
+    // The order of the edges stays.
+    edges.iter_mut().for_each(|e| e.weight = options.metric.of_euclidean(e.weight));
+    core.iter_mut().for_each(|c| *c = options.metric.of_euclidean(*c));
     let tree = condense::condense(&edges, &unique.weights, &core, options.min_cluster_size);
-    select::label(tree, &unique.of_point, options)
+    Some(select::label(tree, &unique.of_point, options))
 }
 
 /// Clusters `n` points by the edges of a graph, weights being distances; parts of the graph that are not connected are

@@ -1,8 +1,10 @@
 //! Core distances, and the neighbours they were found with.
 
+use crate::NEVER;
 use crate::kdtree::{Group, KdTree, LEAF, Unique, Visitor, rough_limit, squared};
 use multiversion::multiversion;
 use rayon::prelude::*;
+use std::sync::atomic::{AtomicBool, Ordering::Relaxed};
 
 /// Most neighbours that are remembered of a point.
 const MOST: usize = 32;
@@ -26,7 +28,13 @@ pub(crate) struct Neighbours {
 
 /// A tree over distinct `points` `[n][dim]` that parts dense points from scattered ones, by what core distances would be if
 /// there were only the points in the same small part of a first tree.
-pub(crate) fn density_tree(points: &[f32], dim: usize, weights: &[u32], min_samples: usize) -> KdTree {
+pub(crate) fn density_tree(
+    points: &[f32],
+    dim: usize,
+    weights: &[u32],
+    min_samples: usize,
+    stop: &AtomicBool,
+) -> Option<KdTree> {
     let first = KdTree::new(points, dim);
     let among = GUESS_AMONG.max(2 * min_samples);
     let small = |node: usize| (first.nodes[node].end - first.nodes[node].start) as usize <= among;
@@ -41,13 +49,16 @@ pub(crate) fn density_tree(points: &[f32], dim: usize, weights: &[u32], min_samp
         .par_iter()
         .map_init(Search::default, |search, &root| {
             let mut out = Vec::new();
-            for leaf in first.leaves(root) {
+            for leaf in first.leaves(root).take_while(|_| !stop.load(Relaxed)) {
                 search_leaf(&first, &weights, &first, leaf, root, min_samples, search);
                 out.extend(search.found.iter().take(search.count).map(|f| f.last().map_or(0.0, |b| b.0).sqrt()));
             }
             out
         })
         .collect();
+    if stop.load(Relaxed) {
+        return None;
+    }
     let mut core = vec![0.0; weights.len()];
     for (&root, guesses) in roots.iter().zip(guesses) {
         let start = first.nodes[root as usize].start as usize;
@@ -57,7 +68,7 @@ pub(crate) fn density_tree(points: &[f32], dim: usize, weights: &[u32], min_samp
     }
     // In many dimensions a tree is most of the memory.
     drop(first);
-    KdTree::by_density(points, dim, &core)
+    Some(KdTree::by_density(points, dim, &core))
 }
 
 fn in_tree_order(tree: &KdTree, weights: &[u32]) -> Vec<u32> {
@@ -67,8 +78,9 @@ fn in_tree_order(tree: &KdTree, weights: &[u32]) -> Vec<u32> {
 /// Of each point of a leaf its core distance and whether its neighbours are complete; and their rows of neighbours.
 type OfLeaf = (Vec<(f64, bool)>, Vec<u32>);
 
-/// Core distances and nearest neighbours of the tree's points; `weights` are how many points each stands for.
-pub(crate) fn neighbours(tree: &KdTree, weights: &[u32], min_samples: usize) -> Neighbours {
+/// Core distances and nearest neighbours of the tree's points; `weights` are how many points each stands for. None when
+/// `stop` is set meanwhile.
+pub(crate) fn neighbours(tree: &KdTree, weights: &[u32], min_samples: usize, stop: &AtomicBool) -> Option<Neighbours> {
     let n = tree.order.len();
     let kept = min_samples.saturating_sub(1).clamp(1, MOST);
     let weights = in_tree_order(tree, weights);
@@ -78,6 +90,9 @@ pub(crate) fn neighbours(tree: &KdTree, weights: &[u32], min_samples: usize) -> 
         .par_iter()
         .with_min_len(8)
         .map_init(Search::default, |search, &leaf| {
+            if stop.load(Relaxed) {
+                return OfLeaf::default();
+            }
             search_leaf(tree, &weights, tree, leaf, 0, min_samples, search);
             let start = tree.nodes[leaf as usize].start;
             let mut near = vec![NONE; search.count * kept];
@@ -102,7 +117,7 @@ pub(crate) fn neighbours(tree: &KdTree, weights: &[u32], min_samples: usize) -> 
         out.complete.extend(core.iter().map(|c| c.1));
         out.near.extend(near);
     }
-    out
+    (!stop.load(Relaxed)).then_some(out)
 }
 
 /// Core distances of points `[n][dim]`; see [`crate::Options::min_samples`].
@@ -111,8 +126,8 @@ pub(crate) fn neighbours(tree: &KdTree, weights: &[u32], min_samples: usize) -> 
 /// When `dim` is 0 or does not divide the number of values.
 pub fn core_distances(points: &[f32], dim: usize, min_samples: usize) -> Vec<f64> {
     let unique = Unique::new(points, dim);
-    let tree = density_tree(&unique.points, dim, &unique.weights, min_samples);
-    let found = neighbours(&tree, &unique.weights, min_samples);
+    let tree = density_tree(&unique.points, dim, &unique.weights, min_samples, &NEVER).expect("nothing stops it");
+    let found = neighbours(&tree, &unique.weights, min_samples, &NEVER).expect("nothing stops it");
     let mut core = vec![0.0; unique.weights.len()];
     for (&i, c) in tree.order.iter().zip(found.core) {
         core[i as usize] = c;

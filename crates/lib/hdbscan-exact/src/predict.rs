@@ -3,7 +3,7 @@
 use crate::kdtree::Unique;
 use crate::neighbours::{density_tree, nearest, neighbours};
 use crate::select::Clusters;
-use crate::{Clustering, Options};
+use crate::{Clustering, NEVER, Options};
 
 /// What [`approximate_predict`] says.
 #[derive(Debug, Clone, PartialEq)]
@@ -39,15 +39,17 @@ pub fn approximate_predict(
     assert!(queries.len().is_multiple_of(dim), "queries are [m][dim]");
     assert!(points.iter().chain(queries).all(|v| v.is_finite()), "points are finite");
     let count = queries.len() / dim;
-    let unique = Unique::new(points, dim);
+    let unique = Unique::new(&options.metric.prepare(points, dim), dim);
+    let queries = &*options.metric.prepare(queries, dim);
     let m = unique.weights.len();
     assert_eq!(m, clustering.tree.points as usize, "the clustering is of other points");
     if m == 0 || count == 0 {
         return Prediction { labels: vec![-1; count], probabilities: vec![0.0; count], nodes: vec![m as u32; count] };
     }
-    let tree = density_tree(&unique.points, dim, &unique.weights, options.min_samples);
+    let tree =
+        density_tree(&unique.points, dim, &unique.weights, options.min_samples, &NEVER).expect("nothing stops it");
     let others = options.min_samples.saturating_sub(1).max(1);
-    let core = neighbours(&tree, &unique.weights, others).core;
+    let core = neighbours(&tree, &unique.weights, others, &NEVER).expect("nothing stops it").core;
     let near = nearest(&tree, &unique.weights, queries, 2 * others);
     let clusters = Clusters::new(&clustering.tree);
     let selected: Vec<usize> = clustering.selected.iter().map(|&c| c as usize - m).collect();
@@ -74,6 +76,7 @@ pub fn approximate_predict(
             a.0.total_cmp(&b.0).then(a.1.total_cmp(&b.1)).then(a.2.cmp(&b.2))
         };
         let Some((distance, _, neighbour)) = closest.min_by(by) else { return (-1, (0.0, m as u32)) };
+        let distance = options.metric.of_euclidean(distance);
         let lambda = if distance > 0.0 { 1.0 / distance } else { f64::INFINITY };
         let (mut cluster, left) = leaves[neighbour as usize];
         if left > lambda {

@@ -1,12 +1,14 @@
 //! Labels of scikit-learn and Python's hdbscan on small sets, made by scripts/make_hdbscan_golden.py, and properties of clusterings.
 
 use hdbscan_exact::{
-    Clustering, Edge, Options, Selection, adjusted_rand, approximate_predict, cluster, cluster_graph, core_distances,
+    Clustering, Edge, Metric, Options, Selection, adjusted_rand, approximate_predict, cluster, cluster_graph,
+    cluster_until, core_distances,
 };
 use proptest::prelude::*;
 use std::collections::BTreeMap;
 use std::path::PathBuf;
 use std::str::FromStr;
+use std::sync::atomic::AtomicBool;
 
 struct Case {
     name: String,
@@ -46,6 +48,7 @@ fn read(file: &str, coordinates: Option<Vec<f32>>) -> Vec<Case> {
                 epsilon: h[4].parse().unwrap(),
                 selection: if h[5] == "leaf" { Selection::Leaf } else { Selection::ExcessOfMass },
                 allow_single_cluster: h[6] == "1",
+                metric: Metric::Euclidean,
             },
             points: coordinates.clone().unwrap_or_else(|| numbers(lines.next())),
             labels: numbers(lines.next()),
@@ -138,6 +141,59 @@ fn predictions_agree_with_python() {
     }
 }
 
+/// Directions around four axes, of any length, some far from all.
+fn directions() -> Vec<f32> {
+    let wave = |k: f32| (k * 12.9898).sin() * 43758.547 % 1.0;
+    let mut out = Vec::new();
+    for i in 0..160 {
+        let (around, length) = (if i % 10 == 9 { 2.0 } else { 0.15 }, 1.0 + 5.0 * wave(i as f32 + 0.5).abs());
+        for c in 0..4 {
+            let axis = if c == i % 4 { 1.0 } else { 0.0 };
+            out.push(length * (axis + around * wave((4 * i + c) as f32)));
+        }
+    }
+    out
+}
+
+/// Cosine distances of all pairs, and the graph of their mutual reachability.
+#[test]
+fn cosine_is_that_of_the_matrix_of_distances() {
+    let (points, n) = (directions(), 160);
+    let cosine = |a: usize, b: usize| {
+        let [a, b] = [a, b].map(|i| &points[4 * i..4 * i + 4]);
+        let dot = |x: &[f32], y: &[f32]| x.iter().zip(y).map(|(x, y)| f64::from(*x) * f64::from(*y)).sum::<f64>();
+        1.0 - dot(a, b) / (dot(a, a) * dot(b, b)).sqrt()
+    };
+    // With core distances many edges have the same weight, and which of them are in the tree depends on the order of the points.
+    for (min_samples, least) in [(1, 1.0), (5, 0.97)] {
+        let options = Options { metric: Metric::Cosine, min_samples, ..Options::default() };
+        let core: Vec<f64> = (0..n)
+            .map(|i| {
+                let mut all: Vec<f64> = (0..n).map(|j| cosine(i, j).max(0.0)).collect();
+                all.sort_by(f64::total_cmp);
+                all[options.min_samples - 1]
+            })
+            .collect();
+        let edge = |a: usize, b: usize| Edge::new(a as u32, b as u32, cosine(a, b).max(core[a]).max(core[b]));
+        let edges: Vec<Edge> = (0..n).flat_map(|a| (0..a).map(move |b| (a, b))).map(|(a, b)| edge(a, b)).collect();
+        let (ours, expected) = (cluster(&points, 4, &options), cluster_graph(n, edges, &options));
+        assert!(ours.selected.len() >= 4);
+        assert!(adjusted_rand(&ours.labels, &expected.labels) >= least);
+        let lambdas =
+            |c: &Clustering| c.tree.edges.iter().map(|e| e.lambda).filter(|l| l.is_finite()).fold(0.0, f64::max);
+        assert!((lambdas(&ours) / lambdas(&expected) - 1.0).abs() < 1e-3);
+        let again = approximate_predict(&points, 4, &ours, &options, &points);
+        assert!(adjusted_rand(&again.labels, &ours.labels) > 0.8);
+    }
+}
+
+#[test]
+fn what_is_stopped_returns_nothing() {
+    let (points, options) = (directions(), Options::default());
+    assert_eq!(cluster_until(&points, 4, &options, &AtomicBool::new(true)), None);
+    assert_eq!(cluster_until(&points, 4, &options, &AtomicBool::new(false)), Some(cluster(&points, 4, &options)));
+}
+
 /// Clusters the points in another order and puts the result back into the first one.
 fn permuted(points: &[f32], dim: usize, order: &[usize], options: &Options) -> Clustering {
     let shuffled: Vec<f32> = order.iter().flat_map(|&i| points[i * dim..(i + 1) * dim].iter().copied()).collect();
@@ -176,7 +232,7 @@ proptest! {
     ) {
         let points: Vec<f32> = coordinates.iter().flat_map(|&(x, y)| [f32::from(x), f32::from(y)]).collect();
         let selection = if leaf { Selection::Leaf } else { Selection::ExcessOfMass };
-        let options = Options { min_cluster_size, min_samples, epsilon, selection, allow_single_cluster };
+        let options = Options { min_cluster_size, min_samples, epsilon, selection, allow_single_cluster, metric: Metric::Euclidean };
         let mut order: Vec<usize> = (0..coordinates.len()).collect();
         order.sort_by_key(|&i| (i as u32 ^ by).wrapping_mul(2_654_435_761));
         let straight = cluster(&points, 2, &options);

@@ -4,7 +4,7 @@
 
 use artifacts::Level;
 use clap::Parser;
-use hdbscan_exact::Selection;
+use hdbscan_exact::{Metric, Selection};
 use serde::Serialize;
 use stage::CommonArgs;
 use std::path::PathBuf;
@@ -161,6 +161,7 @@ impl Settings {
             epsilon: self.epsilon,
             selection: if self.leaf { Selection::Leaf } else { Selection::ExcessOfMass },
             allow_single_cluster: self.allow_single_cluster,
+            metric: Metric::Euclidean,
         }
     }
 }
