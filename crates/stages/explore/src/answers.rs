@@ -128,6 +128,8 @@ fn edited_label(world: &World, edited: &Edited, cell: u32) -> Option<i32> {
 /// What a text finds.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct Found {
+    /// The text, as it was asked.
+    pub text: String,
     /// Score of every instance, none for one without a descriptor; empty where only names answer.
     pub scores: Vec<Option<f32>>,
     /// Instances that a person gave a name which holds the text.
@@ -156,7 +158,7 @@ pub fn find(world: &World, edited: &Edited, text: &str) -> Result<Found> {
         Err(_) if !named.is_empty() => Vec::new(),
         Err(why) => return Err(Error::new(why.clone())),
     };
-    Ok(Found { scores, named })
+    Ok(Found { text: text.into(), scores, named })
 }
 
 /// Cosine of every instance with a text's feature; null for one without a descriptor.

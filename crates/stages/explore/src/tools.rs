@@ -211,7 +211,7 @@ fn find(asked: &Asked, find: &Find) -> Result<Value> {
         let e = Error::new("not a question").field("text, most");
         return Err(e.expected(format!("a text that is not empty, and 1 to {MOST}")));
     }
-    let answers::Found { scores, named } = answers::find(asked.world, asked.edited, &find.text)?;
+    let answers::Found { scores, named, .. } = answers::find(asked.world, asked.edited, &find.text)?;
     let scene = asked.edited.objects(asked.world);
     let score = |o: &Object| scores.get(o.id as usize).copied().flatten();
     let mut found: Vec<(&Object, Option<f32>, bool)> = scene

@@ -32,6 +32,7 @@ fn the_server_answers_clicks_texts_edits_and_selections() {
     assert_eq!(server.json("POST", "/pick", &click(1, 1, &[]))["instance"], Value::Null);
 
     let found = server.json("GET", "/find?text=far%20ball", &Value::Null);
+    assert_eq!(found["text"], "far ball");
     assert_eq!(found["scores"], json!([0.0, 1.0]));
 
     // Split and named: ids stay, the file says what was done, and the answers follow.
