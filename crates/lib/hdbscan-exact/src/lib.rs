@@ -61,7 +61,7 @@ impl Default for Options {
 }
 
 /// The result of a clustering.
-#[derive(Debug, Clone, PartialEq)]
+#[derive(Debug, Clone, Default, PartialEq)]
 pub struct Clustering {
     /// Cluster of every point, from 0; -1 for noise.
     pub labels: Vec<i32>,
@@ -73,6 +73,8 @@ pub struct Clustering {
     pub outlier_scores: Vec<f32>,
     /// The cluster of the tree that every point leaves it from: the smallest that holds it, whether selected or not.
     pub nodes: Vec<u32>,
+    /// The distinct point of the tree that every point is.
+    pub distinct: Vec<u32>,
     /// The condensed tree.
     pub tree: CondensedTree,
     /// The node of the tree that was selected for each cluster, by label.

@@ -193,6 +193,7 @@ pub(crate) fn label(tree: CondensedTree, of_point: &[u32], options: &Options) ->
         probabilities: of_point.iter().map(|&u| probabilities[u as usize]).collect(),
         outlier_scores: of_point.iter().map(|&u| outlier_scores[u as usize]).collect(),
         nodes: of_point.iter().map(|&u| nodes[u as usize]).collect(),
+        distinct: of_point.to_vec(),
         tree,
         selected: selected.iter().map(|&c| (c + m) as u32).collect(),
     }

@@ -200,7 +200,7 @@ fn permuted(points: &[f32], dim: usize, order: &[usize], options: &Options) -> C
     let mut r = cluster(&shuffled, dim, options);
     let found = r.clone();
     for (to, &i) in order.iter().enumerate() {
-        (r.labels[i], r.nodes[i]) = (found.labels[to], found.nodes[to]);
+        (r.labels[i], r.nodes[i], r.distinct[i]) = (found.labels[to], found.nodes[to], found.distinct[to]);
         (r.probabilities[i], r.outlier_scores[i]) = (found.probabilities[to], found.outlier_scores[to]);
     }
     r

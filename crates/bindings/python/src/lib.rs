@@ -1,0 +1,17 @@
+//! The Rust half of the Python package `cags`: it takes and gives numpy arrays, releases the interpreter lock while it works,
+//! and leaves checks of arguments, names and documentation to the Python half in `cags/`.
+
+mod hdbscan;
+mod points;
+mod work;
+
+use pyo3::prelude::*;
+
+/// What the Python half calls.
+#[pymodule]
+mod _native {
+    #[pymodule_export]
+    use crate::hdbscan::{hdbscan, hdbscan_graph, hdbscan_predict};
+    #[pymodule_export]
+    use crate::points::{farthest_point_sample, nearest_neighbours};
+}
