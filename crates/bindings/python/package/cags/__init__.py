@@ -4,14 +4,30 @@
 ``HDBSCAN``                  exact hierarchical clustering, an estimator of scikit-learn
 ``farthest_point_sample``    points spread evenly over a cloud
 ``nearest_neighbours``       the nearest other points of each point
+``Gaussians``, ``Camera``    a scene, and from where it is seen
+``render``                   the picture of it
+``render_backward``          the gradient of every parameter, given that of every pixel
+``read_ply``, ``write_ply``  files of Gaussians, in all formats of docs/splats.md
 ===========================  ======================================================================
 
 Results depend neither on the number of threads nor on the machine. Long work releases the interpreter lock.
 """
 
+from ._gaussians import Camera, Gaussians, Rendered, read_ply, render, render_backward, write_ply
 from ._points import farthest_point_sample, nearest_neighbours
 
-__all__ = ["HDBSCAN", "farthest_point_sample", "nearest_neighbours"]
+__all__ = [
+    "HDBSCAN",
+    "Camera",
+    "Gaussians",
+    "Rendered",
+    "farthest_point_sample",
+    "nearest_neighbours",
+    "read_ply",
+    "render",
+    "render_backward",
+    "write_ply",
+]
 
 
 def __getattr__(name):

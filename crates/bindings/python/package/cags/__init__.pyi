@@ -1,4 +1,5 @@
-from typing import Any
+from os import PathLike
+from typing import Any, Sequence
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -9,3 +10,70 @@ def farthest_point_sample(
     points: ArrayLike, count: int, *, start: int = 0, n_jobs: int | None = None
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]: ...
 def nearest_neighbours(points: ArrayLike, k: int, *, n_jobs: int | None = None) -> NDArray[np.int64]: ...
+
+class Gaussians:
+    means: NDArray[np.float32]
+    log_scales: NDArray[np.float32]
+    rotations: NDArray[np.float32]
+    opacity_logits: NDArray[np.float32]
+    sh: NDArray[np.float32]
+    antialias: bool
+    def __init__(
+        self,
+        means: ArrayLike,
+        log_scales: ArrayLike,
+        rotations: ArrayLike,
+        opacity_logits: ArrayLike,
+        sh: ArrayLike,
+        antialias: bool = False,
+    ) -> None: ...
+    def __len__(self) -> int: ...
+    def __getitem__(self, which: Any) -> Gaussians: ...
+
+class Camera:
+    width: int
+    height: int
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    rotation: NDArray[np.float64]
+    translation: NDArray[np.float64]
+    def __init__(
+        self,
+        width: int,
+        height: int,
+        fx: float,
+        fy: float,
+        cx: float,
+        cy: float,
+        rotation: ArrayLike = ...,
+        translation: ArrayLike = ...,
+    ) -> None: ...
+
+class Rendered:
+    rgb: NDArray[np.float32]
+    alpha: NDArray[np.float32]
+    depth: NDArray[np.float32]
+
+def render(
+    gaussians: Gaussians,
+    camera: Camera,
+    *,
+    background: Sequence[float] = (0, 0, 0),
+    near: float | None = None,
+    n_jobs: int | None = None,
+) -> Rendered: ...
+def render_backward(
+    gaussians: Gaussians,
+    camera: Camera,
+    d_rgb: ArrayLike,
+    d_alpha: ArrayLike | None = None,
+    d_depth: ArrayLike | None = None,
+    *,
+    background: Sequence[float] = (0, 0, 0),
+    near: float | None = None,
+    n_jobs: int | None = None,
+) -> Gaussians: ...
+def read_ply(path: str | PathLike[str]) -> Gaussians: ...
+def write_ply(path: str | PathLike[str], gaussians: Gaussians, *, instance: ArrayLike | None = None) -> None: ...
