@@ -80,7 +80,7 @@ impl Views {
         let matter = Matter::of(&g).ok_or_else(none)?;
         let at = |&i: &u32| DVec3::from(g.means[i as usize].map(f64::from));
         let centres: Vec<DVec3> = matter.counted.iter().map(at).collect();
-        let eye = Eye { gaussians: &g, options: &options, matter: &matter, centres: &centres };
+        let eye = Eye::new(&g, &options, &matter, &centres);
         stage.info(&format!(
             "{} of {} Gaussians count: {} are too faint, {} far away, {} floaters",
             matter.counted.len(),
@@ -159,14 +159,16 @@ impl Views {
                 places.all_over(rng)
             } else {
                 let lacking = |i: &usize| choice.sightings[*i] < ENOUGH;
-                let lacking: Vec<DVec3> = (0..eye.centres.len()).filter(lacking).map(|i| eye.centres[i]).collect();
+                let target = |i| (eye.centres[i], eye.widest[i]);
+                let lacking: Vec<(DVec3, f64)> = (0..eye.centres.len()).filter(lacking).map(target).collect();
                 places.aimed(&lacking, AIMED, rng)
             };
             tried += cameras.len();
             let good: Vec<Option<Candidate>> = cameras.into_par_iter().map(|c| eye.look(c)).collect();
-            let mut good: Vec<Candidate> = good.into_iter().flatten().collect();
+            let good: Vec<Candidate> = good.into_iter().flatten().collect();
             let front = front.get_or_insert_with(|| Front::of(&good, eye.centres));
-            good.par_iter_mut().for_each(|c| front.keep(&mut c.sight, c.camera.position(), eye.centres));
+            let in_front = |mut c: Candidate| front.keep(&mut c.sight, c.camera.position(), eye.centres).then_some(c);
+            let good: Vec<Candidate> = good.into_par_iter().filter_map(in_front).collect();
             for candidate in &good {
                 reachable.iter_mut().zip(&candidate.sight.seen).for_each(|(all, one)| *all |= one);
             }

@@ -75,7 +75,7 @@ mod tests {
     use glam::DVec3;
 
     fn candidate(eye: DVec3, seen: u64) -> Candidate {
-        let sight = Sight { seen: vec![seen], shown: seen.count_ones() as usize };
+        let sight = Sight { seen: vec![seen], shown: vec![seen] };
         Candidate { camera: Camera::look_at(eye, DVec3::ZERO, DVec3::Z, 8, 8, 1.0), sight }
     }
 

@@ -166,7 +166,8 @@ impl Matter {
     }
 }
 
-fn median(mut values: Vec<f64>) -> f64 {
+/// The middle one of numbers, of an even number the greater; there is one at least.
+pub fn median(mut values: Vec<f64>) -> f64 {
     let middle = values.len() / 2;
     *values.select_nth_unstable_by(middle, f64::total_cmp).1
 }

@@ -9,6 +9,7 @@ use rand::Rng;
 use rand_chacha::ChaCha8Rng;
 use rayon::prelude::*;
 use std::f64::consts::TAU;
+use std::ops::Range;
 
 /// Free cubes on every side of a camera in a room, and around an object.
 const CLEARANCE: i32 = 2;
@@ -27,6 +28,8 @@ const DISTANCES: [f64; 3] = [1.0, 0.7, 0.4];
 const STEEPEST: f64 = 0.966;
 /// Sine of the lowest elevation of a camera around a thing on the ground: 8 degrees.
 const ABOVE_GROUND: f64 = 0.14;
+/// How near a camera comes to its target, of the farthest that is near enough.
+const NEARNESS: Range<f64> = 0.35..0.95;
 /// Attempts to find a place for a target.
 const ATTEMPTS: usize = 16;
 
@@ -122,20 +125,20 @@ impl<'a> Places<'a> {
         cameras
     }
 
-    /// At most `count` cameras that look at targets, each at one drawn at random, past nothing that hides it.
-    pub fn aimed(&self, targets: &[DVec3], count: usize, rng: &mut ChaCha8Rng) -> Vec<Camera> {
+    /// At most `count` cameras that look at targets, each at one drawn at random, past nothing that hides it. With each target is how
+    /// much the picture's shorter side may show at its distance, world units.
+    pub fn aimed(&self, targets: &[(DVec3, f64)], count: usize, rng: &mut ChaCha8Rng) -> Vec<Camera> {
         if targets.is_empty() {
             return Vec::new();
         }
         (0..count).filter_map(|_| self.at(targets[rng.random_range(0..targets.len())], rng)).collect()
     }
 
-    fn at(&self, target: DVec3, rng: &mut ChaCha8Rng) -> Option<Camera> {
+    fn at(&self, (target, widest): (DVec3, f64), rng: &mut ChaCha8Rng) -> Option<Camera> {
         let side = self.matter.grid.side;
-        let wanted = match self.look {
-            Look::InsideOut => self.matter.diagonal() * rng.random_range(0.12..0.5),
-            _ => self.fitting() * rng.random_range(0.15..0.7),
-        };
+        let (w, h) = (f64::from(self.lens.size.0), f64::from(self.lens.size.1));
+        let farthest = widest * w / (2.0 * w.min(h) * (0.5 * self.lens.fov).tan());
+        let wanted = farthest * rng.random_range(NEARNESS);
         let mut best: Option<(f64, Camera)> = None;
         for _ in 0..ATTEMPTS {
             let eye = if self.look == Look::InsideOut {

@@ -1,7 +1,7 @@
 //! What a camera sees.
 
 use super::grid::scales;
-use super::matter::Matter;
+use super::matter::{Matter, median};
 use glam::DVec3;
 use gs_raster::{RasterOptions, Rendered, render};
 use gs_scene::{Camera, Gaussians};
@@ -16,13 +16,11 @@ const LEAST_SHOWN: f64 = 0.02;
 /// A Gaussian is hidden where its centre lies behind the mean depth of its pixel by more than this share of that depth, and
 /// this many cubes.
 const BEHIND: (f64, f64) = (0.02, 1.0);
-/// A Gaussian is seen well where a pixel at its distance is at most this share of the box's diagonal, over the picture's
-/// shorter side in pixels: as if the box were 3.3 times as large as the picture. Or where its own middle standard deviation is
-/// this many pixels of a picture of 480 lines: what was learnt from far is large. On scenes of this project photographs show a
-/// box 1.5 to 8 times as large as they are, and the median Gaussian as 1 to 6 pixels.
-const COARSEST: f64 = 0.3;
-const LARGE: f64 = 3.0;
-const LINES: f64 = 480.0;
+/// A Gaussian is seen well where the picture's shorter side shows no more than this at its distance, in diagonals of the box, if
+/// its middle standard deviation is the median one; of others in proportion to theirs, but from the first to the second of these
+/// limits. Gaussians are small where photographs were near and there was much to see, so renders go near there too.
+const WIDEST: f64 = 0.5;
+const LIMITS: (f64, f64) = (0.1, 2.0);
 
 /// Sets of the Gaussians that count, one bit each.
 pub type Bits = Vec<u64>;
@@ -34,6 +32,8 @@ pub struct Eye<'a> {
     pub matter: &'a Matter,
     /// Centres of the Gaussians that count.
     pub centres: &'a [DVec3],
+    /// How much the picture's shorter side may show at the distance of each of them, world units.
+    pub widest: Vec<f64>,
 }
 
 /// A camera that may be chosen.
@@ -45,13 +45,21 @@ pub struct Candidate {
 /// What a picture shows.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Sight {
-    /// The Gaussians that count and that it shows well.
+    /// The Gaussians that count and that it shows, well or from too far.
+    pub shown: Bits,
+    /// Those that it shows well.
     pub seen: Bits,
-    /// How many of those that count it shows, well or from too far.
-    pub shown: usize,
 }
 
-impl Eye<'_> {
+impl<'a> Eye<'a> {
+    /// The scene of Gaussians of which these centres count.
+    pub fn new(gaussians: &'a Gaussians, options: &'a RasterOptions, matter: &'a Matter, centres: &'a [DVec3]) -> Self {
+        let sizes: Vec<f64> = matter.counted.iter().map(|&i| middle(scales(gaussians, i as usize))).collect();
+        let (median, diagonal) = (median(sizes.clone()), matter.diagonal());
+        let widest = |size: f64| (WIDEST * size / median).clamp(LIMITS.0, LIMITS.1) * diagonal;
+        Self { gaussians, options, matter, centres, widest: sizes.into_iter().map(widest).collect() }
+    }
+
     /// What a camera sees, judged by a picture of a quarter of its size; none where something is before the lens or next to
     /// nothing is to be seen.
     pub fn look(&self, camera: Camera) -> Option<Candidate> {
@@ -79,9 +87,8 @@ impl Eye<'_> {
 
     /// What a picture shows: Gaussians that are in it and not hidden; well, those that are near enough.
     pub fn sight(&self, camera: &Camera, rendered: &Rendered) -> Sight {
-        let (mut seen, mut shown) = (vec![0u64; self.centres.len().div_ceil(64)], 0);
+        let [mut shown, mut seen] = [(); 2].map(|()| vec![0u64; self.centres.len().div_ceil(64)]);
         let (w, h) = (f64::from(camera.width), f64::from(camera.height));
-        let coarsest = COARSEST * self.matter.diagonal();
         for (i, &centre) in self.centres.iter().enumerate() {
             let (u, v, z) = camera.project(centre);
             if z < f64::from(self.options.near) || u < 0.0 || v < 0.0 || u >= w || v >= h {
@@ -94,20 +101,23 @@ impl Eye<'_> {
             if hidden {
                 continue;
             }
-            shown += 1;
-            let size = middle(scales(self.gaussians, self.matter.counted[i] as usize));
-            let farthest = coarsest.max(size * LINES / LARGE) * camera.fx / w.min(h);
-            if z <= farthest {
+            shown[i / 64] |= 1 << (i % 64);
+            if z <= self.widest[i] * camera.fx / w.min(h) {
                 seen[i / 64] |= 1 << (i % 64);
             }
         }
-        Sight { seen, shown }
+        Sight { shown, seen }
     }
 }
 
 /// The second of three numbers by size.
 fn middle(v: DVec3) -> f64 {
     v.element_sum() - v.max_element() - v.min_element()
+}
+
+/// How many members a set has.
+pub fn count(bits: &[u64]) -> usize {
+    bits.iter().map(|b| b.count_ones() as usize).sum()
 }
 
 /// The members of a set, ascending.
