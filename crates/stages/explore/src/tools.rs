@@ -274,8 +274,7 @@ fn relations(asked: &Asked, relations: &Relations) -> Result<Value> {
         let says = format!("{} is {} {}", named(r.subject), kind.as_str().unwrap_or_default(), named(r.object));
         json!({"subject": r.subject, "relation": kind, "object": r.object, "says": says})
     };
-    let known =
-        scene.up.is_some().then_some("on, in, under, next to").unwrap_or("in, next to: nothing says what is up");
+    let known = if scene.up.is_some() { "on, in, under, next to" } else { "in, next to: nothing says what is up" };
     Ok(json!({"relations": scene.relations.iter().filter(wanted).map(one).collect::<Vec<_>>(), "known": known}))
 }
 
