@@ -51,7 +51,7 @@ clip-tiny: build
 
 wheel: ## Build the Python package cags into out/wheel (needs Python 3.9)
 	python3 -m venv out/maturin && out/maturin/bin/pip install -q 'maturin>=1.16,<2'
-	out/maturin/bin/maturin build --profile dist --locked -m crates/bindings/python/Cargo.toml --target-dir target --out out/wheel
+	out/maturin/bin/maturin build --release --strip --locked -m crates/bindings/python/Cargo.toml --target-dir target --out out/wheel
 
 # The programs with manual pages and completions: out/dist.
 dist:

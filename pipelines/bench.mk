@@ -41,15 +41,12 @@ bench-sam: build
 	$(CARGO) bench -p mask-embed --bench sam -- "$$(realpath "$${PHOTOGRAPHS:-out/bench/sam/images}")" $(CURDIR)/models \
 	  $(CURDIR)/out/bench/sam.json
 
-# HDBSCAN beside hdbscan-rs and fast_hdbscan (needs Python; POINTS=1000000x6 or file.npy, TRUTH=file.npy, RUNS): cluster.json.
-POINTS ?= 1000000x6
-RUNS ?= 3
-TRUTH ?=
-bench-cluster:
-	$(CARGO) build --release -p hdbscan-exact --benches
-	@test -x out/bench/python-cluster/bin/python || { python3 -m venv out/bench/python-cluster \
-	  && out/bench/python-cluster/bin/pip install -q numpy scikit-learn hdbscan-rs fast_hdbscan; }
-	out/bench/python-cluster/bin/python scripts/bench_cluster.py $(POINTS) out/bench/cluster.json $(RUNS) $(TRUTH)
+# HDBSCAN from Python beside the field's others, 10,000 to 1,000,000 points (BENCH_PYTHON_ARGS; hours): docs/results/python.md's table.
+bench-python: wheel
+	@test -x out/bench/python-hdbscan/bin/python || { python3 -m venv out/bench/python-hdbscan \
+	  && out/bench/python-hdbscan/bin/pip install -q scikit-learn hdbscan fast_hdbscan hdbscan-rs; }
+	out/bench/python-hdbscan/bin/pip install -q --no-deps --force-reinstall out/wheel/cags-*.whl
+	out/bench/python-hdbscan/bin/python scripts/bench_python.py out/bench/python/hdbscan.md $(BENCH_PYTHON_ARGS)
 
 # A query over a million Gaussians and 500 instances: query.json.
 bench-query:

@@ -3,7 +3,9 @@
 use pyo3::exceptions::PyRuntimeError;
 use pyo3::prelude::*;
 use rayon::ThreadPoolBuilder;
-use std::sync::atomic::{AtomicBool, Ordering::Relaxed};
+use std::panic::{AssertUnwindSafe, catch_unwind, resume_unwind};
+use std::sync::atomic::AtomicBool;
+use std::sync::atomic::Ordering::{Acquire, Relaxed, Release};
 use std::thread;
 use std::time::Duration;
 
@@ -17,24 +19,22 @@ const ASK_EVERY: Duration = Duration::from_millis(50);
 pub fn run<T: Send>(py: Python<'_>, threads: usize, work: impl FnOnce(&AtomicBool) -> T + Send) -> PyResult<T> {
     let pool = ThreadPoolBuilder::new().num_threads(threads).build();
     let pool = pool.map_err(|e| PyRuntimeError::new_err(format!("cannot start {threads} threads: {e}")))?;
-    let stop = AtomicBool::new(false);
+    let (stop, done) = (AtomicBool::new(false), AtomicBool::new(false));
     let caller = thread::current();
     thread::scope(|scope| {
         let worker = scope.spawn(|| {
-            let out = pool.install(|| work(&stop));
+            let out = catch_unwind(AssertUnwindSafe(|| pool.install(|| work(&stop))));
+            done.store(true, Release);
             caller.unpark();
             out
         });
         let mut interrupted = Ok(());
-        while !worker.is_finished() && interrupted.is_ok() {
+        while !done.load(Acquire) && interrupted.is_ok() {
             py.detach(|| thread::park_timeout(ASK_EVERY));
             interrupted = py.check_signals();
         }
         stop.store(interrupted.is_err(), Relaxed);
-        match (interrupted, py.detach(|| worker.join())) {
-            (Err(e), _) => Err(e),
-            (Ok(()), Ok(out)) => Ok(out),
-            (Ok(()), Err(panic)) => std::panic::resume_unwind(panic),
-        }
+        let out = py.detach(|| worker.join().expect("it catches panics"));
+        interrupted.and_then(|()| out.map_err(|panic| resume_unwind(panic)))
     })
 }
