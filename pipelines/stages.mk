@@ -41,7 +41,6 @@ override GEOMETRY := $(OUT)/geometry.ply
 GEOMETRY_DONE := $(GEOMETRY)
 else
 GEOMETRY_DONE := $(OPTIONS)/geometry.files
-report_GEOMETRY = --geometry $(call arg,GEOMETRY)
 endif
 # The id maps, where SAM makes them.
 SAM_MAKES := $(filter $(OUT)/masks/masks.json,$(MASKS_DONE))
@@ -107,12 +106,12 @@ feat_RUN = $(BIN)/feat-train --geometry $(call arg,GEOMETRY) --graph $(GRAPH) --
 cluster_RUN = $(BIN)/cluster-match --scene $(call arg,PHOTOGRAPHS) --geometry $(call arg,GEOMETRY) --graph $(GRAPH) --footprints $(FOOTPRINTS) \
   --features $(FEATURES) --masks $(MASKS) --out $(INSTANCES) $(cluster_OPTIONS) $(COMMON)
 score_RUN = $(BIN)/eval score --scene $(call arg,PHOTOGRAPHS) --geometry $(call arg,GEOMETRY) --instances $(INSTANCES) --out $(OUT)/score.json \
-  $(if $(CLIP),--clip $(call arg,CLIP)) $(SCORE_ARGS) $(COMMON) --quiet
+  $(if $(CLIP),--clip $(call arg,CLIP)) $(SCORE_ARGS) $(filter-out --quiet,$(COMMON)) --quiet
 protocol_RUN = $(BIN)/eval $(PROTOCOL) --scene $(call arg,PHOTOGRAPHS) --geometry $(call arg,GEOMETRY) --instances $(INSTANCES) \
-  --out $(OUT)/protocol $(protocol_FIRST) $(if $(TEXTS),--text-features $(call arg,TEXTS),$(if $(CLIP),--clip $(call arg,CLIP))) $(SCORE_ARGS) $(COMMON) --quiet
+  --out $(OUT)/protocol $(protocol_FIRST) $(if $(TEXTS),--text-features $(call arg,TEXTS),$(if $(CLIP),--clip $(call arg,CLIP))) $(SCORE_ARGS) $(filter-out --quiet,$(COMMON)) --quiet
 query_RUN = $(BIN)/eval query --scene $(call arg,PHOTOGRAPHS) --geometry $(call arg,GEOMETRY) --instances $(INSTANCES) --clip $(call arg,CLIP) \
   --out $(OUT)/query $(foreach q,$(QUERIES),--text '$(subst ','\'',$(subst _,$(space),$q))') $(COMMON)
-report_RUN = $(BIN)/eval report --scene $(call arg,PHOTOGRAPHS) --run-dir $(OUT) $(report_GEOMETRY) --masks $(MASKS) --out $(OUT)/report.html \
+report_RUN = $(BIN)/eval report --scene $(call arg,PHOTOGRAPHS) --run-dir $(OUT) --geometry $(call arg,GEOMETRY) --masks $(MASKS) --out $(OUT)/report.html \
   $(report_OPTIONS) $(COMMON)
 
 # Before the first stage runs, every stage checks its options. geom_FROM says in errors where those of stage 1 come from.

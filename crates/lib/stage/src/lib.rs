@@ -14,6 +14,7 @@ mod memory;
 mod progress;
 mod range;
 mod record;
+mod run_folder;
 mod signals;
 
 pub use allocator::Allocator;
@@ -27,8 +28,9 @@ pub use record::{RunRecord, cpu_seconds, peak_rss_bytes};
 use clap::builder::RangedU64ValueParser;
 use clap::error::ContextValue;
 use gs_io::{Error, Result, escaped};
+use std::ffi::OsString;
 use std::io::Write;
-use std::path::Path;
+use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 
 /// The git revision that the programs were built from: the commit that was checked out, or `CAGS_REVISION` of the build's
@@ -61,9 +63,13 @@ pub struct CommonArgs {
     /// than the machine or the control group has]
     #[arg(long, global = true, value_name = "BYTES")]
     pub memory_limit: Option<Bytes>,
-    /// Check the options and do nothing else: no file is read or written
+    /// Check the options and do nothing else: no file is read or written, but the records of --run-dir
     #[arg(long, global = true)]
     pub check: bool,
+    /// Folder of a run, such as OUT of make. Inputs that are not given are those of the run: dataset, Gaussians, instances, CLIP
+    /// and so on
+    #[arg(long, global = true, value_name = "DIR")]
+    pub run_dir: Option<PathBuf>,
 }
 
 /// Whether a stage skips what a scene does not need, for the stages that do.
@@ -81,6 +87,9 @@ const VERSION: &str = concat!(env!("CARGO_PKG_VERSION"), " (", env!("CAGS_REVISI
 pub trait Program: clap::Parser {
     /// The program's name, such as `gs-geom`.
     const NAME: &'static str;
+
+    /// Options that name outputs though they have the name of an input of other programs: `--run-dir` leaves them alone.
+    const OUTPUTS: &'static [&'static str] = &[];
 
     /// The common arguments within.
     fn common(&self) -> &CommonArgs;
@@ -102,11 +111,17 @@ pub trait Program: clap::Parser {
     fn run(self, stage: &Stage) -> Result<()>;
 }
 
-/// Parses the arguments, sets up threads and logging, runs the program and turns its result into an exit code.
+/// [`run`] with the command line of this process.
 pub fn main<P: Program>() -> ExitCode {
+    run::<P>(std::env::args_os().collect())
+}
+
+/// Parses the arguments, the program's name first, sets up threads and logging, runs the program and turns its result into an exit
+/// code.
+pub fn run<P: Program>(mut given: Vec<OsString>) -> ExitCode {
     signals::outlive_long_files();
     let _ = allocator::NAME.set(P::NAME);
-    let arguments: Vec<String> = std::env::args_os().skip(1).map(|a| a.to_string_lossy().into_owned()).collect();
+    let mut arguments = readable(&given);
     let failed = |stage: &Stage, e: &Error| {
         stage.error(e);
         ExitCode::from(2)
@@ -116,7 +131,16 @@ pub fn main<P: Program>() -> ExitCode {
         let generated = generate::generate::<P>(P::NAME, &arguments[1..]);
         return generated.map_or_else(|e| failed(&stage, &e), |()| ExitCode::SUCCESS);
     }
-    let matches = P::command().version(VERSION).after_help(generate::HELP).try_get_matches();
+    let told = match run_folder::told::<P>(&given) {
+        Ok(told) => told,
+        Err(e) => return failed(&Stage::silent(P::NAME), &e),
+    };
+    if !told.is_empty() {
+        let end = given.iter().position(|a| a == "--").unwrap_or(given.len());
+        given.splice(end..end, told.iter().cloned());
+        arguments = readable(&given);
+    }
+    let matches = P::command().version(VERSION).after_help(generate::HELP).try_get_matches_from(given);
     let parsed = matches.and_then(|mut m| {
         let command = m.subcommand_name().map(String::from);
         P::from_arg_matches_mut(&mut m).map(|program| (program, command))
@@ -130,6 +154,11 @@ pub fn main<P: Program>() -> ExitCode {
     };
     let mut stage = Stage::new(P::NAME, program.common());
     stage.command = command;
+    if let (false, Some(dir)) = (told.is_empty(), &program.common().run_dir) {
+        let options = told.iter().map(|a| a.to_string_lossy()).collect::<Vec<_>>().join(" ");
+        stage.info(&format!("from {}: {options}", dir.display()));
+    }
+    stage.arguments.clone_from(&arguments);
     if program.common().memory_limit.is_some() && !program.forecasts() {
         let e = Error::new("this command does not forecast its memory").field("--memory-limit").hint("leave it out");
         return failed(&stage, &e);
@@ -152,6 +181,11 @@ pub fn main<P: Program>() -> ExitCode {
             None => failed(&stage, &e),
         },
     }
+}
+
+/// A command line without the program, as it is kept and shown.
+fn readable(given: &[OsString]) -> Vec<String> {
+    given.iter().skip(1).map(|a| a.to_string_lossy().into_owned()).collect()
 }
 
 /// Prints help or version as [`Stage::print`] does; ends the program with exit code 2 and clap's few lines where the command

@@ -14,6 +14,8 @@ use std::time::{Instant, SystemTime, UNIX_EPOCH};
 pub struct Stage {
     name: &'static str,
     pub(crate) command: Option<String>,
+    /// The command line, without the program.
+    pub(crate) arguments: Vec<String>,
     pub(crate) common: CommonArgs,
     started: Instant,
     skipped: Mutex<Vec<String>>,
@@ -30,6 +32,7 @@ impl Stage {
         Self {
             name,
             command: None,
+            arguments: std::env::args_os().skip(1).map(|a| a.to_string_lossy().into_owned()).collect(),
             common: common.clone(),
             started: Instant::now(),
             skipped: Mutex::default(),
@@ -158,7 +161,7 @@ impl Stage {
             version: env!("CARGO_PKG_VERSION").into(),
             revision: crate::REVISION.into(),
             program_hash: crate::record::program_hash(),
-            arguments: std::env::args_os().skip(1).map(|a| a.to_string_lossy().into_owned()).collect(),
+            arguments: self.arguments.clone(),
             parameters,
             inputs,
             seed: self.common.seed,

@@ -62,11 +62,17 @@ impl Program for Args {
                 Err(Error::new("pictures need an image encoder").field("--image").expected("--clip with image.onnx"))
             }
             Command::Lerf(o) => o.check(),
+            Command::Report(_) if self.common.run_dir.is_none() => {
+                Err(Error::new("which run").field("--run-dir").expected("the folder of a run, such as OUT of make"))
+            }
             _ => Ok(()),
         }
     }
 
-    fn run(self, stage: &Stage) -> Result<()> {
+    fn run(mut self, stage: &Stage) -> Result<()> {
+        if let (Command::Report(o), Some(dir)) = (&mut self.command, &self.common.run_dir) {
+            o.run_dir.clone_from(dir);
+        }
         let parameters = serde_json::to_value(&self.command).unwrap_or_default();
         let text = match &self.command {
             Command::Query(o) => query::run(o, parameters, stage, self.common.json)?,

@@ -439,12 +439,12 @@ pub struct ReportOptions {
     /// Dataset folder (COLMAP, transforms.json or ScanNet)
     #[arg(long, value_name = "DIR")]
     pub scene: PathBuf,
-    /// Folder of the run: geometry.ply and whatever else there is under its usual name
-    #[arg(long, value_name = "DIR")]
+    /// Folder of the run, of the common options.
+    #[arg(skip)]
     pub run_dir: PathBuf,
-    /// The Gaussians, where they are not in the run [default: geometry.ply there]
+    /// The Gaussians of the run
     #[arg(long, value_name = "FILE")]
-    pub geometry: Option<PathBuf>,
+    pub geometry: PathBuf,
     /// Folder of id maps (*_s.npy) [default: masks/ in the run, or language_features/ in the scene]
     #[arg(long, value_name = "DIR")]
     pub masks: Option<PathBuf>,

@@ -15,7 +15,7 @@ use self::runs::{Run, grouped};
 use crate::memory::{self, Sizes};
 use crate::options::ReportOptions;
 use crate::scene::{VIEWS, folder_name, load};
-use gs_io::{Result, write_bytes, write_json};
+use gs_io::{Error, Result, write_bytes, write_json};
 use gs_scene::dataset::{LoadOptions, Split};
 use report::html::Page;
 use serde_json::{Value, json};
@@ -26,10 +26,13 @@ use std::path::{Path, PathBuf};
 const EXPLORE: &str = "http://127.0.0.1:7007/";
 
 pub(crate) fn run(o: &ReportOptions, parameters: Value, stage: &Stage) -> Result<String> {
+    if !o.run_dir.is_dir() {
+        return Err(Error::new("no such folder").field("--run-dir").file(&o.run_dir).expected("OUT of a run"));
+    }
     let load_options = LoadOptions { resolution: o.views.resolution, holdout: o.holdout };
     let dataset = load(&o.scene, &load_options, stage)?;
     let sizes = Sizes {
-        geometry: memory::bytes(&geometry(o)),
+        geometry: memory::bytes(&o.geometry),
         features: memory::bytes(&o.run_dir.join("features.safetensors")),
         pixels: memory::pixels(&dataset.views),
         shown: if o.views.views.is_empty() { VIEWS } else { o.views.views.len() } as u64,
@@ -38,19 +41,14 @@ pub(crate) fn run(o: &ReportOptions, parameters: Value, stage: &Stage) -> Result
     stage.forecast(memory::of_report(&sizes), "give a smaller --resolution")?;
     let (out, figures) = (&o.out, o.out.with_file_name("metrics.json"));
     let outputs = stage.outputs(out).file(out).file(&figures);
-    let mut claim = outputs.reads(&dataset.files).reads(files(&o.run_dir).chain([geometry(o)])).claim()?;
+    let mut claim = outputs.reads(&dataset.files).reads(files(&o.run_dir).chain([o.geometry.clone()])).claim()?;
     let mut metrics = Metrics::default();
-    let material = Material::read(&dataset, o, &geometry(o), masks(o), &mut metrics)?;
+    let material = Material::read(&dataset, o, &o.geometry, masks(o), &mut metrics)?;
     write_bytes(out, write(&material, &mut metrics)?.as_bytes())?;
     write_json(&figures, &metrics)?;
     stage.record(&mut claim, parameters, material.inputs, json!({"left_out": metrics.skipped.len()}))?;
     stage.info(&format!("wrote {}", out.display()));
     Ok(metrics.table())
-}
-
-/// The Gaussians, which may lie outside of the run.
-fn geometry(o: &ReportOptions) -> PathBuf {
-    o.geometry.clone().unwrap_or_else(|| o.run_dir.join("geometry.ply"))
 }
 
 /// The folder of id maps, if there is one.

@@ -65,7 +65,7 @@ pub fn scene(world: &World, edited: &Edited, blob: &Blob, mode: &str, photograph
         })
         .collect();
     json!({
-        "name": world.run.dir.canonicalize().unwrap_or_else(|_| world.run.dir.clone()).file_name().map(|n| n.to_string_lossy()),
+        "name": world.source.name(),
         "mode": mode,
         "gaussians": world.packed.order.len(),
         "of": g.len(),

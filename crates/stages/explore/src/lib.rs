@@ -1,6 +1,6 @@
 //! `explore`: a page to look at a scene, click on a thing, ask in words and take it home.
 //!
-//! `run_folder` finds what a run was made from, `world` loads it, `pack` brings the Gaussians down to 16 bytes each and
+//! `world` loads a run, `pack` brings its Gaussians down to 16 bytes each and
 //! `describe` says the rest as JSON. `serve` gives the page of `web/` a server on this machine, whose `answers` come from
 //! the rasteriser, for Gaussians within `reach` of a click, and the language model; `page` puts everything into one file that needs no server.
 //! `tools` answers programs, over HTTP by `serve` and over the Model Context Protocol by `mcp`.
@@ -13,7 +13,6 @@ mod pack;
 mod page;
 mod pictures;
 mod reach;
-mod run_folder;
 mod serve;
 mod tools;
 mod web;

@@ -3,6 +3,7 @@
 use clap::{Parser, Subcommand};
 use gs_io::{Error, Result};
 use gs_scene::dataset::Resolution;
+use query::TextOptions;
 use serde::{Serialize, Serializer};
 use stage::{CommonArgs, Program, Stage};
 use std::net::IpAddr;
@@ -32,16 +33,16 @@ enum Command {
 /// The run to look at.
 #[derive(Debug, Clone, clap::Args, Serialize)]
 pub struct Source {
-    /// Folder of a finished run, such as OUT of make: instances.safetensors must be in it
+    /// Dataset folder (COLMAP, transforms.json or ScanNet)
     #[arg(long, value_name = "DIR")]
-    pub run_dir: PathBuf,
-    /// Dataset folder [default: the one that the instances were made from]
-    #[arg(long, value_name = "DIR")]
-    pub scene: Option<PathBuf>,
-    /// The geometry.ply that the instances were made from [default: the one that the run's record names]
+    pub scene: PathBuf,
+    /// The geometry.ply that the instances were made from
     #[arg(long, value_name = "FILE")]
-    pub geometry: Option<PathBuf>,
-    /// CLIP folder with text.onnx, for questions in words [default: the one that the run was scored or asked with]
+    pub geometry: PathBuf,
+    /// instances.safetensors of cluster-match; instances.edits.json, what a person changes of them, is kept beside it
+    #[arg(long, value_name = "FILE")]
+    pub instances: PathBuf,
+    /// CLIP folder with text.onnx, for questions in words
     #[arg(long, value_name = "DIR")]
     pub clip: Option<PathBuf>,
     /// Table of text features by name, instead of --clip: JSON, OpenGaussian's text_features.zip, or npz
@@ -50,6 +51,35 @@ pub struct Source {
     /// Bands of spherical harmonics that the page draws: 0 (16 bytes a Gaussian) or 1 (28 bytes, highlights move)
     #[arg(long, value_name = "DEGREE", default_value_t = 0, value_parser = clap::value_parser!(u8).range(0..=1))]
     pub sh: u8,
+}
+
+impl Source {
+    /// The name of the folder that the instances lie in.
+    pub fn name(&self) -> Option<String> {
+        let path = self.instances.canonicalize().ok()?;
+        Some(path.parent()?.file_name()?.to_string_lossy().into_owned())
+    }
+
+    /// What a person changed of the instances; need not be there.
+    pub fn edits(&self) -> PathBuf {
+        self.instances.with_file_name("instances.edits.json")
+    }
+
+    /// The features that the instances were clustered from, where they lie beside them.
+    pub fn features(&self) -> Option<PathBuf> {
+        Some(self.instances.with_file_name("features.safetensors")).filter(|f| f.is_file())
+    }
+
+    /// Where text features come from.
+    pub fn texts(&self) -> TextOptions {
+        let (clip, text_features) = (self.clip.clone(), self.text_features.clone());
+        TextOptions { clip, text_features, any_model: false, min_support: None }
+    }
+
+    /// All files that are read but those of the dataset.
+    pub fn files(&self) -> impl Iterator<Item = PathBuf> {
+        [self.instances.clone(), self.geometry.clone(), self.edits()].into_iter().chain(self.features())
+    }
 }
 
 /// `explore serve`.

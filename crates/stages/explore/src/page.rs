@@ -19,8 +19,7 @@ const LINKED_SCRIPT: &str = "<script type=\"module\" src=\"app/main.js\"></scrip
 
 /// Writes the file.
 pub fn run(o: &PageOptions, parameters: Value, stage: &Stage) -> Result<()> {
-    let run = crate::run_folder::RunFolder::find(&o.source)?;
-    let mut claim = stage.outputs(&o.out).file(&o.out).reads(run.files().chain([&run.edits])).claim()?;
+    let mut claim = stage.outputs(&o.out).file(&o.out).reads(o.source.files()).claim()?;
     let world = World::read(&o.source, o.resolution, stage)?;
     let edited = world.edited(world.saved_edits()?)?;
     let texts = texts(&world, &edited, &o.text)?;

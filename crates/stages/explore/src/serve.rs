@@ -289,7 +289,7 @@ async fn save(State(s): Held, body: Bytes) -> Response {
         let edits: Vec<Edit> = parsed(&body)?;
         let edits = Edits { instances: s.world.scene.artifact.hash().into(), edits };
         let new = s.world.edited(edits)?;
-        new.edits.write(&s.world.run.edits)?;
+        new.edits.write(s.world.source.edits())?;
         let list = describe::instances_of(Some(&new), &s.world);
         *s.edited.lock().expect("no panic holds this lock") = new;
         Ok(json(&Value::Array(list)))

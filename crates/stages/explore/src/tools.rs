@@ -307,6 +307,6 @@ fn export(asked: &Asked, export: &Export) -> Result<Value> {
     }
     let made_by = concat!("explore ", env!("CARGO_PKG_VERSION"));
     let world = asked.world;
-    Labelled::new(&world.scene.geometry, &world.run.geometry, label, made_by)?.write(&path, &which)?;
+    Labelled::new(&world.scene.geometry, &world.source.geometry, label, made_by)?.write(&path, &which)?;
     Ok(json!({"file": path, "gaussians": which.len(), "of": label.len()}))
 }

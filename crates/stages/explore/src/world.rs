@@ -3,7 +3,6 @@
 use crate::options::Source;
 use crate::pack::{Packed, pack};
 use crate::reach::Reach;
-use crate::run_folder::RunFolder;
 use artifacts::{Edits, Instances, Remarks};
 use gs_io::{Error, Result};
 use gs_scene::Gaussians;
@@ -17,7 +16,7 @@ use std::sync::OnceLock;
 /// What the page shows, and what answers its questions.
 pub struct World {
     /// Where it was read from.
-    pub run: RunFolder,
+    pub source: Source,
     /// The photographs.
     pub dataset: Dataset,
     /// Gaussians and instances, without anybody's edits.
@@ -67,18 +66,17 @@ impl World {
     /// # Errors
     /// When files are missing, damaged or of different scenes.
     pub fn read(o: &Source, resolution: Resolution, stage: &Stage) -> Result<Self> {
-        let run = RunFolder::find(o)?;
-        let dataset = dataset::load(&run.scene, &LoadOptions { resolution, ..LoadOptions::default() })?;
-        stage.forecast(forecast(&run, &dataset), "give a smaller geometry (gs-geom train --max-gaussians)")?;
-        let scene = LabelledScene::read(&run.instances, &run.geometry, None)?;
+        let dataset = dataset::load(&o.scene, &LoadOptions { resolution, ..LoadOptions::default() })?;
+        stage.forecast(forecast(o, &dataset), "give a smaller geometry (gs-geom train --max-gaussians)")?;
+        let scene = LabelledScene::read(&o.instances, &o.geometry, None)?;
         scene.check_dataset(&dataset)?;
         let mut messages = dataset.warnings.clone();
         messages.extend(scene.geometry.damage());
-        let words = words(&run, &scene);
+        let words = words(o, &scene);
         let packed = pack(scene.gaussians(), o.sh);
         let reach = Reach::new(scene.gaussians(), &packed.order);
         let (cells, cell_of) = cells(&scene.instances);
-        let feature_colors = match feature_colors(&run, &scene, &packed) {
+        let feature_colors = match feature_colors(o, &scene, &packed) {
             Ok(colors) => colors,
             Err(e) => {
                 messages.push(format!("colours of features are left out: {e}"));
@@ -90,7 +88,7 @@ impl World {
         if packed.order.len() < n {
             stage.skipped(&format!("{} of {n} Gaussians: too faint to be drawn", n - packed.order.len()));
         }
-        Ok(Self { run, dataset, scene, packed, reach, cells, cell_of, feature_colors, words, messages })
+        Ok(Self { source: o.clone(), dataset, scene, packed, reach, cells, cell_of, feature_colors, words, messages })
     }
 
     /// All Gaussians of the geometry.
@@ -103,7 +101,7 @@ impl World {
     /// # Errors
     /// When the file is damaged, or is about other instances.
     pub fn saved_edits(&self) -> Result<Edits> {
-        let (path, hash) = (&self.run.edits, self.scene.artifact.hash());
+        let (path, hash) = (&self.source.edits(), self.scene.artifact.hash());
         if !path.exists() {
             return Ok(Edits { instances: hash.into(), edits: Vec::new() });
         }
@@ -115,7 +113,7 @@ impl World {
             .file(path)
             .field("instances")
             .found(&edits.instances)
-            .expected(format!("{hash} ({})", self.run.instances.display()))
+            .expected(format!("{hash} ({})", self.source.instances.display()))
             .hint("move the file away to start anew"))
     }
 
@@ -136,14 +134,14 @@ impl World {
 }
 
 /// Peak of memory in bytes: geometry, packed Gaussians and a photograph (docs/results/explore.md has measured peaks).
-fn forecast(run: &RunFolder, dataset: &Dataset) -> u64 {
+fn forecast(source: &Source, dataset: &Dataset) -> u64 {
     const PROGRAM: u64 = 45_000_000;
-    let geometry = std::fs::metadata(&run.geometry).map_or(0, |m| m.len());
+    let geometry = std::fs::metadata(&source.geometry).map_or(0, |m| m.len());
     let pixels = |v: &View| u64::from(v.camera.width) * u64::from(v.camera.height);
-    PROGRAM + run.texts.bytes() + geometry * 19 / 10 + 40 * dataset.views.iter().map(pixels).max().unwrap_or(0)
+    PROGRAM + source.texts().bytes() + geometry * 19 / 10 + 40 * dataset.views.iter().map(pixels).max().unwrap_or(0)
 }
 
-fn words(run: &RunFolder, scene: &LabelledScene) -> std::result::Result<TextSource, String> {
+fn words(source: &Source, scene: &LabelledScene) -> std::result::Result<TextSource, String> {
     if scene.instances.dim == 0 {
         return Err(
             "The instances have no language features: run make scene with CLIP=folder (scripts/export_clip.py \
@@ -151,14 +149,14 @@ fn words(run: &RunFolder, scene: &LabelledScene) -> std::result::Result<TextSour
                 .into(),
         );
     }
-    if !run.texts.given() {
+    if !source.texts().given() {
         return Err(
             "No language model: give --clip models/clip or --text-features FILE. Clicking works, and names that \
                     you give can be found."
                 .into(),
         );
     }
-    TextSource::open_for(&scene.artifact, scene.instances.dim, &run.texts).map_err(|e| e.to_string())
+    TextSource::open_for(&scene.artifact, scene.instances.dim, &source.texts()).map_err(|e| e.to_string())
 }
 
 /// The different pairs of label and node in order of their first Gaussian, and which of them each Gaussian has.
@@ -179,10 +177,10 @@ fn cells(instances: &Instances) -> (Vec<(i32, i32)>, Vec<u32>) {
 /// Grey of a Gaussian that no view sees and that has no features.
 const NO_FEATURE: [u8; 3] = [64; 3];
 
-fn feature_colors(run: &RunFolder, scene: &LabelledScene, packed: &Packed) -> Result<Vec<[u8; 3]>> {
-    let Some(path) = &run.features else { return Ok(Vec::new()) };
+fn feature_colors(source: &Source, scene: &LabelledScene, packed: &Packed) -> Result<Vec<[u8; 3]>> {
+    let Some(path) = source.features() else { return Ok(Vec::new()) };
     let hash = &scene.inputs[artifacts::role::GEOMETRY];
-    let features = query::read_features(path, hash, scene.gaussians().len())?;
+    let features = query::read_features(&path, hash, scene.gaussians().len())?;
     let mut colors = vec![NO_FEATURE; scene.gaussians().len()];
     let of_kept = report::feature_colors(&features.values, features.dim);
     for (&i, color) in features.kept.iter().zip(of_kept) {

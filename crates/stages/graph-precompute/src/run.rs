@@ -12,6 +12,7 @@ use std::collections::BTreeMap;
 
 impl Program for Args {
     const NAME: &'static str = "graph-precompute";
+    const OUTPUTS: &'static [&'static str] = &["graph", "footprints"];
 
     fn common(&self) -> &CommonArgs {
         &self.common

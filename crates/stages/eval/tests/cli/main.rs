@@ -371,8 +371,9 @@ fn a_report_of_geometry_alone_says_what_is_left_out() {
     // Gaussians that somebody else trained do not lie in the run.
     fs::rename(f.run().join("geometry.ply"), f.path().join("mine.ply")).unwrap();
     f.good("report", &format!("{REPORT}|--geometry|{{}}/mine.ply"));
-    f.bad("report", "--run-dir|{}/none|--scene|{}/balls|--out|{}/r/r.html", &["geometry.ply"]);
-    f.bad("report", "--run-dir|{}/run|--scene|{}/none|--out|{}/r/r.html", &["none"]);
+    f.bad("report", "--scene|{}/balls|--geometry|{}/mine.ply|--out|{}/r.html", &["--run-dir"]);
+    f.bad("report", "--run-dir|{}/none|--scene|{}/balls|--out|{}/r/r.html", &["--run-dir", "no such folder"]);
+    f.bad("report", "--run-dir|{}/run|--scene|{}/none|--geometry|{}/mine.ply|--out|{}/r/r.html", &["none"]);
 }
 
 #[test]
