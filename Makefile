@@ -38,6 +38,10 @@ scene: checked-scene build ## The same on your own photographs, or on Gaussians 
 explore: build ## Look at a finished run in the browser, click on things, ask in words: make explore OUT=folder
 	target/release/explore serve --run-dir $(or $(OUT),out/demo) --open --threads $(THREADS) $(EXPLORE_ARGS)
 
+query: build ## Ask a finished run for something: make query OUT=folder TEXT="coffee mug"
+	@test -n "$$TEXT" || { echo 'say what to look for: make query OUT=folder TEXT="coffee mug"' >&2; exit 2; }
+	target/release/eval query --run-dir $(or $(OUT),out/demo) --text "$$TEXT" --out $(or $(OUT),out/demo)/asked --threads $(THREADS) $(QUERY_ARGS)
+
 # Settings that are missing or wrong are said before anything is built.
 checked-scene:
 	@$(PIPELINE) -f pipelines/custom.mk checked

@@ -9,7 +9,7 @@ define newline
 endef
 # Not every shell puts the home folder for the ~ of SCENE=~/photographs.
 as_it_is = $(subst $(newline),,$(subst $(newline)~/,$(HOME)/,$(newline)$(value $1)))
-$(foreach v,$(PATHS) QUERIES,\
+$(foreach v,$(PATHS) QUERIES TEXT,\
   $(if $(findstring $(newline),$(value $v)),$(error $v has a line break in it: give it in one line))\
   $(if $(filter command,$(firstword $(origin $v))),$(eval export override $v := $$(call as_it_is,$v)))\
   $(if $(filter environment,$(firstword $(origin $v))),$(eval $v := $$(call as_it_is,$v))))

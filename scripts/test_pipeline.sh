@@ -64,6 +64,12 @@ else
   say "skipped: no python3"
 fi
 
+say "== a question in one line"
+make -s query OUT="$work/a" TEXT=floor > "$work/query.log" 2>&1 || { cat "$work/query.log"; fail "make query"; }
+grep -q -e '--clip ' "$work/query.log" && [ -s "$work/a/asked/query.json" ] || { cat "$work/query.log"; fail "make query answers nothing"; }
+! make -s query OUT="$work/a" > "$work/query.log" 2>&1 && grep -q 'say what to look for' "$work/query.log" || fail "make query without TEXT"
+pass "make query finds scene, Gaussians, instances and words of a run"
+
 say "== a second make"
 tiny "$work/a" 2 > "$work/again.log" 2>&1
 [ -z "$(stages_of "$work/again.log")" ] || { cat "$work/again.log"; fail "a second make ran a stage"; }
