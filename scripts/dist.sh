@@ -15,7 +15,7 @@ CAGS_REVISION=${CAGS_REVISION:-$(git rev-parse --short=12 HEAD)}
 export CAGS_REVISION
 cargo build --profile dist --locked --workspace --bins
 scripts/licences.py --check
-for program in gs-geom graph-precompute feat-train cluster-match eval explore export mask-embed synth-scene bench; do
+for program in cags gs-geom graph-precompute feat-train cluster-match eval explore export mask-embed synth-scene bench; do
   cp "target/dist/$program" "$out/$name/bin/"
   "target/dist/$program" --generate man "$out/$name/man"
   for shell in bash zsh fish; do "target/dist/$program" --generate $shell "$out/$name/completions"; done

@@ -6,7 +6,7 @@
 //! becomes a mask (`silhouette`) and the forecast of memory (`memory`).
 
 mod check;
-pub mod cli;
+mod cli;
 mod mask;
 mod mask_stats;
 mod memory;
@@ -20,6 +20,7 @@ mod silhouette;
 
 pub use self::query::ask::Asker;
 pub use self::query::segment::divide;
+pub use cli::Args;
 pub use mask::Mask;
 pub use protocols::instances::read_truth;
 pub use scene::numbered;

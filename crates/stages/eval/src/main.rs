@@ -6,5 +6,5 @@ use std::process::ExitCode;
 static ALLOCATOR: stage::Allocator = stage::Allocator;
 
 fn main() -> ExitCode {
-    stage::main::<eval::cli::Args>()
+    stage::main::<eval::Args>()
 }

@@ -10,8 +10,10 @@
 mod contrastive;
 mod inputs;
 mod memory;
-pub mod options;
+mod options;
 mod outputs;
 mod random;
 mod run;
 mod spectral;
+
+pub use options::Args;
