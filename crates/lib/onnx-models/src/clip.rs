@@ -94,7 +94,7 @@ impl Encoder {
     fn open(path: &Path, name: &str, rank: usize, kind: Kind, options: &EngineOptions) -> Result<Self> {
         let path = &if path.is_dir() { path.join(name) } else { path.to_path_buf() };
         if !path.exists() {
-            let hint = "export one with scripts/export_clip.py where a model hub can be reached, or use the one in testdata/clip-tiny";
+            let hint = "fetch one with make clip, export one with scripts/export_clip.py, or use the one in testdata/clip-tiny";
             return Err(Error::new("no such model").file(path).hint(hint));
         }
         let config = ClipConfig::read(path.parent().unwrap_or(Path::new("")))?;

@@ -72,7 +72,7 @@ fn wrong_models_and_configurations_are_named() {
     let dir = tempfile::tempdir().unwrap();
     let image = |what: &Path| ClipImage::open(what, &options).err().unwrap().to_string();
     let e = image(dir.path());
-    assert!(e.contains("image.onnx: no such model; export one with scripts/export_clip.py"), "{e}");
+    assert!(e.contains("image.onnx: no such model; fetch one with make clip"), "{e}");
     // The text encoder in place of the image encoder.
     let e = image(&folder().join("text.onnx"));
     assert!(e.contains("found integers of rank 2, expected floats of rank 4"), "{e}");

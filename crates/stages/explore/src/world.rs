@@ -143,11 +143,9 @@ fn forecast(source: &Source, dataset: &Dataset) -> u64 {
 
 fn words(source: &Source, scene: &LabelledScene) -> std::result::Result<TextSource, String> {
     if scene.instances.dim == 0 {
-        return Err(
-            "The instances have no language features: run make scene with CLIP=folder (scripts/export_clip.py \
-                    makes one). Clicking works, and names that you give can be found."
-                .into(),
-        );
+        return Err("The instances have no language features: run make clip, then make scene again. \
+                    Clicking works, and names that you give can be found."
+            .into());
     }
     if !source.texts().given() {
         return Err(

@@ -7,6 +7,7 @@
 //! which views are done already, `logits` how sure a mask is of each pixel.
 
 pub mod automatic;
+mod check;
 pub mod crops;
 mod embed;
 mod finished;
@@ -34,7 +35,7 @@ impl Program for Args {
     }
 
     fn forecasts(&self) -> bool {
-        !matches!(self.task, Task::Crops(_))
+        !matches!(self.task, Task::Crops(_) | Task::Check(_))
     }
 
     fn run(self, stage: &Stage) -> Result<()> {
@@ -43,6 +44,7 @@ impl Program for Args {
             Task::Embed(args) => embed::run(&args, stage),
             Task::Import(args) => import::run(&args, stage),
             Task::Crops(args) => crops::run(&args, stage),
+            Task::Check(args) => check::run(&args, stage),
         }
     }
 }

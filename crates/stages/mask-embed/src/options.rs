@@ -28,6 +28,8 @@ pub(crate) enum Task {
     Import(ImportArgs),
     /// Write the pictures of all masks into one file, for training an encoder
     Crops(CropsArgs),
+    /// Check that the two halves of a CLIP model can be run and fit together
+    Check(CheckArgs),
 }
 
 /// Which photographs.
@@ -142,6 +144,16 @@ pub(crate) struct EmbedArgs {
     #[arg(long, value_name = "FOLDER")]
     #[serde(skip)]
     pub out: Option<PathBuf>,
+}
+
+/// A CLIP model.
+#[derive(Debug, Clone, clap::Args)]
+pub(crate) struct CheckArgs {
+    #[command(flatten)]
+    pub engine: EngineArgs,
+    /// Folder with CLIP's image.onnx, text.onnx and clip.json
+    #[arg(long, value_name = "FOLDER")]
+    pub clip: PathBuf,
 }
 
 /// Id maps from label pictures.
