@@ -5,6 +5,7 @@ mod gaussians;
 mod hdbscan;
 mod points;
 mod raster;
+mod runs;
 mod work;
 
 use pyo3::prelude::*;
@@ -20,4 +21,6 @@ mod _native {
     use crate::points::{farthest_point_sample, nearest_neighbours};
     #[pymodule_export]
     use crate::raster::{render, render_backward};
+    #[pymodule_export]
+    use crate::runs::{Labelled, Words, check_artifact, input_of_run};
 }

@@ -24,6 +24,7 @@ pub use memory::Bytes;
 pub use progress::Progress;
 pub use range::{at_least, positive, within};
 pub use record::{RunRecord, cpu_seconds, peak_rss_bytes};
+pub use run_folder::input_of_run;
 
 use clap::builder::RangedU64ValueParser;
 use clap::error::ContextValue;

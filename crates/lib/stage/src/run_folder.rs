@@ -75,6 +75,27 @@ pub(crate) fn told<P: Program>(arguments: &[OsString]) -> Result<Vec<OsString>> 
     Asked { command, matches, dir, outputs: P::OUTPUTS }.tell()
 }
 
+/// The file or folder that an option of the programs, such as `geometry` or `text-features`, had in a run, or that lies in its folder
+/// under its usual name; none where the run tells of none.
+pub fn input_of_run(dir: &Path, option: &str) -> Option<PathBuf> {
+    let input = INPUTS.iter().find(|input| input.id.replace('_', "-") == option)?;
+    find(&input.place, &format!("--{option}"), dir, &records(dir))
+}
+
+/// The command lines that wrote what is in a folder.
+fn records(dir: &Path) -> Vec<Vec<String>> {
+    RECORDED.iter().filter_map(|file| RunRecord::read(dir.join(file)).ok()).map(|r| r.arguments).collect()
+}
+
+fn find(place: &Place, option: &str, dir: &Path, records: &[Vec<String>]) -> Option<PathBuf> {
+    let recorded = || records.iter().find_map(|line| existing(&value(line, option)?, dir));
+    let here = |name: &str| Some(dir.join(name)).filter(|path| path.exists());
+    match place {
+        Place::Recorded(name) => recorded().or_else(|| here((*name)?)),
+        Place::Folder(name) => here(name).or_else(recorded),
+    }
+}
+
 /// A command with the options that it was given.
 struct Asked<'a> {
     command: &'a Command,
@@ -85,7 +106,7 @@ struct Asked<'a> {
 
 impl Asked<'_> {
     fn tell(&self) -> Result<Vec<OsString>> {
-        let records = self.records();
+        let records = records(self.dir);
         let (mut options, mut known) = (Vec::new(), Vec::new());
         for input in INPUTS {
             let Some(arg) = self.arg(input.id).filter(|_| !self.outputs.contains(&input.id)) else { continue };
@@ -101,7 +122,7 @@ impl Asked<'_> {
                 return Err(Error::new("no such folder").field("--run-dir").file(self.dir).expected("OUT of a run"));
             }
             let option = option(arg);
-            match self.find(&input.place, &option, &records) {
+            match find(&input.place, &option, self.dir, &records) {
                 Some(path) => options.extend([OsString::from(option), path.into_os_string()]),
                 None if arg.is_required_set() => return Err(self.missing(input.id, &option, &records)),
                 None => _ = known.pop(),
@@ -139,20 +160,6 @@ impl Asked<'_> {
                 .any(|g| g.contains(&arg.get_id()) && g.contains(&other.get_id()))
         };
         given().any(|other| conflict(arg, other) || conflict(other, arg) || instead(other))
-    }
-
-    /// The command lines that wrote what is in the folder.
-    fn records(&self) -> Vec<Vec<String>> {
-        RECORDED.iter().filter_map(|file| RunRecord::read(self.dir.join(file)).ok()).map(|r| r.arguments).collect()
-    }
-
-    fn find(&self, place: &Place, option: &str, records: &[Vec<String>]) -> Option<PathBuf> {
-        let recorded = || records.iter().find_map(|line| existing(&value(line, option)?, self.dir));
-        let here = |name: &str| Some(self.dir.join(name)).filter(|path| path.exists());
-        match place {
-            Place::Recorded(name) => recorded().or_else(|| here((*name)?)),
-            Place::Folder(name) => here(name).or_else(recorded),
-        }
     }
 
     fn missing(&self, id: &str, option: &str, records: &[Vec<String>]) -> Error {

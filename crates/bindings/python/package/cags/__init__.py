@@ -8,6 +8,7 @@
 ``render``                   the picture of it
 ``render_backward``          the gradient of every parameter, given that of every pixel
 ``read_ply``, ``write_ply``  files of Gaussians, in all formats of docs/splats.md
+``Run``                      a finished run: its artifacts, objects, and questions in words
 ===========================  ======================================================================
 
 Results depend neither on the number of threads nor on the machine. Long work releases the interpreter lock.
@@ -15,12 +16,17 @@ Results depend neither on the number of threads nor on the machine. Long work re
 
 from ._gaussians import Camera, Gaussians, Rendered, read_ply, render, render_backward, write_ply
 from ._points import farthest_point_sample, nearest_neighbours
+from ._run import Artifact, Match, Object, Run
 
 __all__ = [
     "HDBSCAN",
+    "Artifact",
     "Camera",
     "Gaussians",
+    "Match",
+    "Object",
     "Rendered",
+    "Run",
     "farthest_point_sample",
     "nearest_neighbours",
     "read_ply",

@@ -1,5 +1,5 @@
 from os import PathLike
-from typing import Any, Sequence
+from typing import Any, Iterator, Literal, Mapping, Sequence
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -77,3 +77,39 @@ def render_backward(
 ) -> Gaussians: ...
 def read_ply(path: str | PathLike[str]) -> Gaussians: ...
 def write_ply(path: str | PathLike[str], gaussians: Gaussians, *, instance: ArrayLike | None = None) -> None: ...
+
+class Artifact(Mapping[str, NDArray[Any]]):
+    provenance: dict[str, Any]
+    def __getitem__(self, name: str) -> NDArray[Any]: ...
+    def __iter__(self) -> Iterator[str]: ...
+    def __len__(self) -> int: ...
+
+class Match:
+    instance: int
+    score: float
+
+class Object:
+    id: int
+    name: str | None
+    score: float
+    gaussians: int
+    siblings: list[int]
+    centroid: NDArray[np.float64]
+    center: NDArray[np.float64]
+    half_size: NDArray[np.float64]
+    axes: NDArray[np.float64]
+    volume: float
+    view: str | None
+
+class Run:
+    labels: NDArray[np.int32]
+    def __init__(self, folder: str | PathLike[str]) -> None: ...
+    @property
+    def gaussians(self) -> Gaussians: ...
+    def artifact(self, format: Literal["graph", "footprints", "features", "instances"]) -> Artifact: ...
+    def query(
+        self, text: str, *, clip: str | PathLike[str] | None = None, text_features: str | PathLike[str] | None = None
+    ) -> list[Match]: ...
+    def select(self, instance: int) -> Gaussians: ...
+    def objects(self) -> list[Object]: ...
+    def to_open3d(self) -> Any: ...

@@ -1,0 +1,98 @@
+//! Finished runs: their files, what they label, and questions in words.
+
+use crate::work::run;
+use gs_io::{Artifact, Error};
+use gs_scene::dataset::{self, LoadOptions};
+use numpy::{IntoPyArray, PyArray1};
+use objects::Up;
+use pyo3::exceptions::{PyOSError, PyValueError};
+use pyo3::prelude::*;
+use query::{Index, LabelledScene, TextOptions, TextSource};
+use std::collections::BTreeMap;
+use std::path::PathBuf;
+
+/// What is wrong with a file.
+fn failed(e: &Error) -> PyErr {
+    PyValueError::new_err(e.to_string())
+}
+
+/// The file or folder that a run was made from, or wrote, for an option of the programs such as `geometry`.
+#[pyfunction]
+pub fn input_of_run(folder: PathBuf, option: &str) -> PyResult<Option<PathBuf>> {
+    if !folder.is_dir() {
+        return Err(PyOSError::new_err(format!("{}: no such folder", folder.display())));
+    }
+    Ok(stage::input_of_run(&folder, option))
+}
+
+/// Checks an artifact's checksum, format and version; what its provenance says, as JSON.
+#[pyfunction]
+pub fn check_artifact(py: Python<'_>, path: PathBuf, format: &str, version: u32) -> PyResult<String> {
+    let artifact = run(py, 1, |_| Artifact::open(&path, format, version))?.map_err(|e| failed(&e))?;
+    serde_json::to_string(artifact.provenance()).map_err(|e| PyValueError::new_err(e.to_string()))
+}
+
+/// Instances with their Gaussians, a person's edits included.
+#[pyclass(frozen)]
+pub struct Labelled {
+    scene: LabelledScene,
+}
+
+#[pymethods]
+impl Labelled {
+    #[new]
+    fn new(py: Python<'_>, instances: PathBuf, geometry: PathBuf, edits: Option<PathBuf>) -> PyResult<Self> {
+        let read = run(py, 0, |_| LabelledScene::read(&instances, &geometry, edits.as_deref()))?;
+        Ok(Self { scene: read.map_err(|e| failed(&e))? })
+    }
+
+    /// Instance of every Gaussian, -1 for none.
+    fn labels<'py>(&self, py: Python<'py>) -> Bound<'py, PyArray1<i32>> {
+        self.scene.instances.label.clone().into_pyarray(py)
+    }
+
+    /// `scene.json`; boxes are upright where a dataset says what is up.
+    fn objects(&self, py: Python<'_>, scene: Option<PathBuf>) -> PyResult<String> {
+        let described = run(py, 0, |_| {
+            let dataset = scene.map(|path| dataset::load(&path, &LoadOptions::default())).transpose()?;
+            let up = dataset.and_then(|d| Up::of_cameras(d.views.iter().map(|v| &v.camera)));
+            let s = &self.scene;
+            let texts = BTreeMap::new();
+            Ok(objects::describe(&s.instances, s.gaussians(), &s.remarks, &texts, up, s.inputs.clone()))
+        })?;
+        let described = described.map_err(|e: Error| failed(&e))?;
+        serde_json::to_string(&described).map_err(|e| PyValueError::new_err(e.to_string()))
+    }
+}
+
+/// A language model or a table of text features that fits the instances.
+#[pyclass(frozen)]
+pub struct Words {
+    source: TextSource,
+}
+
+#[pymethods]
+impl Words {
+    #[new]
+    fn new(
+        py: Python<'_>,
+        labelled: &Labelled,
+        clip: Option<PathBuf>,
+        text_features: Option<PathBuf>,
+    ) -> PyResult<Self> {
+        let scene = &labelled.scene;
+        let options = TextOptions { clip, text_features, any_model: false, min_support: None };
+        let source = run(py, 0, |_| TextSource::open_for(&scene.artifact, scene.instances.dim, &options))?;
+        Ok(Self { source: source.map_err(|e| failed(&e))? })
+    }
+
+    /// Instances by falling cosine of their descriptors with the text.
+    fn rank(&self, py: Python<'_>, labelled: &Labelled, text: &str) -> PyResult<Vec<(u32, f32)>> {
+        let ranked = run(py, 0, |_| {
+            let feature = self.source.known(&[], &[text.to_string()], "text")?.remove(0);
+            let ranking = Index::new(&labelled.scene.instances).rank(&feature, &[]);
+            Ok(ranking.into_iter().map(|r| (r.instance, r.score)).collect())
+        })?;
+        ranked.map_err(|e: Error| failed(&e))
+    }
+}

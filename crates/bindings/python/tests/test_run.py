@@ -1,0 +1,108 @@
+"""cags.Run on a run that the programs made."""
+
+import json
+import subprocess
+import sys
+import types
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import cags
+
+ROOT = Path(__file__).resolve().parents[4]
+PROGRAM = ROOT / "target/release/cags"
+CLIP = ROOT / "testdata/clip-tiny"
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    if not PROGRAM.exists():
+        pytest.skip(f"no {PROGRAM}: cargo build --release")
+    work = tmp_path_factory.mktemp("run")
+    subprocess.run([PROGRAM, "synth-scene", "--size", "tiny", "--out", "photos", "--quiet"], cwd=work, check=True)
+    line = [PROGRAM, "run", "photos", "-o", "out", "ITERATIONS=200", "MASKS=photos/language_features", f"CLIP={CLIP}", "--quiet"]
+    subprocess.run(line, cwd=work, check=True)
+    return work / "out"
+
+
+@pytest.fixture(scope="module")
+def run(folder):
+    return cags.Run(folder)
+
+
+def test_labels_and_gaussians_belong_together(run, folder):
+    assert len(run.labels) == len(run.gaussians) and run.labels.dtype == np.int32
+    np.testing.assert_array_equal(run.labels, np.load(folder / "instances.labels.npy"))
+    chosen = run.select(0)
+    assert len(chosen) == (run.labels == 0).sum() > 0
+    np.testing.assert_array_equal(chosen.means, run.gaussians.means[run.labels == 0])
+    with pytest.raises(ValueError, match="instance 12345"):
+        run.select(12345)
+    assert str(folder) in repr(run)
+
+
+def test_artifacts_lie_in_the_file(run, folder):
+    instances = run.artifact("instances")
+    np.testing.assert_array_equal(instances["label"], run.labels)
+    assert isinstance(instances["label"].base, np.memmap) or isinstance(instances["label"], np.memmap)
+    with pytest.raises(ValueError):
+        instances["label"][0] = 1
+    graph = run.artifact("graph")
+    assert graph["knn"].dtype == np.uint32 and graph["knn"].shape[0] == len(graph["anchors"])
+    assert run.artifact("footprints")["row_ptr"].dtype == np.uint64
+    assert run.artifact("features")["features"].shape[0] == len(graph["kept"])
+    assert graph.provenance["format"] == "graph" and set(graph) >= {"kept", "knn"}
+    with pytest.raises(ValueError, match="no artifact"):
+        run.artifact("masks")
+
+
+def test_questions_are_answered_as_eval_query_does(run, folder, tmp_path):
+    line = [PROGRAM, "query", "--run-dir", folder, "--text", "red mug", "--granularity", "instance", "--out", tmp_path / "q", "--quiet"]
+    subprocess.run(line, check=True)
+    ranking = json.loads((tmp_path / "q/query.json").read_text())["queries"][0]["ranking"]
+    for answer in (run.query("red mug"), run.query("red mug", clip=CLIP)):
+        assert [(m.instance, pytest.approx(m.score, abs=1e-6)) for m in answer[: len(ranking)]] == [
+            (r["instance"], r["score"]) for r in ranking
+        ]
+    with pytest.raises(ValueError, match="no such model"):
+        run.query("red mug", clip=tmp_path)
+
+
+def test_objects_are_those_of_the_labels(run):
+    objects = run.objects()
+    assert {o.id: o.gaussians for o in objects} == {int(k): int((run.labels == k).sum()) for k in set(run.labels.tolist()) - {-1}}
+    o = objects[0]
+    np.testing.assert_allclose(o.axes @ o.axes.T, np.eye(3), atol=1e-5)
+    np.testing.assert_allclose(o.centroid, run.select(o.id).means.mean(axis=0), atol=1e-3)
+    assert o.volume == pytest.approx(8 * np.prod(o.half_size), rel=1e-4)
+
+
+def test_open3d_only_where_it_is(run, monkeypatch):
+    monkeypatch.setitem(sys.modules, "open3d", None)
+    with pytest.raises(ImportError, match="pip install open3d"):
+        run.to_open3d()
+    fake = types.SimpleNamespace(
+        geometry=types.SimpleNamespace(PointCloud=types.SimpleNamespace), utility=types.SimpleNamespace(Vector3dVector=np.asarray)
+    )
+    monkeypatch.setitem(sys.modules, "open3d", fake)
+    cloud = run.to_open3d()
+    assert cloud.points.shape == cloud.colors.shape == (len(run.labels), 3)
+    assert cloud.colors.min() >= 0 and cloud.colors.max() <= 1
+
+
+def test_what_is_no_run_is_refused(tmp_path, folder):
+    with pytest.raises(OSError, match="no such folder"):
+        cags.Run(tmp_path / "none")
+    with pytest.raises(ValueError, match="not finished"):
+        cags.Run(tmp_path)
+    broken = tmp_path / "broken"
+    broken.mkdir()
+    for name in ("geometry.ply", "instances.safetensors"):
+        data = bytearray((folder / name).read_bytes())
+        if name.startswith("instances"):
+            data[-1] ^= 1
+        (broken / name).write_bytes(data)
+    with pytest.raises(ValueError, match="instances.safetensors"):
+        cags.Run(broken)
