@@ -77,6 +77,19 @@ fn photographs_become_answers_with_one_program() {
     let again = said(here, &["cluster", "--run-dir", "out", "--cluster", "free", "--out", "free.safetensors"]);
     assert!(again.contains("from out: --scene") && again.contains("--features out/features.safetensors"), "{again}");
     said(here, &["report", "--run-dir", "out", "--holdout", "0", "--out", "page.html", "--quiet"]);
+    // A splat of any format instead of stage 1, up to the objects taken from it.
+    for format in ["spz", "compressed.ply", "splat", "glb"] {
+        let (splat, out) = (format!("mine.{format}"), format!("out-{format}"));
+        said(here, &["convert", "out/geometry.ply", &splat, "--quiet"]);
+        let setting = format!("GEOMETRY={splat}");
+        said(here, &["run", "photos", "-o", &out, &setting, "MASKS=photos/language_features", "--quiet"]);
+        said(
+            here,
+            &["export", "objects", "--run-dir", &out, "--only", "0", "--out", &format!("objects-{format}"), "--quiet"],
+        );
+        let inspected = said(here, &["inspect", &format!("{out}/instances.ply")]);
+        assert!(inspected.contains("gaussians") && here.join(&out).join("report.html").is_file(), "{inspected}");
+    }
     let tables = said(here, &["export", "objects", "--run-dir", "out", "--format", "spz", "--out", "objects"]);
     assert!(tables.contains("--instances out/instances.safetensors"), "{tables}");
 }

@@ -16,16 +16,16 @@ pub struct Labelled<'a> {
 }
 
 impl<'a> Labelled<'a> {
-    /// `label` is as long as there are Gaussians; `file` is where `geometry` was read from, and `made_by` what writes, such as
-    /// `export 0.1.0`.
+    /// `label` is as long as there are Gaussians; `file` is where `geometry` was read from, and `own` are comments for a PLY, such as
+    /// `made by export 0.1.0`.
     ///
     /// # Errors
     /// When the file cannot be read any more.
-    pub fn new(geometry: &'a Geometry, file: &Path, label: &'a [i32], made_by: &str) -> Result<Self> {
+    pub fn new(geometry: &'a Geometry, file: &Path, label: &'a [i32], own: Vec<String>) -> Result<Self> {
         // Rows with numbers that are not finite would break those who read the file.
-        let plain = geometry.damaged.is_empty() && ply::holds_gaussians(file).unwrap_or(false);
+        let plain = geometry.damaged.is_empty() && Format::of_file(file)? == Format::Ply;
         let rows = plain.then(|| ply::Vertices::read(file)).transpose()?;
-        Ok(Self { geometry, label, rows, comments: geometry.comments(vec![format!("made by {made_by}")]) })
+        Ok(Self { geometry, label, rows, comments: geometry.comments(own) })
     }
 
     /// Writes the Gaussians `which`, ascending, with all their harmonics, in the format that the file's name says; to a PLY with

@@ -5,7 +5,7 @@ use crate::inputs::Inputs;
 use crate::options::{Args, Settings};
 use artifacts::{Health, Instances, NOISE_COLOR, instance_color};
 use gs_io::{Claim, Error, Outputs, Result, write_bytes};
-use gs_scene::{Gaussians, SH_C0, ply};
+use gs_scene::{Gaussians, Labelled, SH_C0, ply};
 use serde_json::{Value, json};
 use stage::Stage;
 use std::path::Path;
@@ -51,16 +51,15 @@ pub(crate) fn write(
     let fail = |e: serde_json::Error| Error::new(e.to_string());
     let parameters = serde_json::to_value(settings).map_err(fail)?;
     let own = vec![format!("made by cluster-match {}", env!("CARGO_PKG_VERSION")), format!("parameters {parameters}")];
-    let (gaussians, comments) = (&inputs.geometry.gaussians, inputs.geometry.comments(own));
+    let (gaussians, comments) = (&inputs.geometry.gaussians, inputs.geometry.comments(own.clone()));
     let [labelled, list, table] = SIDE_FILES.map(|extension| a.out.with_extension(extension));
     let painted = a.paint.then(|| painted(gaussians, &instances.label));
-    // As the file has them, with what other programs put beside the Gaussians' parameters; but stand-ins of damaged ones.
-    let as_they_are = painted.is_none() && inputs.geometry.damaged.is_empty() && ply::holds_gaussians(&a.geometry)?;
-    if as_they_are {
-        let rows: Vec<u32> = (0..gaussians.len() as u32).collect();
-        ply::Vertices::read(&a.geometry)?.write(labelled, &rows, Some(&instances.label), &comments)?;
-    } else {
-        ply::write_labelled_gaussians(labelled, painted.as_ref().unwrap_or(gaussians), &instances.label, &comments)?;
+    match painted {
+        Some(painted) => ply::write_labelled_gaussians(labelled, &painted, &instances.label, &comments)?,
+        None => {
+            let all: Vec<u32> = (0..gaussians.len() as u32).collect();
+            Labelled::new(&inputs.geometry, &a.geometry, &instances.label, own)?.write(&labelled, &all)?;
+        }
     }
     gs_io::npy::write_i32(list, &[instances.label.len()], &instances.label)?;
     health::say(health, stage);

@@ -305,8 +305,8 @@ fn export(asked: &Asked, export: &Export) -> Result<Value> {
     if path.symlink_metadata().is_ok() {
         return Err(Error::new("a file of this name is there").file(&path).hint("choose another name"));
     }
-    let made_by = concat!("explore ", env!("CARGO_PKG_VERSION"));
+    let own = vec![concat!("made by explore ", env!("CARGO_PKG_VERSION")).into()];
     let world = asked.world;
-    Labelled::new(&world.scene.geometry, &world.source.geometry, label, made_by)?.write(&path, &which)?;
+    Labelled::new(&world.scene.geometry, &world.source.geometry, label, own)?.write(&path, &which)?;
     Ok(json!({"file": path, "gaussians": which.len(), "of": label.len()}))
 }

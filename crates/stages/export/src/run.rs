@@ -172,8 +172,8 @@ impl UpOptions {
 }
 
 fn splats_of<'a>(scene: &'a LabelledScene, inputs: &Inputs) -> Result<Labelled<'a>> {
-    let made_by = concat!("export ", env!("CARGO_PKG_VERSION"));
-    Labelled::new(&scene.geometry, &inputs.geometry, &scene.instances.label, made_by)
+    let own = vec![concat!("made by export ", env!("CARGO_PKG_VERSION")).into()];
+    Labelled::new(&scene.geometry, &inputs.geometry, &scene.instances.label, own)
 }
 
 fn describe(labelled: &LabelledScene, names: &Names, up: Option<Up>) -> Scene {
