@@ -2,9 +2,11 @@
 
 use crate::group::tree;
 use crate::join::by_masks;
+use crate::plane::Place;
 use crate::vote::by_votes;
 use artifacts::{Footprints, Graph, Level, TreeEdge};
 use gs_io::{Error, Result};
+use gs_scene::Gaussians;
 use hdbscan_exact::Clustering;
 use kiddo::{ImmutableKdTree, SquaredEuclidean};
 use rayon::prelude::*;
@@ -97,8 +99,17 @@ impl Assignment {
     ///
     /// # Errors
     /// When the footprints can't be read.
-    pub fn join(&mut self, kept: &[u32], footprints: &Footprints, levels: &[Level], least: f64) -> Result<()> {
-        let number = by_masks(&self.of_kept(kept), self.instances, footprints, levels, least)?;
+    pub fn join(
+        &mut self,
+        gaussians: &Gaussians,
+        kept: &[u32],
+        footprints: &Footprints,
+        levels: &[Level],
+        least: f64,
+    ) -> Result<()> {
+        let labels = self.of_kept(kept);
+        let places = Place::of_instances(gaussians, kept, &labels, self.instances);
+        let number = by_masks(&labels, self.instances, footprints, levels, least, places)?;
         self.instances = number.iter().max().map_or(0, |&n| n as usize + 1);
         let renumber = |l: &mut i32| *l = usize::try_from(*l).map_or(*l, |k| number[k] as i32);
         self.labels.iter_mut().for_each(renumber);

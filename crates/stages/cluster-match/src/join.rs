@@ -4,6 +4,7 @@
 //! stands on it, a wall behind a lamp, and a rim with few Gaussians is no bridge. The masks still tell: two pieces of one
 //! thing mostly lie in the same mask of a view, two things only where a view merges them.
 
+use crate::plane::Place;
 use artifacts::{Footprints, Level};
 use gs_io::Result;
 use rayon::prelude::*;
@@ -13,6 +14,9 @@ use std::collections::BTreeMap;
 const LEAST_VIEWS: usize = 2;
 /// Least share of their weight that lies in views that see both.
 const LEAST_COMMON: f64 = 0.05;
+/// Pieces that lie in one plane need this share of the agreement of others: a floor or a wall is seldom seen whole, and what hides
+/// its middle parts its masks.
+const IN_PLANE: f64 = 0.75;
 
 /// An instance as the masks see it.
 #[derive(Debug, Clone, Default)]
@@ -23,11 +27,12 @@ struct Profile {
     units: Vec<f64>,
     /// Sum of those.
     total: f64,
+    place: Place,
 }
 
 impl Profile {
-    fn new(masks: Vec<(u32, f64)>, unit_of: &[u32], units: usize) -> Self {
-        let mut out = Self { units: vec![0.0; units], ..Self::default() };
+    fn new(masks: Vec<(u32, f64)>, unit_of: &[u32], units: usize, place: Place) -> Self {
+        let mut out = Self { units: vec![0.0; units], place, ..Self::default() };
         for &(k, w) in &masks {
             out.units[unit_of[k as usize] as usize] += w;
         }
@@ -46,7 +51,8 @@ impl Profile {
         for &(k, w) in &other.masks {
             *masks.entry(k).or_default() += w;
         }
-        Self::new(masks.into_iter().collect(), unit_of, self.units.len())
+        let place = self.place.joined(&other.place);
+        Self::new(masks.into_iter().collect(), unit_of, self.units.len(), place)
     }
 }
 
@@ -100,14 +106,16 @@ pub fn mask_weights(
         .collect()
 }
 
-/// Joins instances, those that agree most first, until no two agree by `least` (more than a half) or more. `labels` are those of
-/// the kept Gaussians, -1 for none. Returns the new number of each instance; numbers stay in order.
+/// Joins instances, those that agree most first, until no two agree by `least` (more than a half) or more, or by [`IN_PLANE`] of it
+/// where their `places` lie in one plane. `labels` are those of the kept Gaussians, -1 for none. Returns the new number of each
+/// instance; numbers stay in order.
 pub fn by_masks(
     labels: &[i32],
     instances: usize,
     footprints: &Footprints,
     levels: &[Level],
     least: f64,
+    places: Vec<Place>,
 ) -> Result<Vec<u32>> {
     let unit_of = units(footprints);
     let units = footprints.views.len() * artifacts::LEVELS;
@@ -115,7 +123,8 @@ pub fn by_masks(
     for (r, of) in mask_weights(labels, footprints, levels)? {
         of.into_iter().filter(|(_, w)| *w > 0.0).for_each(|(k, w)| masks[k as usize].push((r, w)));
     }
-    let mut profiles: Vec<Profile> = masks.into_iter().map(|m| Profile::new(m, &unit_of, units)).collect();
+    let of_instance = |(masks, place)| Profile::new(masks, &unit_of, units, place);
+    let mut profiles: Vec<Profile> = masks.into_iter().zip(places).map(of_instance).collect();
     Ok(join(&mut profiles, &unit_of, least))
 }
 
@@ -131,7 +140,10 @@ fn join(profiles: &mut [Profile], unit_of: &[u32], least: f64) -> Vec<u32> {
     pairs.sort_unstable();
     pairs.dedup();
     let of = |profiles: &[Profile], (a, b): (u32, u32)| {
-        ((a, b), agreement(&profiles[a as usize], &profiles[b as usize], unit_of))
+        let (one, other) = (&profiles[a as usize], &profiles[b as usize]);
+        let agreement = agreement(one, other, unit_of);
+        let eased = agreement >= IN_PLANE * least && one.place.in_plane_of(&other.place);
+        ((a, b), if eased { agreement / IN_PLANE } else { agreement })
     };
     let mut agreements: BTreeMap<(u32, u32), f64> = pairs.into_par_iter().map(|pair| of(profiles, pair)).collect();
     let mut into: Vec<u32> = (0..profiles.len() as u32).collect();
@@ -161,13 +173,14 @@ fn join(profiles: &mut [Profile], unit_of: &[u32], least: f64) -> Vec<u32> {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::plane::testing::{board, places};
 
     /// Two masks a view; an instance has the given shares in the first, in views where it is seen at all.
     fn profile(firsts: &[Option<f64>]) -> Profile {
         let masks = firsts.iter().enumerate().filter_map(|(v, f)| f.map(|f| (v as u32, f)));
         let masks = masks.flat_map(|(v, f)| [(2 * v, f), (2 * v + 1, 1.0 - f)]).filter(|(_, w)| *w > 0.0);
         let unit_of = unit_of(firsts.len());
-        Profile::new(masks.collect(), &unit_of, firsts.len())
+        Profile::new(masks.collect(), &unit_of, firsts.len(), Place::default())
     }
 
     fn unit_of(views: usize) -> Vec<u32> {
@@ -195,5 +208,19 @@ mod tests {
         ];
         assert_eq!(join(&mut profiles.clone(), &unit_of(4), 0.6), [0, 1, 0, 2]);
         assert_eq!(join(&mut profiles, &unit_of(4), 0.8), [0, 1, 2, 3]);
+    }
+
+    #[test]
+    fn pieces_of_one_plane_need_less_agreement() {
+        let (one, two) = (Some(1.0), Some(0.0));
+        let join_of = |second: Vec<[f32; 3]>| {
+            // The same mask in five views of nine.
+            let views = [profile(&[one; 9]), profile(&[one, one, one, one, one, two, two, two, two])];
+            let places = places(&[board([0.0; 3], 0, 1), second]);
+            let of = views.into_iter().zip(places).map(|(profile, place)| Profile { place, ..profile });
+            join(&mut of.collect::<Vec<_>>(), &unit_of(9), 0.6)
+        };
+        assert_eq!(join_of(board([2.0, 0.0, 0.0], 0, 1)), [0, 0]);
+        assert_eq!(join_of(board([2.0, 0.0, 0.0], 1, 2)), [0, 1]);
     }
 }

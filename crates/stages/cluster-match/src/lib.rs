@@ -2,7 +2,8 @@
 //!
 //! [`options`] is the command line, `run` the story, `inputs` and `outputs` its ends. `group` clusters Gaussians;
 //! `assignment` keeps who belongs to which instance, gives noise and unseen Gaussians to their neighbours, and applies what
-//! the masks say: `vote` corrects rims, `join` joins pieces of one thing. `associate` matches instances with the
+//! the masks say: `vote` corrects rims, `join` joins pieces of one thing (`plane` tells floors
+//! and walls). `associate` matches instances with the
 //! masks of each view, `describe` gathers what is known of each instance, `rank` says how sure it is one whole thing,
 //! `health` how far masks and instances agree, `memory` forecasts the peak.
 
@@ -17,6 +18,7 @@ mod join;
 mod memory;
 mod options;
 mod outputs;
+mod plane;
 mod rank;
 mod run;
 #[cfg(test)]

@@ -128,7 +128,7 @@ fn correct(mut found: Assignment, inputs: &Inputs, settings: &Settings, stage: &
     }
     if settings.join > 0.0 {
         let before = found.instances;
-        found.join(&graph.kept, footprints, &settings.levels, settings.join)?;
+        found.join(&inputs.geometry.gaussians, &graph.kept, footprints, &settings.levels, settings.join)?;
         if found.instances < before {
             stage.info(&format!("{} instances after joining pieces that the masks show as one", found.instances));
         }
