@@ -138,6 +138,9 @@ fn correct(mut found: Assignment, inputs: &Inputs, settings: &Settings, stage: &
         let clustering = group(parts, parts_dim, graph, settings.cluster, &settings.hdbscan());
         let mut parts = Assignment::new(&clustering, &graph.kept, means.len());
         settle(&mut parts, inputs, settings, &[Level::Small])?;
+        if settings.join > 0.0 {
+            parts.join(&inputs.geometry.gaussians, &graph.kept, footprints, &[Level::Small], settings.join)?;
+        }
         let split = found.split(&parts, settings.split);
         if split > 0 {
             stage.info(&format!("{split} small things within others are instances of their own"));
