@@ -157,7 +157,7 @@ fn one_file_holds_the_scene() {
     let made = run.run("page", &["--out", &file, "--text", "far ball", "--photographs", "1"]);
     assert!(made.status.success(), "{}", String::from_utf8_lossy(&made.stderr));
     let page = std::fs::read_to_string(&out).unwrap();
-    assert!(page.contains("\"far ball\":[0.0,1.0]") && page.matches("data:image/jpeg").count() == 3);
+    assert!(page.contains("\"scores\":[0.0,1.0]") && page.matches("data:image/jpeg").count() == 3);
     let first = std::fs::read(&out).unwrap();
     assert!(
         run.run("page", &["--out", &file, "--text", "far ball", "--photographs", "1", "--threads", "1"])
