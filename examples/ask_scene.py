@@ -21,9 +21,12 @@ def ask(url, tool, **arguments):
 
 
 def main(text, url="http://127.0.0.1:7007"):
-    for found in ask(url, "find", text=text, most=3)["found"]:
+    answer = ask(url, "find", text=text, most=3)
+    if answer["matches"] is False:
+        print(f"nothing matches {text}; what comes nearest:")
+    for found in answer["found"]:
         print(f"object {found['id']}: cosine {found['cosine']}, at {found['centre']}")
-    best = ask(url, "find", text=text, most=1)["found"][0]["id"]
+    best = answer["found"][0]["id"]
     print("size", ask(url, "measure", object=best)["size"])
     for relation in ask(url, "relations", object=best)["relations"]:
         print(relation["says"])

@@ -24,7 +24,10 @@ def ask(text, run):
 
 def main(text, run="out/demo"):
     answer = ask(text, Path(run))
-    best = answer["queries"][0]["ranking"][0]["instance"]
+    asked = answer["queries"][0]
+    if not asked.get("verdict", {}).get("matches", True):
+        print(f"nothing matches {text}; nearest is", end=" ")
+    best = asked["ranking"][0]["instance"]
     tensors, _ = read(Path(run) / "instances.safetensors")
     chosen = tensors["label"] == best
     print(f"{text}: instance {best}, {chosen.sum()} Gaussians around {tensors['centroid'][best]}")

@@ -4,7 +4,8 @@
     scripts/bench_python.py OUT.md [--points 10000x2,1000000x6] [--runs 3]
 
 Each fit runs in a process of its own on all cores, on 40 blobs of different density with 15 % scattered points. Seconds are those of
-the fit alone, after a small one that compiles what is compiled late. A library is left out, with a word, where a fit takes over 10
+the fit alone, after a small one that compiles what is compiled late: of the clock, and of all processors together, which other work on
+the machine changes less; the plot has the latter. A library is left out, with a word, where a fit takes over 10
 minutes or 16 GB, or would by what it took for a tenth of the points. It makes OUT.json and OUT.svg too. `make bench-python` makes
 the environment. min_samples counts the point itself here, in scikit-learn and in hdbscan-rs; the others get one less.
 """
@@ -36,11 +37,11 @@ import sys, time, resource, numpy as np, {module}
 make = lambda: {call}
 make().fit(np.random.default_rng(0).normal(size=(2000, {dim})))
 x = np.load(sys.argv[1])
-before = time.perf_counter()
+before, spent = time.perf_counter(), time.process_time()
 found = make().fit_predict(x)
-seconds = time.perf_counter() - before
+seconds, spent = time.perf_counter() - before, time.process_time() - spent
 np.save(sys.argv[2], np.asarray(found, np.int32))
-print(seconds, resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024)
+print(seconds, spent, resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024)
 """
 
 
@@ -55,7 +56,7 @@ def blobs(n, d, seed=11):
 
 
 def fit(library, points, dim, labels):
-    """Seconds and peak memory of a fit in bytes; or in words why there are none."""
+    """Seconds of the clock, of all processors, and peak memory of a fit in bytes; or in words why there are none."""
     call = LIBRARIES[library][1].format(size=SIZE, samples=SAMPLES)
     module = call[: call.index(".HDBSCAN")]
     child = subprocess.Popen([sys.executable, "-W", "ignore", "-c", FIT.format(module=module, call=call, dim=dim), points, labels],
@@ -72,8 +73,8 @@ def fit(library, points, dim, labels):
     out, errors = child.communicate()
     if why or child.returncode:
         return why or errors.strip().splitlines()[-1]
-    seconds, peak = map(float, out.split())
-    return (seconds, peak) if seconds <= LONGEST else "over 10 minutes"
+    seconds, spent, peak = map(float, out.split())
+    return (seconds, spent, peak) if seconds <= LONGEST else "over 10 minutes"
 
 
 def main():
@@ -91,7 +92,7 @@ def main():
         for n, d in (map(int, p.split("x")) for p in a.points.split(",")):
             points = f"{folder}/points.npy"
             np.save(points, blobs(n, d))
-            row = {"points": n, "dim": d, "seconds": {}, "bytes": {}, "ari": {}, "left_out": {}}
+            row = {"points": n, "dim": d, "seconds": {}, "processor_seconds": {}, "bytes": {}, "ari": {}, "left_out": {}}
             for run in range(a.runs):
                 for library in LIBRARIES:
                     before = last.get((library, n // 10, d))
@@ -107,12 +108,13 @@ def main():
                         row["left_out"][library] = last[library, n, d] = found
                         continue
                     row["seconds"].setdefault(library, []).append(found[0])
-                    row["bytes"][library] = found[1]
+                    row["processor_seconds"].setdefault(library, []).append(found[1])
+                    row["bytes"][library] = found[2]
                     last[library, n, d] = found[0]
                     if run == 0 and library != "cags":
                         ours, theirs = (np.load(f"{folder}/{name}.npy") for name in ("cags", library))
                         row["ari"][library] = adjusted_rand_score(ours, theirs)
-                    print(f"{n} x {d}, {library}: {found[0]:.2f} s, {found[1] / 1e6:.0f} MB", file=sys.stderr)
+                    print(f"{n} x {d}, {library}: {found[0]:.2f} s, {found[1]:.2f} processor seconds, {found[2] / 1e6:.0f} MB", file=sys.stderr)
             rows.append(row)
             a.out.with_suffix(".json").write_text(json.dumps(rows, indent=1) + "\n")
     versions = {library: version(package) for library, (package, _) in LIBRARIES.items()}
@@ -123,11 +125,12 @@ def main():
 def cell(row, library):
     if library in row["left_out"]:
         return row["left_out"][library]
-    seconds, ours = row["seconds"][library], statistics.median(row["seconds"]["cags"])
-    middle = statistics.median(seconds)
-    spread = f" ({min(seconds):.3g} to {max(seconds):.3g})" if len(seconds) > 1 else ""
+    spent, ours = row["processor_seconds"][library], statistics.median(row["processor_seconds"]["cags"])
+    middle = statistics.median(spent)
+    spread = f" ({min(spent):.3g} to {max(spent):.3g})" if len(spent) > 1 else ""
     ratio = "" if library == "cags" else f", {middle / ours:.1f} times, ARI {row['ari'][library]:.4f}"
-    return f"{middle:.3g}{spread}{ratio}, {row['bytes'][library] / 1e6:.0f} MB"
+    clock = statistics.median(row["seconds"][library])
+    return f"{middle:.3g}{spread}{ratio}, clock {clock:.3g}, {row['bytes'][library] / 1e6:.0f} MB"
 
 
 def table(rows, versions):
@@ -139,7 +142,7 @@ def table(rows, versions):
 
 
 def plot(rows):
-    """Seconds against points, a panel for each number of dimensions, both axes by powers of ten."""
+    """Processor seconds against points, a panel for each number of dimensions, both axes by powers of ten."""
     colors = dict(zip(LIBRARIES, ["#c0392b", "#2471a3", "#1e8449", "#7d3c98", "#b9770e"]))
     dims = sorted({row["dim"] for row in rows})
     width, height, left, low, high = 250, 220, 46, -2.5, 3.0
@@ -155,7 +158,7 @@ def plot(rows):
         for power in (4, 5, 6):
             parts.append(f'<text x="{x(panel, 10**power)}" y="{height + 46}" text-anchor="middle">{10**power:,}</text>')
         for library, color in colors.items():
-            of = [(row["points"], statistics.median(row["seconds"][library])) for row in rows if row["dim"] == dim and library in row["seconds"]]
+            of = [(row["points"], statistics.median(row["processor_seconds"][library])) for row in rows if row["dim"] == dim and library in row["seconds"]]
             line = " ".join(f"{x(panel, n):.1f},{y(s):.1f}" for n, s in of)
             parts.append(f'<polyline points="{line}" fill="none" stroke="{color}" stroke-width="2"/>')
             parts += [f'<circle cx="{x(panel, n):.1f}" cy="{y(s):.1f}" r="3.5" fill="{color}"/>' for n, s in of]

@@ -7,7 +7,7 @@ use numpy::{IntoPyArray, PyArray1};
 use objects::Up;
 use pyo3::exceptions::{PyOSError, PyValueError};
 use pyo3::prelude::*;
-use query::{Index, LabelledScene, TextOptions, TextSource};
+use query::{Granules, Index, LabelledScene, TextOptions, TextSource, Unrelated, Verdict};
 use std::collections::BTreeMap;
 use std::path::PathBuf;
 
@@ -69,7 +69,11 @@ impl Labelled {
 #[pyclass(frozen)]
 pub struct Words {
     source: TextSource,
+    unrelated: Option<Unrelated>,
 }
+
+/// Instances with their scores, and whether any matches, by which score and which one by chance.
+type Answer = (Vec<(u32, f32)>, Option<(bool, f32, f32)>);
 
 #[pymethods]
 impl Words {
@@ -82,16 +86,24 @@ impl Words {
     ) -> PyResult<Self> {
         let scene = &labelled.scene;
         let options = TextOptions { clip, text_features, any_model: false, min_support: None };
-        let source = run(py, 0, |_| TextSource::open_for(&scene.artifact, scene.instances.dim, &options))?;
-        Ok(Self { source: source.map_err(|e| failed(&e))? })
+        let opened = run(py, 0, |_| {
+            let source = TextSource::open_for(&scene.artifact, scene.instances.dim, &options)?;
+            let unrelated = Unrelated::encode(&source, &[])?;
+            Ok(Self { source, unrelated })
+        })?;
+        opened.map_err(|e: Error| failed(&e))
     }
 
-    /// Instances by falling cosine of their descriptors with the text.
-    fn rank(&self, py: Python<'_>, labelled: &Labelled, text: &str) -> PyResult<Vec<(u32, f32)>> {
+    /// Instances by falling cosine of their descriptors with the text, and whether it matches anything.
+    fn rank(&self, py: Python<'_>, labelled: &Labelled, text: &str) -> PyResult<Answer> {
         let ranked = run(py, 0, |_| {
             let feature = self.source.known(&[], &[text.to_string()], "text")?.remove(0);
-            let ranking = Index::new(&labelled.scene.instances).rank(&feature, &[]);
-            Ok(ranking.into_iter().map(|r| (r.instance, r.score)).collect())
+            let instances = &labelled.scene.instances;
+            let (index, granules) = (Index::new(instances), Granules::new(instances));
+            let by_chance = self.unrelated.as_ref().and_then(|u| u.chance(&index, &granules, &[], 1));
+            let verdict = by_chance.and_then(|chance| Verdict::on(&feature, chance, &index, &granules, &[], 1));
+            let ranking = index.rank(&feature, &[]).into_iter().map(|r| (r.instance, r.score)).collect();
+            Ok((ranking, verdict.map(|v| (v.matches, v.best, v.by_chance))))
         })?;
         ranked.map_err(|e: Error| failed(&e))
     }

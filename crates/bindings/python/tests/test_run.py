@@ -70,6 +70,21 @@ def test_questions_are_answered_as_eval_query_does(run, folder, tmp_path):
         run.query("red mug", clip=tmp_path)
 
 
+def test_an_answer_says_whether_anything_matches(run, folder, tmp_path):
+    texts = ["floor", "zeppelin"]
+    line = [PROGRAM, "query", "--run-dir", folder, "--out", tmp_path / "q", "--quiet"]
+    subprocess.run([*line, *(o for text in texts for o in ("--text", text))], check=True)
+    for text, asked in zip(texts, json.loads((tmp_path / "q/query.json").read_text())["queries"]):
+        found, verdict = run.query(text), asked["verdict"]
+        assert (found.matches, bool(asked["selected"])) == (verdict["matches"], verdict["matches"]), text
+        assert found.matches == (found.best > found.by_chance) and found.best >= found[0].score
+        assert (found.best, found.by_chance) == pytest.approx((verdict["best"], verdict["by_chance"]), abs=1e-6)
+    table = tmp_path / "texts.json"
+    dim = run.artifact("instances")["descriptor"].shape[1]
+    table.write_text(json.dumps({"mug": [1.0] + [0.0] * (dim - 1)}))
+    assert run.query("mug", text_features=table).matches is None
+
+
 def test_objects_are_those_of_the_labels(run):
     objects = run.objects()
     assert {o.id: o.gaussians for o in objects} == {int(k): int((run.labels == k).sum()) for k in set(run.labels.tolist()) - {-1}}

@@ -56,12 +56,8 @@ impl<'a> Granules<'a> {
     /// score, on a scale on which the mean of all is 0 and the best 1, and of its fit with masks, which counts 0.6. A part and the
     /// whole often score the same, and then the masks tell. None where none has a score.
     pub fn meant(&self, feature: &[f32], negatives: &[Vec<f32>], min_support: u32) -> Option<Meant> {
-        let Instances { granules, granule_descriptor, dim, .. } = self.instances;
-        let question = Question::new(feature, negatives);
-        let descriptors = granule_descriptor.chunks_exact((*dim).max(1)).zip(&self.lengths);
-        let score = |(q, (d, &length)): (usize, (&[f32], &f64))| Some((q, question.score(d, length)?));
-        let enough = |(q, _): &(usize, f32)| granules[*q].support >= min_support;
-        let scores: Vec<(usize, f32)> = descriptors.enumerate().filter_map(score).filter(enough).collect();
+        let granules = &self.instances.granules;
+        let scores = self.scores(feature, negatives, min_support);
         let mean = scores.iter().map(|s| f64::from(s.1)).sum::<f64>() / scores.len().max(1) as f64;
         let above = scores.iter().map(|s| f64::from(s.1)).fold(mean, f64::max) - mean;
         let rank = |&(q, score): &(usize, f32)| {
@@ -71,6 +67,15 @@ impl<'a> Granules<'a> {
         // Of equals the first.
         let best = scores.iter().map(|s| (s, rank(s))).reduce(|a, b| if b.1 > a.1 { b } else { a });
         best.map(|(&(q, score), _)| self.meaning(q as u32, score))
+    }
+
+    /// Granules that masks show in enough views, each with its score as of instances.
+    pub(crate) fn scores(&self, feature: &[f32], negatives: &[Vec<f32>], min_support: u32) -> Vec<(usize, f32)> {
+        let Instances { granules, granule_descriptor, dim, .. } = self.instances;
+        let question = Question::new(feature, negatives);
+        let descriptors = granule_descriptor.chunks_exact((*dim).max(1)).zip(&self.lengths).enumerate();
+        let enough = descriptors.filter(|&(q, _)| granules[q].support >= min_support);
+        enough.filter_map(|(q, (d, &length))| Some((q, question.score(d, length)?))).collect()
     }
 
     fn meaning(&self, granule: u32, score: f32) -> Meant {

@@ -1,6 +1,7 @@
 //! What answers a question about one set of instances: the instances with their Gaussians (`scene`), features of texts
-//! (`text`), the ranking by them (`ranking`), the part, thing or group that is meant (`granules`), Gaussians with descriptors of their own (`gaussians`), which Gaussian is nearest to a point (`nearest`) and which a pixel shows.
+//! (`text`), the ranking by them (`ranking`) and whether the best is better than by chance (`chance`), the part, thing or group that is meant (`granules`), Gaussians with descriptors of their own (`gaussians`), which Gaussian is nearest to a point (`nearest`) and which a pixel shows.
 
+mod chance;
 mod gaussians;
 mod granules;
 mod nearest;
@@ -8,10 +9,11 @@ mod ranking;
 mod scene;
 mod text;
 
+pub use chance::{Unrelated, Verdict};
 pub use gaussians::{Chosen, DescribedGaussians, Share};
 pub use granules::{Granules, Kind, Meant};
 pub use gs_raster::pixel_weights;
 pub use nearest::{nearest, nearest_of};
 pub use ranking::{Index, Join, Ranked, Selection};
 pub use scene::{LabelledScene, MIN_OPACITY, nearest_solid, read_features};
-pub use text::{TextOptions, TextSource, TextTable};
+pub use text::{CLIP_TEMPLATES, LERF_NEGATIVES, TextOptions, TextSource, TextTable};

@@ -8,13 +8,27 @@ use std::collections::BTreeMap;
 use std::io::Read;
 use std::path::{Path, PathBuf};
 
+/// LERF's texts that mean nothing in particular, for its relevancy.
+pub const LERF_NEGATIVES: [&str; 4] = ["object", "things", "stuff", "texture"];
+/// The seven templates that CLIP's authors found to do as well on ImageNet as their eighty.
+pub const CLIP_TEMPLATES: [&str; 7] = [
+    "itap of a {}.",
+    "a bad photo of the {}.",
+    "a origami {}.",
+    "a photo of the large {}.",
+    "a {} in a video game.",
+    "art of the {}.",
+    "a photo of the small {}.",
+];
+
 /// Where text features come from, and which instances have a descriptor.
 #[derive(Debug, Clone, clap::Args, Serialize)]
 pub struct TextOptions {
     /// CLIP folder with text.onnx: the other half of the model that encoded the masks
     #[arg(long, value_name = "DIR")]
     pub clip: Option<PathBuf>,
-    /// Table of text features by name, instead of --clip: JSON, OpenGaussian's text_features.zip, or npz
+    /// Table of text features by name, instead of --clip: JSON, OpenGaussian's text_features.zip, or npz. Whether a text matches
+    /// anything is not judged, unless it holds 20 of the unrelated texts (docs/queries.md)
     #[arg(long, value_name = "FILE", conflicts_with = "clip")]
     pub text_features: Option<PathBuf>,
     /// Accept another CLIP model than the one that encoded the masks, if its features have the same dimension

@@ -4,7 +4,7 @@
 
 use artifacts::Instances;
 use eval::Asker;
-use query::{Index, Selection};
+use query::{Granules, Index, Selection};
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use std::time::Instant;
@@ -64,7 +64,10 @@ fn main() {
         negatives: Vec::new(),
         selection,
         join: None,
-        granules: None,
+        granules: Granules::new(&instances),
+        any: false,
+        always: false,
+        by_chance: None,
     };
     let ask = |asker: &Asker<'_>| times(&texts, |text| assert!(!asker.answer(text).gaussians.is_empty()));
     let best = ask(&asker);

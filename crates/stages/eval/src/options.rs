@@ -4,7 +4,7 @@ use crate::silhouette::{Rendering, Silhouette};
 use clap::builder::{PossibleValuesParser, TypedValueParser};
 use gs_io::{Error, Result};
 use gs_scene::dataset::Resolution;
-use query::{Share, TextOptions};
+use query::{CLIP_TEMPLATES, LERF_NEGATIVES, Share, TextOptions};
 use serde::{Serialize, Serializer};
 use std::path::PathBuf;
 
@@ -34,10 +34,11 @@ pub struct Choice {
     /// Select only instances whose score is at least this, -1 to 1: the cosine, or with --negatives the relevancy
     #[arg(long, value_name = "SCORE", allow_negative_numbers = true, value_parser = stage::within(-1.0f32..=1.0))]
     pub threshold: Option<f32>,
-    /// Score by LERF's relevancy against these texts, with commas between, such as object,things,stuff,texture
+    /// Score by LERF's relevancy against these texts, with commas between; lerf for its own: object,things,stuff,texture
     #[arg(long, value_delimiter = ',', value_name = "TEXTS", value_parser = words)]
     pub negatives: Vec<String>,
-    /// Put every text into this template, such as "a photo of a {}"; several templates are averaged
+    /// Put every text into this template, such as "a photo of a {}"; several templates are averaged; clip for the seven of
+    /// CLIP's authors
     #[arg(long, value_name = "TEMPLATE", value_parser = template)]
     pub template: Vec<String>,
     /// Also select those of the ten best instances whose mean feature is within this distance of the best one's, as
@@ -50,6 +51,21 @@ pub struct Choice {
 }
 
 impl Choice {
+    /// The negatives, with the texts of a named set in its place.
+    pub fn negatives(&self) -> Vec<String> {
+        self.negatives.iter().flat_map(|n| named(n, "lerf", &LERF_NEGATIVES)).collect()
+    }
+
+    /// The templates, with those of a named set in its place.
+    pub fn templates(&self) -> Vec<String> {
+        self.template.iter().flat_map(|t| named(t, "clip", &CLIP_TEMPLATES)).collect()
+    }
+
+    /// Whether people say how many instances or which scores are selected.
+    pub fn is_decided(&self) -> bool {
+        self.top_k.is_some() || self.threshold.is_some()
+    }
+
     /// What differs from "the instance of the highest cosine", in words, for the rule of a score.
     pub fn describe(&self, min_support: Option<u32>) -> String {
         let parts = [
@@ -468,9 +484,32 @@ fn words(text: &str) -> Result<String> {
 }
 
 fn template(text: &str) -> Result<String> {
-    if text.contains("{}") { Ok(text.into()) } else { Err(Error::new("no place for the text").expected("{} in it")) }
+    if text.contains("{}") || text == "clip" {
+        return Ok(text.into());
+    }
+    Err(Error::new("no place for the text").expected("{} in it, or clip"))
+}
+
+/// The texts of a set where it is named, else the text itself.
+fn named(text: &str, name: &str, set: &[&str]) -> Vec<String> {
+    if text == name { set.iter().map(|t| (*t).into()).collect() } else { vec![text.into()] }
 }
 
 fn as_text<T: std::fmt::Display, S: Serializer>(value: &T, to: S) -> std::result::Result<S::Ok, S::Error> {
     to.collect_str(value)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn names_of_sets_stand_for_their_texts() {
+        let negatives = vec!["lerf".into(), "wall".into()];
+        let choice = Choice { negatives, template: vec!["a {}".into(), "clip".into()], ..Choice::default() };
+        assert_eq!(choice.negatives(), ["object", "things", "stuff", "texture", "wall"]);
+        let templates = choice.templates();
+        assert!(templates.len() == 8 && templates.iter().all(|t| template(t).is_ok()));
+        assert!(template("clip").is_ok() && template("clips").is_err());
+    }
 }

@@ -38,9 +38,12 @@ pub(crate) fn run(o: &QueryOptions, parameters: Value, stage: &Stage, json_lines
     for view in &o.views.views {
         find_view(&dataset, view)?;
     }
-    let asker = Asker::new(&scene, source, &o.choice, o.texts.min_support, o.granularity)?;
+    let mut asker = Asker::new(&scene, source, &o.choice, o.texts.min_support, o.granularity)?;
     if scene.all_noise() {
         stage.warn("all Gaussians are noise: every query selects nothing");
+    }
+    if !o.text.is_empty() || o.interactive {
+        asker.judge()?;
     }
     let (summary, printed) = match out {
         Some(out) if !o.interactive => {
@@ -89,7 +92,7 @@ fn answers(
     stage: &Stage,
 ) -> Result<Vec<Asked>> {
     let texts = o.text.iter().zip(features);
-    let mut asked: Vec<Asked> = texts.map(|(t, f)| Asked::new(t.clone(), "text", None, asker.answer(f))).collect();
+    let mut asked: Vec<Asked> = texts.map(|(t, f)| Asked::new(t.clone(), "text", None, asker.answer_text(f))).collect();
     if let Some(clip) = o.texts.clip.as_deref().filter(|_| !o.image.is_empty()) {
         for (path, feature) in o.image.iter().zip(image::features(&o.image, clip, scene)?) {
             let name = path.file_stem().unwrap_or_default().to_string_lossy().into_owned();

@@ -136,8 +136,8 @@ impl Found {
     fn answers(&self, o: &ScoreOptions, texts: &[String]) -> Result<Answers> {
         if let Some((described, _)) = &self.described {
             let source = TextSource::open_for(&described.artifact, self.dim(), &o.texts)?;
-            let negatives = source.known(&[], &o.choice.negatives, "--negatives")?;
-            let features = source.encode_in(&o.choice.template, texts)?;
+            let negatives = source.known(&[], &o.choice.negatives(), "--negatives")?;
+            let features = source.encode_in(&o.choice.templates(), texts)?;
             let chosen = described.choose(&features, &negatives, o.share()).into_iter().zip(&features);
             let answer = |(Chosen { gaussians, score }, feature): (_, &Option<_>)| match feature {
                 Some(_) => Ok(Answered { gaussians, score, ..Answered::default() }),

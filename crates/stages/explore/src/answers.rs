@@ -1,11 +1,10 @@
 //! What the page asks a server: what is at a pixel, what a text means, the Gaussians of a selection.
 
 use crate::world::{Edited, World};
-use artifacts::Instances;
 use glam::{DMat3, DVec3};
 use gs_io::{Error, Result};
 use gs_scene::Camera;
-use query::Index;
+use query::{Index, Verdict};
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
 
@@ -134,6 +133,8 @@ pub struct Found {
     pub scores: Vec<Option<f32>>,
     /// Instances that a person gave a name which holds the text.
     pub named: Vec<u32>,
+    /// Whether the text matches anything; none where that is not judged.
+    pub verdict: Option<Verdict>,
 }
 
 /// What a text finds.
@@ -149,21 +150,21 @@ pub fn find(world: &World, edited: &Edited, text: &str) -> Result<Found> {
         .filter(|(_, name)| name.to_lowercase().contains(&wanted))
         .map(|(&k, _)| k)
         .collect();
-    let scores = match &world.words {
-        Ok(source) => match source.known(&[], &[text.trim().to_string()], "text") {
-            Ok(features) => scores(&edited.instances, &features[0]),
-            Err(_) if !named.is_empty() => Vec::new(),
-            Err(e) => return Err(e),
-        },
-        Err(_) if !named.is_empty() => Vec::new(),
-        Err(why) => return Err(Error::new(why.clone())),
+    let feature = match &world.words {
+        Ok(source) => source.known(&[], &[text.trim().to_string()], "text").map(|features| features[0].clone()),
+        Err(why) => Err(Error::new(why.clone())),
     };
-    Ok(Found { text: text.into(), scores, named })
+    match feature {
+        Ok(feature) => Ok(Found { named, ..answer(world, edited, text, &feature) }),
+        Err(_) if !named.is_empty() => Ok(Found { text: text.into(), scores: Vec::new(), named, verdict: None }),
+        Err(e) => Err(e),
+    }
 }
 
-/// Cosine of every instance with a text's feature; null for one without a descriptor.
-pub fn scores(instances: &Instances, feature: &[f32]) -> Vec<Option<f32>> {
-    Index::new(instances).scores(feature, &[])
+/// What a text of this feature finds, whatever instances are named.
+pub fn answer(world: &World, edited: &Edited, text: &str, feature: &[f32]) -> Found {
+    let scores = Index::new(&edited.instances).scores(feature, &[]);
+    Found { text: text.into(), scores, named: Vec::new(), verdict: edited.verdict(world, feature) }
 }
 
 /// What to save as a PLY.

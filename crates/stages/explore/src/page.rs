@@ -37,7 +37,7 @@ pub fn run(o: &PageOptions, parameters: Value, stage: &Stage) -> Result<()> {
     Ok(())
 }
 
-/// Scores of all instances for each text.
+/// What each text finds.
 fn texts(world: &World, edited: &Edited, texts: &[String]) -> Result<Map<String, Value>> {
     let source = match (&world.words, texts) {
         (_, []) => return Ok(Map::new()),
@@ -45,7 +45,7 @@ fn texts(world: &World, edited: &Edited, texts: &[String]) -> Result<Map<String,
         (Err(why), _) => return Err(Error::new("texts cannot be answered").field("--text").hint(why.clone())),
     };
     let features = source.known(&[], texts, "--text")?;
-    Ok(texts.iter().zip(features).map(|(t, f)| (t.clone(), json!(answers::scores(&edited.instances, &f)))).collect())
+    Ok(texts.iter().zip(features).map(|(t, f)| (t.clone(), json!(answers::answer(world, edited, t, &f)))).collect())
 }
 
 /// At most `most` of `count` numbers, evenly spread.

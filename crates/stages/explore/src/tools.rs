@@ -47,7 +47,8 @@ pub const TOOLS: [Tool; 5] = [
     Tool {
         name: "find",
         about: "The objects that a text describes, best first: those that a person named so, then by the cosine of the \
-                text's feature and the object's. There is always a best: compare scores before you believe it.",
+                text's feature and the object's. There is always a best: matches says whether it is better than by chance, null \
+                where that is not known.",
         schema: schema::<Find>,
         answer: |asked, v| find(asked, &parsed(v)?),
     },
@@ -211,7 +212,7 @@ fn find(asked: &Asked, find: &Find) -> Result<Value> {
         let e = Error::new("not a question").field("text, most");
         return Err(e.expected(format!("a text that is not empty, and 1 to {MOST}")));
     }
-    let answers::Found { scores, named, .. } = answers::find(asked.world, asked.edited, &find.text)?;
+    let answers::Found { scores, named, verdict, .. } = answers::find(asked.world, asked.edited, &find.text)?;
     let scene = asked.edited.objects(asked.world);
     let score = |o: &Object| scores.get(o.id as usize).copied().flatten();
     let mut found: Vec<(&Object, Option<f32>, bool)> = scene
@@ -223,7 +224,11 @@ fn find(asked: &Asked, find: &Find) -> Result<Value> {
     let by = |s: Option<f32>| s.unwrap_or(f32::NEG_INFINITY);
     found.sort_by(|a, b| b.2.cmp(&a.2).then(by(b.1).total_cmp(&by(a.1))).then(a.0.id.cmp(&b.0.id)));
     let one = |&(o, cosine, named): &(&Object, Option<f32>, bool)| json!({"id": o.id, "name": o.name.as_ref().map(|n| &n.text), "named_so": named, "cosine": cosine, "centre": o.bounds.center});
-    Ok(json!({"text": find.text, "found": found.iter().take(find.most).map(one).collect::<Vec<_>>()}))
+    let matches = if named.is_empty() { verdict.map(|v| v.matches) } else { Some(true) };
+    let by_chance = verdict.map(|v| v.by_chance);
+    Ok(
+        json!({"text": find.text, "matches": matches, "by_chance": by_chance, "found": found.iter().take(find.most).map(one).collect::<Vec<_>>()}),
+    )
 }
 
 fn measure(asked: &Asked, measure: &Measure) -> Result<Value> {

@@ -8,7 +8,7 @@ use gs_io::{Error, Result};
 use gs_scene::Gaussians;
 use gs_scene::dataset::{self, Dataset, LoadOptions, Resolution, View};
 use objects::Up;
-use query::{LabelledScene, TextSource};
+use query::{Granules, Index, LabelledScene, TextSource, Unrelated, Verdict};
 use stage::Stage;
 use std::collections::BTreeMap;
 use std::sync::OnceLock;
@@ -33,6 +33,8 @@ pub struct World {
     pub feature_colors: Vec<[u8; 3]>,
     /// Where text features come from, or why there are none.
     pub words: std::result::Result<TextSource, String>,
+    /// What says whether a text matches anything; encoded at the first text.
+    unrelated: OnceLock<Option<Unrelated>>,
     /// What a person should know: photographs that are missing, features of another scene.
     pub messages: Vec<String>,
 }
@@ -46,6 +48,7 @@ pub struct Edited {
     /// Names and scale.
     pub remarks: Remarks,
     objects: OnceLock<objects::Scene>,
+    by_chance: OnceLock<Option<f32>>,
 }
 
 impl Edited {
@@ -56,6 +59,14 @@ impl Edited {
             let inputs = world.scene.inputs.clone();
             objects::describe(&self.instances, world.gaussians(), &self.remarks, &BTreeMap::new(), up, inputs)
         })
+    }
+
+    /// Whether a text of this feature matches anything; none where that is not judged.
+    pub fn verdict(&self, world: &World, feature: &[f32]) -> Option<Verdict> {
+        let unrelated = world.unrelated()?;
+        let (index, granules) = (Index::new(&self.instances), Granules::new(&self.instances));
+        let by_chance = *self.by_chance.get_or_init(|| unrelated.chance(&index, &granules, &[], 1));
+        Verdict::on(feature, by_chance?, &index, &granules, &[], 1)
     }
 }
 
@@ -88,7 +99,25 @@ impl World {
         if packed.order.len() < n {
             stage.skipped(&format!("{} of {n} Gaussians: too faint to be drawn", n - packed.order.len()));
         }
-        Ok(Self { source: o.clone(), dataset, scene, packed, reach, cells, cell_of, feature_colors, words, messages })
+        Ok(Self {
+            source: o.clone(),
+            dataset,
+            scene,
+            packed,
+            reach,
+            cells,
+            cell_of,
+            feature_colors,
+            words,
+            unrelated: OnceLock::new(),
+            messages,
+        })
+    }
+
+    /// Unrelated texts, encoded once; none where the source of text features has none, or fails.
+    fn unrelated(&self) -> Option<&Unrelated> {
+        let encode = |source| Unrelated::encode(source, &[]).ok().flatten();
+        self.unrelated.get_or_init(|| self.words.as_ref().ok().and_then(encode)).as_ref()
     }
 
     /// All Gaussians of the geometry.
@@ -124,7 +153,7 @@ impl World {
     pub fn edited(&self, edits: Edits) -> Result<Edited> {
         let mut instances = self.scene.instances.clone();
         let remarks = edits.apply(&mut instances, &self.gaussians().means)?;
-        Ok(Edited { edits, instances, remarks, objects: OnceLock::new() })
+        Ok(Edited { edits, instances, remarks, objects: OnceLock::new(), by_chance: OnceLock::new() })
     }
 
     /// The view of this stem.

@@ -15,6 +15,30 @@ fn click(x: u32, y: u32, hidden: &[u32]) -> Value {
 }
 
 #[test]
+fn a_text_no_better_than_by_chance_is_said() {
+    let run = Run::new();
+    let mut table = json!({"near ball": [1, 0], "far ball": [0, 1], "ghost": [0.7, 0.7]});
+    query::Unrelated::texts().for_each(|t| table[t] = json!([0.6, 0.8]));
+    std::fs::write(run.dir.path().join("text.json"), table.to_string()).unwrap();
+    let server = run.serve(&[]);
+    let ask = |text: &str| server.json("GET", &format!("/find?text={text}"), &Value::Null);
+    let ghost = ask("ghost")["verdict"].take();
+    assert_eq!(ghost["matches"], json!(false));
+    assert!((ghost["best"].as_f64().unwrap() - 0.5f64.sqrt()).abs() < 1e-6);
+    assert!((ghost["by_chance"].as_f64().unwrap() - 0.8).abs() < 1e-6);
+    assert_eq!(ask("far%20ball")["verdict"]["matches"], json!(true));
+    let door = |text: &str| server.json("POST", "/tools/find", &json!({"text": text}));
+    assert_eq!((&door("ghost")["matches"], &door("ghost")["by_chance"]), (&json!(false), &json!(0.8)));
+    // A name that a person gave needs no score.
+    server.json("PUT", "/edits", &json!([{"op": "rename", "instance": 1, "name": "Ghost"}]));
+    assert_eq!(door("ghost")["matches"], json!(true));
+    let page = run.dir.path().join("page.html");
+    let written = run.run("page", &["--out", page.to_str().unwrap(), "--text", "ghost"]);
+    assert!(written.status.success(), "{}", String::from_utf8_lossy(&written.stderr));
+    assert!(std::fs::read_to_string(page).unwrap().contains("\"verdict\":{"));
+}
+
+#[test]
 fn the_server_answers_clicks_texts_edits_and_selections() {
     let run = Run::new();
     let server = run.serve(&[]);
@@ -133,7 +157,7 @@ fn one_file_holds_the_scene() {
     let made = run.run("page", &["--out", &file, "--text", "far ball", "--photographs", "1"]);
     assert!(made.status.success(), "{}", String::from_utf8_lossy(&made.stderr));
     let page = std::fs::read_to_string(&out).unwrap();
-    assert!(page.contains("\"far ball\":[0.0,1.0]") && page.matches("data:image/jpeg").count() == 3);
+    assert!(page.contains("\"scores\":[0.0,1.0]") && page.matches("data:image/jpeg").count() == 3);
     let first = std::fs::read(&out).unwrap();
     assert!(
         run.run("page", &["--out", &file, "--text", "far ball", "--photographs", "1", "--threads", "1"])

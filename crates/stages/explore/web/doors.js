@@ -101,7 +101,7 @@ export class File {
       const texts = Object.keys(this.pictures.texts);
       throw new Error(texts.length ? `This file knows the answers to: ${texts.join(", ")}. Other words need explore serve.` : "This file was written without texts (explore page --text). Names that you give can be found.");
     }
-    return { text, scores: known ? this.pictures.texts[known] : [], named };
+    return { scores: [], verdict: null, ...(known && this.pictures.texts[known]), text, named };
   }
 
   async save() {

@@ -229,11 +229,13 @@ const find = attempt(async (text) => {
   const named = answer.named.filter((k) => instances.origin[k]?.length);
   const all = [...named.map((k) => ({ k, score: null })), ...ranking.filter((r) => !named.includes(r.k))];
   if (!all.length) throw new Error("No instance has a descriptor to compare with.");
-  state.answer = { text: answer.text, scores, ranking: all };
-  state.threshold = named.length ? null : ranking[0].score;
+  const none = !named.length && answer.verdict?.matches === false;
+  state.answer = { text: answer.text, scores, ranking: all, none };
+  state.threshold = named.length || none ? null : ranking[0].score;
   results();
-  await selectInstances(named.length ? named : [ranking[0].k]);
-  say("");
+  await selectInstances(named.length ? named : none ? [] : [ranking[0].k]);
+  const { best, by_chance } = answer.verdict ?? {};
+  say(none ? `Nothing matches “${answer.text}”: its best score, ${best.toFixed(3)}, is no better than that of unrelated texts (${by_chance.toFixed(3)}).` : "");
 });
 
 function clearAnswer() {
@@ -251,7 +253,7 @@ function results() {
   const slider = $("threshold");
   for (const part of ["histogram", "threshold-label"]) $(part).style.display = values.length > 1 ? "" : "none";
   if (values.length) Object.assign(slider, { min: low, max: high, value: state.threshold ?? high });
-  $("results-title").textContent = `“${answer.text}”`;
+  $("results-title").textContent = `“${answer.text}”${answer.none ? ": nothing matches" : ""}`;
   const BINS = 25, counts = new Array(BINS).fill(0);
   const bin = (v) => Math.min(BINS - 1, Math.floor((v - low) / (high - low || 1) * BINS));
   values.forEach((v) => counts[bin(v)]++);

@@ -16,10 +16,11 @@ Results depend neither on the number of threads nor on the machine. Long work re
 
 from ._gaussians import Camera, Gaussians, Rendered, read_ply, render, render_backward, write_ply
 from ._points import farthest_point_sample, nearest_neighbours
-from ._run import Artifact, Match, Object, Run
+from ._run import Answer, Artifact, Match, Object, Run
 
 __all__ = [
     "HDBSCAN",
+    "Answer",
     "Artifact",
     "Camera",
     "Gaussians",

@@ -88,6 +88,11 @@ class Match:
     instance: int
     score: float
 
+class Answer(list[Match]):
+    matches: bool | None
+    best: float | None
+    by_chance: float | None
+
 class Object:
     id: int
     name: str | None
@@ -109,7 +114,7 @@ class Run:
     def artifact(self, format: Literal["graph", "footprints", "features", "instances"]) -> Artifact: ...
     def query(
         self, text: str, *, clip: str | PathLike[str] | None = None, text_features: str | PathLike[str] | None = None
-    ) -> list[Match]: ...
+    ) -> Answer: ...
     def select(self, instance: int) -> Gaussians: ...
     def objects(self) -> list[Object]: ...
     def to_open3d(self) -> Any: ...

@@ -53,6 +53,23 @@ class Match:
     score: float
 
 
+class Answer(list):
+    """The instances that answer a text, as a list of :class:`Match`, best first.
+
+    Attributes
+    ----------
+    matches : bool or None
+        Whether the text matches anything: its best score is better than that of 95 of 100 unrelated texts. None for a table of
+        text features that holds no unrelated texts.
+    best, by_chance : float or None
+        Its best score over instances, parts and groups, and what those texts reach.
+    """
+
+    def __init__(self, ranking, verdict):
+        super().__init__(Match(*match) for match in ranking)
+        self.matches, self.best, self.by_chance = verdict or (None, None, None)
+
+
 @dataclass
 class Object:
     """A thing of the scene; lengths are in its units.
@@ -112,8 +129,9 @@ class Run:
     Examples
     --------
     >>> run = cags.Run("out/demo")                                              # doctest: +SKIP
-    >>> best = run.query("green kettle")[0]                                     # doctest: +SKIP
-    >>> cags.write_ply("kettle.ply", run.select(best.instance))                 # doctest: +SKIP
+    >>> found = run.query("green kettle")                                       # doctest: +SKIP
+    >>> if found.matches:                                                       # doctest: +SKIP
+    ...     cags.write_ply("kettle.ply", run.select(found[0].instance))
     """
 
     def __init__(self, folder):
@@ -165,8 +183,9 @@ class Run:
 
         Returns
         -------
-        list of Match
-            All instances with a descriptor, best first.
+        Answer
+            All instances with a descriptor, as a list of :class:`Match`, best first; ``matches`` says whether the best is better
+            than by chance.
         """
         if clip is None and text_features is None:
             clip = _native.input_of_run(self.folder, "clip")
@@ -176,7 +195,7 @@ class Run:
         key = (str(clip), str(text_features))
         if key not in self._words:
             self._words[key] = _native.Words(self._labelled, clip, text_features)
-        return [Match(*match) for match in self._words[key].rank(self._labelled, text)]
+        return Answer(*self._words[key].rank(self._labelled, text))
 
     def select(self, instance):
         """The Gaussians of an instance, as :class:`Gaussians`."""

@@ -8,7 +8,7 @@ use crate::score::{QueryScore, ThingScore};
 use artifacts::{Health, Level, MaskFolder, NOISE_COLOR, SharedMasks, hash_folder, instance_color, maps_path, role};
 use gs_io::{Error, IoContext, Result};
 use gs_scene::dataset::{Dataset, Split, View};
-use query::read_features;
+use query::{Verdict, read_features};
 use report::curve;
 use report::feature_colors;
 use report::html::{Figure, Page};
@@ -240,6 +240,8 @@ pub(super) fn queries(m: &Material, page: &mut Page, metrics: &mut Metrics) -> R
             1 => facts.push(format!("instance {}", q.selected[0])),
             n => facts.push(format!("{n} instances")),
         }
+        let chance = |v: Verdict| format!("nothing matches: cosine {:.3}, unrelated texts {:.3}", v.best, v.by_chance);
+        facts.extend(q.verdict.filter(|v| !v.matches).map(chance));
         facts.extend(q.score.map(|s| format!("cosine {s:.3}")));
         facts.extend(scored(&q.text).map(|s| format!("IoU {:.3}", s.iou)));
         let mut figures = Vec::new();

@@ -3,7 +3,9 @@
 use crate::options::{Choice, Granularity};
 use artifacts::role;
 use gs_io::Result;
-use query::{Granules, Index, Join, Kind, LabelledScene, Ranked, Selection, TextSource, read_features};
+use query::{
+    Granules, Index, Join, Kind, LabelledScene, Ranked, Selection, TextSource, Unrelated, Verdict, read_features,
+};
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
 
@@ -21,8 +23,14 @@ pub struct Asker<'a> {
     pub selection: Selection,
     /// Whether look-alikes of the best are selected with it.
     pub join: Option<Join>,
-    /// Parts, things and groups, where these answer instead of instances.
-    pub granules: Option<Granules<'a>>,
+    /// Parts, things and groups.
+    pub granules: Granules<'a>,
+    /// Whether these answer instead of instances.
+    pub any: bool,
+    /// Whether the best is selected also where nothing matches.
+    pub always: bool,
+    /// What unrelated texts score ([`Unrelated`]); none where that is not asked.
+    pub by_chance: Option<f32>,
 }
 
 /// The answer to one feature.
@@ -38,6 +46,8 @@ pub struct Answered {
     pub granule: Option<Found>,
     /// The selected Gaussians, ascending.
     pub gaussians: Vec<u32>,
+    /// Whether a text matches anything; none where that is not judged.
+    pub verdict: Option<Verdict>,
 }
 
 /// The part, thing or group that answers a query.
@@ -83,6 +93,9 @@ pub struct QueryResult {
     pub kind: String,
     /// Where, for a pixel or a point.
     pub place: Option<Place>,
+    /// Whether a text matches anything; none where that is not judged: of pictures, places, and texts of a table.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub verdict: Option<Verdict>,
     /// What was found, where parts, things and groups answered.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub granule: Option<Found>,
@@ -133,11 +146,12 @@ pub struct Asked {
 impl Asked {
     /// What was asked for with its answer, of which there is no file yet.
     pub fn new(text: String, kind: &str, place: Option<Place>, answer: Answered) -> Self {
-        let Answered { ranking, selected, score, granule, gaussians } = answer;
+        let Answered { ranking, selected, score, granule, gaussians, verdict } = answer;
         let ranking = ranking.into_iter().take(KEPT_RANKS).map(|ranked| Entry { ranked, name: None }).collect();
         let (kind, count) = (kind.into(), gaussians.len());
         let (ply, views) = (None, Vec::new());
-        let result = QueryResult { text, kind, place, granule, selected, score, gaussians: count, ply, ranking, views };
+        let result =
+            QueryResult { text, kind, place, verdict, granule, selected, score, gaussians: count, ply, ranking, views };
         Self { result, gaussians }
     }
 
@@ -163,28 +177,54 @@ impl<'a> Asker<'a> {
             }
             _ => None,
         };
-        let negatives = source.as_ref().map_or(Ok(Vec::new()), |s| s.known(&[], &choice.negatives, "--negatives"))?;
-        let one = choice.top_k.is_none() && choice.threshold.is_none() && join.is_none();
+        let negatives = source.as_ref().map_or(Ok(Vec::new()), |s| s.known(&[], &choice.negatives(), "--negatives"))?;
+        let one = !choice.is_decided() && join.is_none();
         Ok(Self {
-            granules: (one && granularity == Granularity::Any).then(|| Granules::new(&scene.instances)),
+            granules: Granules::new(&scene.instances),
+            any: one && granularity == Granularity::Any,
+            always: choice.is_decided(),
+            by_chance: None,
             index: Index::new(&scene.instances),
             source,
-            templates: choice.template.clone(),
+            templates: choice.templates(),
             negatives,
             selection: Selection::new(choice.top_k, choice.threshold, min_support.unwrap_or(1)),
             join,
         })
     }
 
+    /// From here on texts are judged, where the source of their features can.
+    ///
+    /// # Errors
+    /// When the encoder fails.
+    pub fn judge(&mut self) -> Result<()> {
+        let Some(source) = &self.source else { return Ok(()) };
+        let chance = |u: Unrelated| u.chance(&self.index, &self.granules, &self.negatives, self.selection.min_support);
+        self.by_chance = Unrelated::encode(source, &self.templates)?.and_then(chance);
+        Ok(())
+    }
+
+    /// Answers a text by its feature: where it is judged and nothing matches, nothing is selected, unless people said how many.
+    pub fn answer_text(&self, feature: &[f32]) -> Answered {
+        let answer = self.answer(feature);
+        let (negatives, least) = (&self.negatives, self.selection.min_support);
+        let on = |chance| Verdict::on(feature, chance, &self.index, &self.granules, negatives, least);
+        let verdict = self.by_chance.and_then(on);
+        if verdict.is_some_and(|v| !v.matches) && !self.always {
+            return Answered { ranking: answer.ranking, verdict, ..Answered::default() };
+        }
+        Answered { verdict, ..answer }
+    }
+
     /// Answers one feature of the descriptors' dimension.
     pub fn answer(&self, feature: &[f32]) -> Answered {
         let ranking = self.index.rank(feature, &self.negatives);
-        let (granules, least) = (self.granules.as_ref(), self.selection.min_support);
-        if let Some(meant) = granules.and_then(|g| g.meant(feature, &self.negatives, least)) {
+        let meant = || self.granules.meant(feature, &self.negatives, self.selection.min_support);
+        if let Some(meant) = self.any.then(meant).flatten() {
             let artifacts::Granule { support, fit, .. } = self.index.instances.granules[meant.granule as usize];
             let granule = Some(Found { index: meant.granule, kind: meant.kind, support, fit });
             let (selected, gaussians) = (meant.instances, meant.gaussians);
-            return Answered { ranking, selected, score: Some(meant.score), granule, gaussians };
+            return Answered { ranking, selected, score: Some(meant.score), granule, gaussians, verdict: None };
         }
         let mut selected = self.selection.choose(&ranking);
         if let Some(join) = &self.join {
@@ -192,6 +232,6 @@ impl<'a> Asker<'a> {
         }
         let score = ranking.iter().find(|r| selected.first() == Some(&r.instance)).map(|r| r.score);
         let gaussians = self.index.members(&selected);
-        Answered { ranking, selected, score, granule: None, gaussians }
+        Answered { ranking, selected, score, granule: None, gaussians, verdict: None }
     }
 }

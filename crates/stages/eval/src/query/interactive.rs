@@ -41,7 +41,7 @@ pub(super) fn run(
             continue;
         };
         let started = Instant::now();
-        let mut asked = Asked::new(text.into(), "text", None, asker.answer(&feature));
+        let mut asked = Asked::new(text.into(), "text", None, asker.answer_text(&feature));
         asked.name(&scene.remarks.names);
         let took = started.elapsed();
         let asked = granularity::apply(o.granularity, &scene.instances, asked, &|why| stage.warn(why));

@@ -65,7 +65,7 @@ fn located(
     }
     let selected: Vec<u32> = first.map(|r| r.instance).into_iter().collect();
     let gaussians = asker.index.members(&selected);
-    let answer = Answered { score: first.map(|r| r.score), gaussians, selected, ranking, granule: None };
+    let answer = Answered { score: first.map(|r| r.score), gaussians, selected, ranking, ..Answered::default() };
     Asked::new(format!("{kind} {text}"), kind, Some(place), answer)
 }
 

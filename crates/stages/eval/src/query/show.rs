@@ -7,7 +7,7 @@ use crate::scene::{find_view, numbered, view_name, views_to_show};
 use crate::silhouette::Silhouette;
 use gs_io::{Result, write_bytes, write_json};
 use gs_scene::dataset::{Dataset, View};
-use query::{Kind, LabelledScene, TextSource};
+use query::{Kind, LabelledScene, TextSource, Verdict};
 use report::picture::{Picture, mask_png};
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeSet;
@@ -92,7 +92,9 @@ impl QueryResults {
     /// A warning for each query that selects nothing.
     pub fn warnings(&self) -> impl Iterator<Item = String> {
         self.queries.iter().filter(|q| q.gaussians == 0).map(|q| {
-            if q.selected.is_empty() {
+            if q.verdict.is_some_and(|v| !v.matches) {
+                format!("nothing matches {:?}, so nothing is selected; --top-k 1 selects the best all the same", q.text)
+            } else if q.selected.is_empty() {
                 format!("no instance passes for {:?}: nothing is selected", q.text)
             } else {
                 format!("the instances selected for {:?} hold no Gaussian: nothing to show", q.text)
@@ -136,6 +138,9 @@ pub fn table(results: &QueryResults) -> String {
 pub fn answer_table(q: &QueryResult) -> String {
     let mut s = String::new();
     let _ = writeln!(s, "{:?} ({} Gaussians selected)", q.text, q.gaussians);
+    if let Some(Verdict { best, by_chance, .. }) = q.verdict.filter(|v| !v.matches) {
+        let _ = writeln!(s, "  nothing matches: the best score is {best:.4}, unrelated texts reach {by_chance:.4}");
+    }
     if let Some(Found { kind, support, fit, .. }) = q.granule {
         let what = match kind {
             Kind::Part => "a part of an instance",

@@ -63,6 +63,36 @@ fn options_say_which_instances_are_selected() {
 }
 
 #[test]
+fn a_text_no_better_than_by_chance_selects_nothing() {
+    let f = Fixture::new(2);
+    let plain = f.query("--text|thing|--views|frame_00002");
+    assert_eq!((&plain[0]["selected"], &plain[0]["verdict"]), (&json!([0]), &Value::Null), "no unrelated texts");
+    let mut table = f.json("text.json");
+    query::Unrelated::texts().for_each(|t| table[t] = json!([0.6, 0.8]));
+    fs::write(f.table(), table.to_string()).unwrap();
+    let asked = "--text|thing|--text|red ball|--views|frame_00002";
+    let q = f.query(asked);
+    let verdict = |q: &Value| {
+        let v = &q["verdict"];
+        (v["matches"].clone(), [&v["best"], &v["by_chance"]].map(|s| (s.as_f64().unwrap() * 1e3).round()))
+    };
+    assert_eq!((&q[0]["selected"], &q[0]["gaussians"], &q[0]["score"]), (&json!([]), &json!(0), &Value::Null));
+    assert_eq!(verdict(&q[0]), (json!(false), [707.0, 800.0]));
+    assert_eq!((verdict(&q[1]), &q[1]["selected"]), ((json!(true), [1000.0, 800.0]), &json!([0])));
+    assert_eq!(q[0]["ranking"][0]["instance"], 0, "what comes nearest is still said");
+    let printed = f.good("query", &format!("{TABLE}|{asked}"));
+    assert!(printed.contains("nothing matches: the best score is 0.7071, unrelated texts reach 0.8000"), "{printed}");
+    f.warned("query", &format!("{TABLE}|{asked}|--quiet"), &["nothing matches \"thing\"", "--top-k 1"]);
+    for (options, selected) in [("--top-k|1", json!([0])), ("--threshold|0.5", json!([0, 1]))] {
+        let q = f.query(&format!("--text|thing|--views|frame_00002|{options}"));
+        assert_eq!((&q[0]["selected"], &q[0]["verdict"]["matches"]), (&selected, &json!(false)), "{options}");
+    }
+    // Scores ask for the best, whatever it is.
+    assert_eq!(f.score("")["query_pairs"], 4);
+    f.bad("query", &format!("{TABLE}|{asked}|--negatives|lerf"), &["no such text in the table", "\"object\""]);
+}
+
+#[test]
 fn a_text_encoder_takes_any_words() {
     let f = Fixture::new(2);
     let encoder = onnx_models::ClipText::open(CLIP, &onnx_models::EngineOptions::default()).unwrap();
