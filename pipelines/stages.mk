@@ -91,27 +91,31 @@ protocol_OPTIONS := $(PROTOCOL) $(CLIP) $(TEXTS) $(SCORE_ARGS)
 queries_OPTIONS := $(CLIP) $(QUERIES)
 report_OPTIONS := $(REPORT_FIRST) $(REPORT_ARGS)
 
+# What later stages take for the photographs: with the cameras that stage 1 refined, where it does. Masks do not depend on them.
+POSED := $(if $(and $(filter $(OUT)/geometry.ply,$(GEOMETRY_DONE)),$(filter --refine-poses,$(geom_OPTIONS))),$(OUT)/geometry.cameras.json,$(PHOTOGRAPHS))
+export POSED
+
 # What each stage runs. `arg` writes a path out, so that commands can be copied, or as "$NAME" where a shell would take it apart.
 arg = $(if $(call odd,$($1)),"$$$1",$($1))
 geom_RUN = $(BIN)/gs-geom train --scene $(call arg,PHOTOGRAPHS) --out $(OUT)/geometry.ply $(geom_OPTIONS) $(COMMON)
 views_RUN = $(BIN)/gs-geom views --geometry $(call arg,GEOMETRY) --out $(SCENE) $(views_OPTIONS) $(COMMON)
-metrics_RUN = $(BIN)/gs-geom eval --scene $(call arg,PHOTOGRAPHS) --geometry $(call arg,GEOMETRY) --out $(OUT)/geom_metrics.json \
+metrics_RUN = $(BIN)/gs-geom eval --scene $(call arg,POSED) --geometry $(call arg,GEOMETRY) --out $(OUT)/geom_metrics.json \
   $(EVAL_ARGS) $(COMMON)
 masks_RUN = $(BIN)/mask-embed masks --scene $(call arg,PHOTOGRAPHS) --sam $(call arg,SAM) --out $(MASKS) $(masks_ARGS) $(COMMON)
 embed_RUN = $(BIN)/mask-embed embed --scene $(call arg,PHOTOGRAPHS) --masks $(MASKS) --clip $(call arg,CLIP) $(COMMON)
-graph_RUN = $(BIN)/graph-precompute --scene $(call arg,PHOTOGRAPHS) --geometry $(call arg,GEOMETRY) --masks $(MASKS) \
+graph_RUN = $(BIN)/graph-precompute --scene $(call arg,POSED) --geometry $(call arg,GEOMETRY) --masks $(MASKS) \
   --footprints $(FOOTPRINTS) --graph $(GRAPH) $(graph_OPTIONS) $(COMMON)
 feat_RUN = $(BIN)/feat-train --geometry $(call arg,GEOMETRY) --graph $(GRAPH) --footprints $(FOOTPRINTS) --out $(FEATURES) \
   $(feat_OPTIONS) $(COMMON)
-cluster_RUN = $(BIN)/cluster-match --scene $(call arg,PHOTOGRAPHS) --geometry $(call arg,GEOMETRY) --graph $(GRAPH) --footprints $(FOOTPRINTS) \
+cluster_RUN = $(BIN)/cluster-match --scene $(call arg,POSED) --geometry $(call arg,GEOMETRY) --graph $(GRAPH) --footprints $(FOOTPRINTS) \
   --features $(FEATURES) --masks $(MASKS) --out $(INSTANCES) $(cluster_OPTIONS) $(COMMON)
-score_RUN = $(BIN)/eval score --scene $(call arg,PHOTOGRAPHS) --geometry $(call arg,GEOMETRY) --instances $(INSTANCES) --out $(OUT)/score.json \
+score_RUN = $(BIN)/eval score --scene $(call arg,POSED) --geometry $(call arg,GEOMETRY) --instances $(INSTANCES) --out $(OUT)/score.json \
   $(if $(CLIP),--clip $(call arg,CLIP)) $(SCORE_ARGS) $(filter-out --quiet,$(COMMON)) --quiet
-protocol_RUN = $(BIN)/eval $(PROTOCOL) --scene $(call arg,PHOTOGRAPHS) --geometry $(call arg,GEOMETRY) --instances $(INSTANCES) \
+protocol_RUN = $(BIN)/eval $(PROTOCOL) --scene $(call arg,POSED) --geometry $(call arg,GEOMETRY) --instances $(INSTANCES) \
   --out $(OUT)/protocol $(protocol_FIRST) $(if $(TEXTS),--text-features $(call arg,TEXTS),$(if $(CLIP),--clip $(call arg,CLIP))) $(SCORE_ARGS) $(filter-out --quiet,$(COMMON)) --quiet
-query_RUN = $(BIN)/eval query --scene $(call arg,PHOTOGRAPHS) --geometry $(call arg,GEOMETRY) --instances $(INSTANCES) --clip $(call arg,CLIP) \
+query_RUN = $(BIN)/eval query --scene $(call arg,POSED) --geometry $(call arg,GEOMETRY) --instances $(INSTANCES) --clip $(call arg,CLIP) \
   --out $(OUT)/query $(foreach q,$(QUERIES),--text '$(subst ','\'',$(subst _,$(space),$q))') $(COMMON)
-report_RUN = $(BIN)/eval report --scene $(call arg,PHOTOGRAPHS) --run-dir $(OUT) --geometry $(call arg,GEOMETRY) --masks $(MASKS) --out $(OUT)/report.html \
+report_RUN = $(BIN)/eval report --scene $(call arg,POSED) --run-dir $(OUT) --geometry $(call arg,GEOMETRY) --masks $(MASKS) --out $(OUT)/report.html \
   $(report_OPTIONS) $(COMMON)
 
 # Before the first stage runs, every stage checks its options. geom_FROM says in errors where those of stage 1 come from.

@@ -1,8 +1,9 @@
 //! The renderer against the f64 reference on random scenes.
 
+use crate::pose::tests::of_reference;
 use crate::reference::{Cuts, Gaussian, Pixel, backward as reference_backward, render as reference_render, widen};
-use crate::{PixelGradients, RasterOptions, Workspace, forward, render_features};
-use glam::DVec3;
+use crate::{CameraGradient, PixelGradients, RasterOptions, Workspace, camera_gradient, forward, render_features};
+use glam::{DMat3, DQuat, DVec3};
 use gs_scene::{Camera, Gaussians};
 use proptest::prelude::*;
 use proptest::test_runner::RngSeed;
@@ -229,15 +230,99 @@ proptest! {
     }
 }
 
-/// The renderer's gradients, in the layout of the reference's.
-fn our_gradients(g: &Gaussians, camera: &Camera, options: &RasterOptions, d: &[Pixel]) -> Vec<(Vec<f64>, [f64; 2])> {
+/// The camera moved as [`crate::CameraGradient`] has it, by `step` along its number `k`: turn, shift, zoom.
+fn moved(camera: &Camera, k: usize, step: f64) -> Camera {
+    let mut by = [0.0; 7];
+    by[k] = step;
+    let (turn, zoom) = (DVec3::new(by[0], by[1], by[2]), by[6].exp());
+    let turn = DMat3::from_quat(DQuat::from_scaled_axis(turn));
+    Camera {
+        rotation: turn * camera.rotation,
+        translation: turn * camera.translation + DVec3::new(by[3], by[4], by[5]),
+        fx: camera.fx * zoom,
+        fy: camera.fy * zoom,
+        ..camera.clone()
+    }
+}
+
+#[test]
+fn camera_gradients_are_the_central_differences() {
+    for (degree, antialias) in [(0, false), (1, false), (3, false), (3, true)] {
+        let mut dice = Dice::new(175 + u64::from(degree));
+        let (mut g, mut camera) = smooth_scene(&mut dice, degree);
+        if antialias {
+            camera = Camera::look_at(camera.position(), DVec3::ZERO, -DVec3::Y, 3, 2, 0.6);
+        }
+        camera.fy *= 1.1;
+        let options = RasterOptions { background: [0.2, 0.5, 0.9], antialias, ..RasterOptions::default() };
+        let d = dice.pixels(&vec![false; (camera.width * camera.height) as usize]);
+        // With a centre so far beside the image that the Jacobian is clamped, and, for the focal lengths, without.
+        for clamped in [true, false] {
+            if !clamped {
+                g.means[0] = [0.2, 0.1, 0.2];
+            }
+            let scene = widen(&g);
+            let analytic = reference_backward(&scene, &camera, &options, Cuts::None, &d);
+            let analytic = of_reference(&scene, &analytic, &camera, &options);
+            let numbers = |c: &CameraGradient| [&c.turn[..], &c.shift, &[c.zoom]].concat();
+            let numeric: Vec<f64> = (0..7)
+                .map(|k| {
+                    let at = |step: f64| loss(&scene, &moved(&camera, k, step), &options, Cuts::None, &d);
+                    let h = 1e-3;
+                    (8.0 * (at(h) - at(-h)) - (at(2.0 * h) - at(-2.0 * h))) / (12.0 * h)
+                })
+                .collect();
+            let mut workspace = Workspace::default();
+            our_pass(&mut workspace, &g, &camera, &options, &d);
+            let ours = numbers(&camera_gradient(&g, &workspace.gradients, &camera, &options));
+            let analytic = numbers(&analytic);
+            for (name, range) in [("turn", 0..3), ("shift", 3..6), ("zoom", 6..7)] {
+                if name == "zoom" && clamped {
+                    continue;
+                }
+                let exact = relative(&analytic[range.clone()], &numeric[range.clone()]);
+                let single = relative(&ours[range.clone()], &numeric[range.clone()]);
+                eprintln!("degree {degree}, antialias {antialias}, {name}: f64 {exact:e}, f32 {single:e}");
+                assert!(exact <= 1e-6, "degree {degree}, {name}: f64 is off by {exact:e}");
+                assert!(single <= 1e-3, "degree {degree}, {name}: f32 is off by {single:e}");
+            }
+        }
+    }
+}
+
+#[test]
+fn camera_gradients_do_not_depend_on_threads() {
+    let mut dice = Dice::new(31);
+    let (g, camera) = (dice.gaussians(3000, 2), dice.camera());
+    let options = RasterOptions::default();
+    let d = dice.pixels(&vec![false; (camera.width * camera.height) as usize]);
+    let on = |threads: usize| {
+        let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
+        pool.install(|| {
+            let mut workspace = Workspace::default();
+            our_pass(&mut workspace, &g, &camera, &options, &d);
+            camera_gradient(&g, &workspace.gradients, &camera, &options)
+        })
+    };
+    let one = on(1);
+    assert!(one.is_finite() && one.zoom != 0.0);
+    assert_eq!(one, on(2));
+}
+
+/// Both passes of the renderer.
+fn our_pass(w: &mut Workspace, g: &Gaussians, camera: &Camera, options: &RasterOptions, d: &[Pixel]) {
     let rgb: Vec<f32> = d.iter().flat_map(|p| p.rgb.map(|v| v as f32)).collect();
     let alpha: Vec<f32> = d.iter().map(|p| p.alpha as f32).collect();
     let depth: Vec<f32> = d.iter().map(|p| p.depth as f32).collect();
+    w.forward(g, camera, options);
+    w.backward(g, camera, options, PixelGradients { rgb: &rgb, alpha: Some(&alpha), depth: Some(&depth) });
+}
+
+/// The renderer's gradients, in the layout of the reference's.
+fn our_gradients(g: &Gaussians, camera: &Camera, options: &RasterOptions, d: &[Pixel]) -> Vec<(Vec<f64>, [f64; 2])> {
     let mut workspace = Workspace::default();
-    workspace.forward(g, camera, options);
-    let pixels = PixelGradients { rgb: &rgb, alpha: Some(&alpha), depth: Some(&depth) };
-    let p = workspace.backward(g, camera, options, pixels);
+    our_pass(&mut workspace, g, camera, options, d);
+    let p = &workspace.gradients;
     let stride = g.sh_stride();
     let one = |i: usize| {
         let [m, s, q] = [&p.means[i][..], &p.log_scales[i], &p.rotations[i]];

@@ -1,12 +1,16 @@
 //! Posed photographs: [`load`] recognises the layout of a folder and gives its views.
 
 pub mod colmap;
+mod depth;
+pub mod refined;
 mod scannet;
 mod transforms;
 mod view;
 
 use crate::lens::Lens;
 use crate::{Camera, PointCloud, image};
+use depth::Depth;
+pub use depth::DepthMap;
 use glam::{DMat3, DMat4, DQuat, DVec3};
 use gs_io::{Error, IoContext, Result, hash_bytes, hash_file};
 use rayon::prelude::*;
@@ -130,6 +134,7 @@ pub(crate) struct RawView {
     pub rotation: DMat3,
     pub translation: DVec3,
     pub split: Option<Split>,
+    pub depth: Option<Depth>,
 }
 
 pub(crate) struct RawDataset {
@@ -187,11 +192,23 @@ impl RawView {
     }
 }
 
-/// Loads the dataset in a folder (or the `transforms.json` given), whatever its layout.
+/// Loads the dataset in a folder (or the `transforms.json` or the file of [`refined`] cameras given), whatever its layout.
 ///
 /// # Errors
 /// When the layout is not recognised, a file is damaged, or no view is left.
 pub fn load(path: &Path, options: &LoadOptions) -> Result<Dataset> {
+    if path.extension().is_some_and(|e| e == "json") && path.is_file() {
+        let json = transforms::read_json(path)?;
+        if let Some((root, refined)) = refined::read(path, &json)? {
+            let mut raw = read(&root)?;
+            refined.apply(&mut raw)?;
+            return finish(&root, raw, options);
+        }
+    }
+    finish(path, read(path)?, options)
+}
+
+fn read(path: &Path) -> Result<RawDataset> {
     let raw = if path.extension().is_some_and(|e| e == "json") {
         transforms::load(path.parent().unwrap_or(Path::new(".")), &[path.to_path_buf()])?
     } else if !path.is_dir() {
@@ -210,7 +227,7 @@ pub fn load(path: &Path, options: &LoadOptions) -> Result<Dataset> {
             .expected("sparse/0/cameras.bin|txt (COLMAP), transforms.json or transforms_train.json, or color/ pose/ intrinsic/ (ScanNet)")
             .hint("run COLMAP on the photographs first"));
     };
-    finish(path, raw, options)
+    Ok(raw)
 }
 
 fn finish(root: &Path, mut raw: RawDataset, options: &LoadOptions) -> Result<Dataset> {
@@ -254,6 +271,7 @@ fn finish(root: &Path, mut raw: RawDataset, options: &LoadOptions) -> Result<Dat
     }
     let RawDataset { format, mut files, points, warnings, .. } = raw;
     files.extend(views.iter().map(|v| v.image_path.clone()));
+    files.extend(views.iter().filter_map(View::depth_path).map(Path::to_path_buf));
     Ok(Dataset { root: root.to_path_buf(), format, views, points, files, warnings })
 }
 

@@ -58,6 +58,16 @@ impl Lens {
             .hint("use the photographs that the poses were made from"))
     }
 
+    /// The lens with focal lengths so many times as long. Its distortion bends the same pixels by as much: what was undistorted
+    /// before stays as it is.
+    pub(crate) fn zoomed(&self, by: f64) -> Self {
+        let [fx, fy, cx, cy] = self.focal_center;
+        let Distortion { k, denominator, p } = self.distortion;
+        let radial = |k: [f64; 3]| [k[0] * by.powi(2), k[1] * by.powi(4), k[2] * by.powi(6)];
+        let distortion = Distortion { k: radial(k), denominator: radial(denominator), p: p.map(|p| p * by) };
+        Self { focal_center: [fx * by, fy * by, cx, cy], distortion, ..*self }
+    }
+
     /// Where in the photograph the pinhole camera's point (x, y) is seen; the pinhole camera has the same principal
     /// point and `zoom` times the focal lengths.
     pub(crate) fn locate(&self, zoom: f64, x: f64, y: f64) -> (f64, f64) {

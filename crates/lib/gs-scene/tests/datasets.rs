@@ -710,3 +710,85 @@ fn bad_transforms_are_refused() {
     write(&dir.path().join("transforms.json"), "{\"frames\": [");
     assert!(dataset::load(dir.path(), &FULL).unwrap_err().to_string().contains("transforms.json: not JSON"));
 }
+
+/// A dataset whose lens is distorted, and the same under refined cameras: other poses and focal lengths, the same pictures.
+#[test]
+fn refined_cameras_stand_for_a_dataset() {
+    let dir = tempfile::tempdir().unwrap();
+    let root = dir.path().join("scene");
+    let views = colmap_scene(&root, &cameras(4, 60, 44));
+    text_model(&root.join("sparse/0"), &views, "OPENCV", &[55.0, 56.0, 29.0, 22.5, -0.2, 0.05, 0.002, -0.003]);
+    for name in ["cameras.bin", "images.bin"] {
+        let _ = fs::remove_file(root.join("sparse/0").join(name));
+    }
+    let halved = LoadOptions { resolution: Resolution::Divisor(2.0), ..FULL };
+    let given = dataset::load(&root, &halved).unwrap();
+    let moved = |v: &dataset::View| {
+        let turn = DMat3::from_rotation_y(0.02);
+        let (rotation, translation) = (turn * v.camera.rotation, v.camera.translation + DVec3::new(0.1, 0.0, -0.05));
+        Camera { fx: 1.03 * v.camera.fx, fy: 1.03 * v.camera.fy, rotation, translation, ..v.camera.clone() }
+    };
+    let wanted: Vec<Camera> = given.views.iter().map(moved).collect();
+    let file = dir.path().join("g.cameras.json");
+    dataset::refined::write(&file, &given, &wanted).unwrap();
+    assert!(fs::read_to_string(&file).unwrap().contains("\"dataset\": \"scene\""), "relative where it lies below");
+    for options in [&halved, &FULL] {
+        let (own, refined) = (dataset::load(&root, options).unwrap(), dataset::load(&file, options).unwrap());
+        assert_eq!(
+            (&refined.root, refined.format, &refined.points),
+            (&dir.path().join("scene"), own.format, &own.points)
+        );
+        for ((a, b), c) in refined.views.iter().zip(&own.views).zip(&wanted) {
+            assert_eq!((&a.name, a.stem(), a.split, &a.image_path), (&b.name, b.stem(), b.split, &b.image_path));
+            let d = c.resized(a.camera.width, a.camera.height);
+            assert!((a.camera.rotation - d.rotation).abs().to_cols_array().iter().all(|v| *v < 1e-12));
+            assert!(a.camera.translation.distance(d.translation) < 1e-12);
+            assert!((a.camera.fx / d.fx - 1.0).abs() < 1e-9 && (a.camera.fy / d.fy - 1.0).abs() < 1e-9);
+            let (x, y) = (a.load_image().unwrap(), b.load_image().unwrap());
+            assert!(x.rgb.iter().zip(&y.rgb).all(|(x, y)| (x - y).abs() < 1e-5));
+        }
+    }
+    for (from, to, says) in [
+        ("\"dataset\": \"scene\"", "\"dataset\": \"gone\"", "dataset"),
+        ("\"focal\": 1.03", "\"focal\": 103", "focal"),
+        ("\"translation\": [", "\"translation\": [1,", "translation"),
+        ("\"rotation\": [", "\"rotation\": [9.5, 0, 0, 0], \"was\": [", "rotation"),
+    ] {
+        let text = fs::read_to_string(&file).unwrap();
+        assert!(text.contains(from), "{text}");
+        let bad = dir.path().join("bad.json");
+        fs::write(&bad, text.replace(from, to)).unwrap();
+        let e = dataset::load(&bad, &FULL).unwrap_err().to_string();
+        assert!(e.contains("bad.json") && e.contains(says) && e.lines().count() == 1, "{e}");
+    }
+}
+
+#[test]
+fn depth_images_of_scannet_have_a_camera_of_their_own() {
+    let dir = tempfile::tempdir().unwrap();
+    let root = dir.path();
+    let c = &cameras(1, 40, 30)[0];
+    for folder in ["color", "depth"] {
+        fs::create_dir_all(root.join(folder)).unwrap();
+    }
+    for id in [0, 20] {
+        image::RgbImage::new(40, 30).save(root.join(format!("color/{id}.jpg"))).unwrap();
+        write(&root.join(format!("pose/{id}.txt")), &pose_text(c));
+    }
+    let depth = image::ImageBuffer::from_fn(20, 16, |x, y| image::Luma([(1000 + 10 * x + y) as u16]));
+    depth.save(root.join("depth/20.png")).unwrap();
+    let matrix = |fx: f64, cx: f64, cy: f64| format!("{fx} 0 {cx} 0\n0 {fx} {cy} 0\n0 0 1 0\n0 0 0 1\n");
+    write(&root.join("intrinsic/intrinsic_color.txt"), &matrix(40.0, 20.0, 15.0));
+    let load = || dataset::load(root, &FULL).unwrap();
+    let map = |d: &Dataset, v: usize| d.views[v].load_depth().unwrap();
+    // Without intrinsics of their own, depth images are smaller photographs.
+    let found = map(&load(), 1).unwrap();
+    assert_eq!((found.camera.width, found.camera.fx, found.camera.cy), (20, 20.0, 8.0));
+    assert!((found.depth[20 * 3 + 7] - 1.073).abs() < 1e-6);
+    assert!(map(&load(), 0).is_none());
+    write(&root.join("intrinsic/intrinsic_depth.txt"), &matrix(22.0, 10.5, 7.5));
+    let d = load();
+    let found = map(&d, 1).unwrap();
+    assert_eq!((found.camera.fx, found.camera.cx, found.camera.rotation), (22.0, 10.5, d.views[1].camera.rotation));
+    assert!(files(&d).contains(&"depth/20.png".into()) && files(&d).contains(&"intrinsic/intrinsic_depth.txt".into()));
+}

@@ -12,6 +12,7 @@ use crate::run::forecast::{cache_bytes, forecast_start, most_gaussians};
 use crate::run::init;
 use crate::run::outputs::plan_path;
 use crate::start;
+use crate::training::poses::Poses;
 use crate::training::schedule::{Purpose, Schedule, generator};
 use crate::training::{Recipe, Trainer, checkpoint};
 use gs_io::{Result, Watched, write_json};
@@ -137,8 +138,8 @@ fn probe<'a>(
         Schedule { iterations: warm + 3 * views, sh_every: (warm / 4).max(1), coarse: vec![(warm + views, SMALL)] };
     let growth = Growth { until: 0, ..recipe.growth };
     let exposures = if recipe.exposure { photographs.len() } else { 0 };
-    let state = checkpoint::start(start, exposures);
-    let recipe = Recipe { schedule, growth, ..recipe };
+    let state = checkpoint::start(start, exposures, Poses::default());
+    let recipe = Recipe { schedule, growth, poses: None, ..recipe };
     let mut trainer = Trainer::new(recipe, extent, photographs, heldout, state);
     let time = |trainer: &mut Trainer<'_>, iterations: u32| -> Result<f64> {
         let begun = Instant::now();

@@ -45,7 +45,7 @@ pub(crate) enum Command {
 /// Which photographs, and at which size.
 #[derive(Debug, Clone, clap::Args, Serialize)]
 pub(crate) struct SceneOptions {
-    /// Dataset folder (COLMAP, transforms.json or ScanNet)
+    /// Dataset folder (COLMAP, transforms.json or ScanNet), or the refined cameras OUT.cameras.json of a training
     #[arg(long, value_name = "DIR")]
     #[serde(skip)]
     pub scene: PathBuf,
@@ -101,11 +101,11 @@ pub(crate) struct Train {
     /// Degree of the spherical harmonics, 0 to 3
     #[arg(long, value_name = "DEGREE", default_value_t = 3, value_parser = clap::value_parser!(u8).range(0..=3))]
     pub sh_degree: u8,
-    /// What to start from: the dataset's points (random points where it has none), random points in front of the cameras, or
-    /// a file of Gaussians (docs/splats.md) or a PLY of points
+    /// What to start from: the dataset's points (where it has none, those of its depth images, else what the photographs have in
+    /// common, else random ones), random points in front of the cameras, or a file of Gaussians (docs/splats.md) or a PLY of points
     #[arg(long, value_name = "points|random|FILE.ply", default_value = "points")]
     pub init: Init,
-    /// Number of random points to start from, 1 to 1e9
+    /// Number of random points to start from, and the most from depth images and from depths by plane sweep, 1 to 1e9
     #[arg(long, value_name = "COUNT", default_value_t = 20_000, value_parser = within(1..=MOST_GAUSSIANS))]
     pub init_points: usize,
     /// What is skipped.
@@ -137,6 +137,11 @@ pub(crate) struct Train {
     /// Held-out views are rendered at the photographs' mean
     #[arg(long)]
     pub exposure: bool,
+    /// Refine poses and focal lengths: first by corners that photographs have in common, then with the scene, by what renders and
+    /// photographs differ in. Held-out views are brought to the scene before they are measured. OUT.cameras.json holds the
+    /// refined cameras; later stages take it as their --scene
+    #[arg(long)]
+    pub refine_poses: bool,
     /// Picture sizes in the course of the run; with --preset 3dgs the default is full
     #[arg(long, value_enum, default_value = "coarse", default_value_if("preset", "3dgs", "full"))]
     pub schedule: PictureSizes,

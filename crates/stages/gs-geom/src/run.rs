@@ -11,12 +11,13 @@ use crate::densification::Way;
 use crate::options::{Args, Background, Command, PictureSizes, Preset, Train};
 use crate::photographs::masks::Masks;
 use crate::photographs::{Photographs, full_share};
+use crate::training::poses::PoseRates;
 use crate::training::{Recipe, Trainer, checkpoint};
 use artifacts::role;
 use forecast::{cache_bytes, forecast_start, most_gaussians};
-use gs_io::{Claim, Provenance, Result, hash_file};
+use gs_io::{Claim, Provenance, Result, hash_bytes, hash_file};
 use gs_scene::Camera;
-use gs_scene::dataset::Dataset;
+use gs_scene::dataset::{Dataset, Split, View};
 use serde_json::{Value, json};
 use stage::{CommonArgs, Program, Stage};
 use std::collections::BTreeMap;
@@ -79,7 +80,8 @@ fn learn(
         Some(state) => state,
         None => {
             let exposures = if options.exposure { train.len() } else { 0 };
-            checkpoint::start(init::gaussians(options, dataset, &cameras, extent, stage)?, exposures)
+            let (gaussians, poses) = init::start(options, dataset, &cameras, extent, stage)?;
+            checkpoint::start(gaussians, exposures, poses)
         }
     };
     outputs::check_finite(options, &state)?;
@@ -98,7 +100,7 @@ fn learn(
     let done = iterate::iterate(options, &mut trainer, &run, &watched, stage).and_then(|()| {
         watched.check()?;
         let cpu_seconds = stage::cpu_seconds().zip(before).map(|(now, before)| now - before);
-        finish::finish(options, &mut trainer, &run, &forecast, plan, cpu_seconds, claim, stage)
+        finish::finish(options, dataset, &mut trainer, &run, &forecast, plan, cpu_seconds, claim, stage)
     });
     done.inspect_err(|_| iterate::rescue(options, &trainer, &run, stage))
 }
@@ -126,6 +128,7 @@ impl Train {
             alpha: self.masks.alpha(),
             antialias: self.antialias,
             exposure: self.exposure,
+            poses: self.refine_poses.then(PoseRates::default),
             ..recipe
         }
     }
@@ -140,6 +143,11 @@ fn provenance(options: &Train, recipe: &Recipe, dataset: &Dataset, masks: &Masks
     let mut inputs = BTreeMap::from([(role::DATASET.to_string(), dataset.hash()?)]);
     if let Some(init) = options.init.file() {
         inputs.insert("init".into(), hash_file(init)?);
+    }
+    if init::has_depths(options, dataset) {
+        let own = dataset.views_of(Split::Train).filter_map(View::depth_path);
+        let hashes = own.map(hash_file).collect::<Result<Vec<String>>>()?;
+        inputs.insert("depths".into(), hash_bytes(hashes.concat().as_bytes()));
     }
     if let Some(hash) = masks.hash()? {
         inputs.insert("photograph_masks".into(), hash);

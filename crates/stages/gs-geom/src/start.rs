@@ -1,4 +1,8 @@
-//! Where Gaussians start: at the dataset's points, at random in front of the cameras, or as a PLY says.
+//! Where Gaussians start: at the dataset's points, at those of its depth images, at random in front of the cameras, or as a PLY
+//! says.
+
+pub mod depths;
+pub mod sweep;
 
 use crate::training::optimiser::zeros;
 use crate::training::schedule::{Purpose, generator};

@@ -4,10 +4,12 @@ pub mod checkpoint;
 pub mod exposure;
 pub mod loss;
 pub mod optimiser;
+pub mod poses;
 pub mod schedule;
 #[cfg(test)]
 mod tests;
 
+use crate::corners::lenses;
 use crate::densification::rules::{Growth, Moment};
 use crate::densification::{Strategy, Way};
 use crate::metrics::{self, Means};
@@ -15,10 +17,11 @@ use crate::photographs::masks::{Alpha, multiply};
 use crate::photographs::{Photographs, Target};
 use checkpoint::State;
 use gs_io::Result;
-use gs_raster::{PixelGradients, RasterOptions, Workspace, near_plane};
+use gs_raster::{PixelGradients, RasterOptions, Workspace, camera_gradient, near_plane};
 use gs_scene::{Camera, morton_order};
 use loss::{Derivatives, Loss, Pair, l1_dssim};
 use optimiser::drop_bad_gradients;
+use poses::{Moment as PoseMoment, PoseRates};
 use rand::Rng;
 use schedule::{LearningRates, Purpose, Schedule, ViewOrder, generator};
 use serde::Serialize;
@@ -51,6 +54,8 @@ pub struct Recipe {
     pub antialias: bool,
     /// Whether to train an affine map of colours for each training photograph.
     pub exposure: bool,
+    /// How fast poses and focal lengths are refined; none where they stay.
+    pub poses: Option<PoseRates>,
 }
 
 impl Recipe {
@@ -68,9 +73,16 @@ impl Recipe {
             alpha: Alpha::default(),
             antialias: false,
             exposure: false,
+            poses: None,
         }
     }
 }
+
+/// Steps that align the held-out views' cameras before they are measured, in the course of the run and at its end, and the first and last of
+/// their rates, in radians and extents.
+const ALIGN_STEPS: u32 = 8;
+const ALIGN_LAST: u32 = 60;
+const ALIGN_RATES: [f64; 2] = [5e-4, 2e-5];
 
 /// Where the time of an optimisation went.
 #[derive(Debug, Clone, Copy, Default, PartialEq)]
@@ -99,6 +111,8 @@ pub struct Trainer<'a> {
     pub train: Photographs<'a>,
     heldout: Photographs<'a>,
     order: ViewOrder,
+    /// The lens of each view, of those to learn from and then of those held out.
+    lenses: Vec<usize>,
     pub state: State,
     workspace: Workspace,
     /// d loss / d rendered colour.
@@ -119,8 +133,12 @@ impl<'a> Trainer<'a> {
     /// `heldout` may be empty.
     pub fn new(recipe: Recipe, extent: f64, train: Photographs<'a>, heldout: Photographs<'a>, state: State) -> Self {
         assert_eq!(state.exposures.maps.len(), if recipe.exposure { train.len() } else { 0 });
+        let cameras = |p: &Photographs<'_>| (0..p.len()).map(|i| p.camera(i).clone()).collect::<Vec<Camera>>();
+        let cameras = [cameras(&train), cameras(&heldout)].concat();
+        assert_eq!(state.poses.views.len(), if recipe.poses.is_some() { cameras.len() } else { 0 });
         Self {
             order: ViewOrder::new(recipe.seed, train.len()),
+            lenses: lenses(&cameras),
             last_heldout: state.progress.curve.iter().rev().find_map(|line| parsed(line)?["psnr_heldout"].as_f64()),
             recipe,
             extent,
@@ -149,6 +167,7 @@ impl<'a> Trainer<'a> {
         let frame = self.frame()?;
         self.render(&frame);
         self.last = self.gradient(&frame);
+        self.refine(&frame);
         self.update(&frame);
         self.densify(&frame);
         // Room for the held-out views.
@@ -176,7 +195,7 @@ impl<'a> Trainer<'a> {
             depth: false,
         };
         let target = self.train.target(view, metrics::behind(*alpha, background))?;
-        let camera = self.train.camera(view).clone();
+        let camera = self.camera(view, self.train.camera(view));
         lap(&mut self.clock, &mut self.timings.rest);
         Ok(Frame { iteration, view, camera, target, raster })
     }
@@ -225,6 +244,73 @@ impl<'a> Trainer<'a> {
         self.workspace.backward(gaussians, &frame.camera, &frame.raster, pixels);
         lap(&mut self.clock, &mut self.timings.backward);
         loss
+    }
+
+    /// The camera of a view at the size of the dataset's camera `given`, refined where cameras are.
+    fn camera(&self, view: usize, given: &Camera) -> Camera {
+        match self.recipe.poses {
+            Some(_) => self.state.poses.camera(view, self.lenses[view], given),
+            None => given.clone(),
+        }
+    }
+
+    /// The cameras in use, of the views to learn from and then of those held out.
+    pub fn cameras(&mut self) -> Result<Vec<Camera>> {
+        self.train.set_divisor(1)?;
+        let own = (0..self.train.len()).map(|i| self.train.camera(i));
+        let all = own.chain((0..self.heldout.len()).map(|i| self.heldout.camera(i)));
+        Ok(all.enumerate().map(|(view, given)| self.camera(view, given)).collect())
+    }
+
+    /// A step of the cameras.
+    fn refine(&mut self, frame: &Frame) {
+        let Some(rates) = &self.recipe.poses else { return };
+        let g = camera_gradient(&self.state.gaussians, &self.workspace.gradients, &frame.camera, &frame.raster);
+        let t = self.recipe.schedule.share(frame.iteration);
+        self.state.poses.step(frame.view, self.lenses[frame.view], &g, rates, t, self.extent);
+        lap(&mut self.clock, &mut self.timings.backward);
+    }
+
+    /// Brings the held-out views' cameras to where the scene as it is shows their photographs best: the scene holds the poses of
+    /// the views that it learnt from, and others are off by as much as those were.
+    fn align(&mut self, steps: u32) -> Result<()> {
+        if self.recipe.poses.is_none() {
+            return Ok(());
+        }
+        let Recipe { alpha, background, .. } = self.recipe;
+        let options = self.heldout_options();
+        for i in 0..self.heldout.len() {
+            let view = self.train.len() + i;
+            let target = self.heldout.target(i, metrics::behind(alpha, background))?;
+            let counts = target.alpha.as_ref().filter(|_| alpha == Alpha::Ignore);
+            let mut moment = PoseMoment::default();
+            for step in 0..steps {
+                let camera = self.camera(view, self.heldout.camera(i));
+                let gaussians = &self.state.gaussians;
+                self.workspace.forward(gaussians, &camera, &options);
+                let rgb = &mut self.workspace.forward.rendered.rgb;
+                let mut shown = Cow::Borrowed(&rgb[..]);
+                if let Some(counts) = counts {
+                    multiply(shown.to_mut(), counts);
+                }
+                let pair = Pair { render: &shown, target: &target.rgb, width: camera.width as usize };
+                l1_dssim(pair, DSSIM_WEIGHT, &mut self.gradient, &mut self.derivatives);
+                drop(shown);
+                if let Some(counts) = counts {
+                    multiply(&mut self.gradient, counts);
+                }
+                let pixels = PixelGradients { rgb: &self.gradient, alpha: None, depth: None };
+                self.workspace.backward(gaussians, &camera, &options, pixels);
+                let g = camera_gradient(gaussians, &self.workspace.gradients, &camera, &options);
+                if g.is_finite() {
+                    let rate =
+                        ALIGN_RATES[0] * (ALIGN_RATES[1] / ALIGN_RATES[0]).powf(f64::from(step) / f64::from(steps));
+                    let pose = &mut self.state.poses.views[view];
+                    *pose = moment.step(pose, &g, rate, self.extent);
+                }
+            }
+        }
+        Ok(())
     }
 
     /// A step of Adam.
@@ -294,6 +380,7 @@ impl<'a> Trainer<'a> {
         if line["iteration"] != iteration || line.get("psnr_heldout").is_some() {
             return Ok(());
         }
+        self.align(if iteration == total { ALIGN_LAST } else { ALIGN_STEPS })?;
         if let Some(psnr) = self.heldout()?.psnr {
             self.last_heldout = Some(psnr);
             line["psnr_heldout"] = json!(psnr);
@@ -303,17 +390,21 @@ impl<'a> Trainer<'a> {
         Ok(())
     }
 
+    fn heldout_options(&self) -> RasterOptions {
+        let Recipe { background, antialias, .. } = self.recipe;
+        RasterOptions { background, antialias, near: near_plane(self.extent), depth: false, ..RasterOptions::default() }
+    }
+
     /// Mean PSNR and SSIM over the held-out views with all spherical harmonics, at the scene's own exposure; none without
     /// such views.
     pub fn heldout(&mut self) -> Result<Means> {
-        let Recipe { alpha, background, antialias, .. } = self.recipe;
-        let near = near_plane(self.extent);
-        let options = RasterOptions { background, antialias, near, depth: false, ..RasterOptions::default() };
+        let Recipe { alpha, background, .. } = self.recipe;
+        let options = self.heldout_options();
         let mut all = Vec::with_capacity(self.heldout.len());
         for i in 0..self.heldout.len() {
-            let (camera, target) =
-                (self.heldout.camera(i), self.heldout.target(i, metrics::behind(alpha, background))?);
-            self.workspace.forward(&self.state.gaussians, camera, &options);
+            let target = self.heldout.target(i, metrics::behind(alpha, background))?;
+            let camera = self.camera(self.train.len() + i, self.heldout.camera(i));
+            self.workspace.forward(&self.state.gaussians, &camera, &options);
             let rgb = &mut self.workspace.forward.rendered.rgb;
             all.push(metrics::compare(rgb, camera.width as usize, &target, alpha, &mut self.derivatives));
         }

@@ -81,7 +81,15 @@ pub(crate) fn load(root: &Path, model: &Path) -> Result<RawDataset> {
             image_path = folder.join(other);
         }
         if image_path.is_file() {
-            views.push(RawView { name, image_path, lens: cameras[&camera], rotation, translation, split: None });
+            views.push(RawView {
+                name,
+                image_path,
+                lens: cameras[&camera],
+                rotation,
+                translation,
+                split: None,
+                depth: None,
+            });
         } else {
             warnings.push(format!("{}: no such photograph, view skipped", image_path.display()));
         }

@@ -1,6 +1,7 @@
 //! ScanNet as its tools extract it: `color/<id>.jpg`, `pose/<id>.txt`, `intrinsic/intrinsic_color.txt`, and the scan's
-//! vertices in `*_vh_clean_2.ply`.
+//! vertices in `*_vh_clean_2.ply`; where they are there, depth images in `depth/<id>.png`.
 
+use super::depth::{self, Depth};
 use super::{Format, RawDataset, RawView, invert_pose, read_text};
 use crate::lens::{Distortion, Lens};
 use crate::{PointCloud, image, ply};
@@ -22,7 +23,9 @@ pub(super) fn load(root: &Path) -> Result<RawDataset> {
         .filter_map(|path| Some((path.file_stem()?.to_str()?.parse().ok()?, path)))
         .collect();
     frames.sort();
+    let depths = Depths::find(root)?;
     let mut files = vec![intrinsic.clone()];
+    files.extend(depths.intrinsic.clone());
     let mut warnings = Vec::new();
     let mut views = Vec::new();
     for (_, image_path) in frames {
@@ -44,13 +47,36 @@ pub(super) fn load(root: &Path) -> Result<RawDataset> {
         };
         check_intrinsics(&lens).map_err(|e| e.file(&intrinsic))?;
         let name = image_path.file_name().unwrap_or_default().to_string_lossy().into_owned();
-        views.push(RawView { name, image_path, lens, rotation, translation, split: None });
+        let depth = depths.of(&image_path);
+        views.push(RawView { name, image_path, lens, rotation, translation, split: None, depth });
         files.push(pose_path);
     }
     let scan = list(root)?.into_iter().find(|p| p.to_string_lossy().ends_with("_vh_clean_2.ply"));
     let points = scan.as_ref().map_or_else(|| Ok(PointCloud::default()), ply::read_points)?;
     files.extend(scan);
     Ok(RawDataset { format: Format::ScanNet, files, views, points, warnings })
+}
+
+/// The depth images, `depth/<id>.png` in millimetres, with a camera of their own.
+struct Depths {
+    folder: PathBuf,
+    intrinsic: Option<PathBuf>,
+    focal_center: Option<[f64; 4]>,
+}
+
+impl Depths {
+    fn find(root: &Path) -> Result<Self> {
+        let folder = root.join("depth");
+        let intrinsic = Some(root.join("intrinsic/intrinsic_depth.txt")).filter(|p| folder.is_dir() && p.is_file());
+        let k = intrinsic.as_deref().map(matrix).transpose()?;
+        let focal_center = k.map(|k| [k.x_axis.x, k.y_axis.y, k.z_axis.x, k.z_axis.y]);
+        Ok(Self { folder, intrinsic, focal_center })
+    }
+
+    fn of(&self, image: &Path) -> Option<Depth> {
+        let path = self.folder.join(image.with_extension("png").file_name()?);
+        path.is_file().then(|| Depth { path, unit: depth::MILLIMETRES, focal_center: self.focal_center })
+    }
 }
 
 /// Paths in a folder, sorted.

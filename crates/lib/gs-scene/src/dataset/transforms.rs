@@ -1,5 +1,6 @@
 //! `transforms.json` of nerfstudio, instant-ngp and Blender; OpenGaussian's conversion of ScanNet is one of these.
 
+use super::depth::{Depth, MILLIMETRES};
 use super::{Format, RawDataset, RawView, Split, check_inside, invert_pose, other_case, read_text};
 use crate::lens::{Distortion, Lens};
 use crate::{PointCloud, image, ply};
@@ -35,8 +36,7 @@ pub(super) fn load(root: &Path, files: &[PathBuf]) -> Result<RawDataset> {
             Some("transforms_test.json") => Some(Split::Test),
             _ => None,
         };
-        let json: Value = serde_json::from_slice(&without_infinities(read_text(file)?))
-            .map_err(|e| Error::new(format!("not JSON: {e}")).file(file).hint(AGAIN))?;
+        let json = read_json(file)?;
         read_frames(root, &json, split, &mut out).map_err(|e| e.file(file))?;
         if let Some(name) = json["ply_file_path"].as_str() {
             check_inside(name, "ply_file_path").map_err(|e| e.file(file))?;
@@ -52,6 +52,12 @@ pub(super) fn load(root: &Path, files: &[PathBuf]) -> Result<RawDataset> {
         out.files.push(path);
     }
     Ok(out)
+}
+
+/// The content of a JSON file.
+pub(super) fn read_json(file: &Path) -> Result<Value> {
+    serde_json::from_slice(&without_infinities(read_text(file)?))
+        .map_err(|e| Error::new(format!("not JSON: {e}")).file(file).hint(AGAIN))
 }
 
 /// Python writes lost poses as `-Infinity` and `NaN`, which JSON does not know: makes them empty strings.
@@ -123,9 +129,31 @@ fn read_frames(root: &Path, json: &Value, split: Option<Split>, out: &mut RawDat
         });
         let short = ["images/", "color/"].iter().find_map(|folder| name.strip_prefix(folder));
         let name = short.unwrap_or(&name).to_string();
-        out.views.push(RawView { name, image_path, lens, rotation, translation, split });
+        let depth = depth(root, json, frame, &format!("frames[{i}]"), &mut out.warnings)?;
+        out.views.push(RawView { name, image_path, lens, rotation, translation, split, depth });
     }
     Ok(())
+}
+
+/// The frame's depth image, as nerfstudio names it: a number of it is a millimetre, unless the file says otherwise.
+fn depth(root: &Path, file: &Value, frame: &Value, field: &str, warnings: &mut Vec<String>) -> Result<Option<Depth>> {
+    let Some(name) = frame["depth_file_path"].as_str() else { return Ok(None) };
+    check_inside(name, &format!("{field}.depth_file_path"))?;
+    let path = root.join(name.trim_start_matches("./"));
+    if !path.is_file() {
+        warnings.push(format!("{}: no such depth image", path.display()));
+        return Ok(None);
+    }
+    let unit = match &file["depth_unit_scale_factor"] {
+        Value::Null => MILLIMETRES,
+        v => v.as_f64().filter(|u| *u > 0.0 && u.is_finite()).ok_or_else(|| {
+            Error::new("no unit of depth")
+                .field("depth_unit_scale_factor")
+                .found(brief(v))
+                .expected("a number above zero")
+        })?,
+    };
+    Ok(Some(Depth { path, unit, focal_center: None }))
 }
 
 /// A value's first characters, to show what was found.

@@ -1,5 +1,6 @@
 //! One view: a photograph, the camera that took it, and the pinhole camera that stands for it.
 
+use super::depth::{Depth, DepthMap};
 use super::{RawView, Resolution, Split};
 use crate::lens::Lens;
 use crate::{Camera, Image};
@@ -21,11 +22,12 @@ pub struct View {
     pub split: Split,
     stem: String,
     lens: Lens,
+    depth: Option<Depth>,
 }
 
 impl View {
     pub(super) fn new(raw: RawView, stem: String, split: Split, resolution: Resolution) -> Result<Self> {
-        let RawView { name, image_path, lens, rotation, translation, .. } = raw;
+        let RawView { name, image_path, lens, rotation, translation, depth, .. } = raw;
         let Some(zoom) = lens.zoom() else {
             return Err(Error::new("the lens distortion is too strong to take out")
                 .file(image_path)
@@ -37,7 +39,7 @@ impl View {
         let (width, height) = lens.size;
         let full = Camera { width, height, fx: fx * zoom, fy: fy * zoom, cx, cy, rotation, translation };
         let (width, height) = resolution.apply(width, height);
-        Ok(Self { name, image_path, camera: full.resized(width, height), split, stem, lens })
+        Ok(Self { name, image_path, camera: full.resized(width, height), split, stem, lens, depth })
     }
 
     /// By what masks and other files of this view are found: the file name without folder and last extension. Where
@@ -55,21 +57,42 @@ impl View {
     /// # Errors
     /// When the file cannot be read or its size is not the camera's.
     pub fn load_image(&self) -> Result<Image> {
-        self.load(&self.image_path)
+        self.load(&self.image_path, self.camera.width, self.camera.height)
+    }
+
+    /// As [`Self::load_image`], at the photograph's own size, or with a longer side of so many pixels where it is larger.
+    pub fn load_image_within(&self, longest: u32) -> Result<Image> {
+        let (w, h) = self.lens.size;
+        let by = (f64::from(longest) / f64::from(w.max(h))).min(1.0);
+        let [w, h] = [w, h].map(|v| ((f64::from(v) * by).round() as u32).max(1));
+        self.load(&self.image_path, w, h)
+    }
+
+    /// Where the depth image lies, if there is one.
+    pub fn depth_path(&self) -> Option<&Path> {
+        self.depth.as_ref().map(|d| &*d.path)
+    }
+
+    /// Decodes the depth image, undistorted as the photograph is; none where there is none.
+    ///
+    /// # Errors
+    /// When it cannot be read, or is no picture of 16-bit grey.
+    pub fn load_depth(&self) -> Result<Option<DepthMap>> {
+        self.depth.as_ref().map(|d| d.load(self)).transpose()
     }
 
     /// Decodes a mask of the photograph, a picture of the same size, as `[height][width]`, 0 (black) to 1 (white), at the
     /// camera's size.
     pub fn load_mask(&self, path: &Path) -> Result<Vec<f32>> {
-        let mask = self.load(path)?;
+        let mask = self.load(path, self.camera.width, self.camera.height)?;
         Ok(mask.rgb.as_chunks::<3>().0.iter().map(|p| p.iter().sum::<f32>() / 3.0).collect())
     }
 
-    fn load(&self, path: &Path) -> Result<Image> {
+    fn load(&self, path: &Path, width: u32, height: u32) -> Result<Image> {
         let photo = Image::read(path)?;
         self.lens.expect_size((photo.width, photo.height), path)?;
         let flat = if self.lens.distortion.is_none() { photo } else { self.undistort(&photo) };
-        Ok(flat.resize_area(self.camera.width, self.camera.height))
+        Ok(flat.resize_area(width, height))
     }
 
     /// Whether the lens bends straight lines: what was made from the photograph as it lies on disk has them bent, too.

@@ -152,6 +152,7 @@ mod tests {
     use crate::densification::drawable;
     use crate::training::checkpoint;
     use crate::training::optimiser::zeros;
+    use crate::training::poses::Poses;
     use proptest::prelude::*;
 
     /// Gaussians in a row: scale e^(-s), opacity 0.5.
@@ -166,7 +167,7 @@ mod tests {
     }
 
     fn run(g: &mut Gaussians, gradients: &[f32], options: &Adaptive, most: usize) -> (Adam, Report) {
-        let mut state = checkpoint::start(g.clone(), 0);
+        let mut state = checkpoint::start(g.clone(), 0, Poses::default());
         state.adam.first.means.iter_mut().enumerate().for_each(|(i, m)| m[0] = 1.0 + i as f32);
         let sum = gradients.iter().map(|p| 3.0 * p).collect();
         state.seen = ScreenGradients { sum, views: vec![3; gradients.len()] };

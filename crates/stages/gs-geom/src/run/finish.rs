@@ -1,14 +1,16 @@
 //! What a finished run leaves: Gaussians, curve, exposures and its record.
 
-use super::outputs::{CURVE, EXPOSURES, PARTIAL, PLOT, check_finite, plan_path};
+use super::outputs::{CAMERAS, CURVE, EXPOSURES, PARTIAL, PLOT, check_finite, plan_path};
 use crate::densification::{Strategy, drawable};
 use crate::memory::Forecast;
 use crate::metrics::Means;
 use crate::options::Train;
 use crate::training::checkpoint::{self, ProgressState, State};
+use crate::training::poses::turned_from;
 use crate::training::{Timings, Trainer};
 use gs_io::{Claim, Provenance, Result, with_suffix, write_bytes, write_json};
-use gs_scene::{Gaussians, ply};
+use gs_scene::dataset::{Dataset, Split, View, refined};
+use gs_scene::{Camera, Gaussians, ply};
 use report::curve::Panel;
 use serde_json::{Value, json};
 use stage::Stage;
@@ -25,6 +27,7 @@ const PANELS: [Panel; 3] = [
 /// processor time of the iterations.
 pub(super) fn finish(
     options: &Train,
+    dataset: &Dataset,
     trainer: &mut Trainer<'_>,
     run: &Provenance,
     forecast: &Forecast,
@@ -41,6 +44,8 @@ pub(super) fn finish(
     report(progress, stage);
     let Provenance { parameters, inputs, .. } = run;
     write_beside(options, trainer)?;
+    write_cameras(options, dataset, trainer, stage)?;
+    let State { gaussians, progress, .. } = &trainer.state;
     ply::write_some_gaussians(&options.out, gaussians, &rows, &comments(parameters, inputs))?;
     let [cloned, split, removed, relocated] = progress.densified;
     let heldout = psnr.map_or(String::new(), |p| format!(", {p:.2} dB on held-out views"));
@@ -108,6 +113,33 @@ fn write_beside(options: &Train, trainer: &Trainer<'_>) -> Result<()> {
     let maps: serde_json::Map<String, Value> =
         maps.map(|(name, map)| (name.to_string(), json!(map.chunks(4).collect::<Vec<_>>()))).collect();
     write_json(with_suffix(&options.out, EXPOSURES), &maps)
+}
+
+/// Writes the refined cameras, and says how far they moved.
+fn write_cameras(options: &Train, dataset: &Dataset, trainer: &mut Trainer<'_>, stage: &Stage) -> Result<()> {
+    if !options.refine_poses {
+        return Ok(());
+    }
+    let cameras = trainer.cameras()?;
+    let of = |split: Split| dataset.views_of(split).map(|v| v.name.as_str());
+    let by_name: BTreeMap<&str, &Camera> = of(Split::Train).chain(of(Split::Test)).zip(&cameras).collect();
+    let cameras: Vec<Camera> = dataset.views.iter().map(|v| by_name[v.name.as_str()].clone()).collect();
+    let path = with_suffix(&options.out, CAMERAS);
+    refined::write(&path, dataset, &cameras)?;
+    let moved = |f: fn(&View, &Camera) -> f64| {
+        let mut all: Vec<f64> = dataset.views.iter().zip(&cameras).map(|(v, c)| f(v, c)).collect();
+        all.sort_by(f64::total_cmp);
+        all[all.len() / 2]
+    };
+    let turn = moved(|v, c| turned_from(&v.camera.rotation, &c.rotation).length().to_degrees());
+    let shift = moved(|v, c| v.camera.position().distance(c.position()));
+    let zoom = moved(|v, c| c.fx / v.camera.fx);
+    stage.info(&format!(
+        "cameras moved by {turn:.3} degrees and {shift:.4} units, focal lengths by a factor of {zoom:.5} (medians); held-out views were \
+         brought to the scene before they were measured; later stages: --scene {}",
+        path.display()
+    ));
+    Ok(())
 }
 
 /// Seconds of each part.

@@ -1,5 +1,7 @@
 //! How much memory a training will take, from its photographs and the Gaussians it starts from.
 
+use super::init;
+use crate::corners;
 use crate::densification::Strategy;
 use crate::densification::rules::Growth;
 use crate::memory::{self, Forecast};
@@ -74,7 +76,15 @@ pub(crate) fn forecast_start(
     let fixed = options.densify == Strategy::Fixed;
     let kept = if fixed { points } else { points.min(options.max_gaussians.unwrap_or(points)) };
     let before = PER_POINT * points as u64 + read;
-    stage.needs_at_once(forecast.peak(kept).0 + before, LESS)?;
+    // The corners are found before there is anything else.
+    let corners = match options.refine_poses || init::is_bare(options, dataset) {
+        true => {
+            let views: Vec<&View> = dataset.views.iter().collect();
+            corners::bytes(&views, rayon::current_num_threads() as u64)? + forecast.decoding
+        }
+        false => 0,
+    };
+    stage.needs_at_once((forecast.peak(kept).0 + before).max(corners), LESS)?;
     Ok(forecast)
 }
 

@@ -1,8 +1,10 @@
 //! What a run learns from, and the Gaussians that `--init` says to start from.
 
+use crate::corners::{self, Found};
 use crate::densification::Strategy;
 use crate::options::{Init, Train, check_some};
 use crate::start;
+use crate::training::poses::Poses;
 use gs_io::{Error, Result};
 use gs_scene::dataset::{Dataset, Split, View};
 use gs_scene::{Camera, Gaussians, PointCloud, ply, splat};
@@ -23,7 +25,59 @@ pub(crate) fn split<'a>(options: &Train, dataset: &'a Dataset) -> Result<(Vec<&'
     Ok((train, heldout))
 }
 
-/// The Gaussians before the first iteration.
+/// Whether the Gaussians are to start from points that the dataset lacks.
+pub(crate) fn is_bare(options: &Train, dataset: &Dataset) -> bool {
+    options.init == Init::Points && dataset.points.is_empty()
+}
+
+/// Whether the Gaussians start from depth images: where there are no points, but some of these.
+pub(crate) fn has_depths(options: &Train, dataset: &Dataset) -> bool {
+    is_bare(options, dataset) && dataset.views_of(Split::Train).any(|v| v.depth_path().is_some())
+}
+
+/// The Gaussians before the first iteration, and the cameras where these are refined. `cameras` are those of the views to learn from.
+pub(crate) fn start(
+    options: &Train,
+    dataset: &Dataset,
+    cameras: &[&Camera],
+    extent: f64,
+    stage: &Stage,
+) -> Result<(Gaussians, Poses)> {
+    let of = |split: Split| dataset.views_of(split);
+    let views: Vec<&View> = of(Split::Train).chain(of(Split::Test)).collect();
+    let given: Vec<Camera> = views.iter().map(|v| v.camera.clone()).collect();
+    let bare = is_bare(options, dataset) && options.densify != Strategy::Fixed;
+    let deep = has_depths(options, dataset);
+    let mut found = Found { cameras: given.clone(), points: PointCloud::default() };
+    if options.refine_poses || (bare && !deep) {
+        found = corners::find(&views, options.refine_poses, stage)?;
+    }
+    let refined = options.refine_poses.then(|| Poses::new(&found.cameras, &given, &corners::lenses(&given)));
+    let learnt = &views.iter().copied().zip(&found.cameras).collect::<Vec<_>>()[..cameras.len()];
+    let mut points = found.points;
+    let corners = points.len();
+    let from = if deep {
+        points = start::depths::points(learnt, options.init_points, stage)?;
+        let images = learnt.iter().filter(|(v, _)| v.depth_path().is_some()).count();
+        format!("{} of {images} depth images", points.len())
+    } else if bare && corners >= corners::FEWEST_POINTS {
+        let swept = start::sweep::points(learnt, &points, options.init_points, stage)?;
+        points.positions.extend(&swept.positions);
+        points.colors.extend(&swept.colors);
+        format!("{corners} of corners and {} of depths by plane sweep", swept.len())
+    } else {
+        if bare {
+            stage.warn(&format!("the photographs have only {corners} points in common: starting from random ones"));
+        }
+        let gaussians = gaussians(options, dataset, cameras, extent, stage)?;
+        return Ok((gaussians, refined.unwrap_or_default()));
+    };
+    stage.info(&format!("the dataset has no points: starting from {from}"));
+    let gaussians = from_points(options, &points, extent, stage).map_err(|e| e.file(&options.scene.scene))?;
+    Ok((gaussians, refined.unwrap_or_default()))
+}
+
+/// The Gaussians that `--init` says to start from.
 pub(crate) fn gaussians(
     options: &Train,
     dataset: &Dataset,

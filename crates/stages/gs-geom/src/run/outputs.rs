@@ -1,18 +1,20 @@
 //! The files that a training reads and writes.
 
+use super::init::has_depths;
 use crate::options::Train;
 use crate::photographs::masks::Masks;
 use crate::training::checkpoint::{self, State};
 use gs_io::{Claim, Error, Result, Watched, with_suffix};
-use gs_scene::dataset::Dataset;
+use gs_scene::dataset::{Dataset, View};
 use stage::Stage;
 use std::path::{Path, PathBuf};
 
-/// What lies beside the output: the training curve and its plot, the photographs' exposures, and the Gaussians of an
+/// What lies beside the output: the training curve and its plot, the photographs' exposures, the refined cameras, and the Gaussians of an
 /// unfinished run.
 pub(super) const CURVE: &str = ".curve.jsonl";
 pub(super) const PLOT: &str = ".curve.svg";
 pub(super) const EXPOSURES: &str = ".exposures.json";
+pub(super) const CAMERAS: &str = ".cameras.json";
 pub(super) const PARTIAL: &str = ".partial.ply";
 
 /// Where the plan of an output lies while its run is unfinished.
@@ -24,7 +26,9 @@ pub(crate) fn plan_path(output: &Path) -> PathBuf {
 pub(super) fn claim(options: &Train, dataset: &Dataset, masks: &Masks, stage: &Stage) -> Result<Claim> {
     let out = &options.out;
     let exposures = Some(EXPOSURES).filter(|_| options.exposure);
-    let beside = [CURVE, PLOT, PARTIAL].into_iter().chain(exposures).map(|suffix| with_suffix(out, suffix));
+    let cameras = Some(CAMERAS).filter(|_| options.refine_poses);
+    let beside =
+        [CURVE, PLOT, PARTIAL].into_iter().chain(exposures).chain(cameras).map(|suffix| with_suffix(out, suffix));
     let outputs = stage.outputs(out).file(out).files(beside).file(plan_path(out));
     let outputs = outputs.artifact(checkpoint::path_of(out), checkpoint::FORMAT);
     let init = options.init.file().map(Path::to_path_buf);
@@ -34,7 +38,9 @@ pub(super) fn claim(options: &Train, dataset: &Dataset, masks: &Masks, stage: &S
 /// The files that are hashed at one time and read at another.
 pub(super) fn watched(options: &Train, dataset: &Dataset, masks: &Masks) -> Watched {
     let masks = dataset.views.iter().filter_map(|v| masks.of(v));
-    Watched::by_content(dataset.views.iter().map(|v| &*v.image_path).chain(masks).chain(options.init.file()))
+    let depths = dataset.views.iter().filter_map(View::depth_path).filter(|_| has_depths(options, dataset));
+    let photographs = dataset.views.iter().map(|v| &*v.image_path);
+    Watched::by_content(photographs.chain(masks).chain(depths).chain(options.init.file()))
 }
 
 /// Refuses Gaussians that are not finite: no stage can use them, and no later step makes them finite.

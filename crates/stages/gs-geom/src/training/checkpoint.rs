@@ -2,6 +2,7 @@
 
 use super::exposure::{Exposures, NUMBERS};
 use super::optimiser::Adam;
+use super::poses::{NUMBERS as POSE, Poses};
 use gs_io::{Artifact, ArtifactWriter, Error, Provenance, Result};
 use gs_scene::{Gaussians, sh_coefficients};
 use serde::{Deserialize, Serialize};
@@ -10,7 +11,7 @@ use std::path::{Path, PathBuf};
 /// Format name of the artifact.
 pub const FORMAT: &str = "gs-geom-checkpoint";
 /// Version of the format.
-pub const VERSION: u32 = 4;
+pub const VERSION: u32 = 5;
 
 /// State of an optimisation after some iterations. Random numbers are drawn from the seed and the iteration (see
 /// [`super::schedule::generator`]), so no generator is part of it.
@@ -20,6 +21,7 @@ pub struct State {
     pub adam: Adam,
     pub seen: ScreenGradients,
     pub exposures: Exposures,
+    pub poses: Poses,
     pub progress: ProgressState,
 }
 
@@ -71,10 +73,10 @@ pub fn path_of(output: &Path) -> PathBuf {
     gs_io::with_suffix(output, ".checkpoint")
 }
 
-/// The state before the first iteration; `exposures` is the number of views with an exposure map.
-pub fn start(gaussians: Gaussians, exposures: usize) -> State {
+/// The state before the first iteration; `exposures` is the number of views with an exposure map, `poses` are the cameras to refine, if any.
+pub fn start(gaussians: Gaussians, exposures: usize, poses: Poses) -> State {
     let (adam, seen) = (Adam::new(&gaussians), ScreenGradients::new(gaussians.len()));
-    State { gaussians, adam, seen, exposures: Exposures::new(exposures), progress: ProgressState::default() }
+    State { gaussians, adam, seen, exposures: Exposures::new(exposures), poses, progress: ProgressState::default() }
 }
 
 /// Writes a checkpoint; `provenance` is that of the run.
@@ -84,13 +86,21 @@ pub fn write(path: &Path, state: &State, provenance: Provenance) -> Result<()> {
     let extra = serde_json::to_value(&extra).map_err(|e| Error::new(e.to_string()).file(path))?;
     let (n, e) = (state.gaussians.len(), &state.exposures);
     let exposures = [e.maps.len(), NUMBERS];
+    let p = &state.poses;
+    let (views, lenses) = (p.views.len(), p.zooms.len());
     let mut writer = ArtifactWriter::new(Provenance { extra, ..provenance })
         .tensor("gradient_sum", &[n], &state.seen.sum)
         .tensor("gradient_views", &[n], &state.seen.views)
         .tensor("exposure_maps", &exposures, e.maps.as_flattened())
         .tensor("exposure_first", &exposures, e.first.as_flattened())
         .tensor("exposure_second", &exposures, e.second.as_flattened())
-        .tensor("exposure_steps", &exposures[..1], &e.steps);
+        .tensor("exposure_steps", &exposures[..1], &e.steps)
+        .tensor("poses", &[views, POSE], p.views.as_flattened())
+        .tensor("pose_first", &[views, 6], p.first.as_flattened())
+        .tensor("pose_second", &[views, 6], p.second.as_flattened())
+        .tensor("zooms", &[lenses], &p.zooms)
+        .tensor("zoom_moments", &[lenses, 2], p.of_zooms.as_flattened())
+        .tensor("pose_steps", &[views + lenses], &p.steps);
     for (prefix, g) in [("", &state.gaussians), ("first_", &state.adam.first), ("second_", &state.adam.second)] {
         writer = writer
             .tensor(&format!("{prefix}means"), &[n, 3], g.means.as_flattened())
@@ -139,7 +149,21 @@ pub fn read(path: &Path, run: &Provenance) -> Result<Option<State>> {
     let exposure = |name: &str| -> Result<Vec<[f32; NUMBERS]>> {
         Ok(a.tensor::<f32>(name, &[Some(steps.len()), Some(NUMBERS)])?.as_chunks().0.to_vec())
     };
+    let poses = a.tensor::<f64>("poses", &[None, Some(POSE)])?.as_chunks().0.to_vec();
+    let zooms = a.tensor::<f64>("zooms", &[None])?.to_vec();
+    let (views, lenses) = (poses.len(), zooms.len());
+    let moves = |name: &str| -> Result<Vec<[f64; 6]>> {
+        Ok(a.tensor::<f64>(name, &[Some(views), Some(6)])?.as_chunks().0.to_vec())
+    };
     Ok(Some(State {
+        poses: Poses {
+            first: moves("pose_first")?,
+            second: moves("pose_second")?,
+            of_zooms: a.tensor::<f64>("zoom_moments", &[Some(lenses), Some(2)])?.as_chunks().0.to_vec(),
+            steps: a.tensor::<u32>("pose_steps", &[Some(views + lenses)])?.to_vec(),
+            views: poses,
+            zooms,
+        },
         exposures: Exposures {
             maps: exposure("exposure_maps")?,
             first: exposure("exposure_first")?,
@@ -160,6 +184,8 @@ pub fn read(path: &Path, run: &Provenance) -> Result<Option<State>> {
 mod tests {
     use super::*;
     use crate::training::optimiser::zeros;
+    use glam::DVec3;
+    use gs_scene::Camera;
 
     fn provenance(seed: u64) -> Provenance {
         let parameters = serde_json::json!({"seed": seed, "rate": 0.2f32});
@@ -175,13 +201,17 @@ mod tests {
         let fill = |v: &mut [f32], at: f32| v.iter_mut().enumerate().for_each(|(i, v)| *v = at + (i as f32).sin());
         fill(g.means.as_flattened_mut(), 1.0);
         fill(&mut g.sh, 2.0);
-        let mut state = start(g, 3);
+        let cameras = [0.0, 1.0].map(|x| Camera::look_at(DVec3::new(x, 3.0, 1.0), DVec3::ZERO, DVec3::Z, 64, 48, 1.0));
+        let mut state = start(g, 3, Poses::new(&cameras, &cameras, &[0, 1]));
         fill(&mut state.adam.first.sh, 3.0);
         fill(state.adam.second.rotations.as_flattened_mut(), 4.0);
         fill(&mut state.seen.sum, 5.0);
         fill(state.exposures.maps.as_flattened_mut(), 6.0);
         fill(state.exposures.second.as_flattened_mut(), 7.0);
         state.exposures.steps = vec![3, 1, 4];
+        state.poses.steps = vec![1, 5, 9, 2];
+        state.poses.first[1] = [0.1, -0.2, 1.0 / 3.0, 0.4, 5e-300, 0.6];
+        state.poses.zooms[1] = 0.01;
         state.adam.steps = 12;
         state.progress = ProgressState {
             iteration: 12,

@@ -7,6 +7,7 @@ use crate::start;
 use crate::world::scene;
 use gs_io::{Provenance, Watched};
 use gs_scene::dataset::{self, LoadOptions, Split};
+use poses::Poses;
 
 /// A run in parts: after each of `stops` it goes on from a checkpoint file. Its state, with the PSNR on the held-out views.
 fn trained(recipe: &Recipe, cache: usize, stops: &[u32]) -> (State, f64) {
@@ -19,7 +20,10 @@ fn trained(recipe: &Recipe, cache: usize, stops: &[u32]) -> (State, f64) {
     let cameras: Vec<&Camera> = dataset.views_of(Split::Train).map(|v| &v.camera).collect();
     let extent = start::extent(&cameras, &dataset.points.positions);
     let first = start::from_points(&dataset.points, 2, extent).unwrap();
-    let mut state = checkpoint::start(first, if recipe.exposure { cameras.len() } else { 0 });
+    let all: Vec<Camera> =
+        [Split::Train, Split::Test].iter().flat_map(|s| dataset.views_of(*s).map(|v| v.camera.clone())).collect();
+    let poses = recipe.poses.map(|_| Poses::new(&all, &all, &lenses(&all))).unwrap_or_default();
+    let mut state = checkpoint::start(first, if recipe.exposure { cameras.len() } else { 0 }, poses);
     let dir = tempfile::tempdir().unwrap();
     let path = dir.path().join("checkpoint");
     let (format, version) = (checkpoint::FORMAT.into(), checkpoint::VERSION);
@@ -51,7 +55,7 @@ fn every_way_is_the_same_for_any_threads_and_after_a_stop_and_keeps_to_the_most_
     let ways = [
         Recipe { exposure: true, ..mcmc },
         Recipe { schedule: coarse.schedule.clone().coarse_to_fine(), antialias: true, ..coarse },
-        Recipe { random_background: true, ..adaptive },
+        Recipe { random_background: true, poses: Some(PoseRates::default()), ..adaptive },
     ];
     let on = |threads: usize| rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
     for recipe in ways {

@@ -1,0 +1,53 @@
+//! Depth images beside photographs.
+
+use super::View;
+use crate::{Camera, decode_image};
+use gs_io::{Error, IoContext, Result};
+use image::DynamicImage;
+use std::path::PathBuf;
+
+/// World units of a depth image's number, where nothing else is said: nerfstudio and ScanNet write millimetres, the world is in
+/// metres.
+pub(crate) const MILLIMETRES: f64 = 1e-3;
+
+/// A depth image of a view.
+#[derive(Debug, Clone, PartialEq)]
+pub(crate) struct Depth {
+    pub path: PathBuf,
+    /// World units of a number.
+    pub unit: f64,
+    /// fx, fy, cx, cy in pixels of the depth image, where it is not the photograph's camera at another size.
+    pub focal_center: Option<[f64; 4]>,
+}
+
+/// How far away things are along the optical axis.
+#[derive(Debug, Clone, PartialEq)]
+pub struct DepthMap {
+    /// The pinhole camera of the map, at its size.
+    pub camera: Camera,
+    /// `[height][width]`, camera z in world units; 0 where it is not known.
+    pub depth: Vec<f32>,
+}
+
+impl Depth {
+    pub(super) fn load(&self, view: &View) -> Result<DepthMap> {
+        let picture = decode_image(&std::fs::read(&self.path).at("read", &self.path)?, &self.path)?;
+        let DynamicImage::ImageLuma16(picture) = picture else {
+            return Err(Error::new("not a depth image")
+                .file(&self.path)
+                .found(format!("{:?}", picture.color()))
+                .expected("a PNG of 16-bit grey")
+                .hint("export the depths again, or take them out of the dataset"));
+        };
+        let (width, height) = picture.dimensions();
+        let mut depth: Vec<f32> = picture.pixels().map(|p| (f64::from(p[0]) * self.unit) as f32).collect();
+        let camera = match self.focal_center {
+            Some([fx, fy, cx, cy]) => Camera { width, height, fx, fy, cx, cy, ..view.camera.clone() },
+            None => {
+                view.undistort_nearest(&mut depth, width as usize, height as usize);
+                view.camera.resized(width, height)
+            }
+        };
+        Ok(DepthMap { camera, depth })
+    }
+}

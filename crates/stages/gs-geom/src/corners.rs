@@ -1,0 +1,270 @@
+//! What the photographs themselves say of where things and cameras are: corners that several photographs show are matched,
+//! placed, and fitted.
+//!
+//! * `detect`: corners of a photograph and their descriptions
+//! * `pairs`: which photographs are compared, and what they have in common
+//! * `tracks`: corners that are one point, and where it lies
+//! * `adjust`: poses, focal lengths and points that fit together
+//!
+//! All is in double precision and does not depend on the number of threads.
+
+mod adjust;
+mod detect;
+mod pairs;
+#[cfg(test)]
+mod tests;
+mod tracks;
+
+use adjust::Bundle;
+use detect::{Corners, LONGEST, detect};
+use glam::{DVec2, DVec3};
+use gs_io::Result;
+use gs_scene::dataset::{Split, View};
+use gs_scene::{Camera, PointCloud, image_size};
+use pairs::{EXACT, matches, partners};
+use rayon::prelude::*;
+use stage::Stage;
+use tracks::{Point, Sighting, error, join, limit, place};
+
+/// Fewest points to start from: fewer tell less of a scene than random ones.
+pub(crate) const FEWEST_POINTS: usize = 100;
+/// Limits of a corner's error while poses are found, in [`EXACT`]s, and beyond which it counts less.
+const ROUNDS: [[f64; 2]; 4] = [[24.0, 4.0], [6.0, 2.0], [2.0, 1.0], [1.0, 0.5]];
+/// How far a corner may be off along given poses, in medians of all, and at most.
+const SPREAD: f64 = 3.0;
+const SLACKEST: f64 = 8.0;
+/// Fewest corners by which a view's pose is found.
+const FEWEST_SEEN: usize = 12;
+
+/// What the photographs tell.
+pub(crate) struct Found {
+    /// Of all views.
+    pub cameras: Vec<Camera>,
+    /// Points that training views show, with their colours.
+    pub points: PointCloud,
+}
+
+/// Corners of all views, and which of them are one point.
+struct Sights<'a> {
+    views: &'a [&'a View],
+    corners: Vec<Corners>,
+    tracks: Vec<Vec<Sighting>>,
+}
+
+/// Places the corners that training views share, with the cameras as they are given, or, where `refine` says so, with cameras that
+/// fit the corners: first those of the training views, with their focal lengths, then those of the others on the points found.
+pub(crate) fn find(views: &[&View], refine: bool, stage: &Stage) -> Result<Found> {
+    let given: Vec<Camera> = views.iter().map(|v| v.camera.clone()).collect();
+    let sights = Sights::of(views, &given, refine, stage)?;
+    let learns: Vec<bool> = views.iter().map(|v| v.split == Split::Train).collect();
+    let mut cameras = given.clone();
+    let (before, spread) = sights.placed(&cameras, &learns, SLACKEST);
+    if !refine {
+        let (points, _) = sights.placed(&cameras, &learns, (SPREAD * spread).clamp(1.0, SLACKEST));
+        stage.info(&format!(
+            "{} points from corners, which the poses miss by {} in the median",
+            points.len(),
+            pixels(&cameras, spread)
+        ));
+        if spread > 1.0 && points.len() >= FEWEST_POINTS {
+            stage.warn("the poses do not fit the photographs well: --refine-poses finds better ones");
+        }
+        return Ok(Found { points: sights.cloud(&points), cameras });
+    }
+    let lenses = lenses(&given);
+    for [slack, width] in ROUNDS {
+        stage.go_on()?;
+        let (mut points, _) = sights.placed(&cameras, &learns, slack);
+        let free = sights.held(&points, &learns);
+        Bundle { cameras: &mut cameras, given: &given, lenses: &lenses, free: &free, points: &mut points, all: true }
+            .adjust(width);
+    }
+    let (mut points, after) = sights.placed(&cameras, &learns, 1.0);
+    let cloud = sights.cloud(&points);
+    // The others, each by the points that it shows.
+    sights.show(&mut points, &learns);
+    let others: Vec<bool> = learns.iter().map(|l| !l).collect();
+    let free = sights.held(&points, &others);
+    for [_, width] in ROUNDS {
+        Bundle { cameras: &mut cameras, given: &given, lenses: &lenses, free: &free, points: &mut points, all: false }
+            .adjust(width);
+    }
+    stage.info(&format!(
+        "poses from {} corners, which they miss by {} in the median; those given missed {} by {}",
+        cloud.len(),
+        pixels(&cameras, after),
+        before.len(),
+        pixels(&given, spread)
+    ));
+    let found = (0..views.len()).filter(|&v| sights.count(&points, v) >= FEWEST_SEEN).count();
+    if found < views.len() {
+        stage.warn(&format!("{} of {} photographs have too few corners in common with others: the corners leave their poses as they are", views.len() - found, views.len()));
+    }
+    Ok(Found { cameras, points: cloud })
+}
+
+/// Bytes that [`find`] takes at once on so many threads, besides decoded photographs.
+pub(crate) fn bytes(views: &[&View], threads: u64) -> Result<u64> {
+    let of = |v: &&View| image_size(&v.image_path).map(detect::bytes);
+    Ok(threads * views.iter().map(of).collect::<Result<Vec<u64>>>()?.into_iter().max().unwrap_or(0))
+}
+
+/// An error of so many [`EXACT`]s, in words.
+fn pixels(cameras: &[Camera], error: f64) -> String {
+    format!("{:.2} pixels", error * limit(&cameras[0], EXACT))
+}
+
+/// The lens of each camera, by number: those of equal intrinsics are one.
+pub(crate) fn lenses(cameras: &[Camera]) -> Vec<usize> {
+    let same = |a: &Camera, b: &Camera| {
+        (a.width, a.height) == (b.width, b.height) && [a.fx, a.fy, a.cx, a.cy] == [b.fx, b.fy, b.cx, b.cy]
+    };
+    let mut firsts: Vec<&Camera> = Vec::new();
+    let of = cameras.iter().map(|c| {
+        firsts.iter().position(|f| same(f, c)).unwrap_or_else(|| {
+            firsts.push(c);
+            firsts.len() - 1
+        })
+    });
+    of.collect()
+}
+
+impl<'a> Sights<'a> {
+    /// Held-out views are looked at only where their poses are to be found.
+    fn of(views: &'a [&'a View], cameras: &[Camera], all: bool, stage: &Stage) -> Result<Self> {
+        let up = cameras.iter().map(|c| c.rotation.transpose() * -DVec3::Y).sum::<DVec3>();
+        let mut progress = stage.progress("photograph", views.len() as u64);
+        let mut corners = Vec::new();
+        // Few at a time: each takes the memory of a decoded photograph several times.
+        for views in views.chunks(2 * rayon::current_num_threads()) {
+            stage.go_on()?;
+            let own = views.par_iter().map(|v| {
+                if !all && v.split != Split::Train {
+                    return Ok(Corners::default());
+                }
+                // The corners of a photograph are finer than the pictures that are learnt from.
+                let image = v.load_image_within(LONGEST)?;
+                let mut corners = detect(&image, roll(&v.camera, up));
+                let to = [v.camera.width, v.camera.height].map(f64::from);
+                let from = [image.width, image.height].map(f64::from);
+                corners
+                    .at
+                    .iter_mut()
+                    .flatten()
+                    .zip([0, 1].into_iter().cycle())
+                    .for_each(|(x, k)| *x *= to[k] / from[k]);
+                Ok(corners)
+            });
+            corners.extend(own.collect::<Result<Vec<_>>>()?);
+            views.iter().for_each(|_| progress.step());
+        }
+        progress.finish(&[]);
+        let pairs = partners(cameras);
+        let compare = |&[i, j]: &[usize; 2]| ([i, j], matches([&corners[i], &corners[j]], [&cameras[i], &cameras[j]]));
+        let found: Vec<_> = pairs.par_iter().map(compare).collect();
+        stage.go_on()?;
+        let counts: Vec<usize> = corners.iter().map(|c| c.at.len()).collect();
+        stage.info(&format!(
+            "{} corners in {} photographs, {} matches in {} of {} pairs",
+            counts.iter().sum::<usize>(),
+            counts.iter().filter(|n| **n > 0).count(),
+            found.iter().map(|(_, m)| m.len()).sum::<usize>(),
+            found.iter().filter(|(_, m)| !m.is_empty()).count(),
+            pairs.len()
+        ));
+        Ok(Self { views, tracks: join(&counts, &found), corners })
+    }
+
+    fn at(&self, s: Sighting) -> DVec2 {
+        DVec2::from_array(self.corners[s.view].at[s.corner])
+    }
+
+    /// The points of the tracks by the views of `of`, and the median of their errors, in [`EXACT`]s.
+    fn placed(&self, cameras: &[Camera], of: &[bool], slack: f64) -> (Vec<Point>, f64) {
+        let one = |(i, track): (usize, &Vec<Sighting>)| {
+            let seen = track.iter().filter(|s| of[s.view]).map(|&s| (s, self.at(s))).collect();
+            place(i, seen, cameras, slack)
+        };
+        let points: Vec<Point> = self.tracks.par_iter().enumerate().filter_map(one).collect();
+        let errors = points.iter().flat_map(|p| {
+            p.seen.iter().filter_map(|(s, at)| {
+                let c = &cameras[s.view];
+                Some(error(c, p.place, *at)?.length() / limit(c, EXACT))
+            })
+        });
+        let errors: Vec<f64> = errors.collect();
+        let spread = if errors.is_empty() { 0.0 } else { median(errors) };
+        (points, spread)
+    }
+
+    /// In how many of the points a view is.
+    fn count(&self, points: &[Point], view: usize) -> usize {
+        points.iter().filter(|p| p.seen.iter().any(|(s, _)| s.view == view)).count()
+    }
+
+    /// Those of the views of `of` that see enough to be placed.
+    fn held(&self, points: &[Point], of: &[bool]) -> Vec<bool> {
+        let mut counts = vec![0; self.views.len()];
+        points.iter().flat_map(|p| &p.seen).for_each(|(s, _)| counts[s.view] += 1);
+        counts.iter().zip(of).map(|(&n, &of)| of && n >= FEWEST_SEEN).collect()
+    }
+
+    /// Adds to points where views other than those of `of` show them.
+    fn show(&self, points: &mut [Point], of: &[bool]) {
+        for p in points {
+            let track = &self.tracks[p.track];
+            p.seen.extend(track.iter().filter(|s| !of[s.view]).map(|&s| (s, self.at(s))));
+        }
+    }
+
+    fn cloud(&self, points: &[Point]) -> PointCloud {
+        let color = |p: &Point| {
+            let of = |c: usize| {
+                let sum: u32 = p.seen.iter().map(|(s, _)| u32::from(self.corners[s.view].colors[s.corner][c])).sum();
+                (sum / p.seen.len() as u32) as u8
+            };
+            [of(0), of(1), of(2)]
+        };
+        PointCloud {
+            positions: points.iter().map(|p| p.place.as_vec3().to_array()).collect(),
+            colors: points.iter().map(color).collect(),
+        }
+    }
+}
+
+/// The direction of the world's "up" in a picture, in radians from the picture's own; 0 where the camera looks along it.
+fn roll(c: &Camera, up: DVec3) -> f64 {
+    let up = c.rotation * up.normalize_or_zero();
+    if up.truncate().length() < 0.3 { 0.0 } else { up.x.atan2(-up.y) }
+}
+
+/// The middle of the values; of an even number the upper one.
+fn median(mut values: Vec<f64>) -> f64 {
+    let middle = values.len() / 2;
+    *values.select_nth_unstable_by(middle, f64::total_cmp).1
+}
+
+/// The solution of a symmetric positive system; none where it is not positive.
+fn solve<const N: usize>(mut a: [[f64; N]; N], mut b: [f64; N]) -> Option<[f64; N]> {
+    // Cholesky's factor, in the lower triangle.
+    for i in 0..N {
+        for j in 0..=i {
+            let sum = a[i][j] - (0..j).map(|k| a[i][k] * a[j][k]).sum::<f64>();
+            if i == j {
+                if !(sum > 0.0) {
+                    return None;
+                }
+                a[i][i] = sum.sqrt();
+            } else {
+                a[i][j] = sum / a[j][j];
+            }
+        }
+    }
+    for i in 0..N {
+        b[i] = (b[i] - (0..i).map(|k| a[i][k] * b[k]).sum::<f64>()) / a[i][i];
+    }
+    for i in (0..N).rev() {
+        b[i] = (b[i] - (i + 1..N).map(|k| a[k][i] * b[k]).sum::<f64>()) / a[i][i];
+    }
+    Some(b)
+}
