@@ -213,9 +213,9 @@ impl Sort {
 fn push_tiles(s: &Splat, [columns, rows]: [usize; 2], out: &mut Vec<u32>) {
     const SIDE: f32 = TILE as f32;
     let range = |low: f32, high: f32, count: usize| {
-        let low = (low / SIDE).floor().max(0.0) as usize;
-        let high = (high / SIDE).floor().max(-1.0) + 1.0;
-        low..(high as usize).min(count)
+        // Casts round towards zero and stop at the ends: floors that call no library.
+        let high = if high >= 0.0 { ((high / SIDE) as usize).saturating_add(1) } else { 0 };
+        (low / SIDE) as usize..high.min(count)
     };
     let [x, y] = s.mean;
     let [width, height] = s.extent;

@@ -124,10 +124,11 @@ impl Image {
     /// Bilinear value of channel values at pixel coordinates (centres at +0.5), the border repeated.
     pub(crate) fn sample(&self, x: f64, y: f64) -> [f32; 3] {
         let (w, h) = (self.width as usize, self.height as usize);
-        let mut out = [0.0; 3];
+        let (pixels, mut out) = (self.rgb.as_chunks::<3>().0, [0.0; 3]);
         for (at, weight) in corners(x, y, w, h) {
+            let pixel = &pixels[at];
             for c in 0..3 {
-                out[c] += weight * self.rgb[3 * at + c];
+                out[c] += weight * pixel[c];
             }
         }
         out
@@ -144,7 +145,8 @@ impl Image {
 fn corners(x: f64, y: f64, w: usize, h: usize) -> [(usize, f32); 4] {
     // max comes first: it turns NaN into 0.
     let (x, y) = ((x - 0.5).max(0.0).min((w - 1) as f64), (y - 0.5).max(0.0).min((h - 1) as f64));
-    let (x0, y0) = (x.floor() as usize, y.floor() as usize);
+    // Casts are floors of what is not negative, and call no library.
+    let (x0, y0) = (x as usize, y as usize);
     let (fx, fy) = ((x - x0 as f64) as f32, (y - y0 as f64) as f32);
     let (x1, y1) = ((x0 + 1).min(w - 1), (y0 + 1).min(h - 1));
     [
