@@ -395,15 +395,17 @@ fn splat_gradient<const DEPTH: bool>(s: &Splat, x: &Row, sums: &[Row; 7]) -> Spl
         moments[1][l] = moments[0][l] * dx;
         moments[2][l] = sums[1][l] * dx;
     }
-    let [g, g_y, g_yy, red, green, blue] = [0, 1, 2, 3, 4, 5].map(|k| folded(&sums[k]));
-    let [g_x, g_xx, g_xy] = moments.map(|row| folded(&row));
+    // One by one: a closure would be compiled without the processor's vectors.
+    let (g, g_y, g_yy) = (folded(&sums[0]), folded(&sums[1]), folded(&sums[2]));
+    let color = [folded(&sums[3]), folded(&sums[4]), folded(&sums[5])];
+    let (g_x, g_xx, g_xy) = (folded(&moments[0]), folded(&moments[1]), folded(&moments[2]));
     let [xx, xy, yy] = s.conic;
     SplatGradient {
         mean: [xx * g_x + xy * g_y, xy * g_x + yy * g_y],
         conic: [-0.5 * g_xx, -g_xy, -0.5 * g_yy],
         opacity: g / s.opacity,
         depth: if DEPTH { folded(&sums[6]) } else { 0.0 },
-        color: [red, green, blue],
+        color,
     }
 }
 

@@ -116,8 +116,8 @@ impl Image {
         Self {
             width,
             height,
-            rgb: resize_planes(&self.rgb, 3, size, to),
-            alpha: self.alpha.as_ref().map(|a| resize_planes(a, 1, size, to)),
+            rgb: resize_planes::<3>(&self.rgb, size, to),
+            alpha: self.alpha.as_ref().map(|a| resize_planes::<1>(a, size, to)),
         }
     }
 
@@ -177,20 +177,22 @@ fn axis_weights(from: usize, to: usize) -> Vec<Vec<(usize, f32)>> {
         .collect()
 }
 
-fn resize_planes(data: &[f32], channels: usize, (w, h): (usize, usize), (to_w, to_h): (usize, usize)) -> Vec<f32> {
+fn resize_planes<const CHANNELS: usize>(data: &[f32], (w, h): (usize, usize), to: (usize, usize)) -> Vec<f32> {
+    let (to_w, to_h) = to;
     let (wx, wy) = (axis_weights(w, to_w), axis_weights(h, to_h));
-    let mut out = vec![0.0; to_w * to_h * channels];
-    out.par_chunks_mut(to_w * channels).zip(&wy).for_each(|(row, rows)| {
-        let mut line = vec![0.0f32; w * channels];
+    let mut out = vec![0.0; to_w * to_h * CHANNELS];
+    out.par_chunks_mut(to_w * CHANNELS).zip(&wy).for_each(|(row, rows)| {
+        let mut line = vec![0.0f32; w * CHANNELS];
         for &(y, weight) in rows {
-            for (l, s) in line.iter_mut().zip(&data[y * w * channels..(y + 1) * w * channels]) {
+            for (l, s) in line.iter_mut().zip(&data[y * w * CHANNELS..(y + 1) * w * CHANNELS]) {
                 *l += weight * s;
             }
         }
-        for (x, cols) in wx.iter().enumerate() {
-            for &(i, weight) in cols {
-                for c in 0..channels {
-                    row[x * channels + c] += weight * line[i * channels + c];
+        let line = line.as_chunks::<CHANNELS>().0;
+        for (pixel, columns) in row.as_chunks_mut::<CHANNELS>().0.iter_mut().zip(&wx) {
+            for &(i, weight) in columns {
+                for (p, v) in pixel.iter_mut().zip(&line[i]) {
+                    *p += weight * v;
                 }
             }
         }

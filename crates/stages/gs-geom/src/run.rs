@@ -11,6 +11,7 @@ use crate::densification::Way;
 use crate::options::{Args, Background, Command, PictureSizes, Preset, Train};
 use crate::photographs::masks::Masks;
 use crate::photographs::{Photographs, full_share};
+use crate::training::schedule::LearningRates;
 use crate::training::{Recipe, Trainer, checkpoint};
 use artifacts::role;
 use forecast::{cache_bytes, forecast_start, most_gaussians};
@@ -116,6 +117,11 @@ impl Train {
         if let Some(Way::Adaptive(way)) = &mut recipe.densification {
             way.gradient = self.densify_gradient.unwrap_or(way.gradient);
             way.max_scale = self.preset.map(|Preset::Stock| STOCK_MAX_SCALE);
+        }
+        if self.preset == Some(Preset::Stock) {
+            let stock = LearningRates::default();
+            let position = recipe.rates.position.min(stock.position);
+            recipe.rates = LearningRates { position, ..stock };
         }
         recipe.growth.every = self.densify_every.unwrap_or(recipe.growth.every);
         recipe.growth.max_gaussians = max_gaussians;
