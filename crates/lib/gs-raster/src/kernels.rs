@@ -409,16 +409,15 @@ fn splat_gradient<const DEPTH: bool>(s: &Splat, x: &Row, sums: &[Row; 7]) -> Spl
     }
 }
 
-/// The sum of a row's columns, halves added to halves: the same order for any width of vectors.
+/// The sum of a row's columns, halves added to halves: the same order for any width of vectors. (Loops of constant length
+/// become vectors; one over the halves does not.)
 #[inline(always)]
 fn folded(row: &Row) -> f32 {
-    let mut row = *row;
-    for half in [8, 4, 2, 1] {
-        for l in 0..half {
-            row[l] += row[l + half];
-        }
+    let mut quarter = [0.0f32; 4];
+    for l in 0..4 {
+        quarter[l] = (row[l] + row[l + 8]) + (row[l + 4] + row[l + 12]);
     }
-    row[0]
+    (quarter[0] + quarter[2]) + (quarter[1] + quarter[3])
 }
 
 /// Alphas and blending weights of every Gaussian at every pixel of a tile, `[list][TILE * TILE]`, both zero on entry. With
