@@ -119,9 +119,8 @@ impl Train {
             way.max_scale = self.preset.map(|Preset::Stock| STOCK_MAX_SCALE);
         }
         if self.preset == Some(Preset::Stock) {
-            let stock = LearningRates::default();
-            let position = recipe.rates.position.min(stock.position);
-            recipe.rates = LearningRates { position, ..stock };
+            // --densify fixed keeps the centres.
+            recipe.rates = LearningRates { position: recipe.rates.position, ..LearningRates::default() };
         }
         recipe.growth.every = self.densify_every.unwrap_or(recipe.growth.every);
         recipe.growth.max_gaussians = max_gaussians;
