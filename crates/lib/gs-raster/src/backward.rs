@@ -128,22 +128,31 @@ fn pixel_gradients(
         behind: [0.0; PIXELS],
     });
     let r = &forward.rendered;
-    let w = r.width as usize;
+    let (w, back) = (r.width as usize, options.background);
     for y in 0..th {
-        for x in 0..tw {
-            let (from, to) = ((y0 + y) * w + x0 + x, y * TILE + x);
-            let mut d_alpha = d.alpha.map_or(0.0, |a| a[from]);
-            let d_depth = d.depth.map_or(0.0, |z| z[from]);
-            let mut behind = if d.depth.is_some() { d_depth * r.depth[from] } else { 0.0 };
+        let (from, to) = ((y0 + y) * w + x0, y * TILE);
+        let row = |of: &[f32], at: &mut [f32]| at[to..to + tw].copy_from_slice(&of[from..from + tw]);
+        if let Some(alpha) = d.alpha {
+            row(alpha, &mut tile.alpha);
+        }
+        if let Some(depth) = d.depth {
+            row(depth, &mut tile.depth);
+            let products = depth[from..from + tw].iter().zip(&r.depth[from..from + tw]).map(|(d, z)| d * z);
+            tile.behind[to..to + tw].iter_mut().zip(products).for_each(|(behind, v)| *behind = v);
+        }
+        let own = 3 * from..3 * (from + tw);
+        let [of_loss, rendered] = [d.rgb, &r.rgb].map(|all| all[own.clone()].as_chunks::<3>().0);
+        for (x, (g, rgb)) in of_loss.iter().zip(rendered).enumerate() {
+            let (alpha, at) = (r.alpha[from + x], to + x);
+            let left = 1.0 - alpha;
+            let (mut d_alpha, mut behind) = (tile.alpha[at], tile.behind[at]);
             for c in 0..3 {
-                let g = d.rgb[3 * from + c];
-                tile.rgb[c][to] = g;
-                d_alpha -= options.background[c] * g;
-                behind += g * (r.rgb[3 * from + c] - (1.0 - r.alpha[from]) * options.background[c]);
+                tile.rgb[c][at] = g[c];
+                d_alpha -= back[c] * g[c];
+                behind += g[c] * (rgb[c] - left * back[c]);
             }
-            tile.depth[to] = d_depth;
-            tile.alpha[to] = d_alpha;
-            tile.behind[to] = behind + d_alpha * r.alpha[from];
+            tile.alpha[at] = d_alpha;
+            tile.behind[at] = behind + d_alpha * alpha;
         }
     }
     tile

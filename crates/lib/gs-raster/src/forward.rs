@@ -61,6 +61,7 @@ pub(crate) fn composite(tiles: &Tiles, options: &RasterOptions, rendered: &mut R
     rendered.rgb.resize(w * h * 3, 0.0);
     rendered.alpha.resize(w * h, 0.0);
     rendered.depth.resize(if options.depth { w * h } else { 0 }, 0.0);
+    let back = options.background;
     // A band of tiles owns whole image rows, so bands can be written side by side.
     let bands = rendered
         .rgb
@@ -78,16 +79,17 @@ pub(crate) fn composite(tiles: &Tiles, options: &RasterOptions, rendered: &mut R
             let p = forward_tile(tile, options.depth);
             evaluated += p.evaluated;
             for y in 0..th {
-                for x in 0..tw {
-                    let (from, to) = (y * TILE + x, y * w + x0 + x);
-                    let left = p.transmittance[from];
-                    for c in 0..3 {
-                        rgb[3 * to + c] = p.rgb[c][from] + left * options.background[c];
-                    }
-                    alpha[to] = 1.0 - left;
-                    if options.depth {
-                        depth[to] = p.depth[from];
-                    }
+                let (from, to) = (y * TILE, y * w + x0);
+                let left = &p.transmittance[from..from + tw];
+                let [red, green, blue] = [0, 1, 2].map(|c| &p.rgb[c][from..from + tw]);
+                let colors = red.iter().zip(green).zip(blue).zip(left);
+                let pixels = rgb[3 * to..3 * (to + tw)].as_chunks_mut::<3>().0;
+                for (pixel, (((r, g), b), left)) in pixels.iter_mut().zip(colors) {
+                    *pixel = [r + left * back[0], g + left * back[1], b + left * back[2]];
+                }
+                alpha[to..to + tw].iter_mut().zip(left).for_each(|(alpha, left)| *alpha = 1.0 - left);
+                if options.depth {
+                    depth[to..to + tw].copy_from_slice(&p.depth[from..from + tw]);
                 }
             }
         }

@@ -395,28 +395,29 @@ fn splat_gradient<const DEPTH: bool>(s: &Splat, x: &Row, sums: &[Row; 7]) -> Spl
         moments[1][l] = moments[0][l] * dx;
         moments[2][l] = sums[1][l] * dx;
     }
-    let [g, g_y, g_yy, red, green, blue] = [0, 1, 2, 3, 4, 5].map(|k| folded(&sums[k]));
-    let [g_x, g_xx, g_xy] = moments.map(|row| folded(&row));
+    // One by one: a closure would be compiled without the processor's vectors.
+    let (g, g_y, g_yy) = (folded(&sums[0]), folded(&sums[1]), folded(&sums[2]));
+    let color = [folded(&sums[3]), folded(&sums[4]), folded(&sums[5])];
+    let (g_x, g_xx, g_xy) = (folded(&moments[0]), folded(&moments[1]), folded(&moments[2]));
     let [xx, xy, yy] = s.conic;
     SplatGradient {
         mean: [xx * g_x + xy * g_y, xy * g_x + yy * g_y],
         conic: [-0.5 * g_xx, -g_xy, -0.5 * g_yy],
         opacity: g / s.opacity,
         depth: if DEPTH { folded(&sums[6]) } else { 0.0 },
-        color: [red, green, blue],
+        color,
     }
 }
 
-/// The sum of a row's columns, halves added to halves: the same order for any width of vectors.
+/// The sum of a row's columns, halves added to halves: the same order for any width of vectors. (Loops of constant length
+/// become vectors; one over the halves does not.)
 #[inline(always)]
 fn folded(row: &Row) -> f32 {
-    let mut row = *row;
-    for half in [8, 4, 2, 1] {
-        for l in 0..half {
-            row[l] += row[l + half];
-        }
+    let mut quarter = [0.0f32; 4];
+    for l in 0..4 {
+        quarter[l] = (row[l] + row[l + 8]) + (row[l + 4] + row[l + 12]);
     }
-    row[0]
+    (quarter[0] + quarter[2]) + (quarter[1] + quarter[3])
 }
 
 /// Alphas and blending weights of every Gaussian at every pixel of a tile, `[list][TILE * TILE]`, both zero on entry. With

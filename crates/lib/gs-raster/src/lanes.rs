@@ -21,10 +21,32 @@ fn set<const N: usize>(lanes: &mut [Lane; N], l: usize, values: [f32; N]) {
     }
 }
 
-/// Lane `l` of each value.
+/// Lane `l` of each value. (A loop: calls of `from_fn` or `map` keep the loops over lanes from becoming vectors.)
 #[inline(always)]
 fn get<const N: usize>(lanes: &[Lane; N], l: usize) -> [f32; N] {
-    std::array::from_fn(|k| lanes[k][l])
+    let mut values = [0.0; N];
+    for k in 0..N {
+        values[k] = lanes[k][l];
+    }
+    values
+}
+
+/// Lane `l` of each value, in double precision.
+#[inline(always)]
+fn wide<const N: usize>(lanes: &[Lane; N], l: usize) -> [f64; N] {
+    let mut values = [0.0; N];
+    for k in 0..N {
+        values[k] = f64::from(lanes[k][l]);
+    }
+    values
+}
+
+/// Sets lane `l` of each value, rounded to single precision.
+#[inline(always)]
+fn round<const N: usize>(lanes: &mut [Lane; N], l: usize, values: [f64; N]) {
+    for k in 0..N {
+        lanes[k][l] = values[k] as f32;
+    }
 }
 
 /// Projects the Gaussians `range`, in pieces of [`LANES`] at most, and calls `seen` for those that are drawn; the others are
@@ -71,7 +93,7 @@ pub(crate) fn project_range(
 #[multiversion(targets("x86_64+avx512f+avx512vl", "x86_64+avx2"))]
 fn project_lanes(p: &Parameters<Lane>, lens: &Lens, options: &RasterOptions, out: &mut Projected<Lane>) {
     for l in 0..LANES {
-        set(out, l, project(&get(p, l).map(f64::from), lens, options).map(|v| v as f32));
+        round(out, l, project(&wide(p, l), lens, options));
     }
 }
 
@@ -91,7 +113,7 @@ fn basis_lanes(p: &Parameters<Lane>, lens: &Lens, degree: u8, out: &mut Basis) {
 #[multiversion(targets("x86_64+avx512f+avx512vl", "x86_64+avx2"))]
 fn basis_of<const DEGREE: u8>(p: &Parameters<Lane>, lens: &Lens, out: &mut Basis) {
     for l in 0..LANES {
-        let b = sh::basis(DEGREE, sh::unit(lens.direction(&get(p, l).map(f64::from))).0);
+        let b = sh::basis(DEGREE, sh::unit(lens.direction(&wide(p, l))).0);
         for k in 0..const { sh_coefficients(DEGREE) } {
             out[k][l] = b[k] as f32;
         }
@@ -160,14 +182,14 @@ impl Backward {
 #[multiversion(targets("x86_64+avx512f+avx512vl", "x86_64+avx2"))]
 fn backward_of<const DEGREE: u8>(p: &Backward, lens: &Lens, options: &RasterOptions, out: &mut Parameters<Lane>) {
     for l in 0..LANES {
-        let [x, y, xx, xy, yy, opacity, depth] = get(&p.ellipse, l).map(f64::from);
+        let [x, y, xx, xy, yy, opacity, depth] = wide(&p.ellipse, l);
         let d = SplatGradient { mean: [x, y], conic: [xx, xy, yy], opacity, depth, color: [0.0; 3] };
-        set(out, l, project_backward(&get(&p.inputs, l).map(f64::from), lens, options, &d).map(|v| v as f32));
+        round(out, l, project_backward(&wide(&p.inputs, l), lens, options, &d));
     }
     if DEGREE > 0 {
         for l in 0..LANES {
-            let direction = lens.direction(&get(&p.inputs, l).map(f64::from));
-            let d = sh::direction_gradient(DEGREE, direction, &get(&p.weights, l).map(f64::from));
+            let direction = lens.direction(&wide(&p.inputs, l));
+            let d = sh::direction_gradient(DEGREE, direction, &wide(&p.weights, l));
             for k in 0..3 {
                 out[k][l] += d[k] as f32;
             }

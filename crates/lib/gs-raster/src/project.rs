@@ -353,7 +353,7 @@ pub(crate) fn project_backward(
     d_t[2] += -rz2 * (fx * e.t[0] * d.mean[0] + fy * e.t[1] * d.mean[1]) + d.depth;
 
     // ma = S (R^T jw0): d S is d_ma times what it stretches, which is ma / S; and d S S the gradient of log S.
-    let [a, b, c] = [0, 1, 2].map(|k| d_ma[k] * e.a[k] + d_mb[k] * e.b[k]);
+    let DVec3 { x: a, y: b, z: c } = d_ma * e.a + d_mb * e.b;
     // d R = jw0 (S d_ma)^T + jw1 (S d_mb)^T.
     let row = |r: usize| d_ma_s * e.jw[0][r] + d_mb_s * e.jw[1][r];
     let d_quat = quat_backward(e.quat, &[row(0), row(1), row(2)]);
@@ -361,7 +361,8 @@ pub(crate) fn project_backward(
     let q = e.quat;
     let along = q[0] * d_quat[0] + q[1] * d_quat[1] + q[2] * d_quat[2] + q[3] * d_quat[3];
     let DVec3 { x, y, z } = lens.back * d_t;
-    let [qw, qx, qy, qz] = [0, 1, 2, 3].map(|k| (d_quat[k] - along * q[k]) / e.quat_norm);
+    let across = |k: usize| (d_quat[k] - along * q[k]) / e.quat_norm;
+    let [qw, qx, qy, qz] = [across(0), across(1), across(2), across(3)];
     let opacity_logit = d.opacity * e.own_opacity * e.compensation * (1.0 - e.own_opacity);
     [x, y, z, a, b, c, qw, qx, qy, qz, opacity_logit]
 }

@@ -110,35 +110,44 @@ impl Tiles {
         let chunks = self.chunks.par_iter_mut().enumerate();
         chunks.for_each(|(c, chunk)| chunk.fill(g, c, &lens, options, [columns, rows]));
 
-        self.dropped = Dropped::default();
-        self.index.clear();
-        self.splats.clear();
-        self.places.clear();
-        self.first.clear();
-        self.first.push(0);
-        let mut end = 0;
-        for chunk in &self.chunks {
-            self.index.extend_from_slice(&chunk.index);
-            self.splats.extend_from_slice(&chunk.splats);
-            self.places.extend_from_slice(&chunk.touched);
-            self.first.extend(chunk.counts.iter().map(|n| {
-                end += n;
-                end
-            }));
-            self.dropped.add(&chunk.dropped);
-        }
-
-        self.offsets.clear();
-        self.offsets.resize(columns * rows + 1, 0);
-        for &t in &self.places {
-            self.offsets[t as usize + 1] += 1;
-        }
-        for t in 0..columns * rows {
-            self.offsets[t + 1] += self.offsets[t];
-        }
+        let Self { chunks, index, splats, places, first, offsets, dropped, sort, .. } = self;
+        // Two parts that need nothing of each other.
+        let copy = || {
+            index.clear();
+            splats.clear();
+            for chunk in &*chunks {
+                index.extend_from_slice(&chunk.index);
+                splats.extend_from_slice(&chunk.splats);
+            }
+        };
+        let list = || {
+            *dropped = Dropped::default();
+            places.clear();
+            first.clear();
+            first.push(0);
+            let mut end = 0;
+            for chunk in &*chunks {
+                places.extend_from_slice(&chunk.touched);
+                first.extend(chunk.counts.iter().map(|n| {
+                    end += n;
+                    end
+                }));
+                dropped.add(&chunk.dropped);
+            }
+            offsets.clear();
+            offsets.resize(columns * rows + 1, 0);
+            for &t in &*places {
+                offsets[t as usize + 1] += 1;
+            }
+            for t in 0..columns * rows {
+                offsets[t + 1] += offsets[t];
+            }
+            sort.by_depth(chunks.iter().flat_map(|chunk| &chunk.splats));
+        };
+        rayon::join(copy, list);
         self.entries.resize(self.places.len(), 0);
         // Tiles become places in their lists; each list's end moves through it, and is the next one's beginning at the end.
-        for &i in self.sort.by_depth(&self.splats) {
+        for &i in &self.sort.order {
             for place in &mut self.places[self.first[i as usize] as usize..self.first[i as usize + 1] as usize] {
                 let next = &mut self.offsets[*place as usize];
                 *place = *next;
@@ -174,12 +183,13 @@ struct Sort {
 }
 
 impl Sort {
-    /// Positions in `splats`, front to back.
-    fn by_depth(&mut self, splats: &[Splat]) -> &[u32] {
+    /// Puts the positions of splats into `order`, front to back.
+    fn by_depth<'a>(&mut self, splats: impl Iterator<Item = &'a Splat>) {
         self.pairs.clear();
         // Positive floats sort as their bits do.
-        self.pairs.extend(splats.iter().zip(0..).map(|(s, i)| (s.depth.to_bits(), i)));
-        self.other.resize(splats.len(), (0, 0));
+        self.pairs.extend(splats.zip(0..).map(|(s, i)| (s.depth.to_bits(), i)));
+        let count = self.pairs.len();
+        self.other.resize(count, (0, 0));
         let digit = |key: u32, pass: usize| (key >> (pass * DIGIT)) as usize & ((1 << DIGIT) - 1);
         let mut counts = [[0u32; 1 << DIGIT]; 32usize.div_ceil(DIGIT)];
         for (key, _) in &self.pairs {
@@ -188,7 +198,7 @@ impl Sort {
             }
         }
         for (pass, counts) in counts.iter_mut().enumerate() {
-            if counts.iter().any(|&n| n as usize == splats.len()) {
+            if counts.iter().any(|&n| n as usize == count) {
                 continue;
             }
             let mut begin = 0;
@@ -204,7 +214,6 @@ impl Sort {
         }
         self.order.clear();
         self.order.extend(self.pairs.iter().map(|(_, i)| i));
-        &self.order
     }
 }
 
@@ -213,9 +222,9 @@ impl Sort {
 fn push_tiles(s: &Splat, [columns, rows]: [usize; 2], out: &mut Vec<u32>) {
     const SIDE: f32 = TILE as f32;
     let range = |low: f32, high: f32, count: usize| {
-        let low = (low / SIDE).floor().max(0.0) as usize;
-        let high = (high / SIDE).floor().max(-1.0) + 1.0;
-        low..(high as usize).min(count)
+        // Casts round towards zero and stop at the ends: floors that call no library.
+        let high = if high >= 0.0 { ((high / SIDE) as usize).saturating_add(1) } else { 0 };
+        (low / SIDE) as usize..high.min(count)
     };
     let [x, y] = s.mean;
     let [width, height] = s.extent;

@@ -116,18 +116,19 @@ impl Image {
         Self {
             width,
             height,
-            rgb: resize_planes(&self.rgb, 3, size, to),
-            alpha: self.alpha.as_ref().map(|a| resize_planes(a, 1, size, to)),
+            rgb: resize_planes::<3>(&self.rgb, size, to),
+            alpha: self.alpha.as_ref().map(|a| resize_planes::<1>(a, size, to)),
         }
     }
 
     /// Bilinear value of channel values at pixel coordinates (centres at +0.5), the border repeated.
     pub(crate) fn sample(&self, x: f64, y: f64) -> [f32; 3] {
         let (w, h) = (self.width as usize, self.height as usize);
-        let mut out = [0.0; 3];
+        let (pixels, mut out) = (self.rgb.as_chunks::<3>().0, [0.0; 3]);
         for (at, weight) in corners(x, y, w, h) {
+            let pixel = &pixels[at];
             for c in 0..3 {
-                out[c] += weight * self.rgb[3 * at + c];
+                out[c] += weight * pixel[c];
             }
         }
         out
@@ -144,7 +145,8 @@ impl Image {
 fn corners(x: f64, y: f64, w: usize, h: usize) -> [(usize, f32); 4] {
     // max comes first: it turns NaN into 0.
     let (x, y) = ((x - 0.5).max(0.0).min((w - 1) as f64), (y - 0.5).max(0.0).min((h - 1) as f64));
-    let (x0, y0) = (x.floor() as usize, y.floor() as usize);
+    // Casts are floors of what is not negative, and call no library.
+    let (x0, y0) = (x as usize, y as usize);
     let (fx, fy) = ((x - x0 as f64) as f32, (y - y0 as f64) as f32);
     let (x1, y1) = ((x0 + 1).min(w - 1), (y0 + 1).min(h - 1));
     [
@@ -175,20 +177,22 @@ fn axis_weights(from: usize, to: usize) -> Vec<Vec<(usize, f32)>> {
         .collect()
 }
 
-fn resize_planes(data: &[f32], channels: usize, (w, h): (usize, usize), (to_w, to_h): (usize, usize)) -> Vec<f32> {
+fn resize_planes<const CHANNELS: usize>(data: &[f32], (w, h): (usize, usize), to: (usize, usize)) -> Vec<f32> {
+    let (to_w, to_h) = to;
     let (wx, wy) = (axis_weights(w, to_w), axis_weights(h, to_h));
-    let mut out = vec![0.0; to_w * to_h * channels];
-    out.par_chunks_mut(to_w * channels).zip(&wy).for_each(|(row, rows)| {
-        let mut line = vec![0.0f32; w * channels];
+    let mut out = vec![0.0; to_w * to_h * CHANNELS];
+    out.par_chunks_mut(to_w * CHANNELS).zip(&wy).for_each(|(row, rows)| {
+        let mut line = vec![0.0f32; w * CHANNELS];
         for &(y, weight) in rows {
-            for (l, s) in line.iter_mut().zip(&data[y * w * channels..(y + 1) * w * channels]) {
+            for (l, s) in line.iter_mut().zip(&data[y * w * CHANNELS..(y + 1) * w * CHANNELS]) {
                 *l += weight * s;
             }
         }
-        for (x, cols) in wx.iter().enumerate() {
-            for &(i, weight) in cols {
-                for c in 0..channels {
-                    row[x * channels + c] += weight * line[i * channels + c];
+        let line = line.as_chunks::<CHANNELS>().0;
+        for (pixel, columns) in row.as_chunks_mut::<CHANNELS>().0.iter_mut().zip(&wx) {
+            for &(i, weight) in columns {
+                for (p, v) in pixel.iter_mut().zip(&line[i]) {
+                    *p += weight * v;
                 }
             }
         }

@@ -1,7 +1,7 @@
 //! Quality for the time: trains scenes in alternative ways and writes figures (JSON) and a table (Markdown).
 //!
-//! `cargo bench -p gs-geom --bench geom -- OUT.json NAME=FOLDER@RESOLUTION...`, with `ITERATIONS`, `SEEDS` and
-//! `MAX_GAUSSIANS` from the environment. Each run is a process of its own on one thread, and its figures are over processor
+//! `cargo bench -p gs-geom --bench geom -- OUT.json NAME=FOLDER@RESOLUTION...`, with `ITERATIONS`, `SEEDS`, `ONLY` (settings,
+//! with commas) and `MAX_GAUSSIANS` (the program's default where it is empty) from the environment. Each run is a process of its own on one thread, and its figures are over processor
 //! time, because other programs stretch wall-clock time. Runs whose result lies beside the JSON are not run again. Scenes
 //! whose folder is missing are skipped.
 
@@ -14,11 +14,12 @@ use serde_json::{Value, json};
 use std::path::{Path, PathBuf};
 
 /// The alternatives: a name and the options that make it.
-const SETTINGS: [(&str, &[&str]); 4] = [
-    ("3DGS", &["--schedule", "full"]),
-    ("coarse", &["--schedule", "coarse"]),
+const SETTINGS: [(&str, &[&str]); 5] = [
+    ("defaults", &[]),
+    ("preset 3dgs", &["--preset", "3dgs"]),
+    ("full", &["--schedule", "full"]),
     ("mcmc", &["--densify", "mcmc", "--schedule", "full"]),
-    ("antialias", &["--schedule", "coarse", "--antialias"]),
+    ("antialias", &["--antialias"]),
 ];
 
 /// The figures of a run.
@@ -39,7 +40,8 @@ fn main() -> Result<(), String> {
     let mut arguments = std::env::args().skip(1).filter(|a| a != "--bench");
     let out = PathBuf::from(arguments.next().ok_or("which file to write?")?);
     let (iterations, seeds) = (numbers("ITERATIONS", "500,2000")?, numbers("SEEDS", "3")?[0]);
-    let most = setting("MAX_GAUSSIANS", "30000");
+    let (most, only) = (setting("MAX_GAUSSIANS", ""), setting("ONLY", ""));
+    let only: Vec<&str> = only.split(',').filter(|name| !name.is_empty()).collect();
     let mut all = Vec::new();
     let mut table = "| scene | setting | iterations | PSNR (least to most) | SSIM | Gaussians | CPU s | it per CPU s | peak MB |\n|---|---|---|---|---|---|---|---|---|\n".to_string();
     for scene in arguments {
@@ -49,14 +51,18 @@ fn main() -> Result<(), String> {
             eprintln!("skipping {name}: no folder {folder}");
             continue;
         }
-        for (setting, options) in SETTINGS {
+        for (setting, options) in SETTINGS.iter().filter(|s| only.is_empty() || only.contains(&s.0)) {
             for &n in &iterations {
                 let mut runs = Vec::new();
                 for seed in 0..seeds {
                     let file = format!("{name}-{resolution}-{setting}-{n}-{most}-{seed}.ply");
                     let (n, seed) = (n.to_string(), seed.to_string());
-                    let more = ["--threads", "1", "--max-gaussians", &most, "--resolution", resolution];
-                    let more = [&more[..], &["--iterations", &n, "--seed", &seed], options].concat();
+                    let mut more =
+                        vec!["--threads", "1", "--resolution", resolution, "--iterations", &n, "--seed", &seed];
+                    if !most.is_empty() {
+                        more.extend(["--max-gaussians", &most]);
+                    }
+                    more.extend(*options);
                     runs.push(train(Path::new(folder), &out.with_extension("runs").join(file), &more)?);
                 }
                 let (group, row) = group(name, setting, n, &runs);

@@ -107,6 +107,8 @@ pub fn ssim(pair: Pair<'_>, d: &mut Derivatives) -> f64 {
 struct Scratch {
     /// A row with a window's half width of zero pixels on both sides.
     padded: Vec<f32>,
+    /// A row of zeros.
+    zeros: Vec<f32>,
     /// Rows after the horizontal pass, `[map][row]`, the band's and its neighbours'.
     rows: Vec<f32>,
     /// The band after both passes, `[map][row]`.
@@ -151,6 +153,7 @@ impl Scratch {
         let (have, want) = (last - first, y1 - y0);
         self.padded.clear();
         self.padded.resize(row + 6 * RADIUS, 0.0);
+        self.zeros.resize(row, 0.0);
         self.rows.resize(MAPS * have * row, 0.0);
         self.out.resize(MAPS * want * row, 0.0);
         for map in 0..MAPS {
@@ -161,7 +164,7 @@ impl Scratch {
             }
             let out = &mut self.out[map * want * row..(map + 1) * want * row];
             for (y, out) in (y0..y1).zip(out.chunks_exact_mut(row)) {
-                blur_column(rows, y - first, out);
+                blur_column(rows, &self.zeros, y - first, out);
             }
         }
         std::array::from_fn(|map| &self.out[map * want * row..(map + 1) * want * row])
@@ -172,41 +175,38 @@ impl Scratch {
 #[multiversion(targets("x86_64+avx512f+avx512vl", "x86_64+avx2"))]
 fn blur_row(padded: &[f32], out: &mut [f32]) {
     let n = out.len();
-    for (o, &c) in out.iter_mut().zip(&padded[3 * RADIUS..][..n]) {
-        *o = TAPS[RADIUS] * c;
-    }
-    for (k, &tap) in TAPS[..RADIUS].iter().enumerate() {
-        let (left, right) = (&padded[3 * k..][..n], &padded[6 * RADIUS - 3 * k..][..n]);
-        for ((o, &l), &r) in out.iter_mut().zip(left).zip(right) {
-            *o += tap * (l + r);
-        }
-    }
+    weigh(
+        &padded[3 * RADIUS..][..n],
+        std::array::from_fn(|k| [&padded[3 * k..][..n], &padded[6 * RADIUS - 3 * k..][..n]]),
+        out,
+    );
 }
 
-/// Vertical pass around row `centre` of `rows`; rows beyond either end count as zero.
+/// Vertical pass around row `centre` of `rows`; rows beyond either end are `zeros`.
 #[multiversion(targets("x86_64+avx512f+avx512vl", "x86_64+avx2"))]
-fn blur_column(rows: &[f32], centre: usize, out: &mut [f32]) {
+fn blur_column(rows: &[f32], zeros: &[f32], centre: usize, out: &mut [f32]) {
     let n = out.len();
-    let at = |y: usize| rows.get(y * n..(y + 1) * n);
-    for (o, &c) in out.iter_mut().zip(&rows[centre * n..][..n]) {
-        *o = TAPS[RADIUS] * c;
-    }
-    for (k, &tap) in TAPS[..RADIUS].iter().enumerate() {
-        let above = centre.checked_sub(RADIUS - k).and_then(at);
-        let below = at(centre + RADIUS - k);
-        match (above, below) {
-            (Some(above), Some(below)) => {
-                for ((o, &a), &b) in out.iter_mut().zip(above).zip(below) {
-                    *o += tap * (a + b);
-                }
-            }
-            (Some(one), None) | (None, Some(one)) => {
-                for (o, &v) in out.iter_mut().zip(one) {
-                    *o += tap * v;
-                }
-            }
-            (None, None) => {}
-        }
+    let at = |y: Option<usize>| y.and_then(|y| rows.get(y * n..(y + 1) * n)).unwrap_or(&zeros[..n]);
+    let pair = |k: usize| [at(centre.checked_sub(RADIUS - k)), at(Some(centre + RADIUS - k))];
+    weigh(at(Some(centre)), std::array::from_fn(pair), out);
+}
+
+/// The window's sum: its centre, and pairs of rows as far from it on both sides, from the far end.
+#[inline(always)]
+fn weigh(centre: &[f32], pairs: [[&[f32]; 2]; RADIUS], out: &mut [f32]) {
+    let n = out.len();
+    let centre = &centre[..n];
+    let [[a0, a1], [b0, b1], [c0, c1], [d0, d1], [e0, e1]] = pairs;
+    let [a0, a1, b0, b1, c0] = [&a0[..n], &a1[..n], &b0[..n], &b1[..n], &c0[..n]];
+    let [c1, d0, d1, e0, e1] = [&c1[..n], &d0[..n], &d1[..n], &e0[..n], &e1[..n]];
+    // One loop without another in it becomes vectors, whose sums stay in registers.
+    for i in 0..n {
+        let sum = TAPS[RADIUS] * centre[i];
+        let sum = sum + TAPS[0] * (a0[i] + a1[i]);
+        let sum = sum + TAPS[1] * (b0[i] + b1[i]);
+        let sum = sum + TAPS[2] * (c0[i] + c1[i]);
+        let sum = sum + TAPS[3] * (d0[i] + d1[i]);
+        out[i] = sum + TAPS[4] * (e0[i] + e1[i]);
     }
 }
 

@@ -75,6 +75,7 @@ fn resets_heal_and_large_gaussians_stay_unless_asked() {
     let psnr = |reset_every: u32, max_scale: Option<f32>| {
         let mut recipe = Recipe::new(Strategy::Adaptive, 500);
         recipe.schedule = recipe.schedule.coarse_to_fine();
+        recipe.rates = LearningRates::default();
         recipe.densification = Some(Way::Adaptive(Adaptive { reset_every, max_scale, ..Adaptive::default() }));
         recipe.growth = Growth { until: 300, max_gaussians: 10_000, ..recipe.growth };
         trained(&recipe, 1 << 30, &[]).1
