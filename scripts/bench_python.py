@@ -4,10 +4,11 @@
     scripts/bench_python.py OUT.md [--points 10000x2,1000000x6] [--runs 3]
 
 Each fit runs in a process of its own on all cores, on 40 blobs of different density with 15 % scattered points. Seconds are those of
-the fit alone, after a small one that compiles what is compiled late: of the clock, and of all processors together, which other work on
-the machine changes less; the plot has the latter. A library is left out, with a word, where a fit takes over 10
-minutes or 16 GB, or would by what it took for a tenth of the points. It makes OUT.json and OUT.svg too. `make bench-python` makes
-the environment. min_samples counts the point itself here, in scikit-learn and in hdbscan-rs; the others get one less.
+the fit alone, after a small one that compiles what is compiled late: of the clock, and of the process's processors, which other work
+on the machine changes less (workers that a library starts as processes of their own are not in them); the plot has the latter. A
+library is left out, with a word, where a fit takes over 10 minutes or 16 GB, or would by what it took for a tenth of the points. It
+makes OUT.json and OUT.svg too. `make bench-python` makes the environment. min_samples counts the point itself here, in scikit-learn
+and in hdbscan-rs; the others get one less.
 """
 import argparse
 import json
