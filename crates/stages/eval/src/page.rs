@@ -16,7 +16,7 @@ use crate::memory::{self, Sizes};
 use crate::options::ReportOptions;
 use crate::scene::{VIEWS, folder_name, load};
 use gs_io::{Error, Result, write_bytes, write_json};
-use gs_scene::dataset::{Dataset, LoadOptions, Split};
+use gs_scene::dataset::{LoadOptions, Split};
 use report::html::Page;
 use serde_json::{Value, json};
 use stage::Stage;
@@ -43,7 +43,7 @@ pub(crate) fn run(o: &ReportOptions, parameters: Value, stage: &Stage) -> Result
     let outputs = stage.outputs(out).file(out).file(&figures);
     let mut claim = outputs.reads(&dataset.files).reads(files(&o.run_dir).chain([o.geometry.clone()])).claim()?;
     let mut metrics = Metrics::default();
-    let material = Material::read(&dataset, o, &o.geometry, masks(o, &dataset), &mut metrics)?;
+    let material = Material::read(&dataset, o, &o.geometry, masks(o), &mut metrics)?;
     write_bytes(out, write(&material, &mut metrics)?.as_bytes())?;
     write_json(&figures, &metrics)?;
     stage.record(&mut claim, parameters, material.inputs, json!({"left_out": metrics.skipped.len()}))?;
@@ -52,8 +52,8 @@ pub(crate) fn run(o: &ReportOptions, parameters: Value, stage: &Stage) -> Result
 }
 
 /// The folder of id maps, if there is one.
-fn masks(o: &ReportOptions, dataset: &Dataset) -> Option<PathBuf> {
-    let in_place = [o.run_dir.join("masks"), dataset.root.join("language_features")];
+fn masks(o: &ReportOptions) -> Option<PathBuf> {
+    let in_place = [o.run_dir.join("masks"), o.scene.join("language_features")];
     o.masks.clone().or_else(|| in_place.into_iter().find(|m| m.is_dir()))
 }
 

@@ -251,7 +251,7 @@ fn solve<const N: usize>(mut a: [[f64; N]; N], mut b: [f64; N]) -> Option<[f64; 
         for j in 0..=i {
             let sum = a[i][j] - (0..j).map(|k| a[i][k] * a[j][k]).sum::<f64>();
             if i == j {
-                if !(sum > 0.0) {
+                if sum <= 0.0 || sum.is_nan() {
                     return None;
                 }
                 a[i][i] = sum.sqrt();

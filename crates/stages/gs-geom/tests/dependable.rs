@@ -209,7 +209,7 @@ fn gaussians_that_are_not_finite_are_never_written() {
     killed(&training(scene(), &out, "60", &[]), &out);
     // The next step goes wrong: a moment is not a number.
     let state = format!("{out}.checkpoint");
-    let checkpoint = gs_io::Artifact::open(&state, "gs-geom-checkpoint", 4).unwrap();
+    let checkpoint = gs_io::Artifact::open(&state, "gs-geom-checkpoint", 5).unwrap();
     let moments = &checkpoint.tensor::<f32>("first_means", &[None, Some(3)]).unwrap()[..9];
     let moments: Vec<u8> = moments.iter().flat_map(|v| v.to_le_bytes()).collect();
     let mut bytes = fs::read(&state).unwrap();

@@ -153,7 +153,7 @@ impl Bundle<'_> {
             }
             (0..6).for_each(|k| s.blocks[v][k][k] += s.prior[6 * v + k]);
         }
-        for p in self.points.iter() {
+        for p in &*self.points {
             let mut block = DMat3::ZERO;
             for (sighting, at) in &p.seen {
                 let (view, c) = (sighting.view, &self.cameras[sighting.view]);

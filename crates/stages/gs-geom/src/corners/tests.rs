@@ -73,7 +73,7 @@ fn shaken_cameras_come_back() {
     let before = errors(&world, &cameras, &world.points(&cameras));
     for width in [4.0, 1.0, 0.5] {
         let mut points = world.points(&cameras);
-        let (lenses, free) = (vec![0; 12], vec![true; 12]);
+        let (lenses, free) = ([0; 12], [true; 12]);
         Bundle { cameras: &mut cameras, given: &given, lenses: &lenses, free: &free, points: &mut points, all: true }
             .adjust(width);
     }

@@ -333,9 +333,14 @@ mod tests {
         let known: Vec<[f32; 2]> =
             (0..w * h).map(|i| if (6..15).contains(&(i % w)) { [0.0; 2] } else { [plane(i), 1.0] }).collect();
         let all = filled(&known, w);
+        // Means of what is known lie within it.
+        let most = plane(w * h - 1) + 1e-3;
         for (i, v) in all.iter().enumerate() {
-            assert!(v[1] > 0.0 && (v[0] - plane(i)).abs() < if known[i][1] > 0.0 { 1e-6 } else { 6.0 }, "{i}: {v:?}");
+            assert!(v[1] > 0.0 && (-1e-3..most).contains(&v[0]), "{i}: {v:?}");
+            assert!(known[i][1] == 0.0 || v[0] == plane(i), "{i}: {v:?}");
         }
+        let (left, right) = (all[6 * w + 6][0], all[6 * w + 14][0]);
+        assert!(left < right, "{left} {right}");
         assert!(filled(&vec![[0.0; 2]; w * h], w).iter().all(|v| v[1] == 0.0));
     }
 

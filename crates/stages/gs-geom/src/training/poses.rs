@@ -36,7 +36,8 @@ impl PoseRates {
     /// The turn of a step at `t` of the run (0 to 1).
     fn at(&self, t: f64) -> f64 {
         let t = t.clamp(0.0, 1.0);
-        self.turn * (self.turn_end / self.turn).powf(t) * (t / self.warm_up.max(1e-9)).min(1.0)
+        let grown = if self.warm_up > 0.0 { (t / self.warm_up).min(1.0) } else { 1.0 };
+        self.turn * (self.turn_end / self.turn).powf(t) * grown
     }
 }
 
@@ -173,7 +174,7 @@ mod tests {
     fn a_camera_is_what_it_was_and_moves_against_its_gradient() {
         let given = camera();
         let begun = moved(&given, DVec3::new(0.01, 0.0, 0.0), DVec3::ZERO, 0.02);
-        let mut poses = Poses::new(&[begun.clone()], &[given.clone()], &[0]);
+        let mut poses = Poses::new(std::slice::from_ref(&begun), std::slice::from_ref(&given), &[0]);
         let close = |a: &Camera, b: &Camera| {
             (a.rotation - b.rotation).abs().to_cols_array().iter().all(|v| *v < 1e-12)
                 && a.translation.distance(b.translation) < 1e-12
