@@ -92,7 +92,7 @@ queries_OPTIONS := $(CLIP) $(QUERIES)
 report_OPTIONS := $(REPORT_FIRST) $(REPORT_ARGS)
 
 # What later stages take for the photographs: with the cameras that stage 1 refined, where it does. Masks do not depend on them.
-POSED := $(if $(and $(filter $(OUT)/geometry.ply,$(GEOMETRY_DONE)),$(filter --refine-poses,$(geom_OPTIONS))),$(OUT)/geometry.cameras.json,$(PHOTOGRAPHS))
+POSED := $(if $(and $(filter $(OUT)/geometry.ply,$(GEOMETRY_DONE)),$(filter --refine-poses,$(geom_OPTIONS))),$(OUT)/geometry.ply.cameras.json,$(PHOTOGRAPHS))
 export POSED
 
 # What each stage runs. `arg` writes a path out, so that commands can be copied, or as "$NAME" where a shell would take it apart.

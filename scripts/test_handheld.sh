@@ -30,7 +30,7 @@ run noisy '--pose-noise 1' '--refine-poses'
 compare 'PSNR from noisy poses' "$(psnr exact)" "$(psnr noisy)" 1
 miou() { figure "$work/$1/score.json" instance_miou; }
 compare 'mIoU of instances from noisy poses' "$(miou exact)" "$(miou noisy)" 0.05
-grep -q 'scene .*geometry.cameras.json' "$work/noisy.log" || fail "later stages do not use the refined cameras"
+grep -q 'scene .*geometry.ply.cameras.json' "$work/noisy.log" || fail "later stages do not use the refined cameras"
 
 train() { target/release/gs-geom train --quiet --iterations 700 --out "$work/$1.ply" --scene "$work/$2" "${@:3}"; }
 heldout() { figure "$work/$1.ply.run.json" psnr_heldout; }

@@ -39,8 +39,7 @@ impl LearningRates {
     pub fn for_iterations(iterations: u32) -> Self {
         let step = (STOCK_ITERATIONS / f64::from(iterations.max(1))).powf(STEP_POWER).clamp(1.0, MOST_STEP);
         let base = Self::default();
-        // Not the rest: where a plain wall gives them no direction, Gaussians would wander, and hang as haze before a camera
-        // that was held out.
+            // Not the rest: in some runs haze then hung before a camera that was held out (docs/results/lost.md).
         Self { feature: step * base.feature, scaling: step * base.scaling, end: 0.1, ..base }
     }
 
