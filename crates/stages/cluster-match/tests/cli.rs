@@ -22,7 +22,7 @@ fn gaussians() -> Gaussians {
     for i in 0..2 * EACH {
         let side = if i < EACH { -0.6 } else { 0.6 };
         let (a, b) = ((i % 5) as f32, (i % EACH / 5) as f32);
-        g.means.push([side + a * 0.08 - 0.16, b * 0.1 - 0.35, (i % 3) as f32 * 0.05]);
+        g.means.push([side + a * 0.08 - 0.16, b * 0.1 - 0.35, (i % 3) as f32 * 0.15]);
     }
     g.means.push([-0.5, 0.0, -50.0]);
     let n = g.means.len();
