@@ -45,7 +45,9 @@ fn trained(recipe: &Recipe, cache: usize, stops: &[u32]) -> (State, f64) {
 
 fn recipe(strategy: Strategy, iterations: u32, max_gaussians: usize) -> Recipe {
     let recipe = Recipe::new(strategy, iterations);
-    Recipe { seed: 7, growth: Growth { every: 20, max_gaussians, ..recipe.growth }, ..recipe }
+    // The larger steps of short runs are too large for 160 iterations on 190 Gaussians.
+    let rates = LearningRates::default();
+    Recipe { seed: 7, rates, growth: Growth { every: 20, max_gaussians, ..recipe.growth }, ..recipe }
 }
 
 #[test]
@@ -65,8 +67,7 @@ fn every_way_is_the_same_for_any_threads_and_after_a_stop_and_keeps_to_the_most_
         assert!(whole == parts, "{recipe:?}");
         let n = whole.gaussians.len();
         assert!(n <= recipe.growth.max_gaussians && whole.progress.densified != [0; 4], "{n}: {recipe:?}");
-        // It learns; with another background in each of so few iterations, not much.
-        assert!(psnr > if recipe.random_background { 15.0 } else { 17.0 }, "{psnr}: {recipe:?}");
+        assert!(psnr > 17.0, "{psnr}: {recipe:?}");
     }
 }
 
