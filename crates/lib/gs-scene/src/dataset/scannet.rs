@@ -75,7 +75,7 @@ impl Depths {
 
     fn of(&self, image: &Path) -> Option<Depth> {
         let path = self.folder.join(image.with_extension("png").file_name()?);
-        path.is_file().then(|| Depth { path, unit: depth::MILLIMETRES, focal_center: self.focal_center })
+        path.is_file().then_some(Depth { path, unit: depth::MILLIMETRES, focal_center: self.focal_center })
     }
 }
 
