@@ -76,7 +76,6 @@ clean:
 test: ## Run all tests that need nothing but this folder
 	$(CARGO) test --release --workspace
 	scripts/test_pipeline.sh
-	scripts/test_handheld.sh
 	@command -v python3 > /dev/null || echo "SKIPPED: make clip: no python3"; ! command -v python3 > /dev/null || scripts/test_clip.py
 	scripts/test_benchmarks.sh
 	scripts/test_snakemake.sh
