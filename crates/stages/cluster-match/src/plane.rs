@@ -86,7 +86,7 @@ pub(crate) mod testing {
             let mut x = corner;
             x[u] += (i % 10) as f32 / 10.0;
             x[v] += (i / 10) as f32 / 10.0;
-            x[3 - u - v] += if i % 3 == 0 { 0.01 } else { 0.0 };
+            x[3 - u - v] += if i.is_multiple_of(3) { 0.01 } else { 0.0 };
             x
         };
         (0..100).map(centre).collect()
