@@ -234,8 +234,8 @@ const find = attempt(async (text) => {
   state.threshold = named.length || none ? null : ranking[0].score;
   results();
   await selectInstances(named.length ? named : none ? [] : [ranking[0].k]);
-  const { best, by_chance } = answer.verdict ?? {};
-  say(none ? `Nothing matches “${answer.text}”: its best score, ${best.toFixed(3)}, is no better than that of unrelated texts (${by_chance.toFixed(3)}).` : "");
+  const { verdict } = answer;
+  say(none ? `Nothing matches “${answer.text}”: its best score, ${verdict.best.toFixed(3)}, is no better than that of unrelated texts (${verdict.by_chance.toFixed(3)}).` : "");
 });
 
 function clearAnswer() {
