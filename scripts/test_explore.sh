@@ -8,7 +8,7 @@ work=$(mktemp -d)
 trap 'rm -rf "$work"' EXIT
 # The page selects instances, so eval query is to answer with these.
 make --no-print-directory -f pipelines/demo.mk OUT="$work/demo" GEOM_ARGS='--iterations 600' CLUSTER_ARGS='--granules 0' > "$work/log" 2>&1 || { cat "$work/log"; exit 1; }
-on_demo() { EXPLORE_RUN="$work/demo" EXPLORE_SCREENSHOT="${SCREENSHOT:-}" cargo test --release -p explore --test "$1" -- --ignored --nocapture --test-threads 1; }
+on_demo() { EXPLORE_RUN="$work/demo" EXPLORE_SCREENSHOT="${SCREENSHOT:-}" cargo test --release --workspace --test "$1" -- --ignored --nocapture --test-threads 1; }
 on_demo door
 echo "ok: the session of docs/door.md"
 for program in chromium chromedriver; do

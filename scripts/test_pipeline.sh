@@ -6,6 +6,8 @@ set -euo pipefail
 cd "$(dirname "$0")/.."
 # With the tests, whose dependencies ask more of shared crates: else everything is compiled again after cargo test.
 cargo build --release --workspace --bins --tests
+# What make would build, without the tests and so with other shared crates, is there.
+export CARGO=true
 
 work=$(mktemp -d)
 trap 'rm -rf "$work"' EXIT

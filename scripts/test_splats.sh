@@ -21,7 +21,7 @@ node "$SPLAT_TRANSFORM" --version > /dev/null 2>&1 || skip "it does not start: i
 
 cargo test --release --workspace --test splat_transform -- --ignored --skip real_files
 if [ -d ../shared/data/splats ]; then
-  cargo test --release -p gs-scene --test splat_transform -- --ignored --exact real_files_read_as_it_reads_them
+  cargo test --release --workspace --test splat_transform -- --ignored --exact real_files_read_as_it_reads_them
 else
   echo "SKIPPED: real splats: no ../shared/data/splats"
 fi
