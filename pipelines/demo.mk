@@ -13,7 +13,7 @@ CLIP ?= testdata/clip-tiny
 include $(CONF)
 SEED ?= 0
 SYNTH_ARGS ?= --seed $(SEED) --objects 10 --views 30 --width 480 --height 360 --granularity-p 0.5
-GEOM_FIRST = $(call unless,GEOM_ARGS,--iterations 1500)
+GEOM_FIRST = $(call unless,GEOM_ARGS,--iterations 1000)
 GEOM_ARGS ?=
 GRAPH_ARGS ?=
 FEAT_ARGS ?=

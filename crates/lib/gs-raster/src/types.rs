@@ -34,10 +34,10 @@ impl RasterOptions {
     }
 }
 
-/// The near plane of a scene of this size (world units): 0.01, or a hundredth of a smaller one, so that a scene in kilometres
-/// is drawn as it is in metres.
+/// The near plane of a scene of this size (world units): a hundredth of it, so that a scene in kilometres is drawn as it is in
+/// metres.
 pub fn near_plane(size: f64) -> f32 {
-    (0.01 * size.min(1.0)).max(f64::from(f32::MIN_POSITIVE)) as f32
+    (0.01 * size).clamp(f64::from(f32::MIN_POSITIVE), f64::from(f32::MAX)) as f32
 }
 
 /// A rendered view.

@@ -12,6 +12,7 @@ use crate::options::{Args, Background, Command, PictureSizes, Preset, Train};
 use crate::photographs::masks::Masks;
 use crate::photographs::{Photographs, full_share};
 use crate::training::poses::PoseRates;
+use crate::training::schedule::LearningRates;
 use crate::training::{Recipe, Trainer, checkpoint};
 use artifacts::role;
 use forecast::{cache_bytes, forecast_start, most_gaussians};
@@ -118,6 +119,10 @@ impl Train {
         if let Some(Way::Adaptive(way)) = &mut recipe.densification {
             way.gradient = self.densify_gradient.unwrap_or(way.gradient);
             way.max_scale = self.preset.map(|Preset::Stock| STOCK_MAX_SCALE);
+        }
+        if self.preset == Some(Preset::Stock) {
+            // --densify fixed keeps the centres.
+            recipe.rates = LearningRates { position: recipe.rates.position, ..LearningRates::default() };
         }
         recipe.growth.every = self.densify_every.unwrap_or(recipe.growth.every);
         recipe.growth.max_gaussians = max_gaussians;

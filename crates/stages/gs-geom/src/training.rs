@@ -61,7 +61,7 @@ pub struct Recipe {
 impl Recipe {
     /// The defaults of a strategy for a number of iterations.
     pub fn new(strategy: Strategy, iterations: u32) -> Self {
-        let rates = LearningRates::default();
+        let rates = LearningRates::for_iterations(iterations);
         Self {
             seed: 0,
             schedule: Schedule::for_iterations(iterations),
@@ -320,6 +320,7 @@ impl<'a> Trainer<'a> {
         let rules = self.recipe.densification.as_ref().map(Way::rules);
         let rates = &self.recipe.rates;
         let centres = self.recipe.schedule.rate_of_centres(rates, frame.iteration, self.extent);
+        let rates = &rates.at(self.recipe.schedule.share(frame.iteration));
         if let Some(rules) = rules {
             rules.regularise(gaussians, gradients);
         }

@@ -13,7 +13,7 @@ use std::path::Path;
 const VIEWS: usize = 24;
 /// A training of a few seconds.
 const TRAINING: [&str; 10] =
-    ["--iterations", "1000", "--holdout", "6", "--sh-degree", "0", "--max-gaussians", "400", "--schedule", "full"];
+    ["--iterations", "2000", "--holdout", "6", "--sh-degree", "0", "--max-gaussians", "400", "--schedule", "full"];
 
 /// A folder with a scene of the balls; `change` may change the photographs, `[height][width][rgba]`.
 fn photographed(rgba: bool, change: impl Fn(usize, &mut [[f32; 4]])) -> Folder {

@@ -6,7 +6,16 @@ use rand_chacha::ChaCha8Rng;
 use rand_chacha::rand_core::SeedableRng;
 use serde::Serialize;
 
-/// Learning rates as 3DGS has them. The rates of the centres are per unit of the scene's extent.
+/// Iterations that the rates of 3DGS are made for.
+const STOCK_ITERATIONS: f64 = 30_000.0;
+/// Shorter runs take larger steps, by the ratio of iterations to this power (docs/geometry.md).
+const STEP_POWER: f64 = 2.0 / 3.0;
+/// Steps are larger by this factor at most.
+const MOST_STEP: f64 = 3.0;
+/// Share of a run after which all rates fall to [`LearningRates::end`].
+const FALL: f64 = 0.8;
+
+/// Learning rates; the defaults are those of 3DGS. The rates of the centres are per unit of the scene's extent.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize)]
 pub struct LearningRates {
     /// Of the centres, at the start; 0 keeps them in place.
@@ -21,6 +30,27 @@ pub struct LearningRates {
     pub scaling: f64,
     /// Of the quaternions.
     pub rotation: f64,
+    /// What is left at the end of all but the centres'; they fall exponentially over the last fifth of the run.
+    pub end: f64,
+}
+
+impl LearningRates {
+    /// For a run of so many iterations.
+    pub fn for_iterations(iterations: u32) -> Self {
+        let step = (STOCK_ITERATIONS / f64::from(iterations.max(1))).powf(STEP_POWER).clamp(1.0, MOST_STEP);
+        let base = Self::default();
+        // Not the rest: with colours, haze then hung before a held-out camera in some runs (docs/results/lost.md).
+        Self { scaling: step * base.scaling, end: 0.1, ..base }
+    }
+
+    /// The rates once this share of a run is over; those of the centres are [`Schedule::rate_of_centres`]'s.
+    #[must_use]
+    pub fn at(&self, share: f64) -> Self {
+        let left = self.end.powf(((share - FALL) / (1.0 - FALL)).max(0.0));
+        let [feature, opacity, scaling, rotation] =
+            [self.feature, self.opacity, self.scaling, self.rotation].map(|rate| left * rate);
+        Self { feature, opacity, scaling, rotation, ..*self }
+    }
 }
 
 impl Default for LearningRates {
@@ -32,6 +62,7 @@ impl Default for LearningRates {
             opacity: 0.05,
             scaling: 0.005,
             rotation: 0.001,
+            end: 1.0,
         }
     }
 }
@@ -149,6 +180,26 @@ mod tests {
         assert!(close(s.rate_of_centres(&base, 15_000, 1.0), 1.6e-5));
         assert!(close(s.rate_of_centres(&base, 30_000, 1.0), 1.6e-6));
         assert_eq!([0, 999, 1000, 2000, 3000, 30_000].map(|i| s.sh_degree(i, 3)), [0, 0, 1, 2, 3, 3]);
+    }
+
+    #[test]
+    fn short_runs_take_larger_steps_and_all_fall_at_the_end() {
+        let stock = LearningRates::default();
+        assert_eq!([0.0, 0.5, 1.0].map(|share| stock.at(share)), [stock; 3]);
+        assert_eq!(LearningRates { end: 1.0, ..LearningRates::for_iterations(30_000) }, stock);
+        assert_eq!(LearningRates::for_iterations(100_000), LearningRates::for_iterations(30_000));
+        let short = LearningRates::for_iterations(1000);
+        assert!((short.scaling / stock.scaling - 3.0).abs() < 1e-9);
+        assert_eq!(LearningRates { scaling: stock.scaling, end: 1.0, ..short }, stock);
+        let between = LearningRates::for_iterations(10_000);
+        assert!((between.scaling / stock.scaling - 3f64.powf(2.0 / 3.0)).abs() < 1e-9);
+        assert_eq!(short.at(0.8), short);
+        let near = |a: f64, b: f64| (a / b - 1.0).abs() < 1e-9;
+        assert!(
+            near(short.at(1.0).opacity, 0.1 * short.opacity)
+                && near(short.at(0.9).scaling, short.scaling / 10f64.sqrt())
+        );
+        assert_eq!(short.at(1.0).position, short.position, "the schedule has its own fall for these");
     }
 
     #[test]
