@@ -24,6 +24,7 @@ use crate::vectors::unit;
 use crate::world::{Inputs, World};
 use artifacts::{Graph, Match};
 use gs_io::Result;
+use ndarray::ArrayView1;
 use rayon::prelude::*;
 use serde::Serialize;
 use stage::Stage;
@@ -423,7 +424,8 @@ fn distance(world: &World, a: u32, b: u32) -> f32 {
 fn edge_limit(graph: &Graph, means: &[[f32; 3]], factor: f32) -> Option<f32> {
     let mean = |i: usize| glam::Vec3::from(means[graph.kept[i] as usize]);
     let nearest = graph.gaussian_knn.rows().into_iter().enumerate();
-    let mut lengths: Vec<f32> = nearest.map(|(i, near)| mean(i).distance(mean(near[0] as usize))).collect();
+    let length = |(i, near): (usize, ArrayView1<'_, u32>)| Some(mean(i).distance(mean(*near.first()? as usize)));
+    let mut lengths: Vec<f32> = nearest.filter_map(length).collect();
     lengths.sort_unstable_by(f32::total_cmp);
     (factor > 0.0 && !lengths.is_empty()).then(|| factor * lengths[lengths.len() / 2])
 }

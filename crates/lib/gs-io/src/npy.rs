@@ -144,6 +144,13 @@ mod tests {
     }
 
     #[test]
+    fn a_shape_beyond_memory_is_an_error_even_without_elements() {
+        let header = "{'descr': '<f4', 'fortran_order': False, 'shape': (0, 65536, 65536, 65536, 65536)}";
+        let bytes = [MAGIC, &[1, 0, header.len() as u8, 0], header.as_bytes()].concat();
+        assert!(parse(&bytes).unwrap_err().to_string().starts_with("shape: not the shape of an array"));
+    }
+
+    #[test]
     fn damaged_files_are_refused_or_hold_what_their_header_says() {
         let dir = tempfile::tempdir().unwrap();
         let p = dir.path().join("a.npy");

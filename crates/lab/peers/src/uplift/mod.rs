@@ -252,8 +252,8 @@ fn is_some(descriptor: &[f32]) -> bool {
 }
 
 /// Descriptors of Gaussians with their neighbours', as texts are answered in VALA: half its own, half the mean of
-/// `count` Gaussians, itself and the nearest of its neighbours that have a descriptor. Rows of `knn` are
-/// nearest first, filled up with the Gaussian itself; fewer are averaged where it has fewer.
+/// `count` Gaussians, itself and the nearest of its neighbours that have a descriptor. Rows of `knn` are nearest first,
+/// filled up with the Gaussian itself; fewer are averaged where it has fewer.
 fn smoothed(table: Table, knn: &Array2<u32>, count: usize) -> Table {
     let (width, most) = (table.slots * table.dim, count.saturating_sub(1));
     if most == 0 || width == 0 {
