@@ -2,7 +2,6 @@
 
 use crate::work::run;
 use graph_precompute::{fps::farthest_points, kdtree::KdTree, positions::shifted};
-use numpy::ndarray::Array2;
 use numpy::{IntoPyArray, PyArray1, PyArray2, PyReadonlyArray2};
 use pyo3::exceptions::PyValueError;
 use pyo3::prelude::*;
@@ -47,6 +46,5 @@ pub fn nearest_neighbours<'py>(
 ) -> PyResult<Bound<'py, PyArray2<i64>>> {
     let points = rows(&points);
     let found = run(py, threads, |_| tree_of(&points).map(|tree| tree.all_nearest(k)))??;
-    let wide: Vec<i64> = found.into_iter().map(i64::from).collect();
-    Ok(Array2::from_shape_vec((points.len(), k), wide).expect("k of each point").into_pyarray(py))
+    Ok(found.mapv(i64::from).into_pyarray(py))
 }

@@ -87,7 +87,7 @@ impl Words {
         let scene = &labelled.scene;
         let options = TextOptions { clip, text_features, any_model: false, min_support: None };
         let opened = run(py, 0, |_| {
-            let source = TextSource::open_for(&scene.artifact, scene.instances.dim, &options)?;
+            let source = TextSource::open_for(&scene.artifact, scene.instances.dim(), &options)?;
             let unrelated = Unrelated::encode(&source, &[])?;
             Ok(Self { source, unrelated })
         })?;

@@ -2,7 +2,7 @@
 
 use crate::cells::{descriptors_beside, files};
 use crate::plan::{Plan, Product, TablePlan};
-use artifacts::{Descriptors, Instances, NOISE_COLOR, TrueObject, TruePoints, TrueScene, instance_color};
+use artifacts::{Descriptors, Instances, NOISE_COLOR, TrueObject, TruePoints, TrueScene, flat, instance_color};
 use base64::Engine as _;
 use eval::true_labels;
 use gs_io::{Result, write_bytes};
@@ -110,7 +110,7 @@ fn by_name(d: &Descriptors, texts: &TextTable, things: &[TrueObject], n: usize) 
     let names: Vec<(u32, &[f32])> = things.iter().filter_map(|t| Some((t.id, texts.get(&t.name)?))).collect();
     let cosine = |a: &[f32], b: &[f32]| a.iter().zip(b).map(|(x, y)| f64::from(x * y)).sum::<f64>();
     let of_row = |row: usize| {
-        let slots = || d.of_row(row).chunks_exact(d.dim).filter(|s| s.iter().any(|v| *v != 0.0));
+        let slots = || flat(d.of_row(row)).chunks_exact(d.dim()).filter(|s| s.iter().any(|v| *v != 0.0));
         let score = |text: &[f32]| slots().map(|s| cosine(s, text)).fold(f64::NEG_INFINITY, f64::max);
         let best = names.iter().map(|(t, text)| (score(text), *t)).reduce(|a, b| if b.0 > a.0 { b } else { a });
         best.filter(|b| b.0.is_finite()).map(|b| (b.1, true))
@@ -179,8 +179,8 @@ mod tests {
         let path = dir.path().join("t.json");
         std::fs::write(&path, r#"{"mug": [1, 0], "tray": [0, 1], "handle of the mug": [0.9, 0.1]}"#).unwrap();
         let thing = |id, name: &str| TrueObject { id, name: name.into(), ..Default::default() };
-        let values = vec![0.9, 0.1, 0.0, 0.0, 0.0, 0.0, 0.2, 0.8, 0.0, 0.0, 0.0, 0.0];
-        let d = Descriptors { kept: vec![0, 2, 3], row: vec![0, 1, 2], slots: 2, dim: 2, values };
+        let values = ndarray::arr3(&[[[0.9, 0.1], [0.0, 0.0]], [[0.0, 0.0], [0.2, 0.8]], [[0.0, 0.0]; 2]]);
+        let d = Descriptors { kept: vec![0, 2, 3], row: vec![0, 1, 2], values };
         let found = by_name(&d, &TextTable::read(&path).unwrap(), &[thing(4, "mug"), thing(7, "tray")], 4);
         assert_eq!(found, [Some((4, true)), None, Some((7, true)), None]);
     }

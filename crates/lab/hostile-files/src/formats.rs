@@ -256,18 +256,15 @@ fn check_transforms(bytes: &[u8]) {
 
 fn check_npy(bytes: &[u8]) {
     with("a_s.npy", bytes, |path| {
-        if let Some(a) = sound(gs_io::npy::read_f32(path), path) {
-            assert_eq!(a.shape.iter().product::<usize>(), a.data.len());
-        }
+        sound(gs_io::npy::read_f32(path), path);
         if let Some(m) = sound(MaskMaps::read(path), path) {
-            assert_eq!(m.ids.len(), 4 * m.width * m.height);
+            assert_eq!(m.ids.dim().0, 4);
             // Tables of so many rows are made from it.
             assert!(m.ids.iter().all(|&i| i >= -1) && m.id_count() <= (bytes.len() * 4).max(1 << 16));
         }
         if let Some(f) = sound(MaskFeatures::read(path), path) {
-            assert_eq!(f.values.len(), f.count * f.dim);
             // A row of that width is made for each instance.
-            assert!(f.dim <= bytes.len().max(1 << 16));
+            assert!(f.dim() <= bytes.len().max(1 << 16));
         }
     });
 }
@@ -288,14 +285,14 @@ fn check_artifact(bytes: &[u8]) {
         sound(Graph::read(path), path);
         sound(Features::read(path), path);
         if let Some((d, _)) = sound(Descriptors::read(path), path) {
-            d.row.iter().for_each(|&r| assert_eq!(d.of_row(r as usize).len(), d.slots * d.dim));
+            d.row.iter().for_each(|&r| _ = d.of_row(r as usize));
         }
         if let Some(f) = sound(Footprints::read(path), path) {
             (0..f.rows.len()).for_each(|r| _ = f.entries(r));
         }
         if let Some((instances, _)) = sound(Instances::read(path), path) {
             for k in 0..instances.len() {
-                assert_eq!(instances.descriptor_of(k).len(), instances.dim);
+                _ = instances.descriptor_of(k);
                 if let Some(family) = instances.family(k) {
                     family.own.iter().for_each(|&c| _ = instances.gaussians_of_cluster(c));
                     family.parts.iter().for_each(|&c| _ = instances.instances_of_cluster(c));
@@ -367,8 +364,7 @@ fn check_id_png(bytes: &[u8]) {
         let args = args.into_iter().chain([dir.clone().into_os_string(), "--out".into(), out.clone().into()]);
         let args = mask_embed::Args::try_parse_from(args).expect("sound arguments");
         if sound(args.run(&Stage::silent("mask-embed")), &dir).is_some() {
-            let maps = MaskMaps::read(artifacts::maps_path(&out, "a")).expect("a map");
-            assert_eq!(maps.ids.len(), 4 * maps.width * maps.height);
+            MaskMaps::read(artifacts::maps_path(&out, "a")).expect("a map");
         }
     });
 }

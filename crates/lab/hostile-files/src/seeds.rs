@@ -7,6 +7,7 @@ use artifacts::{
 use gs_io::Provenance;
 use gs_scene::splat::{self, Extra, Format as SplatFormat};
 use gs_scene::{Camera, Gaussians, Image, PointCloud, colmap, ply};
+use ndarray::{Array2, Array3, ArrayView, arr2};
 use std::fs;
 use std::io::Write;
 use std::path::Path;
@@ -171,8 +172,8 @@ pub(crate) fn transforms() -> Vec<Vec<u8>> {
 }
 
 pub(crate) fn npy() -> Vec<Vec<u8>> {
-    let maps = MaskMaps { width: 5, height: 4, ids: (0..80).map(|i| i % 9 - 1).collect() };
-    let features = MaskFeatures { count: 3, dim: 4, values: vec![0.5; 12] };
+    let maps = MaskMaps { ids: Array3::from_shape_fn((4, 4, 5), |(l, y, x)| (20 * l + 5 * y + x) as i32 % 9 - 1) };
+    let features = MaskFeatures { values: Array2::from_elem((3, 4), 0.5) };
     let halves: Vec<u8> = [
         &b"\x93NUMPY\x01\x00\x36\x00{'descr': '<f2', 'fortran_order': False, 'shape': (4,)}\n"[..],
         &[0, 0x3c, 1, 0, 0, 0x7c, 0, 0xc0],
@@ -181,7 +182,7 @@ pub(crate) fn npy() -> Vec<Vec<u8>> {
     vec![
         made("a_s.npy", |p| maps.write(p).expect("written")),
         made("a_f.npy", |p| features.write(p).expect("written")),
-        made("i.npy", |p| gs_io::npy::write_i32(p, &[2, 3], &[-1, 0, 1, 2, 3, 4]).expect("written")),
+        made("i.npy", |p| gs_io::npy::write_i32(p, &arr2(&[[-1, 0, 1], [2, 3, 4]])).expect("written")),
         halves,
     ]
 }
@@ -190,7 +191,8 @@ pub(crate) fn npz() -> Vec<Vec<u8>> {
     let pack = |method: zip::CompressionMethod| {
         let mut archive = zip::ZipWriter::new(std::io::Cursor::new(Vec::new()));
         for (name, shape) in [("coffee mug", vec![4]), ("sheep", vec![1, 4])] {
-            let array = made("a.npy", |p| gs_io::npy::write_f32(p, &shape, &[1.0, 0.0, 0.5, 0.25]).expect("written"));
+            let array = ArrayView::from_shape(shape, &[1.0, 0.0, 0.5, 0.25]).expect("four numbers");
+            let array = made("a.npy", |p| gs_io::npy::write_f32(p, &array).expect("written"));
             let options = zip::write::SimpleFileOptions::default().compression_method(method);
             archive.start_file(format!("{name}.npy"), options).expect("begun");
             archive.write_all(&array).expect("written");
@@ -209,8 +211,7 @@ pub(crate) fn instances() -> Instances {
     let edge = TreeEdge { parent: 4, child: 5, lambda: 1.0, size: 2, instance: 0 };
     Instances {
         label: vec![0, -1, 0, 1],
-        dim: 2,
-        descriptor: vec![1.0, 0.0, 0.0, 1.0],
+        descriptor: arr2(&[[1.0, 0.0], [0.0, 1.0]]),
         support: vec![1, 2],
         score: vec![0.5, 1.0],
         count: vec![2, 1],
@@ -223,7 +224,7 @@ pub(crate) fn instances() -> Instances {
         node: vec![5, -1, 5, 6],
         oriented: vec![OrientedBox::default(); 2],
         granules: vec![Granule { members: Members::Cluster(5), support: 3, fit: 0.5 }],
-        granule_descriptor: vec![0.6, 0.8],
+        granule_descriptor: arr2(&[[0.6, 0.8]]),
     }
 }
 
@@ -233,17 +234,15 @@ pub(crate) fn artifact() -> Vec<Vec<u8>> {
     let graph = Graph {
         kept: vec![0, 2, 3],
         anchors: vec![1, 0],
-        k: 2,
-        knn: vec![0, 1, 2, 0],
-        anchor_knn: vec![1, 1, 0, 0],
+        knn: arr2(&[[0, 1], [2, 0]]),
+        anchor_knn: arr2(&[[1, 1], [0, 0]]),
         nearest_anchor: vec![0, 0, 1],
-        gaussian_k: 1,
-        gaussian_knn: vec![1, 0, 0],
+        gaussian_knn: arr2(&[[1], [0], [0]]),
         seen_views: vec![1, 0, 2, 1],
         seen_weight: vec![0.5, 0.0, 1.0, 2.0],
     };
-    let features = Features { kept: vec![0, 2, 3], dim: 2, values: vec![0.5; 6], ..Features::default() };
-    let descriptors = Descriptors { kept: vec![0, 3], row: vec![1, 0], slots: 2, dim: 2, values: vec![0.5; 8] };
+    let features = Features { kept: vec![0, 2, 3], values: Array2::from_elem((3, 2), 0.5), ..Features::default() };
+    let descriptors = Descriptors { kept: vec![0, 3], row: vec![1, 0], values: Array3::from_elem((2, 2, 2), 0.5) };
     let row = Row { view: 0, level: 3, mask: 1, pixels: 9, gated: 8, alpha: 0.9 };
     let footprints = FootprintsBuilder {
         views: vec!["a".into()],

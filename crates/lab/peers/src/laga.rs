@@ -22,7 +22,7 @@ use crate::cli::Peer;
 use crate::product::{Grouping, Product, Table};
 use crate::vectors::{add, group_means, most_alike, normalised, normed, smoothed};
 use crate::world::{Inputs, LearnedInputs, World};
-use artifacts::{Features, Level, Match};
+use artifacts::{Features, Level, Match, flat};
 use gs_io::Result;
 use hdbscan_exact::{Options as Hdbscan, cluster};
 use rand::Rng;
@@ -105,8 +105,7 @@ impl Peer for Options {
         for (rank, &level) in levels.iter().enumerate() {
             let (dim, mut features) = affinity(&world.learned, level == Level::Small);
             if self.smooth > 0 {
-                let (knn, k) = (&world.graph.gaussian_knn, world.graph.gaussian_k);
-                features = smoothed(&features, dim, knn, k, self.smooth as usize);
+                features = smoothed(&features, dim, &world.graph.gaussian_knn, self.smooth as usize);
             }
             let objects = self.objects(world, stage, level, self.epsilon * (rank + 1) as f64, dim, &features)?;
             stage.info(&format!("level {level}: {} objects", objects.masks.len()));
@@ -186,12 +185,12 @@ fn mean(features: &[Vec<f32>], dim: usize) -> Vec<f32> {
 
 /// Unit affinity features and their dimension: the features, with `parts` those of parts beside them, each half of unit length.
 fn affinity(learned: &Features, parts: bool) -> (usize, Vec<f32>) {
-    let parts = if parts { learned.parts_dim } else { 0 };
-    let dim = learned.dim + parts;
+    let parts = if parts { learned.parts.ncols() } else { 0 };
+    let dim = learned.dim() + parts;
     let rows = (0..learned.kept.len()).into_par_iter().flat_map_iter(|i| {
-        let mut all = wide(&normed(&wide(learned.row(i))));
+        let mut all = wide(&normed(&wide(flat(learned.row(i)))));
         if parts > 0 {
-            all.extend(wide(&normed(&wide(&learned.parts[i * parts..(i + 1) * parts]))));
+            all.extend(wide(&normed(&wide(flat(learned.parts.row(i))))));
         }
         normed(&all)
     });
@@ -372,6 +371,7 @@ fn table(levels: &[Objects], n: usize, dim: usize) -> Table {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use ndarray::arr2;
 
     fn gram(points: &[[f64; 2]]) -> Vec<f64> {
         points.iter().flat_map(|a| points.iter().map(move |b| a[0] * b[0] + a[1] * b[1])).collect()
@@ -387,14 +387,14 @@ mod tests {
 
     #[test]
     fn features_of_parts_stand_beside_those_of_things() {
-        let features = Features { kept: vec![0], dim: 2, values: vec![3.0, 4.0], parts_dim: 1, parts: vec![-7.0] };
+        let features = Features { kept: vec![0], values: arr2(&[[3.0, 4.0]]), parts: arr2(&[[-7.0]]) };
         assert_eq!(affinity(&features, false), (2, vec![0.6, 0.8]));
         let half = 0.5f32.sqrt();
         let (dim, all) = affinity(&features, true);
         assert_eq!(dim, 3);
         all.iter().zip([0.6 * half, 0.8 * half, -half]).for_each(|(a, b)| assert!((a - b).abs() < 1e-6));
         // Three in a row, each with the first of its neighbours: (1, 0) + (0, 1) twice, (0, 1) alone.
-        let smoothed = smoothed(&[1.0, 0.0, 0.0, 1.0, 0.0, 1.0], 2, &[1, 0, 1], 1, 2);
+        let smoothed = smoothed(&[1.0, 0.0, 0.0, 1.0, 0.0, 1.0], 2, &arr2(&[[1], [0], [1]]), 2);
         smoothed.iter().zip([half, half, half, half, 0.0, 1.0]).for_each(|(a, b)| assert!((a - b).abs() < 1e-6));
     }
 

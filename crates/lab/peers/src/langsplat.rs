@@ -18,7 +18,7 @@ pub use pixels::{Batches, ViewPixels, sample};
 use crate::cli::Peer;
 use crate::product::{Product, Table};
 use crate::world::{Inputs, World};
-use artifacts::Descriptors;
+use artifacts::{Descriptors, flat};
 use gs_io::{Error, Result};
 use rand::seq::SliceRandom;
 use rand::{Rng, SeedableRng};
@@ -110,7 +110,7 @@ impl Peer for Options {
 /// The code of the mask at each pixel.
 fn goals(pixels: &ViewPixels, world: &World, autoencoder: &Autoencoder) -> Vec<f32> {
     let features = &world.features[&pixels.view];
-    let codes = autoencoder.encode(&features.values);
+    let codes = autoencoder.encode(flat(features.values.view()));
     let code = autoencoder.code;
     pixels.masks.iter().flat_map(|&id| &codes[id as usize * code..(id as usize + 1) * code]).copied().collect()
 }

@@ -24,6 +24,7 @@ use crate::vectors::unit;
 use crate::world::{Inputs, World};
 use artifacts::{Graph, Match};
 use gs_io::Result;
+use ndarray::ArrayView1;
 use rayon::prelude::*;
 use serde::Serialize;
 use stage::Stage;
@@ -422,17 +423,17 @@ fn distance(world: &World, a: u32, b: u32) -> f32 {
 /// The longest edge: `factor` median distances of nearest neighbours. None: there is no limit.
 fn edge_limit(graph: &Graph, means: &[[f32; 3]], factor: f32) -> Option<f32> {
     let mean = |i: usize| glam::Vec3::from(means[graph.kept[i] as usize]);
-    let nearest = graph.gaussian_knn.chunks_exact(graph.gaussian_k.max(1)).enumerate();
-    let mut lengths: Vec<f32> = nearest.map(|(i, near)| mean(i).distance(mean(near[0] as usize))).collect();
+    let nearest = graph.gaussian_knn.rows().into_iter().enumerate();
+    let length = |(i, near): (usize, ArrayView1<'_, u32>)| Some(mean(i).distance(mean(*near.first()? as usize)));
+    let mut lengths: Vec<f32> = nearest.filter_map(length).collect();
     lengths.sort_unstable_by(f32::total_cmp);
     (factor > 0.0 && !lengths.is_empty()).then(|| factor * lengths[lengths.len() / 2])
 }
 
 /// The connected parts of some Gaussians, those of enough Gaussians.
 fn parts(points: &[u32], graph: &Graph, near: impl Fn(u32, u32) -> bool) -> Vec<Vec<u32>> {
-    let k = graph.gaussian_k;
     let edges = points.iter().enumerate().flat_map(|(a, &i)| {
-        let neighbours = graph.gaussian_knn[i as usize * k..(i as usize + 1) * k].iter();
+        let neighbours = graph.gaussian_knn.row(i as usize).into_iter();
         let near = &near;
         let inside = neighbours.filter_map(move |&j| Some((points.binary_search(&j).ok()?, j)));
         inside.filter(move |&(_, j)| near(i, j)).map(move |(b, _)| (a as u32, b as u32))
@@ -669,8 +670,8 @@ mod tests {
     #[test]
     fn parts_are_connected_and_of_four_points() {
         // A chain 0-1-2-3, a chain 4-5; the edge 3-4 leads out of reach.
-        let knn = vec![1, 2, 3, 4, 5, 4];
-        let graph = Graph { kept: (0..6).collect(), gaussian_k: 1, gaussian_knn: knn, ..Graph::default() };
+        let gaussian_knn = ndarray::arr2(&[[1], [2], [3], [4], [5], [4]]);
+        let graph = Graph { kept: (0..6).collect(), gaussian_knn, ..Graph::default() };
         let points: Vec<u32> = (0..6).collect();
         assert_eq!(parts(&points, &graph, |a, b| (a, b) != (3, 4)), [vec![0, 1, 2, 3]]);
         assert_eq!(parts(&points, &graph, |_, _| true), [points]);

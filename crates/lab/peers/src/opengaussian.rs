@@ -22,11 +22,12 @@ use crate::kmeans::k_means;
 use crate::product::{Grouping, Product};
 use crate::vectors::unit;
 use crate::world::{Inputs, LearnedInputs, World};
-use artifacts::{Features, Level, MaskMaps, Match};
+use artifacts::{Features, Level, MaskMaps, Match, flat};
 use cluster_match::{FeatureTable, Overlaps, best_masks, overlaps};
 use gs_io::Result;
 use gs_raster::{TILE, TileWeights, render_features};
 use gs_scene::Camera;
+use ndarray::Array2;
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
 use serde::Serialize;
@@ -83,12 +84,13 @@ impl Peer for Options {
     }
 
     fn make(&self, world: &World, stage: &Stage) -> Result<Product> {
-        let dim = world.learned.dim;
-        let mut features = world.learned.values.clone();
+        let dim = world.learned.dim();
+        let mut features = flat(world.learned.values.view()).to_vec();
         features.chunks_exact_mut(dim).for_each(unit);
         // As they are shown: 0 to 1.
         let values = features.iter().map(|f| (f + 1.0) / 2.0).collect();
-        let shown = Features { kept: world.learned.kept.clone(), dim, values, ..Features::default() };
+        let values = Array2::from_shape_vec(world.learned.values.dim(), values).expect("as many");
+        let shown = Features { kept: world.learned.kept.clone(), values, ..Features::default() };
         let means = &world.geometry.gaussians.means;
         let places: Vec<[f32; 3]> = shown.kept.iter().map(|&i| means[i as usize]).collect();
         let mut rng = ChaCha8Rng::seed_from_u64(stage.seed());
@@ -154,10 +156,10 @@ fn look(
     shown: &Features,
     stage: &Stage,
 ) -> Result<(Vec<Masks>, Vec<usize>)> {
-    let (gaussians, dim) = (&world.geometry.gaussians, shown.dim);
+    let (gaussians, dim) = (&world.geometry.gaussians, shown.dim());
     let mut of_all = vec![0.0; world.gaussians() * dim];
     for (at, &i) in shown.kept.iter().enumerate() {
-        of_all[i as usize * dim..(i as usize + 1) * dim].copy_from_slice(shown.row(at));
+        of_all[i as usize * dim..(i as usize + 1) * dim].copy_from_slice(flat(shown.row(at)));
     }
     let (mut all, mut most) = (Vec::new(), vec![1; count]);
     for view in 0..world.views.len() {
@@ -194,7 +196,7 @@ fn shares(t: &TileWeights<'_>, coarse: &[i32], shown: &[f32], dim: usize, maps: 
     // Pixels with the same masks, and which of these sets each pixel belongs to; the first has no masks.
     let (mut sets, mut set_of) = (vec![Vec::new()], [0; PIXELS]);
     for (x, y) in (0..t.height).flat_map(|y| (0..t.width).map(move |x| (x, y))) {
-        let at = (t.y0 + y) * maps.width + t.x0 + x;
+        let at = [t.y0 + y, t.x0 + x];
         let set: Vec<u32> = levels.iter().filter_map(|&l| u32::try_from(maps.level(l)[at]).ok()).collect();
         set_of[y * TILE + x] = sets.iter().position(|s| *s == set).unwrap_or_else(|| {
             sets.push(set);
@@ -310,6 +312,7 @@ mod tests {
     use super::*;
     use crate::testing::options;
     use cluster_match::Region;
+    use ndarray::arr3;
 
     #[test]
     fn positions_count_by_their_weight() {
@@ -337,7 +340,7 @@ mod tests {
 
     #[test]
     fn clusters_alone_share_pixels_and_features_with_masks() {
-        let maps = MaskMaps { width: 3, height: 1, ids: [5, 5, 6].repeat(4) };
+        let maps = MaskMaps { ids: arr3(&[[[5, 5, 6]]; 4]) };
         let mut alphas = vec![0.0; 3 * PIXELS];
         for (g, row) in [[0.8, 0.8, 0.0], [0.75, 0.0, 1.0], [0.0, 0.95, 0.5]].iter().enumerate() {
             alphas[g * PIXELS..g * PIXELS + 3].copy_from_slice(row);
@@ -393,7 +396,7 @@ mod tests {
     #[test]
     fn masks_of_two_features_are_left_out_unless_they_are_large() {
         let row = [0, 0, 0, 0, 1, 1, 2, 2, 2, -1];
-        let maps = MaskMaps { width: 10, height: 1, ids: row.repeat(4) };
+        let maps = MaskMaps { ids: arr3(&[[row]; 4]) };
         // Mask 0 is half 0.3 and half 0.7: variance 0.04, but the largest. Mask 1 is 0.4 and 0.6: 0.01. Mask 2 is even.
         let image = [0.3, 0.3, 0.7, 0.7, 0.4, 0.6, 0.2, 0.2, 0.2, 0.9];
         let found = seen(&image, 1, &maps, &[Level::Large]);

@@ -6,6 +6,7 @@ use crate::world::World;
 use artifacts::{Descriptors, Features, Instances, Match};
 use cluster_match::describe;
 use gs_io::{Claim, Result};
+use ndarray::{Array2, Array3};
 use serde_json::{Value, json};
 use stage::Stage;
 
@@ -69,13 +70,13 @@ pub fn write(
         Product::Both(grouping, table) => (Some(grouping), Some(table)),
         Product::Features(features) => {
             let provenance = stage.provenance(Features::FORMAT, 1, parameters.clone(), world.hashes.clone());
-            stage.record(claim, parameters, world.hashes.clone(), json!({"dim": features.dim}))?;
+            stage.record(claim, parameters, world.hashes.clone(), json!({"dim": features.dim()}))?;
             return features.write(&peer.inputs().out, provenance);
         }
     };
     let instances = grouping.map(|g| g.instances(world));
     let descriptors = table.map(|t| t.descriptors(world));
-    let counts = (instances.as_ref().map(Instances::len), descriptors.as_ref().map(Descriptors::rows));
+    let counts = (instances.as_ref().map(Instances::len), descriptors.as_ref().map(|d| d.values.dim().0));
     stage.record(
         claim,
         parameters.clone(),
@@ -102,7 +103,9 @@ impl Table {
         let n = world.footprints.kept.len() as u32;
         let row = if rows.is_empty() { (0..n).collect() } else { rows };
         values.chunks_exact_mut(dim.max(1)).for_each(unit);
-        Descriptors { kept: world.footprints.kept.clone(), row, slots, dim, values }
+        let shape = (values.len() / (slots * dim).max(1), slots, dim);
+        let values = Array3::from_shape_vec(shape, values).expect("whole rows");
+        Descriptors { kept: world.footprints.kept.clone(), row, values }
     }
 }
 
@@ -114,9 +117,9 @@ impl Grouping {
         let means = &world.geometry.gaussians.means;
         let mut all = describe(means, labels, k, matches, &world.features);
         if !descriptors.is_empty() {
-            all.dim = descriptors.len() / k.max(1);
-            descriptors.chunks_exact_mut(all.dim.max(1)).for_each(unit);
-            all.descriptor = descriptors;
+            let dim = descriptors.len() / k.max(1);
+            descriptors.chunks_exact_mut(dim.max(1)).for_each(unit);
+            all.descriptor = Array2::from_shape_vec((k, dim), descriptors).expect("of each instance");
         }
         let (views, most) = (world.views.len().max(1) as f32, all.label.len().max(1) as f32);
         let confidence = |k: usize| (all.support[k] as f32 + all.count[k] as f32 / most) / (views + 1.0);

@@ -15,6 +15,7 @@ use crate::cli::Peer;
 use crate::product::{Grouping, Product};
 use crate::vectors::{group_means, most_alike, smoothed, unit};
 use crate::world::{Inputs, LearnedInputs, World};
+use artifacts::flat;
 use gs_io::Result;
 use hdbscan_exact::{Options as Hdbscan, cluster};
 use rand::SeedableRng;
@@ -61,16 +62,15 @@ impl Peer for Options {
     }
 
     fn make(&self, world: &World, stage: &Stage) -> Result<Product> {
-        let learned = &world.learned;
-        let mut features = learned.values.clone();
-        features.par_chunks_exact_mut(learned.dim).for_each(unit);
-        let (knn, k) = (&world.graph.gaussian_knn, world.graph.gaussian_k);
-        let features = smoothed(&features, learned.dim, knn, k, self.neighbours);
+        let dim = world.learned.dim();
+        let mut features = flat(world.learned.values.view()).to_vec();
+        features.par_chunks_exact_mut(dim).for_each(unit);
+        let features = smoothed(&features, dim, &world.graph.gaussian_knn, self.neighbours);
         let count = ((world.kept() as f64 * self.share).ceil() as usize).max(self.least).min(world.kept());
         let mut rng = ChaCha8Rng::seed_from_u64(stage.seed());
         let mut chosen = sample(&mut rng, world.kept(), count).into_vec();
         chosen.sort_unstable();
-        let (labels, instances) = clusters(&features, learned.dim, &chosen, self);
+        let (labels, instances) = clusters(&features, dim, &chosen, self);
         let labels = world.spread(&labels);
         let matches = world.matches(&labels, self.threshold)?;
         Ok(Product::Instances(Grouping { labels, instances, matches, ..Grouping::default() }))

@@ -10,8 +10,9 @@ use crate::cli::Peer;
 use crate::product::{Grouping, Product};
 use crate::vectors::{group_means, most_alike, unit};
 use crate::world::{Inputs, World};
-use artifacts::{Features, Instances, TruePoints};
+use artifacts::{Features, Instances, TruePoints, flat};
 use gs_io::{Error, Result};
+use ndarray::Array2;
 use serde::Serialize;
 use stage::Stage;
 use std::path::{Path, PathBuf};
@@ -71,7 +72,7 @@ impl Peer for Options {
         let learned = &world.learned;
         let labels = match self.of {
             Truth::Labels => truth,
-            Truth::Clustering => world.spread(&nearest_mean(&learned.values, learned.dim, &kept, things)),
+            Truth::Clustering => world.spread(&nearest_mean(flat(learned.values.view()), learned.dim(), &kept, things)),
             Truth::Features => return Ok(Product::Features(one_hot(&world.footprints.kept, &kept, things))),
         };
         let scores = eval::true_confidence(&world.geometry, &labels, things, &points);
@@ -91,14 +92,9 @@ fn nearest_mean(features: &[f32], dim: usize, truth: &[i32], things: usize) -> V
 
 /// A dimension for each thing; Gaussians of none have a zero.
 fn one_hot(kept: &[u32], truth: &[i32], things: usize) -> Features {
-    let dim = things.max(1);
-    let mut values = vec![0.0; kept.len() * dim];
-    for (row, &thing) in truth.iter().enumerate() {
-        if let Ok(thing) = usize::try_from(thing) {
-            values[row * dim + thing] = 1.0;
-        }
-    }
-    Features { kept: kept.to_vec(), dim, values, ..Features::default() }
+    let value = |(i, thing)| if truth[i] == thing as i32 { 1.0 } else { 0.0 };
+    let values = Array2::from_shape_fn((kept.len(), things.max(1)), value);
+    Features { kept: kept.to_vec(), values, ..Features::default() }
 }
 
 #[cfg(test)]
@@ -116,6 +112,6 @@ mod tests {
     #[test]
     fn true_features_are_alike_within_a_thing_and_at_right_angles_between() {
         let f = one_hot(&[4, 6, 7], &[1, -1, 0], 2);
-        assert_eq!((f.dim, f.row(0), f.row(1), f.row(2)), (2, &[0.0, 1.0][..], &[0.0, 0.0][..], &[1.0, 0.0][..]));
+        assert_eq!(f.values, ndarray::arr2(&[[0.0, 1.0], [0.0, 0.0], [1.0, 0.0]]));
     }
 }

@@ -1,5 +1,6 @@
 //! Unit vectors: of single Gaussians, averaged over neighbours, and the means that they are most like.
 
+use ndarray::Array2;
 use rayon::prelude::*;
 
 /// Brings a vector to unit length; one of length zero stays.
@@ -26,13 +27,13 @@ pub fn add(sum: &mut [f64], v: &[f32]) {
     sum.iter_mut().zip(v).for_each(|(s, &v)| *s += f64::from(v));
 }
 
-/// Means of `count` vectors, `[n][dim]`, each one's own and its nearest neighbours', at unit length; `knn` is `[n][k]`, nearest
+/// Means of `count` vectors, `[n][dim]`, each one's own and its nearest neighbours', at unit length; rows of `knn` are nearest
 /// first, padded with itself. Fewer are averaged where there are fewer neighbours.
-pub fn smoothed(rows: &[f32], dim: usize, knn: &[u32], k: usize, count: usize) -> Vec<f32> {
+pub fn smoothed(rows: &[f32], dim: usize, knn: &Array2<u32>, count: usize) -> Vec<f32> {
     let row = |i: usize| &rows[i * dim..(i + 1) * dim];
     let of = |i: usize| {
         let mut sum = vec![0.0f64; dim];
-        let near = knn[i * k..i * k + k.min(count.saturating_sub(1))].iter().map(|&j| j as usize).filter(|&j| j != i);
+        let near = knn.row(i).into_iter().take(count.saturating_sub(1)).map(|&j| j as usize).filter(|&j| j != i);
         near.chain([i]).for_each(|j| add(&mut sum, row(j)));
         normed(&sum)
     };
@@ -76,12 +77,13 @@ mod tests {
     fn smoothing_is_the_mean_with_the_neighbours() {
         // Along x, along y, along x; the middle one is everybody's neighbour, rows are padded with themselves.
         let f = [1.0, 0.0, 0.0, 1.0, 1.0, 0.0];
-        let s = smoothed(&f, 2, &[1, 0, 0, 2, 1, 2], 2, 3);
+        let knn = ndarray::arr2(&[[1, 0], [0, 2], [1, 2]]);
+        let s = smoothed(&f, 2, &knn, 3);
         let [a, b] = [0.5f32.sqrt(), 0.2f32.sqrt()];
         for (found, expected) in s.iter().zip([a, a, 2.0 * b, b, a, a]) {
             assert!((found - expected).abs() < 1e-6, "{s:?}");
         }
-        assert_eq!(smoothed(&f, 2, &[1, 0, 0, 2, 1, 2], 2, 1), [1.0, 0.0, 0.0, 1.0, 1.0, 0.0]);
+        assert_eq!(smoothed(&f, 2, &knn, 1), [1.0, 0.0, 0.0, 1.0, 1.0, 0.0]);
     }
 
     #[test]

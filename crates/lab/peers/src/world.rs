@@ -5,13 +5,14 @@
 use crate::cli::Peer;
 use artifacts::{
     Descriptors, Features, Footprints, Graph, Level, MaskFeatures, MaskFolder, MaskMaps, Match, Row, features_path,
-    hash_folder, role,
+    flat, hash_folder, role,
 };
 use cluster_match::{FeatureTable, matches, overlaps};
 use gs_io::{Claim, Error, Result, Watched, hash_file};
 use gs_raster::{RasterOptions, TileWeights, tile_weights};
 use gs_scene::dataset::{self, Dataset, LoadOptions, Resolution, View};
 use gs_scene::{Camera, Geometry};
+use ndarray::Array2;
 use serde::Serialize;
 use stage::Stage;
 use std::collections::BTreeMap;
@@ -181,7 +182,7 @@ impl World {
 
     /// Dimension of the mask features.
     pub fn dim(&self) -> usize {
-        self.features.values().next().map_or(0, |f| f.dim)
+        self.features.values().next().map_or(0, MaskFeatures::dim)
     }
 
     /// Rows of the footprints whose masks are of the levels that are used, by view and mask.
@@ -192,14 +193,14 @@ impl World {
 
     /// The feature of a mask, of unit length; none where it is zero.
     pub fn feature(&self, row: &Row) -> Option<&[f32]> {
-        let feature = self.features.get(&row.view)?.row(row.mask as usize)?;
+        let feature = flat(self.features.get(&row.view)?.row(row.mask as usize)?);
         feature.iter().any(|&v| v != 0.0).then_some(feature)
     }
 
     /// The id maps of a view, and its camera in their size.
     pub fn maps(&self, view: usize) -> Result<(MaskMaps, Camera)> {
         let maps = self.masks.read(&self.views[view])?;
-        let camera = self.views[view].camera.resized(maps.width as u32, maps.height as u32);
+        let camera = self.views[view].camera.resized(maps.width() as u32, maps.height() as u32);
         Ok((maps, camera))
     }
 
@@ -225,12 +226,8 @@ impl World {
     /// the largest IoU, where that exceeds `threshold`. `labels` are those of all Gaussians.
     pub fn matches(&self, labels: &[i32], threshold: f32) -> Result<Vec<Match>> {
         // Features that are all alike leave the IoU alone.
-        let alike = Features {
-            kept: self.footprints.kept.clone(),
-            dim: 1,
-            values: vec![1.0; self.kept()],
-            ..Features::default()
-        };
+        let values = Array2::ones((self.kept(), 1));
+        let alike = Features { kept: self.footprints.kept.clone(), values, ..Features::default() };
         let table = FeatureTable::new(&alike, self.gaussians());
         let mut all = Vec::new();
         for view in 0..self.views.len() {
@@ -252,7 +249,7 @@ fn learned(path: &Path, footprints: &Footprints, hashes: &mut BTreeMap<String, S
     if features.kept != footprints.kept {
         return Err(wrong("features of other Gaussians than the footprints", "kept"));
     }
-    if features.dim == 0 {
+    if features.dim() == 0 {
         return Err(wrong("features without numbers", "features"));
     }
     hashes.insert(role::FEATURES.into(), file.hash().into());
@@ -277,8 +274,9 @@ fn features_of(footprints: &Footprints, inputs: &Inputs) -> Result<BTreeMap<u32,
     for (view, stem) in footprints.views.iter().enumerate() {
         let path = features_path(&inputs.masks, stem);
         let features = MaskFeatures::read(&path)?;
-        if let Some(other) = all.values().next().filter(|f| f.dim != features.dim) {
-            return Err(Error::new("features of different models").file(&path).found(features.dim).expected(other.dim));
+        let dim = features.dim();
+        if let Some(other) = all.values().next().map(MaskFeatures::dim).filter(|&other| other != dim) {
+            return Err(Error::new("features of different models").file(&path).found(dim).expected(other));
         }
         all.insert(view as u32, features);
     }

@@ -14,6 +14,7 @@ use crate::truth::{label, masks, scannet, write_json};
 use artifacts::{MaskTruth, TrueObject, TruePart, TruePoints, TrueScene, features_path, maps_path};
 use gs_io::{IoContext, Outputs, Result, npy};
 use gs_scene::{Camera, Image, PointCloud, colmap};
+use ndarray::ArrayView2;
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
 use serde_json::{Value, json};
@@ -280,6 +281,9 @@ fn run_masks(stage: &Stage, folder: &Path, options: &Options) -> Result<()> {
 fn write_view(out: &Path, images: &str, stem: &str, frame: &Frame) -> Result<()> {
     let (w, h) = (frame.width, frame.height);
     Image::from_rgb8(w as u32, h as u32, &frame.rgb).write_png(out.join(images).join(format!("{stem}.png")))?;
-    npy::write_i32(out.join("truth/views").join(format!("{stem}.npy")), &[h, w], &frame.thing)?;
-    npy::write_i32(out.join("truth/parts").join(format!("{stem}.npy")), &[h, w], &frame.part)
+    for (folder, ids) in [("truth/views", &frame.thing), ("truth/parts", &frame.part)] {
+        let ids = ArrayView2::from_shape((h, w), ids).expect("an id of each pixel");
+        npy::write_i32(out.join(folder).join(format!("{stem}.npy")), &ids)?;
+    }
+    Ok(())
 }

@@ -203,10 +203,10 @@ fn true_points_show_where_the_instance_maps_say() {
     let points = TruePoints::read(root.join("truth/points.safetensors")).unwrap();
     let data = dataset::load(root, &LoadOptions::default()).unwrap();
     let classes = scene.classes();
-    let maps: Vec<Vec<f32>> = data
+    let maps: Vec<ndarray::ArrayD<f32>> = data
         .views
         .iter()
-        .map(|v| npy::read_f32(root.join("truth/views").join(format!("{}.npy", v.stem()))).unwrap().data)
+        .map(|v| npy::read_f32(root.join("truth/views").join(format!("{}.npy", v.stem()))).unwrap())
         .collect();
     let (mut right, mut seen) = (0, 0);
     for i in (0..points.position.len()).step_by(7) {
@@ -224,7 +224,7 @@ fn true_points_show_where_the_instance_maps_say() {
             let hit = scene.trace(eye, (p - eye).normalize(), 0.0).unwrap();
             if (hit.t - (p - eye).length()).abs() < 1e-4 {
                 views += 1;
-                right += usize::from(map[v as usize * 160 + u as usize] == points.instance[i] as f32);
+                right += usize::from(map[[v as usize, u as usize]] == points.instance[i] as f32);
             }
         }
         assert!(views > 0, "point {i} is seen by no view");
@@ -248,9 +248,9 @@ fn without_faults_large_masks_are_the_true_instances() {
         // Labels are given for training and held-out views.
         assert_eq!(root.join("label").join(stem(v)).with_extension("json").exists(), v % 4 == 0);
         let view = npy::read_f32(root.join("truth/views").join(format!("{}.npy", stem(v)))).unwrap();
-        assert_eq!(view.shape, [120, 160]);
+        assert_eq!(view.shape(), [120, 160]);
         let mut pairs = BTreeSet::new();
-        for (&id, &instance) in maps.level(Level::Large).iter().zip(&view.data) {
+        for (&id, &instance) in maps.level(Level::Large).iter().zip(&view) {
             assert!(instance >= 0.0, "rooms are closed");
             if id >= 0 {
                 pairs.insert((id, instance as u32));

@@ -1,12 +1,39 @@
 //! What readers and writers of several artifacts share.
 
+use gs_io::artifact::Element;
 use gs_io::{Artifact, Error, Result};
+use ndarray::Array2;
 use std::fmt::Display;
 
 /// Names of the views (file stems) that an artifact speaks of.
 pub(crate) fn view_names(a: &Artifact) -> Result<Vec<String>> {
     serde_json::from_value(a.provenance().extra["views"].clone())
         .map_err(|e| Error::new(format!("no list of view names: {e}")).file(a.path()).field("views"))
+}
+
+/// A tensor of rows and columns.
+pub(crate) fn table<T: Element>(a: &Artifact, name: &str, shape: [Option<usize>; 2]) -> Result<Array2<T>> {
+    let values = a.tensor::<T>(name, &shape)?.to_vec();
+    shaped(a, name, values)
+}
+
+/// The values of a tensor of rows and columns, all finite, that was left in the file.
+pub(crate) fn finite(a: &Artifact, name: &str, rows: usize) -> Result<Array2<f32>> {
+    let dim = a.extents::<f32>(name, &[Some(rows), None])?[1];
+    let values: Vec<f32> = a.read(name, 0..rows * dim)?;
+    if let Some(at) = values.iter().position(|v| !v.is_finite()) {
+        return Err(Error::new("not a finite number")
+            .file(a.path())
+            .field(format!("{name}[{}][{}]", at / dim, at % dim))
+            .found(values[at])
+            .hint("run the stage that makes it again"));
+    }
+    shaped(a, name, values)
+}
+
+fn shaped<T: Element>(a: &Artifact, name: &str, values: Vec<T>) -> Result<Array2<T>> {
+    let shape = a.extents::<T>(name, &[None, None])?;
+    Ok(Array2::from_shape_vec((shape[0], shape[1]), values).expect("as many values as its extents say"))
 }
 
 /// Refuses tensor `name` where one of its values is not `good`, as a function of its position and itself.

@@ -1,8 +1,9 @@
 //! `descriptors.safetensors`: language descriptors of single Gaussians, of systems that do not describe instances.
 
-use crate::checks::{below, check, check_kept};
-use crate::features::finite;
+use crate::checks::{below, check, check_kept, finite};
+use crate::flat;
 use gs_io::{Artifact, ArtifactWriter, Error, Provenance, Result};
+use ndarray::{Array3, ArrayView2, Axis};
 use std::path::Path;
 
 /// Language descriptors of Gaussians: each names a row of a table, which holds one descriptor or several.
@@ -12,12 +13,8 @@ pub struct Descriptors {
     pub kept: Vec<u32>,
     /// Row of each; n. Gaussians may share one.
     pub row: Vec<u32>,
-    /// Descriptors in a row, at least 1.
-    pub slots: usize,
-    /// Dimension of a descriptor.
-    pub dim: usize,
-    /// `[rows][slots][dim]`, each descriptor of unit length, or zero for none.
-    pub values: Vec<f32>,
+    /// `[rows][slots][dim]`, with at least 1 slot; each descriptor of unit length, or zero for none.
+    pub values: Array3<f32>,
 }
 
 impl Descriptors {
@@ -25,26 +22,26 @@ impl Descriptors {
     pub const FORMAT: &str = "descriptors";
     const VERSION: u32 = 1;
 
-    /// Number of rows.
-    pub fn rows(&self) -> usize {
-        self.values.len() / (self.slots * self.dim).max(1)
+    /// Dimension of a descriptor.
+    pub fn dim(&self) -> usize {
+        self.values.dim().2
     }
 
     /// The descriptors of a row, `[slots][dim]`.
-    pub fn of_row(&self, row: usize) -> &[f32] {
-        let width = self.slots * self.dim;
-        &self.values[row * width..(row + 1) * width]
+    pub fn of_row(&self, row: usize) -> ArrayView2<'_, f32> {
+        self.values.index_axis(Axis(0), row)
     }
 
     /// Writes the artifact.
     pub fn write(&self, path: impl AsRef<Path>, mut provenance: Provenance) -> Result<()> {
         provenance.format = Self::FORMAT.into();
         provenance.version = Self::VERSION;
+        let (rows, slots, dim) = self.values.dim();
         ArtifactWriter::new(provenance)
             .tensor("kept", &[self.kept.len()], &self.kept)
             .tensor("row", &[self.row.len()], &self.row)
-            .tensor("slots", &[1], &[self.slots as u32])
-            .tensor("descriptor", &[self.rows() * self.slots, self.dim], &self.values)
+            .tensor("slots", &[1], &[slots as u32])
+            .tensor("descriptor", &[rows * slots, dim], flat(self.values.view()))
             .write(path)
     }
 
@@ -68,32 +65,34 @@ impl Descriptors {
         check(&a, "slots", slots, fits, "not as many in every row", |_| format!("a divisor of {all}"))?;
         let slots = slots[0] as usize;
         below(&a, "row", &row, all / slots)?;
-        let (dim, values) = finite(&a, "descriptor", all)?;
-        Ok((Self { kept, row, slots, dim, values }, a))
+        let shape = (all / slots, slots, shape[1]);
+        let values = finite(&a, "descriptor", all)?.into_shape_with_order(shape);
+        let values = values.map_err(|e| Error::new(e.to_string()).file(a.path()).field("slots").found(slots))?;
+        Ok((Self { kept, row, values }, a))
     }
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
+    use ndarray::arr3;
 
     #[test]
     fn reads_back_and_refuses_what_does_not_fit() {
         let dir = tempfile::tempdir().unwrap();
         let path = dir.path().join("descriptors.safetensors");
-        let values = vec![1.0, 0.0, 0.6, 0.8, 0.0, 1.0, 0.0, 0.0];
-        let good = Descriptors { kept: vec![1, 4, 5], row: vec![1, 0, 1], slots: 2, dim: 2, values };
+        let values = arr3(&[[[1.0, 0.0], [0.6, 0.8]], [[0.0, 1.0], [0.0, 0.0]]]);
+        let good = Descriptors { kept: vec![1, 4, 5], row: vec![1, 0, 1], values };
         good.write(&path, Provenance::default()).unwrap();
         let (read, _) = Descriptors::read(&path).unwrap();
         assert_eq!(read, good);
-        assert_eq!((read.rows(), read.of_row(1)), (2, &[0.0, 1.0, 0.0, 0.0][..]));
         let mut nan = good.values.clone();
-        nan[3] = f32::NAN;
+        nan[[0, 1, 1]] = f32::NAN;
         for (bad, said) in [
             (Descriptors { values: nan, ..good.clone() }, "descriptor[1][1]: not a finite number"),
             (Descriptors { kept: vec![4, 1, 5], ..good.clone() }, "do not ascend"),
             (Descriptors { row: vec![1, 2, 0], ..good.clone() }, "row[1]: index out of range"),
-            (Descriptors { dim: 0, values: vec![], ..good.clone() }, "without a dimension"),
+            (Descriptors { values: Array3::default((0, 2, 0)), ..good.clone() }, "without a dimension"),
         ] {
             bad.write(&path, Provenance::default()).unwrap();
             let e = Descriptors::read(&path).unwrap_err().to_string();

@@ -3,6 +3,7 @@
 use crate::extents::Extents;
 use crate::instances::{Instances, Match, OrientedBox};
 use gs_io::{Error, IoContext, Result, write_json};
+use ndarray::Array2;
 use serde::{Deserialize, Serialize};
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::Path;
@@ -154,7 +155,7 @@ impl Edits {
         if !changed.is_empty() {
             // What a person made of the instances is what texts are to find.
             instances.granules.clear();
-            instances.granule_descriptor.clear();
+            instances.granule_descriptor = Array2::default((0, instances.dim()));
             measure(instances, means, &changed);
         }
         Ok(remarks)
@@ -220,7 +221,7 @@ fn merge(instances: &mut Instances, ids: &[u32]) -> Result<()> {
     instances.matches.iter_mut().filter(|m| all.contains(&m.instance)).for_each(|m| m.instance = first);
     instances.matches.sort_by_key(|m| (m.instance, m.view));
 
-    let mut sum = vec![0.0; instances.dim];
+    let mut sum = vec![0.0; instances.dim()];
     for &id in ids {
         let support = f64::from(instances.support[id as usize]);
         sum.iter_mut().zip(instances.descriptor_of(id as usize)).for_each(|(s, &v)| *s += support * f64::from(v));
@@ -230,9 +231,9 @@ fn merge(instances: &mut Instances, ids: &[u32]) -> Result<()> {
     let count = ids.iter().map(|&id| instances.count[id as usize]).sum();
     others.iter().for_each(|&id| clear(instances, id as usize));
     let views: BTreeSet<u32> = instances.matches.iter().filter(|m| m.instance == first).map(|m| m.view).collect();
-    let (first, dim) = (first as usize, instances.dim);
+    let first = first as usize;
     let unit = sum.iter().map(|v| if length > 1e-12 { (v / length) as f32 } else { 0.0 });
-    instances.descriptor[first * dim..(first + 1) * dim].iter_mut().zip(unit).for_each(|(d, v)| *d = v);
+    instances.descriptor.row_mut(first).iter_mut().zip(unit).for_each(|(d, v)| *d = v);
     (instances.support[first], instances.score[first]) = (views.len() as u32, score);
     instances.count[first] = count;
     Ok(())
@@ -240,8 +241,7 @@ fn merge(instances: &mut Instances, ids: &[u32]) -> Result<()> {
 
 /// Leaves nothing of an instance but its id.
 fn clear(instances: &mut Instances, id: usize) {
-    let dim = instances.dim;
-    instances.descriptor[id * dim..(id + 1) * dim].fill(0.0);
+    instances.descriptor.row_mut(id).fill(0.0);
     (instances.count[id], instances.support[id], instances.score[id]) = (0, 0, 0.0);
     instances.matches.retain(|m| m.instance as usize != id);
 }
@@ -281,8 +281,8 @@ fn split(instances: &mut Instances, id: u32) -> Result<()> {
 
 /// Adds an instance with descriptor, support and score of another; the rest of it is measured later.
 fn copy(instances: &mut Instances, of: usize) {
-    let descriptor = instances.descriptor_of(of).to_vec();
-    instances.descriptor.extend(descriptor);
+    let descriptor = instances.descriptor_of(of).to_owned();
+    instances.descriptor.push_row(descriptor.view()).expect("of one dimension");
     instances.support.push(instances.support[of]);
     instances.score.push(instances.score[of]);
     instances.count.push(0);
@@ -308,6 +308,7 @@ mod tests {
     use super::*;
     use crate::instances::TreeEdge;
     use crate::{Granule, Members};
+    use ndarray::{arr2, aview1};
 
     /// Instances 0 of parts 12 (Gaussians 0, 1) and 13 (2, 3, 4) with Gaussian 5 in neither, and 1 (6, 7); 8 is noise.
     fn example() -> (Instances, Vec<[f32; 3]>) {
@@ -318,8 +319,7 @@ mod tests {
         let extents = Extents::of(&means, &label, 2);
         let instances = Instances {
             label,
-            dim: 2,
-            descriptor: vec![1.0, 0.0, 0.0, 1.0],
+            descriptor: arr2(&[[1.0, 0.0], [0.0, 1.0]]),
             support: vec![3, 1],
             score: vec![0.4, 0.6],
             count: extents.count,
@@ -332,7 +332,7 @@ mod tests {
             tree: vec![edge(9, 10, 0), edge(9, 11, 1), edge(10, 12, -1), edge(10, 13, -1)],
             node: vec![12, 12, 13, 13, 13, 10, 11, 11, -1],
             granules: vec![Granule { members: Members::Instance(1), support: 1, fit: 1.0 }],
-            granule_descriptor: vec![0.0, 1.0],
+            granule_descriptor: arr2(&[[0.0, 1.0]]),
         };
         (instances, means)
     }
@@ -361,7 +361,7 @@ mod tests {
             applied(vec![rename(0, "pot"), rename(1, "mug"), Edit::Merge { instances: vec![1, 0] }]).unwrap();
         assert_eq!(i.label, [1, 1, 1, 1, 1, 1, 1, 1, -1]);
         assert_eq!((&i.count, &i.support), (&vec![0, 8], &vec![0, 3]), "three views, one of them twice");
-        assert_eq!((i.score[1], i.bbox_min[1], i.descriptor_of(0)), (0.6, [0.0; 3], &[0.0; 2][..]));
+        assert_eq!((i.score[1], i.bbox_min[1], i.descriptor_of(0)), (0.6, [0.0; 3], aview1(&[0.0; 2])));
         let (d, ten) = (i.descriptor_of(1), 10f32.sqrt());
         assert!((d[0] - 3.0 / ten).abs() < 1e-6 && (d[1] - 1.0 / ten).abs() < 1e-6, "weighted by support: {d:?}");
         assert_eq!(
@@ -388,7 +388,7 @@ mod tests {
         taken.label[..2].fill(1);
         let edits = Edits { edits: vec![Edit::Split { instance: 0 }], ..Edits::default() };
         edits.apply(&mut taken, &means).unwrap();
-        assert_eq!((taken.count[2], taken.support[2], taken.descriptor_of(2)), (0, 0, &[0.0; 2][..]));
+        assert_eq!((taken.count[2], taken.support[2], taken.descriptor_of(2)), (0, 0, aview1(&[0.0; 2])));
     }
 
     #[test]

@@ -1,7 +1,9 @@
 //! `graph.safetensors`: anchors and neighbours.
 
-use crate::checks::{below, check_kept};
+use crate::checks::{below, check_kept, table};
+use crate::flat;
 use gs_io::{Artifact, ArtifactWriter, Provenance, Result};
+use ndarray::Array2;
 use std::path::Path;
 
 /// The anchor graph of the paper's "Local Graph Sampling", and which Gaussians take part.
@@ -11,19 +13,15 @@ pub struct Graph {
     pub kept: Vec<u32>,
     /// Anchors as positions in `kept`; M.
     pub anchors: Vec<u32>,
-    /// Neighbours per anchor, k.
-    pub k: usize,
     /// Nearest kept Gaussians of each anchor, itself excluded, nearest first, ties by index; `[M][k]`, positions in
     /// `kept`. Rows are padded with the anchor's own position where a scene has too few Gaussians.
-    pub knn: Vec<u32>,
+    pub knn: Array2<u32>,
     /// Nearest anchors of each anchor, itself excluded; `[M][k]`, indices into `anchors`, padded likewise.
-    pub anchor_knn: Vec<u32>,
+    pub anchor_knn: Array2<u32>,
     /// Nearest anchor of each kept Gaussian; n, indices into `anchors`.
     pub nearest_anchor: Vec<u32>,
-    /// Spatial neighbours per kept Gaussian.
-    pub gaussian_k: usize,
-    /// Nearest kept Gaussians of each kept Gaussian, itself excluded; `[n][gaussian_k]`, padded with itself.
-    pub gaussian_knn: Vec<u32>,
+    /// Nearest kept Gaussians of each kept Gaussian, itself excluded; `[n][k of its own]`, padded with itself.
+    pub gaussian_knn: Array2<u32>,
     /// In how many views each Gaussian contributes; N.
     pub seen_views: Vec<u32>,
     /// Sum of blending weights over all pixels of all views; N.
@@ -43,10 +41,10 @@ impl Graph {
         ArtifactWriter::new(provenance)
             .tensor("kept", &[n], &self.kept)
             .tensor("anchors", &[m], &self.anchors)
-            .tensor("knn", &[m, self.k], &self.knn)
-            .tensor("anchor_knn", &[m, self.k], &self.anchor_knn)
+            .tensor("knn", &[m, self.knn.ncols()], flat(self.knn.view()))
+            .tensor("anchor_knn", &[m, self.anchor_knn.ncols()], flat(self.anchor_knn.view()))
             .tensor("nearest_anchor", &[n], &self.nearest_anchor)
-            .tensor("gaussian_knn", &[n, self.gaussian_k], &self.gaussian_knn)
+            .tensor("gaussian_knn", &[n, self.gaussian_knn.ncols()], flat(self.gaussian_knn.view()))
             .tensor("seen_views", &[self.seen_views.len()], &self.seen_views)
             .tensor("seen_weight", &[self.seen_weight.len()], &self.seen_weight)
             .write(path)
@@ -61,28 +59,25 @@ impl Graph {
         let kept = a.tensor::<u32>("kept", &[None])?.to_vec();
         let anchors = a.tensor::<u32>("anchors", &[None])?.to_vec();
         let (n, m) = (kept.len(), anchors.len());
-        let width = |name: &str| a.shape(name).and_then(|s| s.get(1).copied()).unwrap_or(0);
-        let (k, gaussian_k) = (width("knn"), width("gaussian_knn"));
+        let knn = table(&a, "knn", [Some(m), None])?;
         let seen_views = a.tensor::<u32>("seen_views", &[None])?.to_vec();
         let total = seen_views.len();
         let graph = Self {
-            knn: a.tensor("knn", &[Some(m), Some(k)])?.to_vec(),
-            anchor_knn: a.tensor("anchor_knn", &[Some(m), Some(k)])?.to_vec(),
+            anchor_knn: table(&a, "anchor_knn", [Some(m), Some(knn.ncols())])?,
             nearest_anchor: a.tensor("nearest_anchor", &[Some(n)])?.to_vec(),
-            gaussian_knn: a.tensor("gaussian_knn", &[Some(n), Some(gaussian_k)])?.to_vec(),
+            gaussian_knn: table(&a, "gaussian_knn", [Some(n), None])?,
             seen_weight: a.tensor("seen_weight", &[Some(total)])?.to_vec(),
             kept,
             anchors,
-            k,
-            gaussian_k,
+            knn,
             seen_views,
         };
         check_kept(&a, &graph.kept, total)?;
         below(&a, "anchors", &graph.anchors, n)?;
-        below(&a, "knn", &graph.knn, n)?;
-        below(&a, "anchor_knn", &graph.anchor_knn, m)?;
+        below(&a, "knn", flat(graph.knn.view()), n)?;
+        below(&a, "anchor_knn", flat(graph.anchor_knn.view()), m)?;
         below(&a, "nearest_anchor", &graph.nearest_anchor, m)?;
-        below(&a, "gaussian_knn", &graph.gaussian_knn, n)?;
+        below(&a, "gaussian_knn", flat(graph.gaussian_knn.view()), n)?;
         Ok((graph, a))
     }
 }

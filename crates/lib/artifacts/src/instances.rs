@@ -1,8 +1,10 @@
 //! `instances.safetensors`: the 3D instances with their descriptors, boxes and matches.
 
-use crate::checks::{below, check, check_labels, column, view_names};
+use crate::checks::{below, check, check_labels, column, table, view_names};
+use crate::flat;
 use crate::granules::{self, Granule, Members};
 use gs_io::{Artifact, ArtifactWriter, Provenance, Result};
+use ndarray::{Array2, ArrayView1};
 use serde_json::json;
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::Path;
@@ -53,10 +55,8 @@ pub struct OrientedBox {
 pub struct Instances {
     /// Instance of every Gaussian, -1 for noise; N.
     pub label: Vec<i32>,
-    /// Dimension of a descriptor; 0 when the scene has no language features.
-    pub dim: usize,
     /// Language descriptors, of unit length or zero; `[K][dim]`.
-    pub descriptor: Vec<f32>,
+    pub descriptor: Array2<f32>,
     /// Views in which the instance was matched with a mask; K.
     pub support: Vec<u32>,
     /// Confidence that this is one whole thing, 0 to 1, to rank instances by: the mean association score of its matches times
@@ -83,7 +83,7 @@ pub struct Instances {
     /// What texts may ask for: parts, things and groups, those that many masks show well first; Q.
     pub granules: Vec<Granule>,
     /// Their language descriptors, of unit length or zero; `[Q][dim]`.
-    pub granule_descriptor: Vec<f32>,
+    pub granule_descriptor: Array2<f32>,
 }
 
 /// The place of an instance in the tree of clusters.
@@ -113,9 +113,14 @@ impl Instances {
         self.count.is_empty()
     }
 
+    /// Dimension of a descriptor; 0 when the scene has no language features.
+    pub fn dim(&self) -> usize {
+        self.descriptor.ncols()
+    }
+
     /// Descriptor of an instance.
-    pub fn descriptor_of(&self, instance: usize) -> &[f32] {
-        &self.descriptor[instance * self.dim..(instance + 1) * self.dim]
+    pub fn descriptor_of(&self, instance: usize) -> ArrayView1<'_, f32> {
+        self.descriptor.row(instance)
     }
 
     /// The place of an instance in the tree; `None` for one that is not in it, because it is the root.
@@ -206,13 +211,13 @@ impl Instances {
             .tensor("granule_cluster", &[q], &column(granules, |g| members(g).1))
             .tensor("granule_support", &[q], &column(granules, |g| g.support))
             .tensor("granule_fit", &[q], &column(granules, |g| g.fit))
-            .tensor("granule_descriptor", &[q, self.dim], &self.granule_descriptor)
+            .tensor("granule_descriptor", &[q, self.dim()], flat(self.granule_descriptor.view()))
             .tensor("obb_center", &[k, 3], center.as_flattened())
             .tensor("obb_axes", &[k, 3, 3], axes.as_flattened().as_flattened())
             .tensor("obb_half_size", &[k, 3], half.as_flattened())
             .tensor("node", &[self.node.len()], &self.node)
             .tensor("label", &[self.label.len()], &self.label)
-            .tensor("descriptor", &[k, self.dim], &self.descriptor)
+            .tensor("descriptor", &[k, self.dim()], flat(self.descriptor.view()))
             .tensor("support", &[k], &self.support)
             .tensor("score", &[k], &self.score)
             .tensor("count", &[k], &self.count)
@@ -240,7 +245,7 @@ impl Instances {
         let a = Artifact::open(path, Self::FORMAT, Self::VERSION)?;
         let count = a.tensor::<u32>("count", &[None])?.to_vec();
         let k = count.len();
-        let dim = a.shape("descriptor").and_then(|s| s.get(1).copied()).unwrap_or(0);
+        let descriptor = table(&a, "descriptor", [Some(k), None])?;
         let views = view_names(&a)?;
         let triples = |name: &str| -> Result<Vec<[f32; 3]>> {
             Ok(a.tensor::<f32>(name, &[Some(k), Some(3)])?.as_chunks::<3>().0.to_vec())
@@ -255,8 +260,6 @@ impl Instances {
             oriented: (0..k).map(|i| OrientedBox { center: center[i], axes: axes[i], half_size: half[i] }).collect(),
             node: a.tensor("node", &[Some(label.len())])?.to_vec(),
             label,
-            dim,
-            descriptor: a.tensor("descriptor", &[Some(k), Some(dim)])?.to_vec(),
             support: a.tensor("support", &[Some(k)])?.to_vec(),
             score: a.tensor("score", &[Some(k)])?.to_vec(),
             centroid: triples("centroid")?,
@@ -267,9 +270,10 @@ impl Instances {
             tree,
             views,
             granule_descriptor: match granules.is_empty() {
-                true => Vec::new(),
-                false => a.tensor("granule_descriptor", &[Some(granules.len()), Some(dim)])?.to_vec(),
+                true => Array2::default((0, descriptor.ncols())),
+                false => table(&a, "granule_descriptor", [Some(granules.len()), Some(descriptor.ncols())])?,
             },
+            descriptor,
             granules,
         };
         Ok((instances, a))
@@ -311,8 +315,7 @@ mod tests {
         for dim in [0usize, 4] {
             let i = Instances {
                 label: vec![0, -1, 1, 1],
-                dim,
-                descriptor: vec![0.5; 2 * dim],
+                descriptor: Array2::from_elem((2, dim), 0.5),
                 support: vec![3, 0],
                 score: vec![0.5, 0.0],
                 count: vec![1, 2],
@@ -331,7 +334,7 @@ mod tests {
                     Granule { members: Members::Instance(1), support: 2, fit: 0.75 },
                     Granule { members: Members::Cluster(5), support: 3, fit: 1.0 },
                 ],
-                granule_descriptor: vec![0.5; 2 * dim],
+                granule_descriptor: Array2::from_elem((2, dim), 0.5),
             };
             i.write(&p, Provenance::default()).unwrap();
             assert_eq!(Instances::read(&p).unwrap().0, i);

@@ -21,6 +21,8 @@ mod palette;
 mod scratch;
 mod truth;
 
+use ndarray::{ArrayView, Dimension};
+
 pub use descriptors::Descriptors;
 pub use edits::{Edit, Edits, Remarks};
 pub use extents::Extents;
@@ -39,6 +41,14 @@ pub use nyu40::NYU40;
 pub use palette::{NOISE_COLOR, instance_color};
 pub use scratch::{Scratch, ScratchEntries};
 pub use truth::{MaskTruth, TrueObject, TruePart, TruePoints, TrueScene};
+
+/// The values of an array in C order, for what works on slices.
+///
+/// # Panics
+/// When the array is not in standard layout, which those of artifacts are.
+pub fn flat<T, D: Dimension>(array: ArrayView<'_, T, D>) -> &[T] {
+    array.to_slice().expect("standard layout")
+}
 
 /// Roles under which artifacts record the hashes of their inputs.
 pub mod role {

@@ -1,8 +1,9 @@
 //! Id maps and mask features in LangSplat's layout: `<stem>_s.npy` and `<stem>_f.npy` in one folder.
 
-use crate::role;
+use crate::{flat, role};
 use gs_io::{Error, IoContext, Provenance, Result, Watched, hash_files, npy};
 use gs_scene::dataset::View;
+use ndarray::{Array2, Array3, ArrayView1, ArrayView2, Axis, s};
 use std::path::{Path, PathBuf};
 
 /// Levels of an id map file.
@@ -96,13 +97,9 @@ pub fn watch_folder(folder: impl AsRef<Path>, suffix: &str) -> Result<Watched> {
 /// The id maps of one view.
 #[derive(Debug, Clone, PartialEq)]
 pub struct MaskMaps {
-    /// Width in pixels; the photograph may have another size.
-    pub width: usize,
-    /// Height in pixels.
-    pub height: usize,
     /// Mask id per pixel, -1 for none; `[4][height][width]`. Ids count on from level to level, so that an id is the row
     /// of the mask in `*_f.npy`; ids without pixels exist.
-    pub ids: Vec<i32>,
+    pub ids: Array3<i32>,
 }
 
 impl MaskMaps {
@@ -117,7 +114,7 @@ impl MaskMaps {
     pub fn read(path: impl AsRef<Path>) -> Result<Self> {
         let path = path.as_ref();
         let a = npy::read_f32(path)?;
-        let (levels, height, width) = match a.shape[..] {
+        let (levels, height, width) = match *a.shape() {
             [levels @ (1 | LEVELS), h, w] => (levels, h, w),
             [h, w] => (1, h, w),
             _ => (0, 0, 0),
@@ -126,46 +123,52 @@ impl MaskMaps {
             return Err(Error::new("not an id map")
                 .file(path)
                 .field("shape")
-                .found(format!("{:?}", a.shape))
+                .found(format!("{:?}", a.shape()))
                 .expected("[4, height, width]"));
         }
         // Tables with a row for each id are made from this: ids are dense, so there are no more of them than pixels.
         let most = Self::MAX_ID.min((levels * height * width).max(1 << 16) as f32);
-        if let Some(at) = a.data.iter().position(|&v| v.fract() != 0.0 || !(-1.0..most).contains(&v)) {
+        let values = flat(a.view());
+        if let Some(at) = values.iter().position(|&v| v.fract() != 0.0 || !(-1.0..most).contains(&v)) {
             let (x, y, l) = (at % width, at / width % height, at / (width * height));
             return Err(Error::new("not a mask id")
                 .file(path)
                 .field(format!("level {l}, row {y}, column {x}"))
-                .found(a.data[at])
+                .found(values[at])
                 .expected(format!("-1 or a whole number from 0, below {most}"))
                 .hint("id maps must not be interpolated or blended"));
         }
-        let mut ids: Vec<i32> = a.data.iter().map(|&v| v as i32).collect();
+        let mut ids: Vec<i32> = values.iter().map(|&v| v as i32).collect();
         if levels == 1 {
             ids = ids.repeat(LEVELS);
         }
-        Ok(Self { width, height, ids })
+        Ok(Self { ids: Array3::from_shape_vec((LEVELS, height, width), ids).expect("ids of all levels") })
     }
 
     /// Writes `*_s.npy` as LangSplat does: f32 `[4, H, W]`.
     pub fn write(&self, path: impl AsRef<Path>) -> Result<()> {
-        let data: Vec<f32> = self.ids.iter().map(|&i| i as f32).collect();
-        npy::write_f32(path, &[LEVELS, self.height, self.width], &data)
+        npy::write_f32(path, &self.ids.mapv(|id| id as f32))
+    }
+
+    /// Width in pixels; the photograph may have another size.
+    pub fn width(&self) -> usize {
+        self.ids.dim().2
+    }
+
+    /// Height in pixels.
+    pub fn height(&self) -> usize {
+        self.ids.dim().1
     }
 
     /// The map of one level, `[height][width]`.
-    pub fn level(&self, level: Level) -> &[i32] {
-        let n = self.width * self.height;
-        &self.ids[level as usize * n..(level as usize + 1) * n]
+    pub fn level(&self, level: Level) -> ArrayView2<'_, i32> {
+        self.ids.index_axis(Axis(0), level as usize)
     }
 
     /// Forgets the masks of all levels but these.
     pub fn keep(&mut self, levels: &[Level]) {
-        let n = self.width * self.height;
-        for (level, ids) in Level::ALL.iter().zip(self.ids.chunks_exact_mut(n.max(1))) {
-            if !levels.contains(level) {
-                ids.fill(-1);
-            }
+        for level in Level::ALL.iter().filter(|level| !levels.contains(level)) {
+            self.ids.index_axis_mut(Axis(0), *level as usize).fill(-1);
         }
     }
 
@@ -173,10 +176,8 @@ impl MaskMaps {
     /// with fewer pixels than a step some vanish.
     #[must_use]
     pub fn shrunk(&self, step: usize) -> Self {
-        let rows = self.ids.chunks_exact(self.width.max(1)).enumerate();
-        let kept = rows.filter(|(row, _)| (row % self.height.max(1)).is_multiple_of(step));
-        let ids = kept.flat_map(|(_, row)| row.iter().copied().step_by(step)).collect();
-        Self { width: self.width.div_ceil(step), height: self.height.div_ceil(step), ids }
+        let step = step as isize;
+        Self { ids: self.ids.slice(s![.., ..;step, ..;step]).as_standard_layout().into_owned() }
     }
 
     /// Refuses maps, read from `file`, of another shape than a photograph of `width` x `height`: maps may be of another size.
@@ -184,7 +185,7 @@ impl MaskMaps {
     /// # Errors
     /// When they have not the [`same_shape`].
     pub fn expect_shape(&self, width: u32, height: u32, file: impl AsRef<Path>) -> Result<()> {
-        let (w, h) = (self.width, self.height);
+        let (w, h) = (self.width(), self.height());
         if same_shape([w as u32, h as u32], [width, height]) {
             return Ok(());
         }
@@ -235,7 +236,8 @@ impl MaskFolder {
         let mut maps = MaskMaps::read(&file)?;
         maps.expect_shape(view.camera.width, view.camera.height, &file)?;
         if self.bends(view) {
-            view.undistort_nearest(&mut maps.ids, maps.width, maps.height);
+            let (width, height) = (maps.width(), maps.height());
+            view.undistort_nearest(maps.ids.as_slice_mut().expect("as read"), width, height);
         }
         Ok(maps)
     }
@@ -252,12 +254,8 @@ pub fn same_shape([width, height]: [u32; 2], photograph: [u32; 2]) -> bool {
 /// The language features of the masks of one view.
 #[derive(Debug, Clone, PartialEq)]
 pub struct MaskFeatures {
-    /// Number of masks over all levels.
-    pub count: usize,
-    /// Dimension of a feature.
-    pub dim: usize,
-    /// `[count][dim]`, unit length, or zero for a mask without pixels.
-    pub values: Vec<f32>,
+    /// `[masks][dim]`, the masks of all levels; unit length, or zero for a mask without pixels.
+    pub values: Array2<f32>,
 }
 
 impl MaskFeatures {
@@ -268,63 +266,65 @@ impl MaskFeatures {
     pub fn read(path: impl AsRef<Path>) -> Result<Self> {
         let path = path.as_ref();
         let a = npy::read_f32(path)?;
-        let &[count, dim] = &a.shape[..] else {
-            return Err(Error::new("not mask features")
-                .file(path)
-                .field("shape")
-                .found(format!("{:?}", a.shape))
-                .expected("[masks, dimension]"));
-        };
-        if let Some(at) = a.data.iter().position(|v| !v.is_finite()) {
-            let field = format!("row {}, column {}", at / dim, at % dim);
-            return Err(Error::new("not a finite number").file(path).field(field).found(a.data[at]));
+        let found = format!("{:?}", a.shape());
+        let values: Array2<f32> = a.into_dimensionality().map_err(|_| {
+            Error::new("not mask features").file(path).field("shape").found(found).expected("[masks, dimension]")
+        })?;
+        if let Some(((row, column), v)) = values.indexed_iter().find(|(_, v)| !v.is_finite()) {
+            let field = format!("row {row}, column {column}");
+            return Err(Error::new("not a finite number").file(path).field(field).found(v));
         }
-        Ok(Self { count, dim, values: a.data })
+        Ok(Self { values })
     }
 
     /// Writes `*_f.npy`: f32 `[masks, dim]`.
     pub fn write(&self, path: impl AsRef<Path>) -> Result<()> {
-        npy::write_f32(path, &[self.count, self.dim], &self.values)
+        npy::write_f32(path, &self.values)
     }
 
     /// Feature of mask `id`, if there is one.
-    pub fn row(&self, id: usize) -> Option<&[f32]> {
-        self.values.get(id * self.dim..(id + 1) * self.dim)
+    pub fn row(&self, id: usize) -> Option<ArrayView1<'_, f32>> {
+        (id < self.values.nrows()).then(|| self.values.row(id))
+    }
+
+    /// Dimension of a feature.
+    pub fn dim(&self) -> usize {
+        self.values.ncols()
     }
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
+    use ndarray::arr2;
 
     #[test]
     fn shrunk_maps_keep_the_first_of_every_few_pixels() {
         // 5 x 3 pixels at four levels: level, row and column are the digits of the id.
-        let id = |i: i32| 100 * (i / 15) + 10 * (i / 5 % 3) + i % 5;
-        let m = MaskMaps { width: 5, height: 3, ids: (0..60).map(id).collect() };
+        let id = |(l, y, x)| (100 * l + 10 * y + x) as i32;
+        let m = MaskMaps { ids: Array3::from_shape_fn((4, 3, 5), id) };
         let half = m.shrunk(2);
-        assert_eq!((half.width, half.height), (3, 2));
-        assert_eq!(half.level(Level::Default), [0, 2, 4, 20, 22, 24]);
-        assert_eq!(half.level(Level::Large), [300, 302, 304, 320, 322, 324]);
+        assert_eq!((half.width(), half.height()), (3, 2));
+        assert_eq!(half.level(Level::Default), arr2(&[[0, 2, 4], [20, 22, 24]]));
+        assert_eq!(half.level(Level::Large), arr2(&[[300, 302, 304], [320, 322, 324]]));
         assert_eq!(m.shrunk(1), m);
-        assert_eq!(m.shrunk(64).ids, [0, 100, 200, 300]);
+        assert_eq!(flat(m.shrunk(64).ids.view()), [0, 100, 200, 300]);
     }
 
     #[test]
     fn id_maps_read_back_and_refuse_blended_ids() {
         let dir = tempfile::tempdir().unwrap();
         let p = maps_path(dir.path(), "frame_00001");
-        let m = MaskMaps { width: 3, height: 2, ids: (0..24).map(|i| i % 7 - 1).collect() };
+        let m = MaskMaps { ids: Array3::from_shape_fn((4, 2, 3), |(l, y, x)| (6 * l + 3 * y + x) as i32 % 7 - 1) };
         m.write(&p).unwrap();
         assert_eq!(MaskMaps::read(&p).unwrap(), m);
-        assert_eq!(m.level(Level::Large), &m.ids[18..]);
         assert_eq!(stems(dir.path()).unwrap(), ["frame_00001"]);
-        npy::write_f32(&p, &[2, 3], &[0.0, 0.5, 0.0, 0.0, 0.0, 0.0]).unwrap();
+        npy::write_f32(&p, &arr2(&[[0.0, 0.5, 0.0], [0.0, 0.0, 0.0]])).unwrap();
         let e = MaskMaps::read(&p).unwrap_err().to_string();
         assert!(e.contains("level 0, row 0, column 1") && e.contains("found 0.5"), "{e}");
-        npy::write_f32(&p, &[2, 3], &[-1.0, 0.0, 1.0, 2.0, 3.0, 4.0]).unwrap();
-        assert_eq!(MaskMaps::read(&p).unwrap().level(Level::Medium), [-1, 0, 1, 2, 3, 4]);
-        npy::write_f32(&p, &[0, 3], &[]).unwrap();
+        npy::write_f32(&p, &arr2(&[[-1.0, 0.0, 1.0], [2.0, 3.0, 4.0]])).unwrap();
+        assert_eq!(MaskMaps::read(&p).unwrap().level(Level::Medium), arr2(&[[-1, 0, 1], [2, 3, 4]]));
+        npy::write_f32(&p, &Array2::<f32>::zeros((0, 3))).unwrap();
         assert!(MaskMaps::read(&p).is_err());
     }
 
@@ -341,13 +341,12 @@ mod tests {
         let load = gs_scene::dataset::LoadOptions { resolution: "1".parse().unwrap(), holdout: 0 };
         let view = gs_scene::dataset::load(root, &load).unwrap().views.remove(0);
         // A wall that ends at column 20 of the photograph, 20 pixels left of its middle.
-        let ids = (0..4 * 80 * 60).map(|i| i32::from(i % 80 >= 20)).collect();
-        let given = MaskMaps { width: 80, height: 60, ids };
+        let given = MaskMaps { ids: Array3::from_shape_fn((4, 60, 80), |(_, _, x)| i32::from(x >= 20)) };
         given.write(maps_path(&masks, "a")).unwrap();
         let folder = MaskFolder::open(&masks);
         let read = folder.read(&view).unwrap();
         assert!(folder.bends(&view));
-        let begins = |row: usize| read.level(Level::Large)[80 * row..].iter().position(|&id| id == 1).unwrap();
+        let begins = |row: usize| read.level(Level::Large).row(row).iter().position(|&id| id == 1).unwrap();
         // A barrel pulls inwards, and more so the farther out: in the middle row x of the undistorted picture is seen at
         // 40 + (x - 40) (1 - 0.3 ((x - 40) / 50)^2).
         assert_eq!([begins(30), begins(29)], [19, 19]);

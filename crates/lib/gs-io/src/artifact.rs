@@ -342,11 +342,6 @@ impl Artifact {
         Ok(out)
     }
 
-    /// The shape of tensor `name`, if there is one.
-    pub fn shape(&self, name: &str) -> Option<Vec<usize>> {
-        self.tensors.get(name).map(|tensor| tensor.shape.clone())
-    }
-
     /// Checks that this artifact was made from the input of the given role with this hash.
     pub fn expect_input(&self, role: &str, hash: &str) -> Result<()> {
         match self.provenance.inputs.get(role) {

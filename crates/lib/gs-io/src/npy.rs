@@ -1,17 +1,9 @@
 //! NumPy `.npy` arrays (format versions 1 to 3, C order), little-endian.
 
 use crate::{Error, IoContext, Result, write_atomic};
+use ndarray::{ArrayD, ArrayRef, Dimension};
 use std::fs;
 use std::path::Path;
-
-/// An array as read: shape and values in C order.
-#[derive(Debug, Clone, PartialEq)]
-pub struct Npy<T> {
-    /// Extent of each axis.
-    pub shape: Vec<usize>,
-    /// Values in C order; as many as the product of the shape.
-    pub data: Vec<T>,
-}
 
 const MAGIC: &[u8] = b"\x93NUMPY";
 
@@ -20,14 +12,14 @@ const MAGIC: &[u8] = b"\x93NUMPY";
 /// # Errors
 /// Names file and field when the file is not an npy, is cut short or longer than its header says, is in Fortran order,
 /// big-endian, or of another dtype.
-pub fn read_f32(path: impl AsRef<Path>) -> Result<Npy<f32>> {
+pub fn read_f32(path: impl AsRef<Path>) -> Result<ArrayD<f32>> {
     let path = path.as_ref();
     let bytes = fs::read(path).at("read", path)?;
     parse(&bytes).map_err(|e| e.file(path))
 }
 
 /// Parses an npy from memory; see [`read_f32`].
-pub fn parse(bytes: &[u8]) -> Result<Npy<f32>> {
+pub fn parse(bytes: &[u8]) -> Result<ArrayD<f32>> {
     let bad = |what: &str| Error::new(what).hint("write it again with numpy.save");
     if bytes.len() < 10 || &bytes[..6] != MAGIC {
         return Err(bad("not an npy file").field("magic"));
@@ -102,37 +94,36 @@ pub fn parse(bytes: &[u8]) -> Result<Npy<f32>> {
         "u8" => read!(u64),
         _ => return Err(bad("unsupported dtype").field("descr").found(descr).expected("a real number type")),
     };
-    Ok(Npy { shape, data })
+    ArrayD::from_shape_vec(shape, data).map_err(|e| bad(&format!("not the shape of an array: {e}")).field("shape"))
 }
 
-fn write(path: &Path, descr: &str, shape: &[usize], body: &[u8]) -> Result<()> {
+fn write<T: bytemuck::Pod, D: Dimension>(path: &Path, descr: &str, array: &ArrayRef<T, D>) -> Result<()> {
+    let shape = array.shape();
     let tuple = format!("{shape:?}").replace('[', "(").replace(']', if shape.len() == 1 { ",)" } else { ")" });
     let header = format!("{{'descr': '{descr}', 'fortran_order': False, 'shape': {tuple}, }}");
     // Data begin at a multiple of 64 bytes: 10 come before the header, and a line break ends it.
     let width = (header.len() + 11).next_multiple_of(64) - 11;
     let header = format!("{header:<width$}\n");
+    let ordered = array.as_standard_layout();
+    let body = bytemuck::cast_slice(ordered.as_slice().expect("standard layout"));
     let parts = [MAGIC, &[1, 0], &(header.len() as u16).to_le_bytes(), header.as_bytes(), body];
     write_atomic(path, |w| parts.iter().try_for_each(|part| w.write_all(part)).at("write", path))
 }
 
-/// Writes an f32 array. The product of `shape` must be the number of values.
-///
-/// # Panics
-/// When `shape` does not fit `data`.
-pub fn write_f32(path: impl AsRef<Path>, shape: &[usize], data: &[f32]) -> Result<()> {
-    assert_eq!(shape.iter().product::<usize>(), data.len());
-    write(path.as_ref(), "<f4", shape, bytemuck::cast_slice(data))
+/// Writes an f32 array, in C order whatever its layout in memory.
+pub fn write_f32<D: Dimension>(path: impl AsRef<Path>, array: &ArrayRef<f32, D>) -> Result<()> {
+    write(path.as_ref(), "<f4", array)
 }
 
 /// Writes an i32 array as [`write_f32`] does.
-pub fn write_i32(path: impl AsRef<Path>, shape: &[usize], data: &[i32]) -> Result<()> {
-    assert_eq!(shape.iter().product::<usize>(), data.len());
-    write(path.as_ref(), "<i4", shape, bytemuck::cast_slice(data))
+pub fn write_i32<D: Dimension>(path: impl AsRef<Path>, array: &ArrayRef<i32, D>) -> Result<()> {
+    write(path.as_ref(), "<i4", array)
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
+    use ndarray::{Array2, arr1, arr2};
 
     #[test]
     fn round_trip() {
@@ -140,19 +131,30 @@ mod tests {
         let p = dir.path().join("a.npy");
         for shape in [vec![6], vec![2, 3], vec![1, 2, 3], vec![0, 4]] {
             let data: Vec<f32> = (0..shape.iter().product::<usize>()).map(|i| i as f32 - 1.5).collect();
-            write_f32(&p, &shape, &data).unwrap();
-            assert_eq!(read_f32(&p).unwrap(), Npy { shape: shape.clone(), data });
+            let array = ArrayD::from_shape_vec(shape, data).unwrap();
+            write_f32(&p, &array).unwrap();
+            assert_eq!(read_f32(&p).unwrap(), array);
             assert_eq!(fs::read(&p).unwrap().iter().position(|&b| b == b'\n').unwrap() % 64, 63);
         }
-        write_i32(&p, &[3], &[-1, 0, 7]).unwrap();
-        assert_eq!(read_f32(&p).unwrap().data, [-1.0, 0.0, 7.0]);
+        write_i32(&p, &arr1(&[-1, 0, 7])).unwrap();
+        assert_eq!(read_f32(&p).unwrap(), arr1(&[-1.0, 0.0, 7.0]).into_dyn());
+        let table = arr2(&[[1.0, 2.0, 3.0], [4.0, 5.0, 6.0]]);
+        write_f32(&p, &table.t()).unwrap();
+        assert_eq!(read_f32(&p).unwrap(), table.t().into_dyn(), "in C order whatever lies in memory");
+    }
+
+    #[test]
+    fn a_shape_beyond_memory_is_an_error_even_without_elements() {
+        let header = "{'descr': '<f4', 'fortran_order': False, 'shape': (0, 65536, 65536, 65536, 65536)}";
+        let bytes = [MAGIC, &[1, 0, header.len() as u8, 0], header.as_bytes()].concat();
+        assert!(parse(&bytes).unwrap_err().to_string().starts_with("shape: not the shape of an array"));
     }
 
     #[test]
     fn damaged_files_are_refused_or_hold_what_their_header_says() {
         let dir = tempfile::tempdir().unwrap();
         let p = dir.path().join("a.npy");
-        write_f32(&p, &[4, 4], &[1.0; 16]).unwrap();
+        write_f32(&p, &Array2::<f32>::ones((4, 4))).unwrap();
         let good = fs::read(&p).unwrap();
         assert!((0..good.len()).all(|length| parse(&good[..length]).is_err()));
         for bit in 0..8 * good.len() {
@@ -160,9 +162,7 @@ mod tests {
             bytes[bit / 8] ^= 1 << (bit % 8);
             // A flipped bit can make another shape, such as (0, 4), which a cut file can fill.
             for length in (0..=bytes.len()).rev().step_by(4) {
-                if let Ok(a) = parse(&bytes[..length]) {
-                    assert_eq!(a.shape.iter().product::<usize>(), a.data.len());
-                }
+                _ = parse(&bytes[..length]);
             }
         }
     }

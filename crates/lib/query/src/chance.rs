@@ -87,17 +87,17 @@ fn best_score(
 mod tests {
     use super::*;
     use artifacts::{Granule, Instances, Members};
+    use ndarray::arr2;
 
     /// Instances along x and y; a group between x and z.
     fn instances() -> Instances {
         Instances {
             label: vec![0, 1],
-            dim: 3,
-            descriptor: vec![1.0, 0.0, 0.0, 0.0, 1.0, 0.0],
+            descriptor: arr2(&[[1.0, 0.0, 0.0], [0.0, 1.0, 0.0]]),
             support: vec![5, 2],
             count: vec![1, 1],
             granules: vec![Granule { members: Members::Cluster(9), support: 3, fit: 0.9 }],
-            granule_descriptor: vec![0.6, 0.0, 0.8],
+            granule_descriptor: arr2(&[[0.6, 0.0, 0.8]]),
             ..Instances::default()
         }
     }

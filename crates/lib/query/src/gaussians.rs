@@ -1,7 +1,7 @@
 //! Gaussians that have language descriptors of their own, and which of them answer a text.
 
 use crate::ranking::{Question, norm};
-use artifacts::{Descriptors, role};
+use artifacts::{Descriptors, flat, role};
 use gs_io::{Artifact, Error, Result};
 use serde::Serialize;
 use std::path::Path;
@@ -53,7 +53,7 @@ impl DescribedGaussians {
     }
 
     fn new(descriptors: Descriptors, artifact: Artifact) -> Self {
-        let lengths = descriptors.values.chunks_exact(descriptors.dim.max(1)).map(norm).collect();
+        let lengths = descriptors.values.rows().into_iter().map(flat).map(norm).collect();
         Self { descriptors, artifact, lengths }
     }
 
@@ -66,10 +66,10 @@ impl DescribedGaussians {
 /// Scores of the rows: the best of a row's descriptors.
 fn row_scores(d: &Descriptors, lengths: &[f64], feature: &[f32], negatives: &[Vec<f32>]) -> Vec<Option<f32>> {
     let question = Question::new(feature, negatives);
-    let slots = d.values.chunks_exact(d.dim.max(1)).zip(lengths).map(|(v, &length)| question.score(v, length));
+    let slots = d.values.rows().into_iter().zip(lengths).map(|(v, &length)| question.score(flat(v), length));
     let slots: Vec<Option<f32>> = slots.collect();
     let best = |row: &[Option<f32>]| row.iter().copied().flatten().reduce(f32::max);
-    slots.chunks_exact(d.slots.max(1)).map(best).collect()
+    slots.chunks_exact(d.values.dim().1.max(1)).map(best).collect()
 }
 
 fn choose(
@@ -81,7 +81,7 @@ fn choose(
 ) -> Vec<Chosen> {
     let scores = |feature: &Option<Vec<f32>>| match feature {
         Some(feature) => row_scores(d, lengths, feature, negatives),
-        None => vec![None; d.rows()],
+        None => vec![None; d.values.dim().0],
     };
     let scores: Vec<Vec<Option<f32>>> = features.iter().map(scores).collect();
     let highest = |row: usize| {
@@ -89,7 +89,7 @@ fn choose(
         of_row.fold(None, |best: Option<(usize, f32)>, s| if best.is_some_and(|b| b.1 >= s.1) { best } else { Some(s) })
     };
     let most_alike: Vec<Option<usize>> = match share {
-        Share::MostAlike => (0..d.rows()).map(|row| highest(row).map(|best| best.0)).collect(),
+        Share::MostAlike => (0..d.values.dim().0).map(|row| highest(row).map(|best| best.0)).collect(),
         _ => Vec::new(),
     };
     let one = |(text, scores): (usize, &Vec<Option<f32>>)| {
@@ -115,12 +115,14 @@ fn choose(
 #[cfg(test)]
 mod tests {
     use super::*;
+    use ndarray::arr3;
 
     /// Rows along x, along y, between both with a second descriptor along -x, and without any; Gaussian 5 shares the first.
     fn answers(share: Share, negatives: &[Vec<f32>]) -> Vec<Chosen> {
-        let values = vec![1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.6, 0.8, -1.0, 0.0, 0.0, 0.0, 0.0, 0.0];
-        let d = Descriptors { kept: vec![1, 2, 3, 4, 5], row: vec![0, 1, 2, 3, 0], slots: 2, dim: 2, values };
-        let lengths: Vec<f64> = d.values.chunks_exact(2).map(norm).collect();
+        let one = |v: [f32; 2]| [v, [0.0; 2]];
+        let values = arr3(&[one([1.0, 0.0]), one([0.0, 1.0]), [[0.6, 0.8], [-1.0, 0.0]], one([0.0; 2])]);
+        let d = Descriptors { kept: vec![1, 2, 3, 4, 5], row: vec![0, 1, 2, 3, 0], values };
+        let lengths: Vec<f64> = d.values.rows().into_iter().map(flat).map(norm).collect();
         let texts = [Some(vec![2.0, 0.0]), Some(vec![0.0, 3.0]), None, Some(vec![-1.0, 0.0])];
         choose(&d, &lengths, &texts, negatives, share)
     }

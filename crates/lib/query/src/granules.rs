@@ -1,7 +1,7 @@
 //! Which part, thing or group a feature means.
 
 use crate::ranking::{Question, norm};
-use artifacts::{Granule, Instances, Members};
+use artifacts::{Granule, Instances, Members, flat};
 use serde::{Deserialize, Serialize};
 
 /// How much it counts that the masks show a granule as one, beside how well it suits the feature: the best score of all is one unit
@@ -48,7 +48,7 @@ pub struct Meant {
 impl<'a> Granules<'a> {
     /// Lays out the granules of these instances.
     pub fn new(instances: &'a Instances) -> Self {
-        let lengths = instances.granule_descriptor.chunks_exact(instances.dim.max(1)).map(norm).collect();
+        let lengths = instances.granule_descriptor.rows().into_iter().map(flat).map(norm).collect();
         Self { instances, lengths }
     }
 
@@ -71,11 +71,11 @@ impl<'a> Granules<'a> {
 
     /// Granules that masks show in enough views, each with its score as of instances.
     pub(crate) fn scores(&self, feature: &[f32], negatives: &[Vec<f32>], min_support: u32) -> Vec<(usize, f32)> {
-        let Instances { granules, granule_descriptor, dim, .. } = self.instances;
+        let Instances { granules, granule_descriptor, .. } = self.instances;
         let question = Question::new(feature, negatives);
-        let descriptors = granule_descriptor.chunks_exact((*dim).max(1)).zip(&self.lengths).enumerate();
+        let descriptors = granule_descriptor.rows().into_iter().zip(&self.lengths).enumerate();
         let enough = descriptors.filter(|&(q, _)| granules[q].support >= min_support);
-        enough.filter_map(|(q, (d, &length))| Some((q, question.score(d, length)?))).collect()
+        enough.filter_map(|(q, (d, &length))| Some((q, question.score(flat(d), length)?))).collect()
     }
 
     fn meaning(&self, granule: u32, score: f32) -> Meant {
@@ -108,6 +108,7 @@ impl<'a> Granules<'a> {
 mod tests {
     use super::*;
     use artifacts::TreeEdge;
+    use ndarray::arr2;
 
     /// A set of cup 0 (Gaussians 0 to 3, a handle 2, 3 of its own) and spoon 1 (Gaussians 4 to 6), and instance 2, a book (7).
     fn scene() -> Instances {
@@ -119,7 +120,6 @@ mod tests {
             node: vec![11, 11, 13, 13, 12, 12, 12, 14],
             tree: vec![edge(9, 10, -1), edge(9, 14, 2), edge(10, 11, 0), edge(10, 12, 1), edge(11, 13, -1)],
             count: vec![4, 3, 1],
-            dim: 3,
             granules: vec![
                 granule(Members::Instance(0), 5, 0.9),
                 granule(Members::Cluster(13), 3, 0.8),
@@ -127,8 +127,13 @@ mod tests {
                 granule(Members::Instance(1), 5, 0.5),
                 granule(Members::Cluster(12), 1, 0.5),
             ],
-            granule_descriptor: [[1.0, 0.0, 0.0], [0.8, 0.0, 0.6], [u, u, 0.0], [0.0, 1.0, 0.0], [0.0, 1.0, 0.0]]
-                .concat(),
+            granule_descriptor: arr2(&[
+                [1.0, 0.0, 0.0],
+                [0.8, 0.0, 0.6],
+                [u, u, 0.0],
+                [0.0, 1.0, 0.0],
+                [0.0, 1.0, 0.0],
+            ]),
             ..Instances::default()
         }
     }

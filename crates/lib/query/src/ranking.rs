@@ -1,6 +1,6 @@
 //! Instances ranked by how well their descriptors fit a feature, and the choice among them.
 
-use artifacts::{Features, Instances};
+use artifacts::{Features, Instances, flat};
 use serde::{Deserialize, Serialize};
 
 /// An instance in a ranking.
@@ -118,17 +118,18 @@ impl<'a> Index<'a> {
             members[next[l]] = i as u32;
             next[l] += 1;
         }
-        let norms = (0..k).map(|i| norm(instances.descriptor_of(i))).collect();
+        let norms = (0..k).map(|i| norm(flat(instances.descriptor_of(i)))).collect();
         Self { instances, norms, members, starts }
     }
 
     /// Score of every instance: the plain cosine, or with `negatives` LERF's relevancy (docs/protocols.md); none for one without a
     /// descriptor (no view matched it) or when the feature is zero.
     pub fn scores(&self, feature: &[f32], negatives: &[Vec<f32>]) -> Vec<Option<f32>> {
-        let dim = self.instances.dim;
+        let dim = self.instances.dim();
         assert!(feature.len() == dim && negatives.iter().all(|n| n.len() == dim));
         let question = Question::new(feature, negatives);
-        (0..self.instances.len()).map(|k| question.score(self.instances.descriptor_of(k), self.norms[k])).collect()
+        let descriptor = |k| flat(self.instances.descriptor_of(k));
+        (0..self.instances.len()).map(|k| question.score(descriptor(k), self.norms[k])).collect()
     }
 
     /// All instances that have a score, best first, ties by index.
@@ -179,10 +180,10 @@ pub struct Join {
 impl Join {
     /// Prepares joining within `distance` (OpenGaussian: 0.9), by the features that the instances were clustered from.
     pub fn new(instances: &Instances, features: &Features, distance: f32) -> Self {
-        let mut sums: Vec<(Vec<f64>, usize)> = vec![(vec![0.0; features.dim], 0); instances.len()];
+        let mut sums: Vec<(Vec<f64>, usize)> = vec![(vec![0.0; features.dim()], 0); instances.len()];
         for (at, &gaussian) in features.kept.iter().enumerate() {
             let Ok(label) = usize::try_from(instances.label[gaussian as usize]) else { continue };
-            let row = features.row(at);
+            let row = flat(features.row(at));
             let length = norm(row);
             if length > 0.0 {
                 let (sum, count) = &mut sums[label];
@@ -214,13 +215,13 @@ impl Join {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use ndarray::arr2;
 
     fn instances() -> Instances {
         let k = 4;
         Instances {
             label: vec![1, -1, 0, 1, 3, 2],
-            dim: 2,
-            descriptor: vec![1.0, 0.0, 0.6, 0.8, 0.0, 0.0, -1.0, 0.0],
+            descriptor: arr2(&[[1.0, 0.0], [0.6, 0.8], [0.0, 0.0], [-1.0, 0.0]]),
             support: vec![5, 1, 0, 7],
             score: vec![0.5; k],
             count: vec![1, 2, 1, 1],
@@ -268,8 +269,8 @@ mod tests {
     fn joining_takes_near_instances_of_the_best_ten() {
         let mut i = instances();
         i.label = vec![0, 1, 3, 3, -1];
-        let values = vec![1.0, 0.0, 0.9, 0.3, -2.0, 0.1, -1.0, 0.0, 0.0, 0.0];
-        let f = Features { kept: vec![0, 1, 2, 3, 4], dim: 2, values, ..Features::default() };
+        let values = arr2(&[[1.0, 0.0], [0.9, 0.3], [-2.0, 0.1], [-1.0, 0.0], [0.0, 0.0]]);
+        let f = Features { kept: vec![0, 1, 2, 3, 4], values, ..Features::default() };
         let ranking = rank(&[1.0, 0.0]);
         assert_eq!(Join::new(&i, &f, 0.9).extend(&ranking, 0, &[0]), [0, 1]);
         assert_eq!(Join::new(&i, &f, 0.1).extend(&ranking, 0, &[0]), [0]);

@@ -163,11 +163,11 @@ fn read_npz(archive: &mut Archive<'_>, most: u64) -> Result<Features> {
         left -= data.len() as u64;
         let name = file.trim_end_matches(".npy").to_string();
         let array = gs_io::npy::parse(&data).map_err(|e| e.field(&name))?;
-        if !matches!(array.shape[..], [_] | [1, _]) {
-            let e = Error::new("not a vector").field(&name).found(format!("{:?}", array.shape));
+        if !matches!(array.shape(), [_] | [1, _]) {
+            let e = Error::new("not a vector").field(&name).found(format!("{:?}", array.shape()));
             return Err(e.expected("[d] or [1, d]"));
         }
-        features.insert(name, array.data);
+        features.insert(name, array.into_iter().collect());
     }
     Ok(features)
 }
@@ -325,6 +325,7 @@ fn closest<'a>(text: &str, names: impl Iterator<Item = &'a String>) -> impl Iter
 #[cfg(test)]
 mod tests {
     use super::*;
+    use ndarray::{ArrayD, arr1, arr2};
 
     fn table(json: &str) -> Result<TextSource> {
         let dir = tempfile::tempdir().unwrap();
@@ -354,12 +355,12 @@ mod tests {
         Ok(TextSource::Table(TextTable::read(&path)?))
     }
 
-    fn npz(entries: &[(&str, &[usize], &[f32])]) -> Result<TextSource> {
+    fn npz(entries: &[(&str, ArrayD<f32>)]) -> Result<TextSource> {
         let dir = tempfile::tempdir().unwrap();
-        let file = |&(name, shape, data): &(&str, &[usize], &[f32])| {
-            let array = dir.path().join("a.npy");
-            gs_io::npy::write_f32(&array, shape, data).unwrap();
-            (format!("{name}.npy"), std::fs::read(&array).unwrap())
+        let file = |(name, array): &(&str, ArrayD<f32>)| {
+            let path = dir.path().join("a.npy");
+            gs_io::npy::write_f32(&path, array).unwrap();
+            (format!("{name}.npy"), std::fs::read(&path).unwrap())
         };
         zipped("text.npz", &entries.iter().map(file).collect::<Vec<_>>())
     }
@@ -388,12 +389,13 @@ mod tests {
 
     #[test]
     fn an_npz_is_a_table_too() {
-        let t = npz(&[("coffee mug", &[2], &[1.0, 0.0]), ("sheep", &[1, 2], &[0.6, 0.8])]).unwrap();
+        let [mug, sheep] = [arr1(&[1.0, 0.0]).into_dyn(), arr2(&[[0.6, 0.8]]).into_dyn()];
+        let t = npz(&[("coffee mug", mug), ("sheep", sheep)]).unwrap();
         assert_eq!(t.encode(&["sheep".into()]).unwrap(), [Some(vec![0.6, 0.8])]);
         assert_eq!((t.dim(), t.names()), (2, vec!["coffee mug".to_string(), "sheep".into()]));
-        let e = npz(&[("a", &[2, 2], &[0.0; 4])]).err().unwrap().to_string();
+        let e = npz(&[("a", ArrayD::zeros(vec![2, 2]))]).err().unwrap().to_string();
         assert!(e.contains("text.npz: a: not a vector; found [2, 2], expected [d] or [1, d]"), "{e}");
-        let e = npz(&[("a", &[1], &[f32::NAN])]).err().unwrap().to_string();
+        let e = npz(&[("a", arr1(&[f32::NAN]).into_dyn())]).err().unwrap().to_string();
         assert!(e.contains("a: a number is not finite"), "{e}");
         assert!(npz(&[]).err().unwrap().to_string().contains("no text features"));
         assert!(table("PK\u{3}\u{4}cut").err().unwrap().to_string().contains("not a readable zip"));

@@ -6,7 +6,7 @@
 //! rendered over the mask. Rendering is linear, so both are sums over Gaussians of feature times summed weight, and no
 //! feature image is made.
 
-use artifacts::{Features, Level, MaskMaps, Match};
+use artifacts::{Features, Level, MaskMaps, Match, flat};
 use gs_raster::{RasterOptions, TILE, TileWeights, tile_weights};
 use gs_scene::{Camera, Gaussians};
 use std::collections::BTreeMap;
@@ -81,7 +81,7 @@ impl<'a> FeatureTable<'a> {
     /// Adds `weight` times the feature of a Gaussian. One without a feature is seen by no view and has nothing to add.
     fn add_to(&self, sum: &mut [f64], gaussian: u32, weight: f32) {
         if let (Some(at), true) = (self.position[gaussian as usize], weight > 0.0) {
-            for (s, f) in sum.iter_mut().zip(self.features.row(at as usize)) {
+            for (s, f) in sum.iter_mut().zip(flat(self.features.row(at as usize))) {
                 *s += f64::from(weight) * f64::from(*f);
             }
         }
@@ -102,7 +102,7 @@ impl TileMasks {
         let mut out = Self { ids: Vec::new(), sets: Vec::new(), pixels: Vec::new() };
         let mut last = 0;
         for (x, y) in (0..t.height).flat_map(|y| (0..t.width).map(move |x| (x, y))) {
-            let at = (t.y0 + y) * maps.width + t.x0 + x;
+            let at = [t.y0 + y, t.x0 + x];
             let ids = levels.iter().filter_map(|&level| u32::try_from(maps.level(level)[at]).ok());
             let set: Vec<u16> = ids.map(|id| out.number(id)).collect();
             if out.sets.get(last) != Some(&set) {
@@ -152,7 +152,7 @@ fn silhouettes(t: &TileWeights<'_>, labels: &[i32]) -> BTreeMap<u32, [bool; PIXE
 }
 
 fn tile_overlaps(t: &TileWeights<'_>, labels: &[i32], table: &FeatureTable<'_>, masks: &TileMasks) -> Overlaps {
-    let dim = table.features.dim;
+    let dim = table.features.dim();
     let inside = silhouettes(t, labels);
     let mut out = Overlaps::default();
     // Areas.
@@ -263,6 +263,7 @@ mod tests {
     use super::*;
     use glam::DVec3;
     use gs_scene::Geometry;
+    use ndarray::{Array3, arr2};
 
     const W: usize = 64;
     const H: usize = 48;
@@ -282,24 +283,15 @@ mod tests {
 
     /// Halves of the image on one level, the whole of it on another.
     fn maps() -> MaskMaps {
-        let half = |p: usize| i32::from(p % W >= W / 2);
-        let level = |f: &dyn Fn(usize) -> i32| (0..W * H).map(f).collect::<Vec<_>>();
-        MaskMaps {
-            width: W,
-            height: H,
-            ids: [level(&half), level(&|_| 2), level(&|_| -1), level(&|p| 3 + half(p))].concat(),
-        }
+        let id = |(level, _, x)| [i32::from(x >= W / 2), 2, -1, 3 + i32::from(x >= W / 2)][level];
+        MaskMaps { ids: Array3::from_shape_fn((4, H, W), id) }
     }
 
     #[test]
     fn instances_match_the_masks_they_are_seen_as() {
         let (g, camera) = scene();
-        let features = Features {
-            kept: vec![0, 1, 2],
-            dim: 2,
-            values: vec![1.0, 0.0, 0.0, 1.0, -1.0, 0.2],
-            ..Features::default()
-        };
+        let values = arr2(&[[1.0, 0.0], [0.0, 1.0], [-1.0, 0.2]]);
+        let features = Features { kept: vec![0, 1, 2], values, ..Features::default() };
         let table = FeatureTable::new(&features, 3);
         let o = overlaps(&g, &RasterOptions::default(), &[0, 1, 2], &table, &camera, &maps(), &[Level::Large]);
         assert_eq!(o.masks[&3].area + o.masks[&4].area, (W * H) as u32);
@@ -328,15 +320,15 @@ mod tests {
         let (mut g, camera) = scene();
         // Half transparent, so that silhouettes have shades.
         g.opacity_logits = vec![2.5, 2.0, 1.5];
-        let features =
-            Features { kept: vec![0, 2], dim: 3, values: vec![1.0, 2.0, 0.5, -1.0, 3.0, 0.25], ..Features::default() };
+        let values = arr2(&[[1.0, 2.0, 0.5], [-1.0, 3.0, 0.25]]);
+        let features = Features { kept: vec![0, 2], values, ..Features::default() };
         let all = [1.0, 2.0, 0.5, 0.0, 0.0, 0.0, -1.0, 3.0, 0.25];
         let (labels, maps, levels) = ([0, -1, 0], maps(), [Level::Default, Level::Small]);
         let table = FeatureTable::new(&features, 3);
         let o = overlaps(&g, raster, &labels, &table, &camera, &maps, &levels);
         let image = gs_raster::render_features(&g, &all, 3, &camera, options);
         let alone = g.select(&[0, 2]);
-        let own = gs_raster::render_features(&alone, &features.values, 3, &camera, options);
+        let own = gs_raster::render_features(&alone, flat(features.values.view()), 3, &camera, options);
         let alpha = gs_raster::render(&alone, &camera, options).alpha;
         let sum = |image: &[f32], inside: &dyn Fn(usize) -> bool| -> (u32, [f64; 3]) {
             let mut out = (0, [0.0; 3]);
@@ -353,11 +345,11 @@ mod tests {
             }
         };
         for (id, level) in [(0, Level::Default), (1, Level::Default), (2, Level::Small)] {
-            check(&o.masks[&id], sum(&image, &|p| maps.level(level)[p] == id as i32));
+            check(&o.masks[&id], sum(&image, &|p| flat(maps.level(level))[p] == id as i32));
         }
         let inside = |p: usize| alpha[p] > SELECTED_ALPHA;
         check(&o.instances[&0], sum(&own, &inside));
-        let common = |mask: i32| sum(&own, &|p| inside(p) && maps.level(Level::Default)[p] == mask).0;
+        let common = |mask: i32| sum(&own, &|p| inside(p) && flat(maps.level(Level::Default))[p] == mask).0;
         assert_eq!(o.common[&(0, 0)], common(0));
         assert_eq!(o.common.get(&(0, 1)).copied().unwrap_or(0), common(1));
         assert_eq!(o.common[&(0, 2)], o.instances[&0].area);

@@ -1,6 +1,7 @@
 //! What is known of each instance: size, place, support, language.
 
-use artifacts::{Extents, Instances, MaskFeatures, Match};
+use artifacts::{Extents, Instances, MaskFeatures, Match, flat};
+use ndarray::{Array2, aview1};
 use std::collections::BTreeMap;
 
 /// Gathers what is known of the instances. `labels` are those of all Gaussians, numbered 0 to K - 1 or -1; `features` are
@@ -14,11 +15,10 @@ pub fn describe(
     mut matches: Vec<Match>,
     features: &BTreeMap<u32, MaskFeatures>,
 ) -> Instances {
-    let dim = features.values().map(|f| f.dim).next().unwrap_or(0);
+    let dim = features.values().map(MaskFeatures::dim).next().unwrap_or(0);
     let Extents { count, centroid, bbox_min, bbox_max, oriented } = Extents::of(means, &labels, instances);
     let mut out = Instances {
-        dim,
-        descriptor: vec![0.0; instances * dim],
+        descriptor: Array2::zeros((instances, dim)),
         support: vec![0; instances],
         score: vec![0.0; instances],
         count,
@@ -34,8 +34,8 @@ pub fn describe(
     }
     for (k, own) in of_instance.iter().enumerate() {
         out.support[k] = own.len() as u32;
-        let rows = own.iter().filter_map(|m| Some((1.0, features.get(&m.view)?.row(m.mask as usize)?)));
-        out.descriptor[k * dim..(k + 1) * dim].copy_from_slice(&mean_of_units(rows, dim));
+        let rows = own.iter().filter_map(|m| Some((1.0, flat(features.get(&m.view)?.row(m.mask as usize)?))));
+        out.descriptor.row_mut(k).assign(&aview1(&mean_of_units(rows, dim)));
     }
     matches.sort_by_key(|m| (m.instance, m.view));
     Instances { label: labels, matches, ..out }
@@ -59,18 +59,19 @@ fn unit(row: &[f32]) -> Option<Vec<f32>> {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use ndarray::arr2;
 
     #[test]
     fn descriptors_are_unit_means_and_boxes_hold_their_gaussians() {
         let means = [[0.0, 0.0, 0.0], [2.0, 1.0, 0.0], [9.0; 3]];
-        let f = MaskFeatures { count: 2, dim: 2, values: vec![3.0, 0.0, 0.0, 1.0] };
+        let f = MaskFeatures { values: arr2(&[[3.0, 0.0], [0.0, 1.0]]) };
         let features = BTreeMap::from([(0, f.clone()), (1, f)]);
         let m = |view, mask, score| Match { instance: 0, view, mask, score, visible: 1.0 };
         let i = describe(&means, vec![0, 0, -1], 2, vec![m(1, 1, 0.2), m(0, 0, 0.8)], &features);
         assert_eq!((i.count[0], i.count[1], i.support[0], i.support[1]), (2, 0, 2, 0));
         assert_eq!((i.centroid[0], i.bbox_max[0]), ([1.0, 0.5, 0.0], [2.0, 1.0, 0.0]));
         assert!((i.descriptor_of(0)[0] - 0.5f32.sqrt()).abs() < 1e-6);
-        assert_eq!(i.descriptor_of(1), [0.0, 0.0]);
+        assert_eq!(i.descriptor_of(1), aview1(&[0.0, 0.0]));
         assert_eq!(i.matches[0].view, 0);
     }
 }

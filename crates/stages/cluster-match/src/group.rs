@@ -1,8 +1,9 @@
 //! Clustering of Gaussians by their features.
 
 use crate::options::Space;
-use artifacts::{Graph, TreeEdge};
+use artifacts::{Graph, TreeEdge, flat};
 use hdbscan_exact::{Clustering, Edge, Options, cluster, cluster_graph};
+use ndarray::Array2;
 use rayon::prelude::*;
 
 /// Gaussians that one task handles.
@@ -46,8 +47,8 @@ pub fn standardise(values: &[f32], dim: usize) -> Vec<f32> {
 }
 
 /// Clusters the kept Gaussians by their features, `[n][dim]`.
-pub fn group(features: &[f32], dim: usize, graph: &Graph, space: Space, options: &Options) -> Clustering {
-    let dim = dim.max(1);
+pub fn group(features: &Array2<f32>, graph: &Graph, space: Space, options: &Options) -> Clustering {
+    let (features, dim) = (flat(features.view()), features.ncols().max(1));
     match space {
         Space::Free => cluster(&standardise(features, dim), dim, options),
         Space::Graph => {
@@ -111,8 +112,8 @@ fn unit(row: &mut [f32]) {
 /// Edges between spatial neighbours with mutual reachability, each once: a Gaussian's core distance is the distance to the
 /// (`min_samples` - 1)-th nearest in features among its spatial neighbours, or to the last where there are fewer.
 fn neighbour_edges(graph: &Graph, between: &Chords, min_samples: usize) -> Vec<Edge> {
-    let (n, k) = (graph.kept.len(), graph.gaussian_k);
-    let list = |i: usize| &graph.gaussian_knn[i * k..(i + 1) * k];
+    let (n, k) = (graph.kept.len(), graph.gaussian_knn.ncols());
+    let list = |i: usize| flat(graph.gaussian_knn.row(i));
     // To all neighbours; rows are padded with the Gaussian itself, which does not count.
     let mut distances = vec![0.0f64; n * k];
     let core: Vec<f64> = distances
@@ -165,6 +166,7 @@ pub fn tree(clustering: &Clustering) -> Vec<TreeEdge> {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use ndarray::arr2;
 
     #[test]
     fn standardised_dimensions_have_mean_0_and_deviation_1_and_constants_vanish() {
@@ -179,29 +181,22 @@ mod tests {
     }
 
     /// Two rods along x with features along two axes; their ends touch neither in space nor in features.
-    fn two_rods() -> (Vec<f32>, Graph) {
+    fn two_rods() -> Graph {
         let n = 60usize;
-        let values =
-            (0..n).flat_map(|i| if i < 30 { [1.0, 0.01 * (i % 7) as f32] } else { [0.01 * (i % 5) as f32, 1.0] });
-        let neighbours = (0..n as i32).flat_map(|i| {
+        let neighbours = (0..n as i32).map(|i| {
             let (low, high) = if i < 30 { (0, 29) } else { (30, 59) };
             [i - 2, i - 1, i + 1, i + 2].map(|j| j.clamp(low, high) as u32)
         });
-        let graph = Graph {
-            kept: (0..n as u32).collect(),
-            gaussian_k: 4,
-            gaussian_knn: neighbours.collect(),
-            ..Graph::default()
-        };
-        (values.collect(), graph)
+        let gaussian_knn = neighbours.collect::<Vec<_>>().into();
+        Graph { kept: (0..n as u32).collect(), gaussian_knn, ..Graph::default() }
     }
 
     #[test]
     fn rods_of_one_feature_are_one_thing_in_features_and_two_in_space() {
-        let (_, g) = two_rods();
-        let f: Vec<f32> = (0..60).flat_map(|i| [1.0, 0.001 * (i % 7) as f32]).collect();
+        let g = two_rods();
+        let f = Array2::from_shape_fn((60, 2), |(i, c)| [1.0, 0.001 * (i % 7) as f32][c]);
         let o = Options { min_cluster_size: 10, min_samples: 3, epsilon: 0.1, ..Options::default() };
-        let c = group(&f, 2, &g, Space::Graph, &o);
+        let c = group(&f, &g, Space::Graph, &o);
         assert_eq!(c.selected.len(), 2);
         assert_ne!(c.labels[5], c.labels[45]);
     }
@@ -218,12 +213,8 @@ mod tests {
     #[test]
     fn every_pair_of_neighbours_has_one_edge() {
         // 0 and 1 name each other, 2 names 0 only, 3 is alone: padded with itself.
-        let graph = Graph {
-            kept: (0..4).collect(),
-            gaussian_k: 2,
-            gaussian_knn: vec![1, 0, 0, 1, 0, 2, 3, 3],
-            ..Graph::default()
-        };
+        let graph =
+            Graph { kept: (0..4).collect(), gaussian_knn: arr2(&[[1, 0], [0, 1], [0, 2], [3, 3]]), ..Graph::default() };
         let between = Chords::new(vec![1.0, 0.0, 1.0, 0.1, 1.0, 0.3, 1.0, 0.9], 2);
         let pairs = |samples| -> Vec<(u32, u32, f64)> {
             neighbour_edges(&graph, &between, samples).into_iter().map(|e| (e.a, e.b, e.weight)).collect()

@@ -65,7 +65,7 @@ fn check_features(a: &Args, features: &Features, graph: &Graph, gaussians: usize
     if graph.seen_views.len() != gaussians || graph.kept != features.kept {
         return wrong("the features belong to other Gaussians than the graph", "kept");
     }
-    if features.dim == 0 {
+    if features.dim() == 0 {
         return wrong("the features have no dimension", "features");
     }
     Ok(())
@@ -133,13 +133,12 @@ pub(crate) fn mask_features(
         let e = Error::new(what).file(&path).field(field).found(found).expected(expected);
         Err(e.hint("run mask-embed embed again"))
     };
-    if features.count < maps.id_count() {
-        return wrong("fewer features than masks", "rows", features.count, format!("at least {}", maps.id_count()));
+    let (rows, columns) = features.values.dim();
+    if rows < maps.id_count() {
+        return wrong("fewer features than masks", "rows", rows, format!("at least {}", maps.id_count()));
     }
     match dim {
-        Some(dim) if dim != features.dim => {
-            wrong("features of different models", "columns", features.dim, dim.to_string())
-        }
+        Some(dim) if dim != columns => wrong("features of different models", "columns", columns, dim.to_string()),
         _ => Ok(Some(features)),
     }
 }

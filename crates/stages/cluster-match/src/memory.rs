@@ -7,7 +7,7 @@ use crate::options::Space;
 pub fn forecast(inputs: &Inputs, space: Space) -> u64 {
     let (entries, samples) = (inputs.footprints.total(), inputs.footprints.pixels.col.len());
     let (gaussians, kept) = (inputs.geometry.gaussians.len(), inputs.features.kept.len() as u64);
-    let (dim, parts) = (inputs.features.dim as u64, inputs.features.parts_dim as u64);
+    let (dim, parts) = (inputs.features.dim() as u64, inputs.features.parts.ncols() as u64);
     // Features as they are read and as they are clustered; free points are also parted from their duplicates and lie in a tree:
     // coordinates, the leaves' blocks, boxes.
     let value = match space {

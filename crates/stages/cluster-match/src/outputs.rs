@@ -6,6 +6,7 @@ use crate::options::{Args, Settings};
 use artifacts::{Health, Instances, NOISE_COLOR, instance_color};
 use gs_io::{Claim, Error, Outputs, Result, write_bytes};
 use gs_scene::{Gaussians, Labelled, SH_C0, ply};
+use ndarray::aview1;
 use serde_json::{Value, json};
 use stage::Stage;
 use std::path::Path;
@@ -61,7 +62,7 @@ pub(crate) fn write(
             Labelled::new(&inputs.geometry, &a.geometry, &instances.label, own)?.write(&labelled, &all)?;
         }
     }
-    gs_io::npy::write_i32(list, &[instances.label.len()], &instances.label)?;
+    gs_io::npy::write_i32(list, &aview1(&instances.label))?;
     health::say(health, stage);
     let text = as_text(instances, health, &parameters);
     write_bytes(table, &serde_json::to_vec_pretty(&text).map_err(fail)?)?;
@@ -124,7 +125,7 @@ fn as_text(instances: &Instances, health: &Health, parameters: &Value) -> Value 
         .collect();
     let unlabelled = instances.label.iter().filter(|&&l| l < 0).count();
     json!({
-        "gaussians": instances.label.len(), "without_instance": unlabelled, "descriptor_dim": instances.dim,
+        "gaussians": instances.label.len(), "without_instance": unlabelled, "descriptor_dim": instances.dim(),
         "health": health, "parameters": parameters, "instances": list,
     })
 }

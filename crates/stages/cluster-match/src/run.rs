@@ -11,9 +11,10 @@ use crate::options::{Args, Noise, Settings};
 use crate::outputs::{self, Found};
 use crate::rank::confidence;
 use crate::{health, memory};
-use artifacts::{Instances, Level, MaskFeatures, MaskFolder, Match};
+use artifacts::{Instances, Level, MaskFeatures, MaskFolder, Match, flat};
 use gs_io::{Error, Result, Watched};
 use gs_raster::RasterOptions;
+use ndarray::{Array2, aview1};
 use stage::{CommonArgs, Program, Stage};
 use std::collections::BTreeMap;
 use std::time::Instant;
@@ -53,7 +54,7 @@ impl Program for Args {
 
         let start = Instant::now();
         let (features, hdbscan) = (&inputs.features, settings.hdbscan());
-        let clustering = group(&features.values, features.dim, &inputs.graph, settings.cluster, &hdbscan);
+        let clustering = group(&features.values, &inputs.graph, settings.cluster, &hdbscan);
         let noise = clustering.labels.iter().filter(|&&l| l < 0).count();
         let seconds = start.elapsed().as_secs_f64();
         let found = Assignment::new(&clustering, &inputs.graph.kept, inputs.geometry.gaussians.len());
@@ -89,13 +90,16 @@ impl Program for Args {
         };
         let described = describe(means, found.labels, found.instances, matches, &features);
         let mut instances = Instances { views, tree: found.tree, node: found.nodes, ..described };
+        let dim = instances.dim();
+        instances.granule_descriptor = Array2::default((0, dim));
         for (granule, shown) in granules {
             // A mask that fits twice as well counts four times.
             let feature = |s: &Shown| {
                 let mask = footprints.rows[s.row as usize];
-                Some((s.fit * s.fit, features.get(&mask.view)?.row(mask.mask as usize)?))
+                Some((s.fit * s.fit, flat(features.get(&mask.view)?.row(mask.mask as usize)?)))
             };
-            instances.granule_descriptor.extend(mean_of_units(shown.iter().filter_map(feature), instances.dim));
+            let descriptor = mean_of_units(shown.iter().filter_map(feature), dim);
+            instances.granule_descriptor.push_row(aview1(&descriptor)).expect("of one dimension");
             instances.granules.push(granule);
         }
         instances.score = confidence(&instances, footprints, &weights);
@@ -133,9 +137,9 @@ fn correct(mut found: Assignment, inputs: &Inputs, settings: &Settings, stage: &
             stage.info(&format!("{} instances after joining pieces that the masks show as one", found.instances));
         }
     }
-    let (parts, parts_dim) = (&inputs.features.parts, inputs.features.parts_dim);
-    if settings.split > 0.0 && parts_dim > 0 {
-        let clustering = group(parts, parts_dim, graph, settings.cluster, &settings.hdbscan());
+    let parts = &inputs.features.parts;
+    if settings.split > 0.0 && parts.ncols() > 0 {
+        let clustering = group(parts, graph, settings.cluster, &settings.hdbscan());
         let mut parts = Assignment::new(&clustering, &graph.kept, means.len());
         settle(&mut parts, inputs, settings, &[Level::Small])?;
         if settings.join > 0.0 {
@@ -175,10 +179,10 @@ fn match_views(
     let folder = MaskFolder::open(&a.masks);
     for (index, view) in inputs.views.iter().enumerate() {
         let maps = folder.read(view)?;
-        let camera = view.camera.resized(maps.width as u32, maps.height as u32);
+        let camera = view.camera.resized(maps.width() as u32, maps.height() as u32);
         let overlaps = overlaps(gaussians, &raster, labels, &table, &camera, &maps, &settings.levels);
         found.extend(matches(&overlaps, index as u32, settings.threshold as f32));
-        let dim = features.values().next().map(|f| f.dim);
+        let dim = features.values().next().map(MaskFeatures::dim);
         features.extend(mask_features(&a.masks, view.stem(), &maps, dim)?.map(|f| (index as u32, f)));
         progress.step();
     }

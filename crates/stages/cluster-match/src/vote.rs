@@ -49,14 +49,13 @@ fn vote(
     graph: &Graph,
     levels: &[Level],
 ) -> Result<Vec<(u32, u32)>> {
-    let k = graph.gaussian_k;
     // The Gaussians with several instances around them, and these: (Gaussian, instance), ascending.
     let asked: Vec<(u32, u32)> = (0..labels.len())
         .into_par_iter()
         .with_min_len(CHUNK)
         .filter(|&i| labels[i] >= 0)
         .flat_map_iter(|i| {
-            let around = graph.gaussian_knn[i * k..(i + 1) * k].iter().map(|&j| labels[j as usize]);
+            let around = graph.gaussian_knn.row(i).into_iter().map(|&j| labels[j as usize]);
             let mut choice: Vec<u32> = around.chain([labels[i]]).filter_map(|l| u32::try_from(l).ok()).collect();
             choice.sort_unstable();
             choice.dedup();
@@ -173,8 +172,7 @@ mod tests {
         let near = |i: i64| [i - 1, i + 1].map(|j| if (0..20).contains(&j) { j as u32 } else { i as u32 });
         let graph = Graph {
             kept: (0..n).collect(),
-            gaussian_k: 2,
-            gaussian_knn: (0..20).flat_map(near).collect(),
+            gaussian_knn: (0..20).map(near).collect::<Vec<_>>().into(),
             ..Graph::default()
         };
         (dir, footprints, graph)

@@ -7,6 +7,7 @@ use glam::DVec3;
 use gs_io::{Artifact, Provenance, hash_file};
 use gs_scene::dataset::{self, LoadOptions, Resolution};
 use gs_scene::{Camera, Gaussians, Image, ply};
+use ndarray::{Array2, Array3, arr2, aview1};
 use serde_json::{Value, json};
 use stage::RunRecord;
 use std::path::PathBuf;
@@ -93,16 +94,16 @@ impl Scene {
         let both = |id: i32| seen.iter().map(move |&s| if s < 0 { -1 } else { id });
         let large = seen.iter().map(|&s| if s < 0 { -1 } else { 3 + s });
         let ids = both(0).chain(both(1)).chain(both(2)).chain(large).collect();
-        MaskMaps { width: SIZE, height: SIZE, ids }.write(self.path(&format!("masks/v{view}_s.npy"))).unwrap();
+        let ids = Array3::from_shape_vec((4, SIZE, SIZE), ids).unwrap();
+        MaskMaps { ids }.write(self.path(&format!("masks/v{view}_s.npy"))).unwrap();
     }
 
     /// Language features: things at right angles to each other, slightly different in each view.
     fn language(&self, views: std::ops::Range<usize>) {
         for v in views {
-            let values =
-                [[0.6, 0.6, 0.5]; 3].concat().into_iter().chain([1.0, 0.0, 0.1 * v as f32, 0.0, 2.0, 0.0]).collect();
-            let f = MaskFeatures { count: 5, dim: 3, values };
-            f.write(self.path(&format!("masks/v{v}_f.npy"))).unwrap();
+            let both = [0.6, 0.6, 0.5];
+            let values = arr2(&[both, both, both, [1.0, 0.0, 0.1 * v as f32], [0.0, 2.0, 0.0]]);
+            MaskFeatures { values }.write(self.path(&format!("masks/v{v}_f.npy"))).unwrap();
         }
     }
 
@@ -114,11 +115,11 @@ impl Scene {
     fn artifacts(&self, change: impl Fn(&mut Features)) {
         let n = 2 * EACH;
         let means = gaussians().means;
-        let near = |i: usize| -> Vec<u32> {
+        let near = |i: usize| -> [u32; 8] {
             let square = |j: usize| (0..3).map(|k| (means[i][k] - means[j][k]).powi(2)).sum::<f32>();
             let mut others: Vec<usize> = (0..n).filter(|&j| j != i).collect();
             others.sort_by(|&a, &b| square(a).total_cmp(&square(b)).then(a.cmp(&b)));
-            others[..8].iter().map(|&j| j as u32).collect()
+            std::array::from_fn(|k| others[k] as u32)
         };
         let mut seen_views = vec![VIEWS as u32; n + 1];
         seen_views[n] = 0;
@@ -126,8 +127,7 @@ impl Scene {
             kept: (0..n as u32).collect(),
             anchors: vec![0],
             nearest_anchor: vec![0; n],
-            gaussian_k: 8,
-            gaussian_knn: (0..n).flat_map(near).collect(),
+            gaussian_knn: (0..n).map(near).collect::<Vec<_>>().into(),
             seen_weight: seen_views.iter().map(|&v| v as f32).collect(),
             seen_views,
             ..Graph::default()
@@ -145,12 +145,8 @@ impl Scene {
             let noise = |k: usize| ((i * 31 + k * 17) % 23) as f32 * 0.004;
             if i < EACH { [1.0, noise(1), noise(2)] } else { [noise(3), 1.0, noise(4)] }
         };
-        let mut features = Features {
-            kept: graph.kept.clone(),
-            dim: 3,
-            values: (0..n).flat_map(value).collect(),
-            ..Features::default()
-        };
+        let values = (0..n).map(value).collect::<Vec<_>>().into();
+        let mut features = Features { kept: graph.kept.clone(), values, ..Features::default() };
         change(&mut features);
         self.write(&graph, &footprints, &features);
     }
@@ -241,7 +237,7 @@ fn instances_are_found_matched_and_described_the_same_for_any_number_of_threads(
     let (a, b) = things(&i);
     // The one that no view sees has the label of what is nearest.
     assert_eq!((i.len(), i.label[2 * EACH]), (2, a as i32));
-    assert_eq!((i.support[a], i.support[b], i.dim), (VIEWS as u32, VIEWS as u32, 3));
+    assert_eq!((i.support[a], i.support[b], i.dim()), (VIEWS as u32, VIEWS as u32, 3));
     assert!(i.score[a] > 0.5 && i.score[b] > 0.5);
     assert!(i.matches.iter().all(|m| m.mask == if m.instance as usize == a { 3 } else { 4 }), "{:?}", i.matches);
     assert_eq!(i.count[a] + i.count[b], 81);
@@ -256,7 +252,7 @@ fn instances_are_found_matched_and_described_the_same_for_any_number_of_threads(
     for (found, expected) in i.descriptor_of(a).iter().zip(mean) {
         assert!((f64::from(*found) - expected / length).abs() < 1e-6);
     }
-    assert_eq!(i.descriptor_of(b), [0.0, 1.0, 0.0]);
+    assert_eq!(i.descriptor_of(b), aview1(&[0.0, 1.0, 0.0]));
     assert_eq!(i.tree.iter().filter(|e| e.instance >= 0).count(), 2);
 
     // Beside it: the Gaussians as they were with their instances, labels, and a text.
@@ -268,7 +264,7 @@ fn instances_are_found_matched_and_described_the_same_for_any_number_of_threads(
     let written: Vec<i32> = rows.map(|r| i32::from_le_bytes(*r.last_chunk().unwrap())).collect();
     assert_eq!(written, i.label);
     let labels = gs_io::npy::read_f32(s.path("out/instances.labels.npy")).unwrap();
-    assert!(labels.data.iter().zip(&i.label).all(|(a, b)| *a == *b as f32) && labels.shape == [81]);
+    assert!(labels.iter().zip(&i.label).all(|(a, b)| *a == *b as f32) && labels.shape() == [81]);
     let text: Value = serde_json::from_slice(&std::fs::read(s.path("out/instances.json")).unwrap()).unwrap();
     assert_eq!(text["instances"].as_array().unwrap().len(), 2);
     assert_eq!(text["instances"][b]["matches"][1]["view"], "v1");
@@ -321,8 +317,7 @@ fn parts_that_are_small_beside_their_instance_leave_it() {
     let s = Scene::new();
     let part = |i: usize| if SMALL.contains(&i) { 2 } else { usize::from(i >= EACH) };
     s.artifacts(|f| {
-        f.parts_dim = 3;
-        f.parts = (0..2 * EACH).flat_map(|i| [0, 1, 2].map(|c| f32::from(u8::from(c == part(i))))).collect();
+        f.parts = Array2::from_shape_fn((2 * EACH, 3), |(i, c)| f32::from(u8::from(c == part(i))));
     });
     let whole = s.succeed(&["--votes", "0", "--min-samples", "3", "--split", "0"]).0;
     let (i, said) = s.succeed(&["--votes", "0", "--min-samples", "3", "--split", "0.3"]);
@@ -350,7 +345,7 @@ fn options_do_what_they_say() {
         things(&i);
         assert_eq!(i.support, [VIEWS as u32; 2], "{extra:?}");
         // Without language the rest is there, and it is said.
-        assert!(i.dim == 0 && i.descriptor.is_empty() && said.contains("skipped language descriptors"), "{said}");
+        assert!(i.dim() == 0 && i.descriptor.is_empty() && said.contains("skipped language descriptors"), "{said}");
     }
     // Another level: one mask for both things, which each covers half of, or the best of two levels.
     let (i, _) = s.succeed(&["--levels", "medium", "--join", "0"]);
@@ -392,7 +387,7 @@ fn options_do_what_they_say() {
     }
 
     // Noise: a Gaussian that is like neither thing.
-    s.artifacts(|f| f.values[..3].copy_from_slice(&[-4.0, -4.0, 0.0]));
+    s.artifacts(|f| f.values.row_mut(0).assign(&aview1(&[-4.0, -4.0, 0.0])));
     let free = ["--cluster", "free", "--min-samples", "5"];
     assert_eq!(s.succeed(&[&free[..], &["--noise", "keep"]].concat()).0.label[0], -1);
     things(&s.succeed(&free).0);
@@ -458,7 +453,7 @@ fn scenes_without_anything_are_results_not_errors() {
     assert!(said.contains("everything is noise") && said.contains("--allow-single-cluster"), "{said}");
     assert_eq!(ply::read_gaussians(s.path("out/instances.ply")).unwrap().len(), 81);
     // One thing.
-    s.artifacts(|f| f.values.chunks_exact_mut(3).for_each(|row| row.copy_from_slice(&[0.0, 1.0, 0.0])));
+    s.artifacts(|f| f.values.assign(&aview1(&[0.0, 1.0, 0.0])));
     let (i, _) = s.succeed(&["--cluster", "free", "--allow-single-cluster"]);
     assert!(i.len() == 1 && i.label.iter().all(|&l| l == 0));
     // Id maps without masks.
@@ -481,7 +476,7 @@ fn scenes_without_anything_are_results_not_errors() {
     };
     let footprints =
         FootprintsBuilder { views: vec!["v0".into()], kept: vec![0], row_ptr: vec![0], ..Default::default() };
-    s.write(&graph, &footprints, &Features { kept: vec![0], dim: 2, values: vec![1.0, 0.0], ..Features::default() });
+    s.write(&graph, &footprints, &Features { kept: vec![0], values: arr2(&[[1.0, 0.0]]), ..Features::default() });
     let (i, said) = s.succeed(&[]);
     assert_eq!(i.label, [-1]);
     assert!(said.contains("skipped 3 of 4 views in matching") && said.contains("v1, v2, v3"), "{said}");
@@ -511,15 +506,15 @@ fn bad_input_is_one_line_and_leaves_outputs_alone() {
     // Language features that do not fit the masks.
     s.language(0..VIEWS);
     let one = s.path("masks/v2_f.npy");
-    MaskFeatures { count: 2, dim: 3, values: vec![0.5; 6] }.write(&one).unwrap();
+    MaskFeatures { values: Array2::from_elem((2, 3), 0.5) }.write(&one).unwrap();
     s.fail(&[], &["v2_f.npy", "fewer features than masks", "found 2", "at least 5"]);
-    MaskFeatures { count: 5, dim: 2, values: vec![0.5; 10] }.write(&one).unwrap();
+    MaskFeatures { values: Array2::from_elem((5, 2), 0.5) }.write(&one).unwrap();
     s.fail(&[], &["v2_f.npy", "different models", "found 2", "expected 3"]);
     std::fs::write(&one, "no array").unwrap();
     s.fail(&[], &["v2_f.npy"]);
     std::fs::remove_file(&one).unwrap();
     let (i, said) = s.succeed(&[]);
-    assert!(said.contains("1 of 4 views have no mask features") && i.dim == 3, "{said}");
+    assert!(said.contains("1 of 4 views have no mask features") && i.dim() == 3, "{said}");
 
     // Artifacts of another scene.
     s.masks(1, &[0; SIZE * SIZE]);
@@ -538,9 +533,9 @@ fn bad_input_is_one_line_and_leaves_outputs_alone() {
     ply::write_gaussians(s.path("geometry.ply"), &other, &[]).unwrap();
     s.fail(&[], &["graph.safetensors", "another geometry"]);
     ply::write_gaussians(s.path("geometry.ply"), &gaussians(), &[]).unwrap();
-    s.artifacts(|f| f.values[7] = f32::NAN);
+    s.artifacts(|f| f.values[[2, 1]] = f32::NAN);
     s.fail(&[], &["features.safetensors", "features[2][1]", "not a finite number"]);
-    s.artifacts(|f| (f.dim, f.values) = (0, Vec::new()));
+    s.artifacts(|f| f.values = Array2::default((2 * EACH, 0)));
     s.fail(&[], &["features.safetensors", "no dimension"]);
     std::fs::write(s.path("features.safetensors"), &features[..features.len() - 9]).unwrap();
     s.fail(&[], &["features.safetensors"]);

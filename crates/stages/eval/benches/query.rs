@@ -2,8 +2,9 @@
 //! --out FILE`. Medians over texts; the reference beside it scans labels and descriptors anew for every query, as a script
 //! does.
 
-use artifacts::Instances;
+use artifacts::{Instances, flat};
 use eval::Asker;
+use ndarray::Array2;
 use query::{Granules, Index, Selection};
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
@@ -42,8 +43,8 @@ fn main() {
     let mut rng = ChaCha8Rng::seed_from_u64(0);
     let instances = Instances {
         label: (0..GAUSSIANS).map(|_| rng.random_range(-1..INSTANCES as i32)).collect(),
-        dim: DIM,
-        descriptor: (0..INSTANCES).flat_map(|_| unit(&mut rng)).collect(),
+        descriptor: Array2::from_shape_vec((INSTANCES, DIM), (0..INSTANCES).flat_map(|_| unit(&mut rng)).collect())
+            .expect("DIM of each"),
         support: vec![5; INSTANCES],
         score: vec![0.5; INSTANCES],
         count: vec![(GAUSSIANS / INSTANCES) as u32; INSTANCES],
@@ -80,7 +81,7 @@ fn main() {
     });
     let scan = times(&texts[..21], |text| {
         let cosine = |d: &[f32]| d.iter().zip(text).map(|(a, b)| a * b).sum::<f32>();
-        let scores: Vec<f32> = instances.descriptor.chunks_exact(DIM).map(cosine).collect();
+        let scores: Vec<f32> = instances.descriptor.rows().into_iter().map(|d| cosine(flat(d))).collect();
         let first = (0..INSTANCES).max_by(|&a, &b| scores[a].total_cmp(&scores[b])).expect("instances") as i32;
         let members: Vec<u32> = (0..GAUSSIANS as u32).filter(|&i| instances.label[i as usize] == first).collect();
         std::hint::black_box(members);

@@ -127,7 +127,7 @@ fn check_masks(folder: &Path, dataset: &Dataset, dim: Option<usize>) -> Result<S
         return Err(e.hint("give the maps of this scene, named after its photographs"));
     };
     let maps = MaskFolder::open(folder).read(view)?;
-    let said = format!("{}_s.npy: {}x{} pixels, {} masks", view.stem(), maps.width, maps.height, maps.id_count());
+    let said = format!("{}_s.npy: {}x{} pixels, {} masks", view.stem(), maps.width(), maps.height(), maps.id_count());
     let path = features_path(folder, view.stem());
     if !path.exists() {
         return Ok(said + "\n");
@@ -137,11 +137,12 @@ fn check_masks(folder: &Path, dataset: &Dataset, dim: Option<usize>) -> Result<S
         let e = Error::new(what).file(&path).field("shape").found(found).expected(expected);
         Err(e.hint("masks and features must be of one run, masks and texts of one model"))
     };
-    if features.count < maps.id_count() {
-        return wrong("fewer features than masks", features.count, maps.id_count());
+    let (rows, columns) = features.values.dim();
+    if rows < maps.id_count() {
+        return wrong("fewer features than masks", rows, maps.id_count());
     }
     match dim {
-        Some(dim) if dim != features.dim => wrong("another dimension than the text features", features.dim, dim),
-        _ => Ok(format!("{said}, features of dimension {}\n", features.dim)),
+        Some(dim) if dim != columns => wrong("another dimension than the text features", columns, dim),
+        _ => Ok(format!("{said}, features of dimension {columns}\n")),
     }
 }

@@ -88,9 +88,9 @@ pub fn measure(folder: &Path, footprints: Option<&Footprints>) -> Result<MaskSta
     let [mut masks, mut areas, mut covered]: [[Vec<f64>; 4]; 3] = Default::default();
     for stem in &stems {
         let maps = MaskMaps::read(maps_path(folder, stem))?;
-        let image = (maps.width * maps.height) as f64;
+        let image = (maps.width() * maps.height()) as f64;
         for level in Level::ALL {
-            let pixels = counts(maps.level(level).iter().filter(|&&id| id >= 0));
+            let pixels = counts(maps.level(level).into_iter().filter(|&&id| id >= 0));
             let l = level as usize;
             masks[l].push(pixels.len() as f64);
             covered[l].push(pixels.values().sum::<usize>() as f64 / image);
@@ -274,10 +274,8 @@ mod tests {
     #[test]
     fn counts_areas_and_cover_are_those_of_the_maps() {
         let dir = tempfile::tempdir().unwrap();
-        let mut ids = vec![0; 50];
-        ids.extend(vec![1; 30]);
-        ids.extend(vec![-1; 20]);
-        let maps = MaskMaps { width: 10, height: 10, ids: ids.repeat(4) };
+        let id = |(_, y, _)| [0, 0, 0, 0, 0, 1, 1, 1, -1, -1][y];
+        let maps = MaskMaps { ids: ndarray::Array3::from_shape_fn((4, 10, 10), id) };
         maps.write(maps_path(dir.path(), "v")).unwrap();
         let stats = measure(dir.path(), None).unwrap();
         let l = &stats.levels[0];

@@ -75,12 +75,12 @@ pub(crate) fn run(o: &QueryOptions, parameters: Value, stage: &Stage, json_lines
 /// The source of text features; none where only pictures or places are asked for, and it does not fit the instances.
 fn source(o: &QueryOptions, scene: &LabelledScene) -> Result<Option<TextSource>> {
     if !o.text.is_empty() || !o.image.is_empty() || o.interactive {
-        return TextSource::open_for(&scene.artifact, scene.instances.dim, &o.texts).map(Some);
+        return TextSource::open_for(&scene.artifact, scene.instances.dim(), &o.texts).map(Some);
     }
     if !o.texts.given() {
         return Ok(None);
     }
-    Ok(Some(TextSource::open(&o.texts)?).filter(|s| s.dim() == scene.instances.dim))
+    Ok(Some(TextSource::open(&o.texts)?).filter(|s| s.dim() == scene.instances.dim()))
 }
 
 /// The answers to texts, of these features, and to pictures.

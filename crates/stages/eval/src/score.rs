@@ -126,8 +126,8 @@ impl Found {
     /// Dimension of the descriptors that answer; 0 where there are none.
     fn dim(&self) -> usize {
         match (&self.described, &self.instances) {
-            (Some((described, _)), _) => described.descriptors.dim,
-            (None, Some(scene)) => scene.instances.dim,
+            (Some((described, _)), _) => described.descriptors.dim(),
+            (None, Some(scene)) => scene.instances.dim(),
             (None, None) => 0,
         }
     }

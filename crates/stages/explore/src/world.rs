@@ -171,7 +171,7 @@ fn forecast(source: &Source, dataset: &Dataset) -> u64 {
 }
 
 fn words(source: &Source, scene: &LabelledScene) -> std::result::Result<TextSource, String> {
-    if scene.instances.dim == 0 {
+    if scene.instances.dim() == 0 {
         return Err("The instances have no language features: run make clip, then make scene again. \
                     Clicking works, and names that you give can be found."
             .into());
@@ -183,7 +183,7 @@ fn words(source: &Source, scene: &LabelledScene) -> std::result::Result<TextSour
                 .into(),
         );
     }
-    TextSource::open_for(&scene.artifact, scene.instances.dim, &source.texts()).map_err(|e| e.to_string())
+    TextSource::open_for(&scene.artifact, scene.instances.dim(), &source.texts()).map_err(|e| e.to_string())
 }
 
 /// The different pairs of label and node in order of their first Gaussian, and which of them each Gaussian has.
@@ -209,7 +209,7 @@ fn feature_colors(source: &Source, scene: &LabelledScene, packed: &Packed) -> Re
     let hash = &scene.inputs[artifacts::role::GEOMETRY];
     let features = query::read_features(&path, hash, scene.gaussians().len())?;
     let mut colors = vec![NO_FEATURE; scene.gaussians().len()];
-    let of_kept = report::feature_colors(&features.values, features.dim);
+    let of_kept = report::feature_colors(artifacts::flat(features.values.view()), features.dim());
     for (&i, color) in features.kept.iter().zip(of_kept) {
         colors[i as usize] = color.map(|v| (255.0 * v).round() as u8);
     }

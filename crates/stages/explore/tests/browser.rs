@@ -175,7 +175,8 @@ impl Browser {
         self.client.goto(url).await.unwrap();
         for _ in 0..600 {
             // The page's script ran before the browser said that it is here.
-            let state = self.js("return [page?.seconds ?? null, page?.errors ?? ['its script does not run']]", vec![]).await;
+            let state =
+                self.js("return [page?.seconds ?? null, page?.errors ?? ['its script does not run']]", vec![]).await;
             assert_eq!(state[1], json!([]), "errors while loading {url}");
             if let Some(seconds) = state[0].as_f64() {
                 return seconds;
@@ -344,7 +345,10 @@ async fn a_served_scene_can_be_seen_clicked_asked_and_edited() {
     if let Some(path) = screenshot() {
         browser.client.set_window_size(1200, 800).await.unwrap();
         browser
-            .js("page.jump(page.instances.views(page.selectedInstances()[0] ?? 0)[0][0]); await page.viewer.busy", vec![])
+            .js(
+                "page.jump(page.instances.views(page.selectedInstances()[0] ?? 0)[0][0]); await page.viewer.busy",
+                vec![],
+            )
             .await;
         tokio::time::sleep(Duration::from_secs(2)).await;
         std::fs::write(path, browser.client.screenshot().await.unwrap()).unwrap();

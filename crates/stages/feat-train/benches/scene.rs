@@ -11,6 +11,7 @@
 use artifacts::{FootprintsBuilder, Graph, Row, ScratchEntries, role};
 use gs_io::{Provenance, hash_file};
 use gs_scene::{Gaussians, ply};
+use ndarray::{Array2, Axis};
 use rand::seq::SliceRandom;
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
@@ -65,13 +66,11 @@ pub fn write(side: usize, views: usize, folder: &Path) {
     let gaussian_knn = neighbours(&index, side, (1, 1));
     let graph_of_all = Graph {
         kept: (0..n as u32).collect(),
-        knn: anchors.iter().flat_map(|&a| &gaussian_knn[a as usize * K..][..K]).copied().collect(),
+        knn: gaussian_knn.select(Axis(0), &anchors.iter().map(|&a| a as usize).collect::<Vec<_>>()),
         anchor_knn: neighbours(&anchor_id, columns, BLOCK),
         anchors,
         nearest_anchor,
         gaussian_knn,
-        k: K,
-        gaussian_k: K,
         seen_views: vec![1; n],
         seen_weight: vec![1.0; n],
     };
@@ -82,11 +81,11 @@ pub fn write(side: usize, views: usize, folder: &Path) {
 }
 
 /// The K nearest of each on a grid that is `width` wide and has this spacing; `ids` names its places row by row.
-fn neighbours(ids: &[u32], width: usize, spacing: (usize, usize)) -> Vec<u32> {
+fn neighbours(ids: &[u32], width: usize, spacing: (usize, usize)) -> Array2<u32> {
     let mut steps: Vec<(i64, i64)> = (-9..=9).flat_map(|dy| (-9..=9).map(move |dx| (dy, dx))).collect();
     steps.sort_by_key(|(dy, dx)| (dy * spacing.0 as i64).pow(2) + (dx * spacing.1 as i64).pow(2));
     let (height, across) = ((ids.len() / width) as i64, width as i64);
-    let mut out = vec![0; ids.len() * K];
+    let mut out = Array2::zeros((ids.len(), K));
     for (place, &id) in ids.iter().enumerate() {
         let (y, x) = (place as i64 / across, place as i64 % across);
         let inside = |&(dy, dx): &(i64, i64)| {
@@ -94,7 +93,7 @@ fn neighbours(ids: &[u32], width: usize, spacing: (usize, usize)) -> Vec<u32> {
             within.then(|| ids[((y + dy) * across + x + dx) as usize])
         };
         let near = steps[1..].iter().filter_map(inside);
-        out[id as usize * K..][..K].iter_mut().zip(near).for_each(|(to, j)| *to = j);
+        out.row_mut(id as usize).iter_mut().zip(near).for_each(|(to, j)| *to = j);
     }
     out
 }

@@ -1,17 +1,17 @@
 //! What both methods give, and the curve that they write beside it.
 
 use gs_io::{Result, with_suffix, write_bytes};
+use ndarray::Array2;
 use report::curve::{self, Panel};
 use serde_json::Value;
 use std::path::Path;
 
 /// Features and what the record of the run says of them.
 pub struct Made {
-    pub dim: usize,
     /// `[n][dim]`, in the order of the graph's kept Gaussians.
-    pub values: Vec<f32>,
-    /// Dimension of the features of parts, and they, `[n][dim]`; 0 where there are none.
-    pub parts: (usize, Vec<f32>),
+    pub values: Array2<f32>,
+    /// Features of parts; without columns where there are none.
+    pub parts: Array2<f32>,
     pub summary: Value,
 }
 

@@ -42,13 +42,12 @@ impl Program for Args {
         };
 
         let parameters = self.options.parameters(self.common.seed);
-        let (parts_dim, parts) = made.parts;
-        let features = Features { kept: inputs.graph.kept, dim: made.dim, values: made.values, parts_dim, parts };
+        let features = Features { kept: inputs.graph.kept, values: made.values, parts: made.parts };
         watched.check()?;
         features.write(&self.out, stage.provenance("", 0, parameters.clone(), inputs.hashes.clone()))?;
         // The run is complete: what is left of it must not look like an unfinished one.
         let _ = std::fs::remove_file(unfinished);
-        stage.info(&format!("features of {} Gaussians, {} dimensions", features.kept.len(), features.dim));
+        stage.info(&format!("features of {} Gaussians, {} dimensions", features.kept.len(), features.dim()));
         stage.record(&mut claim, parameters, inputs.hashes, made.summary)
     }
 }

@@ -3,6 +3,7 @@
 use artifacts::{Features, FootprintsBuilder, Graph, PixelSamples, Row, role};
 use gs_io::{Provenance, hash_file};
 use gs_scene::{Gaussians, ply};
+use ndarray::ArrayView1;
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
 use std::process::{Command, Output, Stdio};
@@ -40,22 +41,20 @@ fn write_with(dir: &Path, gaussians: &Gaussians, graph: &Graph, footprints: Foot
 }
 
 fn graph() -> Graph {
-    let near = |i: usize, of: &[usize]| -> Vec<u32> {
+    let near = |i: usize, of: &[usize]| -> [u32; 4] {
         let mut all: Vec<usize> = (0..of.len()).filter(|&j| of[j] != i).collect();
         all.sort_by_key(|&j| (of[j].abs_diff(i), j));
-        all[..4].iter().map(|&j| j as u32).collect()
+        std::array::from_fn(|k| all[k] as u32)
     };
     let everyone: Vec<usize> = (0..N).collect();
     let anchors: Vec<usize> = (0..N).step_by(8).collect();
     Graph {
         kept: (0..N as u32).collect(),
         anchors: anchors.iter().map(|&a| a as u32).collect(),
-        k: 4,
-        knn: anchors.iter().flat_map(|&a| near(a, &everyone)).collect(),
-        anchor_knn: anchors.iter().flat_map(|&a| near(a, &anchors)).collect(),
+        knn: anchors.iter().map(|&a| near(a, &everyone)).collect::<Vec<_>>().into(),
+        anchor_knn: anchors.iter().map(|&a| near(a, &anchors)).collect::<Vec<_>>().into(),
         nearest_anchor: (0..N).map(|i| (((i + 3) / 8) as u32).min(anchors.len() as u32 - 1)).collect(),
-        gaussian_k: 4,
-        gaussian_knn: (0..N).flat_map(|i| near(i, &everyone)).collect(),
+        gaussian_knn: everyone.iter().map(|&i| near(i, &everyone)).collect::<Vec<_>>().into(),
         seen_views: vec![1; N],
         seen_weight: vec![1.0; N],
     }
@@ -155,7 +154,7 @@ fn the_closed_form_tells_things_apart_and_not_their_halves() {
 fn parts_are_what_level_small_shows() {
     let (dir, out) = setup();
     succeed(dir.path(), &out, &[]);
-    assert_eq!(Features::read(&out).unwrap().0.parts_dim, 0, "no masks of level small");
+    assert_eq!(Features::read(&out).unwrap().0.parts.ncols(), 0, "no masks of level small");
     let mut f = footprints();
     for view in 0..VIEWS as u32 {
         for part in 0..6 {
@@ -166,12 +165,12 @@ fn parts_are_what_level_small_shows() {
     write_with(dir.path(), &gaussians(), &graph(), f);
     succeed(dir.path(), &out, &[]);
     let (f, _) = Features::read(&out).unwrap();
-    let part = |i: usize| &f.parts[i * f.parts_dim..(i + 1) * f.parts_dim];
-    let cosine = |a: &[f32], b: &[f32]| a.iter().zip(b).map(|(a, b)| a * b).sum::<f32>();
+    let part = |i: usize| f.parts.row(i);
+    let cosine = |a: ArrayView1<'_, f32>, b: ArrayView1<'_, f32>| a.dot(&b);
     assert!(cosine(part(5), part(15)) > 0.9 && cosine(part(5), part(35)) < 0.5, "halves of a thing are parts");
     assert!(cosine(f.row(5), f.row(35)) > cosine(part(5), part(35)) + 0.2);
     succeed(dir.path(), &out, &["--levels", "small"]);
-    assert_eq!(Features::read(&out).unwrap().0.parts_dim, 0, "the features are of that level");
+    assert_eq!(Features::read(&out).unwrap().0.parts.ncols(), 0, "the features are of that level");
 }
 
 #[test]

@@ -4,8 +4,13 @@
 use graph_precompute::fps::farthest_points;
 use graph_precompute::kdtree::KdTree;
 use graph_precompute::positions::shifted;
+use ndarray::{ArrayView2, Axis, aview1};
 use serde_json::json;
 use std::time::Instant;
+
+fn column(v: &[u32]) -> ArrayView2<'_, u32> {
+    aview1(v).insert_axis(Axis(1))
+}
 
 fn main() {
     let mut arguments = std::env::args().skip(1).filter(|a| a != "--bench");
@@ -15,7 +20,7 @@ fn main() {
     };
     let runs: usize = arguments.next().map_or(3, |r| r.parse().expect("a number of runs"));
     let array = gs_io::npy::read_f32(&file).expect("positions, f32 [n, 3]");
-    let means: Vec<[f32; 3]> = array.data.chunks_exact(3).map(|p| [p[0], p[1], p[2]]).collect();
+    let means: Vec<[f32; 3]> = array.rows().into_iter().map(|p| [p[0], p[1], p[2]]).collect();
     drop(array);
     let k = 16;
     let mut seconds = Vec::new();
@@ -34,18 +39,15 @@ fn main() {
         let among_anchors = KdTree::new(&anchors).all_nearest(k);
         let knn = clock.elapsed().as_secs_f64();
         seconds.push(json!({"tree": build, "fps": fps, "knn": knn, "nearest": 0.0, "total": build + fps + knn}));
-        let bytes = |v: &[u32]| gs_io::hash_bytes(&v.iter().flat_map(|i| i.to_le_bytes()).collect::<Vec<u8>>());
-        digest = [&sample.anchors[..], &sample.nearest, &among_all, &among_anchors].map(bytes).join(" ");
+        let made = [column(&sample.anchors), column(&sample.nearest), among_all.view(), among_anchors.view()];
+        let bytes =
+            |v: ArrayView2<'_, u32>| gs_io::hash_bytes(&v.iter().flat_map(|i| i.to_le_bytes()).collect::<Vec<u8>>());
+        digest = made.map(bytes).join(" ");
         if let Ok(folder) = std::env::var("GRAPH_OUT") {
-            let write = |name: &str, v: &[u32], width: usize| {
-                let v: Vec<i32> = v.iter().map(|&i| i as i32).collect();
+            for (name, v) in ["anchors", "nearest", "knn", "anchor_knn"].iter().zip(made) {
                 let path = format!("{folder}/{name}.npy");
-                gs_io::npy::write_i32(path, &[v.len() / width, width], &v).expect("a folder to write to");
-            };
-            write("anchors", &sample.anchors, 1);
-            write("nearest", &sample.nearest, 1);
-            write("knn", &among_all, k);
-            write("anchor_knn", &among_anchors, k);
+                gs_io::npy::write_i32(path, &v.mapv(|i| i as i32)).expect("a folder to write to");
+            }
         }
     }
     let peak = stage::peak_rss_bytes();

@@ -4,7 +4,7 @@
 //! weights are summed per cell, and a cell's sum goes to each of its masks. Tiles are added up in their order, so the sums
 //! do not depend on the number of threads.
 
-use artifacts::{LEVELS, MaskMaps, Row};
+use artifacts::{LEVELS, Level, MaskMaps, Row};
 use gs_io::mixed;
 use gs_raster::{RasterOptions, TILE, TileWeights};
 use gs_scene::{Camera, Gaussians};
@@ -120,8 +120,8 @@ fn tile_pixels(
     let mut out = Vec::new();
     for y in 0..tile.height {
         for x in 0..tile.width {
-            let (at, pixel) = (y * TILE + x, (tile.y0 + y) * maps.width + tile.x0 + x);
-            let rows = rows_at(maps, row_of, pixel);
+            let (at, pixel) = (y * TILE + x, (tile.y0 + y) * maps.width() + tile.x0 + x);
+            let rows = rows_at(maps, row_of, [tile.y0 + y, tile.x0 + x]);
             for level in 0..LEVELS {
                 let row = rows[level];
                 let key = mixed(options.seed ^ mixed((pixel * LEVELS + level) as u64));
@@ -144,10 +144,9 @@ fn tile_pixels(
 fn mask_rows(maps: &MaskMaps, min_pixels: usize) -> (Vec<Row>, [Vec<u32>; LEVELS], usize) {
     let mut rows = Vec::new();
     let mut small = 0;
-    let size = maps.width * maps.height;
-    let row_of = std::array::from_fn(|level| {
+    let row_of = Level::ALL.map(|level| {
         let mut pixels = vec![0u32; maps.id_count()];
-        for &id in &maps.ids[level * size..(level + 1) * size] {
+        for &id in maps.level(level) {
             if id >= 0 {
                 pixels[id as usize] += 1;
             }
@@ -168,9 +167,8 @@ fn mask_rows(maps: &MaskMaps, min_pixels: usize) -> (Vec<Row>, [Vec<u32>; LEVELS
 
 /// The rows of the masks that a pixel belongs to, level by level.
 #[inline(always)]
-fn rows_at(maps: &MaskMaps, row_of: &[Vec<u32>; LEVELS], pixel: usize) -> [u32; LEVELS] {
-    let size = maps.width * maps.height;
-    std::array::from_fn(|level| match maps.ids[level * size + pixel] {
+fn rows_at(maps: &MaskMaps, row_of: &[Vec<u32>; LEVELS], [y, x]: [usize; 2]) -> [u32; LEVELS] {
+    std::array::from_fn(|level| match maps.ids[[level, y, x]] {
         id if id >= 0 => row_of[level][id as usize],
         _ => NONE,
     })
@@ -201,8 +199,7 @@ fn tile_sums(tile: &TileWeights, maps: &MaskMaps, row_of: &[Vec<u32>; LEVELS], g
     let mut cell_of = [0u16; TILE * TILE];
     for y in 0..tile.height {
         for x in 0..tile.width {
-            let pixel = (tile.y0 + y) * maps.width + tile.x0 + x;
-            let masks = rows_at(maps, row_of, pixel);
+            let masks = rows_at(maps, row_of, [tile.y0 + y, tile.x0 + x]);
             let at = y * TILE + x;
             let passes = tile.alpha[at] > gate;
             for &row in masks.iter().filter(|r| **r != NONE) {
@@ -268,26 +265,22 @@ fn add_up(rows: usize, triples: impl Iterator<Item = (u32, u32, f32)>) -> Vec<Ve
 mod tests {
     use super::*;
     use crate::testing::{camera, cloud};
-    use artifacts::Level;
+    use artifacts::flat;
     use gs_scene::Geometry;
+    use ndarray::Array3;
 
     const W: usize = 70;
     const H: usize = 45;
 
     /// Stripes at one level, blocks at another, a mask of three pixels, and pixels without a mask.
     fn maps() -> MaskMaps {
-        let mut ids = vec![-1; LEVELS * W * H];
-        for y in 0..H {
-            for x in 0..W {
-                let at = |level: Level| level as usize * W * H + y * W + x;
-                ids[at(Level::Default)] = if x < 60 { (x / 13) as i32 } else { -1 };
-                ids[at(Level::Large)] = 10 + (y / 20) as i32 * 2 + (x / 50) as i32;
-                if y == 30 && x < 3 {
-                    ids[at(Level::Small)] = 9;
-                }
-            }
-        }
-        MaskMaps { width: W, height: H, ids }
+        let id = |(level, y, x)| match Level::ALL[level] {
+            Level::Default if x < 60 => (x / 13) as i32,
+            Level::Large => 10 + (y / 20) as i32 * 2 + (x / 50) as i32,
+            Level::Small if y == 30 && x < 3 => 9,
+            _ => -1,
+        };
+        MaskMaps { ids: Array3::from_shape_fn((LEVELS, H, W), id) }
     }
 
     fn options(min_pixels: usize, samples: usize) -> FootprintOptions {
@@ -306,7 +299,7 @@ mod tests {
         for (k, row) in result.rows.iter().enumerate() {
             let mine: Vec<&Pixel> = result.pixels.iter().filter(|p| p.row as usize == k).collect();
             assert!(mine.len() <= 6 && (mine.len() == 6 || row.gated < 30), "{row:?}: {}", mine.len());
-            let map = &maps.ids[row.level as usize * W * H..][..W * H];
+            let map = flat(maps.level(Level::ALL[row.level as usize]));
             for pixel in mine {
                 let rendered: Vec<f32> = (0..d)
                     .map(|c| pixel.entries.iter().map(|&(i, w)| w * features[i as usize * d + c]).sum())
@@ -355,7 +348,7 @@ mod tests {
         assert_eq!(result.rows.len(), 5 + 6);
         let mut gated_all = 0;
         for (row, entries) in result.rows.iter().zip(&result.entries) {
-            let map = &maps.ids[row.level as usize * W * H..][..W * H];
+            let map = flat(maps.level(Level::ALL[row.level as usize]));
             let mine: Vec<usize> = (0..W * H).filter(|&p| map[p] == row.mask as i32).collect();
             let gated: Vec<usize> = mine.iter().copied().filter(|&p| alpha[p] > 0.7).collect();
             assert_eq!((row.pixels as usize, row.gated as usize), (mine.len(), gated.len()));

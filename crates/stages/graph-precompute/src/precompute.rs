@@ -160,9 +160,10 @@ impl<'a> Collected<'a> {
         if settings.mask_divisor > 1 {
             maps = maps.shrunk(settings.mask_divisor);
         }
-        let camera = view.camera.resized(maps.width as u32, maps.height as u32);
+        let (width, height) = (maps.width(), maps.height());
+        let camera = view.camera.resized(width as u32, height as u32);
         let index = self.out.views.len() as u32;
-        let scale = (maps.width * maps.height) as f64 / REFERENCE_PIXELS;
+        let scale = (width * height) as f64 / REFERENCE_PIXELS;
         let look = FootprintOptions {
             gate: settings.gate as f32,
             min_pixels: (settings.min_mask_pixels * scale.min(1.0)).ceil() as usize,

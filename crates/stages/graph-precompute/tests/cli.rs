@@ -5,6 +5,7 @@ use glam::DVec3;
 use gs_io::Provenance;
 use gs_scene::dataset::{self, LoadOptions, Resolution};
 use gs_scene::{Camera, Gaussians, Image, PointCloud, colmap, ply};
+use ndarray::Array3;
 use std::path::{Path, PathBuf};
 use std::process::{Command, Output};
 
@@ -17,9 +18,9 @@ fn setup(size: u32) -> (tempfile::TempDir, PathBuf, PathBuf) {
     let (s, o) = (dir.path().join("scene"), dir.path().join("out"));
     std::fs::create_dir_all(&o).unwrap();
     let n = (size * size) as usize;
-    let half: Vec<i32> = (0..n).map(|p| i32::from(p % size as usize >= size as usize / 2)).collect();
-    let ids = [0, 2, 4].iter().flat_map(|level| half.iter().map(move |i| i + level)).chain(vec![6; n]).collect();
-    let maps = MaskMaps { width: size as usize, height: size as usize, ids };
+    let half = |x| i32::from(x >= size as usize / 2);
+    let id = |(level, _, x)| if level == 3 { 6 } else { 2 * level as i32 + half(x) };
+    let maps = MaskMaps { ids: Array3::from_shape_fn((4, size as usize, size as usize), id) };
     let grey = Image { width: size, height: size, rgb: vec![0.5; 3 * n], alpha: None };
     let mut views = Vec::new();
     for v in 0..5 {
@@ -75,7 +76,8 @@ fn artifacts_are_right_and_the_same_for_any_number_of_threads() {
     succeed(&run(&s, &o, &["--threads", "2"]));
     assert!(first == read(), "the number of threads changes the artifacts");
     let (graph, a) = Graph::read(o.join("graph.safetensors")).unwrap();
-    assert_eq!((graph.kept.len(), graph.anchors.len(), graph.k, graph.gaussian_k), (60, 6, 16, 16));
+    assert_eq!((graph.kept.len(), graph.anchors.len()), (60, 6));
+    assert_eq!((graph.knn.dim(), graph.gaussian_knn.dim()), ((6, 16), (60, 16)));
     assert_eq!(graph.seen_views[60], 0);
     let f = Footprints::read(o.join("footprints.safetensors")).unwrap();
     assert_eq!(f.artifact().provenance().inputs, a.provenance().inputs);
@@ -172,9 +174,9 @@ fn bad_input_is_one_line_and_leaves_outputs_alone() {
     let good = std::fs::read(&masks).unwrap();
     std::fs::write(&masks, &good[..good.len() / 2]).unwrap();
     fail(&[], &["v2_s.npy"]);
-    MaskMaps { width: 20, height: 48, ids: vec![0; 4 * 20 * 48] }.write(&masks).unwrap();
+    MaskMaps { ids: Array3::zeros((4, 48, 20)) }.write(&masks).unwrap();
     fail(&[], &["v2_s.npy", "found 20x48", "expected 48x48"]);
-    MaskMaps { width: 48, height: 48, ids: vec![-1; 4 * 48 * 48] }.write(&masks).unwrap();
+    MaskMaps { ids: Array3::from_elem((4, 48, 48), -1) }.write(&masks).unwrap();
     for v in [1, 3, 4] {
         std::fs::remove_file(s.join(format!("masks/v{v}_s.npy"))).unwrap();
     }
@@ -269,13 +271,12 @@ fn given_maps_of_distorted_photographs_are_undistorted_with_them() {
     let camera = format!("1 SIMPLE_RADIAL {SIZE} {SIZE} {f} 24 24 -0.3\n");
     std::fs::write(s.join("sparse/0/cameras.txt"), camera).unwrap();
     // A thing that ends left of the middle, as it is drawn on the photographs.
-    let n = (SIZE * SIZE) as usize;
-    let ids = (0..4 * n).map(|p| i32::from(p % SIZE as usize >= 14)).collect();
-    let drawn = MaskMaps { width: SIZE as usize, height: SIZE as usize, ids };
+    let size = SIZE as usize;
+    let drawn = MaskMaps { ids: Array3::from_shape_fn((4, size, size), |(_, _, x)| i32::from(x >= 14)) };
     let load = LoadOptions { resolution: Resolution::Divisor(1.0), holdout: 8 };
     let views = dataset::load(&s, &load).unwrap().views;
     let mut flat = drawn.clone();
-    views[0].undistort_nearest(&mut flat.ids, flat.width, flat.height);
+    views[0].undistort_nearest(flat.ids.as_slice_mut().unwrap(), size, size);
     assert_ne!(flat, drawn);
     let write = |maps: &MaskMaps| views.iter().for_each(|v| maps.write(maps_path(s.join("masks"), v.stem())).unwrap());
     let rows = || {

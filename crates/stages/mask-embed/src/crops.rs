@@ -4,7 +4,7 @@
 
 use crate::options::CropsArgs;
 use crate::photographs;
-use artifacts::{Level, MaskFolder, MaskMaps, MaskTruth, TrueScene, hash_folder, maps_path, role};
+use artifacts::{Level, MaskFolder, MaskMaps, MaskTruth, TrueScene, flat, hash_folder, maps_path, role};
 use gs_io::{ArtifactWriter, Error, Result};
 use gs_scene::dataset::View;
 use onnx_models::{Bounds, LabelMap, RgbImage, Tokenizer, crop_mask, mask_bounds};
@@ -21,7 +21,7 @@ pub const CROPS_FORMAT: &str = "crops";
 pub(crate) type Owner = (usize, Level, Bounds);
 
 fn label_map(maps: &MaskMaps, level: Level) -> LabelMap<'_> {
-    LabelMap { width: maps.width, height: maps.height, ids: maps.level(level) }
+    LabelMap { width: maps.width(), height: maps.height(), ids: flat(maps.level(level)) }
 }
 
 /// Masks that own pixels, ids ascending.
@@ -121,12 +121,13 @@ pub(crate) fn run(args: &CropsArgs, stage: &Stage) -> Result<()> {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use ndarray::arr3;
 
     #[test]
     fn every_mask_with_pixels_has_a_crop_whatever_its_level() {
         let crops = |image: &RgbImage, maps: &MaskMaps| cut(image, maps, &owners(maps), 2);
         // 2 x 1 map: default has mask 0 on the left; small none; medium mask 2 on both; large masks 2 (again) and 3.
-        let maps = MaskMaps { width: 2, height: 1, ids: vec![0, -1, -1, -1, 2, 2, 2, 3] };
+        let maps = MaskMaps { ids: arr3(&[[[0, -1]], [[-1, -1]], [[2, 2]], [[2, 3]]]) };
         let image = RgbImage { width: 2, height: 1, pixels: vec![10, 10, 10, 200, 200, 200] };
         let all = crops(&image, &maps);
         assert_eq!(all.iter().map(|(id, _)| *id).collect::<Vec<_>>(), [0, 2, 3]);
@@ -134,7 +135,7 @@ mod tests {
         // Two pixels beside each other, black below (the odd row of padding).
         assert_eq!(all[1].1[..4], [10, 200, 0, 0]);
         assert_eq!(all[2].1, [200; 12]);
-        let none = MaskMaps { width: 2, height: 1, ids: vec![-1; 8] };
+        let none = MaskMaps { ids: arr3(&[[[-1, -1]]; 4]) };
         assert!(crops(&image, &none).is_empty());
     }
 }

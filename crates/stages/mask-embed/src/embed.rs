@@ -7,6 +7,7 @@ use crate::photographs;
 use artifacts::{MaskFeatures, MaskFolder, MaskMaps, features_path, hash_folder, maps_path, role};
 use gs_io::{Claim, Result, Watched, hash_bytes, hash_file, write_json};
 use gs_scene::dataset::{Dataset, View};
+use ndarray::{Array2, aview1};
 use onnx_models::{ClipImage, ClipText, RgbImage};
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
@@ -66,11 +67,11 @@ pub(crate) fn run(args: &EmbedArgs, stage: &Stage) -> Result<()> {
                 forecast(&clip, &scene.views, stage)?;
             }
             let (features, pictures) = embed(&clip, &image, &maps)?;
-            let shown = features.values.chunks(features.dim).filter(|r| r.iter().any(|&v| v != 0.0)).count();
+            let shown = features.values.rows().into_iter().filter(|r| r.iter().any(|&v| v != 0.0)).count();
             watched.check()?;
             finished::remove_manifest(&manifest)?;
             features.write(&output)?;
-            Ok(Facts { masks: features.count, features: shown, pictures })
+            Ok(Facts { masks: features.values.nrows(), features: shown, pictures })
         })?;
         masks += facts.features;
         pictures += facts.pictures;
@@ -132,11 +133,11 @@ fn embed(clip: &ClipImage, image: &RgbImage, maps: &MaskMaps) -> Result<(MaskFea
         waiting.drain(..ready);
     }
     encoded.extend(clip.encode(&waiting)?);
-    let mut values = vec![0f32; maps.id_count() * dim];
+    let mut values = Array2::zeros((maps.id_count(), dim));
     for (id, picture) in picture_of {
-        values[id * dim..(id + 1) * dim].copy_from_slice(&encoded[picture * dim..(picture + 1) * dim]);
+        values.row_mut(id).assign(&aview1(&encoded[picture * dim..(picture + 1) * dim]));
     }
-    Ok((MaskFeatures { count: maps.id_count(), dim, values }, first.len()))
+    Ok((MaskFeatures { values }, first.len()))
 }
 
 /// Says how much memory the photographs will take, after a full batch of empty pictures has shown what the model takes.

@@ -6,6 +6,7 @@ use crate::options::ImportArgs;
 use artifacts::{LEVELS, Level, MaskMaps, hash_folder, maps_path};
 use gs_io::{Error, IoContext, Result, hash_files, write_json};
 use image::DynamicImage;
+use ndarray::Array3;
 use serde_json::json;
 use stage::{Stage, peak_rss_bytes};
 use std::collections::{BTreeMap, BTreeSet};
@@ -90,7 +91,7 @@ fn load(paths: &[PathBuf]) -> Result<MaskMaps> {
         ids.extend(values.iter().map(|l| id_of.get(l).copied().unwrap_or(-1)));
         first += id_of.len() as i32;
     }
-    Ok(MaskMaps { width, height, ids })
+    Ok(MaskMaps { ids: Array3::from_shape_vec((LEVELS, height, width), ids).expect("four pictures") })
 }
 
 /// Turns label pictures into id maps, then writes the manifest. Nothing is written before all pictures have been read
@@ -114,7 +115,7 @@ pub(crate) fn run(args: &ImportArgs, stage: &Stage) -> Result<()> {
         if masks.iter().all(|&n| n == 0) {
             stage.warn(&format!("{}: no label but 0", paths[0].display()));
         }
-        views.insert(view.clone(), json!({ "size": [maps.width, maps.height], "masks": masks }));
+        views.insert(view.clone(), json!({ "size": [maps.width(), maps.height()], "masks": masks }));
     }
     finished::remove_manifest(&manifest)?;
     let mut progress = stage.progress("views", found.len() as u64);

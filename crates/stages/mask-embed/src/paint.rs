@@ -2,7 +2,8 @@
 
 use crate::automatic::Proposals;
 use crate::regions::Patch;
-use artifacts::{LEVELS, MaskMaps, instance_color};
+use artifacts::{LEVELS, MaskMaps, flat, instance_color};
+use ndarray::Array3;
 use onnx_models::RgbImage;
 use rayon::prelude::*;
 
@@ -72,17 +73,16 @@ pub fn paint(proposals: &Proposals, chosen: &[Vec<usize>; LEVELS], size: MapSize
         }
         first += masks.len() as i32;
     }
-    MaskMaps { width, height, ids }
+    MaskMaps { ids: Array3::from_shape_vec((LEVELS, height, width), ids).expect("four maps") }
 }
 
 /// Id maps as a picture: the four levels in two rows, each mask in a colour of its own over the photograph, outlined.
 /// `image` is resized to the map.
 pub fn preview(image: &RgbImage, maps: &MaskMaps) -> RgbImage {
-    let (w, h) = (maps.width, maps.height);
+    let (w, h) = (maps.width(), maps.height());
     let small = onnx_models::resize_rgb(image, w, h);
     let mut out = RgbImage { width: 2 * w, height: 2 * h, pixels: vec![0; 4 * w * h * 3] };
-    for level in 0..LEVELS {
-        let map = &maps.ids[level * w * h..(level + 1) * w * h];
+    for (level, map) in maps.ids.outer_iter().map(flat).enumerate() {
         let first = map.iter().copied().filter(|&i| i >= 0).min().unwrap_or(0);
         for y in 0..h {
             for x in 0..w {
@@ -111,6 +111,7 @@ mod tests {
     use crate::automatic::Proposal;
     use crate::logits::{Grid, Logits};
     use crate::nms::Pixels;
+    use artifacts::Level;
 
     fn size(width: usize, height: usize, min_area: usize) -> MapSize {
         MapSize { width, height, min_area }
@@ -143,18 +144,18 @@ mod tests {
     fn ids_count_on_and_small_masks_lie_on_top() {
         let p = proposals(&[[2, 2, 5, 5], [0, 0, 10, 10], [12, 0, 20, 10]]);
         let m = paint(&p, &[vec![0, 1, 2], vec![0], vec![], vec![1, 2]], size(20, 10, 1));
-        let at = |level: usize, x: usize, y: usize| m.ids[level * 200 + y * 20 + x];
+        let at = |level: usize, x: usize, y: usize| m.ids[[level, y, x]];
         // By area: 1 (100), 2 (80), 0 (9).
         assert_eq!((at(0, 0, 0), at(0, 13, 5), at(0, 3, 3), at(0, 11, 5)), (0, 1, 2, -1));
         assert_eq!((at(1, 3, 3), at(1, 0, 0)), (3, -1));
-        assert!(m.ids[400..600].iter().all(|&i| i == -1));
+        assert!(m.level(Level::Medium).iter().all(|&i| i == -1));
         assert_eq!((at(3, 3, 3), at(3, 13, 3)), (4, 5));
         assert_eq!(m.id_count(), 6);
         // The same at twice the size: the straight edges fall half way between logits of equal size.
         let big = paint(&p, &[vec![0, 1, 2], vec![], vec![], vec![]], size(40, 20, 1));
         for y in 0..20 {
             for x in 0..40 {
-                assert_eq!(big.ids[y * 40 + x], at(0, x / 2, y / 2), "at {x}, {y}");
+                assert_eq!(big.ids[[0, y, x]], at(0, x / 2, y / 2), "at {x}, {y}");
             }
         }
     }
@@ -174,7 +175,7 @@ mod tests {
 
     #[test]
     fn previews_show_four_levels() {
-        let m = MaskMaps { width: 4, height: 2, ids: vec![-1; 32] };
+        let m = MaskMaps { ids: Array3::from_elem((4, 2, 4), -1) };
         let photo = RgbImage { width: 8, height: 4, pixels: vec![90; 96] };
         let p = preview(&photo, &m);
         assert_eq!((p.width, p.height), (8, 4));

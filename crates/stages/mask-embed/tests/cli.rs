@@ -1,9 +1,12 @@
 //! The program on small scenes, with a segmenter by colour in place of SAM and an encoder whose features can be computed
 //! by hand in place of CLIP (scripts/make_onnx_testdata.py makes both).
 
-use artifacts::{Level, MaskFeatures, MaskMaps, MaskTruth, TrueObject, TruePart, TrueScene, features_path, maps_path};
+use artifacts::{
+    Level, MaskFeatures, MaskMaps, MaskTruth, TrueObject, TruePart, TrueScene, features_path, flat, maps_path,
+};
 use gs_io::Artifact;
 use gs_scene::Image;
+use ndarray::Array3;
 use serde_json::json;
 use std::collections::BTreeMap;
 use std::ffi::OsStr;
@@ -129,8 +132,8 @@ fn masks_follow_the_colours_at_every_level() {
     scene.make_masks(&scene.masks, &["--preview", path(&previews)]);
     for v in 0..2 {
         let maps = MaskMaps::read(maps_path(&scene.masks, &format!("v{v}"))).unwrap();
-        assert_eq!((maps.width, maps.height), (WIDTH, HEIGHT));
-        let at = |l: Level, x: usize, y: usize| maps.level(l)[y * WIDTH + x + v * 8];
+        assert_eq!((maps.width(), maps.height()), (WIDTH, HEIGHT));
+        let at = |l: Level, x: usize, y: usize| maps.level(l)[[y, x + v * 8]];
         for level in Level::ALL {
             let (wall, dark, bright) = (at(level, 2, 20), at(level, 30, 30), at(level, 76, 44));
             assert!(wall >= 0 && dark >= 0 && bright >= 0 && wall != dark && dark != bright && wall != bright);
@@ -140,8 +143,8 @@ fn masks_follow_the_colours_at_every_level() {
         assert_eq!(at(Level::Large, 96, 32), at(Level::Large, 76, 44));
         // A square's pixels, up to one at its border.
         let dark = at(Level::Large, 30, 30);
-        for (i, &id) in maps.level(Level::Large).iter().enumerate() {
-            let (x, y) = ((i % WIDTH) as i64 - v as i64 * 8, (i / WIDTH) as i64);
+        for ((y, x), &id) in maps.level(Level::Large).indexed_iter() {
+            let (x, y) = (x as i64 - v as i64 * 8, y as i64);
             let inside = (17..47).contains(&x) && (17..47).contains(&y);
             let outside = !(15..49).contains(&x) || !(15..49).contains(&y);
             assert!(if id == dark { !outside } else { !inside }, "at {x}, {y}");
@@ -153,8 +156,8 @@ fn masks_follow_the_colours_at_every_level() {
     let small = scene.masks.with_file_name("small");
     scene.make_masks(&small, &["--map-size", "64"]);
     let maps = MaskMaps::read(maps_path(&small, "v0")).unwrap();
-    assert_eq!((maps.width, maps.height), (64, 32));
-    assert_eq!(maps.level(Level::Large)[15 * 64 + 20], maps.level(Level::Large)[22 * 64 + 10]);
+    assert_eq!((maps.width(), maps.height()), (64, 32));
+    assert_eq!(maps.level(Level::Large)[[15, 20]], maps.level(Level::Large)[[22, 10]]);
 }
 
 #[test]
@@ -211,19 +214,18 @@ fn other_exports_are_used_as_their_description_says() {
             assert_eq!(maps, sam, "the same numbers by other names");
         }
         for level in &Level::ALL[1..] {
-            let at = |x: usize, y: usize| maps.level(*level)[y * WIDTH + x];
+            let at = |x: usize, y: usize| maps.level(*level)[[y, x]];
             let things = [at(2, 20), at(30, 30), at(76, 44), at(64, 4)];
             assert!(things.iter().all(|&id| id >= 0), "{name}: {things:?}");
             assert_eq!(things.iter().collect::<std::collections::BTreeSet<_>>().len(), 4, "{name}: {things:?}");
             assert_eq!(at(96, 32) == at(76, 44), *level != Level::Small, "{name}");
         }
         // Stretched or not, a thing lies where it lies.
-        let dark = maps.level(Level::Large)[30 * WIDTH + 30];
-        let differ = |i: &usize| {
-            let inside = (16..48).contains(&(i % WIDTH)) && (16..48).contains(&(i / WIDTH));
-            (maps.level(Level::Large)[*i] == dark) != inside
-        };
-        assert!((0..WIDTH * HEIGHT).filter(differ).count() < 140, "{name}");
+        let dark = maps.level(Level::Large)[[30, 30]];
+        let square = 16..48;
+        let differ =
+            |&((y, x), &id): &((usize, usize), &i32)| (id == dark) != (square.contains(&x) && square.contains(&y));
+        assert!(maps.level(Level::Large).indexed_iter().filter(differ).count() < 140, "{name}");
     }
 }
 
@@ -323,14 +325,14 @@ fn features_are_those_of_the_crops() {
     ok(&scene.embed_args(&[]));
     let maps = MaskMaps::read(maps_path(&scene.masks, "v0")).unwrap();
     let features = MaskFeatures::read(features_path(&scene.masks, "v0")).unwrap();
-    assert_eq!((features.count, features.dim), (maps.id_count(), 4));
+    assert_eq!(features.values.dim(), (maps.id_count(), 4));
     // The dark square fills its crop: the feature is (mean of each channel, 1), scaled.
-    let dark = maps.level(Level::Large)[30 * WIDTH + 30];
+    let dark = maps.level(Level::Large)[[30, 30]];
     let expected = [20.0, 30.0, 10.0, 255.0].map(|v: f64| v / (400.0f64 + 900.0 + 100.0 + 65025.0).sqrt());
     for (f, e) in features.row(dark as usize).unwrap().iter().zip(expected) {
         assert!((f64::from(*f) - e).abs() < 0.01, "{f} {e}");
     }
-    for id in 0..features.count {
+    for id in 0..features.values.nrows() {
         let norm: f32 = features.row(id).unwrap().iter().map(|v| v * v).sum();
         assert!((norm - 1.0).abs() < 1e-5);
     }
@@ -375,7 +377,7 @@ fn crops_are_written_for_training() {
     assert_eq!(tokens["red mug"][1..], tokens["mug"]);
     let maps = MaskMaps::read(maps_path(&scene.masks, "v0")).unwrap();
     assert_eq!(view.iter().filter(|&&v| v == 0).count(), maps.id_count());
-    let dark = maps.level(Level::Large)[30 * WIDTH + 30] as u32;
+    let dark = maps.level(Level::Large)[[30, 30]] as u32;
     let at = (0..view.len()).find(|&i| view[i] == 0 && mask[i] == dark).unwrap();
     let crop = &pixels[at * 768..(at + 1) * 768];
     assert_eq!([crop[8 * 16 + 8], crop[256 + 8 * 16 + 8], crop[512 + 8 * 16 + 8]], [20, 30, 10]);
@@ -397,9 +399,9 @@ fn label_pictures_become_id_maps() {
     }
     ok(&["import", "--labels", path(&labels), "--out", path(&out)]);
     let a = MaskMaps::read(maps_path(&out, "a.b")).unwrap();
-    assert_eq!(a.ids, [-1, 0, 0, 1, -1, 2, 2, 3, -1, 4, 4, 5, -1, 6, 6, 7]);
+    assert_eq!(flat(a.ids.view()), [-1, 0, 0, 1, -1, 2, 2, 3, -1, 4, 4, 5, -1, 6, 6, 7]);
     let c = MaskMaps::read(maps_path(&out, "c")).unwrap();
-    assert_eq!(c.ids, [0, -1, 2, 1, -1, -1, 3, 3]);
+    assert_eq!(flat(c.ids.view()), [0, -1, 2, 1, -1, -1, 3, 3]);
     assert!(out.join("masks.json").exists());
 
     let import = || error(&["import", "--labels", path(&labels), "--out", path(&out)]);
@@ -485,7 +487,7 @@ fn id_maps_of_another_shape_are_refused_before_the_first_view() {
     scene.make_masks(&scene.masks, &[]);
     let file = maps_path(&scene.masks, "v1");
     let maps = MaskMaps::read(&file).unwrap();
-    MaskMaps { width: maps.height, height: maps.width, ids: maps.ids }.write(&file).unwrap();
+    MaskMaps { ids: maps.ids.permuted_axes([0, 2, 1]) }.write(&file).unwrap();
     let out = scene.masks.with_file_name("out");
     let inputs = ["--scene", path(&scene.folder), "--masks", path(&scene.masks), "--out", path(&out)];
     for command in [&["embed", "--clip", CLIP][..], &["crops"]] {
@@ -496,6 +498,6 @@ fn id_maps_of_another_shape_are_refused_before_the_first_view() {
         assert!(!out.exists());
     }
     // Smaller maps are whole pictures, too.
-    MaskMaps { width: 64, height: 32, ids: vec![0; 4 * 64 * 32] }.write(&file).unwrap();
+    MaskMaps { ids: Array3::zeros((4, 32, 64)) }.write(&file).unwrap();
     ok(&[&["embed", "--clip", CLIP], &inputs[..]].concat());
 }

@@ -177,11 +177,9 @@ fn photographs(world: &World) -> Vec<Case> {
         with("one mask", "the same single mask everywhere", &|s| s.masks.ids.fill(0)),
         with("no masks", "no mask anywhere", &|s| s.masks.ids.fill(-1)),
         with("thousands of masks", "every four by four pixels a mask of their own", &|s| {
-            let (w, n) = (s.masks.width, s.masks.width * s.masks.height);
-            let tiles = w.div_ceil(4);
-            for (i, id) in s.masks.ids.iter_mut().enumerate() {
-                let p = i % n;
-                *id = (i / n * (n.div_ceil(4)) + p / w / 4 * tiles + p % w / 4) as i32;
+            let (w, n) = (s.masks.width(), s.masks.width() * s.masks.height());
+            for ((level, y, x), id) in s.masks.ids.indexed_iter_mut() {
+                *id = (level * n.div_ceil(4) + y / 4 * w.div_ceil(4) + x / 4) as i32;
             }
         }),
         with("camera inside a thing", "every camera at the middle of the Gaussians", &|s| {

@@ -5,6 +5,7 @@ use glam::{DMat3, DQuat, DVec3};
 use gs_io::{Result, create_dir};
 use gs_scene::dataset::{LoadOptions, Resolution, load};
 use gs_scene::{Camera, Gaussians, Image, PointCloud, colmap, ply};
+use ndarray::Array3;
 use std::path::Path;
 
 /// A posed photograph with its masks.
@@ -85,9 +86,7 @@ impl World {
     /// Masks with other ids: `id` becomes `count - 1 - id`, level by level as before.
     pub fn with_mask_ids_reversed(mut self) -> Self {
         for s in &mut self.shots {
-            let n = s.masks.width * s.masks.height;
-            for level in 0..LEVELS {
-                let ids = &mut s.masks.ids[level * n..(level + 1) * n];
+            for mut ids in s.masks.ids.outer_iter_mut() {
                 let known = ids.iter().copied().filter(|&i| i >= 0);
                 let Some((low, high)) = known.clone().min().zip(known.max()) else { continue };
                 ids.iter_mut().filter(|i| **i >= 0).for_each(|i| *i = low + high - *i);
@@ -110,21 +109,16 @@ impl World {
     pub fn at_twice_the_size(mut self) -> Self {
         for s in &mut self.shots {
             let (w, h) = (s.image.width as usize, s.image.height as usize);
-            let at = |i: usize, w: usize| (i / (2 * w) / 2, i % (2 * w) / 2);
             s.camera = s.camera.resized(2 * w as u32, 2 * h as u32);
             let mut rgb = Vec::with_capacity(12 * w * h);
             for i in 0..4 * w * h {
-                let (y, x) = at(i, w);
+                let (y, x) = (i / (2 * w) / 2, i % (2 * w) / 2);
                 rgb.extend(&s.image.rgb[3 * (y * w + x)..3 * (y * w + x) + 3]);
             }
             s.image = Image { width: 2 * w as u32, height: 2 * h as u32, rgb, alpha: None };
-            let (mw, mh) = (s.masks.width, s.masks.height);
-            let ids = (0..LEVELS * 4 * mw * mh).map(|i| {
-                let (level, i) = (i / (4 * mw * mh), i % (4 * mw * mh));
-                let (y, x) = at(i, mw);
-                s.masks.ids[level * mw * mh + y * mw + x]
-            });
-            s.masks = MaskMaps { width: 2 * mw, height: 2 * mh, ids: ids.collect() };
+            let shape = (LEVELS, 2 * s.masks.height(), 2 * s.masks.width());
+            let ids = Array3::from_shape_fn(shape, |(level, y, x)| s.masks.ids[[level, y / 2, x / 2]]);
+            s.masks = MaskMaps { ids };
         }
         self
     }

@@ -1,7 +1,7 @@
 //! Sampled pixels with the Gaussians that they show: rendering of features for learners that see every pixel many times.
 
 use crate::world::World;
-use artifacts::Level;
+use artifacts::{Level, flat};
 use gs_io::Result;
 use gs_raster::TILE;
 use rand::Rng;
@@ -65,11 +65,11 @@ pub fn sample(world: &World, levels: &[Level], count: usize, rng: &mut impl Rng)
             let feature = usize::try_from(id).ok().and_then(|id| features?.row(id));
             feature.is_some_and(|f| f.iter().any(|&v| v != 0.0))
         };
-        let ids = |pixel: usize| levels.iter().map(move |&level| (level, pixel)).map(|(l, p)| maps.level(l)[p]);
-        let candidates: Vec<usize> = (0..maps.width * maps.height).filter(|&p| ids(p).any(described)).collect();
+        let ids = |pixel: usize| levels.iter().map(move |&level| (level, pixel)).map(|(l, p)| flat(maps.level(l))[p]);
+        let candidates: Vec<usize> = (0..maps.width() * maps.height()).filter(|&p| ids(p).any(described)).collect();
         let chosen = index::sample(rng, candidates.len(), count.min(candidates.len()));
         // Order of each pixel in the sample.
-        let mut order = vec![u32::MAX; maps.width * maps.height];
+        let mut order = vec![u32::MAX; maps.width() * maps.height()];
         let mut pixels = ViewPixels { view: view as u32, ..ViewPixels::default() };
         for (at, chosen) in chosen.iter().enumerate() {
             order[candidates[chosen]] = at as u32;
@@ -78,7 +78,7 @@ pub fn sample(world: &World, levels: &[Level], count: usize, rng: &mut impl Rng)
         let tiles = world.tiles(&camera, true, |t| {
             let mut out = Vec::new();
             for (x, y) in (0..t.height).flat_map(|y| (0..t.width).map(move |x| (x, y))) {
-                let at = order[(t.y0 + y) * maps.width + t.x0 + x];
+                let at = order[(t.y0 + y) * maps.width() + t.x0 + x];
                 if at != u32::MAX {
                     let weights = t.weights.iter().skip(y * TILE + x).step_by(PIXELS);
                     let entries = t.gaussians.iter().map(|&i| position[i as usize]).zip(weights.copied());

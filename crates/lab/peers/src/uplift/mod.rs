@@ -21,11 +21,12 @@ pub use vala::ValaOptions;
 use crate::product::{Product, Table};
 use crate::vectors::{normalised, unit};
 use crate::world::World;
-use artifacts::{Level, MaskMaps, Row};
+use artifacts::{Level, MaskMaps, Row, flat};
 use glam::DVec3;
 use gs_io::Result;
 use gs_raster::{TILE, TileWeights};
 use gs_scene::Camera;
+use ndarray::Array2;
 use rayon::prelude::*;
 use serde::Serialize;
 use stage::Stage;
@@ -49,9 +50,9 @@ struct Finish {
 
 impl Finish {
     fn applied(self, table: Table, world: &World) -> Product {
-        let (knn, k) = (&world.graph.gaussian_knn, world.graph.gaussian_k);
-        let table = if self.fill { filled(table, knn, k) } else { table };
-        Product::Descriptors(smoothed(table, knn, k, self.smooth))
+        let knn = &world.graph.gaussian_knn;
+        let table = if self.fill { filled(table, knn) } else { table };
+        Product::Descriptors(smoothed(table, knn, self.smooth))
     }
 }
 
@@ -132,7 +133,7 @@ fn centres(world: &World, camera: &Camera, positions: &[u32]) -> Vec<Centre> {
 fn give_centres(shares: &mut Shares, view: u32, centres: &[Centre], maps: &MaskMaps, slots: &[Level]) {
     for c in centres {
         for (slot, &level) in slots.iter().enumerate() {
-            if let Ok(mask) = u32::try_from(maps.level(level)[c.pixel as usize]) {
+            if let Ok(mask) = u32::try_from(flat(maps.level(level))[c.pixel as usize]) {
                 shares[c.gaussian as usize].push(Share { view, mask, slot: slot as u32, weight: c.weight });
             }
         }
@@ -190,7 +191,7 @@ fn masks_of(t: &TileWeights<'_>, maps: &MaskMaps, slots: &[Level]) -> Vec<(u32, 
     let mut masks: Vec<(u32, u32, Vec<u8>)> = Vec::new();
     for (slot, &level) in slots.iter().enumerate() {
         for (x, y) in (0..t.height).flat_map(|y| (0..t.width).map(move |x| (x, y))) {
-            let Ok(id) = u32::try_from(maps.level(level)[(t.y0 + y) * maps.width + t.x0 + x]) else { continue };
+            let Ok(id) = u32::try_from(maps.level(level)[[t.y0 + y, t.x0 + x]]) else { continue };
             let pixel = (y * TILE + x) as u8;
             match masks.iter_mut().rev().find(|m| m.0 == slot as u32 && m.1 == id) {
                 Some(mask) => mask.2.push(pixel),
@@ -251,9 +252,9 @@ fn is_some(descriptor: &[f32]) -> bool {
 }
 
 /// Descriptors of Gaussians with their neighbours', as texts are answered in VALA: half its own, half the mean of
-/// `count` Gaussians, itself and the nearest of its neighbours that have a descriptor. `knn` has `k` neighbours of
-/// every Gaussian, nearest first, filled up with itself; fewer are averaged where it has fewer.
-fn smoothed(table: Table, knn: &[u32], k: usize, count: usize) -> Table {
+/// `count` Gaussians, itself and the nearest of its neighbours that have a descriptor. Rows of `knn` are nearest first,
+/// filled up with the Gaussian itself; fewer are averaged where it has fewer.
+fn smoothed(table: Table, knn: &Array2<u32>, count: usize) -> Table {
     let (width, most) = (table.slots * table.dim, count.saturating_sub(1));
     if most == 0 || width == 0 {
         return table;
@@ -266,7 +267,7 @@ fn smoothed(table: Table, knn: &[u32], k: usize, count: usize) -> Table {
             if !is_some(of(i)) {
                 continue;
             }
-            let near = knn[i * k..][..k].iter().map(|&g| g as usize).filter(|&g| g != i);
+            let near = knn.row(i).into_iter().map(|&g| g as usize).filter(|&g| g != i);
             let near = near.map(of).filter(|d| is_some(d)).take(most);
             let all: Vec<&[f32]> = std::iter::once(of(i)).chain(near).collect();
             for (c, out) in out.iter_mut().enumerate() {
@@ -281,19 +282,15 @@ fn smoothed(table: Table, knn: &[u32], k: usize, count: usize) -> Table {
 
 /// Descriptors with those of neighbours where there was none: of the nearest that has one, and so on from neighbour to
 /// neighbour. `knn` is as in [`smoothed`].
-fn filled(mut table: Table, knn: &[u32], k: usize) -> Table {
+fn filled(mut table: Table, knn: &Array2<u32>) -> Table {
     let (width, dim) = (table.slots * table.dim, table.dim);
     loop {
         let old = &table.values;
         let from = |at: usize| {
             let (i, slot) = (at / table.slots, at % table.slots);
             let of = |g: usize| g * width + slot * dim;
-            let near = knn[i * k..][..k].iter().map(|&g| of(g as usize));
-            if is_some(&old[of(i)..][..dim]) {
-                None
-            } else {
-                near.into_iter().find(|&from| is_some(&old[from..][..dim]))
-            }
+            let mut near = knn.row(i).into_iter().map(|&g| of(g as usize));
+            if is_some(&old[of(i)..][..dim]) { None } else { near.find(|&from| is_some(&old[from..][..dim])) }
         };
         let copies: Vec<(usize, usize)> = (0..old.len() / dim.max(1))
             .into_par_iter()
@@ -309,6 +306,7 @@ fn filled(mut table: Table, knn: &[u32], k: usize) -> Table {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use ndarray::{arr2, arr3};
 
     #[test]
     fn levels_have_one_slot_each() {
@@ -329,20 +327,20 @@ mod tests {
         // Four Gaussians in a plane of features; the last has no descriptor.
         let values = vec![1.0, 0.0, 0.0, 1.0, 0.0, 1.0, 0.0, 0.0];
         let table = Table { rows: Vec::new(), slots: 1, dim: 2, values };
-        let knn = [1, 2, 0, 2, 1, 3, 1, 2];
-        let made = smoothed(table.clone(), &knn, 2, 3).values;
+        let knn = arr2(&[[1, 2], [0, 2], [1, 3], [1, 2]]);
+        let made = smoothed(table.clone(), &knn, 3).values;
         // Of Gaussian 0: 0.5 (1, 0) + 0.5 (1/3, 2/3) = (2/3, 1/3), of length sqrt(5)/3.
         let (a, b) = (2.0 / 5f32.sqrt(), 1.0 / 5f32.sqrt());
         assert!((made[0] - a).abs() < 1e-6 && (made[1] - b).abs() < 1e-6, "{made:?}");
         // Gaussian 2 has neighbours 1 and 3, and 3 has nothing to say.
         assert_eq!(made[4..], [0.0, 1.0, 0.0, 0.0]);
-        assert_eq!(smoothed(table.clone(), &knn, 2, 1), table, "a Gaussian alone is not smoothed");
+        assert_eq!(smoothed(table.clone(), &knn, 1), table, "a Gaussian alone is not smoothed");
     }
 
     #[test]
     fn a_centre_takes_the_masks_of_its_pixel() {
         // Two pixels at four levels; -1 is no mask.
-        let maps = MaskMaps { width: 2, height: 1, ids: vec![-1, -1, 0, 1, -1, -1, 2, -1] };
+        let maps = MaskMaps { ids: arr3(&[[[-1, -1]], [[0, 1]], [[-1, -1]], [[2, -1]]]) };
         let mut shares = vec![Vec::new(); 2];
         let seen = |gaussian, pixel| Centre { gaussian, pixel, weight: 0.5 };
         give_centres(&mut shares, 7, &[seen(0, 1), seen(1, 0)], &maps, &[Level::Large, Level::Small]);
@@ -355,10 +353,10 @@ mod tests {
         // Slots of one number each. Gaussian 1 sees 0, and 2 sees only 1.
         let values = vec![5.0, 0.0, 0.0, 7.0, 0.0, 0.0];
         let table = Table { rows: Vec::new(), slots: 2, dim: 1, values };
-        let made = filled(table, &[1, 2, 2, 0, 1, 2], 2).values;
+        let made = filled(table, &arr2(&[[1, 2], [2, 0], [1, 2]])).values;
         assert_eq!(made, [5.0, 7.0, 5.0, 7.0, 5.0, 7.0]);
         let none = Table { rows: Vec::new(), slots: 1, dim: 1, values: vec![0.0; 2] };
-        assert_eq!(filled(none.clone(), &[1, 0], 1), none);
+        assert_eq!(filled(none.clone(), &arr2(&[[1], [0]])), none);
     }
 
     #[test]
@@ -373,7 +371,7 @@ mod tests {
     #[test]
     fn masks_of_a_tile_have_its_pixels() {
         // A tile of 2 x 1 pixels at column 1 of an image of 3 x 1; ids by level, -1 for none.
-        let maps = MaskMaps { width: 3, height: 1, ids: vec![-1, -1, -1, 0, 1, 1, -1, -1, -1, 2, 3, -1] };
+        let maps = MaskMaps { ids: arr3(&[[[-1, -1, -1]], [[0, 1, 1]], [[-1, -1, -1]], [[2, 3, -1]]]) };
         let none = [0.0; 0];
         let alpha = [0.0; PIXELS];
         let t = TileWeights {

@@ -11,7 +11,8 @@ use crate::render::Frame;
 use crate::scene::Scene;
 use crate::truth::named::Named;
 use crate::truth::scannet;
-use artifacts::{Level, MaskFeatures, MaskMaps};
+use artifacts::{Level, MaskFeatures, MaskMaps, flat};
+use ndarray::Array2;
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
 use serde::Serialize;
@@ -120,7 +121,7 @@ impl Language {
         let count = maps.id_count();
         let mut shares: Vec<BTreeMap<u32, f64>> = vec![BTreeMap::new(); count];
         for level in Level::ALL {
-            let map = maps.level(level);
+            let map = flat(maps.level(level));
             let mut boxes: BTreeMap<i32, [usize; 4]> = BTreeMap::new();
             for (at, &id) in map.iter().enumerate().filter(|(_, id)| **id >= 0) {
                 let (x, y) = (at % frame.width, at / frame.width);
@@ -150,7 +151,7 @@ impl Language {
             }
             values.extend(v.into_iter().map(|x| x as f32));
         }
-        MaskFeatures { count, dim: DIM, values }
+        MaskFeatures { values: Array2::from_shape_vec((count, DIM), values).expect("DIM of each") }
     }
 
     /// What a crop with so many (weighted) pixels of each part means. A thing of which it shows all that the view sees is
@@ -196,7 +197,7 @@ mod tests {
         let (scene, frame) = example();
         let speech = Speech { leaking, noise };
         let f = Language::new(scene, &[], &[]).encode(frame, maps, &speech, &mut ChaCha8Rng::seed_from_u64(3));
-        (0..f.count).map(|i| f.row(i).unwrap().iter().map(|&x| f64::from(x)).collect()).collect()
+        f.values.rows().into_iter().map(|row| row.iter().map(|&x| f64::from(x)).collect()).collect()
     }
 
     #[test]

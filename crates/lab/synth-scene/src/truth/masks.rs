@@ -17,6 +17,7 @@ use crate::scene::Scene;
 use crate::truth::regions::{Pairs, Regions, neighbours};
 use artifacts::{LEVELS, Level, MaskMaps, MaskTruth};
 use glam::DVec2;
+use ndarray::Array3;
 use rand::Rng;
 use rand_chacha::ChaCha8Rng;
 use serde::Serialize;
@@ -74,8 +75,7 @@ pub(crate) fn segment(
     patches: &mut ChaCha8Rng,
     pairs: &Pairs,
 ) -> (MaskMaps, Vec<MaskTruth>) {
-    let mut maps = MaskMaps { width: frame.width, height: frame.height, ids: Vec::new() };
-    let mut truth = Vec::new();
+    let (mut ids, mut truth) = (Vec::new(), Vec::new());
     let mut visible = vec![0usize; scene.parts.len()];
     for &p in frame.part.iter().filter(|&&p| p >= 0) {
         visible[p as usize] += 1;
@@ -113,11 +113,11 @@ pub(crate) fn segment(
                 }
             }
         }
-        let owned = compact(&painted, kept.len(), truth.len() as i32, &mut maps.ids);
+        let owned = compact(&painted, kept.len(), truth.len() as i32, &mut ids);
         truth.extend(kept.into_iter().zip(owned).filter(|(_, owned)| *owned).map(|(t, _)| t));
     }
-    debug_assert_eq!(maps.ids.len(), LEVELS * frame.width * frame.height);
-    (maps, truth)
+    let ids = Array3::from_shape_vec((LEVELS, frame.height, frame.width), ids).expect("an id of each pixel");
+    (MaskMaps { ids }, truth)
 }
 
 /// The masks of a level as sets of parts. Only visible parts count.
@@ -323,6 +323,7 @@ fn compact(painted: &[i32], masks: usize, first: i32, ids: &mut Vec<i32>) -> Vec
 mod tests {
     use super::*;
     use crate::testing::example;
+    use artifacts::flat;
     use proptest::prelude::*;
     use rand::SeedableRng;
 
@@ -341,7 +342,7 @@ mod tests {
     fn check_ids(maps: &MaskMaps, truth: &[MaskTruth]) {
         assert_eq!(maps.id_count(), truth.len());
         for level in Level::ALL {
-            let map = maps.level(level);
+            let map = flat(maps.level(level));
             for (id, t) in truth.iter().enumerate() {
                 assert_eq!(map.contains(&(id as i32)), t.level == level as u32, "{id} {t:?}");
             }
@@ -356,7 +357,7 @@ mod tests {
         check_ids(&maps, &truth);
         for (at, &thing) in frame.thing.iter().enumerate() {
             for level in [Level::Default, Level::Large] {
-                let id = maps.level(level)[at];
+                let id = flat(maps.level(level))[at];
                 if id >= 0 {
                     assert_eq!(truth[id as usize].instances, [thing as u32]);
                     assert_eq!(truth[id as usize].caption, scene.things[thing as usize].name);
@@ -364,7 +365,7 @@ mod tests {
                     assert!(frame.thing.iter().filter(|&&t| t == thing).count() < SMALLEST);
                 }
             }
-            let id = maps.level(Level::Small)[at];
+            let id = flat(maps.level(Level::Small))[at];
             if id >= 0 {
                 let t = &truth[id as usize];
                 assert!(t.kind == "whole" || t.part == Some(frame.part[at] as u32));
@@ -386,7 +387,7 @@ mod tests {
         for level in Level::ALL {
             let mut id_of = BTreeMap::new();
             for (at, &part) in frame.part.iter().enumerate() {
-                let id = maps.level(level)[at];
+                let id = flat(maps.level(level))[at];
                 assert_eq!(*id_of.entry(part).or_insert(id), id);
             }
         }
@@ -432,12 +433,12 @@ mod tests {
             let patches = truth.iter().filter(|t| t.kind == "spurious").count();
             let share = patches as f64 / all.len() as f64;
             assert!((share - p).abs() < 0.15, "{share} of {p}");
-            for (at, &id) in maps.ids.iter().enumerate() {
+            for (&id, &before) in maps.ids.iter().zip(&exact.ids) {
                 let shown = &truth[id.max(0) as usize];
                 if id >= 0 && shown.kind != "spurious" {
-                    assert_eq!(shown, &all[exact.ids[at] as usize], "what is not covered stays");
+                    assert_eq!(shown, &all[before as usize], "what is not covered stays");
                 } else if id < 0 {
-                    assert_eq!(exact.ids[at], -1);
+                    assert_eq!(before, -1);
                 }
             }
             let patch = truth.iter().find(|t| t.kind == "spurious").unwrap();
@@ -452,10 +453,8 @@ mod tests {
         let ((exact, all), (maps, truth)) = (with(0.0), with(1.0));
         check_ids(&maps, &truth);
         assert!(truth.len() > all.len());
-        let small = |m: &MaskMaps| m.level(Level::Small).to_vec();
-        let (whole, torn) = (small(&exact), small(&maps));
         let mut from = BTreeMap::new();
-        for (&old, &new) in whole.iter().zip(&torn) {
+        for (&old, &new) in exact.level(Level::Small).iter().zip(maps.level(Level::Small)) {
             assert_eq!(old < 0, new < 0);
             assert_eq!(*from.entry(new).or_insert(old), old, "a piece is of one mask");
         }

@@ -5,7 +5,9 @@ use super::metrics::Metrics;
 use super::runs::{self, Run, grouped};
 use crate::query::show::QueryResults;
 use crate::score::{QueryScore, ThingScore};
-use artifacts::{Health, Level, MaskFolder, NOISE_COLOR, SharedMasks, hash_folder, instance_color, maps_path, role};
+use artifacts::{
+    Health, Level, MaskFolder, NOISE_COLOR, SharedMasks, flat, hash_folder, instance_color, maps_path, role,
+};
 use gs_io::{Error, IoContext, Result};
 use gs_scene::dataset::{Dataset, Split, View};
 use query::{Verdict, read_features};
@@ -94,8 +96,8 @@ pub(super) fn id_maps(m: &Material, page: &mut Page, metrics: &mut Metrics) -> R
         let (w, h) = (s.photo.width, s.photo.height);
         // Ids of the large level begin after those of the others; only their differences matter for colours.
         let color = |i: usize| {
-            let (x, y) = (i % w * maps.width / w, i / w * maps.height / h);
-            u32::try_from(level[y * maps.width + x]).map_or(NOISE_COLOR, instance_color)
+            let (x, y) = (i % w * maps.width() / w, i / w * maps.height() / h);
+            u32::try_from(level[[y, x]]).map_or(NOISE_COLOR, instance_color)
         };
         let overlay: Vec<[f32; 3]> = (0..w * h).map(color).collect();
         let caption = format!("{}: {} masks", s.view.stem(), distinct.len());
@@ -121,19 +123,19 @@ pub(super) fn features(m: &Material, page: &mut Page, metrics: &mut Metrics) -> 
         return Ok(());
     }
     let features = read_features(&path, &m.inputs[role::GEOMETRY], m.geometry.gaussians.len())?;
-    if features.dim == 0 || features.kept.is_empty() {
+    if features.dim() == 0 || features.kept.is_empty() {
         metrics.skipped.push("features: no Gaussian has one".into());
         return Ok(());
     }
     let mut colors = vec![None; m.geometry.gaussians.len()];
-    for (&i, c) in features.kept.iter().zip(feature_colors(&features.values, features.dim)) {
+    for (&i, c) in features.kept.iter().zip(feature_colors(flat(features.values.view()), features.dim())) {
         colors[i as usize] = Some(c);
     }
     page.section("features", "Features");
     page.paragraph(&format!(
         "The feature of every Gaussian, of dimension {}, as a colour: the three leading principal components are red, green \
          and blue. Gaussians of one colour are one thing to the clustering.",
-        features.dim
+        features.dim()
     ));
     let colored = |s: &Shown| figure(&render_colors(m, &colors, s.view), 3, s.view.stem().to_string());
     page.figures(3, &m.shown.iter().map(colored).collect::<Result<Vec<_>>>()?);
@@ -214,7 +216,7 @@ pub(super) fn queries(m: &Material, page: &mut Page, metrics: &mut Metrics) -> R
     let current = m.found.is_none() || is_of(&path, &m.inputs);
     let results = if current { optional_json::<QueryResults>(&path)? } else { None };
     let Some(results) = results.filter(|r| !r.queries.is_empty()) else {
-        let without_language = m.found.as_ref().is_some_and(|(instances, _)| instances.dim == 0);
+        let without_language = m.found.as_ref().is_some_and(|(instances, _)| instances.dim() == 0);
         metrics.skipped.push(if without_language {
             "text queries: the instances have no language features, because the masks were not encoded with a CLIP \
              model (mask-embed embed --clip)"

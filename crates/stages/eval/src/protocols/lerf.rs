@@ -145,7 +145,7 @@ fn ask(
     stage: &Stage,
 ) -> Result<AskedScene> {
     let scene = inputs.read(&dataset, stage)?;
-    let source = TextSource::open_for(&scene.artifact, scene.instances.dim, &o.texts)?;
+    let source = TextSource::open_for(&scene.artifact, scene.instances.dim(), &o.texts)?;
     features.extend(sources(&scene, Some(&source))?);
     let categories: BTreeSet<&String> = frames.iter().flat_map(|f| f.categories.keys()).collect();
     let texts: Vec<String> = match benchmark {

@@ -58,7 +58,7 @@ impl Made {
             let own = manifest(&folder.join("features.json"))
                 .is_some_and(|m| m.inputs.get(role::MASKS) == provenance.inputs.get(role::MASKS));
             let features = if own { "CLIP" } else { "given" };
-            made.features = Some(if scene.instances.dim == 0 { "none" } else { features }.into());
+            made.features = Some(if scene.instances.dim() == 0 { "none" } else { features }.into());
         }
         made
     }

@@ -240,8 +240,11 @@ fn of_instances(
     let scene = inputs.read(&load(folder, &LoadOptions::default(), stage)?, stage)?;
     let mut notes = Vec::new();
     let why = without_classes(&scene, o);
-    let source =
-        if why.is_none() { Some(TextSource::open_for(&scene.artifact, scene.instances.dim, &o.texts)?) } else { None };
+    let source = if why.is_none() {
+        Some(TextSource::open_for(&scene.artifact, scene.instances.dim(), &o.texts)?)
+    } else {
+        None
+    };
     notes.extend(why.map(|why| format!("no class scores: {why}")));
     let features = sources(&scene, source.as_ref())?;
     let (vertices, labels) = gs_scene::ply::read_labels(&files.labels, "label")?;
@@ -281,7 +284,7 @@ fn without_classes(scene: &LabelledScene, o: &ScannetOptions) -> Option<&'static
     }
     let undescribed = "the instances have no language features, because the masks were not encoded with a CLIP model \
                        (mask-embed embed --clip)";
-    (scene.instances.dim == 0).then_some(undescribed)
+    (scene.instances.dim() == 0).then_some(undescribed)
 }
 
 /// The rule in words; that of classes where they are scored.

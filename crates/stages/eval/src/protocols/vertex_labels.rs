@@ -27,11 +27,11 @@ const LARGEST: f64 = 16_777_216.0;
 
 fn of_npy(bytes: &[u8]) -> Result<Vec<u32>> {
     let array = npy::parse(bytes)?;
-    if !matches!(array.shape[..], [_] | [_, 1]) {
-        let e = Error::new("not a list of labels").field("shape").found(format!("{:?}", array.shape));
+    if !matches!(array.shape(), [_] | [_, 1]) {
+        let e = Error::new("not a list of labels").field("shape").found(format!("{:?}", array.shape()));
         return Err(e.expected("[vertices]"));
     }
-    array.data.iter().enumerate().map(|(at, &v)| label(f64::from(v), at, &v)).collect()
+    array.iter().enumerate().map(|(at, &v)| label(f64::from(v), at, &v)).collect()
 }
 
 fn of_text(bytes: &[u8]) -> Result<Vec<u32>> {
@@ -53,12 +53,13 @@ fn label(value: f64, vertex: usize, said: &dyn std::fmt::Display) -> Result<u32>
 #[cfg(test)]
 mod tests {
     use super::*;
+    use ndarray::{arr1, arr2};
 
     #[test]
     fn labels_are_read_from_npy_and_text() {
         let dir = tempfile::tempdir().unwrap();
         let (array, text) = (dir.path().join("l.npy"), dir.path().join("l.txt"));
-        npy::write_i32(&array, &[3], &[5, -1, 40]).unwrap();
+        npy::write_i32(&array, &arr1(&[5, -1, 40])).unwrap();
         std::fs::write(&text, "5\n-1\n40\n").unwrap();
         assert_eq!(read(&array, 3).unwrap(), [5, 0, 40]);
         assert_eq!(read(&text, 3).unwrap(), [5, 0, 40]);
@@ -66,11 +67,11 @@ mod tests {
             let e = read(path, 3).unwrap_err().to_string();
             assert!(parts.iter().all(|p| e.contains(p)), "{parts:?}: {e}");
         };
-        npy::write_f32(&array, &[3, 1], &[1.0, 2.5, 3.0]).unwrap();
+        npy::write_f32(&array, &arr2(&[[1.0], [2.5], [3.0]])).unwrap();
         bad(&array, &["l.npy: vertex 1: not a label; found 2.5"]);
-        npy::write_i32(&array, &[1, 3], &[1, 2, 3]).unwrap();
+        npy::write_i32(&array, &arr2(&[[1, 2, 3]])).unwrap();
         bad(&array, &["shape: not a list of labels; found [1, 3], expected [vertices]"]);
-        npy::write_i32(&array, &[2], &[1, 2]).unwrap();
+        npy::write_i32(&array, &arr1(&[1, 2])).unwrap();
         bad(&array, &["not a label per vertex; found 2, expected 3"]);
         for (said, part) in
             [("1 2 wall", "vertex 2: not a label; found wall"), ("1 2 inf", "found inf"), ("", "found 0")]

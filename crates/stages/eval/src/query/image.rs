@@ -10,11 +10,11 @@ pub(super) fn features(pictures: &[PathBuf], clip: &Path, scene: &LabelledScene)
     // --clip may name text.onnx itself; the image encoder lies beside it.
     let folder = if clip.is_dir() { clip } else { clip.parent().unwrap_or(Path::new("")) };
     let encoder = ClipImage::open(folder, &EngineOptions::default())?;
-    if encoder.dimension() != scene.instances.dim {
+    if encoder.dimension() != scene.instances.dim() {
         return Err(Error::new("the image features are of another model than the masks'")
             .file(scene.path())
             .field("descriptor")
-            .found(format!("dimension {}", scene.instances.dim))
+            .found(format!("dimension {}", scene.instances.dim()))
             .expected(encoder.dimension()));
     }
     let one = |path: &PathBuf| {

@@ -78,7 +78,7 @@ pub(super) fn write(
     let sh = labels.iter().flat_map(|l| color(l).map(|c| (c - 0.5) / SH_C0)).collect();
     let coloured = Gaussians { sh, sh_degree: 0, ..scene.gaussians().clone() };
     let (npy, ply) = ("labels.npy", "segmentation.ply");
-    gs_io::npy::write_i32(out.join(npy), &[labels.len()], &labels)?;
+    gs_io::npy::write_i32(out.join(npy), &ndarray::aview1(&labels))?;
     let comments: Vec<String> = o.text.iter().enumerate().map(|(t, text)| format!("cags label {t}: {text}")).collect();
     gs_scene::ply::write_gaussians(out.join(ply), &coloured, &scene.geometry.comments(comments))?;
     for view in views_to_show(dataset, &o.views.views, |_| true)? {

@@ -79,7 +79,7 @@ pub fn write(
     }
     let results = QueryResults {
         text_source: asker.source.as_ref().map_or("none".into(), TextSource::describe),
-        dimension: scene.instances.dim,
+        dimension: scene.instances.dim(),
         instances: scene.instances.len(),
         queries: asked.into_iter().map(|a| a.result).collect(),
         segmentation,

@@ -9,6 +9,7 @@ use gs_io::{Provenance, hash_file};
 use gs_raster::RasterOptions;
 use gs_scene::dataset::{self, LoadOptions};
 use gs_scene::{Camera, Gaussians, Image};
+use ndarray::{Array2, Array3};
 use serde_json::{Value, json};
 use std::collections::BTreeMap;
 use std::f64::consts::TAU;
@@ -104,8 +105,7 @@ impl Fixture {
         let k = 3;
         let instances = Instances {
             label: groups().into_iter().map(label).collect(),
-            dim: descriptors[0].len(),
-            descriptor: descriptors.concat(),
+            descriptor: Array2::from_shape_vec((k, descriptors[0].len()), descriptors.concat()).unwrap(),
             support: vec![5, 4, 3],
             score: vec![0.8; k],
             count: vec![1, 1, 81],
@@ -141,25 +141,21 @@ impl Fixture {
 
     fn write_features(&self, g: &Gaussians) {
         let kept: Vec<u32> = (0..g.len() as u32).collect();
-        let values = groups().iter().flat_map(|&i| [i as f32, (i * i) as f32, 1.0]).collect();
-        Features { kept, dim: 3, values, ..Features::default() }
+        let values = groups().iter().map(|&i| [i as f32, (i * i) as f32, 1.0]).collect::<Vec<_>>().into();
+        Features { kept, values, ..Features::default() }
             .write(self.run().join("features.safetensors"), self.provenance())
             .unwrap();
     }
 
     fn write_masks(&self, i: usize, camera: &Camera) {
-        let n = (WIDTH * HEIGHT) as usize;
-        let mut ids = vec![-1; 4 * n];
-        for (k, centre) in CENTRES.iter().enumerate() {
-            let (cx, cy, r) = disc(camera, centre);
-            for p in 0..n {
-                let (x, y) = ((p % WIDTH as usize) as f64 + 0.5, (p / WIDTH as usize) as f64 + 0.5);
-                if (x - cx).hypot(y - cy) < r {
-                    (0..4).for_each(|l| ids[l * n + p] = (2 * l + k) as i32);
-                }
-            }
-        }
-        let maps = MaskMaps { width: WIDTH as usize, height: HEIGHT as usize, ids };
+        let id = |(level, y, x)| {
+            let inside = |centre| {
+                let (cx, cy, r) = disc(camera, centre);
+                (x as f64 + 0.5 - cx).hypot(y as f64 + 0.5 - cy) < r
+            };
+            CENTRES.iter().rposition(inside).map_or(-1, |k| (2 * level + k) as i32)
+        };
+        let maps = MaskMaps { ids: Array3::from_shape_fn((4, HEIGHT as usize, WIDTH as usize), id) };
         maps.write(maps_path(self.scene().join("language_features"), &stem(i))).unwrap();
     }
 

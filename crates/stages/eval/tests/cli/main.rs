@@ -3,9 +3,10 @@
 mod fixture;
 mod protocols;
 
-use artifacts::{Descriptors, Instances};
+use artifacts::{Descriptors, Instances, flat};
 use fixture::{Fixture, HEIGHT, SCORE, TABLE, VIEWS, WIDTH, failed, stem};
 use gs_io::Provenance;
+use ndarray::{Array2, Array3, arr3};
 use serde_json::{Value, json};
 use std::fs;
 use std::process::Stdio;
@@ -207,8 +208,8 @@ fn a_perfect_run_scores_high() {
 fn gaussians_with_descriptors_of_their_own_answer_texts() {
     let f = Fixture::new(2);
     // The balls' Gaussians, a little off; the floor has none.
-    let values = vec![0.8, 0.6, 0.28, 0.96];
-    let mut d = Descriptors { kept: vec![0, 1], row: vec![0, 1], slots: 1, dim: 2, values };
+    let values = arr3(&[[[0.8, 0.6]], [[0.28, 0.96]]]);
+    let mut d = Descriptors { kept: vec![0, 1], row: vec![0, 1], values };
     let path = f.path().join("descriptors.safetensors");
     d.write(&path, f.provenance()).unwrap();
     let whole = f.score("");
@@ -510,7 +511,7 @@ fn several_texts_divide_the_cloud() {
     let printed = f.good("query", &format!("{TABLE}|{at}|--threshold|0"));
     assert!(printed.contains("segmentation (81 Gaussians without a text)"), "{printed}");
     let labels = gs_io::npy::read_f32(f.path().join("out/labels.npy")).unwrap();
-    assert_eq!((labels.shape, &labels.data[..4]), (vec![83], &[1.0, 0.0, -1.0, -1.0][..]));
+    assert_eq!((labels.shape(), &flat(labels.view())[..4]), (&[83][..], &[1.0, 0.0, -1.0, -1.0][..]));
     let s = &f.json("out/query.json")["segmentation"];
     assert_eq!((&s["segments"][0]["text"], &s["segments"][0]["gaussians"]), (&"blue ball".into(), &1.into()));
     let g = gs_scene::ply::read_gaussians(f.path().join("out/segmentation.ply")).unwrap();
@@ -609,8 +610,7 @@ fn views_without_masks_leave_instances_without_words() {
     let report = format!("{REPORT}|--views|frame_00000,frame_00001,frame_00002");
     // One view has an id map without a mask, another none: the rest speaks for the instances.
     let masks = f.scene().join("language_features");
-    let (width, height) = (WIDTH as usize, HEIGHT as usize);
-    let empty = artifacts::MaskMaps { width, height, ids: vec![-1; 4 * width * height] };
+    let empty = artifacts::MaskMaps { ids: Array3::from_elem((4, HEIGHT as usize, WIDTH as usize), -1) };
     empty.write(artifacts::maps_path(&masks, &stem(0))).unwrap();
     fs::remove_file(artifacts::maps_path(&masks, &stem(1))).unwrap();
     f.change_instances(|i| i.matches.retain(|m| m.view > 1));
@@ -757,14 +757,14 @@ fn a_scene_of_a_benchmark_is_checked_before_anything_runs() {
     fs::copy(&label, scene.join("label/frame_99999.json")).unwrap();
     good(&["frame_99999.json: no photograph of this name"]);
     // Masks: of another shape, of another dtype or blended, of other photographs; features of another run or model.
-    gs_io::npy::write_f32(&map, &[4, 40, 96], &[0.0; 4 * 40 * 96]).unwrap();
+    gs_io::npy::write_f32(&map, &Array3::<f32>::zeros((4, 40, 96))).unwrap();
     bad(&[&format!("{}_s.npy", stem(0)), "another shape than the photograph; found 96x40, expected 96x72"]);
-    gs_io::npy::write_f32(&map, &[4, 72, 96], &[0.5; 4 * 72 * 96]).unwrap();
+    gs_io::npy::write_f32(&map, &Array3::from_elem((4, 72, 96), 0.5)).unwrap();
     bad(&["not a mask id; found 0.5"]);
-    gs_io::npy::write_f32(&map, &[4, 72, 96], &[1.0; 4 * 72 * 96]).unwrap();
+    gs_io::npy::write_f32(&map, &Array3::<f32>::ones((4, 72, 96))).unwrap();
     let features = |rows: usize, dim: usize| {
         let file = masks.join(format!("{}_f.npy", stem(0)));
-        gs_io::npy::write_f32(file, &[rows, dim], &vec![0.5; rows * dim]).unwrap();
+        gs_io::npy::write_f32(file, &Array2::from_elem((rows, dim), 0.5)).unwrap();
     };
     features(1, 2);
     bad(&["fewer features than masks; found 1, expected 2"]);
@@ -775,7 +775,7 @@ fn a_scene_of_a_benchmark_is_checked_before_anything_runs() {
     // All that is wrong is said at once.
     fs::write(&label, "{").unwrap();
     fs::remove_dir_all(&masks).unwrap();
-    gs_io::npy::write_f32(masks.join("other_s.npy"), &[1, 1], &[0.0]).unwrap();
+    gs_io::npy::write_f32(masks.join("other_s.npy"), &Array2::<f32>::zeros((1, 1))).unwrap();
     let said = String::from_utf8(run().stderr).unwrap();
     assert!(said.contains("not a label file") && said.contains("no id map is of a photograph"), "{said}");
     assert!(said.contains("1 such as other_s.npy"), "{said}");

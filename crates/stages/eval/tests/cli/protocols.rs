@@ -2,9 +2,10 @@
 //! OpenCV 4.8 to 4.10 (CAGS_PYTHON names one), the numbers it gave are the golden ones of `testdata/protocols.json`.
 
 use crate::fixture::{failed, provenance, read_json};
-use artifacts::{Features, Instances, OrientedBox, TruePoints, TrueScene};
+use artifacts::{Features, Instances, OrientedBox, TruePoints, TrueScene, flat};
 use gs_io::{hash_bytes, hash_file};
 use gs_scene::Gaussians;
+use ndarray::{Array2, aview1};
 use serde_json::{Map, Value, json};
 use std::path::{Path, PathBuf};
 use std::process::{Command, Output};
@@ -63,14 +64,12 @@ impl Scene {
         }
         gs_scene::ply::write_gaussians(this.geometry(), &g, &[]).unwrap();
         let k = things.len();
-        let mut descriptor = vec![0.0f32; k * DIM];
-        for i in 0..k {
-            descriptor[i * DIM + i % DIM] = 1.0;
-            descriptor[i * DIM + (i + 1) % DIM] = 0.3;
+        let mut descriptor = Array2::zeros((k, DIM));
+        for i in (0..k).filter(|&i| i != 4) {
+            descriptor[[i, i % DIM]] = 1.0;
+            descriptor[[i, (i + 1) % DIM]] = 0.3;
         }
-        descriptor[4 * DIM..5 * DIM].fill(0.0);
         let instances = Instances {
-            dim: DIM,
             descriptor,
             support: (0..k as u32).map(|i| if i == 1 { 1 } else { 3 + i }).collect(),
             score: (0..k).map(|i| 0.2 + 0.1 * ((i * 5) % 7) as f32).collect(),
@@ -148,11 +147,9 @@ impl Scene {
     fn write_features(&self) {
         let (instances, _) = Instances::read(self.instances()).unwrap();
         let (dim, n) = (instances.len(), instances.label.len());
-        let mut values = vec![0.0; n * dim];
-        for (row, &label) in values.chunks_exact_mut(dim).zip(&instances.label) {
-            row[usize::try_from(label).map_or(0, |l| l.min(dim - 2))] = 2.0;
-        }
-        let features = Features { kept: (0..n as u32).collect(), dim, values, ..Features::default() };
+        let thing = |i: usize| usize::try_from(instances.label[i]).map_or(0, |l| l.min(dim - 2));
+        let values = Array2::from_shape_fn((n, dim), |(i, c)| if c == thing(i) { 2.0 } else { 0.0 });
+        let features = Features { kept: (0..n as u32).collect(), values, ..Features::default() };
         features.write(self.features(), provenance(&self.geometry(), &self.scene())).unwrap();
     }
 
@@ -174,7 +171,7 @@ impl Scene {
     /// Content of everything that the scores depend on; of instances the values, whatever else their file holds.
     fn hash(&self) -> String {
         let (i, _) = Instances::read(self.instances()).unwrap();
-        let mut all = format!("{:?}{:?}{:?}{:?}", i.label, i.descriptor, i.support, i.score);
+        let mut all = format!("{:?}{:?}{:?}{:?}", i.label, flat(i.descriptor.view()), i.support, i.score);
         for name in ["geometry.ply", "texts.json"] {
             all += &hash_file(self.at(name)).unwrap();
         }
@@ -430,7 +427,7 @@ fn labels_of_another_program_are_scored_vertex_by_vertex() {
         c.arg("--out").arg(s.at("said")).args(rest).output().unwrap()
     };
     let score = |labels: &[i32]| {
-        gs_io::npy::write_i32(&file, &[labels.len()], labels).unwrap();
+        gs_io::npy::write_i32(&file, &aview1(labels)).unwrap();
         let o = run(&[]);
         assert!(o.status.success(), "{}", String::from_utf8_lossy(&o.stderr));
         read_json(&s.at("said/metrics.json"))
@@ -538,7 +535,7 @@ fn instances_are_scored_where_there_is_no_text() {
     };
     scored(run(false), "neither --clip nor --text-features was given");
     let (mut i, _) = Instances::read(s.instances()).unwrap();
-    (i.dim, i.descriptor) = (0, Vec::new());
+    i.descriptor = Array2::default((i.len(), 0));
     i.write(s.instances(), provenance(&s.geometry(), &s.scene())).unwrap();
     scored(run(true), "the instances have no language features");
 

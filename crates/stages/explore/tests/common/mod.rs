@@ -6,6 +6,7 @@ use glam::DVec3;
 use gs_io::{Provenance, hash_file};
 use gs_scene::dataset::{self, LoadOptions};
 use gs_scene::{Camera, Gaussians, Image};
+use ndarray::arr2;
 use serde_json::{Value, json};
 use std::collections::BTreeMap;
 use std::io::{BufRead, BufReader, Read, Write};
@@ -66,8 +67,7 @@ impl Run {
         let edge = |parent, child, instance| TreeEdge { parent, child, lambda: 1.0, size: 1, instance };
         let instances = Instances {
             label: vec![0, 1, 1, -1],
-            dim: 2,
-            descriptor: vec![1.0, 0.0, 0.0, 1.0],
+            descriptor: arr2(&[[1.0, 0.0], [0.0, 1.0]]),
             support: vec![2, 2],
             score: vec![0.9, 0.8],
             count: vec![1, 2],
@@ -91,8 +91,8 @@ impl Run {
             ..Instances::default()
         };
         instances.write(run.out().join("instances.safetensors"), provenance()).unwrap();
-        let features =
-            Features { kept: vec![0, 1, 2], dim: 2, values: vec![1.0, 0.0, 0.0, 1.0, 0.1, 0.9], ..Features::default() };
+        let values = arr2(&[[1.0, 0.0], [0.0, 1.0], [0.1, 0.9]]);
+        let features = Features { kept: vec![0, 1, 2], values, ..Features::default() };
         features.write(run.out().join("features.safetensors"), provenance()).unwrap();
         std::fs::write(run.dir.path().join("text.json"), r#"{"near ball": [1, 0], "far ball": [0, 1]}"#).unwrap();
         run

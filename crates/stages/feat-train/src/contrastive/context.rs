@@ -38,7 +38,7 @@ impl Context {
     /// Prepares the graph; `colors` and `positions` are those of the kept Gaussians. Without `propagate` an anchor's output
     /// goes to the anchor's own Gaussian alone.
     pub fn new(graph: &Graph, colors: &[[f32; 3]], positions: &[[f32; 3]], kind: Neighbours, propagate: bool) -> Self {
-        let (n, m, k) = (graph.kept.len(), graph.anchors.len(), graph.k);
+        let (n, m, k) = (graph.kept.len(), graph.anchors.len(), graph.knn.ncols());
         // Anchors of the graph in the order of the curve, and the other way round.
         let at: Vec<[f32; 3]> = graph.anchors.iter().map(|&a| positions[a as usize]).collect();
         let curve = morton_order(&at);
@@ -69,12 +69,11 @@ impl Context {
         let (mut neighbour_start, mut neighbours) = (vec![0u32], Vec::with_capacity(m * k));
         for &a in &curve {
             let a = a as usize;
-            let row = a * k..(a + 1) * k;
             // Rows are padded with the anchor itself, which is not its own neighbour.
-            let others = graph.anchor_knn[row.clone()].iter().map(|&b| b as usize).filter(|&b| b != a);
+            let others = graph.anchor_knn.row(a).into_iter().map(|&b| b as usize).filter(|&b| b != a);
             match kind {
                 Neighbours::Gaussians => neighbours
-                    .extend(graph.knn[row].iter().filter(|&&i| i != graph.anchors[a]).map(|&i| place[i as usize])),
+                    .extend(graph.knn.row(a).iter().filter(|&&i| i != graph.anchors[a]).map(|&i| place[i as usize])),
                 Neighbours::AnchorInputs => neighbours.extend(others.map(|b| place[graph.anchors[b] as usize])),
                 Neighbours::Anchors => neighbours.extend(others.map(|b| rank[b])),
             }

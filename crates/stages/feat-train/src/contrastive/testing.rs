@@ -4,6 +4,7 @@ use super::context::Context;
 use super::masks::{MaskSet, Pixels};
 use crate::options::Neighbours;
 use artifacts::Graph;
+use ndarray::Array2;
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
@@ -18,15 +19,14 @@ pub fn graph(n: usize, k: usize) -> Graph {
         all.truncate(k);
         all
     };
+    let table = |rows: Vec<u32>| Array2::from_shape_vec((rows.len() / k, k), rows).unwrap();
     let everyone: Vec<u32> = (0..n as u32).collect();
     Graph {
         kept: everyone.clone(),
-        knn: anchors.iter().flat_map(|&a| near(a as usize, &everyone, a, a as usize)).collect(),
-        anchor_knn: (0..m).flat_map(|a| near(anchors[a] as usize, &anchors, a as u32, a)).collect(),
+        knn: table(anchors.iter().flat_map(|&a| near(a as usize, &everyone, a, a as usize)).collect()),
+        anchor_knn: table((0..m).flat_map(|a| near(anchors[a] as usize, &anchors, a as u32, a)).collect()),
         nearest_anchor: (0..n).map(|i| (((i + 1) / 4) as u32).min(m as u32 - 1)).collect(),
-        gaussian_knn: (0..n).flat_map(|i| near(i, &everyone, i as u32, i)).collect(),
-        k,
-        gaussian_k: k,
+        gaussian_knn: table((0..n).flat_map(|i| near(i, &everyone, i as u32, i)).collect()),
         seen_views: vec![1; n],
         seen_weight: vec![1.0; n],
         anchors,

@@ -10,6 +10,7 @@ use crate::inputs::Inputs;
 use crate::options::{Args, Loss};
 use crate::outputs::{Made, write_curve};
 use gs_io::{Error, Result, mixed};
+use ndarray::Array2;
 use rand::SeedableRng;
 use rand::seq::SliceRandom;
 use rand_chacha::ChaCha8Rng;
@@ -101,7 +102,10 @@ pub fn train(args: &Args, inputs: &Inputs, context: &Context, mut sets: MaskSets
     draw(&state.curve)?;
     let summary = json!({ "views": sets.len(), "last": last, "resumed_at": resumed_at, "iterations": state.iteration,
         "gaussians": inputs.graph.kept.len(), "network_bytes": solver.network_bytes() });
-    Ok(Made { dim, values: solver.final_features(&state.model), parts: (0, Vec::new()), summary })
+    let shape = (inputs.graph.kept.len(), dim);
+    let values =
+        Array2::from_shape_vec(shape, solver.final_features(&state.model)).expect("a feature of each Gaussian");
+    Ok(Made { values, parts: Array2::default((shape.0, 0)), summary })
 }
 
 /// The sets that are held out and those that are learnt from, of `count`.

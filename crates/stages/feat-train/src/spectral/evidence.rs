@@ -7,6 +7,7 @@
 use super::sparse::{Block, Blocks, Matrix};
 use artifacts::{Entries, Footprints, Graph, Level};
 use gs_io::Result;
+use ndarray::Array2;
 use rayon::prelude::*;
 use std::collections::VecDeque;
 use std::path::Path;
@@ -23,14 +24,13 @@ const CHUNK: usize = 4096;
 pub fn collect(footprints: &Footprints, graph: &Graph, levels: &[Level], output: &Path) -> Result<Matrix> {
     let used = |&r: &u32| footprints.rows[r as usize].is_of(levels) && footprints.entries_of(r as usize) > 0;
     let masks: Vec<u32> = (0..footprints.rows.len() as u32).filter(used).collect();
-    let neighbours = Neighbours { k: graph.gaussian_k, items: &graph.gaussian_knn };
-    matrix(footprints, masks, &neighbours, MOST, output)
+    matrix(footprints, masks, &graph.gaussian_knn, MOST, output)
 }
 
 /// The block of [`collect`]'s matrix that each Gaussian will be in, and the number of blocks.
 pub fn blocks(graph: &Graph) -> (Vec<u32>, usize) {
     let n = graph.kept.len();
-    let parts = patches(n, &Neighbours { k: graph.gaussian_k, items: &graph.gaussian_knn });
+    let parts = patches(n, &graph.gaussian_knn);
     let mut block = vec![0u32; n];
     for (b, part) in parts.iter().enumerate() {
         part.iter().for_each(|&i| block[i as usize] = b as u32);
@@ -71,16 +71,9 @@ pub fn bytes(entries: u64) -> u64 {
     22 * entries.min(MOST as u64)
 }
 
-/// Spatial neighbours of every Gaussian, padded with itself.
-pub(super) struct Neighbours<'a> {
-    pub(super) k: usize,
-    pub(super) items: &'a [u32],
-}
-
-impl Neighbours<'_> {
-    fn of(&self, i: usize) -> impl Iterator<Item = usize> + '_ {
-        self.items[i * self.k..(i + 1) * self.k].iter().map(|&j| j as usize).filter(move |&j| j != i)
-    }
+/// The spatial neighbours of a Gaussian; rows are padded with itself.
+fn neighbours(knn: &Array2<u32>, i: usize) -> impl Iterator<Item = usize> + '_ {
+    knn.row(i).into_iter().map(|&j| j as usize).filter(move |&j| j != i)
 }
 
 /// Evidence of some Gaussians, a row each; masks ascend within a row.
@@ -163,7 +156,7 @@ impl Part<'_> {
 
 /// Parts the Gaussians into patches of [`BLOCK`], each grown over the neighbours of its first, which lies at the rim of
 /// those before.
-fn patches(n: usize, neighbours: &Neighbours<'_>) -> Vec<Vec<u32>> {
+fn patches(n: usize, knn: &Array2<u32>) -> Vec<Vec<u32>> {
     let mut out = Vec::with_capacity(n.div_ceil(BLOCK));
     let mut taken = vec![false; n];
     let (mut rim, mut lowest) = (VecDeque::<u32>::new(), 0);
@@ -187,7 +180,7 @@ fn patches(n: usize, neighbours: &Neighbours<'_>) -> Vec<Vec<u32>> {
                 taken[seed] = true;
                 patch.push(seed as u32);
             } else {
-                for j in neighbours.of(patch[at] as usize) {
+                for j in neighbours(knn, patch[at] as usize) {
                     if patch.len() < size && !taken[j] {
                         taken[j] = true;
                         patch.push(j as u32);
@@ -197,7 +190,7 @@ fn patches(n: usize, neighbours: &Neighbours<'_>) -> Vec<Vec<u32>> {
             }
         }
         for &i in &patch[at.saturating_sub(1)..] {
-            rim.extend(neighbours.of(i as usize).filter(|&j| !taken[j]).map(|j| j as u32));
+            rim.extend(neighbours(knn, i as usize).filter(|&j| !taken[j]).map(|j| j as u32));
         }
         left -= size;
         out.push(patch);
@@ -213,12 +206,12 @@ type Sums = (Block, Vec<f64>, Vec<f64>);
 fn smoothed(
     patch: &[u32],
     rows: &Rows,
-    neighbours: &Neighbours<'_>,
+    knn: &Array2<u32>,
     place: &[u32],
     (copy, local): &mut (Vec<u32>, Vec<u32>),
 ) -> Sums {
     // Whose evidence counts: the patch and what surrounds it.
-    let around = with_neighbours(patch, neighbours);
+    let around = with_neighbours(patch, knn);
     let mut masks: Vec<u32> = Vec::new();
     for &i in &around {
         for &k in rows.row(place[i as usize]).0 {
@@ -255,7 +248,7 @@ fn smoothed(
             count += 1;
         };
         add(i as usize);
-        neighbours.of(i as usize).for_each(add);
+        neighbours(knn, i as usize).for_each(add);
         let share = 1.0 / count as f32;
         let mut total = 0.0;
         for (k, s) in sum.iter_mut().enumerate().filter(|(_, s)| **s > 0.0) {
@@ -276,9 +269,9 @@ fn smoothed(
 }
 
 /// Gaussians and their neighbours, ascending.
-fn with_neighbours(gaussians: &[u32], neighbours: &Neighbours<'_>) -> Vec<u32> {
+fn with_neighbours(gaussians: &[u32], knn: &Array2<u32>) -> Vec<u32> {
     let mut all = gaussians.to_vec();
-    all.extend(gaussians.iter().flat_map(|&i| neighbours.of(i as usize)).map(|j| j as u32));
+    all.extend(gaussians.iter().flat_map(|&i| neighbours(knn, i as usize)).map(|j| j as u32));
     all.sort_unstable();
     all.dedup();
     all
@@ -288,7 +281,7 @@ fn with_neighbours(gaussians: &[u32], neighbours: &Neighbours<'_>) -> Vec<u32> {
 pub(super) fn matrix(
     footprints: &Footprints,
     masks: Vec<u32>,
-    neighbours: &Neighbours<'_>,
+    knn: &Array2<u32>,
     most: usize,
     output: &Path,
 ) -> Result<Matrix> {
@@ -301,7 +294,7 @@ pub(super) fn matrix(
     let inverse_root = |v: f64| if v > 0.0 { 1.0 / v.sqrt() } else { 0.0 };
     let (mut row_scale, mut column_sums) = (vec![0.0f32; n], vec![0.0f64; masks.len()]);
     let mut place = vec![u32::MAX; n];
-    let patches = patches(n, neighbours);
+    let patches = patches(n, knn);
     let mut left = &patches[..];
     while !left.is_empty() {
         let mut entries = 0;
@@ -311,14 +304,14 @@ pub(super) fn matrix(
         };
         let (group, later) = left.split_at(left.iter().take_while(fits).count().max(1));
         left = later;
-        let around = with_neighbours(&group.concat(), neighbours);
+        let around = with_neighbours(&group.concat(), knn);
         around.iter().zip(0..).for_each(|(&i, at)| place[i as usize] = at);
         let rows = Rows::read(footprints, &masks, &counts, around, &place)?;
         let room = || (vec![0; rows.gaussians.len()], vec![u32::MAX; masks.len()]);
         let made: Vec<Sums> = group
             .par_iter()
             .with_min_len(4)
-            .map_init(room, |room, patch| smoothed(patch, &rows, neighbours, &place, room))
+            .map_init(room, |room, patch| smoothed(patch, &rows, knn, &place, room))
             .collect();
         rows.gaussians.iter().for_each(|&i| place[i as usize] = u32::MAX);
         drop(rows);
@@ -347,7 +340,7 @@ mod tests {
             let mut plain = vec![0.0f64; n];
             gaussians.iter().zip(weights).for_each(|(&i, &w)| plain[i as usize] = f64::from(w));
             for i in 0..n {
-                let others = near[i * 3..(i + 1) * 3].iter().filter(|&&j| j as usize != i);
+                let others = near.row(i).into_iter().filter(|&&j| j as usize != i);
                 let around: Vec<f64> = others.map(|&j| plain[j as usize]).collect();
                 spread[k][i] = (plain[i] + around.iter().sum::<f64>()) / (1 + around.len()) as f64;
             }
@@ -375,9 +368,7 @@ mod tests {
     #[test]
     fn patches_hold_everyone_once_and_neighbours_together() {
         let n = 3 * BLOCK + 77;
-        let items = line(n);
-        let neighbours = Neighbours { k: 3, items: &items };
-        let parts = patches(n, &neighbours);
+        let parts = patches(n, &line(n));
         assert_eq!(parts.len(), 4);
         let mut all: Vec<u32> = parts.concat();
         all.sort_unstable();

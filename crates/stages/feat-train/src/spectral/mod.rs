@@ -17,6 +17,7 @@ use crate::options::Args;
 use crate::outputs::{Made, write_curve};
 use artifacts::Level;
 use gs_io::{Error, Result};
+use ndarray::Array2;
 use report::curve::Panel;
 use serde_json::json;
 use stage::Stage;
@@ -74,7 +75,11 @@ pub fn features(args: &Args, inputs: &Inputs, stage: &Stage) -> Result<Made> {
     drop(matrix);
     let parts =
         parts(&args.out, &levels, inputs, &SpectralOptions { cutoff: PARTS_CUTOFF * cutoff, ..options }, stage)?;
-    Ok(Made { dim, values: features, parts, summary })
+    Ok(Made { values: table(dim, features), parts, summary })
+}
+
+fn table(dim: usize, features: Vec<f32>) -> Array2<f32> {
+    Array2::from_shape_vec((features.len() / dim, dim), features).expect("whole features")
 }
 
 /// Whether there are features of parts: not where all features are of level small already, or none is.
@@ -82,21 +87,22 @@ pub(crate) fn has_parts(levels: &[Level]) -> bool {
     levels.contains(&Level::Small) && levels.iter().any(|&l| l != Level::Small)
 }
 
-/// Features of parts and their dimension: the masks of level small alone, with a lower cutoff. None where that has no masks.
+/// Features of parts: the masks of level small alone, with a lower cutoff. Without columns where that has no masks.
 fn parts(
     output: &Path,
     levels: &[Level],
     inputs: &Inputs,
     options: &SpectralOptions,
     stage: &Stage,
-) -> Result<(usize, Vec<f32>)> {
+) -> Result<Array2<f32>> {
+    let none = Array2::default((inputs.graph.kept.len(), 0));
     if !has_parts(levels) {
-        return Ok((0, Vec::new()));
+        return Ok(none);
     }
     let matrix = evidence::collect(&inputs.footprints, &inputs.graph, &[Level::Small], output)?;
     if matrix.masks.is_empty() {
-        return Ok((0, Vec::new()));
+        return Ok(none);
     }
     let Spectral { dim, features, .. } = spectral(&matrix, options, stage)?;
-    Ok((dim, features))
+    Ok(table(dim, features))
 }

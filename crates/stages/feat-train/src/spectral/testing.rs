@@ -1,9 +1,10 @@
 //! Random evidence.
 
-use super::evidence::{MOST, Neighbours, matrix};
+use super::evidence::{MOST, matrix};
 use super::sparse::Matrix;
 use artifacts::{Footprints, FootprintsBuilder, Row};
 use gs_io::Provenance;
+use ndarray::Array2;
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
@@ -20,9 +21,9 @@ pub fn columns(n: usize, masks: usize) -> Vec<(Vec<u32>, Vec<f32>)> {
 }
 
 /// Every Gaussian's neighbours on a line: before, behind, and two behind.
-pub fn line(n: usize) -> Vec<u32> {
+pub fn line(n: usize) -> Array2<u32> {
     let inside = |i: i64, j: i64| if (0..n as i64).contains(&j) { j as u32 } else { i as u32 };
-    (0..n as i64).flat_map(|i| [i - 1, i + 1, i + 2].map(|j| inside(i, j))).collect()
+    (0..n as i64).map(|i| [i - 1, i + 1, i + 2].map(|j| inside(i, j))).collect::<Vec<_>>().into()
 }
 
 /// A random matrix of `n` Gaussians and `masks` masks.
@@ -40,9 +41,7 @@ pub fn random_in_groups(n: usize, masks: usize, most: usize) -> Matrix {
         builder.push(Row::default(), gaussians.into_iter().zip(weights));
     }
     builder.write(&file, Provenance::default()).unwrap();
-    let items = line(n);
-    let neighbours = Neighbours { k: 3, items: &items };
-    matrix(&Footprints::read(&file).unwrap(), (0..masks as u32).collect(), &neighbours, most, &file).unwrap()
+    matrix(&Footprints::read(&file).unwrap(), (0..masks as u32).collect(), &line(n), most, &file).unwrap()
 }
 
 /// The matrix itself, by columns (masks).
