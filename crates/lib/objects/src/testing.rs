@@ -2,6 +2,7 @@
 
 use artifacts::{Extents, Instances, Match, TreeEdge};
 use gs_scene::Gaussians;
+use ndarray::Array2;
 
 /// Gaussians on a grid through upright boxes, given by lower and upper corner; label k for box k. One Gaussian of no
 /// instance comes first.
@@ -27,6 +28,7 @@ pub fn boxes(boxes: &[([f32; 3], [f32; 3])]) -> (Instances, Gaussians) {
     let instances = Instances {
         node: label.iter().map(|&l| if l < 0 { -1 } else { n as i32 + 2 + l }).collect(),
         label,
+        descriptor: Array2::default((k, 0)),
         support: vec![2; k],
         score: (0..k).map(|k| 1.0 / (1.0 + k as f32)).collect(),
         count: extents.count,

@@ -69,7 +69,8 @@ pub(crate) fn points(views: &[(&View, &Camera)], known: &PointCloud, most: usize
     let pictures = views.par_iter().map(small).collect::<Result<Vec<_>>>()?;
     let cameras: Vec<Camera> = pictures.iter().map(|p| p.1.clone()).collect();
     let known: Vec<DVec3> = known.positions.iter().map(|p| DVec3::from(p.map(f64::from))).collect();
-    let all: Vec<f64> = cameras.iter().flat_map(|c| depths(c, &known)).collect();
+    let mut all: Vec<f64> = cameras.iter().flat_map(|c| depths(c, &known)).collect();
+    all.sort_by(f64::total_cmp);
     let pictures: Vec<Small> = pictures
         .into_iter()
         .enumerate()
@@ -102,14 +103,12 @@ pub(crate) fn points(views: &[(&View, &Camera)], known: &PointCloud, most: usize
     Ok(voxels.cloud())
 }
 
-/// Depths of the points that a camera sees, sorted.
+/// Depths of the points that a camera sees.
 fn depths(c: &Camera, points: &[DVec3]) -> Vec<f64> {
     let inside = |&(u, v, z): &(f64, f64, f64)| {
         z > 0.0 && (0.0..f64::from(c.width)).contains(&u) && (0.0..f64::from(c.height)).contains(&v)
     };
-    let mut all: Vec<f64> = points.iter().map(|p| c.project(*p)).filter(inside).map(|p| p.2).collect();
-    all.sort_by(f64::total_cmp);
-    all
+    points.iter().map(|p| c.project(*p)).filter(inside).map(|p| p.2).collect()
 }
 
 fn range(mut depths: Vec<f64>) -> [f64; 2] {
