@@ -33,8 +33,8 @@ LIBRARIES = {
     "hdbscan": ("hdbscan", "hdbscan.HDBSCAN(min_cluster_size={size}, min_samples={samples} - 1, core_dist_n_jobs=-1)"),
     "scikit-learn": ("scikit-learn", "sklearn.cluster.HDBSCAN(min_cluster_size={size}, min_samples={samples}, n_jobs=-1, copy=True)"),
 }
-FIT = """
-import sys, time, resource, numpy as np, {module}
+FIT = r"""
+import re, sys, time, numpy as np, {module}
 make = lambda: {call}
 make().fit(np.random.default_rng(0).normal(size=(2000, {dim})))
 x = np.load(sys.argv[1])
@@ -42,7 +42,7 @@ before, spent = time.perf_counter(), time.process_time()
 found = make().fit_predict(x)
 seconds, spent = time.perf_counter() - before, time.process_time() - spent
 np.save(sys.argv[2], np.asarray(found, np.int32))
-print(seconds, spent, resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024)
+print(seconds, spent, int(re.search(r'VmHWM:\s*(\d+)', open('/proc/self/status').read())[1]) * 1024)
 """
 
 
@@ -96,11 +96,13 @@ def main():
             row = {"points": n, "dim": d, "seconds": {}, "processor_seconds": {}, "bytes": {}, "ari": {}, "left_out": {}}
             for run in range(a.runs):
                 for library in LIBRARIES:
-                    before = last.get((library, n // 10, d))
+                    before, earlier = (last.get((library, n // by, d)) for by in (10, 100))
                     taken = row["seconds"].get(library, [])
                     if library in row["left_out"] or taken and taken[0] > 60:
                         continue
-                    if isinstance(before, str) or before is not None and before * 10 > LONGEST:
+                    # As it grew so far, in proportion at least.
+                    growth = max(10, before / earlier) if isinstance(before, float) and isinstance(earlier, float) else 10
+                    if isinstance(before, str) or before is not None and before * growth > LONGEST:
                         row["left_out"][library] = "over 10 minutes by what a tenth took" if not isinstance(before, str) else before
                         last[library, n, d] = row["left_out"][library]
                         continue
