@@ -75,7 +75,7 @@ impl Descriptors {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use ndarray::arr3;
+    use ndarray::{arr2, arr3};
 
     #[test]
     fn reads_back_and_refuses_what_does_not_fit() {
@@ -86,6 +86,7 @@ mod tests {
         good.write(&path, Provenance::default()).unwrap();
         let (read, _) = Descriptors::read(&path).unwrap();
         assert_eq!(read, good);
+        assert_eq!((read.values.dim().0, read.of_row(1)), (2, arr2(&[[0.0, 1.0], [0.0, 0.0]]).view()));
         let mut nan = good.values.clone();
         nan[[0, 1, 1]] = f32::NAN;
         for (bad, said) in [

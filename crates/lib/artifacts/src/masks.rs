@@ -318,6 +318,7 @@ mod tests {
         let m = MaskMaps { ids: Array3::from_shape_fn((4, 2, 3), |(l, y, x)| (6 * l + 3 * y + x) as i32 % 7 - 1) };
         m.write(&p).unwrap();
         assert_eq!(MaskMaps::read(&p).unwrap(), m);
+        assert_eq!(flat(m.level(Level::Large)), &flat(m.ids.view())[18..]);
         assert_eq!(stems(dir.path()).unwrap(), ["frame_00001"]);
         npy::write_f32(&p, &arr2(&[[0.0, 0.5, 0.0], [0.0, 0.0, 0.0]])).unwrap();
         let e = MaskMaps::read(&p).unwrap_err().to_string();

@@ -85,3 +85,17 @@ pub struct Gradients {
     /// How many of the Gaussians drawn have a gradient that single precision does not hold: theirs are zero here.
     pub overflowed: usize,
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_near_plane_goes_with_the_scene() {
+        for by in [1e-6, 3.0, 1e6] {
+            let ratio = f64::from(near_plane(by)) / f64::from(near_plane(1.0));
+            assert!((ratio / by - 1.0).abs() < 1e-6, "{by}: {ratio}");
+        }
+        assert!(near_plane(0.0) > 0.0 && near_plane(1e300).is_finite());
+    }
+}
