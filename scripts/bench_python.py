@@ -101,10 +101,10 @@ def main():
                     if library in row["left_out"] or taken and taken[0] > 60:
                         continue
                     # As it grew so far, in proportion at least.
-                    growth = max(10, before / earlier) if isinstance(before, float) and isinstance(earlier, float) else 10
-                    if isinstance(before, str) or before is not None and before * growth > LONGEST:
-                        row["left_out"][library] = "over 10 minutes by what a tenth took" if not isinstance(before, str) else before
-                        last[library, n, d] = row["left_out"][library]
+                    if not isinstance(before, str) and before and before * max(10, before / (earlier or before)) > LONGEST:
+                        before = "over 10 minutes by what a tenth took"
+                    if isinstance(before, str):
+                        row["left_out"][library] = last[library, n, d] = before
                         continue
                     found = fit(library, points, d, f"{folder}/{library}.npy")
                     if isinstance(found, str):
