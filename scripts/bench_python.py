@@ -13,6 +13,7 @@ and in hdbscan-rs; the others get one less.
 import argparse
 import json
 import os
+import signal
 import statistics
 import subprocess
 import sys
@@ -64,12 +65,14 @@ def fit(library, points, dim, labels):
                              stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
     end = time.monotonic() + LONGEST + 60
     why = None
-    while child.poll() is None and why is None:
-        time.sleep(0.2)
-        pages = Path(f"/proc/{child.pid}/statm")
-        used = int(pages.read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE") if pages.exists() else 0
-        why = "over 16 GB" if used > MOST else "over 10 minutes" if time.monotonic() > end else None
-    if why:
+    try:
+        while child.poll() is None and why is None:
+            time.sleep(0.2)
+            pages = Path(f"/proc/{child.pid}/statm")
+            used = int(pages.read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE") if pages.exists() else 0
+            why = "over 16 GB" if used > MOST else "over 10 minutes" if time.monotonic() > end else None
+    finally:
+        # Also where this program is ended: what is left would work beside the next run.
         child.kill()
     out, errors = child.communicate()
     if why or child.returncode:
@@ -86,6 +89,7 @@ def main():
     parser.add_argument("--runs", type=int, default=3, help="fits of each that takes under a minute; others get one [%(default)s]")
     a = parser.parse_args()
     a.out.parent.mkdir(parents=True, exist_ok=True)
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(1))
     from sklearn.metrics import adjusted_rand_score
 
     rows, last = [], {}
