@@ -5,6 +5,7 @@ pub mod adaptive;
 pub mod mcmc;
 pub mod rules;
 
+use crate::training::schedule::LearningRates;
 use adaptive::Adaptive;
 use clap::ValueEnum;
 use gs_scene::Gaussians;
@@ -35,6 +36,11 @@ impl Strategy {
             Self::Mcmc => Some(Way::Mcmc(Mcmc::default())),
             Self::None | Self::Fixed => None,
         }
+    }
+
+    /// These learning rates, without that of the centres where they stay.
+    pub fn rates(self, rates: LearningRates) -> LearningRates {
+        if self == Self::Fixed { LearningRates { position: 0.0, ..rates } } else { rates }
     }
 
     /// When the number of Gaussians grows in a run of `iterations`: as in 3DGS at 30,000 and more. Shorter runs begin

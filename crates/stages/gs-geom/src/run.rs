@@ -112,17 +112,20 @@ const STOCK_MAX_SCALE: f32 = 0.1;
 impl Train {
     /// The hyper-parameters that the options amount to.
     pub(crate) fn recipe(&self, max_gaussians: usize, seed: u64) -> Recipe {
+        let stock = self.preset == Some(Preset::Stock);
         let mut recipe = Recipe::new(self.densify, self.iterations);
         if self.schedule == PictureSizes::Coarse {
             recipe.schedule = recipe.schedule.coarse_to_fine();
         }
         if let Some(Way::Adaptive(way)) = &mut recipe.densification {
             way.gradient = self.densify_gradient.unwrap_or(way.gradient);
-            way.max_scale = self.preset.map(|Preset::Stock| STOCK_MAX_SCALE);
+            if stock {
+                way.max_scale = Some(STOCK_MAX_SCALE);
+                way.split_reach = None;
+            }
         }
-        if self.preset == Some(Preset::Stock) {
-            // --densify fixed keeps the centres.
-            recipe.rates = LearningRates { position: recipe.rates.position, ..LearningRates::default() };
+        if stock {
+            recipe.rates = self.densify.rates(LearningRates::default());
         }
         recipe.growth.every = self.densify_every.unwrap_or(recipe.growth.every);
         recipe.growth.max_gaussians = max_gaussians;

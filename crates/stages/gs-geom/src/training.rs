@@ -61,11 +61,10 @@ pub struct Recipe {
 impl Recipe {
     /// The defaults of a strategy for a number of iterations.
     pub fn new(strategy: Strategy, iterations: u32) -> Self {
-        let rates = LearningRates::for_iterations(iterations);
         Self {
             seed: 0,
             schedule: Schedule::for_iterations(iterations),
-            rates: if strategy == Strategy::Fixed { LearningRates { position: 0.0, ..rates } } else { rates },
+            rates: strategy.rates(LearningRates::for_iterations(iterations)),
             densification: strategy.way(),
             growth: strategy.growth(iterations),
             background: [0.0; 3],

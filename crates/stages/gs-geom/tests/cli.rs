@@ -344,10 +344,15 @@ fn the_preset_of_3dgs_has_full_pictures_no_limit_and_removes_large_gaussians() {
     assert!(said.contains("no limit to their number"), "{said}");
     assert_eq!((&p["schedule"]["coarse"], &p["growth"]["max_gaussians"]), (&json!([]), &json!(usize::MAX)));
     assert!((p["densification"]["max_scale"].as_f64().unwrap() - 0.1).abs() < 1e-6, "{p}");
+    let rates = |p: &Value| p["rates"]["position"].as_f64().unwrap();
+    assert_eq!((rates(&p), &p["densification"]["split_reach"]), (1.6e-4, &Value::Null));
+    assert_eq!(rates(&with(&["--preset", "3dgs", "--densify", "fixed"]).1), 0.0);
     let (said, p) = with(&["--preset", "3dgs", "--max-gaussians", "5000", "--schedule", "coarse"]);
     assert!(said.contains("at most") && p["growth"]["max_gaussians"] == 5000, "{said} {p}");
     assert_ne!(p["schedule"]["coarse"], json!([]));
-    assert_eq!(with(&[]).1["densification"]["max_scale"], Value::Null);
+    let p = with(&[]).1;
+    assert_eq!((&p["densification"]["max_scale"], &p["densification"]["split_reach"]), (&Value::Null, &json!(1.0)));
+    assert!(rates(&p) > 1.6e-4 && p["rates"]["opacity"] == 0.05, "{p}");
 }
 
 /// Checks that the forecast is near the peak.

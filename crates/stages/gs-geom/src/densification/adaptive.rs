@@ -32,6 +32,9 @@ pub struct Adaptive {
     /// Gaussians beyond this share of the scene's extent are removed after the first reset of opacities, if there is one.
     /// 3DGS has 0.1; here there is none, because that tears holes into plain walls and tables (docs/geometry.md).
     pub max_scale: Option<f32>,
+    /// The halves of a split Gaussian lie within so many of its standard deviations along each of its axes. 3DGS draws them
+    /// anywhere; a half far from the surface may hang as haze before a camera (docs/results/geometry.md).
+    pub split_reach: Option<f32>,
     /// Iterations between opacity resets; 0 for none. Short runs keep the period of 3DGS: they have no time to recover from
     /// one.
     pub reset_every: u32,
@@ -62,7 +65,8 @@ impl Adaptive {
         let halves = sources.len();
         sources.extend(split.iter().flat_map(|&i| [i, i]));
         *g = g.select(&sources);
-        (halves..g.len()).for_each(|i| halve(g, i, rng));
+        let reach = self.split_reach.unwrap_or(f32::INFINITY);
+        (halves..g.len()).for_each(|i| halve(g, i, reach, rng));
         adam.select(&sources, fresh);
 
         let huge = |i: usize| self.max_scale.is_some_and(|most| largest_scale(g, i) > most * extent);
@@ -81,7 +85,14 @@ impl Adaptive {
 
 impl Default for Adaptive {
     fn default() -> Self {
-        Self { gradient: 2e-4, min_opacity: 0.005, clone_scale: 0.01, max_scale: None, reset_every: 3000 }
+        Self {
+            gradient: 2e-4,
+            min_opacity: 0.005,
+            clone_scale: 0.01,
+            max_scale: None,
+            split_reach: Some(1.0),
+            reset_every: 3000,
+        }
     }
 }
 
@@ -127,12 +138,12 @@ fn largest_scale(g: &Gaussians, i: usize) -> f32 {
     g.log_scales[i].iter().copied().fold(f32::NEG_INFINITY, f32::max).exp()
 }
 
-/// Moves Gaussian `i` to a draw from itself and shrinks it.
-fn halve(g: &mut Gaussians, i: usize, rng: &mut ChaCha8Rng) {
+/// Moves Gaussian `i` to a draw from itself, at most `reach` standard deviations away along each axis, and shrinks it.
+fn halve(g: &mut Gaussians, i: usize, reach: f32, rng: &mut ChaCha8Rng) {
     let [w, x, y, z] = g.rotations[i];
     let q = Quat::from_xyzw(x, y, z, w);
     let q = if q.length_squared() > 0.0 { q.normalize() } else { Quat::IDENTITY };
-    let local = Vec3::from(g.log_scales[i].map(|s| s.exp() * normal(rng)));
+    let local = Vec3::from(g.log_scales[i].map(|s| s.exp() * normal(rng).clamp(-reach, reach)));
     let moved = Vec3::from(g.means[i]) + q * local;
     if moved.is_finite() {
         g.means[i] = moved.into();
@@ -209,13 +220,20 @@ mod tests {
             g.log_scales[i] = [0.5, -1.0, -3.0];
             g.rotations[i] = [2.0 * (angle / 2.0).cos(), 0.0, 0.0, 2.0 * (angle / 2.0).sin()];
         }
-        let mut rng = generator(1, Purpose::Split, 0);
-        (0..g.len()).for_each(|i| halve(&mut g, i, &mut rng));
         let along = Vec3::new(angle.cos(), angle.sin(), 0.0);
-        let offsets: Vec<Vec3> = g.means.iter().map(|&m| Vec3::from(m) - Vec3::new(1.0, 2.0, 3.0)).collect();
-        let spread = |axis: Vec3| (offsets.iter().map(|o| o.dot(axis).powi(2)).sum::<f32>() / 20_000.0).sqrt();
+        let offsets = |reach: f32| -> Vec<Vec3> {
+            let (mut halves, mut rng) = (g.clone(), generator(1, Purpose::Split, 0));
+            (0..g.len()).for_each(|i| halve(&mut halves, i, reach, &mut rng));
+            halves.means.iter().map(|&m| Vec3::from(m) - Vec3::new(1.0, 2.0, 3.0)).collect()
+        };
+        let anywhere = offsets(f32::INFINITY);
+        let spread = |axis: Vec3| (anywhere.iter().map(|o| o.dot(axis).powi(2)).sum::<f32>() / 20_000.0).sqrt();
         assert!((spread(along) / 0.5f32.exp() - 1.0).abs() < 0.03);
         assert!((spread(Vec3::Z) / (-3.0f32).exp() - 1.0).abs() < 0.03);
+        let near = offsets(1.0);
+        let farthest = |axis: Vec3| near.iter().map(|o| o.dot(axis).abs()).fold(0.0, f32::max);
+        assert!((farthest(along) / 0.5f32.exp() - 1.0).abs() < 1e-4);
+        assert!((farthest(Vec3::Z) / (-3.0f32).exp() - 1.0).abs() < 1e-4);
     }
 
     #[test]

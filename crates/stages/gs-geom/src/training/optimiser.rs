@@ -46,6 +46,8 @@ struct Step {
     correction1: f32,
     /// 1 / sqrt(1 - beta2^t).
     correction2: f32,
+    /// See [`LearningRates::selective`].
+    selective: bool,
 }
 
 impl Adam {
@@ -65,6 +67,7 @@ impl Adam {
         let step = Step {
             correction1: (1.0 / (1.0 - BETA1.powi(t))) as f32,
             correction2: (1.0 / (1.0 - BETA2.powi(t)).sqrt()) as f32,
+            selective: rates.selective,
         };
         let (m, v) = (&mut self.first, &mut self.second);
         // Rows of `stride` values, the first `rate.len()` of which move.
@@ -132,9 +135,14 @@ impl Adam {
 fn update_one(p: &mut f32, m: &mut f32, v: &mut f32, d: f32, rate: f32, s: Step) {
     const B1: f32 = BETA1 as f32;
     const B2: f32 = BETA2 as f32;
-    *m = B1 * *m + (1.0 - BETA1) as f32 * d;
-    *v = B2 * *v + (1.0 - BETA2) as f32 * d * d;
-    *p -= rate * s.correction1 * *m / (v.sqrt() * s.correction2 + EPSILON);
+    let first = B1 * *m + (1.0 - BETA1) as f32 * d;
+    let second = B2 * *v + (1.0 - BETA2) as f32 * d * d;
+    let moved = *p - rate * s.correction1 * first / (second.sqrt() * s.correction2 + EPSILON);
+    // Chosen without a branch, for SIMD.
+    let stays = s.selective && d == 0.0;
+    *m = if stays { *m } else { first };
+    *v = if stays { *v } else { second };
+    *p = if stays { *p } else { moved };
 }
 
 #[multiversion(targets("x86_64+avx512f+avx512vl", "x86_64+avx2"))]
@@ -243,6 +251,25 @@ mod tests {
                 assert!(sh[3..].iter().all(|&v| close(v, oracle(&own, 0.0005))));
             }
         }
+    }
+
+    #[test]
+    fn without_a_gradient_a_parameter_stays_or_follows_its_moments() {
+        let after = |selective: bool| {
+            let mut g = zeros(2, 1);
+            let mut adam = Adam::new(&g);
+            let rates = LearningRates { selective, ..rates(0.1) };
+            adam.step(&mut g, &gradients(2, 12, |_| 1.0), 0.1, &rates, 1);
+            let before = (g.clone(), adam.first.clone(), adam.second.clone());
+            adam.step(&mut g, &gradients(2, 12, |i| i as f32), 0.1, &rates, 1);
+            (before, (g, adam.first, adam.second))
+        };
+        let (before, now) = after(true);
+        let of_first = |all: &(Gaussians, Gaussians, Gaussians)| [&all.0, &all.1, &all.2].map(|g| g.select(&[0]));
+        assert_eq!(of_first(&now), of_first(&before), "no gradient");
+        assert!(now.0.means[1][0] < before.0.means[1][0] && now.0.sh_of(1)[11] < before.0.sh_of(1)[11]);
+        let (before, now) = after(false);
+        assert!(now.0.means[0][0] < before.0.means[0][0] && now.1.means[0][0] < before.1.means[0][0]);
     }
 
     #[test]
