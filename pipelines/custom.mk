@@ -5,7 +5,7 @@
 #:  QUERIES="red_mug …" texts to ask for, with underscores for spaces, without quotes
 #:  RESOLUTION=640px    size of the photographs for stage 1: a width that wider ones are shrunk to, a divisor, or auto
 #:  QUALITY=balanced    fast, balanced or exact: pipelines/quality
-#:  ITERATIONS=2000     steps of stage 1; fast 700, exact 10000
+#:  ITERATIONS=1500     steps of stage 1; fast 700, exact 10000
 #:  SEED=0              of every stage's random choices
 #:  THREADS=0           threads of every stage, 0 for one per core
 #:  CONF=file           settings from a file, one NAME = value a line

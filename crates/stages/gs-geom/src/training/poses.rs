@@ -28,7 +28,7 @@ pub struct PoseRates {
 
 impl Default for PoseRates {
     fn default() -> Self {
-        Self { turn: 3e-4, turn_end: 1e-5, zoom: 0.3, warm_up: 0.05 }
+        Self { turn: 2e-3, turn_end: 1e-4, zoom: 0.3, warm_up: 0.05 }
     }
 }
 
