@@ -1,7 +1,7 @@
 //! Which Gaussian belongs to which instance, from the clustering to the last correction.
 
 use crate::group::tree;
-use crate::join::by_masks;
+use crate::join::{by_masks, with_rest};
 use crate::plane::Place;
 use crate::vote::by_votes;
 use artifacts::{Footprints, Graph, Level, TreeEdge};
@@ -10,11 +10,13 @@ use gs_scene::Gaussians;
 use hdbscan_exact::Clustering;
 use kiddo::{ImmutableKdTree, SquaredEuclidean};
 use rayon::prelude::*;
-use std::collections::{BTreeMap, HashSet};
+use std::collections::{BTreeMap, BTreeSet, HashSet};
 use std::num::NonZero;
 
 /// Least share of a part that lies in an instance for it to be that instance's.
 const INSIDE: f64 = 0.7;
+/// A part is a thing of its own where large masks hold it and the rest less often than medium masks do, by this probability.
+const APART: f64 = 0.2;
 
 /// The instances of all Gaussians of a scene.
 pub(crate) struct Assignment {
@@ -117,10 +119,29 @@ impl Assignment {
         Ok(())
     }
 
-    /// Makes instances of those of `parts` that lie in a much larger instance: at least [`INSIDE`] of their Gaussians, and at most
-    /// `share` of its own. An instance of which more than half would leave stays as it is. In the tree such a part hangs below
-    /// the cluster of that instance. Returns how many there are.
-    pub fn split(&mut self, parts: &Self, share: f64) -> usize {
+    /// The instances and those of `parts` in them that the large masks show apart from the rest more often, by [`APART`], than
+    /// the medium ones. SAM's largest mask of a place is the whole thing there: a part is alone in it no more often than in smaller ones.
+    ///
+    /// # Errors
+    /// When the footprints can't be read.
+    pub fn apart(&self, parts: &Self, kept: &[u32], footprints: &Footprints) -> Result<BTreeSet<(i32, i32)>> {
+        let pair = |i: &u32| (self.labels[*i as usize], parts.labels[*i as usize]);
+        let pairs: BTreeSet<(i32, i32)> = kept.iter().map(pair).filter(|p| p.0 >= 0).collect();
+        let number: BTreeMap<(i32, i32), i32> = pairs.iter().copied().zip(0..).collect();
+        let labels: Vec<i32> = kept.iter().map(|i| number.get(&pair(i)).copied().unwrap_or(-1)).collect();
+        let wholes: Vec<i32> = pairs.iter().map(|p| p.0).collect();
+        let [medium, large] =
+            [Level::Medium, Level::Large].map(|level| with_rest(&labels, &wholes, footprints, &[level]));
+        let (medium, large) = (medium?, large?);
+        let apart =
+            pairs.into_iter().zip(medium.into_iter().zip(large)).filter(|(p, (m, l))| p.1 >= 0 && m - l >= APART);
+        Ok(apart.map(|(p, _)| p).collect())
+    }
+
+    /// Makes instances of those of `parts` that lie in a larger instance: at least [`INSIDE`] of their Gaussians, and at most
+    /// `share` of its own, or a half for those that are `apart`. An instance of which more than half would leave stays as it is. In the tree
+    /// such a part hangs below the cluster of that instance. Returns how many there are.
+    pub fn split(&mut self, parts: &Self, share: f64, apart: &BTreeSet<(i32, i32)>) -> usize {
         let mut common: BTreeMap<(i32, i32), usize> = BTreeMap::new();
         let (mut sizes, mut part_sizes) = (vec![0usize; self.instances], vec![0usize; parts.instances]);
         for (&whole, &part) in self.labels.iter().zip(&parts.labels) {
@@ -132,6 +153,7 @@ impl Assignment {
         }
         let small = |&((whole, part), n): &((i32, i32), usize)| {
             let (size, part_size) = (sizes[whole as usize] as f64, part_sizes[part as usize] as f64);
+            let share = if apart.contains(&(whole, part)) { share.max(0.5) } else { share };
             n as f64 >= INSIDE * part_size && part_size <= share * size
         };
         let mut found: BTreeMap<i32, Vec<(i32, usize)>> = BTreeMap::new();
@@ -185,6 +207,7 @@ mod tests {
             tree,
             clusters: Vec::new(),
         };
+        let (none, last) = (BTreeSet::new(), (0..120).map(|i| if i < 90 { -1 } else { 0 }).collect::<Vec<i32>>());
         let edge = TreeEdge { parent: 4, child: 5, lambda: 2.0, size: 100, instance: 0 };
         let wholes: Vec<i32> = (0..120).map(|i| i32::from(i >= 100)).collect();
         // Part 0 is most of instance 0; 1 is small and lies in it; 2 lies half in either; 3 is half of instance 1.
@@ -196,16 +219,19 @@ mod tests {
         };
         let parts = of((0..120).map(part).collect(), 4, Vec::new());
         let mut a = of(wholes.clone(), 2, vec![edge]);
-        assert_eq!((a.split(&parts, 0.1), a.instances), (1, 3));
+        assert_eq!((a.split(&parts, 0.1, &none), a.instances), (1, 3));
         let expected: Vec<i32> = (0..120).map(|i| if (90..96).contains(&i) { 2 } else { wholes[i] }).collect();
         assert_eq!(a.labels, expected);
         // It hangs below the instance's cluster.
         assert_eq!(a.tree[1], TreeEdge { parent: 5, child: 6, lambda: f32::MAX, size: 6, instance: 2 });
         assert!(a.nodes[90..96].iter().all(|&n| n == 6) && a.nodes.iter().filter(|&&n| n == 6).count() == 6);
         // Nothing is small enough; or the instance would fall apart.
-        assert_eq!(of(wholes.clone(), 2, vec![edge]).split(&parts, 0.05), 0);
+        assert_eq!(of(wholes.clone(), 2, vec![edge]).split(&parts, 0.05, &none), 0);
         let crumbs = of((0..120).map(|i| i / 6).collect(), 20, Vec::new());
-        assert_eq!(of(wholes, 2, vec![edge]).split(&crumbs, 0.1), 0);
+        assert_eq!(of(wholes, 2, vec![edge]).split(&crumbs, 0.1, &none), 0);
+        // What is apart may be larger.
+        assert_eq!(of(last.clone(), 1, vec![edge]).split(&parts, 0.1, &none), 0);
+        assert_eq!(of(last, 1, vec![edge]).split(&parts, 0.1, &BTreeSet::from([(0, 2)])), 1);
     }
 
     #[test]

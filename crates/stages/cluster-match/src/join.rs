@@ -76,6 +76,33 @@ fn agreement(a: &Profile, b: &Profile, unit_of: &[u32]) -> f64 {
     sum / weight
 }
 
+/// How much each piece agrees with the rest of its instance ([`agreement`]), by the masks at `levels`. `labels` are the pieces of the
+/// kept Gaussians, -1 for none; `wholes` has the instance of each piece.
+///
+/// # Errors
+/// When the footprints can't be read.
+pub fn with_rest(labels: &[i32], wholes: &[i32], footprints: &Footprints, levels: &[Level]) -> Result<Vec<f64>> {
+    let unit_of = units(footprints);
+    let units = footprints.views.len() * artifacts::LEVELS;
+    let mut pieces: Vec<BTreeMap<u32, f64>> = vec![BTreeMap::new(); wholes.len()];
+    let mut instances: BTreeMap<i32, BTreeMap<u32, f64>> = BTreeMap::new();
+    for (r, of) in mask_weights(labels, footprints, levels)? {
+        for (piece, w) in of.into_iter().filter(|(_, w)| *w > 0.0) {
+            pieces[piece as usize].insert(r, w);
+            *instances.entry(wholes[piece as usize]).or_default().entry(r).or_default() += w;
+        }
+    }
+    let profile = |masks: Vec<(u32, f64)>| Profile::new(masks, &unit_of, units, Place::default());
+    let agreement_of = |(piece, whole): (BTreeMap<u32, f64>, &i32)| {
+        let all = instances.get(whole).into_iter().flatten();
+        let others = all.map(|(r, w)| (*r, w - piece.get(r).unwrap_or(&0.0), *w));
+        // What is left of nothing but rounding is nothing.
+        let rest = others.filter(|(_, left, w)| *left > 1e-9 * w).map(|(r, left, _)| (r, left)).collect();
+        agreement(&profile(piece.into_iter().collect()), &profile(rest), &unit_of)
+    };
+    Ok(pieces.into_par_iter().zip(wholes).map(agreement_of).collect())
+}
+
 /// The view and level of each mask, as one number.
 pub fn units(footprints: &Footprints) -> Vec<u32> {
     footprints.rows.iter().map(|r| r.view * artifacts::LEVELS as u32 + r.level).collect()
@@ -174,6 +201,7 @@ fn join(profiles: &mut [Profile], unit_of: &[u32], least: f64) -> Vec<u32> {
 mod tests {
     use super::*;
     use crate::plane::testing::{board, places};
+    use crate::testing::footprints;
 
     /// Two masks a view; an instance has the given shares in the first, in views where it is seen at all.
     fn profile(firsts: &[Option<f64>]) -> Profile {
@@ -194,6 +222,17 @@ mod tests {
         assert!((agreement(&a, &b, &unit_of(3)) - 0.375).abs() < 1e-12);
         let seen_once = profile(&[Some(1.0), None, None]);
         assert_eq!(agreement(&a, &seen_once, &unit_of(3)), 0.0);
+    }
+
+    #[test]
+    fn a_piece_agrees_with_the_rest_as_far_as_masks_hold_both() {
+        // Of instance 0 the pieces 0 and 1, in one mask in the first view alone; piece 2 is all of instance 1.
+        let views: [&[&[u32]]; 2] = [&[&[0, 1, 2, 3, 4]], &[&[0, 1, 4, 5], &[2, 3, 6, 7]]];
+        let footprints = footprints(&views);
+        let agreements = |levels| with_rest(&[0, 0, 1, 1, -1, -1, 2, 2], &[0, 0, 1], &footprints, levels).unwrap();
+        let [a, b, alone] = agreements(&[Level::Large])[..] else { panic!("one for each piece") };
+        assert!((a - 0.5).abs() < 1e-12 && (b - 0.5).abs() < 1e-12 && alone == 0.0, "{a} {b} {alone}");
+        assert_eq!(agreements(&[Level::Medium]), [0.0; 3], "no masks");
     }
 
     #[test]

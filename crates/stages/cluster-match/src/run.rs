@@ -145,7 +145,8 @@ fn correct(mut found: Assignment, inputs: &Inputs, settings: &Settings, stage: &
         if settings.join > 0.0 {
             parts.join(&inputs.geometry.gaussians, &graph.kept, footprints, &[Level::Small], settings.join)?;
         }
-        let split = found.split(&parts, settings.split);
+        let apart = found.apart(&parts, &graph.kept, footprints)?;
+        let split = found.split(&parts, settings.split, &apart);
         if split > 0 {
             stage.info(&format!("{split} small things within others are instances of their own"));
         }
