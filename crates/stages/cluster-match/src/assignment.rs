@@ -121,6 +121,7 @@ impl Assignment {
 
     /// The instances and those of `parts` in them that the large masks show apart from the rest more often, by [`APART`], than
     /// the medium ones. SAM's largest mask of a place is the whole thing there: a part is alone in it no more often than in smaller ones.
+    /// Where either level says nothing of a part, it is not apart.
     ///
     /// # Errors
     /// When the footprints can't be read.
@@ -130,11 +131,10 @@ impl Assignment {
         let number: BTreeMap<(i32, i32), i32> = pairs.iter().copied().zip(0..).collect();
         let labels: Vec<i32> = kept.iter().map(|i| number.get(&pair(i)).copied().unwrap_or(-1)).collect();
         let wholes: Vec<i32> = pairs.iter().map(|p| p.0).collect();
-        let [medium, large] =
-            [Level::Medium, Level::Large].map(|level| with_rest(&labels, &wholes, footprints, &[level]));
-        let (medium, large) = (medium?, large?);
-        let apart =
-            pairs.into_iter().zip(medium.into_iter().zip(large)).filter(|(p, (m, l))| p.1 >= 0 && m - l >= APART);
+        let agreements = |level| with_rest(&labels, &wholes, footprints, &[level]);
+        let both = agreements(Level::Medium)?.into_iter().zip(agreements(Level::Large)?);
+        let leaves = |medium: Option<f64>, large: Option<f64>| medium.zip(large).is_some_and(|(m, l)| m - l >= APART);
+        let apart = pairs.into_iter().zip(both).filter(|&(pair, (medium, large))| pair.1 >= 0 && leaves(medium, large));
         Ok(apart.map(|(p, _)| p).collect())
     }
 
@@ -153,7 +153,7 @@ impl Assignment {
         }
         let small = |&((whole, part), n): &((i32, i32), usize)| {
             let (size, part_size) = (sizes[whole as usize] as f64, part_sizes[part as usize] as f64);
-            let share = if apart.contains(&(whole, part)) { share.max(0.5) } else { share };
+            let share = if apart.contains(&(whole, part)) { 0.5 } else { share };
             n as f64 >= INSIDE * part_size && part_size <= share * size
         };
         let mut found: BTreeMap<i32, Vec<(i32, usize)>> = BTreeMap::new();
@@ -197,6 +197,7 @@ impl Assignment {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::testing::footprints_of;
 
     #[test]
     fn parts_much_smaller_than_their_instance_leave_it() {
@@ -232,6 +233,30 @@ mod tests {
         // What is apart may be larger.
         assert_eq!(of(last.clone(), 1, vec![edge]).split(&parts, 0.1, &none), 0);
         assert_eq!(of(last, 1, vec![edge]).split(&parts, 0.1, &BTreeSet::from([(0, 2)])), 1);
+    }
+
+    #[test]
+    fn parts_are_apart_that_large_masks_separate_more_often_than_medium_ones() {
+        let of = |labels: [i32; 8], instances| Assignment {
+            nodes: vec![5; 8],
+            labels: labels.to_vec(),
+            instances,
+            tree: Vec::new(),
+            clusters: Vec::new(),
+        };
+        // A mouse on its pad; the last two Gaussians are another instance.
+        let (whole, parts) = (of([0, 0, 0, 0, 0, 0, 1, 1], 2), of([0, 0, 1, 1, 1, 1, 2, 2], 3));
+        let together: [&[&[u32]]; 2] = [&[&[0, 1, 2, 3, 4, 5], &[6, 7]]; 2];
+        let once: [&[&[u32]]; 2] = [together[0], &[&[0, 1], &[2, 3, 4, 5], &[6, 7]]];
+        let unseen: [&[&[u32]]; 2] = [&[&[6, 7]]; 2];
+        let apart = |medium, large| {
+            let footprints = footprints_of(&[(Level::Medium, medium), (Level::Large, large)]);
+            whole.apart(&parts, &[0, 1, 2, 3, 4, 5, 6, 7], &footprints).unwrap()
+        };
+        assert_eq!(apart(&together, &once), BTreeSet::from([(0, 0), (0, 1)]));
+        for (medium, large) in [(&together, &together), (&once, &together), (&once, &once), (&together, &unseen)] {
+            assert!(apart(medium, large).is_empty(), "{medium:?} {large:?}");
+        }
     }
 
     #[test]

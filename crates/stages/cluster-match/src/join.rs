@@ -57,13 +57,13 @@ impl Profile {
 }
 
 /// The probability that a random part of `a` and a random part of `b` lie in the same mask, averaged over the views that see
-/// both. A view counts by the smaller of the two shares of weight that lie in it.
-fn agreement(a: &Profile, b: &Profile, unit_of: &[u32]) -> f64 {
+/// both. A view counts by the smaller of the two shares of weight that lie in it. None where too few views see both.
+fn agreement(a: &Profile, b: &Profile, unit_of: &[u32]) -> Option<f64> {
     let common = |u: usize| (a.units[u] / a.total).min(b.units[u] / b.total);
     let both: Vec<f64> = (0..a.units.len()).map(common).filter(|w| *w > 0.0).collect();
     let weight: f64 = both.iter().sum();
     if both.len() < LEAST_VIEWS || weight < LEAST_COMMON {
-        return 0.0;
+        return None;
     }
     let (mut sum, mut at) = (0.0, 0);
     for &(k, w) in &a.masks {
@@ -73,7 +73,7 @@ fn agreement(a: &Profile, b: &Profile, unit_of: &[u32]) -> f64 {
             sum += common(u) * (w / a.units[u]) * (other / b.units[u]);
         }
     }
-    sum / weight
+    Some(sum / weight)
 }
 
 /// How much each piece agrees with the rest of its instance ([`agreement`]), by the masks at `levels`. `labels` are the pieces of the
@@ -81,24 +81,27 @@ fn agreement(a: &Profile, b: &Profile, unit_of: &[u32]) -> f64 {
 ///
 /// # Errors
 /// When the footprints can't be read.
-pub fn with_rest(labels: &[i32], wholes: &[i32], footprints: &Footprints, levels: &[Level]) -> Result<Vec<f64>> {
+pub fn with_rest(
+    labels: &[i32],
+    wholes: &[i32],
+    footprints: &Footprints,
+    levels: &[Level],
+) -> Result<Vec<Option<f64>>> {
     let unit_of = units(footprints);
     let units = footprints.views.len() * artifacts::LEVELS;
-    let mut pieces: Vec<BTreeMap<u32, f64>> = vec![BTreeMap::new(); wholes.len()];
+    let pieces = masks_of(labels, wholes.len(), footprints, levels)?;
     let mut instances: BTreeMap<i32, BTreeMap<u32, f64>> = BTreeMap::new();
-    for (r, of) in mask_weights(labels, footprints, levels)? {
-        for (piece, w) in of.into_iter().filter(|(_, w)| *w > 0.0) {
-            pieces[piece as usize].insert(r, w);
-            *instances.entry(wholes[piece as usize]).or_default().entry(r).or_default() += w;
-        }
+    for (piece, whole) in pieces.iter().zip(wholes) {
+        let sums = instances.entry(*whole).or_default();
+        piece.iter().for_each(|&(k, w)| *sums.entry(k).or_default() += w);
     }
-    let profile = |masks: Vec<(u32, f64)>| Profile::new(masks, &unit_of, units, Place::default());
-    let agreement_of = |(piece, whole): (BTreeMap<u32, f64>, &i32)| {
-        let all = instances.get(whole).into_iter().flatten();
-        let others = all.map(|(r, w)| (*r, w - piece.get(r).unwrap_or(&0.0), *w));
+    let profile = |masks| Profile::new(masks, &unit_of, units, Place::default());
+    let agreement_of = |(piece, whole): (Vec<(u32, f64)>, &i32)| {
+        let own: BTreeMap<u32, f64> = piece.iter().copied().collect();
+        let others = instances[whole].iter().map(|(k, w)| (*k, w - own.get(k).unwrap_or(&0.0), *w));
         // What is left of nothing but rounding is nothing.
-        let rest = others.filter(|(_, left, w)| *left > 1e-9 * w).map(|(r, left, _)| (r, left)).collect();
-        agreement(&profile(piece.into_iter().collect()), &profile(rest), &unit_of)
+        let rest = others.filter(|(_, left, w)| *left > 1e-9 * w).map(|(k, left, _)| (k, left)).collect();
+        agreement(&profile(piece), &profile(rest), &unit_of)
     };
     Ok(pieces.into_par_iter().zip(wholes).map(agreement_of).collect())
 }
@@ -133,6 +136,20 @@ pub fn mask_weights(
         .collect()
 }
 
+/// The masks at `levels` that hold each of `instances` instances, as rows of the footprints, ascending, with its weight in them.
+fn masks_of(
+    labels: &[i32],
+    instances: usize,
+    footprints: &Footprints,
+    levels: &[Level],
+) -> Result<Vec<Vec<(u32, f64)>>> {
+    let mut masks = vec![Vec::new(); instances];
+    for (r, of) in mask_weights(labels, footprints, levels)? {
+        of.into_iter().filter(|(_, w)| *w > 0.0).for_each(|(k, w)| masks[k as usize].push((r, w)));
+    }
+    Ok(masks)
+}
+
 /// Joins instances, those that agree most first, until no two agree by `least` (more than a half) or more, or by [`IN_PLANE`] of it
 /// where their `places` lie in one plane. `labels` are those of the kept Gaussians, -1 for none. Returns the new number of each
 /// instance; numbers stay in order.
@@ -146,10 +163,7 @@ pub fn by_masks(
 ) -> Result<Vec<u32>> {
     let unit_of = units(footprints);
     let units = footprints.views.len() * artifacts::LEVELS;
-    let mut masks = vec![Vec::new(); instances];
-    for (r, of) in mask_weights(labels, footprints, levels)? {
-        of.into_iter().filter(|(_, w)| *w > 0.0).for_each(|(k, w)| masks[k as usize].push((r, w)));
-    }
+    let masks = masks_of(labels, instances, footprints, levels)?;
     let of_instance = |(masks, place)| Profile::new(masks, &unit_of, units, place);
     let mut profiles: Vec<Profile> = masks.into_iter().zip(places).map(of_instance).collect();
     Ok(join(&mut profiles, &unit_of, least))
@@ -168,7 +182,7 @@ fn join(profiles: &mut [Profile], unit_of: &[u32], least: f64) -> Vec<u32> {
     pairs.dedup();
     let of = |profiles: &[Profile], (a, b): (u32, u32)| {
         let (one, other) = (&profiles[a as usize], &profiles[b as usize]);
-        let agreement = agreement(one, other, unit_of);
+        let agreement = agreement(one, other, unit_of).unwrap_or(0.0);
         let eased = agreement >= IN_PLANE * least && one.place.in_plane_of(&other.place);
         ((a, b), if eased { agreement / IN_PLANE } else { agreement })
     };
@@ -219,9 +233,9 @@ mod tests {
     fn agreement_is_the_probability_of_one_mask() {
         let (a, b) = (profile(&[Some(1.0), Some(1.0), None]), profile(&[Some(0.75), Some(0.0), Some(1.0)]));
         // Views 0 and 1 count a third of b and half of a: equally.
-        assert!((agreement(&a, &b, &unit_of(3)) - 0.375).abs() < 1e-12);
+        assert!((agreement(&a, &b, &unit_of(3)).unwrap() - 0.375).abs() < 1e-12);
         let seen_once = profile(&[Some(1.0), None, None]);
-        assert_eq!(agreement(&a, &seen_once, &unit_of(3)), 0.0);
+        assert_eq!(agreement(&a, &seen_once, &unit_of(3)), None);
     }
 
     #[test]
@@ -230,9 +244,10 @@ mod tests {
         let views: [&[&[u32]]; 2] = [&[&[0, 1, 2, 3, 4]], &[&[0, 1, 4, 5], &[2, 3, 6, 7]]];
         let footprints = footprints(&views);
         let agreements = |levels| with_rest(&[0, 0, 1, 1, -1, -1, 2, 2], &[0, 0, 1], &footprints, levels).unwrap();
+        let half = |agreement: Option<f64>| (agreement.unwrap() - 0.5).abs() < 1e-12;
         let [a, b, alone] = agreements(&[Level::Large])[..] else { panic!("one for each piece") };
-        assert!((a - 0.5).abs() < 1e-12 && (b - 0.5).abs() < 1e-12 && alone == 0.0, "{a} {b} {alone}");
-        assert_eq!(agreements(&[Level::Medium]), [0.0; 3], "no masks");
+        assert!(half(a) && half(b) && alone.is_none(), "{a:?} {b:?} {alone:?}");
+        assert_eq!(agreements(&[Level::Medium]), [None; 3], "no masks");
     }
 
     #[test]
