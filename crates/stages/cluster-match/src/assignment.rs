@@ -119,9 +119,9 @@ impl Assignment {
         Ok(())
     }
 
-    /// The instances and those of `parts` in them that the large masks show apart from the rest more often, by [`APART`], than
-    /// the medium ones. SAM's largest mask of a place is the whole thing there: a part is alone in it no more often than in smaller ones.
-    /// Where either level says nothing of a part, it is not apart.
+    /// Pairs of an instance and one of `parts` in it that the large masks set apart: the probability that one of them holds the part and
+    /// the rest of the instance is lower, by [`APART`], than that of the medium masks. SAM's largest mask of a place is the whole thing
+    /// there. Where either level says nothing of a part, it is not apart.
     ///
     /// # Errors
     /// When the footprints can't be read.
