@@ -15,7 +15,7 @@ mod pairs;
 mod tests;
 mod tracks;
 
-use adjust::Bundle;
+use adjust::{Bundle, Slack};
 use detect::{Corners, LONGEST, detect};
 use glam::{DVec2, DVec3};
 use gs_io::Result;
@@ -72,12 +72,22 @@ pub(crate) fn find(views: &[&View], refine: bool, stage: &Stage) -> Result<Found
         return Ok(Found { points: sights.cloud(&points), cameras });
     }
     let lenses = lenses(&given);
+    let mut poses = Slack::widest(sights.depth(&cameras, &learns));
     for [slack, width] in ROUNDS {
         stage.go_on()?;
         let (mut points, _) = sights.placed(&cameras, &learns, slack);
         let free = sights.held(&points, &learns);
-        Bundle { cameras: &mut cameras, given: &given, lenses: &lenses, free: &free, points: &mut points, all: true }
-            .adjust(width);
+        Bundle {
+            cameras: &mut cameras,
+            given: &given,
+            lenses: &lenses,
+            free: &free,
+            points: &mut points,
+            slack: poses,
+            all: true,
+        }
+        .adjust(width);
+        poses = poses.learnt(&cameras, &given, &free);
     }
     let (mut points, after) = sights.placed(&cameras, &learns, 1.0);
     let cloud = sights.cloud(&points);
@@ -86,8 +96,16 @@ pub(crate) fn find(views: &[&View], refine: bool, stage: &Stage) -> Result<Found
     let others: Vec<bool> = learns.iter().map(|l| !l).collect();
     let free = sights.held(&points, &others);
     for [_, width] in ROUNDS {
-        Bundle { cameras: &mut cameras, given: &given, lenses: &lenses, free: &free, points: &mut points, all: false }
-            .adjust(width);
+        Bundle {
+            cameras: &mut cameras,
+            given: &given,
+            lenses: &lenses,
+            free: &free,
+            points: &mut points,
+            slack: poses,
+            all: false,
+        }
+        .adjust(width);
     }
     stage.info(&format!(
         "poses from {} corners, which they miss by {} in the median; those given missed {} by {}",
@@ -195,6 +213,14 @@ impl<'a> Sights<'a> {
         let errors: Vec<f64> = errors.collect();
         let spread = if errors.is_empty() { 0.0 } else { median(errors) };
         (points, spread)
+    }
+
+    /// The median distance of points from the cameras that show them; 0 without points.
+    fn depth(&self, cameras: &[Camera], of: &[bool]) -> f64 {
+        let (points, _) = self.placed(cameras, of, ROUNDS[0][0]);
+        let all = points.iter().flat_map(|p| p.seen.iter().map(|(s, _)| cameras[s.view].to_camera(p.place).z));
+        let all: Vec<f64> = all.collect();
+        if all.is_empty() { 0.0 } else { median(all) }
     }
 
     /// In how many of the points a view is.

@@ -11,11 +11,45 @@ use gs_scene::Camera;
 /// Steps of a round at most, and of the conjugate gradients within one.
 const STEPS: usize = 12;
 const INNER: usize = 60;
-/// How far poses are expected to be off: degrees, of the turn and of the shift seen from the scene. It holds the scene where the
-/// given poses have it, and weighs as one corner.
-const POSE: f64 = 5.0;
-/// The same of the logarithm of the focal lengths.
-const ZOOM: f64 = 0.05;
+/// By how much focal lengths are expected to be off.
+const ZOOM: f64 = 0.02;
+/// Median length of three numbers of a normal distribution, in its standard deviations.
+const MEDIAN_LENGTH: f64 = 1.538;
+
+/// A pose that is off by more than so many expected errors is held less and less (Cauchy): a few may be wrong where most are right.
+const WRONG: f64 = 3.0;
+
+/// How far the given poses are expected to be off, about and along each axis. An error of this size weighs as much as a corner that is
+/// off by [`EXACT`]. So the scene stays where the given poses have it, and poses that fit the corners stay as they are: where few corners are
+/// shared, other poses would fit these as well.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Slack {
+    /// Radians.
+    pub turn: f64,
+    /// World units.
+    pub shift: f64,
+}
+
+impl Slack {
+    /// Of poses of which nothing is known: five degrees, also seen from a scene so far away.
+    pub fn widest(depth: f64) -> Self {
+        let turn = 5f64.to_radians();
+        Self { turn, shift: turn * depth }
+    }
+
+    /// As far as the cameras of the views in `free` have moved, in the median; no more than `self`.
+    pub fn learnt(self, cameras: &[Camera], given: &[Camera], free: &[bool]) -> Self {
+        let of = |f: fn(&Camera, &Camera) -> f64| {
+            let moved = cameras.iter().zip(given).zip(free).filter(|(_, free)| **free);
+            let lengths: Vec<f64> = moved.map(|((c, g), _)| f(c, g)).collect();
+            (!lengths.is_empty()).then(|| median(lengths) / MEDIAN_LENGTH)
+        };
+        let turn = of(|c, g| turned_from(&g.rotation, &c.rotation).length());
+        let shift = of(|c, g| c.position().distance(g.position()));
+        let within = |found: Option<f64>, most: f64| found.map_or(most, |f| f.clamp(1e-3 * most, most));
+        Self { turn: within(turn, self.turn), shift: within(shift, self.shift) }
+    }
+}
 
 /// What moves, and what it moves from.
 pub(super) struct Bundle<'a> {
@@ -27,6 +61,8 @@ pub(super) struct Bundle<'a> {
     /// Views whose cameras move.
     pub free: &'a [bool],
     pub points: &'a mut [Point],
+    /// By how much the given poses are expected to be off.
+    pub slack: Slack,
     /// Whether points and focal lengths move, too.
     pub all: bool,
 }
@@ -59,22 +95,13 @@ struct System {
 impl Bundle<'_> {
     /// Moves everything to a better fit; corners farther off than `width` limits count less and less (Cauchy).
     pub fn adjust(&mut self, width: f64) {
-        let depths: Vec<f64> = self
-            .points
-            .iter()
-            .flat_map(|p| p.seen.iter().map(|(s, _)| self.cameras[s.view].to_camera(p.place).z))
-            .collect();
-        if depths.is_empty() {
-            return;
-        }
-        let depth = median(depths);
         let mut damping = 1e-4;
-        let mut cost = self.cost(self.cameras, self.points, width, depth);
+        let mut cost = self.cost(self.cameras, self.points, width);
         for _ in 0..STEPS {
-            let system = self.system(width, depth, damping);
+            let system = self.system(width, damping);
             let step = system.solve(self, damping);
             let (cameras, points) = self.stepped(&system, &step);
-            let now = self.cost(&cameras, &points, width, depth);
+            let now = self.cost(&cameras, &points, width);
             if now < cost {
                 let done = cost - now < 1e-4 * cost;
                 self.cameras.clone_from_slice(&cameras);
@@ -98,14 +125,17 @@ impl Bundle<'_> {
     }
 
     /// How far a camera is from where it was given, in expected errors: turn, shift, logarithm of the focal length.
-    fn off(&self, c: &Camera, view: usize, depth: f64) -> (DVec3, DVec3, f64) {
+    fn off(&self, c: &Camera, view: usize) -> (DVec3, DVec3, f64) {
         let given = &self.given[view];
-        let size = POSE.to_radians();
         let shift = c.rotation * (c.position() - given.position());
-        (turned_from(&given.rotation, &c.rotation) / size, shift / (size * depth), (c.fx / given.fx).ln() / ZOOM)
+        (
+            turned_from(&given.rotation, &c.rotation) / self.slack.turn,
+            shift / self.slack.shift,
+            (c.fx / given.fx).ln() / ZOOM,
+        )
     }
 
-    fn cost(&self, cameras: &[Camera], points: &[Point], width: f64, depth: f64) -> f64 {
+    fn cost(&self, cameras: &[Camera], points: &[Point], width: f64) -> f64 {
         let mut sum = 0.0;
         for p in points {
             for (s, at) in &p.seen {
@@ -116,8 +146,8 @@ impl Bundle<'_> {
         }
         let mut seen = vec![false; self.count_lenses()];
         for (v, c) in cameras.iter().enumerate().filter(|(v, _)| self.free[*v]) {
-            let (turn, shift, zoom) = self.off(c, v, depth);
-            sum += turn.length_squared() + shift.length_squared();
+            let (turn, shift, zoom) = self.off(c, v);
+            sum += WRONG * WRONG * ((turn.length_squared() + shift.length_squared()) / (WRONG * WRONG)).ln_1p();
             if self.all && !std::mem::replace(&mut seen[self.lenses[v]], true) {
                 sum += zoom * zoom;
             }
@@ -125,7 +155,7 @@ impl Bundle<'_> {
         sum
     }
 
-    fn system(&self, width: f64, depth: f64, damping: f64) -> System {
+    fn system(&self, width: f64, damping: f64) -> System {
         let (views, lenses) = (self.cameras.len(), self.count_lenses());
         let mut s = System {
             rows: Vec::new(),
@@ -136,15 +166,16 @@ impl Bundle<'_> {
             blocks: vec![[[0.0; 6]; 6]; views],
             of_lenses: vec![0.0; lenses],
         };
-        let size = POSE.to_radians();
+        let Slack { turn: about, shift: along } = self.slack;
         for (v, c) in self.cameras.iter().enumerate().filter(|(v, _)| self.free[*v]) {
-            let (turn, shift, zoom) = self.off(c, v, depth);
+            let (turn, shift, zoom) = self.off(c, v);
+            let weight = 1.0 / (1.0 + (turn.length_squared() + shift.length_squared()) / (WRONG * WRONG));
             for k in 0..3 {
-                s.prior[6 * v + k] = 1.0 / (size * size);
-                s.pull[6 * v + k] = turn[k] / size;
-                s.prior[6 * v + 3 + k] = 1.0 / (size * depth).powi(2);
+                s.prior[6 * v + k] = weight / (about * about);
+                s.pull[6 * v + k] = weight * turn[k] / about;
+                s.prior[6 * v + 3 + k] = weight / (along * along);
                 // A shift of the world's points is one of the camera the other way.
-                s.pull[6 * v + 3 + k] = -shift[k] / (size * depth);
+                s.pull[6 * v + 3 + k] = -weight * shift[k] / along;
             }
             let lens = 6 * views + self.lenses[v];
             if self.all {
