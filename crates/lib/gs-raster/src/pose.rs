@@ -26,6 +26,8 @@ pub struct CameraGradient {
     /// By the logarithm of the focal lengths. Gaussians so far beside the image that the Jacobian is clamped count as if it
     /// were not.
     pub zoom: f64,
+    /// Mean depth of the Gaussians that have a gradient, world units; 0 without any.
+    pub depth: f64,
 }
 
 impl CameraGradient {
@@ -35,6 +37,7 @@ impl CameraGradient {
             self.shift[k] += o.shift[k];
         }
         self.zoom += o.zoom;
+        self.depth += o.depth;
         self
     }
 
@@ -65,15 +68,17 @@ pub fn camera_gradient(
     };
     // A Gaussian that is not drawn has no gradient, and its parameters may not be finite.
     let moves = |i: &usize| gradients.mean2d[*i] != [0.0; 2] || gradients.means[*i] != [0.0; 3];
-    let sums: Vec<CameraGradient> = (0..g.len().div_ceil(CHUNK))
+    let sums: Vec<(CameraGradient, u32)> = (0..g.len().div_ceil(CHUNK))
         .into_par_iter()
         .map(|k| (k * CHUNK..g.len().min((k + 1) * CHUNK)).filter(moves).map(one))
-        .map(|parts| parts.fold(CameraGradient::default(), |sum, p| sum.add(&p)))
+        .map(|parts| parts.fold(Default::default(), |(sum, n): (CameraGradient, u32), p| (sum.add(&p), n + 1)))
         .collect();
-    sums.iter().fold(CameraGradient::default(), CameraGradient::add)
+    let count: u32 = sums.iter().map(|(_, n)| n).sum();
+    let sum = sums.iter().fold(CameraGradient::default(), |sum, (part, _)| sum.add(part));
+    CameraGradient { depth: sum.depth / f64::from(count.max(1)), ..sum }
 }
 
-/// One Gaussian's part. `d_own` is d loss / d its parameters, `d_color` d loss / d its colour, `d_mean` d loss / d its projected
+/// One Gaussian's part, with its depth. `d_own` is d loss / d its parameters, `d_color` d loss / d its colour, `d_mean` d loss / d its projected
 /// centre.
 fn part<T: Copy + Into<f64>>(
     own: &Parameters,
@@ -106,7 +111,7 @@ fn part<T: Copy + Into<f64>>(
     let shift = camera.rotation * d_center;
     let off = [camera.fx * t.x / t.z, camera.fy * t.y / t.z];
     let zoom = d_mean[0] * off[0] + d_mean[1] * off[1] + d_a + d_b + d_c;
-    CameraGradient { turn: turn.to_array(), shift: shift.to_array(), zoom }
+    CameraGradient { turn: turn.to_array(), shift: shift.to_array(), zoom, depth: t.z }
 }
 
 #[cfg(test)]

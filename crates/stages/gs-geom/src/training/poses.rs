@@ -1,7 +1,9 @@
 //! Cameras that are refined with the scene: a pose for each view, a focal length for each lens.
 //!
-//! A step turns and shifts the camera in its own axes by what Adam makes of [`gs_raster::camera_gradient`]. The scene's own
-//! steps are many times smaller than its poses' errors, and so it holds them all where they are.
+//! A step turns and shifts the camera by what Adam makes of [`gs_raster::camera_gradient`]. It turns about the point on its axis that is as
+//! far away as the scene: about its own centre, a turn would move the picture almost as a shift does, and Adam, which scales each number by
+//! itself, would hardly tell the two apart. The scene's own steps are many times smaller than its poses' errors, and so it holds them
+//! all where they are.
 
 use glam::{DMat3, DQuat, DVec3};
 use gs_raster::CameraGradient;
@@ -20,7 +22,7 @@ pub struct PoseRates {
     pub turn: f64,
     /// The same at the end of the run, exponential between.
     pub turn_end: f64,
-    /// Of the logarithm of the focal lengths, in turns.
+    /// Of the logarithm of the focal lengths, in turns: a lens moves with each of its views.
     pub zoom: f64,
     /// Share of the run in which the rates grow from 0: the scene must show something first.
     pub warm_up: f64,
@@ -28,7 +30,7 @@ pub struct PoseRates {
 
 impl Default for PoseRates {
     fn default() -> Self {
-        Self { turn: 2e-3, turn_end: 1e-4, zoom: 0.3, warm_up: 0.05 }
+        Self { turn: 2e-3, turn_end: 1e-4, zoom: 0.1, warm_up: 0.05 }
     }
 }
 
@@ -118,13 +120,15 @@ impl Moment {
     /// The pose after a step of `rate` radians, and as many extents.
     pub fn step(&mut self, pose: &[f64; NUMBERS], g: &CameraGradient, rate: f64, extent: f64) -> [f64; NUMBERS] {
         self.steps = self.steps.saturating_add(1);
-        let gradient = [g.turn, g.shift].concat();
+        let pivot = g.depth * DVec3::Z;
+        let turn = DVec3::from(g.turn) - pivot.cross(DVec3::from(g.shift));
+        let gradient = [turn.to_array(), g.shift].concat();
         let by: [f64; MOVES] =
             std::array::from_fn(|k| -rate * adam(&mut self.first[k], &mut self.second[k], gradient[k], self.steps));
         let [w, x, y, z, tx, ty, tz] = *pose;
         let turn = DQuat::from_scaled_axis(DVec3::new(by[0], by[1], by[2]));
         let q = (turn * DQuat::from_xyzw(x, y, z, w)).normalize();
-        let t = turn * DVec3::new(tx, ty, tz) + extent * DVec3::new(by[3], by[4], by[5]);
+        let t = turn * (DVec3::new(tx, ty, tz) - pivot) + pivot + extent * DVec3::new(by[3], by[4], by[5]);
         [q.w, q.x, q.y, q.z, t.x, t.y, t.z]
     }
 }
@@ -185,7 +189,7 @@ mod tests {
         let rates = PoseRates { warm_up: 0.0, ..PoseRates::default() };
         poses.step(0, 0, &CameraGradient { zoom: f64::NAN, ..CameraGradient::default() }, &rates, 0.0, 2.0);
         assert_eq!(poses, before);
-        let g = CameraGradient { turn: [0.0, 5.0, 0.0], shift: [0.0, 0.0, -3.0], zoom: 1.0 };
+        let g = CameraGradient { turn: [0.0, 5.0, 0.0], shift: [0.0, 0.0, -3.0], zoom: 1.0, depth: 0.0 };
         poses.step(0, 0, &g, &rates, 0.0, 2.0);
         let expected = moved(
             &begun,
@@ -194,6 +198,18 @@ mod tests {
             -rates.turn * rates.zoom,
         );
         assert!(close(&poses.camera(0, 0, &given), &expected));
+    }
+
+    #[test]
+    fn a_turn_leaves_what_is_in_the_middle_in_place() {
+        let given = camera();
+        let middle = given.rotation.transpose() * (DVec3::new(0.0, 0.0, 1.5) - given.translation);
+        let mut poses = Poses::new(std::slice::from_ref(&given), std::slice::from_ref(&given), &[0]);
+        let g = CameraGradient { turn: [0.0, 5.0, 0.0], depth: 1.5, ..CameraGradient::default() };
+        poses.step(0, 0, &g, &PoseRates { warm_up: 0.0, ..PoseRates::default() }, 0.0, 2.0);
+        let after = poses.camera(0, 0, &given);
+        assert!(after.to_camera(middle).distance(DVec3::new(0.0, 0.0, 1.5)) < 1e-12);
+        assert!(turned_from(&given.rotation, &after.rotation).y < -1e-3);
     }
 
     #[test]
