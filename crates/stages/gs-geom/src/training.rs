@@ -77,11 +77,10 @@ impl Recipe {
     }
 }
 
-/// Steps that align the held-out views' cameras before they are measured, in the course of the run and at its end, and the first and last of
-/// their rates, in radians and extents.
-const ALIGN_STEPS: u32 = 8;
-const ALIGN_LAST: u32 = 60;
-const ALIGN_RATES: [f64; 2] = [5e-4, 2e-5];
+/// How the cameras of held-out views are aligned before they are measured, in the course of the run and at its end: divisor of the pictures,
+/// steps, and the first and last of their rates, in radians and extents. Small pictures also bring back what is far off.
+const ALIGN: [(u32, u32, [f64; 2]); 1] = [(1, 3, [5e-4, 1e-4])];
+const ALIGN_LAST: [(u32, u32, [f64; 2]); 3] = [(4, 40, [4e-3, 1e-3]), (2, 40, [2e-3, 4e-4]), (1, 60, [1e-3, 2e-5])];
 
 /// Where the time of an optimisation went.
 #[derive(Debug, Clone, Copy, Default, PartialEq)]
@@ -272,12 +271,13 @@ impl<'a> Trainer<'a> {
 
     /// Brings the held-out views' cameras to where the scene as it is shows their photographs best: the scene holds the poses of
     /// the views that it learnt from, and others are off by as much as those were.
-    fn align(&mut self, steps: u32) -> Result<()> {
+    fn align(&mut self, divisor: u32, steps: u32, rates: [f64; 2]) -> Result<()> {
         if self.recipe.poses.is_none() {
             return Ok(());
         }
         let Recipe { alpha, background, .. } = self.recipe;
         let options = self.heldout_options();
+        self.heldout.set_divisor(divisor)?;
         for i in 0..self.heldout.len() {
             let view = self.train.len() + i;
             let target = self.heldout.target(i, metrics::behind(alpha, background))?;
@@ -302,8 +302,7 @@ impl<'a> Trainer<'a> {
                 self.workspace.backward(gaussians, &camera, &options, pixels);
                 let g = camera_gradient(gaussians, &self.workspace.gradients, &camera, &options);
                 if g.is_finite() {
-                    let rate =
-                        ALIGN_RATES[0] * (ALIGN_RATES[1] / ALIGN_RATES[0]).powf(f64::from(step) / f64::from(steps));
+                    let rate = rates[0] * (rates[1] / rates[0]).powf(f64::from(step) / f64::from(steps));
                     let pose = &mut self.state.poses.views[view];
                     *pose = moment.step(pose, &g, rate, self.extent);
                 }
@@ -380,7 +379,10 @@ impl<'a> Trainer<'a> {
         if line["iteration"] != iteration || line.get("psnr_heldout").is_some() {
             return Ok(());
         }
-        self.align(if iteration == total { ALIGN_LAST } else { ALIGN_STEPS })?;
+        let rounds = if iteration == total { &ALIGN_LAST[..] } else { &ALIGN };
+        for &(divisor, steps, rates) in rounds {
+            self.align(divisor, steps, rates)?;
+        }
         if let Some(psnr) = self.heldout()?.psnr {
             self.last_heldout = Some(psnr);
             line["psnr_heldout"] = json!(psnr);

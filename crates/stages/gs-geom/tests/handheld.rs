@@ -15,13 +15,13 @@ use std::path::Path;
 
 const VIEWS: usize = 16;
 
-/// The ring's cameras, shaken by about half a degree and a hundredth.
+/// The ring's cameras, shaken by about a degree and two hundredths.
 fn shaken() -> Vec<Camera> {
     let off = |i: usize, k: usize| (7.3 * (3 * i + k) as f64).sin();
     let shake = |(i, c): (usize, Camera)| {
-        let turn = 0.008 * DVec3::new(off(i, 0), off(i, 1), off(i, 2));
+        let turn = 0.02 * DVec3::new(off(i, 0), off(i, 1), off(i, 2));
         let rotation = glam::DMat3::from_quat(glam::DQuat::from_scaled_axis(turn)) * c.rotation;
-        let translation = c.translation + 0.01 * DVec3::new(off(i, 3), off(i, 4), off(i, 5));
+        let translation = c.translation + 0.02 * DVec3::new(off(i, 3), off(i, 4), off(i, 5));
         Camera { rotation, translation, ..c }
     };
     ring(VIEWS).into_iter().enumerate().map(shake).collect()
