@@ -319,20 +319,25 @@ impl Peer for Options {
 
     fn make(&self, world: &World, stage: &Stage) -> Result<Product> {
         let (n, dim) = (world.kept(), world.dim());
-        if n == 0 || dim == 0 {
-            return Err(Error::new("no Gaussian is seen, or features without dimension")
-                .file(&self.inputs.masks)
+        if n == 0 {
+            return Err(Error::new("no Gaussian is seen")
+                .file(&self.inputs.footprints)
                 .hint("run graph-precompute again with views that show the scene"));
         }
         let lifted = Lifted::read(world)?;
-        let mut rng = ChaCha8Rng::seed_from_u64(stage.seed());
-        let (columns, mut semantics) = principal(&lifted.means(dim), dim, self.dimensions, &mut rng);
+        let (columns, mut semantics) = if dim == 0 {
+            stage.warn("masks without features: pairs are proposed by positions alone");
+            (0, Vec::new())
+        } else {
+            let mut rng = ChaCha8Rng::seed_from_u64(stage.seed());
+            principal(&lifted.means(dim), dim, self.dimensions, &mut rng)
+        };
         scale(&mut semantics, columns, 1.0);
         let means = &world.geometry.gaussians.means;
         let mut positions: Vec<f32> = world.footprints.kept.iter().flat_map(|&i| means[i as usize]).collect();
         scale(&mut positions, 3, f64::from(self.position_scale));
-        let rows = semantics.chunks_exact(columns).zip(positions.chunks_exact(3));
-        let points: Vec<f32> = rows.flat_map(|(s, p)| s.iter().chain(p).copied()).collect();
+        let row = |i: usize| semantics[i * columns..][..columns].iter().chain(&positions[3 * i..][..3]).copied();
+        let points: Vec<f32> = (0..n).flat_map(row).collect();
         let pairs = candidates(&points, columns + 3, self.neighbours);
         let affinities: Vec<f64> = pairs.par_iter().map(|&(a, b)| affinity(lifted.of(a), lifted.of(b))).collect();
         let (mut labels, instances) = tree(n, &pairs, &affinities, self);
