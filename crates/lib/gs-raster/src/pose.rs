@@ -78,8 +78,8 @@ pub fn camera_gradient(
     CameraGradient { depth: sum.depth / f64::from(count.max(1)), ..sum }
 }
 
-/// One Gaussian's part, with its depth. `d_own` is d loss / d its parameters, `d_color` d loss / d its colour, `d_mean` d loss / d its projected
-/// centre.
+/// One Gaussian's part, with its depth. `d_own` is d loss / d its parameters, `d_color` d loss / d its colour, `d_mean` d loss / d
+/// its projected centre.
 fn part<T: Copy + Into<f64>>(
     own: &Parameters,
     sh: &[T],

@@ -72,22 +72,17 @@ pub(crate) fn find(views: &[&View], refine: bool, stage: &Stage) -> Result<Found
         return Ok(Found { points: sights.cloud(&points), cameras });
     }
     let lenses = lenses(&given);
-    let mut poses = Slack::widest(sights.depth(&cameras, &learns));
+    let fit = |cameras: &mut [Camera], points: &mut [Point], free: &[bool], slack: Slack, width: f64, all: bool| {
+        Bundle { cameras, given: &given, lenses: &lenses, free, points, slack, all }.adjust(width);
+    };
+    let mut off = None;
     for [slack, width] in ROUNDS {
         stage.go_on()?;
         let (mut points, _) = sights.placed(&cameras, &learns, slack);
         let free = sights.held(&points, &learns);
-        Bundle {
-            cameras: &mut cameras,
-            given: &given,
-            lenses: &lenses,
-            free: &free,
-            points: &mut points,
-            slack: poses,
-            all: true,
-        }
-        .adjust(width);
-        poses = poses.learnt(&cameras, &given, &free);
+        let expected = off.unwrap_or_else(|| Slack::widest(depth(&points, &cameras)));
+        fit(&mut cameras, &mut points, &free, expected, width, true);
+        off = Some(expected.learnt(&cameras, &given, &free));
     }
     let (mut points, after) = sights.placed(&cameras, &learns, 1.0);
     let cloud = sights.cloud(&points);
@@ -95,17 +90,9 @@ pub(crate) fn find(views: &[&View], refine: bool, stage: &Stage) -> Result<Found
     sights.show(&mut points, &learns);
     let others: Vec<bool> = learns.iter().map(|l| !l).collect();
     let free = sights.held(&points, &others);
+    let expected = off.expect("one round at least");
     for [_, width] in ROUNDS {
-        Bundle {
-            cameras: &mut cameras,
-            given: &given,
-            lenses: &lenses,
-            free: &free,
-            points: &mut points,
-            slack: poses,
-            all: false,
-        }
-        .adjust(width);
+        fit(&mut cameras, &mut points, &free, expected, width, false);
     }
     stage.info(&format!(
         "poses from {} corners, which they miss by {} in the median; those given missed {} by {}",
@@ -215,14 +202,6 @@ impl<'a> Sights<'a> {
         (points, spread)
     }
 
-    /// The median distance of points from the cameras that show them; 0 without points.
-    fn depth(&self, cameras: &[Camera], of: &[bool]) -> f64 {
-        let (points, _) = self.placed(cameras, of, ROUNDS[0][0]);
-        let all = points.iter().flat_map(|p| p.seen.iter().map(|(s, _)| cameras[s.view].to_camera(p.place).z));
-        let all: Vec<f64> = all.collect();
-        if all.is_empty() { 0.0 } else { median(all) }
-    }
-
     /// In how many of the points a view is.
     fn count(&self, points: &[Point], view: usize) -> usize {
         points.iter().filter(|p| p.seen.iter().any(|(s, _)| s.view == view)).count()
@@ -262,6 +241,13 @@ impl<'a> Sights<'a> {
 fn roll(c: &Camera, up: DVec3) -> f64 {
     let up = c.rotation * up.normalize_or_zero();
     if up.truncate().length() < 0.3 { 0.0 } else { up.x.atan2(-up.y) }
+}
+
+/// The median distance of points from the cameras that show them; 0 without points.
+fn depth(points: &[Point], cameras: &[Camera]) -> f64 {
+    let all = points.iter().flat_map(|p| p.seen.iter().map(|(s, _)| cameras[s.view].to_camera(p.place).z));
+    let all: Vec<f64> = all.collect();
+    if all.is_empty() { 0.0 } else { median(all) }
 }
 
 /// The middle of the values; of an even number the upper one.

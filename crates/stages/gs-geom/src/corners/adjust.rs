@@ -147,7 +147,7 @@ impl Bundle<'_> {
         let mut seen = vec![false; self.count_lenses()];
         for (v, c) in cameras.iter().enumerate().filter(|(v, _)| self.free[*v]) {
             let (turn, shift, zoom) = self.off(c, v);
-            sum += WRONG * WRONG * ((turn.length_squared() + shift.length_squared()) / (WRONG * WRONG)).ln_1p();
+            sum += WRONG * WRONG * wrong(turn, shift).ln_1p();
             if self.all && !std::mem::replace(&mut seen[self.lenses[v]], true) {
                 sum += zoom * zoom;
             }
@@ -169,7 +169,7 @@ impl Bundle<'_> {
         let Slack { turn: about, shift: along } = self.slack;
         for (v, c) in self.cameras.iter().enumerate().filter(|(v, _)| self.free[*v]) {
             let (turn, shift, zoom) = self.off(c, v);
-            let weight = 1.0 / (1.0 + (turn.length_squared() + shift.length_squared()) / (WRONG * WRONG));
+            let weight = 1.0 / (1.0 + wrong(turn, shift));
             for k in 0..3 {
                 s.prior[6 * v + k] = weight / (about * about);
                 s.pull[6 * v + k] = weight * turn[k] / about;
@@ -254,6 +254,11 @@ impl Bundle<'_> {
         }
         (cameras, points)
     }
+}
+
+/// The square of how far a pose is off, in expected errors, over that of [`WRONG`].
+fn wrong(turn: DVec3, shift: DVec3) -> f64 {
+    (turn.length_squared() + shift.length_squared()) / (WRONG * WRONG)
 }
 
 impl Row {
