@@ -241,7 +241,7 @@ pub(crate) fn artifact() -> Vec<Vec<u8>> {
         seen_views: vec![1, 0, 2, 1],
         seen_weight: vec![0.5, 0.0, 1.0, 2.0],
     };
-    let features = Features { kept: vec![0, 2, 3], values: Array2::from_elem((3, 2), 0.5), ..Features::default() };
+    let features = Features { kept: vec![0, 2, 3], values: Array2::from_elem((3, 2), 0.5) };
     let descriptors = Descriptors { kept: vec![0, 3], row: vec![1, 0], values: Array3::from_elem((2, 2, 2), 0.5) };
     let row = Row { view: 0, level: 3, mask: 1, pixels: 9, gated: 8, alpha: 0.9 };
     let footprints = FootprintsBuilder {

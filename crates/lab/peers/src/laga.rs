@@ -9,7 +9,7 @@
 //! score of an object for a text is the best of weight times relevance.
 //!
 //! The affinity features are those of `feat-train`. The code trains 16 + 8 + 8 numbers for three levels, of which the coarsest
-//! level uses the first 16; here level small alone has the features of parts beside the others. A prototype is the
+//! level uses the first 16; here all levels have the same features. A prototype is the
 //! mean over the footprint; the code brings the features of pixels to unit length before. Footprints hold no masks of less than
 //! 0.1 % of the image, where the code drops those of up to 400 pixels, 0.06 %.
 //!
@@ -103,7 +103,7 @@ impl Peer for Options {
         levels.dedup();
         let mut all = Vec::new();
         for (rank, &level) in levels.iter().enumerate() {
-            let (dim, mut features) = affinity(&world.learned, level == Level::Small);
+            let (dim, mut features) = (world.learned.dim(), affinity(&world.learned));
             if self.smooth > 0 {
                 features = smoothed(&features, dim, &world.graph.gaussian_knn, self.smooth as usize);
             }
@@ -183,18 +183,10 @@ fn mean(features: &[Vec<f32>], dim: usize) -> Vec<f32> {
     normed(&sum)
 }
 
-/// Unit affinity features and their dimension: the features, with `parts` those of parts beside them, each half of unit length.
-fn affinity(learned: &Features, parts: bool) -> (usize, Vec<f32>) {
-    let parts = if parts { learned.parts.ncols() } else { 0 };
-    let dim = learned.dim() + parts;
-    let rows = (0..learned.kept.len()).into_par_iter().flat_map_iter(|i| {
-        let mut all = wide(&normed(&wide(flat(learned.row(i)))));
-        if parts > 0 {
-            all.extend(wide(&normed(&wide(flat(learned.parts.row(i))))));
-        }
-        normed(&all)
-    });
-    (dim, rows.collect())
+/// Unit affinity features.
+fn affinity(learned: &Features) -> Vec<f32> {
+    let row = |i: usize| normed(&wide(flat(learned.row(i))));
+    (0..learned.kept.len()).into_par_iter().flat_map_iter(row).collect()
 }
 
 /// Unit mean of the features over a mask's weights; none where it is zero.
@@ -386,13 +378,8 @@ mod tests {
     }
 
     #[test]
-    fn features_of_parts_stand_beside_those_of_things() {
-        let features = Features { kept: vec![0], values: arr2(&[[3.0, 4.0]]), parts: arr2(&[[-7.0]]) };
-        assert_eq!(affinity(&features, false), (2, vec![0.6, 0.8]));
+    fn features_are_smoothed_over_neighbours() {
         let half = 0.5f32.sqrt();
-        let (dim, all) = affinity(&features, true);
-        assert_eq!(dim, 3);
-        all.iter().zip([0.6 * half, 0.8 * half, -half]).for_each(|(a, b)| assert!((a - b).abs() < 1e-6));
         // Three in a row, each with the first of its neighbours: (1, 0) + (0, 1) twice, (0, 1) alone.
         let smoothed = smoothed(&[1.0, 0.0, 0.0, 1.0, 0.0, 1.0], 2, &arr2(&[[1], [0], [1]]), 2);
         smoothed.iter().zip([half, half, half, half, 0.0, 1.0]).for_each(|(a, b)| assert!((a - b).abs() < 1e-6));

@@ -90,7 +90,7 @@ impl Peer for Options {
         // As they are shown: 0 to 1.
         let values = features.iter().map(|f| (f + 1.0) / 2.0).collect();
         let values = Array2::from_shape_vec(world.learned.values.dim(), values).expect("as many");
-        let shown = Features { kept: world.learned.kept.clone(), values, ..Features::default() };
+        let shown = Features { kept: world.learned.kept.clone(), values };
         let means = &world.geometry.gaussians.means;
         let places: Vec<[f32; 3]> = shown.kept.iter().map(|&i| means[i as usize]).collect();
         let mut rng = ChaCha8Rng::seed_from_u64(stage.seed());

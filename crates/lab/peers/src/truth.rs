@@ -94,7 +94,7 @@ fn nearest_mean(features: &[f32], dim: usize, truth: &[i32], things: usize) -> V
 fn one_hot(kept: &[u32], truth: &[i32], things: usize) -> Features {
     let value = |(i, thing)| if truth[i] == thing as i32 { 1.0 } else { 0.0 };
     let values = Array2::from_shape_fn((kept.len(), things.max(1)), value);
-    Features { kept: kept.to_vec(), values, ..Features::default() }
+    Features { kept: kept.to_vec(), values }
 }
 
 #[cfg(test)]

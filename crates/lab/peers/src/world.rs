@@ -227,7 +227,7 @@ impl World {
     pub fn matches(&self, labels: &[i32], threshold: f32) -> Result<Vec<Match>> {
         // Features that are all alike leave the IoU alone.
         let values = Array2::ones((self.kept(), 1));
-        let alike = Features { kept: self.footprints.kept.clone(), values, ..Features::default() };
+        let alike = Features { kept: self.footprints.kept.clone(), values };
         let table = FeatureTable::new(&alike, self.gaussians());
         let mut all = Vec::new();
         for view in 0..self.views.len() {

@@ -13,9 +13,6 @@ pub struct Features {
     pub kept: Vec<u32>,
     /// `[n][dim]`, finite.
     pub values: Array2<f32>,
-    /// Features that tell parts and small things apart, from the masks of level small; of each Gaussian one, finite. No
-    /// columns where there are none.
-    pub parts: Array2<f32>,
 }
 
 impl Features {
@@ -29,11 +26,7 @@ impl Features {
         provenance.version = Self::VERSION;
         let n = self.kept.len();
         let writer = ArtifactWriter::new(provenance).tensor("kept", &[n], &self.kept);
-        let writer = writer.tensor("features", &[n, self.dim()], flat(self.values.view()));
-        match self.parts.ncols() {
-            0 => writer.write(path),
-            dim => writer.tensor("parts", &[n, dim], flat(self.parts.view())).write(path),
-        }
+        writer.tensor("features", &[n, self.dim()], flat(self.values.view())).write(path)
     }
 
     /// Reads and checks the artifact.
@@ -42,12 +35,11 @@ impl Features {
     /// When the file is damaged, tensors do not fit together, or a feature is not finite.
     pub fn read(path: impl AsRef<Path>) -> Result<(Self, Artifact)> {
         // Left in the file, to be in memory once.
-        let a = Artifact::open_leaving(path, Self::FORMAT, Self::VERSION, &["features", "parts"])?;
+        let a = Artifact::open_leaving(path, Self::FORMAT, Self::VERSION, &["features"])?;
         let kept = a.tensor::<u32>("kept", &[None])?.to_vec();
         check_kept(&a, &kept, usize::MAX)?;
         let values = finite(&a, "features", kept.len())?;
-        let parts = if a.has("parts") { finite(&a, "parts", kept.len())? } else { Array2::default((kept.len(), 0)) };
-        Ok((Self { kept, values, parts }, a))
+        Ok((Self { kept, values }, a))
     }
 
     /// Feature of the kept Gaussian at `position`.

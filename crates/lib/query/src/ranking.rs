@@ -270,7 +270,7 @@ mod tests {
         let mut i = instances();
         i.label = vec![0, 1, 3, 3, -1];
         let values = arr2(&[[1.0, 0.0], [0.9, 0.3], [-2.0, 0.1], [-1.0, 0.0], [0.0, 0.0]]);
-        let f = Features { kept: vec![0, 1, 2, 3, 4], values, ..Features::default() };
+        let f = Features { kept: vec![0, 1, 2, 3, 4], values };
         let ranking = rank(&[1.0, 0.0]);
         assert_eq!(Join::new(&i, &f, 0.9).extend(&ranking, 0, &[0]), [0, 1]);
         assert_eq!(Join::new(&i, &f, 0.1).extend(&ranking, 0, &[0]), [0]);

@@ -1,8 +1,9 @@
 //! Which Gaussian belongs to which instance, from the clustering to the last correction.
 
 use crate::group::tree;
-use crate::join::{by_masks, with_rest};
+use crate::linkage::Linkage;
 use crate::plane::Place;
+use crate::profile::{Profile, units, with_rest};
 use crate::vote::by_votes;
 use artifacts::{Footprints, Graph, Level, TreeEdge};
 use gs_io::{Error, Result};
@@ -97,7 +98,7 @@ impl Assignment {
         Ok(changed)
     }
 
-    /// Joins instances that the masks show as one with a probability of at least `least` ([`by_masks`]).
+    /// Joins instances that the masks show as one with a probability of at least `least` ([`Linkage`]).
     ///
     /// # Errors
     /// When the footprints can't be read.
@@ -111,9 +112,14 @@ impl Assignment {
     ) -> Result<()> {
         let labels = self.of_kept(kept);
         let places = Place::of_instances(gaussians, kept, &labels, self.instances);
-        let number = by_masks(&labels, self.instances, footprints, levels, least, places)?;
-        self.instances = number.iter().max().map_or(0, |&n| n as usize + 1);
-        let renumber = |l: &mut i32| *l = usize::try_from(*l).map_or(*l, |k| number[k] as i32);
+        let (profiles, unit_of) =
+            (Profile::of_instances(&labels, self.instances, footprints, levels)?, units(footprints));
+        let mut linkage = Linkage::new(profiles, &[], &unit_of);
+        linkage.meet(places);
+        linkage.join(least, usize::MAX, (0.0, f64::MAX));
+        let (number, instances) = linkage.labels();
+        self.instances = instances;
+        let renumber = |l: &mut i32| *l = usize::try_from(*l).map_or(*l, |k| number[k]);
         self.labels.iter_mut().for_each(renumber);
         self.tree.iter_mut().for_each(|e| renumber(&mut e.instance));
         Ok(())

@@ -291,7 +291,7 @@ mod tests {
     fn instances_match_the_masks_they_are_seen_as() {
         let (g, camera) = scene();
         let values = arr2(&[[1.0, 0.0], [0.0, 1.0], [-1.0, 0.2]]);
-        let features = Features { kept: vec![0, 1, 2], values, ..Features::default() };
+        let features = Features { kept: vec![0, 1, 2], values };
         let table = FeatureTable::new(&features, 3);
         let o = overlaps(&g, &RasterOptions::default(), &[0, 1, 2], &table, &camera, &maps(), &[Level::Large]);
         assert_eq!(o.masks[&3].area + o.masks[&4].area, (W * H) as u32);
@@ -321,7 +321,7 @@ mod tests {
         // Half transparent, so that silhouettes have shades.
         g.opacity_logits = vec![2.5, 2.0, 1.5];
         let values = arr2(&[[1.0, 2.0, 0.5], [-1.0, 3.0, 0.25]]);
-        let features = Features { kept: vec![0, 2], values, ..Features::default() };
+        let features = Features { kept: vec![0, 2], values };
         let all = [1.0, 2.0, 0.5, 0.0, 0.0, 0.0, -1.0, 3.0, 0.25];
         let (labels, maps, levels) = ([0, -1, 0], maps(), [Level::Default, Level::Small]);
         let table = FeatureTable::new(&features, 3);

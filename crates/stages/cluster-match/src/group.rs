@@ -1,6 +1,5 @@
 //! Clustering of Gaussians by their features.
 
-use crate::options::Space;
 use artifacts::{Graph, TreeEdge, flat};
 use hdbscan_exact::{Clustering, Edge, Options, cluster, cluster_graph};
 use ndarray::Array2;
@@ -46,18 +45,18 @@ pub fn standardise(values: &[f32], dim: usize) -> Vec<f32> {
     out
 }
 
-/// Clusters the kept Gaussians by their features, `[n][dim]`.
-pub fn group(features: &Array2<f32>, graph: &Graph, space: Space, options: &Options) -> Clustering {
-    let (features, dim) = (flat(features.view()), features.ncols().max(1));
-    match space {
-        Space::Free => cluster(&standardise(features, dim), dim, options),
-        Space::Graph => {
-            let chords = Chords::new(features.to_vec(), dim);
-            let edges = neighbour_edges(graph, &chords, options.min_samples);
-            drop(chords);
-            cluster_graph(graph.kept.len(), edges, options)
-        }
-    }
+/// Clusters the kept Gaussians by their features, `[n][dim]`, on the graph of spatial neighbours.
+pub fn on_graph(features: &Array2<f32>, graph: &Graph, options: &Options) -> Clustering {
+    let chords = Chords::new(flat(features.view()).to_vec(), features.ncols().max(1));
+    let edges = neighbour_edges(graph, &chords, options.min_samples);
+    drop(chords);
+    cluster_graph(graph.kept.len(), edges, options)
+}
+
+/// Clusters the Gaussians by their features as free points (paper, "Instance Clustering").
+pub fn free(features: &Array2<f32>, options: &Options) -> Clustering {
+    let dim = features.ncols().max(1);
+    cluster(&standardise(flat(features.view()), dim), dim, options)
 }
 
 /// Distances of features on the graph: lengths of the difference at unit length, sqrt(2 - 2 cosine).
@@ -196,7 +195,7 @@ mod tests {
         let g = two_rods();
         let f = Array2::from_shape_fn((60, 2), |(i, c)| [1.0, 0.001 * (i % 7) as f32][c]);
         let o = Options { min_cluster_size: 10, min_samples: 3, epsilon: 0.1, ..Options::default() };
-        let c = group(&f, &g, Space::Graph, &o);
+        let c = on_graph(&f, &g, &o);
         assert_eq!(c.selected.len(), 2);
         assert_ne!(c.labels[5], c.labels[45]);
     }

@@ -1,7 +1,7 @@
 //! What the result says of itself: whether one instance holds too much of the scene, masks contradict each other, or
 //! instances share their masks.
 
-use crate::join::units;
+use crate::profile::units;
 use artifacts::{Footprints, Health, Instances, SHARED, SharedMasks};
 use rayon::prelude::*;
 use stage::Stage;
@@ -122,7 +122,7 @@ fn share(a: &[Seen], b: &[Seen]) -> Option<f64> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::join::mask_weights;
+    use crate::profile::mask_weights;
     use crate::testing::{footprints, instances};
     use artifacts::Level;
 

@@ -14,11 +14,12 @@ mod granules;
 mod group;
 mod health;
 mod inputs;
-mod join;
+mod linkage;
 mod memory;
 mod options;
 mod outputs;
 mod plane;
+mod profile;
 mod rank;
 mod run;
 #[cfg(test)]
@@ -27,5 +28,5 @@ mod vote;
 
 pub use associate::{FeatureTable, Overlaps, Region, best_masks, matches, overlaps};
 pub use describe::describe;
-pub use join::mask_weights;
 pub use options::Args;
+pub use profile::mask_weights;

@@ -7,18 +7,13 @@ use crate::options::Space;
 pub fn forecast(inputs: &Inputs, space: Space) -> u64 {
     let (entries, samples) = (inputs.footprints.total(), inputs.footprints.pixels.col.len());
     let (gaussians, kept) = (inputs.geometry.gaussians.len(), inputs.features.kept.len() as u64);
-    let (dim, parts) = (inputs.features.dim() as u64, inputs.features.parts.ncols() as u64);
+    let dim = inputs.features.dim() as u64;
     // Features as they are read and as they are clustered; free points are also parted from their duplicates and lie in a tree:
     // coordinates, the leaves' blocks, boxes.
     let value = match space {
-        Space::Graph => 6,
+        Space::Masks | Space::Graph => 6,
         Space::Free => 18,
     };
     // Entries are read in batches of 4 million. Fitted to 11 runs of 5,000 to 950,000 Gaussians.
-    12_800_000
-        + 9 * entries.min(1 << 22)
-        + 14 * samples as u64
-        + 1000 * gaussians as u64
-        + value * kept * dim.max(parts)
-        + 8 * kept * dim.min(parts)
+    12_800_000 + 9 * entries.min(1 << 22) + 14 * samples as u64 + 1000 * gaussians as u64 + value * kept * dim
 }

@@ -51,11 +51,16 @@ pub struct Args {
 #[derive(Debug, Clone, clap::Args, Serialize)]
 #[command(next_help_heading = "Clustering")]
 pub(crate) struct Settings {
-    /// Cluster on the graph of spatial neighbours, or free points in feature space (the paper)
-    #[arg(long, value_enum, default_value_t = Space::Graph)]
+    /// What decides which Gaussians are one instance: how far their masks agree, their features on the graph of spatial neighbours, or their
+    /// features as free points (the paper)
+    #[arg(long, value_enum, default_value_t = Space::Masks)]
     pub cluster: Space,
-    /// Fewest Gaussians of an instance [default: 30; on the graph a thousandth of the Gaussians that are seen, at least 10
-    /// and at most 30, because small scenes have small things]
+    /// How far the masks of neighbouring pieces must agree that both are one instance, 0 to 1: a lower value joins more. Only with
+    /// masks
+    #[arg(long, value_name = "AGREEMENT", value_parser = stage::within(0.0..=1.0), default_value_t = 0.42)]
+    pub agreement: f64,
+    /// Fewest Gaussians of an instance [default: 8 with masks, 30 with free points; on the graph a thousandth of the Gaussians that are
+    /// seen, at least 10 and at most 30, because small scenes have small things]
     #[arg(long, value_name = "COUNT", value_parser = stage::within(2usize..=MOST))]
     pub min_cluster_size: Option<usize>,
     /// Neighbours, the Gaussian itself included, that set its core distance
@@ -76,19 +81,19 @@ pub(crate) struct Settings {
     /// What happens to Gaussians in no cluster
     #[arg(long, value_enum, default_value_t = Noise::Nearest)]
     pub noise: Noise,
-    /// Join instances that the masks show as one with at least this probability: more than 0.5, or 0 to join none; for free
-    /// points the default is 0
-    #[arg(long, value_name = "PROBABILITY", value_parser = join_probability, default_value = "0.6",
+    /// How far the masks of pieces that do not touch must agree that both are one instance, 0 to 1; 0 joins none; for free points the
+    /// default is 0
+    #[arg(long, value_name = "AGREEMENT", value_parser = stage::within(0.0..=1.0), default_value = "0.5",
         default_value_if("cluster", "free", "0"))]
     pub join: f64,
-    /// Most rounds in which a Gaussian may change to the neighbouring instance that its masks show; for free points the
-    /// default is 0
-    #[arg(long, value_name = "ROUNDS", default_value = "8", default_value_if("cluster", "free", "0"))]
+    /// Most rounds in which a Gaussian may change to the neighbouring instance that its masks show; on the graph the
+    /// default is 8
+    #[arg(long, value_name = "ROUNDS", default_value = "0", default_value_if("cluster", "graph", "8"))]
     pub votes: usize,
     /// Let small parts leave their instance and become instances: what stands on a shelf is no shelf. The largest share of the
     /// instance's Gaussians that such a part may have, 0 to 0.5; 0 lets none leave. A part that is
-    /// alone in large masks more often than in medium ones may have up to 0.5. The masks of level small show the parts, so
-    /// features of other levels alone have none; for free points the default is 0
+    /// alone in large masks more often than in medium ones may have up to 0.5. The masks of level small show the parts; for
+    /// free points the default is 0
     #[arg(long, value_name = "SHARE", value_parser = stage::within(0.0..=0.5), default_value = "0.03",
         default_value_if("cluster", "free", "0"))]
     pub split: f64,
@@ -125,6 +130,8 @@ const MOST: usize = u32::MAX as usize;
 #[derive(Debug, Clone, Copy, PartialEq, Eq, clap::ValueEnum, Serialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Space {
+    /// Average linkage of spatial neighbours by how far their masks agree
+    Masks,
     /// Any two: HDBSCAN of standardised features as free points (the paper)
     Free,
     /// Spatial neighbours only: HDBSCAN on the graph of neighbours
@@ -141,16 +148,15 @@ pub(crate) enum Noise {
     Keep,
 }
 
-fn join_probability(text: &str) -> Result<f64, String> {
-    let good = |v: &f64| *v == 0.0 || *v > 0.5 && *v <= 1.0;
-    text.parse().ok().filter(good).ok_or_else(|| "expected 0, or more than 0.5 and at most 1".into())
-}
-
 impl Settings {
     /// These settings for a scene of `n` Gaussians that are seen: nothing is left open.
     pub fn for_gaussians(&self, n: usize) -> Self {
         // Measured at 12,000 and 88,000 Gaussians (docs/accuracy.md).
-        let smallest = if self.cluster == Space::Graph { n.div_ceil(1000).clamp(10, 30) } else { 30 };
+        let smallest = match self.cluster {
+            Space::Masks => 8,
+            Space::Graph => n.div_ceil(1000).clamp(10, 30),
+            Space::Free => 30,
+        };
         Self { min_cluster_size: self.min_cluster_size.or(Some(smallest)), ..self.clone() }
     }
 

@@ -61,7 +61,7 @@ fn seen(footprints: &Footprints, weights: &[(u32, BTreeMap<u32, f64>)]) -> BTree
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::join::mask_weights;
+    use crate::profile::mask_weights;
     use crate::testing::{footprints, instances};
     use artifacts::{Level, Match};
 

@@ -4,20 +4,23 @@ use crate::assignment::Assignment;
 use crate::associate::{FeatureTable, matches, overlaps};
 use crate::describe::{describe, mean_of_units};
 use crate::granules::{self, Candidates, Shown};
-use crate::group::group;
+use crate::group::{free, on_graph};
 use crate::inputs::{Inputs, mask_features};
-use crate::join::mask_weights;
-use crate::options::{Args, Noise, Settings};
+use crate::options::{Args, Noise, Settings, Space};
 use crate::outputs::{self, Found};
+use crate::profile::mask_weights;
 use crate::rank::confidence;
-use crate::{health, memory};
-use artifacts::{Instances, Level, MaskFeatures, MaskFolder, Match, flat};
+use crate::{health, linkage, memory};
+use artifacts::{Instances, Level, MaskFeatures, MaskFolder, Match, Row, flat};
 use gs_io::{Error, Result, Watched};
 use gs_raster::RasterOptions;
 use ndarray::{Array2, aview1};
 use stage::{CommonArgs, Program, Stage};
 use std::collections::BTreeMap;
 use std::time::Instant;
+
+/// How far the masks of level small must agree that two are one part.
+const PARTS: f64 = 0.6;
 
 impl Program for Args {
     const NAME: &'static str = "cluster-match";
@@ -53,8 +56,13 @@ impl Program for Args {
         )?;
 
         let start = Instant::now();
-        let (features, hdbscan) = (&inputs.features, settings.hdbscan());
-        let clustering = group(&features.values, &inputs.graph, settings.cluster, &hdbscan);
+        let clustering = match settings.cluster {
+            Space::Masks => {
+                linkage::cluster(&inputs, &settings, &settings.levels, (settings.agreement, settings.join))?
+            }
+            Space::Graph => on_graph(&inputs.features.values, &inputs.graph, &settings.hdbscan()),
+            Space::Free => free(&inputs.features.values, &settings.hdbscan()),
+        };
         let noise = clustering.labels.iter().filter(|&&l| l < 0).count();
         let seconds = start.elapsed().as_secs_f64();
         let found = Assignment::new(&clustering, &inputs.graph.kept, inputs.geometry.gaussians.len());
@@ -130,21 +138,17 @@ fn correct(mut found: Assignment, inputs: &Inputs, settings: &Settings, stage: &
     if settings.votes > 0 {
         stage.info(&format!("votes of the masks changed the instance of {changed} Gaussians"));
     }
-    if settings.join > 0.0 {
+    if settings.cluster == Space::Graph && settings.join > 0.0 {
         let before = found.instances;
         found.join(&inputs.geometry.gaussians, &graph.kept, footprints, &settings.levels, settings.join)?;
         if found.instances < before {
             stage.info(&format!("{} instances after joining pieces that the masks show as one", found.instances));
         }
     }
-    let parts = &inputs.features.parts;
-    if settings.split > 0.0 && parts.ncols() > 0 {
-        let clustering = group(parts, graph, settings.cluster, &settings.hdbscan());
-        let mut parts = Assignment::new(&clustering, &graph.kept, means.len());
-        settle(&mut parts, inputs, settings, &[Level::Small])?;
-        if settings.join > 0.0 {
-            parts.join(&inputs.geometry.gaussians, &graph.kept, footprints, &[Level::Small], settings.join)?;
-        }
+    let small = |row: &Row| row.is_of(&[Level::Small]);
+    if settings.split > 0.0 && settings.levels.contains(&Level::Small) && footprints.rows.iter().any(small) {
+        let clustering = linkage::cluster(inputs, settings, &[Level::Small], (PARTS, 0.0))?;
+        let parts = Assignment::new(&clustering, &graph.kept, means.len());
         let apart = found.apart(&parts, &graph.kept, footprints)?;
         let split = found.split(&parts, settings.split, &apart);
         if split > 0 {

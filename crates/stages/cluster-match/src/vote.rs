@@ -4,7 +4,7 @@
 //! the label of its nearest neighbour. Once instances are known, each view tells where they end: a Gaussian gets the label of
 //! the neighbouring instance whose masks hold most of its weight. Its neighbours have no say, or rims would be smooth.
 
-use crate::join::{mask_weights, units};
+use crate::profile::{mask_weights, units};
 use artifacts::{Entries, Footprints, Graph, Level};
 use gs_io::Result;
 use rayon::prelude::*;

@@ -10,6 +10,7 @@ use gs_scene::{Camera, Gaussians, Image, ply};
 use ndarray::{Array2, Array3, arr2, aview1};
 use serde_json::{Value, json};
 use stage::RunRecord;
+use std::ops::Range;
 use std::path::PathBuf;
 use std::process::{Command, Output};
 
@@ -99,7 +100,7 @@ impl Scene {
     }
 
     /// Language features: things at right angles to each other, slightly different in each view.
-    fn language(&self, views: std::ops::Range<usize>) {
+    fn language(&self, views: Range<usize>) {
         for v in views {
             let both = [0.6, 0.6, 0.5];
             let values = arr2(&[both, both, both, [1.0, 0.0, 0.1 * v as f32], [0.0, 2.0, 0.0]]);
@@ -113,6 +114,11 @@ impl Scene {
 
     /// Writes graph, footprints and features; `change` may change the features first.
     fn artifacts(&self, change: impl Fn(&mut Features)) {
+        self.artifacts_with(&[], change);
+    }
+
+    /// The same, with `small` masks in every view.
+    fn artifacts_with(&self, small: &[Range<usize>], change: impl Fn(&mut Features)) {
         let n = 2 * EACH;
         let means = gaussians().means;
         let near = |i: usize| -> [u32; 8] {
@@ -136,7 +142,8 @@ impl Scene {
         let mut footprints = FootprintsBuilder { views, kept: graph.kept.clone(), ..FootprintsBuilder::default() };
         // As the id maps have it: both things in one medium mask, each in its large one.
         for view in 0..VIEWS as u32 {
-            for (level, mask, own) in [(2, 2, 0..n), (3, 3, 0..EACH), (3, 4, EACH..n)] {
+            let small = small.iter().map(|own| (1, 1, own.clone()));
+            for (level, mask, own) in small.chain([(2, 2, 0..n), (3, 3, 0..EACH), (3, 4, EACH..n)]) {
                 let row = Row { view, level, mask, pixels: 50, gated: 50, alpha: 1.0 };
                 footprints.push(row, own.map(|i| (i as u32, 1.0)));
             }
@@ -146,7 +153,7 @@ impl Scene {
             if i < EACH { [1.0, noise(1), noise(2)] } else { [noise(3), 1.0, noise(4)] }
         };
         let values = (0..n).map(value).collect::<Vec<_>>().into();
-        let mut features = Features { kept: graph.kept.clone(), values, ..Features::default() };
+        let mut features = Features { kept: graph.kept.clone(), values };
         change(&mut features);
         self.write(&graph, &footprints, &features);
     }
@@ -298,7 +305,7 @@ fn the_provenance_holds_every_option_and_the_forecast_is_near_the_peak() {
     s.succeed(&["--cluster", "free", "--noise", "keep"]);
     let (_, a) = Instances::read(s.path("out/instances.safetensors")).unwrap();
     let expected = json!({
-        "cluster": "free", "min_cluster_size": 8, "min_samples": 10, "epsilon": 0.0, "leaf": false,
+        "cluster": "free", "agreement": 0.42, "min_cluster_size": 8, "min_samples": 10, "epsilon": 0.0, "leaf": false,
         "allow_single_cluster": false, "noise": "keep", "join": 0.0, "votes": 0, "split": 0.0, "levels": ["large"],
         "threshold": 0.2, "granules": 0,
     });
@@ -313,14 +320,13 @@ fn the_provenance_holds_every_option_and_the_forecast_is_near_the_peak() {
 
 #[test]
 fn parts_that_are_small_beside_their_instance_leave_it() {
-    const SMALL: std::ops::Range<usize> = 0..10;
+    const SMALL: Range<usize> = 0..10;
     let s = Scene::new();
-    let part = |i: usize| if SMALL.contains(&i) { 2 } else { usize::from(i >= EACH) };
-    s.artifacts(|f| {
-        f.parts = Array2::from_shape_fn((2 * EACH, 3), |(i, c)| f32::from(u8::from(c == part(i))));
-    });
-    let whole = s.succeed(&["--votes", "0", "--min-samples", "3", "--split", "0"]).0;
-    let (i, said) = s.succeed(&["--votes", "0", "--min-samples", "3", "--split", "0.3"]);
+    s.artifacts_with(&[SMALL, 10..EACH, EACH..2 * EACH], |_| {});
+    // Small masks alone would part it in the first place.
+    let levels = ["--levels", "small,medium,large", "--agreement", "0.2"];
+    let whole = s.succeed(&[&levels[..], &["--split", "0"]].concat()).0;
+    let (i, said) = s.succeed(&[&levels[..], &["--split", "0.3"]].concat());
     assert!(whole.len() == 2 && i.len() == 3 && said.contains("1 small things within others"), "{said}");
     for (at, (&before, &after)) in whole.label.iter().zip(&i.label).enumerate().take(2 * EACH) {
         assert_eq!(after, if SMALL.contains(&at) { 2 } else { before }, "{at}");
@@ -330,7 +336,7 @@ fn parts_that_are_small_beside_their_instance_leave_it() {
     assert_eq!(family.parent, Some(i.family(whole.label[0] as usize).unwrap().own[0]));
     assert_eq!(i.gaussians_of_cluster(family.own[0]), SMALL.map(|i| i as u32).collect::<Vec<_>>());
     // Larger than that share, it stays.
-    assert_eq!(s.succeed(&["--votes", "0", "--min-samples", "3"]).0.len(), 2);
+    assert_eq!(s.succeed(&levels).0.len(), 2);
 }
 
 #[test]
@@ -338,8 +344,9 @@ fn options_do_what_they_say() {
     let s = Scene::new();
     for extra in [
         &["--cluster", "free", "--min-samples", "5"][..],
-        &["--epsilon", "0.3", "--leaf", "--min-samples", "4"],
-        &["--votes", "0", "--join", "0"],
+        &["--cluster", "graph", "--epsilon", "0.3", "--leaf", "--min-samples", "4"],
+        &["--cluster", "graph", "--votes", "0", "--join", "0"],
+        &["--votes", "8", "--join", "0"],
     ] {
         let (i, said) = s.succeed(extra);
         things(&i);
@@ -348,12 +355,15 @@ fn options_do_what_they_say() {
         assert!(i.dim() == 0 && i.descriptor.is_empty() && said.contains("skipped language descriptors"), "{said}");
     }
     // Another level: one mask for both things, which each covers half of, or the best of two levels.
-    let (i, _) = s.succeed(&["--levels", "medium", "--join", "0"]);
+    let graph = ["--levels", "medium", "--cluster", "graph"];
+    let (i, _) = s.succeed(&[&graph[..], &["--join", "0"]].concat());
     assert!(i.matches.iter().all(|m| m.mask == 2 && m.score < 0.7) && !i.matches.is_empty());
     // What masks show as one is joined.
-    let (i, said) = s.succeed(&["--levels", "medium"]);
+    let (i, said) = s.succeed(&graph);
     assert!(i.len() == 1 && i.label.iter().all(|&l| l == 0) && said.contains("1 instances after joining"), "{said}");
     assert!(i.tree.iter().all(|e| e.instance <= 0));
+    let (i, said) = s.succeed(&["--levels", "medium"]);
+    assert!(i.len() == 1 && i.label.iter().all(|&l| l == 0), "{said}");
     // Left apart, they are said to share their masks.
     let (i, said) = s.succeed(&["--levels", "medium", "--cluster", "free", "--min-samples", "5"]);
     assert!(i.len() == 2 && said.contains("instances 0 and 1 share 100 % of their masks: each pair"), "{said}");
@@ -476,7 +486,7 @@ fn scenes_without_anything_are_results_not_errors() {
     };
     let footprints =
         FootprintsBuilder { views: vec!["v0".into()], kept: vec![0], row_ptr: vec![0], ..Default::default() };
-    s.write(&graph, &footprints, &Features { kept: vec![0], values: arr2(&[[1.0, 0.0]]), ..Features::default() });
+    s.write(&graph, &footprints, &Features { kept: vec![0], values: arr2(&[[1.0, 0.0]]) });
     let (i, said) = s.succeed(&[]);
     assert_eq!(i.label, [-1]);
     assert!(said.contains("skipped 3 of 4 views in matching") && said.contains("v1, v2, v3"), "{said}");
@@ -490,7 +500,8 @@ fn bad_input_is_one_line_and_leaves_outputs_alone() {
         ("--min-cluster-size", "1", "expected 2 to"),
         ("--min-samples", "0", "expected 1 to"),
         ("--epsilon", "NaN", "expected 0 or more"),
-        ("--join", "0.5", "expected 0, or more than 0.5 and at most 1"),
+        ("--join", "2", "expected 0 to 1"),
+        ("--agreement", "1.1", "expected 0 to 1"),
         ("--threshold", "1.5", "expected 0 to 1"),
         ("--levels", "huge", "expected default, small, medium or large"),
     ] {

@@ -4,7 +4,6 @@ use crate::contrastive::engine::Engine;
 use crate::contrastive::masks::MaskSets;
 use crate::inputs::Inputs;
 use crate::options::Options;
-use crate::spectral;
 use crate::spectral::evidence::{self, blocks, masks_of_blocks};
 use crate::spectral::gram;
 use artifacts::{Footprints, LEVELS, Level};
@@ -23,20 +22,13 @@ pub fn forecast(inputs: &Inputs, options: &Options, geometry: u64) -> Result<u64
     let read = 16 * footprints.pixels.col.len() as u64;
     // The blocks at work, the product of the matrix with itself, and the features.
     let blocks = blocks(&inputs.graph);
-    let of = |levels: &[Level]| {
-        let rows = footprints.rows.iter().enumerate().filter(|(_, row)| row.is_of(levels));
-        let (masks, used) =
-            rows.fold((0, 0), |(masks, used), (r, _)| (masks + 1, used + footprints.entries_of(r) as u64));
-        let dim = options.most_vectors(footprints.kept.len()).min(masks) as u64;
-        let product = gram::bytes(&masks_of_blocks(footprints, &blocks, levels)?, masks, used);
-        Ok((evidence::bytes(used).max(product).max(5 * gaussians * dim), 4 * gaussians * dim))
-    };
     let levels = options.levels();
-    let (features, kept) = of(&levels)?;
-    // The features of parts are made when those are there.
-    let parts = if spectral::has_parts(&levels) { kept + of(&[Level::Small])?.0 } else { 0 };
+    let rows = footprints.rows.iter().enumerate().filter(|(_, row)| row.is_of(&levels));
+    let (masks, used) = rows.fold((0, 0), |(masks, used), (r, _)| (masks + 1, used + footprints.entries_of(r) as u64));
+    let dim = options.most_vectors(footprints.kept.len()).min(masks) as u64;
+    let product = gram::bytes(&masks_of_blocks(footprints, &blocks, &levels)?, masks, used);
     // With the footprints' rows and the graph.
-    Ok(6_200_000 + read + 360 * gaussians + features.max(parts))
+    Ok(6_200_000 + read + 360 * gaussians + evidence::bytes(used).max(product).max(5 * gaussians * dim))
 }
 
 /// With a preset: the peak is while the geometry is read, or in training. Fitted to 21 runs.

@@ -10,8 +10,6 @@ use std::path::Path;
 pub struct Made {
     /// `[n][dim]`, in the order of the graph's kept Gaussians.
     pub values: Array2<f32>,
-    /// Features of parts; without columns where there are none.
-    pub parts: Array2<f32>,
     pub summary: Value,
 }
 

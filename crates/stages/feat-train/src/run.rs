@@ -42,7 +42,7 @@ impl Program for Args {
         };
 
         let parameters = self.options.parameters(self.common.seed);
-        let features = Features { kept: inputs.graph.kept, values: made.values, parts: made.parts };
+        let features = Features { kept: inputs.graph.kept, values: made.values };
         watched.check()?;
         features.write(&self.out, stage.provenance("", 0, parameters.clone(), inputs.hashes.clone()))?;
         // The run is complete: what is left of it must not look like an unfinished one.

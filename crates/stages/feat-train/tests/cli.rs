@@ -3,7 +3,6 @@
 use artifacts::{Features, FootprintsBuilder, Graph, PixelSamples, Row, role};
 use gs_io::{Provenance, hash_file};
 use gs_scene::{Gaussians, ply};
-use ndarray::ArrayView1;
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
 use std::process::{Command, Output, Stdio};
@@ -148,29 +147,6 @@ fn the_closed_form_tells_things_apart_and_not_their_halves() {
     assert!(cosine(45, 75) > 0.8, "the halves of a thing stay together: {}", cosine(45, 75));
     assert!(cosine(5, 60) < 0.3 && cosine(60, 115) < 0.3 && cosine(5, 115) < 0.3);
     assert!(curve(&out, "iteration")[0] == 1.0 && curve(&out, "singular_value")[0] > 0.9);
-}
-
-#[test]
-fn parts_are_what_level_small_shows() {
-    let (dir, out) = setup();
-    succeed(dir.path(), &out, &[]);
-    assert_eq!(Features::read(&out).unwrap().0.parts.ncols(), 0, "no masks of level small");
-    let mut f = footprints();
-    for view in 0..VIEWS as u32 {
-        for part in 0..6 {
-            let row = Row { view, level: 1, mask: 5 + part, pixels: 100, gated: 90, alpha: 0.9 };
-            f.push(row, (20 * part..20 * part + 20).map(|i| (i, 1.0)));
-        }
-    }
-    write_with(dir.path(), &gaussians(), &graph(), f);
-    succeed(dir.path(), &out, &[]);
-    let (f, _) = Features::read(&out).unwrap();
-    let part = |i: usize| f.parts.row(i);
-    let cosine = |a: ArrayView1<'_, f32>, b: ArrayView1<'_, f32>| a.dot(&b);
-    assert!(cosine(part(5), part(15)) > 0.9 && cosine(part(5), part(35)) < 0.5, "halves of a thing are parts");
-    assert!(cosine(f.row(5), f.row(35)) > cosine(part(5), part(35)) + 0.2);
-    succeed(dir.path(), &out, &["--levels", "small"]);
-    assert_eq!(Features::read(&out).unwrap().0.parts.ncols(), 0, "the features are of that level");
 }
 
 #[test]

@@ -142,9 +142,7 @@ impl Fixture {
     fn write_features(&self, g: &Gaussians) {
         let kept: Vec<u32> = (0..g.len() as u32).collect();
         let values = groups().iter().map(|&i| [i as f32, (i * i) as f32, 1.0]).collect::<Vec<_>>().into();
-        Features { kept, values, ..Features::default() }
-            .write(self.run().join("features.safetensors"), self.provenance())
-            .unwrap();
+        Features { kept, values }.write(self.run().join("features.safetensors"), self.provenance()).unwrap();
     }
 
     fn write_masks(&self, i: usize, camera: &Camera) {

@@ -149,7 +149,7 @@ impl Scene {
         let (dim, n) = (instances.len(), instances.label.len());
         let thing = |i: usize| usize::try_from(instances.label[i]).map_or(0, |l| l.min(dim - 2));
         let values = Array2::from_shape_fn((n, dim), |(i, c)| if c == thing(i) { 2.0 } else { 0.0 });
-        let features = Features { kept: (0..n as u32).collect(), values, ..Features::default() };
+        let features = Features { kept: (0..n as u32).collect(), values };
         features.write(self.features(), provenance(&self.geometry(), &self.scene())).unwrap();
     }
 

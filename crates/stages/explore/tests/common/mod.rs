@@ -92,7 +92,7 @@ impl Run {
         };
         instances.write(run.out().join("instances.safetensors"), provenance()).unwrap();
         let values = arr2(&[[1.0, 0.0], [0.0, 1.0], [0.1, 0.9]]);
-        let features = Features { kept: vec![0, 1, 2], values, ..Features::default() };
+        let features = Features { kept: vec![0, 1, 2], values };
         features.write(run.out().join("features.safetensors"), provenance()).unwrap();
         std::fs::write(run.dir.path().join("text.json"), r#"{"near ball": [1, 0], "far ball": [0, 1]}"#).unwrap();
         run

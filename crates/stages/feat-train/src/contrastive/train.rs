@@ -105,7 +105,7 @@ pub fn train(args: &Args, inputs: &Inputs, context: &Context, mut sets: MaskSets
     let shape = (inputs.graph.kept.len(), dim);
     let values =
         Array2::from_shape_vec(shape, solver.final_features(&state.model)).expect("a feature of each Gaussian");
-    Ok(Made { values, parts: Array2::default((shape.0, 0)), summary })
+    Ok(Made { values, summary })
 }
 
 /// The sets that are held out and those that are learnt from, of `count`.

@@ -15,21 +15,15 @@ pub mod vectors;
 use crate::inputs::Inputs;
 use crate::options::Args;
 use crate::outputs::{Made, write_curve};
-use artifacts::Level;
 use gs_io::{Error, Result};
 use ndarray::Array2;
 use report::curve::Panel;
 use serde_json::json;
 use stage::Stage;
-use std::path::Path;
 use std::time::Instant;
 use vectors::{Spectral, SpectralOptions, spectral};
 
 const SPECTRUM: [Panel; 1] = [("singular_value", "singular values", "#1f77b4")];
-
-/// Cutoff of the features of parts, as a share of that of the features. Chosen on four scenes with real masks: at the same cutoff
-/// what stands on a shelf runs together with it.
-const PARTS_CUTOFF: f64 = 0.75;
 
 /// Computes the features and writes their spectrum as the curve.
 pub fn features(args: &Args, inputs: &Inputs, stage: &Stage) -> Result<Made> {
@@ -72,37 +66,6 @@ pub fn features(args: &Args, inputs: &Inputs, stage: &Stage) -> Result<Made> {
         "without_mask": without, "entries": matrix.entries(), "gram_entries": gram_entries,
         "singular_values": found.values,
     });
-    drop(matrix);
-    let parts =
-        parts(&args.out, &levels, inputs, &SpectralOptions { cutoff: PARTS_CUTOFF * cutoff, ..options }, stage)?;
-    Ok(Made { values: table(dim, features), parts, summary })
-}
-
-fn table(dim: usize, features: Vec<f32>) -> Array2<f32> {
-    Array2::from_shape_vec((features.len() / dim, dim), features).expect("whole features")
-}
-
-/// Whether there are features of parts: not where all features are of level small already, or none is.
-pub(crate) fn has_parts(levels: &[Level]) -> bool {
-    levels.contains(&Level::Small) && levels.iter().any(|&l| l != Level::Small)
-}
-
-/// Features of parts: the masks of level small alone, with a lower cutoff. Without columns where that has no masks.
-fn parts(
-    output: &Path,
-    levels: &[Level],
-    inputs: &Inputs,
-    options: &SpectralOptions,
-    stage: &Stage,
-) -> Result<Array2<f32>> {
-    let none = Array2::default((inputs.graph.kept.len(), 0));
-    if !has_parts(levels) {
-        return Ok(none);
-    }
-    let matrix = evidence::collect(&inputs.footprints, &inputs.graph, &[Level::Small], output)?;
-    if matrix.masks.is_empty() {
-        return Ok(none);
-    }
-    let Spectral { dim, features, .. } = spectral(&matrix, options, stage)?;
-    Ok(table(dim, features))
+    let values = Array2::from_shape_vec((features.len() / dim, dim), features).expect("whole features");
+    Ok(Made { values, summary })
 }

@@ -1,0 +1,346 @@
+//! Clustering by how far the masks agree that Gaussians belong together: average linkage.
+//!
+//! A Gaussian at a rim lies in two masks of a view, and many masks are wrong. What many Gaussians have in common is firm. So
+//! neighbours are joined from the bottom up, those that agree most first, and what is joined has the masks of all its Gaussians.
+
+use crate::inputs::Inputs;
+use crate::options::Settings;
+use crate::plane::Place;
+use crate::profile::{Profile, units};
+use artifacts::{Graph, Level};
+use gs_io::Result;
+use hdbscan_exact::{Clustering, Edge, Options, Selection, cluster_graph};
+use rayon::prelude::*;
+use std::cmp::Reverse;
+use std::collections::{BTreeMap, BTreeSet};
+
+/// A cluster joins one more than this many times as large that it agrees with most, though that one agrees more with another: it hardly
+/// changes it. Else a floor would take its Gaussians one a round.
+const TIMES: usize = 16;
+/// Pieces that lie in one plane need this share of the agreement of others: a floor or a wall is seldom seen whole, and what hides
+/// its middle parts its masks.
+const IN_PLANE: f64 = 0.75;
+/// The distance of two that agree fully: distances of 0 would make the tree's lambdas infinite.
+const FLOOR: f64 = 0.1;
+/// Least difference between distances within instances and between them.
+const APART: f64 = 1e-6;
+/// Agreement of two of which hardly any view shows both in one mask.
+const NONE: f64 = 1e-9;
+
+/// Clusters the kept Gaussians by the masks at `levels`: neighbours that agree by `least`, then pieces that do not touch and agree by
+/// `join`; 0 joins none of those. The tree above goes on to where nothing agrees.
+///
+/// # Errors
+/// When the footprints can't be read.
+pub fn cluster(
+    inputs: &Inputs,
+    settings: &Settings,
+    levels: &[Level],
+    (least, join): (f64, f64),
+) -> Result<Clustering> {
+    let (graph, footprints, n) = (&inputs.graph, &inputs.footprints, inputs.graph.kept.len());
+    let unit_of = units(footprints);
+    let hdbscan = settings.hdbscan();
+    // Two distances that nothing else has part what is one instance from what is not.
+    let cut = distance(least);
+    let (within, above) = ((0.0, cut), (cut + 2.0 * APART, f64::MAX));
+    let mut linkage = Linkage::new(Profile::of_gaussians(n, footprints, levels)?, &neighbours(graph), &unit_of);
+    linkage.join(least, usize::MAX, within);
+    linkage.join(NONE, hdbscan.min_cluster_size, within);
+    if join > 0.0 {
+        let (labels, count) = linkage.labels();
+        linkage.meet(Place::of_instances(&inputs.geometry.gaussians, &graph.kept, &labels, count));
+        linkage.join(join.max(least), usize::MAX, within);
+    }
+    // The root of the tree is no cluster, but where the masks show all as one.
+    let allow_single_cluster =
+        hdbscan.allow_single_cluster || (n >= hdbscan.min_cluster_size && linkage.labels().1 == 1);
+    linkage.join(NONE, usize::MAX, above);
+    let options = Options { epsilon: cut + APART, selection: Selection::Leaf, allow_single_cluster, ..hdbscan };
+    Ok(cluster_graph(n, linkage.edges, &options))
+}
+
+/// Pairs of spatial neighbours, each once.
+fn neighbours(graph: &Graph) -> Vec<(u32, u32)> {
+    let of = |i: u32| graph.gaussian_knn.row(i as usize).into_iter().map(move |&j| (i.min(j), i.max(j)));
+    // Rows are padded with the Gaussian itself.
+    let mut pairs: Vec<(u32, u32)> = (0..graph.kept.len() as u32).flat_map(of).filter(|(a, b)| a < b).collect();
+    pairs.par_sort_unstable();
+    pairs.dedup();
+    pairs
+}
+
+/// The distance of two with this agreement, 0.1 to 1.1.
+fn distance(agreement: f64) -> f64 {
+    FLOOR + 1.0 - agreement
+}
+
+/// Clusters that are joined step by step.
+pub struct Linkage<'a> {
+    unit_of: &'a [u32],
+    profiles: Vec<Profile>,
+    /// Members of each cluster; 0 for one that has joined another.
+    sizes: Vec<usize>,
+    /// Agreement of each cluster with those that it may join.
+    near: Vec<BTreeMap<u32, f64>>,
+    /// Where clusters lie, once those that don't touch may join ([`Linkage::meet`]).
+    places: Vec<Place>,
+    /// The cluster that each joined, or itself.
+    into: Vec<u32>,
+    /// What was joined, by a member of each side and the distance. It never falls.
+    edges: Vec<Edge>,
+    heights: Vec<f64>,
+}
+
+impl<'a> Linkage<'a> {
+    /// Clusters of one each, of which these `pairs` may join.
+    pub fn new(profiles: Vec<Profile>, pairs: &[(u32, u32)], unit_of: &'a [u32]) -> Self {
+        let n = profiles.len();
+        let mut out = Self {
+            unit_of,
+            profiles,
+            sizes: vec![1; n],
+            near: vec![BTreeMap::new(); n],
+            places: Vec::new(),
+            into: (0..n as u32).collect(),
+            edges: Vec::new(),
+            heights: vec![0.0; n],
+        };
+        out.compare(pairs);
+        out
+    }
+
+    fn compare(&mut self, pairs: &[(u32, u32)]) {
+        let agreement = |&(a, b): &(u32, u32)| {
+            let (a, b) = (a as usize, b as usize);
+            let agreement = self.profiles[a].agreement(&self.profiles[b])?;
+            if self.places.is_empty() {
+                return Some(agreement.value);
+            }
+            let eased = self.places[a].in_plane_of(&self.places[b]);
+            agreement.firm.then_some(if eased { (agreement.value / IN_PLANE).min(1.0) } else { agreement.value })
+        };
+        let values: Vec<Option<f64>> = pairs.par_iter().map(agreement).collect();
+        for (&(a, b), value) in pairs.iter().zip(values) {
+            if let Some(value) = value {
+                self.near[a as usize].insert(b, value);
+                self.near[b as usize].insert(a, value);
+            }
+        }
+    }
+
+    /// From now on clusters may also join that do not touch, but lie mostly in the same mask of some view, and no two that too few views
+    /// show both of. `places` are those of the clusters, as [`Linkage::labels`] numbers them.
+    pub fn meet(&mut self, places: Vec<Place>) {
+        let left: Vec<u32> = (0..self.sizes.len() as u32).filter(|&i| self.sizes[i as usize] > 0).collect();
+        self.places = vec![Place::default(); self.sizes.len()];
+        left.iter().zip(places).for_each(|(&i, place)| self.places[i as usize] = place);
+        let mut mainly: BTreeMap<u32, Vec<u32>> = BTreeMap::new();
+        for &i in &left {
+            self.profiles[i as usize].main_masks().for_each(|k| mainly.entry(k).or_default().push(i));
+        }
+        let meet = mainly.values().flat_map(|of| of.iter().flat_map(|&a| of.iter().map(move |&b| (a, b))));
+        let touch = left.iter().flat_map(|&a| self.near[a as usize].keys().map(move |&b| (a, b)));
+        let mut pairs: Vec<(u32, u32)> = meet.chain(touch).filter(|(a, b)| a < b).collect();
+        pairs.sort_unstable();
+        pairs.dedup();
+        self.near.iter_mut().for_each(BTreeMap::clear);
+        self.compare(&pairs);
+    }
+
+    /// The cluster that each joins in this round, or itself.
+    fn round(&self, least: f64, below: usize) -> Vec<(u32, f64)> {
+        let best = |near: &BTreeMap<u32, f64>| {
+            let best = near.iter().fold((0, f64::MIN), |best, (&c, &v)| if v > best.1 { (c, v) } else { best });
+            (best.1 >= least).then_some(best)
+        };
+        let best: Vec<Option<(u32, f64)>> = self.near.par_iter().map(best).collect();
+        let rank = |i: u32| (self.sizes[i as usize], Reverse(i));
+        let joins = |i: u32| {
+            let other = best[i as usize].filter(|_| self.sizes[i as usize] < below)?;
+            let (own, size) = (self.sizes[i as usize], self.sizes[other.0 as usize]);
+            let mutual = best[other.0 as usize].is_some_and(|(c, _)| c == i);
+            let small = below < usize::MAX && size >= below;
+            (if mutual { rank(i) < rank(other.0) } else { small || own * TIMES < size }).then_some(other)
+        };
+        (0..best.len() as u32).into_par_iter().map(|i| joins(i).unwrap_or((i, 0.0))).collect()
+    }
+
+    /// Joins clusters that agree by `least` or more, and of those only such as have fewer than `below` members, into others. `apart` is the
+    /// least distance that they get.
+    pub fn join(&mut self, least: f64, below: usize, (low, high): (f64, f64)) {
+        loop {
+            let target = self.round(least, below);
+            let root = |mut i: u32| {
+                while target[i as usize].0 != i {
+                    i = target[i as usize].0;
+                }
+                i
+            };
+            let mut groups: BTreeMap<u32, Vec<u32>> = BTreeMap::new();
+            let joins = (0..target.len() as u32).filter(|&i| target[i as usize].0 != i);
+            joins.for_each(|i| groups.entry(root(i)).or_default().push(i));
+            if groups.is_empty() {
+                return;
+            }
+            let mut pairs = Vec::new();
+            for (&to, members) in &groups {
+                members.iter().for_each(|&i| self.join_one(i, target[i as usize], to, (low, high)));
+                for i in members.iter().chain([&to]) {
+                    let near = std::mem::take(&mut self.near[*i as usize]).into_keys();
+                    pairs.extend(near.map(root).filter(|&c| c != to).map(|c| (to.min(c), to.max(c))));
+                }
+            }
+            pairs.sort_unstable();
+            pairs.dedup();
+            for end in pairs.iter().flat_map(|&(a, b)| [a, b]).collect::<BTreeSet<u32>>() {
+                self.near[end as usize].retain(|&c, _| target[c as usize].0 == c);
+            }
+            self.compare(&pairs);
+        }
+    }
+
+    /// Cluster `i` becomes one of `to`, because it agrees with `other`.
+    fn join_one(&mut self, i: u32, (other, agreement): (u32, f64), to: u32, (low, high): (f64, f64)) {
+        let (a, b) = (to as usize, i as usize);
+        let height = distance(agreement).max(self.heights[a]).max(self.heights[b]).clamp(low, high);
+        self.heights[a] = height;
+        self.edges.push(Edge::new(i, other, height));
+        let own = std::mem::take(&mut self.profiles[b]);
+        self.profiles[a] = self.profiles[a].joined(&own, self.unit_of);
+        self.sizes[a] += std::mem::take(&mut self.sizes[b]);
+        if !self.places.is_empty() {
+            self.places[a] = self.places[a].joined(&self.places[b]);
+        }
+        self.into[b] = to;
+    }
+
+    /// The cluster of each member, and the number of clusters. Clusters are numbered by the member whose name they keep.
+    pub fn labels(&self) -> (Vec<i32>, usize) {
+        let mut number = vec![0; self.into.len()];
+        let mut count = 0;
+        for i in (0..self.into.len()).filter(|&i| self.into[i] as usize == i) {
+            number[i] = count;
+            count += 1;
+        }
+        let root = |mut i: usize| {
+            while self.into[i] as usize != i {
+                i = self.into[i] as usize;
+            }
+            number[i]
+        };
+        ((0..self.into.len()).map(root).collect(), count as usize)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::plane::testing::{board, places};
+
+    /// Two masks a view; a member has the given share in the first, in views where it is seen at all.
+    fn profile(firsts: &[Option<f32>]) -> Profile {
+        let masks = firsts.iter().zip((0..).step_by(2)).filter_map(|(f, mask)| f.map(|f| (mask, f)));
+        let masks = masks.flat_map(|(mask, f)| [(mask, f), (mask + 1, 1.0 - f)]).filter(|(_, w)| *w > 0.0);
+        Profile::new(masks.collect(), &UNIT_OF)
+    }
+
+    /// Level default of ten views.
+    const UNIT_OF: [u32; 20] = [0, 0, 4, 4, 8, 8, 12, 12, 16, 16, 20, 20, 24, 24, 28, 28, 32, 32, 36, 36];
+    const ONE: Option<f32> = Some(1.0);
+    const TWO: Option<f32> = Some(0.0);
+    const ALL: (f64, f64) = (0.0, f64::MAX);
+
+    fn labels(linkage: &Linkage<'_>) -> Vec<i32> {
+        linkage.labels().0
+    }
+
+    #[test]
+    fn what_agrees_most_is_joined_first_and_then_counts_as_one() {
+        // 0 and 1 agree in 4 views of 4, 2 with either in 3, 3 with 2 in 2 and with 0 and 1 in 1.
+        let profiles = || {
+            let views = [[ONE; 4], [ONE; 4], [ONE, ONE, ONE, TWO], [ONE, TWO, TWO, TWO]];
+            views.iter().map(|v| profile(v)).collect::<Vec<_>>()
+        };
+        let pairs = [(0, 1), (1, 2), (2, 3)];
+        let join = |least| {
+            let mut linkage = Linkage::new(profiles(), &pairs, &UNIT_OF);
+            linkage.join(least, usize::MAX, ALL);
+            (labels(&linkage), linkage.edges.iter().map(|e| (e.a, e.b, (100.0 * e.weight).round())).collect::<Vec<_>>())
+        };
+        assert_eq!(join(0.8), (vec![0, 0, 1, 2], vec![(0, 1, 10.0)]));
+        // With 2 the third view speaks for a half only: (1 + 0 + 0 + 1/3) / 4.
+        assert_eq!(join(0.4).0, [0, 0, 0, 1]);
+        let (all, edges) = join(0.3);
+        assert_eq!((all, edges), (vec![0; 4], vec![(0, 1, 10.0), (0, 2, 35.0), (0, 3, 77.0)]));
+    }
+
+    #[test]
+    fn only_small_clusters_join_against_the_masks_and_heights_keep_their_range() {
+        let views: Vec<Profile> =
+            [[ONE; 4], [ONE; 4], [ONE, TWO, TWO, TWO], [TWO; 4]].iter().map(|v| profile(v)).collect();
+        let mut linkage = Linkage::new(views, &[(0, 1), (1, 2), (2, 3)], &UNIT_OF);
+        linkage.join(0.9, usize::MAX, (0.0, 0.5));
+        linkage.join(1e-9, 2, (0.0, 0.5));
+        // 2 agrees with 3 more than with the pair; both are small, so they join, and the two pairs do not.
+        assert_eq!(labels(&linkage), [0, 0, 1, 1]);
+        linkage.join(1e-9, usize::MAX, (0.6, 9.0));
+        let heights: Vec<f64> = linkage.edges.iter().map(|e| e.weight).collect();
+        assert!(
+            labels(&linkage) == [0; 4] && heights[..2].iter().all(|h| *h <= 0.5) && heights[2] >= 0.6,
+            "{heights:?}"
+        );
+    }
+
+    #[test]
+    fn a_floor_takes_its_crumbs_in_few_rounds() {
+        // The floor agrees more with the first crumb than with the others, these most with the floor.
+        let share = |i: usize| Some(1.0 - 0.001 * i as f32);
+        let mut views = vec![profile(&[ONE; 6])];
+        views.extend((0..40).map(|i| profile(&[share(i); 6])));
+        let pairs: Vec<(u32, u32)> = (1..41).map(|i| (0, i)).collect();
+        let mut linkage = Linkage::new(views, &pairs, &UNIT_OF);
+        linkage.sizes[0] = 1000;
+        let round = linkage.round(0.5, usize::MAX);
+        assert!((1..41).all(|i| round[i].0 == 0) && round[0].0 == 0);
+        linkage.join(0.5, usize::MAX, ALL);
+        assert_eq!(labels(&linkage), [0; 41]);
+    }
+
+    #[test]
+    fn pieces_that_do_not_touch_meet_in_masks() {
+        // 0 and 2 share masks in three views of four; 1 is merged with them in one view; 3 is seen in one view only.
+        let views = || {
+            vec![
+                profile(&[ONE; 4]),
+                profile(&[ONE, TWO, TWO, TWO]),
+                profile(&[ONE, ONE, ONE, TWO]),
+                profile(&[ONE, None]),
+            ]
+        };
+        let join = |least| {
+            let mut linkage = Linkage::new(views(), &[], &UNIT_OF);
+            linkage.join(0.1, usize::MAX, ALL);
+            assert_eq!(labels(&linkage), [0, 1, 2, 3], "no two touch");
+            linkage.meet(vec![Place::default(); 4]);
+            linkage.join(least, usize::MAX, ALL);
+            labels(&linkage)
+        };
+        assert_eq!(join(0.6), [0, 1, 0, 2]);
+        assert_eq!(join(0.8), [0, 1, 2, 3]);
+    }
+
+    #[test]
+    fn pieces_of_one_plane_need_less_agreement() {
+        let join = |second: Vec<[f32; 3]>| {
+            // The same mask in five views of nine.
+            let views = vec![profile(&[ONE; 9]), profile(&[ONE, ONE, ONE, ONE, ONE, TWO, TWO, TWO, TWO])];
+            let mut linkage = Linkage::new(views, &[], &UNIT_OF);
+            linkage.meet(places(&[board([0.0; 3], 0, 1), second]));
+            linkage.join(0.6, usize::MAX, ALL);
+            labels(&linkage)
+        };
+        assert_eq!(join(board([2.0, 0.0, 0.0], 0, 1)), [0, 0]);
+        assert_eq!(join(board([2.0, 0.0, 0.0], 1, 2)), [0, 1]);
+    }
+}

@@ -1,0 +1,297 @@
+//! What the masks show of a Gaussian or of several, and how far that makes them one thing.
+
+use artifacts::{Footprints, LEVELS, Level};
+use gs_io::Result;
+use rayon::prelude::*;
+use std::cmp::Ordering;
+use std::collections::BTreeMap;
+
+/// How much the agreement of a level counts (default, small, medium, large). Two that share small masks are one thing more surely than
+/// two that share large ones, and the medium level adds next to nothing. Chosen on scenes for tuning with three kinds of masks
+/// (docs/results/real-masks.md).
+const COUNTS: [f64; LEVELS] = [0.4, 1.0, 0.05, 0.6];
+/// Fewest views and levels that must show both, and least share of their weight in these, for their masks to tell.
+const LEAST_COMMON: (usize, f64) = (2, 0.05);
+
+/// The view and level of each mask, as one number; ascending.
+pub fn units(footprints: &Footprints) -> Vec<u32> {
+    footprints.rows.iter().map(|r| r.view * LEVELS as u32 + r.level).collect()
+}
+
+/// The masks of one level of a view that show some Gaussians.
+#[derive(Debug, Clone, Copy)]
+struct Unit {
+    /// As [`units`] counts.
+    number: u32,
+    /// Where they end in [`Profile::masks`].
+    end: u32,
+    /// Weight in all of them.
+    weight: f32,
+}
+
+/// What the masks show of a Gaussian or of several.
+#[derive(Debug, Clone, Default)]
+pub struct Profile {
+    /// Mask (by its row in the footprints) and the weight in it, ascending. f32 because single Gaussians have most of the memory.
+    masks: Vec<(u32, f32)>,
+    units: Vec<Unit>,
+    /// Weight in all masks.
+    total: f64,
+}
+
+/// How far two belong together.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Agreement {
+    /// The probability that a bit of each lies in the same mask, 0 to 1: of each level the mean over the views that show both, by the root
+    /// of the product of their weights; of the levels the mean by [`COUNTS`].
+    pub value: f64,
+    /// Whether enough views show both.
+    pub firm: bool,
+}
+
+impl Profile {
+    /// From masks and weights, ascending. `unit_of` has the unit of each mask.
+    pub fn new(masks: Vec<(u32, f32)>, unit_of: &[u32]) -> Self {
+        let mut units: Vec<Unit> = Vec::new();
+        for (at, &(mask, weight)) in masks.iter().enumerate() {
+            let (number, end) = (unit_of[mask as usize], at as u32 + 1);
+            match units.last_mut().filter(|u| u.number == number) {
+                Some(unit) => (unit.end, unit.weight) = (end, unit.weight + weight),
+                None => units.push(Unit { number, end, weight }),
+            }
+        }
+        let total = units.iter().map(|u| f64::from(u.weight)).sum();
+        Self { masks, units, total }
+    }
+
+    /// Those of `n` Gaussians in the masks at `levels`.
+    ///
+    /// # Errors
+    /// When the footprints can't be read.
+    pub fn of_gaussians(n: usize, footprints: &Footprints, levels: &[Level]) -> Result<Vec<Self>> {
+        let unit_of = units(footprints);
+        let rows = (0..footprints.rows.len() as u32).filter(|&r| footprints.rows[r as usize].is_of(levels));
+        let mut masks = vec![Vec::new(); n];
+        footprints.in_batches(&rows.collect::<Vec<u32>>(), |rows, batch| {
+            for (&row, entries) in rows.iter().zip(batch) {
+                entries.iter().filter(|(_, w)| *w > 0.0).for_each(|(i, w)| masks[i as usize].push((row, w)));
+            }
+        })?;
+        Ok(masks.into_par_iter().map(|m| Self::new(m, &unit_of)).collect())
+    }
+
+    /// Those of `instances` instances in the masks at `levels`. `labels` are those of the kept Gaussians, -1 for none.
+    ///
+    /// # Errors
+    /// When the footprints can't be read.
+    pub fn of_instances(
+        labels: &[i32],
+        instances: usize,
+        footprints: &Footprints,
+        levels: &[Level],
+    ) -> Result<Vec<Self>> {
+        let mut masks = vec![Vec::new(); instances];
+        for (row, of) in mask_weights(labels, footprints, levels)? {
+            of.into_iter().filter(|(_, w)| *w > 0.0).for_each(|(k, w)| masks[k as usize].push((row, w as f32)));
+        }
+        let unit_of = units(footprints);
+        Ok(masks.into_iter().map(|m| Self::new(m, &unit_of)).collect())
+    }
+
+    /// Of both together.
+    pub fn joined(&self, other: &Self, unit_of: &[u32]) -> Self {
+        let (mut a, mut b) = (&self.masks[..], &other.masks[..]);
+        let mut masks = Vec::with_capacity(a.len() + b.len());
+        while let (Some(&x), Some(&y)) = (a.first(), b.first()) {
+            let order = x.0.cmp(&y.0);
+            masks.push((x.0.min(y.0), if order.is_le() { x.1 } else { 0.0 } + if order.is_ge() { y.1 } else { 0.0 }));
+            a = &a[usize::from(order.is_le())..];
+            b = &b[usize::from(order.is_ge())..];
+        }
+        masks.extend_from_slice(a);
+        masks.extend_from_slice(b);
+        Self::new(masks, unit_of)
+    }
+
+    /// Without the part `other`.
+    pub fn without(&self, other: &Self, unit_of: &[u32]) -> Self {
+        let part: BTreeMap<u32, f32> = other.masks.iter().copied().collect();
+        let left = self.masks.iter().map(|&(k, w)| (k, w - part.get(&k).unwrap_or(&0.0), w));
+        // What is left of nothing but rounding is nothing.
+        Self::new(left.filter(|(_, left, w)| *left > 1e-5 * w).map(|(k, left, _)| (k, left)).collect(), unit_of)
+    }
+
+    /// The masks that hold more than half of what their view and level show.
+    pub fn main_masks(&self) -> impl Iterator<Item = u32> + '_ {
+        self.each().flat_map(|(u, masks)| masks.iter().filter(move |m| 2.0 * m.1 > u.weight).map(|m| m.0))
+    }
+
+    fn each(&self) -> impl Iterator<Item = (&Unit, &[(u32, f32)])> {
+        let starts = std::iter::once(0).chain(self.units.iter().map(|u| u.end as usize));
+        self.units.iter().zip(starts).map(|(u, start)| (u, &self.masks[start..u.end as usize]))
+    }
+
+    /// How far two belong together; None where no view shows both.
+    pub fn agreement(&self, other: &Self) -> Option<Agreement> {
+        let mut levels = [[0.0; 2]; LEVELS];
+        let (mut seen, mut share) = (0, 0.0);
+        let (mut own, mut others) = (self.each().peekable(), other.each().peekable());
+        while let (Some((x, a)), Some((y, b))) = (own.peek(), others.peek()) {
+            let order = x.number.cmp(&y.number);
+            if order.is_eq() {
+                let (wx, wy) = (f64::from(x.weight), f64::from(y.weight));
+                let [same, all] = &mut levels[x.number as usize % LEVELS];
+                let root = (wx * wy).sqrt();
+                *same += common(a, b) / root;
+                *all += root;
+                seen += 1;
+                share += (wx / self.total).min(wy / other.total);
+            }
+            if order.is_le() {
+                own.next();
+            }
+            if order.is_ge() {
+                others.next();
+            }
+        }
+        let counted = || levels.iter().zip(COUNTS).filter(|([_, all], _)| *all > 0.0);
+        let all: f64 = counted().map(|(_, count)| count).sum();
+        let sum: f64 = counted().map(|([same, all], count)| count * same / all).sum();
+        let firm = seen >= LEAST_COMMON.0 && share >= LEAST_COMMON.1;
+        (seen > 0).then(|| Agreement { value: if all > 0.0 { sum / all } else { 0.0 }, firm })
+    }
+}
+
+/// Sum of the products of weights in common masks.
+fn common(mut a: &[(u32, f32)], mut b: &[(u32, f32)]) -> f64 {
+    let mut sum = 0.0;
+    while let (Some(x), Some(y)) = (a.first(), b.first()) {
+        let order = x.0.cmp(&y.0);
+        if order == Ordering::Equal {
+            sum += f64::from(x.1) * f64::from(y.1);
+        }
+        a = &a[usize::from(order.is_le())..];
+        b = &b[usize::from(order.is_ge())..];
+    }
+    sum
+}
+
+/// How far each piece agrees with the rest of its instance, by the masks at `levels`. `labels` are the pieces of the
+/// kept Gaussians, -1 for none; `wholes` has the instance of each piece. None where too few views show both.
+///
+/// # Errors
+/// When the footprints can't be read.
+pub fn with_rest(
+    labels: &[i32],
+    wholes: &[i32],
+    footprints: &Footprints,
+    levels: &[Level],
+) -> Result<Vec<Option<f64>>> {
+    let unit_of = units(footprints);
+    let pieces = Profile::of_instances(labels, wholes.len(), footprints, levels)?;
+    let mut instances: BTreeMap<i32, Profile> = BTreeMap::new();
+    for (piece, whole) in pieces.iter().zip(wholes) {
+        let sum = instances.entry(*whole).or_default();
+        *sum = sum.joined(piece, &unit_of);
+    }
+    let of = |(piece, whole): (&Profile, &i32)| {
+        let agreement = piece.agreement(&instances[whole].without(piece, &unit_of))?;
+        agreement.firm.then_some(agreement.value)
+    };
+    Ok(pieces.par_iter().zip(wholes).map(of).collect())
+}
+
+/// The masks at `levels`, as rows of the footprints, and the weight of each instance in them. `labels` are those of the kept
+/// Gaussians, -1 for none.
+///
+/// # Errors
+/// When the footprints can't be read.
+pub fn mask_weights(
+    labels: &[i32],
+    footprints: &Footprints,
+    levels: &[Level],
+) -> Result<Vec<(u32, BTreeMap<u32, f64>)>> {
+    (0..footprints.rows.len() as u32)
+        .into_par_iter()
+        .filter(|&r| footprints.rows[r as usize].is_of(levels))
+        .map(|r| {
+            let mut of: BTreeMap<u32, f64> = BTreeMap::new();
+            for (i, w) in footprints.entries(r as usize)?.iter() {
+                if let Ok(k) = u32::try_from(labels[i as usize]) {
+                    *of.entry(k).or_default() += f64::from(w);
+                }
+            }
+            Ok((r, of))
+        })
+        .collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::testing::{footprints, footprints_of};
+
+    /// Two views of two levels, default and small, with two masks each.
+    const UNIT_OF: [u32; 8] = [0, 0, 1, 1, 4, 4, 5, 5];
+
+    fn of(masks: &[(u32, f32)]) -> Profile {
+        Profile::new(masks.to_vec(), &UNIT_OF)
+    }
+
+    #[test]
+    fn agreement_is_the_probability_of_one_mask() {
+        let (a, b) = (of(&[(0, 3.0), (1, 1.0), (4, 4.0)]), of(&[(0, 2.0), (1, 2.0), (5, 16.0)]));
+        // First view: 3/4 1/2 + 1/4 1/2, by the root of 4 times 4; second view: 0, by the root of 4 times 16.
+        let expected = 0.5 * 4.0 / 12.0;
+        assert!((a.agreement(&b).unwrap().value - expected).abs() < 1e-12);
+        assert_eq!(a.agreement(&b), b.agreement(&a));
+        assert_eq!(a.agreement(&of(&[(2, 1.0)])), None, "no view shows both at one level");
+        // Levels count by their weights: one mask at level default, two at level small.
+        let (a, b) = (of(&[(0, 1.0), (2, 1.0)]), of(&[(0, 1.0), (3, 1.0)]));
+        assert!((a.agreement(&b).unwrap().value - COUNTS[0] / (COUNTS[0] + COUNTS[1])).abs() < 1e-12);
+    }
+
+    #[test]
+    fn agreement_is_firm_where_enough_views_show_both() {
+        let a = of(&[(0, 1.0), (4, 1.0)]);
+        assert!(a.agreement(&a).unwrap().firm);
+        assert!(!a.agreement(&of(&[(0, 1.0)])).unwrap().firm, "one view");
+        let elsewhere = of(&[(0, 0.01), (2, 10.0), (4, 0.01)]);
+        assert!(!a.agreement(&elsewhere).unwrap().firm, "seen elsewhere");
+    }
+
+    #[test]
+    fn a_part_that_is_joined_can_be_taken_out_again() {
+        let (a, b) = (of(&[(0, 1.0), (2, 3.0)]), of(&[(0, 2.0), (1, 4.0)]));
+        let both = a.joined(&b, &UNIT_OF);
+        assert_eq!(both.masks, [(0, 3.0), (1, 4.0), (2, 3.0)]);
+        assert_eq!((both.units[0].weight, both.total), (7.0, 10.0));
+        assert_eq!(both.without(&b, &UNIT_OF).masks, a.masks);
+        assert_eq!(both.main_masks().collect::<Vec<_>>(), [1, 2]);
+    }
+
+    #[test]
+    fn gaussians_and_instances_have_the_same_masks() {
+        let views: [&[&[u32]]; 2] = [&[&[0, 1, 2], &[4]], &[&[2, 3]]];
+        let footprints = footprints_of(&[(Level::Small, &views), (Level::Large, &views)]);
+        let of_gaussians = Profile::of_gaussians(8, &footprints, &[Level::Large]).unwrap();
+        let labels = [0, 0, 0, 1, -1, -1, -1, -1];
+        let of_instances = Profile::of_instances(&labels, 2, &footprints, &[Level::Large]).unwrap();
+        let unit_of = units(&footprints);
+        let sum = of_gaussians[..3].iter().fold(Profile::default(), |sum, p| sum.joined(p, &unit_of));
+        assert_eq!((&sum.masks, &of_gaussians[3].masks), (&of_instances[0].masks, &of_instances[1].masks));
+        assert!(of_gaussians[5].masks.is_empty());
+    }
+
+    #[test]
+    fn a_piece_agrees_with_the_rest_as_far_as_masks_hold_both() {
+        // Of instance 0 the pieces 0 and 1, in one mask in the first view alone; piece 2 is all of instance 1.
+        let views: [&[&[u32]]; 2] = [&[&[0, 1, 2, 3, 4]], &[&[0, 1, 4, 5], &[2, 3, 6, 7]]];
+        let footprints = footprints(&views);
+        let agreements = |levels| with_rest(&[0, 0, 1, 1, -1, -1, 2, 2], &[0, 0, 1], &footprints, levels).unwrap();
+        let half = |agreement: Option<f64>| (agreement.unwrap() - 0.5).abs() < 1e-12;
+        let [a, b, alone] = agreements(&[Level::Large])[..] else { panic!("one for each piece") };
+        assert!(half(a) && half(b) && alone.is_none(), "{a:?} {b:?} {alone:?}");
+        assert_eq!(agreements(&[Level::Medium]), [None; 3], "no masks");
+    }
+}
