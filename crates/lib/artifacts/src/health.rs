@@ -73,10 +73,10 @@ impl Health {
         let (largest, purity) = (percent(self.largest), self.purity.map_or("no masks".into(), percent));
         let too_large = format!(
             "one instance holds {largest} of the Gaussians; if it is more than floor or walls, try cluster-match --levels \
-             small, or feat-train --levels small"
+             small, or a larger --agreement"
         );
-        let impure = "the masks of the views contradict each other; look at the masks in the report, and try feat-train \
-                      --levels small, or more views";
+        let impure = "the masks of the views contradict each other; look at the masks in the report, and try \
+                      cluster-match --levels small, or more views";
         let pair = |s: &SharedMasks| {
             let [a, b] = s.instances;
             format!("instances {a} and {b} share {} of their masks", percent(s.share))
@@ -87,8 +87,7 @@ impl Health {
             n => format!(" and {n} more pairs share most of theirs"),
         };
         let one_thing = format!(
-            "{named}{more}: each pair may be one thing in pieces; try cluster-match with a smaller --join (above 0.5), or more \
-             views"
+            "{named}{more}: each pair may be one thing in pieces; try cluster-match with a smaller --agreement, or more views"
         );
         [
             Finding {

@@ -1,9 +1,9 @@
-//! Stage 3: 3D instances from features, the masks they were seen as, and a language descriptor for each.
+//! Stage 3: 3D instances, the masks they were seen as, and a language descriptor for each.
 //!
-//! [`options`] is the command line, `run` the story, `inputs` and `outputs` its ends. `group` clusters Gaussians;
-//! `assignment` keeps who belongs to which instance, gives noise and unseen Gaussians to their neighbours, and applies what
-//! the masks say: `vote` corrects rims, `join` joins pieces of one thing (`plane` tells floors
-//! and walls). `associate` matches instances with the
+//! [`options`] is the command line, `run` the story, `inputs` and `outputs` its ends. `linkage` clusters Gaussians by how far
+//! their masks agree (`profile` says how far, `plane` tells floors and walls), `group` by their features;
+//! `assignment` keeps who belongs to which instance, and gives noise and unseen Gaussians to their neighbours; where features
+//! were clustered, `vote` corrects rims. `associate` matches instances with the
 //! masks of each view, `describe` gathers what is known of each instance, `rank` says how sure it is one whole thing,
 //! `health` how far masks and instances agree, `memory` forecasts the peak.
 

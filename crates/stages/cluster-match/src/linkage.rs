@@ -81,14 +81,15 @@ pub struct Linkage<'a> {
     profiles: Vec<Profile>,
     /// Members of each cluster; 0 for one that has joined another.
     sizes: Vec<usize>,
-    /// Agreement of each cluster with those that it may join.
-    near: Vec<BTreeMap<u32, f64>>,
+    /// Those that each cluster may join, and its agreement with them.
+    near: Vec<Vec<(u32, f64)>>,
     /// Where clusters lie, once those that don't touch may join ([`Linkage::meet`]).
     places: Vec<Place>,
     /// The cluster that each joined, or itself.
     into: Vec<u32>,
-    /// What was joined, by a member of each side and the distance. It never falls.
+    /// What was joined, by a member of each side and the distance.
     edges: Vec<Edge>,
+    /// The largest distance within each cluster: those above it are no smaller.
     heights: Vec<f64>,
 }
 
@@ -100,7 +101,7 @@ impl<'a> Linkage<'a> {
             unit_of,
             profiles,
             sizes: vec![1; n],
-            near: vec![BTreeMap::new(); n],
+            near: vec![Vec::new(); n],
             places: Vec::new(),
             into: (0..n as u32).collect(),
             edges: Vec::new(),
@@ -110,6 +111,7 @@ impl<'a> Linkage<'a> {
         out
     }
 
+    /// Finds the agreement of pairs that are in nobody's list.
     fn compare(&mut self, pairs: &[(u32, u32)]) {
         let agreement = |&(a, b): &(u32, u32)| {
             let (a, b) = (a as usize, b as usize);
@@ -123,8 +125,8 @@ impl<'a> Linkage<'a> {
         let values: Vec<Option<f64>> = pairs.par_iter().map(agreement).collect();
         for (&(a, b), value) in pairs.iter().zip(values) {
             if let Some(value) = value {
-                self.near[a as usize].insert(b, value);
-                self.near[b as usize].insert(a, value);
+                self.near[a as usize].push((b, value));
+                self.near[b as usize].push((a, value));
             }
         }
     }
@@ -140,20 +142,19 @@ impl<'a> Linkage<'a> {
             self.profiles[i as usize].main_masks().for_each(|k| mainly.entry(k).or_default().push(i));
         }
         let meet = mainly.values().flat_map(|of| of.iter().flat_map(|&a| of.iter().map(move |&b| (a, b))));
-        let touch = left.iter().flat_map(|&a| self.near[a as usize].keys().map(move |&b| (a, b)));
+        let touch = left.iter().flat_map(|&a| self.near[a as usize].iter().map(move |&(b, _)| (a, b)));
         let mut pairs: Vec<(u32, u32)> = meet.chain(touch).filter(|(a, b)| a < b).collect();
         pairs.sort_unstable();
         pairs.dedup();
-        self.near.iter_mut().for_each(BTreeMap::clear);
+        self.near.iter_mut().for_each(Vec::clear);
         self.compare(&pairs);
     }
 
     /// The cluster that each joins in this round, or itself.
     fn round(&self, least: f64, below: usize) -> Vec<(u32, f64)> {
-        let best = |near: &BTreeMap<u32, f64>| {
-            let best = near.iter().fold((0, f64::MIN), |best, (&c, &v)| if v > best.1 { (c, v) } else { best });
-            (best.1 >= least).then_some(best)
-        };
+        // Of equals the first.
+        let order = |a: &(u32, f64), b: &(u32, f64)| a.1.total_cmp(&b.1).then(b.0.cmp(&a.0));
+        let best = |near: &Vec<(u32, f64)>| near.iter().copied().filter(|b| b.1 >= least).max_by(order);
         let best: Vec<Option<(u32, f64)>> = self.near.par_iter().map(best).collect();
         let rank = |i: u32| (self.sizes[i as usize], Reverse(i));
         let joins = |i: u32| {
@@ -166,8 +167,8 @@ impl<'a> Linkage<'a> {
         (0..best.len() as u32).into_par_iter().map(|i| joins(i).unwrap_or((i, 0.0))).collect()
     }
 
-    /// Joins clusters that agree by `least` or more, and of those only such as have fewer than `below` members, into others. `apart` is the
-    /// least distance that they get.
+    /// Joins clusters that agree by `least` or more; only such as have fewer than `below` members join others. Their distances are
+    /// kept between `low` and `high`.
     pub fn join(&mut self, least: f64, below: usize, (low, high): (f64, f64)) {
         loop {
             let target = self.round(least, below);
@@ -187,14 +188,14 @@ impl<'a> Linkage<'a> {
             for (&to, members) in &groups {
                 members.iter().for_each(|&i| self.join_one(i, target[i as usize], to, (low, high)));
                 for i in members.iter().chain([&to]) {
-                    let near = std::mem::take(&mut self.near[*i as usize]).into_keys();
-                    pairs.extend(near.map(root).filter(|&c| c != to).map(|c| (to.min(c), to.max(c))));
+                    let near = std::mem::take(&mut self.near[*i as usize]).into_iter();
+                    pairs.extend(near.map(|(c, _)| root(c)).filter(|&c| c != to).map(|c| (to.min(c), to.max(c))));
                 }
             }
             pairs.sort_unstable();
             pairs.dedup();
             for end in pairs.iter().flat_map(|&(a, b)| [a, b]).collect::<BTreeSet<u32>>() {
-                self.near[end as usize].retain(|&c, _| target[c as usize].0 == c);
+                self.near[end as usize].retain(|&(c, _)| target[c as usize].0 == c && !groups.contains_key(&c));
             }
             self.compare(&pairs);
         }
