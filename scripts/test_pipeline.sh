@@ -199,7 +199,7 @@ EVAL_ARGS|--holdou 8|--resolution 0px
 MASK_ARGS|--points-per-sid 6|--points-per-side 0
 GRAPH_ARGS|--anchor-ration 0.1|--k 0
 FEAT_ARGS|--levles small|--tau 0
-CLUSTER_ARGS|--jion 0.6|--join 0.2
+CLUSTER_ARGS|--jion 0.6|--join 2
 SCORE_ARGS|--alhpa 0.5|--alpha 3
 REPORT_ARGS|--veiws x|
 LIST
