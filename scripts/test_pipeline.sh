@@ -369,7 +369,7 @@ ablation() { target/release/bench run "${plan:-pipelines/ablation-small.plan}" -
 ablation > "$work/ablation.log" 2>&1 || { tail -3 "$work/ablation.log"; fail "the small ablation"; }
 grep -q 'instance mIoU' "$work/ablation/report.md" && [ -s "$work/ablation/report.html" ] || fail "no tables"
 ablation > "$work/again.log" 2>&1
-grep -q '^bench: 0 of 12 runs' "$work/again.log" || { cat "$work/again.log"; fail "a second run ran a stage"; }
+grep -q '^bench: 0 of 14 runs' "$work/again.log" || { cat "$work/again.log"; fail "a second run ran a stage"; }
 sed 's/^features spectral .*/& --dim 2/' pipelines/ablation-small.plan > "$work/broken.plan"
 plan=$work/broken.plan ablation > "$work/broken.log" 2>&1 && fail "two dimensions are as good as many"
 grep -q 'not what the plan expects' "$work/broken.log" || { cat "$work/broken.log"; fail "no word of what was expected"; }
