@@ -102,11 +102,11 @@ impl Peer for Options {
         levels.sort();
         levels.dedup();
         let mut all = Vec::new();
+        let (dim, mut features) = (world.learned.dim(), affinity(&world.learned));
+        if self.smooth > 0 {
+            features = smoothed(&features, dim, &world.graph.gaussian_knn, self.smooth as usize);
+        }
         for (rank, &level) in levels.iter().enumerate() {
-            let (dim, mut features) = (world.learned.dim(), affinity(&world.learned));
-            if self.smooth > 0 {
-                features = smoothed(&features, dim, &world.graph.gaussian_knn, self.smooth as usize);
-            }
             let objects = self.objects(world, stage, level, self.epsilon * (rank + 1) as f64, dim, &features)?;
             stage.info(&format!("level {level}: {} objects", objects.masks.len()));
             all.push(objects);
@@ -378,7 +378,8 @@ mod tests {
     }
 
     #[test]
-    fn features_are_smoothed_over_neighbours() {
+    fn features_are_of_unit_length_and_smoothed_over_neighbours() {
+        assert_eq!(affinity(&Features { kept: vec![0], values: arr2(&[[3.0, 4.0]]) }), [0.6, 0.8]);
         let half = 0.5f32.sqrt();
         // Three in a row, each with the first of its neighbours: (1, 0) + (0, 1) twice, (0, 1) alone.
         let smoothed = smoothed(&[1.0, 0.0, 0.0, 1.0, 0.0, 1.0], 2, &arr2(&[[1], [0], [1]]), 2);

@@ -63,16 +63,16 @@ pub(crate) struct Settings {
     /// seen, at least 10 and at most 30, because small scenes have small things]
     #[arg(long, value_name = "COUNT", value_parser = stage::within(2usize..=MOST))]
     pub min_cluster_size: Option<usize>,
-    /// Neighbours, the Gaussian itself included, that set its core distance
+    /// Neighbours, the Gaussian itself included, that set its core distance. Only with features
     #[arg(long, value_name = "COUNT", value_parser = stage::within(1usize..=MOST), default_value_t = 10)]
     pub min_samples: usize,
-    /// Join clusters that were born below this feature distance; for free points the default is 0
+    /// Join clusters that were born below this feature distance; for free points the default is 0. Only with features
     // Free points: of 0 to 0.3 none is better (docs/results/paper.md). On the graph 0.1 to 0.2 give the same mIoU within 0.01 on synthetic scenes
     // of mixed granularity; 0 gives hundreds of fragments, because near-equal features have lambdas without bound.
     #[arg(long, value_name = "DISTANCE", value_parser = stage::at_least(0.0f64), default_value = "0.15",
         default_value_if("cluster", "free", "0"))]
     pub epsilon: f64,
-    /// Select the finest clusters instead of the most stable ones
+    /// Select the finest clusters instead of the most stable ones. Only with features
     #[arg(long)]
     pub leaf: bool,
     /// Allow one instance of all Gaussians where nothing divides them

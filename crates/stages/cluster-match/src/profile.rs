@@ -158,7 +158,7 @@ impl Profile {
         let all: f64 = counted().map(|(_, count)| count).sum();
         let sum: f64 = counted().map(|([same, all], count)| count * same / all).sum();
         let firm = seen >= LEAST_COMMON.0 && share >= LEAST_COMMON.1;
-        (seen > 0).then(|| Agreement { value: if all > 0.0 { sum / all } else { 0.0 }, firm })
+        (seen > 0).then(|| Agreement { value: sum / all, firm })
     }
 }
 

@@ -118,27 +118,21 @@ impl Program for Args {
     }
 }
 
-/// Gives noise an instance, and lets the masks of `levels` vote. Returns how many Gaussians that changed.
-fn settle(found: &mut Assignment, inputs: &Inputs, settings: &Settings, levels: &[Level]) -> Result<usize> {
-    if settings.noise == Noise::Nearest {
-        let mut noise = vec![false; found.labels.len()];
-        inputs.graph.kept.iter().for_each(|&i| noise[i as usize] = found.labels[i as usize] < 0);
-        found.fill_from_nearest(&inputs.geometry.gaussians.means, |i| noise[i])?;
-    }
-    let votes = settings.votes;
-    if votes > 0 { found.vote(&inputs.graph, &inputs.footprints, levels, votes) } else { Ok(0) }
-}
-
 /// Corrects the clustering by where Gaussians lie and by the masks of each view.
 fn correct(mut found: Assignment, inputs: &Inputs, settings: &Settings, stage: &Stage) -> Result<Assignment> {
     let (means, graph, footprints) = (&inputs.geometry.gaussians.means, &inputs.graph, &inputs.footprints);
     let mut kept = vec![false; means.len()];
     graph.kept.iter().for_each(|&i| kept[i as usize] = true);
-    let changed = settle(&mut found, inputs, settings, &settings.levels)?;
+    if settings.noise == Noise::Nearest {
+        let noise: Vec<bool> = kept.iter().zip(&found.labels).map(|(&kept, &label)| kept && label < 0).collect();
+        found.fill_from_nearest(means, |i| noise[i])?;
+    }
     if settings.votes > 0 {
+        let changed = found.vote(graph, footprints, &settings.levels, settings.votes)?;
         stage.info(&format!("votes of the masks changed the instance of {changed} Gaussians"));
     }
-    if settings.cluster == Space::Graph && settings.join > 0.0 {
+    // Clustering by the masks has joined them already.
+    if settings.cluster != Space::Masks && settings.join > 0.0 {
         let before = found.instances;
         found.join(&inputs.geometry.gaussians, &graph.kept, footprints, &settings.levels, settings.join)?;
         if found.instances < before {

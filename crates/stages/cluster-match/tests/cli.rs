@@ -367,6 +367,8 @@ fn options_do_what_they_say() {
     // Left apart, they are said to share their masks.
     let (i, said) = s.succeed(&["--levels", "medium", "--cluster", "free", "--min-samples", "5"]);
     assert!(i.len() == 2 && said.contains("instances 0 and 1 share 100 % of their masks: each pair"), "{said}");
+    let (i, _) = s.succeed(&["--levels", "medium", "--cluster", "free", "--min-samples", "5", "--join", "0.5"]);
+    assert_eq!(i.len(), 1, "joined where that is asked for");
     let (i, _) = s.succeed(&["--levels", "medium,large"]);
     assert!(i.matches.len() == 2 * VIEWS && i.matches.iter().all(|m| m.mask >= 3));
     assert!(s.succeed(&["--threshold", "1"]).0.matches.is_empty());
