@@ -75,21 +75,38 @@ pub(crate) fn find(
     footprints: &Footprints,
     views: usize,
 ) -> Result<Vec<(Granule, Vec<Shown>)>> {
-    let mut best: Vec<Vec<Shown>> = vec![Vec::new(); candidates.members.len()];
-    let mut first = 0;
-    for rows in footprints.rows.chunk_by(|a, b| a.view == b.view) {
-        let masks = (first..first + rows.len())
-            .into_par_iter()
-            .map(|r| Mask::new(r, candidates, labels, nodes, footprints))
-            .collect::<Result<Vec<Mask>>>()?;
-        first += rows.len();
-        best_of_view(&masks, &mut best);
-    }
+    let best = best_masks(candidates, labels, nodes, footprints)?;
     let mut found: Vec<(f64, Granule, Vec<Shown>)> =
         candidates.members.iter().zip(best).filter_map(|(&members, shown)| judge(members, shown, views)).collect();
     // Of equals the first.
     found.sort_by(|a, b| b.0.total_cmp(&a.0));
     Ok(different(found))
+}
+
+/// Which of `count` instances masks of at least `views` views show as one. `labels` are those of the kept Gaussians.
+///
+/// # Errors
+/// When the footprints can't be read.
+pub(crate) fn are_shown(labels: &[i32], count: usize, footprints: &Footprints, views: usize) -> Result<Vec<bool>> {
+    let nodes = vec![-1; labels.len()];
+    let candidates = Candidates::new(labels, count, &nodes, &BTreeMap::new());
+    let best = best_masks(&candidates, labels, &nodes, footprints)?;
+    Ok(candidates.members.iter().zip(best).map(|(&m, shown)| judge(m, shown, views).is_some()).collect())
+}
+
+/// The mask that fits each candidate best, of each view that shows it.
+fn best_masks(c: &Candidates, labels: &[i32], nodes: &[i32], footprints: &Footprints) -> Result<Vec<Vec<Shown>>> {
+    let mut best: Vec<Vec<Shown>> = vec![Vec::new(); c.members.len()];
+    let mut first = 0;
+    for rows in footprints.rows.chunk_by(|a, b| a.view == b.view) {
+        let masks = (first..first + rows.len())
+            .into_par_iter()
+            .map(|r| Mask::new(r, c, labels, nodes, footprints))
+            .collect::<Result<Vec<Mask>>>()?;
+        first += rows.len();
+        best_of_view(&masks, &mut best);
+    }
+    Ok(best)
 }
 
 /// What a mask shows of the candidates.

@@ -18,6 +18,7 @@ mod linkage;
 mod memory;
 mod options;
 mod outputs;
+mod parts;
 mod plane;
 mod profile;
 mod rank;

@@ -8,6 +8,7 @@ use crate::group::{free, on_graph};
 use crate::inputs::{Inputs, mask_features};
 use crate::options::{Args, Noise, Settings, Space};
 use crate::outputs::{self, Found};
+use crate::parts::split;
 use crate::profile::mask_weights;
 use crate::rank::confidence;
 use crate::{health, linkage, memory};
@@ -143,8 +144,7 @@ fn correct(mut found: Assignment, inputs: &Inputs, settings: &Settings, stage: &
     if settings.split > 0.0 && settings.levels.contains(&Level::Small) && footprints.rows.iter().any(small) {
         let clustering = linkage::cluster(inputs, settings, &[Level::Small], (PARTS, 0.0))?;
         let parts = Assignment::new(&clustering, &graph.kept, means.len());
-        let apart = found.apart(&parts, &graph.kept, footprints)?;
-        let split = found.split(&parts, settings.split, &apart);
+        let split = split(&mut found, &parts, &graph.kept, footprints, settings.split)?;
         if split > 0 {
             stage.info(&format!("{split} small things within others are instances of their own"));
         }
