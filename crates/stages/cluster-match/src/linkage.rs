@@ -115,7 +115,7 @@ impl<'a> Linkage<'a> {
     fn compare(&mut self, pairs: &[(u32, u32)]) {
         let agreement = |&(a, b): &(u32, u32)| {
             let (a, b) = (a as usize, b as usize);
-            let agreement = self.profiles[a].agreement(&self.profiles[b])?;
+            let agreement = self.profiles[a].agreement(&self.profiles[b], self.unit_of)?;
             if self.places.is_empty() {
                 return Some(agreement.value);
             }
@@ -139,7 +139,7 @@ impl<'a> Linkage<'a> {
         left.iter().zip(places).for_each(|(&i, place)| self.places[i as usize] = place);
         let mut mainly: BTreeMap<u32, Vec<u32>> = BTreeMap::new();
         for &i in &left {
-            self.profiles[i as usize].main_masks().for_each(|k| mainly.entry(k).or_default().push(i));
+            self.profiles[i as usize].main_masks(self.unit_of).for_each(|k| mainly.entry(k).or_default().push(i));
         }
         let meet = mainly.values().flat_map(|of| of.iter().flat_map(|&a| of.iter().map(move |&b| (a, b))));
         let touch = left.iter().flat_map(|&a| self.near[a as usize].iter().map(move |&(b, _)| (a, b)));
@@ -208,7 +208,7 @@ impl<'a> Linkage<'a> {
         self.heights[a] = height;
         self.edges.push(Edge::new(i, other, height));
         let own = std::mem::take(&mut self.profiles[b]);
-        self.profiles[a] = self.profiles[a].joined(&own, self.unit_of);
+        self.profiles[a] = self.profiles[a].joined(&own);
         self.sizes[a] += std::mem::take(&mut self.sizes[b]);
         if !self.places.is_empty() {
             self.places[a] = self.places[a].joined(&self.places[b]);
@@ -243,7 +243,7 @@ mod tests {
     fn profile(firsts: &[Option<f32>]) -> Profile {
         let masks = firsts.iter().zip((0..).step_by(2)).filter_map(|(f, mask)| f.map(|f| (mask, f)));
         let masks = masks.flat_map(|(mask, f)| [(mask, f), (mask + 1, 1.0 - f)]).filter(|(_, w)| *w > 0.0);
-        Profile::new(masks.collect(), &UNIT_OF)
+        Profile::new(masks.collect())
     }
 
     /// Level default of ten views.

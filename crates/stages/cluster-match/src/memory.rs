@@ -12,10 +12,10 @@ pub fn forecast(inputs: &Inputs, space: Space) -> u64 {
     // coordinates, the leaves' blocks, boxes. By the masks: every entry in the profile of its Gaussian, and those growing. Entries
     // are read in batches of 4 million.
     let (value, entries) = match space {
-        Space::Masks => (4, 24 * entries),
+        Space::Masks => (4, 18 * entries),
         Space::Graph => (6, 9 * entries.min(1 << 22)),
         Space::Free => (18, 9 * entries.min(1 << 22)),
     };
-    // Fitted to 11 runs of 5,000 to 950,000 Gaussians; by the masks to 10 of 12,000 to 57,000.
+    // Fitted to 11 runs of 5,000 to 950,000 Gaussians; by the masks to 11 of 12,000 to 950,000.
     12_800_000 + entries + 14 * samples as u64 + 1000 * gaussians as u64 + value * kept * dim
 }

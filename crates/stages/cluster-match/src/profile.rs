@@ -18,23 +18,11 @@ pub fn units(footprints: &Footprints) -> Vec<u32> {
     footprints.rows.iter().map(|r| r.view * LEVELS as u32 + r.level).collect()
 }
 
-/// The masks of one level of a view that show some Gaussians.
-#[derive(Debug, Clone, Copy)]
-struct Unit {
-    /// As [`units`] counts.
-    number: u32,
-    /// Where they end in [`Profile::masks`].
-    end: u32,
-    /// Weight in all of them.
-    weight: f32,
-}
-
 /// What the masks show of a Gaussian or of several.
 #[derive(Debug, Clone, Default)]
 pub struct Profile {
     /// Mask (by its row in the footprints) and the weight in it, ascending. f32 because single Gaussians have most of the memory.
     masks: Vec<(u32, f32)>,
-    units: Vec<Unit>,
     /// Weight in all masks.
     total: f64,
 }
@@ -50,18 +38,10 @@ pub struct Agreement {
 }
 
 impl Profile {
-    /// From masks and weights, ascending. `unit_of` has the unit of each mask.
-    pub fn new(masks: Vec<(u32, f32)>, unit_of: &[u32]) -> Self {
-        let mut units: Vec<Unit> = Vec::new();
-        for (at, &(mask, weight)) in masks.iter().enumerate() {
-            let (number, end) = (unit_of[mask as usize], at as u32 + 1);
-            match units.last_mut().filter(|u| u.number == number) {
-                Some(unit) => (unit.end, unit.weight) = (end, unit.weight + weight),
-                None => units.push(Unit { number, end, weight }),
-            }
-        }
-        let total = units.iter().map(|u| f64::from(u.weight)).sum();
-        Self { masks, units, total }
+    /// From masks and weights, ascending.
+    pub fn new(masks: Vec<(u32, f32)>) -> Self {
+        let total = masks.iter().map(|m| f64::from(m.1)).sum();
+        Self { masks, total }
     }
 
     /// Those of `n` Gaussians in the masks at `levels`.
@@ -69,15 +49,21 @@ impl Profile {
     /// # Errors
     /// When the footprints can't be read.
     pub fn of_gaussians(n: usize, footprints: &Footprints, levels: &[Level]) -> Result<Vec<Self>> {
-        let unit_of = units(footprints);
         let rows = (0..footprints.rows.len() as u32).filter(|&r| footprints.rows[r as usize].is_of(levels));
-        let mut masks = vec![Vec::new(); n];
-        footprints.in_batches(&rows.collect::<Vec<u32>>(), |rows, batch| {
+        let rows: Vec<u32> = rows.collect();
+        // Read twice: a list that grows takes up to twice its memory.
+        let mut counts = vec![0; n];
+        footprints.in_batches(&rows, |_, batch| {
+            let shown = batch.iter().flat_map(|entries| entries.iter().filter(|(_, w)| *w > 0.0));
+            shown.for_each(|(i, _)| counts[i as usize] += 1);
+        })?;
+        let mut masks: Vec<Vec<(u32, f32)>> = counts.into_iter().map(Vec::with_capacity).collect();
+        footprints.in_batches(&rows, |rows, batch| {
             for (&row, entries) in rows.iter().zip(batch) {
                 entries.iter().filter(|(_, w)| *w > 0.0).for_each(|(i, w)| masks[i as usize].push((row, w)));
             }
         })?;
-        Ok(masks.into_par_iter().map(|m| Self::new(m, &unit_of)).collect())
+        Ok(masks.into_par_iter().map(Self::new).collect())
     }
 
     /// Those of `instances` instances in the masks at `levels`. `labels` are those of the kept Gaussians, -1 for none.
@@ -94,12 +80,11 @@ impl Profile {
         for (row, of) in mask_weights(labels, footprints, levels)? {
             of.into_iter().filter(|(_, w)| *w > 0.0).for_each(|(k, w)| masks[k as usize].push((row, w as f32)));
         }
-        let unit_of = units(footprints);
-        Ok(masks.into_iter().map(|m| Self::new(m, &unit_of)).collect())
+        Ok(masks.into_iter().map(Self::new).collect())
     }
 
     /// Of both together.
-    pub fn joined(&self, other: &Self, unit_of: &[u32]) -> Self {
+    pub fn joined(&self, other: &Self) -> Self {
         let (mut a, mut b) = (&self.masks[..], &other.masks[..]);
         let mut masks = Vec::with_capacity(a.len() + b.len());
         while let (Some(&x), Some(&y)) = (a.first(), b.first()) {
@@ -110,48 +95,42 @@ impl Profile {
         }
         masks.extend_from_slice(a);
         masks.extend_from_slice(b);
-        Self::new(masks, unit_of)
+        Self::new(masks)
     }
 
     /// Without the part `other`.
-    pub fn without(&self, other: &Self, unit_of: &[u32]) -> Self {
+    pub fn without(&self, other: &Self) -> Self {
         let part: BTreeMap<u32, f32> = other.masks.iter().copied().collect();
         let left = self.masks.iter().map(|&(k, w)| (k, w - part.get(&k).unwrap_or(&0.0), w));
         // What is left of nothing but rounding is nothing.
-        Self::new(left.filter(|(_, left, w)| *left > 1e-5 * w).map(|(k, left, _)| (k, left)).collect(), unit_of)
+        Self::new(left.filter(|(_, left, w)| *left > 1e-5 * w).map(|(k, left, _)| (k, left)).collect())
     }
 
-    /// The masks that hold more than half of what their view and level show.
-    pub fn main_masks(&self) -> impl Iterator<Item = u32> + '_ {
-        self.each().flat_map(|(u, masks)| masks.iter().filter(move |m| 2.0 * m.1 > u.weight).map(|m| m.0))
+    /// The masks that hold more than half of what their view and level show. `unit_of` has the view and level of each mask ([`units`]).
+    pub fn main_masks<'a>(&'a self, unit_of: &'a [u32]) -> impl Iterator<Item = u32> + 'a {
+        self.masks.chunk_by(|x, y| unit_of[x.0 as usize] == unit_of[y.0 as usize]).flat_map(|masks| {
+            let all = weight(masks);
+            masks.iter().filter(move |m| 2.0 * f64::from(m.1) > all).map(|m| m.0)
+        })
     }
 
-    fn each(&self) -> impl Iterator<Item = (&Unit, &[(u32, f32)])> {
-        let starts = std::iter::once(0).chain(self.units.iter().map(|u| u.end as usize));
-        self.units.iter().zip(starts).map(|(u, start)| (u, &self.masks[start..u.end as usize]))
-    }
-
-    /// How far two belong together; None where no view shows both.
-    pub fn agreement(&self, other: &Self) -> Option<Agreement> {
+    /// How far two belong together; None where no view shows both. `unit_of` has the view and level of each mask ([`units`]).
+    pub fn agreement(&self, other: &Self, unit_of: &[u32]) -> Option<Agreement> {
         let mut levels = [[0.0; 2]; LEVELS];
         let (mut seen, mut share) = (0, 0.0);
-        let (mut own, mut others) = (self.each().peekable(), other.each().peekable());
-        while let (Some((x, a)), Some((y, b))) = (own.peek(), others.peek()) {
-            let order = x.number.cmp(&y.number);
-            if order.is_eq() {
-                let (wx, wy) = (f64::from(x.weight), f64::from(y.weight));
-                let [same, all] = &mut levels[x.number as usize % LEVELS];
+        let (mut own, mut others) = (&self.masks[..], &other.masks[..]);
+        while let (Some(x), Some(y)) = (own.first(), others.first()) {
+            let (unit, other_unit) = (unit_of[x.0 as usize], unit_of[y.0 as usize]);
+            let first = unit.min(other_unit);
+            let (a, b) = (take(&mut own, first, unit_of), take(&mut others, first, unit_of));
+            if unit == other_unit {
+                let (wx, wy) = (weight(a), weight(b));
+                let [same, all] = &mut levels[first as usize % LEVELS];
                 let root = (wx * wy).sqrt();
                 *same += common(a, b) / root;
                 *all += root;
                 seen += 1;
                 share += (wx / self.total).min(wy / other.total);
-            }
-            if order.is_le() {
-                own.next();
-            }
-            if order.is_ge() {
-                others.next();
             }
         }
         let counted = || levels.iter().zip(COUNTS).filter(|([_, all], _)| *all > 0.0);
@@ -160,6 +139,19 @@ impl Profile {
         let firm = seen >= LEAST_COMMON.0 && share >= LEAST_COMMON.1;
         (seen > 0).then(|| Agreement { value: sum / all, firm })
     }
+}
+
+/// Takes those at the start of `masks` that are of `unit`.
+fn take<'a>(masks: &mut &'a [(u32, f32)], unit: u32, unit_of: &[u32]) -> &'a [(u32, f32)] {
+    let count = masks.iter().take_while(|m| unit_of[m.0 as usize] == unit).count();
+    let (taken, rest) = masks.split_at(count);
+    *masks = rest;
+    taken
+}
+
+/// Weight in all of them.
+fn weight(masks: &[(u32, f32)]) -> f64 {
+    masks.iter().map(|m| f64::from(m.1)).sum()
 }
 
 /// Sum of the products of weights in common masks.
@@ -192,10 +184,10 @@ pub fn with_rest(
     let mut instances: BTreeMap<i32, Profile> = BTreeMap::new();
     for (piece, whole) in pieces.iter().zip(wholes) {
         let sum = instances.entry(*whole).or_default();
-        *sum = sum.joined(piece, &unit_of);
+        *sum = sum.joined(piece);
     }
     let of = |(piece, whole): (&Profile, &i32)| {
-        let agreement = piece.agreement(&instances[whole].without(piece, &unit_of))?;
+        let agreement = piece.agreement(&instances[whole].without(piece), &unit_of)?;
         agreement.firm.then_some(agreement.value)
     };
     Ok(pieces.par_iter().zip(wholes).map(of).collect())
@@ -235,7 +227,7 @@ mod tests {
     const UNIT_OF: [u32; 8] = [0, 0, 1, 1, 4, 4, 5, 5];
 
     fn of(masks: &[(u32, f32)]) -> Profile {
-        Profile::new(masks.to_vec(), &UNIT_OF)
+        Profile::new(masks.to_vec())
     }
 
     #[test]
@@ -243,31 +235,31 @@ mod tests {
         let (a, b) = (of(&[(0, 3.0), (1, 1.0), (4, 4.0)]), of(&[(0, 2.0), (1, 2.0), (5, 16.0)]));
         // First view: 3/4 1/2 + 1/4 1/2, by the root of 4 times 4; second view: 0, by the root of 4 times 16.
         let expected = 0.5 * 4.0 / 12.0;
-        assert!((a.agreement(&b).unwrap().value - expected).abs() < 1e-12);
-        assert_eq!(a.agreement(&b), b.agreement(&a));
-        assert_eq!(a.agreement(&of(&[(2, 1.0)])), None, "no view shows both at one level");
+        assert!((a.agreement(&b, &UNIT_OF).unwrap().value - expected).abs() < 1e-12);
+        assert_eq!(a.agreement(&b, &UNIT_OF), b.agreement(&a, &UNIT_OF));
+        assert_eq!(a.agreement(&of(&[(2, 1.0)]), &UNIT_OF), None, "no view shows both at one level");
         // Levels count by their weights: one mask at level default, two at level small.
         let (a, b) = (of(&[(0, 1.0), (2, 1.0)]), of(&[(0, 1.0), (3, 1.0)]));
-        assert!((a.agreement(&b).unwrap().value - COUNTS[0] / (COUNTS[0] + COUNTS[1])).abs() < 1e-12);
+        assert!((a.agreement(&b, &UNIT_OF).unwrap().value - COUNTS[0] / (COUNTS[0] + COUNTS[1])).abs() < 1e-12);
     }
 
     #[test]
     fn agreement_is_firm_where_enough_views_show_both() {
         let a = of(&[(0, 1.0), (4, 1.0)]);
-        assert!(a.agreement(&a).unwrap().firm);
-        assert!(!a.agreement(&of(&[(0, 1.0)])).unwrap().firm, "one view");
+        assert!(a.agreement(&a, &UNIT_OF).unwrap().firm);
+        assert!(!a.agreement(&of(&[(0, 1.0)]), &UNIT_OF).unwrap().firm, "one view");
         let elsewhere = of(&[(0, 0.01), (2, 10.0), (4, 0.01)]);
-        assert!(!a.agreement(&elsewhere).unwrap().firm, "seen elsewhere");
+        assert!(!a.agreement(&elsewhere, &UNIT_OF).unwrap().firm, "seen elsewhere");
     }
 
     #[test]
     fn a_part_that_is_joined_can_be_taken_out_again() {
         let (a, b) = (of(&[(0, 1.0), (2, 3.0)]), of(&[(0, 2.0), (1, 4.0)]));
-        let both = a.joined(&b, &UNIT_OF);
+        let both = a.joined(&b);
         assert_eq!(both.masks, [(0, 3.0), (1, 4.0), (2, 3.0)]);
-        assert_eq!((both.units[0].weight, both.total), (7.0, 10.0));
-        assert_eq!(both.without(&b, &UNIT_OF).masks, a.masks);
-        assert_eq!(both.main_masks().collect::<Vec<_>>(), [1, 2]);
+        assert_eq!(both.total, 10.0);
+        assert_eq!(both.without(&b).masks, a.masks);
+        assert_eq!(both.main_masks(&UNIT_OF).collect::<Vec<_>>(), [1, 2]);
     }
 
     #[test]
@@ -277,8 +269,7 @@ mod tests {
         let of_gaussians = Profile::of_gaussians(8, &footprints, &[Level::Large]).unwrap();
         let labels = [0, 0, 0, 1, -1, -1, -1, -1];
         let of_instances = Profile::of_instances(&labels, 2, &footprints, &[Level::Large]).unwrap();
-        let unit_of = units(&footprints);
-        let sum = of_gaussians[..3].iter().fold(Profile::default(), |sum, p| sum.joined(p, &unit_of));
+        let sum = of_gaussians[..3].iter().fold(Profile::default(), |sum, p| sum.joined(p));
         assert_eq!((&sum.masks, &of_gaussians[3].masks), (&of_instances[0].masks, &of_instances[1].masks));
         assert!(of_gaussians[5].masks.is_empty());
     }
