@@ -4,6 +4,7 @@ pub mod colmap;
 mod depth;
 pub mod refined;
 mod scannet;
+mod seven_scenes;
 mod transforms;
 mod view;
 
@@ -27,6 +28,8 @@ pub enum Format {
     Transforms,
     /// ScanNet: `color/`, `pose/`, `intrinsic/`.
     ScanNet,
+    /// 7-Scenes: `seq-01/frame-000000.color.png` and `.pose.txt`.
+    SevenScenes,
 }
 
 /// What a view is for.
@@ -163,6 +166,7 @@ impl RawView {
                 Format::Colmap => "COLMAP's model",
                 Format::Transforms => "transforms.json",
                 Format::ScanNet => "intrinsic/ and pose/",
+                Format::SevenScenes => "its .pose.txt",
             };
             let hint = format!("correct the camera in {from}, or export it again");
             Err(Error::new("no camera has this")
@@ -214,17 +218,19 @@ fn read(path: &Path) -> Result<RawDataset> {
     } else if !path.is_dir() {
         return Err(Error::new("no such folder")
             .file(path)
-            .hint("give the folder of a COLMAP, transforms.json or ScanNet scene"));
+            .hint("give the folder of a COLMAP, transforms.json, ScanNet or 7-Scenes scene"));
     } else if let Some(model) = colmap::find_model(path) {
         colmap::load(path, &model)?
     } else if let Some(files) = transforms::find(path) {
         transforms::load(path, &files)?
     } else if scannet::is_scannet(path) {
         scannet::load(path)?
+    } else if seven_scenes::is_seven_scenes(path) {
+        seven_scenes::load(path)?
     } else {
         return Err(Error::new("no dataset recognised in this folder")
             .file(path)
-            .expected("sparse/0/cameras.bin|txt (COLMAP), transforms.json or transforms_train.json, or color/ pose/ intrinsic/ (ScanNet)")
+            .expected("sparse/0/cameras.bin|txt (COLMAP), transforms.json or transforms_train.json, color/ pose/ intrinsic/ (ScanNet), or seq-01/frame-000000.color.png (7-Scenes)")
             .hint("run COLMAP on the photographs first"));
     };
     Ok(raw)
@@ -345,4 +351,30 @@ fn invert_pose(world_from_camera: DMat4, field: &str) -> Result<Option<(DMat3, D
 fn read_text(path: &Path) -> Result<String> {
     let bytes = std::fs::read(path).at("read", path)?;
     String::from_utf8(bytes).map_err(|_| Error::new("not a text file").file(path).hint("copy or export it again"))
+}
+
+/// Paths in a folder, sorted.
+fn list(folder: &Path) -> Result<Vec<PathBuf>> {
+    let entries = std::fs::read_dir(folder).at("list", folder)?;
+    let mut paths = entries.map(|e| Ok(e.at("list", folder)?.path())).collect::<Result<Vec<_>>>()?;
+    paths.sort();
+    Ok(paths)
+}
+
+/// A 4x4 matrix of numbers in rows; `-inf` marks a lost pose.
+fn matrix(path: &Path) -> Result<DMat4> {
+    let text = read_text(path)?;
+    let number = |w: &str| {
+        let wrong = |_| Error::new("not a number").file(path).found(w).hint("extract the scene again");
+        w.parse::<f64>().map_err(wrong)
+    };
+    let numbers = text.split_ascii_whitespace().map(number).collect::<Result<Vec<_>>>()?;
+    let m: &[f64; 16] = numbers.as_slice().try_into().map_err(|_| {
+        Error::new("not a 4x4 matrix")
+            .file(path)
+            .found(format!("{} numbers", numbers.len()))
+            .expected("16 numbers")
+            .hint("extract the scene again")
+    })?;
+    Ok(DMat4::from_cols_array(m).transpose())
 }

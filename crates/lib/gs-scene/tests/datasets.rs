@@ -792,3 +792,39 @@ fn depth_images_of_scannet_have_a_camera_of_their_own() {
     assert_eq!((found.camera.fx, found.camera.cx, found.camera.rotation), (22.0, 10.5, d.views[1].camera.rotation));
     assert!(files(&d).contains(&"depth/20.png".into()) && files(&d).contains(&"intrinsic/intrinsic_depth.txt".into()));
 }
+
+#[test]
+fn seven_scenes_has_its_sequences_and_its_kinect() {
+    let dir = tempfile::tempdir().unwrap();
+    let root = dir.path();
+    let c = cameras(3, 40, 30);
+    let frame = |sequence: &str, id: usize, pose: &str| {
+        let at = |end: &str| root.join(format!("seq-0{sequence}/frame-00000{id}.{end}"));
+        write(&at("pose.txt"), pose);
+        image::RgbImage::new(40, 30).save(at("color.png")).unwrap();
+        at("depth.png")
+    };
+    let depth = image::ImageBuffer::from_fn(20, 15, |x, _| image::Luma([if x == 3 { 65535u16 } else { 1500 }]));
+    depth.save(frame("1", 0, &pose_text(&c[0]))).unwrap();
+    frame("1", 1, &"-1.#IND ".repeat(16).replace("-1.#IND", "nan"));
+    frame("2", 0, &pose_text(&c[1]));
+    fs::remove_file(frame("2", 2, "")).unwrap_err();
+    fs::remove_file(root.join("seq-02/frame-000002.pose.txt")).unwrap();
+    write(&root.join("TestSplit.txt"), "sequence2\r\n");
+    let d = dataset::load(root, &FULL).unwrap();
+    let found: Vec<_> = d.views.iter().map(|v| (v.name.as_str(), v.split)).collect();
+    let [a, b] = ["seq-01/frame-000000.color.png", "seq-02/frame-000000.color.png"];
+    assert_eq!((d.format, found), (Format::SevenScenes, vec![(a, Split::Train), (b, Split::Test)]));
+    assert!(d.warnings.len() == 2 && d.warnings[0].contains("frame-000001.pose.txt: the pose is not finite"));
+    assert!(d.warnings[1].contains("frame-000002.pose.txt: no such pose"), "{:?}", d.warnings);
+    let k = &d.views[0].camera;
+    assert!((k.fx - 525.0 / 16.0).abs() < 1e-9 && (k.position() - c[0].position()).length() < 1e-9);
+    let map = d.views[0].load_depth().unwrap().unwrap();
+    assert_eq!((map.camera.fx, map.camera.cx, map.depth[2], map.depth[3]), (585.0 / 32.0, 10.0, 1.5, 0.0));
+    // One sequence alone; a damaged list of those to hold out.
+    let one = dataset::load(&root.join("seq-02"), &FULL).unwrap();
+    assert_eq!((one.views.len(), one.views[0].name.as_str()), (1, "frame-000000.color.png"));
+    write(&root.join("TestSplit.txt"), "all");
+    let e = dataset::load(root, &FULL).unwrap_err().to_string();
+    assert!(e.contains("TestSplit.txt") && e.contains("sequence3"), "{e}");
+}

@@ -11,7 +11,7 @@ use std::path::PathBuf;
 /// The scene and what was found in it.
 #[derive(Debug, Clone, clap::Args, Serialize)]
 pub struct Inputs {
-    /// Dataset folder (COLMAP, transforms.json or ScanNet)
+    /// Dataset folder (COLMAP, transforms.json, ScanNet or 7-Scenes)
     #[arg(long, value_name = "DIR")]
     pub scene: PathBuf,
     /// The geometry.ply that the instances were made from
@@ -190,7 +190,7 @@ pub struct Labels {
 #[derive(Debug, Clone, clap::Args, Serialize)]
 #[command(group(clap::ArgGroup::new("scored").required(true).multiple(true).args(["instances", "descriptors"])))]
 pub struct ScoreOptions {
-    /// Dataset folder (COLMAP, transforms.json or ScanNet)
+    /// Dataset folder (COLMAP, transforms.json, ScanNet or 7-Scenes)
     #[arg(long, value_name = "DIR")]
     pub scene: PathBuf,
     /// The geometry.ply that instances or descriptors were made from
@@ -417,7 +417,7 @@ pub enum Benchmark {
 /// `eval check`.
 #[derive(Debug, Clone, clap::Args, Serialize)]
 pub struct CheckOptions {
-    /// Dataset folder (COLMAP, transforms.json or ScanNet)
+    /// Dataset folder (COLMAP, transforms.json, ScanNet or 7-Scenes)
     #[arg(long, value_name = "DIR")]
     pub scene: PathBuf,
     /// How the scene will be scored
@@ -452,7 +452,7 @@ pub struct MasksOptions {
 /// `eval report`.
 #[derive(Debug, Clone, clap::Args, Serialize)]
 pub struct ReportOptions {
-    /// Dataset folder (COLMAP, transforms.json or ScanNet)
+    /// Dataset folder (COLMAP, transforms.json, ScanNet or 7-Scenes)
     #[arg(long, value_name = "DIR")]
     pub scene: PathBuf,
     /// Folder of the run, of the common options.

@@ -33,7 +33,7 @@ enum Command {
 /// The run to look at.
 #[derive(Debug, Clone, clap::Args, Serialize)]
 pub struct Source {
-    /// Dataset folder (COLMAP, transforms.json or ScanNet)
+    /// Dataset folder (COLMAP, transforms.json, ScanNet or 7-Scenes)
     #[arg(long, value_name = "DIR")]
     pub scene: PathBuf,
     /// The geometry.ply that the instances were made from

@@ -11,7 +11,7 @@ use std::path::PathBuf;
 #[derive(Debug, clap::Parser)]
 #[command(name = "graph-precompute", version)]
 pub struct Args {
-    /// Dataset folder (COLMAP, transforms.json or ScanNet)
+    /// Dataset folder (COLMAP, transforms.json, ScanNet or 7-Scenes)
     #[arg(long, value_name = "DIR")]
     pub(crate) scene: PathBuf,
     /// Gaussians: a PLY of 3DGS, or another format of docs/splats.md

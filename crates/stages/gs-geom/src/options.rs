@@ -45,7 +45,7 @@ pub(crate) enum Command {
 /// Which photographs, and at which size.
 #[derive(Debug, Clone, clap::Args, Serialize)]
 pub(crate) struct SceneOptions {
-    /// Dataset folder (COLMAP, transforms.json or ScanNet), or the refined cameras OUT.cameras.json of a training
+    /// Dataset folder (COLMAP, transforms.json, ScanNet or 7-Scenes), or the refined cameras OUT.cameras.json of a training
     #[arg(long, value_name = "DIR")]
     #[serde(skip)]
     pub scene: PathBuf,

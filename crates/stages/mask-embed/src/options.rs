@@ -35,7 +35,7 @@ pub(crate) enum Task {
 /// Which photographs.
 #[derive(Debug, Clone, clap::Args, Serialize)]
 pub(crate) struct SceneArgs {
-    /// Scene folder: COLMAP, transforms.json or ScanNet
+    /// Scene folder: COLMAP, transforms.json, ScanNet or 7-Scenes
     #[arg(long, value_name = "FOLDER")]
     #[serde(skip)]
     pub scene: PathBuf,

@@ -10,6 +10,9 @@ use std::path::PathBuf;
 /// metres.
 pub(crate) const MILLIMETRES: f64 = 1e-3;
 
+/// Where a Kinect saw nothing; other sensors do not reach so far, and write 0.
+const UNKNOWN: u16 = u16::MAX;
+
 /// A depth image of a view.
 #[derive(Debug, Clone, PartialEq)]
 pub(crate) struct Depth {
@@ -40,7 +43,8 @@ impl Depth {
                 .hint("export the depths again, or take them out of the dataset"));
         };
         let (width, height) = picture.dimensions();
-        let mut depth: Vec<f32> = picture.pixels().map(|p| (f64::from(p[0]) * self.unit) as f32).collect();
+        let value = |p: u16| if p == UNKNOWN { 0.0 } else { (f64::from(p) * self.unit) as f32 };
+        let mut depth: Vec<f32> = picture.pixels().map(|p| value(p[0])).collect();
         let camera = match self.focal_center {
             Some([fx, fy, cx, cy]) => Camera { width, height, fx, fy, cx, cy, ..view.camera.clone() },
             None => {

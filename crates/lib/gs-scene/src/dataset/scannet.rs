@@ -2,11 +2,10 @@
 //! vertices in `*_vh_clean_2.ply`; where they are there, depth images in `depth/<id>.png`.
 
 use super::depth::{self, Depth};
-use super::{Format, RawDataset, RawView, invert_pose, read_text};
+use super::{Format, RawDataset, RawView, invert_pose, list, matrix};
 use crate::lens::{Distortion, Lens};
 use crate::{PointCloud, image, ply};
-use glam::DMat4;
-use gs_io::{Error, IoContext, Result};
+use gs_io::{Error, Result};
 use std::path::{Path, PathBuf};
 
 /// Whether a folder has the layout.
@@ -79,14 +78,6 @@ impl Depths {
     }
 }
 
-/// Paths in a folder, sorted.
-fn list(folder: &Path) -> Result<Vec<PathBuf>> {
-    let entries = std::fs::read_dir(folder).at("list", folder)?;
-    let mut paths = entries.map(|e| Ok(e.at("list", folder)?.path())).collect::<Result<Vec<_>>>()?;
-    paths.sort();
-    Ok(paths)
-}
-
 /// The file does not say for which image size it holds, and frames are often extracted smaller than they were taken:
 /// the principal point, which lies near the middle, tells.
 fn check_intrinsics(lens: &Lens) -> Result<()> {
@@ -102,22 +93,4 @@ fn check_intrinsics(lens: &Lens) -> Result<()> {
         .found(format!("{fx} {fy} {cx} {cy}"))
         .expected(format!("a principal point near the middle of {w}x{h} pixels"))
         .hint("extract the frames at full size, or scale the intrinsics with them"))
-}
-
-/// A 4x4 matrix of numbers in rows; `-inf` marks a lost pose.
-fn matrix(path: &Path) -> Result<DMat4> {
-    let text = read_text(path)?;
-    let number = |w: &str| {
-        let wrong = |_| Error::new("not a number").file(path).found(w).hint("extract the scene again");
-        w.parse::<f64>().map_err(wrong)
-    };
-    let numbers = text.split_ascii_whitespace().map(number).collect::<Result<Vec<_>>>()?;
-    let m: &[f64; 16] = numbers.as_slice().try_into().map_err(|_| {
-        Error::new("not a 4x4 matrix")
-            .file(path)
-            .found(format!("{} numbers", numbers.len()))
-            .expected("16 numbers")
-            .hint("extract the scene again")
-    })?;
-    Ok(DMat4::from_cols_array(m).transpose())
 }
