@@ -102,7 +102,7 @@ fn scatter(curve: &Curve) -> String {
     let mut line: Vec<(f64, f64)> = dots.iter().zip(&curve.front).filter(|(_, f)| **f).map(|(d, _)| d.at).collect();
     line.sort_by(|a, b| a.0.total_cmp(&b.0));
     let title = format!("{} ({})", curve.title, curve.scene);
-    Chart { title, axes: format!("{}; upwards: CPU seconds", curve.measure), line, dots }.svg()
+    Chart { title, axes: format!("{}; upwards: CPU seconds", curve.measure), line, dots, ..Chart::default() }.svg()
 }
 
 /// What a plan gave.

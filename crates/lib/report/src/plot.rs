@@ -26,6 +26,8 @@ pub struct Chart {
     pub axes: String,
     /// Points (x, y) that a line joins, by rising x. A point that is not finite breaks the line.
     pub line: Vec<(f64, f64)>,
+    /// Lines to compare with, dashed, with a name at the end of each.
+    pub beside: Vec<(String, Vec<(f64, f64)>)>,
     /// Points that stand alone. Where there are any, both axes include 0.
     pub dots: Vec<Dot>,
 }
@@ -75,7 +77,8 @@ impl Chart {
     fn body(&self) -> String {
         let mut s = format!(r#"<text class="title" x="{LEFT}" y="16">{}</text>"#, escape(&self.title));
         let dots = self.dots.iter().flat_map(|d| [d.at, (d.at.0, d.range.0), (d.at.0, d.range.1), (0.0, 0.0)]);
-        let all = || self.line.iter().copied().chain(dots.clone()).filter(|(x, y)| x.is_finite() && y.is_finite());
+        let lines = || self.line.iter().chain(self.beside.iter().flat_map(|b| &b.1)).copied();
+        let all = || lines().chain(dots.clone()).filter(|(x, y)| x.is_finite() && y.is_finite());
         let range = |f: fn((f64, f64)) -> f64| {
             all().map(f).fold((f64::INFINITY, f64::NEG_INFINITY), |(lo, hi), v| (lo.min(v), hi.max(v)))
         };
@@ -101,18 +104,26 @@ impl Chart {
         let (middle, y) = (0.5 * (LEFT + WIDTH - RIGHT), HEIGHT - 6.0);
         let axes = escape(&self.axes);
         let _ = write!(s, r#"<text class="axis" text-anchor="middle" x="{middle}" y="{y}">{axes}</text>"#);
-        self.draw_line(&frame, &mut s);
+        self.draw_line(&self.line, "", &frame, &mut s);
+        for (name, line) in &self.beside {
+            self.draw_line(line, r#" stroke-dasharray="5 3""#, &frame, &mut s);
+            if let Some(&(x, y)) = line.last() {
+                let (x, y) = (frame.px(x), frame.py(y) + 14.0);
+                let name = escape(name);
+                let _ = write!(s, r#"<text class="axis" text-anchor="end" x="{x:.1}" y="{y:.1}">{name}</text>"#);
+            }
+        }
         self.dots.iter().for_each(|d| d.draw(&frame, &mut s));
         s
     }
 
-    fn draw_line(&self, frame: &Frame, s: &mut String) {
-        let points = thin(&self.line);
+    fn draw_line(&self, line: &[(f64, f64)], style: &str, frame: &Frame, s: &mut String) {
+        let points = thin(line);
         for piece in points.split(|(x, y)| !(x.is_finite() && y.is_finite())).filter(|p| !p.is_empty()) {
             let points: Vec<String> =
                 piece.iter().map(|&(x, y)| format!("{:.1},{:.1}", frame.px(x), frame.py(y))).collect();
-            let _ = write!(s, r#"<polyline class="curve" points="{}"/>"#, points.join(" "));
-            for &(x, y) in piece.iter().filter(|_| self.dots.is_empty() && self.line.len() <= FEW_POINTS) {
+            let _ = write!(s, r#"<polyline class="curve"{style} points="{}"/>"#, points.join(" "));
+            for &(x, y) in piece.iter().filter(|_| self.dots.is_empty() && line.len() <= FEW_POINTS) {
                 let (x, y) = (frame.px(x), frame.py(y));
                 let _ = write!(s, r#"<circle class="point" cx="{x:.1}" cy="{y:.1}" r="2.5"/>"#);
             }
@@ -230,6 +241,19 @@ mod tests {
         assert!(line("none", vec![(f64::NAN, 1.0)]).svg().contains(">none<"));
         let flat = line("flat", vec![(0.0, 2.0), (1.0, 2.0)]).svg();
         assert!(flat.contains("<polyline") && !flat.contains("NaN"));
+    }
+
+    #[test]
+    fn lines_beside_it_share_the_frame_and_have_names() {
+        let chart = Chart {
+            beside: vec![("a<b".into(), vec![(0.0, 1.0), (4.0, 9.0)])],
+            ..line("", vec![(0.0, 3.0), (2.0, 5.0)])
+        };
+        let s = chart.svg();
+        assert_eq!((s.matches("<polyline").count(), s.matches("dasharray").count()), (2, 1));
+        // The first line ends in the middle, the other at the right border.
+        let middle = 0.5 * (LEFT + WIDTH - RIGHT);
+        assert!(s.contains(&format!("{middle:.1},")) && s.contains("a&lt;b"), "{s}");
     }
 
     #[test]

@@ -1,4 +1,4 @@
-//! Quality for the time: trains scenes in alternative ways and writes figures (JSON) and a table (Markdown).
+//! Quality for the time: trains scenes in alternative ways and writes figures (JSON), a table (Markdown) and curves (SVG).
 //!
 //! `cargo bench -p gs-geom --bench geom -- OUT.json NAME=FOLDER@RESOLUTION...`, with `ITERATIONS`, `SEEDS`, `ONLY` (settings,
 //! with commas) and `MAX_GAUSSIANS` (the program's default where it is empty) from the environment. Each run is a process of its own on one thread, and its figures are over processor
@@ -10,6 +10,7 @@
 mod common;
 
 use common::{numbers, setting, summary, train, write};
+use report::plot::Chart;
 use serde_json::{Value, json};
 use std::path::{Path, PathBuf};
 
@@ -72,9 +73,26 @@ fn main() -> Result<(), String> {
             }
         }
     }
+    write(&out.with_extension("svg"), &curves(&all))?;
     let all = json!({"max_gaussians": most, "settings": all});
     write(&out, &serde_json::to_string_pretty(&all).map_err(|e| e.to_string())?)?;
     write(&out.with_extension("md"), &table)
+}
+
+/// A chart for each scene: held-out PSNR over processor time, medians; the first setting and the others beside it.
+fn curves(groups: &[Value]) -> String {
+    let median = |g: &Value, key: &str| g[key]["median"].as_f64().unwrap_or(f64::NAN);
+    let charts = groups.chunk_by(|a, b| a["scene"] == b["scene"]).map(|of| {
+        let mut lines = of.chunk_by(|a, b| a["setting"] == b["setting"]).map(|of| {
+            let points = of.iter().map(|g| (median(g, "cpu_seconds"), median(g, "psnr_heldout")));
+            (of[0]["setting"].as_str().unwrap_or_default().to_string(), points.collect())
+        });
+        let (first, line) = lines.next().unwrap_or_default();
+        let title = format!("{}: {first}", of[0]["scene"].as_str().unwrap_or_default());
+        let axes = "processor seconds; upwards: held-out PSNR in dB".into();
+        (Chart { title, axes, line, beside: lines.collect(), ..Chart::default() }, "#0b5fa5")
+    });
+    report::plot::file(&charts.collect::<Vec<_>>())
 }
 
 /// Runs that differ by their seeds, as JSON and as a row of the table.
