@@ -12,7 +12,7 @@ use gs_io::Result;
 use hdbscan_exact::{Clustering, Edge, Options, Selection, cluster_graph};
 use rayon::prelude::*;
 use std::cmp::Reverse;
-use std::collections::{BTreeMap, BTreeSet};
+use std::collections::BTreeMap;
 
 /// A cluster joins one more than this many times as large that it agrees with most, though that one agrees more with another: it hardly
 /// changes it. Else a floor would take its Gaussians one a round.
@@ -184,19 +184,21 @@ impl<'a> Linkage<'a> {
             if groups.is_empty() {
                 return;
             }
-            let mut pairs = Vec::new();
+            let (mut pairs, mut changed) = (Vec::new(), vec![false; target.len()]);
             for (&to, members) in &groups {
                 members.iter().for_each(|&i| self.join_one(i, target[i as usize], to, (low, high)));
                 for i in members.iter().chain([&to]) {
+                    changed[*i as usize] = true;
                     let near = std::mem::take(&mut self.near[*i as usize]).into_iter();
                     pairs.extend(near.map(|(c, _)| root(c)).filter(|&c| c != to).map(|c| (to.min(c), to.max(c))));
                 }
             }
-            pairs.sort_unstable();
+            pairs.par_sort_unstable();
             pairs.dedup();
-            for end in pairs.iter().flat_map(|&(a, b)| [a, b]).collect::<BTreeSet<u32>>() {
-                self.near[end as usize].retain(|&(c, _)| target[c as usize].0 == c && !groups.contains_key(&c));
-            }
+            let mut near_changed = vec![false; target.len()];
+            pairs.iter().for_each(|&(a, b)| (near_changed[a as usize], near_changed[b as usize]) = (true, true));
+            let near = self.near.par_iter_mut().zip(near_changed).filter(|(_, near_changed)| *near_changed);
+            near.for_each(|(near, _)| near.retain(|&(c, _)| !changed[c as usize]));
             self.compare(&pairs);
         }
     }
