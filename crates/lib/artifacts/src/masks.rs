@@ -277,6 +277,30 @@ impl MaskFeatures {
         Ok(Self { values })
     }
 
+    /// Those of the masks of a view, if `folder` has any: at least one for each mask of `maps`, and of `dim` dimensions where that is known.
+    ///
+    /// # Errors
+    /// When the file is damaged or does not fit.
+    pub fn of_view(folder: &Path, stem: &str, maps: &MaskMaps, dim: Option<usize>) -> Result<Option<Self>> {
+        let path = features_path(folder, stem);
+        if !path.is_file() {
+            return Ok(None);
+        }
+        let features = Self::read(&path)?;
+        let wrong = |what: &str, field: &str, found: usize, expected: String| {
+            let e = Error::new(what).file(&path).field(field).found(found).expected(expected);
+            Err(e.hint("run mask-embed embed again, with the model of the other features and of the texts"))
+        };
+        let (rows, columns) = features.values.dim();
+        if rows < maps.id_count() {
+            return wrong("fewer features than masks", "rows", rows, format!("at least {}", maps.id_count()));
+        }
+        match dim {
+            Some(dim) if dim != columns => wrong("features of different models", "columns", columns, dim.to_string()),
+            _ => Ok(Some(features)),
+        }
+    }
+
     /// Writes `*_f.npy`: f32 `[masks, dim]`.
     pub fn write(&self, path: impl AsRef<Path>) -> Result<()> {
         npy::write_f32(path, &self.values)

@@ -1,7 +1,7 @@
 //! Reading the inputs, and checking that they belong together.
 
 use crate::options::Args;
-use artifacts::{Features, Footprints, Graph, MaskFeatures, MaskMaps, features_path, hash_folder, role};
+use artifacts::{Features, Footprints, Graph, hash_folder, role};
 use gs_io::{Error, IoContext, Provenance, Result, hash_file};
 use gs_scene::Geometry;
 use gs_scene::dataset::{self, Dataset, LoadOptions, Resolution, View};
@@ -115,30 +115,4 @@ fn clip_of_features(folder: &Path, masks: &str) -> Result<BTreeMap<String, Strin
             .hint("run mask-embed embed again"));
     }
     Ok(known.inputs.into_iter().filter(|(role, _)| [role::CLIP, role::CLIP_TEXT].contains(&role.as_str())).collect())
-}
-
-/// The mask features of a view, if there are any; they must fit its id maps and have `dim` dimensions, where that is known.
-pub(crate) fn mask_features(
-    folder: &Path,
-    stem: &str,
-    maps: &MaskMaps,
-    dim: Option<usize>,
-) -> Result<Option<MaskFeatures>> {
-    let path = features_path(folder, stem);
-    if !path.is_file() {
-        return Ok(None);
-    }
-    let features = MaskFeatures::read(&path)?;
-    let wrong = |what: &str, field: &str, found: usize, expected: String| {
-        let e = Error::new(what).file(&path).field(field).found(found).expected(expected);
-        Err(e.hint("run mask-embed embed again"))
-    };
-    let (rows, columns) = features.values.dim();
-    if rows < maps.id_count() {
-        return wrong("fewer features than masks", "rows", rows, format!("at least {}", maps.id_count()));
-    }
-    match dim {
-        Some(dim) if dim != columns => wrong("features of different models", "columns", columns, dim.to_string()),
-        _ => Ok(Some(features)),
-    }
 }

@@ -5,7 +5,7 @@ use crate::associate::{FeatureTable, matches, overlaps};
 use crate::describe::{describe, mean_of_units};
 use crate::granules::{self, Candidates, Shown};
 use crate::group::{free, on_graph};
-use crate::inputs::{Inputs, mask_features};
+use crate::inputs::Inputs;
 use crate::options::{Args, Noise, Settings, Space};
 use crate::outputs::{self, Found};
 use crate::parts::split;
@@ -182,7 +182,7 @@ fn match_views(
         let overlaps = overlaps(gaussians, &raster, labels, &table, &camera, &maps, &settings.levels);
         found.extend(matches(&overlaps, index as u32, settings.threshold as f32));
         let dim = features.values().next().map(MaskFeatures::dim);
-        features.extend(mask_features(&a.masks, view.stem(), &maps, dim)?.map(|f| (index as u32, f)));
+        features.extend(MaskFeatures::of_view(&a.masks, view.stem(), &maps, dim)?.map(|f| (index as u32, f)));
         progress.step();
     }
     progress.finish(&[("matches", found.len() as f64)]);

@@ -6,7 +6,7 @@ use crate::protocols::instances;
 use crate::protocols::scannet::ScanFiles;
 use crate::scene::folder_name;
 use crate::score::labels;
-use artifacts::{LerfScene, MaskFeatures, MaskFolder, features_path};
+use artifacts::{LerfScene, MaskFeatures, MaskFolder};
 use gs_io::{Error, Result};
 use gs_scene::dataset::{self, Dataset, LoadOptions, Resolution};
 use query::{TextSource, TextTable};
@@ -128,21 +128,8 @@ fn check_masks(folder: &Path, dataset: &Dataset, dim: Option<usize>) -> Result<S
     };
     let maps = MaskFolder::open(folder).read(view)?;
     let said = format!("{}_s.npy: {}x{} pixels, {} masks", view.stem(), maps.width(), maps.height(), maps.id_count());
-    let path = features_path(folder, view.stem());
-    if !path.exists() {
-        return Ok(said + "\n");
-    }
-    let features = MaskFeatures::read(&path)?;
-    let wrong = |what: &str, found: usize, expected: usize| {
-        let e = Error::new(what).file(&path).field("shape").found(found).expected(expected);
-        Err(e.hint("masks and features must be of one run, masks and texts of one model"))
-    };
-    let (rows, columns) = features.values.dim();
-    if rows < maps.id_count() {
-        return wrong("fewer features than masks", rows, maps.id_count());
-    }
-    match dim {
-        Some(dim) if dim != columns => wrong("another dimension than the text features", columns, dim),
-        _ => Ok(format!("{said}, features of dimension {columns}\n")),
-    }
+    Ok(match MaskFeatures::of_view(folder, view.stem(), &maps, dim)? {
+        Some(features) => format!("{said}, features of dimension {}\n", features.dim()),
+        None => said + "\n",
+    })
 }

@@ -767,9 +767,9 @@ fn a_scene_of_a_benchmark_is_checked_before_anything_runs() {
         gs_io::npy::write_f32(file, &Array2::from_elem((rows, dim), 0.5)).unwrap();
     };
     features(1, 2);
-    bad(&["fewer features than masks; found 1, expected 2"]);
+    bad(&["fewer features than masks; found 1, expected at least 2"]);
     features(2, 3);
-    bad(&["another dimension than the text features; found 3, expected 2"]);
+    bad(&["features of different models; found 3, expected 2"]);
     features(2, 2);
     good(&["2 masks, features of dimension 2"]);
     // All that is wrong is said at once.
