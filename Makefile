@@ -18,7 +18,7 @@ PIPELINE = $(MAKE) --no-print-directory
 help: ## Say what can be made
 	@awk -F ':.*## ' '/^##@/ { print "\n" substr($$0, 5) ":" } /^[a-z-]+:.*## / { printf "  %-16s %s\n", $$1, $$2 }' Makefile
 	@echo
-	@echo "make scene needs SCENE=folder (COLMAP, transforms.json or ScanNet) or GEOMETRY=file, and OUT=folder; it takes"
+	@echo "make scene needs SCENE=folder (COLMAP, transforms.json, ScanNet or 7-Scenes) or GEOMETRY=file, and OUT=folder; it takes"
 	@sed -nE 's/^#: ?/  /p' pipelines/custom.mk
 	@echo
 	@echo "Benchmarks of one part: make $$(sed -nE 's/^(bench-[a-z-]+):.*/\1/p' pipelines/bench.mk | paste -sd' ')"

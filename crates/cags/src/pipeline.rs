@@ -67,7 +67,7 @@ enum Commands {
 
 #[derive(Debug, clap::Args)]
 struct RunOptions {
-    /// Folder of photographs with poses (COLMAP, transforms.json or ScanNet), or the file of a trained splat
+    /// Folder of photographs with poses (COLMAP, transforms.json, ScanNet or 7-Scenes), or the file of a trained splat
     #[arg(value_name = "SCENE")]
     input: PathBuf,
     /// Settings of make scene, such as QUALITY=fast GEOMETRY=file.spz CLIP=folder "QUERIES=red_mug plate"

@@ -21,7 +21,7 @@ use std::path::{Path, PathBuf};
 /// Files of one scene, and the masks to use.
 #[derive(Debug, Clone, clap::Args, Serialize)]
 pub struct Inputs {
-    /// Dataset folder (COLMAP, transforms.json or ScanNet)
+    /// Dataset folder (COLMAP, transforms.json, ScanNet or 7-Scenes)
     #[arg(long, value_name = "DIR")]
     #[serde(skip)]
     pub scene: PathBuf,

@@ -102,7 +102,7 @@ pub struct LoadOptions {
     /// How much photographs are shrunk.
     pub resolution: Resolution,
     /// Every n-th view by sorted name is held out, from the first; 0 holds none out. A dataset that names its own
-    /// held-out views (in `transforms_test.json` or nerfstudio's `test_filenames`) keeps to them.
+    /// held-out views (in `transforms_test.json`, nerfstudio's `test_filenames` or 7-Scenes' `TestSplit.txt`) keeps to them.
     pub holdout: usize,
 }
 
@@ -359,6 +359,20 @@ fn list(folder: &Path) -> Result<Vec<PathBuf>> {
     let mut paths = entries.map(|e| Ok(e.at("list", folder)?.path())).collect::<Result<Vec<_>>>()?;
     paths.sort();
     Ok(paths)
+}
+
+/// Camera-from-world rotation and translation of the 4x4 matrix in a file; none, with a warning, where there is none or it is not finite.
+fn pose(path: &Path, warnings: &mut Vec<String>) -> Result<Option<(DMat3, DVec3)>> {
+    let why = if path.is_file() {
+        match invert_pose(matrix(path)?, "pose").map_err(|e| e.file(path))? {
+            Some(pose) => return Ok(Some(pose)),
+            None => "the pose is not finite",
+        }
+    } else {
+        "no such pose"
+    };
+    warnings.push(format!("{}: {why}, view skipped", path.display()));
+    Ok(None)
 }
 
 /// A 4x4 matrix of numbers in rows; `-inf` marks a lost pose.

@@ -806,7 +806,7 @@ fn seven_scenes_has_its_sequences_and_its_kinect() {
     };
     let depth = image::ImageBuffer::from_fn(20, 15, |x, _| image::Luma([if x == 3 { 65535u16 } else { 1500 }]));
     depth.save(frame("1", 0, &pose_text(&c[0]))).unwrap();
-    frame("1", 1, &"-1.#IND ".repeat(16).replace("-1.#IND", "nan"));
+    frame("1", 1, &"nan ".repeat(16));
     frame("2", 0, &pose_text(&c[1]));
     fs::remove_file(frame("2", 2, "")).unwrap_err();
     fs::remove_file(root.join("seq-02/frame-000002.pose.txt")).unwrap();
@@ -821,7 +821,16 @@ fn seven_scenes_has_its_sequences_and_its_kinect() {
     assert!((k.fx - 525.0 / 16.0).abs() < 1e-9 && (k.position() - c[0].position()).length() < 1e-9);
     let map = d.views[0].load_depth().unwrap().unwrap();
     assert_eq!((map.camera.fx, map.camera.cx, map.depth[2], map.depth[3]), (585.0 / 32.0, 10.0, 1.5, 0.0));
-    // One sequence alone; a damaged list of those to hold out.
+    // Sequences to hold out alone; one sequence; a damaged list of those to hold out.
+    let parts = tempfile::tempdir().unwrap();
+    fs::create_dir(parts.path().join("seq-2")).unwrap();
+    for end in ["color.png", "pose.txt"] {
+        let name = format!("frame-000000.{end}");
+        fs::copy(root.join("seq-02").join(&name), parts.path().join("seq-2").join(&name)).unwrap();
+    }
+    write(&parts.path().join("TestSplit.txt"), "sequence2");
+    let all_held_out = dataset::load(parts.path(), &LoadOptions { holdout: 0, ..FULL }).unwrap();
+    assert_eq!(all_held_out.views[0].split, Split::Train);
     let one = dataset::load(&root.join("seq-02"), &FULL).unwrap();
     assert_eq!((one.views.len(), one.views[0].name.as_str()), (1, "frame-000000.color.png"));
     write(&root.join("TestSplit.txt"), "all");

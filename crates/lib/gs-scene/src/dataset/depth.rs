@@ -6,8 +6,8 @@ use gs_io::{Error, IoContext, Result};
 use image::DynamicImage;
 use std::path::PathBuf;
 
-/// World units of a depth image's number, where nothing else is said: nerfstudio and ScanNet write millimetres, the world is in
-/// metres.
+/// World units of a depth image's number, where nothing else is said: nerfstudio, ScanNet and 7-Scenes write millimetres, the world
+/// is in metres.
 pub(crate) const MILLIMETRES: f64 = 1e-3;
 
 /// Where a Kinect saw nothing; other sensors do not reach so far, and write 0.
@@ -19,8 +19,18 @@ pub(crate) struct Depth {
     pub path: PathBuf,
     /// World units of a number.
     pub unit: f64,
-    /// fx, fy, cx, cy in pixels of the depth image, where it is not the photograph's camera at another size.
-    pub focal_center: Option<[f64; 4]>,
+    pub camera: DepthCamera,
+}
+
+/// The camera of a depth image, which stands where the photograph's does.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(crate) enum DepthCamera {
+    /// The photograph's, at another size.
+    Photograph,
+    /// fx, fy, cx, cy in pixels.
+    Pixels([f64; 4]),
+    /// The focal length in widths of the image, whose middle the camera looks at.
+    Focal(f64),
 }
 
 /// How far away things are along the optical axis.
@@ -45,9 +55,14 @@ impl Depth {
         let (width, height) = picture.dimensions();
         let value = |p: u16| if p == UNKNOWN { 0.0 } else { (f64::from(p) * self.unit) as f32 };
         let mut depth: Vec<f32> = picture.pixels().map(|p| value(p[0])).collect();
-        let camera = match self.focal_center {
-            Some([fx, fy, cx, cy]) => Camera { width, height, fx, fy, cx, cy, ..view.camera.clone() },
-            None => {
+        let own = |[fx, fy, cx, cy]: [f64; 4]| Camera { width, height, fx, fy, cx, cy, ..view.camera.clone() };
+        let camera = match self.camera {
+            DepthCamera::Pixels(camera) => own(camera),
+            DepthCamera::Focal(focal) => {
+                let (w, h) = (f64::from(width), f64::from(height));
+                own([focal * w, focal * w, 0.5 * w, 0.5 * h])
+            }
+            DepthCamera::Photograph => {
                 view.undistort_nearest(&mut depth, width as usize, height as usize);
                 view.camera.resized(width, height)
             }

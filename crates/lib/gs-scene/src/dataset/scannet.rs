@@ -1,10 +1,11 @@
 //! ScanNet as its tools extract it: `color/<id>.jpg`, `pose/<id>.txt`, `intrinsic/intrinsic_color.txt`, and the scan's
 //! vertices in `*_vh_clean_2.ply`; where they are there, depth images in `depth/<id>.png`.
 
-use super::depth::{self, Depth};
-use super::{Format, RawDataset, RawView, invert_pose, list, matrix};
+use super::depth::{Depth, DepthCamera, MILLIMETRES};
+use super::{Format, RawDataset, RawView, list, matrix, pose};
 use crate::lens::{Distortion, Lens};
 use crate::{PointCloud, image, ply};
+use glam::DMat4;
 use gs_io::{Error, Result};
 use std::path::{Path, PathBuf};
 
@@ -29,15 +30,7 @@ pub(super) fn load(root: &Path) -> Result<RawDataset> {
     let mut views = Vec::new();
     for (_, image_path) in frames {
         let pose_path = root.join("pose").join(image_path.with_extension("txt").file_name().unwrap_or_default());
-        if !pose_path.is_file() {
-            warnings.push(format!("{}: no such pose, view skipped", pose_path.display()));
-            continue;
-        }
-        let pose = invert_pose(matrix(&pose_path)?, "pose").map_err(|e| e.file(&pose_path))?;
-        let Some((rotation, translation)) = pose else {
-            warnings.push(format!("{}: the pose is not finite, view skipped", pose_path.display()));
-            continue;
-        };
+        let Some((rotation, translation)) = pose(&pose_path, &mut warnings)? else { continue };
         let size = image::size_of(&image_path)?;
         let lens = Lens {
             size,
@@ -60,7 +53,7 @@ pub(super) fn load(root: &Path) -> Result<RawDataset> {
 struct Depths {
     folder: PathBuf,
     intrinsic: Option<PathBuf>,
-    focal_center: Option<[f64; 4]>,
+    camera: DepthCamera,
 }
 
 impl Depths {
@@ -68,13 +61,13 @@ impl Depths {
         let folder = root.join("depth");
         let intrinsic = Some(root.join("intrinsic/intrinsic_depth.txt")).filter(|p| folder.is_dir() && p.is_file());
         let k = intrinsic.as_deref().map(matrix).transpose()?;
-        let focal_center = k.map(|k| [k.x_axis.x, k.y_axis.y, k.z_axis.x, k.z_axis.y]);
-        Ok(Self { folder, intrinsic, focal_center })
+        let own = |k: DMat4| DepthCamera::Pixels([k.x_axis.x, k.y_axis.y, k.z_axis.x, k.z_axis.y]);
+        Ok(Self { folder, intrinsic, camera: k.map_or(DepthCamera::Photograph, own) })
     }
 
     fn of(&self, image: &Path) -> Option<Depth> {
         let path = self.folder.join(image.with_extension("png").file_name()?);
-        path.is_file().then_some(Depth { path, unit: depth::MILLIMETRES, focal_center: self.focal_center })
+        path.is_file().then_some(Depth { path, unit: MILLIMETRES, camera: self.camera })
     }
 }
 

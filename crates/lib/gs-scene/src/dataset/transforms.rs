@@ -1,6 +1,6 @@
 //! `transforms.json` of nerfstudio, instant-ngp and Blender; OpenGaussian's conversion of ScanNet is one of these.
 
-use super::depth::{Depth, MILLIMETRES};
+use super::depth::{Depth, DepthCamera, MILLIMETRES};
 use super::{Format, RawDataset, RawView, Split, check_inside, invert_pose, other_case, read_text};
 use crate::lens::{Distortion, Lens};
 use crate::{PointCloud, image, ply};
@@ -153,7 +153,7 @@ fn depth(root: &Path, file: &Value, frame: &Value, field: &str, warnings: &mut V
                 .expected("a number above zero")
         })?,
     };
-    Ok(Some(Depth { path, unit, focal_center: None }))
+    Ok(Some(Depth { path, unit, camera: DepthCamera::Photograph }))
 }
 
 /// A value's first characters, to show what was found.
