@@ -6,7 +6,7 @@ SPLATS ?=
 bench-raster:
 	$(CARGO) bench -p gs-raster --bench raster -- $(abspath $(SPLATS)) $(CURDIR)/out/bench/raster.json
 
-# gs-geom's quality for the time: geom.json, geom.md.
+# gs-geom's quality for the time: geom.json, geom.md, geom.svg.
 bench-geom:
 	scripts/bench_geom.sh
 

@@ -1,5 +1,5 @@
 #!/bin/bash
-# Quality for the time of gs-geom's alternatives: out/bench/geom.json and geom.md, the table of docs/results/geometry.md.
+# Quality for the time of gs-geom's alternatives: out/bench/geom.json, and geom.md and geom.svg, the table and curves of docs/results/geometry.md.
 # DESK is a folder of photographs with COLMAP poses (skipped where there is none); RESOLUTION, ITERATIONS, SEEDS, ONLY (settings)
 # and MAX_GAUSSIANS say what is run. "handheld" is a synthetic scene whose poses are off by a tenth of a degree and a millimetre. Finished runs are kept in out/bench/geom.runs: stop it and start it again, or start with few
 # seeds and add some. Remove that folder after a change of the program.

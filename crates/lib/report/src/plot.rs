@@ -1,4 +1,4 @@
-//! Charts as SVG: a line, points, or both.
+//! Charts as SVG: lines, points, or both.
 
 use crate::html::escape;
 use std::fmt::Write;
@@ -107,7 +107,7 @@ impl Chart {
         self.draw_line(&self.line, "", &frame, &mut s);
         for (name, line) in &self.beside {
             self.draw_line(line, r#" stroke-dasharray="5 3""#, &frame, &mut s);
-            if let Some(&(x, y)) = line.last() {
+            if let Some(&(x, y)) = line.iter().rfind(|(x, y)| x.is_finite() && y.is_finite()) {
                 let (x, y) = (frame.px(x), frame.py(y) + 14.0);
                 let name = escape(name);
                 let _ = write!(s, r#"<text class="axis" text-anchor="end" x="{x:.1}" y="{y:.1}">{name}</text>"#);
@@ -246,14 +246,14 @@ mod tests {
     #[test]
     fn lines_beside_it_share_the_frame_and_have_names() {
         let chart = Chart {
-            beside: vec![("a<b".into(), vec![(0.0, 1.0), (4.0, 9.0)])],
+            beside: vec![("a<b".into(), vec![(0.0, 1.0), (4.0, 9.0), (5.0, f64::NAN)])],
             ..line("", vec![(0.0, 3.0), (2.0, 5.0)])
         };
         let s = chart.svg();
         assert_eq!((s.matches("<polyline").count(), s.matches("dasharray").count()), (2, 1));
         // The first line ends in the middle, the other at the right border.
         let middle = 0.5 * (LEFT + WIDTH - RIGHT);
-        assert!(s.contains(&format!("{middle:.1},")) && s.contains("a&lt;b"), "{s}");
+        assert!(s.contains(&format!("{middle:.1},")) && s.contains("a&lt;b") && !s.contains("NaN"), "{s}");
     }
 
     #[test]

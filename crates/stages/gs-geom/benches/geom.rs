@@ -40,7 +40,8 @@ fn figures(record: &Value, iterations: u32) -> [(&'static str, f64); 6] {
 fn main() -> Result<(), String> {
     let mut arguments = std::env::args().skip(1).filter(|a| a != "--bench");
     let out = PathBuf::from(arguments.next().ok_or("which file to write?")?);
-    let (iterations, seeds) = (numbers("ITERATIONS", "500,2000")?, numbers("SEEDS", "3")?[0]);
+    let (mut iterations, seeds) = (numbers("ITERATIONS", "500,2000")?, numbers("SEEDS", "3")?[0]);
+    iterations.sort_unstable();
     let (most, only) = (setting("MAX_GAUSSIANS", ""), setting("ONLY", ""));
     let only: Vec<&str> = only.split(',').filter(|name| !name.is_empty()).collect();
     let mut all = Vec::new();
