@@ -6,13 +6,13 @@
 use crate::inputs::Inputs;
 use crate::options::Settings;
 use crate::plane::Place;
-use crate::profile::{Profile, units};
+use crate::profile::{Profile, some_views, units};
 use artifacts::{Graph, Level};
 use gs_io::Result;
 use hdbscan_exact::{Clustering, Edge, Options, Selection, cluster_graph};
 use rayon::prelude::*;
 use std::cmp::Reverse;
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 
 /// A cluster joins one more than this many times as large that it agrees with most, though that one agrees more with another: it hardly
 /// changes it. Else a floor would take its Gaussians one a round.
@@ -26,6 +26,11 @@ const FLOOR: f64 = 0.1;
 const APART: f64 = 1e-6;
 /// Agreement of two of which hardly any view shows both in one mask.
 const NONE: f64 = 1e-9;
+
+/// Entries of footprints that single Gaussians have at most, 18 bytes each. Where all views show most of a large scene there are more.
+pub const MOST_ENTRIES: u64 = 1 << 27;
+/// Where there are more, Gaussians that agree by this in some of the views become one before the others are read.
+const FIRM: f64 = 0.7;
 
 /// Clusters the kept Gaussians by the masks at `levels`: neighbours that agree by `least`, then pieces that do not touch and agree by
 /// `join`; 0 joins none of those. The tree above goes on to where nothing agrees.
@@ -44,7 +49,15 @@ pub fn cluster(
     // Two distances that nothing else has part what is one instance from what is not.
     let cut = distance(least);
     let (within, above) = ((0.0, cut), (cut + 2.0 * APART, f64::MAX));
-    let mut linkage = Linkage::new(Profile::of_gaussians(n, footprints, levels)?, &neighbours(graph), &unit_of);
+    let views = some_views(footprints, levels, MOST_ENTRIES);
+    let own: Vec<i32> = (0..n as i32).collect();
+    let profiles = Profile::of_pieces(&own, n, footprints, levels, &views)?;
+    let mut linkage = Linkage::new(profiles, &neighbours(graph), &unit_of);
+    if views.contains(&false) {
+        linkage.join(FIRM, usize::MAX, within);
+        let (labels, count) = linkage.labels();
+        linkage.see(Profile::of_pieces(&labels, count, footprints, levels, &vec![true; views.len()])?);
+    }
     linkage.join(least, usize::MAX, within);
     linkage.join(NONE, hdbscan.min_cluster_size, within);
     if join > 0.0 {
@@ -131,21 +144,40 @@ impl<'a> Linkage<'a> {
         }
     }
 
+    /// The clusters, ascending, as [`Linkage::labels`] numbers them.
+    fn left(&self) -> Vec<u32> {
+        (0..self.sizes.len() as u32).filter(|&i| self.sizes[i as usize] > 0).collect()
+    }
+
+    /// From now on the clusters have these profiles.
+    pub fn see(&mut self, profiles: Vec<Profile>) {
+        let left = self.left();
+        left.iter().zip(profiles).for_each(|(&i, profile)| self.profiles[i as usize] = profile);
+        let touch = left.iter().flat_map(|&a| self.near[a as usize].iter().map(move |&(b, _)| (a, b)));
+        let pairs: Vec<(u32, u32)> = touch.filter(|(a, b)| a < b).collect();
+        self.near.iter_mut().for_each(Vec::clear);
+        self.compare(&pairs);
+    }
+
     /// From now on clusters may also join that do not touch, but lie mostly in the same mask of some view, and no two that too few views
     /// show both of. `places` are those of the clusters, as [`Linkage::labels`] numbers them.
     pub fn meet(&mut self, places: Vec<Place>) {
-        let left: Vec<u32> = (0..self.sizes.len() as u32).filter(|&i| self.sizes[i as usize] > 0).collect();
+        let left = self.left();
         self.places = vec![Place::default(); self.sizes.len()];
         left.iter().zip(places).for_each(|(&i, place)| self.places[i as usize] = place);
         let mut mainly: BTreeMap<u32, Vec<u32>> = BTreeMap::new();
         for &i in &left {
             self.profiles[i as usize].main_masks(self.unit_of).for_each(|k| mainly.entry(k).or_default().push(i));
         }
-        let meet = mainly.values().flat_map(|of| of.iter().flat_map(|&a| of.iter().map(move |&b| (a, b))));
         let touch = left.iter().flat_map(|&a| self.near[a as usize].iter().map(move |&(b, _)| (a, b)));
-        let mut pairs: Vec<(u32, u32)> = meet.chain(touch).filter(|(a, b)| a < b).collect();
-        pairs.sort_unstable();
-        pairs.dedup();
+        let mut pairs: BTreeSet<(u32, u32)> = touch.filter(|(a, b)| a < b).collect();
+        // Ascending, so a < b. The same pairs meet in many masks.
+        pairs.extend(
+            mainly
+                .values()
+                .flat_map(|of| of.iter().enumerate().flat_map(|(k, &a)| of[k + 1..].iter().map(move |&b| (a, b)))),
+        );
+        let pairs: Vec<(u32, u32)> = pairs.into_iter().collect();
         self.near.iter_mut().for_each(Vec::clear);
         self.compare(&pairs);
     }
@@ -308,6 +340,20 @@ mod tests {
         assert!((1..41).all(|i| round[i].0 == 0) && round[0].0 == 0);
         linkage.join(0.5, usize::MAX, ALL);
         assert_eq!(labels(&linkage), [0; 41]);
+    }
+
+    #[test]
+    fn clusters_of_some_views_are_judged_by_all() {
+        // In the first view all are one; the others show that only 0 and 1 are, and 2 and 3.
+        let first: Vec<Profile> = (0..4).map(|_| profile(&[ONE])).collect();
+        let mut linkage = Linkage::new(first, &[(0, 1), (1, 2), (2, 3)], &UNIT_OF);
+        linkage.join(0.7, 2, ALL);
+        assert_eq!(labels(&linkage), [0, 0, 1, 1]);
+        linkage.see(vec![profile(&[ONE; 4]), profile(&[ONE, TWO, TWO, TWO])]);
+        linkage.join(0.4, usize::MAX, ALL);
+        assert_eq!(labels(&linkage), [0, 0, 1, 1]);
+        linkage.join(0.2, usize::MAX, ALL);
+        assert_eq!(labels(&linkage), [0; 4]);
     }
 
     #[test]

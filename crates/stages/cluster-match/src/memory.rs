@@ -1,21 +1,30 @@
 //! How much memory a run will take, said before it starts. docs/performance.md compares it with measured peaks.
 
 use crate::inputs::Inputs;
-use crate::options::Space;
+use crate::linkage::MOST_ENTRIES;
+use crate::options::{Settings, Space};
+use artifacts::Level;
 
-/// Peak memory in bytes of clustering in this space.
-pub fn forecast(inputs: &Inputs, space: Space) -> u64 {
-    let (entries, samples) = (inputs.footprints.total(), inputs.footprints.pixels.col.len());
+/// Peak memory in bytes of clustering with these settings.
+pub fn forecast(inputs: &Inputs, settings: &Settings) -> u64 {
+    let footprints = &inputs.footprints;
     let (gaussians, kept) = (inputs.geometry.gaussians.len(), inputs.features.kept.len() as u64);
-    let dim = inputs.features.dim() as u64;
+    let (dim, samples) = (inputs.features.dim() as u64, footprints.pixels.col.len() as u64);
+    // By the masks: every entry in the profile of its Gaussian or, where there are too many, of a small piece.
+    let profiles = |levels: &[Level]| {
+        let of = (0..footprints.rows.len()).filter(|&r| footprints.rows[r].is_of(levels));
+        let entries: u64 = of.map(|r| footprints.entries_of(r) as u64).sum();
+        18 * entries.min(MOST_ENTRIES) + 3 * entries.saturating_sub(MOST_ENTRIES)
+    };
+    let parts = if settings.split > 0.0 { profiles(&[Level::Small]) } else { 0 };
     // Features as they are read and as they are clustered; free points are also parted from their duplicates and lie in a tree:
-    // coordinates, the leaves' blocks, boxes. By the masks: every entry in the profile of its Gaussian, and those growing. Entries
-    // are read in batches of 4 million.
-    let (value, entries) = match space {
-        Space::Masks => (4, 18 * entries),
-        Space::Graph => (6, 9 * entries.min(1 << 22)),
-        Space::Free => (18, 9 * entries.min(1 << 22)),
+    // coordinates, the leaves' blocks, boxes. Entries are read in batches of 4 million.
+    let batch = 9 * footprints.total().min(1 << 22);
+    let (value, entries) = match settings.cluster {
+        Space::Masks => (4, profiles(&settings.levels)),
+        Space::Graph => (6, batch.max(parts)),
+        Space::Free => (18, batch.max(parts)),
     };
     // Fitted to 11 runs of 5,000 to 950,000 Gaussians; by the masks to 11 of 12,000 to 950,000.
-    12_800_000 + entries + 14 * samples as u64 + 1000 * gaussians as u64 + value * kept * dim
+    12_800_000 + entries + 14 * samples + 1000 * gaussians as u64 + value * kept * dim
 }

@@ -92,8 +92,8 @@ pub(crate) struct Settings {
     pub votes: usize,
     /// Let small parts leave their instance and become instances: what stands on a shelf is no shelf. The largest share of the
     /// instance's Gaussians that such a part may have, 0 to 0.5; 0 lets none leave. A part that is
-    /// alone in large masks more often than in medium ones may have up to 0.5. The masks of level small show the parts; for
-    /// free points the default is 0
+    /// alone in large masks more often than in medium ones may have up to 0.5. The masks of level small make the parts, and one leaves
+    /// only where some mask shows it as one; for free points the default is 0
     #[arg(long, value_name = "SHARE", value_parser = stage::within(0.0..=0.5), default_value = "0.03",
         default_value_if("cluster", "free", "0"))]
     pub split: f64,

@@ -67,9 +67,9 @@ impl Pieces {
     }
 }
 
-/// Makes instances of those of `parts` that lie in a larger instance and that some mask shows as one: at least [`INSIDE`] of their
-/// Gaussians, and at most `share` of its own, or a half for those that large masks set apart. An instance of which more than half would
-/// leave stays as it is. In the tree such a part hangs below the cluster of that instance. Returns how many there are.
+/// Makes instances of `parts`. A part leaves where at least [`INSIDE`] of its Gaussians lie in one instance, it has at most `share` of that
+/// instance's (or a half, where large masks set it apart), and some mask shows it as one. An instance of which more than half would leave
+/// stays as it is. In the tree such a part hangs below the cluster of that instance. Returns how many there are.
 ///
 /// # Errors
 /// When the footprints can't be read.

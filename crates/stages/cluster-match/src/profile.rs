@@ -1,6 +1,6 @@
 //! What the masks show of a Gaussian or of several, and how far that makes them one thing.
 
-use artifacts::{Footprints, LEVELS, Level};
+use artifacts::{Footprints, LEVELS, Level, Row};
 use gs_io::Result;
 use rayon::prelude::*;
 use std::cmp::Ordering;
@@ -16,6 +16,15 @@ const LEAST_COMMON: (usize, f64) = (2, 0.05);
 /// The view and level of each mask, as one number; ascending.
 pub fn units(footprints: &Footprints) -> Vec<u32> {
     footprints.rows.iter().map(|r| r.view * LEVELS as u32 + r.level).collect()
+}
+
+/// Views, evenly spread, whose masks at `levels` have about `most` entries at most.
+pub fn some_views(footprints: &Footprints, levels: &[Level], most: u64) -> Vec<bool> {
+    let of_level = |r: &usize| footprints.rows[*r].is_of(levels);
+    let entries: usize = (0..footprints.rows.len()).filter(of_level).map(|r| footprints.entries_of(r)).sum();
+    let share = (most as f64 / entries.max(1) as f64).min(1.0);
+    let read = |views: usize| (views as f64 * share).floor();
+    (0..footprints.views.len()).map(|v| read(v + 1) > read(v)).collect()
 }
 
 /// What the masks show of a Gaussian or of several.
@@ -40,28 +49,42 @@ pub struct Agreement {
 impl Profile {
     /// From masks and weights, ascending.
     pub fn new(masks: Vec<(u32, f32)>) -> Self {
-        let total = masks.iter().map(|m| f64::from(m.1)).sum();
+        let total = weight(&masks);
         Self { masks, total }
     }
 
-    /// Those of `n` Gaussians in the masks at `levels`.
+    /// Those of `count` small pieces in the masks at `levels` of the `views` that hold. `labels` are those of the kept Gaussians.
     ///
     /// # Errors
     /// When the footprints can't be read.
-    pub fn of_gaussians(n: usize, footprints: &Footprints, levels: &[Level]) -> Result<Vec<Self>> {
-        let rows = (0..footprints.rows.len() as u32).filter(|&r| footprints.rows[r as usize].is_of(levels));
+    pub fn of_pieces(
+        labels: &[i32],
+        count: usize,
+        footprints: &Footprints,
+        levels: &[Level],
+        views: &[bool],
+    ) -> Result<Vec<Self>> {
+        let is_read = |r: &Row| r.is_of(levels) && views[r.view as usize];
+        let rows = (0..footprints.rows.len() as u32).filter(|&r| is_read(&footprints.rows[r as usize]));
         let rows: Vec<u32> = rows.collect();
+        let each = |take: &mut dyn FnMut(usize, u32, f32)| {
+            footprints.in_batches(&rows, |rows, batch| {
+                for (&row, entries) in rows.iter().zip(batch) {
+                    let shown = entries.iter().filter(|(_, w)| *w > 0.0);
+                    shown.for_each(|(i, w)| take(labels[i as usize] as usize, row, w));
+                }
+            })
+        };
         // Read twice: a list that grows takes up to twice its memory.
-        let mut counts = vec![0; n];
-        footprints.in_batches(&rows, |_, batch| {
-            let shown = batch.iter().flat_map(|entries| entries.iter().filter(|(_, w)| *w > 0.0));
-            shown.for_each(|(i, _)| counts[i as usize] += 1);
+        let mut counts = vec![(0, u32::MAX); count];
+        each(&mut |k, row, _| {
+            counts[k].0 += usize::from(counts[k].1 != row);
+            counts[k].1 = row;
         })?;
-        let mut masks: Vec<Vec<(u32, f32)>> = counts.into_iter().map(Vec::with_capacity).collect();
-        footprints.in_batches(&rows, |rows, batch| {
-            for (&row, entries) in rows.iter().zip(batch) {
-                entries.iter().filter(|(_, w)| *w > 0.0).for_each(|(i, w)| masks[i as usize].push((row, w)));
-            }
+        let mut masks: Vec<Vec<(u32, f32)>> = counts.into_iter().map(|(n, _)| Vec::with_capacity(n)).collect();
+        each(&mut |k, row, w| match masks[k].last_mut().filter(|m| m.0 == row) {
+            Some(mask) => mask.1 += w,
+            None => masks[k].push((row, w)),
         })?;
         Ok(masks.into_par_iter().map(Self::new).collect())
     }
@@ -266,12 +289,30 @@ mod tests {
     fn gaussians_and_instances_have_the_same_masks() {
         let views: [&[&[u32]]; 2] = [&[&[0, 1, 2], &[4]], &[&[2, 3]]];
         let footprints = footprints_of(&[(Level::Small, &views), (Level::Large, &views)]);
-        let of_gaussians = Profile::of_gaussians(8, &footprints, &[Level::Large]).unwrap();
+        let own: Vec<i32> = (0..8).collect();
+        let of_gaussians = Profile::of_pieces(&own, 8, &footprints, &[Level::Large], &[true; 2]).unwrap();
         let labels = [0, 0, 0, 1, -1, -1, -1, -1];
         let of_instances = Profile::of_instances(&labels, 2, &footprints, &[Level::Large]).unwrap();
         let sum = of_gaussians[..3].iter().fold(Profile::default(), |sum, p| sum.joined(p));
         assert_eq!((&sum.masks, &of_gaussians[3].masks), (&of_instances[0].masks, &of_instances[1].masks));
         assert!(of_gaussians[5].masks.is_empty());
+    }
+
+    #[test]
+    fn some_views_are_read_where_there_are_too_many_entries() {
+        let view: &[&[u32]] = &[&[0, 1], &[2]];
+        let footprints = footprints(&[view; 6]);
+        let views = |most| some_views(&footprints, &[Level::Large], most);
+        assert_eq!(views(18), [true; 6]);
+        assert_eq!(views(9), [false, true, false, true, false, true]);
+        assert_eq!(views(12), [false, true, true, false, true, true]);
+        let own = [0, 0, 1, 2, 3, 4, 5, 6];
+        let pieces = Profile::of_pieces(&own, 7, &footprints, &[Level::Large], &views(9)).unwrap();
+        assert_eq!(
+            (&pieces[0].masks[..], &pieces[1].masks[..]),
+            (&[(2, 2.0), (6, 2.0), (10, 2.0)][..], &[(3, 1.0), (7, 1.0), (11, 1.0)][..])
+        );
+        assert_eq!(pieces[2].total, 0.0);
     }
 
     #[test]

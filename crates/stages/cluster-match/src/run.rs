@@ -52,7 +52,7 @@ impl Program for Args {
         let inputs = Inputs::read(a, stage)?;
         let settings = a.settings.for_gaussians(inputs.graph.kept.len());
         stage.forecast(
-            memory::forecast(&inputs, settings.cluster),
+            memory::forecast(&inputs, &settings),
             "drop small footprint entries: graph-precompute --cut 0.001",
         )?;
 
