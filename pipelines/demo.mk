@@ -1,5 +1,5 @@
-# `make demo`: a synthetic scene with inconsistent granularity, every stage, and answers to text queries. Two minutes
-# on two cores once all is built, most of them stage 1.
+# `make demo`: a synthetic scene with inconsistent granularity, every stage, and answers to text queries. One minute
+# on two cores once all is built.
 
 include pipelines/paths.mk
 OUT ?= out/demo
