@@ -31,7 +31,7 @@ const WARM_UP: u32 = 30;
 /// Divisor of the picture size for the warm-up and one of the measurements.
 const SMALL: u32 = 4;
 /// Share of the time to plan with; the rest is for what the plan does not see.
-const SHARE: f64 = 0.92;
+const SHARE: f64 = 0.86;
 /// Narrower pictures are not planned, pixels.
 const LEAST_WIDTH: f64 = 160.0;
 
@@ -47,17 +47,18 @@ struct Kept {
     speed: Speed,
 }
 
-/// The options with a plan for `budget` seconds in place of the budget, and the plan for the record.
+/// The options with a plan for `budget` seconds since `begun` in place of the budget, and the plan for the record.
 pub(crate) fn plan_for(
     options: &Train,
     budget: f64,
+    begun: Instant,
     dataset: &Dataset,
     masks: &Masks,
     stage: &Stage,
 ) -> Result<(Train, Value)> {
     let kept = match kept(options, budget) {
         Some(kept) => kept,
-        None => measured(options, budget, dataset, masks, stage)?,
+        None => measured(options, budget, begun, dataset, masks, stage)?,
     };
     let Plan { iterations, gaussians, seconds, .. } = kept.plan;
     let mut planned = options.clone();
@@ -81,8 +82,16 @@ fn kept(options: &Train, budget: f64) -> Option<Kept> {
 }
 
 /// Measures the speed and plans.
-fn measured(options: &Train, budget: f64, dataset: &Dataset, masks: &Masks, stage: &Stage) -> Result<Kept> {
-    let begun = Instant::now();
+fn measured(
+    options: &Train,
+    budget: f64,
+    begun: Instant,
+    dataset: &Dataset,
+    masks: &Masks,
+    stage: &Stage,
+) -> Result<Kept> {
+    // The run does again what was done until here, and reads all photographs instead of some.
+    let mut again = begun.elapsed().as_secs_f64();
     let most = most_gaussians(options, dataset);
     let recipe = options.recipe(most, stage.seed());
     let (train, heldout) = init::split(options, dataset)?;
@@ -90,17 +99,21 @@ fn measured(options: &Train, budget: f64, dataset: &Dataset, masks: &Masks, stag
     let width = cameras.iter().map(|c| c.width).max().unwrap_or(1);
     let extent = start::extent(&cameras, &dataset.points.positions);
     forecast_start(options, dataset, masks, &recipe.growth, stage)?;
+    let start = Instant::now();
     let gaussians = init::gaussians(options, dataset, &cameras, extent, stage)?;
+    again += start.elapsed().as_secs_f64();
     let some = train.len().min(VIEWS);
     let views: Vec<&View> = (0..some).map(|i| train[i * train.len() / some]).collect();
     let watched = Watched::default();
+    let start = Instant::now();
     let photographs = Photographs::load(views, masks.clone(), cache_bytes(options), &watched)?;
+    again += start.elapsed().as_secs_f64() * dataset.views.len() as f64 / some as f64;
     let count = gaussians.len();
     let none = Photographs::load(Vec::new(), Masks::default(), 0, &watched)?;
     let speed = probe(recipe, extent, photographs, none, gaussians)?;
 
     let limits = Limits {
-        seconds: (SHARE * budget - begun.elapsed().as_secs_f64()).max(0.0),
+        seconds: (SHARE * budget - begun.elapsed().as_secs_f64() - again).max(0.0),
         iterations: options.iterations,
         start: count,
         gaussians: if options.densify == Strategy::Fixed { count } else { most.max(count) },

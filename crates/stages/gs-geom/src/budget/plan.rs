@@ -16,6 +16,10 @@ const PARTS: u32 = 256;
 /// Share of a forward and backward pass that is forward.
 const FORWARD_SHARE: f64 = 0.45;
 
+/// Least of [`Speed::exponent`]. Doubling a start's Gaussians often costs nothing there, but a run's later Gaussians overlap more: runs took
+/// 15 to 23 % more than plans without it said.
+const LEAST_EXPONENT: f64 = 0.1;
+
 /// How long iterations take: `pixels` x (share of the pixels) x (N / `gaussians`)^`exponent` + `each` x N / `gaussians`.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct Speed {
@@ -36,7 +40,7 @@ impl Speed {
         let full = full.max(1e-6);
         let pixels = ((full - small) / (1.0 - share)).clamp(0.3 * full, full);
         let each = full - pixels;
-        let exponent = ((doubled - 2.0 * each).max(1e-9) / pixels).log2().clamp(0.0, 1.0);
+        let exponent = ((doubled - 2.0 * each).max(1e-9) / pixels).log2().clamp(LEAST_EXPONENT, 1.0);
         Self { gaussians: gaussians.max(1) as f64, pixels, each, exponent }
     }
 
@@ -154,7 +158,7 @@ mod tests {
         let fitted = Speed::fit(10_000, SPEED.seconds(10_000.0, 1.0), small, SPEED.seconds(20_000.0, 1.0));
         assert!((fitted.pixels - SPEED.pixels).abs() < 1e-9 && (fitted.exponent - 0.5).abs() < 1e-9, "{fitted:?}");
         let noisy = Speed::fit(10_000, 0.1, (0.25, 0.2), 0.01);
-        assert!(noisy.pixels > 0.0 && noisy.exponent == 0.0 && noisy.each >= 0.0);
+        assert!(noisy.pixels > 0.0 && noisy.exponent == LEAST_EXPONENT && noisy.each >= 0.0);
     }
 
     #[test]
