@@ -256,6 +256,12 @@ impl Footprints {
         self.row_ptr[self.rows.len()]
     }
 
+    /// Number of entries of the masks at `levels`.
+    pub fn total_at(&self, levels: &[Level]) -> u64 {
+        let of_levels = self.rows.iter().enumerate().filter(|(_, row)| row.is_of(levels));
+        of_levels.map(|(r, _)| self.entries_of(r) as u64).sum()
+    }
+
     /// Reads the entries of row `r`.
     ///
     /// # Errors

@@ -8,7 +8,7 @@ use std::io::{ErrorKind, Write};
 use std::path::Path;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Mutex, OnceLock};
-use std::time::{Instant, SystemTime, UNIX_EPOCH};
+use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
 
 /// A running stage: its voice, its clock, its seed and the record of its run.
 pub struct Stage {
@@ -138,6 +138,11 @@ impl Stage {
         }
     }
 
+    /// Time since the stage began.
+    pub fn elapsed(&self) -> Duration {
+        self.started.elapsed()
+    }
+
     /// What this run will write, to be completed and claimed before the work; its record will lie beside `main`.
     pub fn outputs(&self, main: impl AsRef<Path>) -> Outputs {
         let by = [Some(self.name), self.command.as_deref()].into_iter().flatten().collect::<Vec<_>>().join(" ");
@@ -154,7 +159,7 @@ impl Stage {
         inputs: BTreeMap<String, String>,
         summary: Value,
     ) -> Result<()> {
-        let elapsed = self.started.elapsed();
+        let elapsed = self.elapsed();
         let began = SystemTime::now() - elapsed;
         let mut record = RunRecord {
             program: self.name.into(),

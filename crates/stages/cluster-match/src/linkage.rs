@@ -149,14 +149,24 @@ impl<'a> Linkage<'a> {
         (0..self.sizes.len() as u32).filter(|&i| self.sizes[i as usize] > 0).collect()
     }
 
+    /// Pairs that may join, each once.
+    fn touching(&self) -> impl Iterator<Item = (u32, u32)> {
+        let of = |a: u32| self.near[a as usize].iter().map(move |&(b, _)| (a, b));
+        (0..self.near.len() as u32).flat_map(of).filter(|(a, b)| a < b)
+    }
+
+    /// Finds the agreement of these pairs anew; no others may join.
+    fn compare_only(&mut self, pairs: &[(u32, u32)]) {
+        self.near.iter_mut().for_each(Vec::clear);
+        self.compare(pairs);
+    }
+
     /// From now on the clusters have these profiles.
     pub fn see(&mut self, profiles: Vec<Profile>) {
         let left = self.left();
         left.iter().zip(profiles).for_each(|(&i, profile)| self.profiles[i as usize] = profile);
-        let touch = left.iter().flat_map(|&a| self.near[a as usize].iter().map(move |&(b, _)| (a, b)));
-        let pairs: Vec<(u32, u32)> = touch.filter(|(a, b)| a < b).collect();
-        self.near.iter_mut().for_each(Vec::clear);
-        self.compare(&pairs);
+        let pairs: Vec<(u32, u32)> = self.touching().collect();
+        self.compare_only(&pairs);
     }
 
     /// From now on clusters may also join that do not touch, but lie mostly in the same mask of some view, and no two that too few views
@@ -169,17 +179,13 @@ impl<'a> Linkage<'a> {
         for &i in &left {
             self.profiles[i as usize].main_masks(self.unit_of).for_each(|k| mainly.entry(k).or_default().push(i));
         }
-        let touch = left.iter().flat_map(|&a| self.near[a as usize].iter().map(move |&(b, _)| (a, b)));
-        let mut pairs: BTreeSet<(u32, u32)> = touch.filter(|(a, b)| a < b).collect();
-        // Ascending, so a < b. The same pairs meet in many masks.
-        pairs.extend(
-            mainly
-                .values()
-                .flat_map(|of| of.iter().enumerate().flat_map(|(k, &a)| of[k + 1..].iter().map(move |&b| (a, b)))),
-        );
-        let pairs: Vec<(u32, u32)> = pairs.into_iter().collect();
-        self.near.iter_mut().for_each(Vec::clear);
-        self.compare(&pairs);
+        let mut pairs: BTreeSet<(u32, u32)> = self.touching().collect();
+        // The same pairs meet in many masks.
+        for of in mainly.into_values() {
+            // Ascending, so a < b.
+            pairs.extend(of.iter().enumerate().flat_map(|(k, &a)| of[k + 1..].iter().map(move |&b| (a, b))));
+        }
+        self.compare_only(&pairs.into_iter().collect::<Vec<_>>());
     }
 
     /// The cluster that each joins in this round, or itself.

@@ -12,8 +12,7 @@ pub fn forecast(inputs: &Inputs, settings: &Settings) -> u64 {
     let (dim, samples) = (inputs.features.dim() as u64, footprints.pixels.col.len() as u64);
     // By the masks: every entry in the profile of its Gaussian or, where there are too many, of a small piece.
     let profiles = |levels: &[Level]| {
-        let of = (0..footprints.rows.len()).filter(|&r| footprints.rows[r].is_of(levels));
-        let entries: u64 = of.map(|r| footprints.entries_of(r) as u64).sum();
+        let entries = footprints.total_at(levels);
         18 * entries.min(MOST_ENTRIES) + 3 * entries.saturating_sub(MOST_ENTRIES)
     };
     let parts = if settings.split > 0.0 { profiles(&[Level::Small]) } else { 0 };

@@ -20,9 +20,7 @@ pub fn units(footprints: &Footprints) -> Vec<u32> {
 
 /// Views, evenly spread, whose masks at `levels` have about `most` entries at most.
 pub fn some_views(footprints: &Footprints, levels: &[Level], most: u64) -> Vec<bool> {
-    let of_level = |r: &usize| footprints.rows[*r].is_of(levels);
-    let entries: usize = (0..footprints.rows.len()).filter(of_level).map(|r| footprints.entries_of(r)).sum();
-    let share = (most as f64 / entries.max(1) as f64).min(1.0);
+    let share = (most as f64 / footprints.total_at(levels).max(1) as f64).min(1.0);
     let read = |views: usize| (views as f64 * share).floor();
     (0..footprints.views.len()).map(|v| read(v + 1) > read(v)).collect()
 }
@@ -53,7 +51,8 @@ impl Profile {
         Self { masks, total }
     }
 
-    /// Those of `count` small pieces in the masks at `levels` of the `views` that hold. `labels` are those of the kept Gaussians.
+    /// Those of `count` small pieces in the masks at `levels` of the `views` that hold. `labels` are those of the kept Gaussians. Unlike
+    /// [`Profile::of_instances`] it sums in f32 and holds nothing beside the profiles: pieces are many, and their sums short.
     ///
     /// # Errors
     /// When the footprints can't be read.

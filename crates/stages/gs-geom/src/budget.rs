@@ -47,18 +47,17 @@ struct Kept {
     speed: Speed,
 }
 
-/// The options with a plan for `budget` seconds since `begun` in place of the budget, and the plan for the record.
+/// The options with a plan for `budget` seconds since the program began in place of the budget, and the plan for the record.
 pub(crate) fn plan_for(
     options: &Train,
     budget: f64,
-    begun: Instant,
     dataset: &Dataset,
     masks: &Masks,
     stage: &Stage,
 ) -> Result<(Train, Value)> {
     let kept = match kept(options, budget) {
         Some(kept) => kept,
-        None => measured(options, budget, begun, dataset, masks, stage)?,
+        None => measured(options, budget, dataset, masks, stage)?,
     };
     let Plan { iterations, gaussians, seconds, .. } = kept.plan;
     let mut planned = options.clone();
@@ -82,16 +81,9 @@ fn kept(options: &Train, budget: f64) -> Option<Kept> {
 }
 
 /// Measures the speed and plans.
-fn measured(
-    options: &Train,
-    budget: f64,
-    begun: Instant,
-    dataset: &Dataset,
-    masks: &Masks,
-    stage: &Stage,
-) -> Result<Kept> {
+fn measured(options: &Train, budget: f64, dataset: &Dataset, masks: &Masks, stage: &Stage) -> Result<Kept> {
     // The run does again what was done until here, and reads all photographs instead of some.
-    let mut again = begun.elapsed().as_secs_f64();
+    let mut again = stage.elapsed().as_secs_f64();
     let most = most_gaussians(options, dataset);
     let recipe = options.recipe(most, stage.seed());
     let (train, heldout) = init::split(options, dataset)?;
@@ -113,7 +105,7 @@ fn measured(
     let speed = probe(recipe, extent, photographs, none, gaussians)?;
 
     let limits = Limits {
-        seconds: (SHARE * budget - begun.elapsed().as_secs_f64() - again).max(0.0),
+        seconds: (SHARE * budget - stage.elapsed().as_secs_f64() - again).max(0.0),
         iterations: options.iterations,
         start: count,
         gaussians: if options.densify == Strategy::Fixed { count } else { most.max(count) },

@@ -22,7 +22,6 @@ use gs_scene::dataset::{Dataset, Split, View};
 use serde_json::{Value, json};
 use stage::{CommonArgs, Program, Stage};
 use std::collections::BTreeMap;
-use std::time::Instant;
 
 impl Program for Args {
     const NAME: &'static str = "gs-geom";
@@ -45,7 +44,6 @@ impl Program for Args {
 
 /// `gs-geom train`, with a plan where there is a budget of time.
 fn train(options: &Train, stage: &Stage) -> Result<()> {
-    let begun = Instant::now();
     // From here on a signal ends the run with a checkpoint.
     stage.interrupted();
     let dataset = options.scene.load(stage)?;
@@ -53,7 +51,7 @@ fn train(options: &Train, stage: &Stage) -> Result<()> {
     let mut claim = outputs::claim(options, &dataset, &masks, stage)?;
     match options.time_budget {
         Some(seconds) => {
-            let (planned, plan) = budget::plan_for(options, seconds, begun, &dataset, &masks, stage)?;
+            let (planned, plan) = budget::plan_for(options, seconds, &dataset, &masks, stage)?;
             let dataset = planned.scene.load_quietly()?;
             learn(&planned, plan, &dataset, masks, &mut claim, stage)
         }
