@@ -16,10 +16,14 @@ use std::collections::BTreeMap;
 use std::fs::File;
 use std::io::Read;
 use std::path::Path;
-use std::sync::Mutex;
+use std::sync::{Mutex, MutexGuard, PoisonError};
 
-/// One measurement at a time: the counters are those of the process.
-static TURN: Mutex<()> = Mutex::new(());
+/// The counters are those of the process: while a reader is measured, no other thread makes, reads or measures files.
+fn turn() -> MutexGuard<'static, ()> {
+    static TURN: Mutex<()> = Mutex::new(());
+    // A finding of another test, caught by its harness, says nothing of this one.
+    TURN.lock().unwrap_or_else(PoisonError::into_inner)
+}
 
 /// The format of this name.
 ///
@@ -32,9 +36,8 @@ pub fn format(name: &str) -> &'static Format {
 /// Small good files of a format, made once.
 pub fn seeds(format: &Format) -> Vec<Vec<u8>> {
     static MADE: Mutex<BTreeMap<&str, Vec<Vec<u8>>>> = Mutex::new(BTreeMap::new());
-    // What making them takes is no reader's.
-    let _turn = TURN.lock().unwrap_or_else(std::sync::PoisonError::into_inner);
-    let mut made = MADE.lock().unwrap_or_else(std::sync::PoisonError::into_inner);
+    let _turn = turn();
+    let mut made = MADE.lock().unwrap_or_else(PoisonError::into_inner);
     made.entry(format.name).or_insert_with(format.seeds).clone()
 }
 
@@ -44,6 +47,7 @@ pub fn seeds(format: &Format) -> Vec<Vec<u8>> {
 /// # Panics
 /// When `testdata/corpus.zip` is missing or damaged.
 pub fn corpus(format: &Format) -> Vec<Vec<u8>> {
+    let _turn = turn();
     let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("testdata/corpus.zip");
     let mut zip = zip::ZipArchive::new(File::open(path).expect("testdata/corpus.zip")).expect("a zip file");
     let folder = format!("{}/", format.name);
@@ -61,6 +65,7 @@ pub fn corpus(format: &Format) -> Vec<Vec<u8>> {
 /// # Panics
 /// When one cannot be read.
 pub fn findings(format: &Format) -> Vec<Vec<u8>> {
+    let _turn = turn();
     let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("testdata").join(format.name);
     let entries = std::fs::read_dir(folder).into_iter().flatten();
     entries.map(|e| std::fs::read(e.expect("an entry").path()).expect("a finding")).collect()
@@ -71,8 +76,7 @@ pub fn findings(format: &Format) -> Vec<Vec<u8>> {
 /// # Panics
 /// When a reader panics, takes more memory than the format allows, or lets a name out of its folder: a finding.
 pub fn run(format: &Format, bytes: &[u8]) -> usize {
-    // A finding of another test, caught by its harness, says nothing of this one.
-    let _turn = TURN.lock().unwrap_or_else(std::sync::PoisonError::into_inner);
+    let _turn = turn();
     // What stands beside damaged files is made now, so that it is not counted.
     formats::folder();
     let (held, ()) = meter::peak(|| (format.check)(bytes));
