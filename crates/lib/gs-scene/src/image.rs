@@ -122,6 +122,7 @@ impl Image {
     }
 
     /// Bilinear value of channel values at pixel coordinates (centres at +0.5), the border repeated.
+    #[inline]
     pub(crate) fn sample(&self, x: f64, y: f64) -> [f32; 3] {
         let (w, h) = (self.width as usize, self.height as usize);
         let (pixels, mut out) = (self.rgb.as_chunks::<3>().0, [0.0; 3]);

@@ -21,6 +21,7 @@ impl Distortion {
     }
 
     /// Where the lens sends the ray through (x, y, 1): normalised image coordinates, undistorted to distorted.
+    #[inline(always)]
     pub(crate) fn distort(&self, x: f64, y: f64) -> (f64, f64) {
         let r2 = x * x + y * y;
         let poly = |c: &[f64; 3]| 1.0 + r2 * (c[0] + r2 * (c[1] + r2 * c[2]));
@@ -70,6 +71,7 @@ impl Lens {
 
     /// Where in the photograph the pinhole camera's point (x, y) is seen; the pinhole camera has the same principal
     /// point and `zoom` times the focal lengths.
+    #[inline(always)]
     pub(crate) fn locate(&self, zoom: f64, x: f64, y: f64) -> (f64, f64) {
         let [fx, fy, cx, cy] = self.focal_center;
         let (u, v) = self.distortion.distort((x - cx) / (fx * zoom), (y - cy) / (fy * zoom));

@@ -20,7 +20,7 @@ use detect::{Corners, LONGEST, detect};
 use glam::{DVec2, DVec3};
 use gs_io::Result;
 use gs_scene::dataset::{Split, View};
-use gs_scene::{Camera, PointCloud, image_size};
+use gs_scene::{Camera, Image, PointCloud, image_size};
 use pairs::{EXACT, matches, partners};
 use rayon::prelude::*;
 use stage::Stage;
@@ -36,26 +36,34 @@ const SLACKEST: f64 = 8.0;
 /// Fewest corners by which a view's pose is found.
 const FEWEST_SEEN: usize = 12;
 
+/// Makes a small picture of the photograph that a camera took.
+type Shrink = fn(&Image, &Camera) -> Image;
+
 /// What the photographs tell.
 pub(crate) struct Found {
     /// Of all views.
     pub cameras: Vec<Camera>,
     /// Points that training views show, with their colours.
     pub points: PointCloud,
+    /// Small pictures of the training views, where they were asked for.
+    pub pictures: Vec<Image>,
 }
 
 /// Corners of all views, and which of them are one point.
 struct Sights<'a> {
     views: &'a [&'a View],
     corners: Vec<Corners>,
+    pictures: Vec<Image>,
     tracks: Vec<Vec<Sighting>>,
 }
 
 /// Places the corners that training views share, with the cameras as they are given, or, where `refine` says so, with cameras that
-/// fit the corners: first those of the training views, with their focal lengths, then those of the others on the points found.
-pub(crate) fn find(views: &[&View], refine: bool, stage: &Stage) -> Result<Found> {
+/// fit the corners: first those of the training views, with their focal lengths, then those of the others on the points found. `small`
+/// asks for small pictures, too.
+pub(crate) fn find(views: &[&View], refine: bool, small: Option<Shrink>, stage: &Stage) -> Result<Found> {
     let given: Vec<Camera> = views.iter().map(|v| v.camera.clone()).collect();
-    let sights = Sights::of(views, &given, refine, stage)?;
+    let mut sights = Sights::of(views, &given, refine, small, stage)?;
+    let pictures = std::mem::take(&mut sights.pictures);
     let learns: Vec<bool> = views.iter().map(|v| v.split == Split::Train).collect();
     let mut cameras = given.clone();
     let (before, spread) = sights.placed(&cameras, &learns, SLACKEST);
@@ -69,7 +77,7 @@ pub(crate) fn find(views: &[&View], refine: bool, stage: &Stage) -> Result<Found
         if spread > 1.0 && points.len() >= FEWEST_POINTS {
             stage.warn("the poses do not fit the photographs well: --refine-poses finds better ones");
         }
-        return Ok(Found { points: sights.cloud(&points), cameras });
+        return Ok(Found { points: sights.cloud(&points), cameras, pictures });
     }
     let lenses = lenses(&given);
     let fit = |cameras: &mut [Camera], points: &mut [Point], free: &[bool], slack: Slack, width: f64, all: bool| {
@@ -105,7 +113,7 @@ pub(crate) fn find(views: &[&View], refine: bool, stage: &Stage) -> Result<Found
     if found < views.len() {
         stage.warn(&format!("{} of {} photographs have too few corners in common with others: the corners leave their poses as they are", views.len() - found, views.len()));
     }
-    Ok(Found { cameras, points: cloud })
+    Ok(Found { cameras, points: cloud, pictures })
 }
 
 /// Bytes that [`find`] takes at once on so many threads, besides decoded photographs.
@@ -136,16 +144,17 @@ pub(crate) fn lenses(cameras: &[Camera]) -> Vec<usize> {
 
 impl<'a> Sights<'a> {
     /// Held-out views are looked at only where their poses are to be found.
-    fn of(views: &'a [&'a View], cameras: &[Camera], all: bool, stage: &Stage) -> Result<Self> {
+    fn of(views: &'a [&'a View], cameras: &[Camera], all: bool, small: Option<Shrink>, stage: &Stage) -> Result<Self> {
         let up = cameras.iter().map(|c| c.rotation.transpose() * -DVec3::Y).sum::<DVec3>();
         let mut progress = stage.progress("photograph", views.len() as u64);
-        let mut corners = Vec::new();
+        let (mut corners, mut pictures) = (Vec::new(), Vec::new());
         // Few at a time: each takes the memory of a decoded photograph several times.
         for views in views.chunks(2 * rayon::current_num_threads()) {
             stage.go_on()?;
             let own = views.par_iter().map(|v| {
-                if !all && v.split != Split::Train {
-                    return Ok(Corners::default());
+                let learns = v.split == Split::Train;
+                if !all && !learns {
+                    return Ok((Corners::default(), None));
                 }
                 // The corners of a photograph are finer than the pictures that are learnt from.
                 let image = v.load_image_within(LONGEST)?;
@@ -158,9 +167,13 @@ impl<'a> Sights<'a> {
                     .flatten()
                     .zip([0, 1].into_iter().cycle())
                     .for_each(|(x, k)| *x *= to[k] / from[k]);
-                Ok(corners)
+                let small = small.filter(|_| learns).map(|small| small(&image, &v.camera));
+                Ok((corners, small))
             });
-            corners.extend(own.collect::<Result<Vec<_>>>()?);
+            for (found, small) in own.collect::<Result<Vec<_>>>()? {
+                corners.push(found);
+                pictures.extend(small);
+            }
             views.iter().for_each(|_| progress.step());
         }
         progress.finish(&[]);
@@ -177,7 +190,7 @@ impl<'a> Sights<'a> {
             found.iter().filter(|(_, m)| !m.is_empty()).count(),
             pairs.len()
         ));
-        Ok(Self { views, tracks: join(&counts, &found), corners })
+        Ok(Self { views, tracks: join(&counts, &found), corners, pictures })
     }
 
     fn at(&self, s: Sighting) -> DVec2 {

@@ -5,6 +5,7 @@ use super::{RawView, Resolution, Split};
 use crate::lens::Lens;
 use crate::{Camera, Image};
 use gs_io::{Error, Result};
+use multiversion::multiversion;
 use rayon::prelude::*;
 use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
@@ -92,7 +93,7 @@ impl View {
         let photo = Image::read(path)?;
         self.lens.expect_size((photo.width, photo.height), path)?;
         let flat = if self.lens.distortion.is_none() { photo } else { self.undistort(&photo) };
-        Ok(flat.resize_area(width, height))
+        Ok(if (width, height) == (flat.width, flat.height) { flat } else { flat.resize_area(width, height) })
     }
 
     /// Whether the lens bends straight lines: what was made from the photograph as it lies on disk has them bent, too.
@@ -129,25 +130,30 @@ impl View {
 
     /// Resamples the photograph as the pinhole camera would have seen it.
     fn undistort(&self, photo: &Image) -> Image {
-        let w = photo.width as usize;
-        let zoom = self.zoom();
-        let locate = |x: usize, y: usize| self.lens.locate(zoom, x as f64 + 0.5, y as f64 + 0.5);
-        let mut out = photo.clone();
-        out.rgb.par_chunks_mut(3 * w).enumerate().for_each(|(y, row)| {
-            for (x, pixel) in row.chunks_exact_mut(3).enumerate() {
-                let (u, v) = locate(x, y);
-                pixel.copy_from_slice(&photo.sample(u, v));
-            }
+        let (w, zoom) = (photo.width as usize, self.zoom());
+        let mut rgb = vec![0.0f32; photo.rgb.len()];
+        rgb.par_chunks_mut(3 * w).enumerate().for_each_init(
+            || vec![(0.0, 0.0); w],
+            |places, (y, row)| {
+                locate_row(&self.lens, zoom, y as f64 + 0.5, places);
+                let pixels = row.as_chunks_mut::<3>().0.iter_mut();
+                pixels.zip(places).for_each(|(pixel, place)| *pixel = photo.sample(place.0, place.1));
+            },
+        );
+        let alpha = photo.alpha.as_ref().map(|_| {
+            let of = |i: usize| self.lens.locate(zoom, (i % w) as f64 + 0.5, (i / w) as f64 + 0.5);
+            let pixels = (0..w * photo.height as usize).into_par_iter().map(of);
+            pixels.map(|place| photo.sample_alpha(place.0, place.1)).collect()
         });
-        if let Some(alpha) = &mut out.alpha {
-            alpha.par_chunks_mut(w).enumerate().for_each(|(y, row)| {
-                for (x, pixel) in row.iter_mut().enumerate() {
-                    let (u, v) = locate(x, y);
-                    *pixel = photo.sample_alpha(u, v);
-                }
-            });
-        }
-        out
+        Image { rgb, alpha, ..*photo }
+    }
+}
+
+/// [`Lens::locate`] of a row's pixels.
+#[multiversion(targets("x86_64+avx2"))]
+fn locate_row(lens: &Lens, zoom: f64, y: f64, places: &mut [(f64, f64)]) {
+    for (x, place) in places.iter_mut().enumerate() {
+        *place = lens.locate(zoom, x as f64 + 0.5, y);
     }
 }
 

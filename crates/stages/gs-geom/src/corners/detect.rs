@@ -2,11 +2,12 @@
 //! scale, described by histograms of gradients (SIFT, Lowe 2004; compared as RootSIFT, Arandjelovic and Zisserman 2012).
 
 use gs_scene::Image;
+use multiversion::multiversion;
 
-/// Bytes for each pixel that is worked on: a grey picture at six blurs, their five differences, what a blur takes, colours.
+/// Bytes for each pixel that is worked on: six blurs of a grey picture and of its halves, five differences, what a blur takes.
 const PER_PIXEL: u64 = 64;
 /// Numbers of a description: 4 x 4 cells of 8 directions.
-const NUMBERS: usize = 128;
+pub(super) const NUMBERS: usize = 128;
 /// Length of a description.
 const LENGTH: f32 = 1024.0;
 /// Longer side of the picture that is worked on, at most; half as large a photograph is enlarged to twice its size.
@@ -120,7 +121,6 @@ struct Place {
     /// Standard deviation of its blur, in pixels of the octave.
     sigma: f64,
     strength: f64,
-    code: Code,
 }
 
 /// By how much a photograph is enlarged.
@@ -147,21 +147,16 @@ pub(super) fn detect(image: &Image, roll: f64) -> Corners {
     drop(picture);
     let taken = TAKEN * zoom.max(1.0);
     let mut first = Plane { width, height, values: grey }.blurred((FIRST * FIRST - taken * taken).sqrt());
-    let mut places = Vec::new();
-    let mut octave = 0;
+    let (mut places, mut octaves) = (Vec::new(), Vec::new());
     while first.width.min(first.height) >= SMALLEST {
         let mut levels = vec![first];
         for i in 1..SCALES + 3 {
             let (before, now) = (sigma(i as f64 - 1.0), sigma(i as f64));
             levels.push(levels[i - 1].blurred((now * now - before * before).sqrt()));
         }
-        let found = places.len();
-        extrema(&levels, octave, &mut places);
-        for p in &mut places[found..] {
-            p.code = describe(&levels[p.level], p, roll);
-        }
+        extrema(&levels, octaves.len(), &mut places);
         first = levels[SCALES].halved();
-        octave += 1;
+        octaves.push(levels);
     }
     // Equal strengths in the order in which they were found.
     places.sort_by(|a, b| b.strength.total_cmp(&a.strength));
@@ -180,7 +175,7 @@ pub(super) fn detect(image: &Image, roll: f64) -> Corners {
         let from = 3 * pixel;
         out.at.push(at);
         out.colors.push([0, 1, 2].map(|c| (image.rgb[from + c].clamp(0.0, 1.0) * 255.0).round() as u8));
-        out.codes.push(p.code);
+        out.codes.push(describe(&octaves[p.octave][p.level], &p, roll));
     }
     out
 }
@@ -190,18 +185,17 @@ fn sigma(level: f64) -> f64 {
     FIRST * (level / SCALES as f64).exp2()
 }
 
-/// Adds the extrema of an octave's differences, without their descriptions.
+/// Adds the extrema of an octave's differences.
 fn extrema(levels: &[Plane], octave: usize, out: &mut Vec<Place>) {
     let differences: Vec<Plane> = levels.windows(2).map(|l| l[1].minus(&l[0])).collect();
     let (w, h) = (levels[0].width, levels[0].height);
     for level in 1..=SCALES {
         let [below, own, above] = [0, 1, 2].map(|k| &differences[level - 1 + k]);
+        let mut stands_out = vec![false; w];
         for y in 1..h - 1 {
-            for x in 1..w - 1 {
+            outstanding(&own.values[(y - 1) * w..(y + 2) * w], &mut stands_out);
+            for x in (1..w - 1).filter(|&x| stands_out[x]) {
                 let v = own.values[y * w + x];
-                if f64::from(v.abs()) < 0.5 * CONTRAST {
-                    continue;
-                }
                 let sign = v.signum();
                 // Strictly above the neighbours that come later, so that of two equal ones one is left.
                 let highest = [own, below, above].iter().enumerate().all(|(k, plane)| {
@@ -220,6 +214,20 @@ fn extrema(levels: &[Plane], octave: usize, out: &mut Vec<Place>) {
                 }
             }
         }
+    }
+}
+
+/// Which pixels of the middle one of three rows are no less than the four beside them, or no more, and not faint; not of the first and
+/// the last pixel.
+#[multiversion(targets("x86_64+avx2"))]
+fn outstanding(rows: &[f32], out: &mut [bool]) {
+    let w = out.len();
+    let (above, row, below) = (&rows[..w], &rows[w..2 * w], &rows[2 * w..3 * w]);
+    for x in 1..w - 1 {
+        let (v, [a, b, c, d]) = (row[x], [row[x - 1], row[x + 1], above[x], below[x]]);
+        let high = (v >= a) & (v >= b) & (v >= c) & (v >= d);
+        let low = (v <= a) & (v <= b) & (v <= c) & (v <= d);
+        out[x] = (high | low) & (v.abs() >= (0.5 * CONTRAST) as f32);
     }
 }
 
@@ -257,7 +265,6 @@ fn refined(differences: &[Plane], octave: usize, level: usize, x: usize, y: usiz
                 y: y as f64 + off.y,
                 sigma: sigma(level as f64 + off.z),
                 strength,
-                code: [0; NUMBERS],
             });
         }
         let step = |v: usize, by: f64, most: usize| {

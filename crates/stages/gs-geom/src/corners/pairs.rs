@@ -1,7 +1,7 @@
 //! The same corners in two photographs: alike, near each other's epipolar lines by poses that need not be exact, and in
 //! agreement about how the two cameras lie.
 
-use super::detect::{Code, Corners};
+use super::detect::{Code, Corners, NUMBERS};
 use glam::{DMat3, DQuat, DVec2, DVec3};
 use gs_scene::Camera;
 use multiversion::multiversion;
@@ -154,15 +154,9 @@ fn alike(corners: [&Corners; 2], cameras: [&Camera; 2]) -> Vec<[usize; 2]> {
     let mut near = Vec::new();
     for (i, a) in sights[0].iter().enumerate() {
         let line = e * a.extend(1.0);
-        let reach = band * line.truncate().length();
-        near.clear();
-        let is_near = |b: &DVec2| (line.x * b.x + line.y * b.y + line.z).abs() < reach;
-        near.extend((0..sights[1].len()).filter(|&j| is_near(&sights[1][j])));
-        for &j in &near {
-            let distance = difference(&corners[0].codes[i], &corners[1].codes[j]);
-            best[0][i].see(distance, j);
-            best[1][j].see(distance, i);
-        }
+        near_line(&sights[1], line, band * line.truncate().length(), &mut near);
+        let [own, others] = &mut best;
+        compare(i, &corners[0].codes[i], &corners[1].codes, &near, (&mut own[i], others));
     }
     let mutual = |i: usize| {
         let j = best[0][i].clear()?;
@@ -171,19 +165,54 @@ fn alike(corners: [&Corners; 2], cameras: [&Camera; 2]) -> Vec<[usize; 2]> {
     (0..corners[0].at.len()).filter_map(mutual).collect()
 }
 
-/// Squared distance of two descriptions.
+/// The sights within reach of a line.
 #[multiversion(targets("x86_64+avx2"))]
-fn difference(a: &Code, b: &Code) -> i32 {
-    let mut sum = 0i32;
-    for (x, y) in a.iter().zip(b) {
-        let d = i32::from(*x - *y);
-        sum += d * d;
+fn near_line(sights: &[DVec2], line: DVec3, reach: f64, near: &mut Vec<u32>) {
+    near.clear();
+    for (part, sights) in sights.chunks(64).enumerate() {
+        let mut is_near = [0u8; 64];
+        for (is_near, b) in is_near.iter_mut().zip(sights) {
+            *is_near = u8::from((line.x * b.x + line.y * b.y + line.z).abs() < reach);
+        }
+        for (eight, flags) in is_near.as_chunks().0.iter().enumerate() {
+            let mut flags = u64::from_le_bytes(*flags);
+            while flags != 0 {
+                near.push((64 * part + 8 * eight) as u32 + flags.trailing_zeros() / 8);
+                flags &= flags - 1;
+            }
+        }
     }
-    sum
+}
+
+/// Shows corner `i` those that are near, and these the corner.
+#[multiversion(targets("x86_64+avx2"))]
+fn compare(i: usize, code: &Code, codes: &[Code], near: &[u32], (own, others): (&mut Best, &mut [Best])) {
+    for &j in near {
+        let (other, best) = (&codes[j as usize], &mut others[j as usize]);
+        let [first, second] = [0, NUMBERS / 2].map(|from| from..from + NUMBERS / 2);
+        let half = difference(&code[first.clone()], &other[first]);
+        // Most are too far by half of their numbers.
+        if half >= own.second && half >= best.second {
+            continue;
+        }
+        let distance = half + difference(&code[second.clone()], &other[second]);
+        own.see(distance, j as usize);
+        best.see(distance, i);
+    }
+}
+
+/// Squared distance of two descriptions, or of parts of them.
+#[inline(always)]
+fn difference(a: &[i16], b: &[i16]) -> i32 {
+    let square = |(x, y): (&i16, &i16)| {
+        let d = i32::from(*x - *y);
+        d * d
+    };
+    a.iter().zip(b).map(square).sum()
 }
 
 /// The nearest and the second nearest distance so far.
-#[derive(Clone, Copy)]
+#[derive(Debug, Clone, Copy, PartialEq)]
 struct Best {
     first: i32,
     second: i32,
@@ -208,5 +237,48 @@ impl Best {
     /// The nearest, where the second is farther.
     fn clear(&self) -> Option<usize> {
         (f64::from(self.first) < RATIO * RATIO * f64::from(self.second)).then_some(self.of)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use proptest::prelude::*;
+
+    proptest! {
+        #[test]
+        fn what_is_near_and_nearest_is_that_of_the_plain_version(
+            sights in prop::collection::vec((-1.0f64..1.0, -1.0f64..1.0), 1..200),
+            line in (-1.0f64..1.0, -1.0f64..1.0, -0.5f64..0.5),
+            reach in 0.0f64..0.5,
+            seed: u16,
+        ) {
+            let sights: Vec<DVec2> = sights.into_iter().map(DVec2::from).collect();
+            let line = DVec3::from(line);
+            let mut near = Vec::new();
+            near_line(&sights, line, reach, &mut near);
+            let is_near = |j: &usize| line.dot(sights[*j].extend(1.0)).abs() < reach;
+            let expected: Vec<usize> = (0..sights.len()).filter(is_near).collect();
+            prop_assert_eq!(near.iter().map(|&j| j as usize).collect::<Vec<_>>(), &expected[..]);
+
+            // Two corners in turn, so that what is near has seen some already.
+            let code = |k: usize| -> Code {
+                std::array::from_fn(|n| ((k + usize::from(seed)) * 40_503 + n * 7919 + k * n * 31) as i16 % 200)
+            };
+            let codes: Vec<Code> = (0..sights.len()).map(code).collect();
+            let mut others = vec![Best::default(); codes.len()];
+            let mut plain = others.clone();
+            for i in 0..2 {
+                let (own, mut plain_own) = (&mut Best::default(), Best::default());
+                compare(i, &code(1000 + i), &codes, &near, (own, &mut others));
+                for &j in &expected {
+                    let distance = difference(&code(1000 + i), &codes[j]);
+                    plain_own.see(distance, j);
+                    plain[j].see(distance, i);
+                }
+                prop_assert_eq!(*own, plain_own);
+                prop_assert_eq!(&others, &plain);
+            }
+        }
     }
 }

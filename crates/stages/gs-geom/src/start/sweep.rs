@@ -3,10 +3,10 @@
 //! other pixels get what is interpolated: plain walls and floors have no depth of their own, and where nothing starts, nothing grows.
 
 use super::depths::Voxels;
-use glam::{DMat3, DVec3};
+use glam::{DMat3, DVec3, Vec3};
 use gs_io::Result;
-use gs_scene::dataset::View;
 use gs_scene::{Camera, Image, PointCloud};
+use multiversion::multiversion;
 use rayon::prelude::*;
 use stage::Stage;
 
@@ -38,10 +38,17 @@ const BEYOND: [f64; 2] = [0.6, 2.0];
 /// A small picture with what is tried on it.
 struct Small {
     image: Image,
+    /// Its colours ([`pixels`]).
+    pixels: Vec<[f32; 4]>,
     camera: Camera,
     /// 1 / depth of the nearest and the farthest plane.
     range: [f64; 2],
     neighbours: Vec<usize>,
+}
+
+/// The colours of a picture, each with a zero: four numbers are read at once.
+fn pixels(image: &Image) -> Vec<[f32; 4]> {
+    image.rgb.as_chunks().0.iter().map(|&[r, g, b]| [r, g, b, 0.0]).collect()
 }
 
 impl Small {
@@ -58,29 +65,38 @@ impl Small {
     }
 }
 
-/// At most `most` points of what several of `views` show. `known` points say how far away things are.
-pub(crate) fn points(views: &[(&View, &Camera)], known: &PointCloud, most: usize, stage: &Stage) -> Result<PointCloud> {
-    let small = |&(view, camera): &(&View, &Camera)| -> Result<(Image, Camera)> {
-        let longest = camera.width.max(camera.height);
-        let by = (f64::from(LONGEST) / f64::from(longest)).min(1.0);
-        let [w, h] = [camera.width, camera.height].map(|v| ((f64::from(v) * by).round() as u32).max(1));
-        Ok((view.load_image()?.resize_area(w, h), camera.resized(w, h)))
-    };
-    let pictures = views.par_iter().map(small).collect::<Result<Vec<_>>>()?;
-    let cameras: Vec<Camera> = pictures.iter().map(|p| p.1.clone()).collect();
+/// The small picture of a photograph. A little blurred, by an odd size between: what is sharp matches only at the right fraction of a
+/// pixel.
+pub(crate) fn small(photograph: &Image, camera: &Camera) -> Image {
+    let by = (f64::from(LONGEST) / f64::from(camera.width.max(camera.height))).min(1.0);
+    let [w, h] = [camera.width, camera.height].map(|v| ((f64::from(v) * by).round() as u32).max(1));
+    photograph.resize_area(w + w / 2, h + h / 2).resize_area(w, h)
+}
+
+/// At most `most` points of what several pictures show, each [`small`]. `known` points say how far away things are.
+pub(crate) fn points(
+    pictures: Vec<Image>,
+    cameras: &[Camera],
+    known: &PointCloud,
+    most: usize,
+    stage: &Stage,
+) -> Result<PointCloud> {
+    let cameras: Vec<Camera> = cameras.iter().zip(&pictures).map(|(c, p)| c.resized(p.width, p.height)).collect();
     let known: Vec<DVec3> = known.positions.iter().map(|p| DVec3::from(p.map(f64::from))).collect();
     let mut all: Vec<f64> = cameras.iter().flat_map(|c| depths(c, &known)).collect();
     all.sort_by(f64::total_cmp);
     let pictures: Vec<Small> = pictures
         .into_iter()
+        .zip(&cameras)
         .enumerate()
         .map(|(i, (image, camera))| {
-            let own = depths(&camera, &known);
+            let own = depths(camera, &known);
             let [near, far] = range(if own.len() < 20 { all.clone() } else { own });
             Small {
                 neighbours: neighbours(&cameras, i, 0.5 * (near + far)),
+                pixels: pixels(&image),
                 image,
-                camera,
+                camera: camera.clone(),
                 range: [1.0 / near, 1.0 / far],
             }
         })
@@ -158,7 +174,7 @@ fn planes(own: &Small, all: &[Small]) -> Vec<f32> {
 
 /// Difference of the colours of each pixel at each plane from those of the better half of the neighbours that see it.
 fn costs(own: &Small, all: &[Small]) -> Vec<f32> {
-    let (w, h) = (own.image.width as usize, own.image.height as usize);
+    let w = own.image.width as usize;
     let c = &own.camera;
     // The sight of a pixel in a neighbour's axes: a z + b, with z the depth.
     let others: Vec<(&Small, DMat3, DVec3)> = own
@@ -170,51 +186,82 @@ fn costs(own: &Small, all: &[Small]) -> Vec<f32> {
             (&all[i], turn, o.translation - turn * c.translation)
         })
         .collect();
-    let mut costs = vec![MOST_DIFFERENCE; w * h * PLANES];
-    for (pixel, costs) in costs.chunks_exact_mut(PLANES).enumerate() {
+    let inverses: [f32; PLANES] = std::array::from_fn(|plane| own.inverse(plane as f64) as f32);
+    let mut found = vec![[0.0; PLANES]; others.len()];
+    let mut costs = vec![0.0; own.pixels.len() * PLANES];
+    for (pixel, costs) in costs.as_chunks_mut::<PLANES>().0.iter_mut().enumerate() {
         let sight = DVec3::new(((pixel % w) as f64 + 0.5 - c.cx) / c.fx, ((pixel / w) as f64 + 0.5 - c.cy) / c.fy, 1.0);
-        let color = &own.image.rgb[3 * pixel..3 * pixel + 3];
-        for (plane, cost) in costs.iter_mut().enumerate() {
-            let inverse = own.inverse(plane as f64);
-            let mut found = [f32::INFINITY; NEIGHBOURS];
-            let mut count = 0;
-            for (o, turn, shift) in &others {
-                let p = *turn * sight + *shift * inverse;
-                if p.z <= 0.0 {
-                    continue;
-                }
-                let (u, v) = (o.camera.fx * p.x / p.z + o.camera.cx, o.camera.fy * p.y / p.z + o.camera.cy);
-                if let Some(seen) = sample(&o.image, u, v) {
-                    let difference = (0..3).map(|k| (seen[k] - color[k]).abs()).sum::<f32>() / 3.0;
-                    found[count] = difference.min(MOST_DIFFERENCE);
-                    count += 1;
-                }
-            }
-            if count > 0 {
-                found[..count].sort_by(f32::total_cmp);
-                let half = count.div_ceil(2);
-                *cost = found[..half].iter().sum::<f32>() / half as f32;
-            }
+        for (found, (o, turn, shift)) in found.iter_mut().zip(&others) {
+            differences(o, own.pixels[pixel], (*turn * sight).as_vec3(), shift.as_vec3(), &inverses, found);
         }
+        better_half(&mut found, costs);
     }
     costs
 }
 
-/// Bilinear colour; none outside.
-fn sample(image: &Image, u: f64, v: f64) -> Option<[f32; 3]> {
-    let (w, h) = (image.width as usize, image.height as usize);
-    let (x, y) = (u - 0.5, v - 0.5);
-    if !(x >= 0.0 && y >= 0.0 && x < (w - 1) as f64 && y < (h - 1) as f64) {
+/// Difference of a colour from what a neighbour shows at each plane, where its axes have the place `a + b / depth`; infinite where it
+/// does not see it.
+#[multiversion(targets("x86_64+avx2"))]
+fn differences(o: &Small, color: [f32; 4], a: Vec3, b: Vec3, inverses: &[f32; PLANES], out: &mut [f32; PLANES]) {
+    let [fx, fy, cx, cy] = [o.camera.fx, o.camera.fy, o.camera.cx - 0.5, o.camera.cy - 0.5].map(|v| v as f32);
+    let mut at = [[0.0f32; PLANES]; 2];
+    let [us, vs] = &mut at;
+    for (k, inverse) in inverses.iter().enumerate() {
+        let z = a.z + b.z * inverse;
+        // Behind the neighbour: outside of its picture.
+        let by = if z > 0.0 { 1.0 / z } else { f32::NAN };
+        us[k] = fx * (a.x + b.x * inverse) * by + cx;
+        vs[k] = fy * (a.y + b.y * inverse) * by + cy;
+    }
+    for (out, (u, v)) in out.iter_mut().zip(us.iter().zip(vs)) {
+        *out = sample(o, *u, *v).map_or(f32::INFINITY, |seen| {
+            let difference = (0..3).map(|k| (seen[k] - color[k]).abs()).sum::<f32>() / 3.0;
+            difference.min(MOST_DIFFERENCE)
+        });
+    }
+}
+
+/// Bilinear colour at a place in pixels, whose centres are whole numbers; none outside.
+#[inline(always)]
+fn sample(o: &Small, x: f32, y: f32) -> Option<[f32; 4]> {
+    let (w, h) = (o.image.width as usize, o.image.height as usize);
+    if !(x >= 0.0 && y >= 0.0 && x < (w - 1) as f32 && y < (h - 1) as f32) {
         return None;
     }
-    let (x0, y0) = (x as usize, y as usize);
-    let (a, b) = ((x - x0 as f64) as f32, (y - y0 as f64) as f32);
-    let at = 3 * (y0 * w + x0);
-    let (above, below) = (&image.rgb[at..at + 6], &image.rgb[at + 3 * w..at + 3 * w + 6]);
-    Some([0, 1, 2].map(|k| {
-        let (s, t) = (above[k] + a * (above[k + 3] - above[k]), below[k] + a * (below[k + 3] - below[k]));
-        s + b * (t - s)
+    let (x0, y0) = (x as u32, y as u32);
+    let (u, v) = (x - x0 as f32, y - y0 as f32);
+    let at = y0 as usize * w + x0 as usize;
+    let (above, below) = (&o.pixels[at..at + 2], &o.pixels[at + w..at + w + 2]);
+    Some(std::array::from_fn(|k| {
+        let (s, t) = (above[0][k] + u * (above[1][k] - above[0][k]), below[0][k] + u * (below[1][k] - below[0][k]));
+        s + v * (t - s)
     }))
+}
+
+/// Of each plane the mean of the smaller half of what was found; infinite ones do not count. Sorts what was found.
+#[multiversion(targets("x86_64+avx2"))]
+fn better_half(found: &mut [[f32; PLANES]], out: &mut [f32; PLANES]) {
+    for end in 1..found.len() {
+        for k in (0..end).rev() {
+            let [low, high] = &mut found[k..k + 2] else { unreachable!("two of them") };
+            for (a, b) in low.iter_mut().zip(high) {
+                (*a, *b) = if *b < *a { (*b, *a) } else { (*a, *b) };
+            }
+        }
+    }
+    let mut counts = [0.0f32; PLANES];
+    for of in found.iter() {
+        counts.iter_mut().zip(of).for_each(|(n, v)| *n += if *v < f32::INFINITY { 1.0 } else { 0.0 });
+    }
+    let mut sums = [0.0f32; PLANES];
+    for (k, of) in found.iter().enumerate() {
+        // One of one or two, two of three or four.
+        let taken = sums.iter_mut().zip(of).zip(&counts);
+        taken.for_each(|((sum, v), n)| *sum += if *n > 2.0 * k as f32 { *v } else { 0.0 });
+    }
+    for ((out, sum), n) in out.iter_mut().zip(sums).zip(counts) {
+        *out = if n > 0.0 { sum / (0.5 * n).ceil() } else { MOST_DIFFERENCE };
+    }
 }
 
 /// Sums of the least costs of all ways that lead to a pixel from eight sides, with what changes of the plane cost on the way.
@@ -224,30 +271,43 @@ fn smoothed(costs: &[f32], image: &Image) -> Vec<f32> {
     let mut along = vec![0.0f32; costs.len()];
     let difference =
         |a: usize, b: usize| (0..3).map(|k| (image.rgb[3 * a + k] - image.rgb[3 * b + k]).abs()).sum::<f32>() / 3.0;
+    let costs = costs.as_chunks::<PLANES>().0;
     for (dx, dy) in [(1i64, 0i64), (-1, 0), (0, 1), (0, -1), (1, 1), (-1, -1), (1, -1), (-1, 1)] {
+        let along = along.as_chunks_mut::<PLANES>().0;
         for step in 0..w * h {
             // From the side that the way comes from.
             let pixel = if dy > 0 || (dy == 0 && dx > 0) { step } else { w * h - 1 - step };
             let (x, y) = ((pixel % w) as i64 - dx, (pixel / w) as i64 - dy);
-            let here = pixel * PLANES..(pixel + 1) * PLANES;
             if x < 0 || y < 0 || x >= w as i64 || y >= h as i64 {
-                along[here.clone()].copy_from_slice(&costs[here]);
+                along[pixel] = costs[pixel];
                 continue;
             }
             let from = y as usize * w + x as usize;
-            let mut before = [0.0f32; PLANES + 2];
-            before[1..=PLANES].copy_from_slice(&along[from * PLANES..(from + 1) * PLANES]);
-            (before[0], before[PLANES + 1]) = (f32::INFINITY, f32::INFINITY);
-            let least = before[1..=PLANES].iter().copied().fold(f32::INFINITY, f32::min);
-            let jump = least + (JUMP / (1.0 + difference(pixel, from) / EDGE)).max(1.5 * STEP);
-            for (k, (to, cost)) in along[here.clone()].iter_mut().zip(&costs[here]).enumerate() {
-                let beside = before[k].min(before[k + 2]) + STEP;
-                *to = cost + before[k + 1].min(beside).min(jump) - least;
-            }
+            let jump = (JUMP / (1.0 + difference(pixel, from) / EDGE)).max(1.5 * STEP);
+            along[pixel] = onward(&along[from], &costs[pixel], jump);
         }
-        sums.iter_mut().zip(&along).for_each(|(s, a)| *s += a);
+        sums.iter_mut().zip(along.as_flattened()).for_each(|(s, a)| *s += a);
     }
     sums
+}
+
+/// The least costs of the ways to a pixel, from those to the one before, less the least of these.
+#[multiversion(targets("x86_64+avx2"))]
+fn onward(before: &[f32; PLANES], costs: &[f32; PLANES], jump: f32) -> [f32; PLANES] {
+    fn smaller(a: f32, b: f32) -> f32 {
+        if a < b { a } else { b }
+    }
+    let mut least = [f32::INFINITY; 8];
+    for part in before.as_chunks::<8>().0 {
+        least.iter_mut().zip(part).for_each(|(l, v)| *l = smaller(*l, *v));
+    }
+    let least = least.into_iter().fold(f32::INFINITY, smaller);
+    let mut padded = [f32::INFINITY; PLANES + 2];
+    padded[1..=PLANES].copy_from_slice(before);
+    std::array::from_fn(|k| {
+        let beside = smaller(padded[k], padded[k + 2]) + STEP;
+        costs[k] + smaller(smaller(padded[k + 1], beside), least + jump) - least
+    })
 }
 
 /// Places and colours of the pixels whose depths neighbours agree with.
@@ -343,15 +403,14 @@ mod tests {
         assert!(filled(&vec![[0.0; 2]; w * h], w).iter().all(|v| v[1] == 0.0));
     }
 
-    /// A textured wall four units away, seen by three cameras beside each other.
-    #[test]
-    fn a_wall_is_where_it_is() {
+    /// A textured wall four units away, seen by cameras beside each other.
+    fn wall(cameras: &[f64]) -> Vec<Small> {
         let camera = |x: f64| Camera::look_at(DVec3::new(x, 0.0, 0.0), DVec3::new(x, 0.0, 4.0), -DVec3::Y, 64, 48, 1.0);
         let texture = |x: f64, y: f64| {
             [0.0, 1.0, 2.0]
                 .map(|k| (0.5 + 0.25 * (3.0 * x + k).sin() + 0.25 * (4.0 * y - 1.7 * x * y + 2.0 * k).cos()) as f32)
         };
-        let cameras = [-0.4, 0.0, 0.4].map(camera);
+        let cameras: Vec<Camera> = cameras.iter().map(|&x| camera(x)).collect();
         let small = |i: usize| {
             let c = &cameras[i];
             let mut rgb = Vec::new();
@@ -362,13 +421,74 @@ mod tests {
                 rgb.extend(texture(p.x, p.y));
             }
             let image = Image { width: 64, height: 48, rgb, alpha: None };
-            Small { image, camera: c.clone(), range: [1.0 / 2.0, 1.0 / 9.0], neighbours: neighbours(&cameras, i, 4.0) }
+            let neighbours = neighbours(&cameras, i, 4.0);
+            Small { pixels: pixels(&image), image, camera: c.clone(), range: [1.0 / 2.0, 1.0 / 9.0], neighbours }
         };
-        let all: Vec<Small> = (0..3).map(small).collect();
+        (0..cameras.len()).map(small).collect()
+    }
+
+    #[test]
+    fn a_wall_is_where_it_is() {
+        let all = wall(&[-0.4, 0.0, 0.4]);
         let maps: Vec<Vec<f32>> = all.iter().map(|s| planes(s, &all)).collect();
         let points = agreed(1, &all, &maps);
         let off: Vec<f64> = points.iter().map(|(p, _)| (p.z - 4.0).abs()).collect();
         let near = off.iter().filter(|d| **d < 0.1).count();
         assert!(points.len() > 2000 && near * 20 > points.len() * 18, "{near} of {}", points.len());
+    }
+
+    /// [`costs`], plainly.
+    fn plain_costs(own: &Small, all: &[Small], pixel: usize, plane: usize) -> f32 {
+        let place = own.place(pixel, plane as f64);
+        let seen = |&i: &usize| {
+            let (o, (u, v, z)) = (&all[i], all[i].camera.project(place));
+            let (w, h) = (o.image.width as usize, o.image.height as usize);
+            let (x, y) = (u - 0.5, v - 0.5);
+            if !(z > 0.0 && x >= 0.0 && y >= 0.0 && x < (w - 1) as f64 && y < (h - 1) as f64) {
+                return None;
+            }
+            let color = |k: usize| {
+                let at = |dx: usize, dy: usize| {
+                    let weight = |d: usize, v: f64| if d == 0 { 1.0 - v.fract() } else { v.fract() };
+                    let pixel = (y as usize + dy) * w + x as usize + dx;
+                    weight(dx, x) * weight(dy, y) * f64::from(o.image.rgb[3 * pixel + k])
+                };
+                at(0, 0) + at(1, 0) + at(0, 1) + at(1, 1)
+            };
+            let off = (0..3).map(|k| (color(k) - f64::from(own.image.rgb[3 * pixel + k])).abs()).sum::<f64>() / 3.0;
+            Some(off.min(f64::from(MOST_DIFFERENCE)))
+        };
+        let mut found: Vec<f64> = own.neighbours.iter().filter_map(seen).collect();
+        found.sort_by(f64::total_cmp);
+        let half = found.len().div_ceil(2);
+        if half == 0 { MOST_DIFFERENCE } else { (found[..half].iter().sum::<f64>() / half as f64) as f32 }
+    }
+
+    #[test]
+    fn costs_are_those_of_the_plain_version() {
+        let all = wall(&[-0.9, -0.4, 0.0, 0.3, 0.8, 1.3]);
+        let own = &all[1];
+        assert_eq!(own.neighbours.len(), 5);
+        let costs = costs(own, &all);
+        // All cameras are level: a neighbour sees the first and the last row on its border, or just not.
+        let inner = 64 * PLANES..47 * 64 * PLANES;
+        let off = |i: usize| (costs[i] - plain_costs(own, &all, i / PLANES, i % PLANES)).abs();
+        assert!(inner.clone().filter(|&i| off(i) > 1e-4).count() < inner.len() / 1000);
+        assert!(costs.contains(&MOST_DIFFERENCE) && costs.iter().any(|&c| c < 0.01));
+    }
+
+    #[test]
+    fn the_way_onward_is_that_of_the_plain_version() {
+        let number = |k: usize| ((k * 2_654_435_761) % 1000) as f32 / 1000.0;
+        let (before, costs): ([f32; PLANES], [f32; PLANES]) =
+            (std::array::from_fn(|k| 0.1 * number(k)), std::array::from_fn(|k| number(k + 500)));
+        let jump = 0.03;
+        let least = before.iter().copied().fold(f32::INFINITY, f32::min);
+        for (k, next) in onward(&before, &costs, jump).into_iter().enumerate() {
+            let ways = (0..PLANES).map(|from| before[from] + [0.0, STEP, jump][k.abs_diff(from).min(2)]);
+            // A jump may lead to any plane.
+            let best = ways.fold(least + jump, f32::min);
+            assert!((next - (costs[k] + best - least)).abs() < 1e-6, "{k}");
+        }
     }
 }
