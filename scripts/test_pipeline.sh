@@ -427,4 +427,34 @@ for instances in "$base/instances.safetensors" "$work/ceilings.large.safetensors
 done
 pass "no instances are better than the ceilings of bench"
 
+say "== handheld captures"
+hand=$work/hand
+for poses in exact noisy; do
+  target/release/synth-scene --out "$hand/$poses" --family kitchen --seed 33 --views 24 --width 320 --height 240 --quiet \
+    --pose-noise "$([ $poses = exact ] && echo 0 || echo 1)" > /dev/null
+done
+cp -r "$hand/exact" "$hand/bare" && rm "$hand/bare/sparse/0/points3D.bin"
+quality() { # held-out PSNR of scene $1, with further options
+  local scene=$hand/$1
+  shift
+  target/release/gs-geom train --scene "$scene" --out "$scene.ply" --iterations 500 --quiet "$@" > "$work/hand.log" 2>&1 \
+    || { cat "$work/hand.log"; fail "geometry of $scene"; }
+  grep -oE '"psnr_heldout": *[0-9.]+' "$scene.ply.run.json" | grep -oE '[0-9.]+$'
+}
+parted() { # instance mIoU of dataset $2 on the geometry of scene $1
+  local own=$hand/$1 masks=$hand/$1/language_features
+  target/release/graph-precompute --scene "$2" --geometry "$own.ply" --masks "$masks" --graph "$own.graph" --footprints "$own.prints" --quiet
+  local inputs=(--geometry "$own.ply" --graph "$own.graph" --footprints "$own.prints" --quiet)
+  target/release/feat-train "${inputs[@]}" --out "$own.features"
+  target/release/cluster-match --scene "$2" "${inputs[@]}" --masks "$masks" --features "$own.features" --out "$own.instances.safetensors"
+  target/release/eval score --scene "$2" --geometry "$own.ply" --instances "$own.instances.safetensors" --out "$own.score" 2>&1 \
+    | awk '$1 == "instance_miou" { print $2 }'
+}
+exact=$(quality exact) bare=$(quality bare) noisy=$(quality noisy --refine-poses)
+awk "BEGIN { exit !($bare > $exact - 1) }" || fail "without points $bare dB, with them $exact"
+awk "BEGIN { exit !($noisy > $exact - 1) }" || fail "refined poses $noisy dB, exact ones $exact"
+whole=$(parted exact "$hand/exact") refined=$(parted noisy "$hand/noisy.ply.cameras.json")
+awk "BEGIN { exit !($refined > $whole - 0.05) }" || fail "instances with refined poses $refined, with exact ones $whole"
+pass "without points ($bare dB) or exact poses ($noisy dB, instances $refined) a scene is as good as with them ($exact dB, $whole)"
+
 say "$passed passed, 0 failed"

@@ -1,6 +1,6 @@
 //! Points from photographs with known poses alone: a depth for each pixel of small pictures by plane sweep (Collins 1996), smoothed
-//! along lines (semi-global matching, Hirschmueller 2008), kept where the depths of neighbouring views agree. Between these a view's
-//! other pixels get what is interpolated: plain walls and floors have no depth of their own, and where nothing starts, nothing grows.
+//! along lines (semi-global matching, Hirschmueller 2008), kept where a neighbouring view has nearly the same. A little wrong is better
+//! than nothing: where nothing starts, nothing grows. What no view agrees with is worse than nothing, and so is what lies between.
 
 use super::depths::Voxels;
 use glam::{DMat3, DVec3, Vec3};
@@ -26,11 +26,7 @@ const STEP: f32 = 0.004;
 const JUMP: f32 = 0.05;
 const EDGE: f32 = 0.04;
 /// Planes that the depths of two views may differ by.
-const AGREE: f64 = 1.5;
-/// Views that must agree with a depth.
-const LEAST_AGREEING: usize = 2;
-/// Every how many pixels a filled depth is a point.
-const FILL: usize = 2;
+const AGREE: f64 = 4.0;
 /// The shares of the known points between which the depths of a view lie, and how much nearer and farther others may be.
 const RANGE: [f64; 2] = [0.02, 0.98];
 const BEYOND: [f64; 2] = [0.6, 2.0];
@@ -55,6 +51,18 @@ impl Small {
     /// 1 / depth of a plane, also between two.
     fn inverse(&self, plane: f64) -> f64 {
         self.range[0] + (self.range[1] - self.range[0]) * plane / (PLANES - 1) as f64
+    }
+
+    /// Whether its map of planes has nearly this place.
+    fn agrees(&self, place: DVec3, map: &[f32]) -> bool {
+        let (u, v, z) = self.camera.project(place);
+        let (w, h) = (self.camera.width as usize, self.camera.height as usize);
+        if !(z > 0.0 && u >= 0.0 && v >= 0.0 && u < w as f64 && v < h as f64) {
+            return false;
+        }
+        let there = f64::from(map[v as usize * w + u as usize]);
+        let step = (self.range[0] - self.range[1]) / (PLANES - 1) as f64;
+        (1.0 / z - self.inverse(there)).abs() < AGREE * step
     }
 
     fn place(&self, pixel: usize, plane: f64) -> DVec3 {
@@ -310,98 +318,26 @@ fn onward(before: &[f32; PLANES], costs: &[f32; PLANES], jump: f32) -> [f32; PLA
     })
 }
 
-/// Places and colours of the pixels whose depths neighbours agree with.
+/// Places and colours of the pixels whose depths a neighbour agrees with.
 fn agreed(own: usize, all: &[Small], maps: &[Vec<f32>]) -> Vec<(DVec3, [u8; 3])> {
     let small = &all[own];
-    let needed = LEAST_AGREEING.min(small.neighbours.len());
-    let w = small.camera.width as usize;
-    let agrees = |(pixel, &plane): (usize, &f32)| {
-        if plane.is_nan() || needed == 0 {
-            return false;
-        }
-        let place = small.place(pixel, f64::from(plane));
-        let agrees = |&&i: &&usize| {
-            let (o, (u, v, z)) = (&all[i], all[i].camera.project(place));
-            if !(z > 0.0 && u >= 0.0 && v >= 0.0 && u < f64::from(o.camera.width) && v < f64::from(o.camera.height)) {
-                return false;
-            }
-            let there = maps[i][v as usize * o.camera.width as usize + u as usize];
-            let step = (o.range[0] - o.range[1]) / (PLANES - 1) as f64;
-            (1.0 / z - o.inverse(f64::from(there))).abs() < AGREE * step
-        };
-        small.neighbours.iter().filter(agrees).count() >= needed
-    };
-    let sure: Vec<bool> = maps[own].iter().enumerate().map(agrees).collect();
-    let known: Vec<[f32; 2]> =
-        maps[own].iter().zip(&sure).map(|(p, s)| if *s { [*p, 1.0] } else { [0.0; 2] }).collect();
-    let filled = filled(&known, w);
     // What is transparent is no thing.
     let is_there = |pixel: usize| small.image.alpha.as_ref().is_none_or(|a| a[pixel] >= 0.5);
-    let on_grid = |pixel: usize| (pixel % w).is_multiple_of(FILL) && (pixel / w).is_multiple_of(FILL);
-    let is_used = |&pixel: &usize| is_there(pixel) && (sure[pixel] || (on_grid(pixel) && filled[pixel][1] > 0.0));
-    let point = |pixel: usize| {
-        let color = [0, 1, 2].map(|k| (small.image.rgb[3 * pixel + k].clamp(0.0, 1.0) * 255.0).round() as u8);
-        (small.place(pixel, f64::from(filled[pixel][0])), color)
-    };
-    (0..sure.len()).filter(is_used).map(point).collect()
-}
-
-/// Fills what is not known of `[height][width]` values and weights from means over larger and larger squares, interpolated; what is
-/// known stays.
-fn filled(known: &[[f32; 2]], w: usize) -> Vec<[f32; 2]> {
-    let h = known.len() / w.max(1);
-    if known.iter().all(|k| k[1] > 0.0) || w.max(h) < 2 {
-        return known.to_vec();
-    }
-    let (half_w, half_h) = (w.div_ceil(2), h.div_ceil(2));
-    let mut coarse = vec![[0.0f32; 2]; half_w * half_h];
-    for (i, [value, weight]) in known.iter().enumerate() {
-        let to = &mut coarse[i / w / 2 * half_w + i % w / 2];
-        *to = [to[0] + weight * value, to[1] + weight];
-    }
-    coarse.iter_mut().filter(|c| c[1] > 0.0).for_each(|c| *c = [c[0] / c[1], 1.0]);
-    let coarse = filled(&coarse, half_w);
-    let from_coarse = |i: usize| {
-        // Places of the four squares around the pixel's middle.
-        let place = |v: usize, most: usize| {
-            let p = (v as f32 + 0.5) / 2.0 - 0.5;
-            let low = p.floor().max(0.0) as usize;
-            (low.min(most - 1), (low + 1).min(most - 1), (p - low as f32).clamp(0.0, 1.0))
-        };
-        let ((x0, x1, a), (y0, y1, b)) = (place(i % w, half_w), place(i / w, half_h));
-        let mut sum = [0.0f32; 2];
-        for (x, y, by) in
-            [(x0, y0, (1.0 - a) * (1.0 - b)), (x1, y0, a * (1.0 - b)), (x0, y1, (1.0 - a) * b), (x1, y1, a * b)]
-        {
-            let [value, weight] = coarse[y * half_w + x];
-            sum = [sum[0] + by * weight * value, sum[1] + by * weight];
+    let point = |(pixel, &plane): (usize, &f32)| {
+        if plane.is_nan() || !is_there(pixel) {
+            return None;
         }
-        if sum[1] > 0.0 { [sum[0] / sum[1], 1.0] } else { [0.0; 2] }
+        let place = small.place(pixel, f64::from(plane));
+        let agrees = |&i: &usize| all[i].agrees(place, &maps[i]);
+        let color = [0, 1, 2].map(|k| (small.image.rgb[3 * pixel + k].clamp(0.0, 1.0) * 255.0).round() as u8);
+        small.neighbours.iter().any(agrees).then_some((place, color))
     };
-    known.iter().enumerate().map(|(i, k)| if k[1] > 0.0 { *k } else { from_coarse(i) }).collect()
+    maps[own].iter().enumerate().filter_map(point).collect()
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
-
-    #[test]
-    fn holes_are_filled_from_around_and_known_values_stay() {
-        let (w, h) = (21, 13);
-        let plane = |i: usize| (i % w) as f32 + 2.0 * (i / w) as f32;
-        let known: Vec<[f32; 2]> =
-            (0..w * h).map(|i| if (6..15).contains(&(i % w)) { [0.0; 2] } else { [plane(i), 1.0] }).collect();
-        let all = filled(&known, w);
-        // Means of what is known lie within it.
-        let most = plane(w * h - 1) + 1e-3;
-        for (i, v) in all.iter().enumerate() {
-            assert!(v[1] > 0.0 && (-1e-3..most).contains(&v[0]), "{i}: {v:?}");
-            assert!(known[i][1] == 0.0 || v[0] == plane(i), "{i}: {v:?}");
-        }
-        let (left, right) = (all[6 * w + 6][0], all[6 * w + 14][0]);
-        assert!(left < right, "{left} {right}");
-        assert!(filled(&vec![[0.0; 2]; w * h], w).iter().all(|v| v[1] == 0.0));
-    }
 
     /// A textured wall four units away, seen by cameras beside each other.
     fn wall(cameras: &[f64]) -> Vec<Small> {
