@@ -1,7 +1,7 @@
 //! `cags`: all programs of the pipeline as one, and the pipeline itself.
 //!
 //! `cags gs-geom train ...` is the program `gs-geom`; `cags train ...` is short for it. Under the name of a program, as a link to
-//! it, it is that program: so [`pipeline`] runs the rules of make with nothing else installed.
+//! it, it is that program: so `pipeline` runs the rules of make with nothing else installed.
 
 mod pipeline;
 

@@ -1,6 +1,6 @@
 //! Stage 3: 3D instances, the masks they were seen as, and a language descriptor for each.
 //!
-//! [`options`] is the command line, `run` the story, `inputs` and `outputs` its ends. `linkage` clusters Gaussians by how far
+//! `options` is the command line, `run` the story, `inputs` and `outputs` its ends. `linkage` clusters Gaussians by how far
 //! their masks agree (`profile` says how far, `plane` tells floors and walls), `group` by their features;
 //! `assignment` keeps who belongs to which instance, and gives noise and unseen Gaussians to their neighbours; where features
 //! were clustered, `vote` corrects rims. `associate` matches instances with the

@@ -4,7 +4,7 @@
 //! centroids of masks, which are a sparse matrix times the features once geometry is frozen. `spectral` is a closed form:
 //! the leading singular vectors of the matrix of Gaussians and masks. `docs/method.md` has the equations.
 //!
-//! * [`options`] and `run`: the command line, and the stage from inputs to features.
+//! * `options` and `run`: the command line, and the stage from inputs to features.
 //! * `inputs`, `outputs`, `memory`, `random`: what both methods share.
 
 mod contrastive;
