@@ -71,8 +71,7 @@ pub fn write(plan: &Plan, table: &TablePlan, work: &Path, to: &Path) -> Result<(
 fn things_in(camera: &Camera, g: &Gaussians, truth: &[i32]) -> usize {
     let mut of: BTreeMap<i32, (usize, usize)> = BTreeMap::new();
     for (mean, &thing) in g.means.iter().zip(truth).filter(|(_, t)| **t >= 0) {
-        let (u, v, z) = camera.project(mean.map(f64::from).into());
-        let inside = z > 0.0 && u >= 0.0 && v >= 0.0 && u < f64::from(camera.width) && v < f64::from(camera.height);
+        let inside = camera.sees(mean.map(f64::from).into()).is_some();
         let (all, within) = of.entry(thing).or_default();
         (*all, *within) = (*all + 1, *within + usize::from(inside));
     }

@@ -40,6 +40,13 @@ impl Camera {
         (self.fx * p.x / p.z + self.cx, self.fy * p.y / p.z + self.cy, p.z)
     }
 
+    /// Pixel coordinates and depth of a point of the world; none where it is behind the camera or outside of its image.
+    pub fn sees(&self, world: DVec3) -> Option<(f64, f64, f64)> {
+        let (u, v, z) = self.project(world);
+        let inside = (0.0..f64::from(self.width)).contains(&u) && (0.0..f64::from(self.height)).contains(&v);
+        (z > 0.0 && inside).then_some((u, v, z))
+    }
+
     /// The same camera with an image of `width` x `height` pixels: focal lengths and principal point scale with each
     /// axis.
     #[must_use]

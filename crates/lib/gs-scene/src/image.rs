@@ -58,6 +58,13 @@ pub fn has_alpha(path: impl AsRef<Path>) -> Result<bool> {
     Ok(image::ImageDecoder::color_type(&decoder).has_alpha())
 }
 
+/// Width and height of a picture of this size, shrunk to a longer side of so many pixels where it is larger.
+pub fn size_within((width, height): (u32, u32), longest: u32) -> (u32, u32) {
+    let by = (f64::from(longest) / f64::from(width.max(height))).min(1.0);
+    let [width, height] = [width, height].map(|v| ((f64::from(v) * by).round() as u32).max(1));
+    (width, height)
+}
+
 fn unreadable(path: &Path, e: &dyn std::fmt::Display) -> Error {
     Error::new(format!("not a readable picture: {e}"))
         .file(path)

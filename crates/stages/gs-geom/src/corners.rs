@@ -40,6 +40,7 @@ const FEWEST_SEEN: usize = 12;
 type Shrink = fn(&Image, &Camera) -> Image;
 
 /// What the photographs tell.
+#[derive(Default)]
 pub(crate) struct Found {
     /// Of all views.
     pub cameras: Vec<Camera>,
@@ -53,7 +54,6 @@ pub(crate) struct Found {
 struct Sights<'a> {
     views: &'a [&'a View],
     corners: Vec<Corners>,
-    pictures: Vec<Image>,
     tracks: Vec<Vec<Sighting>>,
 }
 
@@ -62,8 +62,7 @@ struct Sights<'a> {
 /// asks for small pictures, too.
 pub(crate) fn find(views: &[&View], refine: bool, small: Option<Shrink>, stage: &Stage) -> Result<Found> {
     let given: Vec<Camera> = views.iter().map(|v| v.camera.clone()).collect();
-    let mut sights = Sights::of(views, &given, refine, small, stage)?;
-    let pictures = std::mem::take(&mut sights.pictures);
+    let (sights, pictures) = Sights::of(views, &given, refine, small, stage)?;
     let learns: Vec<bool> = views.iter().map(|v| v.split == Split::Train).collect();
     let mut cameras = given.clone();
     let (before, spread) = sights.placed(&cameras, &learns, SLACKEST);
@@ -143,8 +142,14 @@ pub(crate) fn lenses(cameras: &[Camera]) -> Vec<usize> {
 }
 
 impl<'a> Sights<'a> {
-    /// Held-out views are looked at only where their poses are to be found.
-    fn of(views: &'a [&'a View], cameras: &[Camera], all: bool, small: Option<Shrink>, stage: &Stage) -> Result<Self> {
+    /// And the small pictures that were asked for. Held-out views are looked at only where their poses are to be found.
+    fn of(
+        views: &'a [&'a View],
+        cameras: &[Camera],
+        all: bool,
+        small: Option<Shrink>,
+        stage: &Stage,
+    ) -> Result<(Self, Vec<Image>)> {
         let up = cameras.iter().map(|c| c.rotation.transpose() * -DVec3::Y).sum::<DVec3>();
         let mut progress = stage.progress("photograph", views.len() as u64);
         let (mut corners, mut pictures) = (Vec::new(), Vec::new());
@@ -190,7 +195,7 @@ impl<'a> Sights<'a> {
             found.iter().filter(|(_, m)| !m.is_empty()).count(),
             pairs.len()
         ));
-        Ok(Self { views, tracks: join(&counts, &found), corners, pictures })
+        Ok((Self { views, tracks: join(&counts, &found), corners }, pictures))
     }
 
     fn at(&self, s: Sighting) -> DVec2 {

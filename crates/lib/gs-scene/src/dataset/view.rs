@@ -3,7 +3,7 @@
 use super::depth::{Depth, DepthMap};
 use super::{RawView, Resolution, Split};
 use crate::lens::Lens;
-use crate::{Camera, Image};
+use crate::{Camera, Image, size_within};
 use gs_io::{Error, Result};
 use multiversion::multiversion;
 use rayon::prelude::*;
@@ -63,9 +63,7 @@ impl View {
 
     /// As [`Self::load_image`], at the photograph's own size, or with a longer side of so many pixels where it is larger.
     pub fn load_image_within(&self, longest: u32) -> Result<Image> {
-        let (w, h) = self.lens.size;
-        let by = (f64::from(longest) / f64::from(w.max(h))).min(1.0);
-        let [w, h] = [w, h].map(|v| ((f64::from(v) * by).round() as u32).max(1));
+        let (w, h) = size_within(self.lens.size, longest);
         self.load(&self.image_path, w, h)
     }
 
@@ -93,7 +91,7 @@ impl View {
         let photo = Image::read(path)?;
         self.lens.expect_size((photo.width, photo.height), path)?;
         let flat = if self.lens.distortion.is_none() { photo } else { self.undistort(&photo) };
-        Ok(if (width, height) == (flat.width, flat.height) { flat } else { flat.resize_area(width, height) })
+        Ok(flat.resize_area(width, height))
     }
 
     /// Whether the lens bends straight lines: what was made from the photograph as it lies on disk has them bent, too.

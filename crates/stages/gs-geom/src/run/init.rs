@@ -48,22 +48,22 @@ pub(crate) fn start(
     let given: Vec<Camera> = views.iter().map(|v| v.camera.clone()).collect();
     let bare = is_bare(options, dataset) && options.densify != Strategy::Fixed;
     let deep = has_depths(options, dataset);
-    let mut found = Found { cameras: given.clone(), points: PointCloud::default(), pictures: Vec::new() };
+    let mut found = Found { cameras: given.clone(), ..Found::default() };
     let sweeps = bare && !deep;
     if options.refine_poses || sweeps {
         found = corners::find(&views, options.refine_poses, sweeps.then_some(start::sweep::small), stage)?;
     }
     let refined = options.refine_poses.then(|| Poses::new(&found.cameras, &given, &corners::lenses(&given)));
-    let learnt = &views.iter().copied().zip(&found.cameras).collect::<Vec<_>>()[..cameras.len()];
+    let learnt = &found.cameras[..cameras.len()];
     let mut points = found.points;
     let corners = points.len();
     let from = if deep {
-        points = start::depths::points(learnt, options.init_points, stage)?;
-        let images = learnt.iter().filter(|(v, _)| v.depth_path().is_some()).count();
+        let views: Vec<_> = views.into_iter().zip(learnt).collect();
+        points = start::depths::points(&views, options.init_points, stage)?;
+        let images = views.iter().filter(|(v, _)| v.depth_path().is_some()).count();
         format!("{} of {images} depth images", points.len())
-    } else if bare && corners >= corners::FEWEST_POINTS {
-        let own = &found.cameras[..cameras.len()];
-        let swept = start::sweep::points(found.pictures, own, &points, options.init_points, stage)?;
+    } else if sweeps && corners >= corners::FEWEST_POINTS {
+        let swept = start::sweep::points(found.pictures, learnt, &points, options.init_points, stage)?;
         points.positions.extend(&swept.positions);
         points.colors.extend(&swept.colors);
         format!("{corners} of corners and {} of depths by plane sweep", swept.len())

@@ -5,7 +5,7 @@
 use super::depths::Voxels;
 use glam::{DMat3, DVec3, Vec3};
 use gs_io::Result;
-use gs_scene::{Camera, Image, PointCloud};
+use gs_scene::{Camera, Image, PointCloud, size_within};
 use multiversion::multiversion;
 use rayon::prelude::*;
 use stage::Stage;
@@ -33,8 +33,7 @@ const BEYOND: [f64; 2] = [0.6, 2.0];
 
 /// A small picture with what is tried on it.
 struct Small {
-    image: Image,
-    /// Its colours ([`pixels`]).
+    /// Red, green, blue, opacity: four numbers are read at once.
     pixels: Vec<[f32; 4]>,
     camera: Camera,
     /// 1 / depth of the nearest and the farthest plane.
@@ -42,9 +41,10 @@ struct Small {
     neighbours: Vec<usize>,
 }
 
-/// The colours of a picture, each with a zero: four numbers are read at once.
+/// The colours and opacities of a picture.
 fn pixels(image: &Image) -> Vec<[f32; 4]> {
-    image.rgb.as_chunks().0.iter().map(|&[r, g, b]| [r, g, b, 0.0]).collect()
+    let opacity = |i: usize| image.alpha.as_ref().map_or(1.0, |a| a[i]);
+    image.rgb.as_chunks().0.iter().enumerate().map(|(i, &[r, g, b])| [r, g, b, opacity(i)]).collect()
 }
 
 impl Small {
@@ -55,12 +55,8 @@ impl Small {
 
     /// Whether its map of planes has nearly this place.
     fn agrees(&self, place: DVec3, map: &[f32]) -> bool {
-        let (u, v, z) = self.camera.project(place);
-        let (w, h) = (self.camera.width as usize, self.camera.height as usize);
-        if !(z > 0.0 && u >= 0.0 && v >= 0.0 && u < w as f64 && v < h as f64) {
-            return false;
-        }
-        let there = f64::from(map[v as usize * w + u as usize]);
+        let Some((u, v, z)) = self.camera.sees(place) else { return false };
+        let there = f64::from(map[v as usize * self.camera.width as usize + u as usize]);
         let step = (self.range[0] - self.range[1]) / (PLANES - 1) as f64;
         (1.0 / z - self.inverse(there)).abs() < AGREE * step
     }
@@ -76,8 +72,7 @@ impl Small {
 /// The small picture of a photograph. A little blurred, by an odd size between: what is sharp matches only at the right fraction of a
 /// pixel.
 pub(crate) fn small(photograph: &Image, camera: &Camera) -> Image {
-    let by = (f64::from(LONGEST) / f64::from(camera.width.max(camera.height))).min(1.0);
-    let [w, h] = [camera.width, camera.height].map(|v| ((f64::from(v) * by).round() as u32).max(1));
+    let (w, h) = size_within((camera.width, camera.height), LONGEST);
     photograph.resize_area(w + w / 2, h + h / 2).resize_area(w, h)
 }
 
@@ -97,13 +92,12 @@ pub(crate) fn points(
         .into_iter()
         .zip(&cameras)
         .enumerate()
-        .map(|(i, (image, camera))| {
+        .map(|(i, (picture, camera))| {
             let own = depths(camera, &known);
             let [near, far] = range(if own.len() < 20 { all.clone() } else { own });
             Small {
                 neighbours: neighbours(&cameras, i, 0.5 * (near + far)),
-                pixels: pixels(&image),
-                image,
+                pixels: pixels(&picture),
                 camera: camera.clone(),
                 range: [1.0 / near, 1.0 / far],
             }
@@ -129,10 +123,7 @@ pub(crate) fn points(
 
 /// Depths of the points that a camera sees.
 fn depths(c: &Camera, points: &[DVec3]) -> Vec<f64> {
-    let inside = |&(u, v, z): &(f64, f64, f64)| {
-        z > 0.0 && (0.0..f64::from(c.width)).contains(&u) && (0.0..f64::from(c.height)).contains(&v)
-    };
-    points.iter().map(|p| c.project(*p)).filter(inside).map(|p| p.2).collect()
+    points.iter().filter_map(|p| c.sees(*p)).map(|p| p.2).collect()
 }
 
 fn range(mut depths: Vec<f64>) -> [f64; 2] {
@@ -150,9 +141,7 @@ fn neighbours(cameras: &[Camera], own: usize, depth: f64) -> Vec<usize> {
     let mut all: Vec<(f64, usize)> = Vec::new();
     for (i, o) in cameras.iter().enumerate() {
         let angle = (c.position() - target).angle_between(o.position() - target).to_degrees();
-        let (u, v, z) = o.project(target);
-        let sees = z > 0.0 && (0.0..f64::from(o.width)).contains(&u) && (0.0..f64::from(o.height)).contains(&v);
-        if i != own && sees && angle >= LEAST_ANGLE {
+        if i != own && o.sees(target).is_some() && angle >= LEAST_ANGLE {
             all.push(((angle / ANGLE).ln().abs(), i));
         }
     }
@@ -163,10 +152,9 @@ fn neighbours(cameras: &[Camera], own: usize, depth: f64) -> Vec<usize> {
 
 /// The best plane of each pixel, between two where the costs say so; NaN where no neighbour sees it.
 fn planes(own: &Small, all: &[Small]) -> Vec<f32> {
-    let (w, h) = (own.image.width as usize, own.image.height as usize);
     let costs = costs(own, all);
-    let smooth = smoothed(&costs, &own.image);
-    (0..w * h)
+    let smooth = smoothed(&costs, own);
+    (0..own.pixels.len())
         .map(|pixel| {
             let of = &smooth[pixel * PLANES..(pixel + 1) * PLANES];
             let best = (0..PLANES).min_by(|&a, &b| of[a].total_cmp(&of[b])).unwrap_or(0);
@@ -182,8 +170,8 @@ fn planes(own: &Small, all: &[Small]) -> Vec<f32> {
 
 /// Difference of the colours of each pixel at each plane from those of the better half of the neighbours that see it.
 fn costs(own: &Small, all: &[Small]) -> Vec<f32> {
-    let w = own.image.width as usize;
     let c = &own.camera;
+    let w = c.width as usize;
     // The sight of a pixel in a neighbour's axes: a z + b, with z the depth.
     let others: Vec<(&Small, DMat3, DVec3)> = own
         .neighbours
@@ -222,17 +210,20 @@ fn differences(o: &Small, color: [f32; 4], a: Vec3, b: Vec3, inverses: &[f32; PL
         vs[k] = fy * (a.y + b.y * inverse) * by + cy;
     }
     for (out, (u, v)) in out.iter_mut().zip(us.iter().zip(vs)) {
-        *out = sample(o, *u, *v).map_or(f32::INFINITY, |seen| {
-            let difference = (0..3).map(|k| (seen[k] - color[k]).abs()).sum::<f32>() / 3.0;
-            difference.min(MOST_DIFFERENCE)
-        });
+        *out = sample(o, *u, *v).map_or(f32::INFINITY, |seen| difference(seen, color).min(MOST_DIFFERENCE));
     }
+}
+
+/// The mean difference of two colours' channels.
+#[inline(always)]
+fn difference(a: [f32; 4], b: [f32; 4]) -> f32 {
+    (0..3).map(|k| (a[k] - b[k]).abs()).sum::<f32>() / 3.0
 }
 
 /// Bilinear colour at a place in pixels, whose centres are whole numbers; none outside.
 #[inline(always)]
 fn sample(o: &Small, x: f32, y: f32) -> Option<[f32; 4]> {
-    let (w, h) = (o.image.width as usize, o.image.height as usize);
+    let (w, h) = (o.camera.width as usize, o.camera.height as usize);
     if !(x >= 0.0 && y >= 0.0 && x < (w - 1) as f32 && y < (h - 1) as f32) {
         return None;
     }
@@ -273,12 +264,11 @@ fn better_half(found: &mut [[f32; PLANES]], out: &mut [f32; PLANES]) {
 }
 
 /// Sums of the least costs of all ways that lead to a pixel from eight sides, with what changes of the plane cost on the way.
-fn smoothed(costs: &[f32], image: &Image) -> Vec<f32> {
-    let (w, h) = (image.width as usize, image.height as usize);
+fn smoothed(costs: &[f32], own: &Small) -> Vec<f32> {
+    let (w, h) = (own.camera.width as usize, own.camera.height as usize);
     let mut sums = vec![0.0f32; costs.len()];
     let mut along = vec![0.0f32; costs.len()];
-    let difference =
-        |a: usize, b: usize| (0..3).map(|k| (image.rgb[3 * a + k] - image.rgb[3 * b + k]).abs()).sum::<f32>() / 3.0;
+    let difference = |a: usize, b: usize| difference(own.pixels[a], own.pixels[b]);
     let costs = costs.as_chunks::<PLANES>().0;
     for (dx, dy) in [(1i64, 0i64), (-1, 0), (0, 1), (0, -1), (1, 1), (-1, -1), (1, -1), (-1, 1)] {
         let along = along.as_chunks_mut::<PLANES>().0;
@@ -321,15 +311,15 @@ fn onward(before: &[f32; PLANES], costs: &[f32; PLANES], jump: f32) -> [f32; PLA
 /// Places and colours of the pixels whose depths a neighbour agrees with.
 fn agreed(own: usize, all: &[Small], maps: &[Vec<f32>]) -> Vec<(DVec3, [u8; 3])> {
     let small = &all[own];
-    // What is transparent is no thing.
-    let is_there = |pixel: usize| small.image.alpha.as_ref().is_none_or(|a| a[pixel] >= 0.5);
     let point = |(pixel, &plane): (usize, &f32)| {
-        if plane.is_nan() || !is_there(pixel) {
+        let [color @ .., opacity] = small.pixels[pixel];
+        // What is transparent is no thing.
+        if plane.is_nan() || opacity < 0.5 {
             return None;
         }
         let place = small.place(pixel, f64::from(plane));
         let agrees = |&i: &usize| all[i].agrees(place, &maps[i]);
-        let color = [0, 1, 2].map(|k| (small.image.rgb[3 * pixel + k].clamp(0.0, 1.0) * 255.0).round() as u8);
+        let color = color.map(|v| (v.clamp(0.0, 1.0) * 255.0).round() as u8);
         small.neighbours.iter().any(agrees).then_some((place, color))
     };
     maps[own].iter().enumerate().filter_map(point).collect()
@@ -358,7 +348,7 @@ mod tests {
             }
             let image = Image { width: 64, height: 48, rgb, alpha: None };
             let neighbours = neighbours(&cameras, i, 4.0);
-            Small { pixels: pixels(&image), image, camera: c.clone(), range: [1.0 / 2.0, 1.0 / 9.0], neighbours }
+            Small { pixels: pixels(&image), camera: c.clone(), range: [1.0 / 2.0, 1.0 / 9.0], neighbours }
         };
         (0..cameras.len()).map(small).collect()
     }
@@ -378,7 +368,7 @@ mod tests {
         let place = own.place(pixel, plane as f64);
         let seen = |&i: &usize| {
             let (o, (u, v, z)) = (&all[i], all[i].camera.project(place));
-            let (w, h) = (o.image.width as usize, o.image.height as usize);
+            let (w, h) = (o.camera.width as usize, o.camera.height as usize);
             let (x, y) = (u - 0.5, v - 0.5);
             if !(z > 0.0 && x >= 0.0 && y >= 0.0 && x < (w - 1) as f64 && y < (h - 1) as f64) {
                 return None;
@@ -387,11 +377,11 @@ mod tests {
                 let at = |dx: usize, dy: usize| {
                     let weight = |d: usize, v: f64| if d == 0 { 1.0 - v.fract() } else { v.fract() };
                     let pixel = (y as usize + dy) * w + x as usize + dx;
-                    weight(dx, x) * weight(dy, y) * f64::from(o.image.rgb[3 * pixel + k])
+                    weight(dx, x) * weight(dy, y) * f64::from(o.pixels[pixel][k])
                 };
                 at(0, 0) + at(1, 0) + at(0, 1) + at(1, 1)
             };
-            let off = (0..3).map(|k| (color(k) - f64::from(own.image.rgb[3 * pixel + k])).abs()).sum::<f64>() / 3.0;
+            let off = (0..3).map(|k| (color(k) - f64::from(own.pixels[pixel][k])).abs()).sum::<f64>() / 3.0;
             Some(off.min(f64::from(MOST_DIFFERENCE)))
         };
         let mut found: Vec<f64> = own.neighbours.iter().filter_map(seen).collect();
