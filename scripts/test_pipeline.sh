@@ -450,6 +450,11 @@ parted() { # instance mIoU of dataset $2 on the geometry of scene $1
   target/release/eval score --scene "$2" --geometry "$own.ply" --instances "$own.instances.safetensors" --out "$own.score" 2>&1 \
     | awk '$1 == "instance_miou" { print $2 }'
 }
+# Plain walls behind a table are the hard case.
+target/release/synth-scene --out "$hand/table" --family table --seed 52 --views 24 --width 320 --height 240 --quiet > /dev/null
+cp -r "$hand/table" "$hand/table-bare" && rm "$hand/table-bare/sparse/0/points3D.bin"
+table=$(quality table) bare=$(quality table-bare)
+awk "BEGIN { exit !($bare > $table - 1) }" || fail "a table without points $bare dB, with them $table"
 exact=$(quality exact) bare=$(quality bare) noisy=$(quality noisy --refine-poses)
 awk "BEGIN { exit !($bare > $exact - 1) }" || fail "without points $bare dB, with them $exact"
 awk "BEGIN { exit !($noisy > $exact - 1) }" || fail "refined poses $noisy dB, exact ones $exact"

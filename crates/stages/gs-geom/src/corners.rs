@@ -26,8 +26,8 @@ use rayon::prelude::*;
 use stage::Stage;
 use tracks::{Point, Sighting, error, join, limit, place};
 
-/// Fewest points to start from: fewer tell less of a scene than random ones.
-pub(crate) const FEWEST_POINTS: usize = 100;
+/// Fewest points that tell whether the poses are good.
+const FEWEST_POINTS: usize = 100;
 /// Limits of a corner's error while poses are found, in [`EXACT`]s, and beyond which it counts less.
 const ROUNDS: [[f64; 2]; 4] = [[24.0, 4.0], [6.0, 2.0], [2.0, 1.0], [1.0, 0.5]];
 /// How far a corner may be off along given poses, in medians of all, and at most.

@@ -105,7 +105,8 @@ pub(crate) struct Train {
     /// common, else random ones), random points in front of the cameras, or a file of Gaussians (docs/splats.md) or a PLY of points
     #[arg(long, value_name = "points|random|FILE.ply", default_value = "points")]
     pub init: Init,
-    /// Number of random points to start from, and the most from depth images and from depths by plane sweep, 1 to 1e9
+    /// Number of random points to start from, and the most from depth images and from depths by plane sweep (of these not more than
+    /// half of --max-gaussians), 1 to 1e9
     #[arg(long, value_name = "COUNT", default_value_t = 20_000, value_parser = within(1..=MOST_GAUSSIANS))]
     pub init_points: usize,
     /// What is skipped.

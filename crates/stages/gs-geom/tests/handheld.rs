@@ -7,7 +7,7 @@ use common::{Folder, json, killed, record, succeeds, training};
 use glam::{DMat4, DVec3, DVec4};
 use gs_raster::{RasterOptions, render};
 use gs_scene::dataset::{self, LoadOptions};
-use gs_scene::{Camera, PointCloud, ply};
+use gs_scene::{Camera, Image, PointCloud, ply};
 use image::{ImageBuffer, Luma};
 use serde_json::json;
 use std::fs;
@@ -82,6 +82,26 @@ fn a_dataset_that_shows_too_little_starts_at_random_and_says_so() {
     write_scene(&scene, &ring(4), &PointCloud::default(), plain);
     let said = succeeds(&["train", "--scene", &scene, "--out", &out, "--iterations", "2", "--init-points", "77"]);
     assert!(said.contains("starting from 77 random points"), "{said}");
+}
+
+#[test]
+fn photographs_give_the_points_and_leave_half_of_the_gaussians_to_grow() {
+    let dir = Folder::new();
+    let (scene, out) = (dir.path("scene"), dir.path("g.ply"));
+    let cameras: Vec<Camera> = ring(40).iter().map(|c| c.resized(4 * SIZE.0, 4 * SIZE.1)).collect();
+    let mut specks = balls(300);
+    specks.log_scales.iter_mut().flatten().for_each(|s| *s -= 1.5);
+    write_scene(&scene, &cameras, &PointCloud::default(), |_, camera, path| {
+        let r = render(&specks, camera, &RasterOptions::default());
+        Image { width: r.width, height: r.height, rgb: r.rgb, alpha: None }.write_png(path).unwrap();
+    });
+    for most in [1usize, 500] {
+        let limits = ["--max-gaussians", &most.to_string(), "--no-skip"];
+        let said = succeeds(&training(&scene, &out, "1", &limits));
+        assert!(said.contains("of depths by plane sweep"), "{said}");
+        let found = ply::read_gaussians(&out).unwrap().len();
+        assert!(found <= most && found * 4 >= most, "{found} of {most}");
+    }
 }
 
 #[test]

@@ -1,5 +1,6 @@
 //! What a run learns from, and the Gaussians that `--init` says to start from.
 
+use super::forecast::most_gaussians;
 use crate::corners::{self, Found};
 use crate::densification::Strategy;
 use crate::options::{Init, Train, check_some};
@@ -55,28 +56,33 @@ pub(crate) fn start(
     }
     let refined = options.refine_poses.then(|| Poses::new(&found.cameras, &given, &corners::lenses(&given)));
     let learnt = &found.cameras[..cameras.len()];
-    let mut points = found.points;
-    let corners = points.len();
-    let from = if deep {
+    let mut corners = found.points;
+    let say = |from: String| stage.info(&format!("the dataset has no points: starting from {from}"));
+    let gaussians = if deep {
         let views: Vec<_> = views.into_iter().zip(learnt).collect();
-        points = start::depths::points(&views, options.init_points, stage)?;
+        let points = start::depths::points(&views, options.init_points, stage)?;
         let images = views.iter().filter(|(v, _)| v.depth_path().is_some()).count();
-        format!("{} of {images} depth images", points.len())
-    } else if sweeps && corners >= corners::FEWEST_POINTS {
-        let swept = start::sweep::points(found.pictures, learnt, &points, options.init_points, stage)?;
-        points.positions.extend(&swept.positions);
-        points.colors.extend(&swept.colors);
-        format!("{corners} of corners and {} of depths by plane sweep", swept.len())
+        say(format!("{} of {images} depth images", points.len()));
+        from_points(options, &points, extent, stage)
+    } else if sweeps && corners.len() >= start::sweep::FEWEST_CORNERS {
+        // Half are left to grow.
+        let most = most_gaussians(options, dataset);
+        if options.max_gaussians.is_some() {
+            corners = start::some_points(&corners, most.div_ceil(2), stage.seed());
+        }
+        let known = corners.len();
+        let swept = start::sweep::points(found.pictures, learnt, corners, options.init_points.min(most / 2), stage)?;
+        let pixels = swept.points.len() - known;
+        say(format!("{known} of corners and {pixels} of depths by plane sweep"));
+        swept.gaussians(options.sh_degree, extent)
     } else {
         if bare {
-            stage.warn(&format!("the photographs have only {corners} points in common: starting from random ones"));
+            let found = corners.len();
+            stage.warn(&format!("the photographs have only {found} points in common: starting from random ones"));
         }
-        let gaussians = gaussians(options, dataset, cameras, extent, stage)?;
-        return Ok((gaussians, refined.unwrap_or_default()));
+        return Ok((gaussians(options, dataset, cameras, extent, stage)?, refined.unwrap_or_default()));
     };
-    stage.info(&format!("the dataset has no points: starting from {from}"));
-    let gaussians = from_points(options, &points, extent, stage).map_err(|e| e.file(&options.scene.scene))?;
-    Ok((gaussians, refined.unwrap_or_default()))
+    Ok((gaussians.map_err(|e| e.file(&options.scene.scene))?, refined.unwrap_or_default()))
 }
 
 /// The Gaussians that `--init` says to start from.

@@ -1,15 +1,20 @@
 //! Points from photographs with known poses alone: a depth for each pixel of small pictures by plane sweep (Collins 1996), smoothed
 //! along lines (semi-global matching, Hirschmueller 2008), kept where a neighbouring view has nearly the same. A little wrong is better
 //! than nothing: where nothing starts, nothing grows. What no view agrees with is worse than nothing, and so is what lies between.
+//! More pixels become points where the picture has more to show.
 
-use super::depths::Voxels;
+use super::from_points;
+use crate::training::schedule::{Purpose, generator};
 use glam::{DMat3, DVec3, Vec3};
 use gs_io::Result;
-use gs_scene::{Camera, Image, PointCloud, size_within};
+use gs_scene::{Camera, Gaussians, Image, PointCloud, size_within};
 use multiversion::multiversion;
+use rand::Rng;
 use rayon::prelude::*;
 use stage::Stage;
 
+/// Fewest corners that tell how far away things are.
+pub(crate) const FEWEST_CORNERS: usize = 20;
 /// Longer side of the small pictures.
 const LONGEST: u32 = 160;
 /// Depths that are tried, evenly spaced in 1 / depth.
@@ -23,13 +28,41 @@ const LEAST_ANGLE: f64 = 2.0;
 const MOST_DIFFERENCE: f32 = 0.2;
 /// What a step of one plane costs between neighbouring pixels, and a larger one, which edges of the picture make cheaper.
 const STEP: f32 = 0.004;
-const JUMP: f32 = 0.05;
+const JUMP: f32 = 0.1;
 const EDGE: f32 = 0.04;
 /// Planes that the depths of two views may differ by.
 const AGREE: f64 = 4.0;
 /// The shares of the known points between which the depths of a view lie, and how much nearer and farther others may be.
 const RANGE: [f64; 2] = [0.02, 0.98];
-const BEYOND: [f64; 2] = [0.6, 2.0];
+const BEYOND: [f64; 2] = [0.6, 3.0];
+/// Contrast with the pixels beside, 0 to 1, that is added to that of every pixel: plain walls need points too.
+const PLAIN: f32 = 0.02;
+/// Largest size of a Gaussian, in depths: a larger one can hang as haze before another camera.
+const MOST_SIZE: f64 = 0.15;
+/// Share of its depth that a pixel's place is at least away from all cameras: somebody stood there, so it is free.
+const FREE: f64 = 0.2;
+/// Opacity of a Gaussian of a pixel: more than that of a corner, because these are fewer for what they cover.
+const OPACITY: f32 = 0.3;
+
+/// Points to start from: the corners, and after them the pixels that were drawn.
+pub(crate) struct Swept {
+    pub points: PointCloud,
+    corners: usize,
+    /// Largest size of the Gaussian of each.
+    most_sizes: Vec<f64>,
+}
+
+impl Swept {
+    /// A Gaussian for each point.
+    pub(crate) fn gaussians(&self, sh_degree: u8, extent: f64) -> Result<Gaussians> {
+        let mut g = from_points(&self.points, sh_degree, extent)?;
+        for (scales, most) in g.log_scales.iter_mut().zip(&self.most_sizes) {
+            *scales = scales.map(|s| s.min(most.ln() as f32));
+        }
+        g.opacity_logits[self.corners..].fill((OPACITY / (1.0 - OPACITY)).ln());
+        Ok(g)
+    }
+}
 
 /// A small picture with what is tried on it.
 struct Small {
@@ -61,6 +94,17 @@ impl Small {
         (1.0 / z - self.inverse(there)).abs() < AGREE * step
     }
 
+    /// Difference of the colours beside a pixel, 0 to about 1; 0 on the border.
+    fn contrast(&self, pixel: usize) -> f32 {
+        let (w, h) = (self.camera.width as usize, self.camera.height as usize);
+        let (x, y) = (pixel % w, pixel / w);
+        if x == 0 || y == 0 || x + 1 == w || y + 1 == h {
+            return 0.0;
+        }
+        let across = |step: usize| difference(self.pixels[pixel + step], self.pixels[pixel - step]);
+        across(1).hypot(across(w))
+    }
+
     fn place(&self, pixel: usize, plane: f64) -> DVec3 {
         let (c, w) = (&self.camera, self.camera.width as usize);
         let (x, y) = ((pixel % w) as f64 + 0.5, (pixel / w) as f64 + 0.5);
@@ -76,16 +120,16 @@ pub(crate) fn small(photograph: &Image, camera: &Camera) -> Image {
     photograph.resize_area(w + w / 2, h + h / 2).resize_area(w, h)
 }
 
-/// At most `most` points of what several pictures show, each [`small`]. `known` points say how far away things are.
+/// The corners, which say how far away things are, and at most `most` points of what several pictures show, each [`small`].
 pub(crate) fn points(
     pictures: Vec<Image>,
     cameras: &[Camera],
-    known: &PointCloud,
+    corners: PointCloud,
     most: usize,
     stage: &Stage,
-) -> Result<PointCloud> {
+) -> Result<Swept> {
     let cameras: Vec<Camera> = cameras.iter().zip(&pictures).map(|(c, p)| c.resized(p.width, p.height)).collect();
-    let known: Vec<DVec3> = known.positions.iter().map(|p| DVec3::from(p.map(f64::from))).collect();
+    let known: Vec<DVec3> = corners.positions.iter().map(|p| DVec3::from(p.map(f64::from))).collect();
     let mut all: Vec<f64> = cameras.iter().flat_map(|c| depths(c, &known)).collect();
     all.sort_by(f64::total_cmp);
     let pictures: Vec<Small> = pictures
@@ -111,14 +155,29 @@ pub(crate) fn points(
         part.iter().for_each(|_| progress.step());
     }
     progress.finish(&[]);
-    let mut voxels = Voxels::new(all.get(all.len() / 2).copied().unwrap_or(1.0));
-    for own in 0..pictures.len() {
-        for (place, color) in agreed(own, &pictures, &maps) {
-            voxels.see(place, color);
+    let weights: Vec<Vec<f32>> =
+        (0..pictures.len()).into_par_iter().map(|own| weights(own, &pictures, &maps)).collect();
+    let nearest = |place: DVec3| {
+        let seen = cameras.iter().filter_map(|c| c.sees(place));
+        seen.map(|(_, _, depth)| depth).fold(f64::INFINITY, f64::min)
+    };
+    let mut swept = Swept {
+        corners: corners.len(),
+        points: corners,
+        most_sizes: known.iter().map(|&place| MOST_SIZE * nearest(place)).collect(),
+    };
+    for (view, pixel) in drawn(&weights, most, stage.seed()) {
+        let (small, plane) = (&pictures[view], f64::from(maps[view][pixel]));
+        let (place, depth) = (small.place(pixel, plane), 1.0 / small.inverse(plane));
+        if cameras.iter().any(|c| c.position().distance(place) < FREE * depth) {
+            continue;
         }
-        voxels.limit(most);
+        let [color @ .., _] = small.pixels[pixel];
+        swept.points.positions.push(place.as_vec3().to_array());
+        swept.points.colors.push(color.map(|v| (v.clamp(0.0, 1.0) * 255.0).round() as u8));
+        swept.most_sizes.push(MOST_SIZE * depth);
     }
-    Ok(voxels.cloud())
+    Ok(swept)
 }
 
 /// Depths of the points that a camera sees.
@@ -308,21 +367,43 @@ fn onward(before: &[f32; PLANES], costs: &[f32; PLANES], jump: f32) -> [f32; PLA
     })
 }
 
-/// Places and colours of the pixels whose depths a neighbour agrees with.
-fn agreed(own: usize, all: &[Small], maps: &[Vec<f32>]) -> Vec<(DVec3, [u8; 3])> {
+/// How much each pixel is worth as a point: its contrast, shared among the views that see it; nothing where no neighbour agrees with
+/// its depth, and where it is transparent.
+fn weights(own: usize, all: &[Small], maps: &[Vec<f32>]) -> Vec<f32> {
     let small = &all[own];
-    let point = |(pixel, &plane): (usize, &f32)| {
-        let [color @ .., opacity] = small.pixels[pixel];
-        // What is transparent is no thing.
-        if plane.is_nan() || opacity < 0.5 {
-            return None;
+    let weight = |(pixel, &plane): (usize, &f32)| {
+        if plane.is_nan() || small.pixels[pixel][3] < 0.5 {
+            return 0.0;
         }
         let place = small.place(pixel, f64::from(plane));
-        let agrees = |&i: &usize| all[i].agrees(place, &maps[i]);
-        let color = color.map(|v| (v.clamp(0.0, 1.0) * 255.0).round() as u8);
-        small.neighbours.iter().any(agrees).then_some((place, color))
+        let agree = small.neighbours.iter().filter(|&&i| all[i].agrees(place, &maps[i])).count();
+        if agree == 0 { 0.0 } else { (PLAIN + small.contrast(pixel)) / (1 + agree) as f32 }
     };
-    maps[own].iter().enumerate().filter_map(point).collect()
+    maps[own].iter().enumerate().map(weight).collect()
+}
+
+/// At most `most` places in lists of weights, drawn by weight, each once, in order.
+fn drawn(weights: &[Vec<f32>], most: usize, seed: u64) -> Vec<(usize, usize)> {
+    let sum: f64 = weights.iter().flatten().map(|&w| f64::from(w)).sum();
+    let mut rng = generator(seed, Purpose::Start, 2);
+    let mut marks: Vec<f64> = (0..most).map(|_| sum * rng.random::<f64>()).collect();
+    marks.sort_by(f64::total_cmp);
+    let mut marks = marks.into_iter().peekable();
+    let mut upto = 0.0;
+    let mut out = Vec::new();
+    for (view, of) in weights.iter().enumerate() {
+        for (pixel, &weight) in of.iter().enumerate() {
+            upto += f64::from(weight);
+            let mut hit = false;
+            while marks.next_if(|&mark| mark < upto).is_some() {
+                hit = true;
+            }
+            if hit {
+                out.push((view, pixel));
+            }
+        }
+    }
+    out
 }
 
 #[cfg(test)]
@@ -357,10 +438,21 @@ mod tests {
     fn a_wall_is_where_it_is() {
         let all = wall(&[-0.4, 0.0, 0.4]);
         let maps: Vec<Vec<f32>> = all.iter().map(|s| planes(s, &all)).collect();
-        let points = agreed(1, &all, &maps);
-        let off: Vec<f64> = points.iter().map(|(p, _)| (p.z - 4.0).abs()).collect();
-        let near = off.iter().filter(|d| **d < 0.1).count();
-        assert!(points.len() > 2000 && near * 20 > points.len() * 18, "{near} of {}", points.len());
+        let weights = weights(1, &all, &maps);
+        let known: Vec<usize> = (0..weights.len()).filter(|&i| weights[i] > 0.0).collect();
+        let near = known.iter().filter(|&&i| (all[1].place(i, f64::from(maps[1][i])).z - 4.0).abs() < 0.1).count();
+        assert!(known.len() > 2000 && near * 20 > known.len() * 18, "{near} of {}", known.len());
+    }
+
+    #[test]
+    fn what_weighs_more_is_drawn_more_often() {
+        let weights = vec![vec![1.0, 0.0], vec![3.0; 1000], vec![1.0; 1000]];
+        let drawn = drawn(&weights, 500, 1);
+        assert!(drawn.len() <= 500 && drawn.is_sorted() && drawn.windows(2).all(|w| w[0] != w[1]));
+        assert!(!drawn.contains(&(0, 1)));
+        let heavy = drawn.iter().filter(|d| d.0 == 1).count() as f64 / drawn.len() as f64;
+        assert!((0.68..0.78).contains(&heavy), "{heavy}");
+        assert!(super::drawn(&[vec![0.0; 9]], 5, 1).is_empty() && super::drawn(&[], 5, 1).is_empty());
     }
 
     /// [`costs`], plainly.
