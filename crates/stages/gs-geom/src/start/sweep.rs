@@ -42,7 +42,7 @@ const MOST_SIZE: f64 = 0.15;
 /// Share of its depth that a pixel's place is at least away from all cameras: somebody stood there, so it is free.
 const FREE: f64 = 0.2;
 /// Opacity of a Gaussian of a pixel: more than that of a corner, because these are fewer for what they cover.
-const OPACITY: f32 = 0.3;
+const OPACITY: f32 = 0.2;
 
 /// Points to start from: the corners, and after them the pixels that were drawn.
 pub(crate) struct Swept {
