@@ -23,23 +23,23 @@ struct Sum {
 }
 
 /// Points of a voxel grid that grows with them.
-pub(super) struct Voxels {
+struct Voxels {
     edge: f64,
     sums: BTreeMap<[i64; 3], Sum>,
 }
 
 impl Voxels {
     /// None yet, of a size for things at this distance.
-    pub(super) fn new(depth: f64) -> Self {
+    fn new(depth: f64) -> Self {
         Self { edge: (VOXEL * depth).max(f64::MIN_POSITIVE), sums: BTreeMap::new() }
     }
 
-    pub(super) fn see(&mut self, place: DVec3, color: [u8; 3]) {
+    fn see(&mut self, place: DVec3, color: [u8; 3]) {
         self.add(&Sum { place, color: color.map(u64::from), count: 1 });
     }
 
     /// A point for each, in the middle of its points and of their mean colour.
-    pub(super) fn cloud(&self) -> PointCloud {
+    fn cloud(&self) -> PointCloud {
         PointCloud {
             positions: self.sums.values().map(|s| (s.place / s.count as f64).as_vec3().to_array()).collect(),
             colors: self.sums.values().map(|s| s.color.map(|c| (c / s.count) as u8)).collect(),
@@ -55,7 +55,7 @@ impl Voxels {
     }
 
     /// Grows the voxels until there are at most so many.
-    pub(super) fn limit(&mut self, most: usize) {
+    fn limit(&mut self, most: usize) {
         while self.sums.len() > most {
             self.edge *= 1.2;
             let sums = std::mem::take(&mut self.sums);
