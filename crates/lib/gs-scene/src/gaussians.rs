@@ -27,6 +27,11 @@ pub struct Gaussians {
     pub sh_degree: u8,
 }
 
+/// Logit of an opacity, as [`Gaussians::opacity_logits`] has it: ln(o / (1 - o)), infinite for 0 and 1.
+pub fn logit(opacity: f32) -> f32 {
+    (opacity / (1.0 - opacity)).ln()
+}
+
 impl Gaussians {
     /// Number of Gaussians.
     pub fn len(&self) -> usize {

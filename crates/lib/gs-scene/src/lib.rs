@@ -20,7 +20,7 @@ pub mod splat;
 
 pub use camera::Camera;
 pub use dataset::colmap;
-pub use gaussians::{Gaussians, SH_C0, sh_coefficients};
+pub use gaussians::{Gaussians, SH_C0, logit, sh_coefficients};
 pub use geometry::Geometry;
 pub use image::{Image, decode as decode_image, has_alpha as image_has_alpha, size_of as image_size, size_within};
 pub use labelled::Labelled;

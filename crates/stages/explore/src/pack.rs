@@ -70,7 +70,7 @@ pub mod tests {
             q.insert((rotation >> 30) as usize, (1.0 - small.iter().map(|v| v * v).sum::<f32>()).max(0.0).sqrt());
             g.rotations.push([q[0], q[1], q[2], q[3]]);
             let opacity = (color & 255) as f32 / 255.0;
-            g.opacity_logits.push((opacity / (1.0 - opacity)).ln().min(50.0));
+            g.opacity_logits.push(gs_scene::logit(opacity).min(50.0));
             let rgb = from([color >> 24, color >> 16 & 255, color >> 8 & 255], [255.0; 3], 2);
             g.sh.extend(rgb.map(|c| (c - 0.5) / gs_scene::SH_C0));
             for word in p.harmonics.get(at).into_iter().flatten() {

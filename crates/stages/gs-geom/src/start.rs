@@ -8,7 +8,7 @@ use crate::training::optimiser::zeros;
 use crate::training::schedule::{Purpose, generator};
 use glam::{DMat3, DVec3};
 use gs_io::{Error, Result};
-use gs_scene::{Camera, Gaussians, PointCloud, SH_C0};
+use gs_scene::{Camera, Gaussians, PointCloud, SH_C0, logit};
 use kiddo::{ImmutableKdTree, SquaredEuclidean};
 use rand::Rng;
 use rand::seq::index::sample;
@@ -57,7 +57,7 @@ pub fn from_points(points: &PointCloud, sh_degree: u8, extent: f64) -> Result<Ga
         g.means[i] = points.positions[i];
         g.log_scales[i] = [size.clamp(limits[0], limits[1]).ln(); 3];
         g.rotations[i] = [1.0, 0.0, 0.0, 0.0];
-        g.opacity_logits[i] = (START_OPACITY / (1.0 - START_OPACITY)).ln();
+        g.opacity_logits[i] = logit(START_OPACITY);
         for c in 0..3 {
             g.sh[i * stride + c] = (f32::from(points.colors[i][c]) / 255.0 - 0.5) / SH_C0;
         }

@@ -6,7 +6,7 @@
 
 use super::packing;
 use crate::ply::table::{Column, Table};
-use crate::{Gaussians, SH_C0, sh_coefficients};
+use crate::{Gaussians, SH_C0, logit, sh_coefficients};
 use gs_io::{Error, IoContext, Result};
 use std::io::Write;
 use std::path::Path;
@@ -65,7 +65,7 @@ pub(crate) fn read(vertices: &Table<'_>, chunks: Option<&Table<'_>>, sh: Option<
         g.log_scales.push(scales.at(chunk, three(scale)));
         g.rotations.push(rotation_of(rotation));
         let [r, green, b, a] = color.to_be_bytes().map(|v| f32::from(v) / 255.0);
-        g.opacity_logits.push((a / (1.0 - a)).ln());
+        g.opacity_logits.push(logit(a));
         let rgb = colors.as_ref().map_or([r, green, b], |c| c.at(chunk, [r, green, b]));
         g.sh.extend(rgb.map(|c| (c - 0.5) / SH_C0));
         if let (Some(rest), Some(row)) = (&rest, rest_rows.as_mut().and_then(Iterator::next)) {

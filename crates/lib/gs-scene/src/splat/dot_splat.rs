@@ -4,7 +4,7 @@
 
 use super::Splat;
 use super::stream::Stream;
-use crate::{Gaussians, SH_C0};
+use crate::{Gaussians, SH_C0, logit};
 use gs_io::{Error, IoContext, Result};
 use std::fs::File;
 use std::io::{BufReader, Write};
@@ -40,8 +40,7 @@ pub(super) fn read(path: &Path) -> Result<Splat> {
         g.means.push(floats(0));
         g.log_scales.push(floats(3).map(f32::ln));
         g.sh.extend([0, 1, 2].map(|k| (f32::from(bytes[k]) / 255.0 - 0.5) / SH_C0));
-        let a = f32::from(bytes[3]) / 255.0;
-        g.opacity_logits.push((a / (1.0 - a)).ln());
+        g.opacity_logits.push(logit(f32::from(bytes[3]) / 255.0));
         g.rotations.push([4, 5, 6, 7].map(|k| (f32::from(bytes[k]) - 128.0) / 128.0));
     }
     Ok(Splat { gaussians: g, kind: ".splat".into(), ..Splat::default() })

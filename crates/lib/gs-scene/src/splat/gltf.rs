@@ -9,7 +9,7 @@ pub(super) mod writer;
 
 use super::Splat;
 use super::axes::Axes;
-use crate::{Gaussians, sh_coefficients};
+use crate::{Gaussians, logit, sh_coefficients};
 use accessor::Buffers;
 use gs_io::{Error, IoContext, Result};
 use serde_json::Value;
@@ -164,8 +164,7 @@ fn gaussians(primitive: &Value, description: &Value, buffers: &Buffers) -> Resul
     let rotations: Vec<[f32; 4]> =
         get(&rotation)?.vectors::<4>()?.into_iter().map(|[x, y, z, w]| [w, x, y, z]).collect();
     fits(&rotation, rotations.len())?;
-    let logit = |[o]: [f32; 1]| (o / (1.0 - o)).ln();
-    let opacity_logits: Vec<f32> = get(&opacity)?.vectors::<1>()?.into_iter().map(logit).collect();
+    let opacity_logits: Vec<f32> = get(&opacity)?.vectors::<1>()?.into_iter().map(|[o]| logit(o)).collect();
     fits(&opacity, opacity_logits.len())?;
     let sh_degree = (1..=3).take_while(|&d| attributes[coefficient(sh_coefficients(d - 1))].is_u64()).count() as u8;
     let k = sh_coefficients(sh_degree);

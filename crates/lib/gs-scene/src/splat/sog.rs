@@ -5,7 +5,7 @@
 
 use super::compressed_ply::from_three;
 use super::{Splat, plain_name};
-use crate::{Gaussians, sh_coefficients};
+use crate::{Gaussians, logit, sh_coefficients};
 use gs_io::{Error, IoContext, Result};
 use image_webp::WebPDecoder;
 use serde_json::Value;
@@ -151,13 +151,9 @@ impl Reader {
         let scales = self.table("scales", version, 3)?;
         g.log_scales = self.each("scales", 0, |p| [0, 1, 2].map(|k| scales.value(k, p[k])))?;
         let colors = self.table("sh0", version, 4)?;
-        let logit = |a: u8| {
-            let a = f32::from(a) / 255.0;
-            (a / (1.0 - a)).ln()
-        };
         let first: Vec<([f32; 3], f32)> = self.each("sh0", 0, |p| {
             let rgb = [0, 1, 2].map(|k| colors.value(k, p[k]));
-            (rgb, if version == 1 { colors.value(3, p[3]) } else { logit(p[3]) })
+            (rgb, if version == 1 { colors.value(3, p[3]) } else { logit(f32::from(p[3]) / 255.0) })
         })?;
         g.opacity_logits = first.iter().map(|(_, o)| *o).collect();
         let palette = if self.meta["shN"].is_object() { Some(self.palette(version)?) } else { None };

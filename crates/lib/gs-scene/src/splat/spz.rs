@@ -10,7 +10,7 @@ pub(super) mod writer;
 use super::axes::Axes;
 use super::compressed_ply::from_three;
 use super::stream::Stream;
-use crate::{Gaussians, sh_coefficients};
+use crate::{Gaussians, logit, sh_coefficients};
 use flate2::bufread::GzDecoder;
 use glam::{DMat3, DVec3};
 use gs_io::{Error, IoContext, Result};
@@ -267,10 +267,7 @@ impl Parts {
                 })?;
             }
             Kind::Opacities => {
-                g.opacity_logits = data.items(n, field, |[a]: &[u8; 1]| {
-                    let a = f32::from(*a) / 255.0;
-                    (a / (1.0 - a)).ln()
-                })?;
+                g.opacity_logits = data.items(n, field, |[a]: &[u8; 1]| logit(f32::from(*a) / 255.0))?;
             }
             Kind::Colors => self.colors = data.items(n, field, |b: &[u8; 3]| *b)?,
             Kind::Scales => {

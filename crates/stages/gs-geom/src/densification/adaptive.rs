@@ -7,7 +7,7 @@ use crate::training::optimiser::Adam;
 use crate::training::schedule::{Purpose, generator};
 use glam::{Quat, Vec3};
 use gs_raster::Workspace;
-use gs_scene::{Camera, Gaussians};
+use gs_scene::{Camera, Gaussians, logit};
 use rand::Rng;
 use rand_chacha::ChaCha8Rng;
 use serde::Serialize;
@@ -127,7 +127,7 @@ impl Densify for Adaptive {
 
 /// Lowers every opacity to at most 0.01, and forgets their moments: what is needed comes back, floaters do not.
 fn reset_opacities(g: &mut Gaussians, adam: &mut Adam) {
-    let most = (RESET_OPACITY / (1.0 - RESET_OPACITY)).ln();
+    let most = logit(RESET_OPACITY);
     g.opacity_logits.iter_mut().for_each(|o| *o = o.min(most));
     for moments in [&mut adam.first, &mut adam.second] {
         moments.opacity_logits.fill(0.0);

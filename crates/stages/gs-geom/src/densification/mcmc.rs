@@ -4,11 +4,10 @@
 use super::rules::{Densify, Moment, Report};
 use crate::training::checkpoint::{ScreenGradients, State};
 use crate::training::optimiser::Adam;
-use crate::training::schedule::{Purpose, generator};
+use crate::training::schedule::{Purpose, drawn, generator};
 use glam::{Quat, Vec3};
 use gs_raster::Gradients;
 use gs_scene::Gaussians;
-use rand::Rng;
 use rand_chacha::ChaCha8Rng;
 use rayon::prelude::*;
 use serde::Serialize;
@@ -112,22 +111,8 @@ fn round(g: &mut Gaussians, adam: &mut Adam, options: &Mcmc, most: usize, rng: &
 /// `count` Gaussians among those that `may` be drawn, with replacement, in proportion to opacity; none where all are
 /// transparent.
 fn draw(g: &Gaussians, count: usize, may: impl Fn(usize) -> bool, rng: &mut ChaCha8Rng) -> Vec<u32> {
-    let mut total = 0.0;
-    let sums: Vec<f64> = (0..g.len())
-        .map(|i| {
-            total += if may(i) { f64::from(g.opacity(i)) } else { 0.0 };
-            total
-        })
-        .collect();
-    if total <= 0.0 || !total.is_finite() {
-        return Vec::new();
-    }
-    // The first whose sum lies above the draw: its own share is then positive.
-    let mut one = || {
-        let at = rng.random::<f64>() * total;
-        sums.partition_point(|&s| s <= at).min(g.len() - 1) as u32
-    };
-    (0..count).map(|_| one()).collect()
+    let weights = (0..g.len()).map(|i| if may(i) { f64::from(g.opacity(i)) } else { 0.0 });
+    drawn(weights, count, rng).into_iter().map(|i| i as u32).collect()
 }
 
 /// Makes each Gaussian in `sources` share its place with as many copies as it is named there.

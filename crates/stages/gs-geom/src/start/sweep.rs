@@ -4,12 +4,11 @@
 //! More pixels become points where the picture has more to show.
 
 use super::from_points;
-use crate::training::schedule::{Purpose, generator};
+use crate::training::schedule::{Purpose, drawn, generator};
 use glam::{DMat3, DVec3, Vec3};
 use gs_io::Result;
-use gs_scene::{Camera, Gaussians, Image, PointCloud, size_within};
+use gs_scene::{Camera, Gaussians, Image, PointCloud, logit, size_within};
 use multiversion::multiversion;
-use rand::Rng;
 use rayon::prelude::*;
 use stage::Stage;
 
@@ -59,7 +58,7 @@ impl Swept {
         for (scales, most) in g.log_scales.iter_mut().zip(&self.most_sizes) {
             *scales = scales.map(|s| s.min(most.ln() as f32));
         }
-        g.opacity_logits[self.corners..].fill((OPACITY / (1.0 - OPACITY)).ln());
+        g.opacity_logits[self.corners..].fill(logit(OPACITY));
         Ok(g)
     }
 }
@@ -130,14 +129,14 @@ pub(crate) fn points(
 ) -> Result<Swept> {
     let cameras: Vec<Camera> = cameras.iter().zip(&pictures).map(|(c, p)| c.resized(p.width, p.height)).collect();
     let known: Vec<DVec3> = corners.positions.iter().map(|p| DVec3::from(p.map(f64::from))).collect();
-    let mut all: Vec<f64> = cameras.iter().flat_map(|c| depths(c, &known)).collect();
-    all.sort_by(f64::total_cmp);
+    let own: Vec<Vec<f64>> = cameras.iter().map(|c| depths(c, &known)).collect();
+    let all = own.concat();
     let pictures: Vec<Small> = pictures
         .into_iter()
         .zip(&cameras)
+        .zip(own)
         .enumerate()
-        .map(|(i, (picture, camera))| {
-            let own = depths(camera, &known);
+        .map(|(i, ((picture, camera), own))| {
             let [near, far] = range(if own.len() < 20 { all.clone() } else { own });
             Small {
                 neighbours: neighbours(&cameras, i, 0.5 * (near + far)),
@@ -155,8 +154,13 @@ pub(crate) fn points(
         part.iter().for_each(|_| progress.step());
     }
     progress.finish(&[]);
-    let weights: Vec<Vec<f32>> =
-        (0..pictures.len()).into_par_iter().map(|own| weights(own, &pictures, &maps)).collect();
+    let worth: Vec<(usize, u32, f32)> = (0..pictures.len())
+        .into_par_iter()
+        .flat_map_iter(|view| {
+            let pixels = (0..).zip(weights(view, &pictures, &maps));
+            pixels.filter(|&(_, weight)| weight > 0.0).map(move |(pixel, weight)| (view, pixel, weight))
+        })
+        .collect();
     let nearest = |place: DVec3| {
         let seen = cameras.iter().filter_map(|c| c.sees(place));
         seen.map(|(_, _, depth)| depth).fold(f64::INFINITY, f64::min)
@@ -166,7 +170,8 @@ pub(crate) fn points(
         points: corners,
         most_sizes: known.iter().map(|&place| MOST_SIZE * nearest(place)).collect(),
     };
-    for (view, pixel) in drawn(&weights, most, stage.seed()) {
+    let weights = worth.iter().map(|&(_, _, weight)| f64::from(weight));
+    for (view, pixel) in chosen(weights, most, stage.seed()).into_iter().map(|i| (worth[i].0, worth[i].1 as usize)) {
         let (small, plane) = (&pictures[view], f64::from(maps[view][pixel]));
         let (place, depth) = (small.place(pixel, plane), 1.0 / small.inverse(plane));
         if cameras.iter().any(|c| c.position().distance(place) < FREE * depth) {
@@ -382,28 +387,12 @@ fn weights(own: usize, all: &[Small], maps: &[Vec<f32>]) -> Vec<f32> {
     maps[own].iter().enumerate().map(weight).collect()
 }
 
-/// At most `most` places in lists of weights, drawn by weight, each once, in order.
-fn drawn(weights: &[Vec<f32>], most: usize, seed: u64) -> Vec<(usize, usize)> {
-    let sum: f64 = weights.iter().flatten().map(|&w| f64::from(w)).sum();
-    let mut rng = generator(seed, Purpose::Start, 2);
-    let mut marks: Vec<f64> = (0..most).map(|_| sum * rng.random::<f64>()).collect();
-    marks.sort_by(f64::total_cmp);
-    let mut marks = marks.into_iter().peekable();
-    let mut upto = 0.0;
-    let mut out = Vec::new();
-    for (view, of) in weights.iter().enumerate() {
-        for (pixel, &weight) in of.iter().enumerate() {
-            upto += f64::from(weight);
-            let mut hit = false;
-            while marks.next_if(|&mark| mark < upto).is_some() {
-                hit = true;
-            }
-            if hit {
-                out.push((view, pixel));
-            }
-        }
-    }
-    out
+/// At most `most` places of a list of weights, drawn in proportion to them, each once, in order.
+fn chosen(weights: impl Iterator<Item = f64>, most: usize, seed: u64) -> Vec<usize> {
+    let mut all = drawn(weights, most, &mut generator(seed, Purpose::Start, 2));
+    all.sort_unstable();
+    all.dedup();
+    all
 }
 
 #[cfg(test)]
@@ -446,13 +435,13 @@ mod tests {
 
     #[test]
     fn what_weighs_more_is_drawn_more_often() {
-        let weights = vec![vec![1.0, 0.0], vec![3.0; 1000], vec![1.0; 1000]];
-        let drawn = drawn(&weights, 500, 1);
-        assert!(drawn.len() <= 500 && drawn.is_sorted() && drawn.windows(2).all(|w| w[0] != w[1]));
-        assert!(!drawn.contains(&(0, 1)));
-        let heavy = drawn.iter().filter(|d| d.0 == 1).count() as f64 / drawn.len() as f64;
+        let weights = [vec![1.0, 0.0], vec![3.0; 1000], vec![1.0; 1000]].concat();
+        let places = chosen(weights.into_iter(), 500, 1);
+        assert!(places.len() <= 500 && places.is_sorted() && places.windows(2).all(|w| w[0] != w[1]));
+        assert!(!places.contains(&1));
+        let heavy = places.iter().filter(|i| (2..1002).contains(*i)).count() as f64 / places.len() as f64;
         assert!((0.68..0.78).contains(&heavy), "{heavy}");
-        assert!(super::drawn(&[vec![0.0; 9]], 5, 1).is_empty() && super::drawn(&[], 5, 1).is_empty());
+        assert!(chosen([0.0; 9].into_iter(), 5, 1).is_empty() && chosen([].into_iter(), 5, 1).is_empty());
     }
 
     /// [`costs`], plainly.

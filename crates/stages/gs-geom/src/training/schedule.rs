@@ -1,6 +1,7 @@
 //! What changes with the iteration: learning rates, degree of the spherical harmonics, picture size, and the order of the
 //! views. Iterations count from 1.
 
+use rand::Rng;
 use rand::seq::SliceRandom;
 use rand_chacha::ChaCha8Rng;
 use rand_chacha::rand_core::SeedableRng;
@@ -137,6 +138,26 @@ pub fn generator(seed: u64, purpose: Purpose, iteration: u64) -> ChaCha8Rng {
     let mut rng = ChaCha8Rng::seed_from_u64(seed);
     rng.set_stream((purpose as u64) << 48 | iteration);
     rng
+}
+
+/// `count` places of a list of weights, drawn with replacement in proportion to them; none where all are zero or their sum is not
+/// finite.
+pub fn drawn(weights: impl Iterator<Item = f64>, count: usize, rng: &mut ChaCha8Rng) -> Vec<usize> {
+    let mut total = 0.0;
+    let add = |weight| {
+        total += weight;
+        total
+    };
+    let sums: Vec<f64> = weights.map(add).collect();
+    if total <= 0.0 || !total.is_finite() {
+        return Vec::new();
+    }
+    // The first whose sum lies above the draw: its own share is then positive.
+    let mut one = || {
+        let at = rng.random::<f64>() * total;
+        sums.partition_point(|&s| s <= at).min(sums.len() - 1)
+    };
+    (0..count).map(|_| one()).collect()
 }
 
 /// What random numbers are for.

@@ -10,7 +10,7 @@ pub fn cloud(places: &[DVec3], scale: f64, opacity: f32) -> Gaussians {
         means: places.iter().map(|p| p.as_vec3().to_array()).collect(),
         log_scales: vec![[scale.ln() as f32; 3]; n],
         rotations: vec![[1.0, 0.0, 0.0, 0.0]; n],
-        opacity_logits: vec![(opacity / (1.0 - opacity)).ln(); n],
+        opacity_logits: vec![gs_scene::logit(opacity); n],
         sh: (0..3 * n).map(|i| (i as f32 * 1.7).sin()).collect(),
         sh_degree: 0,
     }
