@@ -29,8 +29,12 @@ const NONE: f64 = 1e-9;
 
 /// Entries of footprints that single Gaussians have at most, 18 bytes each. Where all views show most of a large scene there are more.
 pub const MOST_ENTRIES: u64 = 1 << 27;
-/// Where there are more, Gaussians that agree by this in some of the views become one before the others are read.
+/// Gaussians that agree by this are one piece. Where there are more entries, they become one by some of the views before the others are
+/// read.
 const FIRM: f64 = 0.7;
+/// How much more two must agree where the larger of them is e times as large as pieces commonly are: a large piece is more often a whole
+/// thing. Chosen on scenes for tuning (docs/results/real-masks.md).
+const BY_SIZE: f64 = 0.03;
 
 /// Clusters the kept Gaussians by the masks at `levels`: neighbours that agree by `least`, then pieces that do not touch and agree by
 /// `join`; 0 joins none of those. The tree above goes on to where nothing agrees.
@@ -58,7 +62,10 @@ pub fn cluster(
         let (labels, count) = linkage.labels();
         linkage.see(Profile::of_pieces(&labels, count, footprints, levels, &vec![true; views.len()])?);
     }
+    linkage.join(FIRM.max(least), usize::MAX, within);
+    linkage.count_sizes();
     linkage.join(least, usize::MAX, within);
+    linkage.common_size = None;
     linkage.join(NONE, hdbscan.min_cluster_size, within);
     if join > 0.0 {
         let (labels, count) = linkage.labels();
@@ -94,6 +101,8 @@ pub struct Linkage<'a> {
     profiles: Vec<Profile>,
     /// Members of each cluster; 0 for one that has joined another.
     sizes: Vec<usize>,
+    /// The size that pieces commonly have, while sizes count ([`Linkage::count_sizes`]).
+    common_size: Option<usize>,
     /// Those that each cluster may join, and its agreement with them.
     near: Vec<Vec<(u32, f64)>>,
     /// Where clusters lie, once those that don't touch may join ([`Linkage::meet`]).
@@ -114,6 +123,7 @@ impl<'a> Linkage<'a> {
             unit_of,
             profiles,
             sizes: vec![1; n],
+            common_size: None,
             near: vec![Vec::new(); n],
             places: Vec::new(),
             into: (0..n as u32).collect(),
@@ -188,12 +198,34 @@ impl<'a> Linkage<'a> {
         self.compare_only(&pairs.into_iter().collect::<Vec<_>>());
     }
 
-    /// The cluster that each joins in this round, or itself.
+    /// From now on clusters larger than the common size must agree more to join, smaller ones less. The common size is that of the cluster
+    /// of the middle member, by size of the clusters.
+    fn count_sizes(&mut self) {
+        let mut sizes = self.sizes.clone();
+        sizes.sort_unstable();
+        let half = sizes.iter().sum::<usize>().div_ceil(2);
+        let mut members = 0;
+        self.common_size = sizes.into_iter().find(|size| {
+            members += size;
+            members >= half
+        });
+    }
+
+    /// How much more than `least` a cluster of this size must agree with a smaller one.
+    fn extra(&self, size: usize) -> f64 {
+        self.common_size.map_or(0.0, |common| BY_SIZE * (size.max(1) as f64 / common.max(1) as f64).ln())
+    }
+
+    /// The cluster that each joins in this round, or itself, and how far it agrees with it.
     fn round(&self, least: f64, below: usize) -> Vec<(u32, f64)> {
         // Of equals the first.
         let order = |a: &(u32, f64), b: &(u32, f64)| a.1.total_cmp(&b.1).then(b.0.cmp(&a.0));
-        let best = |near: &Vec<(u32, f64)>| near.iter().copied().filter(|b| b.1 >= least).max_by(order);
-        let best: Vec<Option<(u32, f64)>> = self.near.par_iter().map(best).collect();
+        let extra: Vec<f64> = self.sizes.iter().map(|&s| self.extra(s)).collect();
+        let best = |(i, near): (usize, &Vec<(u32, f64)>)| {
+            let eased = near.iter().map(|&(j, value)| (j, (value - extra[i].max(extra[j as usize])).min(1.0)));
+            eased.filter(|b| b.1 >= least).max_by(order)
+        };
+        let best: Vec<Option<(u32, f64)>> = self.near.par_iter().enumerate().map(best).collect();
         let rank = |i: u32| (self.sizes[i as usize], Reverse(i));
         let joins = |i: u32| {
             let other = best[i as usize].filter(|_| self.sizes[i as usize] < below)?;
@@ -346,6 +378,32 @@ mod tests {
         assert!((1..41).all(|i| round[i].0 == 0) && round[0].0 == 0);
         linkage.join(0.5, usize::MAX, ALL);
         assert_eq!(labels(&linkage), [0; 41]);
+    }
+
+    #[test]
+    fn large_pieces_must_agree_more_and_small_ones_less() {
+        // 0 and 1 agree in half of the views, 2 and 3 in three of ten.
+        let together = |n: usize| [[ONE; 10], std::array::from_fn(|v| if v < n { ONE } else { TWO })];
+        let views: Vec<Profile> = together(5).iter().chain(&together(3)).map(|v| profile(v)).collect();
+        let join = |sizes: [usize; 4], count: bool| {
+            let mut linkage = Linkage::new(views.clone(), &[(0, 1), (2, 3)], &UNIT_OF);
+            linkage.sizes = sizes.to_vec();
+            linkage.common_size = count.then_some(100);
+            linkage.join(0.4, usize::MAX, ALL);
+            labels(&linkage)
+        };
+        assert_eq!(join([10000, 1, 1, 1], false), [0, 0, 1, 2]);
+        assert_eq!(join([10000, 1, 1, 1], true), [0, 1, 2, 2]);
+        assert_eq!(join([100; 4], true), [0, 0, 1, 2]);
+    }
+
+    #[test]
+    fn the_common_size_is_that_of_the_middle_member() {
+        let mut linkage = Linkage::new(vec![Profile::default(); 5], &[], &UNIT_OF);
+        linkage.sizes = vec![1, 90, 0, 60, 29];
+        linkage.count_sizes();
+        assert_eq!(linkage.common_size, Some(60));
+        assert_eq!(linkage.extra(60), 0.0);
     }
 
     #[test]
