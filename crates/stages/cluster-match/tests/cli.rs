@@ -305,7 +305,7 @@ fn the_provenance_holds_every_option_and_the_forecast_is_near_the_peak() {
     s.succeed(&["--cluster", "free", "--noise", "keep"]);
     let (_, a) = Instances::read(s.path("out/instances.safetensors")).unwrap();
     let expected = json!({
-        "cluster": "free", "agreement": 0.42, "min_cluster_size": 8, "min_samples": 10, "epsilon": 0.0, "leaf": false,
+        "cluster": "free", "agreement": 0.4, "min_cluster_size": 8, "min_samples": 10, "epsilon": 0.0, "leaf": false,
         "allow_single_cluster": false, "noise": "keep", "join": 0.0, "votes": 0, "split": 0.0, "levels": ["large"],
         "threshold": 0.2, "granules": 0,
     });
