@@ -10,6 +10,7 @@
 mod assignment;
 mod associate;
 mod describe;
+mod doubt;
 mod granules;
 mod group;
 mod health;
@@ -23,6 +24,7 @@ mod plane;
 mod profile;
 mod rank;
 mod run;
+mod surface;
 #[cfg(test)]
 mod testing;
 mod vote;

@@ -3,13 +3,16 @@
 //! A Gaussian at a rim lies in two masks of a view, and many masks are wrong. What many Gaussians have in common is firm. So
 //! neighbours are joined from the bottom up, those that agree most first, and what is joined has the masks of all its Gaussians.
 
+use crate::doubt::Doubt;
 use crate::inputs::Inputs;
 use crate::options::Settings;
 use crate::plane::Place;
 use crate::profile::{Profile, some_views, units};
+use crate::surface::{Touch, rims};
 use artifacts::{Graph, Level};
 use gs_io::Result;
 use hdbscan_exact::{Clustering, Edge, Options, Selection, cluster_graph};
+use nalgebra::Vector3;
 use rayon::prelude::*;
 use std::cmp::Reverse;
 use std::collections::{BTreeMap, BTreeSet};
@@ -32,9 +35,6 @@ pub const MOST_ENTRIES: u64 = 1 << 27;
 /// Gaussians that agree by this are one piece. Where there are more entries, they become one by some of the views before the others are
 /// read.
 const FIRM: f64 = 0.7;
-/// How much more two must agree where the larger of them is e times as large as pieces commonly are: a large piece is more often a whole
-/// thing. Chosen on scenes for tuning (docs/results/real-masks.md).
-const BY_SIZE: f64 = 0.03;
 
 /// Clusters the kept Gaussians by the masks at `levels`: neighbours that agree by `least`, then pieces that do not touch and agree by
 /// `join`; 0 joins none of those. The tree above goes on to where nothing agrees.
@@ -56,6 +56,7 @@ pub fn cluster(
     let views = some_views(footprints, levels, MOST_ENTRIES);
     let own: Vec<i32> = (0..n as i32).collect();
     let profiles = Profile::of_pieces(&own, n, footprints, levels, &views)?;
+    let (centres, facing) = centres_and_facing(inputs, &profiles, &unit_of);
     let mut linkage = Linkage::new(profiles, &neighbours(graph), &unit_of);
     if views.contains(&false) {
         linkage.join(FIRM, usize::MAX, within);
@@ -63,9 +64,9 @@ pub fn cluster(
         linkage.see(Profile::of_pieces(&labels, count, footprints, levels, &vec![true; views.len()])?);
     }
     linkage.join(FIRM.max(least), usize::MAX, within);
-    linkage.count_sizes();
+    linkage.doubt(&rims(&centres, graph, &linkage.labels().0, &facing));
     linkage.join(least, usize::MAX, within);
-    linkage.common_size = None;
+    linkage.doubt = None;
     linkage.join(NONE, hdbscan.min_cluster_size, within);
     if join > 0.0 {
         let (labels, count) = linkage.labels();
@@ -78,6 +79,20 @@ pub fn cluster(
     linkage.join(NONE, usize::MAX, above);
     let options = Options { epsilon: cut + APART, selection: Selection::Leaf, allow_single_cluster, ..hdbscan };
     Ok(cluster_graph(n, linkage.edges, &options))
+}
+
+/// The centres of the kept Gaussians, and the directions from which they are seen.
+fn centres_and_facing(
+    inputs: &Inputs,
+    profiles: &[Profile],
+    unit_of: &[u32],
+) -> (Vec<Vector3<f64>>, Vec<Vector3<f64>>) {
+    let means = &inputs.geometry.gaussians.means;
+    let centre = |&i: &u32| Vector3::from(means[i as usize].map(f64::from));
+    let centres: Vec<Vector3<f64>> = inputs.graph.kept.iter().map(centre).collect();
+    let cameras: Vec<Vector3<f64>> = inputs.views.iter().map(|v| v.camera.position().to_array().into()).collect();
+    let facing = profiles.par_iter().zip(&centres).map(|(p, x)| p.seen_from(&cameras, x, unit_of)).collect();
+    (centres, facing)
 }
 
 /// Pairs of spatial neighbours, each once.
@@ -101,8 +116,8 @@ pub struct Linkage<'a> {
     profiles: Vec<Profile>,
     /// Members of each cluster; 0 for one that has joined another.
     sizes: Vec<usize>,
-    /// The size that pieces commonly have, while sizes count ([`Linkage::count_sizes`]).
-    common_size: Option<usize>,
+    /// How much more two must agree because of their size and shape, while that counts ([`Linkage::doubt`]).
+    doubt: Option<Doubt>,
     /// Those that each cluster may join, and its agreement with them.
     near: Vec<Vec<(u32, f64)>>,
     /// Where clusters lie, once those that don't touch may join ([`Linkage::meet`]).
@@ -123,7 +138,7 @@ impl<'a> Linkage<'a> {
             unit_of,
             profiles,
             sizes: vec![1; n],
-            common_size: None,
+            doubt: None,
             near: vec![Vec::new(); n],
             places: Vec::new(),
             into: (0..n as u32).collect(),
@@ -198,32 +213,25 @@ impl<'a> Linkage<'a> {
         self.compare_only(&pairs.into_iter().collect::<Vec<_>>());
     }
 
-    /// From now on clusters larger than the common size must agree more to join, smaller ones less. The common size is that of the cluster
-    /// of the middle member, by size of the clusters.
-    fn count_sizes(&mut self) {
-        let mut sizes = self.sizes.clone();
-        sizes.sort_unstable();
-        let half = sizes.iter().sum::<usize>().div_ceil(2);
-        let mut members = 0;
-        self.common_size = sizes.into_iter().find(|size| {
-            members += size;
-            members >= half
-        });
-    }
-
-    /// How much more than `least` a cluster of this size must agree with a smaller one.
-    fn extra(&self, size: usize) -> f64 {
-        self.common_size.map_or(0.0, |common| BY_SIZE * (size.max(1) as f64 / common.max(1) as f64).ln())
+    /// From now on large clusters must agree more to join, and such as rise above each other. `touches` has the rims of all that touch, as
+    /// [`Linkage::labels`] numbers them.
+    fn doubt(&mut self, touches: &[Touch]) {
+        let left = self.left();
+        let named = |&((a, b), rim): &Touch| ((left[a as usize], left[b as usize]), rim);
+        self.doubt = Some(Doubt::new(&self.sizes, &touches.iter().map(named).collect::<Vec<_>>()));
     }
 
     /// The cluster that each joins in this round, or itself, and how far it agrees with it.
     fn round(&self, least: f64, below: usize) -> Vec<(u32, f64)> {
         // Of equals the first.
         let order = |a: &(u32, f64), b: &(u32, f64)| a.1.total_cmp(&b.1).then(b.0.cmp(&a.0));
-        let extra: Vec<f64> = self.sizes.iter().map(|&s| self.extra(s)).collect();
+        let more = |a: u32, b: u32| {
+            let size = self.sizes[a as usize].max(self.sizes[b as usize]);
+            self.doubt.as_ref().map_or(0.0, |doubt| doubt.of(a, b, size))
+        };
         let best = |(i, near): (usize, &Vec<(u32, f64)>)| {
-            let eased = near.iter().map(|&(j, value)| (j, (value - extra[i].max(extra[j as usize])).min(1.0)));
-            eased.filter(|b| b.1 >= least).max_by(order)
+            let left = near.iter().map(|&(j, value)| (j, (value - more(i as u32, j)).min(1.0)));
+            left.filter(|b| b.1 >= least).max_by(order)
         };
         let best: Vec<Option<(u32, f64)>> = self.near.par_iter().enumerate().map(best).collect();
         let rank = |i: u32| (self.sizes[i as usize], Reverse(i));
@@ -285,6 +293,9 @@ impl<'a> Linkage<'a> {
         if !self.places.is_empty() {
             self.places[a] = self.places[a].joined(&self.places[b]);
         }
+        if let Some(doubt) = &mut self.doubt {
+            doubt.join(i, to);
+        }
         self.into[b] = to;
     }
 
@@ -310,6 +321,7 @@ impl<'a> Linkage<'a> {
 mod tests {
     use super::*;
     use crate::plane::testing::{board, places};
+    use crate::surface::Rim;
 
     /// Two masks a view; a member has the given share in the first, in views where it is seen at all.
     fn profile(firsts: &[Option<f32>]) -> Profile {
@@ -381,29 +393,22 @@ mod tests {
     }
 
     #[test]
-    fn large_pieces_must_agree_more_and_small_ones_less() {
+    fn doubt_keeps_apart_what_rises_and_lets_crumbs_in() {
         // 0 and 1 agree in half of the views, 2 and 3 in three of ten.
         let together = |n: usize| [[ONE; 10], std::array::from_fn(|v| if v < n { ONE } else { TWO })];
         let views: Vec<Profile> = together(5).iter().chain(&together(3)).map(|v| profile(v)).collect();
-        let join = |sizes: [usize; 4], count: bool| {
+        let join = |rising: Option<u32>| {
             let mut linkage = Linkage::new(views.clone(), &[(0, 1), (2, 3)], &UNIT_OF);
-            linkage.sizes = sizes.to_vec();
-            linkage.common_size = count.then_some(100);
+            linkage.sizes = vec![100, 100, 1, 1];
+            if let Some(rising) = rising {
+                linkage.doubt(&[((0, 1), Rim { pairs: 100, rising }), ((2, 3), Rim { pairs: 100, rising: 0 })]);
+            }
             linkage.join(0.4, usize::MAX, ALL);
             labels(&linkage)
         };
-        assert_eq!(join([10000, 1, 1, 1], false), [0, 0, 1, 2]);
-        assert_eq!(join([10000, 1, 1, 1], true), [0, 1, 2, 2]);
-        assert_eq!(join([100; 4], true), [0, 0, 1, 2]);
-    }
-
-    #[test]
-    fn the_common_size_is_that_of_the_middle_member() {
-        let mut linkage = Linkage::new(vec![Profile::default(); 5], &[], &UNIT_OF);
-        linkage.sizes = vec![1, 90, 0, 60, 29];
-        linkage.count_sizes();
-        assert_eq!(linkage.common_size, Some(60));
-        assert_eq!(linkage.extra(60), 0.0);
+        assert_eq!(join(None), [0, 0, 1, 2]);
+        assert_eq!(join(Some(0)), [0, 0, 1, 1]);
+        assert_eq!(join(Some(100)), [0, 1, 2, 2]);
     }
 
     #[test]

@@ -55,9 +55,9 @@ pub(crate) struct Settings {
     /// features as free points (the paper)
     #[arg(long, value_enum, default_value_t = Space::Masks)]
     pub cluster: Space,
-    /// How far the masks of neighbouring pieces must agree that both are one instance, 0 to 1: a lower value joins more. Larger pieces must
-    /// agree a little more, smaller ones less. Only with masks
-    #[arg(long, value_name = "AGREEMENT", value_parser = stage::within(0.0..=1.0), default_value_t = 0.4)]
+    /// How far the masks of neighbouring pieces must agree that both are one instance, 0 to 1: a lower value joins more. Large pieces must
+    /// agree more, and so must two of which one rises above the other, by up to 0.28. Only with masks
+    #[arg(long, value_name = "AGREEMENT", value_parser = stage::within(0.0..=1.0), default_value_t = 0.18)]
     pub agreement: f64,
     /// Fewest Gaussians of an instance [default: 8 with masks, 30 with free points; on the graph a thousandth of the Gaussians that are
     /// seen, at least 10 and at most 30, because small scenes have small things]

@@ -305,7 +305,7 @@ fn the_provenance_holds_every_option_and_the_forecast_is_near_the_peak() {
     s.succeed(&["--cluster", "free", "--noise", "keep"]);
     let (_, a) = Instances::read(s.path("out/instances.safetensors")).unwrap();
     let expected = json!({
-        "cluster": "free", "agreement": 0.4, "min_cluster_size": 8, "min_samples": 10, "epsilon": 0.0, "leaf": false,
+        "cluster": "free", "agreement": 0.18, "min_cluster_size": 8, "min_samples": 10, "epsilon": 0.0, "leaf": false,
         "allow_single_cluster": false, "noise": "keep", "join": 0.0, "votes": 0, "split": 0.0, "levels": ["large"],
         "threshold": 0.2, "granules": 0,
     });
@@ -324,7 +324,7 @@ fn parts_that_are_small_beside_their_instance_leave_it() {
     let s = Scene::new();
     s.artifacts_with(&[SMALL, 10..EACH, EACH..2 * EACH], |_| {});
     // Small masks alone would part it in the first place.
-    let levels = ["--levels", "small,medium,large", "--agreement", "0.2"];
+    let levels = ["--levels", "small,medium,large", "--agreement", "0"];
     let whole = s.succeed(&[&levels[..], &["--split", "0"]].concat()).0;
     let (i, said) = s.succeed(&[&levels[..], &["--split", "0.3"]].concat());
     assert!(whole.len() == 2 && i.len() == 3 && said.contains("1 small things within others"), "{said}");

@@ -1,0 +1,173 @@
+//! Where one piece rises above the surface of another: what stands on a table rises above it, one half of the table top does not rise
+//! above the other.
+
+use artifacts::Graph;
+use nalgebra::{Matrix3, Vector3};
+use rayon::prelude::*;
+
+/// How often the patch of a Gaussian takes in those of its neighbours. Fewer leave the normals to chance.
+const ROUNDS: usize = 4;
+/// Sine of the angle from which a patch rises above the plane of another.
+const RISES: f64 = 0.25;
+
+/// Where two pieces touch.
+#[derive(Debug, Clone, Copy, Default, PartialEq)]
+pub struct Rim {
+    /// Pairs of neighbours, one in each piece.
+    pub pairs: u32,
+    /// Those of the pairs of which one rises above the surface of the other.
+    pub rising: u32,
+}
+
+impl Rim {
+    /// Of both together.
+    pub fn joined(self, other: Self) -> Self {
+        Self { pairs: self.pairs + other.pairs, rising: self.rising + other.rising }
+    }
+}
+
+/// Two pieces, the smaller number first, and their rim.
+pub type Touch = ((u32, u32), Rim);
+
+/// The rims of all pieces that touch, ascending. `centres` are those of the kept Gaussians, `labels` their pieces, from 0, and `facing` the
+/// directions, of any length, from which each is seen.
+pub fn rims(centres: &[Vector3<f64>], graph: &Graph, labels: &[i32], facing: &[Vector3<f64>]) -> Vec<Touch> {
+    let patches = patches(centres, graph, labels, facing);
+    let patches = &patches;
+    let touches = (0..centres.len()).into_par_iter().flat_map_iter(|i| {
+        let others = neighbours(graph, i).filter(move |&j| labels[j] != labels[i]);
+        others.map(move |j| {
+            let rising = patches[i].rise_of(&patches[j]).max(patches[j].rise_of(&patches[i])) >= RISES;
+            let (a, b) = (labels[i] as u32, labels[j] as u32);
+            ((a.min(b), a.max(b)), Rim { pairs: 1, rising: u32::from(rising) })
+        })
+    });
+    let mut touches: Vec<Touch> = touches.collect();
+    touches.par_sort_unstable_by_key(|t| t.0);
+    touches.dedup_by(|next, t| {
+        let same = next.0 == t.0;
+        if same {
+            t.1 = t.1.joined(next.1);
+        }
+        same
+    });
+    touches
+}
+
+/// The spatial neighbours of a Gaussian. Rows are padded with the Gaussian itself.
+fn neighbours(graph: &Graph, i: usize) -> impl Iterator<Item = usize> + '_ {
+    graph.gaussian_knn.row(i).into_iter().map(|&j| j as usize).filter(move |&j| j != i)
+}
+
+/// The patch of each Gaussian, as far as its own piece reaches.
+fn patches(centres: &[Vector3<f64>], graph: &Graph, labels: &[i32], facing: &[Vector3<f64>]) -> Vec<Patch> {
+    // Near the origin differences of squares keep their digits.
+    let middle = centres.iter().sum::<Vector3<f64>>() / centres.len().max(1) as f64;
+    let mut moments: Vec<Moments> = centres.iter().map(|x| Moments::of(x - middle)).collect();
+    for _ in 0..ROUNDS {
+        let spread = |i: usize| {
+            let own = neighbours(graph, i).filter(|&j| labels[j] == labels[i]);
+            own.fold(moments[i], |sum, j| sum.and(&moments[j]))
+        };
+        moments = (0..moments.len()).into_par_iter().map(spread).collect();
+    }
+    moments.par_iter().zip(facing).map(|(m, facing)| m.patch(facing)).collect()
+}
+
+/// A bit of surface.
+struct Patch {
+    centre: Vector3<f64>,
+    /// Towards those who see it.
+    normal: Vector3<f64>,
+}
+
+impl Patch {
+    /// Sine of the angle at which `other` lies above this plane; negative below it.
+    fn rise_of(&self, other: &Self) -> f64 {
+        let way = other.centre - self.centre;
+        self.normal.dot(&way) / way.norm().max(1e-300)
+    }
+}
+
+/// Sums over centres: their number, the centres and their squares.
+#[derive(Clone, Copy)]
+struct Moments {
+    count: f64,
+    sum: Vector3<f64>,
+    squares: Matrix3<f64>,
+}
+
+impl Moments {
+    fn of(x: Vector3<f64>) -> Self {
+        Self { count: 1.0, sum: x, squares: x * x.transpose() }
+    }
+
+    fn and(self, other: &Self) -> Self {
+        Self { count: self.count + other.count, sum: self.sum + other.sum, squares: self.squares + other.squares }
+    }
+
+    fn patch(&self, facing: &Vector3<f64>) -> Patch {
+        let centre = self.sum / self.count;
+        let axes = (self.squares / self.count - centre * centre.transpose()).symmetric_eigen();
+        let normal: Vector3<f64> = axes.eigenvectors.column(axes.eigenvalues.imin()).into();
+        Patch { centre, normal: if normal.dot(facing) < 0.0 { -normal } else { normal } }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use ndarray::Array2;
+
+    type Sheet = ([f64; 3], [f64; 3], [f64; 3]);
+
+    /// The share of the rim of two sheets of 20 x 20 Gaussians along which one rises above the other. A sheet has a corner and the steps
+    /// along its edges. All are seen from above.
+    fn step(sheets: [Sheet; 2], moved: f64) -> f64 {
+        let sheet = |(corner, u, v): Sheet| {
+            let [corner, u, v] = [corner, u, v].map(Vector3::from);
+            (0..400).map(move |i| corner.add_scalar(moved) + f64::from(i % 20) * u + f64::from(i / 20) * v)
+        };
+        let centres: Vec<Vector3<f64>> = sheets.into_iter().flat_map(sheet).collect();
+        let labels: Vec<i32> = (0..800).map(|i| i / 400).collect();
+        let nearest = |x: &Vector3<f64>| {
+            let mut order: Vec<u32> = (0..800).collect();
+            order.sort_by(|&a, &b| (centres[a as usize] - x).norm().total_cmp(&(centres[b as usize] - x).norm()));
+            order
+        };
+        let rows: Vec<Vec<u32>> = centres.iter().map(nearest).collect();
+        let gaussian_knn = Array2::from_shape_fn((800, 9), |(i, k)| rows[i][k]);
+        let graph = Graph { kept: (0..800).collect(), gaussian_knn, ..Graph::default() };
+        let touches = rims(&centres, &graph, &labels, &vec![Vector3::new(0.6, -0.4, 10.0); 800]);
+        assert!(touches.len() == 1 && touches[0].0 == (0, 1) && touches[0].1.pairs >= 40, "{touches:?}");
+        f64::from(touches[0].1.rising) / f64::from(touches[0].1.pairs)
+    }
+
+    const FLOOR: Sheet = ([0.0; 3], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]);
+
+    #[test]
+    fn what_stands_or_lies_on_a_floor_rises_above_it() {
+        let wall = ([19.5, 0.0, 0.5], [0.0, 0.0, 1.0], [0.0, 1.0, 0.0]);
+        let shelf = ([17.0, 0.0, 1.5], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]);
+        let ramp = ([20.0, 0.0, 0.6], [0.8, 0.0, 0.6], [0.0, 1.0, 0.0]);
+        for (name, other) in [("wall", wall), ("shelf", shelf), ("ramp", ramp)] {
+            assert!(step([FLOOR, other], 0.0) > 0.9, "{name}: {}", step([FLOOR, other], 0.0));
+            assert!(step([other, FLOOR], 0.0) > 0.9, "{name}");
+        }
+    }
+
+    #[test]
+    fn what_goes_on_flat_or_falls_away_does_not_rise() {
+        let flat = ([20.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]);
+        let roof = ([20.0, 0.0, -0.6], [0.8, 0.0, -0.6], [0.0, 1.0, 0.0]);
+        for (name, other) in [("flat", flat), ("roof", roof)] {
+            assert!(step([FLOOR, other], 0.0) < 0.1, "{name}: {}", step([FLOOR, other], 0.0));
+        }
+    }
+
+    #[test]
+    fn far_from_the_origin_steps_are_the_same() {
+        let wall = ([19.5, 0.0, 0.5], [0.0, 0.0, 1.0], [0.0, 1.0, 0.0]);
+        assert_eq!(step([FLOOR, wall], 0.0), step([FLOOR, wall], 4096.0));
+    }
+}
