@@ -4,7 +4,7 @@ use crate::surface::{Rim, Touch};
 use std::collections::BTreeMap;
 
 /// How much more where the larger of them is e times as large as pieces commonly are: a large piece is more often a whole thing. Chosen on
-/// scenes for tuning (docs/results/real-masks.md), as is [`BY_STEP`].
+/// scenes for tuning and the desk (docs/results/real-masks.md), as is [`BY_STEP`].
 const BY_SIZE: f64 = 0.05;
 /// How much more where one rises above the other all along their rim.
 const BY_STEP: f64 = 0.28;
@@ -17,8 +17,8 @@ pub struct Doubt {
 }
 
 impl Doubt {
-    /// Of pieces with these `sizes`; 0 for what is none. The common size is that of the piece with the middle member, by size of pieces.
-    pub fn new(sizes: &[usize], touches: &[Touch]) -> Self {
+    /// Of pieces with these `sizes`; a size of 0 is no piece. Half of all members are in pieces of the common size or smaller.
+    pub fn new(sizes: &[usize], touches: impl IntoIterator<Item = Touch>) -> Self {
         let mut sorted = sizes.to_vec();
         sorted.sort_unstable();
         let half = sizes.iter().sum::<usize>().div_ceil(2);
@@ -28,7 +28,7 @@ impl Doubt {
             members >= half
         });
         let mut rims = vec![BTreeMap::new(); sizes.len()];
-        for &((a, b), rim) in touches {
+        for ((a, b), rim) in touches {
             rims[a as usize].insert(b, rim);
             rims[b as usize].insert(a, rim);
         }
@@ -64,16 +64,16 @@ mod tests {
 
     #[test]
     fn the_common_size_is_that_of_the_middle_member() {
-        let doubt = Doubt::new(&[1, 90, 0, 60, 29], &[((0, 1), FLAT)]);
+        let doubt = Doubt::new(&[1, 90, 0, 60, 29], [((0, 1), FLAT)]);
         assert!(doubt.common_size == 60 && doubt.of(0, 1, 60).abs() < 1e-9);
         assert!(doubt.of(0, 1, 90) > 0.01 && doubt.of(0, 1, 29) < -0.01);
-        assert_eq!(Doubt::new(&[0], &[]).common_size, 1);
+        assert_eq!(Doubt::new(&[0], []).common_size, 1);
     }
 
     #[test]
     fn what_rises_along_its_rim_must_agree_more() {
         let half = Rim { pairs: 10, rising: 5 };
-        let doubt = Doubt::new(&[1; 5], &[((0, 1), STEP), ((0, 2), half), ((0, 3), FLAT)]);
+        let doubt = Doubt::new(&[1; 5], [((0, 1), STEP), ((0, 2), half), ((0, 3), FLAT)]);
         let of = |b| doubt.of(0, b, 1);
         assert_eq!([1, 2, 3, 4].map(of), [BY_STEP, BY_STEP / 2.0, 0.0, 0.0]);
         assert_eq!(of(1), doubt.of(1, 0, 1));
@@ -81,7 +81,7 @@ mod tests {
 
     #[test]
     fn rims_of_joined_pieces_are_joined() {
-        let mut doubt = Doubt::new(&[1; 4], &[((0, 1), STEP), ((0, 2), STEP), ((1, 2), FLAT), ((1, 3), FLAT)]);
+        let mut doubt = Doubt::new(&[1; 4], [((0, 1), STEP), ((0, 2), STEP), ((1, 2), FLAT), ((1, 3), FLAT)]);
         doubt.join(1, 0);
         let rims = |i: usize| doubt.rims[i].iter().map(|(&j, r)| (j, r.pairs, r.rising)).collect::<Vec<_>>();
         assert_eq!(rims(0), [(2, 2000, 1000), (3, 1000, 0)]);

@@ -64,7 +64,8 @@ pub fn cluster(
         linkage.see(Profile::of_pieces(&labels, count, footprints, levels, &vec![true; views.len()])?);
     }
     linkage.join(FIRM.max(least), usize::MAX, within);
-    linkage.doubt(&rims(&centres, graph, &linkage.labels().0, &facing));
+    linkage.start_to_doubt(&rims(&centres, graph, &linkage.labels().0, &facing));
+    drop((centres, facing));
     linkage.join(least, usize::MAX, within);
     linkage.doubt = None;
     linkage.join(NONE, hdbscan.min_cluster_size, within);
@@ -81,7 +82,8 @@ pub fn cluster(
     Ok(cluster_graph(n, linkage.edges, &options))
 }
 
-/// The centres of the kept Gaussians, and the directions from which they are seen.
+/// The centres of the kept Gaussians, and the directions from which they are seen. One of which the views that were read show nothing is
+/// taken to be seen from all cameras.
 fn centres_and_facing(
     inputs: &Inputs,
     profiles: &[Profile],
@@ -91,7 +93,15 @@ fn centres_and_facing(
     let centre = |&i: &u32| Vector3::from(means[i as usize].map(f64::from));
     let centres: Vec<Vector3<f64>> = inputs.graph.kept.iter().map(centre).collect();
     let cameras: Vec<Vector3<f64>> = inputs.views.iter().map(|v| v.camera.position().to_array().into()).collect();
-    let facing = profiles.par_iter().zip(&centres).map(|(p, x)| p.seen_from(&cameras, x, unit_of)).collect();
+    let facing = |(profile, x): (&Profile, &Vector3<f64>)| {
+        let seen = profile.seen_from(&cameras, x, unit_of);
+        if seen == Vector3::zeros() {
+            cameras.iter().map(|c| (c - x).try_normalize(0.0).unwrap_or_default()).sum()
+        } else {
+            seen
+        }
+    };
+    let facing = profiles.par_iter().zip(&centres).map(facing).collect();
     (centres, facing)
 }
 
@@ -116,7 +126,7 @@ pub struct Linkage<'a> {
     profiles: Vec<Profile>,
     /// Members of each cluster; 0 for one that has joined another.
     sizes: Vec<usize>,
-    /// How much more two must agree because of their size and shape, while that counts ([`Linkage::doubt`]).
+    /// How much more two must agree because of their size and shape, while that counts ([`Linkage::start_to_doubt`]).
     doubt: Option<Doubt>,
     /// Those that each cluster may join, and its agreement with them.
     near: Vec<Vec<(u32, f64)>>,
@@ -213,12 +223,12 @@ impl<'a> Linkage<'a> {
         self.compare_only(&pairs.into_iter().collect::<Vec<_>>());
     }
 
-    /// From now on large clusters must agree more to join, and such as rise above each other. `touches` has the rims of all that touch, as
-    /// [`Linkage::labels`] numbers them.
-    fn doubt(&mut self, touches: &[Touch]) {
+    /// From now on large clusters must agree more to join, and so must two of which one rises above the other. `touches` has the rims of all
+    /// that touch, as [`Linkage::labels`] numbers them.
+    fn start_to_doubt(&mut self, touches: &[Touch]) {
         let left = self.left();
-        let named = |&((a, b), rim): &Touch| ((left[a as usize], left[b as usize]), rim);
-        self.doubt = Some(Doubt::new(&self.sizes, &touches.iter().map(named).collect::<Vec<_>>()));
+        let named = touches.iter().map(|&((a, b), rim)| ((left[a as usize], left[b as usize]), rim));
+        self.doubt = Some(Doubt::new(&self.sizes, named));
     }
 
     /// The cluster that each joins in this round, or itself, and how far it agrees with it.
@@ -230,8 +240,8 @@ impl<'a> Linkage<'a> {
             self.doubt.as_ref().map_or(0.0, |doubt| doubt.of(a, b, size))
         };
         let best = |(i, near): (usize, &Vec<(u32, f64)>)| {
-            let left = near.iter().map(|&(j, value)| (j, (value - more(i as u32, j)).min(1.0)));
-            left.filter(|b| b.1 >= least).max_by(order)
+            let eased = near.iter().map(|&(j, value)| (j, (value - more(i as u32, j)).min(1.0)));
+            eased.filter(|b| b.1 >= least).max_by(order)
         };
         let best: Vec<Option<(u32, f64)>> = self.near.par_iter().enumerate().map(best).collect();
         let rank = |i: u32| (self.sizes[i as usize], Reverse(i));
@@ -401,7 +411,8 @@ mod tests {
             let mut linkage = Linkage::new(views.clone(), &[(0, 1), (2, 3)], &UNIT_OF);
             linkage.sizes = vec![100, 100, 1, 1];
             if let Some(rising) = rising {
-                linkage.doubt(&[((0, 1), Rim { pairs: 100, rising }), ((2, 3), Rim { pairs: 100, rising: 0 })]);
+                linkage
+                    .start_to_doubt(&[((0, 1), Rim { pairs: 100, rising }), ((2, 3), Rim { pairs: 100, rising: 0 })]);
             }
             linkage.join(0.4, usize::MAX, ALL);
             labels(&linkage)

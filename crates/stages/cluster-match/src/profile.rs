@@ -107,6 +107,7 @@ impl Profile {
     }
 
     /// The direction from which something at `x` is seen: the sum of the directions to the `cameras`, by the weight in the masks of each view.
+    /// Zero where no mask has it.
     pub fn seen_from(&self, cameras: &[Vector3<f64>], x: &Vector3<f64>, unit_of: &[u32]) -> Vector3<f64> {
         let way = |&(mask, w): &(u32, f32)| {
             let way = cameras[unit_of[mask as usize] as usize / LEVELS] - x;

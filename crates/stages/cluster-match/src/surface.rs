@@ -10,10 +10,13 @@ const ROUNDS: usize = 4;
 /// Sine of the angle from which a patch rises above the plane of another.
 const RISES: f64 = 0.25;
 
+/// Centres lie in a line where the variance across it is at most this share of the variance along it.
+const LINE: f64 = 1e-6;
+
 /// Where two pieces touch.
 #[derive(Debug, Clone, Copy, Default, PartialEq)]
 pub struct Rim {
-    /// Pairs of neighbours, one in each piece.
+    /// Pairs of neighbours, one in each piece; twice where each is a neighbour of the other.
     pub pairs: u32,
     /// Those of the pairs of which one rises above the surface of the other.
     pub rising: u32,
@@ -61,8 +64,7 @@ fn neighbours(graph: &Graph, i: usize) -> impl Iterator<Item = usize> + '_ {
 
 /// The patch of each Gaussian, as far as its own piece reaches.
 fn patches(centres: &[Vector3<f64>], graph: &Graph, labels: &[i32], facing: &[Vector3<f64>]) -> Vec<Patch> {
-    // Near the origin differences of squares keep their digits.
-    let middle = centres.iter().sum::<Vector3<f64>>() / centres.len().max(1) as f64;
+    let middle = middle(centres);
     let mut moments: Vec<Moments> = centres.iter().map(|x| Moments::of(x - middle)).collect();
     for _ in 0..ROUNDS {
         let spread = |i: usize| {
@@ -74,16 +76,29 @@ fn patches(centres: &[Vector3<f64>], graph: &Graph, labels: &[i32], facing: &[Ve
     moments.par_iter().zip(facing).map(|(m, facing)| m.patch(facing)).collect()
 }
 
+/// The median along each axis. Near the origin differences of squares keep their digits, and one Gaussian far away must not move it.
+fn middle(centres: &[Vector3<f64>]) -> Vector3<f64> {
+    let median = |axis: usize| {
+        let mut values: Vec<f64> = centres.iter().map(|x| x[axis]).collect();
+        let half = values.len() / 2;
+        if values.is_empty() { 0.0 } else { *values.select_nth_unstable_by(half, f64::total_cmp).1 }
+    };
+    Vector3::new(median(0), median(1), median(2))
+}
+
 /// A bit of surface.
 struct Patch {
     centre: Vector3<f64>,
-    /// Towards those who see it.
+    /// Towards those who see it; zero where it has no surface.
     normal: Vector3<f64>,
 }
 
 impl Patch {
-    /// Sine of the angle at which `other` lies above this plane; negative below it.
+    /// Sine of the angle at which `other` lies above this plane, negative below it; 1 where there is no plane: crumbs must agree to join.
     fn rise_of(&self, other: &Self) -> f64 {
+        if self.normal == Vector3::zeros() {
+            return 1.0;
+        }
         let way = other.centre - self.centre;
         self.normal.dot(&way) / way.norm().max(1e-300)
     }
@@ -109,8 +124,14 @@ impl Moments {
     fn patch(&self, facing: &Vector3<f64>) -> Patch {
         let centre = self.sum / self.count;
         let axes = (self.squares / self.count - centre * centre.transpose()).symmetric_eigen();
-        let normal: Vector3<f64> = axes.eigenvectors.column(axes.eigenvalues.imin()).into();
-        Patch { centre, normal: if normal.dot(facing) < 0.0 { -normal } else { normal } }
+        let least = axes.eigenvalues.imin();
+        let most = axes.eigenvalues.imax();
+        let normal: Vector3<f64> = axes.eigenvectors.column(least).into();
+        // The axes of one Gaussian, or of a line, are rounding errors.
+        let middle = axes.eigenvalues.sum() - axes.eigenvalues[least] - axes.eigenvalues[most];
+        let flat = self.count > 1.0 && middle > LINE * axes.eigenvalues[most];
+        let side = if normal.dot(facing) < 0.0 { -1.0 } else { 1.0 };
+        Patch { centre, normal: if flat { side * normal } else { Vector3::zeros() } }
     }
 }
 
@@ -122,23 +143,24 @@ mod tests {
     type Sheet = ([f64; 3], [f64; 3], [f64; 3]);
 
     /// The share of the rim of two sheets of 20 x 20 Gaussians along which one rises above the other. A sheet has a corner and the steps
-    /// along its edges. All are seen from above.
-    fn step(sheets: [Sheet; 2], moved: f64) -> f64 {
+    /// along its edges. All are seen from above. One more Gaussian, a piece of its own, is `far` away.
+    fn step(sheets: [Sheet; 2], moved: f64, far: f64) -> f64 {
         let sheet = |(corner, u, v): Sheet| {
             let [corner, u, v] = [corner, u, v].map(Vector3::from);
             (0..400).map(move |i| corner.add_scalar(moved) + f64::from(i % 20) * u + f64::from(i / 20) * v)
         };
-        let centres: Vec<Vector3<f64>> = sheets.into_iter().flat_map(sheet).collect();
-        let labels: Vec<i32> = (0..800).map(|i| i / 400).collect();
+        let mut centres: Vec<Vector3<f64>> = sheets.into_iter().flat_map(sheet).collect();
+        centres.push(Vector3::repeat(far));
+        let labels: Vec<i32> = (0..801).map(|i| i / 400).collect();
         let nearest = |x: &Vector3<f64>| {
-            let mut order: Vec<u32> = (0..800).collect();
+            let mut order: Vec<u32> = (0..801).collect();
             order.sort_by(|&a, &b| (centres[a as usize] - x).norm().total_cmp(&(centres[b as usize] - x).norm()));
             order
         };
         let rows: Vec<Vec<u32>> = centres.iter().map(nearest).collect();
-        let gaussian_knn = Array2::from_shape_fn((800, 9), |(i, k)| rows[i][k]);
-        let graph = Graph { kept: (0..800).collect(), gaussian_knn, ..Graph::default() };
-        let touches = rims(&centres, &graph, &labels, &vec![Vector3::new(0.6, -0.4, 10.0); 800]);
+        let gaussian_knn = Array2::from_shape_fn((801, 9), |(i, k)| if i < 800 { rows[i][k] } else { 800 });
+        let graph = Graph { kept: (0..801).collect(), gaussian_knn, ..Graph::default() };
+        let touches = rims(&centres, &graph, &labels, &vec![Vector3::new(0.6, -0.4, 10.0); 801]);
         assert!(touches.len() == 1 && touches[0].0 == (0, 1) && touches[0].1.pairs >= 40, "{touches:?}");
         f64::from(touches[0].1.rising) / f64::from(touches[0].1.pairs)
     }
@@ -151,8 +173,8 @@ mod tests {
         let shelf = ([17.0, 0.0, 1.5], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]);
         let ramp = ([20.0, 0.0, 0.6], [0.8, 0.0, 0.6], [0.0, 1.0, 0.0]);
         for (name, other) in [("wall", wall), ("shelf", shelf), ("ramp", ramp)] {
-            assert!(step([FLOOR, other], 0.0) > 0.9, "{name}: {}", step([FLOOR, other], 0.0));
-            assert!(step([other, FLOOR], 0.0) > 0.9, "{name}");
+            assert!(step([FLOOR, other], 0.0, 1e3) > 0.9, "{name}: {}", step([FLOOR, other], 0.0, 1e3));
+            assert!(step([other, FLOOR], 0.0, 1e3) > 0.9, "{name}");
         }
     }
 
@@ -161,13 +183,25 @@ mod tests {
         let flat = ([20.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]);
         let roof = ([20.0, 0.0, -0.6], [0.8, 0.0, -0.6], [0.0, 1.0, 0.0]);
         for (name, other) in [("flat", flat), ("roof", roof)] {
-            assert!(step([FLOOR, other], 0.0) < 0.1, "{name}: {}", step([FLOOR, other], 0.0));
+            assert!(step([FLOOR, other], 0.0, 1e3) < 0.1, "{name}: {}", step([FLOOR, other], 0.0, 1e3));
         }
     }
 
     #[test]
-    fn far_from_the_origin_steps_are_the_same() {
+    fn one_gaussian_or_a_line_has_no_surface_and_so_is_a_step() {
+        let (x, up) = (Vector3::new(1.0, 2.0, 0.0), Vector3::z());
+        let one = Moments::of(x);
+        let line = one.and(&Moments::of(3.0 * x));
+        let plane = line.and(&Moments::of(Vector3::x()));
+        let [one, line, plane] = [one, line, plane].map(|m| m.patch(&up));
+        assert_eq!([one.rise_of(&plane), line.rise_of(&plane)], [1.0; 2]);
+        assert!((plane.normal - up).norm() < 1e-9 && plane.rise_of(&one).abs() < 1e-9);
+    }
+
+    #[test]
+    fn neither_a_far_origin_nor_a_far_gaussian_changes_steps() {
         let wall = ([19.5, 0.0, 0.5], [0.0, 0.0, 1.0], [0.0, 1.0, 0.0]);
-        assert_eq!(step([FLOOR, wall], 0.0), step([FLOOR, wall], 4096.0));
+        let near = step([FLOOR, wall], 0.0, 1e3);
+        assert_eq!([step([FLOOR, wall], 4096.0, 1e3), step([FLOOR, wall], 0.0, 1e15)], [near; 2]);
     }
 }
