@@ -423,6 +423,23 @@ mod tests {
     }
 
     #[test]
+    fn large_pieces_must_agree_more_and_small_ones_less() {
+        // 0 and 1 agree in half of the views, 2 and 3 in three of ten. Pieces have 100 members commonly.
+        let together = |n: usize| [[ONE; 10], std::array::from_fn(|v| if v < n { ONE } else { TWO })];
+        let views: Vec<Profile> = together(5).iter().chain(&together(3)).map(|v| profile(v)).collect();
+        let join = |sizes: [usize; 4], count: bool| {
+            let mut linkage = Linkage::new(views.clone(), &[(0, 1), (2, 3)], &UNIT_OF);
+            linkage.sizes = sizes.to_vec();
+            linkage.doubt = count.then(|| Doubt::new(&[100; 4], []));
+            linkage.join(0.4, usize::MAX, ALL);
+            labels(&linkage)
+        };
+        assert_eq!(join([10000, 1, 1, 1], false), [0, 0, 1, 2]);
+        assert_eq!(join([10000, 1, 1, 1], true), [0, 1, 2, 2]);
+        assert_eq!(join([100; 4], true), [0, 0, 1, 2]);
+    }
+
+    #[test]
     fn clusters_of_some_views_are_judged_by_all() {
         // In the first view all are one; the others show that only 0 and 1 are, and 2 and 3.
         let first: Vec<Profile> = (0..4).map(|_| profile(&[ONE])).collect();

@@ -9,7 +9,6 @@ use rayon::prelude::*;
 const ROUNDS: usize = 4;
 /// Sine of the angle from which a patch rises above the plane of another.
 const RISES: f64 = 0.25;
-
 /// Centres lie in a line where the variance across it is at most this share of the variance along it.
 const LINE: f64 = 1e-6;
 
