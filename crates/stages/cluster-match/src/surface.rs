@@ -2,6 +2,7 @@
 //! above the other.
 
 use artifacts::Graph;
+use gs_scene::middle;
 use nalgebra::{Matrix3, Vector3};
 use rayon::prelude::*;
 
@@ -63,7 +64,8 @@ fn neighbours(graph: &Graph, i: usize) -> impl Iterator<Item = usize> + '_ {
 
 /// The patch of each Gaussian, as far as its own piece reaches.
 fn patches(centres: &[Vector3<f64>], graph: &Graph, labels: &[i32], facing: &[Vector3<f64>]) -> Vec<Patch> {
-    let middle = middle(centres);
+    // Near the origin differences of squares keep their digits.
+    let middle: Vector3<f64> = middle(centres.iter().map(|&x| x.into())).into();
     let mut moments: Vec<Moments> = centres.iter().map(|x| Moments::of(x - middle)).collect();
     for _ in 0..ROUNDS {
         let spread = |i: usize| {
@@ -75,16 +77,6 @@ fn patches(centres: &[Vector3<f64>], graph: &Graph, labels: &[i32], facing: &[Ve
     moments.par_iter().zip(facing).map(|(m, facing)| m.patch(facing)).collect()
 }
 
-/// The median along each axis. Near the origin differences of squares keep their digits, and one Gaussian far away must not move it.
-fn middle(centres: &[Vector3<f64>]) -> Vector3<f64> {
-    let median = |axis: usize| {
-        let mut values: Vec<f64> = centres.iter().map(|x| x[axis]).collect();
-        let half = values.len() / 2;
-        if values.is_empty() { 0.0 } else { *values.select_nth_unstable_by(half, f64::total_cmp).1 }
-    };
-    Vector3::new(median(0), median(1), median(2))
-}
-
 /// A bit of surface.
 struct Patch {
     centre: Vector3<f64>,
@@ -93,7 +85,8 @@ struct Patch {
 }
 
 impl Patch {
-    /// Sine of the angle at which `other` lies above this plane, negative below it; 1 where there is no plane: crumbs must agree to join.
+    /// Sine of the angle at which `other` lies above this plane, negative below it. Without a plane it is 1, so that crumbs
+    /// join only what they agree with.
     fn rise_of(&self, other: &Self) -> f64 {
         if self.normal == Vector3::zeros() {
             return 1.0;

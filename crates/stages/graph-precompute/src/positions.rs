@@ -1,5 +1,7 @@
 //! Positions that f32 arithmetic can bear.
 
+use gs_scene::middle;
+
 /// Coordinates beyond this (after the shift) would overflow when squared in f32.
 const LARGEST: f64 = 1e18;
 
@@ -17,14 +19,7 @@ pub struct Positions {
 /// move the origin away from where the points are. Points that are not finite, or beyond 1e18, are left out.
 pub fn shifted(means: &[[f32; 3]]) -> Positions {
     let finite = |p: &[f32; 3]| p.iter().all(|v| v.is_finite());
-    let mut origin = [0.0; 3];
-    for (axis, o) in origin.iter_mut().enumerate() {
-        let mut values: Vec<f32> = means.iter().filter(|p| finite(p)).map(|p| p[axis]).collect();
-        if !values.is_empty() {
-            let middle = values.len() / 2;
-            *o = f64::from(*values.select_nth_unstable_by(middle, f32::total_cmp).1);
-        }
-    }
+    let origin = middle(means.iter().filter(|p| finite(p)).map(|p| p.map(f64::from)));
     let mut out = Positions { points: Vec::with_capacity(means.len()), usable: Vec::with_capacity(means.len()) };
     for (i, p) in means.iter().enumerate() {
         let q = [0, 1, 2].map(|a| f64::from(p[a]) - origin[a]);
