@@ -8,11 +8,10 @@ use crate::inputs::Inputs;
 use crate::options::Settings;
 use crate::plane::Place;
 use crate::profile::{Profile, some_views, units};
-use crate::surface::{Touch, rims};
+use crate::surface::{Points, Touch};
 use artifacts::{Graph, Level};
 use gs_io::Result;
 use hdbscan_exact::{Clustering, Edge, Options, Selection, cluster_graph};
-use nalgebra::Vector3;
 use rayon::prelude::*;
 use std::cmp::Reverse;
 use std::collections::{BTreeMap, BTreeSet};
@@ -43,6 +42,7 @@ const FIRM: f64 = 0.7;
 /// When the footprints can't be read.
 pub fn cluster(
     inputs: &Inputs,
+    points: &Points,
     settings: &Settings,
     levels: &[Level],
     (least, join): (f64, f64),
@@ -56,7 +56,6 @@ pub fn cluster(
     let views = some_views(footprints, levels, MOST_ENTRIES);
     let own: Vec<i32> = (0..n as i32).collect();
     let profiles = Profile::of_pieces(&own, n, footprints, levels, &views)?;
-    let (centres, facing) = centres_and_facing(inputs, &profiles, &unit_of);
     let mut linkage = Linkage::new(profiles, &neighbours(graph), &unit_of);
     if views.contains(&false) {
         linkage.join(FIRM, usize::MAX, within);
@@ -64,8 +63,7 @@ pub fn cluster(
         linkage.see(Profile::of_pieces(&labels, count, footprints, levels, &vec![true; views.len()])?);
     }
     linkage.join(FIRM.max(least), usize::MAX, within);
-    linkage.start_to_doubt(&rims(&centres, graph, &linkage.labels().0, &facing));
-    drop((centres, facing));
+    linkage.start_to_doubt(&points.rims(&linkage.labels().0));
     linkage.join(least, usize::MAX, within);
     linkage.doubt = None;
     linkage.join(NONE, hdbscan.min_cluster_size, within);
@@ -80,29 +78,6 @@ pub fn cluster(
     linkage.join(NONE, usize::MAX, above);
     let options = Options { epsilon: cut + APART, selection: Selection::Leaf, allow_single_cluster, ..hdbscan };
     Ok(cluster_graph(n, linkage.edges, &options))
-}
-
-/// The centres of the kept Gaussians, and the directions from which they are seen. One of which the views that were read show nothing is
-/// taken to be seen from all cameras.
-fn centres_and_facing(
-    inputs: &Inputs,
-    profiles: &[Profile],
-    unit_of: &[u32],
-) -> (Vec<Vector3<f64>>, Vec<Vector3<f64>>) {
-    let means = &inputs.geometry.gaussians.means;
-    let centre = |&i: &u32| Vector3::from(means[i as usize].map(f64::from));
-    let centres: Vec<Vector3<f64>> = inputs.graph.kept.iter().map(centre).collect();
-    let cameras: Vec<Vector3<f64>> = inputs.views.iter().map(|v| v.camera.position().to_array().into()).collect();
-    let facing = |(profile, x): (&Profile, &Vector3<f64>)| {
-        let seen = profile.seen_from(&cameras, x, unit_of);
-        if seen == Vector3::zeros() {
-            cameras.iter().map(|c| (c - x).try_normalize(0.0).unwrap_or_default()).sum()
-        } else {
-            seen
-        }
-    };
-    let facing = profiles.par_iter().zip(&centres).map(facing).collect();
-    (centres, facing)
 }
 
 /// Pairs of spatial neighbours, each once.

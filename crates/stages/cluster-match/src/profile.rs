@@ -2,7 +2,6 @@
 
 use artifacts::{Footprints, LEVELS, Level, Row};
 use gs_io::Result;
-use nalgebra::Vector3;
 use rayon::prelude::*;
 use std::cmp::Ordering;
 use std::collections::BTreeMap;
@@ -104,16 +103,6 @@ impl Profile {
             of.into_iter().filter(|(_, w)| *w > 0.0).for_each(|(k, w)| masks[k as usize].push((row, w as f32)));
         }
         Ok(masks.into_iter().map(Self::new).collect())
-    }
-
-    /// The direction from which something at `x` is seen: the sum of the directions to the `cameras`, by the weight in the masks of each view.
-    /// Zero where no mask has it.
-    pub fn seen_from(&self, cameras: &[Vector3<f64>], x: &Vector3<f64>, unit_of: &[u32]) -> Vector3<f64> {
-        let way = |&(mask, w): &(u32, f32)| {
-            let way = cameras[unit_of[mask as usize] as usize / LEVELS] - x;
-            way * (f64::from(w) / way.norm().max(1e-300))
-        };
-        self.masks.iter().map(way).sum()
     }
 
     /// Of both together.

@@ -11,6 +11,7 @@ use crate::outputs::{self, Found};
 use crate::parts::split;
 use crate::profile::mask_weights;
 use crate::rank::confidence;
+use crate::surface::Points;
 use crate::{health, linkage, memory};
 use artifacts::{Instances, Level, MaskFeatures, MaskFolder, Match, Row, flat};
 use gs_io::{Error, Result, Watched};
@@ -57,9 +58,10 @@ impl Program for Args {
         )?;
 
         let start = Instant::now();
+        let points = Points::of(&inputs)?;
         let clustering = match settings.cluster {
             Space::Masks => {
-                linkage::cluster(&inputs, &settings, &settings.levels, (settings.agreement, settings.join))?
+                linkage::cluster(&inputs, &points, &settings, &settings.levels, (settings.agreement, settings.join))?
             }
             Space::Graph => on_graph(&inputs.features.values, &inputs.graph, &settings.hdbscan()),
             Space::Free => free(&inputs.features.values, &settings.hdbscan()),
@@ -79,7 +81,8 @@ impl Program for Args {
                  where the scene is one thing",
             );
         }
-        let found = correct(found, &inputs, &settings, stage)?;
+        let found = correct(found, &inputs, &points, &settings, stage)?;
+        drop(points);
 
         let (matches, features) = match_views(a, &settings, &inputs, &found.labels, stage)?;
         if features.is_empty() {
@@ -120,7 +123,13 @@ impl Program for Args {
 }
 
 /// Corrects the clustering by where Gaussians lie and by the masks of each view.
-fn correct(mut found: Assignment, inputs: &Inputs, settings: &Settings, stage: &Stage) -> Result<Assignment> {
+fn correct(
+    mut found: Assignment,
+    inputs: &Inputs,
+    points: &Points,
+    settings: &Settings,
+    stage: &Stage,
+) -> Result<Assignment> {
     let (means, graph, footprints) = (&inputs.geometry.gaussians.means, &inputs.graph, &inputs.footprints);
     let mut kept = vec![false; means.len()];
     graph.kept.iter().for_each(|&i| kept[i as usize] = true);
@@ -142,7 +151,7 @@ fn correct(mut found: Assignment, inputs: &Inputs, settings: &Settings, stage: &
     }
     let small = |row: &Row| row.is_of(&[Level::Small]);
     if settings.split > 0.0 && settings.levels.contains(&Level::Small) && footprints.rows.iter().any(small) {
-        let clustering = linkage::cluster(inputs, settings, &[Level::Small], (PARTS, 0.0))?;
+        let clustering = linkage::cluster(inputs, points, settings, &[Level::Small], (PARTS, 0.0))?;
         let parts = Assignment::new(&clustering, &graph.kept, means.len());
         let split = split(&mut found, &parts, &graph.kept, footprints, settings.split)?;
         if split > 0 {

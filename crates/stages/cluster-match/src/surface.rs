@@ -1,7 +1,9 @@
 //! Where one piece rises above the surface of another: what stands on a table rises above it, one half of the table top does not rise
 //! above the other.
 
+use crate::inputs::Inputs;
 use artifacts::Graph;
+use gs_io::Result;
 use gs_scene::middle;
 use nalgebra::{Matrix3, Vector3};
 use rayon::prelude::*;
@@ -32,49 +34,85 @@ impl Rim {
 /// Two pieces, the smaller number first, and their rim.
 pub type Touch = ((u32, u32), Rim);
 
-/// The rims of all pieces that touch, ascending. `centres` are those of the kept Gaussians, `labels` their pieces, from 0, and `facing` the
-/// directions, of any length, from which each is seen.
-pub fn rims(centres: &[Vector3<f64>], graph: &Graph, labels: &[i32], facing: &[Vector3<f64>]) -> Vec<Touch> {
-    let patches = patches(centres, graph, labels, facing);
-    let patches = &patches;
-    let touches = (0..centres.len()).into_par_iter().flat_map_iter(|i| {
-        let others = neighbours(graph, i).filter(move |&j| labels[j] != labels[i]);
-        others.map(move |j| {
-            let rising = patches[i].rise_of(&patches[j]).max(patches[j].rise_of(&patches[i])) >= RISES;
-            let (a, b) = (labels[i] as u32, labels[j] as u32);
-            ((a.min(b), a.max(b)), Rim { pairs: 1, rising: u32::from(rising) })
-        })
-    });
-    let mut touches: Vec<Touch> = touches.collect();
-    touches.par_sort_unstable_by_key(|t| t.0);
-    touches.dedup_by(|next, t| {
-        let same = next.0 == t.0;
-        if same {
-            t.1 = t.1.joined(next.1);
-        }
-        same
-    });
-    touches
+/// The kept Gaussians as points of surfaces.
+pub struct Points<'a> {
+    /// Their spatial neighbours.
+    graph: &'a Graph,
+    centres: Vec<Vector3<f64>>,
+    /// The directions, of any length, from which each is seen.
+    facing: Vec<Vector3<f64>>,
 }
 
-/// The spatial neighbours of a Gaussian. Rows are padded with the Gaussian itself.
-fn neighbours(graph: &Graph, i: usize) -> impl Iterator<Item = usize> + '_ {
-    graph.gaussian_knn.row(i).into_iter().map(|&j| j as usize).filter(move |&j| j != i)
-}
-
-/// The patch of each Gaussian, as far as its own piece reaches.
-fn patches(centres: &[Vector3<f64>], graph: &Graph, labels: &[i32], facing: &[Vector3<f64>]) -> Vec<Patch> {
-    // Near the origin differences of squares keep their digits.
-    let middle: Vector3<f64> = middle(centres.iter().map(|&x| x.into())).into();
-    let mut moments: Vec<Moments> = centres.iter().map(|x| Moments::of(x - middle)).collect();
-    for _ in 0..ROUNDS {
-        let spread = |i: usize| {
-            let own = neighbours(graph, i).filter(|&j| labels[j] == labels[i]);
-            own.fold(moments[i], |sum, j| sum.and(&moments[j]))
-        };
-        moments = (0..moments.len()).into_par_iter().map(spread).collect();
+impl<'a> Points<'a> {
+    /// Those of the inputs. A Gaussian is seen from the cameras whose masks have it, by its weight in them; one in no mask, from all.
+    ///
+    /// # Errors
+    /// When the footprints can't be read.
+    pub(crate) fn of(inputs: &'a Inputs) -> Result<Self> {
+        let (graph, footprints, means) = (&inputs.graph, &inputs.footprints, &inputs.geometry.gaussians.means);
+        let centres: Vec<Vector3<f64>> =
+            graph.kept.iter().map(|&i| Vector3::from(means[i as usize].map(f64::from))).collect();
+        let cameras: Vec<Vector3<f64>> = inputs.views.iter().map(|v| v.camera.position().to_array().into()).collect();
+        let mut facing = vec![Vector3::zeros(); centres.len()];
+        let rows: Vec<u32> = (0..footprints.rows.len() as u32).collect();
+        footprints.in_batches(&rows, |rows, batch| {
+            for (&row, entries) in rows.iter().zip(batch) {
+                let camera = cameras[footprints.rows[row as usize].view as usize];
+                for (i, w) in entries.iter().map(|(i, w)| (i as usize, f64::from(w))) {
+                    let way = camera - centres[i];
+                    facing[i] += way * (w / way.norm().max(1e-300));
+                }
+            }
+        })?;
+        facing.par_iter_mut().zip(&centres).filter(|(facing, _)| **facing == Vector3::zeros()).for_each(
+            |(facing, x)| *facing = cameras.iter().map(|c| (c - x).try_normalize(0.0).unwrap_or_default()).sum(),
+        );
+        Ok(Self { graph, centres, facing })
     }
-    moments.par_iter().zip(facing).map(|(m, facing)| m.patch(facing)).collect()
+
+    /// The rims of all pieces that touch, ascending. `labels` are the pieces of the Gaussians, from 0.
+    pub fn rims(&self, labels: &[i32]) -> Vec<Touch> {
+        let patches = self.patches(labels);
+        let patches = &patches;
+        let touches = (0..labels.len()).into_par_iter().flat_map_iter(|i| {
+            let others = self.neighbours(i).filter(move |&j| labels[j] != labels[i]);
+            others.map(move |j| {
+                let rising = patches[j].is_above(&patches[i]) || patches[i].is_above(&patches[j]);
+                let (a, b) = (labels[i] as u32, labels[j] as u32);
+                ((a.min(b), a.max(b)), Rim { pairs: 1, rising: u32::from(rising) })
+            })
+        });
+        let mut touches: Vec<Touch> = touches.collect();
+        touches.par_sort_unstable_by_key(|t| t.0);
+        touches.dedup_by(|next, t| {
+            let same = next.0 == t.0;
+            if same {
+                t.1 = t.1.joined(next.1);
+            }
+            same
+        });
+        touches
+    }
+
+    /// The spatial neighbours of a Gaussian. Rows are padded with the Gaussian itself.
+    fn neighbours(&self, i: usize) -> impl Iterator<Item = usize> + '_ {
+        self.graph.gaussian_knn.row(i).into_iter().map(|&j| j as usize).filter(move |&j| j != i)
+    }
+
+    /// The patch of each Gaussian, as far as its own piece reaches.
+    fn patches(&self, labels: &[i32]) -> Vec<Patch> {
+        // Near the origin differences of squares keep their digits.
+        let middle: Vector3<f64> = middle(self.centres.iter().map(|&x| x.into())).into();
+        let mut moments: Vec<Moments> = self.centres.iter().map(|x| Moments::of(x - middle)).collect();
+        for _ in 0..ROUNDS {
+            let spread = |i: usize| {
+                let own = self.neighbours(i).filter(|&j| labels[j] == labels[i]);
+                own.fold(moments[i], |sum, j| sum.and(&moments[j]))
+            };
+            moments = (0..moments.len()).into_par_iter().map(spread).collect();
+        }
+        moments.par_iter().zip(&self.facing).map(|(m, facing)| m.patch(facing)).collect()
+    }
 }
 
 /// A bit of surface.
@@ -85,14 +123,11 @@ struct Patch {
 }
 
 impl Patch {
-    /// Sine of the angle at which `other` lies above this plane, negative below it. Without a plane it is 1, so that crumbs
-    /// join only what they agree with.
-    fn rise_of(&self, other: &Self) -> f64 {
-        if self.normal == Vector3::zeros() {
-            return 1.0;
-        }
-        let way = other.centre - self.centre;
-        self.normal.dot(&way) / way.norm().max(1e-300)
+    /// Whether it lies above the plane of `other`. What has no plane is below everything, so that crumbs join only what they agree
+    /// with.
+    fn is_above(&self, other: &Self) -> bool {
+        let way = self.centre - other.centre;
+        other.normal == Vector3::zeros() || other.normal.dot(&way) >= RISES * way.norm()
     }
 }
 
@@ -152,7 +187,8 @@ mod tests {
         let rows: Vec<Vec<u32>> = centres.iter().map(nearest).collect();
         let gaussian_knn = Array2::from_shape_fn((801, 9), |(i, k)| if i < 800 { rows[i][k] } else { 800 });
         let graph = Graph { kept: (0..801).collect(), gaussian_knn, ..Graph::default() };
-        let touches = rims(&centres, &graph, &labels, &vec![Vector3::new(0.6, -0.4, 10.0); 801]);
+        let facing = vec![Vector3::new(0.6, -0.4, 10.0); 801];
+        let touches = Points { graph: &graph, centres, facing }.rims(&labels);
         assert!(touches.len() == 1 && touches[0].0 == (0, 1) && touches[0].1.pairs >= 40, "{touches:?}");
         f64::from(touches[0].1.rising) / f64::from(touches[0].1.pairs)
     }
@@ -186,8 +222,8 @@ mod tests {
         let line = one.and(&Moments::of(3.0 * x));
         let plane = line.and(&Moments::of(Vector3::x()));
         let [one, line, plane] = [one, line, plane].map(|m| m.patch(&up));
-        assert_eq!([one.rise_of(&plane), line.rise_of(&plane)], [1.0; 2]);
-        assert!((plane.normal - up).norm() < 1e-9 && plane.rise_of(&one).abs() < 1e-9);
+        assert!(plane.is_above(&one) && plane.is_above(&line));
+        assert!((plane.normal - up).norm() < 1e-9 && !one.is_above(&plane));
     }
 
     #[test]
