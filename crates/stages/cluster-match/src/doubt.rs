@@ -6,7 +6,7 @@ use std::collections::BTreeMap;
 /// How much more where the larger of them is e times as large as pieces commonly are: a large piece is more often a whole thing. Chosen on
 /// scenes for tuning and the desk (docs/results/real-masks.md), as is [`BY_STEP`].
 const BY_SIZE: f64 = 0.05;
-/// How much more where one rises above the other all along their rim.
+/// How much more where one rises above the other in another colour all along their rim.
 const BY_STEP: f64 = 0.28;
 
 /// What makes it doubtful that two that agree are one thing.

@@ -56,7 +56,8 @@ pub(crate) struct Settings {
     #[arg(long, value_enum, default_value_t = Space::Masks)]
     pub cluster: Space,
     /// How far the masks of neighbouring pieces must agree that both are one instance, 0 to 1: a lower value joins more. Two of which one
-    /// rises above the other must agree by up to 0.28 more, large pieces by a little more, small ones by a little less. Only with masks
+    /// rises above the other in another colour must agree by up to 0.28 more, large pieces by a little more, small ones by a little less.
+    /// Only with masks
     #[arg(long, value_name = "AGREEMENT", value_parser = stage::within(0.0..=1.0), default_value_t = 0.18)]
     pub agreement: f64,
     /// Fewest Gaussians of an instance [default: 8 with masks, 30 with free points; on the graph a thousandth of the Gaussians that are
