@@ -73,6 +73,7 @@ clean:
 
 ##@ Test
 
+# Optimised as the programs are: else numeric tests take far too long.
 test: ## Run all tests that need nothing but this folder
 	$(CARGO) test --release --workspace
 	scripts/test_pipeline.sh
