@@ -198,8 +198,8 @@ impl<'a> Linkage<'a> {
         self.compare_only(&pairs.into_iter().collect::<Vec<_>>());
     }
 
-    /// From now on large clusters must agree more to join, and so must two of which one rises above the other. `touches` has the rims of all
-    /// that touch, as [`Linkage::labels`] numbers them.
+    /// From now on large clusters must agree more to join, and so must two of which one rises above the other in another colour. `touches` has
+    /// the rims of all that touch, as [`Linkage::labels`] numbers them.
     fn start_to_doubt(&mut self, touches: &[Touch]) {
         let left = self.left();
         let named = touches.iter().map(|&((a, b), rim)| ((left[a as usize], left[b as usize]), rim));

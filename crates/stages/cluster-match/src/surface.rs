@@ -260,7 +260,7 @@ mod tests {
         let plane = line.and(&of(Vector3::x()));
         let [one, line, plane] = [of(x), line, plane].map(|m| m.patch(&up));
         assert!(plane.steps_to(&one) && line.steps_to(&plane));
-        assert!((plane.normal - up).norm() < 1e-9 && !plane.steps_to(&plane));
+        assert!((plane.normal - up).norm() < 1e-9 && !one.is_above(&plane) && !plane.steps_to(&plane));
     }
 
     #[test]
