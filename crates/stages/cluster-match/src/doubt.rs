@@ -38,7 +38,7 @@ impl Doubt {
     /// How much more pieces `a` and `b` must agree, whose larger one has `size` members: less than 0 where it is small.
     pub fn of(&self, a: u32, b: u32, size: usize) -> f64 {
         let rim = self.rims[a as usize].get(&b).copied().unwrap_or_default();
-        let step = f64::from(rim.rising) / f64::from(rim.pairs.max(1));
+        let step = f64::from(rim.steps) / f64::from(rim.pairs.max(1));
         BY_SIZE * (size.max(1) as f64 / self.common_size as f64).ln() + BY_STEP * step
     }
 
@@ -59,8 +59,8 @@ impl Doubt {
 mod tests {
     use super::*;
 
-    const STEP: Rim = Rim { pairs: 1000, rising: 1000 };
-    const FLAT: Rim = Rim { pairs: 1000, rising: 0 };
+    const STEP: Rim = Rim { pairs: 1000, steps: 1000 };
+    const FLAT: Rim = Rim { pairs: 1000, steps: 0 };
 
     #[test]
     fn the_common_size_is_that_of_the_middle_member() {
@@ -72,7 +72,7 @@ mod tests {
 
     #[test]
     fn what_rises_along_its_rim_must_agree_more() {
-        let half = Rim { pairs: 10, rising: 5 };
+        let half = Rim { pairs: 10, steps: 5 };
         let doubt = Doubt::new(&[1; 5], [((0, 1), STEP), ((0, 2), half), ((0, 3), FLAT)]);
         let of = |b| doubt.of(0, b, 1);
         assert_eq!([1, 2, 3, 4].map(of), [BY_STEP, BY_STEP / 2.0, 0.0, 0.0]);
@@ -83,7 +83,7 @@ mod tests {
     fn rims_of_joined_pieces_are_joined() {
         let mut doubt = Doubt::new(&[1; 4], [((0, 1), STEP), ((0, 2), STEP), ((1, 2), FLAT), ((1, 3), FLAT)]);
         doubt.join(1, 0);
-        let rims = |i: usize| doubt.rims[i].iter().map(|(&j, r)| (j, r.pairs, r.rising)).collect::<Vec<_>>();
+        let rims = |i: usize| doubt.rims[i].iter().map(|(&j, r)| (j, r.pairs, r.steps)).collect::<Vec<_>>();
         assert_eq!(rims(0), [(2, 2000, 1000), (3, 1000, 0)]);
         assert_eq!((rims(1), rims(2), rims(3)), (vec![], vec![(0, 2000, 1000)], vec![(0, 1000, 0)]));
     }

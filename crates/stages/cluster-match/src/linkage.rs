@@ -382,12 +382,11 @@ mod tests {
         // 0 and 1 agree in half of the views, 2 and 3 in three of ten.
         let together = |n: usize| [[ONE; 10], std::array::from_fn(|v| if v < n { ONE } else { TWO })];
         let views: Vec<Profile> = together(5).iter().chain(&together(3)).map(|v| profile(v)).collect();
-        let join = |rising: Option<u32>| {
+        let join = |steps: Option<u32>| {
             let mut linkage = Linkage::new(views.clone(), &[(0, 1), (2, 3)], &UNIT_OF);
             linkage.sizes = vec![100, 100, 1, 1];
-            if let Some(rising) = rising {
-                linkage
-                    .start_to_doubt(&[((0, 1), Rim { pairs: 100, rising }), ((2, 3), Rim { pairs: 100, rising: 0 })]);
+            if let Some(steps) = steps {
+                linkage.start_to_doubt(&[((0, 1), Rim { pairs: 100, steps }), ((2, 3), Rim { pairs: 100, steps: 0 })]);
             }
             linkage.join(0.4, usize::MAX, ALL);
             labels(&linkage)

@@ -26,13 +26,13 @@ pub struct Rim {
     /// Pairs of neighbours, one in each piece; twice where each is a neighbour of the other.
     pub pairs: u32,
     /// Those of the pairs of which one rises above the surface of the other, in another colour.
-    pub rising: u32,
+    pub steps: u32,
 }
 
 impl Rim {
     /// Of both together.
     pub fn joined(self, other: Self) -> Self {
-        Self { pairs: self.pairs + other.pairs, rising: self.rising + other.rising }
+        Self { pairs: self.pairs + other.pairs, steps: self.steps + other.steps }
     }
 }
 
@@ -85,7 +85,7 @@ impl<'a> Points<'a> {
             let others = self.neighbours(i).filter(move |&j| labels[j] != labels[i]);
             others.map(move |j| {
                 let (a, b) = (labels[i] as u32, labels[j] as u32);
-                ((a.min(b), a.max(b)), Rim { pairs: 1, rising: u32::from(patches[i].steps_to(&patches[j])) })
+                ((a.min(b), a.max(b)), Rim { pairs: 1, steps: u32::from(patches[i].steps_to(&patches[j])) })
             })
         });
         let mut touches: Vec<Touch> = touches.collect();
@@ -227,7 +227,7 @@ mod tests {
         let hues = labels.iter().map(|&l| hue(colours[l as usize % 2])).collect();
         let touches = Points { graph: &graph, centres, facing, hues }.rims(&labels);
         assert!(touches.len() == 1 && touches[0].0 == (0, 1) && touches[0].1.pairs >= 40, "{touches:?}");
-        f64::from(touches[0].1.rising) / f64::from(touches[0].1.pairs)
+        f64::from(touches[0].1.steps) / f64::from(touches[0].1.pairs)
     }
 
     const FLOOR: Sheet = ([0.0; 3], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]);
