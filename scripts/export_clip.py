@@ -10,7 +10,7 @@ Run it where a model hub can be reached, or give --pretrained the path of a chec
 
     image.onnx   pixels f32 [n, 3, S, S] -> image_embeds f32 [n, d]
     text.onnx    input_ids i64 [n, 77]   -> text_embeds f32 [n, d]
-    clip.json    name, dimension, image_size, mean, std, context_length, pad_id
+    clip.json    name, dimension, image_size, mean, std, context_length
 
 Neither output is scaled to unit length; the programs do that. Models with another tokenizer than CLIP's byte pairs
 (SigLIP, CoCa with its own vocabulary, XLM-Roberta) are refused: the programs could not feed them. Where onnxruntime is
@@ -130,7 +130,6 @@ def main():
         "mean": list(mean),
         "std": list(std),
         "context_length": int(length),
-        "pad_id": 0,
     }
     (args.out / "clip.json").write_text(json.dumps(config, indent=2) + "\n")
     print(f"{args.out}/: image.onnx, text.onnx, clip.json")

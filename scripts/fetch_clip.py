@@ -1,17 +1,17 @@
 #!/usr/bin/env python3
 """Fetches a CLIP model as ONNX from the Hugging Face hub, or a mirror of it, into a folder that `--clip` takes. Needs no PyTorch.
 
-    scripts/fetch_clip.py [FOLDER] [--repo Xenova/clip-vit-base-patch16] [--hub https://huggingface.co] [--revision main]
+    scripts/fetch_clip.py [FOLDER] [--repo Xenova/clip-vit-base-patch16] [--variant fp16] [--hub https://huggingface.co] [--revision main]
 
 The repository must have the hub's usual layout: onnx/vision_model.onnx, onnx/text_model.onnx, preprocessor_config.json,
-tokenizer_config.json. FOLDER (models/clip) then holds
+tokenizer_config.json. --variant fp16 takes vision_model_fp16.onnx and text_model_fp16.onnx, half as large. FOLDER (models/clip) then holds
 
-    image.onnx, text.onnx   the two graphs
-    clip.json               size, mean and standard deviation of pictures, length of texts
+    image.onnx, text.onnx   the two graphs, and *.onnx_data beside them where the hub keeps their weights apart
+    clip.json               size, mean and standard deviation of pictures, most ids of texts
     source.json             repository, revision, and size and SHA-256 of each file
 
 A download that was cut goes on where it was. Files that are there and have the sizes and sums of source.json are not fetched again;
-others are never replaced. `make clip` is this with CLIP_REPO and HUB; the default is OpenAI's ViT-B/16 (600 MB).
+others are never replaced. `make clip` is this with CLIP_REPO, VARIANT and HUB; the default is OpenAI's ViT-B/16 (600 MB, fp16 300 MB).
 """
 import argparse
 import hashlib
@@ -26,7 +26,7 @@ import urllib.parse
 import urllib.request
 from pathlib import Path
 
-GRAPHS = {"image.onnx": "onnx/vision_model.onnx", "text.onnx": "onnx/text_model.onnx"}
+GRAPHS = {"image.onnx": "onnx/vision_model", "text.onnx": "onnx/text_model"}
 # Tries of one file. A try that gets something is followed by another however often that happens.
 TRIES = 4
 ROOT = Path(__file__).resolve().parent.parent
@@ -63,6 +63,18 @@ def request(url, start=0):
         raise
     headers = promises.headers | {k.lower(): v for k, v in answer.headers.items()}
     return answer, headers, answer.status == 206 or start == 0
+
+
+def exists(url):
+    try:
+        with urllib.request.urlopen(urllib.request.Request(url, method="HEAD", headers={"User-Agent": "cags"}), timeout=60):
+            return True
+    except urllib.error.HTTPError as e:
+        if e.code in (403, 404):
+            return False
+        raise Refused(f"{url}: {e.code} {e.reason}: run it again") from None
+    except OSError as e:
+        raise Refused(f"{url}: {getattr(e, 'reason', e)}: run it again") from None
 
 
 def sum_of(path):
@@ -151,8 +163,6 @@ def configuration(a, pictures, words):
             raise Refused(f"{a.repo}: preprocessor_config.json asks for pictures of {size}, not squares")
         size = sides.pop()
     length = words.get("model_max_length", 77)
-    pad = words.get("pad_token", "<|endoftext|>")
-    pad = pad.get("content") if isinstance(pad, dict) else pad
     normal = pictures.get("do_normalize", True)
     return {
         "name": a.repo,
@@ -160,8 +170,22 @@ def configuration(a, pictures, words):
         "mean": pictures["image_mean"] if normal else [0.0, 0.0, 0.0],
         "std": pictures["image_std"] if normal else [1.0, 1.0, 1.0],
         "context_length": length if length < 4096 else 77,
-        "pad_id": 49407 if pad == "<|endoftext|>" else 0,
     }
+
+
+def remote_files(a):
+    """Where on the hub the files of the folder lie. All are looked for before the first is fetched."""
+    ending = f"_{a.variant}" if a.variant else ""
+    files = {}
+    for name, graph in GRAPHS.items():
+        remote = f"{graph}{ending}.onnx"
+        if not exists(address(a, remote)):
+            raise Refused(f"{address(a, remote)}: 404 Not Found: is the repository spelt so, public, and of the hub's layout?")
+        files[name] = remote
+        # A graph names the file of its weights, so that keeps its name.
+        if exists(address(a, f"{remote}_data")):
+            files[f"{Path(remote).name}_data"] = f"{remote}_data"
+    return files
 
 
 def complete(folder, a):
@@ -173,8 +197,9 @@ def complete(folder, a):
     if not source.exists():
         raise Refused(f"{folder}: {', '.join(there)} did not come from here: give another folder, or move them away")
     made = json.loads(source.read_text())
-    if made["repository"] != a.repo:
-        raise Refused(f"{folder}: holds {made['repository']}: give another folder for {a.repo}, or delete this one")
+    if (made["repository"], made.get("variant")) != (a.repo, a.variant):
+        held = " ".join(filter(None, [made["repository"], made.get("variant")]))
+        raise Refused(f"{folder}: holds {held}: give another folder for {a.repo}{f' {a.variant}' if a.variant else ''}, or delete this one")
     for name, file in made["files"].items():
         path = folder / name
         if not path.exists() or path.stat().st_size != file["bytes"] or sum_of(path) != file["sha256"]:
@@ -186,6 +211,7 @@ def main():
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("folder", nargs="?", type=Path, default=Path("models/clip"), help="folder to write [models/clip]")
     parser.add_argument("--repo", default="Xenova/clip-vit-base-patch16", help="repository on the hub [%(default)s]")
+    parser.add_argument("--variant", choices=["fp16"], help="weights of 16 bits, half as large [32 bits]")
     parser.add_argument("--hub", default="https://huggingface.co", help="the hub, or a mirror of it [%(default)s]")
     parser.add_argument("--revision", default="main", help="branch, tag or commit [%(default)s]")
     parser.add_argument("--quiet", action="store_true", help="no progress")
@@ -196,13 +222,14 @@ def main():
         return
     # Graphs are whole, and a pair that fits, before they have their names.
     part = folder / "fetched"
-    asked, begun = f"{a.repo} {a.revision} {a.hub}\n", part / "asked"
+    asked, begun = f"{a.repo} {a.variant or 'fp32'} {a.revision} {a.hub}\n", part / "asked"
     if part.exists() and not (begun.exists() and begun.read_text() == asked):
         shutil.rmtree(part)
     part.mkdir(parents=True, exist_ok=True)
     begun.write_text(asked)
     config = configuration(a, text(a, part, "preprocessor_config.json"), text(a, part, "tokenizer_config.json"))
-    files = {name: fetch(address(a, remote), part / name, not a.quiet and sys.stderr.isatty()) for name, remote in GRAPHS.items()}
+    remotes = remote_files(a)
+    files = {name: fetch(address(a, remote), part / name, not a.quiet and sys.stderr.isatty()) for name, remote in remotes.items()}
     (part / "clip.json").write_text(json.dumps(config, indent=2) + "\n")
     files["clip.json"] = {"bytes": (part / "clip.json").stat().st_size, "sha256": sum_of(part / "clip.json")}
     check = ROOT / "target/release/mask-embed"
@@ -212,7 +239,7 @@ def main():
             raise Refused(checked.stderr.strip().removeprefix("mask-embed: error: "))
     for name in files:
         (part / name).rename(folder / name)
-    source = {"repository": a.repo, "revision": a.revision, "hub": a.hub, "files": files}
+    source = {"repository": a.repo, "variant": a.variant, "revision": a.revision, "hub": a.hub, "files": files}
     (folder / "source.json").write_text(json.dumps(source, indent=2) + "\n")
     shutil.rmtree(part)
     print(f"{folder}/: image.onnx, text.onnx and clip.json of {a.repo}")

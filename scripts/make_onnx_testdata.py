@@ -5,6 +5,7 @@
     /tmp/onnx-venv/bin/python scripts/make_onnx_testdata.py
 
 crates/lib/onnx-models/testdata/ops.onnx         floats and integers in, sum, product and a value in between
+crates/lib/onnx-models/testdata/argmax.onnx      where the largest id of each row is
 crates/lib/onnx-models/testdata/clip/            a dual encoder whose features can be computed by hand
 crates/stages/mask-embed/testdata/sam/           a segmenter by colour with the inputs and outputs of SAM
 crates/stages/mask-embed/testdata/sam2/          the same with the inputs and outputs of SAM 2.1's exports, described by model.json
@@ -54,6 +55,16 @@ def ops():
         [value("a", F, ["n", 3]), value("b", I64, ["n", 3])],
         [value("sum", F, ["n", 3]), value("product", F, ["n", 3]), value("b_twice", I64, ["n", 3])],
         [constant("two", np.float32(2))],
+    )
+
+
+def argmax():
+    """Where the largest of the ids of each row is."""
+    write(
+        ROOT / "crates/lib/onnx-models/testdata/argmax.onnx",
+        [helper.make_node("ArgMax", ["ids"], ["end"], axis=-1, keepdims=0)],
+        [value("ids", I64, ["n", "l"])],
+        [value("end", I64, ["n"])],
     )
 
 
@@ -467,6 +478,7 @@ def sam_tiny():
 
 if __name__ == "__main__":
     ops()
+    argmax()
     clip()
     sam()
     exports()

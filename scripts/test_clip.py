@@ -13,7 +13,7 @@ ROOT = Path(__file__).resolve().parent.parent
 TINY, OTHER = ROOT / "testdata/clip-tiny", ROOT / "crates/lib/onnx-models/testdata/clip"
 PICTURES = {"do_center_crop": True, "crop_size": {"height": 64, "width": 64}, "size": {"shortest_edge": 64}, "rescale_factor": 1 / 255,
             "image_mean": [0.48145466, 0.4578275, 0.40821073], "image_std": [0.26862954, 0.26130258, 0.27577711]}
-WORDS = {"tokenizer_class": "CLIPTokenizer", "model_max_length": 77, "pad_token": "!"}
+WORDS = {"tokenizer_class": "CLIPTokenizer", "model_max_length": 77, "pad_token": "<|endoftext|>"}
 # Most bytes of an answer of the hub that cuts connections.
 CUT = 150_000
 
@@ -26,12 +26,21 @@ class Hub(BaseHTTPRequestHandler):
     def log_message(self, *_):
         pass
 
+    def do_HEAD(self):
+        self.do_GET()
+
     def do_GET(self):
         fault, name = self.path.split("/")[1], self.path.split("/resolve/main/")[-1]
         start = int(self.headers.get("Range", "bytes=0-")[len("bytes="):-1])
-        Hub.asked.append((fault, name, start))
-        graph = {"onnx/vision_model.onnx": "image.onnx", "onnx/text_model.onnx": "text.onnx"}.get(name)
-        if graph:
+        looked = self.command == "HEAD"
+        Hub.asked += [] if looked else [(fault, name, start)]
+        ending = "_fp16" if fault == "half" else ""
+        graph = {f"onnx/vision_model{ending}.onnx": "image.onnx", f"onnx/text_model{ending}.onnx": "text.onnx"}.get(name)
+        if name.endswith("_data") or not graph and name.startswith("onnx/"):
+            if fault != "apart":
+                return self.send_error(404)
+            data = b"weights"
+        elif graph:
             data = ((OTHER if fault == "halves" and graph == "text.onnx" else TINY) / graph).read_bytes()
         else:
             words = WORDS | ({"tokenizer_class": "SiglipTokenizer"} if fault == "siglip" else {})
@@ -51,6 +60,8 @@ class Hub(BaseHTTPRequestHandler):
         self.send_response(206 if start else 200)
         self.send_header("Content-Length", str(len(data) - start))
         self.end_headers()
+        if looked:
+            return
         once = fault == "once" and sum(n == name for f, n, _ in Hub.asked if f == "once") > 1
         self.wfile.write(data[start:start + CUT if fault == "cut" else start + 1000 if fault == "once" and graph and not once else None])
         self.close_connection = True
@@ -62,18 +73,21 @@ def main():
     with tempfile.TemporaryDirectory() as work:
         work = Path(work)
 
-        def fetch(fault, folder, **more):
+        def fetch(fault, folder, *more):
             line = [ROOT / "scripts/fetch_clip.py", work / folder, "--hub", f"http://127.0.0.1:{server.server_port}/{fault}", "--repo", "some/tiny"]
-            return subprocess.run([sys.executable, *line], capture_output=True, text=True, timeout=120, **more)
+            return subprocess.run([sys.executable, *line, *more], capture_output=True, text=True, timeout=120)
 
         def same(folder):
             return all((work / folder / f).read_bytes() == (TINY / f).read_bytes() for f in ("image.onnx", "text.onnx"))
 
-        for fault in ("whole", "cut", "redirect", "once"):
-            done = fetch(fault, fault)
+        for fault in ("whole", "cut", "redirect", "once", "apart", "half"):
+            done = fetch(fault, fault, *(["--variant", "fp16"] if fault == "half" else []))
             assert done.returncode == 0 and same(fault), (fault, done.stderr)
             assert not (work / fault / "fetched").exists()
         assert ("cut", "onnx/vision_model.onnx", CUT) in Hub.asked, "a cut download goes on where it was"
+        assert (work / "apart/text_model.onnx_data").read_bytes() == b"weights", "weights that lie apart keep their name"
+        assert "holds some/tiny: give" in fetch("half", "whole", "--variant", "fp16").stderr, "another variant is another model"
+        assert "pad_id" not in (work / "whole/clip.json").read_text()
         source = json.loads((work / "redirect/source.json").read_text())
         assert source["files"]["text.onnx"]["sha256"] == hashlib.sha256((TINY / "text.onnx").read_bytes()).hexdigest()
         # What is there is checked, and fetched no more.
@@ -96,7 +110,7 @@ def main():
         # A download that was killed: what came is kept. Another repository's part is not mixed with it.
         part = work / "killed/fetched"
         part.mkdir(parents=True)
-        (part / "asked").write_text(f"some/tiny main http://127.0.0.1:{server.server_port}/whole\n")
+        (part / "asked").write_text(f"some/tiny fp32 main http://127.0.0.1:{server.server_port}/whole\n")
         (part / "image.onnx").write_bytes((TINY / "image.onnx").read_bytes()[:5000])
         assert fetch("whole", "killed").returncode == 0 and same("killed")
         assert ("whole", "onnx/vision_model.onnx", 5000) in Hub.asked

@@ -85,7 +85,7 @@ impl Words {
         text_features: Option<PathBuf>,
     ) -> PyResult<Self> {
         let scene = &labelled.scene;
-        let options = TextOptions { clip, text_features, any_model: false, min_support: None };
+        let options = TextOptions { clip, text_features, ..TextOptions::default() };
         let opened = run(py, 0, |_| {
             let source = TextSource::open_for(&scene.artifact, scene.instances.dim(), &options)?;
             let unrelated = Unrelated::encode(&source, &[])?;

@@ -1,11 +1,11 @@
 //! The two halves of a CLIP-shaped dual encoder.
 //!
-//! A model is a folder with `image.onnx` (pixels f32 `[n, 3, S, S]` -> `[n, d]`), `text.onnx` (token ids `[n, 77]` ->
-//! `[n, d]`) and, unless OpenAI's constants are right, `clip.json` ([`ClipConfig`]). Where a graph has several outputs,
+//! A model is a folder with `image.onnx` (pixels f32 `[n, 3, S, S]` -> `[n, d]`), `text.onnx` (token ids `[n, 77]` or `[n, l]`,
+//! with or without an `attention_mask` of that shape -> `[n, d]`) and, unless OpenAI's constants are right, `clip.json` ([`ClipConfig`]). Where a graph has several outputs,
 //! the one whose name ends in `_embeds` is taken, else the first. What comes out is scaled to unit length here.
 
-use crate::{EngineOptions, Kind, Model, Outputs, Tensor, Tokenizer, open, parallel_map};
-use gs_io::{Error, IoContext, Result, hash_files};
+use crate::{EngineOptions, Kind, Model, Outputs, Tensor, Tokenizer, hash_model, open, parallel_map};
+use gs_io::{Error, IoContext, Result};
 use serde::{Deserialize, Serialize};
 use std::path::Path;
 
@@ -28,9 +28,10 @@ pub struct ClipConfig {
     pub mean: [f32; 3],
     /// Divides each channel afterwards.
     pub std: [f32; 3],
-    /// Ids per text. When not given (0): what `text.onnx` declares, else 77.
+    /// Most ids per text. When not given (0): what `text.onnx` declares, else 77.
     pub context_length: usize,
-    /// Id that fills short texts.
+    /// Read and not used: short texts are filled with 0 ([`ClipText::encode`] says why).
+    #[serde(skip_serializing)]
     pub pad_id: i32,
 }
 
@@ -77,10 +78,17 @@ impl ClipConfig {
     }
 }
 
+/// The input of a text encoder that says which ids count.
+const MASK: &str = "attention_mask";
+/// Fills short texts. A text encoder finds a text's end as the largest id, or as the first that is 49407. Hub models are fed more of
+/// that id after it: ONNX says that the first of equals is the largest, but rten (0.27) takes the last. With zeros all agree.
+const PAD: i32 = 0;
+
 /// One graph of the pair: `[n, …]` in, `[n, d]` out.
 struct Encoder {
     model: Box<dyn Model>,
-    input: String,
+    /// The main input, and the mask where there is one.
+    inputs: Vec<String>,
     output: usize,
     dimension: usize,
     /// The batch that the graph insists on, if it does.
@@ -100,7 +108,8 @@ impl Encoder {
         let config = ClipConfig::read(path.parent().unwrap_or(Path::new("")))?;
         let model = open(path, Outputs::Declared, &EngineOptions { threads_per_run: 1, ..options.clone() })?;
         let wrong = |what: &str| Error::new(what).file(path).hint("export the model with scripts/export_clip.py");
-        let [input] = model.inputs() else {
+        let (masks, given): (Vec<_>, Vec<_>) = model.inputs().iter().partition(|i| i.name == MASK);
+        let [input] = given[..] else {
             let names: Vec<&str> = model.inputs().iter().map(|i| i.name.as_str()).collect();
             return Err(wrong("another number of inputs").found(names.join(", ")).expected("one"));
         };
@@ -111,22 +120,24 @@ impl Encoder {
                 .expected(format!("{kind} of rank {rank}")));
         }
         let output = model.outputs().iter().position(|o| o.name.ends_with("_embeds")).unwrap_or(0);
-        let (input, fixed_batch, hash) = (input.name.clone(), input.fixed(0), hash_files([("", path)])?);
-        Ok(Self { input, output, dimension: config.dimension, fixed_batch, hash, model, config })
+        let (fixed_batch, hash) = (input.fixed(0), hash_model(path)?);
+        let inputs = [input].into_iter().chain(masks).map(|i| i.name.clone()).collect();
+        Ok(Self { inputs, output, dimension: config.dimension, fixed_batch, hash, model, config })
     }
 
-    /// Features of `count` items, each unit length or zero. `fill` makes the input of items `range`, padded to `batch`.
+    /// Features of `count` items, each unit length or zero. `fill` makes the inputs of items `range`, padded to `batch`.
     fn encode<'t>(
         &self,
         count: usize,
-        fill: impl Fn(std::ops::Range<usize>, usize) -> Tensor<'t> + Sync,
+        fill: impl Fn(std::ops::Range<usize>, usize) -> Vec<Tensor<'t>> + Sync,
     ) -> Result<Vec<f32>> {
         let batch = self.fixed_batch.unwrap_or(BATCH);
         let parts = parallel_map(count.div_ceil(batch), |b| {
             let range = b * batch..((b + 1) * batch).min(count);
             let size = self.fixed_batch.unwrap_or(range.len());
-            let given = fill(range.clone(), size);
-            let out = self.model.run(&[(&self.input, given)])?;
+            let names = self.inputs.iter().map(String::as_str);
+            let given: Vec<(&str, Tensor)> = names.zip(fill(range.clone(), size)).collect();
+            let out = self.model.run(&given)?;
             let tensor = &out[self.output];
             let wrong = |what: &str| {
                 Error::new(what)
@@ -166,7 +177,7 @@ impl Encoder {
 /// Content hash of one half of a CLIP pair.
 fn hash_in(path: &Path, name: &str) -> Option<String> {
     let folder = if path.is_dir() { path } else { path.parent()? };
-    hash_files([("", folder.join(name))]).ok()
+    hash_model(&folder.join(name)).ok()
 }
 
 /// CLIP's image encoder.
@@ -235,7 +246,7 @@ impl ClipImage {
                 pixels.extend(values.iter().map(|&v| (f32::from(v) / 255.0 - mean) / std));
             }
             pixels.resize(batch * 3 * plane, 0.0);
-            Tensor::f32(&[batch, 3, self.size, self.size], pixels)
+            vec![Tensor::f32(&[batch, 3, self.size, self.size], pixels)]
         })
     }
 }
@@ -243,22 +254,27 @@ impl ClipImage {
 /// CLIP's text encoder with its tokenizer.
 pub struct ClipText {
     encoder: Encoder,
-    length: usize,
+    /// Most ids of a text.
+    most: usize,
+    /// Whether every text has so many, because the graph takes no fewer.
+    always: bool,
     tokenizer: Tokenizer,
 }
 
 impl ClipText {
     /// Opens `text.onnx` and `clip.json` of a folder, or a file and the `clip.json` beside it. The model runs once, on
-    /// an empty text, which checks it and gives its dimension.
+    /// an empty text, which checks it and gives its dimension and whether it takes short texts.
     ///
     /// # Errors
     /// When a file is missing or damaged, or the graph is not `[n, 77]` -> `[n, d]`.
     pub fn open(path: impl AsRef<Path>, options: &EngineOptions) -> Result<Self> {
         let encoder = Encoder::open(path.as_ref(), "text.onnx", 2, Kind::Integer, options)?;
-        let declared = encoder.model.inputs()[0].fixed(1).filter(|&l| (3..=MAX_SIZE).contains(&l));
-        let given = encoder.config.context_length;
-        let length = if given > 0 { given } else { declared.unwrap_or(77) };
-        let mut this = Self { encoder, length, tokenizer: Tokenizer::default() };
+        let fixed = encoder.model.inputs()[0].fixed(1).filter(|&l| (3..=MAX_SIZE).contains(&l));
+        let given = Some(encoder.config.context_length).filter(|&l| l > 0);
+        let most = given.or(fixed).unwrap_or(77);
+        let mut this = Self { encoder, most, always: fixed.is_some(), tokenizer: Tokenizer::default() };
+        // Some graphs leave the length open and fix it further in.
+        this.always |= this.encode(&[""]).is_err();
         this.encoder.dimension = this.encode(&[""])?.len();
         Ok(this)
     }
@@ -283,16 +299,52 @@ impl ClipText {
         hash_in(path.as_ref(), "text.onnx")
     }
 
-    /// Features `[n][d]`, each of unit length, of `n` texts.
+    /// Features `[n][d]`, each of unit length, of `n` texts. Texts are as long as the longest that is encoded with them, where the graph
+    /// allows it: what follows a text's end counts for nothing ([`Self::check`]).
     ///
     /// # Errors
     /// When the engine fails, or the model gives something other than `[n, d]` finite floats.
     pub fn encode(&self, texts: &[impl AsRef<str> + Sync]) -> Result<Vec<f32>> {
+        self.encode_padded(texts, PAD, if self.always { self.most } else { 0 })
+    }
+
+    /// [`Self::encode`] with another id after the end of texts, and at least `least` ids a text.
+    fn encode_padded(&self, texts: &[impl AsRef<str> + Sync], pad: i32, least: usize) -> Result<Vec<f32>> {
         self.encoder.encode(texts.len(), |range, batch| {
             let texts = texts[range].iter().map(AsRef::as_ref).chain(std::iter::repeat("")).take(batch);
-            let encode = |text| self.tokenizer.encode(text, self.length, self.encoder.config.pad_id);
-            let ids: Vec<i32> = texts.flat_map(encode).collect();
-            Tensor::i32(&[batch, self.length], ids)
+            let texts: Vec<Vec<i32>> = texts.map(|text| self.tokenizer.encode(text, self.most)).collect();
+            let length = texts.iter().map(Vec::len).max().unwrap_or(0).max(least);
+            let (mut ids, mut mask) = (vec![pad; batch * length], vec![0; batch * length]);
+            for (at, text) in texts.iter().enumerate() {
+                ids[at * length..][..text.len()].copy_from_slice(text);
+                mask[at * length..][..text.len()].fill(1);
+            }
+            vec![Tensor::i32(&[batch, length], ids), Tensor::i32(&[batch, length], mask)]
         })
+    }
+
+    /// Checks that what follows a text's end counts for nothing: a text has the same feature whatever fills it up, and however long.
+    ///
+    /// # Errors
+    /// When it has not, or the engine fails.
+    pub fn check(&self) -> Result<()> {
+        const TEXTS: [&str; 2] = ["a photo of a cat", "mug"];
+        /// Least cosine of two features that rounding alone tells apart.
+        const SAME: f64 = 0.9999;
+        let right = self.encode(&TEXTS)?;
+        let word = self.tokenizer.encode("a", 3)[1];
+        for (pad, least, how) in [(PAD, self.most, "longer"), (word, self.most, "filled with another id")] {
+            let other = self.encode_padded(&TEXTS, pad, least)?;
+            let cosine = |(a, b): (&[f32], &[f32])| a.iter().zip(b).map(|(&a, &b)| f64::from(a) * f64::from(b)).sum();
+            let rows = right.chunks_exact(self.dimension()).zip(other.chunks_exact(self.dimension()));
+            if let Some(cosine) = rows.map(cosine).find(|cosine: &f64| *cosine < SAME) {
+                return Err(Error::new(format!("a text has another feature when it is {how}"))
+                    .file(self.encoder.model.path())
+                    .found(format!("a cosine of {cosine:.4}"))
+                    .expected("1: CLIP reads a text up to its end")
+                    .hint("this is no CLIP text encoder, or a damaged one: export it with scripts/export_clip.py"));
+            }
+        }
+        Ok(())
     }
 }

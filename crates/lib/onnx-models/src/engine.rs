@@ -1,10 +1,33 @@
 //! What every engine offers: open a model, ask for its inputs and outputs, run it.
 
 use crate::{Graph, Tensor, ort_engine, rten_engine};
-use gs_io::{Error, IoContext, Result};
+use gs_io::{Error, IoContext, Result, hash_files};
+use serde::{Serialize, Serializer};
 use std::path::{Path, PathBuf};
 use std::sync::Mutex;
 use std::sync::atomic::{AtomicUsize, Ordering};
+
+/// Which engine runs the models, as every program asks for it.
+#[derive(Debug, Clone, Default, clap::Args, Serialize)]
+pub struct EngineArgs {
+    /// Run the models with ONNX Runtime instead of the built-in engine: path of libonnxruntime.so, version 1.20 or later.
+    /// Needs ORT_DISABLE_TELEMETRY=1 in the environment [default: the built-in engine, rten]
+    #[arg(long, value_name = "LIBRARY")]
+    #[serde(rename = "engine", serialize_with = "engine_name")]
+    pub onnx_runtime: Option<PathBuf>,
+}
+
+#[allow(clippy::ref_option, reason = "serde asks for this type")]
+fn engine_name<S: Serializer>(library: &Option<PathBuf>, serializer: S) -> std::result::Result<S::Ok, S::Error> {
+    serializer.serialize_str(if library.is_some() { "onnxruntime" } else { "rten" })
+}
+
+impl EngineArgs {
+    /// Options for [`open`], for models of which several runs go on at a time.
+    pub fn options(&self) -> EngineOptions {
+        EngineOptions { onnx_runtime: self.onnx_runtime.clone(), threads_per_run: 1 }
+    }
+}
 
 /// Which engine runs the models, and on how many threads.
 #[derive(Debug, Clone, Default)]
@@ -153,11 +176,40 @@ pub fn open(path: impl AsRef<Path>, outputs: Outputs, options: &EngineOptions) -
         }
     };
     // Weights in a separate file are found by the engine beside the model: only then does it have to read it itself.
-    let external = matches!(outputs, Outputs::Declared) && graph.external_data;
+    let external = matches!(outputs, Outputs::Declared) && !graph.external_data.is_empty();
     match &options.onnx_runtime {
         Some(library) => ort_engine::open(path, bytes, external, names, library),
-        None => rten_engine::open(path, bytes, external, names, options.threads_per_run),
+        None => {
+            refuse_quantised(&graph).map_err(|e| e.file(path))?;
+            rten_engine::open(path, bytes, external, names, options.threads_per_run)
+        }
     }
+}
+
+/// rten's sums of 8-bit integers overflow on processors without VNNI: of a CLIP encoder, features with a cosine of 0.9 to the truth.
+fn refuse_quantised(graph: &Graph) -> Result<()> {
+    let integer = |op: &&str| ["MatMulInteger", "ConvInteger"].contains(op);
+    let found = graph.producers.values().map(|n| n.op.as_str()).find(integer);
+    found.map_or(Ok(()), |op| {
+        Err(Error::new("a graph of 8-bit integers, which the built-in engine gets wrong on many processors")
+            .found(op)
+            .expected("floats of 32 or 16 bits")
+            .hint("fetch another variant (make clip VARIANT=fp16), or give --onnx-runtime"))
+    })
+}
+
+/// Content hash of a model: of its file, and of the files beside it that hold its weights.
+///
+/// # Errors
+/// When one of them cannot be read, or the file is not an ONNX model.
+pub fn hash_model(path: &Path) -> Result<String> {
+    let graph = Graph::parse(&std::fs::read(path).at("read", path)?).map_err(|e| e.file(path))?;
+    let beside = graph.external_data.iter().map(|name| (name.as_str(), path.with_file_name(name)));
+    if let Some((_, missing)) = beside.clone().find(|(_, p)| !p.is_file()) {
+        let e = Error::new("the weights of the model are missing").file(path).expected(missing.display());
+        return Err(e.hint("copy them beside the model"));
+    }
+    hash_files([("", path.to_path_buf())].into_iter().chain(beside))
 }
 
 /// Calls `f(0..count)` on as many threads as rayon has and returns the results in order, for work that runs models:

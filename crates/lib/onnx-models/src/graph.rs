@@ -5,7 +5,7 @@
 //! no output needs any longer is not computed.
 
 use gs_io::{Error, Result};
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::ops::Range;
 
 const MODEL_GRAPH: u64 = 7;
@@ -20,8 +20,10 @@ const TENSOR_DIMS: u64 = 1;
 const TENSOR_TYPE: u64 = 2;
 const TENSOR_NAME: u64 = 8;
 const TENSOR_RAW: u64 = 9;
-/// TensorProto.data_location, 1 for a separate file.
-const TENSOR_LOCATION: u64 = 14;
+/// TensorProto.external_data: pairs of key and value, of which `location` names a file beside the model.
+const TENSOR_EXTERNAL: u64 = 13;
+const PAIR_KEY: u64 = 1;
+const PAIR_VALUE: u64 = 2;
 /// TensorProto.DataType of 32-bit floats.
 const FLOAT: u64 = 1;
 
@@ -45,8 +47,8 @@ pub struct Graph {
     pub outputs: Vec<String>,
     /// Where in the file each constant array lies, by its name.
     pub initializers: BTreeMap<String, Range<usize>>,
-    /// Whether weights lie in a separate file.
-    pub external_data: bool,
+    /// Names of the files beside the model that hold weights.
+    pub external_data: BTreeSet<String>,
 }
 
 /// A field of a protobuf message: number, what it holds, and the bytes of the whole field.
@@ -161,8 +163,13 @@ impl Graph {
                 }
                 GRAPH_OUTPUT => graph.outputs.extend(texts(bytes, &inner, VALUE_NAME)?),
                 GRAPH_INITIALIZER => {
-                    let external = |f: &Field| f.number == TENSOR_LOCATION && matches!(f.value, Value::Varint(1));
-                    graph.external_data |= fields(bytes, inner.clone())?.iter().any(external);
+                    for f in fields(bytes, inner.clone())? {
+                        if let (TENSOR_EXTERNAL, Value::Bytes(pair)) = (f.number, f.value)
+                            && texts(bytes, &pair, PAIR_KEY)? == ["location"]
+                        {
+                            graph.external_data.extend(texts(bytes, &pair, PAIR_VALUE)?);
+                        }
+                    }
                     let names = texts(bytes, &inner, TENSOR_NAME)?;
                     graph.initializers.extend(names.into_iter().map(|name| (name, inner.clone())));
                 }

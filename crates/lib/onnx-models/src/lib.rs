@@ -16,7 +16,7 @@ mod tokenizer;
 
 pub use clip::{ClipConfig, ClipImage, ClipText};
 pub use crop::{Bounds, LabelMap, RgbImage, crop_mask, mask_bounds, resize_rgb};
-pub use engine::{EngineOptions, Kind, Model, Outputs, ValueInfo, open, parallel_map};
+pub use engine::{EngineArgs, EngineOptions, Kind, Model, Outputs, ValueInfo, hash_model, open, parallel_map};
 pub use graph::Graph;
 pub use tensor::{Data, Tensor};
 pub use tokenizer::Tokenizer;

@@ -14,6 +14,7 @@ pub use gaussians::{Chosen, DescribedGaussians, Share};
 pub use granules::{Granules, Kind, Meant};
 pub use gs_raster::pixel_weights;
 pub use nearest::{nearest, nearest_of};
+pub use onnx_models::EngineArgs;
 pub use ranking::{Index, Join, Ranked, Selection};
 pub use scene::{LabelledScene, MIN_OPACITY, nearest_solid, read_features};
 pub use text::{CLIP_TEMPLATES, LERF_NEGATIVES, TextOptions, TextSource, TextTable};

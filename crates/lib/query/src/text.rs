@@ -2,7 +2,7 @@
 
 use artifacts::role;
 use gs_io::{Artifact, Error, IoContext, Result};
-use onnx_models::{ClipImage, ClipText, EngineOptions};
+use onnx_models::{ClipImage, ClipText, EngineArgs};
 use serde::Serialize;
 use std::collections::BTreeMap;
 use std::io::Read;
@@ -22,7 +22,7 @@ pub const CLIP_TEMPLATES: [&str; 7] = [
 ];
 
 /// Where text features come from, and which instances have a descriptor.
-#[derive(Debug, Clone, clap::Args, Serialize)]
+#[derive(Debug, Clone, Default, clap::Args, Serialize)]
 pub struct TextOptions {
     /// CLIP folder with text.onnx: the other half of the model that encoded the masks
     #[arg(long, value_name = "DIR")]
@@ -37,6 +37,10 @@ pub struct TextOptions {
     /// Use only instances that were matched with masks in at least this many views [default: 1; scannet: 2]
     #[arg(long, value_name = "VIEWS")]
     pub min_support: Option<u32>,
+    /// What runs the text encoder.
+    #[command(flatten)]
+    #[serde(flatten)]
+    pub engine: EngineArgs,
 }
 
 impl TextOptions {
@@ -176,7 +180,7 @@ impl TextSource {
     /// Opens what the options name: a CLIP folder or a table.
     pub fn open(o: &TextOptions) -> Result<Self> {
         match (&o.clip, &o.text_features) {
-            (Some(clip), _) => Ok(Self::Clip(Box::new(ClipText::open(clip, &EngineOptions::default())?))),
+            (Some(clip), _) => Ok(Self::Clip(Box::new(ClipText::open(clip, &o.engine.options())?))),
             (None, Some(table)) => Ok(Self::Table(TextTable::read(table)?)),
             (None, None) => {
                 Err(Error::new("no source of text features").field("--clip").expected("--clip or --text-features"))

@@ -94,7 +94,7 @@ fn answers(
     let texts = o.text.iter().zip(features);
     let mut asked: Vec<Asked> = texts.map(|(t, f)| Asked::new(t.clone(), "text", None, asker.answer_text(f))).collect();
     if let Some(clip) = o.texts.clip.as_deref().filter(|_| !o.image.is_empty()) {
-        for (path, feature) in o.image.iter().zip(image::features(&o.image, clip, scene)?) {
+        for (path, feature) in o.image.iter().zip(image::features(&o.image, clip, &o.texts.engine, scene)?) {
             let name = path.file_stem().unwrap_or_default().to_string_lossy().into_owned();
             asked.push(Asked::new(name, "image", None, asker.answer(&feature)));
         }

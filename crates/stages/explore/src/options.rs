@@ -3,7 +3,7 @@
 use clap::{Parser, Subcommand};
 use gs_io::{Error, Result};
 use gs_scene::dataset::Resolution;
-use query::TextOptions;
+use query::{EngineArgs, TextOptions};
 use serde::{Serialize, Serializer};
 use stage::{CommonArgs, Program, Stage};
 use std::net::IpAddr;
@@ -51,6 +51,9 @@ pub struct Source {
     /// Bands of spherical harmonics that the page draws: 0 (16 bytes a Gaussian) or 1 (28 bytes, highlights move)
     #[arg(long, value_name = "DEGREE", default_value_t = 0, value_parser = clap::value_parser!(u8).range(0..=1))]
     pub sh: u8,
+    #[command(flatten)]
+    #[serde(flatten)]
+    pub engine: EngineArgs,
 }
 
 impl Source {
@@ -73,7 +76,7 @@ impl Source {
     /// Where text features come from.
     pub fn texts(&self) -> TextOptions {
         let (clip, text_features) = (self.clip.clone(), self.text_features.clone());
-        TextOptions { clip, text_features, any_model: false, min_support: None }
+        TextOptions { clip, text_features, engine: self.engine.clone(), ..TextOptions::default() }
     }
 
     /// All files that are read but those of the dataset.

@@ -16,6 +16,7 @@ pub(crate) fn run(args: &CheckArgs, stage: &Stage) -> Result<()> {
             .found(format!("{pictures} numbers of a picture, {texts} of a text"))
             .expected("the same number"));
     }
+    text.check()?;
     let name = if image.config().name.is_empty() { "CLIP" } else { &image.config().name };
     stage.info(&format!("{name}: features of {texts} numbers, pictures of {0}x{0}", image.size()));
     Ok(())

@@ -73,8 +73,8 @@ fn tokens(scene: &Path) -> Result<BTreeMap<String, Vec<i32>>> {
     }
     let tokenizer = Tokenizer::default();
     let ids = |text: &String| {
-        let mut ids = tokenizer.encode(text, 77, -1);
-        ids.retain(|&i| i >= 0 && i != Tokenizer::START && i != Tokenizer::END);
+        let mut ids = tokenizer.encode(text, 77);
+        ids.retain(|&i| i != Tokenizer::START && i != Tokenizer::END);
         ids
     };
     Ok(texts.into_iter().map(|text| (text.clone(), ids(&text))).collect())

@@ -3,7 +3,7 @@
 #![allow(rustdoc::invalid_html_tags, reason = "help texts name files as <view>_s.npy")]
 
 use gs_scene::dataset::Resolution;
-use onnx_models::EngineOptions;
+use onnx_models::EngineArgs;
 use serde::{Serialize, Serializer};
 use stage::CommonArgs;
 use std::path::PathBuf;
@@ -47,28 +47,6 @@ pub(crate) struct SceneArgs {
 
 fn as_typed<S: Serializer>(resolution: &Resolution, serializer: S) -> Result<S::Ok, S::Error> {
     serializer.collect_str(resolution)
-}
-
-/// Which engine runs the models.
-#[derive(Debug, Clone, clap::Args, Serialize)]
-pub(crate) struct EngineArgs {
-    /// Run the models with ONNX Runtime instead of the built-in engine: path of libonnxruntime.so, version 1.20 or later.
-    /// Needs ORT_DISABLE_TELEMETRY=1 in the environment [default: the built-in engine, rten]
-    #[arg(long, value_name = "LIBRARY")]
-    #[serde(rename = "engine", serialize_with = "engine_name")]
-    pub onnx_runtime: Option<PathBuf>,
-}
-
-#[allow(clippy::ref_option, reason = "serde asks for this type")]
-fn engine_name<S: Serializer>(library: &Option<PathBuf>, serializer: S) -> Result<S::Ok, S::Error> {
-    serializer.serialize_str(if library.is_some() { "onnxruntime" } else { "rten" })
-}
-
-impl EngineArgs {
-    /// Options for [`onnx_models::open`].
-    pub fn options(&self) -> EngineOptions {
-        EngineOptions { onnx_runtime: self.onnx_runtime.clone(), threads_per_run: 1 }
-    }
 }
 
 /// Id maps from photographs with SAM.

@@ -1,15 +1,20 @@
 //! Features of pictures that are asked for.
 
 use gs_io::{Error, Result};
-use onnx_models::{Bounds, ClipImage, EngineOptions, LabelMap, RgbImage, crop_mask};
-use query::LabelledScene;
+use onnx_models::{Bounds, ClipImage, LabelMap, RgbImage, crop_mask};
+use query::{EngineArgs, LabelledScene};
 use std::path::{Path, PathBuf};
 
 /// Features of the pictures, padded to a square with black, as masks are shown to CLIP.
-pub(super) fn features(pictures: &[PathBuf], clip: &Path, scene: &LabelledScene) -> Result<Vec<Vec<f32>>> {
+pub(super) fn features(
+    pictures: &[PathBuf],
+    clip: &Path,
+    engine: &EngineArgs,
+    scene: &LabelledScene,
+) -> Result<Vec<Vec<f32>>> {
     // --clip may name text.onnx itself; the image encoder lies beside it.
     let folder = if clip.is_dir() { clip } else { clip.parent().unwrap_or(Path::new("")) };
-    let encoder = ClipImage::open(folder, &EngineOptions::default())?;
+    let encoder = ClipImage::open(folder, &engine.options())?;
     if encoder.dimension() != scene.instances.dim() {
         return Err(Error::new("the image features are of another model than the masks'")
             .file(scene.path())
