@@ -15,7 +15,7 @@ mod tensor;
 mod tokenizer;
 
 pub use clip::{ClipConfig, ClipImage, ClipText};
-pub use crop::{Bounds, LabelMap, RgbImage, crop_mask, mask_bounds, resize_rgb};
+pub use crop::{Bounds, Crop, LabelMap, RgbImage, crop_mask, mask_bounds, resize_rgb};
 pub use engine::{EngineArgs, EngineOptions, Kind, Model, Outputs, ValueInfo, hash_model, open, parallel_map};
 pub use graph::Graph;
 pub use tensor::{Data, Tensor};

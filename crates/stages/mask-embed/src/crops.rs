@@ -7,7 +7,7 @@ use crate::photographs;
 use artifacts::{Level, MaskFolder, MaskMaps, MaskTruth, TrueScene, flat, hash_folder, maps_path, role};
 use gs_io::{ArtifactWriter, Error, Result};
 use gs_scene::dataset::View;
-use onnx_models::{Bounds, LabelMap, RgbImage, Tokenizer, crop_mask, mask_bounds};
+use onnx_models::{Bounds, Crop, LabelMap, RgbImage, Tokenizer, crop_mask, mask_bounds};
 use rayon::prelude::*;
 use serde_json::json;
 use stage::Stage;
@@ -36,10 +36,21 @@ pub(crate) fn owners(maps: &MaskMaps) -> Vec<Owner> {
     found.into_iter().enumerate().filter_map(|(id, f)| f.map(|(l, b)| (id, l, b))).collect()
 }
 
-/// Crops of these masks of a view, in their order: `(id, crop)`.
-pub(crate) fn cut(image: &RgbImage, maps: &MaskMaps, owners: &[Owner], size: usize) -> Vec<(usize, Vec<u8>)> {
-    let crop = |&(id, level, bounds): &Owner| (id, crop_mask(image, &label_map(maps, level), id as i32, bounds, size));
-    owners.par_iter().map(crop).collect()
+/// Pictures of these masks of a view, in their order, and of each mask in the order of `crops`: `(id, picture)`.
+pub(crate) fn cut(
+    image: &RgbImage,
+    maps: &MaskMaps,
+    owners: &[Owner],
+    size: usize,
+    crops: &[Crop],
+) -> Vec<(usize, Vec<u8>)> {
+    let crops: Vec<(Crop, [u8; 3])> = crops.iter().map(|&crop| (crop, crop.fill(image))).collect();
+    let pictures: Vec<(&Owner, (Crop, [u8; 3]))> =
+        owners.iter().flat_map(|owner| crops.iter().map(move |&crop| (owner, crop))).collect();
+    let picture = |&(&(id, level, bounds), (crop, fill)): &(&Owner, (Crop, [u8; 3]))| {
+        (id, crop_mask(image, &label_map(maps, level), id as i32, bounds, size, crop, fill))
+    };
+    pictures.par_iter().map(picture).collect()
 }
 
 /// Reads the id maps of a view; `None` with a warning when there are none.
@@ -91,7 +102,7 @@ pub(crate) fn run(args: &CropsArgs, stage: &Stage) -> Result<()> {
     for view in &scene.views {
         let Some(maps) = read_maps(folder, view, stage)? else { continue };
         let (image, _) = photographs::read(view)?;
-        for (id, crop) in cut(&image, &maps, &owners(&maps), args.size) {
+        for (id, crop) in cut(&image, &maps, &owners(&maps), args.size, &args.show.crop) {
             pixels.extend(crop);
             view_of.push(names.len() as u32);
             mask_of.push(id as u32);
@@ -125,7 +136,7 @@ mod tests {
 
     #[test]
     fn every_mask_with_pixels_has_a_crop_whatever_its_level() {
-        let crops = |image: &RgbImage, maps: &MaskMaps| cut(image, maps, &owners(maps), 2);
+        let crops = |image: &RgbImage, maps: &MaskMaps| cut(image, maps, &owners(maps), 2, &[Crop::Black]);
         // 2 x 1 map: default has mask 0 on the left; small none; medium mask 2 on both; large masks 2 (again) and 3.
         let maps = MaskMaps { ids: arr3(&[[[0, -1]], [[-1, -1]], [[2, 2]], [[2, 3]]]) };
         let image = RgbImage { width: 2, height: 1, pixels: vec![10, 10, 10, 200, 200, 200] };

@@ -8,7 +8,7 @@ use artifacts::{MaskFeatures, MaskFolder, MaskMaps, features_path, hash_folder, 
 use gs_io::{Claim, Result, Watched, hash_bytes, hash_file, write_json};
 use gs_scene::dataset::{Dataset, View};
 use ndarray::{Array2, aview1};
-use onnx_models::{ClipImage, ClipText, RgbImage};
+use onnx_models::{ClipImage, ClipText, Crop, RgbImage};
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 use serde_json::json;
@@ -66,7 +66,7 @@ pub(crate) fn run(args: &EmbedArgs, stage: &Stage) -> Result<()> {
             if !std::mem::replace(&mut forecast_made, true) {
                 forecast(&clip, &scene.views, stage)?;
             }
-            let (features, pictures) = embed(&clip, &image, &maps)?;
+            let (features, pictures) = embed(&clip, &image, &maps, &args.show.crop)?;
             let shown = features.values.rows().into_iter().filter(|r| r.iter().any(|&v| v != 0.0)).count();
             watched.check()?;
             finished::remove_manifest(&manifest)?;
@@ -80,8 +80,9 @@ pub(crate) fn run(args: &EmbedArgs, stage: &Stage) -> Result<()> {
     if views.is_empty() {
         return Err(no_maps(folder));
     }
-    if pictures < masks {
-        stage.skipped(&format!("{} of {masks} masks: the same pictures as masks of other levels", masks - pictures));
+    let shown = masks * args.show.crop.len();
+    if pictures < shown {
+        stage.skipped(&format!("{} of {shown} pictures: the same as of masks of other levels", shown - pictures));
     }
     watched.check()?;
     let mut inputs = BTreeMap::from([
@@ -111,13 +112,13 @@ fn claim(args: &EmbedArgs, scene: &Dataset, out: &Path, manifest: &Path, stage: 
 
 /// Features of all masks, and how many different pictures they come from. Levels often hold the very same mask, which is
 /// then encoded once. Pictures are made and encoded [`AT_A_TIME`], so that memory does not grow with the masks.
-fn embed(clip: &ClipImage, image: &RgbImage, maps: &MaskMaps) -> Result<(MaskFeatures, usize)> {
+fn embed(clip: &ClipImage, image: &RgbImage, maps: &MaskMaps, crops: &[Crop]) -> Result<(MaskFeatures, usize)> {
     let (dim, side) = (clip.dimension(), 3 * clip.size() * clip.size());
     let mut first: HashMap<String, usize> = HashMap::new();
     let mut picture_of: Vec<(usize, usize)> = Vec::new();
     let (mut waiting, mut encoded): (Vec<u8>, Vec<f32>) = (Vec::new(), Vec::new());
-    for owners in owners(maps).chunks(AT_A_TIME) {
-        for (id, crop) in cut(image, maps, owners, clip.size()) {
+    for owners in owners(maps).chunks((AT_A_TIME / crops.len()).max(1)) {
+        for (id, crop) in cut(image, maps, owners, clip.size(), crops) {
             let next = first.len();
             picture_of.push((
                 id,
@@ -134,10 +135,22 @@ fn embed(clip: &ClipImage, image: &RgbImage, maps: &MaskMaps) -> Result<(MaskFea
     }
     encoded.extend(clip.encode(&waiting)?);
     let mut values = Array2::zeros((maps.id_count(), dim));
-    for (id, picture) in picture_of {
-        values.row_mut(id).assign(&aview1(&encoded[picture * dim..(picture + 1) * dim]));
+    for of_mask in picture_of.chunks(crops.len()) {
+        let features: Vec<&[f32]> = of_mask.iter().map(|&(_, p)| &encoded[p * dim..(p + 1) * dim]).collect();
+        values.row_mut(of_mask[0].0).assign(&aview1(&unit_mean(&features)));
     }
     Ok((MaskFeatures { values }, first.len()))
+}
+
+/// The mean of features, scaled to unit length; one alone as it is.
+fn unit_mean(features: &[&[f32]]) -> Vec<f32> {
+    if let [one] = features {
+        return one.to_vec();
+    }
+    let mut sum = vec![0.0; features[0].len()];
+    features.iter().for_each(|f| sum.iter_mut().zip(*f).for_each(|(s, &v)| *s += f64::from(v)));
+    let norm = sum.iter().map(|v| v * v).sum::<f64>().sqrt();
+    sum.into_iter().map(|v| if norm > 0.0 { (v / norm) as f32 } else { 0.0 }).collect()
 }
 
 /// Says how much memory the photographs will take, after a full batch of empty pictures has shown what the model takes.

@@ -3,7 +3,7 @@
 #![allow(rustdoc::invalid_html_tags, reason = "help texts name files as <view>_s.npy")]
 
 use gs_scene::dataset::Resolution;
-use onnx_models::EngineArgs;
+use onnx_models::{Crop, EngineArgs};
 use serde::{Serialize, Serializer};
 use stage::CommonArgs;
 use std::path::PathBuf;
@@ -47,6 +47,20 @@ pub(crate) struct SceneArgs {
 
 fn as_typed<S: Serializer>(resolution: &Resolution, serializer: S) -> Result<S::Ok, S::Error> {
     serializer.collect_str(resolution)
+}
+
+/// What CLIP is shown of a mask.
+#[derive(Debug, Clone, clap::Args, Serialize)]
+pub(crate) struct ShowArgs {
+    /// What is beside the mask: black; the photograph's mean colour; or the photograph, in the mask's box with N % of its width
+    /// and height more on each side. Of several, with commas between, embed takes the unit mean of the unit features
+    #[arg(long, default_value = "black", value_name = "black|mean|boxN", value_delimiter = ',')]
+    #[serde(serialize_with = "as_listed")]
+    pub crop: Vec<Crop>,
+}
+
+fn as_listed<S: Serializer>(crops: &[Crop], serializer: S) -> Result<S::Ok, S::Error> {
+    serializer.serialize_str(&crops.iter().map(Crop::to_string).collect::<Vec<_>>().join(","))
 }
 
 /// Id maps from photographs with SAM.
@@ -110,6 +124,9 @@ pub(crate) struct EmbedArgs {
     #[command(flatten)]
     #[serde(flatten)]
     pub engine: EngineArgs,
+    #[command(flatten)]
+    #[serde(flatten)]
+    pub show: ShowArgs,
     /// Folder with id maps (<view>_s.npy)
     #[arg(long, value_name = "FOLDER")]
     #[serde(skip)]
@@ -152,11 +169,15 @@ pub(crate) struct CropsArgs {
     #[command(flatten)]
     #[serde(flatten)]
     pub scene: SceneArgs,
+    #[command(flatten)]
+    #[serde(flatten)]
+    pub show: ShowArgs,
     /// Folder with id maps (<view>_s.npy)
     #[arg(long, value_name = "FOLDER")]
     #[serde(skip)]
     pub masks: PathBuf,
-    /// Output file (safetensors): pixels u8 [n, 3, S, S], view u32 [n], mask u32 [n]; in the metadata the names of the
+    /// Output file (safetensors): pixels u8 [n, 3, S, S], view u32 [n], mask u32 [n], the crops of a mask one after the
+    /// other; in the metadata the names of the
     /// views and, of a synthetic scene, the token ids of every caption
     #[arg(long, value_name = "FILE")]
     #[serde(skip)]

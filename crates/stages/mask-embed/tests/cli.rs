@@ -348,6 +348,40 @@ fn features_are_those_of_the_crops() {
 }
 
 #[test]
+fn the_background_is_chosen_and_several_crops_are_averaged() {
+    let scene = Scene::new(1);
+    scene.make_masks(&scene.masks, &[]);
+    let read = |crop: &str| {
+        let said = ok(&scene.embed_args(&["--crop", crop]));
+        assert!(!said.contains("done already"), "another crop makes other features: {said}");
+        let manifest: serde_json::Value =
+            serde_json::from_slice(&std::fs::read(scene.masks.join("features.json")).unwrap()).unwrap();
+        assert_eq!(manifest["parameters"]["crop"], crop);
+        MaskFeatures::read(features_path(&scene.masks, "v0")).unwrap().values
+    };
+    let (black, mean, near) = (read("black"), read("mean"), read("box20"));
+    assert!(black != mean && mean != near && near != black);
+    let together = read("black,mean,box20");
+    for ((a, b), (c, t)) in black.rows().into_iter().zip(mean.rows()).zip(near.rows().into_iter().zip(together.rows()))
+    {
+        let sum: Vec<f64> = (0..a.len()).map(|i| [a[i], b[i], c[i]].map(f64::from).iter().sum()).collect();
+        let norm = sum.iter().map(|v| v * v).sum::<f64>().sqrt();
+        assert!(sum.iter().zip(t).all(|(s, t)| (s / norm - f64::from(*t)).abs() < 1e-6));
+    }
+    let e = String::from_utf8(run(&scene.embed_args(&["--crop", "black,white"])).stderr).unwrap();
+    assert!(e.contains("'white' for '--crop") && e.contains("expected black, mean, or box0 to box200"), "{e}");
+    // All of them in one file, those of a mask side by side.
+    let out = scene.masks.with_file_name("crops.safetensors");
+    let args =
+        ["crops", "--scene", path(&scene.folder), "--masks", path(&scene.masks), "--out", path(&out), "--size", "8"];
+    ok(&[&args[..], &["--crop", "black,box20"]].concat());
+    let written = Artifact::open(&out, mask_embed::crops::CROPS_FORMAT, 1).unwrap();
+    let mask = written.tensor::<u32>("mask", &[None]).unwrap();
+    assert_eq!(mask.len(), 2 * black.nrows());
+    assert!(mask.chunks(2).all(|m| m[0] == m[1]));
+}
+
+#[test]
 fn crops_are_written_for_training() {
     let scene = Scene::new(2);
     scene.make_masks(&scene.masks, &[]);

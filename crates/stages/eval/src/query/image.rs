@@ -1,7 +1,7 @@
 //! Features of pictures that are asked for.
 
 use gs_io::{Error, Result};
-use onnx_models::{Bounds, ClipImage, LabelMap, RgbImage, crop_mask};
+use onnx_models::{Bounds, ClipImage, Crop, LabelMap, RgbImage, crop_mask};
 use query::{EngineArgs, LabelledScene};
 use std::path::{Path, PathBuf};
 
@@ -29,7 +29,7 @@ pub(super) fn features(
         let ids = vec![0; width * height];
         let map = LabelMap { width, height, ids: &ids };
         let whole = Bounds { x0: 0, y0: 0, x1: width, y1: height };
-        Ok(crop_mask(&picture, &map, 0, whole, encoder.size()))
+        Ok(crop_mask(&picture, &map, 0, whole, encoder.size(), Crop::Black, [0; 3]))
     };
     let crops: Vec<Vec<u8>> = pictures.iter().map(one).collect::<Result<_>>()?;
     Ok(encoder.encode(&crops.concat())?.chunks_exact(encoder.dimension()).map(<[f32]>::to_vec).collect())

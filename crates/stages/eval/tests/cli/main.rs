@@ -122,7 +122,11 @@ fn a_picture_is_a_query() {
     let whole = onnx_models::RgbImage { width, height, pixels: image.to_rgb8() };
     let map = onnx_models::LabelMap { width, height, ids: &vec![0; width * height] };
     let bounds = onnx_models::Bounds { x0: 0, y0: 0, x1: width, y1: height };
-    f.write_found(encoder.encode(&onnx_models::crop_mask(&whole, &map, 0, bounds, encoder.size())).unwrap());
+    f.write_found(
+        encoder
+            .encode(&onnx_models::crop_mask(&whole, &map, 0, bounds, encoder.size(), onnx_models::Crop::Black, [0; 3]))
+            .unwrap(),
+    );
     let image = format!("--image|{}|--views|frame_00002", picture.display());
     let ask = format!("--clip|{CLIP}|{image}|--out|{{}}/out");
     f.good("query", &ask);
