@@ -69,7 +69,8 @@ list = find -L $1 -maxdepth 1 -type f -name $2 -printf '%s %T@ %p\n' | LC_ALL=C 
 scene_FILES = $(BIN)/gs-geom inspect $(call arg,PHOTOGRAPHS)
 geometry_FILES = $(call list,$(call arg,GEOMETRY),'*')
 masks_FILES = $(call list,$(MASKS)/,'*_s.npy')
-clip_FILES = $(call list,$(call arg,CLIP)/,'*')
+# Not the text features that programs keep there.
+clip_FILES = $(call list,$(call arg,CLIP)/,'*' ! -name 'cags-texts-*')
 texts_FILES = $(call list,$(call arg,TEXTS),'*')
 
 space := $(subst ,, )

@@ -299,6 +299,11 @@ impl ClipText {
         hash_in(path.as_ref(), "text.onnx")
     }
 
+    /// The file of the graph.
+    pub fn path(&self) -> &Path {
+        self.encoder.model.path()
+    }
+
     /// Features `[n][d]`, each of unit length, of `n` texts. Texts are as long as the longest that is encoded with them, where the graph
     /// allows it: what follows a text's end counts for nothing ([`Self::check`]).
     ///

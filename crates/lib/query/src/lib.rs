@@ -1,6 +1,7 @@
 //! What answers a question about one set of instances: the instances with their Gaussians (`scene`), features of texts
-//! (`text`), the ranking by them (`ranking`) and whether the best is better than by chance (`chance`), the part, thing or group that is meant (`granules`), Gaussians with descriptors of their own (`gaussians`), which Gaussian is nearest to a point (`nearest`) and which a pixel shows.
+//! (`text`) that are kept beside the model (`cache`), the ranking by them (`ranking`) and whether the best is better than by chance (`chance`), the part, thing or group that is meant (`granules`), Gaussians with descriptors of their own (`gaussians`), which Gaussian is nearest to a point (`nearest`) and which a pixel shows.
 
+mod cache;
 mod chance;
 mod gaussians;
 mod granules;
@@ -9,6 +10,7 @@ mod ranking;
 mod scene;
 mod text;
 
+pub use cache::encode_cached;
 pub use chance::{Unrelated, Verdict};
 pub use gaussians::{Chosen, DescribedGaussians, Share};
 pub use granules::{Granules, Kind, Meant};
