@@ -34,6 +34,7 @@ OPTIONS := $(OUT)/.options
 GRAPH := $(OUT)/graph.safetensors
 FOOTPRINTS := $(OUT)/footprints.safetensors
 FEATURES := $(OUT)/features.safetensors
+DRAFT := $(OUT)/draft.safetensors
 INSTANCES := $(OUT)/instances.safetensors
 SCENE_FILES ?= $(OPTIONS)/scene.files
 ifeq ($(GEOMETRY),)
@@ -159,15 +160,19 @@ endif
 $(OUT)/masks/masks.json: $(SCENE_FILES) $(OPTIONS)/masks | $(BIN)/mask-embed
 	$(masks_RUN)
 
-# Stage 0, language half: CLIP features of every mask.
+# Stage 3 up to language, and CLIP features of the masks that instances are described by.
 ifneq ($(and $(CLIP),$(if $(LANGUAGE),,none)),)
 LANGUAGE := $(MASKS)/features.json
-$(LANGUAGE): $(MASKS_DONE) $(OPTIONS)/embed $(OPTIONS)/clip.files | $(BIN)/mask-embed
-	$(embed_RUN)
+cluster_FROM := --from $(DRAFT)
+$(DRAFT): $(FEATURES) $(OPTIONS)/cluster | $(BIN)/cluster-match
+	$(cluster_RUN) --draft $@
+
+$(LANGUAGE): $(DRAFT) $(OPTIONS)/embed $(OPTIONS)/clip.files | $(BIN)/mask-embed
+	$(embed_RUN) --only $(DRAFT)
 endif
 
 .PHONY: masked
-masked: $(MASKS_DONE) $(LANGUAGE)
+masked: $(MASKS_DONE)
 
 # Stage 2a writes two files in one run; the second hangs on the first so that `make -j` does not start it twice.
 $(GRAPH): $(SCENE_FILES) $(GEOMETRY_DONE) $(MASKS_DONE) $(OPTIONS)/graph | $(BIN)/graph-precompute
@@ -183,7 +188,7 @@ $(FEATURES): $(GEOMETRY_DONE) $(GRAPH) $(FOOTPRINTS) $(OPTIONS)/feat | $(BIN)/fe
 
 # Stage 3.
 $(INSTANCES): $(FEATURES) $(LANGUAGE) $(OPTIONS)/cluster | $(BIN)/cluster-match
-	$(cluster_RUN)
+	$(cluster_RUN) $(cluster_FROM)
 
 # Stage 4.
 $(OUT)/score.json: $(INSTANCES) $(OPTIONS)/score | $(BIN)/eval

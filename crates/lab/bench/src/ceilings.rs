@@ -2,7 +2,7 @@
 //! groups. Both become instances that `eval score` scores as any others.
 
 use artifacts::{Footprints, Instances, Level, TruePoints, role};
-use cluster_match::{describe, mask_weights};
+use cluster_match::{gather, mask_weights};
 use gs_io::{Error, Result, Watched, hash_file, write_json};
 use gs_scene::Geometry;
 use gs_scene::dataset::{self, Dataset, LoadOptions};
@@ -148,8 +148,8 @@ impl World {
     fn instances(&self, labels: Vec<i32>) -> Instances {
         let (nodes, things) = (vec![-1; labels.len()], labels.iter().max().map_or(0, |&most| (most + 1) as usize));
         let score = eval::true_confidence(&self.geometry, &labels, things, &self.points);
-        let described = describe(&self.geometry.gaussians.means, labels, things, Vec::new(), &BTreeMap::new());
-        Instances { score, node: nodes, ..described }
+        let gathered = gather(&self.geometry.gaussians.means, labels, things, Vec::new());
+        Instances { score, node: nodes, ..gathered }
     }
 }
 

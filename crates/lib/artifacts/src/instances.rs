@@ -196,7 +196,17 @@ impl Instances {
     pub fn write(&self, path: impl AsRef<Path>, mut provenance: Provenance) -> Result<()> {
         provenance.format = Self::FORMAT.into();
         provenance.version = Self::VERSION;
+        self.write_into(ArtifactWriter::new(self.provenance(provenance)), path)
+    }
+
+    /// A provenance with the names of the views.
+    pub(crate) fn provenance(&self, mut provenance: Provenance) -> Provenance {
         provenance.extra["views"] = json!(self.views);
+        provenance
+    }
+
+    /// Writes an artifact of these tensors and those that `writer` has already.
+    pub(crate) fn write_into<'a>(&'a self, writer: ArtifactWriter<'a>, path: impl AsRef<Path>) -> Result<()> {
         let (k, m, t) = (self.len(), self.matches.len(), self.tree.len());
         let center = column(&self.oriented, |b| b.center);
         let axes = column(&self.oriented, |b| b.axes);
@@ -206,7 +216,7 @@ impl Instances {
             Members::Instance(k) => (k as i32, 0),
             Members::Cluster(c) => (-1, c),
         };
-        ArtifactWriter::new(provenance)
+        writer
             .tensor("granule_instance", &[q], &column(granules, |g| members(g).0))
             .tensor("granule_cluster", &[q], &column(granules, |g| members(g).1))
             .tensor("granule_support", &[q], &column(granules, |g| g.support))
@@ -243,20 +253,25 @@ impl Instances {
     /// When the file is damaged, tensors do not fit together, or an index is out of range.
     pub fn read(path: impl AsRef<Path>) -> Result<(Self, Artifact)> {
         let a = Artifact::open(path, Self::FORMAT, Self::VERSION)?;
+        Ok((Self::from_artifact(&a)?, a))
+    }
+
+    /// The instances that an artifact holds, checked.
+    pub(crate) fn from_artifact(a: &Artifact) -> Result<Self> {
         let count = a.tensor::<u32>("count", &[None])?.to_vec();
         let k = count.len();
-        let descriptor = table(&a, "descriptor", [Some(k), None])?;
-        let views = view_names(&a)?;
+        let descriptor = table(a, "descriptor", [Some(k), None])?;
+        let views = view_names(a)?;
         let triples = |name: &str| -> Result<Vec<[f32; 3]>> {
             Ok(a.tensor::<f32>(name, &[Some(k), Some(3)])?.as_chunks::<3>().0.to_vec())
         };
         let label = a.tensor::<i32>("label", &[None])?.to_vec();
-        check_labels(&a, "label", &label, k)?;
+        check_labels(a, "label", &label, k)?;
         let (center, half) = (triples("obb_center")?, triples("obb_half_size")?);
-        let tree = read_tree(&a, k)?;
-        let granules = granules::read(&a, k, &tree)?;
+        let tree = read_tree(a, k)?;
+        let granules = granules::read(a, k, &tree)?;
         let axes = a.tensor::<f32>("obb_axes", &[Some(k), Some(3), Some(3)])?.as_chunks::<3>().0.as_chunks::<3>().0;
-        let instances = Self {
+        Ok(Self {
             oriented: (0..k).map(|i| OrientedBox { center: center[i], axes: axes[i], half_size: half[i] }).collect(),
             node: a.tensor("node", &[Some(label.len())])?.to_vec(),
             label,
@@ -266,17 +281,16 @@ impl Instances {
             bbox_min: triples("bbox_min")?,
             bbox_max: triples("bbox_max")?,
             count,
-            matches: read_matches(&a, k, views.len())?,
+            matches: read_matches(a, k, views.len())?,
             tree,
             views,
             granule_descriptor: match granules.is_empty() {
                 true => Array2::default((0, descriptor.ncols())),
-                false => table(&a, "granule_descriptor", [Some(granules.len()), Some(descriptor.ncols())])?,
+                false => table(a, "granule_descriptor", [Some(granules.len()), Some(descriptor.ncols())])?,
             },
             descriptor,
             granules,
-        };
-        Ok((instances, a))
+        })
     }
 }
 

@@ -6,6 +6,7 @@
 
 mod checks;
 mod descriptors;
+mod draft;
 mod edits;
 mod extents;
 mod features;
@@ -24,6 +25,7 @@ mod truth;
 use ndarray::{ArrayView, Dimension};
 
 pub use descriptors::Descriptors;
+pub use draft::{Draft, Witness};
 pub use edits::{Edit, Edits, Remarks};
 pub use extents::Extents;
 pub use features::Features;

@@ -277,11 +277,12 @@ impl MaskFeatures {
         Ok(Self { values })
     }
 
-    /// Those of the masks of a view, if `folder` has any: at least one for each mask of `maps`, and of `dim` dimensions where that is known.
+    /// Those of the masks of a view, if `folder` has any: at least one for each of its `masks` ids, and of `dim` dimensions where that is
+    /// known.
     ///
     /// # Errors
     /// When the file is damaged or does not fit.
-    pub fn of_view(folder: &Path, stem: &str, maps: &MaskMaps, dim: Option<usize>) -> Result<Option<Self>> {
+    pub fn of_view(folder: &Path, stem: &str, masks: usize, dim: Option<usize>) -> Result<Option<Self>> {
         let path = features_path(folder, stem);
         if !path.is_file() {
             return Ok(None);
@@ -292,8 +293,8 @@ impl MaskFeatures {
             Err(e.hint("run mask-embed embed again, with the model of the other features and of the texts"))
         };
         let (rows, columns) = features.values.dim();
-        if rows < maps.id_count() {
-            return wrong("fewer features than masks", "rows", rows, format!("at least {}", maps.id_count()));
+        if rows < masks {
+            return wrong("fewer features than masks", "rows", rows, format!("at least {masks}"));
         }
         match dim {
             Some(dim) if dim != columns => wrong("features of different models", "columns", columns, dim.to_string()),

@@ -1,7 +1,7 @@
 //! Whether a text means anything that is there. Some instance is always the most like a text, so a best score says little alone:
 //! beside it stand the best scores of texts that have nothing to do with any scene.
 
-use crate::{Granules, Index, TextSource};
+use crate::{Granules, Index, TextSource, encode_cached};
 use gs_io::Result;
 use serde::{Deserialize, Serialize};
 
@@ -40,7 +40,7 @@ impl Unrelated {
     /// When the encoder fails.
     pub fn encode(source: &TextSource, templates: &[String]) -> Result<Option<Self>> {
         let texts: Vec<String> = Self::texts().map(String::from).collect();
-        let features: Vec<Vec<f32>> = source.encode_in(templates, &texts)?.into_iter().flatten().collect();
+        let features: Vec<Vec<f32>> = encode_cached(source, templates, &texts)?.into_iter().flatten().collect();
         Ok((features.len() >= LEAST).then_some(Self { features }))
     }
 

@@ -4,7 +4,7 @@
 //! their masks agree (`profile` says how far, `plane` tells floors and walls), `group` by their features;
 //! `assignment` keeps who belongs to which instance, and gives noise and unseen Gaussians to their neighbours; where features
 //! were clustered, `vote` corrects rims. `associate` matches instances with the
-//! masks of each view, `describe` gathers what is known of each instance, `rank` says how sure it is one whole thing,
+//! masks of each view, `describe` gathers what is known of each instance and which masks say what it means, `rank` says how sure it is one whole thing,
 //! `health` how far masks and instances agree, `memory` forecasts the peak.
 
 mod assignment;
@@ -30,6 +30,6 @@ mod testing;
 mod vote;
 
 pub use associate::{FeatureTable, Overlaps, Region, best_masks, matches, overlaps};
-pub use describe::describe;
+pub use describe::{descriptors, gather, witnesses};
 pub use options::Args;
 pub use profile::mask_weights;

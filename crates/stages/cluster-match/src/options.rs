@@ -35,6 +35,13 @@ pub struct Args {
     /// (an i32 for every Gaussian, -1 for none) and <name>.json (the instances as text)
     #[arg(long, value_name = "FILE")]
     pub(crate) out: PathBuf,
+    /// Stop before language: write the instances without descriptors, and the masks whose features these will read, into this file,
+    /// and nothing else. Then `mask-embed embed --only FILE`, then this command again with --from FILE in place of --draft FILE
+    #[arg(long, value_name = "FILE", conflicts_with = "from")]
+    pub(crate) draft: Option<PathBuf>,
+    /// Go on from a file of --draft, made with the same inputs and options
+    #[arg(long, value_name = "FILE")]
+    pub(crate) from: Option<PathBuf>,
     /// Paint the Gaussians of the PLY beside the output in the colours of their instances, instead of their own
     #[arg(long)]
     pub(crate) paint: bool,
@@ -122,6 +129,16 @@ pub(crate) struct Settings {
         help_heading = "Matching"
     )]
     pub granules: usize,
+    /// Views whose masks say what an instance, a part or a group means, those that fit best; 0 for all that show it; for free points the
+    /// default is 0, as in the paper
+    #[arg(
+        long,
+        value_name = "VIEWS",
+        default_value = "8",
+        default_value_if("cluster", "free", "0"),
+        help_heading = "Matching"
+    )]
+    pub describe_views: usize,
 }
 
 /// Largest count that an option takes: as many as there can be Gaussians.

@@ -3,12 +3,13 @@
 use crate::health;
 use crate::inputs::Inputs;
 use crate::options::{Args, Settings};
-use artifacts::{Health, Instances, NOISE_COLOR, instance_color};
+use artifacts::{Draft, Health, Instances, NOISE_COLOR, instance_color, role};
 use gs_io::{Claim, Error, Outputs, Result, write_bytes};
 use gs_scene::{Gaussians, Labelled, SH_C0, ply};
 use ndarray::aview1;
 use serde_json::{Value, json};
 use stage::Stage;
+use std::collections::{BTreeMap, BTreeSet};
 use std::path::Path;
 
 /// What is written beside the output, by extension: Gaussians with their instances, labels, and the instances as text.
@@ -20,11 +21,15 @@ pub(crate) fn claim(a: &Args, stage: &Stage) -> Result<Claim> {
     for suffix in ["_s.npy", "_f.npy"] {
         maps.extend(artifacts::folder_files(&a.masks, suffix)?);
     }
+    let read = [&a.geometry, &a.graph, &a.footprints, &a.features].into_iter().chain(&a.from);
+    if let Some(draft) = &a.draft {
+        return stage.outputs(draft).artifact(draft, Draft::FORMAT).reads(read).reads(maps).claim();
+    }
     let outputs = stage
         .outputs(&a.out)
         .artifact(&a.out, Instances::FORMAT)
         .files(SIDE_FILES.map(|extension| a.out.with_extension(extension)))
-        .reads([&a.geometry, &a.graph, &a.footprints, &a.features])
+        .reads(read)
         .reads(maps)
         .drop_stale();
     a.per_instance_plys.iter().fold(outputs, Outputs::folder).claim()
@@ -32,11 +37,67 @@ pub(crate) fn claim(a: &Args, stage: &Stage) -> Result<Claim> {
 
 /// What the stage found.
 pub(crate) struct Found {
-    pub instances: Instances,
+    pub draft: Draft,
     pub health: Health,
     /// Gaussians that the clustering called noise.
     pub noise: usize,
     pub clustering_seconds: f64,
+}
+
+/// Roles of the inputs that a draft is made of: all but language.
+fn before_language(inputs: &Inputs) -> BTreeMap<String, String> {
+    let language = [role::MASK_FEATURES, role::CLIP, role::CLIP_TEXT];
+    inputs.hashes.clone().into_iter().filter(|(role, _)| !language.contains(&role.as_str())).collect()
+}
+
+/// Writes what is known before language.
+pub(crate) fn write_draft(
+    path: &Path,
+    stage: &Stage,
+    inputs: &Inputs,
+    found: &Found,
+    settings: &Settings,
+    claim: &mut Claim,
+) -> Result<()> {
+    let parameters = serde_json::to_value(settings).map_err(|e| Error::new(e.to_string()))?;
+    let hashes = before_language(inputs);
+    let masks: usize = found.draft.wanted().values().map(BTreeSet::len).sum();
+    let summary = json!({ "instances": found.draft.instances.len(), "masks": masks });
+    stage.record(claim, parameters.clone(), hashes.clone(), summary)?;
+    let mut provenance = stage.provenance(Draft::FORMAT, 1, parameters, hashes);
+    provenance.extra = json!({ "health": found.health, "noise": found.noise });
+    found.draft.write(path, provenance)?;
+    let (path, instances) = (path.display(), found.draft.instances.len());
+    stage.info(&format!("wrote {path}: {instances} instances, {masks} masks that say what they mean"));
+    Ok(())
+}
+
+/// Reads a draft that these inputs and settings made.
+///
+/// # Errors
+/// When others made it, or it is damaged.
+pub(crate) fn read_draft(path: &Path, inputs: &Inputs, settings: &Settings) -> Result<Found> {
+    let (draft, file) = Draft::read(path)?;
+    for (role, hash) in before_language(inputs) {
+        file.expect_input(&role, &hash)?;
+    }
+    let provenance = file.provenance();
+    let fail = |e: serde_json::Error| Error::new(e.to_string()).file(path);
+    let parameters = serde_json::to_value(settings).map_err(fail)?;
+    if let Some(map) = parameters.as_object()
+        && let Some((name, value)) = map.iter().find(|(name, value)| provenance.parameters.get(name) != Some(value))
+    {
+        let given = provenance.parameters.get(name).cloned().unwrap_or_default();
+        return Err(Error::new("the draft was made with another option")
+            .file(path)
+            .field(name)
+            .found(given)
+            .expected(value)
+            .hint("give the options of --draft again, or make the draft again"));
+    }
+    let health = serde_json::from_value(provenance.extra["health"].clone()).map_err(fail)?;
+    let noise = provenance.extra["noise"].as_u64().unwrap_or(0) as usize;
+    Ok(Found { draft, health, noise, clustering_seconds: 0.0 })
 }
 
 /// Writes everything, the artifact last: where it is new, so is everything beside it.
@@ -48,7 +109,7 @@ pub(crate) fn write(
     settings: &Settings,
     claim: &mut Claim,
 ) -> Result<()> {
-    let Found { instances, health, noise, clustering_seconds } = found;
+    let Found { draft: Draft { instances, .. }, health, noise, clustering_seconds } = found;
     let fail = |e: serde_json::Error| Error::new(e.to_string());
     let parameters = serde_json::to_value(settings).map_err(fail)?;
     let own = vec![format!("made by cluster-match {}", env!("CARGO_PKG_VERSION")), format!("parameters {parameters}")];

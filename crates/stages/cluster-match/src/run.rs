@@ -2,8 +2,8 @@
 
 use crate::assignment::Assignment;
 use crate::associate::{FeatureTable, matches, overlaps};
-use crate::describe::{describe, mean_of_units};
-use crate::granules::{self, Candidates, Shown};
+use crate::describe::{descriptors, gather, witnesses};
+use crate::granules::{self, Candidates};
 use crate::group::{free, on_graph};
 use crate::inputs::Inputs;
 use crate::options::{Args, Noise, Settings, Space};
@@ -13,10 +13,10 @@ use crate::profile::mask_weights;
 use crate::rank::confidence;
 use crate::surface::Points;
 use crate::{health, linkage, memory};
-use artifacts::{Instances, Level, MaskFeatures, MaskFolder, Match, Row, flat};
+use artifacts::{Draft, Instances, Level, MaskFeatures, MaskFolder, Match, Row};
 use gs_io::{Error, Result, Watched};
 use gs_raster::RasterOptions;
-use ndarray::{Array2, aview1};
+use ndarray::Array2;
 use stage::{CommonArgs, Program, Stage};
 use std::collections::BTreeMap;
 use std::time::Instant;
@@ -42,7 +42,7 @@ impl Program for Args {
         }
     }
 
-    /// Reads the inputs, finds the instances, matches them with masks, and writes them.
+    /// Reads the inputs, finds the instances, matches them with masks, describes them by the masks' features, and writes them.
     fn run(self, stage: &Stage) -> Result<()> {
         let a = &self;
         let mut claim = outputs::claim(a, stage)?;
@@ -52,74 +52,73 @@ impl Program for Args {
         }
         let inputs = Inputs::read(a, stage)?;
         let settings = a.settings.for_gaussians(inputs.graph.kept.len());
-        stage.forecast(
-            memory::forecast(&inputs, &settings),
-            "drop small footprint entries: graph-precompute --cut 0.001",
-        )?;
-
-        let start = Instant::now();
-        let points = Points::of(&inputs)?;
-        let clustering = match settings.cluster {
-            Space::Masks => {
-                linkage::cluster(&inputs, &points, &settings, &settings.levels, (settings.agreement, settings.join))?
-            }
-            Space::Graph => on_graph(&inputs.features.values, &inputs.graph, &settings.hdbscan()),
-            Space::Free => free(&inputs.features.values, &settings.hdbscan()),
+        let mut found = match &a.from {
+            Some(path) => outputs::read_draft(path, &inputs, &settings)?,
+            None => find(a, &settings, &inputs, stage)?,
         };
-        let noise = clustering.labels.iter().filter(|&&l| l < 0).count();
-        let seconds = start.elapsed().as_secs_f64();
-        let found = Assignment::new(&clustering, &inputs.graph.kept, inputs.geometry.gaussians.len());
-        drop(clustering);
-        stage.info(&format!(
-            "{} instances among {} Gaussians, {noise} noise",
-            found.instances,
-            inputs.graph.kept.len()
-        ));
-        if found.instances == 0 {
-            stage.warn(
-                "everything is noise: no instance was found; give a smaller --min-cluster-size, or --allow-single-cluster \
-                 where the scene is one thing",
-            );
-        }
-        let found = correct(found, &inputs, &points, &settings, stage)?;
-        drop(points);
-
-        let (matches, features) = match_views(a, &settings, &inputs, &found.labels, stage)?;
-        if features.is_empty() {
-            stage.skipped("language descriptors: the masks have no features (*_f.npy; mask-embed embed makes them)");
-        }
-        let views = inputs.views.iter().map(|v| v.stem().to_string()).collect();
-        let (means, footprints) = (&inputs.geometry.gaussians.means, &inputs.footprints);
-        let labels: Vec<i32> = inputs.graph.kept.iter().map(|&i| found.labels[i as usize]).collect();
-        let weights = mask_weights(&labels, footprints, &settings.levels)?;
-        let granules = if settings.granules > 0 {
-            let nodes: Vec<i32> = inputs.graph.kept.iter().map(|&i| found.nodes[i as usize]).collect();
-            let parents = found.tree.iter().map(|e| (e.child, e.parent)).collect();
-            let candidates = Candidates::new(&labels, found.instances, &nodes, &parents);
-            granules::find(&candidates, &labels, &nodes, footprints, settings.granules)?
-        } else {
-            Vec::new()
-        };
-        let described = describe(means, found.labels, found.instances, matches, &features);
-        let mut instances = Instances { views, tree: found.tree, node: found.nodes, ..described };
-        let dim = instances.dim();
-        instances.granule_descriptor = Array2::default((0, dim));
-        for (granule, shown) in granules {
-            // A mask that fits twice as well counts four times.
-            let feature = |s: &Shown| {
-                let mask = footprints.rows[s.row as usize];
-                Some((s.fit * s.fit, flat(features.get(&mask.view)?.row(mask.mask as usize)?)))
-            };
-            let descriptor = mean_of_units(shown.iter().filter_map(feature), dim);
-            instances.granule_descriptor.push_row(aview1(&descriptor)).expect("of one dimension");
-            instances.granules.push(granule);
-        }
-        instances.score = confidence(&instances, footprints, &weights);
-        let health = health::measure(&instances, footprints, &weights);
         watched.check()?;
-        let found = Found { instances, health, noise, clustering_seconds: seconds };
+        if let Some(path) = &a.draft {
+            return outputs::write_draft(path, stage, &inputs, &found, &settings, &mut claim);
+        }
+        let features = mask_features(a, &found.draft, stage)?;
+        let Draft { instances, of_instances, of_granules, .. } = &mut found.draft;
+        instances.descriptor = descriptors(instances.len(), of_instances, &features);
+        instances.granule_descriptor = descriptors(instances.granules.len(), of_granules, &features);
+        watched.check()?;
         outputs::write(a, stage, &inputs, &found, &settings, &mut claim)
     }
+}
+
+/// Finds the instances and what there is to say of them without language.
+fn find(a: &Args, settings: &Settings, inputs: &Inputs, stage: &Stage) -> Result<Found> {
+    stage.forecast(memory::forecast(inputs, settings), "drop small footprint entries: graph-precompute --cut 0.001")?;
+    let start = Instant::now();
+    let points = Points::of(inputs)?;
+    let clustering = match settings.cluster {
+        Space::Masks => {
+            linkage::cluster(inputs, &points, settings, &settings.levels, (settings.agreement, settings.join))?
+        }
+        Space::Graph => on_graph(&inputs.features.values, &inputs.graph, &settings.hdbscan()),
+        Space::Free => free(&inputs.features.values, &settings.hdbscan()),
+    };
+    let noise = clustering.labels.iter().filter(|&&l| l < 0).count();
+    let clustering_seconds = start.elapsed().as_secs_f64();
+    let found = Assignment::new(&clustering, &inputs.graph.kept, inputs.geometry.gaussians.len());
+    drop(clustering);
+    stage.info(&format!("{} instances among {} Gaussians, {noise} noise", found.instances, inputs.graph.kept.len()));
+    if found.instances == 0 {
+        stage.warn(
+            "everything is noise: no instance was found; give a smaller --min-cluster-size, or --allow-single-cluster \
+             where the scene is one thing",
+        );
+    }
+    let found = correct(found, inputs, &points, settings, stage)?;
+    drop(points);
+
+    let (matches, masks) = match_views(a, settings, inputs, &found.labels, stage)?;
+    let footprints = &inputs.footprints;
+    let labels: Vec<i32> = inputs.graph.kept.iter().map(|&i| found.labels[i as usize]).collect();
+    let weights = mask_weights(&labels, footprints, &settings.levels)?;
+    let granules = if settings.granules > 0 {
+        let nodes: Vec<i32> = inputs.graph.kept.iter().map(|&i| found.nodes[i as usize]).collect();
+        let parents = found.tree.iter().map(|e| (e.child, e.parent)).collect();
+        let candidates = Candidates::new(&labels, found.instances, &nodes, &parents);
+        granules::find(&candidates, &labels, &nodes, footprints, settings.granules)?
+    } else {
+        Vec::new()
+    };
+    let of_granules = granules::witnesses(&granules, footprints, settings.describe_views);
+    let views = inputs.views.iter().map(|v| v.stem().to_string()).collect();
+    let gathered = gather(&inputs.geometry.gaussians.means, found.labels, found.instances, matches);
+    let of_instances = witnesses(&gathered.matches, settings.describe_views);
+    let granules = granules.into_iter().map(|(granule, _)| granule).collect::<Vec<_>>();
+    let granule_descriptor = Array2::zeros((granules.len(), 0));
+    let mut instances =
+        Instances { views, tree: found.tree, node: found.nodes, granules, granule_descriptor, ..gathered };
+    instances.score = confidence(&instances, footprints, &weights);
+    let health = health::measure(&instances, footprints, &weights);
+    let draft = Draft { instances, of_instances, of_granules, masks };
+    Ok(Found { draft, health, noise, clustering_seconds })
 }
 
 /// Corrects the clustering by where Gaussians lie and by the masks of each view.
@@ -171,18 +170,17 @@ fn correct(
     Ok(found)
 }
 
-/// Matches the instances with the masks of every view; and the mask features by view index.
+/// Matches the instances with the masks of every view; and the number of mask ids of each.
 fn match_views(
     a: &Args,
     settings: &Settings,
     inputs: &Inputs,
     labels: &[i32],
     stage: &Stage,
-) -> Result<(Vec<Match>, BTreeMap<u32, MaskFeatures>)> {
+) -> Result<(Vec<Match>, Vec<u32>)> {
     let (gaussians, raster) = (&inputs.geometry.gaussians, RasterOptions::of(&inputs.geometry));
     let table = FeatureTable::new(&inputs.features, gaussians.len());
-    let mut found = Vec::new();
-    let mut features: BTreeMap<u32, MaskFeatures> = BTreeMap::new();
+    let (mut found, mut masks) = (Vec::new(), Vec::new());
     let mut progress = stage.progress("matching views", inputs.views.len() as u64);
     let folder = MaskFolder::open(&a.masks);
     for (index, view) in inputs.views.iter().enumerate() {
@@ -190,14 +188,35 @@ fn match_views(
         let camera = view.camera.resized(maps.width() as u32, maps.height() as u32);
         let overlaps = overlaps(gaussians, &raster, labels, &table, &camera, &maps, &settings.levels);
         found.extend(matches(&overlaps, index as u32, settings.threshold as f32));
-        let dim = features.values().next().map(MaskFeatures::dim);
-        features.extend(MaskFeatures::of_view(&a.masks, view.stem(), &maps, dim)?.map(|f| (index as u32, f)));
+        masks.push(maps.id_count() as u32);
         progress.step();
     }
     progress.finish(&[("matches", found.len() as f64)]);
-    let (with, all) = (features.len(), inputs.views.len());
-    if with > 0 && with < all {
-        stage.warn(&format!("{} of {all} views have no mask features", all - with));
+    Ok((found, masks))
+}
+
+/// The features of the masks that the descriptors read, by view index.
+fn mask_features(a: &Args, draft: &Draft, stage: &Stage) -> Result<BTreeMap<u32, MaskFeatures>> {
+    let mut features: BTreeMap<u32, MaskFeatures> = BTreeMap::new();
+    let (mut all, mut missing) = (0, 0);
+    for (stem, wanted) in draft.wanted() {
+        let index = draft.instances.views.iter().position(|v| v == stem).expect("a view of the draft");
+        let dim = features.values().next().map(MaskFeatures::dim);
+        let of_view = MaskFeatures::of_view(&a.masks, stem, draft.masks[index] as usize, dim)?;
+        let there = |mask: &&u32| {
+            of_view.as_ref().and_then(|f| f.row(**mask as usize)).is_some_and(|row| row.iter().any(|&v| v != 0.0))
+        };
+        all += wanted.len();
+        missing += wanted.len() - wanted.iter().filter(there).count();
+        features.extend(of_view.map(|f| (index as u32, f)));
     }
-    Ok((found, features))
+    if features.is_empty() {
+        stage.skipped("language descriptors: the masks have no features (*_f.npy; mask-embed embed makes them)");
+    } else if missing > 0 {
+        stage.warn(&format!(
+            "{missing} of {all} masks that say what instances mean have no feature, and count for nothing: run this with --draft FILE, \
+             mask-embed embed with --only FILE, then this with --from FILE"
+        ));
+    }
+    Ok(features)
 }

@@ -128,7 +128,7 @@ fn check_masks(folder: &Path, dataset: &Dataset, dim: Option<usize>) -> Result<S
     };
     let maps = MaskFolder::open(folder).read(view)?;
     let said = format!("{}_s.npy: {}x{} pixels, {} masks", view.stem(), maps.width(), maps.height(), maps.id_count());
-    Ok(match MaskFeatures::of_view(folder, view.stem(), &maps, dim)? {
+    Ok(match MaskFeatures::of_view(folder, view.stem(), maps.id_count(), dim)? {
         Some(features) => format!("{said}, features of dimension {}\n", features.dim()),
         None => said + "\n",
     })

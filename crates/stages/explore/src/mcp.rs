@@ -37,6 +37,8 @@ pub fn run(o: &McpOptions, stage: &Stage) -> Result<()> {
     stage.info(&format!("{objects} objects; answers on standard output until standard input ends"));
     let runtime = tokio::runtime::Builder::new_multi_thread().worker_threads(2).enable_all().build();
     let runtime = runtime.map_err(|e| Error::new(format!("cannot start: {e}")))?;
+    let warmed = door.clone();
+    runtime.spawn_blocking(move || warmed.0.world.warm_up());
     let failed =
         |e: &dyn std::fmt::Display| Error::new(format!("the agent's side failed: {e}")).field("standard input");
     let done = runtime.block_on(async {
@@ -59,6 +61,7 @@ pub fn run(o: &McpOptions, stage: &Stage) -> Result<()> {
     done
 }
 
+#[derive(Clone)]
 struct Door(Arc<Shared>);
 
 impl ServerHandler for Door {

@@ -43,13 +43,20 @@ const KEEP: &str = "private, max-age=600";
 struct Shared {
     world: World,
     blob: Blob,
-    edited: Mutex<Edited>,
+    /// The instances as they are now; nobody holds the lock while he works.
+    edited: Mutex<Arc<Edited>>,
     /// Small photographs, as far as they were asked for.
     previews: Mutex<BTreeMap<usize, Bytes>>,
     /// Folder that programs may write into.
     exports: Option<PathBuf>,
     /// Whether only those who name this machine are answered.
     local: bool,
+}
+
+impl Shared {
+    fn edited(&self) -> Arc<Edited> {
+        Arc::clone(&self.edited.lock().expect("no panic holds this lock"))
+    }
 }
 
 type Held = State<Arc<Shared>>;
@@ -67,6 +74,11 @@ pub fn run(o: &ServeOptions, stage: &Stage) -> Result<()> {
     })?;
     let address = listener.local_addr().at("listen at", "the address")?;
     let shared = Arc::new(shared(o, local, stage)?);
+    // The first text then takes no longer than others.
+    runtime.spawn_blocking({
+        let shared = Arc::clone(&shared);
+        move || shared.world.warm_up()
+    });
     let secret = if local { None } else { Some(secret()?) };
     let app = routes(shared);
     let app = match &secret {
@@ -115,7 +127,7 @@ fn shared(o: &ServeOptions, local: bool, stage: &Stage) -> Result<Shared> {
     Ok(Shared {
         world,
         blob,
-        edited: Mutex::new(edited),
+        edited: Mutex::new(Arc::new(edited)),
         previews: Mutex::default(),
         exports: o.exports.clone(),
         local,
@@ -215,7 +227,7 @@ async fn app_file(Path(name): Path<String>) -> Response {
 async fn scene_json(State(s): Held) -> Response {
     answer(move || {
         let all: Vec<usize> = (0..s.world.dataset.views.len()).collect();
-        let edited = s.edited.lock().expect("no panic holds this lock");
+        let edited = s.edited();
         Ok(json(&describe::scene(&s.world, &edited, &s.blob, "serve", &all)))
     })
     .await
@@ -248,7 +260,7 @@ async fn preview(State(s): Held, Path(view): Path<usize>) -> Response {
 async fn thumbnail(State(s): Held, Path(instance): Path<usize>) -> Response {
     answer(move || {
         let (best, members) = {
-            let edited = s.edited.lock().expect("no panic holds this lock");
+            let edited = s.edited();
             let instances = &edited.instances;
             let best = *pictures::best_views(&s.world, instances).get(instance).ok_or_else(|| no_such("instance"))?;
             (best, Index::new(instances).members(&[instance as u32]))
@@ -263,7 +275,7 @@ async fn thumbnail(State(s): Held, Path(instance): Path<usize>) -> Response {
 async fn pick(State(s): Held, body: Bytes) -> Response {
     answer(move || {
         let click: Click = parsed(&body)?;
-        let edited = s.edited.lock().expect("no panic holds this lock");
+        let edited = s.edited();
         Ok(json(&serde_json::json!(answers::pick(&s.world, &edited, &click)?)))
     })
     .await
@@ -277,7 +289,7 @@ struct Words {
 
 async fn find(State(s): Held, Query(asked): Query<Words>) -> Response {
     answer(move || {
-        let edited = s.edited.lock().expect("no panic holds this lock");
+        let edited = s.edited();
         answers::find(&s.world, &edited, &asked.text).map(|found| json(&serde_json::json!(found)))
     })
     .await
@@ -291,7 +303,7 @@ async fn save(State(s): Held, body: Bytes) -> Response {
         let new = s.world.edited(edits)?;
         new.edits.write(s.world.source.edits())?;
         let list = describe::instances_of(Some(&new), &s.world);
-        *s.edited.lock().expect("no panic holds this lock") = new;
+        *s.edited.lock().expect("no panic holds this lock") = Arc::new(new);
         Ok(json(&Value::Array(list)))
     })
     .await
@@ -301,7 +313,7 @@ async fn save(State(s): Held, body: Bytes) -> Response {
 async fn tool(State(s): Held, Path(name): Path<String>, body: Bytes) -> Response {
     let ask = move || {
         let arguments = if body.is_empty() { Value::Null } else { parsed(&body)? };
-        let edited = s.edited.lock().expect("no panic holds this lock");
+        let edited = s.edited();
         tools::ask(&name, arguments, &Asked { world: &s.world, edited: &edited, exports: s.exports.as_deref() })
     };
     answer(move || {

@@ -120,6 +120,11 @@ impl World {
         self.unrelated.get_or_init(|| self.words.as_ref().ok().and_then(encode)).as_ref()
     }
 
+    /// Does what the first text would have to wait for.
+    pub fn warm_up(&self) {
+        self.unrelated();
+    }
+
     /// All Gaussians of the geometry.
     pub fn gaussians(&self) -> &Gaussians {
         self.scene.gaussians()

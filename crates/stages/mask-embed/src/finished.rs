@@ -30,11 +30,20 @@ pub(crate) fn note_path(output: &Path) -> PathBuf {
     output.with_extension("json")
 }
 
+/// The note of an output that is as it was written.
+fn read<T: DeserializeOwned>(output: &Path) -> Option<Note<T>> {
+    let note: Note<T> = serde_json::from_slice(&std::fs::read(note_path(output)).ok()?).ok()?;
+    (hash_file(output).ok()? == note.hash).then_some(note)
+}
+
 /// The note of an output that need not be made again.
 fn find<T: DeserializeOwned>(output: &Path, made_from: &str) -> Option<Note<T>> {
-    let note: Note<T> = serde_json::from_slice(&std::fs::read(note_path(output)).ok()?).ok()?;
-    let same = note.made_from == made_from && hash_file(output).ok()? == note.hash;
-    same.then_some(note)
+    read(output).filter(|note| note.made_from == made_from)
+}
+
+/// The facts of an output that is as it was written, whatever it was made from.
+pub(crate) fn facts<T: DeserializeOwned>(output: &Path) -> Option<T> {
+    read(output).map(|note| note.facts)
 }
 
 /// Whether an output need not be made again.

@@ -4,8 +4,9 @@
 //! [`automatic`]), chooses ([`nms`]) and writes id maps at four levels ([`paint`], `regions`); `import` takes them from label
 //! pictures instead; `embed` shows the picture of each mask to CLIP. All write LangSplat's files: `<view>_s.npy` and
 //! `<view>_f.npy`. [`crops`] gives the training script of the small encoder what the pipeline would see. `finished` knows
-//! which views are done already, `logits` how sure a mask is of each pixel.
+//! which views are done already, `ahead` makes the next one ready, `logits` how sure a mask is of each pixel.
 
+mod ahead;
 pub mod automatic;
 mod check;
 pub mod crops;

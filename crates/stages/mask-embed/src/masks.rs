@@ -1,5 +1,6 @@
 //! `mask-embed masks`: id maps from photographs with SAM.
 
+use crate::ahead::one_ahead;
 use crate::automatic::{levels, propose};
 use crate::finished::{self, Views};
 use crate::options::{Choice, MasksArgs};
@@ -7,7 +8,7 @@ use crate::paint::{MapSize, paint, preview};
 use crate::photographs;
 use crate::sam::{Embedded, Sam};
 use artifacts::{LEVELS, Level, MaskMaps, maps_path, role};
-use gs_io::{Claim, Error, Result, Watched, write_json};
+use gs_io::{Claim, Result, Watched, write_json};
 use gs_scene::Image;
 use gs_scene::dataset::{Dataset, View};
 use onnx_models::RgbImage;
@@ -16,7 +17,6 @@ use serde_json::json;
 use stage::{Stage, peak_rss_bytes};
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
-use std::sync::mpsc;
 
 /// Facts of a view's id maps.
 #[derive(Serialize, Deserialize)]
@@ -104,27 +104,6 @@ struct Prepared<'a> {
     embedded: Option<Embedded>,
 }
 
-/// Calls `make` for every item and `take` for what it made, in order. Where the program has more threads than one, the next item
-/// is made while the last is taken.
-fn one_ahead<I, T: Send>(
-    items: impl Iterator<Item = I> + Send,
-    make: impl FnMut(I) -> Result<T> + Send,
-    mut take: impl FnMut(T) -> Result<()>,
-) -> Result<()> {
-    let mut made = items.map(make);
-    if rayon::current_num_threads() <= 1 {
-        return made.try_for_each(|made| take(made?));
-    }
-    std::thread::scope(|scope| {
-        let (send, receive) = mpsc::sync_channel(0);
-        // It ends after an error, and when nobody receives any more.
-        let work = move || made.all(|made| made.is_ok() & send.send(made).is_ok());
-        let thread = std::thread::Builder::new().spawn_scoped(scope, work);
-        thread.map_err(|e| Error::new(format!("cannot start a thread: {e}")).hint("give --threads 1"))?;
-        receive.iter().try_for_each(|made| take(made?))
-    })
-}
-
 /// The id maps of a photograph.
 fn make(args: &MasksArgs, sam: &Sam, image: &RgbImage, embedded: Option<Embedded>) -> Result<(MaskMaps, Facts)> {
     let embedded = embedded.map_or_else(|| sam.encode(image), Ok)?;
@@ -172,33 +151,4 @@ fn warn_of_other_maps(folder: &Path, views: &[View], stage: &Stage) -> Result<()
         ));
     }
     Ok(())
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn items_are_taken_in_order_up_to_the_first_error() {
-        let run = |bad: usize, refused: usize| {
-            let (made, mut taken) = (std::sync::atomic::AtomicUsize::new(0), Vec::new());
-            let make = |i| {
-                made.fetch_add(1, std::sync::atomic::Ordering::Relaxed);
-                if i == bad { Err(Error::new("not made")) } else { Ok(i) }
-            };
-            let take = |i| {
-                taken.push(i);
-                if i == refused { Err(Error::new("not taken")) } else { Ok(()) }
-            };
-            let error = one_ahead(0..100, make, take).err().map(|e| e.to_string());
-            (error, taken, made.into_inner())
-        };
-        let (error, taken, made) = run(usize::MAX, usize::MAX);
-        assert_eq!((error, taken, made), (None, (0..100).collect(), 100));
-        let (error, taken, made) = run(7, usize::MAX);
-        assert_eq!((error.as_deref(), taken, made), (Some("not made"), (0..7).collect(), 8));
-        let (error, taken, made) = run(usize::MAX, 7);
-        assert_eq!((error.as_deref(), taken), (Some("not taken"), (0..8).collect()));
-        assert!(made <= 10, "{made}");
-    }
 }

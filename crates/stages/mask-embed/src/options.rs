@@ -135,6 +135,11 @@ pub(crate) struct EmbedArgs {
     #[arg(long, value_name = "FOLDER")]
     #[serde(skip)]
     pub clip: PathBuf,
+    /// Encode only the masks that the instances of this file (cluster-match --draft) are described by; the features of others are zeros
+    /// [default: all masks]
+    #[arg(long, value_name = "FILE")]
+    #[serde(skip)]
+    pub only: Option<PathBuf>,
     /// Output folder for <view>_f.npy and, written last, features.json [default: the folder of the id maps]
     #[arg(long, value_name = "FOLDER")]
     #[serde(skip)]
