@@ -1,7 +1,7 @@
 //! The program on a small scene on disk: instances and descriptors, the same bytes for any thread count, and bad input.
 
 use artifacts::{
-    Features, FootprintsBuilder, Graph, Health, Instances, MaskFeatures, MaskMaps, Row, hash_folder, role,
+    Draft, Features, FootprintsBuilder, Graph, Health, Instances, MaskFeatures, MaskMaps, Row, hash_folder, role,
 };
 use glam::DVec3;
 use gs_io::{Artifact, Provenance, hash_file};
@@ -495,6 +495,54 @@ fn scenes_without_anything_are_results_not_errors() {
 }
 
 #[test]
+fn a_draft_lists_the_masks_that_are_read_and_is_gone_on_from() {
+    let s = Scene::new();
+    s.language(0..VIEWS);
+    let all = |extra: &[&str]| {
+        s.succeed(extra);
+        let names = ["safetensors", "ply", "labels.npy", "json"];
+        names.map(|e| std::fs::read(s.path("out/instances").with_extension(e)).unwrap())
+    };
+    for most in ["2", "0"] {
+        let most = ["--describe-views", most];
+        let whole = all(&most);
+        std::fs::remove_dir_all(s.path("out")).unwrap();
+        let draft = s.path("draft.safetensors");
+        let options = |way: &'static str| [&most[..], &[way, draft.to_str().unwrap()]].concat();
+        // Features are not read for it: there are none yet.
+        (0..VIEWS).for_each(|v| std::fs::remove_file(s.path(&format!("masks/v{v}_f.npy"))).unwrap());
+        let out = s.run(&options("--draft"));
+        assert!(out.status.success() && !s.path("out").exists(), "{}", String::from_utf8_lossy(&out.stderr));
+        let wanted = Draft::read(&draft).unwrap().0;
+        let wanted: Vec<(&str, Vec<u32>)> =
+            wanted.wanted().into_iter().map(|(view, masks)| (view, masks.into_iter().collect())).collect();
+        assert_eq!(wanted.len(), if most[1] == "2" { wanted.len().min(4) } else { 4 });
+        assert!(wanted.iter().all(|(_, masks)| masks.iter().all(|&m| m == 0 || m >= 3)), "{wanted:?}");
+        s.language(0..VIEWS);
+        // What is not wanted is not read.
+        let features = |view: &str| s.path(&format!("masks/{view}_f.npy"));
+        for (view, masks) in &wanted {
+            let mut own = MaskFeatures::read(features(view)).unwrap();
+            (0..5).filter(|m| !masks.contains(m)).for_each(|m| own.values.row_mut(m as usize).fill(9.0));
+            own.write(features(view)).unwrap();
+        }
+        let [artifact, rest @ ..] = all(&options("--from"));
+        assert_eq!(rest, whole[1..]);
+        let tensors = |bytes: &[u8]| {
+            let path = s.path("tensors.safetensors");
+            std::fs::write(&path, bytes).unwrap();
+            Instances::read(&path).unwrap().0
+        };
+        assert_eq!(tensors(&artifact), tensors(&whole[0]));
+        s.language(0..VIEWS);
+        assert_eq!(all(&options("--from"))[0], whole[0], "the same bytes with the same features");
+        let other = ["--from", draft.to_str().unwrap(), "--describe-views", "1"];
+        s.fail(&other, &["draft.safetensors", "describe_views", "made with another option"]);
+    }
+    s.fail(&["--from", s.path("features.safetensors").to_str().unwrap()], &["features.safetensors", "draft"]);
+}
+
+#[test]
 fn bad_input_is_one_line_and_leaves_outputs_alone() {
     let s = Scene::new();
     // clap's own errors have exit code 2 as well, and name option and range.
@@ -527,7 +575,7 @@ fn bad_input_is_one_line_and_leaves_outputs_alone() {
     s.fail(&[], &["v2_f.npy"]);
     std::fs::remove_file(&one).unwrap();
     let (i, said) = s.succeed(&[]);
-    assert!(said.contains("1 of 4 views have no mask features") && i.dim() == 3, "{said}");
+    assert!(said.contains("masks that say what instances mean have no feature") && i.dim() == 3, "{said}");
 
     // Artifacts of another scene.
     s.masks(1, &[0; SIZE * SIZE]);

@@ -2,7 +2,8 @@
 //! by hand in place of CLIP (scripts/make_onnx_testdata.py makes both).
 
 use artifacts::{
-    Level, MaskFeatures, MaskMaps, MaskTruth, TrueObject, TruePart, TrueScene, features_path, flat, maps_path,
+    Draft, Instances, Level, MaskFeatures, MaskMaps, MaskTruth, TrueObject, TruePart, TrueScene, Witness,
+    features_path, flat, maps_path,
 };
 use gs_io::Artifact;
 use gs_scene::Image;
@@ -345,6 +346,68 @@ fn features_are_those_of_the_crops() {
     }
     ok(&scene.embed_args(&["--threads", "1"]));
     assert_eq!(first, contents(&scene.masks));
+}
+
+#[test]
+fn only_the_masks_of_a_draft_are_encoded_and_what_is_there_stays() {
+    let scene = Scene::new(2);
+    scene.make_masks(&scene.masks, &[]);
+    ok(&scene.embed_args(&[]));
+    let all = ["v0", "v1"].map(|v| MaskFeatures::read(features_path(&scene.masks, v)).unwrap());
+    let draft = scene.folder.join("draft.safetensors");
+    let wants = |masks: &[(u32, u32)], inputs: &[(&str, String)]| {
+        let of = |&(view, mask)| Witness { of: 0, view, mask, weight: 1.0 };
+        let instances = Instances {
+            descriptor: ndarray::Array2::zeros((1, 0)),
+            support: vec![1],
+            score: vec![1.0],
+            count: vec![1],
+            centroid: vec![[0.0; 3]],
+            bbox_min: vec![[0.0; 3]],
+            bbox_max: vec![[0.0; 3]],
+            oriented: vec![artifacts::OrientedBox::default()],
+            views: vec!["v0".into(), "v1".into()],
+            ..Instances::default()
+        };
+        let of_instances = masks.iter().map(of).collect();
+        let draft_of = Draft { instances, of_instances, of_granules: Vec::new(), masks: vec![9, 9] };
+        let inputs = inputs.iter().map(|(role, hash)| (role.to_string(), hash.clone())).collect();
+        draft_of.write(&draft, gs_io::Provenance { inputs, ..Default::default() }).unwrap();
+    };
+    let masks = [(artifacts::role::MASKS, artifacts::hash_folder(&scene.masks, "_s.npy").unwrap())];
+    let only = ["--only", draft.to_str().unwrap()];
+    // All have features already: nothing to do.
+    wants(&[(0, 1)], &masks);
+    let said = ok(&scene.embed_args(&only));
+    assert!(said.contains("skipped 1 of 1 views: their features are done already"), "{said}");
+    for v in ["v0", "v1"] {
+        std::fs::remove_file(features_path(&scene.masks, v)).unwrap();
+    }
+    let rows = |found: &MaskFeatures, all: &MaskFeatures, ids: &[usize]| {
+        for id in 0..all.values.nrows() {
+            let expected = if ids.contains(&id) { all.values.row(id).to_vec() } else { vec![0.0; 4] };
+            assert_eq!(found.values.row(id).to_vec(), expected, "{id}");
+        }
+    };
+    ok(&scene.embed_args(&only));
+    rows(&MaskFeatures::read(features_path(&scene.masks, "v0")).unwrap(), &all[0], &[1]);
+    assert!(!features_path(&scene.masks, "v1").exists(), "no mask of it is wanted");
+    // Another list: what is there is kept, and the manifest says what has a feature.
+    wants(&[(0, 0), (1, 2)], &masks);
+    ok(&scene.embed_args(&only));
+    rows(&MaskFeatures::read(features_path(&scene.masks, "v0")).unwrap(), &all[0], &[0, 1]);
+    rows(&MaskFeatures::read(features_path(&scene.masks, "v1")).unwrap(), &all[1], &[2]);
+    let manifest = std::fs::read_to_string(scene.masks.join("features.json")).unwrap();
+    let manifest: serde_json::Value = serde_json::from_str(&manifest).unwrap();
+    assert_eq!(manifest["extra"]["views"]["v0"]["facts"]["only"], json!([0, 1]));
+    // And all of them after that.
+    ok(&scene.embed_args(&[]));
+    for (v, all) in ["v0", "v1"].iter().zip(&all) {
+        assert_eq!(&MaskFeatures::read(features_path(&scene.masks, v)).unwrap(), all);
+    }
+    wants(&[(0, 1)], &[(artifacts::role::MASKS, "0".repeat(64))]);
+    assert!(error(&scene.embed_args(&only)).contains("another masks"));
+    assert!(error(&scene.embed_args(&["--only", path(&scene.masks.join("masks.json"))])).contains("masks.json"));
 }
 
 #[test]
