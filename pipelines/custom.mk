@@ -9,7 +9,7 @@
 #:  SEED=0              of every stage's random choices
 #:  THREADS=0           threads of every stage, 0 for one per core
 #:  CONF=file           settings from a file, one NAME = value a line
-#: and GEOM_ARGS, VIEW_ARGS, MASK_ARGS, GRAPH_ARGS, FEAT_ARGS, CLUSTER_ARGS, SCORE_ARGS, REPORT_ARGS: more options of a stage
+#: and GEOM_ARGS, VIEW_ARGS, MASK_ARGS, EMBED_ARGS, GRAPH_ARGS, FEAT_ARGS, CLUSTER_ARGS, SCORE_ARGS, REPORT_ARGS: more options of a stage
 
 include pipelines/paths.mk
 
@@ -31,7 +31,7 @@ endif
 CLIP ?= $(patsubst %/,%,$(dir $(wildcard models/clip/text.onnx)))
 
 SETTINGS := QUALITY SCENE GEOMETRY MASKS CLIP SAM QUERIES RESOLUTION ITERATIONS SEED \
-  GEOM_ARGS VIEW_ARGS MASK_ARGS GRAPH_ARGS FEAT_ARGS CLUSTER_ARGS SCORE_ARGS REPORT_ARGS
+  GEOM_ARGS VIEW_ARGS MASK_ARGS EMBED_ARGS GRAPH_ARGS FEAT_ARGS CLUSTER_ARGS SCORE_ARGS REPORT_ARGS
 include pipelines/settings.mk
 
 ifeq ($(MASKS),)

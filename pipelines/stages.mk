@@ -46,7 +46,7 @@ endif
 # The id maps, where SAM makes them.
 SAM_MAKES := $(filter $(OUT)/masks/masks.json,$(MASKS_DONE))
 export SAM_MAKES SCENE PHOTOGRAPHS OUT MASKS GEOMETRY CLIP SAM TEXTS QUERIES SEED THREADS
-export GEOM_ARGS VIEW_ARGS MASK_ARGS GRAPH_ARGS FEAT_ARGS CLUSTER_ARGS SCORE_ARGS REPORT_ARGS EVAL_ARGS SYNTH_ARGS
+export GEOM_ARGS VIEW_ARGS MASK_ARGS EMBED_ARGS GRAPH_ARGS FEAT_ARGS CLUSTER_ARGS SCORE_ARGS REPORT_ARGS EVAL_ARGS SYNTH_ARGS
 
 .DEFAULT_GOAL := all
 .PHONY: all FORCE
@@ -85,7 +85,7 @@ views_OPTIONS := $(VIEW_ARGS) $(SEED_ARGS)
 graph_OPTIONS := $(GRAPH_FIRST) $(GRAPH_ARGS) $(SEED_ARGS)
 feat_OPTIONS := $(if $(findstring --preset,$(FEAT_ARGS)),,$(FEAT_QUALITY)) $(FEAT_ARGS) $(SEED_ARGS)
 cluster_OPTIONS := $(call unless,CLUSTER_ARGS,$(CLUSTER_QUALITY)) $(CLUSTER_ARGS) $(SEED_ARGS)
-embed_OPTIONS := $(CLIP)
+embed_OPTIONS := $(CLIP) $(EMBED_ARGS)
 masks_ARGS := $(call unless,MASK_ARGS,$(MASK_QUALITY)) $(MASK_ARGS)
 masks_OPTIONS := $(SAM) $(masks_ARGS)
 score_OPTIONS := $(CLIP) $(SCORE_ARGS)
@@ -104,7 +104,7 @@ views_RUN = $(BIN)/gs-geom views --geometry $(call arg,GEOMETRY) --out $(SCENE) 
 metrics_RUN = $(BIN)/gs-geom eval --scene $(call arg,POSED) --geometry $(call arg,GEOMETRY) --out $(OUT)/geom_metrics.json \
   $(EVAL_ARGS) $(COMMON)
 masks_RUN = $(BIN)/mask-embed masks --scene $(call arg,PHOTOGRAPHS) --sam $(call arg,SAM) --out $(MASKS) $(masks_ARGS) $(COMMON)
-embed_RUN = $(BIN)/mask-embed embed --scene $(call arg,PHOTOGRAPHS) --masks $(MASKS) --clip $(call arg,CLIP) $(COMMON)
+embed_RUN = $(BIN)/mask-embed embed --scene $(call arg,PHOTOGRAPHS) --masks $(MASKS) --clip $(call arg,CLIP) $(EMBED_ARGS) $(COMMON)
 graph_RUN = $(BIN)/graph-precompute --scene $(call arg,POSED) --geometry $(call arg,GEOMETRY) --masks $(MASKS) \
   --footprints $(FOOTPRINTS) --graph $(GRAPH) $(graph_OPTIONS) $(COMMON)
 feat_RUN = $(BIN)/feat-train --geometry $(call arg,GEOMETRY) --graph $(GRAPH) --footprints $(FOOTPRINTS) --out $(FEATURES) \
@@ -129,6 +129,7 @@ checked-options: checked | $(PROGRAMS)
 	@$(if $(VIEWS_MADE),scripts/check_options.sh VIEW_ARGS $(views_RUN))
 	@scripts/check_options.sh EVAL_ARGS $(metrics_RUN)
 	@$(if $(SAM_MAKES),scripts/check_options.sh MASK_ARGS $(masks_RUN))
+	@$(if $(filter $(MASKS)/features.json,$(LANGUAGE)),scripts/check_options.sh EMBED_ARGS $(embed_RUN))
 	@scripts/check_options.sh GRAPH_ARGS $(graph_RUN)
 	@scripts/check_options.sh FEAT_ARGS $(feat_RUN)
 	@scripts/check_options.sh CLUSTER_ARGS $(cluster_RUN)

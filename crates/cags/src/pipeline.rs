@@ -30,7 +30,7 @@ const FILES: [(&str, &str); 12] = carried![
 /// Settings that name a folder or file.
 const PATHS: [&str; 5] = ["GEOMETRY", "MASKS", "CLIP", "SAM", "CONF"];
 /// All others.
-const OTHERS: [&str; 12] = [
+const OTHERS: [&str; 13] = [
     "QUALITY",
     "QUERIES",
     "RESOLUTION",
@@ -38,6 +38,7 @@ const OTHERS: [&str; 12] = [
     "GEOM_ARGS",
     "VIEW_ARGS",
     "MASK_ARGS",
+    "EMBED_ARGS",
     "GRAPH_ARGS",
     "FEAT_ARGS",
     "CLUSTER_ARGS",
