@@ -14,6 +14,7 @@ use self::scores::FinerScore;
 pub use self::scores::{QueryScore, Scores, ThingScore};
 pub use self::truth::{true_confidence, true_labels};
 
+use self::label_iou::LabelScore;
 use self::labels::FrameLabels;
 use crate::memory::{self, SMALLER, Sizes};
 use crate::options::{Rule, ScoreOptions};
@@ -216,10 +217,23 @@ fn score_queries(
         let (selected, score) = predict::chosen(&answers, &text);
         let mine = pairs.iter().filter(|p| p.category == text);
         let frames = mine.map(|p| (p.frame.clone(), p.iou)).collect();
-        QueryScore { text, iou: figures.miou, selected, score, frames }
+        let rank = fitting(&scores.labels, &text).and_then(|instance| {
+            let ranking = &answers.get(&text)?.as_ref().ok()?.ranking;
+            Some(1 + ranking.iter().position(|r| r.instance as i32 == instance)?)
+        });
+        QueryScore { text, iou: figures.miou, selected, score, rank, frames }
     };
     scores.queries = object_figures(&pairs).into_iter().map(query).collect();
     Ok(())
+}
+
+/// The instance that fits a category best: by the sum of its IoUs over the frames where it is the best, of equals the first.
+fn fitting(labels: &[LabelScore], category: &str) -> Option<i32> {
+    let mut sums = BTreeMap::<i32, f64>::new();
+    for label in labels.iter().filter(|l| l.category == category) {
+        label.instance.into_iter().for_each(|i| *sums.entry(i).or_default() += label.iou);
+    }
+    sums.into_iter().max_by(|a, b| a.1.total_cmp(&b.1).then(b.0.cmp(&a.0))).map(|best| best.0)
 }
 
 /// Asks every category of the labels and compares the answers; none where nothing is labelled.

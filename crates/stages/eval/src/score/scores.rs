@@ -121,6 +121,10 @@ pub struct QueryScore {
     pub selected: Vec<u32>,
     /// Cosine of the best.
     pub score: Option<f32>,
+    /// Place among all instances, best first from 1, of the one that fits the labels best ([`LabelScore`]); none where no
+    /// instance touches them, or it has no descriptor.
+    #[serde(default)]
+    pub rank: Option<usize>,
     /// Stem and IoU of each labelled frame.
     pub frames: Vec<(String, f64)>,
 }

@@ -206,6 +206,13 @@ fn a_perfect_run_scores_high() {
     assert_eq!((&labels[0]["category"], &labels[0]["instance"]), (&json!("blue ball"), &json!(1)));
     let v = f.score("--silhouette|visible");
     assert_eq!((&v["silhouette"][0], &v["query_miou"]), (&json!("visible"), &s["query_miou_visible"]));
+    // Where each text means the other ball, the one that fits the labels is second.
+    let ranks = |s: &Value| [0, 1].map(|i| s["queries"][i]["rank"].as_u64());
+    let mut table: serde_json::Map<String, Value> = serde_json::from_slice(&fs::read(f.table()).unwrap()).unwrap();
+    let [red, blue] = ["red ball", "blue ball"].map(|name| table[name].clone());
+    table.extend([("red ball".into(), blue), ("blue ball".into(), red)]);
+    fs::write(f.table(), json!(table).to_string()).unwrap();
+    assert_eq!((ranks(&s), ranks(&f.score(""))), ([Some(1); 2], [Some(2); 2]));
 }
 
 #[test]
@@ -220,6 +227,7 @@ fn gaussians_with_descriptors_of_their_own_answer_texts() {
     let own = |more: &str| f.score(&format!("--descriptors|{{}}/descriptors.safetensors|{more}"));
     let alike = own("");
     assert_eq!((&alike["query_miou"], &alike["instance_miou"]), (&whole["query_miou"], &json!(1.0)));
+    assert_eq!(alike["queries"][1]["rank"], Value::Null, "instances were not asked");
     assert_eq!((&alike["queries"][1]["text"], &alike["queries"][1]["selected"]), (&json!("red ball"), &json!([])));
     assert!((alike["queries"][1]["score"].as_f64().unwrap() - 0.8).abs() < 1e-6);
     // At 0.7 the blue ball's text takes its own alone, at 0.5 both.
