@@ -177,3 +177,6 @@ stress: build ## Hostile scenes and settings through every stage: out/stress/rep
 SCENES ?=
 real-masks: build ## Score instances from real SAM masks of scenes with exact truth: out/real-masks (hours; SCENES=kitchen-10,room-10)
 	scripts/real_masks.py $(if $(SCENES),--scenes $(SCENES)) $(if $(PHOTOGRAPHS),--photographs "$$PHOTOGRAPHS")
+
+clip-report: build ## Score a CLIP model for every crop and prompt on the labelled desk: make clip-report CLIP=folder SCENE=desk OUT=folder
+	@scripts/clip_report.py
