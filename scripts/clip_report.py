@@ -4,9 +4,9 @@
     make clip-report [CLIP=models/clip] [SCENE=../shared/data/desk] [OUT=out/clip-report] [LABELS=testdata/desk]
                      [CROPS="black mean box10 box20 black,box10,box20"]
 
-Photographs become Gaussians, masks and instances once, in OUT/run, by make scene with its settings. For each crop all masks are encoded,
-which takes most of the time, and instances are described; for each prompt every labelled name is asked. OUT/report.md has one table. A
-second run encodes only what is missing.
+Photographs become Gaussians, masks and instances once, in OUT/run, by make scene with its settings. For each crop the masks that describe
+instances are encoded, which takes most of the time; for each prompt every labelled name is asked. OUT/report.md has one table. A second run
+encodes only what is missing.
 """
 import json
 import os
@@ -49,10 +49,13 @@ def embedded(a, crop):
         link = masks / path.name
         if not link.exists():
             link.symlink_to(path.resolve())
+    cluster = ["--run-dir", a.run, "--masks", masks, "--out", instances, *shlex.split(os.environ.get("CLUSTER_ARGS", "")), "--quiet"]
+    draft = a.out / "draft.safetensors"
+    run("cluster-match", *cluster, "--draft", draft)
     start = time.monotonic()
-    run("mask-embed", "embed", "--scene", a.scene, "--masks", masks, "--clip", a.clip, "--crop", crop)
+    run("mask-embed", "embed", "--scene", a.scene, "--masks", masks, "--only", draft, "--clip", a.clip, "--crop", crop)
     seconds = time.monotonic() - start
-    run("cluster-match", "--run-dir", a.run, "--masks", masks, "--out", instances, *shlex.split(os.environ.get("CLUSTER_ARGS", "")), "--quiet")
+    run("cluster-match", *cluster, "--from", draft)
     return instances, seconds
 
 

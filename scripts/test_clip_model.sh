@@ -1,6 +1,6 @@
 #!/usr/bin/env bash
 # A CLIP of ViT-B/16's size, random weights and so many layers (2; 12 is the whole) in out/clip-random-LAYERS, and the engines beside ONNX
-# Runtime on it. Skipped where there is no Python 3.9 or later, or its packages cannot be had.
+# Runtime on it; and the pixels that CLIP is shown. Skipped where there is no Python 3.9 or later, or its packages cannot be had.
 set -euo pipefail
 cd "$(dirname "$0")/.."
 layers=${1:-2} env=out/clip-python model=out/clip-random-${1:-2}
@@ -9,9 +9,11 @@ python=${PYTHON:-python3}
   || { echo "SKIPPED: CLIP beside ONNX Runtime: $python is not Python 3.9 or later with venv"; exit 0; }
 if [ ! -e "$env/ready" ]; then
   mkdir -p out
-  { "$python" -m venv "$env" && "$env/bin/pip" install -q 'numpy<3' 'onnx>=1.17,<2' 'onnxruntime>=1.20,<1.29' && touch "$env/ready"; } \
-    || { echo "SKIPPED: CLIP beside ONNX Runtime: pip cannot get numpy, onnx and onnxruntime"; exit 0; }
+  { "$python" -m venv "$env" && "$env/bin/pip" install -q 'numpy<3' 'onnx>=1.17,<2' 'onnxruntime>=1.20,<1.29' pillow opencv-python-headless && touch "$env/ready"; } \
+    || { echo "SKIPPED: CLIP beside ONNX Runtime: pip cannot get numpy, onnx, onnxruntime, pillow and opencv-python-headless"; exit 0; }
 fi
+[ -x target/release/mask-embed ] || cargo build --release --workspace --bins
+"$env/bin/python" scripts/test_crops.py
 # Made anew where the script changed: a model that was cut has no sum.
 made=$(sha256sum scripts/make_clip_random.py crates/lib/onnx-models/testdata/tokens.json)
 if [ "$(cat "$model/made" 2> /dev/null)" != "$made" ]; then
