@@ -35,7 +35,7 @@ const PROGRAMS: [Program; 9] = [
 ];
 
 /// Short words: what they stand for, a program and one of its commands, if it has any.
-const SHORT: [(&str, &str, &str); 16] = [
+const SHORT: [(&str, &str, &str); 17] = [
     ("inspect", "gs-geom", "inspect"),
     ("convert", "gs-geom", "convert"),
     ("train", "gs-geom", "train"),
@@ -47,6 +47,7 @@ const SHORT: [(&str, &str, &str); 16] = [
     ("features", "feat-train", ""),
     ("cluster", "cluster-match", ""),
     ("query", "eval", "query"),
+    ("inventory", "eval", "names"),
     ("score", "eval", "score"),
     ("report", "eval", "report"),
     ("serve", "explore", "serve"),

@@ -56,6 +56,8 @@ pub struct Remarks {
     pub names: BTreeMap<u32, String>,
     /// Length of the scene's unit in metres, where a length is known.
     pub metres_per_unit: Option<f64>,
+    /// Instances that were merged or split, those without Gaussians now among them.
+    pub changed: BTreeSet<u32>,
 }
 
 /// The file.
@@ -158,6 +160,7 @@ impl Edits {
             instances.granule_descriptor = Array2::default((0, instances.dim()));
             measure(instances, means, &changed);
         }
+        remarks.changed = changed;
         Ok(remarks)
     }
 }

@@ -17,6 +17,7 @@ mod health;
 mod instances;
 mod lerf_ovs;
 mod masks;
+mod names;
 mod nyu40;
 mod palette;
 mod scratch;
@@ -39,6 +40,7 @@ pub use masks::{
     LEVELS, Level, MaskFeatures, MaskFolder, MaskMaps, features_path, folder_files, hash_folder, maps_path, same_shape,
     stems, watch_folder,
 };
+pub use names::{Called, InstanceNames, Naming, ScoredName, called};
 pub use nyu40::NYU40;
 pub use palette::{NOISE_COLOR, instance_color};
 pub use scratch::{Scratch, ScratchEntries};

@@ -47,11 +47,15 @@ impl Unrelated {
     /// The score that 95 of 100 of them do not surpass; none where nothing has a score.
     pub fn chance(&self, index: &Index, granules: &Granules, negatives: &[Vec<f32>], min_support: u32) -> Option<f32> {
         let best = |f: &Vec<f32>| best_score(index, granules, f, negatives, min_support);
-        let mut scores: Vec<f32> = self.features.iter().filter_map(best).collect();
-        scores.sort_unstable_by(f32::total_cmp);
-        let at = (SHARE * scores.len() as f64).ceil() as usize;
-        scores.get(at.saturating_sub(1)).copied()
+        share_of(self.features.iter().filter_map(best).collect())
     }
+}
+
+/// The value that 95 of 100 of these do not surpass; none of none.
+pub(crate) fn share_of(mut values: Vec<f32>) -> Option<f32> {
+    values.sort_unstable_by(f32::total_cmp);
+    let at = (SHARE * values.len() as f64).ceil() as usize;
+    values.get(at.saturating_sub(1)).copied()
 }
 
 impl Verdict {

@@ -1,10 +1,11 @@
 //! What answers a question about one set of instances: the instances with their Gaussians (`scene`), features of texts
-//! (`text`) that are kept beside the model (`cache`), the ranking by them (`ranking`) and whether the best is better than by chance (`chance`), the part, thing or group that is meant (`granules`), Gaussians with descriptors of their own (`gaussians`), which Gaussian is nearest to a point (`nearest`) and which a pixel shows.
+//! (`text`) that are kept beside the model (`cache`), the ranking by them (`ranking`) and whether the best is better than by chance (`chance`), what instances are called (`naming`), the part, thing or group that is meant (`granules`), Gaussians with descriptors of their own (`gaussians`), which Gaussian is nearest to a point (`nearest`) and which a pixel shows.
 
 mod cache;
 mod chance;
 mod gaussians;
 mod granules;
+mod naming;
 mod nearest;
 mod ranking;
 mod scene;
@@ -15,6 +16,7 @@ pub use chance::{Unrelated, Verdict};
 pub use gaussians::{Chosen, DescribedGaussians, Share};
 pub use granules::{Granules, Kind, Meant};
 pub use gs_raster::pixel_weights;
+pub use naming::{Vocabulary, name_instances};
 pub use nearest::{nearest, nearest_of};
 pub use onnx_models::EngineArgs;
 pub use ranking::{Index, Join, Ranked, Selection};

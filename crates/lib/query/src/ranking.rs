@@ -132,6 +132,11 @@ impl<'a> Index<'a> {
         (0..self.instances.len()).map(|k| question.score(descriptor(k), self.norms[k])).collect()
     }
 
+    /// Whether an instance has a descriptor: masks of some view were matched with it.
+    pub fn has_descriptor(&self, instance: usize) -> bool {
+        self.norms[instance] > 0.0
+    }
+
     /// All instances that have a score, best first, ties by index.
     pub fn rank(&self, feature: &[f32], negatives: &[Vec<f32>]) -> Vec<Ranked> {
         let scores = self.scores(feature, negatives).into_iter().enumerate();

@@ -1,9 +1,10 @@
 //! The commands of `eval`.
 
 use crate::options::{
-    CheckOptions, LerfOptions, MasksOptions, QueryOptions, ReportOptions, ScannetOptions, ScoreOptions, TableOptions,
+    CheckOptions, LerfOptions, MasksOptions, NamesOptions, QueryOptions, ReportOptions, ScannetOptions, ScoreOptions,
+    TableOptions,
 };
-use crate::{check, mask_stats, page, protocols, query, score};
+use crate::{check, mask_stats, names, page, protocols, query, score};
 use clap::{Parser, Subcommand};
 use gs_io::{Error, Result};
 use serde::Serialize;
@@ -24,6 +25,8 @@ pub struct Args {
 enum Command {
     /// Find what a text means: ranked instances, a PLY of the selection, pictures, JSON
     Query(QueryOptions),
+    /// Name every instance by a vocabulary: what is there, and how many of each; names.json
+    Names(NamesOptions),
     /// Score a scene of LERF-OVS: objects selected in 3D by their names
     Lerf(LerfOptions),
     /// Score a ScanNet scan: classes of its vertices, class-agnostic instances
@@ -61,6 +64,10 @@ impl Program for Args {
             Command::Query(o) if !o.image.is_empty() && o.texts.clip.is_none() => {
                 Err(Error::new("pictures need an image encoder").field("--image").expected("--clip with image.onnx"))
             }
+            Command::Names(o) if !o.texts.given() => Err(Error::new("nothing to compare names with")
+                .field("--clip")
+                .expected("--clip or --text-features")
+                .hint("give the CLIP model that encoded the masks")),
             Command::Lerf(o) => o.check(),
             Command::Report(_) if self.common.run_dir.is_none() => {
                 Err(Error::new("which run").field("--run-dir").expected("the folder of a run, such as OUT of make"))
@@ -76,6 +83,7 @@ impl Program for Args {
         let parameters = serde_json::to_value(&self.command).unwrap_or_default();
         let text = match &self.command {
             Command::Query(o) => query::run(o, parameters, stage, self.common.json)?,
+            Command::Names(o) => names::run(o, parameters, stage)?,
             Command::Lerf(o) => protocols::lerf::run(o, parameters, stage)?,
             Command::Scannet(o) => protocols::scannet::run(o, parameters, stage)?,
             Command::Table(o) => protocols::table::run(o, parameters, stage)?,

@@ -1,6 +1,6 @@
 //! The last stage: text queries, evaluation protocols and the report.
 //!
-//! `options` holds the options of every command; `cli` says which command runs what: `query` answers questions,
+//! `options` holds the options of every command; `cli` says which command runs what: `query` answers questions, `names` says what is there,
 //! `check` looks at what a benchmark needs, `score` compares with the truth of a scene, `protocols` follows the published benchmarks, `page` makes the report.
 //! They share what answers a question (the library `query`), what they load and how they name it (`scene`), how a selection
 //! becomes a mask (`silhouette`) and the forecast of memory (`memory`).
@@ -10,6 +10,7 @@ mod cli;
 mod mask;
 mod mask_stats;
 mod memory;
+mod names;
 mod options;
 mod page;
 mod protocols;

@@ -58,7 +58,7 @@ impl Choice {
 
     /// The templates, with those of a named set in its place.
     pub fn templates(&self) -> Vec<String> {
-        self.template.iter().flat_map(|t| named(t, "clip", &CLIP_TEMPLATES)).collect()
+        templates(&self.template)
     }
 
     /// Whether people say how many instances or which scores are selected.
@@ -176,6 +176,41 @@ pub struct QueryOptions {
     /// Output folder
     #[arg(long, value_name = "DIR", required_unless_present = "interactive")]
     pub out: Option<PathBuf>,
+}
+
+/// `eval names`.
+#[derive(Debug, Clone, clap::Args, Serialize)]
+pub struct NamesOptions {
+    /// The geometry.ply that the instances were made from
+    #[arg(long, value_name = "FILE")]
+    pub geometry: PathBuf,
+    /// instances.safetensors of cluster-match
+    #[arg(long, value_name = "FILE")]
+    pub instances: PathBuf,
+    /// instances.edits.json of explore: what a person merged, split and named; for the printed table only
+    #[arg(long, value_name = "FILE")]
+    pub edits: Option<PathBuf>,
+    #[command(flatten)]
+    #[serde(flatten)]
+    pub texts: TextOptions,
+    /// Names that things may have: text, one a line, # begins a comment [default: about 1,200 everyday things; with --text-features all
+    /// names of the table]
+    #[arg(long, value_name = "FILE")]
+    pub vocabulary: Option<PathBuf>,
+    /// Put every name into this template, such as "a photo of a {}"; several templates are averaged; clip for the seven of
+    /// CLIP's authors
+    #[arg(long, value_name = "TEMPLATE", value_parser = template)]
+    pub template: Vec<String>,
+    /// Output JSON [default: names.json beside the instances, where all programs look for it]
+    #[arg(long, value_name = "FILE")]
+    pub out: Option<PathBuf>,
+}
+
+impl NamesOptions {
+    /// The templates, with those of a named set in its place.
+    pub fn templates(&self) -> Vec<String> {
+        templates(&self.template)
+    }
 }
 
 /// Where labels lie.
@@ -488,6 +523,10 @@ fn template(text: &str) -> Result<String> {
         return Ok(text.into());
     }
     Err(Error::new("no place for the text").expected("{} in it, or clip"))
+}
+
+fn templates(given: &[String]) -> Vec<String> {
+    given.iter().flat_map(|t| named(t, "clip", &CLIP_TEMPLATES)).collect()
 }
 
 /// The texts of a set where it is named, else the text itself.

@@ -83,6 +83,7 @@ fn write(material: &Material, metrics: &mut Metrics) -> Result<String> {
     sections::features(material, &mut page, metrics)?;
     sections::instances(material, &mut page, metrics)?;
     sections::soundness(material, &mut page, metrics)?;
+    sections::names(material, &mut page, metrics);
     sections::queries(material, &mut page, metrics)?;
     sections::score_tables(material, &mut page);
     sections::training(material, &mut page, metrics)?;
@@ -111,6 +112,7 @@ fn files(run_dir: &Path) -> impl Iterator<Item = PathBuf> {
         "features.safetensors.curve.jsonl",
         "instances.safetensors",
         "score.json",
+        "names.json",
         "query/query.json",
     ];
     names.map(|name| run_dir.join(name)).into_iter()

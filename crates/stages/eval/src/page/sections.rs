@@ -3,10 +3,12 @@
 use super::material::{Material, Shown, is_of, optional_json};
 use super::metrics::Metrics;
 use super::runs::{self, Run, grouped};
+use crate::names::counts;
 use crate::query::show::QueryResults;
 use crate::score::{QueryScore, ThingScore};
 use artifacts::{
-    Health, Level, MaskFolder, NOISE_COLOR, SharedMasks, flat, hash_folder, instance_color, maps_path, role,
+    Health, InstanceNames, Level, MaskFolder, NOISE_COLOR, Naming, ScoredName, SharedMasks, flat, hash_folder,
+    instance_color, maps_path, role,
 };
 use gs_io::{Error, IoContext, Result};
 use gs_scene::dataset::{Dataset, Split, View};
@@ -257,6 +259,42 @@ pub(super) fn queries(m: &Material, page: &mut Page, metrics: &mut Metrics) -> R
         page.figures(3, &figures);
     }
     Ok(())
+}
+
+/// How many of each are there, and what every instance may be.
+pub(super) fn names(m: &Material, page: &mut Page, metrics: &mut Metrics) {
+    let Some((instances, artifact)) = &m.found else { return };
+    let path = InstanceNames::path_beside(artifact.path());
+    if !path.exists() {
+        metrics.skipped.push("names: the run has no names.json (eval names makes it)".into());
+        return;
+    }
+    let names = match InstanceNames::read(&path, artifact.hash()) {
+        Ok(names) => names,
+        Err(e) => return metrics.skipped.push(format!("names: {e}")),
+    };
+    page.section("names", "What is there");
+    page.paragraph(&format!(
+        "The best of {} names for each instance, by the cosine of descriptor and name ({}). A name is sure where its lead over \
+         the best name of another meaning is above {}, what it may be by chance.",
+        names.words,
+        names.source,
+        names.by_chance.map_or("–".into(), |chance| format!("{chance:.3}"))
+    ));
+    let counts = counts(names.named.iter().filter_map(|n| names.best(n.instance)).map(|c| (c.name, c.sure)));
+    let rows: Vec<Vec<String>> = counts.iter().map(|c| vec![c.name.clone(), c.describe()]).collect();
+    page.table(&["name", "count"], &rows);
+    let row = |n: &Naming| {
+        let scored = |s: &ScoredName| format!("{} ({:.3})", s.name, s.score);
+        let others = n.names.iter().skip(1).map(scored).collect::<Vec<_>>().join(", ");
+        let gaussians = grouped(&instances.count[n.instance as usize].to_string());
+        let best = n.names.first().map_or(String::new(), scored);
+        let sure = if n.sure { "yes" } else { "no" };
+        vec![n.instance.to_string(), gaussians, best, format!("{:.3}", n.margin), sure.into(), others]
+    };
+    let there = names.named.iter().filter(|n| (n.instance as usize) < instances.len());
+    let rows: Vec<Vec<String>> = there.map(row).collect();
+    page.table(&["instance", "Gaussians", "name (cosine)", "margin", "sure", "or"], &rows);
 }
 
 /// The path of a picture that `query.json` names: it lies in that file's folder, and no other file is shown.

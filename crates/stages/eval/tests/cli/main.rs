@@ -1,6 +1,7 @@
 //! `eval` as people run it.
 
 mod fixture;
+mod names;
 mod protocols;
 
 use artifacts::{Descriptors, Instances, flat};
