@@ -1,6 +1,7 @@
 //! Finished runs: their files, what they label, and questions in words.
 
 use crate::work::run;
+use artifacts::{InstanceNames, called};
 use gs_io::{Artifact, Error};
 use gs_scene::dataset::{self, LoadOptions};
 use numpy::{IntoPyArray, PyArray1};
@@ -8,7 +9,6 @@ use objects::Up;
 use pyo3::exceptions::{PyOSError, PyValueError};
 use pyo3::prelude::*;
 use query::{Granules, Index, LabelledScene, TextOptions, TextSource, Unrelated, Verdict};
-use std::collections::BTreeMap;
 use std::path::PathBuf;
 
 /// What is wrong with a file.
@@ -51,14 +51,15 @@ impl Labelled {
         self.scene.instances.label.clone().into_pyarray(py)
     }
 
-    /// `scene.json`; boxes are upright where a dataset says what is up.
-    fn objects(&self, py: Python<'_>, scene: Option<PathBuf>) -> PyResult<String> {
+    /// `scene.json`; boxes are upright where a dataset says what is up. `names` is a names.json about these instances.
+    fn objects(&self, py: Python<'_>, scene: Option<PathBuf>, names: Option<PathBuf>) -> PyResult<String> {
         let described = run(py, 0, |_| {
             let dataset = scene.map(|path| dataset::load(&path, &LoadOptions::default())).transpose()?;
             let up = dataset.and_then(|d| Up::of_cameras(d.views.iter().map(|v| &v.camera)));
             let s = &self.scene;
-            let texts = BTreeMap::new();
-            Ok(objects::describe(&s.instances, s.gaussians(), &s.remarks, &texts, up, s.inputs.clone()))
+            let names = names.map(|path| InstanceNames::read(path, s.artifact.hash())).transpose()?;
+            let names = called(names.as_ref(), &s.remarks).into_iter().map(|(k, c)| (k, c.into())).collect();
+            Ok(objects::describe(&s.instances, s.gaussians(), &s.remarks, &names, up, s.inputs.clone()))
         })?;
         let described = described.map_err(|e: Error| failed(&e))?;
         serde_json::to_string(&described).map_err(|e| PyValueError::new_err(e.to_string()))

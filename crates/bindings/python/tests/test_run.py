@@ -91,6 +91,11 @@ def test_objects_are_those_of_the_labels(run):
     o = objects[0]
     np.testing.assert_allclose(o.axes @ o.axes.T, np.eye(3), atol=1e-5)
     np.testing.assert_allclose(o.centroid, run.select(o.id).means.mean(axis=0), atol=1e-3)
+    named = {n["instance"]: n for n in json.loads((run.folder / "names.json").read_text())["named"]}
+    for o in objects:
+        best = named.get(o.id)
+        assert (o.name, o.sure) == ((best["names"][0]["name"], best["sure"]) if best else (None, False))
+    o = objects[0]
     assert o.volume == pytest.approx(8 * np.prod(o.half_size), rel=1e-4)
 
 

@@ -2,7 +2,7 @@
 
 use crate::seeds;
 use artifacts::{
-    Descriptors, Edits, Features, Footprints, Graph, Instances, MaskFeatures, MaskMaps, TruePoints, TrueScene,
+    Descriptors, Edits, Features, Footprints, Graph, InstanceNames, Instances, MaskFeatures, MaskMaps, TruePoints, TrueScene,
 };
 use clap::Parser;
 use eval::{read_labels, read_mask, read_truth};
@@ -57,7 +57,7 @@ pub const FORMATS: [Format; 14] = [
     // One array of 16 MiB is believed, then 64 bytes a byte; of one-byte numbers, as floats.
     Format { name: "npz", check: check_npz, seeds: seeds::npz, memory: (7 << 24, JSON + 64 * 5) },
     Format { name: "artifact", check: check_artifact, seeds: seeds::artifact, memory: (FIXED, JSON) },
-    // Edits of instances, scene.json and ids of Gaussians, too. Polygons stand for pictures of the size that the file names; all of a frame have 2^28 pixels at most.
+    // Edits and names of instances, scene.json and ids of Gaussians, too. Polygons stand for pictures of the size that the file names; all of a frame have 2^28 pixels at most.
     Format { name: "labels", check: check_labels, seeds: seeds::labels, memory: (FIXED + (1 << 28), JSON) },
     Format { name: "scannet", check: check_scannet, seeds: seeds::scannet, memory: (FIXED, JSON) },
     // Packed: a byte stands for as many as gzip makes of it, and a Gaussian takes 26 times what it has in the file. A window of
@@ -320,6 +320,9 @@ fn check_labels(bytes: &[u8]) {
                 .iter()
                 .for_each(|r| assert!(scene.object(r.subject).is_some() && scene.object(r.object).is_some()));
             assert!(scene.objects.iter().all(|o| o.bounds.corners().as_flattened().iter().all(|v| !v.is_nan())));
+        }
+        if let Some(names) = sound(InstanceNames::parse(bytes).map_err(|e| e.file(path)), path) {
+            assert!(names.named.iter().all(|n| names.best(n.instance).is_some_and(|c| !c.name.is_empty())));
         }
         if let Some(ids) = sound(Ids::parse(bytes).map_err(|e| e.file(path)), path) {
             assert!(ids.instance.iter().all(|&i| i >= -1));

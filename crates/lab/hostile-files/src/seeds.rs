@@ -280,6 +280,9 @@ pub(crate) fn labels() -> Vec<Vec<u8>> {
 "name":null,"score":0,"gaussians":5,"parent":null,"parts":[],"centroid":[0,0,0],"box":{"center":[0,0,0],"half_size":[0,0,0],
 "axes":[[1,0,0],[0,1,0],[0,0,1]],"upright":true},"volume":0,"best_view":null}],"relations":[{"subject":1,"relation":"on","object":2}]}"#
             .to_vec(),
+        br#"{"format":"names","version":1,"instances":"ab","source":"CLIP","model":"cd","vocabulary":"ef","words":3,"by_chance":0.02,
+"named":[{"instance":0,"names":[{"name":"mug","score":0.3},{"name":"cup","score":0.28}],"margin":0.01,"sure":false}]}"#
+            .to_vec(),
         br#"{"format":"gaussian-ids","version":1,"splat":"ab","instance":[0,-1,3,2147483647]}"#.to_vec(),
     ]
 }

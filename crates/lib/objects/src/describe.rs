@@ -12,7 +12,7 @@ use std::collections::BTreeMap;
 const MIN_OPACITY: f32 = 0.1;
 
 /// Names of objects by id.
-pub type Names = BTreeMap<u32, String>;
+pub type Names = BTreeMap<u32, Name>;
 
 /// The Gaussians of every instance, ascending; as many lists as instances.
 pub fn members(label: &[i32], instances: usize) -> Vec<Vec<u32>> {
@@ -26,13 +26,13 @@ pub fn members(label: &[i32], instances: usize) -> Vec<Vec<u32>> {
 }
 
 /// The objects of a scene and their relations. Instances have the edits applied and one label for each Gaussian; what a
-/// person named (`remarks`) goes before the `texts` that instances answer best. `inputs` are the content hashes of what all
+/// person named (`remarks`) goes before the names of `others`. `inputs` are the content hashes of what all
 /// of this was read from.
 pub fn describe(
     instances: &Instances,
     gaussians: &Gaussians,
     remarks: &Remarks,
-    texts: &Names,
+    others: &Names,
     up: Option<Up>,
     inputs: BTreeMap<String, String>,
 ) -> Scene {
@@ -49,7 +49,7 @@ pub fn describe(
             let (parent, parts) = family(instances, &sizes, k);
             Object {
                 id: k,
-                name: name(remarks, texts, k),
+                name: name(remarks, others, k),
                 score: instances.score[k as usize],
                 gaussians: own.len() as u32,
                 parent,
@@ -81,10 +81,9 @@ pub fn solid_centers(g: &Gaussians, own: &[u32]) -> Vec<[f32; 3]> {
     Some(of(MIN_OPACITY)).filter(|c| !c.is_empty()).unwrap_or_else(|| of(0.0))
 }
 
-fn name(remarks: &Remarks, texts: &Names, k: u32) -> Option<Name> {
-    let given = remarks.names.get(&k).map(|text| (text, NameSource::Edits));
-    let (text, from) = given.or_else(|| texts.get(&k).map(|text| (text, NameSource::Query)))?;
-    Some(Name { text: text.clone(), from })
+fn name(remarks: &Remarks, others: &Names, k: u32) -> Option<Name> {
+    let given = remarks.names.get(&k).map(|text| Name { text: text.clone(), from: NameSource::Edits, sure: true });
+    given.or_else(|| others.get(&k).cloned())
 }
 
 fn family(instances: &Instances, sizes: &BTreeMap<u32, u32>, k: u32) -> (Option<Family>, Vec<Part>) {
@@ -119,12 +118,14 @@ mod tests {
         [([0.0; 3], [2.0, 1.0, 0.7]), ([0.4, 0.4, 0.7], [0.5, 0.5, 0.8]), ([0.58, 0.4, 0.7], [0.68, 0.5, 0.85])];
 
     fn of(instances: &Instances, gaussians: &Gaussians, remarks: &Remarks, up: &str) -> Scene {
-        let texts = BTreeMap::from([(0, "table".into()), (1, "cup".into())]);
+        let name = |text: &str, from, sure| Name { text: text.into(), from, sure };
+        let others =
+            Names::from([(0, name("table", NameSource::Query, true)), (1, name("cup", NameSource::Vocabulary, false))]);
         describe(
             instances,
             gaussians,
             remarks,
-            &texts,
+            &others,
             up.parse().ok(),
             BTreeMap::from([("geometry".into(), "h".into())]),
         )
@@ -133,9 +134,13 @@ mod tests {
     #[test]
     fn a_scene_holds_what_is_known_of_each_object() {
         let (instances, gaussians) = boxes(&TABLE);
-        let remarks = Remarks { names: BTreeMap::from([(1, "red mug".into())]), metres_per_unit: Some(0.5) };
+        let remarks = Remarks {
+            names: BTreeMap::from([(1, "red mug".into())]),
+            metres_per_unit: Some(0.5),
+            ..Remarks::default()
+        };
         let scene = of(&instances, &gaussians, &remarks, "z");
-        let name = |text: &str, from| Some(Name { text: text.into(), from });
+        let name = |text: &str, from| Some(Name { text: text.into(), from, sure: true });
         let names: Vec<_> = scene.objects.iter().map(|o| o.name.clone()).collect();
         assert_eq!(names, [name("table", NameSource::Query), name("red mug", NameSource::Edits), None]);
         let mug = scene.object(1).unwrap();

@@ -2,6 +2,7 @@
 
 use crate::up::Up;
 use crate::upright::ObjectBox;
+use artifacts::Called;
 use gs_io::{Error, IoContext, Result, write_json};
 use serde::{Deserialize, Serialize};
 use std::collections::{BTreeMap, BTreeSet};
@@ -18,6 +19,8 @@ pub enum NameSource {
     Edits,
     /// The text that it answers best (`query.json` of `eval query`).
     Query,
+    /// The best name of a vocabulary (`names.json` of `eval names`).
+    Vocabulary,
 }
 
 /// What an object is called.
@@ -28,6 +31,31 @@ pub struct Name {
     pub text: String,
     /// Who says so.
     pub from: NameSource,
+    /// False where it is a guess; left out of the file where it is none.
+    #[serde(default = "yes", skip_serializing_if = "is_true")]
+    pub sure: bool,
+}
+
+fn yes() -> bool {
+    true
+}
+
+fn is_true(sure: &bool) -> bool {
+    *sure
+}
+
+impl From<Called> for Name {
+    fn from(called: Called) -> Self {
+        let from = if called.by_person { NameSource::Edits } else { NameSource::Vocabulary };
+        Self { text: called.name, from, sure: called.sure }
+    }
+}
+
+impl std::fmt::Display for Name {
+    /// The name; a guess with a question mark.
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        write!(f, "{}{}", self.text, if self.sure { "" } else { "?" })
+    }
 }
 
 /// A cluster of the tree above an object: what it is a part of.
@@ -72,7 +100,7 @@ pub struct BestView {
 pub struct Object {
     /// Instance: the number that Gaussians of it have in `instance` of the PLY.
     pub id: u32,
-    /// What it is called, where somebody or a query said.
+    /// What it is called, where somebody, a query or a vocabulary said.
     pub name: Option<Name>,
     /// Confidence that it is one whole thing, 0 to 1.
     pub score: f32,

@@ -51,8 +51,8 @@ const INPUTS: [Input; 9] = [
     Input { id: "text_features", place: Place::Recorded(None), always: true },
 ];
 
-/// What a person changed of the instances lies beside them.
-const EDITS: (&str, &str) = ("edits", "instances.edits.json");
+/// What lies beside the instances and is about them: what a person changed, and what they are called.
+const BESIDE: [(&str, &str); 2] = [("edits", "instances.edits.json"), ("names", "names.json")];
 
 /// The options that the folder of a run tells, to be added to `arguments` (the program's name first). Empty without `--run-dir`, and where the
 /// command line is wrong, which the parser then says.
@@ -132,10 +132,13 @@ impl Asked<'_> {
             let e = Error::new("this command reads nothing of a run").field("--run-dir");
             return Err(e.hint("leave it out"));
         }
-        let (edits, instances) = (self.dir.join(EDITS.1), OsStr::new("--instances"));
-        let wanted = edits.is_file() && options.iter().any(|o| o == instances) && !self.is_given(EDITS.0);
-        if let Some(arg) = self.arg(EDITS.0).filter(|arg| wanted && !self.excluded(arg)) {
-            options.extend([OsString::from(option(arg)), edits.into_os_string()]);
+        let of_the_run = options.iter().any(|o| o == OsStr::new("--instances"));
+        for (id, name) in BESIDE.into_iter().filter(|_| of_the_run) {
+            let path = self.dir.join(name);
+            let wanted = path.is_file() && !self.is_given(id) && !self.outputs.contains(&id);
+            if let Some(arg) = self.arg(id).filter(|arg| wanted && !self.excluded(arg)) {
+                options.extend([OsString::from(option(arg)), path.into_os_string()]);
+            }
         }
         Ok(options)
     }
@@ -227,6 +230,8 @@ mod tests {
             #[arg(long)]
             edits: Option<PathBuf>,
             #[arg(long)]
+            names: Option<PathBuf>,
+            #[arg(long)]
             clip: Option<PathBuf>,
             #[arg(long, conflicts_with = "clip")]
             text_features: Option<PathBuf>,
@@ -305,8 +310,9 @@ mod tests {
         assert_eq!(of(dir.path(), &["query", "--text", "mug"]).unwrap(), all);
         let given = of(dir.path(), &["query", "--scene", "other", "--instances=mine"]).unwrap();
         assert_eq!(given, "--geometry @/c d.ply");
-        std::fs::write(dir.path().join(EDITS.1), "{}").unwrap();
-        assert_eq!(of(dir.path(), &["query"]).unwrap(), format!("{all} --edits @/instances.edits.json"));
+        BESIDE.iter().for_each(|(_, name)| std::fs::write(dir.path().join(name), "{}").unwrap());
+        let beside = "--edits @/instances.edits.json --names @/names.json";
+        assert_eq!(of(dir.path(), &["query"]).unwrap(), format!("{all} {beside}"));
         // Edits of other instances would be wrong.
         assert!(!of(dir.path(), &["query", "--instances=mine"]).unwrap().contains("edits"));
     }

@@ -102,6 +102,8 @@ fn counts(world: &World) -> Vec<u32> {
 pub fn instances_of(edited: Option<&Edited>, world: &World) -> Vec<Value> {
     let instances = edited.map_or(&world.scene.instances, |e| &e.instances);
     let name = |k: usize| edited.and_then(|e| e.remarks.names.get(&(k as u32)));
+    // The page applies edits itself, so it gets what the vocabulary says of the instances before any.
+    let guess = |k: usize| world.names.as_ref().filter(|_| edited.is_none()).and_then(|n| n.best(k as u32));
     let one = |k: usize| {
         let b = &instances.oriented[k];
         json!({
@@ -111,6 +113,7 @@ pub fn instances_of(edited: Option<&Edited>, world: &World) -> Vec<Value> {
             "centroid": instances.centroid[k],
             "box": {"center": b.center, "axes": b.axes, "half": b.half_size},
             "name": name(k),
+            "guess": guess(k).map(|g| json!({"name": g.name, "sure": g.sure})),
         })
     };
     (0..instances.len()).map(one).collect()

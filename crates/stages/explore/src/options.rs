@@ -1,5 +1,6 @@
 //! The command line.
 
+use artifacts::InstanceNames;
 use clap::{Parser, Subcommand};
 use gs_io::{Error, Result};
 use gs_scene::dataset::Resolution;
@@ -68,6 +69,11 @@ impl Source {
         self.instances.with_file_name("instances.edits.json")
     }
 
+    /// What instances are called by a vocabulary; need not be there.
+    pub fn names(&self) -> PathBuf {
+        InstanceNames::path_beside(&self.instances)
+    }
+
     /// The features that the instances were clustered from, where they lie beside them.
     pub fn features(&self) -> Option<PathBuf> {
         Some(self.instances.with_file_name("features.safetensors")).filter(|f| f.is_file())
@@ -81,7 +87,7 @@ impl Source {
 
     /// All files that are read but those of the dataset.
     pub fn files(&self) -> impl Iterator<Item = PathBuf> {
-        [self.instances.clone(), self.geometry.clone(), self.edits()].into_iter().chain(self.features())
+        [self.instances.clone(), self.geometry.clone(), self.edits(), self.names()].into_iter().chain(self.features())
     }
 }
 

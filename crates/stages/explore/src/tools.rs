@@ -39,8 +39,8 @@ pub struct Tool {
 pub const TOOLS: [Tool; 5] = [
     Tool {
         name: "list",
-        about: "The objects of the scene: id, name, centre, size and volume of the box, number of Gaussians. Lengths are in \
-                units of the scene; metres_per_unit is null where nobody measured one.",
+        about: "The objects of the scene: id, name and whether that is sure or a guess, centre, size and volume of the box, number of \
+                Gaussians. Lengths are in units of the scene; metres_per_unit is null where nobody measured one.",
         schema: schema::<List>,
         answer: |asked, v| Ok(list(asked, &parsed(v)?)),
     },
@@ -165,7 +165,7 @@ fn parsed<T: DeserializeOwned>(arguments: Value) -> Result<T> {
 /// What all answers say of an object.
 fn brief(o: &Object) -> Value {
     json!({
-        "id": o.id, "name": o.name.as_ref().map(|n| &n.text), "centre": o.bounds.center, "size": size(o), "volume": o.volume,
+        "id": o.id, "name": o.name.as_ref().map(|n| &n.text), "sure": o.name.as_ref().map(|n| n.sure), "centre": o.bounds.center, "size": size(o), "volume": o.volume,
         "gaussians": o.gaussians, "score": o.score,
     })
 }
@@ -177,7 +177,7 @@ fn size(o: &Object) -> [f32; 3] {
 
 /// An object in a sentence.
 fn called(o: &Object) -> String {
-    let name = o.name.as_ref().map_or("object", |n| &n.text);
+    let name = o.name.as_ref().map_or("object".into(), ToString::to_string);
     format!("{name} ({})", o.id)
 }
 

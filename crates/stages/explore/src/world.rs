@@ -3,7 +3,7 @@
 use crate::options::Source;
 use crate::pack::{Packed, pack};
 use crate::reach::Reach;
-use artifacts::{Edits, Instances, Remarks};
+use artifacts::{Called, Edits, InstanceNames, Instances, Remarks, called};
 use gs_io::{Error, Result};
 use gs_scene::Gaussians;
 use gs_scene::dataset::{self, Dataset, LoadOptions, Resolution, View};
@@ -35,6 +35,8 @@ pub struct World {
     pub words: std::result::Result<TextSource, String>,
     /// What says whether a text matches anything; encoded at the first text.
     unrelated: OnceLock<Option<Unrelated>>,
+    /// What instances are called by a vocabulary, where the run has that.
+    pub names: Option<InstanceNames>,
     /// What a person should know: photographs that are missing, features of another scene.
     pub messages: Vec<String>,
 }
@@ -57,8 +59,14 @@ impl Edited {
         self.objects.get_or_init(|| {
             let up = Up::of_cameras(world.dataset.views.iter().map(|v| &v.camera));
             let inputs = world.scene.inputs.clone();
-            objects::describe(&self.instances, world.gaussians(), &self.remarks, &BTreeMap::new(), up, inputs)
+            let names = self.called(world).into_iter().map(|(k, c)| (k, c.into())).collect();
+            objects::describe(&self.instances, world.gaussians(), &self.remarks, &names, up, inputs)
         })
+    }
+
+    /// What instances are called, by a person or else by a vocabulary.
+    pub fn called(&self, world: &World) -> BTreeMap<u32, Called> {
+        called(world.names.as_ref(), &self.remarks)
     }
 
     /// Whether a text of this feature matches anything; none where that is not judged.
@@ -84,6 +92,10 @@ impl World {
         let mut messages = dataset.warnings.clone();
         messages.extend(scene.geometry.damage());
         let words = words(o, &scene);
+        let names = names(o, &scene).unwrap_or_else(|e| {
+            messages.push(format!("names are left out: {e}"));
+            None
+        });
         let packed = pack(scene.gaussians(), o.sh);
         let reach = Reach::new(scene.gaussians(), &packed.order);
         let (cells, cell_of) = cells(&scene.instances);
@@ -110,6 +122,7 @@ impl World {
             feature_colors,
             words,
             unrelated: OnceLock::new(),
+            names,
             messages,
         })
     }
@@ -189,6 +202,12 @@ fn words(source: &Source, scene: &LabelledScene) -> std::result::Result<TextSour
         );
     }
     TextSource::open_for(&scene.artifact, scene.instances.dim(), &source.texts()).map_err(|e| e.to_string())
+}
+
+/// The names that lie beside the instances.
+fn names(source: &Source, scene: &LabelledScene) -> Result<Option<InstanceNames>> {
+    let path = Some(source.names()).filter(|path| path.exists());
+    path.map(|path| InstanceNames::read(path, scene.artifact.hash())).transpose()
 }
 
 /// The different pairs of label and node in order of their first Gaussian, and which of them each Gaussian has.

@@ -3,7 +3,7 @@
 //! `scripts/test_explore.sh` runs these on the demo's scene; they need EXPLORE_RUN (a finished run with query/query.json) and
 //! both programs. EXPLORE_SCREENSHOT names a file for a picture of the page.
 
-use artifacts::{Edits, Instances};
+use artifacts::{Edits, InstanceNames, Instances};
 use base64::Engine;
 use fantoccini::actions::{InputSource, MouseActions, PointerAction};
 use fantoccini::{Client, ClientBuilder, Locator};
@@ -197,18 +197,27 @@ impl Browser {
 
     /// A real click on what lies at a pixel of a view, after standing there.
     async fn click(&self, view: usize, pixel: [u32; 2]) {
+        let mouse = self.over(view, pixel).await.then(PointerAction::Down { button: 0 });
+        self.client.perform_actions(mouse.then(PointerAction::Up { button: 0 })).await.unwrap();
+        self.client.release_actions().await.unwrap();
+    }
+
+    /// Lets the pointer rest on a pixel of a view.
+    async fn point(&self, view: usize, pixel: [u32; 2]) {
+        let mouse = self.over(view, pixel).await;
+        self.client.perform_actions(mouse).await.unwrap();
+    }
+
+    /// The mouse over a pixel of a view, from which the page then looks.
+    async fn over(&self, view: usize, pixel: [u32; 2]) -> MouseActions {
         let script = "page.jump(given[0]); await page.viewer.busy; const c = page.viewer.camera, o = page.scene.cameras[given[0]]; \
                       const canvas = document.getElementById('canvas'), rect = canvas.getBoundingClientRect(), s = rect.width / c.width; \
                       const x = (given[1] + 0.5 - o.cx) / o.fx * c.fx + c.cx, y = (given[2] + 0.5 - o.cy) / o.fy * c.fy + c.cy; \
                       return [Math.round(rect.left + x * s), Math.round(rect.top + y * s)];";
         let at = self.js(script, vec![view.into(), pixel[0].into(), pixel[1].into()]).await;
         let to = |k: usize| at[k].as_i64().unwrap() as i32 as i64;
-        let mouse = MouseActions::new("mouse".into())
-            .then(PointerAction::MoveTo { duration: None, x: to(0) as f64, y: to(1) as f64 })
-            .then(PointerAction::Down { button: 0 })
-            .then(PointerAction::Up { button: 0 });
-        self.client.perform_actions(mouse).await.unwrap();
-        self.client.release_actions().await.unwrap();
+        let there = PointerAction::MoveTo { duration: None, x: to(0) as f64, y: to(1) as f64 };
+        MouseActions::new("mouse".into()).then(there)
     }
 
     /// Waits until `condition`, JavaScript, is true.
@@ -333,6 +342,8 @@ async fn a_served_scene_can_be_seen_clicked_asked_and_edited() {
     pictures_agree(&browser, &f, 0).await;
     clicks_select(&browser, &f, usize::MAX).await;
 
+    names_are_listed_and_hovered(&browser, &f).await;
+
     // A text selects what eval query selects, and what is saved are the same Gaussians.
     for (text, selected, gaussians) in answers(&f.run) {
         browser.ask(&text).await;
@@ -389,6 +400,26 @@ async fn a_served_scene_can_be_seen_clicked_asked_and_edited() {
     edits_are_those_of_the_stages(&browser, &f, &edits).await;
     browser.no_errors().await;
     browser.client.clone().close().await.unwrap();
+}
+
+/// Everything stands in the list of what is here, under the names of `names.json`; the pointer tells a thing's name.
+async fn names_are_listed_and_hovered(browser: &Browser, f: &Fixture) {
+    let hash = Instances::read(f.run.join("instances.safetensors")).unwrap().1.hash().to_string();
+    let names = InstanceNames::read(f.run.join("names.json"), &hash).unwrap();
+    let listed = "await page.act('inventory'); return [...document.querySelectorAll('#ranking button')].map((b) => [b.children[1].textContent, b.children[2].textContent])";
+    let rows: Vec<[String; 2]> = serde_json::from_value(browser.js(listed, vec![]).await).unwrap();
+    let count = |row: &[String; 2]| row[1].strip_prefix("× ").unwrap().parse::<usize>().unwrap();
+    assert_eq!(rows.iter().map(count).sum::<usize>(), f.instances.count.iter().filter(|&&n| n > 0).count(), "{rows:?}");
+    browser.js("document.querySelector('#ranking button').click(); await page.viewer.busy", vec![]).await;
+    browser.until("page.selectedInstances().length").await;
+    let selected = browser.selected().await;
+    assert_eq!(selected.len(), count(&rows[0]));
+    assert!(selected.iter().all(|&k| names.best(k).is_some_and(|c| c.name == rows[0][0])), "{selected:?} {rows:?}");
+    browser.js("await page.select([])", vec![]).await;
+    let named = f.places().into_iter().find_map(|(k, view, pixel)| Some((names.best(k)?, view, pixel)));
+    let (called, view, pixel) = named.unwrap();
+    browser.point(view, pixel).await;
+    browser.until(&format!("document.getElementById('canvas').title === {}", json!(called.to_string()))).await;
 }
 
 /// Merging, naming, splitting and the scale: the page's labels are those of `artifacts::Edits`, also after undo and redo.

@@ -39,6 +39,33 @@ fn a_text_no_better_than_by_chance_is_said() {
 }
 
 #[test]
+fn names_of_a_vocabulary_are_shown_only_for_their_instances() {
+    let run = Run::new();
+    run.write_names(&run.instances());
+    let server = run.serve(&[]);
+    let scene = server.json("GET", "/scene.json", &Value::Null);
+    let guesses: Vec<&Value> = (0..2).map(|k| &scene["instances"][k]["guess"]).collect();
+    assert_eq!(guesses, [&json!({"name": "sun", "sure": true}), &json!({"name": "planet", "sure": false})]);
+    assert_eq!(scene["instances"][0]["name"], Value::Null, "no person said so");
+    let names = |server: &common::Server| -> Vec<Value> {
+        let list = server.json("POST", "/tools/list", &json!({}));
+        list["objects"].as_array().unwrap().iter().map(|o| o["name"].clone()).collect()
+    };
+    assert_eq!(names(&server), [json!("sun"), json!("planet")]);
+    // What was split is something else.
+    server.json("PUT", "/edits", &json!([{"op": "split", "instance": 1}]));
+    assert_eq!(names(&server), [json!("sun"), Value::Null, Value::Null]);
+    drop(server);
+    std::fs::remove_file(run.out().join("instances.edits.json")).unwrap();
+    run.write_names("0123456789abcdef");
+    let server = run.serve(&[]);
+    let scene = server.json("GET", "/scene.json", &Value::Null);
+    assert_eq!((&scene["instances"][0]["guess"], names(&server)), (&Value::Null, vec![Value::Null; 2]));
+    let said = scene["messages"].to_string();
+    assert!(said.contains("names are left out") && said.contains("found 0123456789ab"), "{said}");
+}
+
+#[test]
 fn the_server_answers_clicks_texts_edits_and_selections() {
     let run = Run::new();
     let server = run.serve(&[]);

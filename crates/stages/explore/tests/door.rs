@@ -96,9 +96,10 @@ impl Doors {
 fn both_doors_answer_alike() {
     let run = Run::new();
     let edits = json!({"format": "instances.edits", "version": 1,
-        "instances": artifacts::Instances::read(run.out().join("instances.safetensors")).unwrap().1.hash(),
+        "instances": run.instances(),
         "edits": [{"op": "rename", "instance": 0, "name": "Moon"}]});
     std::fs::write(run.out().join("instances.edits.json"), edits.to_string()).unwrap();
+    run.write_names(&run.instances());
     let mut doors = Doors::open(&run, &[]);
 
     let tools = doors.agent.ask("tools/list", &json!({}))["result"]["tools"].take();
@@ -110,6 +111,8 @@ fn both_doors_answer_alike() {
 
     let list = doors.ask("list", &json!({})).unwrap();
     assert_eq!((list["of"].as_u64(), &list["objects"][0]["name"]), (Some(2), &json!("Moon")));
+    let called: Vec<_> = (0..2).map(|k| (&list["objects"][k]["name"], &list["objects"][k]["sure"])).collect();
+    assert_eq!(called, [(&json!("Moon"), &json!(true)), (&json!("planet"), &json!(false))], "a person goes first");
     assert_eq!(doors.ask("list", &json!({"most": 1})).unwrap()["objects"][0]["id"], json!(1));
 
     let ids = |found: &Value| -> Vec<u64> {
@@ -119,6 +122,9 @@ fn both_doors_answer_alike() {
     assert_eq!((ids(&found), &found["found"][0]["cosine"]), (vec![1, 0], &json!(1.0)));
     // A name goes before any score, and needs no language model.
     assert_eq!(ids(&doors.ask("find", &json!({"text": "moon", "most": 1})).unwrap()), [0]);
+    // A guess is no answer, and a question mark says so.
+    assert_eq!(found["found"][0]["named_so"], json!(false));
+    assert_eq!(doors.ask("measure", &json!({"object": 1})).unwrap()["object"], json!("planet? (1)"));
 
     let measured = doors.ask("measure", &json!({"object": 0, "other": 1})).unwrap();
     assert_eq!(measured["gap"], json!({"units": 2.0, "metres": null}));

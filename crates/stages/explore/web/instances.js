@@ -38,6 +38,8 @@ export class Instances {
     this.label = Int32Array.from(this.cells, (c) => c[0]);
     this.tree = this.scene.tree.map(([parent, child, lambda, size, instance]) => ({ parent, child, lambda, size, instance }));
     this.names = new Map();
+    // What a vocabulary calls those that nobody merged or split: k -> { name, sure }.
+    this.guesses = new Map(this.scene.instances.flatMap(({ guess }, k) => (guess ? [[k, guess]] : [])));
     this.origin = this.scene.instances.map((_, k) => [k]);
     this.metresPerUnit = null;
   }
@@ -77,6 +79,7 @@ export class Instances {
       const [first, ...others] = edit.instances;
       if (!others.length) return "Select two or more instances to merge (shift-click).";
       const gone = new Set(others);
+      edit.instances.forEach((k) => this.guesses.delete(k));
       this.label = this.label.map((l) => (gone.has(l) ? first : l));
       for (const e of this.tree) if (gone.has(e.instance)) e.instance = first;
       for (const k of others) {
@@ -97,6 +100,7 @@ export class Instances {
         const part = partOf(cell);
         if (part >= 0) this.label[cell] = ids[part];
       }
+      this.guesses.delete(k);
       for (const e of this.tree) {
         if (own.includes(e.child)) e.instance = -1;
         if (parts.includes(e.child)) e.instance = ids[parts.indexOf(e.child)];
@@ -157,7 +161,24 @@ export class Instances {
   }
 
   name(k) {
-    return this.names.get(k) ?? `instance ${k}`;
+    return this.called(k) ?? `instance ${k}`;
+  }
+
+  // As a person or the vocabulary calls it, a guess with a question mark; null where neither does.
+  called(k) {
+    const guess = this.guesses.get(k);
+    return this.names.get(k) ?? (guess ? guess.name + (guess.sure ? "" : "?") : null);
+  }
+
+  // What is there: [name, instances], those of which there are most first.
+  inventory() {
+    const there = new Map();
+    for (const k of new Set(this.label)) {
+      if (k < 0) continue;
+      const name = this.names.get(k) ?? this.guesses.get(k)?.name ?? "without a name";
+      there.set(name, [...(there.get(name) ?? []), k]);
+    }
+    return [...there].sort((a, b) => b[1].length - a[1].length || (a[0] < b[0] ? -1 : 1));
   }
 
   // Views that show it, best first: [view, mask, score].

@@ -178,12 +178,20 @@ function select(cells, { extend = false, clicked = null } = {}) {
 
 const selectInstances = (ids, options) => select(ids.flatMap((k) => instances.cellsOf(k)), options);
 
-const click = attempt(async (event) => {
+const pick = (here, x, y) => door.pick(here, x, y, hiddenCells(), (cell) => instances.label[cell]);
+
+// What is where an event happened; null outside of the picture.
+async function under(event) {
   const here = camera(), scale = here.width / $("stage").clientWidth;
   const rect = $("canvas").getBoundingClientRect();
   const [x, y] = [event.clientX - rect.left, event.clientY - rect.top].map((v) => Math.floor(v * scale));
-  if (x < 0 || y < 0 || x >= here.width || y >= here.height) return;
-  const picked = await pick(here, x, y);
+  const outside = x < 0 || y < 0 || x >= here.width || y >= here.height;
+  return outside ? null : pick(here, x, y);
+}
+
+const click = attempt(async (event) => {
+  const picked = await under(event);
+  if (!picked) return;
   if (state.tool !== "select") return measure(picked.position);
   if (picked.instance === null) {
     if (!event.shiftKey) await select([]);
@@ -192,8 +200,6 @@ const click = attempt(async (event) => {
   }
   await selectInstances([picked.instance], { extend: event.shiftKey, clicked: picked.cell });
 });
-
-const pick = (here, x, y) => door.pick(here, x, y, hiddenCells(), (cell) => instances.label[cell]);
 
 const measure = attempt(async (position) => {
   if (!position) return say("There is nothing to measure at.");
@@ -242,6 +248,38 @@ function clearAnswer() {
   state.answer = null;
   results();
   return refresh();
+}
+
+// All that is there, by name: in the place of what was found.
+const inventory = attempt(() => {
+  state.answer = state.threshold = null;
+  const there = instances.inventory(), all = there.reduce((sum, [, own]) => sum + own.length, 0);
+  $("results").hidden = false;
+  for (const part of ["histogram", "threshold-label"]) $(part).style.display = "none";
+  $("results-title").textContent = `${all} thing${all === 1 ? "" : "s"} here`;
+  $("ranking").replaceChildren(...there.map(([name, own]) => {
+    const button = element("button", { type: "button", title: own.map((k) => `${instances.name(k)} (${k})`).join(", ") });
+    const pictured = own.find((k) => instances.views(k).length);
+    const picture = pictured === undefined ? null : door.thumbnail(pictured);
+    button.append(picture ? element("img", { src: picture, alt: "", loading: "lazy" }) : element("span"), element("span", {}, name), element("small", {}, `× ${own.length}`));
+    button.addEventListener("click", (e) => selectInstances(own, { extend: e.shiftKey }));
+    const item = element("li");
+    item.append(button);
+    return item;
+  }));
+});
+
+// Where the pointer rests, the thing's name is shown.
+const HOVER_MS = 300;
+let resting = 0;
+function hover(event) {
+  clearTimeout(resting);
+  $("canvas").title = "";
+  if (event.buttons || event.pointerType === "touch" || !(instances.guesses.size + instances.names.size)) return;
+  resting = setTimeout(async () => {
+    const picked = await under(event).catch(() => null);
+    if (picked?.instance != null) $("canvas").title = instances.called(picked.instance) ?? "";
+  }, HOVER_MS);
 }
 
 function results() {
@@ -336,6 +374,7 @@ const TOOLS = [
   ["undo", "Undo", "ctrl+z", () => change(() => instances.undo()), () => instances.edits.length],
   ["redo", "Redo", "ctrl+y", () => change(() => instances.redo()), () => instances.undone.length],
   ["show-all", "Show all", "escape", () => showAll(), () => true],
+  ["inventory", "What is here", "t", () => inventory(), () => true],
   ["measure", "Measure", "u", () => setTool(state.tool === "measure" ? "select" : "measure"), () => true, () => state.tool === "measure"],
   ["scale", "Set scale", "k", () => setTool(state.tool === "scale" ? "select" : "scale"), () => true, () => state.tool === "scale"],
   ["picture", "Save picture", "c", () => savePicture(), () => true],
@@ -405,6 +444,7 @@ const change = attempt(async (work) => {
   }
   state.levels = null;
   if (state.answer) await find(state.answer.text);
+  else if (!$("results").hidden) inventory();
   await refresh();
 });
 
@@ -556,6 +596,8 @@ function about() {
 
 function listen() {
   visitor.listen($("canvas"), click);
+  $("canvas").addEventListener("pointermove", hover);
+  $("canvas").addEventListener("pointerleave", () => clearTimeout(resting));
   $("search").addEventListener("submit", (e) => {
     e.preventDefault();
     find($("text").value);

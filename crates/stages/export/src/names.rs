@@ -1,7 +1,8 @@
-//! What queries call the objects: `query.json` of `eval query`.
+//! What objects are called: by queries (`query.json` of `eval query`), and by a vocabulary (`names.json` of `eval names`).
 
+use artifacts::{InstanceNames, called};
 use gs_io::{Error, IoContext, Result};
-use objects::Names;
+use objects::{Name, NameSource, Names};
 use query::LabelledScene;
 use serde::Deserialize;
 use stage::RunRecord;
@@ -27,11 +28,22 @@ struct Rank {
     score: f32,
 }
 
+/// Names of a vocabulary, a guess among them; what the text says that an instance answers best goes before them.
+///
+/// # Errors
+/// When a file is not of its kind, or about other instances.
+pub fn read(names: Option<&Path>, query: Option<&Path>, scene: &LabelledScene) -> Result<Names> {
+    let by_words = names.map(|path| InstanceNames::read(path, scene.artifact.hash())).transpose()?;
+    let mut all: Names = called(by_words.as_ref(), &scene.remarks).into_iter().map(|(k, c)| (k, c.into())).collect();
+    all.extend(query.map_or(Ok(Names::new()), |path| of_query(path, scene))?);
+    Ok(all)
+}
+
 /// The text that each instance answers best, of those that no other instance answers better.
 ///
 /// # Errors
 /// When the file is not such a file, or its record says that it is about other instances.
-pub fn read(path: &Path, scene: &LabelledScene) -> Result<Names> {
+fn of_query(path: &Path, scene: &LabelledScene) -> Result<Names> {
     let bytes = std::fs::read(path).at("read", path)?;
     let answers: Answers = serde_json::from_slice(&bytes)
         .map_err(|e| Error::new(format!("not a query.json of eval query: {e}")).file(path))?;
@@ -58,7 +70,8 @@ fn best(answers: &[Answer]) -> Names {
             *held = (first.score, &answer.text);
         }
     }
-    best.into_iter().filter(|(_, (_, text))| !text.is_empty()).map(|(id, (_, text))| (id, text.to_string())).collect()
+    let named = best.into_iter().filter(|(_, (_, text))| !text.is_empty());
+    named.map(|(id, (_, text))| (id, Name { text: text.into(), from: NameSource::Query, sure: true })).collect()
 }
 
 #[cfg(test)]
@@ -80,6 +93,7 @@ mod tests {
             answer("nothing", "text", &[]),
             answer("table", "text", &[(0, 0.1)]),
         ]);
-        assert_eq!(names, Names::from([(0, "table".into()), (3, "mug".into())]));
+        let names: Vec<(u32, String)> = names.into_iter().map(|(id, name)| (id, name.to_string())).collect();
+        assert_eq!(names, [(0, "table".into()), (3, "mug".into())]);
     }
 }

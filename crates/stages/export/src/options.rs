@@ -75,6 +75,10 @@ pub struct SceneOptions {
     /// [default: none]
     #[arg(long, value_name = "FILE")]
     pub query: Option<PathBuf>,
+    /// names.json of eval names about these instances: what neither a person nor a query named is called so
+    /// [default: none; with --run-dir that of the run]
+    #[arg(long, value_name = "FILE")]
+    pub names: Option<PathBuf>,
     /// Output file
     #[arg(long, value_name = "FILE")]
     pub out: PathBuf,

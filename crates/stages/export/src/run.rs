@@ -19,9 +19,9 @@ use std::path::Path;
 
 /// `export scene`.
 pub fn scene(o: &SceneOptions, parameters: Value, stage: &Stage) -> Result<()> {
-    let mut claim = o.inputs.reads(stage.outputs(&o.out).file(&o.out)).reads(&o.query).claim()?;
+    let mut claim = o.inputs.reads(stage.outputs(&o.out).file(&o.out)).reads(&o.query).reads(&o.names).claim()?;
     let labelled = o.inputs.read(stage)?;
-    let names = o.query.as_deref().map_or(Ok(Names::new()), |path| names::read(path, &labelled))?;
+    let names = names::read(o.names.as_deref(), o.query.as_deref(), &labelled)?;
     let scene = describe(&labelled, &names, o.up.find(&labelled, stage)?);
     scene.write(&o.out)?;
     let summary = json!({

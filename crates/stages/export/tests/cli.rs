@@ -184,6 +184,23 @@ fn scene_json_tells_objects_and_relations_and_fits_its_schema() {
         *damaged.pointer_mut(change).unwrap() = json!(-1.5);
         assert!(!against_schema(&schema, &damaged).is_empty(), "{change}");
     }
+    // A vocabulary names what nobody else did, and a guess is said to be one.
+    let hash = artifacts::Instances::read(run.path("instances.safetensors")).unwrap().1.hash().to_string();
+    let naming = |instance: u32, name: &str, sure: bool| json!({"instance": instance, "names": [{"name": name, "score": 0.5}], "margin": 0.1, "sure": sure});
+    let by_words = |hash: &str| {
+        let names = json!({"format": "names", "version": 1, "instances": hash, "source": "", "model": "", "vocabulary": "",
+            "words": 3, "by_chance": null, "named": [naming(0, "table", true), naming(1, "cup", true), naming(2, "box", false)]});
+        std::fs::write(run.path("names.json"), names.to_string()).unwrap();
+    };
+    by_words(&hash);
+    run.succeed("scene", "scene.json", &["--edits", "edits.json", "--names", "names.json"]);
+    let scene = Scene::read(run.path("scene.json")).unwrap();
+    let called = scene.objects.iter().map(|o| o.name.as_ref().map_or("-".into(), ToString::to_string));
+    assert_eq!(called.collect::<Vec<_>>(), ["table", "red \"mug\"", "box?", "-", "-"]);
+    let text: Value = serde_json::from_slice(&std::fs::read(run.path("scene.json")).unwrap()).unwrap();
+    assert_eq!(against_schema(&schema, &text), "");
+    by_words("other");
+    run.fail("scene", "new.json", &["--names", "names.json"], &["names of other instances", "run eval names again"]);
     // Without what is up there are no boxes that stand upright, and that fits too.
     run.succeed("scene", "bare.json", &[]);
     let bare: Value = serde_json::from_slice(&std::fs::read(run.path("bare.json")).unwrap()).unwrap();

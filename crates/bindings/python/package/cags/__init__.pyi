@@ -96,6 +96,7 @@ class Answer(list[Match]):
 class Object:
     id: int
     name: str | None
+    sure: bool
     score: float
     gaussians: int
     siblings: list[int]

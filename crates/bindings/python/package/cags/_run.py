@@ -79,7 +79,9 @@ class Object:
     id : int
         Its instance.
     name : str or None
-        As a person named it.
+        As a person named it, else the best of a vocabulary where ``eval names`` was run.
+    sure : bool
+        False where the name is a guess, or there is none.
     score : float
         Confidence that it is one whole thing, 0 to 1.
     gaussians : int
@@ -100,6 +102,7 @@ class Object:
 
     id: int
     name: str
+    sure: bool
     score: float
     gaussians: int
     siblings: list
@@ -206,11 +209,13 @@ class Run:
 
     def objects(self):
         """All things of the scene, as a list of :class:`Object`, ascending by id."""
-        scene = json.loads(self._labelled.objects(self._scene))
+        names = self.folder / "names.json"
+        scene = json.loads(self._labelled.objects(self._scene, names if names.exists() else None))
         return [
             Object(
                 id=o["id"],
                 name=o["name"] and o["name"]["text"],
+                sure=bool(o["name"]) and o["name"].get("sure", True),
                 score=o["score"],
                 gaussians=o["gaussians"],
                 siblings=o["parent"]["objects"] if o["parent"] else [],

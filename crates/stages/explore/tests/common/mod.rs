@@ -98,6 +98,19 @@ impl Run {
         run
     }
 
+    /// What a vocabulary calls the balls: `names.json`, about instances of this hash.
+    pub fn write_names(&self, instances: &str) {
+        let naming = |instance: u32, name: &str, sure: bool| json!({"instance": instance, "names": [{"name": name, "score": 0.9}], "margin": 0.1, "sure": sure});
+        let names = json!({"format": "names", "version": 1, "instances": instances, "source": "test", "model": "m",
+            "vocabulary": "v", "words": 3, "by_chance": 0.1, "named": [naming(0, "sun", true), naming(1, "planet", false)]});
+        std::fs::write(self.out().join("names.json"), names.to_string()).unwrap();
+    }
+
+    /// The content hash of the instances.
+    pub fn instances(&self) -> String {
+        Instances::read(self.out().join("instances.safetensors")).unwrap().1.hash().into()
+    }
+
     pub fn scene(&self) -> PathBuf {
         self.dir.path().join("scene")
     }
