@@ -2,6 +2,7 @@
 #:  GEOMETRY=file.spz   use these trained Gaussians instead of training; without SCENE, renders of them instead of photographs
 #:  MASKS=folder        use these id maps (*_s.npy) instead of running SAM
 #:  CLIP=folder         image.onnx and text.onnx of a CLIP model [models/clip, if there]; without it no text queries
+#:  VOCABULARY=file     names that things may have, one a line [about 1,200 everyday ones]
 #:  QUERIES="red_mug …" texts to ask for, with underscores for spaces, without quotes
 #:  RESOLUTION=640px    size of the photographs for stage 1: a width that wider ones are shrunk to, a divisor, or auto
 #:  QUALITY=balanced    fast, balanced or exact: pipelines/quality
@@ -30,7 +31,7 @@ endif
 endif
 CLIP ?= $(patsubst %/,%,$(dir $(wildcard models/clip/text.onnx)))
 
-SETTINGS := QUALITY SCENE GEOMETRY MASKS CLIP SAM QUERIES RESOLUTION ITERATIONS SEED \
+SETTINGS := QUALITY SCENE GEOMETRY MASKS CLIP SAM VOCABULARY QUERIES RESOLUTION ITERATIONS SEED \
   GEOM_ARGS VIEW_ARGS MASK_ARGS EMBED_ARGS GRAPH_ARGS FEAT_ARGS CLUSTER_ARGS SCORE_ARGS REPORT_ARGS
 include pipelines/settings.mk
 

@@ -9,6 +9,8 @@ SCENE_FILES := $(SCENE)/truth/scene.json
 MASKS := $(SCENE)/language_features
 MASKS_DONE := $(SCENE_FILES)
 CLIP ?= testdata/clip-tiny
+# That model knows few words.
+VOCABULARY ?= $(if $(filter testdata/clip-tiny,$(CLIP)),testdata/clip-tiny/words.txt)
 
 include $(CONF)
 SEED ?= 0
@@ -23,7 +25,7 @@ QUERIES ?= green_kettle pink_coffee_set black_laptop yellow_toy_car
 REPORT_ARGS ?=
 
 QUALITY ?= balanced
-SETTINGS := QUALITY SEED CLIP SYNTH_ARGS GEOM_ARGS GRAPH_ARGS FEAT_ARGS CLUSTER_ARGS SCORE_ARGS QUERIES REPORT_ARGS
+SETTINGS := QUALITY SEED CLIP VOCABULARY SYNTH_ARGS GEOM_ARGS GRAPH_ARGS FEAT_ARGS CLUSTER_ARGS SCORE_ARGS QUERIES REPORT_ARGS
 include pipelines/settings.mk
 include pipelines/stages.mk
 

@@ -8,6 +8,7 @@
 #   LANGUAGE    the masks' features, where they are there already
 #   VIEWS_MADE  the file that says that SCENE is whole, where it is made of the Gaussians
 #   METRICS     the Gaussians' PSNR and SSIM for the report, or empty
+#   VOCABULARY  a file of the names that instances may have, or empty: the everyday ones of eval names
 #   PROTOCOL    lerf or scannet, to be scored by that; TEXTS, a table of text features instead of CLIP's
 #
 # Every target is a file that its stage writes whole or not at all, so a killed make goes on where it was. The options of a
@@ -45,7 +46,7 @@ GEOMETRY_DONE := $(OPTIONS)/geometry.files
 endif
 # The id maps, where SAM makes them.
 SAM_MAKES := $(filter $(OUT)/masks/masks.json,$(MASKS_DONE))
-export SAM_MAKES SCENE PHOTOGRAPHS OUT MASKS GEOMETRY CLIP SAM TEXTS QUERIES SEED THREADS
+export SAM_MAKES SCENE PHOTOGRAPHS OUT MASKS GEOMETRY CLIP SAM TEXTS VOCABULARY QUERIES SEED THREADS
 export GEOM_ARGS VIEW_ARGS MASK_ARGS EMBED_ARGS GRAPH_ARGS FEAT_ARGS CLUSTER_ARGS SCORE_ARGS REPORT_ARGS EVAL_ARGS SYNTH_ARGS
 
 .DEFAULT_GOAL := all
@@ -73,6 +74,7 @@ masks_FILES = $(call list,$(MASKS)/,'*_s.npy')
 # Not the text features that programs keep there.
 clip_FILES = $(call list,$(call arg,CLIP)/,'*' ! -name 'cags-texts-*')
 texts_FILES = $(call list,$(call arg,TEXTS),'*')
+vocabulary_FILES = $(call list,$(call arg,VOCABULARY),'*')
 
 space := $(subst ,, )
 # An option with its value, such as --holdout 0, unless people give it in the variable $1.
@@ -91,6 +93,7 @@ masks_OPTIONS := $(SAM) $(masks_ARGS)
 score_OPTIONS := $(CLIP) $(SCORE_ARGS)
 protocol_OPTIONS := $(PROTOCOL) $(CLIP) $(TEXTS) $(SCORE_ARGS)
 queries_OPTIONS := $(CLIP) $(QUERIES)
+names_OPTIONS := $(CLIP) $(VOCABULARY)
 report_OPTIONS := $(REPORT_FIRST) $(REPORT_ARGS)
 
 # What later stages take for the photographs: with the cameras that stage 1 refined, where it does. Masks do not depend on them.
@@ -117,6 +120,8 @@ protocol_RUN = $(BIN)/eval $(PROTOCOL) --scene $(call arg,POSED) --geometry $(ca
   --out $(OUT)/protocol $(protocol_FIRST) $(if $(TEXTS),--text-features $(call arg,TEXTS),$(if $(CLIP),--clip $(call arg,CLIP))) $(SCORE_ARGS) $(filter-out --quiet,$(COMMON)) --quiet
 query_RUN = $(BIN)/eval query --scene $(call arg,POSED) --geometry $(call arg,GEOMETRY) --instances $(INSTANCES) --clip $(call arg,CLIP) \
   --out $(OUT)/query $(foreach q,$(QUERIES),--text '$(subst ','\'',$(subst _,$(space),$q))') $(COMMON)
+names_RUN = $(BIN)/eval names --geometry $(call arg,GEOMETRY) --instances $(INSTANCES) --clip $(call arg,CLIP) \
+  $(if $(VOCABULARY),--vocabulary $(call arg,VOCABULARY)) --out $(OUT)/names.json $(filter-out --quiet,$(COMMON)) --quiet
 report_RUN = $(BIN)/eval report --scene $(call arg,POSED) --run-dir $(OUT) --geometry $(call arg,GEOMETRY) --masks $(MASKS) --out $(OUT)/report.html \
   $(report_OPTIONS) $(COMMON)
 
@@ -135,6 +140,7 @@ checked-options: checked | $(PROGRAMS)
 	@scripts/check_options.sh CLUSTER_ARGS $(cluster_RUN)
 	@scripts/check_options.sh SCORE_ARGS $(if $(PROTOCOL),$(protocol_RUN),$(score_RUN))
 	@$(if $(QUERY),scripts/check_options.sh QUERIES $(query_RUN))
+	@$(if $(NAMES),scripts/check_options.sh VOCABULARY $(names_RUN))
 	@scripts/check_options.sh REPORT_ARGS $(report_RUN)
 
 # For pipelines/Snakefile, where each of these is a job of its own.
@@ -206,8 +212,15 @@ $(QUERY): $(INSTANCES) $(OPTIONS)/queries | $(BIN)/eval
 	$(query_RUN)
 endif
 
+# What every instance is called, by a vocabulary.
+ifneq ($(CLIP),)
+NAMES := $(OUT)/names.json
+$(NAMES): $(INSTANCES) $(OPTIONS)/names $(if $(VOCABULARY),$(OPTIONS)/vocabulary.files) | $(BIN)/eval
+	$(names_RUN)
+endif
+
 METRICS ?= $(OUT)/geom_metrics.json
-$(OUT)/report.html: $(INSTANCES) $(METRICS) $(OUT)/score.json $(QUERY) $(OPTIONS)/report | $(BIN)/eval
+$(OUT)/report.html: $(INSTANCES) $(METRICS) $(OUT)/score.json $(NAMES) $(QUERY) $(OPTIONS)/report | $(BIN)/eval
 	$(report_RUN)
 
 # The programs are built by the top-level Makefile; a fragment that is run alone builds what it lacks.

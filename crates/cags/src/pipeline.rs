@@ -28,7 +28,7 @@ const FILES: [(&str, &str); 12] = carried![
 ];
 
 /// Settings that name a folder or file.
-const PATHS: [&str; 5] = ["GEOMETRY", "MASKS", "CLIP", "SAM", "CONF"];
+const PATHS: [&str; 6] = ["GEOMETRY", "MASKS", "CLIP", "SAM", "VOCABULARY", "CONF"];
 /// All others.
 const OTHERS: [&str; 13] = [
     "QUALITY",

@@ -74,6 +74,11 @@ fn photographs_become_answers_with_one_program() {
     let answer = said(here, &["query", "--run-dir", "out", "--text", "red mug", "--out", "mug"]);
     assert!(answer.contains("--scene") && answer.contains("--clip"), "{answer}");
     assert!(here.join("mug/query.json").is_file());
+    // Everything has a name: the everyday words, and then those of a list.
+    assert!(here.join("out/names.json").is_file());
+    std::fs::write(here.join("words.txt"), "mug\nfloor\nwall\n").unwrap();
+    let there = said(here, &["inventory", "--run-dir", "out", "--vocabulary", "words.txt", "--out", "few.json"]);
+    assert!(there.contains("things by 3 names") && there.contains(" x "), "{there}");
     let again = said(here, &["cluster", "--run-dir", "out", "--cluster", "free", "--out", "free.safetensors"]);
     assert!(again.contains("from out: --scene") && again.contains("--features out/features.safetensors"), "{again}");
     said(here, &["report", "--run-dir", "out", "--holdout", "0", "--out", "page.html", "--quiet"]);
