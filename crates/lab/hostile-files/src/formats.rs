@@ -2,7 +2,8 @@
 
 use crate::seeds;
 use artifacts::{
-    Descriptors, Edits, Features, Footprints, Graph, InstanceNames, Instances, MaskFeatures, MaskMaps, TruePoints, TrueScene,
+    Descriptors, Edits, Features, Footprints, Graph, InstanceNames, Instances, MaskFeatures, MaskMaps, TruePoints,
+    TrueScene,
 };
 use clap::Parser;
 use eval::{read_labels, read_mask, read_truth};
