@@ -4,7 +4,7 @@
 
 use crate::scene::Family;
 use crate::truth::benchmark::{Layout, LayoutName};
-use crate::truth::language::Speech;
+use crate::truth::language::{Speech, Tongue};
 use crate::truth::masks::Faults;
 use clap::{Parser, ValueEnum};
 use gs_io::{Error, Result};
@@ -85,6 +85,10 @@ pub struct Args {
     /// text_features.json in truth, or beside the masks
     #[arg(long)]
     features: bool,
+    /// Geometry of the features: words at right angles, whose crops are their texts; or that of CLIP's ViT-B/16, with texts near
+    /// each other, images apart from them, noise and confusions
+    #[arg(long, value_enum, value_name = "NAME", default_value_t = Tongue::Words, requires = "features")]
+    language: Tongue,
     #[command(flatten)]
     pub(crate) common: CommonArgs,
 }
@@ -125,7 +129,7 @@ impl Corruption {
             Self::Mild => (mild, Speech::default()),
             Self::Sam => {
                 let masks = Faults { granularity: 0.1, boundary: 2, spurious: 0.15, torn: 1.0, swallow: 0.35, ..mild };
-                (masks, Speech { leaking: 0.1, noise: 0.5 })
+                (masks, Speech { leaking: 0.1, noise: 0.5, ..Speech::default() })
             }
         }
     }
@@ -212,7 +216,11 @@ impl Args {
                 torn: self.torn.unwrap_or(faults.torn),
                 swallow: self.swallow.unwrap_or(faults.swallow),
             },
-            speech: self.features.then_some(speech),
+            speech: self.features.then(|| match self.language {
+                Tongue::Words => speech,
+                // It has noise of its own.
+                language => Speech { language, noise: 0.0, ..speech },
+            }),
             pose_noise: self.pose_noise,
             layout: self.out.as_deref().map_or(Ok(Layout::Colmap), |out| Layout::new(self.layout, out))?,
             ..size

@@ -6,7 +6,7 @@ use crate::render::light::LightMap;
 use crate::render::{self, Frame};
 use crate::scene::{Family, Scene, cameras, families};
 use crate::truth::benchmark::{FOLDERS, Layout};
-use crate::truth::language::Language;
+use crate::truth::language::{Language, Speech};
 use crate::truth::named::{self, Named};
 use crate::truth::points::Collector;
 use crate::truth::regions::Pairs;
@@ -15,6 +15,7 @@ use artifacts::{MaskTruth, TrueObject, TruePart, TruePoints, TrueScene, features
 use gs_io::{IoContext, Outputs, Result, npy};
 use gs_scene::{Camera, Image, PointCloud, colmap};
 use ndarray::ArrayView2;
+use query::Unrelated;
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
 use serde_json::{Value, json};
@@ -34,6 +35,7 @@ const CAMERAS: u64 = 1;
 const POINTS: u64 = 2;
 const POSES: u64 = 3;
 const VERTICES: u64 = 4;
+const SPEECH: u64 = 5;
 const FIRST_VIEW: u64 = 16;
 const FIRST_SPEECH: u64 = 1 << 32;
 const FIRST_PATCHES: u64 = 2 << 32;
@@ -107,7 +109,10 @@ impl<'a> Work<'a> {
         let scene = options.scene();
         let cameras = options.cameras(&scene);
         let named: Vec<Named> = options.layout.finer(&scene).into_iter().flat_map(|(_, named)| named).collect();
-        let language = options.speech.map(|_| Language::new(&scene, &named, &options.layout.texts()));
+        let texts: Vec<&str> = options.layout.texts().into_iter().chain(Unrelated::texts()).collect();
+        let language =
+            |speech: Speech| Language::new(speech.language, &scene, &named, &texts, &mut options.rng(SPEECH));
+        let language = options.speech.map(language);
         Self { stage, options, scene, cameras, language }
     }
 

@@ -10,7 +10,7 @@ mod polygon;
 mod scores;
 mod truth;
 
-use self::scores::FinerScore;
+use self::scores::{Counted, CountedScore, FinerScore};
 pub use self::scores::{QueryScore, Scores, ThingScore};
 pub use self::truth::{true_confidence, true_labels};
 
@@ -47,7 +47,7 @@ pub(crate) fn run(o: &ScoreOptions, parameters: Value, stage: &Stage) -> Result<
         ..Sizes::new(&o.geometry, &o.texts, &dataset.views)
     };
     stage.forecast(memory::of_scores(&sizes), SMALLER)?;
-    let found = Found::read(o, &dataset, stage)?;
+    let mut found = Found::read(o, &dataset, stage)?;
     let mut scores = Scores::default();
     match &found.instances {
         Some(scene) if scene.all_noise() => stage.warn("all Gaussians are noise: every score is 0"),
@@ -69,12 +69,18 @@ pub(crate) fn run(o: &ScoreOptions, parameters: Value, stage: &Stage) -> Result<
         } else if !o.texts.given() {
             scores.skipped.push("query scores: neither --clip nor --text-features was given".into());
         } else {
-            score_queries(o, &found, &dataset, &frames, &mut scores, stage)?;
-            for (kind, figures) in [("parts", &mut scores.parts), ("groups", &mut scores.groups)] {
+            let of = |kind: &str| {
                 let folder = labels.join(kind);
-                if folder.is_dir() {
-                    *figures = score_finer(o, &found, &dataset, &labels::read_folder(&folder)?, stage)?;
-                }
+                if folder.is_dir() { labels::read_folder(&folder) } else { Ok(Vec::new()) }
+            };
+            let (absent, several) = (of("absent")?, of("several")?);
+            found.judges = !absent.is_empty() || !several.is_empty();
+            let one = score_queries(o, &found, &dataset, &frames, &mut scores, stage)?;
+            let asked = |frames: &[FrameLabels]| ask(o, &found, &dataset, frames, stage);
+            scores.parts = asked(&of("parts")?)?.map(|a| a.finer());
+            scores.groups = asked(&of("groups")?)?.map(|a| a.finer());
+            if found.judges {
+                scores.counted = CountedScore::of([asked(&absent)?, one, asked(&several)?].map(|a| a?.counted()));
             }
         }
     } else {
@@ -98,13 +104,15 @@ struct Found {
     described: Option<(DescribedGaussians, Option<Geometry>)>,
     /// Content hashes, by role.
     inputs: BTreeMap<String, String>,
+    /// Whether it is judged if a text matches anything.
+    judges: bool,
 }
 
 impl Found {
     fn read(o: &ScoreOptions, dataset: &Dataset, stage: &Stage) -> Result<Self> {
         let instances = o.inputs().map(|inputs| inputs.read(dataset, stage)).transpose()?;
         let mut inputs = instances.as_ref().map_or_else(BTreeMap::new, |scene| scene.inputs.clone());
-        let Some(path) = &o.descriptors else { return Ok(Self { instances, described: None, inputs }) };
+        let Some(path) = &o.descriptors else { return Ok(Self { instances, described: None, inputs, judges: false }) };
         let watched = Watched::new([&o.geometry]);
         let hash = hash_file(&o.geometry)?;
         let own = if instances.is_none() { Some(Geometry::read(&o.geometry)?) } else { None };
@@ -116,7 +124,7 @@ impl Found {
         let described = DescribedGaussians::read(path, &hash, geometry.gaussians.len())?;
         described.artifact.expect_input(role::DATASET, &dataset.hash()?)?;
         inputs.extend([(role::GEOMETRY.into(), hash), ("descriptors".into(), described.artifact.hash().into())]);
-        Ok(Self { instances, described: Some((described, own)), inputs })
+        Ok(Self { instances, described: Some((described, own)), inputs, judges: false })
     }
 
     fn geometry(&self) -> &Geometry {
@@ -133,7 +141,7 @@ impl Found {
         }
     }
 
-    /// The answers to texts.
+    /// The answers to texts: something is selected whether a text matches or not.
     fn answers(&self, o: &ScoreOptions, texts: &[String]) -> Result<Answers> {
         if let Some((described, _)) = &self.described {
             let source = TextSource::open_for(&described.artifact, self.dim(), &o.texts)?;
@@ -148,7 +156,12 @@ impl Found {
         }
         let scene = self.instances.as_ref().expect("instances or descriptors were given");
         let source = TextSource::open_for(&scene.artifact, self.dim(), &o.texts)?;
-        predict::ask(&Asker::new(scene, Some(source), &o.choice, o.texts.min_support, o.granularity)?, texts)
+        let mut asker = Asker::new(scene, Some(source), &o.choice, o.texts.min_support, o.granularity)?;
+        if self.judges {
+            asker.judge()?;
+        }
+        asker.always = true;
+        predict::ask(&asker, texts)
     }
 }
 
@@ -180,22 +193,33 @@ struct Asked {
     visible: Vec<Pair>,
 }
 
-/// Scores names of parts or of groups of things as [`score_queries`] scores those of things; none where none is labelled.
-fn score_finer(
-    o: &ScoreOptions,
-    found: &Found,
-    dataset: &Dataset,
-    frames: &[FrameLabels],
-    stage: &Stage,
-) -> Result<Option<FinerScore>> {
-    let Some(Asked { pairs, visible, .. }) = ask(o, found, dataset, frames, stage)? else { return Ok(None) };
-    let Figures { miou, macc25, pairs, .. } = Figures::of_pairs(&pairs);
-    let query_miou_visible = Figures::of_pairs(&visible).miou;
-    Ok(Some(FinerScore { query_miou: miou, query_macc25: macc25, query_miou_visible, query_pairs: pairs }))
+impl Asked {
+    /// The figures of names of parts or of groups.
+    fn finer(&self) -> FinerScore {
+        let Figures { miou, macc25, pairs, .. } = Figures::of_pairs(&self.pairs);
+        let query_miou_visible = Figures::of_pairs(&self.visible).miou;
+        FinerScore { query_miou: miou, query_macc25: macc25, query_miou_visible, query_pairs: pairs }
+    }
+
+    /// The figures where a text that matches nothing selects nothing (docs/protocols.md), of what a view shows; none where texts
+    /// are not judged.
+    fn counted(&self) -> Option<Counted> {
+        let verdict = |text: &String| self.answers[text].as_ref().ok().and_then(|a| a.verdict);
+        let texts: BTreeMap<&String, bool> =
+            self.answers.keys().map(|text| (text, verdict(text).is_some_and(|v| v.matches))).collect();
+        let giou = |p: &Pair| match (texts[&p.category], p.truth_pixels) {
+            (matches, 0) => f64::from(u8::from(!matches)),
+            (matches, _) => f64::from(u8::from(matches)) * p.iou,
+        };
+        let gious: Vec<f64> = self.visible.iter().map(giou).collect();
+        let believed = texts.values().filter(|matches| **matches).count();
+        let judged = self.answers.keys().any(|text| verdict(text).is_some());
+        judged.then(|| Counted { texts: texts.len(), believed, pairs: gious.len(), giou: metrics::mean(&gious) })
+    }
 }
 
 /// Scores text queries against the labels, by the protocol of [`crate::protocols::pairs`] with every category of the labels
-/// asked for.
+/// asked for, and returns the answers.
 fn score_queries(
     o: &ScoreOptions,
     found: &Found,
@@ -203,18 +227,19 @@ fn score_queries(
     frames: &[FrameLabels],
     scores: &mut Scores,
     stage: &Stage,
-) -> Result<()> {
-    let Some(Asked { answers, rendering, pairs, visible }) = ask(o, found, dataset, frames, stage)? else {
+) -> Result<Option<Asked>> {
+    let Some(asked) = ask(o, found, dataset, frames, stage)? else {
         scores.skipped.push("query scores: the labels hold no labelled object".into());
-        return Ok(());
+        return Ok(None);
     };
-    let figures = Figures::of_pairs(&pairs);
+    let Asked { answers, rendering, pairs, visible } = &asked;
+    let figures = Figures::of_pairs(pairs);
     (scores.query_miou, scores.query_pairs) = (Some(figures.miou), figures.pairs);
     (scores.query_macc25, scores.query_macc50) = (Some(figures.macc25), Some(figures.macc50));
-    scores.query_miou_visible = Some(Figures::of_pairs(&visible).miou);
+    scores.query_miou_visible = Some(Figures::of_pairs(visible).miou);
     scores.silhouette = Some((rendering.silhouette, rendering.threshold));
     let query = |(text, figures): (String, Figures)| {
-        let (selected, score) = predict::chosen(&answers, &text);
+        let (selected, score) = predict::chosen(answers, &text);
         let mine = pairs.iter().filter(|p| p.category == text);
         let frames = mine.map(|p| (p.frame.clone(), p.iou)).collect();
         let rank = fitting(&scores.labels, &text).and_then(|instance| {
@@ -223,8 +248,8 @@ fn score_queries(
         });
         QueryScore { text, iou: figures.miou, selected, score, rank, frames }
     };
-    scores.queries = object_figures(&pairs).into_iter().map(query).collect();
-    Ok(())
+    scores.queries = object_figures(pairs).into_iter().map(query).collect();
+    Ok(Some(asked))
 }
 
 /// The instance that fits a category best: by the sum of its IoUs over the frames where it is the best, of equals the first.

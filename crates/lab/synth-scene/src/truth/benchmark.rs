@@ -90,11 +90,16 @@ impl Layout {
         }
     }
 
-    /// What of a scene has labels besides things, by the folder in that of the labels: its parts and groups. The benchmarks know things
-    /// alone.
+    /// What of a scene has labels besides things, by the folder in that of the labels: its parts and groups, classes of which there are
+    /// several, and what is absent. The benchmarks know things alone.
     pub fn finer(&self, scene: &Scene) -> Vec<(&'static str, Vec<Named>)> {
         match self {
-            Self::Colmap => vec![("parts", named::parts(scene)), ("groups", named::groups(scene))],
+            Self::Colmap => vec![
+                ("parts", named::parts(scene)),
+                ("groups", named::groups(scene)),
+                ("several", named::several(scene)),
+                ("absent", named::absent(scene)),
+            ],
             Self::LerfOvs(_) | Self::Scan { .. } => Vec::new(),
         }
     }

@@ -3,7 +3,8 @@
 use crate::render::Frame;
 use crate::scene::Scene;
 use crate::truth::named::Named;
-use crate::truth::{polygon, write_json};
+use crate::truth::polygon::{self, Polygon};
+use crate::truth::write_json;
 use gs_io::Result;
 use serde_json::json;
 use std::collections::BTreeMap;
@@ -15,7 +16,7 @@ const SMALLEST: usize = 40;
 const SMALLEST_PIECE: usize = 6;
 
 /// Writes polygons around what `frame` shows of each of `named`. What consists of several things is labelled where all of them
-/// are to be seen.
+/// are to be seen, and what is not there has a polygon without corners.
 pub fn write(path: &Path, image: &str, scene: &Scene, named: &[Named], frame: &Frame) -> Result<()> {
     let mut shown = vec![0usize; scene.parts.len()];
     frame.part.iter().filter(|&&p| p >= 0).for_each(|&p| shown[p as usize] += 1);
@@ -31,7 +32,11 @@ pub fn write(path: &Path, image: &str, scene: &Scene, named: &[Named], frame: &F
         let mut own = vec![false; scene.parts.len()];
         parts.iter().for_each(|&p| own[p as usize] = true);
         let inside: Vec<bool> = frame.part.iter().map(|&p| p >= 0 && own[p as usize]).collect();
-        for line in polygon::trace(&inside, frame.width, frame.height, SMALLEST_PIECE) {
+        let mut lines = polygon::trace(&inside, frame.width, frame.height, SMALLEST_PIECE);
+        if parts.is_empty() {
+            lines.push(Polygon::new());
+        }
+        for line in lines {
             let range = |axis: usize| {
                 line.iter().map(|p| p[axis]).fold((i32::MAX, i32::MIN), |(low, high), v| (low.min(v), high.max(v)))
             };
@@ -40,7 +45,7 @@ pub fn write(path: &Path, image: &str, scene: &Scene, named: &[Named], frame: &F
                 "category": name,
                 "group": id,
                 "segmentation": line,
-                "bbox": [x0, y0, x1, y1],
+                "bbox": if line.is_empty() { [0; 4] } else { [x0, y0, x1, y1] },
                 "layer": objects.len() as f64 + 1.0,
                 "iscrowd": false,
                 "note": "",
@@ -58,7 +63,6 @@ mod tests {
     use super::*;
     use crate::testing::{example, fill};
     use crate::truth::named;
-    use crate::truth::polygon::Polygon;
 
     #[test]
     fn filled_polygons_give_back_the_instance_map() {

@@ -1,6 +1,8 @@
-//! What can be asked of a scene by name: its things, their parts, and groups of two that stand together.
+//! What can be asked of a scene by name: its things, their parts, groups of two that stand together, all of a class, and what is
+//! not there.
 
-use crate::scene::Scene;
+use crate::scene::{Scene, Thing};
+use crate::things::catalogue::{CLASSES, PROPS};
 use crate::truth::masks::nearest;
 use std::collections::{BTreeMap, BTreeSet};
 
@@ -11,7 +13,7 @@ pub struct Named {
     pub name: String,
     /// Its number among its like.
     pub id: usize,
-    /// The parts that it consists of, as positions in [`Scene::parts`].
+    /// The parts that it consists of, as positions in [`Scene::parts`]; none of what is not there.
     pub parts: Vec<u32>,
 }
 
@@ -52,6 +54,28 @@ pub fn groups(scene: &Scene) -> Vec<Named> {
     pairs.into_iter().enumerate().map(both).collect()
 }
 
+/// Classes of which there are several: "plate" means all plates.
+pub fn several(scene: &Scene) -> Vec<Named> {
+    let mut by_class: BTreeMap<&str, Vec<&Thing>> = BTreeMap::new();
+    scene.things.iter().filter(|t| !t.background).for_each(|t| by_class.entry(t.class).or_default().push(t));
+    let all = by_class.into_iter().filter(|(_, things)| things.len() > 1).enumerate();
+    let named = |(id, (class, things)): (usize, (&str, Vec<&Thing>))| Named {
+        name: class.into(),
+        id,
+        parts: things.iter().flat_map(|t| t.parts.clone()).collect(),
+    };
+    all.map(named).collect()
+}
+
+/// Classes of the catalogue that are not there, nor anything that shares a word with them: where there is a row of books, a
+/// book is not absent.
+pub fn absent(scene: &Scene) -> Vec<Named> {
+    let words = |text: &'static str| text.split(' ').filter(|w| w.len() > 2).map(|w| w.trim_end_matches('s'));
+    let there: BTreeSet<&str> = scene.classes().into_iter().flat_map(words).collect();
+    let gone = CLASSES.iter().chain(PROPS).map(|c| c.name).filter(|name| words(name).all(|w| !there.contains(w)));
+    gone.enumerate().map(|(id, name)| Named { name: name.into(), id, parts: Vec::new() }).collect()
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -71,6 +95,13 @@ mod tests {
             assert!(of.len() == 1 && part.parts.len() < whole.parts.len(), "{}", part.name);
             assert!(part.name.ends_with(&format!(" of the {}", whole.name)), "{}", part.name);
         }
+        let (several, absent) = (several(scene), absent(scene));
+        for of in &several {
+            let things = scene.things.iter().filter(|t| t.class == of.name);
+            assert!(things.clone().count() > 1 && of.parts.len() == things.map(|t| t.parts.len()).sum::<usize>());
+        }
+        assert!(absent.len() > 10 && absent.iter().all(|a| a.parts.is_empty()));
+        assert!(absent.iter().all(|a| scene.things.iter().all(|t| t.class != a.name)));
         for group in &groups {
             let of: BTreeSet<u32> = group.parts.iter().map(|&p| scene.parts[p as usize].thing).collect();
             assert!(of.len() == 2 && !of.iter().any(|&t| scene.things[t as usize].background), "{}", group.name);

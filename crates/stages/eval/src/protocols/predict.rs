@@ -27,7 +27,7 @@ pub fn ask(asker: &Asker<'_>, texts: &[String]) -> Result<Answers> {
 /// Answers texts by their features.
 pub fn answers(asker: &Asker<'_>, texts: &[String], features: &[Option<Vec<f32>>]) -> Answers {
     let answer = |f: &Option<Vec<f32>>| match f {
-        Some(f) => Ok(asker.answer(f)),
+        Some(f) => Ok(asker.answer_text(f)),
         None => Err("it has no text feature".into()),
     };
     texts.iter().cloned().zip(features.iter().map(answer)).collect()

@@ -59,6 +59,9 @@ pub struct Scores {
     /// Queries for groups of things ("red mug and blue bowl"), likewise.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub groups: Option<FinerScore>,
+    /// Queries for what is absent, for one thing and for several, where the scene has labels of them.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub counted: Option<CountedScore>,
     /// How selections became masks, `selected` or `visible`, and above which value.
     pub silhouette: Option<(Silhouette, f32)>,
     /// What was left out, and why.
@@ -110,6 +113,33 @@ pub struct FinerScore {
     pub query_pairs: usize,
 }
 
+/// How queries were answered that ask for none, one or several things, where a text that matches nothing selects nothing.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct CountedScore {
+    /// Mean of the generalised IoU over all pairs.
+    pub giou: f64,
+    /// Names of what is not there.
+    pub absent: Option<Counted>,
+    /// Names of things.
+    pub one: Option<Counted>,
+    /// Names that mean several things.
+    pub several: Option<Counted>,
+}
+
+/// Queries that ask for so many.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct Counted {
+    /// Texts asked.
+    pub texts: usize,
+    /// Texts that are said to match something.
+    pub believed: usize,
+    /// Number of (frame, text) pairs.
+    pub pairs: usize,
+    /// Mean over the pairs of the IoU of what the view shows of the selection; where nothing is to be found 1 for nothing, 0 for
+    /// anything.
+    pub giou: f64,
+}
+
 /// How one query was answered.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct QueryScore {
@@ -127,6 +157,16 @@ pub struct QueryScore {
     pub rank: Option<usize>,
     /// Stem and IoU of each labelled frame.
     pub frames: Vec<(String, f64)>,
+}
+
+impl CountedScore {
+    /// The figures of all pairs; none where there are none.
+    pub fn of([absent, one, several]: [Option<Counted>; 3]) -> Option<Self> {
+        let all: Vec<&Counted> = [&absent, &one, &several].into_iter().flatten().collect();
+        let pairs: usize = all.iter().map(|c| c.pairs).sum();
+        let giou = all.iter().map(|c| c.giou * c.pairs as f64).sum::<f64>() / pairs.max(1) as f64;
+        (pairs > 0).then_some(Self { giou, absent, one, several })
+    }
 }
 
 impl Scores {
@@ -162,6 +202,13 @@ impl Scores {
         line("query_macc50", number(self.query_macc50));
         line("parts", number(self.parts.as_ref().map(|p| p.query_miou)));
         line("groups", number(self.groups.as_ref().map(|g| g.query_miou)));
+        if let Some(CountedScore { giou, absent, one, several }) = &self.counted {
+            line("0, 1 or N", Some(format!("{giou:.4}")));
+            for (name, of) in [("  absent", absent), ("  one", one), ("  several", several)] {
+                let shown = |c: &Counted| format!("{:.4}, {} of {} texts match", c.giou, c.believed, c.texts);
+                line(name, of.as_ref().map(shown));
+            }
+        }
         line("queries", self.query_miou.map(|_| format!("{} in {} pairs", self.queries.len(), self.query_pairs)));
         for reason in &self.skipped {
             s += &format!("skipped          {reason}\n");

@@ -217,6 +217,50 @@ fn a_perfect_run_scores_high() {
 }
 
 #[test]
+fn names_of_none_one_and_several_things_are_scored_with_what_matches_nothing() {
+    let f = Fixture::new(2);
+    let plain = f.score("");
+    assert!(plain.get("counted").is_none(), "{plain}");
+    let mut table = f.json("text.json");
+    query::Unrelated::texts().for_each(|t| table[t] = json!([0.6, 0.8]));
+    table["teapot"] = json!([0.7, 0.7]);
+    table["blue teapot"] = json!([0.1, 1.0]);
+    table["ball"] = json!([1.0, 0.1]);
+    std::fs::write(f.table(), table.to_string()).unwrap();
+    let label = f.scene().join("label");
+    let frame = fixture::stem(1);
+    let file = format!("{frame}.json");
+    let one: Value = fixture::read_json(&label.join(&file));
+    let write = |kind: &str, objects: Vec<Value>| {
+        std::fs::create_dir_all(label.join(kind)).unwrap();
+        let labels = json!({"info": one["info"], "objects": objects});
+        std::fs::write(label.join(kind).join(&file), labels.to_string()).unwrap();
+    };
+    let none = |category: &str| json!({"category": category, "segmentation": []});
+    write("absent", vec![none("teapot"), none("blue teapot")]);
+    let both = one["objects"]
+        .as_array()
+        .unwrap()
+        .iter()
+        .map(|o| json!({"category": "ball", "segmentation": o["segmentation"]}));
+    write("several", both.collect());
+    let s = f.score("");
+    assert_eq!(s["query_miou"], plain["query_miou"]);
+    let c = &s["counted"];
+    // A teapot is less like a ball than what has nothing to do with the scene; a blue one is more.
+    assert_eq!(c["absent"], json!({"texts": 2, "believed": 1, "pairs": 2, "giou": 0.5}));
+    assert_eq!((&c["one"]["believed"], &c["one"]["giou"]), (&json!(2), &s["query_miou_visible"]));
+    // One of the two balls is found.
+    let giou = c["several"]["giou"].as_f64().unwrap();
+    assert!(giou > 0.3 && giou < 0.7, "{c}");
+    let of = |kind: &str, field: &str| c[kind][field].as_f64().unwrap();
+    let [pairs, sum] = ["absent", "one", "several"]
+        .iter()
+        .fold([0.0, 0.0], |[n, sum], kind| [n + of(kind, "pairs"), sum + of(kind, "pairs") * of(kind, "giou")]);
+    assert!((c["giou"].as_f64().unwrap() - sum / pairs).abs() < 1e-12);
+}
+
+#[test]
 fn gaussians_with_descriptors_of_their_own_answer_texts() {
     let f = Fixture::new(2);
     // The balls' Gaussians, a little off; the floor has none.
