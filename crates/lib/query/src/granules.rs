@@ -7,6 +7,10 @@ use serde::{Deserialize, Serialize};
 /// How much it counts that the masks show a granule as one, beside how well it suits the feature: the best score of all is one unit
 /// above the mean of all. 0.3 to 0.7 give the same on synthetic scenes within a point (docs/results/peers.md).
 const FIT: f64 = 0.6;
+/// What scores at least this on that scale is meant, too, ...
+const NEARLY: f64 = 0.8;
+/// ... where at most this share of it is selected already.
+const AGAIN: f64 = 0.1;
 /// A granule is a part of an instance when at least this share of it lies in the instance, of which it is at most [`PART`].
 const INSIDE: f64 = 0.8;
 /// See [`INSIDE`].
@@ -40,8 +44,9 @@ pub struct Meant {
     /// Its score with the feature: cosine or relevancy, as of instances.
     pub score: f32,
     /// The instances of which at least half is in it, those with most Gaussians in it first; of a part the instance that holds most of it.
+    /// Then those of what is meant with it.
     pub instances: Vec<u32>,
-    /// Its Gaussians, ascending.
+    /// Its Gaussians and those of what is meant with it, ascending.
     pub gaussians: Vec<u32>,
 }
 
@@ -54,19 +59,32 @@ impl<'a> Granules<'a> {
 
     /// The granule that a feature means, of those that masks show in at least `min_support` views: the one with the highest sum of its
     /// score, on a scale on which the mean of all is 0 and the best 1, and of its fit with masks, which counts 0.6. A part and the
-    /// whole often score the same, and then the masks tell. None where none has a score.
+    /// whole often score the same, and then the masks tell. "Plate" may mean several: what scores nearly as well elsewhere is selected
+    /// with it. None where none has a score.
     pub fn meant(&self, feature: &[f32], negatives: &[Vec<f32>], min_support: u32) -> Option<Meant> {
         let granules = &self.instances.granules;
         let scores = self.scores(feature, negatives, min_support);
         let mean = scores.iter().map(|s| f64::from(s.1)).sum::<f64>() / scores.len().max(1) as f64;
         let above = scores.iter().map(|s| f64::from(s.1)).fold(mean, f64::max) - mean;
-        let rank = |&(q, score): &(usize, f32)| {
-            let scaled = if above > 0.0 { (f64::from(score) - mean) / above } else { 0.0 };
-            scaled + FIT * f64::from(granules[q].fit)
-        };
+        let scaled = |score: f32| if above > 0.0 { (f64::from(score) - mean) / above } else { 0.0 };
+        let rank = |&(q, score): &(usize, f32)| scaled(score) + FIT * f64::from(granules[q].fit);
         // Of equals the first.
         let best = scores.iter().map(|s| (s, rank(s))).reduce(|a, b| if b.1 > a.1 { b } else { a });
-        best.map(|(&(q, score), _)| self.meaning(q as u32, score))
+        let mut meant = best.map(|(&(q, score), _)| self.meaning(q as u32, score))?;
+        let mut more: Vec<&(usize, f32)> = scores.iter().filter(|s| scaled(s.1) >= NEARLY).collect();
+        more.sort_by(|a, b| rank(b).total_cmp(&rank(a)).then(a.0.cmp(&b.0)));
+        for &&(q, score) in &more {
+            let other = self.meaning(q as u32, score);
+            let again = other.gaussians.iter().filter(|i| meant.gaussians.binary_search(i).is_ok()).count();
+            if again as f64 <= AGAIN * other.gaussians.len() as f64 {
+                meant.gaussians.extend(other.gaussians);
+                meant.gaussians.sort_unstable();
+                meant.gaussians.dedup();
+                let new: Vec<u32> = other.instances.into_iter().filter(|k| !meant.instances.contains(k)).collect();
+                meant.instances.extend(new);
+            }
+        }
+        Some(meant)
     }
 
     /// Granules that masks show in enough views, each with its score as of instances.
@@ -151,6 +169,18 @@ mod tests {
         assert_eq!((handle.kind, handle.instances, handle.gaussians), (Kind::Part, vec![0], vec![2, 3]));
         let set = meant([1.0, 1.0, 0.0]);
         assert_eq!((set.kind, set.instances, set.gaussians), (Kind::Group, vec![0, 1], vec![0, 1, 2, 3, 4, 5, 6]));
+    }
+
+    #[test]
+    fn what_scores_nearly_as_well_elsewhere_is_meant_too() {
+        let mut i = scene();
+        let meant = |i: &Instances| Granules::new(i).meant(&[1.0, 0.0, 0.0], &[], 2).unwrap();
+        i.granules.push(Granule { members: Members::Instance(2), support: 4, fit: 0.7 });
+        i.granule_descriptor.push_row(ndarray::aview1(&[0.95, 0.0, 0.31])).unwrap();
+        let both = meant(&i);
+        assert_eq!((both.granule, both.instances, both.gaussians), (0, vec![0, 2], vec![0, 1, 2, 3, 7]));
+        i.granule_descriptor.row_mut(5).assign(&ndarray::aview1(&[0.6, 0.0, 0.8]));
+        assert_eq!(meant(&i).gaussians, [0, 1, 2, 3]);
     }
 
     #[test]
