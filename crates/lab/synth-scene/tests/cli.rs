@@ -347,7 +347,7 @@ fn a_corruption_sets_every_fault_and_an_option_replaces_one() {
     for (name, value) in values.into_iter().chain([("torn", 1.0), ("swallow", 0.35)]) {
         assert_eq!(sam[name].as_f64(), Some(value), "{name}");
     }
-    assert_eq!(sam["features"], serde_json::json!({"leaking": 0.1, "noise": 0.5}));
+    assert_eq!(sam["features"], serde_json::json!({"language": "words", "leaking": 0.1, "noise": 0.5}));
     let mild = parameters("mild", &[]);
     assert_eq!((mild["granularity_p"].as_f64(), mild["spurious"].as_f64()), (Some(0.3), Some(0.0)));
     assert!(mild["features"].is_null());
