@@ -106,7 +106,7 @@ fn enough(vocabulary: Vocabulary) -> Result<Vocabulary> {
 ///
 /// A name's rank goes by its cosine with the descriptor less its mean cosine over the scene's instances, because some names lie near to
 /// everything. The margin is the best name's lead over the best name of another meaning. At most one name is right, so what
-/// leads the second has over the third are chance; a name is sure where its margin is above that of 95 of 100 instances. Instances matched in fewer views than
+/// the second leads the third by is chance: a name is sure where its margin is above that of 95 of 100 instances. Instances matched in fewer views than
 /// `min_support` get no name; without three names of different meaning nothing is sure.
 ///
 /// # Panics
@@ -156,7 +156,11 @@ pub fn name_instances(
 
 /// The words of a name.
 fn meaning(name: &str) -> BTreeSet<String> {
-    name.to_lowercase().split(|c: char| !c.is_alphanumeric()).filter(|w| !w.is_empty()).map(String::from).collect()
+    let name = name.to_lowercase();
+    let words: BTreeSet<String> =
+        name.split(|c: char| !c.is_alphanumeric()).filter(|w| !w.is_empty()).map(String::from).collect();
+    // A name of signs alone means itself.
+    if words.is_empty() { BTreeSet::from([name]) } else { words }
 }
 
 /// Whether one name says no less than the other: "mug" and "coffee mug".

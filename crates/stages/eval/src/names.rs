@@ -26,7 +26,7 @@ pub(crate) fn run(o: &NamesOptions, parameters: Value, stage: &Stage) -> Result<
         }
     };
     if vocabulary.repeated > 0 {
-        stage.warn(&format!("{} lines of the vocabulary name something again: they are left out", vocabulary.repeated));
+        stage.warn(&format!("lines of the vocabulary that name something again are left out: {}", vocabulary.repeated));
     }
     let features = vocabulary.encode(&source, &o.templates(), "--vocabulary")?;
     // The names are of the instances as they were clustered: edits come and go.

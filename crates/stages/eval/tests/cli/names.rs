@@ -37,7 +37,7 @@ fn every_instance_gets_its_best_names() {
     // The words of a person: "thing", which lies between two, is none of them.
     fs::write(f.path().join("mine.txt"), "# mine\nred ball\nblue ball\n\nfloor\nFloor\n").unwrap();
     let mine = format!("{NAMES}|--vocabulary|{{}}/mine.txt");
-    f.warned("names", &mine, &["1 lines of the vocabulary name something again"]);
+    f.warned("names", &mine, &["name something again are left out: 1"]);
     let names = f.json("run/names.json");
     assert_eq!(best(&names), [(0, "red ball", true), (1, "blue ball", true), (2, "floor", true)]);
     assert!((names["by_chance"].as_f64().unwrap() - 4.8 / 7.0).abs() < 1e-5, "{names}");
