@@ -11,6 +11,8 @@ const TEXTS: &str = include_str!("unrelated.txt");
 const SHARE: f64 = 0.95;
 /// A table that holds fewer of them judges nothing.
 const LEAST: usize = 20;
+/// Of fewer scores the mean says nothing, and counts as 0.
+const FEW: usize = 5;
 
 /// Features of texts that have nothing to do with a scene.
 pub struct Unrelated {
@@ -24,7 +26,7 @@ pub struct Verdict {
     pub matches: bool,
     /// Its best score over instances, parts and groups: cosine, or relevancy with negatives.
     pub best: f32,
-    /// What 95 of 100 unrelated texts do not surpass.
+    /// What that would have to surpass: the mean of all scores of the text, and what 95 of 100 unrelated texts have at most above theirs.
     pub by_chance: f32,
 }
 
@@ -44,9 +46,13 @@ impl Unrelated {
         Ok((features.len() >= LEAST).then_some(Self { features }))
     }
 
-    /// The score that 95 of 100 of them do not surpass; none where nothing has a score.
+    /// How far above the mean of all its scores the best of 95 of 100 of them is at most; none where nothing has a score. With CLIP each
+    /// text has a level of its own, on which all pictures lie: what is above it tells more than the score (docs/results/queries.md).
     pub fn chance(&self, index: &Index, granules: &Granules, negatives: &[Vec<f32>], min_support: u32) -> Option<f32> {
-        let best = |f: &Vec<f32>| best_score(index, granules, f, negatives, min_support);
+        let best = |f: &Vec<f32>| {
+            let (best, mean) = best_and_mean(index, granules, f, negatives, min_support)?;
+            Some(best - mean)
+        };
         share_of(self.features.iter().filter_map(best).collect())
     }
 }
@@ -59,32 +65,36 @@ pub(crate) fn share_of(mut values: Vec<f32>) -> Option<f32> {
 }
 
 impl Verdict {
-    /// On a text's feature, where unrelated texts reach `by_chance`; none where nothing has a score.
+    /// On a text's feature, where unrelated texts are `chance` above their mean ([`Unrelated::chance`]); none where nothing has a score.
     pub fn on(
         feature: &[f32],
-        by_chance: f32,
+        chance: f32,
         index: &Index,
         granules: &Granules,
         negatives: &[Vec<f32>],
         min_support: u32,
     ) -> Option<Self> {
-        let best = best_score(index, granules, feature, negatives, min_support)?;
+        let (best, mean) = best_and_mean(index, granules, feature, negatives, min_support)?;
+        let by_chance = mean + chance;
         Some(Self { matches: best > by_chance, best, by_chance })
     }
 }
 
-/// The best score of what masks show in enough views: an instance, a part or a group.
-fn best_score(
+/// The best score of what masks show in enough views, an instance, a part or a group, and the mean of all.
+fn best_and_mean(
     index: &Index,
     granules: &Granules,
     feature: &[f32],
     negatives: &[Vec<f32>],
     min_support: u32,
-) -> Option<f32> {
+) -> Option<(f32, f32)> {
     let instances = index.scores(feature, negatives).into_iter().zip(&index.instances.support);
     let instances = instances.filter(|(_, support)| **support >= min_support).filter_map(|(score, _)| score);
     let granules = granules.scores(feature, negatives, min_support).into_iter();
-    instances.chain(granules.map(|(_, score)| score)).reduce(f32::max)
+    let scores: Vec<f32> = instances.chain(granules.map(|(_, score)| score)).collect();
+    let best = scores.iter().copied().reduce(f32::max)?;
+    let mean = scores.iter().map(|&s| f64::from(s)).sum::<f64>() / scores.len() as f64;
+    Some((best, if scores.len() < FEW { 0.0 } else { mean as f32 }))
 }
 
 #[cfg(test)]
@@ -123,6 +133,21 @@ mod tests {
         assert!((on(&[0.6, 0.0, 0.8], 4).unwrap().best - 0.6).abs() < 1e-6, "rare ones do not");
         assert_eq!(on(&[0.0; 3], 1), None);
         assert_eq!(Unrelated { features: vec![vec![0.0; 3]] }.chance(&index, &granules, &[], 1), None);
+    }
+
+    #[test]
+    fn what_counts_is_above_the_mean_of_many() {
+        let mut i = instances();
+        // Along z all score high and nearly alike; along x they score low, and one stands out.
+        let row = |(k, d): (usize, usize)| [if k == 5 { 0.4 } else { 0.0 }, 0.1 * (k % 2) as f32, 1.0][d];
+        i.label = (0..6).collect();
+        i.descriptor = ndarray::Array2::from_shape_fn((6, 3), row);
+        (i.support, i.count) = (vec![3; 6], vec![1; 6]);
+        let (index, granules) = (Index::new(&i), Granules::new(&i));
+        let on = |f: &[f32]| Verdict::on(f, 0.2, &index, &granules, &[], 1).unwrap();
+        let (x, z) = (on(&[1.0, 0.0, 0.0]), on(&[0.0, 0.0, 1.0]));
+        assert!(x.matches && !z.matches && z.best > x.best, "{x:?} {z:?}");
+        assert!((z.by_chance - z.best - 0.2).abs() < 0.1, "{z:?}");
     }
 
     #[test]
