@@ -119,6 +119,7 @@ mod tests {
             views: vec!["a".into(), "b".into(), "c".into()],
             node: vec![-1],
             granules: vec![crate::Granule { members: crate::Members::Instance(0), support: 2, fit: 0.5 }],
+            granule_descriptor: ndarray::Array2::zeros((1, 0)),
             ..Instances::default()
         };
         let draft = Draft {

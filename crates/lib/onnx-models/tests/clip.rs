@@ -21,7 +21,7 @@ fn close(a: &[f32], b: &[f32]) -> bool {
 fn image_features_are_normalised_and_do_not_depend_on_the_batch() {
     let clip = ClipImage::open(folder(), &EngineOptions::default()).unwrap();
     assert_eq!((clip.size(), clip.dimension(), clip.config().name.as_str()), (8, 4, "test-clip"));
-    // 37 pictures: three batches, the last of them short. Channel c of picture i is flat.
+    // 37 pictures: ten batches, the last of them short. Channel c of picture i is flat.
     let flat = |i: usize, c: usize| ((i * 31 + c * 77) % 256) as u8;
     let crops: Vec<u8> = (0..37).flat_map(|i| (0..3).flat_map(move |c| [flat(i, c); 64])).collect();
     let features = clip.encode(&crops).unwrap();

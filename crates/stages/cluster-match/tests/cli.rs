@@ -307,7 +307,7 @@ fn the_provenance_holds_every_option_and_the_forecast_is_near_the_peak() {
     let expected = json!({
         "cluster": "free", "agreement": 0.18, "min_cluster_size": 8, "min_samples": 10, "epsilon": 0.0, "leaf": false,
         "allow_single_cluster": false, "noise": "keep", "join": 0.0, "votes": 0, "split": 0.0, "levels": ["large"],
-        "threshold": 0.2, "granules": 0,
+        "threshold": 0.2, "granules": 0, "describe_views": 0,
     });
     assert_eq!(a.provenance().parameters, expected);
     let record = RunRecord::read(s.path("out/instances.safetensors")).unwrap();

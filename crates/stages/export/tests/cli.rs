@@ -185,7 +185,7 @@ fn scene_json_tells_objects_and_relations_and_fits_its_schema() {
         assert!(!against_schema(&schema, &damaged).is_empty(), "{change}");
     }
     // A vocabulary names what nobody else did, and a guess is said to be one.
-    let hash = artifacts::Instances::read(run.path("instances.safetensors")).unwrap().1.hash().to_string();
+    let hash = Instances::read(run.path("instances.safetensors")).unwrap().1.hash().to_string();
     let naming = |instance: u32, name: &str, sure: bool| json!({"instance": instance, "names": [{"name": name, "score": 0.5}], "margin": 0.1, "sure": sure});
     let by_words = |hash: &str| {
         let names = json!({"format": "names", "version": 1, "instances": hash, "source": "", "model": "", "vocabulary": "",
