@@ -4,7 +4,7 @@ use crate::cli::Peer;
 use crate::vectors::unit;
 use crate::world::World;
 use artifacts::{Descriptors, Features, Instances, Match};
-use cluster_match::{descriptors as mean_descriptors, gather, witnesses};
+use cluster_match::{Witnesses, descriptors as mean_descriptors, gather};
 use gs_io::{Claim, Result};
 use ndarray::{Array2, Array3};
 use serde_json::{Value, json};
@@ -116,7 +116,7 @@ impl Grouping {
         let nodes = vec![-1; labels.len()];
         let means = &world.geometry.gaussians.means;
         let mut all = gather(means, labels, k, matches);
-        all.descriptor = mean_descriptors(k, &witnesses(&all.matches, 0), &world.features);
+        all.descriptor = mean_descriptors(k, &Witnesses::default().of_instances(&all.matches, 0), &world.features);
         if !descriptors.is_empty() {
             let dim = descriptors.len() / k.max(1);
             descriptors.chunks_exact_mut(dim.max(1)).for_each(unit);

@@ -115,6 +115,8 @@ impl Encoder {
             return Err(Error::new("no such model").file(path).hint(hint));
         }
         let config = ClipConfig::read(path.parent().unwrap_or(Path::new("")))?;
+        // Before the model is in memory: hashing reads the file, too.
+        let hash = hash_model(path)?;
         let model = open(path, Outputs::Declared, &EngineOptions { threads_per_run: 1, ..options.clone() })?;
         let wrong = |what: &str| Error::new(what).file(path).hint("export the model with scripts/export_clip.py");
         let (masks, given): (Vec<_>, Vec<_>) = model.inputs().iter().partition(|i| i.name == MASK);
@@ -129,7 +131,7 @@ impl Encoder {
                 .expected(format!("{kind} of rank {rank}")));
         }
         let output = model.outputs().iter().position(|o| o.name.ends_with("_embeds")).unwrap_or(0);
-        let (fixed, hash) = (input.fixed(0), hash_model(path)?);
+        let fixed = input.fixed(0);
         let (batch, always) = (fixed.unwrap_or(batch), fixed.is_some());
         let inputs = [input].into_iter().chain(masks).map(|i| i.name.clone()).collect();
         Ok(Self { inputs, output, dimension: config.dimension, batch, always, hash, model, config })

@@ -2,7 +2,7 @@
 
 use artifacts::{Extents, Instances, MaskFeatures, Match, Witness, flat};
 use ndarray::{Array2, aview1};
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 
 /// Gathers what is known of the instances but their descriptors. `labels` are those of all Gaussians, numbered 0 to K - 1 or -1. Scores
 /// are zero; views, tree and nodes are left empty.
@@ -26,25 +26,42 @@ pub fn gather(means: &[[f32; 3]], labels: Vec<i32>, instances: usize, mut matche
     }
 }
 
-/// The masks that say what each instance means: of its matches the `most` of the highest score, 0 for all (paper), which count alike.
-pub fn witnesses(matches: &[Match], most: usize) -> Vec<Witness> {
-    let mut all = Vec::new();
-    for own in matches.chunk_by(|a, b| a.instance == b.instance) {
-        let best = best(own.iter().map(|m| f64::from(m.score)), most);
-        let witness = |m: Match| Witness { of: m.instance, view: m.view, mask: m.mask, weight: 1.0 };
-        all.extend(best.into_iter().map(|i| witness(own[i])));
-    }
-    all
+/// A mask that somebody reads already is taken in place of one that fits up to so much better: 1 is as well.
+const NEARLY: f64 = 0.9;
+
+/// Chooses the masks that say what instances and granules mean, so that few masks are read: encoding them takes most of the time.
+#[derive(Default)]
+pub struct Witnesses {
+    /// View and mask of all that were chosen.
+    read: BTreeSet<(u32, u32)>,
 }
 
-/// Where the `most` largest of some values are, ascending; of equals the first; 0 for all.
-pub(crate) fn best(values: impl Iterator<Item = f64>, most: usize) -> Vec<usize> {
-    let mut order: Vec<(usize, f64)> = values.enumerate().collect();
-    order.sort_by(|a, b| b.1.total_cmp(&a.1));
-    order.truncate(if most == 0 { order.len() } else { most });
-    let mut found: Vec<usize> = order.into_iter().map(|(i, _)| i).collect();
-    found.sort_unstable();
-    found
+impl Witnesses {
+    /// The masks of each instance: of its matches the `most` of the highest score, 0 for all (paper). They count alike.
+    pub fn of_instances(&mut self, matches: &[Match], most: usize) -> Vec<Witness> {
+        let of_one = |own: &[Match]| {
+            let witness = |m: &Match| Witness { of: m.instance, view: m.view, mask: m.mask, weight: 1.0 };
+            self.choose(own.iter().map(|m| (f64::from(m.score), witness(m))), most)
+        };
+        matches.chunk_by(|a, b| a.instance == b.instance).flat_map(of_one).collect()
+    }
+
+    /// The `most` witnesses of one instance or granule that fit best, in their order; 0 for all. Of those that fit nearly as well as
+    /// the last of these, ones that are read already come first.
+    pub(crate) fn choose(&mut self, own: impl Iterator<Item = (f64, Witness)>, most: usize) -> Vec<Witness> {
+        let mut own: Vec<(usize, f64, Witness)> = own.enumerate().map(|(i, (fit, w))| (i, fit, w)).collect();
+        if most > 0 && own.len() > most {
+            // Of equals the first: the sorts are stable.
+            own.sort_by(|a, b| b.1.total_cmp(&a.1));
+            let least = NEARLY * own[most - 1].1;
+            let costs = |(_, fit, w): &(usize, f64, Witness)| *fit < least || !self.read.contains(&(w.view, w.mask));
+            own.sort_by_key(costs);
+            own.truncate(most);
+            own.sort_by_key(|(i, ..)| *i);
+        }
+        self.read.extend(own.iter().map(|(.., w)| (w.view, w.mask)));
+        own.into_iter().map(|(.., w)| w).collect()
+    }
 }
 
 /// A descriptor for each of `count` instances or granules, `[count][dim]`: the mean of the unit features of its masks, each with its
@@ -89,7 +106,7 @@ mod tests {
         assert_eq!((i.count[0], i.count[1], i.support[0], i.support[1]), (2, 0, 2, 0));
         assert_eq!((i.centroid[0], i.bbox_max[0]), ([1.0, 0.5, 0.0], [2.0, 1.0, 0.0]));
         assert_eq!(i.matches[0].view, 0);
-        let of = |most| descriptors(2, &witnesses(&i.matches, most), &features);
+        let of = |most| descriptors(2, &Witnesses::default().of_instances(&i.matches, most), &features);
         assert!((of(0)[[0, 0]] - 0.5f32.sqrt()).abs() < 1e-6);
         assert_eq!(of(0).row(1), aview1(&[0.0, 0.0]));
         assert_eq!(of(1).row(0), aview1(&[1.0, 0.0]), "the match that fits best");
@@ -97,10 +114,21 @@ mod tests {
     }
 
     #[test]
-    fn the_best_keep_their_order_and_equals_go_to_the_first() {
-        let values = || [0.5, 0.9, 0.5, 0.7].into_iter();
-        assert_eq!(best(values(), 3), [0, 1, 3]);
-        assert_eq!(best(values(), 9), [0, 1, 2, 3]);
-        assert_eq!(best(values(), 0), [0, 1, 2, 3]);
+    fn the_best_keep_their_order_and_what_is_read_already_comes_first() {
+        let own = |fits: &[f64]| -> Vec<(f64, Witness)> {
+            let of = |(i, &fit): (usize, &f64)| (fit, Witness { of: 0, view: i as u32, mask: 7, weight: 1.0 });
+            fits.iter().enumerate().map(of).collect()
+        };
+        let views = |read: &[(u32, u32)], fits: &[f64], most| {
+            let mut w = Witnesses { read: read.iter().copied().collect() };
+            w.choose(own(fits).into_iter(), most).iter().map(|w| w.view).collect::<Vec<_>>()
+        };
+        let fits = [0.5, 0.9, 0.5, 0.7];
+        assert_eq!(views(&[], &fits, 3), [0, 1, 3], "of equals the first");
+        assert_eq!(views(&[], &fits, 9), [0, 1, 2, 3]);
+        assert_eq!(views(&[], &fits, 0), [0, 1, 2, 3]);
+        assert_eq!(views(&[(2, 7)], &fits, 3), [1, 2, 3], "as good, and read already");
+        assert_eq!(views(&[(2, 8)], &fits, 3), [0, 1, 3], "another mask");
+        assert_eq!(views(&[(0, 7)], &fits, 2), [1, 3], "far from as good");
     }
 }

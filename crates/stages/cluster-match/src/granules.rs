@@ -4,7 +4,7 @@
 //! instance and every cluster of the tree is compared with the masks of all levels in every view, by blending weight. What some
 //! mask fits in two views or more can be asked for, and these masks say what it means.
 
-use crate::describe::best;
+use crate::describe::Witnesses;
 use artifacts::{Footprints, Granule, LEVELS, Members, Witness};
 use gs_io::Result;
 use rayon::prelude::*;
@@ -84,16 +84,21 @@ pub(crate) fn find(
     Ok(different(found))
 }
 
-/// The masks that say what each granule means: the `most` that fit it best, 0 for all. One that fits twice as well counts four times.
-pub(crate) fn witnesses(granules: &[(Granule, Vec<Shown>)], footprints: &Footprints, most: usize) -> Vec<Witness> {
-    let mut all = Vec::new();
-    for (of, (_, shown)) in granules.iter().enumerate() {
-        for i in best(shown.iter().map(|s| s.fit), most) {
-            let row = &footprints.rows[shown[i].row as usize];
-            all.push(Witness { of: of as u32, view: row.view, mask: row.mask, weight: shown[i].fit * shown[i].fit });
-        }
-    }
-    all
+/// The masks that say what each granule means, `most` of each, 0 for all. One that fits twice as well counts four times.
+pub(crate) fn witnesses(
+    granules: &[(Granule, Vec<Shown>)],
+    footprints: &Footprints,
+    most: usize,
+    chosen: &mut Witnesses,
+) -> Vec<Witness> {
+    let of_one = |(of, (_, shown)): (usize, &(Granule, Vec<Shown>))| {
+        let witness = |s: &Shown| {
+            let row = &footprints.rows[s.row as usize];
+            (s.fit, Witness { of: of as u32, view: row.view, mask: row.mask, weight: s.fit * s.fit })
+        };
+        chosen.choose(shown.iter().map(witness), most)
+    };
+    granules.iter().enumerate().flat_map(of_one).collect()
 }
 
 /// Which of `count` instances masks of at least `views` views show as one. `labels` are those of the kept Gaussians.

@@ -30,6 +30,6 @@ mod testing;
 mod vote;
 
 pub use associate::{FeatureTable, Overlaps, Region, best_masks, matches, overlaps};
-pub use describe::{descriptors, gather, witnesses};
+pub use describe::{Witnesses, descriptors, gather};
 pub use options::Args;
 pub use profile::mask_weights;

@@ -129,12 +129,12 @@ pub(crate) struct Settings {
         help_heading = "Matching"
     )]
     pub granules: usize,
-    /// Views whose masks say what an instance, a part or a group means, those that fit best; 0 for all that show it; for free points the
-    /// default is 0, as in the paper
+    /// Views whose masks say what an instance, a part or a group means, those that fit best (docs/results/queries.md); 0 for all that show
+    /// it; for free points the default is 0, as in the paper
     #[arg(
         long,
         value_name = "VIEWS",
-        default_value = "8",
+        default_value = "4",
         default_value_if("cluster", "free", "0"),
         help_heading = "Matching"
     )]

@@ -2,7 +2,7 @@
 
 use crate::assignment::Assignment;
 use crate::associate::{FeatureTable, matches, overlaps};
-use crate::describe::{descriptors, gather, witnesses};
+use crate::describe::{Witnesses, descriptors, gather};
 use crate::granules::{self, Candidates};
 use crate::group::{free, on_graph};
 use crate::inputs::Inputs;
@@ -107,10 +107,11 @@ fn find(a: &Args, settings: &Settings, inputs: &Inputs, stage: &Stage) -> Result
     } else {
         Vec::new()
     };
-    let of_granules = granules::witnesses(&granules, footprints, settings.describe_views);
+    let mut chosen = Witnesses::default();
+    let of_granules = granules::witnesses(&granules, footprints, settings.describe_views, &mut chosen);
     let views = inputs.views.iter().map(|v| v.stem().to_string()).collect();
     let gathered = gather(&inputs.geometry.gaussians.means, found.labels, found.instances, matches);
-    let of_instances = witnesses(&gathered.matches, settings.describe_views);
+    let of_instances = chosen.of_instances(&gathered.matches, settings.describe_views);
     let granules = granules.into_iter().map(|(granule, _)| granule).collect::<Vec<_>>();
     let granule_descriptor = Array2::zeros((granules.len(), 0));
     let mut instances =
