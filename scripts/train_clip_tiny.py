@@ -219,7 +219,15 @@ def export(p, s, table, out):
         "text_w": f32(p["text_w"]),
     }
     nodes = [
-        helper.make_node("Gather", ["table", "ids"], ["rows"], axis=0),
+        # A text is read up to its end, as CLIP does: what follows is the id 0, which means nothing.
+        helper.make_node("Equal", ["ids", "end_mark"], ["is_end"]),
+        helper.make_node("Cast", ["is_end"], ["ends"], to=TensorProto.FLOAT),
+        helper.make_node("CumSum", ["ends", "along"], ["ended"], exclusive=1),
+        helper.make_node("Sub", ["one", "ended"], ["within"]),
+        helper.make_node("Relu", ["within"], ["counts"]),
+        helper.make_node("Cast", ["counts"], ["counts_wide"], to=TensorProto.INT64),
+        helper.make_node("Mul", ["ids", "counts_wide"], ["read"]),
+        helper.make_node("Gather", ["table", "read"], ["rows"], axis=0),
         helper.make_node("Gather", ["word", "rows"], ["e"], axis=0),
         helper.make_node("ReduceSum", ["e", "axis"], ["sum"], keepdims=0),
         helper.make_node("Transpose", ["e"], ["et"], perm=[0, 2, 1]),
@@ -229,7 +237,7 @@ def export(p, s, table, out):
         helper.make_node("Concat", ["sum", "top"], ["pooled"], axis=1),
         helper.make_node("MatMul", ["pooled", "text_w"], ["embedding"]),
     ]
-    weights["axis"] = np.array([1], np.int64)
+    weights |= {"axis": np.array([1], np.int64), "along": np.array(1, np.int64), "end_mark": np.array(49407, np.int64), "one": np.array(1, np.float32)}
     ids = helper.make_tensor_value_info("ids", TensorProto.INT64, ["n", CONTEXT])
     save(nodes, [ids], weights, out / "text.onnx")
 
