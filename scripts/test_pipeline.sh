@@ -35,7 +35,7 @@ same() { # are all artifacts of two runs the same bytes?
     cmp "$1/$f" "$2/$f" || return 1
   done
 }
-stages_of() { grep -oE 'target/release/[a-z-]+( (train|eval|embed|masks|query|score|report))?' "$1" | sed 's|.*/||' | sort | tr '\n' ',' || true; }
+stages_of() { grep -oE 'target/release/[a-z-]+( (train|eval|embed|masks|query|score|names|report))?' "$1" | sed 's|.*/||' | sort | tr '\n' ',' || true; }
 
 say "== a whole run"
 tiny "$work/a" 2 > "$work/a.log" 2>&1 || { cat "$work/a.log"; fail "the pipeline"; }
@@ -96,7 +96,7 @@ pass "literal.conf and paper.conf run"
 say "== a changed option"
 feat='--preset literal --iterations 310' tiny "$work/b" 1 > "$work/changed.log" 2>&1
 ran=$(stages_of "$work/changed.log")
-[ "$ran" = 'cluster-match,eval query,eval report,eval score,feat-train,' ] || fail "a changed feat-train option ran: $ran"
+[ "$ran" = 'cluster-match,cluster-match,eval names,eval query,eval report,eval score,feat-train,mask-embed embed,' ] || fail "a changed feat-train option ran: $ran"
 pass "a changed option runs what depends on it and nothing else"
 
 say "== a scene that is not there"
