@@ -514,9 +514,11 @@ fn a_draft_lists_the_masks_that_are_read_and_is_gone_on_from() {
         let out = s.run(&options("--draft"));
         assert!(out.status.success() && !s.path("out").exists(), "{}", String::from_utf8_lossy(&out.stderr));
         let wanted = Draft::read(&draft).unwrap().0;
+        let views_of_one = wanted.of_instances.chunk_by(|a, b| a.of == b.of).map(<[_]>::len).max();
+        assert!(most[1] == "0" || views_of_one <= Some(2), "{views_of_one:?}");
         let wanted: Vec<(&str, Vec<u32>)> =
             wanted.wanted().into_iter().map(|(view, masks)| (view, masks.into_iter().collect())).collect();
-        assert_eq!(wanted.len(), if most[1] == "2" { wanted.len().min(4) } else { 4 });
+        assert!(most[1] == "2" || wanted.len() == 4, "{wanted:?}");
         assert!(wanted.iter().all(|(_, masks)| masks.iter().all(|&m| m == 0 || m >= 3)), "{wanted:?}");
         s.language(0..VIEWS);
         // What is not wanted is not read.
