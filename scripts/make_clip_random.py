@@ -2,9 +2,9 @@
 """Writes a CLIP of full size with random weights, and what ONNX Runtime makes of it. It means nothing, but is as large and as slow as a real one.
 
     pip install numpy onnx onnxruntime
-    python scripts/make_clip_random.py [--layers 12] FOLDER
+    python scripts/make_clip_random.py [--layers 12] [--patch 32] [--width 512] FOLDER
 
-FOLDER then holds image.onnx, text.onnx and clip.json of ViT-B/16, laid out as the hub's exports: a text's end is ArgMax of its ids, and the
+FOLDER then holds image.onnx, text.onnx and clip.json of ViT-B/16 (of ViT-B/32 with --patch 32, of TinyCLIP-39M with --width 512), laid out as the hub's exports: a text's end is ArgMax of its ids, and the
 number of ids is open. Beside them lie the oracles of `cargo test -p onnx-models --test full_clip`: texts.npy and images.npy, unit features
 that ONNX Runtime gives the texts of tokens.json, filled with 49407 as CLIPTokenizer does, and of pictures.npy, u8 [8, 3, 224, 224].
 """
@@ -78,7 +78,7 @@ class Graph:
         save(helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)], ir_version=8, producer_name="random"), path)
 
 
-def image(path, layers, width=768, heads=12, patch=16, size=224):
+def image(path, layers, width, heads, patch, size=224):
     g, cells = Graph(1), (size // patch) ** 2
     x = g("Conv", "pixel_values", g.weights(width, 3, patch, patch, fan=3 * patch * patch), strides=[patch, patch],
           kernel_shape=[patch, patch], dilations=[1, 1], pads=[0, 0, 0, 0], group=1)
@@ -123,12 +123,14 @@ def main():
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("folder", type=Path, help="folder to write")
     parser.add_argument("--layers", type=int, default=12, help="layers of each half [%(default)s, as ViT-B/16 has]")
+    parser.add_argument("--patch", type=int, default=16, help="pixels of the image half's patches [%(default)s]")
+    parser.add_argument("--width", type=int, default=768, help="width of the image half, 64 a head [%(default)s]")
     a = parser.parse_args()
     a.folder.mkdir(parents=True, exist_ok=True)
-    config = {"name": f"ViT-B/16 of random weights, {a.layers} layers", "dimension": DIMENSION, "image_size": 224,
+    config = {"name": f"ViT of random weights, {a.layers} layers of {a.width}, patches of {a.patch}", "dimension": DIMENSION, "image_size": 224,
               "mean": MEAN, "std": STD, "context_length": MOST}
     (a.folder / "clip.json").write_text(json.dumps(config, indent=2) + "\n")
-    image(a.folder / "image.onnx", a.layers)
+    image(a.folder / "image.onnx", a.layers, a.width, a.width // 64, a.patch)
     text(a.folder / "text.onnx", a.layers)
     tokens = json.loads((ROOT / "crates/lib/onnx-models/testdata/tokens.json").read_text())
     ids = np.array([t["ids"] + [END] * (MOST - len(t["ids"])) for t in tokens], np.int64)

@@ -1,5 +1,5 @@
 #!/usr/bin/env python3
-"""Rules of queries, each alone against the default, on synthetic scenes in both languages: the tables of docs/results/queries.md.
+"""Rules of queries and of names, each alone against the default, on synthetic scenes in both languages: the tables of docs/results/queries.md.
 
     scripts/query_rules.py OUT [--bin target/release]
 
@@ -22,10 +22,12 @@ SCENE = "--objects 16 --views 24 --width 160 --height 120 --points 3000 --corrup
 TRAIN = "--iterations 600 --max-gaussians 6000".split()
 NEGATIVES = ["object", "things", "stuff", "texture"]
 UNRELATED = (Path(__file__).parent.parent / "crates/lib/query/src/unrelated.txt").read_text().splitlines()
+VIEWS = [1, 2, 4, 8, 0]
 
 
 def make(folder, family, seed, bin):
-    """The scene, its geometry, and its instances in each language; what is there is kept."""
+    """The scene, its geometry, the masks that describe it by each of VIEWS, and instances, names and scores in each language; what is
+    there is kept."""
 
     def run(program, *arguments):
         subprocess.run([bin / program, *map(str, arguments), "--quiet", "--overwrite"], check=True, stderr=subprocess.DEVNULL)
@@ -42,24 +44,48 @@ def make(folder, family, seed, bin):
         made = ["--footprints", at["footprints"], "--graph", at["graph"]]
         run("graph-precompute", "--scene", scene, "--geometry", geometry, "--masks", masks, *made)
         run("feat-train", "--geometry", geometry, *made, "--out", at["features"])
+    inputs = ["--scene", scene, "--geometry", geometry, *(v for name, path in at.items() for v in ["--" + name, path])]
+    for k in VIEWS:
+        draft = folder / f"draft-{k}.safetensors"
+        if not draft.exists():
+            run("cluster-match", *inputs, "--masks", masks, "--out", folder / "none.safetensors", "--draft", draft, "--describe-views", k)
+    words = folder / "words.txt"
+    words.write_text("\n".join(sorted(classes(folder) | absent(folder))))
     for language in LANGUAGES:
-        own = folder / language
+        own, out = folder / language, folder / f"{language}.safetensors"
         if not (own / "masks.json").exists():
             run("synth-scene", "--masks-to", own, *shape, "--language", language)
-        out = folder / f"{language}.safetensors"
         if not out.exists():
-            inputs = [v for name, path in at.items() for v in ["--" + name, path]]
-            run("cluster-match", "--scene", scene, "--geometry", geometry, *inputs, "--masks", own, "--out", out)
+            run("cluster-match", *inputs, "--masks", own, "--out", out)
+        texts = ["--geometry", geometry, "--instances", out, "--text-features", own / "text_features.json"]
+        run("eval", "names", *texts, "--vocabulary", words, "--out", folder / f"{language}.names.json")
+        run("eval", "score", *texts, "--scene", scene, "--out", folder / f"{language}.score.json")
+
+
+def things(folder):
+    """What the scene's truth holds."""
+    return json.loads((folder / "scene/truth/scene.json").read_text())["objects"]
+
+
+def classes(folder):
+    return {t["class"] for t in things(folder)}
+
+
+def absent(folder):
+    """Classes of the catalogue that the scene does not hold."""
+    labels = (folder / "scene/label/absent").glob("*.json")
+    return {o["category"] for f in labels for o in json.loads(f.read_text())["objects"]}
 
 
 def tensors(path):
-    """All arrays of a safetensors file."""
+    """All arrays of a safetensors file, and the names of its views."""
     data = path.read_bytes()
     (size,) = struct.unpack("<Q", data[:8])
-    types = {"F32": "<f4", "I32": "<i4", "U32": "<u4"}
-    body = data[8 + size :]
+    types = {"F32": "<f4", "F64": "<f8", "I32": "<i4", "U32": "<u4"}
+    header, body = json.loads(data[8 : 8 + size]), data[8 + size :]
+    views = json.loads(header.pop("__metadata__", {}).get("cags", "{}")).get("extra", {}).get("views")
     read = lambda v: np.frombuffer(body[slice(*v["data_offsets"])], types[v["dtype"]]).reshape(v["shape"])
-    return {k: read(v) for k, v in json.loads(data[8 : 8 + size]).items() if k != "__metadata__"}
+    return {"views": views, **{k: read(v) for k, v in header.items()}}
 
 
 def gaussians(path):
@@ -85,12 +111,30 @@ def unit(v):
     return v / np.where(length > 0, length, 1)
 
 
+def descriptors(draft, masks, middle):
+    """Unit descriptors of granules and of instances by a draft: weighted means of unit features, or their medians where `middle`."""
+    rows = [unit(np.load(masks / f"{view}_f.npy")) for view in draft["views"]]
+    out = {}
+    for name, count in [("instance", len(draft["support"])), ("granule", len(draft["granule_fit"]))]:
+        column = lambda field: draft[f"{name}_witness_{field}"]
+        features = np.array([rows[v][m] for v, m in zip(column("view"), column("mask"))])
+        out[name] = np.zeros((count, features.shape[1]))
+        for k in range(count):
+            own, weights = features[column("of") == k], column("weight")[column("of") == k]
+            if len(own):
+                out[name][k] = np.median(own, 0) if middle else weights @ own
+    return unit(out["granule"]), unit(out["instance"])
+
+
 class Asked:
     """What can be asked of a scene, what may answer, and how well each answer would do."""
 
-    def __init__(self, folder, language, instances=None):
-        i = tensors(instances or folder / f"{language}.safetensors")
-        truth = {k: v[::6] for k, v in tensors(folder / "scene/truth/points.safetensors").items()}
+    def __init__(self, folder, language, views=None, middle=False):
+        """With the descriptors of the program, or with those of a draft of so many `views`."""
+        i = tensors(folder / (f"{language}.safetensors" if views is None else f"draft-{views}.safetensors"))
+        if views is not None:
+            i["granule_descriptor"], i["descriptor"] = descriptors(i, folder / language, middle)
+        truth = {k: v[::6] for k, v in tensors(folder / "scene/truth/points.safetensors").items() if k != "views"}
         means, opacity = gaussians(folder / "geometry.ply")
         solid = np.flatnonzero(opacity >= 0.1)
         nearest = solid[nearest_of(truth["position"], means[solid])]
@@ -113,9 +157,9 @@ class Asked:
         table = {k: np.array(v) for k, v in json.loads((folder / language / "text_features.json").read_text()).items()}
         self.unrelated = unit(np.array([table[t] for t in UNRELATED]))
         self.negatives = unit(np.array([table[t] for t in NEGATIVES]))
-        things = [t for t in json.loads((folder / "scene/truth/scene.json").read_text())["objects"]]
+        all = things(folder)
         parts = lambda chosen, name=None: [p["id"] for t in chosen for p in t["parts"] if name in (None, p["name"])]
-        named = {t["name"]: [t] for t in things if not t["background"]}
+        named = {t["name"]: [t] for t in all if not t["background"]}
         self.texts, true = [], []
         for kind in ["one", "parts", "groups", "several", "absent"]:
             place = folder / "scene/label" / ("" if kind == "one" else kind)
@@ -127,7 +171,7 @@ class Asked:
                     "one": lambda: parts(named[text]),
                     "parts": lambda: parts(named[whole], part),
                     "groups": lambda: parts([t for n in pair for t in named[n]]),
-                    "several": lambda: parts([t for t in things if t["class"] == text and not t["background"]]),
+                    "several": lambda: parts([t for t in all if t["class"] == text and not t["background"]]),
                     "absent": list,
                 }[kind]()
                 self.texts.append((kind, unit(table[text])))
@@ -167,7 +211,7 @@ class Rule:
         """What is held beside that of unrelated texts."""
         s = self.scores(self.all, text)
         above = s.max() - s.mean()
-        return {"best": s.max(), "above": above, "z": above / s.std()}[self.rule.get("verdict", "best")]
+        return {"best": s.max(), "above": above, "z": above / s.std()}[self.rule.get("verdict", "above")]
 
     def answer(self, text):
         """The granules that a text selects, the best first."""
@@ -175,10 +219,10 @@ class Rule:
         scaled = (s - s.mean()) / max(s.max() - s.mean(), 1e-9)
         rank = scaled + self.rule.get("fit", 0.6) * self.a.fit
         chosen = [int(rank.argmax())]
-        if self.rule.get("several"):
+        if several := self.rule.get("several", 0.8):
             mask = self.a.member[chosen[0]]
             for q in np.argsort(-rank, kind="stable"):
-                if scaled[q] >= self.rule["several"] and self.a.member[q] @ mask <= 0.1 * self.a.sizes[q]:
+                if scaled[q] >= several and self.a.member[q] @ mask <= 0.1 * self.a.sizes[q]:
                     chosen.append(int(q))
                     mask = np.maximum(mask, self.a.member[q])
         return chosen
@@ -198,31 +242,43 @@ class Rule:
 
 
 RULES = {
-    "the best alone": {},
-    "scene's mean subtracted": {"centre": 1},
-    "... and the texts'": {"centre": 1, "text-centre": 1},
-    "negatives": {"negatives": 1},
+    "the default": {},
+    "the best alone": {"several": 0},
+    "several 0.7": {"several": 0.7},
+    "several 0.9": {"several": 0.9},
     "fit 0": {"fit": 0.0},
     "fit 0.3": {"fit": 0.3},
     "fit 1": {"fit": 1.0},
-    "fit 1.5": {"fit": 1.5},
-    "centred, fit 0.3": {"centre": 1, "fit": 0.3},
-    "centred, fit 1": {"centre": 1, "fit": 1.0},
+    "scene's mean subtracted": {"centre": 1},
+    "... and the texts'": {"centre": 1, "text-centre": 1},
+    "negatives": {"negatives": 1, "verdict": "best"},
+    "nothing: by the best score": {"verdict": "best"},
+    "nothing: by deviations": {"verdict": "z"},
     "nothing: 90 of 100": {"share": 0.9},
     "nothing: 98 of 100": {"share": 0.98},
-    "nothing: above the mean": {"verdict": "above"},
-    "nothing: z": {"verdict": "z"},
-    "centred, 90 of 100": {"centre": 1, "share": 0.9},
-    "centred, 98 of 100": {"centre": 1, "share": 0.98},
-    "centred, z": {"centre": 1, "verdict": "z"},
-    "several 0.7": {"several": 0.7},
-    "several 0.8": {"several": 0.8},
-    "several 0.85": {"several": 0.85},
-    "several 0.9": {"several": 0.9},
-    "centred, several 0.8": {"centre": 1, "several": 0.8},
-    "centred, several 0.9": {"centre": 1, "several": 0.9},
 }
-COLUMNS = ["one", "parts", "groups", "several", "believed one", "believed parts", "believed several", "believed absent", "giou"]
+COLUMNS = ["one", "parts", "groups", "several", "believed one", "believed parts", "believed absent", "giou"]
+
+
+def row(name, figures):
+    """One line of a table: means over scenes, in points."""
+    mean = lambda c: 100 * np.mean([f[c] for f in figures if c in f] or [np.nan])
+    print(f"| {name} | {' | '.join(f'{mean(c):.1f}' for c in COLUMNS)} |", flush=True)
+
+
+def inventory(folder, language):
+    """Of the instances: class of the thing that owns most of its surface, the best name of `eval names`, and whether that is sure."""
+    i, found = tensors(folder / f"{language}.safetensors"), json.loads((folder / f"{language}.names.json").read_text())
+    truth, (means, opacity) = tensors(folder / "scene/truth/points.safetensors"), gaussians(folder / "geometry.ply")
+    class_of = {p["id"]: t["class"] for t in things(folder) for p in t["parts"]}
+    solid = np.flatnonzero(opacity >= 0.1)
+    label = i["label"][solid[nearest_of(truth["position"][::6], means[solid])]]
+    part = truth["part"][::6]
+    for n in found["named"]:
+        own = np.array([class_of[p] for p in part[label == n["instance"]]])
+        if len(own):
+            names, counts = np.unique(own, return_counts=True)
+            yield names[counts.argmax()] == n["names"][0]["name"], n["sure"]
 
 
 def main():
@@ -230,20 +286,28 @@ def main():
     options.add_argument("out", type=Path)
     options.add_argument("--bin", type=Path, default=Path("target/release"))
     o = options.parse_args()
-    for language in LANGUAGES:
-        for use, seeds in SEEDS.items():
-            asked = []
-            for family in FAMILIES:
-                for seed in seeds:
-                    folder = o.out / f"{family}-{seed}"
-                    folder.mkdir(parents=True, exist_ok=True)
-                    make(folder, family, seed, o.bin.resolve())
-                    asked.append(Asked(folder, language))
-            print(f"\n{language}, {use}: {len(asked)} scenes\n\n| | {' | '.join(COLUMNS)} |\n|---|{'---|' * len(COLUMNS)}")
+    for use, seeds in SEEDS.items():
+        folders = [(o.out / f"{family}-{seed}", family, seed) for family in FAMILIES for seed in seeds]
+        for folder, family, seed in folders:
+            folder.mkdir(parents=True, exist_ok=True)
+            make(folder, family, seed, o.bin.resolve())
+        for language in LANGUAGES:
+            print(f"\n{language}, {use}: {len(folders)} scenes\n\n| | {' | '.join(COLUMNS)} |\n|---|{'---|' * len(COLUMNS)}")
+            asked = [Asked(folder, language) for folder, *_ in folders]
             for name, rule in RULES.items():
-                all = [Rule(a, rule).figures() for a in asked]
-                mean = lambda c: 100 * np.mean([f[c] for f in all if c in f] or [np.nan])
-                print(f"| {name} | {' | '.join(f'{mean(c):.1f}' for c in COLUMNS)} |", flush=True)
+                row(name, [Rule(a, rule).figures() for a in asked])
+            for k in VIEWS:
+                for middle in [False, True]:
+                    kind = f"{'median' if middle else 'mean'} of {k or 'all'} views"
+                    row(kind, [Rule(Asked(folder, language, k, middle), {}).figures() for folder, *_ in folders])
+            scores = [json.loads((folder / f"{language}.score.json").read_text()) for folder, *_ in folders]
+            pixels = lambda of: f"{100 * np.mean([s['query_miou'] for s in of if s]):.1f}"
+            kinds = [("one", scores), ("parts", [s["parts"] for s in scores]), ("groups", [s["groups"] for s in scores])]
+            print("pixels by eval score:", ", ".join(f"{kind} {pixels(of)}" for kind, of in kinds))
+            named = [n for folder, *_ in folders for n in inventory(folder, language)]
+            right = lambda of: f"{sum(r for r, _ in of)} of {len(of)}"
+            sure, guess = [n for n in named if n[1]], [n for n in named if not n[1]]
+            print(f"names: {right(named)} right, sure {right(sure)}, unsure {right(guess)}")
 
 
 if __name__ == "__main__":

@@ -49,11 +49,11 @@ impl TextOptions {
         self.clip.is_some() || self.text_features.is_some()
     }
 
-    /// Bytes of memory that text features will take: an encoder's weights and its tokenizer, or a table. A file that is not
-    /// there counts as empty.
+    /// Bytes of memory that text features will take: an encoder's tokenizer and its weights, which are in memory twice while they are read,
+    /// or a table. A file that is not there counts as empty.
     pub fn bytes(&self) -> u64 {
         let of = |p: &Path| std::fs::metadata(p).map_or(0, |m| m.len());
-        let encoder = |c: &Path| TOKENIZER + of(&if c.is_dir() { c.join("text.onnx") } else { c.into() }) * 5 / 4;
+        let encoder = |c: &Path| TOKENIZER + of(&if c.is_dir() { c.join("text.onnx") } else { c.into() }) * 2;
         self.clip.as_deref().map_or(0, encoder) + self.text_features.as_deref().map_or(0, |t| 2 * of(t))
     }
 }
