@@ -59,8 +59,8 @@ pub struct Instances {
     pub descriptor: Array2<f32>,
     /// Views in which the instance was matched with a mask; K.
     pub support: Vec<u32>,
-    /// Confidence that this is one whole thing, 0 to 1, to rank instances by: the mean association score of its matches times
-    /// (count / largest count)^(1/4); K.
+    /// Confidence that this is one whole thing, 0 to 1, to rank instances by: (count / largest count)^0.2 times how well masks fit it, as
+    /// [`Granule::fit`](crate::Granule); K.
     pub score: Vec<f32>,
     /// Number of Gaussians; K.
     pub count: Vec<u32>,

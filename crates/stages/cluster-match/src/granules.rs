@@ -101,6 +101,25 @@ pub(crate) fn witnesses(
     granules.iter().enumerate().flat_map(of_one).collect()
 }
 
+/// How well masks fit each of `count` instances, 0 to 1: the mean, over the views that show it, of its IoU with the mask that fits best there, by
+/// blending weight. `labels` are those of the kept Gaussians.
+///
+/// # Errors
+/// When the footprints can't be read.
+pub(crate) fn fits(labels: &[i32], count: usize, footprints: &Footprints) -> Result<Vec<f32>> {
+    let nodes = vec![-1; labels.len()];
+    let candidates = Candidates::new(labels, count, &nodes, &BTreeMap::new());
+    let best = best_masks(&candidates, labels, &nodes, footprints)?;
+    Ok(best.into_iter().map(|mut shown| fit(&mut shown)).collect())
+}
+
+/// The mean of the IoUs over the views that show enough of it, which alone are left in `shown`.
+fn fit(shown: &mut Vec<Shown>) -> f32 {
+    let most = shown.iter().map(|s| s.seen).fold(0.0, f64::max);
+    shown.retain(|s| s.seen >= SHOWN * most);
+    (shown.iter().map(|s| s.fit).sum::<f64>() / shown.len().max(1) as f64) as f32
+}
+
 /// Which of `count` instances masks of at least `views` views show as one. `labels` are those of the kept Gaussians.
 ///
 /// # Errors
@@ -179,12 +198,9 @@ fn best_of_view(masks: &[Mask], best: &mut [Vec<Shown>]) {
 
 /// Whether a candidate is a granule, and how surely: the sum of its IoUs. `shown` has its best mask in every view that shows it.
 fn judge(members: Members, mut shown: Vec<Shown>, least: usize) -> Option<(f64, Granule, Vec<Shown>)> {
-    let most = shown.iter().map(|s| s.seen).fold(0.0, f64::max);
-    shown.retain(|s| s.seen >= SHOWN * most);
-    let views = shown.len();
-    let sum: f64 = shown.iter().map(|s| s.fit).sum();
+    let fit = fit(&mut shown);
     shown.retain(|s| s.fit >= LEAST_FIT);
-    let granule = Granule { members, support: shown.len() as u32, fit: (sum / views.max(1) as f64) as f32 };
+    let granule = Granule { members, support: shown.len() as u32, fit };
     let sure = shown.iter().map(|s| s.fit).sum();
     (shown.len() >= least).then_some((sure, granule, shown))
 }

@@ -4,8 +4,9 @@
 //! their masks agree (`profile` says how far, `plane` tells floors and walls), `group` by their features;
 //! `assignment` keeps who belongs to which instance, and gives noise and unseen Gaussians to their neighbours; where features
 //! were clustered, `vote` corrects rims. `associate` matches instances with the
-//! masks of each view, `describe` gathers what is known of each instance and which masks say what it means, `rank` says how sure it is one whole thing,
-//! `health` how far masks and instances agree, `memory` forecasts the peak.
+//! masks of each view, `granules` finds parts, things and groups, and says how well masks fit them and the instances, `describe` gathers
+//! what is known of each instance and which masks say what it means, `rank` says how sure it is one whole thing, `health` how far
+//! masks and instances agree, `memory` forecasts the peak.
 
 mod assignment;
 mod associate;

@@ -116,7 +116,7 @@ fn find(a: &Args, settings: &Settings, inputs: &Inputs, stage: &Stage) -> Result
     let granule_descriptor = Array2::zeros((granules.len(), 0));
     let mut instances =
         Instances { views, tree: found.tree, node: found.nodes, granules, granule_descriptor, ..gathered };
-    instances.score = confidence(&instances, footprints, &weights);
+    instances.score = confidence(&instances.count, &granules::fits(&labels, instances.len(), footprints)?);
     let health = health::measure(&instances, footprints, &weights);
     let draft = Draft { instances, of_instances, of_granules, masks };
     Ok(Found { draft, health, noise, clustering_seconds })
