@@ -91,7 +91,8 @@ pub struct InstanceFigures {
 pub fn score(truth: &[i32], predicted: &[i32], confidence: &[f32], min_points: usize) -> InstanceFigures {
     let best = metrics::score_instances(truth, predicted);
     let ids: BTreeSet<i32> = predicted.iter().copied().filter(|&p| p >= 0).collect();
-    let ap = |threshold| average_precision(truth, predicted, confidence, min_points, threshold);
+    let overlaps = Overlaps::of_labels(truth, predicted, min_points);
+    let ap = |threshold| average_precision(&overlaps, |p| confidence[p], threshold);
     InstanceFigures {
         miou: best.miou,
         acc25: best.macc25,
@@ -103,6 +104,58 @@ pub fn score(truth: &[i32], predicted: &[i32], confidence: &[f32], min_points: u
     }
 }
 
+/// Points of true and predicted instances that take part in average precision.
+pub struct Overlaps {
+    /// Of each true instance.
+    truth: BTreeMap<i32, usize>,
+    /// Of each predicted instance.
+    predicted: BTreeMap<i32, usize>,
+    /// Of a true and a predicted instance.
+    common: BTreeMap<(i32, i32), usize>,
+}
+
+impl Overlaps {
+    /// Of instances that share the points out: those of every point, negative for none.
+    pub fn of_labels(truth: &[i32], predicted: &[i32], min_points: usize) -> Self {
+        assert_eq!(truth.len(), predicted.len());
+        let common = metrics::counts(truth.iter().copied().zip(predicted.iter().copied()));
+        Self::new(truth, metrics::counts(predicted.iter().copied()), common, min_points)
+    }
+
+    /// Of predicted instances that may overlap: the points of each.
+    pub fn of_sets(truth: &[i32], predicted: &[Vec<u32>], min_points: usize) -> Self {
+        let sets = (0i32..).zip(predicted);
+        let pairs = sets.clone().flat_map(|(p, points)| points.iter().map(move |&i| (truth[i as usize], p)));
+        let common = metrics::counts(pairs);
+        Self::new(truth, sets.map(|(p, points)| (p, points.len())).collect(), common, min_points)
+    }
+
+    fn new(
+        truth: &[i32],
+        mut predicted: BTreeMap<i32, usize>,
+        common: BTreeMap<(i32, i32), usize>,
+        min_points: usize,
+    ) -> Self {
+        let mut truth = metrics::counts(truth.iter().copied());
+        for sizes in [&mut truth, &mut predicted] {
+            sizes.retain(|&id, n| id >= 0 && *n >= min_points);
+        }
+        Self { truth, predicted, common }
+    }
+
+    /// IoU of a true and a predicted instance that both take part.
+    pub fn iou(&self, truth: i32, predicted: i32) -> f64 {
+        let both = self.common.get(&(truth, predicted)).copied().unwrap_or(0);
+        both as f64 / (self.truth[&truth] + self.predicted[&predicted] - both) as f64
+    }
+
+    /// The best IoU of each true instance with any predicted one, by rising id.
+    pub fn best(&self) -> impl Iterator<Item = (i32, f64)> + '_ {
+        let best = |&t: &i32| self.predicted.keys().map(|&p| self.iou(t, p)).fold(0.0, f64::max);
+        self.truth.keys().map(move |t| (*t, best(t)))
+    }
+}
+
 /// Average precision by ScanNet's matching. Only true and predicted instances of at least `min_points` points take part;
 /// IoU counts all points, also those without a true object. True instances are taken by rising id; each takes the
 /// predictions (by rising id) whose IoU with it exceeds `threshold` and that were not the first match of an earlier one:
@@ -111,49 +164,34 @@ pub fn score(truth: &[i32], predicted: &[i32], confidence: &[f32], min_points: u
 /// distinct confidence, precision p_i and recall r_i of what is at least that confident; after them (1, 0); the result is
 /// the sum over i of p_i (r_(i-1) - r_(i+1)) / 2, with r repeated before the first and 0 after the last. None without a
 /// true instance that takes part.
-pub fn average_precision(
-    truth: &[i32],
-    predicted: &[i32],
-    confidence: &[f32],
-    min_points: usize,
-    threshold: f64,
-) -> Option<f64> {
-    assert_eq!(truth.len(), predicted.len());
-    let sizes = |ids: &[i32]| {
-        let mut sizes = metrics::counts(ids.iter().copied());
-        sizes.retain(|&id, n| id >= 0 && *n >= min_points);
-        sizes
-    };
-    let (truth_points, predicted_points) = (sizes(truth), sizes(predicted));
-    let common = metrics::counts(truth.iter().copied().zip(predicted.iter().copied()));
+pub fn average_precision(overlaps: &Overlaps, confidence: impl Fn(usize) -> f32, threshold: f64) -> Option<f64> {
+    let Overlaps { truth: truth_points, predicted: predicted_points, common } = overlaps;
     if truth_points.is_empty() {
         return None;
     }
-    let overlaps = |t: i32, p: i32| {
-        let both = common.get(&(t, p)).copied().unwrap_or(0);
-        both as f64 / (truth_points[&t] + predicted_points[&p] - both) as f64 > threshold
-    };
+    let matches = |t: i32, p: i32| overlaps.iou(t, p) > threshold;
+    let confidence = |p: i32| confidence(p as usize);
     // Outcomes: confidence and whether it is a hit. What no prediction reaches is missed at every confidence.
     let mut outcomes: Vec<(f32, bool)> = Vec::new();
     let mut taken = BTreeSet::<i32>::new();
     let mut missed = 0usize;
     for &t in truth_points.keys() {
-        let free = |p: &&i32| overlaps(t, **p) && !taken.contains(*p);
-        let matches: Vec<i32> = predicted_points.keys().filter(free).copied().collect();
-        taken.extend(matches.first());
-        let mut confidences: Vec<f32> = matches.iter().map(|&p| confidence[p as usize]).collect();
+        let free = |p: &&i32| matches(t, **p) && !taken.contains(*p);
+        let found: Vec<i32> = predicted_points.keys().filter(free).copied().collect();
+        taken.extend(found.first());
+        let mut confidences: Vec<f32> = found.iter().map(|&p| confidence(p)).collect();
         confidences.sort_by(f32::total_cmp);
-        missed += usize::from(matches.is_empty());
+        missed += usize::from(found.is_empty());
         outcomes.extend(confidences.pop().map(|most| (most, true)));
         outcomes.extend(confidences.into_iter().map(|c| (c, false)));
     }
-    for (&p, &points) in &predicted_points {
-        if truth_points.keys().any(|&t| overlaps(t, p)) {
+    for (&p, &points) in predicted_points {
+        if truth_points.keys().any(|&t| matches(t, p)) {
             continue;
         }
         let counted: usize = truth_points.keys().filter_map(|&t| common.get(&(t, p))).sum();
         if (points - counted) as f64 / points as f64 <= threshold {
-            outcomes.push((confidence[p as usize], false));
+            outcomes.push((confidence(p), false));
         }
     }
     // From the least confident cut to the most.
@@ -176,7 +214,23 @@ mod tests {
     use super::*;
 
     fn ap(truth: &[i32], predicted: &[i32], confidence: &[f32]) -> f64 {
-        average_precision(truth, predicted, confidence, 1, 0.5).unwrap()
+        average_precision(&Overlaps::of_labels(truth, predicted, 1), |p| confidence[p], 0.5).unwrap()
+    }
+
+    #[test]
+    fn instances_that_overlap_are_scored_by_the_points_of_each() {
+        let truth = [0, 0, 0, 0, 1, 1, 1, 1, -1];
+        let sets = [vec![0, 1, 2, 3], vec![0, 1, 2, 3, 4, 5, 6, 7], vec![4, 5, 6], vec![7, 8]];
+        let o = Overlaps::of_sets(&truth, &sets, 3);
+        assert_eq!(o.best().collect::<Vec<_>>(), [(0, 1.0), (1, 0.75)]);
+        // Both things are found; the group is a false alarm, which costs nothing where it comes last.
+        assert_eq!(average_precision(&o, |p| [0.9, 0.1, 0.8][p], 0.5), Some(1.0));
+        assert!(average_precision(&o, |p| [0.8, 0.9, 0.7][p], 0.5) < Some(0.8));
+        // Sets that share the points out are scored as labels are.
+        let labels = [0, 0, 0, 0, 2, 2, 2, -1, -1];
+        let apart = Overlaps::of_sets(&truth, &[sets[0].clone(), vec![], sets[2].clone()], 3);
+        let [a, b] = [&apart, &Overlaps::of_labels(&truth, &labels, 3)].map(|o| average_precision(o, |_| 1.0, 0.8));
+        assert_eq!(a, b);
     }
 
     #[test]
@@ -197,14 +251,14 @@ mod tests {
         let truth = [vec![0; 4], vec![-1; 4]].concat();
         let on_void = [vec![0; 4], vec![1; 4]].concat();
         assert_eq!(ap(&truth, &on_void, &[0.5, 0.9]), 1.0, "a prediction on nothing labelled is no false alarm");
-        assert_eq!(average_precision(&[-1; 4], &[0; 4], &[1.0], 1, 0.5), None);
+        assert_eq!(average_precision(&Overlaps::of_labels(&[-1; 4], &[0; 4], 1), |_| 1.0, 0.5), None);
     }
 
     #[test]
     fn small_instances_take_no_part() {
         let truth = [vec![0; 10], vec![1; 3]].concat();
         let predicted = [vec![0; 10], vec![-1; 3]].concat();
-        assert_eq!(average_precision(&truth, &predicted, &[1.0], 5, 0.5), Some(1.0));
+        assert_eq!(average_precision(&Overlaps::of_labels(&truth, &predicted, 5), |_| 1.0, 0.5), Some(1.0));
         let s = score(&truth, &predicted, &[1.0], 5);
         assert_eq!((s.miou, s.acc25, s.truth, s.predicted), (0.5, 0.5, 2, 1), "but they count in mIoU");
         assert_eq!(score(&truth, &[-1; 13], &[], 5).ap25, Some(0.0), "all noise");

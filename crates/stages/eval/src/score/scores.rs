@@ -28,6 +28,12 @@ pub struct Scores {
     pub ap25: Option<f64>,
     /// The same at IoU 0.5.
     pub ap50: Option<f64>,
+    /// The same with all instances alike confident, as the tables of methods without scores have it.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub unranked: Option<Precision>,
+    /// What masks show as one, overlapping, where the instances have such proposals.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub proposals: Option<ProposalScores>,
     /// The same scores over Gaussians instead of surface points.
     pub gaussians: Option<GaussianScores>,
     /// Each true thing.
@@ -66,6 +72,33 @@ pub struct Scores {
     pub silhouette: Option<(Silhouette, f32)>,
     /// What was left out, and why.
     pub skipped: Vec<String>,
+}
+
+/// Average precision over surface points, of what has at least 100 of them; none without a true thing.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+pub struct Precision {
+    /// At IoU 0.25.
+    pub ap25: Option<f64>,
+    /// At IoU 0.5.
+    pub ap50: Option<f64>,
+}
+
+/// Parts, things and groups that masks show as one (`granules`), by falling fit; one that has an IoU of 0.3 or more with a better one is
+/// left out, and one of fewer than 100 surface points.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct ProposalScores {
+    /// Proposals that are left.
+    pub count: usize,
+    /// True things of at least 100 points, without background.
+    pub things: usize,
+    /// Those of the things that some proposal has an IoU above 0.5 with.
+    pub found: usize,
+    /// Mean over the things of the best IoU with any proposal.
+    pub object_miou: f64,
+    /// Average precision, ranked by fit, of all true things.
+    pub ranked: Precision,
+    /// The same with all proposals alike confident.
+    pub unranked: Precision,
 }
 
 /// Scores over Gaussians of opacity at least 0.1, each belonging to the thing of the nearest surface point.
@@ -193,6 +226,13 @@ impl Scores {
         line("things/instance", number(self.things_per_instance));
         line("ap25", number(self.ap25));
         line("ap50", number(self.ap50));
+        line("  unranked", number(self.unranked.and_then(|u| u.ap50)));
+        if let Some(p) = &self.proposals {
+            line("proposals", Some(format!("{} of {} things found", p.found, p.things)));
+            line("  object_miou", number(Some(p.object_miou)));
+            line("  ap25", number(p.ranked.ap25));
+            line("  ap50", number(p.ranked.ap50));
+        }
         line("per Gaussian", number(self.gaussians.as_ref().map(|g| g.instance_miou)));
         line("  ap25", number(self.gaussians.as_ref().and_then(|g| g.ap25)));
         line("  ap50", number(self.gaussians.as_ref().and_then(|g| g.ap50)));

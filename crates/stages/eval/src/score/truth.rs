@@ -1,9 +1,9 @@
 //! Instances against the true things of a synthetic scene: over points of their surfaces, and over Gaussians.
 
 use super::metrics::{self, InstanceScore};
-use super::scores::{GaussianScores, Scores, ThingScore};
-use crate::protocols::instances::{MIN_POINTS, average_precision};
-use artifacts::{TruePoints, TrueScene};
+use super::scores::{GaussianScores, Precision, ProposalScores, Scores, ThingScore};
+use crate::protocols::instances::{MIN_POINTS, Overlaps, average_precision};
+use artifacts::{Granule, TruePoints, TrueScene};
 use gs_io::Result;
 use gs_scene::Geometry;
 use query::{LabelledScene, MIN_OPACITY, nearest_of, nearest_solid};
@@ -22,7 +22,8 @@ pub fn score_instances(scene: &LabelledScene, root: &Path, scores: &mut Scores) 
     let names = root.join("truth/scene.json");
     let things = if names.exists() { TrueScene::read(&names)?.objects } else { Vec::new() };
     let label = |nearest: Option<u32>| nearest.map_or(-1, |i| scene.instances.label[i as usize]);
-    let predicted: Vec<i32> = scene.nearest_labelled(&truth.position).into_iter().map(label).collect();
+    let nearest = scene.nearest_labelled(&truth.position);
+    let predicted: Vec<i32> = nearest.iter().copied().map(label).collect();
     let found = metrics::score_instances(&truth.instance, &predicted);
     if found.objects.is_empty() {
         scores.skipped.push(format!("instance scores: {} holds no point of a thing", path.display()));
@@ -49,10 +50,73 @@ pub fn score_instances(scene: &LabelledScene, root: &Path, scores: &mut Scores) 
     scores.instances_per_thing = Some(found.instances_per_object);
     scores.things_per_instance = Some(found.objects_per_instance);
     let confidence = &scene.instances.score;
-    let ap = |threshold| average_precision(&truth.instance, &predicted, confidence, MIN_POINTS, threshold);
-    (scores.ap25, scores.ap50) = (ap(0.25), ap(0.5));
+    let overlaps = Overlaps::of_labels(&truth.instance, &predicted, MIN_POINTS);
+    let ranked = Precision::of(&overlaps, |p| confidence[p]);
+    (scores.ap25, scores.ap50) = (ranked.ap25, ranked.ap50);
+    scores.unranked = Some(Precision::of(&overlaps, |_| 1.0));
+    let background = |id: i32| scores.things.iter().any(|t| t.id == id && t.background);
+    scores.proposals = score_proposals(scene, &truth.instance, &nearest, background);
     scores.gaussians = Some(score_gaussians(scene, &truth));
     Ok(())
+}
+
+impl Precision {
+    fn of(overlaps: &Overlaps, confidence: impl Fn(usize) -> f32) -> Self {
+        let ap = |threshold| average_precision(overlaps, &confidence, threshold);
+        Self { ap25: ap(0.25), ap50: ap(0.5) }
+    }
+}
+
+/// A proposal is dropped when its IoU with one that fits better is this or more.
+const SAME: f64 = 0.3;
+
+/// The proposals of at least `least` points, each with its fit, that are not the [`SAME`] as one that fits better; of equals the first
+/// stays. `points` counts all points.
+fn different(mut proposals: Vec<(f32, Vec<u32>)>, points: usize, least: usize) -> (Vec<f32>, Vec<Vec<u32>>) {
+    proposals.retain(|(_, own)| own.len() >= least);
+    proposals.sort_by(|a, b| b.0.total_cmp(&a.0));
+    let (mut fit, mut kept): (Vec<f32>, Vec<Vec<u32>>) = Default::default();
+    // The kept ones that hold each point.
+    let mut holds: Vec<Vec<usize>> = vec![Vec::new(); points];
+    for (own_fit, own) in proposals {
+        let common = metrics::counts(own.iter().flat_map(|&i| &holds[i as usize]).copied());
+        let is_same = |(&k, &both): (&usize, &usize)| both as f64 >= SAME * (own.len() + kept[k].len() - both) as f64;
+        if !common.iter().any(is_same) {
+            own.iter().for_each(|&i| holds[i as usize].push(kept.len()));
+            fit.push(own_fit);
+            kept.push(own);
+        }
+    }
+    (fit, kept)
+}
+
+/// Scores the parts, things and groups that masks show, which may overlap, by the nearest Gaussian of each point. None where there are none.
+fn score_proposals(
+    scene: &LabelledScene,
+    truth: &[i32],
+    nearest: &[Option<u32>],
+    background: impl Fn(i32) -> bool,
+) -> Option<ProposalScores> {
+    let instances = &scene.instances;
+    let mut points = vec![Vec::new(); instances.label.len()];
+    for (point, gaussian) in (0u32..).zip(nearest) {
+        gaussian.iter().for_each(|&g| points[g as usize].push(point));
+    }
+    let of = |q: &Granule| {
+        let gaussians = q.gaussians(instances);
+        (q.fit, gaussians.iter().flat_map(|&g| &points[g as usize]).copied().collect())
+    };
+    let (fit, kept) = different(instances.granules.iter().map(of).collect(), truth.len(), MIN_POINTS);
+    let overlaps = Overlaps::of_sets(truth, &kept, MIN_POINTS);
+    let best: Vec<f64> = overlaps.best().filter(|b| !background(b.0)).map(|b| b.1).collect();
+    (!instances.granules.is_empty()).then(|| ProposalScores {
+        count: kept.len(),
+        things: best.len(),
+        found: best.iter().filter(|iou| **iou > 0.5).count(),
+        object_miou: metrics::mean(&best),
+        ranked: Precision::of(&overlaps, |p| fit[p]),
+        unranked: Precision::of(&overlaps, |_| 1.0),
+    })
 }
 
 /// Labels of Gaussians that suit `eval score` best: each takes the thing of most of the surface points whose nearest
@@ -106,12 +170,13 @@ fn score_gaussians(scene: &LabelledScene, points: &TruePoints) -> GaussianScores
     let truth: Vec<i32> = nearest_of(&points.position, &means).into_iter().map(thing).collect();
     let predicted: Vec<i32> = counted.iter().map(|&i| scene.instances.label[i]).collect();
     let confidence = &scene.instances.score;
-    let ap = |threshold| average_precision(&truth, &predicted, confidence, MIN_GAUSSIANS, threshold);
+    let Precision { ap25, ap50 } =
+        Precision::of(&Overlaps::of_labels(&truth, &predicted, MIN_GAUSSIANS), |p| confidence[p]);
     GaussianScores {
         count: counted.len(),
         instance_miou: metrics::score_instances(&truth, &predicted).miou,
-        ap25: ap(0.25),
-        ap50: ap(0.5),
+        ap25,
+        ap50,
     }
 }
 
@@ -154,6 +219,16 @@ mod tests {
             let other: Vec<i32> = (0..5).map(|i| code / 4i32.pow(i) % 4 - 1).collect();
             assert!(miou(&other) <= best, "{other:?} scores {}, the truth {best}", miou(&other));
         }
+    }
+
+    #[test]
+    fn of_proposals_that_are_nearly_the_same_the_best_fitting_stays() {
+        let set = |range: std::ops::Range<u32>| range.collect::<Vec<u32>>();
+        // The second is the first but for a point, the third a quarter of the first, the fourth too small.
+        let proposals =
+            vec![(0.6, set(0..8)), (0.7, set(1..8)), (0.9, set(0..2)), (1.0, set(9..10)), (0.5, set(8..12))];
+        let (fit, kept) = different(proposals, 12, 2);
+        assert_eq!((fit, kept), (vec![0.9, 0.7, 0.5], vec![set(0..2), set(1..8), set(8..12)]));
     }
 
     #[test]
