@@ -196,7 +196,8 @@ pub(super) fn soundness(m: &Material, page: &mut Page, metrics: &mut Metrics) ->
     page.checks(&findings.each_ref().map(|f| (f.name.into(), f.found.clone(), f.advice.is_none())));
     if findings.iter().all(|f| f.advice.is_none()) {
         page.paragraph(
-            "No instance holds too much of the scene, the masks of the views agree, and few instances share them.",
+            "None of these figures is doubtful. That proves nothing: on six scans of real rooms none was doubtful either, and 59 of 133 \
+             things were cut or merged with others. Look at the instances beside the photographs; explore merges and splits them.",
         );
     }
     findings.iter().filter_map(|f| f.advice.as_ref()).for_each(|a| page.note(a));
