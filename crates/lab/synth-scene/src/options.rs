@@ -216,7 +216,7 @@ impl Args {
                 torn: self.torn.unwrap_or(faults.torn),
                 swallow: self.swallow.unwrap_or(faults.swallow),
             },
-            speech: self.features.then(|| match self.language {
+            speech: self.features.then_some(match self.language {
                 Tongue::Words => speech,
                 // It has noise of its own.
                 language => Speech { language, noise: 0.0, ..speech },
