@@ -35,6 +35,7 @@ fn folder() -> PathBuf {
 }
 
 /// Asserts that no number is off by more than 1e-5.
+#[allow(clippy::print_stdout, reason = "how far it is off is the result")]
 fn assert_near(found: &[f32], folder: &Path, oracle: &str) {
     let expected = gs_io::npy::read_f32(folder.join(oracle)).unwrap();
     assert_eq!(found.len(), expected.len());
