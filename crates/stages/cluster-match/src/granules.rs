@@ -64,8 +64,8 @@ pub(crate) struct Shown {
     seen: f64,
 }
 
-/// Finds what masks of at least `views` views show as one, what they show best and most often first, with these masks. `labels` and `nodes`
-/// are those of the kept Gaussians.
+/// Finds what masks of at least `views` views show as one, what they show best and most often first, with these masks; nothing for 0 views.
+/// And how well masks fit each instance, 0 to 1, as [`Granule::fit`]. `labels` and `nodes` are those of the kept Gaussians.
 ///
 /// # Errors
 /// When the footprints can't be read.
@@ -75,13 +75,19 @@ pub(crate) fn find(
     nodes: &[i32],
     footprints: &Footprints,
     views: usize,
-) -> Result<Vec<(Granule, Vec<Shown>)>> {
+) -> Result<(Vec<(Granule, Vec<Shown>)>, Vec<f32>)> {
     let best = best_masks(candidates, labels, nodes, footprints)?;
-    let mut found: Vec<(f64, Granule, Vec<Shown>)> =
-        candidates.members.iter().zip(best).filter_map(|(&members, shown)| judge(members, shown, views)).collect();
+    let (mut found, mut fits) = (Vec::new(), Vec::new());
+    for (&members, mut shown) in candidates.members.iter().zip(best) {
+        let fit = fit(&mut shown);
+        if let Members::Instance(_) = members {
+            fits.push(fit);
+        }
+        found.extend(judge(members, fit, shown, views));
+    }
     // Of equals the first.
     found.sort_by(|a, b| b.0.total_cmp(&a.0));
-    Ok(different(found))
+    Ok((different(found), fits))
 }
 
 /// The masks that say what each granule means, `most` of each, 0 for all. One that fits twice as well counts four times.
@@ -101,18 +107,6 @@ pub(crate) fn witnesses(
     granules.iter().enumerate().flat_map(of_one).collect()
 }
 
-/// How well masks fit each of `count` instances, 0 to 1: the mean, over the views that show it, of its IoU with the mask that fits best there, by
-/// blending weight. `labels` are those of the kept Gaussians.
-///
-/// # Errors
-/// When the footprints can't be read.
-pub(crate) fn fits(labels: &[i32], count: usize, footprints: &Footprints) -> Result<Vec<f32>> {
-    let nodes = vec![-1; labels.len()];
-    let candidates = Candidates::new(labels, count, &nodes, &BTreeMap::new());
-    let best = best_masks(&candidates, labels, &nodes, footprints)?;
-    Ok(best.into_iter().map(|mut shown| fit(&mut shown)).collect())
-}
-
 /// The mean of the IoUs over the views that show enough of it, which alone are left in `shown`.
 fn fit(shown: &mut Vec<Shown>) -> f32 {
     let most = shown.iter().map(|s| s.seen).fold(0.0, f64::max);
@@ -128,7 +122,11 @@ pub(crate) fn are_shown(labels: &[i32], count: usize, footprints: &Footprints, v
     let nodes = vec![-1; labels.len()];
     let candidates = Candidates::new(labels, count, &nodes, &BTreeMap::new());
     let best = best_masks(&candidates, labels, &nodes, footprints)?;
-    Ok(candidates.members.iter().zip(best).map(|(&m, shown)| judge(m, shown, views).is_some()).collect())
+    let is_shown = |(&m, mut shown): (&Members, Vec<Shown>)| {
+        let fit = fit(&mut shown);
+        judge(m, fit, shown, views).is_some()
+    };
+    Ok(candidates.members.iter().zip(best).map(is_shown).collect())
 }
 
 /// The mask that fits each candidate best, of each view that shows it.
@@ -196,13 +194,13 @@ fn best_of_view(masks: &[Mask], best: &mut [Vec<Shown>]) {
     of_view.into_iter().for_each(|(c, shown)| best[c as usize].push(shown));
 }
 
-/// Whether a candidate is a granule, and how surely: the sum of its IoUs. `shown` has its best mask in every view that shows it.
-fn judge(members: Members, mut shown: Vec<Shown>, least: usize) -> Option<(f64, Granule, Vec<Shown>)> {
-    let fit = fit(&mut shown);
+/// Whether a candidate with this fit is a granule, and how surely: the sum of its IoUs. `shown` has its best mask in every view that shows
+/// enough of it. None is for 0 views.
+fn judge(members: Members, fit: f32, mut shown: Vec<Shown>, least: usize) -> Option<(f64, Granule, Vec<Shown>)> {
     shown.retain(|s| s.fit >= LEAST_FIT);
     let granule = Granule { members, support: shown.len() as u32, fit };
     let sure = shown.iter().map(|s| s.fit).sum();
-    (shown.len() >= least).then_some((sure, granule, shown))
+    (least > 0 && shown.len() >= least).then_some((sure, granule, shown))
 }
 
 /// Leaves out what the same masks show as something before it.
@@ -254,7 +252,7 @@ mod tests {
     fn found(masks: &[(Level, std::ops::Range<u32>)]) -> Vec<(Granule, Vec<u32>)> {
         let (_dir, f) = footprints(masks);
         let candidates = Candidates::new(&LABELS, 2, &NODES, &PARENTS.into());
-        let found = find(&candidates, &LABELS, &NODES, &f, 2).unwrap();
+        let found = find(&candidates, &LABELS, &NODES, &f, 2).unwrap().0;
         found.into_iter().map(|(g, shown)| (g, shown.iter().map(|s| f.rows[s.row as usize].mask).collect())).collect()
     }
 
@@ -271,6 +269,16 @@ mod tests {
         ];
         // Of two masks that fit alike the first; what instance and cluster have in common is there once.
         assert_eq!(found(&all), expected);
+    }
+
+    #[test]
+    fn the_fit_of_an_instance_is_the_mean_over_its_views() {
+        let (_dir, f) = footprints(&[(Level::Large, 0..4), (Level::Large, 4..11)]);
+        let candidates = Candidates::new(&LABELS, 2, &NODES, &PARENTS.into());
+        let (none, fits) = find(&candidates, &LABELS, &NODES, &f, 0).unwrap();
+        // 4 of 7 Gaussians in two views; the third shows no handle, and there a mask is the whole instance.
+        let expected = ((4.0 / 7.0 * 2.0 + 1.0) / 3.0) as f32;
+        assert!(none.is_empty() && fits.iter().all(|fit| (fit - expected).abs() < 1e-6) && fits.len() == 2, "{fits:?}");
     }
 
     #[test]

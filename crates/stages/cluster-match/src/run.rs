@@ -99,14 +99,11 @@ fn find(a: &Args, settings: &Settings, inputs: &Inputs, stage: &Stage) -> Result
     let footprints = &inputs.footprints;
     let labels: Vec<i32> = inputs.graph.kept.iter().map(|&i| found.labels[i as usize]).collect();
     let weights = mask_weights(&labels, footprints, &settings.levels)?;
-    let granules = if settings.granules > 0 {
-        let nodes: Vec<i32> = inputs.graph.kept.iter().map(|&i| found.nodes[i as usize]).collect();
-        let parents = found.tree.iter().map(|e| (e.child, e.parent)).collect();
-        let candidates = Candidates::new(&labels, found.instances, &nodes, &parents);
-        granules::find(&candidates, &labels, &nodes, footprints, settings.granules)?
-    } else {
-        Vec::new()
-    };
+    let nodes: Vec<i32> = inputs.graph.kept.iter().map(|&i| found.nodes[i as usize]).collect();
+    let parents =
+        if settings.granules > 0 { found.tree.iter().map(|e| (e.child, e.parent)).collect() } else { BTreeMap::new() };
+    let candidates = Candidates::new(&labels, found.instances, &nodes, &parents);
+    let (granules, fits) = granules::find(&candidates, &labels, &nodes, footprints, settings.granules)?;
     let mut chosen = Witnesses::default();
     let of_granules = granules::witnesses(&granules, footprints, settings.describe_views, &mut chosen);
     let views = inputs.views.iter().map(|v| v.stem().to_string()).collect();
@@ -116,7 +113,7 @@ fn find(a: &Args, settings: &Settings, inputs: &Inputs, stage: &Stage) -> Result
     let granule_descriptor = Array2::zeros((granules.len(), 0));
     let mut instances =
         Instances { views, tree: found.tree, node: found.nodes, granules, granule_descriptor, ..gathered };
-    instances.score = confidence(&instances.count, &granules::fits(&labels, instances.len(), footprints)?);
+    instances.score = confidence(&instances.count, &fits);
     let health = health::measure(&instances, footprints, &weights);
     let draft = Draft { instances, of_instances, of_granules, masks };
     Ok(Found { draft, health, noise, clustering_seconds })
