@@ -4,8 +4,8 @@
     pip install numpy onnx onnxruntime
     python scripts/make_clip_random.py [--layers 12] [--patch 32] [--width 512] FOLDER
 
-FOLDER then holds image.onnx, text.onnx and clip.json of ViT-B/16 (of ViT-B/32 with --patch 32, of TinyCLIP-39M with --width 512), laid out as the hub's exports: a text's end is ArgMax of its ids, and the
-number of ids is open. Beside them lie the oracles of `cargo test -p onnx-models --test full_clip`: texts.npy and images.npy, unit features
+FOLDER then holds image.onnx, text.onnx and clip.json of ViT-B/16, laid out as the hub's exports: a text's end is ArgMax of its ids, and the
+number of ids is open. The image half is ViT-B/32's with --patch 32, and as wide as TinyCLIP-39M's with --width 512. Beside them lie the oracles of `cargo test -p onnx-models --test full_clip`: texts.npy and images.npy, unit features
 that ONNX Runtime gives the texts of tokens.json, filled with 49407 as CLIPTokenizer does, and of pictures.npy, u8 [8, 3, 224, 224].
 """
 import argparse
