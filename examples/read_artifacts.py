@@ -29,6 +29,8 @@ def read(path):
 
 def main(run):
     for name in ["graph", "footprints", "features", "instances"]:
+        if not (Path(run) / f"{name}.safetensors").exists():
+            continue  # features are made only where something reads them
         tensors, provenance = read(Path(run) / f"{name}.safetensors")
         print(f"{name}: made by {provenance['program']}")
         for key, t in tensors.items():

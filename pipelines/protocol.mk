@@ -22,7 +22,7 @@ MASKS_DONE := $(MASKS)/masks.json
 endif
 
 # The rule of OpenGaussian needs the features; the table then has both rules.
-protocol_FIRST = $(if $(filter lerf,$(PROTOCOL)),--features $(FEATURES))
+protocol_FIRST = $(addprefix --features ,$(ASKED))
 
 include pipelines/stages.mk
 

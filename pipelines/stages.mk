@@ -35,6 +35,10 @@ OPTIONS := $(OUT)/.options
 GRAPH := $(OUT)/graph.safetensors
 FOOTPRINTS := $(OUT)/footprints.safetensors
 FEATURES := $(OUT)/features.safetensors
+# Features are made where something reads them: clustering by them, OpenGaussian's rule of lerf; or where FEAT_ARGS asks for them, to be
+# seen in the report and by explore.
+CLUSTERED := $(if $(filter graph free --cluster=graph --cluster=free,$(CLUSTER_ARGS)),$(FEATURES))
+ASKED := $(if $(filter lerf,$(PROTOCOL)),$(FEATURES))
 DRAFT := $(OUT)/draft.safetensors
 INSTANCES := $(OUT)/instances.safetensors
 SCENE_FILES ?= $(OPTIONS)/scene.files
@@ -113,7 +117,7 @@ graph_RUN = $(BIN)/graph-precompute --scene $(call arg,POSED) --geometry $(call 
 feat_RUN = $(BIN)/feat-train --geometry $(call arg,GEOMETRY) --graph $(GRAPH) --footprints $(FOOTPRINTS) --out $(FEATURES) \
   $(feat_OPTIONS) $(COMMON)
 cluster_RUN = $(BIN)/cluster-match --scene $(call arg,POSED) --geometry $(call arg,GEOMETRY) --graph $(GRAPH) --footprints $(FOOTPRINTS) \
-  --features $(FEATURES) --masks $(MASKS) --out $(INSTANCES) $(cluster_OPTIONS) $(COMMON)
+  $(addprefix --features ,$(CLUSTERED)) --masks $(MASKS) --out $(INSTANCES) $(cluster_OPTIONS) $(COMMON)
 score_RUN = $(BIN)/eval score --scene $(call arg,POSED) --geometry $(call arg,GEOMETRY) --instances $(INSTANCES) --out $(OUT)/score.json \
   $(if $(CLIP),--clip $(call arg,CLIP)) $(SCORE_ARGS) $(filter-out --quiet,$(COMMON)) --quiet
 protocol_RUN = $(BIN)/eval $(PROTOCOL) --scene $(call arg,POSED) --geometry $(call arg,GEOMETRY) --instances $(INSTANCES) \
@@ -136,7 +140,7 @@ checked-options: checked | $(PROGRAMS)
 	@$(if $(SAM_MAKES),scripts/check_options.sh MASK_ARGS $(masks_RUN))
 	@$(if $(filter $(MASKS)/features.json,$(LANGUAGE)),scripts/check_options.sh EMBED_ARGS $(embed_RUN))
 	@scripts/check_options.sh GRAPH_ARGS $(graph_RUN)
-	@scripts/check_options.sh FEAT_ARGS $(feat_RUN)
+	@$(if $(CLUSTERED)$(ASKED)$(FEAT_ARGS),scripts/check_options.sh FEAT_ARGS $(feat_RUN))
 	@scripts/check_options.sh CLUSTER_ARGS $(cluster_RUN)
 	@scripts/check_options.sh SCORE_ARGS $(if $(PROTOCOL),$(protocol_RUN),$(score_RUN))
 	@$(if $(QUERY),scripts/check_options.sh QUERIES $(query_RUN))
@@ -171,7 +175,7 @@ $(OUT)/masks/masks.json: $(SCENE_FILES) $(OPTIONS)/masks | $(BIN)/mask-embed
 ifneq ($(and $(CLIP),$(if $(LANGUAGE),,none)),)
 LANGUAGE := $(MASKS)/features.json
 cluster_FROM := --from $(DRAFT)
-$(DRAFT): $(FEATURES) $(OPTIONS)/cluster | $(BIN)/cluster-match
+$(DRAFT): $(FOOTPRINTS) $(CLUSTERED) $(OPTIONS)/cluster | $(BIN)/cluster-match
 	$(cluster_RUN) --draft $@
 
 $(LANGUAGE): $(DRAFT) $(OPTIONS)/embed $(OPTIONS)/clip.files | $(BIN)/mask-embed
@@ -194,7 +198,7 @@ $(FEATURES): $(GEOMETRY_DONE) $(GRAPH) $(FOOTPRINTS) $(OPTIONS)/feat | $(BIN)/fe
 	$(feat_RUN)
 
 # Stage 3.
-$(INSTANCES): $(FEATURES) $(LANGUAGE) $(OPTIONS)/cluster | $(BIN)/cluster-match
+$(INSTANCES): $(FOOTPRINTS) $(CLUSTERED) $(LANGUAGE) $(OPTIONS)/cluster | $(BIN)/cluster-match
 	$(cluster_RUN) $(cluster_FROM)
 
 # Stage 4.
@@ -202,7 +206,7 @@ $(OUT)/score.json: $(INSTANCES) $(OPTIONS)/score | $(BIN)/eval
 	$(score_RUN)
 
 # The same by a published protocol.
-$(OUT)/protocol/metrics.json: $(INSTANCES) $(PROTOCOL_FILES) $(OPTIONS)/protocol $(if $(TEXTS),$(OPTIONS)/texts.files) | $(BIN)/eval
+$(OUT)/protocol/metrics.json: $(INSTANCES) $(ASKED) $(PROTOCOL_FILES) $(OPTIONS)/protocol $(if $(TEXTS),$(OPTIONS)/texts.files) | $(BIN)/eval
 	$(protocol_RUN)
 
 # QUERIES is a list of texts with underscores for spaces; without CLIP there is nothing to ask with.
@@ -220,7 +224,7 @@ $(NAMES): $(INSTANCES) $(OPTIONS)/names $(if $(VOCABULARY),$(OPTIONS)/vocabulary
 endif
 
 METRICS ?= $(OUT)/geom_metrics.json
-$(OUT)/report.html: $(INSTANCES) $(METRICS) $(OUT)/score.json $(NAMES) $(QUERY) $(OPTIONS)/report | $(BIN)/eval
+$(OUT)/report.html: $(INSTANCES) $(if $(FEAT_ARGS),$(FEATURES)) $(METRICS) $(OUT)/score.json $(NAMES) $(QUERY) $(OPTIONS)/report | $(BIN)/eval
 	$(report_RUN)
 
 # The programs are built by the top-level Makefile; a fragment that is run alone builds what it lacks.

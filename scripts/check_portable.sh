@@ -23,7 +23,7 @@ stages() {
   "$@" "$bin/feat-train" --preset literal --iterations 20 --geometry "$out/geometry.ply" "${linked[@]}" \
     --out "$out/contrastive.safetensors" "${common[@]}"
   "$@" "$bin/feat-train" --geometry "$out/geometry.ply" "${linked[@]}" --out "$out/features.safetensors" "${common[@]}"
-  "$@" "$bin/cluster-match" "${of[@]}" "${linked[@]}" --features "$out/features.safetensors" --masks $masks \
+  "$@" "$bin/cluster-match" "${of[@]}" "${linked[@]}" --masks $masks \
     --out "$out/instances.safetensors" "${common[@]}"
   "$@" "$bin/eval" score "${of[@]}" --instances "$out/instances.safetensors" --out "$out/score.json" "${common[@]}"
 }

@@ -33,17 +33,16 @@ def make(folder, family, seed, bin):
         subprocess.run([bin / program, *map(str, arguments), "--quiet", "--overwrite"], check=True, stderr=subprocess.DEVNULL)
 
     scene, shape = folder / "scene", [*SCENE, "--family", family, "--seed", seed]
-    at = {name: folder / f"{name}.safetensors" for name in ["footprints", "graph", "features"]}
+    at = {name: folder / f"{name}.safetensors" for name in ["footprints", "graph"]}
     geometry = folder / "geometry.ply"
     if not (scene / "label/absent").is_dir():
         run("synth-scene", "--out", scene, *shape)
     if not geometry.exists():
         run("gs-geom", "train", "--scene", scene, "--out", geometry, *TRAIN)
     masks = scene / "language_features"
-    if not at["features"].exists():
+    if not at["graph"].exists():
         made = ["--footprints", at["footprints"], "--graph", at["graph"]]
         run("graph-precompute", "--scene", scene, "--geometry", geometry, "--masks", masks, *made)
-        run("feat-train", "--geometry", geometry, *made, "--out", at["features"])
     inputs = ["--scene", scene, "--geometry", geometry, *(v for name, path in at.items() for v in ["--" + name, path])]
     for k in VIEWS:
         draft = folder / f"draft-{k}.safetensors"

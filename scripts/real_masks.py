@@ -61,9 +61,11 @@ def instances_of(scene, masks, base, method):
     if not instances.exists():
         graph, prints = graph_of(scene, masks, base)
         inputs = ["--geometry", f"{base}.ply", "--graph", graph, "--footprints", prints]
-        run("feat-train", *inputs, "--out", features, *feat)
-        run("cluster-match", "--scene", scene, *inputs, "--features", features, "--masks", masks[1], "--out", instances,
-            *cluster)
+        learned = []
+        if "--cluster" in cluster:
+            run("feat-train", *inputs, "--out", features, *feat)
+            learned = ["--features", features]
+        run("cluster-match", "--scene", scene, *inputs, *learned, "--masks", masks[1], "--out", instances, *cluster)
     return instances
 
 

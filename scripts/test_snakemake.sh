@@ -62,7 +62,7 @@ pass "snakemake: $files files, the same bytes as make's"
 
 # Each rule's memory, as the log says it, beside the peak that the stage recorded.
 if command -v jq > /dev/null; then
-  for pair in geometry:geometry.ply graph:graph.safetensors features:features.safetensors instances:instances.safetensors \
+  for pair in geometry:geometry.ply graph:graph.safetensors instances:instances.safetensors \
     score:protocol/metrics.json; do
     rule=${pair%%:*} peak=0
     for record in "$work"/snake/*/*/"${pair#*:}".run.json; do

@@ -64,7 +64,8 @@ fn photographs_become_answers_with_one_program() {
     let run =
         ["run", "photos", "-o", "out", "ITERATIONS=60", "MASKS=photos/language_features", &clip_setting, "--quiet"];
     said(here, &run);
-    assert!(here.join("out/report.html").is_file() && here.join("out/instances.ply").is_file());
+    assert!(here.join("out/report.html").is_file() && !here.join("out/features.safetensors").exists());
+    assert!(here.join("out/instances.ply").is_file());
     // Nothing is made twice.
     let made = |file: &str| std::fs::metadata(here.join("out").join(file)).unwrap().modified().unwrap();
     let before = (made("geometry.ply"), made("report.html"));
@@ -79,6 +80,7 @@ fn photographs_become_answers_with_one_program() {
     std::fs::write(here.join("words.txt"), "mug\nfloor\nwall\n").unwrap();
     let there = said(here, &["inventory", "--run-dir", "out", "--vocabulary", "words.txt", "--out", "few.json"]);
     assert!(there.contains("things by 3 names") && there.contains(" x "), "{there}");
+    said(here, &["features", "--run-dir", "out", "--out", "out/features.safetensors", "--quiet"]);
     let again = said(here, &["cluster", "--run-dir", "out", "--cluster", "free", "--out", "free.safetensors"]);
     assert!(again.contains("from out: --scene") && again.contains("--features out/features.safetensors"), "{again}");
     said(here, &["report", "--run-dir", "out", "--holdout", "0", "--out", "page.html", "--quiet"]);

@@ -22,7 +22,7 @@ def folder(tmp_path_factory):
         pytest.skip(f"no {PROGRAM}: cargo build --release")
     work = tmp_path_factory.mktemp("run")
     subprocess.run([PROGRAM, "synth-scene", "--size", "tiny", "--out", "photos", "--quiet"], cwd=work, check=True)
-    line = [PROGRAM, "run", "photos", "-o", "out", "ITERATIONS=200", "MASKS=photos/language_features", f"CLIP={CLIP}", "--quiet"]
+    line = [PROGRAM, "run", "photos", "-o", "out", "ITERATIONS=200", "MASKS=photos/language_features", f"CLIP={CLIP}", "FEAT_ARGS=--dim 64", "--quiet"]
     subprocess.run(line, cwd=work, check=True)
     return work / "out"
 

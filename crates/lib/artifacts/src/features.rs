@@ -20,6 +20,11 @@ impl Features {
     pub const FORMAT: &str = "features";
     const VERSION: u32 = 1;
 
+    /// Features of one dimension that are all alike: they tell no two Gaussians apart, and leave the IoU of matches alone.
+    pub fn alike(kept: &[u32]) -> Self {
+        Self { kept: kept.to_vec(), values: Array2::ones((kept.len(), 1)) }
+    }
+
     /// Writes the artifact.
     pub fn write(&self, path: impl AsRef<Path>, mut provenance: Provenance) -> Result<()> {
         provenance.format = Self::FORMAT.into();

@@ -45,7 +45,7 @@ const INPUTS: [Input; 9] = [
     Input { id: "masks", place: Place::Recorded(Some("masks")), always: false },
     Input { id: "graph", place: Place::Folder("graph.safetensors"), always: false },
     Input { id: "footprints", place: Place::Folder("footprints.safetensors"), always: false },
-    Input { id: "features", place: Place::Folder("features.safetensors"), always: false },
+    Input { id: "features", place: Place::Folder("features.safetensors"), always: true },
     Input { id: "instances", place: Place::Folder("instances.safetensors"), always: true },
     Input { id: "clip", place: Place::Recorded(None), always: true },
     Input { id: "text_features", place: Place::Recorded(None), always: true },

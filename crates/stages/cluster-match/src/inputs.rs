@@ -1,6 +1,6 @@
 //! Reading the inputs, and checking that they belong together.
 
-use crate::options::Args;
+use crate::options::{Args, Space};
 use artifacts::{Features, Footprints, Graph, hash_folder, role};
 use gs_io::{Error, IoContext, Provenance, Result, hash_file};
 use gs_scene::Geometry;
@@ -14,6 +14,7 @@ pub(crate) struct Inputs {
     pub geometry: Geometry,
     pub graph: Graph,
     pub footprints: Footprints,
+    /// Those that are clustered; all alike where the masks are.
     pub features: Features,
     /// The views whose masks the footprints hold.
     pub views: Vec<View>,
@@ -30,7 +31,11 @@ impl Inputs {
         let geometry_hash = hash_file(&a.geometry)?;
         let (graph, graph_file) = Graph::read(&a.graph)?;
         let footprints = Footprints::read(&a.footprints)?;
-        let (features, features_file) = Features::read(&a.features)?;
+        let path = a.features.as_ref().filter(|_| a.settings.cluster != Space::Masks);
+        if path.is_none() && a.features.is_some() {
+            stage.skipped("--features: clustering by the masks does not read them");
+        }
+        let features = path.map(Features::read).transpose()?;
         let masks = hash_folder(&a.masks, "_s.npy")?;
         let dataset = dataset::load(&a.scene, &LoadOptions { resolution: Resolution::Divisor(1.0), holdout: 0 })?;
         dataset.warnings.iter().for_each(|w| stage.warn(w));
@@ -40,29 +45,46 @@ impl Inputs {
         footprints.artifact().expect_input(role::MASKS, &masks)?;
         graph_file.expect_input(role::DATASET, &dataset_hash)?;
         footprints.artifact().expect_input(role::DATASET, &dataset_hash)?;
-        features_file.expect_input(role::GRAPH, graph_file.hash())?;
-        features_file.expect_input(role::FOOTPRINTS, footprints.artifact().hash())?;
-        check_features(a, &features, &graph, geometry.gaussians.len())?;
+        check_kept(a, &graph, &footprints, geometry.gaussians.len())?;
+        let mut features_hash = None;
+        let features = match (features, path) {
+            (Some((features, file)), Some(path)) => {
+                file.expect_input(role::GRAPH, graph_file.hash())?;
+                file.expect_input(role::FOOTPRINTS, footprints.artifact().hash())?;
+                check_features(path, &features, &graph)?;
+                features_hash = Some((role::FEATURES.into(), file.hash().into()));
+                features
+            }
+            _ => Features::alike(&graph.kept),
+        };
         let views = matched_views(a, &dataset, &footprints, stage)?;
         let mut hashes = BTreeMap::from([
             (role::GEOMETRY.into(), geometry_hash),
             (role::DATASET.into(), dataset_hash),
             (role::GRAPH.into(), graph_file.hash().into()),
             (role::FOOTPRINTS.into(), footprints.artifact().hash().into()),
-            (role::FEATURES.into(), features_file.hash().into()),
             (role::MASK_FEATURES.into(), hash_folder(&a.masks, "_f.npy")?),
         ]);
+        hashes.extend(features_hash);
         hashes.extend(clip_of_features(&a.masks, &masks)?);
         hashes.insert(role::MASKS.into(), masks);
         Ok(Self { geometry, graph, footprints, features, views, hashes })
     }
 }
 
-fn check_features(a: &Args, features: &Features, graph: &Graph, gaussians: usize) -> Result<()> {
+fn check_kept(a: &Args, graph: &Graph, footprints: &Footprints, gaussians: usize) -> Result<()> {
+    if graph.seen_views.len() == gaussians && graph.kept == footprints.kept {
+        return Ok(());
+    }
+    let e = Error::new("the graph belongs to other Gaussians than the footprints").file(&a.graph).field("kept");
+    Err(e.hint("run graph-precompute again"))
+}
+
+fn check_features(path: &Path, features: &Features, graph: &Graph) -> Result<()> {
     let wrong = |what: &str, field: &str| {
-        Err(Error::new(what).file(&a.features).field(field).hint("run feat-train again with this --graph"))
+        Err(Error::new(what).file(path).field(field).hint("run feat-train again with this --graph"))
     };
-    if graph.seen_views.len() != gaussians || graph.kept != features.kept {
+    if graph.kept != features.kept {
         return wrong("the features belong to other Gaussians than the graph", "kept");
     }
     if features.dim() == 0 {

@@ -25,9 +25,9 @@ pub struct Args {
     /// footprints.safetensors of graph-precompute
     #[arg(long, value_name = "FILE")]
     pub(crate) footprints: PathBuf,
-    /// features.safetensors of feat-train
-    #[arg(long, value_name = "FILE")]
-    pub(crate) features: PathBuf,
+    /// features.safetensors of feat-train, to cluster by features; the masks do without
+    #[arg(long, value_name = "FILE", required_if_eq_any = [("cluster", "graph"), ("cluster", "free")])]
+    pub(crate) features: Option<PathBuf>,
     /// Folder with id maps (<view>_s.npy) and, for language, mask features (<view>_f.npy)
     #[arg(long, value_name = "DIR")]
     pub(crate) masks: PathBuf,
@@ -115,7 +115,7 @@ pub(crate) struct Settings {
         help_heading = "Matching"
     )]
     pub levels: Vec<Level>,
-    /// Least association score of a match (IoU x similarity of features)
+    /// Least association score of a match: the IoU, times the similarity of features where these are clustered
     #[arg(long, default_value_t = 0.2, value_name = "SCORE", value_parser = stage::within(0.0..=1.0),
         help_heading = "Matching")]
     pub threshold: f64,

@@ -21,7 +21,7 @@ pub(crate) fn claim(a: &Args, stage: &Stage) -> Result<Claim> {
     for suffix in ["_s.npy", "_f.npy"] {
         maps.extend(artifacts::folder_files(&a.masks, suffix)?);
     }
-    let read = [&a.geometry, &a.graph, &a.footprints, &a.features].into_iter().chain(&a.from);
+    let read = [&a.geometry, &a.graph, &a.footprints].into_iter().chain(&a.features).chain(&a.from);
     if let Some(draft) = &a.draft {
         return stage.outputs(draft).artifact(draft, Draft::FORMAT).reads(read).reads(maps).claim();
     }

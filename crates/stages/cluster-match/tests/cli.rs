@@ -199,6 +199,19 @@ impl Scene {
         command.args(extra).output().unwrap()
     }
 
+    /// Runs without features.
+    fn run_without(&self, extra: &[&str]) -> Output {
+        let mut command = Command::new(env!("CARGO_BIN_EXE_cluster-match"));
+        command.arg("--scene").arg(&self.root).args(["--min-cluster-size", "8"]);
+        for file in
+            ["out/instances.safetensors", "geometry.ply", "graph.safetensors", "footprints.safetensors", "masks"]
+        {
+            let option = if file.starts_with("out") { "out" } else { file.split('.').next().unwrap() };
+            command.arg(format!("--{option}")).arg(self.path(file));
+        }
+        command.args(extra).output().unwrap()
+    }
+
     fn succeed(&self, extra: &[&str]) -> (Instances, String) {
         let out = self.run(extra);
         let said = String::from_utf8_lossy(&out.stderr).into_owned();
@@ -406,6 +419,22 @@ fn options_do_what_they_say() {
 }
 
 #[test]
+fn features_are_read_where_they_are_clustered() {
+    let s = Scene::new();
+    let with = s.succeed(&[]).0;
+    let out = s.run_without(&["--overwrite"]);
+    assert!(out.status.success(), "{}", String::from_utf8_lossy(&out.stderr));
+    let without = Instances::read(s.path("out/instances.safetensors")).unwrap().0;
+    assert!(with == without && !without.matches.is_empty());
+    assert!(s.succeed(&["--overwrite"]).1.contains("skipped --features: clustering by the masks does not read them"));
+    for space in ["free", "graph"] {
+        let out = s.run_without(&["--overwrite", "--cluster", space]);
+        let said = String::from_utf8_lossy(&out.stderr).into_owned();
+        assert!(out.status.code() == Some(2) && said.contains("--features"), "{said}");
+    }
+}
+
+#[test]
 fn damaged_gaussians_belong_to_nothing_and_harm_nobody() {
     let s = Scene::new();
     let mut g = gaussians();
@@ -597,11 +626,12 @@ fn bad_input_is_one_line_and_leaves_outputs_alone() {
     s.fail(&[], &["graph.safetensors", "another geometry"]);
     ply::write_gaussians(s.path("geometry.ply"), &gaussians(), &[]).unwrap();
     s.artifacts(|f| f.values[[2, 1]] = f32::NAN);
-    s.fail(&[], &["features.safetensors", "features[2][1]", "not a finite number"]);
+    let free = ["--cluster", "free"];
+    s.fail(&free, &["features.safetensors", "features[2][1]", "not a finite number"]);
     s.artifacts(|f| f.values = Array2::default((2 * EACH, 0)));
-    s.fail(&[], &["features.safetensors", "no dimension"]);
+    s.fail(&free, &["features.safetensors", "no dimension"]);
     std::fs::write(s.path("features.safetensors"), &features[..features.len() - 9]).unwrap();
-    s.fail(&[], &["features.safetensors"]);
+    s.fail(&free, &["features.safetensors"]);
     std::fs::write(s.path("features.safetensors"), &features).unwrap();
     s.succeed(&[]);
     std::fs::write(s.path("graph.safetensors"), &graph[..50]).unwrap();

@@ -38,6 +38,9 @@ impl Made {
             return made;
         };
         let given = |option: &str| files(&record.arguments, option, scene.path());
+        if given("--features").is_empty() {
+            made.method = Some("no training".into());
+        }
         if let Some(trained) = given("--features").iter().find_map(|path| trained(path, provenance)) {
             made.method = Some(text(&trained["preset"]).unwrap_or_else(|| "closed form".into()));
             made.iterations = trained["contrastive"]["iterations"].as_u64();
