@@ -136,9 +136,9 @@ pass "make scannet without texts ends in a table of instances without classes"
 scripts/reproduce_check.sh "$work/scan/scene0062_00" "$work/made-again" > "$work/check.log" 2>&1 || { cat "$work/check.log"; fail "reproduce-check"; }
 grep -q '^[1-9][0-9]* files are the same bytes, 0 differ' "$work/check.log" || { cat "$work/check.log"; fail "no file was compared"; }
 code=0
-printf x >> "$work/scan/scene0062_00/features.safetensors"
+printf x >> "$work/scan/scene0062_00/graph.safetensors"
 scripts/reproduce_check.sh "$work/scan/scene0062_00" "$work/made-again" > "$work/check.log" 2>&1 || code=$?
-[ $code = 1 ] && grep -q '^differs: /features.safetensors' "$work/check.log" || { cat "$work/check.log"; fail "a changed file was not found"; }
+[ $code = 1 ] && grep -q '^differs: /graph.safetensors' "$work/check.log" || { cat "$work/check.log"; fail "a changed file was not found"; }
 pass "reproduce-check: $(sed -n 's/ files.*//p' <(tail -1 "$work/check.log")) files the same, a changed one is named"
 
 echo "$passed passed, 0 failed, $((SECONDS - started)) s; CPU time of all stages: $(times | tail -1)"

@@ -12,7 +12,6 @@ use gs_io::{Claim, Error, Result, Watched, hash_file};
 use gs_raster::{RasterOptions, TileWeights, tile_weights};
 use gs_scene::dataset::{self, Dataset, LoadOptions, Resolution, View};
 use gs_scene::{Camera, Geometry};
-use ndarray::Array2;
 use serde::Serialize;
 use stage::Stage;
 use std::collections::BTreeMap;

@@ -16,6 +16,7 @@ use glam::{DMat3, DMat4, DQuat, DVec3};
 use gs_io::{Error, IoContext, Result, hash_bytes, hash_file};
 use rayon::prelude::*;
 use std::path::{Component, Path, PathBuf};
+use unicode_normalization::UnicodeNormalization;
 pub use view::View;
 use view::stems;
 
@@ -303,12 +304,20 @@ impl Dataset {
     }
 }
 
-/// The file of this name with its extension in other letters, such as `a.JPG` for `a.jpg`: cameras and copying programs differ
-/// in that, and disks where it counts show it.
-fn other_case(folder: &Path, name: &str) -> Option<String> {
+/// The file that a name means which is written otherwise: `a.JPG` for `a.jpg`, for cameras and copying programs differ in that;
+/// `images/a.png` for Windows' `images\\a.png`; letters with accents in one piece or in two, as macOS has them.
+fn other_name(folder: &Path, name: &str) -> Option<String> {
+    let name = name.replace('\\', "/");
+    let there = |n: &String| folder.join(n).is_file();
+    if there(&name) {
+        return Some(name);
+    }
     let (bare, extension) = name.rsplit_once('.')?;
     let other = [extension.to_ascii_lowercase(), extension.to_ascii_uppercase()];
-    other.iter().map(|e| format!("{bare}.{e}")).find(|n| folder.join(n).is_file())
+    other.iter().map(|e| format!("{bare}.{e}")).find(there).or_else(|| {
+        let forms = [name.nfc().collect::<String>(), name.nfd().collect()];
+        forms.into_iter().find(there)
+    })
 }
 
 /// Refuses a name inside a file that leads out of the dataset's folder.
@@ -350,7 +359,13 @@ fn invert_pose(world_from_camera: DMat4, field: &str) -> Result<Option<(DMat3, D
 
 fn read_text(path: &Path) -> Result<String> {
     let bytes = std::fs::read(path).at("read", path)?;
+    let bytes = without_mark(&bytes).to_vec();
     String::from_utf8(bytes).map_err(|_| Error::new("not a text file").file(path).hint("copy or export it again"))
+}
+
+/// Text without the byte order mark that Windows' editors put before it.
+fn without_mark(bytes: &[u8]) -> &[u8] {
+    bytes.strip_prefix(b"\xEF\xBB\xBF").unwrap_or(bytes)
 }
 
 /// Paths in a folder, sorted.

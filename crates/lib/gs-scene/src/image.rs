@@ -47,7 +47,34 @@ pub fn decode(bytes: &[u8], path: &Path) -> Result<DynamicImage> {
             .expected(format!("at most {most} pixels"))
             .hint("shrink it, or copy it again"));
     }
+    // Decoders fill what is missing with grey, which would be learnt.
+    if bytes.starts_with(&JPEG) && !reaches_its_end(bytes) {
+        return Err(unreadable(path, &"the JPEG ends before its end mark, so a part of it is missing"));
+    }
     reader()?.decode().map_err(|e| unreadable(path, &e))
+}
+
+/// How a JPEG begins.
+const JPEG: [u8; 2] = [0xFF, 0xD8];
+
+/// Whether the bytes of a JPEG go on to its end mark. Segments with a length are skipped, so that the end of a small picture within one
+/// is not taken for it (ITU T.81, B.1.1).
+fn reaches_its_end(bytes: &[u8]) -> bool {
+    let mut at = JPEG.len();
+    while let Some(found) = bytes.get(at..).and_then(|rest| rest.iter().position(|&b| b == 0xFF)) {
+        at += found + 1;
+        match bytes.get(at) {
+            Some(0xD9) => return true,
+            // Data, filling, and marks without a length.
+            Some(0x00 | 0x01 | 0xD0..=0xD8) => at += 1,
+            Some(0xFF) => {}
+            _ => match bytes.get(at + 1..at + 3) {
+                Some(&[high, low]) => at += 1 + usize::from(u16::from_be_bytes([high, low])).max(2),
+                _ => return false,
+            },
+        }
+    }
+    false
 }
 
 /// Whether a picture file has an alpha channel, from its header.
@@ -217,6 +244,24 @@ mod tests {
         let n = (width * height * 3) as usize;
         let value = |i: usize| ((i * 37) % 256) as f32 / 255.0;
         Image { width, height, rgb: (0..n).map(value).collect(), alpha: None }
+    }
+
+    #[test]
+    fn a_jpeg_that_ends_early_is_refused_and_one_with_more_behind_it_is_read() {
+        let picture = image::RgbImage::from_raw(48, 32, ramp(48, 32).to_rgb8()).unwrap();
+        let mut jpeg = Cursor::new(Vec::new());
+        DynamicImage::from(picture).write_to(&mut jpeg, image::ImageFormat::Jpeg).unwrap();
+        // The small picture that cameras put within has an end of its own.
+        let mut whole = jpeg.into_inner();
+        let small = [0xFF, 0xE1, 0, 8, 0xFF, 0xD8, 1, 2, 0xFF, 0xD9];
+        whole.splice(2..2, small);
+        let read = |bytes: &[u8]| decode(bytes, Path::new("a.jpg"));
+        assert!(read(&whole).is_ok() && read(&[&whole[..], b"more"].concat()).is_ok());
+        for end in [200, whole.len() / 2, whole.len() - 40, whole.len() - 1] {
+            let e = read(&whole[..end]).unwrap_err().to_string();
+            assert!(e.contains("a.jpg: not a readable picture"), "{end}: {e}");
+        }
+        assert!(read(&whole[..whole.len() - 40]).unwrap_err().to_string().contains("ends before its end mark"));
     }
 
     #[test]

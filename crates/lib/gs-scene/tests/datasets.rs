@@ -632,6 +632,56 @@ fn extensions_may_be_in_capitals_whatever_the_model_says() {
 }
 
 #[test]
+fn names_written_in_another_way_are_found() {
+    let dir = tempfile::tempdir().unwrap();
+    let root = dir.path();
+    let cameras = cameras(3, 20, 16);
+    // In the model composed, by Windows, and as it is; on the disk decomposed, in a folder, and with two blanks.
+    let named =
+        [("K\u{fc}che.png", "Ku\u{308}che.png"), ("a\\b.png", "a/b.png"), ("two  blanks.png", "two  blanks.png")];
+    for (_, file) in named {
+        let path = root.join("images").join(file);
+        fs::create_dir_all(path.parent().unwrap()).unwrap();
+        plain(20, 16).write_png(path).unwrap();
+    }
+    let views: Vec<_> = named.iter().zip(&cameras).map(|(n, c)| (n.0.to_string(), c.clone())).collect();
+    let c = &cameras[0];
+    let model = root.join("sparse/0");
+    text_model(&model, &views, "PINHOLE", &[c.fx, c.fy, c.cx, c.cy]);
+    // Saved by an editor that drops empty lines and puts a mark before the text.
+    for file in ["cameras.txt", "images.txt", "points3D.txt"] {
+        let text = fs::read_to_string(model.join(file)).unwrap();
+        let lines: Vec<&str> = text.lines().filter(|l| !l.is_empty()).collect();
+        write(&model.join(file), &format!("\u{feff}{}\r\n", lines.join("\r\n")));
+    }
+    let d = dataset::load(root, &FULL).unwrap();
+    assert_eq!((d.views.len(), &d.warnings), (3, &vec![]));
+    fs::remove_dir_all(root.join("sparse")).unwrap();
+    let frames: Vec<_> = named
+        .iter()
+        .map(|(name, _)| json!({"file_path": format!("images\\{name}"), "transform_matrix": opengl(c)}))
+        .collect();
+    let json = json!({"w": 20, "h": 16, "fl_x": c.fx, "fl_y": c.fy, "cx": c.cx, "cy": c.cy, "frames": frames});
+    write(&root.join("transforms.json"), &format!("\u{feff}{json}"));
+    assert_eq!(dataset::load(root, &FULL).unwrap().views.len(), 3);
+}
+
+#[test]
+fn of_several_models_the_one_with_most_photographs_is_taken_and_it_is_said() {
+    let dir = tempfile::tempdir().unwrap();
+    let views = colmap_scene(dir.path(), &cameras(6, 20, 16));
+    let sparse = dir.path().join("sparse");
+    colmap::write_model(&sparse.join("0"), &views[..2], &points()).unwrap();
+    colmap::write_model(&sparse.join("10"), &views[..5], &points()).unwrap();
+    let d = dataset::load(dir.path(), &FULL).unwrap();
+    assert_eq!((d.views.len(), d.warnings.len()), (5, 2), "{:?}", d.warnings);
+    assert!(
+        d.warnings[0].contains("sparse/10 with 5 photographs is taken") && d.warnings[0].contains("sparse/0 with 2")
+    );
+    assert!(d.warnings[1].contains("1 of 6 photographs in") && d.warnings[1].contains("are in no view"));
+}
+
+#[test]
 fn missing_photographs_are_skipped_until_none_is_left() {
     let dir = tempfile::tempdir().unwrap();
     colmap_scene(dir.path(), &cameras(3, 20, 16));

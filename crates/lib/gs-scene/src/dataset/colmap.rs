@@ -3,13 +3,13 @@
 mod binary;
 mod text;
 
-use super::{Format, RawDataset, RawView, check_inside, other_case};
+use super::{Format, RawDataset, RawView, check_inside, other_name};
 use crate::PointCloud;
 use crate::lens::{Distortion, Lens};
 pub use binary::write_model;
 use glam::{DMat3, DQuat, DVec3};
 use gs_io::{Error, IoContext, Result};
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
 
 /// A registered image.
@@ -25,12 +25,61 @@ struct Registered {
 
 const AGAIN: &str = "export the COLMAP model again";
 
-/// The folder that holds a sparse model within a scene, if any: `sparse/0`, `sparse`, `colmap/sparse/0` or the folder itself.
+/// The folder that holds a sparse model within a scene, if any: of the models `sparse/0`, `sparse/1`, ... that with most photographs, else
+/// `sparse`, one of `colmap/sparse/0`, ..., or the folder itself.
 pub(crate) fn find_model(scene: &Path) -> Option<PathBuf> {
-    ["sparse/0", "sparse", "colmap/sparse/0", "."]
-        .into_iter()
-        .map(|p| scene.join(p))
-        .find(|p| file_of(p, "cameras").is_some())
+    let largest = |folder: &str| {
+        let models = models_in(&scene.join(folder)).into_iter();
+        // Of equals the first.
+        models.rev().max_by_key(|(_, photographs)| *photographs).map(|(model, _)| model)
+    };
+    let own = |folder: &str| Some(scene.join(folder)).filter(|p| file_of(p, "cameras").is_some());
+    largest("sparse").or_else(|| own("sparse")).or_else(|| largest("colmap/sparse")).or_else(|| own("."))
+}
+
+/// COLMAP writes a model for each group of photographs that it can link, in folders with numbers for names: these, ascending, and the
+/// photographs of each. A model that can't be read has none.
+fn models_in(folder: &Path) -> Vec<(PathBuf, usize)> {
+    let entries = std::fs::read_dir(folder).into_iter().flatten().flatten();
+    let numbered = entries.filter_map(|e| Some((e.file_name().to_str()?.parse::<u32>().ok()?, e.path())));
+    let mut models: Vec<_> = numbered.filter(|(_, path)| file_of(path, "cameras").is_some()).collect();
+    models.sort();
+    if let [(_, only)] = &models[..] {
+        return vec![(only.clone(), 0)];
+    }
+    let photographs = |path: &Path| part(path, "images", binary::images, text::images).map_or(0, |(_, all)| all.len());
+    models.into_iter().map(|(_, path)| (path.clone(), photographs(&path))).collect()
+}
+
+/// Says which model was taken where there are several, and how many photographs beside those of the model no view uses.
+fn left_out(model: &Path, folder: &Path, views: &[RawView]) -> Vec<String> {
+    let mut out = Vec::new();
+    let models = model.parent().map(models_in).unwrap_or_default();
+    let taken = models.iter().find(|(path, _)| path == model).map(|(_, photographs)| *photographs);
+    if let (Some(taken), 2..) = (taken, models.len()) {
+        let others = models.iter().filter(|(path, _)| path != model);
+        let others: Vec<String> = others.map(|(path, n)| format!("{} with {n}", path.display())).collect();
+        out.push(format!(
+            "the model {} with {taken} photographs is taken, not {}: COLMAP could not link them; to take another, move the rest away",
+            model.display(),
+            others.join(", ")
+        ));
+    }
+    // Pictures of other kinds there are masks and the like.
+    let kind = |path: &Path| path.extension().map(|e| e.to_ascii_lowercase());
+    let used: BTreeSet<&Path> = views.iter().map(|v| v.image_path.as_path()).collect();
+    let folders: BTreeSet<&Path> = used.iter().filter_map(|path| path.parent()).collect();
+    let kinds: BTreeSet<_> = used.iter().map(|path| kind(path)).collect();
+    let files = folders.into_iter().flat_map(|f| super::list(f).unwrap_or_default());
+    let unused = files.filter(|f| f.is_file() && kinds.contains(&kind(f)) && !used.contains(f.as_path())).count();
+    if unused > 0 {
+        let all = unused + used.len();
+        out.push(format!(
+            "{unused} of {all} photographs in {} are in no view: the model does not have them",
+            folder.display()
+        ));
+    }
+    out
 }
 
 /// A file of a model: `.bin` where there is one, else `.txt`.
@@ -76,7 +125,7 @@ pub(crate) fn load(root: &Path, model: &Path) -> Result<RawDataset> {
         check_inside(&name, "images").map_err(|e| e.file(model))?;
         let mut image_path = folder.join(&name);
         if !image_path.is_file()
-            && let Some(other) = other_case(&folder, &name)
+            && let Some(other) = other_name(&folder, &name)
         {
             image_path = folder.join(other);
         }
@@ -94,6 +143,7 @@ pub(crate) fn load(root: &Path, model: &Path) -> Result<RawDataset> {
             warnings.push(format!("{}: no such photograph, view skipped", image_path.display()));
         }
     }
+    warnings.extend(left_out(model, &folder, &views));
     warnings.extend(distorted(model, &views));
     Ok(RawDataset { format: Format::Colmap, files, views, points, warnings })
 }

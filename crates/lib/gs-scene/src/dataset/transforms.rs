@@ -1,7 +1,7 @@
 //! `transforms.json` of nerfstudio, instant-ngp and Blender; OpenGaussian's conversion of ScanNet is one of these.
 
 use super::depth::{Depth, DepthCamera, MILLIMETRES};
-use super::{Format, RawDataset, RawView, Split, check_inside, invert_pose, other_case, read_text};
+use super::{Format, RawDataset, RawView, Split, check_inside, invert_pose, other_name, read_text};
 use crate::lens::{Distortion, Lens};
 use crate::{PointCloud, image, ply};
 use glam::{DMat4, DVec4};
@@ -102,7 +102,7 @@ fn read_frames(root: &Path, json: &Value, split: Option<Split>, out: &mut RawDat
             .iter()
             .map(|e| format!("{given}{e}"))
             .find(|n| root.join(n).is_file())
-            .or_else(|| other_case(root, given));
+            .or_else(|| other_name(root, given));
         let Some(name) = found else {
             out.warnings.push(format!("{}: no such photograph, view skipped", root.join(given).display()));
             continue;

@@ -361,11 +361,12 @@ fn instance_figures(
         return Ok(None);
     };
     let mut truth = instances::read_truth(segs, aggregation, vertices)?;
-    for (t, _) in truth.iter_mut().zip(&matched.counts).filter(|(_, counts)| !**counts) {
-        *t = -1;
-    }
     let label = &scene.instances.label;
-    let predicted: Vec<i32> = matched.gaussian.iter().map(|i| i.map_or(-1, |i| label[i as usize])).collect();
+    let mut predicted: Vec<i32> = matched.gaussian.iter().map(|i| i.map_or(-1, |i| label[i as usize])).collect();
+    // A vertex that leaves does so from both sides: else it makes instances too large.
+    for (v, _) in matched.counts.iter().enumerate().filter(|(_, counts)| !**counts) {
+        (truth[v], predicted[v]) = (-1, -1);
+    }
     Ok(Some(instances::score(&truth, &predicted, &scene.instances.score, instances::MIN_POINTS)))
 }
 

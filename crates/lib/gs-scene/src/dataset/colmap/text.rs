@@ -1,5 +1,6 @@
 //! COLMAP's text model files.
 
+use super::super::without_mark;
 use super::{AGAIN, Registered, intrinsics, pose, push_camera, push_point};
 use crate::PointCloud;
 use crate::lens::Lens;
@@ -8,7 +9,7 @@ use std::collections::BTreeMap;
 
 /// Lines of a text model with their numbers, without comments and, where `keep_empty` is not set, empty lines.
 fn lines(bytes: &[u8], keep_empty: bool) -> Result<impl Iterator<Item = (usize, &str)>> {
-    let text = std::str::from_utf8(bytes).map_err(|_| Error::new("not a text file").hint(AGAIN))?;
+    let text = std::str::from_utf8(without_mark(bytes)).map_err(|_| Error::new("not a text file").hint(AGAIN))?;
     let all = text.lines().map(str::trim).enumerate().map(|(i, l)| (i + 1, l));
     Ok(all.filter(move |(_, l)| !l.starts_with('#') && (keep_empty || !l.is_empty())))
 }
@@ -45,8 +46,8 @@ pub(super) fn cameras(bytes: &[u8]) -> Result<BTreeMap<u32, Lens>> {
 
 /// `images.txt`; which points each image sees is skipped.
 pub(super) fn images(bytes: &[u8]) -> Result<Vec<Registered>> {
-    // Two lines an image; the second lists its points as triples and may be empty.
-    let mut all = lines(bytes, true)?;
+    // Two lines an image; the second lists its points as triples, and may be empty or, where empty lines were dropped, missing.
+    let mut all = lines(bytes, true)?.peekable();
     let mut out = Vec::new();
     while let Some((line, text)) = all.next() {
         if text.is_empty() {
@@ -58,9 +59,8 @@ pub(super) fn images(bytes: &[u8]) -> Result<Vec<Registered>> {
         let (rotation, translation) = pose([v[0], v[1], v[2], v[3]], [v[4], v[5], v[6]], &format!("line {line}"))?;
         let camera = numbers::<u32>(&words[8..], line)?[0];
         out.push(Registered { name: name.to_string(), camera, rotation, translation });
-        if let Some((line, points)) = all.next()
-            && points.split_ascii_whitespace().count() % 3 != 0
-        {
+        let Some((line, points)) = all.next_if(|(_, next)| !is_image(next)) else { continue };
+        if points.split_ascii_whitespace().count() % 3 != 0 {
             return Err(Error::new("not a list of an image's points")
                 .field(format!("line {line}"))
                 .expected("triples x y id, or an empty line, after each image")
@@ -68,6 +68,11 @@ pub(super) fn images(bytes: &[u8]) -> Result<Vec<Registered>> {
         }
     }
     Ok(out)
+}
+
+/// Whether a line is of an image and no list of points: these have nothing but numbers.
+fn is_image(line: &str) -> bool {
+    head::<9>(line).is_some() && line.split_ascii_whitespace().any(|w| w.parse::<f64>().is_err())
 }
 
 /// The first words of a line and what follows them, which may hold blanks; none where either is missing.
