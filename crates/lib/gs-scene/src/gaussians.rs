@@ -91,8 +91,8 @@ impl Gaussians {
     }
 
     /// The properties among which Gaussian `i` has a number that cannot be used, if it has one: all must be finite, but that an
-    /// opacity logit may be infinite.
-    pub fn damage(&self, i: usize) -> Option<&'static str> {
+    /// opacity logit may be infinite, and the rotation must have a length. With it what is wrong there, in words.
+    pub fn damage(&self, i: usize) -> Option<(&'static str, &'static str)> {
         let groups = [
             ("x, y, z", &self.means[i][..]),
             ("scale_*", &self.log_scales[i]),
@@ -100,7 +100,10 @@ impl Gaussians {
             ("f_dc_* or f_rest_*", self.sh_of(i)),
         ];
         let damaged = groups.iter().find(|(_, values)| !values.iter().all(|v| v.is_finite()));
-        damaged.map(|(name, _)| *name).or(self.opacity_logits[i].is_nan().then_some("opacity"))
+        let damaged = damaged.map(|(name, _)| *name).or(self.opacity_logits[i].is_nan().then_some("opacity"));
+        // Rows of zeros: programs that take no rotation for them make balls of what nobody ever saw.
+        let turned = self.rotations[i].iter().any(|&v| v != 0.0);
+        damaged.map(|name| (name, "is not finite")).or((!turned).then_some(("rot_*", "is a rotation of length 0")))
     }
 
     /// Whether every number of Gaussian `i` can be used.
@@ -110,9 +113,10 @@ impl Gaussians {
 
     /// Checks that every Gaussian is whole.
     pub fn check_whole(&self) -> Result<()> {
-        let Some((first, parameter)) = (0..self.len()).find_map(|i| Some((i, self.damage(i)?))) else { return Ok(()) };
+        let damage = (0..self.len()).find_map(|i| Some((i, self.damage(i)?)));
+        let Some((first, (parameter, is))) = damage else { return Ok(()) };
         let all = (first..self.len()).filter(|&i| !self.is_whole(i)).count();
-        Err(Error::new("a parameter is not finite")
+        Err(Error::new(format!("a parameter {is}"))
             .field(format!("vertex {first}, {parameter}"))
             .found(format!("{all} of {} vertices with such a one", self.len()))
             .hint("remove these vertices, or export the file again"))

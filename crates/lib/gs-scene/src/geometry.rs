@@ -45,10 +45,12 @@ impl Geometry {
             if g.is_empty() {
                 return Ok(Self { gaussians: g, damaged, antialias, left_out });
             }
-            return Err(Error::new("no Gaussian is whole: every one has a number that is not finite")
-                .file(path)
-                .found(g.len())
-                .hint("train the geometry again"));
+            return Err(Error::new(
+                "no Gaussian is whole: every one has a number that is not finite, or a rotation of length 0",
+            )
+            .file(path)
+            .found(g.len())
+            .hint("train the geometry again"));
         };
         let place = g.means[first];
         for i in damaged.iter().map(|&i| i as usize) {
@@ -67,7 +69,7 @@ impl Geometry {
     pub fn damage(&self) -> Option<String> {
         let damaged = self.damaged.first().map(|first| {
             let (damaged, all) = (self.damaged.len(), self.gaussians.len());
-            format!("{damaged} of {all} Gaussians: damaged, a parameter is not finite (the first is vertex {first})")
+            format!("{damaged} of {all} Gaussians: damaged, a parameter is not finite or a rotation has length 0 (the first is vertex {first})")
         });
         let left_out = self.left_out.iter().map(|what| format!("not read: {what}"));
         let said: Vec<String> = damaged.into_iter().chain(left_out).collect();
@@ -110,7 +112,7 @@ mod tests {
         let mut g = sample();
         g.means[0][1] = f32::NAN;
         g.log_scales[2][0] = f32::INFINITY;
-        g.rotations[3][3] = f32::NAN;
+        g.rotations[3] = [0.0; 4];
         g.opacity_logits[4] = f32::NAN;
         g.opacity_logits[5] = f32::INFINITY;
         g.sh[6 * 12 + 11] = f32::NEG_INFINITY;

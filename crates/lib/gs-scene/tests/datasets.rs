@@ -659,11 +659,17 @@ fn names_written_in_another_way_are_found() {
     fs::remove_dir_all(root.join("sparse")).unwrap();
     let frames: Vec<_> = named
         .iter()
-        .map(|(name, _)| json!({"file_path": format!("images\\{name}"), "transform_matrix": opengl(c)}))
+        .map(|(name, _)| {
+            let name = format!("images\\{name}");
+            json!({"file_path": name, "mask_path": "masks/a.png", "transform_matrix": opengl(c)})
+        })
         .collect();
     let json = json!({"w": 20, "h": 16, "fl_x": c.fx, "fl_y": c.fy, "cx": c.cx, "cy": c.cy, "frames": frames});
     write(&root.join("transforms.json"), &format!("\u{feff}{json}"));
-    assert_eq!(dataset::load(root, &FULL).unwrap().views.len(), 3);
+    let d = dataset::load(root, &FULL).unwrap();
+    // Masks of the frames are not read, which is said once.
+    assert_eq!((d.views.len(), d.warnings.len()), (3, 1));
+    assert!(d.warnings[0].contains("mask_path") && d.warnings[0].contains("--masks"), "{:?}", d.warnings);
 }
 
 #[test]

@@ -96,6 +96,14 @@ fn read_frames(root: &Path, json: &Value, split: Option<Split>, out: &mut RawDat
             Error::new("the frame names no photograph").field(field).found(brief(&frame["file_path"])).hint(AGAIN)
         })?;
         check_inside(path, &format!("{field}.file_path"))?;
+        if let (Some(mask), true) = (frame["mask_path"].as_str(), out.warnings.iter().all(|w| !w.contains("mask_path")))
+        {
+            let folder = Path::new(mask).parent().map_or(root.to_path_buf(), |folder| root.join(folder));
+            out.warnings.push(format!(
+                "mask_path of the frames is not read: give gs-geom train --masks {}, or what the masks hide is learnt",
+                folder.display()
+            ));
+        }
         let given = path.trim_start_matches("./");
         // Blender leaves the extension out.
         let found = ["", ".png", ".jpg", ".jpeg", ".PNG", ".JPG", ".JPEG"]
