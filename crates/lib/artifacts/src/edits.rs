@@ -72,6 +72,8 @@ struct File {
 
 /// Most bytes of a name.
 const LONGEST_NAME: usize = 100;
+/// Most edits of a list: more than a person makes, and few enough for every instance that splitting adds.
+const MOST_EDITS: usize = 10_000;
 
 impl Edits {
     /// Format name in the file.
@@ -115,7 +117,7 @@ impl Edits {
     /// Changes the instances, whose Gaussians have these centres (`[N][3]`), and tells the rest.
     ///
     /// *Merge*: the descriptor is the mean of theirs weighted by support, at unit length; the support is the number of different
-    /// views with a match; the score is their best; edges of the tree name the first. *Split*: the part with most of the
+    /// views with a match; a mask that showed several of them is one match; the score is their best; edges of the tree name the first. *Split*: the part with most of the
     /// instance's Gaussians (ties: the first) keeps its id, with what lies in no part; the others are K, K + 1, ... in the order of
     /// the parts. They have descriptor, support, score and matches of the whole; a part without a Gaussian has none of these. The
     /// edges of the tree name the parts. Count, centroid and boxes are measured again. Either leaves no granules.
@@ -127,6 +129,10 @@ impl Edits {
         let n = instances.label.len();
         if means.len() != n {
             return Err(Error::new("not a label per Gaussian").field("label").found(n).expected(means.len()));
+        }
+        if self.edits.len() > MOST_EDITS {
+            let e = Error::new("too many edits").field("edits").found(self.edits.len());
+            return Err(e.expected(format!("at most {MOST_EDITS}")));
         }
         let (mut remarks, mut changed) = (Remarks::default(), BTreeSet::new());
         for (at, edit) in self.edits.iter().enumerate() {
@@ -222,7 +228,10 @@ fn merge(instances: &mut Instances, ids: &[u32]) -> Result<()> {
     let labels = instances.label.iter_mut().chain(instances.tree.iter_mut().map(|e| &mut e.instance));
     labels.filter(|l| merged(**l)).for_each(|l| *l = first as i32);
     instances.matches.iter_mut().filter(|m| all.contains(&m.instance)).for_each(|m| m.instance = first);
-    instances.matches.sort_by_key(|m| (m.instance, m.view));
+    // A mask that showed several of them is one match: else splitting and merging again would double all, again and again.
+    let of = |m: &Match| (m.instance, m.view, m.mask);
+    instances.matches.sort_by(|a, b| of(a).cmp(&of(b)).then(b.score.total_cmp(&a.score)));
+    instances.matches.dedup_by_key(|m| of(m));
 
     let mut sum = vec![0.0; instances.dim()];
     for &id in ids {
@@ -369,13 +378,24 @@ mod tests {
         assert!((d[0] - 3.0 / ten).abs() < 1e-6 && (d[1] - 1.0 / ten).abs() < 1e-6, "weighted by support: {d:?}");
         assert_eq!(
             i.matches.iter().map(|m| (m.instance, m.view)).collect::<Vec<_>>(),
-            [(1, 0), (1, 1), (1, 1), (1, 2)]
+            [(1, 0), (1, 1), (1, 2)],
+            "the mask that showed both is one match"
         );
         assert_eq!(i.tree.iter().map(|e| e.instance).collect::<Vec<_>>(), [1, 1, -1, -1]);
         assert_eq!(remarks.names, BTreeMap::from([(1, "mug".to_string())]), "what is gone has no name");
         // Its pieces are its parts now: it can be taken apart again.
         let (i, _) = applied(vec![Edit::Merge { instances: vec![1, 0] }, Edit::Split { instance: 1 }]).unwrap();
         assert_eq!(i.label, [1, 1, 1, 1, 1, 1, 2, 2, -1]);
+    }
+
+    #[test]
+    fn splitting_and_merging_again_and_again_adds_no_matches() {
+        let before = example().0.matches.len();
+        let again = |k: u32| [Edit::Split { instance: 0 }, Edit::Merge { instances: vec![0, 2 + k] }];
+        let (i, _) = applied((0..40).flat_map(again).collect()).unwrap();
+        assert_eq!((i.matches.len(), i.count[0]), (before, 6));
+        let many = vec![rename(0, "pot"); MOST_EDITS + 1];
+        assert!(applied(many).unwrap_err().to_string().contains("too many edits"));
     }
 
     #[test]

@@ -485,11 +485,11 @@ fn errors_name_file_field_found_and_expected() {
         file
     }
     type Spoil = fn(Vec<u8>) -> Vec<u8>;
-    let cases: [(&str, Spoil, &str); 17] = [
+    let cases: [(&str, Spoil, &str); 18] = [
         (
             "cameras.bin",
             |b| put(b, 0, u64::MAX.to_le_bytes()),
-            "cameras.bin: camera count: the count does not fit the file's length; found 18446744073709551615, expected at most 1",
+            "cameras.bin: camera count: the count does not fit the file's length; found 18446744073709551615, expected at most 2",
         ),
         (
             "cameras.bin",
@@ -497,9 +497,11 @@ fn errors_name_file_field_found_and_expected() {
             "cameras.bin: camera count: the count does not fit the file's length",
         ),
         ("cameras.bin", |_| vec![0; 8], "cameras.bin: camera count: the model has no camera"),
-        ("cameras.bin", |b| put(b, 12, [99, 0, 0, 0]), "cameras.bin: camera 0: unknown camera model; found model 99"),
-        ("cameras.bin", |b| put(b, 12, [5, 0, 0, 0]), "cameras.bin: camera 0: the file is cut short"),
-        ("cameras.bin", |b| put(b, 16, [0; 8]), "cameras.bin: camera 0: impossible image size; found 0x16"),
+        // COLMAP 4's panoramic lens has no parameters but a size.
+        ("cameras.bin", |b| put(b, 12, [17, 0, 0, 0])[..48].to_vec(), "unknown camera model; found model 17"),
+        ("cameras.bin", |b| put(b, 12, [99, 0, 0, 0]), "cameras.bin: camera 1: unknown camera model; found model 99"),
+        ("cameras.bin", |b| put(b, 12, [5, 0, 0, 0]), "cameras.bin: camera 1: the file is cut short"),
+        ("cameras.bin", |b| put(b, 16, [0; 8]), "cameras.bin: camera 1: impossible image size; found 0x16"),
         (
             "cameras.bin",
             |b| put(b, 8, [42, 0, 0, 0]),

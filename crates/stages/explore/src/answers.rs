@@ -137,11 +137,19 @@ pub struct Found {
     pub verdict: Option<Verdict>,
 }
 
+/// Characters that a text may have at most. CLIP reads 77 tokens; more only keeps a processor busy.
+const LONGEST_TEXT: usize = 1000;
+
 /// What a text finds.
 ///
 /// # Errors
-/// When a table of text features does not have the text.
+/// When the text is too long, or a table of text features does not have it.
 pub fn find(world: &World, edited: &Edited, text: &str) -> Result<Found> {
+    if let Some(more) = text.chars().count().checked_sub(LONGEST_TEXT + 1) {
+        let e =
+            Error::new("the text is too long").field("text").found(format!("{} characters", LONGEST_TEXT + 1 + more));
+        return Err(e.expected(format!("at most {LONGEST_TEXT}")));
+    }
     let wanted = text.trim().to_lowercase();
     let named: Vec<u32> = edited
         .remarks

@@ -167,6 +167,8 @@ async fn guard(State(shared): Held, request: Request, next: Next) -> Response {
     let headers = response.headers_mut();
     headers.insert(header::CONTENT_SECURITY_POLICY, HeaderValue::from_static(POLICY));
     headers.insert(header::X_CONTENT_TYPE_OPTIONS, HeaderValue::from_static("nosniff"));
+    // Pictures too: a page of another origin may not show them.
+    headers.insert("cross-origin-resource-policy", HeaderValue::from_static("same-origin"));
     headers.insert(header::REFERRER_POLICY, HeaderValue::from_static("no-referrer"));
     headers.entry(header::CACHE_CONTROL).or_insert(HeaderValue::from_static("no-store"));
     response
@@ -175,15 +177,17 @@ async fn guard(State(shared): Held, request: Request, next: Next) -> Response {
 /// Why a request is refused, if it is.
 fn refusal(headers: &HeaderMap, local: bool) -> Option<&'static str> {
     let text = |name: header::HeaderName| headers.get(name).and_then(|v| v.to_str().ok());
+    let fetch = |what: &str| headers.get(format!("sec-fetch-{what}")).and_then(|v| v.to_str().ok());
     let host = text(header::HOST).unwrap_or_default();
     let name = host.rsplit_once(':').map_or(host, |(name, _)| name);
     if local && !["127.0.0.1", "localhost"].contains(&name) {
         return Some("this server answers at 127.0.0.1 only");
     }
-    match text(header::ORIGIN) {
-        Some(origin) if origin != format!("http://{host}") => Some("a page of another origin may not ask"),
-        _ => None,
-    }
+    // Browsers name no origin for pictures and scripts. A link from elsewhere to the page is a person's own step.
+    let link = fetch("mode") == Some("navigate") && fetch("dest") == Some("document");
+    let elsewhere = fetch("site").is_some_and(|site| !["same-origin", "none"].contains(&site)) && !link;
+    let stranger = text(header::ORIGIN).is_some_and(|origin| origin != format!("http://{host}"));
+    (elsewhere || stranger).then_some("a page of another origin may not ask")
 }
 
 fn typed(kind: &'static str, body: impl IntoResponse) -> Response {
@@ -357,5 +361,15 @@ mod tests {
                 && from("null")
                 && from("https://evil.example")
         );
+        // A picture within a page of another origin, or of another port here, and a frame; a link to the page is well.
+        let fetched = |site: &str, mode: &str, dest: &str| {
+            let fetch =
+                ["site", "mode", "dest"].map(|n| header::HeaderName::try_from(format!("sec-fetch-{n}")).unwrap());
+            let [s, m, d] = fetch;
+            of(&[(host.clone(), "localhost:7007"), (s, site), (m, mode), (d, dest)], true)
+        };
+        assert!(fetched("cross-site", "no-cors", "image") && fetched("same-site", "no-cors", "image"));
+        assert!(fetched("cross-site", "navigate", "iframe") && !fetched("cross-site", "navigate", "document"));
+        assert!(!fetched("same-origin", "cors", "empty") && !fetched("none", "navigate", "document"));
     }
 }

@@ -123,6 +123,7 @@ fn bad_questions_are_refused_and_the_server_goes_on() {
     let server = run.serve(&[]);
     let mut far = click(0, 0, &[]);
     far["camera"]["fx"] = json!(0.0);
+    let long = format!("/find?text={}", "a".repeat(1001));
     for (method, path, body, expected) in [
         ("POST", "/pick", "{", "not understood"),
         ("POST", "/pick", &click(64, 0, &[])["x"].to_string(), "not understood"),
@@ -130,6 +131,7 @@ fn bad_questions_are_refused_and_the_server_goes_on() {
         ("POST", "/pick", &click(0, 0, &[99]).to_string(), "no such cell"),
         ("POST", "/pick", &far.to_string(), "not a camera"),
         ("GET", "/find?text=zebra", "", "no such text in the table"),
+        ("GET", &long, "", "the text is too long; found 1001 characters"),
         ("PUT", "/edits", r#"[{"op": "split", "instance": 0}]"#, "edits[0].instance"),
         ("PUT", "/edits", r#"[{"op": "explode"}]"#, "not understood"),
         ("POST", "/selection", r#"{"cells": []}"#, "nothing is selected"),
@@ -159,7 +161,8 @@ fn bad_questions_are_refused_and_the_server_goes_on() {
             && head.contains("content-security-policy: default-src 'self'")
             && page.starts_with(b"<!doctype html>")
     );
-    for stranger in ["Host: evil.example\r\n", "Origin: http://evil.example\r\n"] {
+    assert!(head.contains("cross-origin-resource-policy: same-origin"), "{head}");
+    for stranger in ["Host: evil.example\r\n", "Origin: http://evil.example\r\n", "Sec-Fetch-Site: cross-site\r\n"] {
         assert_eq!(server.ask("GET", "/scene.json", stranger, "").0, 403, "{stranger}");
     }
     assert_eq!(server.get("/scene.json").0, 200);

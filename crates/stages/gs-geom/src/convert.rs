@@ -21,8 +21,11 @@ impl Convert {
         left_out.iter().for_each(|what| stage.skipped(&format!("not read: {what}")));
         let all = g.len();
         let mut chosen = choose(&g, self.min_opacity, self.crop);
-        let dropped =
-            [(chosen.not_finite, "not finite"), (chosen.cropped, "outside the box"), (chosen.faint, "too faint")];
+        let dropped = [
+            (chosen.damaged, "damaged: not finite, or a rotation of length 0"),
+            (chosen.cropped, "outside the box"),
+            (chosen.faint, "too faint"),
+        ];
         for (n, why) in dropped.iter().filter(|d| d.0 > 0) {
             stage.skipped(&format!("{n} of {all} Gaussians: {why}"));
         }
@@ -51,7 +54,7 @@ impl Convert {
             "gaussians": g.len(),
             "of": all,
             "from": kind,
-            "not_finite": chosen.not_finite,
+            "damaged": chosen.damaged,
             "cropped": chosen.cropped,
             "faint": chosen.faint,
         });
@@ -64,7 +67,7 @@ impl Convert {
 struct Chosen {
     /// Indices, rising.
     kept: Vec<u32>,
-    not_finite: usize,
+    damaged: usize,
     cropped: usize,
     faint: usize,
 }
@@ -74,7 +77,7 @@ fn choose(g: &Gaussians, min_opacity: f32, crop: Option<Bounds>) -> Chosen {
     let mut chosen = Chosen::default();
     for i in 0..g.len() {
         if !g.is_whole(i) {
-            chosen.not_finite += 1;
+            chosen.damaged += 1;
         } else if crop.is_some_and(|b| !b.contains(g.means[i])) {
             chosen.cropped += 1;
         } else if g.opacity(i) < min_opacity {
@@ -110,11 +113,12 @@ mod tests {
     #[test]
     fn each_reason_is_counted_once() {
         let mut g = zeros(5, 0);
+        g.rotations = vec![[1.0, 0.0, 0.0, 0.0]; 5];
         g.means = vec![[0.0; 3], [2.0, 0.0, 0.0], [f32::NAN; 3], [1.0, 1.0, 1.0], [0.5; 3]];
         g.opacity_logits = vec![0.0, -9.0, -9.0, f32::INFINITY, -9.0];
         let crop = Some(Bounds { low: [0.0; 3], high: [1.0; 3] });
         let c = choose(&g, 0.1, crop);
-        assert_eq!(c, Chosen { kept: vec![0, 3], not_finite: 1, cropped: 1, faint: 1 });
+        assert_eq!(c, Chosen { kept: vec![0, 3], damaged: 1, cropped: 1, faint: 1 });
         assert_eq!(choose(&g, 0.0, None).kept, [0, 1, 3, 4]);
     }
 

@@ -209,7 +209,10 @@ fn non_finite(g: &Gaussians) -> NonFinite {
     let count = |bad: &dyn Fn(usize) -> bool| (0..g.len()).filter(|&i| bad(i)).count();
     let any = |values: &[f32]| values.iter().any(|v| !v.is_finite());
     NonFinite {
-        gaussians: count(&|i| !g.is_whole(i)),
+        gaussians: count(&|i| {
+            let rest = [&g.means[i][..], &g.log_scales[i], &g.rotations[i], g.sh_of(i)];
+            g.opacity_logits[i].is_nan() || rest.into_iter().any(any)
+        }),
         means: count(&|i| any(&g.means[i])),
         log_scales: count(&|i| any(&g.log_scales[i])),
         rotations: count(&|i| any(&g.rotations[i])),

@@ -97,7 +97,7 @@ fn a_file_is_trimmed_cropped_pruned_and_ordered() {
         assert_eq!((g.means[i], g.sh_of(i)), (all.means[from], &all.sh_of(from)[..12]));
     }
     let record: Value = serde_json::from_slice(&fs::read(format!("{out}.run.json")).unwrap()).unwrap();
-    assert_eq!((&record["summary"]["not_finite"], &record["summary"]["of"]), (&1.into(), &40.into()));
+    assert_eq!((&record["summary"]["damaged"], &record["summary"]["of"]), (&1.into(), &40.into()));
     assert_eq!(record["skipped"].as_array().unwrap().len(), 3);
 
     // Back to degree 3: the 62 properties of the original code.

@@ -92,18 +92,20 @@ impl<'a> Cursor<'a> {
 /// `cameras.bin`.
 pub(super) fn cameras(bytes: &[u8]) -> Result<BTreeMap<u32, Lens>> {
     let mut c = Cursor::new(bytes);
-    let n = c.count(48, "camera count")?;
+    // A camera has at least its id, model and size: parameters are as many as its model has.
+    let n = c.count(24, "camera count")?;
     let mut out = BTreeMap::new();
     for i in 0..n {
-        let field = format!("camera {i}");
-        let (id, model) = (c.u32(&field)?, c.u32(&field)?);
+        let id = c.u32(&format!("the camera at position {i}"))?;
+        let field = format!("camera {id}");
+        let model = c.u32(&field)?;
         let (w, h) = (c.u64(&field)?, c.u64(&field)?);
         let Some(&(name, count)) = MODELS.get(model as usize) else {
             return Err(Error::new("unknown camera model")
                 .field(field)
                 .found(format!("model {model}"))
-                .expected("0 to 10")
-                .hint("run COLMAP's image_undistorter, or export the model again"));
+                .expected("0 to 10; those of newer versions are wide-angle or panoramic lenses (EQUIRECTANGULAR)")
+                .hint("run COLMAP's image_undistorter, or reconstruct with the model PINHOLE or OPENCV"));
         };
         let p = (0..count).map(|_| c.f64(&field)).collect::<Result<Vec<_>>>()?;
         push_camera(&mut out, id, intrinsics(name, w, h, &p, &field)?, &field)?;
