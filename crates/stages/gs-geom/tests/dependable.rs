@@ -181,7 +181,7 @@ fn gaussians_that_break_arithmetic_leave_every_parameter_finite() {
         ("on the camera plane", |g, i| g.means[i] = [3.0 + 0.01 * (i % 3) as f32, i as f32 * 0.1, 0.5]),
         ("in the camera", |g, i| g.means[i] = [3.0, 0.0, 0.5]),
         ("far away", |g, i| g.means[i] = [1e6, -1e6, 1e6 + i as f32]),
-        ("zero quaternions", |g, i| g.rotations[i] = [0.0; 4]),
+        ("tiny quaternions", |g, i| g.rotations[i] = [1e-30; 4]),
         ("large quaternions", |g, i| g.rotations[i] = [1e18, -1e18, 1e18, 0.0]),
         ("small quaternions", |g, i| g.rotations[i] = [1e-20, 0.0, 1e-20, 0.0]),
         ("glaring", |g, i| g.sh[3 * i..3 * i + 3].fill(1e30)),
