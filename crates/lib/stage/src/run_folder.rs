@@ -45,7 +45,7 @@ const INPUTS: [Input; 9] = [
     Input { id: "masks", place: Place::Recorded(Some("masks")), always: false },
     Input { id: "graph", place: Place::Folder("graph.safetensors"), always: false },
     Input { id: "footprints", place: Place::Folder("footprints.safetensors"), always: false },
-    Input { id: "features", place: Place::Folder("features.safetensors"), always: true },
+    Input { id: "features", place: Place::Folder("features.safetensors"), always: false },
     Input { id: "instances", place: Place::Folder("instances.safetensors"), always: true },
     Input { id: "clip", place: Place::Recorded(None), always: true },
     Input { id: "text_features", place: Place::Recorded(None), always: true },
@@ -110,7 +110,7 @@ impl Asked<'_> {
         let (mut options, mut known) = (Vec::new(), Vec::new());
         for input in INPUTS {
             let Some(arg) = self.arg(input.id).filter(|_| !self.outputs.contains(&input.id)) else { continue };
-            let wanted = arg.is_required_set() || input.always;
+            let wanted = arg.is_required_set() || input.always || (input.id == "features" && self.clusters_features());
             // A text is asked of one of both.
             let other = input.id == "text_features" && known.contains(&"clip");
             known.push(input.id);
@@ -141,6 +141,12 @@ impl Asked<'_> {
             }
         }
         Ok(options)
+    }
+
+    /// Whether `--cluster` says that features are clustered, which then are required.
+    fn clusters_features(&self) -> bool {
+        let mut space = self.matches.try_get_raw("cluster").ok().flatten().into_iter().flatten();
+        space.next().is_some_and(|space| space != "masks")
     }
 
     fn arg(&self, id: &str) -> Option<&Arg> {
