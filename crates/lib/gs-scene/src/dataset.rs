@@ -221,7 +221,7 @@ fn read(path: &Path) -> Result<RawDataset> {
             .file(path)
             .hint("give the folder of a COLMAP, transforms.json, ScanNet or 7-Scenes scene"));
     } else if let Some(model) = colmap::find_model(path) {
-        colmap::load(path, &model)?
+        colmap::load(path, model)?
     } else if let Some(files) = transforms::find(path) {
         transforms::load(path, &files)?
     } else if scannet::is_scannet(path) {
@@ -307,23 +307,27 @@ impl Dataset {
 /// The file that a name means which is written otherwise: `a.JPG` for `a.jpg`, for cameras and copying programs differ in that;
 /// `images/a.png` for Windows' `images\\a.png`; letters with accents in one piece or in two, as macOS has them.
 fn other_name(folder: &Path, name: &str) -> Option<String> {
-    let name = name.replace('\\', "/");
-    let there = |n: &String| folder.join(n).is_file();
-    if there(&name) {
-        return Some(name);
-    }
-    let (bare, extension) = name.rsplit_once('.')?;
-    let other = [extension.to_ascii_lowercase(), extension.to_ascii_uppercase()];
-    other.iter().map(|e| format!("{bare}.{e}")).find(there).or_else(|| {
-        let forms = [name.nfc().collect::<String>(), name.nfd().collect()];
-        forms.into_iter().find(there)
-    })
+    let name = with_slashes(name);
+    let forms = [name.clone(), name.nfc().collect(), name.nfd().collect()];
+    let cases = |form: String| match form.rsplit_once('.') {
+        Some((bare, extension)) => {
+            let [low, high] = [extension.to_ascii_lowercase(), extension.to_ascii_uppercase()];
+            vec![format!("{bare}.{low}"), format!("{bare}.{high}"), form]
+        }
+        None => vec![form],
+    };
+    forms.into_iter().flat_map(cases).find(|n| folder.join(n).is_file())
+}
+
+/// A path as other systems than Windows write it.
+fn with_slashes(path: &str) -> String {
+    path.replace('\\', "/")
 }
 
 /// Refuses a name inside a file that leads out of the dataset's folder.
 pub(crate) fn check_inside(name: &str, field: &str) -> Result<()> {
     let inside = |c: Component| matches!(c, Component::Normal(_) | Component::CurDir);
-    if !name.is_empty() && Path::new(name).components().all(inside) {
+    if !name.is_empty() && Path::new(&with_slashes(name)).components().all(inside) {
         return Ok(());
     }
     Err(Error::new("the photograph's name leads out of the dataset")
@@ -359,14 +363,13 @@ fn invert_pose(world_from_camera: DMat4, field: &str) -> Result<Option<(DMat3, D
 
 fn read_text(path: &Path) -> Result<String> {
     let bytes = std::fs::read(path).at("read", path)?;
-    let bytes = without_mark(&bytes).to_vec();
-    String::from_utf8(bytes).map_err(|_| Error::new("not a text file").file(path).hint("copy or export it again"))
+    let text = String::from_utf8(bytes);
+    let text = text.map_err(|_| Error::new("not a text file").file(path).hint("copy or export it again"))?;
+    Ok(if text.starts_with(MARK) { text[MARK.len_utf8()..].into() } else { text })
 }
 
-/// Text without the byte order mark that Windows' editors put before it.
-fn without_mark(bytes: &[u8]) -> &[u8] {
-    bytes.strip_prefix(b"\xEF\xBB\xBF").unwrap_or(bytes)
-}
+/// The byte order mark that Windows' editors put before a text.
+const MARK: char = '\u{feff}';
 
 /// Paths in a folder, sorted.
 fn list(folder: &Path) -> Result<Vec<PathBuf>> {

@@ -740,6 +740,7 @@ fn bad_transforms_are_refused() {
             "frames[0].file_path: the photograph's name leads out of the dataset",
         ),
         ("frame.file_path", json!("/etc/a.png"), "leads out of the dataset"),
+        ("frame.file_path", json!("..\\..\\etc\\a.png"), "leads out of the dataset"),
         ("frame.transform_matrix", json!([[1, 2], [3, 4]]), "frames[0].transform_matrix: not a 4x4 matrix"),
         ("frame.transform_matrix", mirrored, "frames[0].transform_matrix: the pose is not a rotation"),
         ("frame.transform_matrix", json!([[0, 0, 0, 0], [0, 0, 0, 0], [0, 0, 0, 0]]), "the pose is not a rotation"),

@@ -25,61 +25,59 @@ struct Registered {
 
 const AGAIN: &str = "export the COLMAP model again";
 
-/// The folder that holds a sparse model within a scene, if any: of the models `sparse/0`, `sparse/1`, ... that with most photographs, else
-/// `sparse`, one of `colmap/sparse/0`, ..., or the folder itself.
-pub(crate) fn find_model(scene: &Path) -> Option<PathBuf> {
-    let largest = |folder: &str| {
-        let models = models_in(&scene.join(folder)).into_iter();
-        // Of equals the first.
-        models.rev().max_by_key(|(_, photographs)| *photographs).map(|(model, _)| model)
+/// A sparse model of a scene.
+pub(crate) struct Model {
+    folder: PathBuf,
+    /// What to say where it was chosen among several.
+    chosen: Option<String>,
+}
+
+/// The sparse model within a scene, if any: of `sparse/0`, `sparse/1`, ... the one with most photographs, else `sparse`, one of
+/// `colmap/sparse/0`, ..., or the folder itself.
+pub(crate) fn find_model(scene: &Path) -> Option<Model> {
+    let own = |folder: &str| {
+        let folder = Some(scene.join(folder)).filter(|f| file_of(f, "cameras").is_some())?;
+        Some(Model { folder, chosen: None })
     };
-    let own = |folder: &str| Some(scene.join(folder)).filter(|p| file_of(p, "cameras").is_some());
+    let largest = |folder: &str| largest_model(&scene.join(folder));
     largest("sparse").or_else(|| own("sparse")).or_else(|| largest("colmap/sparse")).or_else(|| own("."))
 }
 
-/// COLMAP writes a model for each group of photographs that it can link, in folders with numbers for names: these, ascending, and the
-/// photographs of each. A model that can't be read has none.
-fn models_in(folder: &Path) -> Vec<(PathBuf, usize)> {
+/// COLMAP writes a model for each group of photographs that it can link, in folders with numbers for names: of these the one with most
+/// photographs, of equals the first. A model that can't be read has none.
+fn largest_model(folder: &Path) -> Option<Model> {
     let entries = std::fs::read_dir(folder).into_iter().flatten().flatten();
     let numbered = entries.filter_map(|e| Some((e.file_name().to_str()?.parse::<u32>().ok()?, e.path())));
     let mut models: Vec<_> = numbered.filter(|(_, path)| file_of(path, "cameras").is_some()).collect();
     models.sort();
-    if let [(_, only)] = &models[..] {
-        return vec![(only.clone(), 0)];
+    if models.len() < 2 {
+        return models.pop().map(|(_, folder)| Model { folder, chosen: None });
     }
     let photographs = |path: &Path| part(path, "images", binary::images, text::images).map_or(0, |(_, all)| all.len());
-    models.into_iter().map(|(_, path)| (path.clone(), photographs(&path))).collect()
+    let counts: Vec<usize> = models.iter().map(|(_, path)| photographs(path)).collect();
+    let best = (0..models.len()).rev().max_by_key(|&k| counts[k])?;
+    let said = |k: usize| format!("{} with {}", models[k].1.display(), counts[k]);
+    let others: Vec<String> = (0..models.len()).filter(|&k| k != best).map(said).collect();
+    let chosen = format!(
+        "the model {} photographs is taken, not {}: COLMAP could not link them; to take another, move the rest away",
+        said(best),
+        others.join(", ")
+    );
+    Some(Model { folder: models.swap_remove(best).1, chosen: Some(chosen) })
 }
 
-/// Says which model was taken where there are several, and how many photographs beside those of the model no view uses.
-fn left_out(model: &Path, folder: &Path, views: &[RawView]) -> Vec<String> {
-    let mut out = Vec::new();
-    let models = model.parent().map(models_in).unwrap_or_default();
-    let taken = models.iter().find(|(path, _)| path == model).map(|(_, photographs)| *photographs);
-    if let (Some(taken), 2..) = (taken, models.len()) {
-        let others = models.iter().filter(|(path, _)| path != model);
-        let others: Vec<String> = others.map(|(path, n)| format!("{} with {n}", path.display())).collect();
-        out.push(format!(
-            "the model {} with {taken} photographs is taken, not {}: COLMAP could not link them; to take another, move the rest away",
-            model.display(),
-            others.join(", ")
-        ));
-    }
-    // Pictures of other kinds there are masks and the like.
+/// Says how many photographs beside those of the views no view uses. Pictures of other kinds there are masks and the like.
+fn unused(folder: &Path, views: &[RawView]) -> Option<String> {
     let kind = |path: &Path| path.extension().map(|e| e.to_ascii_lowercase());
     let used: BTreeSet<&Path> = views.iter().map(|v| v.image_path.as_path()).collect();
     let folders: BTreeSet<&Path> = used.iter().filter_map(|path| path.parent()).collect();
     let kinds: BTreeSet<_> = used.iter().map(|path| kind(path)).collect();
     let files = folders.into_iter().flat_map(|f| super::list(f).unwrap_or_default());
-    let unused = files.filter(|f| f.is_file() && kinds.contains(&kind(f)) && !used.contains(f.as_path())).count();
-    if unused > 0 {
-        let all = unused + used.len();
-        out.push(format!(
-            "{unused} of {all} photographs in {} are in no view: the model does not have them",
-            folder.display()
-        ));
-    }
-    out
+    let unused = files.filter(|f| kinds.contains(&kind(f)) && !used.contains(f.as_path()) && f.is_file()).count();
+    let all = unused + used.len();
+    (unused > 0).then(|| {
+        format!("{unused} of {all} photographs in {} are in no view: the model does not have them", folder.display())
+    })
 }
 
 /// A file of a model: `.bin` where there is one, else `.txt`.
@@ -87,9 +85,11 @@ fn file_of(folder: &Path, name: &str) -> Option<PathBuf> {
     ["bin", "txt"].iter().map(|e| folder.join(format!("{name}.{e}"))).find(|p| p.is_file())
 }
 
-/// Loads the model in folder `model` of the scene `root`; photographs lie in `images`, `input`, or the scene itself. Without
+/// Loads a model of the scene `root`; photographs lie in `images`, `input`, or the scene itself. Without
 /// `points3D` there are no points.
-pub(crate) fn load(root: &Path, model: &Path) -> Result<RawDataset> {
+pub(crate) fn load(root: &Path, model: Model) -> Result<RawDataset> {
+    let Model { folder: model, chosen } = model;
+    let model = model.as_path();
     let (cameras_path, cameras) = part(model, "cameras", binary::cameras, text::cameras)?;
     if cameras.is_empty() {
         let e = Error::new("the model has no camera").file(&cameras_path);
@@ -143,7 +143,8 @@ pub(crate) fn load(root: &Path, model: &Path) -> Result<RawDataset> {
             warnings.push(format!("{}: no such photograph, view skipped", image_path.display()));
         }
     }
-    warnings.extend(left_out(model, &folder, &views));
+    warnings.extend(chosen);
+    warnings.extend(unused(&folder, &views));
     warnings.extend(distorted(model, &views));
     Ok(RawDataset { format: Format::Colmap, files, views, points, warnings })
 }

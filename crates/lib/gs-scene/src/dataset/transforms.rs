@@ -89,6 +89,13 @@ fn read_frames(root: &Path, json: &Value, split: Option<Split>, out: &mut RawDat
     let frames = json["frames"]
         .as_array()
         .ok_or_else(|| Error::new("the file has no list of frames").field("frames").hint(AGAIN))?;
+    if let Some(mask) = frames.iter().find_map(|frame| frame["mask_path"].as_str()) {
+        let folder = Path::new(mask).parent().map_or(root.to_path_buf(), |folder| root.join(folder));
+        out.warnings.push(format!(
+            "mask_path of the frames is not read: give gs-geom train --masks {}, or what the masks hide is learnt",
+            folder.display()
+        ));
+    }
     for (i, frame) in frames.iter().enumerate() {
         let field = format!("frames[{i}]");
         let path = frame["file_path"].as_str().ok_or_else(|| {
@@ -96,14 +103,6 @@ fn read_frames(root: &Path, json: &Value, split: Option<Split>, out: &mut RawDat
             Error::new("the frame names no photograph").field(field).found(brief(&frame["file_path"])).hint(AGAIN)
         })?;
         check_inside(path, &format!("{field}.file_path"))?;
-        if let (Some(mask), true) = (frame["mask_path"].as_str(), out.warnings.iter().all(|w| !w.contains("mask_path")))
-        {
-            let folder = Path::new(mask).parent().map_or(root.to_path_buf(), |folder| root.join(folder));
-            out.warnings.push(format!(
-                "mask_path of the frames is not read: give gs-geom train --masks {}, or what the masks hide is learnt",
-                folder.display()
-            ));
-        }
         let given = path.trim_start_matches("./");
         // Blender leaves the extension out.
         let found = ["", ".png", ".jpg", ".jpeg", ".PNG", ".JPG", ".JPEG"]

@@ -1,6 +1,6 @@
 //! COLMAP's text model files.
 
-use super::super::without_mark;
+use super::super::MARK;
 use super::{AGAIN, Registered, intrinsics, pose, push_camera, push_point};
 use crate::PointCloud;
 use crate::lens::Lens;
@@ -9,7 +9,8 @@ use std::collections::BTreeMap;
 
 /// Lines of a text model with their numbers, without comments and, where `keep_empty` is not set, empty lines.
 fn lines(bytes: &[u8], keep_empty: bool) -> Result<impl Iterator<Item = (usize, &str)>> {
-    let text = std::str::from_utf8(without_mark(bytes)).map_err(|_| Error::new("not a text file").hint(AGAIN))?;
+    let text = std::str::from_utf8(bytes).map_err(|_| Error::new("not a text file").hint(AGAIN))?;
+    let text = text.strip_prefix(MARK).unwrap_or(text);
     let all = text.lines().map(str::trim).enumerate().map(|(i, l)| (i + 1, l));
     Ok(all.filter(move |(_, l)| !l.starts_with('#') && (keep_empty || !l.is_empty())))
 }
@@ -70,9 +71,9 @@ pub(super) fn images(bytes: &[u8]) -> Result<Vec<Registered>> {
     Ok(out)
 }
 
-/// Whether a line is of an image and no list of points: these have nothing but numbers.
+/// Whether a line is of an image and no list of points, which ends with a number.
 fn is_image(line: &str) -> bool {
-    head::<9>(line).is_some() && line.split_ascii_whitespace().any(|w| w.parse::<f64>().is_err())
+    head::<9>(line).is_some_and(|(_, name)| name.rsplit(' ').next().is_some_and(|end| end.parse::<f64>().is_err()))
 }
 
 /// The first words of a line and what follows them, which may hold blanks; none where either is missing.
