@@ -20,5 +20,5 @@ pub use naming::{Vocabulary, name_instances};
 pub use nearest::{nearest, nearest_of};
 pub use onnx_models::EngineArgs;
 pub use ranking::{Index, Join, Ranked, Selection};
-pub use scene::{LabelledScene, MIN_OPACITY, nearest_solid, read_features};
+pub use scene::{LabelledScene, MIN_OPACITY, check_features, nearest_solid, read_features};
 pub use text::{CLIP_TEMPLATES, LERF_NEGATIVES, TextOptions, TextSource, TextTable};

@@ -116,10 +116,20 @@ pub fn nearest_solid(g: &Gaussians, points: &[[f32; 3]], counts: impl Fn(usize) 
 
 /// Reads the features of some of `gaussians` Gaussians of a geometry.
 pub fn read_features(path: &Path, geometry_hash: &str, gaussians: usize) -> Result<Features> {
-    let (features, artifact) = Features::read(path)?;
-    artifact.expect_input(role::GEOMETRY, geometry_hash)?;
-    if features.kept.last().is_some_and(|&last| last as usize >= gaussians) {
-        return Err(Error::new("index out of range").file(path).field("kept").hint("run feat-train again"));
-    }
+    let (features, file) = Features::read(path)?;
+    check_features(&features, &file, geometry_hash, gaussians)?;
     Ok(features)
+}
+
+/// Checks that features are of this geometry of `gaussians` Gaussians.
+///
+/// # Errors
+/// When they are of another one.
+pub fn check_features(features: &Features, file: &Artifact, geometry_hash: &str, gaussians: usize) -> Result<()> {
+    file.expect_input(role::GEOMETRY, geometry_hash)?;
+    if features.kept.last().is_some_and(|&last| last as usize >= gaussians) {
+        let e = Error::new("index out of range").file(file.path()).field("kept");
+        return Err(e.hint("run feat-train again"));
+    }
+    Ok(())
 }

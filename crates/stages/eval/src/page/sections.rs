@@ -7,12 +7,12 @@ use crate::names::counts;
 use crate::query::show::QueryResults;
 use crate::score::{QueryScore, ThingScore};
 use artifacts::{
-    Health, InstanceNames, Level, MaskFolder, NOISE_COLOR, Naming, ScoredName, SharedMasks, flat, hash_folder,
-    instance_color, maps_path, role,
+    Features, Health, InstanceNames, Level, MaskFolder, NOISE_COLOR, Naming, ScoredName, SharedMasks, flat,
+    hash_folder, instance_color, maps_path, role,
 };
 use gs_io::{Error, IoContext, Result};
 use gs_scene::dataset::{Dataset, Split, View};
-use query::{Verdict, read_features};
+use query::{Verdict, check_features};
 use report::curve;
 use report::feature_colors;
 use report::html::{Figure, Page};
@@ -121,10 +121,17 @@ pub(super) fn id_maps(m: &Material, page: &mut Page, metrics: &mut Metrics) -> R
 pub(super) fn features(m: &Material, page: &mut Page, metrics: &mut Metrics) -> Result<()> {
     let path = m.file("features.safetensors");
     if !path.exists() {
-        metrics.skipped.push("features: the run has no features.safetensors (feat-train makes it)".into());
+        metrics
+            .skipped
+            .push("features: the run has no features.safetensors (the masks do without; FEAT_ARGS makes it)".into());
         return Ok(());
     }
-    let features = read_features(&path, &m.inputs[role::GEOMETRY], m.geometry.gaussians.len())?;
+    let (features, file) = Features::read(&path)?;
+    // A run makes no new ones where nothing reads them: old ones stay.
+    if let Err(e) = check_features(&features, &file, &m.inputs[role::GEOMETRY], m.geometry.gaussians.len()) {
+        metrics.skipped.push(format!("features: {e}"));
+        return Ok(());
+    }
     if features.dim() == 0 || features.kept.is_empty() {
         metrics.skipped.push("features: no Gaussian has one".into());
         return Ok(());
@@ -136,7 +143,7 @@ pub(super) fn features(m: &Material, page: &mut Page, metrics: &mut Metrics) -> 
     page.section("features", "Features");
     page.paragraph(&format!(
         "The feature of every Gaussian, of dimension {}, as a colour: the three leading principal components are red, green \
-         and blue. Gaussians of one colour are one thing to the clustering.",
+         and blue.",
         features.dim()
     ));
     let colored = |s: &Shown| figure(&render_colors(m, &colors, s.view), 3, s.view.stem().to_string());
