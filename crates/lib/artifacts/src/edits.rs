@@ -117,8 +117,8 @@ impl Edits {
     /// Changes the instances, whose Gaussians have these centres (`[N][3]`), and tells the rest.
     ///
     /// *Merge*: the descriptor is the mean of theirs weighted by support, at unit length; the support is the number of different
-    /// views with a match; a mask that showed several of them is one match; the score is their best; edges of the tree name the first. *Split*: the part with most of the
-    /// instance's Gaussians (ties: the first) keeps its id, with what lies in no part; the others are K, K + 1, ... in the order of
+    /// views with a match; a mask that showed several of them is one match; the score is their best; edges of the tree name the
+    /// first. *Split*: the part with most of the instance's Gaussians (ties: the first) keeps its id, with what lies in no part; the others are K, K + 1, ... in the order of
     /// the parts. They have descriptor, support, score and matches of the whole; a part without a Gaussian has none of these. The
     /// edges of the tree name the parts. Count, centroid and boxes are measured again. Either leaves no granules.
     ///

@@ -90,23 +90,27 @@ impl Gaussians {
         [0, 1, 2].map(|c| 0.5 + SH_C0 * sh[c])
     }
 
-    /// The properties among which Gaussian `i` has a number that cannot be used, if it has one: all must be finite, but that an
-    /// opacity logit may be infinite, and the rotation must have a length. With it what is wrong there, in words.
-    pub fn damage(&self, i: usize) -> Option<(&'static str, &'static str)> {
+    /// The properties among which Gaussian `i` has a number that is not finite, if it has one; an opacity logit may be infinite.
+    pub fn not_finite(&self, i: usize) -> Option<&'static str> {
         let groups = [
             ("x, y, z", &self.means[i][..]),
             ("scale_*", &self.log_scales[i]),
             ("rot_*", &self.rotations[i]),
             ("f_dc_* or f_rest_*", self.sh_of(i)),
         ];
-        let damaged = groups.iter().find(|(_, values)| !values.iter().all(|v| v.is_finite()));
-        let damaged = damaged.map(|(name, _)| *name).or(self.opacity_logits[i].is_nan().then_some("opacity"));
-        // Rows of zeros: programs that take no rotation for them make balls of what nobody ever saw.
-        let turned = self.rotations[i].iter().any(|&v| v != 0.0);
-        damaged.map(|name| (name, "is not finite")).or((!turned).then_some(("rot_*", "is a rotation of length 0")))
+        let found = groups.iter().find(|(_, values)| !values.iter().all(|v| v.is_finite()));
+        found.map(|(name, _)| *name).or(self.opacity_logits[i].is_nan().then_some("opacity"))
     }
 
-    /// Whether every number of Gaussian `i` can be used.
+    /// The properties of Gaussian `i` that cannot be used, and why, in words: a number is not finite, or the rotation has length 0. Programs
+    /// that take no rotation for that make balls of what nobody ever saw.
+    fn damage(&self, i: usize) -> Option<(&'static str, &'static str)> {
+        let turned = self.rotations[i].iter().any(|&v| v != 0.0);
+        let not_finite = self.not_finite(i).map(|name| (name, "is not finite"));
+        not_finite.or((!turned).then_some(("rot_*", "is a rotation of length 0")))
+    }
+
+    /// Whether Gaussian `i` can be used: its numbers are finite, but for the opacity logit, and its rotation has a length.
     pub fn is_whole(&self, i: usize) -> bool {
         self.damage(i).is_none()
     }
@@ -124,7 +128,7 @@ impl Gaussians {
 
     /// Whether every number of Gaussian `i` is finite.
     pub fn is_finite(&self, i: usize) -> bool {
-        self.is_whole(i) && self.opacity_logits[i].is_finite()
+        self.not_finite(i).is_none() && self.opacity_logits[i].is_finite()
     }
 
     /// Makes infinite opacity logits +-50, which is as opaque and as transparent as single precision tells.

@@ -31,11 +31,6 @@ impl Inputs {
         let geometry_hash = hash_file(&a.geometry)?;
         let (graph, graph_file) = Graph::read(&a.graph)?;
         let footprints = Footprints::read(&a.footprints)?;
-        let path = a.features.as_ref().filter(|_| a.settings.cluster != Space::Masks);
-        if path.is_none() && a.features.is_some() {
-            stage.skipped("--features: clustering by the masks does not read them");
-        }
-        let features = path.map(Features::read).transpose()?;
         let masks = hash_folder(&a.masks, "_s.npy")?;
         let dataset = dataset::load(&a.scene, &LoadOptions { resolution: Resolution::Divisor(1.0), holdout: 0 })?;
         dataset.warnings.iter().for_each(|w| stage.warn(w));
@@ -46,16 +41,20 @@ impl Inputs {
         graph_file.expect_input(role::DATASET, &dataset_hash)?;
         footprints.artifact().expect_input(role::DATASET, &dataset_hash)?;
         check_kept(a, &graph, &footprints, geometry.gaussians.len())?;
-        let mut features_hash = None;
-        let features = match (features, path) {
-            (Some((features, file)), Some(path)) => {
+        let (features, features_file) = match &a.features {
+            Some(path) if a.settings.cluster != Space::Masks => {
+                let (features, file) = Features::read(path)?;
                 file.expect_input(role::GRAPH, graph_file.hash())?;
                 file.expect_input(role::FOOTPRINTS, footprints.artifact().hash())?;
                 check_features(path, &features, &graph)?;
-                features_hash = Some((role::FEATURES.into(), file.hash().into()));
-                features
+                (features, Some(file))
             }
-            _ => Features::alike(&graph.kept),
+            given => {
+                if given.is_some() {
+                    stage.skipped("--features: clustering by the masks does not read them");
+                }
+                (Features::alike(&graph.kept), None)
+            }
         };
         let views = matched_views(a, &dataset, &footprints, stage)?;
         let mut hashes = BTreeMap::from([
@@ -65,7 +64,7 @@ impl Inputs {
             (role::FOOTPRINTS.into(), footprints.artifact().hash().into()),
             (role::MASK_FEATURES.into(), hash_folder(&a.masks, "_f.npy")?),
         ]);
-        hashes.extend(features_hash);
+        hashes.extend(features_file.map(|file| (role::FEATURES.into(), file.hash().into())));
         hashes.extend(clip_of_features(&a.masks, &masks)?);
         hashes.insert(role::MASKS.into(), masks);
         Ok(Self { geometry, graph, footprints, features, views, hashes })

@@ -145,9 +145,9 @@ const LONGEST_TEXT: usize = 1000;
 /// # Errors
 /// When the text is too long, or a table of text features does not have it.
 pub fn find(world: &World, edited: &Edited, text: &str) -> Result<Found> {
-    if let Some(more) = text.chars().count().checked_sub(LONGEST_TEXT + 1) {
-        let e =
-            Error::new("the text is too long").field("text").found(format!("{} characters", LONGEST_TEXT + 1 + more));
+    let length = text.chars().count();
+    if length > LONGEST_TEXT {
+        let e = Error::new("the text is too long").field("text").found(format!("{length} characters"));
         return Err(e.expected(format!("at most {LONGEST_TEXT}")));
     }
     let wanted = text.trim().to_lowercase();

@@ -209,10 +209,7 @@ fn non_finite(g: &Gaussians) -> NonFinite {
     let count = |bad: &dyn Fn(usize) -> bool| (0..g.len()).filter(|&i| bad(i)).count();
     let any = |values: &[f32]| values.iter().any(|v| !v.is_finite());
     NonFinite {
-        gaussians: count(&|i| {
-            let rest = [&g.means[i][..], &g.log_scales[i], &g.rotations[i], g.sh_of(i)];
-            g.opacity_logits[i].is_nan() || rest.into_iter().any(any)
-        }),
+        gaussians: count(&|i| g.not_finite(i).is_some()),
         means: count(&|i| any(&g.means[i])),
         log_scales: count(&|i| any(&g.log_scales[i])),
         rotations: count(&|i| any(&g.rotations[i])),

@@ -253,6 +253,10 @@ fn damaged_gaussians_are_skipped_as_in_every_stage() {
     let out = dir.path("g.ply");
     let said = refused(&training(scene(), &out, "160", &["--init", &damaged]));
     assert!(said.contains("vertex 7, x, y, z: a parameter is not finite"), "{said}");
+    (g.means[7], g.rotations[7]) = ([0.0; 3], [0.0; 4]);
+    ply::write_gaussians(&damaged, &g, &[]).unwrap();
+    let said = refused(&training(scene(), &out, "160", &["--init", &damaged]));
+    assert!(said.contains("vertex 7, rot_*: a parameter is a rotation of length 0"), "{said}");
     g.means.fill([f32::NAN; 3]);
     ply::write_gaussians(&damaged, &g, &[]).unwrap();
     let e = refused(&["eval", "--scene", scene(), "--geometry", &damaged, "--out", &out]);

@@ -38,7 +38,7 @@ impl Made {
             return made;
         };
         let given = |option: &str| files(&record.arguments, option, scene.path());
-        if given("--features").is_empty() {
+        if made.clustering.as_deref() == Some("masks") {
             made.method = Some("no training".into());
         }
         if let Some(trained) = given("--features").iter().find_map(|path| trained(path, provenance)) {
