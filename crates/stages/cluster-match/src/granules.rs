@@ -64,6 +64,9 @@ pub(crate) struct Shown {
     seen: f64,
 }
 
+/// A granule, and its mask in each view that shows it.
+pub(crate) type Witnessed = (Granule, Vec<Shown>);
+
 /// Finds what masks of at least `views` views show as one, what they show best and most often first, with these masks; nothing for 0 views.
 /// And how well masks fit each instance, 0 to 1, as [`Granule::fit`]. `labels` and `nodes` are those of the kept Gaussians.
 ///
@@ -75,7 +78,7 @@ pub(crate) fn find(
     nodes: &[i32],
     footprints: &Footprints,
     views: usize,
-) -> Result<(Vec<(Granule, Vec<Shown>)>, Vec<f32>)> {
+) -> Result<(Vec<Witnessed>, Vec<f32>)> {
     let best = best_masks(candidates, labels, nodes, footprints)?;
     let (mut found, mut fits) = (Vec::new(), Vec::new());
     for (&members, mut shown) in candidates.members.iter().zip(best) {
@@ -92,12 +95,12 @@ pub(crate) fn find(
 
 /// The masks that say what each granule means, `most` of each, 0 for all. One that fits twice as well counts four times.
 pub(crate) fn witnesses(
-    granules: &[(Granule, Vec<Shown>)],
+    granules: &[Witnessed],
     footprints: &Footprints,
     most: usize,
     chosen: &mut Witnesses,
 ) -> Vec<Witness> {
-    let of_one = |(of, (_, shown)): (usize, &(Granule, Vec<Shown>))| {
+    let of_one = |(of, (_, shown)): (usize, &Witnessed)| {
         let witness = |s: &Shown| {
             let row = &footprints.rows[s.row as usize];
             (s.fit, Witness { of: of as u32, view: row.view, mask: row.mask, weight: s.fit * s.fit })
@@ -204,9 +207,9 @@ fn judge(members: Members, fit: f32, mut shown: Vec<Shown>, least: usize) -> Opt
 }
 
 /// Leaves out what the same masks show as something before it.
-fn different(found: Vec<(f64, Granule, Vec<Shown>)>) -> Vec<(Granule, Vec<Shown>)> {
+fn different(found: Vec<(f64, Granule, Vec<Shown>)>) -> Vec<Witnessed> {
     let mut shows: HashMap<u32, Vec<u32>> = HashMap::new();
-    let mut kept: Vec<(Granule, Vec<Shown>)> = Vec::new();
+    let mut kept: Vec<Witnessed> = Vec::new();
     for (_, granule, shown) in found {
         let mut common: BTreeMap<u32, usize> = BTreeMap::new();
         for other in shown.iter().filter_map(|s| shows.get(&s.row)).flatten() {

@@ -10,6 +10,7 @@ pub use binary::write_model;
 use glam::{DMat3, DQuat, DVec3};
 use gs_io::{Error, IoContext, Result};
 use std::collections::{BTreeMap, BTreeSet};
+use std::ffi::OsStr;
 use std::path::{Path, PathBuf};
 
 /// A registered image.
@@ -68,7 +69,7 @@ fn largest_model(folder: &Path) -> Option<Model> {
 
 /// Says how many photographs beside those of the views no view uses. Pictures of other kinds there are masks and the like.
 fn unused(folder: &Path, views: &[RawView]) -> Option<String> {
-    let kind = |path: &Path| path.extension().map(|e| e.to_ascii_lowercase());
+    let kind = |path: &Path| path.extension().map(OsStr::to_ascii_lowercase);
     let used: BTreeSet<&Path> = views.iter().map(|v| v.image_path.as_path()).collect();
     let folders: BTreeSet<&Path> = used.iter().filter_map(|path| path.parent()).collect();
     let kinds: BTreeSet<_> = used.iter().map(|path| kind(path)).collect();
