@@ -222,23 +222,24 @@ impl MaskFolder {
         Self { path, undistorted }
     }
 
-    /// Whether the maps of this view have the distortion of its lens, which [`Self::read`] takes out.
+    /// Whether the maps of this view have the distortion of its lens or lie on a side, which [`Self::read`] takes out.
     pub fn bends(&self, view: &View) -> bool {
-        view.is_distorted() && !self.undistorted
+        !view.is_straight() && !self.undistorted
     }
 
-    /// Reads the id maps of a view, undistorted.
+    /// Reads the id maps of a view, upright and undistorted.
     ///
     /// # Errors
     /// As [`MaskMaps::read`] and [`MaskMaps::expect_shape`].
     pub fn read(&self, view: &View) -> Result<MaskMaps> {
         let file = maps_path(&self.path, view.stem());
         let mut maps = MaskMaps::read(&file)?;
-        maps.expect_shape(view.camera.width, view.camera.height, &file)?;
         if self.bends(view) {
-            let (width, height) = (maps.width(), maps.height());
-            view.undistort_nearest(maps.ids.as_slice_mut().expect("as read"), width, height);
+            let size = (maps.width(), maps.height());
+            let (width, height) = view.straighten(maps.ids.as_slice_mut().expect("as read"), size);
+            maps.ids = maps.ids.into_shape_with_order((LEVELS, height, width)).expect("as many ids");
         }
+        maps.expect_shape(view.camera.width, view.camera.height, &file)?;
         Ok(maps)
     }
 }

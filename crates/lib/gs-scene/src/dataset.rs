@@ -2,21 +2,25 @@
 
 pub mod colmap;
 mod depth;
+mod mask;
+mod names;
 pub mod refined;
 mod scannet;
 mod seven_scenes;
 mod transforms;
+mod upright;
 mod view;
 
 use crate::lens::Lens;
-use crate::{Camera, PointCloud, image};
+use crate::{Camera, PointCloud};
 use depth::Depth;
 pub use depth::DepthMap;
 use glam::{DMat3, DMat4, DQuat, DVec3};
 use gs_io::{Error, IoContext, Result, hash_bytes, hash_file};
+pub use mask::Odd;
 use rayon::prelude::*;
-use std::path::{Component, Path, PathBuf};
-use unicode_normalization::UnicodeNormalization;
+use std::path::{Path, PathBuf};
+use upright::Turn;
 pub use view::View;
 use view::stems;
 
@@ -139,6 +143,9 @@ pub(crate) struct RawView {
     pub translation: DVec3,
     pub split: Option<Split>,
     pub depth: Option<Depth>,
+    /// Black where the photograph is not to be learnt from.
+    pub mask: Option<PathBuf>,
+    pub turn: Turn,
 }
 
 pub(crate) struct RawDataset {
@@ -148,6 +155,8 @@ pub(crate) struct RawDataset {
     pub views: Vec<RawView>,
     pub points: PointCloud,
     pub warnings: Vec<String>,
+    /// Photographs that a warning names.
+    pub skipped: Vec<PathBuf>,
 }
 
 /// Focal lengths in longer sides of the photograph. A pinhole camera of the least sees 179.9 degrees; lenses stay below 150.
@@ -214,27 +223,72 @@ pub fn load(path: &Path, options: &LoadOptions) -> Result<Dataset> {
 }
 
 fn read(path: &Path) -> Result<RawDataset> {
-    let raw = if path.extension().is_some_and(|e| e == "json") {
+    let mut raw = if path.extension().is_some_and(|e| e == "json") {
         transforms::load(path.parent().unwrap_or(Path::new(".")), &[path.to_path_buf()])?
-    } else if !path.is_dir() {
-        return Err(Error::new("no such folder")
-            .file(path)
-            .hint("give the folder of a COLMAP, transforms.json, ScanNet or 7-Scenes scene"));
-    } else if let Some(model) = colmap::find_model(path) {
+    } else if let Some(model) = colmap::model_of_file(path) {
         colmap::load(path, model)?
-    } else if let Some(files) = transforms::find(path) {
-        transforms::load(path, &files)?
-    } else if scannet::is_scannet(path) {
-        scannet::load(path)?
-    } else if seven_scenes::is_seven_scenes(path) {
-        seven_scenes::load(path)?
+    } else if !path.is_dir() {
+        return Err(Error::new("no such folder").file(path).hint(
+            "give the folder of a COLMAP, transforms.json, ScanNet or 7-Scenes scene, a transforms.json, or a COLMAP model's cameras.bin",
+        ));
     } else {
-        return Err(Error::new("no dataset recognised in this folder")
-            .file(path)
-            .expected("sparse/0/cameras.bin|txt (COLMAP), transforms.json or transforms_train.json, color/ pose/ intrinsic/ (ScanNet), or seq-01/frame-000000.color.png (7-Scenes)")
-            .hint("run COLMAP on the photographs first"));
+        let layouts = layouts(path);
+        let others: Vec<String> = layouts.iter().skip(1).map(Layout::name).collect();
+        let Some(layout) = layouts.into_iter().next() else {
+            return Err(Error::new("no dataset recognised in this folder")
+                .file(path)
+                .expected("sparse/0/cameras.bin|txt (COLMAP), transforms.json or transforms_train.json, color/ pose/ intrinsic/ (ScanNet), or seq-01/frame-000000.color.png (7-Scenes)")
+                .hint("run COLMAP on the photographs first"));
+        };
+        let name = layout.name();
+        let mut raw = layout.load(path)?;
+        if !others.is_empty() {
+            raw.warnings.push(format!(
+                "the folder has several sets of cameras: {name} is read, not {}; --scene takes the file of another",
+                others.join(" or ")
+            ));
+        }
+        raw
     };
+    upright::turn(&mut raw)?;
     Ok(raw)
+}
+
+/// The cameras that a folder has.
+enum Layout {
+    Colmap(colmap::Model),
+    Transforms(Vec<PathBuf>),
+    ScanNet,
+    SevenScenes,
+}
+
+/// All of a folder, the one to be read first: COLMAP's, as trainers of Gaussians do, then a transforms.json.
+fn layouts(path: &Path) -> Vec<Layout> {
+    let mut all: Vec<Layout> = colmap::find_model(path).map(Layout::Colmap).into_iter().collect();
+    all.extend(transforms::find(path).into_iter().map(Layout::Transforms));
+    all.extend(scannet::is_scannet(path).then_some(Layout::ScanNet));
+    all.extend(seven_scenes::is_seven_scenes(path).then_some(Layout::SevenScenes));
+    all
+}
+
+impl Layout {
+    fn name(&self) -> String {
+        match self {
+            Self::Colmap(model) => format!("COLMAP's {}", model.folder().display()),
+            Self::Transforms(files) => files.iter().map(|f| f.display().to_string()).collect::<Vec<_>>().join(" and "),
+            Self::ScanNet => "ScanNet's color, pose and intrinsic".into(),
+            Self::SevenScenes => "the frames of 7-Scenes".into(),
+        }
+    }
+
+    fn load(self, path: &Path) -> Result<RawDataset> {
+        match self {
+            Self::Colmap(model) => colmap::load(path, model),
+            Self::Transforms(files) => transforms::load(path, &files),
+            Self::ScanNet => scannet::load(path),
+            Self::SevenScenes => seven_scenes::load(path),
+        }
+    }
 }
 
 fn finish(root: &Path, mut raw: RawDataset, options: &LoadOptions) -> Result<Dataset> {
@@ -250,13 +304,7 @@ fn finish(root: &Path, mut raw: RawDataset, options: &LoadOptions) -> Result<Dat
     }
     let names: Vec<&str> = raw.views.iter().map(|v| v.name.as_str()).collect();
     let stems = stems(&names).map_err(|e| e.file(root))?;
-    raw.views
-        .par_iter()
-        .map(|v| {
-            v.lens.expect_size(image::size_of(&v.image_path)?, &v.image_path)?;
-            v.check(raw.format)
-        })
-        .collect::<Result<Vec<()>>>()?;
+    raw.views.iter().try_for_each(|v| v.check(raw.format))?;
     let names_its_own = raw.views.iter().any(|v| v.split == Some(Split::Test));
     let views = raw.views.into_iter().zip(stems).enumerate().map(|(i, (v, stem))| {
         let split = match v.split.filter(|_| names_its_own) {
@@ -276,9 +324,12 @@ fn finish(root: &Path, mut raw: RawDataset, options: &LoadOptions) -> Result<Dat
         let (w, h) = smallest;
         raw.warnings.push(format!("photographs of {w}x{h} pixels after division by {d}: for a width, write {d}px"));
     }
-    let RawDataset { format, mut files, points, warnings, .. } = raw;
+    let RawDataset { format, mut files, points, mut warnings, skipped, .. } = raw;
+    warnings.extend(names::unused(root, format, &views, &skipped));
     files.extend(views.iter().map(|v| v.image_path.clone()));
-    files.extend(views.iter().filter_map(View::depth_path).map(Path::to_path_buf));
+    let beside =
+        |v: &View| [v.depth_path(), v.mask_path()].into_iter().flatten().map(Path::to_path_buf).collect::<Vec<_>>();
+    files.extend(views.iter().flat_map(beside));
     Ok(Dataset { root: root.to_path_buf(), format, views, points, files, warnings })
 }
 
@@ -302,39 +353,6 @@ impl Dataset {
         bytes.extend(self.points.colors.iter().flatten());
         Ok(hash_bytes(&bytes))
     }
-}
-
-/// The file that a name means which is written otherwise: `a.JPG` for `a.jpg`, for cameras and copying programs differ in that;
-/// `images/a.png` for Windows' `images\\a.png`; letters with accents in one piece or in two, as macOS has them.
-fn other_name(folder: &Path, name: &str) -> Option<String> {
-    let name = with_slashes(name);
-    let forms = [name.clone(), name.nfc().collect(), name.nfd().collect()];
-    let cases = |form: String| match form.rsplit_once('.') {
-        Some((bare, extension)) => {
-            let [low, high] = [extension.to_ascii_lowercase(), extension.to_ascii_uppercase()];
-            vec![format!("{bare}.{low}"), format!("{bare}.{high}"), form]
-        }
-        None => vec![form],
-    };
-    forms.into_iter().flat_map(cases).find(|n| folder.join(n).is_file())
-}
-
-/// A path as other systems than Windows write it.
-fn with_slashes(path: &str) -> String {
-    path.replace('\\', "/")
-}
-
-/// Refuses a name inside a file that leads out of the dataset's folder.
-pub(crate) fn check_inside(name: &str, field: &str) -> Result<()> {
-    let inside = |c: Component| matches!(c, Component::Normal(_) | Component::CurDir);
-    if !name.is_empty() && Path::new(&with_slashes(name)).components().all(inside) {
-        return Ok(());
-    }
-    Err(Error::new("the photograph's name leads out of the dataset")
-        .field(field)
-        .found(name)
-        .expected("a path below the dataset's folder")
-        .hint("move the photographs there and name them relative to it"))
 }
 
 /// Camera-from-world rotation and translation of a world-from-camera matrix (OpenCV axes); none where a number is not

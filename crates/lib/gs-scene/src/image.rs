@@ -1,7 +1,8 @@
 //! Photographs and other pictures, as f32 RGB.
 
 use gs_io::{Error, IoContext, Result, write_bytes};
-use image::{DynamicImage, ImageReader};
+use image::metadata::Orientation;
+use image::{DynamicImage, ImageDecoder, ImageReader};
 use rayon::prelude::*;
 use std::io::Cursor;
 use std::path::Path;
@@ -24,14 +25,36 @@ pub struct Image {
     pub alpha: Option<Vec<f32>>,
 }
 
-/// Width and height of a picture file, from its header.
+/// Width and height of a picture file as its pixels lie, from its header.
 pub fn size_of(path: impl AsRef<Path>) -> Result<(u32, u32)> {
     let path = path.as_ref();
     let reader = ImageReader::open(path).at("open", path)?.with_guessed_format().at("read", path)?;
     reader.into_dimensions().map_err(|e| unreadable(path, &e))
 }
 
-/// Decodes a PNG or JPEG that was read from `path`. EXIF orientation is ignored.
+/// Width and height of a picture file as its pixels lie, and how its EXIF data would have them turned, from its header.
+pub(crate) fn size_and_turn(path: &Path) -> Result<((u32, u32), Orientation)> {
+    let reader = ImageReader::open(path).at("open", path)?.with_guessed_format().at("read", path)?;
+    let mut decoder = reader.into_decoder().map_err(|e| unreadable(path, &e))?;
+    Ok((decoder.dimensions(), turn_of(&mut decoder)))
+}
+
+/// EXIF data that cannot be read turn nothing.
+fn turn_of(decoder: &mut impl ImageDecoder) -> Orientation {
+    decoder.orientation().unwrap_or(Orientation::NoTransforms)
+}
+
+/// The size of a picture that is turned.
+pub(crate) fn turned_size((width, height): (u32, u32), turn: Orientation) -> (u32, u32) {
+    use Orientation::{Rotate90, Rotate90FlipH, Rotate270, Rotate270FlipH};
+    if matches!(turn, Rotate90 | Rotate270 | Rotate90FlipH | Rotate270FlipH) {
+        (height, width)
+    } else {
+        (width, height)
+    }
+}
+
+/// Decodes a PNG or JPEG that was read from `path`, with the pixels as they lie: no EXIF data turn them.
 ///
 /// # Errors
 /// When it is no picture, or claims more pixels than so many bytes can hold.
@@ -48,7 +71,7 @@ pub fn decode(bytes: &[u8], path: &Path) -> Result<DynamicImage> {
             .hint("shrink it, or copy it again"));
     }
     // Decoders fill what is missing with grey, which would be learnt.
-    if bytes.starts_with(&JPEG) && !reaches_its_end(bytes) {
+    if is_jpeg(bytes) && !reaches_its_end(bytes) {
         return Err(unreadable(path, &"the JPEG ends before its end mark, so a part of it is missing"));
     }
     reader()?.decode().map_err(|e| unreadable(path, &e))
@@ -56,6 +79,10 @@ pub fn decode(bytes: &[u8], path: &Path) -> Result<DynamicImage> {
 
 /// How a JPEG begins.
 const JPEG: [u8; 2] = [0xFF, 0xD8];
+
+pub(crate) fn is_jpeg(bytes: &[u8]) -> bool {
+    bytes.starts_with(&JPEG)
+}
 
 /// Whether the bytes of a JPEG go on to its end mark. Segments with a length are skipped, so that the end of a small picture within one
 /// is not taken for it (ITU T.81, B.1.1).
@@ -82,7 +109,7 @@ pub fn has_alpha(path: impl AsRef<Path>) -> Result<bool> {
     let path = path.as_ref();
     let reader = ImageReader::open(path).at("open", path)?.with_guessed_format().at("read", path)?;
     let decoder = reader.into_decoder().map_err(|e| unreadable(path, &e))?;
-    Ok(image::ImageDecoder::color_type(&decoder).has_alpha())
+    Ok(decoder.color_type().has_alpha())
 }
 
 /// Width and height of a picture of this size, shrunk to a longer side of so many pixels where it is larger.
@@ -114,13 +141,19 @@ impl Image {
         self.rgb.iter().map(|&v| (v.clamp(0.0, 1.0) * 255.0 + 0.5) as u8).collect()
     }
 
-    /// Reads a PNG or JPEG; EXIF orientation is ignored, as COLMAP does.
+    /// Reads a PNG or JPEG, upright: turned as its EXIF data say.
     ///
     /// # Errors
     /// When the file cannot be read, is no picture, or is too large.
     pub fn read(path: impl AsRef<Path>) -> Result<Self> {
-        let path = path.as_ref();
-        let decoded = decode(&std::fs::read(path).at("read", path)?, path)?;
+        let (_, turn) = size_and_turn(path.as_ref())?;
+        Self::read_turned(path.as_ref(), turn)
+    }
+
+    /// Reads a PNG or JPEG and turns it.
+    pub(crate) fn read_turned(path: &Path, turn: Orientation) -> Result<Self> {
+        let mut decoded = decode(&std::fs::read(path).at("read", path)?, path)?;
+        decoded.apply_orientation(turn);
         let alpha = || decoded.to_rgba8().pixels().map(|p| f32::from(p[3]) / 255.0).collect();
         let alpha = decoded.color().has_alpha().then(alpha);
         Ok(Self { alpha, ..Self::from_rgb8(decoded.width(), decoded.height(), decoded.into_rgb8().as_raw()) })

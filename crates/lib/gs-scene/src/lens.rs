@@ -69,6 +69,14 @@ impl Lens {
         Self { focal_center: [fx * by, fy * by, cx, cy], distortion, ..*self }
     }
 
+    /// The lens of the photograph turned clockwise by a quarter. Radial distortion stays; the tangential turns as the vector (p2, p1).
+    pub(crate) fn turned_quarter(&self) -> Self {
+        let ([fx, fy, cx, cy], (width, height)) = (self.focal_center, self.size);
+        let [p1, p2] = self.distortion.p;
+        let distortion = Distortion { p: [p2, -p1], ..self.distortion };
+        Self { size: (height, width), focal_center: [fy, fx, f64::from(height) - cy, cx], distortion }
+    }
+
     /// Where in the photograph the pinhole camera's point (x, y) is seen; the pinhole camera has the same principal
     /// point and `zoom` times the focal lengths.
     #[inline(always)]

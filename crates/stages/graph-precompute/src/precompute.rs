@@ -58,7 +58,8 @@ pub(crate) fn precompute(
     let folder = MaskFolder::open(masks);
     let bent = views.iter().filter(|v| folder.bends(v)).count();
     if bent > 0 {
-        stage.info(&format!("the id maps of {bent} views are undistorted, as their photographs are"));
+        stage
+            .info(&format!("the id maps of {bent} views are undistorted and turned upright, as their photographs are"));
     }
     let mut progress = stage.progress("views", views.len() as u64);
     for view in &views {

@@ -276,7 +276,7 @@ fn given_maps_of_distorted_photographs_are_undistorted_with_them() {
     let load = LoadOptions { resolution: Resolution::Divisor(1.0), holdout: 8 };
     let views = dataset::load(&s, &load).unwrap().views;
     let mut flat = drawn.clone();
-    views[0].undistort_nearest(flat.ids.as_slice_mut().unwrap(), size, size);
+    views[0].straighten(flat.ids.as_slice_mut().unwrap(), (size, size));
     assert_ne!(flat, drawn);
     let write = |maps: &MaskMaps| views.iter().for_each(|v| maps.write(maps_path(s.join("masks"), v.stem())).unwrap());
     let rows = || {

@@ -85,7 +85,7 @@ fn measured(options: &Train, budget: f64, dataset: &Dataset, masks: &Masks, stag
     // The run does again what was done until here, and reads all photographs instead of some.
     let mut again = stage.elapsed().as_secs_f64();
     let most = most_gaussians(options, dataset);
-    let recipe = options.recipe(most, stage.seed());
+    let recipe = options.recipe(most, stage.seed(), masks.alpha());
     let (train, heldout) = init::split(options, dataset)?;
     let cameras: Vec<&Camera> = train.iter().map(|v| &v.camera).collect();
     let width = cameras.iter().map(|c| c.width).max().unwrap_or(1);
@@ -113,7 +113,7 @@ fn measured(options: &Train, budget: f64, dataset: &Dataset, masks: &Masks, stag
         heldout: heldout.len(),
     };
     let plan = plan(&speed, &limits, |iterations| {
-        let recipe = Train { iterations, ..options.clone() }.recipe(most, stage.seed());
+        let recipe = Train { iterations, ..options.clone() }.recipe(most, stage.seed(), masks.alpha());
         (recipe.schedule, recipe.growth)
     });
     let resolution = match plan.divisor > 1.0 {

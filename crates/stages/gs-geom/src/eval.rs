@@ -17,7 +17,8 @@ impl Eval {
         let needed = memory::of_figures(bytes(&self.geometry.geometry)?, &Pictures::of(&dataset)?);
         stage.forecast(needed, "give a smaller --geometry or --resolution")?;
         let (gaussians, options) = self.geometry.read(self.scene.background, stage)?;
-        let (alpha, masks) = (self.masks.alpha(), self.masks.load(&dataset, stage)?);
+        let masks = self.masks.load(&dataset, stage)?;
+        let alpha = masks.alpha();
         let reads = dataset.files.iter().cloned().chain(masks.files()).chain([self.geometry.geometry.clone()]);
         let mut claim = stage.outputs(&self.out).file(&self.out).reads(reads).claim()?;
         let mut split = Split::Test;

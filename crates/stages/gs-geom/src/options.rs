@@ -3,7 +3,7 @@
 
 use crate::bounds::Bounds;
 use crate::densification::Strategy;
-use crate::photographs::masks::{Alpha, Masks};
+use crate::photographs::masks::Masks;
 use crate::views::Views;
 use clap::{Parser, Subcommand, ValueEnum};
 use gs_io::{Error, Result};
@@ -64,8 +64,9 @@ pub(crate) struct SceneOptions {
 /// Which pixels of the photographs count.
 #[derive(Debug, Clone, clap::Args, Serialize)]
 pub(crate) struct MaskOptions {
-    /// Folder of masks with the names of the photographs. Black pixels, and transparent ones of the photographs, do not
-    /// count. Without this option a photograph's transparent pixels (alpha below 1) show --background
+    /// Folder of masks with the names of the photographs, instead of the mask_path of a transforms.json. Black pixels, and
+    /// transparent ones of masks and photographs, do not count. Without masks a photograph's transparent pixels (alpha below 1)
+    /// show --background
     #[arg(long, value_name = "DIR")]
     #[serde(skip)]
     pub masks: Option<PathBuf>,
@@ -349,18 +350,18 @@ impl SceneOptions {
 }
 
 impl MaskOptions {
-    /// What transparent pixels mean.
-    pub fn alpha(&self) -> Alpha {
-        if self.masks.is_some() { Alpha::Ignore } else { Alpha::Background }
-    }
-
-    /// The masks of a dataset's views.
+    /// The masks of a dataset's views, each of which has been read once: nothing is wrong with them.
     pub fn load(&self, dataset: &Dataset, stage: &Stage) -> Result<Masks> {
-        let Some(folder) = &self.masks else { return Ok(Masks::default()) };
-        let masks = Masks::find(folder, &dataset.views)?;
-        let views = dataset.views.len();
-        if masks.len() < views {
-            stage.warn(&format!("{} of {views} photographs have no mask: all their pixels count", views - masks.len()));
+        let masks = match &self.masks {
+            Some(folder) => Masks::find(folder, &dataset.views)?,
+            None => Masks::of_dataset(&dataset.views),
+        };
+        let (count, views) = (masks.len(), dataset.views.len());
+        if (1..views).contains(&count) {
+            stage.warn(&format!("{} of {views} photographs have no mask: all their pixels count", views - count));
+        }
+        for (odd, names) in masks.odd(&dataset.views)? {
+            stage.warn(&format!("{} of {count} masks, {} first, {odd}", names.len(), names[0]));
         }
         Ok(masks)
     }

@@ -9,7 +9,7 @@ pub(crate) mod outputs;
 use crate::budget;
 use crate::densification::Way;
 use crate::options::{Args, Background, Command, PictureSizes, Preset, Train};
-use crate::photographs::masks::Masks;
+use crate::photographs::masks::{Alpha, Masks};
 use crate::photographs::{Photographs, full_share};
 use crate::training::poses::PoseRates;
 use crate::training::schedule::LearningRates;
@@ -69,7 +69,7 @@ fn learn(
     stage: &Stage,
 ) -> Result<()> {
     let (train, heldout) = init::split(options, dataset)?;
-    let recipe = options.recipe(most_gaussians(options, dataset), stage.seed());
+    let recipe = options.recipe(most_gaussians(options, dataset), stage.seed(), masks.alpha());
     let watched = outputs::watched(options, dataset, &masks);
     let forecast = forecast_start(options, dataset, &masks, &recipe.growth, stage)?;
     let photographs = Photographs::load(train.clone(), masks.clone(), cache_bytes(options), &watched)?;
@@ -111,7 +111,7 @@ const STOCK_MAX_SCALE: f32 = 0.1;
 
 impl Train {
     /// The hyper-parameters that the options amount to.
-    pub(crate) fn recipe(&self, max_gaussians: usize, seed: u64) -> Recipe {
+    pub(crate) fn recipe(&self, max_gaussians: usize, seed: u64, alpha: Alpha) -> Recipe {
         let stock = self.preset == Some(Preset::Stock);
         let mut recipe = Recipe::new(self.densify, self.iterations);
         if self.schedule == PictureSizes::Coarse {
@@ -133,7 +133,7 @@ impl Train {
             seed,
             background: self.scene.background.color(),
             random_background: self.scene.background == Background::Random,
-            alpha: self.masks.alpha(),
+            alpha,
             antialias: self.antialias,
             exposure: self.exposure,
             poses: self.refine_poses.then(PoseRates::default),

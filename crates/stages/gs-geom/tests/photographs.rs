@@ -5,8 +5,9 @@ mod common;
 use common::world::{PIXELS, SIZE, balls, points, ring, scene, write_scene};
 use common::{Folder, json, record, refused, succeeds};
 use gs_raster::{RasterOptions, render};
+use gs_scene::dataset::{LoadOptions, Resolution, View};
 use gs_scene::{Camera, Gaussians, PointCloud, ply};
-use serde_json::Value;
+use serde_json::{Value, json};
 use std::fs;
 use std::path::Path;
 
@@ -143,6 +144,36 @@ fn masked_pixels_do_not_count() {
     assert!(succeeds(&[&train[..], &[&masks]].concat()).contains("1 of 24 photographs have no mask"));
     fs::create_dir(dir.path("none")).unwrap();
     assert!(refused(&[&train[..], &[&dir.path("none")]].concat()).contains("no masks in this folder"));
+}
+
+#[test]
+fn masks_that_the_frames_name_are_used_and_odd_ones_are_said() {
+    let dir = photographed(false, |_, _| ());
+    let (scene, masks) = (dir.path("scene"), dir.path("scene/masks"));
+    fs::create_dir(&masks).unwrap();
+    let options = LoadOptions { resolution: Resolution::Divisor(1.0), holdout: 8 };
+    let views = gs_scene::dataset::load(Path::new(&scene), &options).unwrap().views;
+    let frame = |view: &View| {
+        // 0 and 1, as many programs write them; the right half does not count.
+        let mask: Vec<u8> = (0..PIXELS).map(|p| u8::from(p % (SIZE.0 as usize) < SIZE.0 as usize / 2)).collect();
+        image::save_buffer(Path::new(&masks).join(&view.name), &mask, SIZE.0, SIZE.1, image::ColorType::L8).unwrap();
+        let (c, p) = (&view.camera, view.camera.position());
+        let r = c.rotation.transpose();
+        let rows: Vec<[f64; 4]> = (0..3).map(|i| [r.x_axis[i], -r.y_axis[i], -r.z_axis[i], p[i]]).collect();
+        json!({"file_path": format!("images/{}", view.name), "mask_path": format!("masks/{}", view.name), "transform_matrix": rows})
+    };
+    let c = &views[0].camera;
+    let frames: Vec<Value> = views.iter().map(frame).collect();
+    let json = json!({"w": SIZE.0, "h": SIZE.1, "fl_x": c.fx, "fl_y": c.fy, "cx": c.cx, "cy": c.cy, "frames": frames});
+    let transforms = dir.path("scene/transforms.json");
+    fs::write(&transforms, json.to_string()).unwrap();
+    let train = |out: &str, more: &[&str]| {
+        let out = dir.path(out);
+        let said = succeeds(&[&["train", "--scene", &transforms, "--out", &out, "--iterations", "20"], more].concat());
+        assert!(said.contains("24 of 24 masks, 00.png first, have no value above 1: taken as white"), "{said}");
+        fs::read(out).unwrap()
+    };
+    assert!(train("own.ply", &[]) == train("given.ply", &["--masks", &masks]));
 }
 
 /// A held-out view whose mask is black has no figures, and the means are those of the others.

@@ -3,14 +3,15 @@
 mod binary;
 mod text;
 
-use super::{Format, RawDataset, RawView, check_inside, other_name};
+use super::names::{check_inside, file_named};
+use super::upright::Turn;
+use super::{Format, RawDataset, RawView};
 use crate::PointCloud;
 use crate::lens::{Distortion, Lens};
 pub use binary::write_model;
 use glam::{DMat3, DQuat, DVec3};
 use gs_io::{Error, IoContext, Result};
-use std::collections::{BTreeMap, BTreeSet};
-use std::ffi::OsStr;
+use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
 /// A registered image.
@@ -33,6 +34,12 @@ pub(crate) struct Model {
     chosen: Option<String>,
 }
 
+impl Model {
+    pub fn folder(&self) -> &Path {
+        &self.folder
+    }
+}
+
 /// The sparse model within a scene, if any: of `sparse/0`, `sparse/1`, ... the one with most photographs, else `sparse`, one of
 /// `colmap/sparse/0`, ..., or the folder itself.
 pub(crate) fn find_model(scene: &Path) -> Option<Model> {
@@ -42,6 +49,14 @@ pub(crate) fn find_model(scene: &Path) -> Option<Model> {
     };
     let largest = |folder: &str| largest_model(&scene.join(folder));
     largest("sparse").or_else(|| own("sparse")).or_else(|| largest("colmap/sparse")).or_else(|| own("."))
+}
+
+/// The model that a file belongs to: its `cameras`, `images` or `points3D`.
+pub(super) fn model_of_file(path: &Path) -> Option<Model> {
+    let is_part =
+        path.file_stem().is_some_and(|stem| ["cameras", "images", "points3D"].iter().any(|part| *part == stem));
+    let folder = path.parent().filter(|folder| is_part && path.is_file() && file_of(folder, "cameras").is_some())?;
+    Some(Model { folder: folder.to_path_buf(), chosen: None })
 }
 
 /// COLMAP writes a model for each group of photographs that it can link, in folders with numbers for names: of these the one with most
@@ -60,25 +75,11 @@ fn largest_model(folder: &Path) -> Option<Model> {
     let said = |k: usize| format!("{} with {}", models[k].1.display(), counts[k]);
     let others: Vec<String> = (0..models.len()).filter(|&k| k != best).map(said).collect();
     let chosen = format!(
-        "the model {} photographs is taken, not {}: COLMAP could not link them; to take another, move the rest away",
+        "the model {} photographs is taken, not {}: COLMAP could not link them; --scene takes the cameras file of another",
         said(best),
         others.join(", ")
     );
     Some(Model { folder: models.swap_remove(best).1, chosen: Some(chosen) })
-}
-
-/// Says how many photographs beside those of the views no view uses. Pictures of other kinds there are masks and the like.
-fn unused(folder: &Path, views: &[RawView]) -> Option<String> {
-    let kind = |path: &Path| path.extension().map(OsStr::to_ascii_lowercase);
-    let used: BTreeSet<&Path> = views.iter().map(|v| v.image_path.as_path()).collect();
-    let folders: BTreeSet<&Path> = used.iter().filter_map(|path| path.parent()).collect();
-    let kinds: BTreeSet<_> = used.iter().map(|path| kind(path)).collect();
-    let files = folders.into_iter().flat_map(|f| super::list(f).unwrap_or_default());
-    let unused = files.filter(|f| kinds.contains(&kind(f)) && !used.contains(f.as_path()) && f.is_file()).count();
-    let all = unused + used.len();
-    (unused > 0).then(|| {
-        format!("{unused} of {all} photographs in {} are in no view: the model does not have them", folder.display())
-    })
 }
 
 /// A file of a model: `.bin` where there is one, else `.txt`.
@@ -86,8 +87,8 @@ fn file_of(folder: &Path, name: &str) -> Option<PathBuf> {
     ["bin", "txt"].iter().map(|e| folder.join(format!("{name}.{e}"))).find(|p| p.is_file())
 }
 
-/// Loads a model of the scene `root`; photographs lie in `images`, `input`, or the scene itself. Without
-/// `points3D` there are no points.
+/// Loads a model of the scene `root`; photographs lie in `images`, `input`, or the scene itself. Those of a model that is given by
+/// itself lie in such a folder beside it or above. Without `points3D` there are no points.
 pub(crate) fn load(root: &Path, model: Model) -> Result<RawDataset> {
     let Model { folder: model, chosen } = model;
     let model = model.as_path();
@@ -119,18 +120,25 @@ pub(crate) fn load(root: &Path, model: Model) -> Result<RawDataset> {
         files.push(path);
         points = found;
     }
-    let folder = ["images", "input"].iter().map(|d| root.join(d)).find(|d| d.is_dir());
-    let folder = folder.unwrap_or_else(|| root.to_path_buf());
+    let below = |root: &Path| ["images", "input"].map(|name| root.join(name)).into_iter().find(|d| d.is_dir());
+    let folder = if model.starts_with(root) && model != root {
+        below(root).unwrap_or_else(|| root.to_path_buf())
+    } else {
+        let first = |folder: &PathBuf| file_named(folder, &images[0].name).is_some();
+        let above = model.ancestors().skip(1).take(3).filter_map(below);
+        below(model)
+            .into_iter()
+            .chain([model.to_path_buf()])
+            .chain(above)
+            .find(first)
+            .unwrap_or_else(|| model.to_path_buf())
+    };
     let (mut views, mut warnings) = (Vec::new(), Vec::new());
     for Registered { name, camera, rotation, translation } in images {
         check_inside(&name, "images").map_err(|e| e.file(model))?;
-        let mut image_path = folder.join(&name);
-        if !image_path.is_file()
-            && let Some(other) = other_name(&folder, &name)
-        {
-            image_path = folder.join(other);
-        }
-        if image_path.is_file() {
+        let found = file_named(&folder, &name);
+        let image_path = folder.join(found.as_ref().unwrap_or(&name));
+        if found.is_some() {
             views.push(RawView {
                 name,
                 image_path,
@@ -139,15 +147,16 @@ pub(crate) fn load(root: &Path, model: Model) -> Result<RawDataset> {
                 translation,
                 split: None,
                 depth: None,
+                mask: None,
+                turn: Turn::NONE,
             });
         } else {
             warnings.push(format!("{}: no such photograph, view skipped", image_path.display()));
         }
     }
     warnings.extend(chosen);
-    warnings.extend(unused(&folder, &views));
     warnings.extend(distorted(model, &views));
-    Ok(RawDataset { format: Format::Colmap, files, views, points, warnings })
+    Ok(RawDataset { format: Format::Colmap, files, views, points, warnings, skipped: Vec::new() })
 }
 
 /// Says that the model's photographs are not undistorted, where they are not: who undistorted them has another model, too.

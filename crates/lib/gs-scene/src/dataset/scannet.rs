@@ -2,9 +2,10 @@
 //! vertices in `*_vh_clean_2.ply`; where they are there, depth images in `depth/<id>.png`.
 
 use super::depth::{Depth, DepthCamera, MILLIMETRES};
+use super::upright::{Turn, size_by_center};
 use super::{Format, RawDataset, RawView, list, matrix, pose};
 use crate::lens::{Distortion, Lens};
-use crate::{PointCloud, image, ply};
+use crate::{PointCloud, ply};
 use glam::DMat4;
 use gs_io::{Error, Result};
 use std::path::{Path, PathBuf};
@@ -26,12 +27,15 @@ pub(super) fn load(root: &Path) -> Result<RawDataset> {
     let depths = Depths::find(root)?;
     let mut files = vec![intrinsic.clone()];
     files.extend(depths.intrinsic.clone());
-    let mut warnings = Vec::new();
+    let (mut warnings, mut skipped) = (Vec::new(), Vec::new());
     let mut views = Vec::new();
     for (_, image_path) in frames {
         let pose_path = root.join("pose").join(image_path.with_extension("txt").file_name().unwrap_or_default());
-        let Some((rotation, translation)) = pose(&pose_path, &mut warnings)? else { continue };
-        let size = image::size_of(&image_path)?;
+        let Some((rotation, translation)) = pose(&pose_path, &mut warnings)? else {
+            skipped.push(image_path);
+            continue;
+        };
+        let size = size_by_center(&image_path, Some((k.z_axis.x, k.z_axis.y)))?;
         let lens = Lens {
             size,
             focal_center: [k.x_axis.x, k.y_axis.y, k.z_axis.x, k.z_axis.y],
@@ -40,13 +44,23 @@ pub(super) fn load(root: &Path) -> Result<RawDataset> {
         check_intrinsics(&lens).map_err(|e| e.file(&intrinsic))?;
         let name = image_path.file_name().unwrap_or_default().to_string_lossy().into_owned();
         let depth = depths.of(&image_path);
-        views.push(RawView { name, image_path, lens, rotation, translation, split: None, depth });
+        views.push(RawView {
+            name,
+            image_path,
+            lens,
+            rotation,
+            translation,
+            split: None,
+            depth,
+            mask: None,
+            turn: Turn::NONE,
+        });
         files.push(pose_path);
     }
     let scan = list(root)?.into_iter().find(|p| p.to_string_lossy().ends_with("_vh_clean_2.ply"));
     let points = scan.as_ref().map_or_else(|| Ok(PointCloud::default()), ply::read_points)?;
     files.extend(scan);
-    Ok(RawDataset { format: Format::ScanNet, files, views, points, warnings })
+    Ok(RawDataset { format: Format::ScanNet, files, views, points, warnings, skipped })
 }
 
 /// The depth images, `depth/<id>.png` in millimetres, with a camera of their own.

@@ -5,6 +5,7 @@
 //! photographs of this sensor. Poses are the depth camera's; the photographs were taken a few centimetres beside.
 
 use super::depth::{Depth, DepthCamera, MILLIMETRES};
+use super::upright::Turn;
 use super::{Format, RawDataset, RawView, Split, list, pose, read_text};
 use crate::lens::{Distortion, Lens};
 use crate::{PointCloud, image};
@@ -25,7 +26,7 @@ pub(super) fn is_seven_scenes(root: &Path) -> bool {
 /// Loads the views of all sequences.
 pub(super) fn load(root: &Path) -> Result<RawDataset> {
     let split = root.join("TestSplit.txt");
-    let (mut files, mut warnings, mut views) = (Vec::new(), Vec::new(), Vec::new());
+    let (mut files, mut warnings, mut views, mut skipped) = (Vec::new(), Vec::new(), Vec::new(), Vec::new());
     let mut test = BTreeSet::new();
     if split.is_file() {
         for line in read_text(&split)?.lines().map(str::trim).filter(|l| !l.is_empty()) {
@@ -40,7 +41,10 @@ pub(super) fn load(root: &Path) -> Result<RawDataset> {
         let is_test = folder != root && number(&name_of(&folder)).is_some_and(|n| test.contains(&n));
         for (name, image_path) in frames(&folder)? {
             let pose_path = folder.join(format!("{name}.pose.txt"));
-            let Some((rotation, translation)) = pose(&pose_path, &mut warnings)? else { continue };
+            let Some((rotation, translation)) = pose(&pose_path, &mut warnings)? else {
+                skipped.push(image_path);
+                continue;
+            };
             let size = image::size_of(&image_path)?;
             let (w, h) = (f64::from(size.0), f64::from(size.1));
             let focal_center = [FOCAL * w, FOCAL * w, 0.5 * w, 0.5 * h];
@@ -50,7 +54,8 @@ pub(super) fn load(root: &Path) -> Result<RawDataset> {
             let depth = Some(depth).filter(|d| d.path.is_file());
             let name = image_path.strip_prefix(root).unwrap_or(&image_path).to_string_lossy().replace('\\', "/");
             let split = Some(if is_test { Split::Test } else { Split::Train });
-            views.push(RawView { name, image_path, lens, rotation, translation, split, depth });
+            let turn = Turn::NONE;
+            views.push(RawView { name, image_path, lens, rotation, translation, split, depth, mask: None, turn });
             files.push(pose_path);
         }
     }
@@ -58,7 +63,7 @@ pub(super) fn load(root: &Path) -> Result<RawDataset> {
     if views.iter().all(|v: &RawView| v.split == Some(Split::Test)) {
         views.iter_mut().for_each(|v| v.split = None);
     }
-    Ok(RawDataset { format: Format::SevenScenes, files, views, points: PointCloud::default(), warnings })
+    Ok(RawDataset { format: Format::SevenScenes, files, views, points: PointCloud::default(), warnings, skipped })
 }
 
 /// The number in the name of a sequence, which is `sequence3` in lists and `seq-03` on disk.

@@ -1,9 +1,11 @@
 //! `transforms.json` of nerfstudio, instant-ngp and Blender; OpenGaussian's conversion of ScanNet is one of these.
 
 use super::depth::{Depth, DepthCamera, MILLIMETRES};
-use super::{Format, RawDataset, RawView, Split, check_inside, invert_pose, other_name, read_text};
+use super::names::{check_inside, file_named, plain};
+use super::upright::{Turn, size_by_center};
+use super::{Format, RawDataset, RawView, Split, invert_pose, read_text};
 use crate::lens::{Distortion, Lens};
-use crate::{PointCloud, image, ply};
+use crate::{PointCloud, ply};
 use glam::{DMat4, DVec4};
 use gs_io::{Error, Result};
 use serde_json::Value;
@@ -12,11 +14,11 @@ use std::path::{Path, PathBuf};
 
 const AGAIN: &str = "export the transforms again";
 
-/// The transforms files of a folder, if it has any.
-pub(super) fn find(root: &Path) -> Option<Vec<PathBuf>> {
+/// The transforms files of a folder: one, and Blender's two that belong together.
+pub(super) fn find(root: &Path) -> Vec<Vec<PathBuf>> {
     let there = |names: &[&str]| names.iter().map(|n| root.join(n)).filter(|p| p.is_file()).collect::<Vec<PathBuf>>();
     let parts = [&["transforms.json"][..], &["transforms_train.json", "transforms_test.json"]];
-    parts.into_iter().map(there).find(|files| !files.is_empty())
+    parts.into_iter().map(there).filter(|files| !files.is_empty()).collect()
 }
 
 /// Reads views from the files; the split comes from the names `transforms_train.json` and `transforms_test.json`, or
@@ -28,6 +30,7 @@ pub(super) fn load(root: &Path, files: &[PathBuf]) -> Result<RawDataset> {
         views: Vec::new(),
         points: PointCloud::default(),
         warnings: Vec::new(),
+        skipped: Vec::new(),
     };
     let mut clouds = ["points3d.ply", "points3D.ply", "sparse_pc.ply"].map(PathBuf::from).to_vec();
     for file in files {
@@ -40,7 +43,7 @@ pub(super) fn load(root: &Path, files: &[PathBuf]) -> Result<RawDataset> {
         read_frames(root, &json, split, &mut out).map_err(|e| e.file(file))?;
         if let Some(name) = json["ply_file_path"].as_str() {
             check_inside(name, "ply_file_path").map_err(|e| e.file(file))?;
-            clouds.insert(0, name.into());
+            clouds.insert(0, plain(name).into());
         }
     }
     // OpenGaussian lists every frame of ScanNet in both files; a frame to learn from is not held out.
@@ -89,13 +92,6 @@ fn read_frames(root: &Path, json: &Value, split: Option<Split>, out: &mut RawDat
     let frames = json["frames"]
         .as_array()
         .ok_or_else(|| Error::new("the file has no list of frames").field("frames").hint(AGAIN))?;
-    if let Some(mask) = frames.iter().find_map(|frame| frame["mask_path"].as_str()) {
-        let folder = Path::new(mask).parent().map_or(root.to_path_buf(), |folder| root.join(folder));
-        out.warnings.push(format!(
-            "mask_path of the frames is not read: give gs-geom train --masks {}, or what the masks hide is learnt",
-            folder.display()
-        ));
-    }
     for (i, frame) in frames.iter().enumerate() {
         let field = format!("frames[{i}]");
         let path = frame["file_path"].as_str().ok_or_else(|| {
@@ -103,15 +99,8 @@ fn read_frames(root: &Path, json: &Value, split: Option<Split>, out: &mut RawDat
             Error::new("the frame names no photograph").field(field).found(brief(&frame["file_path"])).hint(AGAIN)
         })?;
         check_inside(path, &format!("{field}.file_path"))?;
-        let given = path.trim_start_matches("./");
-        // Blender leaves the extension out.
-        let found = ["", ".png", ".jpg", ".jpeg", ".PNG", ".JPG", ".JPEG"]
-            .iter()
-            .map(|e| format!("{given}{e}"))
-            .find(|n| root.join(n).is_file())
-            .or_else(|| other_name(root, given));
-        let Some(name) = found else {
-            out.warnings.push(format!("{}: no such photograph, view skipped", root.join(given).display()));
+        let Some(name) = file_named(root, path) else {
+            out.warnings.push(format!("{}: no such photograph, view skipped", root.join(plain(path)).display()));
             continue;
         };
         // OpenGL cameras look along -z with y up; ours along +z with y down.
@@ -120,14 +109,13 @@ fn read_frames(root: &Path, json: &Value, split: Option<Split>, out: &mut RawDat
         let Some((rotation, translation)) = invert_pose(matrix(&frame["transform_matrix"], &field)? * flip, &field)?
         else {
             out.warnings.push(format!("{name}: the pose is not finite, view skipped"));
+            out.skipped.push(root.join(name));
             continue;
         };
         let image_path = root.join(&name);
         let lens = lens(json, frame, &image_path, &format!("frames[{i}]"))?;
         let listed = |key: &str| {
-            json[key]
-                .as_array()
-                .is_some_and(|l| l.iter().any(|n| n.as_str().is_some_and(|n| n.trim_start_matches("./") == given)))
+            json[key].as_array().is_some_and(|l| l.iter().any(|n| n.as_str().is_some_and(|n| plain(n) == plain(path))))
         };
         let split = split.or(match (listed("test_filenames"), listed("train_filenames")) {
             (true, false) => Some(Split::Test),
@@ -136,30 +124,44 @@ fn read_frames(root: &Path, json: &Value, split: Option<Split>, out: &mut RawDat
         });
         let short = ["images/", "color/"].iter().find_map(|folder| name.strip_prefix(folder));
         let name = short.unwrap_or(&name).to_string();
-        let depth = depth(root, json, frame, &format!("frames[{i}]"), &mut out.warnings)?;
-        out.views.push(RawView { name, image_path, lens, rotation, translation, split, depth });
+        let field = format!("frames[{i}]");
+        let depth = depth(root, json, frame, &field, &mut out.warnings)?;
+        let mask = companion(root, frame, &["mask_path"], &field, &mut out.warnings)?;
+        let turn = Turn::NONE;
+        out.views.push(RawView { name, image_path, lens, rotation, translation, split, depth, mask, turn });
     }
     Ok(())
 }
 
-/// The frame's depth image, as nerfstudio names it: a number of it is a millimetre, unless the file says otherwise.
-fn depth(root: &Path, file: &Value, frame: &Value, field: &str, warnings: &mut Vec<String>) -> Result<Option<Depth>> {
-    let Some(name) = frame["depth_file_path"].as_str() else { return Ok(None) };
-    check_inside(name, &format!("{field}.depth_file_path"))?;
-    let path = root.join(name.trim_start_matches("./"));
-    if !path.is_file() {
-        warnings.push(format!("{}: no such depth image", path.display()));
-        return Ok(None);
+/// The file beside a photograph that a frame names under one of the keys; none, with a warning, where it is not there.
+fn companion(
+    root: &Path,
+    frame: &Value,
+    keys: &[&str],
+    field: &str,
+    warnings: &mut Vec<String>,
+) -> Result<Option<PathBuf>> {
+    let Some((key, name)) = keys.iter().find_map(|key| Some((key, frame[key].as_str()?))) else { return Ok(None) };
+    check_inside(name, &format!("{field}.{key}"))?;
+    let found = file_named(root, name).map(|name| root.join(name));
+    if found.is_none() {
+        warnings.push(format!("{field}.{key}: no such file as {}", root.join(plain(name)).display()));
     }
-    let unit = match &file["depth_unit_scale_factor"] {
-        Value::Null => MILLIMETRES,
-        v => v.as_f64().filter(|u| *u > 0.0 && u.is_finite()).ok_or_else(|| {
-            Error::new("no unit of depth")
-                .field("depth_unit_scale_factor")
-                .found(brief(v))
-                .expected("a number above zero")
-        })?,
+    Ok(found)
+}
+
+/// The frame's depth image, as nerfstudio names it, or instant-ngp: a number of it is a millimetre, unless the file says otherwise.
+fn depth(root: &Path, file: &Value, frame: &Value, field: &str, warnings: &mut Vec<String>) -> Result<Option<Depth>> {
+    let Some(path) = companion(root, frame, &["depth_file_path", "depth_path"], field, warnings)? else {
+        return Ok(None);
     };
+    let given = ["depth_unit_scale_factor", "integer_depth_scale"].into_iter().find(|key| !file[key].is_null());
+    let unit = given.map_or(Ok(MILLIMETRES), |key| {
+        let number = file[key].as_f64().filter(|u| *u > 0.0 && u.is_finite());
+        number.ok_or_else(|| {
+            Error::new("no unit of depth").field(key).found(brief(&file[key])).expected("a number above zero")
+        })
+    })?;
     Ok(Some(Depth { path, unit, camera: DepthCamera::Photograph }))
 }
 
@@ -230,7 +232,7 @@ fn lens(file: &Value, frame: &Value, image: &Path, field: &str) -> Result<Lens> 
             }
             (w as u32, h as u32)
         }
-        _ => image::size_of(image)?,
+        _ => size_by_center(image, get("cx")?.zip(get("cy")?))?,
     };
     let of_angle = |angle: Option<f64>, size: u32| angle.map(|a| 0.5 * f64::from(size) / (0.5 * a).tan());
     let fx = get("fl_x")?.or(of_angle(get("camera_angle_x")?, w));

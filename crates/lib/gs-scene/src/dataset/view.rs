@@ -1,6 +1,8 @@
 //! One view: a photograph, the camera that took it, and the pinhole camera that stands for it.
 
 use super::depth::{Depth, DepthMap};
+use super::mask::Mask;
+use super::upright::{Turn, turn_planes};
 use super::{RawView, Resolution, Split};
 use crate::lens::Lens;
 use crate::{Camera, Image, size_within};
@@ -24,11 +26,13 @@ pub struct View {
     stem: String,
     lens: Lens,
     depth: Option<Depth>,
+    mask: Option<PathBuf>,
+    turn: Turn,
 }
 
 impl View {
     pub(super) fn new(raw: RawView, stem: String, split: Split, resolution: Resolution) -> Result<Self> {
-        let RawView { name, image_path, lens, rotation, translation, depth, .. } = raw;
+        let RawView { name, image_path, lens, rotation, translation, depth, mask, turn, .. } = raw;
         let Some(zoom) = lens.zoom() else {
             return Err(Error::new("the lens distortion is too strong to take out")
                 .file(image_path)
@@ -40,7 +44,7 @@ impl View {
         let (width, height) = lens.size;
         let full = Camera { width, height, fx: fx * zoom, fy: fy * zoom, cx, cy, rotation, translation };
         let (width, height) = resolution.apply(width, height);
-        Ok(Self { name, image_path, camera: full.resized(width, height), split, stem, lens, depth })
+        Ok(Self { name, image_path, camera: full.resized(width, height), split, stem, lens, depth, mask, turn })
     }
 
     /// By what masks and other files of this view are found: the file name without folder and last extension. Where
@@ -53,18 +57,18 @@ impl View {
         &self.lens
     }
 
-    /// Decodes the photograph, undistorts it and brings it to the camera's size.
+    /// Decodes the photograph, turns it upright, undistorts it and brings it to the camera's size.
     ///
     /// # Errors
     /// When the file cannot be read or its size is not the camera's.
     pub fn load_image(&self) -> Result<Image> {
-        self.load(&self.image_path, self.camera.width, self.camera.height)
+        self.load(self.camera.width, self.camera.height)
     }
 
     /// As [`Self::load_image`], at the photograph's own size, or with a longer side of so many pixels where it is larger.
     pub fn load_image_within(&self, longest: u32) -> Result<Image> {
         let (w, h) = size_within(self.lens.size, longest);
-        self.load(&self.image_path, w, h)
+        self.load(w, h)
     }
 
     /// Where the depth image lies, if there is one.
@@ -75,23 +79,43 @@ impl View {
     /// Decodes the depth image, undistorted as the photograph is; none where there is none.
     ///
     /// # Errors
-    /// When it cannot be read, or is no picture of 16-bit grey.
+    /// When it cannot be read, is neither a picture of 16-bit grey nor an npy file, or lies on a side beside the photograph.
     pub fn load_depth(&self) -> Result<Option<DepthMap>> {
         self.depth.as_ref().map(|d| d.load(self)).transpose()
     }
 
-    /// Decodes a mask of the photograph, a picture of the same size, as `[height][width]`, 0 (black) to 1 (white), at the
-    /// camera's size.
-    pub fn load_mask(&self, path: &Path) -> Result<Vec<f32>> {
-        let mask = self.load(path, self.camera.width, self.camera.height)?;
-        Ok(mask.rgb.as_chunks::<3>().0.iter().map(|p| p.iter().sum::<f32>() / 3.0).collect())
+    /// The mask that the dataset has of the photograph, if there is one.
+    pub fn mask_path(&self) -> Option<&Path> {
+        self.mask.as_deref()
     }
 
-    fn load(&self, path: &Path, width: u32, height: u32) -> Result<Image> {
-        let photo = Image::read(path)?;
-        self.lens.expect_size((photo.width, photo.height), path)?;
+    /// Decodes a mask of the photograph, of the same size as that.
+    ///
+    /// # Errors
+    /// When it cannot be read or has another size.
+    pub fn read_mask(&self, path: &Path) -> Result<Mask> {
+        let mask = Mask::read(path, self.turn)?;
+        self.lens.expect_size((mask.width, mask.height), path)?;
+        Ok(mask)
+    }
+
+    /// As [`Self::read_mask`], undistorted, `[height][width]` at the camera's size: by how much each pixel counts, 0 to 1.
+    pub fn load_mask(&self, path: &Path) -> Result<Vec<f32>> {
+        let Mask { width, height, values, .. } = self.read_mask(path)?;
+        let grey = Image { width, height, rgb: values.into_iter().flat_map(|v| [v; 3]).collect(), alpha: None };
+        let flat = self.flat(grey, self.camera.width, self.camera.height);
+        Ok(flat.rgb.iter().step_by(3).copied().collect())
+    }
+
+    fn load(&self, width: u32, height: u32) -> Result<Image> {
+        let photo = Image::read_turned(&self.image_path, self.turn.photograph)?;
+        self.lens.expect_size((photo.width, photo.height), &self.image_path)?;
+        Ok(self.flat(photo, width, height))
+    }
+
+    fn flat(&self, photo: Image, width: u32, height: u32) -> Image {
         let flat = if self.lens.distortion.is_none() { photo } else { self.undistort(&photo) };
-        Ok(flat.resize_area(width, height))
+        flat.resize_area(width, height)
     }
 
     /// Whether the lens bends straight lines: what was made from the photograph as it lies on disk has them bent, too.
@@ -99,10 +123,24 @@ impl View {
         !self.lens.distortion.is_none()
     }
 
-    /// Takes the distortion out of numbers that cannot be mixed, such as mask ids: each pixel takes the number of the nearest
-    /// one, at the place that [`Self::load_image`] takes its colour from. `planes` are pictures `[height][width]`, one
-    /// after the other, of the photograph as it lies on disk, and may be smaller than it, not of another shape.
-    pub fn undistort_nearest<T: Copy>(&self, planes: &mut [T], width: usize, height: usize) {
+    /// Whether the camera sees the photograph as it lies on disk: neither turned nor bent. [`Self::straighten`] then changes nothing.
+    pub fn is_straight(&self) -> bool {
+        !self.is_distorted() && self.turn.lying.is_none()
+    }
+
+    /// Brings numbers that cannot be mixed, such as mask ids, to the camera of the view: turns them upright, takes the distortion out,
+    /// and gives their width and height. `planes` are pictures `[height][width]`, one after the other, of the photograph as it lies on
+    /// disk, and may be smaller than it, not of another shape.
+    pub fn straighten<T: Copy>(&self, planes: &mut [T], (width, height): (usize, usize)) -> (usize, usize) {
+        let turn = self.turn.of_companion((width as u32, height as u32));
+        let (width, height) = turn_planes(planes, (width, height), turn);
+        self.undistort_nearest(planes, width, height);
+        (width, height)
+    }
+
+    /// Takes the distortion out: each pixel takes the number of the nearest one, at the place that [`Self::load_image`] takes its
+    /// colour from.
+    pub(super) fn undistort_nearest<T: Copy>(&self, planes: &mut [T], width: usize, height: usize) {
         if !self.is_distorted() || width * height == 0 {
             return;
         }

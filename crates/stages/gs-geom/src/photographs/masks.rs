@@ -1,7 +1,8 @@
 //! Which pixels of a photograph count: alpha channels and mask files.
 
 use gs_io::{Error, Result, hash_bytes, hash_file};
-use gs_scene::dataset::View;
+use gs_scene::dataset::{Odd, View};
+use rayon::prelude::*;
 use serde::Serialize;
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
@@ -43,6 +44,30 @@ impl Masks {
                 .expected(views.first().map_or_else(String::new, |v| format!("pictures such as {}.png", v.stem()))));
         }
         Ok(Self(all))
+    }
+
+    /// Those that the dataset itself has.
+    pub fn of_dataset(views: &[View]) -> Self {
+        Self(views.iter().filter_map(|v| Some((v.name.clone(), v.mask_path()?.to_path_buf()))).collect())
+    }
+
+    /// What transparent pixels mean: with masks, that they do not count.
+    pub fn alpha(&self) -> Alpha {
+        if self.0.is_empty() { Alpha::Background } else { Alpha::Ignore }
+    }
+
+    /// Views whose masks are written in an odd way. Reads them all.
+    ///
+    /// # Errors
+    /// When one cannot be read or has another size than its photograph.
+    pub fn odd(&self, views: &[View]) -> Result<BTreeMap<Odd, Vec<String>>> {
+        let odd = |view: &View| self.of(view).map_or(Ok(None), |path| Ok(view.read_mask(path)?.odd));
+        let all = views.par_iter().map(odd).collect::<Result<Vec<_>>>()?;
+        let mut by_kind = BTreeMap::<Odd, Vec<String>>::new();
+        for (view, odd) in views.iter().zip(all) {
+            odd.into_iter().for_each(|odd| by_kind.entry(odd).or_default().push(view.name.clone()));
+        }
+        Ok(by_kind)
     }
 
     pub fn of(&self, view: &View) -> Option<&Path> {

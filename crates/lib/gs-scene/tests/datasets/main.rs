@@ -1,5 +1,9 @@
 //! Datasets in every layout, made on the spot.
 
+mod beside;
+mod upright;
+mod which;
+
 use glam::{DMat3, DVec3};
 use gs_scene::dataset::{self, Dataset, Format, LoadOptions, Resolution, Split};
 use gs_scene::{Camera, Image, PointCloud, colmap, ply};
@@ -273,7 +277,7 @@ fn check_undistortion(model: &str, parameters: &[f64], intrinsics: [f64; 4], dis
         let (before, after) = (photo.resize_area(w / shrink, h / shrink), image.resize_area(w / shrink, h / shrink));
         let planes = |i: &Image| [0, 1].map(|c| i.rgb.iter().skip(c).step_by(3).copied().collect::<Vec<_>>()).concat();
         let mut found = planes(&before);
-        view.undistort_nearest(&mut found, (w / shrink) as usize, (h / shrink) as usize);
+        view.straighten(&mut found, ((w / shrink) as usize, (h / shrink) as usize));
         assert!(found.iter().all(|v| before.rgb.contains(v)), "{model}: a number that was not there");
         let worst = found.iter().zip(planes(&after)).fold(0.0f32, |m, (a, b)| m.max((a - b).abs()));
         assert!(worst < most, "{model}, shrunk by {shrink}: {worst}");
@@ -597,96 +601,6 @@ fn cameras_that_no_one_has_are_refused_whatever_the_layout() {
         colmap(of(change)).unwrap();
         transforms(of(change)).unwrap();
     }
-}
-
-#[test]
-fn extensions_may_be_in_capitals_whatever_the_model_says() {
-    let dir = tempfile::tempdir().unwrap();
-    let root = dir.path();
-    let cameras = cameras(3, 40, 30);
-    colmap_scene(root, &cameras);
-    // As cameras write them, as a program renamed them, and as another did.
-    let named = [("a.JPG", "a.JPG"), ("b.jpg", "b.JPG"), ("c.JPEG", "c.jpeg")];
-    let jpeg = image::RgbImage::from_raw(40, 30, plain(40, 30).to_rgb8()).unwrap();
-    fs::remove_dir_all(root.join("images")).unwrap();
-    fs::create_dir(root.join("images")).unwrap();
-    for (_, file) in named {
-        jpeg.save_with_format(root.join("images").join(file), image::ImageFormat::Jpeg).unwrap();
-    }
-    let views: Vec<_> = named.iter().zip(&cameras).map(|(n, c)| (n.0.to_string(), c.clone())).collect();
-    colmap::write_model(&root.join("sparse/0"), &views, &points()).unwrap();
-    let found = |d: &Dataset| d.views.iter().map(|v| (v.stem().to_string(), v.image_path.clone())).collect::<Vec<_>>();
-    let expected: Vec<_> =
-        named.iter().map(|(_, file)| (file[..1].to_string(), root.join("images").join(file))).collect();
-    let d = dataset::load(root, &FULL).unwrap();
-    assert_eq!((found(&d), d.warnings.len()), (expected.clone(), 0));
-    assert!(d.views.iter().all(|v| v.load_image().is_ok()));
-    fs::remove_dir_all(root.join("sparse")).unwrap();
-    let c = &cameras[0];
-    let frames: Vec<_> = named
-        .iter()
-        .map(|(name, _)| json!({"file_path": format!("images/{name}"), "transform_matrix": opengl(c)}))
-        .collect();
-    let json = json!({"w": 40, "h": 30, "fl_x": c.fx, "fl_y": c.fy, "cx": c.cx, "cy": c.cy, "frames": frames});
-    write(&root.join("transforms.json"), &json.to_string());
-    let d = dataset::load(root, &FULL).unwrap();
-    assert_eq!((found(&d), d.warnings.len()), (expected, 0));
-}
-
-#[test]
-fn names_written_in_another_way_are_found() {
-    let dir = tempfile::tempdir().unwrap();
-    let root = dir.path();
-    let cameras = cameras(3, 20, 16);
-    // In the model composed, by Windows, and as it is; on the disk decomposed, in a folder, and with two blanks.
-    let named =
-        [("K\u{fc}che.png", "Ku\u{308}che.png"), ("a\\b.png", "a/b.png"), ("two  blanks.png", "two  blanks.png")];
-    for (_, file) in named {
-        let path = root.join("images").join(file);
-        fs::create_dir_all(path.parent().unwrap()).unwrap();
-        plain(20, 16).write_png(path).unwrap();
-    }
-    let views: Vec<_> = named.iter().zip(&cameras).map(|(n, c)| (n.0.to_string(), c.clone())).collect();
-    let c = &cameras[0];
-    let model = root.join("sparse/0");
-    text_model(&model, &views, "PINHOLE", &[c.fx, c.fy, c.cx, c.cy]);
-    // Saved by an editor that drops empty lines and puts a mark before the text.
-    for file in ["cameras.txt", "images.txt", "points3D.txt"] {
-        let text = fs::read_to_string(model.join(file)).unwrap();
-        let lines: Vec<&str> = text.lines().filter(|l| !l.is_empty()).collect();
-        write(&model.join(file), &format!("\u{feff}{}\r\n", lines.join("\r\n")));
-    }
-    let d = dataset::load(root, &FULL).unwrap();
-    assert_eq!((d.views.len(), &d.warnings), (3, &vec![]));
-    fs::remove_dir_all(root.join("sparse")).unwrap();
-    let frames: Vec<_> = named
-        .iter()
-        .map(|(name, _)| {
-            let name = format!("images\\{name}");
-            json!({"file_path": name, "mask_path": "masks/a.png", "transform_matrix": opengl(c)})
-        })
-        .collect();
-    let json = json!({"w": 20, "h": 16, "fl_x": c.fx, "fl_y": c.fy, "cx": c.cx, "cy": c.cy, "frames": frames});
-    write(&root.join("transforms.json"), &format!("\u{feff}{json}"));
-    let d = dataset::load(root, &FULL).unwrap();
-    // Masks of the frames are not read, which is said once.
-    assert_eq!((d.views.len(), d.warnings.len()), (3, 1));
-    assert!(d.warnings[0].contains("mask_path") && d.warnings[0].contains("--masks"), "{:?}", d.warnings);
-}
-
-#[test]
-fn of_several_models_the_one_with_most_photographs_is_taken_and_it_is_said() {
-    let dir = tempfile::tempdir().unwrap();
-    let views = colmap_scene(dir.path(), &cameras(6, 20, 16));
-    let sparse = dir.path().join("sparse");
-    colmap::write_model(&sparse.join("0"), &views[..2], &points()).unwrap();
-    colmap::write_model(&sparse.join("10"), &views[..5], &points()).unwrap();
-    let d = dataset::load(dir.path(), &FULL).unwrap();
-    assert_eq!((d.views.len(), d.warnings.len()), (5, 2), "{:?}", d.warnings);
-    assert!(
-        d.warnings[0].contains("sparse/10 with 5 photographs is taken") && d.warnings[0].contains("sparse/0 with 2")
-    );
-    assert!(d.warnings[1].contains("1 of 6 photographs in") && d.warnings[1].contains("are in no view"));
 }
 
 #[test]
