@@ -233,6 +233,104 @@ mod tests {
         assert_eq!(a, b);
     }
 
+    /// The benchmark's own way: lists of outcomes, sorted, summed up from the least confident, and the area by a convolution with
+    /// (-1/2, 0, 1/2).
+    fn as_the_benchmark_counts(
+        truth: &[i32],
+        predicted: &[i32],
+        confidence: &[f32],
+        least: usize,
+        iou: f64,
+    ) -> Option<f64> {
+        let points = |of: &[i32], id: i32| of.iter().filter(|&&v| v == id).count();
+        let both = |t: i32, p: i32| truth.iter().zip(predicted).filter(|&(&a, &b)| (a, b) == (t, p)).count();
+        let large = |of: &[i32]| {
+            let mut ids: Vec<i32> = of.iter().copied().filter(|&id| id >= 0 && points(of, id) >= least).collect();
+            ids.sort_unstable();
+            ids.dedup();
+            ids
+        };
+        let (things, found) = (large(truth), large(predicted));
+        let overlap = |t: i32, p: i32| {
+            let both = both(t, p);
+            both as f64 / (points(truth, t) + points(predicted, p) - both) as f64
+        };
+        let (mut outcomes, mut missed, mut visited) = (Vec::new(), 0, BTreeSet::new());
+        for &t in &things {
+            let mut best: Option<f32> = None;
+            for &p in found.iter().filter(|&&p| overlap(t, p) > iou) {
+                let score = confidence[p as usize];
+                if visited.contains(&p) {
+                    continue;
+                }
+                match best {
+                    Some(before) => {
+                        outcomes.push((before.min(score), 0));
+                        best = Some(before.max(score));
+                    }
+                    None => {
+                        best = Some(score);
+                        visited.insert(p);
+                    }
+                }
+            }
+            match best {
+                Some(score) => outcomes.push((score, 1)),
+                None => missed += 1,
+            }
+        }
+        for &p in found.iter().filter(|&&p| things.iter().all(|&t| overlap(t, p) <= iou)) {
+            let ignored = truth.iter().zip(predicted).filter(|&(t, &q)| q == p && !things.contains(t)).count();
+            if ignored as f64 / points(predicted, p) as f64 <= iou {
+                outcomes.push((confidence[p as usize], 0));
+            }
+        }
+        outcomes.sort_by(|a, b| a.0.total_cmp(&b.0));
+        let mut cuts: Vec<f32> = outcomes.iter().map(|o| o.0).collect();
+        cuts.dedup();
+        let all: usize = outcomes.iter().map(|o| o.1).sum();
+        let (mut precision, mut recall) = (Vec::new(), Vec::new());
+        for cut in cuts {
+            let hits: usize = outcomes.iter().filter(|o| o.0 >= cut).map(|o| o.1).sum();
+            precision.push(hits as f64 / outcomes.iter().filter(|o| o.0 >= cut).count() as f64);
+            recall.push(hits as f64 / (all + missed) as f64);
+        }
+        precision.push(1.0);
+        recall.push(0.0);
+        let padded = [&recall[..1], &recall, &[0.0]].concat();
+        let widths = padded.windows(3).map(|w| 0.5 * (w[0] - w[2]));
+        (!things.is_empty()).then(|| precision.iter().zip(widths).map(|(p, w)| p * w).sum())
+    }
+
+    #[test]
+    fn forty_random_scans_are_scored_as_the_benchmark_scores_them() {
+        let mut state = 7u64;
+        let mut random = |below: usize| {
+            state = state.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1_442_695_040_888_963_407);
+            (state >> 33) as usize % below
+        };
+        let mut informative = 0;
+        for case in 0..40 {
+            let n = 60 + random(120);
+            let things = 2 + random(8);
+            let truth: Vec<i32> = (0..n).map(|i| (i * things / n) as i32 - i32::from(random(6) == 0)).collect();
+            let shown: Vec<i32> = (0..n)
+                .map(|i| if random(4) == 0 { random(things + 3) as i32 - 1 } else { truth[i] / (1 + case % 2) })
+                .collect();
+            let confidence: Vec<f32> = (0..things + 3).map(|_| random(5) as f32 / 4.0).collect();
+            // Faint vertices leave truth and prediction alike.
+            let seen: Vec<usize> = (0..n).filter(|_| random(7) > 0).collect();
+            let [truth, shown] = [truth, shown].map(|of| seen.iter().map(|&i| of[i]).collect::<Vec<i32>>());
+            let s = score(&truth, &shown, &confidence, 5);
+            for (ours, iou) in [(s.ap25, 0.25), (s.ap50, 0.5)] {
+                let theirs = as_the_benchmark_counts(&truth, &shown, &confidence, 5, iou);
+                assert!(ours.zip(theirs).is_some_and(|(a, b)| (a - b).abs() < 1e-12), "{case}: {ours:?} {theirs:?}");
+                informative += usize::from(ours.is_some_and(|ap| ap > 0.05 && ap < 0.95));
+            }
+        }
+        assert!(informative > 40, "{informative}");
+    }
+
     #[test]
     fn average_precision_by_hand() {
         let truth = [0, 0, 0, 0, 1, 1, 1, 1];
