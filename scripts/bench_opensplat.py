@@ -89,7 +89,7 @@ def main():
         def score(ply):
             out = folder / "score.json"
             subprocess.run([geom, "eval", "--scene", args.scene, "--resolution", str(args.resolution), "--geometry", ply, "--out", out,
-                            "--quiet"], check=True)
+                            "--holdout", "8", "--quiet"], check=True)
             return json.loads(out.read_text())
 
         programs = {"opensplat": opensplat, "gs-geom": ours}

@@ -101,6 +101,9 @@ impl Resolution {
     }
 }
 
+/// Every n-th view is held out where nothing says otherwise.
+pub const HOLDOUT: usize = 8;
+
 /// How to load a dataset.
 #[derive(Debug, Clone, PartialEq)]
 pub struct LoadOptions {
@@ -113,7 +116,7 @@ pub struct LoadOptions {
 
 impl Default for LoadOptions {
     fn default() -> Self {
-        Self { resolution: Resolution::Auto, holdout: 8 }
+        Self { resolution: Resolution::Auto, holdout: HOLDOUT }
     }
 }
 
@@ -132,6 +135,8 @@ pub struct Dataset {
     pub files: Vec<PathBuf>,
     /// What was odd: views without a file, poses without numbers.
     pub warnings: Vec<String>,
+    /// Whether it names its own held-out views.
+    pub(crate) names_its_own: bool,
 }
 
 /// A view before resolution and split are applied.
@@ -309,7 +314,7 @@ fn finish(root: &Path, mut raw: RawDataset, options: &LoadOptions) -> Result<Dat
     let views = raw.views.into_iter().zip(stems).enumerate().map(|(i, (v, stem))| {
         let split = match v.split.filter(|_| names_its_own) {
             Some(split) => split,
-            None if options.holdout > 0 && i % options.holdout == 0 => Split::Test,
+            None if is_held_out(i, options.holdout) => Split::Test,
             None => Split::Train,
         };
         View::new(v, stem, split, options.resolution)
@@ -330,10 +335,23 @@ fn finish(root: &Path, mut raw: RawDataset, options: &LoadOptions) -> Result<Dat
     let beside =
         |v: &View| [v.depth_path(), v.mask_path()].into_iter().flatten().map(Path::to_path_buf).collect::<Vec<_>>();
     files.extend(views.iter().flat_map(beside));
-    Ok(Dataset { root: root.to_path_buf(), format, views, points, files, warnings })
+    Ok(Dataset { root: root.to_path_buf(), format, views, points, files, warnings, names_its_own })
+}
+
+/// Whether view `i` is held out where every n-th one is.
+fn is_held_out(i: usize, every: usize) -> bool {
+    every > 0 && i.is_multiple_of(every)
 }
 
 impl Dataset {
+    /// Whether each view is held out where every n-th one is; views that the dataset itself holds out stay so.
+    pub fn held_out(&self, every: usize) -> impl Iterator<Item = bool> {
+        self.views
+            .iter()
+            .enumerate()
+            .map(move |(i, v)| if self.names_its_own { v.split == Split::Test } else { is_held_out(i, every) })
+    }
+
     /// Views of one split.
     pub fn views_of(&self, split: Split) -> impl Iterator<Item = &View> {
         self.views.iter().filter(move |v| v.split == split)

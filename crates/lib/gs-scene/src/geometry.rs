@@ -1,6 +1,6 @@
 //! A finished geometry, as every stage after the first reads it.
 
-use crate::{Gaussians, ply, splat};
+use crate::{Gaussians, Learnt, ply, splat};
 use gs_io::{Error, Result};
 use std::path::Path;
 
@@ -18,6 +18,8 @@ pub struct Geometry {
     pub antialias: bool,
     /// What the file has that was left out, such as spherical harmonics of degree 4.
     pub left_out: Vec<String>,
+    /// Which views they were learnt from, where the file says it.
+    pub learnt: Option<Learnt>,
 }
 
 impl Geometry {
@@ -38,12 +40,13 @@ impl Geometry {
             .hint("make one file of them: gs-geom convert IN OUT.ply"));
         }
         let splat::Splat { gaussians: mut g, antialias, left_out, .. } = splat::read(path)?;
+        let learnt = Learnt::read(path)?;
         g.bound_opacities();
         let stride = g.sh_stride();
         let damaged: Vec<u32> = (0..g.len() as u32).filter(|&i| !g.is_whole(i as usize)).collect();
         let Some(first) = (0..g.len()).find(|&i| damaged.get(i) != Some(&(i as u32))) else {
             if g.is_empty() {
-                return Ok(Self { gaussians: g, damaged, antialias, left_out });
+                return Ok(Self { gaussians: g, damaged, antialias, left_out, learnt });
             }
             return Err(Error::new(
                 "no Gaussian is whole: every one has a number that is not finite, or a rotation of length 0",
@@ -62,7 +65,7 @@ impl Geometry {
             g.opacity_logits[i] = INVISIBLE;
             g.sh[i * stride..(i + 1) * stride].fill(0.0);
         }
-        Ok(Self { gaussians: g, damaged, antialias, left_out })
+        Ok(Self { gaussians: g, damaged, antialias, left_out, learnt })
     }
 
     /// What is to be said of damaged Gaussians and of what was left out, where there are any.
@@ -86,6 +89,7 @@ impl Geometry {
     /// Comments for a PLY of these Gaussians: `own`, and the mark of how they are to be rendered.
     pub fn comments(&self, mut own: Vec<String>) -> Vec<String> {
         own.extend(self.antialias.then(|| ply::ANTIALIASED.to_string()));
+        own.extend(self.learnt.iter().flat_map(Learnt::comments));
         own
     }
 }

@@ -59,6 +59,16 @@ fn read_header(path: &Path) -> Result<(Vec<String>, [bool; 2])> {
     Ok((comments.into_iter().map(String::from).collect(), there))
 }
 
+/// The comments of a PLY; none of a file of another format.
+pub(crate) fn comments(path: &Path) -> Result<Vec<String>> {
+    // A SOG may be a folder.
+    let mut start = Vec::new();
+    if path.is_file() {
+        std::fs::File::open(path).at("open", path)?.take(3).read_to_end(&mut start).at("read", path)?;
+    }
+    if start == b"ply" { Ok(read_header(path)?.0) } else { Ok(Vec::new()) }
+}
+
 /// The comment of a PLY whose Gaussians were learnt with the 2D filter of Mip-Splatting.
 pub const ANTIALIASED: &str = "antialias true";
 

@@ -81,6 +81,15 @@ pub struct SkipArgs {
     pub no_skip: bool,
 }
 
+/// Which views are held out, for the stages that learn from views or are measured on those left.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, clap::Args, serde::Serialize)]
+pub struct HoldoutArgs {
+    /// Hold out every n-th view, from the first; 0 holds none out [as the Gaussians were trained; 8 where they are not, or do not
+    /// say it]
+    #[arg(long, value_name = "N")]
+    pub holdout: Option<usize>,
+}
+
 /// What `--version` says: the version and the git revision.
 const VERSION: &str = concat!(env!("CARGO_PKG_VERSION"), " (", env!("CAGS_REVISION"), ")");
 

@@ -502,9 +502,9 @@ pub struct ReportOptions {
     #[command(flatten)]
     #[serde(flatten)]
     pub views: Views,
-    /// Hold out every Nth view, as in training; 0 for none
-    #[arg(long, default_value_t = 8, value_name = "N")]
-    pub holdout: usize,
+    #[command(flatten)]
+    #[serde(flatten)]
+    pub held: stage::HoldoutArgs,
     /// The page; metrics.json is written beside it
     #[arg(long, value_name = "FILE")]
     pub out: PathBuf,

@@ -16,7 +16,8 @@ use crate::memory::{self, Sizes};
 use crate::options::ReportOptions;
 use crate::scene::{VIEWS, folder_name, load};
 use gs_io::{Error, Result, write_bytes, write_json};
-use gs_scene::dataset::{LoadOptions, Split};
+use gs_scene::HoldOut;
+use gs_scene::dataset::LoadOptions;
 use report::html::Page;
 use serde_json::{Value, json};
 use stage::Stage;
@@ -25,12 +26,15 @@ use std::path::{Path, PathBuf};
 /// Where explore serves a run unless it is told otherwise.
 const EXPLORE: &str = "http://127.0.0.1:7007/";
 
-pub(crate) fn run(o: &ReportOptions, parameters: Value, stage: &Stage) -> Result<String> {
+pub(crate) fn run(o: &ReportOptions, mut parameters: Value, stage: &Stage) -> Result<String> {
     if !o.run_dir.is_dir() {
         return Err(Error::new("no such folder").field("--run-dir").file(&o.run_dir).expected("OUT of a run"));
     }
-    let load_options = LoadOptions { resolution: o.views.resolution, holdout: o.holdout };
+    let held = HoldOut::of(&o.geometry, o.held.holdout)?;
+    parameters["holdout"] = json!(held.every);
+    let load_options = LoadOptions { resolution: o.views.resolution, holdout: held.every };
     let dataset = load(&o.scene, &load_options, stage)?;
+    held.differs(&dataset).iter().for_each(|what| stage.warn(what));
     let sizes = Sizes {
         geometry: memory::bytes(&o.geometry),
         features: memory::bytes(&o.run_dir.join("features.safetensors")),
@@ -43,7 +47,7 @@ pub(crate) fn run(o: &ReportOptions, parameters: Value, stage: &Stage) -> Result
     let outputs = stage.outputs(out).file(out).file(&figures);
     let mut claim = outputs.reads(&dataset.files).reads(files(&o.run_dir).chain([o.geometry.clone()])).claim()?;
     let mut metrics = Metrics::default();
-    let material = Material::read(&dataset, o, &o.geometry, masks(o), &mut metrics)?;
+    let material = Material::read(&dataset, o, &held, masks(o), &mut metrics)?;
     write_bytes(out, write(&material, &mut metrics)?.as_bytes())?;
     write_json(&figures, &metrics)?;
     stage.record(&mut claim, parameters, material.inputs, json!({"left_out": metrics.skipped.len()}))?;
@@ -91,10 +95,11 @@ fn write(material: &Material, metrics: &mut Metrics) -> Result<String> {
     sections::left_out(&records, &mut page, metrics);
 
     let (width, height) = dataset.views.first().map_or((0, 0), |v| (v.camera.width, v.camera.height));
+    let unseen = material.unseen.as_ref().map(|unseen| format!(" ({} held out)", unseen.len()));
     let subtitle = format!(
-        "{} photographs ({} held out) of {width}x{height} pixels, {} Gaussians",
+        "{} photographs{} of {width}x{height} pixels, {} Gaussians",
         dataset.views.len(),
-        dataset.views_of(Split::Test).count(),
+        unseen.unwrap_or_default(),
         grouped(&gaussians.to_string()),
     );
     Ok(page.finish(&folder_name(&material.options.run_dir), &subtitle))
@@ -128,9 +133,12 @@ fn run_records(m: &Material) -> Result<Vec<Run>> {
 fn geometry_figures(m: &Material, metrics: &mut Metrics) -> Result<()> {
     match optional_json::<Value>(&m.file("geom_metrics.json"))? {
         Some(v) => {
-            let number = |names: [&str; 2]| names.iter().find_map(|n| v.get(n).and_then(Value::as_f64));
-            metrics.psnr_heldout = number(["psnr_heldout", "psnr"]);
-            metrics.ssim_heldout = number(["ssim_heldout", "ssim"]);
+            let number = |name: &str| v.get(name).and_then(Value::as_f64);
+            (metrics.psnr_heldout, metrics.ssim_heldout) = (number("psnr_heldout"), number("ssim_heldout"));
+            if metrics.psnr_heldout.is_none() {
+                let why = "PSNR and SSIM of held-out views: geom_metrics.json is of views that training saw, or may have seen";
+                metrics.skipped.push(why.into());
+            }
         }
         None => metrics.skipped.push("PSNR and SSIM: the run has no geom_metrics.json (gs-geom eval makes it)".into()),
     }

@@ -38,9 +38,9 @@ pub(crate) struct Settings {
     /// Views whose masks are used; the protocols learn from training views only
     #[arg(long, value_enum, default_value_t = Views::Train)]
     pub views: Views,
-    /// Hold out every N-th view; 0 holds none out
-    #[arg(long, value_name = "N", default_value_t = 8)]
-    pub holdout: usize,
+    #[command(flatten)]
+    #[serde(flatten)]
+    pub held: stage::HoldoutArgs,
     /// Share of the Gaussians that become anchors; at least one does
     #[arg(long, value_name = "SHARE", default_value_t = 0.1, value_parser = stage::within(1e-9..=1.0))]
     pub anchor_ratio: f64,

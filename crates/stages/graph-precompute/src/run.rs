@@ -4,8 +4,8 @@ use crate::options::{Args, Views};
 use crate::precompute::{Summary, precompute};
 use artifacts::{Footprints, Graph, MaskMaps, ScratchEntries, hash_folder, maps_path, role, watch_folder};
 use gs_io::{Error, Result, Watched, hash_file};
-use gs_scene::Geometry;
 use gs_scene::dataset::{self, LoadOptions, Resolution, Split, View};
+use gs_scene::{Geometry, HoldOut};
 use serde_json::json;
 use stage::{CommonArgs, Program, Stage};
 use std::collections::BTreeMap;
@@ -19,9 +19,11 @@ impl Program for Args {
     }
 
     /// Reads geometry and views, computes footprints and graph, and writes them.
-    fn run(self, stage: &Stage) -> Result<()> {
+    fn run(mut self, stage: &Stage) -> Result<()> {
+        let held = HoldOut::of(&self.geometry, self.settings.held.holdout)?;
+        self.settings.held.holdout = Some(held.every);
         // The size of the id maps decides the resolution, so photographs count at full size.
-        let load = LoadOptions { resolution: Resolution::Divisor(1.0), holdout: self.settings.holdout };
+        let load = LoadOptions { resolution: Resolution::Divisor(1.0), holdout: held.every };
         let dataset = dataset::load(&self.scene, &load)?;
         let maps = dataset.views.iter().map(|v| maps_path(&self.masks, v.stem()));
         let mut claim = stage
@@ -32,7 +34,7 @@ impl Program for Args {
             .reads(dataset.files.iter().cloned().chain(maps).chain([self.geometry.clone()]))
             .claim()?;
         let watched = Watched::new([&self.geometry]).and(watch_folder(&self.masks, "_s.npy")?);
-        dataset.warnings.iter().for_each(|w| stage.warn(w));
+        dataset.warnings.iter().chain(&held.differs(&dataset)).for_each(|w| stage.warn(w));
         let wanted = |v: &&View| self.settings.views == Views::All || v.split == Split::Train;
         let views: Vec<&View> = dataset.views.iter().filter(wanted).collect();
         if views.is_empty() {

@@ -4,7 +4,7 @@ use artifacts::{Footprints, Graph, Level, MaskMaps, Row, maps_path, role};
 use glam::DVec3;
 use gs_io::Provenance;
 use gs_scene::dataset::{self, LoadOptions, Resolution};
-use gs_scene::{Camera, Gaussians, Image, PointCloud, colmap, ply};
+use gs_scene::{Camera, Gaussians, Image, Learnt, PointCloud, colmap, ply};
 use ndarray::Array3;
 use std::path::{Path, PathBuf};
 use std::process::{Command, Output};
@@ -102,6 +102,23 @@ fn artifacts_are_right_and_the_same_for_any_number_of_threads() {
     let cut = Footprints::read(o.join("footprints.safetensors")).unwrap();
     assert_eq!(cut.views.len(), 5);
     assert!(cut.total() * 4 < f.total() * 5);
+}
+
+#[test]
+fn views_are_held_out_as_the_gaussians_were_trained() {
+    let (_dir, s, o) = setup(SIZE);
+    let dataset = dataset::load(&s, &LoadOptions::default()).unwrap();
+    let hash = Learnt::hash(&dataset, 2);
+    let comments = ["holdout 2".to_string(), format!("learnt_views \"{hash}\"")];
+    ply::write_gaussians(s.join("geometry.ply"), &gaussians(), &comments).unwrap();
+    let views = || Footprints::read(o.join("footprints.safetensors")).unwrap().views;
+    succeed(&run(&s, &o, &[]));
+    assert_eq!(views(), ["v1", "v3"]);
+    let provenance = Graph::read(o.join("graph.safetensors")).unwrap().1;
+    assert_eq!(provenance.provenance().parameters["holdout"], 2);
+    let said = succeed(&run(&s, &o, &["--holdout", "0"]));
+    assert!(said.contains("--holdout 0, but the Gaussians were trained with --holdout 2"), "{said}");
+    assert_eq!(views().len(), 5);
 }
 
 #[test]

@@ -6,7 +6,7 @@ use crate::options::{Convert, Order, bytes};
 use artifacts::role;
 use gs_io::{Error, Result};
 use gs_scene::splat::{self, Extra, Format, Splat};
-use gs_scene::{Gaussians, morton_order};
+use gs_scene::{Gaussians, Learnt, morton_order};
 use serde_json::json;
 use stage::Stage;
 use std::collections::BTreeMap;
@@ -48,6 +48,7 @@ impl Convert {
         let mut comments = vec![format!("made by gs-geom {} convert", env!("CARGO_PKG_VERSION"))];
         comments.extend(inputs.iter().map(|(role, hash)| format!("{role} {hash}")));
         comments.push(format!("parameters {parameters}"));
+        comments.extend(Learnt::read(&self.input)?.iter().flat_map(Learnt::comments));
         splat::write(&self.output, &g, &Extra { comments: &comments, antialias, instance: None })?;
         stage.info(&format!("{} of {all} Gaussians, SH degree {}, in {}", g.len(), g.sh_degree, self.output.display()));
         let summary = json!({

@@ -16,7 +16,7 @@ const MOST_PSNR: f64 = 100.0;
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct ViewMetrics {
     pub name: String,
-    /// `train` or `test`.
+    /// `train`, `test`, or `unknown` where it may be either.
     pub split: &'static str,
     /// Peak signal-to-noise ratio, dB; none where no pixel counts.
     pub psnr: Option<f64>,

@@ -8,8 +8,8 @@ use crate::views::Views;
 use clap::{Parser, Subcommand, ValueEnum};
 use gs_io::{Error, Result};
 use gs_raster::RasterOptions;
-use gs_scene::dataset::{self, Dataset, LoadOptions, Resolution};
-use gs_scene::{Gaussians, Geometry};
+use gs_scene::dataset::{self, Dataset, HOLDOUT, LoadOptions, Resolution};
+use gs_scene::{Gaussians, Geometry, HoldOut};
 use serde::{Serialize, Serializer};
 use stage::{Bytes, CommonArgs, Stage, positive, within};
 use std::fmt::Display;
@@ -53,9 +53,9 @@ pub(crate) struct SceneOptions {
     #[arg(long, value_name = "auto|WIDTHpx|DIVISOR", default_value = "auto")]
     #[serde(serialize_with = "as_text")]
     pub resolution: Resolution,
-    /// Hold out every n-th view, from the first; 0 holds none out
-    #[arg(long, value_name = "N", default_value_t = 8)]
-    pub holdout: usize,
+    #[command(flatten)]
+    #[serde(flatten)]
+    pub held: stage::HoldoutArgs,
     /// Colour behind the scene, and behind transparent pixels of the photographs
     #[arg(long, value_enum, default_value_t = Background::Black)]
     pub background: Background,
@@ -338,7 +338,15 @@ fn as_text<S: Serializer>(value: &impl Display, serializer: S) -> std::result::R
 impl SceneOptions {
     /// The dataset, without its warnings.
     pub fn load_quietly(&self) -> Result<Dataset> {
-        dataset::load(&self.scene, &LoadOptions { resolution: self.resolution, holdout: self.holdout })
+        let holdout = self.held.holdout.unwrap_or(HOLDOUT);
+        dataset::load(&self.scene, &LoadOptions { resolution: self.resolution, holdout })
+    }
+
+    /// These with the views held out that are so for the Gaussians of a file, and what is known of them.
+    pub fn for_geometry(&self, geometry: &GeometryOptions) -> Result<(Self, HoldOut)> {
+        let held = HoldOut::of(&geometry.geometry, self.held.holdout)?;
+        let every = stage::HoldoutArgs { holdout: Some(held.every) };
+        Ok((Self { held: every, ..self.clone() }, held))
     }
 
     /// The dataset.

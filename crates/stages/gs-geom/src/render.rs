@@ -14,7 +14,9 @@ use std::io::Cursor;
 
 impl Render {
     pub(crate) fn run(&self, stage: &Stage) -> Result<()> {
-        let dataset = self.scene.load(stage)?;
+        let (scene, held) = self.scene.for_geometry(&self.geometry)?;
+        let dataset = scene.load(stage)?;
+        held.differs(&dataset).iter().for_each(|what| stage.warn(what));
         let needed = memory::of_renders(bytes(&self.geometry.geometry)?, &Pictures::of(&dataset)?, self.exr);
         stage.forecast(needed, "give a smaller --geometry or --resolution")?;
         let (gaussians, options) = self.geometry.read(self.scene.background, stage)?;
@@ -40,7 +42,7 @@ impl Render {
             (role::DATASET.to_string(), dataset.hash()?),
             (role::GEOMETRY.to_string(), hash_file(&self.geometry.geometry)?),
         ]);
-        stage.record(&mut claim, json!(self.scene), inputs, json!({"views": views.len()}))
+        stage.record(&mut claim, json!(scene), inputs, json!({"views": views.len()}))
     }
 }
 

@@ -17,8 +17,8 @@ use crate::training::{Recipe, Trainer, checkpoint};
 use artifacts::role;
 use forecast::{cache_bytes, forecast_start, most_gaussians};
 use gs_io::{Claim, Provenance, Result, hash_bytes, hash_file};
-use gs_scene::Camera;
-use gs_scene::dataset::{Dataset, Split, View};
+use gs_scene::dataset::{Dataset, HOLDOUT, Split, View};
+use gs_scene::{Camera, HoldOut, Learnt, splat};
 use serde_json::{Value, json};
 use stage::{CommonArgs, Program, Stage};
 use std::collections::BTreeMap;
@@ -32,7 +32,10 @@ impl Program for Args {
 
     fn run(self, stage: &Stage) -> Result<()> {
         match self.command {
-            Command::Train(options) => train(&options, stage),
+            Command::Train(mut options) => {
+                options.scene.held.holdout.get_or_insert(HOLDOUT);
+                train(&options, stage)
+            }
             Command::Render(options) => options.run(stage),
             Command::Eval(options) => options.run(stage),
             Command::Views(options) => options.run(stage),
@@ -148,6 +151,7 @@ fn provenance(options: &Train, recipe: &Recipe, dataset: &Dataset, masks: &Masks
     if let (Value::Object(all), Value::Object(resolved)) = (&mut parameters, json!(recipe)) {
         all.extend(resolved);
     }
+    parameters[Learnt::VIEWS] = json!(learnt_views(options, dataset, stage)?);
     let mut inputs = BTreeMap::from([(role::DATASET.to_string(), dataset.hash()?)]);
     if let Some(init) = options.init.file() {
         inputs.insert("init".into(), hash_file(init)?);
@@ -161,4 +165,19 @@ fn provenance(options: &Train, recipe: &Recipe, dataset: &Dataset, masks: &Masks
         inputs.insert("photograph_masks".into(), hash);
     }
     Ok(stage.provenance(checkpoint::FORMAT, checkpoint::VERSION, parameters, inputs))
+}
+
+/// Which views the Gaussians are learnt from, for later stages; `None` where those of `--init` may have been learnt from more.
+fn learnt_views(options: &Train, dataset: &Dataset, stage: &Stage) -> Result<Option<String>> {
+    let every = options.scene.held.holdout.unwrap_or(HOLDOUT);
+    if let Some(init) = options.init.file().filter(|_| dataset.held_out(every).any(|held| held))
+        && splat::holds_gaussians(init)?
+        && HoldOut::of(init, Some(every))?.seen(dataset).is_none_or(|seen| seen > 0)
+    {
+        stage.warn(
+            "the Gaussians of --init may have been learnt from views held out here: no stage will call these unseen",
+        );
+        return Ok(None);
+    }
+    Ok(Some(Learnt::hash(dataset, every)))
 }

@@ -190,7 +190,7 @@ fn views_are_rendered_and_measured() {
     assert_eq!(Image::read(format!("{some}/05.png")).unwrap().width, SIZE.0 / 2);
 
     let metrics = dir.path("m.json");
-    succeeds(&[&["eval"], &base[..], &["--out", &metrics]].concat());
+    succeeds(&[&["eval"], &base[..], &["--out", &metrics, "--holdout", "8"]].concat());
     let m = json(&metrics);
     assert!(m["psnr_heldout"].as_f64().unwrap() > 55.0, "8-bit photographs of the same Gaussians: {m}");
     let o = run(&[&["eval"], &base[..], &["--out", &metrics, "--holdout", "0"]].concat());

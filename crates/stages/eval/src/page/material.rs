@@ -7,18 +7,20 @@ use crate::score::Scores;
 use artifacts::{Instances, role};
 use gs_io::{Artifact, Error, IoContext, Result, hash_file};
 use gs_raster::RasterOptions;
-use gs_scene::Geometry;
 use gs_scene::dataset::{Dataset, Split, View};
+use gs_scene::{Geometry, HoldOut};
 use query::LabelledScene;
 use report::picture::Picture;
 use stage::RunRecord;
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
 
 /// Everything the sections draw from.
 pub(super) struct Material<'a> {
     pub(super) options: &'a ReportOptions,
     pub(super) dataset: &'a Dataset,
+    /// The views that training did not see, where that is known.
+    pub(super) unseen: Option<BTreeSet<&'a str>>,
     /// Folder of id maps, if there is one.
     pub(super) masks: Option<PathBuf>,
     pub(super) geometry: Geometry,
@@ -44,10 +46,11 @@ impl<'a> Material<'a> {
     pub(super) fn read(
         dataset: &'a Dataset,
         options: &'a ReportOptions,
-        geometry: &Path,
+        held: &HoldOut,
         masks: Option<PathBuf>,
         metrics: &mut Metrics,
     ) -> Result<Self> {
+        let geometry = &options.geometry;
         let path = options.run_dir.join("instances.safetensors");
         let (geometry, found, inputs) = if path.exists() {
             let labelled = LabelledScene::read(&path, geometry, None)?;
@@ -79,7 +82,11 @@ impl<'a> Material<'a> {
             let psnr = psnr(&photo, &render);
             shown.push(Shown { view, photo, render, psnr });
         }
-        Ok(Self { options, dataset, masks, geometry, raster, found, inputs, scores, shown })
+        let unseen = held.unseen(dataset).map(|unseen| {
+            let views = dataset.views.iter().zip(unseen);
+            views.filter(|(_, unseen)| *unseen).map(|(v, _)| v.name.as_str()).collect()
+        });
+        Ok(Self { options, dataset, unseen, masks, geometry, raster, found, inputs, scores, shown })
     }
 
     pub(super) fn file(&self, name: &str) -> PathBuf {

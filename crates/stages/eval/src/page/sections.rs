@@ -11,7 +11,7 @@ use artifacts::{
     hash_folder, instance_color, maps_path, role,
 };
 use gs_io::{Error, IoContext, Result};
-use gs_scene::dataset::{Dataset, Split, View};
+use gs_scene::dataset::{Dataset, View};
 use query::{Verdict, check_features};
 use report::curve;
 use report::feature_colors;
@@ -63,13 +63,8 @@ fn figure(picture: &Picture, columns: usize, caption: String) -> Result<Figure> 
 
 pub(super) fn photographs(m: &Material, page: &mut Page) -> Result<()> {
     page.section("photographs", "Photographs and renders");
-    let held_out = m.shown.iter().all(|s| s.view.split == Split::Test);
-    page.paragraph(if held_out {
-        "Left the photograph, right the 3D Gaussians rendered from the same place. These views were held out: training \
-         never saw them."
-    } else {
-        "Left the photograph, right the 3D Gaussians rendered from the same place. Training saw these views."
-    });
+    let what = "Left the photograph, right the 3D Gaussians rendered from the same place.";
+    page.paragraph(&format!("{what} {}", whether_seen(m)));
     let mut figures = Vec::new();
     for s in &m.shown {
         figures.push(figure(&s.photo, 2, format!("{}: photograph", s.view.stem()))?);
@@ -77,6 +72,19 @@ pub(super) fn photographs(m: &Material, page: &mut Page) -> Result<()> {
     }
     page.figures(2, &figures);
     Ok(())
+}
+
+/// Whether training saw the views that are shown.
+fn whether_seen(m: &Material) -> String {
+    let Some(unseen) = &m.unseen else {
+        return "The Gaussians do not say which of these views training saw.".into();
+    };
+    let seen: Vec<&str> = m.shown.iter().filter(|s| !unseen.contains(&*s.view.name)).map(|s| s.view.stem()).collect();
+    match seen.len() {
+        0 => "These views were held out: training never saw them.".into(),
+        n if n == m.shown.len() => "Training saw these views.".into(),
+        _ => format!("Training saw {}; the other views were held out.", seen.join(", ")),
+    }
 }
 
 pub(super) fn id_maps(m: &Material, page: &mut Page, metrics: &mut Metrics) -> Result<()> {

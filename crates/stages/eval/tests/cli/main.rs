@@ -7,6 +7,8 @@ mod protocols;
 use artifacts::{Descriptors, Instances, flat};
 use fixture::{Fixture, HEIGHT, SCORE, TABLE, VIEWS, WIDTH, failed, stem};
 use gs_io::Provenance;
+use gs_scene::Learnt;
+use gs_scene::dataset::{self, LoadOptions};
 use ndarray::{Array2, Array3, arr3};
 use serde_json::{Value, json};
 use std::fs;
@@ -412,6 +414,43 @@ fn a_full_report_stands_alone() {
 }
 
 #[test]
+fn a_report_calls_unseen_what_training_held_out() {
+    let f = Fixture::new(0);
+    [f.instances(), f.run().join("features.safetensors")].iter().for_each(|file| fs::remove_file(file).unwrap());
+    let dataset = dataset::load(&f.scene(), &LoadOptions::default()).unwrap();
+    let g = gs_scene::ply::read_gaussians(f.geometry()).unwrap();
+    let page = |every: Option<usize>, more: &str| {
+        let views = |n| vec![format!("holdout {n}"), format!("learnt_views \"{}\"", Learnt::hash(&dataset, n))];
+        gs_scene::ply::write_gaussians(f.geometry(), &g, &every.map_or(Vec::new(), views)).unwrap();
+        f.good("report", &format!("{REPORT}{more}"));
+        fs::read_to_string(f.path().join("report.html")).unwrap()
+    };
+    let (never, all) = ("These views were held out: training never saw them.", "Training saw these views.");
+    // Nine views: training held out the first, fourth and seventh, whatever the default is.
+    let html = page(Some(3), "");
+    assert!(html.contains(never) && html.contains("9 photographs (3 held out)"));
+    let html = page(Some(0), "");
+    assert!(html.contains(all) && html.contains("(0 held out)") && !html.contains("never saw"));
+    // What is shown is asked for, or held out only here.
+    let html = page(Some(3), "|--holdout|8");
+    let seen = stem(8);
+    assert!(html.contains(&format!("Training saw {seen}; the other views were held out.")), "{html}");
+    assert!(page(Some(3), &format!("|--views|{seen}")).contains(all));
+    assert!(page(Some(3), &format!("|--views|{}", stem(6))).contains(never));
+    // From elsewhere.
+    for more in ["", "|--holdout|8"] {
+        let html = page(None, more);
+        assert!(html.contains("do not say which of these views training saw") && !html.contains("never saw"));
+        assert!(!html.contains("held out)"));
+    }
+    // Figures of views that training may have seen are not those of held-out ones.
+    fs::write(f.run().join("geom_metrics.json"), r#"{"split": "unknown", "psnr": 31.5, "psnr_heldout": null}"#)
+        .unwrap();
+    assert!(!page(None, "").contains("31.50"));
+    assert!(f.json("metrics.json")["psnr_heldout"].is_null());
+}
+
+#[test]
 fn a_report_says_whether_masks_and_instances_are_sound() {
     let f = Fixture::new(0);
     let section = "<h2 id=\"soundness\">Masks and instances: are they sound?";
@@ -449,7 +488,7 @@ fn a_report_of_geometry_alone_says_what_is_left_out() {
     fs::remove_dir_all(f.scene().join("language_features")).unwrap();
     f.good("report", REPORT);
     let html = fs::read_to_string(f.path().join("report.html")).unwrap();
-    assert!(html.contains("<title>run</title>") && html.contains("held out"));
+    assert!(html.contains("<title>run</title>") && html.contains("The Gaussians do not say which of these views"));
     let m = f.json("metrics.json");
     let skipped = m["skipped"].to_string();
     for part in ["instances", "features", "id maps", "scores", "text queries", "PSNR"] {
