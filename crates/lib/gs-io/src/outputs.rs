@@ -33,6 +33,7 @@ pub struct Outputs {
     /// True where every file in the folder must be of this program: their names are not known before the work.
     folders: Vec<(PathBuf, bool)>,
     inputs: Vec<PathBuf>,
+    known: Option<fn(&Path) -> bool>,
 }
 
 impl Outputs {
@@ -40,7 +41,7 @@ impl Outputs {
     pub fn new(by: &str, overwrite: bool, main: impl AsRef<Path>) -> Self {
         let mains = vec![main.as_ref().to_path_buf()];
         let by = by.to_string();
-        Self { by, overwrite, drop_stale: false, mains, files: vec![], folders: vec![], inputs: vec![] }
+        Self { by, overwrite, drop_stale: false, mains, files: vec![], folders: vec![], inputs: vec![], known: None }
     }
 
     /// A second file with a record of its own.
@@ -92,6 +93,13 @@ impl Outputs {
         self
     }
 
+    /// Files of this command are known by this, too, where a cut-off run left neither record nor signed lock.
+    #[must_use]
+    pub fn known_by(mut self, known: fn(&Path) -> bool) -> Self {
+        self.known = Some(known);
+        self
+    }
+
     /// What the last run of this command wrote, and this one did not, goes at the end: it would be taken for this run's.
     #[must_use]
     pub fn drop_stale(mut self) -> Self {
@@ -126,11 +134,11 @@ impl Outputs {
         let past = Past::of(&self.by, &self.mains);
         if !self.overwrite {
             for (path, format) in &self.files {
-                past.check_own(&self.by, path, *format)?;
+                self.check_own(&past, path, *format)?;
             }
             for (folder, _) in self.folders.iter().filter(|(_, all)| *all) {
                 for path in files_below(folder)? {
-                    past.check_own(&self.by, &path, None)?;
+                    self.check_own(&past, &path, None)?;
                 }
             }
             let mut records = self.mains.iter().map(record_path);
@@ -144,6 +152,12 @@ impl Outputs {
         let mut claim = Claim { outputs: self, locks, past, before: BTreeMap::new(), finished: false };
         claim.before = claim.stamps();
         Ok(claim)
+    }
+
+    /// Checks that `path` is free, or of this command.
+    fn check_own(&self, past: &Past, path: &Path, format: Option<&str>) -> Result<()> {
+        past.check_own(&self.by, path, format)
+            .or_else(|e| if self.known.is_some_and(|of| of(path)) { Ok(()) } else { Err(e) })
     }
 
     fn check_names(&self, files: &[PathBuf]) -> Result<()> {

@@ -108,7 +108,7 @@ pub(crate) fn run(args: &EmbedArgs, stage: &Stage) -> Result<()> {
             }
             let features = values.rows().into_iter().filter(|r| r.iter().any(|&v| v != 0.0)).count();
             watched.check()?;
-            finished::remove_manifest(&manifest)?;
+            finished::begin(&manifest, &output)?;
             MaskFeatures { values }.write(&output)?;
             Ok(Facts { masks: rows, features, pictures, from, only })
         })?;
@@ -170,6 +170,7 @@ fn claim(args: &EmbedArgs, scene: &Dataset, out: &Path, manifest: &Path, stage: 
     let notes = features.iter().map(|f| finished::note_path(f));
     // Features of maps that are gone would be taken for this run's.
     let outputs = stage.outputs(manifest).file(manifest).files(notes).files(&features).drop_stale();
+    let outputs = outputs.known_by(finished::is_own);
     outputs.reads(&scene.files).reads(maps).reads(&args.only).claim()
 }
 

@@ -17,6 +17,9 @@ struct Note<T> {
     hash: String,
     /// Facts of the output for the manifest.
     facts: T,
+    /// Whether the output is being written anew, and may be that already.
+    #[serde(default, skip_serializing_if = "std::ops::Not::not")]
+    begun: bool,
 }
 
 /// One hash for all that shapes an output.
@@ -30,15 +33,27 @@ pub(crate) fn note_path(output: &Path) -> PathBuf {
     output.with_extension("json")
 }
 
+/// The note of an output, whatever the output is now.
+fn any<T: DeserializeOwned>(output: &Path) -> Option<Note<T>> {
+    serde_json::from_slice(&std::fs::read(note_path(output)).ok()?).ok()
+}
+
 /// The note of an output that is as it was written.
 fn read<T: DeserializeOwned>(output: &Path) -> Option<Note<T>> {
-    let note: Note<T> = serde_json::from_slice(&std::fs::read(note_path(output)).ok()?).ok()?;
-    (hash_file(output).ok()? == note.hash).then_some(note)
+    any(output).filter(|note: &Note<T>| hash_file(output).is_ok_and(|hash| hash == note.hash))
 }
 
 /// The note of an output that need not be made again.
 fn find<T: DeserializeOwned>(output: &Path, made_from: &str) -> Option<Note<T>> {
     read(output).filter(|note| note.made_from == made_from)
+}
+
+/// Whether an output, or a note, is of this program: a note says so of an output that is as it was written, is being written, or is
+/// gone.
+pub(crate) fn is_own(path: &Path) -> bool {
+    let output = path.with_extension("npy");
+    let of = |note: Note<Value>| note.begun || !output.exists() || hash_file(&output).is_ok_and(|h| h == note.hash);
+    any(path).is_some_and(of)
 }
 
 /// The facts of an output that is as it was written, whatever it was made from.
@@ -53,7 +68,7 @@ pub(crate) fn is_done(output: &Path, made_from: &str) -> bool {
 
 /// Writes the note of an output that has just been written.
 fn write<T: Serialize>(output: &Path, made_from: &str, facts: T) -> Result<Note<T>> {
-    let note = Note { made_from: made_from.to_string(), hash: hash_file(output)?, facts };
+    let note = Note { made_from: made_from.to_string(), hash: hash_file(output)?, facts, begun: false };
     write_json(note_path(output), &note)?;
     Ok(note)
 }
@@ -102,6 +117,14 @@ impl<'a> Views<'a> {
         }
         self.listed
     }
+}
+
+/// Comes right before an output is written: removes the manifest that describes it, and notes whose the output is.
+pub(crate) fn begin(manifest: &Path, output: &Path) -> Result<()> {
+    remove_manifest(manifest)?;
+    let none = Note { made_from: String::new(), hash: String::new(), facts: Value::Null, begun: true };
+    // What is there stays good until it is replaced.
+    write_json(note_path(output), &any(output).map_or(none, |note| Note { begun: true, ..note }))
 }
 
 /// Removes the manifest before an output that it describes changes; it is written again last of all.

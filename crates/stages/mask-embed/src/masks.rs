@@ -67,7 +67,7 @@ pub(crate) fn run(args: &MasksArgs, stage: &Stage) -> Result<()> {
         let output = maps_path(folder, view.stem());
         let facts: Facts = views.next(view, &output, &key, || {
             let (maps, facts) = make(args, &sam, &image, embedded)?;
-            finished::remove_manifest(&manifest)?;
+            finished::begin(&manifest, &output)?;
             maps.write(&output)?;
             Ok(facts)
         })?;
@@ -120,6 +120,7 @@ fn claim(args: &MasksArgs, scene: &Dataset, manifest: &Path, stage: &Stage) -> R
     let maps: Vec<PathBuf> = scene.views.iter().map(|v| maps_path(&args.out, v.stem())).collect();
     let notes = maps.iter().map(|m| finished::note_path(m));
     let outputs = stage.outputs(manifest).file(manifest).files(notes).files(&maps).reads(&scene.files).drop_stale();
+    let outputs = outputs.known_by(finished::is_own);
     let pictures = scene.views.iter().map(|v| format!("{}.png", v.stem()));
     args.preview.iter().fold(outputs, |outputs, folder| outputs.files_in(folder, pictures.clone())).claim()
 }

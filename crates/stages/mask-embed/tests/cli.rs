@@ -180,6 +180,21 @@ fn the_result_depends_neither_on_threads_nor_on_interruptions() {
     std::fs::write(other.join("v2_s.json"), "{").unwrap();
     scene.make_masks(&other, &["--overwrite"]);
     assert_eq!(whole, contents(&other));
+    // As after a kill while the last map was written, copied without hidden files: the notes say whose the rest is.
+    for name in ["masks.json", "masks.json.run.json", "v1_s.npy"] {
+        std::fs::remove_file(other.join(name)).unwrap();
+    }
+    let begun = r#"{"made_from": "", "hash": "", "facts": null, "begun": true}"#;
+    std::fs::write(other.join("v2_s.json"), begun).unwrap();
+    let said = scene.make_masks(&other, &[]);
+    assert!(said.contains("skipped 1 of 3 views"), "{said}");
+    assert_eq!(whole, contents(&other));
+    // A map of somebody else has no note, or one of other bytes.
+    for name in ["masks.json", "masks.json.run.json", "v2_s.json"] {
+        std::fs::remove_file(other.join(name)).unwrap();
+    }
+    assert!(error(&scene.masks_args(&other, &[])).contains("v2_s.npy: the output exists and would be lost"));
+    scene.make_masks(&other, &["--overwrite"]);
     // Again: nothing is made. With another parameter: everything is.
     let touched = || std::fs::metadata(other.join("v1_s.npy")).unwrap().modified().unwrap();
     let before = touched();
