@@ -151,8 +151,9 @@ pub(crate) struct Train {
     #[arg(long, value_name = "BYTES", default_value_t = Bytes(2 << 30))]
     #[serde(skip)]
     pub image_cache: Bytes,
-    /// Iterations (500) or seconds (60s) between checkpoints. The same command goes on from the last checkpoint
-    #[arg(long, value_name = "COUNT|SECONDS", default_value = "60s")]
+    /// Iterations (500) or seconds (60s) between checkpoints; more seconds where saving would take over a twentieth of the time.
+    /// The same command goes on from the last checkpoint
+    #[arg(long, value_name = "COUNT|SECONDS", default_value = "20s")]
     #[serde(skip)]
     pub checkpoint_every: Every,
 }
@@ -413,6 +414,9 @@ mod tests {
 
     #[test]
     fn periods_and_times_are_read() {
+        let typed = ["gs-geom", "train", "--scene", "s", "--out", "o"];
+        let Command::Train(train) = Args::parse_from(typed).command else { panic!("train") };
+        assert_eq!(train.checkpoint_every, Every::Seconds(20.0));
         assert_eq!("40".parse::<Every>().unwrap(), Every::Iterations(40));
         assert_eq!("2.5s".parse::<Every>().unwrap(), Every::Seconds(2.5));
         for wrong in ["0", "-1", "s", "x", "-3s", ""] {

@@ -7,8 +7,9 @@ use crate::training::checkpoint::{self, State};
 use gs_io::{Error, ErrorKind, Provenance, Result, Watched, with_suffix};
 use gs_scene::ply;
 use stage::Stage;
-use std::time::Instant;
 
+/// Where checkpoints come by the clock, seconds between them for each second that the last one took.
+const SPARING: f64 = 20.0;
 /// Weight of the last loss in the mean that the progress shows.
 const SMOOTHING: f64 = 0.02;
 
@@ -30,7 +31,9 @@ pub(super) fn iterate(
 ) -> Result<()> {
     let first = trainer.state.progress.iteration;
     let mut progress = stage.progress("iteration", options.iterations.into()).resumed_at(first.into());
-    let mut last_save = Instant::now();
+    // From the start of the program: what came before the first iteration is saved with it.
+    let seconds = || stage.elapsed().as_secs_f64();
+    let (mut last_save, mut cost) = (0.0, 0.0);
     let mut smooth: Option<f64> = None;
     trainer.complete_curve()?;
     while !trainer.is_done() {
@@ -47,13 +50,15 @@ pub(super) fn iterate(
         progress.set(iteration.into(), &fields);
         let due = match options.checkpoint_every {
             Every::Iterations(n) => iteration.is_multiple_of(n),
-            Every::Seconds(s) => last_save.elapsed().as_secs_f64() >= s,
+            Every::Seconds(s) => seconds() - last_save >= s.max(SPARING * cost),
         };
         if due && !trainer.is_done() {
             // Photographs kept in memory are not read again, but a run that cannot be repeated should end here.
             watched.check_those_left()?;
+            let before = seconds();
             save(options, trainer, run)?;
-            last_save = Instant::now();
+            last_save = seconds();
+            cost = last_save - before;
         }
     }
     progress.finish(&[("loss", smooth.unwrap_or(0.0))]);
