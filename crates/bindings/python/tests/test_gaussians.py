@@ -132,6 +132,49 @@ def test_bad_input_is_refused(cloud, tmp_path):
         cags.render(cloud, CAMERA, near=0)
 
 
+@pytest.mark.parametrize("name, other", [
+    ("means", np.zeros((39, 3), np.float32)), ("means", np.zeros((41, 3), np.float32)), ("means", np.zeros(40, np.float32)),
+    ("means", np.zeros((40, 3))), ("means", np.zeros((40, 3), ">f4")), ("means", np.zeros((40, 3), complex)), ("means", None),
+    ("means", [[0.0, 0.0, 4.0]] * 40), ("means", np.float32(3)), ("log_scales", np.zeros((40, 4), np.float32)),
+    ("rotations", np.zeros((40, 3), np.float32)), ("opacity_logits", np.zeros((40, 1), np.float32)),
+    ("opacity_logits", np.zeros(0, np.float32)), ("sh", np.zeros((40, 5, 3), np.float32)), ("sh", np.zeros((40, 4), np.float32)),
+])
+def test_arrays_that_no_longer_fit_are_refused(cloud, tmp_path, name, other):
+    setattr(cloud, name, other)
+    path = tmp_path / "a.ply"
+    for use in [lambda: cags.render(cloud, CAMERA), lambda: cags.render_backward(cloud, CAMERA, np.ones((30, 40, 3))),
+                lambda: cags.write_ply(path, cloud)]:
+        with pytest.raises(ValueError, match="holds|has the shape"):
+            use()
+    assert not path.exists()
+
+
+def test_arrays_in_another_order_are_the_same(cloud):
+    expected = cags.render(cloud, CAMERA).rgb
+    cloud.means = np.asfortranarray(cloud.means)
+    cloud.sh = np.concatenate([cloud.sh, cloud.sh])[:40]
+    cloud.opacity_logits = np.repeat(cloud.opacity_logits, 2)[::2]
+    assert (cags.render(cloud, CAMERA).rgb == expected).all()
+
+
+@pytest.mark.parametrize("name, other", [
+    ("width", 0), ("width", 1 << 20), ("width", 40.5), ("width", np.nan), ("width", None), ("height", -3), ("height", np.inf),
+    ("fx", np.nan), ("fx", 0), ("fy", "wide"), ("cx", np.inf), ("cy", None), ("rotation", np.full((3, 3), np.nan)),
+    ("rotation", np.eye(4)), ("rotation", 2 * np.eye(3)), ("rotation", np.diag([1, 1, -1])), ("rotation", None),
+    ("translation", [0, 0, np.nan]), ("translation", [0, 0]), ("translation", None),
+])
+def test_cameras_that_are_none_any_more_are_refused(cloud, name, other):
+    good = {f: getattr(CAMERA, f) for f in ["width", "height", "fx", "fy", "cx", "cy", "rotation", "translation"]}
+    with pytest.raises(ValueError):
+        cags.Camera(**(good | {name: other}))
+    camera = cags.Camera(**good)
+    setattr(camera, name, other)
+    with pytest.raises(ValueError):
+        cags.render(cloud, camera)
+    with pytest.raises(ValueError):
+        cags.render_backward(cloud, camera, np.ones((30, 40, 3)))
+
+
 def test_what_is_not_finite_is_not_drawn(cloud):
     broken = cags.Gaussians(*(np.copy(getattr(cloud, f)) for f in ["means", "log_scales", "rotations", "opacity_logits", "sh"]))
     broken.means[4] = np.nan

@@ -46,14 +46,27 @@ class Gaussians:
     antialias: bool = False
 
     def __post_init__(self):
-        for name, shape in _SHAPES.items():
-            array = np.ascontiguousarray(getattr(self, name), dtype=np.float32)
-            setattr(self, name, array)
-            n = len(self.means) if self.means.ndim else 0
+        for name in _SHAPES:
+            found = np.asarray(getattr(self, name))
+            if found.dtype.kind not in "fiub":
+                raise ValueError(f"{name} holds {found.dtype}: expected numbers")
+            setattr(self, name, np.ascontiguousarray(found, dtype=np.float32))
+        self._checked()
+
+    def _checked(self):
+        """The same, in C order, if the arrays still fit each other: anybody may have put others in their place."""
+        arrays = [getattr(self, name) for name in _SHAPES]
+        for (name, shape), array in zip(_SHAPES.items(), arrays):
+            if not isinstance(array, np.ndarray) or array.dtype != np.float32:
+                raise ValueError(f"{name} holds {getattr(array, 'dtype', type(array).__name__)}: expected an array of float32")
+            n = len(arrays[0]) if arrays[0].ndim else 0
             expected = {"means": (n, 3), "log_scales": (n, 3), "rotations": (n, 4), "opacity_logits": (n,)}.get(name)
             fits = array.shape == expected if expected else array.shape in [(n, k, 3) for k in (1, 4, 9, 16)]
             if not fits:
                 raise ValueError(f"{name} has the shape {array.shape}: expected {shape}, n = {n}")
+        if all(a.flags.c_contiguous for a in arrays):
+            return self
+        return Gaussians(*arrays, self.antialias)
 
     def __len__(self):
         return len(self.means)
@@ -88,22 +101,29 @@ class Camera:
     translation: np.ndarray = field(default_factory=lambda: np.zeros(3))
 
     def __post_init__(self):
-        self.rotation = np.asarray(self.rotation, dtype=np.float64)
-        self.translation = np.asarray(self.translation, dtype=np.float64)
+        self._native()
+
+    def _native(self):
+        """Its numbers, if they are still a camera's: anybody may have changed them. Sets what is given as lists as arrays."""
+        try:
+            self.rotation = np.asarray(self.rotation, dtype=np.float64)
+            self.translation = np.asarray(self.translation, dtype=np.float64)
+            numbers = [float(v) for v in (self.fx, self.fy, self.cx, self.cy)]
+            width, height = (int(v) if v == v and v == v // 1 and abs(v) < 1 << 16 else 0 for v in (self.width, self.height))
+        except TypeError as e:
+            raise ValueError(f"a field of the camera is no number: {e}") from None
         if self.rotation.shape != (3, 3) or self.translation.shape != (3,):
             raise ValueError(
                 f"rotation and translation have the shapes {self.rotation.shape} and {self.translation.shape}: expected (3, 3) and (3,)"
             )
-        if np.abs(self.rotation @ self.rotation.T - np.eye(3)).max() > 1e-3 or not np.isfinite(self.translation).all():
+        turns = np.abs(self.rotation @ self.rotation.T - np.eye(3)).max() <= 1e-3 and np.linalg.det(self.rotation) > 0
+        if not (turns and np.isfinite(self.translation).all()):
             raise ValueError("the pose is not a rotation and a translation of finite numbers")
-        if not (self.fx > 0 and self.fy > 0 and np.isfinite([self.fx, self.fy, self.cx, self.cy]).all()):
+        if not (numbers[0] > 0 and numbers[1] > 0 and np.isfinite(numbers).all()):
             raise ValueError(f"fx, fy, cx, cy are {self.fx}, {self.fy}, {self.cx}, {self.cy}: expected positive focal lengths")
-        if not (1 <= self.width <= 1 << 15 and 1 <= self.height <= 1 << 15):
+        if not (1 <= width <= 1 << 15 and 1 <= height <= 1 << 15):
             raise ValueError(f"the picture has {self.width} x {self.height} pixels: expected 1 to 32768 along each side")
-
-    def _native(self):
-        numbers = (float(v) for v in (self.fx, self.fy, self.cx, self.cy))
-        return (int(self.width), int(self.height), *numbers, self.rotation.tolist(), self.translation.tolist())
+        return (width, height, *numbers, self.rotation.tolist(), self.translation.tolist())
 
 
 @dataclass
@@ -163,7 +183,7 @@ def render(gaussians, camera, *, background=(0, 0, 0), near=None, n_jobs=None):
     >>> picture.rgb.shape, bool(picture.alpha[3, 4] > 0.9)
     ((6, 8, 3), True)
     """
-    return Rendered(*_native.render(gaussians, camera._native(), _settings(background, near, n_jobs, gaussians)))
+    return Rendered(*_native.render(gaussians._checked(), camera._native(), _settings(background, near, n_jobs, gaussians)))
 
 
 def render_backward(gaussians, camera, d_rgb, d_alpha=None, d_depth=None, *, background=(0, 0, 0), near=None, n_jobs=None):
@@ -191,7 +211,8 @@ def render_backward(gaussians, camera, d_rgb, d_alpha=None, d_depth=None, *, bac
     >>> bool(gradient.opacity_logits[0] > 0)
     True
     """
-    size = (camera.height, camera.width)
+    view = camera._native()
+    size = (view[1], view[0])
     given = {"d_rgb": (d_rgb, (*size, 3)), "d_alpha": (d_alpha, size), "d_depth": (d_depth, size)}
     arrays = []
     for name, (array, shape) in given.items():
@@ -201,7 +222,7 @@ def render_backward(gaussians, camera, d_rgb, d_alpha=None, d_depth=None, *, bac
                 raise ValueError(f"{name} has the shape {array.shape}: expected {shape}")
         arrays.append(array)
     settings = _settings(background, near, n_jobs, gaussians)
-    return Gaussians(*_native.render_backward(gaussians, camera._native(), *arrays, settings), gaussians.antialias)
+    return Gaussians(*_native.render_backward(gaussians._checked(), view, *arrays, settings), gaussians.antialias)
 
 
 def read_ply(path):
@@ -249,6 +270,7 @@ def write_ply(path, gaussians, *, instance=None):
     ...     bool((cags.read_ply(path).means == one.means).all())
     True
     """
+    gaussians = gaussians._checked()
     if instance is not None:
         instance = np.ascontiguousarray(instance, dtype=np.int32)
         if instance.shape != (len(gaussians),):
