@@ -35,7 +35,7 @@ pub enum Edit {
     Rename {
         /// The instance.
         instance: u32,
-        /// 1 to 100 bytes without control characters.
+        /// 1 to 100 bytes: see [`gs_io::check_name`].
         name: String,
     },
     /// How long a known length is.
@@ -187,14 +187,13 @@ fn check_id(instances: &Instances, id: u32) -> Result<()> {
 
 fn check_name(name: &str) -> Result<()> {
     let e =
-        |what: &str| Err(Error::new(what).expected(format!("1 to {LONGEST_NAME} bytes without control characters")));
+        |what: &str| Err(Error::new(what).expected(format!("1 to {LONGEST_NAME} bytes")));
     match name {
         _ if name.trim().is_empty() => e("an empty name"),
         _ if name.len() > LONGEST_NAME => {
             e("the name is too long").map_err(|e: Error| e.found(format!("{} bytes", name.len())))
         }
-        _ if name.contains(char::is_control) => e("a control character in the name"),
-        _ => Ok(()),
+        _ => gs_io::check_name(name),
     }
 }
 
@@ -472,6 +471,8 @@ mod tests {
             (vec![rename(0, " ")], "edits[0].name: an empty name"),
             (vec![rename(0, &"é".repeat(51))], "edits[0].name: the name is too long; found 102 bytes"),
             (vec![rename(0, "a\u{7}")], "edits[0].name: a control character in the name"),
+            (vec![rename(0, "mug\u{202e}gpj")], "a control character in the name; found \"mug\\u{202e}gpj\""),
+            (vec![rename(0, "-rf")], "edits[0].name: the name begins with a dash"),
             (vec![scale([2.0; 3], 0.0)], "edits[0].metres: not a length; found 0"),
             (vec![scale([2.0; 3], f64::NAN)], "edits[0].metres: not a length"),
             (vec![scale([1.0; 3], 1.0)], "edits[0].to: no length between the two points; found distance 0"),

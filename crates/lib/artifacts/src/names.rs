@@ -1,7 +1,7 @@
 //! `names.json`: what instances are called, by a vocabulary.
 
 use crate::edits::Remarks;
-use gs_io::{Error, IoContext, Result, write_json};
+use gs_io::{Error, IoContext, Result, check_name, write_json};
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
@@ -98,7 +98,7 @@ impl InstanceNames {
     /// Reads the content of such a file.
     ///
     /// # Errors
-    /// When it is no JSON of this form, instances do not ascend, or one has no name.
+    /// When it is no JSON of this form, instances do not ascend, or one has no name or a bad one ([`check_name`]).
     pub fn parse(bytes: &[u8]) -> Result<Self> {
         let wrong = |what: String| Error::new(what).hint("make it again with eval names");
         let names: Self = serde_json::from_slice(bytes).map_err(|e| wrong(format!("not a names.json: {e}")))?;
@@ -112,6 +112,8 @@ impl InstanceNames {
             let e = wrong("names that do not fit".into()).field("named");
             return Err(e.expected("instances that ascend, each with a name"));
         }
+        let all = names.named.iter().flat_map(|n| &n.names);
+        all.map(|s| check_name(&s.name)).collect::<Result<()>>().map_err(|e| e.field("named"))?;
         Ok(names)
     }
 
@@ -195,6 +197,7 @@ mod tests {
             ("\"version\": 1", "\"version\": 2", "found names version 2, expected names version 1"),
             ("\"instance\": 2", "\"instance\": 0", "names that do not fit"),
             ("\"bowl\"", "\"\"", "names that do not fit"),
+            ("\"bowl\"", "\"\\u001b[2J\"", "named: a control character in the name"),
             ("\"sure\"", "\"Sure\"", "not a names.json"),
         ] {
             let text = std::fs::read_to_string(&path).unwrap().replace(from, to);

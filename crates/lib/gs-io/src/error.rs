@@ -1,5 +1,6 @@
 //! The one error type of the workspace.
 
+use crate::names::escaped;
 use std::fmt;
 use std::path::{Path, PathBuf};
 
@@ -122,13 +123,6 @@ impl fmt::Display for Error {
         }
         f.write_str(&escaped(&line))
     }
-}
-
-/// A message as one line that does nothing to a terminal: names of files, and names within them, may hold line breaks and
-/// other control characters, which are written as `\n` or `\u{1b}`.
-pub fn escaped(message: &str) -> String {
-    let one = |c: char| if c.is_control() { c.escape_default().to_string() } else { c.to_string() };
-    message.chars().map(one).collect()
 }
 
 impl std::error::Error for Error {}

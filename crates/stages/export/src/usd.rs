@@ -71,7 +71,7 @@ fn text(s: &str) -> String {
     let one = |c: char| match c {
         '"' => "\\\"".to_string(),
         '\\' => "\\\\".to_string(),
-        c if c.is_control() => " ".to_string(),
+        c if gs_io::is_control(c) => " ".to_string(),
         c => c.to_string(),
     };
     format!("\"{}\"", s.chars().map(one).collect::<String>())

@@ -50,7 +50,7 @@ pub fn write(
         if !gaussians.is_empty() {
             let ply = format!("{name}.ply");
             let ids: Vec<String> = result.selected.iter().map(u32::to_string).collect();
-            let text: String = result.text.chars().map(|c| if c.is_control() { ' ' } else { c }).collect();
+            let text: String = result.text.chars().map(|c| if gs_io::is_control(c) { ' ' } else { c }).collect();
             let own = vec![format!("cags query: {text}"), format!("cags instances: {}", ids.join(" "))];
             let comments = scene.geometry.comments(own);
             gs_scene::ply::write_gaussians(out.join(&ply), &scene.gaussians().select(gaussians), &comments)?;
