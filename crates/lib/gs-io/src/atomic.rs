@@ -1,5 +1,6 @@
 //! Outputs that appear whole or not at all.
 
+use crate::expected::put;
 use crate::place::{folder_of, resolve};
 use crate::{IoContext, Result};
 use std::fs;
@@ -12,10 +13,12 @@ pub fn create_dir(dir: impl AsRef<Path>) -> Result<()> {
 }
 
 /// Writes `path` through `fill`: to a temporary name in the same folder, flushed to the disk, then renamed. A crash, a
-/// full disk or an error from `fill` leaves whatever stood at `path` untouched. A symbolic link stays, and the file that it
+/// full disk or an error from `fill` leaves whatever stood at `path` untouched, and so does a file that another program put
+/// there since this one took the right to write ([`crate::Outputs::claim`]). A symbolic link stays, and the file that it
 /// leads to is written; a file keeps its permissions.
 pub fn write_atomic(path: impl AsRef<Path>, fill: impl FnOnce(&mut dyn Write) -> Result<()>) -> Result<()> {
-    let path = &resolve(path.as_ref());
+    let given = path.as_ref();
+    let path = &resolve(given);
     let folder = folder_of(path);
     create_dir(folder)?;
     let stem = path.file_name().unwrap_or_default().to_string_lossy();
@@ -36,12 +39,7 @@ pub fn write_atomic(path: impl AsRef<Path>, fill: impl FnOnce(&mut dyn Write) ->
         file.as_file().set_permissions(old.permissions()).at("keep the permissions of", path)?;
     }
     file.as_file().sync_all().at("flush", path)?;
-    file.persist(path).map_err(|e| e.error).at("rename into place", path)?;
-    // The rename itself lives in the folder: without this a power cut could undo it.
-    if let Ok(dir) = fs::File::open(folder) {
-        let _ = dir.sync_all();
-    }
-    Ok(())
+    put(file, given, path)
 }
 
 /// Writes `bytes` to `path` as [`write_atomic`] does.

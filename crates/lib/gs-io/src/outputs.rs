@@ -1,5 +1,6 @@
 //! What a run may write, checked before it works: nothing that somebody else made is overwritten.
 
+use crate::expected::Expecting;
 use crate::place::{Identity, Stamp, folder_of, identity, place, stamp, with_suffix};
 use crate::{Error, ErrorKind, IoContext, Lock, Result, artifact, hash_file};
 use serde::{Deserialize, Serialize};
@@ -149,8 +150,14 @@ impl Outputs {
         let mut locks = self.mains.iter().map(Lock::take).collect::<Result<Vec<_>>>()?;
         locks.iter_mut().try_for_each(|lock| lock.sign(&self.by))?;
         remove_partial(&files);
-        let mut claim = Claim { outputs: self, locks, past, before: BTreeMap::new(), finished: false };
+        let mut claim =
+            Claim { outputs: self, locks, past, before: BTreeMap::new(), expecting: None, finished: false };
         claim.before = claim.stamps();
+        if !claim.outputs.overwrite {
+            let whole = claim.outputs.folders.iter().filter(|(_, all)| *all);
+            let folders = whole.map(|(folder, _)| place(&folder.join("x"))).map(|p| folder_of(&p).to_path_buf());
+            claim.expecting = Some(Expecting::new(&claim.before, folders.collect()));
+        }
         Ok(claim)
     }
 
@@ -203,6 +210,8 @@ pub struct Claim {
     locks: Vec<Lock>,
     past: Past,
     before: BTreeMap<PathBuf, Option<Stamp>>,
+    /// None where everything may be overwritten.
+    expecting: Option<Expecting>,
     finished: bool,
 }
 
@@ -217,7 +226,7 @@ impl Claim {
         // What earlier runs wrote here stays theirs, hence this command's.
         let mut files: BTreeMap<PathBuf, Option<String>> = self.past.files.clone();
         files.retain(|path, _| path.exists());
-        for (path, stamp) in self.stamps() {
+        for (path, stamp) in self.own_stamps() {
             let changed = self.before.get(&path).copied().flatten() != stamp;
             // What stood here and was given up, or is of an unfinished run, counts as written.
             let adopted = self.past.unfinished || self.outputs.overwrite && claimed.contains(&path);
@@ -237,6 +246,16 @@ impl Claim {
         }
         self.finished = true;
         Ok(())
+    }
+
+    /// The same without what another program wrote meanwhile: that is as it was before, to this run.
+    fn own_stamps(&self) -> BTreeMap<PathBuf, Option<Stamp>> {
+        let own = |(path, now): (PathBuf, Option<Stamp>)| {
+            let foreign = self.expecting.as_ref().is_some_and(|e| !e.is_own(&path, now));
+            let now = if foreign { self.before.get(&path).copied().flatten() } else { now };
+            (path, now)
+        };
+        self.stamps().into_iter().map(own).filter(|(path, now)| now.is_some() || self.before.contains_key(path)).collect()
     }
 
     /// Every claimed file, by its place, and how it is now.
@@ -264,7 +283,7 @@ impl Claim {
 impl Drop for Claim {
     fn drop(&mut self) {
         // Without a record nothing but the signed lock says whose the new files are.
-        if !self.finished && (self.past.unfinished || self.stamps() != self.before) {
+        if !self.finished && (self.past.unfinished || self.own_stamps() != self.before) {
             self.locks.iter_mut().for_each(Lock::keep);
         }
     }

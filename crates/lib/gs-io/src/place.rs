@@ -30,7 +30,11 @@ pub(crate) fn resolve(path: &Path) -> PathBuf {
 /// The one name of a file, there or not: its folder without links, and its own name.
 pub(crate) fn place(path: &Path) -> PathBuf {
     let folder = folder_of(path);
-    let folder = folder.canonicalize().or_else(|_| std::path::absolute(folder)).unwrap_or_else(|_| folder.into());
+    let folder = folder.canonicalize().unwrap_or_else(|_| match folder.file_name() {
+        // A folder that will be made has the same name before and after.
+        Some(_) => place(folder),
+        None => std::path::absolute(folder).unwrap_or_else(|_| folder.into()),
+    });
     folder.join(path.file_name().unwrap_or_default())
 }
 
