@@ -5,6 +5,7 @@ use crate::{Error, ErrorKind, IoContext, Result, create_dir};
 use std::fs::{File, OpenOptions, TryLockError};
 use std::io::Write;
 use std::path::{Path, PathBuf};
+use std::time::{Duration, Instant};
 
 /// The right to write an output, held by one process at a time: `.<name>.lock` beside it, locked by the operating system,
 /// which takes the lock back however the process ends. A signed one that is left behind says whose run was cut off.
@@ -47,6 +48,22 @@ impl Lock {
         // A run that is refused leaves the signature of the one that was cut off.
         let keep = file.metadata().is_ok_and(|m| m.len() > 0);
         Ok(Self { held: Some((file, path)), keep, made })
+    }
+
+    /// [`Self::take`], after waiting for another holder to end, at most so long.
+    ///
+    /// # Errors
+    /// As [`Self::take`].
+    pub fn wait(output: impl AsRef<Path>, most: Duration) -> Result<Self> {
+        let begun = Instant::now();
+        loop {
+            match Self::take(&output) {
+                Err(e) if e.kind() == ErrorKind::Refused && begun.elapsed() < most => {
+                    std::thread::sleep(Duration::from_millis(2));
+                }
+                taken => return taken,
+            }
+        }
     }
 
     /// `.<name>.lock` beside what `output` leads to.
@@ -109,8 +126,13 @@ mod tests {
         let e = Lock::take(&out).unwrap_err().to_string();
         assert!(e.contains("a.ply: another run is writing this output"), "{e}");
         Lock::take(dir.path().join("new/b.ply")).unwrap();
+        assert!(Lock::wait(&out, Duration::from_millis(5)).is_err());
+        let second = std::thread::spawn({
+            let out = out.clone();
+            move || Lock::wait(out, Duration::from_secs(60)).map(drop)
+        });
         drop(first);
-        drop(Lock::take(&out).unwrap());
+        second.join().unwrap().unwrap();
         assert_eq!(std::fs::read_dir(dir.path()).unwrap().count(), 0);
         let mut cut_off = Lock::take(&out).unwrap();
         cut_off.sign("gs-geom train").unwrap();

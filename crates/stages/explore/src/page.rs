@@ -21,7 +21,7 @@ const LINKED_SCRIPT: &str = "<script type=\"module\" src=\"app/main.js\"></scrip
 pub fn run(o: &PageOptions, parameters: Value, stage: &Stage) -> Result<()> {
     let mut claim = stage.outputs(&o.out).file(&o.out).reads(o.source.files()).claim()?;
     let world = World::read(&o.source, o.resolution, stage)?;
-    let edited = world.edited(world.saved_edits()?)?;
+    let edited = world.saved(world.edits_file()?)?;
     let texts = texts(&world, &edited, &o.text)?;
     let shown = spread(world.dataset.views.len(), o.photographs);
     let blob = describe::blob(&world);

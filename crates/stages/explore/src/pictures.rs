@@ -8,6 +8,8 @@ use gs_scene::dataset::View;
 use gs_scene::{Gaussians, Image};
 use report::picture::Picture;
 
+/// Photographs that a server has in its memory at a time: a large one takes a gigabyte.
+pub const AT_A_TIME: usize = 2;
 /// Quality of the JPEG files, of 100.
 const QUALITY: u8 = 82;
 /// Most pixels along the longer side of an instance's picture.

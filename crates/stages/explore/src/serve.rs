@@ -5,37 +5,36 @@
 //! the scene. Bound to another address, everything lies below a secret in the URL.
 
 use crate::answers::{self, Click, Export};
+use crate::connections::{self, Rules};
 use crate::describe::Blob;
+use crate::kept::{Kept, Lost, Saved};
 use crate::options::ServeOptions;
 use crate::tools::Asked;
 use crate::world::{Edited, World};
 use crate::{describe, pictures, tools, web};
-use artifacts::{Edit, Edits};
+use artifacts::Edit;
 use axum::Router;
 use axum::body::Bytes;
-use axum::extract::{DefaultBodyLimit, Path, Query, Request, State};
+use axum::extract::{DefaultBodyLimit, Path, Query, State};
 use axum::http::{HeaderMap, HeaderValue, StatusCode, header};
-use axum::middleware::{self, Next};
 use axum::response::{IntoResponse, Response};
 use axum::routing::{get, post};
-use gs_io::{Error, IoContext, Result};
+use gs_io::{Error, IoContext, Result, Watched};
 use gs_scene::dataset::Resolution;
 use query::Index;
 use rand::TryRngCore;
 use rand::rngs::OsRng;
-use serde_json::Value;
+use serde_json::{Value, json};
 use stage::Stage;
 use std::collections::BTreeMap;
 use std::net::{IpAddr, Ipv4Addr, SocketAddr};
 use std::path::PathBuf;
 use std::sync::{Arc, Mutex};
 use std::time::Duration;
+use tokio::sync::Semaphore;
 
-/// What scripts, styles and pictures of the page may come from.
-const POLICY: &str = "default-src 'self'; script-src 'self' blob:; worker-src blob:; img-src 'self' data: blob:; \
-                      style-src 'self' 'unsafe-inline'; frame-ancestors 'none'; base-uri 'none'; form-action 'none'";
-/// Largest body of a request in bytes.
-const LARGEST_BODY: usize = 16 << 20;
+/// How long a request may take to come.
+const PATIENCE: Duration = Duration::from_secs(20);
 /// How long a browser may keep photographs, which do not change while the server runs.
 const KEEP: &str = "private, max-age=600";
 
@@ -43,19 +42,21 @@ const KEEP: &str = "private, max-age=600";
 struct Shared {
     world: World,
     blob: Blob,
-    /// The instances as they are now; nobody holds the lock while he works.
-    edited: Mutex<Arc<Edited>>,
+    /// What a person changed.
+    kept: Kept,
+    /// Turns at what takes much memory: photographs, and Gaussians to save.
+    large: Arc<Semaphore>,
+    /// Turns at encoding texts, one fewer than cores: the others are for clicks.
+    texts: Arc<Semaphore>,
     /// Small photographs, as far as they were asked for.
     previews: Mutex<BTreeMap<usize, Bytes>>,
     /// Folder that programs may write into.
     exports: Option<PathBuf>,
-    /// Whether only those who name this machine are answered.
-    local: bool,
 }
 
 impl Shared {
-    fn edited(&self) -> Arc<Edited> {
-        Arc::clone(&self.edited.lock().expect("no panic holds this lock"))
+    fn edited(&self) -> Result<Arc<Edited>, Lost> {
+        self.kept.now(&self.world)
     }
 }
 
@@ -73,7 +74,7 @@ pub fn run(o: &ServeOptions, stage: &Stage) -> Result<()> {
         e.found(address).hint("is the page open already? --port 0 takes a free one")
     })?;
     let address = listener.local_addr().at("listen at", "the address")?;
-    let shared = Arc::new(shared(o, local, stage)?);
+    let shared = Arc::new(shared(o, stage)?);
     // The first text then takes no longer than others.
     runtime.spawn_blocking({
         let shared = Arc::clone(&shared);
@@ -100,10 +101,10 @@ pub fn run(o: &ServeOptions, stage: &Stage) -> Result<()> {
     // Connections that browsers keep open do not hold the end up.
     runtime.block_on(async {
         tokio::select! {
-            served = axum::serve(listener, app).into_future() => served.at("serve", &url),
-            () = stopped => Ok(()),
+            () = connections::serve(listener, app, Rules { local, patience: PATIENCE }) => {}
+            () = stopped => {}
         }
-    })?;
+    });
     runtime.shutdown_timeout(Duration::from_secs(1));
     Ok(())
 }
@@ -114,9 +115,10 @@ fn secret() -> Result<String> {
     Ok(format!("/{:016x}{:016x}", part()?, part()?))
 }
 
-fn shared(o: &ServeOptions, local: bool, stage: &Stage) -> Result<Shared> {
+fn shared(o: &ServeOptions, stage: &Stage) -> Result<Shared> {
+    let run = Watched::by_content([&o.source.instances]);
     let world = World::read(&o.source, Resolution::Auto, stage)?;
-    let edited = world.edited(world.saved_edits()?)?;
+    let kept = Kept::new(&world, run)?;
     let blob = describe::blob(&world);
     stage.info(&format!(
         "{} Gaussians, {} instances; the page is {:.1} MB",
@@ -127,10 +129,11 @@ fn shared(o: &ServeOptions, local: bool, stage: &Stage) -> Result<Shared> {
     Ok(Shared {
         world,
         blob,
-        edited: Mutex::new(Arc::new(edited)),
+        kept,
+        large: Arc::new(Semaphore::new(pictures::AT_A_TIME)),
+        texts: Arc::new(Semaphore::new(rayon::current_num_threads().saturating_sub(1).max(1))),
         previews: Mutex::default(),
         exports: o.exports.clone(),
-        local,
     })
 }
 
@@ -148,61 +151,75 @@ fn routes(shared: Arc<Shared>) -> Router {
         .route("/thumbnail/{instance}", get(thumbnail))
         .route("/pick", post(pick))
         .route("/find", get(find))
-        .route("/edits", axum::routing::put(save))
+        .route("/edits", get(edits).put(save))
         .route("/selection", post(selection))
         .route("/tools", get(|| async { json(&tools::described()) }))
         .route("/tools/{name}", post(tool))
-        .layer(DefaultBodyLimit::max(LARGEST_BODY))
-        .layer(middleware::from_fn_with_state(Arc::clone(&shared), guard))
+        // Their bodies were read, up to a limit.
+        .layer(DefaultBodyLimit::disable())
         .with_state(shared)
-}
-
-/// Lets in who names this server, and no page of another origin; adds the policy of the page.
-async fn guard(State(shared): Held, request: Request, next: Next) -> Response {
-    let refused = refusal(request.headers(), shared.local);
-    let mut response = match refused {
-        Some(why) => (StatusCode::FORBIDDEN, why).into_response(),
-        None => next.run(request).await,
-    };
-    let headers = response.headers_mut();
-    headers.insert(header::CONTENT_SECURITY_POLICY, HeaderValue::from_static(POLICY));
-    headers.insert(header::X_CONTENT_TYPE_OPTIONS, HeaderValue::from_static("nosniff"));
-    // Pictures too: a page of another origin may not show them.
-    headers.insert("cross-origin-resource-policy", HeaderValue::from_static("same-origin"));
-    headers.insert(header::REFERRER_POLICY, HeaderValue::from_static("no-referrer"));
-    headers.entry(header::CACHE_CONTROL).or_insert(HeaderValue::from_static("no-store"));
-    response
-}
-
-/// Why a request is refused, if it is.
-fn refusal(headers: &HeaderMap, local: bool) -> Option<&'static str> {
-    let text = |name: header::HeaderName| headers.get(name).and_then(|v| v.to_str().ok());
-    let fetch = |what: &str| headers.get(format!("sec-fetch-{what}")).and_then(|v| v.to_str().ok());
-    let host = text(header::HOST).unwrap_or_default();
-    let name = host.rsplit_once(':').map_or(host, |(name, _)| name);
-    if local && !["127.0.0.1", "localhost"].contains(&name) {
-        return Some("this server answers at 127.0.0.1 only");
-    }
-    // Browsers name no origin for pictures and scripts. A link from elsewhere to the page is a person's own step.
-    let link = fetch("mode") == Some("navigate") && fetch("dest") == Some("document");
-    let elsewhere = fetch("site").is_some_and(|site| !["same-origin", "none"].contains(&site)) && !link;
-    let stranger = text(header::ORIGIN).is_some_and(|origin| origin != format!("http://{host}"));
-    (elsewhere || stranger).then_some("a page of another origin may not ask")
 }
 
 fn typed(kind: &'static str, body: impl IntoResponse) -> Response {
     ([(header::CONTENT_TYPE, kind)], body).into_response()
 }
 
+/// Why there is no answer, and the status that says so.
+struct Failed(StatusCode, Error);
+
+impl From<Error> for Failed {
+    fn from(e: Error) -> Self {
+        Self(StatusCode::BAD_REQUEST, e)
+    }
+}
+
+impl From<Lost> for Failed {
+    fn from(lost: Lost) -> Self {
+        match lost {
+            Lost::Gone(e) => Self(StatusCode::GONE, e),
+            Lost::Other(e) => Self(StatusCode::CONFLICT, e),
+        }
+    }
+}
+
+impl IntoResponse for Failed {
+    fn into_response(self) -> Response {
+        (self.0, self.1.to_string()).into_response()
+    }
+}
+
 /// Does the work on a thread that may be busy for long, and says in words why it failed.
-async fn answer<T: IntoResponse + Send + 'static>(work: impl FnOnce() -> Result<T> + Send + 'static) -> Response {
+async fn answer<T>(work: impl FnOnce() -> Result<T, Failed> + Send + 'static) -> Response
+where
+    T: IntoResponse + Send + 'static,
+{
     match tokio::task::spawn_blocking(work).await {
-        Ok(Ok(done)) => done.into_response(),
-        Ok(Err(e)) => (StatusCode::BAD_REQUEST, e.to_string()).into_response(),
+        Ok(done) => done.into_response(),
         Err(_) => {
             (StatusCode::INTERNAL_SERVER_ERROR, "the server failed at this; its terminal says why").into_response()
         }
     }
+}
+
+/// The same when it is its turn. The work keeps the turn to its end, also where nobody waits for it any more.
+async fn in_turn<T>(turns: &Arc<Semaphore>, work: impl FnOnce() -> Result<T, Failed> + Send + 'static) -> Response
+where
+    T: IntoResponse + Send + 'static,
+{
+    let turn = Arc::clone(turns).acquire_owned().await;
+    answer(move || {
+        let _turn = turn;
+        work()
+    })
+    .await
+}
+
+/// An answer that was made with these edits.
+fn with_edits(edited: &Edited, answer: impl IntoResponse) -> Response {
+    let mut response = answer.into_response();
+    let tag = HeaderValue::from_str(&format!("\"{}\"", edited.version)).expect("letters and digits");
+    response.headers_mut().insert(header::ETAG, tag);
+    response
 }
 
 fn json(value: &Value) -> Response {
@@ -213,9 +230,9 @@ fn no_such(what: &str) -> Error {
     Error::new(format!("there is no such {what}"))
 }
 
-/// A body of JSON.
-fn parsed<T: serde::de::DeserializeOwned>(body: &Bytes) -> Result<T> {
-    serde_json::from_slice(body).map_err(|e| Error::new(format!("not understood: {e}")))
+/// A body of JSON, which is needed no longer.
+fn parsed<T: serde::de::DeserializeOwned>(body: Bytes) -> Result<T> {
+    serde_json::from_slice(&body).map_err(|e| Error::new(format!("not understood: {e}")))
 }
 
 async fn app_file(Path(name): Path<String>) -> Response {
@@ -231,56 +248,57 @@ async fn app_file(Path(name): Path<String>) -> Response {
 async fn scene_json(State(s): Held) -> Response {
     answer(move || {
         let all: Vec<usize> = (0..s.world.dataset.views.len()).collect();
-        let edited = s.edited();
-        Ok(json(&describe::scene(&s.world, &edited, &s.blob, "serve", &all)))
+        let edited = s.edited()?;
+        Ok(with_edits(&edited, json(&describe::scene(&s.world, &edited, &s.blob, "serve", &all))))
     })
     .await
 }
 
 async fn photograph(State(s): Held, Path(view): Path<usize>) -> Response {
-    answer(move || {
+    in_turn(&Arc::clone(&s.large), move || {
         let view = s.world.dataset.views.get(view).ok_or_else(|| no_such("view"))?;
         let kept = [(header::CONTENT_TYPE, "image/jpeg"), (header::CACHE_CONTROL, KEEP)];
-        pictures::photograph(view).map(|jpeg| (kept, jpeg))
+        Ok(pictures::photograph(view).map(|jpeg| (kept, jpeg))?)
     })
     .await
 }
 
 /// A small photograph. All of them together are a few megabytes, and each took a large one to decode: they are kept.
 async fn preview(State(s): Held, Path(view): Path<usize>) -> Response {
-    answer(move || {
-        let kept = |s: &Shared| s.previews.lock().expect("no panic holds this lock").get(&view).cloned();
-        let made = |s: &Shared| -> Result<Bytes> {
-            let photograph = s.world.dataset.views.get(view).ok_or_else(|| no_such("view"))?;
-            let jpeg = Bytes::from(pictures::preview(photograph)?);
-            s.previews.lock().expect("no panic holds this lock").insert(view, jpeg.clone());
-            Ok(jpeg)
-        };
-        kept(&s).map_or_else(|| made(&s), Ok).map(|jpeg| typed("image/jpeg", jpeg))
+    let kept = move |s: &Shared| s.previews.lock().expect("no panic holds this lock").get(&view).cloned();
+    if let Some(jpeg) = kept(&s) {
+        return typed("image/jpeg", jpeg);
+    }
+    in_turn(&Arc::clone(&s.large), move || {
+        if let Some(jpeg) = kept(&s) {
+            return Ok(typed("image/jpeg", jpeg));
+        }
+        let photograph = s.world.dataset.views.get(view).ok_or_else(|| no_such("view"))?;
+        let jpeg = Bytes::from(pictures::preview(photograph)?);
+        s.previews.lock().expect("no panic holds this lock").insert(view, jpeg.clone());
+        Ok(typed("image/jpeg", jpeg))
     })
     .await
 }
 
 async fn thumbnail(State(s): Held, Path(instance): Path<usize>) -> Response {
-    answer(move || {
-        let (best, members) = {
-            let edited = s.edited();
-            let instances = &edited.instances;
-            let best = *pictures::best_views(&s.world, instances).get(instance).ok_or_else(|| no_such("instance"))?;
-            (best, Index::new(instances).members(&[instance as u32]))
-        };
+    in_turn(&Arc::clone(&s.large), move || {
+        let edited = s.edited()?;
+        let instances = &edited.instances;
+        let best = *pictures::best_views(&s.world, instances).get(instance).ok_or_else(|| no_such("instance"))?;
+        let members = Index::new(instances).members(&[instance as u32]);
         let view = &s.world.dataset.views[best.ok_or_else(|| no_such("picture: no view shows it"))?];
-        pictures::thumbnail(&view.load_image()?, view, s.world.gaussians(), &members)
-            .map(|jpeg| typed("image/jpeg", jpeg))
+        let jpeg = pictures::thumbnail(&view.load_image()?, view, s.world.gaussians(), &members)?;
+        Ok(typed("image/jpeg", jpeg))
     })
     .await
 }
 
 async fn pick(State(s): Held, body: Bytes) -> Response {
     answer(move || {
-        let click: Click = parsed(&body)?;
-        let edited = s.edited();
-        Ok(json(&serde_json::json!(answers::pick(&s.world, &edited, &click)?)))
+        let click: Click = parsed(body)?;
+        let edited = s.edited()?;
+        Ok(with_edits(&edited, json(&json!(answers::pick(&s.world, &edited, &click)?))))
     })
     .await
 }
@@ -292,84 +310,77 @@ struct Words {
 }
 
 async fn find(State(s): Held, Query(asked): Query<Words>) -> Response {
-    answer(move || {
-        let edited = s.edited();
-        answers::find(&s.world, &edited, &asked.text).map(|found| json(&serde_json::json!(found)))
+    in_turn(&Arc::clone(&s.texts), move || {
+        let edited = s.edited()?;
+        let found = answers::find(&s.world, &edited, &asked.text)?;
+        Ok(with_edits(&edited, json(&json!(found))))
     })
     .await
 }
 
-/// Keeps the edits in the run's folder, and answers with the instances after them.
-async fn save(State(s): Held, body: Bytes) -> Response {
+/// The edits, and the instances after them.
+fn as_they_are(s: &Shared, edited: &Edited) -> Value {
+    json!({"edits": edited.edits.edits, "instances": describe::instances_of(Some(edited), &s.world)})
+}
+
+async fn edits(State(s): Held) -> Response {
     answer(move || {
-        let edits: Vec<Edit> = parsed(&body)?;
-        let edits = Edits { instances: s.world.scene.artifact.hash().into(), edits };
-        let new = s.world.edited(edits)?;
-        new.edits.write(s.world.source.edits())?;
-        let list = describe::instances_of(Some(&new), &s.world);
-        *s.edited.lock().expect("no panic holds this lock") = Arc::new(new);
-        Ok(json(&Value::Array(list)))
+        let edited = s.edited()?;
+        Ok(with_edits(&edited, json(&as_they_are(&s, &edited))))
+    })
+    .await
+}
+
+/// Keeps the edits in the run's folder, and answers with the instances after them. `If-Match` names the version that they were made
+/// from: where there is another now, the answer is 409 with what there is.
+async fn save(State(s): Held, headers: HeaderMap, body: Bytes) -> Response {
+    let of = headers.get(header::IF_MATCH).map(|v| v.to_str().unwrap_or_default().trim_matches('"').to_string());
+    answer(move || {
+        let edits: Vec<Edit> = parsed(body)?;
+        Ok(match s.kept.replace(&s.world, edits, of.as_deref())?? {
+            Saved::Yes(new) => with_edits(&new, json(&describe::instances_of(Some(&new), &s.world).into())),
+            Saved::Stale(there) => {
+                let mut now = as_they_are(&s, &there);
+                now["error"] = "the edits were changed since: make yours again from these".into();
+                with_edits(&there, (StatusCode::CONFLICT, json(&now)))
+            }
+        })
     })
     .await
 }
 
 /// A tool's answer; what is wrong with a question is JSON too.
 async fn tool(State(s): Held, Path(name): Path<String>, body: Bytes) -> Response {
-    let ask = move || {
-        let arguments = if body.is_empty() { Value::Null } else { parsed(&body)? };
-        let edited = s.edited();
-        tools::ask(&name, arguments, &Asked { world: &s.world, edited: &edited, exports: s.exports.as_deref() })
+    let turns = match &name[..] {
+        "find" => Some(Arc::clone(&s.texts)),
+        "export" => Some(Arc::clone(&s.large)),
+        _ => None,
     };
-    answer(move || {
+    let ask = move || -> Result<Value, Failed> {
+        let arguments = if body.is_empty() { Value::Null } else { parsed(body)? };
+        let edited = s.edited()?;
+        Ok(tools::ask(&name, arguments, &Asked { world: &s.world, edited: &edited, exports: s.exports.as_deref() })?)
+    };
+    let work = move || {
         Ok(match ask() {
             Ok(answer) => json(&answer),
-            Err(e) => (StatusCode::BAD_REQUEST, json(&serde_json::json!({"error": e.to_string()}))).into_response(),
+            Err(Failed(status, e)) => (status, json(&json!({"error": e.to_string()}))).into_response(),
         })
-    })
-    .await
+    };
+    match turns {
+        Some(turns) => in_turn(&turns, work).await,
+        None => answer(work).await,
+    }
 }
 
 async fn selection(State(s): Held, body: Bytes) -> Response {
-    answer(move || {
-        let chosen = answers::selection(&s.world, &parsed::<Export>(&body)?)?;
+    in_turn(&Arc::clone(&s.large), move || {
+        let wanted: Export = parsed(body)?;
+        s.edited()?;
+        let chosen = answers::selection(&s.world, &wanted)?;
         let comments = s.world.scene.geometry.comments(vec!["cags selection".into()]);
         let ply = gs_scene::ply::some_gaussians(s.world.gaussians(), &chosen, &comments)?;
         Ok(typed("application/octet-stream", ply))
     })
     .await
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn strangers_are_refused() {
-        let of = |pairs: &[(header::HeaderName, &str)], local| {
-            let pairs = pairs.iter().map(|(name, value)| (name.clone(), HeaderValue::from_str(value).unwrap()));
-            refusal(&pairs.collect(), local).is_some()
-        };
-        let (host, origin) = (header::HOST, header::ORIGIN);
-        assert!(!of(&[(host.clone(), "127.0.0.1:7007")], true) && !of(&[(host.clone(), "localhost:7007")], true));
-        // A name that somebody lets lead to this machine.
-        assert!(of(&[(host.clone(), "evil.example:7007")], true) && of(&[], true));
-        assert!(!of(&[(host.clone(), "192.168.1.2:7007")], false));
-        let from = |page: &str| of(&[(host.clone(), "localhost:7007"), (origin.clone(), page)], true);
-        assert!(
-            !from("http://localhost:7007")
-                && from("http://localhost:8000")
-                && from("null")
-                && from("https://evil.example")
-        );
-        // A picture within a page of another origin, or of another port here, and a frame; a link to the page is well.
-        let fetched = |site: &str, mode: &str, dest: &str| {
-            let fetch =
-                ["site", "mode", "dest"].map(|n| header::HeaderName::try_from(format!("sec-fetch-{n}")).unwrap());
-            let [s, m, d] = fetch;
-            of(&[(host.clone(), "localhost:7007"), (s, site), (m, mode), (d, dest)], true)
-        };
-        assert!(fetched("cross-site", "no-cors", "image") && fetched("same-site", "no-cors", "image"));
-        assert!(fetched("cross-site", "navigate", "iframe") && !fetched("cross-site", "navigate", "document"));
-        assert!(!fetched("same-origin", "cors", "empty") && !fetched("none", "navigate", "document"));
-    }
 }

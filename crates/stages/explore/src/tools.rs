@@ -82,7 +82,62 @@ pub fn ask(tool: &str, arguments: Value, asked: &Asked) -> Result<Value> {
     let known = || TOOLS.map(|t| t.name).join(", ");
     let found = TOOLS.iter().find(|t| t.name == tool);
     let tool = found.ok_or_else(|| Error::new("no such tool").found(tool).expected(known()))?;
-    (tool.answer)(asked, if arguments.is_null() { json!({}) } else { arguments }).map(rounded)
+    let mut arguments = if arguments.is_null() { json!({}) } else { arguments };
+    whole_numbers(&mut arguments);
+    check(&arguments, &(tool.schema)().into(), "arguments")?;
+    (tool.answer)(asked, arguments).map(rounded)
+}
+
+/// Makes 17.0 the integer that JSON's schemas take it for.
+fn whole_numbers(value: &mut Value) {
+    match value {
+        Value::Number(n) => {
+            if let Some(v) = n.as_f64().filter(|v| n.is_f64() && v.fract() == 0.0 && v.abs() <= 2f64.powi(53)) {
+                *value = json!(v as i64);
+            }
+        }
+        Value::Array(a) => a.iter_mut().for_each(whole_numbers),
+        Value::Object(o) => o.values_mut().for_each(whole_numbers),
+        _ => {}
+    }
+}
+
+/// Checks the types of arguments, and says in JSON's words what is wrong. Which arguments there are is checked where they are read.
+fn check(value: &Value, schema: &Value, field: &str) -> Result<()> {
+    let (article, kind) = match value {
+        Value::Null => ("", "null"),
+        Value::Bool(_) => ("a ", "boolean"),
+        Value::Number(n) if n.is_f64() => ("a ", "number"),
+        Value::Number(_) => ("an ", "integer"),
+        Value::String(_) => ("a ", "string"),
+        Value::Array(_) => ("an ", "array"),
+        Value::Object(_) => ("an ", "object"),
+    };
+    let kinds = match &schema["type"] {
+        Value::Array(kinds) => kinds.clone(),
+        one => vec![one.clone()],
+    };
+    let most = if schema["format"] == "uint32" { u64::from(u32::MAX) } else { u64::MAX };
+    let fits = kind != "integer" || schema["minimum"] != 0 || value.as_u64().is_some_and(|v| v <= most);
+    if !fits || !kinds.iter().any(|k| k == kind) {
+        let found = if matches!(value, Value::Number(_)) { format!("{kind} {value}") } else { kind.into() };
+        let expected = match kinds[0].as_str().unwrap_or_default() {
+            "integer" if schema["format"] == "uint32" => format!("an integer, 0 to {most}"),
+            "integer" => "an integer, 0 or more".into(),
+            "array" => "an array".into(),
+            "object" => "an object".into(),
+            other => format!("a {other}"),
+        };
+        return Err(Error::new("not understood").field(field).found(format!("{article}{found}")).expected(expected));
+    }
+    match value {
+        Value::Object(of) => {
+            let known = |name: &str| schema["properties"].get(name);
+            of.iter().try_for_each(|(name, v)| known(name).map_or(Ok(()), |own| check(v, own, name)))
+        }
+        Value::Array(of) => of.iter().try_for_each(|v| check(v, &schema["items"], field)),
+        _ => Ok(()),
+    }
 }
 
 /// All numbers with fractions to four digits: nobody needs more, and agents pay for each.
@@ -290,9 +345,10 @@ fn export(asked: &Asked, export: &Export) -> Result<Value> {
     })?;
     let name = Path::new(&export.file);
     let plain = matches!(name.components().collect::<Vec<_>>()[..], [Component::Normal(_)]);
-    if !plain || export.file.starts_with('.') || export.file.contains(['/', '\\', '\0']) {
+    let bad = export.file.starts_with('.') || export.file.contains(['/', '\\']);
+    if !plain || bad || gs_io::check_name(&export.file).is_err() {
         let e = Error::new("not a name of a file").field("file").found(format!("{:?}", export.file));
-        return Err(e.expected("a name without folders, such as mug.ply"));
+        return Err(e.expected("a name without folders, control characters or a dash before it, such as mug.ply"));
     }
     Format::to_write(name)?;
     let mut meant = BTreeSet::new();
@@ -307,9 +363,12 @@ fn export(asked: &Asked, export: &Export) -> Result<Value> {
     }
     std::fs::create_dir_all(folder).map_err(|e| Error::new(format!("cannot make the folder: {e}")).file(folder))?;
     let path = folder.join(name);
+    // What comes there while it is written stays, too.
+    let taken = || Error::new("a file of this name is there").file(&path).hint("choose another name");
     if path.symlink_metadata().is_ok() {
-        return Err(Error::new("a file of this name is there").file(&path).hint("choose another name"));
+        return Err(taken());
     }
+    let _new = gs_io::expect_new(&path);
     let own = vec![concat!("made by explore ", env!("CARGO_PKG_VERSION")).into()];
     let world = asked.world;
     Labelled::new(&world.scene.geometry, &world.source.geometry, label, own)?.write(&path, &which)?;

@@ -4,7 +4,7 @@ use crate::options::Source;
 use crate::pack::{Packed, pack};
 use crate::reach::Reach;
 use artifacts::{Called, Edits, InstanceNames, Instances, Remarks, called};
-use gs_io::{Error, Result};
+use gs_io::{Error, IoContext, Result};
 use gs_scene::Gaussians;
 use gs_scene::dataset::{self, Dataset, LoadOptions, Resolution, View};
 use objects::Up;
@@ -45,6 +45,8 @@ pub struct World {
 pub struct Edited {
     /// What was done.
     pub edits: Edits,
+    /// Which content of the file that is.
+    pub version: String,
     /// The instances after it.
     pub instances: Instances,
     /// Names and scale.
@@ -143,18 +145,34 @@ impl World {
         self.scene.gaussians()
     }
 
-    /// The edits that lie in the run's folder, none where there are none.
+    /// What lies in the run's folder as edits, and its version; nothing where there is no such file.
     ///
     /// # Errors
-    /// When the file is damaged, or is about other instances.
-    pub fn saved_edits(&self) -> Result<Edits> {
-        let (path, hash) = (&self.source.edits(), self.scene.artifact.hash());
-        if !path.exists() {
-            return Ok(Edits { instances: hash.into(), edits: Vec::new() });
+    /// When the file cannot be read.
+    pub fn edits_file(&self) -> Result<(Vec<u8>, String)> {
+        let path = self.source.edits();
+        match std::fs::read(&path) {
+            Ok(bytes) => {
+                let version = format!("{:.32}", gs_io::hash_bytes(&bytes));
+                Ok((bytes, version))
+            }
+            Err(e) if e.kind() == std::io::ErrorKind::NotFound => Ok((Vec::new(), "none".into())),
+            Err(e) => Err(e).at("read", path),
         }
-        let edits = Edits::read(path)?;
+    }
+
+    /// The instances after the edits of [`Self::edits_file`].
+    ///
+    /// # Errors
+    /// When the file is damaged, is about other instances, or an edit does not fit them.
+    pub fn saved(&self, (bytes, version): (Vec<u8>, String)) -> Result<Edited> {
+        let (path, hash) = (&self.source.edits(), self.scene.artifact.hash());
+        if version == "none" {
+            return self.edited(Edits { instances: hash.into(), edits: Vec::new() }, version);
+        }
+        let edits = Edits::parse(&bytes).map_err(|e| e.file(path))?;
         if edits.instances == hash {
-            return Ok(edits);
+            return self.edited(edits, version).map_err(|e| e.file(path));
         }
         Err(Error::new("these edits are about other instances")
             .file(path)
@@ -164,14 +182,14 @@ impl World {
             .hint("move the file away to start anew"))
     }
 
-    /// The instances after some edits.
+    /// The instances after some edits, of this version.
     ///
     /// # Errors
     /// When an edit does not fit the instances.
-    pub fn edited(&self, edits: Edits) -> Result<Edited> {
+    pub fn edited(&self, edits: Edits, version: String) -> Result<Edited> {
         let mut instances = self.scene.instances.clone();
         let remarks = edits.apply(&mut instances, &self.gaussians().means)?;
-        Ok(Edited { edits, instances, remarks, objects: OnceLock::new(), by_chance: OnceLock::new() })
+        Ok(Edited { edits, version, instances, remarks, objects: OnceLock::new(), by_chance: OnceLock::new() })
     }
 
     /// The view of this stem.

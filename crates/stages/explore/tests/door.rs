@@ -155,7 +155,19 @@ fn objects_are_written_where_it_is_allowed_and_nothing_is_overwritten() {
         assert!(said.contains(part), "{arguments}: {said}");
     };
     refused(json!({"objects": [0], "file": "rest.ply"}), "a file of this name is there");
-    for name in ["../out.ply", "/tmp/out.ply", "a/b.ply", "..", "", ".ply", "a\\b.ply", "a\0.ply"] {
+    for name in [
+        "../out.ply",
+        "/tmp/out.ply",
+        "a/b.ply",
+        "..",
+        "",
+        ".ply",
+        "a\\b.ply",
+        "a\0.ply",
+        "-a.ply",
+        "a\n.ply",
+        "a\u{202e}b.ply",
+    ] {
         refused(json!({"objects": [0], "file": name}), "not a name of a file");
     }
     refused(json!({"objects": [0], "file": "a.obj"}), "no format that can be written");
@@ -175,7 +187,18 @@ fn bad_questions_are_answered_with_what_is_wrong() {
         ("find", json!({"text": " "}), "not a question"),
         ("find", json!({"text": "zebra"}), "no such text in the table"),
         ("find", json!({"text": "far ball", "most": 0}), "1 to 100"),
-        ("measure", json!({"object": -1}), "not understood"),
+        ("measure", json!({"object": -1}), "object: not understood; found an integer -1, expected an integer, 0 to"),
+        ("measure", json!({"object": 1u64 << 32}), "found an integer 4294967296, expected an integer, 0 to 4294967295"),
+        ("measure", json!({"object": "0"}), "found a string, expected an integer"),
+        ("measure", json!({"object": 0.5}), "found a number 0.5, expected an integer"),
+        ("measure", json!({"object": [0]}), "found an array, expected an integer"),
+        ("measure", json!({"object": 1e30}), "found a number 1e+30, expected an integer"),
+        ("find", json!({"text": 7}), "text: not understood; found an integer 7, expected a string"),
+        ("find", json!({"text": null}), "found null, expected a string"),
+        ("list", json!({"most": true}), "found a boolean, expected an integer, 0 or more"),
+        ("export", json!({"objects": 1, "file": "a.ply"}), "found an integer 1, expected an array"),
+        ("export", json!({"objects": [{}], "file": "a.ply"}), "objects: not understood; found an object, expected"),
+        ("export", json!({"objects": [], "others": "no", "file": "a.ply"}), "found a string, expected a boolean"),
         ("measure", json!({"object": 9}), "object: no such object; found 9"),
         ("measure", json!({"object": 0, "other": 9}), "other: no such object"),
         ("relations", json!({"object": 2}), "no such object"),
@@ -185,12 +208,149 @@ fn bad_questions_are_answered_with_what_is_wrong() {
         let said = doors.ask(tool, &arguments).unwrap_err();
         assert!(said.contains(part), "{tool} {arguments}: {said}");
     }
+    // JSON's schemas count 1.0 as an integer.
+    assert_eq!(doors.ask("list", &json!({"most": 1.0})), doors.ask("list", &json!({"most": 1})));
+    assert!(doors.ask("measure", &json!({"object": 0.0, "other": 1e0})).is_ok());
+    let (status, _, body) = doors.server.ask("POST", "/tools/measure", "", "[0]");
+    let said = String::from_utf8_lossy(&body);
+    assert!(status == 400 && said.contains("arguments: not understood; found an array, expected an object"), "{said}");
     let (status, _, body) = doors.server.ask("POST", "/tools/find", "", "{");
     assert!(status == 400 && String::from_utf8_lossy(&body).contains("not understood"));
     assert_eq!(doors.server.ask("POST", "/tools/list", "Origin: http://evil.example\r\n", "").0, 403);
     let mut noisy = Command::new(env!("CARGO_BIN_EXE_explore"));
     let noisy = noisy.args(run.arguments("mcp")).arg("--json").output().unwrap();
     assert!(noisy.status.code() == Some(2) && String::from_utf8_lossy(&noisy.stdout).contains("--json"));
+}
+
+fn renamed(instance: u32, name: &str) -> Value {
+    json!({"op": "rename", "instance": instance, "name": name})
+}
+
+#[test]
+fn no_edit_is_lost_between_two_servers_and_an_agent() {
+    let run = Run::new();
+    let servers = [run.serve(&[]), run.serve(&[])];
+    let mut agent = Agent::start(run.arguments("mcp"));
+    let [one, other] = &servers;
+    let ((_, first), (_, same)) = (one.edits(), other.edits());
+    assert_eq!(first, same);
+    let (moon, sun) = (renamed(0, "Moon"), renamed(1, "Sun"));
+    let (status, second, _) = one.put_edits(&json!([moon]), Some(&first));
+    assert!(status == 200 && second != first);
+    // What was made of an older list is not kept; the answer says what there is.
+    let (status, now, said) = other.put_edits(&json!([sun]), Some(&first));
+    assert_eq!((status, &now, &said["edits"]), (409, &second, &json!([moon])));
+    assert_eq!((&said["instances"][0]["name"], said["error"].is_string()), (&json!("Moon"), true));
+    assert_eq!(other.put_edits(&json!([moon, sun]), Some(&now)).0, 200);
+    // Each sees what the others did, and the agent too.
+    assert_eq!(one.edits().0, json!([moon, sun]));
+    assert_eq!(one.json("GET", "/find?text=sun", &Value::Null)["named"], json!([1]));
+    let list = agent.tool("list", &json!({})).unwrap();
+    assert_eq!((&list["objects"][0]["name"], &list["objects"][1]["name"]), (&json!("Moon"), &json!("Sun")));
+    // Without a version nothing can be taken away.
+    assert_eq!(one.put_edits(&json!([sun]), None).0, 409);
+    assert_eq!(one.put_edits(&json!([moon, sun, renamed(0, "Luna")]), None).0, 200);
+
+    // Many at once, each for itself, with both.
+    std::thread::scope(|s| {
+        for k in 0..6 {
+            let server = &servers[k % 2];
+            s.spawn(move || {
+                for round in 0..4 {
+                    let own = renamed(1, &format!("{k} {round}"));
+                    loop {
+                        let (mut edits, version) = server.edits();
+                        edits.as_array_mut().unwrap().push(own.clone());
+                        match server.put_edits(&edits, Some(&version)).0 {
+                            200 => break,
+                            status => assert_eq!(status, 409),
+                        }
+                    }
+                }
+            });
+        }
+    });
+    let kept = other.edits().0;
+    assert_eq!(kept.as_array().unwrap().len(), 3 + 6 * 4);
+    for (k, round) in (0..6).flat_map(|k| (0..4).map(move |round| (k, round))) {
+        assert!(kept.as_array().unwrap().contains(&renamed(1, &format!("{k} {round}"))), "{k} {round}");
+    }
+}
+
+#[test]
+fn a_run_that_became_another_is_said() {
+    let run = Run::new();
+    let server = run.serve(&[]);
+    let mut agent = Agent::start(run.arguments("mcp"));
+    let path = run.out().join("instances.safetensors");
+    let bytes = std::fs::read(&path).unwrap();
+    let (_, version) = server.edits();
+    // Copied over itself it is the same.
+    std::fs::write(&path, &bytes).unwrap();
+    assert_eq!(server.put_edits(&json!([renamed(0, "Moon")]), Some(&version)).0, 200);
+    let edits = run.out().join("instances.edits.json");
+    let kept = std::fs::read(&edits).unwrap();
+
+    let (mut instances, artifact) = artifacts::Instances::read(&path).unwrap();
+    instances.score[0] = 0.5;
+    instances.write(&path, artifact.provenance().clone()).unwrap();
+    let refused = |expected: u16, says: &str| {
+        for (method, path, body) in [
+            ("PUT", "/edits", "[]"),
+            ("GET", "/edits", ""),
+            ("GET", "/scene.json", ""),
+            ("GET", "/find?text=moon", ""),
+            ("POST", "/selection", r#"{"cells": [0]}"#),
+            ("POST", "/tools/list", ""),
+        ] {
+            let (status, head, answer) = server.ask(method, path, "", body);
+            let answer = String::from_utf8_lossy(&answer);
+            assert!(status == expected && answer.contains(says), "{path}: {status} {answer}");
+            assert!(!head.contains("etag"), "{head}");
+        }
+    };
+    refused(409, "the run was clustered again");
+    assert!(agent.tool("list", &json!({})).unwrap_err().contains("the run was clustered again"));
+    assert_eq!(std::fs::read(&edits).unwrap(), kept);
+    // Put back it goes on; a list of edits that is about other instances, or damaged, is not written over.
+    std::fs::write(&path, &bytes).unwrap();
+    assert_eq!(server.edits().0, json!([renamed(0, "Moon")]));
+    for other in [r#"{"format": "instances.edits", "version": 1, "instances": "other", "edits": []}"#, "{"] {
+        std::fs::write(&edits, other).unwrap();
+        refused(409, "instances.edits.json");
+        assert_eq!(std::fs::read_to_string(&edits).unwrap(), other);
+    }
+    std::fs::remove_dir_all(run.out()).unwrap();
+    refused(410, "the run is no longer there");
+    assert!(agent.tool("list", &json!({})).unwrap_err().contains("no longer there"));
+    assert!(!run.out().exists(), "nothing makes it again");
+}
+
+#[test]
+fn what_is_no_request_is_answered_and_the_agent_is_heard_meanwhile() {
+    let run = Run::new();
+    let mut agent = Agent::start(run.arguments("mcp"));
+    let mut say = |line: &str| {
+        writeln!(agent.to.as_mut().unwrap(), "{line}").unwrap();
+        serde_json::from_str::<Value>(&agent.from.next().unwrap().unwrap()).unwrap()
+    };
+    for (line, code, id) in [
+        ("hello", -32700, Value::Null),
+        ("[1", -32700, Value::Null),
+        (r#"{"jsonrpc":"2.0","id":"x","method":5}"#, -32600, json!("x")),
+        (r#"{"jsonrpc":"2.0","id":91,"method":"no/such"}"#, -32601, json!(91)),
+        (r#"{"jsonrpc":"2.0","id":92,"method":"tools/call","params":{}}"#, -32602, json!(92)),
+    ] {
+        let said = say(line);
+        assert_eq!((&said["error"]["code"], said.get("id")), (&json!(code), Some(&id)), "{line}: {said}");
+    }
+    // A cancelled question has no answer; the next one has.
+    let ask = json!({"jsonrpc": "2.0", "id": 93, "method": "tools/call", "params": {"name": "list", "arguments": {}}});
+    let cancel = json!({"jsonrpc": "2.0", "method": "notifications/cancelled", "params": {"requestId": 93}});
+    let both = format!("{ask}\n{cancel}\n{}", json!({"jsonrpc": "2.0", "id": 94, "method": "ping"}));
+    let said = say(&both);
+    // The answer may have been on its way before.
+    assert!(said["id"] == json!(94) || said["id"] == json!(93) && agent.from.next().unwrap().unwrap().contains("94"));
 }
 
 /// The session of docs/door.md: lines `> tool arguments`, each with the answer below it. CAGS_WRITE_DOOR=1 writes the answers anew.

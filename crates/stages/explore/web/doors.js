@@ -1,5 +1,6 @@
 // Where answers come from: a server on this machine, or what the file itself holds. Both have the same doors:
 // load(progress), photograph(view), preview(view), thumbnail(instance), pick(...), find(text), save(edits), selection(...).
+// A server may have edits that this page has not: `behind` says that an answer was made with others.
 import { Gaussians, largest } from "./gaussians.js";
 
 async function answer(response) {
@@ -8,13 +9,13 @@ async function answer(response) {
   throw new Error(text || `the server says ${response.status}`);
 }
 
-const post = (path, body, method = "POST") =>
-  fetch(path, { method, headers: { "content-type": "application/json" }, body: JSON.stringify(body) }).then(answer);
+const post = (path, body) =>
+  fetch(path, { method: "POST", headers: { "content-type": "application/json" }, body: JSON.stringify(body) }).then(answer);
 
 export class Server {
   // `progress(done, total)` in bytes.
   async load(progress) {
-    const scene = await (await fetch("scene.json").then(answer)).json();
+    const scene = await this.known(await fetch("scene.json").then(answer)).json();
     const response = await fetch("scene.bin").then(answer);
     const bytes = new Uint8Array(scene.bytes), reader = response.body.getReader();
     for (let at = 0; ;) {
@@ -25,6 +26,18 @@ export class Server {
     }
     this.scene = scene;
     this.gaussians = new Gaussians(scene, bytes.buffer);
+  }
+
+  // The page has the edits that this answer was made with.
+  known(response) {
+    this.version = response.headers.get("etag");
+    this.behind = false;
+    return response;
+  }
+
+  seen(response) {
+    this.behind = response.headers.get("etag") !== this.version;
+    return response;
   }
 
   photograph(view) {
@@ -41,16 +54,25 @@ export class Server {
 
   async pick(camera, x, y, hidden) {
     const { width, height, fx, fy, cx, cy, rotation, translation } = camera;
-    return (await post("pick", { camera: { width, height, fx, fy, cx, cy, rotation, translation }, x, y, hidden })).json();
+    return this.seen(await post("pick", { camera: { width, height, fx, fy, cx, cy, rotation, translation }, x, y, hidden })).json();
   }
 
   async find(text) {
-    return (await fetch(`find?text=${encodeURIComponent(text)}`).then(answer)).json();
+    return this.seen(await fetch(`find?text=${encodeURIComponent(text)}`).then(answer)).json();
   }
 
-  // The instances after the edits.
+  // The edits that there are, and the instances after them.
+  async edits() {
+    return this.known(await fetch("edits").then(answer)).json();
+  }
+
+  // { instances } after the edits; where others were made since, nothing is saved, and those are told: { edits, instances }.
   async save(edits) {
-    return (await post("edits", edits, "PUT")).json();
+    const headers = { "content-type": "application/json", "if-match": this.version };
+    const response = await fetch("edits", { method: "PUT", headers, body: JSON.stringify(edits) });
+    const stale = response.status === 409 && response.headers.has("etag");
+    const said = await this.known(stale ? response : await answer(response)).json();
+    return stale ? said : { instances: said };
   }
 
   async selection(cells, others) {
@@ -105,7 +127,7 @@ export class File {
   }
 
   async save() {
-    return null;
+    return { instances: null };
   }
 
   async selection(cells, others) {

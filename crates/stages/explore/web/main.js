@@ -178,7 +178,11 @@ function select(cells, { extend = false, clicked = null } = {}) {
 
 const selectInstances = (ids, options) => select(ids.flatMap((k) => instances.cellsOf(k)), options);
 
-const pick = (here, x, y) => door.pick(here, x, y, hiddenCells(), (cell) => instances.label[cell]);
+async function pick(here, x, y) {
+  const picked = await door.pick(here, x, y, hiddenCells(), (cell) => instances.label[cell]);
+  if (door.behind) await catchUp();
+  return picked;
+}
 
 // What is where an event happened; null outside of the picture.
 async function under(event) {
@@ -228,6 +232,8 @@ function setTool(tool) {
 const find = attempt(async (text) => {
   if (!text.trim()) return clearAnswer();
   const answer = await door.find(text, instances.names);
+  // Not waited for: a change that waits for this goes first.
+  if (door.behind) catchUp();
   // A file knows the scores of the instances as they were: what was split off since has those of the whole.
   const best = (from) => from.map((k) => answer.scores[k]).filter((s) => s != null).reduce((a, b) => (a === null || b > a ? b : a), null);
   const scores = answer.scores.length ? instances.origin.map((from, k) => (from.length ? answer.scores[k] ?? best(from) : null)) : [];
@@ -432,21 +438,59 @@ function setLevel(at) {
 
 // ---- edits ----
 
-// After any change of the edits: what was selected may be no more; the server keeps them.
-const change = attempt(async (work) => {
-  const before = [...instances.edits];
-  work();
-  try {
-    state.list = await door.save(instances.edits);
-  } catch (e) {
-    instances.setEdits(before);
-    throw e;
-  }
+// One change after the other: each is made of what the one before left.
+let changing = Promise.resolve();
+const inTurn = (work) => (...given) => (changing = changing.then(() => work(...given)));
+
+const same = (a, b) => JSON.stringify(a) === JSON.stringify(b);
+
+// After any change of the edits: what was selected may be no more.
+async function settle(list) {
+  state.list = list;
   state.levels = null;
   if (state.answer) await find(state.answer.text);
   else if (!$("results").hidden) inventory();
   await refresh();
-});
+}
+
+// Changes the edits, and the server keeps them. Where others came in meanwhile, a new edit is put after them; whatever else was
+// wanted must be done again.
+const change = inTurn(attempt(async (work) => {
+  let before = [...instances.edits], list = state.list, said = null;
+  work();
+  try {
+    for (;;) {
+      const saved = await door.save(instances.edits), added = instances.edits.at(-1);
+      if (!saved.edits) {
+        list = saved.instances;
+        break;
+      }
+      const one = same(instances.edits.slice(0, -1), before) && same(saved.edits.slice(0, before.length), before);
+      before = saved.edits;
+      list = saved.instances;
+      instances.setEdits(before);
+      said = "The edits were changed elsewhere meanwhile: yours was put after those.";
+      const wrong = one ? instances.edit(added) : "The edits were changed elsewhere meanwhile, and are shown as they are now: do yours again.";
+      if (wrong) throw new Error(wrong);
+    }
+  } catch (e) {
+    instances.setEdits(before);
+    await settle(list);
+    throw e;
+  }
+  await settle(list);
+  if (said) say(said);
+}));
+
+// Shows the edits that others made, where an answer knew of some.
+const catchUp = inTurn(attempt(async () => {
+  if (!door.behind) return;
+  const { edits, instances: list } = await door.edits();
+  if (same(edits, instances.edits)) return;
+  instances.setEdits(edits);
+  await settle(list);
+  say("The edits were changed elsewhere: they are shown as they are now.");
+}));
 
 const edit = (one) => change(() => {
   const wrong = instances.edit(one);
@@ -462,10 +506,13 @@ async function split() {
   say(`Now ${selectedInstances().length} instances.`);
 }
 
+// A name as gs_io::check_name has it: without control characters, those that turn the text around among them, and no dash before it.
+const plain = (name) => name.replace(/[\p{Cc}\u061c\u200e\u200f\u2028-\u202e\u2066-\u2069]+/gu, " ").replace(/^[\s-]+|\s+$/g, "");
+
 async function rename() {
   const instance = wholeInstance();
   const name = await ask("What is it?", instances.names.get(instance) ?? "");
-  if (name?.trim()) await edit({ op: "rename", instance, name: name.trim() });
+  if (name && plain(name)) await edit({ op: "rename", instance, name: plain(name) });
 }
 
 // Asks for one line; null when the person would rather not.
@@ -489,7 +536,7 @@ function save(name, blob) {
   page.saved = { name, blob };
 }
 
-const fileName = () => selectedInstances().map((k) => instances.name(k)).slice(0, 3).join("-").replace(/[^\p{L}\p{N}]+/gu, "-") || "scene";
+const fileName = () => selectedInstances().map((k) => instances.name(k)).slice(0, 3).join("-").replace(/[^\p{L}\p{N}]+/gu, "-").replace(/^-|-$/g, "") || "scene";
 
 async function savePly(others) {
   const blob = await door.selection([...state.cells], others);

@@ -147,6 +147,12 @@ impl Run {
     }
 }
 
+/// The version in the head of an answer; empty where there is none.
+fn tag(head: &str) -> String {
+    let tag = head.lines().find_map(|line| line.strip_prefix("etag: "));
+    tag.unwrap_or_default().to_string()
+}
+
 pub struct Server {
     child: Child,
     pub host: String,
@@ -177,6 +183,20 @@ impl Server {
         let head = String::from_utf8_lossy(&answer[..end]).into_owned();
         let status = head.split(' ').nth(1).unwrap().parse().unwrap();
         (status, head.to_lowercase(), answer[end + 4..].to_vec())
+    }
+
+    /// Sends edits that were made from a version; status, the version that there is then, and what is said.
+    pub fn put_edits(&self, edits: &Value, of: Option<&str>) -> (u16, String, Value) {
+        let headers = of.map_or(String::new(), |of| format!("If-Match: {of}\r\n"));
+        let (status, head, body) = self.ask("PUT", "/edits", &headers, &edits.to_string());
+        (status, tag(&head), serde_json::from_slice(&body).unwrap_or_default())
+    }
+
+    /// The edits that there are, and their version.
+    pub fn edits(&self) -> (Value, String) {
+        let (status, head, body) = self.ask("GET", "/edits", "", "");
+        assert_eq!(status, 200);
+        (serde_json::from_slice::<Value>(&body).unwrap()["edits"].take(), tag(&head))
     }
 
     pub fn get(&self, path: &str) -> (u16, Vec<u8>) {
