@@ -186,8 +186,7 @@ fn check_id(instances: &Instances, id: u32) -> Result<()> {
 }
 
 fn check_name(name: &str) -> Result<()> {
-    let e =
-        |what: &str| Err(Error::new(what).expected(format!("1 to {LONGEST_NAME} bytes")));
+    let e = |what: &str| Err(Error::new(what).expected(format!("1 to {LONGEST_NAME} bytes")));
     match name {
         _ if name.trim().is_empty() => e("an empty name"),
         _ if name.len() > LONGEST_NAME => {

@@ -112,8 +112,8 @@ impl InstanceNames {
             let e = wrong("names that do not fit".into()).field("named");
             return Err(e.expected("instances that ascend, each with a name"));
         }
-        let all = names.named.iter().flat_map(|n| &n.names);
-        all.map(|s| check_name(&s.name)).collect::<Result<()>>().map_err(|e| e.field("named"))?;
+        let mut all = names.named.iter().flat_map(|n| &n.names);
+        all.try_for_each(|s| check_name(&s.name)).map_err(|e| e.field("named"))?;
         Ok(names)
     }
 

@@ -150,8 +150,7 @@ impl Outputs {
         let mut locks = self.mains.iter().map(Lock::take).collect::<Result<Vec<_>>>()?;
         locks.iter_mut().try_for_each(|lock| lock.sign(&self.by))?;
         remove_partial(&files);
-        let mut claim =
-            Claim { outputs: self, locks, past, before: BTreeMap::new(), expecting: None, finished: false };
+        let mut claim = Claim { outputs: self, locks, past, before: BTreeMap::new(), expecting: None, finished: false };
         claim.before = claim.stamps();
         if !claim.outputs.overwrite {
             let whole = claim.outputs.folders.iter().filter(|(_, all)| *all);
@@ -255,7 +254,11 @@ impl Claim {
             let now = if foreign { self.before.get(&path).copied().flatten() } else { now };
             (path, now)
         };
-        self.stamps().into_iter().map(own).filter(|(path, now)| now.is_some() || self.before.contains_key(path)).collect()
+        self.stamps()
+            .into_iter()
+            .map(own)
+            .filter(|(path, now)| now.is_some() || self.before.contains_key(path))
+            .collect()
     }
 
     /// Every claimed file, by its place, and how it is now.

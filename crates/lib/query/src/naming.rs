@@ -66,7 +66,9 @@ impl Vocabulary {
             if word.len() > LONGEST || gs_io::check_name(&word).is_err() {
                 let shown: String = word.chars().take(20).collect();
                 let e = Error::new("not a name").field(format!("line {}", at + 1)).found(format!("{shown:?}"));
-                return Err(e.expected(format!("1 to {LONGEST} bytes without control characters or a dash before them")));
+                return Err(
+                    e.expected(format!("1 to {LONGEST} bytes without control characters or a dash before them"))
+                );
             }
             // CLIP does not tell capitals from small letters.
             if known.insert(word.to_lowercase()) {

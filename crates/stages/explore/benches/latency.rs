@@ -1,4 +1,4 @@
-//! What a click and a text take at a million Gaussians, and how large the page is: `cargo bench -p explore --bench latency --
+//! What a click and a text take at a million Gaussians, of one client and of eight, and how large the page is: `cargo bench -p explore --bench latency --
 //! RUN OUT [GAUSSIANS]`. RUN is a finished run of the demo, whose Gaussians are cut into smaller ones until they are a million,
 //! or so many.
 
@@ -117,7 +117,7 @@ fn measured(run: &Path, scene: &Path) -> Value {
     let (bytes_seconds, _) = ask("GET", "/scene.bin", "");
     let mut random = ChaCha8Rng::seed_from_u64(1);
     let cameras = facts["cameras"].as_array().unwrap();
-    let click = |_| {
+    let mut click = || {
         // As a browser asks: the picture of a view on a canvas of 1600 pixels.
         let mut camera = cameras[random.random_range(0..cameras.len())].clone();
         let scale = 1600.0 / camera["width"].as_f64().unwrap();
@@ -129,9 +129,28 @@ fn measured(run: &Path, scene: &Path) -> Value {
         }
         let (w, h) = (camera["width"].as_u64().unwrap() as u32, camera["height"].as_u64().unwrap() as u32);
         let at = [random.random_range(0..w), random.random_range(0..h)];
-        ask("POST", "/pick", &json!({"camera": camera, "x": at[0], "y": at[1], "hidden": []}).to_string()).0
+        json!({"camera": camera, "x": at[0], "y": at[1], "hidden": []}).to_string()
     };
-    let clicks: Vec<f64> = (0..CLICKS).map(click).collect();
+    let clicks: Vec<String> = (0..CLICKS).map(|_| click()).collect();
+    let all = || clicks.iter().map(|click| ask("POST", "/pick", click).0).collect::<Vec<f64>>();
+    // Clicks a second of clients each of which asks again when it has its answer.
+    let rate = |clients: usize| {
+        let started = Instant::now();
+        std::thread::scope(|s| (0..clients).for_each(|_| _ = s.spawn(all)));
+        (clients * CLICKS) as f64 / started.elapsed().as_secs_f64()
+    };
+    let click_seconds = all();
+    let rates = [1, 8].map(rate);
+    // Clicks while the longest text is encoded, again and again.
+    let long = format!("/find?text={}", "a".repeat(1000));
+    let (long_seconds, beside) = std::thread::scope(|s| {
+        let beside = s.spawn(all);
+        let mut long_seconds = Vec::new();
+        while !beside.is_finished() {
+            long_seconds.push(ask("GET", &long, "").0);
+        }
+        (long_seconds, beside.join().unwrap())
+    });
     let text = |k: usize| ask("GET", &format!("/find?text={}", TEXTS[k % TEXTS.len()].replace(' ', "%20")), "").0;
     let texts: Vec<f64> = (0..CLICKS).map(text).collect();
     server.kill().unwrap();
@@ -143,7 +162,10 @@ fn measured(run: &Path, scene: &Path) -> Value {
     json!({
         "gaussians": facts["gaussians"],
         "instances": facts["instances"].as_array().map(Vec::len),
-        "click_seconds": shares(clicks),
+        "click_seconds": shares(click_seconds),
+        "clicks_per_second_of_1_and_8_clients": rates,
+        "long_text_seconds": shares(long_seconds),
+        "click_beside_long_text_seconds": shares(beside),
         "text_seconds": shares(texts),
         "server_start_seconds": start_seconds,
         "scene_json_seconds": json_seconds,

@@ -85,7 +85,7 @@ impl Kept {
         };
         let there = self.look(world, &mut now)?;
         if !of.map_or(edits.starts_with(&there.edits.edits), |of| of == there.version) {
-            return Ok(Saved::Stale(there)).map(Ok);
+            return Ok(Ok(Saved::Stale(there)));
         }
         let kept = || {
             let edits = Edits { instances: world.scene.artifact.hash().into(), edits };

@@ -468,6 +468,20 @@ async fn edits_are_those_of_the_stages(browser: &Browser, f: &Fixture, path: &Pa
     browser.client.refresh().await.unwrap();
     browser.until("globalThis.explore?.seconds").await;
     assert_eq!(browser.js("return page.instances.edits.length", vec![]).await, json!(wanted.len()));
+    // What another program did meanwhile stays, and the page's edit comes after it; it may not be undone unseen.
+    let mut elsewhere = Edits::read(path).unwrap();
+    elsewhere.edits.push(artifacts::Edit::Rename { instance: others[0], name: "theirs".into() });
+    elsewhere.write(path).unwrap();
+    let mine = json!({"op": "rename", "instance": others[2], "name": "mine"});
+    browser.js("await page.edit(given[0])", vec![mine]).await;
+    let both = Edits::read(path).unwrap();
+    assert_eq!(both.edits[..wanted.len() + 1], elsewhere.edits);
+    assert_eq!(both.edits.len(), wanted.len() + 2);
+    assert_eq!(browser.js("return page.instances.edits.length", vec![]).await, json!(both.edits.len()));
+    elsewhere.write(path).unwrap();
+    browser.js("await page.act('undo')", vec![]).await;
+    assert_eq!(Edits::read(path).unwrap(), elsewhere);
+    assert_eq!(browser.js("return page.instances.edits.length", vec![]).await, json!(elsewhere.edits.len()));
     std::fs::remove_file(path).unwrap();
 }
 
