@@ -36,6 +36,7 @@ impl Arrays<'_> {
             opacity_logits: self.opacity_logits.as_slice()?.to_vec(),
             sh: self.sh.as_slice()?.to_vec(),
             sh_degree: degree,
+            ..Gaussians::default()
         })
     }
 }

@@ -62,6 +62,7 @@ pub fn render_backward<'py>(
         opacity_logits: found.opacity_logits,
         sh: found.sh,
         sh_degree: g.sh_degree,
+        ..Gaussians::default()
     };
     Ok(to_arrays(py, gradient))
 }

@@ -164,7 +164,7 @@ fn check_ply(bytes: &[u8]) {
             assert!(g.gaussians.means.iter().flatten().all(|v| v.is_finite()));
         }
         sound(ply::read_points(path), path).iter().for_each(sound_points);
-        if let Some((vertices, labels)) = sound(ply::read_labels(path, "label"), path) {
+        if let Some((vertices, labels)) = sound(ply::read_labels(path, "label", [0.0; 3]), path) {
             assert_eq!(vertices.len(), labels.len());
         }
         sound(ply::is_antialiased(path), path);
@@ -344,7 +344,7 @@ fn check_scannet(bytes: &[u8]) {
     check_part(&SCANNET.map(String::from), bytes, |path| {
         let [segs, aggregation, labels] = [0, 1, 2].map(|i| folder().join(SCANNET[i]));
         let scan = folder().join("scannet");
-        if let Some((vertices, _)) = sound(ply::read_labels(&labels, "label"), &scan)
+        if let Some((vertices, _)) = sound(ply::read_labels(&labels, "label", [0.0; 3]), &scan)
             && let Some(truth) = sound(read_truth(&segs, &aggregation, vertices.len()), &scan)
         {
             assert_eq!(truth.len(), vertices.len());

@@ -25,7 +25,7 @@ pub(crate) fn photograph() -> Image {
 }
 
 fn points() -> PointCloud {
-    PointCloud { positions: vec![[0.0, 1.0, 2.0]; 6], colors: vec![[9, 8, 7]; 6] }
+    PointCloud { positions: vec![[0.0, 1.0, 2.0]; 6], colors: vec![[9, 8, 7]; 6], ..PointCloud::default() }
 }
 
 fn gaussians() -> Gaussians {
@@ -36,6 +36,7 @@ fn gaussians() -> Gaussians {
         opacity_logits: vec![0.5; 5],
         sh: vec![0.25; 5 * 12],
         sh_degree: 1,
+        ..Gaussians::default()
     }
 }
 

@@ -118,7 +118,9 @@ impl World {
         }
         let (graph, graph_file) = Graph::read(&inputs.graph)?;
         let footprints = Footprints::read(&inputs.footprints)?;
-        let dataset = dataset::load(&inputs.scene, &LoadOptions { resolution: Resolution::Divisor(1.0), holdout: 0 })?;
+        let mut dataset =
+            dataset::load(&inputs.scene, &LoadOptions { resolution: Resolution::Divisor(1.0), holdout: 0 })?;
+        dataset.follow(&geometry.gaussians, &inputs.geometry)?;
         let mut hashes = BTreeMap::from([
             (role::GEOMETRY.to_string(), hash_file(&inputs.geometry)?),
             (role::DATASET.to_string(), dataset.hash()?),

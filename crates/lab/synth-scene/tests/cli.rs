@@ -369,7 +369,7 @@ fn families_are_written_whole_and_rooms_as_scans_too() {
         assert_eq!(out.join("scan").exists(), family == "room");
     }
     let scan = dir.path().join("scene/scan/scene0000_00_vh_clean_2.labels.ply");
-    let (at, _) = gs_scene::ply::read_labels(&scan, "label").unwrap();
+    let (at, _) = gs_scene::ply::read_labels(&scan, "label", [0.0; 3]).unwrap();
     assert_eq!(at, TruePoints::read(dir.path().join("scene/truth/points.safetensors")).unwrap().position);
     make(&dir.path().join("scene"), &SMALL);
     assert!(!dir.path().join("scene/scan").exists());
@@ -415,7 +415,8 @@ fn miniatures_of_the_benchmarks_read_as_what_they_are() {
     let one = LoadOptions { holdout: 0, ..LoadOptions::default() };
     let (a, b) = (dataset::load(&scan, &one).unwrap(), dataset::load(&converted, &one).unwrap());
     assert_eq!((a.format, b.format), (dataset::Format::ScanNet, dataset::Format::Transforms));
-    let (vertices, _) = gs_scene::ply::read_labels(scan.join("scene0062_00_vh_clean_2.labels.ply"), "label").unwrap();
+    let (vertices, _) =
+        gs_scene::ply::read_labels(scan.join("scene0062_00_vh_clean_2.labels.ply"), "label", [0.0; 3]).unwrap();
     assert!(vertices.len() == 900 && a.points.positions == vertices && b.points.positions == vertices);
     assert!(!converted.join("scene0062_00_vh_clean_2.ply").exists());
     for (stem, view) in ["0", "20", "40", "60", "80", "100"].iter().zip(&a.views) {

@@ -44,6 +44,7 @@ fn matches_gsplat_on_the_gpu() {
             opacity_logits: get("opacities"),
             sh: get("coeffs"),
             sh_degree: 3,
+            ..Gaussians::default()
         };
         let shape = t.tensor("out_img").unwrap().shape().to_vec();
         let (h, w) = (shape[0] as u32, shape[1] as u32);
@@ -88,6 +89,7 @@ fn matches_the_f64_oracle_forward_and_backward() {
             opacity_logits: get("opacities").iter().map(|o| (o / (1.0 - o)).ln()).collect(),
             sh: get("sh").clone(),
             sh_degree: 3,
+            ..Gaussians::default()
         };
         let m: Vec<f64> = get("viewmat").iter().map(|&v| f64::from(v)).collect();
         let k = get("K");

@@ -7,12 +7,13 @@ mod names;
 pub mod refined;
 mod scannet;
 mod seven_scenes;
+mod shift;
 mod transforms;
 mod upright;
 mod view;
 
+use crate::PointCloud;
 use crate::lens::Lens;
-use crate::{Camera, PointCloud};
 use depth::Depth;
 pub use depth::DepthMap;
 use glam::{DMat3, DMat4, DQuat, DVec3};
@@ -137,6 +138,9 @@ pub struct Dataset {
     pub warnings: Vec<String>,
     /// Whether it names its own held-out views.
     pub(crate) names_its_own: bool,
+    /// What was subtracted from the world's coordinates, cameras' included, so that single precision holds them
+    /// ([`Gaussians::shift`](crate::Gaussians::shift)).
+    pub shift: [f64; 3],
 }
 
 /// A view before resolution and split are applied.
@@ -335,7 +339,10 @@ fn finish(root: &Path, mut raw: RawDataset, options: &LoadOptions) -> Result<Dat
     let beside =
         |v: &View| [v.depth_path(), v.mask_path()].into_iter().flatten().map(Path::to_path_buf).collect::<Vec<_>>();
     files.extend(views.iter().flat_map(beside));
-    Ok(Dataset { root: root.to_path_buf(), format, views, points, files, warnings, names_its_own })
+    let root = root.to_path_buf();
+    let mut dataset = Dataset { root, format, views, points, files, warnings, names_its_own, shift: [0.0; 3] };
+    dataset.settle();
+    Ok(dataset)
 }
 
 /// Whether view `i` is held out where every n-th one is.
@@ -363,12 +370,14 @@ impl Dataset {
         let mut text = String::new();
         let files: Result<Vec<String>> = self.views.par_iter().map(|v| hash_file(&v.image_path)).collect();
         for (v, file) in self.views.iter().zip(files?) {
-            let Camera { rotation, translation, .. } = v.camera;
+            // Without any shift: which one that is depends on the Gaussians that the dataset goes with.
+            let (rotation, translation) = (v.camera.rotation, v.translation());
             text += &format!("{}\n{rotation:?}\n{translation:?}\n{:?}\n{file}\n", v.name, v.lens());
         }
         let mut bytes = text.into_bytes();
         bytes.extend(self.points.positions.iter().flatten().flat_map(|v| v.to_le_bytes()));
         bytes.extend(self.points.colors.iter().flatten());
+        bytes.extend(self.points.shift.iter().filter(|s| **s != 0.0).flat_map(|v| v.to_le_bytes()));
         Ok(hash_bytes(&bytes))
     }
 }

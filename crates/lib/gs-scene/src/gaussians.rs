@@ -1,5 +1,6 @@
 //! The Gaussians of a scene, as a structure of arrays.
 
+use crate::middle::{less, shift_of};
 use gs_io::{Error, Result};
 
 /// Zeroth real spherical harmonic, 1 / (2 sqrt(pi)): colour = 0.5 + `SH_C0` * dc for degree 0.
@@ -13,7 +14,7 @@ pub const fn sh_coefficients(degree: u8) -> usize {
 /// N Gaussians in the parametrisation that 3DGS stores and optimises.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct Gaussians {
-    /// Centres in the world, N.
+    /// Centres in the world, N: less [`Self::shift`].
     pub means: Vec<[f32; 3]>,
     /// Natural logarithms of the standard deviations along the Gaussian's own axes, N.
     pub log_scales: Vec<[f32; 3]>,
@@ -25,6 +26,8 @@ pub struct Gaussians {
     pub sh: Vec<f32>,
     /// Degree of the spherical harmonics, 0 to 3.
     pub sh_degree: u8,
+    /// What was subtracted from the centres, so that single precision holds them; zeros for scenes that are not far from the origin.
+    pub shift: [f64; 3],
 }
 
 /// Logit of an opacity, as [`Gaussians::opacity_logits`] has it: ln(o / (1 - o)), infinite for 0 and 1.
@@ -68,6 +71,27 @@ impl Gaussians {
         let from_centre =
             |m: &[f32; 3]| (0..3).map(|c| (f64::from(m[c]) - centre[c]).powi(2)).sum::<f64>().sqrt() as f32;
         Some(median(self.means.iter().map(from_centre).collect())).filter(|s| *s > 0.0 && s.is_finite()).unwrap_or(1.0)
+    }
+
+    /// Brings centres that are far from the origin near it, and adds what they move by to [`Self::shift`]. Says whether they were far: then
+    /// single precision had cost them digits before.
+    pub(crate) fn settle(&mut self) -> bool {
+        let by = shift_of(self.means.iter().map(|m| m.map(f64::from)));
+        let far = by != [0.0; 3];
+        if far {
+            self.means.iter_mut().for_each(|m| *m = less(m.map(f64::from), by));
+            self.shift = [0, 1, 2].map(|c| self.shift[c] + by[c]);
+        }
+        far
+    }
+
+    /// The same Gaussians with another [`Self::shift`].
+    pub fn shift_to(&mut self, shift: [f64; 3]) {
+        if self.shift != shift {
+            let by = [0, 1, 2].map(|c| shift[c] - self.shift[c]);
+            self.means.iter_mut().for_each(|m| *m = less(m.map(f64::from), by));
+            self.shift = shift;
+        }
     }
 
     /// The highest degree of the spherical harmonics of which some coefficient is not zero: what renders need.
@@ -153,6 +177,7 @@ impl Gaussians {
             opacity_logits: at().map(|i| self.opacity_logits[i]).collect(),
             sh,
             sh_degree: self.sh_degree,
+            shift: self.shift,
         }
     }
 

@@ -106,6 +106,7 @@ mod tests {
             opacity_logits: vec![2.0; 7],
             sh: vec![0.25; 7 * 12],
             sh_degree: 1,
+            ..Gaussians::default()
         }
     }
 

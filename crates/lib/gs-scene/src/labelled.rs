@@ -29,21 +29,23 @@ impl<'a> Labelled<'a> {
     }
 
     /// Writes the Gaussians `which`, ascending, with all their harmonics, in the format that the file's name says; to a PLY with
-    /// the instance of each and all other properties that the geometry's PLY has.
+    /// the instance of each and all other properties that the geometry's PLY has. Gives what the format loses, in words ([`splat::lost`]).
     ///
     /// # Errors
     /// When no format has such a name, or the file cannot be written.
-    pub fn write(&self, to: &Path, which: &[u32]) -> Result<()> {
+    pub fn write(&self, to: &Path, which: &[u32]) -> Result<Vec<String>> {
         let format = Format::to_write(to)?;
         match (format, &self.rows) {
-            (Format::Ply, Some(rows)) => rows.write(to, which, Some(self.label), &self.comments),
+            (Format::Ply, Some(rows)) => rows.write(to, which, Some(self.label), &self.comments).map(|()| Vec::new()),
             _ => {
                 let own: Vec<i32> = which.iter().map(|&i| self.label[i as usize]).collect();
                 let antialias = self.geometry.antialias;
                 // No other format has a place for it.
                 let instance = (format == Format::Ply).then_some(&own[..]);
                 let extra = Extra { comments: &self.comments, antialias, instance };
-                splat::write(to, &self.geometry.gaussians.select(which), &extra)
+                let chosen = self.geometry.gaussians.select(which);
+                splat::write(to, &chosen, &extra)?;
+                splat::lost(to, &chosen)
             }
         }
     }

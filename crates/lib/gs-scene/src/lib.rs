@@ -27,6 +27,6 @@ pub use geometry::Geometry;
 pub use holdout::{HoldOut, Learnt};
 pub use image::{Image, decode as decode_image, has_alpha as image_has_alpha, size_of as image_size, size_within};
 pub use labelled::Labelled;
-pub use middle::middle;
+pub use middle::{middle, say as say_shift};
 pub use order::morton_order;
 pub use ply::PointCloud;

@@ -6,12 +6,15 @@
 //! readers need many times that.
 
 mod copy;
+mod shift;
 pub(crate) mod table;
 
+use crate::middle::{less, shift_of};
 use crate::splat::compressed_ply;
 use crate::{Gaussians, sh_coefficients};
 pub use copy::{INSTANCE, Vertices};
 use gs_io::{Error, IoContext, Result, write_atomic};
+pub use shift::comment as shift_comment;
 use std::io::Read;
 use std::io::Write;
 use std::path::Path;
@@ -20,10 +23,12 @@ use table::{AGAIN, Table};
 /// Coloured points, such as COLMAP's or a scan's vertices.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct PointCloud {
-    /// Positions in the world.
+    /// Positions in the world, less [`Self::shift`].
     pub positions: Vec<[f32; 3]>,
     /// 8-bit sRGB colours, as many as positions.
     pub colors: Vec<[u8; 3]>,
+    /// What was subtracted from the positions, as for [`Gaussians::shift`].
+    pub shift: [f64; 3],
 }
 
 impl PointCloud {
@@ -36,15 +41,32 @@ impl PointCloud {
     pub fn is_empty(&self) -> bool {
         self.positions.is_empty()
     }
+
+    /// Brings points that are far from the origin near it.
+    fn settle(&mut self) {
+        let by = shift_of(self.positions.iter().map(|p| p.map(f64::from)));
+        self.positions.iter_mut().for_each(|p| *p = less(p.map(f64::from), by));
+        self.shift = shift::sum(self.shift, by);
+    }
+
+    /// The same points with another [`Self::shift`].
+    pub fn shift_to(&mut self, shift: [f64; 3]) {
+        if self.shift != shift {
+            let by = [0, 1, 2].map(|c| shift[c] - self.shift[c]);
+            self.positions.iter_mut().for_each(|p| *p = less(p.map(f64::from), by));
+            self.shift = shift;
+        }
+    }
 }
 
 /// Longest header that is read on its own, bytes.
 const MAX_HEADER: u64 = 1 << 20;
 
-/// What `take` makes of the vertices of a file; errors name the file.
-fn vertices<T>(path: &Path, take: impl FnOnce(&Table<'_>) -> Result<T>) -> Result<T> {
+/// What `take` makes of the vertices of a file and of the shift that its comments give; errors name the file.
+fn vertices<T>(path: &Path, take: impl FnOnce(&Table<'_>, [f64; 3]) -> Result<T>) -> Result<T> {
     let bytes = std::fs::read(path).at("read", path)?;
-    table::read(&bytes).and_then(|table| take(&table)).map_err(|e| e.file(path))
+    let read = || take(&table::read(&bytes)?, shift::of(&bytes)?);
+    read().map_err(|e| e.file(path))
 }
 
 /// Properties of vertices by which Gaussians are known: as they are, and packed.
@@ -113,10 +135,12 @@ pub fn read_gaussians_as_they_are(path: impl AsRef<Path>) -> Result<Gaussians> {
 fn from_bytes(bytes: &[u8]) -> Result<Gaussians> {
     let [vertices, chunks, sh] = table::read_elements(bytes, ["vertex", "chunk", "sh"])?;
     let vertices = vertices.ok_or_else(table::no_vertices)?;
-    if compressed_ply::is_compressed(&vertices) {
-        return compressed_ply::read(&vertices, chunks.as_ref(), sh.as_ref());
-    }
-    gaussians_of(&vertices)
+    let mut g = match compressed_ply::is_compressed(&vertices) {
+        true => compressed_ply::read(&vertices, chunks.as_ref(), sh.as_ref())?,
+        false => gaussians_of(&vertices)?,
+    };
+    g.shift = shift::sum(g.shift, shift::of(bytes)?);
+    Ok(g)
 }
 
 fn gaussians_of(table: &Table<'_>) -> Result<Gaussians> {
@@ -132,19 +156,28 @@ fn gaussians_of(table: &Table<'_>) -> Result<Gaussians> {
     let k = sh_coefficients(sh_degree);
     let mut sh = ["f_dc_0", "f_dc_1", "f_dc_2"].map(String::from).to_vec();
     sh.extend((0..k - 1).flat_map(|c| [0, 1, 2].map(|channel| format!("f_rest_{}", channel * (k - 1) + c))));
+    let (shift, means) = table.places()?;
     Ok(Gaussians {
-        means: table.arrays(["x", "y", "z"])?,
+        means,
         log_scales: table.arrays(["scale_0", "scale_1", "scale_2"])?,
         rotations: table.arrays(["rot_0", "rot_1", "rot_2", "rot_3"])?,
         opacity_logits: table.values(&["opacity"])?,
         sh: table.values(&sh)?,
         sh_degree,
+        shift,
     })
 }
 
-fn header(count: usize, comments: &[String], properties: &[(&str, String)]) -> String {
+/// A PLY's header as far as its comments: `comments` in lines of their own, and the shift where there is one.
+pub(crate) fn header_start(comments: &[String], shift: [f64; 3]) -> String {
     let mut header = String::from("ply\nformat binary_little_endian 1.0\n");
-    header.extend(comments.iter().map(|c| format!("comment {}\n", c.replace(['\n', '\r'], " "))));
+    let comments = comments.iter().cloned().chain(shift_comment(shift));
+    header.extend(comments.map(|c| format!("comment {}\n", c.replace(['\n', '\r'], " "))));
+    header
+}
+
+fn header(count: usize, comments: &[String], shift: [f64; 3], properties: &[(&str, String)]) -> String {
+    let mut header = header_start(comments, shift);
     header += &format!("element vertex {count}\n");
     header.extend(properties.iter().map(|(kind, name)| format!("property {kind} {name}\n")));
     header + "end_header\n"
@@ -206,7 +239,7 @@ pub(crate) fn write_rows(
     names.extend(["opacity", "scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3"].map(String::from));
     let mut properties: Vec<(&str, String)> = names.into_iter().map(|n| ("float", n)).collect();
     properties.extend(instance.map(|_| ("int", "instance".to_string())));
-    w.write_all(header(count, comments, &properties).as_bytes()).at("write", place)?;
+    w.write_all(header(count, comments, gaussians.shift, &properties).as_bytes()).at("write", place)?;
     let mut row: Vec<u8> = Vec::with_capacity(4 * properties.len());
     for i in rows {
         row.clear();
@@ -231,8 +264,14 @@ pub(crate) fn write_rows(
 /// # Errors
 /// When the file is damaged, has no positions, or one is not finite, or a colour lies outside its range.
 pub fn read_points(path: impl AsRef<Path>) -> Result<PointCloud> {
-    vertices(path.as_ref(), |table| {
-        let positions = positions(table)?;
+    vertices(path.as_ref(), |table, given| {
+        let (shift, positions) = table.places()?;
+        let mut points = PointCloud {
+            positions: check_finite(positions)?,
+            shift: shift::sum(shift, given),
+            ..PointCloud::default()
+        };
+        points.settle();
         let channel = |name| {
             let Some(c) = table.find(name) else { return Ok(vec![255; table.count]) };
             let (most, kind) = if c.is_float() { (1.0, "float") } else { (255.0, "whole number") };
@@ -251,32 +290,31 @@ pub fn read_points(path: impl AsRef<Path>) -> Result<PointCloud> {
             table.gather(&[c]).into_iter().enumerate().map(byte).collect::<Result<Vec<u8>>>()
         };
         let (r, g, b) = (channel("red")?, channel("green")?, channel("blue")?);
-        let colors = (0..table.count).map(|i| [r[i], g[i], b[i]]).collect();
-        Ok(PointCloud { positions, colors })
+        points.colors = (0..table.count).map(|i| [r[i], g[i], b[i]]).collect();
+        Ok(points)
     })
 }
 
-/// The vertices' positions, which must be finite.
-fn positions(table: &Table<'_>) -> Result<Vec<[f32; 3]>> {
-    let positions = table.arrays(["x", "y", "z"])?;
+/// Refuses positions that are not finite.
+fn check_finite(positions: Vec<[f32; 3]>) -> Result<Vec<[f32; 3]>> {
     let bad = |p: &[f32; 3]| p.iter().any(|v| !v.is_finite());
     let Some(first) = positions.iter().position(bad) else { return Ok(positions) };
     let all = positions.iter().filter(|p| bad(p)).count();
     Err(Error::new("a position is not finite")
         .field(format!("vertex {first}"))
-        .found(format!("{:?}, and {all} of {} vertices are so", positions[first], table.count))
+        .found(format!("{:?}, and {all} of {} vertices are so", positions[first], positions.len()))
         .expected("finite x, y and z")
         .hint("remove these vertices, or export the PLY again"))
 }
 
-/// Reads the positions of a PLY's vertices and a whole-number property of each, such as `label` of ScanNet's
-/// `*.labels.ply`.
+/// Reads the positions of a PLY's vertices, less a shift such as [`Gaussians::shift`], and a whole-number property of each, such as `label`
+/// of ScanNet's `*.labels.ply`.
 ///
 /// # Errors
 /// When the file is damaged, lacks the property, a position is not finite, or a value is not a whole number from 0 to
 /// 16,777,216.
-pub fn read_labels(path: impl AsRef<Path>, property: &str) -> Result<(Vec<[f32; 3]>, Vec<u32>)> {
-    vertices(path.as_ref(), |table| {
+pub fn read_labels(path: impl AsRef<Path>, property: &str, shift: [f64; 3]) -> Result<(Vec<[f32; 3]>, Vec<u32>)> {
+    vertices(path.as_ref(), |table, given| {
         let whole = |(i, v): (usize, f32)| {
             if v.fract() == 0.0 && (0.0..=16_777_216.0).contains(&v) {
                 return Ok(v as u32);
@@ -284,7 +322,8 @@ pub fn read_labels(path: impl AsRef<Path>, property: &str) -> Result<(Vec<[f32; 
             Err(Error::new("not a label").field(format!("vertex {i}, {property}")).found(v))
         };
         let labels = table.values(&[property])?.into_iter().enumerate().map(whole).collect::<Result<Vec<u32>>>()?;
-        Ok((positions(table)?, labels))
+        let positions = table.places_less([0, 1, 2].map(|c| shift[c] - given[c]))?;
+        Ok((check_finite(positions)?, labels))
     })
 }
 
@@ -304,7 +343,7 @@ pub fn write_points(path: impl AsRef<Path>, points: &PointCloud, comments: &[Str
     let bytes = ["red", "green", "blue"].map(|n| ("uchar", String::from(n)));
     let properties = [floats, bytes].concat();
     write_atomic(path, |w| {
-        w.write_all(header(points.len(), comments, &properties).as_bytes()).at("write", path)?;
+        w.write_all(header(points.len(), comments, points.shift, &properties).as_bytes()).at("write", path)?;
         for (p, c) in points.positions.iter().zip(&points.colors) {
             let [x, y, z] = p.map(f32::to_le_bytes);
             w.write_all(&[&x[..], &y, &z, c].concat()).at("write", path)?;

@@ -7,17 +7,20 @@ pub mod compressed_ply;
 mod dot_splat;
 mod gltf;
 pub mod packing;
+mod reach;
 mod sog;
 mod spz;
 mod stream;
 #[cfg(test)]
 pub(crate) mod testing;
 
-use crate::{Gaussians, ply, sh_coefficients};
+use crate::{Gaussians, ply, say_shift, sh_coefficients};
 use gs_io::{Error, IoContext, Result, hash_files, write_atomic};
 use std::fs::File;
 use std::io::{Read, Write};
 use std::path::{Component, Path, PathBuf};
+
+pub use reach::lost;
 
 /// A format of files of Gaussians.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -191,7 +194,17 @@ pub fn read(path: impl AsRef<Path>) -> Result<Splat> {
         Format::Splat => dot_splat::read(file),
         Format::Gltf => gltf::read(file),
     };
-    splat.map_err(|e| e.file(path))
+    let mut splat = splat.map_err(|e| e.file(path))?;
+    if splat.gaussians.settle() {
+        let shift = splat.gaussians.shift;
+        let far = shift.iter().fold(0.0f32, |most, v| most.max(v.abs() as f32));
+        splat.left_out.push(format!(
+            "digits of the centres, which lie about {}, where single precision has steps of {} units: export them in doubles, or less a shift",
+            say_shift(shift),
+            far.next_up() - far
+        ));
+    }
+    Ok(splat)
 }
 
 /// Reads a file of Gaussians all of which must be whole. Infinite opacity logits, which stand for an opacity of 0 or 1, become
@@ -220,12 +233,13 @@ pub fn holds_gaussians(path: impl AsRef<Path>) -> Result<bool> {
 ///
 /// # Errors
 /// When the name says no format that is written, the format cannot hold them, or the file cannot be written. All but PLY hold whole
-/// Gaussians only.
+/// Gaussians only; what else a format cannot hold, [`lost`] says.
 pub fn write(path: impl AsRef<Path>, gaussians: &Gaussians, extra: &Extra<'_>) -> Result<()> {
     let path = path.as_ref();
     let format = Format::to_write(path)?;
     check(format, gaussians, extra).map_err(|e| e.file(path))?;
-    write_atomic(path, |w| put(w, path, format, gaussians, extra).map_err(|e| e.file(path)))
+    let near = reach::near(format, gaussians);
+    write_atomic(path, |w| put(w, path, format, near.as_ref().unwrap_or(gaussians), extra).map_err(|e| e.file(path)))
 }
 
 /// The bytes of the file that [`write()`] writes.
@@ -235,7 +249,8 @@ pub fn write(path: impl AsRef<Path>, gaussians: &Gaussians, extra: &Extra<'_>) -
 pub fn encode(format: Format, gaussians: &Gaussians, extra: &Extra<'_>) -> Result<Vec<u8>> {
     check(format, gaussians, extra)?;
     let mut bytes = Vec::new();
-    put(&mut bytes, Path::new("a file in memory"), format, gaussians, extra)?;
+    let near = reach::near(format, gaussians);
+    put(&mut bytes, Path::new("a file in memory"), format, near.as_ref().unwrap_or(gaussians), extra)?;
     Ok(bytes)
 }
 

@@ -15,6 +15,7 @@ fn sample(n: usize, sh_degree: u8) -> Gaussians {
         opacity_logits: (0..n).map(|i| value(i, 10) % 8.0).collect(),
         sh: (0..n).flat_map(|i| (0..3 * k).map(move |j| value(i, 11 + j))).collect(),
         sh_degree,
+        ..Gaussians::default()
     }
 }
 
@@ -164,8 +165,11 @@ fn the_layout_written_is_that_of_the_original_code() {
 fn points_round_trip_and_colours_of_other_types_are_read() {
     let dir = tempfile::tempdir().unwrap();
     let path = dir.path().join("p.ply");
-    let points =
-        PointCloud { positions: vec![[1.0, -2.5, 3.25], [0.1, 0.2, 0.3]], colors: vec![[0, 128, 255], [1, 2, 3]] };
+    let points = PointCloud {
+        positions: vec![[1.0, -2.5, 3.25], [0.1, 0.2, 0.3]],
+        colors: vec![[0, 128, 255], [1, 2, 3]],
+        ..PointCloud::default()
+    };
     ply::write_points(&path, &points, &["a".into()]).unwrap();
     assert_eq!(ply::read_points(&path).unwrap(), points);
     let text = "ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nproperty float y\nproperty float z\n";
@@ -303,7 +307,7 @@ fn labels_are_read_beside_positions() {
                 1 2 3 0\n4 5 6 65535\n3 0 1 1\n";
     let read = |text: &str, property| {
         let (_dir, path) = file(text.as_bytes());
-        ply::read_labels(path, property).map_err(|e| e.to_string())
+        ply::read_labels(path, property, [0.0; 3]).map_err(|e| e.to_string())
     };
     assert_eq!(read(text, "label").unwrap(), (vec![[1.0, 2.0, 3.0], [4.0, 5.0, 6.0]], vec![0, 65535]));
     assert!(read(text, "class").unwrap_err().contains("class: the vertices lack a property"));

@@ -68,6 +68,7 @@ pub fn describe(
         gaussians: gaussians.len() as u32,
         up,
         metres_per_unit: remarks.metres_per_unit,
+        shift: Some(gaussians.shift).filter(|s| *s != [0.0; 3]),
         relations: relations(&objects, &centers),
         objects,
     }

@@ -166,6 +166,10 @@ pub struct Scene {
     pub up: Option<Up>,
     /// Length of the scene's unit in metres, where a person gave a length.
     pub metres_per_unit: Option<f64>,
+    /// What was subtracted from all coordinates of a scene that is far from the origin, and is to be added for those of the world; left out
+    /// where nothing was.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub shift: Option<[f64; 3]>,
     /// All objects, ascending by id. Ids have gaps where objects were merged.
     pub objects: Vec<Object>,
     /// Relations, ascending by subject, relation, object.

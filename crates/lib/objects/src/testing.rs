@@ -24,6 +24,7 @@ pub fn boxes(boxes: &[([f32; 3], [f32; 3])]) -> (Instances, Gaussians) {
         sh: (0..3 * n).map(|i| i as f32 * 0.001).collect(),
         sh_degree: 0,
         means,
+        ..Gaussians::default()
     };
     let instances = Instances {
         node: label.iter().map(|&l| if l < 0 { -1 } else { n as i32 + 2 + l }).collect(),

@@ -7,7 +7,7 @@ use gs_raster::RasterOptions;
 use gs_scene::dataset::Dataset;
 use gs_scene::{Gaussians, Geometry};
 use std::collections::BTreeMap;
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
 /// Gaussians of less opacity are not taken for a surface.
 pub const MIN_OPACITY: f32 = 0.1;
@@ -16,6 +16,8 @@ pub const MIN_OPACITY: f32 = 0.1;
 pub struct LabelledScene {
     /// The geometry with all its Gaussians; N.
     pub geometry: Geometry,
+    /// The file of the geometry.
+    pub geometry_path: PathBuf,
     /// How to render them.
     pub raster: RasterOptions,
     /// The instances, edits included; labels are as many as Gaussians.
@@ -59,7 +61,7 @@ impl LabelledScene {
             inputs.insert(role::EDITS.into(), hash);
         }
         let raster = RasterOptions::of(&geometry);
-        Ok(Self { geometry, raster, instances: labelled, remarks, artifact, inputs })
+        Ok(Self { geometry, geometry_path: path.to_path_buf(), raster, instances: labelled, remarks, artifact, inputs })
     }
 
     /// Whether no Gaussian belongs to an instance.
@@ -83,8 +85,9 @@ impl LabelledScene {
         self.artifact.path()
     }
 
-    /// Checks that the dataset is the one that the instances were made from.
-    pub fn check_dataset(&self, dataset: &Dataset) -> Result<()> {
+    /// Checks that the dataset is the one that the instances were made from, and brings its cameras to where the Gaussians are.
+    pub fn check_dataset(&self, dataset: &mut Dataset) -> Result<()> {
+        dataset.follow(self.gaussians(), &self.geometry_path)?;
         self.artifact.expect_input(role::DATASET, &dataset.hash()?).map_err(|e| {
             e.expected(format!("the photographs, cameras and points of {}", dataset.root.display()))
                 .hint("give the scene that the instances were made from, or run make again if it was edited")

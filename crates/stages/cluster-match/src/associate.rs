@@ -277,6 +277,7 @@ mod tests {
             opacity_logits: vec![9.0; 3],
             sh: vec![0.0; 9],
             sh_degree: 0,
+            ..Gaussians::default()
         };
         (g, Camera::look_at(DVec3::new(0.0, 0.0, -6.0), DVec3::ZERO, -DVec3::Y, W as u32, H as u32, 0.8))
     }

@@ -32,8 +32,9 @@ impl Inputs {
         let (graph, graph_file) = Graph::read(&a.graph)?;
         let footprints = Footprints::read(&a.footprints)?;
         let masks = hash_folder(&a.masks, "_s.npy")?;
-        let dataset = dataset::load(&a.scene, &LoadOptions { resolution: Resolution::Divisor(1.0), holdout: 0 })?;
+        let mut dataset = dataset::load(&a.scene, &LoadOptions { resolution: Resolution::Divisor(1.0), holdout: 0 })?;
         dataset.warnings.iter().for_each(|w| stage.warn(w));
+        dataset.follow(&geometry.gaussians, &a.geometry)?;
         let dataset_hash = dataset.hash()?;
         graph_file.expect_input(role::GEOMETRY, &geometry_hash)?;
         footprints.artifact().expect_input(role::GEOMETRY, &geometry_hash)?;

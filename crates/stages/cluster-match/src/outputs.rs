@@ -154,6 +154,7 @@ fn painted(g: &Gaussians, labels: &[i32]) -> Gaussians {
         opacity_logits: g.opacity_logits.clone(),
         sh: labels.iter().flat_map(color).collect(),
         sh_degree: 0,
+        shift: g.shift,
     }
 }
 

@@ -467,9 +467,9 @@ fn instances_ply_keeps_all_harmonics_and_what_other_programs_wrote() {
     let (i, _) = s.succeed(&[]);
     let out = s.path("out/instances.ply");
     assert_eq!(ply::read_gaussians(&out).unwrap(), g);
-    let (_, kept) = ply::read_labels(&out, "segments").unwrap();
+    let (_, kept) = ply::read_labels(&out, "segments", [0.0; 3]).unwrap();
     assert!(kept.iter().zip(&theirs).all(|(a, b)| *a == *b as u32));
-    assert_eq!(ply::read_labels(&out, "instance").is_err(), i.label.contains(&-1));
+    assert_eq!(ply::read_labels(&out, "instance", [0.0; 3]).is_err(), i.label.contains(&-1));
 }
 
 #[test]

@@ -94,7 +94,7 @@ fn check_labels(o: &CheckOptions, dataset: &Dataset, stage: &Stage) -> Result<(S
 /// Reads the labelled vertices of a scan, and its instances where it has some.
 fn check_scan(folder: &Path) -> Result<(String, BTreeSet<String>)> {
     let files = ScanFiles::find(folder)?;
-    let (_, labels) = gs_scene::ply::read_labels(&files.labels, "label")?;
+    let (_, labels) = gs_scene::ply::read_labels(&files.labels, "label", [0.0; 3])?;
     let of = |(segments, objects): &(PathBuf, PathBuf)| instances::read_truth(segments, objects, labels.len());
     let objects = files.instances.as_ref().map(of).transpose()?;
     let objects = objects.map_or(0, |truth| truth.into_iter().filter(|&i| i >= 0).collect::<BTreeSet<_>>().len());

@@ -33,7 +33,7 @@ pub(crate) fn run(o: &ReportOptions, mut parameters: Value, stage: &Stage) -> Re
     let held = HoldOut::of(&o.geometry, o.held.holdout)?;
     parameters["holdout"] = json!(held.every);
     let load_options = LoadOptions { resolution: o.views.resolution, holdout: held.every };
-    let dataset = load(&o.scene, &load_options, stage)?;
+    let mut dataset = load(&o.scene, &load_options, stage)?;
     held.differs(&dataset).iter().for_each(|what| stage.warn(what));
     let sizes = Sizes {
         geometry: memory::bytes(&o.geometry),
@@ -47,7 +47,7 @@ pub(crate) fn run(o: &ReportOptions, mut parameters: Value, stage: &Stage) -> Re
     let outputs = stage.outputs(out).file(out).file(&figures);
     let mut claim = outputs.reads(&dataset.files).reads(files(&o.run_dir).chain([o.geometry.clone()])).claim()?;
     let mut metrics = Metrics::default();
-    let material = Material::read(&dataset, o, &held, masks(o), &mut metrics)?;
+    let material = Material::read(&mut dataset, o, &held, masks(o), &mut metrics)?;
     write_bytes(out, write(&material, &mut metrics)?.as_bytes())?;
     write_json(&figures, &metrics)?;
     stage.record(&mut claim, parameters, material.inputs, json!({"left_out": metrics.skipped.len()}))?;

@@ -24,7 +24,7 @@ use stage::Stage;
 
 pub(crate) fn run(o: &QueryOptions, parameters: Value, stage: &Stage, json_lines: bool) -> Result<String> {
     let load_options = LoadOptions { resolution: o.views.resolution, ..LoadOptions::default() };
-    let dataset = load(&o.inputs.scene, &load_options, stage)?;
+    let mut dataset = load(&o.inputs.scene, &load_options, stage)?;
     let out = o.out.as_deref();
     let claim = out.map(|out| {
         let outputs = stage.outputs(out.join("query.json")).folder(out);
@@ -33,7 +33,7 @@ pub(crate) fn run(o: &QueryOptions, parameters: Value, stage: &Stage, json_lines
     });
     let mut claim = claim.transpose()?;
     stage.forecast(memory::of_query(&Sizes::new(&o.inputs.geometry, &o.texts, &dataset.views)), SMALLER)?;
-    let scene = o.inputs.read(&dataset, stage)?;
+    let scene = o.inputs.read(&mut dataset, stage)?;
     let source = source(o, &scene)?;
     for view in &o.views.views {
         find_view(&dataset, view)?;

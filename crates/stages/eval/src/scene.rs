@@ -20,8 +20,8 @@ impl Inputs {
         dataset.files.iter().chain([&self.instances, &self.geometry]).chain(&self.edits)
     }
 
-    /// Reads instances and geometry, which must be those of the dataset. Damaged Gaussians are reported.
-    pub fn read(&self, dataset: &Dataset, stage: &Stage) -> Result<LabelledScene> {
+    /// Reads instances and geometry, which must be those of the dataset, whose cameras follow them. Damaged Gaussians are reported.
+    pub fn read(&self, dataset: &mut Dataset, stage: &Stage) -> Result<LabelledScene> {
         let scene = LabelledScene::read(&self.instances, &self.geometry, self.edits.as_deref())?;
         if let Some(damage) = scene.geometry.damage() {
             stage.skipped(&damage);

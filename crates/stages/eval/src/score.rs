@@ -34,7 +34,7 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::path::Path;
 
 pub(crate) fn run(o: &ScoreOptions, parameters: Value, stage: &Stage) -> Result<String> {
-    let dataset = load(&o.scene, &LoadOptions::default(), stage)?;
+    let mut dataset = load(&o.scene, &LoadOptions::default(), stage)?;
     let labels = labels::folder(o.labels.labels.as_deref(), &dataset.root)?;
     let out = &o.out;
     let own = [&o.instances, &o.edits, &o.descriptors, &o.texts.text_features, &o.choice.features];
@@ -47,7 +47,7 @@ pub(crate) fn run(o: &ScoreOptions, parameters: Value, stage: &Stage) -> Result<
         ..Sizes::new(&o.geometry, &o.texts, &dataset.views)
     };
     stage.forecast(memory::of_scores(&sizes), SMALLER)?;
-    let mut found = Found::read(o, &dataset, stage)?;
+    let mut found = Found::read(o, &mut dataset, stage)?;
     let mut scores = Scores::default();
     match &found.instances {
         Some(scene) if scene.all_noise() => stage.warn("all Gaussians are noise: every score is 0"),
@@ -109,7 +109,7 @@ struct Found {
 }
 
 impl Found {
-    fn read(o: &ScoreOptions, dataset: &Dataset, stage: &Stage) -> Result<Self> {
+    fn read(o: &ScoreOptions, dataset: &mut Dataset, stage: &Stage) -> Result<Self> {
         let instances = o.inputs().map(|inputs| inputs.read(dataset, stage)).transpose()?;
         let mut inputs = instances.as_ref().map_or_else(BTreeMap::new, |scene| scene.inputs.clone());
         let Some(path) = &o.descriptors else { return Ok(Self { instances, described: None, inputs, judges: false }) };
@@ -121,6 +121,7 @@ impl Found {
         if let Some(damage) = own.as_ref().and_then(Geometry::damage) {
             stage.skipped(&damage);
         }
+        dataset.follow(&geometry.gaussians, &o.geometry)?;
         let described = DescribedGaussians::read(path, &hash, geometry.gaussians.len())?;
         described.artifact.expect_input(role::DATASET, &dataset.hash()?)?;
         inputs.extend([(role::GEOMETRY.into(), hash), ("descriptors".into(), described.artifact.hash().into())]);

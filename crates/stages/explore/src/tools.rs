@@ -371,6 +371,10 @@ fn export(asked: &Asked, export: &Export) -> Result<Value> {
     let _new = gs_io::expect_new(&path);
     let own = vec![concat!("made by explore ", env!("CARGO_PKG_VERSION")).into()];
     let world = asked.world;
-    Labelled::new(&world.scene.geometry, &world.source.geometry, label, own)?.write(&path, &which)?;
-    Ok(json!({"file": path, "gaussians": which.len(), "of": label.len()}))
+    let lost = Labelled::new(&world.scene.geometry, &world.source.geometry, label, own)?.write(&path, &which)?;
+    let mut written = json!({"file": path, "gaussians": which.len(), "of": label.len()});
+    if !lost.is_empty() {
+        written["lost"] = lost.into();
+    }
+    Ok(written)
 }

@@ -87,10 +87,10 @@ impl World {
     /// # Errors
     /// When files are missing, damaged or of different scenes.
     pub fn read(o: &Source, resolution: Resolution, stage: &Stage) -> Result<Self> {
-        let dataset = dataset::load(&o.scene, &LoadOptions { resolution, ..LoadOptions::default() })?;
+        let mut dataset = dataset::load(&o.scene, &LoadOptions { resolution, ..LoadOptions::default() })?;
         stage.forecast(forecast(o, &dataset), "give a smaller geometry (gs-geom train --max-gaussians)")?;
         let scene = LabelledScene::read(&o.instances, &o.geometry, None)?;
-        scene.check_dataset(&dataset)?;
+        scene.check_dataset(&mut dataset)?;
         let mut messages = dataset.warnings.clone();
         messages.extend(scene.geometry.damage());
         let words = words(o, &scene);

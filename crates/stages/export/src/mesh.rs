@@ -1,6 +1,7 @@
 //! Triangle meshes and their files.
 
 use gs_io::{IoContext, Result, write_atomic};
+use gs_scene::ply;
 use std::collections::BTreeSet;
 use std::io::Write;
 use std::path::Path;
@@ -12,6 +13,11 @@ pub struct Mesh {
     pub vertices: Vec<[f32; 3]>,
     /// Triangles, as positions in `vertices`.
     pub triangles: Vec<[u32; 3]>,
+}
+
+/// What of a mesh's corners is written as it is in the world: a coordinate less a shift, plus that shift.
+fn in_world(v: f32, shift: f64) -> String {
+    if shift == 0.0 { format!("{v:?}") } else { format!("{:?}", f64::from(v) + shift) }
 }
 
 impl Mesh {
@@ -40,23 +46,27 @@ impl Mesh {
         each_once && directed.iter().all(|&(a, b)| directed.contains(&(b, a))) && euler == 2
     }
 
-    /// Writes Wavefront OBJ.
-    pub fn write_obj(&self, path: &Path, name: &str) -> Result<()> {
+    /// Writes Wavefront OBJ, which has numbers of any length: `shift` is added to the corners.
+    pub fn write_obj(&self, path: &Path, name: &str, shift: [f64; 3]) -> Result<()> {
         write_atomic(path, |w| {
             let mut text = format!("o {name}\n");
-            self.vertices.iter().for_each(|[x, y, z]| text += &format!("v {x:?} {y:?} {z:?}\n"));
+            for p in &self.vertices {
+                let [x, y, z] = [0, 1, 2].map(|c| in_world(p[c], shift[c]));
+                text += &format!("v {x} {y} {z}\n");
+            }
             // OBJ counts from 1.
             self.triangles.iter().for_each(|t| text += &format!("f {} {} {}\n", t[0] + 1, t[1] + 1, t[2] + 1));
             w.write_all(text.as_bytes()).at("write", path)
         })
     }
 
-    /// Writes a little-endian PLY.
-    pub fn write_ply(&self, path: &Path) -> Result<()> {
+    /// Writes a little-endian PLY; a comment says what was subtracted from the corners.
+    pub fn write_ply(&self, path: &Path, shift: [f64; 3]) -> Result<()> {
         write_atomic(path, |w: &mut dyn Write| {
             let (vertices, faces) = (self.vertices.len(), self.triangles.len());
+            let shift = ply::shift_comment(shift).map_or(String::new(), |shift| format!("comment {shift}\n"));
             let header = format!(
-                "ply\nformat binary_little_endian 1.0\nelement vertex {vertices}\nproperty float x\nproperty float y\n\
+                "ply\nformat binary_little_endian 1.0\n{shift}element vertex {vertices}\nproperty float x\nproperty float y\n\
                  property float z\nelement face {faces}\nproperty list uchar int vertex_indices\nend_header\n"
             );
             let mut bytes = header.into_bytes();
@@ -110,13 +120,20 @@ mod tests {
     fn files_hold_the_mesh() {
         let dir = tempfile::tempdir().unwrap();
         let (obj, ply) = (dir.path().join("m.obj"), dir.path().join("m.ply"));
-        tetrahedron(0.5).write_obj(&obj, "thing").unwrap();
+        tetrahedron(0.5).write_obj(&obj, "thing", [0.0; 3]).unwrap();
         let text = std::fs::read_to_string(&obj).unwrap();
         assert!(text.starts_with("o thing\nv 0.5 0.5 0.5\nv 1.5 0.5 0.5\n"), "{text}");
         assert!(text.ends_with("f 2 3 4\n"), "{text}");
-        tetrahedron(0.5).write_ply(&ply).unwrap();
+        tetrahedron(0.5).write_ply(&ply, [0.0; 3]).unwrap();
         // The faces are walked through by the reader, which wants all of them to be there.
-        let points = gs_scene::ply::read_points(&ply).unwrap();
+        let points = ply::read_points(&ply).unwrap();
         assert_eq!(points.positions, tetrahedron(0.5).vertices);
+        let far = [448_262.0, 5_411_932.0, -114.0];
+        tetrahedron(0.5).write_obj(&obj, "thing", far).unwrap();
+        let text = std::fs::read_to_string(&obj).unwrap();
+        assert!(text.starts_with("o thing\nv 448262.5 5411932.5 -113.5\n"), "{text}");
+        tetrahedron(0.5).write_ply(&ply, far).unwrap();
+        let points = ply::read_points(&ply).unwrap();
+        assert_eq!((points.positions, points.shift), (tetrahedron(0.5).vertices, far));
     }
 }

@@ -1,7 +1,7 @@
 //! Centres of Gaussians as a point cloud with colours and ids.
 
 use gs_io::{Error, IoContext, Result, write_atomic, write_bytes};
-use gs_scene::Gaussians;
+use gs_scene::{Gaussians, ply};
 use las::point::Format;
 use las::{Builder, Color, Point, Transform, Vector, Vlr, Writer};
 use std::io::Cursor;
@@ -49,8 +49,9 @@ fn color(g: &Gaussians, i: usize) -> [u8; 3] {
 
 fn write_ply(to: &Path, g: &Gaussians, label: &[i32], which: &[u32]) -> Result<()> {
     write_atomic(to, |w| {
+        let shift = ply::shift_comment(g.shift).map_or(String::new(), |shift| format!("comment {shift}\n"));
         let header = format!(
-            "ply\nformat binary_little_endian 1.0\nelement vertex {}\nproperty float x\nproperty float y\nproperty float z\n\
+            "ply\nformat binary_little_endian 1.0\n{shift}element vertex {}\nproperty float x\nproperty float y\nproperty float z\n\
              property uchar red\nproperty uchar green\nproperty uchar blue\nproperty int instance\nend_header\n",
             which.len()
         );
@@ -76,7 +77,7 @@ fn las_bytes(g: &Gaussians, label: &[i32], which: &[u32]) -> las::Result<Vec<u8>
     builder.generating_software = format!("cags export {}", env!("CARGO_PKG_VERSION"));
     let mut writer = Writer::new(Cursor::new(Vec::new()), builder.into_header()?)?;
     for i in which.iter().map(|&i| i as usize) {
-        let [x, y, z] = g.means[i].map(f64::from);
+        let [x, y, z] = [0, 1, 2].map(|c| place(g, i, c));
         let [red, green, blue] = color(g, i).map(|c| 257 * u16::from(c));
         writer.write_point(Point {
             x,
@@ -106,9 +107,14 @@ fn instance_dimension() -> Vlr {
     Vlr { user_id: "LASF_Spec".into(), record_id: 4, description: "Extra Bytes".into(), data }
 }
 
+/// A coordinate of a Gaussian in the world.
+fn place(g: &Gaussians, i: usize, axis: usize) -> f64 {
+    f64::from(g.means[i][axis]) + g.shift[axis]
+}
+
 fn transforms(g: &Gaussians, which: &[u32]) -> Vector<Transform> {
     let axis = |c: usize| {
-        let values = || which.iter().map(|&i| f64::from(g.means[i as usize][c]));
+        let values = || which.iter().map(|&i| place(g, i as usize, c));
         let (low, high) = (values().fold(f64::INFINITY, f64::min), values().fold(f64::NEG_INFINITY, f64::max));
         if low > high { (0.0, 0.0) } else { (low, high) }
     };
@@ -134,6 +140,7 @@ mod tests {
             sh: (0..12).map(|i| i as f32 * 0.3 - 2.0).collect(),
             sh_degree: 0,
             means,
+            ..Gaussians::default()
         };
         (g, vec![-1, 0, 65_534, 70_000])
     }
@@ -175,10 +182,10 @@ mod tests {
         let path = dir.path().join("p.ply");
         let (g, label) = sample();
         write(&path, PointFormat::of(&path).unwrap(), &g, &label, &[1, 3]).unwrap();
-        let points = gs_scene::ply::read_points(&path).unwrap();
+        let points = ply::read_points(&path).unwrap();
         assert_eq!(points.positions, [g.means[1], g.means[3]]);
         assert_eq!(points.colors, [color(&g, 1), color(&g, 3)]);
-        assert_eq!(gs_scene::ply::read_labels(&path, "instance").unwrap().1, [0, 70_000]);
+        assert_eq!(ply::read_labels(&path, "instance", [0.0; 3]).unwrap().1, [0, 70_000]);
         assert!(PointFormat::of(Path::new("a.xyz")).unwrap_err().to_string().contains("expected .las or .ply"));
     }
 }

@@ -44,10 +44,13 @@ pub fn objects(o: &ObjectsOptions, parameters: Value, stage: &Stage) -> Result<(
     let splats = splats_of(&labelled, &o.inputs)?;
     let wanted = wanted(&labelled, &o.only, "--only")?;
     let members = members(&labelled.instances.label, labelled.instances.len());
+    let mut lost = Vec::new();
     for &id in &wanted {
         let file = o.out.join(format!("{}.{}", stem(id), o.format.extension()));
-        splats.write(&file, &members[id as usize])?;
+        lost.extend(splats.write(&file, &members[id as usize])?);
     }
+    lost.dedup();
+    lost.iter().for_each(|what| stage.warn(what));
     stage.info(&format!("wrote {} objects into {}", wanted.len(), o.out.display()));
     stage.record(&mut claim, parameters, labelled.inputs.clone(), json!({ "objects": wanted.len() }))
 }
@@ -68,7 +71,7 @@ pub fn splats(o: &SplatsOptions, parameters: Value, stage: &Stage) -> Result<()>
     if which.is_empty() {
         return Err(Error::new("nothing is left to write").field("--without").hint("leave some objects"));
     }
-    splats_of(&labelled, &o.inputs)?.write(&o.out, &which)?;
+    splats_of(&labelled, &o.inputs)?.write(&o.out, &which)?.iter().for_each(|what| stage.warn(what));
     if o.ids {
         Ids::of(&o.out, which.iter().map(|&i| label[i as usize]).collect())?.write(&o.out)?;
     }
@@ -96,15 +99,15 @@ pub fn meshes(o: &MeshesOptions, parameters: Value, stage: &Stage) -> Result<()>
     let wanted = wanted(&labelled, &o.only, "--only")?;
     let scene = describe(&labelled, &Names::new(), None);
     let members = members(&labelled.instances.label, labelled.instances.len());
-    let mut flat = Vec::new();
+    let (mut flat, shift) = (Vec::new(), labelled.gaussians().shift);
     for object in scene.objects.iter().filter(|object| wanted.contains(&object.id)) {
         let centers = solid_centers(labelled.gaussians(), &members[object.id as usize]);
         let (mesh, is_box) = hull(&centers, &object.bounds, o.vertices);
         flat.extend(is_box.then_some(object.id));
         let stem = stem(object.id);
         match o.format {
-            MeshFormat::Obj => mesh.write_obj(&o.out.join(format!("{stem}.obj")), &stem)?,
-            MeshFormat::Ply => mesh.write_ply(&o.out.join(format!("{stem}.ply")))?,
+            MeshFormat::Obj => mesh.write_obj(&o.out.join(format!("{stem}.obj")), &stem, shift)?,
+            MeshFormat::Ply => mesh.write_ply(&o.out.join(format!("{stem}.ply")), shift)?,
         }
     }
     if !flat.is_empty() {
@@ -161,8 +164,8 @@ impl UpOptions {
     /// What is up: as a person said, or by the cameras of the dataset.
     fn find(&self, scene: &LabelledScene, stage: &Stage) -> Result<Option<Up>> {
         let Some(folder) = &self.scene else { return Ok(self.up) };
-        let dataset = dataset::load(folder, &LoadOptions::default())?;
-        scene.check_dataset(&dataset)?;
+        let mut dataset = dataset::load(folder, &LoadOptions::default())?;
+        scene.check_dataset(&mut dataset)?;
         let up = Up::of_cameras(dataset.views.iter().map(|v| &v.camera));
         if up.is_none() {
             stage.warn("the cameras do not tell what is up: give --up");

@@ -58,9 +58,18 @@ fn stage(w: &mut dyn Write, g: &Gaussians, prims: &[Prim], o: &StageOptions) -> 
     writeln!(w, "#usda 1.0\n(\n    defaultPrim = \"Scene\"\n    doc = {}", text(&doc))?;
     writeln!(w, "    metersPerUnit = {metres:?}\n    upAxis = \"{axis}\"\n)\n")?;
     writeln!(w, "def Xform \"Scene\" (\n    kind = \"assembly\"\n)\n{{")?;
+    let mut moves = Vec::new();
     if let Some(up) = &o.up {
         writeln!(w, "    matrix4d xformOp:transform = {}", upright(up.vector()))?;
-        writeln!(w, "    uniform token[] xformOpOrder = [\"xformOp:transform\"]")?;
+        moves.push("\"xformOp:transform\"");
+    }
+    // The last of the order comes first: what was subtracted in the geometry's axes is added in these.
+    if g.shift != [0.0; 3] {
+        writeln!(w, "    double3 xformOp:translate = {}", tuple(&g.shift))?;
+        moves.push("\"xformOp:translate\"");
+    }
+    if !moves.is_empty() {
+        writeln!(w, "    uniform token[] xformOpOrder = [{}]", moves.join(", "))?;
     }
     prims.iter().filter(|p| !p.gaussians.is_empty()).try_for_each(|p| object(w, g, p, o.sh_degree))?;
     writeln!(w, "}}")
@@ -178,6 +187,7 @@ mod tests {
             opacity_logits: vec![0.0, 50.0, 0.0],
             sh: (0..3 * 12).map(|i| i as f32).collect(),
             sh_degree: 1,
+            ..Gaussians::default()
         };
         let collider = Mesh {
             vertices: vec![[0.0; 3], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]],
@@ -198,6 +208,13 @@ mod tests {
         stage(&mut bytes, &g, &prims, &o).unwrap();
         let golden = include_str!("../testdata/tiny.usda").replace("VERSION", env!("CARGO_PKG_VERSION"));
         assert_eq!(String::from_utf8(bytes).unwrap(), golden);
+        // A scene far from the origin is moved there in double precision, before it is turned.
+        let far = Gaussians { shift: [448_262.0, 5_411_932.0, 114.5], ..g.clone() };
+        let mut bytes = Vec::new();
+        stage(&mut bytes, &far, &prims, &o).unwrap();
+        let text = String::from_utf8(bytes).unwrap();
+        assert!(text.contains("    double3 xformOp:translate = (448262.0, 5411932.0, 114.5)\n"), "{text}");
+        assert!(text.contains("xformOpOrder = [\"xformOp:transform\", \"xformOp:translate\"]\n"), "{text}");
         // With all bands there are four coefficients a Gaussian, grouped by Gaussian.
         let mut bytes = Vec::new();
         stage(&mut bytes, &g, &prims[..1], &StageOptions { up: None, metres_per_unit: None, sh_degree: 3 }).unwrap();

@@ -38,6 +38,7 @@ fn gaussians() -> (Gaussians, Vec<i32>) {
         sh: (0..12 * n).map(|i| (i % 97) as f32 * 0.01).collect(),
         sh_degree: 1,
         means,
+        ..Gaussians::default()
     };
     (g, label)
 }
@@ -244,7 +245,7 @@ fn splats_keep_harmonics_and_ids_and_can_do_without_an_object() {
     let rest: Vec<u32> = (0..g.len() as u32).filter(|&i| ![1, 3].contains(&label[i as usize])).collect();
     assert_eq!(ply::read_gaussians(run.path("rest.ply")).unwrap(), g.select(&rest));
     run.succeed("splats", "some.ply", &["--only", "4,0"]);
-    let (_, ids) = ply::read_labels(run.path("some.ply"), "instance").unwrap();
+    let (_, ids) = ply::read_labels(run.path("some.ply"), "instance", [0.0; 3]).unwrap();
     assert!(ids.len() == 2 * EACH && ids[..EACH].iter().all(|&i| i == 0) && ids[EACH..].iter().all(|&i| i == 4));
 
     run.succeed("objects", "things", &[]);

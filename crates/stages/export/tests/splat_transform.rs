@@ -23,6 +23,7 @@ fn splat_transform_splits_objects_from_our_ply() {
         opacity_logits: vec![2.0; GAUSSIANS],
         sh: (0..48 * GAUSSIANS).map(|i| (i % 89) as f32 * 0.01 - 0.3).collect(),
         sh_degree: 3,
+        ..Gaussians::default()
     };
     let label: Vec<i32> = (0..GAUSSIANS as i32).map(|i| i * i % (OBJECTS + 1) - 1).collect();
     ply::write_gaussians(path("geometry.ply"), &g, &[]).unwrap();

@@ -49,6 +49,7 @@ pub fn write(side: usize, views: usize, folder: &Path) {
         opacity_logits: vec![2.0; n],
         sh: (0..3 * n).map(|_| rng.random_range(-1.0..1.0)).collect(),
         sh_degree: 0,
+        ..Gaussians::default()
     };
     let (mut nearest_anchor, mut anchors) = (vec![0u32; n], vec![0u32; m]);
     for (place, &i) in index.iter().enumerate() {

@@ -20,6 +20,7 @@ fn gaussians() -> Gaussians {
         opacity_logits: vec![2.0; N],
         sh: (0..3 * N).map(|i| ((i * 7) % 5) as f32 * 0.2).collect(),
         sh_degree: 0,
+        ..Gaussians::default()
     }
 }
 

@@ -24,7 +24,7 @@ impl Program for Args {
         self.settings.held.holdout = Some(held.every);
         // The size of the id maps decides the resolution, so photographs count at full size.
         let load = LoadOptions { resolution: Resolution::Divisor(1.0), holdout: held.every };
-        let dataset = dataset::load(&self.scene, &load)?;
+        let mut dataset = dataset::load(&self.scene, &load)?;
         let maps = dataset.views.iter().map(|v| maps_path(&self.masks, v.stem()));
         let mut claim = stage
             .outputs(&self.graph)
@@ -35,13 +35,14 @@ impl Program for Args {
             .claim()?;
         let watched = Watched::new([&self.geometry]).and(watch_folder(&self.masks, "_s.npy")?);
         dataset.warnings.iter().chain(&held.differs(&dataset)).for_each(|w| stage.warn(w));
+        let geometry = Geometry::read(&self.geometry)?;
+        dataset.follow(&geometry.gaussians, &self.geometry)?;
         let wanted = |v: &&View| self.settings.views == Views::All || v.split == Split::Train;
         let views: Vec<&View> = dataset.views.iter().filter(wanted).collect();
         if views.is_empty() {
             let e = Error::new("all views are held out").file(&self.scene);
             return Err(e.hint("give --views all or --holdout 0"));
         }
-        let geometry = Geometry::read(&self.geometry)?;
         if geometry.gaussians.is_empty() {
             return Err(Error::new("no Gaussians").file(&self.geometry).hint("train the geometry first"));
         }

@@ -6,21 +6,22 @@ use std::str::FromStr;
 
 /// Corners of a box along the axes, world units.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize)]
-pub struct Bounds {
+pub struct Bounds<T = f32> {
     /// Least x, y, z.
-    pub low: [f32; 3],
+    pub low: [T; 3],
     /// Greatest x, y, z.
-    pub high: [f32; 3],
+    pub high: [T; 3],
 }
 
-impl Bounds {
-    /// Whether a point lies in the box, its faces included.
-    pub fn contains(&self, point: [f32; 3]) -> bool {
-        (0..3).all(|c| (self.low[c]..=self.high[c]).contains(&point[c]))
+impl Bounds<f64> {
+    /// Whether a point less `shift` lies in the box, its faces included.
+    pub fn contains(&self, point: [f32; 3], shift: [f64; 3]) -> bool {
+        let near = |corner: [f64; 3], c: usize| (corner[c] - shift[c]) as f32;
+        (0..3).all(|c| (near(self.low, c)..=near(self.high, c)).contains(&point[c]))
     }
 }
 
-impl FromStr for Bounds {
+impl FromStr for Bounds<f64> {
     type Err = Error;
 
     /// As a person writes it: `x0,y0,z0,x1,y1,z1`.
@@ -30,7 +31,7 @@ impl FromStr for Bounds {
                 .found(s)
                 .expected("x0,y0,z0,x1,y1,z1: six finite numbers, the low corner before the high one")
         };
-        let numbers: Vec<f32> =
+        let numbers: Vec<f64> =
             s.split(',').map(|v| v.trim().parse()).collect::<std::result::Result<_, _>>().map_err(|_| wrong())?;
         let [x0, y0, z0, x1, y1, z1] = numbers[..] else { return Err(wrong()) };
         let (low, high) = ([x0, y0, z0], [x1, y1, z1]);
@@ -46,11 +47,11 @@ mod tests {
     #[test]
     fn boxes_are_read() {
         assert_eq!(
-            "-1,0, 2.5,1,0,3".parse::<Bounds>().unwrap(),
+            "-1,0, 2.5,1,0,3".parse::<Bounds<f64>>().unwrap(),
             Bounds { low: [-1.0, 0.0, 2.5], high: [1.0, 0.0, 3.0] }
         );
         for wrong in ["", "1,2,3", "0,0,0,1,1,-1", "0,0,0,1,1,nan", "0,0,0,1,1,inf", "a,0,0,1,1,1", "0,0,0,1,1,1,1"] {
-            assert!(wrong.parse::<Bounds>().is_err(), "{wrong}");
+            assert!(wrong.parse::<Bounds<f64>>().is_err(), "{wrong}");
         }
     }
 }

@@ -2,7 +2,7 @@
 
 use crate::bounds::Bounds;
 use crate::memory;
-use crate::options::{Convert, Order, bytes};
+use crate::options::{Convert, Order, bytes, note_shift};
 use artifacts::role;
 use gs_io::{Error, Result};
 use gs_scene::splat::{self, Extra, Format, Splat};
@@ -51,7 +51,8 @@ impl Convert {
         comments.extend(Learnt::read(&self.input)?.iter().flat_map(Learnt::comments));
         splat::write(&self.output, &g, &Extra { comments: &comments, antialias, instance: None })?;
         stage.info(&format!("{} of {all} Gaussians, SH degree {}, in {}", g.len(), g.sh_degree, self.output.display()));
-        let summary = json!({
+        splat::lost(&self.output, &g)?.iter().for_each(|what| stage.warn(what));
+        let mut summary = json!({
             "gaussians": g.len(),
             "of": all,
             "from": kind,
@@ -59,6 +60,7 @@ impl Convert {
             "cropped": chosen.cropped,
             "faint": chosen.faint,
         });
+        note_shift(&mut summary, g.shift);
         stage.record(&mut claim, parameters, inputs, summary)
     }
 }
@@ -74,12 +76,12 @@ struct Chosen {
 }
 
 /// Picks the Gaussians that can be used, whose centres lie inside the box, and whose opacity is at least `min_opacity`.
-fn choose(g: &Gaussians, min_opacity: f32, crop: Option<Bounds>) -> Chosen {
+fn choose(g: &Gaussians, min_opacity: f32, crop: Option<Bounds<f64>>) -> Chosen {
     let mut chosen = Chosen::default();
     for i in 0..g.len() {
         if !g.is_whole(i) {
             chosen.damaged += 1;
-        } else if crop.is_some_and(|b| !b.contains(g.means[i])) {
+        } else if crop.is_some_and(|b| !b.contains(g.means[i], g.shift)) {
             chosen.cropped += 1;
         } else if g.opacity(i) < min_opacity {
             chosen.faint += 1;

@@ -251,6 +251,7 @@ impl<'a> Sights<'a> {
         PointCloud {
             positions: points.iter().map(|p| p.place.as_vec3().to_array()).collect(),
             colors: points.iter().map(color).collect(),
+            ..PointCloud::default()
         }
     }
 }

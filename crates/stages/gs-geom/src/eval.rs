@@ -14,13 +14,14 @@ use std::collections::BTreeMap;
 impl Eval {
     pub(crate) fn run(&self, stage: &Stage) -> Result<()> {
         let (scene, held) = self.scene.for_geometry(&self.geometry)?;
-        let dataset = scene.load(stage)?;
+        let mut dataset = scene.load(stage)?;
         if let Some(why) = held.differs(&dataset).filter(|_| held.seen(&dataset) > Some(0)) {
             return Err(Error::new(why).hint("leave --holdout out"));
         }
         let needed = memory::of_figures(bytes(&self.geometry.geometry)?, &Pictures::of(&dataset)?);
         stage.forecast(needed, "give a smaller --geometry or --resolution")?;
         let (gaussians, options) = self.geometry.read(self.scene.background, stage)?;
+        dataset.follow(&gaussians, &self.geometry.geometry)?;
         let masks = self.masks.load(&dataset, stage)?;
         let alpha = masks.alpha();
         let reads = dataset.files.iter().cloned().chain(masks.files()).chain([self.geometry.geometry.clone()]);

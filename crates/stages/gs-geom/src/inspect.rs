@@ -2,7 +2,7 @@
 
 use crate::bounds::Bounds;
 use crate::memory;
-use crate::options::{Inspect, bytes};
+use crate::options::{Inspect, bytes, note_shift};
 use gs_io::{IoContext, Result};
 use gs_scene::Gaussians;
 use gs_scene::dataset::{self, LoadOptions};
@@ -39,6 +39,7 @@ impl Inspect {
         object["file_bytes"] = file_bytes.into();
         object["format"] = kind.into();
         object["antialias"] = antialias.into();
+        note_shift(&mut object, gaussians.shift);
         object["not_read"] = left_out.into();
         Ok(if json { format!("{object}\n") } else { text(&object, &report) })
     }

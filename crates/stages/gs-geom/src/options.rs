@@ -9,8 +9,9 @@ use clap::{Parser, Subcommand, ValueEnum};
 use gs_io::{Error, Result};
 use gs_raster::RasterOptions;
 use gs_scene::dataset::{self, Dataset, HOLDOUT, LoadOptions, Resolution};
-use gs_scene::{Gaussians, Geometry, HoldOut};
+use gs_scene::{Gaussians, Geometry, HoldOut, say_shift};
 use serde::{Serialize, Serializer};
+use serde_json::Value;
 use stage::{Bytes, CommonArgs, Stage, positive, within};
 use std::fmt::Display;
 use std::path::{Path, PathBuf};
@@ -234,7 +235,7 @@ pub(crate) struct Convert {
     pub min_opacity: f32,
     /// Drop Gaussians whose centre lies outside this box, world units
     #[arg(long, value_name = "X0,Y0,Z0,X1,Y1,Z1", allow_hyphen_values = true)]
-    pub crop: Option<Bounds>,
+    pub crop: Option<Bounds<f64>>,
     /// Order of the Gaussians
     #[arg(long, value_enum, default_value_t = Order::None)]
     pub order: Order,
@@ -354,6 +355,12 @@ impl SceneOptions {
     pub fn load(&self, stage: &Stage) -> Result<Dataset> {
         let dataset = self.load_quietly()?;
         dataset.warnings.iter().for_each(|w| stage.warn(w));
+        if dataset.shift != [0.0; 3] {
+            stage.info(&format!(
+                "the scene is far from the origin: {} is subtracted from it, and what is written says so",
+                say_shift(dataset.shift)
+            ));
+        }
         Ok(dataset)
     }
 }
@@ -392,6 +399,13 @@ impl GeometryOptions {
             stage.skipped(&format!("spherical harmonics of degrees {} to {degree}: zero in every Gaussian", used + 1));
         }
         Ok((gaussians, options))
+    }
+}
+
+/// Notes in a record what was subtracted from the world's coordinates, where something was.
+pub(crate) fn note_shift(record: &mut Value, shift: [f64; 3]) {
+    if shift != [0.0; 3] {
+        record["shift"] = shift.to_vec().into();
     }
 }
 

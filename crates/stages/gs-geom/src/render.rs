@@ -15,11 +15,12 @@ use std::io::Cursor;
 impl Render {
     pub(crate) fn run(&self, stage: &Stage) -> Result<()> {
         let (scene, held) = self.scene.for_geometry(&self.geometry)?;
-        let dataset = scene.load(stage)?;
+        let mut dataset = scene.load(stage)?;
         held.differs(&dataset).iter().for_each(|what| stage.warn(what));
         let needed = memory::of_renders(bytes(&self.geometry.geometry)?, &Pictures::of(&dataset)?, self.exr);
         stage.forecast(needed, "give a smaller --geometry or --resolution")?;
         let (gaussians, options) = self.geometry.read(self.scene.background, stage)?;
+        dataset.follow(&gaussians, &self.geometry.geometry)?;
         let views = choose(&dataset, &self.views)?;
         let extensions: &[&str] = if self.exr { &["png", "exr"] } else { &["png"] };
         let names = views.iter().flat_map(|v| extensions.iter().map(|e| format!("{}.{e}", v.stem())));

@@ -80,7 +80,7 @@ fn learn(
 
     let cameras: Vec<&Camera> = train.iter().map(|v| &v.camera).collect();
     let extent = crate::start::extent(&cameras, &dataset.points.positions);
-    let state = match iterate::saved(options, &run, stage) {
+    let mut state = match iterate::saved(options, &run, stage) {
         Some(state) => state,
         None => {
             let exposures = if options.exposure { train.len() } else { 0 };
@@ -88,6 +88,7 @@ fn learn(
             checkpoint::start(gaussians, exposures, poses)
         }
     };
+    state.gaussians.shift = dataset.shift;
     outputs::check_finite(options, &state)?;
     let (width, height, n) = (cameras[0].width, cameras[0].height, state.gaussians.len());
     let counts = format!("{} training views and {} held out", train.len(), heldout.len());

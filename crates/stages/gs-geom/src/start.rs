@@ -73,6 +73,7 @@ pub fn some_points(points: &PointCloud, count: usize, seed: u64) -> PointCloud {
     PointCloud {
         positions: chosen.iter().map(|&i| points.positions[i]).collect(),
         colors: chosen.iter().map(|&i| points.colors[i]).collect(),
+        ..PointCloud::default()
     }
 }
 
@@ -123,7 +124,7 @@ pub fn random_points(cameras: &[&Camera], count: usize, seed: u64) -> PointCloud
             world.as_vec3().to_array()
         })
         .collect::<Vec<_>>();
-    PointCloud { colors: vec![[128; 3]; positions.len()], positions }
+    PointCloud { colors: vec![[128; 3]; positions.len()], positions, ..PointCloud::default() }
 }
 
 /// The point nearest to all optical axes in the least-squares sense; one unit ahead of the cameras where that is
@@ -155,7 +156,7 @@ mod tests {
     use proptest::prelude::*;
 
     fn cloud(positions: Vec<[f32; 3]>) -> PointCloud {
-        PointCloud { colors: vec![[255, 0, 51]; positions.len()], positions }
+        PointCloud { colors: vec![[255, 0, 51]; positions.len()], positions, ..PointCloud::default() }
     }
 
     #[test]

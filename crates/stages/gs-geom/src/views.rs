@@ -20,7 +20,7 @@ mod up;
 pub(crate) use options::Views;
 
 use crate::memory;
-use crate::options::{Background, bytes};
+use crate::options::{Background, bytes, note_shift};
 use artifacts::role;
 use choice::{Choice, ENOUGH};
 use coverage::Coverage;
@@ -95,17 +95,16 @@ impl Views {
         let summary = json!({
             "views": plan.cameras.len(), "look": plan.look, "seen": coverage.seen, "seen_by_8": coverage.seen_by_8, "reachable_by_8": coverage.reachable_by_8,
         });
-        write_json(
-            self.out.join("views.json"),
-            &json!({
+        let mut made = json!({
                 "geometry": hash, "parameters": self, "seed": stage.seed(),
                 "look": plan.look, "inside": plan.inside, "up": plan.up.to_array(), "up_from": plan.rule,
                 "ground": plan.ground, "candidates": plan.tried,
                 "gaussians": {"all": g.len(), "faint": matter.faint, "far": matter.far, "floaters": matter.floaters},
                 "box": {"low": matter.low.to_array(), "high": matter.high.to_array()},
                 "coverage": coverage, "views": cameras,
-            }),
-        )?;
+        });
+        note_shift(&mut made, g.shift);
+        write_json(self.out.join("views.json"), &made)?;
         stage.info(&format!(
             "{} views in {}: {:.1} % of what counts is in at least one, {:.1} % in {ENOUGH} or more ({:.1} % of what can be seen)",
             plan.cameras.len(),

@@ -267,7 +267,7 @@ fn damaged_gaussians_are_skipped_as_in_every_stage() {
 fn one_gaussian_and_one_view_are_enough() {
     let dir = Folder::new();
     let root = dir.path("one");
-    let cloud = PointCloud { positions: vec![[0.1, 0.0, 0.0]], colors: vec![[200, 100, 50]] };
+    let cloud = PointCloud { positions: vec![[0.1, 0.0, 0.0]], colors: vec![[200, 100, 50]], ..PointCloud::default() };
     write_world(&root, 1, &cloud);
     let out = dir.path("g.ply");
     let e = refused(&["train", "--scene", &root, "--out", &out]);

@@ -237,7 +237,7 @@ fn scenes_beyond_the_range_of_numbers_are_refused_before_the_first_step() {
     moved(&scene, 9, &points(), |c| c.translation *= 1e300);
     let said = refused(&training(&scene, &out, "60", &[]));
     assert!(said.contains("translation: no camera has this; found ["), "{said}");
-    let one = PointCloud { positions: vec![[0.0; 3]], colors: vec![[200, 100, 50]] };
+    let one = PointCloud { positions: vec![[0.0; 3]], colors: vec![[200, 100, 50]], ..PointCloud::default() };
     moved(&scene, 9, &one, |c| c.translation *= 1e-60);
     let said = refused(&training(&scene, &out, "60", &[]));
     assert!(said.contains("iteration 0: Gaussians are not finite") && said.contains("points and poses"), "{said}");

@@ -27,6 +27,7 @@ fn gaussians() -> Gaussians {
         opacity_logits: (0..n).map(|i| 3.0 - 0.2 * i as f32).collect(),
         sh: (0..n * 48).map(|i| (i as f32).sin()).collect(),
         sh_degree: 3,
+        ..Gaussians::default()
     };
     g.means[7][1] = f32::NAN;
     g.opacity_logits[0] = f32::INFINITY;

@@ -226,7 +226,8 @@ fn antialiased_gaussians_say_so_and_are_rendered_so() {
 fn a_run_starts_from_what_it_is_told_to() {
     let dir = Folder::new();
     let (out, cloud, gaussians) = (dir.path("g.ply"), dir.path("p.ply"), dir.path("i.ply"));
-    let points = PointCloud { positions: balls(60).means[..7].to_vec(), colors: vec![[10, 20, 30]; 7] };
+    let points =
+        PointCloud { positions: balls(60).means[..7].to_vec(), colors: vec![[10, 20, 30]; 7], ..PointCloud::default() };
     ply::write_points(&cloud, &points, &[]).unwrap();
     ply::write_gaussians(&gaussians, &balls(60), &[]).unwrap();
     for (init, count, says) in [

@@ -20,6 +20,7 @@ fn flat(of: &[(DVec3, DVec3)], scale: f64) -> Gaussians {
         opacity_logits: vec![3.0; n],
         sh: (0..3 * n).map(|i| (i as f32 * 1.7).sin()).collect(),
         sh_degree: 0,
+        ..Gaussians::default()
     }
 }
 

@@ -104,6 +104,7 @@ fn told(points: &[(DVec3, u32)], things: usize) -> (Told, BTreeSet<u32>) {
         opacity_logits: vec![3.0; n],
         sh: vec![0.0; 3 * n],
         sh_degree: 0,
+        ..Gaussians::default()
     };
     let instances = Instances {
         label: kept.iter().map(|p| p.1 as i32).collect(),

@@ -61,7 +61,7 @@ pub fn write(
     colors: &[[u8; 3]],
 ) -> Result<()> {
     let [vertices, labels, segs, objects] = files(name, converted);
-    let cloud = PointCloud { positions: points.position.clone(), colors: colors.to_vec() };
+    let cloud = PointCloud { positions: points.position.clone(), colors: colors.to_vec(), ..PointCloud::default() };
     ply::write_points(folder.join(vertices), &cloud, &[])?;
     let mut labelled = format!(
         "ply\nformat binary_little_endian 1.0\nelement vertex {}\nproperty float x\nproperty float y\n\
@@ -119,7 +119,8 @@ mod tests {
         };
         let dir = tempfile::tempdir().unwrap();
         write(dir.path(), SCAN, false, scene, &points, &vec![[9, 8, 7]; parts.len()]).unwrap();
-        let (at, labels) = ply::read_labels(dir.path().join("scene0000_00_vh_clean_2.labels.ply"), "label").unwrap();
+        let (at, labels) =
+            ply::read_labels(dir.path().join("scene0000_00_vh_clean_2.labels.ply"), "label", [0.0; 3]).unwrap();
         assert_eq!(at, points.position);
         for (&l, &i) in labels.iter().zip(&points.instance) {
             assert_eq!(l, label(scene.things[i as usize].class));

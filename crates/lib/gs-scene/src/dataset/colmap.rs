@@ -8,6 +8,7 @@ use super::upright::Turn;
 use super::{Format, RawDataset, RawView};
 use crate::PointCloud;
 use crate::lens::{Distortion, Lens};
+use crate::middle::shifted;
 pub use binary::write_model;
 use glam::{DMat3, DQuat, DVec3};
 use gs_io::{Error, IoContext, Result};
@@ -118,7 +119,8 @@ pub(crate) fn load(root: &Path, model: Model) -> Result<RawDataset> {
     if file_of(model, "points3D").is_some() {
         let (path, found) = part(model, "points3D", binary::points, text::points)?;
         files.push(path);
-        points = found;
+        let (shift, positions) = shifted(&found.positions);
+        points = PointCloud { positions, colors: found.colors, shift };
     }
     let below = |root: &Path| ["images", "input"].map(|name| root.join(name)).into_iter().find(|d| d.is_dir());
     let folder = if model.starts_with(root) && model != root {
@@ -241,16 +243,22 @@ fn pose(q: [f64; 4], t: [f64; 3], field: &str) -> Result<(DMat3, DVec3)> {
     Ok((DMat3::from_quat(quat.normalize()), DVec3::from_array(t)))
 }
 
-fn push_point(out: &mut PointCloud, p: [f64; 3], color: [u8; 3], field: &str) -> Result<()> {
-    let narrow = p.map(|v| v as f32);
-    if !narrow.iter().all(|v| v.is_finite()) {
+/// Points as the model has them.
+#[derive(Default)]
+struct Points {
+    positions: Vec<[f64; 3]>,
+    colors: Vec<[u8; 3]>,
+}
+
+fn push_point(out: &mut Points, p: [f64; 3], color: [u8; 3], field: &str) -> Result<()> {
+    if !p.iter().all(|v| (*v as f32).is_finite()) {
         return Err(Error::new("the position is not finite")
             .field(field)
             .found(format!("{p:?}"))
             .expected("numbers within the range of f32")
             .hint(AGAIN));
     }
-    out.positions.push(narrow);
+    out.positions.push(p);
     out.colors.push(color);
     Ok(())
 }

@@ -31,9 +31,10 @@ pub fn write(path: &Path, dataset: &Dataset, cameras: &[Camera]) -> Result<()> {
         .zip(cameras)
         .map(|(v, c)| {
             let q = DQuat::from_mat3(&c.rotation);
+            let translation = c.translation - c.rotation * DVec3::from(dataset.shift);
             let pose = json!({
                 "rotation": [q.w, q.x, q.y, q.z],
-                "translation": c.translation.to_array(),
+                "translation": translation.to_array(),
                 "focal": c.fx / v.camera.fx,
             });
             (v.name.as_str(), pose)

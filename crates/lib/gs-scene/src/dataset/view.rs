@@ -6,6 +6,7 @@ use super::upright::{Turn, turn_planes};
 use super::{RawView, Resolution, Split};
 use crate::lens::Lens;
 use crate::{Camera, Image, size_within};
+use glam::DVec3;
 use gs_io::{Error, Result};
 use multiversion::multiversion;
 use rayon::prelude::*;
@@ -28,6 +29,8 @@ pub struct View {
     depth: Option<Depth>,
     mask: Option<PathBuf>,
     turn: Turn,
+    /// The pose's translation as the dataset gives it; that of the camera is of the world less a shift.
+    translation: DVec3,
 }
 
 impl View {
@@ -44,13 +47,24 @@ impl View {
         let (width, height) = lens.size;
         let full = Camera { width, height, fx: fx * zoom, fy: fy * zoom, cx, cy, rotation, translation };
         let (width, height) = resolution.apply(width, height);
-        Ok(Self { name, image_path, camera: full.resized(width, height), split, stem, lens, depth, mask, turn })
+        let camera = full.resized(width, height);
+        Ok(Self { name, image_path, camera, split, stem, lens, depth, mask, turn, translation })
     }
 
     /// By what masks and other files of this view are found: the file name without folder and last extension. Where
     /// two views of the dataset share that, the folders before it too, joined by `_`.
     pub fn stem(&self) -> &str {
         &self.stem
+    }
+
+    /// The pose's translation as the dataset gives it.
+    pub(super) fn translation(&self) -> DVec3 {
+        self.translation
+    }
+
+    /// Takes the camera to the world less a shift.
+    pub(super) fn shift_to(&mut self, shift: [f64; 3]) {
+        self.camera.translation = self.translation + self.camera.rotation * DVec3::from(shift);
     }
 
     pub(super) fn lens(&self) -> &Lens {

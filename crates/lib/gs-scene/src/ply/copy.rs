@@ -1,5 +1,6 @@
 //! Vertices of a PLY in another PLY, with all their properties: also those that this workspace knows nothing of.
 
+use super::shift;
 use super::table::{self, Column, Table};
 use gs_io::{Error, IoContext, Result, write_atomic};
 use std::io::Write;
@@ -12,6 +13,8 @@ pub const INSTANCE: &str = "instance";
 pub struct Vertices {
     table: Table<'static>,
     path: PathBuf,
+    /// That of the file's comments: positions stay as they are, and so does what was subtracted from them.
+    shift: [f64; 3],
 }
 
 impl Vertices {
@@ -23,7 +26,8 @@ impl Vertices {
         let path = path.as_ref();
         let bytes = std::fs::read(path).at("read", path)?;
         let table = table::read(&bytes).map_err(|e| e.file(path))?.into_owned();
-        Ok(Self { table, path: path.to_path_buf() })
+        let shift = shift::of(&bytes).map_err(|e| e.file(path))?;
+        Ok(Self { table, path: path.to_path_buf(), shift })
     }
 
     /// Number of vertices.
@@ -37,7 +41,7 @@ impl Vertices {
     }
 
     /// Writes the vertices `rows`, in that order, as a little-endian PLY with all scalar properties as they are; those of an
-    /// ascii file, or of one with lists, as floats. `instance` has a whole number for every vertex that was read, -1 for none:
+    /// ascii file, or of one with lists, as floats and doubles. `instance` has a whole number for every vertex that was read, -1 for none:
     /// it becomes the property [`INSTANCE`], in place of one that the file has. `comments` become comment lines.
     ///
     /// # Errors
@@ -74,7 +78,7 @@ impl Vertices {
         let property = |(name, column): &(&str, Column)| (column.type_name(), (*name).to_string());
         let mut properties: Vec<(&str, String)> = columns.iter().map(property).collect();
         properties.extend(instance.map(|_| ("int", INSTANCE.to_string())));
-        w.write_all(super::header(rows.len(), comments, &properties).as_bytes()).at("write", to)?;
+        w.write_all(super::header(rows.len(), comments, self.shift, &properties).as_bytes()).at("write", to)?;
         let mut row = Vec::new();
         for &i in rows {
             row.clear();
@@ -133,7 +137,7 @@ mod tests {
             let vertices = Vertices::read(&from).unwrap();
             vertices.write(&to, &[1, 0, 1], Some(&[-1, 4]), &["mine".into()]).unwrap();
             assert_eq!(read_gaussians(&to).unwrap(), read_gaussians(&from).unwrap().select(&[1, 0, 1]), "{encoding}");
-            assert_eq!(read_labels(&to, "segment").unwrap().1, [201, 200, 201]);
+            assert_eq!(read_labels(&to, "segment", [0.0; 3]).unwrap().1, [201, 200, 201]);
             let bytes = std::fs::read(&to).unwrap();
             let header = String::from_utf8_lossy(&bytes[..600]).into_owned();
             assert!(header.contains("comment mine\n") && header.contains(" nx\n"), "{header}");
@@ -147,7 +151,7 @@ mod tests {
             }
             // Without labels the file's own stay.
             vertices.write(&to, &[0], None, &[]).unwrap();
-            assert_eq!(read_labels(&to, "instance").unwrap().1, [7]);
+            assert_eq!(read_labels(&to, "instance", [0.0; 3]).unwrap().1, [7]);
         }
     }
 
@@ -162,6 +166,7 @@ mod tests {
             opacity_logits: vec![0.0; 2],
             sh: vec![0.0; 6],
             sh_degree: 0,
+            ..Gaussians::default()
         };
         write_gaussians(&from, &g, &[]).unwrap();
         let refused = |rows: &[u32], labels: Option<&[i32]>| {

@@ -1,5 +1,6 @@
 //! The vertices of a PLY file as rows of bytes with named columns.
 
+use crate::middle::{less, shifted};
 use gs_io::{Error, Result};
 use rayon::prelude::*;
 use std::borrow::Cow;
@@ -38,6 +39,11 @@ impl Scalar {
             "double" | "float64" => Self::F64,
             _ => return None,
         })
+    }
+
+    /// The type of the values of a rewritten row.
+    fn rewritten(self) -> Self {
+        if self == Self::F64 { self } else { Self::F32 }
     }
 
     fn size(self) -> usize {
@@ -188,6 +194,9 @@ fn cut_short(element: &str, rows: usize, count: usize) -> Error {
         .hint(AGAIN)
 }
 
+/// The properties of a position.
+const PLACE: [&str; 3] = ["x", "y", "z"];
+
 /// Rows a thread takes at a time.
 const ROWS: usize = 4096;
 
@@ -225,7 +234,7 @@ impl Column {
 }
 
 /// The rows of an element. Binary rows without lists stay where they lie in the file; all others are rewritten
-/// as little-endian floats, without their lists.
+/// as little-endian floats and doubles, without their lists.
 pub(crate) struct Table<'a> {
     pub(crate) name: String,
     pub(crate) count: usize,
@@ -240,7 +249,7 @@ impl<'a> Table<'a> {
         let (mut stride, mut columns) = (0, Vec::new());
         for p in &element.properties {
             let Property::Scalar(name, named) = p else { continue };
-            let scalar = if as_is { *named } else { Scalar::F32 };
+            let scalar = if as_is { *named } else { named.rewritten() };
             let big = as_is && encoding == Encoding::Big;
             columns.push((name.clone(), Column { at: stride, scalar, big, named: *named }));
             stride += scalar.size();
@@ -335,6 +344,33 @@ impl<'a> Table<'a> {
         out
     }
 
+    /// The positions x y z and their shift: zeros where they are no doubles, or are not far from the origin.
+    pub(crate) fn places(&self) -> Result<([f64; 3], Vec<[f32; 3]>)> {
+        match self.doubles() {
+            Some(columns) => Ok(shifted(&self.exact(columns))),
+            None => Ok(([0.0; 3], self.arrays(PLACE)?)),
+        }
+    }
+
+    /// The positions x y z less a shift.
+    pub(crate) fn places_less(&self, shift: [f64; 3]) -> Result<Vec<[f32; 3]>> {
+        let less_shift = |p: [f64; 3]| less(p, shift);
+        match self.doubles() {
+            Some(columns) => Ok(self.exact(columns).into_iter().map(less_shift).collect()),
+            None => Ok(self.arrays(PLACE)?.into_iter().map(|p| less_shift(p.map(f64::from))).collect()),
+        }
+    }
+
+    /// The columns of x y z where some of them are doubles.
+    fn doubles(&self) -> Option<[Column; 3]> {
+        let [x, y, z] = PLACE.map(|name| self.find(name));
+        Some([x?, y?, z?]).filter(|columns| columns.iter().any(|c| c.scalar == Scalar::F64))
+    }
+
+    fn exact(&self, columns: [Column; 3]) -> Vec<[f64; 3]> {
+        self.rows().map(|row| columns.map(|c| c.scalar.value(&row[c.at..], c.big))).collect()
+    }
+
     /// The values of some properties, `[count][properties]`.
     pub(crate) fn values(&self, names: &[impl AsRef<str>]) -> Result<Vec<f32>> {
         let column = |name: &str| {
@@ -384,7 +420,7 @@ impl<'a> Numbers<'a> {
     }
 }
 
-/// Reads an element row by row: the scalars as little-endian floats, the lists skipped. Returns what lies behind it.
+/// Reads an element row by row: the scalars as little-endian floats, doubles as doubles, the lists skipped. Returns what lies behind it.
 fn read_rows<'a>(element: &Element, encoding: Encoding, body: &'a [u8], rows: &mut Vec<u8>) -> Result<&'a [u8]> {
     let mut numbers = Numbers { rest: body, encoding, words: "".split_ascii_whitespace() };
     for row in 0..element.count {
@@ -395,7 +431,10 @@ fn read_rows<'a>(element: &Element, encoding: Encoding, body: &'a [u8], rows: &m
             match p {
                 Property::Scalar(_, s) => {
                     let v = numbers.next(*s).map_err(at)?.ok_or_else(short)?;
-                    rows.extend((v as f32).to_le_bytes());
+                    match s.rewritten() {
+                        Scalar::F64 => rows.extend(v.to_le_bytes()),
+                        _ => rows.extend((v as f32).to_le_bytes()),
+                    }
                 }
                 Property::List(count, item) => {
                     let n = numbers.next(*count).map_err(at)?.ok_or_else(short)?;

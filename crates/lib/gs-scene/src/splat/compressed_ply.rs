@@ -6,7 +6,7 @@
 
 use super::packing;
 use crate::ply::table::{Column, Table};
-use crate::{Gaussians, SH_C0, logit, sh_coefficients};
+use crate::{Gaussians, SH_C0, logit, ply, sh_coefficients};
 use gs_io::{Error, IoContext, Result};
 use std::io::Write;
 use std::path::Path;
@@ -56,6 +56,7 @@ pub(crate) fn read(vertices: &Table<'_>, chunks: Option<&Table<'_>>, sh: Option<
         opacity_logits: Vec::with_capacity(n),
         sh: Vec::with_capacity(n * 3 * sh_coefficients(sh_degree)),
         sh_degree,
+        shift: [0.0; 3],
     };
     let mut rest_rows = rest.as_ref().map(|r| r.table.rows());
     for (i, row) in vertices.rows().enumerate() {
@@ -152,8 +153,7 @@ pub(super) fn write(w: &mut dyn Write, place: &Path, g: &Gaussians, comments: &[
     let order = packing::along_a_curve(g, &all);
     let packed = packing::pack(g, &order);
     let rest = 3 * (sh_coefficients(g.sh_degree) - 1);
-    let mut header = String::from("ply\nformat binary_little_endian 1.0\n");
-    header.extend(comments.iter().map(|c| format!("comment {}\n", c.replace(['\n', '\r'], " "))));
+    let mut header = ply::header_start(comments, g.shift);
     header += &format!("element chunk {}\n", packed.chunks.len());
     for (group, names) in [("", ["x", "y", "z"]), ("scale_", ["x", "y", "z"]), ("", ["r", "g", "b"])] {
         for most in ["min", "max"] {

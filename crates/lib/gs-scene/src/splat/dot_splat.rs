@@ -31,6 +31,7 @@ pub(super) fn read(path: &Path) -> Result<Splat> {
         opacity_logits: Vec::with_capacity(n),
         sh: Vec::with_capacity(3 * n),
         sh_degree: 0,
+        shift: [0.0; 3],
     };
     let mut data = Stream::new(BufReader::with_capacity(1 << 16, file));
     for i in 0..n {

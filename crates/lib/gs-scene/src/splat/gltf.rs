@@ -9,8 +9,10 @@ pub(super) mod writer;
 
 use super::Splat;
 use super::axes::Axes;
+use crate::middle::shift_of;
 use crate::{Gaussians, logit, sh_coefficients};
 use accessor::Buffers;
+use glam::DVec3;
 use gs_io::{Error, IoContext, Result};
 use serde_json::Value;
 use std::path::{Path, PathBuf};
@@ -93,9 +95,14 @@ pub(super) fn read(path: &Path) -> Result<Splat> {
     let buffers = Buffers::open(&description, binary, path)?;
     let mut all = Gaussians::default();
     let mut left_out = Vec::new();
-    for (map, mesh) in scene::placed_meshes(&description)? {
-        let axes = Axes::affine(scene::ours(map))
-            .map_err(|e| e.field(format!("the node of meshes[{mesh}], its global transform")))?;
+    let placed: Vec<_> =
+        scene::placed_meshes(&description)?.into_iter().map(|(map, m)| (scene::ours(map), m)).collect();
+    // Where nodes place meshes far away, in double precision.
+    let shift = shift_of(placed.iter().map(|(map, _)| map.w_axis.truncate().to_array()));
+    for (mut map, mesh) in placed {
+        map.w_axis -= DVec3::from(shift).extend(0.0);
+        let axes =
+            Axes::affine(map).map_err(|e| e.field(format!("the node of meshes[{mesh}], its global transform")))?;
         for (i, primitive) in description["meshes"][mesh]["primitives"].as_array().into_iter().flatten().enumerate() {
             if primitive["extensions"][EXTENSION].is_object() {
                 let at = |e: Error| e.field(format!("meshes[{mesh}].primitives[{i}]"));
@@ -118,6 +125,7 @@ pub(super) fn read(path: &Path) -> Result<Splat> {
             }
         }
     }
+    all.shift = shift;
     if all.is_empty() {
         return Err(Error::new("no primitive with Gaussians")
             .field("meshes")
@@ -175,7 +183,7 @@ fn gaussians(primitive: &Value, description: &Value, buffers: &Buffers) -> Resul
         fits(&name, values.len())?;
         sh.chunks_exact_mut(3 * k).zip(values).for_each(|(row, rgb)| row[3 * i..3 * i + 3].copy_from_slice(&rgb));
     }
-    Ok(Gaussians { means, log_scales, rotations, opacity_logits, sh, sh_degree })
+    Ok(Gaussians { means, log_scales, rotations, opacity_logits, sh, sh_degree, shift: [0.0; 3] })
 }
 
 /// Adds Gaussians behind others; the lower degree of harmonics is filled with zeros.

@@ -64,7 +64,11 @@ fn plain(w: u32, h: u32) -> Image {
 }
 
 fn points() -> PointCloud {
-    PointCloud { positions: vec![[0.5, -0.25, 1.0], [1.0, 2.0, 3.0]], colors: vec![[1, 2, 3], [250, 251, 252]] }
+    PointCloud {
+        positions: vec![[0.5, -0.25, 1.0], [1.0, 2.0, 3.0]],
+        colors: vec![[1, 2, 3], [250, 251, 252]],
+        ..PointCloud::default()
+    }
 }
 
 /// Names of the files that a dataset consists of, below its folder.

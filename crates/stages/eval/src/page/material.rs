@@ -44,7 +44,7 @@ pub(super) struct Shown<'a> {
 
 impl<'a> Material<'a> {
     pub(super) fn read(
-        dataset: &'a Dataset,
+        dataset: &'a mut Dataset,
         options: &'a ReportOptions,
         held: &HoldOut,
         masks: Option<PathBuf>,
@@ -60,8 +60,11 @@ impl<'a> Material<'a> {
         } else {
             metrics.skipped.push("instances: the run has no instances.safetensors (cluster-match makes it)".into());
             let inputs = BTreeMap::from([(role::GEOMETRY.into(), hash_file(geometry)?)]);
-            (Geometry::read(geometry)?, None, inputs)
+            let read = Geometry::read(geometry)?;
+            dataset.follow(&read.gaussians, geometry)?;
+            (read, None, inputs)
         };
+        let dataset: &'a Dataset = dataset;
         metrics.skipped.extend(geometry.damage());
         let raster = RasterOptions::of(&geometry);
         let path = options.run_dir.join("score.json");

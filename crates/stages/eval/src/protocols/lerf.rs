@@ -138,13 +138,13 @@ struct AskedScene {
 fn ask(
     o: &LerfOptions,
     inputs: &Inputs,
-    dataset: Dataset,
+    mut dataset: Dataset,
     frames: &[FrameLabels],
     benchmark: Option<&LerfScene>,
     features: &mut BTreeMap<String, String>,
     stage: &Stage,
 ) -> Result<AskedScene> {
-    let scene = inputs.read(&dataset, stage)?;
+    let scene = inputs.read(&mut dataset, stage)?;
     let source = TextSource::open_for(&scene.artifact, scene.instances.dim(), &o.texts)?;
     features.extend(sources(&scene, Some(&source))?);
     let categories: BTreeSet<&String> = frames.iter().flat_map(|f| f.categories.keys()).collect();

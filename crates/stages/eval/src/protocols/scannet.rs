@@ -180,7 +180,7 @@ fn of_labels(
     let mut claim = outputs(&o.out, stage).reads([files.labels.as_path(), labels]).claim()?;
     let truth = [files.labels.as_path(), labels].into_iter().map(memory::bytes).sum();
     stage.forecast(memory::of_scan(&Sizes { truth, ..Sizes::default() }), SMALLER)?;
-    let (vertices, truth) = gs_scene::ply::read_labels(&files.labels, "label")?;
+    let (vertices, truth) = gs_scene::ply::read_labels(&files.labels, "label", [0.0; 3])?;
     let said = vertex_labels::read(labels, vertices.len())?;
     let mut notes = vec!["no instance score: these are labels of classes".into()];
     let sets = SETS.map(|size| label_figures(size, &truth, &said, &mut notes)).into();
@@ -237,7 +237,7 @@ fn of_instances(
         .claim()?;
     let truth = parts.map(|p| memory::bytes(p)).sum();
     stage.forecast(memory::of_scan(&Sizes { truth, ..Sizes::new(&inputs.geometry, &o.texts, &[]) }), SMALLER)?;
-    let scene = inputs.read(&load(folder, &LoadOptions::default(), stage)?, stage)?;
+    let scene = inputs.read(&mut load(folder, &LoadOptions::default(), stage)?, stage)?;
     let mut notes = Vec::new();
     let why = without_classes(&scene, o);
     let source = if why.is_none() {
@@ -247,7 +247,7 @@ fn of_instances(
     };
     notes.extend(why.map(|why| format!("no class scores: {why}")));
     let features = sources(&scene, source.as_ref())?;
-    let (vertices, labels) = gs_scene::ply::read_labels(&files.labels, "label")?;
+    let (vertices, labels) = gs_scene::ply::read_labels(&files.labels, "label", scene.gaussians().shift)?;
     let matched = matched(&scene, &vertices, o.association, &files.labels)?;
     if scene.all_noise() {
         notes.push("all Gaussians are noise: no vertex has an instance".into());

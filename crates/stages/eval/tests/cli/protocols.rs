@@ -419,7 +419,7 @@ fn rows_say_how_instances_were_made() {
 fn labels_of_another_program_are_scored_vertex_by_vertex() {
     let s = Scene::new();
     let ply = s.scene().join("scene0000_00_vh_clean_2.labels.ply");
-    let (_, truth) = gs_scene::ply::read_labels(&ply, "label").unwrap();
+    let (_, truth) = gs_scene::ply::read_labels(&ply, "label", [0.0; 3]).unwrap();
     let file = s.at("labels.npy");
     let run = |rest: &[&str]| {
         let mut c = Command::new(env!("CARGO_BIN_EXE_eval"));

@@ -4,7 +4,7 @@ use super::outputs::{CAMERAS, CURVE, EXPOSURES, PARTIAL, PLOT, check_finite, pla
 use crate::densification::{Strategy, drawable};
 use crate::memory::Forecast;
 use crate::metrics::Means;
-use crate::options::Train;
+use crate::options::{Train, note_shift};
 use crate::training::checkpoint::{self, ProgressState, State};
 use crate::training::poses::turned_from;
 use crate::training::{Timings, Trainer};
@@ -54,7 +54,7 @@ pub(super) fn finish(
         rows.len(),
         shares(trainer.timings)
     ));
-    let summary = json!({
+    let mut summary = json!({
         "gaussians": rows.len(),
         "psnr_heldout": psnr,
         "ssim_heldout": ssim,
@@ -67,6 +67,7 @@ pub(super) fn finish(
         "iteration_cpu_seconds": cpu_seconds,
         "plan": plan,
     });
+    note_shift(&mut summary, dataset.shift);
     stage.record(claim, parameters.clone(), inputs.clone(), summary)?;
     for leftover in [with_suffix(&options.out, PARTIAL), plan_path(&options.out), checkpoint::path_of(&options.out)] {
         // What cannot be removed does no harm.

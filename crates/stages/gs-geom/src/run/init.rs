@@ -95,9 +95,10 @@ pub(crate) fn gaussians(
 ) -> Result<Gaussians> {
     if let Some(path) = options.init.file() {
         if splat::holds_gaussians(path)? {
-            return from_gaussians(options, path, stage);
+            return from_gaussians(options, dataset, path, stage);
         }
-        let read = ply::read_points(path)?;
+        let mut read = ply::read_points(path)?;
+        read.shift_to(dataset.shift);
         stage.info(&format!("starting from the {} points of {}", read.len(), path.display()));
         return from_points(options, &read, extent, stage).map_err(|e| e.file(path));
     }
@@ -132,9 +133,10 @@ fn from_points(options: &Train, points: &PointCloud, extent: f64, stage: &Stage)
 }
 
 /// The Gaussians of a file, none of which may be damaged: no gradient repairs one, and `--densify fixed` keeps all.
-fn from_gaussians(options: &Train, path: &Path, stage: &Stage) -> Result<Gaussians> {
-    let g = splat::read_whole(path)?.gaussians;
+fn from_gaussians(options: &Train, dataset: &Dataset, path: &Path, stage: &Stage) -> Result<Gaussians> {
+    let mut g = splat::read_whole(path)?.gaussians;
     check_some(&g, path)?;
+    g.shift_to(dataset.shift);
     let g = g.with_degree(options.sh_degree);
     if let Some(most) = most(options, g.len()) {
         return Err(Error::new("more Gaussians than --max-gaussians")

@@ -43,6 +43,7 @@ impl Voxels {
         PointCloud {
             positions: self.sums.values().map(|s| (s.place / s.count as f64).as_vec3().to_array()).collect(),
             colors: self.sums.values().map(|s| s.color.map(|c| (c / s.count) as u8)).collect(),
+            ..PointCloud::default()
         }
     }
 

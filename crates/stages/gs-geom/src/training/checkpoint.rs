@@ -143,6 +143,7 @@ pub fn read(path: &Path, run: &Provenance) -> Result<Option<State>> {
             opacity_logits: a.tensor::<f32>(&format!("{prefix}opacity_logits"), &[Some(n)])?.to_vec(),
             sh: flat("sh", 3 * sh_coefficients(extra.sh_degree))?.to_vec(),
             sh_degree: extra.sh_degree,
+            ..Gaussians::default()
         })
     };
     let steps = a.tensor::<u32>("exposure_steps", &[None])?.to_vec();

@@ -36,6 +36,7 @@ pub fn zeros(count: usize, sh_degree: u8) -> Gaussians {
         opacity_logits: vec![0.0; count],
         sh: vec![0.0; count * 3 * sh_coefficients(sh_degree)],
         sh_degree,
+        ..Gaussians::default()
     }
 }
 

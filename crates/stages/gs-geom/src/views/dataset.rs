@@ -1,7 +1,7 @@
 //! The files of the dataset.
 
 use super::options::Size;
-use glam::{DMat4, DVec4};
+use glam::{DMat4, DVec3, DVec4};
 use gs_io::{Result, write_bytes, write_json};
 use gs_scene::{Camera, Gaussians, PointCloud, colmap};
 use report::picture::Picture;
@@ -27,9 +27,13 @@ pub fn write_cameras(folder: &Path, cameras: &[Camera], g: &Gaussians, counted: 
     let views: Vec<(String, Camera)> = cameras.iter().enumerate().map(|(i, c)| (name(i), c.clone())).collect();
     let kept = || counted.iter().step_by(counted.len().div_ceil(POINTS).max(1)).map(|&i| i as usize);
     let color = |i: usize| g.base_color(i).map(|v| (v.clamp(0.0, 1.0) * 255.0).round() as u8);
-    let points = PointCloud { positions: kept().map(|i| g.means[i]).collect(), colors: kept().map(color).collect() };
+    let points = PointCloud {
+        positions: kept().map(|i| g.means[i]).collect(),
+        colors: kept().map(color).collect(),
+        shift: g.shift,
+    };
     colmap::write_model(&folder.join("sparse/0"), &views, &points)?;
-    let frames: Vec<Value> = views.iter().map(|(name, camera)| frame(name, camera)).collect();
+    let frames: Vec<Value> = views.iter().map(|(name, camera)| frame(name, camera, g.shift.into())).collect();
     let c = &cameras[0];
     let transforms = json!({
         "camera_model": "PINHOLE", "w": c.width, "h": c.height, "fl_x": c.fx, "fl_y": c.fy, "cx": c.cx, "cy": c.cy,
@@ -38,11 +42,11 @@ pub fn write_cameras(folder: &Path, cameras: &[Camera], g: &Gaussians, counted: 
     write_json(folder.join("transforms.json"), &transforms)
 }
 
-/// A frame of transforms.json: the pose from camera to world, in OpenGL's axes (x right, y up, looking along -z).
-fn frame(name: &str, camera: &Camera) -> Value {
+/// A frame of transforms.json, of a camera in the world less `shift`: the pose from camera to world, in OpenGL's axes (x right, y up, looking along -z).
+fn frame(name: &str, camera: &Camera, shift: DVec3) -> Value {
     let pose = DMat4::from_mat3(camera.rotation.transpose());
     let flip = DMat4::from_diagonal(DVec4::new(1.0, -1.0, -1.0, 1.0));
-    let pose = (DMat4::from_translation(camera.position()) * pose * flip).transpose().to_cols_array_2d();
+    let pose = (DMat4::from_translation(camera.position() + shift) * pose * flip).transpose().to_cols_array_2d();
     json!({"file_path": format!("images/{name}"), "transform_matrix": pose})
 }
 

@@ -13,6 +13,7 @@ pub fn cloud(places: &[DVec3], scale: f64, opacity: f32) -> Gaussians {
         opacity_logits: vec![gs_scene::logit(opacity); n],
         sh: (0..3 * n).map(|i| (i as f32 * 1.7).sin()).collect(),
         sh_degree: 0,
+        ..Gaussians::default()
     }
 }
 

@@ -19,13 +19,14 @@ pub fn balls(n: usize) -> Gaussians {
         opacity_logits: vec![3.0; n],
         sh: (0..3 * n).map(|i| (i as f32 * 1.7).sin()).collect(),
         sh_degree: 0,
+        ..Gaussians::default()
     }
 }
 
 /// The centres of 60 balls, as structure from motion would give them.
 pub fn points() -> PointCloud {
     let color = |i: usize| balls(60).base_color(i).map(|v| (v.clamp(0.0, 1.0) * 255.0) as u8);
-    PointCloud { positions: balls(60).means, colors: (0..60).map(color).collect() }
+    PointCloud { positions: balls(60).means, colors: (0..60).map(color).collect(), ..PointCloud::default() }
 }
 
 /// Cameras around the origin.

@@ -1,9 +1,9 @@
 //! COLMAP's binary model files, in and out. Little-endian, without padding.
 
-use super::{AGAIN, Registered, intrinsics, pose, push_camera, push_point};
+use super::{AGAIN, Points, Registered, intrinsics, pose, push_camera, push_point};
 use crate::lens::Lens;
 use crate::{Camera, PointCloud};
-use glam::DQuat;
+use glam::{DQuat, DVec3};
 use gs_io::{Error, Result, write_bytes};
 use std::collections::BTreeMap;
 use std::path::Path;
@@ -139,10 +139,10 @@ pub(super) fn images(bytes: &[u8]) -> Result<Vec<Registered>> {
 }
 
 /// `points3D.bin`; errors and tracks are skipped.
-pub(super) fn points(bytes: &[u8]) -> Result<PointCloud> {
+pub(super) fn points(bytes: &[u8]) -> Result<Points> {
     let mut c = Cursor::new(bytes);
     let n = c.count(51, "point count")?;
-    let mut out = PointCloud::default();
+    let mut out = Points::default();
     for i in 0..n {
         let field = format!("point {i}");
         c.u64(&field)?;
@@ -158,7 +158,7 @@ pub(super) fn points(bytes: &[u8]) -> Result<PointCloud> {
 }
 
 /// Writes a binary model with one PINHOLE camera per view: `cameras.bin`, `images.bin`, `points3D.bin`. Equal
-/// intrinsics share a camera.
+/// intrinsics share a camera. Cameras are those of the points less their shift, which the model's numbers have again.
 pub fn write_model(folder: &Path, views: &[(String, Camera)], points: &PointCloud) -> Result<()> {
     let mut cameras: Vec<&Camera> = Vec::new();
     let same = |a: &Camera, b: &Camera| {
@@ -187,7 +187,8 @@ pub fn write_model(folder: &Path, views: &[(String, Camera)], points: &PointClou
     for (i, ((name, c), camera)) in views.iter().zip(&of_view).enumerate() {
         b.extend((i as u32 + 1).to_le_bytes());
         let q = DQuat::from_mat3(&c.rotation);
-        b.extend([q.w, q.x, q.y, q.z].iter().chain(&c.translation.to_array()).flat_map(|v| v.to_le_bytes()));
+        let translation = c.translation - c.rotation * DVec3::from(points.shift);
+        b.extend([q.w, q.x, q.y, q.z].iter().chain(&translation.to_array()).flat_map(|v| v.to_le_bytes()));
         b.extend(camera.to_le_bytes());
         b.extend(name.as_bytes());
         b.push(0);
@@ -198,7 +199,7 @@ pub fn write_model(folder: &Path, views: &[(String, Camera)], points: &PointClou
     b.extend((points.len() as u64).to_le_bytes());
     for (i, (p, c)) in points.positions.iter().zip(&points.colors).enumerate() {
         b.extend((i as u64 + 1).to_le_bytes());
-        b.extend(p.iter().flat_map(|&v| f64::from(v).to_le_bytes()));
+        b.extend((0..3).flat_map(|k| (f64::from(p[k]) + points.shift[k]).to_le_bytes()));
         b.extend(c);
         b.extend(0f64.to_le_bytes());
         b.extend(0u64.to_le_bytes());

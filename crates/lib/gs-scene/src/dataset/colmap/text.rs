@@ -1,8 +1,7 @@
 //! COLMAP's text model files.
 
 use super::super::MARK;
-use super::{AGAIN, Registered, intrinsics, pose, push_camera, push_point};
-use crate::PointCloud;
+use super::{AGAIN, Points, Registered, intrinsics, pose, push_camera, push_point};
 use crate::lens::Lens;
 use gs_io::{Error, Result};
 use std::collections::BTreeMap;
@@ -88,8 +87,8 @@ fn head<const N: usize>(line: &str) -> Option<([&str; N], &str)> {
 }
 
 /// `points3D.txt`; errors and tracks are skipped.
-pub(super) fn points(bytes: &[u8]) -> Result<PointCloud> {
-    let mut out = PointCloud::default();
+pub(super) fn points(bytes: &[u8]) -> Result<Points> {
+    let mut out = Points::default();
     for (line, text) in lines(bytes, false)? {
         let words: Vec<&str> = text.split_ascii_whitespace().take(7).collect();
         if words.len() < 7 {

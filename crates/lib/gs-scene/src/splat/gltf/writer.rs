@@ -120,6 +120,11 @@ fn description(attributes: &[Attribute<'_>], g: &Gaussians, axes: &Axes, binary:
     };
     accessors[0]["min"] = json!(bound(f32::INFINITY, f32::min));
     accessors[0]["max"] = json!(bound(f32::NEG_INFINITY, f32::max));
+    let mut node = json!({"mesh": 0});
+    if g.shift != [0.0; 3] {
+        let flipped: Vec<f64> = g.shift.iter().zip(FLIPS).map(|(v, sign)| sign * v).collect();
+        node["translation"] = json!(flipped);
+    }
     let extension = json!({
         "kernel": "ellipse",
         "colorSpace": "srgb_rec709_display",
@@ -131,7 +136,7 @@ fn description(attributes: &[Attribute<'_>], g: &Gaussians, axes: &Axes, binary:
         "extensionsUsed": [EXTENSION],
         "scene": 0,
         "scenes": [{"nodes": [0]}],
-        "nodes": [{"mesh": 0}],
+        "nodes": [node],
         "meshes": [{"primitives": [{"attributes": names, "mode": 0, "extensions": {EXTENSION: extension}}]}],
         "accessors": accessors,
         "bufferViews": views,
