@@ -1,5 +1,6 @@
 # `make scene SCENE=folder OUT=folder`: anyone's posed photographs. The defaults stand in pipelines/custom.conf.
 #:  GEOMETRY=file.spz   use these trained Gaussians instead of training; without SCENE, renders of them instead of photographs
+#:  AXES=RDF            where the axes x, y, z of GEOMETRY point [told by the photographs; without SCENE, as its format says]
 #:  MASKS=folder        use these id maps (*_s.npy) instead of running SAM
 #:  CLIP=folder         image.onnx and text.onnx of a CLIP model [models/clip, if there]; without it no text queries
 #:  VOCABULARY=file     names that things may have, one a line [about 1,200 everyday ones]
@@ -31,7 +32,7 @@ endif
 endif
 CLIP ?= $(patsubst %/,%,$(dir $(wildcard models/clip/text.onnx)))
 
-SETTINGS := QUALITY SCENE GEOMETRY MASKS CLIP SAM VOCABULARY QUERIES RESOLUTION ITERATIONS SEED \
+SETTINGS := QUALITY SCENE GEOMETRY AXES MASKS CLIP SAM VOCABULARY QUERIES RESOLUTION ITERATIONS SEED \
   GEOM_ARGS VIEW_ARGS MASK_ARGS EMBED_ARGS GRAPH_ARGS FEAT_ARGS CLUSTER_ARGS SCORE_ARGS REPORT_ARGS
 include pipelines/settings.mk
 
@@ -40,6 +41,14 @@ override MASKS := $(OUT)/masks
 MASKS_DONE := $(MASKS)/masks.json
 else
 MASKS_DONE = $(OPTIONS)/masks.files
+endif
+
+# Gaussians of others may have other axes than their format says: the photographs tell, or AXES. Those of a run of ours, in its OUT, are right.
+ifneq ($(and $(GEOMETRY),$(SCENE)$(AXES)),)
+ifeq ($(wildcard $(dir $(GEOMETRY)).options/geom),)
+SPLAT := $(GEOMETRY)
+override GEOMETRY := $(OUT)/given.ply
+endif
 endif
 
 geom_FROM := RESOLUTION, ITERATIONS or GEOM_ARGS

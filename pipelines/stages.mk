@@ -6,6 +6,7 @@
 #   PHOTOGRAPHS the data set's folder, where it is not SCENE itself
 #   SCENE_FILES what the dataset consists of, where that is not what gs-geom finds in it
 #   LANGUAGE    the masks' features, where they are there already
+#   SPLAT       Gaussians of others, of which GEOMETRY is made with the right AXES
 #   VIEWS_MADE  the file that says that SCENE is whole, where it is made of the Gaussians
 #   METRICS     the Gaussians' PSNR and SSIM for the report, or empty
 #   VOCABULARY  a file of the names that instances may have, or empty: the everyday ones of eval names
@@ -45,12 +46,14 @@ SCENE_FILES ?= $(OPTIONS)/scene.files
 ifeq ($(GEOMETRY),)
 override GEOMETRY := $(OUT)/geometry.ply
 GEOMETRY_DONE := $(GEOMETRY)
+else ifneq ($(SPLAT),)
+GEOMETRY_DONE := $(GEOMETRY)
 else
 GEOMETRY_DONE := $(OPTIONS)/geometry.files
 endif
 # The id maps, where SAM makes them.
 SAM_MAKES := $(filter $(OUT)/masks/masks.json,$(MASKS_DONE))
-export SAM_MAKES SCENE PHOTOGRAPHS OUT MASKS GEOMETRY CLIP SAM TEXTS VOCABULARY QUERIES SEED THREADS
+export SAM_MAKES SCENE PHOTOGRAPHS OUT MASKS GEOMETRY SPLAT CLIP SAM TEXTS VOCABULARY QUERIES SEED THREADS
 export GEOM_ARGS VIEW_ARGS MASK_ARGS EMBED_ARGS GRAPH_ARGS FEAT_ARGS CLUSTER_ARGS SCORE_ARGS REPORT_ARGS EVAL_ARGS SYNTH_ARGS
 
 .DEFAULT_GOAL := all
@@ -74,6 +77,7 @@ $(OPTIONS)/%.files: FORCE | checked-options
 list = find -L $1 -maxdepth 1 -type f -name $2 -printf '%s %T@ %p\n' | LC_ALL=C sort
 scene_FILES = $(BIN)/gs-geom inspect $(call arg,PHOTOGRAPHS)
 geometry_FILES = $(call list,$(call arg,GEOMETRY),'*')
+splat_FILES = $(call list,$(call arg,SPLAT),'*')
 masks_FILES = $(call list,$(MASKS)/,'*_s.npy')
 # Not the text features that programs keep there.
 clip_FILES = $(call list,$(call arg,CLIP)/,'*' ! -name 'cags-texts-*')
@@ -87,6 +91,7 @@ unless = $(if $(filter $(firstword $2),$($1)),,$2)
 # as an option; 0 is every stage's own. A quality is about our own features, not about those of a preset.
 SEED_ARGS := $(addprefix --seed ,$(filter-out 0,$(SEED)))
 geom_OPTIONS := $(GEOM_QUALITY) $(GEOM_FIRST) $(GEOM_ARGS) $(SEED_ARGS)
+splat_OPTIONS := $(AXES)
 views_OPTIONS := $(VIEW_ARGS) $(SEED_ARGS)
 graph_OPTIONS := $(GRAPH_FIRST) $(GRAPH_ARGS) $(SEED_ARGS)
 feat_OPTIONS := $(if $(findstring --preset,$(FEAT_ARGS)),,$(FEAT_QUALITY)) $(FEAT_ARGS) $(SEED_ARGS)
@@ -107,6 +112,7 @@ export POSED
 # What each stage runs. `arg` writes a path out, so that commands can be copied, or as "$NAME" where a shell would take it apart.
 arg = $(if $(call odd,$($1)),"$$$1",$($1))
 geom_RUN = $(BIN)/gs-geom train --scene $(call arg,PHOTOGRAPHS) --out $(OUT)/geometry.ply $(geom_OPTIONS) $(COMMON)
+splat_RUN = $(BIN)/gs-geom convert $(call arg,SPLAT) $(GEOMETRY) $(if $(AXES),--axes $(AXES),--scene $(call arg,PHOTOGRAPHS)) $(COMMON)
 views_RUN = $(BIN)/gs-geom views --geometry $(call arg,GEOMETRY) --out $(SCENE) $(views_OPTIONS) $(COMMON)
 metrics_RUN = $(BIN)/gs-geom eval --scene $(call arg,POSED) --geometry $(call arg,GEOMETRY) --out $(OUT)/geom_metrics.json \
   $(EVAL_ARGS) $(COMMON)
@@ -135,6 +141,7 @@ geom_FROM ?= GEOM_ARGS
 .PHONY: checked-options
 checked-options: checked | $(PROGRAMS)
 	@scripts/check_options.sh "$(geom_FROM)" $(geom_RUN)
+	@$(if $(SPLAT),scripts/check_options.sh AXES $(splat_RUN))
 	@$(if $(VIEWS_MADE),scripts/check_options.sh VIEW_ARGS $(views_RUN))
 	@scripts/check_options.sh EVAL_ARGS $(metrics_RUN)
 	@$(if $(SAM_MAKES),scripts/check_options.sh MASK_ARGS $(masks_RUN))
@@ -157,6 +164,12 @@ $(OPTIONS)/geometry.forecast: $(SCENE_FILES) scripts/geometry_forecast.sh | $(BI
 # Stage 1. Not run when GEOMETRY names a PLY that exists already.
 $(OUT)/geometry.ply: $(SCENE_FILES) $(OPTIONS)/geom | $(BIN)/gs-geom
 	$(geom_RUN)
+
+# The Gaussians of others, with the axes of the photographs.
+ifneq ($(SPLAT),)
+$(GEOMETRY): $(if $(AXES),,$(SCENE_FILES)) $(OPTIONS)/splat.files $(OPTIONS)/splat | $(BIN)/gs-geom
+	$(splat_RUN)
+endif
 
 $(OUT)/geom_metrics.json: $(SCENE_FILES) $(GEOMETRY_DONE) $(OPTIONS)/geom | $(BIN)/gs-geom
 	$(metrics_RUN)

@@ -30,7 +30,8 @@ const FILES: [(&str, &str); 12] = carried![
 /// Settings that name a folder or file.
 const PATHS: [&str; 6] = ["GEOMETRY", "MASKS", "CLIP", "SAM", "VOCABULARY", "CONF"];
 /// All others.
-const OTHERS: [&str; 13] = [
+const OTHERS: [&str; 14] = [
+    "AXES",
     "QUALITY",
     "QUERIES",
     "RESOLUTION",

@@ -20,6 +20,7 @@ use std::fs::File;
 use std::io::{Read, Write};
 use std::path::{Component, Path, PathBuf};
 
+pub use axes::{System, turn};
 pub use reach::lost;
 
 /// A format of files of Gaussians.
@@ -46,6 +47,8 @@ pub struct Splat {
     pub gaussians: Gaussians,
     /// Whether they were learnt with the 2D filter of Mip-Splatting, where the format says so.
     pub antialias: bool,
+    /// The axes that the file's numbers were taken to have: what the format, or the file, says. [`turn`] makes others of them.
+    pub axes: System,
     /// The format for people, such as `SPZ version 4`.
     pub kind: String,
     /// What the file has that was left out or taken as something else.

@@ -1,25 +1,59 @@
 //! `gs-geom convert`: choosing, ordering and trimming Gaussians, and writing them in another format.
 
+use crate::axes;
 use crate::bounds::Bounds;
-use crate::memory;
+use crate::memory::{self, Pictures};
 use crate::options::{Convert, Order, bytes, note_shift};
 use artifacts::role;
-use gs_io::{Error, Result};
+use gs_io::{Error, IoContext, Result, write_bytes};
+use gs_scene::dataset::{self, LoadOptions};
 use gs_scene::splat::{self, Extra, Format, Splat};
 use gs_scene::{Gaussians, Learnt, morton_order};
 use serde_json::json;
 use stage::Stage;
 use std::collections::BTreeMap;
+use std::path::Path;
 
 impl Convert {
     pub(crate) fn run(&self, stage: &Stage) -> Result<()> {
         Format::to_write(&self.output)?;
-        let outputs = stage.outputs(&self.output).file(&self.output).reads(splat::files(&self.input)?);
+        let load = LoadOptions { resolution: axes::RESOLUTION, holdout: 0 };
+        let dataset = self.scene.as_ref().map(|scene| dataset::load(scene, &load)).transpose()?;
+        let files = dataset.iter().flat_map(|d| d.files.clone());
+        let outputs = stage.outputs(&self.output).file(&self.output).reads(splat::files(&self.input)?).reads(files);
         let mut claim = outputs.claim()?;
-        stage.forecast(memory::of_file(bytes(&self.input)?), "give a smaller file")?;
-        let Splat { gaussians: mut g, antialias, kind, left_out } = splat::read(&self.input)?;
+        let needed = match &dataset {
+            Some(dataset) => memory::of_axes(bytes(&self.input)?, &Pictures::of(dataset)?),
+            None => memory::of_file(bytes(&self.input)?),
+        };
+        stage.forecast(needed, "give a smaller file")?;
+        let splat = splat::read(&self.input)?;
+        let mut inputs = BTreeMap::from([(role::GEOMETRY.to_string(), splat::hash(&self.input)?)]);
+        let to = match dataset {
+            Some(dataset) => {
+                inputs.insert(role::DATASET.into(), dataset.hash()?);
+                axes::told(&splat, dataset, &self.input, stage)?
+            }
+            None => self.axes.unwrap_or(splat.axes),
+        };
+        let Splat { gaussians: mut g, antialias, axes, kind, left_out } = splat;
+        splat::turn(&mut g, axes, to);
         left_out.iter().for_each(|what| stage.skipped(&format!("not read: {what}")));
         let all = g.len();
+        let parameters = json!(self);
+        let plain = |path: &Path| Ok::<bool, Error>(Format::of_file(path)? == Format::Ply);
+        if self.scene.is_some()
+            && to == axes
+            && self.keeps_all()
+            && plain(&self.input)?
+            && Format::to_write(&self.output)? == Format::Ply
+        {
+            write_bytes(&self.output, &std::fs::read(&self.input).at("read", &self.input)?)?;
+            stage.info(&format!("{} is a copy of {}", self.output.display(), self.input.display()));
+            let mut summary = json!({ "gaussians": all, "of": all, "from": kind, "axes": to.to_string() });
+            note_shift(&mut summary, g.shift);
+            return stage.record(&mut claim, parameters, inputs, summary);
+        }
         let mut chosen = choose(&g, self.min_opacity, self.crop);
         let dropped = [
             (chosen.damaged, "damaged: not finite, or a rotation of length 0"),
@@ -43,8 +77,6 @@ impl Convert {
         g.bound_opacities();
         let degree = self.sh_degree.unwrap_or(g.sh_degree);
         g = g.with_degree(degree);
-        let parameters = json!(self);
-        let inputs = BTreeMap::from([(role::GEOMETRY.to_string(), splat::hash(&self.input)?)]);
         let mut comments = vec![format!("made by gs-geom {} convert", env!("CARGO_PKG_VERSION"))];
         comments.extend(inputs.iter().map(|(role, hash)| format!("{role} {hash}")));
         comments.push(format!("parameters {parameters}"));
@@ -56,6 +88,7 @@ impl Convert {
             "gaussians": g.len(),
             "of": all,
             "from": kind,
+            "axes": to.to_string(),
             "damaged": chosen.damaged,
             "cropped": chosen.cropped,
             "faint": chosen.faint,

@@ -29,7 +29,7 @@ impl Inspect {
 
     fn describe(&self, json: bool, stage: &Stage) -> Result<String> {
         stage.needs(memory::of_file(bytes(&self.file)?), "give a smaller file")?;
-        let Splat { gaussians, antialias, kind, left_out } = splat::read(&self.file)?;
+        let Splat { gaussians, antialias, axes, kind, left_out } = splat::read(&self.file)?;
         let report = inspect(&gaussians);
         let mut object = json!(report);
         let mut file_bytes = 0;
@@ -38,6 +38,7 @@ impl Inspect {
         }
         object["file_bytes"] = file_bytes.into();
         object["format"] = kind.into();
+        object["axes"] = axes.to_string().into();
         object["antialias"] = antialias.into();
         note_shift(&mut object, gaussians.shift);
         object["not_read"] = left_out.into();

@@ -9,6 +9,7 @@
 //! * `views`: a dataset of renders from Gaussians alone
 //! * `budget`: a plan for a given time; `memory`: forecasts; `metrics`: PSNR and SSIM
 
+mod axes;
 mod bounds;
 mod budget;
 mod convert;

@@ -119,6 +119,11 @@ pub fn of_bands(gaussians: usize, from: u8, to: u8) -> u64 {
     PROGRAM + 4 * gaussians as u64 * (numbers(from) + numbers(to))
 }
 
+/// Peak in bytes of `convert` where photographs tell the axes: a copy that is turned.
+pub fn of_axes(geometry: u64, pictures: &Pictures) -> u64 {
+    of_figures(geometry, pictures) + geometry
+}
+
 /// Peak in bytes of `render`.
 pub fn of_renders(geometry: u64, pictures: &Pictures, exr: bool) -> u64 {
     let bytes = if exr { 74 } else { 28 };

@@ -9,6 +9,7 @@ use clap::{Parser, Subcommand, ValueEnum};
 use gs_io::{Error, Result};
 use gs_raster::RasterOptions;
 use gs_scene::dataset::{self, Dataset, HOLDOUT, LoadOptions, Resolution};
+use gs_scene::splat::System;
 use gs_scene::{Gaussians, Geometry, HoldOut, say_shift};
 use serde::{Serialize, Serializer};
 use serde_json::Value;
@@ -227,6 +228,16 @@ pub(crate) struct Convert {
     #[arg(value_name = "OUT")]
     #[serde(skip)]
     pub output: PathBuf,
+    /// Where the axes x, y, z of IN point, whatever its format says: R or L, U or D, F or B, such as RUB. An SPZ whose packer kept the numbers
+    /// of a PLY as they lie has RDF [as the format says: SPZ RUB, glTF LUF, all others RDF]
+    #[arg(long, value_name = "AXES", conflicts_with = "scene")]
+    #[serde(serialize_with = "some_as_text", skip_serializing_if = "Option::is_none")]
+    pub axes: Option<System>,
+    /// Photographs with poses that IN shows, which tell its axes: those are taken in which renders come nearer to a few of them. IN is refused
+    /// where a picture of one colour comes as near. A PLY that fits as it is, with none of the options below, is copied byte for byte
+    #[arg(long, value_name = "DIR")]
+    #[serde(skip)]
+    pub scene: Option<PathBuf>,
     /// Degree of the spherical harmonics, 0 to 3: higher bands are dropped, missing ones zero [as in IN]
     #[arg(long, value_name = "DEGREE", value_parser = clap::value_parser!(u8).range(0..=3))]
     pub sh_degree: Option<u8>,
@@ -335,6 +346,17 @@ fn seconds(text: &str) -> Result<f64> {
 
 fn as_text<S: Serializer>(value: &impl Display, serializer: S) -> std::result::Result<S::Ok, S::Error> {
     serializer.collect_str(value)
+}
+
+fn some_as_text<S: Serializer>(value: &Option<impl Display>, serializer: S) -> std::result::Result<S::Ok, S::Error> {
+    serializer.collect_str(&value.as_ref().map_or(String::new(), ToString::to_string))
+}
+
+impl Convert {
+    /// Whether no option does anything to the Gaussians.
+    pub fn keeps_all(&self) -> bool {
+        self.sh_degree.is_none() && self.min_opacity == 0.0 && self.crop.is_none() && self.order == Order::None
+    }
 }
 
 impl SceneOptions {

@@ -2,7 +2,9 @@
 
 mod common;
 
+use common::world::balls;
 use common::{Folder, refused, run};
+use gs_scene::splat::{self, Extra, System};
 use gs_scene::{Gaussians, Image, ply};
 use serde_json::{Value, json};
 use std::fs;
@@ -268,4 +270,57 @@ fn real_files_are_inspected_and_converted() {
         let sum = |g: &Gaussians| g.opacity_logits.iter().map(|&v| f64::from(v)).sum::<f64>();
         assert!(a.len() == b.len() && b.sh_degree == 3 && (sum(&a) - sum(&b)).abs() < 1e-6 * sum(&a).abs());
     }
+}
+
+/// Turns the axes y and z of Gaussians round, as a packer does that takes a PLY for what its format says.
+fn half_turned(g: &Gaussians) -> Gaussians {
+    let mut turned = g.clone();
+    splat::turn(&mut turned, System::PLY, System::SPZ);
+    turned
+}
+
+#[test]
+fn photographs_tell_the_axes_of_a_file() {
+    let dir = Folder::new();
+    let truth = balls(60);
+    let scene = common::world::scene();
+    // An SPZ of Niantic's library, and one of its packer, which keeps numbers as they lie; a PLY that was made of the one by what keeps numbers.
+    for (name, g, axes) in [
+        ("turned.spz", truth.clone(), "RUB, as its format says"),
+        ("kept.spz", half_turned(&truth), "RDF, not as its format says"),
+        ("turned.ply", half_turned(&truth), "RUB, not as its format says"),
+    ] {
+        let (file, out) = (dir.path(name), dir.path(&format!("{name}.out.ply")));
+        splat::write(&file, &g, &Extra::default()).unwrap();
+        let said = common::succeeds(&["convert", &file, &out, "--scene", scene]);
+        assert!(said.contains(&format!("{name}: axes {axes}: ")), "{said}");
+        let read = ply::read_gaussians(&out).unwrap();
+        let off = read.means.iter().zip(&truth.means).flat_map(|(a, b)| (0..3).map(|c| (a[c] - b[c]).abs()));
+        assert!(off.fold(0.0, f32::max) < 1e-4, "{name}");
+        // Whoever knows says so.
+        let told = dir.path(&format!("{name}.told.ply"));
+        succeeds(&["convert", &file, &told, "--axes", &axes[..3]]);
+        assert_eq!(ply::read_gaussians(&told).unwrap(), read, "{name}");
+    }
+    // A PLY that fits is copied, with all that we know nothing of; damaged Gaussians stay what they are.
+    let mut damaged = truth.clone();
+    damaged.rotations[7] = [0.0; 4];
+    let (file, out) = (dir.path("fits.ply"), dir.path("copy.ply"));
+    ply::write_gaussians(&file, &damaged, &["theirs".into()]).unwrap();
+    succeeds(&["convert", &file, &out, "--scene", scene]);
+    assert_eq!(fs::read(&file).unwrap(), fs::read(&out).unwrap());
+
+    // Gaussians of something else are refused, with what was found.
+    let mut other = truth;
+    other.means.iter_mut().for_each(|m| *m = [m[0] * 0.2, 1.5 + m[1] * 0.1, 1.4]);
+    ply::write_gaussians(&file, &other, &[]).unwrap();
+    let said = refused(&["convert", &file, &dir.path("no.ply"), "--scene", scene]);
+    for part in
+        ["fits.ply: the Gaussians do not show these photographs; found ", " dB with axes RDF, ", "one colour has "]
+    {
+        assert!(said.contains(part), "{part}: {said}");
+    }
+    assert!(!dir.names().contains(&"no.ply".to_string()));
+    succeeds(&["convert", &file, &dir.path("yes.ply"), "--axes", "rdf"]);
+    assert!(refused(&["convert", &file, &dir.path("no.ply"), "--axes", "XYZ"]).contains("no axes"));
 }

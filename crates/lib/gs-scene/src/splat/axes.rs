@@ -6,6 +6,91 @@ use glam::{DMat3, DMat4, DQuat, DVec3};
 use gs_io::{Error, Result};
 use rayon::prelude::*;
 
+/// Where the axes x, y, z of a file point: left or right, up or down, front or back, in three letters such as RDF.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct System([u8; 3]);
+
+/// All of them, in the order of the numbers of SPZ's extension, from 1.
+pub(super) const SYSTEMS: [System; 16] = [
+    System(*b"LDB"),
+    System(*b"RDB"),
+    System(*b"LUB"),
+    System(*b"RUB"),
+    System(*b"LDF"),
+    System(*b"RDF"),
+    System(*b"LUF"),
+    System(*b"RUF"),
+    System(*b"LFD"),
+    System(*b"RFD"),
+    System(*b"LFU"),
+    System(*b"RFU"),
+    System(*b"LBD"),
+    System(*b"RBD"),
+    System(*b"LBU"),
+    System(*b"RBU"),
+];
+
+impl System {
+    /// Of a PLY of 3DGS, and of Gaussians in memory.
+    pub const PLY: Self = Self(*b"RDF");
+    /// Of an SPZ that names none.
+    pub const SPZ: Self = Self(*b"RUB");
+    /// Of glTF.
+    pub(super) const GLTF: Self = Self(*b"LUF");
+
+    /// The columns are where the system's axes point: in right, down, front.
+    fn matrix(self) -> DMat3 {
+        let axis = |name: u8| match name {
+            b'L' => -DVec3::X,
+            b'R' => DVec3::X,
+            b'U' => -DVec3::Y,
+            b'D' => DVec3::Y,
+            b'B' => -DVec3::Z,
+            _ => DVec3::Z,
+        };
+        DMat3::from_cols(axis(self.0[0]), axis(self.0[1]), axis(self.0[2]))
+    }
+
+    /// From these axes to right, down, front.
+    pub(super) fn to_ours(self) -> Axes {
+        Axes::turned(self.matrix())
+    }
+}
+
+impl Default for System {
+    fn default() -> Self {
+        Self::PLY
+    }
+}
+
+impl std::fmt::Display for System {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        self.0.iter().try_for_each(|&letter| write!(f, "{}", char::from(letter)))
+    }
+}
+
+impl std::str::FromStr for System {
+    type Err = Error;
+
+    fn from_str(s: &str) -> Result<Self> {
+        let known = SYSTEMS.into_iter().find(|system| system.to_string() == s.to_ascii_uppercase());
+        known.ok_or_else(|| {
+            Error::new("no axes")
+                .found(s)
+                .expected("where x, y and z point: R or L, then U or D, F or B in either order, such as RDF")
+        })
+    }
+}
+
+/// Turns Gaussians that were read as those of a file with the axes `from` into those of the same file with the axes `to`.
+pub fn turn(g: &mut Gaussians, from: System, to: System) {
+    if from != to {
+        let turn = to.matrix() * from.matrix().transpose();
+        Axes::turned(turn).apply(g);
+        g.shift = (turn * DVec3::from(g.shift)).to_array();
+    }
+}
+
 /// A change of axes: points p become scale * turn * p + shift.
 #[derive(Debug, Clone, PartialEq)]
 pub(crate) struct Axes {
@@ -133,6 +218,27 @@ mod tests {
         }
         assert!(Axes::affine(DMat4::from_scale(DVec3::new(1.0, 2.0, 1.0))).is_err());
         assert!(Axes::affine(DMat4::ZERO).is_err());
+    }
+
+    #[test]
+    fn gaussians_are_turned_from_one_system_into_another_and_back() {
+        let g = Gaussians { shift: [5000.0, 7000.0, 1.0], ..crate::splat::testing::cloud(20, 3) };
+        let mut there = g.clone();
+        turn(&mut there, System::SPZ, System::PLY);
+        // The numbers of an SPZ as they lie: what was turned on the way is turned back.
+        assert_eq!(there.means[3], [g.means[3][0], -g.means[3][1], -g.means[3][2]]);
+        assert_eq!(there.shift, [5000.0, -7000.0, -1.0]);
+        turn(&mut there, System::PLY, System::SPZ);
+        assert_eq!(there, g);
+        for system in SYSTEMS {
+            assert_eq!(system.to_string().to_lowercase().parse::<System>().unwrap(), system);
+            turn(&mut there, System::PLY, system);
+            turn(&mut there, system, System::PLY);
+            assert!(there.means.iter().zip(&g.means).all(|(a, b)| (0..3).all(|c| (a[c] - b[c]).abs() < 1e-6)));
+        }
+        for wrong in ["", "RDX", "RRB", "DRF", "RDFB"] {
+            assert!(wrong.parse::<System>().is_err(), "{wrong}");
+        }
     }
 
     #[test]

@@ -8,7 +8,7 @@ mod scene;
 pub(super) mod writer;
 
 use super::Splat;
-use super::axes::Axes;
+use super::axes::{Axes, System};
 use crate::middle::shift_of;
 use crate::{Gaussians, logit, sh_coefficients};
 use accessor::Buffers;
@@ -131,7 +131,8 @@ pub(super) fn read(path: &Path) -> Result<Splat> {
             .field("meshes")
             .expected(format!("a primitive with the extension {EXTENSION} in the scene")));
     }
-    Ok(Splat { gaussians: all, antialias: false, kind: format!("glTF 2.0 with {EXTENSION}"), left_out })
+    let kind = format!("glTF 2.0 with {EXTENSION}");
+    Ok(Splat { gaussians: all, antialias: false, axes: System::GLTF, kind, left_out })
 }
 
 /// What of an extension's properties was not followed.

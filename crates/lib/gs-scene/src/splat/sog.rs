@@ -170,7 +170,8 @@ impl Reader {
             }
         }
         let antialias = self.meta["model"] == "antialiased" || self.meta["antialias"] == true;
-        Ok(Splat { gaussians: g, antialias, kind: format!("SOG version {version}, {where_}"), left_out: Vec::new() })
+        let kind = format!("SOG version {version}, {where_}");
+        Ok(Splat { gaussians: g, antialias, kind, ..Splat::default() })
     }
 
     fn wrong(&self, field: &str) -> Error {

@@ -7,12 +7,11 @@
 use super::Splat;
 pub(super) mod writer;
 
-use super::axes::Axes;
+use super::axes::{SYSTEMS, System};
 use super::compressed_ply::from_three;
 use super::stream::Stream;
 use crate::{Gaussians, logit, sh_coefficients};
 use flate2::bufread::GzDecoder;
-use glam::{DMat3, DVec3};
 use gs_io::{Error, IoContext, Result};
 use ruzstd::decoding::StreamingDecoder;
 use std::fs::File;
@@ -35,25 +34,6 @@ const COORDINATE_SYSTEM: u32 = 0xADBE_0003;
 const MOST_EXTENSIONS: u64 = 1 << 16;
 /// The least limit of a zstd window.
 const WINDOW: u64 = 8 << 20;
-
-/// Names of the axes x, y, z in the order of the extension's numbers, from 1: left or right, up or down, front or back.
-const SYSTEMS: [&[u8; 3]; 16] = [
-    b"LDB", b"RDB", b"LUB", b"RUB", b"LDF", b"RDF", b"LUF", b"RUF", b"LFD", b"RFD", b"LFU", b"RFU", b"LBD", b"RBD",
-    b"LBU", b"RBU",
-];
-
-/// From the axes of a system to right, down, front.
-fn from_system(system: &[u8; 3]) -> Axes {
-    let axis = |name: u8| match name {
-        b'L' => -DVec3::X,
-        b'R' => DVec3::X,
-        b'U' => -DVec3::Y,
-        b'D' => DVec3::Y,
-        b'B' => -DVec3::Z,
-        _ => DVec3::Z,
-    };
-    Axes::turned(DMat3::from_cols(axis(system[0]), axis(system[1]), axis(system[2])))
-}
 
 /// What a header says.
 struct Header {
@@ -306,10 +286,11 @@ impl Parts {
             left_out.push("spherical harmonics of degree 4".to_string());
         }
         let system = coordinate_system(extensions, &mut left_out)?;
-        from_system(system).apply(&mut self.g);
+        system.to_ours().apply(&mut self.g);
         Ok(Splat {
             gaussians: self.g,
             antialias: header.flags & ANTIALIASED != 0,
+            axes: system,
             kind: format!("SPZ version {}", header.version),
             left_out,
         })
@@ -317,8 +298,8 @@ impl Parts {
 }
 
 /// The axes that the extensions name: right, up, back if none does.
-fn coordinate_system(extensions: &[u8], left_out: &mut Vec<String>) -> Result<&'static [u8; 3]> {
-    let mut system = b"RUB";
+fn coordinate_system(extensions: &[u8], left_out: &mut Vec<String>) -> Result<System> {
+    let mut system = System::SPZ;
     let mut rest = extensions;
     while let Some((head, tail)) = rest.split_at_checked(8) {
         let word = |at: usize| u32::from_le_bytes([head[at], head[at + 1], head[at + 2], head[at + 3]]);

@@ -1,6 +1,6 @@
 //! Writing SPZ, version 3: the last in gzip, which all readers know.
 
-use super::super::axes::Axes;
+use super::super::axes::{Axes, System};
 use super::super::packing::smallest_three;
 use super::{ANTIALIASED, COLOR_FACTOR, MAGIC};
 use crate::Gaussians;
@@ -20,7 +20,7 @@ const STEPS: [i32; 2] = [8, 16];
 /// Writes an SPZ, which errors call `place`, in the order of `g`.
 pub(in crate::splat) fn write(w: &mut dyn Write, place: &Path, g: &Gaussians, antialias: bool) -> Result<()> {
     let mut out = GzEncoder::new(w, Compression::default());
-    let axes = super::from_system(b"RUB");
+    let axes = System::SPZ.to_ours();
     let bits = fractional_bits(g)?;
     let mut header = MAGIC.to_vec();
     header.extend(3u32.to_le_bytes());
