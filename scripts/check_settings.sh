@@ -4,8 +4,10 @@
 set -euo pipefail
 bad() { printf '%s\n' "$*" >&2; exit 2; }
 for name in ${GIVEN-}; do
-  case ${!name} in -*) bad "$name=${!name}: a dash in front looks like an option: write ./${!name}" ;; esac
-  [ -e "${!name}" ] || bad "$name=${!name}: no such file or folder"
+  given=${!name}
+  [ "$name" != GEOMETRY ] || given=${SPLAT:-$given} # GEOMETRY is made of it then
+  case $given in -*) bad "$name=$given: a dash in front looks like an option: write ./$given" ;; esac
+  [ -e "$given" ] || bad "$name=$given: no such file or folder"
 done
 [ ! "${SCENE-}" -ef "${OUT-}" ] || bad "OUT=$OUT: this is SCENE itself: give another folder, such as OUT=${OUT%/}/out"
 if [ -n "${SAM_MAKES-}" ] && [ ! -e "$SAM_MAKES" ] && [ ! -e "$SAM/encoder.onnx" ] && [ ! -e "$SAM/model.json" ]; then
@@ -17,6 +19,7 @@ done
 for name in SEED THREADS; do
   [[ ${!name-0} =~ ^[0-9]+$ ]] || bad "$name=${!name}: expected a number"
 done
+[[ ${AXES-} =~ ^[A-Za-z]*$ ]] || bad "AXES=$AXES: expected three letters such as RDF"
 case " ${QUERIES-} " in
   *\"* | *" '"* | *"' "*) bad "QUERIES=$QUERIES: texts have no quotes around them: write red_mug for \"red mug\"" ;;
 esac

@@ -150,6 +150,7 @@ any_name() {
     GRAPH_ARGS='--min-mask-pixels 10' FEAT_ARGS='--preset literal --iterations 30' QUERIES="floor ${payload// /_}_kid's_toy"
 }
 any_name > "$work/odd.log" 2>&1 || { cat "$work/odd.log"; fail "paths of any name"; }
+grep -q 'axes RDF, as its format says' "$work/odd.log" || { cat "$work/odd.log"; fail "the photographs do not tell the axes of GEOMETRY"; }
 [ -s "$work/odd/report.html" ] && [ "$(grep -c '"text"' "$work/odd/query/query.json")" -ge 2 ] || fail "no report of paths of any name"
 any_name > "$work/again.log" 2>&1
 [ -z "$(stages_of "$work/again.log")" ] || { cat "$work/again.log"; fail "a second make of paths of any name ran a stage"; }
