@@ -18,6 +18,7 @@ pub struct Arrays<'py> {
     rotations: PyReadonlyArray2<'py, f32>,
     opacity_logits: PyReadonlyArray1<'py, f32>,
     sh: PyReadonlyArray3<'py, f32>,
+    shift: [f64; 3],
 }
 
 impl Arrays<'_> {
@@ -36,7 +37,7 @@ impl Arrays<'_> {
             opacity_logits: self.opacity_logits.as_slice()?.to_vec(),
             sh: self.sh.as_slice()?.to_vec(),
             sh_degree: degree,
-            ..Gaussians::default()
+            shift: self.shift,
         })
     }
 }
@@ -73,12 +74,13 @@ pub fn to_camera((width, height, fx, fy, cx, cy, rows, translation): CameraIn) -
 
 /// Reads a file of any format of Gaussians.
 #[pyfunction]
-pub fn read_gaussians(py: Python<'_>, path: PathBuf) -> PyResult<(ArraysOut<'_>, bool)> {
+pub fn read_gaussians(py: Python<'_>, path: PathBuf) -> PyResult<(ArraysOut<'_>, bool, [f64; 3])> {
     let there = path.exists();
     let failed =
         |e: gs_io::Error| if there { PyValueError::new_err(e.to_string()) } else { PyOSError::new_err(e.to_string()) };
     let found = run(py, 0, |_| splat::read(&path))?.map_err(failed)?;
-    Ok((to_arrays(py, found.gaussians), found.antialias))
+    let (antialias, shift) = (found.antialias, found.gaussians.shift);
+    Ok((to_arrays(py, found.gaussians), antialias, shift))
 }
 
 /// Writes a file in the format that its name says.

@@ -185,3 +185,15 @@ def test_what_is_not_finite_is_not_drawn(cloud):
 def test_nothing_is_the_background():
     none = cags.Gaussians(*(np.zeros(s) for s in [(0, 3), (0, 3), (0, 4), (0,), (0, 1, 3)]))
     assert (cags.render(none, CAMERA, background=(0, 1, 0)).rgb == [0, 1, 0]).all()
+
+
+def test_a_scene_far_from_the_origin_keeps_its_digits(cloud, tmp_path):
+    shift = (448262.0, 5411932.0, 114.0)
+    far = cags.Gaussians(cloud.means, cloud.log_scales, cloud.rotations, cloud.opacity_logits, cloud.sh, shift=shift)
+    for name in ["far.ply", "far.glb"]:
+        cags.write_ply(tmp_path / name, far)
+        found = cags.read_ply(tmp_path / name)
+        assert found.shift == shift and found[3:5].shift == shift
+        np.testing.assert_allclose(found.means, cloud.means, atol=1e-6)
+    with pytest.raises(ValueError, match="three finite numbers"):
+        cags.Gaussians(cloud.means, cloud.log_scales, cloud.rotations, cloud.opacity_logits, cloud.sh, shift=(0, np.nan, 0))

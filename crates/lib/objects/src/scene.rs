@@ -277,6 +277,10 @@ mod tests {
         scene.write(&path).unwrap();
         assert_eq!(Scene::read(&path).unwrap(), scene);
         assert_eq!(scene.relations_of(0).count(), 1);
+        assert!(scene.shift.is_none() && !sample().as_object().unwrap().contains_key("shift"));
+        let far = Scene { shift: Some([448_262.0, 5_411_932.0, 114.0]), ..scene.clone() };
+        far.write(&path).unwrap();
+        assert_eq!(Scene::read(&path).unwrap(), far);
         assert_eq!((scene.object(1).map(|o| o.id), scene.object(2)), (Some(1), None));
     }
 

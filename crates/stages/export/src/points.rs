@@ -168,6 +168,25 @@ mod tests {
     }
 
     #[test]
+    fn a_scene_far_from_the_origin_is_where_it_is_in_the_world() {
+        let (g, label) = sample();
+        let shift = [448_262.0, 5_411_932.0, 114.0];
+        let far = Gaussians { shift, ..g };
+        let mut reader = Reader::new(Cursor::new(las_bytes(&far, &label, &[0, 1, 2, 3]).unwrap())).unwrap();
+        let all = reader.read_all().unwrap();
+        for (i, p) in all.points().enumerate() {
+            let p = p.unwrap();
+            let off = (0..3).map(|c| ([p.x, p.y, p.z][c] - shift[c] - f64::from(far.means[i][c])).abs());
+            assert!(off.fold(0.0, f64::max) < 1e-5, "{p:?}");
+        }
+        let dir = tempfile::tempdir().unwrap();
+        let path = dir.path().join("p.ply");
+        write(&path, PointFormat::Ply, &far, &label, &[1, 3]).unwrap();
+        let points = ply::read_points(&path).unwrap();
+        assert_eq!((points.positions, points.shift), (vec![far.means[1], far.means[3]], shift));
+    }
+
+    #[test]
     fn a_cloud_of_no_or_one_point_is_a_file_too() {
         let (g, label) = sample();
         for which in [&[][..], &[2]] {

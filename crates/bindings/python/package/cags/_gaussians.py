@@ -29,6 +29,8 @@ class Gaussians:
         Spherical harmonics of degree 0 to 3, the constant term first.
     antialias : bool, default=False
         Whether they were learnt with the 2D filter of Mip-Splatting, and are rendered so.
+    shift : three floats, default=(0, 0, 0)
+        What was subtracted from the centres of a scene far from the origin: ``means + shift`` in float64 are those of the world.
 
     Examples
     --------
@@ -44,6 +46,7 @@ class Gaussians:
     opacity_logits: np.ndarray
     sh: np.ndarray
     antialias: bool = False
+    shift: tuple = (0.0, 0.0, 0.0)
 
     def __post_init__(self):
         for name in _SHAPES:
@@ -55,6 +58,10 @@ class Gaussians:
 
     def _checked(self):
         """The same, in C order, if the arrays still fit each other: anybody may have put others in their place."""
+        shift = tuple(float(v) for v in self.shift)
+        if len(shift) != 3 or not np.isfinite(shift).all():
+            raise ValueError(f"shift is {shift}: expected three finite numbers")
+        self.shift = shift
         arrays = [getattr(self, name) for name in _SHAPES]
         for (name, shape), array in zip(_SHAPES.items(), arrays):
             if not isinstance(array, np.ndarray) or array.dtype != np.float32:
@@ -66,14 +73,14 @@ class Gaussians:
                 raise ValueError(f"{name} has the shape {array.shape}: expected {shape}, n = {n}")
         if all(a.flags.c_contiguous for a in arrays):
             return self
-        return Gaussians(*arrays, self.antialias)
+        return Gaussians(*arrays, self.antialias, self.shift)
 
     def __len__(self):
         return len(self.means)
 
     def __getitem__(self, which):
         """Some of them: a slice, indices or a mask."""
-        return Gaussians(*(np.atleast_1d(getattr(self, name)[which]) for name in _SHAPES), self.antialias)
+        return Gaussians(*(np.atleast_1d(getattr(self, name)[which]) for name in _SHAPES), self.antialias, self.shift)
 
 
 @dataclass
@@ -245,8 +252,8 @@ def read_ply(path):
     """
     if not os.path.exists(path):
         raise FileNotFoundError(2, "no such file", os.fspath(path))
-    arrays, antialias = _native.read_gaussians(path)
-    return Gaussians(*arrays, antialias)
+    arrays, antialias, shift = _native.read_gaussians(path)
+    return Gaussians(*arrays, antialias, shift)
 
 
 def write_ply(path, gaussians, *, instance=None):
