@@ -71,6 +71,12 @@ pub fn findings(format: &Format) -> Vec<Vec<u8>> {
     entries.map(|e| std::fs::read(e.expect("an entry").path()).expect("a finding")).collect()
 }
 
+/// The most memory that `work` held, in bytes.
+pub fn held(work: impl FnOnce()) -> usize {
+    let _turn = turn();
+    meter::peak(work).0
+}
+
 /// Gives a file of these bytes to the readers of a format and returns the most memory they held, in bytes.
 ///
 /// # Panics

@@ -2,15 +2,18 @@
 
 use gs_io::{Error, IoContext, Result, write_bytes};
 use image::metadata::Orientation;
-use image::{DynamicImage, ImageDecoder, ImageReader};
+use image::{DynamicImage, ImageDecoder, ImageReader, Limits};
 use rayon::prelude::*;
-use std::io::Cursor;
+use std::fs::File;
+use std::io::{BufRead, BufReader, Cursor, Seek};
 use std::path::Path;
 
 /// Pixels that a picture may have at most.
 const MAX_PIXELS: u64 = 1 << 28;
 /// Pixels per byte of file beyond which a header lies: a gray PNG of one colour has about 1,030, a JPEG about 500.
 const MAX_PIXELS_PER_BYTE: u64 = 2_000;
+/// Bytes beside the pixels that decoders may take whatever the file's length.
+const BESIDE: u64 = 1 << 20;
 
 /// A picture: sRGB values as stored, not linearised.
 #[derive(Debug, Clone, Default, PartialEq)]
@@ -28,14 +31,28 @@ pub struct Image {
 /// Width and height of a picture file as its pixels lie, from its header.
 pub fn size_of(path: impl AsRef<Path>) -> Result<(u32, u32)> {
     let path = path.as_ref();
+    header_of(path)?.into_dimensions().map_err(|e| unreadable(path, &e))
+}
+
+/// A reader of a picture file's header.
+fn header_of(path: &Path) -> Result<ImageReader<BufReader<File>>> {
     let reader = ImageReader::open(path).at("open", path)?.with_guessed_format().at("read", path)?;
-    reader.into_dimensions().map_err(|e| unreadable(path, &e))
+    Ok(bounded(reader, std::fs::metadata(path).at("read", path)?.len(), 0))
+}
+
+/// Bounds what a picture of so many bytes may be unpacked to beside its pixels: a colour profile of a PNG may claim any size, and is
+/// left out where it is larger. Pixels take at most 8 bytes.
+fn bounded<R: BufRead + Seek>(mut reader: ImageReader<R>, bytes: u64, pixels: u64) -> ImageReader<R> {
+    let most = BESIDE.saturating_add(bytes.saturating_mul(2)).saturating_add(pixels.saturating_mul(8));
+    let mut limits = Limits::default();
+    limits.max_alloc = limits.max_alloc.map(|usual| usual.min(most));
+    reader.limits(limits);
+    reader
 }
 
 /// Width and height of a picture file as its pixels lie, and how its EXIF data would have them turned, from its header.
 pub(crate) fn size_and_turn(path: &Path) -> Result<((u32, u32), Orientation)> {
-    let reader = ImageReader::open(path).at("open", path)?.with_guessed_format().at("read", path)?;
-    let mut decoder = reader.into_decoder().map_err(|e| unreadable(path, &e))?;
+    let mut decoder = header_of(path)?.into_decoder().map_err(|e| unreadable(path, &e))?;
     Ok((decoder.dimensions(), turn_of(&mut decoder)))
 }
 
@@ -60,9 +77,11 @@ pub(crate) fn turned_size((width, height): (u32, u32), turn: Orientation) -> (u3
 /// When it is no picture, or claims more pixels than so many bytes can hold.
 pub fn decode(bytes: &[u8], path: &Path) -> Result<DynamicImage> {
     let reader = || ImageReader::new(Cursor::new(bytes)).with_guessed_format().at("read", path);
-    let (w, h) = reader()?.into_dimensions().map_err(|e| unreadable(path, &e))?;
-    let most = MAX_PIXELS.min((bytes.len() as u64).saturating_mul(MAX_PIXELS_PER_BYTE));
-    if u64::from(w) * u64::from(h) > most {
+    let length = bytes.len() as u64;
+    let (w, h) = bounded(reader()?, length, 0).into_dimensions().map_err(|e| unreadable(path, &e))?;
+    let pixels = u64::from(w) * u64::from(h);
+    let most = MAX_PIXELS.min(length.saturating_mul(MAX_PIXELS_PER_BYTE));
+    if pixels > most {
         return Err(Error::new("the picture is too large, or its header lies")
             .file(path)
             .field("size")
@@ -74,7 +93,7 @@ pub fn decode(bytes: &[u8], path: &Path) -> Result<DynamicImage> {
     if is_jpeg(bytes) && !reaches_its_end(bytes) {
         return Err(unreadable(path, &"the JPEG ends before its end mark, so a part of it is missing"));
     }
-    reader()?.decode().map_err(|e| unreadable(path, &e))
+    bounded(reader()?, length, pixels).decode().map_err(|e| unreadable(path, &e))
 }
 
 /// How a JPEG begins.
@@ -107,8 +126,7 @@ fn reaches_its_end(bytes: &[u8]) -> bool {
 /// Whether a picture file has an alpha channel, from its header.
 pub fn has_alpha(path: impl AsRef<Path>) -> Result<bool> {
     let path = path.as_ref();
-    let reader = ImageReader::open(path).at("open", path)?.with_guessed_format().at("read", path)?;
-    let decoder = reader.into_decoder().map_err(|e| unreadable(path, &e))?;
+    let decoder = header_of(path)?.into_decoder().map_err(|e| unreadable(path, &e))?;
     Ok(decoder.color_type().has_alpha())
 }
 

@@ -72,11 +72,17 @@ fn vertices<T>(path: &Path, take: impl FnOnce(&Table<'_>, [f64; 3]) -> Result<T>
 /// Properties of vertices by which Gaussians are known: as they are, and packed.
 const OF_GAUSSIANS: [&str; 2] = ["opacity", "packed_color"];
 
-/// The comment lines of a PLY's header, without the word `comment`, and whether its vertices have each of [`OF_GAUSSIANS`].
-fn read_header(path: &Path) -> Result<(Vec<String>, [bool; 2])> {
+/// The bytes of a file as far as a header may reach.
+fn read_start(path: &Path) -> Result<Vec<u8>> {
     let mut bytes = Vec::new();
     let file = std::fs::File::open(path).at("open", path)?;
     file.take(MAX_HEADER).read_to_end(&mut bytes).at("read", path)?;
+    Ok(bytes)
+}
+
+/// The comment lines of a PLY's header, without the word `comment`, and whether its vertices have each of [`OF_GAUSSIANS`].
+fn read_header(path: &Path) -> Result<(Vec<String>, [bool; 2])> {
+    let bytes = read_start(path)?;
     let (comments, there) = table::read_header(&bytes, OF_GAUSSIANS).map_err(|e| e.file(path))?;
     Ok((comments.into_iter().map(String::from).collect(), there))
 }
@@ -103,6 +109,12 @@ pub fn is_antialiased(path: impl AsRef<Path>) -> Result<bool> {
 /// Whether a PLY's vertices are Gaussians rather than points: whether they have an opacity.
 pub fn holds_gaussians(path: impl AsRef<Path>) -> Result<bool> {
     Ok(read_header(path.as_ref())?.1 != [false; 2])
+}
+
+/// How many vertices a PLY's header says that it has.
+pub(crate) fn count(path: &Path) -> Result<u64> {
+    let header = read_start(path)?;
+    table::count_of_vertices(&header).map_err(|e| e.file(path))
 }
 
 /// Whether a PLY is a compressed one.

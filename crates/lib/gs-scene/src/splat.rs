@@ -147,13 +147,31 @@ pub fn files(path: impl AsRef<Path>) -> Result<Vec<PathBuf>> {
     }
 }
 
+/// How many Gaussians a file says that it has. Only headers are read, and nothing is unpacked.
+///
+/// # Errors
+/// When it is of no known format, or the header is damaged.
+pub fn count(path: impl AsRef<Path>) -> Result<u64> {
+    let file = unfolded(path.as_ref());
+    match Format::of_file(&file)? {
+        Format::Ply | Format::CompressedPly => ply::count(&file),
+        Format::Splat => Ok(std::fs::metadata(&file).at("read", &file)?.len() / dot_splat::BYTES),
+        Format::Spz => spz::claim(&file).map(|claim| claim.0),
+        Format::Sog => sog::claim(&file).map(|claim| claim.0),
+        Format::Gltf => gltf::claim(&file).map(|claim| claim.0),
+    }
+    .map_err(|e| e.file(path))
+}
+
 /// Bytes that the Gaussians of a file would take as a PLY, about: what they take in memory. Only headers are read.
 pub fn bytes_as_ply(path: impl AsRef<Path>) -> Result<u64> {
     let file = unfolded(path.as_ref());
     let bytes = std::fs::metadata(&file).at("read", &file)?.len();
     let claimed = |(count, degree): (u64, u8)| 4 * count * (14 + 3 * sh_coefficients(degree) as u64);
     match Format::of_file(&file)? {
-        Format::Ply | Format::Gltf => Ok(bytes),
+        Format::Ply => Ok(bytes),
+        // Numbers may have fewer bytes than floats.
+        Format::Gltf => gltf::claim(&file).map(|claim| claimed(claim).max(bytes)),
         // 16 bytes become 56, and each further byte 4.
         Format::CompressedPly | Format::Splat => Ok(4 * bytes),
         Format::Spz => spz::claim(&file).map(claimed),
@@ -186,7 +204,7 @@ pub fn read(path: impl AsRef<Path>) -> Result<Splat> {
     let file = &unfolded(path);
     let plain = |kind: &str| -> Result<Splat> {
         let (gaussians, antialias) = (ply::read_gaussians_as_they_are(file)?, ply::is_antialiased(file)?);
-        Ok(Splat { gaussians, antialias, kind: kind.into(), left_out: Vec::new() })
+        Ok(Splat { gaussians, antialias, kind: kind.into(), ..Splat::default() })
     };
     let splat = match Format::of_file(file)? {
         Format::Ply => plain("PLY"),

@@ -23,6 +23,7 @@ fn through(g: &Gaussians, name: &str, extra: &Extra<'_>) -> splat::Splat {
     let format = Format::to_write(&path).unwrap();
     assert_eq!(std::fs::read(&path).unwrap(), splat::encode(format, g, extra).unwrap());
     assert_eq!(Format::of_file(&path).unwrap(), format);
+    assert_eq!(splat::count(&path).unwrap(), g.len() as u64);
     splat::read_whole(&path).unwrap()
 }
 

@@ -5,6 +5,15 @@ use crate::linkage::MOST_ENTRIES;
 use crate::options::{Settings, Space};
 use artifacts::Level;
 
+/// Bytes that a run takes, and for each Gaussian.
+const BASE: u64 = 12_800_000;
+const PER_GAUSSIAN: u64 = 1000;
+
+/// The least that a run with so many Gaussians takes, known before they are read.
+pub fn least(gaussians: u64) -> u64 {
+    BASE + PER_GAUSSIAN * gaussians
+}
+
 /// Peak memory in bytes of clustering with these settings.
 pub fn forecast(inputs: &Inputs, settings: &Settings) -> u64 {
     let footprints = &inputs.footprints;
@@ -25,5 +34,5 @@ pub fn forecast(inputs: &Inputs, settings: &Settings) -> u64 {
         Space::Free => (18, batch.max(parts)),
     };
     // Fitted to 11 runs of 5,000 to 950,000 Gaussians; by the masks to 11 of 12,000 to 950,000.
-    12_800_000 + entries + 14 * samples + 1000 * gaussians as u64 + value * kept * dim
+    least(gaussians as u64) + entries + 14 * samples + value * kept * dim
 }

@@ -16,11 +16,14 @@ use crate::{health, linkage, memory};
 use artifacts::{Draft, Instances, Level, MaskFeatures, MaskFolder, Match, Row};
 use gs_io::{Error, Result, Watched};
 use gs_raster::RasterOptions;
+use gs_scene::splat;
 use ndarray::Array2;
 use stage::{CommonArgs, Program, Stage};
 use std::collections::BTreeMap;
 use std::time::Instant;
 
+/// What takes less memory.
+const SMALLER: &str = "give a smaller geometry, or drop small footprint entries: graph-precompute --cut 0.001";
 /// How far the masks of level small must agree that two are one part.
 const PARTS: f64 = 0.6;
 
@@ -50,6 +53,8 @@ impl Program for Args {
         for suffix in ["_s.npy", "_f.npy"] {
             watched = watched.and(artifacts::watch_folder(&a.masks, suffix)?);
         }
+        // A packed file may hold a thousand times its size.
+        stage.needs_at_once(memory::least(splat::count(&a.geometry)?), SMALLER)?;
         let inputs = Inputs::read(a, stage)?;
         let settings = a.settings.for_gaussians(inputs.graph.kept.len());
         let mut found = match &a.from {
@@ -71,7 +76,7 @@ impl Program for Args {
 
 /// Finds the instances and what there is to say of them without language.
 fn find(a: &Args, settings: &Settings, inputs: &Inputs, stage: &Stage) -> Result<Found> {
-    stage.forecast(memory::forecast(inputs, settings), "drop small footprint entries: graph-precompute --cut 0.001")?;
+    stage.forecast(memory::forecast(inputs, settings), SMALLER)?;
     let start = Instant::now();
     let points = Points::of(inputs)?;
     let clustering = match settings.cluster {

@@ -639,3 +639,14 @@ fn bad_input_is_one_line_and_leaves_outputs_alone() {
     std::fs::remove_file(s.path("graph.safetensors")).unwrap();
     s.fail(&[], &["graph.safetensors"]);
 }
+
+/// The header tells how many Gaussians there are: this file has nothing behind it, which only unpacking would find.
+#[test]
+fn a_limit_of_memory_holds_before_packed_gaussians_are_unpacked() {
+    let s = Scene::new();
+    let count = 10_000_000u32.to_le_bytes();
+    let header = [&b"NGSP\x04\0\0\0"[..], &count, &[0, 12, 0, 5], &[32, 0, 0, 0], &[0; 12]].concat();
+    std::fs::write(s.path("geometry.ply"), [header, vec![7; 100_000]].concat()).unwrap();
+    s.fail(&["--memory-limit", "200M"], &["--memory-limit: the run needs more memory than it may take"]);
+    s.fail(&["--memory-limit", "900G"], &["not a value of SPZ"]);
+}

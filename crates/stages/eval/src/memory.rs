@@ -8,7 +8,7 @@ use std::path::Path;
 /// Sizes of what a command reads.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
 pub struct Sizes {
-    /// Bytes of the geometry.
+    /// Bytes of the geometry as a PLY.
     pub geometry: u64,
     /// Bytes that the text encoder, or the table instead of it, takes.
     pub language: u64,
@@ -27,7 +27,7 @@ pub struct Sizes {
 impl Sizes {
     /// The sizes of a scene, its text features and its largest view, before any of them is read.
     pub fn new(geometry: &Path, texts: &TextOptions, views: &[View]) -> Self {
-        Self { geometry: bytes(geometry), language: texts.bytes(), pixels: pixels(views), ..Self::default() }
+        Self { geometry: bytes_as_ply(geometry), language: texts.bytes(), pixels: pixels(views), ..Self::default() }
     }
 }
 
@@ -44,6 +44,11 @@ pub fn bytes(path: &Path) -> u64 {
         Ok(entries) => entries.flatten().map(|e| of(&e.path())).sum(),
         Err(_) => of(path),
     }
+}
+
+/// Bytes that a file of Gaussians, which may be packed, takes as a PLY; 0 where it cannot be read.
+pub fn bytes_as_ply(geometry: &Path) -> u64 {
+    gs_scene::splat::bytes_as_ply(geometry).unwrap_or(0)
 }
 
 /// Pixels of the largest view.

@@ -36,7 +36,7 @@ pub(crate) fn run(o: &ReportOptions, mut parameters: Value, stage: &Stage) -> Re
     let mut dataset = load(&o.scene, &load_options, stage)?;
     held.differs(&dataset).iter().for_each(|what| stage.warn(what));
     let sizes = Sizes {
-        geometry: memory::bytes(&o.geometry),
+        geometry: memory::bytes_as_ply(&o.geometry),
         features: memory::bytes(&o.run_dir.join("features.safetensors")),
         pixels: memory::pixels(&dataset.views),
         shown: if o.views.views.is_empty() { VIEWS } else { o.views.views.len() } as u64,

@@ -5,8 +5,8 @@ use crate::pack::{Packed, pack};
 use crate::reach::Reach;
 use artifacts::{Called, Edits, InstanceNames, Instances, Remarks, called};
 use gs_io::{Error, IoContext, Result};
-use gs_scene::Gaussians;
 use gs_scene::dataset::{self, Dataset, LoadOptions, Resolution, View};
+use gs_scene::{Gaussians, splat};
 use objects::Up;
 use query::{Granules, Index, LabelledScene, TextSource, Unrelated, Verdict};
 use stage::Stage;
@@ -201,7 +201,7 @@ impl World {
 /// Peak of memory in bytes: geometry, packed Gaussians and a photograph (docs/results/explore.md has measured peaks).
 fn forecast(source: &Source, dataset: &Dataset) -> u64 {
     const PROGRAM: u64 = 45_000_000;
-    let geometry = std::fs::metadata(&source.geometry).map_or(0, |m| m.len());
+    let geometry = splat::bytes_as_ply(&source.geometry).unwrap_or(0);
     let pixels = |v: &View| u64::from(v.camera.width) * u64::from(v.camera.height);
     PROGRAM + source.texts().bytes() + geometry * 19 / 10 + 40 * dataset.views.iter().map(pixels).max().unwrap_or(0)
 }

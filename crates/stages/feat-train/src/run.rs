@@ -32,7 +32,7 @@ impl Program for Args {
             .claim()?;
         let watched = Watched::new([&self.geometry, &self.footprints]);
         let inputs = Inputs::read(&self)?;
-        let geometry = std::fs::metadata(&self.geometry).map_or(0, |m| m.len());
+        let geometry = gs_scene::splat::bytes_as_ply(&self.geometry).unwrap_or(0);
         let needed = memory::forecast(&inputs, &self.options, geometry)?;
         stage.forecast(needed, "drop small footprint entries: graph-precompute --cut 0.001")?;
 

@@ -5,7 +5,7 @@ use crate::precompute::{Summary, precompute};
 use artifacts::{Footprints, Graph, MaskMaps, ScratchEntries, hash_folder, maps_path, role, watch_folder};
 use gs_io::{Error, Result, Watched, hash_file};
 use gs_scene::dataset::{self, LoadOptions, Resolution, Split, View};
-use gs_scene::{Geometry, HoldOut};
+use gs_scene::{Geometry, HoldOut, splat};
 use serde_json::json;
 use stage::{CommonArgs, Program, Stage};
 use std::collections::BTreeMap;
@@ -35,6 +35,8 @@ impl Program for Args {
             .claim()?;
         let watched = Watched::new([&self.geometry]).and(watch_folder(&self.masks, "_s.npy")?);
         dataset.warnings.iter().chain(&held.differs(&dataset)).for_each(|w| stage.warn(w));
+        // A packed file may hold a thousand times its size: what its Gaussians will take is known before.
+        stage.needs_at_once(BASE + PER_GAUSSIAN * splat::count(&self.geometry)?, SMALLER)?;
         let geometry = Geometry::read(&self.geometry)?;
         dataset.follow(&geometry.gaussians, &self.geometry)?;
         let wanted = |v: &&View| self.settings.views == Views::All || v.split == Split::Train;
@@ -67,11 +69,15 @@ impl Program for Args {
     }
 }
 
+/// Bytes that a run takes, and for each Gaussian.
+const BASE: u64 = 19_400_000;
+const PER_GAUSSIAN: u64 = 646;
+/// What takes less memory.
+const SMALLER: &str = "give a smaller geometry, smaller id maps or fewer --pixel-samples";
+
 /// Says how much memory the run will take. The figures are fitted to 15 runs of 5,000 to 80,000 Gaussians, 12 to 108 views and
 /// 10,800 to 172,800 pixels, within 15 % (docs/performance.md).
 fn forecast(a: &Args, geometry: &Geometry, views: &[&View], stage: &Stage) -> Result<()> {
-    const BASE: u64 = 19_400_000;
-    const PER_GAUSSIAN: u64 = 646;
     const PER_PIXEL: u64 = 157;
     const PER_VIEW: u64 = 20_400;
     /// Of a sampled pixel, which shows some 54 Gaussians. Footprints wait on disk, sampled pixels in memory.
@@ -83,7 +89,7 @@ fn forecast(a: &Args, geometry: &Geometry, views: &[&View], stage: &Stage) -> Re
     let masks = first.filter_map(|p| MaskMaps::read(p).ok()).next().map_or(0, |m| m.id_count());
     let of_views = views.len() as u64 * (PER_VIEW + PER_SAMPLE * (samples * masks) as u64);
     let needed = BASE + PER_GAUSSIAN * geometry.gaussians.len() as u64 + PER_PIXEL * pixels + of_views;
-    stage.forecast(needed, "give smaller id maps or fewer --pixel-samples")
+    stage.forecast(needed, SMALLER)
 }
 
 fn say(summary: &Summary, stage: &Stage) {

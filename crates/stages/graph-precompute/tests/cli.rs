@@ -329,3 +329,19 @@ fn one_gaussian_and_one_view_are_enough() {
     assert_eq!((&graph.anchors[..], &graph.nearest_anchor[..]), (&[0u32][..], &[0u32][..]));
     assert!(graph.knn.iter().chain(&graph.anchor_knn).chain(&graph.gaussian_knn).all(|&i| i == 0));
 }
+
+/// The header tells how many Gaussians there are: this file has nothing behind it, which only unpacking would find.
+#[test]
+fn a_limit_of_memory_holds_before_packed_gaussians_are_unpacked() {
+    let (_dir, scene, out) = setup(32);
+    let header =
+        [&b"NGSP\x04\0\0\0"[..], &10_000_000u32.to_le_bytes(), &[0, 12, 0, 5], &[32, 0, 0, 0], &[0; 12]].concat();
+    std::fs::write(scene.join("geometry.ply"), [header, vec![7; 100_000]].concat()).unwrap();
+    for (limit, wanted) in
+        [("200M", "--memory-limit: the run needs more memory than it may take"), ("900G", "not a value of SPZ")]
+    {
+        let refused = run(&scene, &out, &["--memory-limit", limit]);
+        let said = String::from_utf8_lossy(&refused.stderr).into_owned();
+        assert!(refused.status.code() == Some(2) && said.contains(wanted), "{said}");
+    }
+}

@@ -128,6 +128,12 @@ pub(crate) fn read_header<'a, const N: usize>(bytes: &'a [u8], names: [&str; N])
     Ok((header.comments, there))
 }
 
+/// How many vertices a file's header says that it has.
+pub(crate) fn count_of_vertices(bytes: &[u8]) -> Result<u64> {
+    let header = parse_header(bytes)?;
+    header.elements.iter().find(|e| e.name == "vertex").map(|e| e.count as u64).ok_or_else(no_vertices)
+}
+
 fn parse_header(bytes: &[u8]) -> Result<Header<'_>> {
     let fail = |what: &str| Error::new(what).field("header").hint(AGAIN);
     let mut rest = bytes;

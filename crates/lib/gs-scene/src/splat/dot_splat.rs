@@ -11,7 +11,7 @@ use std::io::{BufReader, Write};
 use std::path::Path;
 
 /// Bytes of a Gaussian.
-const BYTES: u64 = 32;
+pub(super) const BYTES: u64 = 32;
 
 /// Reads a .splat file; the caller names it in errors.
 pub(super) fn read(path: &Path) -> Result<Splat> {

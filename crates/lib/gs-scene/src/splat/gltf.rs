@@ -88,6 +88,32 @@ pub(super) fn files(path: &Path) -> Result<Vec<PathBuf>> {
     Ok(all)
 }
 
+/// How many Gaussians the scene of a glTF claims to show, or as many as its files can hold, and the degree of their harmonics at most.
+pub(super) fn claim(path: &Path) -> Result<(u64, u8)> {
+    let bytes = std::fs::read(path).at("read", path)?;
+    let (description, _) = open(&bytes)?;
+    let (mut count, mut degree) = (0u64, 0);
+    for (_, mesh) in scene::placed_meshes(&description)? {
+        let primitives = description["meshes"][mesh]["primitives"].as_array().into_iter().flatten();
+        for primitive in primitives.filter(|p| p["extensions"][EXTENSION].is_object()) {
+            let positions = primitive["attributes"]["POSITION"].as_u64().and_then(|at| usize::try_from(at).ok());
+            let own = positions.and_then(|at| description["accessors"][at]["count"].as_u64()).unwrap_or(0);
+            count = count.saturating_add(own);
+            degree = degree.max(degree_of(&primitive["attributes"]));
+        }
+    }
+    let mut held = 0;
+    for file in files(path)? {
+        held += std::fs::metadata(&file).at("read", &file)?.len();
+    }
+    Ok((count.min(held / LEAST_BYTES as u64), degree))
+}
+
+/// The degree of harmonics of which a primitive has attributes.
+fn degree_of(attributes: &Value) -> u8 {
+    (1..=3).take_while(|&d| attributes[coefficient(sh_coefficients(d - 1))].is_u64()).count() as u8
+}
+
 /// Reads the Gaussians of a glTF; the caller names it in errors.
 pub(super) fn read(path: &Path) -> Result<Splat> {
     let bytes = std::fs::read(path).at("read", path)?;
@@ -175,7 +201,7 @@ fn gaussians(primitive: &Value, description: &Value, buffers: &Buffers) -> Resul
     fits(&rotation, rotations.len())?;
     let opacity_logits: Vec<f32> = get(&opacity)?.vectors::<1>()?.into_iter().map(|[o]| logit(o)).collect();
     fits(&opacity, opacity_logits.len())?;
-    let sh_degree = (1..=3).take_while(|&d| attributes[coefficient(sh_coefficients(d - 1))].is_u64()).count() as u8;
+    let sh_degree = degree_of(attributes);
     let k = sh_coefficients(sh_degree);
     let mut sh = vec![0.0; 3 * k * n];
     for i in 0..k {
