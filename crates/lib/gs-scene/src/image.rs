@@ -12,8 +12,8 @@ use std::path::Path;
 const MAX_PIXELS: u64 = 1 << 28;
 /// Pixels per byte of file beyond which a header lies: a gray PNG of one colour has about 1,030, a JPEG about 500.
 const MAX_PIXELS_PER_BYTE: u64 = 2_000;
-/// Bytes beside the pixels that decoders may take whatever the file's length.
-const BESIDE: u64 = 1 << 20;
+/// Bytes beside the pixels that decoders may take whatever the file's length: a row of 2^20 pixels.
+const BESIDE: u64 = 8 << 20;
 
 /// A picture: sRGB values as stored, not linearised.
 #[derive(Debug, Clone, Default, PartialEq)]
