@@ -135,7 +135,6 @@ fn cameras_of_turned_photographs_and_those_without_a_size_see_them_upright() {
     };
     for size in [json!({"w": 48, "h": 64}), json!({})] {
         let d = lens(size, 25.5, 31.25).unwrap();
-        assert_same_cameras(&d, &Dataset { views: d.views.clone(), ..d.clone() }, 1e-12);
         assert_eq!((d.views[0].camera.width, d.views[0].camera.cx, d.warnings.len()), (48, 25.5, 0));
         assert!((d.views[0].camera.rotation - c.rotation).to_cols_array().iter().all(|v| v.abs() < 1e-9));
         assert!(worst(&d.views[0].load_image().unwrap(), &upright) < 0.03);
