@@ -18,7 +18,7 @@ PIPELINE = $(MAKE) --no-print-directory
 help: ## Say what can be made
 	@awk -F ':.*## ' '/^##@/ { print "\n" substr($$0, 5) ":" } /^[a-z-]+:.*## / { printf "  %-16s %s\n", $$1, $$2 }' Makefile
 	@echo
-	@echo "make scene needs SCENE=folder (COLMAP, transforms.json, ScanNet or 7-Scenes) or GEOMETRY=file, and OUT=folder; it takes"
+	@echo "make scene needs PHOTOGRAPHS=folder-or-video, SCENE=folder (with poses: COLMAP, transforms.json, ScanNet or 7-Scenes) or GEOMETRY=file, and OUT=folder; it takes"
 	@sed -nE 's/^#: ?/  /p' pipelines/custom.mk
 	@echo
 	@echo "Benchmarks of one part: make $$(sed -nE 's/^(bench-[a-z-]+):.*/\1/p' pipelines/bench.mk | paste -sd' ')"
@@ -32,7 +32,7 @@ demo: build ## Make a synthetic scene, run every stage on it, write out/demo/rep
 	@$(PIPELINE) -f pipelines/demo.mk all
 	@echo "look at it, click on things, ask in words: make explore OUT=$(or $(OUT),out/demo)"
 
-scene: checked-scene build ## The same on your own photographs, or on Gaussians alone: make scene SCENE=folder OUT=folder
+scene: checked-scene build ## The same on your photographs or a video: make scene PHOTOGRAPHS=folder OUT=folder, or SCENE=folder with poses
 	@$(PIPELINE) -f pipelines/custom.mk all
 
 explore: build ## Look at a finished run in the browser, click on things, ask in words: make explore OUT=folder
@@ -84,6 +84,7 @@ test: ## Run all tests that need nothing but this folder
 	scripts/test_explore.sh
 	scripts/test_splats.sh
 	scripts/test_python.sh
+	scripts/test_poses.sh
 
 test-data: ## Run the tests that need real photographs, full-size models or oracles (docs/contributing.md)
 	scripts/test_clip_model.sh 12
@@ -152,6 +153,9 @@ $(SNAKEMAKE)/bin/snakemake: pipelines/snakemake.txt
 	python3 -m venv $(SNAKEMAKE)
 	$(SNAKEMAKE)/bin/pip install -q -r $<
 	@touch $@
+
+include pipelines/poses.mk
+poses-env: out/poses-env/bin/python ## Install what finds the poses of photographs into out/poses-env (needs Python 3.10)
 
 reproduce-check: $(if $(OUT),build,checked-out) ## Run a finished OUT again into another folder, compare the bytes: make reproduce-check OUT=folder
 	@scripts/reproduce_check.sh $(OUT) $(INTO)

@@ -1,4 +1,6 @@
-# `make scene SCENE=folder OUT=folder`: anyone's posed photographs. The defaults stand in pipelines/custom.conf.
+# `make scene SCENE=folder OUT=folder`: anyone's posed photographs; PHOTOGRAPHS=folder, those without poses. The defaults stand in
+# pipelines/custom.conf.
+#:  PHOTOGRAPHS=folder  instead of SCENE: photographs without poses, or a video; poses are found first (make poses-env, once)
 #:  GEOMETRY=file.spz   use these trained Gaussians instead of training; without SCENE, renders of them instead of photographs
 #:  AXES=RDF            where the axes x, y, z of GEOMETRY point [told by the photographs; without SCENE, as its format says]
 #:  MASKS=folder        use these id maps (*_s.npy) instead of running SAM
@@ -15,8 +17,11 @@
 
 include pipelines/paths.mk
 
-ifeq ($(SCENE)$(GEOMETRY),)
+ifeq ($(SCENE)$(GEOMETRY)$(PHOTOGRAPHS),)
 $(error say which photographs or Gaussians: make scene SCENE=folder OUT=folder, or GEOMETRY=file OUT=folder (see make help))
+endif
+ifneq ($(and $(PHOTOGRAPHS),$(SCENE)$(GEOMETRY)),)
+$(error PHOTOGRAPHS is for photographs without poses: leave out SCENE and GEOMETRY, or PHOTOGRAPHS)
 endif
 ifeq ($(OUT),)
 $(error say where to write: make scene SCENE=folder OUT=folder)
@@ -25,14 +30,14 @@ endif
 include pipelines/custom.conf
 include pipelines/quality.mk
 include $(CONF)
-ifeq ($(SCENE),)
+ifeq ($(SCENE)$(PHOTOGRAPHS),)
 ifneq ($(MASKS),)
 $(error MASKS=$(MASKS): without SCENE there are no photographs that these masks could be of: leave MASKS out, or give SCENE)
 endif
 endif
 CLIP ?= $(patsubst %/,%,$(dir $(wildcard models/clip/text.onnx)))
 
-SETTINGS := QUALITY SCENE GEOMETRY AXES MASKS CLIP SAM VOCABULARY QUERIES RESOLUTION ITERATIONS SEED \
+SETTINGS := QUALITY SCENE PHOTOGRAPHS POSES_ARGS GEOMETRY AXES MASKS CLIP SAM VOCABULARY QUERIES RESOLUTION ITERATIONS SEED \
   GEOM_ARGS VIEW_ARGS MASK_ARGS EMBED_ARGS GRAPH_ARGS FEAT_ARGS CLUSTER_ARGS SCORE_ARGS REPORT_ARGS
 include pipelines/settings.mk
 
@@ -56,6 +61,12 @@ GEOM_FIRST := --resolution $(RESOLUTION) --iterations $(ITERATIONS)
 EVAL_ARGS ?= --resolution $(RESOLUTION)
 REPORT_FIRST := --resolution $(RESOLUTION)
 
+# Where the cameras stood is found first (docs/capture.md).
+ifneq ($(PHOTOGRAPHS),)
+override SCENE := $(OUT)/poses
+SCENE_FILES := $(SCENE)/poses.json
+endif
+
 # Renders of the Gaussians are the photographs (docs/views.md). None is held out, and to measure the Gaussians on renders of
 # themselves would mean nothing.
 ifeq ($(SCENE),)
@@ -68,3 +79,11 @@ REPORT_FIRST += $(call unless,REPORT_ARGS,--holdout 0)
 endif
 
 include pipelines/stages.mk
+
+POSES_PYTHON ?= out/poses-env/bin/python
+poses_OPTIONS := $(POSES_ARGS) $(SEED_ARGS)
+capture_FILES = find -L $(call arg,PHOTOGRAPHS) -maxdepth 1 -type f -printf '%s %T@ %p\n' | LC_ALL=C sort
+$(OUT)/poses/poses.json: $(OPTIONS)/capture.files $(OPTIONS)/poses | $(POSES_PYTHON)
+	$(POSES_PYTHON) scripts/poses.py $(call arg,PHOTOGRAPHS) --out $(OUT)/poses $(poses_OPTIONS) $(COMMON)
+
+include pipelines/poses.mk

@@ -22,4 +22,4 @@ $(foreach v,OUT INTO DATA TABLE PLAN CONF MASKS,$(call plain,$v))
 $(if $(CONF),$(if $(wildcard $(CONF)),,$(error CONF=$(CONF): no such file)))
 
 # Which of them must be there (scripts/check_settings.sh); later ones may be made.
-export GIVEN := $(foreach v,SCENE GEOMETRY MASKS CLIP TEXTS VOCABULARY,$(if $($v),$v))
+export GIVEN := $(foreach v,SCENE PHOTOGRAPHS GEOMETRY MASKS CLIP TEXTS VOCABULARY,$(if $($v),$v))

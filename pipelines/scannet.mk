@@ -10,8 +10,8 @@ include pipelines/scannet.conf
 PROTOCOL := scannet
 ifeq ($(wildcard $(SCENE)/transforms_train.json),)
 SOURCE_FILES := $(wildcard $(addprefix $(SCENE)/,color/* pose/* intrinsic/* *.ply *.json))
-PHOTOGRAPHS := $(OUT)/frames/$(notdir $(SCENE))
-SCENE_FILES := $(PHOTOGRAPHS)/frames.txt
+DATASET := $(OUT)/frames/$(notdir $(SCENE))
+SCENE_FILES := $(DATASET)/frames.txt
 endif
 PROTOCOL_FILES := $(wildcard $(addprefix $(SCENE)/,*.labels.ply *.segs.json *.aggregation.json))
 # The scan's vertices stay where they are, photographs have half their size (-r 2), no view is held out. Gaussian i is

@@ -3,7 +3,7 @@
 #   MASKS       folder of id maps                         CLIP     folder of a CLIP pair, or empty: no language
 #   MASKS_DONE  the file that says the id maps are whole
 # and the options of each stage: GEOM_ARGS, GRAPH_ARGS, FEAT_ARGS, CLUSTER_ARGS, SCORE_ARGS, QUERIES, REPORT_ARGS. It may set
-#   PHOTOGRAPHS the data set's folder, where it is not SCENE itself
+#   DATASET the data set's folder, where it is not SCENE itself
 #   SCENE_FILES what the dataset consists of, where that is not what gs-geom finds in it
 #   LANGUAGE    the masks' features, where they are there already
 #   SPLAT       Gaussians of others, of which GEOMETRY is made with the right AXES
@@ -26,7 +26,9 @@ BIN ?= target/release
 THREADS ?= 0
 SEED ?= 0
 COMMON := --threads $(THREADS)
-PHOTOGRAPHS ?= $(SCENE)
+ifneq ($(origin DATASET),file)
+DATASET := $(SCENE)
+endif
 
 ifndef QUALITY_FILE
 include pipelines/quality.mk
@@ -53,8 +55,8 @@ GEOMETRY_DONE := $(OPTIONS)/geometry.files
 endif
 # The id maps, where SAM makes them.
 SAM_MAKES := $(filter $(OUT)/masks/masks.json,$(MASKS_DONE))
-export SAM_MAKES SCENE PHOTOGRAPHS OUT MASKS GEOMETRY SPLAT AXES CLIP SAM TEXTS VOCABULARY QUERIES SEED THREADS
-export GEOM_ARGS VIEW_ARGS MASK_ARGS EMBED_ARGS GRAPH_ARGS FEAT_ARGS CLUSTER_ARGS SCORE_ARGS REPORT_ARGS EVAL_ARGS SYNTH_ARGS
+export SAM_MAKES SCENE DATASET PHOTOGRAPHS OUT MASKS GEOMETRY SPLAT AXES CLIP SAM TEXTS VOCABULARY QUERIES SEED THREADS
+export POSES_ARGS GEOM_ARGS VIEW_ARGS MASK_ARGS EMBED_ARGS GRAPH_ARGS FEAT_ARGS CLUSTER_ARGS SCORE_ARGS REPORT_ARGS EVAL_ARGS SYNTH_ARGS
 
 .DEFAULT_GOAL := all
 .PHONY: all FORCE
@@ -75,7 +77,7 @@ $(OPTIONS)/%.files: FORCE | checked-options
 	@mkdir -p $(@D)
 	@text=$$($($*_FILES)) && $(put)
 list = find -L $1 -maxdepth 1 -type f -name $2 -printf '%s %T@ %p\n' | LC_ALL=C sort
-scene_FILES = $(BIN)/gs-geom inspect $(call arg,PHOTOGRAPHS)
+scene_FILES = $(BIN)/gs-geom inspect $(call arg,DATASET)
 geometry_FILES = $(call list,$(call arg,GEOMETRY),'*')
 splat_FILES = $(call list,$(call arg,SPLAT),'*')
 masks_FILES = $(call list,$(MASKS)/,'*_s.npy')
@@ -106,18 +108,18 @@ names_OPTIONS := $(CLIP) $(VOCABULARY)
 report_OPTIONS := $(REPORT_FIRST) $(REPORT_ARGS)
 
 # What later stages take for the photographs: with the cameras that stage 1 refined, where it does. Masks do not depend on them.
-POSED := $(if $(and $(filter $(OUT)/geometry.ply,$(GEOMETRY_DONE)),$(filter --refine-poses,$(geom_OPTIONS))),$(OUT)/geometry.ply.cameras.json,$(PHOTOGRAPHS))
+POSED := $(if $(and $(filter $(OUT)/geometry.ply,$(GEOMETRY_DONE)),$(filter --refine-poses,$(geom_OPTIONS))),$(OUT)/geometry.ply.cameras.json,$(DATASET))
 export POSED
 
 # What each stage runs. `arg` writes a path out, so that commands can be copied, or as "$NAME" where a shell would take it apart.
 arg = $(if $(call odd,$($1)),"$$$1",$($1))
-geom_RUN = $(BIN)/gs-geom train --scene $(call arg,PHOTOGRAPHS) --out $(OUT)/geometry.ply $(geom_OPTIONS) $(COMMON)
-splat_RUN = $(BIN)/gs-geom convert $(call arg,SPLAT) $(GEOMETRY) $(if $(AXES),--axes $(AXES),--scene $(call arg,PHOTOGRAPHS)) $(COMMON)
+geom_RUN = $(BIN)/gs-geom train --scene $(call arg,DATASET) --out $(OUT)/geometry.ply $(geom_OPTIONS) $(COMMON)
+splat_RUN = $(BIN)/gs-geom convert $(call arg,SPLAT) $(GEOMETRY) $(if $(AXES),--axes $(AXES),--scene $(call arg,DATASET)) $(COMMON)
 views_RUN = $(BIN)/gs-geom views --geometry $(call arg,GEOMETRY) --out $(SCENE) $(views_OPTIONS) $(COMMON)
 metrics_RUN = $(BIN)/gs-geom eval --scene $(call arg,POSED) --geometry $(call arg,GEOMETRY) --out $(OUT)/geom_metrics.json \
   $(EVAL_ARGS) $(COMMON)
-masks_RUN = $(BIN)/mask-embed masks --scene $(call arg,PHOTOGRAPHS) --sam $(call arg,SAM) --out $(MASKS) $(masks_ARGS) $(COMMON)
-embed_RUN = $(BIN)/mask-embed embed --scene $(call arg,PHOTOGRAPHS) --masks $(MASKS) --clip $(call arg,CLIP) $(EMBED_ARGS) $(COMMON)
+masks_RUN = $(BIN)/mask-embed masks --scene $(call arg,DATASET) --sam $(call arg,SAM) --out $(MASKS) $(masks_ARGS) $(COMMON)
+embed_RUN = $(BIN)/mask-embed embed --scene $(call arg,DATASET) --masks $(MASKS) --clip $(call arg,CLIP) $(EMBED_ARGS) $(COMMON)
 graph_RUN = $(BIN)/graph-precompute --scene $(call arg,POSED) --geometry $(call arg,GEOMETRY) --masks $(MASKS) \
   --footprints $(FOOTPRINTS) --graph $(GRAPH) $(graph_OPTIONS) $(COMMON)
 feat_RUN = $(BIN)/feat-train --geometry $(call arg,GEOMETRY) --graph $(GRAPH) --footprints $(FOOTPRINTS) --out $(FEATURES) \
@@ -159,7 +161,7 @@ checked-options: checked | $(PROGRAMS)
 prepared: $(SCENE_FILES)
 $(OPTIONS)/geometry.forecast: $(SCENE_FILES) scripts/geometry_forecast.sh | $(BIN)/gs-geom
 	@mkdir -p $(@D)
-	scripts/geometry_forecast.sh $@ $(BIN)/gs-geom train --scene $(call arg,PHOTOGRAPHS) $(geom_OPTIONS) $(COMMON)
+	scripts/geometry_forecast.sh $@ $(BIN)/gs-geom train --scene $(call arg,DATASET) $(geom_OPTIONS) $(COMMON)
 
 # Stage 1. Not run when GEOMETRY names a PLY that exists already.
 $(OUT)/geometry.ply: $(SCENE_FILES) $(OPTIONS)/geom | $(BIN)/gs-geom

@@ -13,7 +13,7 @@ done
 if [ -n "${SAM_MAKES-}" ] && [ ! -e "$SAM_MAKES" ] && [ ! -e "$SAM/encoder.onnx" ] && [ ! -e "$SAM/model.json" ]; then
   bad "SAM=$SAM: no SAM model in this folder: run make models (or cags models), or give MASKS=folder"
 fi
-for name in GEOM_ARGS VIEW_ARGS MASK_ARGS EMBED_ARGS GRAPH_ARGS FEAT_ARGS CLUSTER_ARGS SCORE_ARGS REPORT_ARGS EVAL_ARGS SYNTH_ARGS; do
+for name in POSES_ARGS GEOM_ARGS VIEW_ARGS MASK_ARGS EMBED_ARGS GRAPH_ARGS FEAT_ARGS CLUSTER_ARGS SCORE_ARGS REPORT_ARGS EVAL_ARGS SYNTH_ARGS; do
   bash -nc ": ${!name-}" 2> /dev/null || bad "$name=${!name}: a shell cannot read this: close every quote and bracket"
 done
 for name in SEED THREADS; do

@@ -12,10 +12,12 @@ macro_rules! carried {
     ($($path:literal),* $(,)?) => { [$(($path, include_str!(concat!("../../../", $path)))),*] };
 }
 
-const FILES: [(&str, &str); 12] = carried![
+const FILES: [(&str, &str); 15] = carried![
     "pipelines/custom.mk",
     "pipelines/custom.conf",
     "pipelines/paths.mk",
+    "pipelines/poses.mk",
+    "pipelines/poses.txt",
     "pipelines/quality.mk",
     "pipelines/quality/fast.conf",
     "pipelines/quality/balanced.conf",
@@ -25,12 +27,14 @@ const FILES: [(&str, &str); 12] = carried![
     "scripts/check_options.sh",
     "scripts/check_settings.sh",
     "scripts/fetch_models.sh",
+    "scripts/poses.py",
 ];
 
 /// Settings that name a folder or file.
 const PATHS: [&str; 6] = ["GEOMETRY", "MASKS", "CLIP", "SAM", "VOCABULARY", "CONF"];
 /// All others.
-const OTHERS: [&str; 14] = [
+const OTHERS: [&str; 15] = [
+    "POSES_ARGS",
     "AXES",
     "QUALITY",
     "QUERIES",
@@ -69,7 +73,8 @@ enum Commands {
 
 #[derive(Debug, clap::Args)]
 struct RunOptions {
-    /// Folder of photographs with poses (COLMAP, transforms.json, ScanNet or 7-Scenes), or the file of a trained splat
+    /// Folder of photographs, with poses (COLMAP, transforms.json, ScanNet or 7-Scenes) or without, a video, or the file of a trained
+    /// splat
     #[arg(value_name = "SCENE")]
     input: PathBuf,
     /// Settings of make scene, such as QUALITY=fast GEOMETRY=file.spz CLIP=folder "QUERIES=red_mug plate"
@@ -156,6 +161,18 @@ fn passed_on(common: &CommonArgs) -> String {
     format!("--threads {threads}{flags}{limit}")
 }
 
+/// The setting that an input is for.
+fn kind_of(input: &Path) -> &'static str {
+    let extension = input.extension().unwrap_or_default().to_ascii_lowercase();
+    let is_video = ["mp4", "mov", "m4v", "mkv", "webm", "avi"].iter().any(|video| extension == *video);
+    match input.is_dir() {
+        true if gs_scene::dataset::is_bare(input) => "PHOTOGRAPHS",
+        true => "SCENE",
+        false if is_video => "PHOTOGRAPHS",
+        false => "GEOMETRY",
+    }
+}
+
 /// What make is told. Paths are whole: make runs in another folder.
 fn settings(o: &RunOptions, out: &Path) -> Result<Vec<OsString>> {
     let named = |name: &str, path: &Path| -> Result<OsString> {
@@ -163,7 +180,7 @@ fn settings(o: &RunOptions, out: &Path) -> Result<Vec<OsString>> {
         text.push(absolute(path)?);
         Ok(text)
     };
-    let mut all = vec![named(if o.input.is_dir() { "SCENE" } else { "GEOMETRY" }, &o.input)?, named("OUT", out)?];
+    let mut all = vec![named(kind_of(&o.input), &o.input)?, named("OUT", out)?];
     for (name, value) in &o.settings {
         all.push(match PATHS.contains(&name.as_str()) && !value.is_empty() {
             true => named(name, Path::new(value))?,
@@ -265,6 +282,12 @@ mod tests {
         assert_eq!(told[..3], expected);
         assert_eq!(told[3..], ["ITERATIONS=5".to_string(), format!("SAM={here}/models")]);
         assert!(of(dir.path(), &["CLIP="])[..].contains(&"CLIP=".to_string()));
+        std::fs::write(dir.path().join("a.JPG"), "").unwrap();
+        assert!(
+            of(dir.path(), &[])[0].starts_with("PHOTOGRAPHS=")
+                && of(&dir.path().join("a.MOV"), &[])[0].starts_with("PHOTOGRAPHS=")
+        );
+        std::fs::write(dir.path().join("transforms.json"), "").unwrap();
         assert!(of(dir.path(), &["CONF=x"])[0].starts_with("SCENE=") && of(dir.path(), &["CONF=x"]).len() == 3);
     }
 }

@@ -244,6 +244,12 @@ fn read(path: &Path) -> Result<RawDataset> {
         let layouts = layouts(path);
         let others: Vec<String> = layouts.iter().skip(1).map(Layout::name).collect();
         let Some(layout) = layouts.into_iter().next() else {
+            if is_bare(path) {
+                return Err(Error::new("photographs without poses")
+                    .file(path)
+                    .expected("cameras of COLMAP, a transforms.json, ScanNet or 7-Scenes beside them")
+                    .hint("make scene PHOTOGRAPHS=folder, or cags run, finds the poses first (scripts/poses.py)"));
+            }
             return Err(Error::new("no dataset recognised in this folder")
                 .file(path)
                 .expected("sparse/0/cameras.bin|txt (COLMAP), transforms.json or transforms_train.json, color/ pose/ intrinsic/ (ScanNet), or seq-01/frame-000000.color.png (7-Scenes)")
@@ -261,6 +267,11 @@ fn read(path: &Path) -> Result<RawDataset> {
     };
     upright::turn(&mut raw)?;
     Ok(raw)
+}
+
+/// Whether a folder has photographs and no cameras.
+pub fn is_bare(folder: &Path) -> bool {
+    layouts(folder).is_empty() && list(folder).is_ok_and(|files| files.iter().any(|file| names::is_picture(file)))
 }
 
 /// The cameras that a folder has.

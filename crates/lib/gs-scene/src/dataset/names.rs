@@ -10,6 +10,12 @@ use unicode_normalization::UnicodeNormalization;
 /// Extensions of photographs, which some programs leave out.
 const EXTENSIONS: [&str; 6] = ["png", "jpg", "jpeg", "PNG", "JPG", "JPEG"];
 
+/// Whether a file is named as photographs of phones and cameras are.
+pub(super) fn is_picture(file: &Path) -> bool {
+    let kind = file.extension().unwrap_or_default().to_ascii_lowercase();
+    ["jpg", "jpeg", "png", "heic", "heif", "webp"].iter().any(|k| kind == *k)
+}
+
 /// A path as other systems than Windows write it, from the folder on.
 pub(super) fn plain(path: &str) -> String {
     path.replace('\\', "/").trim_start_matches("./").to_string()

@@ -621,6 +621,17 @@ fn missing_photographs_are_skipped_until_none_is_left() {
 }
 
 #[test]
+fn photographs_without_poses_say_how_to_find_them() {
+    let dir = tempfile::tempdir().unwrap();
+    fs::write(dir.path().join("IMG_1.HEIC"), "").unwrap();
+    let e = dataset::load(dir.path(), &FULL).unwrap_err().to_string();
+    assert!(
+        dataset::is_bare(dir.path()) && e.contains("photographs without poses") && e.contains("PHOTOGRAPHS="),
+        "{e}"
+    );
+}
+
+#[test]
 fn folders_that_are_no_dataset_say_what_one_is() {
     let dir = tempfile::tempdir().unwrap();
     let e = dataset::load(dir.path(), &FULL).unwrap_err().to_string();
