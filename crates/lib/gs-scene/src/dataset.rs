@@ -168,6 +168,23 @@ pub(crate) struct RawDataset {
     pub skipped: Vec<PathBuf>,
 }
 
+impl RawDataset {
+    /// Whether both have the same photographs, seen from the same poses by the same lenses, to the digits that files keep.
+    fn same_cameras(&self, other: &Self) -> bool {
+        let near = |a: &[f64], b: &[f64]| a.iter().zip(b).all(|(a, b)| (a - b).abs() <= 1e-6 * a.abs().max(1.0));
+        let numbers =
+            |v: &RawView| [&v.lens.focal_center[..], &v.rotation.to_cols_array(), &v.translation.to_array()].concat();
+        let same = |(a, b): (&RawView, &RawView)| a.image_path == b.image_path && near(&numbers(a), &numbers(b));
+        let sorted = |d: &'_ Self| {
+            let mut order: Vec<usize> = (0..d.views.len()).collect();
+            order.sort_by(|&a, &b| d.views[a].image_path.cmp(&d.views[b].image_path));
+            order
+        };
+        let pairs = sorted(self).into_iter().zip(sorted(other)).map(|(a, b)| (&self.views[a], &other.views[b]));
+        self.views.len() == other.views.len() && pairs.into_iter().all(same)
+    }
+}
+
 /// Focal lengths in longer sides of the photograph. A pinhole camera of the least sees 179.9 degrees; lenses stay below 150.
 /// The most is a view of 2 arcseconds; telescopes and satellites' cameras stay below 10,000.
 const FOCAL: std::ops::Range<f64> = 1e-3..1e5;
@@ -242,8 +259,8 @@ fn read(path: &Path) -> Result<RawDataset> {
         ));
     } else {
         let layouts = layouts(path);
-        let others: Vec<String> = layouts.iter().skip(1).map(Layout::name).collect();
-        let Some(layout) = layouts.into_iter().next() else {
+        let mut layouts = layouts.into_iter();
+        let Some(layout) = layouts.next() else {
             if is_bare(path) {
                 return Err(Error::new("photographs without poses")
                     .file(path)
@@ -257,6 +274,12 @@ fn read(path: &Path) -> Result<RawDataset> {
         };
         let name = layout.name();
         let mut raw = layout.load(path)?;
+        // Which of two is read matters where they differ.
+        let differs = |other: Layout| {
+            let name = other.name();
+            other.load(path).map_or(true, |other| !raw.same_cameras(&other)).then_some(name)
+        };
+        let others: Vec<String> = layouts.filter_map(differs).collect();
         if !others.is_empty() {
             raw.warnings.push(format!(
                 "the folder has several sets of cameras: {name} is read, not {}; --scene takes the file of another",

@@ -27,7 +27,20 @@ fn a_georeferenced_scene_trains_as_at_home() {
 
     // Gaussians in any format that keeps the shift fit the photographs; those without it are refused.
     let measured = |file: &str| {
-        succeeds(&["eval", "--scene", &scene, "--geometry", file, "--out", &dir.path("m.json"), "--overwrite"]);
+        // Only a PLY says which views training held out.
+        let eval = [
+            "eval",
+            "--scene",
+            &scene,
+            "--geometry",
+            file,
+            "--holdout",
+            "8",
+            "--out",
+            &dir.path("m.json"),
+            "--overwrite",
+        ];
+        succeeds(&eval);
         json(&dir.path("m.json"))["psnr_heldout"].as_f64().unwrap()
     };
     assert!((measured(&out) - psnr).abs() < 0.1, "{} {psnr}", measured(&out));
