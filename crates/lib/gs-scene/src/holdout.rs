@@ -94,8 +94,9 @@ impl HoldOut {
         Some(format!("--holdout {}, but the Gaussians were trained with --holdout {}{those}", self.every, learnt.every))
     }
 
-    /// Whether the views held out may be called so: training did not see them, or an option says so of Gaussians that do not.
+    /// Whether the views held out may be called so: an option says so, which is answered by [`Self::differs`] where it is wrong of
+    /// these photographs' names, or training did not see them.
     pub fn is_trusted(&self, dataset: &Dataset) -> bool {
-        self.seen(dataset).map_or(self.given, |seen| seen == 0)
+        self.given || self.seen(dataset) == Some(0)
     }
 }

@@ -5,7 +5,7 @@ use crate::metrics::{Means, ViewMetrics, measure};
 use crate::options::{Eval, bytes};
 use crate::training::loss::Derivatives;
 use artifacts::role;
-use gs_io::{Error, Result, hash_file, write_json};
+use gs_io::{Result, hash_file, write_json};
 use gs_scene::dataset::{Split, View};
 use serde_json::json;
 use stage::Stage;
@@ -15,9 +15,7 @@ impl Eval {
     pub(crate) fn run(&self, stage: &Stage) -> Result<()> {
         let (scene, held) = self.scene.for_geometry(&self.geometry)?;
         let mut dataset = scene.load(stage)?;
-        if let Some(why) = held.differs(&dataset).filter(|_| held.seen(&dataset) > Some(0)) {
-            return Err(Error::new(why).hint("leave --holdout out"));
-        }
+        held.differs(&dataset).iter().for_each(|what| stage.warn(what));
         let needed = memory::of_figures(bytes(&self.geometry.geometry)?, &Pictures::of(&dataset)?);
         stage.forecast(needed, "give a smaller --geometry or --resolution")?;
         let (gaussians, options) = self.geometry.read(self.scene.background, stage)?;
@@ -52,6 +50,7 @@ impl Eval {
         let of = |wanted: &str, v: Option<f64>| v.filter(|_| split == wanted);
         let metrics = json!({
             "split": split,
+            "seen_by_training": held.seen(&dataset),
             "psnr": psnr,
             "ssim": ssim,
             "psnr_heldout": of("test", psnr),

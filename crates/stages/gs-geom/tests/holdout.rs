@@ -3,7 +3,7 @@
 mod common;
 
 use common::world::{balls, points, scene, write_world};
-use common::{Folder, json, refused, succeeds};
+use common::{Folder, json, succeeds};
 use gs_scene::ply;
 use serde_json::{Value, json};
 use std::fs;
@@ -42,9 +42,9 @@ fn the_hold_out_of_training_is_that_of_later_stages() {
     let said = succeeds(&[&render[..], &["--holdout", "2"]].concat());
     assert!(said.contains("--holdout 2, but the Gaussians were trained with --holdout 5"), "{said}");
     // Of 00, 02, 04, 06 and 08 training saw all but the first; of every tenth view none.
-    let said =
-        refused(&["eval", "--scene", scene(), "--geometry", &out, "--out", &dir.path("n.json"), "--holdout", "2"]);
+    let (m, said) = measured(&dir, scene(), &out, &["--holdout", "2"]);
     assert!(said.contains("trained with --holdout 5: training saw 4 of the views held out here"), "{said}");
+    assert_eq!(m["seen_by_training"], 4);
     assert_eq!(names(&measured(&dir, scene(), &out, &["--holdout", "10"]).0), ["00.png"]);
     // All views were learnt from.
     trained(scene(), &out, &["--holdout", "0", "--overwrite"]);
