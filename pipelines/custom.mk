@@ -50,7 +50,7 @@ endif
 
 # Gaussians of others may have other axes than their format says: the photographs tell, or AXES. Those of a run of ours, in its OUT, are right.
 ifneq ($(and $(GEOMETRY),$(SCENE)$(AXES)),)
-ifeq ($(wildcard $(dir $(GEOMETRY)).options/geom),)
+ifeq ($(if $(call odd,$(GEOMETRY)),,$(wildcard $(dir $(GEOMETRY)).options/geom)),)
 SPLAT := $(GEOMETRY)
 override GEOMETRY := $(OUT)/given.ply
 endif
