@@ -157,7 +157,8 @@ pub(crate) fn load(root: &Path, model: Model) -> Result<RawDataset> {
         }
     }
     warnings.extend(chosen);
-    warnings.extend(distorted(model, &views));
+    // Those of scripts/poses.py are as the camera took them.
+    warnings.extend(distorted(model, &views).filter(|_| !root.join("poses.json").is_file()));
     Ok(RawDataset { format: Format::Colmap, files, views, points, warnings, skipped: Vec::new() })
 }
 

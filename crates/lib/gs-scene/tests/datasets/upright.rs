@@ -117,6 +117,10 @@ fn cameras_of_the_pixels_as_they_lie_are_turned_with_the_photograph() {
         let same = same.filter(|&(x, y)| at(x, y) == plain[y * shape.0 + x]).count();
         assert!(same * 100 > 99 * plain.len(), "{orientation}: {same} of {}", plain.len());
     }
+    // Photographs whose poses scripts/poses.py found are known to be as the lens saw them.
+    assert!(straight.warnings.len() == 1 && straight.warnings[0].contains("distorted"), "{:?}", straight.warnings);
+    write(&dir.path().join("poses.json"), "{}");
+    assert!(scene(dir.path(), 6).warnings.is_empty());
 }
 
 #[test]
