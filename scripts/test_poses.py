@@ -88,7 +88,7 @@ def off(model, truth):
     return max(angles), np.linalg.norm(scale * a @ turn.T - b, axis=1).max() / np.linalg.norm(b, axis=1).max(), tilt
 
 
-def photographs(folder, poses, name="img_{:02}.jpg", exif=None):
+def photographs(folder, poses, name="img_{:02}.jpg"):
     folder.mkdir()
     for i, (eye, rotation) in enumerate(poses):
         Image.fromarray(picture(eye, rotation)).save(folder / name.format(i), quality=97)

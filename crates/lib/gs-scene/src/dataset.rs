@@ -20,6 +20,7 @@ use glam::{DMat3, DMat4, DQuat, DVec3};
 use gs_io::{Error, IoContext, Result, hash_bytes, hash_file};
 pub use mask::Odd;
 use rayon::prelude::*;
+use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 use upright::Turn;
 pub use view::View;
@@ -171,17 +172,14 @@ pub(crate) struct RawDataset {
 impl RawDataset {
     /// Whether both have the same photographs, seen from the same poses by the same lenses, to the digits that files keep.
     fn same_cameras(&self, other: &Self) -> bool {
-        let near = |a: &[f64], b: &[f64]| a.iter().zip(b).all(|(a, b)| (a - b).abs() <= 1e-6 * a.abs().max(1.0));
         let numbers =
             |v: &RawView| [&v.lens.focal_center[..], &v.rotation.to_cols_array(), &v.translation.to_array()].concat();
-        let same = |(a, b): (&RawView, &RawView)| a.image_path == b.image_path && near(&numbers(a), &numbers(b));
-        let sorted = |d: &'_ Self| {
-            let mut order: Vec<usize> = (0..d.views.len()).collect();
-            order.sort_by(|&a, &b| d.views[a].image_path.cmp(&d.views[b].image_path));
-            order
+        let by_photograph = |d: &Self| -> BTreeMap<PathBuf, Vec<f64>> {
+            d.views.iter().map(|v| (v.image_path.clone(), numbers(v))).collect()
         };
-        let pairs = sorted(self).into_iter().zip(sorted(other)).map(|(a, b)| (&self.views[a], &other.views[b]));
-        self.views.len() == other.views.len() && pairs.into_iter().all(same)
+        let near = |a: &[f64], b: &[f64]| a.iter().zip(b).all(|(a, b)| (a - b).abs() <= 1e-6 * a.abs().max(1.0));
+        let (ours, theirs) = (by_photograph(self), by_photograph(other));
+        self.views.len() == other.views.len() && ours.iter().zip(&theirs).all(|(a, b)| a.0 == b.0 && near(a.1, b.1))
     }
 }
 
@@ -258,8 +256,7 @@ fn read(path: &Path) -> Result<RawDataset> {
             "give the folder of a COLMAP, transforms.json, ScanNet or 7-Scenes scene, a transforms.json, or a COLMAP model's cameras.bin",
         ));
     } else {
-        let layouts = layouts(path);
-        let mut layouts = layouts.into_iter();
+        let mut layouts = layouts(path).into_iter();
         let Some(layout) = layouts.next() else {
             if is_bare(path) {
                 return Err(Error::new("photographs without poses")
