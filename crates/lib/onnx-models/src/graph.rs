@@ -49,6 +49,8 @@ pub struct Graph {
     pub initializers: BTreeMap<String, Range<usize>>,
     /// Names of the files beside the model that hold weights.
     pub external_data: BTreeSet<String>,
+    /// Whether a node holds a graph of its own (If, Loop, Scan), which may read any value without naming it as an input.
+    pub nested: bool,
 }
 
 /// A field of a protobuf message: number, what it holds, and the bytes of the whole field.
@@ -156,6 +158,7 @@ impl Graph {
                 GRAPH_NODE => {
                     let of = |number| texts(bytes, &inner, number);
                     let op = of(NODE_OP_TYPE)?.pop().unwrap_or_default();
+                    graph.nested |= ["If", "Loop", "Scan"].contains(&op.as_str());
                     let node = Node { op, inputs: of(NODE_INPUT)?, outputs: of(NODE_OUTPUT)? };
                     for output in &node.outputs {
                         graph.producers.insert(output.clone(), node.clone());
@@ -182,7 +185,8 @@ impl Graph {
         Ok(graph)
     }
 
-    /// The same model with the values `names` as its only outputs.
+    /// The same model with the values `names` as its only outputs, without what they do not need: ONNX Runtime computes every
+    /// node that it is given.
     ///
     /// # Errors
     /// When no node makes such a value.
@@ -192,10 +196,17 @@ impl Graph {
                 .field(*name)
                 .expected(format!("an output such as {}", self.outputs.join(", "))));
         }
+        let needed = self.needed(names);
         let (range, whole) = graph_range(bytes)?;
         let mut graph = Vec::with_capacity(range.len());
         for field in fields(bytes, range)? {
-            if field.number != GRAPH_OUTPUT {
+            let makes = match (field.number, &field.value) {
+                (GRAPH_NODE, Value::Bytes(node)) => texts(bytes, node, NODE_OUTPUT)?,
+                (GRAPH_INITIALIZER, Value::Bytes(array)) => texts(bytes, array, TENSOR_NAME)?,
+                (GRAPH_OUTPUT, _) => continue,
+                _ => Vec::new(),
+            };
+            if makes.is_empty() || self.nested || makes.iter().any(|n| needed.contains(n.as_str())) {
                 graph.extend_from_slice(&bytes[field.whole]);
             }
         }
@@ -208,6 +219,20 @@ impl Graph {
         push_bytes(&mut model, MODEL_GRAPH, &graph);
         model.extend_from_slice(&bytes[whole.end..]);
         Ok(model)
+    }
+
+    /// The values that the values `names` are made from, and these.
+    fn needed<'a>(&'a self, names: &[&'a str]) -> BTreeSet<&'a str> {
+        let mut needed = BTreeSet::new();
+        let mut open = names.to_vec();
+        while let Some(name) = open.pop() {
+            if needed.insert(name)
+                && let Some(node) = self.producers.get(name)
+            {
+                open.extend(node.inputs.iter().map(String::as_str));
+            }
+        }
+        needed
     }
 
     /// Shape and values of the constant array `name`; `None` where there is none, or where its values are no 32-bit floats

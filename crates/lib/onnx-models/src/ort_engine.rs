@@ -67,6 +67,9 @@ pub(crate) fn open(
         .with_optimization_level(GraphOptimizationLevel::All)
         .map_err(|e| fail(&e))?
         .with_intra_threads(rayon::current_num_threads())
+        .map_err(|e| fail(&e))?
+        // Threads that spin between two runs keep the program's own threads from the cores.
+        .with_intra_op_spinning(false)
         .map_err(|e| fail(&e))
         .and_then(|mut b| {
             if external { b.commit_from_file(path) } else { b.commit_from_memory(&bytes) }.map_err(|e| fail(&e))

@@ -2,7 +2,7 @@
 //!
 //! ONNX Runtime is tried too where `ORT_TEST_LIBRARY` names its shared library.
 
-use onnx_models::{EngineOptions, Kind, Model, Outputs, Tensor, open};
+use onnx_models::{EngineOptions, Graph, Kind, Model, Outputs, Tensor, open};
 use std::path::{Path, PathBuf};
 
 fn testdata(name: &str) -> PathBuf {
@@ -53,6 +53,15 @@ fn a_value_inside_the_graph_can_be_the_output() {
         let e = open(testdata("ops.onnx"), Outputs::Values(&["thrice"]), &options).err().unwrap().to_string();
         assert!(e.contains("thrice: the model has no such value") && e.contains("sum, product"), "{e}");
     }
+}
+
+#[test]
+fn what_an_output_does_not_need_is_left_out() {
+    let bytes = std::fs::read(testdata("ops.onnx")).unwrap();
+    let whole = Graph::parse(&bytes).unwrap();
+    let part = Graph::parse(&whole.with_outputs(&bytes, &["twice"]).unwrap()).unwrap();
+    assert!(whole.producers.contains_key("product") && !part.producers.contains_key("product"));
+    assert_eq!(part.producers["twice"], whole.producers["twice"]);
 }
 
 #[test]
