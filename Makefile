@@ -126,15 +126,13 @@ ONLY ?=
 ablation: build ## Tables 3 to 5 on synthetic scenes by a plan: make ablation PLAN=file OUT=folder ONLY=tables (hours)
 	target/release/bench run $(or $(PLAN),pipelines/ablation.plan) --work $(or $(OUT),out/ablation)/runs \
 	  --out $(or $(OUT),out/ablation)/report.json --threads $(JOBS) $(if $(ONLY),--only $(ONLY))
-	$(if $(PLAN)$(OUT)$(ONLY),,sed -i '/^# Tables/,$$d' docs/results/paper.md && sed '1s/.*/# Tables/' out/ablation/report.md >> docs/results/paper.md)
 
-# docs/results/peers.md and .json are written anew by a run of the whole plan.
+# A run of the whole plan writes docs/results/peers.json anew; docs/results/peers.md has tables of out/peers/report.md.
 peers: build ## The field's systems beside ours: make peers PLAN=file OUT=folder ONLY=systems (hours; docs/peers.md)
 	target/release/bench run $(or $(PLAN),pipelines/peers.plan) --work $(or $(OUT),out/peers)/runs \
 	  --out $(or $(OUT),out/peers)/report.json --threads $(JOBS) $(if $(ONLY),--only $(ONLY))
 	scripts/peers_summary.py $(or $(OUT),out/peers)/report.json $(or $(OUT),out/peers)/peers.json
-	$(if $(PLAN)$(OUT)$(ONLY),,sed -i '/^# Tables/,$$d' docs/results/peers.md && sed '1s/.*/# Tables/' out/peers/report.md >> docs/results/peers.md \
-	  && cp out/peers/peers.json docs/results/peers.json && cp out/peers/report.svg docs/images/peers.svg)
+	$(if $(PLAN)$(OUT)$(ONLY),,cp out/peers/peers.json docs/results/peers.json && cp out/peers/report.svg docs/images/peers.svg)
 
 search: build ## Search the readings of the paper for the best one, in three rounds: out/search (hours)
 	mkdir -p out/search
@@ -170,7 +168,7 @@ BASE ?=
 bench: build ## Run time against error of every approximation, and growth: out/bench/report.html (BASE=revision: two builds in turns)
 ifeq ($(BASE),)
 	target/release/bench run pipelines/tradeoffs.plan --work out/bench/tradeoffs --out out/bench/report.json \
-	  $(if $(ONLY),--only $(ONLY),&& cp out/bench/report.md docs/results/tradeoffs.md)
+	  $(if $(ONLY),--only $(ONLY))
 else
 	scripts/bench_base.sh $(BASE)
 endif

@@ -1,6 +1,6 @@
 #!/bin/bash
-# Predicted against measured peak memory of gs-geom on quite different runs: out/bench/memory.md, the table of
-# docs/results/geometry-memory.md. DESK is a folder of photographs with COLMAP poses (its runs are skipped where there is none).
+# Predicted against measured peak memory of gs-geom on quite different runs: out/bench/memory.md
+# (docs/performance.md, "Memory"). DESK is a folder of photographs with COLMAP poses (its runs are skipped where there is none).
 set -euo pipefail
 cd "$(dirname "$0")/.."
 CARGO=${CARGO:-cargo}

@@ -20,7 +20,7 @@ for word in "$@"; do
   previous=$word
 done
 # 18 iterations per CPU second were measured at 480 x 360 pixels and 45,000 Gaussians; the exponents are those of
-# docs/results/tradeoffs.md, between the two largest sizes there. A run begins with few Gaussians, so fewer save nothing here.
+# docs/performance.md ("Growth"), between the two largest sizes there. A run begins with few Gaussians, so fewer save nothing here.
 awk -v iterations="$iterations" '
   match($0, /[0-9]+x[0-9]+ pixels/) { split(substr($0, RSTART, RLENGTH), s, /[x ]/); pixels = s[1] * s[2] }
   match($0, /[0-9]+ training views and [0-9]+ held out/) { split(substr($0, RSTART, RLENGTH), v, " "); views = v[1] + v[5] }

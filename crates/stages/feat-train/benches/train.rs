@@ -1,6 +1,6 @@
 //! `make bench-train`: what an iteration of training costs at a million Gaussians, 100,000 anchors and 300 views, what
 //! `--early-stop` saves, and what the closed form costs. [`scene`] says how the scene is made. Writes out/bench/train.json;
-//! docs/training.md has the figures.
+//! docs/performance.md has the figures.
 
 mod scene;
 

@@ -1,6 +1,6 @@
 //! Forecasts of the memory that a run will take.
 //!
-//! The terms are counted from the sizes of the arrays that live at the same time; docs/geometry-memory.md compares them with
+//! The terms are counted from the sizes of the arrays that live at the same time; docs/performance.md compares them with
 //! measured peaks, and so does tests/cli.rs on small scenes.
 
 use gs_io::Result;
