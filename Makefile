@@ -90,11 +90,12 @@ test-data: ## Run the tests that need real photographs, full-size models or orac
 	scripts/test_clip_model.sh 12
 	$(CARGO) test --release --workspace -- --ignored
 
-lint: ## Check formatting, lints, documentation and licences
+lint: ## Check formatting, lints, documentation, licences, and links and options of the documents
 	$(CARGO) fmt --all --check
 	$(CARGO) clippy --release --workspace --all-targets -- -D warnings
 	RUSTDOCFLAGS="-D warnings" $(CARGO) doc --release --workspace --no-deps --quiet
 	scripts/licences.py --check
+	scripts/check_docs.py --self-test && scripts/check_docs.py
 
 SEED ?= 1
 TRIALS ?= 200
