@@ -1,6 +1,6 @@
 #!/bin/bash
-# Cost of gs-geom's iteration against Gaussians, pixels and threads: out/bench/growth.json and growth.md, the table of
-# docs/results/geometry.md. GAUSSIANS, WIDTHS, COUNTS (of threads) and REPEATS say what is run. Finished runs are kept in
+# Cost of gs-geom's iteration against Gaussians, pixels and threads: out/bench/growth.json and growth.md.
+# GAUSSIANS, WIDTHS, COUNTS (of threads) and REPEATS say what is run. Finished runs are kept in
 # out/bench/growth.runs: remove that folder after a change of the program.
 set -euo pipefail
 cd "$(dirname "$0")/.."

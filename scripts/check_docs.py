@@ -1,5 +1,5 @@
 #!/usr/bin/env python3
-"""Checks README.md and docs/: links, anchors, options, paths, targets of make, and sizes.
+"""Checks README.md, those of crates, and docs/: links, anchors, options, paths, targets of make, sizes; and links to docs/ in code.
 
     scripts/check_docs.py                # says what is wrong, a line each; exit code 1 where something is
     scripts/check_docs.py --self-test    # makes documents with one fault of each kind, and fails where one is not found
@@ -55,10 +55,9 @@ def options(root):
         for attribute, field in re.findall(r"#\[arg\((.*?)\)\]\s*(?:#\[[^\n]*\]\s*)*(?:pub(?:\(\w+\))? )?(\w+):", text, re.S):
             if re.search(r"\blong\b", attribute):
                 known.add(field.replace("_", "-"))
-        known.update(re.findall(r"\"--([a-z0-9-]+)\"", text))
     for script in root.glob("scripts/*"):
         if script.is_file() and script.name != Path(__file__).name:
-            known.update(re.findall(r"[\"' |(]--([a-z0-9-]+)[\"' |)=]", script.read_text(errors="replace")))
+            known.update(re.findall(r"[\"' |(]--([a-z][a-z0-9-]*)[\"' |)=]", script.read_text(errors="replace")))
     return known
 
 
@@ -83,12 +82,13 @@ def check(root, words=WORDS):
     """What is wrong, a line each."""
     found, total = [], 0
     known_options, known_targets = options(root), targets(root)
-    for page in pages(root):
+    for page in [*pages(root), *sorted(root.glob("crates/**/README.md"))]:
         name, text = str(page.relative_to(root)), page.read_text()
-        total += len(text.split())
-        lines, most = text.count("\n"), LINES.get(name) or LINES[str(page.parent.relative_to(root))]
-        if lines > most:
-            found.append(f"{name}: {lines} lines; {most} at most")
+        most = LINES.get(name) or LINES.get(str(page.parent.relative_to(root)))
+        if most:
+            total += len(text.split())
+            lines = text.count("\n")
+            found += [f"{name}: {lines} lines; {most} at most"] if lines > most else []
         prose, code = split(text)
         for link in re.findall(r"\]\(([^)\s]+)\)", prose):
             path, _, anchor = link.partition("#")
@@ -108,6 +108,11 @@ def check(root, words=WORDS):
                 if is_ours and not any(root.glob(word.rstrip("/."))):
                     found.append(f"{name}: no such path: {word}")
             found += [f"{name}: no such target: make {t}" for t in made(piece) if t not in known_targets]
+    for source in [root / "Makefile", *root.glob("crates/**/*.rs"), *root.glob("scripts/*"), *root.glob("pipelines/*")]:
+        if source.is_file() and source.name != Path(__file__).name:
+            for link in re.findall(r"\bdocs/[a-z/-]+\.md", source.read_text(errors="replace")):
+                if not (root / link).exists():
+                    found.append(f"{source.relative_to(root)}: no such file: {link}")
     if total > words:
         found.append(f"README.md and docs: {total} words; {words} at most")
     return found
@@ -120,6 +125,7 @@ def self_test():
         "docs/results/table.md": "# Table\n\n[page](../page.md)\n",
         "Makefile": "demo: build ## Show\n",
         "crates/lab/prog/src/options.rs": "#[arg(long, default_value_t = 1)]\npub(crate) fast: u32,\n",
+        "crates/lab/prog/README.md": "# prog\n",
         "scripts/run.py": 'p.add_argument("--slow")\n',
     }
     faults = [
@@ -134,6 +140,8 @@ def self_test():
         ("README.md", "x\n" * 78, "README.md: 81 lines; 80 at most"),
         ("docs/page.md", "x\n" * 114, "docs/page.md: 121 lines; 120 at most"),
         ("docs/results/table.md", "x\n" * 68, "docs/results/table.md: 71 lines; 70 at most"),
+        ("crates/lab/prog/README.md", "[x](../../docs/page.md)\n", "crates/lab/prog/README.md: no such file: ../../docs/page.md"),
+        ("scripts/run.py", "# docs/none.md\n", "scripts/run.py: no such file: docs/none.md"),
         ("docs/page.md", "x " * 100, "README.md and docs: 128 words; 100 at most"),
     ]
     for file, more, expected in [("README.md", "", None), *faults]:

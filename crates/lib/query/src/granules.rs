@@ -5,7 +5,7 @@ use artifacts::{Granule, Instances, Members, flat};
 use serde::{Deserialize, Serialize};
 
 /// How much it counts that the masks show a granule as one, beside how well it suits the feature: the best score of all is one unit
-/// above the mean of all. 0.3 to 0.7 give the same on synthetic scenes within a point (docs/results/peers.md).
+/// above the mean of all. 0.3 to 1 give nearly the same on synthetic scenes (docs/results/queries.md).
 const FIT: f64 = 0.6;
 /// What scores at least this on that scale is meant, too, ...
 const NEARLY: f64 = 0.8;
