@@ -77,7 +77,7 @@ fn a_time_budget_is_a_plan_that_can_be_run_without_it() {
     let given = ["train", "--scene", scene(), "--densify", "mcmc", "--max-gaussians", "400", "--out"];
     let budget = ["--time-budget", "1.5s", "--iterations", "300"];
     // A run that was killed keeps to its plan, however fast the machine is by then.
-    killed(&[&given[..], &[&out], &budget].concat(), &out);
+    killed(&[&given[..], &[&out], &budget].concat(), &out, "1");
     let kept = json(&format!("{out}.plan.json"));
     succeeds(&[&given[..], &[&out], &budget].concat());
     let record = record(&out);
@@ -96,11 +96,16 @@ fn a_time_budget_is_a_plan_that_can_be_run_without_it() {
 fn a_killed_run_goes_on_to_the_same_bytes() {
     let dir = Folder::new();
     let out = dir.path("g.ply");
-    killed(&training(scene(), &out, "160", &[]), &out);
-    succeeds(&training(scene(), &out, "160", &["--checkpoint-every", "0.01s"]));
-    assert_eq!(fs::read(&out).unwrap(), undisturbed().0);
-    assert_eq!(fs::read(format!("{out}.curve.jsonl")).unwrap(), undisturbed().1);
-    assert_eq!(dir.names(), ["g.ply", "g.ply.curve.jsonl", "g.ply.curve.svg", "g.ply.run.json"]);
+    // By the number of iterations, and by the clock as where nothing is asked for.
+    for every in ["1", "0.01s"] {
+        killed(&training(scene(), &out, "160", &[]), &out, every);
+        let said = succeeds(&training(scene(), &out, "160", &["--checkpoint-every", "0.01s"]));
+        assert!(said.contains("going on after iteration"), "{said}");
+        assert_eq!(fs::read(&out).unwrap(), undisturbed().0);
+        assert_eq!(fs::read(format!("{out}.curve.jsonl")).unwrap(), undisturbed().1);
+        assert_eq!(dir.names(), ["g.ply", "g.ply.curve.jsonl", "g.ply.curve.svg", "g.ply.run.json"]);
+        fs::remove_file(&out).unwrap();
+    }
 }
 
 #[test]
@@ -121,7 +126,7 @@ fn a_signal_ends_with_a_checkpoint_and_usable_gaussians() {
 fn a_checkpoint_of_other_parameters_is_not_used() {
     let dir = Folder::new();
     let out = dir.path("g.ply");
-    killed(&training(scene(), &out, "160", &["--holdout", "5"]), &out);
+    killed(&training(scene(), &out, "160", &["--holdout", "5"]), &out, "1");
     let o = run(&training(scene(), &out, "160", &[]));
     let said = String::from_utf8_lossy(&o.stderr);
     assert!(o.status.success() && said.contains("beginning anew") && said.contains("another run"), "{said}");

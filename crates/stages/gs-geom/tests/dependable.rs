@@ -206,7 +206,7 @@ fn gaussians_that_break_arithmetic_leave_every_parameter_finite() {
 fn gaussians_that_are_not_finite_are_never_written() {
     let dir = Folder::new();
     let out = dir.path("g.ply");
-    killed(&training(scene(), &out, "60", &[]), &out);
+    killed(&training(scene(), &out, "60", &[]), &out, "1");
     // The next step goes wrong: a moment is not a number.
     let state = format!("{out}.checkpoint");
     let checkpoint = gs_io::Artifact::open(&state, "gs-geom-checkpoint", 5).unwrap();

@@ -41,7 +41,7 @@ fn refined_cameras_are_the_same_bytes_after_a_kill_and_on_any_threads_and_stand_
     let options = ["--refine-poses", "--seed", "3", "--threads", "2"];
     succeeds(&training(&scene, &out, "160", &options));
     let one = ["--refine-poses", "--seed", "3", "--threads", "1"];
-    killed(&training(&scene, &again, "160", &one), &again);
+    killed(&training(&scene, &again, "160", &one), &again, "1");
     succeeds(&training(&scene, &again, "160", &one));
     let [cameras, others] = [&out, &again].map(|o| format!("{o}.cameras.json"));
     for (a, b) in [(&out, &again), (&cameras, &others)] {

@@ -56,9 +56,11 @@ pub fn disturbed(arguments: &[&str], out: &str, disturb: impl FnOnce(&mut std::p
     child.wait_with_output().unwrap()
 }
 
-/// Kills a training after its first checkpoint.
-pub fn killed(arguments: &[&str], out: &str) {
-    disturbed(&[arguments, &["--checkpoint-every", "1"]].concat(), out, |child| child.kill().unwrap());
+/// Kills a training after its first checkpoint, of those that it makes `every` so many iterations or seconds.
+pub fn killed(arguments: &[&str], out: &str, every: &str) {
+    disturbed(&[arguments, &["--checkpoint-every", every]].concat(), out, |child| child.kill().unwrap());
+    let there = |suffix: &str| PathBuf::from(format!("{out}{suffix}")).exists();
+    assert!(there(".checkpoint") && !there(""), "--checkpoint-every {every}: a checkpoint before the end");
 }
 
 pub fn json(path: &str) -> Value {
