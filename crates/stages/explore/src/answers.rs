@@ -107,8 +107,9 @@ pub fn pick(world: &World, edited: &Edited, click: &Click) -> Result<Picked> {
     }
     let most = |a: &(i32, f64), b: &(i32, f64)| a.1.total_cmp(&b.1).then(b.0.cmp(&a.0));
     let best = of_instance.into_iter().max_by(most).map(|(label, _)| label);
-    let own =
-        |cell: &u32| world.cells[*cell as usize].0 == best.unwrap_or(-1) || edited_label(world, edited, *cell) == best;
+    // What the edits made of a cell: all of it belongs to one instance.
+    let label = |cell: u32| edited.instances.label[world.first_of[cell as usize] as usize];
+    let own = |cell: &u32| world.cells[*cell as usize].0 == best.unwrap_or(-1) || Some(label(*cell)) == best;
     let cell = of_cell.iter().filter(|(c, _)| own(c)).max_by(|a, b| a.1.total_cmp(b.1)).map(|(&c, _)| c);
     Ok(Picked {
         instance: best.and_then(|l| u32::try_from(l).ok()),
@@ -116,12 +117,6 @@ pub fn pick(world: &World, edited: &Edited, click: &Click) -> Result<Picked> {
         position: (alpha > 0.0).then_some(position),
         alpha,
     })
-}
-
-/// The instance that a cell belongs to after the edits; none where no Gaussian has the cell.
-fn edited_label(world: &World, edited: &Edited, cell: u32) -> Option<i32> {
-    let first = world.cell_of.iter().position(|&c| c == cell)?;
-    Some(edited.instances.label[first])
 }
 
 /// What a text finds.

@@ -29,6 +29,8 @@ pub struct World {
     pub cells: Vec<(i32, i32)>,
     /// Cell of every Gaussian; N.
     pub cell_of: Vec<u32>,
+    /// First Gaussian of every cell.
+    pub first_of: Vec<u32>,
     /// Colours of the features, rgb per packed Gaussian; empty where the run has no features.
     pub feature_colors: Vec<[u8; 3]>,
     /// Where text features come from, or why there are none.
@@ -100,7 +102,7 @@ impl World {
         });
         let packed = pack(scene.gaussians(), o.sh);
         let reach = Reach::new(scene.gaussians(), &packed.order);
-        let (cells, cell_of) = cells(&scene.instances);
+        let (cells, cell_of, first_of) = cells(&scene.instances);
         let feature_colors = match feature_colors(o, &scene, &packed) {
             Ok(colors) => colors,
             Err(e) => {
@@ -121,6 +123,7 @@ impl World {
             reach,
             cells,
             cell_of,
+            first_of,
             feature_colors,
             words,
             unrelated: OnceLock::new(),
@@ -228,19 +231,20 @@ fn names(source: &Source, scene: &LabelledScene) -> Result<Option<InstanceNames>
     path.map(|path| InstanceNames::read(path, scene.artifact.hash())).transpose()
 }
 
-/// The different pairs of label and node in order of their first Gaussian, and which of them each Gaussian has.
-fn cells(instances: &Instances) -> (Vec<(i32, i32)>, Vec<u32>) {
+/// The different pairs of label and node in order of their first Gaussian, which of them each Gaussian has, and those first ones.
+fn cells(instances: &Instances) -> (Vec<(i32, i32)>, Vec<u32>, Vec<u32>) {
     let mut known = BTreeMap::new();
-    let mut cells = Vec::new();
+    let (mut cells, mut first) = (Vec::new(), Vec::new());
     let pairs = instances.label.iter().copied().zip(instances.node.iter().copied());
-    let of = pairs.map(|pair| {
+    let of = pairs.enumerate().map(|(i, pair)| {
         *known.entry(pair).or_insert_with(|| {
             cells.push(pair);
+            first.push(i as u32);
             cells.len() as u32 - 1
         })
     });
     let of = of.collect();
-    (cells, of)
+    (cells, of, first)
 }
 
 /// Grey of a Gaussian that no view sees and that has no features.
@@ -265,8 +269,8 @@ mod tests {
     #[test]
     fn cells_are_pairs_of_instance_and_cluster() {
         let i = Instances { label: vec![0, 0, -1, 0, 1], node: vec![7, 8, -1, 7, 7], ..Instances::default() };
-        let (cells, of) = cells(&i);
+        let (cells, of, first) = cells(&i);
         assert_eq!(cells, [(0, 7), (0, 8), (-1, -1), (1, 7)]);
-        assert_eq!(of, [0, 1, 2, 0, 3]);
+        assert_eq!((of, first), (vec![0, 1, 2, 0, 3], vec![0, 1, 2, 4]));
     }
 }
