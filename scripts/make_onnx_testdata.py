@@ -7,6 +7,7 @@
 crates/lib/onnx-models/testdata/ops.onnx         floats and integers in, sum, product and a value in between
 crates/lib/onnx-models/testdata/argmax.onnx      where the largest id of each row is
 crates/lib/onnx-models/testdata/clip/            a dual encoder whose features can be computed by hand
+crates/stages/explore/testdata/slow/             a text encoder that takes most of a second for each run
 crates/stages/mask-embed/testdata/sam/           a segmenter by colour with the inputs and outputs of SAM
 crates/stages/mask-embed/testdata/sam2/          the same with the inputs and outputs of SAM 2.1's exports, described by model.json
 crates/stages/mask-embed/testdata/efficient-sam/ the same as EfficientSAM's
@@ -100,6 +101,36 @@ def clip():
     )
     config = '{\n  "name": "test-clip",\n  "dimension": 4,\n  "image_size": 8,\n  "mean": [0, 0, 0],\n  "std": [1, 1, 1]\n}\n'
     (folder / "clip.json").write_text(config)
+
+
+def slow():
+    """Text feature: along the first axis, once large products of zeros are made. No weights, much work."""
+    node = helper.make_node
+    folder = ROOT / "crates/stages/explore/testdata/slow"
+    products = [node("MatMul", [f"square_{k}", f"square_{k}"], [f"square_{k + 1}"]) for k in range(24)]
+    write(
+        folder / "text.onnx",
+        [
+            node("Cast", ["input_ids"], ["floats"], to=F),
+            node("ReduceMax", ["floats"], ["most"], keepdims=0),
+            # From the input, or the engine would do the work when it opens the graph.
+            node("Mul", ["most", "nothing"], ["zero"]),
+            node("Expand", ["zero", "side"], ["square_0"]),
+            *products,
+            node("ReduceMax", [products[-1].output[0]], ["still_zero"], keepdims=0),
+            node("ReduceMean", ["floats"], ["mean"], axes=[1]),
+            node("Mul", ["mean", "axis"], ["along"]),
+            node("Add", ["along", "still_zero"], ["text_embeds"]),
+        ],
+        [value("input_ids", I64, ["n", "l"])],
+        [value("text_embeds", F, ["n", 2])],
+        [
+            constant("nothing", np.float32(0)),
+            constant("side", np.array([1024, 1024], np.int64)),
+            constant("axis", np.array([[1, 0]], np.float32)),
+        ],
+    )
+    (folder / "clip.json").write_text('{\n  "name": "slow",\n  "dimension": 2\n}\n')
 
 
 def sam():
@@ -480,6 +511,7 @@ if __name__ == "__main__":
     ops()
     argmax()
     clip()
+    slow()
     sam()
     exports()
     sam_tiny()

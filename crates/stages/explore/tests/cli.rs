@@ -3,16 +3,9 @@
 mod common;
 
 use artifacts::Edits;
-use common::{Run, SIZE, camera, gaussians};
+use common::{Run, camera, click, gaussians};
 use glam::DVec3;
 use serde_json::{Value, json};
-
-fn click(x: u32, y: u32, hidden: &[u32]) -> Value {
-    let c = camera(0.0);
-    let camera = json!({"width": SIZE.0, "height": SIZE.1, "fx": c.fx, "fy": c.fy, "cx": c.cx, "cy": c.cy,
-        "rotation": c.rotation.transpose().to_cols_array(), "translation": c.translation.to_array()});
-    json!({"camera": camera, "x": x, "y": y, "hidden": hidden})
-}
 
 #[test]
 fn a_text_no_better_than_by_chance_is_said() {

@@ -19,6 +19,8 @@ pub const SIZE: (u32, u32) = (64, 48);
 /// A run of two balls, one before the other, seen by two cameras; instance 0 is in front. Ball 1 has two parts.
 pub struct Run {
     pub dir: tempfile::TempDir,
+    /// Where texts come from: an option and its value.
+    texts: [String; 2],
 }
 
 pub fn gaussians() -> Gaussians {
@@ -37,9 +39,19 @@ pub fn camera(x: f64) -> Camera {
     Camera::look_at(DVec3::new(x, 0.0, 0.0), DVec3::new(0.0, 0.0, 4.0), -DVec3::Y, SIZE.0, SIZE.1, 1.0)
 }
 
+/// A click on a pixel of the first view.
+pub fn click(x: u32, y: u32, hidden: &[u32]) -> Value {
+    let c = camera(0.0);
+    let camera = json!({"width": SIZE.0, "height": SIZE.1, "fx": c.fx, "fy": c.fy, "cx": c.cx, "cy": c.cy,
+        "rotation": c.rotation.transpose().to_cols_array(), "translation": c.translation.to_array()});
+    json!({"camera": camera, "x": x, "y": y, "hidden": hidden})
+}
+
 impl Run {
     pub fn new() -> Self {
-        let run = Self { dir: tempfile::tempdir().unwrap() };
+        let dir = tempfile::tempdir().unwrap();
+        let texts = ["--text-features".into(), dir.path().join("text.json").display().to_string()];
+        let run = Self { dir, texts };
         let (g, scene) = (gaussians(), run.scene());
         std::fs::create_dir_all(scene.join("images")).unwrap();
         std::fs::create_dir_all(run.out()).unwrap();
@@ -60,10 +72,7 @@ impl Run {
         let transforms =
             json!({"w": SIZE.0, "h": SIZE.1, "fl_x": c.fx, "fl_y": c.fy, "cx": c.cx, "cy": c.cy, "frames": frames});
         std::fs::write(scene.join("transforms.json"), transforms.to_string()).unwrap();
-        let dataset = dataset::load(&scene, &LoadOptions::default()).unwrap().hash().unwrap();
-        let inputs =
-            [(role::GEOMETRY.to_string(), hash_file(&geometry).unwrap()), (role::DATASET.to_string(), dataset)];
-        let provenance = || Provenance { inputs: BTreeMap::from(inputs.clone()), ..Provenance::default() };
+        let provenance = || run.provenance();
         let edge = |parent, child, instance| TreeEdge { parent, child, lambda: 1.0, size: 1, instance };
         let instances = Instances {
             label: vec![0, 1, 1, -1],
@@ -98,6 +107,33 @@ impl Run {
         run
     }
 
+    /// What the run was made from.
+    fn provenance(&self) -> Provenance {
+        let dataset = dataset::load(&self.scene(), &LoadOptions::default()).unwrap().hash().unwrap();
+        let geometry = hash_file(self.out().join("geometry.ply")).unwrap();
+        let inputs = [(role::GEOMETRY.to_string(), geometry), (role::DATASET.to_string(), dataset)];
+        Provenance { inputs: BTreeMap::from(inputs), ..Provenance::default() }
+    }
+
+    /// Says that the instances are of the photographs as they are now.
+    pub fn sign(&self) {
+        let path = self.out().join("instances.safetensors");
+        Instances::read(&path).unwrap().0.write(&path, self.provenance()).unwrap();
+    }
+
+    /// The run with a language model whose every answer takes most of a second.
+    pub fn with_slow_words() -> Self {
+        let mut run = Self::new();
+        let clip = run.dir.path().join("clip");
+        std::fs::create_dir(&clip).unwrap();
+        for name in ["text.onnx", "clip.json"] {
+            std::fs::copy(Path::new(env!("CARGO_MANIFEST_DIR")).join("testdata/slow").join(name), clip.join(name))
+                .unwrap();
+        }
+        run.texts = ["--clip".into(), clip.display().to_string()];
+        run
+    }
+
     /// What a vocabulary calls the balls: `names.json`, about instances of this hash.
     pub fn write_names(&self, instances: &str) {
         let naming = |instance: u32, name: &str, sure: bool| json!({"instance": instance, "names": [{"name": name, "score": 0.9}], "margin": 0.1, "sure": sure});
@@ -124,8 +160,7 @@ impl Run {
         let (out, scene) = (self.out(), self.scene());
         let pairs = [("--run-dir", at(&out)), ("--scene", at(&scene)), ("--geometry", at(&out.join("geometry.ply")))];
         let pairs = pairs.into_iter().flat_map(|(option, value)| [option.to_string(), value]);
-        let texts = ["--text-features".to_string(), at(&self.dir.path().join("text.json"))];
-        [command.to_string()].into_iter().chain(pairs).chain(texts).collect()
+        [command.to_string()].into_iter().chain(pairs).chain(self.texts.clone()).collect()
     }
 
     pub fn run(&self, command: &str, more: &[&str]) -> Output {
@@ -167,6 +202,13 @@ impl Drop for Server {
 }
 
 impl Server {
+    /// Most memory that the server has had so far, in bytes; on Linux only.
+    pub fn peak(&self) -> u64 {
+        let status = std::fs::read_to_string(format!("/proc/{}/status", self.child.id())).unwrap();
+        let peak = status.lines().find_map(|l| l.strip_prefix("VmHWM:")).unwrap();
+        1024 * peak.trim().trim_end_matches(" kB").parse::<u64>().unwrap()
+    }
+
     /// Status, headers and body of an answer; `headers` end with line breaks.
     pub fn ask(&self, method: &str, path: &str, headers: &str, body: &str) -> (u16, String, Vec<u8>) {
         let mut stream = TcpStream::connect(&self.host).unwrap();
