@@ -3,8 +3,11 @@
 //! `scripts/test_explore.sh` runs these on the demo's scene; they need EXPLORE_RUN (a finished run with query/query.json) and
 //! both programs. EXPLORE_SCREENSHOT names a file for a picture of the page.
 
+mod common;
+
 use artifacts::{Edits, InstanceNames, Instances};
 use base64::Engine;
+use common::{Run, SIZE};
 use fantoccini::actions::{InputSource, MouseActions, PointerAction};
 use fantoccini::{Client, ClientBuilder, Locator};
 use gs_io::Result;
@@ -398,6 +401,25 @@ async fn a_served_scene_can_be_seen_clicked_asked_and_edited() {
     let script = "try { new page.viewer.constructor({ getContext: () => null }); } catch (e) { return e.message; }";
     assert!(browser.js(script, vec![]).await.as_str().unwrap().contains("no WebGL2"));
     edits_are_those_of_the_stages(&browser, &f, &edits).await;
+    browser.no_errors().await;
+    browser.client.clone().close().await.unwrap();
+}
+
+#[tokio::test]
+#[ignore = "needs chromium; run scripts/test_explore.sh"]
+async fn a_click_is_answered_while_the_first_text_is_encoded() {
+    let browser = Browser::open().await;
+    let run = Run::with_slow_words();
+    let server = run.serve(&[]);
+    browser.load(&format!("http://{}{}", server.host, server.path)).await;
+    let mouse = browser.over(0, [SIZE.0 / 2, SIZE.1 / 2]).await.then(PointerAction::Down { button: 0 });
+    let field = browser.client.find(Locator::Id("text")).await.unwrap();
+    field.send_keys("mug\u{e007}").await.unwrap();
+    browser.client.perform_actions(mouse.then(PointerAction::Up { button: 0 })).await.unwrap();
+    browser.until("page.selectedInstances().length").await;
+    assert_eq!(browser.selected().await, [0]);
+    assert_eq!(browser.js("return page.state.answer", vec![]).await, Value::Null, "the text is still encoded");
+    browser.until("page.state.answer?.text === 'mug'").await;
     browser.no_errors().await;
     browser.client.clone().close().await.unwrap();
 }
