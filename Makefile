@@ -135,12 +135,6 @@ peers: build ## The field's systems beside ours: make peers PLAN=file OUT=folder
 	scripts/peers_summary.py $(or $(OUT),out/peers)/report.json $(or $(OUT),out/peers)/peers.json
 	$(if $(PLAN)$(OUT)$(ONLY),,cp out/peers/peers.json docs/results/peers.json && cp out/peers/report.svg docs/images/peers.svg)
 
-search: build ## Search the readings of the paper for the best one, in three rounds: out/search (hours)
-	mkdir -p out/search
-	for n in 1 2 3; do scripts/search_readings.py plan $$n > out/search/$$n.plan \
-	  && target/release/bench run out/search/$$n.plan --work out/search/runs --out out/search/$$n.json --threads $(JOBS) \
-	  && scripts/search_readings.py effects out/search/$$n.json | tee out/search/$$n.md || exit; done
-
 batch: build ## Scenes x variants x seeds from a table, JOBS at a time: make batch TABLE=file OUT=folder (docs/cluster.md)
 	@$(PIPELINE) -j $(JOBS) -f pipelines/batch.mk all
 

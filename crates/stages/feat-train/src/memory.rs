@@ -1,6 +1,5 @@
 //! How much memory a run will take, known before it starts. docs/performance.md compares it with measured peaks.
 
-use crate::contrastive::engine::Engine;
 use crate::contrastive::masks::MaskSets;
 use crate::inputs::Inputs;
 use crate::options::Options;
@@ -36,8 +35,7 @@ fn trained(footprints: &Footprints, options: &Options, geometry: u64) -> Result<
     let gaussians = footprints.kept.len() as u64;
     let read = 4_700_000 + 26 * footprints.pixels.col.len() as u64;
     let sets = in_mask_sets(footprints, &options.levels())?;
-    let per_value = if Engine::serves(&options.contrastive) { 20 } else { 53 };
-    let state = 200 + per_value * options.trained_dim() as u64;
+    let state = 200 + 53 * options.trained_dim() as u64;
     Ok(read + (2 * geometry + 117 * gaussians).max(sets + state * gaussians))
 }
 

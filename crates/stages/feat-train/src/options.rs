@@ -3,7 +3,7 @@
 #![allow(rustdoc::invalid_html_tags, reason = "help texts name files as <FILE>.curve.svg")]
 
 use artifacts::Level;
-use clap::{ArgAction, Parser, ValueEnum};
+use clap::{Parser, ValueEnum};
 use gs_io::{Error, Result};
 use serde::Serialize;
 use serde_json::{Value, json};
@@ -42,13 +42,10 @@ pub struct Options {
     /// Mask levels to use, separated by commas: default, small, medium, large [default: all; large with --preset]
     #[arg(long, value_name = "LEVELS", value_delimiter = ',')]
     pub levels: Vec<Level>,
-    /// Dimension of the features, 1 to 512, or 2 to 64 with --preset [default: 6 with --preset; else as many as --cutoff
-    /// keeps, at most 256, and from 262,144 Gaussians on fewer, down to 64]
+    /// Dimension of the features, 1 to 512, or 2 to 64 with --preset [default: 6 with --preset; else as many as there are
+    /// singular values above 0.6, at most 256, and from 262,144 Gaussians on fewer, down to 64]
     #[arg(long, value_name = "COUNT", value_parser = within(1usize..=512))]
     pub dim: Option<usize>,
-    /// What only the closed form reads.
-    #[command(flatten)]
-    pub spectral: Spectral,
     /// What only the paper's method reads.
     #[command(flatten)]
     pub contrastive: Contrastive,
@@ -64,16 +61,6 @@ pub enum Preset {
     Paper,
 }
 
-/// Options of the closed form.
-#[derive(Debug, Clone, Copy, PartialEq, clap::Args, Serialize)]
-#[command(next_help_heading = "Closed form (without --preset)")]
-pub struct Spectral {
-    /// Singular value below which a vector fades out, above 0: a low cutoff shows parts, a high one whole things. The nearer
-    /// the singular value of a vector is to 1, the better the vector separates things
-    #[arg(long, value_name = "VALUE", default_value_t = 0.6, value_parser = positive::<f64>)]
-    pub cutoff: f64,
-}
-
 /// Options of the paper's method.
 #[derive(Debug, Clone, PartialEq, clap::Args, Serialize)]
 #[command(next_help_heading = "Paper (with --preset)")]
@@ -85,15 +72,6 @@ pub struct Contrastive {
     /// Layers of the graph network, 0 to 4; 0 trains the features without context
     #[arg(long, value_name = "COUNT", default_value_t = 2, value_parser = within(0usize..=4))]
     pub layers: usize,
-    /// Neighbours of an anchor
-    #[arg(long, value_enum, default_value_t = Neighbours::Gaussians)]
-    pub neighbours: Neighbours,
-    /// Give every layer a bias, which the paper does not print
-    #[arg(long, value_name = "BOOL", action = ArgAction::Set, default_value_t = false)]
-    pub bias: bool,
-    /// Whether the last layer has a ReLU as the others do
-    #[arg(long, value_name = "BOOL", action = ArgAction::Set, default_value_t = true)]
-    pub last_relu: bool,
     /// When the feature of each Gaussian is brought to unit length; with --preset paper the default is after
     #[arg(long, value_enum, default_value = "never", default_value_if("preset", "paper", "after"))]
     pub unit_length: UnitLength,
@@ -114,9 +92,6 @@ pub struct Contrastive {
     #[arg(long, value_name = "RATE", value_parser = positive::<f64>, default_value = "0.001",
         default_value_if("preset", "paper", "0.01"))]
     pub lr: f64,
-    /// Learning rate of the graph network, above 0
-    #[arg(long, value_name = "RATE", default_value_t = 1e-3, value_parser = positive::<f64>)]
-    pub weight_lr: f64,
     /// Pixels of each mask that a loss of pixels looks at, drawn anew in every iteration from those that graph-precompute
     /// --pixel-samples kept; 0 takes all of them
     #[arg(long, value_name = "COUNT", default_value_t = 0)]
@@ -137,26 +112,12 @@ pub struct Contrastive {
     pub no_skip: bool,
 }
 
-/// Neighbours of an anchor, whose features it sums.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum, Serialize)]
-#[serde(rename_all = "kebab-case")]
-pub enum Neighbours {
-    /// The nearest Gaussians; their inputs are the same in every layer (the paper's formula).
-    Gaussians,
-    /// The nearest anchors, with their features of the layer before (the paper's text: "distance between anchors").
-    Anchors,
-    /// The nearest anchors, with the same inputs in every layer (the formula's inputs, the text's neighbours).
-    AnchorInputs,
-}
-
 /// When the feature of a Gaussian is brought to unit length.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum, Serialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum UnitLength {
     /// Never: as printed in the paper.
     Never,
-    /// Before context is added to it, as OpenGaussian normalises what it renders.
-    Before,
     /// After context was added to it.
     After,
 }
@@ -177,15 +138,6 @@ pub enum Axis {
 pub enum Loss {
     /// As printed in the paper: the positive is the mask itself, a constant; the other masks are in the denominator.
     Printed,
-    /// The same with the mask itself in the denominator too, so that the loss is bounded below.
-    #[value(name = "self")]
-    #[serde(rename = "self")]
-    WithSelf,
-    /// The positive is the centroid of a random half of the mask's Gaussians, in numerator and denominator.
-    HalfMask,
-    /// The positive is the centroid of the same thing's mask in another view, in numerator and denominator. A mask without
-    /// such a counterpart is its own positive.
-    CrossView,
     /// Per Gaussian: each Gaussian against the centroids of all masks. Its positives are its own masks, by their weight.
     Gaussian,
     /// Per pixel: each sampled pixel against the centroids of all masks. Its positive is its own mask.
@@ -264,14 +216,15 @@ impl Options {
         self.dim.unwrap_or((MOST_VALUES / gaussians.max(1)).clamp(LEAST_VECTORS, MOST_VECTORS))
     }
 
-    /// All of them and the seed, with what depends on the preset filled in and without the options of the other method.
+    /// All of them and the seed, with what depends on the preset filled in and without the options of the paper's method where it is not used.
     pub(crate) fn parameters(&self, seed: u64) -> Value {
         let trained = self.preset.is_some();
         let dim = if trained { Some(self.trained_dim()) } else { self.dim };
         let mut parameters = json!(Self { levels: self.levels(), dim, ..self.clone() });
         parameters["seed"] = json!(seed);
-        let other = if trained { "spectral" } else { "contrastive" };
-        parameters.as_object_mut().expect("a struct is an object").remove(other);
+        if !trained {
+            parameters.as_object_mut().expect("a struct is an object").remove("contrastive");
+        }
         parameters
     }
 }
@@ -286,16 +239,16 @@ mod tests {
             let files = ["feat-train", "--geometry", "g", "--graph", "g", "--footprints", "f", "--out", "o"];
             Args::parse_from([&files, arguments].concat()).options.parameters(3)
         };
-        let closed = json!({ "preset": null, "levels": ["default", "small", "medium", "large"], "dim": null,
-            "spectral": { "cutoff": 0.5 }, "seed": 3 });
-        assert_eq!(of(&["--cutoff", "0.5"]), closed);
-        let literal = of(&["--preset", "literal", "--loss", "self"]);
+        let closed =
+            json!({ "preset": null, "levels": ["default", "small", "medium", "large"], "dim": null, "seed": 3 });
+        assert_eq!(of(&[]), closed);
+        let literal = of(&["--preset", "literal", "--loss", "separation"]);
         assert_eq!(
             (&literal["preset"], &literal["levels"], &literal["dim"]),
             (&json!("literal"), &json!(["large"]), &json!(6))
         );
-        assert_eq!(literal["contrastive"], json!(Contrastive { loss: Loss::WithSelf, ..Contrastive::default() }));
-        assert_eq!(literal["contrastive"].as_object().map(serde_json::Map::len), Some(17));
+        assert_eq!(literal["contrastive"], json!(Contrastive { loss: Loss::Separation, ..Contrastive::default() }));
+        assert_eq!(literal["contrastive"].as_object().map(serde_json::Map::len), Some(13));
         let best = Contrastive {
             init: Init::NormalSmall,
             unit_length: UnitLength::After,

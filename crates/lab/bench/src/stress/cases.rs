@@ -196,7 +196,7 @@ fn settings(world: &World) -> Vec<Case> {
     let settings = [
         ("tau 1e-4", "temperature 0.0001", format!("{short} --tau 0.0001")),
         ("tau 10", "temperature 10", format!("{short} --tau 10")),
-        ("learning rates x 100", "features and weights", format!("{short} --lr 0.1 --weight-lr 0.1")),
+        ("learning rate x 100", "of the features", format!("{short} --lr 0.1")),
         ("100,000 iterations", "ten times the paper's", "--iterations 100000".into()),
         ("one dimension", "contrastive features of dimension 1", format!("{short} --dim 1")),
     ];

@@ -22,34 +22,6 @@ fn corrected(rate: f64, step: u64) -> (f64, f64) {
     (rate / power(BETA1), power(BETA2).sqrt())
 }
 
-/// What changes from step to step in f32: p' = p - rate m' / (root √v' + epsilon).
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Rates {
-    rate: f32,
-    root: f32,
-}
-
-impl Rates {
-    /// Of step `step`, which counts from 1.
-    pub fn at(rate: f64, step: u64) -> Self {
-        let (rate, root) = corrected(rate, step);
-        Self { rate: rate as f32, root: (1.0 / root) as f32 }
-    }
-
-    /// Updates a parameter `p` and the moments `m` and `v` of its gradient `g`.
-    #[inline(always)]
-    pub fn update(&self, p: &mut f32, m: &mut f32, v: &mut f32, g: f32) {
-        let mean = BETA1 as f32 * *m + (1.0 - BETA1) as f32 * g;
-        let square = BETA2 as f32 * *v + (1.0 - BETA2) as f32 * g * g;
-        // Denormal numbers are slow, and as good as zero.
-        let mean = if mean.abs() < TINY as f32 { 0.0 } else { mean };
-        let square = if square < TINY_SQUARE as f32 { 0.0 } else { square };
-        *m = mean;
-        *v = square;
-        *p -= self.rate * mean / (square.sqrt() * self.root + EPSILON as f32);
-    }
-}
-
 /// State of the optimiser for one array of parameters.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct Adam<T> {

@@ -4,7 +4,6 @@
 //! anchor serves lies together: sums over an anchor's Gaussians are sums over a range, no two threads ever add to the same
 //! place, and what a view sees or an anchor sums is mostly close in memory too.
 
-use crate::options::Neighbours;
 use artifacts::Graph;
 use gs_scene::morton_order;
 
@@ -26,18 +25,14 @@ pub struct Context {
     pub served: Vec<u32>,
     /// Where the neighbours of each anchor begin in `neighbours`; M + 1. Padding is left out.
     pub neighbour_start: Vec<u32>,
-    /// The neighbours: places in the training order, or anchors, by their kind.
+    /// The neighbours: places in the training order.
     pub neighbours: Vec<u32>,
-    pub kind: Neighbours,
-    /// The reverse graph of anchors, for gradients: where the list of the anchors that have anchor a as a neighbour begins.
-    pub reverse_start: Vec<u32>,
-    pub reverse: Vec<u32>,
 }
 
 impl Context {
     /// Prepares the graph; `colors` and `positions` are those of the kept Gaussians. Without `propagate` an anchor's output
     /// goes to the anchor's own Gaussian alone.
-    pub fn new(graph: &Graph, colors: &[[f32; 3]], positions: &[[f32; 3]], kind: Neighbours, propagate: bool) -> Self {
+    pub fn new(graph: &Graph, colors: &[[f32; 3]], positions: &[[f32; 3]], propagate: bool) -> Self {
         let (n, m, k) = (graph.kept.len(), graph.anchors.len(), graph.knn.ncols());
         // Anchors of the graph in the order of the curve, and the other way round.
         let at: Vec<[f32; 3]> = graph.anchors.iter().map(|&a| positions[a as usize]).collect();
@@ -70,21 +65,12 @@ impl Context {
         for &a in &curve {
             let a = a as usize;
             // Rows are padded with the anchor itself, which is not its own neighbour.
-            let others = graph.anchor_knn.row(a).into_iter().map(|&b| b as usize).filter(|&b| b != a);
-            match kind {
-                Neighbours::Gaussians => neighbours
-                    .extend(graph.knn.row(a).iter().filter(|&&i| i != graph.anchors[a]).map(|&i| place[i as usize])),
-                Neighbours::AnchorInputs => neighbours.extend(others.map(|b| place[graph.anchors[b] as usize])),
-                Neighbours::Anchors => neighbours.extend(others.map(|b| rank[b])),
-            }
+            let others = graph.knn.row(a).into_iter().filter(|&&i| i != graph.anchors[a]);
+            neighbours.extend(others.map(|&i| place[i as usize]));
             neighbour_start.push(neighbours.len() as u32);
         }
-        let (reverse_start, reverse) = match kind {
-            Neighbours::Anchors => transpose(&neighbour_start, &neighbours, m),
-            Neighbours::Gaussians | Neighbours::AnchorInputs => (vec![0; m + 1], Vec::new()),
-        };
         let colors = order.iter().map(|&i| colors[i as usize]).collect();
-        Self { order, colors, anchors, source, served, neighbour_start, neighbours, kind, reverse_start, reverse }
+        Self { order, colors, anchors, source, served, neighbour_start, neighbours }
     }
 
     #[inline]
@@ -92,21 +78,10 @@ impl Context {
         &self.neighbours[self.neighbour_start[a] as usize..self.neighbour_start[a + 1] as usize]
     }
 
-    /// Whether neighbours are places in the training order, and not anchors.
-    pub fn neighbours_are_places(&self) -> bool {
-        self.kind != Neighbours::Anchors
-    }
-
     /// Whether two places that follow each other receive the output of different anchors.
     pub fn parts(&self, before: u32, after: u32) -> bool {
         let source = self.source[before as usize];
         source != self.source[after as usize] || source == NONE
-    }
-
-    /// Anchors that have anchor `a` as a neighbour.
-    #[inline]
-    pub fn reverse_of(&self, a: usize) -> &[u32] {
-        &self.reverse[self.reverse_start[a] as usize..self.reverse_start[a + 1] as usize]
     }
 }
 
@@ -117,24 +92,4 @@ pub fn inverse(permutation: &[u32]) -> Vec<u32> {
         out[from as usize] = to as u32;
     }
     out
-}
-
-/// Reverses adjacency lists; sources ascend.
-fn transpose(start: &[u32], targets: &[u32], m: usize) -> (Vec<u32>, Vec<u32>) {
-    let mut out_start = vec![0u32; m + 1];
-    for &t in targets {
-        out_start[t as usize + 1] += 1;
-    }
-    for i in 0..m {
-        out_start[i + 1] += out_start[i];
-    }
-    let mut next = out_start.clone();
-    let mut out = vec![0u32; targets.len()];
-    for a in 0..m {
-        for &t in &targets[start[a] as usize..start[a + 1] as usize] {
-            out[next[t as usize] as usize] = a as u32;
-            next[t as usize] += 1;
-        }
-    }
-    (out_start, out)
 }

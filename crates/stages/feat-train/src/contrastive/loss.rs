@@ -2,13 +2,6 @@
 //! masks.
 
 use crate::options::Loss;
-use gs_io::mixed;
-
-/// Whether an entry belongs to the half of its mask that is the positive of [`Loss::HalfMask`].
-pub fn in_half(noise: u64, entry: usize) -> bool {
-    mixed(noise ^ entry as u64) & 1 == 1
-}
-
 /// Centroids shorter than this have no direction and are left out.
 pub const SHORTEST: f64 = 1e-12;
 
@@ -19,8 +12,6 @@ pub struct Evaluated {
     pub loss: f64,
     /// Gradient of the centroids `[K][d]`.
     pub centroids: Vec<f64>,
-    /// Gradient of the positives `[K][d]`; empty unless they are separate.
-    pub positives: Vec<f64>,
     /// 1 - mean cosine of different masks.
     pub separation: f64,
 }
@@ -177,58 +168,34 @@ fn separation(centroids: &[f64], d: usize, alive: &[usize], gradient: &mut [f64]
     value
 }
 
-/// The loss per mask, averaged over the masks that take part. `positives` are needed for [`Loss::HalfMask`], which gives
-/// their gradient too, and for [`Loss::CrossView`], where they are constant and zeros mean none. [`Loss::Gaussian`] and
-/// [`Loss::Pixel`] do not compare masks: their loss is 0 here, and only the separation counts.
-pub fn evaluate(loss: Loss, centroids: &[f64], positives: Option<&[f64]>, d: usize, tau: f64) -> Evaluated {
-    let masks = centroids.len() / d;
+/// The loss per mask, averaged over the masks that take part. [`Loss::Gaussian`] and [`Loss::Pixel`] do not compare masks:
+/// their loss is 0 here, and only the separation counts.
+pub fn evaluate(loss: Loss, centroids: &[f64], d: usize, tau: f64) -> Evaluated {
     let (unit, length) = directions(centroids, d);
-    let (pos_unit, pos_length) = positives.map_or_else(Default::default, |p| directions(p, d));
-    let separate = loss == Loss::HalfMask;
-    let has_positive = |k: usize| pos_length.get(k).is_some_and(|l| *l > SHORTEST);
-    let alive: Vec<usize> = (0..masks).filter(|&k| length[k] > SHORTEST && (!separate || has_positive(k))).collect();
-    let mut out = Evaluated {
-        centroids: vec![0.0; centroids.len()],
-        positives: vec![0.0; if separate { pos_unit.len() } else { 0 }],
-        ..Evaluated::default()
-    };
+    let alive: Vec<usize> = (0..length.len()).filter(|&k| length[k] > SHORTEST).collect();
+    let mut out = Evaluated { centroids: vec![0.0; centroids.len()], ..Evaluated::default() };
     if alive.len() < 2 {
         return out; // nothing to push from: an empty sum
     }
-    let of = |rows: &[f64], k: usize| -> Vec<f64> { rows[k * d..(k + 1) * d].to_vec() };
+    let of = |k: usize| &unit[k * d..(k + 1) * d];
     let mut unit_gradient = vec![0.0; centroids.len()];
-    let mut pos_gradient = vec![0.0; pos_unit.len()];
     let mut cosines = 0.0;
     let share = 1.0 / alive.len() as f64;
     for &k in &alive {
-        let u = of(&unit, k);
         let others: Vec<usize> = alive.iter().copied().filter(|&j| j != k).collect();
-        let mut logits: Vec<f64> = others.iter().map(|&j| dot(&u, &unit[j * d..(j + 1) * d]) / tau).collect();
+        let mut logits: Vec<f64> = others.iter().map(|&j| dot(of(k), of(j)) / tau).collect();
         cosines += logits.iter().sum::<f64>() * tau;
-        let own = match loss {
-            Loss::Gaussian | Loss::Pixel | Loss::Separation => continue,
-            Loss::Printed | Loss::WithSelf => 1.0 / tau,
-            Loss::CrossView if !has_positive(k) => 1.0 / tau,
-            Loss::HalfMask | Loss::CrossView => dot(&u, &of(&pos_unit, k)) / tau,
-        };
         if loss != Loss::Printed {
-            logits.push(own);
+            continue;
         }
-        out.loss += share * (log_sum_exp(&mut logits) - own);
+        out.loss += share * (log_sum_exp(&mut logits) - 1.0 / tau);
         let softmax = logits;
-        let add = |gradient: &mut [f64], k: usize, scale: f64, v: &[f64]| {
-            gradient[k * d..(k + 1) * d].iter_mut().zip(v).for_each(|(g, v)| *g += scale * v);
+        let mut add = |k: usize, scale: f64, v: &[f64]| {
+            unit_gradient[k * d..(k + 1) * d].iter_mut().zip(v).for_each(|(g, v)| *g += scale * v);
         };
         for (&j, &p) in others.iter().zip(&softmax) {
-            let v = of(&unit, j);
-            add(&mut unit_gradient, k, share * p / tau, &v);
-            add(&mut unit_gradient, j, share * p / tau, &u);
-        }
-        if matches!(loss, Loss::HalfMask | Loss::CrossView) && has_positive(k) {
-            let scale = share * (softmax[others.len()] - 1.0) / tau;
-            let v = of(&pos_unit, k);
-            add(&mut unit_gradient, k, scale, &v);
-            add(&mut pos_gradient, k, scale, &u);
+            add(k, share * p / tau, of(j));
+            add(j, share * p / tau, of(k));
         }
     }
     out.separation = 1.0 - cosines * share / (alive.len() - 1) as f64;
@@ -238,11 +205,7 @@ pub fn evaluate(loss: Loss, centroids: &[f64], positives: Option<&[f64]>, d: usi
     for k in alive {
         let range = k * d..(k + 1) * d;
         let (g, u) = (&unit_gradient[range.clone()], &unit[range.clone()]);
-        add_direction_gradient(&mut out.centroids[range.clone()], u, length[k], g);
-        if separate {
-            let (g, u) = (&pos_gradient[range.clone()], &pos_unit[range.clone()]);
-            add_direction_gradient(&mut out.positives[range], u, pos_length[k], g);
-        }
+        add_direction_gradient(&mut out.centroids[range], u, length[k], g);
     }
     out
 }
@@ -254,36 +217,33 @@ mod tests {
     #[test]
     fn the_printed_loss_is_the_formula() {
         let c = [1.0, 0.0, 0.0, 2.0, 1.0, 1.0];
-        let e = evaluate(Loss::Printed, &c, None, 2, 0.1);
+        let e = evaluate(Loss::Printed, &c, 2, 0.1);
         let r = 0.5f64.sqrt();
         let l = |a: f64, b: f64| -10.0 + ((10.0 * a).exp() + (10.0 * b).exp()).ln();
         let want = (l(0.0, r) + l(0.0, r) + l(r, r)) / 3.0;
         assert!((e.loss - want).abs() < 1e-12, "{} {want}", e.loss);
         assert!((e.separation - (1.0 - 2.0 * r / 3.0)).abs() < 1e-12);
-        assert!(evaluate(Loss::WithSelf, &c, None, 2, 0.1).loss >= 0.0);
     }
 
     #[test]
     fn masks_push_their_nearest_away_the_most() {
         let c = [1.0, 2.0, 4.0];
-        let e = evaluate(Loss::Separation, &c, None, 1, 0.1);
+        let e = evaluate(Loss::Separation, &c, 1, 0.1);
         // Per mask the nearest with weight 1, the other with 0.1.
         let want = (1.0 / 2.0 + 0.1 / 10.0) + (1.0 / 2.0 + 0.1 / 5.0) + (1.0 / 5.0 + 0.1 / 10.0);
         assert!((e.loss - want / 6.0).abs() < 1e-12, "{}", e.loss);
         assert!(e.centroids[0] > 0.0 && e.centroids[2] < 0.0, "less loss further out: {:?}", e.centroids);
-        assert!(evaluate(Loss::Separation, &[0.5, 1.0], None, 1, 0.1).loss > 0.0, "two masks");
+        assert!(evaluate(Loss::Separation, &[0.5, 1.0], 1, 0.1).loss > 0.0, "two masks");
     }
 
     #[test]
     fn small_temperatures_do_not_overflow_and_empty_sums_and_zero_centroids_are_left_out() {
         let c = [1.0, 0.0, 0.99, 0.01, 0.0, 1.0];
-        for loss in [Loss::Printed, Loss::WithSelf] {
-            let e = evaluate(loss, &c, None, 2, 1e-4);
-            assert!(e.loss.is_finite() && e.centroids.iter().all(|g| g.is_finite()), "{e:?}");
-        }
-        assert_eq!(evaluate(Loss::Printed, &[1.0, 0.0], None, 2, 0.1).loss, 0.0);
-        let with_zero = evaluate(Loss::Printed, &[1.0, 0.0, 0.0, 0.0, 0.0, 1.0], None, 2, 0.1);
-        let without = evaluate(Loss::Printed, &[1.0, 0.0, 0.0, 1.0], None, 2, 0.1);
+        let e = evaluate(Loss::Printed, &c, 2, 1e-4);
+        assert!(e.loss.is_finite() && e.centroids.iter().all(|g| g.is_finite()), "{e:?}");
+        assert_eq!(evaluate(Loss::Printed, &[1.0, 0.0], 2, 0.1).loss, 0.0);
+        let with_zero = evaluate(Loss::Printed, &[1.0, 0.0, 0.0, 0.0, 0.0, 1.0], 2, 0.1);
+        let without = evaluate(Loss::Printed, &[1.0, 0.0, 0.0, 1.0], 2, 0.1);
         assert_eq!(with_zero.loss, without.loss);
         assert_eq!(with_zero.centroids[2..4], [0.0, 0.0]);
     }

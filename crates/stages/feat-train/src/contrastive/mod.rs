@@ -1,17 +1,14 @@
 //! The paper's stage 2, `feat-train --preset literal` and `--preset paper`: contextual propagation and contrastive learning on masks.
 //!
 //! * [`context`] and [`masks`]: what training reads of a scene.
-//! * [`model`], with [`network`], [`normalize`], [`loss`], [`terms`] and [`cross_view`]: the equations and their gradients,
-//!   readable, for f32 and f64 ([`real`]).
-//! * [`engine`]: the same in f32, fast. [`solver`] takes the one that serves the options.
-//! * [`mod@train`]: the loop, on the [`state`], which [`checkpoint`] saves. [`adam`]: the optimiser.
+//! * [`model`], with [`network`], [`normalize`], [`loss`] and [`terms`]: the equations and their gradients, for f32 and
+//!   f64 ([`real`]).
+//! * [`mod@train`]: the loop, on the [`state`], which [`checkpoint`] saves. [`solver`]: one iteration of it. [`adam`]: the optimiser.
 
 mod adam;
 mod alignment;
 pub mod checkpoint;
 mod context;
-mod cross_view;
-pub mod engine;
 mod loss;
 pub mod masks;
 mod model;
@@ -62,8 +59,7 @@ fn frozen_graph(args: &Args, inputs: &Inputs, stage: &Stage) -> Result<Context> 
     let color = |&i: &u32| [0, 1, 2].map(|channel| 0.5 + SH_C0 * gaussians.sh_of(i as usize)[channel]);
     let colors: Vec<[f32; 3]> = kept.iter().map(color).collect();
     let positions: Vec<[f32; 3]> = kept.iter().map(|&i| gaussians.means[i as usize]).collect();
-    let options = &args.options.contrastive;
-    Ok(Context::new(&inputs.graph, &colors, &positions, options.neighbours, !options.no_propagation))
+    Ok(Context::new(&inputs.graph, &colors, &positions, !args.options.contrastive.no_propagation))
 }
 
 /// The masks of every view and level that teaches something.

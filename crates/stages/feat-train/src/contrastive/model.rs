@@ -9,7 +9,7 @@ use super::network::{self, Activations, Layer};
 use super::normalize::{Moments, channel_moments, row_moments};
 use super::real::Real;
 use super::terms;
-use crate::options::{Axis, Contrastive, Init, Loss, Neighbours, UnitLength};
+use crate::options::{Axis, Contrastive, Init, Loss, UnitLength};
 use crate::random::normal;
 use rand::Rng;
 use rayon::prelude::*;
@@ -45,7 +45,7 @@ impl<T> Propagated<T> {
     /// Bytes of all activations.
     pub fn bytes(&self) -> usize {
         let Activations { features, sums } = &self.activations;
-        let values = features.iter().chain(sums).chain([&self.hat]).map(Vec::len).sum::<usize>();
+        let values = features.iter().chain([sums, &self.hat]).map(Vec::len).sum::<usize>();
         values * size_of::<T>()
     }
 }
@@ -75,10 +75,7 @@ impl<T: Real> Model<T> {
             .collect();
         let features =
             context.order.iter().flat_map(|&i| drawn[i as usize * d..(i as usize + 1) * d].to_vec()).collect();
-        let mut layers = network::random_layers(options.layers, d + COLOR, d, context.kind, options.bias, rng);
-        if let Some(last) = layers.last_mut() {
-            last.relu = options.last_relu;
-        }
+        let layers = network::random_layers(options.layers, d + COLOR, d, rng);
         Self { dim: d, options, features, layers }
     }
 
@@ -149,11 +146,7 @@ impl<T: Real> Model<T> {
             out
         };
         let h = gather(&|a| &context.anchors[a..=a]);
-        let sums = match context.kind {
-            Neighbours::Gaussians | Neighbours::AnchorInputs => gather(&|a| context.neighbours_of(a)),
-            Neighbours::Anchors => network::neighbour_sums(context, &h, channels),
-        };
-        (h, sums)
+        (h, gather(&|a| context.neighbours_of(a)))
     }
 
     /// f_final of the Gaussian at `place`: its own feature and what it receives. Returns the length that was divided by, or 1
@@ -163,16 +156,12 @@ impl<T: Real> Model<T> {
         let d = out.len();
         let own = &self.features[place * d..(place + 1) * d];
         out.iter_mut().zip(own).for_each(|(o, f)| *o = f.get());
-        let mut length = if self.options.unit_length == UnitLength::Before { make_unit(out) } else { 1.0 };
         let source = context.source[place];
         if source != NONE && !propagated.hat.is_empty() {
             let hat = &propagated.hat[source as usize * d..(source as usize + 1) * d];
             out.iter_mut().zip(hat).for_each(|(o, h)| *o += h.get());
         }
-        if self.options.unit_length == UnitLength::After {
-            length = make_unit(out);
-        }
-        length
+        if self.options.unit_length == UnitLength::After { make_unit(out) } else { 1.0 }
     }
 
     /// f_final of all Gaussians `[n][d]`, in the order of `kept`.
@@ -188,25 +177,14 @@ impl<T: Real> Model<T> {
         out
     }
 
-    /// Centroids A f of all masks `[K][d]`.
+    /// Centroids A f of all masks `[K][d]`: sums over pieces of columns, in order.
     pub fn centroids(&self, context: &Context, propagated: &Propagated<T>, set: &MaskSet) -> Vec<f64> {
-        self.mask_sums(context, propagated, set, |_| true)
-    }
-
-    /// The sums of a row of A f over those of its entries that `counts` names, over pieces of columns, in order; `[K][d]`.
-    fn mask_sums(
-        &self,
-        context: &Context,
-        propagated: &Propagated<T>,
-        set: &MaskSet,
-        counts: impl Fn(usize) -> bool + Sync,
-    ) -> Vec<f64> {
         let d = self.dim;
         let piece = |bounds: &[u32]| {
             let (mut sums, mut f) = (vec![0.0; set.len() * d], vec![0.0; d]);
             for c in bounds[0] as usize..bounds[1] as usize {
                 self.final_feature(context, propagated, set.columns[c] as usize, &mut f);
-                for e in (set.start[c] as usize..set.start[c + 1] as usize).filter(|&e| counts(e)) {
+                for e in set.start[c] as usize..set.start[c + 1] as usize {
                     let (k, w) = (set.mask[e] as usize, f64::from(set.weight[e]));
                     sums[k * d..(k + 1) * d].iter_mut().zip(&f).for_each(|(s, f)| *s += w * f);
                 }
@@ -228,17 +206,9 @@ impl<T: Real> Model<T> {
         })
     }
 
-    /// Loss and gradients on the masks of one view. `noise` seeds the halves of [`Loss::HalfMask`] and the choice of pixels;
-    /// `beside` are positives from another view `[K][d]` for [`Loss::CrossView`].
-    pub fn step(
-        &self,
-        context: &Context,
-        propagated: &Propagated<T>,
-        set: &MaskSet,
-        noise: u64,
-        beside: Option<&[f64]>,
-    ) -> Step<T> {
-        let view = self.look(context, propagated, set, noise, beside);
+    /// Loss and gradients on the masks of one view. `noise` seeds the choice of pixels.
+    pub fn step(&self, context: &Context, propagated: &Propagated<T>, set: &MaskSet, noise: u64) -> Step<T> {
+        let view = self.look(context, propagated, set, noise);
         let d = self.dim;
         // Back to the columns, piece by piece; the Gaussians of an anchor lie in one piece.
         let parts: Vec<PieceGradients<T>> = set
@@ -267,20 +237,10 @@ impl<T: Real> Model<T> {
     }
 
     /// The loss on the masks of one view, and its gradients of centroids and pixels.
-    fn look<'a>(
-        &self,
-        context: &Context,
-        propagated: &Propagated<T>,
-        set: &'a MaskSet,
-        noise: u64,
-        beside: Option<&[f64]>,
-    ) -> View<'a> {
+    fn look<'a>(&self, context: &Context, propagated: &Propagated<T>, set: &'a MaskSet, noise: u64) -> View<'a> {
         let (d, s) = (self.dim, &self.options);
         let centroids = self.centroids(context, propagated, set);
-        let halves = (s.loss == Loss::HalfMask).then_some(noise);
-        let positives =
-            halves.map(|noise| self.mask_sums(context, propagated, set, |entry| loss::in_half(noise, entry)));
-        let mut evaluated = loss::evaluate(s.loss, &centroids, positives.as_deref().or(beside), d, s.tau);
+        let mut evaluated = loss::evaluate(s.loss, &centroids, d, s.tau);
         let to_centroids = &mut evaluated.centroids;
         let feature = |c: usize, f: &mut [f64]| {
             self.final_feature(context, propagated, set.columns[c] as usize, f);
@@ -293,7 +253,7 @@ impl<T: Real> Model<T> {
             evaluated.loss += value;
             to_columns.push(rows);
         }
-        View { set, evaluated, halves, to_columns }
+        View { set, evaluated, to_columns }
     }
 
     /// Gradients of the features of some columns, and of what their anchors give them.
@@ -317,9 +277,6 @@ impl<T: Real> Model<T> {
             for e in set.start[c] as usize..set.start[c + 1] as usize {
                 let (k, w) = (set.mask[e] as usize * d, f64::from(set.weight[e]));
                 g.iter_mut().zip(&evaluated.centroids[k..k + d]).for_each(|(g, v)| *g += w * v);
-                if view.halves.is_some_and(|noise| loss::in_half(noise, e)) {
-                    g.iter_mut().zip(&evaluated.positives[k..k + d]).for_each(|(g, v)| *g += w * v);
-                }
             }
             let place = set.columns[c] as usize;
             for rows in &view.to_columns {
@@ -339,14 +296,6 @@ impl<T: Real> Model<T> {
                 }
                 let sum = made.to_anchors.len() - d;
                 made.to_anchors[sum..].iter_mut().zip(&g).for_each(|(s, g)| *s += g);
-            }
-            if self.options.unit_length == UnitLength::Before {
-                let feature = &self.features[place * d..(place + 1) * d];
-                f.iter_mut().zip(feature).for_each(|(f, v)| *f = v.get());
-                let length = make_unit(&mut f);
-                spare.copy_from_slice(&g);
-                g.fill(0.0);
-                loss::add_direction_gradient(&mut g, &f, length, &spare);
             }
             made.features.extend(g.iter().map(|&v| T::of(v)));
         }
@@ -389,8 +338,6 @@ fn make_unit(v: &mut [f64]) -> f64 {
 struct View<'a> {
     set: &'a MaskSet,
     evaluated: Evaluated,
-    /// Seed of the halves of masks that are positives, where the loss has them.
-    halves: Option<u64>,
     /// Gradients of the columns' features `[columns][d]` from terms of single Gaussians and pixels.
     to_columns: Vec<Vec<f64>>,
 }
@@ -413,17 +360,14 @@ mod tests {
     const D: usize = 4;
 
     /// Compares every gradient with central differences.
-    fn check(options: Contrastive, kind: Neighbours, propagate: bool) {
-        let name = format!("{options:?} {kind:?} {propagate}");
-        let context = context(50, kind, propagate);
+    fn check(options: Contrastive, propagate: bool) {
+        let name = format!("{options:?} {propagate}");
+        let context = context(50, propagate);
         let set = mask_set(&context, 5, 3);
         let mut rng = ChaCha8Rng::seed_from_u64(1);
         let mut model = Model::<f64>::new(D, options, &context, &mut rng);
         let propagated = model.propagate(&context);
-        // Positives for three masks of five.
-        let beside: Vec<f64> = (0..20).map(|i| if i < 12 { f64::from(i * i % 7) - 2.0 } else { 0.0 }).collect();
-        let beside = (model.options.loss == Loss::CrossView).then_some(&beside[..]);
-        let step = model.step(&context, &propagated, &set, 77, beside);
+        let step = model.step(&context, &propagated, &set, 77);
         let close = |analytic: f64, plus: f64, minus: f64, h: f64, what: &str| {
             let numeric = (plus - minus) / (2.0 * h);
             assert!(
@@ -439,7 +383,7 @@ mod tests {
                 let was = model.features[at];
                 let mut loss = |v: f64| {
                     model.features[at] = v;
-                    model.step(&context, &propagated, &set, 77, beside).loss
+                    model.step(&context, &propagated, &set, 77).loss
                 };
                 let (plus, minus) = (loss(was + h), loss(was - h));
                 model.features[at] = was;
@@ -453,7 +397,7 @@ mod tests {
                 let mut loss = |v: f64| {
                     model.layers[l].weights[i] = v;
                     let p = model.propagate(&context);
-                    model.step(&context, &p, &set, 77, beside).loss
+                    model.step(&context, &p, &set, 77).loss
                 };
                 let (plus, minus) = (loss(was + h), loss(was - h));
                 model.layers[l].weights[i] = was;
@@ -466,33 +410,20 @@ mod tests {
 
     #[test]
     fn gradients_are_those_of_finite_differences() {
-        use Neighbours::{Anchors, Gaussians};
+        let printed = Contrastive::default();
         for layers in 0..=4 {
-            check(Contrastive { layers, ..Contrastive::default() }, Gaussians, true);
+            check(Contrastive { layers, ..printed.clone() }, true);
         }
-        for layers in [1, 3] {
-            check(Contrastive { layers, ..Contrastive::default() }, Anchors, true);
-        }
-        check(Contrastive::default(), Gaussians, false);
-        check(Contrastive::default(), Neighbours::AnchorInputs, true);
-        check(Contrastive { last_relu: false, bias: true, ..Contrastive::default() }, Gaussians, true);
-        for unit_length in [UnitLength::Before, UnitLength::After] {
-            let unit = Contrastive { unit_length, ..Contrastive::default() };
-            for kind in [Gaussians, Anchors] {
-                check(Contrastive { last_relu: false, bias: true, ..unit.clone() }, kind, true);
-            }
-            for loss in [Loss::Gaussian, Loss::Pixel, Loss::Separation] {
-                check(Contrastive { loss, ..unit.clone() }, Gaussians, true);
-            }
-        }
-        for loss in [Loss::WithSelf, Loss::HalfMask, Loss::CrossView, Loss::Gaussian, Loss::Pixel] {
+        check(printed.clone(), false);
+        for loss in [Loss::Printed, Loss::Gaussian, Loss::Pixel, Loss::Separation] {
+            check(Contrastive { loss, unit_length: UnitLength::After, ..printed.clone() }, true);
             for norm_axis in [Axis::Channel, Axis::Gaussian] {
-                check(Contrastive { loss, norm_axis, ..Contrastive::default() }, Anchors, true);
+                check(Contrastive { loss, norm_axis, ..printed.clone() }, true);
             }
         }
-        let cohesive = Contrastive { cohesion: 0.3, tau: 0.5, init: Init::NormalSmall, ..Contrastive::default() };
-        check(cohesive.clone(), Gaussians, true);
-        check(Contrastive { loss: Loss::Pixel, layers: 0, pixels: 2, ..cohesive.clone() }, Gaussians, true);
-        check(Contrastive { loss: Loss::Pixel, ..cohesive }, Anchors, true);
+        let cohesive = Contrastive { cohesion: 0.3, tau: 0.5, init: Init::NormalSmall, ..printed };
+        check(cohesive.clone(), true);
+        check(Contrastive { loss: Loss::Pixel, layers: 0, pixels: 2, ..cohesive.clone() }, true);
+        check(Contrastive { loss: Loss::Pixel, ..cohesive }, true);
     }
 }

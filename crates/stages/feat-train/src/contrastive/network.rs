@@ -1,12 +1,10 @@
 //! The graph network on anchors (paper, "Neighborhood Feature Aggregation"):
-//! f_m^(l+1) = ReLU(W1 f_m^(l) + Σ_{n in N(m)} W2 h_n), with f_m^(0) = h_m; a bias is added where the options ask for it.
+//! f_m^(l+1) = ReLU(W1 f_m^(l) + Σ_{n in N(m)} W2 h_n), with f_m^(0) = h_m.
 //!
-//! Σ W2 h_n = W2 Σ h_n, so neighbours are summed in the input's channels and, with Gaussians as neighbours, once for all
-//! layers. The inputs are detached: gradients reach the weights only.
+//! Σ W2 h_n = W2 Σ h_n, so neighbours are summed in the input's channels, once for all layers. The inputs are detached: gradients reach the weights only.
 
 use super::context::Context;
 use super::real::Real;
-use crate::options::Neighbours;
 use rand::Rng;
 use rayon::prelude::*;
 
@@ -24,49 +22,34 @@ pub struct Layer<T> {
     pub neighbour: usize,
     /// Channels of its output.
     pub output: usize,
-    /// W1 `[input][output]`, then W2 `[neighbour][output]`, then the bias `[output]` if there is one.
+    /// W1 `[input][output]`, then W2 `[neighbour][output]`.
     pub weights: Vec<T>,
-    /// Whether negative outputs become zero.
-    pub relu: bool,
 }
 
 impl<T: Real> Layer<T> {
     /// Uniform in ±1/sqrt(inputs), as linear layers usually start.
-    fn random(input: usize, neighbour: usize, output: usize, bias: bool, rng: &mut impl Rng) -> Self {
+    fn random(input: usize, neighbour: usize, output: usize, rng: &mut impl Rng) -> Self {
         let mut draw = |count: usize, fan_in: usize| -> Vec<T> {
             let bound = 1.0 / (fan_in as f64).sqrt();
             (0..count).map(|_| T::of(rng.random_range(-bound..bound))).collect()
         };
         let mut weights = draw(input * output, input);
         weights.extend(draw(neighbour * output, neighbour));
-        if bias {
-            weights.extend(draw(output, neighbour));
-        }
-        Self { input, neighbour, output, weights, relu: true }
+        Self { input, neighbour, output, weights }
     }
 
-    /// W1, W2 and the bias, which is empty where there is none.
-    pub fn split(&self) -> (&[T], &[T], &[T]) {
-        let (w1, rest) = self.weights.split_at(self.input * self.output);
-        let (w2, bias) = rest.split_at(self.neighbour * self.output);
-        (w1, w2, bias)
+    /// W1 and W2.
+    fn split(&self) -> (&[T], &[T]) {
+        self.weights.split_at(self.input * self.output)
     }
 }
 
 /// The layers: `input` → 16 → … → `output` channels.
-pub fn random_layers<T: Real>(
-    count: usize,
-    input: usize,
-    output: usize,
-    kind: Neighbours,
-    bias: bool,
-    rng: &mut impl Rng,
-) -> Vec<Layer<T>> {
+pub fn random_layers<T: Real>(count: usize, input: usize, output: usize, rng: &mut impl Rng) -> Vec<Layer<T>> {
     (0..count)
         .map(|l| {
             let own = if l == 0 { input } else { HIDDEN };
-            let neighbour = if kind == Neighbours::Anchors { own } else { input };
-            Layer::random(own, neighbour, if l + 1 == count { output } else { HIDDEN }, bias, rng)
+            Layer::random(own, input, if l + 1 == count { output } else { HIDDEN }, rng)
         })
         .collect()
 }
@@ -76,36 +59,24 @@ pub fn random_layers<T: Real>(
 pub struct Activations<T> {
     /// Input of each layer, and the output of the last: `[M][channels]`.
     pub features: Vec<Vec<T>>,
-    /// Summed neighbours of each layer `[M][channels]`; with Gaussians as neighbours the first serves all.
-    pub sums: Vec<Vec<T>>,
-}
-
-impl<T> Activations<T> {
-    fn sums_of(&self, layer: usize) -> &[T] {
-        &self.sums[layer.min(self.sums.len() - 1)]
-    }
+    /// Summed inputs of the neighbours `[M][channels]`, the same for all layers.
+    pub sums: Vec<T>,
 }
 
 /// Runs the layers on the anchors' inputs `h` `[M][channels]`; `sums` are the summed inputs of the neighbours.
 pub fn forward<T: Real>(layers: &[Layer<T>], context: &Context, h: Vec<T>, sums: Vec<T>) -> Activations<T> {
-    let mut out = Activations { features: vec![h], sums: vec![sums] };
+    let mut out = Activations { features: vec![h], sums };
     for (l, layer) in layers.iter().enumerate() {
-        if l > 0 && context.kind == Neighbours::Anchors {
-            let sums = neighbour_sums(context, &out.features[l], layer.neighbour);
-            out.sums.push(sums);
-        }
-        let (x, s) = (&out.features[l], out.sums_of(l));
-        let (w1, w2, bias) = layer.split();
+        let (x, s) = (&out.features[l], &out.sums);
+        let (w1, w2) = layer.split();
         let m = context.anchors.len();
         let mut y = vec![T::default(); m * layer.output];
         y.par_chunks_mut(CHUNK * layer.output).enumerate().for_each(|(chunk, rows)| {
             for (i, row) in rows.chunks_exact_mut(layer.output).enumerate() {
                 let a = chunk * CHUNK + i;
-                // Without a bias the row stays zero.
-                row.iter_mut().zip(bias).for_each(|(r, &b)| *r = b);
                 multiply_add(&x[a * layer.input..(a + 1) * layer.input], w1, row);
                 multiply_add(&s[a * layer.neighbour..(a + 1) * layer.neighbour], w2, row);
-                for v in row.iter_mut().filter(|v| layer.relu && **v < T::default()) {
+                for v in row.iter_mut().filter(|v| **v < T::default()) {
                     *v = T::default();
                 }
             }
@@ -125,20 +96,6 @@ fn multiply_add<T: Real>(x: &[T], w: &[T], row: &mut [T]) {
     }
 }
 
-/// Σ over neighbouring anchors of their features.
-pub fn neighbour_sums<T: Real>(context: &Context, features: &[T], channels: usize) -> Vec<T> {
-    let mut sums = vec![T::default(); context.anchors.len() * channels];
-    sums.par_chunks_mut(CHUNK * channels).enumerate().for_each(|(chunk, rows)| {
-        for (i, row) in rows.chunks_exact_mut(channels).enumerate() {
-            for &n in context.neighbours_of(chunk * CHUNK + i) {
-                let x = &features[n as usize * channels..(n as usize + 1) * channels];
-                row.iter_mut().zip(x).for_each(|(r, &x)| *r += x);
-            }
-        }
-    });
-    sums
-}
-
 /// Gradients of all weights, layer by layer, given the gradient of the last output `[M][channels]`.
 pub fn backward<T: Real>(
     layers: &[Layer<T>],
@@ -151,11 +108,11 @@ pub fn backward<T: Real>(
         let output = &activations.features[l + 1];
         // ReLU: what did not pass takes no gradient.
         gradient.par_iter_mut().zip(output).with_min_len(CHUNK).for_each(|(g, &y)| {
-            if layer.relu && y <= T::default() {
+            if y <= T::default() {
                 *g = T::default();
             }
         });
-        out[l] = weight_gradients(layer, &activations.features[l], activations.sums_of(l), &gradient);
+        out[l] = weight_gradients(layer, &activations.features[l], &activations.sums, &gradient);
         if l > 0 {
             gradient = input_gradients(layer, context, &gradient);
         }
@@ -178,11 +135,9 @@ fn weight_gradients<T: Real>(layer: &Layer<T>, x: &[T], s: &[T], gradient: &[T])
                 let inputs = x[a * layer.input..(a + 1) * layer.input]
                     .iter()
                     .chain(&s[a * layer.neighbour..(a + 1) * layer.neighbour]);
-                let (weights, bias) = sums.split_at_mut((layer.input + layer.neighbour) * width);
-                for (&v, row) in inputs.zip(weights.chunks_exact_mut(width)) {
+                for (&v, row) in inputs.zip(sums.chunks_exact_mut(width)) {
                     row.iter_mut().zip(g).for_each(|(r, &g)| *r += v * g);
                 }
-                bias.iter_mut().zip(g).for_each(|(r, &g)| *r += g);
             }
             sums.iter().map(|v| v.get()).collect()
         })
@@ -194,24 +149,15 @@ fn weight_gradients<T: Real>(layer: &Layer<T>, x: &[T], s: &[T], gradient: &[T])
     total.into_iter().map(T::of).collect()
 }
 
-/// Gradient of a layer's input: through W1, and with anchors as neighbours through W2 to every anchor's neighbours.
+/// Gradient of a layer's input, through W1.
 fn input_gradients<T: Real>(layer: &Layer<T>, context: &Context, gradient: &[T]) -> Vec<T> {
-    let (w1, w2, _) = layer.split();
+    let (w1, _) = layer.split();
     let (width, input) = (layer.output, layer.input);
     let mut out = vec![T::default(); context.anchors.len() * input];
     out.par_chunks_mut(CHUNK * input).enumerate().for_each(|(chunk, rows)| {
-        let mut sum = vec![T::default(); width];
         for (i, row) in rows.chunks_exact_mut(input).enumerate() {
             let a = chunk * CHUNK + i;
             multiply_transposed(&gradient[a * width..(a + 1) * width], w1, row);
-            if context.kind == Neighbours::Anchors {
-                sum.fill(T::default());
-                for &m in context.reverse_of(a) {
-                    let g = &gradient[m as usize * width..(m as usize + 1) * width];
-                    sum.iter_mut().zip(g).for_each(|(s, &g)| *s += g);
-                }
-                multiply_transposed(&sum, w2, row);
-            }
         }
     });
     out

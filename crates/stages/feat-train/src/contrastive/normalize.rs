@@ -37,19 +37,6 @@ impl Moments {
         Self { mean, deviation, inverse: if noise { 0.0 } else { 1.0 / (deviation + EPSILON) }, count }
     }
 
-    /// From parts: each the sums of (x - pivot) and of its square, the pivot and how many values, added up in order.
-    pub fn from_parts(parts: impl Iterator<Item = [f64; 4]> + Clone) -> Self {
-        let Some([_, _, pivot, _]) = parts.clone().find(|p| p[3] > 0.0) else { return Self::default() };
-        let (mut s1, mut s2, mut count) = (0.0, 0.0, 0.0);
-        for [a, b, from, n] in parts.filter(|p| p[3] > 0.0) {
-            let shift = from - pivot;
-            s1 += a + n * shift;
-            s2 += b + 2.0 * shift * a + n * shift * shift;
-            count += n;
-        }
-        Self::from_sums(pivot, s1, s2, count)
-    }
-
     #[inline]
     pub fn apply(&self, v: f64) -> f64 {
         (v - self.mean) * self.inverse

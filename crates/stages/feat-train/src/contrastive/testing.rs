@@ -2,7 +2,6 @@
 
 use super::context::Context;
 use super::masks::{MaskSet, Pixels};
-use crate::options::Neighbours;
 use artifacts::Graph;
 use ndarray::Array2;
 use rand::{Rng, SeedableRng};
@@ -38,9 +37,9 @@ pub fn colors(n: usize) -> Vec<[f32; 3]> {
     (0..n).map(|_| std::array::from_fn(|_| rng.random_range(0.0..1.0))).collect()
 }
 
-pub fn context(n: usize, kind: Neighbours, propagate: bool) -> Context {
+pub fn context(n: usize, propagate: bool) -> Context {
     let positions: Vec<[f32; 3]> = (0..n).map(|i| [i as f32, 0.0, 0.0]).collect();
-    Context::new(&graph(n, 3), &colors(n), &positions, kind, propagate)
+    Context::new(&graph(n, 3), &colors(n), &positions, propagate)
 }
 
 /// `masks` masks over most of the Gaussians, some of which lie in two.

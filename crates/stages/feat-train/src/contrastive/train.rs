@@ -7,7 +7,7 @@ use super::model::Model;
 use super::solver::Solver;
 use super::state::{CurvePoint, State};
 use crate::inputs::Inputs;
-use crate::options::{Args, Loss};
+use crate::options::Args;
 use crate::outputs::{Made, write_curve};
 use gs_io::{Error, Result, mixed};
 use ndarray::Array2;
@@ -56,14 +56,9 @@ pub fn train(args: &Args, inputs: &Inputs, context: &Context, mut sets: MaskSets
     let mut order = Views { count: seen.len() as u64, seed, epoch: u64::MAX, order: Vec::new() };
     let mut progress = stage.progress("iterations", options.iterations).resumed_at(resumed_at);
     while state.iteration < options.iterations {
-        let number = seen[order.at(state.iteration)];
-        let set = &*sets.get(number)?;
+        let set = &*sets.get(seen[order.at(state.iteration)])?;
         let noise = mixed(seed ^ mixed(state.iteration));
-        // Another view to take positives from, for the loss that asks for them.
-        let other = seen[(mixed(noise) % seen.len() as u64) as usize];
-        let beside = options.loss == Loss::CrossView && other != number;
-        let beside = beside.then(|| sets.get(other)).transpose()?;
-        let [loss, separation] = solver.forward(&state.model, set, beside.as_deref(), noise);
+        let [loss, separation] = solver.forward(&state.model, set, noise);
         if !loss.is_finite() {
             return Err(Error::new("the loss is not finite")
                 .field(format!("iteration {}", state.iteration + 1))
@@ -76,7 +71,7 @@ pub fn train(args: &Args, inputs: &Inputs, context: &Context, mut sets: MaskSets
             let point = state.window.take(state.iteration + 1, alignment, options.lr);
             state.curve.push(point);
         }
-        solver.update(&mut state, set, noise, options);
+        solver.update(&mut state, set, options);
         let settled = state.iteration.is_multiple_of(LOOK_EVERY)
             && !held_out.is_empty()
             && state.settled.look(solver.mean_loss(&state.model, &held_out));

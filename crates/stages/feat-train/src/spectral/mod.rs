@@ -23,6 +23,9 @@ use stage::Stage;
 use std::time::Instant;
 use vectors::{Spectral, SpectralOptions, spectral};
 
+/// Singular value below which a vector fades out: a low one shows parts, a high one whole things.
+const CUTOFF: f64 = 0.6;
+
 const SPECTRUM: [Panel; 1] = [("singular_value", "singular values", "#1f77b4")];
 
 /// Computes the features and writes their spectrum as the curve.
@@ -37,20 +40,19 @@ pub fn features(args: &Args, inputs: &Inputs, stage: &Stage) -> Result<Made> {
             .hint("choose other --levels, or check that masks and geometry are of one scene"));
     }
     let evidence_seconds = clock.elapsed().as_secs_f64();
-    let cutoff = args.options.spectral.cutoff;
     let options = SpectralOptions {
         most: args.options.most_vectors(matrix.gaussians),
         auto: args.options.dim.is_none(),
-        cutoff,
+        cutoff: CUTOFF,
         seed: args.common.seed,
     };
     let Spectral { dim, features, found, gram_entries } = spectral(&matrix, &options, stage)?;
     let vectors_seconds = clock.elapsed().as_secs_f64() - evidence_seconds;
-    let above = found.values.iter().filter(|v| **v > cutoff).count();
+    let above = found.values.iter().filter(|v| **v > CUTOFF).count();
     if above > dim {
         let more = if above == found.values.len() { " or more" } else { "" };
         stage.warn(&format!(
-            "{above}{more} singular values exceed the cutoff of {cutoff}, but only the first {dim} are kept: small things \
+            "{above}{more} singular values exceed the cutoff of {CUTOFF}, but only the first {dim} are kept: small things \
              may run together; give a larger --dim"
         ));
     }
