@@ -40,6 +40,8 @@ const TRIES: usize = 10;
 const ROUNDS: usize = 300;
 /// Most masks of an object that its descriptors are made from, evenly chosen: k-means takes all pairs.
 const MOST_MASKS: usize = 2000;
+/// Most descriptors of an object and level (the code).
+const MOST: usize = 20;
 
 /// Settings.
 #[derive(Debug, Clone, clap::Args, Serialize)]
@@ -60,12 +62,6 @@ pub struct Options {
     /// Objects that part below this distance of unit prototypes are one, times 1 for the finest level used, 2 for the next; 0 to 2
     #[arg(long, value_name = "DISTANCE", default_value_t = 0.1, value_parser = stage::within(0.0..=2.0))]
     epsilon: f64,
-    /// A Gaussian joins an object from this cosine to its mean prototype, -1 to 1; the code has no limit
-    #[arg(long, value_name = "COSINE", default_value_t = -1.0, value_parser = stage::within(-1.0f32..=1.0), allow_hyphen_values = true)]
-    similarity: f32,
-    /// Most descriptors of an object and level, 1 to 100
-    #[arg(long, value_name = "COUNT", default_value_t = 20, value_parser = stage::within(1..=100u32))]
-    most: u32,
     /// Descriptors are dropped whose weight is below this share of the object's largest, 0 to 1
     #[arg(long, value_name = "SHARE", default_value_t = 0.95, value_parser = stage::within(0.0..=1.0))]
     min_weight: f64,
@@ -156,12 +152,12 @@ impl Options {
             }
         }
         let centres = group_means(of_mask.iter().copied().zip(prototypes.chunks_exact(dim)), dim, count);
-        let labels = most_alike(features, dim, &centres, self.similarity);
+        let labels = most_alike(features, dim, &centres, -1.0);
         let describe = |(object, masks): (usize, &Vec<u32>)| {
             let features = masks.iter().filter_map(|&r| world.feature(&rows[r as usize]));
             let features: Vec<Vec<f32>> = features.map(|f| normed(&wide(f))).collect();
             let seed = stage.seed() ^ ((level as u64) << 32) ^ object as u64;
-            (mean(&features, world.dim()), describe(&features, self.most as usize, self.min_weight, seed))
+            (mean(&features, world.dim()), describe(&features, MOST, self.min_weight, seed))
         };
         let (means, descriptors) = own.par_iter().enumerate().map(describe).unzip();
         Ok(Objects { labels, masks: own, means, descriptors })

@@ -38,6 +38,12 @@ const COSINE: f32 = 0.001;
 const EPSILON: [f32; 2] = [1e-8, 1e-15];
 /// Deviation of the codes at the start. The authors start at zero, where a code has no direction to be brought to unit length.
 const START: f32 = 0.01;
+/// Learning rate of the autoencoder.
+const AUTOENCODER_RATE: f32 = 7e-4;
+/// Pixels sampled of each view.
+const PIXELS: usize = 16384;
+/// Pixels in a step of the codes.
+const STEP_PIXELS: usize = 1024;
 
 /// Settings.
 #[derive(Debug, Clone, clap::Args, Serialize)]
@@ -51,21 +57,12 @@ pub struct Options {
     /// Steps of the autoencoder, of 64 mask features each, 1 or more. The authors take 100 rounds of all masks
     #[arg(long, value_name = "COUNT", default_value_t = 1200, value_parser = stage::within(1..=10_000_000usize))]
     autoencoder_steps: usize,
-    /// Learning rate of the autoencoder, above 0
-    #[arg(long, value_name = "RATE", default_value_t = 7e-4, value_parser = stage::positive::<f32>)]
-    autoencoder_rate: f32,
     /// Steps of the codes, each of one view, 1 or more. The authors take 30000, of whole views
     #[arg(long, value_name = "COUNT", default_value_t = 2500, value_parser = stage::within(1..=10_000_000usize))]
     iterations: usize,
     /// Learning rate of the codes, above 0
     #[arg(long, value_name = "RATE", default_value_t = 0.0025, value_parser = stage::positive::<f32>)]
     rate: f32,
-    /// Pixels sampled of each view, 1 or more
-    #[arg(long, value_name = "COUNT", default_value_t = 16384, value_parser = stage::within(1..=100_000_000usize))]
-    pixels: usize,
-    /// Pixels in a step of the codes, 1 or more
-    #[arg(long, value_name = "COUNT", default_value_t = 1024, value_parser = stage::within(1..=100_000_000usize))]
-    batch: usize,
 }
 
 impl Peer for Options {
@@ -87,7 +84,7 @@ impl Peer for Options {
         stage.info(&format!("autoencoder: mean cosine {:.3}", autoencoder.cosine(&features)));
         let mut values = vec![0.0; n * levels.len() * dim];
         for (slot, &level) in levels.iter().enumerate() {
-            let views = sample(world, &[level], self.pixels, &mut rng)?;
+            let views = sample(world, &[level], PIXELS, &mut rng)?;
             if views.is_empty() {
                 return Err(Error::new("no mask with a feature").field("--levels").found(level));
             }
@@ -142,7 +139,7 @@ impl Autoencoder {
         let decoder = Net::new(&[&[code], &DECODER[..], &[dim]].concat(), false, rng);
         let mut both = Self { encoder, decoder, code, dim };
         let mut gradients = [&both.encoder, &both.decoder].map(|net| vec![0.0; net.parameters.len()]);
-        let mut adam = [0, 1].map(|k| Adam::new(gradients[k].len(), options.autoencoder_rate, EPSILON[0], 0.0));
+        let mut adam = [0, 1].map(|k| Adam::new(gradients[k].len(), AUTOENCODER_RATE, EPSILON[0], 0.0));
         let mut order: Vec<usize> = (0..count).collect();
         let mut at = count;
         for _ in 0..options.autoencoder_steps {
@@ -222,7 +219,7 @@ fn fit(
     let mut batches = Batches::default();
     let (mut loss, last) = (0.0, options.iterations.min(100));
     for iteration in 0..options.iterations {
-        let Some((view, range)) = batches.draw(views, options.batch, rng) else { break };
+        let Some((view, range)) = batches.draw(views, STEP_PIXELS, rng) else { break };
         let mut units = codes.clone();
         let lengths = unit_rows(&mut units, code);
         let mut g = views[view].render(range.clone(), &units, code);
@@ -260,7 +257,7 @@ mod tests {
             weight: vec![1.0, 1.0, 1.0, 1.0, 0.5],
         };
         let goal = vec![1.0, 0.0, 1.0, 0.0, 1.0, 0.0, 0.0, 1.0, 0.0, -1.0];
-        let options = options::<Options>("--code 2 --iterations 2000 --batch 5");
+        let options = options::<Options>("--code 2 --iterations 2000");
         let (mut codes, _) = fit(std::slice::from_ref(&view), &[goal], 3, &options, &mut ChaCha8Rng::seed_from_u64(1));
         unit_rows(&mut codes, 2);
         assert!(codes[0] > 0.98 && codes[3] < -0.98, "{codes:?}");

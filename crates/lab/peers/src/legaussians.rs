@@ -38,6 +38,12 @@ const SMOOTH: [usize; 2] = [10, 512];
 const SMOOTH_LEAST: f32 = 0.1;
 /// Rounds of k-means at most.
 const ROUNDS: usize = 50;
+/// Learning rate of the codes. The authors' is 0.001.
+const RATE: f32 = 0.05;
+/// Learning rate of the nets. The authors' is 0.001.
+const DECODER_RATE: f32 = 0.003;
+/// Pixels sampled of each view.
+const PIXELS: usize = 16384;
 
 /// Settings.
 #[derive(Debug, Clone, clap::Args, Serialize)]
@@ -51,18 +57,9 @@ pub struct Options {
     /// Steps, each of one view, 1 or more. The authors take 30000, of whole views
     #[arg(long, value_name = "COUNT", default_value_t = 4000, value_parser = stage::within(1..=10_000_000usize))]
     iterations: usize,
-    /// Learning rate of the codes, above 0. The authors' is 0.001
-    #[arg(long, value_name = "RATE", default_value_t = 0.05, value_parser = stage::positive::<f32>)]
-    rate: f32,
-    /// Learning rate of the nets, above 0. The authors' is 0.001
-    #[arg(long, value_name = "RATE", default_value_t = 0.003, value_parser = stage::positive::<f32>)]
-    decoder_rate: f32,
     /// Weight of the smoothing, 0 or more
     #[arg(long, value_name = "WEIGHT", default_value_t = 1.0, value_parser = stage::at_least::<f32>(0.0))]
     smooth: f32,
-    /// Pixels sampled of each view, 1 or more
-    #[arg(long, value_name = "COUNT", default_value_t = 16384, value_parser = stage::within(1..=100_000_000usize))]
-    pixels: usize,
     /// Pixels in a step, 1 or more
     #[arg(long, value_name = "COUNT", default_value_t = 64, value_parser = stage::within(1..=100_000_000usize))]
     batch: usize,
@@ -83,7 +80,7 @@ impl Peer for Options {
     fn make(&self, world: &World, stage: &Stage) -> Result<Product> {
         let mut rng = ChaCha8Rng::seed_from_u64(stage.seed());
         let (n, dim) = (world.kept(), world.dim());
-        let views = sample(world, &world.levels, self.pixels, &mut rng)?;
+        let views = sample(world, &world.levels, PIXELS, &mut rng)?;
         if views.is_empty() {
             return Err(Error::new("no mask with a feature").hint("choose other --levels"));
         }
@@ -259,9 +256,9 @@ impl Learner {
         options: &Options,
         rng: &mut impl Rng,
     ) -> f64 {
-        let mut of_codes = Adam::new(self.codes.len(), options.rate, EPSILON[1], 0.0);
+        let mut of_codes = Adam::new(self.codes.len(), RATE, EPSILON[1], 0.0);
         let mut of_doubts = Adam::new(self.doubts.len(), UNCERTAINTY[0], EPSILON[1], 0.0);
-        let of_net = |net: &Net| Adam::new(net.parameters.len(), options.decoder_rate, EPSILON[0], DECAY);
+        let of_net = |net: &Net| Adam::new(net.parameters.len(), DECODER_RATE, EPSILON[0], DECAY);
         let (mut of_decoder, mut of_smoother) = (of_net(&self.decoder), of_net(&self.smoother));
         let mut by_net = vec![0.0; self.decoder.parameters.len().max(self.smoother.parameters.len())];
         let mut batches = Batches::default();

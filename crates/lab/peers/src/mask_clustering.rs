@@ -10,7 +10,7 @@
 //! the view shows a fifth or more of what the best view shows of it. The code leaves points that lie in two masks of a frame out
 //! of its counts, in all frames; here a Gaussian without such a mask is left out in that frame only, for with splats nearly all
 //! would go. At the end a Gaussian that is no point of an object joins the one whose masks give it most weight, for the code's
-//! points within 3 cm of a mask take those in too; with `--bare` it stays alone.
+//! points within 3 cm of a mask take those in too.
 //!
 //! The paper has one map of masks for each frame. With several levels each is clustered by itself, and objects of different
 //! levels meet in the code's last step, which drops an object that lies in another. Objects of the code may overlap; here a
@@ -38,6 +38,14 @@ const MANY_POINTS: u32 = 500;
 const MIN_MASKS: usize = 2;
 /// Percentiles of the observers, from the first to the last step (the code): 95, 90, ... 0.
 const PERCENTILES: std::ops::RangeInclusive<u32> = 0..=19;
+/// Masks whose mean feature describes an object, those that cover most of it (the code).
+const TOP_MASKS: usize = 5;
+/// An object is dropped of which another holds more than this share (the code).
+const OVERLAP: f64 = 0.8;
+/// Longest edge inside an object, in median distances of nearest neighbours.
+const REACH: f32 = 10.0;
+/// A mask is seen in a frame from this share of its points (the code).
+const VISIBLE: f64 = 0.3;
 
 /// Settings.
 #[derive(Debug, Clone, clap::Args, Serialize)]
@@ -48,12 +56,6 @@ pub struct Options {
     #[command(flatten)]
     #[serde(flatten)]
     rules: Rules,
-    /// Masks whose mean feature describes an object, those that cover most of it, 1 or more
-    #[arg(long, value_name = "COUNT", default_value_t = 5, value_parser = stage::at_least(1u32))]
-    top_masks: u32,
-    /// Leave Gaussians alone that are points of no object; else they join the one whose masks give them most weight
-    #[arg(long)]
-    bare: bool,
 }
 
 /// The system's thresholds.
@@ -65,9 +67,6 @@ struct Rules {
     /// Least weight of a point in a view, as a share of the largest that the Gaussian has in a view, 0 to 1
     #[arg(long, value_name = "SHARE", default_value_t = 0.2, value_parser = stage::within(0.0f32..=1.0))]
     point_weight: f32,
-    /// A mask is seen in a frame from this share of its points, 0 to 1
-    #[arg(long, value_name = "SHARE", default_value_t = 0.3, value_parser = stage::within(0.0..=1.0))]
-    visible: f64,
     /// A mask contains another that has more than this share of its seen points in it, 0 to 1
     #[arg(long, value_name = "SHARE", default_value_t = 0.8, value_parser = stage::within(0.0..=1.0))]
     contained: f64,
@@ -80,12 +79,6 @@ struct Rules {
     /// A point stays in an object whose masks hold it in more than this share of the frames, 0 to 1
     #[arg(long, value_name = "SHARE", default_value_t = 0.5, value_parser = stage::within(0.0..=1.0))]
     detection: f64,
-    /// An object is dropped of which another holds more than this share, 0 to 1
-    #[arg(long, value_name = "SHARE", default_value_t = 0.8, value_parser = stage::within(0.0..=1.0))]
-    overlap: f64,
-    /// Longest edge inside an object, in median distances of nearest neighbours; 0 to split none
-    #[arg(long, value_name = "FACTOR", default_value_t = 10.0, value_parser = stage::at_least(0.0f32))]
-    reach: f32,
 }
 
 /// Points of a mask with their weights.
@@ -135,7 +128,7 @@ impl Peer for Options {
     }
 
     fn make(&self, world: &World, stage: &Stage) -> Result<Product> {
-        let reach = edge_limit(&world.graph, &world.geometry.gaussians.means, self.rules.reach);
+        let reach = edge_limit(&world.graph, &world.geometry.gaussians.means, REACH);
         let mut objects = Vec::new();
         for &level in &world.levels {
             let masks = read(world, level as u32, &self.rules)?;
@@ -149,12 +142,10 @@ impl Peer for Options {
                 objects.extend(refine(&masks, node, parts, self.rules.detection));
             }
         }
-        let objects = drop_inside(objects, world.kept(), self.rules.overlap);
+        let objects = drop_inside(objects, world.kept(), OVERLAP);
         let (mut labels, kept) = exclusive(&objects, world.kept());
         let objects: Vec<&Object> = kept.iter().map(|&o| &objects[o]).collect();
-        if !self.bare {
-            fill(&mut labels, &claims(world, &objects)?);
-        }
+        fill(&mut labels, &claims(world, &objects)?);
         Ok(Product::Instances(self.grouping(world, &objects, &labels)))
     }
 }
@@ -176,7 +167,7 @@ impl Options {
             }
             matches.extend(views.into_values());
             let mut sum = vec![0.0f64; dim];
-            for &(r, _) in masks.iter().take(self.top_masks as usize) {
+            for &(r, _) in masks.iter().take(TOP_MASKS) {
                 let feature = world.feature(&world.footprints.rows[r as usize]).unwrap_or_default();
                 let mut feature = feature.to_vec();
                 unit(&mut feature);
@@ -270,7 +261,7 @@ impl Masks {
         let counts: Vec<_> = counts.into_iter().collect();
         for frame in counts.chunk_by(|a, b| a.0.0 == b.0.0) {
             let all: u32 = frame.iter().map(|c| c.1).sum();
-            if f64::from(all) < rules.visible * self.points[m].len() as f64 && all < MANY_POINTS {
+            if f64::from(all) < VISIBLE * self.points[m].len() as f64 && all < MANY_POINTS {
                 continue;
             }
             visible += 1;
@@ -564,13 +555,10 @@ mod tests {
     const RULES: Rules = Rules {
         point_share: 0.5,
         point_weight: 0.5,
-        visible: 0.3,
         contained: 0.8,
         undersegmented: 0.3,
         consensus: 0.9,
         detection: 0.5,
-        overlap: 0.8,
-        reach: 0.0,
     };
 
     /// Two things of ten points each. Frames 0 to 3 see each as a mask; frame 4, if `joined`, sees both as one.

@@ -50,6 +50,8 @@ const NEAR_SUM: f64 = 0.9;
 /// ... and as a distance.
 const NEAR: f64 = 0.5;
 const PIXELS: usize = TILE * TILE;
+/// Least score of a match (the code).
+const LEAST_SCORE: f32 = 0.2;
 
 /// Settings.
 #[derive(Debug, Clone, clap::Args, Serialize)]
@@ -69,9 +71,6 @@ pub struct Options {
     /// Weight of positions, in units of the scene, for coarse clusters (LERF-OVS 0.5, ScanNet 1)
     #[arg(long, value_name = "FACTOR", default_value_t = 0.5, value_parser = stage::at_least(0.0f32))]
     position_weight: f32,
-    /// Least score of a match
-    #[arg(long, value_name = "SCORE", default_value_t = 0.2, value_parser = stage::within(0.0..=1.0f32))]
-    threshold: f32,
 }
 
 impl Peer for Options {
@@ -100,7 +99,7 @@ impl Peer for Options {
             masks.iter().map(|m| if self.fixed { self.fine } else { (m + 1).min(self.fine) }).collect();
         let (labels, instances) = fine(&features, dim, &coarse, &most, &mut rng);
         let labels = world.spread(&labels);
-        let matches = matched(world, &labels, &shown, &seen, self.threshold, stage)?;
+        let matches = matched(world, &labels, &shown, &seen, LEAST_SCORE, stage)?;
         Ok(Product::Instances(Grouping { labels, instances, matches, ..Grouping::default() }))
     }
 }

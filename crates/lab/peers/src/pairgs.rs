@@ -40,6 +40,8 @@ const SPARE: usize = 8;
 const CHUNK: usize = 4096;
 /// Points in a leaf of the search tree.
 const LEAF: usize = 16;
+/// Principal components of the lifted features that neighbours are sought by.
+const DIMENSIONS: usize = 8;
 
 /// Settings.
 #[derive(Debug, Clone, clap::Args, Serialize)]
@@ -50,9 +52,6 @@ pub struct Options {
     /// Nearest Gaussians that each proposes an edge to, 1 to 256
     #[arg(long, value_name = "COUNT", default_value_t = 16, value_parser = stage::within(1..=256usize))]
     neighbours: usize,
-    /// Principal components of the lifted features that neighbours are sought by, 1 to 64
-    #[arg(long, value_name = "COUNT", default_value_t = 8, value_parser = stage::within(1..=64usize))]
-    dimensions: usize,
     /// How much positions count beside semantics for neighbours, as a factor of their deviation, above 0
     #[arg(long, value_name = "FACTOR", default_value_t = 1.0, value_parser = stage::positive::<f32>)]
     position_scale: f32,
@@ -330,7 +329,7 @@ impl Peer for Options {
             (0, Vec::new())
         } else {
             let mut rng = ChaCha8Rng::seed_from_u64(stage.seed());
-            principal(&lifted.means(dim), dim, self.dimensions, &mut rng)
+            principal(&lifted.means(dim), dim, DIMENSIONS, &mut rng)
         };
         scale(&mut semantics, columns, 1.0);
         let means = &world.geometry.gaussians.means;

@@ -25,6 +25,10 @@ use rayon::prelude::*;
 use serde::Serialize;
 use stage::Stage;
 use std::path::Path;
+/// Fewest Gaussians that are clustered, where there are as many: 2 % of a small scene are too few.
+const LEAST: usize = 2000;
+/// Least IoU of a cluster with a mask that describes it.
+const LEAST_IOU: f32 = 0.2;
 
 /// Settings.
 #[derive(Debug, Clone, clap::Args, Serialize)]
@@ -38,18 +42,12 @@ pub struct Options {
     /// Share of the Gaussians that are clustered, above 0, at most 1
     #[arg(long, value_name = "SHARE", default_value_t = 0.02, value_parser = stage::within(1e-6..=1.0f64))]
     share: f64,
-    /// Fewest Gaussians that are clustered, where there are as many: 2 % of a small scene are too few
-    #[arg(long, value_name = "COUNT", default_value_t = 2000, value_parser = stage::within(1..=1_000_000usize))]
-    least: usize,
     /// Fewest Gaussians of a cluster of the sample, 2 or more
     #[arg(long, value_name = "COUNT", default_value_t = 10, value_parser = stage::within(2..=1_000_000usize))]
     min_cluster_size: usize,
     /// Join clusters that were born below this distance
     #[arg(long, value_name = "DISTANCE", default_value_t = 0.01, value_parser = stage::at_least(0.0f64))]
     epsilon: f64,
-    /// Least IoU of a cluster with a mask that describes it, 0 to 1
-    #[arg(long, value_name = "IOU", default_value_t = 0.2, value_parser = stage::within(0.0..=1.0f32))]
-    threshold: f32,
 }
 
 impl Peer for Options {
@@ -66,13 +64,13 @@ impl Peer for Options {
         let mut features = flat(world.learned.values.view()).to_vec();
         features.par_chunks_exact_mut(dim).for_each(unit);
         let features = smoothed(&features, dim, &world.graph.gaussian_knn, self.neighbours);
-        let count = ((world.kept() as f64 * self.share).ceil() as usize).max(self.least).min(world.kept());
+        let count = ((world.kept() as f64 * self.share).ceil() as usize).max(LEAST).min(world.kept());
         let mut rng = ChaCha8Rng::seed_from_u64(stage.seed());
         let mut chosen = sample(&mut rng, world.kept(), count).into_vec();
         chosen.sort_unstable();
         let (labels, instances) = clusters(&features, dim, &chosen, self);
         let labels = world.spread(&labels);
-        let matches = world.matches(&labels, self.threshold)?;
+        let matches = world.matches(&labels, LEAST_IOU)?;
         Ok(Product::Instances(Grouping { labels, instances, matches, ..Grouping::default() }))
     }
 }

@@ -31,6 +31,10 @@ const ROUNDS: usize = 25;
 /// Descriptors that k-means sees, for each centre. faiss wants 39 to 256; a scene's descriptors are alike and need
 /// fewer.
 const LEARNING: usize = 10;
+/// Bytes of a quantised descriptor, but no more than half as many as a descriptor has numbers (the authors).
+const PARTS: usize = 128;
+/// Centres for each byte (the authors).
+const CENTRES: usize = 256;
 
 /// Settings of Dr. Splat.
 #[derive(Debug, Clone, clap::Args, Serialize)]
@@ -44,14 +48,8 @@ pub struct DrSplatOptions {
     /// Divide the weights of a pixel's Gaussians by their sum
     #[arg(long)]
     even: bool,
-    /// Bytes of a quantised descriptor, 1 to 4096, but no more than half as many as a descriptor has numbers
-    #[arg(long, value_name = "COUNT", default_value_t = 128, value_parser = stage::within(1usize..=4096))]
-    subvectors: usize,
-    /// Centres for each byte, 2 to 256
-    #[arg(long, value_name = "COUNT", default_value_t = 256, value_parser = stage::within(2usize..=256))]
-    centres: usize,
     /// Leave descriptors as they are
-    #[arg(long, conflicts_with_all = ["subvectors", "centres"])]
+    #[arg(long)]
     no_quantisation: bool,
 }
 
@@ -74,10 +72,10 @@ impl Peer for DrSplatOptions {
         let mut table = described(world, slots(&world.levels).len(), &shares, weighted_mean);
         if !self.no_quantisation {
             let codebook = Codebook {
-                parts: self.subvectors.min(table.dim / 2),
-                centres: self.centres,
+                parts: PARTS.min(table.dim / 2),
+                centres: CENTRES,
                 rounds: ROUNDS,
-                most: LEARNING * self.centres,
+                most: LEARNING * CENTRES,
                 seed: stage.seed(),
             };
             quantise(&mut table.values, table.dim, &codebook);

@@ -71,7 +71,7 @@ pub struct ValaOptions {
 enum By {
     /// Of a view's Gaussians, each at the pixel of its centre, as in the code
     View,
-    /// Of the Gaussians along the ray of a pixel, at all pixels; --quantile, --bound and --most don't count
+    /// Of the Gaussians along the ray of a pixel, at all pixels
     Ray,
 }
 
@@ -85,13 +85,13 @@ struct Gate {
     #[arg(long, value_name = "WEIGHT", default_value_t = 0.13, value_parser = stage::within(0.0..=1.0))]
     floor: f64,
     /// Quantile of a view's blending weights above which weights pass, 0 to 1
-    #[arg(long, value_name = "SHARE", default_value_t = 0.85, value_parser = stage::within(0.0..=1.0))]
+    #[arg(skip = 0.85)]
     quantile: f64,
     /// Blending weight that replaces the quantile where more Gaussians exceed it, 0 to 1 (1: never)
-    #[arg(long, value_name = "WEIGHT", default_value_t = 0.15, value_parser = stage::within(0.0..=1.0))]
+    #[arg(skip = 0.15)]
     bound: f64,
     /// Share of a view's Gaussians that passes at most, 0 to 1
-    #[arg(long, value_name = "SHARE", default_value_t = 0.5, value_parser = stage::within(0.0..=1.0))]
+    #[arg(skip = 0.5)]
     most: f64,
 }
 
