@@ -11,9 +11,11 @@ from pathlib import Path
 
 import av
 import numpy as np
+import pillow_heif
 import pycolmap
 from PIL import Image
 
+pillow_heif.register_heif_opener()
 ROOT = Path(__file__).resolve().parent.parent
 WIDTH, HEIGHT, FOCAL = 400, 300, 330.0
 # Corner, and the two edges, of each rectangle; z is up.
@@ -97,13 +99,14 @@ def photographs(folder, poses, name="img_{:02}.jpg"):
 
 def test_photographs(home):
     truth = photographs(home / "photos", walk(16))
-    # As a phone writes it on its side, as PNG, and one of something else.
-    on_side = Image.open(home / "photos/img_03.jpg").transpose(Image.Transpose.ROTATE_90)
+    # On their side as phones write them, in every format, and one of something else. HEIC says itself how it is turned.
     exif = Image.Exif()
     exif[0x0112] = 6
-    on_side.save(home / "photos/img_03.jpg", quality=97, exif=exif)
-    Image.open(home / "photos/img_04.jpg").save(home / "photos/img_04.png")
-    (home / "photos/img_04.jpg").unlink()
+    for i, kind in ((3, "jpg"), (4, "png"), (5, "webp"), (6, "heic")):
+        upright = Image.open(home / f"photos/img_{i:02}.jpg")
+        (home / f"photos/img_{i:02}.jpg").unlink()
+        side = {} if kind == "heic" else {"exif": exif}
+        (upright.transpose(Image.Transpose.ROTATE_90) if side else upright).save(home / f"photos/img_{i:02}.{kind}", quality=97, **side)
     Image.fromarray(np.full((HEIGHT, WIDTH, 3), 90, np.uint8)).save(home / "photos/wall.jpg")
     said = run(home / "photos", home / "a", "--threads", 1)
     assert "wall.jpg: no pose" in said.stderr, said.stderr
@@ -112,7 +115,9 @@ def test_photographs(home):
     angle, centre, tilt = off(home / "a/sparse/0", truth)
     assert angle < 0.3 and centre < 0.01 and tilt < 3, (angle, centre, tilt)
     assert sorted(p.stem for p in (home / "a/images").iterdir()) == sorted(truth)
-    assert Image.open(home / "a/images/img_03.jpg").size == (WIDTH, HEIGHT)
+    for i in (3, 4, 5, 6):
+        read = np.asarray(Image.open(home / f"a/images/img_{i:02}.jpg"), float)
+        assert read.shape == (HEIGHT, WIDTH, 3) and np.abs(read - picture(*truth[f"img_{i:02}"])).mean() < 12, i
     # The same bytes for another number of threads, and after a kill.
     process = subprocess.Popen([sys.executable, ROOT / "scripts/poses.py", home / "photos", "--out", home / "b"], stderr=subprocess.PIPE, text=True)
     while not (home / "b/.poses/key.json").exists() and process.poll() is None:
