@@ -23,6 +23,8 @@ import sys
 import time
 from pathlib import Path
 
+# Many small products: threads of the library would only wait for each other.
+os.environ["OPENBLAS_NUM_THREADS"] = "1"
 try:
     import numpy as np
     import pillow_heif
@@ -190,11 +192,10 @@ def looks_alike(database, views, of_video):
     ids = {image.name: image.image_id for image in database.read_all_images()}
     largest = []
     for view in views:
-        points = np.asarray(pycolmap.keypoints_to_matrix(database.read_keypoints(ids[view["name"]])))
-        described = database.read_descriptors(ids[view["name"]])
-        described = np.asarray(getattr(described, "data", described), dtype=np.float32)
-        order = np.argsort(-points[:, 2] if points.shape[1] == 4 else -np.hypot(points[:, 2], points[:, 4]), kind="stable")[:LARGEST]
-        rows = described[order]
+        # Columns: x, y, and the 2x2 matrix, row by row, that makes a unit circle of the feature.
+        points = np.asarray(database.read_keypoints(ids[view["name"]])).reshape(-1, 6)
+        described = np.asarray(database.read_descriptors(ids[view["name"]]).data, dtype=np.float32).reshape(-1, 128)
+        rows = described[np.argsort(-np.hypot(points[:, 2], points[:, 4]), kind="stable")[:LARGEST]]
         largest.append(rows / np.maximum(np.linalg.norm(rows, axis=1, keepdims=True), 1e-6))
     n = len(views)
     agree = np.zeros((n, n))

@@ -69,8 +69,10 @@ def walk(count, share=0.4):
     return [(eye, look(eye, [0, 0, 0.4])) for eye in eyes]
 
 
-def run(source, out, *more, code=0):
-    done = subprocess.run([sys.executable, ROOT / "scripts/poses.py", source, "--out", out, "--json", *map(str, more)], capture_output=True, text=True)
+def run(source, out, *more, code=0, settings="pass"):
+    """Runs poses.py, with other values of its constants where `settings` gives them."""
+    program = f"import sys; sys.path.insert(0, {str(ROOT / 'scripts')!r}); import poses; {settings}; sys.exit(poses.main())"
+    done = subprocess.run([sys.executable, "-c", program, source, "--out", out, "--json", *map(str, more)], capture_output=True, text=True)
     assert done.returncode == code, (done.returncode, done.stderr)
     return done
 
@@ -141,7 +143,8 @@ def test_video(home):
                 pixels = np.mean([np.roll(pixels, s, 1) for s in range(12)], axis=0).astype(np.uint8)
             container.mux(stream.encode(av.VideoFrame.from_ndarray(pixels, format="rgb24")))
         container.mux(stream.encode())
-    run(home / "walk.mp4", home / "v", "--frames", 20)
+    # Pairs are chosen, as of more photographs than 60.
+    run(home / "walk.mp4", home / "v", "--frames", 20, settings="poses.ALL_PAIRS, poses.ALIKE, poses.NEIGHBOURS = 8, 3, 3")
     names = sorted(p.stem for p in (home / "v/images").iterdir())
     assert len(names) >= 18 and all(int(n[6:]) % 3 != 1 for n in names), names
     angle, centre, tilt = off(home / "v/sparse/0", {f"frame_{i:06}": pose for i, pose in enumerate(poses)})
