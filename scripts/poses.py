@@ -47,6 +47,8 @@ PEAKS = (0.0067, 0.0015)
 FEWEST = 6
 # Degrees between the rays of a point, below which a camera has only turned.
 TURNED = 2.0
+# Degrees that a plane of a floor or table may be off what cameras say is level, and the share of the points that it must have.
+LEVEL, LEVEL_SHARE = 10.0, 0.1
 FOCAL_35MM, MAKE, MODEL, EXIF_IFD = 0xA405, 0x010F, 0x0110, 0x8769
 
 
@@ -285,12 +287,37 @@ def largest_model(a, work, views, progress):
     return best, len(found)
 
 
-def z_up(model):
-    """Turns the model so that z is up: photographs are upright, so that the cameras' axes to the right lie level."""
+def level(model, up, seed):
+    """The normal of the plane that has most points (at least LEVEL_SHARE) of those that rise at most LEVEL degrees: floor or table."""
+    points = np.array([p.xyz for _, p in sorted(model.points3D.items()) if p.track.length() >= 3])
+    if len(points) < 100:
+        return up
+    noise = np.random.default_rng(seed)
+    points = points[noise.permutation(len(points))[:4000]]
+    near = 0.005 * np.median(np.linalg.norm(points - np.mean([i.projection_center() for i in model.images.values() if i.has_pose], 0), axis=1))
+    a, b, c = points[noise.integers(0, len(points), (3, 20000))]
+    normals = np.cross(b - a, c - a)
+    normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
+    flat = np.abs(normals @ up) > np.cos(np.radians(LEVEL))
+    best = max(zip(a[flat], normals[flat]), key=lambda p: np.count_nonzero(np.abs((points - p[0]) @ p[1]) < near), default=None)
+    if best is None:
+        return up
+    (at, normal) = best
+    for _ in range(5):
+        on = points[np.abs((points - at) @ normal) < near]
+        at = on.mean(0)
+        normal = np.linalg.svd(on - at, full_matrices=False)[2][2]
+    normal *= np.sign(normal @ up)
+    return normal if len(on) >= LEVEL_SHARE * len(points) and normal @ up > np.cos(np.radians(LEVEL)) else up
+
+
+def z_up(model, seed):
+    """Turns the model so that z is up: photographs are upright, so that the cameras' axes to the right lie level; so does a floor or table."""
     rotations = [image.cam_from_world().rotation.matrix() for image in model.images.values() if image.has_pose]
     right = np.array([r[0] for r in rotations])
     up = np.linalg.eigh(right.T @ right)[1][:, 0]
     up *= np.sign(up @ -sum(r[1] for r in rotations)) or 1.0
+    up = level(model, up, seed)
     side = np.cross(up, [1.0, 0, 0] if abs(up[0]) < 0.9 else [0, 1.0, 0])
     side /= np.linalg.norm(side)
     turn = np.stack([side, np.cross(up, side), up])
@@ -419,7 +446,7 @@ def run(a, progress):
         progress.warn(f"{m['name']}: no pose: {m['why']}")
     if len(missing) > 10:
         progress.warn(f"and {len(missing) - 10} more: {a.out / 'poses.json'}")
-    z_up(model)
+    z_up(model, a.seed)
     result = work / "result"
     shutil.rmtree(result, ignore_errors=True)
     (result / "images").mkdir(parents=True)
