@@ -81,6 +81,10 @@ pub struct Args {
     /// each axis. Photographs and truth keep the exact poses, which truth/sparse then holds
     #[arg(long, value_name = "SIZE", default_value_t = 0.0, value_parser = within(0.0..=10.0))]
     pose_noise: f64,
+    /// Fine marks on all surfaces, 0 to 1: without them rooms are too plain for structure from
+    /// motion, and 0.3 is enough
+    #[arg(long, value_name = "SHARE", default_value_t = 0.0, value_parser = within(0.0..=1.0))]
+    detail: f64,
     /// Write a feature like CLIP's for each mask (<view>_f.npy), and a table of text features for eval --text-features:
     /// text_features.json in truth, or beside the masks
     #[arg(long)]
@@ -160,6 +164,8 @@ pub struct Options {
     pub speech: Option<Speech>,
     /// Noise of the poses in `sparse/0`, in degrees about and centimetres along each axis.
     pub pose_noise: f64,
+    /// Strength of fine marks on all surfaces, 0 to 1.
+    pub detail: f64,
     /// Every how many views get polygon labels; 0 for none.
     pub label_every: usize,
     /// Where the files lie, and what they are called.
@@ -182,8 +188,22 @@ impl Size {
             Self::Large => (40, 120, 640, 480, 40_000),
         };
         let (family, faults, layout) = (Family::Studio, Faults::default(), Layout::Colmap);
-        let (seed, speech, pose_noise, label_every) = (0, None, 0.0, LABEL_EVERY);
-        Options { seed, family, objects, views, width, height, points, faults, speech, pose_noise, label_every, layout }
+        let (seed, speech, pose_noise, detail, label_every) = (0, None, 0.0, 0.0, LABEL_EVERY);
+        Options {
+            seed,
+            family,
+            objects,
+            views,
+            width,
+            height,
+            points,
+            faults,
+            speech,
+            pose_noise,
+            detail,
+            label_every,
+            layout,
+        }
     }
 }
 
@@ -222,6 +242,7 @@ impl Args {
                 language => Speech { language, noise: 0.0, ..speech },
             }),
             pose_noise: self.pose_noise,
+            detail: self.detail,
             layout: self.out.as_deref().map_or(Ok(Layout::Colmap), |out| Layout::new(self.layout, out))?,
             ..size
         })

@@ -5,6 +5,7 @@ pub mod light;
 
 use crate::render::light::LightMap;
 use crate::scene::{Hit, Scene};
+use crate::things::material::marks;
 use glam::DVec3;
 use gs_scene::Camera;
 use rayon::prelude::*;
@@ -95,7 +96,12 @@ fn shade(scene: &Scene, light: &LightMap, direction: DVec3, hit: &Hit) -> DVec3 
     let p = &scene.primitives[hit.primitive];
     let m = &p.material;
     let here = light.at(scene, hit.primitive, hit.local);
-    let mut out = m.color(hit.local) * (here.diffuse + m.glow);
+    let mut color = m.color(hit.local);
+    if scene.detail > 0.0 {
+        // Each surface has its own.
+        color *= (1.0 + scene.detail * marks(hit.local + 3.7 * hit.primitive as f64)).max(0.0);
+    }
+    let mut out = color * (here.diffuse + m.glow);
     if m.specular > 0.0 && here.key > 0.0 {
         let normal = p.rotation * p.shape.normal(hit.local);
         let to_lamp = (light.key_lamp() - p.to_world(hit.local)).normalize_or_zero();

@@ -111,6 +111,8 @@ pub struct Scene {
     pub tables: Vec<DVec3>,
     /// The family it is of, which says where cameras go.
     pub family: Family,
+    /// How strong the fine marks on all surfaces are, 0 to 1.
+    pub detail: f64,
     bvh: Bvh,
 }
 

@@ -73,6 +73,7 @@ impl Options {
     pub fn scene(&self) -> Scene {
         let mut scene = families::plan(self.family, self.objects, &mut self.rng(LAYOUT));
         self.layout.rename(&mut scene);
+        scene.detail = self.detail;
         scene
     }
 

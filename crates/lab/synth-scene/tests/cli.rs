@@ -130,6 +130,7 @@ fn bad_options_are_refused_before_anything_is_written() {
         (["--boundary-noise", "99"], "--boundary-noise"),
         (["--spurious", "1.1"], "--spurious"),
         (["--pose-noise", "11"], "--pose-noise"),
+        (["--detail", "1.5"], "--detail"),
     ] {
         let said = refused(&out, &arguments);
         assert!(said.contains(part) && said.contains("expected"), "{said}");
@@ -295,7 +296,7 @@ fn masks_alone_are_those_of_the_full_run() {
     assert!(said.contains("masks.json: the output exists and would be lost") && said.lines().count() == 1, "{said}");
 }
 
-/// Which folders of a scene each fault may change.
+/// Which folders of a scene each fault, and detail, may change.
 #[test]
 fn each_fault_changes_its_own_files_and_nothing_else() {
     let dir = tempfile::tempdir().unwrap();
@@ -309,6 +310,7 @@ fn each_fault_changes_its_own_files_and_nothing_else() {
     let maps = ["language_features", "truth/masks.json", "truth/scene.json"];
     let edges = ["language_features", "truth/scene.json"];
     let poses = ["sparse/0/images.bin", "truth/scene.json", "truth/sparse"];
+    let looks = ["images/frame", "sparse/0/points3D.bin", "truth/scene.json"];
     for (option, value, may) in [
         ("--granularity-p", "1", &maps[..]),
         ("--boundary-noise", "2", &edges),
@@ -317,6 +319,7 @@ fn each_fault_changes_its_own_files_and_nothing_else() {
         ("--torn", "1", &maps),
         ("--swallow", "1", &maps),
         ("--pose-noise", "0.5", &poses),
+        ("--detail", "1", &looks),
     ] {
         let changed = with(option, &[option, value]);
         let differs: BTreeSet<&PathBuf> =

@@ -186,6 +186,11 @@ fn clouds(p: DVec3) -> f64 {
     (noise(p) + 0.5 * noise(p * 2.1 + 17.0)) / 0.75 - 1.0
 }
 
+/// Fine marks of a surface, as scratches, weave and grime make them: noise from 15 cm down to 1 cm, about -1 to 1.
+pub fn marks(p: DVec3) -> f64 {
+    [6.7, 16.3, 39.1, 97.0].iter().map(|&f| 2.0 * noise(p * f) - 1.0).sum::<f64>() / 2.0
+}
+
 /// A random number of 0..1 that belongs to a lattice point.
 fn hash(x: i64, y: i64, z: i64) -> f64 {
     let mut h = (x as u64).wrapping_mul(0x9E37_79B9_7F4A_7C15)
