@@ -12,7 +12,7 @@ macro_rules! carried {
     ($($path:literal),* $(,)?) => { [$(($path, include_str!(concat!("../../../", $path)))),*] };
 }
 
-const FILES: [(&str, &str); 15] = carried![
+const FILES: [(&str, &str); 16] = carried![
     "pipelines/custom.mk",
     "pipelines/custom.conf",
     "pipelines/paths.mk",
@@ -24,6 +24,7 @@ const FILES: [(&str, &str); 15] = carried![
     "pipelines/quality/exact.conf",
     "pipelines/settings.mk",
     "pipelines/stages.mk",
+    "scripts/capture.py",
     "scripts/check_options.sh",
     "scripts/check_settings.sh",
     "scripts/fetch_models.sh",
