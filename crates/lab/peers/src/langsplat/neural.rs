@@ -2,54 +2,26 @@
 
 use nalgebra::{DMatrixView, DMatrixViewMut};
 use rand::Rng;
-use std::borrow::Cow;
 
 const NORM_EPSILON: f32 = 1e-5;
 /// How fast the running mean and variance of a batch norm follow.
 const NORM_MOMENTUM: f32 = 0.1;
 
-/// A matrix in memory row by row, maybe read as its transpose.
-#[derive(Clone, Copy)]
-struct Matrix<'a> {
-    values: &'a [f32],
-    cols: usize,
-    transposed: bool,
+/// The transpose of a matrix of `cols` columns; both lie in memory row by row.
+fn transposed(values: &[f32], cols: usize) -> Vec<f32> {
+    let rows = values.len() / cols.max(1);
+    let mut out = vec![0.0; values.len()];
+    for (r, row) in values.chunks_exact(cols).enumerate() {
+        row.iter().enumerate().for_each(|(c, &v)| out[c * rows + r] = v);
+    }
+    out
 }
 
-impl<'a> Matrix<'a> {
-    fn new(values: &'a [f32], cols: usize) -> Self {
-        Self { values, cols, transposed: false }
-    }
-
-    fn transposed(self) -> Self {
-        Self { transposed: true, ..self }
-    }
-
-    /// Its numbers row by row, as they are read.
-    fn by_rows(self) -> Cow<'a, [f32]> {
-        if !self.transposed {
-            return Cow::Borrowed(self.values);
-        }
-        let rows = self.values.len() / self.cols.max(1);
-        let mut out = vec![0.0; self.values.len()];
-        for (r, row) in self.values.chunks_exact(self.cols).enumerate() {
-            row.iter().enumerate().for_each(|(c, &v)| out[c * rows + r] = v);
-        }
-        Cow::Owned(out)
-    }
-
-    /// Columns, as it is read.
-    fn width(self) -> usize {
-        if self.transposed { self.values.len() / self.cols.max(1) } else { self.cols }
-    }
-}
-
-/// `out` = `keep` `out` + `a` `b`; `out` has `cols` columns.
-fn multiply(out: &mut [f32], cols: usize, a: Matrix<'_>, b: Matrix<'_>, keep: f32) {
-    let (rows, inner) = (out.len() / cols.max(1), a.width());
-    let (a, b) = (a.by_rows(), b.by_rows());
+/// `out` = `keep` `out` + `a` `b`, all row by row; `out` has `cols` columns.
+fn multiply(out: &mut [f32], cols: usize, a: &[f32], b: &[f32], keep: f32) {
+    let (rows, inner) = (out.len() / cols.max(1), b.len() / cols.max(1));
     // The library reads matrices column by column, so it sees all of them transposed: out' = b' a'.
-    let (a, b) = (DMatrixView::from_slice(&a, inner, rows), DMatrixView::from_slice(&b, cols, inner));
+    let (a, b) = (DMatrixView::from_slice(a, inner, rows), DMatrixView::from_slice(b, cols, inner));
     DMatrixViewMut::from_slice(out, cols, rows).gemm(1.0, &b, &a, keep);
 }
 
@@ -57,7 +29,7 @@ fn multiply(out: &mut [f32], cols: usize, a: Matrix<'_>, b: Matrix<'_>, keep: f3
 pub fn products(a: &[f32], b: &[f32], dim: usize) -> Vec<f32> {
     let cols = b.len() / dim.max(1);
     let mut out = vec![0.0; a.len() / dim.max(1) * cols];
-    multiply(&mut out, cols, Matrix::new(a, dim), Matrix::new(b, dim).transposed(), 0.0);
+    multiply(&mut out, cols, a, &transposed(b, dim), 0.0);
     out
 }
 
@@ -132,8 +104,7 @@ impl Net {
             let (inputs, outputs) = (self.sizes[layer], self.sizes[layer + 1]);
             let x = &trace.values[layer];
             let mut y = self.parameters[bias..gain].repeat(x.len() / inputs);
-            let weights = Matrix::new(&self.parameters[weight..bias], inputs).transposed();
-            multiply(&mut y, outputs, Matrix::new(x, inputs), weights, 1.0);
+            multiply(&mut y, outputs, x, &transposed(&self.parameters[weight..bias], inputs), 1.0);
             if self.norm_follows(layer) {
                 let [mean, variance] =
                     if training { moments(&y, outputs) } else { self.running[trace.moments.len()].clone() };
@@ -191,13 +162,12 @@ impl Net {
             }
             let x = &trace.values[layer];
             let by_weight = &mut gradient[weight..bias];
-            multiply(by_weight, inputs, Matrix::new(&g, outputs).transposed(), Matrix::new(x, inputs), 0.0);
+            multiply(by_weight, inputs, &transposed(&g, outputs), x, 0.0);
             let by_bias = &mut gradient[bias..gain];
             by_bias.fill(0.0);
             g.chunks_exact(outputs).for_each(|row| by_bias.iter_mut().zip(row).for_each(|(b, g)| *b += g));
             let mut by_input = vec![0.0; x.len()];
-            let weights = Matrix::new(&self.parameters[weight..bias], inputs);
-            multiply(&mut by_input, inputs, Matrix::new(&g, outputs), weights, 0.0);
+            multiply(&mut by_input, inputs, &g, &self.parameters[weight..bias], 0.0);
             g = by_input;
         }
         g
