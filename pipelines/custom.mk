@@ -57,7 +57,8 @@ endif
 endif
 
 geom_FROM := RESOLUTION, ITERATIONS or GEOM_ARGS
-GEOM_FIRST := --resolution $(RESOLUTION) --iterations $(ITERATIONS)
+GEOM_FIRST := --resolution $(RESOLUTION) --iterations $(ITERATIONS) \
+  $(if $(filter --refine-poses --refine-poses=%,$(GEOM_ARGS)),,--refine-poses auto)
 EVAL_ARGS ?= --resolution $(RESOLUTION)
 REPORT_FIRST := --resolution $(RESOLUTION)
 

@@ -107,8 +107,9 @@ queries_OPTIONS := $(CLIP) $(QUERIES)
 names_OPTIONS := $(CLIP) $(VOCABULARY)
 report_OPTIONS := $(REPORT_FIRST) $(REPORT_ARGS)
 
-# What later stages take for the photographs: with the cameras that stage 1 refined, where it does. Masks do not depend on them.
-POSED := $(if $(and $(filter $(OUT)/geometry.ply,$(GEOMETRY_DONE)),$(filter --refine-poses,$(geom_OPTIONS))),$(OUT)/geometry.ply.cameras.json,$(DATASET))
+# What later stages take for the photographs: with the cameras that stage 1 refined, where it did. Known once that has run: it removes those of
+# an earlier run. Masks do not depend on them.
+POSED = $(if $(and $(filter $(OUT)/geometry.ply,$(GEOMETRY_DONE)),$(shell test -e $(OUT)/geometry.ply.cameras.json && echo refined)),$(OUT)/geometry.ply.cameras.json,$(DATASET))
 export POSED
 
 # What each stage runs. `arg` writes a path out, so that commands can be copied, or as "$NAME" where a shell would take it apart.

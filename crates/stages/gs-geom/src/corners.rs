@@ -15,6 +15,7 @@ mod pairs;
 mod tests;
 mod tracks;
 
+use crate::options::Choice;
 use adjust::{Bundle, Slack};
 use detect::{Corners, LONGEST, detect};
 use glam::{DVec2, DVec3};
@@ -30,6 +31,10 @@ use tracks::{Point, Sighting, error, join, limit, place};
 const FEWEST_POINTS: usize = 100;
 /// Limits of a corner's error while poses are found, in [`EXACT`]s, and beyond which it counts less.
 const ROUNDS: [[f64; 2]; 4] = [[24.0, 4.0], [6.0, 2.0], [2.0, 1.0], [1.0, 0.5]];
+/// What is enough to choose other poses than those given: an error of so many [`EXACT`]s, and so many times that of the best ones
+/// (docs/results/handheld.md).
+const FITS: f64 = 0.25;
+const LEAST_GAIN: f64 = 1.25;
 /// How far a corner may be off along given poses, in medians of all, and at most.
 const SPREAD: f64 = 3.0;
 const SLACKEST: f64 = 8.0;
@@ -44,6 +49,8 @@ type Shrink = fn(&Image, &Camera) -> Image;
 pub(crate) struct Found {
     /// Of all views.
     pub cameras: Vec<Camera>,
+    /// Whether these are others than those given.
+    pub refined: bool,
     /// Points that training views show, with their colours.
     pub points: PointCloud,
     /// Small pictures of the training views, where they were asked for.
@@ -60,46 +67,63 @@ struct Sights<'a> {
 /// Places the corners that training views share, with the cameras as they are given, or, where `refine` says so, with cameras that
 /// fit the corners: first those of the training views, with their focal lengths, then those of the others on the points found. `small`
 /// asks for small pictures, too.
-pub(crate) fn find(views: &[&View], refine: bool, small: Option<Shrink>, stage: &Stage) -> Result<Found> {
+pub(crate) fn find(views: &[&View], refine: Choice, small: Option<Shrink>, stage: &Stage) -> Result<Found> {
     let given: Vec<Camera> = views.iter().map(|v| v.camera.clone()).collect();
-    let (sights, pictures) = Sights::of(views, &given, refine, small, stage)?;
     let learns: Vec<bool> = views.iter().map(|v| v.split == Split::Train).collect();
-    let mut cameras = given.clone();
-    let (before, spread) = sights.placed(&cameras, &learns, SLACKEST);
-    if !refine {
-        let (points, _) = sights.placed(&cameras, &learns, (SPREAD * spread).clamp(1.0, SLACKEST));
+    let mut sights = Sights { views, corners: vec![Corners::default(); views.len()], tracks: Vec::new() };
+    let pictures = sights.look(&given, &learns, small, stage)?;
+    let (before, spread) = sights.placed(&given, &learns, SLACKEST);
+    let as_given = |sights: &Sights<'_>, pictures| {
+        let (points, _) = sights.placed(&given, &learns, (SPREAD * spread).clamp(1.0, SLACKEST));
+        Found { points: sights.cloud(&points), cameras: given.clone(), pictures, refined: false }
+    };
+    if refine == Choice::Off {
+        let found = as_given(&sights, pictures);
         stage.info(&format!(
             "{} points from corners, which the poses miss by {} in the median",
-            points.len(),
-            pixels(&cameras, spread)
+            found.points.len(),
+            pixels(&given, spread)
         ));
-        if spread > 1.0 && points.len() >= FEWEST_POINTS {
+        if spread > 1.0 && found.points.len() >= FEWEST_POINTS {
             stage.warn("the poses do not fit the photographs well: --refine-poses finds better ones");
         }
-        return Ok(Found { points: sights.cloud(&points), cameras, pictures });
+        return Ok(found);
     }
-    let lenses = lenses(&given);
-    let fit = |cameras: &mut [Camera], points: &mut [Point], free: &[bool], slack: Slack, width: f64, all: bool| {
-        Bundle { cameras, given: &given, lenses: &lenses, free, points, slack, all }.adjust(width);
-    };
-    let mut off = None;
-    for [slack, width] in ROUNDS {
-        stage.go_on()?;
-        let (mut points, _) = sights.placed(&cameras, &learns, slack);
-        let free = sights.held(&points, &learns);
-        let expected = off.unwrap_or_else(|| Slack::widest(depth(&points, &cameras)));
-        fit(&mut cameras, &mut points, &free, expected, width, true);
-        off = Some(expected.learnt(&cameras, &given, &free));
+    let (mut cameras, expected) = sights.fitted(&given, &learns, stage)?;
+    let (points, after) = sights.placed(&cameras, &learns, 1.0);
+    if refine == Choice::Auto {
+        // With the same slack: else wrong matches would count for one of both alone.
+        let best = sights.placed(&cameras, &learns, SLACKEST).1;
+        let of = |flags: &[bool]| flags.iter().filter(|f| **f).count();
+        // Where corners hold few of the photographs, they say more about these than about the others.
+        let held = 3 * of(&sights.held(&points, &learns)) >= 2 * of(&learns) && points.len() >= FEWEST_POINTS;
+        let pays = held && spread > LEAST_GAIN * best && spread > FITS;
+        let [was, is] = [spread, best].map(|e| pixels(&given, e));
+        let does = match (pays, held) {
+            (true, _) => "poses are refined",
+            (false, true) => "poses stay as they are given",
+            (false, false) => "too few photographs have corners in common, poses stay as they are given",
+        };
+        stage.info(&format!(
+            "--refine-poses auto: {} corners miss the given poses by {was} in the median, and the best ones by {is}: {does}",
+            points.len()
+        ));
+        if !pays {
+            return Ok(as_given(&sights, pictures));
+        }
     }
-    let (mut points, after) = sights.placed(&cameras, &learns, 1.0);
     let cloud = sights.cloud(&points);
     // The others, each by the points that it shows.
-    sights.show(&mut points, &learns);
     let others: Vec<bool> = learns.iter().map(|l| !l).collect();
+    sights.look(&given, &others, None, stage)?;
+    let (mut points, _) = sights.placed(&cameras, &learns, 1.0);
+    sights.show(&mut points, &learns);
     let free = sights.held(&points, &others);
-    let expected = off.expect("one round at least");
+    let lenses = lenses(&given);
     for [_, width] in ROUNDS {
-        fit(&mut cameras, &mut points, &free, expected, width, false);
+        let (cameras, points) = (&mut cameras[..], &mut points[..]);
+        let slack = expected;
+        Bundle { cameras, given: &given, lenses: &lenses, free: &free, points, slack, all: false }.adjust(width);
     }
     stage.info(&format!(
         "poses from {} corners, which they miss by {} in the median; those given missed {} by {}",
@@ -108,11 +132,11 @@ pub(crate) fn find(views: &[&View], refine: bool, small: Option<Shrink>, stage: 
         before.len(),
         pixels(&given, spread)
     ));
-    let found = (0..views.len()).filter(|&v| sights.count(&points, v) >= FEWEST_SEEN).count();
-    if found < views.len() {
-        stage.warn(&format!("{} of {} photographs have too few corners in common with others: the corners leave their poses as they are", views.len() - found, views.len()));
+    let placed = (0..views.len()).filter(|&v| sights.count(&points, v) >= FEWEST_SEEN).count();
+    if placed < views.len() {
+        stage.warn(&format!("{} of {} photographs have too few corners in common with others: the corners leave their poses as they are", views.len() - placed, views.len()));
     }
-    Ok(Found { cameras, points: cloud, pictures })
+    Ok(Found { cameras, refined: true, points: cloud, pictures })
 }
 
 /// Bytes that [`find`] takes at once on so many threads, besides decoded photographs.
@@ -142,25 +166,18 @@ pub(crate) fn lenses(cameras: &[Camera]) -> Vec<usize> {
 }
 
 impl<'a> Sights<'a> {
-    /// And the small pictures that were asked for. Held-out views are looked at only where their poses are to be found.
-    fn of(
-        views: &'a [&'a View],
-        cameras: &[Camera],
-        all: bool,
-        small: Option<Shrink>,
-        stage: &Stage,
-    ) -> Result<(Self, Vec<Image>)> {
+    /// Finds the corners of the views of `of`, and joins those of all that have some; `cameras` are those given. The small pictures that were
+    /// asked for.
+    fn look(&mut self, cameras: &[Camera], of: &[bool], small: Option<Shrink>, stage: &Stage) -> Result<Vec<Image>> {
         let up = cameras.iter().map(|c| c.rotation.transpose() * -DVec3::Y).sum::<DVec3>();
-        let mut progress = stage.progress("photograph", views.len() as u64);
-        let (mut corners, mut pictures) = (Vec::new(), Vec::new());
+        let own: Vec<usize> = (0..of.len()).filter(|&v| of[v]).collect();
+        let mut progress = stage.progress("photograph", own.len() as u64);
+        let mut pictures = Vec::new();
         // Few at a time: each takes the memory of a decoded photograph several times.
-        for views in views.chunks(2 * rayon::current_num_threads()) {
+        for part in own.chunks(2 * rayon::current_num_threads()) {
             stage.go_on()?;
-            let own = views.par_iter().map(|v| {
-                let learns = v.split == Split::Train;
-                if !all && !learns {
-                    return Ok((Corners::default(), None));
-                }
+            let one = |&i: &usize| {
+                let v = self.views[i];
                 // The corners of a photograph are finer than the pictures that are learnt from.
                 let image = v.load_image_within(LONGEST)?;
                 let mut corners = detect(&image, roll(&v.camera, up));
@@ -172,17 +189,18 @@ impl<'a> Sights<'a> {
                     .flatten()
                     .zip([0, 1].into_iter().cycle())
                     .for_each(|(x, k)| *x *= to[k] / from[k]);
-                let small = small.filter(|_| learns).map(|small| small(&image, &v.camera));
-                Ok((corners, small))
-            });
-            for (found, small) in own.collect::<Result<Vec<_>>>()? {
-                corners.push(found);
+                Ok((corners, small.map(|small| small(&image, &v.camera))))
+            };
+            let found = part.par_iter().map(one).collect::<Result<Vec<_>>>()?;
+            for (&i, (corners, small)) in part.iter().zip(found) {
+                self.corners[i] = corners;
                 pictures.extend(small);
+                progress.step();
             }
-            views.iter().for_each(|_| progress.step());
         }
         progress.finish(&[]);
         let pairs = partners(cameras);
+        let corners = &self.corners;
         let compare = |&[i, j]: &[usize; 2]| ([i, j], matches([&corners[i], &corners[j]], [&cameras[i], &cameras[j]]));
         let found: Vec<_> = pairs.par_iter().map(compare).collect();
         stage.go_on()?;
@@ -195,7 +213,24 @@ impl<'a> Sights<'a> {
             found.iter().filter(|(_, m)| !m.is_empty()).count(),
             pairs.len()
         ));
-        Ok((Self { views, tracks: join(&counts, &found), corners }, pictures))
+        self.tracks = join(&counts, &found);
+        Ok(pictures)
+    }
+
+    /// The cameras, of which those of the views of `learns` fit the corners, and how far those given are off.
+    fn fitted(&self, given: &[Camera], learns: &[bool], stage: &Stage) -> Result<(Vec<Camera>, Slack)> {
+        let lenses = lenses(given);
+        let (mut cameras, mut off) = (given.to_vec(), None);
+        for [slack, width] in ROUNDS {
+            stage.go_on()?;
+            let (mut points, _) = self.placed(&cameras, learns, slack);
+            let free = self.held(&points, learns);
+            let slack = off.unwrap_or_else(|| Slack::widest(depth(&points, &cameras)));
+            let (points, all) = (&mut points[..], true);
+            Bundle { cameras: &mut cameras, given, lenses: &lenses, free: &free, points, slack, all }.adjust(width);
+            off = Some(slack.learnt(&cameras, given, &free));
+        }
+        Ok((cameras, off.expect("one round at least")))
     }
 
     fn at(&self, s: Sighting) -> DVec2 {
@@ -276,7 +311,7 @@ fn median(mut values: Vec<f64>) -> f64 {
 }
 
 /// The solution of a symmetric positive system; none where it is not positive.
-fn solve<const N: usize>(mut a: [[f64; N]; N], mut b: [f64; N]) -> Option<[f64; N]> {
+pub(crate) fn solve<const N: usize>(mut a: [[f64; N]; N], mut b: [f64; N]) -> Option<[f64; N]> {
     // Cholesky's factor, in the lower triangle.
     for i in 0..N {
         for j in 0..=i {

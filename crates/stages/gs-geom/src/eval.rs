@@ -53,6 +53,7 @@ impl Eval {
             "seen_by_training": held.seen(&dataset),
             "psnr": psnr,
             "ssim": ssim,
+            "psnr_fitted": Means::of(figures.iter().map(|f| (f.name.as_str(), f.psnr_fitted.zip(f.ssim)))).psnr,
             "psnr_heldout": of("test", psnr),
             "ssim_heldout": of("test", ssim),
             "psnr_train": of("train", psnr),

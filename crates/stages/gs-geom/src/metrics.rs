@@ -1,5 +1,6 @@
 //! PSNR and SSIM of renders against photographs.
 
+use crate::corners::solve;
 use crate::photographs::masks::{Alpha, Masks, multiply};
 use crate::photographs::{Target, exact_target};
 use crate::training::loss::{Derivatives, Pair, ssim};
@@ -22,6 +23,9 @@ pub struct ViewMetrics {
     pub psnr: Option<f64>,
     /// Structural similarity, -1 to 1; none where no pixel counts.
     pub ssim: Option<f64>,
+    /// The PSNR once the render's colours went through the affine map (3x4) that brings them nearest to the photograph's: it leaves out
+    /// exposure and white balance, which no scene can know of a photograph that it never saw.
+    pub psnr_fitted: Option<f64>,
 }
 
 /// PSNR in dB for values from 0 to 1.
@@ -43,9 +47,37 @@ pub fn measure(
 ) -> Result<ViewMetrics> {
     let target = exact_target(view, masks, behind(alpha, options.background))?;
     let mut rgb = render(g, &view.camera, &RasterOptions { depth: false, ..options.clone() }).rgb;
+    let mut mapped = fitted(&rgb, &target, alpha);
     let (psnr, ssim) = compare(&mut rgb, view.camera.width as usize, &target, alpha, room).unzip();
+    let psnr_fitted = compare(&mut mapped, view.camera.width as usize, &target, alpha, room).map(|f| f.0);
     let split = if view.split == Split::Test { "test" } else { "train" };
-    Ok(ViewMetrics { name: view.name.clone(), split, psnr, ssim })
+    Ok(ViewMetrics { name: view.name.clone(), split, psnr, ssim, psnr_fitted })
+}
+
+/// The render through the affine map of colours that brings it nearest to the target, in the least-squares sense of the pixels that count.
+fn fitted(rgb: &[f32], target: &Target, alpha: Alpha) -> Vec<f32> {
+    let weights = target.alpha.as_ref().filter(|_| alpha == Alpha::Ignore);
+    let (mut a, mut b) = ([[0.0; 4]; 4], [[0.0; 4]; 3]);
+    let pixels = rgb.as_chunks::<3>().0;
+    for (i, (p, wanted)) in pixels.iter().zip(target.rgb.as_chunks::<3>().0).enumerate() {
+        let weight = weights.map_or(1.0, |w| w[i]);
+        let [r, g, blue] = p.map(|v| v.clamp(0.0, 1.0));
+        let row = [r, g, blue, 1.0].map(|v| f64::from(weight * v));
+        for j in 0..4 {
+            (0..4).for_each(|k| a[j][k] += row[j] * row[k]);
+            (0..3).for_each(|c| b[c][j] += row[j] * f64::from(wanted[c]));
+        }
+    }
+    // A picture of one colour says little: as a thousandth of a pixel that stays as it is.
+    (0..4).for_each(|k| a[k][k] += 1e-3);
+    (0..3).for_each(|c| b[c][c] += 1e-3);
+    let map: Vec<[f64; 4]> = b.iter().filter_map(|b| solve(a, *b)).collect();
+    let [red, green, blue] = map[..] else { return rgb.to_vec() };
+    let through = |p: &[f32; 3]| {
+        let [r, g, b] = p.map(|v| f64::from(v.clamp(0.0, 1.0)));
+        [red, green, blue].map(|m| (m[0] * r + m[1] * g + m[2] * b + m[3]) as f32)
+    };
+    pixels.iter().flat_map(through).collect()
 }
 
 /// What is to lie behind a photograph's transparent pixels, where `background` is behind the scene: pixels that do not
@@ -109,6 +141,23 @@ impl Means {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn a_map_of_colours_takes_exposure_out_and_leaves_the_rest() {
+        let rgb: Vec<f32> = (0..300).map(|i| 0.5 + 0.3 * (i as f32 * 0.77).sin()).collect();
+        let brighter = rgb.iter().map(|v| 0.8 * v + 0.1).collect();
+        let mut target = Target { rgb: brighter, alpha: None };
+        assert!(psnr(&fitted(&rgb, &target, Alpha::Background), &target.rgb) > 60.0);
+        // A pixel that is another thing stays one.
+        target.rgb[30..33].fill(1.0);
+        let left = psnr(&fitted(&rgb, &target, Alpha::Background), &target.rgb);
+        assert!((20.0..40.0).contains(&left), "{left}");
+        // Where it does not count, it does not turn the map.
+        let alpha = (0..100).map(|i| if i == 10 { 0.0 } else { 1.0 }).collect();
+        target.alpha = Some(alpha);
+        let mapped = fitted(&rgb, &target, Alpha::Ignore);
+        assert!(mapped.iter().zip(&target.rgb).enumerate().all(|(i, (a, b))| i / 3 == 10 || (a - b).abs() < 1e-3));
+    }
 
     #[test]
     fn psnr_of_known_errors() {

@@ -143,9 +143,9 @@ pub(crate) struct Train {
     pub exposure: bool,
     /// Refine poses and focal lengths: first by corners that photographs have in common, then with the scene, by what renders and
     /// photographs differ in. Held-out views are brought to the scene before they are measured. OUT.cameras.json holds the
-    /// refined cameras; later stages take it as their --scene
-    #[arg(long)]
-    pub refine_poses: bool,
+    /// refined cameras; later stages take it as their --scene. auto: where other poses fit the corners much better than those given
+    #[arg(long, value_name = "off|on|auto", value_enum, num_args = 0..=1, default_value = "off", default_missing_value = "on")]
+    pub refine_poses: Choice,
     /// Picture sizes in the course of the run; with --preset 3dgs the default is full
     #[arg(long, value_enum, default_value = "coarse", default_value_if("preset", "3dgs", "full"))]
     pub schedule: PictureSizes,
@@ -158,6 +158,24 @@ pub(crate) struct Train {
     #[arg(long, value_name = "COUNT|SECONDS", default_value = "20s")]
     #[serde(skip)]
     pub checkpoint_every: Every,
+}
+
+/// Whether something is done. In records `off` and `on` are false and true.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
+pub(crate) enum Choice {
+    Off,
+    On,
+    /// Where the photographs show that it pays; never for COLMAP's poses with points, which come from the photographs
+    Auto,
+}
+
+impl Serialize for Choice {
+    fn serialize<S: Serializer>(&self, serializer: S) -> std::result::Result<S::Ok, S::Error> {
+        match self {
+            Self::Auto => serializer.serialize_str("auto"),
+            own => serializer.serialize_bool(*own == Self::On),
+        }
+    }
 }
 
 /// A set of defaults.
@@ -401,7 +419,7 @@ impl MaskOptions {
         for (odd, names) in masks.odd(&dataset.views)? {
             stage.warn(&format!("{} of {count} masks, {} first, {odd}", names.len(), names[0]));
         }
-        Ok(masks)
+        masks.with_borders(dataset, stage)
     }
 }
 

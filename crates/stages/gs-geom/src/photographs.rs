@@ -1,5 +1,6 @@
 //! The photographs to learn from, decoded once where memory allows, at the picture size in use.
 
+pub mod border;
 pub mod masks;
 
 use gs_io::{Result, Watched};
@@ -163,7 +164,8 @@ pub fn full_share(budget: usize) -> usize {
 
 /// Bytes of a kept photograph's pixel.
 pub fn bytes_per_pixel(view: &View, masks: &Masks) -> Result<usize> {
-    Ok(if masks.of(view).is_some() || image_has_alpha(&view.image_path)? { 4 } else { 3 })
+    let own = masks.of(view).is_some() || masks.border((view.camera.width, view.camera.height)).is_some();
+    Ok(if own || image_has_alpha(&view.image_path)? { 4 } else { 3 })
 }
 
 /// Which photographs, of `bytes` a pixel, fit in `budget` bytes, in order.
@@ -191,8 +193,9 @@ fn unchanged(view: &View, masks: &Masks, watched: &Watched) -> Result<Image> {
 /// them.
 fn decode(view: &View, masks: &Masks) -> Result<Image> {
     let mut image = view.load_image()?;
-    if let Some(mask) = masks.of(view) {
-        let mask = view.load_mask(mask)?;
+    let mask = masks.of(view).map(|mask| view.load_mask(mask)).transpose()?;
+    let border = masks.border((image.width, image.height)).map(<[f32]>::to_vec);
+    for mask in mask.into_iter().chain(border) {
         match &mut image.alpha {
             Some(alpha) => alpha.iter_mut().zip(&mask).for_each(|(a, m)| *a *= m),
             None => image.alpha = Some(mask),

@@ -8,7 +8,7 @@ pub(crate) mod outputs;
 
 use crate::budget;
 use crate::densification::Way;
-use crate::options::{Args, Background, Command, PictureSizes, Preset, Train};
+use crate::options::{Args, Background, Choice, Command, PictureSizes, Preset, Train};
 use crate::photographs::masks::{Alpha, Masks};
 use crate::photographs::{Photographs, full_share};
 use crate::training::poses::PoseRates;
@@ -56,6 +56,7 @@ fn train(options: &Train, stage: &Stage) -> Result<()> {
         Some(seconds) => {
             let (planned, plan) = budget::plan_for(options, seconds, &dataset, &masks, stage)?;
             let dataset = planned.scene.load_quietly()?;
+            let masks = masks.with_borders(&dataset, stage)?;
             learn(&planned, plan, &dataset, masks, &mut claim, stage)
         }
         None => learn(options, Value::Null, &dataset, masks, &mut claim, stage),
@@ -140,7 +141,7 @@ impl Train {
             alpha,
             antialias: self.antialias,
             exposure: self.exposure,
-            poses: self.refine_poses.then(PoseRates::default),
+            poses: (self.refine_poses != Choice::Off).then(PoseRates::default),
             ..recipe
         }
     }

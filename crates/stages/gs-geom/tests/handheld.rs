@@ -105,6 +105,35 @@ fn photographs_give_the_points_and_leave_half_of_the_gaussians_to_grow() {
 }
 
 #[test]
+fn auto_leaves_poses_of_colmap_and_nothing_of_a_run_that_refined_others() {
+    let dir = Folder::new();
+    let mut specks = balls(1200);
+    specks.log_scales.iter_mut().flatten().for_each(|s| *s -= 2.0);
+    let truth: Vec<Camera> = ring(40).iter().map(|c| c.resized(6 * SIZE.0, 6 * SIZE.1)).collect();
+    let out = dir.path("g.ply");
+    // The one after the other into one output: what the first leaves and the second does not is gone.
+    for off in [true, false] {
+        let scene = dir.path(if off { "off" } else { "exact" });
+        let shaken = |(i, c): (usize, &Camera)| {
+            let by = |k: usize| if off { 0.008 * (7.3 * (3 * i + k) as f64).sin() } else { 0.0 };
+            let turn = glam::DQuat::from_scaled_axis(DVec3::new(by(0), by(1), by(2)));
+            Camera { rotation: glam::DMat3::from_quat(turn) * c.rotation, ..c.clone() }
+        };
+        let given: Vec<Camera> = truth.iter().enumerate().map(shaken).collect();
+        write_scene(&scene, &given, &common::world::points(), |i, _, path| {
+            let r = render(&specks, &truth[i], &RasterOptions::default());
+            Image { width: r.width, height: r.height, rgb: r.rgb, alpha: None }.write_png(path).unwrap();
+        });
+        let choice = ["--refine-poses", if off { "on" } else { "auto" }, "--max-gaussians", "500"];
+        let said = succeeds(&training(&scene, &out, "2", &choice));
+        assert_eq!(Path::new(&format!("{out}.cameras.json")).exists(), off, "{said}");
+        assert_eq!(said.contains("they stay as they are given"), !off, "{said}");
+        let parameters = &record(&out)["parameters"];
+        assert!(parameters["refine_poses"] == off && parameters["poses"].is_null() != off, "{parameters}");
+    }
+}
+
+#[test]
 fn depth_images_give_the_points() {
     let dir = Folder::new();
     let (scene, out) = (dir.path("scene"), dir.path("g.ply"));

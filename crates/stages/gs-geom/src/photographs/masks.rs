@@ -1,11 +1,15 @@
 //! Which pixels of a photograph count: alpha channels and mask files.
 
+use super::border;
 use gs_io::{Error, Result, hash_bytes, hash_file};
-use gs_scene::dataset::{Odd, View};
+use gs_scene::dataset::{Dataset, Odd, Split, View};
+use gs_scene::image_has_alpha;
 use rayon::prelude::*;
 use serde::Serialize;
+use stage::Stage;
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
+use std::sync::Arc;
 
 /// What transparent pixels of the photographs mean.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize)]
@@ -18,9 +22,12 @@ pub enum Alpha {
     Ignore,
 }
 
-/// Mask files by the names of the views they belong to.
+/// Which pixels count: mask files by the names of the views they belong to, and dark borders of photographs by their size.
 #[derive(Debug, Clone, Default, PartialEq)]
-pub struct Masks(BTreeMap<String, PathBuf>);
+pub struct Masks {
+    files: BTreeMap<String, PathBuf>,
+    borders: BTreeMap<(u32, u32), Arc<Vec<f32>>>,
+}
 
 impl Masks {
     /// The masks in a folder: a PNG or JPEG a view, with the name of the photograph, with (as COLMAP has it) or without its
@@ -43,17 +50,34 @@ impl Masks {
                 .field("--masks")
                 .expected(views.first().map_or_else(String::new, |v| format!("pictures such as {}.png", v.stem()))));
         }
-        Ok(Self(all))
+        Ok(Self { files: all, borders: BTreeMap::new() })
     }
 
     /// Those that the dataset itself has.
     pub fn of_dataset(views: &[View]) -> Self {
-        Self(views.iter().filter_map(|v| Some((v.name.clone(), v.mask_path()?.to_path_buf()))).collect())
+        let files = views.iter().filter_map(|v| Some((v.name.clone(), v.mask_path()?.to_path_buf()))).collect();
+        Self { files, borders: BTreeMap::new() }
+    }
+
+    /// And the borders of the photographs as large as the dataset's cameras are, where they have some; says so. Without masks, transparent
+    /// photographs have none: their alpha means something else.
+    pub fn with_borders(mut self, dataset: &Dataset, stage: &Stage) -> Result<Self> {
+        let views: Vec<&View> = dataset.views_of(Split::Train).collect();
+        let clear = |v: &View| Ok(self.files.is_empty() && image_has_alpha(&v.image_path)?);
+        if !views.iter().map(|v| clear(v)).collect::<Result<Vec<bool>>>()?.contains(&true) {
+            self.borders = border::find(&views, stage)?;
+        }
+        Ok(self)
+    }
+
+    /// Which pixels of a photograph of this size lie within its border, 0 or 1; none where it has none.
+    pub fn border(&self, size: (u32, u32)) -> Option<&[f32]> {
+        self.borders.get(&size).map(|b| &b[..])
     }
 
     /// What transparent pixels mean: with masks, that they do not count.
     pub fn alpha(&self) -> Alpha {
-        if self.0.is_empty() { Alpha::Background } else { Alpha::Ignore }
+        if self.files.is_empty() && self.borders.is_empty() { Alpha::Background } else { Alpha::Ignore }
     }
 
     /// Views whose masks are written in an odd way. Reads them all.
@@ -71,24 +95,24 @@ impl Masks {
     }
 
     pub fn of(&self, view: &View) -> Option<&Path> {
-        self.0.get(&view.name).map(PathBuf::as_path)
+        self.files.get(&view.name).map(PathBuf::as_path)
     }
 
     pub fn len(&self) -> usize {
-        self.0.len()
+        self.files.len()
     }
 
     pub fn files(&self) -> impl Iterator<Item = PathBuf> {
-        self.0.values().cloned()
+        self.files.values().cloned()
     }
 
     /// Content hash of names and files; none without masks.
     pub fn hash(&self) -> Result<Option<String>> {
         let mut text = String::new();
-        for (name, path) in &self.0 {
+        for (name, path) in &self.files {
             text += &format!("{name}\n{}\n", hash_file(path)?);
         }
-        Ok((!self.0.is_empty()).then(|| hash_bytes(text.as_bytes())))
+        Ok((!self.files.is_empty()).then(|| hash_bytes(text.as_bytes())))
     }
 }
 

@@ -4,11 +4,11 @@ use super::outputs::{CAMERAS, CURVE, EXPOSURES, PARTIAL, PLOT, check_finite, pla
 use crate::densification::{Strategy, drawable};
 use crate::memory::Forecast;
 use crate::metrics::Means;
-use crate::options::{Train, note_shift};
+use crate::options::{Choice, Train, note_shift};
 use crate::training::checkpoint::{self, ProgressState, State};
 use crate::training::poses::turned_from;
 use crate::training::{Timings, Trainer};
-use gs_io::{Claim, Provenance, Result, with_suffix, write_bytes, write_json};
+use gs_io::{Claim, IoContext, Provenance, Result, with_suffix, write_bytes, write_json};
 use gs_scene::dataset::{Dataset, Split, View, refined};
 use gs_scene::{Camera, Gaussians, ply};
 use report::curve::Panel;
@@ -42,11 +42,16 @@ pub(super) fn finish(
     let State { gaussians, progress, .. } = &trainer.state;
     let rows = rows(options, gaussians, stage);
     report(progress, stage);
-    let Provenance { parameters, inputs, .. } = run;
+    let Provenance { mut parameters, inputs, .. } = run.clone();
+    // What was chosen, in the place of "auto".
+    parameters["refine_poses"] = json!(!trainer.state.poses.views.is_empty());
+    if trainer.state.poses.views.is_empty() {
+        parameters["poses"] = Value::Null;
+    }
     write_beside(options, trainer)?;
     write_cameras(options, dataset, trainer, stage)?;
     let State { gaussians, progress, .. } = &trainer.state;
-    ply::write_some_gaussians(&options.out, gaussians, &rows, &comments(parameters, inputs))?;
+    ply::write_some_gaussians(&options.out, gaussians, &rows, &comments(&parameters, &inputs))?;
     let [cloned, split, removed, relocated] = progress.densified;
     let heldout = psnr.map_or(String::new(), |p| format!(", {p:.2} dB on held-out views"));
     stage.info(&format!(
@@ -68,7 +73,7 @@ pub(super) fn finish(
         "plan": plan,
     });
     note_shift(&mut summary, dataset.shift);
-    stage.record(claim, parameters.clone(), inputs.clone(), summary)?;
+    stage.record(claim, parameters, inputs, summary)?;
     for leftover in [with_suffix(&options.out, PARTIAL), plan_path(&options.out), checkpoint::path_of(&options.out)] {
         // What cannot be removed does no harm.
         let _ = std::fs::remove_file(leftover);
@@ -118,8 +123,13 @@ fn write_beside(options: &Train, trainer: &Trainer<'_>) -> Result<()> {
 
 /// Writes the refined cameras, and says how far they moved.
 fn write_cameras(options: &Train, dataset: &Dataset, trainer: &mut Trainer<'_>, stage: &Stage) -> Result<()> {
-    if !options.refine_poses {
-        return Ok(());
+    if trainer.state.poses.views.is_empty() {
+        // Those that an earlier run wrote, and this one chose not to, would be taken for this run's.
+        let path = with_suffix(&options.out, CAMERAS);
+        return match options.refine_poses {
+            Choice::Auto if path.exists() => std::fs::remove_file(&path).at("remove", &path),
+            _ => Ok(()),
+        };
     }
     let cameras = trainer.cameras()?;
     let of = |split: Split| dataset.views_of(split).map(|v| v.name.as_str());

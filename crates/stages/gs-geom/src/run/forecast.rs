@@ -77,7 +77,7 @@ pub(crate) fn forecast_start(
     let kept = if fixed { points } else { points.min(options.max_gaussians.unwrap_or(points)) };
     let before = PER_POINT * points as u64 + read;
     // The corners are found before there is anything else.
-    let corners = match options.refine_poses || init::is_bare(options, dataset) {
+    let corners = match init::needs_corners(options, dataset) {
         true => {
             let views: Vec<&View> = dataset.views.iter().collect();
             corners::bytes(&views, rayon::current_num_threads() as u64)? + forecast.decoding

@@ -3,11 +3,11 @@
 use super::forecast::most_gaussians;
 use crate::corners::{self, Found};
 use crate::densification::Strategy;
-use crate::options::{Init, Train, check_some};
+use crate::options::{Choice, Init, Train, check_some};
 use crate::start;
 use crate::training::poses::Poses;
 use gs_io::{Error, Result};
-use gs_scene::dataset::{Dataset, Split, View};
+use gs_scene::dataset::{Dataset, Format, Split, View};
 use gs_scene::{Camera, Gaussians, PointCloud, ply, splat};
 use stage::Stage;
 use std::path::Path;
@@ -36,6 +36,19 @@ pub(crate) fn has_depths(options: &Train, dataset: &Dataset) -> bool {
     is_bare(options, dataset) && dataset.views_of(Split::Train).any(|v| v.depth_path().is_some())
 }
 
+/// Whether the photographs are asked for other poses. Those of COLMAP that come with points were found so already.
+fn refine(options: &Train, dataset: &Dataset) -> Choice {
+    match options.refine_poses {
+        Choice::Auto if dataset.format == Format::Colmap && !dataset.points.is_empty() => Choice::Off,
+        choice => choice,
+    }
+}
+
+/// Whether corners of the photographs are found before there are Gaussians.
+pub(crate) fn needs_corners(options: &Train, dataset: &Dataset) -> bool {
+    refine(options, dataset) != Choice::Off || is_bare(options, dataset) && !has_depths(options, dataset)
+}
+
 /// The Gaussians before the first iteration, and the cameras where these are refined. `cameras` are those of the views to learn from.
 pub(crate) fn start(
     options: &Train,
@@ -51,10 +64,15 @@ pub(crate) fn start(
     let deep = has_depths(options, dataset);
     let mut found = Found { cameras: given.clone(), ..Found::default() };
     let sweeps = bare && !deep;
-    if options.refine_poses || sweeps {
-        found = corners::find(&views, options.refine_poses, sweeps.then_some(start::sweep::small), stage)?;
+    let refine = refine(options, dataset);
+    if refine != options.refine_poses {
+        stage.info("--refine-poses auto: COLMAP found the poses in the photographs: they stay as they are given");
     }
-    let refined = options.refine_poses.then(|| Poses::new(&found.cameras, &given, &corners::lenses(&given)));
+    if refine != Choice::Off || sweeps {
+        found = corners::find(&views, refine, sweeps.then_some(start::sweep::small), stage)?;
+    }
+    let refined = found.refined.then(|| Poses::new(&found.cameras, &given, &corners::lenses(&given)));
+    let refined = refined.unwrap_or_default();
     let learnt = &found.cameras[..cameras.len()];
     let mut corners = found.points;
     let say = |from: String| stage.info(&format!("the dataset has no points: starting from {from}"));
@@ -80,9 +98,9 @@ pub(crate) fn start(
             let found = corners.len();
             stage.warn(&format!("the photographs have only {found} points in common: starting from random ones"));
         }
-        return Ok((gaussians(options, dataset, cameras, extent, stage)?, refined.unwrap_or_default()));
+        return Ok((gaussians(options, dataset, cameras, extent, stage)?, refined));
     };
-    Ok((gaussians.map_err(|e| e.file(&options.scene.scene))?, refined.unwrap_or_default()))
+    Ok((gaussians.map_err(|e| e.file(&options.scene.scene))?, refined))
 }
 
 /// The Gaussians that `--init` says to start from.
