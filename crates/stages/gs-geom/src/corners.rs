@@ -92,22 +92,8 @@ pub(crate) fn find(views: &[&View], refine: Choice, small: Option<Shrink>, stage
     let (mut cameras, expected) = sights.fitted(&given, &learns, stage)?;
     let (points, after) = sights.placed(&cameras, &learns, 1.0);
     if refine == Choice::Auto {
-        // With the same slack: else wrong matches would count for one of both alone.
-        let best = sights.placed(&cameras, &learns, SLACKEST).1;
-        let of = |flags: &[bool]| flags.iter().filter(|f| **f).count();
-        // Where corners hold few of the photographs, they say more about these than about the others.
-        let held = 3 * of(&sights.held(&points, &learns)) >= 2 * of(&learns) && points.len() >= FEWEST_POINTS;
-        let pays = held && spread > LEAST_GAIN * best && spread > FITS;
-        let [was, is] = [spread, best].map(|e| pixels(&given, e));
-        let does = match (pays, held) {
-            (true, _) => "poses are refined",
-            (false, true) => "poses stay as they are given",
-            (false, false) => "too few photographs have corners in common, poses stay as they are given",
-        };
-        stage.info(&format!(
-            "--refine-poses auto: {} corners miss the given poses by {was} in the median, and the best ones by {is}: {does}",
-            points.len()
-        ));
+        let (pays, said) = sights.pays(&given, &cameras, &learns);
+        stage.info(&format!("--refine-poses auto: {said}"));
         if !pays {
             return Ok(as_given(&sights, pictures));
         }
@@ -233,6 +219,28 @@ impl<'a> Sights<'a> {
         Ok((cameras, off.expect("one round at least")))
     }
 
+    /// Whether cameras that fit the corners of the views of `learns` are to be taken for those given, and why.
+    fn pays(&self, given: &[Camera], fitted: &[Camera], learns: &[bool]) -> (bool, String) {
+        // With the same slack: else wrong matches would count for one of both alone.
+        let [was, is] = [given, fitted].map(|cameras| self.placed(cameras, learns, SLACKEST).1);
+        let (points, _) = self.placed(fitted, learns, 1.0);
+        let of = |flags: &[bool]| flags.iter().filter(|f| **f).count();
+        // Where corners hold few of the photographs, they say more about these than about the others.
+        let held = 3 * of(&self.held(&points, learns)) >= 2 * of(learns) && points.len() >= FEWEST_POINTS;
+        let pays = held && was > LEAST_GAIN * is && was > FITS;
+        let does = match (pays, held) {
+            (true, _) => "poses are refined",
+            (false, true) => "poses stay as they are given",
+            (false, false) => "too few photographs have corners in common, poses stay as they are given",
+        };
+        let [was, is] = [was, is].map(|e| pixels(given, e));
+        let count = points.len();
+        (
+            pays,
+            format!("{count} corners miss the given poses by {was} in the median, and the best ones by {is}: {does}"),
+        )
+    }
+
     fn at(&self, s: Sighting) -> DVec2 {
         DVec2::from_array(self.corners[s.view].at[s.corner])
     }
@@ -262,7 +270,7 @@ impl<'a> Sights<'a> {
 
     /// Those of the views of `of` that see enough to be placed.
     fn held(&self, points: &[Point], of: &[bool]) -> Vec<bool> {
-        let mut counts = vec![0; self.views.len()];
+        let mut counts = vec![0; self.corners.len()];
         points.iter().flat_map(|p| &p.seen).for_each(|(s, _)| counts[s.view] += 1);
         counts.iter().zip(of).map(|(&n, &of)| of && n >= FEWEST_SEEN).collect()
     }

@@ -117,6 +117,32 @@ fn shaken_cameras_come_back() {
 }
 
 #[test]
+fn poses_are_refined_where_corners_say_that_it_pays() {
+    let mut world = World::new(12, 150);
+    let corners: Vec<Corners> = (0..12)
+        .map(|view| {
+            let at = (0..150).map(|i| (world.sightings(i)[view].1 + world.any(0.4).truncate()).to_array()).collect();
+            Corners { at, ..Corners::default() }
+        })
+        .collect();
+    let track = |i: usize| (0..12).map(|view| Sighting { view, corner: i }).collect::<Vec<_>>();
+    let (all, few) = ((0..150).map(track).collect::<Vec<_>>(), (0..60).map(track).collect());
+    let decide = |given: &[Camera], tracks: Vec<Vec<Sighting>>| {
+        let (sights, learns) = (Sights { views: &[], corners: corners.clone(), tracks }, [true; 12]);
+        let (fitted, _) = sights.fitted(given, &learns, &Stage::silent("gs-geom")).unwrap();
+        sights.pays(given, &fitted, &learns)
+    };
+    let (exact, shaken) = (world.cameras.clone(), world.shaken(0.5));
+    let (refined, said) = decide(&shaken, all.clone());
+    assert!(refined && said.starts_with("150 corners") && said.ends_with(": poses are refined"), "{said}");
+    let (refined, said) = decide(&exact, all);
+    assert!(!refined && said.ends_with(": poses stay as they are given"), "{said}");
+    // 60 points are too few to say.
+    let (refined, said) = decide(&shaken, few);
+    assert!(!refined && said.contains("too few"), "{said}");
+}
+
+#[test]
 fn a_camera_is_found_by_known_points_alone() {
     let mut world = World::new(4, 60);
     let mut points = world.points(&world.cameras);

@@ -22,8 +22,11 @@ const SIDE: f64 = 0.5;
 /// Pixels beyond the dark ones that do not count either: they are a mixture.
 const MIXED: usize = 1;
 
+/// By width and height of photographs: a value for each pixel.
+pub(super) type BySize = BTreeMap<(u32, u32), Arc<Vec<f32>>>;
+
 /// Of each size of photographs that has a border: 0 for pixels that lie in it, 1 for others.
-pub(super) fn find(views: &[&View], stage: &Stage) -> Result<BTreeMap<(u32, u32), Arc<Vec<f32>>>> {
+pub(super) fn find(views: &[&View], stage: &Stage) -> Result<BySize> {
     let mut by_size: BTreeMap<(u32, u32), Vec<&View>> = BTreeMap::new();
     views.iter().for_each(|v| by_size.entry((v.camera.width, v.camera.height)).or_default().push(v));
     let mut borders = BTreeMap::new();

@@ -9,7 +9,6 @@ use serde::Serialize;
 use stage::Stage;
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
-use std::sync::Arc;
 
 /// What transparent pixels of the photographs mean.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize)]
@@ -26,7 +25,7 @@ pub enum Alpha {
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct Masks {
     files: BTreeMap<String, PathBuf>,
-    borders: BTreeMap<(u32, u32), Arc<Vec<f32>>>,
+    borders: border::BySize,
 }
 
 impl Masks {
