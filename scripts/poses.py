@@ -19,7 +19,11 @@ import json
 import os
 import shutil
 import signal
+import sqlite3
 import sys
+import threading
+from concurrent.futures import ProcessPoolExecutor
+from multiprocessing import get_context, parent_process
 from pathlib import Path
 
 # Many small products: threads of the library would only wait for each other.
@@ -85,7 +89,7 @@ def features_and_matches(a, work, views, of_video, peak, progress):
     with pycolmap.Database.open(path) as database:
         whole = database.num_images() == len(views)
     if not whole:
-        path.unlink()
+        forget(path)
         with pycolmap.Database.open(path):
             pass
         # In this order, whatever thread is done first: the numbers of photographs are the same then. One camera for each kind of photograph.
@@ -105,21 +109,63 @@ def features_and_matches(a, work, views, of_video, peak, progress):
     else:
         with pycolmap.Database.open(path) as database:
             pairs = looks_alike(database, views, of_video)
-    matching = pycolmap.FeatureMatchingOptions()
-    matching.use_gpu, matching.num_threads = False, threads
+    match(work, [(views[i]["name"], views[j]["name"]) for i, j in pairs], threads, progress)
     verification = pycolmap.TwoViewGeometryOptions()
     verification.ransac.random_seed = a.seed
-    progress.begin("pairs", len(pairs))
-    listed = work / "pairs.txt"
-    for start in range(0, len(pairs), 100):
-        some = pairs[start : start + 100]
-        listed.write_text("".join(f"{views[i]['name']} {views[j]['name']}\n" for i, j in some))
-        pairing = pycolmap.ImportedPairingOptions()
-        pairing.match_list_path = str(listed)
-        pycolmap.match_image_pairs(path, matching_options=matching, pairing_options=pairing, verification_options=verification,
-                                   device=pycolmap.Device.cpu)
-        progress.step(start + len(some))
+    verifier = pycolmap.GeometricVerifierOptions()
+    verifier.num_threads = threads
+    pycolmap.geometric_verification(path, verifier, pycolmap.ExistingMatchedPairingOptions(), verification)
     progress.end()
+
+
+def match(work, pairs, threads, progress):
+    """Matches of the pairs, by processes of one thread each: threads of pycolmap 4.2 that share an index lose matches now and then."""
+    path = work / "database.db"
+    for part in work.glob("part_*.db"):
+        gather(path, part)
+    some = [pairs[start : start + 50] for start in range(0, len(pairs), 50)]
+    progress.begin("pairs", len(pairs))
+    with ProcessPoolExecutor(min(threads, max(len(some), 1)), get_context("spawn"), begin_part, (work,)) as workers:
+        try:
+            for done, _ in enumerate(workers.map(match_part, [work] * len(some), some), 1):
+                progress.step(min(done * 50, len(pairs)))
+        except BaseException:
+            workers.shutdown(cancel_futures=True)
+            raise
+    for part in work.glob("part_*.db"):
+        gather(path, part)
+
+
+def gather(path, part):
+    """Moves the matches of a process into the database."""
+    with sqlite3.connect(path) as database:
+        database.execute("attach ? as part", (str(part),))
+        database.execute("insert or ignore into matches select * from part.matches")
+    database.close()
+    forget(part)
+
+
+def forget(database):
+    """Removes a database with its log: SQLite would read the log into the next one of that name."""
+    for file in database.parent.glob(database.name + "*"):
+        file.unlink()
+
+
+def begin_part(work):
+    """A process of `match` begins: it takes a copy of the features, and ends with its parent."""
+    threading.Thread(target=lambda: (parent_process().join(), os._exit(1)), daemon=True).start()
+    database = sqlite3.connect(work / "database.db")
+    database.execute("vacuum into ?", (str(work / f"part_{os.getpid()}.db"),))
+    database.close()
+
+
+def match_part(work, pairs):
+    listed = work / f"pairs_{os.getpid()}.txt"
+    listed.write_text("".join(f"{a} {b}\n" for a, b in pairs))
+    matching, pairing = pycolmap.FeatureMatchingOptions(), pycolmap.ImportedPairingOptions()
+    matching.use_gpu, matching.num_threads, matching.skip_geometric_verification = False, 1, True
+    pairing.match_list_path = str(listed)
+    pycolmap.match_image_pairs(work / f"part_{os.getpid()}.db", matching_options=matching, pairing_options=pairing, device=pycolmap.Device.cpu)
 
 
 def largest_model(a, work, views, progress):
@@ -293,7 +339,7 @@ def run(a, progress):
         if len(registered) >= max(a.least * len(views), FEWEST) or fainter.exists():
             break
         progress.say(f"{len(registered)} of {len(views)} photographs fit together: once more, with fainter features")
-        (work / "database.db").unlink()
+        forget(work / "database.db")
         fainter.touch()
     sheet = a.out / "registered.jpg"
     contact_sheet(work, views, registered, sheet)
