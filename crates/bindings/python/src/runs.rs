@@ -51,6 +51,14 @@ impl Labelled {
         self.scene.instances.label.clone().into_pyarray(py)
     }
 
+    /// Fit, views and Gaussians of all that masks show as one, by falling fit.
+    fn proposals<'py>(&self, py: Python<'py>) -> Vec<(f32, u32, Bound<'py, PyArray1<u32>>)> {
+        let instances = &self.scene.instances;
+        let mut granules: Vec<_> = instances.granules.iter().collect();
+        granules.sort_by(|a, b| b.fit.total_cmp(&a.fit));
+        granules.into_iter().map(|g| (g.fit, g.support, g.gaussians(instances).into_pyarray(py))).collect()
+    }
+
     /// `scene.json`; boxes are upright where a dataset says what is up. `names` is a names.json about these instances.
     fn objects(&self, py: Python<'_>, scene: Option<PathBuf>, names: Option<PathBuf>) -> PyResult<String> {
         let described = run(py, 0, |_| {

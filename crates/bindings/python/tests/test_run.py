@@ -1,5 +1,6 @@
 """cags.Run on a run that the programs made."""
 
+import html
 import json
 import subprocess
 import sys
@@ -97,6 +98,36 @@ def test_objects_are_those_of_the_labels(run):
         assert (o.name, o.sure) == ((best["names"][0]["name"], best["sure"]) if best else (None, False))
     o = objects[0]
     assert o.volume == pytest.approx(8 * np.prod(o.half_size), rel=1e-4)
+
+
+def test_proposals_may_overlap_but_are_not_the_same_twice(run):
+    everything, proposals = run.proposals(overlap=1.1), run.proposals()
+    assert 0 < len(proposals) < len(everything) == len(run.artifact("instances")["granule_fit"])
+    assert [p.fit for p in everything] == sorted(run.artifact("instances")["granule_fit"].tolist(), reverse=True)
+    assert all(p.views >= 2 and 0 <= p.fit <= 1 and (np.diff(p.gaussians.astype(int)) > 0).all() for p in everything)
+    sets = [set(p.gaussians.tolist()) for p in proposals]
+    assert all(len(a & b) < 0.3 * len(a | b) for i, a in enumerate(sets) for b in sets[:i])
+
+
+def test_a_table_has_a_row_for_each_object(run, monkeypatch):
+    table = pytest.importorskip("pandas") and run.to_dataframe()
+    objects = run.objects()
+    assert table.index.tolist() == [o.id for o in objects] and table["gaussians"].tolist() == [o.gaussians for o in objects]
+    np.testing.assert_allclose(table[["x", "y", "z"]], [o.center for o in objects])
+    np.testing.assert_allclose(table[["size_1", "size_2", "size_3"]].prod(axis=1), [o.volume for o in objects], rtol=1e-4)
+    monkeypatch.setitem(sys.modules, "pandas", None)
+    with pytest.raises(ImportError, match="pip install pandas"):
+        run.to_dataframe()
+
+
+def test_a_notebook_shows_the_page(run, folder, tmp_path):
+    with pytest.raises(FileNotFoundError, match="explore page --run-dir"):
+        run.show(tmp_path / "none.html")
+    page = tmp_path / "page.html"
+    subprocess.run([PROGRAM, "explore", "page", "--run-dir", folder, "--out", page, "--quiet"], check=True)
+    shown = run.show(page, height=300)._repr_html_()
+    assert shown.startswith("<iframe srcdoc=") and 'height="300"' in shown
+    assert html.unescape(shown.split('"')[1]) == page.read_text(encoding="utf-8")
 
 
 def test_open3d_only_where_it_is(run, monkeypatch):

@@ -16,7 +16,7 @@ Results depend neither on the number of threads nor on the machine. Long work re
 
 from ._gaussians import Camera, Gaussians, Rendered, read_ply, render, render_backward, write_ply
 from ._points import farthest_point_sample, nearest_neighbours
-from ._run import Answer, Artifact, Match, Object, Run
+from ._run import Answer, Artifact, Match, Object, Page, Proposal, Run
 
 __all__ = [
     "HDBSCAN",
@@ -26,6 +26,8 @@ __all__ = [
     "Gaussians",
     "Match",
     "Object",
+    "Page",
+    "Proposal",
     "Rendered",
     "Run",
     "farthest_point_sample",

@@ -1,5 +1,6 @@
 """Finished runs of the pipeline."""
 
+import html
 import json
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -112,6 +113,35 @@ class Object:
     axes: np.ndarray
     volume: float
     view: str
+
+
+@dataclass
+class Proposal:
+    """What masks show as one; proposals may overlap, the instances don't.
+
+    Attributes
+    ----------
+    fit : float
+        Mean IoU with the best mask of each view that shows it, 0 to 1.
+    views : int
+        How many views have a mask that shows it as one.
+    gaussians : uint32 array
+        Its Gaussians, ascending.
+    """
+
+    fit: float
+    views: int
+    gaussians: np.ndarray
+
+
+class Page:
+    """A page that a notebook shows where it stands as the value of a cell."""
+
+    def __init__(self, html, height):
+        self.html, self.height = html, height
+
+    def _repr_html_(self):
+        return f'<iframe srcdoc="{html.escape(self.html)}" width="100%" height="{self.height}" style="border:0"></iframe>'
 
 
 class Run:
@@ -228,6 +258,57 @@ class Run:
             )
             for o in scene["objects"]
         ]
+
+    def proposals(self, overlap=0.3):
+        """What masks show as one thing, as a list of :class:`Proposal`, best fit first.
+
+        Instances divide the scene; proposals may lie within each other: the cup, its handle, the set of cups.
+
+        Parameters
+        ----------
+        overlap : float
+            One whose IoU with a better one is this or more is left out; above 1 all stay.
+        """
+        held = [[] for _ in self.labels]
+        out = []
+        for fit, views, gaussians in self._labelled.proposals():
+            common = {}
+            for k in (k for i in gaussians for k in held[i]):
+                common[k] = common.get(k, 0) + 1
+            if all(both < overlap * (len(gaussians) + len(out[k].gaussians) - both) for k, both in common.items()):
+                for i in gaussians:
+                    held[i].append(len(out))
+                out.append(Proposal(fit, views, gaussians))
+        return out
+
+    def to_dataframe(self):
+        """The :meth:`objects` as ``pandas.DataFrame``, a row for each, by id. Needs pandas."""
+        try:
+            import pandas
+        except ImportError:
+            raise ImportError("to_dataframe needs pandas: pip install pandas") from None
+        rows = []
+        for o in self.objects():
+            row = {k: getattr(o, k) for k in ("id", "name", "sure", "score", "gaussians", "volume", "view")}
+            rows.append(row | dict(zip("xyz", o.center.tolist())) | dict(zip(("size_1", "size_2", "size_3"), (2 * o.half_size).tolist())))
+        columns = ["id", "name", "sure", "score", "gaussians", "volume", "view", "x", "y", "z", "size_1", "size_2", "size_3"]
+        return pandas.DataFrame(rows, columns=columns).set_index("id")
+
+    def show(self, page=None, height=600):
+        """The scene in a notebook, to turn and click, as the value of a cell.
+
+        Parameters
+        ----------
+        page : path, optional
+            The file that ``explore page --run-dir FOLDER --out FOLDER/page.html`` writes, by default that one. It becomes a part of
+            the notebook.
+        height : int
+            In pixels.
+        """
+        page = self.folder / "page.html" if page is None else Path(page)
+        if not page.exists():
+            raise FileNotFoundError(f"{page}: no such page; explore page --run-dir {self.folder} --out {page} writes it")
+        return Page(page.read_text(encoding="utf-8"), height)
 
     def to_open3d(self):
         """The Gaussians' centres as ``open3d.geometry.PointCloud``, in their own colours. Needs open3d."""
