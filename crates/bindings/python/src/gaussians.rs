@@ -2,6 +2,7 @@
 
 use crate::work::run;
 use glam::{DMat3, DVec3};
+use gs_scene::ply::INSTANCE;
 use gs_scene::splat::{self, Extra};
 use gs_scene::{Camera, Gaussians};
 use numpy::ndarray::{Array2, Array3};
@@ -94,6 +95,7 @@ pub fn write_gaussians(
 ) -> PyResult<()> {
     let g = gaussians.to_gaussians()?;
     let instance: Option<Vec<i32>> = instance.map(|i| i.as_array().to_vec());
-    let extra = Extra { antialias, instance: instance.as_deref(), ..Extra::default() };
+    let ids: Vec<_> = instance.iter().map(|labels| (INSTANCE, &labels[..])).collect();
+    let extra = Extra { antialias, ids: &ids, ..Extra::default() };
     run(py, 0, |_| splat::write(&path, &g, &extra))?.map_err(|e| PyValueError::new_err(e.to_string()))
 }

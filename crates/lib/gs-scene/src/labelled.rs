@@ -1,5 +1,6 @@
 //! Gaussians with the instance of each, to write some of them as a splat of their own.
 
+use crate::ply::{INSTANCE, IdColumn};
 use crate::splat::{self, Extra, Format};
 use crate::{Geometry, ply};
 use gs_io::Result;
@@ -8,8 +9,8 @@ use std::path::Path;
 /// Gaussians with the instance of each.
 pub struct Labelled<'a> {
     geometry: &'a Geometry,
-    /// Instance of every Gaussian, -1 for none.
-    label: &'a [i32],
+    /// For every Gaussian its instance, and what else a PLY is to say of it.
+    ids: Vec<IdColumn<'a>>,
     /// The rows of the geometry's file, where they can be copied.
     rows: Option<ply::Vertices>,
     comments: Vec<String>,
@@ -25,7 +26,13 @@ impl<'a> Labelled<'a> {
         // Rows with numbers that are not finite would break those who read the file.
         let plain = geometry.damaged.is_empty() && Format::of_file(file)? == Format::Ply;
         let rows = plain.then(|| ply::Vertices::read(file)).transpose()?;
-        Ok(Self { geometry, label, rows, comments: geometry.comments(own) })
+        Ok(Self { geometry, ids: vec![(INSTANCE, label)], rows, comments: geometry.comments(own) })
+    }
+
+    /// With one number more for every Gaussian in a PLY.
+    pub fn with(mut self, ids: IdColumn<'a>) -> Self {
+        self.ids.push(ids);
+        self
     }
 
     /// Writes the Gaussians `which`, ascending, with all their harmonics, in the format that the file's name says; to a PLY with
@@ -36,13 +43,14 @@ impl<'a> Labelled<'a> {
     pub fn write(&self, to: &Path, which: &[u32]) -> Result<Vec<String>> {
         let format = Format::to_write(to)?;
         match (format, &self.rows) {
-            (Format::Ply, Some(rows)) => rows.write(to, which, Some(self.label), &self.comments).map(|()| Vec::new()),
+            (Format::Ply, Some(rows)) => rows.write(to, which, &self.ids, &self.comments).map(|()| Vec::new()),
             _ => {
-                let own: Vec<i32> = which.iter().map(|&i| self.label[i as usize]).collect();
-                let antialias = self.geometry.antialias;
-                // No other format has a place for it.
-                let instance = (format == Format::Ply).then_some(&own[..]);
-                let extra = Extra { comments: &self.comments, antialias, instance };
+                let of = |(_, all): &IdColumn<'_>| which.iter().map(|&i| all[i as usize]).collect();
+                let own: Vec<Vec<i32>> = self.ids.iter().map(of).collect();
+                let mut ids: Vec<IdColumn<'_>> = self.ids.iter().zip(&own).map(|(c, own)| (c.0, &own[..])).collect();
+                // No other format has a place for them.
+                ids.retain(|_| format == Format::Ply);
+                let extra = Extra { comments: &self.comments, antialias: self.geometry.antialias, ids: &ids };
                 let chosen = self.geometry.gaussians.select(which);
                 splat::write(to, &chosen, &extra)?;
                 splat::lost(to, &chosen)

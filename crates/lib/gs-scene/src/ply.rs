@@ -12,7 +12,7 @@ pub(crate) mod table;
 use crate::middle::{less, shift_of};
 use crate::splat::compressed_ply;
 use crate::{Gaussians, sh_coefficients};
-pub use copy::{INSTANCE, Vertices};
+pub use copy::{INSTANCE, IdColumn, Vertices};
 use gs_io::{Error, IoContext, Result, write_atomic};
 pub use shift::comment as shift_comment;
 use std::io::Read;
@@ -198,7 +198,7 @@ fn header(count: usize, comments: &[String], shift: [f64; 3], properties: &[(&st
 /// Writes the standard 3DGS layout: little-endian floats, 62 properties at degree 3. `comments` become comment lines.
 pub fn write_gaussians(path: impl AsRef<Path>, gaussians: &Gaussians, comments: &[String]) -> Result<()> {
     let (path, rows) = (path.as_ref(), (gaussians.len(), 0..gaussians.len()));
-    write_atomic(path, |w| write_rows(w, path, gaussians, rows, None, comments))
+    write_atomic(path, |w| write_rows(w, path, gaussians, rows, &[], comments))
 }
 
 /// The same with a whole number more for each Gaussian, the property `instance`: -1 for none. `instance` has one per Gaussian.
@@ -212,7 +212,7 @@ pub fn write_labelled_gaussians(
     if instance.len() != n {
         return Err(Error::new("not a label per Gaussian").file(path).found(instance.len()).expected(n));
     }
-    write_atomic(path, |w| write_rows(w, path, gaussians, (n, 0..n), Some(instance), comments))
+    write_atomic(path, |w| write_rows(w, path, gaussians, (n, 0..n), &[(INSTANCE, instance)], comments))
 }
 
 /// The same for the Gaussians `rows` only, in that order, without a copy of them.
@@ -223,14 +223,14 @@ pub fn write_some_gaussians(
     comments: &[String],
 ) -> Result<()> {
     let (path, rows) = (path.as_ref(), (rows.len(), rows.iter().map(|&i| i as usize)));
-    write_atomic(path, |w| write_rows(w, path, gaussians, rows, None, comments))
+    write_atomic(path, |w| write_rows(w, path, gaussians, rows, &[], comments))
 }
 
 /// The bytes of the file that [`write_some_gaussians`] writes.
 pub fn some_gaussians(gaussians: &Gaussians, rows: &[u32], comments: &[String]) -> Result<Vec<u8>> {
     let mut bytes = Vec::new();
     let rows = (rows.len(), rows.iter().map(|&i| i as usize));
-    write_rows(&mut bytes, Path::new("a PLY in memory"), gaussians, rows, None, comments)?;
+    write_rows(&mut bytes, Path::new("a PLY in memory"), gaussians, rows, &[], comments)?;
     Ok(bytes)
 }
 
@@ -240,7 +240,7 @@ pub(crate) fn write_rows(
     place: &Path,
     gaussians: &Gaussians,
     (count, rows): (usize, impl Iterator<Item = usize>),
-    instance: Option<&[i32]>,
+    ids: &[IdColumn<'_>],
     comments: &[String],
 ) -> Result<()> {
     gaussians.check().map_err(|e| e.file(place))?;
@@ -250,7 +250,7 @@ pub(crate) fn write_rows(
     names.extend((0..3 * (k - 1)).map(|i| format!("f_rest_{i}")));
     names.extend(["opacity", "scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3"].map(String::from));
     let mut properties: Vec<(&str, String)> = names.into_iter().map(|n| ("float", n)).collect();
-    properties.extend(instance.map(|_| ("int", "instance".to_string())));
+    properties.extend(ids.iter().map(|(name, _)| ("int", (*name).to_string())));
     w.write_all(header(count, comments, gaussians.shift, &properties).as_bytes()).at("write", place)?;
     let mut row: Vec<u8> = Vec::with_capacity(4 * properties.len());
     for i in rows {
@@ -264,7 +264,7 @@ pub(crate) fn write_rows(
         }
         put(gaussians.opacity_logits[i]);
         gaussians.log_scales[i].into_iter().chain(gaussians.rotations[i]).for_each(&mut put);
-        row.extend(instance.iter().flat_map(|l| l[i].to_le_bytes()));
+        row.extend(ids.iter().flat_map(|(_, l)| l[i].to_le_bytes()));
         w.write_all(&row).at("write", place)?;
     }
     Ok(())

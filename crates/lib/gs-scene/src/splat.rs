@@ -14,6 +14,7 @@ mod stream;
 #[cfg(test)]
 pub(crate) mod testing;
 
+use crate::ply::IdColumn;
 use crate::{Gaussians, ply, say_shift, sh_coefficients};
 use gs_io::{Error, IoContext, Result, hash_files, write_atomic};
 use std::fs::File;
@@ -62,8 +63,8 @@ pub struct Extra<'a> {
     pub comments: &'a [String],
     /// Whether the Gaussians were learnt with the 2D filter of Mip-Splatting; .splat and GLB cannot say it.
     pub antialias: bool,
-    /// The instance of each Gaussian, -1 for none: in a PLY only.
-    pub instance: Option<&'a [i32]>,
+    /// Numbers of each Gaussian, such as its instance: in a PLY only.
+    pub ids: &'a [IdColumn<'a>],
 }
 
 /// First bytes by which a file is known.
@@ -277,7 +278,7 @@ pub fn encode(format: Format, gaussians: &Gaussians, extra: &Extra<'_>) -> Resul
 
 fn check(format: Format, gaussians: &Gaussians, extra: &Extra<'_>) -> Result<()> {
     gaussians.check()?;
-    if let Some(instance) = extra.instance {
+    for (_, instance) in extra.ids {
         if instance.len() != gaussians.len() {
             return Err(Error::new("not a label per Gaussian").found(instance.len()).expected(gaussians.len()));
         }
@@ -299,7 +300,7 @@ fn put(w: &mut dyn Write, place: &Path, format: Format, g: &Gaussians, extra: &E
         comments.push(ply::ANTIALIASED.into());
     }
     match format {
-        Format::Ply => ply::write_rows(w, place, g, (g.len(), 0..g.len()), extra.instance, &comments),
+        Format::Ply => ply::write_rows(w, place, g, (g.len(), 0..g.len()), extra.ids, &comments),
         Format::CompressedPly => compressed_ply::write(w, place, g, &comments),
         Format::Spz => spz::writer::write(w, place, g, extra.antialias),
         Format::Splat => dot_splat::write(w, place, g),

@@ -141,19 +141,19 @@ fn table_of_errors() {
 fn comments_the_filter_and_instances_go_where_they_can() {
     let g = cloud(5, 1);
     let comments = ["made by a test".to_string()];
-    let extra = Extra { comments: &comments, antialias: true, instance: None };
+    let extra = Extra { comments: &comments, antialias: true, ids: &[] };
     for (name, kept) in
         [("a.ply", true), ("a.compressed.ply", true), ("a.spz", true), ("a.splat", false), ("a.glb", false)]
     {
         assert_eq!(through(&g, name, &extra).antialias, kept, "{name}");
     }
     let instance = [0, 1, -1, 1, 0];
-    let extra = Extra { instance: Some(&instance), ..Extra::default() };
+    let extra = Extra { ids: &[("instance", &instance), ("class_id", &instance)], ..Extra::default() };
     let bytes = splat::encode(Format::Ply, &g, &extra).unwrap();
-    assert!(String::from_utf8_lossy(&bytes).contains("property int instance"));
+    assert!(String::from_utf8_lossy(&bytes).contains("property int instance\nproperty int class_id\n"));
     let e = splat::encode(Format::Spz, &g, &extra).unwrap_err().to_string();
     assert!(e.contains("only a PLY holds instances"), "{e}");
-    let short = Extra { instance: Some(&instance[..2]), ..Extra::default() };
+    let short = Extra { ids: &[("instance", &instance[..2])], ..Extra::default() };
     assert!(splat::encode(Format::Ply, &g, &short).is_err());
 }
 

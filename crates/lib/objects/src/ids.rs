@@ -1,7 +1,9 @@
 //! `<name>.ids.json`: the object of each Gaussian of a splat, beside a file that cannot hold it.
 
+use crate::Names;
 use gs_io::{Error, IoContext, Result, hash_file, write_bytes};
 use serde::{Deserialize, Serialize};
+use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
 
 /// Ids of the Gaussians of a splat, by their order in its file.
@@ -14,6 +16,38 @@ pub struct Ids {
     pub splat: String,
     /// Object of each Gaussian, -1 for none.
     pub instance: Vec<i32>,
+    /// What the objects are, ascending by id.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub objects: Vec<ObjectClass>,
+    /// What `class_id` counts: the names, in alphabetical order.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub classes: Vec<String>,
+}
+
+/// An object and its class.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct ObjectClass {
+    /// The number in `instance_id`.
+    pub instance_id: u32,
+    /// The number in `class_id`; -1 where it has no name.
+    pub class_id: i32,
+    /// Its name.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub name: Option<String>,
+}
+
+/// The classes of objects by their names: objects of one name are of one class. Returns the classes, alphabetically.
+pub fn classes(objects: &[u32], names: &Names) -> (Vec<ObjectClass>, Vec<String>) {
+    let name = |id: &u32| names.get(id).map(|n| n.text.clone());
+    let all: BTreeSet<String> = objects.iter().filter_map(name).collect();
+    let classes: Vec<String> = all.into_iter().collect();
+    let class = |&id: &u32| {
+        let name = name(&id);
+        let class_id = name.as_ref().and_then(|n| classes.binary_search(n).ok()).map_or(-1, |k| k as i32);
+        ObjectClass { instance_id: id, class_id, name }
+    };
+    (objects.iter().map(class).collect(), classes)
 }
 
 impl Ids {
@@ -31,7 +65,13 @@ impl Ids {
     /// # Errors
     /// When the splat cannot be read.
     pub fn of(splat: impl AsRef<Path>, instance: Vec<i32>) -> Result<Self> {
-        Ok(Self { format: Self::FORMAT.into(), version: Self::VERSION, splat: hash_file(splat)?, instance })
+        let (format, splat) = (Self::FORMAT.into(), hash_file(splat)?);
+        Ok(Self { format, version: Self::VERSION, splat, instance, objects: Vec::new(), classes: Vec::new() })
+    }
+
+    /// With what the objects are, as [`classes`] says.
+    pub fn called(self, objects: Vec<ObjectClass>, classes: Vec<String>) -> Self {
+        Self { objects, classes, ..self }
     }
 
     /// Writes them beside the splat.
@@ -91,6 +131,7 @@ impl Ids {
 mod tests {
     use super::*;
     use crate::testing::boxes;
+    use crate::{Name, NameSource};
     use gs_scene::ply;
 
     #[test]
@@ -111,6 +152,18 @@ mod tests {
         assert!(refused(n).contains("splat: the ids are of another file"), "{}", refused(n));
         std::fs::remove_file(Ids::path(&splat)).unwrap();
         assert!(refused(n).contains("a.ply.ids.json: cannot read"));
+    }
+
+    #[test]
+    fn objects_of_one_name_are_of_one_class() {
+        let name = |text: &str| Name { text: text.into(), from: NameSource::Edits, sure: true };
+        let names = Names::from([(3, name("plate")), (5, name("mug")), (9, name("plate"))]);
+        let (objects, classes) = classes(&[3, 4, 5, 9], &names);
+        assert_eq!(classes, ["mug", "plate"]);
+        assert_eq!(
+            objects.iter().map(|o| (o.instance_id, o.class_id)).collect::<Vec<_>>(),
+            [(3, 1), (4, -1), (5, 0), (9, 1)]
+        );
     }
 
     #[test]

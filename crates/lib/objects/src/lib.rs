@@ -13,7 +13,7 @@ mod up;
 mod upright;
 
 pub use describe::{Names, describe, members, solid_centers};
-pub use ids::Ids;
+pub use ids::{Ids, ObjectClass, classes};
 pub use scene::{BestView, Family, Name, NameSource, Object, Part, Relation, RelationKind, SCHEMA, Scene};
 pub use up::{Up, UpSource};
 pub use upright::{ObjectBox, upright_box};

@@ -154,9 +154,14 @@ pub struct SplatsOptions {
     /// Everything but these objects: ids, with commas
     #[arg(long, value_name = "IDS", value_delimiter = ',', conflicts_with = "only")]
     pub without: Vec<u32>,
-    /// Also write <name>.ids.json: the ids by the order of the Gaussians, for programs that drop unknown properties
+    /// Also write <name>.ids.json: the ids by the order of the Gaussians, for programs that drop unknown properties, and what each object
+    /// is called. A PLY then has instance_id and class_id, too
     #[arg(long)]
     pub ids: bool,
+    /// names.json of eval names about these instances, for the classes of --ids
+    /// [default: none; with --run-dir that of the run]
+    #[arg(long, value_name = "FILE")]
+    pub names: Option<PathBuf>,
     /// Output file; its extension is the format: .ply, .spz, .splat or .glb. Ids are in PLYs alone; others take --ids
     #[arg(long, value_name = "FILE")]
     pub out: PathBuf,

@@ -15,6 +15,7 @@ use objects::{Ids, Names, Scene, Up, members, solid_centers};
 use query::LabelledScene;
 use serde_json::{Value, json};
 use stage::Stage;
+use std::collections::BTreeMap;
 use std::path::Path;
 
 /// `export scene`.
@@ -58,7 +59,7 @@ pub fn objects(o: &ObjectsOptions, parameters: Value, stage: &Stage) -> Result<(
 /// `export splats`.
 pub fn splats(o: &SplatsOptions, parameters: Value, stage: &Stage) -> Result<()> {
     let outputs = stage.outputs(&o.out).file(&o.out).files(o.ids.then(|| Ids::path(&o.out)));
-    let mut claim = o.inputs.reads(outputs.drop_stale()).claim()?;
+    let mut claim = o.inputs.reads(outputs.drop_stale()).reads(&o.names).claim()?;
     let labelled = o.inputs.read(stage)?;
     let label = &labelled.instances.label;
     let only = if o.only.is_empty() { None } else { Some(wanted(&labelled, &o.only, "--only")?) };
@@ -71,9 +72,20 @@ pub fn splats(o: &SplatsOptions, parameters: Value, stage: &Stage) -> Result<()>
     if which.is_empty() {
         return Err(Error::new("nothing is left to write").field("--without").hint("leave some objects"));
     }
-    splats_of(&labelled, &o.inputs)?.write(&o.out, &which)?.iter().for_each(|what| stage.warn(what));
+    let mut splats = splats_of(&labelled, &o.inputs)?;
     if o.ids {
-        Ids::of(&o.out, which.iter().map(|&i| label[i as usize]).collect())?.write(&o.out)?;
+        let mut written: Vec<u32> = which.iter().filter_map(|&i| u32::try_from(label[i as usize]).ok()).collect();
+        written.sort_unstable();
+        written.dedup();
+        let (objects, classes) = objects::classes(&written, &names::read(o.names.as_deref(), None, &labelled)?);
+        let of: BTreeMap<i32, i32> = objects.iter().map(|o| (o.instance_id as i32, o.class_id)).collect();
+        let class: Vec<i32> = label.iter().map(|l| of.get(l).copied().unwrap_or(-1)).collect();
+        splats = splats.with(("instance_id", label)).with(("class_id", &class));
+        splats.write(&o.out, &which)?.iter().for_each(|what| stage.warn(what));
+        let own = which.iter().map(|&i| label[i as usize]).collect();
+        Ids::of(&o.out, own)?.called(objects, classes).write(&o.out)?;
+    } else {
+        splats.write(&o.out, &which)?.iter().for_each(|what| stage.warn(what));
     }
     stage.info(&format!("wrote {}: {} of {} Gaussians", o.out.display(), which.len(), label.len()));
     stage.record(&mut claim, parameters, labelled.inputs.clone(), json!({ "gaussians": which.len() }))

@@ -261,6 +261,33 @@ fn splats_keep_harmonics_and_ids_and_can_do_without_an_object() {
 }
 
 #[test]
+fn ids_say_the_class_of_each_gaussian() {
+    let run = Run::new();
+    let (g, label) = gaussians();
+    let call = |instance, name: &str| Edit::Rename { instance, name: name.into() };
+    run.edits(vec![call(1, "plate"), call(2, "mug"), call(3, "plate")]);
+    run.succeed("splats", "all.ply", &["--ids", "--edits", "edits.json"]);
+    let ids = Ids::read(run.path("all.ply"), g.len()).unwrap();
+    assert_eq!(ids.classes, ["mug", "plate"]);
+    let of: Vec<(u32, i32)> = ids.objects.iter().map(|o| (o.instance_id, o.class_id)).collect();
+    assert_eq!(of, [(0, -1), (1, 1), (2, 0), (3, 1), (4, -1)]);
+    // The three are the last of a row.
+    let bytes = std::fs::read(run.path("all.ply")).unwrap();
+    let header = String::from_utf8_lossy(&bytes[..3000]).into_owned();
+    let last = "property int instance\nproperty int instance_id\nproperty int class_id\nend_header\n";
+    let start = header.find(last).unwrap_or_else(|| panic!("{header}")) + last.len();
+    let row = (bytes.len() - start) / g.len();
+    for (i, &label) in label.iter().enumerate() {
+        let row = &bytes[start + i * row..][..row];
+        let word = |back: usize| i32::from_le_bytes(row[row.len() - 4 * back..][..4].try_into().unwrap());
+        let class = of.iter().find(|o| o.0 as i32 == label).map_or(-1, |o| o.1);
+        assert_eq!([word(3), word(2), word(1)], [label, label, class]);
+    }
+    assert_eq!(ply::read_gaussians(run.path("all.ply")).unwrap(), g);
+    run.fail("splats", "o.ply", &["--ids", "--names", "all.ply"], &["all.ply"]);
+}
+
+#[test]
 fn every_format_of_splats_is_written_with_ids_beside_it() {
     let run = Run::new();
     let (g, label) = gaussians();

@@ -44,17 +44,17 @@ fn splat_transform_splits_objects_from_our_ply() {
     instances.write(path("i.safetensors"), Provenance { inputs, ..Provenance::default() }).unwrap();
     let mut export = Command::new(env!("CARGO_BIN_EXE_export"));
     export.arg("splats").arg("--geometry").arg(path("geometry.ply")).arg("--instances").arg(path("i.safetensors"));
-    assert!(export.arg("--out").arg(path("all.ply")).status().unwrap().success());
+    assert!(export.arg("--ids").arg("--out").arg(path("all.ply")).status().unwrap().success());
 
     // Those with most, with fewest, and those of no object; the program reads all whole numbers as unsigned.
-    for id in [-1, 3, 5, 8] {
+    for (property, id) in [("instance", -1), ("instance_id", 3), ("instance", 5), ("instance_id", 8)] {
         let mut split = Command::new("node");
         split
             .arg(&program)
             .arg("--overwrite")
             .arg(path("all.ply"))
             .arg("--filter-value")
-            .arg(format!("instance,eq,{}", id as u32));
+            .arg(format!("{property},eq,{}", id as u32));
         let done = split.arg(path("one.ply")).output().unwrap();
         let own: Vec<u32> = (0..GAUSSIANS as u32).filter(|&i| label[i as usize] == id).collect();
         assert!(done.status.success() && !own.is_empty(), "{}", String::from_utf8_lossy(&done.stderr));

@@ -81,7 +81,7 @@ impl Convert {
         comments.extend(inputs.iter().map(|(role, hash)| format!("{role} {hash}")));
         comments.push(format!("parameters {parameters}"));
         comments.extend(Learnt::read(&self.input)?.iter().flat_map(Learnt::comments));
-        splat::write(&self.output, &g, &Extra { comments: &comments, antialias, instance: None })?;
+        splat::write(&self.output, &g, &Extra { comments: &comments, antialias, ids: &[] })?;
         stage.info(&format!("{} of {all} Gaussians, SH degree {}, in {}", g.len(), g.sh_degree, self.output.display()));
         splat::lost(&self.output, &g)?.iter().for_each(|what| stage.warn(what));
         let mut summary = json!({

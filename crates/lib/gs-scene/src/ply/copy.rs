@@ -9,6 +9,9 @@ use std::path::{Path, PathBuf};
 /// Name of the property that says which instance a Gaussian belongs to.
 pub const INSTANCE: &str = "instance";
 
+/// A whole number for each Gaussian, -1 for none, and the name of its property.
+pub type IdColumn<'a> = (&'a str, &'a [i32]);
+
 /// The vertices of a PLY, to write some of them.
 pub struct Vertices {
     table: Table<'static>,
@@ -41,20 +44,14 @@ impl Vertices {
     }
 
     /// Writes the vertices `rows`, in that order, as a little-endian PLY with all scalar properties as they are; those of an
-    /// ascii file, or of one with lists, as floats and doubles. `instance` has a whole number for every vertex that was read, -1 for none:
-    /// it becomes the property [`INSTANCE`], in place of one that the file has. `comments` become comment lines.
+    /// ascii file, or of one with lists, as floats and doubles. `ids` have a number for every vertex that was read, and take the place of
+    /// properties of their names that the file has. `comments` become comment lines.
     ///
     /// # Errors
     /// When there are not as many labels as vertices, one of the rows is not there, or the file cannot be written.
-    pub fn write(
-        &self,
-        to: impl AsRef<Path>,
-        rows: &[u32],
-        instance: Option<&[i32]>,
-        comments: &[String],
-    ) -> Result<()> {
+    pub fn write(&self, to: impl AsRef<Path>, rows: &[u32], ids: &[IdColumn<'_>], comments: &[String]) -> Result<()> {
         let to = to.as_ref();
-        if let Some(labels) = instance.filter(|l| l.len() != self.len()) {
+        if let Some((_, labels)) = ids.iter().find(|(_, l)| l.len() != self.len()) {
             let e = Error::new("not a label per vertex").file(&self.path);
             return Err(e.found(labels.len()).expected(self.len()));
         }
@@ -62,7 +59,7 @@ impl Vertices {
             let e = Error::new("no such vertex").file(&self.path);
             return Err(e.found(row).expected(format!("below {}", self.len())));
         }
-        write_atomic(to, |w| self.write_rows(w, to, rows, instance, comments))
+        write_atomic(to, |w| self.write_rows(w, to, rows, ids, comments))
     }
 
     fn write_rows(
@@ -70,20 +67,20 @@ impl Vertices {
         w: &mut dyn Write,
         to: &Path,
         rows: &[u32],
-        instance: Option<&[i32]>,
+        ids: &[IdColumn<'_>],
         comments: &[String],
     ) -> Result<()> {
-        let kept = |(name, _): &(&str, _)| instance.is_none() || *name != INSTANCE;
+        let kept = |(name, _): &(&str, _)| ids.iter().all(|(id, _)| id != name);
         let columns: Vec<_> = self.table.columns().filter(kept).collect();
         let property = |(name, column): &(&str, Column)| (column.type_name(), (*name).to_string());
         let mut properties: Vec<(&str, String)> = columns.iter().map(property).collect();
-        properties.extend(instance.map(|_| ("int", INSTANCE.to_string())));
+        properties.extend(ids.iter().map(|(name, _)| ("int", (*name).to_string())));
         w.write_all(super::header(rows.len(), comments, self.shift, &properties).as_bytes()).at("write", to)?;
         let mut row = Vec::new();
         for &i in rows {
             row.clear();
             columns.iter().for_each(|(_, column)| self.table.put(i as usize, *column, &mut row));
-            row.extend(instance.iter().flat_map(|l| l[i as usize].to_le_bytes()));
+            row.extend(ids.iter().flat_map(|(_, l)| l[i as usize].to_le_bytes()));
             w.write_all(&row).at("write", to)?;
         }
         Ok(())
@@ -135,7 +132,7 @@ mod tests {
         for encoding in ["binary_little_endian", "binary_big_endian", "ascii"] {
             let (from, to) = (file(encoding, dir.path()), dir.path().join("out.ply"));
             let vertices = Vertices::read(&from).unwrap();
-            vertices.write(&to, &[1, 0, 1], Some(&[-1, 4]), &["mine".into()]).unwrap();
+            vertices.write(&to, &[1, 0, 1], &[(INSTANCE, &[-1, 4])], &["mine".into()]).unwrap();
             assert_eq!(read_gaussians(&to).unwrap(), read_gaussians(&from).unwrap().select(&[1, 0, 1]), "{encoding}");
             assert_eq!(read_labels(&to, "segment", [0.0; 3]).unwrap().1, [201, 200, 201]);
             let bytes = std::fs::read(&to).unwrap();
