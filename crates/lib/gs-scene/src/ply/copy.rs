@@ -147,7 +147,7 @@ mod tests {
                 assert_eq!(bytes[time], (1e9 + 1.25f64).to_le_bytes());
             }
             // Without labels the file's own stay.
-            vertices.write(&to, &[0], None, &[]).unwrap();
+            vertices.write(&to, &[0], &[], &[]).unwrap();
             assert_eq!(read_labels(&to, "instance", [0.0; 3]).unwrap().1, [7]);
         }
     }
@@ -166,11 +166,11 @@ mod tests {
             ..Gaussians::default()
         };
         write_gaussians(&from, &g, &[]).unwrap();
-        let refused = |rows: &[u32], labels: Option<&[i32]>| {
-            Vertices::read(&from).unwrap().write(&to, rows, labels, &[]).unwrap_err().to_string()
+        let refused = |rows: &[u32], ids: &[IdColumn<'_>]| {
+            Vertices::read(&from).unwrap().write(&to, rows, ids, &[]).unwrap_err().to_string()
         };
-        assert!(refused(&[0], Some(&[1])).contains("not a label per vertex; found 1, expected 2"));
-        assert!(refused(&[2], None).contains("no such vertex; found 2, expected below 2"));
+        assert!(refused(&[0], &[(INSTANCE, &[1])]).contains("not a label per vertex; found 1, expected 2"));
+        assert!(refused(&[2], &[]).contains("no such vertex; found 2, expected below 2"));
         assert!(!to.exists());
     }
 }
