@@ -154,9 +154,13 @@ def forget(database):
 def begin_part(work):
     """A process of `match` begins: it takes a copy of the features, and ends with its parent."""
     threading.Thread(target=lambda: (parent_process().join(), os._exit(1)), daemon=True).start()
+    # Its name only once it is whole: after a kill all parts are gathered.
+    copy = work / f"copy_{os.getpid()}.db"
+    forget(copy)
     database = sqlite3.connect(work / "database.db")
-    database.execute("vacuum into ?", (str(work / f"part_{os.getpid()}.db"),))
+    database.execute("vacuum into ?", (str(copy),))
     database.close()
+    os.rename(copy, work / f"part_{os.getpid()}.db")
 
 
 def match_part(work, pairs):
