@@ -4,6 +4,7 @@ use crate::options::{Args, Views};
 use crate::precompute::{Summary, precompute};
 use artifacts::{Footprints, Graph, MaskMaps, ScratchEntries, hash_folder, maps_path, role, watch_folder};
 use gs_io::{Error, Result, Watched, hash_file};
+use gs_raster::Photographs;
 use gs_scene::dataset::{self, LoadOptions, Resolution, Split, View};
 use gs_scene::{Geometry, HoldOut, splat};
 use serde_json::json;
@@ -49,6 +50,10 @@ impl Program for Args {
             return Err(Error::new("no Gaussians").file(&self.geometry).hint("train the geometry first"));
         }
         forecast(&self, &geometry, &views, stage)?;
+        let likeness = Photographs::of(&views)?.likeness(&geometry.gaussians, geometry.antialias, &views);
+        if likeness.is_drawn() {
+            likeness.expect_same(&self.geometry, &likeness.to_string())?;
+        }
         let inputs = BTreeMap::from([
             (role::GEOMETRY.to_string(), hash_file(&self.geometry)?),
             (role::DATASET.to_string(), dataset.hash()?),

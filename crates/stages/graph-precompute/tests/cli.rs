@@ -3,6 +3,7 @@
 use artifacts::{Footprints, Graph, Level, MaskMaps, Row, maps_path, role};
 use glam::DVec3;
 use gs_io::Provenance;
+use gs_raster::{RasterOptions, Rendered, render};
 use gs_scene::dataset::{self, LoadOptions, Resolution};
 use gs_scene::{Camera, Gaussians, Image, Learnt, PointCloud, colmap, ply};
 use ndarray::Array3;
@@ -10,6 +11,8 @@ use std::path::{Path, PathBuf};
 use std::process::{Command, Output};
 
 const SIZE: u32 = 48;
+/// What the Gaussians' harmonics make.
+const GREY: f32 = 0.5 + 0.282_094_8 * 0.3;
 
 /// A COLMAP scene of two clusters of Gaussians in photographs of `size` x `size` pixels, one mask each and one for both; and a
 /// folder for the output.
@@ -21,7 +24,7 @@ fn setup(size: u32) -> (tempfile::TempDir, PathBuf, PathBuf) {
     let half = |x| i32::from(x >= size as usize / 2);
     let id = |(level, _, x)| if level == 3 { 6 } else { 2 * level as i32 + half(x) };
     let maps = MaskMaps { ids: Array3::from_shape_fn((4, size as usize, size as usize), id) };
-    let grey = Image { width: size, height: size, rgb: vec![0.5; 3 * n], alpha: None };
+    let grey = Image { width: size, height: size, rgb: vec![GREY; 3 * n], alpha: None };
     let mut views = Vec::new();
     for v in 0..5 {
         let eye = DVec3::new(f64::from(v) * 0.1 - 0.2, -0.2, -3.0);
@@ -102,6 +105,34 @@ fn artifacts_are_right_and_the_same_for_any_number_of_threads() {
     let cut = Footprints::read(o.join("footprints.safetensors")).unwrap();
     assert_eq!(cut.views.len(), 5);
     assert!(cut.total() * 4 < f.total() * 5);
+}
+
+#[test]
+fn gaussians_of_other_photographs_are_refused() {
+    let (_dir, s, o) = setup(SIZE);
+    // One cluster is red, the other one green.
+    let mut g = gaussians();
+    for (i, colour) in g.sh.as_chunks_mut::<3>().0.iter_mut().enumerate() {
+        *colour = if i % 2 == 0 { [1.5, -1.5, -1.5] } else { [-1.5, 1.5, -1.5] };
+    }
+    let load = LoadOptions { resolution: Resolution::Divisor(1.0), holdout: 0 };
+    for view in dataset::load(&s, &load).unwrap().views {
+        let Rendered { width, height, rgb, .. } = render(&g, &view.camera, &RasterOptions::fit(&g));
+        Image { width, height, rgb, alpha: None }.write_png(&view.image_path).unwrap();
+    }
+    ply::write_gaussians(s.join("geometry.ply"), &g, &[]).unwrap();
+    succeed(&run(&s, &o, &[]));
+    // The same thing in the coordinates of cameras on its other side.
+    g.means.iter_mut().for_each(|m| m[0] = -m[0]);
+    ply::write_gaussians(s.join("geometry.ply"), &g, &[]).unwrap();
+    let refused = run(&s, &o, &["--overwrite"]);
+    let said = String::from_utf8_lossy(&refused.stderr).into_owned();
+    assert!(
+        refused.status.code() == Some(2)
+            && said.contains("geometry.ply: the Gaussians do not show these photographs; found "),
+        "{said}"
+    );
+    assert!(said.contains(" dB, where one plain colour has ") && said.contains(" on 4 photographs"), "{said}");
 }
 
 #[test]

@@ -6,7 +6,7 @@ use crate::memory::{self, Pictures};
 use crate::options::{Convert, Order, bytes, note_shift};
 use artifacts::role;
 use gs_io::{Error, IoContext, Result, write_bytes};
-use gs_scene::dataset::{self, LoadOptions};
+use gs_scene::dataset::{self, LoadOptions, Resolution};
 use gs_scene::splat::{self, Extra, Format, Splat};
 use gs_scene::{Gaussians, Learnt, morton_order};
 use serde_json::json;
@@ -17,7 +17,7 @@ use std::path::Path;
 impl Convert {
     pub(crate) fn run(&self, stage: &Stage) -> Result<()> {
         Format::to_write(&self.output)?;
-        let load = LoadOptions { resolution: axes::RESOLUTION, holdout: 0 };
+        let load = LoadOptions { resolution: Resolution::Width(240), holdout: 0 };
         let dataset = self.scene.as_ref().map(|scene| dataset::load(scene, &load)).transpose()?;
         let files = dataset.iter().flat_map(|d| d.files.clone());
         let outputs = stage.outputs(&self.output).file(&self.output).reads(splat::files(&self.input)?).reads(files);

@@ -252,7 +252,7 @@ pub(crate) struct Convert {
     #[serde(serialize_with = "some_as_text", skip_serializing_if = "Option::is_none")]
     pub axes: Option<System>,
     /// Photographs with poses that IN shows, which tell its axes: those are taken in which renders come nearer to a few of them. IN is refused
-    /// where a picture of one colour comes as near. A PLY that fits as it is, with none of the options below, is copied byte for byte
+    /// where one plain colour comes as near. A PLY that fits as it is, with none of the options below, is copied byte for byte
     #[arg(long, value_name = "DIR")]
     #[serde(skip)]
     pub scene: Option<PathBuf>,
