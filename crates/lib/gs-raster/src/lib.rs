@@ -35,5 +35,5 @@ pub use pose::{CameraGradient, camera_gradient};
 pub use reference::{Pixel, render_gaussians as render_reference};
 pub use tiles::TILE;
 pub use types::{Gradients, PixelGradients, RasterOptions, Rendered, near_plane};
-pub use weights::{TileWeights, pixel_weights, tile_weights};
+pub use weights::{TileWeights, pixel_weights, tile_bytes, tile_weights};
 pub use workspace::{Measured, Workspace};

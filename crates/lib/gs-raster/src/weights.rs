@@ -40,6 +40,14 @@ pub fn tile_weights<R: Send>(
     (0..tiles.count()).into_par_iter().map(|t| one_tile(&tiles, t, early_stop, &f)).collect()
 }
 
+/// What [`tile_weights`] takes at once in bytes, for so many Gaussians in a view of so many pixels: two numbers for each Gaussian and pixel of a
+/// tile, a tile for each thread. A crowded tile has about four times the mean.
+pub fn tile_bytes(gaussians: u64, pixels: u64) -> u64 {
+    let tiles = (pixels / PIXELS as u64).max(1);
+    let crowded = (4 * gaussians / tiles).min(gaussians);
+    rayon::current_num_threads() as u64 * crowded * (2 * size_of::<f32>() * PIXELS) as u64
+}
+
 /// The Gaussians that a pixel (x, y) of the view shows, front to back, with their blending weights, 0 to 1 and all above 0: what
 /// [`tile_weights`] with `early_stop` has of it, without the work for the other tiles. Empty outside the view.
 pub fn pixel_weights(g: &Gaussians, camera: &Camera, options: &RasterOptions, [x, y]: [u32; 2]) -> Vec<(u32, f64)> {

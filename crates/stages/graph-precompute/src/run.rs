@@ -4,7 +4,7 @@ use crate::options::{Args, Views};
 use crate::precompute::{Summary, precompute};
 use artifacts::{Footprints, Graph, MaskMaps, ScratchEntries, hash_folder, maps_path, role, watch_folder};
 use gs_io::{Error, Result, Watched, hash_file};
-use gs_raster::Photographs;
+use gs_raster::{Photographs, tile_bytes};
 use gs_scene::dataset::{self, LoadOptions, Resolution, Split, View};
 use gs_scene::{Geometry, HoldOut, splat};
 use serde_json::json;
@@ -90,10 +90,11 @@ fn forecast(a: &Args, geometry: &Geometry, views: &[&View], stage: &Stage) -> Re
     let pixels = views.iter().map(|v| u64::from(v.camera.width) * u64::from(v.camera.height)).max().unwrap_or(0);
     // The first view's masks speak for all; a damaged file is an error later on.
     let samples = a.settings.pixel_samples;
-    let first = views.iter().filter(|_| samples > 0).map(|v| maps_path(&a.masks, v.stem()));
-    let masks = first.filter_map(|p| MaskMaps::read(p).ok()).next().map_or(0, |m| m.id_count());
+    let first = views.iter().filter_map(|v| MaskMaps::read(maps_path(&a.masks, v.stem())).ok()).next();
+    let (masks, of_map) = first.map_or((0, pixels), |m| (m.id_count(), (m.width() * m.height()) as u64));
     let of_views = views.len() as u64 * (PER_VIEW + PER_SAMPLE * (samples * masks) as u64);
-    let needed = BASE + PER_GAUSSIAN * geometry.gaussians.len() as u64 + PER_PIXEL * pixels + of_views;
+    let gaussians = geometry.gaussians.len() as u64;
+    let needed = BASE + PER_GAUSSIAN * gaussians + PER_PIXEL * pixels + of_views + tile_bytes(gaussians, of_map);
     stage.forecast(needed, SMALLER)
 }
 
