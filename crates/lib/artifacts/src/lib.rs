@@ -33,7 +33,7 @@ pub use features::Features;
 pub use footprints::{Entries, Footprints, FootprintsBuilder, PixelSamples, Row};
 pub use granules::{Granule, Members};
 pub use graph::Graph;
-pub use health::{Finding, Health, SHARED, SharedMasks};
+pub use health::Health;
 pub use instances::{Family, Instances, Match, OrientedBox, TreeEdge};
 pub use lerf_ovs::{LERF_OVS, LerfScene};
 pub use masks::{

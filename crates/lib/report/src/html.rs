@@ -94,16 +94,6 @@ impl Page {
         self.body += "</div>";
     }
 
-    /// Facts as tiles, as [`Self::tiles`], each with whether it is as it should be; the others are coloured.
-    pub fn checks(&mut self, facts: &[(String, String, bool)]) {
-        self.body += r#"<div class="tiles checks">"#;
-        for (name, value, good) in facts {
-            let class = if *good { "" } else { r#" class="doubt""# };
-            let _ = write!(self.body, "<div{class}><b>{}</b><span>{}</span></div>", escape(value), escape(name));
-        }
-        self.body += "</div>";
-    }
-
     /// A table; cells that read as numbers are set to the right.
     pub fn table(&mut self, head: &[&str], rows: &[Vec<String>]) {
         self.body += r#"<div class="wide"><table><thead><tr>"#;
@@ -148,15 +138,6 @@ const STYLE: &str = include_str!("page.css");
 #[cfg(test)]
 mod tests {
     use super::*;
-
-    #[test]
-    fn what_is_not_as_it_should_be_is_coloured() {
-        let mut p = Page::default();
-        p.checks(&[("a".into(), "1 %".into(), true), ("<b>".into(), "40 %".into(), false)]);
-        let html = p.finish("t", "s");
-        assert!(html.contains("<div><b>1 %</b><span>a</span></div>"), "{html}");
-        assert!(html.contains(r#"<div class="doubt"><b>40 %</b><span>&lt;b&gt;</span></div>"#), "{html}");
-    }
 
     #[test]
     fn names_cannot_break_the_page() {

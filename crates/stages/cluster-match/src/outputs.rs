@@ -1,6 +1,5 @@
 //! What the stage writes: the artifact, and beside it what people and viewers read.
 
-use crate::health;
 use crate::inputs::Inputs;
 use crate::options::{Args, Settings};
 use artifacts::{Draft, Health, Instances, NOISE_COLOR, instance_color, role};
@@ -124,7 +123,7 @@ pub(crate) fn write(
         }
     }
     gs_io::npy::write_i32(list, &aview1(&instances.label))?;
-    health::say(health, stage);
+    stage.info(&health.figures().map(|(name, found)| format!("{found} {name}")).join("; "));
     let text = as_text(instances, health, &parameters);
     write_bytes(table, &serde_json::to_vec_pretty(&text).map_err(fail)?)?;
     if let Some(folder) = &a.per_instance_plys {
@@ -132,7 +131,7 @@ pub(crate) fn write(
     }
     let matched = instances.support.iter().filter(|&&s| s > 0).count();
     let summary = json!({
-        "largest_share": health.largest, "mask_purity": health.purity, "sharing": health.sharing,
+        "largest_share": health.largest, "mask_purity": health.purity,
         "instances": instances.len(), "noise": noise, "matched": matched, "matches": instances.matches.len(),
         "clustering_seconds": clustering_seconds,
     });

@@ -119,7 +119,7 @@ fn find(a: &Args, settings: &Settings, inputs: &Inputs, stage: &Stage) -> Result
     let mut instances =
         Instances { views, tree: found.tree, node: found.nodes, granules, granule_descriptor, ..gathered };
     instances.score = confidence(&instances.count, &fits);
-    let health = health::measure(&instances, footprints, &weights);
+    let health = health::measure(&instances, &weights);
     let draft = Draft { instances, of_instances, of_granules, masks };
     Ok(Found { draft, health, noise, clustering_seconds })
 }

@@ -154,6 +154,11 @@ impl Overlaps {
         let best = |&t: &i32| self.predicted.keys().map(|&p| self.iou(t, p)).fold(0.0, f64::max);
         self.truth.keys().map(move |t| (*t, best(t)))
     }
+
+    /// Whether each predicted instance is one whole thing, by rising id: it has an IoU above 0.5 with a true one.
+    pub fn whole(&self) -> impl Iterator<Item = (i32, bool)> + '_ {
+        self.predicted.keys().map(|&p| (p, self.truth.keys().any(|&t| self.iou(t, p) > 0.5)))
+    }
 }
 
 /// Average precision by ScanNet's matching. Only true and predicted instances of at least `min_points` points take part;
@@ -223,6 +228,7 @@ mod tests {
         let sets = [vec![0, 1, 2, 3], vec![0, 1, 2, 3, 4, 5, 6, 7], vec![4, 5, 6], vec![7, 8]];
         let o = Overlaps::of_sets(&truth, &sets, 3);
         assert_eq!(o.best().collect::<Vec<_>>(), [(0, 1.0), (1, 0.75)]);
+        assert_eq!(o.whole().collect::<Vec<_>>(), [(0, true), (1, false), (2, true)]);
         // Both things are found; the group is a false alarm, which costs nothing where it comes last.
         assert_eq!(average_precision(&o, |p| [0.9, 0.1, 0.8][p], 0.5), Some(1.0));
         assert!(average_precision(&o, |p| [0.8, 0.9, 0.7][p], 0.5) < Some(0.8));

@@ -31,6 +31,9 @@ pub struct Scores {
     /// The same with all instances alike confident, as the tables of methods without scores have it.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub unranked: Option<Precision>,
+    /// How many instances are one whole thing.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub whole: Option<WholeScore>,
     /// What masks show as one, overlapping, where the instances have such proposals.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub proposals: Option<ProposalScores>,
@@ -81,6 +84,17 @@ pub struct Precision {
     pub ap25: Option<f64>,
     /// At IoU 0.5.
     pub ap50: Option<f64>,
+}
+
+/// Instances of at least 100 surface points, and those with an IoU above 0.5 with a true thing, background too.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+pub struct WholeScore {
+    /// Instances.
+    pub instances: usize,
+    /// Those that are whole.
+    pub whole: usize,
+    /// The half of the instances with the higher confidence, rounded down, has so many of these.
+    pub in_upper_half: usize,
 }
 
 /// Parts, things and groups that masks show as one (`granules`), by falling fit; one that has an IoU of 0.3 or more with a better one is
@@ -227,6 +241,7 @@ impl Scores {
         line("ap25", number(self.ap25));
         line("ap50", number(self.ap50));
         line("  unranked", number(self.unranked.and_then(|u| u.ap50)));
+        line("whole", self.whole.map(|w| format!("{} of {} instances", w.whole, w.instances)));
         if let Some(p) = &self.proposals {
             line("proposals", Some(format!("{} of {} things found", p.found, p.things)));
             line("  object_miou", number(Some(p.object_miou)));

@@ -1,7 +1,7 @@
 //! Instances against the true things of a synthetic scene: over points of their surfaces, and over Gaussians.
 
 use super::metrics::{self, InstanceScore};
-use super::scores::{GaussianScores, Precision, ProposalScores, Scores, ThingScore};
+use super::scores::{GaussianScores, Precision, ProposalScores, Scores, ThingScore, WholeScore};
 use crate::protocols::instances::{MIN_POINTS, Overlaps, average_precision};
 use artifacts::{Granule, TruePoints, TrueScene};
 use gs_io::Result;
@@ -53,6 +53,12 @@ pub fn score_instances(scene: &LabelledScene, root: &Path, scores: &mut Scores) 
     let overlaps = Overlaps::of_labels(&truth.instance, &predicted, MIN_POINTS);
     let ranked = Precision::of(&overlaps, |p| confidence[p]);
     (scores.ap25, scores.ap50) = (ranked.ap25, ranked.ap50);
+    let mut whole: Vec<(f32, bool)> = overlaps.whole().map(|(p, whole)| (confidence[p as usize], whole)).collect();
+    // Of equals the first; the sort is stable.
+    whole.sort_by(|a, b| b.0.total_cmp(&a.0));
+    let count = |of: &[(f32, bool)]| of.iter().filter(|(_, whole)| *whole).count();
+    let (instances, in_upper_half) = (whole.len(), count(&whole[..whole.len() / 2]));
+    scores.whole = Some(WholeScore { instances, whole: count(&whole), in_upper_half });
     scores.unranked = Some(Precision::of(&overlaps, |_| 1.0));
     let background = |id: i32| scores.things.iter().any(|t| t.id == id && t.background);
     scores.proposals = score_proposals(scene, &truth.instance, &nearest, background);
