@@ -2,7 +2,7 @@
 
 use crate::product::{Product, write};
 use crate::world::{Inputs, World};
-use crate::{laga, langsplat, legaussians, mask_clustering, opengaussian, pairgs, saga, truth, uplift};
+use crate::{laga, langsplat, legaussians, lightsplat, mask_clustering, opengaussian, pairgs, saga, truth, uplift};
 use artifacts::Instances;
 use gs_io::{Error, Result};
 use serde::Serialize;
@@ -44,6 +44,8 @@ enum System {
     Pairgs(pairgs::Options),
     /// MaskClustering: masks of all views clustered by how many views agree
     MaskClustering(mask_clustering::Options),
+    /// LightSplat: masks of all views linked by their Gaussians and features
+    Lightsplat(lightsplat::Options),
     /// No rival: what the truth of a synthetic scene allows
     Truth(truth::Options),
 }
@@ -88,6 +90,7 @@ impl System {
             Self::Legaussians(o) => o,
             Self::Pairgs(o) => o,
             Self::MaskClustering(o) => o,
+            Self::Lightsplat(o) => o,
             Self::Truth(o) => o,
         }
     }

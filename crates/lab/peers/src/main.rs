@@ -8,6 +8,7 @@ mod kmeans;
 mod laga;
 mod langsplat;
 mod legaussians;
+mod lightsplat;
 mod mask_clustering;
 mod opengaussian;
 mod pairgs;
