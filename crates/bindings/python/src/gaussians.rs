@@ -97,5 +97,5 @@ pub fn write_gaussians(
     let instance: Option<Vec<i32>> = instance.map(|i| i.as_array().to_vec());
     let ids: Vec<_> = instance.iter().map(|labels| (INSTANCE, &labels[..])).collect();
     let extra = Extra { antialias, ids: &ids, ..Extra::default() };
-    run(py, 0, |_| splat::write(&path, &g, &extra))?.map_err(|e| PyValueError::new_err(e.to_string()))
+    run(py, 0, |_| splat::write(&path, &g, &extra))?.map(drop).map_err(|e| PyValueError::new_err(e.to_string()))
 }

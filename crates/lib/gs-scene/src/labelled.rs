@@ -36,14 +36,17 @@ impl<'a> Labelled<'a> {
     }
 
     /// Writes the Gaussians `which`, ascending, with all their harmonics, in the format that the file's name says; to a PLY with
-    /// the instance of each and all other properties that the geometry's PLY has. Gives what the format loses, in words ([`splat::lost`]).
+    /// the instance of each and all other properties that the geometry's PLY has. Gives those that the file has, in its order, and what
+    /// the format loses, in words ([`splat::lost`]).
     ///
     /// # Errors
     /// When no format has such a name, or the file cannot be written.
-    pub fn write(&self, to: &Path, which: &[u32]) -> Result<Vec<String>> {
+    pub fn write(&self, to: &Path, which: &[u32]) -> Result<(Vec<u32>, Vec<String>)> {
         let format = Format::to_write(to)?;
         match (format, &self.rows) {
-            (Format::Ply, Some(rows)) => rows.write(to, which, &self.ids, &self.comments).map(|()| Vec::new()),
+            (Format::Ply, Some(rows)) => {
+                rows.write(to, which, &self.ids, &self.comments).map(|()| (which.to_vec(), Vec::new()))
+            }
             _ => {
                 let of = |(_, all): &IdColumn<'_>| which.iter().map(|&i| all[i as usize]).collect();
                 let own: Vec<Vec<i32>> = self.ids.iter().map(of).collect();
@@ -52,8 +55,9 @@ impl<'a> Labelled<'a> {
                 ids.retain(|_| format == Format::Ply);
                 let extra = Extra { comments: &self.comments, antialias: self.geometry.antialias, ids: &ids };
                 let chosen = self.geometry.gaussians.select(which);
-                splat::write(to, &chosen, &extra)?;
-                splat::lost(to, &chosen)
+                let order = splat::write(to, &chosen, &extra)?;
+                let of = |order: Vec<u32>| order.into_iter().map(|at| which[at as usize]).collect();
+                Ok((order.map_or_else(|| which.to_vec(), of), splat::lost(to, &chosen)?))
             }
         }
     }

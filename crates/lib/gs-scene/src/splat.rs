@@ -33,7 +33,7 @@ pub enum Format {
     CompressedPly,
     /// SPZ of Niantic: `.spz`. Versions 1 to 4 are read, 3 is written.
     Spz,
-    /// SOG of PlayCanvas: a zip, `.sog`, or a folder with `meta.json`. Read only.
+    /// SOG of PlayCanvas: a zip, `.sog`, or a folder with `meta.json`. Versions 1 and 2 are read; version 2 is written, as a zip.
     Sog,
     /// 32 bytes a Gaussian, of antimatter15: `.splat`.
     Splat,
@@ -84,7 +84,7 @@ const NAMES: [(&str, Format, bool); 8] = [
     (".splat", Format::Splat, true),
     (".glb", Format::Gltf, true),
     (".gltf", Format::Gltf, false),
-    (".sog", Format::Sog, false),
+    (".sog", Format::Sog, true),
     ("meta.json", Format::Sog, false),
 ];
 
@@ -105,7 +105,7 @@ impl Format {
             Some((format, true)) => Ok(format),
             _ => Err(Error::new("no format that can be written has such a name")
                 .file(path)
-                .expected("a name that ends in .ply, .compressed.ply, .spz, .splat or .glb")),
+                .expected("a name that ends in .ply, .compressed.ply, .spz, .sog, .splat or .glb")),
         }
     }
 
@@ -251,28 +251,30 @@ pub fn holds_gaussians(path: impl AsRef<Path>) -> Result<bool> {
     }
 }
 
-/// Writes Gaussians in the format that the file's name says. All formats but the compressed PLY keep their order.
+/// Writes Gaussians in the format that the file's name says. Returns the indices of those that the file has, in its order; none where
+/// it has all of them in theirs.
 ///
 /// # Errors
 /// When the name says no format that is written, the format cannot hold them, or the file cannot be written. All but PLY hold whole
 /// Gaussians only; what else a format cannot hold, [`lost`] says.
-pub fn write(path: impl AsRef<Path>, gaussians: &Gaussians, extra: &Extra<'_>) -> Result<()> {
+pub fn write(path: impl AsRef<Path>, gaussians: &Gaussians, extra: &Extra<'_>) -> Result<Option<Vec<u32>>> {
     let path = path.as_ref();
     let format = Format::to_write(path)?;
     check(format, gaussians, extra).map_err(|e| e.file(path))?;
-    let near = reach::near(format, gaussians);
-    write_atomic(path, |w| put(w, path, format, near.as_ref().unwrap_or(gaussians), extra).map_err(|e| e.file(path)))
+    let order = reach::order(format, gaussians);
+    write_atomic(path, |w| put(w, path, format, gaussians, order.as_deref(), extra).map_err(|e| e.file(path)))?;
+    Ok(order)
 }
 
 /// The bytes of the file that [`write()`] writes.
 ///
 /// # Errors
-/// As [`write()`]; [`Format::Sog`] is not written.
+/// As [`write()`].
 pub fn encode(format: Format, gaussians: &Gaussians, extra: &Extra<'_>) -> Result<Vec<u8>> {
     check(format, gaussians, extra)?;
     let mut bytes = Vec::new();
-    let near = reach::near(format, gaussians);
-    put(&mut bytes, Path::new("a file in memory"), format, near.as_ref().unwrap_or(gaussians), extra)?;
+    let order = reach::order(format, gaussians);
+    put(&mut bytes, Path::new("a file in memory"), format, gaussians, order.as_deref(), extra)?;
     Ok(bytes)
 }
 
@@ -288,13 +290,21 @@ fn check(format: Format, gaussians: &Gaussians, extra: &Extra<'_>) -> Result<()>
     }
     match format {
         Format::Ply => Ok(()),
-        Format::Sog => Err(Error::new("SOG is not written").hint("write SPZ or a compressed PLY")),
         _ if gaussians.is_empty() => Err(Error::new("no Gaussians").hint("only a PLY may hold none")),
         _ => gaussians.check_whole(),
     }
 }
 
-fn put(w: &mut dyn Write, place: &Path, format: Format, g: &Gaussians, extra: &Extra<'_>) -> Result<()> {
+fn put(
+    w: &mut dyn Write,
+    place: &Path,
+    format: Format,
+    g: &Gaussians,
+    order: Option<&[u32]>,
+    extra: &Extra<'_>,
+) -> Result<()> {
+    let chosen = order.map(|order| g.select(order));
+    let g = chosen.as_ref().unwrap_or(g);
     let mut comments = extra.comments.to_vec();
     if extra.antialias && !comments.iter().any(|c| c == ply::ANTIALIASED) {
         comments.push(ply::ANTIALIASED.into());
@@ -305,7 +315,7 @@ fn put(w: &mut dyn Write, place: &Path, format: Format, g: &Gaussians, extra: &E
         Format::Spz => spz::writer::write(w, place, g, extra.antialias),
         Format::Splat => dot_splat::write(w, place, g),
         Format::Gltf => gltf::writer::write(w, place, g, extra.comments),
-        Format::Sog => Err(Error::new("SOG is not written").file(place)),
+        Format::Sog => sog::writer::write(w, place, g, extra.antialias),
     }
 }
 

@@ -16,32 +16,16 @@ fn scene(seed: u64, n: usize, sh_degree: u8, scale: f32) -> Gaussians {
     g
 }
 
-fn through(g: &Gaussians, name: &str, extra: &Extra<'_>) -> splat::Splat {
+/// What is read of a file, and what was written to it, in its order.
+fn through(g: &Gaussians, name: &str, extra: &Extra<'_>) -> (splat::Splat, Gaussians) {
     let dir = tempfile::tempdir().unwrap();
     let path = dir.path().join(name);
-    splat::write(&path, g, extra).unwrap();
+    let order = splat::write(&path, g, extra).unwrap();
     let format = Format::to_write(&path).unwrap();
     assert_eq!(std::fs::read(&path).unwrap(), splat::encode(format, g, extra).unwrap());
     assert_eq!(Format::of_file(&path).unwrap(), format);
     assert_eq!(splat::count(&path).unwrap(), g.len() as u64);
-    splat::read_whole(&path).unwrap()
-}
-
-/// Compressed PLYs have another order: Gaussians are found again by the nearest opacity and centre.
-fn reordered(g: &Gaussians, back: &Gaussians) -> Gaussians {
-    let near = |i: usize| {
-        let far = |k: &u32| -> f32 {
-            let (a, b) = (g.means[*k as usize], back.means[i]);
-            (0..3).map(|c| (a[c] - b[c]).powi(2)).sum::<f32>() + (g.opacity(*k as usize) - back.opacity(i)).powi(2)
-        };
-        (0..g.len() as u32).min_by(|a, b| far(a).total_cmp(&far(b))).unwrap()
-    };
-    let order: Vec<u32> = (0..back.len()).map(near).collect();
-    let mut once = order.clone();
-    once.sort_unstable();
-    once.dedup();
-    assert_eq!(once.len(), g.len(), "each is found once");
-    g.select(&order)
+    (splat::read_whole(&path).unwrap(), order.map_or_else(|| g.clone(), |order| g.select(&order)))
 }
 
 /// The largest difference within a chunk, which the steps are fractions of: here of the whole scene.
@@ -51,6 +35,11 @@ fn widest(rows: &[[f32; 3]]) -> f32 {
         high - low
     };
     of(0).max(of(1)).max(of(2))
+}
+
+fn range<'a>(values: impl IntoIterator<Item = &'a f32>) -> f32 {
+    let (low, high) = values.into_iter().fold((f32::MAX, f32::MIN), |(l, h), v| (l.min(*v), h.max(*v)));
+    (high - low).max(0.0)
 }
 
 fn limits(format: Format, g: &Gaussians) -> Differences {
@@ -76,6 +65,23 @@ fn limits(format: Format, g: &Gaussians) -> Differences {
             // Steps of 8 and 16 in 128, after a step of 1.
             harmonics: [0.5 * 9.0 / 128.0, 0.5 * 17.0 / 128.0],
         },
+        Format::Sog => {
+            // No number is farther from an entry of its table than 2/255 of the range.
+            let step = |from: usize, to: usize| {
+                let of = |i: usize| &g.sh_of(i)[from.min(g.sh_stride())..to.min(g.sh_stride())];
+                half(4.0 / 255.0 * range((0..g.len()).flat_map(of)), 8.0)
+            };
+            Differences {
+                // 16 bits of sign(x) ln(1 + |x|).
+                center: half(2.0 * farthest.ln_1p() / 65535.0 * (1.0 + farthest), 8.0 * farthest),
+                log_scale: half(4.0 / 255.0 * range(g.log_scales.as_flattened()), 8.0),
+                // Three parts, each off by half a step of sqrt 2 / 255.
+                angle: 0.02,
+                opacity: half(1.0 / 255.0, 1.0),
+                color: gs_scene::SH_C0 * step(0, 3),
+                harmonics: [step(3, 48); 2],
+            }
+        }
         Format::Splat => Differences {
             center: 0.0,
             log_scale: 1e-5,
@@ -93,27 +99,23 @@ fn exact() -> Differences {
     Differences { center: 0.0, log_scale: 0.0, angle: 0.0, opacity: 0.0, color: 0.0, harmonics: [0.0; 2] }
 }
 
-const NAMES: [&str; 5] = ["a.ply", "a.compressed.ply", "a.spz", "a.splat", "a.glb"];
+const NAMES: [&str; 6] = ["a.ply", "a.compressed.ply", "a.spz", "a.sog", "a.splat", "a.glb"];
 
 proptest! {
     #![proptest_config(ProptestConfig { cases: 40, ..ProptestConfig::default() })]
     #[test]
     fn every_number_comes_back_within_a_step(
-        seed: u64, n in 1usize..700, degree in 0u8..4, scale in prop_oneof![Just(0.01f32), Just(1.0), Just(300.0)]
+        seed: u64, n in prop_oneof![Just(1usize), Just(3), 1usize..700], degree in 0u8..4,
+        scale in prop_oneof![Just(0.01f32), Just(1.0), Just(300.0)]
     ) {
         let g = scene(seed, n, degree, scale);
         for name in NAMES {
             let format = Format::to_write(name).unwrap();
-            let back = through(&g, name, &Extra::default()).gaussians;
-            let mut wanted = if format == Format::CompressedPly && scale < 2.0 { reordered(&g, &back) } else { g.clone() };
-            if format == Format::CompressedPly && scale > 2.0 {
-                // Too coarse for finding them again; other scales are enough.
-                continue;
-            }
+            let (back, mut wanted) = through(&g, name, &Extra::default());
             if format == Format::Splat {
                 wanted = wanted.with_degree(0);
             }
-            Differences::between(&wanted, &back).within(limits(format, &g));
+            Differences::between(&wanted, &back.gaussians).within(limits(format, &g));
         }
     }
 }
@@ -127,13 +129,11 @@ fn table_of_errors() {
     for name in NAMES {
         let format = Format::to_write(name).unwrap();
         let bytes = splat::encode(format, &g, &Extra::default()).unwrap().len() as f64 / g.len() as f64;
-        let back = through(&g, name, &Extra::default()).gaussians;
-        let wanted = match format {
-            Format::CompressedPly => reordered(&g, &back),
-            Format::Splat => g.clone().with_degree(0),
-            _ => g.clone(),
-        };
-        eprintln!("{name}: {bytes:.0} bytes a Gaussian, {:?}", Differences::between(&wanted, &back));
+        let (back, mut wanted) = through(&g, name, &Extra::default());
+        if format == Format::Splat {
+            wanted = wanted.with_degree(0);
+        }
+        eprintln!("{name}: {bytes:.0} bytes a Gaussian, {:?}", Differences::between(&wanted, &back.gaussians));
     }
 }
 
@@ -142,10 +142,15 @@ fn comments_the_filter_and_instances_go_where_they_can() {
     let g = cloud(5, 1);
     let comments = ["made by a test".to_string()];
     let extra = Extra { comments: &comments, antialias: true, ids: &[] };
-    for (name, kept) in
-        [("a.ply", true), ("a.compressed.ply", true), ("a.spz", true), ("a.splat", false), ("a.glb", false)]
-    {
-        assert_eq!(through(&g, name, &extra).antialias, kept, "{name}");
+    for (name, kept) in [
+        ("a.ply", true),
+        ("a.compressed.ply", true),
+        ("a.spz", true),
+        ("a.sog", true),
+        ("a.splat", false),
+        ("a.glb", false),
+    ] {
+        assert_eq!(through(&g, name, &extra).0.antialias, kept, "{name}");
     }
     let instance = [0, 1, -1, 1, 0];
     let extra = Extra { ids: &[("instance", &instance), ("class_id", &instance)], ..Extra::default() };
@@ -167,13 +172,17 @@ fn what_a_format_cannot_hold_is_refused() {
         e
     };
     let mut g = cloud(5, 1);
-    assert!(refused("a.sog", &g).contains(".spz"));
+    assert!(refused("meta.json", &g).contains("ends in .ply"));
     assert!(refused("a", &g).contains("ends in .ply"));
     g.means[3][1] = f32::NAN;
-    assert!(refused("a.spz", &g).contains("vertex 3, x, y, z: a parameter is not finite"));
+    for name in ["a.spz", "a.sog"] {
+        assert!(refused(name, &g).contains("vertex 3, x, y, z: a parameter is not finite"));
+    }
     g.means[3][1] = 1e9;
     assert!(refused("a.spz", &g).contains("too far from the origin"));
-    assert!(refused("a.glb", &Gaussians::default()).contains("no Gaussians"));
+    for name in ["a.glb", "a.sog"] {
+        assert!(refused(name, &Gaussians::default()).contains("no Gaussians"));
+    }
     // A PLY holds anything.
     g.means[3][1] = f32::NAN;
     splat::write(dir.path().join("a.ply"), &g, &Extra::default()).unwrap();
@@ -185,7 +194,7 @@ fn opaque_and_invisible_gaussians_stay_so() {
     let mut g = cloud(4, 0);
     g.opacity_logits = vec![f32::INFINITY, f32::NEG_INFINITY, 30.0, 0.0];
     for name in NAMES {
-        let back = through(&g, name, &Extra::default()).gaussians;
+        let back = through(&g, name, &Extra::default()).0.gaussians;
         let mut opacities: Vec<f32> = (0..4).map(|i| back.opacity(i)).collect();
         opacities.sort_unstable_by(f32::total_cmp);
         assert!(opacities[0] < 1e-6 && (opacities[1] - 0.5).abs() < 0.003 && opacities[2] > 1.0 - 1e-6, "{name}");

@@ -35,7 +35,7 @@ fn it_reads_what_we_write() {
     let dir = tempfile::tempdir().unwrap();
     for degree in [0, 1, 2, 3] {
         let g = cloud(3000, degree);
-        for name in ["a.ply", "a.compressed.ply", "a.spz", "a.splat"] {
+        for name in ["a.ply", "a.compressed.ply", "a.spz", "a.sog", "a.splat"] {
             let (ours, theirs) = (dir.path().join(name), dir.path().join("theirs.ply"));
             splat::write(&ours, &g, &Extra::default()).unwrap();
             transform(&ours, &theirs);
@@ -50,6 +50,15 @@ fn it_reads_what_we_write() {
             Differences::between(&wanted, &found).within(Differences { angle, ..ROUNDING });
         }
     }
+}
+
+/// Checks that our SOG of these Gaussians is at most 1.3 times as large as that of splat-transform.
+fn as_small(g: &Gaussians, theirs: &Path) {
+    let ours = theirs.with_extension("ours.sog");
+    splat::write(&ours, g, &Extra::default()).unwrap();
+    let [ours, theirs] = [&ours, theirs].map(|path| std::fs::metadata(path).unwrap().len());
+    eprintln!("SOG of {} Gaussians, degree {}: {ours} bytes, theirs {theirs}", g.len(), g.sh_degree);
+    assert!(10 * ours <= 13 * theirs);
 }
 
 #[test]
@@ -80,6 +89,7 @@ fn we_read_what_it_writes() {
             eprintln!("{name}, degree {degree}, {kind}: {:?}", Differences::between(&wanted, &found));
             Differences::between(&wanted, &found).within(ROUNDING);
         }
+        as_small(&g, &at("b.sog"));
     }
 }
 
@@ -98,5 +108,10 @@ fn real_files_read_as_it_reads_them() {
         let differences = Differences::between(&ours, &ply::read_gaussians(&theirs).unwrap());
         eprintln!("{name}: {} Gaussians, {differences:?}", ours.len());
         differences.within(ROUNDING);
+        if name == "inria_layout_9k.ply" {
+            let sog = dir.path().join("theirs.sog");
+            transform(&data.join(name), &sog);
+            as_small(&ours, &sog);
+        }
     }
 }

@@ -204,7 +204,7 @@ struct Export {
     /// Everything but these objects.
     #[serde(default)]
     others: bool,
-    /// Name of the new file, without folders: .ply, .spz, .splat or .glb. Only a PLY holds the ids of objects.
+    /// Name of the new file, without folders: .ply, .compressed.ply, .spz, .sog, .splat or .glb. Only a PLY holds the ids of objects.
     file: String,
 }
 
@@ -371,8 +371,9 @@ fn export(asked: &Asked, export: &Export) -> Result<Value> {
     let _new = gs_io::expect_new(&path);
     let own = vec![concat!("made by explore ", env!("CARGO_PKG_VERSION")).into()];
     let world = asked.world;
-    let lost = Labelled::new(&world.scene.geometry, &world.source.geometry, label, own)?.write(&path, &which)?;
-    let mut written = json!({"file": path, "gaussians": which.len(), "of": label.len()});
+    let (order, lost) =
+        Labelled::new(&world.scene.geometry, &world.source.geometry, label, own)?.write(&path, &which)?;
+    let mut written = json!({"file": path, "gaussians": order.len(), "of": label.len()});
     if !lost.is_empty() {
         written["lost"] = lost.into();
     }

@@ -1,11 +1,12 @@
 //! The command line.
 
 use clap::{Parser, Subcommand, ValueEnum};
-use gs_io::{Error, Result};
+use gs_io::Result;
+use gs_scene::splat::Format;
 use objects::Up;
 use serde::{Serialize, Serializer};
 use stage::{CommonArgs, Program, Stage};
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 
 /// Take the objects of a scene to other programs: scene.json, splats, points, meshes, USD
 #[derive(Debug, Parser)]
@@ -90,8 +91,13 @@ pub struct SceneOptions {
 pub enum SplatFormat {
     /// PLY with all properties of the geometry and `instance`
     Ply,
+    /// PLY as PlayCanvas compresses it
+    #[value(name = "compressed.ply")]
+    CompressedPly,
     /// SPZ version 3
     Spz,
+    /// SOG version 2, a zip
+    Sog,
     /// 32 bytes a Gaussian, no harmonics
     Splat,
     /// glTF with KHR_gaussian_splatting
@@ -99,26 +105,13 @@ pub enum SplatFormat {
 }
 
 impl SplatFormat {
-    /// The format of an output by its extension.
-    ///
-    /// # Errors
-    /// When there is no such format.
-    pub fn of(path: &Path) -> Result<Self> {
-        let name = path.file_name().unwrap_or_default().to_string_lossy().to_lowercase();
-        let extension = name.rsplit_once('.').map_or("", |(_, extension)| extension);
-        // A compressed PLY has another order.
-        let format = if name.ends_with(".compressed.ply") { "" } else { extension };
-        Self::from_str(format, false).map_err(|_| {
-            let known: Vec<String> = Self::value_variants().iter().map(|f| format!(".{}", f.extension())).collect();
-            Error::new("no format of splats has this extension").file(path).expected(known.join(", "))
-        })
-    }
-
     /// The extension, without its dot.
     pub fn extension(self) -> &'static str {
         match self {
             Self::Ply => "ply",
+            Self::CompressedPly => "compressed.ply",
             Self::Spz => "spz",
+            Self::Sog => "sog",
             Self::Splat => "splat",
             Self::Glb => "glb",
         }
@@ -162,7 +155,7 @@ pub struct SplatsOptions {
     /// [default: none; with --run-dir that of the run]
     #[arg(long, value_name = "FILE")]
     pub names: Option<PathBuf>,
-    /// Output file; its extension is the format: .ply, .spz, .splat or .glb. Ids are in PLYs alone; others take --ids
+    /// Output file; its extension is the format: .ply, .compressed.ply, .spz, .sog, .splat or .glb. Ids are in PLYs alone; others take --ids
     #[arg(long, value_name = "FILE")]
     pub out: PathBuf,
 }
@@ -248,7 +241,7 @@ impl Program for Args {
 
     fn check(&self) -> Result<()> {
         match &self.command {
-            Command::Splats(o) => SplatFormat::of(&o.out).map(drop),
+            Command::Splats(o) => Format::to_write(&o.out).map(drop),
             Command::Points(o) => crate::points::PointFormat::of(&o.out).map(drop),
             Command::Usd(o) => crate::usd::check_name(&o.out),
             _ => Ok(()),

@@ -48,7 +48,7 @@ pub fn objects(o: &ObjectsOptions, parameters: Value, stage: &Stage) -> Result<(
     let mut lost = Vec::new();
     for &id in &wanted {
         let file = o.out.join(format!("{}.{}", stem(id), o.format.extension()));
-        lost.extend(splats.write(&file, &members[id as usize])?);
+        lost.extend(splats.write(&file, &members[id as usize])?.1);
     }
     lost.dedup();
     lost.iter().for_each(|what| stage.warn(what));
@@ -72,8 +72,13 @@ pub fn splats(o: &SplatsOptions, parameters: Value, stage: &Stage) -> Result<()>
     if which.is_empty() {
         return Err(Error::new("nothing is left to write").field("--without").hint("leave some objects"));
     }
+    let write = |splats: &Labelled<'_>| -> Result<Vec<u32>> {
+        let (order, lost) = splats.write(&o.out, &which)?;
+        lost.iter().for_each(|what| stage.warn(what));
+        Ok(order)
+    };
     let mut splats = splats_of(&labelled, &o.inputs)?;
-    if o.ids {
+    let order = if o.ids {
         let mut written: Vec<u32> = which.iter().filter_map(|&i| u32::try_from(label[i as usize]).ok()).collect();
         written.sort_unstable();
         written.dedup();
@@ -81,14 +86,15 @@ pub fn splats(o: &SplatsOptions, parameters: Value, stage: &Stage) -> Result<()>
         let of: BTreeMap<i32, i32> = objects.iter().map(|o| (o.instance_id as i32, o.class_id)).collect();
         let class: Vec<i32> = label.iter().map(|l| of.get(l).copied().unwrap_or(-1)).collect();
         splats = splats.with(("instance_id", label)).with(("class_id", &class));
-        splats.write(&o.out, &which)?.iter().for_each(|what| stage.warn(what));
-        let own = which.iter().map(|&i| label[i as usize]).collect();
+        let order = write(&splats)?;
+        let own = order.iter().map(|&i| label[i as usize]).collect();
         Ids::of(&o.out, own)?.called(objects, classes).write(&o.out)?;
+        order
     } else {
-        splats.write(&o.out, &which)?.iter().for_each(|what| stage.warn(what));
-    }
-    stage.info(&format!("wrote {}: {} of {} Gaussians", o.out.display(), which.len(), label.len()));
-    stage.record(&mut claim, parameters, labelled.inputs.clone(), json!({ "gaussians": which.len() }))
+        write(&splats)?
+    };
+    stage.info(&format!("wrote {}: {} of {} Gaussians", o.out.display(), order.len(), label.len()));
+    stage.record(&mut claim, parameters, labelled.inputs.clone(), json!({ "gaussians": order.len() }))
 }
 
 /// `export points`.

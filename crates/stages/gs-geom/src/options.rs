@@ -241,8 +241,8 @@ pub(crate) struct Convert {
     #[serde(skip)]
     pub input: PathBuf,
     /// Where to write them, in the format of the name: .ply (little-endian floats in the property order of the original 3DGS
-    /// code, 62 properties at SH degree 3), .compressed.ply, .spz, .splat (no harmonics beyond the constant one) or .glb; another
-    /// file than IN
+    /// code, 62 properties at SH degree 3), .compressed.ply, .spz, .sog, .splat (no harmonics beyond the constant one) or .glb;
+    /// another file than IN
     #[arg(value_name = "OUT")]
     #[serde(skip)]
     pub output: PathBuf,

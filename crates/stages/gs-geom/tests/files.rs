@@ -123,6 +123,7 @@ fn a_file_is_converted_by_the_name_of_the_output_and_its_format_is_said() {
         ("a.compressed.ply", "compressed PLY", 3),
         ("a.glb", "glTF 2.0 with KHR_gaussian_splatting", 3),
         ("a.spz", "SPZ version 3", 3),
+        ("a.sog", "SOG version 2, bundled", 3),
         ("a.splat", ".splat", 0),
         ("b.ply", "PLY", 0),
     ] {
@@ -147,8 +148,8 @@ fn a_file_is_converted_by_the_name_of_the_output_and_its_format_is_said() {
     assert_eq!(record["summary"]["from"], ".splat");
     // Nothing is guessed from another name.
     assert!(
-        refused(&["convert", &from, &dir.path("c.sog")])
-            .contains("ends in .ply, .compressed.ply, .spz, .splat or .glb")
+        refused(&["convert", &from, &dir.path("c.gltf")])
+            .contains("ends in .ply, .compressed.ply, .spz, .sog, .splat or .glb")
     );
     fs::write(dir.path("d.spz"), "no splat").unwrap();
     assert!(refused(&["convert", &dir.path("d.spz"), &dir.path("d.ply")]).contains("not a file of Gaussians"));

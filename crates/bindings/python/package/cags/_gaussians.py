@@ -257,7 +257,7 @@ def read_ply(path):
 
 
 def write_ply(path, gaussians, *, instance=None):
-    """Write a file of Gaussians, whole or not at all; by its ending also .compressed.ply, .spz, .splat or .glb.
+    """Write a file of Gaussians, whole or not at all; by its ending also .compressed.ply, .spz, .sog, .splat or .glb.
 
     Parameters
     ----------

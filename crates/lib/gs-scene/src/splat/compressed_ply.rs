@@ -147,11 +147,10 @@ fn coefficient(byte: u8) -> f32 {
     (share - 0.5) * SH_RANGE
 }
 
-/// Writes a compressed PLY, which errors call `place`: in an order that keeps neighbours together, not that of `g`.
+/// Writes a compressed PLY, which errors call `place`, in the order of `g`: the nearer its neighbours, the finer the steps.
 pub(super) fn write(w: &mut dyn Write, place: &Path, g: &Gaussians, comments: &[String]) -> Result<()> {
     let all: Vec<u32> = (0..g.len() as u32).collect();
-    let order = packing::along_a_curve(g, &all);
-    let packed = packing::pack(g, &order);
+    let packed = packing::pack(g, &all);
     let rest = 3 * (sh_coefficients(g.sh_degree) - 1);
     let mut header = ply::header_start(comments, g.shift);
     header += &format!("element chunk {}\n", packed.chunks.len());
@@ -173,9 +172,9 @@ pub(super) fn write(w: &mut dyn Write, place: &Path, g: &Gaussians, comments: &[
     packed.words.iter().try_for_each(|words| put(words.map(u32::to_le_bytes).as_flattened()))?;
     if rest > 0 {
         let (k, mut row) = (rest / 3, vec![0; rest]);
-        for &i in &order {
+        for i in 0..g.len() {
             // Channel by channel in the file, coefficient by coefficient in memory.
-            let sh = &g.sh_of(i as usize)[3..];
+            let sh = &g.sh_of(i)[3..];
             row.iter_mut().enumerate().for_each(|(j, byte)| *byte = byte_of(sh[j % k * 3 + j / k]));
             put(&row)?;
         }

@@ -3,6 +3,9 @@
 //! Version 1 has ranges of which a byte is a share, version 2 tables of 256 values. Positions have 16 bits, in two pictures.
 //! Harmonics are rows of a palette.
 
+mod tables;
+pub(super) mod writer;
+
 use super::compressed_ply::from_three;
 use super::{Splat, plain_name};
 use crate::{Gaussians, logit, sh_coefficients};
