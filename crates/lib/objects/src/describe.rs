@@ -58,6 +58,7 @@ pub fn describe(
                 bounds,
                 volume: bounds.volume(),
                 best_view: best_view(instances, k),
+                unseen: None,
             }
         })
         .collect();

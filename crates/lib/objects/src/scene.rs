@@ -119,6 +119,9 @@ pub struct Object {
     pub volume: f32,
     /// The view that shows most of it; none where no mask was matched with it.
     pub best_view: Option<BestView>,
+    /// Share of the box's surface that no view saw, 0 to 1; left out where the views were not looked at.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub unseen: Option<f32>,
 }
 
 /// How an object stands to another.

@@ -2,7 +2,7 @@
 //!
 //! [`options`](Args) is the command line; `run` reads the scene and writes what a command asks for: splats itself,
 //! `points` labelled point clouds, `hull` and `mesh` closed meshes around objects, `usd` all of it as a USD stage, `names` what
-//! queries call them.
+//! queries call them, `unseen` what of them no view saw.
 
 mod hull;
 mod mesh;
@@ -10,6 +10,7 @@ mod names;
 mod options;
 mod points;
 mod run;
+mod unseen;
 mod usd;
 
 pub use hull::hull;

@@ -7,11 +7,12 @@ use crate::options::{
     UsdOptions,
 };
 use crate::points::{self, PointFormat};
+use crate::unseen::unseen;
 use crate::usd::{self, Prim, StageOptions};
 use gs_io::{Claim, Error, Outputs, Result};
-use gs_scene::Labelled;
 use gs_scene::dataset::{self, LoadOptions};
-use objects::{Ids, Names, Scene, Up, members, solid_centers};
+use gs_scene::{Camera, Labelled};
+use objects::{Ids, Names, ObjectBox, Scene, Up, members, solid_centers};
 use query::LabelledScene;
 use serde_json::{Value, json};
 use stage::Stage;
@@ -23,7 +24,13 @@ pub fn scene(o: &SceneOptions, parameters: Value, stage: &Stage) -> Result<()> {
     let mut claim = o.inputs.reads(stage.outputs(&o.out).file(&o.out)).reads(&o.query).reads(&o.names).claim()?;
     let labelled = o.inputs.read(stage)?;
     let names = names::read(o.names.as_deref(), o.query.as_deref(), &labelled)?;
-    let scene = describe(&labelled, &names, o.up.find(&labelled, stage)?);
+    let (up, cameras) = o.up.find(&labelled, stage)?;
+    let mut scene = describe(&labelled, &names, up);
+    if !cameras.is_empty() {
+        let boxes: Vec<ObjectBox> = scene.objects.iter().map(|object| object.bounds).collect();
+        let shares = unseen(labelled.gaussians(), &labelled.raster, &cameras, &boxes);
+        scene.objects.iter_mut().zip(shares).for_each(|(object, share)| object.unseen = Some(share));
+    }
     scene.write(&o.out)?;
     let summary = json!({
         "objects": scene.objects.len(), "relations": scene.relations.len(),
@@ -141,7 +148,7 @@ pub fn usd(o: &UsdOptions, parameters: Value, stage: &Stage) -> Result<()> {
     usd::check_name(&o.out)?;
     let mut claim = o.inputs.reads(stage.outputs(&o.out).file(&o.out)).claim()?;
     let labelled = o.inputs.read(stage)?;
-    let up = o.up.find(&labelled, stage)?;
+    let (up, _) = o.up.find(&labelled, stage)?;
     let scene = describe(&labelled, &Names::new(), up);
     let (g, whole) = (labelled.gaussians(), labelled.geometry.whole());
     let mut members = members(&labelled.instances.label, labelled.instances.len());
@@ -179,16 +186,17 @@ impl Inputs {
 }
 
 impl UpOptions {
-    /// What is up: as a person said, or by the cameras of the dataset.
-    fn find(&self, scene: &LabelledScene, stage: &Stage) -> Result<Option<Up>> {
-        let Some(folder) = &self.scene else { return Ok(self.up) };
+    /// What is up: as a person said, or by the cameras of the dataset; with these.
+    fn find(&self, scene: &LabelledScene, stage: &Stage) -> Result<(Option<Up>, Vec<Camera>)> {
+        let Some(folder) = &self.scene else { return Ok((self.up, Vec::new())) };
         let mut dataset = dataset::load(folder, &LoadOptions::default())?;
         scene.check_dataset(&mut dataset)?;
-        let up = Up::of_cameras(dataset.views.iter().map(|v| &v.camera));
+        let cameras: Vec<Camera> = dataset.views.into_iter().map(|view| view.camera).collect();
+        let up = Up::of_cameras(&cameras);
         if up.is_none() {
             stage.warn("the cameras do not tell what is up: give --up");
         }
-        Ok(up)
+        Ok((up, cameras))
     }
 }
 

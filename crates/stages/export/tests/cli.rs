@@ -229,6 +229,11 @@ fn cameras_tell_what_is_up_and_queries_what_things_are_called() {
     assert!((scene.up.unwrap().direction[2] - 1.0).abs() < 1e-6, "{:?}", scene.up);
     let names: Vec<_> = scene.objects.iter().map(|o| o.name.as_ref().map(|n| n.text.clone())).collect();
     assert_eq!(names, [Some("table".into()), Some("mug".into()), None, None, None]);
+    let unseen: Vec<f32> = scene.objects.iter().map(|o| o.unseen.unwrap()).collect();
+    // The table has so few Gaussians that one sees through; the mug's bottom stands on it; the book lies in a box.
+    assert!(unseen[0] < 0.1 && (0.16..0.7).contains(&unseen[1]) && unseen[2] == 1.0, "{unseen:?}");
+    let schema = serde_json::from_str(objects::SCHEMA).unwrap();
+    assert_eq!(against_schema(&schema, &serde_json::to_value(&scene).unwrap()), "");
     record["inputs"]["instances"] = json!("0123456789abcdef");
     std::fs::write(run.path("query.json.run.json"), record.to_string()).unwrap();
     run.fail("scene", "b.json", &["--query", "query.json"], &["queries of other instances; found 0123456789ab"]);
