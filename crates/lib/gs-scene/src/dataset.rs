@@ -88,6 +88,13 @@ impl std::fmt::Display for Resolution {
     }
 }
 
+/// As it is written.
+impl serde::Serialize for Resolution {
+    fn serialize<S: serde::Serializer>(&self, to: S) -> std::result::Result<S::Ok, S::Error> {
+        to.collect_str(self)
+    }
+}
+
 /// A side of a photograph in pixels below which its resolution was hardly meant.
 const SMALL: u32 = 24;
 

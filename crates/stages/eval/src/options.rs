@@ -5,7 +5,7 @@ use clap::builder::{PossibleValuesParser, TypedValueParser};
 use gs_io::{Error, Result};
 use gs_scene::dataset::Resolution;
 use query::{CLIP_TEMPLATES, LERF_NEGATIVES, Share, TextOptions};
-use serde::{Serialize, Serializer};
+use serde::Serialize;
 use std::path::PathBuf;
 
 /// The scene and what was found in it.
@@ -109,7 +109,6 @@ pub struct Views {
     pub views: Vec<String>,
     /// Size of the pictures: a divisor of the photographs' size, a width such as 640px, or auto for 1600px
     #[arg(long, default_value = "auto")]
-    #[serde(serialize_with = "as_text")]
     pub resolution: Resolution,
 }
 
@@ -532,10 +531,6 @@ fn templates(given: &[String]) -> Vec<String> {
 /// The texts of a set where it is named, else the text itself.
 fn named(text: &str, name: &str, set: &[&str]) -> Vec<String> {
     if text == name { set.iter().map(|t| (*t).into()).collect() } else { vec![text.into()] }
-}
-
-fn as_text<T: std::fmt::Display, S: Serializer>(value: &T, to: S) -> std::result::Result<S::Ok, S::Error> {
-    to.collect_str(value)
 }
 
 #[cfg(test)]

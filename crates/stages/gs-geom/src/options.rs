@@ -53,7 +53,6 @@ pub(crate) struct SceneOptions {
     pub scene: PathBuf,
     /// Size of the photographs: a divisor, a width in pixels that wider ones are shrunk to such as 640px, or auto for 1600px
     #[arg(long, value_name = "auto|WIDTHpx|DIVISOR", default_value = "auto")]
-    #[serde(serialize_with = "as_text")]
     pub resolution: Resolution,
     #[command(flatten)]
     #[serde(flatten)]
@@ -360,10 +359,6 @@ fn seconds(text: &str) -> Result<f64> {
         units.iter().find_map(|(suffix, unit)| Some((text.strip_suffix(suffix)?, *unit))).unwrap_or((text, 1.0));
     let seconds = number.parse::<f64>().ok().map(|n| n * unit).filter(|s| *s > 0.0 && s.is_finite());
     seconds.ok_or_else(|| Error::new("not a time").found(text).expected("a time such as 90s, 10m or 1.5h"))
-}
-
-fn as_text<S: Serializer>(value: &impl Display, serializer: S) -> std::result::Result<S::Ok, S::Error> {
-    serializer.collect_str(value)
 }
 
 fn some_as_text<S: Serializer>(value: &Option<impl Display>, serializer: S) -> std::result::Result<S::Ok, S::Error> {

@@ -41,12 +41,7 @@ pub(crate) struct SceneArgs {
     pub scene: PathBuf,
     /// Size of the photographs: a divisor, a width that wider ones are shrunk to such as 640px, or auto for 1600px
     #[arg(long, default_value = "auto", value_name = "auto|WIDTHpx|DIVISOR")]
-    #[serde(serialize_with = "as_typed")]
     pub resolution: Resolution,
-}
-
-fn as_typed<S: Serializer>(resolution: &Resolution, serializer: S) -> Result<S::Ok, S::Error> {
-    serializer.collect_str(resolution)
 }
 
 /// What CLIP is shown of a mask.
