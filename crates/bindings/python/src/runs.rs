@@ -8,7 +8,7 @@ use numpy::{IntoPyArray, PyArray1};
 use objects::Up;
 use pyo3::exceptions::{PyOSError, PyValueError};
 use pyo3::prelude::*;
-use query::{Granules, Index, LabelledScene, TextOptions, TextSource, Unrelated, Verdict};
+use query::{Granules, Index, LabelledScene, TextOptions, TextSource, Unrelated, Verdict, different};
 use std::path::PathBuf;
 
 /// What is wrong with a file.
@@ -51,12 +51,13 @@ impl Labelled {
         self.scene.instances.label.clone().into_pyarray(py)
     }
 
-    /// Fit, views and Gaussians of all that masks show as one, by falling fit.
-    fn proposals<'py>(&self, py: Python<'py>) -> Vec<(f32, u32, Bound<'py, PyArray1<u32>>)> {
+    /// Fit, views and Gaussians of what masks show as one, by falling fit, without those that share `overlap` with a better one.
+    fn proposals<'py>(&self, py: Python<'py>, overlap: f64) -> Vec<(f32, u32, Bound<'py, PyArray1<u32>>)> {
         let instances = &self.scene.instances;
-        let mut granules: Vec<_> = instances.granules.iter().collect();
-        granules.sort_by(|a, b| b.fit.total_cmp(&a.fit));
-        granules.into_iter().map(|g| (g.fit, g.support, g.gaussians(instances).into_pyarray(py))).collect()
+        let mut sets: Vec<_> = instances.granules.iter().map(|g| (g.fit, g.gaussians(instances))).collect();
+        let kept = different(&sets, instances.label.len(), overlap);
+        let of = |k: usize| (sets[k].0, instances.granules[k].support, std::mem::take(&mut sets[k].1).into_pyarray(py));
+        kept.into_iter().map(of).collect()
     }
 
     /// `scene.json`; boxes are upright where a dataset says what is up. `names` is a names.json about these instances.

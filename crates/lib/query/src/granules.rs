@@ -3,6 +3,7 @@
 use crate::ranking::{Question, norm};
 use artifacts::{Granule, Instances, Members, flat};
 use serde::{Deserialize, Serialize};
+use std::collections::BTreeMap;
 
 /// How much it counts that the masks show a granule as one, beside how well it suits the feature: the best score of all is one unit
 /// above the mean of all. 0.3 to 1 give nearly the same on synthetic scenes (docs/results/queries.md).
@@ -122,6 +123,28 @@ impl<'a> Granules<'a> {
     }
 }
 
+/// A proposal is the same as one that fits better when their IoU is this or more.
+pub const SAME: f64 = 0.3;
+
+/// Of proposals that may overlap, each a fit and a set of numbers below `count`, those whose IoU with every kept one that fits better is
+/// below `same`: their indices, best fit first; of equals the first.
+pub fn different(proposals: &[(f32, Vec<u32>)], count: usize, same: f64) -> Vec<usize> {
+    let mut order: Vec<usize> = (0..proposals.len()).collect();
+    order.sort_by(|&a, &b| proposals[b].0.total_cmp(&proposals[a].0));
+    // The kept ones that hold each number, and how much of each is in the one at hand.
+    let mut holds: Vec<Vec<usize>> = vec![Vec::new(); count];
+    order.retain(|&k| {
+        let own = &proposals[k].1;
+        let mut common = BTreeMap::new();
+        own.iter().flat_map(|&i| &holds[i as usize]).for_each(|&other| *common.entry(other).or_insert(0usize) += 1);
+        let union = |(other, both): (&usize, &usize)| (own.len() + proposals[*other].1.len() - both) as f64;
+        let differs = common.iter().all(|(other, both)| (*both as f64) < same * union((other, both)));
+        own.iter().filter(|_| differs).for_each(|&i| holds[i as usize].push(k));
+        differs
+    });
+    order
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -193,5 +216,14 @@ mod tests {
         assert_eq!(Granules::new(&scene()).meant(&[1.0; 3], &[], 6), None);
         assert_eq!(Granules::new(&scene()).meant(&[0.0; 3], &[], 0), None);
         assert_eq!(Granules::new(&Instances::default()).meant(&[], &[], 0), None);
+    }
+
+    #[test]
+    fn of_proposals_that_are_nearly_the_same_the_best_fitting_stays() {
+        let set = |range: std::ops::Range<u32>| range.collect::<Vec<u32>>();
+        // The second is the first but for a point, the third a quarter of the first.
+        let proposals = [(0.6, set(0..8)), (0.7, set(1..8)), (0.9, set(0..2)), (0.5, set(8..12))];
+        assert_eq!(different(&proposals, 12, SAME), [2, 1, 3]);
+        assert_eq!(different(&proposals, 12, 1.1), [2, 1, 0, 3]);
     }
 }

@@ -269,17 +269,7 @@ class Run:
         overlap : float
             One whose IoU with a better one is this or more is left out; above 1 all stay.
         """
-        held = [[] for _ in self.labels]
-        out = []
-        for fit, views, gaussians in self._labelled.proposals():
-            common = {}
-            for k in (k for i in gaussians for k in held[i]):
-                common[k] = common.get(k, 0) + 1
-            if all(both < overlap * (len(gaussians) + len(out[k].gaussians) - both) for k, both in common.items()):
-                for i in gaussians:
-                    held[i].append(len(out))
-                out.append(Proposal(fit, views, gaussians))
-        return out
+        return [Proposal(*p) for p in self._labelled.proposals(overlap)]
 
     def to_dataframe(self):
         """The :meth:`objects` as ``pandas.DataFrame``, a row for each, by id. Needs pandas."""

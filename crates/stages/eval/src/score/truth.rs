@@ -6,7 +6,7 @@ use crate::protocols::instances::{MIN_POINTS, Overlaps, average_precision};
 use artifacts::{Granule, TruePoints, TrueScene};
 use gs_io::Result;
 use gs_scene::Geometry;
-use query::{LabelledScene, MIN_OPACITY, nearest_of, nearest_solid};
+use query::{LabelledScene, MIN_OPACITY, SAME, different, nearest_of, nearest_solid};
 use std::path::Path;
 
 /// Scores the instances against `truth/points.safetensors` of the scene: each surface point takes the label of the
@@ -73,29 +73,6 @@ impl Precision {
     }
 }
 
-/// A proposal is dropped when its IoU with one that fits better is this or more.
-const SAME: f64 = 0.3;
-
-/// The proposals of at least `least` points, each with its fit, that are not the [`SAME`] as one that fits better; of equals the first
-/// stays. `points` counts all points.
-fn different(mut proposals: Vec<(f32, Vec<u32>)>, points: usize, least: usize) -> (Vec<f32>, Vec<Vec<u32>>) {
-    proposals.retain(|(_, own)| own.len() >= least);
-    proposals.sort_by(|a, b| b.0.total_cmp(&a.0));
-    let (mut fit, mut kept): (Vec<f32>, Vec<Vec<u32>>) = Default::default();
-    // The kept ones that hold each point.
-    let mut holds: Vec<Vec<usize>> = vec![Vec::new(); points];
-    for (own_fit, own) in proposals {
-        let common = metrics::counts(own.iter().flat_map(|&i| &holds[i as usize]).copied());
-        let is_same = |(&k, &both): (&usize, &usize)| both as f64 >= SAME * (own.len() + kept[k].len() - both) as f64;
-        if !common.iter().any(is_same) {
-            own.iter().for_each(|&i| holds[i as usize].push(kept.len()));
-            fit.push(own_fit);
-            kept.push(own);
-        }
-    }
-    (fit, kept)
-}
-
 /// Scores the parts, things and groups that masks show, which may overlap, by the nearest Gaussian of each point. None where there are none.
 fn score_proposals(
     scene: &LabelledScene,
@@ -110,9 +87,11 @@ fn score_proposals(
     }
     let of = |q: &Granule| {
         let gaussians = q.gaussians(instances);
-        (q.fit, gaussians.iter().flat_map(|&g| &points[g as usize]).copied().collect())
+        (q.fit, gaussians.iter().flat_map(|&g| &points[g as usize]).copied().collect::<Vec<u32>>())
     };
-    let (fit, kept) = different(instances.granules.iter().map(of).collect(), truth.len(), MIN_POINTS);
+    let proposals: Vec<_> = instances.granules.iter().map(of).filter(|(_, own)| own.len() >= MIN_POINTS).collect();
+    let kept = different(&proposals, truth.len(), SAME).into_iter().map(|k| &proposals[k]);
+    let (fit, kept): (Vec<f32>, Vec<Vec<u32>>) = kept.cloned().unzip();
     let overlaps = Overlaps::of_sets(truth, &kept, MIN_POINTS);
     let best: Vec<f64> = overlaps.best().filter(|b| !background(b.0)).map(|b| b.1).collect();
     (!instances.granules.is_empty()).then(|| ProposalScores {
@@ -225,16 +204,6 @@ mod tests {
             let other: Vec<i32> = (0..5).map(|i| code / 4i32.pow(i) % 4 - 1).collect();
             assert!(miou(&other) <= best, "{other:?} scores {}, the truth {best}", miou(&other));
         }
-    }
-
-    #[test]
-    fn of_proposals_that_are_nearly_the_same_the_best_fitting_stays() {
-        let set = |range: std::ops::Range<u32>| range.collect::<Vec<u32>>();
-        // The second is the first but for a point, the third a quarter of the first, the fourth too small.
-        let proposals =
-            vec![(0.6, set(0..8)), (0.7, set(1..8)), (0.9, set(0..2)), (1.0, set(9..10)), (0.5, set(8..12))];
-        let (fit, kept) = different(proposals, 12, 2);
-        assert_eq!((fit, kept), (vec![0.9, 0.7, 0.5], vec![set(0..2), set(1..8), set(8..12)]));
     }
 
     #[test]
