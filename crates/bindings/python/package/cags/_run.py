@@ -277,12 +277,9 @@ class Run:
             import pandas
         except ImportError:
             raise ImportError("to_dataframe needs pandas: pip install pandas") from None
-        rows = []
-        for o in self.objects():
-            row = {k: getattr(o, k) for k in ("id", "name", "sure", "score", "gaussians", "volume", "view")}
-            rows.append(row | dict(zip("xyz", o.center.tolist())) | dict(zip(("size_1", "size_2", "size_3"), (2 * o.half_size).tolist())))
-        columns = ["id", "name", "sure", "score", "gaussians", "volume", "view", "x", "y", "z", "size_1", "size_2", "size_3"]
-        return pandas.DataFrame(rows, columns=columns).set_index("id")
+        own = ["id", "name", "sure", "score", "gaussians", "volume", "view"]
+        rows = [[getattr(o, k) for k in own] + o.center.tolist() + (2 * o.half_size).tolist() for o in self.objects()]
+        return pandas.DataFrame(rows, columns=[*own, "x", "y", "z", "size_1", "size_2", "size_3"]).set_index("id")
 
     def show(self, page=None, height=600):
         """The scene in a notebook, to turn and click, as the value of a cell.
