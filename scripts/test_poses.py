@@ -13,6 +13,7 @@ import av
 import numpy as np
 import pillow_heif
 import pycolmap
+from film import similarity
 from PIL import Image
 
 pillow_heif.register_heif_opener()
@@ -83,14 +84,11 @@ def off(model, truth):
     found = pycolmap.Reconstruction(model)
     pairs = [(i.projection_center(), i.cam_from_world().rotation.matrix(), *truth[Path(i.name).stem]) for i in found.images.values() if i.has_pose]
     ours, theirs = (np.array([p[k] for p in pairs]) for k in (0, 2))
-    a, b = ours - ours.mean(0), theirs - theirs.mean(0)
-    left, sizes, right = np.linalg.svd(b.T @ a)
-    sign = np.diag([1, 1, np.sign(np.linalg.det(left @ right))])
-    turn = left @ sign @ right
-    scale = (sizes * np.diag(sign)).sum() / (a**2).sum()
+    scale, turn, shift = similarity(ours, theirs)
     angles = [np.degrees(np.arccos(np.clip((np.trace(r @ turn.T @ t.T) - 1) / 2, -1, 1))) for _, r, _, t in pairs]
     tilt = np.degrees(np.arccos(np.clip(turn[2, 2], -1, 1)))
-    return max(angles), np.linalg.norm(scale * a @ turn.T - b, axis=1).max() / np.linalg.norm(b, axis=1).max(), tilt
+    away = np.linalg.norm(scale * ours @ turn.T + shift - theirs, axis=1)
+    return max(angles), away.max() / np.linalg.norm(theirs - theirs.mean(0), axis=1).max(), tilt
 
 
 def photographs(folder, poses, name="img_{:02}.jpg"):
