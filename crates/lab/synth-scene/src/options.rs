@@ -53,7 +53,7 @@ pub struct Args {
     /// Points of the sparse cloud, or vertices of a scan, 1 to 10000000 [tiny 1500, demo 9000, large 40000]
     #[arg(long, value_name = "COUNT", value_parser = within(1usize..=10_000_000))]
     points: Option<usize>,
-    /// Defaults of the six options of faults below, and the faults of the features
+    /// Defaults of the three options of faults below, and all other faults of the masks and their features (docs/granularity.md)
     #[arg(long, value_enum, default_value_t = Corruption::Mild)]
     corruption: Corruption,
     /// Probability that a mask level of a view shows a thing at another granularity: split into parts, or merged with
@@ -66,17 +66,6 @@ pub struct Args {
     /// Probability that a mask is missing [exact 0, mild 0.05, sam 0.05]
     #[arg(long, value_name = "PROBABILITY", value_parser = within(0.0..=1.0))]
     missing: Option<f64>,
-    /// Masks that show no thing, for each mask of a level, 0 to 1 [exact 0, mild 0, sam 0.15]
-    #[arg(long, value_name = "SHARE", value_parser = within(0.0..=1.0))]
-    spurious: Option<f64>,
-    /// Probability that what lies apart in an image, with something in front, has masks of its own at level small, and
-    /// less often at the others [exact 0, mild 0, sam 1]
-    #[arg(long, value_name = "PROBABILITY", value_parser = within(0.0..=1.0))]
-    torn: Option<f64>,
-    /// Probability that of two objects that touch in an image one is in the other's mask at level large, where it covers
-    /// 1 % of the image; background and other levels follow as with a real model [exact 0, mild 0, sam 0.35]
-    #[arg(long, value_name = "PROBABILITY", value_parser = within(0.0..=1.0))]
-    swallow: Option<f64>,
     /// Noise of the poses in sparse/0, 0 to 10: standard deviation in degrees about each axis, and in centimetres along
     /// each axis. Photographs and truth keep the exact poses, which truth/sparse then holds
     #[arg(long, value_name = "SIZE", default_value_t = 0.0, value_parser = within(0.0..=10.0))]
@@ -232,9 +221,7 @@ impl Args {
                 granularity: self.granularity_p.unwrap_or(faults.granularity),
                 boundary: self.boundary_noise.unwrap_or(faults.boundary),
                 missing: self.missing.unwrap_or(faults.missing),
-                spurious: self.spurious.unwrap_or(faults.spurious),
-                torn: self.torn.unwrap_or(faults.torn),
-                swallow: self.swallow.unwrap_or(faults.swallow),
+                ..faults
             },
             speech: self.features.then_some(match self.language {
                 Tongue::Words => speech,
