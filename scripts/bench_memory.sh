@@ -39,7 +39,7 @@ run 'synthetic, few and small' "$OUT/scene" --resolution 160px --iterations 60 -
 run 'synthetic, many and small' "$OUT/scene" --resolution 160px --iterations 16 --checkpoint-every 8 \
     --init random --init-points 300000
 run 'synthetic, growing' "$OUT/scene" --resolution 160px --iterations 240 --checkpoint-every 100 \
-    --densify-gradient 0.000001 --densify-every 20 --max-gaussians 150000
+    --densify-every 20 --max-gaussians 150000
 run 'desk, few and large' "$DESK" --resolution 1 --iterations 12 --checkpoint-every 6
 run 'desk, many and large' "$DESK" --resolution 960px --iterations 12 --checkpoint-every 6 \
     --init random --init-points 150000

@@ -1,14 +1,14 @@
-//! `gs-geom convert`: choosing, ordering and trimming Gaussians, and writing them in another format.
+//! `gs-geom convert`: choosing and trimming Gaussians, and writing them in another format.
 
 use crate::axes;
 use crate::bounds::Bounds;
 use crate::memory::{self, Pictures};
-use crate::options::{Convert, Order, bytes, note_shift};
+use crate::options::{Convert, bytes, note_shift};
 use artifacts::role;
 use gs_io::{Error, IoContext, Result, write_bytes};
 use gs_scene::dataset::{self, LoadOptions, Resolution};
 use gs_scene::splat::{self, Extra, Format, Splat};
-use gs_scene::{Gaussians, Learnt, morton_order};
+use gs_scene::{Gaussians, Learnt};
 use serde_json::json;
 use stage::Stage;
 use std::collections::BTreeMap;
@@ -54,12 +54,9 @@ impl Convert {
             note_shift(&mut summary, g.shift);
             return stage.record(&mut claim, parameters, inputs, summary);
         }
-        let mut chosen = choose(&g, self.min_opacity, self.crop);
-        let dropped = [
-            (chosen.damaged, "damaged: not finite, or a rotation of length 0"),
-            (chosen.cropped, "outside the box"),
-            (chosen.faint, "too faint"),
-        ];
+        let chosen = choose(&g, self.crop);
+        let dropped =
+            [(chosen.damaged, "damaged: not finite, or a rotation of length 0"), (chosen.cropped, "outside the box")];
         for (n, why) in dropped.iter().filter(|d| d.0 > 0) {
             stage.skipped(&format!("{n} of {all} Gaussians: {why}"));
         }
@@ -67,12 +64,11 @@ impl Convert {
             return Err(Error::new("no Gaussian is left")
                 .file(&self.input)
                 .found(format!("{all} Gaussians"))
-                .hint("give a lower --min-opacity or a larger --crop"));
+                .hint("give a larger --crop"));
         }
         if let Some(degree) = self.sh_degree.filter(|&d| d > g.sh_degree) {
             stage.forecast(memory::of_bands(chosen.kept.len(), g.sh_degree, degree), "give a lower --sh-degree")?;
         }
-        arrange(&g, &mut chosen.kept, self.order);
         g = g.select(&chosen.kept);
         g.bound_opacities();
         let degree = self.sh_degree.unwrap_or(g.sh_degree);
@@ -91,7 +87,6 @@ impl Convert {
             "axes": to.to_string(),
             "damaged": chosen.damaged,
             "cropped": chosen.cropped,
-            "faint": chosen.faint,
         });
         note_shift(&mut summary, g.shift);
         stage.record(&mut claim, parameters, inputs, summary)
@@ -105,40 +100,21 @@ struct Chosen {
     kept: Vec<u32>,
     damaged: usize,
     cropped: usize,
-    faint: usize,
 }
 
-/// Picks the Gaussians that can be used, whose centres lie inside the box, and whose opacity is at least `min_opacity`.
-fn choose(g: &Gaussians, min_opacity: f32, crop: Option<Bounds<f64>>) -> Chosen {
+/// Picks the Gaussians that can be used, and whose centres lie inside the box.
+fn choose(g: &Gaussians, crop: Option<Bounds<f64>>) -> Chosen {
     let mut chosen = Chosen::default();
     for i in 0..g.len() {
         if !g.is_whole(i) {
             chosen.damaged += 1;
         } else if crop.is_some_and(|b| !b.contains(g.means[i], g.shift)) {
             chosen.cropped += 1;
-        } else if g.opacity(i) < min_opacity {
-            chosen.faint += 1;
         } else {
             chosen.kept.push(i as u32);
         }
     }
     chosen
-}
-
-/// Puts indices in order; equal ones stay as they were.
-fn arrange(g: &Gaussians, kept: &mut [u32], order: Order) {
-    match order {
-        Order::None => {}
-        Order::Opacity => {
-            let logit = |i: u32| g.opacity_logits[i as usize];
-            kept.sort_by(|&a, &b| logit(b).total_cmp(&logit(a)));
-        }
-        Order::Morton => {
-            let centres: Vec<[f32; 3]> = kept.iter().map(|&i| g.means[i as usize]).collect();
-            let ordered: Vec<u32> = morton_order(&centres).into_iter().map(|k| kept[k as usize]).collect();
-            kept.copy_from_slice(&ordered);
-        }
-    }
 }
 
 #[cfg(test)]
@@ -151,25 +127,9 @@ mod tests {
         let mut g = zeros(5, 0);
         g.rotations = vec![[1.0, 0.0, 0.0, 0.0]; 5];
         g.means = vec![[0.0; 3], [2.0, 0.0, 0.0], [f32::NAN; 3], [1.0, 1.0, 1.0], [0.5; 3]];
-        g.opacity_logits = vec![0.0, -9.0, -9.0, f32::INFINITY, -9.0];
+        g.opacity_logits[3] = f32::INFINITY;
         let crop = Some(Bounds { low: [0.0; 3], high: [1.0; 3] });
-        let c = choose(&g, 0.1, crop);
-        assert_eq!(c, Chosen { kept: vec![0, 3], damaged: 1, cropped: 1, faint: 1 });
-        assert_eq!(choose(&g, 0.0, None).kept, [0, 1, 3, 4]);
-    }
-
-    #[test]
-    fn orders_are_stable() {
-        let mut g = zeros(4, 0);
-        g.means = vec![[1.0, 1.0, 1.0], [0.0; 3], [1.0, 0.0, 0.0], [0.0; 3]];
-        g.opacity_logits = vec![0.0, 2.0, 1.0, 2.0];
-        let run = |order| {
-            let mut all = vec![0, 1, 2, 3];
-            arrange(&g, &mut all, order);
-            all
-        };
-        assert_eq!(run(Order::None), [0, 1, 2, 3]);
-        assert_eq!(run(Order::Opacity), [1, 3, 2, 0]);
-        assert_eq!(run(Order::Morton), [1, 3, 2, 0]);
+        assert_eq!(choose(&g, crop), Chosen { kept: vec![0, 3, 4], damaged: 1, cropped: 1 });
+        assert_eq!(choose(&g, None).kept, [0, 1, 3, 4]);
     }
 }

@@ -13,7 +13,7 @@ use gs_scene::splat::System;
 use gs_scene::{Gaussians, Geometry, HoldOut, say_shift};
 use serde::{Serialize, Serializer};
 use serde_json::Value;
-use stage::{Bytes, CommonArgs, Stage, positive, within};
+use stage::{Bytes, CommonArgs, Stage, within};
 use std::fmt::Display;
 use std::path::{Path, PathBuf};
 use std::str::FromStr;
@@ -40,7 +40,7 @@ pub(crate) enum Command {
     Views(Views),
     /// Describe a file of Gaussians (counts, bounds, histograms, faults), or list the files of a dataset
     Inspect(Inspect),
-    /// Drop, crop, trim and re-order the Gaussians of a file
+    /// Write a file of Gaussians in another format, cropped, with other harmonics or axes
     Convert(Convert),
 }
 
@@ -126,9 +126,6 @@ pub(crate) struct Train {
     /// limit with --preset 3dgs]
     #[arg(long, value_name = "COUNT", value_parser = within(1..=MOST_GAUSSIANS))]
     pub max_gaussians: Option<usize>,
-    /// Gradient of the projected centre above which a Gaussian is cloned or split, per half picture size [0.0002]
-    #[arg(long, value_name = "GRADIENT", value_parser = positive::<f32>)]
-    pub densify_gradient: Option<f32>,
     /// Iterations between densifications [a thirtieth of --iterations, 50 to 100]
     #[arg(long, value_name = "COUNT", value_parser = clap::value_parser!(u32).range(1..))]
     pub densify_every: Option<u32>,
@@ -258,15 +255,9 @@ pub(crate) struct Convert {
     /// Degree of the spherical harmonics, 0 to 3: higher bands are dropped, missing ones zero [as in IN]
     #[arg(long, value_name = "DEGREE", value_parser = clap::value_parser!(u8).range(0..=3))]
     pub sh_degree: Option<u8>,
-    /// Drop Gaussians fainter than this, 0 to 1
-    #[arg(long, value_name = "OPACITY", default_value_t = 0.0, value_parser = within(0.0f32..=1.0))]
-    pub min_opacity: f32,
     /// Drop Gaussians whose centre lies outside this box, world units
     #[arg(long, value_name = "X0,Y0,Z0,X1,Y1,Z1", allow_hyphen_values = true)]
     pub crop: Option<Bounds<f64>>,
-    /// Order of the Gaussians
-    #[arg(long, value_enum, default_value_t = Order::None)]
-    pub order: Order,
 }
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum, Serialize)]
@@ -282,18 +273,6 @@ impl Background {
     pub fn color(self) -> [f32; 3] {
         if self == Self::White { [1.0; 3] } else { [0.0; 3] }
     }
-}
-
-/// In which order Gaussians are written.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, ValueEnum)]
-#[serde(rename_all = "lowercase")]
-pub(crate) enum Order {
-    /// As in the input
-    None,
-    /// Along a Morton curve: neighbours in space lie near each other in the file
-    Morton,
-    /// The most opaque first
-    Opacity,
 }
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum, Serialize)]
@@ -368,7 +347,7 @@ fn some_as_text<S: Serializer>(value: &Option<impl Display>, serializer: S) -> s
 impl Convert {
     /// Whether no option does anything to the Gaussians.
     pub fn keeps_all(&self) -> bool {
-        self.sh_degree.is_none() && self.min_opacity == 0.0 && self.crop.is_none() && self.order == Order::None
+        self.sh_degree.is_none() && self.crop.is_none()
     }
 }
 

@@ -122,12 +122,9 @@ impl Train {
         if self.schedule == PictureSizes::Coarse {
             recipe.schedule = recipe.schedule.coarse_to_fine();
         }
-        if let Some(Way::Adaptive(way)) = &mut recipe.densification {
-            way.gradient = self.densify_gradient.unwrap_or(way.gradient);
-            if stock {
-                way.max_scale = Some(STOCK_MAX_SCALE);
-                way.split_reach = None;
-            }
+        if stock && let Some(Way::Adaptive(way)) = &mut recipe.densification {
+            way.max_scale = Some(STOCK_MAX_SCALE);
+            way.split_reach = None;
         }
         if stock {
             recipe.rates = self.densify.rates(LearningRates::default());

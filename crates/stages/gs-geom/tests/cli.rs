@@ -320,12 +320,7 @@ fn bad_input_is_refused_in_one_line() {
     );
     assert!(refused(&["render", "--scene", scene(), "--geometry", &missing, "--out", &out]).contains("missing"));
 
-    for (option, value) in [
-        ("--densify-every", "0"),
-        ("--densify-gradient", "NaN"),
-        ("--max-gaussians", "0"),
-        ("--init-points", "2000000000"),
-    ] {
+    for (option, value) in [("--densify-every", "0"), ("--max-gaussians", "0"), ("--init-points", "2000000000")] {
         // With --check before the photographs are looked for.
         for e in [train(scene(), &[option, value]), train(&missing, &[option, value, "--check"])] {
             assert!(e.contains(option) && e.contains("invalid value"), "{e}");
@@ -386,7 +381,7 @@ fn forecasts_are_near_the_peaks() {
     for (command, out) in [
         ([&["render"], &drawn[..], &[&pictures]].concat(), &pictures),
         ([&["eval"], &drawn[..], &[&metrics]].concat(), &metrics),
-        (vec!["convert", &geometry, &converted, "--min-opacity", "0.0"], &converted),
+        (vec!["convert", &geometry, &converted], &converted),
     ] {
         succeeds(&command);
         near(&record(out)["memory_predicted_bytes"], out);

@@ -87,29 +87,28 @@ fn the_files_of_a_dataset_are_listed() {
 }
 
 #[test]
-fn a_file_is_trimmed_cropped_pruned_and_ordered() {
+fn a_file_is_trimmed_and_cropped() {
     let dir = Folder::new();
     let file = written(&dir);
     let out = dir.path("new/out.ply");
-    let crop = ["--crop", "-1,0,-2,5,2,-2", "--order", "opacity"];
-    succeeds(&[&["convert", &file, &out, "--sh-degree", "1", "--min-opacity", "0.5"], &crop[..]].concat());
+    succeeds(&["convert", &file, &out, "--sh-degree", "1", "--crop", "-1,0,-2,5,2,-2"]);
     let (g, all) = (ply::read_gaussians(&out).unwrap(), gaussians());
-    // 0 to 20 lie inside, 0 to 15 are opaque enough (0.2 * 15 = 3), 7 is broken; they are in order already.
-    assert_eq!((g.len(), g.sh_degree, g.opacity_logits[0]), (15, 1, 50.0));
-    for (i, from) in (0..16).filter(|&i| i != 7).enumerate() {
+    // 0 to 20 lie inside, 7 is broken.
+    assert_eq!((g.len(), g.sh_degree, g.opacity_logits[0]), (20, 1, 50.0));
+    for (i, from) in (0..21).filter(|&i| i != 7).enumerate() {
         assert_eq!((g.means[i], g.sh_of(i)), (all.means[from], &all.sh_of(from)[..12]));
     }
     let record: Value = serde_json::from_slice(&fs::read(format!("{out}.run.json")).unwrap()).unwrap();
     assert_eq!((&record["summary"]["damaged"], &record["summary"]["of"]), (&1.into(), &40.into()));
-    assert_eq!(record["skipped"].as_array().unwrap().len(), 3);
+    assert_eq!(record["skipped"].as_array().unwrap().len(), 2);
 
     // Back to degree 3: the 62 properties of the original code.
     let full = dir.path("full.ply");
-    succeeds(&["convert", &out, &full, "--sh-degree", "3", "--order", "morton", "--quiet"]);
+    succeeds(&["convert", &out, &full, "--sh-degree", "3", "--quiet"]);
     let header = String::from_utf8_lossy(&fs::read(&full).unwrap()[..3000]).into_owned();
     assert_eq!(header.matches("property float").count(), 62);
     assert!(!header.contains(&dir.path("")));
-    assert_eq!(ply::read_gaussians(&full).unwrap().len(), 15);
+    assert_eq!(ply::read_gaussians(&full).unwrap().len(), 20);
 }
 
 #[test]
@@ -243,7 +242,7 @@ fn the_input_is_never_overwritten() {
     for name in &names {
         assert!(refused(&["convert", &file, name]).contains("the output is one of the inputs"), "{name}");
     }
-    assert!(refused(&["convert", &file, &out, "--min-opacity", "2"]).contains("--min-opacity"));
+    assert!(refused(&["convert", &file, &out, "--sh-degree", "4"]).contains("--sh-degree"));
     assert!(refused(&["convert", &file, &out, "--crop", "90,90,90,91,91,91"]).contains("no Gaussian is left"));
     assert!(refused(&["convert", &file, &out, "--crop", "1,2"]).contains("not a box"));
     assert!(refused(&["convert", &dir.path("none.ply"), &out]).contains("none.ply"));
@@ -266,7 +265,7 @@ fn real_files_are_inspected_and_converted() {
         let sum: u64 = v["opacity"].as_array().unwrap().iter().map(|b| b["count"].as_u64().unwrap()).sum();
         assert_eq!(sum, n);
         let out = dir.path(name);
-        succeeds(&["convert", &file, &out, "--order", "morton", "--sh-degree", "3"]);
+        succeeds(&["convert", &file, &out, "--sh-degree", "3"]);
         let (a, b) = (ply::read_gaussians(&file).unwrap(), ply::read_gaussians(&out).unwrap());
         let sum = |g: &Gaussians| g.opacity_logits.iter().map(|&v| f64::from(v)).sum::<f64>();
         assert!(a.len() == b.len() && b.sh_degree == 3 && (sum(&a) - sum(&b)).abs() < 1e-6 * sum(&a).abs());
