@@ -200,7 +200,7 @@ EVAL_ARGS|--holdou 8|--resolution 0px
 MASK_ARGS|--points-per-sid 6|--points-per-side 0
 EMBED_ARGS|--corp mean|--crop white
 GRAPH_ARGS|--anchor-ration 0.1|--k 0
-FEAT_ARGS|--levles small|--tau 0
+FEAT_ARGS|--levles small|--layers 5
 CLUSTER_ARGS|--jion 0.6|--join 2
 SCORE_ARGS|--alhpa 0.5|--alpha 3
 REPORT_ARGS|--veiws x|

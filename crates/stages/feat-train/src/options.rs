@@ -7,7 +7,7 @@ use clap::{Parser, ValueEnum};
 use gs_io::{Error, Result};
 use serde::Serialize;
 use serde_json::{Value, json};
-use stage::{CommonArgs, at_least, positive, within};
+use stage::{CommonArgs, at_least, within};
 use std::path::PathBuf;
 
 /// Computes a feature for every Gaussian from the masks of all views
@@ -61,7 +61,7 @@ pub enum Preset {
     Paper,
 }
 
-/// Options of the paper's method.
+/// Options of the paper's method, and what only the preset says.
 #[derive(Debug, Clone, PartialEq, clap::Args, Serialize)]
 #[command(next_help_heading = "Paper (with --preset)")]
 #[group(requires = "preset")]
@@ -72,26 +72,9 @@ pub struct Contrastive {
     /// Layers of the graph network, 0 to 4; 0 trains the features without context
     #[arg(long, value_name = "COUNT", default_value_t = 2, value_parser = within(0usize..=4))]
     pub layers: usize,
-    /// When the feature of each Gaussian is brought to unit length; with --preset paper the default is after
-    #[arg(long, value_enum, default_value = "never", default_value_if("preset", "paper", "after"))]
-    pub unit_length: UnitLength,
-    /// Values that share a mean and a standard deviation in the graph network; with --preset paper the default is gaussian
-    #[arg(long, value_enum, default_value = "channel", default_value_if("preset", "paper", "gaussian"))]
-    pub norm_axis: Axis,
     /// Loss on the masks of a view; with --preset paper the default is gaussian
     #[arg(long, value_enum, default_value = "printed", default_value_if("preset", "paper", "gaussian"))]
     pub loss: Loss,
-    /// Initial features; with --preset paper the default is normal-small
-    #[arg(long, value_enum, default_value = "uniform", default_value_if("preset", "paper", "normal-small"))]
-    pub init: Init,
-    /// Temperature of the loss, 1e-6 to 1e6; with --preset paper the default is 0.2
-    #[arg(long, value_name = "TAU", value_parser = within(1e-6..=1e6), default_value = "0.1",
-        default_value_if("preset", "paper", "0.2"))]
-    pub tau: f64,
-    /// Learning rate of the features, above 0; with --preset paper the default is 0.01
-    #[arg(long, value_name = "RATE", value_parser = positive::<f64>, default_value = "0.001",
-        default_value_if("preset", "paper", "0.01"))]
-    pub lr: f64,
     /// Pixels of each mask that a loss of pixels looks at, drawn anew in every iteration from those that graph-precompute
     /// --pixel-samples kept; 0 takes all of them
     #[arg(long, value_name = "COUNT", default_value_t = 0)]
@@ -103,17 +86,25 @@ pub struct Contrastive {
     /// Add the output of the graph network to the anchors only, not to all Gaussians
     #[arg(long)]
     pub no_propagation: bool,
-    /// Hold out every tenth view, and stop when the loss of these views no longer falls
-    #[arg(long)]
-    pub early_stop: bool,
-    /// Skip nothing: also use views with a single mask, although their loss and gradient are zero
-    // Not stage::SkipArgs: the requirement of this group does not reach into another struct.
-    #[arg(long)]
-    pub no_skip: bool,
+    /// When the feature of each Gaussian is brought to unit length.
+    #[arg(skip = UnitLength::Never)]
+    pub unit_length: UnitLength,
+    /// Values that share a mean and a standard deviation in the graph network.
+    #[arg(skip = Axis::Channel)]
+    pub norm_axis: Axis,
+    /// Initial features.
+    #[arg(skip = Init::Uniform)]
+    pub init: Init,
+    /// Temperature of the loss.
+    #[arg(skip = 0.1)]
+    pub tau: f64,
+    /// Learning rate of the features.
+    #[arg(skip = 0.001)]
+    pub lr: f64,
 }
 
 /// When the feature of a Gaussian is brought to unit length.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum, Serialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum UnitLength {
     /// Never: as printed in the paper.
@@ -123,7 +114,7 @@ pub enum UnitLength {
 }
 
 /// Values that are standardised together.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum, Serialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum Axis {
     /// Each channel over all Gaussians.
@@ -148,7 +139,7 @@ pub enum Loss {
 }
 
 /// Initial features.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum, Serialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum Init {
     /// Uniform in 0 to 1, as in OpenGaussian.
@@ -206,6 +197,16 @@ impl Options {
         }
     }
 
+    /// The paper's method as the preset has it, and the options that were given.
+    pub(crate) fn method(&self) -> Contrastive {
+        let given = self.contrastive.clone();
+        if self.preset != Some(Preset::Paper) {
+            return given;
+        }
+        let (unit_length, norm_axis, init) = (UnitLength::After, Axis::Gaussian, Init::NormalSmall);
+        Contrastive { unit_length, norm_axis, init, tau: 0.2, lr: 0.01, ..given }
+    }
+
     /// Dimension of trained features.
     pub(crate) fn trained_dim(&self) -> usize {
         self.dim.unwrap_or(PAPER_DIM)
@@ -220,7 +221,7 @@ impl Options {
     pub(crate) fn parameters(&self, seed: u64) -> Value {
         let trained = self.preset.is_some();
         let dim = if trained { Some(self.trained_dim()) } else { self.dim };
-        let mut parameters = json!(Self { levels: self.levels(), dim, ..self.clone() });
+        let mut parameters = json!(Self { levels: self.levels(), dim, contrastive: self.method(), ..self.clone() });
         parameters["seed"] = json!(seed);
         if !trained {
             parameters.as_object_mut().expect("a struct is an object").remove("contrastive");
@@ -248,16 +249,17 @@ mod tests {
             (&json!("literal"), &json!(["large"]), &json!(6))
         );
         assert_eq!(literal["contrastive"], json!(Contrastive { loss: Loss::Separation, ..Contrastive::default() }));
-        assert_eq!(literal["contrastive"].as_object().map(serde_json::Map::len), Some(13));
+        assert_eq!(literal["contrastive"].as_object().map(serde_json::Map::len), Some(11));
         let best = Contrastive {
             init: Init::NormalSmall,
             unit_length: UnitLength::After,
             norm_axis: Axis::Gaussian,
-            tau: 0.5,
+            tau: 0.2,
             lr: 0.01,
+            pixels: 9,
             loss: Loss::Gaussian,
             ..Contrastive::default()
         };
-        assert_eq!(of(&["--preset", "paper", "--tau", "0.5"])["contrastive"], json!(best), "what is given wins");
+        assert_eq!(of(&["--preset", "paper", "--pixels", "9"])["contrastive"], json!(best), "what is given wins");
     }
 }

@@ -123,7 +123,7 @@ fn setup() -> (tempfile::TempDir, PathBuf) {
 #[test]
 fn damaged_gaussians_change_nothing() {
     let (dir, out) = setup();
-    let options = ["--preset", "literal", "--iterations", "100", "--lr", "0.01"];
+    let options = ["--preset", "literal", "--iterations", "100"];
     succeed(dir.path(), &out, &options);
     let values = || Features::read(&out).unwrap().0.values;
     let before = values();
@@ -154,14 +154,13 @@ fn the_closed_form_tells_things_apart_and_not_their_halves() {
 fn training_separates_masks_and_does_not_depend_on_threads() {
     let (dir, out) = setup();
     for variant in [
-        &[][..],
-        &["--loss", "gaussian", "--norm-axis", "gaussian"],
-        &["--loss", "gaussian", "--layers", "0", "--init", "normal-small"],
-        &["--loss", "pixel", "--cohesion", "0.1"],
+        &["literal"][..],
+        &["literal", "--loss", "gaussian"],
+        &["paper", "--layers", "0"],
+        &["paper", "--loss", "pixel", "--cohesion", "0.1"],
     ] {
         let with = |threads| {
-            let args =
-                ["--preset", "literal", "--iterations", "300", "--lr", "0.01", "--seed", "4", "--threads", threads];
+            let args = ["--iterations", "300", "--seed", "4", "--threads", threads, "--preset"];
             succeed(dir.path(), &out, &[&args[..], variant].concat())
         };
         assert!(with("1") == with("2"), "{variant:?}");
@@ -188,7 +187,7 @@ fn every_row_of_the_ablation_tables_trains() {
     lines.extend((0..=4).map(|count: u32| layers[0].replace("COUNT", &count.to_string())));
     let mut outputs = BTreeMap::new();
     for line in lines {
-        let args: Vec<&str> = line.split(' ').chain(["--iterations", "200", "--lr", "0.01"]).collect();
+        let args: Vec<&str> = line.split(' ').chain(["--iterations", "200"]).collect();
         succeed(dir.path(), &out, &args);
         let losses = curve(&out, "loss");
         assert!(losses[losses.len() - 1] < losses[0], "{line}: {losses:?}");
@@ -238,22 +237,6 @@ fn a_stopped_run_continues_to_the_same_bytes() {
 }
 
 #[test]
-fn training_stops_early_when_held_out_views_have_settled() {
-    let (dir, out) = setup();
-    let args = ["--preset", "literal", "--lr", "0.01", "--loss", "gaussian", "--iterations", "50000", "--early-stop"];
-    succeed(dir.path(), &out, &args);
-    let record = std::fs::read_to_string(beside(&out, ".run.json")).unwrap();
-    let record: serde_json::Value = serde_json::from_str(&record).unwrap();
-    let done = record["summary"]["iterations"].as_u64().unwrap();
-    assert!((1000..50_000).contains(&done) && done.is_multiple_of(250), "{done}");
-    // What it learnt is what that many iterations learn.
-    let early = Features::read(&out).unwrap().0.values;
-    let done = done.to_string();
-    succeed(dir.path(), &out, &[&args[..6], &["--iterations", &done, "--early-stop"]].concat());
-    assert!(early == Features::read(&out).unwrap().0.values);
-}
-
-#[test]
 fn bad_input_is_one_line_and_leaves_the_output_alone() {
     let (dir, out) = setup();
     std::fs::write(&out, "good").unwrap();
@@ -268,14 +251,14 @@ fn bad_input_is_one_line_and_leaves_the_output_alone() {
         assert_eq!(std::fs::read(&out).unwrap(), b"good");
     };
     fail(&["--preset", "paper", "--layers", "5"], &["--layers", "'5'", "0 to 4"]);
-    fail(&["--tau", "0"], &["--tau"]);
+    fail(&["--cohesion=-1"], &["--cohesion"]);
     fail(&["--preset", "paper", "--dim", "65"], &["--dim", "65"]);
     fail(&["--loss", "pixel"], &["--preset"]);
     // The same without a file to read.
     let nowhere = dir.path().join("nowhere");
     let check = |extra: &[&str]| run(&nowhere, &out, &[extra, &["--check"]].concat());
     for (wrong, needle) in [
-        (&["--tau", "0"][..], "--tau"),
+        (&["--cohesion=-1"][..], "--cohesion"),
         (&["--preset", "paper", "--dim", "65"], "2 to 64"),
         (&["--levles", "small"], "--levles"),
     ] {

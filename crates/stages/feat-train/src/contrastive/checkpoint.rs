@@ -1,13 +1,13 @@
 //! The state of an unfinished run: `<out>.checkpoint`.
 
-use super::state::{CurvePoint, Settled, State, Window};
+use super::state::{CurvePoint, State, Window};
 use gs_io::{Artifact, ArtifactWriter, Error, Provenance, Result};
 use stage::Stage;
 use std::path::{Path, PathBuf};
 
 /// Kind of the file.
 pub const FORMAT: &str = "feat-train-checkpoint";
-const VERSION: u32 = 3;
+const VERSION: u32 = 4;
 
 /// Where the checkpoint of `output` lies.
 pub fn path(output: &Path) -> PathBuf {
@@ -19,12 +19,10 @@ pub fn write(path: &Path, provenance: &Provenance, state: &mut State) -> Result<
     let curve: Vec<f64> =
         state.curve.iter().flat_map(|p| [p.iteration as f64, p.loss, p.alignment, p.separation, p.rate]).collect();
     let (iteration, window) = ([state.iteration], [state.window.loss, state.window.separation, state.window.count]);
-    let settled = [state.settled.lowest, state.settled.looks];
     let provenance = Provenance { format: FORMAT.into(), version: VERSION, ..provenance.clone() };
     let mut writer = ArtifactWriter::new(provenance)
         .tensor("iteration", &[1], &iteration)
         .tensor("window", &[3], &window)
-        .tensor("settled", &[2], &settled)
         .tensor("curve", &[curve.len() / 5, 5], &curve);
     for (name, values) in state.arrays() {
         writer = writer.tensor(&name, &[values.len()], values);
@@ -54,7 +52,6 @@ fn read(path: &Path, provenance: &Provenance, iterations: u64, state: &mut State
         return Err(Error::new("past the last iteration").file(path).found(iteration).expected(iterations));
     }
     let curve = a.tensor::<f64>("curve", &[None, Some(5)])?;
-    let settled = a.tensor::<f64>("settled", &[Some(2)])?;
     let window = a.tensor::<f64>("window", &[Some(3)])?;
     let mut arrays: Vec<Vec<f32>> = Vec::new();
     for (name, values) in state.arrays() {
@@ -67,7 +64,6 @@ fn read(path: &Path, provenance: &Provenance, iterations: u64, state: &mut State
     state.arrays().into_iter().zip(arrays).for_each(|((_, values), found)| *values = found);
     state.iteration = iteration;
     state.window = Window { loss: window[0], separation: window[1], count: window[2] };
-    state.settled = Settled { lowest: settled[0], looks: settled[1] };
     let point =
         |p: &[f64]| CurvePoint { iteration: p[0] as u64, loss: p[1], alignment: p[2], separation: p[3], rate: p[4] };
     state.curve = curve.chunks_exact(5).map(point).collect();

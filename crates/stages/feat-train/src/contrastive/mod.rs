@@ -71,7 +71,7 @@ fn masks_to_learn_from<'a>(
 ) -> Result<MaskSets<'a>> {
     let (levels, options) = (args.options.levels(), &args.options.contrastive);
     // A single mask has no other to be separated from, but cohesion works on it.
-    let least = if options.no_skip || options.cohesion > 0.0 { 1 } else { 2 };
+    let least = if options.cohesion > 0.0 { 1 } else { 2 };
     let sets = MaskSets::new(&inputs.footprints, context, &levels, least)?;
     let units = inputs.footprints.views.len() * levels.len();
     if sets.len() < units {

@@ -5,7 +5,6 @@ use super::masks::MaskSet;
 use super::model::{Model, Propagated, Step};
 use super::state::State;
 use crate::options::Contrastive;
-use std::rc::Rc;
 
 /// Learning rate of the graph network.
 const WEIGHT_RATE: f64 = 1e-3;
@@ -30,12 +29,6 @@ impl<'a> Solver<'a> {
         self.propagated = model.propagate(self.context);
         self.step = model.step(self.context, &self.propagated, set, noise);
         [self.step.loss, self.step.separation]
-    }
-
-    /// Mean loss of views, which nothing is learnt from.
-    pub fn mean_loss(&mut self, model: &Model<f32>, sets: &[Rc<MaskSet>]) -> f64 {
-        let losses: f64 = sets.iter().map(|set| self.forward(model, set, 0)[0]).sum();
-        losses / sets.len() as f64
     }
 
     /// Mean cosine of a mask's Gaussians with its centroid.

@@ -13,8 +13,6 @@ pub struct State {
     pub iteration: u64,
     /// Means for the next point of the curve.
     pub window: Window,
-    /// The loss of held-out views.
-    pub settled: Settled,
     pub curve: Vec<CurvePoint>,
 }
 
@@ -26,7 +24,6 @@ impl State {
             model,
             iteration: 0,
             window: Window::default(),
-            settled: Settled { lowest: f64::MAX, looks: 0.0 },
             curve: Vec::new(),
         }
     }
@@ -81,29 +78,5 @@ impl Window {
     pub fn take(&mut self, iteration: u64, alignment: f64, rate: f64) -> CurvePoint {
         let w = std::mem::take(self);
         CurvePoint { iteration, loss: w.loss / w.count, alignment, separation: w.separation / w.count, rate }
-    }
-}
-
-/// Training stops early after so many looks at the held-out views without a better loss ...
-const PATIENCE: f64 = 4.0;
-/// ... better meaning lower by this, in nats.
-const BETTER: f64 = 1e-3;
-
-/// Lowest loss of the held-out views, and how many looks ago it was.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Settled {
-    pub lowest: f64,
-    pub looks: f64,
-}
-
-impl Settled {
-    /// Whether the loss has settled, given that of a look.
-    pub fn look(&mut self, loss: f64) -> bool {
-        if loss < self.lowest - BETTER {
-            *self = Self { lowest: loss, looks: 0.0 };
-        } else {
-            self.looks += 1.0;
-        }
-        self.looks >= PATIENCE
     }
 }
