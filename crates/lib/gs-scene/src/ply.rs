@@ -201,20 +201,6 @@ pub fn write_gaussians(path: impl AsRef<Path>, gaussians: &Gaussians, comments: 
     write_atomic(path, |w| write_rows(w, path, gaussians, rows, &[], comments))
 }
 
-/// The same with a whole number more for each Gaussian, the property `instance`: -1 for none. `instance` has one per Gaussian.
-pub fn write_labelled_gaussians(
-    path: impl AsRef<Path>,
-    gaussians: &Gaussians,
-    instance: &[i32],
-    comments: &[String],
-) -> Result<()> {
-    let (path, n) = (path.as_ref(), gaussians.len());
-    if instance.len() != n {
-        return Err(Error::new("not a label per Gaussian").file(path).found(instance.len()).expected(n));
-    }
-    write_atomic(path, |w| write_rows(w, path, gaussians, (n, 0..n), &[(INSTANCE, instance)], comments))
-}
-
 /// The same for the Gaussians `rows` only, in that order, without a copy of them.
 pub fn write_some_gaussians(
     path: impl AsRef<Path>,

@@ -31,7 +31,7 @@ pub struct Args {
     /// Folder with id maps (<view>_s.npy) and, for language, mask features (<view>_f.npy)
     #[arg(long, value_name = "DIR")]
     pub(crate) masks: PathBuf,
-    /// Output file. Beside it are written <name>.ply (the Gaussians in the colours of their instances), <name>.labels.npy
+    /// Output file. Beside it are written <name>.ply (the Gaussians, each with its instance), <name>.labels.npy
     /// (an i32 for every Gaussian, -1 for none) and <name>.json (the instances as text)
     #[arg(long, value_name = "FILE")]
     pub(crate) out: PathBuf,
@@ -42,12 +42,6 @@ pub struct Args {
     /// Go on from a file of --draft, made with the same inputs and options
     #[arg(long, value_name = "FILE")]
     pub(crate) from: Option<PathBuf>,
-    /// Paint the Gaussians of the PLY beside the output in the colours of their instances, instead of their own
-    #[arg(long)]
-    pub(crate) paint: bool,
-    /// Also write one PLY per instance into this folder
-    #[arg(long, value_name = "DIR")]
-    pub(crate) per_instance_plys: Option<PathBuf>,
     #[command(flatten)]
     pub(crate) settings: Settings,
     #[command(flatten)]
@@ -80,15 +74,9 @@ pub(crate) struct Settings {
     #[arg(long, value_name = "DISTANCE", value_parser = stage::at_least(0.0f64), default_value = "0.15",
         default_value_if("cluster", "free", "0"))]
     pub epsilon: f64,
-    /// Select the finest clusters instead of the most stable ones. Only with features
-    #[arg(long)]
-    pub leaf: bool,
     /// Allow one instance of all Gaussians where nothing divides them
     #[arg(long)]
     pub allow_single_cluster: bool,
-    /// What happens to Gaussians in no cluster
-    #[arg(long, value_enum, default_value_t = Noise::Nearest)]
-    pub noise: Noise,
     /// How far the masks of pieces that do not touch must agree that both are one instance, 0 to 1; 0 joins none; for free points the
     /// default is 0
     #[arg(long, value_name = "AGREEMENT", value_parser = stage::within(0.0..=1.0), default_value = "0.5",
@@ -115,10 +103,6 @@ pub(crate) struct Settings {
         help_heading = "Matching"
     )]
     pub levels: Vec<Level>,
-    /// Least association score of a match: the IoU, times the similarity of features where these are clustered
-    #[arg(long, default_value_t = 0.2, value_name = "SCORE", value_parser = stage::within(0.0..=1.0),
-        help_heading = "Matching")]
-    pub threshold: f64,
     /// Look for parts, things and groups that texts may ask for, which masks of this many views show; 0 looks for none; for free
     /// points the default is 0
     #[arg(
@@ -156,16 +140,6 @@ pub enum Space {
     Graph,
 }
 
-/// What happens to Gaussians that the clustering calls noise.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, clap::ValueEnum, Serialize)]
-#[serde(rename_all = "lowercase")]
-pub(crate) enum Noise {
-    /// They get the instance of the nearest Gaussian in space that has one
-    Nearest,
-    /// They get no instance
-    Keep,
-}
-
 impl Settings {
     /// These settings for a scene of `n` Gaussians that are seen: nothing is left open.
     pub fn for_gaussians(&self, n: usize) -> Self {
@@ -184,7 +158,7 @@ impl Settings {
             min_cluster_size: self.min_cluster_size.unwrap_or(30),
             min_samples: self.min_samples,
             epsilon: self.epsilon,
-            selection: if self.leaf { Selection::Leaf } else { Selection::ExcessOfMass },
+            selection: Selection::ExcessOfMass,
             allow_single_cluster: self.allow_single_cluster,
             metric: Metric::Euclidean,
         }

@@ -2,9 +2,9 @@
 
 use crate::inputs::Inputs;
 use crate::options::{Args, Settings};
-use artifacts::{Draft, Health, Instances, NOISE_COLOR, instance_color, role};
-use gs_io::{Claim, Error, Outputs, Result, write_bytes};
-use gs_scene::{Gaussians, Labelled, SH_C0, ply};
+use artifacts::{Draft, Health, Instances, instance_color, role};
+use gs_io::{Claim, Error, Result, write_bytes};
+use gs_scene::Labelled;
 use ndarray::aview1;
 use serde_json::{Value, json};
 use stage::Stage;
@@ -24,14 +24,14 @@ pub(crate) fn claim(a: &Args, stage: &Stage) -> Result<Claim> {
     if let Some(draft) = &a.draft {
         return stage.outputs(draft).artifact(draft, Draft::FORMAT).reads(read).reads(maps).claim();
     }
-    let outputs = stage
+    stage
         .outputs(&a.out)
         .artifact(&a.out, Instances::FORMAT)
         .files(SIDE_FILES.map(|extension| a.out.with_extension(extension)))
         .reads(read)
         .reads(maps)
-        .drop_stale();
-    a.per_instance_plys.iter().fold(outputs, Outputs::folder).claim()
+        .drop_stale()
+        .claim()
 }
 
 /// What the stage found.
@@ -112,23 +112,13 @@ pub(crate) fn write(
     let fail = |e: serde_json::Error| Error::new(e.to_string());
     let parameters = serde_json::to_value(settings).map_err(fail)?;
     let own = vec![format!("made by cluster-match {}", env!("CARGO_PKG_VERSION")), format!("parameters {parameters}")];
-    let (gaussians, comments) = (&inputs.geometry.gaussians, inputs.geometry.comments(own.clone()));
     let [labelled, list, table] = SIDE_FILES.map(|extension| a.out.with_extension(extension));
-    let painted = a.paint.then(|| painted(gaussians, &instances.label));
-    match painted {
-        Some(painted) => ply::write_labelled_gaussians(labelled, &painted, &instances.label, &comments)?,
-        None => {
-            let all: Vec<u32> = (0..gaussians.len() as u32).collect();
-            Labelled::new(&inputs.geometry, &a.geometry, &instances.label, own)?.write(&labelled, &all)?;
-        }
-    }
+    let all: Vec<u32> = (0..instances.label.len() as u32).collect();
+    Labelled::new(&inputs.geometry, &a.geometry, &instances.label, own)?.write(&labelled, &all)?;
     gs_io::npy::write_i32(list, &aview1(&instances.label))?;
     stage.info(&health.figures().map(|(name, found)| format!("{found} {name}")).join("; "));
     let text = as_text(instances, health, &parameters);
     write_bytes(table, &serde_json::to_vec_pretty(&text).map_err(fail)?)?;
-    if let Some(folder) = &a.per_instance_plys {
-        write_instance_plys(folder, gaussians, instances, &comments)?;
-    }
     let matched = instances.support.iter().filter(|&&s| s > 0).count();
     let summary = json!({
         "largest_share": health.largest, "mask_purity": health.purity,
@@ -141,20 +131,6 @@ pub(crate) fn write(
     instances.write(&a.out, provenance)?;
     stage.info(&format!("wrote {}: {} instances, {matched} matched with masks", a.out.display(), instances.len()));
     Ok(())
-}
-
-/// The geometry in the colours of its instances.
-fn painted(g: &Gaussians, labels: &[i32]) -> Gaussians {
-    let color = |&l: &i32| u32::try_from(l).map_or(NOISE_COLOR, instance_color).map(|v| (v - 0.5) / SH_C0);
-    Gaussians {
-        means: g.means.clone(),
-        log_scales: g.log_scales.clone(),
-        rotations: g.rotations.clone(),
-        opacity_logits: g.opacity_logits.clone(),
-        sh: labels.iter().flat_map(color).collect(),
-        sh_degree: 0,
-        shift: g.shift,
-    }
 }
 
 /// The instances as JSON: where they are, how large, and as which masks they were seen.
@@ -189,18 +165,4 @@ fn as_text(instances: &Instances, health: &Health, parameters: &Value) -> Value 
         "gaussians": instances.label.len(), "without_instance": unlabelled, "descriptor_dim": instances.dim(),
         "health": health, "parameters": parameters, "instances": list,
     })
-}
-
-/// One PLY per instance, `instance_0000.ply` on.
-fn write_instance_plys(folder: &Path, g: &Gaussians, instances: &Instances, comments: &[String]) -> Result<()> {
-    let mut members = vec![Vec::new(); instances.len()];
-    for (i, &label) in instances.label.iter().enumerate() {
-        if let Ok(k) = usize::try_from(label) {
-            members[k].push(i as u32);
-        }
-    }
-    for (k, own) in members.iter().enumerate() {
-        ply::write_gaussians(folder.join(format!("instance_{k:04}.ply")), &g.select(own), comments)?;
-    }
-    Ok(())
 }

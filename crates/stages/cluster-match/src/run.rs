@@ -6,7 +6,7 @@ use crate::describe::{Witnesses, descriptors, gather};
 use crate::granules::{self, Candidates};
 use crate::group::{free, on_graph};
 use crate::inputs::Inputs;
-use crate::options::{Args, Noise, Settings, Space};
+use crate::options::{Args, Settings, Space};
 use crate::outputs::{self, Found};
 use crate::parts::split;
 use crate::profile::mask_weights;
@@ -26,6 +26,8 @@ use std::time::Instant;
 const SMALLER: &str = "give a smaller geometry, or drop small footprint entries: graph-precompute --cut 0.001";
 /// How far the masks of level small must agree that two are one part.
 const PARTS: f64 = 0.6;
+/// Least score of a match: the IoU, times the similarity of features where these are clustered.
+const LEAST_MATCH: f32 = 0.2;
 
 impl Program for Args {
     const NAME: &'static str = "cluster-match";
@@ -135,10 +137,8 @@ fn correct(
     let (means, graph, footprints) = (&inputs.geometry.gaussians.means, &inputs.graph, &inputs.footprints);
     let mut kept = vec![false; means.len()];
     graph.kept.iter().for_each(|&i| kept[i as usize] = true);
-    if settings.noise == Noise::Nearest {
-        let noise: Vec<bool> = kept.iter().zip(&found.labels).map(|(&kept, &label)| kept && label < 0).collect();
-        found.fill_from_nearest(means, |i| noise[i])?;
-    }
+    let noise: Vec<bool> = kept.iter().zip(&found.labels).map(|(&kept, &label)| kept && label < 0).collect();
+    found.fill_from_nearest(means, |i| noise[i])?;
     if settings.votes > 0 {
         let changed = found.vote(graph, footprints, &settings.levels, settings.votes)?;
         stage.info(&format!("votes of the masks changed the instance of {changed} Gaussians"));
@@ -190,7 +190,7 @@ fn match_views(
         let maps = folder.read(view)?;
         let camera = view.camera.resized(maps.width() as u32, maps.height() as u32);
         let overlaps = overlaps(gaussians, &raster, labels, &table, &camera, &maps, &settings.levels);
-        found.extend(matches(&overlaps, index as u32, settings.threshold as f32));
+        found.extend(matches(&overlaps, index as u32, LEAST_MATCH));
         masks.push(maps.id_count() as u32);
         progress.step();
     }

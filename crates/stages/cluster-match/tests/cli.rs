@@ -6,6 +6,7 @@ use artifacts::{
 use glam::DVec3;
 use gs_io::{Artifact, Provenance, hash_file};
 use gs_scene::dataset::{self, LoadOptions, Resolution};
+use gs_scene::splat::{self, Extra};
 use gs_scene::{Camera, Gaussians, Image, ply};
 use ndarray::{Array2, Array3, arr2, aview1};
 use serde_json::{Value, json};
@@ -315,12 +316,12 @@ fn instances_are_found_matched_and_described_the_same_for_any_number_of_threads(
 #[test]
 fn the_provenance_holds_every_option_and_the_forecast_is_near_the_peak() {
     let s = Scene::new();
-    s.succeed(&["--cluster", "free", "--noise", "keep"]);
+    s.succeed(&["--cluster", "free"]);
     let (_, a) = Instances::read(s.path("out/instances.safetensors")).unwrap();
     let expected = json!({
-        "cluster": "free", "agreement": 0.18, "min_cluster_size": 8, "min_samples": 10, "epsilon": 0.0, "leaf": false,
-        "allow_single_cluster": false, "noise": "keep", "join": 0.0, "votes": 0, "split": 0.0, "levels": ["large"],
-        "threshold": 0.2, "granules": 0, "describe_views": 0,
+        "cluster": "free", "agreement": 0.18, "min_cluster_size": 8, "min_samples": 10, "epsilon": 0.0,
+        "allow_single_cluster": false, "join": 0.0, "votes": 0, "split": 0.0, "levels": ["large"],
+        "granules": 0, "describe_views": 0,
     });
     assert_eq!(a.provenance().parameters, expected);
     let record = RunRecord::read(s.path("out/instances.safetensors")).unwrap();
@@ -357,7 +358,7 @@ fn options_do_what_they_say() {
     let s = Scene::new();
     for extra in [
         &["--cluster", "free", "--min-samples", "5"][..],
-        &["--cluster", "graph", "--epsilon", "0.3", "--leaf", "--min-samples", "4"],
+        &["--cluster", "graph", "--epsilon", "0.3", "--min-samples", "4"],
         &["--cluster", "graph", "--votes", "0", "--join", "0"],
         &["--votes", "8", "--join", "0"],
     ] {
@@ -383,38 +384,10 @@ fn options_do_what_they_say() {
     assert_eq!(i.len(), 1, "joined where that is asked for");
     let (i, _) = s.succeed(&["--levels", "medium,large"]);
     assert!(i.matches.len() == 2 * VIEWS && i.matches.iter().all(|m| m.mask >= 3));
-    assert!(s.succeed(&["--threshold", "1"]).0.matches.is_empty());
 
-    // Painted, Gaussians of one instance have one colour.
-    let i = s.succeed(&["--paint"]).0;
-    let painted = ply::read_gaussians(s.path("out/instances.ply")).unwrap();
-    let [a, b] = [0, 1].map(|k| i.label.iter().position(|&l| l == k).unwrap());
-    assert_eq!((&painted.means, painted.sh_degree), (&gaussians().means, 0));
-    assert!(painted.sh_of(a) != painted.sh_of(b));
-    assert!((0..81).filter(|&g| i.label[g] == 0).all(|g| painted.sh_of(g) == painted.sh_of(a)));
-
-    // One PLY per instance, none left from an earlier run.
-    let folder = s.path("plys");
-    let plys = ["--per-instance-plys", folder.to_str().unwrap()];
-    assert_eq!(s.succeed(&[&plys[..], &["--levels", "medium"]].concat()).0.len(), 1);
-    s.succeed(&plys);
-    assert!(folder.join("instance_0001.ply").exists());
-    s.succeed(&[&plys[..], &["--levels", "medium"]].concat());
-    assert!(!folder.join("instance_0001.ply").exists());
-    std::fs::write(folder.join("mine.ply"), "mine").unwrap();
-    assert_eq!(s.run(&plys).status.code(), Some(2));
-    std::fs::remove_file(folder.join("mine.ply")).unwrap();
-    let (i, _) = s.succeed(&plys);
-    for k in 0..2 {
-        let own = ply::read_gaussians(folder.join(format!("instance_{k:04}.ply"))).unwrap();
-        assert_eq!(own.len(), i.count[k] as usize);
-    }
-
-    // Noise: a Gaussian that is like neither thing.
+    // Noise: a Gaussian that is like neither thing gets the instance of its nearest neighbour.
     s.artifacts(|f| f.values.row_mut(0).assign(&aview1(&[-4.0, -4.0, 0.0])));
-    let free = ["--cluster", "free", "--min-samples", "5"];
-    assert_eq!(s.succeed(&[&free[..], &["--noise", "keep"]].concat()).0.label[0], -1);
-    things(&s.succeed(&free).0);
+    things(&s.succeed(&["--cluster", "free", "--min-samples", "5"]).0);
 }
 
 #[test]
@@ -457,11 +430,8 @@ fn instances_ply_keeps_all_harmonics_and_what_other_programs_wrote() {
     (g.sh_degree, g.sh) = (3, (0..48 * n).map(|i| (i % 101) as f32 * 0.01).collect());
     // Another program's number for each Gaussian, in place of the instance.
     let theirs: Vec<i32> = (0..n as i32).map(|i| 1000 + i).collect();
-    ply::write_labelled_gaussians(s.path("named.ply"), &g, &theirs, &[]).unwrap();
-    let named = std::fs::read(s.path("named.ply")).unwrap();
-    let at = named.windows(9).position(|w| w == b" instance").unwrap();
-    let renamed = [&named[..at], b" segments", &named[at + 9..]].concat();
-    std::fs::write(s.path("geometry.ply"), renamed).unwrap();
+    let ids = [("segments", &theirs[..])];
+    splat::write(s.path("geometry.ply"), &g, &Extra { ids: &ids, ..Extra::default() }).unwrap();
     s.artifacts(|_| {});
     let (i, _) = s.succeed(&[]);
     let out = s.path("out/instances.ply");
@@ -582,7 +552,6 @@ fn bad_input_is_one_line_and_leaves_outputs_alone() {
         ("--epsilon", "NaN", "expected 0 or more"),
         ("--join", "2", "expected 0 to 1"),
         ("--agreement", "1.1", "expected 0 to 1"),
-        ("--threshold", "1.5", "expected 0 to 1"),
         ("--levels", "huge", "expected default, small, medium or large"),
     ] {
         let out = s.run(&[option, value]);
