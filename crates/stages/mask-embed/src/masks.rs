@@ -4,12 +4,11 @@ use crate::ahead::one_ahead;
 use crate::automatic::{levels, propose};
 use crate::finished::{self, Views};
 use crate::options::{Choice, MasksArgs};
-use crate::paint::{MapSize, paint, preview};
+use crate::paint::{MapSize, paint};
 use crate::photographs;
 use crate::sam::{Embedded, Sam};
 use artifacts::{LEVELS, Level, MaskMaps, maps_path, role};
 use gs_io::{Claim, Result, Watched, write_json};
-use gs_scene::Image;
 use gs_scene::dataset::{Dataset, View};
 use onnx_models::RgbImage;
 use serde::{Deserialize, Serialize};
@@ -71,11 +70,6 @@ pub(crate) fn run(args: &MasksArgs, stage: &Stage) -> Result<()> {
             maps.write(&output)?;
             Ok(facts)
         })?;
-        if let Some(folder) = &args.preview {
-            let picture = preview(&image, &MaskMaps::read(&output)?);
-            Image::from_rgb8(picture.width as u32, picture.height as u32, &picture.pixels)
-                .write_png(folder.join(format!("{}.png", view.stem())))?;
-        }
         asked += facts.asked;
         points += facts.points;
         large += facts.masks[Level::Large as usize];
@@ -115,14 +109,12 @@ fn make(args: &MasksArgs, sam: &Sam, image: &RgbImage, embedded: Option<Embedded
     Ok((maps, facts))
 }
 
-/// The right to write id maps, their notes, the manifest and the previews. Maps that this program did not make stay.
+/// The right to write id maps, their notes and the manifest. Maps that this program did not make stay.
 fn claim(args: &MasksArgs, scene: &Dataset, manifest: &Path, stage: &Stage) -> Result<Claim> {
     let maps: Vec<PathBuf> = scene.views.iter().map(|v| maps_path(&args.out, v.stem())).collect();
     let notes = maps.iter().map(|m| finished::note_path(m));
     let outputs = stage.outputs(manifest).file(manifest).files(notes).files(&maps).reads(&scene.files).drop_stale();
-    let outputs = outputs.known_by(finished::is_own);
-    let pictures = scene.views.iter().map(|v| format!("{}.png", v.stem()));
-    args.preview.iter().fold(outputs, |outputs, folder| outputs.files_in(folder, pictures.clone())).claim()
+    outputs.known_by(finished::is_own).claim()
 }
 
 /// Says how much memory the photographs will take. The models run on an empty picture first: their need is known only then.

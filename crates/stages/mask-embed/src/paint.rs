@@ -1,8 +1,8 @@
-//! From chosen masks to an id map, and id maps as pictures.
+//! From chosen masks to an id map.
 
 use crate::automatic::Proposals;
 use crate::regions::Patch;
-use artifacts::{LEVELS, MaskMaps, flat, instance_color};
+use artifacts::{LEVELS, MaskMaps};
 use ndarray::Array3;
 use onnx_models::RgbImage;
 use rayon::prelude::*;
@@ -76,35 +76,6 @@ pub fn paint(proposals: &Proposals, chosen: &[Vec<usize>; LEVELS], size: MapSize
     MaskMaps { ids: Array3::from_shape_vec((LEVELS, height, width), ids).expect("four maps") }
 }
 
-/// Id maps as a picture: the four levels in two rows, each mask in a colour of its own over the photograph, outlined.
-/// `image` is resized to the map.
-pub fn preview(image: &RgbImage, maps: &MaskMaps) -> RgbImage {
-    let (w, h) = (maps.width(), maps.height());
-    let small = onnx_models::resize_rgb(image, w, h);
-    let mut out = RgbImage { width: 2 * w, height: 2 * h, pixels: vec![0; 4 * w * h * 3] };
-    for (level, map) in maps.ids.outer_iter().map(flat).enumerate() {
-        let first = map.iter().copied().filter(|&i| i >= 0).min().unwrap_or(0);
-        for y in 0..h {
-            for x in 0..w {
-                let id = map[y * w + x];
-                let edge = (x + 1 < w && map[y * w + x + 1] != id) || (y + 1 < h && map[(y + 1) * w + x] != id);
-                let photo = &small.pixels[(y * w + x) * 3..][..3];
-                let at = ((level / 2 * h + y) * 2 * w + level % 2 * w + x) * 3;
-                let color = instance_color((id - first) as u32).map(|c| (c * 255.0).round() as u16);
-                for c in 0..3 {
-                    out.pixels[at + c] = match id {
-                        _ if edge => 255,
-                        // No mask: the photograph, darkened.
-                        -1 => photo[c] / 3,
-                        _ => (u16::from(photo[c]) * 2 / 5 + color[c] * 3 / 5) as u8,
-                    };
-                }
-            }
-        }
-    }
-    out
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -171,14 +142,5 @@ mod tests {
         let mut owned = vec![0; 2];
         m.ids.iter().filter(|&&i| i >= 0).for_each(|&i| owned[i as usize] += 1);
         assert_eq!(owned, [50, 40]);
-    }
-
-    #[test]
-    fn previews_show_four_levels() {
-        let m = MaskMaps { ids: Array3::from_elem((4, 2, 4), -1) };
-        let photo = RgbImage { width: 8, height: 4, pixels: vec![90; 96] };
-        let p = preview(&photo, &m);
-        assert_eq!((p.width, p.height), (8, 4));
-        assert!(p.pixels.iter().all(|&v| v == 30));
     }
 }
