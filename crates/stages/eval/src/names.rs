@@ -28,7 +28,7 @@ pub(crate) fn run(o: &NamesOptions, parameters: Value, stage: &Stage) -> Result<
     if vocabulary.repeated > 0 {
         stage.warn(&format!("lines of the vocabulary that name something again are left out: {}", vocabulary.repeated));
     }
-    let features = vocabulary.encode(&source, &o.templates(), "--vocabulary")?;
+    let features = vocabulary.encode(&source, &o.templates.all(), "--vocabulary")?;
     // The names are of the instances as they were clustered: edits come and go.
     let before = o.edits.as_ref().map(|_| Instances::read(&o.instances)).transpose()?;
     let clustered = before.as_ref().map_or(&scene.instances, |(instances, _)| instances);

@@ -25,6 +25,22 @@ pub struct Inputs {
     pub edits: Option<PathBuf>,
 }
 
+/// What words are put into.
+#[derive(Debug, Clone, Default, clap::Args, Serialize)]
+pub struct Templates {
+    /// Put every text or name into this template, such as "a photo of a {}"; several templates are averaged; clip for the seven
+    /// of CLIP's authors
+    #[arg(long, value_name = "TEMPLATE", value_parser = template)]
+    template: Vec<String>,
+}
+
+impl Templates {
+    /// The templates, with those of a named set in its place.
+    pub fn all(&self) -> Vec<String> {
+        self.template.iter().flat_map(|t| named(t, "clip", &CLIP_TEMPLATES)).collect()
+    }
+}
+
 /// Which instances answer a text.
 #[derive(Debug, Clone, Default, clap::Args, Serialize)]
 pub struct Choice {
@@ -37,10 +53,9 @@ pub struct Choice {
     /// Score by LERF's relevancy against these texts, with commas between; lerf for its own: object,things,stuff,texture
     #[arg(long, value_delimiter = ',', value_name = "TEXTS", value_parser = words)]
     pub negatives: Vec<String>,
-    /// Put every text into this template, such as "a photo of a {}"; several templates are averaged; clip for the seven of
-    /// CLIP's authors
-    #[arg(long, value_name = "TEMPLATE", value_parser = template)]
-    pub template: Vec<String>,
+    #[command(flatten)]
+    #[serde(flatten)]
+    pub templates: Templates,
     /// Also select those of the ten best instances whose mean feature is within this distance of the best one's, as
     /// OpenGaussian does with 0.9
     #[arg(long, value_name = "DISTANCE", requires = "features", value_parser = stage::positive::<f32>)]
@@ -56,11 +71,6 @@ impl Choice {
         self.negatives.iter().flat_map(|n| named(n, "lerf", &LERF_NEGATIVES)).collect()
     }
 
-    /// The templates, with those of a named set in its place.
-    pub fn templates(&self) -> Vec<String> {
-        templates(&self.template)
-    }
-
     /// Whether people say how many instances or which scores are selected.
     pub fn is_decided(&self) -> bool {
         self.top_k.is_some() || self.threshold.is_some()
@@ -73,7 +83,7 @@ impl Choice {
             self.threshold.map(|t| format!("score at least {t}")),
             min_support.map(|n| format!("matched in at least {n} views")),
             (!self.negatives.is_empty()).then(|| format!("relevancy against {}", self.negatives.join(", "))),
-            (!self.template.is_empty()).then(|| format!("templates {}", self.template.join(", "))),
+            (!self.templates.template.is_empty()).then(|| format!("templates {}", self.templates.template.join(", "))),
             self.join.map(|d| format!("look-alikes within {d} joined")),
         ];
         parts.into_iter().flatten().map(|part| format!("; {part}")).collect()
@@ -196,20 +206,12 @@ pub struct NamesOptions {
     /// names of the table]
     #[arg(long, value_name = "FILE")]
     pub vocabulary: Option<PathBuf>,
-    /// Put every name into this template, such as "a photo of a {}"; several templates are averaged; clip for the seven of
-    /// CLIP's authors
-    #[arg(long, value_name = "TEMPLATE", value_parser = template)]
-    pub template: Vec<String>,
+    #[command(flatten)]
+    #[serde(flatten)]
+    pub templates: Templates,
     /// Output JSON [default: names.json beside the instances, where all programs look for it]
     #[arg(long, value_name = "FILE")]
     pub out: Option<PathBuf>,
-}
-
-impl NamesOptions {
-    /// The templates, with those of a named set in its place.
-    pub fn templates(&self) -> Vec<String> {
-        templates(&self.template)
-    }
 }
 
 /// Where labels lie.
@@ -524,10 +526,6 @@ fn template(text: &str) -> Result<String> {
     Err(Error::new("no place for the text").expected("{} in it, or clip"))
 }
 
-fn templates(given: &[String]) -> Vec<String> {
-    given.iter().flat_map(|t| named(t, "clip", &CLIP_TEMPLATES)).collect()
-}
-
 /// The texts of a set where it is named, else the text itself.
 fn named(text: &str, name: &str, set: &[&str]) -> Vec<String> {
     if text == name { set.iter().map(|t| (*t).into()).collect() } else { vec![text.into()] }
@@ -540,9 +538,10 @@ mod tests {
     #[test]
     fn names_of_sets_stand_for_their_texts() {
         let negatives = vec!["lerf".into(), "wall".into()];
-        let choice = Choice { negatives, template: vec!["a {}".into(), "clip".into()], ..Choice::default() };
+        let templates = Templates { template: vec!["a {}".into(), "clip".into()] };
+        let choice = Choice { negatives, templates, ..Choice::default() };
         assert_eq!(choice.negatives(), ["object", "things", "stuff", "texture", "wall"]);
-        let templates = choice.templates();
+        let templates = choice.templates.all();
         assert!(templates.len() == 8 && templates.iter().all(|t| template(t).is_ok()));
         assert!(template("clip").is_ok() && template("clips").is_err());
     }

@@ -147,7 +147,7 @@ impl Found {
         if let Some((described, _)) = &self.described {
             let source = TextSource::open_for(&described.artifact, self.dim(), &o.texts)?;
             let negatives = source.known(&[], &o.choice.negatives(), "--negatives")?;
-            let features = source.encode_in(&o.choice.templates(), texts)?;
+            let features = source.encode_in(&o.choice.templates.all(), texts)?;
             let chosen = described.choose(&features, &negatives, o.share()).into_iter().zip(&features);
             let answer = |(Chosen { gaussians, score }, feature): (_, &Option<_>)| match feature {
                 Some(_) => Ok(Answered { gaussians, score, ..Answered::default() }),

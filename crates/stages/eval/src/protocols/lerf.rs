@@ -152,7 +152,7 @@ fn ask(
         Some(b) => b.queries.iter().map(|q| (*q).to_string()).collect(),
         None => categories.iter().map(|c| (*c).clone()).collect(),
     };
-    let encoded = source.encode_in(&o.choice.templates(), &texts)?;
+    let encoded = source.encode_in(&o.choice.templates.all(), &texts)?;
     let mut source = Some(source);
     let mut answers = Vec::new();
     for rule in rules(o) {

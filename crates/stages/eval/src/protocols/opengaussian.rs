@@ -20,8 +20,8 @@ const FEWEST_INLIERS: usize = 10;
 
 /// The rule's choice among the instances; templates are those of the command.
 pub fn choice(o: &LerfOptions) -> Choice {
-    let (features, template) = (o.choice.features.clone(), o.choice.template.clone());
-    Choice { join: Some(JOIN), features, template, ..Choice::default() }
+    let (features, templates) = (o.choice.features.clone(), o.choice.templates.clone());
+    Choice { join: Some(JOIN), features, templates, ..Choice::default() }
 }
 
 /// What the rule does beyond its choice, in words.

@@ -186,7 +186,7 @@ impl<'a> Asker<'a> {
             by_chance: None,
             index: Index::new(&scene.instances),
             source,
-            templates: choice.templates(),
+            templates: choice.templates.all(),
             negatives,
             selection: Selection::new(choice.top_k, choice.threshold, min_support.unwrap_or(1)),
             join,
