@@ -202,7 +202,7 @@ EMBED_ARGS|--corp mean|--crop white
 GRAPH_ARGS|--anchor-ration 0.1|--k 0
 FEAT_ARGS|--levles small|--layers 5
 CLUSTER_ARGS|--jion 0.6|--join 2
-SCORE_ARGS|--alhpa 0.5|--alpha 3
+SCORE_ARGS|--treshold 0.5|--threshold 3
 REPORT_ARGS|--veiws x|
 LIST
 wrong QUERIES '"red mug' 'no quotes around them'

@@ -93,20 +93,19 @@ impl Choice {
 /// How a selection becomes a mask.
 #[derive(Debug, Clone, clap::Args, Serialize)]
 pub struct Masking {
-    /// Render the selected Gaussians alone, as OpenGaussian and CAGS score, or count only what is visible of them
+    /// Render the selected Gaussians alone (opacity above 0.7), as OpenGaussian and CAGS score, or count only what is visible of them (half)
     /// [default: visible in query, selected in score and lerf]
     #[arg(long, value_enum)]
     pub silhouette: Option<Silhouette>,
-    /// A pixel belongs to the mask above this opacity, 0 to 1 [default: 0.7 for selected, 0.5 for visible]
-    #[arg(long, value_name = "VALUE", value_parser = stage::within(0.0f32..=1.0))]
-    pub alpha: Option<f32>,
 }
 
 impl Masking {
     /// The rule, where `default` is the command's silhouette.
     pub fn rendering(&self, default: Silhouette) -> Rendering {
-        let silhouette = self.silhouette.unwrap_or(default);
-        Rendering { silhouette, threshold: self.alpha.unwrap_or(silhouette.default_threshold()) }
+        match self.silhouette.unwrap_or(default) {
+            Silhouette::Selected => Rendering::SELECTED,
+            Silhouette::Visible => Rendering::SEEN,
+        }
     }
 }
 
@@ -338,10 +337,6 @@ pub struct LerfOptions {
     #[command(flatten)]
     #[serde(flatten)]
     pub labels: Labels,
-    /// Name of the scene; one of the benchmark's four is asked the benchmark's queries, any other its labels' categories
-    /// [default: that of its folder]
-    #[arg(long, value_parser = words)]
-    pub name: Option<String>,
     /// Where the true masks come from
     #[arg(long, value_enum, default_value = "polygons")]
     pub truth: Truth,
@@ -370,7 +365,6 @@ impl LerfOptions {
             ("--negatives", !choice.negatives.is_empty()),
             ("--join", choice.join.is_some()),
             ("--silhouette", masking.silhouette.is_some()),
-            ("--alpha", masking.alpha.is_some()),
         ];
         let e = |what: &str, field: &str| Error::new(what).field(field);
         if let Some((option, _)) = fixed.iter().find(|(_, given)| *given) {

@@ -16,14 +16,6 @@ pub enum Silhouette {
 }
 
 impl Silhouette {
-    /// The value above which a pixel belongs, where none is given: 0.7 of accumulated alpha, or half of the pixel.
-    pub const fn default_threshold(self) -> f32 {
-        match self {
-            Self::Selected => 0.7,
-            Self::Visible => 0.5,
-        }
-    }
-
     /// The name it has on the command line.
     pub fn name(self) -> &'static str {
         match self {
@@ -46,11 +38,10 @@ pub struct Rendering {
 const CHANNELS: usize = 16;
 
 impl Rendering {
-    /// A selection alone, by the threshold where none is given.
-    pub const SELECTED: Self =
-        Self { silhouette: Silhouette::Selected, threshold: Silhouette::Selected.default_threshold() };
-    /// What is seen of a selection, by the threshold where none is given.
-    pub const SEEN: Self = Self { silhouette: Silhouette::Visible, threshold: Silhouette::Visible.default_threshold() };
+    /// A selection alone.
+    pub const SELECTED: Self = Self { silhouette: Silhouette::Selected, threshold: 0.7 };
+    /// What is seen of a selection: half of a pixel.
+    pub const SEEN: Self = Self { silhouette: Silhouette::Visible, threshold: 0.5 };
 
     /// Masks of several selections (ascending indices of Gaussians) in one view, in order; rendered as `raster` says.
     pub fn masks(

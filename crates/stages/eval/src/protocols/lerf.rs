@@ -30,7 +30,7 @@ pub(crate) fn run(o: &LerfOptions, parameters: Value, stage: &Stage) -> Result<S
         e.expected("a folder of <frame>.json").hint("give --labels")
     };
     let folder = labels::folder(o.labels.labels.as_deref(), scene.unwrap_or(Path::new(".")))?.ok_or_else(none)?;
-    let name = o.name.clone().unwrap_or_else(|| folder_name(scene.unwrap_or(&folder)));
+    let name = folder_name(scene.unwrap_or(&folder));
     let dataset = scene.map(|scene| load(scene, &LoadOptions::default(), stage)).transpose()?;
     let read = o.inputs.iter().zip(&dataset).flat_map(|(inputs, dataset)| inputs.files(dataset));
     let outputs = o.save_predictions.iter().fold(outputs(&o.out, stage), Outputs::folder);

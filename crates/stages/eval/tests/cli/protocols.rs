@@ -17,6 +17,8 @@ const DIM: usize = 24;
 
 struct Scene {
     dir: tempfile::TempDir,
+    /// Of the dataset's folder.
+    name: &'static str,
 }
 
 impl Scene {
@@ -42,7 +44,7 @@ impl Scene {
         let things = TrueScene::read(scene.join("truth/scene.json")).unwrap().objects;
         let step = (truth.position.len() / 2500).max(1);
         let points: Vec<usize> = (0..truth.position.len()).step_by(step).collect();
-        let this = Self { dir };
+        let this = Self { dir, name: "scene0000_00" };
         let mut g = Gaussians::default();
         let mut label = Vec::new();
         let (merged, cut) = (things.len() as i32 - 1, things.len() as i32 - 3);
@@ -128,7 +130,7 @@ impl Scene {
         self.dir.path().join(name)
     }
     fn scene(&self) -> PathBuf {
-        self.at("scene0000_00")
+        self.at(self.name)
     }
     fn geometry(&self) -> PathBuf {
         self.at("geometry.ply")
@@ -502,7 +504,7 @@ fn tables_join_scenes_and_refuse_what_does_not_fit() {
     refused("b", "a confusion matrix does not fit");
     put(&json!({"protocol": "x"}));
     refused("b", "protocol: not metrics of a protocol");
-    s.metrics("lerf", &["--name", "another"]);
+    s.metrics("lerf", &[]);
     refused("out", "two protocols");
 }
 
@@ -653,14 +655,16 @@ fn the_truth_of_a_scan_is_checked_with_its_texts() {
 
 #[test]
 fn a_benchmark_scene_asks_its_own_table() {
-    let s = Scene::new();
-    let notes = s.metrics("lerf", &["--name", "teatime"])["notes"].to_string();
+    let mut s = Scene::new();
+    std::fs::rename(s.scene(), s.at("teatime")).unwrap();
+    s.name = "teatime";
+    let notes = s.metrics("lerf", &[])["notes"].to_string();
     // frame_00001, 3 and 5 are labelled; none is teatime's.
     assert!(notes.contains("not in the benchmark") && notes.contains("published numbers have 59"), "{notes}");
     assert!(notes.contains("no labelled object was scored"), "{notes}");
     let label = s.scene().join("label");
     std::fs::rename(label.join("frame_00001.json"), label.join("frame_00002.json")).unwrap();
-    let m = s.metrics("lerf", &["--name", "teatime"]);
+    let m = s.metrics("lerf", &[]);
     assert!(m["pairs"].as_array().unwrap().iter().all(|p| p["iou"] == 0.0));
     assert!(m["notes"].to_string().contains("not in the benchmark's table of queries"), "{}", m["notes"]);
 }
