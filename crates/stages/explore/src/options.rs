@@ -3,9 +3,8 @@
 use artifacts::InstanceNames;
 use clap::{Parser, Subcommand};
 use gs_io::{Error, Result};
-use gs_scene::dataset::Resolution;
 use query::{EngineArgs, TextOptions};
-use serde::{Serialize, Serializer};
+use serde::Serialize;
 use stage::{CommonArgs, Program, Stage};
 use std::net::IpAddr;
 use std::path::PathBuf;
@@ -132,20 +131,9 @@ pub struct PageOptions {
     /// A text that the page can answer; may be given several times. Without a server there is no language model
     #[arg(long, value_name = "WORDS")]
     pub text: Vec<String>,
-    /// Most photographs in the file, evenly spread over the views
-    #[arg(long, value_name = "COUNT", default_value_t = 40)]
-    pub photographs: usize,
-    /// Size of the photographs: a width that wider ones are shrunk to, such as 480px, or a divisor
-    #[arg(long, default_value = "480px")]
-    #[serde(serialize_with = "as_text")]
-    pub resolution: Resolution,
     /// Output file
     #[arg(long, value_name = "FILE")]
     pub out: PathBuf,
-}
-
-fn as_text<S: Serializer>(resolution: &Resolution, s: S) -> Result<S::Ok, S::Error> {
-    s.collect_str(resolution)
 }
 
 impl Program for Args {

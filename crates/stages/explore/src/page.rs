@@ -6,6 +6,7 @@ use crate::{answers, describe, pictures, web};
 use base64::Engine;
 use base64::engine::general_purpose::STANDARD;
 use gs_io::{Error, Result, write_bytes};
+use gs_scene::dataset::Resolution;
 use query::Index;
 use serde_json::{Map, Value, json};
 use stage::Stage;
@@ -17,13 +18,17 @@ const POLICY: &str = "<meta http-equiv=\"Content-Security-Policy\" content=\"def
 const LINKED_STYLE: &str = "<link rel=\"stylesheet\" href=\"app/style.css\">";
 const LINKED_SCRIPT: &str = "<script type=\"module\" src=\"app/main.js\"></script>";
 
+/// Most photographs in the file, evenly spread over the views, and what wider ones are shrunk to.
+const PHOTOGRAPHS: usize = 40;
+const WIDTH: Resolution = Resolution::Width(480);
+
 /// Writes the file.
 pub fn run(o: &PageOptions, parameters: Value, stage: &Stage) -> Result<()> {
     let mut claim = stage.outputs(&o.out).file(&o.out).reads(o.source.files()).claim()?;
-    let world = World::read(&o.source, o.resolution, stage)?;
+    let world = World::read(&o.source, WIDTH, stage)?;
     let edited = world.saved(world.edits_file()?)?;
     let texts = texts(&world, &edited, &o.text)?;
-    let shown = spread(world.dataset.views.len(), o.photographs);
+    let shown = spread(world.dataset.views.len(), PHOTOGRAPHS);
     let blob = describe::blob(&world);
     let scene = describe::scene(&world, &edited, &blob, "file", &shown);
     let pictures = pictures_of(&world, &edited, &shown, texts, stage)?;

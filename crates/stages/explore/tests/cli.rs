@@ -177,16 +177,12 @@ fn one_file_holds_the_scene() {
     let run = Run::new();
     let out = run.dir.path().join("scene.html");
     let file = out.display().to_string();
-    let made = run.run("page", &["--out", &file, "--text", "far ball", "--photographs", "1"]);
+    let made = run.run("page", &["--out", &file, "--text", "far ball"]);
     assert!(made.status.success(), "{}", String::from_utf8_lossy(&made.stderr));
     let page = std::fs::read_to_string(&out).unwrap();
-    assert!(page.contains("\"scores\":[0.0,1.0]") && page.matches("data:image/jpeg").count() == 3);
+    assert!(page.contains("\"scores\":[0.0,1.0]") && page.matches("data:image/jpeg").count() == 4);
     let first = std::fs::read(&out).unwrap();
-    assert!(
-        run.run("page", &["--out", &file, "--text", "far ball", "--photographs", "1", "--threads", "1"])
-            .status
-            .success()
-    );
+    assert!(run.run("page", &["--out", &file, "--text", "far ball", "--threads", "1"]).status.success());
     assert_eq!(std::fs::read(&out).unwrap(), first, "the same bytes");
     // Somebody else's file stays.
     let theirs = run.dir.path().join("theirs.html");
