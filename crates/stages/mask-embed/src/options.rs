@@ -94,12 +94,12 @@ pub struct Choice {
     /// Points asked along the longer side of a photograph; along the shorter as many as fit the same distance
     #[arg(long, default_value_t = 32, value_name = "COUNT", value_parser = stage::within(1usize..=256))]
     pub points_per_side: usize,
-    /// Least IoU that SAM predicts for a mask.
-    #[arg(skip = 0.7)]
+    /// Least IoU that SAM predicts for a mask, 0 to 1
+    #[arg(long, default_value_t = 0.7, value_name = "IOU", value_parser = stage::within(0.0..=1.0))]
     pub pred_iou: f64,
-    /// Least stability of a mask: IoU of the mask cut a little tighter and a little looser. SAM's own script has 0.85; the edges of
-    /// MobileSAM are softer.
-    #[arg(skip = 0.7)]
+    /// Least stability of a mask, 0 to 1: IoU of the mask cut a little tighter and a little looser. SAM's own script has
+    /// 0.85; the edges of MobileSAM are softer
+    #[arg(long, default_value_t = 0.7, value_name = "IOU", value_parser = stage::within(0.0..=1.0))]
     pub stability: f64,
     /// Skip nothing: ask every point of the grid, each through the decoder's whole graph (docs/performance.md)
     #[arg(long)]
