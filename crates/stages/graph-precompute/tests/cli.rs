@@ -11,8 +11,6 @@ use std::path::{Path, PathBuf};
 use std::process::{Command, Output};
 
 const SIZE: u32 = 48;
-/// What the Gaussians' harmonics make.
-const GREY: f32 = 0.5 + 0.282_094_8 * 0.3;
 
 /// A COLMAP scene of two clusters of Gaussians in photographs of `size` x `size` pixels, one mask each and one for both; and a
 /// folder for the output.
@@ -24,7 +22,7 @@ fn setup(size: u32) -> (tempfile::TempDir, PathBuf, PathBuf) {
     let half = |x| i32::from(x >= size as usize / 2);
     let id = |(level, _, x)| if level == 3 { 6 } else { 2 * level as i32 + half(x) };
     let maps = MaskMaps { ids: Array3::from_shape_fn((4, size as usize, size as usize), id) };
-    let grey = Image { width: size, height: size, rgb: vec![GREY; 3 * n], alpha: None };
+    let grey = Image { width: size, height: size, rgb: vec![0.5; 3 * n], alpha: None };
     let mut views = Vec::new();
     for v in 0..5 {
         let eye = DVec3::new(f64::from(v) * 0.1 - 0.2, -0.2, -3.0);
