@@ -1,5 +1,5 @@
-//! Differentiable rasteriser of 3D Gaussians on the CPU: projection, tiles, forward, backward, per-pixel weights. It knows
-//! nothing of training.
+//! Differentiable rasteriser of 3D Gaussians on the CPU: projection, tiles, forward, backward, per-pixel weights; and whether
+//! Gaussians show photographs. It knows nothing of training.
 //!
 //! Conventions (those of gsplat and the original 3DGS): pixel centres at +0.5; 0.3 added to the 2D covariance's diagonal;
 //! alpha = min(0.99, opacity exp(-sigma)), skipped below 1/255; compositing stops before the Gaussian that would bring the
