@@ -38,8 +38,8 @@ pub struct EngineOptions {
     /// ONNX Runtime 1.29 and later send usage data unless the environment holds `ORT_DISABLE_TELEMETRY=1`, and no call
     /// comes early enough to stop them; so the library is not loaded without that variable.
     pub onnx_runtime: Option<PathBuf>,
-    /// Threads of one [`Model::run`] with rten: 1 for models that [`parallel_map`] runs several at a time, 0 for one
-    /// per thread of the program. ONNX Runtime always uses all, one run after another.
+    /// Threads of one [`Model::run`] with rten: 1 for models that [`parallel_map`] runs several at a time, 0 for those
+    /// of rayon's pool that the run is called in. ONNX Runtime always uses all, one run after another.
     pub threads_per_run: usize,
 }
 

@@ -15,8 +15,8 @@ struct RtenModel {
     outputs: Vec<ValueInfo>,
     output_ids: Vec<NodeId>,
     threads: usize,
-    /// Idle thread pools: a run takes one, so that runs at the same time do not share threads.
-    pools: Mutex<Vec<Arc<ThreadPool>>>,
+    /// Idle thread pools and their threads: a run takes one, so that runs at the same time do not share threads.
+    pools: Mutex<Vec<(usize, Arc<ThreadPool>)>>,
 }
 
 pub(crate) fn open(
@@ -58,7 +58,6 @@ pub(crate) fn open(
         .map(|n| model.find_node(n).ok_or_else(|| Error::new("no such output").file(path).field(n)))
         .collect::<Result<Vec<_>>>()?;
     let outputs = output_ids.iter().map(|&id| info(id)).collect();
-    let threads = if threads == 0 { rayon::current_num_threads() } else { threads };
     Ok(Box::new(RtenModel {
         path: path.to_path_buf(),
         inputs,
@@ -97,11 +96,16 @@ impl Model for RtenModel {
             };
             views.push((id, view.into()));
         }
-        let pool = self.pools.lock().expect("no panic holds this lock").pop();
-        let pool = pool.unwrap_or_else(|| Arc::new(ThreadPool::with_num_threads(self.threads)));
+        let threads = if self.threads == 0 { rayon::current_num_threads() } else { self.threads };
+        let idle = || self.pools.lock().expect("no panic holds this lock");
+        let taken = {
+            let mut idle = idle();
+            idle.iter().position(|(n, _)| *n == threads).map(|i| idle.swap_remove(i).1)
+        };
+        let pool = taken.unwrap_or_else(|| Arc::new(ThreadPool::with_num_threads(threads)));
         let options = RunOptions::default().with_thread_pool(Some(Arc::clone(&pool)));
         let values = self.model.run(views, &self.output_ids, Some(options));
-        self.pools.lock().expect("no panic holds this lock").push(pool);
+        idle().push((threads, pool));
         let values = values.map_err(|e| fail(&e))?;
         values
             .into_iter()

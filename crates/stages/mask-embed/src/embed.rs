@@ -1,6 +1,6 @@
 //! `mask-embed embed`: CLIP features of the masks of existing id maps.
 
-use crate::ahead::one_ahead;
+use crate::ahead::ahead;
 use crate::crops::{Owner, cut, no_maps, owners, read_maps};
 use crate::finished::{self, Views};
 use crate::options::EmbedArgs;
@@ -116,7 +116,7 @@ pub(crate) fn run(args: &EmbedArgs, stage: &Stage) -> Result<()> {
         pictures += facts.pictures;
         Ok(())
     };
-    one_ahead(with_maps, prepare, finish)?;
+    ahead(&with_maps.collect::<Vec<_>>(), 1, prepare, finish)?;
     let views = views.finish("features");
     if views.is_empty() {
         match &wanted {

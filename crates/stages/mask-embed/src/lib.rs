@@ -4,7 +4,7 @@
 //! [`automatic`]), chooses ([`nms`]) and writes id maps at four levels ([`paint`], `regions`); `import` takes them from label
 //! pictures instead; `embed` shows the picture of each mask to CLIP. All write LangSplat's files: `<view>_s.npy` and
 //! `<view>_f.npy`. [`crops`] gives the training script of the small encoder what the pipeline would see. `finished` knows
-//! which views are done already, `ahead` makes the next one ready, `logits` how sure a mask is of each pixel.
+//! which views are done already, `ahead` works on several at a time, `logits` how sure a mask is of each pixel.
 
 mod ahead;
 pub mod automatic;

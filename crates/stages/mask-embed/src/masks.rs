@@ -1,21 +1,25 @@
 //! `mask-embed masks`: id maps from photographs with SAM.
 
-use crate::ahead::one_ahead;
+use crate::ahead::ahead;
 use crate::automatic::{levels, propose};
 use crate::finished::{self, Views};
 use crate::options::{Choice, MasksArgs};
 use crate::paint::{MapSize, paint};
 use crate::photographs;
-use crate::sam::{Embedded, Sam};
+use crate::sam::Sam;
 use artifacts::{LEVELS, Level, MaskMaps, maps_path, role};
-use gs_io::{Claim, Result, Watched, write_json};
+use gs_io::{Claim, Error, Result, Watched, write_json};
 use gs_scene::dataset::{Dataset, View};
 use onnx_models::RgbImage;
+use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 use serde_json::json;
 use stage::{Stage, peak_rss_bytes};
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
+
+/// Photographs that are worked on at a time, where there are as many threads: each takes 400 MB with MobileSAM.
+const LANES: usize = 8;
 
 /// Facts of a view's id maps.
 #[derive(Serialize, Deserialize)]
@@ -48,24 +52,24 @@ pub(crate) fn run(args: &MasksArgs, stage: &Stage) -> Result<()> {
     warn_of_other_maps(folder, &scene.views, stage)?;
 
     let mut views = Views::new(stage, scene.views.len());
-    let mut forecast_made = false;
-    let prepare = |view| {
+    let read = |view: &View| {
         let (image, image_hash) = photographs::read(view)?;
         let key = finished::made_from(&[&parameters.to_string(), sam.hash(), &image_hash]);
-        let mut embedded = None;
-        if !finished::is_done(&maps_path(folder, view.stem()), &key) {
-            if !std::mem::replace(&mut forecast_made, true) {
-                forecast(args, &sam, &scene.views, stage)?;
-            }
-            embedded = Some(sam.encode(&image)?);
-        }
-        Ok(Prepared { view, image, key, embedded })
+        let done = finished::is_done(&maps_path(folder, view.stem()), &key);
+        Ok((image, key, done))
+    };
+    if scene.views.par_iter().any(|view| read(view).is_ok_and(|(.., done)| !done)) {
+        forecast(args, &sam, &scene.views, stage)?;
+    }
+    let prepare = |view| {
+        let (image, key, done) = read(view)?;
+        Ok((view, key, if done { None } else { Some(make(args, &sam, &image)?) }))
     };
     let (mut asked, mut points, mut large) = (0, 0, 0);
-    let finish = |Prepared { view, image, key, embedded }: Prepared| {
+    let finish = |(view, key, made): (&View, String, Option<(MaskMaps, Facts)>)| {
         let output = maps_path(folder, view.stem());
         let facts: Facts = views.next(view, &output, &key, || {
-            let (maps, facts) = make(args, &sam, &image, embedded)?;
+            let (maps, facts) = made.ok_or_else(|| Error::new("the id map changed during the run").file(&output))?;
             finished::begin(&manifest, &output)?;
             maps.write(&output)?;
             Ok(facts)
@@ -75,7 +79,7 @@ pub(crate) fn run(args: &MasksArgs, stage: &Stage) -> Result<()> {
         large += facts.masks[Level::Large as usize];
         Ok(())
     };
-    one_ahead(scene.views.iter(), prepare, finish)?;
+    ahead(&scene.views.iter().collect::<Vec<_>>(), LANES, prepare, finish)?;
     let views = views.finish("id maps");
     if asked < points {
         stage.skipped(&format!("{} of {points} points: within masks already found", points - asked));
@@ -88,20 +92,9 @@ pub(crate) fn run(args: &MasksArgs, stage: &Stage) -> Result<()> {
     stage.record(&mut claim, parameters, inputs, json!({ "views": count, "masks_large": large }))
 }
 
-/// A photograph on its way to its id maps.
-struct Prepared<'a> {
-    view: &'a View,
-    image: RgbImage,
-    /// Hash of what its maps are made from.
-    key: String,
-    /// For SAM's decoder, where maps are to be made.
-    embedded: Option<Embedded>,
-}
-
 /// The id maps of a photograph.
-fn make(args: &MasksArgs, sam: &Sam, image: &RgbImage, embedded: Option<Embedded>) -> Result<(MaskMaps, Facts)> {
-    let embedded = embedded.map_or_else(|| sam.encode(image), Ok)?;
-    let proposals = propose(sam, &embedded, &args.choice)?;
+fn make(args: &MasksArgs, sam: &Sam, image: &RgbImage) -> Result<(MaskMaps, Facts)> {
+    let proposals = propose(sam, &sam.encode(image)?, &args.choice)?;
     let size = MapSize::of(image, args.map_size, args.min_area);
     let maps = paint(&proposals, &levels(&proposals.masks), size);
     let (points, asked) = (proposals.points, proposals.asked);
@@ -120,15 +113,15 @@ fn claim(args: &MasksArgs, scene: &Dataset, manifest: &Path, stage: &Stage) -> R
 /// Says how much memory the photographs will take. The models run on an empty picture first: their need is known only then.
 fn forecast(args: &MasksArgs, sam: &Sam, views: &[View], stage: &Stage) -> Result<()> {
     let nothing = RgbImage { width: 4, height: 3, pixels: vec![0; 36] };
-    // Twice: the decoder answers about one photograph while the next is encoded.
     let choice = Choice { points_per_side: 4, ..args.choice };
-    one_ahead(0..2, |_| sam.encode(&nothing), |embedded| propose(sam, &embedded, &choice).map(drop))?;
+    let lanes = LANES.min(views.len()).min(rayon::current_num_threads());
+    ahead(&vec![(); lanes], lanes, |()| propose(sam, &sam.encode(&nothing)?, &choice), |_| Ok(()))?;
     let (side, pixels) = (args.choice.points_per_side as u64, photographs::largest(views));
     let map = if args.map_size == 0 { pixels } else { pixels.min((args.map_size * args.map_size * 3 / 4) as u64) };
     // Of every third point of the grid or so that is asked three masks wait with their logits, 200 kB where one fills the
     // picture; then the map, 16 bytes a pixel, and the masks of a level, a byte for each pixel of their boxes.
     let waiting = 100_000 * (side * side * 3 / 4);
-    let needed = peak_rss_bytes().unwrap_or(0) + waiting + 9 * pixels + 30 * map;
+    let needed = peak_rss_bytes().unwrap_or(0) + lanes as u64 * (waiting + 9 * pixels + 30 * map);
     stage.forecast(needed, "give fewer --threads, or smaller photographs (--resolution) and maps (--map-size)")
 }
 

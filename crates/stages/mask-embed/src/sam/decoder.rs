@@ -5,6 +5,8 @@
 //!   instead: `q (X W)' = (q W') X'` and `a (X W) = (a X) W`, the same sums in another order.
 //! * What the first layer needs of the photograph is computed once for all points ([`Photograph`]).
 //! * Masks whose predicted IoU is too low are never drawn.
+//! * Of the pixels beside the photograph, which fill the square, a sample is read ([`FILLING`]). This alone changes the masks: on
+//!   four photographs of the desk half of 1,050 masks keep an IoU of 0.998 or more with those of all pixels, 95 % keep 0.979.
 //!
 //! The graph itself is the oracle: [`super::Sam`] compares the two when it opens a model.
 
@@ -23,6 +25,8 @@ const HEADS: usize = 8;
 /// Side and number of the encoder's pixels.
 const SIDE: usize = MASK_SIDE / 4;
 const PIXELS: usize = SIDE * SIDE;
+/// Of so many pixels that fill the square, one is read and stands for the others.
+const FILLING: usize = 16;
 /// Pixels that are worked on together: all their channels fit the processor's own cache.
 const TILE: usize = 128;
 /// Added to variances, as in PyTorch's layer norm and in SAM's own for pictures.
@@ -75,26 +79,37 @@ pub(super) struct Photograph {
     pub keys: Vec<f32>,
     pub values: Vec<f32>,
     pub queries: Vec<f32>,
-    /// Pixels of the photograph; the others fill the square.
-    pub inside: Vec<usize>,
+    /// The pixels, by their index in the square: those of the photograph, then a sample of those that fill the square.
+    pub order: Vec<usize>,
+    /// How many are of the photograph.
+    pub inside: usize,
+    /// Logarithm of the number of pixels that one of the sample stands for.
+    pub stands_for: f32,
 }
 
 impl Photograph {
     /// From the values [`Names::photograph`] of a photograph that takes the first `width` x `height` pixels; `None` when
     /// the values are not of SAM's shapes.
     pub fn new(values: &[Tensor], [width, height]: [usize; 2]) -> Option<Self> {
+        let (mut order, filling): (Vec<usize>, Vec<usize>) =
+            (0..PIXELS).partition(|p| p % SIDE < width && p / SIDE < height);
+        let inside = order.len();
+        // The last tile is full.
+        let sample = (inside + filling.len() / FILLING).next_multiple_of(TILE) - inside;
+        order.extend((0..sample).map(|i| filling[(2 * i + 1) * filling.len() / (2 * sample)]));
+        let stands_for = (filling.len() as f32 / sample.max(1) as f32).ln();
         let planar = |t: &Tensor| {
             let channels = *t.shape.last().filter(|c| **c > 0)?;
             let v = t.as_f32().filter(|_| t.shape == [1, PIXELS, channels])?;
-            let column = |rows: &[f32], c: usize| rows.iter().skip(c).step_by(channels).copied().collect::<Vec<_>>();
-            let tile = |rows| (0..channels).flat_map(move |c| column(rows, c));
-            Some(v.chunks(TILE * channels).flat_map(tile).collect::<Vec<f32>>())
+            let channel = |tile: &[usize], c| tile.iter().map(|p| v[p * channels + c]).collect::<Vec<f32>>();
+            let tiles = order.chunks(TILE).flat_map(|tile| (0..channels).flat_map(move |c| channel(tile, c)));
+            Some(tiles.collect::<Vec<f32>>())
         };
         let [placed, pixels, keys, values, queries] = values else { return None };
         let (placed, pixels) = (planar(placed)?, planar(pixels)?);
         let places = placed.iter().zip(&pixels).map(|(p, v)| p - v).collect();
-        let inside = (0..PIXELS).filter(|p| p % SIDE < width && p / SIDE < height).collect();
-        Some(Self { pixels, places, keys: planar(keys)?, values: planar(values)?, queries: planar(queries)?, inside })
+        let [keys, values, queries] = [planar(keys)?, planar(values)?, planar(queries)?];
+        Some(Self { pixels, places, keys, values, queries, order, inside, stands_for })
     }
 }
 
@@ -280,9 +295,18 @@ fn scores_by_head(x: &[f32], pixels: &[f32], channels: usize, scores: &mut [f32]
     }
 }
 
-/// The tiles of an array.
-fn tiles(values: &[f32]) -> std::slice::ChunksExact<'_, f32> {
-    values.chunks_exact(values.len() / (PIXELS / TILE))
+/// Gives each pixel of the sample the weight in softmax of the pixels that it stands for. Scores `[tiles][rows][TILE]`.
+fn weigh_sample(scores: &mut [f32], rows: usize, photograph: &Photograph) {
+    let [whole, part] = [photograph.inside / TILE, photograph.inside % TILE];
+    for (i, row) in scores.chunks_exact_mut(TILE).enumerate().skip(whole * rows) {
+        let from = if i / rows == whole { part } else { 0 };
+        row[from..].iter_mut().for_each(|s| *s += photograph.stands_for);
+    }
+}
+
+/// The tiles of an array of so many pixels.
+fn tiles(values: &[f32], pixels: usize) -> std::slice::ChunksExact<'_, f32> {
+    values.chunks_exact(values.len() / pixels * TILE)
 }
 
 impl Decoder {
@@ -313,11 +337,11 @@ impl Decoder {
     /// Whether a photograph and its tokens have the channels that the weights expect.
     pub fn fits(&self, photograph: &Photograph, tokens: &[f32]) -> bool {
         let Layer { to_pixels, to_tokens, .. } = &self.layers[0];
-        let Photograph { pixels, places, keys, values, queries, .. } = photograph;
-        let [own, others] = [self.width, to_pixels.q.bias.len()].map(|n| n * PIXELS);
+        let Photograph { pixels, places, keys, values, queries, order, .. } = photograph;
+        let [own, others] = [self.width, to_pixels.q.bias.len()].map(|n| n * order.len());
         let channels =
             [pixels, places].iter().all(|v| v.len() == own) && [keys, values].iter().all(|v| v.len() == others);
-        let queries = queries.len() == to_tokens.q.bias.len() * PIXELS;
+        let queries = queries.len() == to_tokens.q.bias.len() * order.len();
         channels && queries && tokens.len().is_multiple_of(self.width) && tokens.len() / self.width > self.masks.len()
     }
 
@@ -382,11 +406,13 @@ impl Decoder {
     }
 
     /// What the tokens of the desk's scores take from its pixels.
-    fn attend_pixels(&self, attention: &Attention, desk: &mut Desk) -> Vec<f32> {
-        let rows = desk.scores.len() / PIXELS;
+    fn attend_pixels(&self, attention: &Attention, known: &Photograph, desk: &mut Desk) -> Vec<f32> {
+        let count = known.order.len();
+        let rows = desk.scores.len() / count;
+        weigh_sample(&mut desk.scores, rows, known);
         softmax_rows(&mut desk.scores, rows, TILE);
         let mut sums = vec![0.0; self.width * rows];
-        for (pixels, scores) in tiles(&desk.pixels).zip(tiles(&desk.scores)) {
+        for (pixels, scores) in tiles(&desk.pixels, count).zip(tiles(&desk.scores, count)) {
             self.product(matrix(pixels, TILE), matrix(scores, TILE).transposed(), 1.0, &mut sums);
         }
         let sums = self.times(matrix(&sums, rows).transposed(), &attention.v.weight);
@@ -401,13 +427,15 @@ impl Decoder {
         let q = self.scaled(&attention.q, asks);
         let inner = attention.q.bias.len();
         let (tokens, width) = (q.len() / inner, inner / HEADS);
-        desk.scores.resize(HEADS * tokens * PIXELS, 0.0);
-        for (scores, keys) in desk.scores.chunks_exact_mut(HEADS * tokens * TILE).zip(tiles(&known.keys)) {
+        let count = known.order.len();
+        desk.scores.resize(HEADS * tokens * count, 0.0);
+        for (scores, keys) in desk.scores.chunks_exact_mut(HEADS * tokens * TILE).zip(tiles(&known.keys, count)) {
             scores_by_head(&q, keys, inner, scores);
         }
+        weigh_sample(&mut desk.scores, HEADS * tokens, known);
         softmax_rows(&mut desk.scores, HEADS * tokens, TILE);
         let mut sums = vec![0.0; tokens * inner];
-        for (scores, values) in tiles(&desk.scores).zip(tiles(&known.values)) {
+        for (scores, values) in tiles(&desk.scores, count).zip(tiles(&known.values, count)) {
             let row = |x, i| &<[f32]>::as_chunks::<TILE>(x).0[i];
             for (i, sum) in sums.iter_mut().enumerate() {
                 let (t, c) = (i / inner, i % inner);
@@ -449,11 +477,12 @@ impl Decoder {
         let values = self.times(matrix(&by_head(&v, inner), inner), &attention.out.weight);
         let Norm { scale, shift: offset } = &layer.norms[3];
         let rows = queries.len() / width;
-        desk.pixels.resize(width * PIXELS, 0.0);
-        desk.scores.resize(rows * PIXELS, 0.0);
+        let count = known.order.len();
+        desk.pixels.resize(width * count, 0.0);
+        desk.scores.resize(rows * count, 0.0);
         let mut placed = vec![0.0; width * TILE];
         let mut scores = vec![0.0; shift.len() * TILE];
-        let known = tiles(&known.pixels).zip(tiles(&known.queries)).zip(tiles(&known.places));
+        let known = tiles(&known.pixels, count).zip(tiles(&known.queries, count)).zip(tiles(&known.places, count));
         let out = desk.pixels.chunks_exact_mut(width * TILE).zip(desk.scores.chunks_exact_mut(rows * TILE));
         for (((known_pixels, known_queries), places), (pixels, out)) in known.zip(out) {
             if first {
@@ -498,7 +527,7 @@ impl Decoder {
         second.norms[0].rows(&mut y);
         let queries = self.queries(&second.to_pixels, &add(&y, tokens));
         self.update_pixels(first, [&placed, &x], &queries, photograph, desk);
-        let taken = self.attend_pixels(&second.to_pixels, desk);
+        let taken = self.attend_pixels(&second.to_pixels, photograph, desk);
         let y = self.finish_tokens(second, &y, &taken);
 
         // Tokens: the predicted IoU's, one for each mask, the point's. The first of four masks is not wanted.
@@ -510,7 +539,7 @@ impl Decoder {
         let placed = add(&y, tokens);
         let queries = self.queries(&self.last, &rows(&placed));
         self.update_pixels(second, [&placed, &y], &queries, photograph, desk);
-        let mut x = add(&rows(&y), &self.attend_pixels(&self.last, desk));
+        let mut x = add(&rows(&y), &self.attend_pixels(&self.last, photograph, desk));
         self.last_norm.rows(&mut x);
         let quality = self.mlp(&self.quality, &x[..channels]);
         let mut candidates = Candidates::default();
@@ -537,29 +566,21 @@ impl Decoder {
             let (a, b) = (GemmInputA::Packed(a), GemmInputB::Unpacked(b));
             self.gemm.gemm(out, a, b, GemmOptions::default()).expect("the shapes fit");
         };
-        for inside in photograph.inside.chunks(TILE) {
-            let n = inside.len();
-            let at = |c: usize, p: usize| desk.pixels[(p / TILE * self.width + c) * TILE + p % TILE];
-            let gathered: Vec<f32>;
-            // In a photograph wider than high the chunks are whole tiles.
-            let pixels = if n == TILE && inside[0] % TILE == 0 && inside[n - 1] == inside[0] + n - 1 {
-                &desk.pixels[inside[0] * self.width..][..self.width * TILE]
-            } else {
-                gathered = (0..self.width).flat_map(|c| inside.iter().map(move |&p| at(c, p))).collect();
-                &gathered
-            };
-            let [mut once, mut twice] = [middle, last].map(|channels| vec![0.0; 4 * channels * n]);
-            let mut drawn = vec![0.0; masks * n];
-            multiply(first, matrix(pixels, n), &mut once);
-            for (place, values) in once.chunks_exact_mut(middle * n).enumerate() {
-                norm(values, n, EPSILON_OF_PICTURES, first_bias, scale, shift);
+        let inside = photograph.order[..photograph.inside].chunks(TILE);
+        for (inside, pixels) in inside.zip(tiles(&desk.pixels, photograph.order.len())) {
+            let [mut once, mut twice] = [middle, last].map(|channels| vec![0.0; 4 * channels * TILE]);
+            let mut drawn = vec![0.0; masks * TILE];
+            multiply(first, matrix(pixels, TILE), &mut once);
+            for (place, values) in once.chunks_exact_mut(middle * TILE).enumerate() {
+                norm(values, TILE, EPSILON_OF_PICTURES, first_bias, scale, shift);
                 biased_gelu(values, 0.0);
-                multiply(second, matrix(values, n), &mut twice);
-                for (inner, values) in twice.chunks_exact_mut(last * n).enumerate() {
-                    values.chunks_exact_mut(n).zip(second_bias).for_each(|(v, &bias)| biased_gelu(v, bias));
-                    head_scores(weights, last, values, n, &mut drawn);
+                multiply(second, matrix(values, TILE), &mut twice);
+                for (inner, values) in twice.chunks_exact_mut(last * TILE).enumerate() {
+                    values.chunks_exact_mut(TILE).zip(second_bias).for_each(|(v, &bias)| biased_gelu(v, bias));
+                    head_scores(weights, last, values, TILE, &mut drawn);
                     let [dy, dx] = [place / 2 * 2 + inner / 2, place % 2 * 2 + inner % 2];
-                    for (drawn, logits) in drawn.chunks_exact(n).zip(logits.chunks_exact_mut(MASK_SIDE * MASK_SIDE)) {
+                    for (drawn, logits) in drawn.chunks_exact(TILE).zip(logits.chunks_exact_mut(MASK_SIDE * MASK_SIDE))
+                    {
                         for (&logit, &p) in drawn.iter().zip(inside) {
                             logits[(p / SIDE * 4 + dy) * MASK_SIDE + p % SIDE * 4 + dx] = logit;
                         }
@@ -568,5 +589,29 @@ impl Decoder {
             }
         }
         logits
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_sample_of_equal_pixels_stands_for_all_of_them() {
+        // One channel, 1 for the photograph's pixels and 3 for those beside it.
+        let [width, height] = [50, 33];
+        let values: Vec<f32> =
+            (0..PIXELS).map(|p| if p % SIDE < width && p / SIDE < height { 1.0 } else { 3.0 }).collect();
+        let tensor = Tensor::f32(&[1, PIXELS, 1], values.clone());
+        let photograph = Photograph::new(&[(); 5].map(|()| tensor.clone()), [width, height]).unwrap();
+        assert!(photograph.order.len() < PIXELS && photograph.order.len().is_multiple_of(TILE));
+        assert_eq!(photograph.inside, width * height);
+        let mut scores = photograph.pixels.clone();
+        weigh_sample(&mut scores, 1, &photograph);
+        softmax_rows(&mut scores, 1, TILE);
+        let got: f32 = scores[..photograph.inside].iter().sum();
+        let all: f64 = values.iter().map(|v| f64::from(*v).exp()).sum();
+        let want = (width * height) as f64 * 1f64.exp() / all;
+        assert!((f64::from(got) / want - 1.0).abs() < 1e-5, "{got} {want}");
     }
 }
