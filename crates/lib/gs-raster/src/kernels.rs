@@ -420,18 +420,23 @@ fn folded(row: &Row) -> f32 {
     (quarter[0] + quarter[2]) + (quarter[1] + quarter[3])
 }
 
-/// Alphas and blending weights of every Gaussian at every pixel of a tile, `[list][TILE * TILE]`, both zero on entry. With
-/// `early_stop` a pixel takes nothing more once its transmittance is spent; without, alphas go on to the last Gaussian.
-/// Returns the accumulated alpha.
-pub(crate) fn weights_tile(tile: Tile<'_>, early_stop: bool, alphas: &mut [f32], weights: &mut [f32]) -> [f32; PIXELS] {
+/// Alphas and blending weights of a tile's Gaussians at every pixel, `[G][TILE * TILE]`, both empty on entry. With
+/// `early_stop` a pixel takes nothing more once its transmittance is spent, and G ends where no pixel takes more; without,
+/// alphas go on to the last Gaussian. Returns the accumulated alpha.
+pub(crate) fn weights_tile(
+    tile: Tile<'_>,
+    early_stop: bool,
+    alphas: &mut Vec<f32>,
+    weights: &mut Vec<f32>,
+) -> [f32; PIXELS] {
     Arch::new().dispatch(WeightsTile { tile, early_stop, alphas, weights })
 }
 
 struct WeightsTile<'a> {
     tile: Tile<'a>,
     early_stop: bool,
-    alphas: &'a mut [f32],
-    weights: &'a mut [f32],
+    alphas: &'a mut Vec<f32>,
+    weights: &'a mut Vec<f32>,
 }
 
 impl WithSimd for WeightsTile<'_> {
@@ -448,14 +453,20 @@ impl WithSimd for WeightsTile<'_> {
         let grid = Grid::new(rectangle);
         // Columns beyond the image's right edge are no pixels, though without a stop they have a transmittance.
         let inside: Row = std::array::from_fn(|l| if l < width { 1.0 } else { 0.0 });
-        let layers = self.alphas.chunks_exact_mut(PIXELS).zip(self.weights.chunks_exact_mut(PIXELS));
-        for (&entry, (alphas, weights)) in list.iter().zip(layers) {
+        let mut live = [grid.inside; TILE];
+        for (n, &entry) in list.iter().enumerate() {
             let s = &splats[entry as usize];
             let [t, accumulated] = [&mut transmittance, &mut accumulated].map(|v| vectors_mut::<S>(v));
-            let (alphas, weights) = (vectors_mut::<S>(alphas), vectors_mut::<S>(weights));
+            if self.early_stop && n % BATCH == 0 && n > 0 && !some_go_on(simd, t, grid.inside, &mut live[..blocks]) {
+                break;
+            }
+            let [alphas, weights] = [&mut *self.alphas, &mut *self.weights].map(|layers| {
+                layers.resize((n + 1) * PIXELS, 0.0);
+                vectors_mut::<S>(&mut layers[n * PIXELS..])
+            });
             let falloff = Falloff::new(simd, s, &grid);
             for b in 0..blocks {
-                let mut rows = falloff.rows[b];
+                let mut rows = falloff.rows[b] & live[b];
                 let dx = simd.sub_f32s(vectors::<S>(&grid.x)[b], falloff.mean_x);
                 while rows != 0 {
                     let r = rows.trailing_zeros() as usize % TILE;

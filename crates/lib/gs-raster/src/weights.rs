@@ -16,7 +16,8 @@ pub struct TileWeights<'a> {
     pub width: usize,
     /// Height within the image, at most [`crate::TILE`].
     pub height: usize,
-    /// Original indices of the Gaussians that touch the tile, front to back; G of them.
+    /// Original indices of the Gaussians that touch the tile, front to back; G of them. With an early stop those behind all that
+    /// is seen are left out.
     pub gaussians: &'a [u32],
     /// alpha of each Gaussian at each pixel, 0 where it is skipped; `[G][TILE * TILE]`.
     pub alphas: &'a [f32],
@@ -72,9 +73,10 @@ fn colourless(options: &RasterOptions) -> RasterOptions {
 fn one_tile<R>(tiles: &Tiles, number: usize, early_stop: bool, f: &impl Fn(&TileWeights<'_>) -> R) -> R {
     let tile = tiles.tile(number);
     let (x0, y0, width, height) = tile.rectangle;
-    let gaussians: Vec<u32> = tile.list.iter().map(|&e| tiles.index[e as usize]).collect();
-    let [mut alphas, mut weights] = [(); 2].map(|()| vec![0.0; gaussians.len() * PIXELS]);
+    let [mut alphas, mut weights] = [(); 2].map(|()| Vec::with_capacity(tile.list.len() * PIXELS));
     let alpha = weights_tile(tile, early_stop, &mut alphas, &mut weights);
+    let list = &tile.list[..weights.len() / PIXELS];
+    let gaussians: Vec<u32> = list.iter().map(|&e| tiles.index[e as usize]).collect();
     let [alphas, weights] = [&alphas, &weights];
     f(&TileWeights { x0, y0, width, height, gaussians: &gaussians, alphas, weights, alpha: &alpha })
 }

@@ -221,10 +221,7 @@ fn tile_sums(tile: &TileWeights, maps: &MaskMaps, row_of: &[Vec<u32>; LEVELS], g
     }
     let mut sums = vec![0.0f32; cells.len()];
     for (&gaussian, weights) in tile.gaussians.iter().zip(tile.weights.chunks_exact(TILE * TILE)) {
-        sums.fill(0.0);
-        for (&w, &cell) in weights.iter().zip(&cell_of) {
-            sums[cell as usize] += w;
-        }
+        sum_by_cell(weights, &cell_of, &mut sums);
         let total: f32 = sums.iter().sum();
         if total > 0.0 {
             out.seen.push((gaussian, total));
@@ -236,6 +233,25 @@ fn tile_sums(tile: &TileWeights, maps: &MaskMaps, row_of: &[Vec<u32>; LEVELS], g
         }
     }
     out
+}
+
+/// Pixels that [`sum_by_cell`] looks at together.
+const BLOCK: usize = 8;
+
+/// Sums a tile's weights by the pixels' cells, pixel after pixel. Most blocks of pixels have no weight, or lie in one cell.
+fn sum_by_cell(weights: &[f32], cell_of: &[u16; TILE * TILE], sums: &mut [f32]) {
+    sums.fill(0.0);
+    for (weights, cells) in weights.as_chunks::<BLOCK>().0.iter().zip(cell_of.as_chunks::<BLOCK>().0) {
+        if weights.iter().fold(0, |all, w| all | w.to_bits()) == 0 {
+            continue;
+        }
+        if cells.iter().fold(0, |all, c| all | (c ^ cells[0])) == 0 {
+            let sum = &mut sums[cells[0] as usize];
+            *sum = weights.iter().fold(*sum, |sum, w| sum + w);
+        } else {
+            weights.iter().zip(cells).for_each(|(w, &c)| sums[c as usize] += w);
+        }
+    }
 }
 
 /// Sums (row, Gaussian, weight) triples per row and Gaussian, in the order given; Gaussians ascend.
