@@ -226,8 +226,8 @@ impl World {
     /// Matches instances with masks as `cluster-match` does, for systems without a rule of their own: in each view the mask with
     /// the largest IoU, where that exceeds `threshold`. `labels` are those of all Gaussians.
     pub fn matches(&self, labels: &[i32], threshold: f32) -> Result<Vec<Match>> {
-        let alike = Features::alike(&self.footprints.kept);
-        let table = FeatureTable::new(&alike, self.gaussians());
+        let none = Features::none(&self.footprints.kept);
+        let table = FeatureTable::new(&none, self.gaussians());
         let mut all = Vec::new();
         for view in 0..self.views.len() {
             let (maps, camera) = self.maps(view)?;

@@ -20,9 +20,9 @@ impl Features {
     pub const FORMAT: &str = "features";
     const VERSION: u32 = 1;
 
-    /// Features of one dimension that are all alike: they tell no two Gaussians apart, and leave the IoU of matches alone.
-    pub fn alike(kept: &[u32]) -> Self {
-        Self { kept: kept.to_vec(), values: Array2::ones((kept.len(), 1)) }
+    /// Features of no dimension: they tell no two Gaussians apart, and leave the IoU of matches alone.
+    pub fn none(kept: &[u32]) -> Self {
+        Self { kept: kept.to_vec(), values: Array2::zeros((kept.len(), 0)) }
     }
 
     /// Writes the artifact.

@@ -80,6 +80,9 @@ impl<'a> FeatureTable<'a> {
 
     /// Adds `weight` times the feature of a Gaussian. One without a feature is seen by no view and has nothing to add.
     fn add_to(&self, sum: &mut [f64], gaussian: u32, weight: f32) {
+        if sum.is_empty() {
+            return;
+        }
         if let (Some(at), true) = (self.position[gaussian as usize], weight > 0.0) {
             for (s, f) in sum.iter_mut().zip(flat(self.features.row(at as usize))) {
                 *s += f64::from(weight) * f64::from(*f);
@@ -172,7 +175,7 @@ fn tile_overlaps(t: &TileWeights<'_>, labels: &[i32], table: &FeatureTable<'_>, 
     for (g, &i) in t.gaussians.iter().enumerate() {
         let (alphas, weights) = (&t.alphas[g * PIXELS..(g + 1) * PIXELS], &t.weights[g * PIXELS..(g + 1) * PIXELS]);
         for ((sum, pixels), set) in of_set.iter_mut().zip(&masks.pixels).zip(&masks.sets) {
-            if !set.is_empty() {
+            if dim > 0 && !set.is_empty() {
                 table.add_to(sum, i, sum_of(weights, pixels));
             }
         }
@@ -183,11 +186,14 @@ fn tile_overlaps(t: &TileWeights<'_>, labels: &[i32], table: &FeatureTable<'_>, 
             continue;
         };
         let (mut sum, mut visible) = (0.0f32, 0.0f32);
-        for p in 0..PIXELS {
-            visible += if pixels[p] { weights[p] } else { 0.0 };
-            let weight = left[p] * alphas[p];
-            left[p] *= 1.0 - alphas[p];
-            sum += if pixels[p] { weight } else { 0.0 };
+        // Most blocks of pixels have nothing of a Gaussian.
+        for from in (0..PIXELS).step_by(8).filter(|&from| alphas[from..from + 8].iter().any(|a| *a > 0.0)) {
+            for p in from..from + 8 {
+                visible += if pixels[p] { weights[p] } else { 0.0 };
+                let weight = left[p] * alphas[p];
+                left[p] *= 1.0 - alphas[p];
+                sum += if pixels[p] { weight } else { 0.0 };
+            }
         }
         table.add_to(&mut region.features, i, sum);
         region.visible += f64::from(visible);
@@ -224,14 +230,17 @@ pub fn overlaps(
 }
 
 fn cosine(a: &[f64], b: &[f64]) -> f64 {
+    if a.is_empty() {
+        return 1.0;
+    }
     let dot: f64 = a.iter().zip(b).map(|(x, y)| x * y).sum();
     let norm = |v: &[f64]| v.iter().map(|x| x * x).sum::<f64>().sqrt();
     let length = norm(a) * norm(b);
     if length > 1e-30 { dot / length } else { 0.0 }
 }
 
-/// The best mask of each instance in a view: S = IoU x similarity of mean features (0 where it is negative), kept where it
-/// exceeds `threshold`; ties go to the lower mask id.
+/// The best mask of each instance in a view: S = IoU x similarity of mean features (0 where it is negative; 1 where features
+/// have no dimension), kept where it exceeds `threshold`; ties go to the lower mask id.
 pub fn matches(overlaps: &Overlaps, view: u32, threshold: f32) -> Vec<Match> {
     best_masks(overlaps, view, threshold, |iou, i, (_, m)| iou * cosine(&i.features, &m.features).max(0.0))
 }

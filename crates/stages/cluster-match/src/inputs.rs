@@ -14,7 +14,7 @@ pub(crate) struct Inputs {
     pub geometry: Geometry,
     pub graph: Graph,
     pub footprints: Footprints,
-    /// Those that are clustered; all alike where the masks are.
+    /// Those that are clustered; of no dimension where the masks are.
     pub features: Features,
     /// The views whose masks the footprints hold.
     pub views: Vec<View>,
@@ -54,7 +54,7 @@ impl Inputs {
                 if given.is_some() {
                     stage.skipped("--features: clustering by the masks does not read them");
                 }
-                (Features::alike(&graph.kept), None)
+                (Features::none(&graph.kept), None)
             }
         };
         let views = matched_views(a, &dataset, &footprints, stage)?;
