@@ -311,7 +311,7 @@ fn check_labels(bytes: &[u8]) {
         if let Some(edits) = sound(Edits::read(path), path) {
             let (mut instances, means) = (seeds::instances(), [[0.0; 3]; 4]);
             if let Ok(remarks) = edits.apply(&mut instances, &means) {
-                assert!(remarks.names.keys().all(|&k| instances.count[k as usize] > 0));
+                assert!(remarks.names.keys().chain(remarks.notes.keys()).all(|&k| instances.count[k as usize] > 0));
                 assert!(remarks.metres_per_unit.is_none_or(|m| m.is_finite() && m > 0.0));
             }
         }

@@ -272,7 +272,8 @@ pub(crate) fn labels() -> Vec<Vec<u8>> {
 {"category":"../../cup","segmentation":[[10,1],[11,1],[30,2],[-10,20]]},{"category":"lid","segmentation":[]}]}"#
             .to_vec(),
         br#"{"format":"instances.edits","version":1,"instances":"ab","edits":[{"op":"rename","instance":1,"name":"kettle"},
-{"op":"merge","instances":[0,1]},{"op":"split","instance":0},{"op":"scale","from":[0,0,0],"to":[1,0,0],"metres":0.3}]}"#
+{"op":"merge","instances":[0,1]},{"op":"split","instance":0},{"op":"note","instance":0,"text":"chipped"},
+{"op":"assign","instance":-1,"gaussians":"1 2"},{"op":"scale","from":[0,0,0],"to":[1,0,0],"metres":0.3}]}"#
             .to_vec(),
         br#"{"format":"scene","version":1,"inputs":{"geometry":"ab"},"gaussians":9,"up":{"direction":[0,0,1],"from":"given"},
 "metres_per_unit":0.5,"objects":[{"id":1,"name":{"text":"mug","from":"edits"},"score":0.5,"gaussians":4,"parent":{"cluster":7,

@@ -2,10 +2,12 @@
 
 use crate::extents::Extents;
 use crate::instances::{Instances, Match, OrientedBox};
+use crate::runs::ranges_of;
 use gs_io::{Error, IoContext, Result, write_json};
 use ndarray::Array2;
 use serde::{Deserialize, Serialize};
 use std::collections::{BTreeMap, BTreeSet};
+use std::ops::Range;
 use std::path::Path;
 
 /// `instances.edits.json`: what a person changed of the instances, applied in order; the artifact itself is never touched.
@@ -38,6 +40,20 @@ pub enum Edit {
         /// 1 to 100 bytes: see [`gs_io::check_name`].
         name: String,
     },
+    /// What people should know of it.
+    Note {
+        /// The instance.
+        instance: u32,
+        /// At most 500 bytes; an empty one takes the note away.
+        text: String,
+    },
+    /// These Gaussians belong to another instance, or to none.
+    Assign {
+        /// The instance; -1 for none.
+        instance: i32,
+        /// Which, as [`crate::runs_of`] writes them.
+        gaussians: String,
+    },
     /// How long a known length is.
     Scale {
         /// One end, in units of the scene.
@@ -54,9 +70,11 @@ pub enum Edit {
 pub struct Remarks {
     /// Names by instance; only of instances that were named and hold Gaussians.
     pub names: BTreeMap<u32, String>,
+    /// Notes by instance, likewise.
+    pub notes: BTreeMap<u32, String>,
     /// Length of the scene's unit in metres, where a length is known.
     pub metres_per_unit: Option<f64>,
-    /// Instances that were merged or split, those without Gaussians now among them.
+    /// Instances that were merged or split, or lost all Gaussians: no longer what they were.
     pub changed: BTreeSet<u32>,
 }
 
@@ -72,6 +90,8 @@ struct File {
 
 /// Most bytes of a name.
 const LONGEST_NAME: usize = 100;
+/// Most bytes of a note.
+const LONGEST_NOTE: usize = 500;
 /// Most edits of a list: more than a person makes, and few enough for every instance that splitting adds.
 const MOST_EDITS: usize = 10_000;
 
@@ -96,7 +116,7 @@ impl Edits {
     pub fn parse(bytes: &[u8]) -> Result<Self> {
         let file: File = serde_json::from_slice(bytes).map_err(|e| {
             Error::new(format!("not a list of edits: {e}")).expected(
-                r#"{"format", "version", "instances", "edits": [{"op": "merge", "split", "rename" or "scale", ...}]}"#,
+                r#"{"format", "version", "instances", "edits": [{"op": "merge", "split", "rename", "note", "assign" or "scale", ...}]}"#,
             )
         })?;
         let found = (&file.format[..], file.version);
@@ -120,7 +140,8 @@ impl Edits {
     /// views with a match; a mask that showed several of them is one match; the score is their best; edges of the tree name the
     /// first. *Split*: the part with most of the instance's Gaussians (ties: the first) keeps its id, with what lies in no part; the others are K, K + 1, ... in the order of
     /// the parts. They have descriptor, support, score and matches of the whole; a part without a Gaussian has none of these. The
-    /// edges of the tree name the parts. Count, centroid and boxes are measured again. Either leaves no granules.
+    /// edges of the tree name the parts. *Assign*: an instance that loses all its Gaussians loses everything but its id.
+    /// Count, centroid and boxes are measured again. Each of them leaves no granules.
     ///
     /// # Errors
     /// When a change does not fit the instances that those before it left; it is named by its number. The instances are then
@@ -134,25 +155,40 @@ impl Edits {
             let e = Error::new("too many edits").field("edits").found(self.edits.len());
             return Err(e.expected(format!("at most {MOST_EDITS}")));
         }
-        let (mut remarks, mut changed) = (Remarks::default(), BTreeSet::new());
+        let (mut remarks, mut moved) = (Remarks::default(), BTreeSet::new());
         for (at, edit) in self.edits.iter().enumerate() {
             let field = |name: &str| format!("edits[{at}].{name}");
             match edit {
                 Edit::Merge { instances: ids } => {
                     merge(instances, ids).map_err(|e| e.field(field("instances")))?;
-                    ids[1..].iter().for_each(|id| _ = remarks.names.remove(id));
-                    changed.extend(ids);
+                    ids[1..].iter().for_each(|&id| remarks.forget(id));
+                    remarks.changed.extend(ids);
                 }
                 Edit::Split { instance } => {
                     let first_new = instances.len() as u32;
                     split(instances, *instance).map_err(|e| e.field(field("instance")))?;
-                    changed.insert(*instance);
-                    changed.extend(first_new..instances.len() as u32);
+                    remarks.changed.insert(*instance);
+                    remarks.changed.extend(first_new..instances.len() as u32);
                 }
                 Edit::Rename { instance, name } => {
                     check_id(instances, *instance).map_err(|e| e.field(field("instance")))?;
                     check_name(name).map_err(|e| e.field(field("name")))?;
                     remarks.names.insert(*instance, name.clone());
+                }
+                Edit::Note { instance, text } => {
+                    check_id(instances, *instance).map_err(|e| e.field(field("instance")))?;
+                    check_note(text).map_err(|e| e.field(field("text")))?;
+                    remarks.notes.insert(*instance, text.clone());
+                    remarks.notes.retain(|_, text| !text.is_empty());
+                }
+                Edit::Assign { instance, gaussians } => {
+                    let ranges = ranges_of(gaussians, n).map_err(|e| e.field(field("gaussians")))?;
+                    let touched = assign(instances, *instance, &ranges).map_err(|e| e.field(field("instance")))?;
+                    for &id in touched.iter().filter(|&&id| instances.count[id as usize] == 0) {
+                        remarks.forget(id);
+                        remarks.changed.insert(id);
+                    }
+                    moved.extend(touched);
                 }
                 Edit::Scale { from, to, metres } => {
                     let metres_per_unit = scale(*from, *to, *metres, field)?;
@@ -160,14 +196,22 @@ impl Edits {
                 }
             }
         }
-        if !changed.is_empty() {
+        moved.extend(&remarks.changed);
+        if !moved.is_empty() {
             // What a person made of the instances is what texts are to find.
             instances.granules.clear();
             instances.granule_descriptor = Array2::default((0, instances.dim()));
-            measure(instances, means, &changed);
+            measure(instances, means, &moved);
         }
-        remarks.changed = changed;
         Ok(remarks)
+    }
+}
+
+impl Remarks {
+    /// Leaves nothing of an instance that is no more.
+    fn forget(&mut self, id: u32) {
+        self.names.remove(&id);
+        self.notes.remove(&id);
     }
 }
 
@@ -193,6 +237,18 @@ fn check_name(name: &str) -> Result<()> {
             e("the name is too long").map_err(|e: Error| e.found(format!("{} bytes", name.len())))
         }
         _ => gs_io::check_name(name),
+    }
+}
+
+fn check_note(text: &str) -> Result<()> {
+    let e = |what: &str, found: String| {
+        let e = Error::new(what).found(found);
+        Err(e.expected(format!("one line of at most {LONGEST_NOTE} bytes")))
+    };
+    match text {
+        _ if text.len() > LONGEST_NOTE => e("the note is too long", format!("{} bytes", text.len())),
+        _ if text.contains(gs_io::is_control) => e("a control character in the note", format!("{text:?}")),
+        _ => Ok(()),
     }
 }
 
@@ -287,6 +343,34 @@ fn split(instances: &mut Instances, id: u32) -> Result<()> {
         instances.count[whole] -= members.len() as u32;
     }
     Ok(())
+}
+
+/// Gives Gaussians to an instance, or to none; the instances that had or have them.
+fn assign(instances: &mut Instances, to: i32, ranges: &[Range<u32>]) -> Result<BTreeSet<u32>> {
+    let mut touched = BTreeSet::new();
+    match u32::try_from(to) {
+        Ok(id) => {
+            check_id(instances, id)?;
+            touched.insert(id);
+        }
+        Err(_) if to == -1 => {}
+        Err(_) => return Err(Error::new("no such instance").found(to).expected("an id, or -1 for none")),
+    }
+    for i in ranges.iter().cloned().flatten() {
+        let from = std::mem::replace(&mut instances.label[i as usize], to);
+        if let Ok(id) = u32::try_from(from) {
+            instances.count[id as usize] -= 1;
+            touched.insert(id);
+        }
+        if let Ok(id) = usize::try_from(to) {
+            instances.count[id] += 1;
+        }
+    }
+    for &id in touched.iter().filter(|&&id| instances.count[id as usize] == 0).collect::<Vec<_>>() {
+        clear(instances, id as usize);
+        instances.tree.iter_mut().filter(|e| e.instance == id as i32).for_each(|e| e.instance = -1);
+    }
+    Ok(touched)
 }
 
 /// Adds an instance with descriptor, support and score of another; the rest of it is measured later.
@@ -412,6 +496,42 @@ mod tests {
         assert_eq!((taken.count[2], taken.support[2], taken.descriptor_of(2)), (0, 0, aview1(&[0.0; 2])));
     }
 
+    fn note(instance: u32, text: &str) -> Edit {
+        Edit::Note { instance, text: text.into() }
+    }
+
+    fn assign(instance: i32, gaussians: &str) -> Edit {
+        Edit::Assign { instance, gaussians: gaussians.into() }
+    }
+
+    #[test]
+    fn gaussians_are_given_to_another_instance_or_to_none() {
+        // Noise and a Gaussian of 0 to instance 1; then one of those to none.
+        let (i, remarks) = applied(vec![assign(1, "1 1 6 1"), assign(-1, "8 1")]).unwrap();
+        assert_eq!(i.label, [0, 1, 0, 0, 0, 0, 1, 1, -1]);
+        assert_eq!((&i.count, remarks.changed.len(), i.granules.len()), (&vec![5, 3], 0, 0));
+        assert_eq!(i.descriptor_of(1), example().0.descriptor_of(1), "what it is stays");
+        // Twice is once; splitting afterwards leaves what was given away where it is.
+        let again = vec![assign(1, "0 1"), assign(1, "0 1"), Edit::Split { instance: 0 }];
+        assert_eq!(applied(again).unwrap().0.label, [1, 2, 0, 0, 0, 0, 1, 1, -1]);
+        // Without a Gaussian nothing is left but the id.
+        let (i, remarks) = applied(vec![rename(1, "cup"), note(1, "chipped"), assign(0, "6 2")]).unwrap();
+        assert_eq!((&i.count, &i.support, i.tree[1].instance), (&vec![8, 0], &vec![3, 0], -1));
+        assert_eq!(remarks, Remarks { changed: BTreeSet::from([1]), ..Remarks::default() });
+        let e = applied(vec![assign(0, "6 2"), assign(1, "6 1")]).unwrap_err().to_string();
+        assert!(e.contains("edits[1].instance: the instance has no Gaussians"), "{e}");
+    }
+
+    #[test]
+    fn the_last_note_counts_and_an_empty_one_takes_it_away() {
+        let kept = |edits| applied(edits).unwrap().1.notes;
+        let persian = "مال مادربزرگ <b>";
+        assert_eq!(kept(vec![note(0, "a"), note(0, persian), note(1, "b")])[&0], persian);
+        assert_eq!(kept(vec![note(0, "a"), note(0, "")]), BTreeMap::new());
+        let merged = vec![note(0, "a"), note(1, "b"), Edit::Merge { instances: vec![1, 0] }];
+        assert_eq!(kept(merged), BTreeMap::from([(1, "b".to_string())]));
+    }
+
     #[test]
     fn the_last_name_and_the_last_length_count() {
         let scale = |metres| Edit::Scale { from: [1.0, 0.0, 0.0], to: [1.0, 3.0, 4.0], metres };
@@ -427,6 +547,7 @@ mod tests {
         let path = dir.path().join("instances.edits.json");
         let text = r#"{"format":"instances.edits","version":1,"instances":"ab","edits":[
             {"op":"merge","instances":[3,5]},{"op":"split","instance":3},{"op":"rename","instance":3,"name":"kettle"},
+            {"op":"note","instance":3,"text":"from grandma"},{"op":"assign","instance":3,"gaussians":"120 3 5 1"},
             {"op":"scale","from":[0,0,0],"to":[1,0,0],"metres":0.3}]}"#;
         let edits = Edits::parse(text.as_bytes()).unwrap();
         assert_eq!((edits.instances.as_str(), &edits.edits[2]), ("ab", &rename(3, "kettle")));
@@ -472,6 +593,12 @@ mod tests {
             (vec![rename(0, "a\u{7}")], "edits[0].name: a control character in the name"),
             (vec![rename(0, "mug\u{202e}gpj")], "a control character in the name; found \"mug\\u{202e}gpj\""),
             (vec![rename(0, "-rf")], "edits[0].name: the name begins with a dash"),
+            (vec![note(9, "x")], "edits[0].instance: no such instance; found 9"),
+            (vec![note(0, &"é".repeat(251))], "edits[0].text: the note is too long; found 502 bytes"),
+            (vec![note(0, "a\nb")], "edits[0].text: a control character in the note; found \"a\\nb\""),
+            (vec![assign(2, "0 1")], "edits[0].instance: no such instance; found 2, expected 0 to 1"),
+            (vec![assign(-2, "0 1")], "edits[0].instance: no such instance; found -2"),
+            (vec![assign(1, "8 2")], "edits[0].gaussians: not a list of Gaussians; found \"8 2\""),
             (vec![scale([2.0; 3], 0.0)], "edits[0].metres: not a length; found 0"),
             (vec![scale([2.0; 3], f64::NAN)], "edits[0].metres: not a length"),
             (vec![scale([1.0; 3], 1.0)], "edits[0].to: no length between the two points; found distance 0"),

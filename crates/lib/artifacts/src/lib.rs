@@ -20,6 +20,7 @@ mod masks;
 mod names;
 mod nyu40;
 mod palette;
+mod runs;
 mod scratch;
 mod truth;
 
@@ -43,6 +44,7 @@ pub use masks::{
 pub use names::{Called, InstanceNames, Naming, ScoredName, called};
 pub use nyu40::NYU40;
 pub use palette::{NOISE_COLOR, instance_color};
+pub use runs::runs_of;
 pub use scratch::{Scratch, ScratchEntries};
 pub use truth::{MaskTruth, TrueObject, TruePart, TruePoints, TrueScene};
 

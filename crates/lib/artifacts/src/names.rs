@@ -130,7 +130,7 @@ impl InstanceNames {
     }
 }
 
-/// What instances are called after a person's edits: as the person said, else as the vocabulary has it. What was merged or split is no longer what
+/// What instances are called after a person's edits: as the person said, else as the vocabulary has it. What was merged, split or emptied is no longer what
 /// the vocabulary was asked about, and has no name of it.
 pub fn called(names: Option<&InstanceNames>, remarks: &Remarks) -> BTreeMap<u32, Called> {
     let ids = names.into_iter().flat_map(|n| &n.named).map(|one| one.instance);

@@ -50,6 +50,7 @@ pub fn describe(
             Object {
                 id: k,
                 name: name(remarks, others, k),
+                note: remarks.notes.get(&k).cloned(),
                 score: instances.score[k as usize],
                 gaussians: own.len() as u32,
                 parent,
@@ -138,6 +139,7 @@ mod tests {
         let (instances, gaussians) = boxes(&TABLE);
         let remarks = Remarks {
             names: BTreeMap::from([(1, "red mug".into())]),
+            notes: BTreeMap::from([(1, "chipped".into())]),
             metres_per_unit: Some(0.5),
             ..Remarks::default()
         };
@@ -147,6 +149,7 @@ mod tests {
         assert_eq!(names, [name("table", NameSource::Query), name("red mug", NameSource::Edits), None]);
         let mug = scene.object(1).unwrap();
         assert_eq!((mug.gaussians, mug.score, mug.id), (729, 0.5, 1));
+        assert_eq!((mug.note.as_deref(), &scene.objects[0].note), (Some("chipped"), &None));
         // A hundredth of 729 centres is less than a layer of the grid: the box is that of all.
         assert!((mug.bounds.center[2] - 0.75).abs() < 1e-6 && (mug.volume - 0.001).abs() < 1e-6, "{mug:?}");
         assert_eq!(mug.centroid, instances.centroid[1]);

@@ -102,6 +102,9 @@ pub struct Object {
     pub id: u32,
     /// What it is called, where somebody, a query or a vocabulary said.
     pub name: Option<Name>,
+    /// What a person noted of it; left out where nobody did.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub note: Option<String>,
     /// Confidence that it is one whole thing, 0 to 1.
     pub score: f32,
     /// Gaussians in it; at least 1.

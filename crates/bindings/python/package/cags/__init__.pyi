@@ -97,6 +97,7 @@ class Object:
     id: int
     name: str | None
     sure: bool
+    note: str | None
     score: float
     gaussians: int
     siblings: list[int]

@@ -83,6 +83,8 @@ class Object:
         As a person named it, else the best of a vocabulary where ``eval names`` was run.
     sure : bool
         False where the name is a guess, or there is none.
+    note : str or None
+        What a person noted of it.
     score : float
         Confidence that it is one whole thing, 0 to 1.
     gaussians : int
@@ -104,6 +106,7 @@ class Object:
     id: int
     name: str
     sure: bool
+    note: str
     score: float
     gaussians: int
     siblings: list
@@ -246,6 +249,7 @@ class Run:
                 id=o["id"],
                 name=o["name"] and o["name"]["text"],
                 sure=bool(o["name"]) and o["name"].get("sure", True),
+                note=o.get("note"),
                 score=o["score"],
                 gaussians=o["gaussians"],
                 siblings=o["parent"]["objects"] if o["parent"] else [],
@@ -277,7 +281,7 @@ class Run:
             import pandas
         except ImportError:
             raise ImportError("to_dataframe needs pandas: pip install pandas") from None
-        own = ["id", "name", "sure", "score", "gaussians", "volume", "view"]
+        own = ["id", "name", "sure", "note", "score", "gaussians", "volume", "view"]
         rows = [[getattr(o, k) for k in own] + o.center.tolist() + (2 * o.half_size).tolist() for o in self.objects()]
         return pandas.DataFrame(rows, columns=[*own, "x", "y", "z", "size_1", "size_2", "size_3"]).set_index("id")
 
