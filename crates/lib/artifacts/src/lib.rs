@@ -44,7 +44,7 @@ pub use masks::{
 pub use names::{Called, InstanceNames, Naming, ScoredName, called};
 pub use nyu40::NYU40;
 pub use palette::{NOISE_COLOR, instance_color};
-pub use runs::runs_of;
+pub use runs::{ranges_of, runs_of};
 pub use scratch::{Scratch, ScratchEntries};
 pub use truth::{MaskTruth, TrueObject, TruePart, TruePoints, TrueScene};
 

@@ -27,6 +27,14 @@ pub struct TileWeights<'a> {
     pub alpha: &'a [f32],
 }
 
+impl TileWeights<'_> {
+    /// Alpha and blending weight of the Gaussian at this place of the list at a pixel (x, y) of the image, which lies in the tile.
+    pub fn of(&self, place: usize, x: usize, y: usize) -> (f32, f32) {
+        let at = place * PIXELS + (y - self.y0) * TILE + x - self.x0;
+        (self.alphas[at], self.weights[at])
+    }
+}
+
 /// Calls `f` for every tile of the view, in parallel, and returns the results in tile order (row by row). With
 /// `early_stop` pixels take nothing more once their transmittance is spent, as when rendering; without, alphas of hidden
 /// Gaussians are there too.

@@ -15,7 +15,7 @@ pub use cache::encode_cached;
 pub use chance::{Unrelated, Verdict};
 pub use gaussians::{Chosen, DescribedGaussians, Share};
 pub use granules::{Granules, Kind, Meant, SAME, different};
-pub use gs_raster::pixel_weights;
+pub use gs_raster::{pixel_weights, tile_weights};
 pub use naming::{Vocabulary, name_instances};
 pub use nearest::{nearest, nearest_of};
 pub use onnx_models::EngineArgs;

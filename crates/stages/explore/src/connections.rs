@@ -17,8 +17,8 @@ use tokio::sync::Semaphore;
 /// What scripts, styles and pictures of the page may come from.
 const POLICY: &str = "default-src 'self'; script-src 'self' blob:; worker-src blob:; img-src 'self' data: blob:; \
                       style-src 'self' 'unsafe-inline'; frame-ancestors 'none'; base-uri 'none'; form-action 'none'";
-/// Largest body of a request in bytes: ten thousand edits have two megabytes.
-const LARGEST_BODY: usize = 4 << 20;
+/// Largest body of a request in bytes: ten thousand edits have two megabytes, a hundred that assign 50,000 scattered Gaussians twenty.
+const LARGEST_BODY: usize = 32 << 20;
 /// Most connections at a time; others wait until one ends.
 const MOST: usize = 128;
 

@@ -3,6 +3,8 @@
 use crate::pack::CHUNK;
 use crate::world::{Edited, World};
 use axum::body::Bytes;
+use base64::Engine;
+use base64::engine::general_purpose::STANDARD;
 use gs_scene::Camera;
 use query::TextSource;
 use serde_json::{Value, json};
@@ -23,8 +25,8 @@ pub fn blob(world: &World) -> Blob {
     blob.add("chunks", packed.chunks.iter().flatten().flat_map(|v| v.to_le_bytes()));
     blob.add("harmonics", packed.harmonics.iter().flatten().flat_map(|w| w.to_le_bytes()));
     blob.add("features", world.feature_colors.iter().flatten().copied());
-    let cells = packed.order.iter().map(|&i| world.cell_of[i as usize]);
-    if world.cells.len() <= 1 << 16 {
+    let cells = packed.order.iter().map(|&i| world.cells.of[i as usize]);
+    if world.cells.pairs.len() <= 1 << 16 {
         blob.add("cells", cells.flat_map(|c| (c as u16).to_le_bytes()));
     } else {
         blob.add("cells", cells.flat_map(u32::to_le_bytes));
@@ -77,8 +79,9 @@ pub fn scene(world: &World, edited: &Edited, blob: &Blob, mode: &str, photograph
         "spread": g.spread(),
         "bytes": blob.bytes.len(),
         "sections": sections,
-        "cells": world.cells,
-        "cell_counts": counts(world),
+        "cells": world.cells.pairs,
+        "cell_counts": world.cells.counts,
+        "cut": cut(edited, world),
         "tree": tree,
         "matches": matches,
         "instances": instances_of(None, world),
@@ -91,11 +94,14 @@ pub fn scene(world: &World, edited: &Edited, blob: &Blob, mode: &str, photograph
     })
 }
 
-/// Gaussians of every cell, those that are never drawn among them.
-fn counts(world: &World) -> Vec<u32> {
-    let mut counts = vec![0; world.cells.len()];
-    world.cell_of.iter().for_each(|&c| counts[c as usize] += 1);
-    counts
+/// The cells where edits cut them, and which of them each such edit assigned; null where none does.
+pub fn cut(edited: &Edited, world: &World) -> Value {
+    let cells = &edited.cells;
+    if cells.assigned.is_empty() {
+        return Value::Null;
+    }
+    let of: Vec<u8> = world.packed.order.iter().flat_map(|&i| cells.of[i as usize].to_le_bytes()).collect();
+    json!({"cells": cells.pairs, "cell_counts": cells.counts, "of": STANDARD.encode(of), "assigned": cells.assigned})
 }
 
 /// The instances as a list.

@@ -6,6 +6,7 @@
 //! `kept` holds what a person changed, and what other programs did meanwhile. `tools` answers programs, over HTTP by `serve` and over the Model Context Protocol by `mcp`, in `lines`.
 
 mod answers;
+mod cells;
 mod connections;
 mod describe;
 mod kept;

@@ -4,7 +4,7 @@
 //! name this server (`Host`), and a page of another origin is refused, so that no web page that happens to be open can read
 //! the scene. Bound to another address, everything lies below a secret in the URL.
 
-use crate::answers::{self, Click, Export};
+use crate::answers::{self, Click, Export, Lasso};
 use crate::connections::{self, Rules};
 use crate::describe::Blob;
 use crate::kept::{Kept, Lost, Saved};
@@ -150,6 +150,7 @@ fn routes(shared: Arc<Shared>) -> Router {
         .route("/preview/{view}", get(preview))
         .route("/thumbnail/{instance}", get(thumbnail))
         .route("/pick", post(pick))
+        .route("/lasso", post(lasso))
         .route("/find", get(find))
         .route("/edits", get(edits).put(save))
         .route("/selection", post(selection))
@@ -303,6 +304,15 @@ async fn pick(State(s): Held, body: Bytes) -> Response {
     .await
 }
 
+async fn lasso(State(s): Held, body: Bytes) -> Response {
+    in_turn(&Arc::clone(&s.large), move || {
+        let lasso: Lasso = parsed(body)?;
+        let edited = s.edited()?;
+        Ok(with_edits(&edited, json(&json!(answers::lasso(&s.world, &edited, &lasso)?))))
+    })
+    .await
+}
+
 /// `?text=...`.
 #[derive(serde::Deserialize)]
 struct Words {
@@ -320,7 +330,11 @@ async fn find(State(s): Held, Query(asked): Query<Words>) -> Response {
 
 /// The edits, and the instances after them.
 fn as_they_are(s: &Shared, edited: &Edited) -> Value {
-    json!({"edits": edited.edits.edits, "instances": describe::instances_of(Some(edited), &s.world)})
+    json!({
+        "edits": edited.edits.edits,
+        "instances": describe::instances_of(Some(edited), &s.world),
+        "cut": describe::cut(edited, &s.world),
+    })
 }
 
 async fn edits(State(s): Held) -> Response {
@@ -338,7 +352,12 @@ async fn save(State(s): Held, headers: HeaderMap, body: Bytes) -> Response {
     answer(move || {
         let edits: Vec<Edit> = parsed(body)?;
         Ok(match s.kept.replace(&s.world, edits, of.as_deref())?? {
-            Saved::Yes(new) => with_edits(&new, json(&describe::instances_of(Some(&new), &s.world).into())),
+            Saved::Yes(new) => {
+                let mut now = as_they_are(&s, &new);
+                // Whoever sent them has them.
+                now["edits"] = Value::Null;
+                with_edits(&new, json(&now))
+            }
             Saved::Stale(there) => {
                 let mut now = as_they_are(&s, &there);
                 now["error"] = "the edits were changed since: make yours again from these".into();
@@ -376,8 +395,7 @@ async fn tool(State(s): Held, Path(name): Path<String>, body: Bytes) -> Response
 async fn selection(State(s): Held, body: Bytes) -> Response {
     in_turn(&Arc::clone(&s.large), move || {
         let wanted: Export = parsed(body)?;
-        s.edited()?;
-        let chosen = answers::selection(&s.world, &wanted)?;
+        let chosen = answers::selection(&s.edited()?.cells, &wanted)?;
         let comments = s.world.scene.geometry.comments(vec!["cags selection".into()]);
         let ply = gs_scene::ply::some_gaussians(s.world.gaussians(), &chosen, &comments)?;
         Ok(typed("application/octet-stream", ply))

@@ -219,10 +219,14 @@ fn parsed<T: DeserializeOwned>(arguments: Value) -> Result<T> {
 
 /// What all answers say of an object.
 fn brief(o: &Object) -> Value {
-    json!({
+    let mut brief = json!({
         "id": o.id, "name": o.name.as_ref().map(|n| &n.text), "sure": o.name.as_ref().map(|n| n.sure), "centre": o.bounds.center, "size": size(o), "volume": o.volume,
         "gaussians": o.gaussians, "score": o.score,
-    })
+    });
+    if let Some(note) = &o.note {
+        brief["note"] = json!(note);
+    }
+    brief
 }
 
 /// Sides of the box; of an upright one the third is its height.

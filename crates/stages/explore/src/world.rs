@@ -1,5 +1,6 @@
 //! A run, loaded.
 
+use crate::cells::Cells;
 use crate::options::Source;
 use crate::pack::{Packed, pack};
 use crate::reach::Reach;
@@ -25,12 +26,8 @@ pub struct World {
     pub packed: Packed,
     /// Where their Gaussians can be seen.
     pub reach: Reach,
-    /// The different pairs of instance and cluster that Gaussians have: what the page shows and hides together.
-    pub cells: Vec<(i32, i32)>,
-    /// Cell of every Gaussian; N.
-    pub cell_of: Vec<u32>,
-    /// First Gaussian of every cell.
-    pub first_of: Vec<u32>,
+    /// What the page shows and hides together, before anybody's edits.
+    pub cells: Cells,
     /// Colours of the features, rgb per packed Gaussian; empty where the run has no features.
     pub feature_colors: Vec<[u8; 3]>,
     /// Where text features come from, or why there are none.
@@ -51,8 +48,10 @@ pub struct Edited {
     pub version: String,
     /// The instances after it.
     pub instances: Instances,
-    /// Names and scale.
+    /// Names, notes and scale.
     pub remarks: Remarks,
+    /// What the page shows and hides together.
+    pub cells: Cells,
     objects: OnceLock<objects::Scene>,
     by_chance: OnceLock<Option<f32>>,
 }
@@ -102,7 +101,7 @@ impl World {
         });
         let packed = pack(scene.gaussians(), o.sh);
         let reach = Reach::new(scene.gaussians(), &packed.order);
-        let (cells, cell_of, first_of) = cells(&scene.instances);
+        let cells = Cells::new(&scene.instances);
         let feature_colors = match feature_colors(o, &scene, &packed) {
             Ok(colors) => colors,
             Err(e) => {
@@ -122,8 +121,6 @@ impl World {
             packed,
             reach,
             cells,
-            cell_of,
-            first_of,
             feature_colors,
             words,
             unrelated: OnceLock::new(),
@@ -192,7 +189,8 @@ impl World {
     pub fn edited(&self, edits: Edits, version: String) -> Result<Edited> {
         let mut instances = self.scene.instances.clone();
         let remarks = edits.apply(&mut instances, &self.gaussians().means)?;
-        Ok(Edited { edits, version, instances, remarks, objects: OnceLock::new(), by_chance: OnceLock::new() })
+        let cells = self.cells.cut(&edits.edits)?;
+        Ok(Edited { edits, version, instances, remarks, cells, objects: OnceLock::new(), by_chance: OnceLock::new() })
     }
 
     /// The view of this stem.
@@ -231,22 +229,6 @@ fn names(source: &Source, scene: &LabelledScene) -> Result<Option<InstanceNames>
     path.map(|path| InstanceNames::read(path, scene.artifact.hash())).transpose()
 }
 
-/// The different pairs of label and node in order of their first Gaussian, which of them each Gaussian has, and those first ones.
-fn cells(instances: &Instances) -> (Vec<(i32, i32)>, Vec<u32>, Vec<u32>) {
-    let mut known = BTreeMap::new();
-    let (mut cells, mut first) = (Vec::new(), Vec::new());
-    let pairs = instances.label.iter().copied().zip(instances.node.iter().copied());
-    let of = pairs.enumerate().map(|(i, pair)| {
-        *known.entry(pair).or_insert_with(|| {
-            cells.push(pair);
-            first.push(i as u32);
-            cells.len() as u32 - 1
-        })
-    });
-    let of = of.collect();
-    (cells, of, first)
-}
-
 /// Grey of a Gaussian that no view sees and that has no features.
 const NO_FEATURE: [u8; 3] = [64; 3];
 
@@ -260,17 +242,4 @@ fn feature_colors(source: &Source, scene: &LabelledScene, packed: &Packed) -> Re
         colors[i as usize] = color.map(|v| (255.0 * v).round() as u8);
     }
     Ok(packed.order.iter().map(|&i| colors[i as usize]).collect())
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn cells_are_pairs_of_instance_and_cluster() {
-        let i = Instances { label: vec![0, 0, -1, 0, 1], node: vec![7, 8, -1, 7, 7], ..Instances::default() };
-        let (cells, of, first) = cells(&i);
-        assert_eq!(cells, [(0, 7), (0, 8), (-1, -1), (1, 7)]);
-        assert_eq!((of, first), (vec![0, 1, 2, 0, 3], vec![0, 1, 2, 4]));
-    }
 }

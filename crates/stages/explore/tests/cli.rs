@@ -3,7 +3,7 @@
 mod common;
 
 use artifacts::Edits;
-use common::{Run, camera, click, gaussians};
+use common::{Run, SIZE, camera, click, gaussians};
 use glam::DVec3;
 use serde_json::{Value, json};
 
@@ -80,11 +80,14 @@ fn the_server_answers_clicks_texts_edits_and_selections() {
     assert_eq!(found["scores"], json!([0.0, 1.0]));
 
     // Split and named: ids stay, the file says what was done, and the answers follow.
-    let edits = json!([{"op": "split", "instance": 1}, {"op": "rename", "instance": 2, "name": "Moon"}]);
-    let list = server.json("PUT", "/edits", &edits);
+    let edits = json!([{"op": "split", "instance": 1}, {"op": "rename", "instance": 2, "name": "Moon"},
+        {"op": "note", "instance": 2, "text": "ours"}]);
+    let list = server.json("PUT", "/edits", &edits)["instances"].take();
     assert_eq!(list.as_array().unwrap().len(), 3);
     assert_eq!(list[2]["name"], json!("Moon"));
-    assert_eq!(Edits::read(run.out().join("instances.edits.json")).unwrap().edits.len(), 2);
+    assert_eq!(Edits::read(run.out().join("instances.edits.json")).unwrap().edits.len(), 3);
+    let noted = server.json("POST", "/tools/list", &json!({}));
+    assert_eq!((&noted["objects"][1]["note"], &noted["objects"][2]["note"]), (&Value::Null, &json!("ours")));
     assert_eq!(server.json("GET", "/find?text=moon", &Value::Null)["named"], json!([2]));
     assert_eq!(server.json("POST", "/pick", &click(32, 24, &[0]))["instance"], json!(1));
     let right = camera(0.0).project(DVec3::new(0.9, 0.0, 4.0));
@@ -111,11 +114,49 @@ fn the_server_answers_clicks_texts_edits_and_selections() {
 }
 
 #[test]
+fn a_lasso_catches_what_is_seen_and_what_is_given_away_stays_so() {
+    let run = Run::new();
+    let server = run.serve(&[]);
+    let (w, h) = (f64::from(SIZE.0), f64::from(SIZE.1));
+    let caught = |instance: i32, own: bool, hidden: &[u32], left: f64| {
+        let mut lasso = click(0, 0, hidden);
+        lasso["outline"] = json!([[left, 0.0], [w, 0.0], [w, h], [left, h]]);
+        (lasso["instance"], lasso["own"]) = (instance.into(), own.into());
+        let caught = server.json("POST", "/lasso", &lasso);
+        (caught["gaussians"].as_str().unwrap().to_string(), caught["count"].as_u64().unwrap())
+    };
+    // The near ball hides a part of the far one; nothing that is too faint is ever caught.
+    let one = ("2 1".to_string(), 1);
+    assert_eq!((caught(1, true, &[], 0.0), caught(0, false, &[], 0.0)), (one.clone(), one));
+    assert_eq!(caught(1, true, &[0], 0.0), ("1 2".to_string(), 2));
+    assert_eq!((caught(0, true, &[], 0.0).1, caught(0, true, &[], 40.0)), (1, (String::new(), 0)));
+    let right = camera(0.0).project(DVec3::new(0.9, 0.0, 4.0));
+    let there = || server.json("POST", "/pick", &click(right.0 as u32, right.1 as u32, &[]))["instance"].take();
+    assert_eq!(there(), json!(1));
+    let assign = |instance: i32| json!([{"op": "assign", "instance": instance, "gaussians": "2 1"}]);
+    let said = server.json("PUT", "/edits", &assign(-1));
+    assert_eq!((said["instances"][1]["count"].as_u64(), &said["cut"]["assigned"]), (Some(1), &json!([[2]])));
+    assert_eq!(there(), Value::Null);
+    server.json("PUT", "/edits", &json!([assign(-1)[0], assign(0)[0]]));
+    assert_eq!(there(), json!(0));
+    let list = server.json("POST", "/tools/list", &json!({}));
+    assert_eq!([&list["objects"][0]["gaussians"], &list["objects"][1]["gaussians"]], [&json!(2), &json!(1)]);
+}
+
+#[test]
 fn bad_questions_are_refused_and_the_server_goes_on() {
     let run = Run::new();
     let server = run.serve(&[]);
     let mut far = click(0, 0, &[]);
     far["camera"]["fx"] = json!(0.0);
+    let lasso = |width: u32, corners: usize| {
+        let mut lasso = click(0, 0, &[]);
+        lasso["camera"]["width"] = width.into();
+        lasso["camera"]["height"] = (if width > 64 { 32_768 } else { 48 }).into();
+        lasso["outline"] = json!(vec![[0.0, 0.0]; corners]);
+        (lasso["instance"], lasso["own"]) = (0.into(), true.into());
+        lasso
+    };
     let long = format!("/find?text={}", "a".repeat(1001));
     for (method, path, body, expected) in [
         ("POST", "/pick", "{", "not understood"),
@@ -127,6 +168,10 @@ fn bad_questions_are_refused_and_the_server_goes_on() {
         ("GET", &long, "", "the text is too long; found 1001 characters"),
         ("PUT", "/edits", r#"[{"op": "split", "instance": 0}]"#, "edits[0].instance"),
         ("PUT", "/edits", r#"[{"op": "explode"}]"#, "not understood"),
+        ("PUT", "/edits", r#"[{"op": "assign", "instance": 0, "gaussians": "9 9"}]"#, "edits[0].gaussians"),
+        ("POST", "/lasso", &lasso(64, 2).to_string(), "not an outline; found 2 corners, expected 3 to 10000"),
+        ("POST", "/lasso", &lasso(64, 10_001).to_string(), "not an outline; found 10001 corners"),
+        ("POST", "/lasso", &lasso(32_768, 3).to_string(), "the picture is too large; found 1073741824 pixels"),
         ("POST", "/selection", r#"{"cells": []}"#, "nothing is selected"),
         ("POST", "/selection", r#"{"cells": [4]}"#, "no such cell"),
         ("GET", "/photograph/2", "", "no such view"),
