@@ -237,6 +237,11 @@ impl Browser {
         );
     }
 
+    /// Types with the focus on an element.
+    async fn keys(&self, id: &str, keys: &str) {
+        self.client.find(Locator::Id(id)).await.unwrap().send_keys(keys).await.unwrap();
+    }
+
     async fn selected(&self) -> Vec<u32> {
         let ids = self.js("await page.viewer.busy; return page.selectedInstances()", vec![]).await;
         serde_json::from_value(ids).unwrap()
@@ -424,6 +429,42 @@ async fn a_click_is_answered_while_the_first_text_is_encoded() {
     browser.client.clone().close().await.unwrap();
 }
 
+/// A note is typed without a mouse, kept in the run's folder, shown as text, and undone like any edit.
+#[tokio::test]
+#[ignore = "needs chromium; run scripts/test_explore.sh"]
+async fn notes_are_kept_and_shown() {
+    let run = Run::new();
+    run.write_names(&run.instances());
+    let server = run.serve(&[]);
+    let browser = Browser::open().await;
+    let url = format!("http://{}{}", server.host, server.path);
+    browser.load(&url).await;
+    browser.js("await page.selectInstances([0])", vec![]).await;
+    let note = "<b>grandma's</b>, 👩‍🍳 میراث";
+    browser.keys("canvas", "o").await;
+    browser.until("document.getElementById('ask').open").await;
+    browser.keys("ask-value", &format!("{note}\u{e007}")).await;
+    browser.until("document.getElementById('note').textContent").await;
+    let shown = "await page.act('inventory'); const at = (q) => document.querySelector(q)?.textContent ?? null; return [at('#note'), at('#ranking span small'), at('b')]";
+    let path = run.out().join("instances.edits.json");
+    let there = json!([note, note, null]);
+    assert_eq!(browser.js(shown, vec![]).await, there);
+    let kept = artifacts::Edit::Note { instance: 0, text: note.into() };
+    assert_eq!(Edits::read(&path).unwrap().edits, [kept]);
+    browser.js("await page.act('undo')", vec![]).await;
+    assert_eq!(browser.js(shown, vec![]).await, json!(["", null, null]));
+    browser.js("await page.act('redo')", vec![]).await;
+    browser.load(&url).await;
+    browser.js("await page.selectInstances([0])", vec![]).await;
+    assert_eq!(browser.js(shown, vec![]).await, there);
+    // A long one is refused where there is no server, too.
+    let long = json!({"op": "note", "instance": 0, "text": "é".repeat(251)});
+    let said = browser.js("return page.instances.edit(given[0])", vec![long]).await;
+    assert_eq!(said, json!("This is too long: it has 502 bytes, and 500 at most are kept."));
+    browser.no_errors().await;
+    browser.client.clone().close().await.unwrap();
+}
+
 /// Everything stands in the list of what is here, under the names of `names.json`; the pointer tells a thing's name.
 async fn names_are_listed_and_hovered(browser: &Browser, f: &Fixture) {
     let hash = Instances::read(f.run.join("instances.safetensors")).unwrap().1.hash().to_string();
@@ -452,6 +493,7 @@ async fn edits_are_those_of_the_stages(browser: &Browser, f: &Fixture, path: &Pa
     let mut wanted = vec![
         json!({"op": "merge", "instances": [others[0], others[1]]}),
         json!({"op": "rename", "instance": others[2], "name": "grandma's kettle"}),
+        json!({"op": "note", "instance": others[2], "text": "grandma's"}),
         json!({"op": "scale", "from": [0.0, 0.0, 0.0], "to": [2.0, 0.0, 0.0], "metres": 1.0}),
     ];
     wanted.extend(split.map(|k| json!({"op": "split", "instance": k})));

@@ -1,6 +1,9 @@
 // Instances, the tree that they were cut from, and what a person changed of them. Gaussians of one instance and one
 // cluster of the tree are a cell: everything here is about cells.
 
+// Most bytes of a name and of a note, as artifacts::Edits has them.
+const LONGEST = { name: 100, text: 500 };
+
 export class Instances {
   constructor(scene, gaussians) {
     Object.assign(this, { scene, cells: scene.cells, edits: [], undone: [] });
@@ -38,6 +41,7 @@ export class Instances {
     this.label = Int32Array.from(this.cells, (c) => c[0]);
     this.tree = this.scene.tree.map(([parent, child, lambda, size, instance]) => ({ parent, child, lambda, size, instance }));
     this.names = new Map();
+    this.notes = new Map();
     // What a vocabulary calls those that nobody merged or split: k -> { name, sure }.
     this.guesses = new Map(this.scene.instances.flatMap(({ guess }, k) => (guess ? [[k, guess]] : [])));
     this.origin = this.scene.instances.map((_, k) => [k]);
@@ -79,13 +83,12 @@ export class Instances {
       const [first, ...others] = edit.instances;
       if (!others.length) return "Select two or more instances to merge (shift-click).";
       const gone = new Set(others);
-      edit.instances.forEach((k) => this.guesses.delete(k));
+      this.guesses.delete(first);
       this.label = this.label.map((l) => (gone.has(l) ? first : l));
       for (const e of this.tree) if (gone.has(e.instance)) e.instance = first;
       for (const k of others) {
         this.origin[first] = [...this.origin[first], ...this.origin[k]];
-        this.origin[k] = [];
-        this.names.delete(k);
+        this.forget(k);
       }
     } else if (edit.op === "split") {
       const k = edit.instance, { own, parts } = this.family(k);
@@ -105,12 +108,22 @@ export class Instances {
         if (own.includes(e.child)) e.instance = -1;
         if (parts.includes(e.child)) e.instance = ids[parts.indexOf(e.child)];
       }
-    } else if (edit.op === "rename") {
-      this.names.set(edit.instance, edit.name);
+    } else if (edit.op === "rename" || edit.op === "note") {
+      const [field, all] = edit.op === "note" ? ["text", this.notes] : ["name", this.names];
+      const bytes = new TextEncoder().encode(edit[field]).length;
+      if (bytes > LONGEST[field]) return `This is too long: it has ${bytes} bytes, and ${LONGEST[field]} at most are kept.`;
+      if (edit[field]) all.set(edit.instance, edit[field]);
+      else all.delete(edit.instance);
     } else if (edit.op === "scale") {
       this.metresPerUnit = edit.metres / Math.hypot(...edit.from.map((v, k) => v - edit.to[k]));
     }
     return null;
+  }
+
+  // Leaves nothing of an instance that is no more.
+  forget(k) {
+    this.origin[k] = [];
+    for (const known of [this.names, this.notes, this.guesses]) known.delete(k);
   }
 
   // The clusters of an instance, and those that it consists of.

@@ -263,17 +263,22 @@ const inventory = attempt(() => {
   $("results").hidden = false;
   for (const part of ["histogram", "threshold-label"]) $(part).style.display = "none";
   $("results-title").textContent = `${all} thing${all === 1 ? "" : "s"} here`;
-  $("ranking").replaceChildren(...there.map(([name, own]) => {
-    const button = element("button", { type: "button", title: own.map((k) => `${instances.name(k)} (${k})`).join(", ") });
-    const pictured = own.find((k) => instances.views(k).length);
-    const picture = pictured === undefined ? null : door.thumbnail(pictured);
-    button.append(picture ? element("img", { src: picture, alt: "", loading: "lazy" }) : element("span"), element("span", {}, name), element("small", {}, `× ${own.length}`));
+  fill(there.map(([name, own]) => ({ name, own, beside: `× ${own.length}`, title: own.map((k) => `${instances.name(k)} (${k})`).join(", ") })));
+});
+
+// Fills the list: things of a name, their notes, and what stands beside it.
+function fill(rows) {
+  $("ranking").replaceChildren(...rows.map(({ name, own, beside, title }) => {
+    const button = element("button", { type: "button", title }), words = element("span", {}, name);
+    const pictured = own.find((k) => instances.views(k).length), picture = pictured === undefined ? null : door.thumbnail(pictured);
+    for (const k of own) if (instances.notes.has(k)) words.append(element("small", {}, instances.notes.get(k)));
+    button.append(picture ? element("img", { src: picture, alt: "", loading: "lazy" }) : element("span"), words, element("small", {}, beside));
     button.addEventListener("click", (e) => selectInstances(own, { extend: e.shiftKey }));
     const item = element("li");
     item.append(button);
     return item;
   }));
-});
+}
 
 // Where the pointer rests, the thing's name is shown.
 const HOVER_MS = 300;
@@ -304,15 +309,7 @@ function results() {
   const tallest = Math.max(1, ...counts), limit = state.threshold ?? Infinity;
   $("histogram").innerHTML = counts.map((n, b) => `<rect class="${b >= bin(limit) && limit !== Infinity ? "in" : ""}" x="${b * 4 + 0.3}" y="${24 - 24 * n / tallest}" width="3.4" height="${24 * n / tallest}"/>`).join("");
   $("threshold-value").textContent = state.threshold === null ? "" : state.threshold.toFixed(3);
-  $("ranking").replaceChildren(...answer.ranking.slice(0, 60).map(({ k, score }) => {
-    const button = element("button", { type: "button", title: `Select ${instances.name(k)}` });
-    const picture = instances.views(k).length ? door.thumbnail(k) : null;
-    button.append(picture ? element("img", { src: picture, alt: "", loading: "lazy" }) : element("span"), element("span", {}, instances.name(k)), element("small", {}, score === null ? "name" : score.toFixed(3)));
-    button.addEventListener("click", (e) => selectInstances([k], { extend: e.shiftKey }));
-    const item = element("li");
-    item.append(button);
-    return item;
-  }));
+  fill(answer.ranking.slice(0, 60).map(({ k, score }) => ({ name: instances.name(k), own: [k], beside: score === null ? "name" : score.toFixed(3), title: `Select ${instances.name(k)}` })));
 }
 
 // ---- panels ----
@@ -333,6 +330,7 @@ function panel() {
   $("selection-name").textContent = chosen.length > 1 ? `${chosen.length} instances` : whole === null ? `part of ${instances.name(chosen[0])}` : instances.name(whole);
   const box = selectedBox();
   $("facts").textContent = `${count.toLocaleString("en")} Gaussians, ${box.half.map((h) => size(2 * h)).join(" × ")}`;
+  $("note").textContent = (whole !== null && instances.notes.get(whole)) || "";
   $("level-label").hidden = levels.length < 2;
   if (levels.length > 1) {
     const at = levels.findIndex((l) => l.cells.length === state.cells.size);
@@ -370,6 +368,7 @@ const ACTIONS = [
   ["hide", "Hide", "h", () => hide(), () => state.cells.size],
   ["frame", "Look at it", "f", () => frame(), () => state.cells.size],
   ["rename", "Rename", "n", () => rename(), () => wholeInstance() !== null],
+  ["annotate", "Note", "o", () => annotate(), () => wholeInstance() !== null],
   ["merge", "Merge", "m", () => merge(), () => selectedInstances().length > 1],
   ["split", "Split", "x", () => split(), () => wholeInstance() !== null && instances.family(wholeInstance()).parts.length > 1],
   ["save-selection", "Save as PLY", "p", () => savePly(false), () => state.cells.size],
@@ -506,13 +505,20 @@ async function split() {
   say(`Now ${selectedInstances().length} instances.`);
 }
 
-// A name as gs_io::check_name has it: without control characters, those that turn the text around among them, and no dash before it.
-const plain = (name) => name.replace(/[\p{Cc}\u061c\u200e\u200f\u2028-\u202e\u2066-\u2069]+/gu, " ").replace(/^[\s-]+|\s+$/g, "");
+// A text without control characters, those that turn it around among them; a name has no dash before it either (gs_io::check_name).
+const plain = (text) => text.replace(/[\p{Cc}\u061c\u200e\u200f\u2028-\u202e\u2066-\u2069]+/gu, " ").trim();
+const plainName = (name) => plain(name).replace(/^[\s-]+/, "");
 
 async function rename() {
   const instance = wholeInstance();
   const name = await ask("What is it?", instances.names.get(instance) ?? "");
-  if (name && plain(name)) await edit({ op: "rename", instance, name: plain(name) });
+  if (name && plainName(name)) await edit({ op: "rename", instance, name: plainName(name) });
+}
+
+async function annotate() {
+  const instance = wholeInstance();
+  const text = await ask("What should people know of it?", instances.notes.get(instance) ?? "");
+  if (text !== null && plain(text) !== (instances.notes.get(instance) ?? "")) await edit({ op: "note", instance, text: plain(text) });
 }
 
 // Asks for one line; null when the person would rather not.
@@ -548,7 +554,7 @@ function saveJson() {
   const things = selectedInstances().map((k) => {
     const cells = instances.cellsOf(k), { count, center, low, high } = instances.extent(cells);
     const views = instances.views(k).map(([view, mask, score]) => ({ view: scene.cameras[view].name, mask, score }));
-    return { instance: k, name: instances.names.get(k) ?? null, gaussians: count, center, low, high, box: state.list?.[k]?.box ?? scene.instances[k]?.box ?? null, views };
+    return { instance: k, name: instances.names.get(k) ?? null, note: instances.notes.get(k) ?? null, gaussians: count, center, low, high, box: state.list?.[k]?.box ?? scene.instances[k]?.box ?? null, views };
   });
   const all = { scene: scene.name, instances_hash: scene.instances_hash, metres_per_unit: metres, selection: things };
   save(`${fileName()}.json`, new Blob([JSON.stringify(all, null, 1)], { type: "application/json" }));
