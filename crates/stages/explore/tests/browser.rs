@@ -465,6 +465,27 @@ async fn notes_are_kept_and_shown() {
     browser.client.clone().close().await.unwrap();
 }
 
+/// The list of a search calls things as the inventory does, a guess with a question mark, until a person knows better.
+#[tokio::test]
+#[ignore = "needs chromium; run scripts/test_explore.sh"]
+async fn the_list_has_the_names_of_the_inventory() {
+    let run = Run::new();
+    run.write_names(&run.instances());
+    let server = run.serve(&[]);
+    let browser = Browser::open().await;
+    browser.load(&format!("http://{}{}", server.host, server.path)).await;
+    browser.ask("far ball").await;
+    let listed = "return [...document.querySelectorAll('#ranking button')].map((b) => b.children[1].textContent).concat(document.getElementById('selection-name').textContent)";
+    browser.until("document.getElementById('selection-name').textContent").await;
+    assert_eq!(browser.js(listed, vec![]).await, json!(["planet?", "sun", "planet?"]));
+    browser.js("await page.edit({ op: 'rename', instance: 1, name: 'my moon' })", vec![]).await;
+    assert_eq!(browser.js(listed, vec![]).await, json!(["my moon", "sun", "my moon"]));
+    browser.js("await page.act('undo')", vec![]).await;
+    assert_eq!(browser.js(listed, vec![]).await, json!(["planet?", "sun", "planet?"]));
+    browser.no_errors().await;
+    browser.client.clone().close().await.unwrap();
+}
+
 /// Everything stands in the list of what is here, under the names of `names.json`; the pointer tells a thing's name.
 async fn names_are_listed_and_hovered(browser: &Browser, f: &Fixture) {
     let hash = Instances::read(f.run.join("instances.safetensors")).unwrap().1.hash().to_string();
