@@ -395,10 +395,11 @@ async fn tool(State(s): Held, Path(name): Path<String>, body: Bytes) -> Response
 async fn selection(State(s): Held, body: Bytes) -> Response {
     in_turn(&Arc::clone(&s.large), move || {
         let wanted: Export = parsed(body)?;
-        let chosen = answers::selection(&s.edited()?.cells, &wanted)?;
+        let edited = s.edited()?;
+        let chosen = answers::selection(&edited.cells, &wanted)?;
         let comments = s.world.scene.geometry.comments(vec!["cags selection".into()]);
         let ply = gs_scene::ply::some_gaussians(s.world.gaussians(), &chosen, &comments)?;
-        Ok(typed("application/octet-stream", ply))
+        Ok(with_edits(&edited, typed("application/octet-stream", ply)))
     })
     .await
 }

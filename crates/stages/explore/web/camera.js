@@ -81,8 +81,9 @@ export class Visitor {
     this.changed(true);
   }
 
-  // Listens to a canvas. `click(event)` is called for a press that does not move.
-  listen(canvas, click) {
+  // Listens to a canvas. `click(event)` is called for a press that does not move. `trace(event, done)` says whether a drag is a
+  // tool's; then the camera stays.
+  listen(canvas, click, trace) {
     const fingers = new Map();
     let moved = 0;
     canvas.addEventListener("contextmenu", (e) => e.preventDefault());
@@ -90,6 +91,7 @@ export class Visitor {
       canvas.setPointerCapture(e.pointerId);
       if (!fingers.size) moved = 0;
       fingers.set(e.pointerId, [e.clientX, e.clientY]);
+      if (fingers.size === 1) trace(e, false);
     });
     canvas.addEventListener("pointermove", (e) => {
       const last = fingers.get(e.pointerId);
@@ -99,12 +101,13 @@ export class Visitor {
       moved += Math.hypot(now[0] - last[0], now[1] - last[1]);
       const other = [...fingers].find(([id]) => id !== e.pointerId)?.[1];
       fingers.set(e.pointerId, now);
-      if (moved < 4) return;
+      const moves = other || e.buttons & 2 || e.ctrlKey;
+      if (moved < 4 || (!moves && trace(e, false))) return;
       if (other) {
         const gap = (p) => Math.hypot(p[0] - other[0], p[1] - other[1]);
         this.pan(dx / 2, dy / 2);
         this.zoom(gap(last) / Math.max(1, gap(now)));
-      } else if (e.buttons & 2 || e.ctrlKey) {
+      } else if (moves) {
         this.pan(dx, dy);
       } else {
         this.orbit(dx, dy);
@@ -113,7 +116,7 @@ export class Visitor {
     const end = (e) => {
       if (!fingers.delete(e.pointerId) || fingers.size) return;
       if (e.type === "pointerup" && moved < 4 && e.button === 0) click(e);
-      else this.changed(false);
+      else if (!trace(e, true)) this.changed(false);
     };
     canvas.addEventListener("pointerup", end);
     canvas.addEventListener("pointercancel", end);

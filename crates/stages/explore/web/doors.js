@@ -1,5 +1,6 @@
 // Where answers come from: a server on this machine, or what the file itself holds. Both have the same doors:
-// load(progress), photograph(view), preview(view), thumbnail(instance), pick(...), find(text), save(edits), selection(...).
+// load(progress), photograph(view), preview(view), thumbnail(instance), pick(...), find(text), save(edits), selection(...); only a
+// server, which knows the Gaussians of the geometry, has lasso(...).
 // A server may have edits that this page has not: `behind` says that an answer was made with others.
 import { Gaussians, largest } from "./gaussians.js";
 
@@ -11,6 +12,8 @@ async function answer(response) {
 
 const post = (path, body) =>
   fetch(path, { method: "POST", headers: { "content-type": "application/json" }, body: JSON.stringify(body) }).then(answer);
+
+const pinhole = ({ width, height, fx, fy, cx, cy, rotation, translation }) => ({ width, height, fx, fy, cx, cy, rotation, translation });
 
 export class Server {
   // `progress(done, total)` in bytes.
@@ -53,30 +56,33 @@ export class Server {
   }
 
   async pick(camera, x, y, hidden) {
-    const { width, height, fx, fy, cx, cy, rotation, translation } = camera;
-    return this.seen(await post("pick", { camera: { width, height, fx, fy, cx, cy, rotation, translation }, x, y, hidden })).json();
+    return this.seen(await post("pick", { camera: pinhole(camera), x, y, hidden })).json();
+  }
+
+  // { gaussians, count }: those seen within an outline in pixels, that the instance has, or that it has not.
+  async lasso(camera, outline, hidden, instance, own) {
+    return (await post("lasso", { camera: pinhole(camera), outline, hidden, instance, own })).json();
   }
 
   async find(text) {
     return this.seen(await fetch(`find?text=${encodeURIComponent(text)}`).then(answer)).json();
   }
 
-  // The edits that there are, and the instances after them.
+  // The edits that there are, and the instances and cells after them.
   async edits() {
     return this.known(await fetch("edits").then(answer)).json();
   }
 
-  // { instances } after the edits; where others were made since, nothing is saved, and those are told: { edits, instances }.
+  // { instances, cut } after the edits; where others were made since, nothing is saved, and those are told, too: { edits }.
   async save(edits) {
     const headers = { "content-type": "application/json", "if-match": this.version };
     const response = await fetch("edits", { method: "PUT", headers, body: JSON.stringify(edits) });
     const stale = response.status === 409 && response.headers.has("etag");
-    const said = await this.known(stale ? response : await answer(response)).json();
-    return stale ? said : { instances: said };
+    return this.known(stale ? response : await answer(response)).json();
   }
 
   async selection(cells, others) {
-    return (await post("selection", { cells, others })).blob();
+    return this.seen(await post("selection", { cells, others })).blob();
   }
 }
 

@@ -20,7 +20,7 @@ export class Gaussians {
     this.chunks = section("chunks", Float32Array);
     this.harmonics = section("harmonics", Uint32Array);
     this.features = section("features", Uint8Array);
-    this.cells = section("cells", scene.cells.length <= 65536 ? Uint16Array : Uint32Array);
+    this.uncut = this.cells = section("cells", scene.cells.length <= 65536 ? Uint16Array : Uint32Array);
     this.positions = new Float32Array(3 * this.count);
     // Without the arrays of `three`: there may be millions.
     for (let i = 0; i < this.count; i++) {

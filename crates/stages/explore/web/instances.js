@@ -1,12 +1,22 @@
 // Instances, the tree that they were cut from, and what a person changed of them. Gaussians of one instance and one
-// cluster of the tree are a cell: everything here is about cells.
+// cluster of the tree are a cell, cut where a person gave a part of it away: everything here is about cells.
 
 // Most bytes of a name and of a note, as artifacts::Edits has them.
 const LONGEST = { name: 100, text: 500 };
 
 export class Instances {
   constructor(scene, gaussians) {
-    Object.assign(this, { scene, cells: scene.cells, edits: [], undone: [] });
+    Object.assign(this, { scene, gaussians, edits: [], undone: [] });
+    this.root = Math.min(...scene.tree.map((e) => e[0]));
+    this.setCells(scene.cut);
+    this.setEdits(scene.edits);
+  }
+
+  // The cells as somebody who knows all Gaussians cut them for some edits, and which of them each edit assigns; null: uncut.
+  setCells(cut) {
+    const { gaussians } = this, { cells, cell_counts, assigned } = cut ?? { ...this.scene, assigned: [] };
+    gaussians.cells = cut ? new Uint32Array(Uint8Array.from(atob(cut.of), (c) => c.charCodeAt(0)).buffer) : gaussians.uncut;
+    Object.assign(this, { cells, counts: cell_counts, assigned });
     this.sizes = new Float64Array(this.cells.length);
     this.sums = this.cells.map(() => [0, 0, 0]);
     this.lowest = this.cells.map(() => [Infinity, Infinity, Infinity]);
@@ -22,14 +32,11 @@ export class Instances {
         if (v > this.highest[cell][k]) this.highest[cell][k] = v;
       }
     }
-    this.root = Math.min(...scene.tree.map((e) => e[0]));
-    this.setEdits(scene.edits);
   }
 
   // Starts from these edits; nothing of them can be undone one by one but from the last.
-  setEdits(edits) {
-    this.edits = [];
-    this.undone = [];
+  setEdits(edits, undone = []) {
+    Object.assign(this, { edits: [], undone, assigns: 0 });
     this.start();
     for (const edit of edits) {
       this.apply(edit);
@@ -63,9 +70,7 @@ export class Instances {
 
   undo() {
     if (!this.edits.length) return false;
-    const last = this.edits.pop(), undone = [...this.undone, last];
-    this.setEdits(this.edits);
-    this.undone = undone;
+    this.setEdits(this.edits.slice(0, -1), [...this.undone, this.edits.at(-1)]);
     return true;
   }
 
@@ -96,7 +101,7 @@ export class Instances {
       const inside = parts.map((p) => this.within(p));
       const members = this.cellsOf(k);
       const partOf = (cell) => inside.findIndex((s) => s.has(this.cells[cell][1]));
-      const sizes = parts.map((_, p) => members.filter((c) => partOf(c) === p).reduce((s, c) => s + this.scene.cell_counts[c], 0));
+      const sizes = parts.map((_, p) => members.filter((c) => partOf(c) === p).reduce((s, c) => s + this.counts[c], 0));
       const keeps = sizes.indexOf(Math.max(...sizes));
       const ids = parts.map((_, p) => (p === keeps ? k : this.origin.push(sizes[p] ? [...this.origin[k]] : []) - 1));
       for (const cell of members) {
@@ -114,6 +119,15 @@ export class Instances {
       if (bytes > LONGEST[field]) return `This is too long: it has ${bytes} bytes, and ${LONGEST[field]} at most are kept.`;
       if (edit[field]) all.set(edit.instance, edit[field]);
       else all.delete(edit.instance);
+    } else if (edit.op === "assign") {
+      // Until the cells were cut for this edit it changes nothing here.
+      const cells = this.assigned[this.assigns++] ?? [], had = new Set(cells.map((c) => this.label[c]));
+      for (const c of cells) this.label[c] = edit.instance;
+      for (const k of had) {
+        if (k < 0 || this.label.includes(k)) continue;
+        this.forget(k);
+        for (const e of this.tree) if (e.instance === k) e.instance = -1;
+      }
     } else if (edit.op === "scale") {
       this.metresPerUnit = edit.metres / Math.hypot(...edit.from.map((v, k) => v - edit.to[k]));
     }

@@ -16,7 +16,7 @@ const MOST_IN_MOTION = 1_500_000;
 // How long a frame may take in motion, in milliseconds; where it takes longer, fewer pixels are drawn, down to this share of each side.
 const FRAME = 16, COARSEST = 0.25;
 let viewer, visitor, instances, scene, gaussians, started = false;
-const state = { cells: new Set(), clicked: null, levels: null, hidden: new Set(), rest: "shown", colors: "photograph", answer: null, tool: "select", points: [], moving: false, sharpness: 1 };
+const state = { cells: new Set(), clicked: null, levels: null, hidden: new Set(), rest: "shown", colors: "photograph", answer: null, tool: "select", points: [], path: [], moving: false, sharpness: 1 };
 const held = new Set();
 
 function say(text, wrong = false) {
@@ -124,6 +124,7 @@ function overlay() {
       line(corner(ends[0]), corner(ends[1]), "box");
     }
   }
+  if (state.path.length) marks.push(`<polygon points="${state.path.join(" ")}"/>`);
   const points = state.points;
   if (points.length === 2) line(points[0], points[1]);
   for (const point of points) {
@@ -179,7 +180,12 @@ function select(cells, { extend = false, clicked = null } = {}) {
 const selectInstances = (ids, options) => select(ids.flatMap((k) => instances.cellsOf(k)), options);
 
 async function pick(here, x, y) {
-  const picked = await door.pick(here, x, y, hiddenCells(), (cell) => instances.label[cell]);
+  const picked = await door.pick(here, x, y, hiddenCells(), (cell) => instances.label[cell]).catch(async (e) => {
+    // The cells may be others since.
+    door.behind = true;
+    await catchUp();
+    throw e;
+  });
   if (door.behind) await catchUp();
   return picked;
 }
@@ -196,7 +202,7 @@ async function under(event) {
 const click = attempt(async (event) => {
   const picked = await under(event);
   if (!picked) return;
-  if (state.tool !== "select") return measure(picked.position);
+  if (["measure", "scale"].includes(state.tool)) return measure(picked.position);
   if (picked.instance === null) {
     if (!event.shiftKey) await select([]);
     say(picked.alpha > 0.1 ? "This belongs to no instance." : "");
@@ -219,10 +225,38 @@ const measure = attempt(async (position) => {
   setTool("select");
 });
 
+// A drag with a lasso draws around Gaussians.
+function trace(event, done) {
+  if (!["add", "remove"].includes(state.tool)) return false;
+  const rect = $("canvas").getBoundingClientRect();
+  if (event.type === "pointerdown") state.path = [];
+  if (!done) state.path.push([event.clientX - rect.left, event.clientY - rect.top]);
+  const path = state.path;
+  if (done) state.path = [];
+  overlay();
+  if (done && event.type === "pointerup" && path.length > 2) lasso(path);
+  return true;
+}
+
+// What is seen within is given to the selected instance, or taken from it.
+const lasso = attempt(async (path) => {
+  const instance = wholeInstance(), adds = state.tool === "add";
+  if (instance === null) throw new Error("Select one whole thing first.");
+  const here = camera(), scale = here.width / $("stage").clientWidth;
+  const { gaussians, count } = await door.lasso(here, path.map((p) => p.map((v) => v * scale)), hiddenCells(), instance, !adds);
+  if (!count) return say(adds ? "Nothing else is seen in there." : "Nothing of it is seen in there.");
+  if (await edit({ op: "assign", instance: adds ? instance : -1, gaussians }) === null) return;
+  if (!state.cells.size) setTool("select");
+  say(`${count.toLocaleString("en")} Gaussians ${adds ? "added" : "removed"}. Undo with ctrl+z.`);
+});
+
 function setTool(tool) {
-  state.tool = tool;
-  state.points = [];
-  say({ measure: "Click on two points to measure between them.", scale: "Click on two points whose distance you know." }[tool] ?? "");
+  Object.assign(state, { tool, points: [], path: [] });
+  $("canvas").classList.toggle("tool", tool !== "select");
+  say({
+    measure: "Click on two points to measure between them.", scale: "Click on two points whose distance you know.",
+    add: "Draw around what belongs to it.", remove: "Draw around what does not belong to it.",
+  }[tool] ?? "");
   overlay();
   tools();
 }
@@ -371,6 +405,11 @@ const ACTIONS = [
   ["annotate", "Note", "o", () => annotate(), () => wholeInstance() !== null],
   ["merge", "Merge", "m", () => merge(), () => selectedInstances().length > 1],
   ["split", "Split", "x", () => split(), () => wholeInstance() !== null && instances.family(wholeInstance()).parts.length > 1],
+  // Which Gaussians of the geometry are seen only a server knows.
+  ...(door.lasso ? [
+    ["add", "Add with a lasso", "l", () => toggle("add"), () => wholeInstance() !== null, () => state.tool === "add"],
+    ["remove", "Remove with a lasso", "shift+l", () => toggle("remove"), () => wholeInstance() !== null, () => state.tool === "remove"],
+  ] : []),
   ["save-selection", "Save as PLY", "p", () => savePly(false), () => state.cells.size],
   ["save-rest", "Save the rest as PLY", "shift+p", () => savePly(true), () => state.cells.size],
   ["save-json", "Save as JSON", "j", () => saveJson(), () => state.cells.size],
@@ -380,8 +419,8 @@ const TOOLS = [
   ["redo", "Redo", "ctrl+y", () => change(() => instances.redo()), () => instances.undone.length],
   ["show-all", "Show all", "escape", () => showAll(), () => true],
   ["inventory", "What is here", "t", () => inventory(), () => true],
-  ["measure", "Measure", "u", () => setTool(state.tool === "measure" ? "select" : "measure"), () => true, () => state.tool === "measure"],
-  ["scale", "Set scale", "k", () => setTool(state.tool === "scale" ? "select" : "scale"), () => true, () => state.tool === "scale"],
+  ["measure", "Measure", "u", () => toggle("measure"), () => true, () => state.tool === "measure"],
+  ["scale", "Set scale", "k", () => toggle("scale"), () => true, () => state.tool === "scale"],
   ["picture", "Save picture", "c", () => savePicture(), () => true],
   ["save-edits", "Save edits", "ctrl+s", () => saveEdits(), () => instances.edits.length && scene.mode === "file"],
 ];
@@ -405,6 +444,8 @@ function tools() {
     if (on) $(id).setAttribute("aria-pressed", Boolean(on()));
   }
 }
+
+const toggle = (tool) => setTool(state.tool === tool ? "select" : tool);
 
 function setRest(rest) {
   state.rest = state.rest === rest ? "shown" : rest;
@@ -443,6 +484,25 @@ const inTurn = (work) => (...given) => (changing = changing.then(() => work(...g
 
 const same = (a, b) => JSON.stringify(a) === JSON.stringify(b);
 
+// Shows these edits, with the cells cut for them; where those are not told, as they are. What was selected or hidden stays so.
+function replay(edits, cut, undone) {
+  const before = gaussians.cells, whole = wholeInstance();
+  if (cut !== undefined && (cut || before !== gaussians.uncut)) {
+    instances.setCells(cut);
+    // New cells come last: those of the scene keep their numbers.
+    const now = (cells) => {
+      const still = new Set([...cells].filter((c) => c < scene.cells.length));
+      before.forEach((cell, i) => cells.has(cell) && still.add(gaussians.cells[i]));
+      return still;
+    };
+    Object.assign(state, { cells: now(state.cells), hidden: now(state.hidden), clicked: null });
+    viewer.setCells();
+  }
+  instances.setEdits(edits, undone);
+  // What a lasso took from it, or gave it, is out or in.
+  if (before !== gaussians.cells && whole !== null) state.cells = new Set(instances.cellsOf(whole));
+}
+
 // After any change of the edits: what was selected may be no more.
 async function settle(list) {
   state.list = list;
@@ -462,12 +522,13 @@ const change = inTurn(attempt(async (work) => {
       const saved = await door.save(instances.edits), added = instances.edits.at(-1);
       if (!saved.edits) {
         list = saved.instances;
+        replay(instances.edits, saved.cut, instances.undone);
         break;
       }
       const one = same(instances.edits.slice(0, -1), before) && same(saved.edits.slice(0, before.length), before);
       before = saved.edits;
       list = saved.instances;
-      instances.setEdits(before);
+      replay(before, saved.cut);
       said = "The edits were changed elsewhere meanwhile: yours was put after those.";
       const wrong = one ? instances.edit(added) : "The edits were changed elsewhere meanwhile, and are shown as they are now: do yours again.";
       if (wrong) throw new Error(wrong);
@@ -484,9 +545,9 @@ const change = inTurn(attempt(async (work) => {
 // Shows the edits that others made, where an answer knew of some.
 const catchUp = inTurn(attempt(async () => {
   if (!door.behind) return;
-  const { edits, instances: list } = await door.edits();
+  const { edits, instances: list, cut } = await door.edits();
   if (same(edits, instances.edits)) return;
-  instances.setEdits(edits);
+  replay(edits, cut);
   await settle(list);
   say("The edits were changed elsewhere: they are shown as they are now.");
 }));
@@ -546,6 +607,10 @@ const fileName = () => selectedInstances().map((k) => instances.name(k)).slice(0
 
 async function savePly(others) {
   const blob = await door.selection([...state.cells], others);
+  if (door.behind) {
+    await catchUp();
+    throw new Error("The edits were changed elsewhere meanwhile: save again.");
+  }
   save(others ? `without-${fileName()}.ply` : `${fileName()}.ply`, blob);
 }
 
@@ -623,6 +688,7 @@ function setColors(colors) {
 // The camera changed: while it moves the picture may be coarse.
 function changed(moving) {
   state.moving = moving;
+  if (moving) state.path = [];
   clearTimeout(changed.timer);
   if (moving) changed.timer = setTimeout(() => changed(false), 250);
   draw();
@@ -648,7 +714,7 @@ function about() {
 }
 
 function listen() {
-  visitor.listen($("canvas"), click);
+  visitor.listen($("canvas"), click, trace);
   $("canvas").addEventListener("pointermove", hover);
   $("canvas").addEventListener("pointerleave", () => clearTimeout(resting));
   $("search").addEventListener("submit", (e) => {

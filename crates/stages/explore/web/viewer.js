@@ -139,14 +139,8 @@ export class Viewer {
   upload() {
     const gl = this.gl, g = this.gaussians;
     const rows = Math.max(1, Math.ceil(g.count / WIDTH));
-    const padded = (array, size) => {
-      const out = new array.constructor(size);
-      out.set(array);
-      return out;
-    };
     this.textures = {
       words: texture(gl, gl.RGBA32UI, gl.RGBA_INTEGER, gl.UNSIGNED_INT, WIDTH, rows, padded(g.words, 4 * WIDTH * rows)),
-      cells: texture(gl, gl.R32UI, gl.RED_INTEGER, gl.UNSIGNED_INT, WIDTH, rows, padded(Uint32Array.from(g.cells), WIDTH * rows)),
       harmonics: g.degree
         ? texture(gl, gl.RGB32UI, gl.RGB_INTEGER, gl.UNSIGNED_INT, WIDTH, rows, padded(g.harmonics, 3 * WIDTH * rows))
         : texture(gl, gl.RGB32UI, gl.RGB_INTEGER, gl.UNSIGNED_INT, 1, 1, new Uint32Array(3)),
@@ -154,6 +148,7 @@ export class Viewer {
         ? texture(gl, gl.RGB8, gl.RGB, gl.UNSIGNED_BYTE, WIDTH, rows, padded(g.features, 3 * WIDTH * rows))
         : texture(gl, gl.RGB8, gl.RGB, gl.UNSIGNED_BYTE, 1, 1, new Uint8Array(3)),
     };
+    this.setCells();
     const ranges = Math.max(1, Math.ceil(g.chunks.length / 4 / WIDTH));
     this.textures.chunks = texture(gl, gl.RGBA32F, gl.RGBA, gl.FLOAT, WIDTH, ranges, padded(g.chunks, 4 * WIDTH * ranges));
     this.array = gl.createVertexArray();
@@ -170,6 +165,13 @@ export class Viewer {
     };
     attribute("corner", 2, false, 0, new Float32Array([-1, -1, 1, -1, -1, 1, 1, 1]));
     this.order = attribute("index", 1, true, 1, new Uint32Array(Math.max(1, g.count)));
+  }
+
+  // The cells of the Gaussians as they are now.
+  setCells() {
+    const gl = this.gl, g = this.gaussians, rows = Math.max(1, Math.ceil(g.count / WIDTH));
+    if (this.textures.cells) gl.deleteTexture(this.textures.cells);
+    this.textures.cells = texture(gl, gl.R32UI, gl.RED_INTEGER, gl.UNSIGNED_INT, WIDTH, rows, padded(Uint32Array.from(g.cells), WIDTH * rows));
   }
 
   // How each cell is drawn: `of(cell)` gives { color: [r, g, b] or null, mix, mode, selected }.
@@ -295,6 +297,12 @@ export class Viewer {
     }
     return rgb;
   }
+}
+
+function padded(array, size) {
+  const out = new array.constructor(size);
+  out.set(array);
+  return out;
 }
 
 function program(gl, vertex, fragment) {
