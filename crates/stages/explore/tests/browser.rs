@@ -8,7 +8,7 @@ mod common;
 use artifacts::{Edits, InstanceNames, Instances};
 use base64::Engine;
 use common::{Run, SIZE};
-use fantoccini::actions::{InputSource, MouseActions, PointerAction};
+use fantoccini::actions::{InputSource, KeyAction, KeyActions, MouseActions, PointerAction};
 use fantoccini::{Client, ClientBuilder, Locator};
 use gs_io::Result;
 use gs_raster::RasterOptions;
@@ -138,6 +138,11 @@ struct Browser {
 
 impl Browser {
     async fn open() -> Self {
+        Self::in_colours("dark").await
+    }
+
+    /// For a person who likes `dark` or `light`.
+    async fn in_colours(scheme: &str) -> Self {
         let (driver, port) = start("chromedriver", &["--port=0"], "successfully on port ");
         let arguments = [
             "--headless=new",
@@ -149,12 +154,12 @@ impl Browser {
             "--disable-component-update",
             "--no-first-run",
             if screenshot().is_some() { "--force-device-scale-factor=1" } else { "--force-device-scale-factor=0.5" },
-            "--force-prefers-color-scheme=dark",
             // Every name but this machine's is unknown: the network is cut.
             "--host-resolver-rules=MAP * ~NOTFOUND, EXCLUDE 127.0.0.1",
         ];
         let size = format!("--window-size={},{}", WINDOW.0, WINDOW.1);
-        let arguments: Vec<&str> = arguments.into_iter().chain([&size[..]]).collect();
+        let scheme = format!("--force-prefers-color-scheme={scheme}");
+        let arguments: Vec<&str> = arguments.into_iter().chain([&size[..], &scheme]).collect();
         let wanted = json!({"goog:chromeOptions": {"args": arguments}, "timeouts": {"script": 240_000}});
         let Value::Object(wanted) = wanted else { unreachable!() };
         let mut builder = ClientBuilder::new(hyper_util::client::legacy::connect::HttpConnector::new());
@@ -248,6 +253,14 @@ impl Browser {
             "never: {condition}; {}",
             self.js("return [page.errors, document.getElementById('hint').textContent]", vec![]).await
         );
+    }
+
+    /// Presses keys where the focus is.
+    async fn press(&self, keys: &str) {
+        let keys = keys.chars().fold(KeyActions::new("keys".into()), |k, value| {
+            k.then(KeyAction::Down { value }).then(KeyAction::Up { value })
+        });
+        self.client.perform_actions(keys).await.unwrap();
     }
 
     /// Types with the focus on an element.
@@ -501,6 +514,101 @@ async fn the_list_has_the_names_of_the_inventory() {
     assert_eq!(browser.js(listed, vec![]).await, json!(["planet?", "sun", "planet?"]));
     browser.no_errors().await;
     browser.client.clone().close().await.unwrap();
+}
+
+/// What a mouse can do is done with keys: each control is reached in the order of the page, says its name and shows its focus.
+#[tokio::test]
+#[ignore = "needs chromium; run scripts/test_explore.sh"]
+async fn keys_reach_everything() {
+    let run = Run::new();
+    run.write_names(&run.instances());
+    let server = run.serve(&[]);
+    let browser = Browser::open().await;
+    browser.load(&format!("http://{}{}", server.host, server.path)).await;
+    browser.keys("canvas", "t").await;
+    browser.until("document.querySelector('#ranking button')").await;
+    // Along the list by arrows, which leave the camera where it is.
+    let eye = browser.js("document.querySelector('#ranking button').focus(); return page.visitor.eye", vec![]).await;
+    browser.press("\u{e015}\u{e015}\u{e013}\u{e015}\u{e007}").await;
+    browser.until("page.selectedInstances().length").await;
+    let names = "return [document.activeElement.children[1].textContent, document.getElementById('said').textContent]";
+    let names = browser.js(names, vec![]).await;
+    assert!(names[0] == "sun" && names[1].as_str().unwrap().starts_with("sun. 1 Gaussians, "), "{names}");
+    // Tab, from the start of the page to its end.
+    browser
+        .js("await page.selectInstances([1], { clicked: 1 }); document.getElementById('text').focus()", vec![])
+        .await;
+    let mut order = Vec::new();
+    for _ in 0..60 {
+        let at = "const e = document.activeElement, style = getComputedStyle(e); const name = e.labels?.[0]?.textContent || e.ariaLabel || e.title || e.textContent.trim() || e.querySelector('img')?.alt; \
+                  return e === document.body ? null : [e.id || e.closest('[id]').id, style.outlineStyle === 'solid' && parseFloat(style.outlineWidth) >= 1.5, Boolean(name)]";
+        let at = browser.js(at, vec![]).await;
+        if at.is_null() || (!order.is_empty() && at[0] == "text") {
+            break;
+        }
+        assert!(at[1] == json!(true) && at[2] == json!(true), "focus seen, name: {at}");
+        order.push(at[0].as_str().unwrap().to_string());
+        browser.press("\u{e004}").await;
+    }
+    order.dedup();
+    let wanted = "text help-button canvas ranking level isolate ghost hide frame rename annotate split add remove save-selection save-rest \
+                  save-json photographs show-all inventory measure scale picture colors view blend";
+    assert_eq!(order.join(" "), wanted);
+    // A slider moves by arrows, and not the camera.
+    browser.js("document.getElementById('level').focus()", vec![]).await;
+    browser.press("\u{e012}").await;
+    browser.until("page.state.cells.size === 1").await;
+    assert_eq!(browser.js("return page.visitor.eye", vec![]).await, eye);
+    // What is no more there does not keep the focus; Escape leaves a tool.
+    browser.js("document.getElementById('hide').focus()", vec![]).await;
+    browser.press("\u{e007}").await;
+    browser.until("document.getElementById('details').hidden").await;
+    assert_eq!(browser.js("return document.activeElement.id", vec![]).await, json!("canvas"));
+    browser.press("u").await;
+    browser.until("page.state.tool === 'measure'").await;
+    browser.press("\u{e00c}").await;
+    browser.until("page.state.tool === 'select'").await;
+    browser.no_errors().await;
+    browser.client.clone().close().await.unwrap();
+}
+
+/// axe-core, which `scripts/test_explore.sh` fetches, finds nothing against WCAG 2.2 A and AA in any state of the page.
+#[tokio::test]
+#[ignore = "needs chromium and axe-core; run scripts/test_explore.sh"]
+async fn everybody_can_use_it() {
+    let axe = std::env::var("EXPLORE_AXE").expect("EXPLORE_AXE: run scripts/test_explore.sh");
+    let axe = std::fs::read_to_string(axe).unwrap();
+    let run = Run::new();
+    run.write_names(&run.instances());
+    let server = run.serve(&[]);
+    let mut wrong = Vec::new();
+    for scheme in ["dark", "light"] {
+        let browser = Browser::in_colours(scheme).await;
+        browser.load(&format!("http://{}{}", server.host, server.path)).await;
+        browser.client.execute(&axe, vec![]).await.unwrap();
+        for (state, enter) in [
+            ("start", ""),
+            ("inventory", "await page.act('inventory')"),
+            ("selected", "await page.selectInstances([1])"),
+            ("found", "await page.find('far ball')"),
+            ("several selected", "await page.selectInstances([0, 1])"),
+            ("tool", "await page.act('measure')"),
+            ("lasso", "await page.selectInstances([1]); await page.act('add')"),
+            ("asked", "page.act('annotate')"),
+            ("answered", "document.getElementById('ask').close(); await page.act('show-all')"),
+            ("wrong", "await page.find('zebra')"),
+            ("help", "document.getElementById('help-button').click()"),
+        ] {
+            let check = "const levels = ['wcag2a', 'wcag2aa', 'wcag21a', 'wcag21aa', 'wcag22aa']; \
+                         const { violations, passes } = await axe.run({ runOnly: levels }); if (!passes.length) throw new Error('nothing was checked'); \
+                         return violations.map((v) => `${v.id}: ${v.help}: ${v.nodes.map((n) => `${n.html} (${n.failureSummary})`).join(' | ')}`)";
+            let found = browser.js(&format!("{enter}; await page.viewer.busy; {check}"), vec![]).await;
+            wrong.extend(found.as_array().unwrap().iter().map(|v| format!("{scheme}, {state}: {v}")));
+        }
+        browser.no_errors().await;
+        browser.client.clone().close().await.unwrap();
+    }
+    assert!(wrong.is_empty(), "{} violations:\n{}", wrong.len(), wrong.join("\n"));
 }
 
 /// Everything stands in the list of what is here, under the names of `names.json`; the pointer tells a thing's name.

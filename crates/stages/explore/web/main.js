@@ -294,7 +294,7 @@ function clearAnswer() {
 const inventory = attempt(() => {
   state.answer = state.threshold = null;
   const there = instances.inventory(), all = there.reduce((sum, [, own]) => sum + own.length, 0);
-  $("results").hidden = false;
+  reveal("results", true);
   for (const part of ["histogram", "threshold-label"]) $(part).style.display = "none";
   $("results-title").textContent = `${all} thing${all === 1 ? "" : "s"} here`;
   fill(there.map(([name, own]) => ({ name, own, beside: `× ${own.length}`, title: own.map((k) => `${instances.name(k)} (${k})`).join(", ") })));
@@ -302,6 +302,7 @@ const inventory = attempt(() => {
 
 // Fills the list: things of a name, their notes, and what stands beside it.
 function fill(rows) {
+  const at = [...$("ranking").querySelectorAll("button")].indexOf(document.activeElement);
   $("ranking").replaceChildren(...rows.map(({ name, own, beside, title }) => {
     const button = element("button", { type: "button", title }), words = element("span", {}, name);
     const pictured = own.find((k) => instances.views(k).length), picture = pictured === undefined ? null : door.thumbnail(pictured);
@@ -312,6 +313,22 @@ function fill(rows) {
     item.append(button);
     return item;
   }));
+  $("ranking").querySelectorAll("button")[at]?.focus();
+}
+
+// Arrows go along the list, and do not turn the scene.
+function along(event) {
+  const step = { ArrowDown: 1, ArrowUp: -1 }[event.key], all = [...$("ranking").querySelectorAll("button")];
+  if (!step) return;
+  event.preventDefault();
+  event.stopPropagation();
+  all[all.indexOf(document.activeElement) + step]?.focus();
+}
+
+// Hides or shows a panel; the focus does not go with it.
+function reveal(id, shown) {
+  if (!shown && $(id).contains(document.activeElement)) $("canvas").focus();
+  $(id).hidden = !shown;
 }
 
 // Where the pointer rests, the thing's name is shown.
@@ -329,7 +346,7 @@ function hover(event) {
 
 function results() {
   const answer = state.answer;
-  $("results").hidden = !answer;
+  reveal("results", Boolean(answer));
   if (!answer) return;
   const scored = answer.ranking.filter((r) => r.score !== null), values = scored.map((r) => r.score);
   const [low, high] = [Math.min(...values), Math.max(...values)];
@@ -357,14 +374,18 @@ function element(tag, attributes = {}, text = "") {
 
 function panel() {
   const chosen = selectedInstances();
-  $("details").hidden = !state.cells.size;
-  if (!state.cells.size) return;
+  reveal("details", state.cells.size > 0);
+  if (!state.cells.size) {
+    $("said").textContent = "";
+    return;
+  }
   const whole = wholeInstance(), { levels, thing } = state.levels ?? { levels: [], thing: -1 };
   const { count } = instances.extent(state.cells);
   $("selection-name").textContent = chosen.length > 1 ? `${chosen.length} instances` : whole === null ? `part of ${instances.name(chosen[0])}` : instances.name(whole);
   const box = selectedBox();
   $("facts").textContent = `${count.toLocaleString("en")} Gaussians, ${box.half.map((h) => size(2 * h)).join(" × ")}`;
   $("note").textContent = (whole !== null && instances.notes.get(whole)) || "";
+  $("said").textContent = ["selection-name", "facts", "note"].map((id) => $(id).textContent).filter(Boolean).join(". ");
   $("level-label").hidden = levels.length < 2;
   if (levels.length > 1) {
     const at = levels.findIndex((l) => l.cells.length === state.cells.size);
@@ -639,8 +660,8 @@ async function savePicture() {
 
 function keys(event) {
   const typing = event.target.closest?.("input:not([type=range]), select, dialog");
-  const key = event.key.toLowerCase();
-  if (typing) {
+  const key = event.key.toLowerCase(), slides = event.target.type === "range" && key.startsWith("arrow");
+  if (typing || slides) {
     if (key === "escape" && event.target === $("text")) $("canvas").focus();
     return;
   }
@@ -722,6 +743,7 @@ function listen() {
     find($("text").value);
   });
   $("text").addEventListener("search", () => $("text").value || clearAnswer());
+  $("ranking").addEventListener("keydown", along);
   $("threshold").addEventListener("input", () => {
     state.threshold = Number($("threshold").value);
     const chosen = state.answer.ranking.filter((r) => r.score !== null && r.score >= state.threshold);
