@@ -4,6 +4,7 @@
 use artifacts::{Edit, Instances, ranges_of};
 use gs_io::Result;
 use std::collections::{BTreeMap, BTreeSet};
+use std::ops::Range;
 
 /// A cell for every Gaussian.
 #[derive(Debug, Clone, Default, PartialEq)]
@@ -42,7 +43,6 @@ impl Cells {
             _ => None,
         });
         let lists = lists.collect::<Result<Vec<_>>>()?;
-        let each = |ranges: &[std::ops::Range<u32>]| ranges.to_vec().into_iter().flatten().map(|i| i as usize);
         for ranges in &lists {
             let mut inside = BTreeMap::<u32, u32>::new();
             each(ranges).for_each(|i| *inside.entry(cells.of[i]).or_default() += 1);
@@ -60,6 +60,10 @@ impl Cells {
         cells.assigned = lists.iter().map(of).collect();
         Ok(cells)
     }
+}
+
+fn each(ranges: &[Range<u32>]) -> impl Iterator<Item = usize> {
+    ranges.iter().cloned().flatten().map(|i| i as usize)
 }
 
 #[cfg(test)]

@@ -158,7 +158,7 @@ impl Browser {
             "--host-resolver-rules=MAP * ~NOTFOUND, EXCLUDE 127.0.0.1",
         ];
         let size = format!("--window-size={},{}", WINDOW.0, WINDOW.1);
-        let scheme = format!("--force-prefers-color-scheme={scheme}");
+        let scheme = format!("--blink-settings=preferredColorScheme={}", u8::from(scheme == "light"));
         let arguments: Vec<&str> = arguments.into_iter().chain([&size[..], &scheme]).collect();
         let wanted = json!({"goog:chromeOptions": {"args": arguments}, "timeouts": {"script": 240_000}});
         let Value::Object(wanted) = wanted else { unreachable!() };
@@ -390,11 +390,11 @@ async fn a_served_scene_can_be_seen_clicked_asked_and_edited() {
     if let Some(path) = screenshot() {
         browser.client.set_window_size(1200, 800).await.unwrap();
         // A thing with a note, and a lasso half drawn around it.
-        let script = "const k = page.selectedInstances()[0] ?? 0; await page.edit({ op: 'note', instance: k, text: 'From grandma. The lid is new.' }); \
+        let script = "const k = page.selectedInstances()[0] ?? 0; await page.edit({ op: 'note', instance: k, text: 'From grandma. One wheel is new.' }); \
                       await page.selectInstances([k]); await page.act('add'); page.jump(page.instances.views(k)[0][0]); await page.viewer.busy; \
                       const stage = document.getElementById('stage'), c = page.visitor.camera(stage.clientWidth, stage.clientHeight); \
                       const t = [0, 1, 2].map((i) => page.row(c.rotation, i).reduce((sum, v, j) => sum + v * page.instances.extent(page.state.cells).center[j], c.translation[i])); \
-                      const [x, y, r] = [c.fx * t[0] / t[2] + c.cx, c.fy * t[1] / t[2] + c.cy, 0.09 * c.height]; \
+                      const [x, y, r] = [c.fx * t[0] / t[2] + c.cx, c.fy * t[1] / t[2] + c.cy, 0.13 * c.height]; \
                       page.state.path = Array.from({ length: 40 }, (_, n) => [x + r * (1 + 0.1 * Math.sin(n / 2)) * Math.cos(n / 6.4), y + r * Math.sin(n / 6.4)]); \
                       await page.refresh();";
         browser.js(script, vec![]).await;
@@ -586,6 +586,8 @@ async fn everybody_can_use_it() {
         let browser = Browser::in_colours(scheme).await;
         browser.load(&format!("http://{}{}", server.host, server.path)).await;
         browser.client.execute(&axe, vec![]).await.unwrap();
+        let as_asked = format!("return matchMedia('(prefers-color-scheme: {scheme})').matches");
+        assert_eq!(browser.js(&as_asked, vec![]).await, json!(true), "{scheme}");
         for (state, enter) in [
             ("start", ""),
             ("inventory", "await page.act('inventory')"),
