@@ -20,7 +20,7 @@ pub struct Inputs {
     /// instances.safetensors of cluster-match
     #[arg(long, value_name = "FILE")]
     pub instances: PathBuf,
-    /// instances.edits.json of explore: what a person merged, split and named
+    /// instances.edits.json of explore: what a person corrected and named
     #[arg(long, value_name = "FILE")]
     pub edits: Option<PathBuf>,
 }
@@ -195,7 +195,7 @@ pub struct NamesOptions {
     /// instances.safetensors of cluster-match
     #[arg(long, value_name = "FILE")]
     pub instances: PathBuf,
-    /// instances.edits.json of explore: what a person merged, split and named; for the printed table only
+    /// instances.edits.json of explore: what a person corrected and named; for the printed table only
     #[arg(long, value_name = "FILE")]
     pub edits: Option<PathBuf>,
     #[command(flatten)]
@@ -234,7 +234,7 @@ pub struct ScoreOptions {
     /// instances.safetensors of cluster-match
     #[arg(long, value_name = "FILE")]
     pub instances: Option<PathBuf>,
-    /// instances.edits.json of explore: what a person merged, split and named
+    /// instances.edits.json of explore: what a person corrected and named
     #[arg(long, value_name = "FILE", requires = "instances")]
     pub edits: Option<PathBuf>,
     /// Descriptors of single Gaussians (descriptors.safetensors), which then answer the texts: those of at least the --threshold, the

@@ -46,7 +46,7 @@ pub struct Inputs {
     /// instances.safetensors of cluster-match
     #[arg(long, value_name = "FILE")]
     pub instances: PathBuf,
-    /// instances.edits.json of explore: merges, splits, names and scale [default: none]
+    /// instances.edits.json of explore: corrections, names, notes and scale [default: none]
     #[arg(long, value_name = "FILE")]
     pub edits: Option<PathBuf>,
 }
