@@ -17,13 +17,8 @@ for program in chromium chromedriver; do
 done
 package=axe-core@4.14.1
 folder=$PWD/target/axe
-if [ "$(cat "$folder/installed" 2> /dev/null)" != "$package" ]; then
-  rm -rf "$folder"
-  timeout 300 npm install --silent --no-audit --no-fund --ignore-scripts --fetch-retries 1 --prefix "$folder" "$package" > /dev/null 2>&1 &&
-    echo "$package" > "$folder/installed" || rm -rf "$folder"
-fi
 export EXPLORE_AXE=$folder/node_modules/axe-core/axe.min.js
-if [ -f "$EXPLORE_AXE" ]; then
+if scripts/npm_install.sh "$package" "$folder"; then
   on_demo browser --
 else
   on_demo browser -- --skip everybody_can_use_it

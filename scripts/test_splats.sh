@@ -11,12 +11,7 @@ for program in npm node; do
   command -v $program > /dev/null || skip "no $program (Debian: apt-get install npm)"
 done
 export SPLAT_TRANSFORM=$folder/node_modules/@playcanvas/splat-transform/bin/cli.mjs
-if [ "$(cat "$folder/installed" 2> /dev/null)" != "$package" ]; then
-  rm -rf "$folder"
-  timeout 300 npm install --silent --no-audit --no-fund --ignore-scripts --fetch-retries 1 --prefix "$folder" "$package" > /dev/null 2>&1 ||
-    { rm -rf "$folder"; skip "npm cannot install it: no network?"; }
-  echo "$package" > "$folder/installed"
-fi
+scripts/npm_install.sh "$package" "$folder" || skip "npm cannot install it: no network?"
 node "$SPLAT_TRANSFORM" --version > /dev/null 2>&1 || skip "it does not start: it needs node 18 or later"
 
 cargo test --release --workspace --test splat_transform -- --ignored --skip real_files
