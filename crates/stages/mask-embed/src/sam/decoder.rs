@@ -26,7 +26,7 @@ const HEADS: usize = 8;
 const SIDE: usize = MASK_SIDE / 4;
 const PIXELS: usize = SIDE * SIDE;
 /// Of so many pixels that fill the square, one is read and stands for the others.
-const FILLING: usize = 16;
+pub(super) const FILLING: usize = 16;
 /// Pixels that are worked on together: all their channels fit the processor's own cache.
 const TILE: usize = 128;
 /// Added to variances, as in PyTorch's layer norm and in SAM's own for pictures.
@@ -88,16 +88,16 @@ pub(super) struct Photograph {
 }
 
 impl Photograph {
-    /// From the values [`Names::photograph`] of a photograph that takes the first `width` x `height` pixels; `None` when
-    /// the values are not of SAM's shapes.
-    pub fn new(values: &[Tensor], [width, height]: [usize; 2]) -> Option<Self> {
-        let (mut order, filling): (Vec<usize>, Vec<usize>) =
+    /// From the values [`Names::photograph`] of a photograph that takes the first `width` x `height` pixels; one of `filling`
+    /// others is read. `None` when the values are not of SAM's shapes.
+    pub fn new(values: &[Tensor], [width, height]: [usize; 2], filling: usize) -> Option<Self> {
+        let (mut order, others): (Vec<usize>, Vec<usize>) =
             (0..PIXELS).partition(|p| p % SIDE < width && p / SIDE < height);
         let inside = order.len();
         // The last tile is full.
-        let sample = (inside + filling.len() / FILLING).next_multiple_of(TILE) - inside;
-        order.extend((0..sample).map(|i| filling[(2 * i + 1) * filling.len() / (2 * sample)]));
-        let stands_for = (filling.len() as f32 / sample.max(1) as f32).ln();
+        let sample = (inside + others.len() / filling).next_multiple_of(TILE) - inside;
+        order.extend((0..sample).map(|i| others[(2 * i + 1) * others.len() / (2 * sample)]));
+        let stands_for = (others.len() as f32 / sample.max(1) as f32).ln();
         let planar = |t: &Tensor| {
             let channels = *t.shape.last().filter(|c| **c > 0)?;
             let v = t.as_f32().filter(|_| t.shape == [1, PIXELS, channels])?;
@@ -603,7 +603,7 @@ mod tests {
         let values: Vec<f32> =
             (0..PIXELS).map(|p| if p % SIDE < width && p / SIDE < height { 1.0 } else { 3.0 }).collect();
         let tensor = Tensor::f32(&[1, PIXELS, 1], values.clone());
-        let photograph = Photograph::new(&[(); 5].map(|()| tensor.clone()), [width, height]).unwrap();
+        let photograph = Photograph::new(&[(); 5].map(|()| tensor.clone()), [width, height], FILLING).unwrap();
         assert!(photograph.order.len() < PIXELS && photograph.order.len().is_multiple_of(TILE));
         assert_eq!(photograph.inside, width * height);
         let mut scores = photograph.pixels.clone();
