@@ -80,9 +80,6 @@ impl<'a> FeatureTable<'a> {
 
     /// Adds `weight` times the feature of a Gaussian. One without a feature is seen by no view and has nothing to add.
     fn add_to(&self, sum: &mut [f64], gaussian: u32, weight: f32) {
-        if sum.is_empty() {
-            return;
-        }
         if let (Some(at), true) = (self.position[gaussian as usize], weight > 0.0) {
             for (s, f) in sum.iter_mut().zip(flat(self.features.row(at as usize))) {
                 *s += f64::from(weight) * f64::from(*f);
