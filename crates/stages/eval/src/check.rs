@@ -50,7 +50,8 @@ fn check_labels(o: &CheckOptions, dataset: &Dataset, stage: &Stage) -> Result<(S
     let benchmark = LerfScene::named(&folder_name(&o.scene));
     let (mut frames, mut pairs, mut asked) = (0, 0, BTreeSet::new());
     for path in labels::list(&folder)?.into_iter().filter(|p| p.extension().is_some_and(|e| e == "json")) {
-        let labels = labels::read(&path)?;
+        let mut labels = labels::read(&path)?;
+        labels::straighten(std::slice::from_mut(&mut labels), &dataset.views);
         if benchmark.is_some_and(|b| !b.scores_frame(&labels.frame)) {
             continue;
         }

@@ -58,7 +58,12 @@ pub(crate) fn run(o: &ScoreOptions, parameters: Value, stage: &Stage) -> Result<
         truth::score_instances(scene, &dataset.root, &mut scores)?;
     }
     if let Some(labels) = &labels {
-        let frames = labels::read_folder(labels)?;
+        let read = |folder: &Path| {
+            let mut frames = labels::read_folder(folder)?;
+            labels::straighten(&mut frames, &dataset.views);
+            Ok(frames)
+        };
+        let frames = read(labels)?;
         if let Some(scene) = &found.instances {
             score_labels(scene, &dataset, labels, &frames, &mut scores)?;
         }
@@ -71,7 +76,7 @@ pub(crate) fn run(o: &ScoreOptions, parameters: Value, stage: &Stage) -> Result<
         } else {
             let of = |kind: &str| {
                 let folder = labels.join(kind);
-                if folder.is_dir() { labels::read_folder(&folder) } else { Ok(Vec::new()) }
+                if folder.is_dir() { read(&folder) } else { Ok(Vec::new()) }
             };
             let (absent, several) = (of("absent")?, of("several")?);
             found.judges = !absent.is_empty() || !several.is_empty();

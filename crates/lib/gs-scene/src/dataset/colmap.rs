@@ -167,8 +167,8 @@ fn distorted(model: &Path, views: &[RawView]) -> Option<String> {
     let bent = views.iter().filter(|v| !v.lens.distortion.is_none()).count();
     (bent > 0).then(|| {
         format!(
-            "{}: the lenses of {bent} of {} photographs are distorted: photographs and id maps of them are undistorted as they \
-             are read, drawn labels are not; where the photographs are undistorted already, give the model that belongs \
+            "{}: the lenses of {bent} of {} photographs are distorted: photographs, id maps and labels of them are undistorted \
+             as they are read; where the photographs are undistorted already, give the model that belongs \
              to them (COLMAP's image_undistorter writes both)",
             model.display(),
             views.len()

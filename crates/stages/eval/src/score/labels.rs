@@ -77,6 +77,17 @@ struct Object {
     segmentation: Vec<[f64; 2]>,
 }
 
+/// Brings labels, which are drawn on photographs as they lie on disk, to the cameras of their views: upright and undistorted.
+pub fn straighten(frames: &mut [FrameLabels], views: &[View]) {
+    for frame in frames {
+        let Some(view) = views.iter().find(|v| v.stem() == frame.frame && !v.is_straight()) else { continue };
+        for mask in frame.categories.values_mut() {
+            (mask.width, mask.height) = view.straighten(&mut mask.bits, (mask.width, mask.height));
+            (frame.width, frame.height) = (mask.width as u32, mask.height as u32);
+        }
+    }
+}
+
 /// Reads all `*.json` of a label folder, by name.
 pub fn read_folder(folder: &Path) -> Result<Vec<FrameLabels>> {
     files(folder)?.iter().map(read).collect()
@@ -215,6 +226,30 @@ mod tests {
         let path = dir.path().join("frame_00007.json");
         std::fs::write(&path, json).unwrap();
         (dir, path)
+    }
+
+    #[test]
+    fn labels_of_a_distorted_photograph_are_undistorted() {
+        let (dir, path) = write(
+            r#"{"info":{"width":80,"height":60},
+               "objects":[{"category":"wall","segmentation":[[20,0],[79,0],[79,59],[20,59]]}]}"#,
+        );
+        std::fs::create_dir_all(dir.path().join("sparse/0")).unwrap();
+        let sparse = |name: &str, text: &str| std::fs::write(dir.path().join("sparse/0").join(name), text).unwrap();
+        sparse("cameras.txt", "1 SIMPLE_RADIAL 80 60 50 40 30 -0.3\n");
+        sparse("images.txt", "1 1 0 0 0 0 0 0 1 frame_00007.png\n\n");
+        let grey = gs_scene::Image { width: 80, height: 60, rgb: vec![0.5; 3 * 80 * 60], alpha: None };
+        grey.write_png(dir.path().join("images/frame_00007.png")).unwrap();
+        let load = gs_scene::dataset::LoadOptions { resolution: "1".parse().unwrap(), holdout: 0 };
+        let views = gs_scene::dataset::load(dir.path(), &load).unwrap().views;
+        let mut frames = [read(path).unwrap()];
+        let begins = |frames: &[FrameLabels], row: usize| {
+            frames[0].categories["wall"].bits[80 * row..].iter().position(|inside| *inside).unwrap()
+        };
+        assert_eq!([begins(&frames, 0), begins(&frames, 30)], [20, 20]);
+        straighten(&mut frames, &views);
+        // As for id maps of such a photograph: a barrel pulls inwards, and more so the farther out.
+        assert!(begins(&frames, 0) < 19 && begins(&frames, 30) == 19);
     }
 
     #[test]
