@@ -68,8 +68,8 @@ pub fn run(inputs: &Inputs, out: &Path, stage: &Stage) -> Result<()> {
     }
     let dataset = dataset::load(&inputs.scene, &LoadOptions::default())?;
     let mut sets = vec![("true labels".to_string(), vec![])];
-    sets.extend(Level::ALL.map(|level| (level.to_string(), vec![level])));
-    sets.push(("all".into(), Level::ALL.to_vec()));
+    sets.extend(Level::SAM.map(|level| (level.to_string(), vec![level])));
+    sets.push(("all".into(), Level::SAM.to_vec()));
     let file = |name: &str| out.with_extension(name.replace(' ', "-") + ".safetensors");
     let outputs =
         stage.outputs(out).file(out).reads(&dataset.files).reads([&points, &inputs.geometry, &inputs.footprints]);

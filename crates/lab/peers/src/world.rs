@@ -4,14 +4,15 @@
 
 use crate::cli::Peer;
 use artifacts::{
-    Descriptors, Features, Footprints, Graph, Level, MaskFeatures, MaskFolder, MaskMaps, Match, Row, features_path,
-    flat, hash_folder, role,
+    Descriptors, Features, Footprints, Graph, LEVELS, Level, MaskFeatures, MaskFolder, MaskMaps, Match, Row,
+    features_path, flat, hash_folder, role,
 };
 use cluster_match::{FeatureTable, matches, overlaps};
 use gs_io::{Claim, Error, Result, Watched, hash_file};
 use gs_raster::{RasterOptions, TileWeights, tile_weights};
 use gs_scene::dataset::{self, Dataset, LoadOptions, Resolution, View};
 use gs_scene::{Camera, Geometry};
+use ndarray::{Array3, Axis, concatenate};
 use serde::Serialize;
 use stage::Stage;
 use std::collections::BTreeMap;
@@ -200,7 +201,12 @@ impl World {
 
     /// The id maps of a view, and its camera in their size.
     pub fn maps(&self, view: usize) -> Result<(MaskMaps, Camera)> {
-        let maps = self.masks.read(&self.views[view])?;
+        let mut maps = self.masks.read(&self.views[view])?;
+        if maps.levels().len() < LEVELS {
+            // Levels that are not there have no masks.
+            let none = Array3::from_elem((LEVELS - maps.levels().len(), maps.height(), maps.width()), -1);
+            maps.ids = concatenate![Axis(0), maps.ids, none];
+        }
         let camera = self.views[view].camera.resized(maps.width() as u32, maps.height() as u32);
         Ok((maps, camera))
     }

@@ -1,10 +1,11 @@
 //! What `cluster-match` keeps of masks and instances in `instances.safetensors`. None of it tells whether instances are whole things: on scenes with
 //! truth nothing that is known without it did (docs/results/lost.md).
 
+use crate::Naming;
 use gs_io::{Artifact, Error, Result};
 use serde::{Deserialize, Serialize};
 
-/// How far masks and instances agree: `extra.health` of `instances.safetensors`.
+/// How far masks and instances agree, and what masks with names call them: `extra.health` of `instances.safetensors`.
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
 pub struct Health {
     /// Share of the labelled Gaussians in the largest instance, 0 to 1.
@@ -13,6 +14,10 @@ pub struct Health {
     /// estimate: all views made the instances, so a mask that most views contradict shows here as impure. None without
     /// masks.
     pub purity: Option<f64>,
+    /// Names of the instances that masks with names show, ascending. The score is the share of the instance's weight, in all masks of
+    /// these levels, that lies in masks of that name, times how sure the model is; half of it makes a name sure.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub names: Vec<Naming>,
 }
 
 impl Health {

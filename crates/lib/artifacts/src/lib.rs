@@ -38,8 +38,8 @@ pub use health::Health;
 pub use instances::{Family, Instances, Match, OrientedBox, TreeEdge};
 pub use lerf_ovs::{LERF_OVS, LerfScene};
 pub use masks::{
-    LEVELS, Level, MaskFeatures, MaskFolder, MaskMaps, features_path, folder_files, hash_folder, maps_path, same_shape,
-    stems, watch_folder,
+    LEVELS, Level, MaskFeatures, MaskFolder, MaskMaps, MaskName, MaskNames, features_path, folder_files, hash_folder,
+    maps_path, names_path, read_mask_names, same_shape, stems, watch_folder,
 };
 pub use names::{Called, InstanceNames, Naming, ScoredName, called};
 pub use nyu40::NYU40;
@@ -66,6 +66,8 @@ pub mod role {
     pub const MASKS: &str = "masks";
     /// All mask features (`*_f.npy`) of a masks folder.
     pub const MASK_FEATURES: &str = "mask-features";
+    /// All `*_n.json` of the masks folder.
+    pub const MASK_NAMES: &str = "mask-names";
     /// `image.onnx` of the CLIP pair that made the mask features.
     pub const CLIP: &str = "clip";
     /// `text.onnx` of the same pair.

@@ -1,15 +1,17 @@
 //! Id maps and mask features in LangSplat's layout: `<stem>_s.npy` and `<stem>_f.npy` in one folder.
 
 use crate::{flat, role};
-use gs_io::{Error, IoContext, Provenance, Result, Watched, hash_files, npy};
+use gs_io::{Error, IoContext, Provenance, Result, Watched, check_name, hash_files, npy};
 use gs_scene::dataset::View;
 use ndarray::{Array2, Array3, ArrayView1, ArrayView2, Axis, s};
+use serde::{Deserialize, Serialize};
+use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
-/// Levels of an id map file.
-pub const LEVELS: usize = 4;
+/// Levels that an id map file may have: [`Level::SAM`] alone, or [`Level::ALL`].
+pub const LEVELS: usize = 6;
 
-/// A granularity level of SAM's masks, in the order of the files.
+/// A kind of masks, in the order of the files: granularity levels of SAM, then models that name what they see.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, serde::Serialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Level {
@@ -21,30 +23,34 @@ pub enum Level {
     Medium = 2,
     /// Whole things.
     Large = 3,
+    /// Segments of a panoptic model: each is a thing, or all that is seen of a class.
+    Classes = 4,
+    /// What a model finds that is asked for words.
+    Concepts = 5,
 }
 
 impl Level {
+    /// LangSplat's levels, which every file has.
+    pub const SAM: [Self; 4] = [Self::Default, Self::Small, Self::Medium, Self::Large];
     /// All levels in the order of the files.
-    pub const ALL: [Self; LEVELS] = [Self::Default, Self::Small, Self::Medium, Self::Large];
+    pub const ALL: [Self; LEVELS] =
+        [Self::Default, Self::Small, Self::Medium, Self::Large, Self::Classes, Self::Concepts];
+    const NAMES: [&str; LEVELS] = ["default", "small", "medium", "large", "classes", "concepts"];
 }
 
 impl std::str::FromStr for Level {
     type Err = Error;
 
     fn from_str(s: &str) -> Result<Self> {
-        match s {
-            "default" | "0" => Ok(Self::Default),
-            "small" | "1" => Ok(Self::Small),
-            "medium" | "2" => Ok(Self::Medium),
-            "large" | "3" => Ok(Self::Large),
-            _ => Err(Error::new("unknown level").found(s).expected("default, small, medium or large (or 0 to 3)")),
-        }
+        let is_meant = |l: &Self| s == Self::NAMES[*l as usize] || s == (*l as usize).to_string();
+        let expected = "default, small, medium, large, classes or concepts (or 0 to 5)";
+        Self::ALL.into_iter().find(is_meant).ok_or_else(|| Error::new("unknown level").found(s).expected(expected))
     }
 }
 
 impl std::fmt::Display for Level {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-        f.write_str(["default", "small", "medium", "large"][*self as usize])
+        f.write_str(Self::NAMES[*self as usize])
     }
 }
 
@@ -56,6 +62,47 @@ pub fn maps_path(folder: impl AsRef<Path>, stem: &str) -> PathBuf {
 /// Where the mask features of a view lie: `<folder>/<stem>_f.npy`.
 pub fn features_path(folder: impl AsRef<Path>, stem: &str) -> PathBuf {
     folder.as_ref().join(format!("{stem}_f.npy"))
+}
+
+/// Where the names of the masks of a view lie, where a model gave any: `<folder>/<stem>_n.json`.
+pub fn names_path(folder: impl AsRef<Path>, stem: &str) -> PathBuf {
+    folder.as_ref().join(format!("{stem}_n.json"))
+}
+
+/// What a model calls a mask.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct MaskName {
+    /// The name of its class.
+    pub name: String,
+    /// How sure the model is, 0 to 1.
+    pub score: f32,
+}
+
+/// The names of the masks of one view, by id.
+pub type MaskNames = BTreeMap<u32, MaskName>;
+
+/// Reads the names of the masks of a view; none where there is no such file.
+///
+/// # Errors
+/// When the file is damaged, a name is empty or bad ([`check_name`]), or a score is not in 0 to 1.
+pub fn read_mask_names(folder: impl AsRef<Path>, stem: &str) -> Result<MaskNames> {
+    let path = names_path(folder, stem);
+    if !path.is_file() {
+        return Ok(MaskNames::new());
+    }
+    let bytes = std::fs::read(&path).at("read", &path)?;
+    let names: MaskNames = serde_json::from_slice(&bytes).map_err(|e| {
+        Error::new(format!("not the names of masks: {e}")).file(&path).hint("docs/artifacts.md says what it holds")
+    })?;
+    for (id, mask) in &names {
+        check_name(&mask.name).map_err(|e| e.file(&path).field(id.to_string()))?;
+        if mask.name.is_empty() || !(0.0..=1.0).contains(&mask.score) {
+            let e = Error::new("not the name of a mask").file(&path).field(id.to_string()).found(format!("{mask:?}"));
+            return Err(e.expected("a name, and a score from 0 to 1"));
+        }
+    }
+    Ok(names)
 }
 
 /// Stems of all views that have id maps in `folder`, sorted.
@@ -97,7 +144,7 @@ pub fn watch_folder(folder: impl AsRef<Path>, suffix: &str) -> Result<Watched> {
 /// The id maps of one view.
 #[derive(Debug, Clone, PartialEq)]
 pub struct MaskMaps {
-    /// Mask id per pixel, -1 for none; `[4][height][width]`. Ids count on from level to level, so that an id is the row
+    /// Mask id per pixel, -1 for none; `[4 or 6][height][width]`. Ids count on from level to level, so that an id is the row
     /// of the mask in `*_f.npy`; ids without pixels exist.
     pub ids: Array3<i32>,
 }
@@ -106,7 +153,7 @@ impl MaskMaps {
     /// Largest id a file may name: as many as f32 counts exactly.
     const MAX_ID: f32 = 16_777_216.0;
 
-    /// Reads `*_s.npy`: any real dtype, `[4, H, W]` (or `[1, H, W]` and `[H, W]`: one level for all four).
+    /// Reads `*_s.npy`: any real dtype, `[4, H, W]` or `[6, H, W]` (or `[1, H, W]` and `[H, W]`: one level for SAM's four).
     ///
     /// # Errors
     /// When the file is damaged, has another shape, or an id is not a whole number of at least -1 or out of proportion to
@@ -115,7 +162,7 @@ impl MaskMaps {
         let path = path.as_ref();
         let a = npy::read_f32(path)?;
         let (levels, height, width) = match *a.shape() {
-            [levels @ (1 | LEVELS), h, w] => (levels, h, w),
+            [levels @ (1 | 4 | LEVELS), h, w] => (levels, h, w),
             [h, w] => (1, h, w),
             _ => (0, 0, 0),
         };
@@ -124,7 +171,7 @@ impl MaskMaps {
                 .file(path)
                 .field("shape")
                 .found(format!("{:?}", a.shape()))
-                .expected("[4, height, width]"));
+                .expected("[4, height, width], or [6, height, width] with classes and concepts"));
         }
         // Tables with a row for each id are made from this: ids are dense, so there are no more of them than pixels.
         let most = Self::MAX_ID.min((levels * height * width).max(1 << 16) as f32);
@@ -140,12 +187,13 @@ impl MaskMaps {
         }
         let mut ids: Vec<i32> = values.iter().map(|&v| v as i32).collect();
         if levels == 1 {
-            ids = ids.repeat(LEVELS);
+            ids = ids.repeat(Level::SAM.len());
         }
-        Ok(Self { ids: Array3::from_shape_vec((LEVELS, height, width), ids).expect("ids of all levels") })
+        let levels = levels.max(Level::SAM.len());
+        Ok(Self { ids: Array3::from_shape_vec((levels, height, width), ids).expect("ids of all levels") })
     }
 
-    /// Writes `*_s.npy` as LangSplat does: f32 `[4, H, W]`.
+    /// Writes `*_s.npy` as LangSplat does: f32 `[4, H, W]`; `[6, H, W]` where there are more levels.
     pub fn write(&self, path: impl AsRef<Path>) -> Result<()> {
         npy::write_f32(path, &self.ids.mapv(|id| id as f32))
     }
@@ -160,14 +208,28 @@ impl MaskMaps {
         self.ids.dim().1
     }
 
+    /// The levels that there are: SAM's, or all.
+    pub fn levels(&self) -> &'static [Level] {
+        &Level::ALL[..self.ids.dim().0]
+    }
+
+    /// The mask of a level that owns the pixel in this row and column; None too where there is no such level.
+    #[inline(always)]
+    pub fn mask(&self, level: Level, [y, x]: [usize; 2]) -> Option<u32> {
+        self.ids.get([level as usize, y, x]).and_then(|&id| u32::try_from(id).ok())
+    }
+
     /// The map of one level, `[height][width]`.
+    ///
+    /// # Panics
+    /// When there is no such level.
     pub fn level(&self, level: Level) -> ArrayView2<'_, i32> {
         self.ids.index_axis(Axis(0), level as usize)
     }
 
     /// Forgets the masks of all levels but these.
     pub fn keep(&mut self, levels: &[Level]) {
-        for level in Level::ALL.iter().filter(|level| !levels.contains(level)) {
+        for level in self.levels().iter().filter(|level| !levels.contains(level)) {
             self.ids.index_axis_mut(Axis(0), *level as usize).fill(-1);
         }
     }
@@ -237,7 +299,8 @@ impl MaskFolder {
         if self.bends(view) {
             let size = (maps.width(), maps.height());
             let (width, height) = view.straighten(maps.ids.as_slice_mut().expect("as read"), size);
-            maps.ids = maps.ids.into_shape_with_order((LEVELS, height, width)).expect("as many ids");
+            let levels = maps.levels().len();
+            maps.ids = maps.ids.into_shape_with_order((levels, height, width)).expect("as many ids");
         }
         maps.expect_shape(view.camera.width, view.camera.height, &file)?;
         Ok(maps)

@@ -3,7 +3,7 @@
 use crate::edits::Remarks;
 use gs_io::{Error, IoContext, Result, check_name, write_json};
 use serde::{Deserialize, Serialize};
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
 
 /// `names.json`: the best names of every instance, as it was clustered. docs/queries.md says how they are found.
@@ -18,15 +18,15 @@ pub struct InstanceNames {
     pub instances: String,
     /// Where text features came from, for people.
     pub source: String,
-    /// Content hash of the text encoder's graph, or of the table.
+    /// Content hash of the text encoder's graph, or of the table; empty where masks alone gave the names.
     pub model: String,
-    /// Content hash of the vocabulary: its names, one a line.
+    /// Content hash of the vocabulary: its names, one a line; empty where masks alone gave the names.
     pub vocabulary: String,
     /// Names in it.
     pub words: usize,
     /// The margin that is no better than chance; none where the names have fewer than three meanings, or nothing is named.
     pub by_chance: Option<f32>,
-    /// Instances with a descriptor, ascending.
+    /// Instances with a descriptor or with masks that have names, ascending.
     pub named: Vec<Naming>,
 }
 
@@ -38,7 +38,7 @@ pub struct Naming {
     pub instance: u32,
     /// The best names, best first; 1 to 3.
     pub names: Vec<ScoredName>,
-    /// How much better the first name is than the best one of another meaning, on the scale of cosines; 0 or more.
+    /// How much better the first name is than the best one of another meaning, on the scale of the scores; 0 or more.
     pub margin: f32,
     /// Whether that is more than chance.
     pub sure: bool,
@@ -50,7 +50,7 @@ pub struct Naming {
 pub struct ScoredName {
     /// The name.
     pub name: String,
-    /// Cosine of its feature with the descriptor, -1 to 1.
+    /// Cosine of its feature with the descriptor, -1 to 1; of a name that masks give, see [`crate::Health::names`].
     pub score: f32,
 }
 
@@ -70,6 +70,20 @@ impl InstanceNames {
     pub const FORMAT: &str = "names";
     /// Version of the format.
     pub const VERSION: u32 = 1;
+
+    /// The names that masks give to instances of this content hash ([`crate::Health::names`]), without a vocabulary.
+    pub fn by_masks(named: Vec<Naming>, instances: &str) -> Self {
+        let words: BTreeSet<&str> = named.iter().flat_map(|n| &n.names).map(|s| s.name.as_str()).collect();
+        Self {
+            format: Self::FORMAT.into(),
+            version: Self::VERSION,
+            instances: instances.into(),
+            source: "names of the masks".into(),
+            words: words.len(),
+            named,
+            ..Self::default()
+        }
+    }
 
     /// Where the names of instances lie: `names.json` beside them.
     pub fn path_beside(instances: impl AsRef<Path>) -> PathBuf {
@@ -151,7 +165,6 @@ impl std::fmt::Display for Called {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use std::collections::BTreeSet;
 
     fn names() -> InstanceNames {
         let naming = |instance, name: &str, sure| {

@@ -103,7 +103,7 @@ impl TileMasks {
         let mut last = 0;
         for (x, y) in (0..t.height).flat_map(|y| (0..t.width).map(move |x| (x, y))) {
             let at = [t.y0 + y, t.x0 + x];
-            let ids = levels.iter().filter_map(|&level| u32::try_from(maps.level(level)[at]).ok());
+            let ids = levels.iter().filter_map(|&level| maps.mask(level, at));
             let set: Vec<u16> = ids.map(|id| out.number(id)).collect();
             if out.sets.get(last) != Some(&set) {
                 last = out.sets.iter().position(|s| *s == set).unwrap_or_else(|| {

@@ -1,10 +1,18 @@
-//! How far masks and instances agree.
+//! How far masks and instances agree, and what masks with names call them.
 
-use artifacts::{Health, Instances};
+use artifacts::{Footprints, Health, Instances, Level, MaskNames, Naming, ScoredName, read_mask_names};
+use gs_io::Result;
 use std::collections::BTreeMap;
+use std::path::Path;
 
-/// The health of `instances`, from the weight of each in the masks (rows of the footprints).
-pub fn measure(instances: &Instances, weights: &[(u32, BTreeMap<u32, f64>)]) -> Health {
+/// Weight of each instance in masks, which are rows of the footprints.
+type Weights = [(u32, BTreeMap<u32, f64>)];
+
+/// A name that this share of an instance's weight speaks for is sure.
+const SURE: f32 = 0.5;
+
+/// The health of `instances`, from the weight of each in the masks.
+pub fn measure(instances: &Instances, weights: &Weights) -> Health {
     let labelled: usize = instances.count.iter().map(|&c| c as usize).sum();
     let largest = instances.count.iter().max().map_or(0.0, |&c| f64::from(c) / labelled.max(1) as f64);
     let (mut inside, mut all) = (0.0, 0.0);
@@ -12,15 +20,49 @@ pub fn measure(instances: &Instances, weights: &[(u32, BTreeMap<u32, f64>)]) -> 
         inside += of.values().copied().fold(0.0, f64::max);
         all += of.values().sum::<f64>();
     }
-    Health { largest, purity: (all > 0.0).then(|| inside / all) }
+    Health { largest, purity: (all > 0.0).then(|| inside / all), names: Vec::new() }
+}
+
+/// What the masks of levels with names call each instance ([`Health::names`]). `folder` has the id maps.
+///
+/// # Errors
+/// When a file of names is damaged.
+pub fn names(weights: &Weights, footprints: &Footprints, folder: &Path) -> Result<Vec<Naming>> {
+    let names =
+        footprints.views.iter().map(|view| read_mask_names(folder, view)).collect::<Result<Vec<MaskNames>>>()?;
+    let (mut all, mut called): (BTreeMap<u32, f64>, BTreeMap<u32, BTreeMap<&str, f64>>) = Default::default();
+    for (row, of) in weights {
+        let row = &footprints.rows[*row as usize];
+        if row.is_of(&Level::SAM) {
+            continue;
+        }
+        let name = names[row.view as usize].get(&row.mask);
+        for (&k, &w) in of {
+            *all.entry(k).or_default() += w;
+            if let Some(mask) = name {
+                *called.entry(k).or_default().entry(&mask.name).or_default() += w * f64::from(mask.score);
+            }
+        }
+    }
+    let naming = |(instance, of): (u32, BTreeMap<&str, f64>)| {
+        let score = |w: f64| (w / all[&instance]) as f32;
+        let mut names: Vec<ScoredName> =
+            of.into_iter().map(|(name, w)| ScoredName { name: name.into(), score: score(w) }).collect();
+        // Of equals the first by name; the sort is stable.
+        names.sort_by(|a, b| b.score.total_cmp(&a.score));
+        names.truncate(3);
+        let margin = names[0].score - names.get(1).map_or(0.0, |second| second.score);
+        Naming { instance, margin, sure: names[0].score >= SURE, names }
+    };
+    Ok(called.into_iter().map(naming).collect())
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
     use crate::profile::mask_weights;
-    use crate::testing::{footprints, instances};
-    use artifacts::{Footprints, Level};
+    use crate::testing::{footprints, footprints_of, instances};
+    use artifacts::{MaskName, names_path};
 
     fn health(instances: &Instances, footprints: &Footprints, level: Level) -> Health {
         measure(instances, &mask_weights(&instances.label, footprints, &[level]).unwrap())
@@ -32,7 +74,33 @@ mod tests {
         let footprints = footprints(&[&[&[0, 1], &[3, 4, 5, 6]]]);
         let instances = instances([0, 0, 0, 0, 0, 0, 1, 1]);
         let found = health(&instances, &footprints, Level::Large);
-        assert_eq!(found, Health { largest: 0.75, purity: Some(5.0 / 6.0) });
+        assert_eq!(found, Health { largest: 0.75, purity: Some(5.0 / 6.0), names: vec![] });
         assert_eq!(health(&instances, &footprints, Level::Small).purity, None);
+    }
+
+    #[test]
+    fn an_instance_is_called_what_most_of_its_weight_is() {
+        let dir = tempfile::tempdir().unwrap();
+        let called = |name: &str, score| MaskName { name: name.into(), score };
+        // Two views of level classes; the second has a mask without a name.
+        let views: [&[&[u32]]; 2] = [&[&[0, 1, 2, 3], &[4, 5, 6, 7]], &[&[0, 1], &[2, 3], &[4, 5, 6, 7]]];
+        let footprints = footprints_of(&[(Level::Classes, &views), (Level::Large, &views)]);
+        let masks: [&[(u32, MaskName)]; 2] = [
+            &[(0, called("sofa", 0.9)), (1, called("table", 0.5))],
+            &[(0, called("chair", 1.0)), (2, called("table", 0.6))],
+        ];
+        for (view, names) in masks.iter().enumerate() {
+            let names: MaskNames = names.iter().cloned().collect();
+            gs_io::write_json(names_path(dir.path(), &view.to_string()), &names).unwrap();
+        }
+        let weights = mask_weights(&[0, 0, 0, 0, 1, 1, 1, 1], &footprints, &Level::ALL).unwrap();
+        let found = names(&weights, &footprints, dir.path()).unwrap();
+        let said: Vec<_> = found.iter().map(|n| (n.instance, n.sure, n.names[0].name.as_str())).collect();
+        assert_eq!(said, [(0, false, "sofa"), (1, true, "table")]);
+        let scores: Vec<f32> = found.iter().flat_map(|n| &n.names).map(|n| n.score).collect();
+        assert!(scores.iter().zip([0.45, 0.25, 0.55]).all(|(a, b)| (a - b).abs() < 1e-6), "{scores:?}");
+        std::fs::write(names_path(dir.path(), "0"), r#"{"0": {"name": "", "score": 2}}"#).unwrap();
+        let e = names(&weights, &footprints, dir.path()).unwrap_err().to_string();
+        assert!(e.contains("0_n.json: 0: not the name of a mask"), "{e}");
     }
 }

@@ -1,7 +1,7 @@
 //! Reading the inputs, and checking that they belong together.
 
 use crate::options::{Args, Space};
-use artifacts::{Features, Footprints, Graph, hash_folder, role};
+use artifacts::{Features, Footprints, Graph, Level, hash_folder, role};
 use gs_io::{Error, IoContext, Provenance, Result, hash_file};
 use gs_scene::Geometry;
 use gs_scene::dataset::{self, Dataset, LoadOptions, Resolution, View};
@@ -65,6 +65,9 @@ impl Inputs {
             (role::FOOTPRINTS.into(), footprints.artifact().hash().into()),
             (role::MASK_FEATURES.into(), hash_folder(&a.masks, "_f.npy")?),
         ]);
+        if footprints.rows.iter().any(|row| !row.is_of(&Level::SAM)) {
+            hashes.insert(role::MASK_NAMES.into(), hash_folder(&a.masks, "_n.json")?);
+        }
         hashes.extend(features_file.map(|file| (role::FEATURES.into(), file.hash().into())));
         hashes.extend(clip_of_features(&a.masks, &masks)?);
         hashes.insert(role::MASKS.into(), masks);

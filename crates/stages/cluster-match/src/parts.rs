@@ -33,13 +33,13 @@ impl Pieces {
         Self { pairs, labels }
     }
 
-    /// Those that the large masks set apart: the probability that one of them holds the part and the rest of the instance is lower, by
+    /// Those that the large masks, or those of classes in their place, set apart: the probability that one of them holds the part and the rest of the instance is lower, by
     /// [`APART`], than that of the medium masks. SAM's largest mask of a place is the whole thing there. Where either level says
     /// nothing of a part, it is not apart.
-    fn apart(&self, footprints: &Footprints) -> Result<Vec<bool>> {
+    fn apart(&self, footprints: &Footprints, large: Level) -> Result<Vec<bool>> {
         let wholes: Vec<i32> = self.pairs.iter().map(|p| p.0).collect();
         let agreements = |level| with_rest(&self.labels, &wholes, footprints, &[level]);
-        let (medium, large) = (agreements(Level::Medium)?, agreements(Level::Large)?);
+        let (medium, large) = (agreements(Level::Medium)?, agreements(large)?);
         Ok(medium.into_iter().zip(large).map(|(m, l)| m.zip(l).is_some_and(|(m, l)| m - l >= APART)).collect())
     }
 
@@ -69,7 +69,7 @@ impl Pieces {
 
 /// Makes instances of `parts`. A part leaves where at least [`INSIDE`] of its Gaussians lie in one instance, it has at most `share` of that
 /// instance's (or a half, where large masks set it apart), and some mask shows it as one. An instance of which more than half would leave
-/// stays as it is. In the tree such a part hangs below the cluster of that instance. Returns how many there are.
+/// stays as it is. `large` is the level of whole things. In the tree such a part hangs below the cluster of that instance. Returns how many there are.
 ///
 /// # Errors
 /// When the footprints can't be read.
@@ -78,10 +78,12 @@ pub(crate) fn split(
     parts: &Assignment,
     kept: &[u32],
     footprints: &Footprints,
+    large: Level,
     share: f64,
 ) -> Result<usize> {
     let pieces = Pieces::new(wholes, parts, kept);
-    let (apart, shown) = (pieces.apart(footprints)?, are_shown(&pieces.labels, pieces.pairs.len(), footprints, VIEWS)?);
+    let apart = pieces.apart(footprints, large)?;
+    let shown = are_shown(&pieces.labels, pieces.pairs.len(), footprints, VIEWS)?;
     let shares = apart.iter().zip(shown).map(|(&apart, shown)| shown.then_some(if apart { 0.5 } else { share }));
     let leaving = pieces.leaving(&shares.collect::<Vec<_>>());
     let before = wholes.instances;
@@ -147,8 +149,9 @@ mod tests {
         let together: [&[&[u32]]; 2] = [&[&[0, 1, 2, 3, 4, 5], &[6, 7]]; 2];
         let once: [&[&[u32]]; 2] = [together[0], &[&[0, 1], &[2, 3, 4, 5], &[6, 7]]];
         let unseen: [&[&[u32]]; 2] = [&[&[6, 7]]; 2];
-        let apart =
-            |medium, large| pieces.apart(&footprints_of(&[(Level::Medium, medium), (Level::Large, large)])).unwrap();
+        let apart = |medium, large| {
+            pieces.apart(&footprints_of(&[(Level::Medium, medium), (Level::Large, large)]), Level::Large).unwrap()
+        };
         assert_eq!(apart(&together, &once), [true, true, false]);
         for (medium, large) in [(&together, &together), (&once, &together), (&once, &once), (&together, &unseen)] {
             assert_eq!(apart(medium, large), [false; 3], "{medium:?} {large:?}");
@@ -161,7 +164,8 @@ mod tests {
         let split = |views: [&[&[u32]]; 2]| {
             let mut wholes = of(vec![0; 8], 1);
             let parts = of(vec![0, 0, 0, 0, 0, 0, 1, 1], 2);
-            let split = split(&mut wholes, &parts, &all, &footprints_of(&[(Level::Small, &views)]), 0.3).unwrap();
+            let split =
+                split(&mut wholes, &parts, &all, &footprints_of(&[(Level::Small, &views)]), Level::Large, 0.3).unwrap();
             (split, wholes)
         };
         let shown: &[&[u32]] = &[&[0, 1, 2, 3, 4, 5], &[6, 7]];

@@ -13,7 +13,7 @@ use crate::profile::mask_weights;
 use crate::rank::confidence;
 use crate::surface::Points;
 use crate::{health, linkage, memory};
-use artifacts::{Draft, Instances, Level, MaskFeatures, MaskFolder, Match, Row};
+use artifacts::{Draft, Health, Instances, Level, MaskFeatures, MaskFolder, Match, Row};
 use gs_io::{Error, Result, Watched};
 use gs_raster::RasterOptions;
 use gs_scene::splat;
@@ -52,13 +52,13 @@ impl Program for Args {
         let a = &self;
         let mut claim = outputs::claim(a, stage)?;
         let mut watched = Watched::new([&a.geometry, &a.footprints]);
-        for suffix in ["_s.npy", "_f.npy"] {
+        for suffix in ["_s.npy", "_f.npy", "_n.json"] {
             watched = watched.and(artifacts::watch_folder(&a.masks, suffix)?);
         }
         // A packed file may hold a thousand times its size.
         stage.needs_at_once(memory::least(splat::count(&a.geometry)?), SMALLER)?;
         let inputs = Inputs::read(a, stage)?;
-        let settings = a.settings.for_gaussians(inputs.graph.kept.len());
+        let settings = a.settings.for_scene(inputs.graph.kept.len(), &inputs.footprints);
         let mut found = match &a.from {
             Some(path) => outputs::read_draft(path, &inputs, &settings)?,
             None => find(a, &settings, &inputs, stage)?,
@@ -121,7 +121,8 @@ fn find(a: &Args, settings: &Settings, inputs: &Inputs, stage: &Stage) -> Result
     let mut instances =
         Instances { views, tree: found.tree, node: found.nodes, granules, granule_descriptor, ..gathered };
     instances.score = confidence(&instances.count, &fits);
-    let health = health::measure(&instances, &weights);
+    let names = health::names(&weights, footprints, &a.masks)?;
+    let health = Health { names, ..health::measure(&instances, &weights) };
     let draft = Draft { instances, of_instances, of_granules, masks };
     Ok(Found { draft, health, noise, clustering_seconds })
 }
@@ -155,7 +156,8 @@ fn correct(
     if settings.split > 0.0 && settings.levels.contains(&Level::Small) && footprints.rows.iter().any(small) {
         let clustering = linkage::cluster(inputs, points, settings, &[Level::Small], (PARTS, 0.0))?;
         let parts = Assignment::new(&clustering, &graph.kept, means.len());
-        let split = split(&mut found, &parts, &graph.kept, footprints, settings.split)?;
+        let large = if settings.levels.contains(&Level::Classes) { Level::Classes } else { Level::Large };
+        let split = split(&mut found, &parts, &graph.kept, footprints, large, settings.split)?;
         if split > 0 {
             stage.info(&format!("{split} small things within others are instances of their own"));
         }

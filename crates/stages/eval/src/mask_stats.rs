@@ -9,7 +9,7 @@
 
 use crate::options::MasksOptions;
 use crate::score::metrics::counts;
-use artifacts::{Footprints, Level, MaskMaps, maps_path, role};
+use artifacts::{Footprints, LEVELS, Level, MaskMaps, maps_path, role};
 use gs_io::{Error, Result, write_json};
 use report::sheet::markdown;
 use serde::Serialize;
@@ -85,11 +85,11 @@ pub fn measure(folder: &Path, footprints: Option<&Footprints>) -> Result<MaskSta
             .found(other)
             .hint("run graph-precompute on these masks"));
     }
-    let [mut masks, mut areas, mut covered]: [[Vec<f64>; 4]; 3] = Default::default();
+    let [mut masks, mut areas, mut covered]: [[Vec<f64>; LEVELS]; 3] = Default::default();
     for stem in &stems {
         let maps = MaskMaps::read(maps_path(folder, stem))?;
         let image = (maps.width() * maps.height()) as f64;
-        for level in Level::ALL {
+        for &level in maps.levels() {
             let pixels = counts(maps.level(level).into_iter().filter(|&&id| id >= 0));
             let l = level as usize;
             masks[l].push(pixels.len() as f64);

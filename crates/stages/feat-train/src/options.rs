@@ -39,7 +39,7 @@ pub struct Options {
     /// it; where the two presets differ, their help says so
     #[arg(long, value_enum)]
     pub preset: Option<Preset>,
-    /// Mask levels to use, separated by commas: default, small, medium, large [default: all; large with --preset]
+    /// Mask levels to use, separated by commas: default, small, medium, large, classes, concepts [default: all; large with --preset]
     #[arg(long, value_name = "LEVELS", value_delimiter = ',')]
     pub levels: Vec<Level>,
     /// Dimension of the features, 1 to 512, or 2 to 64 with --preset [default: 6 with --preset; else as many as there are
@@ -240,8 +240,7 @@ mod tests {
             let files = ["feat-train", "--geometry", "g", "--graph", "g", "--footprints", "f", "--out", "o"];
             Args::parse_from([&files, arguments].concat()).options.parameters(3)
         };
-        let closed =
-            json!({ "preset": null, "levels": ["default", "small", "medium", "large"], "dim": null, "seed": 3 });
+        let closed = json!({ "preset": null, "levels": ["default", "small", "medium", "large", "classes", "concepts"], "dim": null, "seed": 3 });
         assert_eq!(of(&[]), closed);
         let literal = of(&["--preset", "literal", "--loss", "separation"]);
         assert_eq!(

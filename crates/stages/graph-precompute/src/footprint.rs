@@ -124,7 +124,7 @@ fn tile_pixels(
             let rows = rows_at(maps, row_of, [tile.y0 + y, tile.x0 + x]);
             for level in 0..LEVELS {
                 let row = rows[level];
-                let key = mixed(options.seed ^ mixed((pixel * LEVELS + level) as u64));
+                let key = mixed(options.seed ^ mixed((pixel * Level::SAM.len() + level) as u64));
                 if row == NONE || tile.alpha[at] <= options.gate || key > below[row as usize] {
                     continue;
                 }
@@ -145,8 +145,8 @@ fn mask_rows(maps: &MaskMaps, min_pixels: usize) -> (Vec<Row>, [Vec<u32>; LEVELS
     let mut rows = Vec::new();
     let mut small = 0;
     let row_of = Level::ALL.map(|level| {
-        let mut pixels = vec![0u32; maps.id_count()];
-        for &id in maps.level(level) {
+        let mut pixels = vec![0u32; if maps.levels().contains(&level) { maps.id_count() } else { 0 }];
+        for &id in maps.ids.outer_iter().nth(level as usize).iter().flatten() {
             if id >= 0 {
                 pixels[id as usize] += 1;
             }
@@ -168,10 +168,7 @@ fn mask_rows(maps: &MaskMaps, min_pixels: usize) -> (Vec<Row>, [Vec<u32>; LEVELS
 /// The rows of the masks that a pixel belongs to, level by level.
 #[inline(always)]
 fn rows_at(maps: &MaskMaps, row_of: &[Vec<u32>; LEVELS], [y, x]: [usize; 2]) -> [u32; LEVELS] {
-    std::array::from_fn(|level| match maps.ids[[level, y, x]] {
-        id if id >= 0 => row_of[level][id as usize],
-        _ => NONE,
-    })
+    Level::ALL.map(|level| maps.mask(level, [y, x]).map_or(NONE, |id| row_of[level as usize][id as usize]))
 }
 
 /// What one tile adds.

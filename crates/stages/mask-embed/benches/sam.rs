@@ -69,7 +69,7 @@ fn recall(some: &[Pixels], all: &[Pixels]) -> usize {
 /// How many masks of the maps `all` at levels small, medium and large the maps `some` have, and their number.
 fn recall_of_maps(some: &MaskMaps, all: &MaskMaps) -> [usize; 2] {
     let mut found = [0, 0];
-    for level in &Level::ALL[1..] {
+    for level in &Level::SAM[1..] {
         let (mut both, mut areas) = (BTreeMap::<_, usize>::new(), [BTreeMap::<i32, usize>::new(), BTreeMap::new()]);
         for (&a, &b) in some.level(*level).iter().zip(all.level(*level)) {
             *both.entry((b, a)).or_default() += 1;

@@ -9,10 +9,12 @@ use crate::logits::{Grid, Logits};
 use crate::nms::{GOOD, Pixels, Rated, box_nms, mask_nms, merges_things};
 use crate::options::Choice;
 use crate::sam::{Candidates, Embedded, Sam};
-use artifacts::LEVELS;
+use artifacts::Level;
 use gs_io::Result;
 use onnx_models::parallel_map;
 
+/// Levels of SAM's masks.
+pub const SAM_LEVELS: usize = Level::SAM.len();
 /// Distance of the two thresholds of the stability score from 0, as in SAM.
 const STABILITY_OFFSET: f32 = 1.0;
 /// How often a small mask is asked in the hope of the whole thing that it is part of.
@@ -86,7 +88,7 @@ pub fn propose(sam: &Sam, embedded: &Embedded, choice: &Choice) -> Result<Propos
         let at_level = |l: usize| masks.iter().filter(move |m| m.level == l);
         let times = |p: &Pixels| asked.iter().filter(|&&a| p.contains(grid.index(a))).count();
         let small: Vec<(&Pixels, usize)> = at_level(1).map(|m| (&m.pixels, times(&m.pixels))).collect();
-        let good = at_level(LEVELS - 1).filter(|m| m.score > GOOD);
+        let good = at_level(SAM_LEVELS - 1).filter(|m| m.score > GOOD);
         let whole: Vec<&Pixels> = good.map(|m| &m.pixels).collect();
         let known = |point: [f64; 2]| {
             let i = grid.index(point);
@@ -127,7 +129,7 @@ fn consider(answer: &Candidates, grid: &Grid, choice: &Choice) -> Vec<Proposal> 
 /// things go ([`merges_things`]), then box suppression, then LangSplat's.
 ///
 /// Levels are SAM's own three masks per prompt; default is all of them together. Then [`fill`].
-pub fn levels(masks: &[Proposal]) -> [Vec<usize>; LEVELS] {
+pub fn levels(masks: &[Proposal]) -> [Vec<usize>; SAM_LEVELS] {
     let by_boxes = |c: Vec<usize>| -> Vec<usize> {
         let rated: Vec<Rated> = c.iter().map(|&i| (&masks[i].pixels, masks[i].quality)).collect();
         box_nms(&rated, BOX_NMS).into_iter().map(|k| c[k]).collect()
@@ -137,10 +139,10 @@ pub fn levels(masks: &[Proposal]) -> [Vec<usize>; LEVELS] {
         mask_nms(&rated).into_iter().map(|k| c[k]).collect()
     };
     // Masks of level large are whole things; a mask around several of them is none itself.
-    let things: Vec<Rated> = masks.iter().filter(|m| m.level == LEVELS - 1).map(|m| (&m.pixels, m.score)).collect();
+    let things: Vec<Rated> = masks.iter().filter(|m| m.level == SAM_LEVELS - 1).map(|m| (&m.pixels, m.score)).collect();
     let single: Vec<usize> =
         (0..masks.len()).filter(|&i| !merges_things(&masks[i].pixels, masks[i].score, &things)).collect();
-    let mut chosen: [Vec<usize>; LEVELS] = Default::default();
+    let mut chosen: [Vec<usize>; SAM_LEVELS] = Default::default();
     for (level, slot) in chosen.iter_mut().enumerate().skip(1) {
         *slot = by_masks(by_boxes(single.iter().copied().filter(|&i| masks[i].level == level).collect()));
     }
@@ -155,11 +157,11 @@ const FILL_FREE: f64 = 0.7;
 /// itself whole, what has no parts is its own part. From the best score down, a mask is taken when the level covers at
 /// most 30% of it. Without this a thing for which SAM finds no good mask at a level is absent from it, as most small
 /// things are from level large.
-pub fn fill(masks: &[Proposal], chosen: &[Vec<usize>; LEVELS]) -> [Vec<usize>; LEVELS] {
+pub fn fill(masks: &[Proposal], chosen: &[Vec<usize>; SAM_LEVELS]) -> [Vec<usize>; SAM_LEVELS] {
     let mut filled = chosen.clone();
     for (level, slot) in filled.iter_mut().enumerate().skip(1) {
         let mut others: Vec<usize> =
-            (1..LEVELS).filter(|&l| l != level).flat_map(|l| chosen[l].iter().copied()).collect();
+            (1..SAM_LEVELS).filter(|&l| l != level).flat_map(|l| chosen[l].iter().copied()).collect();
         others.sort_by(|&a, &b| masks[b].score.total_cmp(&masks[a].score).then(a.cmp(&b)));
         let mut covered = slot.iter().fold(Pixels::default(), |all, &i| all.union(&masks[i].pixels));
         for i in others {

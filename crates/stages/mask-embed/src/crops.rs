@@ -28,7 +28,7 @@ fn label_map(maps: &MaskMaps, level: Level) -> LabelMap<'_> {
 pub(crate) fn owners(maps: &MaskMaps) -> Vec<Owner> {
     let count = maps.id_count();
     let mut found: Vec<Option<(Level, Bounds)>> = vec![None; count];
-    for level in Level::ALL {
+    for &level in maps.levels() {
         for (slot, bounds) in found.iter_mut().zip(mask_bounds(&label_map(maps, level), count)) {
             *slot = slot.or(bounds.map(|b| (level, b)));
         }

@@ -7,7 +7,7 @@ use crate::options::{Choice, MasksArgs};
 use crate::paint::{MapSize, paint};
 use crate::photographs;
 use crate::sam::Sam;
-use artifacts::{LEVELS, Level, MaskMaps, maps_path, role};
+use artifacts::{Level, MaskMaps, maps_path, role};
 use gs_io::{Claim, Error, Result, Watched, write_json};
 use gs_scene::dataset::{Dataset, View};
 use onnx_models::RgbImage;
@@ -27,15 +27,16 @@ struct Facts {
     /// Width and height of the maps.
     size: [usize; 2],
     /// Masks of each level.
-    masks: [usize; LEVELS],
+    masks: Vec<usize>,
     /// Points of the grid, and how many of them were asked.
     points: usize,
     asked: usize,
 }
 
 /// Masks of each level of a map.
-pub(crate) fn count_masks(maps: &MaskMaps) -> [usize; LEVELS] {
-    Level::ALL.map(|l| maps.level(l).iter().filter(|&&id| id >= 0).collect::<BTreeSet<_>>().len())
+pub(crate) fn count_masks(maps: &MaskMaps) -> Vec<usize> {
+    let of = |l: &Level| maps.level(*l).iter().filter(|&&id| id >= 0).collect::<BTreeSet<_>>().len();
+    maps.levels().iter().map(of).collect()
 }
 
 /// Makes the id maps of every view of a scene that are not done already, then the manifest.

@@ -1,8 +1,8 @@
 //! From chosen masks to an id map.
 
-use crate::automatic::Proposals;
+use crate::automatic::{Proposals, SAM_LEVELS};
 use crate::regions::Patch;
-use artifacts::{LEVELS, MaskMaps};
+use artifacts::MaskMaps;
 use ndarray::Array3;
 use onnx_models::RgbImage;
 use rayon::prelude::*;
@@ -37,10 +37,10 @@ impl MapSize {
 /// pixels that it shares with an earlier one. A mask left with fewer than `min_area` pixels is not painted at all. Ids
 /// count on from level to level, and every id owns pixels, so that LangSplat's readers, which take the highest id of a
 /// level for its number of masks, agree.
-pub fn paint(proposals: &Proposals, chosen: &[Vec<usize>; LEVELS], size: MapSize) -> MaskMaps {
+pub fn paint(proposals: &Proposals, chosen: &[Vec<usize>; SAM_LEVELS], size: MapSize) -> MaskMaps {
     let MapSize { width, height, min_area } = size;
     let min_area = min_area.max(1);
-    let mut ids = vec![-1i32; LEVELS * width * height];
+    let mut ids = vec![-1i32; SAM_LEVELS * width * height];
     let mut first = 0;
     for (level, indices) in chosen.iter().enumerate() {
         let whole = |&i: &usize| {
@@ -73,7 +73,7 @@ pub fn paint(proposals: &Proposals, chosen: &[Vec<usize>; LEVELS], size: MapSize
         }
         first += masks.len() as i32;
     }
-    MaskMaps { ids: Array3::from_shape_vec((LEVELS, height, width), ids).expect("four maps") }
+    MaskMaps { ids: Array3::from_shape_vec((SAM_LEVELS, height, width), ids).expect("four maps") }
 }
 
 #[cfg(test)]

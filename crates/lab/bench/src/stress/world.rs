@@ -1,6 +1,6 @@
 //! A scene as numbers, to be changed and written out again.
 
-use artifacts::{LEVELS, MaskMaps, maps_path};
+use artifacts::{MaskMaps, maps_path};
 use glam::{DMat3, DQuat, DVec3};
 use gs_io::{Result, create_dir};
 use gs_scene::dataset::{LoadOptions, Resolution, load};
@@ -116,7 +116,7 @@ impl World {
                 rgb.extend(&s.image.rgb[3 * (y * w + x)..3 * (y * w + x) + 3]);
             }
             s.image = Image { width: 2 * w as u32, height: 2 * h as u32, rgb, alpha: None };
-            let shape = (LEVELS, 2 * s.masks.height(), 2 * s.masks.width());
+            let shape = (s.masks.levels().len(), 2 * s.masks.height(), 2 * s.masks.width());
             let ids = Array3::from_shape_fn(shape, |(level, y, x)| s.masks.ids[[level, y / 2, x / 2]]);
             s.masks = MaskMaps { ids };
         }

@@ -242,7 +242,7 @@ impl Language {
         }
         let count = maps.id_count();
         let mut shares: Vec<BTreeMap<u32, f64>> = vec![BTreeMap::new(); count];
-        for level in Level::ALL {
+        for level in Level::SAM {
             let map = flat(maps.level(level));
             let mut boxes: BTreeMap<i32, [usize; 4]> = BTreeMap::new();
             for (at, &id) in map.iter().enumerate().filter(|(_, id)| **id >= 0) {

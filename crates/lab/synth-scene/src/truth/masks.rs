@@ -15,7 +15,7 @@
 use crate::render::Frame;
 use crate::scene::Scene;
 use crate::truth::regions::{Pairs, Regions, neighbours};
-use artifacts::{LEVELS, Level, MaskMaps, MaskTruth};
+use artifacts::{Level, MaskMaps, MaskTruth};
 use glam::DVec2;
 use ndarray::Array3;
 use rand::Rng;
@@ -80,7 +80,7 @@ pub(crate) fn segment(
     for &p in frame.part.iter().filter(|&&p| p >= 0) {
         visible[p as usize] += 1;
     }
-    for level in Level::ALL {
+    for level in Level::SAM {
         let mut regions = Regions::new(scene, frame, shown(scene, &visible, level, faults.granularity, rng));
         if faults.torn > 0.0 {
             regions.tear(frame, level, faults.torn, pairs);
@@ -116,7 +116,7 @@ pub(crate) fn segment(
         let owned = compact(&painted, kept.len(), truth.len() as i32, &mut ids);
         truth.extend(kept.into_iter().zip(owned).filter(|(_, owned)| *owned).map(|(t, _)| t));
     }
-    let ids = Array3::from_shape_vec((LEVELS, frame.height, frame.width), ids).expect("an id of each pixel");
+    let ids = Array3::from_shape_vec((Level::SAM.len(), frame.height, frame.width), ids).expect("an id of each pixel");
     (MaskMaps { ids }, truth)
 }
 
@@ -341,7 +341,7 @@ mod tests {
     /// Ids count on from level to level, each owns pixels and has its truth at its position.
     fn check_ids(maps: &MaskMaps, truth: &[MaskTruth]) {
         assert_eq!(maps.id_count(), truth.len());
-        for level in Level::ALL {
+        for level in Level::SAM {
             let map = flat(maps.level(level));
             for (id, t) in truth.iter().enumerate() {
                 assert_eq!(map.contains(&(id as i32)), t.level == level as u32, "{id} {t:?}");
@@ -384,7 +384,7 @@ mod tests {
         assert!(large.iter().any(|t| t.kind == "part" && t.caption.contains(" of the ")));
         assert!(truth.iter().any(|t| t.level == 1 && t.kind == "whole"));
         // A part is never cut: its pixels all have one id.
-        for level in Level::ALL {
+        for level in Level::SAM {
             let mut id_of = BTreeMap::new();
             for (at, &part) in frame.part.iter().enumerate() {
                 let id = flat(maps.level(level))[at];
@@ -472,7 +472,7 @@ mod tests {
             let (maps, truth) = shown(0.35, view);
             check_ids(&maps, &truth);
             assert!(truth.len() < all.len());
-            for level in Level::ALL {
+            for level in Level::SAM {
                 let mut into = BTreeMap::new();
                 for (&old, &new) in exact.level(level).iter().zip(maps.level(level)).filter(|(old, _)| **old >= 0) {
                     assert_eq!(*into.entry(old).or_insert(new), new, "a mask is swallowed whole");
@@ -505,7 +505,7 @@ mod tests {
             }
             // Exact edges: every pixel of a mask that is not spurious shows one of its things.
             if boundary == 0 {
-                for level in Level::ALL {
+                for level in Level::SAM {
                     for (&id, &thing) in maps.level(level).iter().zip(&frame.thing).filter(|(id, _)| **id >= 0) {
                         let t = &truth[id as usize];
                         prop_assert!(t.kind == "spurious" || t.instances.contains(&(thing as u32)));

@@ -101,10 +101,10 @@ pub(super) fn id_maps(m: &Material, page: &mut Page, metrics: &mut Metrics) -> R
             continue;
         }
         let maps = MaskFolder::open(folder).read(s.view)?;
-        let level = maps.level(Level::Large);
+        let level = maps.level(if maps.levels().contains(&Level::Classes) { Level::Classes } else { Level::Large });
         let distinct: BTreeSet<i32> = level.iter().copied().filter(|&id| id >= 0).collect();
         let (w, h) = (s.photo.width, s.photo.height);
-        // Ids of the large level begin after those of the others; only their differences matter for colours.
+        // Ids of a level begin after those of the others; only their differences matter for colours.
         let color = |i: usize| {
             let (x, y) = (i % w * maps.width() / w, i / w * maps.height() / h);
             u32::try_from(level[[y, x]]).map_or(NOISE_COLOR, instance_color)
