@@ -172,8 +172,8 @@ stress: build ## Hostile scenes and settings through every stage: out/stress/rep
 	target/release/bench stress --work out/stress/scenes --out out/stress/report.json
 
 SCENES ?=
-real-masks: build ## Score instances from real SAM masks of scenes with exact truth: out/real-masks (hours; SCENES=kitchen-10,room-10)
-	scripts/real_masks.py $(if $(SCENES),--scenes $(SCENES)) $(if $(PHOTOGRAPHS),--photographs "$$PHOTOGRAPHS")
+real-masks: build ## Score instances from real SAM masks of scenes with a truth: out/real-masks (hours; SCENES=room-10, SCANS=folder, PHOTOGRAPHS=desk=folder)
+	scripts/real_masks.py $(if $(SCENES),--scenes $(SCENES)) $(if $(SCANS),--scans "$$SCANS") $(if $(PHOTOGRAPHS),--photographs "$$PHOTOGRAPHS")
 
 clip-report: build ## Score a CLIP model for every crop and prompt on the labelled desk: make clip-report CLIP=folder SCENE=desk OUT=folder
 	@scripts/clip_report.py

@@ -1,18 +1,19 @@
 #!/usr/bin/env python3
-"""real_masks.py: instances from a real SAM's masks of ray-traced photographs, whose truth is exact.
+"""real_masks.py: instances from a real SAM's masks of scenes with a truth: ray-traced, scanned rooms, photographs with labels.
 
-    scripts/real_masks.py [--scenes kitchen-0,room-10] [--geometries 3] [--photographs FOLDER]
+    scripts/real_masks.py [--scenes kitchen-0,room-10] [--geometries 3] [--scans FOLDER] [--photographs FOLDER]
 
 For each scene (family-seed; seeds 0 to 2 are for tuning, 10 to 14 for reporting) it makes photographs, masks (slow, once),
 and Gaussians of several seeds, runs each method of METHODS, asks bench for the ceilings, and writes OUT/real-masks.md and
-OUT/scores.json. Everything is kept in OUT (out/real-masks), so a second run makes only what is missing. --photographs scores the
-desk of testdata/desk too.
+OUT/scores.json. Everything is kept in OUT (out/real-masks), so a second run makes only what is missing. --scans takes renders of
+scanned rooms (scan.py), --photographs the captures whose labels lie in testdata.
 """
 import argparse
 import json
 import os
 import statistics
 import subprocess
+import sys
 from pathlib import Path
 
 BIN = Path(os.environ.get("BIN", "target/release"))
@@ -29,7 +30,7 @@ METHODS = {
 }
 # What a scene's other methods are measured by.
 WHOLE = "true masks, large level only"
-COLUMNS = {"instance_miou": "instance mIoU", "ap25": "AP25", "ap50": "AP50", "label_miou": "label mIoU", "impure": "impure masks"}
+COLUMNS = {"instance_miou": "instance mIoU", "object_miou": "things mIoU", "ap25": "AP25", "ap50": "AP50", "label_miou": "label mIoU", "impure": "impure masks"}
 LEGEND = f"""\
 A scene's figure is the mean over its geometries (least to most). A figure of several scenes is the mean of theirs (least to most
 over scenes; largest distance between two geometries of one scene). The share of true masks is a scene's figure over that of
@@ -122,25 +123,35 @@ def table(scores):
     lines = [LEGEND, line("scene", "method", COLUMNS.values()), "|---" * (len(COLUMNS) + 2) + "|"]
     for scene in scores:
         lines += [line(scene, method, [one(values(scene, method, c)) for c in COLUMNS]) for method in scores[scene]]
-    for what, seeds in (("tuning", TUNING), ("reporting", REPORTING)):
-        own = [s for s in scores if ":" not in s and int(s.rpartition("-")[2]) in seeds]
+    drawn = [(s, int(s.rpartition("-")[2])) for s in scores if s.partition("-")[0] in FAMILIES]
+    groups = {what: [s for s, seed in drawn if seed in seeds] for what, seeds in (("tuning", TUNING), ("reporting", REPORTING))}
+    groups["scans"] = [s for s in scores if s.startswith("scan ")]
+    for what, own in groups.items():
         methods = list(dict.fromkeys(method for s in own for method in scores[s]))
         for name, of in ((what, values), (f"{what}, share of true masks", share)):
             lines += [line(f"**{name}**", method, [several([of(s, method, c) for s in own]) for c in COLUMNS])
-                      for method in methods if of is values or method != WHOLE]
+                      for method in methods if of is values or (what != "scans" and method != WHOLE)]
     return "\n".join(lines) + "\n"
 
 
 def arguments():
     everything = [f"{family}-{seed}" for seed in TUNING + REPORTING for family in FAMILIES]
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--scenes", default=",".join(everything), help="names with commas between [all 32]")
+    parser.add_argument("--scenes", help="ray-traced scenes, names with commas between [all 32; none with --scans or --photographs]")
     parser.add_argument("--geometries", type=int, default=3, help="seeds of stage 1 for each scene [3]")
-    parser.add_argument("--photographs", type=Path, help="folder of the desk's photographs")
+    parser.add_argument("--scans", type=Path, help="folder of scans, NAME_vert.npy and labels; scan.py says what they hold")
+    parser.add_argument("--photographs", default="", help="captures with labels in testdata: desk=FOLDER,room=FOLDER,shelf=FOLDER")
     parser.add_argument("--sam", type=Path, default=Path("models"), help="folder of the SAM model [models]")
     parser.add_argument("--out", type=Path, default=Path("out/real-masks"), help="folder [out/real-masks]")
     a = parser.parse_args()
+    if a.scenes is None:
+        a.scenes = "" if a.scans or a.photographs else ",".join(everything)
     a.scenes = [s for s in a.scenes.split(",") if s]
+    a.photographs = dict(p.split("=", 1) if "=" in p else parser.error(f"--photographs: {p!r} is not NAME=FOLDER")
+                         for p in a.photographs.split(",") if p)
+    for name, folder in a.photographs.items():
+        if not (Path("testdata") / name).is_dir() or not Path(folder).is_dir():
+            parser.error(f"--photographs: there is no folder {folder}, or no labels in testdata/{name}")
     for name in a.scenes:
         family, _, seed = name.rpartition("-")
         if family not in FAMILIES or not seed.isdigit():
@@ -150,12 +161,19 @@ def arguments():
 
 def main():
     a = arguments()
-    # Scene, photographs, options of stage 1, whether true masks are there, folders of labels.
+    # Scene, photographs, options of stage 1, whether true masks are there, folders of labels (None: the truth).
     work = [(name, a.out / name / "scene", ["--resolution", "320px", "--iterations", "1500", "--sh-degree", "0"], True, [None])
             for name in a.scenes]
-    if a.photographs:
-        labels = [Path("testdata/desk"), Path("testdata/desk-full")]
-        work.append(("desk", a.photographs, ["--resolution", "640px", "--iterations", "3000"], False, labels))
+    scans = {p.name.removesuffix("_vert.npy"): p for p in sorted(a.scans.glob("*_vert.npy"))} if a.scans else {}
+    for name, file in scans.items():
+        scene = a.out / f"scan {name}" / "scene"
+        if not (scene / "truth/points.safetensors").exists():
+            subprocess.run([sys.executable, Path(__file__).parent / "scan.py", str(file).removesuffix("_vert.npy"), scene,
+                            "--views", "48", "--overwrite", "--quiet"], check=True)
+        work.append((f"scan {name}", scene, ["--resolution", "640px", "--iterations", "1500", "--holdout", "0"], False, [None]))
+    for name, folder in a.photographs.items():
+        labels = [p for p in (Path("testdata") / name, Path(f"testdata/{name}-full")) if p.is_dir()]
+        work.append((name, folder, ["--resolution", "640px", "--iterations", "3000"], False, labels))
     scores = {}
     for name, scene, options, true, labels in work:
         folder = a.out / name
