@@ -13,9 +13,15 @@ crates/stages/mask-embed/testdata/sam2/          the same with the inputs and ou
 crates/stages/mask-embed/testdata/efficient-sam/ the same as EfficientSAM's
 crates/stages/mask-embed/testdata/edge-sam/      the same as EdgeSAM's
 crates/stages/mask-embed/testdata/sam-tiny/      a decoder with SAM's architecture and names, narrow and with random weights
+crates/stages/mask-embed/testdata/panoptic-*/    panoptic segmenters by colour with the inputs and outputs of DETR, Mask2Former,
+                                                 OneFormer and EoMT, and the segments of a photograph by transformers
+
+The segments need torch, transformers and pillow too, EoMT's a transformers that has it (4.53); without, those there stay.
 """
 
+import json
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 from onnx import TensorProto, checker, helper, numpy_helper, save
@@ -507,6 +513,130 @@ def sam_tiny():
     )
 
 
+# Weights of red, green and blue and a sum for the mask of each query, then logits of its classes: sky, grass, car, roof, none.
+QUERIES = [
+    [-4, 0, 4, -2, 9, 0, 1, 0, 0],
+    [-4, 4, -3, -4, 0, 8, 0, 1, 1],
+    [5, -3, -2, -6, 0, 0, 9, 1, 0],
+    # The same sky, less sure: it gets too little.
+    [-4, 0, 4, -1, 7, 1, 0, 0, 1],
+    # Surely none.
+    [1, 1, 1, 1, 0, 0, 1, 0, 9],
+    # Where no other is: half of what it claims.
+    [3, 3, -1, 1, 0, 0, 1, 8, 0],
+    # Not sure enough.
+    [4, 4, 4, 4, 1, 1, 1, 1, 1],
+]
+PANOPTIC_MAP = (120, 80)
+
+
+def panoptic_photo():
+    """96 x 64 pixels: sky over grass, a red car, a yellow roof; all fade a little to the right."""
+    photo = np.zeros((64, 96, 3))
+    photo[:34], photo[34:] = (70, 130, 230), (60, 170, 50)
+    photo[26:54, 8:52], photo[20:38, 58:84] = (220, 40, 30), (190, 180, 40)
+    return (photo * np.linspace(1.1, 0.7, 96)[:, None]).clip(0, 255).astype(np.uint8)
+
+
+def panoptic_model(family, folder, size, divisor=None):
+    """Masks and classes from the colours of the picture: masks of a quarter of its side, classes none in the dark."""
+    node = helper.make_node
+    queries = np.array(QUERIES, np.float32)
+    count = len(queries)
+    classes, masks = ("logits", "pred_masks") if family == "detr" else ("class_queries_logits", "masks_queries_logits")
+    # In the dark each query is none.
+    dark = np.zeros((3, 5), np.float32)
+    dark[:, 4] = -2
+    inputs, given = [value("pixel_values", F, ["batch", 3, "height", "width"])], "ones"
+    if family == "detr":
+        inputs.append(value("pixel_mask", I64, ["batch", 64, 64]))
+    elif family == "mask2former":
+        inputs.append(value("pixel_mask", I64, ["batch", "height", "width"]))
+    elif family == "oneformer":
+        inputs.append(value("task_inputs", I64, ["batch", 4]))
+    else:
+        inputs = [value("pixel_values", F, [1, 3, *size])]
+    nodes = []
+    if len(inputs) > 1:
+        # A mask of ones, or tokens whose mean is one, change nothing.
+        nodes = [node("Cast", [inputs[1].name], ["floats"], to=F), node("ReduceMean", ["floats"], ["given"], keepdims=0)]
+        given = "given"
+    write(
+        folder / "model.onnx",
+        [
+            *nodes,
+            node("AveragePool", ["pixel_values"], ["small"], kernel_shape=[4, 4], strides=[4, 4]),
+            node("Conv", ["small", "colors", "sums"], ["each"], kernel_shape=[1, 1]),
+            node("Mul", ["each", given], [masks]),
+            node("ReduceMean", ["pixel_values"], ["mean"], axes=[2, 3], keepdims=0),
+            node("MatMul", ["mean", "dark"], ["light"]),
+            node("Add", ["of_queries", "light"], [classes]),
+        ],
+        inputs,
+        [value(classes, F, ["batch", count, 5]), value(masks, F, ["batch", count, "small_height", "small_width"])],
+        [
+            constant("ones", np.float32(1)),
+            constant("colors", queries[:, :3].reshape(count, 3, 1, 1)),
+            constant("sums", queries[:, 3]),
+            constant("dark", dark),
+            constant("of_queries", queries[None, :, 4:]),
+        ],
+    )
+    names = {str(i): name for i, name in enumerate(["sky", "grass", "car", "roof"])}
+    edges = {"shortest_edge": size[0], "longest_edge": size[1]}
+    preprocessor = {
+        "do_normalize": True, "do_pad": family == "eomt", "do_rescale": True, "do_resize": True, "resample": 2,
+        "image_mean": [0.485, 0.456, 0.406], "image_std": [0.229, 0.224, 0.225], "rescale_factor": 1 / 255,
+        "size": {"height": size[0], "width": size[1]} if family == "oneformer" else edges,
+    }
+    preprocessor |= {"size_divisor": divisor} if divisor else {}
+    described = [("config", {"model_type": family, "id2label": names}), ("preprocessor_config", preprocessor)]
+    if family == "oneformer":
+        described.append(("model", {"constants": {"task_inputs": [2, 0, 1, 1]}}))
+    for name, content in described:
+        (folder / f"{name}.json").write_text(json.dumps(content, indent=2) + "\n")
+
+
+def panoptic_segments(family, folder):
+    """What transformers makes of the photograph: its own picture for the graph, its own segments from the answer."""
+    try:
+        import torch
+        import transformers
+        from onnx.reference import ReferenceEvaluator
+        from PIL import Image
+        of = getattr(transformers, {"detr": "Detr", "mask2former": "Mask2Former", "oneformer": "OneFormer", "eomt": "Eomt"}[family] + "ImageProcessor")
+    except (ImportError, AttributeError) as missing:
+        print(f"SKIPPED: segments of {folder.name}: {missing}")
+        return
+    # OneFormer's processor wants a file of the hub; its pictures are as Mask2Former's without a divisor.
+    processor = of.from_pretrained(folder) if family != "oneformer" else transformers.Mask2FormerImageProcessor.from_pretrained(folder, size_divisor=0)
+    photo = panoptic_photo()
+    inputs = {"pixel_values": processor(images=[photo], return_tensors="np")["pixel_values"].astype(np.float32)}
+    inputs |= {"detr": {"pixel_mask": np.ones((1, 64, 64), np.int64)}, "oneformer": {"task_inputs": np.array([[2, 0, 1, 1]])}}.get(family, {})
+    if family == "mask2former":
+        inputs["pixel_mask"] = np.ones(inputs["pixel_values"].shape[:1] + inputs["pixel_values"].shape[2:], np.int64)
+    graph = ReferenceEvaluator(str(folder / "model.onnx"))
+    outputs = {name: torch.tensor(values) for name, values in zip(graph.output_names, graph.run(None, inputs))}
+    result = of.post_process_panoptic_segmentation(processor, SimpleNamespace(**outputs), target_sizes=[PANOPTIC_MAP[::-1]])[0]
+    # Ids from 0; EoMT's do that already.
+    ids = result["segmentation"].numpy().astype(int) - (family != "eomt")
+    names = json.loads((folder / "config.json").read_text())["id2label"]
+    segments = [{"name": names[str(s["label_id"])], "score": s["score"]} for s in result["segments_info"]]
+    print(f"{folder.name}: {segments}, {np.bincount(ids.ravel() + 1)} pixels of none and of each")
+    (folder / "segments.json").write_text(json.dumps(segments, indent=2) + "\n")
+    Image.fromarray(photo).save(folder / "photo.png")
+    # 0 for none.
+    Image.fromarray((ids + 1).astype(np.uint8)).save(folder / "ids.png")
+
+
+def panoptic():
+    # Heights and widths of the picture: the photograph's own, but for EoMT, which fills a square.
+    for family, size, divisor in [("detr", (64, 96), None), ("mask2former", (64, 96), 32), ("oneformer", (64, 96), None), ("eomt", (96, 96), None)]:
+        folder = ROOT / f"crates/stages/mask-embed/testdata/panoptic-{family}"
+        panoptic_model(family, folder, size, divisor)
+        panoptic_segments(family, folder)
+
+
 if __name__ == "__main__":
     ops()
     argmax()
@@ -515,3 +645,4 @@ if __name__ == "__main__":
     sam()
     exports()
     sam_tiny()
+    panoptic()

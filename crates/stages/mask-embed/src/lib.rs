@@ -5,10 +5,12 @@
 //! pictures instead; `embed` shows the picture of each mask to CLIP. All write LangSplat's files: `<view>_s.npy` and
 //! `<view>_f.npy`. [`crops`] gives the training script of the small encoder what the pipeline would see. `finished` knows
 //! which views are done already, `ahead` works on several at a time, `logits` how sure a mask is of each pixel.
+//! [`panoptic`] runs models that give all things of a photograph at once.
 
 mod ahead;
 pub mod automatic;
 mod check;
+mod constants;
 pub mod crops;
 mod embed;
 mod finished;
@@ -18,6 +20,7 @@ mod masks;
 pub mod nms;
 mod options;
 pub mod paint;
+pub mod panoptic;
 mod photographs;
 mod regions;
 pub mod sam;

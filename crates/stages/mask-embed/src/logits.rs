@@ -77,10 +77,10 @@ impl Logits {
 }
 
 /// Two neighbours and the weight of the second.
-type Taps = (usize, usize, f32);
+pub(crate) type Taps = (usize, usize, f32);
 
 /// Those of each of `n` pixels that `extent` pixels of the grid are enlarged to; the grid has `last` pixels.
-fn taps(n: usize, extent: f64, last: usize) -> Vec<Taps> {
+pub(crate) fn taps(n: usize, extent: f64, last: usize) -> Vec<Taps> {
     (0..n)
         .map(|i| {
             let at = ((i as f64 + 0.5) / n as f64 * extent - 0.5).clamp(0.0, (last - 1) as f64);

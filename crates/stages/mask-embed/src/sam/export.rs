@@ -1,15 +1,11 @@
 //! How an export of SAM is laid out: `model.json` beside its two graphs. What is not said there is as in SAM's own export.
 
+use crate::constants::{FILE, Numbers, constant};
 use gs_io::{Error, IoContext, Result};
 use onnx_models::{Kind, Model, Tensor, ValueInfo};
 use serde::Deserialize;
 use std::collections::BTreeMap;
 use std::path::Path;
-
-/// Name of the file.
-pub(super) const FILE: &str = "model.json";
-/// Most values of a constant input.
-const MOST: usize = 1 << 24;
 
 /// How a photograph gets into the encoder's square.
 #[derive(Debug, Clone, Copy, PartialEq, Deserialize)]
@@ -19,14 +15,6 @@ pub(super) enum Fit {
     Pad,
     /// Stretched to the whole square.
     Stretch,
-}
-
-/// Numbers of an input: one for all its values, or each.
-#[derive(Debug, Clone, PartialEq, Deserialize)]
-#[serde(untagged)]
-enum Numbers {
-    All(f32),
-    Each(Vec<f32>),
 }
 
 /// What `model.json` says.
@@ -162,7 +150,7 @@ impl Prompt {
         let own =
             [("mask_input", Numbers::All(0.0)), ("has_mask_input", Numbers::All(0.0)), ("orig_im_size", side_of_masks)];
         for (name, numbers) in &export.constants {
-            constants.push((name.clone(), constant(input(name)?, numbers, decoder)?));
+            constants.push((name.clone(), constant(input(name)?, numbers, decoder.path())?));
         }
         for info in decoder.inputs() {
             let given = constants.iter().map(|c| &c.0).chain(embeddings.iter().map(|e| &e.0));
@@ -175,7 +163,7 @@ impl Prompt {
                 return Err(wrong("nothing says what this input of the decoder gets", decoder, &info.name)
                     .expected(format!("it under embeddings, points, labels or constants of {FILE}")));
             };
-            constants.push((info.name.clone(), constant(info, numbers, decoder)?));
+            constants.push((info.name.clone(), constant(info, numbers, decoder.path())?));
         }
         let scale = if export.point_frame > 0.0 { export.point_frame / side as f32 } else { 1.0 };
         Ok(Self { embeddings, points, labels, whole_labels, constants, pad_point: export.pad_point, scale })
@@ -208,34 +196,6 @@ impl Prompt {
         let constants = self.constants.iter().map(|(name, value)| (name.as_str(), value.view()));
         embeddings.chain([(self.points.0.as_str(), points), (&self.labels.0, labels)]).chain(constants).collect()
     }
-}
-
-/// The input's numbers in its shape; axes that are free have one.
-fn constant(info: &ValueInfo, numbers: &Numbers, decoder: &dyn Model) -> Result<Tensor<'static>> {
-    let given = match numbers {
-        Numbers::All(_) => 1,
-        Numbers::Each(all) => all.len(),
-    };
-    let shape: Vec<usize> = match &info.shape {
-        Some(axes) => axes.iter().map(|a| a.unwrap_or(1)).collect(),
-        None => vec![given],
-    };
-    let count = shape.iter().try_fold(1usize, |n, &d| n.checked_mul(d)).filter(|n| *n <= MOST);
-    let values = match (numbers, count) {
-        (Numbers::All(v), Some(count)) => vec![*v; count],
-        (Numbers::Each(all), Some(count)) if all.len() == count => all.clone(),
-        _ => {
-            return Err(Error::new("the input has another number of values")
-                .file(decoder.path())
-                .field(&info.name)
-                .found(format!("{given} in {FILE}"))
-                .expected(format!("one number, or as many as {shape:?} has")));
-        }
-    };
-    Ok(match info.kind {
-        Some(Kind::Integer) => Tensor::i32(&shape, values.into_iter().map(|v| v as i32).collect::<Vec<_>>()),
-        _ => Tensor::f32(&shape, values),
-    })
 }
 
 #[cfg(test)]

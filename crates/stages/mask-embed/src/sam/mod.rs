@@ -13,6 +13,7 @@ mod export;
 mod planar;
 mod weights;
 
+use crate::constants::FILE;
 use decoder::{Decoder, FILLING, Names, Photograph};
 use export::{Export, Fit, Prompt};
 use gs_io::{Error, IoContext, Result, hash_files};
@@ -174,8 +175,8 @@ impl Sam {
             None => Decoding::Graph(whole),
         };
         let mut files = vec![("encoder.onnx", &encoder_path), ("sam.onnx", &decoder_path)];
-        let description = folder.join(export::FILE);
-        files.extend(description.exists().then_some((export::FILE, &description)));
+        let description = folder.join(FILE);
+        files.extend(description.exists().then_some((FILE, &description)));
         let [mean, std] = [export.mean, export.std].map(|c| c.map(|v| (v * 255.0) as f32));
         Ok(Self { encoder, decoding, prompt, side, fit: export.fit, mean, std, hash: hash_files(files)? })
     }
