@@ -173,7 +173,7 @@ stress: build ## Hostile scenes and settings through every stage: out/stress/rep
 
 SCENES ?=
 real-masks: build ## Score instances from real SAM masks of scenes with a truth: out/real-masks (hours; SCENES=room-10, SCANS=folder, PHOTOGRAPHS=desk=folder)
-	scripts/real_masks.py $(if $(SCENES),--scenes $(SCENES)) $(if $(SCANS),--scans "$$SCANS") $(if $(PHOTOGRAPHS),--photographs "$$PHOTOGRAPHS")
+	scripts/real_masks.py $(if $(SCENES),--scenes $(SCENES)) $(if $(PANOPTIC),--panoptic) $(if $(SCANS),--scans "$$SCANS") $(if $(PHOTOGRAPHS),--photographs "$$PHOTOGRAPHS")
 
 clip-report: build ## Score a CLIP model for every crop and prompt on the labelled desk: make clip-report CLIP=folder SCENE=desk OUT=folder
 	@scripts/clip_report.py

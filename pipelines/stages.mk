@@ -133,7 +133,7 @@ protocol_RUN = $(BIN)/eval $(PROTOCOL) --scene $(call arg,POSED) --geometry $(ca
   --out $(OUT)/protocol $(protocol_FIRST) $(if $(TEXTS),--text-features $(call arg,TEXTS),$(if $(CLIP),--clip $(call arg,CLIP))) $(SCORE_ARGS) $(filter-out --quiet,$(COMMON)) --quiet
 query_RUN = $(BIN)/eval query --scene $(call arg,POSED) --geometry $(call arg,GEOMETRY) --instances $(INSTANCES) --clip $(call arg,CLIP) \
   --out $(OUT)/query $(foreach q,$(QUERIES),--text '$(subst ','\'',$(subst _,$(space),$q))') $(COMMON)
-names_RUN = $(BIN)/eval names --geometry $(call arg,GEOMETRY) --instances $(INSTANCES) --clip $(call arg,CLIP) \
+names_RUN = $(BIN)/eval names --geometry $(call arg,GEOMETRY) --instances $(INSTANCES) $(if $(CLIP),--clip $(call arg,CLIP)) \
   $(if $(VOCABULARY),--vocabulary $(call arg,VOCABULARY)) --out $(OUT)/names.json $(filter-out --quiet,$(COMMON)) --quiet
 report_RUN = $(BIN)/eval report --scene $(call arg,POSED) --run-dir $(OUT) --geometry $(call arg,GEOMETRY) --masks $(MASKS) --out $(OUT)/report.html \
   $(report_OPTIONS) $(COMMON)
@@ -232,8 +232,8 @@ $(QUERY): $(INSTANCES) $(OPTIONS)/queries | $(BIN)/eval
 	$(query_RUN)
 endif
 
-# What every instance is called, by a vocabulary.
-ifneq ($(CLIP),)
+# What every instance is called, by a vocabulary or by a panoptic model.
+ifneq ($(CLIP)$(findstring --panoptic,$(MASK_ARGS)),)
 NAMES := $(OUT)/names.json
 $(NAMES): $(INSTANCES) $(OPTIONS)/names $(if $(VOCABULARY),$(OPTIONS)/vocabulary.files) | $(BIN)/eval
 	$(names_RUN)

@@ -133,7 +133,7 @@ def main():
         quality(truth, ids, kinds, sums)
         maps, names = with_classes(np.load(a.masks / f"{file.stem}_s.npy"), ids, kinds)
         np.save(a.out / f"{file.stem}_s.npy", maps)
-        (a.out / f"{file.stem}_n.json").write_text(json.dumps(names))
+        (a.out / f"{file.stem}_s.json").write_text(json.dumps({"facts": {"names": names}}))
     print(f"{100 * sums[0] / max(sums[1] + 0.5 * (sums[2] + sums[3]), 1):.1f}")
 
 

@@ -28,15 +28,20 @@ METHODS = {
     "true masks, default": ("true", [], []),
     "true masks, large level only": ("true", *LARGE),
 }
+# With level classes of panoptic models, from nearly perfect ones to bad ones (panoptic_faults.py).
+PANOPTIC = {f"with classes, faults {n}": (f"faults-{n}", [], []) for n in range(5)}
+METHODS.update(PANOPTIC)
 # What a scene's other methods are measured by.
 WHOLE = "true masks, large level only"
-COLUMNS = {"instance_miou": "instance mIoU", "object_miou": "things mIoU", "ap25": "AP25", "ap50": "AP50", "label_miou": "label mIoU", "impure": "impure masks"}
+COLUMNS = {"instance_miou": "instance mIoU", "object_miou": "things mIoU", "ap25": "AP25", "ap50": "AP50", "label_miou": "label mIoU", "impure": "impure masks",
+           "found": "share found", "pq": "PQ"}
 LEGEND = f"""\
 A scene's figure is the mean over its geometries (least to most). A figure of several scenes is the mean of theirs (least to most
 over scenes; largest distance between two geometries of one scene). The share of true masks is a scene's figure over that of
 "{WHOLE}". Ceilings: true labels on the Gaussians; the masks of a level, each given the thing that
 has most of it, and Gaussians that take the thing with most weight in their masks. Impure masks: the share of the masks' weight
-in masks of which less than 80 % is one thing.
+in masks of which less than 80 % is one thing. Found: things that some instance fits with an IoU above 0.5. PQ: the panoptic quality
+of the classes, in percent.
 """
 
 
@@ -81,6 +86,15 @@ def ceilings_of(scene, masks, base):
         yield f"ceiling: {ceiling['name']}{ideal}", out.parent / ceiling["instances"], ceiling["impure"]
 
 
+def with_classes(scene, folder, key):
+    """SAM's id maps of a scene in folder/masks with the level classes of a panoptic model; writes its quality beside them."""
+    if not (folder / f"{key}.pq").exists():
+        script = [sys.executable, Path(__file__).parent / "panoptic_faults.py", scene, folder / "masks", folder / key]
+        done = subprocess.run([*script, "--faults", key.rpartition("-")[2]], check=True, capture_output=True, text=True)
+        (folder / f"{key}.pq").write_text(done.stdout)
+    return key, folder / key
+
+
 def score(scene, base, instances, labels, impure=None):
     """The scores of instances on the geometry `base`.ply, by polygons in the folder `labels` or by the scene's truth."""
     own = str(instances).removesuffix(".safetensors").removesuffix(".instances")
@@ -88,7 +102,9 @@ def score(scene, base, instances, labels, impure=None):
     if not out.exists():
         marks = ["--labels", labels] if labels else []
         run("eval", "score", "--scene", scene, "--geometry", f"{base}.ply", "--instances", instances, "--out", out, *marks)
-    return {**json.loads(out.read_text()), "impure": impure}
+    scores = json.loads(out.read_text())
+    things = [t["iou"] > 0.5 for t in scores.get("things", []) if not t["background"] and t["points"] >= 100]
+    return {**scores, "impure": impure, "found": statistics.mean(things) if things else None}
 
 
 def spread(values):
@@ -141,6 +157,7 @@ def arguments():
     parser.add_argument("--geometries", type=int, default=3, help="seeds of stage 1 for each scene [3]")
     parser.add_argument("--scans", type=Path, help="folder of scans, NAME_vert.npy and labels; scan.py says what they hold")
     parser.add_argument("--photographs", default="", help="captures with labels in testdata: desk=FOLDER,room=FOLDER,shelf=FOLDER")
+    parser.add_argument("--panoptic", action="store_true", help="also with the classes of panoptic models of five qualities")
     parser.add_argument("--sam", type=Path, default=Path("models"), help="folder of the SAM model [models]")
     parser.add_argument("--out", type=Path, default=Path("out/real-masks"), help="folder [out/real-masks]")
     a = parser.parse_args()
@@ -185,18 +202,22 @@ def main():
         # Goes on where it was, and does nothing where all views are done.
         run("mask-embed", "masks", "--scene", scene, "--sam", a.sam, "--out", folder / "masks")
         masks = {"masks": ("masks", folder / "masks"), "true": ("true", scene / "language_features")}
+        if a.panoptic and (scene / "truth/views").exists():
+            masks.update((key, with_classes(scene, folder, key)) for key, _, _ in PANOPTIC.values())
         for seed in range(a.geometries):
             base = folder / f"g{seed}"
             if not Path(f"{base}.ply").exists():
                 run("gs-geom", "train", "--scene", scene, *options, "--seed", seed, "--out", f"{base}.ply")
             made = [(method, instances_of(scene, masks[key], base, method), None)
-                    for method, (key, _, _) in METHODS.items() if true or key != "true"]
+                    for method, (key, _, _) in METHODS.items() if key in masks and (true or key != "true")]
             made += ceilings_of(scene, masks["masks"], base) if true else []
             for method, instances, impure in made:
                 for marks in labels:
                     row = scores.setdefault(f"{name}: {marks.name}" if marks else name, {}).setdefault(method, [])
                     s = score(scene, base, instances, marks, impure)
-                    row.append({k: s[k] for k in COLUMNS})
+                    pq = folder / f"{METHODS.get(method, [''])[0]}.pq"
+                    s["pq"] = float(pq.read_text()) if pq.exists() else None
+                    row.append({k: s.get(k) for k in COLUMNS})
         print(f"{name} is done", flush=True)
     (a.out / "scores.json").write_text(
         json.dumps([{"scene": n, "method": m, "scores": v} for n, of in scores.items() for m, v in of.items()]))

@@ -39,7 +39,7 @@ pub use instances::{Family, Instances, Match, OrientedBox, TreeEdge};
 pub use lerf_ovs::{LERF_OVS, LerfScene};
 pub use masks::{
     LEVELS, Level, MaskFeatures, MaskFolder, MaskMaps, MaskName, MaskNames, features_path, folder_files, hash_folder,
-    maps_path, names_path, read_mask_names, same_shape, stems, watch_folder,
+    maps_path, note_path, read_mask_names, same_shape, stems, watch_folder,
 };
 pub use names::{Called, InstanceNames, Naming, ScoredName, called};
 pub use nyu40::NYU40;
@@ -66,7 +66,7 @@ pub mod role {
     pub const MASKS: &str = "masks";
     /// All mask features (`*_f.npy`) of a masks folder.
     pub const MASK_FEATURES: &str = "mask-features";
-    /// All `*_n.json` of the masks folder.
+    /// All `*_s.json` of the masks folder, where masks have names.
     pub const MASK_NAMES: &str = "mask-names";
     /// `image.onnx` of the CLIP pair that made the mask features.
     pub const CLIP: &str = "clip";

@@ -64,9 +64,9 @@ pub fn features_path(folder: impl AsRef<Path>, stem: &str) -> PathBuf {
     folder.as_ref().join(format!("{stem}_f.npy"))
 }
 
-/// Where the names of the masks of a view lie, where a model gave any: `<folder>/<stem>_n.json`.
-pub fn names_path(folder: impl AsRef<Path>, stem: &str) -> PathBuf {
-    folder.as_ref().join(format!("{stem}_n.json"))
+/// Where it lies what the id maps of a view were made from, and the names of the masks: `<folder>/<stem>_s.json`.
+pub fn note_path(folder: impl AsRef<Path>, stem: &str) -> PathBuf {
+    maps_path(folder, stem).with_extension("json")
 }
 
 /// What a model calls a mask.
@@ -82,19 +82,20 @@ pub struct MaskName {
 /// The names of the masks of one view, by id.
 pub type MaskNames = BTreeMap<u32, MaskName>;
 
-/// Reads the names of the masks of a view; none where there is no such file.
+/// Reads the names of the masks of a view, `facts.names` of its note; none where there are none.
 ///
 /// # Errors
 /// When the file is damaged, a name is empty or bad ([`check_name`]), or a score is not in 0 to 1.
 pub fn read_mask_names(folder: impl AsRef<Path>, stem: &str) -> Result<MaskNames> {
-    let path = names_path(folder, stem);
+    let path = note_path(folder, stem);
     if !path.is_file() {
         return Ok(MaskNames::new());
     }
+    let wrong = |e| Error::new(format!("not the names of masks: {e}")).file(&path).field("facts.names");
     let bytes = std::fs::read(&path).at("read", &path)?;
-    let names: MaskNames = serde_json::from_slice(&bytes).map_err(|e| {
-        Error::new(format!("not the names of masks: {e}")).file(&path).hint("docs/artifacts.md says what it holds")
-    })?;
+    let note: serde_json::Value = serde_json::from_slice(&bytes).map_err(wrong)?;
+    let Some(names) = note["facts"].get("names") else { return Ok(MaskNames::new()) };
+    let names = MaskNames::deserialize(names).map_err(wrong)?;
     for (id, mask) in &names {
         check_name(&mask.name).map_err(|e| e.file(&path).field(id.to_string()))?;
         if mask.name.is_empty() || !(0.0..=1.0).contains(&mask.score) {

@@ -30,7 +30,8 @@ pub fn measure(instances: &Instances, weights: &Weights) -> Health {
 pub fn names(weights: &Weights, footprints: &Footprints, folder: &Path) -> Result<Vec<Naming>> {
     let names =
         footprints.views.iter().map(|view| read_mask_names(folder, view)).collect::<Result<Vec<MaskNames>>>()?;
-    let (mut all, mut called): (BTreeMap<u32, f64>, BTreeMap<u32, BTreeMap<&str, f64>>) = Default::default();
+    let mut all: BTreeMap<u32, f64> = BTreeMap::new();
+    let mut called: BTreeMap<u32, BTreeMap<&str, f64>> = BTreeMap::new();
     for (row, of) in weights {
         let row = &footprints.rows[*row as usize];
         if row.is_of(&Level::SAM) {
@@ -62,7 +63,8 @@ mod tests {
     use super::*;
     use crate::profile::mask_weights;
     use crate::testing::{footprints, footprints_of, instances};
-    use artifacts::{MaskName, names_path};
+    use artifacts::{MaskName, note_path};
+    use serde_json::json;
 
     fn health(instances: &Instances, footprints: &Footprints, level: Level) -> Health {
         measure(instances, &mask_weights(&instances.label, footprints, &[level]).unwrap())
@@ -91,7 +93,8 @@ mod tests {
         ];
         for (view, names) in masks.iter().enumerate() {
             let names: MaskNames = names.iter().cloned().collect();
-            gs_io::write_json(names_path(dir.path(), &view.to_string()), &names).unwrap();
+            let note = json!({ "facts": { "names": names } });
+            gs_io::write_json(note_path(dir.path(), &view.to_string()), &note).unwrap();
         }
         let weights = mask_weights(&[0, 0, 0, 0, 1, 1, 1, 1], &footprints, &Level::ALL).unwrap();
         let found = names(&weights, &footprints, dir.path()).unwrap();
@@ -99,8 +102,9 @@ mod tests {
         assert_eq!(said, [(0, false, "sofa"), (1, true, "table")]);
         let scores: Vec<f32> = found.iter().flat_map(|n| &n.names).map(|n| n.score).collect();
         assert!(scores.iter().zip([0.45, 0.25, 0.55]).all(|(a, b)| (a - b).abs() < 1e-6), "{scores:?}");
-        std::fs::write(names_path(dir.path(), "0"), r#"{"0": {"name": "", "score": 2}}"#).unwrap();
+        let wrong = json!({ "facts": { "names": { "0": { "name": "", "score": 2 } } } });
+        gs_io::write_json(note_path(dir.path(), "0"), &wrong).unwrap();
         let e = names(&weights, &footprints, dir.path()).unwrap_err().to_string();
-        assert!(e.contains("0_n.json: 0: not the name of a mask"), "{e}");
+        assert!(e.contains("0_s.json: 0: not the name of a mask"), "{e}");
     }
 }

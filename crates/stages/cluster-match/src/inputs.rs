@@ -66,7 +66,7 @@ impl Inputs {
             (role::MASK_FEATURES.into(), hash_folder(&a.masks, "_f.npy")?),
         ]);
         if footprints.rows.iter().any(|row| !row.is_of(&Level::SAM)) {
-            hashes.insert(role::MASK_NAMES.into(), hash_folder(&a.masks, "_n.json")?);
+            hashes.insert(role::MASK_NAMES.into(), hash_folder(&a.masks, "_s.json")?);
         }
         hashes.extend(features_file.map(|file| (role::FEATURES.into(), file.hash().into())));
         hashes.extend(clip_of_features(&a.masks, &masks)?);

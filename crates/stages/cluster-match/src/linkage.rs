@@ -316,7 +316,7 @@ mod tests {
     }
 
     /// Level default of ten views.
-    const UNIT_OF: [u32; 20] = [0, 0, 4, 4, 8, 8, 12, 12, 16, 16, 20, 20, 24, 24, 28, 28, 32, 32, 36, 36];
+    const UNIT_OF: [u32; 20] = [0, 0, 6, 6, 12, 12, 18, 18, 24, 24, 30, 30, 36, 36, 42, 42, 48, 48, 54, 54];
     const ONE: Option<f32> = Some(1.0);
     const TWO: Option<f32> = Some(0.0);
     const ALL: (f64, f64) = (0.0, f64::MAX);

@@ -172,3 +172,26 @@ impl Settings {
         }
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::testing::footprints_of;
+
+    #[test]
+    fn classes_take_the_place_of_large_masks_where_there_are_any() {
+        let parse = |more: &[&str]| {
+            let files =
+                ["--scene", "s", "--geometry", "g", "--graph", "h", "--footprints", "f", "--masks", "m", "--out", "o"];
+            Args::parse_from([&["cluster-match"], &files[..], more].concat()).settings
+        };
+        let view: &[&[&[u32]]] = &[&[&[0, 1]]];
+        let sam = Level::SAM.map(|level| (level, view));
+        let with_classes = [&sam[..], &[(Level::Classes, view)]].concat();
+        let levels = |more: &[&str], masks: &[_]| parse(more).for_scene(8, &footprints_of(masks)).levels;
+        assert_eq!(levels(&[], &sam), Level::SAM);
+        assert_eq!(levels(&[], &with_classes), [Level::Default, Level::Small, Level::Medium, Level::Classes]);
+        assert_eq!(levels(&["--levels", "large,classes"], &with_classes), [Level::Large, Level::Classes]);
+        assert_eq!(levels(&["--cluster", "free", "--features", "x"], &with_classes), [Level::Large]);
+    }
+}

@@ -52,7 +52,7 @@ impl Program for Args {
         let a = &self;
         let mut claim = outputs::claim(a, stage)?;
         let mut watched = Watched::new([&a.geometry, &a.footprints]);
-        for suffix in ["_s.npy", "_f.npy", "_n.json"] {
+        for suffix in ["_s.npy", "_f.npy", "_s.json"] {
             watched = watched.and(artifacts::watch_folder(&a.masks, suffix)?);
         }
         // A packed file may hold a thousand times its size.

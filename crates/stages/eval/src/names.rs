@@ -2,7 +2,7 @@
 
 use crate::memory::{self, SMALLER, Sizes};
 use crate::options::NamesOptions;
-use artifacts::{Health, InstanceNames, Instances, Naming, called};
+use artifacts::{Health, InstanceNames, Instances, Naming, called, role};
 use gs_io::{Claim, Result};
 use query::{LabelledScene, TextSource, Vocabulary, name_instances};
 use serde_json::{Value, json};
@@ -18,7 +18,8 @@ pub(crate) fn run(o: &NamesOptions, parameters: Value, stage: &Stage) -> Result<
     stage.forecast(memory::of_query(&Sizes::new(&o.geometry, &o.texts, &[])), SMALLER)?;
     let scene = LabelledScene::read(&o.instances, &o.geometry, o.edits.as_deref())?;
     let by_masks = Health::of(&scene.artifact)?.map_or(Vec::new(), |health| health.names);
-    if !o.texts.given() && !by_masks.is_empty() {
+    let named_masks = scene.artifact.provenance().inputs.contains_key(role::MASK_NAMES);
+    if !o.texts.given() && named_masks {
         return finish(o, InstanceNames::by_masks(by_masks, scene.artifact.hash()), &scene, parameters, claim, stage);
     }
     let source = TextSource::open_for(&scene.artifact, scene.instances.dim(), &o.texts)?;
@@ -43,9 +44,6 @@ pub(crate) fn run(o: &NamesOptions, parameters: Value, stage: &Stage) -> Result<
     named.retain(|n| !sure.contains_key(&n.instance));
     named.extend(sure.into_values());
     named.sort_by_key(|n| n.instance);
-    if named.is_empty() {
-        stage.warn("no instance has a descriptor: nothing is named");
-    }
     let names = InstanceNames {
         format: InstanceNames::FORMAT.into(),
         version: InstanceNames::VERSION,
@@ -70,6 +68,9 @@ fn finish(
     stage: &Stage,
 ) -> Result<String> {
     let out = o.out.clone().unwrap_or_else(|| InstanceNames::path_beside(&o.instances));
+    if names.named.is_empty() {
+        stage.warn("no instance has a descriptor or a mask with a name: nothing is named");
+    }
     names.write(&out)?;
     let sure = names.named.iter().filter(|n| n.sure).count();
     let summary =

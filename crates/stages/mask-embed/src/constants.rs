@@ -18,7 +18,7 @@ pub(crate) enum Numbers {
     Each(Vec<f32>),
 }
 
-/// The input's numbers in its shape; axes that are free have one.
+/// The input's numbers in its shape; axes that are free have one. Of an empty list the last free axis has none.
 ///
 /// # Errors
 /// When the number of values is another.
@@ -27,10 +27,14 @@ pub(crate) fn constant(info: &ValueInfo, numbers: &Numbers, model: &Path) -> Res
         Numbers::All(_) => 1,
         Numbers::Each(all) => all.len(),
     };
-    let shape: Vec<usize> = match &info.shape {
+    let mut shape: Vec<usize> = match &info.shape {
         Some(axes) => axes.iter().map(|a| a.unwrap_or(1)).collect(),
         None => vec![given],
     };
+    let last_free = info.shape.as_ref().and_then(|axes| axes.iter().rposition(Option::is_none));
+    if let (0, Some(axis)) = (given, last_free) {
+        shape[axis] = 0;
+    }
     let count = shape.iter().try_fold(1usize, |n, &d| n.checked_mul(d)).filter(|n| *n <= MOST);
     let values = match (numbers, count) {
         (Numbers::All(v), Some(count)) => vec![*v; count],

@@ -3,7 +3,7 @@
 use crate::finished;
 use crate::masks::count_masks;
 use crate::options::ImportArgs;
-use artifacts::{LEVELS, Level, MaskMaps, hash_folder, maps_path};
+use artifacts::{Level, MaskMaps, hash_folder, maps_path};
 use gs_io::{Error, IoContext, Result, hash_files, write_json};
 use image::DynamicImage;
 use ndarray::Array3;
@@ -45,9 +45,9 @@ fn find(folder: &Path) -> Result<BTreeMap<String, Vec<PathBuf>>> {
     let mut views: BTreeMap<String, Vec<PathBuf>> = BTreeMap::new();
     for picture in artifacts::folder_files(folder, ".png")? {
         let name = picture.file_stem().unwrap_or_default().to_string_lossy();
-        let level = Level::ALL.iter().find_map(|l| name.strip_suffix(&format!("_{l}")));
+        let level = Level::SAM.iter().find_map(|l| name.strip_suffix(&format!("_{l}")));
         let view = level.unwrap_or(&name);
-        let all = Level::ALL.map(|l| folder.join(format!("{view}_{l}.png")));
+        let all = Level::SAM.map(|l| folder.join(format!("{view}_{l}.png")));
         if level.is_none() {
             if all.iter().any(|p| p.exists()) {
                 return Err(Error::new("labels for all levels and for single ones")
@@ -84,14 +84,14 @@ fn load(paths: &[PathBuf]) -> Result<MaskMaps> {
         }
     }
     let Labels { width, height, .. } = labels[0];
-    let (mut ids, mut first) = (Vec::with_capacity(LEVELS * width * height), 0);
-    for Labels { values, .. } in labels.iter().cycle().take(LEVELS) {
+    let (mut ids, mut first) = (Vec::with_capacity(Level::SAM.len() * width * height), 0);
+    for Labels { values, .. } in labels.iter().cycle().take(Level::SAM.len()) {
         let distinct: BTreeSet<u16> = values.iter().copied().filter(|&l| l > 0).collect();
         let id_of: BTreeMap<u16, i32> = distinct.into_iter().zip(first..).collect();
         ids.extend(values.iter().map(|l| id_of.get(l).copied().unwrap_or(-1)));
         first += id_of.len() as i32;
     }
-    Ok(MaskMaps { ids: Array3::from_shape_vec((LEVELS, height, width), ids).expect("four pictures") })
+    Ok(MaskMaps { ids: Array3::from_shape_vec((Level::SAM.len(), height, width), ids).expect("four pictures") })
 }
 
 /// Turns label pictures into id maps, then writes the manifest. Nothing is written before all pictures have been read

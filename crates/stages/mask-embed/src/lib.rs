@@ -10,6 +10,7 @@
 mod ahead;
 pub mod automatic;
 mod check;
+pub mod classes;
 mod constants;
 pub mod crops;
 mod embed;

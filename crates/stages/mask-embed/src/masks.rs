@@ -2,12 +2,14 @@
 
 use crate::ahead::ahead;
 use crate::automatic::{levels, propose};
+use crate::classes::with_classes;
 use crate::finished::{self, Views};
 use crate::options::{Choice, MasksArgs};
 use crate::paint::{MapSize, paint};
+use crate::panoptic::{Panoptic, Segments};
 use crate::photographs;
 use crate::sam::Sam;
-use artifacts::{Level, MaskMaps, maps_path, role};
+use artifacts::{Level, MaskMaps, MaskNames, maps_path, role};
 use gs_io::{Claim, Error, Result, Watched, write_json};
 use gs_scene::dataset::{Dataset, View};
 use onnx_models::RgbImage;
@@ -17,6 +19,7 @@ use serde_json::json;
 use stage::{Stage, peak_rss_bytes};
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
+use std::sync::{Mutex, PoisonError};
 
 /// Photographs that are worked on at a time, where there are as many threads: each takes 400 MB with MobileSAM.
 const LANES: usize = 8;
@@ -31,6 +34,24 @@ struct Facts {
     /// Points of the grid, and how many of them were asked.
     points: usize,
     asked: usize,
+    /// What a panoptic model calls masks.
+    #[serde(default, skip_serializing_if = "MaskNames::is_empty")]
+    names: MaskNames,
+}
+
+/// What sees the photographs.
+struct Models {
+    sam: Sam,
+    /// One photograph at a time: a full-size DETR takes 3.4 GB.
+    panoptic: Option<Mutex<Panoptic>>,
+}
+
+impl Models {
+    /// What the panoptic model sees, if there is one; width and height are those of the map.
+    fn segments(&self, image: &RgbImage, size: [usize; 2]) -> Result<Option<Segments>> {
+        let one = |model: &Mutex<Panoptic>| model.lock().unwrap_or_else(PoisonError::into_inner).segments(image, size);
+        self.panoptic.as_ref().map(one).transpose()
+    }
 }
 
 /// Masks of each level of a map.
@@ -46,25 +67,33 @@ pub(crate) fn run(args: &MasksArgs, stage: &Stage) -> Result<()> {
     let manifest = folder.join("masks.json");
     let mut claim = claim(args, &scene, &manifest, stage)?;
     let sam = Sam::open(&args.sam, &args.engine.options(), args.choice.no_skip)?;
+    let panoptic = args.panoptic.as_ref().map(|folder| Panoptic::open(folder, &args.engine.options())).transpose()?;
+    let panoptic_hash = panoptic.as_ref().map(|model| model.hash().to_string());
+    let models = Models { sam, panoptic: panoptic.map(Mutex::new) };
     let watched = Watched::new(scene.views.iter().map(|v| &v.image_path));
     let parameters = json!(args);
-    let inputs =
-        BTreeMap::from([(role::DATASET.to_string(), scene.hash()?), ("sam".to_string(), sam.hash().to_string())]);
+    let mut inputs = BTreeMap::from([
+        (role::DATASET.to_string(), scene.hash()?),
+        ("sam".to_string(), models.sam.hash().to_string()),
+    ]);
+    inputs.extend(panoptic_hash.iter().map(|hash| ("panoptic".to_string(), hash.clone())));
     warn_of_other_maps(folder, &scene.views, stage)?;
 
     let mut views = Views::new(stage, scene.views.len());
     let read = |view: &View| {
         let (image, image_hash) = photographs::read(view)?;
-        let key = finished::made_from(&[&parameters.to_string(), sam.hash(), &image_hash]);
+        let mut parts = vec![parameters.to_string(), models.sam.hash().to_string(), image_hash];
+        parts.extend(panoptic_hash.clone());
+        let key = finished::made_from(&parts.iter().map(String::as_str).collect::<Vec<_>>());
         let done = finished::is_done(&maps_path(folder, view.stem()), &key);
         Ok((image, key, done))
     };
     if scene.views.par_iter().any(|view| read(view).is_ok_and(|(.., done)| !done)) {
-        forecast(args, &sam, &scene.views, stage)?;
+        forecast(args, &models, &scene.views, stage)?;
     }
     let prepare = |view| {
         let (image, key, done) = read(view)?;
-        Ok((view, key, if done { None } else { Some(make(args, &sam, &image)?) }))
+        Ok((view, key, if done { None } else { Some(make(args, &models, &image)?) }))
     };
     let (mut asked, mut points, mut large) = (0, 0, 0);
     let finish = |(view, key, made): (&View, String, Option<(MaskMaps, Facts)>)| {
@@ -94,12 +123,16 @@ pub(crate) fn run(args: &MasksArgs, stage: &Stage) -> Result<()> {
 }
 
 /// The id maps of a photograph.
-fn make(args: &MasksArgs, sam: &Sam, image: &RgbImage) -> Result<(MaskMaps, Facts)> {
-    let proposals = propose(sam, &sam.encode(image)?, &args.choice)?;
+fn make(args: &MasksArgs, models: &Models, image: &RgbImage) -> Result<(MaskMaps, Facts)> {
+    let proposals = propose(&models.sam, &models.sam.encode(image)?, &args.choice)?;
     let size = MapSize::of(image, args.map_size, args.min_area);
-    let maps = paint(&proposals, &levels(&proposals.masks), size);
+    let (mut maps, mut names) = (paint(&proposals, &levels(&proposals.masks), size), MaskNames::new());
     let (points, asked) = (proposals.points, proposals.asked);
-    let facts = Facts { size: [size.width, size.height], masks: count_masks(&maps), points, asked };
+    drop(proposals);
+    if let Some(seen) = models.segments(image, [size.width, size.height])? {
+        (maps, names) = with_classes(&maps, &seen, size.min_area);
+    }
+    let facts = Facts { size: [size.width, size.height], masks: count_masks(&maps), points, asked, names };
     Ok((maps, facts))
 }
 
@@ -112,11 +145,15 @@ fn claim(args: &MasksArgs, scene: &Dataset, manifest: &Path, stage: &Stage) -> R
 }
 
 /// Says how much memory the photographs will take. The models run on an empty picture first: their need is known only then.
-fn forecast(args: &MasksArgs, sam: &Sam, views: &[View], stage: &Stage) -> Result<()> {
+fn forecast(args: &MasksArgs, models: &Models, views: &[View], stage: &Stage) -> Result<()> {
     let nothing = RgbImage { width: 4, height: 3, pixels: vec![0; 36] };
     let choice = Choice { points_per_side: 4, ..args.choice };
     let lanes = LANES.min(views.len()).min(rayon::current_num_threads());
-    ahead(&vec![(); lanes], lanes, |()| propose(sam, &sam.encode(&nothing)?, &choice), |_| Ok(()))?;
+    let look = |()| {
+        drop(propose(&models.sam, &models.sam.encode(&nothing)?, &choice)?);
+        models.segments(&nothing, [4, 3])
+    };
+    ahead(&vec![(); lanes], lanes, look, |_| Ok(()))?;
     let (side, pixels) = (args.choice.points_per_side as u64, photographs::largest(views));
     let map = if args.map_size == 0 { pixels } else { pixels.min((args.map_size * args.map_size * 3 / 4) as u64) };
     // Of every third point of the grid or so that is asked three masks wait with their logits, 200 kB where one fills the

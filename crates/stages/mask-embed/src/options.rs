@@ -76,6 +76,11 @@ pub(crate) struct MasksArgs {
     #[arg(long, default_value = "models", value_name = "FOLDER")]
     #[serde(skip)]
     pub sam: PathBuf,
+    /// Folder of a panoptic model, which adds level classes with names: model.onnx, config.json and preprocessor_config.json as
+    /// the hub has them (docs/masks.md) [default: none]
+    #[arg(long, value_name = "FOLDER")]
+    #[serde(skip)]
+    pub panoptic: Option<PathBuf>,
     /// Longest side of the id maps in pixels; 0 for the size of the photograph
     #[arg(long, default_value_t = 800, value_name = "PIXELS")]
     pub map_size: usize,

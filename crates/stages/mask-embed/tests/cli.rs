@@ -3,13 +3,13 @@
 
 use artifacts::{
     Draft, Instances, Level, MaskFeatures, MaskMaps, MaskTruth, TrueObject, TruePart, TrueScene, Witness,
-    features_path, flat, maps_path,
+    features_path, flat, maps_path, read_mask_names,
 };
 use gs_io::Artifact;
 use gs_scene::Image;
 use ndarray::Array3;
 use serde_json::json;
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::ffi::OsStr;
 use std::fmt::Debug;
 use std::path::{Path, PathBuf};
@@ -134,7 +134,7 @@ fn masks_follow_the_colours_at_every_level() {
         let maps = MaskMaps::read(maps_path(&scene.masks, &format!("v{v}"))).unwrap();
         assert_eq!((maps.width(), maps.height()), (WIDTH, HEIGHT));
         let at = |l: Level, x: usize, y: usize| maps.level(l)[[y, x + v * 8]];
-        for level in Level::ALL {
+        for level in Level::SAM {
             let (wall, dark, bright) = (at(level, 2, 20), at(level, 30, 30), at(level, 76, 44));
             assert!(wall >= 0 && dark >= 0 && bright >= 0 && wall != dark && dark != bright && wall != bright);
         }
@@ -209,6 +209,34 @@ fn the_result_depends_neither_on_threads_nor_on_interruptions() {
     assert_eq!(std::fs::read(other.join("v1_s.npy")).unwrap(), whole["v0_s.npy"]);
 }
 
+#[test]
+fn a_panoptic_model_adds_classes_with_names() {
+    let scene = Scene::new(2);
+    let other = scene.masks.with_file_name("other");
+    scene.make_masks(&other, &[]);
+    let model = export("panoptic-detr");
+    let panoptic = ["--panoptic", path(&model), "--threads"];
+    scene.make_masks(&scene.masks, &[&panoptic[..], &["1"]].concat());
+    for view in ["v0", "v1"] {
+        let [plain, named] = [&other, &scene.masks].map(|m| MaskMaps::read(maps_path(m, view)).unwrap());
+        assert_eq!((plain.levels(), named.levels()), (&Level::SAM[..], &Level::ALL[..]));
+        Level::SAM.iter().for_each(|&l| assert_eq!(plain.level(l), named.level(l), "{l}"));
+        let names = read_mask_names(&scene.masks, view).unwrap();
+        let ids = named.level(Level::Classes).into_iter();
+        let owned: BTreeSet<u32> = ids.filter_map(|&id| u32::try_from(id).ok()).collect();
+        assert!(names.keys().all(|id| owned.contains(id)) && owned.len() > names.len(), "{names:?}");
+        assert!(names.values().any(|m| m.name == "grass" && m.score > 0.9), "{names:?}");
+        assert!(read_mask_names(&other, view).unwrap().is_empty());
+    }
+    // The same with more threads, in place of maps without classes; then nothing is left to do.
+    scene.make_masks(&other, &[&panoptic[..], &["3"]].concat());
+    assert_eq!(contents(&scene.masks), contents(&other));
+    let said = scene.make_masks(&other, &[&panoptic[..], &["3"]].concat());
+    assert!(said.contains("skipped 2 of 2 views: their id maps are done already"), "{said}");
+    let e = error(&scene.masks_args(&other, &["--panoptic", path(&scene.folder)]));
+    assert!(e.contains("config.json: no such file"), "{e}");
+}
+
 /// A folder of an export other than SAM's own.
 fn export(name: &str) -> PathBuf {
     Path::new(SAM).with_file_name(name)
@@ -219,18 +247,18 @@ fn other_exports_are_used_as_their_description_says() {
     let scene = Scene::new(1);
     scene.make_masks(&scene.masks, &[]);
     let sam = MaskMaps::read(maps_path(&scene.masks, "v0")).unwrap();
-    for name in ["edge-sam", "sam2", "efficient-sam"] {
+    for name in ["edge-sam", "sam2", "efficient-sam", "sam2-hub"] {
         let out = scene.masks.with_file_name(name);
         scene.make_masks(&out, &["--sam", path(&export(name))]);
         let maps = MaskMaps::read(maps_path(&out, "v0")).unwrap();
         if name == "edge-sam" {
             assert_eq!(maps, sam, "the same numbers by other names");
         }
-        for level in &Level::ALL[1..] {
+        for level in &Level::SAM[1..] {
             let at = |x: usize, y: usize| maps.level(*level)[[y, x]];
             let things = [at(2, 20), at(30, 30), at(76, 44), at(64, 4)];
             assert!(things.iter().all(|&id| id >= 0), "{name}: {things:?}");
-            assert_eq!(things.iter().collect::<std::collections::BTreeSet<_>>().len(), 4, "{name}: {things:?}");
+            assert_eq!(things.iter().collect::<BTreeSet<_>>().len(), 4, "{name}: {things:?}");
             assert_eq!(at(96, 32) == at(76, 44), *level != Level::Small, "{name}");
         }
         // Stretched or not, a thing lies where it lies.

@@ -2,6 +2,7 @@
 
 use crate::CLIP;
 use crate::fixture::Fixture;
+use artifacts::{Health, Instances, Naming, ScoredName, role};
 use serde_json::{Value, json};
 use std::fs;
 
@@ -132,4 +133,28 @@ fn bad_vocabularies_and_sources_are_one_line() {
     fs::write(f.table(), r#"{"a": [1, 0, 0], "b": [0, 1, 0]}"#).unwrap();
     f.bad("names", NAMES, &["another model"]);
     assert!(!f.run().join("names.json").exists());
+}
+
+#[test]
+fn names_of_masks_stand_alone_without_texts_and_win_where_they_are_sure() {
+    let f = fixture();
+    let naming = |instance: u32, name: &str, score: f32| Naming {
+        instance,
+        names: vec![ScoredName { name: name.into(), score }],
+        margin: score,
+        sure: score >= 0.5,
+    };
+    let health = Health { names: vec![naming(0, "sports ball", 0.9), naming(2, "rug", 0.3)], ..Health::default() };
+    let mut provenance = f.provenance();
+    provenance.extra = json!({ "health": health });
+    provenance.inputs.insert(role::MASK_NAMES.into(), String::new());
+    let (instances, _) = Instances::read(f.instances()).unwrap();
+    instances.write(f.instances(), provenance).unwrap();
+    f.good("names", "--run-dir|{}/run|--geometry|{}/run/geometry.ply");
+    let names = f.json("run/names.json");
+    assert_eq!(best(&names), [(0, "sports ball", true), (2, "rug", false)]);
+    assert_eq!((&names["source"], &names["words"]), (&json!("names of the masks"), &json!(2)));
+    f.good("names", NAMES);
+    let names = f.json("run/names.json");
+    assert_eq!(best(&names).iter().map(|n| n.1).collect::<Vec<_>>(), ["sports ball", "blue ball", "floor"]);
 }

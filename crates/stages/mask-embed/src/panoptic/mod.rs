@@ -139,27 +139,20 @@ enum Frame {
 }
 
 impl Frame {
-    /// Width and height of the photograph, and of the picture that it lies in.
+    /// Width and height of the photograph as it is shown, and of the picture that it lies in.
     fn of(&self, image: &RgbImage) -> [[usize; 2]; 2] {
+        let sides = [image.width, image.height].map(|n| n as f64);
+        let scaled = |by: f64| sides.map(|n| ((n * by).round_ties_even() as usize).max(1));
         match *self {
             Self::Stretched(size) => [size; 2],
-            Self::Padded(size) => {
-                let scaled = scaled(image, size[0].min(size[1]), size[0].max(size[1]));
-                [[scaled[0].min(size[0]), scaled[1].min(size[1])], size]
-            }
+            Self::Padded(size) => [scaled((size[0] as f64 / sides[0]).min(size[1] as f64 / sides[1])), size],
             Self::Scaled(shortest, longest, divisor) => {
-                [scaled(image, shortest, longest).map(|n| n.next_multiple_of(divisor)); 2]
+                let by = shortest as f64 / sides[0].min(sides[1]);
+                let by = by.min(longest as f64 / sides[0].max(sides[1]));
+                [scaled(by).map(|n| n.next_multiple_of(divisor)); 2]
             }
         }
     }
-}
-
-/// Width and height of a photograph whose shorter side becomes `shortest`, or less so that the other is at most `longest`.
-fn scaled(image: &RgbImage, shortest: usize, longest: usize) -> [usize; 2] {
-    let sides = [image.width, image.height].map(|n| n as f64);
-    let (short, long) = (sides[0].min(sides[1]), sides[0].max(sides[1]));
-    let scale = (shortest as f64 / short).min(longest as f64 / long);
-    sides.map(|n| ((n * scale).round_ties_even() as usize).max(1))
 }
 
 /// A panoptic model.
@@ -181,12 +174,13 @@ pub struct Panoptic {
     hash: String,
 }
 
-fn read<T: DeserializeOwned>(path: &Path, hint: &str) -> Result<T> {
+fn read<T: DeserializeOwned>(path: &Path) -> Result<T> {
     if !path.exists() {
         return Err(Error::new("no such file").file(path).hint("copy it from the page that the model is from"));
     }
+    let wrong = |e| Error::new(format!("not what a panoptic model has: {e}")).file(path);
     serde_json::from_slice(&std::fs::read(path).at("read", path)?)
-        .map_err(|e| Error::new(format!("not what a panoptic model has: {e}")).file(path).hint(hint))
+        .map_err(|e| wrong(e).hint("docs/masks.md says what the folder holds"))
 }
 
 fn names(values: &[ValueInfo]) -> String {
@@ -207,7 +201,7 @@ impl Panoptic {
                 .hint("give a folder with model.onnx or onnx/model.onnx, config.json and preprocessor_config.json"));
         };
         let [config, preprocessor, description] = [CONFIG, PREPROCESSOR, FILE].map(|n| folder.join(n));
-        let Config { model_type, id2label } = read(&config, "copy it again from where the model is from")?;
+        let Config { model_type, id2label } = read(&config)?;
         let family = Family::of(&model_type).ok_or_else(|| {
             let what = "not a kind of panoptic model that this program knows";
             Error::new(what)
@@ -216,12 +210,8 @@ impl Panoptic {
                 .found(&model_type)
                 .expected("detr, mask2former, oneformer or eomt")
         })?;
-        let shown: Preprocessor = read(&preprocessor, "copy it again from where the model is from")?;
-        let settings = if description.exists() {
-            read(&description, "docs/masks.md lists the fields")?
-        } else {
-            Settings::default()
-        };
+        let shown: Preprocessor = read(&preprocessor)?;
+        let settings = if description.exists() { read(&description)? } else { Settings::default() };
         let rule = rule(family, &settings, &description)?;
         let norm = norm(&shown, &preprocessor)?;
 
@@ -237,7 +227,9 @@ impl Panoptic {
         for input in model.inputs().iter().filter(|i| i.name != picture.name) {
             match settings.constants.get(&input.name) {
                 Some(numbers) => constants.push((input.name.clone(), constant(input, numbers, path)?)),
-                None if input.name == PIXEL_MASK => mask = Some([1, 2].map(|axis| input.fixed(axis))),
+                None if input.name == PIXEL_MASK => {
+                    mask = Some([1, 2].map(|axis| input.fixed(axis).filter(|n| *n <= LONGEST)));
+                }
                 None => {
                     return Err(Error::new("nothing says what this input gets")
                         .file(path)
@@ -382,4 +374,21 @@ fn frame(family: Family, picture: &ValueInfo, shown: &Preprocessor, path: &Path)
         .field("size or size_divisor")
         .found(format!("{:?}, {divisor}", shown.size))
         .expected(format!("shortest_edge and longest_edge, or height and width: 1 to {LONGEST} pixels")))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn photographs_are_shown_as_large_as_to_transformers() {
+        let photo = |width, height| RgbImage { width, height, pixels: Vec::new() };
+        let detr = Frame::Scaled(800, 1333, 1);
+        assert_eq!(detr.of(&photo(640, 480)), [[1067, 800]; 2]);
+        assert_eq!(detr.of(&photo(1906, 1070)), [[1333, 748]; 2]);
+        assert_eq!(detr.of(&photo(748, 1333)), [[748, 1333]; 2]);
+        assert_eq!(Frame::Scaled(800, 1333, 32).of(&photo(1906, 1070)), [[1344, 768]; 2]);
+        assert_eq!(Frame::Padded([640, 640]).of(&photo(1906, 1070)), [[640, 359], [640, 640]]);
+        assert_eq!(Frame::Stretched([512, 384]).of(&photo(9, 9000)), [[512, 384]; 2]);
+    }
 }

@@ -46,18 +46,14 @@ impl Plane {
         out.extend(columns.iter().map(|&(x0, x1, fx)| line[x0] + (line[x1] - line[x0]) * fx));
     }
 
-    fn scaled(&self, [width, height]: [usize; 2]) -> Self {
-        let columns = taps(width, self.width as f64, self.width);
-        let mut values = Vec::with_capacity(width * height);
-        for row in taps(height, self.height as f64, self.height) {
-            self.row(row, &columns, &mut values);
+    /// The first columns and rows, as many as `part` says, of the plane scaled to a width and height.
+    fn scaled(&self, to: [usize; 2], part: [usize; 2]) -> Self {
+        let columns = &taps(to[0], self.width as f64, self.width)[..part[0]];
+        let mut values = Vec::with_capacity(part[0] * part[1]);
+        for row in taps(to[1], self.height as f64, self.height).into_iter().take(part[1]) {
+            self.row(row, columns, &mut values);
         }
-        Self { width, height, values }
-    }
-
-    fn cut(&self, [width, height]: [usize; 2]) -> Self {
-        let rows = self.values.chunks_exact(self.width).take(height);
-        Self { width, height, values: rows.flat_map(|r| &r[..width]).copied().collect() }
+        Self { width: part[0], height: part[1], values }
     }
 
     fn sigmoid(mut self) -> Self {
@@ -70,13 +66,8 @@ fn sigmoid(v: f32) -> f32 {
     1.0 / (1.0 + (-v).exp())
 }
 
-/// Pixels of a query.
-#[derive(Clone, Copy, Default)]
-struct Areas {
-    won: usize,
-    claimed: usize,
-    shown: usize,
-}
+/// Pixels that a query gets, that it claims, and that it gets and shows.
+type Areas = [usize; 3];
 
 impl Rule {
     /// The queries that are of some class, by logits `[queries][classes + 1]` of which the last is for none.
@@ -114,15 +105,11 @@ impl Rule {
                 self.share_row(&queries, &planes, row, &columns, ids, &mut areas);
                 areas
             })
-            .reduce(none, |mut all, other| {
-                for (a, b) in zip(&mut all, other) {
-                    *a = Areas { won: a.won + b.won, claimed: a.claimed + b.claimed, shown: a.shown + b.shown };
-                }
-                all
-            });
+            .reduce(none, |a, b| zip(a, b).map(|(a, b)| [a[0] + b[0], a[1] + b[1], a[2] + b[2]]).collect());
         // The ratio in 32 bits against a bound in 64, as there: four fifths are more than 0.8.
-        let stays =
-            |a: &Areas| a.shown > 0 && f64::from(a.won as f32 / a.claimed as f32) > self.overlap && a.claimed > 0;
+        let stays = |&[got, claimed, shown]: &Areas| {
+            claimed > 0 && shown > 0 && f64::from(got as f32 / claimed as f32) > self.overlap
+        };
         let found: Vec<usize> = (0..queries.len()).filter(|&k| stays(&areas[k])).collect();
         let mut id_of = vec![-1; queries.len()];
         zip(0.., &found).for_each(|(id, &k)| id_of[k] = id);
@@ -135,8 +122,8 @@ impl Rule {
         let plane = Plane { width: w, height: h, values: masks[q.index * w * h..][..w * h].to_vec() };
         match self.family {
             Family::Detr | Family::OneFormer => plane.sigmoid(),
-            Family::Mask2Former => plane.scaled([MASK2FORMER_SIDE; 2]).sigmoid(),
-            Family::Eomt => plane.scaled(input).cut(inside),
+            Family::Mask2Former => plane.scaled([MASK2FORMER_SIDE; 2], [MASK2FORMER_SIDE; 2]).sigmoid(),
+            Family::Eomt => plane.scaled(input, inside),
         }
     }
 
@@ -161,7 +148,7 @@ impl Rule {
                 let weighed = probability * query.score;
                 // All but EoMT claim by the weighed probability.
                 let claimed = if eomt { probability } else { weighed } >= self.mask_threshold;
-                areas[k].claimed += usize::from(claimed);
+                areas[k][1] += usize::from(claimed);
                 if weighed > best.0 {
                     // EoMT shows only what is claimed too.
                     *best = (weighed, claimed || !eomt);
@@ -171,8 +158,8 @@ impl Rule {
         }
         for (id, (_, shown)) in zip(ids, best) {
             let areas = &mut areas[*id as usize];
-            areas.won += 1;
-            areas.shown += usize::from(shown);
+            areas[0] += 1;
+            areas[2] += usize::from(shown);
             if !shown {
                 *id = -1;
             }
