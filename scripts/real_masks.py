@@ -156,7 +156,7 @@ def arguments():
     parser.add_argument("--scenes", help="ray-traced scenes, names with commas between [all 32; none with --scans or --photographs]")
     parser.add_argument("--geometries", type=int, default=3, help="seeds of stage 1 for each scene [3]")
     parser.add_argument("--scans", type=Path, help="folder of scans, NAME_vert.npy and labels; scan.py says what they hold")
-    parser.add_argument("--photographs", default="", help="captures with labels in testdata: desk=FOLDER,room=FOLDER,shelf=FOLDER")
+    parser.add_argument("--photographs", default="", help="captures with labels in testdata: desk=FOLDER,room=FOLDER,blanket=FOLDER")
     parser.add_argument("--panoptic", action="store_true", help="also with the classes of panoptic models of five qualities")
     parser.add_argument("--sam", type=Path, default=Path("models"), help="folder of the SAM model [models]")
     parser.add_argument("--out", type=Path, default=Path("out/real-masks"), help="folder [out/real-masks]")

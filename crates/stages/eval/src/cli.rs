@@ -64,10 +64,6 @@ impl Program for Args {
             Command::Query(o) if !o.image.is_empty() && o.texts.clip.is_none() => {
                 Err(Error::new("pictures need an image encoder").field("--image").expected("--clip with image.onnx"))
             }
-            Command::Names(o) if !o.texts.given() => Err(Error::new("nothing to compare names with")
-                .field("--clip")
-                .expected("--clip or --text-features")
-                .hint("give the CLIP model that encoded the masks")),
             Command::Lerf(o) => o.check(),
             Command::Report(_) if self.common.run_dir.is_none() => {
                 Err(Error::new("which run").field("--run-dir").expected("the folder of a run, such as OUT of make"))

@@ -3,7 +3,7 @@
 use crate::memory::{self, SMALLER, Sizes};
 use crate::options::NamesOptions;
 use artifacts::{Health, InstanceNames, Instances, Naming, called, role};
-use gs_io::{Claim, Result};
+use gs_io::{Claim, Error, Result};
 use query::{LabelledScene, TextSource, Vocabulary, name_instances};
 use serde_json::{Value, json};
 use stage::Stage;
@@ -19,7 +19,13 @@ pub(crate) fn run(o: &NamesOptions, parameters: Value, stage: &Stage) -> Result<
     let scene = LabelledScene::read(&o.instances, &o.geometry, o.edits.as_deref())?;
     let by_masks = Health::of(&scene.artifact)?.map_or(Vec::new(), |health| health.names);
     let named_masks = scene.artifact.provenance().inputs.contains_key(role::MASK_NAMES);
-    if !o.texts.given() && named_masks {
+    if !o.texts.given() && !named_masks {
+        return Err(Error::new("nothing to compare names with")
+            .field("--clip")
+            .expected("--clip or --text-features, or masks with names")
+            .hint("give the CLIP model that encoded the masks"));
+    }
+    if !o.texts.given() {
         return finish(o, InstanceNames::by_masks(by_masks, scene.artifact.hash()), &scene, parameters, claim, stage);
     }
     let source = TextSource::open_for(&scene.artifact, scene.instances.dim(), &o.texts)?;

@@ -92,7 +92,7 @@ fn artifacts_are_right_and_the_same_for_any_number_of_threads() {
 
     // The provenance holds every option.
     let expected = serde_json::json!({
-        "views": "train", "holdout": 8, "anchor_ratio": 0.1, "k": 16, "levels": ["default", "small", "medium", "large"], "gate": 0.7, "min_mask_pixels": 50.0, "cut": 0.0,
+        "views": "train", "holdout": 8, "anchor_ratio": 0.1, "k": 16, "levels": ["default", "small", "medium", "large", "classes", "concepts"], "gate": 0.7, "min_mask_pixels": 50.0, "cut": 0.0,
         "pixel_samples": 0, "no_skip": false, "preset": null, "seed": 0,
     });
     assert_eq!(a.provenance().parameters, expected);

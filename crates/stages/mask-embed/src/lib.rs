@@ -5,7 +5,7 @@
 //! pictures instead; `embed` shows the picture of each mask to CLIP. All write LangSplat's files: `<view>_s.npy` and
 //! `<view>_f.npy`. [`crops`] gives the training script of the small encoder what the pipeline would see. `finished` knows
 //! which views are done already, `ahead` works on several at a time, `logits` how sure a mask is of each pixel.
-//! [`panoptic`] runs models that give all things of a photograph at once.
+//! [`panoptic`] runs models that give all things of a photograph at once, with names; [`classes`] makes a level of them.
 
 mod ahead;
 pub mod automatic;
