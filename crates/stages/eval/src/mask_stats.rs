@@ -103,7 +103,7 @@ pub fn measure(folder: &Path, footprints: Option<&Footprints>) -> Result<MaskSta
         None => Ok([0; 4]),
     };
     let mut levels = Vec::new();
-    for level in Level::ALL {
+    for level in Level::ALL.into_iter().filter(|&level| !masks[level as usize].is_empty()) {
         let l = level as usize;
         let [compared, fates @ ..] = fates(level)?;
         let [split, merged, stable] = fates.map(|n| (compared > 0).then(|| n as f64 / compared as f64));
