@@ -172,7 +172,7 @@ stress: build ## Hostile scenes and settings through every stage: out/stress/rep
 	target/release/bench stress --work out/stress/scenes --out out/stress/report.json
 
 SCENES ?=
-real-masks: build ## Score instances from real SAM masks of scenes with a truth: out/real-masks (hours; SCENES=room-10, SCANS=folder, PHOTOGRAPHS=desk=folder)
+real-masks: build ## Score instances from real SAM masks of scenes with a truth: out/real-masks (hours; SCENES=room-10, SCANS=folder, PHOTOGRAPHS=desk=folder, PANOPTIC=1)
 	scripts/real_masks.py $(if $(SCENES),--scenes $(SCENES)) $(if $(PANOPTIC),--panoptic) $(if $(SCANS),--scans "$$SCANS") $(if $(PHOTOGRAPHS),--photographs "$$PHOTOGRAPHS")
 
 clip-report: build ## Score a CLIP model for every crop and prompt on the labelled desk: make clip-report CLIP=folder SCENE=desk OUT=folder

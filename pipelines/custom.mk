@@ -4,6 +4,7 @@
 #:  GEOMETRY=file.spz   use these trained Gaussians instead of training; without SCENE, renders of them instead of photographs
 #:  AXES=RDF            where the axes x, y, z of GEOMETRY point [told by the photographs; without SCENE, as its format says]
 #:  MASKS=folder        use these id maps (*_s.npy) instead of running SAM
+#:  PANOPTIC=folder     a panoptic model beside SAM, which says what its masks show (docs/masks.md)
 #:  CLIP=folder         image.onnx and text.onnx of a CLIP model [models/clip, if there]; without it no text queries
 #:  VOCABULARY=file     names that things may have, one a line [about 1,200 everyday ones]
 #:  QUERIES="red_mug …" texts to ask for, with underscores for spaces, without quotes
@@ -37,7 +38,7 @@ endif
 endif
 CLIP ?= $(patsubst %/,%,$(dir $(wildcard models/clip/text.onnx)))
 
-SETTINGS := QUALITY SCENE PHOTOGRAPHS POSES_ARGS GEOMETRY AXES MASKS CLIP SAM VOCABULARY QUERIES RESOLUTION ITERATIONS SEED \
+SETTINGS := QUALITY SCENE PHOTOGRAPHS POSES_ARGS GEOMETRY AXES MASKS CLIP SAM PANOPTIC VOCABULARY QUERIES RESOLUTION ITERATIONS SEED \
   GEOM_ARGS VIEW_ARGS MASK_ARGS EMBED_ARGS GRAPH_ARGS FEAT_ARGS CLUSTER_ARGS SCORE_ARGS REPORT_ARGS
 include pipelines/settings.mk
 

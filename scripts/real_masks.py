@@ -1,7 +1,7 @@
 #!/usr/bin/env python3
 """real_masks.py: instances from a real SAM's masks of scenes with a truth: ray-traced, scanned rooms, photographs with labels.
 
-    scripts/real_masks.py [--scenes kitchen-0,room-10] [--geometries 3] [--scans FOLDER] [--photographs FOLDER]
+    scripts/real_masks.py [--scenes kitchen-0,room-10] [--geometries 3] [--scans FOLDER] [--photographs desk=FOLDER]
 
 For each scene (family-seed; seeds 0 to 2 are for tuning, 10 to 14 for reporting) it makes photographs, masks (slow, once),
 and Gaussians of several seeds, runs each method of METHODS, asks bench for the ceilings, and writes OUT/real-masks.md and
@@ -164,10 +164,12 @@ def arguments():
     if a.scenes is None:
         a.scenes = "" if a.scans or a.photographs else ",".join(everything)
     a.scenes = [s for s in a.scenes.split(",") if s]
-    a.photographs = dict(p.split("=", 1) if "=" in p else parser.error(f"--photographs: {p!r} is not NAME=FOLDER")
-                         for p in a.photographs.split(",") if p)
+    pairs = [p.partition("=") for p in a.photographs.split(",") if p]
+    a.photographs = {name: Path(folder) for name, _, folder in pairs}
+    if a.scans and not list(a.scans.glob("*_vert.npy")):
+        parser.error(f"--scans: no NAME_vert.npy in {a.scans}")
     for name, folder in a.photographs.items():
-        if not (Path("testdata") / name).is_dir() or not Path(folder).is_dir():
+        if not (Path("testdata") / name).is_dir() or not folder.is_dir():
             parser.error(f"--photographs: there is no folder {folder}, or no labels in testdata/{name}")
     for name in a.scenes:
         family, _, seed = name.rpartition("-")

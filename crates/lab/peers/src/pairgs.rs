@@ -21,6 +21,7 @@ use crate::cli::Peer;
 use crate::product::{Grouping, Product};
 use crate::union::root;
 use crate::world::{Inputs, World};
+use artifacts::LEVELS;
 use gs_io::{Error, Result};
 use hdbscan_exact::{Edge, Metric, Selection, cluster_graph};
 use nalgebra::DMatrix;
@@ -104,7 +105,7 @@ impl Lifted {
                 let row = &world.footprints.rows[mask as usize];
                 let feature = world.feature(row);
                 for (i, weight) in entries.iter().map(|(i, w)| (i as usize, w)) {
-                    shares[next[i]] = Share { image: row.view * 4 + row.level, mask, weight };
+                    shares[next[i]] = Share { image: row.view * LEVELS as u32 + row.level, mask, weight };
                     next[i] += 1;
                     let Some(feature) = feature else { continue };
                     weights[i] += f64::from(weight);

@@ -45,7 +45,7 @@ pub struct Inputs {
     #[arg(long, value_name = "FILE")]
     #[serde(skip)]
     pub out: PathBuf,
-    /// Levels of the masks that are used, with commas between: default, small, medium, large
+    /// Levels of the masks that are used, with commas between: default, small, medium, large, classes, concepts
     #[arg(long, value_name = "LEVELS", value_delimiter = ',', default_value = "large")]
     pub levels: Vec<Level>,
 }

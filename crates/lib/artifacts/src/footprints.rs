@@ -12,7 +12,7 @@ use std::path::Path;
 pub struct Row {
     /// Index of the view in [`Footprints::views`].
     pub view: u32,
-    /// Level, 0 to 3: default, small, medium, large.
+    /// Level, 0 to 5, in the order of [`Level::ALL`].
     pub level: u32,
     /// Id in the view's `*_s.npy`, which is also the row of its `*_f.npy`.
     pub mask: u32,

@@ -1,7 +1,7 @@
 //! Id maps and mask features in LangSplat's layout: `<stem>_s.npy` and `<stem>_f.npy` in one folder.
 
 use crate::{flat, role};
-use gs_io::{Error, IoContext, Provenance, Result, Watched, check_name, hash_files, npy};
+use gs_io::{Error, IoContext, Provenance, Result, Watched, check_name, hash_file, hash_files, npy};
 use gs_scene::dataset::View;
 use ndarray::{Array2, Array3, ArrayView1, ArrayView2, Axis, s};
 use serde::{Deserialize, Serialize};
@@ -85,8 +85,9 @@ pub type MaskNames = BTreeMap<u32, MaskName>;
 /// Reads the names of the masks of a view, `facts.names` of its note; none where there are none.
 ///
 /// # Errors
-/// When the file is damaged, a name is empty or bad ([`check_name`]), or a score is not in 0 to 1.
+/// When the file is damaged or of another id map, a name is empty or bad ([`check_name`]), or a score is not in 0 to 1.
 pub fn read_mask_names(folder: impl AsRef<Path>, stem: &str) -> Result<MaskNames> {
+    let folder = folder.as_ref();
     let path = note_path(folder, stem);
     if !path.is_file() {
         return Ok(MaskNames::new());
@@ -95,6 +96,12 @@ pub fn read_mask_names(folder: impl AsRef<Path>, stem: &str) -> Result<MaskNames
     let bytes = std::fs::read(&path).at("read", &path)?;
     let note: serde_json::Value = serde_json::from_slice(&bytes).map_err(wrong)?;
     let Some(names) = note["facts"].get("names") else { return Ok(MaskNames::new()) };
+    // mask-embed notes which map they are of.
+    let map = maps_path(folder, stem);
+    if note["hash"].as_str().is_some_and(|hash| hash_file(&map).is_ok_and(|found| found != hash)) {
+        let e = Error::new("names of another id map").file(&path).field("hash");
+        return Err(e.hint("run mask-embed masks again"));
+    }
     let names = MaskNames::deserialize(names).map_err(wrong)?;
     for (id, mask) in &names {
         check_name(&mask.name).map_err(|e| e.file(&path).field(id.to_string()))?;

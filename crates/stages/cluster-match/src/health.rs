@@ -1,6 +1,6 @@
 //! How far masks and instances agree, and what masks with names call them.
 
-use artifacts::{Footprints, Health, Instances, Level, MaskNames, Naming, ScoredName, read_mask_names};
+use artifacts::{Footprints, Health, Instances, MaskNames, Naming, ScoredName, read_mask_names};
 use gs_io::Result;
 use std::collections::BTreeMap;
 use std::path::Path;
@@ -23,20 +23,20 @@ pub fn measure(instances: &Instances, weights: &Weights) -> Health {
     Health { largest, purity: (all > 0.0).then(|| inside / all), names: Vec::new() }
 }
 
-/// What the masks of levels with names call each instance ([`Health::names`]). `folder` has the id maps.
+/// What masks call each instance ([`Health::names`]), by its weight in the masks of levels with names. `folder` has the id maps.
 ///
 /// # Errors
 /// When a file of names is damaged.
 pub fn names(weights: &Weights, footprints: &Footprints, folder: &Path) -> Result<Vec<Naming>> {
+    if weights.is_empty() {
+        return Ok(Vec::new());
+    }
     let names =
         footprints.views.iter().map(|view| read_mask_names(folder, view)).collect::<Result<Vec<MaskNames>>>()?;
     let mut all: BTreeMap<u32, f64> = BTreeMap::new();
     let mut called: BTreeMap<u32, BTreeMap<&str, f64>> = BTreeMap::new();
     for (row, of) in weights {
         let row = &footprints.rows[*row as usize];
-        if row.is_of(&Level::SAM) {
-            continue;
-        }
         let name = names[row.view as usize].get(&row.mask);
         for (&k, &w) in of {
             *all.entry(k).or_default() += w;
@@ -63,7 +63,7 @@ mod tests {
     use super::*;
     use crate::profile::mask_weights;
     use crate::testing::{footprints, footprints_of, instances};
-    use artifacts::{MaskName, note_path};
+    use artifacts::{Level, MaskName, note_path};
     use serde_json::json;
 
     fn health(instances: &Instances, footprints: &Footprints, level: Level) -> Health {
@@ -96,7 +96,7 @@ mod tests {
             let note = json!({ "facts": { "names": names } });
             gs_io::write_json(note_path(dir.path(), &view.to_string()), &note).unwrap();
         }
-        let weights = mask_weights(&[0, 0, 0, 0, 1, 1, 1, 1], &footprints, &Level::ALL).unwrap();
+        let weights = mask_weights(&[0, 0, 0, 0, 1, 1, 1, 1], &footprints, &[Level::Classes]).unwrap();
         let found = names(&weights, &footprints, dir.path()).unwrap();
         let said: Vec<_> = found.iter().map(|n| (n.instance, n.sure, n.names[0].name.as_str())).collect();
         assert_eq!(said, [(0, false, "sofa"), (1, true, "table")]);

@@ -7,6 +7,7 @@ use clap::Parser;
 use hdbscan_exact::{Metric, Selection};
 use serde::Serialize;
 use stage::CommonArgs;
+use std::collections::BTreeSet;
 use std::path::PathBuf;
 
 /// Stage 3: 3D instances, the masks they are seen as, and a language descriptor for each
@@ -153,9 +154,14 @@ impl Settings {
         let mut levels = self.levels.clone();
         if levels.is_empty() {
             levels = Level::ALL.into_iter().filter(there).collect();
-            // A model that knows classes says better what a whole thing is than SAM.
-            let classes = levels.contains(&Level::Classes);
-            levels.retain(|level| !classes || *level != Level::Large);
+            // A model that knows classes says better what a whole thing is than SAM, where it saw every view.
+            let views = |level| {
+                let of_level = footprints.rows.iter().filter(|row| row.is_of(&[level]));
+                of_level.map(|row| row.view).collect::<BTreeSet<u32>>()
+            };
+            if levels.contains(&Level::Classes) && views(Level::Large).is_subset(&views(Level::Classes)) {
+                levels.retain(|level| *level != Level::Large);
+            }
         }
         Self { min_cluster_size: self.min_cluster_size.or(Some(smallest)), levels, ..self.clone() }
     }
@@ -191,6 +197,9 @@ mod tests {
         let levels = |more: &[&str], masks: &[_]| parse(more).for_scene(8, &footprints_of(masks)).levels;
         assert_eq!(levels(&[], &sam), Level::SAM);
         assert_eq!(levels(&[], &with_classes), [Level::Default, Level::Small, Level::Medium, Level::Classes]);
+        let (two, one): (&[&[&[u32]]], &[&[&[u32]]]) = (&[&[&[0, 1]], &[&[0, 1]]], &[&[&[0, 1]], &[]]);
+        let some = levels(&[], &[(Level::Large, two), (Level::Classes, one)]);
+        assert!(some.contains(&Level::Large) && some.contains(&Level::Classes), "{some:?}");
         assert_eq!(levels(&["--levels", "large,classes"], &with_classes), [Level::Large, Level::Classes]);
         assert_eq!(levels(&["--cluster", "free", "--features", "x"], &with_classes), [Level::Large]);
     }

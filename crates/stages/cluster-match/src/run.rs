@@ -121,7 +121,8 @@ fn find(a: &Args, settings: &Settings, inputs: &Inputs, stage: &Stage) -> Result
     let mut instances =
         Instances { views, tree: found.tree, node: found.nodes, granules, granule_descriptor, ..gathered };
     instances.score = confidence(&instances.count, &fits);
-    let names = health::names(&weights, footprints, &a.masks)?;
+    let named = mask_weights(&labels, footprints, &Level::ALL[Level::SAM.len()..])?;
+    let names = health::names(&named, footprints, &a.masks)?;
     let health = Health { names, ..health::measure(&instances, &weights) };
     let draft = Draft { instances, of_instances, of_granules, masks };
     Ok(Found { draft, health, noise, clustering_seconds })

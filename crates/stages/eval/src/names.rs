@@ -26,6 +26,9 @@ pub(crate) fn run(o: &NamesOptions, parameters: Value, stage: &Stage) -> Result<
             .hint("give the CLIP model that encoded the masks"));
     }
     if !o.texts.given() {
+        if given.is_some() {
+            stage.skipped("--vocabulary: without a text encoder only masks give names");
+        }
         return finish(o, InstanceNames::by_masks(by_masks, scene.artifact.hash()), &scene, parameters, claim, stage);
     }
     let source = TextSource::open_for(&scene.artifact, scene.instances.dim(), &o.texts)?;

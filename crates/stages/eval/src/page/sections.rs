@@ -119,7 +119,7 @@ pub(super) fn id_maps(m: &Material, page: &mut Page, metrics: &mut Metrics) -> R
     }
     page.section("id-maps", "Masks");
     page.paragraph(
-        "The 2D masks of the level \u{201c}large\u{201d}, a colour per mask, grey where there is none. Every view is \
+        "The 2D masks of the level \u{201c}large\u{201d}, or of classes where there are any, a colour per mask, grey where there is none. Every view is \
          segmented on its own: colours do not correspond between views, and neither need the extents of masks.",
     );
     page.figures(3, &figures);
@@ -280,13 +280,14 @@ pub(super) fn names(m: &Material, page: &mut Page, metrics: &mut Metrics) {
         Err(e) => return metrics.skipped.push(format!("names: {e}")),
     };
     page.section("names", "What is there");
-    page.paragraph(&format!(
-        "The best of {} names for each instance, by the cosine of descriptor and name ({}). A name is sure where its lead over \
-         the best name of another meaning is above {}, what it may be by chance.",
-        names.words,
-        names.source,
-        names.by_chance.map_or("–".into(), |chance| format!("{chance:.3}"))
-    ));
+    let mut how = format!("The best of {} names for each instance ({}).", names.words, names.source);
+    if let Some(chance) = names.by_chance {
+        how += &format!(
+            " By the cosine of descriptor and name; a name is sure where its lead over the best name of another meaning is above \
+             {chance:.3}, what it may be by chance."
+        );
+    }
+    page.paragraph(&how);
     let counts = counts(names.named.iter().filter_map(|n| names.best(n.instance)).map(|c| (c.name, c.sure)));
     let rows: Vec<Vec<String>> = counts.iter().map(|c| vec![c.name.clone(), c.describe()]).collect();
     page.table(&["name", "count"], &rows);
@@ -300,7 +301,7 @@ pub(super) fn names(m: &Material, page: &mut Page, metrics: &mut Metrics) {
     };
     let there = names.named.iter().filter(|n| (n.instance as usize) < instances.len());
     let rows: Vec<Vec<String>> = there.map(row).collect();
-    page.table(&["instance", "Gaussians", "name (cosine)", "margin", "sure", "or"], &rows);
+    page.table(&["instance", "Gaussians", "name (score)", "margin", "sure", "or"], &rows);
 }
 
 /// The path of a picture that `query.json` names: it lies in that file's folder, and no other file is shown.

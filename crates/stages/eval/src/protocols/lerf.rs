@@ -37,8 +37,8 @@ pub(crate) fn run(o: &LerfOptions, parameters: Value, stage: &Stage) -> Result<S
     let mut claim = outputs.reads(read.chain(&o.texts.text_features).chain(&o.choice.features)).claim()?;
     let benchmark = LerfScene::named(&name);
     let (mut frames, mut notes) = labelled_frames(o.truth, &folder, benchmark)?;
-    // Saved predictions lie on the photographs as the labels do.
-    labels::straighten(&mut frames, dataset.as_ref().filter(|_| o.predictions.is_none()).map_or(&[], |d| &d.views));
+    // Where there is a scene, predictions are of its cameras, saved ones too.
+    labels::straighten(&mut frames, dataset.as_ref().map_or(&[], |d| &d.views));
     let labels = frames.iter().flat_map(|f| f.categories.values()).map(|m| m.bits.len() as u64).sum();
     let read = o.choice.features.as_deref().map_or(0, memory::bytes);
     let sizes = o.inputs.as_ref().zip(dataset.as_ref());

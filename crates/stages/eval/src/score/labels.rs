@@ -81,9 +81,10 @@ struct Object {
 pub fn straighten(frames: &mut [FrameLabels], views: &[View]) {
     for frame in frames {
         let Some(view) = views.iter().find(|v| v.stem() == frame.frame && !v.is_straight()) else { continue };
+        let (width, height) = view.straighten::<bool>(&mut [], (frame.width as usize, frame.height as usize));
+        (frame.width, frame.height) = (width as u32, height as u32);
         for mask in frame.categories.values_mut() {
             (mask.width, mask.height) = view.straighten(&mut mask.bits, (mask.width, mask.height));
-            (frame.width, frame.height) = (mask.width as u32, mask.height as u32);
         }
     }
 }

@@ -7,7 +7,7 @@
 mod segments;
 
 use crate::constants::{FILE, Numbers, constant};
-use gs_io::{Error, IoContext, Result, hash_bytes, hash_files};
+use gs_io::{Error, IoContext, Result, check_name, hash_bytes, hash_files};
 use ndarray::Array2;
 use onnx_models::{EngineOptions, Kind, Model, Outputs, RgbImage, Tensor, ValueInfo, hash_model, open, resize_rgb};
 use segments::Rule;
@@ -202,6 +202,11 @@ impl Panoptic {
         };
         let [config, preprocessor, description] = [CONFIG, PREPROCESSOR, FILE].map(|n| folder.join(n));
         let Config { model_type, id2label } = read(&config)?;
+        for (label, name) in &id2label {
+            let empty = || Error::new("a class without a name");
+            let checked = if name.is_empty() { Err(empty()) } else { check_name(name) };
+            checked.map_err(|e| e.file(&config).field(format!("id2label.{label}")))?;
+        }
         let family = Family::of(&model_type).ok_or_else(|| {
             let what = "not a kind of panoptic model that this program knows";
             Error::new(what)

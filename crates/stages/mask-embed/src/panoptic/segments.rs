@@ -11,6 +11,9 @@ use std::iter::zip;
 /// Side of the masks of Mask2Former before they are scaled to the map.
 const MASK2FORMER_SIDE: usize = 384;
 
+/// Logits beyond this are as sure as this.
+const MOST_LOGIT: f32 = 100.0;
+
 /// What a query must have to be a segment.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Rule {
@@ -119,7 +122,9 @@ impl Rule {
 
     /// The mask of a query as it is scaled to the map: probabilities, or logits of EoMT.
     fn plane(&self, q: &Query, masks: &[f32], [h, w]: [usize; 2], inside: [usize; 2], input: [usize; 2]) -> Plane {
-        let plane = Plane { width: w, height: h, values: masks[q.index * w * h..][..w * h].to_vec() };
+        let values = &masks[q.index * w * h..][..w * h];
+        let values = values.iter().map(|v| v.clamp(-MOST_LOGIT, MOST_LOGIT)).collect();
+        let plane = Plane { width: w, height: h, values };
         match self.family {
             Family::Detr | Family::OneFormer => plane.sigmoid(),
             Family::Mask2Former => plane.scaled([MASK2FORMER_SIDE; 2], [MASK2FORMER_SIDE; 2]).sigmoid(),
