@@ -197,7 +197,8 @@ mod tests {
         let levels = |more: &[&str], masks: &[_]| parse(more).for_scene(8, &footprints_of(masks)).levels;
         assert_eq!(levels(&[], &sam), Level::SAM);
         assert_eq!(levels(&[], &with_classes), [Level::Default, Level::Small, Level::Medium, Level::Classes]);
-        let (two, one): (&[&[&[u32]]], &[&[&[u32]]]) = (&[&[&[0, 1]], &[&[0, 1]]], &[&[&[0, 1]], &[]]);
+        let two: &[&[&[u32]]] = &[&[&[0, 1]], &[&[0, 1]]];
+        let one: &[&[&[u32]]] = &[&[&[0, 1]], &[]];
         let some = levels(&[], &[(Level::Large, two), (Level::Classes, one)]);
         assert!(some.contains(&Level::Large) && some.contains(&Level::Classes), "{some:?}");
         assert_eq!(levels(&["--levels", "large,classes"], &with_classes), [Level::Large, Level::Classes]);
