@@ -33,9 +33,9 @@ impl Pieces {
         Self { pairs, labels }
     }
 
-    /// Those that the large masks, or those of classes in their place, set apart: the probability that one of them holds the part and the rest of the instance is lower, by
-    /// [`APART`], than that of the medium masks. SAM's largest mask of a place is the whole thing there. Where either level says
-    /// nothing of a part, it is not apart.
+    /// Those that the masks of whole things (`large`) set apart: the probability that one of them holds the part and the rest of the
+    /// instance is lower, by [`APART`], than that of the medium masks. SAM's largest mask of a place is the whole thing there. Where either
+    /// level says nothing of a part, it is not apart.
     fn apart(&self, footprints: &Footprints, large: Level) -> Result<Vec<bool>> {
         let wholes: Vec<i32> = self.pairs.iter().map(|p| p.0).collect();
         let agreements = |level| with_rest(&self.labels, &wholes, footprints, &[level]);
@@ -69,7 +69,8 @@ impl Pieces {
 
 /// Makes instances of `parts`. A part leaves where at least [`INSIDE`] of its Gaussians lie in one instance, it has at most `share` of that
 /// instance's (or a half, where large masks set it apart), and some mask shows it as one. An instance of which more than half would leave
-/// stays as it is. `large` is the level of whole things. In the tree such a part hangs below the cluster of that instance. Returns how many there are.
+/// stays as it is. `large` is the level of whole things. In the tree such a part hangs below the cluster of that instance. Returns how many
+/// there are.
 ///
 /// # Errors
 /// When the footprints can't be read.

@@ -145,8 +145,11 @@ fn mask_rows(maps: &MaskMaps, min_pixels: usize) -> (Vec<Row>, [Vec<u32>; LEVELS
     let mut rows = Vec::new();
     let mut small = 0;
     let row_of = Level::ALL.map(|level| {
-        let mut pixels = vec![0u32; if maps.levels().contains(&level) { maps.id_count() } else { 0 }];
-        for &id in maps.ids.outer_iter().nth(level as usize).iter().flatten() {
+        if !maps.levels().contains(&level) {
+            return Vec::new();
+        }
+        let mut pixels = vec![0u32; maps.id_count()];
+        for &id in maps.level(level) {
             if id >= 0 {
                 pixels[id as usize] += 1;
             }
