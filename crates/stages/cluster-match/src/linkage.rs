@@ -22,6 +22,8 @@ const TIMES: usize = 16;
 /// Pieces that lie in one plane need this share of the agreement of others: a floor or a wall is seldom seen whole, and what hides
 /// its middle parts its masks.
 const IN_PLANE: f64 = 0.75;
+/// Pairs that are compared at once: their agreements are held beside the lists.
+const AT_ONCE: usize = 1 << 20;
 /// The distance of two that agree fully: distances of 0 would make the tree's lambdas infinite.
 const FLOOR: f64 = 0.1;
 /// Least difference between distances within instances and between them.
@@ -60,7 +62,9 @@ pub fn cluster(
     if views.contains(&false) {
         linkage.join(FIRM, usize::MAX, within);
         let (labels, count) = linkage.labels();
-        linkage.see(Profile::of_pieces(&labels, count, footprints, levels, &vec![true; views.len()])?);
+        let profiles = Profile::of_pieces(&labels, count, footprints, levels, &vec![true; views.len()])?;
+        // Some may have had no view in common before.
+        linkage.see(profiles, neighbours(graph));
     }
     linkage.join(FIRM.max(least), usize::MAX, within);
     linkage.start_to_doubt(&points.rims(&linkage.labels().0));
@@ -88,6 +92,13 @@ fn neighbours(graph: &Graph) -> Vec<(u32, u32)> {
     pairs.par_sort_unstable();
     pairs.dedup();
     pairs
+}
+
+/// Each of these once. `seen` is all false, before and after.
+fn once(all: impl Iterator<Item = u32>, seen: &mut [bool]) -> Vec<u32> {
+    let out: Vec<u32> = all.filter(|&i| !std::mem::replace(&mut seen[i as usize], true)).collect();
+    out.iter().for_each(|&i| seen[i as usize] = false);
+    out
 }
 
 /// The distance of two with this agreement, 0.1 to 1.1.
@@ -119,12 +130,15 @@ impl<'a> Linkage<'a> {
     /// Clusters of one each, of which these `pairs` may join.
     pub fn new(profiles: Vec<Profile>, pairs: &[(u32, u32)], unit_of: &'a [u32]) -> Self {
         let n = profiles.len();
+        // Lists that grow take up to twice their memory.
+        let mut counts = vec![0; n];
+        pairs.iter().for_each(|&(a, b)| [a, b].into_iter().for_each(|i| counts[i as usize] += 1));
         let mut out = Self {
             unit_of,
             profiles,
             sizes: vec![1; n],
             doubt: None,
-            near: vec![Vec::new(); n],
+            near: counts.into_iter().map(Vec::with_capacity).collect(),
             places: Vec::new(),
             into: (0..n as u32).collect(),
             edges: Vec::new(),
@@ -136,6 +150,7 @@ impl<'a> Linkage<'a> {
 
     /// Finds the agreement of pairs that are in nobody's list.
     fn compare(&mut self, pairs: &[(u32, u32)]) {
+        let mut near = std::mem::take(&mut self.near);
         let agreement = |&(a, b): &(u32, u32)| {
             let (a, b) = (a as usize, b as usize);
             let agreement = self.profiles[a].agreement(&self.profiles[b], self.unit_of)?;
@@ -145,13 +160,16 @@ impl<'a> Linkage<'a> {
             let eased = self.places[a].in_plane_of(&self.places[b]);
             agreement.firm.then_some(if eased { (agreement.value / IN_PLANE).min(1.0) } else { agreement.value })
         };
-        let values: Vec<Option<f64>> = pairs.par_iter().map(agreement).collect();
-        for (&(a, b), value) in pairs.iter().zip(values) {
-            if let Some(value) = value {
-                self.near[a as usize].push((b, value));
-                self.near[b as usize].push((a, value));
+        for pairs in pairs.chunks(AT_ONCE) {
+            let values: Vec<Option<f64>> = pairs.par_iter().map(agreement).collect();
+            for (&(a, b), value) in pairs.iter().zip(values) {
+                if let Some(value) = value {
+                    near[a as usize].push((b, value));
+                    near[b as usize].push((a, value));
+                }
             }
         }
+        self.near = near;
     }
 
     /// The clusters, ascending, as [`Linkage::labels`] numbers them.
@@ -171,11 +189,18 @@ impl<'a> Linkage<'a> {
         self.compare(pairs);
     }
 
-    /// From now on the clusters have these profiles.
-    pub fn see(&mut self, profiles: Vec<Profile>) {
+    /// From now on the clusters have these profiles, and those may join that hold one of these `pairs` of members.
+    pub fn see(&mut self, profiles: Vec<Profile>, mut pairs: Vec<(u32, u32)>) {
         let left = self.left();
         left.iter().zip(profiles).for_each(|(&i, profile)| self.profiles[i as usize] = profile);
-        let pairs: Vec<(u32, u32)> = self.touching().collect();
+        let cluster: Vec<u32> = self.labels().0.into_iter().map(|label| left[label as usize]).collect();
+        pairs.par_iter_mut().for_each(|(a, b)| {
+            let ends = (cluster[*a as usize], cluster[*b as usize]);
+            (*a, *b) = (ends.0.min(ends.1), ends.0.max(ends.1));
+        });
+        pairs.retain(|(a, b)| a < b);
+        pairs.par_sort_unstable();
+        pairs.dedup();
         self.compare_only(&pairs);
     }
 
@@ -206,62 +231,71 @@ impl<'a> Linkage<'a> {
         self.doubt = Some(Doubt::new(&self.sizes, named));
     }
 
-    /// The cluster that each joins in this round, or itself, and how far it agrees with it.
-    fn round(&self, least: f64, below: usize) -> Vec<(u32, f64)> {
+    /// The cluster near `i` that it agrees with most, by `least` or more.
+    fn best(&self, i: u32, least: f64) -> Option<(u32, f64)> {
+        let more = |j: u32| {
+            let size = self.sizes[i as usize].max(self.sizes[j as usize]);
+            self.doubt.as_ref().map_or(0.0, |doubt| doubt.of(i, j, size))
+        };
+        let eased = self.near[i as usize].iter().map(|&(j, value)| (j, (value - more(j)).min(1.0)));
         // Of equals the first.
-        let order = |a: &(u32, f64), b: &(u32, f64)| a.1.total_cmp(&b.1).then(b.0.cmp(&a.0));
-        let more = |a: u32, b: u32| {
-            let size = self.sizes[a as usize].max(self.sizes[b as usize]);
-            self.doubt.as_ref().map_or(0.0, |doubt| doubt.of(a, b, size))
-        };
-        let best = |(i, near): (usize, &Vec<(u32, f64)>)| {
-            let eased = near.iter().map(|&(j, value)| (j, (value - more(i as u32, j)).min(1.0)));
-            eased.filter(|b| b.1 >= least).max_by(order)
-        };
-        let best: Vec<Option<(u32, f64)>> = self.near.par_iter().enumerate().map(best).collect();
+        eased.filter(|b| b.1 >= least).max_by(|a, b| a.1.total_cmp(&b.1).then(b.0.cmp(&a.0)))
+    }
+
+    /// The cluster that `i` joins, given the best of each, and how far it agrees with it.
+    fn joins(&self, i: u32, best: &[Option<(u32, f64)>], below: usize) -> Option<(u32, f64)> {
         let rank = |i: u32| (self.sizes[i as usize], Reverse(i));
-        let joins = |i: u32| {
-            let other = best[i as usize].filter(|_| self.sizes[i as usize] < below)?;
-            let (own, size) = (self.sizes[i as usize], self.sizes[other.0 as usize]);
-            let mutual = best[other.0 as usize].is_some_and(|(c, _)| c == i);
-            let small = below < usize::MAX && size >= below;
-            (if mutual { rank(i) < rank(other.0) } else { small || own * TIMES < size }).then_some(other)
-        };
-        (0..best.len() as u32).into_par_iter().map(|i| joins(i).unwrap_or((i, 0.0))).collect()
+        let other = best[i as usize].filter(|_| self.sizes[i as usize] < below)?;
+        let (own, size) = (self.sizes[i as usize], self.sizes[other.0 as usize]);
+        let mutual = best[other.0 as usize].is_some_and(|(c, _)| c == i);
+        let small = below < usize::MAX && size >= below;
+        (if mutual { rank(i) < rank(other.0) } else { small || own * TIMES < size }).then_some(other)
     }
 
     /// Joins clusters that agree by `least` or more; only such as have fewer than `below` members join others. Their distances are
     /// kept between `low` and `high`.
     pub fn join(&mut self, least: f64, below: usize, (low, high): (f64, f64)) {
+        let n = self.sizes.len();
+        let (mut best, mut target): (Vec<_>, Vec<u32>) = (vec![None; n], (0..n as u32).collect());
+        let seen = &mut vec![false; n];
+        // Those that the last round changed. No others have another best, and only they and those near them may join.
+        let mut news = self.left();
         loop {
-            let target = self.round(least, below);
+            let found: Vec<_> = news.par_iter().map(|&i| self.best(i, least)).collect();
+            news.iter().zip(found).for_each(|(&i, found)| best[i as usize] = found);
+            let near = |&i: &u32| self.near[i as usize].iter().map(|&(j, _)| j).chain([i]);
+            let asked = once(news.iter().flat_map(near), seen);
+            let join = |&i: &u32| self.joins(i, &best, below).map(|other| (i, other));
+            let joins: Vec<(u32, (u32, f64))> = asked.par_iter().filter_map(join).collect();
+            if joins.is_empty() {
+                return;
+            }
+            joins.iter().for_each(|&(i, (other, _))| target[i as usize] = other);
             let root = |mut i: u32| {
-                while target[i as usize].0 != i {
-                    i = target[i as usize].0;
+                while target[i as usize] != i {
+                    i = target[i as usize];
                 }
                 i
             };
-            let mut groups: BTreeMap<u32, Vec<u32>> = BTreeMap::new();
-            let joins = (0..target.len() as u32).filter(|&i| target[i as usize].0 != i);
-            joins.for_each(|i| groups.entry(root(i)).or_default().push(i));
-            if groups.is_empty() {
-                return;
-            }
-            let (mut pairs, mut changed) = (Vec::new(), vec![false; target.len()]);
-            for (&to, members) in &groups {
-                members.iter().for_each(|&i| self.join_one(i, target[i as usize], to, (low, high)));
-                for i in members.iter().chain([&to]) {
-                    changed[*i as usize] = true;
-                    let near = std::mem::take(&mut self.near[*i as usize]).into_iter();
-                    pairs.extend(near.map(|(c, _)| root(c)).filter(|&c| c != to).map(|c| (to.min(c), to.max(c))));
-                }
+            let mut joins: Vec<(u32, u32, (u32, f64))> = joins.iter().map(|&(i, other)| (root(i), i, other)).collect();
+            joins.sort_unstable_by_key(|&(to, i, _)| (to, i));
+            joins.iter().for_each(|&(to, i, other)| self.join_one(i, other, to, (low, high)));
+            let changed = once(joins.iter().flat_map(|&(to, i, _)| [to, i]), seen);
+            let mut pairs = Vec::new();
+            for &i in &changed {
+                let (to, near) = (root(i), std::mem::take(&mut self.near[i as usize]));
+                pairs.extend(
+                    near.into_iter().map(|(c, _)| root(c)).filter(|&c| c != to).map(|c| (to.min(c), to.max(c))),
+                );
             }
             pairs.par_sort_unstable();
             pairs.dedup();
-            let mut near_changed = vec![false; target.len()];
-            pairs.iter().for_each(|&(a, b)| (near_changed[a as usize], near_changed[b as usize]) = (true, true));
-            let near = self.near.par_iter_mut().zip(near_changed).filter(|(_, near_changed)| *near_changed);
-            near.for_each(|(near, _)| near.retain(|&(c, _)| !changed[c as usize]));
+            let ends = once(pairs.iter().flat_map(|&(a, b)| [a, b]), seen);
+            changed.iter().for_each(|&i| seen[i as usize] = true);
+            ends.iter().for_each(|&i| self.near[i as usize].retain(|&(c, _)| !seen[c as usize]));
+            changed.iter().for_each(|&i| seen[i as usize] = false);
+            news = once(joins.iter().map(|j| j.0).chain(ends), seen);
+            joins.iter().for_each(|&(_, i, _)| target[i as usize] = i);
             self.compare(&pairs);
         }
     }
@@ -371,8 +405,9 @@ mod tests {
         let pairs: Vec<(u32, u32)> = (1..41).map(|i| (0, i)).collect();
         let mut linkage = Linkage::new(views, &pairs, &UNIT_OF);
         linkage.sizes[0] = 1000;
-        let round = linkage.round(0.5, usize::MAX);
-        assert!((1..41).all(|i| round[i].0 == 0) && round[0].0 == 0);
+        let best: Vec<_> = (0..41).map(|i| linkage.best(i, 0.5)).collect();
+        let joins = |i| linkage.joins(i, &best, usize::MAX).map(|(other, _)| other);
+        assert!((1..41).all(|i| joins(i) == Some(0)) && joins(0).is_none());
         linkage.join(0.5, usize::MAX, ALL);
         assert_eq!(labels(&linkage), [0; 41]);
     }
@@ -420,11 +455,21 @@ mod tests {
         let mut linkage = Linkage::new(first, &[(0, 1), (1, 2), (2, 3)], &UNIT_OF);
         linkage.join(0.7, 2, ALL);
         assert_eq!(labels(&linkage), [0, 0, 1, 1]);
-        linkage.see(vec![profile(&[ONE; 4]), profile(&[ONE, TWO, TWO, TWO])]);
+        linkage.see(vec![profile(&[ONE; 4]), profile(&[ONE, TWO, TWO, TWO])], vec![(0, 1), (1, 2), (2, 3)]);
         linkage.join(0.4, usize::MAX, ALL);
         assert_eq!(labels(&linkage), [0, 0, 1, 1]);
         linkage.join(0.2, usize::MAX, ALL);
         assert_eq!(labels(&linkage), [0; 4]);
+    }
+
+    #[test]
+    fn neighbours_that_no_view_showed_together_are_compared_by_all_views() {
+        let pairs = vec![(0, 1), (1, 2)];
+        let mut linkage = Linkage::new([ONE, None, None].map(|m| profile(&[m])).to_vec(), &pairs, &UNIT_OF);
+        linkage.join(0.7, usize::MAX, ALL);
+        linkage.see([[ONE, ONE], [None, ONE], [None, TWO]].map(|m| profile(&m)).to_vec(), pairs);
+        linkage.join(0.7, usize::MAX, ALL);
+        assert_eq!(labels(&linkage), [0, 0, 1]);
     }
 
     #[test]
