@@ -14,6 +14,7 @@ mod opengaussian;
 mod pairgs;
 mod product;
 mod saga;
+mod silhouettes;
 #[cfg(test)]
 mod testing;
 mod truth;

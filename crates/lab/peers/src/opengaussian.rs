@@ -20,10 +20,10 @@
 use crate::cli::Peer;
 use crate::kmeans::k_means;
 use crate::product::{Grouping, Product};
+use crate::silhouettes::{FeatureTable, Overlaps, best_masks, overlaps};
 use crate::vectors::unit;
 use crate::world::{Inputs, LearnedInputs, World};
 use artifacts::{Features, Level, MaskMaps, Match, flat};
-use cluster_match::{FeatureTable, Overlaps, best_masks, overlaps};
 use gs_io::Result;
 use gs_raster::{TILE, TileWeights, render_features};
 use gs_scene::Camera;
@@ -309,8 +309,8 @@ fn best(found: &Overlaps, view: u32, mixed: &BTreeSet<u32>, threshold: f32) -> V
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::silhouettes::Region;
     use crate::testing::options;
-    use cluster_match::Region;
     use ndarray::arr3;
 
     #[test]

@@ -1,4 +1,4 @@
-//! Which mask of a view shows which instance (paper, "Instance Clustering and Semantic Matching").
+//! Which mask of a view shows which instance, by silhouettes (OpenGaussian).
 //!
 //! One rasterisation of a view serves all instances. The silhouette of an instance is where the instance rendered alone
 //! has alpha > 0.8: per pixel, 1 - prod(1 - alpha_i) over its own Gaussians, hidden ones included (OpenGaussian's rule).

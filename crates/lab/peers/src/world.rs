@@ -3,11 +3,11 @@
 #![allow(rustdoc::invalid_html_tags, reason = "help texts name files as <view>_s.npy")]
 
 use crate::cli::Peer;
+use crate::silhouettes::{FeatureTable, matches, overlaps};
 use artifacts::{
     Descriptors, Features, Footprints, Graph, LEVELS, Level, MaskFeatures, MaskFolder, MaskMaps, Match, Row,
     features_path, flat, hash_folder, role,
 };
-use cluster_match::{FeatureTable, matches, overlaps};
 use gs_io::{Claim, Error, Result, Watched, hash_file};
 use gs_raster::{RasterOptions, TileWeights, tile_weights};
 use gs_scene::dataset::{self, Dataset, LoadOptions, Resolution, View};
@@ -229,8 +229,8 @@ impl World {
         labels
     }
 
-    /// Matches instances with masks as `cluster-match` does, for systems without a rule of their own: in each view the mask with
-    /// the largest IoU, where that exceeds `threshold`. `labels` are those of all Gaussians.
+    /// Matches instances with masks, for systems without a rule of their own: in each view the mask with the largest IoU, where that
+    /// exceeds `threshold`. `labels` are those of all Gaussians.
     pub fn matches(&self, labels: &[i32], threshold: f32) -> Result<Vec<Match>> {
         let none = Features::none(&self.footprints.kept);
         let table = FeatureTable::new(&none, self.gaussians());

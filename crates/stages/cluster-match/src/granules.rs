@@ -5,7 +5,9 @@
 //! mask fits in two views or more can be asked for, and these masks say what it means.
 
 use crate::describe::Witnesses;
-use artifacts::{Footprints, Granule, LEVELS, Members, Witness};
+use crate::matching::Likeness;
+use crate::profile::Sums;
+use artifacts::{Footprints, Granule, LEVELS, Level, Members, Witness};
 use gs_io::Result;
 use rayon::prelude::*;
 use std::collections::{BTreeMap, HashMap};
@@ -58,17 +60,17 @@ impl Candidates {
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(crate) struct Shown {
     pub row: u32,
-    /// Their IoU, 0 to 1.
+    /// Their IoU, 0 to 1, times how alike they are.
     pub fit: f64,
-    /// Weight of what the view shows of the candidate.
-    seen: f64,
+    /// Weight of what the view shows of the candidate: about its visible pixels.
+    pub seen: f64,
 }
 
 /// A granule, and its mask in each view that shows it.
 pub(crate) type Witnessed = (Granule, Vec<Shown>);
 
 /// Finds what masks of at least `views` views show as one, what they show best and most often first, with these masks; nothing for 0 views.
-/// And how well masks fit each instance, 0 to 1, as [`Granule::fit`]. `labels` and `nodes` are those of the kept Gaussians.
+/// And of each instance how well masks fit it, 0 to 1, as [`Granule::fit`], with these. `labels` and `nodes` are those of the kept Gaussians.
 ///
 /// # Errors
 /// When the footprints can't be read.
@@ -78,19 +80,37 @@ pub(crate) fn find(
     nodes: &[i32],
     footprints: &Footprints,
     views: usize,
-) -> Result<(Vec<Witnessed>, Vec<f32>)> {
-    let best = best_masks(candidates, labels, nodes, footprints)?;
-    let (mut found, mut fits) = (Vec::new(), Vec::new());
+) -> Result<(Vec<Witnessed>, Vec<(f32, Vec<Shown>)>)> {
+    let best = best_masks(candidates, labels, nodes, footprints, &Level::ALL, &|_, _| 1.0)?;
+    let (mut found, mut instances) = (Vec::new(), Vec::new());
     for (&members, mut shown) in candidates.members.iter().zip(best) {
         let fit = fit(&mut shown);
         if let Members::Instance(_) = members {
-            fits.push(fit);
+            instances.push((fit, shown.clone()));
         }
         found.extend(judge(members, fit, shown, views));
     }
     // Of equals the first.
     found.sort_by(|a, b| b.0.total_cmp(&a.0));
-    Ok((different(found), fits))
+    Ok((different(found), instances))
+}
+
+/// The mask at `levels` of each view that fits each instance best, times how alike they are. `labels` are those of the kept Gaussians.
+///
+/// # Errors
+/// When the footprints can't be read.
+pub(crate) fn best_at(
+    levels: &[Level],
+    labels: &[i32],
+    count: usize,
+    footprints: &Footprints,
+    likeness: &Likeness,
+) -> Result<Vec<Vec<Shown>>> {
+    let nodes = vec![-1; labels.len()];
+    let candidates = Candidates::new(labels, count, &nodes, &BTreeMap::new());
+    let mut best = best_masks(&candidates, labels, &nodes, footprints, levels, &|k, row| likeness.of(k, row))?;
+    best.iter_mut().for_each(|shown| _ = fit(shown));
+    Ok(best)
 }
 
 /// The masks that say what each granule means, `most` of each, 0 for all. One that fits twice as well counts four times.
@@ -124,7 +144,7 @@ fn fit(shown: &mut Vec<Shown>) -> f32 {
 pub(crate) fn are_shown(labels: &[i32], count: usize, footprints: &Footprints, views: usize) -> Result<Vec<bool>> {
     let nodes = vec![-1; labels.len()];
     let candidates = Candidates::new(labels, count, &nodes, &BTreeMap::new());
-    let best = best_masks(&candidates, labels, &nodes, footprints)?;
+    let best = best_masks(&candidates, labels, &nodes, footprints, &Level::ALL, &|_, _| 1.0)?;
     let is_shown = |(&m, mut shown): (&Members, Vec<Shown>)| {
         let fit = fit(&mut shown);
         judge(m, fit, shown, views).is_some()
@@ -132,17 +152,25 @@ pub(crate) fn are_shown(labels: &[i32], count: usize, footprints: &Footprints, v
     Ok(candidates.members.iter().zip(best).map(is_shown).collect())
 }
 
-/// The mask that fits each candidate best, of each view that shows it.
-fn best_masks(c: &Candidates, labels: &[i32], nodes: &[i32], footprints: &Footprints) -> Result<Vec<Vec<Shown>>> {
+/// The mask at `levels` that fits each candidate best, of each view that shows it. `like` says how alike a candidate and a row are.
+fn best_masks(
+    c: &Candidates,
+    labels: &[i32],
+    nodes: &[i32],
+    footprints: &Footprints,
+    levels: &[Level],
+    like: &impl Fn(u32, u32) -> f64,
+) -> Result<Vec<Vec<Shown>>> {
     let mut best: Vec<Vec<Shown>> = vec![Vec::new(); c.members.len()];
     let mut first = 0;
     for rows in footprints.rows.chunk_by(|a, b| a.view == b.view) {
         let masks = (first..first + rows.len())
             .into_par_iter()
-            .map(|r| Mask::new(r, c, labels, nodes, footprints))
+            .filter(|&r| footprints.rows[r].is_of(levels))
+            .map_init(Default::default, |sums, r| Mask::new(r, c, labels, nodes, footprints, sums))
             .collect::<Result<Vec<Mask>>>()?;
         first += rows.len();
-        best_of_view(&masks, &mut best);
+        best_of_view(&masks, like, &mut best);
     }
     Ok(best)
 }
@@ -158,27 +186,32 @@ struct Mask {
 }
 
 impl Mask {
-    fn new(row: usize, c: &Candidates, labels: &[i32], nodes: &[i32], footprints: &Footprints) -> Result<Self> {
-        let (mut by_node, mut of): (BTreeMap<i32, f64>, BTreeMap<u32, f64>) = Default::default();
+    fn new(
+        row: usize,
+        c: &Candidates,
+        labels: &[i32],
+        nodes: &[i32],
+        footprints: &Footprints,
+        sums: &mut (Sums, Sums),
+    ) -> Result<Self> {
+        let (by_node, of) = sums;
         let mut area = 0.0;
         for (i, w) in footprints.entries(row)?.iter() {
             let w = f64::from(w);
             area += w;
-            *by_node.entry(nodes[i as usize]).or_default() += w;
-            if let Ok(instance) = u32::try_from(labels[i as usize]) {
-                *of.entry(instance).or_default() += w;
-            }
+            by_node.add(nodes[i as usize], w);
+            of.add(labels[i as usize], w);
         }
-        for (node, w) in by_node {
-            c.above.get(&node).into_iter().flatten().for_each(|&own| *of.entry(own).or_default() += w);
+        for (node, w) in by_node.take() {
+            c.above.get(&(node as i32)).into_iter().flatten().for_each(|&own| of.add(own as i32, w));
         }
-        Ok(Self { row: row as u32, level: footprints.rows[row].level, area, of: of.into_iter().collect() })
+        Ok(Self { row: row as u32, level: footprints.rows[row].level, area, of: of.take().collect() })
     }
 }
 
 /// Adds the mask of a view that fits each candidate best, of equals the first. What a view shows of a candidate is what the masks of
 /// a level hold of it, of that level which holds most.
-fn best_of_view(masks: &[Mask], best: &mut [Vec<Shown>]) {
+fn best_of_view(masks: &[Mask], like: &impl Fn(u32, u32) -> f64, best: &mut [Vec<Shown>]) {
     let mut seen: HashMap<u32, [f64; LEVELS]> = HashMap::new();
     for m in masks {
         m.of.iter().for_each(|&(c, w)| seen.entry(c).or_default()[m.level as usize] += w);
@@ -187,7 +220,7 @@ fn best_of_view(masks: &[Mask], best: &mut [Vec<Shown>]) {
     for m in masks {
         for &(c, w) in m.of.iter().filter(|(_, w)| *w > 0.0) {
             let seen = seen[&c].into_iter().fold(0.0, f64::max);
-            let shown = Shown { row: m.row, fit: w / (seen + m.area - w), seen };
+            let shown = Shown { row: m.row, fit: w / (seen + m.area - w) * like(c, m.row), seen };
             let now = of_view.entry(c).or_insert(shown);
             if shown.fit > now.fit {
                 *now = shown;
@@ -226,7 +259,7 @@ fn different(found: Vec<(f64, Granule, Vec<Shown>)>) -> Vec<Witnessed> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use artifacts::{FootprintsBuilder, Level, Row};
+    use artifacts::{FootprintsBuilder, Row};
     use gs_io::Provenance;
 
     const PARENTS: [(u32, u32); 4] = [(11, 10), (12, 10), (13, 11), (14, 11)];
@@ -278,7 +311,8 @@ mod tests {
     fn the_fit_of_an_instance_is_the_mean_over_its_views() {
         let (_dir, f) = footprints(&[(Level::Large, 0..4), (Level::Large, 4..11)]);
         let candidates = Candidates::new(&LABELS, 2, &NODES, &PARENTS.into());
-        let (none, fits) = find(&candidates, &LABELS, &NODES, &f, 0).unwrap();
+        let (none, instances) = find(&candidates, &LABELS, &NODES, &f, 0).unwrap();
+        let fits: Vec<f32> = instances.iter().map(|(fit, _)| *fit).collect();
         // 4 of 7 Gaussians in two views; the third shows no handle, and there a mask is the whole instance.
         let expected = ((4.0 / 7.0 * 2.0 + 1.0) / 3.0) as f32;
         assert!(none.is_empty() && fits.iter().all(|fit| (fit - expected).abs() < 1e-6) && fits.len() == 2, "{fits:?}");

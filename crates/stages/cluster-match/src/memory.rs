@@ -4,7 +4,6 @@ use crate::inputs::Inputs;
 use crate::linkage::MOST_ENTRIES;
 use crate::options::{Settings, Space};
 use artifacts::Level;
-use gs_raster::tile_bytes;
 
 /// Bytes that a run takes, and for each Gaussian.
 const BASE: u64 = 12_800_000;
@@ -35,9 +34,5 @@ pub fn forecast(inputs: &Inputs, settings: &Settings) -> u64 {
         Space::Free => (18, batch.max(parts)),
     };
     // Fitted to 11 runs of 5,000 to 950,000 Gaussians; by the masks to 11 of 12,000 to 950,000.
-    // The id maps' pixels, as far as masks cover them: those of the first view speak for all.
-    let covered =
-        |level| footprints.rows.iter().filter(|r| r.view == 0 && r.is_of(&[level])).map(|r| u64::from(r.pixels)).sum();
-    let pixels = Level::ALL.into_iter().map(covered).max().unwrap_or(0);
-    least(gaussians as u64) + tile_bytes(gaussians as u64, pixels) + entries + 14 * samples + value * kept * dim
+    least(gaussians as u64) + entries + 14 * samples + value * kept * dim
 }

