@@ -5,6 +5,8 @@
 #:  AXES=RDF            where the axes x, y, z of GEOMETRY point [told by the photographs; without SCENE, as its format says]
 #:  MASKS=folder        use these id maps (*_s.npy) instead of running SAM
 #:  PANOPTIC=folder     a panoptic model beside SAM, which says what its masks show (docs/masks.md)
+#:  CONCEPTS=folder     SAM 3 beside SAM, which finds what nouns name (docs/masks.md)
+#:  NOUNS=file          those nouns, one a line [VOCABULARY, else about 1,200 everyday ones: slow]
 #:  CLIP=folder         image.onnx and text.onnx of a CLIP model [models/clip, if there]; without it no text queries
 #:  VOCABULARY=file     names that things may have, one a line [about 1,200 everyday ones]
 #:  QUERIES="red_mug …" texts to ask for, with underscores for spaces, without quotes
@@ -36,9 +38,10 @@ ifneq ($(MASKS),)
 $(error MASKS=$(MASKS): without SCENE there are no photographs that these masks could be of: leave MASKS out, or give SCENE)
 endif
 endif
+NOUNS ?= $(VOCABULARY)
 CLIP ?= $(patsubst %/,%,$(dir $(wildcard models/clip/text.onnx)))
 
-SETTINGS := QUALITY SCENE PHOTOGRAPHS POSES_ARGS GEOMETRY AXES MASKS CLIP SAM PANOPTIC VOCABULARY QUERIES RESOLUTION ITERATIONS SEED \
+SETTINGS := QUALITY SCENE PHOTOGRAPHS POSES_ARGS GEOMETRY AXES MASKS CLIP SAM PANOPTIC CONCEPTS NOUNS VOCABULARY QUERIES RESOLUTION ITERATIONS SEED \
   GEOM_ARGS VIEW_ARGS MASK_ARGS EMBED_ARGS GRAPH_ARGS FEAT_ARGS CLUSTER_ARGS SCORE_ARGS REPORT_ARGS
 include pipelines/settings.mk
 

@@ -1,7 +1,7 @@
 # The folders and files that people name on the command line, taken as they are: make would expand a $ in them, and a shell
 # backticks. Recipes read those that may have any name from the environment, as "$$SCENE". Include this first.
 
-PATHS := SCENE OUT INTO DATA TABLE PLAN CONF MASKS GEOMETRY CLIP SAM PANOPTIC TEXTS VOCABULARY PHOTOGRAPHS
+PATHS := SCENE OUT INTO DATA TABLE PLAN CONF MASKS GEOMETRY CLIP SAM PANOPTIC CONCEPTS NOUNS TEXTS VOCABULARY PHOTOGRAPHS
 
 define newline
 
@@ -22,4 +22,4 @@ $(foreach v,OUT INTO DATA TABLE PLAN CONF MASKS,$(call plain,$v))
 $(if $(CONF),$(if $(wildcard $(CONF)),,$(error CONF=$(CONF): no such file)))
 
 # Which of them must be there (scripts/check_settings.sh); later ones may be made.
-export GIVEN := $(foreach v,SCENE PHOTOGRAPHS GEOMETRY MASKS CLIP PANOPTIC TEXTS VOCABULARY,$(if $($v),$v))
+export GIVEN := $(foreach v,SCENE PHOTOGRAPHS GEOMETRY MASKS CLIP PANOPTIC CONCEPTS NOUNS TEXTS VOCABULARY,$(if $($v),$v))

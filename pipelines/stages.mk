@@ -55,7 +55,7 @@ GEOMETRY_DONE := $(OPTIONS)/geometry.files
 endif
 # The id maps, where SAM makes them.
 SAM_MAKES := $(filter $(OUT)/masks/masks.json,$(MASKS_DONE))
-export SAM_MAKES SCENE DATASET PHOTOGRAPHS OUT MASKS GEOMETRY SPLAT AXES CLIP SAM PANOPTIC TEXTS VOCABULARY QUERIES SEED THREADS
+export SAM_MAKES SCENE DATASET PHOTOGRAPHS OUT MASKS GEOMETRY SPLAT AXES CLIP SAM PANOPTIC CONCEPTS NOUNS TEXTS VOCABULARY QUERIES SEED THREADS
 export POSES_ARGS GEOM_ARGS VIEW_ARGS MASK_ARGS EMBED_ARGS GRAPH_ARGS FEAT_ARGS CLUSTER_ARGS SCORE_ARGS REPORT_ARGS EVAL_ARGS SYNTH_ARGS
 
 .DEFAULT_GOAL := all
@@ -85,6 +85,7 @@ masks_FILES = $(call list,$(MASKS)/,'*_s.[nj]*')
 # Not the text features that programs keep there.
 clip_FILES = $(call list,$(call arg,CLIP)/,'*' ! -name 'cags-texts-*')
 panoptic_FILES = find -L $(call arg,PANOPTIC) -type f -printf '%s %T@ %p\n' | LC_ALL=C sort
+concepts_FILES = find -L $(call arg,CONCEPTS) $(call arg,NOUNS) -type f -printf '%s %T@ %p\n' | LC_ALL=C sort
 texts_FILES = $(call list,$(call arg,TEXTS),'*')
 vocabulary_FILES = $(call list,$(call arg,VOCABULARY),'*')
 
@@ -102,7 +103,7 @@ feat_OPTIONS := $(if $(findstring --preset,$(FEAT_ARGS)),,$(FEAT_QUALITY)) $(FEA
 cluster_OPTIONS := $(call unless,CLUSTER_ARGS,$(CLUSTER_QUALITY)) $(CLUSTER_ARGS) $(SEED_ARGS)
 embed_OPTIONS := $(CLIP) $(EMBED_ARGS)
 masks_ARGS := $(call unless,MASK_ARGS,$(MASK_QUALITY)) $(MASK_ARGS)
-masks_OPTIONS := $(SAM) $(PANOPTIC) $(masks_ARGS)
+masks_OPTIONS := $(SAM) $(PANOPTIC) $(CONCEPTS) $(if $(CONCEPTS),$(NOUNS)) $(masks_ARGS)
 score_OPTIONS := $(CLIP) $(SCORE_ARGS)
 protocol_OPTIONS := $(PROTOCOL) $(CLIP) $(TEXTS) $(SCORE_ARGS)
 queries_OPTIONS := $(CLIP) $(QUERIES)
@@ -121,8 +122,8 @@ splat_RUN = $(BIN)/gs-geom convert $(call arg,SPLAT) $(GEOMETRY) $(if $(AXES),--
 views_RUN = $(BIN)/gs-geom views --geometry $(call arg,GEOMETRY) --out $(SCENE) $(views_OPTIONS) $(COMMON)
 metrics_RUN = $(BIN)/gs-geom eval --scene $(call arg,POSED) --geometry $(call arg,GEOMETRY) --out $(OUT)/geom_metrics.json \
   $(EVAL_ARGS) $(COMMON)
-masks_RUN = $(BIN)/mask-embed masks --scene $(call arg,DATASET) --sam $(call arg,SAM) $(if $(PANOPTIC),--panoptic $(call arg,PANOPTIC)) --out $(MASKS) \
-  $(masks_ARGS) $(COMMON)
+masks_RUN = $(BIN)/mask-embed masks --scene $(call arg,DATASET) --sam $(call arg,SAM) $(if $(PANOPTIC),--panoptic $(call arg,PANOPTIC)) \
+  $(if $(CONCEPTS),--concepts $(call arg,CONCEPTS) $(if $(NOUNS),--nouns $(call arg,NOUNS))) --out $(MASKS) $(masks_ARGS) $(COMMON)
 embed_RUN = $(BIN)/mask-embed embed --scene $(call arg,DATASET) --masks $(MASKS) --clip $(call arg,CLIP) $(EMBED_ARGS) $(COMMON)
 graph_RUN = $(BIN)/graph-precompute --scene $(call arg,POSED) --geometry $(call arg,GEOMETRY) --masks $(MASKS) \
   --footprints $(FOOTPRINTS) --graph $(GRAPH) $(graph_OPTIONS) $(COMMON)
@@ -187,7 +188,7 @@ $(VIEWS_MADE): $(GEOMETRY_DONE) $(OPTIONS)/views | $(BIN)/gs-geom
 endif
 
 # Stage 0: id maps, where the data set has none.
-$(OUT)/masks/masks.json: $(SCENE_FILES) $(OPTIONS)/masks $(if $(PANOPTIC),$(OPTIONS)/panoptic.files) | $(BIN)/mask-embed
+$(OUT)/masks/masks.json: $(SCENE_FILES) $(OPTIONS)/masks $(if $(PANOPTIC),$(OPTIONS)/panoptic.files) $(if $(CONCEPTS),$(OPTIONS)/concepts.files) | $(BIN)/mask-embed
 	$(masks_RUN)
 
 # Stage 3 up to language, and CLIP features of the masks that instances are described by.
@@ -235,8 +236,8 @@ $(QUERY): $(INSTANCES) $(OPTIONS)/queries | $(BIN)/eval
 	$(query_RUN)
 endif
 
-# What every instance is called, by a vocabulary or by a panoptic model.
-ifneq ($(CLIP)$(and $(SAM_MAKES),$(PANOPTIC)),)
+# What every instance is called, by a vocabulary or by masks with names.
+ifneq ($(CLIP)$(and $(SAM_MAKES),$(PANOPTIC)$(CONCEPTS)),)
 NAMES := $(OUT)/names.json
 $(NAMES): $(INSTANCES) $(OPTIONS)/names $(if $(VOCABULARY),$(OPTIONS)/vocabulary.files) | $(BIN)/eval
 	$(names_RUN)

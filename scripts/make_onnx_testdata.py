@@ -16,6 +16,8 @@ crates/stages/mask-embed/testdata/edge-sam/      the same as EdgeSAM's
 crates/stages/mask-embed/testdata/sam-tiny/      a decoder with SAM's architecture and names, narrow and with random weights
 crates/stages/mask-embed/testdata/panoptic-*/    panoptic segmenters by colour with the inputs and outputs of DETR, Mask2Former,
                                                  OneFormer and EoMT, and the segments of a photograph by transformers
+crates/stages/mask-embed/testdata/concepts-*/    segmenters of what nouns name, by colour, with the inputs and outputs of exports of SAM 3
+                                                 and EfficientSAM3, and what they see of that photograph
 
 The segments need torch, transformers and pillow too, EoMT's a transformers that has it (4.53); without, those there stay.
 """
@@ -667,6 +669,176 @@ def panoptic():
         panoptic_segments(family, folder)
 
 
+# Words that have a colour, with their id in CLIP's vocabulary: presence, then weights of red, green and blue, a sum and a logit for
+# each of three queries. The second sees the same, less surely; the third is not sure enough.
+WORDS = {
+    "sky": (2390, 4, [[-4, 0, 6, -3, 3], [-4, 0, 6, -2.5, 1], [-4, 0, 6, -2, -1]]),
+    "grass": (5922, 4, [[-4, 6, -2, -3, 4], [-4, 6, -2, -2.5, 1], [0, 0, 0, 9, -2]]),
+    "car": (1615, 3, [[5, -4, -3, -4, 2], [5, -4, -3, -3.5, 1], [0, 0, 0, 9, -2]]),
+    "roof": (6449, 4, [[4, 6, -4, -3, 2], [4, 6, -4, -2.5, 1], [0, 0, 0, 9, -2]]),
+    # The car by another name, less sure.
+    "vehicle": (5299, 2, [[5, -4, -3, -3.5, 1], [5, -4, -3, -4, 0.5], [0, 0, 0, 9, -2]]),
+    # All over, so that the others cover most of it.
+    "room": (1530, 2, [[0, 0, 0, 3, 1], [0, 0, 0, 3, -1], [0, 0, 0, 3, -1]]),
+}
+CONCEPTS = {
+    "samexporter": {
+        "files": ["sam3_image_encoder", "sam3_language_encoder", "sam3_decoder"], "context": 32, "bytes": True,
+        "image": [f"{name}_{i}" for name in ["vision_pos_enc", "backbone_fpn"] for i in range(3)],
+        "text": ["text_attention_mask", "text_memory", "text_embeds"],
+        "taken": ["language_mask", "language_features", "language_embeds"],
+        "boxes": [("box_coords", F, [8, 1, 4]), ("box_labels", I64, [8, 1]), ("box_masks", TensorProto.BOOL, [1, 8])],
+        "sizes": ["original_height", "original_width"], "presence": "presence_logit_dec",
+    },
+    # The page names no inputs for exemplars, nor outputs of the image encoder: these are made up.
+    "pixl": {
+        "files": [f"efficientsam3_ev_m_{name}" for name in ["image_encoder", "text_encoder", "decoder"]], "context": 16, "bytes": False,
+        "image": [f"{name}_{i}" for name in ["pos", "fpn"] for i in range(3)],
+        "text": ["language_padding", "language_features", "language_embeds"],
+        "taken": ["language_padding", "language_features", "language_embeds"],
+        "boxes": [("exemplar_boxes", F, [1, 8, 4]), ("exemplar_labels", I64, [1, 8]), ("exemplar_mask", TensorProto.BOOL, [1, 8])],
+        "sizes": [], "presence": "presence_logit",
+    },
+}
+
+
+def concepts_graphs(of, folder):
+    """Three graphs: features of the picture are its colours, those of a text the words it has, a mask of each word's queries."""
+    node, words = helper.make_node, len(WORDS)
+    context, image, text, taken = of["context"], of["image"], of["text"], of["taken"]
+    shapes = [[1, 3, 16 >> i, 24 >> i] for i in range(3)]
+    begin = [node("Unsqueeze", ["image", "first"], ["one"])] if of["bytes"] else []
+    floats = [node("Cast", ["one"], ["floats"], to=F), node("Div", ["floats", "half"], ["to_two"]), node("Sub", ["to_two", "unit"], ["input"])] if of["bytes"] else []
+    pools = [node("AveragePool", ["input" if of["bytes"] else "image"], [image[3]], kernel_shape=[4, 4], strides=[4, 4])]
+    pools += [node("AveragePool", [image[2 + i]], [image[3 + i]], kernel_shape=[2, 2], strides=[2, 2]) for i in (1, 2)]
+    write(
+        folder / f"{of['files'][0]}.onnx",
+        [*begin, *floats, *pools, *[node("Sub", [image[3 + i]] * 2, [image[i]]) for i in range(3)]],
+        [value("image", TensorProto.UINT8, [3, 64, 96]) if of["bytes"] else value("image", F, [1, 3, 64, 96])],
+        [value(name, F, shape) for name, shape in zip(image, shapes * 2)],
+        [constant("first", np.array([0], np.int64)), constant("half", np.float32(127.5)), constant("unit", np.float32(1))],
+    )
+    text_values = [(TensorProto.BOOL, [1, context]), (F, [context, 1, words]), (F, [context, 1, 2])]
+    write(
+        folder / f"{of['files'][1]}.onnx",
+        [
+            node("Equal", ["tokens", "zero"], [text[0]]),
+            node("Unsqueeze", ["tokens", "last"], ["each"]),
+            node("Equal", ["each", "ids"], ["is_word"]),
+            node("Cast", ["is_word"], ["words"], to=F),
+            node("Transpose", ["words"], [text[1]], perm=[1, 0, 2]),
+            node("Cast", ["each"], ["numbers"], to=F),
+            node("Transpose", ["numbers"], ["numbers_first"], perm=[1, 0, 2]),
+            node("Concat", ["numbers_first", "numbers_first"], [text[2]], axis=2),
+        ],
+        [value("tokens", I64, [1, context])],
+        [value(name, *v) for name, v in zip(text, text_values)],
+        [constant("zero", np.int64(0)), constant("last", np.array([2], np.int64)), constant("ids", np.array([w[0] for w in WORDS.values()], np.int64))],
+    )
+    queries = np.array([w[2] for w in WORDS.values()], np.float32)
+    # Nothing is present without a known word, or with a box that is not masked.
+    presence = np.array([[w[1] + 4] for w in WORDS.values()], np.float32)
+    boxes = [name for name, _, _ in of["boxes"]]
+    write(
+        folder / f"{of['files'][2]}.onnx",
+        [
+            node("Not", [taken[0]], ["counts"]),
+            node("Cast", ["counts"], ["weights"], to=F),
+            node("Unsqueeze", ["weights", "last"], ["weights_last"]),
+            node("Transpose", ["weights_last"], ["weights_first"], perm=[1, 0, 2]),
+            node("Mul", [taken[1], "weights_first"], ["known"]),
+            node("ReduceMax", ["known"], ["words"], axes=[0], keepdims=0),
+            node("MatMul", ["words", "table"], ["flat"]),
+            node("Reshape", ["flat", "by_query"], ["of_queries"]),
+            node("Split", ["of_queries", "parts"], ["colors", "surety"], axis=2),
+            node("Add", [image[3], image[0]], ["features"]),
+            node("Reshape", ["features", "by_color"], ["lines"]),
+            node("Concat", ["lines", "ones"], ["with_one"], axis=1),
+            node("MatMul", ["colors", "with_one"], ["planes"]),
+            node("Reshape", ["planes", "by_plane"], ["pred_masks"]),
+            node("Cast", [boxes[2]], ["masked"], to=F),
+            node("ReduceSum", ["masked"], ["count"], keepdims=0),
+            node("Cast", [boxes[1]], ["labels"], to=F),
+            node("ReduceSum", ["labels"], ["sum"], keepdims=0),
+            node("ReduceMax", [boxes[0]], ["corner"], keepdims=0),
+            node("Sum", ["count", "sum"], ["slots"]),
+            node("Mul", ["slots", "ten"], ["tens"]),
+            node("Sum", ["tens", "corner", "none"], ["off"]),
+            node("MatMul", ["words", "presence"], ["present"]),
+            node("Add", ["present", "off"], [of["presence"]]),
+            node("Identity", ["surety"], ["pred_logits"]),
+            node("Identity", ["zeros"], ["pred_boxes"]),
+        ],
+        [
+            *[value(name, I64, []) for name in of["sizes"]],
+            *[value(name, F, shape) for name, shape in zip(image, shapes * 2)],
+            *[value(name, *v) for name, v in zip(taken, text_values)],
+            *[value(*box) for box in of["boxes"]],
+        ],
+        [value("pred_boxes", F, [1, 3, 4]), value("pred_logits", F, [1, 3, 1]), value("pred_masks", F, [1, 3, 16, 24]), value(of["presence"], F, [1, 1])],
+        [
+            constant("last", np.array([2], np.int64)), constant("table", queries.reshape(words, 15)), constant("presence", presence),
+            constant("by_query", np.array([1, 3, 5])), constant("by_color", np.array([1, 3, 384])), constant("by_plane", np.array([1, 3, 16, 24])),
+            constant("parts", np.array([4, 1])), constant("ones", np.ones((1, 1, 384), np.float32)),
+            constant("zeros", np.zeros((1, 3, 4), np.float32)), constant("ten", np.float32(10)), constant("none", np.float32(-164)),
+        ],
+    )
+
+
+def enlarge(plane, width, height):
+    """Linearly, by the centres of pixels."""
+    for axis, size in enumerate((height, width)):
+        last = plane.shape[axis] - 1
+        at = np.clip((np.arange(size) + 0.5) / size * (last + 1) - 0.5, 0, last)
+        low = np.floor(at).astype(int)
+        part = (at - low).reshape((-1, 1) if axis == 0 else (1, -1))
+        plane = np.take(plane, low, axis) * (1 - part) + np.take(plane, np.minimum(low + 1, last), axis) * part
+    return plane
+
+
+def concepts_segments(of, folder):
+    """What the graphs see of the photograph: from the surest on each gets what is free of its mask, where that is more than half."""
+    from onnx.reference import ReferenceEvaluator
+    from PIL import Image
+
+    image, text, decoder = [ReferenceEvaluator(str(folder / f"{name}.onnx")) for name in of["files"]]
+    sigmoid = lambda x: 1 / (1 + np.exp(-np.asarray(x, float)))
+    photo = panoptic_photo().transpose(2, 0, 1)
+    seen = dict(zip(of["image"], image.run(None, {"image": photo if of["bytes"] else (photo[None] / np.float32(127.5) - np.float32(1))})))
+    found = []
+    for word, (token, _, _) in WORDS.items():
+        tokens = np.zeros((1, of["context"]), np.int64)
+        tokens[0, :3] = 49406, token, 49407
+        inputs = {**seen, **dict(zip(of["taken"], text.run(None, {"tokens": tokens})))}
+        inputs |= {name: np.zeros(shape, np.float32) if kind == F else np.ones(shape, bool if kind == TensorProto.BOOL else np.int64) for name, kind, shape in of["boxes"]}
+        inputs |= {name: np.array(1008) for name in of["sizes"]}
+        _, logits, masks, presence = decoder.run(None, inputs)
+        scores = sigmoid(logits[0, :, 0]) * sigmoid(presence[0, 0])
+        found += [(word, score, sigmoid(enlarge(mask, *PANOPTIC_MAP))) for score, mask in zip(scores, masks[0]) if score > 0.5]
+    ids, segments = np.full(PANOPTIC_MAP[::-1], -1), []
+    for word, score, mask in sorted(found, key=lambda f: -f[1]):
+        mask = mask > 0.5
+        free = mask & (ids < 0)
+        if free.sum() > 0.5 * mask.sum():
+            ids[free] = len(segments)
+            segments.append({"name": word, "score": float(score)})
+    print(f"{folder.name}: {[(w, round(float(s), 3)) for w, s, _ in found]}, left {segments}, {np.bincount(ids.ravel() + 1)} pixels of none and of each")
+    (folder / "segments.json").write_text(json.dumps(segments, indent=2) + "\n")
+    Image.fromarray(panoptic_photo()).save(folder / "photo.png")
+    Image.fromarray((ids + 1).astype(np.uint8)).save(folder / "ids.png")
+
+
+def concepts():
+    for name, of in CONCEPTS.items():
+        folder = ROOT / f"crates/stages/mask-embed/testdata/concepts-{name}"
+        concepts_graphs(of, folder)
+        concepts_segments(of, folder)
+        if name != "samexporter":
+            content = dict(zip(["image", "text", "decoder"], [f"{name}.onnx" for name in of["files"]]))
+            content["constants"] = {name: int(kind != F) for name, kind, _ in of["boxes"]}
+            (folder / "model.json").write_text(json.dumps(content, indent=2) + "\n")
+
+
 if __name__ == "__main__":
     ops()
     argmax()
@@ -676,3 +848,4 @@ if __name__ == "__main__":
     exports()
     sam_tiny()
     panoptic()
+    concepts()

@@ -210,6 +210,7 @@ wrong QUERIES "'red mug' plate" 'no quotes around them'
 wrong RESOLUTION 64O 'not a resolution'
 wrong SEED x 'expected a number'
 wrong SAM "$work/nowhere" 'no SAM model' MASKS=
+for setting in PANOPTIC CONCEPTS NOUNS; do wrong $setting "$work/nowhere" 'no such file or folder' MASKS=; done
 [ ! -e "$work/wrong/geometry.ply" ] && [ ! -e "$work/wrong/.options" ] || fail "a stage ran with wrong options"
 pass "an option that cannot be meant is refused by the name of its setting before a stage runs"
 

@@ -32,7 +32,7 @@ const FILES: [(&str, &str); 16] = carried![
 ];
 
 /// Settings that name a folder or file.
-const PATHS: [&str; 7] = ["GEOMETRY", "MASKS", "CLIP", "SAM", "PANOPTIC", "VOCABULARY", "CONF"];
+const PATHS: [&str; 9] = ["GEOMETRY", "MASKS", "CLIP", "SAM", "PANOPTIC", "CONCEPTS", "NOUNS", "VOCABULARY", "CONF"];
 /// All others.
 const OTHERS: [&str; 15] = [
     "POSES_ARGS",

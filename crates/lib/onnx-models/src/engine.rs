@@ -57,7 +57,7 @@ pub enum Outputs<'a> {
 pub enum Kind {
     /// 32-bit floats.
     Float,
-    /// Integers of 32 or 64 bits.
+    /// Integers of 32 or 64 bits; 8-bit numbers from 0; truth values, as 0 and 1.
     Integer,
     /// Anything else.
     Other,

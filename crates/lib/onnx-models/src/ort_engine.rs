@@ -13,14 +13,22 @@ use std::sync::{Mutex, PoisonError};
 /// The library that this process has loaded; there can be only one.
 static LOADED: Mutex<Option<(PathBuf, Environment)>> = Mutex::new(None);
 
+/// Integers as an input has them.
+enum Integers {
+    I64(Vec<i64>),
+    I32(Vec<i32>),
+    U8(Vec<u8>),
+    Bool(Vec<bool>),
+}
+
 const TELEMETRY: &str = "ORT_DISABLE_TELEMETRY";
 
 struct OrtModel {
     path: PathBuf,
     inputs: Vec<ValueInfo>,
     outputs: Vec<ValueInfo>,
-    /// Element type of each input that is integer, to widen or narrow to.
-    wide: Vec<bool>,
+    /// Element type of each input, to convert integers to.
+    types: Vec<TensorElementType>,
     session: Mutex<Session>,
 }
 
@@ -82,9 +90,12 @@ pub(crate) fn open(
             found.map(info).ok_or_else(|| Error::new("no such output").file(path).field(n))
         })
         .collect::<Result<Vec<_>>>()?;
-    let is_i64 = |o: &Outlet| matches!(o.dtype(), ValueType::Tensor { ty: TensorElementType::Int64, .. });
-    let wide = session.inputs().iter().map(is_i64).collect();
-    Ok(Box::new(OrtModel { path: path.to_path_buf(), inputs, outputs, wide, session: Mutex::new(session) }))
+    let element = |o: &Outlet| match o.dtype() {
+        ValueType::Tensor { ty, .. } => *ty,
+        _ => TensorElementType::Undefined,
+    };
+    let types = session.inputs().iter().map(element).collect();
+    Ok(Box::new(OrtModel { path: path.to_path_buf(), inputs, outputs, types, session: Mutex::new(session) }))
 }
 
 fn info(o: &Outlet) -> ValueInfo {
@@ -92,7 +103,10 @@ fn info(o: &Outlet) -> ValueInfo {
         ValueType::Tensor { ty, shape, .. } => {
             let kind = match ty {
                 TensorElementType::Float32 => Kind::Float,
-                TensorElementType::Int32 | TensorElementType::Int64 => Kind::Integer,
+                TensorElementType::Int32
+                | TensorElementType::Int64
+                | TensorElementType::Uint8
+                | TensorElementType::Bool => Kind::Integer,
                 _ => Kind::Other,
             };
             (Some(shape.iter().map(|&d| usize::try_from(d).ok()).collect()), Some(kind))
@@ -118,24 +132,29 @@ impl Model for OrtModel {
     fn run_checked(&self, inputs: &[(&str, Tensor)]) -> Result<Vec<Tensor<'static>>> {
         let fail =
             |e: &dyn std::fmt::Display| Error::new(format!("ONNX Runtime cannot run the model: {e}")).file(&self.path);
-        // Owned integer copies of the declared width, kept alive while views of them are in use.
-        let mut wide = Vec::new();
-        let mut narrow = Vec::new();
-        for (name, tensor) in inputs {
-            let is_wide = self.inputs.iter().position(|i| i.name == *name).is_some_and(|i| self.wide[i]);
-            wide.push(if is_wide { tensor.to_i64() } else { None });
-            narrow.push(if is_wide { None } else { tensor.to_i32() });
-        }
+        // Integers of the declared type, kept alive while views of them are in use.
+        let convert = |(name, tensor): &(&str, Tensor)| {
+            let at = self.inputs.iter().position(|i| i.name == *name);
+            Some(match at.map(|i| self.types[i]) {
+                Some(TensorElementType::Int64) => Integers::I64(tensor.to_i64()?.into_owned()),
+                Some(TensorElementType::Uint8) => Integers::U8(tensor.to_u8()?),
+                Some(TensorElementType::Bool) => Integers::Bool(tensor.to_i32()?.iter().map(|&v| v != 0).collect()),
+                _ => Integers::I32(tensor.to_i32()?.into_owned()),
+            })
+        };
+        let converted: Vec<Option<Integers>> = inputs.iter().map(convert).collect();
         let mut values: Vec<(&str, SessionInputValue)> = Vec::with_capacity(inputs.len());
-        for (i, (name, tensor)) in inputs.iter().enumerate() {
+        for ((name, tensor), integers) in inputs.iter().zip(&converted) {
             let shape: Vec<i64> = tensor.shape.iter().map(|&d| d as i64).collect();
-            let value: SessionInputValue = match (&tensor.data, &wide[i], &narrow[i]) {
-                (Data::F32(v), ..) => TensorRef::from_array_view((shape, v.as_ref())).map_err(|e| fail(&e))?.into(),
-                (_, Some(v), _) => TensorRef::from_array_view((shape, v.as_ref())).map_err(|e| fail(&e))?.into(),
-                (_, _, Some(v)) => TensorRef::from_array_view((shape, v.as_ref())).map_err(|e| fail(&e))?.into(),
-                _ => return Err(fail(&"an integer does not fit 32 bits").field(format!("input {name}"))),
+            let value: ort::Result<SessionInputValue> = match (&tensor.data, integers) {
+                (Data::F32(v), _) => TensorRef::from_array_view((shape, v.as_ref())).map(Into::into),
+                (_, Some(Integers::I64(v))) => TensorRef::from_array_view((shape, &v[..])).map(Into::into),
+                (_, Some(Integers::I32(v))) => TensorRef::from_array_view((shape, &v[..])).map(Into::into),
+                (_, Some(Integers::U8(v))) => TensorRef::from_array_view((shape, &v[..])).map(Into::into),
+                (_, Some(Integers::Bool(v))) => TensorRef::from_array_view((shape, &v[..])).map(Into::into),
+                _ => return Err(fail(&"an integer does not fit the input").field(format!("input {name}"))),
             };
-            values.push((name, value));
+            values.push((name, value.map_err(|e| fail(&e))?));
         }
         let mut session = self.session.lock().unwrap_or_else(PoisonError::into_inner);
         let results = session.run(values).map_err(|e| fail(&e))?;
@@ -149,6 +168,9 @@ impl Model for OrtModel {
                 }
                 if let Ok((shape, v)) = value.try_extract_tensor::<i64>() {
                     return Ok(Tensor::i64(&dims(shape), v.to_vec()));
+                }
+                if let Ok((shape, v)) = value.try_extract_tensor::<bool>() {
+                    return Ok(Tensor::i32(&dims(shape), v.iter().map(|&v| i32::from(v)).collect::<Vec<_>>()));
                 }
                 match value.try_extract_tensor::<i32>() {
                     Ok((shape, v)) => Ok(Tensor::i32(&dims(shape), v.to_vec())),

@@ -12,6 +12,8 @@ struct RtenModel {
     path: PathBuf,
     model: rten::Model,
     inputs: Vec<ValueInfo>,
+    /// Inputs of 8-bit numbers.
+    bytes: Vec<NodeId>,
     outputs: Vec<ValueInfo>,
     output_ids: Vec<NodeId>,
     threads: usize,
@@ -47,12 +49,17 @@ pub(crate) fn open(
             }),
             kind: node.as_ref().and_then(rten::NodeInfo::dtype).map(|t| match t {
                 ValueType::Tensor(DataType::Float) => Kind::Float,
-                ValueType::Tensor(DataType::Int32) => Kind::Integer,
+                ValueType::Tensor(DataType::Int32 | DataType::UInt8) => Kind::Integer,
                 _ => Kind::Other,
             }),
         }
     };
     let inputs = model.input_ids().iter().map(|&id| info(id)).collect();
+    let is_u8 = |id: &NodeId| {
+        let kind = model.node_info(*id).and_then(|n| n.dtype());
+        matches!(kind, Some(ValueType::Tensor(DataType::UInt8)))
+    };
+    let bytes = model.input_ids().iter().copied().filter(is_u8).collect();
     let output_ids = names
         .iter()
         .map(|n| model.find_node(n).ok_or_else(|| Error::new("no such output").file(path).field(n)))
@@ -61,6 +68,7 @@ pub(crate) fn open(
     Ok(Box::new(RtenModel {
         path: path.to_path_buf(),
         inputs,
+        bytes,
         outputs,
         output_ids,
         threads,
@@ -84,15 +92,21 @@ impl Model for RtenModel {
 
     fn run_checked(&self, inputs: &[(&str, Tensor)]) -> Result<Vec<Tensor<'static>>> {
         let fail = |e: &dyn std::fmt::Display| Error::new(format!("rten cannot run the model: {e}")).file(&self.path);
-        // 64-bit integers are narrowed first, so that views of them live long enough.
+        // Integers are narrowed first, so that views of them live long enough.
         let narrowed: Vec<Option<Cow<[i32]>>> = inputs.iter().map(|(_, t)| t.to_i32()).collect();
+        let bytes: Vec<Option<Vec<u8>>> = inputs.iter().map(|(_, t)| t.to_u8()).collect();
         let mut views = Vec::with_capacity(inputs.len());
-        for ((name, tensor), ints) in inputs.iter().zip(&narrowed) {
+        for (((name, tensor), ints), bytes) in inputs.iter().zip(&narrowed).zip(&bytes) {
             let id = self.model.node_id(name).map_err(|e| fail(&e))?;
-            let view: ValueView = match (&tensor.data, ints) {
-                (Data::F32(v), _) => TensorView::from_data(&tensor.shape[..], v.as_ref()).into(),
-                (_, Some(v)) => TensorView::from_data(&tensor.shape[..], v.as_ref()).into(),
-                (_, None) => return Err(fail(&"an integer does not fit 32 bits").field(format!("input {name}"))),
+            let is_u8 = self.bytes.contains(&id);
+            let view: ValueView = match (&tensor.data, ints, bytes) {
+                (Data::F32(v), ..) => TensorView::from_data(&tensor.shape[..], v.as_ref()).into(),
+                (_, _, Some(v)) if is_u8 => TensorView::from_data(&tensor.shape[..], &v[..]).into(),
+                (_, Some(v), _) if !is_u8 => TensorView::from_data(&tensor.shape[..], v.as_ref()).into(),
+                _ => {
+                    let bits = if is_u8 { 8 } else { 32 };
+                    return Err(fail(&format!("an integer does not fit {bits} bits")).field(format!("input {name}")));
+                }
             };
             views.push((id, view.into()));
         }

@@ -83,6 +83,11 @@ impl<'a> Tensor<'a> {
         }
     }
 
+    /// The values as 8-bit numbers; `None` for floats and for numbers out of range.
+    pub(crate) fn to_u8(&self) -> Option<Vec<u8>> {
+        self.to_i32()?.iter().map(|&v| u8::try_from(v).ok()).collect()
+    }
+
     /// The values as 64-bit integers; `None` for floats.
     pub fn to_i64(&self) -> Option<Cow<'_, [i64]>> {
         match &self.data {

@@ -21,7 +21,7 @@ const LONGEST: usize = 100;
 /// The names that instances may have.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Vocabulary {
-    /// The names, in order; at least two, all different.
+    /// The names, in order, all different.
     pub words: Vec<String>,
     /// Lines that named something again, which are left out.
     pub repeated: usize,
@@ -38,13 +38,14 @@ impl Vocabulary {
     ///
     /// # Errors
     /// When the file cannot be read or is not UTF-8, a name is longer than 100 bytes or has control characters, or there are
-    /// fewer than two names.
-    pub fn read(path: impl AsRef<Path>) -> Result<Self> {
+    /// fewer than `least` names.
+    pub fn read(path: impl AsRef<Path>, least: usize) -> Result<Self> {
         let path = path.as_ref();
         let bytes = std::fs::read(path).at("read", path)?;
         let text = std::str::from_utf8(&bytes);
         let text = text.map_err(|_| Error::new("not text").file(path).expected("UTF-8, a name a line"))?;
-        Self::parse(text.trim_start_matches('\u{feff}')).map_err(|e| e.file(path))
+        let words = Self::parse(text.trim_start_matches('\u{feff}')).map_err(|e| e.file(path))?;
+        words.enough(least).map_err(|e| e.file(path))
     }
 
     /// The names of a table, but those that are there for other ends: texts that mean nothing in particular, and unrelated ones.
@@ -53,7 +54,8 @@ impl Vocabulary {
     /// When fewer than two are left.
     pub fn of_table(names: Vec<String>) -> Result<Self> {
         let others: BTreeSet<&str> = Unrelated::texts().chain(LERF_NEGATIVES).collect();
-        enough(Self { words: names.into_iter().filter(|n| !others.contains(&n[..])).collect(), repeated: 0 })
+        let words = names.into_iter().filter(|n| !others.contains(&n[..])).collect();
+        Self { words, repeated: 0 }.enough(2)
     }
 
     fn parse(text: &str) -> Result<Self> {
@@ -77,7 +79,15 @@ impl Vocabulary {
                 repeated += 1;
             }
         }
-        enough(Self { words, repeated })
+        Ok(Self { words, repeated })
+    }
+
+    fn enough(self, least: usize) -> Result<Self> {
+        if self.words.len() >= least {
+            return Ok(self);
+        }
+        let e = Error::new("too few names").found(self.words.len()).expected(format!("at least {least}, one a line"));
+        Err(e.hint("add names of what may be there"))
     }
 
     /// Content hash of the names.
@@ -93,15 +103,6 @@ impl Vocabulary {
         let one = |(f, word): (Option<Vec<f32>>, &String)| f.ok_or_else(|| source.unknown(word).field(option));
         encode_cached(source, templates, &self.words)?.into_iter().zip(&self.words).map(one).collect()
     }
-}
-
-/// A vocabulary of one name says nothing.
-fn enough(vocabulary: Vocabulary) -> Result<Vocabulary> {
-    if vocabulary.words.len() >= 2 {
-        return Ok(vocabulary);
-    }
-    let e = Error::new("too few names to choose between").found(vocabulary.words.len());
-    Err(e.expected("at least two, one a line").hint("add names of what may be there"))
 }
 
 /// Names of all instances that have a descriptor, ascending by instance, and the margin that is no better than chance.
@@ -274,12 +275,12 @@ mod tests {
         let path = dir.path().join("words.txt");
         let read = |bytes: &[u8]| {
             std::fs::write(&path, bytes).unwrap();
-            Vocabulary::read(&path).map_err(|e| e.to_string())
+            Vocabulary::read(&path, 2).map_err(|e| e.to_string())
         };
         let v = read("\u{feff}# mine\r\n\r\n Mug \nsoup   bowl\n\nmug\n#bowl".as_bytes()).unwrap();
         assert_eq!((v.words, v.repeated), (vec!["Mug".to_string(), "soup bowl".into()], 1));
         for (bytes, part) in [
-            (&b"# nothing\n\n"[..], "words.txt: too few names to choose between; found 0, expected at least two"),
+            (&b"# nothing\n\n"[..], "words.txt: too few names; found 0, expected at least 2"),
             (b"mug\nMUG", "found 1"),
             (b"\xff\xfe", "words.txt: not text; expected UTF-8"),
             (b"mug\na\0b", "words.txt: line 2: not a name; found \"a\\0b\""),
@@ -288,7 +289,7 @@ mod tests {
             assert!(e.contains(part), "{e}");
         }
         assert!(read("x".repeat(101).as_bytes()).unwrap_err().contains("line 1: not a name"));
-        let e = Vocabulary::read(dir.path().join("none")).unwrap_err().to_string();
+        let e = Vocabulary::read(dir.path().join("none"), 1).unwrap_err().to_string();
         assert!(e.contains("none: cannot read"), "{e}");
     }
 

@@ -14,7 +14,7 @@ pub(crate) fn run(o: &NamesOptions, parameters: Value, stage: &Stage) -> Result<
     let out = o.out.clone().unwrap_or_else(|| InstanceNames::path_beside(&o.instances));
     let reads = [&o.instances, &o.geometry].into_iter().chain(&o.edits).chain(&o.texts.text_features);
     let claim = stage.outputs(&out).file(&out).reads(reads.chain(&o.vocabulary)).claim()?;
-    let given = o.vocabulary.as_deref().map(Vocabulary::read).transpose()?;
+    let given = o.vocabulary.as_deref().map(|file| Vocabulary::read(file, 2)).transpose()?;
     stage.forecast(memory::of_query(&Sizes::new(&o.geometry, &o.texts, &[])), SMALLER)?;
     let scene = LabelledScene::read(&o.instances, &o.geometry, o.edits.as_deref())?;
     let by_masks = Health::of(&scene.artifact)?.map_or(Vec::new(), |health| health.names);

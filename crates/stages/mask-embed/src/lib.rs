@@ -5,12 +5,14 @@
 //! pictures instead; `embed` shows the picture of each mask to CLIP. All write LangSplat's files: `<view>_s.npy` and
 //! `<view>_f.npy`. [`crops`] gives the training script of the small encoder what the pipeline would see. `finished` knows
 //! which views are done already, `ahead` works on several at a time, `logits` how sure a mask is of each pixel.
-//! [`panoptic`] runs models that give all things of a photograph at once, with names; [`classes`] makes a level of them.
+//! [`panoptic`] runs models that give all things of a photograph at once, with names, [`concepts`] models that are asked for nouns;
+//! [`classes`] makes levels of what both see.
 
 mod ahead;
 pub mod automatic;
 mod check;
 pub mod classes;
+pub mod concepts;
 mod constants;
 pub mod crops;
 mod embed;

@@ -2,7 +2,8 @@
 
 use crate::ahead::ahead;
 use crate::automatic::{levels, propose};
-use crate::classes::with_classes;
+use crate::classes::with_names;
+use crate::concepts::Concepts;
 use crate::finished::{self, Views};
 use crate::options::{Choice, MasksArgs};
 use crate::paint::{MapSize, paint};
@@ -13,13 +14,14 @@ use artifacts::{Level, MaskMaps, MaskNames, maps_path, role};
 use gs_io::{Claim, Error, Result, Watched, write_json};
 use gs_scene::dataset::{Dataset, View};
 use onnx_models::RgbImage;
+use query::Vocabulary;
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 use serde_json::json;
 use stage::{Stage, peak_rss_bytes};
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
-use std::sync::{Mutex, PoisonError};
+use std::sync::{Mutex, MutexGuard, PoisonError};
 
 /// Photographs that are worked on at a time, where there are as many threads: each takes 400 MB with MobileSAM.
 const LANES: usize = 8;
@@ -34,7 +36,7 @@ struct Facts {
     /// Points of the grid, and how many of them were asked.
     points: usize,
     asked: usize,
-    /// What a panoptic model calls masks.
+    /// What models call masks.
     #[serde(default, skip_serializing_if = "MaskNames::is_empty")]
     names: MaskNames,
 }
@@ -44,13 +46,33 @@ struct Models {
     sam: Sam,
     /// One photograph at a time: a full-size DETR takes 3.4 GB.
     panoptic: Option<Mutex<Panoptic>>,
+    concepts: Option<Mutex<Concepts>>,
+}
+
+/// The model that it guards, for one photograph at a time.
+fn lock<T>(model: &Mutex<T>) -> MutexGuard<'_, T> {
+    model.lock().unwrap_or_else(PoisonError::into_inner)
 }
 
 impl Models {
-    /// What the panoptic model sees, if there is one; width and height are those of the map.
-    fn segments(&self, image: &RgbImage, size: [usize; 2]) -> Result<Option<Segments>> {
-        let one = |model: &Mutex<Panoptic>| model.lock().unwrap_or_else(PoisonError::into_inner).segments(image, size);
-        self.panoptic.as_ref().map(one).transpose()
+    /// What the panoptic model sees, and what that for nouns sees of the first `nouns`, if there are such models; width and height are
+    /// those of the map.
+    fn named(&self, image: &RgbImage, size: [usize; 2], nouns: usize) -> Result<[Option<Segments>; 2]> {
+        let classes = self.panoptic.as_ref().map(|model| lock(model).segments(image, size)).transpose()?;
+        let concepts = self.concepts.as_ref().map(|model| lock(model).segments(image, size, nouns)).transpose()?;
+        Ok([classes, concepts])
+    }
+
+    /// Photographs at a time: with nouns, whose model takes longer than all else, it has all threads.
+    fn lanes(&self) -> usize {
+        if self.concepts.is_some() { 1 } else { LANES }
+    }
+
+    /// Content hashes of both, by what they are called among inputs.
+    fn hashes(&self) -> Vec<(String, String)> {
+        let panoptic = self.panoptic.iter().map(|model| ("panoptic".to_string(), lock(model).hash().to_string()));
+        let concepts = self.concepts.iter().map(|model| ("concepts".to_string(), lock(model).hash().to_string()));
+        panoptic.chain(concepts).collect()
     }
 }
 
@@ -68,22 +90,23 @@ pub(crate) fn run(args: &MasksArgs, stage: &Stage) -> Result<()> {
     let mut claim = claim(args, &scene, &manifest, stage)?;
     let sam = Sam::open(&args.sam, &args.engine.options(), args.choice.no_skip)?;
     let panoptic = args.panoptic.as_ref().map(|folder| Panoptic::open(folder, &args.engine.options())).transpose()?;
-    let panoptic_hash = panoptic.as_ref().map(|model| model.hash().to_string());
-    let models = Models { sam, panoptic: panoptic.map(Mutex::new) };
+    let concepts = args.concepts.as_ref().map(|folder| concepts(folder, args, stage)).transpose()?;
+    let models = Models { sam, panoptic: panoptic.map(Mutex::new), concepts: concepts.map(Mutex::new) };
     let watched = Watched::new(scene.views.iter().map(|v| &v.image_path));
     let parameters = json!(args);
     let mut inputs = BTreeMap::from([
         (role::DATASET.to_string(), scene.hash()?),
         ("sam".to_string(), models.sam.hash().to_string()),
     ]);
-    inputs.extend(panoptic_hash.iter().map(|hash| ("panoptic".to_string(), hash.clone())));
+    let hashes = models.hashes();
+    inputs.extend(hashes.clone());
     warn_of_other_maps(folder, &scene.views, stage)?;
 
     let mut views = Views::new(stage, scene.views.len());
     let read = |view: &View| {
         let (image, image_hash) = photographs::read(view)?;
         let mut parts = vec![parameters.to_string(), models.sam.hash().to_string(), image_hash];
-        parts.extend(panoptic_hash.clone());
+        parts.extend(hashes.iter().map(|(_, hash)| hash.clone()));
         let key = finished::made_from(&parts.iter().map(String::as_str).collect::<Vec<_>>());
         let done = finished::is_done(&maps_path(folder, view.stem()), &key);
         Ok((image, key, done))
@@ -109,7 +132,7 @@ pub(crate) fn run(args: &MasksArgs, stage: &Stage) -> Result<()> {
         large += facts.masks[Level::Large as usize];
         Ok(())
     };
-    ahead(&scene.views.iter().collect::<Vec<_>>(), LANES, prepare, finish)?;
+    ahead(&scene.views.iter().collect::<Vec<_>>(), models.lanes(), prepare, finish)?;
     let views = views.finish("id maps");
     if asked < points {
         stage.skipped(&format!("{} of {points} points: within masks already found", points - asked));
@@ -129,11 +152,23 @@ fn make(args: &MasksArgs, models: &Models, image: &RgbImage) -> Result<(MaskMaps
     let (mut maps, mut names) = (paint(&proposals, &levels(&proposals.masks), size), MaskNames::new());
     let (points, asked) = (proposals.points, proposals.asked);
     drop(proposals);
-    if let Some(seen) = models.segments(image, [size.width, size.height])? {
-        (maps, names) = with_classes(&maps, &seen, size.min_area);
+    let [classes, concepts] = models.named(image, [size.width, size.height], usize::MAX)?;
+    if classes.is_some() || concepts.is_some() {
+        (maps, names) = with_names(&maps, classes.as_ref(), concepts.as_ref(), size.min_area);
     }
     let facts = Facts { size: [size.width, size.height], masks: count_masks(&maps), points, asked, names };
     Ok((maps, facts))
+}
+
+/// The model that is asked for nouns.
+fn concepts(folder: &Path, args: &MasksArgs, stage: &Stage) -> Result<Concepts> {
+    let nouns = args.nouns.as_ref().map_or_else(|| Ok(Vocabulary::everyday()), |file| Vocabulary::read(file, 1))?;
+    if nouns.repeated > 0 {
+        stage.warn(&format!("lines of --nouns that name something again are left out: {}", nouns.repeated));
+    }
+    let model = Concepts::open(folder, &nouns.words, &args.engine.options())?;
+    stage.info(&format!("{} nouns are looked for in each photograph", nouns.words.len()));
+    Ok(model)
 }
 
 /// The right to write id maps, their notes and the manifest. Maps that this program did not make stay.
@@ -148,10 +183,10 @@ fn claim(args: &MasksArgs, scene: &Dataset, manifest: &Path, stage: &Stage) -> R
 fn forecast(args: &MasksArgs, models: &Models, views: &[View], stage: &Stage) -> Result<()> {
     let nothing = RgbImage { width: 4, height: 3, pixels: vec![0; 36] };
     let choice = Choice { points_per_side: 4, ..args.choice };
-    let lanes = LANES.min(views.len()).min(rayon::current_num_threads());
+    let lanes = models.lanes().min(views.len()).min(rayon::current_num_threads());
     let look = |()| {
         drop(propose(&models.sam, &models.sam.encode(&nothing)?, &choice)?);
-        models.segments(&nothing, [4, 3])
+        models.named(&nothing, [4, 3], 1)
     };
     ahead(&vec![(); lanes], lanes, look, |_| Ok(()))?;
     let (side, pixels) = (args.choice.points_per_side as u64, photographs::largest(views));

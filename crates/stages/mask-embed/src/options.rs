@@ -81,6 +81,16 @@ pub(crate) struct MasksArgs {
     #[arg(long, value_name = "FOLDER")]
     #[serde(skip)]
     pub panoptic: Option<PathBuf>,
+    /// Folder of a model that is asked for nouns, which adds level concepts with names: the three graphs of SAM 3 as samexporter
+    /// exports them, or others with a model.json (docs/masks.md) [default: none]
+    #[arg(long, value_name = "FOLDER")]
+    #[serde(skip)]
+    pub concepts: Option<PathBuf>,
+    /// What to look for with --concepts: a text file, a noun a line. The time of a photograph grows with their number
+    /// [default: about 1,200 everyday things, the vocabulary of eval names]
+    #[arg(long, value_name = "FILE", requires = "concepts")]
+    #[serde(skip)]
+    pub nouns: Option<PathBuf>,
     /// Longest side of the id maps in pixels; 0 for the size of the photograph
     #[arg(long, default_value_t = 800, value_name = "PIXELS")]
     pub map_size: usize,

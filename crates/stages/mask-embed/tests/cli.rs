@@ -237,6 +237,48 @@ fn a_panoptic_model_adds_classes_with_names() {
     assert!(e.contains("no such model"), "{e}");
 }
 
+#[test]
+fn nouns_add_concepts_with_names() {
+    let scene = Scene::new(2);
+    let [other, both] = ["other", "both"].map(|name| scene.masks.with_file_name(name));
+    let (model, nouns) = (export("concepts-samexporter"), scene.folder.join("nouns.txt"));
+    std::fs::write(&nouns, "# mine\ngrass\nroof\nGrass\n").unwrap();
+    let concepts = ["--concepts", path(&model), "--nouns", path(&nouns), "--threads"];
+    let said = scene.make_masks(&scene.masks, &[&concepts[..], &["1"]].concat());
+    assert!(said.contains("2 nouns are looked for") && said.contains("name something again are left out: 1"), "{said}");
+    scene.make_masks(&other, &[]);
+    for view in ["v0", "v1"] {
+        let [plain, named] = [&other, &scene.masks].map(|m| MaskMaps::read(maps_path(m, view)).unwrap());
+        Level::SAM.iter().for_each(|&l| assert_eq!(plain.level(l), named.level(l), "{l}"));
+        assert!(named.level(Level::Classes).iter().all(|&id| id == -1));
+        let names = read_mask_names(&scene.masks, view).unwrap();
+        let at = |x, y| Some(&names.get(&named.mask(Level::Concepts, [y, x])?)?.name[..]);
+        // The ceiling is green; the bright square is a roof to this model; the dark one is nothing.
+        assert_eq!([at(5, 4), at(108, 30), at(35, 30)], [Some("grass"), Some("roof"), None]);
+    }
+    // The same with more threads; then nothing is left to do, until there are other nouns.
+    scene.make_masks(&other, &[&concepts[..], &["3"]].concat());
+    assert_eq!(contents(&scene.masks), contents(&other));
+    let again = || scene.make_masks(&other, &[&concepts[..], &["3"]].concat());
+    assert!(again().contains("skipped 2 of 2 views: their id maps are done already"));
+    std::fs::write(&nouns, "grass").unwrap();
+    assert!(!again().contains("done already"));
+    scene.make_masks(&both, &[&["--panoptic", path(&export("panoptic-detr"))], &concepts[..], &["2"]].concat());
+    let maps = MaskMaps::read(maps_path(&both, "v0")).unwrap();
+    let names = read_mask_names(&both, "v0").unwrap();
+    let named = |level| names.keys().any(|id| maps.level(level).iter().any(|&i| i == *id as i32));
+    assert!(named(Level::Classes) && named(Level::Concepts));
+    let bad = |args: &[&str], words: &[&str]| {
+        let e = error(&scene.masks_args(&other, args));
+        assert!(words.iter().all(|w| e.contains(w)), "{e}");
+    };
+    bad(&["--concepts", path(&scene.folder)], &["sam3_image_encoder.onnx: no such model", "samexporter"]);
+    let alone = run(&scene.masks_args(&other, &["--nouns", path(&nouns)]));
+    assert!(!alone.status.success() && String::from_utf8_lossy(&alone.stderr).contains("--concepts <FOLDER>"));
+    std::fs::write(&nouns, "# none\n").unwrap();
+    bad(&[&concepts[..], &["1"]].concat(), &["nouns.txt: too few names; found 0, expected at least 1, one a line"]);
+}
+
 /// A folder of an export other than SAM's own.
 fn export(name: &str) -> PathBuf {
     Path::new(SAM).with_file_name(name)

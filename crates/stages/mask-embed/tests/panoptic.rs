@@ -132,7 +132,7 @@ fn what_is_missing_or_wrong_is_said() {
         json!({"id2label": {"0": "sky"}}),
         &["id2label", "found no 1, expected names for 0 to 3", "copy config.json"],
     );
-    config(json!({"id2label": 3}), &["not what a panoptic model has", "invalid type", "docs/masks.md"]);
+    config(json!({"id2label": 3}), &["not what describes such a model", "invalid type", "docs/masks.md"]);
     let shown = |changes: Value, words: &[&str]| error("detr", "preprocessor_config.json", changes, words);
     shown(json!({"image_std": [0.2, 0, 0.2]}), &["image_std", "found", "expected finite numbers"]);
     shown(json!({"rescale_factor": -1}), &["rescale_factor", "found -1", "the first and the last positive"]);

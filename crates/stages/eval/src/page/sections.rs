@@ -101,7 +101,8 @@ pub(super) fn id_maps(m: &Material, page: &mut Page, metrics: &mut Metrics) -> R
             continue;
         }
         let maps = MaskFolder::open(folder).read(s.view)?;
-        let level = maps.level(if maps.levels().contains(&Level::Classes) { Level::Classes } else { Level::Large });
+        let any = |level: &Level| maps.levels().contains(level) && maps.level(*level).iter().any(|&id| id >= 0);
+        let level = maps.level(Some(Level::Classes).filter(any).unwrap_or(Level::Large));
         let distinct: BTreeSet<i32> = level.iter().copied().filter(|&id| id >= 0).collect();
         let (w, h) = (s.photo.width, s.photo.height);
         // Ids of a level begin after those of the others; only their differences matter for colours.

@@ -116,7 +116,7 @@ fn bad_vocabularies_and_sources_are_one_line() {
     f.bad("names", "--run-dir|{}/run|--geometry|{}/run/geometry.ply", &["--clip", "nothing to compare names with"]);
     f.bad("names", &format!("{NAMES}|--vocabulary|{{}}/none.txt"), &["--vocabulary", "none.txt: cannot read"]);
     for (text, part) in [
-        ("", "too few names to choose between; found 0, expected at least two"),
+        ("", "too few names; found 0, expected at least 2"),
         ("# none\n\n \n", "found 0"),
         ("red ball\n", "found 1"),
         ("red ball\nred\u{7} ball\n", "line 2: not a name"),

@@ -4,7 +4,7 @@
 //! names of the classes and the kind of model) and `preprocessor_config.json` (how the photograph is shown). `model.json`
 //! is for what these don't say, and may be missing. `segments` makes ids of the model's answer.
 
-mod segments;
+pub(crate) mod segments;
 
 use crate::constants::{FILE, Numbers, constant};
 use gs_io::{Error, IoContext, Result, check_name, hash_bytes, hash_files};
@@ -21,7 +21,7 @@ const PREPROCESSOR: &str = "preprocessor_config.json";
 /// Input that says which pixels belong to the photograph.
 const PIXEL_MASK: &str = "pixel_mask";
 /// Longest side of the picture that a model is shown.
-const LONGEST: usize = 8192;
+pub(crate) const LONGEST: usize = 8192;
 
 /// What the model sees in one photograph.
 #[derive(Debug, Clone, PartialEq)]
@@ -174,16 +174,17 @@ pub struct Panoptic {
     hash: String,
 }
 
-fn read<T: DeserializeOwned>(path: &Path) -> Result<T> {
+/// Reads a file that describes a model.
+pub(crate) fn read<T: DeserializeOwned>(path: &Path) -> Result<T> {
     if !path.exists() {
         return Err(Error::new("no such file").file(path).hint("copy it from the page that the model is from"));
     }
-    let wrong = |e| Error::new(format!("not what a panoptic model has: {e}")).file(path);
+    let wrong = |e| Error::new(format!("not what describes such a model: {e}")).file(path);
     serde_json::from_slice(&std::fs::read(path).at("read", path)?)
         .map_err(|e| wrong(e).hint("docs/masks.md says what the folder holds"))
 }
 
-fn names(values: &[ValueInfo]) -> String {
+pub(crate) fn names(values: &[ValueInfo]) -> String {
     values.iter().map(|v| v.name.as_str()).collect::<Vec<_>>().join(", ")
 }
 
@@ -277,16 +278,7 @@ impl Panoptic {
     pub fn segments(&self, image: &RgbImage, size: [usize; 2]) -> Result<Segments> {
         let frame = self.frame.of(image);
         let [[width, height], input] = frame;
-        let small = resize_rgb(image, width, height);
-        let mut pixels = Vec::with_capacity(3 * input[0] * input[1]);
-        for (c, (factor, sum)) in self.norm.iter().enumerate() {
-            let norm = |v: u8| f32::from(v) * factor + sum;
-            for row in small.pixels.chunks_exact(3 * width) {
-                pixels.extend(row.iter().skip(c).step_by(3).map(|&v| norm(v)));
-                pixels.extend(std::iter::repeat_n(norm(0), input[0] - width));
-            }
-            pixels.resize((c + 1) * input[0] * input[1], norm(0));
-        }
+        let pixels = planes(&resize_rgb(image, width, height), input, &self.norm);
         let mut inputs = vec![(self.picture.as_str(), Tensor::f32(&[1, 3, input[1], input[0]], pixels))];
         inputs.extend(self.constants.iter().map(|(name, value)| (name.as_str(), value.view())));
         if let Some([h, w]) = self.mask {
@@ -327,6 +319,21 @@ impl Panoptic {
     }
 }
 
+/// The channels of a picture one after the other, with black to the right and below up to a width and height; `norm` has a factor
+/// and a sum for the 8-bit values of each.
+pub(crate) fn planes(image: &RgbImage, [width, height]: [usize; 2], norm: &[(f32, f32); 3]) -> Vec<f32> {
+    let mut pixels = Vec::with_capacity(3 * width * height);
+    for (c, (factor, sum)) in norm.iter().enumerate() {
+        let norm = |v: u8| f32::from(v) * factor + sum;
+        for row in image.pixels.chunks_exact(3 * image.width) {
+            pixels.extend(row.iter().skip(c).step_by(3).map(|&v| norm(v)));
+            pixels.extend(std::iter::repeat_n(norm(0), width - image.width));
+        }
+        pixels.resize((c + 1) * width * height, norm(0));
+    }
+    pixels
+}
+
 fn rule(family: Family, settings: &Settings, path: &Path) -> Result<Rule> {
     let threshold = settings.threshold.unwrap_or(if family == Family::Eomt { 0.8 } else { 0.5 });
     let shares = [
@@ -334,25 +341,36 @@ fn rule(family: Family, settings: &Settings, path: &Path) -> Result<Rule> {
         ("mask_threshold", settings.mask_threshold.into()),
         ("overlap", settings.overlap),
     ];
-    if let Some((field, found)) = shares.iter().find(|s| !(0.0..=1.0).contains(&s.1)) {
-        return Err(Error::new("not a usable value").file(path).field(*field).found(found).expected("0 to 1"));
-    }
+    check_shares(&shares, path)?;
     Ok(Rule { family, threshold, mask_threshold: settings.mask_threshold, overlap: settings.overlap })
+}
+
+/// Refuses fields of a file, each with its value, that are not from 0 to 1.
+pub(crate) fn check_shares(shares: &[(&str, f64)], path: &Path) -> Result<()> {
+    shares.iter().find(|s| !(0.0..=1.0).contains(&s.1)).map_or(Ok(()), |(field, found)| {
+        Err(Error::new("not a usable value").file(path).field(*field).found(found).expected("0 to 1"))
+    })
 }
 
 /// Factor and sum for the 8-bit values of each channel.
 fn norm(shown: &Preprocessor, path: &Path) -> Result<[(f32, f32); 3]> {
     let factor = if shown.do_rescale { shown.rescale_factor } else { 1.0 };
     let (mean, std) = if shown.do_normalize { (shown.image_mean, shown.image_std) } else { ([0.0; 3], [1.0; 3]) };
+    scaled(factor, mean, std).ok_or_else(|| {
+        Error::new("not a usable value")
+            .file(path)
+            .field("rescale_factor, image_mean or image_std")
+            .found(format!("{factor}, {mean:?}, {std:?}"))
+            .expected("finite numbers, the first and the last positive")
+    })
+}
+
+/// Factor and sum for 8-bit values that are multiplied by `factor`, then lose a mean and are divided by a deviation; None where these are
+/// no positive or no finite numbers.
+pub(crate) fn scaled(factor: f32, mean: [f32; 3], std: [f32; 3]) -> Option<[(f32, f32); 3]> {
     let norm = [0, 1, 2].map(|c| (factor / std[c], -mean[c] / std[c]));
-    if factor > 0.0 && std.iter().all(|s| *s > 0.0) && norm.iter().all(|(f, s)| f.is_finite() && s.is_finite()) {
-        return Ok(norm);
-    }
-    Err(Error::new("not a usable value")
-        .file(path)
-        .field("rescale_factor, image_mean or image_std")
-        .found(format!("{factor}, {mean:?}, {std:?}"))
-        .expected("finite numbers, the first and the last positive"))
+    let usable = factor > 0.0 && std.iter().all(|s| *s > 0.0);
+    (usable && norm.iter().all(|(f, s)| f.is_finite() && s.is_finite())).then_some(norm)
 }
 
 /// How the input `picture` shows a photograph.
