@@ -20,8 +20,6 @@ use std::path::Path;
 /// Side of the picture, in pixels, and ids of a noun, where the graphs leave them open.
 const SIDE: usize = 1008;
 const IDS: usize = 32;
-/// Input of a text encoder that says which ids count.
-const IDS_MASK: &str = "attention_mask";
 /// Outputs of the decoder: logits of the queries, their masks, and, beginning so, one that says whether there is such a thing at all.
 const OUTPUTS: [&str; 3] = ["pred_logits", "pred_masks", "presence_logit"];
 /// samexporter's inputs of the decoder, with the outputs of the text encoder that they get.
@@ -106,8 +104,8 @@ pub struct Concepts {
     /// Places of [`OUTPUTS`].
     outputs: [usize; 3],
     nouns: Vec<String>,
-    /// Ids of each noun, filled with 0, and how many there are before that.
-    ids: Vec<(Vec<i32>, usize)>,
+    /// Ids of each noun, filled with 0.
+    ids: Vec<Vec<i32>>,
     /// What the text encoder gives for each noun so far.
     texts: Vec<Vec<Tensor<'static>>>,
     threshold: f32,
@@ -143,22 +141,22 @@ impl Concepts {
         let [image, text, decoder] = paths.map(|path| open(path, Outputs::Declared, &options));
         let (image, text, decoder) = (image?, text?, decoder?);
 
-        let [picture] = image.inputs() else {
-            let e = Error::new("another number of inputs").file(image.path()).found(names(image.inputs()));
-            return Err(e.expected("one, for a picture"));
+        let ([picture], [tokens]) = (image.inputs(), text.inputs()) else {
+            let model = if image.inputs().len() == 1 { &text } else { &image };
+            let e = Error::new("another number of inputs").file(model.path()).found(names(model.inputs()));
+            return Err(e.expected("one: a picture, or the ids of a text"));
         };
         let rank = picture.shape.as_ref().map_or(4, Vec::len);
         if !(3..=4).contains(&rank) {
             let e = Error::new("not an input for a picture").file(image.path()).field(&picture.name);
             return Err(e.found(format!("{rank} axes")).expected("[3, height, width] or [1, 3, height, width]"));
         }
-        let size = [rank - 1, rank - 2].map(|axis| picture.fixed(axis).filter(|n| *n <= LONGEST).unwrap_or(SIDE));
+        let size = [rank - 1, rank - 2].map(|axis| fixed(picture, axis, SIDE));
         let norm = if picture.kind == Some(Kind::Integer) { [(1.0, 0.0); 3] } else { norm };
-        let ids = ids(nouns, &*text)?;
+        let ids = ids(nouns, tokens)?;
         let sources = sources(&layout, &description, &*image, &*text, &*decoder)?;
         let place = |name: &str| {
-            let place = |is: &dyn Fn(&str) -> bool| decoder.outputs().iter().position(|o| is(&o.name));
-            place(&|n| n == name).or_else(|| place(&|n| n.starts_with(name))).ok_or_else(|| {
+            decoder.outputs().iter().position(|o| o.name.starts_with(name)).ok_or_else(|| {
                 let e = Error::new("the model has no such output").file(decoder.path()).field(name);
                 e.found(names(decoder.outputs())).hint("export it with samexporter 0.5 or later")
             })
@@ -217,12 +215,8 @@ impl Concepts {
     /// Reads nouns until the first `most` are.
     fn read_nouns(&mut self, most: usize) -> Result<()> {
         let Some(text) = &self.text else { return Ok(()) };
-        for (ids, length) in &self.ids[self.texts.len().min(most)..most] {
-            let shape = [1, ids.len()];
-            let mask: Vec<i32> = (0..ids.len()).map(|i| i32::from(i < *length)).collect();
-            let of = |input: &ValueInfo| if input.name == IDS_MASK { mask.clone() } else { ids.clone() };
-            let given: Vec<_> = text.inputs().iter().map(|i| (i.name.as_str(), Tensor::i32(&shape, of(i)))).collect();
-            let out = text.run(&given)?;
+        for ids in &self.ids[self.texts.len().min(most)..most] {
+            let out = text.run(&[(&text.inputs()[0].name, Tensor::i32(&[1, ids.len()], &ids[..]))])?;
             out.iter().try_for_each(|t| finite(t, text.path()))?;
             self.texts.push(out);
         }
@@ -281,25 +275,25 @@ fn finite(values: &Tensor, model: &Path) -> Result<()> {
     }
 }
 
-/// The ids of each noun as the text encoder reads them, filled with 0, and how many there are before that.
-fn ids(nouns: &[String], text: &dyn Model) -> Result<Vec<(Vec<i32>, usize)>> {
-    let fixed = text.inputs().iter().find(|i| i.name != IDS_MASK).and_then(|i| i.fixed(1)).filter(|n| *n <= LONGEST);
-    let (most, tokenizer) = (fixed.unwrap_or(IDS), Tokenizer::default());
+/// The ids of each noun as the text encoder reads them, filled with 0.
+fn ids(nouns: &[String], input: &ValueInfo) -> Result<Vec<Vec<i32>>> {
+    let (most, tokenizer) = (fixed(input, 1, IDS), Tokenizer::default());
     let one = |noun: &String| {
         let mut ids = tokenizer.encode(noun, usize::MAX);
-        let length = ids.len();
-        if length > most {
-            let e = Error::new("a noun that is too long for the model")
-                .field("--nouns")
-                .found(format!("{noun}: {length} tokens"));
-            return Err(e
-                .expected(format!("at most {most}, a start and an end among them"))
-                .hint("name it in fewer words"));
+        if ids.len() > most {
+            let e = Error::new("a noun that is too long for the model").field("--nouns");
+            let e = e.found(format!("{noun}: {} tokens", ids.len())).hint("name it in fewer words");
+            return Err(e.expected(format!("at most {most}, a start and an end among them")));
         }
         ids.resize(most, 0);
-        Ok((ids, length))
+        Ok(ids)
     };
     nouns.iter().map(one).collect()
+}
+
+/// The extent of an axis, or what it has where the graph leaves it open.
+fn fixed(input: &ValueInfo, axis: usize, open: usize) -> usize {
+    input.fixed(axis).filter(|n| *n <= LONGEST).unwrap_or(open)
 }
 
 /// Where each input of the decoder comes from.
