@@ -1,7 +1,7 @@
 //! Reading the inputs, and checking that they belong together.
 
 use crate::options::{Args, Space};
-use artifacts::{Features, Footprints, Graph, Level, hash_folder, role};
+use artifacts::{Features, Footprints, Graph, Level, MaskMaps, hash_folder, maps_path, role};
 use gs_io::{Error, IoContext, Provenance, Result, hash_file};
 use gs_scene::Geometry;
 use gs_scene::dataset::{self, Dataset, LoadOptions, Resolution, View};
@@ -65,7 +65,11 @@ impl Inputs {
             (role::FOOTPRINTS.into(), footprints.artifact().hash().into()),
             (role::MASK_FEATURES.into(), hash_folder(&a.masks, "_f.npy")?),
         ]);
-        if footprints.rows.iter().any(|row| !row.is_of(&Level::SAM)) {
+        // A model that names what it sees may have seen nothing.
+        let has_names =
+            |view: &String| MaskMaps::read(maps_path(&a.masks, view)).is_ok_and(|m| m.levels() != Level::SAM);
+        if footprints.rows.iter().any(|row| !row.is_of(&Level::SAM)) || footprints.views.first().is_some_and(has_names)
+        {
             hashes.insert(role::MASK_NAMES.into(), hash_folder(&a.masks, "_s.json")?);
         }
         hashes.extend(features_file.map(|file| (role::FEATURES.into(), file.hash().into())));

@@ -467,6 +467,19 @@ fn scenes_without_anything_are_results_not_errors() {
     let (i, _) = s.succeed(&["--cluster", "free", "--min-samples", "5", "--levels", "small"]);
     things(&i);
     assert!(i.matches.is_empty() && i.support == [0, 0]);
+    let has_names = || {
+        let made = Artifact::open(s.path("out/instances.safetensors"), "instances", 1).unwrap();
+        made.provenance().inputs.contains_key(role::MASK_NAMES)
+    };
+    assert!(!has_names());
+    // Those of a model that names what it sees, and saw nothing.
+    for v in 0..VIEWS {
+        let ids = Array3::from_elem((6, SIZE, SIZE), -1);
+        MaskMaps { ids }.write(s.path(&format!("masks/v{v}_s.npy"))).unwrap();
+    }
+    s.artifacts(|_| {});
+    s.succeed(&[]);
+    assert!(has_names());
     // One Gaussian.
     ply::write_gaussians(s.path("geometry.ply"), &gaussians().select(&[0]), &[]).unwrap();
     let graph = Graph {
