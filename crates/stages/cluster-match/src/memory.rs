@@ -6,7 +6,7 @@ use crate::options::{Settings, Space};
 use artifacts::Level;
 
 /// Bytes that a run takes, and for each Gaussian.
-const BASE: u64 = 12_800_000;
+const BASE: u64 = 15_500_000;
 const PER_GAUSSIAN: u64 = 1000;
 
 /// The least that a run with so many Gaussians takes, known before they are read.
@@ -22,7 +22,7 @@ pub fn forecast(inputs: &Inputs, settings: &Settings) -> u64 {
     // By the masks: every entry in the profile of its Gaussian or, where there are too many, of a small piece.
     let profiles = |levels: &[Level]| {
         let entries = footprints.total_at(levels);
-        18 * entries.min(MOST_ENTRIES) + 3 * entries.saturating_sub(MOST_ENTRIES)
+        14 * entries.min(MOST_ENTRIES) + 3 * entries.saturating_sub(MOST_ENTRIES)
     };
     let parts = if settings.split > 0.0 { profiles(&[Level::Small]) } else { 0 };
     // Features as they are read and as they are clustered; free points are also parted from their duplicates and lie in a tree:
@@ -33,6 +33,6 @@ pub fn forecast(inputs: &Inputs, settings: &Settings) -> u64 {
         Space::Graph => (6, batch.max(parts)),
         Space::Free => (18, batch.max(parts)),
     };
-    // Fitted to 11 runs of 5,000 to 950,000 Gaussians; by the masks to 11 of 12,000 to 950,000.
+    // By features fitted to 11 runs of 5,000 to 950,000 Gaussians; by the masks to 11 of 14,000 to 890,000.
     least(gaussians as u64) + entries + 14 * samples + value * kept * dim
 }
