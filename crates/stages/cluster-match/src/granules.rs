@@ -162,15 +162,18 @@ fn best_masks(
     like: &impl Fn(u32, u32) -> f64,
 ) -> Result<Vec<Vec<Shown>>> {
     let mut best: Vec<Vec<Shown>> = vec![Vec::new(); c.members.len()];
+    // Numbers of clusters begin after those of all Gaussians.
+    let root = nodes.iter().copied().filter(|&n| n >= 0).min().unwrap_or(0);
+    let nodes: Vec<i32> = nodes.iter().map(|&n| if n < 0 { -1 } else { n - root }).collect();
+    let above = c.above.iter().filter(|(node, _)| **node >= root).map(|(node, own)| (node - root, &own[..])).collect();
     let mut first = 0;
     for rows in footprints.rows.chunk_by(|a, b| a.view == b.view) {
         let masks = (first..first + rows.len())
             .into_par_iter()
-            .filter(|&r| footprints.rows[r].is_of(levels))
-            .map_init(Default::default, |sums, r| Mask::new(r, c, labels, nodes, footprints, sums))
+            .map_init(Default::default, |sums, r| Mask::new(r, &above, labels, &nodes, footprints, sums))
             .collect::<Result<Vec<Mask>>>()?;
         first += rows.len();
-        best_of_view(&masks, like, &mut best);
+        best_of_view(&masks, levels, like, &mut best);
     }
     Ok(best)
 }
@@ -188,7 +191,7 @@ struct Mask {
 impl Mask {
     fn new(
         row: usize,
-        c: &Candidates,
+        above: &BTreeMap<i32, &[u32]>,
         labels: &[i32],
         nodes: &[i32],
         footprints: &Footprints,
@@ -203,21 +206,21 @@ impl Mask {
             of.add(labels[i as usize], w);
         }
         for (node, w) in by_node.take() {
-            c.above.get(&(node as i32)).into_iter().flatten().for_each(|&own| of.add(own as i32, w));
+            above.get(&(node as i32)).into_iter().copied().flatten().for_each(|&own| of.add(own as i32, w));
         }
         Ok(Self { row: row as u32, level: footprints.rows[row].level, area, of: of.take().collect() })
     }
 }
 
-/// Adds the mask of a view that fits each candidate best, of equals the first. What a view shows of a candidate is what the masks of
-/// a level hold of it, of that level which holds most.
-fn best_of_view(masks: &[Mask], like: &impl Fn(u32, u32) -> f64, best: &mut [Vec<Shown>]) {
+/// Adds the mask at `levels` of a view that fits each candidate best, of equals the first. What a view shows of a candidate is what the masks
+/// of a level hold of it, of that level which holds most.
+fn best_of_view(masks: &[Mask], levels: &[Level], like: &impl Fn(u32, u32) -> f64, best: &mut [Vec<Shown>]) {
     let mut seen: HashMap<u32, [f64; LEVELS]> = HashMap::new();
     for m in masks {
         m.of.iter().for_each(|&(c, w)| seen.entry(c).or_default()[m.level as usize] += w);
     }
     let mut of_view: BTreeMap<u32, Shown> = BTreeMap::new();
-    for m in masks {
+    for m in masks.iter().filter(|m| levels.contains(&Level::ALL[m.level as usize])) {
         for &(c, w) in m.of.iter().filter(|(_, w)| *w > 0.0) {
             let seen = seen[&c].into_iter().fold(0.0, f64::max);
             let shown = Shown { row: m.row, fit: w / (seen + m.area - w) * like(c, m.row), seen };

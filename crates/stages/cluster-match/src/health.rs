@@ -1,6 +1,6 @@
 //! How far masks and instances agree, and what masks with names call them.
 
-use artifacts::{Footprints, Health, Instances, MaskNames, Naming, ScoredName, read_mask_names};
+use artifacts::{Footprints, Health, Instances, LEVELS, Level, MaskNames, Naming, ScoredName, read_mask_names};
 use gs_io::Result;
 use std::collections::BTreeMap;
 use std::path::Path;
@@ -23,25 +23,41 @@ pub fn measure(instances: &Instances, weights: &Weights) -> Health {
     Health { largest, purity: (all > 0.0).then(|| inside / all), names: Vec::new() }
 }
 
-/// What masks call each instance ([`Health::names`]), by its weight in the masks of levels with names. `folder` has the id maps.
+/// What masks call each instance ([`Health::names`]), by the share of what the views show of it. `weights` are those in the masks of all
+/// levels. Where a view has two levels with names, the one that says more counts. `folder` has the id maps.
 ///
 /// # Errors
 /// When a file of names is damaged.
 pub fn names(weights: &Weights, footprints: &Footprints, folder: &Path) -> Result<Vec<Naming>> {
-    if weights.is_empty() {
+    let row_of = |row: u32| &footprints.rows[row as usize];
+    if weights.iter().all(|(row, _)| row_of(*row).is_of(&Level::SAM)) {
         return Ok(Vec::new());
     }
     let names =
         footprints.views.iter().map(|view| read_mask_names(folder, view)).collect::<Result<Vec<MaskNames>>>()?;
     let mut all: BTreeMap<u32, f64> = BTreeMap::new();
     let mut called: BTreeMap<u32, BTreeMap<&str, f64>> = BTreeMap::new();
-    for (row, of) in weights {
-        let row = &footprints.rows[*row as usize];
-        let name = names[row.view as usize].get(&row.mask);
-        for (&k, &w) in of {
-            *all.entry(k).or_default() += w;
-            if let Some(mask) = name {
-                *called.entry(k).or_default().entry(&mask.name).or_default() += w * f64::from(mask.score);
+    for of_view in weights.chunk_by(|a, b| row_of(a.0).view == row_of(b.0).view) {
+        let mut seen: BTreeMap<u32, [f64; LEVELS]> = BTreeMap::new();
+        let mut said: BTreeMap<(u32, u32), BTreeMap<&str, f64>> = BTreeMap::new();
+        for (row, of) in of_view {
+            let row = row_of(*row);
+            let name = names[row.view as usize].get(&row.mask);
+            for (&k, &w) in of {
+                seen.entry(k).or_default()[row.level as usize] += w;
+                if let Some(mask) = name {
+                    *said.entry((k, row.level)).or_default().entry(&mask.name).or_default() +=
+                        w * f64::from(mask.score);
+                }
+            }
+        }
+        for (k, levels) in seen {
+            *all.entry(k).or_default() += levels.into_iter().fold(0.0, f64::max);
+            let sum = |of: &BTreeMap<&str, f64>| of.values().sum::<f64>();
+            let of_level = said.range((k, 0)..=(k, u32::MAX)).map(|(_, of)| of);
+            let more = of_level.max_by(|a, b| sum(a).total_cmp(&sum(b)));
+            for (name, w) in more.into_iter().flatten() {
+                *called.entry(k).or_default().entry(name).or_default() += w;
             }
         }
     }
@@ -63,7 +79,7 @@ mod tests {
     use super::*;
     use crate::profile::mask_weights;
     use crate::testing::{footprints, footprints_of, instances};
-    use artifacts::{Level, MaskName, note_path};
+    use artifacts::{MaskName, note_path};
     use serde_json::json;
 
     fn health(instances: &Instances, footprints: &Footprints, level: Level) -> Health {
@@ -96,7 +112,7 @@ mod tests {
             let note = json!({ "facts": { "names": names } });
             gs_io::write_json(note_path(dir.path(), &view.to_string()), &note).unwrap();
         }
-        let weights = mask_weights(&[0, 0, 0, 0, 1, 1, 1, 1], &footprints, &[Level::Classes]).unwrap();
+        let weights = mask_weights(&[0, 0, 0, 0, 1, 1, 1, 1], &footprints, &Level::ALL).unwrap();
         let found = names(&weights, &footprints, dir.path()).unwrap();
         let said: Vec<_> = found.iter().map(|n| (n.instance, n.sure, n.names[0].name.as_str())).collect();
         assert_eq!(said, [(0, false, "sofa"), (1, true, "table")]);
@@ -106,5 +122,28 @@ mod tests {
         gs_io::write_json(note_path(dir.path(), "0"), &wrong).unwrap();
         let e = names(&weights, &footprints, dir.path()).unwrap_err().to_string();
         assert!(e.contains("0_s.json: 0: not the name of a mask"), "{e}");
+    }
+
+    #[test]
+    fn one_mask_that_grazes_an_instance_does_not_name_it() {
+        let dir = tempfile::tempdir().unwrap();
+        let name = |name: &str| MaskName { name: name.into(), score: 0.9 };
+        // The only concept of two views holds one of four Gaussians of instance 0; a class holds all of instance 1, with a concept.
+        let large: [&[&[u32]]; 2] = [&[&[0, 1, 2, 3], &[4, 5, 6, 7]]; 2];
+        let (classes, concepts): ([&[&[u32]]; 2], [&[&[u32]]; 2]) =
+            ([&[&[], &[], &[4, 5, 6, 7]]; 2], [&[&[], &[], &[], &[0, 4, 5]], &[]]);
+        let footprints =
+            footprints_of(&[(Level::Large, &large), (Level::Classes, &classes), (Level::Concepts, &concepts)]);
+        let names_of = MaskNames::from([(2, name("table")), (3, name("lamp"))]);
+        for view in ["0", "1"] {
+            let note = json!({ "facts": { "names": names_of } });
+            gs_io::write_json(note_path(dir.path(), view), &note).unwrap();
+        }
+        let weights = mask_weights(&[0, 0, 0, 0, 1, 1, 1, 1], &footprints, &Level::ALL).unwrap();
+        let found = names(&weights, &footprints, dir.path()).unwrap();
+        let said: Vec<_> =
+            found.iter().map(|n| (n.instance, n.sure, n.names[0].name.as_str(), n.names.len())).collect();
+        assert_eq!(said, [(0, false, "lamp", 1), (1, true, "table", 1)]);
+        assert!((found[0].names[0].score - 0.9 / 8.0).abs() < 1e-6 && (found[1].names[0].score - 0.9).abs() < 1e-6);
     }
 }

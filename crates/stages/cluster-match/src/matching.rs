@@ -4,9 +4,8 @@
 //! rendered feature of a mask is the mean of its Gaussians' features, each by its weight.
 
 use crate::granules::Shown;
-use artifacts::{Features, Footprints, Match, flat};
+use artifacts::{Features, Footprints, Level, Match, flat};
 use gs_io::Result;
-use rayon::prelude::*;
 
 /// Least score of a match.
 const LEAST: f64 = 0.2;
@@ -31,33 +30,38 @@ pub(crate) struct Likeness {
 }
 
 impl Likeness {
-    /// Those of `count` instances and of all rows of the footprints. `labels` are instances of the kept Gaussians, -1 for none.
+    /// Those of `count` instances, over all views, and of the masks at `levels`. `labels` are instances of the kept Gaussians, -1 for none.
     ///
     /// # Errors
     /// When the footprints can't be read.
-    pub fn new(labels: &[i32], count: usize, features: &Features, footprints: &Footprints) -> Result<Self> {
+    pub fn new(
+        labels: &[i32],
+        count: usize,
+        features: &Features,
+        footprints: &Footprints,
+        levels: &[Level],
+    ) -> Result<Self> {
         let dim = features.dim();
+        let mut all = Self { instances: vec![vec![0.0; dim]; count], masks: vec![Vec::new(); footprints.rows.len()] };
         if dim == 0 {
-            return Ok(Self { instances: vec![Vec::new(); count], masks: vec![Vec::new(); footprints.rows.len()] });
+            return Ok(all);
         }
         let add = |sum: &mut [f64], weight: f64, i: usize| {
             sum.iter_mut().zip(flat(features.row(i))).for_each(|(s, f)| *s += weight * f64::from(*f));
         };
-        let mask = |row| -> Result<Vec<f64>> {
-            let mut sum = vec![0.0; dim];
-            footprints.entries(row)?.iter().for_each(|(i, w)| add(&mut sum, f64::from(w), i as usize));
-            Ok(sum)
-        };
-        let masks = (0..footprints.rows.len()).into_par_iter().map(mask).collect::<Result<_>>()?;
         let mut seen = vec![0.0; labels.len()];
-        for row in 0..footprints.rows.len() {
-            footprints.entries(row)?.iter().for_each(|(i, w)| seen[i as usize] += f64::from(w));
+        for row in (0..footprints.rows.len()).filter(|&r| footprints.rows[r].is_of(levels)) {
+            let mut mask = vec![0.0; dim];
+            for (i, w) in footprints.entries(row)?.iter() {
+                seen[i as usize] += f64::from(w);
+                add(&mut mask, f64::from(w), i as usize);
+            }
+            all.masks[row] = mask;
         }
-        let mut instances = vec![vec![0.0; dim]; count];
         for (i, (&label, &weight)) in labels.iter().zip(&seen).enumerate().filter(|(_, (label, _))| **label >= 0) {
-            add(&mut instances[label as usize], weight, i);
+            add(&mut all.instances[label as usize], weight, i);
         }
-        Ok(Self { instances, masks })
+        Ok(all)
     }
 
     /// The cosine of an instance and a mask, a row of the footprints; 0 where it is negative or one has no direction, 1 where features
@@ -94,7 +98,7 @@ mod tests {
         let footprints = footprints(&[&[&[0, 1], &[2, 3]], &[&[0, 1]]]);
         let values = Array2::from_shape_fn((8, 2), |(i, c)| if i < 2 { [3.0, 0.0][c] } else { [0.0, 1.0][c] });
         let features = Features { kept: (0..8).collect(), values };
-        let likeness = Likeness::new(&[0, 0, 0, -1, 1, 1, 1, 1], 2, &features, &footprints).unwrap();
+        let likeness = Likeness::new(&[0, 0, 0, -1, 1, 1, 1, 1], 2, &features, &footprints, &[Level::Large]).unwrap();
         // 4 times (3, 0) and once (0, 1).
         let length = (12.0f64 * 12.0 + 1.0).sqrt();
         let of = |instance| [0, 1, 2].map(|row| likeness.of(instance, row));

@@ -8,7 +8,7 @@ use std::collections::BTreeMap;
 
 /// How much the agreement of a level counts, in the order of [`Level::ALL`]. Two that share small masks are one thing more surely than
 /// two that share large ones, and the medium level adds next to nothing. Chosen on scenes for tuning with three kinds of masks
-/// (docs/results/real-masks.md); the two with names on seven scenes (docs/results/scans.md).
+/// (docs/results/real-masks.md); classes on seven scenes (docs/results/scans.md), and concepts as they.
 const COUNTS: [f64; LEVELS] = [0.4, 1.0, 0.05, 0.6, 1.5, 1.5];
 /// Fewest views and levels that must show both, and least share of their weight in these, for their masks to tell.
 const LEAST_COMMON: (usize, f64) = (2, 0.05);

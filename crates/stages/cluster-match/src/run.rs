@@ -17,7 +17,6 @@ use artifacts::{Draft, Health, Instances, Level, MaskFeatures, MaskFolder, Row};
 use gs_io::{Error, Result, Watched};
 use gs_scene::splat;
 use ndarray::Array2;
-use rayon::prelude::*;
 use stage::{CommonArgs, Program, Stage};
 use std::collections::BTreeMap;
 use std::time::Instant;
@@ -102,7 +101,7 @@ fn find(a: &Args, settings: &Settings, inputs: &Inputs, stage: &Stage) -> Result
 
     let footprints = &inputs.footprints;
     let labels: Vec<i32> = inputs.graph.kept.iter().map(|&i| found.labels[i as usize]).collect();
-    let weights = mask_weights(&labels, footprints, &settings.levels)?;
+    let weights = mask_weights(&labels, footprints, &Level::ALL)?;
     let nodes: Vec<i32> = inputs.graph.kept.iter().map(|&i| found.nodes[i as usize]).collect();
     let parents =
         if settings.granules > 0 { found.tree.iter().map(|e| (e.child, e.parent)).collect() } else { BTreeMap::new() };
@@ -111,7 +110,7 @@ fn find(a: &Args, settings: &Settings, inputs: &Inputs, stage: &Stage) -> Result
     let (fits, mut shown): (Vec<f32>, Vec<_>) = of_instances.into_iter().unzip();
     let levels = &settings.levels;
     if inputs.features.dim() > 0 || !footprints.rows.iter().all(|r| r.is_of(levels)) {
-        let likeness = Likeness::new(&labels, found.instances, &inputs.features, footprints)?;
+        let likeness = Likeness::new(&labels, found.instances, &inputs.features, footprints, levels)?;
         shown = granules::best_at(levels, &labels, found.instances, footprints, &likeness)?;
     }
     let mut chosen = Witnesses::default();
@@ -124,9 +123,9 @@ fn find(a: &Args, settings: &Settings, inputs: &Inputs, stage: &Stage) -> Result
     let mut instances =
         Instances { views, tree: found.tree, node: found.nodes, granules, granule_descriptor, ..gathered };
     instances.score = confidence(&instances.count, &fits);
-    let named = mask_weights(&labels, footprints, &Level::ALL[Level::SAM.len()..])?;
-    let names = health::names(&named, footprints, &a.masks)?;
-    let health = Health { names, ..health::measure(&instances, &weights) };
+    let names = health::names(&weights, footprints, &a.masks)?;
+    let of_levels: Vec<_> = weights.into_iter().filter(|(r, _)| footprints.rows[*r as usize].is_of(levels)).collect();
+    let health = Health { names, ..health::measure(&instances, &of_levels) };
     let draft = Draft { instances, of_instances, of_granules, masks: mask_counts(a, inputs)? };
     Ok(Found { draft, health, noise, clustering_seconds })
 }
@@ -182,7 +181,8 @@ fn correct(
 /// The number of mask ids of each view.
 fn mask_counts(a: &Args, inputs: &Inputs) -> Result<Vec<u32>> {
     let folder = MaskFolder::open(&a.masks);
-    inputs.views.par_iter().map(|view| Ok(folder.read(view)?.id_count() as u32)).collect()
+    // One at a time: a map of a large photograph takes much memory.
+    inputs.views.iter().map(|view| Ok(folder.read(view)?.id_count() as u32)).collect()
 }
 
 /// The features of the masks that the descriptors read, by view index.
