@@ -20,7 +20,7 @@ pub struct Match {
     pub mask: u32,
     /// Association score, IoU x similarity of mean features (paper, S_kj), 0 to 1.
     pub score: f32,
-    /// How much of the silhouette is seen: blending weight of the instance's Gaussians summed over it, in pixels.
+    /// How much is seen of the instance: blending weight of its Gaussians summed over pixels in masks.
     pub visible: f32,
 }
 
