@@ -69,6 +69,9 @@ pub(crate) struct Shown {
 /// A granule, and its mask in each view that shows it.
 pub(crate) type Witnessed = (Granule, Vec<Shown>);
 
+/// How well masks fit an instance, and its mask in each view that shows it.
+pub(crate) type Fitted = (f32, Vec<Shown>);
+
 /// Finds what masks of at least `views` views show as one, what they show best and most often first, with these masks; nothing for 0 views.
 /// And of each instance how well masks fit it, 0 to 1, as [`Granule::fit`], with these. `labels` and `nodes` are those of the kept Gaussians.
 ///
@@ -80,7 +83,7 @@ pub(crate) fn find(
     nodes: &[i32],
     footprints: &Footprints,
     views: usize,
-) -> Result<(Vec<Witnessed>, Vec<(f32, Vec<Shown>)>)> {
+) -> Result<(Vec<Witnessed>, Vec<Fitted>)> {
     let best = best_masks(candidates, labels, nodes, footprints, &Level::ALL, &|_, _| 1.0)?;
     let (mut found, mut instances) = (Vec::new(), Vec::new());
     for (&members, mut shown) in candidates.members.iter().zip(best) {

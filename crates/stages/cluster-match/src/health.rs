@@ -130,8 +130,8 @@ mod tests {
         let name = |name: &str| MaskName { name: name.into(), score: 0.9 };
         // The only concept of two views holds one of four Gaussians of instance 0; a class holds all of instance 1, with a concept.
         let large: [&[&[u32]]; 2] = [&[&[0, 1, 2, 3], &[4, 5, 6, 7]]; 2];
-        let (classes, concepts): ([&[&[u32]]; 2], [&[&[u32]]; 2]) =
-            ([&[&[], &[], &[4, 5, 6, 7]]; 2], [&[&[], &[], &[], &[0, 4, 5]], &[]]);
+        let classes: [&[&[u32]]; 2] = [&[&[], &[], &[4, 5, 6, 7]]; 2];
+        let concepts: [&[&[u32]]; 2] = [&[&[], &[], &[], &[0, 4, 5]], &[]];
         let footprints =
             footprints_of(&[(Level::Large, &large), (Level::Classes, &classes), (Level::Concepts, &concepts)]);
         let names_of = MaskNames::from([(2, name("table")), (3, name("lamp"))]);

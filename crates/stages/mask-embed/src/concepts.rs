@@ -1,7 +1,7 @@
 //! Models that are asked for nouns, through ONNX: SAM 3 and its kin.
 //!
 //! A folder holds three graphs, by default as samexporter 0.5 (`export_sam3`) names them: one sees a photograph, one reads a noun, and the
-//! decoder gives masks with scores for both. Other exports have a `model.json` ([`Layout`]). Nouns are read once in a run.
+//! decoder gives masks with scores for both. Other exports have a `model.json` (docs/masks.md). Nouns are read once in a run.
 
 use crate::constants::{FILE, Numbers, constant};
 use crate::logits::{Grid, Logits};
