@@ -6,8 +6,8 @@
 
 use crate::describe::Witnesses;
 use crate::matching::Likeness;
-use crate::profile::Sums;
-use artifacts::{Footprints, Granule, LEVELS, Level, Members, Witness};
+use crate::profile::{Sums, shown_of};
+use artifacts::{Footprints, Granule, Level, Members, Witness};
 use gs_io::Result;
 use rayon::prelude::*;
 use std::collections::{BTreeMap, HashMap};
@@ -218,14 +218,11 @@ impl Mask {
 /// Adds the mask at `levels` of a view that fits each candidate best, of equals the first. What a view shows of a candidate is what the masks
 /// of a level hold of it, of that level which holds most.
 fn best_of_view(masks: &[Mask], levels: &[Level], like: &impl Fn(u32, u32) -> f64, best: &mut [Vec<Shown>]) {
-    let mut seen: HashMap<u32, [f64; LEVELS]> = HashMap::new();
-    for m in masks {
-        m.of.iter().for_each(|&(c, w)| seen.entry(c).or_default()[m.level as usize] += w);
-    }
+    let seen = shown_of(masks.iter().map(|m| (m.level, m.of.iter().copied())));
     let mut of_view: BTreeMap<u32, Shown> = BTreeMap::new();
     for m in masks.iter().filter(|m| levels.contains(&Level::ALL[m.level as usize])) {
         for &(c, w) in m.of.iter().filter(|(_, w)| *w > 0.0) {
-            let seen = seen[&c].into_iter().fold(0.0, f64::max);
+            let seen = seen[&c];
             let shown = Shown { row: m.row, fit: w / (seen + m.area - w) * like(c, m.row), seen };
             let now = of_view.entry(c).or_insert(shown);
             if shown.fit > now.fit {

@@ -1,6 +1,7 @@
 //! How far masks and instances agree, and what masks with names call them.
 
-use artifacts::{Footprints, Health, Instances, LEVELS, Level, MaskNames, Naming, ScoredName, read_mask_names};
+use crate::profile::shown_of;
+use artifacts::{Footprints, Health, Instances, Level, MaskNames, Naming, ScoredName, read_mask_names};
 use gs_io::Result;
 use std::collections::BTreeMap;
 use std::path::Path;
@@ -38,21 +39,17 @@ pub fn names(weights: &Weights, footprints: &Footprints, folder: &Path) -> Resul
     let mut all: BTreeMap<u32, f64> = BTreeMap::new();
     let mut called: BTreeMap<u32, BTreeMap<&str, f64>> = BTreeMap::new();
     for of_view in weights.chunk_by(|a, b| row_of(a.0).view == row_of(b.0).view) {
-        let mut seen: BTreeMap<u32, [f64; LEVELS]> = BTreeMap::new();
         let mut said: BTreeMap<(u32, u32), BTreeMap<&str, f64>> = BTreeMap::new();
         for (row, of) in of_view {
             let row = row_of(*row);
-            let name = names[row.view as usize].get(&row.mask);
+            let Some(mask) = names[row.view as usize].get(&row.mask) else { continue };
             for (&k, &w) in of {
-                seen.entry(k).or_default()[row.level as usize] += w;
-                if let Some(mask) = name {
-                    *said.entry((k, row.level)).or_default().entry(&mask.name).or_default() +=
-                        w * f64::from(mask.score);
-                }
+                *said.entry((k, row.level)).or_default().entry(&mask.name).or_default() += w * f64::from(mask.score);
             }
         }
-        for (k, levels) in seen {
-            *all.entry(k).or_default() += levels.into_iter().fold(0.0, f64::max);
+        let masks = of_view.iter().map(|(row, of)| (row_of(*row).level, of.iter().map(|(&k, &w)| (k, w))));
+        for (k, shown) in shown_of(masks) {
+            *all.entry(k).or_default() += shown;
             let sum = |of: &BTreeMap<&str, f64>| of.values().sum::<f64>();
             let of_level = said.range((k, 0)..=(k, u32::MAX)).map(|(_, of)| of);
             let more = of_level.max_by(|a, b| sum(a).total_cmp(&sum(b)));

@@ -152,9 +152,7 @@ impl Profile {
                 let (wx, wy) = (weight(a), weight(b));
                 let [same, all] = &mut levels[unit as usize % LEVELS];
                 let root = (wx * wy).sqrt();
-                // Dividing nothing takes time.
-                let common = common(a, b);
-                *same += if common > 0.0 { common / root } else { 0.0 };
+                *same += common(a, b) / root;
                 *all += root;
                 seen += 1;
                 share += (wx / self.total).min(wy / other.total);
@@ -168,11 +166,9 @@ impl Profile {
     }
 }
 
-/// Takes those at the start of `masks` that are of `unit`, at least one.
+/// Takes those at the start of `masks` that are of `unit`.
 fn take<'a>(masks: &mut &'a [(u32, f32)], unit: u32, unit_of: &[u32]) -> &'a [(u32, f32)] {
-    // One mask in most cases: the rims of Gaussians and instances are thin.
-    let is_of = |m: &(u32, f32)| unit_of[m.0 as usize] == unit;
-    let count = 1 + masks[1..].iter().take_while(|m| is_of(m)).count();
+    let count = masks.iter().take_while(|m| unit_of[m.0 as usize] == unit).count();
     let (taken, rest) = masks.split_at(count);
     *masks = rest;
     taken
@@ -240,6 +236,16 @@ pub fn mask_weights(
             Ok((r, sums.take().collect()))
         })
         .collect()
+}
+
+/// What a view shows of each instance: what the masks of a level hold of it, of that level which holds most. `masks` are those of the
+/// view: their level, and the weights of instances in them.
+pub(crate) fn shown_of<W: Iterator<Item = (u32, f64)>>(masks: impl Iterator<Item = (u32, W)>) -> BTreeMap<u32, f64> {
+    let mut levels: BTreeMap<u32, [f64; LEVELS]> = BTreeMap::new();
+    for (level, of) in masks {
+        of.for_each(|(k, w)| levels.entry(k).or_default()[level as usize] += w);
+    }
+    levels.into_iter().map(|(k, levels)| (k, levels.into_iter().fold(0.0, f64::max))).collect()
 }
 
 /// Sums of weights by number, for numbers that are few but come often.

@@ -444,9 +444,11 @@ fn instances_ply_keeps_all_harmonics_and_what_other_programs_wrote() {
 #[test]
 fn a_geometry_learnt_with_the_filter_is_written_with_it() {
     let s = Scene::new();
+    let (plain, _) = s.succeed(&[]);
     ply::write_gaussians(s.path("geometry.ply"), &gaussians(), &[ply::ANTIALIASED.into()]).unwrap();
     s.artifacts(|_| {});
-    s.succeed(&[]);
+    let (marked, _) = s.succeed(&[]);
+    assert_eq!(plain.label, marked.label);
     assert!(ply::is_antialiased(s.path("out/instances.ply")).unwrap());
 }
 
