@@ -86,8 +86,8 @@ pub(crate) struct MasksArgs {
     #[arg(long, value_name = "FOLDER")]
     #[serde(skip)]
     pub concepts: Option<PathBuf>,
-    /// What to look for with --concepts: a text file, a noun a line. Each takes a run of the decoder on every photograph, with SAM 3
-    /// seconds [default: about 1,200 everyday things, the vocabulary of eval names]
+    /// What to look for with --concepts: a text file, a noun a line. With SAM 3 each noun takes about 13 processor seconds a photograph
+    /// [default: about 1,200 everyday things, the vocabulary of eval names]
     #[arg(long, value_name = "FILE", requires = "concepts")]
     #[serde(skip)]
     pub nouns: Option<PathBuf>,
