@@ -156,7 +156,7 @@ impl Options {
         let describe = |(object, masks): (usize, &Vec<u32>)| {
             let features = masks.iter().filter_map(|&r| world.feature(&rows[r as usize]));
             let features: Vec<Vec<f32>> = features.map(|f| normed(&wide(f))).collect();
-            let seed = stage.seed() ^ ((level as u64) << 32) ^ object as u64;
+            let seed = stage.seed() ^ ((level.index() as u64) << 32) ^ object as u64;
             (mean(&features, world.dim()), describe(&features, MOST, self.min_weight, seed))
         };
         let (means, descriptors) = own.par_iter().enumerate().map(describe).unzip();

@@ -131,7 +131,7 @@ impl Peer for Options {
         let reach = edge_limit(&world.graph, &world.geometry.gaussians.means, REACH);
         let mut objects = Vec::new();
         for &level in &world.levels {
-            let masks = read(world, level as u32, &self.rules)?;
+            let masks = read(world, level.index() as u32, &self.rules)?;
             let (nodes, thresholds, dropped) = nodes(&masks, &self.rules);
             stage.info(&format!("level {level}: {} masks, {dropped} of them under-segmented", masks.row.len()));
             let nodes = cluster(nodes, masks.row.len(), &thresholds, self.rules.consensus);

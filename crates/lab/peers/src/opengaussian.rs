@@ -354,7 +354,7 @@ mod tests {
             weights: &alphas,
             alpha: &[],
         };
-        let found = shares(&t, &[0, 0, 1], &[1.0, 0.5, 0.25], 1, &maps, &[Level::Large]);
+        let found = shares(&t, &[0, 0, 1], &[1.0, 0.5, 0.25], 1, &maps, &[Level::LARGE]);
         // Cluster 0 alone has alpha 0.95, 0.8 and 1, so pixels 0 and 2: 0.8 x 1 + 0.2 x 0.75 x 0.5, and 0.5. Cluster 1 has
         // pixel 1: 0.95 x 0.25.
         let expected = [((0, 5), 0.875), ((0, 6), 0.5), ((1, 5), 0.2375)];
@@ -398,7 +398,7 @@ mod tests {
         let maps = MaskMaps { ids: arr3(&[[row]; 4]) };
         // Mask 0 is half 0.3 and half 0.7: variance 0.04, but the largest. Mask 1 is 0.4 and 0.6: 0.01. Mask 2 is even.
         let image = [0.3, 0.3, 0.7, 0.7, 0.4, 0.6, 0.2, 0.2, 0.2, 0.9];
-        let found = seen(&image, 1, &maps, &[Level::Large]);
+        let found = seen(&image, 1, &maps, &[Level::LARGE]);
         let mixed: Vec<u32> = found.iter().filter(|(_, m)| m.mixed).map(|(&id, _)| id).collect();
         assert_eq!((mixed, found.len(), found[&1].area), (vec![1], 3, 2.0));
         assert!((found[&0].mean[0] - 0.5).abs() < 1e-6 && (found[&2].mean[0] - 0.2).abs() < 1e-6);

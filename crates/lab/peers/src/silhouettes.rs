@@ -300,7 +300,7 @@ mod tests {
         let values = arr2(&[[1.0, 0.0], [0.0, 1.0], [-1.0, 0.2]]);
         let features = Features { kept: vec![0, 1, 2], values };
         let table = FeatureTable::new(&features, 3);
-        let o = overlaps(&g, &RasterOptions::default(), &[0, 1, 2], &table, &camera, &maps(), &[Level::Large]);
+        let o = overlaps(&g, &RasterOptions::default(), &[0, 1, 2], &table, &camera, &maps(), &[Level::LARGE]);
         assert_eq!(o.masks[&3].area + o.masks[&4].area, (W * H) as u32);
         assert!(o.common.contains_key(&(0, 3)) && o.common.contains_key(&(1, 4)));
         assert!(!o.common.contains_key(&(0, 4)) && !o.common.contains_key(&(1, 3)));
@@ -330,7 +330,7 @@ mod tests {
         let values = arr2(&[[1.0, 2.0, 0.5], [-1.0, 3.0, 0.25]]);
         let features = Features { kept: vec![0, 2], values };
         let all = [1.0, 2.0, 0.5, 0.0, 0.0, 0.0, -1.0, 3.0, 0.25];
-        let (labels, maps, levels) = ([0, -1, 0], maps(), [Level::Default, Level::Small]);
+        let (labels, maps, levels) = ([0, -1, 0], maps(), [Level::DEFAULT, Level::SMALL]);
         let table = FeatureTable::new(&features, 3);
         let o = overlaps(&g, raster, &labels, &table, &camera, &maps, &levels);
         let image = gs_raster::render_features(&g, &all, 3, &camera, options);
@@ -351,12 +351,12 @@ mod tests {
                 assert!((a - b).abs() < 1e-3 * b.abs().max(1.0), "{region:?}, expected {features:?}");
             }
         };
-        for (id, level) in [(0, Level::Default), (1, Level::Default), (2, Level::Small)] {
+        for (id, level) in [(0, Level::DEFAULT), (1, Level::DEFAULT), (2, Level::SMALL)] {
             check(&o.masks[&id], sum(&image, &|p| flat(maps.level(level))[p] == id as i32));
         }
         let inside = |p: usize| alpha[p] > SELECTED_ALPHA;
         check(&o.instances[&0], sum(&own, &inside));
-        let common = |mask: i32| sum(&own, &|p| inside(p) && flat(maps.level(Level::Default))[p] == mask).0;
+        let common = |mask: i32| sum(&own, &|p| inside(p) && flat(maps.level(Level::DEFAULT))[p] == mask).0;
         assert_eq!(o.common[&(0, 0)], common(0));
         assert_eq!(o.common.get(&(0, 1)).copied().unwrap_or(0), common(1));
         assert_eq!(o.common[&(0, 2)], o.instances[&0].area);

@@ -5,8 +5,8 @@
 use crate::cli::Peer;
 use crate::silhouettes::{FeatureTable, matches, overlaps};
 use artifacts::{
-    Descriptors, Features, Footprints, Graph, LEVELS, Level, MaskFeatures, MaskFolder, MaskMaps, Match, Row,
-    features_path, flat, hash_folder, role,
+    Descriptors, Features, Footprints, Graph, Level, MaskFeatures, MaskFolder, MaskMaps, Match, Row, features_path,
+    flat, hash_folder, role,
 };
 use gs_io::{Claim, Error, Result, Watched, hash_file};
 use gs_raster::{RasterOptions, TileWeights, tile_weights};
@@ -202,9 +202,10 @@ impl World {
     /// The id maps of a view, and its camera in their size.
     pub fn maps(&self, view: usize) -> Result<(MaskMaps, Camera)> {
         let mut maps = self.masks.read(&self.views[view])?;
-        if maps.levels().len() < LEVELS {
+        let needed = self.levels.iter().map(|level| level.index() + 1).max().unwrap_or(0);
+        if let missing @ 1.. = needed.saturating_sub(maps.levels().len()) {
             // Levels that are not there have no masks.
-            let none = Array3::from_elem((LEVELS - maps.levels().len(), maps.height(), maps.width()), -1);
+            let none = Array3::from_elem((missing, maps.height(), maps.width()), -1);
             maps.ids = concatenate![Axis(0), maps.ids, none];
         }
         let camera = self.views[view].camera.resized(maps.width() as u32, maps.height() as u32);

@@ -250,7 +250,7 @@ fn without_faults_large_masks_are_the_true_instances() {
         let view = npy::read_f32(root.join("truth/views").join(format!("{}.npy", stem(v)))).unwrap();
         assert_eq!(view.shape(), [120, 160]);
         let mut pairs = BTreeSet::new();
-        for (&id, &instance) in maps.level(Level::Large).iter().zip(&view) {
+        for (&id, &instance) in maps.level(Level::LARGE).iter().zip(&view) {
             assert!(instance >= 0.0, "rooms are closed");
             if id >= 0 {
                 pairs.insert((id, instance as u32));

@@ -12,7 +12,7 @@ use std::path::Path;
 pub struct Row {
     /// Index of the view in [`Footprints::views`].
     pub view: u32,
-    /// Level, 0 to 5, in the order of [`Level::ALL`].
+    /// Level, 0 to 15, in the order of [`Level::ALL`].
     pub level: u32,
     /// Id in the view's `*_s.npy`, which is also the row of its `*_f.npy`.
     pub mask: u32,
@@ -27,7 +27,7 @@ pub struct Row {
 impl Row {
     /// Whether its mask is of one of the `levels`.
     pub fn is_of(&self, levels: &[Level]) -> bool {
-        levels.iter().any(|&l| l as u32 == self.level)
+        levels.iter().any(|&l| l.index() as u32 == self.level)
     }
 }
 

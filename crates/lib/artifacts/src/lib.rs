@@ -38,8 +38,8 @@ pub use health::Health;
 pub use instances::{Family, Instances, Match, OrientedBox, TreeEdge};
 pub use lerf_ovs::{LERF_OVS, LerfScene};
 pub use masks::{
-    LEVELS, Level, MaskFeatures, MaskFolder, MaskMaps, MaskName, MaskNames, features_path, folder_files, hash_folder,
-    maps_path, note_path, read_mask_names, same_shape, stems, watch_folder,
+    Kind, LEVELS, Level, MaskFeatures, MaskFolder, MaskMaps, MaskName, MaskNames, features_path, folder_files,
+    hash_folder, maps_path, note_path, read_mask_names, same_shape, stems, watch_folder,
 };
 pub use names::{Called, InstanceNames, Naming, ScoredName, called};
 pub use nyu40::NYU40;

@@ -8,49 +8,93 @@ use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
-/// Levels that an id map file may have: [`Level::SAM`] alone, or [`Level::ALL`].
-pub const LEVELS: usize = 6;
+/// Most levels that an id map file may have: SAM's four, then classes and concepts of up to six models of each kind.
+pub const LEVELS: usize = 16;
 
-/// A kind of masks, in the order of the files: granularity levels of SAM, then models that name what they see.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, serde::Serialize)]
-#[serde(rename_all = "lowercase")]
-pub enum Level {
-    /// SAM's default masks.
-    Default = 0,
-    /// Subparts.
-    Small = 1,
-    /// Parts.
-    Medium = 2,
-    /// Whole things.
-    Large = 3,
-    /// Segments of a panoptic model: each is a thing, or all that is seen of a class.
-    Classes = 4,
-    /// What a model finds that is asked for words.
-    Concepts = 5,
+/// A level of masks: its place in the files. Granularities of SAM come first, then models that name what they see.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
+pub struct Level(u8);
+
+/// What made the masks of a level.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Kind {
+    /// SAM, at one of its granularities.
+    Segments,
+    /// A panoptic model: a mask is a thing, or all that is seen of a class.
+    Classes,
+    /// A model that is asked for words.
+    Concepts,
 }
 
 impl Level {
+    /// SAM's default masks.
+    pub const DEFAULT: Self = Self(0);
+    /// Subparts.
+    pub const SMALL: Self = Self(1);
+    /// Parts.
+    pub const MEDIUM: Self = Self(2);
+    /// Whole things.
+    pub const LARGE: Self = Self(3);
+    /// What the first panoptic model sees.
+    pub const CLASSES: Self = Self(4);
+    /// What the first model finds that is asked for words.
+    pub const CONCEPTS: Self = Self(5);
     /// LangSplat's levels, which every file has.
-    pub const SAM: [Self; 4] = [Self::Default, Self::Small, Self::Medium, Self::Large];
+    pub const SAM: [Self; 4] = [Self::DEFAULT, Self::SMALL, Self::MEDIUM, Self::LARGE];
     /// All levels in the order of the files.
-    pub const ALL: [Self; LEVELS] =
-        [Self::Default, Self::Small, Self::Medium, Self::Large, Self::Classes, Self::Concepts];
-    const NAMES: [&str; LEVELS] = ["default", "small", "medium", "large", "classes", "concepts"];
+    pub const ALL: [Self; LEVELS] = {
+        let mut all = [Self::DEFAULT; LEVELS];
+        let mut at = 0;
+        while at < LEVELS {
+            all[at] = Self(at as u8);
+            at += 1;
+        }
+        all
+    };
+    const SAM_NAMES: [&str; 4] = ["default", "small", "medium", "large"];
+
+    /// Its place in the files, from 0.
+    pub const fn index(self) -> usize {
+        self.0 as usize
+    }
+
+    /// What made its masks. After SAM's levels the kinds take turns: classes, concepts, classes-2, concepts-2, ...
+    pub const fn kind(self) -> Kind {
+        match self.0 {
+            0..4 => Kind::Segments,
+            n if n % 2 == 0 => Kind::Classes,
+            _ => Kind::Concepts,
+        }
+    }
 }
 
 impl std::str::FromStr for Level {
     type Err = Error;
 
     fn from_str(s: &str) -> Result<Self> {
-        let is_meant = |l: &Self| s == Self::NAMES[*l as usize] || s == (*l as usize).to_string();
-        let expected = "default, small, medium, large, classes or concepts (or 0 to 5)";
+        let is_meant = |l: &Self| s == l.to_string() || s == l.0.to_string();
+        let expected = "default, small, medium, large, classes, concepts, classes-2, ... concepts-6 (or 0 to 15)";
         Self::ALL.into_iter().find(is_meant).ok_or_else(|| Error::new("unknown level").found(s).expected(expected))
     }
 }
 
 impl std::fmt::Display for Level {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-        f.write_str(Self::NAMES[*self as usize])
+        let name = match self.kind() {
+            Kind::Segments => Self::SAM_NAMES[self.index()],
+            Kind::Classes => "classes",
+            Kind::Concepts => "concepts",
+        };
+        match self.0 / 2 {
+            0..=2 => f.write_str(name),
+            nth => write!(f, "{name}-{}", nth - 1),
+        }
+    }
+}
+
+impl Serialize for Level {
+    fn serialize<S: serde::Serializer>(&self, serializer: S) -> std::result::Result<S::Ok, S::Error> {
+        serializer.collect_str(self)
     }
 }
 
@@ -152,7 +196,7 @@ pub fn watch_folder(folder: impl AsRef<Path>, suffix: &str) -> Result<Watched> {
 /// The id maps of one view.
 #[derive(Debug, Clone, PartialEq)]
 pub struct MaskMaps {
-    /// Mask id per pixel, -1 for none; `[4 or 6][height][width]`. Ids count on from level to level, so that an id is the row
+    /// Mask id per pixel, -1 for none; `[levels][height][width]`, levels an even number from 4. Ids count on from level to level, so that an id is the row
     /// of the mask in `*_f.npy`; ids without pixels exist.
     pub ids: Array3<i32>,
 }
@@ -161,7 +205,7 @@ impl MaskMaps {
     /// Largest id a file may name: as many as f32 counts exactly.
     const MAX_ID: f32 = 16_777_216.0;
 
-    /// Reads `*_s.npy`: any real dtype, `[4, H, W]` or `[6, H, W]` (or `[1, H, W]` and `[H, W]`: one level for SAM's four).
+    /// Reads `*_s.npy`: any real dtype, `[L, H, W]` with L levels, an even number from 4 (or `[1, H, W]` and `[H, W]`: one level for SAM's four).
     ///
     /// # Errors
     /// When the file is damaged, has another shape, or an id is not a whole number of at least -1 or out of proportion to
@@ -170,7 +214,9 @@ impl MaskMaps {
         let path = path.as_ref();
         let a = npy::read_f32(path)?;
         let (levels, height, width) = match *a.shape() {
-            [levels @ (1 | 4 | LEVELS), h, w] => (levels, h, w),
+            [levels, h, w] if levels == 1 || (Level::SAM.len()..=LEVELS).contains(&levels) && levels % 2 == 0 => {
+                (levels, h, w)
+            }
             [h, w] => (1, h, w),
             _ => (0, 0, 0),
         };
@@ -179,7 +225,7 @@ impl MaskMaps {
                 .file(path)
                 .field("shape")
                 .found(format!("{:?}", a.shape()))
-                .expected("[4, height, width], or [6, height, width] with classes and concepts"));
+                .expected("[4, height, width], or 2 more levels for each classes and concepts, up to 16"));
         }
         // Tables with a row for each id are made from this: ids are dense, so there are no more of them than pixels.
         let most = Self::MAX_ID.min((levels * height * width).max(1 << 16) as f32);
@@ -201,7 +247,7 @@ impl MaskMaps {
         Ok(Self { ids: Array3::from_shape_vec((levels, height, width), ids).expect("ids of all levels") })
     }
 
-    /// Writes `*_s.npy` as LangSplat does: f32 `[4, H, W]`; `[6, H, W]` where there are more levels.
+    /// Writes `*_s.npy` as LangSplat does: f32 `[4, H, W]`; more levels where models name masks.
     pub fn write(&self, path: impl AsRef<Path>) -> Result<()> {
         npy::write_f32(path, &self.ids.mapv(|id| id as f32))
     }
@@ -224,7 +270,7 @@ impl MaskMaps {
     /// The mask of a level that owns the pixel in this row and column; None too where there is no such level.
     #[inline(always)]
     pub fn mask(&self, level: Level, [y, x]: [usize; 2]) -> Option<u32> {
-        self.ids.get([level as usize, y, x]).and_then(|&id| u32::try_from(id).ok())
+        self.ids.get([level.index(), y, x]).and_then(|&id| u32::try_from(id).ok())
     }
 
     /// The map of one level, `[height][width]`.
@@ -232,13 +278,13 @@ impl MaskMaps {
     /// # Panics
     /// When there is no such level.
     pub fn level(&self, level: Level) -> ArrayView2<'_, i32> {
-        self.ids.index_axis(Axis(0), level as usize)
+        self.ids.index_axis(Axis(0), level.index())
     }
 
     /// Forgets the masks of all levels but these.
     pub fn keep(&mut self, levels: &[Level]) {
         for level in self.levels().iter().filter(|level| !levels.contains(level)) {
-            self.ids.index_axis_mut(Axis(0), *level as usize).fill(-1);
+            self.ids.index_axis_mut(Axis(0), level.index()).fill(-1);
         }
     }
 
@@ -402,8 +448,8 @@ mod tests {
         let m = MaskMaps { ids: Array3::from_shape_fn((4, 3, 5), id) };
         let half = m.shrunk(2);
         assert_eq!((half.width(), half.height()), (3, 2));
-        assert_eq!(half.level(Level::Default), arr2(&[[0, 2, 4], [20, 22, 24]]));
-        assert_eq!(half.level(Level::Large), arr2(&[[300, 302, 304], [320, 322, 324]]));
+        assert_eq!(half.level(Level::DEFAULT), arr2(&[[0, 2, 4], [20, 22, 24]]));
+        assert_eq!(half.level(Level::LARGE), arr2(&[[300, 302, 304], [320, 322, 324]]));
         assert_eq!(m.shrunk(1), m);
         assert_eq!(flat(m.shrunk(64).ids.view()), [0, 100, 200, 300]);
     }
@@ -415,15 +461,32 @@ mod tests {
         let m = MaskMaps { ids: Array3::from_shape_fn((4, 2, 3), |(l, y, x)| (6 * l + 3 * y + x) as i32 % 7 - 1) };
         m.write(&p).unwrap();
         assert_eq!(MaskMaps::read(&p).unwrap(), m);
-        assert_eq!(flat(m.level(Level::Large)), &flat(m.ids.view())[18..]);
+        assert_eq!(flat(m.level(Level::LARGE)), &flat(m.ids.view())[18..]);
         assert_eq!(stems(dir.path()).unwrap(), ["frame_00001"]);
         npy::write_f32(&p, &arr2(&[[0.0, 0.5, 0.0], [0.0, 0.0, 0.0]])).unwrap();
         let e = MaskMaps::read(&p).unwrap_err().to_string();
         assert!(e.contains("level 0, row 0, column 1") && e.contains("found 0.5"), "{e}");
         npy::write_f32(&p, &arr2(&[[-1.0, 0.0, 1.0], [2.0, 3.0, 4.0]])).unwrap();
-        assert_eq!(MaskMaps::read(&p).unwrap().level(Level::Medium), arr2(&[[-1, 0, 1], [2, 3, 4]]));
+        assert_eq!(MaskMaps::read(&p).unwrap().level(Level::MEDIUM), arr2(&[[-1, 0, 1], [2, 3, 4]]));
         npy::write_f32(&p, &Array2::<f32>::zeros((0, 3))).unwrap();
         assert!(MaskMaps::read(&p).is_err());
+    }
+
+    #[test]
+    fn levels_are_known_by_name_and_a_file_may_have_as_many_as_it_likes() {
+        let named = Level::ALL.map(|level| level.to_string());
+        assert_eq!(named[3..9], ["large", "classes", "concepts", "classes-2", "concepts-2", "classes-3"]);
+        assert!(Level::ALL.iter().zip(&named).all(|(level, name)| name.parse::<Level>().unwrap() == *level));
+        assert!(["classes-1", "classes-7", "16", ""].iter().all(|name| name.parse::<Level>().is_err()));
+        let kinds = [Level::LARGE, Level::CLASSES, Level::ALL[7]].map(Level::kind);
+        assert_eq!(kinds, [Kind::Segments, Kind::Classes, Kind::Concepts]);
+        let dir = tempfile::tempdir().unwrap();
+        let p = maps_path(dir.path(), "a");
+        for (levels, good) in [(4, true), (5, false), (6, true), (8, true), (16, true), (18, false)] {
+            let maps = MaskMaps { ids: Array3::from_shape_fn((levels, 2, 3), |(l, ..)| l as i32) };
+            maps.write(&p).unwrap();
+            assert_eq!(MaskMaps::read(&p).ok(), good.then_some(maps), "{levels}");
+        }
     }
 
     #[test]
@@ -444,7 +507,7 @@ mod tests {
         let folder = MaskFolder::open(&masks);
         let read = folder.read(&view).unwrap();
         assert!(folder.bends(&view));
-        let begins = |row: usize| read.level(Level::Large).row(row).iter().position(|&id| id == 1).unwrap();
+        let begins = |row: usize| read.level(Level::LARGE).row(row).iter().position(|&id| id == 1).unwrap();
         // A barrel pulls inwards, and more so the farther out: in the middle row x of the undistorted picture is seen at
         // 40 + (x - 40) (1 - 0.3 ((x - 40) / 50)^2).
         assert_eq!([begins(30), begins(29)], [19, 19]);

@@ -276,7 +276,8 @@ mod tests {
         for view in 0..3 {
             b.views.push(view.to_string());
             for (mask, (level, range)) in masks.iter().enumerate() {
-                let row = Row { view, level: *level as u32, mask: mask as u32, pixels: 10, gated: 10, alpha: 1.0 };
+                let row =
+                    Row { view, level: level.index() as u32, mask: mask as u32, pixels: 10, gated: 10, alpha: 1.0 };
                 let shown = range.clone().filter(|i| view < 2 || !(4..7).contains(i));
                 b.push(row, shown.map(|i| (i, 1.0)));
             }
@@ -297,8 +298,8 @@ mod tests {
 
     #[test]
     fn masks_of_each_level_find_their_part_and_thing() {
-        use Level::{Large, Small};
-        let all = [(Small, 0..4), (Small, 4..7), (Small, 7..11), (Large, 0..7), (Large, 7..11)];
+        let (small, large) = (Level::SMALL, Level::LARGE);
+        let all = [(small, 0..4), (small, 4..7), (small, 7..11), (large, 0..7), (large, 7..11)];
         let of = |members, support| Granule { members, support, fit: 1.0 };
         let expected = [
             (of(Members::Instance(0), 3), vec![3, 3, 0]),
@@ -312,7 +313,7 @@ mod tests {
 
     #[test]
     fn the_fit_of_an_instance_is_the_mean_over_its_views() {
-        let (_dir, f) = footprints(&[(Level::Large, 0..4), (Level::Large, 4..11)]);
+        let (_dir, f) = footprints(&[(Level::LARGE, 0..4), (Level::LARGE, 4..11)]);
         let candidates = Candidates::new(&LABELS, 2, &NODES, &PARENTS.into());
         let (none, instances) = find(&candidates, &LABELS, &NODES, &f, 0).unwrap();
         let fits: Vec<f32> = instances.iter().map(|(fit, _)| *fit).collect();
@@ -324,10 +325,10 @@ mod tests {
     #[test]
     fn what_no_mask_shows_as_one_is_no_granule() {
         // One mask over everything: IoU 3 / 11 with the handle, which is too little, 4 / 11 with bowl and spoon.
-        let members: Vec<Members> = found(&[(Level::Large, 0..11)]).iter().map(|(g, _)| g.members).collect();
+        let members: Vec<Members> = found(&[(Level::LARGE, 0..11)]).iter().map(|(g, _)| g.members).collect();
         assert!(!members.contains(&Members::Cluster(14)), "{members:?}");
         // The last view shows the bowl of the cup alone.
-        let cup = found(&[(Level::Large, 0..7), (Level::Large, 7..11)]);
+        let cup = found(&[(Level::LARGE, 0..7), (Level::LARGE, 7..11)]);
         assert_eq!(cup.len(), 2, "the bowl is nothing of its own: {cup:?}");
         assert_eq!((cup[0].0.members, cup[0].0.support, cup[0].0.fit), (Members::Instance(0), 3, 1.0));
     }

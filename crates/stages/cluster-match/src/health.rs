@@ -88,9 +88,9 @@ mod tests {
         // Instance 0 holds Gaussians 0 to 5, instance 1 holds 6 and 7. One mask fits, one holds 3 and 1.
         let footprints = footprints(&[&[&[0, 1], &[3, 4, 5, 6]]]);
         let instances = instances([0, 0, 0, 0, 0, 0, 1, 1]);
-        let found = health(&instances, &footprints, Level::Large);
+        let found = health(&instances, &footprints, Level::LARGE);
         assert_eq!(found, Health { largest: 0.75, purity: Some(5.0 / 6.0), names: vec![] });
-        assert_eq!(health(&instances, &footprints, Level::Small).purity, None);
+        assert_eq!(health(&instances, &footprints, Level::SMALL).purity, None);
     }
 
     #[test]
@@ -99,7 +99,7 @@ mod tests {
         let called = |name: &str, score| MaskName { name: name.into(), score };
         // Two views of level classes; the second has a mask without a name.
         let views: [&[&[u32]]; 2] = [&[&[0, 1, 2, 3], &[4, 5, 6, 7]], &[&[0, 1], &[2, 3], &[4, 5, 6, 7]]];
-        let footprints = footprints_of(&[(Level::Classes, &views), (Level::Large, &views)]);
+        let footprints = footprints_of(&[(Level::CLASSES, &views), (Level::LARGE, &views)]);
         let masks: [&[(u32, MaskName)]; 2] = [
             &[(0, called("sofa", 0.9)), (1, called("table", 0.5))],
             &[(0, called("chair", 1.0)), (2, called("table", 0.6))],
@@ -130,7 +130,7 @@ mod tests {
         let classes: [&[&[u32]]; 2] = [&[&[], &[], &[4, 5, 6, 7]]; 2];
         let concepts: [&[&[u32]]; 2] = [&[&[], &[], &[], &[0, 4, 5]], &[]];
         let footprints =
-            footprints_of(&[(Level::Large, &large), (Level::Classes, &classes), (Level::Concepts, &concepts)]);
+            footprints_of(&[(Level::LARGE, &large), (Level::CLASSES, &classes), (Level::CONCEPTS, &concepts)]);
         let names_of = MaskNames::from([(2, name("table")), (3, name("lamp"))]);
         for view in ["0", "1"] {
             let note = json!({ "facts": { "names": names_of } });

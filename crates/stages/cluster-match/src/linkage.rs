@@ -341,6 +341,7 @@ mod tests {
     use super::*;
     use crate::plane::testing::{board, places};
     use crate::surface::Rim;
+    use artifacts::LEVELS;
 
     /// Two masks a view; a member has the given share in the first, in views where it is seen at all.
     fn profile(firsts: &[Option<f32>]) -> Profile {
@@ -350,7 +351,15 @@ mod tests {
     }
 
     /// Level default of ten views.
-    const UNIT_OF: [u32; 20] = [0, 0, 6, 6, 12, 12, 18, 18, 24, 24, 30, 30, 36, 36, 42, 42, 48, 48, 54, 54];
+    const UNIT_OF: [u32; 20] = {
+        let mut units = [0; 20];
+        let mut mask = 0;
+        while mask < units.len() {
+            units[mask] = (mask / 2 * LEVELS) as u32;
+            mask += 1;
+        }
+        units
+    };
     const ONE: Option<f32> = Some(1.0);
     const TWO: Option<f32> = Some(0.0);
     const ALL: (f64, f64) = (0.0, f64::MAX);

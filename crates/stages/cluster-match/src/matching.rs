@@ -98,7 +98,7 @@ mod tests {
         let footprints = footprints(&[&[&[0, 1], &[2, 3]], &[&[0, 1]]]);
         let values = Array2::from_shape_fn((8, 2), |(i, c)| if i < 2 { [3.0, 0.0][c] } else { [0.0, 1.0][c] });
         let features = Features { kept: (0..8).collect(), values };
-        let likeness = Likeness::new(&[0, 0, 0, -1, 1, 1, 1, 1], 2, &features, &footprints, &[Level::Large]).unwrap();
+        let likeness = Likeness::new(&[0, 0, 0, -1, 1, 1, 1, 1], 2, &features, &footprints, &[Level::LARGE]).unwrap();
         // 4 times (3, 0) and once (0, 1).
         let length = (12.0f64 * 12.0 + 1.0).sqrt();
         let of = |instance| [0, 1, 2].map(|row| likeness.of(instance, row));

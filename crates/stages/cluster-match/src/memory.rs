@@ -24,7 +24,7 @@ pub fn forecast(inputs: &Inputs, settings: &Settings) -> u64 {
         let entries = footprints.total_at(levels);
         14 * entries.min(MOST_ENTRIES) + 3 * entries.saturating_sub(MOST_ENTRIES)
     };
-    let parts = if settings.split > 0.0 { profiles(&[Level::Small]) } else { 0 };
+    let parts = if settings.split > 0.0 { profiles(&[Level::SMALL]) } else { 0 };
     // Features as they are read and as they are clustered; free points are also parted from their duplicates and lie in a tree:
     // coordinates, the leaves' blocks, boxes. Entries are read in batches of 4 million.
     let batch = 9 * footprints.total().min(1 << 22);

@@ -2,7 +2,7 @@
 
 #![allow(rustdoc::invalid_html_tags, reason = "help texts name files as <view>_s.npy")]
 
-use artifacts::{Footprints, Level};
+use artifacts::{Footprints, Kind, Level};
 use clap::Parser;
 use hdbscan_exact::{Metric, Selection};
 use serde::Serialize;
@@ -155,12 +155,13 @@ impl Settings {
         if levels.is_empty() {
             levels = Level::ALL.into_iter().filter(there).collect();
             // A model that knows classes says better what a whole thing is than SAM, where it saw every view.
-            let views = |level| {
-                let of_level = footprints.rows.iter().filter(|row| row.is_of(&[level]));
-                of_level.map(|row| row.view).collect::<BTreeSet<u32>>()
+            let views = |levels: &[Level]| {
+                let of_levels = footprints.rows.iter().filter(|row| row.is_of(levels));
+                of_levels.map(|row| row.view).collect::<BTreeSet<u32>>()
             };
-            if levels.contains(&Level::Classes) && views(Level::Large).is_subset(&views(Level::Classes)) {
-                levels.retain(|level| *level != Level::Large);
+            let classes: Vec<Level> = levels.iter().copied().filter(|l| l.kind() == Kind::Classes).collect();
+            if !classes.is_empty() && views(&[Level::LARGE]).is_subset(&views(&classes)) {
+                levels.retain(|level| *level != Level::LARGE);
             }
         }
         Self { min_cluster_size: self.min_cluster_size.or(Some(smallest)), levels, ..self.clone() }
@@ -193,15 +194,19 @@ mod tests {
         };
         let view: &[&[&[u32]]] = &[&[&[0, 1]]];
         let sam = Level::SAM.map(|level| (level, view));
-        let with_classes = [&sam[..], &[(Level::Classes, view)]].concat();
+        let with_classes = [&sam[..], &[(Level::CLASSES, view)]].concat();
         let levels = |more: &[&str], masks: &[_]| parse(more).for_scene(8, &footprints_of(masks)).levels;
         assert_eq!(levels(&[], &sam), Level::SAM);
-        assert_eq!(levels(&[], &with_classes), [Level::Default, Level::Small, Level::Medium, Level::Classes]);
+        assert_eq!(levels(&[], &with_classes), [Level::DEFAULT, Level::SMALL, Level::MEDIUM, Level::CLASSES]);
         let two: &[&[&[u32]]] = &[&[&[0, 1]], &[&[0, 1]]];
         let one: &[&[&[u32]]] = &[&[&[0, 1]], &[]];
-        let some = levels(&[], &[(Level::Large, two), (Level::Classes, one)]);
-        assert!(some.contains(&Level::Large) && some.contains(&Level::Classes), "{some:?}");
-        assert_eq!(levels(&["--levels", "large,classes"], &with_classes), [Level::Large, Level::Classes]);
-        assert_eq!(levels(&["--cluster", "free", "--features", "x"], &with_classes), [Level::Large]);
+        let some = levels(&[], &[(Level::LARGE, two), (Level::CLASSES, one)]);
+        assert!(some.contains(&Level::LARGE) && some.contains(&Level::CLASSES), "{some:?}");
+        // Two models of which each saw one view.
+        let other: &[&[&[u32]]] = &[&[], &[&[0, 1]]];
+        let both = levels(&[], &[(Level::LARGE, two), (Level::CLASSES, one), ("classes-2".parse().unwrap(), other)]);
+        assert!(!both.contains(&Level::LARGE) && both.contains(&Level::ALL[6]), "{both:?}");
+        assert_eq!(levels(&["--levels", "large,classes"], &with_classes), [Level::LARGE, Level::CLASSES]);
+        assert_eq!(levels(&["--cluster", "free", "--features", "x"], &with_classes), [Level::LARGE]);
     }
 }

@@ -39,7 +39,7 @@ impl Pieces {
     fn apart(&self, footprints: &Footprints, large: Level) -> Result<Vec<bool>> {
         let wholes: Vec<i32> = self.pairs.iter().map(|p| p.0).collect();
         let agreements = |level| with_rest(&self.labels, &wholes, footprints, &[level]);
-        let (medium, large) = (agreements(Level::Medium)?, agreements(large)?);
+        let (medium, large) = (agreements(Level::MEDIUM)?, agreements(large)?);
         Ok(medium.into_iter().zip(large).map(|(m, l)| m.zip(l).is_some_and(|(m, l)| m - l >= APART)).collect())
     }
 
@@ -151,7 +151,7 @@ mod tests {
         let once: [&[&[u32]]; 2] = [together[0], &[&[0, 1], &[2, 3, 4, 5], &[6, 7]]];
         let unseen: [&[&[u32]]; 2] = [&[&[6, 7]]; 2];
         let apart = |medium, large| {
-            pieces.apart(&footprints_of(&[(Level::Medium, medium), (Level::Large, large)]), Level::Large).unwrap()
+            pieces.apart(&footprints_of(&[(Level::MEDIUM, medium), (Level::LARGE, large)]), Level::LARGE).unwrap()
         };
         assert_eq!(apart(&together, &once), [true, true, false]);
         for (medium, large) in [(&together, &together), (&once, &together), (&once, &once), (&together, &unseen)] {
@@ -166,7 +166,7 @@ mod tests {
             let mut wholes = of(vec![0; 8], 1);
             let parts = of(vec![0, 0, 0, 0, 0, 0, 1, 1], 2);
             let split =
-                split(&mut wholes, &parts, &all, &footprints_of(&[(Level::Small, &views)]), Level::Large, 0.3).unwrap();
+                split(&mut wholes, &parts, &all, &footprints_of(&[(Level::SMALL, &views)]), Level::LARGE, 0.3).unwrap();
             (split, wholes)
         };
         let shown: &[&[u32]] = &[&[0, 1, 2, 3, 4, 5], &[6, 7]];

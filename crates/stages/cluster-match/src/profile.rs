@@ -9,7 +9,12 @@ use std::collections::BTreeMap;
 /// How much the agreement of a level counts, in the order of [`Level::ALL`]. Two that share small masks are one thing more surely than
 /// two that share large ones, and the medium level adds next to nothing. Chosen on scenes for tuning with three kinds of masks
 /// (docs/results/real-masks.md); classes on seven scenes (docs/results/scans.md), and concepts as they.
-const COUNTS: [f64; LEVELS] = [0.4, 1.0, 0.05, 0.6, 1.5, 1.5];
+const COUNTS: [f64; LEVELS] = {
+    let [default, small, medium, large] = [0.4, 1.0, 0.05, 0.6];
+    let mut counts = [1.5; LEVELS];
+    [counts[0], counts[1], counts[2], counts[3]] = [default, small, medium, large];
+    counts
+};
 /// Fewest views and levels that must show both, and least share of their weight in these, for their masks to tell.
 const LEAST_COMMON: (usize, f64) = (2, 0.05);
 
@@ -283,7 +288,8 @@ mod tests {
     use crate::testing::{footprints, footprints_of};
 
     /// Two views of two levels, default and small, with two masks each.
-    const UNIT_OF: [u32; 8] = [0, 0, 1, 1, 6, 6, 7, 7];
+    const UNIT_OF: [u32; 8] = [0, 0, 1, 1, SECOND, SECOND, SECOND + 1, SECOND + 1];
+    const SECOND: u32 = LEVELS as u32;
 
     fn of(masks: &[(u32, f32)]) -> Profile {
         Profile::new(masks.to_vec())
@@ -324,11 +330,11 @@ mod tests {
     #[test]
     fn gaussians_and_instances_have_the_same_masks() {
         let views: [&[&[u32]]; 2] = [&[&[0, 1, 2], &[4]], &[&[2, 3]]];
-        let footprints = footprints_of(&[(Level::Small, &views), (Level::Large, &views)]);
+        let footprints = footprints_of(&[(Level::SMALL, &views), (Level::LARGE, &views)]);
         let own: Vec<i32> = (0..8).collect();
-        let of_gaussians = Profile::of_pieces(&own, 8, &footprints, &[Level::Large], &[true; 2]).unwrap();
+        let of_gaussians = Profile::of_pieces(&own, 8, &footprints, &[Level::LARGE], &[true; 2]).unwrap();
         let labels = [0, 0, 0, 1, -1, -1, -1, -1];
-        let of_instances = Profile::of_instances(&labels, 2, &footprints, &[Level::Large]).unwrap();
+        let of_instances = Profile::of_instances(&labels, 2, &footprints, &[Level::LARGE]).unwrap();
         let sum = of_gaussians[..3].iter().fold(Profile::default(), |sum, p| sum.joined(p));
         assert_eq!((&sum.masks, &of_gaussians[3].masks), (&of_instances[0].masks, &of_instances[1].masks));
         assert!(of_gaussians[5].masks.is_empty());
@@ -338,12 +344,12 @@ mod tests {
     fn some_views_are_read_where_there_are_too_many_entries() {
         let view: &[&[u32]] = &[&[0, 1], &[2]];
         let footprints = footprints(&[view; 6]);
-        let views = |most| some_views(&footprints, &[Level::Large], most);
+        let views = |most| some_views(&footprints, &[Level::LARGE], most);
         assert_eq!(views(18), [true; 6]);
         assert_eq!(views(9), [false, true, false, true, false, true]);
         assert_eq!(views(12), [false, true, true, false, true, true]);
         let own = [0, 0, 1, 2, 3, 4, 5, 6];
-        let pieces = Profile::of_pieces(&own, 7, &footprints, &[Level::Large], &views(9)).unwrap();
+        let pieces = Profile::of_pieces(&own, 7, &footprints, &[Level::LARGE], &views(9)).unwrap();
         assert_eq!(
             (&pieces[0].masks[..], &pieces[1].masks[..]),
             (&[(2, 2.0), (6, 2.0), (10, 2.0)][..], &[(3, 1.0), (7, 1.0), (11, 1.0)][..])
@@ -358,8 +364,8 @@ mod tests {
         let footprints = footprints(&views);
         let agreements = |levels| with_rest(&[0, 0, 1, 1, -1, -1, 2, 2], &[0, 0, 1], &footprints, levels).unwrap();
         let half = |agreement: Option<f64>| (agreement.unwrap() - 0.5).abs() < 1e-12;
-        let [a, b, alone] = agreements(&[Level::Large])[..] else { panic!("one for each piece") };
+        let [a, b, alone] = agreements(&[Level::LARGE])[..] else { panic!("one for each piece") };
         assert!(half(a) && half(b) && alone.is_none(), "{a:?} {b:?} {alone:?}");
-        assert_eq!(agreements(&[Level::Medium]), [None; 3], "no masks");
+        assert_eq!(agreements(&[Level::MEDIUM]), [None; 3], "no masks");
     }
 }

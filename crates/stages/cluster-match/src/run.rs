@@ -13,7 +13,7 @@ use crate::profile::mask_weights;
 use crate::rank::confidence;
 use crate::surface::Points;
 use crate::{health, linkage, memory};
-use artifacts::{Draft, Health, Instances, Level, MaskFeatures, MaskFolder, Row};
+use artifacts::{Draft, Health, Instances, Kind, Level, MaskFeatures, MaskFolder, Row};
 use gs_io::{Error, Result, Watched};
 use gs_scene::splat;
 use ndarray::Array2;
@@ -155,11 +155,12 @@ fn correct(
             stage.info(&format!("{} instances after joining pieces that the masks show as one", found.instances));
         }
     }
-    let small = |row: &Row| row.is_of(&[Level::Small]);
-    if settings.split > 0.0 && settings.levels.contains(&Level::Small) && footprints.rows.iter().any(small) {
-        let clustering = linkage::cluster(inputs, points, settings, &[Level::Small], (PARTS, 0.0))?;
+    let small = |row: &Row| row.is_of(&[Level::SMALL]);
+    if settings.split > 0.0 && settings.levels.contains(&Level::SMALL) && footprints.rows.iter().any(small) {
+        let clustering = linkage::cluster(inputs, points, settings, &[Level::SMALL], (PARTS, 0.0))?;
         let parts = Assignment::new(&clustering, &graph.kept, means.len());
-        let large = if settings.levels.contains(&Level::Classes) { Level::Classes } else { Level::Large };
+        let classes = settings.levels.iter().find(|level| level.kind() == Kind::Classes);
+        let large = *classes.unwrap_or(&Level::LARGE);
         let split = split(&mut found, &parts, &graph.kept, footprints, large, settings.split)?;
         if split > 0 {
             stage.info(&format!("{split} small things within others are instances of their own"));

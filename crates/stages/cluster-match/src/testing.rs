@@ -5,7 +5,7 @@ use gs_io::Provenance;
 
 /// Footprints of eight Gaussians, of all weight 1, with the masks of each view; all of level large.
 pub fn footprints(views: &[&[&[u32]]]) -> Footprints {
-    footprints_of(&[(Level::Large, views)])
+    footprints_of(&[(Level::LARGE, views)])
 }
 
 /// The same with several levels.
@@ -15,7 +15,8 @@ pub fn footprints_of(levels: &[(Level, &[&[&[u32]]])]) -> Footprints {
     for (view, _) in levels[0].1.iter().enumerate() {
         for (level, views) in levels {
             for (mask, gaussians) in views[view].iter().enumerate() {
-                let (view, level, mask, pixels) = (view as u32, *level as u32, mask as u32, gaussians.len() as u32);
+                let (view, level, mask, pixels) =
+                    (view as u32, level.index() as u32, mask as u32, gaussians.len() as u32);
                 let row = Row { view, level, mask, pixels, gated: pixels, alpha: 1.0 };
                 b.push(row, gaussians.iter().map(|&i| (i, 1.0)));
             }

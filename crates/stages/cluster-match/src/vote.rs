@@ -182,7 +182,7 @@ mod tests {
     fn a_thing_as_thin_as_a_gaussian_stays_what_its_masks_say() {
         let (_dir, footprints, graph) = row(|i| i == 7);
         let mut labels: Vec<i32> = (0..20).map(|i| i32::from(i == 7 || i == 8)).collect();
-        assert_eq!(by_votes(&mut labels, 2, &footprints, &graph, &[Level::Large], 5).unwrap(), 1);
+        assert_eq!(by_votes(&mut labels, 2, &footprints, &graph, &[Level::LARGE], 5).unwrap(), 1);
         assert_eq!(labels, (0..20).map(|i| i32::from(i == 7)).collect::<Vec<_>>());
     }
 
@@ -195,12 +195,12 @@ mod tests {
         labels[17] = -1;
         let mut expected: Vec<i32> = (0..20).map(|i| i32::from(i >= 10)).collect();
         expected[17] = -1;
-        let moved = by_votes(&mut labels, 2, &footprints, &graph, &[Level::Large], 5).unwrap();
+        let moved = by_votes(&mut labels, 2, &footprints, &graph, &[Level::LARGE], 5).unwrap();
         assert_eq!((moved, &labels), (3, &expected));
-        assert_eq!(by_votes(&mut labels, 2, &footprints, &graph, &[Level::Large], 5).unwrap(), 0);
+        assert_eq!(by_votes(&mut labels, 2, &footprints, &graph, &[Level::LARGE], 5).unwrap(), 0);
         // No masks of this level: no votes, no change.
         let mut off = vec![0; 20];
         off[3] = 1;
-        assert_eq!(by_votes(&mut off, 2, &footprints, &graph, &[Level::Small], 5).unwrap(), 0);
+        assert_eq!(by_votes(&mut off, 2, &footprints, &graph, &[Level::SMALL], 5).unwrap(), 0);
     }
 }

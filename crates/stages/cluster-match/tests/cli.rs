@@ -560,7 +560,7 @@ fn bad_input_is_one_line_and_leaves_outputs_alone() {
         ("--epsilon", "NaN", "expected 0 or more"),
         ("--join", "2", "expected 0 to 1"),
         ("--agreement", "1.1", "expected 0 to 1"),
-        ("--levels", "huge", "expected default, small, medium, large, classes or concepts"),
+        ("--levels", "huge", "expected default, small, medium, large, classes, concepts"),
     ] {
         let out = s.run(&[option, value]);
         let said = String::from_utf8_lossy(&out.stderr).into_owned();

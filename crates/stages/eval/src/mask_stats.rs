@@ -91,7 +91,7 @@ pub fn measure(folder: &Path, footprints: Option<&Footprints>) -> Result<MaskSta
         let image = (maps.width() * maps.height()) as f64;
         for &level in maps.levels() {
             let pixels = counts(maps.level(level).into_iter().filter(|&&id| id >= 0));
-            let l = level as usize;
+            let l = level.index();
             masks[l].push(pixels.len() as f64);
             covered[l].push(pixels.values().sum::<usize>() as f64 / image);
             areas[l].extend(pixels.values().map(|&n| n as f64 / image));
@@ -99,12 +99,12 @@ pub fn measure(folder: &Path, footprints: Option<&Footprints>) -> Result<MaskSta
     }
     let pairs = footprints.map(closest_views).transpose()?;
     let fates = |level: Level| match footprints.zip(pairs.as_ref()) {
-        Some((f, pairs)) => compare(f, level as u32, pairs),
+        Some((f, pairs)) => compare(f, level.index() as u32, pairs),
         None => Ok([0; 4]),
     };
     let mut levels = Vec::new();
-    for level in Level::ALL.into_iter().filter(|&level| !masks[level as usize].is_empty()) {
-        let l = level as usize;
+    for level in Level::ALL.into_iter().filter(|&level| !masks[level.index()].is_empty()) {
+        let l = level.index();
         let [compared, fates @ ..] = fates(level)?;
         let [split, merged, stable] = fates.map(|n| (compared > 0).then(|| n as f64 / compared as f64));
         let (masks, area) = (mean_and_spread(&masks[l]), quantiles(&mut areas[l]));

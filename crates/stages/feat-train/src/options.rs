@@ -192,7 +192,7 @@ impl Options {
     pub(crate) fn levels(&self) -> Vec<Level> {
         match (&self.levels[..], self.preset) {
             ([], None) => Level::ALL.to_vec(),
-            ([], Some(_)) => vec![Level::Large],
+            ([], Some(_)) => vec![Level::LARGE],
             (given, _) => given.to_vec(),
         }
     }
@@ -221,7 +221,8 @@ impl Options {
     pub(crate) fn parameters(&self, seed: u64) -> Value {
         let trained = self.preset.is_some();
         let dim = if trained { Some(self.trained_dim()) } else { self.dim };
-        let mut parameters = json!(Self { levels: self.levels(), dim, contrastive: self.method(), ..self.clone() });
+        let levels = if trained { self.levels() } else { self.levels.clone() };
+        let mut parameters = json!(Self { levels, dim, contrastive: self.method(), ..self.clone() });
         parameters["seed"] = json!(seed);
         if !trained {
             parameters.as_object_mut().expect("a struct is an object").remove("contrastive");
@@ -240,7 +241,7 @@ mod tests {
             let files = ["feat-train", "--geometry", "g", "--graph", "g", "--footprints", "f", "--out", "o"];
             Args::parse_from([&files, arguments].concat()).options.parameters(3)
         };
-        let closed = json!({ "preset": null, "levels": ["default", "small", "medium", "large", "classes", "concepts"], "dim": null, "seed": 3 });
+        let closed = json!({ "preset": null, "levels": [], "dim": null, "seed": 3 });
         assert_eq!(of(&[]), closed);
         let literal = of(&["--preset", "literal", "--loss", "separation"]);
         assert_eq!(

@@ -47,14 +47,9 @@ pub(crate) struct Settings {
     /// Neighbours per anchor
     #[arg(long, value_name = "COUNT", default_value_t = 16, value_parser = stage::within(1usize..=1024))]
     pub k: usize,
-    /// Levels of the masks, with commas between: default, small, medium, large, classes, concepts. The files hold no others, so the
-    /// later stages can use no others
-    #[arg(
-        long,
-        value_name = "LEVELS",
-        value_delimiter = ',',
-        default_value = "default,small,medium,large,classes,concepts"
-    )]
+    /// Levels of the masks, with commas between: default, small, medium, large, classes, concepts, classes-2 and so on. The files
+    /// hold no others, so the later stages can use no others [default: all]
+    #[arg(long, value_name = "LEVELS", value_delimiter = ',')]
     pub levels: Vec<Level>,
     /// Shrink id maps by this factor, 1 to 64, before footprints are measured: every N-th pixel of every N-th row stays, as in
     /// OpenGaussian with -r N (2 on ScanNet)

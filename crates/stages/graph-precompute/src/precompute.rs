@@ -157,7 +157,9 @@ impl<'a> Collected<'a> {
     fn add(&mut self, view: &View, masks: &MaskFolder, settings: &Settings, seed: u64) -> Result<()> {
         // The map may be smaller than the photograph, but not of another shape.
         let mut maps = masks.read(view)?;
-        maps.keep(&settings.levels);
+        if !settings.levels.is_empty() {
+            maps.keep(&settings.levels);
+        }
         if settings.mask_divisor > 1 {
             maps = maps.shrunk(settings.mask_divisor);
         }

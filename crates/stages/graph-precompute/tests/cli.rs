@@ -92,7 +92,7 @@ fn artifacts_are_right_and_the_same_for_any_number_of_threads() {
 
     // The provenance holds every option.
     let expected = serde_json::json!({
-        "views": "train", "holdout": 8, "anchor_ratio": 0.1, "k": 16, "levels": ["default", "small", "medium", "large", "classes", "concepts"], "gate": 0.7, "min_mask_pixels": 50.0, "cut": 0.0,
+        "views": "train", "holdout": 8, "anchor_ratio": 0.1, "k": 16, "levels": [], "gate": 0.7, "min_mask_pixels": 50.0, "cut": 0.0,
         "pixel_samples": 0, "no_skip": false, "preset": null, "seed": 0,
     });
     assert_eq!(a.provenance().parameters, expected);
@@ -276,7 +276,7 @@ fn only_the_masks_of_the_named_levels_are_kept() {
     succeed(&run(&s, &o, &["--levels", "large,small"]));
     let some = footprints();
     let of = |f: &Footprints| -> Vec<(Row, Vec<(u32, f32)>)> {
-        let wanted = |r: &usize| f.rows[*r].is_of(&[Level::Small, Level::Large]);
+        let wanted = |r: &usize| f.rows[*r].is_of(&[Level::SMALL, Level::LARGE]);
         let entries = |r| f.entries(r).unwrap().iter().collect();
         (0..f.rows.len()).filter(wanted).map(|r| (f.rows[r], entries(r))).collect()
     };

@@ -3,19 +3,19 @@
 
 use crate::panoptic::Segments;
 use artifacts::{Level, MaskMaps, MaskName, MaskNames};
-use ndarray::{Array2, Axis, concatenate};
+use ndarray::{Array2, Axis};
 use std::collections::BTreeMap;
 
-/// Adds the levels of masks with names to SAM's, and gives the names: segments of at least `min_area` pixels. Level classes has the large
-/// masks too where none of `classes` is, without a name: a thing of no known class is better seen by SAM than not at all
+/// Adds the levels of masks with names to SAM's, one for each of `classes` and `concepts`, and gives the names: segments of at least
+/// `min_area` pixels. A level of classes has the large masks too where none of its own is, without a name: a thing of no known class is better seen by SAM than not at all
 /// (docs/results/real-masks.md). What was seen has the maps' size; a level of nothing is empty.
 pub fn with_names(
     maps: &MaskMaps,
-    classes: Option<&Segments>,
-    concepts: Option<&Segments>,
+    classes: &[Segments],
+    concepts: &[Segments],
     min_area: usize,
 ) -> (MaskMaps, MaskNames) {
-    let large = maps.level(Level::Large);
+    let large = maps.level(Level::LARGE);
     let (mut names, mut next) = (MaskNames::new(), maps.id_count() as i32);
     // Paints what is large enough of the free pixels' part of each mask.
     let mut paint = |level: &mut Array2<i32>, source: &[i32], segments: Option<&Segments>| {
@@ -34,17 +34,20 @@ pub fn with_names(
         };
         names.extend(id_of.into_iter().filter_map(|(id, new)| Some((new as u32, named(segments?, id)))));
     };
-    let mut levels = [(); 2].map(|()| Array2::from_elem(large.dim(), -1));
-    let [level, asked] = &mut levels;
-    if let Some(seen) = classes {
-        paint(level, artifacts::flat(seen.ids.view()), Some(seen));
-        paint(level, artifacts::flat(large), None);
+    let mut all = maps.ids.clone();
+    for nth in 0..classes.len().max(concepts.len()) {
+        for (seen, fill) in [(classes.get(nth), true), (concepts.get(nth), false)] {
+            let mut level = Array2::from_elem(large.dim(), -1);
+            if let Some(seen) = seen {
+                paint(&mut level, artifacts::flat(seen.ids.view()), Some(seen));
+                if fill {
+                    paint(&mut level, artifacts::flat(large), None);
+                }
+            }
+            all.push(Axis(0), level.view()).expect("of the maps' size");
+        }
     }
-    if let Some(seen) = concepts {
-        paint(asked, artifacts::flat(seen.ids.view()), Some(seen));
-    }
-    let [level, asked] = levels.map(|level| level.insert_axis(Axis(0)));
-    (MaskMaps { ids: concatenate![Axis(0), maps.ids, level, asked] }, names)
+    (MaskMaps { ids: all }, names)
 }
 
 #[cfg(test)]
@@ -60,22 +63,29 @@ mod tests {
         let segment = |name: &str, score| Segment { name: name.into(), score };
         let ids = arr2(&[[-1, 0, 0, 0, -1, -1], [-1, 0, 0, 0, 1, -1]]);
         let seen = Segments { ids, masks: vec![segment("door", 0.9), segment("crumb", 0.8)] };
-        let (found, names) = with_names(&maps, Some(&seen), None, 2);
-        assert_eq!(found.levels(), Level::ALL);
+        let (found, names) = with_names(&maps, std::slice::from_ref(&seen), &[], 2);
+        assert_eq!(found.levels(), &Level::ALL[..6]);
         assert_eq!(found.ids.slice(ndarray::s![..4, .., ..]), maps.ids);
         // The crumb is too small; what is left of the large masks is not.
-        assert_eq!(found.level(Level::Classes), arr2(&[[9, 8, 8, 8, 10, 10], [9, 8, 8, 8, 10, 10]]));
-        assert!(found.level(Level::Concepts).iter().all(|&id| id == -1));
+        assert_eq!(found.level(Level::CLASSES), arr2(&[[9, 8, 8, 8, 10, 10], [9, 8, 8, 8, 10, 10]]));
+        assert!(found.level(Level::CONCEPTS).iter().all(|&id| id == -1));
         let door = |id| (id, MaskName { name: "door".into(), score: 0.9 });
         assert_eq!(names, MaskNames::from([door(8)]));
         // Of nouns alone: classes stays empty, as where there is no such level.
-        let (asked, names) = with_names(&maps, None, Some(&seen), 2);
-        assert!(asked.level(Level::Classes).iter().all(|&id| id == -1));
-        assert_eq!(asked.level(Level::Concepts), arr2(&[[-1, 8, 8, 8, -1, -1]; 2]));
+        let (asked, names) = with_names(&maps, &[], std::slice::from_ref(&seen), 2);
+        assert!(asked.level(Level::CLASSES).iter().all(|&id| id == -1));
+        assert_eq!(asked.level(Level::CONCEPTS), arr2(&[[-1, 8, 8, 8, -1, -1]; 2]));
         assert_eq!(names, MaskNames::from([door(8)]));
-        let (both, names) = with_names(&maps, Some(&seen), Some(&seen), 2);
-        assert_eq!(both.level(Level::Classes), found.level(Level::Classes));
-        assert_eq!(both.level(Level::Concepts), arr2(&[[-1, 11, 11, 11, -1, -1]; 2]));
+        let (both, names) = with_names(&maps, std::slice::from_ref(&seen), std::slice::from_ref(&seen), 2);
+        assert_eq!(both.level(Level::CLASSES), found.level(Level::CLASSES));
+        assert_eq!(both.level(Level::CONCEPTS), arr2(&[[-1, 11, 11, 11, -1, -1]; 2]));
         assert_eq!(names, MaskNames::from([door(8), door(11)]));
+        // A second panoptic model has a level of its own, and so would a second model for nouns.
+        let (two, names) = with_names(&maps, &[seen.clone(), seen.clone()], &[seen], 2);
+        assert_eq!(two.levels(), &Level::ALL[..8]);
+        assert_eq!(two.ids.slice(ndarray::s![..6, .., ..]), both.ids);
+        assert_eq!(two.level("classes-2".parse().unwrap()), found.level(Level::CLASSES).mapv(|id| id + 4));
+        assert!(two.level("concepts-2".parse().unwrap()).iter().all(|&id| id == -1));
+        assert_eq!(names, MaskNames::from([door(8), door(11), door(12)]));
     }
 }

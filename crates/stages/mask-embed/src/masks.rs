@@ -10,7 +10,7 @@ use crate::paint::{MapSize, paint};
 use crate::panoptic::{Panoptic, Segments};
 use crate::photographs;
 use crate::sam::Sam;
-use artifacts::{Level, MaskMaps, MaskNames, maps_path, role};
+use artifacts::{LEVELS, Level, MaskMaps, MaskNames, maps_path, role};
 use gs_io::{Claim, Error, Result, Watched, write_json};
 use gs_scene::dataset::{Dataset, View};
 use onnx_models::RgbImage;
@@ -45,8 +45,8 @@ struct Facts {
 struct Models {
     sam: Sam,
     /// One photograph at a time: a full-size DETR takes 3.4 GB.
-    panoptic: Option<Mutex<Panoptic>>,
-    concepts: Option<Mutex<Concepts>>,
+    panoptic: Vec<Mutex<Panoptic>>,
+    concepts: Vec<Mutex<Concepts>>,
 }
 
 /// The model that it guards, for one photograph at a time.
@@ -55,24 +55,25 @@ fn lock<T>(model: &Mutex<T>) -> MutexGuard<'_, T> {
 }
 
 impl Models {
-    /// What the panoptic model sees, and what that for nouns sees of the first `nouns`, if there are such models; width and height are
-    /// those of the map.
-    fn named(&self, image: &RgbImage, size: [usize; 2], nouns: usize) -> Result<[Option<Segments>; 2]> {
-        let classes = self.panoptic.as_ref().map(|model| lock(model).segments(image, size)).transpose()?;
-        let concepts = self.concepts.as_ref().map(|model| lock(model).segments(image, size, nouns)).transpose()?;
-        Ok([classes, concepts])
+    /// What each panoptic model sees, and what each of those for nouns sees of the first `nouns`; width and height are those of the map.
+    fn named(&self, image: &RgbImage, size: [usize; 2], nouns: usize) -> Result<[Vec<Segments>; 2]> {
+        let classes = self.panoptic.iter().map(|model| lock(model).segments(image, size)).collect::<Result<_>>()?;
+        let concepts = self.concepts.iter().map(|model| lock(model).segments(image, size, nouns));
+        Ok([classes, concepts.collect::<Result<_>>()?])
     }
 
     /// Photographs at a time: with nouns, whose model takes longer than all else, it has all threads.
     fn lanes(&self) -> usize {
-        if self.concepts.is_some() { 1 } else { LANES }
+        if self.concepts.is_empty() { LANES } else { 1 }
     }
 
-    /// Content hashes of both, by what they are called among inputs.
+    /// Content hashes of both kinds, by what they are called among inputs: panoptic, panoptic-2, ...
     fn hashes(&self) -> Vec<(String, String)> {
-        let panoptic = self.panoptic.iter().map(|model| ("panoptic".to_string(), lock(model).hash().to_string()));
-        let concepts = self.concepts.iter().map(|model| ("concepts".to_string(), lock(model).hash().to_string()));
-        panoptic.chain(concepts).collect()
+        let name = |kind: &str, at| if at == 0 { kind.to_string() } else { format!("{kind}-{}", at + 1) };
+        let panoptic = self.panoptic.iter().map(|model| lock(model).hash().to_string()).enumerate();
+        let concepts = self.concepts.iter().map(|model| lock(model).hash().to_string()).enumerate();
+        let panoptic = panoptic.map(|(at, hash)| (name("panoptic", at), hash));
+        panoptic.chain(concepts.map(|(at, hash)| (name("concepts", at), hash))).collect()
     }
 }
 
@@ -88,10 +89,7 @@ pub(crate) fn run(args: &MasksArgs, stage: &Stage) -> Result<()> {
     let folder = &args.out;
     let manifest = folder.join("masks.json");
     let mut claim = claim(args, &scene, &manifest, stage)?;
-    let sam = Sam::open(&args.sam, &args.engine.options(), args.choice.no_skip)?;
-    let panoptic = args.panoptic.as_ref().map(|folder| Panoptic::open(folder, &args.engine.options())).transpose()?;
-    let concepts = args.concepts.as_ref().map(|folder| concepts(folder, args, stage)).transpose()?;
-    let models = Models { sam, panoptic: panoptic.map(Mutex::new), concepts: concepts.map(Mutex::new) };
+    let models = open(args, stage)?;
     let watched = Watched::new(scene.views.iter().map(|v| &v.image_path));
     let parameters = json!(args);
     let mut inputs = BTreeMap::from([
@@ -129,7 +127,7 @@ pub(crate) fn run(args: &MasksArgs, stage: &Stage) -> Result<()> {
         })?;
         asked += facts.asked;
         points += facts.points;
-        large += facts.masks[Level::Large as usize];
+        large += facts.masks[Level::LARGE.index()];
         Ok(())
     };
     ahead(&scene.views.iter().collect::<Vec<_>>(), models.lanes(), prepare, finish)?;
@@ -145,6 +143,20 @@ pub(crate) fn run(args: &MasksArgs, stage: &Stage) -> Result<()> {
     stage.record(&mut claim, parameters, inputs, json!({ "views": count, "masks_large": large }))
 }
 
+/// The models that see the photographs.
+fn open(args: &MasksArgs, stage: &Stage) -> Result<Models> {
+    let most = (LEVELS - Level::SAM.len()) / 2;
+    for (option, models) in [("--panoptic", &args.panoptic), ("--concepts", &args.concepts)] {
+        if models.len() > most {
+            let e = Error::new("too many models").field(option).found(models.len());
+            return Err(e.expected(format!("at most {most}")));
+        }
+    }
+    let sam = Sam::open(&args.sam, &args.engine.options(), args.choice.no_skip)?;
+    let panoptic = args.panoptic.iter().map(|folder| Ok(Mutex::new(Panoptic::open(folder, &args.engine.options())?)));
+    Ok(Models { sam, panoptic: panoptic.collect::<Result<_>>()?, concepts: concepts(args, stage)? })
+}
+
 /// The id maps of a photograph.
 fn make(args: &MasksArgs, models: &Models, image: &RgbImage) -> Result<(MaskMaps, Facts)> {
     let proposals = propose(&models.sam, &models.sam.encode(image)?, &args.choice)?;
@@ -153,22 +165,25 @@ fn make(args: &MasksArgs, models: &Models, image: &RgbImage) -> Result<(MaskMaps
     let (points, asked) = (proposals.points, proposals.asked);
     drop(proposals);
     let [classes, concepts] = models.named(image, [size.width, size.height], usize::MAX)?;
-    if classes.is_some() || concepts.is_some() {
-        (maps, names) = with_names(&maps, classes.as_ref(), concepts.as_ref(), size.min_area);
+    if !classes.is_empty() || !concepts.is_empty() {
+        (maps, names) = with_names(&maps, &classes, &concepts, size.min_area);
     }
     let facts = Facts { size: [size.width, size.height], masks: count_masks(&maps), points, asked, names };
     Ok((maps, facts))
 }
 
-/// The model that is asked for nouns.
-fn concepts(folder: &Path, args: &MasksArgs, stage: &Stage) -> Result<Concepts> {
+/// The models that are asked for nouns.
+fn concepts(args: &MasksArgs, stage: &Stage) -> Result<Vec<Mutex<Concepts>>> {
+    if args.concepts.is_empty() {
+        return Ok(Vec::new());
+    }
     let nouns = args.nouns.as_ref().map_or_else(|| Ok(Vocabulary::everyday()), |file| Vocabulary::read(file, 1))?;
     if nouns.repeated > 0 {
         stage.warn(&format!("lines of --nouns that name something again are left out: {}", nouns.repeated));
     }
-    let model = Concepts::open(folder, &nouns.words, &args.engine.options())?;
     stage.info(&format!("{} nouns are looked for in each photograph", nouns.words.len()));
-    Ok(model)
+    let open = |folder: &PathBuf| Ok(Mutex::new(Concepts::open(folder, &nouns.words, &args.engine.options())?));
+    args.concepts.iter().map(open).collect()
 }
 
 /// The right to write id maps, their notes and the manifest. Maps that this program did not make stay.

@@ -77,15 +77,15 @@ pub(crate) struct MasksArgs {
     #[serde(skip)]
     pub sam: PathBuf,
     /// Folder of a panoptic model, which adds level classes with names: model.onnx, config.json and preprocessor_config.json as
-    /// the hub has them (docs/masks.md) [default: none]
+    /// the hub has them (docs/masks.md). Up to six; the second adds classes-2 [default: none]
     #[arg(long, value_name = "FOLDER")]
     #[serde(skip)]
-    pub panoptic: Option<PathBuf>,
+    pub panoptic: Vec<PathBuf>,
     /// Folder of a model that is asked for nouns, which adds level concepts with names: the three graphs of SAM 3 as samexporter
-    /// exports them, or others with a model.json (docs/masks.md) [default: none]
+    /// exports them, or others with a model.json (docs/masks.md). Up to six; the second adds concepts-2 [default: none]
     #[arg(long, value_name = "FOLDER")]
     #[serde(skip)]
-    pub concepts: Option<PathBuf>,
+    pub concepts: Vec<PathBuf>,
     /// What to look for with --concepts: a text file, a noun a line. With SAM 3 each noun takes about 13 processor seconds a photograph
     /// [default: about 1,200 everyday things, the vocabulary of eval names]
     #[arg(long, value_name = "FILE", requires = "concepts")]

@@ -119,7 +119,7 @@ mod tests {
         // By area: 1 (100), 2 (80), 0 (9).
         assert_eq!((at(0, 0, 0), at(0, 13, 5), at(0, 3, 3), at(0, 11, 5)), (0, 1, 2, -1));
         assert_eq!((at(1, 3, 3), at(1, 0, 0)), (3, -1));
-        assert!(m.level(Level::Medium).iter().all(|&i| i == -1));
+        assert!(m.level(Level::MEDIUM).iter().all(|&i| i == -1));
         assert_eq!((at(3, 3, 3), at(3, 13, 3)), (4, 5));
         assert_eq!(m.id_count(), 6);
         // The same at twice the size: the straight edges fall half way between logits of equal size.

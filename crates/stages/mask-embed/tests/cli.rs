@@ -139,11 +139,11 @@ fn masks_follow_the_colours_at_every_level() {
             assert!(wall >= 0 && dark >= 0 && bright >= 0 && wall != dark && dark != bright && wall != bright);
         }
         // The inner square is apart at level small and part of the bright one at level large.
-        assert_ne!(at(Level::Small, 96, 32), at(Level::Small, 76, 44));
-        assert_eq!(at(Level::Large, 96, 32), at(Level::Large, 76, 44));
+        assert_ne!(at(Level::SMALL, 96, 32), at(Level::SMALL, 76, 44));
+        assert_eq!(at(Level::LARGE, 96, 32), at(Level::LARGE, 76, 44));
         // A square's pixels, up to one at its border.
-        let dark = at(Level::Large, 30, 30);
-        for ((y, x), &id) in maps.level(Level::Large).indexed_iter() {
+        let dark = at(Level::LARGE, 30, 30);
+        for ((y, x), &id) in maps.level(Level::LARGE).indexed_iter() {
             let (x, y) = (x as i64 - v as i64 * 8, y as i64);
             let inside = (17..47).contains(&x) && (17..47).contains(&y);
             let outside = !(15..49).contains(&x) || !(15..49).contains(&y);
@@ -155,7 +155,7 @@ fn masks_follow_the_colours_at_every_level() {
     scene.make_masks(&small, &["--map-size", "64"]);
     let maps = MaskMaps::read(maps_path(&small, "v0")).unwrap();
     assert_eq!((maps.width(), maps.height()), (64, 32));
-    assert_eq!(maps.level(Level::Large)[[15, 20]], maps.level(Level::Large)[[22, 10]]);
+    assert_eq!(maps.level(Level::LARGE)[[15, 20]], maps.level(Level::LARGE)[[22, 10]]);
 }
 
 #[test]
@@ -219,10 +219,10 @@ fn a_panoptic_model_adds_classes_with_names() {
     scene.make_masks(&scene.masks, &[&panoptic[..], &["1"]].concat());
     for view in ["v0", "v1"] {
         let [plain, named] = [&other, &scene.masks].map(|m| MaskMaps::read(maps_path(m, view)).unwrap());
-        assert_eq!((plain.levels(), named.levels()), (&Level::SAM[..], &Level::ALL[..]));
+        assert_eq!((plain.levels(), named.levels()), (&Level::SAM[..], &Level::ALL[..6]));
         Level::SAM.iter().for_each(|&l| assert_eq!(plain.level(l), named.level(l), "{l}"));
         let names = read_mask_names(&scene.masks, view).unwrap();
-        let ids = named.level(Level::Classes).into_iter();
+        let ids = named.level(Level::CLASSES).into_iter();
         let owned: BTreeSet<u32> = ids.filter_map(|&id| u32::try_from(id).ok()).collect();
         assert!(names.keys().all(|id| owned.contains(id)) && owned.len() > names.len(), "{names:?}");
         assert!(names.values().any(|m| m.name == "grass" && m.score > 0.9), "{names:?}");
@@ -233,6 +233,16 @@ fn a_panoptic_model_adds_classes_with_names() {
     assert_eq!(contents(&scene.masks), contents(&other));
     let said = scene.make_masks(&other, &[&panoptic[..], &["3"]].concat());
     assert!(said.contains("skipped 2 of 2 views: their id maps are done already"), "{said}");
+    // A second model has a level of its own; of the same one it has the same masks.
+    scene.make_masks(&other, &["--panoptic", path(&model), "--panoptic", path(&model)]);
+    let maps = MaskMaps::read(maps_path(&other, "v0")).unwrap();
+    let [first, second] = [4, 6].map(|at| maps.level(Level::ALL[at]));
+    let apart = second[[0, 0]] - first[[0, 0]];
+    assert!(apart > 0 && first.iter().zip(second).all(|(a, b)| *b == if *a < 0 { -1 } else { a + apart }));
+    let named = read_mask_names(&other, "v0").unwrap();
+    assert_eq!(named.len(), 2 * read_mask_names(&scene.masks, "v0").unwrap().len());
+    let e = error(&scene.masks_args(&other, &["--panoptic", path(&model)].repeat(7)));
+    assert!(e.contains("--panoptic: too many models; found 7, expected at most 6"), "{e}");
     let e = error(&scene.masks_args(&other, &["--panoptic", path(&scene.folder)]));
     assert!(e.contains("no such model"), "{e}");
 }
@@ -250,9 +260,9 @@ fn nouns_add_concepts_with_names() {
     for view in ["v0", "v1"] {
         let [plain, named] = [&other, &scene.masks].map(|m| MaskMaps::read(maps_path(m, view)).unwrap());
         Level::SAM.iter().for_each(|&l| assert_eq!(plain.level(l), named.level(l), "{l}"));
-        assert!(named.level(Level::Classes).iter().all(|&id| id == -1));
+        assert!(named.level(Level::CLASSES).iter().all(|&id| id == -1));
         let names = read_mask_names(&scene.masks, view).unwrap();
-        let at = |x, y| Some(&names.get(&named.mask(Level::Concepts, [y, x])?)?.name[..]);
+        let at = |x, y| Some(&names.get(&named.mask(Level::CONCEPTS, [y, x])?)?.name[..]);
         // The ceiling is green; the bright square is a roof to this model; the dark one is nothing.
         assert_eq!([at(5, 4), at(108, 30), at(35, 30)], [Some("grass"), Some("roof"), None]);
     }
@@ -267,7 +277,7 @@ fn nouns_add_concepts_with_names() {
     let maps = MaskMaps::read(maps_path(&both, "v0")).unwrap();
     let names = read_mask_names(&both, "v0").unwrap();
     let named = |level| names.keys().any(|id| maps.level(level).iter().any(|&i| i == *id as i32));
-    assert!(named(Level::Classes) && named(Level::Concepts));
+    assert!(named(Level::CLASSES) && named(Level::CONCEPTS));
     let bad = |args: &[&str], words: &[&str]| {
         let e = error(&scene.masks_args(&other, args));
         assert!(words.iter().all(|w| e.contains(w)), "{e}");
@@ -301,14 +311,14 @@ fn other_exports_are_used_as_their_description_says() {
             let things = [at(2, 20), at(30, 30), at(76, 44), at(64, 4)];
             assert!(things.iter().all(|&id| id >= 0), "{name}: {things:?}");
             assert_eq!(things.iter().collect::<BTreeSet<_>>().len(), 4, "{name}: {things:?}");
-            assert_eq!(at(96, 32) == at(76, 44), *level != Level::Small, "{name}");
+            assert_eq!(at(96, 32) == at(76, 44), *level != Level::SMALL, "{name}");
         }
         // Stretched or not, a thing lies where it lies.
-        let dark = maps.level(Level::Large)[[30, 30]];
+        let dark = maps.level(Level::LARGE)[[30, 30]];
         let square = 16..48;
         let differ =
             |&((y, x), &id): &((usize, usize), &i32)| (id == dark) != (square.contains(&x) && square.contains(&y));
-        assert!(maps.level(Level::Large).indexed_iter().filter(differ).count() < 140, "{name}");
+        assert!(maps.level(Level::LARGE).indexed_iter().filter(differ).count() < 140, "{name}");
     }
 }
 
@@ -410,7 +420,7 @@ fn features_are_those_of_the_crops() {
     let features = MaskFeatures::read(features_path(&scene.masks, "v0")).unwrap();
     assert_eq!(features.values.dim(), (maps.id_count(), 4));
     // The dark square fills its crop: the feature is (mean of each channel, 1), scaled.
-    let dark = maps.level(Level::Large)[[30, 30]];
+    let dark = maps.level(Level::LARGE)[[30, 30]];
     let expected = [20.0, 30.0, 10.0, 255.0].map(|v: f64| v / (400.0f64 + 900.0 + 100.0 + 65025.0).sqrt());
     for (f, e) in features.row(dark as usize).unwrap().iter().zip(expected) {
         assert!((f64::from(*f) - e).abs() < 0.01, "{f} {e}");
@@ -556,7 +566,7 @@ fn crops_are_written_for_training() {
     assert_eq!(tokens["red mug"][1..], tokens["mug"]);
     let maps = MaskMaps::read(maps_path(&scene.masks, "v0")).unwrap();
     assert_eq!(view.iter().filter(|&&v| v == 0).count(), maps.id_count());
-    let dark = maps.level(Level::Large)[[30, 30]] as u32;
+    let dark = maps.level(Level::LARGE)[[30, 30]] as u32;
     let at = (0..view.len()).find(|&i| view[i] == 0 && mask[i] == dark).unwrap();
     let crop = &pixels[at * 768..(at + 1) * 768];
     assert_eq!([crop[8 * 16 + 8], crop[256 + 8 * 16 + 8], crop[512 + 8 * 16 + 8]], [20, 30, 10]);

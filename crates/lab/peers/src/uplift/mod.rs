@@ -310,7 +310,7 @@ mod tests {
 
     #[test]
     fn levels_have_one_slot_each() {
-        assert_eq!(slots(&[Level::Large, Level::Small, Level::Large]), [Level::Large, Level::Small]);
+        assert_eq!(slots(&[Level::LARGE, Level::SMALL, Level::LARGE]), [Level::LARGE, Level::SMALL]);
     }
 
     #[test]
@@ -343,7 +343,7 @@ mod tests {
         let maps = MaskMaps { ids: arr3(&[[[-1, -1]], [[0, 1]], [[-1, -1]], [[2, -1]]]) };
         let mut shares = vec![Vec::new(); 2];
         let seen = |gaussian, pixel| Centre { gaussian, pixel, weight: 0.5 };
-        give_centres(&mut shares, 7, &[seen(0, 1), seen(1, 0)], &maps, &[Level::Large, Level::Small]);
+        give_centres(&mut shares, 7, &[seen(0, 1), seen(1, 0)], &maps, &[Level::LARGE, Level::SMALL]);
         let share = |mask, slot| Share { view: 7, mask, slot, weight: 0.5 };
         assert_eq!(shares, [vec![share(1, 1)], vec![share(2, 0), share(0, 1)]]);
     }
@@ -384,6 +384,6 @@ mod tests {
             weights: &none,
             alpha: &alpha,
         };
-        assert_eq!(masks_of(&t, &maps, &[Level::Large, Level::Small]), [(0, 3, vec![0]), (1, 1, vec![0, 1])]);
+        assert_eq!(masks_of(&t, &maps, &[Level::LARGE, Level::SMALL]), [(0, 3, vec![0]), (1, 1, vec![0, 1])]);
     }
 }

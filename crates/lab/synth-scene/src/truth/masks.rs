@@ -124,7 +124,7 @@ pub(crate) fn segment(
 fn shown(scene: &Scene, visible: &[usize], level: Level, p: f64, rng: &mut ChaCha8Rng) -> Vec<Vec<u32>> {
     let parts_of =
         |t: usize| -> Vec<u32> { scene.things[t].parts.clone().filter(|&p| visible[p as usize] > 0).collect() };
-    let coarse = matches!(level, Level::Default | Level::Large);
+    let coarse = matches!(level, Level::DEFAULT | Level::LARGE);
     // Draw for every thing of the scene, seen or not: what a thing shows does not depend on the others.
     let draws: Vec<(bool, bool, f64)> =
         scene.things.iter().map(|_| (rng.random::<f64>() < p, rng.random::<bool>(), rng.random())).collect();
@@ -147,7 +147,7 @@ fn shown(scene: &Scene, visible: &[usize], level: Level, p: f64, rng: &mut ChaCh
         let parts = parts_of(t);
         let mut groups: BTreeMap<(&str, u32), Vec<u32>> = BTreeMap::new();
         for &part in &parts {
-            let key = if level == Level::Medium { 0 } else { part };
+            let key = if level == Level::MEDIUM { 0 } else { part };
             groups.entry((scene.parts[part as usize].name, key)).or_default().push(part);
         }
         let mut masks: Vec<Vec<u32>> = groups.into_values().collect();
@@ -216,7 +216,7 @@ fn describe(scene: &Scene, visible: &[usize], parts: &[u32], pixels: usize, leve
         }
     };
     MaskTruth {
-        level: level as u32,
+        level: level.index() as u32,
         part: (kind == PART && parts.len() == 1).then(|| parts[0]),
         instances,
         kind: kind.into(),
@@ -254,7 +254,7 @@ fn describe_patch(scene: &Scene, things: impl Iterator<Item = i32>, level: Level
     let instances: Vec<u32> = counts.into_iter().filter(|&(_, n)| n as f64 >= least).map(|(t, _)| t).collect();
     let names: Vec<String> = instances.iter().map(|&t| format!("the {}", scene.things[t as usize].name)).collect();
     let caption = format!("patch of {}", names.join(" and "));
-    MaskTruth { level: level as u32, instances, part: None, kind: "spurious".into(), caption }
+    MaskTruth { level: level.index() as u32, instances, part: None, kind: "spurious".into(), caption }
 }
 
 /// Paints so many masks in their order, each grown or shrunk; `exact` and the result hold their numbers, -1 for none.
@@ -344,7 +344,7 @@ mod tests {
         for level in Level::SAM {
             let map = flat(maps.level(level));
             for (id, t) in truth.iter().enumerate() {
-                assert_eq!(map.contains(&(id as i32)), t.level == level as u32, "{id} {t:?}");
+                assert_eq!(map.contains(&(id as i32)), t.level == level.index() as u32, "{id} {t:?}");
             }
             assert!(map.iter().any(|&id| id >= 0), "a level is never empty");
         }
@@ -356,7 +356,7 @@ mod tests {
         let (maps, truth) = segment(scene, frame, &EXACT, &mut rng(), &mut rng(), &pairs());
         check_ids(&maps, &truth);
         for (at, &thing) in frame.thing.iter().enumerate() {
-            for level in [Level::Default, Level::Large] {
+            for level in [Level::DEFAULT, Level::LARGE] {
                 let id = flat(maps.level(level))[at];
                 if id >= 0 {
                     assert_eq!(truth[id as usize].instances, [thing as u32]);
@@ -365,7 +365,7 @@ mod tests {
                     assert!(frame.thing.iter().filter(|&&t| t == thing).count() < SMALLEST);
                 }
             }
-            let id = flat(maps.level(Level::Small))[at];
+            let id = flat(maps.level(Level::SMALL))[at];
             if id >= 0 {
                 let t = &truth[id as usize];
                 assert!(t.kind == "whole" || t.part == Some(frame.part[at] as u32));
@@ -401,7 +401,7 @@ mod tests {
         check_ids(&moved, &truth);
         let changed = exact.ids.iter().zip(&moved.ids).filter(|(a, b)| a != b).count();
         assert!(changed > 100 && changed < exact.ids.len() / 5, "{changed} of {}", exact.ids.len());
-        for (at, &id) in moved.level(Level::Large).iter().enumerate().filter(|(_, id)| **id >= 0) {
+        for (at, &id) in moved.level(Level::LARGE).iter().enumerate().filter(|(_, id)| **id >= 0) {
             let thing = truth[id as usize].instances[0] as i32;
             let two = dilated(&dilated(&[at], frame.width, frame.height), frame.width, frame.height);
             let near = two.iter().any(|&n| frame.thing[n] == thing);
@@ -454,7 +454,7 @@ mod tests {
         check_ids(&maps, &truth);
         assert!(truth.len() > all.len());
         let mut from = BTreeMap::new();
-        for (&old, &new) in exact.level(Level::Small).iter().zip(maps.level(Level::Small)) {
+        for (&old, &new) in exact.level(Level::SMALL).iter().zip(maps.level(Level::SMALL)) {
             assert_eq!(old < 0, new < 0);
             assert_eq!(*from.entry(new).or_insert(old), old, "a piece is of one mask");
         }

@@ -103,7 +103,7 @@ impl Regions {
         }
         for (i, mut pieces) in pieces.into_iter().enumerate() {
             let first = self.parts[i][0];
-            if pieces.len() < 2 || pairs.draw(first, first).1 >= p * APART[level as usize] {
+            if pieces.len() < 2 || pairs.draw(first, first).1 >= p * APART[level.index()] {
                 continue;
             }
             pieces.sort_by_key(Vec::len);
@@ -136,10 +136,10 @@ impl Regions {
             let share = areas[small] as f64 / self.map.len() as f64;
             let size = (share / TYPICAL).powf(EXPONENT);
             let often = match (thing(small).background, thing(large).background) {
-                _ if thing(small).parts == thing(large).parts => PARTS[level as usize] * size,
-                (false, false) => OBJECTS[level as usize] * size,
-                (true, true) => BACKGROUNDS[level as usize],
-                _ => ACROSS[level as usize],
+                _ if thing(small).parts == thing(large).parts => PARTS[level.index()] * size,
+                (false, false) => OBJECTS[level.index()] * size,
+                (true, true) => BACKGROUNDS[level.index()],
+                _ => ACROSS[level.index()],
             };
             let (scene, view) = pairs.draw(x, y);
             let draw = if view < AS_EVER { scene } else { (view - AS_EVER) / (1.0 - AS_EVER) };

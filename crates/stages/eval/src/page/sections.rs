@@ -102,7 +102,7 @@ pub(super) fn id_maps(m: &Material, page: &mut Page, metrics: &mut Metrics) -> R
         }
         let maps = MaskFolder::open(folder).read(s.view)?;
         let any = |level: &Level| maps.levels().contains(level) && maps.level(*level).iter().any(|&id| id >= 0);
-        let level = maps.level(Some(Level::Classes).filter(any).unwrap_or(Level::Large));
+        let level = maps.level(Some(Level::CLASSES).filter(any).unwrap_or(Level::LARGE));
         let distinct: BTreeSet<i32> = level.iter().copied().filter(|&id| id >= 0).collect();
         let (w, h) = (s.photo.width, s.photo.height);
         // Ids of a level begin after those of the others; only their differences matter for colours.

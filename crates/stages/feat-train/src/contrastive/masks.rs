@@ -254,7 +254,7 @@ mod tests {
         builder.write(&file, Provenance::default()).unwrap();
         let footprints = Footprints::read(&file).unwrap();
         let context = testing::context(40, true);
-        let mut sets = MaskSets::new(&footprints, &context, &[Level::Default], 2).unwrap();
+        let mut sets = MaskSets::new(&footprints, &context, &[Level::DEFAULT], 2).unwrap();
         let kept = sets.get(1).unwrap();
         assert!(sets.len() == 2 && Rc::ptr_eq(&kept, &sets.get(1).unwrap()));
         sets.room = 0;
