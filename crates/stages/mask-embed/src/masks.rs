@@ -9,7 +9,7 @@ use crate::options::{Choice, MasksArgs};
 use crate::paint::{MapSize, paint};
 use crate::panoptic::{Panoptic, Segments};
 use crate::photographs;
-use crate::sam::Sam;
+use crate::sam::{Embedded, Sam};
 use artifacts::{LEVELS, Level, MaskMaps, MaskNames, maps_path, role};
 use gs_io::{Claim, Error, Result, Watched, write_json};
 use gs_scene::dataset::{Dataset, View};
@@ -41,6 +41,12 @@ struct Facts {
     names: MaskNames,
 }
 
+/// A photograph as SAM's decoder wants it, and the segments of each panoptic model.
+struct Seen {
+    embedded: Embedded,
+    classes: Vec<Segments>,
+}
+
 /// What sees the photographs.
 struct Models {
     sam: Sam,
@@ -55,11 +61,17 @@ fn lock<T>(model: &Mutex<T>) -> MutexGuard<'_, T> {
 }
 
 impl Models {
-    /// What each panoptic model sees, and what each of those for nouns sees of the first `nouns`; width and height are those of the map.
-    fn named(&self, image: &RgbImage, size: [usize; 2], nouns: usize) -> Result<[Vec<Segments>; 2]> {
-        let classes = self.panoptic.iter().map(|model| lock(model).segments(image, size)).collect::<Result<_>>()?;
-        let concepts = self.concepts.iter().map(|model| lock(model).segments(image, size, nouns));
-        Ok([classes, concepts.collect::<Result<_>>()?])
+    /// What SAM's encoder and the panoptic models see.
+    fn look(&self, image: &RgbImage, size: MapSize) -> Result<Seen> {
+        let segments = |model: &Mutex<Panoptic>| lock(model).segments(image, [size.width, size.height]);
+        let classes = self.panoptic.iter().map(segments).collect::<Result<_>>()?;
+        Ok(Seen { embedded: self.sam.encode(image)?, classes })
+    }
+
+    /// What each model sees that is asked for nouns, of the first `nouns`.
+    fn ask(&self, image: &RgbImage, size: MapSize, nouns: usize) -> Result<Vec<Segments>> {
+        let ask = |model: &Mutex<Concepts>| lock(model).segments(image, [size.width, size.height], nouns);
+        self.concepts.iter().map(ask).collect()
     }
 
     /// Photographs at a time: with nouns, whose model takes longer than all else, it has all threads.
@@ -109,12 +121,13 @@ pub(crate) fn run(args: &MasksArgs, stage: &Stage) -> Result<()> {
         let done = finished::is_done(&maps_path(folder, view.stem()), &key);
         Ok((image, key, done))
     };
-    if scene.views.par_iter().any(|view| read(view).is_ok_and(|(.., done)| !done)) {
-        forecast(args, &models, &scene.views, stage)?;
-    }
+    let todo = |view: &&View| read(view).is_ok_and(|(.., done)| !done);
+    let todo: Vec<&View> = scene.views.par_iter().filter(todo).collect();
+    let first = Mutex::new(forecast(args, &models, &scene.views, &todo, stage)?);
     let prepare = |view| {
         let (image, key, done) = read(view)?;
-        Ok((view, key, if done { None } else { Some(make(args, &models, &image)?) }))
+        let seen = || lock(&first).remove(View::stem(view));
+        Ok((view, key, if done { None } else { Some(make(args, &models, &image, seen())?) }))
     };
     let (mut asked, mut points, mut large) = (0, 0, 0);
     let finish = |(view, key, made): (&View, String, Option<(MaskMaps, Facts)>)| {
@@ -157,14 +170,16 @@ fn open(args: &MasksArgs, stage: &Stage) -> Result<Models> {
     Ok(Models { sam, panoptic: panoptic.collect::<Result<_>>()?, concepts: concepts(args, stage)? })
 }
 
-/// The id maps of a photograph.
-fn make(args: &MasksArgs, models: &Models, image: &RgbImage) -> Result<(MaskMaps, Facts)> {
-    let proposals = propose(&models.sam, &models.sam.encode(image)?, &args.choice)?;
+/// The id maps of a photograph, of which the models may have seen their part already.
+fn make(args: &MasksArgs, models: &Models, image: &RgbImage, seen: Option<Seen>) -> Result<(MaskMaps, Facts)> {
     let size = MapSize::of(image, args.map_size, args.min_area);
+    let Seen { embedded, classes } = seen.map_or_else(|| models.look(image, size), Ok)?;
+    let proposals = propose(&models.sam, &embedded, &args.choice)?;
+    drop(embedded);
     let (mut maps, mut names) = (paint(&proposals, &levels(&proposals.masks), size), MaskNames::new());
     let (points, asked) = (proposals.points, proposals.asked);
     drop(proposals);
-    let [classes, concepts] = models.named(image, [size.width, size.height], usize::MAX)?;
+    let concepts = models.ask(image, size, usize::MAX)?;
     if !classes.is_empty() || !concepts.is_empty() {
         (maps, names) = with_names(&maps, &classes, &concepts, size.min_area);
     }
@@ -194,23 +209,41 @@ fn claim(args: &MasksArgs, scene: &Dataset, manifest: &Path, stage: &Stage) -> R
     outputs.known_by(finished::is_own).claim()
 }
 
-/// Says how much memory the photographs will take. The models run on an empty picture first: their need is known only then.
-fn forecast(args: &MasksArgs, models: &Models, views: &[View], stage: &Stage) -> Result<()> {
-    let nothing = RgbImage { width: 4, height: 3, pixels: vec![0; 36] };
+/// Says how much memory the photographs will take. The models look at the first of those that are `todo`, as their need is known only
+/// then; what they saw is given back, by stem.
+fn forecast(
+    args: &MasksArgs,
+    models: &Models,
+    views: &[View],
+    todo: &[&View],
+    stage: &Stage,
+) -> Result<BTreeMap<String, Seen>> {
     let choice = Choice { points_per_side: 4, ..args.choice };
-    let lanes = models.lanes().min(views.len()).min(rayon::current_num_threads());
-    let look = |()| {
-        drop(propose(&models.sam, &models.sam.encode(&nothing)?, &choice)?);
-        models.named(&nothing, [4, 3], 1)
+    let lanes = models.lanes().min(todo.len()).min(rayon::current_num_threads());
+    if lanes == 0 {
+        return Ok(BTreeMap::new());
+    }
+    let look = |view: &View| {
+        let (image, _) = photographs::read(view)?;
+        let size = MapSize::of(&image, args.map_size, args.min_area);
+        let seen = models.look(&image, size)?;
+        drop(propose(&models.sam, &seen.embedded, &choice)?);
+        models.ask(&image, size, 1)?;
+        Ok((view.stem().to_string(), seen))
     };
-    ahead(&vec![(); lanes], lanes, look, |_| Ok(()))?;
+    let mut first = BTreeMap::new();
+    ahead(&todo[..lanes], lanes, look, |(stem, seen)| {
+        first.insert(stem, seen);
+        Ok(())
+    })?;
     let (side, pixels) = (args.choice.points_per_side as u64, photographs::largest(views));
     let map = if args.map_size == 0 { pixels } else { pixels.min((args.map_size * args.map_size * 3 / 4) as u64) };
     // Of every third point of the grid or so that is asked three masks wait with their logits, 200 kB where one fills the
     // picture; then the map, 16 bytes a pixel, and the masks of a level, a byte for each pixel of their boxes.
     let waiting = 100_000 * (side * side * 3 / 4);
     let needed = peak_rss_bytes().unwrap_or(0) + lanes as u64 * (waiting + 9 * pixels + 30 * map);
-    stage.forecast(needed, "give fewer --threads, or smaller photographs (--resolution) and maps (--map-size)")
+    stage.forecast(needed, "give fewer --threads, or smaller photographs (--resolution) and maps (--map-size)")?;
+    Ok(first)
 }
 
 /// Warns of id maps of other views in the folder: later stages would take them for maps of this scene.
