@@ -241,7 +241,7 @@ fn forecast(
     // Of every third point of the grid or so that is asked three masks wait with their logits, 200 kB where one fills the
     // picture; then the map, 16 bytes a pixel, and the masks of a level, a byte for each pixel of their boxes.
     let waiting = 100_000 * (side * side * 3 / 4);
-    let needed = peak_rss_bytes().unwrap_or(0) + lanes as u64 * (waiting + 9 * pixels + 30 * map);
+    let needed = peak_rss_bytes().unwrap_or(0) + lanes as u64 * (waiting + 30 * map);
     stage.forecast(needed, "give fewer --threads, or smaller photographs (--resolution) and maps (--map-size)")?;
     Ok(first)
 }
