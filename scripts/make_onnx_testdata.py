@@ -12,6 +12,7 @@ crates/stages/mask-embed/testdata/sam/           a segmenter by colour with the 
 crates/stages/mask-embed/testdata/sam2/          the same with the inputs and outputs of SAM 2.1's exports, described by model.json
 crates/stages/mask-embed/testdata/efficient-sam/ the same as EfficientSAM's
 crates/stages/mask-embed/testdata/sam2-hub/      the same as the Hugging Face hub's SAM 2.1
+crates/stages/mask-embed/testdata/sam-hub/       and its first SAM
 crates/stages/mask-embed/testdata/edge-sam/      the same as EdgeSAM's
 crates/stages/mask-embed/testdata/sam-tiny/      a decoder with SAM's architecture and names, narrow and with random weights
 crates/stages/mask-embed/testdata/panoptic-*/    panoptic segmenters by colour with the inputs and outputs of DETR, Mask2Former,
@@ -300,34 +301,32 @@ def exports():
         constants + three_constants,
     )
 
-    # As the hub has it: more axes, other names, and boxes, of which none is given.
-    folder = stages / "sam2-hub"
-    features = [(f"image_embeddings.{i}", n) for i, n in enumerate([256, 128, 64])]
-    feature_values = [value(name, F, [1, 3, n, n]) for name, n in features]
-    encoder = [pool(1024 // n, name, "pixel_values") for name, n in features]
-    write(folder / "vision_encoder.onnx", encoder, [value("pixel_values", F, [1, 3, 1024, 1024])], feature_values)
-    nodes, constants = by_color("input_points", ["image_embeddings.1", "image_embeddings.2", "input_labels"])
-    write(
-        folder / "prompt_encoder_mask_decoder.onnx",
-        [node("Identity", ["image_embeddings.0"], ["picture"]), *nodes, *three]
-        + [
-            node("Unsqueeze", ["three_masks", "axes"], ["pred_masks"]),
-            # A box that is given spoils the scores.
-            node("Shape", ["input_boxes"], ["extents"]),
-            node("Gather", ["extents", "from_1"], ["boxes"]),
-            node("Cast", ["boxes"], ["boxes_float"], to=F),
-            node("Sub", ["three_scores", "boxes_float"], ["unboxed"]),
-            node("Unsqueeze", ["unboxed", "zero1"], ["iou_scores"]),
-        ],
-        [
-            value("input_points", F, ["batch", 1, "num_points", 2]),
-            value("input_labels", I64, ["batch", 1, "num_points"]),
-            value("input_boxes", F, ["batch", "num_boxes", 4]),
-            *feature_values,
-        ],
-        [value("iou_scores", F, [1, 1, 3]), value("pred_masks", F, [1, 1, 3, 256, 256])],
-        [*constants, *three_constants, constant("axes", np.array([0, 1], np.int64))],
-    )
+    # As the hub has them: more axes, other names, and for SAM 2.1 boxes, of which none is given.
+    boxes = [
+        # A box that is given spoils the scores.
+        node("Shape", ["input_boxes"], ["extents"]),
+        node("Gather", ["extents", "from_1"], ["boxes"]),
+        node("Cast", ["boxes"], ["boxes_float"], to=F),
+        node("Sub", ["three_scores", "boxes_float"], ["unboxed"]),
+    ]
+    for name, features, unboxed in [
+        ("sam2-hub", [("image_embeddings.0", 256), ("image_embeddings.1", 128), ("image_embeddings.2", 64)], boxes),
+        ("sam-hub", [("image_embeddings", 256), ("image_positional_embeddings", 64)], [node("Identity", ["three_scores"], ["unboxed"])]),
+    ]:
+        feature_values = [value(feature, F, [1, 3, n, n]) for feature, n in features]
+        encoder = [pool(1024 // n, feature, "pixel_values") for feature, n in features]
+        write(stages / name / "vision_encoder.onnx", encoder, [value("pixel_values", F, [1, 3, 1024, 1024])], feature_values)
+        nodes, constants = by_color("input_points", [feature for feature, _ in features[1:]] + ["input_labels"])
+        write(
+            stages / name / "prompt_encoder_mask_decoder.onnx",
+            [node("Identity", [features[0][0]], ["picture"]), *nodes, *three]
+            + [node("Unsqueeze", ["three_masks", "axes"], ["pred_masks"]), *unboxed, node("Unsqueeze", ["unboxed", "zero1"], ["iou_scores"])],
+            [value("input_points", F, ["batch", 1, "num_points", 2]), value("input_labels", I64, ["batch", 1, "num_points"])]
+            + ([value("input_boxes", F, ["batch", "num_boxes", 4])] if unboxed is boxes else [])
+            + feature_values,
+            [value("iou_scores", F, [1, 1, 3]), value("pred_masks", F, [1, 1, 3, 256, 256])],
+            [*constants, *three_constants, constant("axes", np.array([0, 1], np.int64))],
+        )
 
     folder = stages / "efficient-sam"
     write(

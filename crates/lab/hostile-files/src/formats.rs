@@ -3,7 +3,7 @@
 use crate::seeds;
 use artifacts::{
     Descriptors, Edits, Features, Footprints, Graph, InstanceNames, Instances, MaskFeatures, MaskMaps, TruePoints,
-    TrueScene,
+    TrueScene, note_path, read_mask_names,
 };
 use clap::Parser;
 use eval::{read_labels, read_mask, read_truth};
@@ -324,6 +324,11 @@ fn check_labels(bytes: &[u8]) {
         }
         if let Some(names) = sound(InstanceNames::parse(bytes).map_err(|e| e.file(path)), path) {
             assert!(names.named.iter().all(|n| names.best(n.instance).is_some_and(|c| !c.name.is_empty())));
+        }
+        let masks = path.parent().expect("a folder");
+        fs::copy(path, note_path(masks, "a")).expect("a copy");
+        if let Some(names) = sound(read_mask_names(masks, "a"), &note_path(masks, "a")) {
+            assert!(names.values().all(|mask| !mask.name.is_empty() && mask.score.is_finite()));
         }
         if let Some(ids) = sound(Ids::parse(bytes).map_err(|e| e.file(path)), path) {
             assert!(ids.instance.iter().all(|&i| i >= -1));

@@ -285,6 +285,7 @@ pub(crate) fn labels() -> Vec<Vec<u8>> {
         br#"{"format":"names","version":1,"instances":"ab","source":"CLIP","model":"cd","vocabulary":"ef","words":3,"by_chance":0.02,
 "named":[{"instance":0,"names":[{"name":"mug","score":0.3},{"name":"cup","score":0.28}],"margin":0.01,"sure":false}]}"#
             .to_vec(),
+        br#"{"facts":{"size":[4,3],"names":{"57":{"name":"chair","score":0.93},"58":{"name":"dining table","score":0.5}}}}"#.to_vec(),
         br#"{"format":"gaussian-ids","version":1,"splat":"ab","instance":[0,-1,3,2147483647]}"#.to_vec(),
     ]
 }

@@ -299,7 +299,7 @@ fn other_exports_are_used_as_their_description_says() {
     let scene = Scene::new(1);
     scene.make_masks(&scene.masks, &[]);
     let sam = MaskMaps::read(maps_path(&scene.masks, "v0")).unwrap();
-    for name in ["edge-sam", "sam2", "efficient-sam", "sam2-hub"] {
+    for name in ["edge-sam", "sam2", "efficient-sam", "sam2-hub", "sam-hub"] {
         let out = scene.masks.with_file_name(name);
         scene.make_masks(&out, &["--sam", path(&export(name))]);
         let maps = MaskMaps::read(maps_path(&out, "v0")).unwrap();
