@@ -6,15 +6,11 @@ use rayon::prelude::*;
 use std::cmp::Ordering;
 use std::collections::BTreeMap;
 
-/// How much the agreement of a level counts, in the order of [`Level::ALL`]. Two that share small masks are one thing more surely than
-/// two that share large ones, and the medium level adds next to nothing. Chosen on scenes for tuning with three kinds of masks
-/// (docs/results/real-masks.md); classes on seven scenes (docs/results/scans.md), and concepts as they.
-const COUNTS: [f64; LEVELS] = {
-    let [default, small, medium, large] = [0.4, 1.0, 0.05, 0.6];
-    let mut counts = [1.5; LEVELS];
-    [counts[0], counts[1], counts[2], counts[3]] = [default, small, medium, large];
-    counts
-};
+/// How much the agreement of each of SAM's levels counts. Two that share small masks are one thing more surely than two that share large
+/// ones, and the medium level adds next to nothing. Chosen on scenes for tuning with three kinds of masks (docs/results/real-masks.md).
+const COUNTS: [f64; Level::SAM.len()] = [0.4, 1.0, 0.05, 0.6];
+/// The same of levels whose masks have names: fitted for classes on seven scenes (docs/results/scans.md), and taken for concepts.
+const NAMED: f64 = 1.5;
 /// Fewest views and levels that must show both, and least share of their weight in these, for their masks to tell.
 const LEAST_COMMON: (usize, f64) = (2, 0.05);
 
@@ -43,7 +39,7 @@ pub struct Profile {
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Agreement {
     /// The probability that a bit of each lies in the same mask, 0 to 1: of each level the mean over the views that show both, by the root
-    /// of the product of their weights; of the levels the mean by [`COUNTS`].
+    /// of the product of their weights; of the levels the mean by [`COUNTS`] and [`NAMED`].
     pub value: f64,
     /// Whether enough views show both.
     pub firm: bool,
@@ -163,7 +159,8 @@ impl Profile {
                 share += (wx / self.total).min(wy / other.total);
             }
         }
-        let counted = || levels.iter().zip(COUNTS).filter(|([_, all], _)| *all > 0.0);
+        let counts = || COUNTS.into_iter().chain(std::iter::repeat(NAMED));
+        let counted = || levels.iter().zip(counts()).filter(|([_, all], _)| *all > 0.0);
         let all: f64 = counted().map(|(_, count)| count).sum();
         let sum: f64 = counted().map(|([same, all], count)| count * same / all).sum();
         let firm = seen >= LEAST_COMMON.0 && share >= LEAST_COMMON.1;
