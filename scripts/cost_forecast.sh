@@ -4,7 +4,7 @@
 # was measured at such sizes: docs/reproduce.md says what each figure comes from.
 set -euo pipefail
 levels=4
-[[ ${GRAPH_ARGS-} =~ --levels[=\ ]([a-z0-9,]+) ]] && levels=$(tr ',' '\n' <<< "${BASH_REMATCH[1]}" | wc -l)
+[[ ${GRAPH_ARGS-} =~ --levels[=\ ]([a-z0-9,-]+) ]] && levels=$(tr ',' '\n' <<< "${BASH_REMATCH[1]}" | wc -l)
 closed=1
 [[ ${FEAT_ARGS-} =~ --preset|--method ]] && closed=0
 awk -v levels="$levels" -v closed="$closed" -v masks="${MAKES_MASKS:+1}" -v cores="$(nproc)" '

@@ -12,7 +12,7 @@ use std::path::{Path, PathBuf};
 pub const LEVELS: usize = 16;
 
 /// A level of masks: its place in the files. Granularities of SAM come first, then models that name what they see.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
+#[derive(Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
 pub struct Level(u8);
 
 /// What made the masks of a level.
@@ -89,6 +89,12 @@ impl std::fmt::Display for Level {
             0..=2 => f.write_str(name),
             nth => write!(f, "{name}-{}", nth - 1),
         }
+    }
+}
+
+impl std::fmt::Debug for Level {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        write!(f, "{self}")
     }
 }
 
@@ -225,7 +231,7 @@ impl MaskMaps {
                 .file(path)
                 .field("shape")
                 .found(format!("{:?}", a.shape()))
-                .expected("[4, height, width], or 2 more levels for each classes and concepts, up to 16"));
+                .expected("[4, height, width], or two more for each pair of classes and concepts, up to 16"));
         }
         // Tables with a row for each id are made from this: ids are dense, so there are no more of them than pixels.
         let most = Self::MAX_ID.min((levels * height * width).max(1 << 16) as f32);
@@ -262,7 +268,7 @@ impl MaskMaps {
         self.ids.dim().1
     }
 
-    /// The levels that there are: SAM's, or all.
+    /// The levels that there are: SAM's, and perhaps more.
     pub fn levels(&self) -> &'static [Level] {
         &Level::ALL[..self.ids.dim().0]
     }

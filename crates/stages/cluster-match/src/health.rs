@@ -25,7 +25,7 @@ pub fn measure(instances: &Instances, weights: &Weights) -> Health {
 }
 
 /// What masks call each instance ([`Health::names`]), by the share of what the views show of it. `weights` are those in the masks of all
-/// levels. Where a view has two levels with names, the one that says more counts. `folder` has the id maps.
+/// levels. Where a view has several levels with names, the one that says most counts. `folder` has the id maps.
 ///
 /// # Errors
 /// When a file of names is damaged.

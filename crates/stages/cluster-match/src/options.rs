@@ -94,7 +94,7 @@ pub(crate) struct Settings {
     #[arg(long, value_name = "SHARE", value_parser = stage::within(0.0..=0.5), default_value = "0.03",
         default_value_if("cluster", "free", "0"))]
     pub split: f64,
-    /// Levels of the masks that vote, join and match: default, small, medium, large, classes, concepts [default: all, but large where
+    /// Levels of the masks that vote, join and match: default, small, medium, large, classes, concepts, classes-2 and so on [default: all, but large where
     /// there are classes; for free points large, as in the paper]
     #[arg(
         long,

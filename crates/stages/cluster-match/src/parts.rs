@@ -36,10 +36,10 @@ impl Pieces {
     /// Those that the masks of whole things (`large`) set apart: the probability that one of them holds the part and the rest of the
     /// instance is lower, by [`APART`], than that of the medium masks. SAM's largest mask of a place is the whole thing there. Where either
     /// level says nothing of a part, it is not apart.
-    fn apart(&self, footprints: &Footprints, large: Level) -> Result<Vec<bool>> {
+    fn apart(&self, footprints: &Footprints, large: &[Level]) -> Result<Vec<bool>> {
         let wholes: Vec<i32> = self.pairs.iter().map(|p| p.0).collect();
-        let agreements = |level| with_rest(&self.labels, &wholes, footprints, &[level]);
-        let (medium, large) = (agreements(Level::MEDIUM)?, agreements(large)?);
+        let agreements = |levels| with_rest(&self.labels, &wholes, footprints, levels);
+        let (medium, large) = (agreements(&[Level::MEDIUM])?, agreements(large)?);
         Ok(medium.into_iter().zip(large).map(|(m, l)| m.zip(l).is_some_and(|(m, l)| m - l >= APART)).collect())
     }
 
@@ -69,7 +69,7 @@ impl Pieces {
 
 /// Makes instances of `parts`. A part leaves where at least [`INSIDE`] of its Gaussians lie in one instance, it has at most `share` of that
 /// instance's (or a half, where large masks set it apart), and some mask shows it as one. An instance of which more than half would leave
-/// stays as it is. `large` is the level of whole things. In the tree such a part hangs below the cluster of that instance. Returns how many
+/// stays as it is. `large` are the levels of whole things. In the tree such a part hangs below the cluster of that instance. Returns how many
 /// there are.
 ///
 /// # Errors
@@ -79,7 +79,7 @@ pub(crate) fn split(
     parts: &Assignment,
     kept: &[u32],
     footprints: &Footprints,
-    large: Level,
+    large: &[Level],
     share: f64,
 ) -> Result<usize> {
     let pieces = Pieces::new(wholes, parts, kept);
@@ -151,7 +151,7 @@ mod tests {
         let once: [&[&[u32]]; 2] = [together[0], &[&[0, 1], &[2, 3, 4, 5], &[6, 7]]];
         let unseen: [&[&[u32]]; 2] = [&[&[6, 7]]; 2];
         let apart = |medium, large| {
-            pieces.apart(&footprints_of(&[(Level::MEDIUM, medium), (Level::LARGE, large)]), Level::LARGE).unwrap()
+            pieces.apart(&footprints_of(&[(Level::MEDIUM, medium), (Level::LARGE, large)]), &[Level::LARGE]).unwrap()
         };
         assert_eq!(apart(&together, &once), [true, true, false]);
         for (medium, large) in [(&together, &together), (&once, &together), (&once, &once), (&together, &unseen)] {
@@ -166,7 +166,8 @@ mod tests {
             let mut wholes = of(vec![0; 8], 1);
             let parts = of(vec![0, 0, 0, 0, 0, 0, 1, 1], 2);
             let split =
-                split(&mut wholes, &parts, &all, &footprints_of(&[(Level::SMALL, &views)]), Level::LARGE, 0.3).unwrap();
+                split(&mut wholes, &parts, &all, &footprints_of(&[(Level::SMALL, &views)]), &[Level::LARGE], 0.3)
+                    .unwrap();
             (split, wholes)
         };
         let shown: &[&[u32]] = &[&[0, 1, 2, 3, 4, 5], &[6, 7]];

@@ -159,8 +159,9 @@ fn correct(
     if settings.split > 0.0 && settings.levels.contains(&Level::SMALL) && footprints.rows.iter().any(small) {
         let clustering = linkage::cluster(inputs, points, settings, &[Level::SMALL], (PARTS, 0.0))?;
         let parts = Assignment::new(&clustering, &graph.kept, means.len());
-        let classes = settings.levels.iter().find(|level| level.kind() == Kind::Classes);
-        let large = *classes.unwrap_or(&Level::LARGE);
+        let classes = settings.levels.iter().copied().filter(|level| level.kind() == Kind::Classes);
+        let classes: Vec<Level> = classes.collect();
+        let large = if classes.is_empty() { &[Level::LARGE][..] } else { &classes };
         let split = split(&mut found, &parts, &graph.kept, footprints, large, settings.split)?;
         if split > 0 {
             stage.info(&format!("{split} small things within others are instances of their own"));

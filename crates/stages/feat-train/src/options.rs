@@ -39,7 +39,7 @@ pub struct Options {
     /// it; where the two presets differ, their help says so
     #[arg(long, value_enum)]
     pub preset: Option<Preset>,
-    /// Mask levels to use, separated by commas: default, small, medium, large, classes, concepts [default: all; large with --preset]
+    /// Mask levels to use, separated by commas: default, small, medium, large, classes, concepts, classes-2 and so on [default: all; large with --preset]
     #[arg(long, value_name = "LEVELS", value_delimiter = ',')]
     pub levels: Vec<Level>,
     /// Dimension of the features, 1 to 512, or 2 to 64 with --preset [default: 6 with --preset; else as many as there are

@@ -122,12 +122,20 @@ pub(crate) fn run(args: &MasksArgs, stage: &Stage) -> Result<()> {
         Ok((image, key, done))
     };
     let todo = |view: &&View| read(view).is_ok_and(|(.., done)| !done);
-    let todo: Vec<&View> = scene.views.par_iter().filter(todo).collect();
-    let first = Mutex::new(forecast(args, &models, &scene.views, &todo, stage)?);
+    let lanes = models.lanes().min(rayon::current_num_threads());
+    let mut first = Vec::new();
+    for some in scene.views.chunks(rayon::current_num_threads()) {
+        if first.len() < lanes {
+            first.par_extend(some.par_iter().filter(todo));
+        }
+    }
+    first.truncate(lanes);
+    let look = |view: &View| read(view).map(|(image, key, _)| (image, key));
+    let first = Mutex::new(forecast(args, &models, &scene.views, &first, look, stage)?);
     let prepare = |view| {
         let (image, key, done) = read(view)?;
-        let seen = || lock(&first).remove(View::stem(view));
-        Ok((view, key, if done { None } else { Some(make(args, &models, &image, seen())?) }))
+        let seen = lock(&first).remove(&key);
+        Ok((view, key, if done { None } else { Some(make(args, &models, &image, seen)?) }))
     };
     let (mut asked, mut points, mut large) = (0, 0, 0);
     let finish = |(view, key, made): (&View, String, Option<(MaskMaps, Facts)>)| {
@@ -209,41 +217,44 @@ fn claim(args: &MasksArgs, scene: &Dataset, manifest: &Path, stage: &Stage) -> R
     outputs.known_by(finished::is_own).claim()
 }
 
-/// Says how much memory the photographs will take. The models look at the first of those that are `todo`, as their need is known only
-/// then; what they saw is given back, by stem.
+/// Says how much memory the photographs will take. The models look at the `first` photographs, one in each lane, as their need is known
+/// only then; what they saw is given back, by what the map will be made from. `read` gives a photograph and that.
 fn forecast(
     args: &MasksArgs,
     models: &Models,
     views: &[View],
-    todo: &[&View],
+    first: &[&View],
+    read: impl Fn(&View) -> Result<(RgbImage, String)> + Sync,
     stage: &Stage,
 ) -> Result<BTreeMap<String, Seen>> {
     let choice = Choice { points_per_side: 4, ..args.choice };
-    let lanes = models.lanes().min(todo.len()).min(rayon::current_num_threads());
-    if lanes == 0 {
-        return Ok(BTreeMap::new());
+    let mut found = BTreeMap::new();
+    if first.is_empty() {
+        return Ok(found);
     }
     let look = |view: &View| {
-        let (image, _) = photographs::read(view)?;
+        let (image, key) = read(view)?;
         let size = MapSize::of(&image, args.map_size, args.min_area);
         let seen = models.look(&image, size)?;
         drop(propose(&models.sam, &seen.embedded, &choice)?);
         models.ask(&image, size, 1)?;
-        Ok((view.stem().to_string(), seen))
+        Ok((key, seen))
     };
-    let mut first = BTreeMap::new();
-    ahead(&todo[..lanes], lanes, look, |(stem, seen)| {
-        first.insert(stem, seen);
+    ahead(first, first.len(), look, |(key, seen)| {
+        found.insert(key, seen);
         Ok(())
     })?;
     let (side, pixels) = (args.choice.points_per_side as u64, photographs::largest(views));
     let map = if args.map_size == 0 { pixels } else { pixels.min((args.map_size * args.map_size * 3 / 4) as u64) };
     // Of every third point of the grid or so that is asked three masks wait with their logits, 200 kB where one fills the
-    // picture; then the map, 16 bytes a pixel, and the masks of a level, a byte for each pixel of their boxes.
+    // picture; then the map, 16 bytes a pixel, with more levels twice and 8 for each, and the masks of a level, a byte for each pixel of
+    // their boxes. What is larger than the first photographs takes 9 bytes a pixel more.
     let waiting = 100_000 * (side * side * 3 / 4);
-    let needed = peak_rss_bytes().unwrap_or(0) + lanes as u64 * (waiting + 30 * map);
+    let more = 32 * models.panoptic.len().max(models.concepts.len()) as u64;
+    let larger = pixels - photographs::largest(first.iter().copied());
+    let needed = peak_rss_bytes().unwrap_or(0) + first.len() as u64 * (waiting + (30 + more) * map + 9 * larger);
     stage.forecast(needed, "give fewer --threads, or smaller photographs (--resolution) and maps (--map-size)")?;
-    Ok(first)
+    Ok(found)
 }
 
 /// Warns of id maps of other views in the folder: later stages would take them for maps of this scene.

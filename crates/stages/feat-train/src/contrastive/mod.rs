@@ -82,7 +82,8 @@ fn masks_to_learn_from<'a>(
         let what = if least == 1 { "no view has a mask" } else { "no view has two masks to tell apart" };
         return Err(Error::new(what)
             .file(&args.footprints)
-            .field(format!("levels {levels:?}"))
+            .field("--levels")
+            .found(format!("{levels:?}"))
             .hint("choose other --levels, or make masks with more than one segment a view"));
     }
     if options.needs_pixels() && !sets.have_pixels() {

@@ -36,7 +36,8 @@ pub fn features(args: &Args, inputs: &Inputs, stage: &Stage) -> Result<Made> {
     if matrix.masks.is_empty() {
         return Err(Error::new("no mask has a footprint")
             .file(&args.footprints)
-            .field(format!("levels {levels:?}"))
+            .field("--levels")
+            .found(format!("{levels:?}"))
             .hint("choose other --levels, or check that masks and geometry are of one scene"));
     }
     let evidence_seconds = clock.elapsed().as_secs_f64();
