@@ -58,7 +58,7 @@ pub const FORMATS: [Format; 14] = [
     // One array of 16 MiB is believed, then 64 bytes a byte; of one-byte numbers, as floats.
     Format { name: "npz", check: check_npz, seeds: seeds::npz, memory: (7 << 24, JSON + 64 * 5) },
     Format { name: "artifact", check: check_artifact, seeds: seeds::artifact, memory: (FIXED, JSON) },
-    // Edits and names of instances, scene.json and ids of Gaussians, too. Polygons stand for pictures of the size that the file names; all of a frame have 2^28 pixels at most.
+    // Edits and names of instances, names of masks, scene.json and ids of Gaussians, too. Polygons stand for pictures of the size that the file names; all of a frame have 2^28 pixels at most.
     Format { name: "labels", check: check_labels, seeds: seeds::labels, memory: (FIXED + (1 << 28), JSON) },
     Format { name: "scannet", check: check_scannet, seeds: seeds::scannet, memory: (FIXED, JSON) },
     // Packed: a byte stands for as many as gzip makes of it, and a Gaussian takes 26 times what it has in the file. A window of

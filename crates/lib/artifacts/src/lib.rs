@@ -38,7 +38,7 @@ pub use health::Health;
 pub use instances::{Family, Instances, Match, OrientedBox, TreeEdge};
 pub use lerf_ovs::{LERF_OVS, LerfScene};
 pub use masks::{
-    Kind, LEVELS, Level, MaskFeatures, MaskFolder, MaskMaps, MaskName, MaskNames, features_path, folder_files,
+    LEVELS, Level, LevelKind, MaskFeatures, MaskFolder, MaskMaps, MaskName, MaskNames, features_path, folder_files,
     hash_folder, maps_path, note_path, read_mask_names, same_shape, stems, watch_folder,
 };
 pub use names::{Called, InstanceNames, Naming, ScoredName, called};

@@ -17,7 +17,7 @@ pub struct Level(u8);
 
 /// What made the masks of a level.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Kind {
+pub enum LevelKind {
     /// SAM, at one of its granularities.
     Segments,
     /// A panoptic model: a mask is a thing, or all that is seen of a class.
@@ -59,11 +59,11 @@ impl Level {
     }
 
     /// What made its masks. After SAM's levels the kinds take turns: classes, concepts, classes-2, concepts-2, ...
-    pub const fn kind(self) -> Kind {
+    pub const fn kind(self) -> LevelKind {
         match self.0 {
-            0..4 => Kind::Segments,
-            n if n % 2 == 0 => Kind::Classes,
-            _ => Kind::Concepts,
+            0..4 => LevelKind::Segments,
+            n if n % 2 == 0 => LevelKind::Classes,
+            _ => LevelKind::Concepts,
         }
     }
 }
@@ -81,9 +81,9 @@ impl std::str::FromStr for Level {
 impl std::fmt::Display for Level {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
         let name = match self.kind() {
-            Kind::Segments => Self::SAM_NAMES[self.index()],
-            Kind::Classes => "classes",
-            Kind::Concepts => "concepts",
+            LevelKind::Segments => Self::SAM_NAMES[self.index()],
+            LevelKind::Classes => "classes",
+            LevelKind::Concepts => "concepts",
         };
         match self.0 / 2 {
             0..=2 => f.write_str(name),
@@ -485,7 +485,7 @@ mod tests {
         assert!(Level::ALL.iter().zip(&named).all(|(level, name)| name.parse::<Level>().unwrap() == *level));
         assert!(["classes-1", "classes-7", "16", ""].iter().all(|name| name.parse::<Level>().is_err()));
         let kinds = [Level::LARGE, Level::CLASSES, Level::ALL[7]].map(Level::kind);
-        assert_eq!(kinds, [Kind::Segments, Kind::Classes, Kind::Concepts]);
+        assert_eq!(kinds, [LevelKind::Segments, LevelKind::Classes, LevelKind::Concepts]);
         let dir = tempfile::tempdir().unwrap();
         let p = maps_path(dir.path(), "a");
         for (levels, good) in [(4, true), (5, false), (6, true), (8, true), (16, true), (18, false)] {

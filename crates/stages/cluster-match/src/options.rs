@@ -2,7 +2,7 @@
 
 #![allow(rustdoc::invalid_html_tags, reason = "help texts name files as <view>_s.npy")]
 
-use artifacts::{Footprints, Kind, Level};
+use artifacts::{Footprints, Level, LevelKind};
 use clap::Parser;
 use hdbscan_exact::{Metric, Selection};
 use serde::Serialize;
@@ -94,8 +94,8 @@ pub(crate) struct Settings {
     #[arg(long, value_name = "SHARE", value_parser = stage::within(0.0..=0.5), default_value = "0.03",
         default_value_if("cluster", "free", "0"))]
     pub split: f64,
-    /// Levels of the masks that vote, join and match: default, small, medium, large, classes, concepts, classes-2 and so on [default: all, but large where
-    /// there are classes; for free points large, as in the paper]
+    /// Levels of the masks that vote, join and match: default, small, medium, large, classes, concepts, classes-2 and so on
+    /// [default: all, but large where there are classes; for free points large, as in the paper]
     #[arg(
         long,
         value_delimiter = ',',
@@ -124,6 +124,11 @@ pub(crate) struct Settings {
         help_heading = "Matching"
     )]
     pub describe_views: usize,
+}
+
+/// Those of the `levels` that show classes.
+pub fn classes(levels: &[Level]) -> Vec<Level> {
+    levels.iter().copied().filter(|level| level.kind() == LevelKind::Classes).collect()
 }
 
 /// Largest count that an option takes: as many as there can be Gaussians.
@@ -159,7 +164,7 @@ impl Settings {
                 let of_levels = footprints.rows.iter().filter(|row| row.is_of(levels));
                 of_levels.map(|row| row.view).collect::<BTreeSet<u32>>()
             };
-            let classes: Vec<Level> = levels.iter().copied().filter(|l| l.kind() == Kind::Classes).collect();
+            let classes = classes(&levels);
             if !classes.is_empty() && views(&[Level::LARGE]).is_subset(&views(&classes)) {
                 levels.retain(|level| *level != Level::LARGE);
             }

@@ -6,14 +6,14 @@ use crate::granules::{self, Candidates};
 use crate::group::{free, on_graph};
 use crate::inputs::Inputs;
 use crate::matching::{Likeness, matches};
-use crate::options::{Args, Settings, Space};
+use crate::options::{Args, Settings, Space, classes};
 use crate::outputs::{self, Found};
 use crate::parts::split;
 use crate::profile::mask_weights;
 use crate::rank::confidence;
 use crate::surface::Points;
 use crate::{health, linkage, memory};
-use artifacts::{Draft, Health, Instances, Kind, Level, MaskFeatures, MaskFolder, Row};
+use artifacts::{Draft, Health, Instances, Level, MaskFeatures, MaskFolder, Row};
 use gs_io::{Error, Result, Watched};
 use gs_scene::splat;
 use ndarray::Array2;
@@ -159,8 +159,7 @@ fn correct(
     if settings.split > 0.0 && settings.levels.contains(&Level::SMALL) && footprints.rows.iter().any(small) {
         let clustering = linkage::cluster(inputs, points, settings, &[Level::SMALL], (PARTS, 0.0))?;
         let parts = Assignment::new(&clustering, &graph.kept, means.len());
-        let classes = settings.levels.iter().copied().filter(|level| level.kind() == Kind::Classes);
-        let classes: Vec<Level> = classes.collect();
+        let classes = classes(&settings.levels);
         let large = if classes.is_empty() { &[Level::LARGE][..] } else { &classes };
         let split = split(&mut found, &parts, &graph.kept, footprints, large, settings.split)?;
         if split > 0 {

@@ -2,13 +2,13 @@
 //! nouns.
 
 use crate::panoptic::Segments;
-use artifacts::{Level, MaskMaps, MaskName, MaskNames};
-use ndarray::{Array2, Axis};
+use artifacts::{Level, LevelKind, MaskMaps, MaskName, MaskNames};
+use ndarray::{Array3, ArrayViewMut2, Axis, s};
 use std::collections::BTreeMap;
 
 /// Adds the levels of masks with names to SAM's, one for each of `classes` and `concepts`, and gives the names: segments of at least
-/// `min_area` pixels. A level of classes has the large masks too where none of its own is, without a name: a thing of no known class is better seen by SAM than not at all
-/// (docs/results/real-masks.md). What was seen has the maps' size; a level of nothing is empty.
+/// `min_area` pixels. A level of classes has the large masks too where none of its own is, without a name: a thing of no known class is
+/// better seen by SAM than not at all (docs/results/real-masks.md). What was seen has the maps' size; a level of nothing is empty.
 pub fn with_names(
     maps: &MaskMaps,
     classes: &[Segments],
@@ -18,7 +18,7 @@ pub fn with_names(
     let large = maps.level(Level::LARGE);
     let (mut names, mut next) = (MaskNames::new(), maps.id_count() as i32);
     // Paints what is large enough of the free pixels' part of each mask.
-    let mut paint = |level: &mut Array2<i32>, source: &[i32], segments: Option<&Segments>| {
+    let mut paint = |level: &mut ArrayViewMut2<'_, i32>, source: &[i32], segments: Option<&Segments>| {
         let mut areas = BTreeMap::<i32, usize>::new();
         let of_free = source.iter().zip(&*level).filter(|(id, now)| **id >= 0 && **now < 0);
         of_free.for_each(|(&id, _)| *areas.entry(id).or_default() += 1);
@@ -34,17 +34,16 @@ pub fn with_names(
         };
         names.extend(id_of.into_iter().filter_map(|(id, new)| Some((new as u32, named(segments?, id)))));
     };
-    let mut all = maps.ids.clone();
-    for nth in 0..classes.len().max(concepts.len()) {
-        for (seen, fill) in [(classes.get(nth), true), (concepts.get(nth), false)] {
-            let mut level = Array2::from_elem(large.dim(), -1);
-            if let Some(seen) = seen {
-                paint(&mut level, artifacts::flat(seen.ids.view()), Some(seen));
-                if fill {
-                    paint(&mut level, artifacts::flat(large), None);
-                }
-            }
-            all.push(Axis(0), level.view()).expect("of the maps' size");
+    let named = &Level::ALL[Level::SAM.len()..][..2 * classes.len().max(concepts.len())];
+    let mut all = Array3::from_elem((Level::SAM.len() + named.len(), maps.height(), maps.width()), -1);
+    all.slice_mut(s![..Level::SAM.len(), .., ..]).assign(&maps.ids);
+    for (at, level) in named.iter().enumerate() {
+        let of_kind = if level.kind() == LevelKind::Classes { classes } else { concepts };
+        let Some(seen) = of_kind.get(at / 2) else { continue };
+        let mut map = all.index_axis_mut(Axis(0), level.index());
+        paint(&mut map, artifacts::flat(seen.ids.view()), Some(seen));
+        if level.kind() == LevelKind::Classes {
+            paint(&mut map, artifacts::flat(large), None);
         }
     }
     (MaskMaps { ids: all }, names)
@@ -54,7 +53,7 @@ pub fn with_names(
 mod tests {
     use super::*;
     use crate::panoptic::Segment;
-    use ndarray::{Array3, arr2};
+    use ndarray::arr2;
 
     #[test]
     fn large_masks_fill_what_no_segment_covers() {

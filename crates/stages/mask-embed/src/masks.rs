@@ -81,11 +81,10 @@ impl Models {
 
     /// Content hashes of both kinds, by what they are called among inputs: panoptic, panoptic-2, ...
     fn hashes(&self) -> Vec<(String, String)> {
-        let name = |kind: &str, at| if at == 0 { kind.to_string() } else { format!("{kind}-{}", at + 1) };
         let panoptic = self.panoptic.iter().map(|model| lock(model).hash().to_string()).enumerate();
         let concepts = self.concepts.iter().map(|model| lock(model).hash().to_string()).enumerate();
-        let panoptic = panoptic.map(|(at, hash)| (name("panoptic", at), hash));
-        panoptic.chain(concepts.map(|(at, hash)| (name("concepts", at), hash))).collect()
+        let all = panoptic.map(|model| ("panoptic", model)).chain(concepts.map(|model| ("concepts", model)));
+        all.map(|(kind, (at, hash))| (if at == 0 { kind.into() } else { format!("{kind}-{}", at + 1) }, hash)).collect()
     }
 }
 
@@ -121,20 +120,19 @@ pub(crate) fn run(args: &MasksArgs, stage: &Stage) -> Result<()> {
         let done = finished::is_done(&maps_path(folder, view.stem()), &key);
         Ok((image, key, done))
     };
-    let todo = |view: &&View| read(view).is_ok_and(|(.., done)| !done);
+    let todo = |view| read(view).ok().filter(|(.., done)| !done).map(|(image, key, _)| (image, key));
     let lanes = models.lanes().min(rayon::current_num_threads());
     let mut first = Vec::new();
     for some in scene.views.chunks(rayon::current_num_threads()) {
         if first.len() < lanes {
-            first.par_extend(some.par_iter().filter(todo));
+            first.par_extend(some.par_iter().filter_map(todo));
         }
     }
     first.truncate(lanes);
-    let look = |view: &View| read(view).map(|(image, key, _)| (image, key));
-    let first = Mutex::new(forecast(args, &models, &scene.views, &first, look, stage)?);
+    let seen = Mutex::new(forecast(args, &models, &scene.views, first, stage)?);
     let prepare = |view| {
         let (image, key, done) = read(view)?;
-        let seen = lock(&first).remove(&key);
+        let seen = lock(&seen).remove(&key);
         Ok((view, key, if done { None } else { Some(make(args, &models, &image, seen)?) }))
     };
     let (mut asked, mut points, mut large) = (0, 0, 0);
@@ -218,13 +216,12 @@ fn claim(args: &MasksArgs, scene: &Dataset, manifest: &Path, stage: &Stage) -> R
 }
 
 /// Says how much memory the photographs will take. The models look at the `first` photographs, one in each lane, as their need is known
-/// only then; what they saw is given back, by what the map will be made from. `read` gives a photograph and that.
+/// only then. What they saw is given back, by what the map will be made from, which each photograph comes with.
 fn forecast(
     args: &MasksArgs,
     models: &Models,
     views: &[View],
-    first: &[&View],
-    read: impl Fn(&View) -> Result<(RgbImage, String)> + Sync,
+    first: Vec<(RgbImage, String)>,
     stage: &Stage,
 ) -> Result<BTreeMap<String, Seen>> {
     let choice = Choice { points_per_side: 4, ..args.choice };
@@ -232,26 +229,25 @@ fn forecast(
     if first.is_empty() {
         return Ok(found);
     }
-    let look = |view: &View| {
-        let (image, key) = read(view)?;
-        let size = MapSize::of(&image, args.map_size, args.min_area);
-        let seen = models.look(&image, size)?;
+    let look = |(image, key): &(RgbImage, String)| {
+        let size = MapSize::of(image, args.map_size, args.min_area);
+        let seen = models.look(image, size)?;
         drop(propose(&models.sam, &seen.embedded, &choice)?);
-        models.ask(&image, size, 1)?;
-        Ok((key, seen))
+        models.ask(image, size, 1)?;
+        Ok((key.clone(), seen))
     };
-    ahead(first, first.len(), look, |(key, seen)| {
+    ahead(&first.iter().collect::<Vec<_>>(), first.len(), look, |(key, seen)| {
         found.insert(key, seen);
         Ok(())
     })?;
     let (side, pixels) = (args.choice.points_per_side as u64, photographs::largest(views));
     let map = if args.map_size == 0 { pixels } else { pixels.min((args.map_size * args.map_size * 3 / 4) as u64) };
     // Of every third point of the grid or so that is asked three masks wait with their logits, 200 kB where one fills the
-    // picture; then the map, 16 bytes a pixel, with more levels twice and 8 for each, and the masks of a level, a byte for each pixel of
-    // their boxes. What is larger than the first photographs takes 9 bytes a pixel more.
+    // picture; then the map, 16 bytes a pixel and at most 32 more for each two levels with names, and the masks of a level, a byte for
+    // each pixel of their boxes. What is larger than the first photographs takes 9 bytes a pixel more.
     let waiting = 100_000 * (side * side * 3 / 4);
     let more = 32 * models.panoptic.len().max(models.concepts.len()) as u64;
-    let larger = pixels - photographs::largest(first.iter().copied());
+    let larger = pixels.saturating_sub(first.iter().map(|(i, _)| (i.width * i.height) as u64).max().unwrap_or(0));
     let needed = peak_rss_bytes().unwrap_or(0) + first.len() as u64 * (waiting + (30 + more) * map + 9 * larger);
     stage.forecast(needed, "give fewer --threads, or smaller photographs (--resolution) and maps (--map-size)")?;
     Ok(found)

@@ -17,8 +17,8 @@ pub(crate) fn open(args: &SceneArgs, stage: &Stage) -> Result<Dataset> {
 }
 
 /// Pixels of the largest photograph.
-pub(crate) fn largest<'a>(views: impl IntoIterator<Item = &'a View>) -> u64 {
-    views.into_iter().map(|v| u64::from(v.camera.width) * u64::from(v.camera.height)).max().unwrap_or(0)
+pub(crate) fn largest(views: &[View]) -> u64 {
+    views.iter().map(|v| u64::from(v.camera.width) * u64::from(v.camera.height)).max().unwrap_or(0)
 }
 
 /// The photograph of a view, undistorted and at the resolution asked for, and the hash of its pixels.

@@ -67,7 +67,7 @@ fn of_footprints(world: &World) -> Result<Shares> {
     world.footprints.in_batches(&world.rows(), |rows, entries| {
         for (&r, entries) in rows.iter().zip(entries) {
             let row = world.footprints.rows[r as usize];
-            let Some(slot) = slots.iter().position(|&l| l.index() as u32 == row.level) else { continue };
+            let Some(slot) = slots.iter().position(|&l| row.is_of(&[l])) else { continue };
             let share = |weight| Share { view: row.view, mask: row.mask, slot: slot as u32, weight: f64::from(weight) };
             entries.iter().for_each(|(i, weight)| shares[i as usize].push(share(weight)));
         }
