@@ -14,7 +14,7 @@ crates/stages/mask-embed/testdata/efficient-sam/ the same as EfficientSAM's
 crates/stages/mask-embed/testdata/sam2-hub/      the same as the Hugging Face hub's SAM 2.1
 crates/stages/mask-embed/testdata/sam-hub/       and its first SAM
 crates/stages/mask-embed/testdata/edge-sam/      the same as EdgeSAM's
-crates/stages/mask-embed/testdata/sam-tiny/      a decoder with SAM's architecture and names, narrow and with random weights
+crates/stages/mask-embed/testdata/sam-tiny/      encoder and decoder with MobileSAM's architecture and names, narrow and with random weights
 crates/stages/mask-embed/testdata/panoptic-*/    panoptic segmenters by colour with the inputs and outputs of DETR, Mask2Former,
                                                  OneFormer and EoMT, and the segments of a photograph by transformers
 crates/stages/mask-embed/testdata/concepts-*/    segmenters of what nouns name, by colour, with the inputs and outputs of exports of SAM 3
@@ -392,10 +392,8 @@ def exports():
     )
 
 
-class Decoder:
-    """SAM's mask decoder (Kirillov et al. 2023, appendix A) as PyTorch's exporter writes it, narrow."""
-
-    WIDTH, INNER, HEADS, SIDE = 16, 8, 8, 64
+class Layers:
+    """Operators as PyTorch's exporter writes them, with random weights."""
 
     def __init__(self):
         self.random = np.random.default_rng(1)
@@ -422,9 +420,91 @@ class Decoder:
         product = self.op("MatMul", x, self.weight(f"onnx::MatMul_{len(self.nodes)}", inputs, outputs))
         return self.op("Add", self.weight(f"{name}.bias", outputs), product)
 
-    def norm(self, x, name):
-        scale = self.constant(f"{name}.weight", self.random.uniform(0.5, 1.5, self.WIDTH).astype(np.float32))
-        return self.op("LayerNormalization", x, scale, self.weight(f"{name}.bias", self.WIDTH), epsilon=1e-5, axis=-1)
+    def norm(self, x, name, width):
+        scale = self.constant(f"{name}.weight", self.random.uniform(0.5, 1.5, width).astype(np.float32))
+        return self.op("LayerNormalization", x, scale, self.weight(f"{name}.bias", width), epsilon=1e-5, axis=-1)
+
+    def gelu(self, x):
+        erf = self.op("Erf", self.op("Div", x, np.float32(2**0.5)))
+        return self.op("Mul", self.op("Mul", x, self.op("Add", erf, np.float32(1))), np.float32(0.5))
+
+
+class Encoder(Layers):
+    """MobileSAM's encoder, TinyViT (Wu et al. 2022), narrow: one block a stage, windows of 4, 6 and 3 pixels."""
+
+    STEM, STAGES = 8, [(12, 3, 4, 2), (40, 2, 6, 1), (8, 1, 3, 1)]  # channels, heads, side of a window, growth of the MLP
+
+    def conv(self, x, name, inputs, outputs, side=1, stride=1, group=1, bias=True):
+        weight = self.random.normal(0, (inputs * side * side / group) ** -0.5, (outputs, inputs // group, side, side)).astype(np.float32)
+        inputs = [x, self.constant(f"onnx::Conv_{len(self.nodes)}" if bias else f"{name.replace('/', '.')}.weight", weight)]
+        inputs += [self.weight(f"onnx::Conv_{len(self.nodes)}_bias", outputs)] if bias else []
+        made = f"/{name}/Conv_output_0"
+        pads = [side // 2] * 4
+        self.nodes.append(helper.make_node("Conv", inputs, [made], pads=pads, strides=[stride] * 2, group=group, kernel_shape=[side] * 2))
+        return made
+
+    def separable(self, x, name, inputs, inner, outputs, stride):
+        x = self.gelu(self.conv(x, f"{name}/conv1/c", inputs, inner))
+        x = self.gelu(self.conv(x, f"{name}/conv2/c", inner, inner, 3, stride, inner))
+        return self.conv(x, f"{name}/conv3/c", inner, outputs)
+
+    def block(self, x, stage, side, channels, heads, window, growth):
+        """Of `[1, channels, side, side]`."""
+        name, width, count = f"layers.{stage}.blocks.0", channels // heads, -(-side // window)
+        rows = self.op("Transpose", x, perm=[0, 2, 3, 1])
+        fill = count * window - side
+        padded = self.op("Pad", rows, np.array([0, 0, 0, 0, 0, fill, fill, 0]))
+        windows = self.op("Transpose", self.op("Reshape", padded, np.array([count, window, count, window, channels])), perm=[0, 2, 1, 3, 4])
+        windows = self.op("Reshape", windows, np.array([count * count, window * window, channels]))
+        qkv = self.linear(self.norm(windows, f"{name}.attn.norm", channels), f"{name}.attn.qkv", channels, 3 * channels)
+        qkv = self.op("Reshape", qkv, np.array([count * count, window * window, heads, 3 * width]))
+        qkv = self.op("Transpose", qkv, perm=[0, 2, 1, 3])
+        q, k, v = (self.op("Slice", qkv, np.array([i * width]), np.array([(i + 1) * width]), np.array([3])) for i in range(3))
+        scores = self.op("Mul", self.op("MatMul", q, self.op("Transpose", k, perm=[0, 1, 3, 2])), np.float32(width**-0.5))
+        made = f"/layers.{stage}/blocks.0/attn/Add_output_0"
+        places = self.random.normal(0, 1, (heads, window * window, window * window)).astype(np.float32)
+        self.nodes.append(helper.make_node("Constant", [], [f"places.{stage}"], value=constant("", places)))
+        self.nodes.append(helper.make_node("Add", [scores, f"places.{stage}"], [made]))
+        sums = self.op("Transpose", self.op("MatMul", self.op("Softmax", made, axis=3), v), perm=[0, 2, 1, 3])
+        sums = self.op("Reshape", sums, np.array([count, count, window, window, channels]))
+        sums = self.op("Transpose", self.linear(sums, f"{name}.attn.proj", channels, channels), perm=[0, 2, 1, 3, 4])
+        sums = self.op("Reshape", sums, np.array([1, count * window, count * window, channels]))
+        sums = self.op("Slice", sums, np.array([0, 0]), np.array([side, side]), np.array([1, 2]))
+        x = self.op("Transpose", self.op("Add", rows, sums), perm=[0, 3, 1, 2])
+        x = self.conv(x, f"layers.{stage}/blocks.0/local_conv/c", channels, channels, 3, 1, channels)
+        rows = self.op("Transpose", x, perm=[0, 2, 3, 1])
+        hidden = self.linear(self.norm(rows, f"{name}.mlp.norm", channels), f"{name}.mlp.fc1", channels, growth * channels)
+        rows = self.op("Add", rows, self.linear(self.gelu(hidden), f"{name}.mlp.fc2", growth * channels, channels))
+        return self.op("Transpose", rows, perm=[0, 3, 1, 2])
+
+    def norm_of_pictures(self, x, channels):
+        centred = self.op("Sub", x, self.op("ReduceMean", x, axes=[1]))
+        variance = self.op("ReduceMean", self.op("Pow", centred, np.float32(2)), axes=[1])
+        normed = self.op("Div", centred, self.op("Sqrt", self.op("Add", variance, np.float32(1e-6))))
+        scale, shift = (self.random.uniform(0.5, 1.5, (channels, 1, 1)).astype(np.float32) for _ in range(2))
+        return self.op("Add", self.op("Mul", scale, normed), shift)
+
+    def build(self, path, outputs):
+        channels, side = self.STEM, 1024
+        x = self.gelu(self.conv("input", "patch_embed/seq/seq.0/c", 3, channels // 2, 3, 2))
+        x = self.conv(x, "patch_embed/seq/seq.2/c", channels // 2, channels, 3, 2)
+        side //= 4
+        x = self.gelu(self.op("Add", self.separable(x, "layers.0/blocks.0", channels, 2 * channels, channels, 1), x))
+        for i, (width, heads, window, growth) in enumerate(self.STAGES):
+            stride = 1 if i == 2 else 2
+            x = self.separable(x, f"layers.{i}/downsample", channels, width, width, stride)
+            channels, side = width, side // stride
+            x = self.block(x, i + 1, side, channels, heads, window, growth)
+        x = self.norm_of_pictures(self.conv(x, "neck/neck.0", channels, outputs, bias=False), outputs)
+        x = self.norm_of_pictures(self.conv(x, "neck/neck.2", outputs, outputs, 3, bias=False), outputs)
+        self.nodes[-1].output[0] = "output"
+        write(path, self.nodes, [value("input", F, ["batch_size", 3, 1024, 1024])], [value("output", F, ["batch_size", outputs, side, side])], self.constants)
+
+
+class Decoder(Layers):
+    """SAM's mask decoder (Kirillov et al. 2023, appendix A) as PyTorch's exporter writes it, narrow."""
+
+    WIDTH, INNER, HEADS, SIDE = 16, 8, 8, 64
 
     def heads(self, x, width):
         split = self.op("Reshape", x, np.array([1, -1, self.HEADS, width // self.HEADS]))
@@ -436,10 +516,6 @@ class Decoder:
         weights = self.op("Softmax", self.op("Div", scores, np.float32((inner / self.HEADS) ** 0.5)), axis=-1)
         sums = self.op("Transpose", self.op("MatMul", weights, v), perm=[0, 2, 1, 3])
         return self.linear(self.op("Reshape", sums, np.array([1, -1, inner])), f"{name}.out_proj", inner, self.WIDTH)
-
-    def gelu(self, x):
-        erf = self.op("Erf", self.op("Div", x, np.float32(2**0.5)))
-        return self.op("Mul", self.op("Mul", x, self.op("Add", erf, np.float32(1))), np.float32(0.5))
 
     def mlp(self, x, name, outputs):
         for i in range(3):
@@ -478,17 +554,17 @@ class Decoder:
             name = f"mask_decoder.transformer.layers.{i}"
             asks = add(x, tokens) if i else x
             own = self.attention(f"{name}.self_attn", asks, asks, x, width)
-            x = self.norm(add(x, own) if i else own, f"{name}.norm1")
+            x = self.norm(add(x, own) if i else own, f"{name}.norm1", width)
             placed = add(pixels, places)
             x = add(x, self.attention(f"{name}.cross_attn_token_to_image", add(x, tokens), placed, pixels, inner))
-            x = self.norm(x, f"{name}.norm2")
+            x = self.norm(x, f"{name}.norm2", width)
             hidden = self.op("Relu", self.linear(x, f"{name}.mlp.lin1", width, 2 * width))
-            x = self.norm(add(x, self.linear(hidden, f"{name}.mlp.lin2", 2 * width, width)), f"{name}.norm3")
+            x = self.norm(add(x, self.linear(hidden, f"{name}.mlp.lin2", 2 * width, width)), f"{name}.norm3", width)
             taken = self.attention(f"{name}.cross_attn_image_to_token", placed, add(x, tokens), x, inner)
-            pixels = self.norm(add(pixels, taken), f"{name}.norm4")
+            pixels = self.norm(add(pixels, taken), f"{name}.norm4", width)
         name = "mask_decoder.transformer.final_attn_token_to_image"
         x = add(x, self.attention(name, add(x, tokens), add(pixels, places), pixels, inner))
-        x = self.norm(x, "mask_decoder.transformer.norm_final_attn")
+        x = self.norm(x, "mask_decoder.transformer.norm_final_attn", width)
 
         picture = self.op("Reshape", self.op("Transpose", pixels, perm=[0, 2, 1]), np.array([1, width, side, side]))
         picture = self.enlarge(picture, "mask_decoder.output_upscaling.0", width, 8)
@@ -532,16 +608,7 @@ def sam_tiny():
     folder = ROOT / "crates/stages/mask-embed/testdata/sam-tiny"
     decoder = Decoder()
     decoder.build(folder)
-    write(
-        folder / "encoder.onnx",
-        [
-            helper.make_node("AveragePool", ["input"], ["small"], kernel_shape=[16, 16], strides=[16, 16]),
-            helper.make_node("Conv", ["small", "spread"], ["output"], strides=[1, 1], dilations=[1, 1], kernel_shape=[1, 1]),
-        ],
-        [value("input", F, ["batch_size", 3, 1024, 1024])],
-        [value("output", F, ["batch_size", decoder.WIDTH, 64, 64])],
-        [constant("spread", decoder.random.normal(0, 1, (decoder.WIDTH, 3, 1, 1)).astype(np.float32))],
-    )
+    Encoder().build(folder / "encoder.onnx", decoder.WIDTH)
 
 
 # Weights of red, green and blue and a sum for the mask of each query, then logits of its classes: sky, grass, car, roof, none.

@@ -15,6 +15,9 @@ const GRAPH_OUTPUT: u64 = 12;
 const NODE_INPUT: u64 = 1;
 const NODE_OUTPUT: u64 = 2;
 const NODE_OP_TYPE: u64 = 4;
+const NODE_ATTRIBUTE: u64 = 5;
+/// AttributeProto.t, what a Constant makes.
+const ATTRIBUTE_TENSOR: u64 = 5;
 const VALUE_NAME: u64 = 1;
 const TENSOR_DIMS: u64 = 1;
 const TENSOR_TYPE: u64 = 2;
@@ -121,6 +124,15 @@ fn texts(bytes: &[u8], message: &Range<usize>, number: u64) -> Result<Vec<String
     fields(bytes, message.clone())?.into_iter().filter_map(text).collect()
 }
 
+/// Where the messages `number` of a message lie.
+fn messages(bytes: &[u8], message: &Range<usize>, number: u64) -> Result<Vec<Range<usize>>> {
+    let inner = |f: Field| match f.value {
+        Value::Bytes(r) if f.number == number => Some(r),
+        _ => None,
+    };
+    Ok(fields(bytes, message.clone())?.into_iter().filter_map(inner).collect())
+}
+
 fn graph_range(bytes: &[u8]) -> Result<(Range<usize>, Range<usize>)> {
     let model = fields(bytes, 0..bytes.len())?;
     let mut graphs = model.into_iter().filter(|f| f.number == MODEL_GRAPH);
@@ -160,6 +172,13 @@ impl Graph {
                     let op = of(NODE_OP_TYPE)?.pop().unwrap_or_default();
                     graph.nested |= ["If", "Loop", "Scan"].contains(&op.as_str());
                     let node = Node { op, inputs: of(NODE_INPUT)?, outputs: of(NODE_OUTPUT)? };
+                    if node.op == "Constant" {
+                        let arrays = messages(bytes, &inner, NODE_ATTRIBUTE)?
+                            .into_iter()
+                            .map(|a| messages(bytes, &a, ATTRIBUTE_TENSOR));
+                        let array = arrays.collect::<Result<Vec<_>>>()?.concat().pop();
+                        graph.initializers.extend(node.outputs.first().cloned().zip(array));
+                    }
                     for output in &node.outputs {
                         graph.producers.insert(output.clone(), node.clone());
                     }

@@ -17,6 +17,6 @@ mod tokenizer;
 pub use clip::{ClipConfig, ClipImage, ClipText};
 pub use crop::{Bounds, Crop, LabelMap, RgbImage, crop_mask, mask_bounds, resize_rgb};
 pub use engine::{EngineArgs, EngineOptions, Kind, Model, Outputs, ValueInfo, hash_model, open, parallel_map};
-pub use graph::Graph;
+pub use graph::{Graph, Node};
 pub use tensor::{Data, Tensor};
 pub use tokenizer::Tokenizer;

@@ -23,7 +23,7 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
 use std::sync::{Mutex, MutexGuard, PoisonError};
 
-/// Photographs that are worked on at a time, where there are as many threads: each takes 400 MB with MobileSAM.
+/// Photographs that are worked on at a time, where there are as many threads: each takes 280 MB with MobileSAM.
 const LANES: usize = 8;
 
 /// Facts of a view's id maps.

@@ -10,7 +10,7 @@
 //!
 //! The graph itself is the oracle: [`super::Sam`] compares the two when it opens a model.
 
-use super::planar::{biased_gelu, dot, head_scores, norm, softmax_rows, softmax_tokens};
+use super::planar::{biased_gelu, dot, head_scores, norm, norm_rows, softmax_rows, softmax_tokens};
 use super::weights::{self, File};
 use super::{Candidates, MASK_SIDE};
 use gs_io::{Error, Result};
@@ -30,18 +30,18 @@ pub(super) const FILLING: usize = 16;
 /// Pixels that are worked on together: all their channels fit the processor's own cache.
 const TILE: usize = 128;
 /// Added to variances, as in PyTorch's layer norm and in SAM's own for pictures.
-const EPSILON: f32 = 1e-5;
-const EPSILON_OF_PICTURES: f32 = 1e-6;
+pub(super) const EPSILON: f32 = 1e-5;
+pub(super) const EPSILON_OF_PICTURES: f32 = 1e-6;
 
 /// `x W + b`, rows times columns.
-struct Linear {
-    weight: PackedBMatrix<f32>,
-    bias: Vec<f32>,
+pub(super) struct Linear {
+    pub weight: PackedBMatrix<f32>,
+    pub bias: Vec<f32>,
 }
 
-struct Norm {
-    scale: Vec<f32>,
-    shift: Vec<f32>,
+pub(super) struct Norm {
+    pub scale: Vec<f32>,
+    pub shift: Vec<f32>,
 }
 
 /// An attention. Of one between tokens and pixels, the pixels' `k` or `q` holds its transposed matrix.
@@ -159,7 +159,7 @@ pub(super) struct Names {
     pub tokens: String,
 }
 
-fn matrix(values: &[f32], columns: usize) -> Matrix<'_> {
+pub(super) fn matrix(values: &[f32], columns: usize) -> Matrix<'_> {
     NdTensorView::from_data([values.len() / columns, columns], values)
 }
 
@@ -171,17 +171,18 @@ fn add(a: &[f32], b: &[f32]) -> Vec<f32> {
     a.iter().zip(b).map(|(a, b)| a + b).collect()
 }
 
+impl Linear {
+    /// Channels that it reads, and that it makes.
+    pub fn reads_and_makes(&self) -> [usize; 2] {
+        let weight = GemmInputB::Packed(&self.weight);
+        [weight.rows(), weight.cols()]
+    }
+}
+
 impl Norm {
     /// Of every row.
-    fn rows(&self, values: &mut [f32]) {
-        for row in values.chunks_exact_mut(self.scale.len()) {
-            let mean = row.iter().sum::<f32>() / row.len() as f32;
-            let variance = row.iter().map(|v| (v - mean) * (v - mean)).sum::<f32>() / row.len() as f32;
-            let inverse = 1.0 / (variance + EPSILON).sqrt();
-            for ((v, scale), shift) in row.iter_mut().zip(&self.scale).zip(&self.shift) {
-                *v = (*v - mean) * inverse * scale + shift;
-            }
-        }
+    pub fn rows(&self, values: &mut [f32], epsilon: f32) {
+        norm_rows(values, epsilon, &self.scale, &self.shift);
     }
 }
 
@@ -359,7 +360,7 @@ impl Decoder {
     }
 
     fn linear(&self, layer: &Linear, x: &[f32]) -> Vec<f32> {
-        let inputs = GemmInputB::Packed(&layer.weight).rows();
+        let [inputs, _] = layer.reads_and_makes();
         let mut out = self.times(matrix(x, inputs), &layer.weight);
         out.iter_mut().zip(layer.bias.iter().cycle()).for_each(|(o, b)| *o += b);
         out
@@ -448,9 +449,9 @@ impl Decoder {
     /// Tokens after they took `taken` from the pixels.
     fn finish_tokens(&self, layer: &Layer, x: &[f32], taken: &[f32]) -> Vec<f32> {
         let mut x = add(x, taken);
-        layer.norms[1].rows(&mut x);
+        layer.norms[1].rows(&mut x, EPSILON);
         let mut x = add(&x, &self.mlp(&layer.mlp, &x));
-        layer.norms[2].rows(&mut x);
+        layer.norms[2].rows(&mut x, EPSILON);
         x
     }
 
@@ -518,13 +519,13 @@ impl Decoder {
         let [first, second] = &self.layers;
         // The first layer has no places among the tokens, and nothing to add to.
         let mut x = self.attend_tokens(&first.own, tokens, tokens);
-        first.norms[0].rows(&mut x);
+        first.norms[0].rows(&mut x, EPSILON);
         let taken = self.attend_photograph(&first.to_pixels, &add(&x, tokens), photograph, desk);
         let x = self.finish_tokens(first, &x, &taken);
 
         let placed = add(&x, tokens);
         let mut y = add(&x, &self.attend_tokens(&second.own, &placed, &x));
-        second.norms[0].rows(&mut y);
+        second.norms[0].rows(&mut y, EPSILON);
         let queries = self.queries(&second.to_pixels, &add(&y, tokens));
         self.update_pixels(first, [&placed, &x], &queries, photograph, desk);
         let taken = self.attend_pixels(&second.to_pixels, photograph, desk);
@@ -540,7 +541,7 @@ impl Decoder {
         let queries = self.queries(&self.last, &rows(&placed));
         self.update_pixels(second, [&placed, &y], &queries, photograph, desk);
         let mut x = add(&rows(&y), &self.attend_pixels(&self.last, photograph, desk));
-        self.last_norm.rows(&mut x);
+        self.last_norm.rows(&mut x, EPSILON);
         let quality = self.mlp(&self.quality, &x[..channels]);
         let mut candidates = Candidates::default();
         let mut weights = Vec::new();

@@ -6,19 +6,22 @@
 //! declares the best mask only, but computes four: one for prompts of several points, and whole, part and subpart for a
 //! single one. The four are found in the graph before the choice among them and taken instead (`all_masks`); the
 //! enlargement to the photograph's size, which is most of the memory and much of the time, is then never computed.
-//! Where the decoder is built as SAM's, `decoder` takes the place of most of the graph.
+//! Where the decoder is built as SAM's, `decoder` takes the place of most of its graph; where the encoder is built as
+//! MobileSAM's, `encoder` takes the place of its.
 
 mod decoder;
+mod encoder;
 mod export;
 mod planar;
 mod weights;
 
 use crate::constants::FILE;
 use decoder::{Decoder, FILLING, Names, Photograph};
+use encoder::Encoder;
 use export::{Export, Fit, Prompt};
 use gs_io::{Error, IoContext, Result, hash_files};
 use onnx_models::{EngineOptions, Graph, Model, Outputs, RgbImage, Tensor, open, resize_rgb};
-use std::path::Path;
+use std::path::{Path, PathBuf};
 use weights::File;
 
 /// Side of the masks that the decoder makes and takes.
@@ -26,7 +29,8 @@ const MASK_SIDE: usize = 256;
 
 /// SAM's two models.
 pub struct Sam {
-    encoder: Box<dyn Model>,
+    encoding: Encoding,
+    encoder_path: PathBuf,
     decoding: Decoding,
     prompt: Prompt,
     side: usize,
@@ -35,6 +39,12 @@ pub struct Sam {
     mean: [f32; 3],
     std: [f32; 3],
     hash: String,
+}
+
+enum Encoding {
+    Graph(Box<dyn Model>),
+    /// The encoder is built as MobileSAM's.
+    Own(Box<Encoder>),
 }
 
 enum Decoding {
@@ -174,11 +184,22 @@ impl Sam {
             Some(parts) => Decoding::Parts(parts),
             None => Decoding::Graph(whole),
         };
+        let own = || {
+            let bytes = std::fs::read(&encoder_path).ok()?;
+            let graph = Graph::parse(&bytes).ok()?;
+            let known = prompt.only_embedding().is_some() && side == 4 * MASK_SIDE;
+            Encoder::read(&File { graph: &graph, bytes: &bytes }).filter(|_| known)
+        };
+        let encoding = match if plain { None } else { own() } {
+            Some(own) => Encoding::Own(Box::new(own)),
+            None => Encoding::Graph(encoder),
+        };
         let mut files = vec![("encoder.onnx", &encoder_path), ("sam.onnx", &decoder_path)];
         let description = folder.join(FILE);
         files.extend(description.exists().then_some((FILE, &description)));
         let [mean, std] = [export.mean, export.std].map(|c| c.map(|v| (v * 255.0) as f32));
-        Ok(Self { encoder, decoding, prompt, side, fit: export.fit, mean, std, hash: hash_files(files)? })
+        let hash = hash_files(files)?;
+        Ok(Self { encoding, encoder_path, decoding, prompt, side, fit: export.fit, mean, std, hash })
     }
 
     /// Content hash of both models and their description.
@@ -198,18 +219,25 @@ impl Sam {
             Fit::Stretch => [side; 2],
         };
         let small = resize_rgb(image, frame[0], frame[1]);
-        let mut pixels = vec![0f32; 3 * side * side];
-        for (i, p) in small.pixels.chunks_exact(3).enumerate() {
-            let at = i / frame[0] * side + i % frame[0];
-            for c in 0..3 {
-                pixels[c * side * side + at] = (f32::from(p[c]) - self.mean[c]) / self.std[c];
+        let normal = |c: usize, p: u8| (f32::from(p) - self.mean[c]) / self.std[c];
+        let values: Vec<Tensor> = match &self.encoding {
+            Encoding::Own(encoder) => {
+                let pixels: Vec<f32> = small.pixels.iter().enumerate().map(|(i, p)| normal(i % 3, *p)).collect();
+                vec![encoder.encode(&pixels, frame[0], side)]
             }
-        }
-        let name = self.encoder.inputs()[0].name.clone();
-        let out = self.encoder.run(&[(&name, Tensor::f32(&[1, 3, side, side], pixels))])?;
-        let values: Vec<Tensor> = self.prompt.outputs().map(|i| out[i].clone()).collect();
+            Encoding::Graph(encoder) => {
+                let mut pixels = vec![0f32; 3 * side * side];
+                for (i, p) in small.pixels.chunks_exact(3).enumerate() {
+                    let at = i / frame[0] * side + i % frame[0];
+                    (0..3).for_each(|c| pixels[c * side * side + at] = normal(c, p[c]));
+                }
+                let name = &encoder.inputs()[0].name;
+                let out = encoder.run(&[(name, Tensor::f32(&[1, 3, side, side], pixels))])?;
+                self.prompt.outputs().map(|i| out[i].clone()).collect()
+            }
+        };
         if values.iter().any(|t| t.as_f32().is_none_or(|v| v.iter().any(|v| !v.is_finite()))) {
-            return Err(Error::new("the encoder does not give finite numbers").file(self.encoder.path()));
+            return Err(Error::new("the encoder does not give finite numbers").file(&self.encoder_path));
         }
         let extent = frame.map(|n| n as f64 * MASK_SIDE as f64 / side as f64);
         let photograph = match &self.decoding {
@@ -304,7 +332,7 @@ fn ask_graph(graph: &dyn Model, inputs: &[(&str, Tensor)], least: f32) -> Result
 mod tests {
     use super::*;
 
-    fn tiny() -> std::path::PathBuf {
+    fn tiny() -> PathBuf {
         Path::new(env!("CARGO_MANIFEST_DIR")).join("testdata/sam-tiny")
     }
 
@@ -349,6 +377,45 @@ mod tests {
                 }
             }
         }
+    }
+
+    /// The embeddings of pictures by our encoder and by the graph of the models in a folder are the same.
+    fn compare_encoders(folder: &Path) {
+        let options = EngineOptions::default();
+        let [fast, plain] = [false, true].map(|plain| Sam::open(folder, &options, plain).unwrap());
+        assert!(matches!(fast.encoding, Encoding::Own(_)) && matches!(plain.encoding, Encoding::Graph(_)));
+        for picture in [picture(40, 40), picture(64, 36), picture(30, 60)] {
+            let one = rayon::ThreadPoolBuilder::new().num_threads(1).build().unwrap();
+            let [got, want] = [&fast, &plain].map(|sam| sam.encode(&picture).unwrap().values.remove(0));
+            assert_eq!(got, one.install(|| fast.encode(&picture).unwrap().values.remove(0)));
+            assert_eq!(got.shape, want.shape);
+            let pairs = got.as_f32().unwrap().iter().zip(want.as_f32().unwrap());
+            pairs.for_each(|(a, b)| assert!((a - b).abs() < 1e-4 * (1.0 + b.abs()), "{a} {b}"));
+        }
+    }
+
+    #[test]
+    fn the_encoder_gives_the_embedding_of_its_graph() {
+        compare_encoders(&tiny());
+    }
+
+    #[test]
+    #[ignore = "needs MobileSAM in models/: make models"]
+    fn mobile_sams_encoder_gives_the_embedding_of_its_graph() {
+        compare_encoders(&Path::new(env!("CARGO_MANIFEST_DIR")).join("../../../models"));
+    }
+
+    #[test]
+    fn an_encoder_that_only_looks_like_mobile_sams_is_run_as_its_graph() {
+        let folder = tempfile::tempdir().unwrap();
+        std::fs::copy(tiny().join("sam.onnx"), folder.path().join("sam.onnx")).unwrap();
+        let mut bytes = std::fs::read(tiny().join("encoder.onnx")).unwrap();
+        let at = bytes.windows(3).position(|w| w == b"Erf").unwrap();
+        bytes[at..at + 3].copy_from_slice(b"Sin");
+        std::fs::write(folder.path().join("encoder.onnx"), bytes).unwrap();
+        let sam = Sam::open(folder.path(), &EngineOptions::default(), false).unwrap();
+        assert!(matches!(sam.encoding, Encoding::Graph(_)));
+        assert_eq!(sam.encode(&picture(60, 40)).unwrap().values[0].shape, [1, 16, 64, 64]);
     }
 
     #[test]

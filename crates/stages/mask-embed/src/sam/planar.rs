@@ -135,6 +135,63 @@ pub(super) fn softmax_tokens(scores: &mut [f32], pixels: usize, shift: &[f32]) {
     }
 }
 
+/// A row of a 3 x 3 convolution of each channel by itself. `rows` are those above, at and below it, `[pixels + 2][channels]`; it has
+/// every `step`-th pixel. `weights` `[3][3][channels]`.
+#[multiversion(targets("x86_64+avx512f+avx512vl", "x86_64+avx2"))]
+pub(super) fn depthwise(rows: [&[f32]; 3], step: usize, weights: &[f32], bias: &[f32], out: &mut [f32]) {
+    const LANES: usize = 32;
+    let channels = bias.len();
+    for (u, out) in out.chunks_exact_mut(channels).enumerate() {
+        let around = rows.map(|row| &row[u * step * channels..][..3 * channels]);
+        for (i, out) in out.chunks_mut(LANES).enumerate() {
+            let from = i * LANES;
+            let mut sums = [0.0f32; LANES];
+            if let Ok(out) = <&mut [f32; LANES]>::try_from(&mut *out) {
+                sums.copy_from_slice(&bias[from..][..LANES]);
+                for (y, row) in around.iter().enumerate() {
+                    for x in 0..3 {
+                        let pixel: &[f32; LANES] =
+                            row[x * channels + from..].first_chunk().expect("a block of channels");
+                        let weights =
+                            weights[(3 * y + x) * channels + from..].first_chunk::<LANES>().expect("as many weights");
+                        for l in 0..LANES {
+                            sums[l] += pixel[l] * weights[l];
+                        }
+                    }
+                }
+                *out = sums;
+            } else {
+                for (c, out) in (from..).zip(out) {
+                    let place = |i: usize| around[i / 3][i % 3 * channels + c] * weights[i * channels + c];
+                    *out = bias[c] + (0..9).map(place).sum::<f32>();
+                }
+            }
+        }
+    }
+}
+
+/// Layer norm of every row, over its values.
+#[multiversion(targets("x86_64+avx512f+avx512vl", "x86_64+avx2"))]
+pub(super) fn norm_rows(values: &mut [f32], epsilon: f32, scale: &[f32], shift: &[f32]) {
+    const LANES: usize = 32;
+    let share = 1.0 / scale.len() as f32;
+    for row in values.chunks_exact_mut(scale.len()) {
+        let mut sums = [0.0f32; LANES];
+        for block in row.chunks(LANES) {
+            block.iter().zip(&mut sums).for_each(|(v, sum)| *sum += v);
+        }
+        let mean = sums.iter().sum::<f32>() * share;
+        sums.fill(0.0);
+        for block in row.chunks(LANES) {
+            block.iter().zip(&mut sums).for_each(|(v, sum)| *sum += (v - mean) * (v - mean));
+        }
+        let inverse = 1.0 / (sums.iter().sum::<f32>() * share + epsilon).sqrt();
+        for ((v, scale), shift) in row.iter_mut().zip(scale).zip(shift) {
+            *v = (*v - mean) * inverse * scale + shift;
+        }
+    }
+}
+
 /// Layer norm over the channels of every pixel, after a bias per channel: `(x - mean) / deviation * scale + shift`.
 #[multiversion(targets("x86_64+avx512f+avx512vl", "x86_64+avx2"))]
 pub(super) fn norm(values: &mut [f32], pixels: usize, epsilon: f32, bias: &[f32], scale: &[f32], shift: &[f32]) {

@@ -1,9 +1,9 @@
-//! The weights of SAM's mask decoder, found in its ONNX file.
+//! The weights of SAM's encoder and mask decoder, found in their ONNX files.
 //!
 //! Exporters keep PyTorch's names for biases and norms. They rename the matrices of linear layers, which are found
 //! through the operators that use them.
 
-use onnx_models::Graph;
+use onnx_models::{Graph, Node};
 
 /// A matrix `[rows][columns]` of a file.
 pub(super) struct Matrix {
@@ -30,7 +30,7 @@ pub(super) struct Layer {
     pub makes: String,
 }
 
-/// The file of a decoder.
+/// The file of an encoder or a decoder.
 pub(super) struct File<'a> {
     pub graph: &'a Graph,
     pub bytes: &'a [u8],
@@ -79,17 +79,51 @@ impl File<'_> {
         })
     }
 
+    /// Shape, weights and bias of the convolution whose path in PyTorch ends with `end`; zeros where it has no bias.
+    pub fn convolution(&self, end: &str) -> Option<(Vec<usize>, Vec<f32>, Vec<f32>)> {
+        let node = self.made(&format!("{end}/Conv_output_0")).filter(|n| n.op == "Conv")?;
+        let (shape, weights) = self.graph.weights(self.bytes, node.inputs.get(1)?)?;
+        let bias = match node.inputs.get(2) {
+            Some(name) => self.graph.weights(self.bytes, name)?.1,
+            None => vec![0.0; *shape.first()?],
+        };
+        (bias.len() == *shape.first()? && shape.iter().all(|n| *n > 0)).then_some((shape, weights, bias))
+    }
+
+    /// The operator that makes a value whose name ends with `end`.
+    fn made(&self, end: &str) -> Option<&Node> {
+        self.graph.producers.iter().find(|(name, _)| name.ends_with(end)).map(|(_, node)| node)
+    }
+
+    /// Shape and values of the constant array that an operator reads which makes a value whose name ends with `end`.
+    pub fn added_to(&self, end: &str) -> Option<(Vec<usize>, Vec<f32>)> {
+        self.array_of(&self.made(end)?.inputs)
+    }
+
+    /// The constant array, of more than one value, among so many values.
+    fn array_of(&self, names: &[String]) -> Option<(Vec<usize>, Vec<f32>)> {
+        names.iter().filter_map(|name| self.graph.weights(self.bytes, name)).find(|(_, values)| values.len() > 1)
+    }
+
     /// Scale and shift that were last applied to what the operator with the weights `end` reads: `x * scale + shift`.
     pub fn scale_and_shift_before(&self, end: &str) -> Option<[Vec<f32>; 2]> {
-        let constant = |inputs: &[String]| inputs.iter().find_map(|i| self.graph.weights(self.bytes, i));
-        let mut name = self.graph.consumer(self.name(end)?)?.inputs.first()?;
+        self.scale_and_shift(self.graph.consumer(self.name(end)?)?.inputs.first()?)
+    }
+
+    /// Those that were last applied to the graph's only output.
+    pub fn last_scale_and_shift(&self) -> Option<[Vec<f32>; 2]> {
+        let [output] = &self.graph.outputs[..] else { return None };
+        self.scale_and_shift(output)
+    }
+
+    fn scale_and_shift<'a>(&'a self, mut name: &'a str) -> Option<[Vec<f32>; 2]> {
         for _ in 0..16 {
             let node = self.graph.producer(name)?;
             if node.op == "Add"
-                && let Some((_, shift)) = constant(&node.inputs)
+                && let Some((_, shift)) = self.array_of(&node.inputs)
             {
                 let scaled = node.inputs.iter().find_map(|i| self.graph.producer(i)).filter(|n| n.op == "Mul")?;
-                return Some([constant(&scaled.inputs)?.1, shift]);
+                return Some([self.array_of(&scaled.inputs)?.1, shift]);
             }
             name = node.inputs.first()?;
         }
