@@ -4,8 +4,7 @@
 //!   `convert`: the other commands
 //! * `training`: the loop, and in its folder the loss, the optimiser, the schedule, exposures and checkpoints
 //! * `densification`: how the number of Gaussians changes
-//! * `photographs`: the photographs and their masks; `start`: the Gaussians before the first iteration; `corners`: what the
-//!   photographs tell of points and poses
+//! * `photographs`: the photographs and their masks; `start`: the Gaussians before the first iteration
 //! * `views`: a dataset of renders from Gaussians alone
 //! * `budget`: a plan for a given time; `memory`: forecasts; `metrics`: PSNR and SSIM
 
@@ -13,7 +12,6 @@ mod axes;
 mod bounds;
 mod budget;
 mod convert;
-mod corners;
 mod densification;
 mod eval;
 mod inspect;

@@ -1,6 +1,5 @@
 //! PSNR and SSIM of renders against photographs.
 
-use crate::corners::solve;
 use crate::photographs::masks::{Alpha, Masks, multiply};
 use crate::photographs::{Target, exact_target};
 use crate::training::loss::{Derivatives, Pair, ssim};
@@ -8,6 +7,7 @@ use gs_io::Result;
 use gs_raster::{RasterOptions, render};
 use gs_scene::Gaussians;
 use gs_scene::dataset::{Split, View};
+use gs_sfm::solve;
 use serde::Serialize;
 
 /// PSNR of equal pictures, dB: the mean squared error counts as at least 1e-10.

@@ -11,6 +11,7 @@ use gs_raster::RasterOptions;
 use gs_scene::dataset::{self, Dataset, HOLDOUT, LoadOptions, Resolution};
 use gs_scene::splat::System;
 use gs_scene::{Gaussians, Geometry, HoldOut, say_shift};
+use gs_sfm::Refine;
 use serde::{Serialize, Serializer};
 use serde_json::Value;
 use stage::{Bytes, CommonArgs, Stage, within};
@@ -141,7 +142,7 @@ pub(crate) struct Train {
     /// photographs differ in. Held-out views are brought to the scene before they are measured. OUT.cameras.json holds the
     /// refined cameras; later stages take it as their --scene. auto: where other poses fit the corners much better than those given
     #[arg(long, value_name = "off|on|auto", value_enum, num_args = 0..=1, default_value = "off", default_missing_value = "on")]
-    pub refine_poses: Choice,
+    pub refine_poses: Refine,
     /// Picture sizes in the course of the run; with --preset 3dgs the default is full
     #[arg(long, value_enum, default_value = "coarse", default_value_if("preset", "3dgs", "full"))]
     pub schedule: PictureSizes,
@@ -154,24 +155,6 @@ pub(crate) struct Train {
     #[arg(long, value_name = "COUNT|SECONDS", default_value = "20s")]
     #[serde(skip)]
     pub checkpoint_every: Every,
-}
-
-/// Whether something is done. In records `off` and `on` are false and true.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
-pub(crate) enum Choice {
-    Off,
-    On,
-    /// Where the photographs show that it pays; never for COLMAP's poses with points, which come from the photographs
-    Auto,
-}
-
-impl Serialize for Choice {
-    fn serialize<S: Serializer>(&self, serializer: S) -> std::result::Result<S::Ok, S::Error> {
-        match self {
-            Self::Auto => serializer.serialize_str("auto"),
-            own => serializer.serialize_bool(*own == Self::On),
-        }
-    }
 }
 
 /// A set of defaults.

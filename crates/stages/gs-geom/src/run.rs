@@ -8,7 +8,7 @@ pub(crate) mod outputs;
 
 use crate::budget;
 use crate::densification::Way;
-use crate::options::{Args, Background, Choice, Command, PictureSizes, Preset, Train};
+use crate::options::{Args, Background, Command, PictureSizes, Preset, Train};
 use crate::photographs::masks::{Alpha, Masks};
 use crate::photographs::{Photographs, full_share};
 use crate::training::poses::PoseRates;
@@ -19,6 +19,7 @@ use forecast::{cache_bytes, forecast_start, most_gaussians};
 use gs_io::{Claim, Provenance, Result, hash_bytes, hash_file};
 use gs_scene::dataset::{Dataset, HOLDOUT, Split, View};
 use gs_scene::{Camera, HoldOut, Learnt, splat};
+use gs_sfm::Refine;
 use serde_json::{Value, json};
 use stage::{CommonArgs, Program, Stage};
 use std::collections::BTreeMap;
@@ -138,7 +139,7 @@ impl Train {
             alpha,
             antialias: self.antialias,
             exposure: self.exposure,
-            poses: (self.refine_poses != Choice::Off).then(PoseRates::default),
+            poses: (self.refine_poses != Refine::Off).then(PoseRates::default),
             ..recipe
         }
     }

@@ -2,13 +2,13 @@
 //! says.
 
 pub mod depths;
-pub mod sweep;
 
 use crate::training::optimiser::zeros;
 use crate::training::schedule::{Purpose, generator};
 use glam::{DMat3, DVec3};
 use gs_io::{Error, Result};
 use gs_scene::{Camera, Gaussians, PointCloud, SH_C0, logit};
+use gs_sfm::sweep::Swept;
 use kiddo::{ImmutableKdTree, SquaredEuclidean};
 use rand::Rng;
 use rand::seq::index::sample;
@@ -17,6 +17,8 @@ use std::num::NonZero;
 
 /// Opacity of a new Gaussian.
 const START_OPACITY: f32 = 0.1;
+/// That of a pixel of a depth map: more, because these are fewer for what they cover.
+const SWEPT_OPACITY: f32 = 0.2;
 /// Neighbours whose distances set a new Gaussian's size.
 const NEIGHBOURS: usize = 3;
 /// Smallest size of a new Gaussian, as a share of the scene's extent: points may coincide.
@@ -62,6 +64,16 @@ pub fn from_points(points: &PointCloud, sh_degree: u8, extent: f64) -> Result<Ga
             g.sh[i * stride + c] = (f32::from(points.colors[i][c]) / 255.0 - 0.5) / SH_C0;
         }
     }
+    Ok(g)
+}
+
+/// One Gaussian for each point of a plane sweep.
+pub fn from_sweep(swept: &Swept, sh_degree: u8, extent: f64) -> Result<Gaussians> {
+    let mut g = from_points(&swept.points, sh_degree, extent)?;
+    for (scales, most) in g.log_scales.iter_mut().zip(&swept.most_sizes) {
+        *scales = scales.map(|s| s.min(most.ln() as f32));
+    }
+    g.opacity_logits[swept.corners..].fill(logit(SWEPT_OPACITY));
     Ok(g)
 }
 

@@ -9,7 +9,6 @@ pub mod schedule;
 #[cfg(test)]
 mod tests;
 
-use crate::corners::lenses;
 use crate::densification::rules::{Growth, Moment};
 use crate::densification::{Strategy, Way};
 use crate::metrics::{self, Means};
@@ -19,6 +18,7 @@ use checkpoint::State;
 use gs_io::Result;
 use gs_raster::{PixelGradients, RasterOptions, Workspace, camera_gradient, near_plane};
 use gs_scene::{Camera, morton_order};
+use gs_sfm::corners::lenses;
 use loss::{Derivatives, Loss, Pair, l1_dssim};
 use optimiser::drop_bad_gradients;
 use poses::{Moment as PoseMoment, PoseRates};

@@ -4,13 +4,14 @@ use super::outputs::{CAMERAS, CURVE, EXPOSURES, PARTIAL, PLOT, check_finite, pla
 use crate::densification::{Strategy, drawable};
 use crate::memory::Forecast;
 use crate::metrics::Means;
-use crate::options::{Choice, Train, note_shift};
+use crate::options::{Train, note_shift};
 use crate::training::checkpoint::{self, ProgressState, State};
-use crate::training::poses::turned_from;
 use crate::training::{Timings, Trainer};
 use gs_io::{Claim, IoContext, Provenance, Result, with_suffix, write_bytes, write_json};
 use gs_scene::dataset::{Dataset, Split, View, refined};
 use gs_scene::{Camera, Gaussians, ply};
+use gs_sfm::Refine;
+use gs_sfm::turn::turned_from;
 use report::curve::Panel;
 use serde_json::{Value, json};
 use stage::Stage;
@@ -127,7 +128,7 @@ fn write_cameras(options: &Train, dataset: &Dataset, trainer: &mut Trainer<'_>, 
         // Those that an earlier run wrote, and this one chose not to, would be taken for this run's.
         let path = with_suffix(&options.out, CAMERAS);
         return match options.refine_poses {
-            Choice::Auto if path.exists() => std::fs::remove_file(&path).at("remove", &path),
+            Refine::Auto if path.exists() => std::fs::remove_file(&path).at("remove", &path),
             _ => Ok(()),
         };
     }

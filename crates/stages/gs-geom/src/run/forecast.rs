@@ -1,7 +1,6 @@
 //! How much memory a training will take, from its photographs and the Gaussians it starts from.
 
 use super::init;
-use crate::corners;
 use crate::densification::Strategy;
 use crate::densification::rules::Growth;
 use crate::memory::{self, Forecast};
@@ -12,6 +11,7 @@ use gs_io::Result;
 use gs_raster::{RasterOptions, TILE, forward};
 use gs_scene::Gaussians;
 use gs_scene::dataset::{Dataset, Split, View};
+use gs_sfm::corners;
 use stage::{Bytes, Stage};
 
 /// Pixels of the training photographs for each Gaussian, by default (docs/geometry.md).

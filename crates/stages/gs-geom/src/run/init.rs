@@ -1,14 +1,16 @@
 //! What a run learns from, and the Gaussians that `--init` says to start from.
 
 use super::forecast::most_gaussians;
-use crate::corners::{self, Found};
 use crate::densification::Strategy;
-use crate::options::{Choice, Init, Train, check_some};
+use crate::options::{Init, Train, check_some};
 use crate::start;
 use crate::training::poses::Poses;
+use crate::training::schedule::{Purpose, drawn, generator};
 use gs_io::{Error, Result};
 use gs_scene::dataset::{Dataset, Format, Split, View};
 use gs_scene::{Camera, Gaussians, PointCloud, ply, splat};
+use gs_sfm::corners::{self, Found};
+use gs_sfm::{Refine, sweep};
 use stage::Stage;
 use std::path::Path;
 
@@ -37,16 +39,16 @@ pub(crate) fn has_depths(options: &Train, dataset: &Dataset) -> bool {
 }
 
 /// Whether the photographs are asked for other poses. Those of COLMAP that come with points were found so already.
-fn refine(options: &Train, dataset: &Dataset) -> Choice {
+fn refine(options: &Train, dataset: &Dataset) -> Refine {
     match options.refine_poses {
-        Choice::Auto if dataset.format == Format::Colmap && !dataset.points.is_empty() => Choice::Off,
+        Refine::Auto if dataset.format == Format::Colmap && !dataset.points.is_empty() => Refine::Off,
         choice => choice,
     }
 }
 
 /// Whether corners of the photographs are found before there are Gaussians.
 pub(crate) fn needs_corners(options: &Train, dataset: &Dataset) -> bool {
-    refine(options, dataset) != Choice::Off || is_bare(options, dataset) && !has_depths(options, dataset)
+    refine(options, dataset) != Refine::Off || is_bare(options, dataset) && !has_depths(options, dataset)
 }
 
 /// The Gaussians before the first iteration, and the cameras where these are refined. `cameras` are those of the views to learn from.
@@ -68,8 +70,8 @@ pub(crate) fn start(
     if refine != options.refine_poses {
         stage.info("--refine-poses auto: COLMAP found the poses in the photographs: they stay as they are given");
     }
-    if refine != Choice::Off || sweeps {
-        found = corners::find(&views, refine, sweeps.then_some(start::sweep::small), stage)?;
+    if refine != Refine::Off || sweeps {
+        found = corners::find(&views, refine, sweeps.then_some(sweep::small), stage)?;
     }
     let refined = found.refined.then(|| Poses::new(&found.cameras, &given, &corners::lenses(&given)));
     let refined = refined.unwrap_or_default();
@@ -82,17 +84,19 @@ pub(crate) fn start(
         let images = views.iter().filter(|(v, _)| v.depth_path().is_some()).count();
         say(format!("{} of {images} depth images", points.len()));
         from_points(options, &points, extent, stage)
-    } else if sweeps && corners.len() >= start::sweep::FEWEST_CORNERS {
+    } else if sweeps && corners.len() >= sweep::FEWEST_CORNERS {
         // Half are left to grow.
         let most = most_gaussians(options, dataset);
         if options.max_gaussians.is_some() {
             corners = start::some_points(&corners, most.div_ceil(2), stage.seed());
         }
         let known = corners.len();
-        let swept = start::sweep::points(found.pictures, learnt, corners, options.init_points.min(most / 2), stage)?;
+        let (most, rng) = (options.init_points.min(most / 2), &mut generator(stage.seed(), Purpose::Start, 2));
+        let draw = |weights: &[f64]| drawn(weights.iter().copied(), most, rng);
+        let swept = sweep::points(found.pictures, learnt, corners, draw, stage)?;
         let pixels = swept.points.len() - known;
         say(format!("{known} of corners and {pixels} of depths by plane sweep"));
-        swept.gaussians(options.sh_degree, extent)
+        start::from_sweep(&swept, options.sh_degree, extent)
     } else {
         if bare {
             let found = corners.len();

@@ -1,11 +1,12 @@
 //! The files that a training reads and writes.
 
 use super::init::has_depths;
-use crate::options::{Choice, Train};
+use crate::options::Train;
 use crate::photographs::masks::Masks;
 use crate::training::checkpoint::{self, State};
 use gs_io::{Claim, Error, Result, Watched, with_suffix};
 use gs_scene::dataset::{Dataset, View};
+use gs_sfm::Refine;
 use stage::Stage;
 use std::path::{Path, PathBuf};
 
@@ -26,7 +27,7 @@ pub(crate) fn plan_path(output: &Path) -> PathBuf {
 pub(super) fn claim(options: &Train, dataset: &Dataset, masks: &Masks, stage: &Stage) -> Result<Claim> {
     let out = &options.out;
     let exposures = Some(EXPOSURES).filter(|_| options.exposure);
-    let cameras = Some(CAMERAS).filter(|_| options.refine_poses != Choice::Off);
+    let cameras = Some(CAMERAS).filter(|_| options.refine_poses != Refine::Off);
     let beside =
         [CURVE, PLOT, PARTIAL].into_iter().chain(exposures).chain(cameras).map(|suffix| with_suffix(out, suffix));
     let outputs = stage.outputs(out).file(out).files(beside).file(plan_path(out));

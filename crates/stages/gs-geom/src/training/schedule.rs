@@ -204,6 +204,17 @@ mod tests {
     use super::*;
 
     #[test]
+    fn what_weighs_more_is_drawn_more_often() {
+        let weights = [vec![1.0, 0.0], vec![3.0; 1000], vec![1.0; 1000]].concat();
+        let draw = |weights: &[f64]| drawn(weights.iter().copied(), 500, &mut generator(1, Purpose::Start, 0));
+        let places = draw(&weights);
+        assert!(places.len() == 500 && !places.contains(&1));
+        let heavy = places.iter().filter(|i| (2..1002).contains(*i)).count() as f64 / places.len() as f64;
+        assert!((0.70..0.80).contains(&heavy), "{heavy}");
+        assert!(draw(&[0.0; 9]).is_empty() && draw(&[]).is_empty());
+    }
+
+    #[test]
     fn the_full_schedule_is_that_of_3dgs() {
         let s = Schedule::for_iterations(30_000);
         let base = LearningRates::default();

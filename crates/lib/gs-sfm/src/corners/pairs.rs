@@ -132,7 +132,7 @@ impl Between {
             }
             // As one match that wants each angle to stay within 0.05.
             (0..5).for_each(|k| h[k][k] += (width / 0.05).powi(2));
-            let Some(step) = super::solve::<5>(h, g.map(|v| -v)) else { return pose };
+            let Some(step) = crate::solve::<5>(h, g.map(|v| -v)) else { return pose };
             pose = pose.moved(&step);
         }
         pose

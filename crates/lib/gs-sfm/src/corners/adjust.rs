@@ -3,8 +3,8 @@
 
 use super::pairs::EXACT;
 use super::tracks::{Point, error, limit};
-use super::{median, solve};
-use crate::training::poses::{moved, turned_from};
+use crate::turn::{moved, turned_from};
+use crate::{median, solve};
 use glam::{DMat3, DVec3};
 use gs_scene::Camera;
 

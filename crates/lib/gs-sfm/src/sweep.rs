@@ -3,17 +3,15 @@
 //! than nothing: where nothing starts, nothing grows. What no view agrees with is worse than nothing, and so is what lies between.
 //! More pixels become points where the picture has more to show.
 
-use super::from_points;
-use crate::training::schedule::{Purpose, drawn, generator};
 use glam::{DMat3, DVec3, Vec3};
 use gs_io::Result;
-use gs_scene::{Camera, Gaussians, Image, PointCloud, logit, size_within};
+use gs_scene::{Camera, Image, PointCloud, size_within};
 use multiversion::multiversion;
 use rayon::prelude::*;
 use stage::Stage;
 
 /// Fewest corners that tell how far away things are.
-pub(crate) const FEWEST_CORNERS: usize = 20;
+pub const FEWEST_CORNERS: usize = 20;
 /// Longer side of the small pictures.
 const LONGEST: u32 = 160;
 /// Depths that are tried, evenly spaced in 1 / depth.
@@ -40,27 +38,14 @@ const PLAIN: f32 = 0.02;
 const MOST_SIZE: f64 = 0.15;
 /// Share of its depth that a pixel's place is at least away from all cameras: somebody stood there, so it is free.
 const FREE: f64 = 0.2;
-/// Opacity of a Gaussian of a pixel: more than that of a corner, because these are fewer for what they cover.
-const OPACITY: f32 = 0.2;
-
 /// Points to start from: the corners, and after them the pixels that were drawn.
-pub(crate) struct Swept {
+pub struct Swept {
+    /// World units, with their colours.
     pub points: PointCloud,
-    corners: usize,
+    /// How many are corners.
+    pub corners: usize,
     /// Largest size of the Gaussian of each.
-    most_sizes: Vec<f64>,
-}
-
-impl Swept {
-    /// A Gaussian for each point.
-    pub(crate) fn gaussians(&self, sh_degree: u8, extent: f64) -> Result<Gaussians> {
-        let mut g = from_points(&self.points, sh_degree, extent)?;
-        for (scales, most) in g.log_scales.iter_mut().zip(&self.most_sizes) {
-            *scales = scales.map(|s| s.min(most.ln() as f32));
-        }
-        g.opacity_logits[self.corners..].fill(logit(OPACITY));
-        Ok(g)
-    }
+    pub most_sizes: Vec<f64>,
 }
 
 /// A small picture with what is tried on it.
@@ -114,17 +99,21 @@ impl Small {
 
 /// The small picture of a photograph. A little blurred, by an odd size between: what is sharp matches only at the right fraction of a
 /// pixel.
-pub(crate) fn small(photograph: &Image, camera: &Camera) -> Image {
+pub fn small(photograph: &Image, camera: &Camera) -> Image {
     let (w, h) = size_within((camera.width, camera.height), LONGEST);
     photograph.resize_area(w + w / 2, h + h / 2).resize_area(w, h)
 }
 
-/// The corners, which say how far away things are, and at most `most` points of what several pictures show, each [`small`].
-pub(crate) fn points(
+/// The corners, which say how far away things are, and points of what several pictures show, each [`small`]. `draw` takes places of
+/// a list of weights, in proportion to them; each place counts once.
+///
+/// # Errors
+/// When the run is interrupted.
+pub fn points(
     pictures: Vec<Image>,
     cameras: &[Camera],
     corners: PointCloud,
-    most: usize,
+    draw: impl FnOnce(&[f64]) -> Vec<usize>,
     stage: &Stage,
 ) -> Result<Swept> {
     let cameras: Vec<Camera> = cameras.iter().zip(&pictures).map(|(c, p)| c.resized(p.width, p.height)).collect();
@@ -170,8 +159,11 @@ pub(crate) fn points(
         points: corners,
         most_sizes: known.iter().map(|&place| MOST_SIZE * nearest(place)).collect(),
     };
-    let weights = worth.iter().map(|&(_, _, weight)| f64::from(weight));
-    for (view, pixel) in chosen(weights, most, stage.seed()).into_iter().map(|i| (worth[i].0, worth[i].1 as usize)) {
+    let weights: Vec<f64> = worth.iter().map(|&(_, _, weight)| f64::from(weight)).collect();
+    let mut chosen = draw(&weights);
+    chosen.sort_unstable();
+    chosen.dedup();
+    for (view, pixel) in chosen.into_iter().map(|i| (worth[i].0, worth[i].1 as usize)) {
         let (small, plane) = (&pictures[view], f64::from(maps[view][pixel]));
         let (place, depth) = (small.place(pixel, plane), 1.0 / small.inverse(plane));
         if cameras.iter().any(|c| c.position().distance(place) < FREE * depth) {
@@ -387,14 +379,6 @@ fn weights(own: usize, all: &[Small], maps: &[Vec<f32>]) -> Vec<f32> {
     maps[own].iter().enumerate().map(weight).collect()
 }
 
-/// At most `most` places of a list of weights, drawn in proportion to them, each once, in order.
-fn chosen(weights: impl Iterator<Item = f64>, most: usize, seed: u64) -> Vec<usize> {
-    let mut all = drawn(weights, most, &mut generator(seed, Purpose::Start, 2));
-    all.sort_unstable();
-    all.dedup();
-    all
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -431,17 +415,6 @@ mod tests {
         let known: Vec<usize> = (0..weights.len()).filter(|&i| weights[i] > 0.0).collect();
         let near = known.iter().filter(|&&i| (all[1].place(i, f64::from(maps[1][i])).z - 4.0).abs() < 0.1).count();
         assert!(known.len() > 2000 && near * 20 > known.len() * 18, "{near} of {}", known.len());
-    }
-
-    #[test]
-    fn what_weighs_more_is_drawn_more_often() {
-        let weights = [vec![1.0, 0.0], vec![3.0; 1000], vec![1.0; 1000]].concat();
-        let places = chosen(weights.into_iter(), 500, 1);
-        assert!(places.len() <= 500 && places.is_sorted() && places.windows(2).all(|w| w[0] != w[1]));
-        assert!(!places.contains(&1));
-        let heavy = places.iter().filter(|i| (2..1002).contains(*i)).count() as f64 / places.len() as f64;
-        assert!((0.68..0.78).contains(&heavy), "{heavy}");
-        assert!(chosen([0.0; 9].into_iter(), 5, 1).is_empty() && chosen([].into_iter(), 5, 1).is_empty());
     }
 
     /// [`costs`], plainly.

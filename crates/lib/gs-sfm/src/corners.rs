@@ -15,7 +15,7 @@ mod pairs;
 mod tests;
 mod tracks;
 
-use crate::options::Choice;
+use crate::{Refine, median};
 use adjust::{Bundle, Slack};
 use detect::{Corners, LONGEST, detect};
 use glam::{DVec2, DVec3};
@@ -46,7 +46,7 @@ type Shrink = fn(&Image, &Camera) -> Image;
 
 /// What the photographs tell.
 #[derive(Default)]
-pub(crate) struct Found {
+pub struct Found {
     /// Of all views.
     pub cameras: Vec<Camera>,
     /// Whether these are others than those given.
@@ -67,7 +67,7 @@ struct Sights<'a> {
 /// Places the corners that training views share, with the cameras as they are given, or, where `refine` says so, with cameras that
 /// fit the corners: first those of the training views, with their focal lengths, then those of the others on the points found. `small`
 /// asks for small pictures, too.
-pub(crate) fn find(views: &[&View], refine: Choice, small: Option<Shrink>, stage: &Stage) -> Result<Found> {
+pub fn find(views: &[&View], refine: Refine, small: Option<Shrink>, stage: &Stage) -> Result<Found> {
     let given: Vec<Camera> = views.iter().map(|v| v.camera.clone()).collect();
     let learns: Vec<bool> = views.iter().map(|v| v.split == Split::Train).collect();
     let mut sights = Sights { views, corners: vec![Corners::default(); views.len()], tracks: Vec::new() };
@@ -77,7 +77,7 @@ pub(crate) fn find(views: &[&View], refine: Choice, small: Option<Shrink>, stage
         let (points, _) = sights.placed(&given, &learns, (SPREAD * spread).clamp(1.0, SLACKEST));
         Found { points: sights.cloud(&points), cameras: given.clone(), pictures, refined: false }
     };
-    if refine == Choice::Off {
+    if refine == Refine::Off {
         let found = as_given(&sights, pictures);
         stage.info(&format!(
             "{} points from corners, which the poses miss by {} in the median",
@@ -91,7 +91,7 @@ pub(crate) fn find(views: &[&View], refine: Choice, small: Option<Shrink>, stage
     }
     let (mut cameras, expected) = sights.fitted(&given, &learns, stage)?;
     let (points, after) = sights.placed(&cameras, &learns, 1.0);
-    if refine == Choice::Auto {
+    if refine == Refine::Auto {
         let (pays, said) = sights.pays(&given, &cameras, &learns);
         stage.info(&format!("--refine-poses auto: {said}"));
         if !pays {
@@ -126,7 +126,7 @@ pub(crate) fn find(views: &[&View], refine: Choice, small: Option<Shrink>, stage
 }
 
 /// Bytes that [`find`] takes at once on so many threads, besides decoded photographs.
-pub(crate) fn bytes(views: &[&View], threads: u64) -> Result<u64> {
+pub fn bytes(views: &[&View], threads: u64) -> Result<u64> {
     let of = |v: &&View| image_size(&v.image_path).map(detect::bytes);
     Ok(threads * views.iter().map(of).collect::<Result<Vec<u64>>>()?.into_iter().max().unwrap_or(0))
 }
@@ -137,7 +137,7 @@ fn pixels(cameras: &[Camera], error: f64) -> String {
 }
 
 /// The lens of each camera, by number: those of equal intrinsics are one.
-pub(crate) fn lenses(cameras: &[Camera]) -> Vec<usize> {
+pub fn lenses(cameras: &[Camera]) -> Vec<usize> {
     let same = |a: &Camera, b: &Camera| {
         (a.width, a.height) == (b.width, b.height) && [a.fx, a.fy, a.cx, a.cy] == [b.fx, b.fy, b.cx, b.cy]
     };
@@ -310,35 +310,4 @@ fn depth(points: &[Point], cameras: &[Camera]) -> f64 {
     let all = points.iter().flat_map(|p| p.seen.iter().map(|(s, _)| cameras[s.view].to_camera(p.place).z));
     let all: Vec<f64> = all.collect();
     if all.is_empty() { 0.0 } else { median(all) }
-}
-
-/// The middle of the values; of an even number the upper one.
-fn median(mut values: Vec<f64>) -> f64 {
-    let middle = values.len() / 2;
-    *values.select_nth_unstable_by(middle, f64::total_cmp).1
-}
-
-/// The solution of a symmetric positive system; none where it is not positive.
-pub(crate) fn solve<const N: usize>(mut a: [[f64; N]; N], mut b: [f64; N]) -> Option<[f64; N]> {
-    // Cholesky's factor, in the lower triangle.
-    for i in 0..N {
-        for j in 0..=i {
-            let sum = a[i][j] - (0..j).map(|k| a[i][k] * a[j][k]).sum::<f64>();
-            if i == j {
-                if sum <= 0.0 || sum.is_nan() {
-                    return None;
-                }
-                a[i][i] = sum.sqrt();
-            } else {
-                a[i][j] = sum / a[j][j];
-            }
-        }
-    }
-    for i in 0..N {
-        b[i] = (b[i] - (0..i).map(|k| a[i][k] * b[k]).sum::<f64>()) / a[i][i];
-    }
-    for i in (0..N).rev() {
-        b[i] = (b[i] - (i + 1..N).map(|k| a[k][i] * b[k]).sum::<f64>()) / a[i][i];
-    }
-    Some(b)
 }

@@ -1,7 +1,8 @@
 //! Corners without pictures: points of a known place, seen by cameras of a known pose.
 
 use super::*;
-use crate::training::poses::{moved, turned_from};
+use crate::solve;
+use crate::turn::{moved, turned_from};
 use detect::Code;
 use rand::Rng;
 use rand_chacha::ChaCha8Rng;
