@@ -236,8 +236,9 @@ $(QUERY): $(INSTANCES) $(OPTIONS)/queries | $(BIN)/eval
 	$(query_RUN)
 endif
 
-# What every instance is called, by a vocabulary or by masks with names.
-ifneq ($(CLIP)$(and $(SAM_MAKES),$(PANOPTIC)$(CONCEPTS)),)
+# What every instance is called, by a vocabulary or by masks with names: those of a model that is asked, or of a note beside given masks.
+NAMED := $(if $(SAM_MAKES),$(PANOPTIC)$(CONCEPTS),$(shell grep -ls '"names"' $(MASKS)/*_s.json | head -n 1))
+ifneq ($(CLIP)$(NAMED),)
 NAMES := $(OUT)/names.json
 $(NAMES): $(INSTANCES) $(OPTIONS)/names $(if $(VOCABULARY),$(OPTIONS)/vocabulary.files) | $(BIN)/eval
 	$(names_RUN)

@@ -1,7 +1,7 @@
 //! MobileSAM's encoder (Zhang et al. 2023), which is TinyViT (Wu et al. 2022). What lies between two narrow layers is made row by
 //! row and stays in the processor's cache, where its graph writes all of it to memory.
 //!
-//! The graph itself is the oracle. An encoder that is built otherwise is run as its graph.
+//! The graph itself is the oracle of the tests. An encoder that is built otherwise is run as its graph.
 
 use super::decoder::{EPSILON, EPSILON_OF_PICTURES, Linear, Norm, matrix};
 use super::planar::{biased_gelu, depthwise, softmax_rows};
@@ -127,8 +127,8 @@ impl Reader<'_> {
     fn depthwise(&self, end: &str) -> Option<Depthwise> {
         let (shape, values, bias) = self.file.convolution(end)?;
         let channels = bias.len();
-        let weights = (0..values.len()).map(|i| values[i % channels * 9 + i / channels]).collect();
-        (shape == [channels, 1, 3, 3]).then_some(Depthwise { weights, bias })
+        let at = |i: usize| values[i % channels * 9 + i / channels];
+        (shape == [channels, 1, 3, 3]).then(|| Depthwise { weights: (0..values.len()).map(at).collect(), bias })
     }
 
     fn separable(&self, end: &str) -> Option<Separable> {
