@@ -18,6 +18,8 @@ use std::collections::BTreeMap;
 
 /// Least IoU of an object with a mask that describes it.
 const LEAST_IOU: f32 = 0.2;
+/// Fewest Gaussians of a mask.
+const LEAST_GAUSSIANS: usize = 20;
 
 /// Settings.
 #[derive(Debug, Clone, clap::Args, Serialize)]
@@ -28,9 +30,6 @@ pub struct Options {
     /// Blending weight, summed over a mask's pixels, from which a Gaussian is in the mask
     #[arg(long, value_name = "PIXELS", default_value_t = 0.5, value_parser = stage::at_least(0.0f32))]
     weight: f32,
-    /// Fewest Gaussians of a mask
-    #[arg(long, value_name = "COUNT", default_value_t = 20, value_parser = stage::within(1..=1_000_000usize))]
-    min_gaussians: usize,
     /// Least IoU of the Gaussians of two linked masks, 0 to 1
     #[arg(long, value_name = "SHARE", default_value_t = 0.5, value_parser = stage::within(0.0..=1.0f64))]
     iou: f64,
@@ -50,7 +49,7 @@ impl Peer for Options {
         for r in world.rows() {
             let entries = footprints.entries(r as usize)?;
             let set: Vec<(u32, f32)> = entries.iter().filter(|e| e.1 >= self.weight).collect();
-            if set.len() >= self.min_gaussians {
+            if set.len() >= LEAST_GAUSSIANS {
                 rows.push(r);
                 sets.push(set);
             }
