@@ -28,7 +28,7 @@ help: ## Say what can be made
 build: ## Build all programs into target/release
 	$(CARGO) build --release --workspace --bins
 
-# Those of the pipeline alone, with the same features, so that nothing is built twice.
+# Those of the pipeline alone. All of them: fewer would have other features of the same crates, and be built twice.
 programs:
 	$(CARGO) build --release --workspace --bins --exclude bench --exclude peers --exclude hostile-files
 

@@ -2,7 +2,7 @@
 //! PHOTOGRAPHS MODELS OUT` takes up to 8 pictures of a folder and writes JSON.
 //!
 //! Each photograph goes through three settings in turn: the default; `--no-skip` (every point, each through the decoder's
-//! whole graph); and every point with the default's decoder, which shows what the decoder is worth alone. Recall is the
+//! whole graph); and every point with the default's encoder and decoder, which shows what these are worth. Recall is the
 //! share of the masks that `--no-skip` chooses, at any level, that a mask of the default's meets with an IoU of 0.7. That of
 //! the maps is stricter: after painting, where masks hide parts of others, and at the same level.
 
@@ -122,7 +122,7 @@ fn main() {
         "threads": rayon::current_num_threads(),
         "seconds_per_photograph": mean(default, Run::seconds),
         "seconds_per_photograph_full_grid": mean(full, Run::seconds),
-        "seconds_per_photograph_full_grid_own_decoder": mean(full_fast, Run::seconds),
+        "seconds_per_photograph_full_grid_own": mean(full_fast, Run::seconds),
         "speedup": mean(full, Run::seconds) / mean(default, Run::seconds),
         "prompts": mean(default, |r| r.asked as f64),
         "prompts_full_grid": mean(full, |r| r.asked as f64),

@@ -116,7 +116,7 @@ pub struct Choice {
     /// 0.85; the edges of MobileSAM are softer
     #[arg(long, default_value_t = 0.7, value_name = "IOU", value_parser = stage::within(0.0..=1.0))]
     pub stability: f64,
-    /// Skip nothing: ask every point of the grid, each through the decoder's whole graph (docs/performance.md)
+    /// Skip nothing: run the encoder's graph, and the decoder's whole graph for every point of the grid (docs/performance.md)
     #[arg(long)]
     pub no_skip: bool,
 }

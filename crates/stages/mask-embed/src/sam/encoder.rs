@@ -1,7 +1,7 @@
 //! MobileSAM's encoder (Zhang et al. 2023), which is TinyViT (Wu et al. 2022). What lies between two narrow layers is made row by
 //! row and stays in the processor's cache, where its graph writes all of it to memory.
 //!
-//! The graph itself is the oracle of the tests. An encoder that is built otherwise is run as its graph.
+//! The graph itself is the oracle: [`super::Sam`] compares the two when it opens a model that it does not know.
 
 use super::decoder::{EPSILON, EPSILON_OF_PICTURES, Linear, Norm, matrix};
 use super::planar::{biased_gelu, depthwise, softmax_rows};
@@ -222,7 +222,7 @@ impl Encoder {
             && norms.into_iter().all(|(n, [_, makes])| [n.scale.len(), n.shift.len()] == [*makes; 2])
     }
 
-    /// Whether the graph has no other layer and no other function.
+    /// Whether the graph has as many operators of each important kind.
     fn is_all_of(&self, file: &File) -> bool {
         let [convolutions, blocks] = [self.convolutions.len(), self.stages.iter().map(|(_, b)| b.len()).sum::<usize>()];
         let between = self.stages.len();

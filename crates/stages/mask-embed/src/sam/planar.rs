@@ -1,5 +1,5 @@
-//! Loops over pixels for SAM's decoder, compiled for the processor at hand. Arrays are planar: `[channels][pixels]`, so
-//! that pixels lie side by side.
+//! Loops over pixels for SAM's encoder and decoder, compiled for the processor at hand. The decoder's arrays are planar:
+//! `[channels][pixels]`, so that pixels lie side by side. The encoder's are `[pixels][channels]`.
 
 use multiversion::multiversion;
 
@@ -238,6 +238,32 @@ mod tests {
             assert!((gelu(x) - x * phi).abs() < 3e-7 * x.abs().max(1.0), "{x}: {}", gelu(x));
         }
         assert!(gelu(-40.0).abs() < 1e-30 && gelu(40.0) == 40.0);
+    }
+
+    #[test]
+    fn rows_are_convolved_and_normalised_as_their_formulas_say() {
+        // Whole blocks of channels and some more, with steps of one and of two.
+        for (channels, step) in [(40, 1), (64, 2)] {
+            let number = |i: usize| (i as f32 * 0.7).sin();
+            let rows: Vec<Vec<f32>> = (0..3).map(|y| (0..7 * channels).map(|i| number(i + 31 * y)).collect()).collect();
+            let (weights, bias): (Vec<f32>, Vec<f32>) =
+                ((0..9 * channels).map(|i| number(i + 5)).collect(), (0..channels).map(number).collect());
+            let width = 5usize.div_ceil(step);
+            let mut out = vec![0.0; width * channels];
+            depthwise([&rows[0], &rows[1], &rows[2]], step, &weights, &bias, &mut out);
+            for (i, out) in out.iter().enumerate() {
+                let (u, c) = (i / channels, i % channels);
+                let one = |k: usize| rows[k / 3][(u * step + k % 3) * channels + c] * weights[k * channels + c];
+                assert!((out - bias[c] - (0..9).map(one).sum::<f32>()).abs() < 1e-5);
+            }
+            let mut normed = out.clone();
+            norm_rows(&mut normed, 0.0, &vec![2.0; channels], &vec![1.0; channels]);
+            for row in normed.chunks_exact(channels) {
+                let moment =
+                    |power: i32| row.iter().map(|v| ((v - 1.0) / 2.0).powi(power)).sum::<f32>() / channels as f32;
+                assert!(moment(1).abs() < 1e-5 && (moment(2) - 1.0).abs() < 1e-4);
+            }
+        }
     }
 
     #[test]
