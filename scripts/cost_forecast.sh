@@ -19,7 +19,7 @@ awk -v levels="$levels" -v closed="$closed" -v masks="${MAKES_MASKS:+1}" -v core
     features = 400 + 2 * 8 * entries / 2 ^ 20
     instances = 14 * size ^ 0.84 * more ^ 0.89 * larger ^ 0.64
     sam = masks ? 6 * views : 0
-    memory = most(megabytes * 2 ^ 20, 19.4e6 + 646 * n + 157 * pixels + 20400 * views)
+    memory = most(megabytes * 2 ^ 20, 19.4e6 + 500 * n + 157 * pixels + 20400 * views)
     # 40 masks of a view and level, each of which shares Gaussians with 600.
     memory = most(memory, closed ? 3.8e8 + 940 * n + 36 * 600 * 40 * views * levels \
       : 4.7e6 + 518 * n + least(14 * entries, 2 ^ 29) + 26 * entries / views / levels)

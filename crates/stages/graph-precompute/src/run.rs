@@ -38,7 +38,7 @@ impl Program for Args {
         dataset.warnings.iter().chain(&held.differs(&dataset)).for_each(|w| stage.warn(w));
         // A packed file may hold a thousand times its size: what its Gaussians will take is known before.
         stage.needs_at_once(BASE + PER_GAUSSIAN * splat::count(&self.geometry)?, SMALLER)?;
-        let geometry = Geometry::read(&self.geometry)?;
+        let mut geometry = Geometry::read(&self.geometry)?;
         dataset.follow(&geometry.gaussians, &self.geometry)?;
         let wanted = |v: &&View| self.settings.views == Views::All || v.split == Split::Train;
         let views: Vec<&View> = dataset.views.iter().filter(wanted).collect();
@@ -54,6 +54,8 @@ impl Program for Args {
         if likeness.is_drawn() {
             likeness.expect_same(&self.geometry, &likeness.to_string())?;
         }
+        // Nothing is coloured from here on.
+        geometry.gaussians = std::mem::take(&mut geometry.gaussians).with_degree(0);
         let inputs = BTreeMap::from([
             (role::GEOMETRY.to_string(), hash_file(&self.geometry)?),
             (role::DATASET.to_string(), dataset.hash()?),
@@ -76,7 +78,7 @@ impl Program for Args {
 
 /// Bytes that a run takes, and for each Gaussian.
 const BASE: u64 = 19_400_000;
-const PER_GAUSSIAN: u64 = 646;
+const PER_GAUSSIAN: u64 = 500;
 /// What takes less memory.
 const SMALLER: &str = "give a smaller geometry, smaller id maps or fewer --pixel-samples";
 
@@ -87,14 +89,13 @@ fn forecast(a: &Args, geometry: &Geometry, views: &[&View], stage: &Stage) -> Re
     const PER_VIEW: u64 = 20_400;
     /// Of a sampled pixel, which shows some 54 Gaussians. Footprints wait on disk, sampled pixels in memory.
     const PER_SAMPLE: u64 = 330;
-    let pixels = views.iter().map(|v| u64::from(v.camera.width) * u64::from(v.camera.height)).max().unwrap_or(0);
-    // The first view's masks speak for all; a damaged file is an error later on.
+    // The first view's masks speak for all, their size too; a damaged file is an error later on.
     let samples = a.settings.pixel_samples;
     let first = views.iter().filter_map(|v| MaskMaps::read(maps_path(&a.masks, v.stem())).ok()).next();
-    let (masks, of_map) = first.map_or((0, pixels), |m| (m.id_count(), (m.width() * m.height()) as u64));
+    let (masks, pixels) = first.map_or((0, 0), |m| (m.id_count(), (m.width() * m.height()) as u64));
     let of_views = views.len() as u64 * (PER_VIEW + PER_SAMPLE * (samples * masks) as u64);
     let gaussians = geometry.gaussians.len() as u64;
-    let needed = BASE + PER_GAUSSIAN * gaussians + PER_PIXEL * pixels + of_views + tile_bytes(gaussians, of_map);
+    let needed = BASE + PER_GAUSSIAN * gaussians + PER_PIXEL * pixels + of_views + tile_bytes(gaussians, pixels);
     stage.forecast(needed, SMALLER)
 }
 
