@@ -115,22 +115,19 @@ fn fields(bytes: &[u8], range: Range<usize>) -> Result<Vec<Field>> {
     Ok(found)
 }
 
-/// The texts of the fields `number` of a message.
-fn texts(bytes: &[u8], message: &Range<usize>, number: u64) -> Result<Vec<String>> {
-    let text = |f: Field| match f.value {
-        Value::Bytes(r) if f.number == number => Some(String::from_utf8(bytes[r].to_vec()).map_err(|_| damaged())),
-        _ => None,
-    };
-    fields(bytes, message.clone())?.into_iter().filter_map(text).collect()
-}
-
-/// Where the messages `number` of a message lie.
+/// Where the fields `number` of a message lie that hold a text or a message.
 fn messages(bytes: &[u8], message: &Range<usize>, number: u64) -> Result<Vec<Range<usize>>> {
     let inner = |f: Field| match f.value {
         Value::Bytes(r) if f.number == number => Some(r),
         _ => None,
     };
     Ok(fields(bytes, message.clone())?.into_iter().filter_map(inner).collect())
+}
+
+/// The texts of the fields `number` of a message.
+fn texts(bytes: &[u8], message: &Range<usize>, number: u64) -> Result<Vec<String>> {
+    let text = |r: Range<usize>| String::from_utf8(bytes[r].to_vec()).map_err(|_| damaged());
+    messages(bytes, message, number)?.into_iter().map(text).collect()
 }
 
 fn graph_range(bytes: &[u8]) -> Result<(Range<usize>, Range<usize>)> {

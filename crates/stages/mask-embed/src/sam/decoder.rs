@@ -180,6 +180,12 @@ impl Linear {
 }
 
 impl Norm {
+    /// The norm whose PyTorch name ends with `end`.
+    pub fn read(file: &File, end: &str) -> Option<Self> {
+        let of = |what: &str| file.vector(&format!("{end}.{what}"));
+        Some(Self { scale: of("weight")?, shift: of("bias")? })
+    }
+
     /// Of every row.
     pub fn rows(&self, values: &mut [f32], epsilon: f32) {
         norm_rows(values, epsilon, &self.scale, &self.shift);
@@ -206,8 +212,7 @@ impl Reader<'_> {
     }
 
     fn norm(&self, end: &str) -> Option<Norm> {
-        let of = |what: &str| self.file.vector(&format!("{end}.{what}")).filter(|v| v.len() == self.width);
-        Some(Norm { scale: of("weight")?, shift: of("bias")? })
+        Norm::read(self.file, end).filter(|n| [n.scale.len(), n.shift.len()] == [self.width; 2])
     }
 
     /// `pixels` names the part that belongs to the pixels: its matrix is transposed.

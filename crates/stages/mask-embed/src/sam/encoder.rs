@@ -63,6 +63,36 @@ impl Neighbours {
     }
 }
 
+/// A map of `channels` with every `step`-th pixel of `x`, row by row: `make` writes a row of `inner` channels, and `take` makes one of
+/// the result of row y, its neighbours and memory that is kept.
+fn by_rows(
+    x: &Map,
+    inner: usize,
+    channels: usize,
+    step: usize,
+    make: impl Fn(usize, &mut [f32]) + Sync,
+    take: impl Fn(usize, [&[f32]; 3], &mut Vec<f32>, &mut [f32]) + Sync,
+) -> Map {
+    let [width, height] = [x.width, x.height].map(|n| n.div_ceil(step));
+    let mut values = vec![0.0; width * height * channels];
+    let band = height.div_ceil(rayon::current_num_threads());
+    values.par_chunks_mut(band * width * channels).enumerate().for_each(|(i, out)| {
+        let mut neighbours = Neighbours::new(x, inner, i * band * step);
+        let mut kept = Vec::new();
+        for (y, out) in (i * band..).map(|y| y * step).zip(out.chunks_exact_mut(width * channels)) {
+            take(y, neighbours.of(y, &make), &mut kept, out);
+        }
+    });
+    Map { width, height, channels, values }
+}
+
+fn local(x: &Map, layer: &Depthwise) -> Map {
+    let copy = |v: usize, row: &mut [f32]| row.copy_from_slice(x.row(v));
+    by_rows(x, x.channels, x.channels, 1, copy, |_, rows, _, out| {
+        depthwise(rows, 1, &layer.weights, &layer.bias, out);
+    })
+}
+
 /// A 3 x 3 convolution of each channel by itself: weights `[3][3][channels]`.
 struct Depthwise {
     weights: Vec<f32>,
@@ -141,25 +171,20 @@ impl Reader<'_> {
         self.pack(&layer.weight, layer.bias)
     }
 
-    fn norm(&self, end: &str) -> Option<Norm> {
-        let of = |what: &str| self.file.vector(&format!("{end}.{what}"));
-        Some(Norm { scale: of("weight")?, shift: of("bias")? })
-    }
-
     fn block(&self, stage: usize, i: usize) -> Option<Block> {
         let (path, end) = (format!("layers.{stage}/blocks.{i}"), format!("layers.{stage}.blocks.{i}"));
         let (shape, places) = self.file.added_to(&format!("{path}/attn/Add_output_0"))?;
         let &[heads, pixels, _] = &shape[..] else { return None };
         let side = pixels.isqrt();
         let block = Block {
-            norm: self.norm(&format!("{end}.attn.norm"))?,
+            norm: Norm::read(self.file, &format!("{end}.attn.norm"))?,
             qkv: self.linear(&format!("{end}.attn.qkv"))?,
             places,
             heads,
             side,
             out: self.linear(&format!("{end}.attn.proj"))?,
             local: self.depthwise(&format!("{path}/local_conv/c"))?,
-            mlp_norm: self.norm(&format!("{end}.mlp.norm"))?,
+            mlp_norm: Norm::read(self.file, &format!("{end}.mlp.norm"))?,
             mlp: [self.linear(&format!("{end}.mlp.fc1"))?, self.linear(&format!("{end}.mlp.fc2"))?],
         };
         let channels = block.out.bias.len();
@@ -254,7 +279,7 @@ impl Encoder {
             x = self.separable(&x, before, step, false);
             for block in blocks {
                 self.attend(&mut x, block);
-                x = self.local(&x, &block.local);
+                x = local(&x, &block.local);
                 self.mix(&mut x, block);
             }
         }
@@ -278,52 +303,37 @@ impl Encoder {
 
     /// A 3 x 3 convolution of all channels; zeros beside the picture.
     fn convolve(&self, x: &Map, layer: &Linear, step: usize) -> Map {
-        let [width, height] = [x.width, x.height].map(|n| n.div_ceil(step));
-        let (from, channels) = (x.channels, layer.bias.len());
-        let mut values = vec![0.0; width * height * channels];
-        let band = height.div_ceil(rayon::current_num_threads());
-        values.par_chunks_mut(band * width * channels).enumerate().for_each(|(i, out)| {
-            let mut neighbours = Neighbours::new(x, from, i * band * step);
-            let mut patches = vec![0.0; width * 9 * from];
-            for (y, out) in (i * band..).map(|y| y * step).zip(out.chunks_exact_mut(width * channels)) {
-                let rows = neighbours.of(y, |v, row| row.copy_from_slice(x.row(v)));
-                for (u, patch) in patches.chunks_exact_mut(9 * from).enumerate() {
-                    for (part, row) in patch.chunks_exact_mut(3 * from).zip(rows) {
-                        part.copy_from_slice(&row[u * step * from..][..3 * from]);
-                    }
+        let copy = |v: usize, row: &mut [f32]| row.copy_from_slice(x.row(v));
+        by_rows(x, x.channels, layer.bias.len(), step, copy, |_, rows, patches, out| {
+            patches.resize(out.len() / layer.bias.len() * 9 * x.channels, 0.0);
+            for (u, patch) in patches.chunks_exact_mut(9 * x.channels).enumerate() {
+                for (part, row) in patch.chunks_exact_mut(3 * x.channels).zip(rows) {
+                    part.copy_from_slice(&row[u * step * x.channels..][..3 * x.channels]);
                 }
-                self.times(matrix(&patches, 9 * from), layer, 0.0, out);
             }
-        });
-        Map { width, height, channels, values }
+            self.times(matrix(patches, 9 * x.channels), layer, 0.0, out);
+        })
     }
 
     /// Mixes channels, convolves each with steps of `step`, mixes again; `adds` to what was there.
     fn separable(&self, x: &Map, s: &Separable, step: usize, adds: bool) -> Map {
-        let [width, height] = [x.width, x.height].map(|n| n.div_ceil(step));
         let (inner, channels) = (s.first.bias.len(), s.last.bias.len());
-        let mut values = vec![0.0; width * height * channels];
-        let band = height.div_ceil(rayon::current_num_threads());
-        values.par_chunks_mut(band * width * channels).enumerate().for_each(|(i, out)| {
-            let mut neighbours = Neighbours::new(x, inner, i * band * step);
-            let mut convolved = vec![0.0; width * inner];
-            for (y, out) in (i * band..).map(|y| y * step).zip(out.chunks_exact_mut(width * channels)) {
-                let rows = neighbours.of(y, |v, row| {
-                    self.times(matrix(x.row(v), x.channels), &s.first, 0.0, row);
-                    biased_gelu(row, 0.0);
-                });
-                depthwise(rows, step, &s.middle.weights, &s.middle.bias, &mut convolved);
-                biased_gelu(&mut convolved, 0.0);
-                if adds {
-                    out.copy_from_slice(x.row(y));
-                }
-                self.times(matrix(&convolved, inner), &s.last, f32::from(u8::from(adds)), out);
-                if adds {
-                    biased_gelu(out, 0.0);
-                }
+        let mix = |v: usize, row: &mut [f32]| {
+            self.times(matrix(x.row(v), x.channels), &s.first, 0.0, row);
+            biased_gelu(row, 0.0);
+        };
+        by_rows(x, inner, channels, step, mix, |y, rows, convolved, out| {
+            convolved.resize(out.len() / channels * inner, 0.0);
+            depthwise(rows, step, &s.middle.weights, &s.middle.bias, convolved);
+            biased_gelu(convolved, 0.0);
+            if adds {
+                out.copy_from_slice(x.row(y));
             }
-        });
-        Map { width, height, channels, values }
+            self.times(matrix(convolved, inner), &s.last, f32::from(u8::from(adds)), out);
+            if adds {
+                biased_gelu(out, 0.0);
+            }
+        })
     }
 
     /// Every pixel attends to those of its window. Zeros fill windows that reach beyond the picture.
@@ -386,19 +396,6 @@ impl Encoder {
             }
         };
         x.values.par_chunks_mut(side * line).for_each(attend);
-    }
-
-    fn local(&self, x: &Map, layer: &Depthwise) -> Map {
-        let mut values = vec![0.0; x.values.len()];
-        let (band, line) = (x.height.div_ceil(rayon::current_num_threads()), x.width * x.channels);
-        values.par_chunks_mut(band * line).enumerate().for_each(|(i, out)| {
-            let mut neighbours = Neighbours::new(x, x.channels, i * band);
-            for (y, out) in (i * band..).zip(out.chunks_exact_mut(line)) {
-                let rows = neighbours.of(y, |v, row| row.copy_from_slice(x.row(v)));
-                depthwise(rows, 1, &layer.weights, &layer.bias, out);
-            }
-        });
-        Map { values, ..*x }
     }
 
     /// Mixes the channels of every pixel.

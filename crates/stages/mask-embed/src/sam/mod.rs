@@ -28,7 +28,7 @@ use weights::File;
 const MASK_SIDE: usize = 256;
 
 /// Side of the square that MobileSAM's encoder sees.
-const SIDE: usize = 4 * MASK_SIDE;
+const SQUARE: usize = 4 * MASK_SIDE;
 /// Hash of the files that `make models` fetches: encoder and decoder need not be compared with their graphs again (tests).
 const COMPARED: &str = "0e035ee24319251cc13d9397c606d3bc206e337791e47a0d1ab5076d732ca6bd";
 
@@ -191,7 +191,7 @@ impl Sam {
             (compared || parts.agree_with(&*whole, &prompt, side).ok()?).then(|| Box::new(parts))
         };
         let own = || {
-            let (1, SIDE) = (encoder.outputs().len(), side) else { return None };
+            let (1, SQUARE) = (encoder.outputs().len(), side) else { return None };
             prompt.only_embedding()?;
             let bytes = std::fs::read(&encoder_path).ok()?;
             let own = Encoder::read(&File { graph: &Graph::parse(&bytes).ok()?, bytes: &bytes })?;
@@ -223,20 +223,12 @@ impl Sam {
             Fit::Stretch => [side; 2],
         };
         let small = resize_rgb(image, frame[0], frame[1]);
-        let normal = |c: usize, p: u8| (f32::from(p) - self.mean[c]) / self.std[c];
+        let normal = |(i, p): (usize, &u8)| (f32::from(*p) - self.mean[i % 3]) / self.std[i % 3];
+        let pixels: Vec<f32> = small.pixels.iter().enumerate().map(normal).collect();
         let values: Vec<Tensor> = match &self.encoding {
-            Encoding::Own(encoder) => {
-                let pixels: Vec<f32> = small.pixels.iter().enumerate().map(|(i, p)| normal(i % 3, *p)).collect();
-                vec![encoder.encode(&pixels, frame[0], side)]
-            }
-            Encoding::Graph(encoder) => {
-                let mut pixels = vec![0f32; 3 * side * side];
-                for (i, p) in small.pixels.chunks_exact(3).enumerate() {
-                    let at = i / frame[0] * side + i % frame[0];
-                    (0..3).for_each(|c| pixels[c * side * side + at] = normal(c, p[c]));
-                }
-                let name = &encoder.inputs()[0].name;
-                let out = encoder.run(&[(name, Tensor::f32(&[1, 3, side, side], pixels))])?;
+            Encoding::Own(encoder) => vec![encoder.encode(&pixels, frame[0], side)],
+            Encoding::Graph(graph) => {
+                let out = encode_by_graph(&**graph, &pixels, frame[0], side)?;
                 self.prompt.outputs().map(|i| out[i].clone()).collect()
             }
         };
@@ -316,15 +308,22 @@ impl Parts {
     }
 }
 
+/// Outputs of the encoder's graph for a picture in the upper left corner of a square of `side` pixels. `pixels` are normalised,
+/// `[height][width][3]`; those beside them are zero.
+fn encode_by_graph(graph: &dyn Model, pixels: &[f32], width: usize, side: usize) -> Result<Vec<Tensor<'static>>> {
+    let mut planes = vec![0.0; 3 * side * side];
+    for (i, pixel) in pixels.chunks_exact(3).enumerate() {
+        let at = i / width * side + i % width;
+        pixel.iter().enumerate().for_each(|(c, v)| planes[c * side * side + at] = *v);
+    }
+    graph.run(&[(&graph.inputs()[0].name, Tensor::f32(&[1, 3, side, side], planes))])
+}
+
 /// Whether our encoder gives a picture's embedding as the graph does.
 fn agree(own: &Encoder, graph: &dyn Model) -> Result<bool> {
-    let [width, height] = [SIDE, SIDE / 2];
-    let pixels: Vec<f32> =
-        (0..3 * width * height).map(|i| 2.0 * (i as f32 * 0.37).sin() * (i as f32 * 1e-4).cos()).collect();
-    let got = own.encode(&pixels, width, SIDE);
-    let mut planes = vec![0.0; 3 * SIDE * SIDE];
-    pixels.iter().enumerate().for_each(|(i, p)| planes[i % 3 * SIDE * SIDE + i / 3] = *p);
-    let want = graph.run(&[(&graph.inputs()[0].name, Tensor::f32(&[1, 3, SIDE, SIDE], planes))])?;
+    let number = |i: usize| 2.0 * (i as f32 * 0.37).sin() * (i as f32 * 1e-4).cos();
+    let pixels: Vec<f32> = (0..3 * SQUARE * SQUARE / 2).map(number).collect();
+    let (got, want) = (own.encode(&pixels, SQUARE, SQUARE), encode_by_graph(graph, &pixels, SQUARE, SQUARE)?);
     let (Some(a), Some(b)) = (got.as_f32(), want[0].as_f32()) else { return Ok(false) };
     Ok(got.shape == want[0].shape && a.iter().zip(b).all(|(a, b)| (a - b).abs() <= 1e-3 * (1.0 + b.abs())))
 }
@@ -424,7 +423,7 @@ mod tests {
         let [fast, plain] = [false, true].map(|plain| Sam::open(&folder, &EngineOptions::default(), plain).unwrap());
         assert_eq!(fast.hash, COMPARED, "other models than those that were compared");
         let (Decoding::Parts(parts), Decoding::Graph(whole)) = (&fast.decoding, &plain.decoding) else { panic!() };
-        assert!(parts.agree_with(&**whole, &plain.prompt, SIDE).unwrap());
+        assert!(parts.agree_with(&**whole, &plain.prompt, SQUARE).unwrap());
     }
 
     #[test]
