@@ -51,7 +51,8 @@ pub fn corpus(format: &Format) -> Vec<Vec<u8>> {
     let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("testdata/corpus.zip");
     let mut zip = zip::ZipArchive::new(File::open(path).expect("testdata/corpus.zip")).expect("a zip file");
     let folder = format!("{}/", format.name);
-    let names: Vec<String> = zip.file_names().filter(|n| n.starts_with(&folder)).map(str::to_string).collect();
+    let names: Vec<String> =
+        zip.file_names().map(|n| n.expect("a name").into()).filter(|n: &String| n.starts_with(&folder)).collect();
     let mut read = |name: &String| {
         let mut bytes = Vec::new();
         zip.by_name(name).and_then(|mut f| Ok(f.read_to_end(&mut bytes)?)).expect("a whole entry");

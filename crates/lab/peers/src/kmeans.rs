@@ -1,6 +1,6 @@
 //! k-means: Lloyd's rounds from starts that are drawn apart (k-means++).
 
-use rand::Rng;
+use rand::RngExt;
 use rayon::prelude::*;
 
 /// Points that one task handles.
@@ -9,7 +9,7 @@ const CHUNK: usize = 1024;
 /// Clusters points, `[n][dim]`, in at most `count` clusters by Euclidean distance, in at most `rounds` rounds: the cluster of each
 /// point, and how many there are. A cluster that loses all its points keeps its place and may get others. Fewer
 /// clusters than asked for come out where there are fewer places.
-pub fn k_means(points: &[f32], dim: usize, count: usize, rounds: usize, rng: &mut impl Rng) -> (Vec<u32>, usize) {
+pub fn k_means(points: &[f32], dim: usize, count: usize, rounds: usize, rng: &mut impl RngExt) -> (Vec<u32>, usize) {
     let n = points.len() / dim.max(1);
     let row = |i: usize| &points[i * dim..(i + 1) * dim];
     let mut centres: Vec<f32> = Vec::new();

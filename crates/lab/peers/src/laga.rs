@@ -25,7 +25,7 @@ use crate::world::{Inputs, LearnedInputs, World};
 use artifacts::{Features, Level, Match, flat};
 use gs_io::Result;
 use hdbscan_exact::{Options as Hdbscan, cluster};
-use rand::Rng;
+use rand::RngExt;
 use rand_chacha::ChaCha8Rng;
 use rand_chacha::rand_core::SeedableRng;
 use rayon::prelude::*;

@@ -21,7 +21,7 @@ use crate::world::{Inputs, World};
 use artifacts::{Descriptors, flat};
 use gs_io::{Error, Result};
 use rand::seq::SliceRandom;
-use rand::{Rng, SeedableRng};
+use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use serde::Serialize;
 use stage::Stage;
@@ -129,7 +129,7 @@ struct Autoencoder {
 
 impl Autoencoder {
     /// Learns unit `features`, `[masks][dim]`.
-    fn train(features: &[f32], dim: usize, options: &Options, rng: &mut impl Rng) -> Result<Self> {
+    fn train(features: &[f32], dim: usize, options: &Options, rng: &mut impl RngExt) -> Result<Self> {
         let count = features.len() / dim.max(1);
         if count < 2 {
             return Err(Error::new("too few mask features to learn from").found(count).expected("2 or more"));
@@ -211,7 +211,7 @@ fn fit(
     goals: &[Vec<f32>],
     gaussians: usize,
     options: &Options,
-    rng: &mut impl Rng,
+    rng: &mut impl RngExt,
 ) -> (Vec<f32>, f64) {
     let code = options.code;
     let mut codes: Vec<f32> = (0..gaussians * code).map(|_| rng.random_range(-START..=START)).collect();

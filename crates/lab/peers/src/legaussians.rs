@@ -14,7 +14,7 @@ use crate::world::{Inputs, World};
 use artifacts::Descriptors;
 use gs_io::{Error, Result};
 use rand::seq::index;
-use rand::{Rng, SeedableRng};
+use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use serde::Serialize;
 use stage::Stage;
@@ -152,7 +152,7 @@ fn nearest(points: &[f32], codebook: &[f32], dim: usize) -> Vec<(usize, f32)> {
 
 /// k-means of unit points with the cosine, weighted, from centres drawn as k-means++ draws them. Unit centres, at most `count`,
 /// fewer where fewer points differ.
-fn k_means(points: &[f32], weights: &[f32], dim: usize, count: usize, rng: &mut impl Rng) -> Vec<f32> {
+fn k_means(points: &[f32], weights: &[f32], dim: usize, count: usize, rng: &mut impl RngExt) -> Vec<f32> {
     let mut centres: Vec<f32> = Vec::new();
     // What each point is away from the nearest centre: half its squared distance.
     let mut away = vec![1.0f32; weights.len()];
@@ -232,9 +232,9 @@ struct Learner {
 }
 
 impl Learner {
-    fn new(gaussians: usize, entries: usize, rng: &mut impl Rng) -> Self {
+    fn new(gaussians: usize, entries: usize, rng: &mut impl RngExt) -> Self {
         // Normally distributed: two uniform numbers of Box and Muller.
-        let normal = |rng: &mut dyn rand::RngCore| {
+        let normal = |rng: &mut dyn rand::Rng| {
             let (a, b): (f32, f32) = (rng.random_range(f32::MIN_POSITIVE..1.0), rng.random_range(0.0..1.0));
             (-2.0 * a.ln()).sqrt() * (std::f32::consts::TAU * b).cos()
         };
@@ -254,7 +254,7 @@ impl Learner {
         goals: &[Vec<usize>],
         positions: &[[f32; 3]],
         options: &Options,
-        rng: &mut impl Rng,
+        rng: &mut impl RngExt,
     ) -> f64 {
         let mut of_codes = Adam::new(self.codes.len(), RATE, EPSILON[1], 0.0);
         let mut of_doubts = Adam::new(self.doubts.len(), UNCERTAINTY[0], EPSILON[1], 0.0);

@@ -25,7 +25,7 @@ use artifacts::LEVELS;
 use gs_io::{Error, Result};
 use hdbscan_exact::{Edge, Metric, Selection, cluster_graph};
 use nalgebra::DMatrix;
-use rand::{Rng, SeedableRng};
+use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use rayon::prelude::*;
 use serde::Serialize;

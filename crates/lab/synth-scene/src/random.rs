@@ -1,6 +1,6 @@
 //! Random numbers of the distributions that scenes are drawn from.
 
-use rand::Rng;
+use rand::RngExt;
 use rand_chacha::ChaCha8Rng;
 use std::f64::consts::TAU;
 

@@ -5,7 +5,7 @@ use glam::{DMat3, DVec3};
 use gs_raster::{Measured, RasterOptions, Workspace, tile_weights};
 use gs_scene::{Camera, Gaussians};
 use rand_chacha::ChaCha8Rng;
-use rand_chacha::rand_core::{RngCore, SeedableRng};
+use rand_chacha::rand_core::{Rng, SeedableRng};
 use serde_json::{Value, json};
 
 const REPETITIONS: usize = 15;

@@ -8,7 +8,7 @@ use gs_scene::{Camera, Gaussians};
 use proptest::prelude::*;
 use proptest::test_runner::RngSeed;
 use rand_chacha::ChaCha8Rng;
-use rand_chacha::rand_core::{RngCore, SeedableRng};
+use rand_chacha::rand_core::{Rng, SeedableRng};
 
 struct Dice(ChaCha8Rng);
 

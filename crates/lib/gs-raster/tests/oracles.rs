@@ -78,7 +78,7 @@ fn matches_the_f64_oracle_forward_and_backward() {
             let mut bytes = Vec::new();
             f.read_to_end(&mut bytes).unwrap();
             if let Ok(a) = gs_io::npy::parse(&bytes) {
-                arrays.insert(f.name().trim_end_matches(".npy").to_string(), a.into_iter().collect());
+                arrays.insert(f.name().unwrap().trim_end_matches(".npy").to_string(), a.into_iter().collect());
             }
         }
         let get = |n: &str| arrays.get(n).unwrap_or_else(|| panic!("no {n} in {:?}", arrays.keys()));

@@ -8,7 +8,7 @@ use gs_raster::{
 };
 use gs_scene::{Camera, Gaussians};
 use rand_chacha::ChaCha8Rng;
-use rand_chacha::rand_core::{RngCore, SeedableRng};
+use rand_chacha::rand_core::{Rng, SeedableRng};
 
 /// `n` Gaussians of degree 3 in a cube of side 3, of all opacities.
 fn random(n: usize, seed: u64) -> Gaussians {

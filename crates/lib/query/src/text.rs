@@ -133,7 +133,7 @@ fn read_zip(bytes: &[u8]) -> Result<Features> {
     let mut archive = Archive::new(std::io::Cursor::new(bytes)).map_err(broken)?;
     // All that comes out together: entries may be packed a thousandfold, and several may be the same bytes of the file.
     let most = (64 * bytes.len() as u64).max(LARGEST_ARRAY);
-    let names: Vec<String> = archive.file_names().map(String::from).collect();
+    let names: Vec<String> = archive.file_names().map(|n| n.map_err(broken).map(Into::into)).collect::<Result<_>>()?;
     if let Some(table) = names.iter().position(|n| Path::new(n).file_name().is_some_and(|n| n == TABLE)) {
         let json = unpack(&mut archive, table, most)?.1;
         return read_json(&json).map_err(|e| e.field(TABLE));
@@ -150,7 +150,7 @@ fn read_zip(bytes: &[u8]) -> Result<Features> {
 fn unpack(archive: &mut Archive<'_>, index: usize, most: u64) -> Result<(String, Vec<u8>)> {
     let broken = |e: &dyn std::fmt::Display| Error::new(format!("not a readable zip: {e}")).hint("copy it again");
     let mut entry = archive.by_index(index).map_err(|e| broken(&e))?;
-    let (name, mut data) = (entry.name().to_string(), Vec::new());
+    let (name, mut data) = (entry.name().map_err(|e| broken(&e))?.to_string(), Vec::new());
     (&mut entry).take(most + 1).read_to_end(&mut data).map_err(|e| broken(&e).field(&name))?;
     if data.len() as u64 > most {
         let e = Error::new("too large for text features").field(&name);

@@ -6,7 +6,7 @@ use artifacts::{Instances, flat};
 use eval::Asker;
 use ndarray::Array2;
 use query::{Granules, Index, Selection};
-use rand::{Rng, SeedableRng};
+use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use std::time::Instant;
 

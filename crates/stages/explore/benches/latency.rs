@@ -5,7 +5,7 @@
 use artifacts::{Instances, role};
 use gs_io::{Provenance, hash_file, write_json};
 use gs_scene::dataset::{self, LoadOptions};
-use rand::{Rng, SeedableRng};
+use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use serde_json::{Value, json};
 use std::collections::BTreeMap;

@@ -49,7 +49,7 @@ pub fn pack(g: &Gaussians, degree: u8) -> Packed {
 #[cfg(test)]
 pub mod tests {
     use super::*;
-    use rand::{Rng, SeedableRng};
+    use rand::{RngExt, SeedableRng};
 
     /// What a page reads: the inverse of [`pack`], written out plainly.
     pub fn unpack(p: &Packed) -> Gaussians {

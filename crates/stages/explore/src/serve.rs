@@ -22,8 +22,8 @@ use axum::routing::{get, post};
 use gs_io::{Error, IoContext, Result, Watched};
 use gs_scene::dataset::Resolution;
 use query::Index;
-use rand::TryRngCore;
-use rand::rngs::OsRng;
+use rand::TryRng;
+use rand::rngs::SysRng;
 use serde_json::{Value, json};
 use stage::Stage;
 use std::collections::BTreeMap;
@@ -111,7 +111,7 @@ pub fn run(o: &ServeOptions, stage: &Stage) -> Result<()> {
 
 /// A path that nobody guesses.
 fn secret() -> Result<String> {
-    let part = || OsRng.try_next_u64().map_err(|e| Error::new(format!("no random numbers: {e}")));
+    let part = || SysRng.try_next_u64().map_err(|e| Error::new(format!("no random numbers: {e}")));
     Ok(format!("/{:016x}{:016x}", part()?, part()?))
 }
 

@@ -13,7 +13,7 @@ use gs_io::{Provenance, hash_file};
 use gs_scene::{Gaussians, ply};
 use ndarray::{Array2, Axis};
 use rand::seq::SliceRandom;
-use rand::{Rng, SeedableRng};
+use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use stage::RunRecord;
 use std::collections::BTreeMap;

@@ -3,7 +3,7 @@
 use glam::DVec3;
 use gs_scene::{Camera, Gaussians};
 use proptest::prelude::{Strategy, prop};
-use rand::{Rng, SeedableRng};
+use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use std::ops::Range;
 

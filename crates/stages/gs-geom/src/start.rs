@@ -10,7 +10,7 @@ use gs_io::{Error, Result};
 use gs_scene::{Camera, Gaussians, PointCloud, SH_C0, logit};
 use gs_sfm::sweep::Swept;
 use kiddo::{ImmutableKdTree, SquaredEuclidean};
-use rand::Rng;
+use rand::RngExt;
 use rand::seq::index::sample;
 use rayon::prelude::*;
 use std::num::NonZero;

@@ -22,7 +22,7 @@ use gs_sfm::corners::lenses;
 use loss::{Derivatives, Loss, Pair, l1_dssim};
 use optimiser::drop_bad_gradients;
 use poses::{Moment as PoseMoment, PoseRates};
-use rand::Rng;
+use rand::RngExt;
 use schedule::{LearningRates, Purpose, Schedule, ViewOrder, generator};
 use serde::Serialize;
 use serde_json::{Value, json};

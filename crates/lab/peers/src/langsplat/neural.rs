@@ -1,7 +1,7 @@
 //! Small dense networks with their gradients, and Adam.
 
 use nalgebra::{DMatrixView, DMatrixViewMut};
-use rand::Rng;
+use rand::RngExt;
 
 const NORM_EPSILON: f32 = 1e-5;
 /// How fast the running mean and variance of a batch norm follow.
@@ -63,7 +63,7 @@ impl Trace {
 
 impl Net {
     /// A net of these sizes, input first. Weights and biases are uniform within one over the root of a layer's inputs.
-    pub fn new(sizes: &[usize], norm: bool, rng: &mut impl Rng) -> Self {
+    pub fn new(sizes: &[usize], norm: bool, rng: &mut impl RngExt) -> Self {
         let mut parameters = Vec::new();
         let mut running = Vec::new();
         for (at, pair) in sizes.windows(2).enumerate() {

@@ -4,7 +4,7 @@ use crate::world::World;
 use artifacts::{Level, flat};
 use gs_io::Result;
 use gs_raster::TILE;
-use rand::Rng;
+use rand::RngExt;
 use rand::seq::{SliceRandom, index};
 
 const PIXELS: usize = TILE * TILE;
@@ -54,7 +54,7 @@ impl ViewPixels {
 }
 
 /// Up to `count` pixels of every view that has any, of those that lie in a mask with a feature at one of the levels.
-pub fn sample(world: &World, levels: &[Level], count: usize, rng: &mut impl Rng) -> Result<Vec<ViewPixels>> {
+pub fn sample(world: &World, levels: &[Level], count: usize, rng: &mut impl RngExt) -> Result<Vec<ViewPixels>> {
     let mut position = vec![u32::MAX; world.gaussians()];
     world.footprints.kept.iter().enumerate().for_each(|(at, &i)| position[i as usize] = at as u32);
     let mut all = Vec::new();
@@ -115,7 +115,7 @@ impl Batches {
         &mut self,
         views: &[ViewPixels],
         count: usize,
-        rng: &mut impl Rng,
+        rng: &mut impl RngExt,
     ) -> Option<(usize, std::ops::Range<usize>)> {
         if self.stack.is_empty() {
             self.stack.extend(0..views.len());

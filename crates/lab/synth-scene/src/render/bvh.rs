@@ -139,7 +139,7 @@ impl Bvh {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use rand::{Rng, SeedableRng};
+    use rand::{RngExt, SeedableRng};
 
     #[test]
     fn every_box_that_a_ray_meets_is_visited() {

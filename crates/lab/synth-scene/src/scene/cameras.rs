@@ -6,7 +6,7 @@ use crate::scene::Scene;
 use crate::scene::room::TABLE_HEIGHT;
 use glam::{DMat3, DVec2, DVec3, EulerRot};
 use gs_scene::Camera;
-use rand::Rng;
+use rand::RngExt;
 use rand_chacha::ChaCha8Rng;
 use std::f64::consts::{PI, TAU};
 

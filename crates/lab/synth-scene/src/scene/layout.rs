@@ -9,7 +9,7 @@ use crate::things::furniture;
 use crate::things::material::PAINTS;
 use crate::things::model::Model;
 use glam::{DVec2, DVec3};
-use rand::Rng;
+use rand::RngExt;
 use rand::seq::SliceRandom;
 use rand_chacha::ChaCha8Rng;
 use std::f64::consts::{FRAC_PI_2, TAU};

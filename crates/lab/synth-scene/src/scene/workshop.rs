@@ -11,7 +11,7 @@ use crate::things::class::Class;
 use crate::things::model::Model;
 use crate::things::workshop::{self, BOARD_FRONT, SHELF_DEPTH, SHELF_LENGTH, SHELF_ROOM, SHELVES, STRETCH};
 use glam::{DVec2, DVec3};
-use rand::Rng;
+use rand::RngExt;
 use rand::seq::SliceRandom;
 use rand_chacha::ChaCha8Rng;
 

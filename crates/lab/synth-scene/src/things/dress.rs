@@ -3,7 +3,7 @@
 use crate::things::material::{Paint, Pattern};
 use crate::things::model::Model;
 use glam::DVec3;
-use rand::Rng;
+use rand::RngExt;
 use rand_chacha::ChaCha8Rng;
 
 /// Probabilities of a small and of a large thing, of a patterned and of a shiny one.

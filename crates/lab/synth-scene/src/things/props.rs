@@ -6,7 +6,7 @@ use crate::things::material::{BLUE, GREEN, Material, PAINTS, Paint, Pattern, RED
 use crate::things::model::{Model, profile, z_towards};
 use crate::things::shape::Shape;
 use glam::{DMat3, DVec3};
-use rand::Rng;
+use rand::RngExt;
 use rand_chacha::ChaCha8Rng;
 use std::f64::consts::{PI, TAU};
 

@@ -6,7 +6,7 @@ use crate::things::material::{Material, PAINTS, Paint, Pattern, VIVID, albedo, g
 use crate::things::model::{Model, profile};
 use crate::things::shape::Shape;
 use glam::{DMat3, DVec3};
-use rand::Rng;
+use rand::RngExt;
 use rand_chacha::ChaCha8Rng;
 use std::f64::consts::{PI, TAU};
 

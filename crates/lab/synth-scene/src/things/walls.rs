@@ -6,7 +6,7 @@ use crate::things::material::{Material, Paint, Pattern, matt};
 use crate::things::model::Model;
 use crate::things::shape::Shape;
 use glam::DVec3;
-use rand::Rng;
+use rand::RngExt;
 use rand_chacha::ChaCha8Rng;
 
 /// The floor of a room with the given half extents.

@@ -18,7 +18,7 @@ use crate::truth::scannet;
 use artifacts::{Level, MaskFeatures, MaskMaps, flat};
 use clap::ValueEnum;
 use ndarray::Array2;
-use rand::{Rng, SeedableRng};
+use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use serde::Serialize;
 use std::collections::{BTreeMap, BTreeSet};

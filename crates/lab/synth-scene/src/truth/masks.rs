@@ -18,7 +18,7 @@ use crate::truth::regions::{Pairs, Regions, neighbours};
 use artifacts::{Level, MaskMaps, MaskTruth};
 use glam::DVec2;
 use ndarray::Array3;
-use rand::Rng;
+use rand::RngExt;
 use rand_chacha::ChaCha8Rng;
 use serde::Serialize;
 use std::collections::BTreeMap;

@@ -132,7 +132,7 @@ fn straightened(line: &[[i32; 2]]) -> Polygon {
 mod tests {
     use super::*;
     use crate::testing::fill;
-    use rand::{Rng, SeedableRng};
+    use rand::{RngExt, SeedableRng};
 
     fn back(inside: &[bool], width: usize, height: usize) -> Vec<bool> {
         let mut all = vec![false; width * height];

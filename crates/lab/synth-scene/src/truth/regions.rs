@@ -5,7 +5,7 @@
 use crate::render::Frame;
 use crate::scene::Scene;
 use artifacts::Level;
-use rand::Rng;
+use rand::RngExt;
 use rand_chacha::ChaCha8Rng;
 use std::collections::BTreeMap;
 

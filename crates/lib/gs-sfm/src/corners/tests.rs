@@ -4,7 +4,7 @@ use super::*;
 use crate::solve;
 use crate::turn::{moved, turned_from};
 use detect::Code;
-use rand::Rng;
+use rand::RngExt;
 use rand_chacha::ChaCha8Rng;
 use rand_chacha::rand_core::SeedableRng;
 

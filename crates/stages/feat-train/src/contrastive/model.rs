@@ -11,7 +11,7 @@ use super::real::Real;
 use super::terms;
 use crate::options::{Axis, Contrastive, Init, Loss, UnitLength};
 use crate::random::normal;
-use rand::Rng;
+use rand::RngExt;
 use rayon::prelude::*;
 use std::ops::Range;
 
@@ -63,7 +63,7 @@ pub struct Step<T> {
 
 impl<T: Real> Model<T> {
     /// A model before training. `rng` draws features in the order of kept Gaussians, whatever the training order.
-    pub fn new(d: usize, options: Contrastive, context: &Context, rng: &mut impl Rng) -> Self {
+    pub fn new(d: usize, options: Contrastive, context: &Context, rng: &mut impl RngExt) -> Self {
         let n = context.order.len();
         let drawn: Vec<T> = (0..n * d)
             .map(|_| {

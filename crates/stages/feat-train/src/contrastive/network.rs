@@ -5,7 +5,7 @@
 
 use super::context::Context;
 use super::real::Real;
-use rand::Rng;
+use rand::RngExt;
 use rayon::prelude::*;
 
 /// Channels between layers (paper: "an intermediate channel size of 16").
@@ -28,7 +28,7 @@ pub struct Layer<T> {
 
 impl<T: Real> Layer<T> {
     /// Uniform in ±1/sqrt(inputs), as linear layers usually start.
-    fn random(input: usize, neighbour: usize, output: usize, rng: &mut impl Rng) -> Self {
+    fn random(input: usize, neighbour: usize, output: usize, rng: &mut impl RngExt) -> Self {
         let mut draw = |count: usize, fan_in: usize| -> Vec<T> {
             let bound = 1.0 / (fan_in as f64).sqrt();
             (0..count).map(|_| T::of(rng.random_range(-bound..bound))).collect()
@@ -45,7 +45,7 @@ impl<T: Real> Layer<T> {
 }
 
 /// The layers: `input` → 16 → … → `output` channels.
-pub fn random_layers<T: Real>(count: usize, input: usize, output: usize, rng: &mut impl Rng) -> Vec<Layer<T>> {
+pub fn random_layers<T: Real>(count: usize, input: usize, output: usize, rng: &mut impl RngExt) -> Vec<Layer<T>> {
     (0..count)
         .map(|l| {
             let own = if l == 0 { input } else { HIDDEN };

@@ -4,7 +4,7 @@ use super::context::Context;
 use super::masks::{MaskSet, Pixels};
 use artifacts::Graph;
 use ndarray::Array2;
-use rand::{Rng, SeedableRng};
+use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
 /// A graph of `n` Gaussians on a line, every fourth an anchor.

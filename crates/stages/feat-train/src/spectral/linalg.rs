@@ -75,7 +75,7 @@ pub fn symmetric_eigen(matrix: &Columns) -> (Vec<f64>, Columns) {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use rand::{Rng, SeedableRng};
+    use rand::{RngExt, SeedableRng};
     use rand_chacha::ChaCha8Rng;
 
     #[test]

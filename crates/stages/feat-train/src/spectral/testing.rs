@@ -5,7 +5,7 @@ use super::sparse::Matrix;
 use artifacts::{Footprints, FootprintsBuilder, Row};
 use gs_io::Provenance;
 use ndarray::Array2;
-use rand::{Rng, SeedableRng};
+use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
 /// Evidence of `masks` random masks on `n` Gaussians, by mask.

@@ -8,7 +8,7 @@ use crate::training::schedule::{Purpose, generator};
 use glam::{Quat, Vec3};
 use gs_raster::Workspace;
 use gs_scene::{Camera, Gaussians, logit};
-use rand::Rng;
+use rand::RngExt;
 use rand_chacha::ChaCha8Rng;
 use serde::Serialize;
 

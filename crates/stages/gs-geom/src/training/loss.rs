@@ -274,7 +274,7 @@ fn add_l1(x: &[f32], y: &[f32], scale: f32, out: &mut [f32]) -> f64 {
 mod tests {
     use super::*;
     use proptest::prelude::*;
-    use rand::Rng;
+    use rand::RngExt;
     use rand_chacha::ChaCha8Rng;
     use rand_chacha::rand_core::SeedableRng;
 

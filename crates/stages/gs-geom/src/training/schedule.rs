@@ -1,7 +1,7 @@
 //! What changes with the iteration: learning rates, degree of the spherical harmonics, picture size, and the order of the
 //! views. Iterations count from 1.
 
-use rand::Rng;
+use rand::RngExt;
 use rand::seq::SliceRandom;
 use rand_chacha::ChaCha8Rng;
 use rand_chacha::rand_core::SeedableRng;

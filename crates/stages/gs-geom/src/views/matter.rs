@@ -4,7 +4,7 @@ use super::grid::{Grid, OUTSIDE, directions};
 use super::up::frame_of;
 use glam::{DMat3, DVec3};
 use gs_scene::Gaussians;
-use rand::Rng;
+use rand::RngExt;
 use rand_chacha::ChaCha8Rng;
 use rayon::prelude::*;
 use serde::Serialize;

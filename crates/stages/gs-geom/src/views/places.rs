@@ -5,7 +5,7 @@ use super::matter::Matter;
 use super::options::Look;
 use glam::DVec3;
 use gs_scene::Camera;
-use rand::Rng;
+use rand::RngExt;
 use rand_chacha::ChaCha8Rng;
 use rayon::prelude::*;
 use std::f64::consts::TAU;
