@@ -1,7 +1,8 @@
 //! Farthest points and nearest neighbours of points in space.
 
 use crate::work::run;
-use graph_precompute::{fps::farthest_points, kdtree::KdTree, positions::shifted};
+use graph_precompute::positions::shifted;
+use gs_scene::points::{KdTree, farthest_points};
 use numpy::{IntoPyArray, PyArray1, PyArray2, PyReadonlyArray2};
 use pyo3::exceptions::PyValueError;
 use pyo3::prelude::*;

@@ -1,4 +1,4 @@
-//! What all stages read: [`Gaussians`] and their [`ply`] files, [`Camera`]s, [`dataset`]s of posed photographs, and images.
+//! What all stages read: [`Gaussians`] and their [`ply`] files, [`points`], [`Camera`]s, [`dataset`]s of posed photographs, images.
 //!
 //! Conventions, once for the whole workspace:
 //! * World and camera coordinates are right-handed; cameras look along +z with x right and y down (OpenCV, COLMAP).
@@ -18,6 +18,7 @@ mod lens;
 mod middle;
 mod order;
 pub mod ply;
+pub mod points;
 pub mod splat;
 
 pub use camera::Camera;

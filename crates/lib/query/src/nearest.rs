@@ -1,7 +1,6 @@
 //! The nearest Gaussian or point.
 
-use gs_scene::Gaussians;
-use kiddo::{ImmutableKdTree, SquaredEuclidean};
+use gs_scene::{Gaussians, points::KdTree};
 use rayon::prelude::*;
 
 /// Index of the nearest Gaussian among `candidates` (ascending indices) for each vertex; none when there are none.
@@ -10,12 +9,14 @@ pub fn nearest(gaussians: &Gaussians, candidates: &[u32], vertices: &[[f32; 3]])
     nearest_of(&positions, vertices).into_iter().map(|n| n.map(|n| candidates[n as usize])).collect()
 }
 
-/// Index of the nearest of `positions` for each point; none when there are none.
+/// Index of the nearest of `positions` for each point, the lowest of equals; none when there are none.
 pub fn nearest_of(positions: &[[f32; 3]], points: &[[f32; 3]]) -> Vec<Option<u32>> {
-    let tree = (!positions.is_empty()).then(|| ImmutableKdTree::<f32, 3>::new_from_slice(positions).ok()).flatten();
-    let Some(tree) = tree else { return vec![None; points.len()] };
-    let one = |p: &[f32; 3]| Some(tree.query(p).nearest_one::<SquaredEuclidean<f32>>().execute().item);
-    points.par_iter().map(one).collect()
+    let tree = KdTree::new(positions);
+    let one = |found: &mut Vec<_>, &p: &[f32; 3]| {
+        tree.nearest(p, 1, found);
+        found.first().map(|&(_, index)| index)
+    };
+    points.par_iter().map_init(Vec::new, one).collect()
 }
 
 #[cfg(test)]

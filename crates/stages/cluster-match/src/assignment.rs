@@ -6,13 +6,10 @@ use crate::plane::Place;
 use crate::profile::{Profile, units};
 use crate::vote::by_votes;
 use artifacts::{Footprints, Graph, Level, TreeEdge};
-use gs_io::{Error, Result};
-use gs_scene::Gaussians;
+use gs_io::Result;
+use gs_scene::{Gaussians, points::KdTree};
 use hdbscan_exact::Clustering;
-use kiddo::{ImmutableKdTree, SquaredEuclidean};
 use rayon::prelude::*;
-use std::collections::HashSet;
-use std::num::NonZero;
 
 /// The instances of all Gaussians of a scene.
 pub(crate) struct Assignment {
@@ -42,36 +39,28 @@ impl Assignment {
 
     /// Gives every Gaussian for which `wanted` holds the instance and the node of the nearest Gaussian that has an instance;
     /// ties go to the lower index. Nothing changes where no Gaussian has one.
-    pub fn fill_from_nearest(&mut self, means: &[[f32; 3]], wanted: impl Fn(usize) -> bool + Sync) -> Result<()> {
+    pub fn fill_from_nearest(&mut self, means: &[[f32; 3]], wanted: impl Fn(usize) -> bool + Sync) {
         let finite = |p: &[f32; 3]| p.iter().all(|v| v.is_finite());
-        // The first Gaussian of each place: the tree cannot split heaps of coincident points. Adding zero makes -0 to 0.
-        let mut places = HashSet::new();
-        let known: Vec<u32> = (0..means.len() as u32)
-            .filter(|&i| self.labels[i as usize] >= 0 && finite(&means[i as usize]))
-            .filter(|&i| places.insert(means[i as usize].map(|v| (v + 0.0).to_bits())))
-            .collect();
-        let Some(&first) = known.first() else { return Ok(()) };
+        let known: Vec<u32> =
+            (0..means.len() as u32).filter(|&i| self.labels[i as usize] >= 0 && finite(&means[i as usize])).collect();
+        let Some(&first) = known.first() else { return };
         // Centred, so that far-away scenes keep their digits.
         let origin = means[first as usize];
         let shift = |p: [f32; 3]| [0, 1, 2].map(|k| p[k] - origin[k]);
         let places: Vec<[f32; 3]> = known.iter().map(|&i| shift(means[i as usize])).collect();
-        let tree = ImmutableKdTree::<f32, 3>::new_from_slice(&places)
-            .map_err(|e| Error::new(format!("cannot index the centres of the Gaussians: {e:?}")))?;
-        let some = NonZero::new(4.min(places.len())).expect("there is one");
+        let tree = KdTree::new(&places);
         let found: Vec<(usize, usize)> = (0..means.len())
             .into_par_iter()
             .filter(|&i| wanted(i) && finite(&means[i]))
-            .filter_map(|i| {
-                let near = tree.query(&shift(means[i])).nearest_n::<SquaredEuclidean<f32>>(some).execute();
-                let near = near.iter().map(|n| (n.distance, n.item));
-                let best = near.min_by(|a, b| a.0.total_cmp(&b.0).then(a.1.cmp(&b.1)));
-                best.map(|(_, item)| (i, known[item as usize] as usize))
+            .map_init(Vec::new, |near, i| {
+                tree.nearest(shift(means[i]), 1, near);
+                near.first().map(|&(_, place)| (i, known[place as usize] as usize))
             })
+            .flatten()
             .collect();
         for (i, near) in found {
             (self.labels[i], self.nodes[i]) = (self.labels[near], self.nodes[near]);
         }
-        Ok(())
     }
 
     /// Lets the masks vote `rounds` times ([`by_votes`]). A Gaussian that changes its instance becomes one of the new
@@ -140,13 +129,13 @@ mod tests {
         };
         let means = [[0.0, 0.0, 0.0], [10.0, 0.0, 0.0], [4.0, 0.0, 0.0], [6.0, 0.0, 0.0], [5.0, 0.0, 0.0]];
         let mut a = of(&[0, 1, -1, -1, -1], &[8, 9, 7, 7, 7]);
-        a.fill_from_nearest(&means, |i| (2..4).contains(&i)).unwrap();
+        a.fill_from_nearest(&means, |i| (2..4).contains(&i));
         assert_eq!((a.labels, a.nodes), (vec![0, 1, 0, 1, -1], vec![8, 9, 8, 9, 7]));
         let mut none = of(&[-1; 5], &[7; 5]);
-        none.fill_from_nearest(&means, |_| true).unwrap();
+        none.fill_from_nearest(&means, |_| true);
         assert_eq!(none.labels, [-1; 5]);
         let mut heap = of(&[3, 3, -1], &[5; 3]);
-        heap.fill_from_nearest(&[[1.0; 3]; 3], |i| i == 2).unwrap();
+        heap.fill_from_nearest(&[[1.0; 3]; 3], |i| i == 2);
         assert_eq!(heap.labels, [3, 3, 3]);
     }
 }

@@ -142,7 +142,7 @@ fn correct(
     let mut kept = vec![false; means.len()];
     graph.kept.iter().for_each(|&i| kept[i as usize] = true);
     let noise: Vec<bool> = kept.iter().zip(&found.labels).map(|(&kept, &label)| kept && label < 0).collect();
-    found.fill_from_nearest(means, |i| noise[i])?;
+    found.fill_from_nearest(means, |i| noise[i]);
     if settings.votes > 0 {
         let changed = found.vote(graph, footprints, &settings.levels, settings.votes)?;
         stage.info(&format!("votes of the masks changed the instance of {changed} Gaussians"));
@@ -174,7 +174,7 @@ fn correct(
         stage.skipped(&format!(
             "{unseen} of {n} Gaussians in clustering: never seen; labelled from their nearest neighbour"
         ));
-        found.fill_from_nearest(means, |i| !kept[i] && whole[i])?;
+        found.fill_from_nearest(means, |i| !kept[i] && whole[i]);
     }
     Ok(found)
 }

@@ -1,9 +1,8 @@
 //! Times the anchor graph on a file of positions: `cargo bench -p graph-precompute --bench graph -- POSITIONS.npy [RUNS]`.
 //! Prints one JSON object; scripts/bench_graph.py puts another library's figures beside it.
 
-use graph_precompute::fps::farthest_points;
-use graph_precompute::kdtree::KdTree;
 use graph_precompute::positions::shifted;
+use gs_scene::points::{KdTree, farthest_points};
 use ndarray::{ArrayView2, Axis, aview1};
 use serde_json::json;
 use std::time::Instant;

@@ -1,8 +1,7 @@
 //! The anchor graph over the kept Gaussians (paper, "Local Graph Sampling").
 
-use crate::fps::farthest_points;
-use crate::kdtree::{KdTree, distance};
 use artifacts::Graph;
+use gs_scene::points::{KdTree, distance, farthest_points};
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
@@ -60,7 +59,6 @@ impl AnchorDistances {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::testing::points;
     use proptest::prelude::*;
     use rand::RngExt;
 
@@ -68,7 +66,7 @@ mod tests {
         #![proptest_config(ProptestConfig::with_cases(60))]
         #[test]
         fn the_graph_is_what_it_says(
-            p in points(1..250),
+            p in prop::collection::vec(prop::array::uniform3((-8i8..8).prop_map(|v| f32::from(v) / 4.0)), 1..250),
             ratio in 0.01f64..1.0,
             seed in 0u64..9,
         ) {

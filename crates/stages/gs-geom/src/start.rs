@@ -7,13 +7,11 @@ use crate::training::optimiser::zeros;
 use crate::training::schedule::{Purpose, generator};
 use glam::{DMat3, DVec3};
 use gs_io::{Error, Result};
-use gs_scene::{Camera, Gaussians, PointCloud, SH_C0, logit};
+use gs_scene::{Camera, Gaussians, PointCloud, SH_C0, logit, points::KdTree};
 use gs_sfm::sweep::Swept;
-use kiddo::{ImmutableKdTree, SquaredEuclidean};
 use rand::RngExt;
 use rand::seq::index::sample;
 use rayon::prelude::*;
-use std::num::NonZero;
 
 /// Opacity of a new Gaussian.
 const START_OPACITY: f32 = 0.1;
@@ -91,7 +89,7 @@ pub fn some_points(points: &PointCloud, count: usize, seed: u64) -> PointCloud {
 
 /// Root mean squared distance of each position to its three nearest other places; `alone` where there is no other.
 ///
-/// Coinciding positions count as one place: they would make sizes zero and the tree's queries quadratic.
+/// Coinciding positions count as one place: they would make sizes zero.
 fn spacing(positions: &[[f32; 3]], alone: f32) -> Vec<f32> {
     let mut order: Vec<u32> = (0..positions.len() as u32).collect();
     let key = |i: u32| positions[i as usize].map(|v| v + 0.0);
@@ -104,17 +102,14 @@ fn spacing(positions: &[[f32; 3]], alone: f32) -> Vec<f32> {
         }
         place_of[i as usize] = places.len() as u32 - 1;
     }
-    // One more, because each place finds itself.
-    let want = NonZero::new((NEIGHBOURS + 1).min(places.len())).expect("there is a place");
-    let Ok(tree) = ImmutableKdTree::<f32, 3>::new_from_slice(&places) else { return vec![alone; positions.len()] };
+    let tree = KdTree::new(&places);
     let sizes: Vec<f32> = places
         .par_iter()
-        .map(|p| {
-            let found = tree.query(p).nearest_n::<SquaredEuclidean<f32>>(want).execute();
-            let mut distances: Vec<f64> = found.iter().map(|f| f64::from(f.distance)).collect();
-            distances.sort_by(f64::total_cmp);
-            let others = distances.get(1..).unwrap_or_default();
-            let mean = others.iter().sum::<f64>() / others.len() as f64;
+        .map_init(Vec::new, |found, &p| {
+            // One more, because each place finds itself.
+            tree.nearest(p, NEIGHBOURS + 1, found);
+            let others = found.get(1..).unwrap_or_default();
+            let mean = others.iter().map(|f| f64::from(f.0)).sum::<f64>() / others.len() as f64;
             if mean.is_finite() { mean.sqrt() as f32 } else { alone }
         })
         .collect();

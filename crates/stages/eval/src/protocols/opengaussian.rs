@@ -2,10 +2,8 @@
 //! rendered in a view (docs/protocols.md).
 
 use crate::options::{Choice, LerfOptions};
-use gs_scene::Gaussians;
-use kiddo::{ImmutableKdTree, SquaredEuclidean};
+use gs_scene::{Gaussians, points::KdTree};
 use rayon::prelude::*;
-use std::num::NonZero;
 
 /// Views that must have matched an instance for it to have a score.
 pub const MIN_SUPPORT: u32 = 5;
@@ -56,17 +54,18 @@ pub fn shown(g: &Gaussians, selection: &[u32], in_view: &[bool]) -> Result<Vec<u
 /// For each point the mean of the squared distances to its nearest floor(sqrt(n)) points, itself among them; and the bound
 /// that outliers reach: mean plus standard deviation (n - 1 in the denominator) of all these distances of all points.
 fn distances(points: &[[f32; 3]]) -> (Vec<f64>, f64) {
-    let count = NonZero::new(points.len().isqrt());
-    let tree = ImmutableKdTree::<f32, 3>::new_from_slice(points).ok();
-    let Some((tree, count)) = tree.zip(count) else { return (Vec::new(), 0.0) };
+    let (tree, count) = (KdTree::new(points), points.len().isqrt());
+    if points.is_empty() {
+        return (Vec::new(), 0.0);
+    }
     // Of each point the mean, and the sum of squares.
-    let of = |p: &[f32; 3]| {
-        let near = tree.query(p).nearest_n::<SquaredEuclidean<f32>>(count).execute();
-        let d = || near.iter().map(|n| f64::from(n.distance));
-        (d().sum::<f64>() / count.get() as f64, d().map(|d| d * d).sum::<f64>())
+    let of = |near: &mut Vec<(f32, u32)>, &p: &[f32; 3]| {
+        tree.nearest(p, count, near);
+        let d = || near.iter().map(|n| f64::from(n.0));
+        (d().sum::<f64>() / count as f64, d().map(|d| d * d).sum::<f64>())
     };
-    let rows: Vec<(f64, f64)> = points.par_iter().map(of).collect();
-    let all = (points.len() * count.get()) as f64;
+    let rows: Vec<(f64, f64)> = points.par_iter().map_init(Vec::new, of).collect();
+    let all = (points.len() * count) as f64;
     let mean = rows.iter().map(|r| r.0).sum::<f64>() / points.len() as f64;
     let squares: f64 = rows.iter().map(|r| r.1).sum();
     let variance = (squares - all * mean * mean).max(0.0) / (all - 1.0).max(1.0);

@@ -4,7 +4,7 @@
 //! change nodes whose box is nearer to it than that; all others are skipped. The point with the largest distance at
 //! the root is the next anchor, and when the sampling ends every point knows its nearest anchor.
 
-use crate::kdtree::{KdTree, LANES, distance};
+use super::kdtree::{KdTree, LANES, distance};
 use multiversion::multiversion;
 use std::ops::Range;
 
@@ -132,7 +132,7 @@ fn farther(a: (f32, u32), b: (f32, u32)) -> (f32, u32) {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::testing::points;
+    use crate::points::testing::points;
     use proptest::prelude::*;
 
     fn brute(points: &[[f32; 3]], count: usize, start: u32) -> Sample {

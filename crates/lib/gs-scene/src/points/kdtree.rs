@@ -1,5 +1,4 @@
-//! A kd-tree whose answers have one defined order: by distance, then by index. docs/architecture.md says which tree of the
-//! workspace is for what.
+//! A kd-tree in space whose answers have one defined order: by distance, then by index.
 //!
 //! Distances are squared Euclidean, in f32, summed as (dx² + dy²) + dz². The distance to a bounding box is computed with
 //! the same operations, and f32 rounding is monotone, so a box is never farther than a point inside it: pruning is exact,
@@ -11,7 +10,7 @@ use ndarray::Array2;
 use rayon::prelude::*;
 
 /// Points that are worked on side by side; leaves hold multiples of it, but for the last.
-pub(crate) const LANES: usize = 8;
+pub(super) const LANES: usize = 8;
 /// Points in a leaf, at most.
 const LEAF: usize = 32;
 /// Queries answered together.
@@ -23,36 +22,36 @@ const PARALLEL_BUILD: usize = 16_384;
 #[derive(Debug, Clone)]
 pub struct KdTree {
     /// In preorder: the left child of an inner node follows it.
-    pub(crate) nodes: Vec<Node>,
+    pub(super) nodes: Vec<Node>,
     /// Index of the point in each slot; a leaf is a range of slots.
-    pub(crate) index: Vec<u32>,
+    pub(super) index: Vec<u32>,
     /// Coordinates by slot, an array per axis.
-    pub(crate) axes: [Vec<f32>; 3],
+    pub(super) axes: [Vec<f32>; 3],
 }
 
 #[derive(Debug, Clone, Copy, Default)]
-pub(crate) struct Node {
+pub(super) struct Node {
     lo: [f32; 3],
     hi: [f32; 3],
-    pub(crate) start: u32,
-    pub(crate) end: u32,
+    pub(super) start: u32,
+    pub(super) end: u32,
     /// Smallest index of a point inside.
     min_index: u32,
     /// Right child; 0 for a leaf.
-    pub(crate) right: u32,
+    pub(super) right: u32,
 }
 
 impl Node {
     /// Squared distance from `q` to the box; 0 inside.
     #[inline(always)]
-    pub(crate) fn distance(&self, q: [f32; 3]) -> f32 {
+    pub(super) fn distance(&self, q: [f32; 3]) -> f32 {
         let d = |a: usize| (self.lo[a] - q[a]).max(q[a] - self.hi[a]).max(0.0);
         let [x, y, z] = [d(0), d(1), d(2)];
         x * x + y * y + z * z
     }
 }
 
-/// Squared distance as this crate computes it everywhere.
+/// Squared distance as the tree computes it.
 #[inline(always)]
 pub fn distance(a: [f32; 3], b: [f32; 3]) -> f32 {
     let [x, y, z] = [b[0] - a[0], b[1] - a[1], b[2] - a[2]];
@@ -84,8 +83,17 @@ impl KdTree {
 
     /// The point in a slot.
     #[inline]
-    pub(crate) fn at(&self, slot: usize) -> [f32; 3] {
+    pub(super) fn at(&self, slot: usize) -> [f32; 3] {
         [self.axes[0][slot], self.axes[1][slot], self.axes[2][slot]]
+    }
+
+    /// The `k` points nearest to `q`, nearest first, ties by index: `found` becomes (squared distance, index). Fewer where there
+    /// are fewer; points that are not finite are never found.
+    pub fn nearest(&self, q: [f32; 3], k: usize, found: &mut Vec<(f32, u32)>) {
+        found.clear();
+        if k > 0 && !self.nodes.is_empty() {
+            search(self, q, k, None, found);
+        }
     }
 
     /// The `k` nearest other points of the points `of`, each of which is there once: `[of][k]`, nearest first, ties by index;
@@ -175,7 +183,8 @@ fn scan(
         *d = distance(q, [x, y, z]);
     }
     for (&d, &i) in distances.iter().zip(&tree.index[start..end]) {
-        if d > worst.0 || (d, i) > *worst || Some(i) == except {
+        // What is no number is no neighbour.
+        if d > worst.0 || (d, i) > *worst || Some(i) == except || d.is_nan() {
             continue;
         }
         if found.len() == k {
@@ -238,7 +247,7 @@ fn build(items: &mut [Item], nodes: &mut [Node], first_slot: usize, first_node: 
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::testing::points;
+    use crate::points::testing::points;
     use proptest::prelude::*;
 
     fn brute(points: &[[f32; 3]], q: [f32; 3], k: usize, except: Option<u32>) -> Vec<(f32, u32)> {
@@ -259,7 +268,7 @@ mod tests {
         fn neighbours_are_those_of_brute_force(p in points(1..400), k in 1usize..20, q in prop::array::uniform3(-3f32..3.0)) {
             let tree = KdTree::new(&p);
             let mut found = Vec::new();
-            search(&tree, q, k, None, &mut found);
+            tree.nearest(q, k, &mut found);
             prop_assert_eq!(&found, &brute(&p, q, k, None));
             let all = tree.all_nearest(k);
             for (i, row) in all.rows().into_iter().enumerate() {
