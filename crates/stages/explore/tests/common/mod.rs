@@ -188,6 +188,30 @@ fn tag(head: &str) -> String {
     tag.unwrap_or_default().to_string()
 }
 
+/// Status, headers and body of an answer; `headers` end with line breaks.
+pub fn http(server: &str, method: &str, path: &str, headers: &str, body: &str) -> (u16, String, Vec<u8>) {
+    let mut stream = TcpStream::connect(server).unwrap();
+    let host = if headers.contains("Host:") { String::new() } else { format!("Host: {server}\r\n") };
+    let length = body.len();
+    write!(
+        stream,
+        "{method} {path} HTTP/1.1\r\n{host}Connection: close\r\nContent-Length: {length}\r\n{headers}\r\n{body}"
+    )
+    .unwrap();
+    let mut stream = BufReader::new(stream);
+    let mut head = String::new();
+    while !head.ends_with("\r\n\r\n") {
+        assert_ne!(stream.read_line(&mut head).unwrap(), 0, "an answer that ends in its head: {head}");
+    }
+    let status = head.split(' ').nth(1).unwrap().parse().unwrap();
+    let head = head.to_lowercase();
+    // Some servers wait for us to close.
+    let length = head.lines().find_map(|line| line.strip_prefix("content-length:")?.trim().parse().ok());
+    let mut body = Vec::new();
+    stream.take(length.unwrap_or(u64::MAX)).read_to_end(&mut body).unwrap();
+    (status, head, body)
+}
+
 pub struct Server {
     child: Child,
     pub host: String,
@@ -209,22 +233,9 @@ impl Server {
         1024 * peak.trim().trim_end_matches(" kB").parse::<u64>().unwrap()
     }
 
-    /// Status, headers and body of an answer; `headers` end with line breaks.
+    /// What the server answers to a request ([`http`]).
     pub fn ask(&self, method: &str, path: &str, headers: &str, body: &str) -> (u16, String, Vec<u8>) {
-        let mut stream = TcpStream::connect(&self.host).unwrap();
-        let host = if headers.contains("Host:") { String::new() } else { format!("Host: {}\r\n", self.host) };
-        write!(
-            stream,
-            "{method} {path} HTTP/1.1\r\n{host}Connection: close\r\nContent-Length: {}\r\n{headers}\r\n{body}",
-            body.len()
-        )
-        .unwrap();
-        let mut answer = Vec::new();
-        stream.read_to_end(&mut answer).unwrap();
-        let end = answer.windows(4).position(|w| w == b"\r\n\r\n").unwrap();
-        let head = String::from_utf8_lossy(&answer[..end]).into_owned();
-        let status = head.split(' ').nth(1).unwrap().parse().unwrap();
-        (status, head.to_lowercase(), answer[end + 4..].to_vec())
+        http(&self.host, method, path, headers, body)
     }
 
     /// Sends edits that were made from a version; status, the version that there is then, and what is said.

@@ -3,13 +3,14 @@
 //! `scripts/test_explore.sh` runs these on the demo's scene; they need EXPLORE_RUN (a finished run with query/query.json) and
 //! both programs. EXPLORE_SCREENSHOT names a file for a picture of the page.
 
+#[path = "../common/mod.rs"]
 mod common;
+mod driver;
 
 use artifacts::{Edits, InstanceNames, Instances};
 use base64::Engine;
 use common::{Run, SIZE};
-use fantoccini::actions::{InputSource, KeyAction, KeyActions, MouseActions, PointerAction};
-use fantoccini::{Client, ClientBuilder, Locator};
+use driver::{Session, down, move_to, up};
 use gs_io::Result;
 use gs_raster::RasterOptions;
 use gs_scene::dataset::{self, LoadOptions};
@@ -132,17 +133,17 @@ fn screenshot() -> Option<std::ffi::OsString> {
 }
 
 struct Browser {
-    client: Client,
+    session: Session,
     _driver: Running,
 }
 
 impl Browser {
-    async fn open() -> Self {
-        Self::in_colours("dark").await
+    fn open() -> Self {
+        Self::in_colours("dark")
     }
 
     /// For a person who likes `dark` or `light`.
-    async fn in_colours(scheme: &str) -> Self {
+    fn in_colours(scheme: &str) -> Self {
         let (driver, port) = start("chromedriver", &["--port=0"], "successfully on port ");
         let arguments = [
             "--headless=new",
@@ -161,133 +162,111 @@ impl Browser {
         let scheme = format!("--blink-settings=preferredColorScheme={}", u8::from(scheme == "light"));
         let arguments: Vec<&str> = arguments.into_iter().chain([&size[..], &scheme]).collect();
         let wanted = json!({"goog:chromeOptions": {"args": arguments}, "timeouts": {"script": 240_000}});
-        let Value::Object(wanted) = wanted else { unreachable!() };
-        let mut builder = ClientBuilder::new(hyper_util::client::legacy::connect::HttpConnector::new());
-        let client =
-            builder.capabilities(wanted).connect(&format!("http://127.0.0.1:{port}")).await.expect("chromium starts");
-        Self { client, _driver: driver }
+        Self { session: Session::new(&port, &wanted), _driver: driver }
     }
 
     /// Runs JavaScript that may await; `page` is the page's handle for tests.
-    async fn js(&self, body: &str, given: Vec<Value>) -> Value {
+    fn js(&self, body: &str, given: Vec<Value>) -> Value {
         let script = format!(
             "const done = arguments[arguments.length - 1], given = arguments, page = globalThis.explore; \
              (async () => {{ {body} }})().then((v) => done({{ v: v ?? null }}), (e) => done({{ e: String(e.stack ?? e) }}));"
         );
-        let answer = self.client.execute_async(&script, given).await.expect("the browser runs a script");
+        let answer = self.session.execute_async(&script, &given);
         assert!(answer.get("e").is_none(), "{body}: {answer}");
         answer["v"].clone()
     }
 
-    async fn load(&self, url: &str) -> f64 {
-        self.client.goto(url).await.unwrap();
+    fn load(&self, url: &str) -> f64 {
+        self.session.goto(url);
         for _ in 0..600 {
             // The page's script ran before the browser said that it is here.
-            let state =
-                self.js("return [page?.seconds ?? null, page?.errors ?? ['its script does not run']]", vec![]).await;
+            let state = self.js("return [page?.seconds ?? null, page?.errors ?? ['its script does not run']]", vec![]);
             assert_eq!(state[1], json!([]), "errors while loading {url}");
             if let Some(seconds) = state[0].as_f64() {
                 return seconds;
             }
-            tokio::time::sleep(Duration::from_millis(100)).await;
+            std::thread::sleep(Duration::from_millis(100));
         }
         panic!("{url} did not load in a minute");
     }
 
     /// The page's picture of one of the scene's cameras at its own size, without marks.
-    async fn picture(&self, view: usize) -> Vec<u8> {
+    fn picture(&self, view: usize) -> Vec<u8> {
         let script = "page.viewer.background = [0, 0, 0]; const camera = page.scene.cameras[given[0]]; \
                       await page.viewer.show(camera); const rgb = page.viewer.pixels(); let text = ''; \
                       for (let i = 0; i < rgb.length; i += 8192) text += String.fromCharCode(...rgb.subarray(i, i + 8192)); \
                       return btoa(text);";
-        bytes(&self.js(script, vec![view.into()]).await)
+        bytes(&self.js(script, vec![view.into()]))
     }
 
     /// A real click on what lies at a pixel of a view, after standing there.
-    async fn click(&self, view: usize, pixel: [u32; 2]) {
-        let mouse = self.over(view, pixel).await.then(PointerAction::Down { button: 0 });
-        self.client.perform_actions(mouse.then(PointerAction::Up { button: 0 })).await.unwrap();
-        self.client.release_actions().await.unwrap();
+    fn click(&self, view: usize, pixel: [u32; 2]) {
+        self.session.mouse(&[self.over(view, pixel), down(), up()]);
+        self.session.release();
     }
 
     /// Lets the pointer rest on a pixel of a view.
-    async fn point(&self, view: usize, pixel: [u32; 2]) {
-        let mouse = self.over(view, pixel).await;
-        self.client.perform_actions(mouse).await.unwrap();
+    fn point(&self, view: usize, pixel: [u32; 2]) {
+        self.session.mouse(&[self.over(view, pixel)]);
     }
 
     /// Drags the mouse along points of the window.
-    async fn drag(&self, along: &[[f64; 2]]) {
-        let to = |[x, y]: [f64; 2]| PointerAction::MoveTo { duration: None, x, y };
-        let mouse = MouseActions::new("mouse".into()).then(to(along[0])).then(PointerAction::Down { button: 0 });
-        let mouse = along[1..].iter().fold(mouse, |mouse, &point| mouse.then(to(point)));
-        self.client.perform_actions(mouse.then(PointerAction::Up { button: 0 })).await.unwrap();
-        self.client.release_actions().await.unwrap();
+    fn drag(&self, along: &[[f64; 2]]) {
+        let mut mouse: Vec<Value> = along.iter().map(|&place| move_to(place)).collect();
+        mouse.insert(1, down());
+        mouse.push(up());
+        self.session.mouse(&mouse);
+        self.session.release();
     }
 
-    /// The mouse over a pixel of a view, from which the page then looks.
-    async fn over(&self, view: usize, pixel: [u32; 2]) -> MouseActions {
-        let [x, y] = self.place(view, pixel).await;
-        MouseActions::new("mouse".into()).then(PointerAction::MoveTo { duration: None, x, y })
+    /// The pointer over a pixel of a view, from which the page then looks.
+    fn over(&self, view: usize, pixel: [u32; 2]) -> Value {
+        move_to(self.place(view, pixel))
     }
 
     /// Where a pixel of a view is in the window, as the page looks from there.
-    async fn place(&self, view: usize, pixel: [u32; 2]) -> [f64; 2] {
+    fn place(&self, view: usize, pixel: [u32; 2]) -> [f64; 2] {
         let script = "page.jump(given[0]); await page.viewer.busy; const c = page.viewer.camera, o = page.scene.cameras[given[0]]; \
                       const canvas = document.getElementById('canvas'), rect = canvas.getBoundingClientRect(), s = rect.width / c.width; \
                       const x = (given[1] + 0.5 - o.cx) / o.fx * c.fx + c.cx, y = (given[2] + 0.5 - o.cy) / o.fy * c.fy + c.cy; \
                       return [Math.round(rect.left + x * s), Math.round(rect.top + y * s)];";
-        let at = self.js(script, vec![view.into(), pixel[0].into(), pixel[1].into()]).await;
+        let at = self.js(script, vec![view.into(), pixel[0].into(), pixel[1].into()]);
         serde_json::from_value(at).unwrap()
     }
 
     /// Waits until `condition`, JavaScript, is true.
-    async fn until(&self, condition: &str) {
+    fn until(&self, condition: &str) {
         for _ in 0..300 {
-            if self.js(&format!("return Boolean({condition})"), vec![]).await == json!(true) {
+            if self.js(&format!("return Boolean({condition})"), vec![]) == json!(true) {
                 return;
             }
-            tokio::time::sleep(Duration::from_millis(100)).await;
+            std::thread::sleep(Duration::from_millis(100));
         }
         panic!(
             "never: {condition}; {}",
-            self.js("return [page.errors, document.getElementById('hint').textContent]", vec![]).await
+            self.js("return [page.errors, document.getElementById('hint').textContent]", vec![])
         );
     }
 
-    /// Presses keys where the focus is.
-    async fn press(&self, keys: &str) {
-        let keys = keys.chars().fold(KeyActions::new("keys".into()), |k, value| {
-            k.then(KeyAction::Down { value }).then(KeyAction::Up { value })
-        });
-        self.client.perform_actions(keys).await.unwrap();
-    }
-
-    /// Types with the focus on an element.
-    async fn keys(&self, id: &str, keys: &str) {
-        self.client.find(Locator::Id(id)).await.unwrap().send_keys(keys).await.unwrap();
-    }
-
-    async fn selected(&self) -> Vec<u32> {
-        let ids = self.js("await page.viewer.busy; return page.selectedInstances()", vec![]).await;
+    fn selected(&self) -> Vec<u32> {
+        let ids = self.js("await page.viewer.busy; return page.selectedInstances()", vec![]);
         serde_json::from_value(ids).unwrap()
     }
 
-    async fn ask(&self, text: &str) {
-        let field = self.client.find(Locator::Id("text")).await.unwrap();
-        field.clear().await.unwrap();
-        field.send_keys(&format!("{text}\u{e007}")).await.unwrap();
-        self.until(&format!("page.state.answer?.text === {}", json!(text))).await;
+    fn ask(&self, text: &str) {
+        self.session.clear("text");
+        self.session.keys("text", &format!("{text}\u{e007}"));
+        self.until(&format!("page.state.answer?.text === {}", json!(text)));
     }
 
-    async fn saved(&self, action: &str) -> Vec<u8> {
+    fn saved(&self, action: &str) -> Vec<u8> {
         let script = "page.saved = null; await page.act(given[0]); const b = new Uint8Array(await page.saved.blob.arrayBuffer()); \
                       let text = ''; for (let i = 0; i < b.length; i += 8192) text += String.fromCharCode(...b.subarray(i, i + 8192)); return btoa(text);";
-        bytes(&self.js(script, vec![action.into()]).await)
+        bytes(&self.js(script, vec![action.into()]))
     }
 
-    async fn no_errors(&self) {
-        assert_eq!(self.js("return page.errors", vec![]).await, json!([]));
+    fn no_errors(&self) {
+        assert_eq!(self.js("return page.errors", vec![]), json!([]));
     }
 }
 
@@ -326,69 +305,69 @@ fn explore() -> &'static str {
 }
 
 /// The pictures of a few views are the rasteriser's.
-async fn pictures_agree(browser: &Browser, f: &Fixture, degree: u8) {
-    browser.js("await page.select([]); page.setColors('photograph'); return null", vec![]).await;
+fn pictures_agree(browser: &Browser, f: &Fixture, degree: u8) {
+    browser.js("await page.select([]); page.setColors('photograph'); return null", vec![]);
     for view in [0, f.views.len() / 2] {
-        let shown = browser.picture(view).await;
+        let shown = browser.picture(view);
         let rendered = gs_raster::render(f.gaussians(), &f.views[view].camera, &f.raster(degree));
         let found = psnr(&shown, &rendered.rgb);
         eprintln!("view {view}, degree {degree}: {found:.1} dB");
         assert!(found >= PSNR, "view {view}: {found:.1} dB");
     }
     // The same Gaussians as if they had been learnt with the 2D filter of Mip-Splatting.
-    browser.js("page.gaussians.antialias = true", vec![]).await;
-    let shown = browser.picture(0).await;
-    browser.js("page.gaussians.antialias = false", vec![]).await;
+    browser.js("page.gaussians.antialias = true", vec![]);
+    let shown = browser.picture(0);
+    browser.js("page.gaussians.antialias = false", vec![]);
     let filtered = RasterOptions { antialias: true, ..f.raster(degree) };
     let found = psnr(&shown, &gs_raster::render(f.gaussians(), &f.views[0].camera, &filtered).rgb);
     assert!(found >= PSNR, "antialiased: {found:.1} dB");
 }
 
 /// Clicks on things that are seen clearly select them.
-async fn clicks_select(browser: &Browser, f: &Fixture, most: usize) {
+fn clicks_select(browser: &Browser, f: &Fixture, most: usize) {
     let places = f.places();
     assert!(places.len() >= 10, "only {} instances are seen clearly", places.len());
     for &(instance, view, pixel) in &places {
         let script = "return (await page.pick(page.scene.cameras[given[0]], given[1], given[2])).instance";
-        let found = browser.js(script, vec![view.into(), pixel[0].into(), pixel[1].into()]).await;
+        let found = browser.js(script, vec![view.into(), pixel[0].into(), pixel[1].into()]);
         assert_eq!(found, json!(instance), "view {view}, pixel {pixel:?}");
     }
     for (instance, view, pixel) in places.into_iter().take(most) {
-        browser.js("await page.select([])", vec![]).await;
-        browser.click(view, pixel).await;
-        browser.until("page.selectedInstances().length").await;
-        assert_eq!(browser.selected().await, [instance], "view {view}, pixel {pixel:?}");
+        browser.js("await page.select([])", vec![]);
+        browser.click(view, pixel);
+        browser.until("page.selectedInstances().length");
+        assert_eq!(browser.selected(), [instance], "view {view}, pixel {pixel:?}");
     }
 }
 
-#[tokio::test]
+#[test]
 #[ignore = "needs chromium and a finished run; run scripts/test_explore.sh"]
-async fn a_served_scene_can_be_seen_clicked_asked_and_edited() {
+fn a_served_scene_can_be_seen_clicked_asked_and_edited() {
     let f = Fixture::read();
     let edits = f.run.join("instances.edits.json");
     let _ = std::fs::remove_file(&edits);
     let run = f.run.to_str().unwrap();
     let (_server, url) = start(explore(), &["serve", "--run-dir", run, "--port", "0"], "look at ");
-    let browser = Browser::open().await;
-    let seconds = browser.load(&url).await;
+    let browser = Browser::open();
+    let seconds = browser.load(&url);
     eprintln!("loaded in {seconds:.1} s");
     assert!(seconds < LOAD_SECONDS, "{seconds}");
-    pictures_agree(&browser, &f, 0).await;
-    clicks_select(&browser, &f, usize::MAX).await;
+    pictures_agree(&browser, &f, 0);
+    clicks_select(&browser, &f, usize::MAX);
 
-    names_are_listed_and_hovered(&browser, &f).await;
+    names_are_listed_and_hovered(&browser, &f);
 
     // A text selects what eval query selects, and what is saved are the same Gaussians.
     for (text, selected, gaussians) in answers(&f.run) {
-        browser.ask(&text).await;
-        assert_eq!(browser.selected().await, selected, "{text}");
+        browser.ask(&text);
+        assert_eq!(browser.selected(), selected, "{text}");
         let Some(gaussians) = gaussians else { continue };
-        assert_eq!(read_ply(&browser.saved("save-selection").await), gaussians, "{text}");
-        let rest = read_ply(&browser.saved("save-rest").await);
+        assert_eq!(read_ply(&browser.saved("save-selection")), gaussians, "{text}");
+        let rest = read_ply(&browser.saved("save-rest"));
         assert_eq!(rest.len() + gaussians.len(), f.gaussians().len());
     }
     if let Some(path) = screenshot() {
-        browser.client.set_window_size(1200, 800).await.unwrap();
+        browser.session.resize(1200, 800);
         // A thing with a note, and a lasso half drawn around it.
         let script = "const k = page.selectedInstances()[0] ?? 0; await page.edit({ op: 'note', instance: k, text: 'From grandma. One wheel is new.' }); \
                       await page.selectInstances([k]); await page.act('add'); page.jump(page.instances.views(k)[0][0]); await page.viewer.busy; \
@@ -397,20 +376,20 @@ async fn a_served_scene_can_be_seen_clicked_asked_and_edited() {
                       const [x, y, r] = [c.fx * t[0] / t[2] + c.cx, c.fy * t[1] / t[2] + c.cy, 0.13 * c.height]; \
                       page.state.path = Array.from({ length: 40 }, (_, n) => [x + r * (1 + 0.1 * Math.sin(n / 2)) * Math.cos(n / 6.4), y + r * Math.sin(n / 6.4)]); \
                       await page.refresh(); await page.viewer.busy;";
-        browser.js(script, vec![]).await;
-        std::fs::write(path, browser.client.screenshot().await.unwrap()).unwrap();
-        browser.js("await page.act('show-all'); await page.act('undo')", vec![]).await;
+        browser.js(script, vec![]);
+        std::fs::write(path, bytes(&browser.session.screenshot())).unwrap();
+        browser.js("await page.act('show-all'); await page.act('undo')", vec![]);
     }
 
     // Hidden, what lies behind shows; isolated, nothing else does.
     let count = |place: &(u32, usize, [u32; 2])| f.instances.count[place.0 as usize];
     let (instance, view, pixel) = f.places().into_iter().min_by_key(count).unwrap();
     let at = 3 * (pixel[1] * f.views[view].camera.width + pixel[0]) as usize;
-    browser.js("await page.selectInstances([given[0]])", vec![instance.into()]).await;
-    browser.js("await page.select([])", vec![]).await;
-    let whole = browser.picture(view).await;
-    browser.js("await page.selectInstances([given[0]]); await page.act('isolate')", vec![instance.into()]).await;
-    let alone = browser.picture(view).await;
+    browser.js("await page.selectInstances([given[0]])", vec![instance.into()]);
+    browser.js("await page.select([])", vec![]);
+    let whole = browser.picture(view);
+    browser.js("await page.selectInstances([given[0]]); await page.act('isolate')", vec![instance.into()]);
+    let alone = browser.picture(view);
     let lit = |picture: &[u8]| picture.chunks(3).filter(|c| c.iter().any(|&v| v > 8)).count();
     assert!(
         lit(&alone) < lit(&whole) / 2 && alone[at..at + 3].iter().any(|&v| v > 8),
@@ -418,8 +397,8 @@ async fn a_served_scene_can_be_seen_clicked_asked_and_edited() {
         lit(&alone),
         lit(&whole)
     );
-    browser.js("await page.act('isolate'); await page.act('hide')", vec![]).await;
-    let without = browser.picture(view).await;
+    browser.js("await page.act('isolate'); await page.act('hide')", vec![]);
+    let without = browser.picture(view);
     let change: i32 = (at..at + 3).map(|k| (i32::from(without[k]) - i32::from(whole[k])).abs()).sum();
     let same = without
         .chunks(3)
@@ -428,153 +407,145 @@ async fn a_served_scene_can_be_seen_clicked_asked_and_edited() {
         .count();
     assert!(change > 15 && same * 3 > whole.len() / 2, "hidden: changed by {change}, {same} pixels stayed");
     let script = "return (await page.pick(page.scene.cameras[given[0]], given[1], given[2])).instance";
-    let clicked = browser.js(script, vec![view.into(), pixel[0].into(), pixel[1].into()]).await;
+    let clicked = browser.js(script, vec![view.into(), pixel[0].into(), pixel[1].into()]);
     assert_ne!(clicked, json!(instance), "what is hidden is not clicked");
-    browser.js("await page.act('show-all')", vec![]).await;
+    browser.js("await page.act('show-all')", vec![]);
 
     let script = "try { new page.viewer.constructor({ getContext: () => null }); } catch (e) { return e.message; }";
-    assert!(browser.js(script, vec![]).await.as_str().unwrap().contains("no WebGL2"));
-    edits_are_those_of_the_stages(&browser, &f, &edits).await;
-    browser.no_errors().await;
-    browser.client.clone().close().await.unwrap();
+    assert!(browser.js(script, vec![]).as_str().unwrap().contains("no WebGL2"));
+    edits_are_those_of_the_stages(&browser, &f, &edits);
+    browser.no_errors();
 }
 
-#[tokio::test]
+#[test]
 #[ignore = "needs chromium; run scripts/test_explore.sh"]
-async fn a_click_is_answered_while_the_first_text_is_encoded() {
-    let browser = Browser::open().await;
+fn a_click_is_answered_while_the_first_text_is_encoded() {
+    let browser = Browser::open();
     let run = Run::with_slow_words();
     let server = run.serve(&[]);
-    browser.load(&format!("http://{}{}", server.host, server.path)).await;
-    let mouse = browser.over(0, [SIZE.0 / 2, SIZE.1 / 2]).await.then(PointerAction::Down { button: 0 });
-    let field = browser.client.find(Locator::Id("text")).await.unwrap();
-    field.send_keys("mug\u{e007}").await.unwrap();
-    browser.client.perform_actions(mouse.then(PointerAction::Up { button: 0 })).await.unwrap();
-    browser.until("page.selectedInstances().length").await;
-    assert_eq!(browser.selected().await, [0]);
-    assert_eq!(browser.js("return page.state.answer", vec![]).await, Value::Null, "the text is still encoded");
-    browser.until("page.state.answer?.text === 'mug'").await;
-    browser.no_errors().await;
-    browser.client.clone().close().await.unwrap();
+    browser.load(&format!("http://{}{}", server.host, server.path));
+    let there = browser.over(0, [SIZE.0 / 2, SIZE.1 / 2]);
+    browser.session.keys("text", "mug\u{e007}");
+    browser.session.mouse(&[there, down(), up()]);
+    browser.until("page.selectedInstances().length");
+    assert_eq!(browser.selected(), [0]);
+    assert_eq!(browser.js("return page.state.answer", vec![]), Value::Null, "the text is still encoded");
+    browser.until("page.state.answer?.text === 'mug'");
+    browser.no_errors();
 }
 
 /// A note is typed without a mouse, kept in the run's folder, shown as text, and undone like any edit.
-#[tokio::test]
+#[test]
 #[ignore = "needs chromium; run scripts/test_explore.sh"]
-async fn notes_are_kept_and_shown() {
+fn notes_are_kept_and_shown() {
     let run = Run::new();
     run.write_names(&run.instances());
     let server = run.serve(&[]);
-    let browser = Browser::open().await;
+    let browser = Browser::open();
     let url = format!("http://{}{}", server.host, server.path);
-    browser.load(&url).await;
-    browser.js("await page.selectInstances([0])", vec![]).await;
+    browser.load(&url);
+    browser.js("await page.selectInstances([0])", vec![]);
     let note = "<b>grandma's</b>, 👩‍🍳 میراث";
-    browser.keys("canvas", "o").await;
-    browser.until("document.getElementById('ask').open").await;
-    browser.keys("ask-value", &format!("{note}\u{e007}")).await;
-    browser.until("document.getElementById('note').textContent").await;
+    browser.session.keys("canvas", "o");
+    browser.until("document.getElementById('ask').open");
+    browser.session.keys("ask-value", &format!("{note}\u{e007}"));
+    browser.until("document.getElementById('note').textContent");
     let shown = "await page.act('inventory'); const at = (q) => document.querySelector(q)?.textContent ?? null; return [at('#note'), at('#ranking span small'), at('b')]";
     let path = run.out().join("instances.edits.json");
     let there = json!([note, note, null]);
-    assert_eq!(browser.js(shown, vec![]).await, there);
+    assert_eq!(browser.js(shown, vec![]), there);
     let kept = artifacts::Edit::Note { instance: 0, text: note.into() };
     assert_eq!(Edits::read(&path).unwrap().edits, [kept]);
-    browser.js("await page.act('undo')", vec![]).await;
-    assert_eq!(browser.js(shown, vec![]).await, json!(["", null, null]));
-    browser.js("await page.act('redo')", vec![]).await;
-    browser.load(&url).await;
-    browser.js("await page.selectInstances([0])", vec![]).await;
-    assert_eq!(browser.js(shown, vec![]).await, there);
+    browser.js("await page.act('undo')", vec![]);
+    assert_eq!(browser.js(shown, vec![]), json!(["", null, null]));
+    browser.js("await page.act('redo')", vec![]);
+    browser.load(&url);
+    browser.js("await page.selectInstances([0])", vec![]);
+    assert_eq!(browser.js(shown, vec![]), there);
     // A long one is refused where there is no server, too.
     let long = json!({"op": "note", "instance": 0, "text": "é".repeat(251)});
-    let said = browser.js("return page.instances.edit(given[0])", vec![long]).await;
+    let said = browser.js("return page.instances.edit(given[0])", vec![long]);
     assert_eq!(said, json!("This is too long: it has 502 bytes, and 500 at most are kept."));
-    browser.no_errors().await;
-    browser.client.clone().close().await.unwrap();
+    browser.no_errors();
 }
 
 /// The list of a search calls things as the inventory does, a guess with a question mark, until a person knows better.
-#[tokio::test]
+#[test]
 #[ignore = "needs chromium; run scripts/test_explore.sh"]
-async fn the_list_has_the_names_of_the_inventory() {
+fn the_list_has_the_names_of_the_inventory() {
     let run = Run::new();
     run.write_names(&run.instances());
     let server = run.serve(&[]);
-    let browser = Browser::open().await;
-    browser.load(&format!("http://{}{}", server.host, server.path)).await;
-    browser.ask("far ball").await;
+    let browser = Browser::open();
+    browser.load(&format!("http://{}{}", server.host, server.path));
+    browser.ask("far ball");
     let listed = "return [...document.querySelectorAll('#ranking button')].map((b) => b.children[1].textContent).concat(document.getElementById('selection-name').textContent)";
-    browser.until("document.getElementById('selection-name').textContent").await;
-    assert_eq!(browser.js(listed, vec![]).await, json!(["planet?", "sun", "planet?"]));
-    browser.js("await page.edit({ op: 'rename', instance: 1, name: 'my moon' })", vec![]).await;
-    assert_eq!(browser.js(listed, vec![]).await, json!(["my moon", "sun", "my moon"]));
-    browser.js("await page.act('undo')", vec![]).await;
-    assert_eq!(browser.js(listed, vec![]).await, json!(["planet?", "sun", "planet?"]));
-    browser.no_errors().await;
-    browser.client.clone().close().await.unwrap();
+    browser.until("document.getElementById('selection-name').textContent");
+    assert_eq!(browser.js(listed, vec![]), json!(["planet?", "sun", "planet?"]));
+    browser.js("await page.edit({ op: 'rename', instance: 1, name: 'my moon' })", vec![]);
+    assert_eq!(browser.js(listed, vec![]), json!(["my moon", "sun", "my moon"]));
+    browser.js("await page.act('undo')", vec![]);
+    assert_eq!(browser.js(listed, vec![]), json!(["planet?", "sun", "planet?"]));
+    browser.no_errors();
 }
 
 /// What a mouse can do is done with keys: each control is reached in the order of the page, says its name and shows its focus.
-#[tokio::test]
+#[test]
 #[ignore = "needs chromium; run scripts/test_explore.sh"]
-async fn keys_reach_everything() {
+fn keys_reach_everything() {
     let run = Run::new();
     run.write_names(&run.instances());
     let server = run.serve(&[]);
-    let browser = Browser::open().await;
-    browser.load(&format!("http://{}{}", server.host, server.path)).await;
-    browser.keys("canvas", "t").await;
-    browser.until("document.querySelector('#ranking button')").await;
+    let browser = Browser::open();
+    browser.load(&format!("http://{}{}", server.host, server.path));
+    browser.session.keys("canvas", "t");
+    browser.until("document.querySelector('#ranking button')");
     // Along the list by arrows, which leave the camera where it is.
-    let eye = browser.js("document.querySelector('#ranking button').focus(); return page.visitor.eye", vec![]).await;
-    browser.press("\u{e015}\u{e015}\u{e013}\u{e015}\u{e007}").await;
-    browser.until("page.selectedInstances().length").await;
+    let eye = browser.js("document.querySelector('#ranking button').focus(); return page.visitor.eye", vec![]);
+    browser.session.press("\u{e015}\u{e015}\u{e013}\u{e015}\u{e007}");
+    browser.until("page.selectedInstances().length");
     let names = "return [document.activeElement.children[1].textContent, document.getElementById('said').textContent]";
-    let names = browser.js(names, vec![]).await;
+    let names = browser.js(names, vec![]);
     assert!(names[0] == "sun" && names[1].as_str().unwrap().starts_with("sun. 1 Gaussians, "), "{names}");
     // Tab, from the start of the page to its end.
-    browser
-        .js("await page.selectInstances([1], { clicked: 1 }); document.getElementById('text').focus()", vec![])
-        .await;
+    browser.js("await page.selectInstances([1], { clicked: 1 }); document.getElementById('text').focus()", vec![]);
     let mut order = Vec::new();
     for _ in 0..60 {
         let at = "const e = document.activeElement, style = getComputedStyle(e); const name = e.labels?.[0]?.textContent || e.ariaLabel || e.title || e.textContent.trim() || e.querySelector('img')?.alt; \
                   return e === document.body ? null : [e.id || e.closest('[id]').id, style.outlineStyle === 'solid' && parseFloat(style.outlineWidth) >= 1.5, Boolean(name)]";
-        let at = browser.js(at, vec![]).await;
+        let at = browser.js(at, vec![]);
         if at.is_null() || (!order.is_empty() && at[0] == "text") {
             break;
         }
         assert!(at[1] == json!(true) && at[2] == json!(true), "focus seen, name: {at}");
         order.push(at[0].as_str().unwrap().to_string());
-        browser.press("\u{e004}").await;
+        browser.session.press("\u{e004}");
     }
     order.dedup();
     let wanted = "text help-button canvas ranking level isolate ghost hide frame rename annotate split add remove save-selection save-rest \
                   save-json photographs show-all inventory measure scale picture colors view blend";
     assert_eq!(order.join(" "), wanted);
     // A slider moves by arrows, and not the camera.
-    browser.js("document.getElementById('level').focus()", vec![]).await;
-    browser.press("\u{e012}").await;
-    browser.until("page.state.cells.size === 1").await;
-    assert_eq!(browser.js("return page.visitor.eye", vec![]).await, eye);
+    browser.js("document.getElementById('level').focus()", vec![]);
+    browser.session.press("\u{e012}");
+    browser.until("page.state.cells.size === 1");
+    assert_eq!(browser.js("return page.visitor.eye", vec![]), eye);
     // What is no more there does not keep the focus; Escape leaves a tool.
-    browser.js("document.getElementById('hide').focus()", vec![]).await;
-    browser.press("\u{e007}").await;
-    browser.until("document.getElementById('details').hidden").await;
-    assert_eq!(browser.js("return document.activeElement.id", vec![]).await, json!("canvas"));
-    browser.press("u").await;
-    browser.until("page.state.tool === 'measure'").await;
-    browser.press("\u{e00c}").await;
-    browser.until("page.state.tool === 'select'").await;
-    browser.no_errors().await;
-    browser.client.clone().close().await.unwrap();
+    browser.js("document.getElementById('hide').focus()", vec![]);
+    browser.session.press("\u{e007}");
+    browser.until("document.getElementById('details').hidden");
+    assert_eq!(browser.js("return document.activeElement.id", vec![]), json!("canvas"));
+    browser.session.press("u");
+    browser.until("page.state.tool === 'measure'");
+    browser.session.press("\u{e00c}");
+    browser.until("page.state.tool === 'select'");
+    browser.no_errors();
 }
 
 /// axe-core, which `scripts/test_explore.sh` fetches, finds nothing against WCAG 2.2 A and AA in any state of the page.
-#[tokio::test]
+#[test]
 #[ignore = "needs chromium and axe-core; run scripts/test_explore.sh"]
-async fn everybody_can_use_it() {
+fn everybody_can_use_it() {
     let axe = std::env::var("EXPLORE_AXE").expect("EXPLORE_AXE: run scripts/test_explore.sh");
     let axe = std::fs::read_to_string(axe).unwrap();
     let run = Run::new();
@@ -582,11 +553,11 @@ async fn everybody_can_use_it() {
     let server = run.serve(&[]);
     let mut wrong = Vec::new();
     for scheme in ["dark", "light"] {
-        let browser = Browser::in_colours(scheme).await;
-        browser.load(&format!("http://{}{}", server.host, server.path)).await;
-        browser.client.execute(&axe, vec![]).await.unwrap();
+        let browser = Browser::in_colours(scheme);
+        browser.load(&format!("http://{}{}", server.host, server.path));
+        browser.session.execute(&axe);
         let as_asked = format!("return matchMedia('(prefers-color-scheme: {scheme})').matches");
-        assert_eq!(browser.js(&as_asked, vec![]).await, json!(true), "{scheme}");
+        assert_eq!(browser.js(&as_asked, vec![]), json!(true), "{scheme}");
         for (state, enter) in [
             ("start", ""),
             ("inventory", "await page.act('inventory')"),
@@ -603,37 +574,36 @@ async fn everybody_can_use_it() {
             let check = "const levels = ['wcag2a', 'wcag2aa', 'wcag21a', 'wcag21aa', 'wcag22aa']; \
                          const { violations, passes } = await axe.run({ runOnly: levels }); if (!passes.length) throw new Error('nothing was checked'); \
                          return violations.map((v) => `${v.id}: ${v.help}: ${v.nodes.map((n) => `${n.html} (${n.failureSummary})`).join(' | ')}`)";
-            let found = browser.js(&format!("{enter}; await page.viewer.busy; {check}"), vec![]).await;
+            let found = browser.js(&format!("{enter}; await page.viewer.busy; {check}"), vec![]);
             wrong.extend(found.as_array().unwrap().iter().map(|v| format!("{scheme}, {state}: {v}")));
         }
-        browser.no_errors().await;
-        browser.client.clone().close().await.unwrap();
+        browser.no_errors();
     }
     assert!(wrong.is_empty(), "{} violations:\n{}", wrong.len(), wrong.join("\n"));
 }
 
 /// Everything stands in the list of what is here, under the names of `names.json`; the pointer tells a thing's name.
-async fn names_are_listed_and_hovered(browser: &Browser, f: &Fixture) {
+fn names_are_listed_and_hovered(browser: &Browser, f: &Fixture) {
     let hash = Instances::read(f.run.join("instances.safetensors")).unwrap().1.hash().to_string();
     let names = InstanceNames::read(f.run.join("names.json"), &hash).unwrap();
     let listed = "await page.act('inventory'); return [...document.querySelectorAll('#ranking button')].map((b) => [b.children[1].textContent, b.children[2].textContent])";
-    let rows: Vec<[String; 2]> = serde_json::from_value(browser.js(listed, vec![]).await).unwrap();
+    let rows: Vec<[String; 2]> = serde_json::from_value(browser.js(listed, vec![])).unwrap();
     let count = |row: &[String; 2]| row[1].strip_prefix("× ").unwrap().parse::<usize>().unwrap();
     assert_eq!(rows.iter().map(count).sum::<usize>(), f.instances.count.iter().filter(|&&n| n > 0).count(), "{rows:?}");
-    browser.js("document.querySelector('#ranking button').click(); await page.viewer.busy", vec![]).await;
-    browser.until("page.selectedInstances().length").await;
-    let selected = browser.selected().await;
+    browser.js("document.querySelector('#ranking button').click(); await page.viewer.busy", vec![]);
+    browser.until("page.selectedInstances().length");
+    let selected = browser.selected();
     assert_eq!(selected.len(), count(&rows[0]));
     assert!(selected.iter().all(|&k| names.best(k).is_some_and(|c| c.name == rows[0][0])), "{selected:?} {rows:?}");
-    browser.js("await page.select([])", vec![]).await;
+    browser.js("await page.select([])", vec![]);
     let named = f.places().into_iter().find_map(|(k, view, pixel)| Some((names.best(k)?, view, pixel)));
     let (called, view, pixel) = named.unwrap();
-    browser.point(view, pixel).await;
-    browser.until(&format!("document.getElementById('canvas').title === {}", json!(called.to_string()))).await;
+    browser.point(view, pixel);
+    browser.until(&format!("document.getElementById('canvas').title === {}", json!(called.to_string())));
 }
 
 /// Merging, naming, splitting and the scale: the page's labels are those of `artifacts::Edits`, also after undo and redo.
-async fn edits_are_those_of_the_stages(browser: &Browser, f: &Fixture, path: &Path) {
+fn edits_are_those_of_the_stages(browser: &Browser, f: &Fixture, path: &Path) {
     let split = (0..f.instances.len())
         .find(|&k| f.instances.count[k] > 0 && f.instances.family(k).is_some_and(|x| x.parts.len() > 1));
     let others: Vec<u32> = (0..f.instances.len() as u32).filter(|&k| Some(k as usize) != split).take(3).collect();
@@ -645,15 +615,14 @@ async fn edits_are_those_of_the_stages(browser: &Browser, f: &Fixture, path: &Pa
     ];
     wanted.extend(split.map(|k| json!({"op": "split", "instance": k})));
     for edit in &wanted {
-        browser.js("await page.edit(given[0])", vec![edit.clone()]).await;
+        browser.js("await page.edit(given[0])", vec![edit.clone()]);
     }
     let saved = Edits::read(path).unwrap();
     assert_eq!(saved.edits.len(), wanted.len());
     let mut edited = f.instances.clone();
     let remarks = saved.apply(&mut edited, &f.gaussians().means).unwrap();
     assert_eq!(remarks.names[&others[2]], "grandma's kettle");
-    let page =
-        browser.js("return [page.scene.cells, [...page.instances.label], page.instances.metresPerUnit]", vec![]).await;
+    let page = browser.js("return [page.scene.cells, [...page.instances.label], page.instances.metresPerUnit]", vec![]);
     let cells: Vec<(i32, i32)> = serde_json::from_value(page[0].clone()).unwrap();
     let labels: Vec<i32> = serde_json::from_value(page[1].clone()).unwrap();
     for i in 0..edited.label.len() {
@@ -662,61 +631,61 @@ async fn edits_are_those_of_the_stages(browser: &Browser, f: &Fixture, path: &Pa
         assert_eq!(labels[cell], edited.label[i], "Gaussian {i} of {own:?}");
     }
     assert_eq!(page[2].as_f64(), remarks.metres_per_unit);
-    browser.ask("grandma").await;
-    assert_eq!(browser.selected().await, [others[2]], "a name that a person gave is found");
+    browser.ask("grandma");
+    assert_eq!(browser.selected(), [others[2]], "a name that a person gave is found");
     // Undone to the start and done again.
     for _ in &wanted {
-        browser.js("await page.act('undo')", vec![]).await;
+        browser.js("await page.act('undo')", vec![]);
     }
     assert_eq!(Edits::read(path).unwrap().edits.len(), 0);
-    let label = browser.js("return [...page.instances.label]", vec![]).await;
+    let label = browser.js("return [...page.instances.label]", vec![]);
     assert_eq!(label, json!(cells.iter().map(|c| c.0).collect::<Vec<_>>()));
     for _ in &wanted {
-        browser.js("await page.act('redo')", vec![]).await;
+        browser.js("await page.act('redo')", vec![]);
     }
     assert_eq!(Edits::read(path).unwrap(), saved);
     // The page starts from what was saved.
-    browser.client.refresh().await.unwrap();
-    browser.until("globalThis.explore?.seconds").await;
-    assert_eq!(browser.js("return page.instances.edits.length", vec![]).await, json!(wanted.len()));
+    browser.session.refresh();
+    browser.until("globalThis.explore?.seconds");
+    assert_eq!(browser.js("return page.instances.edits.length", vec![]), json!(wanted.len()));
     // What another program did meanwhile stays, and the page's edit comes after it; it may not be undone unseen.
     let mut elsewhere = Edits::read(path).unwrap();
     elsewhere.edits.push(artifacts::Edit::Rename { instance: others[0], name: "theirs".into() });
     elsewhere.write(path).unwrap();
     let mine = json!({"op": "rename", "instance": others[2], "name": "mine"});
-    browser.js("await page.edit(given[0])", vec![mine]).await;
+    browser.js("await page.edit(given[0])", vec![mine]);
     let both = Edits::read(path).unwrap();
     assert_eq!(both.edits[..wanted.len() + 1], elsewhere.edits);
     assert_eq!(both.edits.len(), wanted.len() + 2);
-    assert_eq!(browser.js("return page.instances.edits.length", vec![]).await, json!(both.edits.len()));
+    assert_eq!(browser.js("return page.instances.edits.length", vec![]), json!(both.edits.len()));
     elsewhere.write(path).unwrap();
-    browser.js("await page.act('undo')", vec![]).await;
+    browser.js("await page.act('undo')", vec![]);
     assert_eq!(Edits::read(path).unwrap(), elsewhere);
-    assert_eq!(browser.js("return page.instances.edits.length", vec![]).await, json!(elsewhere.edits.len()));
+    assert_eq!(browser.js("return page.instances.edits.length", vec![]), json!(elsewhere.edits.len()));
     std::fs::remove_file(path).unwrap();
 }
 
 /// A lasso drawn with the mouse takes from an instance what is seen within it, and gives it what is another's; both are in the file, can
 /// be undone and done again, and are there when the page is opened again, from a server or a file.
-#[tokio::test]
+#[test]
 #[ignore = "needs chromium and a finished run; run scripts/test_explore.sh"]
-async fn a_lasso_corrects_an_instance() {
+fn a_lasso_corrects_an_instance() {
     let f = &Fixture::read();
     let path = &f.run.join("instances.edits.json");
     let _ = std::fs::remove_file(path);
     let (_server, url) = start(explore(), &["serve", "--run-dir", f.run.to_str().unwrap(), "--port", "0"], "look at ");
-    let browser = &Browser::open().await;
-    browser.load(&url).await;
+    let browser = &Browser::open();
+    browser.load(&url);
     let count = |place: &(u32, usize, [u32; 2])| f.instances.count[place.0 as usize];
     let (instance, view, pixel) = f.places().into_iter().max_by_key(count).unwrap();
-    browser.js("await page.selectInstances([given[0]])", vec![instance.into()]).await;
+    browser.js("await page.selectInstances([given[0]])", vec![instance.into()]);
     // A square of 60 pixels of the window around the pixel.
-    let center = browser.place(view, pixel).await;
+    let center = browser.place(view, pixel);
     let square =
         [[-30.0, -30.0], [30.0, -30.0], [30.0, 30.0], [-30.0, 30.0]].map(|[x, y]| [center[0] + x, center[1] + y]);
     let to_view = "const c = page.viewer.camera, o = page.scene.cameras[given[0]], rect = document.getElementById('canvas').getBoundingClientRect(), s = c.width / rect.width; \
                    return given[1].map(([x, y]) => [((x - rect.left) * s - c.cx) / c.fx * o.fx + o.cx, ((y - rect.top) * s - c.cy) / c.fy * o.fy + o.cy])";
-    let corners = browser.js(to_view, vec![view.into(), json!(square)]).await;
+    let corners = browser.js(to_view, vec![view.into(), json!(square)]);
     let corners: Vec<[f64; 2]> = serde_json::from_value(corners).unwrap();
     let camera = &f.views[view].camera;
     // Those with their centre well within that little lies before; with the transmittance before them.
@@ -735,9 +704,9 @@ async fn a_lasso_corrects_an_instance() {
     };
     let mut labels = f.instances.label.clone();
     for (tool, edits, to) in [("remove", 1, -1), ("add", 2, instance as i32)] {
-        browser.js("await page.act(given[0])", vec![tool.into()]).await;
-        browser.drag(&square).await;
-        browser.until(&format!("page.instances.edits.length === {edits} && !page.viewer.busy")).await;
+        browser.js("await page.act(given[0])", vec![tool.into()]);
+        browser.drag(&square);
+        browser.until(&format!("page.instances.edits.length === {edits} && !page.viewer.busy"));
         let saved = Edits::read(path).unwrap();
         let mut edited = f.instances.clone();
         saved.apply(&mut edited, &f.gaussians().means).unwrap();
@@ -759,50 +728,49 @@ async fn a_lasso_corrects_an_instance() {
         let hidden = moved.iter().filter(|&&i| before(i) > 0.95).count();
         assert!(hidden * 20 < moved.len(), "{tool}: {hidden} of {} lie behind something", moved.len());
         labels = edited.label;
-        as_edited(browser, f, instance, &labels, true).await;
+        as_edited(browser, f, instance, &labels, true);
     }
     let saved = Edits::read(path).unwrap();
     for _ in 0..2 {
-        browser.js("await page.act('undo')", vec![]).await;
+        browser.js("await page.act('undo')", vec![]);
     }
-    as_edited(browser, f, instance, &f.instances.label, true).await;
+    as_edited(browser, f, instance, &f.instances.label, true);
     for _ in 0..2 {
-        browser.js("await page.act('redo')", vec![]).await;
+        browser.js("await page.act('redo')", vec![]);
     }
     assert_eq!(Edits::read(path).unwrap(), saved);
-    as_edited(browser, f, instance, &labels, true).await;
-    browser.client.refresh().await.unwrap();
-    browser.until("globalThis.explore?.seconds").await;
-    as_edited(browser, f, instance, &labels, true).await;
+    as_edited(browser, f, instance, &labels, true);
+    browser.session.refresh();
+    browser.until("globalThis.explore?.seconds");
+    as_edited(browser, f, instance, &labels, true);
     // In a file edits can be undone, but there is nothing to draw with.
     let out = f.run.join("edited.html");
     let page = ["page", "--run-dir", f.run.to_str().unwrap(), "--overwrite", "--quiet", "--out", out.to_str().unwrap()];
     assert!(Command::new(explore()).current_dir(ROOT).args(page).status().unwrap().success());
-    browser.load(&format!("file://{}", out.canonicalize().unwrap().display())).await;
-    as_edited(browser, f, instance, &labels, false).await;
-    browser.js("await page.act('undo'); await page.act('undo')", vec![]).await;
-    as_edited(browser, f, instance, &f.instances.label, false).await;
-    browser.js("await page.act('redo'); await page.act('redo')", vec![]).await;
-    as_edited(browser, f, instance, &labels, false).await;
-    assert_eq!(browser.js("return document.getElementById('add')", vec![]).await, Value::Null);
+    browser.load(&format!("file://{}", out.canonicalize().unwrap().display()));
+    as_edited(browser, f, instance, &labels, false);
+    browser.js("await page.act('undo'); await page.act('undo')", vec![]);
+    as_edited(browser, f, instance, &f.instances.label, false);
+    browser.js("await page.act('redo'); await page.act('redo')", vec![]);
+    as_edited(browser, f, instance, &labels, false);
+    assert_eq!(browser.js("return document.getElementById('add')", vec![]), Value::Null);
     std::fs::remove_file(path).unwrap();
-    browser.no_errors().await;
-    browser.client.clone().close().await.unwrap();
+    browser.no_errors();
 }
 
 /// The page has the Gaussians of an instance that these labels say, and saves them; a file only those that are drawn.
-async fn as_edited(browser: &Browser, f: &Fixture, instance: u32, labels: &[i32], served: bool) {
+fn as_edited(browser: &Browser, f: &Fixture, instance: u32, labels: &[i32], served: bool) {
     let own: Vec<u32> = (0..labels.len() as u32).filter(|&i| labels[i as usize] == instance as i32).collect();
     let drawn = own.iter().filter(|&&i| f.gaussians().opacity(i as usize) >= 1.0 / 255.0).count();
     let script = "await page.selectInstances([given[0]]); return page.instances.extent(page.state.cells).count";
-    assert_eq!(browser.js(script, vec![instance.into()]).await, json!(drawn));
-    let saved = read_ply(&browser.saved("save-selection").await);
+    assert_eq!(browser.js(script, vec![instance.into()]), json!(drawn));
+    let saved = read_ply(&browser.saved("save-selection"));
     assert!(if served { saved == f.gaussians().select(&own) } else { saved.len() == drawn });
 }
 
-#[tokio::test]
+#[test]
 #[ignore = "needs chromium and a finished run; run scripts/test_explore.sh"]
-async fn one_file_works_without_a_server() -> Result<()> {
+fn one_file_works_without_a_server() -> Result<()> {
     let f = Fixture::read();
     let out = f.run.join("page-test.html");
     let known = answers(&f.run);
@@ -819,27 +787,26 @@ async fn one_file_works_without_a_server() -> Result<()> {
     ];
     known.iter().for_each(|(text, ..)| arguments.extend(["--text", text]));
     assert!(Command::new(explore()).current_dir(ROOT).args(&arguments).status().unwrap().success());
-    let browser = Browser::open().await;
+    let browser = Browser::open();
     let url = format!("file://{}", out.canonicalize().unwrap().display());
     eprintln!(
         "the file has {:.1} MB, loaded in {:.1} s",
         std::fs::metadata(&out).unwrap().len() as f64 / 1e6,
-        browser.load(&url).await
+        browser.load(&url)
     );
-    pictures_agree(&browser, &f, f.gaussians().sh_degree.min(1)).await;
+    pictures_agree(&browser, &f, f.gaussians().sh_degree.min(1));
     // The page's own picking gives the rasteriser's answers.
-    clicks_select(&browser, &f, 2).await;
+    clicks_select(&browser, &f, 2);
     for (text, selected, gaussians) in &known {
-        browser.ask(text).await;
-        assert_eq!(browser.selected().await, *selected, "{text}");
+        browser.ask(text);
+        assert_eq!(browser.selected(), *selected, "{text}");
         let Some(gaussians) = gaussians else { continue };
-        let saved = read_ply(&browser.saved("save-selection").await);
+        let saved = read_ply(&browser.saved("save-selection"));
         let drawn = (0..gaussians.len()).filter(|&i| gaussians.opacity(i) >= 1.0 / 255.0).count();
         assert_eq!(saved.len(), drawn, "{text}: all that can be seen");
     }
-    let asked = browser.js("return performance.getEntriesByType('resource').map((r) => r.name).filter((n) => !n.startsWith('data:') && !n.startsWith('blob:'))", vec![]).await;
+    let asked = browser.js("return performance.getEntriesByType('resource').map((r) => r.name).filter((n) => !n.startsWith('data:') && !n.startsWith('blob:'))", vec![]);
     assert_eq!(asked, json!([]), "the file asks nobody for anything");
-    browser.no_errors().await;
-    browser.client.clone().close().await.unwrap();
+    browser.no_errors();
     Ok(())
 }
