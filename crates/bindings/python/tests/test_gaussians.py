@@ -3,6 +3,7 @@
 import struct
 
 import numpy as np
+import plyfile
 import pytest
 
 import cags
@@ -91,6 +92,28 @@ def test_files_come_back(cloud, tmp_path, name, error):
     assert len(found) == 40 and np.abs(a - b).max() <= error
     if name == "a.ply":
         assert all((getattr(found, f) == getattr(cloud, f)).all() for f in ["log_scales", "rotations", "opacity_logits", "sh"])
+
+
+@pytest.mark.parametrize("bands", [1, 4, 9, 16])
+def test_plyfile_reads_what_is_written_and_its_files_are_read(tmp_path, bands):
+    r = np.random.default_rng(bands)
+    n, path = 5, tmp_path / "a.ply"
+    cloud = cags.Gaussians(*(r.normal(size=(n, *shape)) for shape in [(3,), (3,), (4,), (), (bands, 3)]))
+    cags.write_ply(path, cloud)
+    vertices = plyfile.PlyData.read(path, mmap=False)["vertex"]
+    of = {f"{name}{j}": column for name, columns in [("scale_", cloud.log_scales), ("rot_", cloud.rotations), ("f_dc_", cloud.sh[:, 0])]
+          for j, column in enumerate(columns.T)}
+    # All coefficients of red, then of green, then of blue.
+    of |= {f"f_rest_{j}": column for j, column in enumerate(cloud.sh[:, 1:].transpose(2, 1, 0).reshape(-1, n))}
+    of |= dict(zip("xyz", cloud.means.T), opacity=cloud.opacity_logits, nx=0, ny=0, nz=0)
+    assert set(of) == set(vertices.data.dtype.names)
+    for name, column in of.items():
+        np.testing.assert_array_equal(vertices[name], column, name)
+    for text, order in [(True, "="), (False, "<"), (False, ">")]:
+        plyfile.PlyData([vertices], text=text, byte_order=order).write(path)
+        found = cags.read_ply(path)
+        for name in ["means", "log_scales", "rotations", "opacity_logits", "sh"]:
+            np.testing.assert_array_equal(getattr(found, name), getattr(cloud, name), name)
 
 
 def test_instances_are_in_the_ply(cloud, tmp_path):

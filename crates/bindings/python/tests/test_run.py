@@ -7,6 +7,7 @@ import sys
 import types
 from pathlib import Path
 
+import jsonschema
 import numpy as np
 import pytest
 
@@ -157,3 +158,28 @@ def test_what_is_no_run_is_refused(tmp_path, folder):
         (broken / name).write_bytes(data)
     with pytest.raises(ValueError, match="instances.safetensors"):
         cags.Run(broken)
+
+
+def test_scene_json_fits_its_schema(folder, tmp_path):
+    schema = json.loads(subprocess.run([PROGRAM, "export", "schema"], check=True, capture_output=True).stdout)
+    jsonschema.Draft202012Validator.check_schema(schema)
+    schema = jsonschema.Draft202012Validator(schema)
+    inputs = ["--geometry", folder / "geometry.ply", "--instances", folder / "instances.safetensors"]
+    named = json.loads((folder / "names.json").read_text())
+    scale = {"op": "scale", "from": [0, 0, 0], "to": [0, 0, 2], "metres": 1}
+    edits = [{"op": "rename", "instance": 0, "name": 'a "mug"'}, scale]
+    text = {"format": "instances.edits", "version": 1, "instances": named["instances"], "edits": edits}
+    (tmp_path / "edits.json").write_text(json.dumps(text))
+    scenes = []
+    for options in [["--run-dir", folder], inputs, [*inputs, "--edits", tmp_path / "edits.json", "--up", "z"]]:
+        subprocess.run([PROGRAM, "export", "scene", *options, "--out", tmp_path / "scene.json", "--overwrite", "--quiet"], check=True)
+        scenes.append(json.loads((tmp_path / "scene.json").read_text()))
+        schema.validate(scenes[-1])
+    whole, bare, edited = scenes
+    assert whole["up"] and bare["up"] is None and not bare["objects"][0]["box"]["upright"]
+    assert edited["metres_per_unit"] == 0.5 and edited["objects"][0]["name"]["from"] == "edits"
+    thing = whole["objects"][0]
+    relation = {"subject": 0, "object": 0, "relation": "beside"}
+    flat = {**thing["box"], "half_size": [-1, 1, 1]}
+    for wrong in [{"version": 2}, {"up": 1}, {"objects": [{**thing, "id": -1}]}, {"objects": [{**thing, "box": flat}]}, {"relations": [relation]}]:
+        assert not schema.is_valid({**whole, **wrong}), wrong

@@ -149,16 +149,8 @@ fn objects_in(folder: &Path) -> Vec<String> {
     names
 }
 
-/// Why a value does not fit the schema of scene.json; empty where it does.
-fn against_schema(schema: &Value, value: &Value) -> String {
-    let (mut all, mut compiler) = (boon::Schemas::new(), boon::Compiler::new());
-    compiler.add_resource("scene.schema.json", schema.clone()).unwrap();
-    let index = compiler.compile("scene.schema.json", &mut all).unwrap();
-    all.validate(value, index).err().map(|e| e.to_string()).unwrap_or_default()
-}
-
 #[test]
-fn scene_json_tells_objects_and_relations_and_fits_its_schema() {
+fn scene_json_tells_objects_and_relations() {
     let run = Run::new();
     let names = Edit::Rename { instance: 1, name: "red \"mug\"".into() };
     run.edits(vec![names, Edit::Scale { from: [0.0; 3], to: [0.0, 0.0, 2.0], metres: 1.0 }]);
@@ -173,18 +165,6 @@ fn scene_json_tells_objects_and_relations_and_fits_its_schema() {
     use RelationKind::{In, NextTo, On, Under};
     assert_eq!(told, [(1, On, 0), (1, NextTo, 3), (2, In, 3), (3, On, 0), (4, Under, 0)]);
 
-    let printed = Command::new(env!("CARGO_BIN_EXE_export")).arg("schema").output().unwrap();
-    let schema: Value = serde_json::from_slice(&printed.stdout).unwrap();
-    let text: Value = serde_json::from_slice(&std::fs::read(run.path("scene.json")).unwrap()).unwrap();
-    assert_eq!(against_schema(&schema, &text), "");
-    // And the schema refuses what is none.
-    for change in
-        ["/objects/0/box/half_size/0", "/relations/0/relation", "/version", "/objects/1/best_view/mask", "/up"]
-    {
-        let mut damaged = text.clone();
-        *damaged.pointer_mut(change).unwrap() = json!(-1.5);
-        assert!(!against_schema(&schema, &damaged).is_empty(), "{change}");
-    }
     // A vocabulary names what nobody else did, and a guess is said to be one.
     let hash = Instances::read(run.path("instances.safetensors")).unwrap().1.hash().to_string();
     let naming = |instance: u32, name: &str, sure: bool| json!({"instance": instance, "names": [{"name": name, "score": 0.5}], "margin": 0.1, "sure": sure});
@@ -198,14 +178,11 @@ fn scene_json_tells_objects_and_relations_and_fits_its_schema() {
     let scene = Scene::read(run.path("scene.json")).unwrap();
     let called = scene.objects.iter().map(|o| o.name.as_ref().map_or("-".into(), ToString::to_string));
     assert_eq!(called.collect::<Vec<_>>(), ["table", "red \"mug\"", "box?", "-", "-"]);
-    let text: Value = serde_json::from_slice(&std::fs::read(run.path("scene.json")).unwrap()).unwrap();
-    assert_eq!(against_schema(&schema, &text), "");
     by_words("other");
     run.fail("scene", "new.json", &["--names", "names.json"], &["names of other instances", "run eval names again"]);
-    // Without what is up there are no boxes that stand upright, and that fits too.
+    // Without what is up there are no boxes that stand upright.
     run.succeed("scene", "bare.json", &[]);
     let bare: Value = serde_json::from_slice(&std::fs::read(run.path("bare.json")).unwrap()).unwrap();
-    assert_eq!(against_schema(&schema, &bare), "");
     assert_eq!((&bare["up"], &bare["objects"][0]["box"]["upright"]), (&Value::Null, &json!(false)));
 }
 
@@ -232,8 +209,6 @@ fn cameras_tell_what_is_up_and_queries_what_things_are_called() {
     let unseen: Vec<f32> = scene.objects.iter().map(|o| o.unseen.unwrap()).collect();
     // The table has so few Gaussians that one sees through; the mug's bottom stands on it; the book lies in a box.
     assert!(unseen[0] < 0.1 && (0.16..0.7).contains(&unseen[1]) && unseen[2] == 1.0, "{unseen:?}");
-    let schema = serde_json::from_str(objects::SCHEMA).unwrap();
-    assert_eq!(against_schema(&schema, &serde_json::to_value(&scene).unwrap()), "");
     record["inputs"]["instances"] = json!("0123456789abcdef");
     std::fs::write(run.path("query.json.run.json"), record.to_string()).unwrap();
     run.fail("scene", "b.json", &["--query", "query.json"], &["queries of other instances; found 0123456789ab"]);
