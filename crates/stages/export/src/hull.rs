@@ -3,12 +3,11 @@
 use crate::mesh::Mesh;
 use glam::DVec3;
 use objects::ObjectBox;
-use parry3d_f64::math::Vector;
-use parry3d_f64::transformation::try_convex_hull;
+use robust::{Coord3D, orient3d};
 use std::collections::BTreeSet;
 use std::f64::consts::TAU;
 
-/// Least half side of the box that takes the place of a hull, in half its longest side: physics needs a volume.
+/// Least thickness of a hull, in its length, and of the box that takes the place of a thinner one: physics needs a volume.
 const THINNEST: f32 = 1e-3;
 
 /// A closed convex mesh of at most `vertices` corners around those centres that lie in the box, each of them the outermost in
@@ -48,21 +47,38 @@ fn outermost(points: &[DVec3], count: usize) -> Vec<DVec3> {
     chosen
 }
 
-/// The convex hull; none where the points span no volume.
+/// The convex hull; none where the points are flat. Grown point by point from a tetrahedron; signs of volumes are exact, so that it is
+/// closed wherever the points lie.
 fn convex(points: &[DVec3]) -> Option<Mesh> {
-    if points.len() < 4 {
+    let coord = |i: usize| Coord3D { x: points[i].x, y: points[i].y, z: points[i].z };
+    let beyond = |[a, b, c]: [usize; 3], p: usize| -orient3d(coord(a), coord(b), coord(c), coord(p));
+    let most = |of: &dyn Fn(usize) -> f64| (0..points.len()).max_by(|&i, &j| of(i).total_cmp(&of(j)));
+    let a = most(&|i| -points[i].x)?;
+    let b = most(&|i| points[i].distance_squared(points[a]))?;
+    let c = most(&|i| (points[i] - points[a]).cross(points[b] - points[a]).length_squared())?;
+    let d = most(&|i| beyond([a, b, c], i).abs())?;
+    let volume = beyond([a, b, c], d);
+    let [ab, ac] = [b, c].map(|i| points[i] - points[a]);
+    // Points of a tilted plane, rounded, are not quite in one.
+    if volume.abs() <= f64::from(THINNEST) * ab.length() * ab.cross(ac).length() {
         return None;
     }
-    // Around their middle and of size 1: the library's tolerances are absolute.
-    let middle = points.iter().sum::<DVec3>() / points.len() as f64;
-    let size = points.iter().map(|p| p.distance(middle)).fold(0.0, f64::max);
-    if !(size > 0.0 && size.is_finite()) {
-        return None;
+    let (b, c) = if volume < 0.0 { (b, c) } else { (c, b) };
+    // Counterclockwise as seen from outside.
+    let mut faces = vec![[a, b, c], [b, a, d], [c, b, d], [a, c, d]];
+    for p in 0..points.len() {
+        let (seen, hidden): (Vec<_>, Vec<_>) = faces.into_iter().partition(|&face| beyond(face, p) > 0.0);
+        let edges = || seen.iter().flat_map(|&[a, b, c]| [[a, b], [b, c], [c, a]]);
+        let rim = edges().filter(|&[a, b]| !edges().any(|edge| edge == [b, a]));
+        faces = hidden;
+        faces.extend(rim.map(|[a, b]| [a, b, p]));
     }
-    let scaled: Vec<Vector> = points.iter().map(|p| ((*p - middle) / size).to_array().into()).collect();
-    let (corners, triangles) = try_convex_hull(&scaled).ok()?;
-    let place = |v: &Vector| (DVec3::new(v.x, v.y, v.z) * size + middle).as_vec3().to_array();
-    Some(Mesh { vertices: corners.iter().map(place).collect(), triangles })
+    let corners: Vec<usize> = faces.iter().flatten().copied().collect::<BTreeSet<_>>().into_iter().collect();
+    let number = |i: usize| corners.partition_point(|&c| c < i) as u32;
+    Some(Mesh {
+        vertices: corners.iter().map(|&i| points[i].as_vec3().to_array()).collect(),
+        triangles: faces.iter().map(|face| face.map(number)).collect(),
+    })
 }
 
 /// A box as a mesh.
@@ -82,6 +98,7 @@ fn of_box(bounds: &ObjectBox) -> Mesh {
 mod tests {
     use super::*;
     use objects::upright_box;
+    use proptest::prelude::*;
 
     fn grid(size: [f32; 3], at: [f32; 3]) -> Vec<[f32; 3]> {
         let steps = || (0..=10).map(|i| i as f32 / 10.0);
@@ -119,6 +136,28 @@ mod tests {
         assert!(mesh.vertices.iter().all(|v| spread.iter().any(|p| (0..3).all(|c| (p[c] - v[c]).abs() < 1e-5))));
     }
 
+    proptest! {
+        #[test]
+        fn hulls_are_closed_and_hold_all_points(
+            points in prop::collection::vec(prop::array::uniform3(-3i8..4), 4..40),
+            scale in 1e-3f32..1e3,
+            jitter in prop::array::uniform3(-1e-6f32..1e-6),
+        ) {
+            // Many of a grid lie in one plane or on one line; some no more quite.
+            let place = |(i, p): (usize, &[i8; 3])| {
+                DVec3::from([0, 1, 2].map(|c| f64::from(f32::from(p[c]) * scale + if i % 3 == 0 { jitter[c] } else { 0.0 })))
+            };
+            let points: Vec<DVec3> = points.iter().enumerate().map(place).collect();
+            let Some(mesh) = convex(&points) else { return Ok(()) };
+            prop_assert!(mesh.is_closed() && mesh.volume() > 0.0);
+            let coord = |p: DVec3| Coord3D { x: p.x, y: p.y, z: p.z };
+            for t in &mesh.triangles {
+                let [a, b, c] = t.map(|i| coord(DVec3::from(mesh.vertices[i as usize].map(f64::from))));
+                prop_assert!(points.iter().all(|&p| orient3d(a, b, c, coord(p)) >= 0.0));
+            }
+        }
+    }
+
     fn outermost_of_a_ball() -> Vec<[f32; 3]> {
         (0..4000u32)
             .map(|i| {
@@ -134,7 +173,8 @@ mod tests {
     fn what_has_no_volume_gets_its_box() {
         let flat: Vec<[f32; 3]> = (0..100).map(|i| [(i % 10) as f32, (i / 10) as f32, 2.0]).collect();
         let line: Vec<[f32; 3]> = (0..100).map(|i| [i as f32, i as f32, 2.0]).collect();
-        for points in [flat, line, vec![[1.0, 2.0, 3.0]; 30], vec![[1.0; 3]]] {
+        let tilted: Vec<[f32; 3]> = flat.iter().map(|&[x, y, _]| [x, y, 0.3 * x + 0.7 * y + 50.0]).collect();
+        for points in [flat, tilted, line, vec![[1.0, 2.0, 3.0]; 30], vec![[1.0; 3]]] {
             let (mesh, is_box) = of(&points);
             assert!(is_box && mesh.is_closed() && mesh.volume() > 0.0, "{mesh:?}");
         }
