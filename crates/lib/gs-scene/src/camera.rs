@@ -29,6 +29,18 @@ impl Camera {
         -(self.rotation.transpose() * self.translation)
     }
 
+    /// The pose in the world, world from camera, in rows.
+    pub fn pose(&self) -> [[f64; 4]; 4] {
+        let (r, p) = (self.rotation.transpose(), self.position());
+        let row = |i: usize| [r.x_axis[i], r.y_axis[i], r.z_axis[i], p[i]];
+        [row(0), row(1), row(2), [0.0, 0.0, 0.0, 1.0]]
+    }
+
+    /// The same with the camera in OpenGL's axes: x right, y up, looking along -z.
+    pub fn opengl_pose(&self) -> [[f64; 4]; 4] {
+        self.pose().map(|[x, y, z, w]| [x, -y, -z, w])
+    }
+
     /// A point of the world in camera coordinates.
     pub fn to_camera(&self, world: DVec3) -> DVec3 {
         self.rotation * world + self.translation

@@ -22,6 +22,7 @@ pub use mask::Odd;
 use rayon::prelude::*;
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
+pub use transforms::write as write_transforms;
 use upright::Turn;
 pub use view::View;
 use view::stems;

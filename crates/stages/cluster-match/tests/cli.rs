@@ -53,21 +53,13 @@ impl Scene {
         for v in 0..VIEWS {
             let eye = DVec3::new(v as f64 * 0.1 - 0.15, -0.1, -3.0);
             let c = Camera::look_at(eye, DVec3::ZERO, DVec3::NEG_Y, SIZE as u32, SIZE as u32, 0.9);
-            let (r, t) = (c.rotation.transpose(), c.position());
-            // OpenGL axes: y and z turned round.
-            let row = |i: usize| [r.col(0)[i], -r.col(1)[i], -r.col(2)[i], t[i]];
-            frames.push(json!({
-                "file_path": format!("images/v{v}.png"),
-                "transform_matrix": [row(0), row(1), row(2), [0.0, 0.0, 0.0, 1.0]],
-            }));
+            frames.push((format!("images/v{v}.png"), c));
             let (w, n) = (SIZE as u32, SIZE * SIZE);
             Image { width: w, height: w, rgb: vec![0.5; 3 * n], alpha: None }
                 .write_png(s.path(&format!("images/v{v}.png")))
                 .unwrap();
         }
-        let f = 0.5 * SIZE as f64 / 0.45f64.tan();
-        let transforms = json!({ "w": SIZE, "h": SIZE, "fl_x": f, "fl_y": f, "frames": frames });
-        std::fs::write(s.path("transforms.json"), transforms.to_string()).unwrap();
+        dataset::write_transforms(&s.path("transforms.json"), &frames, [0.0; 3]).unwrap();
         ply::write_gaussians(s.path("geometry.ply"), &gaussians(), &[]).unwrap();
         for v in 0..VIEWS {
             s.masks(v, &s.seen(v));

@@ -92,16 +92,12 @@ impl Run {
             let (sin, cos) = (f64::from(v) * 1.3).sin_cos();
             let eye = glam::DVec3::new(1.0 + 3.0 * cos, 0.5 + 3.0 * sin, 2.5);
             let c = Camera::look_at(eye, glam::DVec3::new(1.0, 0.5, 0.7), glam::DVec3::Z, 16, 16, 1.0);
-            let (r, t) = (c.rotation.transpose(), c.position());
-            let row = |i: usize| [r.col(0)[i], -r.col(1)[i], -r.col(2)[i], t[i]];
             let name = format!("images/v{v}.png");
-            frames.push(json!({"file_path": name, "transform_matrix": [row(0), row(1), row(2), [0.0, 0.0, 0.0, 1.0]]}));
             let image = Image { width: 16, height: 16, rgb: vec![0.5; 3 * 256], alpha: None };
             image.write_png(self.path(&format!("photos/{name}"))).unwrap();
+            frames.push((name, c));
         }
-        let f = 8.0 / 0.5f64.tan();
-        let transforms = json!({ "w": 16, "h": 16, "fl_x": f, "fl_y": f, "frames": frames });
-        std::fs::write(self.path("photos/transforms.json"), transforms.to_string()).unwrap();
+        gs_scene::dataset::write_transforms(&self.path("photos/transforms.json"), &frames, [0.0; 3]).unwrap();
     }
 
     fn edits(&self, edits: Vec<Edit>) {

@@ -4,7 +4,7 @@ mod common;
 
 use common::world::{SIZE, balls, photograph, ring, write_scene};
 use common::{Folder, json, killed, record, succeeds, training};
-use glam::{DMat4, DVec3, DVec4};
+use glam::DVec3;
 use gs_raster::{RasterOptions, render};
 use gs_scene::dataset::{self, LoadOptions};
 use gs_scene::{Camera, Image, PointCloud, ply};
@@ -139,7 +139,6 @@ fn depth_images_give_the_points() {
     let (scene, out) = (dir.path("scene"), dir.path("g.ply"));
     fs::create_dir_all(dir.path("scene/images")).unwrap();
     fs::create_dir_all(dir.path("scene/depth")).unwrap();
-    let flip = DMat4::from_diagonal(DVec4::new(1.0, -1.0, -1.0, 1.0));
     let frames: Vec<_> = ring(6)
         .iter()
         .enumerate()
@@ -149,10 +148,9 @@ fn depth_images_give_the_points() {
             let depth = r.depth.iter().zip(&r.alpha).map(|(z, a)| if *a > 0.9 { (1000.0 * z / a) as u16 } else { 0 });
             let depth = ImageBuffer::<Luma<u16>, _>::from_vec(SIZE.0, SIZE.1, depth.collect()).unwrap();
             depth.save(dir.path(&format!("scene/depth/{i}.png"))).unwrap();
-            let pose = DMat4::from_translation(c.position()) * DMat4::from_mat3(c.rotation.transpose()) * flip;
             json!({
                 "file_path": format!("images/{i}.png"), "depth_file_path": format!("depth/{i}.png"),
-                "transform_matrix": pose.transpose().to_cols_array_2d(),
+                "transform_matrix": c.opengl_pose(),
             })
         })
         .collect();

@@ -157,10 +157,7 @@ fn masks_that_the_frames_name_are_used_and_odd_ones_are_said() {
         // 0 and 1, as many programs write them; the right half does not count.
         let mask: Vec<u8> = (0..PIXELS).map(|p| u8::from(p % (SIZE.0 as usize) < SIZE.0 as usize / 2)).collect();
         image::save_buffer(Path::new(&masks).join(&view.name), &mask, SIZE.0, SIZE.1, image::ColorType::L8).unwrap();
-        let (c, p) = (&view.camera, view.camera.position());
-        let r = c.rotation.transpose();
-        let rows: Vec<[f64; 4]> = (0..3).map(|i| [r.x_axis[i], -r.y_axis[i], -r.z_axis[i], p[i]]).collect();
-        json!({"file_path": format!("images/{}", view.name), "mask_path": format!("masks/{}", view.name), "transform_matrix": rows})
+        json!({"file_path": format!("images/{}", view.name), "mask_path": format!("masks/{}", view.name), "transform_matrix": view.camera.opengl_pose()})
     };
     let c = &views[0].camera;
     let frames: Vec<Value> = views.iter().map(frame).collect();

@@ -3,13 +3,13 @@
 
 use crate::scene::Scene;
 use crate::truth::named::{self, Named};
-use crate::truth::{scannet, write_json};
+use crate::truth::scannet;
 use artifacts::{LERF_OVS, LerfScene, TruePoints};
 use clap::ValueEnum;
 use gs_io::{Error, Result, write_bytes};
+use gs_scene::dataset::write_transforms;
 use gs_scene::{Camera, PointCloud, colmap};
 use serde::{Serialize, Serializer};
-use serde_json::{Value, json};
 use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
 
@@ -146,7 +146,7 @@ impl Layout {
         match self {
             Self::Colmap | Self::LerfOvs(_) => colmap::write_model(&out.join("sparse/0"), views, sparse),
             Self::Scan { converted: false, .. } => write_poses(out, views),
-            Self::Scan { converted: true, .. } => write_transforms(out, views),
+            Self::Scan { converted: true, .. } => write_opengaussian(out, views),
         }
     }
 
@@ -174,13 +174,6 @@ fn frames(scene: &LerfScene, views: usize) -> BTreeSet<u32> {
     chosen
 }
 
-/// The pose of a camera in the world, in rows of 4x4 numbers.
-fn world_from_camera(camera: &Camera) -> [[f64; 4]; 4] {
-    let (r, c) = (camera.rotation.transpose(), camera.position());
-    let row = |k: usize| [r.x_axis[k], r.y_axis[k], r.z_axis[k], c[k]];
-    [row(0), row(1), row(2), [0.0, 0.0, 0.0, 1.0]]
-}
-
 fn text(rows: &[[f64; 4]; 4]) -> String {
     rows.iter().map(|r| r.map(|v| format!("{v:.9}")).join(" ") + "\n").collect()
 }
@@ -188,7 +181,7 @@ fn text(rows: &[[f64; 4]; 4]) -> String {
 fn write_poses(out: &Path, views: &[(String, Camera)]) -> Result<()> {
     for (name, camera) in views {
         let path = out.join("pose").join(name).with_extension("txt");
-        write_bytes(&path, text(&world_from_camera(camera)).as_bytes())?;
+        write_bytes(&path, text(&camera.pose()).as_bytes())?;
     }
     let Some((_, k)) = views.first() else { return Ok(()) };
     let intrinsic = [[k.fx, 0.0, k.cx, 0.0], [0.0, k.fy, k.cy, 0.0], [0.0, 0.0, 1.0, 0.0], [0.0, 0.0, 0.0, 1.0]];
@@ -196,17 +189,10 @@ fn write_poses(out: &Path, views: &[(String, Camera)]) -> Result<()> {
 }
 
 /// OpenGaussian lists all frames in both files, cameras in OpenGL's axes, names without extension.
-fn write_transforms(out: &Path, views: &[(String, Camera)]) -> Result<()> {
-    let Some((_, k)) = views.first() else { return Ok(()) };
-    let frame = |(name, camera): &(String, Camera)| -> Value {
-        let rows = world_from_camera(camera).map(|[x, y, z, w]| [x, -y, -z, w]);
-        json!({ "file_path": format!("color/{}", name.trim_end_matches(".png")), "transform_matrix": rows })
-    };
-    let frames: Vec<Value> = views.iter().map(frame).collect();
-    let all = json!({
-        "w": k.width, "h": k.height, "fl_x": k.fx, "fl_y": k.fy, "cx": k.cx, "cy": k.cy, "frames": frames,
-    });
-    TRANSFORMS.iter().try_for_each(|name| write_json(&out.join(name), &all))
+fn write_opengaussian(out: &Path, views: &[(String, Camera)]) -> Result<()> {
+    let names = views.iter().map(|(name, camera)| (format!("color/{}", name.trim_end_matches(".png")), camera.clone()));
+    let views: Vec<_> = names.collect();
+    TRANSFORMS.iter().try_for_each(|name| write_transforms(&out.join(name), &views, [0.0; 3]))
 }
 
 #[cfg(test)]

@@ -5,10 +5,10 @@ use super::names::{check_inside, file_named, plain};
 use super::upright::{Turn, size_by_center};
 use super::{Format, RawDataset, RawView, Split, invert_pose, read_text};
 use crate::lens::{Distortion, Lens};
-use crate::{PointCloud, ply};
+use crate::{Camera, PointCloud, ply};
 use glam::{DMat4, DVec4};
-use gs_io::{Error, Result};
-use serde_json::Value;
+use gs_io::{Error, Result, write_json};
+use serde_json::{Value, json};
 use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
 
@@ -19,6 +19,26 @@ pub(super) fn find(root: &Path) -> Vec<Vec<PathBuf>> {
     let there = |names: &[&str]| names.iter().map(|n| root.join(n)).filter(|p| p.is_file()).collect::<Vec<PathBuf>>();
     let parts = [&["transforms.json"][..], &["transforms_train.json", "transforms_test.json"]];
     parts.into_iter().map(there).filter(|files| !files.is_empty()).collect()
+}
+
+/// Writes views, file names and cameras in the world less `shift`, that all have the intrinsics of the first.
+///
+/// # Errors
+/// When the file can't be written.
+pub fn write(path: &Path, views: &[(String, Camera)], shift: [f64; 3]) -> Result<()> {
+    let Some((_, c)) = views.first() else { return Ok(()) };
+    let frame = |(name, camera): &(String, Camera)| -> Value {
+        let mut pose = camera.opengl_pose();
+        pose.iter_mut().zip(shift).for_each(|(row, shift)| row[3] += shift);
+        json!({"file_path": name, "transform_matrix": pose})
+    };
+    let frames: Vec<Value> = views.iter().map(frame).collect();
+    write_json(
+        path,
+        &json!({
+            "camera_model": "PINHOLE", "w": c.width, "h": c.height, "fl_x": c.fx, "fl_y": c.fy, "cx": c.cx, "cy": c.cy, "frames": frames,
+        }),
+    )
 }
 
 /// Reads views from the files; the split comes from the names `transforms_train.json` and `transforms_test.json`, or

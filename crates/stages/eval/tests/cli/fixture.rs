@@ -54,13 +54,10 @@ impl Fixture {
             let out = gs_raster::render(&g, camera, &RasterOptions::default());
             let image = Image { width: WIDTH, height: HEIGHT, rgb: out.rgb, alpha: None };
             image.write_png(scene.join(format!("images/{name}.png"))).unwrap();
-            frames.push(json!({"file_path": format!("images/{name}.png"), "transform_matrix": opengl_pose(camera)}));
+            frames.push((format!("images/{name}.png"), camera.clone()));
             f.write_masks(i, camera);
         }
-        let c = &cameras()[0];
-        let transforms =
-            json!({"w": WIDTH, "h": HEIGHT, "fl_x": c.fx, "fl_y": c.fy, "cx": c.cx, "cy": c.cy, "frames": frames});
-        std::fs::write(scene.join("transforms.json"), transforms.to_string()).unwrap();
+        dataset::write_transforms(&scene.join("transforms.json"), &frames, [0.0; 3]).unwrap();
         for i in [1, 4] {
             f.write_label(i, &[("red ball", 0), ("blue ball", 1)], (WIDTH, HEIGHT));
         }
@@ -285,12 +282,6 @@ pub fn cameras() -> Vec<Camera> {
         DVec3::new(4.0 * a.cos(), 4.0 * a.sin(), 1.5)
     };
     (0..VIEWS).map(|i| Camera::look_at(eye(i), DVec3::new(0.0, 0.0, 0.3), DVec3::Z, WIDTH, HEIGHT, 0.8)).collect()
-}
-
-fn opengl_pose(c: &Camera) -> [[f64; 4]; 4] {
-    let (m, p) = (c.rotation.transpose(), c.position());
-    let row = |r: usize| [m.x_axis[r], -m.y_axis[r], -m.z_axis[r], p[r]];
-    [row(0), row(1), row(2), [0.0, 0.0, 0.0, 1.0]]
 }
 
 fn groups() -> Vec<usize> {

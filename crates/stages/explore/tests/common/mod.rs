@@ -63,15 +63,9 @@ impl Run {
             let rgb = gs_raster::render(&g, &camera, &gs_raster::RasterOptions::default()).rgb;
             let name = format!("images/f{k}.png");
             Image { width: SIZE.0, height: SIZE.1, rgb, alpha: None }.write_png(scene.join(&name)).unwrap();
-            let (r, eye) = (camera.rotation, camera.position());
-            // OpenGL: y up, z backwards.
-            let row = |i: usize| [r.row(0)[i], -r.row(1)[i], -r.row(2)[i], eye[i]];
-            frames.push(json!({"file_path": name, "transform_matrix": [row(0), row(1), row(2), [0.0, 0.0, 0.0, 1.0]]}));
+            frames.push((name, camera));
         }
-        let c = camera(0.0);
-        let transforms =
-            json!({"w": SIZE.0, "h": SIZE.1, "fl_x": c.fx, "fl_y": c.fy, "cx": c.cx, "cy": c.cy, "frames": frames});
-        std::fs::write(scene.join("transforms.json"), transforms.to_string()).unwrap();
+        dataset::write_transforms(&scene.join("transforms.json"), &frames, [0.0; 3]).unwrap();
         let provenance = || run.provenance();
         let edge = |parent, child, instance| TreeEdge { parent, child, lambda: 1.0, size: 1, instance };
         let instances = Instances {

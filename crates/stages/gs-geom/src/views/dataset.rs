@@ -1,11 +1,10 @@
 //! The files of the dataset.
 
 use super::options::Size;
-use glam::{DMat4, DVec3, DVec4};
-use gs_io::{Result, write_bytes, write_json};
+use gs_io::{Result, write_bytes};
+use gs_scene::dataset::write_transforms;
 use gs_scene::{Camera, Gaussians, PointCloud, colmap};
 use report::picture::Picture;
-use serde_json::{Value, json};
 use std::path::Path;
 
 /// Most centres of Gaussians among the sparse points.
@@ -33,21 +32,8 @@ pub fn write_cameras(folder: &Path, cameras: &[Camera], g: &Gaussians, counted: 
         shift: g.shift,
     };
     colmap::write_model(&folder.join("sparse/0"), &views, &points)?;
-    let frames: Vec<Value> = views.iter().map(|(name, camera)| frame(name, camera, g.shift.into())).collect();
-    let c = &cameras[0];
-    let transforms = json!({
-        "camera_model": "PINHOLE", "w": c.width, "h": c.height, "fl_x": c.fx, "fl_y": c.fy, "cx": c.cx, "cy": c.cy,
-        "frames": frames,
-    });
-    write_json(folder.join("transforms.json"), &transforms)
-}
-
-/// A frame of transforms.json, of a camera in the world less `shift`: the pose from camera to world, in OpenGL's axes (x right, y up, looking along -z).
-fn frame(name: &str, camera: &Camera, shift: DVec3) -> Value {
-    let pose = DMat4::from_mat3(camera.rotation.transpose());
-    let flip = DMat4::from_diagonal(DVec4::new(1.0, -1.0, -1.0, 1.0));
-    let pose = (DMat4::from_translation(camera.position() + shift) * pose * flip).transpose().to_cols_array_2d();
-    json!({"file_path": format!("images/{name}"), "transform_matrix": pose})
+    let views: Vec<_> = views.into_iter().map(|(name, camera)| (format!("images/{name}"), camera)).collect();
+    write_transforms(&folder.join("transforms.json"), &views, g.shift)
 }
 
 /// Small pictures side by side.
