@@ -7,9 +7,9 @@ use crate::doubt::Doubt;
 use crate::inputs::Inputs;
 use crate::options::Settings;
 use crate::plane::Place;
-use crate::profile::{Profile, some_views, units};
+use crate::profile::{Pieces, Profile, some_views, units};
 use crate::surface::{Points, Touch};
-use artifacts::{Graph, Level};
+use artifacts::{Footprints, Graph, Level};
 use gs_io::Result;
 use hdbscan_exact::{Clustering, Edge, Options, Selection, cluster_graph};
 use rayon::prelude::*;
@@ -38,35 +38,29 @@ pub const MOST_ENTRIES: u64 = 1 << 27;
 const FIRM: f64 = 0.7;
 
 /// Clusters the kept Gaussians by the masks at `levels`: neighbours that agree by `least`, then pieces that do not touch and agree by
-/// `join`; 0 joins none of those. The tree above goes on to where nothing agrees.
+/// `join`; 0 joins none of those. The tree above goes on to where nothing agrees. `points` are those of the inputs, once somebody needed
+/// them.
 ///
 /// # Errors
 /// When the footprints can't be read.
-pub fn cluster(
-    inputs: &Inputs,
-    points: &Points,
+pub fn cluster<'a>(
+    inputs: &'a Inputs,
+    points: &mut Option<Points<'a>>,
     settings: &Settings,
     levels: &[Level],
     (least, join): (f64, f64),
 ) -> Result<Clustering> {
-    let (graph, footprints, n) = (&inputs.graph, &inputs.footprints, inputs.graph.kept.len());
-    let unit_of = units(footprints);
+    let (graph, n) = (&inputs.graph, inputs.graph.kept.len());
+    let unit_of = units(&inputs.footprints);
     let hdbscan = settings.hdbscan();
     // Two distances that nothing else has part what is one instance from what is not.
     let cut = distance(least);
     let (within, above) = ((0.0, cut), (cut + 2.0 * APART, f64::MAX));
-    let views = some_views(footprints, levels, MOST_ENTRIES);
-    let own: Vec<i32> = (0..n as i32).collect();
-    let profiles = Profile::of_pieces(&own, n, footprints, levels, &views)?;
-    let mut linkage = Linkage::new(profiles, &neighbours(graph), &unit_of);
-    if views.contains(&false) {
-        linkage.join(FIRM, usize::MAX, within);
-        let (labels, count) = linkage.labels();
-        let profiles = Profile::of_pieces(&labels, count, footprints, levels, &vec![true; views.len()])?;
-        // Some may have had no view in common before.
-        linkage.see(profiles, neighbours(graph));
-    }
-    linkage.join(FIRM.max(least), usize::MAX, within);
+    let mut linkage = firm(graph, &inputs.footprints, levels, &unit_of, (FIRM.max(least), within))?;
+    let points = match points {
+        Some(points) => points,
+        none => none.insert(Points::of(inputs)?),
+    };
     linkage.start_to_doubt(&points.rims(&linkage.labels().0));
     linkage.join(least, usize::MAX, within);
     linkage.doubt = None;
@@ -84,13 +78,45 @@ pub fn cluster(
     Ok(cluster_graph(n, linkage.edges, &options))
 }
 
+/// The first merge: what agrees by `least`.
+fn firm<'a>(
+    graph: &Graph,
+    footprints: &Footprints,
+    levels: &[Level],
+    unit_of: &'a [u32],
+    (least, within): (f64, (f64, f64)),
+) -> Result<Linkage<'a>> {
+    let views = some_views(footprints, levels, MOST_ENTRIES);
+    let own: Vec<i32> = (0..graph.kept.len() as i32).collect();
+    let pieces = Pieces::of(&own, own.len(), footprints, levels, &views)?;
+    let mut linkage = Linkage::new(pieces.profiles(), &neighbours(graph), unit_of);
+    if !views.contains(&false) {
+        linkage.join(least, usize::MAX, within);
+        return Ok(linkage.into_owned(unit_of));
+    }
+    linkage.join(FIRM, usize::MAX, within);
+    linkage.profiles.fill(Profile::default());
+    let linkage = linkage.into_owned(unit_of);
+    drop(pieces);
+    let (labels, count) = linkage.labels();
+    let pieces = Pieces::of(&labels, count, footprints, levels, &vec![true; views.len()])?;
+    let mut linkage: Linkage<'_> = linkage;
+    // Some may have had no view in common before.
+    linkage.see(pieces.profiles(), neighbours(graph));
+    linkage.join(least, usize::MAX, within);
+    Ok(linkage.into_owned(unit_of))
+}
+
 /// Pairs of spatial neighbours, each once.
 fn neighbours(graph: &Graph) -> Vec<(u32, u32)> {
-    let of = |i: u32| graph.gaussian_knn.row(i as usize).into_iter().map(move |&j| (i.min(j), i.max(j)));
-    // Rows are padded with the Gaussian itself.
-    let mut pairs: Vec<(u32, u32)> = (0..graph.kept.len() as u32).flat_map(of).filter(|(a, b)| a < b).collect();
+    let row = |i: u32| graph.gaussian_knn.row(i as usize);
+    // By the first of both, where that knows the second. Rows are padded with the Gaussian itself.
+    let own = |i: u32| {
+        let others = row(i).into_iter().filter(move |&&j| i < j || (j < i && !row(j).iter().any(|&k| k == i)));
+        others.map(move |&j| (i.min(j), i.max(j)))
+    };
+    let mut pairs: Vec<(u32, u32)> = (0..graph.kept.len() as u32).into_par_iter().flat_map_iter(own).collect();
     pairs.par_sort_unstable();
-    pairs.dedup();
     pairs
 }
 
@@ -106,16 +132,21 @@ fn distance(agreement: f64) -> f64 {
     FLOOR + 1.0 - agreement
 }
 
+/// A cluster that another may join, and how far they agree. Packed: with the masks of single Gaussians these have most of the memory.
+#[derive(Clone, Copy)]
+#[repr(Rust, packed(4))]
+struct Near(u32, f64);
+
 /// Clusters that are joined step by step.
 pub struct Linkage<'a> {
     unit_of: &'a [u32],
-    profiles: Vec<Profile>,
+    profiles: Vec<Profile<'a>>,
     /// Members of each cluster; 0 for one that has joined another.
     sizes: Vec<usize>,
     /// How much more two must agree because of their size and shape, while that counts ([`Linkage::start_to_doubt`]).
     doubt: Option<Doubt>,
     /// Those that each cluster may join, and its agreement with them.
-    near: Vec<Vec<(u32, f64)>>,
+    near: Vec<Vec<Near>>,
     /// Where clusters lie, once those that don't touch may join ([`Linkage::meet`]).
     places: Vec<Place>,
     /// The cluster that each joined, or itself.
@@ -128,7 +159,7 @@ pub struct Linkage<'a> {
 
 impl<'a> Linkage<'a> {
     /// Clusters of one each, of which these `pairs` may join.
-    pub fn new(profiles: Vec<Profile>, pairs: &[(u32, u32)], unit_of: &'a [u32]) -> Self {
+    pub fn new(profiles: Vec<Profile<'a>>, pairs: &[(u32, u32)], unit_of: &'a [u32]) -> Self {
         let n = profiles.len();
         // Lists that grow take up to twice their memory.
         let mut counts = vec![0; n];
@@ -148,6 +179,13 @@ impl<'a> Linkage<'a> {
         out
     }
 
+    /// The same with profiles of its own.
+    fn into_owned(self, unit_of: &[u32]) -> Linkage<'_> {
+        let Self { profiles, sizes, doubt, near, places, into, edges, heights, .. } = self;
+        let profiles = profiles.into_iter().map(Profile::into_owned).collect();
+        Linkage { unit_of, profiles, sizes, doubt, near, places, into, edges, heights }
+    }
+
     /// Finds the agreement of pairs that are in nobody's list.
     fn compare(&mut self, pairs: &[(u32, u32)]) {
         let mut near = std::mem::take(&mut self.near);
@@ -164,8 +202,8 @@ impl<'a> Linkage<'a> {
             let values: Vec<Option<f64>> = pairs.par_iter().map(agreement).collect();
             for (&(a, b), value) in pairs.iter().zip(values) {
                 if let Some(value) = value {
-                    near[a as usize].push((b, value));
-                    near[b as usize].push((a, value));
+                    near[a as usize].push(Near(b, value));
+                    near[b as usize].push(Near(a, value));
                 }
             }
         }
@@ -179,7 +217,7 @@ impl<'a> Linkage<'a> {
 
     /// Pairs that may join, each once.
     fn touching(&self) -> impl Iterator<Item = (u32, u32)> {
-        let of = |a: u32| self.near[a as usize].iter().map(move |&(b, _)| (a, b));
+        let of = |a: u32| self.near[a as usize].iter().map(move |&Near(b, _)| (a, b));
         (0..self.near.len() as u32).flat_map(of).filter(|(a, b)| a < b)
     }
 
@@ -190,7 +228,7 @@ impl<'a> Linkage<'a> {
     }
 
     /// From now on the clusters have these profiles, and those may join that hold one of these `pairs` of members.
-    pub fn see(&mut self, profiles: Vec<Profile>, mut pairs: Vec<(u32, u32)>) {
+    pub fn see(&mut self, profiles: Vec<Profile<'a>>, mut pairs: Vec<(u32, u32)>) {
         let left = self.left();
         left.iter().zip(profiles).for_each(|(&i, profile)| self.profiles[i as usize] = profile);
         let cluster: Vec<u32> = self.labels().0.into_iter().map(|label| left[label as usize]).collect();
@@ -237,7 +275,7 @@ impl<'a> Linkage<'a> {
             let size = self.sizes[i as usize].max(self.sizes[j as usize]);
             self.doubt.as_ref().map_or(0.0, |doubt| doubt.of(i, j, size))
         };
-        let eased = self.near[i as usize].iter().map(|&(j, value)| (j, (value - more(j)).min(1.0)));
+        let eased = self.near[i as usize].iter().map(|&Near(j, value)| (j, (value - more(j)).min(1.0)));
         // Of equals the first.
         eased.filter(|b| b.1 >= least).max_by(|a, b| a.1.total_cmp(&b.1).then(b.0.cmp(&a.0)))
     }
@@ -263,7 +301,7 @@ impl<'a> Linkage<'a> {
         loop {
             let found: Vec<_> = news.par_iter().map(|&i| self.best(i, least)).collect();
             news.iter().zip(found).for_each(|(&i, found)| best[i as usize] = found);
-            let near = |&i: &u32| self.near[i as usize].iter().map(|&(j, _)| j).chain([i]);
+            let near = |&i: &u32| self.near[i as usize].iter().map(|&Near(j, _)| j).chain([i]);
             let asked = once(news.iter().flat_map(near), seen);
             let join = |&i: &u32| self.joins(i, &best, below).map(|other| (i, other));
             let joins: Vec<(u32, (u32, f64))> = asked.par_iter().filter_map(join).collect();
@@ -285,14 +323,14 @@ impl<'a> Linkage<'a> {
             for &i in &changed {
                 let (to, near) = (root(i), std::mem::take(&mut self.near[i as usize]));
                 pairs.extend(
-                    near.into_iter().map(|(c, _)| root(c)).filter(|&c| c != to).map(|c| (to.min(c), to.max(c))),
+                    near.into_iter().map(|Near(c, _)| root(c)).filter(|&c| c != to).map(|c| (to.min(c), to.max(c))),
                 );
             }
             pairs.par_sort_unstable();
             pairs.dedup();
             let ends = once(pairs.iter().flat_map(|&(a, b)| [a, b]), seen);
             changed.iter().for_each(|&i| seen[i as usize] = true);
-            ends.iter().for_each(|&i| self.near[i as usize].retain(|&(c, _)| !seen[c as usize]));
+            ends.iter().for_each(|&i| self.near[i as usize].retain(|&Near(c, _)| !seen[c as usize]));
             changed.iter().for_each(|&i| seen[i as usize] = false);
             news = once(joins.iter().map(|j| j.0).chain(ends), seen);
             joins.iter().for_each(|&(_, i, _)| target[i as usize] = i);
@@ -344,7 +382,7 @@ mod tests {
     use artifacts::LEVELS;
 
     /// Two masks a view; a member has the given share in the first, in views where it is seen at all.
-    fn profile(firsts: &[Option<f32>]) -> Profile {
+    fn profile(firsts: &[Option<f32>]) -> Profile<'static> {
         let masks = firsts.iter().zip((0..).step_by(2)).filter_map(|(f, mask)| f.map(|f| (mask, f)));
         let masks = masks.flat_map(|(mask, f)| [(mask, f), (mask + 1, 1.0 - f)]).filter(|(_, w)| *w > 0.0);
         Profile::new(masks.collect())
@@ -390,7 +428,7 @@ mod tests {
 
     #[test]
     fn only_small_clusters_join_against_the_masks_and_heights_keep_their_range() {
-        let views: Vec<Profile> =
+        let views: Vec<Profile<'_>> =
             [[ONE; 4], [ONE; 4], [ONE, TWO, TWO, TWO], [TWO; 4]].iter().map(|v| profile(v)).collect();
         let mut linkage = Linkage::new(views, &[(0, 1), (1, 2), (2, 3)], &UNIT_OF);
         linkage.join(0.9, usize::MAX, (0.0, 0.5));
@@ -425,7 +463,7 @@ mod tests {
     fn doubt_keeps_apart_what_rises_and_lets_crumbs_in() {
         // 0 and 1 agree in half of the views, 2 and 3 in three of ten.
         let together = |n: usize| [[ONE; 10], std::array::from_fn(|v| if v < n { ONE } else { TWO })];
-        let views: Vec<Profile> = together(5).iter().chain(&together(3)).map(|v| profile(v)).collect();
+        let views: Vec<Profile<'_>> = together(5).iter().chain(&together(3)).map(|v| profile(v)).collect();
         let join = |steps: Option<u32>| {
             let mut linkage = Linkage::new(views.clone(), &[(0, 1), (2, 3)], &UNIT_OF);
             linkage.sizes = vec![100, 100, 1, 1];
@@ -444,7 +482,7 @@ mod tests {
     fn large_pieces_must_agree_more_and_small_ones_less() {
         // 0 and 1 agree in half of the views, 2 and 3 in three of ten. Pieces have 100 members commonly.
         let together = |n: usize| [[ONE; 10], std::array::from_fn(|v| if v < n { ONE } else { TWO })];
-        let views: Vec<Profile> = together(5).iter().chain(&together(3)).map(|v| profile(v)).collect();
+        let views: Vec<Profile<'_>> = together(5).iter().chain(&together(3)).map(|v| profile(v)).collect();
         let join = |sizes: [usize; 4], count: bool| {
             let mut linkage = Linkage::new(views.clone(), &[(0, 1), (2, 3)], &UNIT_OF);
             linkage.sizes = sizes.to_vec();
@@ -460,7 +498,7 @@ mod tests {
     #[test]
     fn clusters_of_some_views_are_judged_by_all() {
         // In the first view all are one; the others show that only 0 and 1 are, and 2 and 3.
-        let first: Vec<Profile> = (0..4).map(|_| profile(&[ONE])).collect();
+        let first: Vec<Profile<'_>> = (0..4).map(|_| profile(&[ONE])).collect();
         let mut linkage = Linkage::new(first, &[(0, 1), (1, 2), (2, 3)], &UNIT_OF);
         linkage.join(0.7, 2, ALL);
         assert_eq!(labels(&linkage), [0, 0, 1, 1]);

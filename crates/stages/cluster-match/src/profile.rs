@@ -3,6 +3,7 @@
 use artifacts::{Footprints, LEVELS, Level, Row};
 use gs_io::Result;
 use rayon::prelude::*;
+use std::borrow::Cow;
 use std::cmp::Ordering;
 use std::collections::BTreeMap;
 
@@ -28,9 +29,9 @@ pub fn some_views(footprints: &Footprints, levels: &[Level], most: u64) -> Vec<b
 
 /// What the masks show of a Gaussian or of several.
 #[derive(Debug, Clone, Default)]
-pub struct Profile {
+pub struct Profile<'a> {
     /// Mask (by its row in the footprints) and the weight in it, ascending. f32 because single Gaussians have most of the memory.
-    masks: Vec<(u32, f32)>,
+    masks: Cow<'a, [(u32, f32)]>,
     /// Weight in all masks.
     total: f64,
 }
@@ -45,25 +46,20 @@ pub struct Agreement {
     pub firm: bool,
 }
 
-impl Profile {
-    /// From masks and weights, ascending.
-    pub fn new(masks: Vec<(u32, f32)>) -> Self {
-        let total = weight(&masks);
-        Self { masks, total }
-    }
+/// The masks of many small pieces, one after the other: the system takes one large block back, but hardly a million small ones.
+pub struct Pieces {
+    masks: Vec<(u32, f32)>,
+    /// Where those of each piece end.
+    ends: Vec<usize>,
+}
 
-    /// Those of `count` small pieces in the masks at `levels` of the `views` that hold. `labels` are those of the kept Gaussians. Unlike
+impl Pieces {
+    /// Those of `count` pieces in the masks at `levels` of the `views` that hold. `labels` are those of the kept Gaussians. Unlike
     /// [`Profile::of_instances`] it sums in f32 and holds nothing beside the profiles: pieces are many, and their sums short.
     ///
     /// # Errors
     /// When the footprints can't be read.
-    pub fn of_pieces(
-        labels: &[i32],
-        count: usize,
-        footprints: &Footprints,
-        levels: &[Level],
-        views: &[bool],
-    ) -> Result<Vec<Self>> {
+    pub fn of(labels: &[i32], count: usize, footprints: &Footprints, levels: &[Level], views: &[bool]) -> Result<Self> {
         let is_read = |r: &Row| r.is_of(levels) && views[r.view as usize];
         let rows = (0..footprints.rows.len() as u32).filter(|&r| is_read(&footprints.rows[r as usize]));
         let rows: Vec<u32> = rows.collect();
@@ -75,18 +71,43 @@ impl Profile {
                 }
             })
         };
-        // Read twice: a list that grows takes up to twice its memory.
-        let mut counts = vec![(0, u32::MAX); count];
-        each(&mut |k, row, _| {
-            counts[k].0 += usize::from(counts[k].1 != row);
-            counts[k].1 = row;
+        // Read twice: first how many there are.
+        let (mut ends, mut last) = (vec![0; count], vec![u32::MAX; count]);
+        each(&mut |k, row, _| ends[k] += usize::from(std::mem::replace(&mut last[k], row) != row))?;
+        let mut all = 0;
+        ends.iter_mut().for_each(|end| all += std::mem::replace(end, all));
+        let mut masks = vec![(0, 0.0); all];
+        last.fill(u32::MAX);
+        each(&mut |k, row, w| {
+            if std::mem::replace(&mut last[k], row) != row {
+                masks[ends[k]] = (row, 0.0);
+                ends[k] += 1;
+            }
+            masks[ends[k] - 1].1 += w;
         })?;
-        let mut masks: Vec<Vec<(u32, f32)>> = counts.into_iter().map(|(n, _)| Vec::with_capacity(n)).collect();
-        each(&mut |k, row, w| match masks[k].last_mut().filter(|m| m.0 == row) {
-            Some(mask) => mask.1 += w,
-            None => masks[k].push((row, w)),
-        })?;
-        Ok(masks.into_par_iter().map(Self::new).collect())
+        Ok(Self { masks, ends })
+    }
+
+    /// The profile of each.
+    pub fn profiles(&self) -> Vec<Profile<'_>> {
+        let of = |k: usize| {
+            let masks = &self.masks[k.checked_sub(1).map_or(0, |before| self.ends[before])..self.ends[k]];
+            Profile { masks: masks.into(), total: weight(masks) }
+        };
+        (0..self.ends.len()).into_par_iter().map(of).collect()
+    }
+}
+
+impl Profile<'_> {
+    /// From masks and weights, ascending.
+    pub fn new(masks: Vec<(u32, f32)>) -> Self {
+        let total = weight(&masks);
+        Self { masks: masks.into(), total }
+    }
+
+    /// The same on its own.
+    pub fn into_owned(self) -> Profile<'static> {
+        Profile { masks: self.masks.into_owned().into(), total: self.total }
     }
 
     /// Those of `instances` instances in the masks at `levels`. `labels` are those of the kept Gaussians, -1 for none.
@@ -107,7 +128,7 @@ impl Profile {
     }
 
     /// Of both together.
-    pub fn joined(&self, other: &Self) -> Self {
+    pub fn joined(&self, other: &Profile<'_>) -> Profile<'static> {
         let (mut a, mut b) = (&self.masks[..], &other.masks[..]);
         let mut masks = Vec::with_capacity(a.len() + b.len());
         while let (Some(&x), Some(&y)) = (a.first(), b.first()) {
@@ -118,15 +139,16 @@ impl Profile {
         }
         masks.extend_from_slice(a);
         masks.extend_from_slice(b);
-        Self::new(masks)
+        masks.shrink_to_fit();
+        Profile::new(masks)
     }
 
     /// Without the part `other`.
-    pub fn without(&self, other: &Self) -> Self {
+    pub fn without(&self, other: &Profile<'_>) -> Profile<'static> {
         let part: BTreeMap<u32, f32> = other.masks.iter().copied().collect();
         let left = self.masks.iter().map(|&(k, w)| (k, w - part.get(&k).unwrap_or(&0.0), w));
         // What is left of nothing but rounding is nothing.
-        Self::new(left.filter(|(_, left, w)| *left > 1e-5 * w).map(|(k, left, _)| (k, left)).collect())
+        Profile::new(left.filter(|(_, left, w)| *left > 1e-5 * w).map(|(k, left, _)| (k, left)).collect())
     }
 
     /// The masks that hold more than half of what their view and level show. `unit_of` has the view and level of each mask ([`units`]).
@@ -138,7 +160,7 @@ impl Profile {
     }
 
     /// How far two belong together; None where no view shows both. `unit_of` has the view and level of each mask ([`units`]).
-    pub fn agreement(&self, other: &Self, unit_of: &[u32]) -> Option<Agreement> {
+    pub fn agreement(&self, other: &Profile<'_>, unit_of: &[u32]) -> Option<Agreement> {
         let mut levels = [[0.0; 2]; LEVELS];
         let (mut seen, mut share) = (0, 0.0);
         let (mut own, mut others) = (&self.masks[..], &other.masks[..]);
@@ -208,12 +230,12 @@ pub fn with_rest(
 ) -> Result<Vec<Option<f64>>> {
     let unit_of = units(footprints);
     let pieces = Profile::of_instances(labels, wholes.len(), footprints, levels)?;
-    let mut instances: BTreeMap<i32, Profile> = BTreeMap::new();
+    let mut instances: BTreeMap<i32, Profile<'_>> = BTreeMap::new();
     for (piece, whole) in pieces.iter().zip(wholes) {
         let sum = instances.entry(*whole).or_default();
         *sum = sum.joined(piece);
     }
-    let of = |(piece, whole): (&Profile, &i32)| {
+    let of = |(piece, whole): (&Profile<'_>, &i32)| {
         let agreement = piece.agreement(&instances[whole].without(piece), &unit_of)?;
         agreement.firm.then_some(agreement.value)
     };
@@ -288,7 +310,7 @@ mod tests {
     const UNIT_OF: [u32; 8] = [0, 0, 1, 1, SECOND, SECOND, SECOND + 1, SECOND + 1];
     const SECOND: u32 = LEVELS as u32;
 
-    fn of(masks: &[(u32, f32)]) -> Profile {
+    fn of(masks: &[(u32, f32)]) -> Profile<'static> {
         Profile::new(masks.to_vec())
     }
 
@@ -318,7 +340,7 @@ mod tests {
     fn a_part_that_is_joined_can_be_taken_out_again() {
         let (a, b) = (of(&[(0, 1.0), (2, 3.0)]), of(&[(0, 2.0), (1, 4.0)]));
         let both = a.joined(&b);
-        assert_eq!(both.masks, [(0, 3.0), (1, 4.0), (2, 3.0)]);
+        assert_eq!(both.masks[..], [(0, 3.0), (1, 4.0), (2, 3.0)]);
         assert_eq!(both.total, 10.0);
         assert_eq!(both.without(&b).masks, a.masks);
         assert_eq!(both.main_masks(&UNIT_OF).collect::<Vec<_>>(), [1, 2]);
@@ -329,7 +351,8 @@ mod tests {
         let views: [&[&[u32]]; 2] = [&[&[0, 1, 2], &[4]], &[&[2, 3]]];
         let footprints = footprints_of(&[(Level::SMALL, &views), (Level::LARGE, &views)]);
         let own: Vec<i32> = (0..8).collect();
-        let of_gaussians = Profile::of_pieces(&own, 8, &footprints, &[Level::LARGE], &[true; 2]).unwrap();
+        let pieces = Pieces::of(&own, 8, &footprints, &[Level::LARGE], &[true; 2]).unwrap();
+        let of_gaussians = pieces.profiles();
         let labels = [0, 0, 0, 1, -1, -1, -1, -1];
         let of_instances = Profile::of_instances(&labels, 2, &footprints, &[Level::LARGE]).unwrap();
         let sum = of_gaussians[..3].iter().fold(Profile::default(), |sum, p| sum.joined(p));
@@ -346,7 +369,8 @@ mod tests {
         assert_eq!(views(9), [false, true, false, true, false, true]);
         assert_eq!(views(12), [false, true, true, false, true, true]);
         let own = [0, 0, 1, 2, 3, 4, 5, 6];
-        let pieces = Profile::of_pieces(&own, 7, &footprints, &[Level::LARGE], &views(9)).unwrap();
+        let pieces = Pieces::of(&own, 7, &footprints, &[Level::LARGE], &views(9)).unwrap();
+        let pieces = pieces.profiles();
         assert_eq!(
             (&pieces[0].masks[..], &pieces[1].masks[..]),
             (&[(2, 2.0), (6, 2.0), (10, 2.0)][..], &[(3, 1.0), (7, 1.0), (11, 1.0)][..])

@@ -77,10 +77,11 @@ impl Program for Args {
 fn find(a: &Args, settings: &Settings, inputs: &Inputs, stage: &Stage) -> Result<Found> {
     stage.forecast(memory::forecast(inputs, settings), SMALLER)?;
     let start = Instant::now();
-    let points = Points::of(inputs)?;
+    // Made after the first merge, which takes most memory.
+    let mut points = None;
     let clustering = match settings.cluster {
         Space::Masks => {
-            linkage::cluster(inputs, &points, settings, &settings.levels, (settings.agreement, settings.join))?
+            linkage::cluster(inputs, &mut points, settings, &settings.levels, (settings.agreement, settings.join))?
         }
         Space::Graph => on_graph(&inputs.features.values, &inputs.graph, &settings.hdbscan()),
         Space::Free => free(&inputs.features.values, &settings.hdbscan()),
@@ -96,8 +97,7 @@ fn find(a: &Args, settings: &Settings, inputs: &Inputs, stage: &Stage) -> Result
              where the scene is one thing",
         );
     }
-    let found = correct(found, inputs, &points, settings, stage)?;
-    drop(points);
+    let found = correct(found, inputs, points, settings, stage)?;
 
     let footprints = &inputs.footprints;
     let labels: Vec<i32> = inputs.graph.kept.iter().map(|&i| found.labels[i as usize]).collect();
@@ -131,10 +131,10 @@ fn find(a: &Args, settings: &Settings, inputs: &Inputs, stage: &Stage) -> Result
 }
 
 /// Corrects the clustering by where Gaussians lie and by the masks of each view.
-fn correct(
+fn correct<'a>(
     mut found: Assignment,
-    inputs: &Inputs,
-    points: &Points,
+    inputs: &'a Inputs,
+    mut points: Option<Points<'a>>,
     settings: &Settings,
     stage: &Stage,
 ) -> Result<Assignment> {
@@ -157,7 +157,7 @@ fn correct(
     }
     let small = |row: &Row| row.is_of(&[Level::SMALL]);
     if settings.split > 0.0 && settings.levels.contains(&Level::SMALL) && footprints.rows.iter().any(small) {
-        let clustering = linkage::cluster(inputs, points, settings, &[Level::SMALL], (PARTS, 0.0))?;
+        let clustering = linkage::cluster(inputs, &mut points, settings, &[Level::SMALL], (PARTS, 0.0))?;
         let parts = Assignment::new(&clustering, &graph.kept, means.len());
         let classes = classes(&settings.levels);
         let large = if classes.is_empty() { &[Level::LARGE][..] } else { &classes };
