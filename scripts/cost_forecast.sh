@@ -24,7 +24,7 @@ awk -v levels="$levels" -v closed="$closed" -v masks="${MAKES_MASKS:+1}" -v core
     memory = most(memory, closed ? 3.8e8 + 940 * n + 36 * 600 * 40 * views * levels \
       : 4.7e6 + 518 * n + least(14 * entries, 2 ^ 29) + 26 * entries / views / levels)
     many = 2 ^ 27 # entries that clustering by masks keeps of single Gaussians
-    memory = most(memory, 12.8e6 + (1000 + 256) * n + 18 * least(entries, many) + 3 * most(entries - many, 0))
+    memory = most(memory, 15.5e6 + most(1250 * n, 650 * n + most(10 * least(entries, many), 3 * entries)))
     disk = 725 * n + 20 * entries + (masks ? 7.7e6 * views : 0)
     hours = (geometry + graph + features + instances + sam) / 3600
     printf "at most %.1f CPU hours (%s%.1f geometry, %.1f graph, %.1f features, %.1f instances), ", hours, \

@@ -31,7 +31,7 @@ const APART: f64 = 1e-6;
 /// Agreement of two of which hardly any view shows both in one mask.
 const NONE: f64 = 1e-9;
 
-/// Entries of footprints that single Gaussians have at most, 14 bytes each. Where all views show most of a large scene there are more.
+/// Entries of footprints that single Gaussians have at most, 8 bytes each. Where all views show most of a large scene there are more.
 pub const MOST_ENTRIES: u64 = 1 << 27;
 /// Gaussians that agree by this are one piece. Where there are more entries, they become one by some of the views before the others are
 /// read.
