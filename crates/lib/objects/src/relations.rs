@@ -200,8 +200,17 @@ impl Placed {
     }
 }
 
+/// Area of a polygon, corners counter-clockwise.
+fn area(of: &[DVec2]) -> f64 {
+    0.5 * of.iter().enumerate().map(|(i, p)| p.perp_dot(of[(i + 1) % of.len()])).sum::<f64>()
+}
+
 /// Area that two convex polygons share, corners counter-clockwise.
 fn overlap(a: &[DVec2], b: &[DVec2]) -> f64 {
+    // The edges of a point, such as an object of one Gaussian has, would cut nothing off.
+    if b.iter().all(|p| *p == b[0]) {
+        return 0.0;
+    }
     let mut left = a.to_vec();
     for (i, &from) in b.iter().enumerate() {
         let edge = b[(i + 1) % b.len()] - from;
@@ -219,8 +228,7 @@ fn overlap(a: &[DVec2], b: &[DVec2]) -> f64 {
         }
         left = cut;
     }
-    let next = |i: usize| left[(i + 1) % left.len()];
-    0.5 * left.iter().enumerate().map(|(i, p)| p.perp_dot(next(i))).sum::<f64>()
+    area(&left)
 }
 
 /// Distance of two convex polygons; 0 where they overlap.
@@ -278,6 +286,9 @@ mod tests {
         for up in [DVec3::Z, DVec3::NEG_Y, DVec3::new(0.3, -0.8, 0.2).normalize()] {
             assert_eq!(told(&[TOP, MUG, CHEST], up, |_, _| false), [(1, On, 0), (2, Under, 0)], "{up}");
         }
+        // An object of one place carries nothing and lies on nothing that is elsewhere.
+        let point = [40.0, 40.0, TOP.1[2]];
+        assert_eq!(told(&[TOP, (point, point)], DVec3::Z, |_, _| false), []);
         // Held a hand above the table it is on nothing.
         let held = ([0.5, 0.4, 0.85], [0.6, 0.5, 0.95]);
         let on = |t: &(u32, RelationKind, u32)| t.1 == On;
