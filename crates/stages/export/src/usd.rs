@@ -2,7 +2,7 @@
 //! convex collider.
 
 use crate::mesh::Mesh;
-use glam::{DMat3, DVec3};
+use glam::{DMat3, DQuat, DVec3};
 use gs_io::{Error, IoContext, Result, write_atomic};
 use gs_scene::{Gaussians, sh_coefficients};
 use objects::Up;
@@ -59,14 +59,14 @@ fn stage(w: &mut dyn Write, g: &Gaussians, prims: &[Prim], o: &StageOptions) -> 
     writeln!(w, "    metersPerUnit = {metres:?}\n    upAxis = \"{axis}\"\n)\n")?;
     writeln!(w, "def Xform \"Scene\" (\n    kind = \"assembly\"\n)\n{{")?;
     let mut moves = Vec::new();
-    if let Some(up) = &o.up {
-        writeln!(w, "    matrix4d xformOp:transform = {}", upright(up.vector()))?;
-        moves.push("\"xformOp:transform\"");
-    }
-    // The last of the order comes first: what was subtracted in the geometry's axes is added in these.
+    // The last of the order comes first: a scene is turned where it lies, not around a far origin.
     if g.shift != [0.0; 3] {
         writeln!(w, "    double3 xformOp:translate = {}", tuple(&g.shift))?;
         moves.push("\"xformOp:translate\"");
+    }
+    if let Some(up) = &o.up {
+        writeln!(w, "    matrix4d xformOp:transform = {}", upright(up.vector()))?;
+        moves.push("\"xformOp:transform\"");
     }
     if !moves.is_empty() {
         writeln!(w, "    uniform token[] xformOpOrder = [{}]", moves.join(", "))?;
@@ -86,13 +86,12 @@ fn text(s: &str) -> String {
     format!("\"{}\"", s.chars().map(one).collect::<String>())
 }
 
-/// The rotation that takes `up` to +z, as USD writes it: points are rows that are multiplied from the left.
+/// The shortest turn that takes `up` to +z, as USD writes it: points are rows that are multiplied from the left.
 fn upright(up: DVec3) -> String {
-    let x = up.any_orthonormal_vector();
-    let turn = DMat3::from_cols(x, up.cross(x), up);
+    let turn = DMat3::from_quat(DQuat::from_rotation_arc(DVec3::Z, up));
     // Column c of `turn` is where axis c of the stage lies in the geometry, which is just what USD's columns say.
-    // Adding 0 makes -0 a plain 0.
-    let row = |r: usize| [turn.x_axis[r], turn.y_axis[r], turn.z_axis[r], 0.0].map(|v| v + 0.0);
+    // Without rounding errors where it is a quarter of a turn; adding 0 makes -0 a plain 0.
+    let row = |r: usize| [turn.x_axis[r], turn.y_axis[r], turn.z_axis[r], 0.0].map(|v| (v * 1e12).round() / 1e12 + 0.0);
     format!("( {}, {}, {}, (0, 0, 0, 1) )", tuple(&row(0)), tuple(&row(1)), tuple(&row(2)))
 }
 
@@ -208,13 +207,13 @@ mod tests {
         stage(&mut bytes, &g, &prims, &o).unwrap();
         let golden = include_str!("../testdata/tiny.usda").replace("VERSION", env!("CARGO_PKG_VERSION"));
         assert_eq!(String::from_utf8(bytes).unwrap(), golden);
-        // A scene far from the origin is moved there in double precision, before it is turned.
+        // A scene far from the origin is moved there in double precision, after it is turned.
         let far = Gaussians { shift: [448_262.0, 5_411_932.0, 114.5], ..g.clone() };
         let mut bytes = Vec::new();
         stage(&mut bytes, &far, &prims, &o).unwrap();
         let text = String::from_utf8(bytes).unwrap();
         assert!(text.contains("    double3 xformOp:translate = (448262.0, 5411932.0, 114.5)\n"), "{text}");
-        assert!(text.contains("xformOpOrder = [\"xformOp:transform\", \"xformOp:translate\"]\n"), "{text}");
+        assert!(text.contains("xformOpOrder = [\"xformOp:translate\", \"xformOp:transform\"]\n"), "{text}");
         // With all bands there are four coefficients a Gaussian, grouped by Gaussian.
         let mut bytes = Vec::new();
         stage(&mut bytes, &g, &prims[..1], &StageOptions { up: None, metres_per_unit: None, sh_degree: 3 }).unwrap();
