@@ -10,6 +10,7 @@ use glam::{DMat4, DVec4};
 use gs_io::{Error, Result, write_json};
 use serde_json::{Value, json};
 use std::collections::BTreeSet;
+use std::f64::consts::PI;
 use std::path::{Path, PathBuf};
 
 const AGAIN: &str = "export the transforms again";
@@ -202,6 +203,14 @@ fn matrix(value: &Value, field: &str) -> Result<DMat4> {
             m[4 * r + c] = v.as_f64().unwrap_or(f64::NAN);
         }
     }
+    // Lost poses, which may be all zeros, are left out later.
+    if m[12..15].iter().any(|v| *v != 0.0 && v.is_finite()) {
+        return Err(Error::new("the last row of the pose is not 0 0 0 1")
+            .field(field)
+            .found(brief(&rows[3]))
+            .expected("the translation in the last column")
+            .hint("transpose the matrices"));
+    }
     Ok(DMat4::from_cols_array(&m).transpose())
 }
 
@@ -254,9 +263,18 @@ fn lens(file: &Value, frame: &Value, image: &Path, field: &str) -> Result<Lens> 
         }
         _ => size_by_center(image, get("cx")?.zip(get("cy")?))?,
     };
-    let of_angle = |angle: Option<f64>, size: u32| angle.map(|a| 0.5 * f64::from(size) / (0.5 * a).tan());
-    let fx = get("fl_x")?.or(of_angle(get("camera_angle_x")?, w));
-    let fy = get("fl_y")?.or(of_angle(get("camera_angle_y")?, h));
+    // Of a tangent nobody could tell degrees from radians.
+    let of_angle = |key: &str, size: u32| match get(key)? {
+        Some(a) if !(a > 0.0 && a < PI) => Err(Error::new("no angle of view")
+            .field(format!("{field}, {key}"))
+            .found(a)
+            .expected("radians, between 0 and 3.1416")
+            .hint(AGAIN)),
+        angle => Ok(angle.map(|a| 0.5 * f64::from(size) / (0.5 * a).tan())),
+    };
+    let focal = |key: &str, angle: &str, size: u32| get(key)?.map_or_else(|| of_angle(angle, size), |f| Ok(Some(f)));
+    let fx = focal("fl_x", "camera_angle_x", w)?;
+    let fy = focal("fl_y", "camera_angle_y", h)?;
     let focal = fx.or(fy).zip(fy.or(fx)).filter(|(x, y)| [x, y].iter().all(|f| **f > 0.0 && f.is_finite()));
     let Some((fx, fy)) = focal else {
         return Err(Error::new("no usable focal length")

@@ -655,6 +655,9 @@ fn bad_transforms_are_refused() {
         owner[key.trim_start_matches("frame.")] = value;
         load(&json)
     };
+    // Degrees.
+    let wide = json!({"camera_angle_x": 51.5, "frames": [{"file_path": "a.png", "transform_matrix": good}]});
+    assert!(load(&wide).unwrap_err().contains("frames[0], camera_angle_x: no angle of view; found 51.5"));
     for (key, value) in [("extra", json!(1)), ("is_fisheye", json!(false)), ("camera_model", json!("PINHOLE"))] {
         assert!(with(key, value).is_ok(), "{key}");
     }
@@ -673,6 +676,11 @@ fn bad_transforms_are_refused() {
         ("frame.transform_matrix", json!([[1, 2], [3, 4]]), "frames[0].transform_matrix: not a 4x4 matrix"),
         ("frame.transform_matrix", mirrored, "frames[0].transform_matrix: the pose is not a rotation"),
         ("frame.transform_matrix", json!([[0, 0, 0, 0], [0, 0, 0, 0], [0, 0, 0, 0]]), "the pose is not a rotation"),
+        (
+            "frame.transform_matrix",
+            json!([[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [1.5, 0, 2, 1]]),
+            "the last row of the pose is not 0 0 0 1; found [1.5,0,2,1]",
+        ),
         ("fl_x", json!(null), "no usable focal length"),
         ("fl_x", json!(-4), "no usable focal length"),
         ("fl_x", json!("long"), "frames[0], fl_x: not a number; found \"long\""),
