@@ -3,6 +3,9 @@
 use crate::middle::{less, shift_of};
 use gs_io::{Error, Result};
 
+/// Largest coordinate of a centre: squares of distances stay finite in f32.
+const FARTHEST: f32 = 1e17;
+
 /// Zeroth real spherical harmonic, 1 / (2 sqrt(pi)): colour = 0.5 + `SH_C0` * dc for degree 0.
 pub const SH_C0: f32 = 0.282_094_8;
 
@@ -126,15 +129,22 @@ impl Gaussians {
         found.map(|(name, _)| *name).or(self.opacity_logits[i].is_nan().then_some("opacity"))
     }
 
-    /// The properties of Gaussian `i` that cannot be used, and why, in words: a number is not finite, or the rotation has length 0. Programs
-    /// that take no rotation for that make balls of what nobody ever saw.
+    /// Whether the centre of Gaussian `i` can be calculated with.
+    pub(crate) fn is_near(&self, i: usize) -> bool {
+        self.means[i].iter().all(|v| v.abs() <= FARTHEST)
+    }
+
+    /// The properties of Gaussian `i` that cannot be used, and why, in words: a number is not finite, the centre is too far, or the
+    /// rotation has length 0. Programs that take no rotation for that make balls of what nobody ever saw.
     fn damage(&self, i: usize) -> Option<(&'static str, &'static str)> {
         let turned = self.rotations[i].iter().any(|&v| v != 0.0);
         let not_finite = self.not_finite(i).map(|name| (name, "is not finite"));
-        not_finite.or((!turned).then_some(("rot_*", "is a rotation of length 0")))
+        let far = (!self.is_near(i)).then_some(("x, y, z", "is beyond 1e17"));
+        not_finite.or(far).or((!turned).then_some(("rot_*", "is a rotation of length 0")))
     }
 
-    /// Whether Gaussian `i` can be used: its numbers are finite, but for the opacity logit, and its rotation has a length.
+    /// Whether Gaussian `i` can be used: its numbers are finite, but for the opacity logit, its centre is within 1e17, and its rotation
+    /// has a length.
     pub fn is_whole(&self, i: usize) -> bool {
         self.damage(i).is_none()
     }

@@ -24,7 +24,7 @@ pub struct Geometry {
 
 impl Geometry {
     /// Reads a file of any of the formats of [`splat`] that is one file. Damaged Gaussians do not condemn the rest: a transparent one takes the place of each, where its centre
-    /// is or, if that is not finite, where the first whole Gaussian is, so that numbers stay and boxes do not grow. Infinite
+    /// is or, if that cannot be used, where the first whole Gaussian is, so that numbers stay and boxes do not grow. Infinite
     /// opacity logits are no damage: they become +-50, as in [`splat::read_whole`].
     ///
     /// # Errors
@@ -57,7 +57,7 @@ impl Geometry {
         };
         let place = g.means[first];
         for i in damaged.iter().map(|&i| i as usize) {
-            if g.means[i].iter().any(|v| !v.is_finite()) {
+            if !g.is_near(i) {
                 g.means[i] = place;
             }
             g.log_scales[i] = [-10.0; 3];
@@ -72,7 +72,7 @@ impl Geometry {
     pub fn damage(&self) -> Option<String> {
         let damaged = self.damaged.first().map(|first| {
             let (damaged, all) = (self.damaged.len(), self.gaussians.len());
-            format!("{damaged} of {all} Gaussians: damaged, a parameter is not finite or a rotation has length 0 (the first is vertex {first})")
+            format!("{damaged} of {all} Gaussians: damaged, a parameter is not finite, a centre beyond 1e17 or a rotation of length 0 (the first is vertex {first})")
         });
         let left_out = self.left_out.iter().map(|what| format!("not read: {what}"));
         let said: Vec<String> = damaged.into_iter().chain(left_out).collect();
@@ -112,10 +112,15 @@ mod tests {
 
     #[test]
     fn damaged_gaussians_become_invisible_and_the_rest_stays() {
+        [f32::NAN, 1e19].into_iter().for_each(damaged);
+    }
+
+    /// One of them has `first` for a coordinate.
+    fn damaged(first: f32) {
         let dir = tempfile::tempdir().unwrap();
         let path = dir.path().join("g.ply");
         let mut g = sample();
-        g.means[0][1] = f32::NAN;
+        g.means[0][1] = first;
         g.log_scales[2][0] = f32::INFINITY;
         g.rotations[3] = [0.0; 4];
         g.opacity_logits[4] = f32::NAN;

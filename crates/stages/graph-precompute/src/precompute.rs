@@ -19,10 +19,8 @@ const REFERENCE_PIXELS: f64 = 986.0 * 728.0;
 #[derive(Debug, Clone, Default, PartialEq, serde::Serialize)]
 pub struct Summary {
     pub gaussians: usize,
-    /// Of these, Gaussians with a parameter that is not finite.
+    /// Of these, Gaussians that are damaged.
     pub damaged: usize,
-    /// Others without a usable position (beyond 1e18).
-    pub unusable: usize,
     /// Gaussians that take part.
     pub kept: usize,
     pub anchors: usize,
@@ -137,20 +135,13 @@ impl<'a> Collected<'a> {
         }
     }
 
-    /// The Gaussians with finite parameters and a usable position; the others are said to be left out.
-    fn usable(&mut self, stage: &Stage) -> Vec<u32> {
+    /// The whole Gaussians; the others are said to be left out.
+    fn usable(&self, stage: &Stage) -> Vec<u32> {
         if let Some(damage) = self.geometry.damage() {
             stage.skipped(&damage);
         }
-        let (mut usable, whole) = (shifted(&self.geometry.gaussians.means).usable, self.geometry.whole());
-        usable.retain(|&i| whole[i as usize]);
-        let n = self.summary.gaussians;
-        self.summary.unusable = n - self.summary.damaged - usable.len();
-        if self.summary.unusable > 0 {
-            let unusable = self.summary.unusable;
-            stage.warn(&format!("{unusable} of {n} Gaussians have no usable position and are left out"));
-        }
-        usable
+        let whole = self.geometry.whole();
+        (0..whole.len() as u32).filter(|&i| whole[i as usize]).collect()
     }
 
     /// Adds the masks of a view.
