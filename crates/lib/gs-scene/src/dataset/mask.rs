@@ -29,6 +29,8 @@ pub enum Odd {
     Alpha,
     /// The brightest pixel counts by less than a half.
     Dim,
+    /// No pixel counts.
+    Black,
 }
 
 impl std::fmt::Display for Odd {
@@ -38,6 +40,7 @@ impl std::fmt::Display for Odd {
             Self::EightBits => "have 16 bits a pixel and no value above 255: taken as white",
             Self::Alpha => "have one colour all over and transparent pixels: these do not count, the others do",
             Self::Dim => "have no pixel of half the white: all their pixels count by less than a half; write 255 where a pixel counts",
+            Self::Black => "are black: no pixel of them counts",
         })
     }
 }
@@ -79,7 +82,7 @@ impl Mask {
             (f32::from(most), None)
         };
         values.iter_mut().for_each(|v| *v /= white);
-        let odd = odd.or((brightest > 0.0 && brightest < 0.5 * white).then_some(Odd::Dim));
+        let odd = odd.or((brightest == 0.0).then_some(Odd::Black)).or((brightest < 0.5 * white).then_some(Odd::Dim));
         Ok(Self { width, height, values, odd })
     }
 }

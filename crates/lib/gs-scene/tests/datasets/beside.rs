@@ -63,10 +63,10 @@ fn a_mask_means_the_same_however_it_is_written() {
     grey(3).save(path("ids")).unwrap();
     assert_eq!(d.views[0].read_mask(&path("ids")).unwrap().odd, Some(Odd::Dim));
     // Nothing counts, or everything.
-    for (white, all) in [(0, 0.0), (255, 1.0)] {
+    for (white, all, odd) in [(0, 0.0, Some(Odd::Black)), (255, 1.0, None)] {
         GrayImage::from_pixel(4, 2, Luma([white])).save(path("plain")).unwrap();
         let mask = d.views[0].read_mask(&path("plain")).unwrap();
-        assert_eq!((mask.values, mask.odd), (vec![all; 8], None));
+        assert_eq!((mask.values, mask.odd), (vec![all; 8], odd));
     }
     GrayImage::new(2, 1).save(path("small")).unwrap();
     let e = d.views[0].load_mask(&path("small")).unwrap_err().to_string();
