@@ -7,7 +7,7 @@ use clap::Parser;
 use hdbscan_exact::{Metric, Selection};
 use serde::Serialize;
 use stage::CommonArgs;
-use std::collections::BTreeSet;
+use std::collections::{BTreeMap, BTreeSet};
 use std::path::PathBuf;
 
 /// Stage 3: 3D instances, the masks they are seen as, and a language descriptor for each
@@ -59,9 +59,9 @@ pub(crate) struct Settings {
     pub cluster: Space,
     /// How far the masks of neighbouring pieces must agree that both are one instance, 0 to 1: a lower value joins more. Two of which one
     /// rises above the other in another colour must agree by up to 0.28 more, large pieces by a little more, small ones by a little less.
-    /// Only with masks
-    #[arg(long, value_name = "AGREEMENT", value_parser = stage::within(0.0..=1.0), default_value_t = 0.18)]
-    pub agreement: f64,
+    /// Only with masks [default: 0.18; 0.6 where the masks have one level, and that is not small or medium]
+    #[arg(long, value_name = "AGREEMENT", value_parser = stage::within(0.0..=1.0))]
+    pub agreement: Option<f64>,
     /// Fewest Gaussians of an instance [default: 8 with masks, 30 with free points; on the graph a thousandth of the Gaussians that are
     /// seen, at least 10 and at most 30, because small scenes have small things]
     #[arg(long, value_name = "COUNT", value_parser = stage::within(2usize..=MOST))]
@@ -131,6 +131,25 @@ pub fn classes(levels: &[Level]) -> Vec<Level> {
     levels.iter().copied().filter(|level| level.kind() == LevelKind::Classes).collect()
 }
 
+/// How far masks of several levels must agree, and those of one level: fitted on drawn scenes of four families by
+/// pipelines/one-level.plan, and looked at on five scans (docs/results/scans.md).
+const OF_LEVELS: f64 = 0.18;
+const OF_ONE_LEVEL: f64 = 0.6;
+
+/// Whether the masks have one level of whole things, which a map of one level has in place of all four: each view has the same masks at all of
+/// its levels.
+fn is_one_level(footprints: &Footprints, levels: &[Level]) -> bool {
+    let mut masks: BTreeMap<u32, BTreeMap<u32, Vec<u32>>> = BTreeMap::new();
+    for row in footprints.rows.iter().filter(|row| row.is_of(levels)) {
+        masks.entry(row.view).or_default().entry(row.level).or_default().push(row.mask);
+    }
+    let parts = |level: &u32| [Level::SMALL, Level::MEDIUM].iter().any(|part| part.index() == *level as usize);
+    let of_parts = masks.values().flat_map(BTreeMap::keys).all(parts);
+    let alone = |of: &BTreeMap<u32, Vec<u32>>| of.values().all(|masks| Some(masks) == of.values().next());
+    let named: BTreeSet<&u32> = masks.values().flat_map(BTreeMap::keys).collect();
+    !of_parts && (named.len() == 1 || masks.values().all(|of| of.len() > 1 && alone(of)))
+}
+
 /// Largest count that an option takes: as many as there can be Gaussians.
 const MOST: usize = u32::MAX as usize;
 
@@ -169,7 +188,13 @@ impl Settings {
                 levels.retain(|level| *level != Level::LARGE);
             }
         }
-        Self { min_cluster_size: self.min_cluster_size.or(Some(smallest)), levels, ..self.clone() }
+        let whole = self.cluster == Space::Masks && is_one_level(footprints, &levels);
+        Self {
+            agreement: self.agreement.or(Some(if whole { OF_ONE_LEVEL } else { OF_LEVELS })),
+            min_cluster_size: self.min_cluster_size.or(Some(smallest)),
+            levels,
+            ..self.clone()
+        }
     }
 
     /// The options of HDBSCAN.
@@ -213,5 +238,13 @@ mod tests {
         assert!(!both.contains(&Level::LARGE) && both.contains(&Level::ALL[6]), "{both:?}");
         assert_eq!(levels(&["--levels", "large,classes"], &with_classes), [Level::LARGE, Level::CLASSES]);
         assert_eq!(levels(&["--cluster", "free", "--features", "x"], &with_classes), [Level::LARGE]);
+        // Whole things of one level, under one name or four.
+        let agreement = |more: &[&str], masks: &[_]| parse(more).for_scene(8, &footprints_of(masks)).agreement;
+        let split: &[&[&[u32]]] = &[&[&[0], &[1]]];
+        assert_eq!(agreement(&[], &sam), Some(OF_ONE_LEVEL));
+        assert_eq!(agreement(&[], &[(Level::LARGE, view)]), Some(OF_ONE_LEVEL));
+        assert_eq!(agreement(&[], &[(Level::SMALL, view)]), Some(OF_LEVELS));
+        assert_eq!(agreement(&[], &[(Level::SMALL, split), (Level::LARGE, view)]), Some(OF_LEVELS));
+        assert_eq!(agreement(&["--agreement", "0.3"], &sam), Some(0.3));
     }
 }

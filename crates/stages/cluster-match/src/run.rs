@@ -80,9 +80,13 @@ fn find(a: &Args, settings: &Settings, inputs: &Inputs, stage: &Stage) -> Result
     // Made after the first merge, which takes most memory.
     let mut points = None;
     let clustering = match settings.cluster {
-        Space::Masks => {
-            linkage::cluster(inputs, &mut points, settings, &settings.levels, (settings.agreement, settings.join))?
-        }
+        Space::Masks => linkage::cluster(
+            inputs,
+            &mut points,
+            settings,
+            &settings.levels,
+            (settings.agreement.unwrap_or_default(), settings.join),
+        )?,
         Space::Graph => on_graph(&inputs.features.values, &inputs.graph, &settings.hdbscan()),
         Space::Free => free(&inputs.features.values, &settings.hdbscan()),
     };
@@ -201,7 +205,7 @@ fn mask_features(a: &Args, draft: &Draft, stage: &Stage) -> Result<BTreeMap<u32,
         missing += wanted.len() - wanted.iter().filter(there).count();
         features.extend(of_view.map(|f| (index as u32, f)));
     }
-    if features.is_empty() {
+    if features.is_empty() && !draft.instances.is_empty() {
         stage.skipped("language descriptors: the masks have no features (*_f.npy; mask-embed embed makes them)");
     } else if missing > 0 {
         stage.warn(&format!(
