@@ -111,7 +111,7 @@ impl Outputs {
     /// Checks everything, then takes the right to write: call it before the work.
     ///
     /// # Errors
-    /// When an output is one of the inputs or lies in a folder of theirs, is named twice, is not a regular file, exists and
+    /// When an output is one of the inputs or an output folder is one of theirs, is named twice, is not a regular file, exists and
     /// was not written by this command (unless it may be overwritten), cannot be written, or is being written by another run.
     pub fn claim(self) -> Result<Claim> {
         let files: Vec<PathBuf> = self.files.iter().map(|(p, _)| p.clone()).collect();

@@ -42,6 +42,14 @@ pub fn write(to: &Path, format: PointFormat, g: &Gaussians, label: &[i32], which
     }
 }
 
+/// What LAS can't tell of these points: its coordinates are steps of what spans all of them.
+pub fn coarse(g: &Gaussians, which: &[u32]) -> Option<String> {
+    let (step, size) = (transforms(g, which).x.scale, g.spread());
+    (step > 1e-3 * size).then(|| {
+        format!("LAS has coordinates in steps of {step}, and the scene's size is {size:.3}: crop what is far with gs-geom convert --crop")
+    })
+}
+
 /// Colour of a Gaussian, 8 bits a channel.
 fn color(g: &Gaussians, i: usize) -> [u8; 3] {
     g.base_color(i).map(|v| (255.0 * v.clamp(0.0, 1.0)).round() as u8)

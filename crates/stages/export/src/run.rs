@@ -112,6 +112,13 @@ pub fn points(o: &PointsOptions, parameters: Value, stage: &Stage) -> Result<()>
     let (g, whole) = (labelled.gaussians(), labelled.geometry.whole());
     let solid = |&i: &u32| whole[i as usize] && g.opacity(i as usize) >= o.min_opacity;
     let which: Vec<u32> = (0..g.len() as u32).filter(solid).collect();
+    if which.is_empty() {
+        stage.warn("no Gaussian is solid enough to be a point: give a lower --min-opacity");
+    } else if format == PointFormat::Las
+        && let Some(coarse) = points::coarse(g, &which)
+    {
+        stage.warn(&coarse);
+    }
     points::write(&o.out, format, g, &labelled.instances.label, &which)?;
     stage.info(&format!("wrote {}: {} points of {} Gaussians", o.out.display(), which.len(), g.len()));
     stage.record(&mut claim, parameters, labelled.inputs.clone(), json!({ "points": which.len() }))

@@ -64,7 +64,7 @@ impl Convert {
             return Err(Error::new("no Gaussian is left")
                 .file(&self.input)
                 .found(format!("{all} Gaussians"))
-                .hint("give a larger --crop"));
+                .hint(if self.crop.is_some() { "give a larger --crop" } else { "make the file again" }));
         }
         if let Some(degree) = self.sh_degree.filter(|&d| d > g.sh_degree) {
             stage.forecast(memory::of_bands(chosen.kept.len(), g.sh_degree, degree), "give a lower --sh-degree")?;

@@ -16,7 +16,7 @@ use crate::training::schedule::LearningRates;
 use crate::training::{Recipe, Trainer, checkpoint};
 use artifacts::role;
 use forecast::{cache_bytes, forecast_start, most_gaussians};
-use gs_io::{Claim, Provenance, Result, hash_bytes, hash_file};
+use gs_io::{Claim, Error, Provenance, Result, hash_bytes, hash_file};
 use gs_scene::dataset::{Dataset, HOLDOUT, Split, View};
 use gs_scene::{Camera, HoldOut, Learnt, splat};
 use gs_sfm::Refine;
@@ -29,6 +29,18 @@ impl Program for Args {
 
     fn common(&self) -> &CommonArgs {
         &self.common
+    }
+
+    fn check(&self) -> Result<()> {
+        let Command::Train(train) = &self.command else { return Ok(()) };
+        match splat::Format::to_write(&train.out) {
+            Ok(format) if format != splat::Format::Ply => Err(Error::new("a training writes PLY")
+                .field("--out")
+                .found(train.out.display())
+                .expected("a name that ends in .ply")
+                .hint("make other formats of it with gs-geom convert")),
+            _ => Ok(()),
+        }
     }
 
     fn run(self, stage: &Stage) -> Result<()> {

@@ -63,6 +63,12 @@ fn a_file_is_inspected_in_text_and_json() {
 }
 
 #[test]
+fn a_training_writes_no_other_format() {
+    let said = refused(&["train", "--scene", "s", "--out", "g.spz"]);
+    assert!(said.contains("--out: a training writes PLY; found g.spz"), "{said}");
+}
+
+#[test]
 fn the_files_of_a_dataset_are_listed() {
     let dir = Folder::new();
     let root = PathBuf::from(dir.path("my scene"));

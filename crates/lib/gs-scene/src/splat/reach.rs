@@ -69,7 +69,7 @@ pub fn lost(path: &Path, g: &Gaussians) -> gs_io::Result<Vec<String>> {
     };
     if coarse {
         lost.push(format!(
-            "centres have few digits: the farthest reaches to {farthest} units, the scene's size is {:.3}; crop it first (--crop)",
+            "centres have few digits: the farthest reaches to {farthest} units, the scene's size is {:.3}; crop it first: gs-geom convert --crop",
             g.spread()
         ));
     }
