@@ -109,6 +109,11 @@ impl Format {
         }
     }
 
+    /// The format that a name says, where it says one.
+    pub fn of_name(path: impl AsRef<Path>) -> Option<Self> {
+        named(path.as_ref()).map(|(format, _)| format)
+    }
+
     /// The format of a file to read: by its first bytes, and where these say nothing by its name.
     ///
     /// # Errors

@@ -78,8 +78,8 @@ pub(crate) struct Settings {
     /// Allow one instance of all Gaussians where nothing divides them
     #[arg(long)]
     pub allow_single_cluster: bool,
-    /// How far the masks of pieces that do not touch must agree that both are one instance, 0 to 1; 0 joins none; for free points the
-    /// default is 0
+    /// How far the masks of pieces that do not touch must agree that both are one instance, 0 to 1, but no less than --agreement; 0 joins
+    /// none; for free points the default is 0
     #[arg(long, value_name = "AGREEMENT", value_parser = stage::within(0.0..=1.0), default_value = "0.5",
         default_value_if("cluster", "free", "0"))]
     pub join: f64,

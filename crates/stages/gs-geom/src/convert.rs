@@ -55,8 +55,10 @@ impl Convert {
             return stage.record(&mut claim, parameters, inputs, summary);
         }
         let chosen = choose(&g, self.crop);
-        let dropped =
-            [(chosen.damaged, "damaged: not finite, or a rotation of length 0"), (chosen.cropped, "outside the box")];
+        let dropped = [
+            (chosen.damaged, "damaged: not finite, a centre beyond 1e17, or a rotation of length 0"),
+            (chosen.cropped, "outside the box"),
+        ];
         for (n, why) in dropped.iter().filter(|d| d.0 > 0) {
             stage.skipped(&format!("{n} of {all} Gaussians: {why}"));
         }

@@ -33,13 +33,13 @@ impl Program for Args {
 
     fn check(&self) -> Result<()> {
         let Command::Train(train) = &self.command else { return Ok(()) };
-        match splat::Format::to_write(&train.out) {
-            Ok(format) if format != splat::Format::Ply => Err(Error::new("a training writes PLY")
+        match splat::Format::of_name(&train.out) {
+            None | Some(splat::Format::Ply) => Ok(()),
+            Some(_) => Err(Error::new("a training writes PLY")
                 .field("--out")
                 .found(train.out.display())
                 .expected("a name that ends in .ply")
                 .hint("make other formats of it with gs-geom convert")),
-            _ => Ok(()),
         }
     }
 

@@ -62,8 +62,9 @@ impl Mask {
         let transparent = pixels.clone().any(|[.., a]| a < u16::MAX);
         let first = picture.pixels().next().map(|p| p.0);
         if transparent && pixels.clone().all(|[r, g, b, _]| first.is_some_and(|f| f[..3] == [r, g, b])) {
-            let values = pixels.map(|[.., a]| f32::from(a) / f32::from(u16::MAX)).collect();
-            return Ok(Self { width, height, values, odd: Some(Odd::Alpha) });
+            let values: Vec<f32> = pixels.map(|[.., a]| f32::from(a) / f32::from(u16::MAX)).collect();
+            let odd = if values.iter().any(|v| *v > 0.0) { Odd::Alpha } else { Odd::Black };
+            return Ok(Self { width, height, values, odd: Some(odd) });
         }
         // Of 16 bits, whatever the file has: 255 of 8 bits is 65,535 of these.
         let unit = f32::from(u16::MAX / most);

@@ -203,8 +203,10 @@ fn matrix(value: &Value, field: &str) -> Result<DMat4> {
             m[4 * r + c] = v.as_f64().unwrap_or(f64::NAN);
         }
     }
-    // Lost poses, which may be all zeros, are left out later.
-    if m[12..15].iter().any(|v| *v != 0.0 && v.is_finite()) {
+    // Lost poses, which may be all zeros, are left out later. Rounding errors of an inverse are no translation.
+    let w = if m[15].is_finite() && m[15] != 0.0 { m[15] } else { 1.0 };
+    m.iter_mut().for_each(|v| *v /= w);
+    if m[12..15].iter().any(|v| v.abs() > 1e-6 && v.is_finite()) {
         return Err(Error::new("the last row of the pose is not 0 0 0 1")
             .field(field)
             .found(brief(&rows[3]))

@@ -655,6 +655,9 @@ fn bad_transforms_are_refused() {
         owner[key.trim_start_matches("frame.")] = value;
         load(&json)
     };
+    // A row of other scale is the same pose; a transposed one is not.
+    let scaled = good.map(|row| row.map(|v| 2.0 * v));
+    assert!(with("frame.transform_matrix", json!(scaled)).is_ok());
     // Degrees.
     let wide = json!({"camera_angle_x": 51.5, "frames": [{"file_path": "a.png", "transform_matrix": good}]});
     assert!(load(&wide).unwrap_err().contains("frames[0], camera_angle_x: no angle of view; found 51.5"));
