@@ -96,11 +96,10 @@ fn firm<'a>(
     }
     linkage.join(FIRM, usize::MAX, within);
     linkage.profiles.fill(Profile::default());
-    let linkage = linkage.into_owned(unit_of);
+    let mut linkage: Linkage<'_> = linkage.into_owned(unit_of);
     drop(pieces);
     let (labels, count) = linkage.labels();
     let pieces = Pieces::of(&labels, count, footprints, levels, &vec![true; views.len()])?;
-    let mut linkage: Linkage<'_> = linkage;
     // Some may have had no view in common before.
     linkage.see(pieces.profiles(), neighbours(graph));
     linkage.join(least, usize::MAX, within);

@@ -131,23 +131,23 @@ pub fn classes(levels: &[Level]) -> Vec<Level> {
     levels.iter().copied().filter(|level| level.kind() == LevelKind::Classes).collect()
 }
 
-/// How far masks of several levels must agree, and those of one level: fitted on drawn scenes of four families by
-/// pipelines/one-level.plan, and looked at on five scans (docs/results/scans.md).
+/// How far masks of several levels must agree that two pieces are one, chosen on scenes for tuning.
 const OF_LEVELS: f64 = 0.18;
+/// The same of one level of whole things: fitted on drawn scenes of four families by pipelines/one-level.plan; five scans gain
+/// (docs/results/scans.md).
 const OF_ONE_LEVEL: f64 = 0.6;
 
-/// Whether the masks have one level of whole things, which a map of one level has in place of all four: each view has the same masks at all of
-/// its levels.
+/// Whether the masks have one level of whole things. A map of one level counts as four that are alike: so in every view the same levels have
+/// the same masks.
 fn is_one_level(footprints: &Footprints, levels: &[Level]) -> bool {
-    let mut masks: BTreeMap<u32, BTreeMap<u32, Vec<u32>>> = BTreeMap::new();
+    let mut views: BTreeMap<u32, BTreeMap<u32, Vec<u32>>> = BTreeMap::new();
     for row in footprints.rows.iter().filter(|row| row.is_of(levels)) {
-        masks.entry(row.view).or_default().entry(row.level).or_default().push(row.mask);
+        views.entry(row.view).or_default().entry(row.level).or_default().push(row.mask);
     }
-    let parts = |level: &u32| [Level::SMALL, Level::MEDIUM].iter().any(|part| part.index() == *level as usize);
-    let of_parts = masks.values().flat_map(BTreeMap::keys).all(parts);
-    let alone = |of: &BTreeMap<u32, Vec<u32>>| of.values().all(|masks| Some(masks) == of.values().next());
-    let named: BTreeSet<&u32> = masks.values().flat_map(BTreeMap::keys).collect();
-    !of_parts && (named.len() == 1 || masks.values().all(|of| of.len() > 1 && alone(of)))
+    let Some(first) = views.values().next() else { return false };
+    let part = |level: &u32| [Level::SMALL, Level::MEDIUM].iter().any(|part| part.index() == *level as usize);
+    let one = |of: &BTreeMap<u32, Vec<u32>>| of.values().all(|masks| Some(masks) == of.values().next());
+    !first.keys().all(part) && views.values().all(|of| of.keys().eq(first.keys()) && one(of))
 }
 
 /// Largest count that an option takes: as many as there can be Gaussians.
@@ -195,6 +195,11 @@ impl Settings {
             levels,
             ..self.clone()
         }
+    }
+
+    /// How far masks must agree, where [`Self::for_scene`] left nothing open.
+    pub fn agreement(&self) -> f64 {
+        self.agreement.unwrap_or(OF_LEVELS)
     }
 
     /// The options of HDBSCAN.

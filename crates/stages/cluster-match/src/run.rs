@@ -80,13 +80,9 @@ fn find(a: &Args, settings: &Settings, inputs: &Inputs, stage: &Stage) -> Result
     // Made after the first merge, which takes most memory.
     let mut points = None;
     let clustering = match settings.cluster {
-        Space::Masks => linkage::cluster(
-            inputs,
-            &mut points,
-            settings,
-            &settings.levels,
-            (settings.agreement.unwrap_or_default(), settings.join),
-        )?,
+        Space::Masks => {
+            linkage::cluster(inputs, &mut points, settings, &settings.levels, (settings.agreement(), settings.join))?
+        }
         Space::Graph => on_graph(&inputs.features.values, &inputs.graph, &settings.hdbscan()),
         Space::Free => free(&inputs.features.values, &settings.hdbscan()),
     };
