@@ -200,11 +200,6 @@ impl Placed {
     }
 }
 
-/// Area of a polygon, corners counter-clockwise.
-fn area(of: &[DVec2]) -> f64 {
-    0.5 * of.iter().enumerate().map(|(i, p)| p.perp_dot(of[(i + 1) % of.len()])).sum::<f64>()
-}
-
 /// Area that two convex polygons share, corners counter-clockwise.
 fn overlap(a: &[DVec2], b: &[DVec2]) -> f64 {
     // The edges of a point, such as an object of one Gaussian has, would cut nothing off.
@@ -228,7 +223,8 @@ fn overlap(a: &[DVec2], b: &[DVec2]) -> f64 {
         }
         left = cut;
     }
-    area(&left)
+    let next = |i: usize| left[(i + 1) % left.len()];
+    0.5 * left.iter().enumerate().map(|(i, p)| p.perp_dot(next(i))).sum::<f64>()
 }
 
 /// Distance of two convex polygons; 0 where they overlap.

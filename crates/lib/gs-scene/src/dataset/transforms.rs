@@ -274,9 +274,9 @@ fn lens(file: &Value, frame: &Value, image: &Path, field: &str) -> Result<Lens> 
             .hint(AGAIN)),
         angle => Ok(angle.map(|a| 0.5 * f64::from(size) / (0.5 * a).tan())),
     };
-    let focal = |key: &str, angle: &str, size: u32| get(key)?.map_or_else(|| of_angle(angle, size), |f| Ok(Some(f)));
-    let fx = focal("fl_x", "camera_angle_x", w)?;
-    let fy = focal("fl_y", "camera_angle_y", h)?;
+    let pixels = |key: &str, angle: &str, size: u32| get(key)?.map_or_else(|| of_angle(angle, size), |f| Ok(Some(f)));
+    let fx = pixels("fl_x", "camera_angle_x", w)?;
+    let fy = pixels("fl_y", "camera_angle_y", h)?;
     let focal = fx.or(fy).zip(fy.or(fx)).filter(|(x, y)| [x, y].iter().all(|f| **f > 0.0 && f.is_finite()));
     let Some((fx, fy)) = focal else {
         return Err(Error::new("no usable focal length")
