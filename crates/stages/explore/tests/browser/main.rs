@@ -434,16 +434,22 @@ fn a_click_is_answered_while_the_first_text_is_encoded() {
     browser.no_errors();
 }
 
+/// A small run with names, its server, where that is, and a browser that has loaded it.
+fn open_named() -> (Run, common::Server, String, Browser) {
+    let run = Run::new();
+    run.write_names(&run.instances());
+    let server = run.serve(&[]);
+    let url = format!("http://{}{}", server.host, server.path);
+    let browser = Browser::open();
+    browser.load(&url);
+    (run, server, url, browser)
+}
+
 /// A note is typed without a mouse, kept in the run's folder, shown as text, and undone like any edit.
 #[test]
 #[ignore = "needs chromium; run scripts/test_explore.sh"]
 fn notes_are_kept_and_shown() {
-    let run = Run::new();
-    run.write_names(&run.instances());
-    let server = run.serve(&[]);
-    let browser = Browser::open();
-    let url = format!("http://{}{}", server.host, server.path);
-    browser.load(&url);
+    let (run, _server, url, browser) = open_named();
     browser.js("await page.selectInstances([0])", vec![]);
     let note = "<b>grandma's</b>, 👩‍🍳 میراث";
     browser.session.keys("canvas", "o");
@@ -473,11 +479,7 @@ fn notes_are_kept_and_shown() {
 #[test]
 #[ignore = "needs chromium; run scripts/test_explore.sh"]
 fn the_list_has_the_names_of_the_inventory() {
-    let run = Run::new();
-    run.write_names(&run.instances());
-    let server = run.serve(&[]);
-    let browser = Browser::open();
-    browser.load(&format!("http://{}{}", server.host, server.path));
+    let (_run, _server, _, browser) = open_named();
     browser.ask("far ball");
     let listed = "return [...document.querySelectorAll('#ranking button')].map((b) => b.children[1].textContent).concat(document.getElementById('selection-name').textContent)";
     browser.until("document.getElementById('selection-name').textContent");
@@ -493,11 +495,7 @@ fn the_list_has_the_names_of_the_inventory() {
 #[test]
 #[ignore = "needs chromium; run scripts/test_explore.sh"]
 fn keys_reach_everything() {
-    let run = Run::new();
-    run.write_names(&run.instances());
-    let server = run.serve(&[]);
-    let browser = Browser::open();
-    browser.load(&format!("http://{}{}", server.host, server.path));
+    let (_run, _server, _, browser) = open_named();
     browser.session.keys("canvas", "t");
     browser.until("document.querySelector('#ranking button')");
     // Along the list by arrows, which leave the camera where it is.
